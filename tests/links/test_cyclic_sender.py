@@ -1,4 +1,4 @@
-"""Frames that are sent again and again: the kernel's message, and the event loop's own timer."""
+"""Cyclic sending: the message to the kernel, and the timer of the event loop."""
 
 import asyncio
 import struct
@@ -14,7 +14,7 @@ SYNC = CyclicFrame(0x80, False, b"\7", 10 * MS)
 
 
 def test_the_message_to_the_broadcast_manager() -> None:
-    """`struct bcm_msg_head` of linux/can/bcm.h on a 64-bit machine: 56 bytes, then the frame."""
+    """`struct bcm_msg_head` of linux/can/bcm.h on a 64-bit system has 56 bytes. The frame follows."""
     if struct.calcsize("P") != 8:
         pytest.skip("laid out otherwise")
     message = setup(CyclicFrame(0x18FEE9AA, True, b"\1\2", 1_002_500_000))
@@ -35,7 +35,7 @@ class Clock:
 
 
 def run(late_ns: list[int], *, fail_after: int = 1 << 30) -> tuple[list[int], list[str]]:
-    """Send until `late_ns` is used up; return the times of the frames, and the errors that were reported."""
+    """Send until the end of `late_ns`. Return the times of the frames and the reported errors."""
     clock, sent_at, errors = Clock(), list[int](), list[str]()
 
     async def story() -> None:

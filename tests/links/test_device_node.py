@@ -1,4 +1,4 @@
-"""Errors of a node that cannot be opened, with the processes of a simulated /proc."""
+"""Errors when a node cannot be opened, with the processes of a simulated /proc."""
 
 import asyncio
 import errno
@@ -34,7 +34,7 @@ def test_every_holder_is_named_by_program_and_pid(tmp_path: Path) -> None:
     process(proc, 10, "minicom", "/dev/null", str(port))
     process(proc, 11, "bash", "/dev/null")
     process(proc, 12, "screen", str(port))
-    (proc / "13").mkdir()  # ended, or another user's
+    (proc / "13").mkdir()  # a process that has ended, or of another user
     (proc / "self").mkdir()
     assert holders_of(str(link), proc) == "minicom (pid 10), screen (pid 12)"
     assert holders_of("/dev/ttyUSB9", proc) == ""
@@ -56,7 +56,7 @@ def test_another_imud_is_named_by_what_it_does(tmp_path: Path, command: list[str
 
 @in_loop
 async def test_access_is_waited_for_quietly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """udev sets the group of a node after the kernel has made it; a refusal counts only when that time is over."""
+    """udev sets the group of a node shortly after the kernel has created it. imud waits before it reports an error."""
     path, granted = tmp_path / "tty", False
 
     def access(_path: object, _mode: int, **_more: bool) -> bool:
@@ -101,7 +101,7 @@ def test_access_that_is_not_granted_is_waited_for_no_longer(tmp_path: Path, monk
 @needs_root
 @pytest.mark.parametrize(("gid", "mode"), [(0, 0o600), (0, 0o660), (DAEMON_UID, 0o600), (DAEMON_UID, 0o640)])
 def test_a_node_that_no_group_may_open_needs_a_udev_rule(gid: int, mode: int, tmp_path: Path) -> None:
-    """As I2C and SPI nodes of plain Debian: to join a group gives no access."""
+    """I2C and SPI nodes of plain Debian belong to root: joining a group does not give access."""
     path = tmp_path / "i2c-1"
     path.touch()
     os.chown(path, 0, gid)

@@ -1,4 +1,4 @@
-"""Waiting for files through inotify."""
+"""Waits for files with inotify."""
 
 import asyncio
 import os
@@ -20,7 +20,7 @@ async def turns(count: int = 20) -> None:
 
 
 def run(path: Path, ready: Callable[[], bool], act: Callable[[], object]) -> None:
-    """Check that a wait ends after `act`, and not before."""
+    """Check that a wait ends after `act` and not before."""
 
     async def scene() -> None:
         waiting = asyncio.create_task(wait_until(path, ready))
@@ -107,7 +107,7 @@ async def test_a_wait_does_not_poll_and_leaves_no_descriptor_when_it_is_cancelle
     await asyncio.gather(waiting, return_exceptions=True)
     await asyncio.get_running_loop().shutdown_default_executor()
     assert descriptors() == before
-    assert asked == 2  # before and after the watch was set
+    assert asked == 2  # before and after the watch
 
 
 def test_a_failed_watch_is_an_error_and_leaves_no_descriptor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

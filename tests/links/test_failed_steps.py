@@ -1,4 +1,4 @@
-"""Sockets and timers that a failed step must not leave behind: every step after `socket()` fails once."""
+"""A failed step must close all sockets and timers. Every step after `socket()` fails once."""
 
 import asyncio
 import errno
@@ -20,7 +20,7 @@ BUFFER_BYTES = 1 << 20
 
 
 class FakeSocket:
-    """A socket whose call number `fails_at` fails."""
+    """A socket. Its call number `fails_at` fails."""
 
     def __init__(self, fails_at: int = 0, error: int = errno.ENODEV) -> None:
         self._fails_at, self._error = fails_at, error
@@ -53,7 +53,7 @@ def test_a_raw_socket_is_closed_when_a_step_fails(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_raw_socket_has_the_permitted_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without CAP_NET_ADMIN the third call fails: the usual option then sets the buffer."""
+    """Without CAP_NET_ADMIN, the third call fails. The normal option then sets the buffer."""
     made = FakeSocket(3, errno.EPERM)
     monkeypatch.setattr(socket, "socket", lambda *_: made)
     assert open_raw(SocketCanOptions(interface="can0"), []) is made  # type: ignore[comparison-overlap]  # the fake
@@ -73,7 +73,7 @@ def sys_with_can0(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def link_of(made: FakeSocket, sys: Path) -> SocketCanLink:
-    """Return a link whose socket is `made`."""
+    """Return a link with the socket `made`."""
     settings = SocketCanOptions(interface="can0")
     return SocketCanLink(settings, sys=sys, open_socket=lambda *_: made)  # type: ignore[arg-type]  # the fake
 
@@ -100,7 +100,7 @@ def test_a_link_that_cannot_be_set_up_is_closed(
     [(errno.ENOBUFS, "queue is full"), (errno.EAGAIN, "queue is full"), (errno.ENETDOWN, "taken down")],
 )
 def test_a_refused_frame_is_explained(sys_with_can0: Path, error: int, words: str) -> None:
-    made = FakeSocket(4, error)  # after two options and the size of the buffer
+    made = FakeSocket(4, error)  # after two options and the buffer size
     link = link_of(made, sys_with_can0)
     link.open()
     with pytest.raises(LinkError, match=words):

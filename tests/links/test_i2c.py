@@ -1,4 +1,4 @@
-"""The I2C link on a simulated bus: repeated start, the SMBus way, failures."""
+"""The I2C link on a simulated bus: repeated start, SMBus transfers, failures."""
 
 import errno
 

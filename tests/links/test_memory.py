@@ -1,4 +1,4 @@
-"""The link for tests."""
+"""The memory link, which only tests use."""
 
 import asyncio
 

@@ -1,4 +1,4 @@
-"""Network interfaces: presence from a tree of files, details from answers made by hand, waiting on news."""
+"""Network interfaces: existence from a file tree, details from prepared netlink replies, and waits for changes."""
 
 import asyncio
 import struct

@@ -1,4 +1,4 @@
-"""Buses of python-can, on its virtual one."""
+"""The link to python-can, on its virtual bus."""
 
 import asyncio
 import threading
@@ -80,7 +80,7 @@ def test_settings_of_other_backends_and_filters() -> None:
 
 
 class FakeBus:
-    """A bus of python-can that gives these messages, and notes its end."""
+    """A bus of python-can with prepared messages. It notes its shutdown."""
 
     def __init__(self, *messages: can.Message) -> None:
         self.messages = list(messages)

@@ -1,4 +1,4 @@
-"""Captures played through the link."""
+"""Captures replayed through the link."""
 
 import asyncio
 import errno
@@ -40,7 +40,7 @@ def raw(tmp_path: Path) -> Path:
 
 
 class Played:
-    """A link that plays a capture in virtual time, with the delivered data and its times."""
+    """A link that replays a capture in simulated time, with the delivered data and its times."""
 
     def __init__(self, path: Path, **settings: Any) -> None:
         self.clock = VirtualClock()
@@ -59,7 +59,7 @@ class Played:
         return [t_rx_ns - self.chunks[0][1] for _, t_rx_ns in self.chunks]
 
     def play(self, pieces_max: int) -> None:
-        """Play to the end, or until `pieces_max` pieces arrived."""
+        """Replay to the end, or until `pieces_max` pieces have arrived."""
         run_virtually(self.clock, self._play(pieces_max))
 
     async def _play(self, pieces_max: int) -> None:
@@ -91,7 +91,7 @@ def play(path: Path, *, pieces_max: int = 1 << 30, **settings: Any) -> Played:
 
 
 def check_times(played: Played) -> None:
-    """True of every speed: never in the future, never back."""
+    """Check the times, for any speed: they are not in the future and do not decrease."""
     times = [t_rx_ns for _, t_rx_ns in played.chunks]
     assert times == sorted(times)
     assert all(t_rx_ns <= now_ns for t_rx_ns, now_ns in zip(times, played.delivered_ns, strict=True))

@@ -35,7 +35,7 @@ def make(path: Path, **keys: object) -> CanLink:
 
 
 def play(path: Path, enough: int = 1 << 30, **keys: Any) -> tuple[list[CanFrame], list[LinkError | None], int]:
-    """Play in virtual time until the end, or until `enough` frames; return the frames, the ends and the duration."""
+    """Replay in simulated time to the end, or until `enough` frames. Return frames, ends and duration."""
     clock = VirtualClock()
     link = CanReplayLink(ReplayOptions(path=str(path), **keys), clock.now_ns)
     link.filters = [CanFilter(101, 0x7FF, False), CanFilter(102, 0x7FF, False)]

@@ -1,4 +1,4 @@
-"""An RS-485 line on a real pty: one port for all, echoes, silence, late and foreign replies, and a cable pulled."""
+"""An RS-485 bus on a real pty: a shared port, echoes, silence, late and foreign replies, and an unplugged cable."""
 
 import asyncio
 import errno
@@ -67,7 +67,7 @@ def sure(link: Rs485Link, transfer: Transfer) -> bytes:
 
 
 def time_out(link: Rs485Link, transfer: Transfer) -> None:
-    """Ask until a reply is later than its time-out: this thread itself may be late."""
+    """Send requests until a reply arrives after its timeout. This thread may also be late."""
     for _ in range(TRIES):
         try:
             link.transfer(transfer)
@@ -187,8 +187,7 @@ def test_silent_module_costs_its_time_out_and_comes_back(tmp_path: Path) -> None
 
 
 def test_late_reply_is_never_taken_for_the_next(tmp_path: Path) -> None:
-    """The late reply with the value 0 arrives 100 ms after its timeout, when a second request is pending whose value is
-    1."""
+    """The late reply has the value 0. It arrives 100 ms after its timeout, during a request with the value 1."""
     late = slave(1, processing_ns=100_000_000)
     with wired(tmp_path, late, slave(2)) as (path, line), opened(path, reply_ms=1) as link:
         time_out(link, SETTINGS)
@@ -199,7 +198,7 @@ def test_late_reply_is_never_taken_for_the_next(tmp_path: Path) -> None:
 
 
 def test_after_a_time_out_one_register_is_read_first_and_then_no_more(pty: PtyPort) -> None:
-    """The reply to that request differs in length from the reply that the module owes: two registers for one."""
+    """The reply to the single-register request has another length than the late reply, which has two registers."""
     one, value = read_registers(4, 1).sends[0], bytes.fromhex("03 02 0008")
     long, serial = SERIAL.sends[0], b"\x03\x08" + serial_of(1)
     script = [
@@ -283,7 +282,7 @@ def test_cable_pulled_and_back(pty: PtyPort) -> None:
         with pytest.raises(LinkMissing):
             link.transfer(SERIAL)
     link_a.close()
-    with pytest.raises(LinkError):  # the node is gone: a new port is opened, not the old one shared
+    with pytest.raises(LinkError):  # the node does not exist: the link opens a new port instead of the shared old port
         link_a.open()
     link_b.close()
 
@@ -317,7 +316,7 @@ def test_the_line_gets_the_longer_time_for_a_reply_and_has_the_counters_of_the_k
 
 
 class Driver:
-    """A serial driver's ioctls for RS-485."""
+    """The RS-485 ioctls of a serial driver."""
 
     def __init__(self, flags: int, error: int = 0) -> None:
         self.flags, self.error = flags, error

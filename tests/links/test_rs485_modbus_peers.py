@@ -1,6 +1,6 @@
-"""Another Modbus implementation at either end: pymodbus as the modules under our driver, and as master of ours.
+"""The Modbus code with pymodbus: pymodbus as devices for imud's driver, and as master of imud's simulator.
 
-A pymodbus server has a pseudo-terminal of its own; a thread carries bytes between that and ours.
+A pymodbus server has its own pseudo-terminal. A thread moves bytes between this terminal and the terminal of imud.
 """
 
 import asyncio
@@ -79,7 +79,7 @@ def carried(one: PtyPort, other: PtyPort) -> Iterator[None]:
 
 @contextmanager
 def served(*devices: SimDevice) -> Iterator[str]:
-    """Path of a line on which a pymodbus server plays these devices."""
+    """Yield the path of a bus. A pymodbus server simulates these devices on it."""
     ours, theirs = PtyPort(), PtyPort()
     ready, loop = threading.Event(), asyncio.new_event_loop()
     servers: list[Any] = []
@@ -157,7 +157,7 @@ def test_pymodbus_client_on_our_simulator(tmp_path: Path) -> None:
             block = client.read_holding_registers(0x34, count=26, device_id=1)
             assert not block.isError()
             assert len(block.registers) == 26
-            assert 700 < block.registers[2] < 2700  # about 1 G on the axis that points up, of 2048 counts
+            assert 700 < block.registers[2] < 2700  # about 1 G on the upward axis, 2048 counts
             refused = client.read_holding_registers(0x34, count=26, device_id=2)
             assert refused.isError()
             assert refused.exception_code == 2

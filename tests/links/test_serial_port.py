@@ -1,4 +1,4 @@
-"""A serial port's errors in words, how long adapters hold bytes back by a made-up /sys, the kernel's error counters."""
+"""Serial port: error messages, latency timers of adapters from a simulated /sys, and error counters of the kernel."""
 
 import errno
 import os
@@ -15,7 +15,7 @@ from imud.model.units import NS_PER_MS
 from tests.support.pty_port import PtyPort
 
 START = (0, 0, 0, 0, 1000, 0, 5, 7, 11, 13, 17, *[0] * 9)
-"""cts dsr rng dcd rx tx, then frame overrun parity brk buf_overrun as linux/serial.h orders them."""
+"""Counters cts dsr rng dcd rx tx, then frame overrun parity brk buf_overrun, in the order of linux/serial.h."""
 LATER = (0, 0, 0, 0, 2000, 0, 6, 9, 14, 17, 22, *[0] * 9)
 
 
@@ -48,7 +48,7 @@ def test_an_open_port_has_one_descriptor_and_leaves_none() -> None:
     port.close()
     port.close()
     assert descriptors() == before
-    again = open_port(str(pty.path), 115200, PROC)  # it is neither locked nor exclusive any more
+    again = open_port(str(pty.path), 115200, PROC)  # no lock and no exclusive mode remain
     again.baudrate = 9600
     again.close()
     pty.unplug()
@@ -77,7 +77,7 @@ def test_the_timer_is_found_through_a_link(tmp_path: Path) -> None:
 
 def test_only_what_was_counted_since_the_start_is_reported() -> None:
     assert relative(START, START) == KernelCounters()
-    # overruns of the UART's FIFO (9 - 7) and of the tty's buffer (22 - 17) are one figure
+    # one value contains overruns of the UART's FIFO (9 - 7) and of the tty's buffer (22 - 17)
     assert relative(START, LATER) == KernelCounters(overrun=7, framing=1, parity=3, break_=4)
     before = (*[0] * 6, 0x7FFF_FFFF, *[0] * 13)
     after = (*[0] * 6, -0x8000_0000, *[0] * 13)

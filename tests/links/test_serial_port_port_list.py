@@ -1,4 +1,4 @@
-"""Listing ports, from made-up /dev and /sys trees."""
+"""Lists of ports from simulated /dev and /sys trees."""
 
 from pathlib import Path
 
@@ -20,14 +20,14 @@ def sys(dev: Path) -> Path:
 
 
 def native(dev: Path, sys: Path, name: str, kind: str) -> None:
-    """A port of the 8250 or PL011 driver, with its `type`."""
+    """Create a port of the 8250 or PL011 driver with its `type`."""
     (dev / name).touch()
     (sys / "class" / "tty" / name).mkdir()
     (sys / "class" / "tty" / name / "type").write_text(f"{kind}\n")
 
 
 def usb(dev: Path, sys: Path, name: str, **texts: str) -> None:
-    """A USB adapter as /sys shows it: the tty's device lies below the interface, which lies below the USB device."""
+    """Create a USB adapter like /sys: the tty's device is below the interface, which is below the USB device."""
     (dev / name).touch()
     device = sys / "devices" / "usb1" / f"1-{name}"
     port = device / "1.0" / name
@@ -57,7 +57,7 @@ def test_without_by_id_the_path_and_then_the_node_is_the_name(dev: Path, sys: Pa
 
 
 def test_equal_adapters_without_serial_numbers_are_named_by_their_sockets(dev: Path, sys: Path) -> None:
-    """Both have the same by-id name, which leads to the one that was plugged in last."""
+    """Both adapters have the same by-id name, which refers to the adapter that was plugged in last."""
     for name in ("ttyUSB0", "ttyUSB1"):
         usb(dev, sys, name, product="CH340")
         (dev / "serial" / "by-path" / f"pci-{name[-1]}").symlink_to(f"../../{name}")

@@ -1,4 +1,4 @@
-"""How a CAN link lets frames gather, on a socket of another family: the same reads, stamps and loop."""
+"""Holds of a CAN link, on a socket of another family with the same reads, time stamps and event loop."""
 
 import asyncio
 import errno
@@ -21,7 +21,7 @@ Ends = tuple[socket.socket, socket.socket, Path]
 
 
 class Bus:
-    """A link with a socket of the loop device, the delivered frames, and the times of its timers."""
+    """A link with a loopback socket, the delivered frames, and the times of its timers."""
 
     def __init__(self, ends: Ends, gather_ms: int) -> None:
         receiver, sender, sys = ends
@@ -37,7 +37,7 @@ class Bus:
         self.by_timer: list[bool] = []
         """True for each batch that a timer read."""
         self.then: Callable[[], None] = lambda: None
-        """Done once, right after the next delivery."""
+        """Function that runs once, directly after the next delivery."""
         self._sender = sender
         self._news = asyncio.Event()
         self._looking = False
@@ -48,7 +48,7 @@ class Bus:
             self._sender.send(pack_frame(can_id, False, b"\1"))
 
     async def until(self, condition: Callable[[], object]) -> None:
-        """Wait for deliveries until it holds."""
+        """Wait for deliveries until the condition is true."""
 
         async def wait() -> None:
             while not condition():
@@ -195,7 +195,7 @@ def test_a_bus_that_ends_in_the_pause_says_so_once(ends: Ends, monkeypatch: pyte
         bus.send(1)
         await bus.until(lambda: bus.batches)
         Reader.down = True
-        bus.send(2)  # it must not be watched any more
+        bus.send(2)  # the link must not watch the socket any longer
         await bus.until(lambda: bus.ends)
         await asyncio.sleep(0.005)
 

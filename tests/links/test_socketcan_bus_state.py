@@ -15,7 +15,7 @@ def test_life_of_a_controller() -> None:
     assert bus.add_error_frame(0x4, frame(0x08)) == "can0 is near its error limit (warning)"
     assert bus.problem == ""
     assert bus.add_error_frame(0x4, frame(0x20)).startswith("can0 is error-passive: ")
-    assert bus.add_error_frame(0x4, frame(0x10)) == ""  # still
+    assert bus.add_error_frame(0x4, frame(0x10)) == ""  # the state has not changed
     assert "terminated" in bus.problem
     assert bus.add_error_frame(0x40, frame(0)).startswith("can0 is bus-off: ")
     assert "`ip link set can0 down`, then `ip link set can0 up type can restart-ms 100`" in bus.problem

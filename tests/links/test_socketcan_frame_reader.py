@@ -1,4 +1,4 @@
-"""The receiving side of CAN on a socket of another family: the same system call, stamps and drop count."""
+"""The receiver of CAN frames, on a socket of another family with the same system call, time stamps and drop counter."""
 
 import select
 import socket
@@ -20,14 +20,14 @@ ERROR_FRAME = RAW_FRAME.pack(0x2000_0004, 8, bytes([0, 1, 0, 0, 0, 0, 0, 0]))
 
 
 def real_ns() -> int:
-    """Return the time of a monotonic clock that is OFFSET_NS behind the clock of the kernel's stamps."""
+    """Return the time of a clock that is OFFSET_NS behind the clock of the kernel's time stamps."""
     return time.time_ns() - OFFSET_NS
 
 
 class Wire:
-    """A reader on a UDP socket of the loop device, whose datagrams are frames.
+    """A reader on a loopback UDP socket. Datagrams replace the frames.
 
-    The clocks of the reader stand still during a read. Two readings of them are never apart, and each stamp is exact.
+    The clocks of the reader stop during a read. Two readings are thus equal, and each time stamp is exact.
     """
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class Wire:
         self._wait_for_stamps()
 
     def send(self, *can_ids: int) -> tuple[int, int]:
-        """Send frames; return the times before and after that."""
+        """Send frames. Return the time before and after sending."""
         before_ns = real_ns()
         for can_id in can_ids:
             self.sender.send(pack_frame(can_id, False, bytes([can_id & 0xFF])))
@@ -58,7 +58,7 @@ class Wire:
         return self.reader.read()
 
     def ids(self) -> list[tuple[int, bool]]:
-        """Read; return the identifiers, and whether frames were lost before."""
+        """Read. Return the identifiers, and whether frames were lost before each."""
         return [(frame.can_id, frame.after_loss) for frame in self.read()]
 
     def close(self) -> None:
@@ -70,7 +70,7 @@ class Wire:
         return self.error_means_loss
 
     def _wait_for_stamps(self) -> None:
-        """The kernel starts to stamp some ms after the first socket asked for it; before, it stamps at the read."""
+        """Wait until the kernel time-stamps datagrams, some ms after the first socket has requested time stamps."""
         end_s, is_stamped = time.monotonic() + LIMIT_S, False
         while not is_stamped:
             assert time.monotonic() < end_s, "no kernel stamps"
@@ -123,11 +123,13 @@ def test_drops_are_counted_and_marked_where_they_were(wire: Wire) -> None:
 
 
 def test_a_drop_is_seen_after_reads_of_single_frames(wire: Wire) -> None:
-    """A read without drops needs less room for control messages; the next has all of it again."""
+    """A read without drops needs less space for control messages. The next read has the full space again."""
     wire.receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
     wire.send(1)
     assert wire.ids() == [(1, False)]
-    wire.sender.send(pack_frame(2, False, b"") + bytes(4000))  # fills the buffer alone, and is cut to a frame
+    wire.sender.send(
+        pack_frame(2, False, b"") + bytes(4000)
+    )  # fills the buffer, and the reader truncates it to a frame
     wire.send(3)
     assert wire.ids() == [(2, False)]
     wire.send(4)
@@ -174,8 +176,8 @@ def test_frames_of_before_and_after_a_step_of_the_wall_clock_keep_their_order_an
 def test_a_frame_of_a_time_between_two_steps_of_the_wall_clock_is_not_dated_before_it_came(
     wire: Wire, step_ns: int
 ) -> None:
-    """The wall clock is set and set back between two reads, as a host under SIGSTOP sees it."""
-    wire.wall_ahead_ns += step_ns  # of both reads; the kernel stamps by the clock without it
+    """The wall clock is set and set back between two reads, like on a host under SIGSTOP."""
+    wire.wall_ahead_ns += step_ns  # the offset of both reads; the kernel's time stamps do not contain it
     wire.send(1)
     wire.read()
     sent_ns, _ = wire.send(2, 3)
@@ -194,7 +196,7 @@ def test_a_frame_is_no_older_than_the_read_that_emptied_the_queue(wire: Wire) ->
 
 
 def test_clocks_that_are_always_read_apart_give_the_closest_of_some_readings(wire: Wire) -> None:
-    """The thread is away between the two clocks each time: for 30 us, then for 20 ms."""
+    """Each time, the thread stops between the readings of both clocks: first for 30 us, then for 20 ms."""
     away_ns, calls = [0, 0, 30_000, 0, 20_000_000, 0, 20_000_000], iter(range(7))
     gone_ns, base_ns, begun = 0, real_ns(), False
 

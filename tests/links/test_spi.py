@@ -32,7 +32,7 @@ def test_same_bits_on_the_wires_whatever_the_words(word_bits: int) -> None:
     link.open()
     link.select(3)
     assert bus.mode == 3
-    for _ in range(2):  # the second time from what was prepared
+    for _ in range(2):  # the second transfer uses the stored buffers
         assert link.transfer(Transfer((b"\x80\x00\x12\x34", b"\xfe\x01"))) == b"\x7f\xff\xed\xcb\x01\xfe"
     assert bus.messages == [((b"\x80\x00\x12\x34", b"\xfe\x01"), word_bits, 2_000_000)] * 2
     link.close()
@@ -45,7 +45,7 @@ def test_buffers_outlive_the_garbage_collector() -> None:
     link = link_to(bus)
     link.open()
     link.select(0)
-    transfers = [Transfer((bytes([n, n]),)) for n in range(100)]  # more than are kept
+    transfers = [Transfer((bytes([n, n]),)) for n in range(100)]  # more than PREPARED_MAX
     for _ in range(2):
         for n, transfer in enumerate(transfers):
             assert link.transfer(transfer) == bytes([n ^ 0xFF] * 2)

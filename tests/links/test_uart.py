@@ -93,7 +93,7 @@ def test_bytes_pass_as_they_are(pty: PtyPort) -> None:
 
 
 async def drained(pty: PtyPort, count: int, received: bytes = b"") -> bytes:
-    """Receive until there are `count` bytes."""
+    """Receive until `count` bytes have arrived."""
     done = asyncio.Event()
 
     def on_readable() -> None:
@@ -127,9 +127,9 @@ def test_what_the_port_does_not_take_is_queued_in_order_and_bounded(pty: PtyPort
 def test_what_is_sent_later_waits_behind_the_queue(pty: PtyPort) -> None:
     async def scene(_receiver: Receiver) -> None:
         sent = pty.fill()
-        link.write(bytes(1000))  # all of it is queued
+        link.write(bytes(1000))  # all bytes are queued
         received = b""
-        while not select.select([], [pty.slave], [], 0)[1]:  # until there is room again
+        while not select.select([], [pty.slave], [], 0)[1]:  # until the port accepts data again
             received += pty.received()
         link.write(b"last")
         assert await drained(pty, sent + 1004, received) == bytes(sent + 1000) + b"last"
@@ -178,9 +178,9 @@ def test_a_spurious_wake_up_is_no_end(pty: PtyPort) -> None:
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(lambda _loop, context: failures.append(context))
         pty.send(b"x")
-        wait_until(lambda: waiting_bytes(pty.slave) == 1, "the byte is there")  # the loop has no turn until then
+        wait_until(lambda: waiting_bytes(pty.slave) == 1, "the byte is there")  # the event loop does not run until then
         loop.call_soon(lambda: stolen.append(os.read(pty.slave, 1)))
-        for _ in range(5):  # the descriptor was readable, but not any more when the link reads it
+        for _ in range(5):  # the descriptor was readable, but no data remains when the link reads it
             await asyncio.sleep(0)
         assert stolen == [b"x"]
 
@@ -216,7 +216,7 @@ def test_closing_inside_the_receiver_is_allowed(pty: PtyPort) -> None:
         link.start(on_data, receiver.on_end)
         pty.send(b"x")
         await asyncio.wait_for(got.wait(), LIMIT_S)
-        await asyncio.sleep(0.01)  # a reader that was left would read, and end the link
+        await asyncio.sleep(0.01)  # a remaining reader would read and end the link
 
     assert play(link, scene).ends == []
 
@@ -303,7 +303,7 @@ def test_a_step_after_open_that_fails_releases_the_port(
     before = open_descriptors()
     link = UartLink(UartOptions(port=pty.path))
     with monkeypatch.context() as patch:
-        if step == "fcntl.ioctl":  # of TIOCEXCL: the library needs the others
+        if step == "fcntl.ioctl":  # TIOCEXCL fails; the library needs the other calls
             real = fcntl.ioctl
             patch.setattr(fcntl, "ioctl", lambda *a: refuse() if a[1] == termios.TIOCEXCL else real(*a))
         else:
@@ -394,7 +394,7 @@ def test_a_paused_port_keeps_what_comes_until_it_is_taken(pty: PtyPort) -> None:
         pty.send(b"d")
         await receiver.until(lambda: receiver.data == b"d")
         link.pause()
-        sent = bytes(range(256)) * 32  # more than one read gives
+        sent = bytes(range(256)) * 32  # more than the limit of one read
         taken = b""
         for at in range(0, len(sent), FULL_READ_BYTES):
             pty.send(sent[at : at + FULL_READ_BYTES])
