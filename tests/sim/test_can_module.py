@@ -1,4 +1,4 @@
-"""Several simulated devices as one, and their way into the kernel."""
+"""Several simulated devices as one object, and their transfer to the kernel."""
 
 import socket
 from typing import Any

@@ -1,4 +1,4 @@
-"""`python -m imud.sim` as the process it is."""
+"""`python -m imud.sim` as a process."""
 
 import csv
 import json
@@ -39,7 +39,7 @@ def start() -> Iterator[Start]:
     yield begin
     for process in started:
         if process.poll() is None:
-            process.communicate(timeout=LIMIT_S)  # the end of stdin ends it, and it tidies up
+            process.communicate(timeout=LIMIT_S)  # the process ends with its standard input and removes its files
 
 
 def path_of(process: "subprocess.Popen[str]") -> Path:
@@ -63,7 +63,7 @@ def read(fd: int, wanted: int) -> list[Measurement]:
 
 
 def drain(fd: int) -> None:
-    """Read to the end: of the file, or with EIO if the far end vanishes during a read."""
+    """Read to the end of the file, or to EIO if the far end closes during a read."""
     with suppress(OSError):
         while os.read(fd, 4096):
             pass
@@ -103,7 +103,7 @@ def test_frames_commands_and_the_end(start: Start, tmp_path: Path) -> None:
     assert "soon" in err
     assert not path.is_symlink()
     sampled = {int(line.split(",")[1]) for line in truth.read_text().splitlines()[2:]}
-    assert sampled & set(ticks)  # frames that a full terminal took in part are not in it
+    assert sampled & set(ticks)  # `sampled` does not contain frames that a full terminal accepted in part
 
 
 def test_unplug_closes_the_port_and_a_new_one_appears(start: Start) -> None:
@@ -119,7 +119,7 @@ def test_unplug_closes_the_port_and_a_new_one_appears(start: Start) -> None:
     command(process, "stats")
     assert process.stdout
     assert json.loads(process.stdout.readline())["unplugs"] == 1
-    process.communicate("", timeout=LIMIT_S)  # the end of stdin ends it
+    process.communicate("", timeout=LIMIT_S)  # the process ends with its standard input
     assert process.returncode == 0
     assert pin_rates("") == PinFaultRates()
     assert pin_rates("lose_pulse=0.1,extra=0.02") == PinFaultRates(lose_pulse=0.1, extra=0.02)
@@ -159,14 +159,14 @@ def test_bad_arguments_are_explained(
 ) -> None:
     monkeypatch.setattr(signal, "signal", lambda _number, _handler: None)
     with pytest.raises(SystemExit, match="2"):
-        sys.exit(main(arguments))  # the parser exits by itself
+        sys.exit(main(arguments))  # the parser exits
     out, err = capsys.readouterr()
     assert out == ""
     assert named in err
 
 
 def lines(tmp_path: Path, *names: str) -> str:
-    """`--pins` for files of these names."""
+    """Return `--pins` for files with these names."""
     for name in names:
         (tmp_path / name).touch()
     return ",".join(f"{name}={tmp_path / name}" for name in names)
@@ -233,7 +233,7 @@ def test_a_rise_on_sin_is_answered(start: Start, tmp_path: Path) -> None:
         sin.write_text("1\n")
         assert len(read(fd, 1)) == 1
         sin.write_text("0\n")
-        os.write(fd, b"LOG VERSION\r\n")  # its answer comes after another look at SIN
+        os.write(fd, b"LOG VERSION\r\n")  # the reply arrives after the process has read SIN again
         heard = b""
         while b"BL_VER" not in heard:
             assert select.select([fd], [], [], LIMIT_S)[0]

@@ -1,4 +1,4 @@
-"""The ground truth is physics: rates are derivatives, gravity points down, axes have the signs of the manual."""
+"""The true values follow physics: rates are derivatives, gravity points down, axes have the signs of the manual."""
 
 from math import acos, asin, degrees, hypot, pi, radians, sin
 
@@ -12,7 +12,7 @@ TIMES_S = [0.0, 1.9, 1000.25]
 
 
 def times(a: Quaternion, b: Quaternion) -> Quaternion:
-    """a ⊗ b by vector algebra, not by the product's own four lines."""
+    """Return a ⊗ b with vector algebra, independent of the code in imud."""
     (aw, *u), (bw, *v) = a, b
     cross = (u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0])
     x, y, z = (aw * v[i] + bw * u[i] + cross[i] for i in range(3))

@@ -1,4 +1,4 @@
-"""Turns of axes, level and heading, checked against rotation matrices."""
+"""Rotations of axes, level and heading, compared with rotation matrices."""
 
 from math import pi, radians
 

@@ -1,4 +1,4 @@
-"""Noise has the strength that it states, comes from its seed, and leaves the attitude alone."""
+"""Noise has the declared strength, depends on its seed, and does not change the attitude."""
 
 from math import hypot
 from statistics import fmean, pstdev

@@ -1,4 +1,4 @@
-"""The simulated CANopen module against its own truth and against the manual, decoded by the product's codec."""
+"""The simulated CANopen device compared with its true values and the manual. imud's codec decodes its frames."""
 
 import itertools
 import math
@@ -125,7 +125,7 @@ def test_what_applies_at_once_and_what_after_a_restart() -> None:
     assert [can_id for can_id, _ in bench.heard] in ([0x188] * 2, [0x188] * 3)
     assert bench.module.node == 8
     bench.send(0x608, cia301.write_frame(0x2000, 0, b"\xff\0\0\0"))
-    assert bench.module.node == 8  # nothing was saved
+    assert bench.module.node == 8  # the setting was not saved
     assert bench.module.objects.settings == QUIET
 
     bench = CanopenBench()

@@ -1,4 +1,4 @@
-"""The simulated module on J1939 against its own truth and the manual's settings, decoded by the product's codec."""
+"""The simulated J1939 device compared with its true values and the manual. imud's codec decodes its frames."""
 
 import itertools
 import math
@@ -35,7 +35,7 @@ def made(**options: object) -> HipnucJ1939Module:
 
 
 def decoded(frames: Sequence[SentFrame], address: int = 8) -> list[tuple[Measurement, int]]:
-    """Measurements, each with its instant."""
+    """Return measurements with the time of each."""
     codec = HipnucJ1939Codec(Ledger(), HipnucJ1939Options(address=address))
     found: list[tuple[Measurement, int]] = []
     for frame in frames:
@@ -135,7 +135,7 @@ def test_four_modules_crystal_wire_and_the_next_frame() -> None:
 def test_what_is_set_read_back_saved_and_lost_at_a_restart() -> None:
     bench = J1939Host(made())
     bench.talk(lambda peer: commands.set_interval(peer, 0xFF37, 20))
-    bench.talk(lambda peer: commands.set_interval(peer, 0xFF4A, 500))  # switched on by it
+    bench.talk(lambda peer: commands.set_interval(peer, 0xFF4A, 500))  # this request enables the message
     counts = pgns(bench.wait(SECOND_NS))
     assert counts[0xFF34] == pytest.approx(100, abs=1)
     assert counts[0xFF37] == pytest.approx(50, abs=1)
@@ -176,7 +176,7 @@ def test_what_is_set_read_back_saved_and_lost_at_a_restart() -> None:
 
 
 def written_and_read(peer: J1939Node, register: int, value: int) -> RequestScript[int]:
-    """Write a register, which is acknowledged, and read it back."""
+    """Write a register, wait for the acknowledgement, and read the register."""
     acknowledged = yield commands.exchange(peer, register, commands.WRITE, value, "write")
     assert isinstance(acknowledged, Reply)
     return (yield from commands.read(peer, register))
@@ -269,7 +269,7 @@ def test_zero_and_directions_of_the_inclinometer() -> None:
 
 
 def test_the_time_of_day_starts_again_after_a_day() -> None:
-    """The module boots for a day and 5 s, and sends UTC each second of its own crystal."""
+    """The device runs for a day and 5 s. It sends UTC each second of its own crystal."""
     hardware = J1939Hardware(boot_ms=86_405_000, skew_ppm=0)
     module = HipnucJ1939Module(BEGIN_NS, J1939Settings(intervals_ms={codec.UTC: 1000}), hardware)
     frames = [f for f in module.advance(BEGIN_NS + 86_407 * SECOND_NS) if split(f.can_id).pgn == codec.UTC]

@@ -22,7 +22,7 @@ GAP_NS = 1_750_000
 
 
 class ModbusMaster:
-    """A line, and a master that has all the time it needs."""
+    """A bus with a master that is never late."""
 
     def __init__(self, *slaves: Slave, **more: bool | int) -> None:
         self.line = ModbusLine(BEGIN_NS, slaves, **more)  # type: ignore[arg-type]  # passed on

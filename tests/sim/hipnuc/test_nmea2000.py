@@ -1,4 +1,4 @@
-"""The simulated NMEA 2000 sensor against its own truth, decoded by the product's codec."""
+"""The simulated NMEA 2000 sensor compared with its true values. imud's codec decodes its frames."""
 
 import itertools
 

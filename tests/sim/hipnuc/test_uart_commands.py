@@ -1,4 +1,4 @@
-"""The simulated module answers, remembers, forgets and turns its axes as manual chapters 2 and 8 say."""
+"""The simulated device replies, saves and resets settings, and rotates its axes as in the manual (chapters 2, 8)."""
 
 from math import radians
 
@@ -140,7 +140,7 @@ def test_urfr_turns_vectors_and_attitude_after_save_and_reboot(mounting: command
         back = [sum(c * value for c, value in zip(row, new, strict=True)) for row in mounting.value]  # B = C · U
         assert back == pytest.approx(old, abs=1e-5)
     up = matrix_from_quat((after.quat_wxyz[0], *after.quat_wxyz[1:]))[2]  # type: ignore[arg-type]  # four floats
-    assert after.accel_g == pytest.approx(up, abs=1e-5)  # the attitude turned with the axes: force still points up
+    assert after.accel_g == pytest.approx(up, abs=1e-5)  # the attitude rotates with the axes: the force still points up
 
 
 @pytest.mark.manual("B 2.2.4 ATT RST 2", "B 2.2.4 ATT RST 5", "B 2.2.4 ATT RST 3", "B 2.2.4 YAW 1", "B 2.2.4 YAW 0")

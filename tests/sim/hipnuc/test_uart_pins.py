@@ -1,4 +1,4 @@
-"""Pins of the simulated module do what manual sections 1.2 and 2.2.4 say, in step with its frames."""
+"""Pins of the simulated device follow the manual, sections 1.2 and 2.2.4, in step with its frames."""
 
 from itertools import pairwise
 from math import degrees, radians
@@ -18,7 +18,7 @@ HIGH_NS = 80_000
 
 def pulses(edges: list[PinEdge], pin: Pin) -> list[tuple[PinEdge, PinEdge]]:
     mine = [edge for edge in edges if edge.pin is pin]
-    mine = mine[not mine[0].rising : len(mine) - mine[-1].rising]  # begun before or not over
+    mine = mine[not mine[0].rising : len(mine) - mine[-1].rising]  # without incomplete pulses at both ends
     assert [edge.rising for edge in mine] == [True, False] * (len(mine) // 2)
     return list(zip(mine[::2], mine[1::2], strict=True))
 
@@ -128,7 +128,7 @@ def test_alarm_follows_the_angles() -> None:
     assert bench.ask(alarm(AlarmAxis.Y, -5, 5, enabled=True).payload.decode().strip()) == ["OK"]
     edges = [edge for edge in run(bench, 20_000.0)[1] if edge.pin is Pin.ALARM]
     assert len(edges) > 4
-    level = edges.pop(0).rising  # it was out of range before the alarm was set
+    level = edges.pop(0).rising  # the angle was out of range before the alarm was set
     assert level
     for edge in edges:
         assert edge.rising is not level
@@ -136,7 +136,7 @@ def test_alarm_follows_the_angles() -> None:
         t_s = (edge.due_ns - BEGIN_NS) / NS_PER_S
         rolls = [degrees(motion.at(t_s - back_s).euler_rad[0]) for back_s in (0.0, 0.0101)]
         assert (abs(rolls[0]) > 5) is edge.rising
-        assert (abs(rolls[1]) > 5) is not edge.rising  # it looks every 10 ms
+        assert (abs(rolls[1]) > 5) is not edge.rising  # the device checks the angle every 10 ms
 
     bench = HipnucUartBench(ModuleSettings(alarm_y=AlarmSetting(-1, 1, True)), HIPNUC_STILL)
     run(bench, 100.0)
@@ -144,7 +144,7 @@ def test_alarm_follows_the_angles() -> None:
     assert [edge.rising for edge in bench.module.pins(bench.now_ns) if edge.pin is Pin.ALARM] == [False]
     bench = HipnucUartBench(ModuleSettings(alarm_y=AlarmSetting(-1, 1, True)), HIPNUC_STILL)
     edges = run(bench, 105.0)[1]
-    rise_ns = edges[-1].due_ns + 10 * NS_PER_MS  # no skew: SOUT falls every 10 ms, so here it is high or about to be
+    rise_ns = edges[-1].due_ns + 10 * NS_PER_MS  # without skew, SOUT falls every 10 ms: here it is high or rises soon
     bench.now_ns = rise_ns - 40_000
     bench.module.reboot(bench.now_ns)
     edges += bench.module.pins(bench.now_ns)
@@ -191,7 +191,7 @@ def test_a_trigger_is_answered_125_us_later_on_average() -> None:
     bench.wait(0.7)
     bench.module.mark(bench.now_ns)
     frame = bench.frames(3.0)[-1]
-    assert frame.word_1_2 == 1  # sampled 2 ms later, less 0.7: 0.3, 1.3, 2.3 …
+    assert frame.word_1_2 == 1  # the sample is 2 ms later; minus 0.7: 0.3, 1.3, 2.3 …
     bench = HipnucUartBench(FAST, HIPNUC_STILL)
     bench.module.reboot(bench.now_ns)
     bench.wait(100.0)

@@ -1,5 +1,4 @@
-"""Each interpretation of the manual as a behavior of the simulated device: rate, factory reset, flash, silence,
-refusals."""
+"""Each interpretation of the manual as a behavior of the simulated device: rate, factory reset, flash, refusals."""
 
 import pytest
 
@@ -27,7 +26,7 @@ def test_when_the_rate_changes(change: RateChange, rate_of_answer: int, rate_aft
     bench.wait(20.0)
     assert bench.module.baud == rate_afterwards
     bench.reboot()
-    assert bench.module.baud == 115_200  # it was not saved
+    assert bench.module.baud == 115_200  # the baud rate was not saved
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The calibration that a simulated module does by itself."""
+"""The magnetometer calibration that a simulated device runs without a command."""
 
 from math import pi
 
@@ -34,7 +34,7 @@ def test_one_turn_about_each_axis_is_enough() -> None:
     bench.wait(60_000)
     assert "MB=14.14, -2.08, -8.75" in bench.ask("LOG MAGCONFIG")
     bench.reboot()
-    assert "MB=14.14, -2.08, -8.75" in bench.ask("LOG MAGCONFIG")  # it has saved it by itself
+    assert "MB=14.14, -2.08, -8.75" in bench.ask("LOG MAGCONFIG")  # the device has saved it without a command
     for settings in (ModuleSettings(att_mode=0), ModuleSettings(att_mode=1, mag_calibration=False)):
         bench = HipnucUartBench(settings, HipnucHardware(motion=tumble(), hard_iron_t=HARD_IRON_T))
         bench.wait(30_000)

@@ -1,4 +1,4 @@
-"""The simulated module's time becomes UTC when PPS and RMC agree, as manual 1.2.1 says, and never falls back."""
+"""The simulated device changes to UTC when PPS and RMC match (manual 1.2.1), and never changes back."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -17,7 +17,7 @@ NO_UTC = 1 << 11
 
 
 class Receiver:
-    """A GNSS receiver wired to a module: a pulse at each full second, a sentence some time after it."""
+    """A GNSS receiver connected to a device. It sends a pulse at each full second, and a sentence some time later."""
 
     def __init__(self, hardware: HipnucHardware) -> None:
         self.module = HipnucModule(BEGIN_NS, ModuleSettings(), hardware)
@@ -25,13 +25,13 @@ class Receiver:
         self.begin_ns = BEGIN_NS + hardware.boot_ms * NS_PER_MS + 123_456
         """CLOCK_MONOTONIC at `second`."""
         self.frames: list[tuple[int, Hi91]] = []
-        """Time of sampling on UTC (ns), frame."""
+        """Pairs of (sampling time in UTC in ns, frame)."""
 
     def utc_ns(self, t_ns: int) -> int:
         return self.second * NS_PER_S + t_ns - self.begin_ns
 
     def go(self, seconds: int, *, pulse: bool = True, says: int | None = 0, late_ms: int = 150) -> None:
-        """Let seconds pass; `says`: how much the sentence's second is off, None for no sentence."""
+        """Let seconds pass. `says` is the error of the sentence in s; None for no sentence."""
         for _ in range(seconds):
             if pulse:
                 self.module.mark(self.begin_ns)
@@ -46,7 +46,7 @@ class Receiver:
 
     def advance(self) -> None:
         for burst in self.module.advance(self.begin_ns):
-            if burst.sample_ns is None:  # cut by a reboot
+            if burst.sample_ns is None:  # incomplete due to a restart
                 continue
             self.frames.append((self.utc_ns(burst.sample_ns), unpack_hi91(burst.data)))
 
@@ -54,7 +54,7 @@ class Receiver:
         return [(utc_ns, frame) for utc_ns, frame in self.frames if utc_ns >= (self.second - seconds) * NS_PER_S]
 
     def error_ms(self, modulus: int = 2**32, seconds: int = 1) -> list[float]:
-        """Truth less time told, over the last second or more."""
+        """Return the true time minus the time of the device, ms, over the last `seconds`."""
         half = modulus / 2
         return [
             (utc_ns / NS_PER_MS - frame.system_time_ms + half) % modulus - half for utc_ns, frame in self.last(seconds)

@@ -1,4 +1,4 @@
-"""The simulated IMU61x on CAN against its own truth, decoded by the product's codec."""
+"""The simulated IMU61x on CAN compared with its true values. imud's codec decodes its frames."""
 
 import itertools
 

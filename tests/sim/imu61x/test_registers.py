@@ -26,7 +26,7 @@ def device(**more: object) -> tuple[Imu61xRegisters, Clock]:
 
 
 def spoken(one: Imu61xRegisters, *words: int) -> list[int]:
-    """Each word in a selection of its own."""
+    """Return the replies to the words. Each word has its own activation of chip select."""
     return [int.from_bytes(miso, "big") for miso in one.spi([word.to_bytes(2, "big") for word in words])]
 
 
@@ -58,7 +58,7 @@ def test_windows_bursts_modes_and_a_restart() -> None:
     assert spoken(one, 0xFE01, 0x0600, 0x0E00, 0, 0)[3:] == [0xBB, 0]  # values are not in window 1
     one.spi([b"\xfe\x00"])
     spoken(one, 0x8644, 0x8D01)
-    assert (one.filter, one.extended) == (0xBB, 0)  # writes to window 1 need it open
+    assert (one.filter, one.extended) == (0xBB, 0)  # writes to window 1 need this window
 
     one, _ = device()
     whole = one.spi(spi.READ_STANDARD.sends)[0]

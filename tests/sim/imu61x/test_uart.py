@@ -1,4 +1,4 @@
-"""The simulated IMU61x against the manual: modes, rates, RAM and flash, restart, calibration states, the wire."""
+"""The simulated IMU61x compared with the manual: modes, rates, RAM and flash, restart, calibration, wire time."""
 
 import struct
 from dataclasses import replace
@@ -44,7 +44,7 @@ def parameter(far: Imu61xBench, which: Parameter) -> float:
 
 
 def test_the_frame_on_the_wire_by_the_offsets_of_table_4() -> None:
-    """The frame is taken apart without the codec: 312 roll 2° about Y, pitch -3° about X, yaw 40° at rest."""
+    """Decode the frame without the codec: 312 roll 2° about Y, pitch -3° about X, yaw 40° at rest."""
     module = Imu61xModule(BEGIN_NS, hardware=IMU61X_STILL)
     (burst,) = module.advance(BEGIN_NS + 517_000_000)
     data = burst.data
@@ -104,7 +104,7 @@ def test_command_mode_is_silent_but_for_replies() -> None:
 
 @pytest.mark.manual("A 1.3 timer")
 def test_listening_in_command_mode_the_full_wire_and_the_timer() -> None:
-    """Table 3 note 1: no more than 200 Hz at 115200; the wire carries 213."""
+    """Table 3 note 1: at most 200 Hz at 115200 baud. The serial port can transfer 213 frames per second."""
     far = imu61x_bench(answers_while_streaming=False)
     far.send(c.ask_status().payload + c.factory_reset().payload)
     assert not any(isinstance(event, ReplyFrame) for event in far.wait(500))
@@ -206,7 +206,7 @@ def calibration_status(far: Imu61xBench) -> int | None:
 
 
 def heard(far: Imu61xBench, request: Request, duration_ms: float) -> list[tuple[float, int]]:
-    """Send a request without waiting for it; when its acknowledgements come (ms) and their results."""
+    """Send a request without waiting. Return the times (ms) and the results of its acknowledgements."""
     far.send(request.payload)
     begun_ns = far.now_ns
     found = []
@@ -221,7 +221,7 @@ def heard(far: Imu61xBench, request: Request, duration_ms: float) -> list[tuple[
 def test_behaviour_of_the_variants() -> None:
     far = imu61x_bench(flash_ms=2000)
     far.send(c.save().payload)
-    assert len(far.samples(1990)) <= 1  # the frame that was on its way
+    assert len(far.samples(1990)) <= 1  # the frame that the device already sent
     ((at_ms, result),) = heard(far, c.ask_status(), 100)
     assert (at_ms < 30, result) == (True, 0)  # the device did not receive the status request
     assert len(far.samples(500)) >= 48

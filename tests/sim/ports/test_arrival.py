@@ -19,12 +19,12 @@ from imud.sim.ports.arrival import (
 
 
 def arrivals(profile: ArrivalProfile, rate_hz: float = 100, count: int = 2000, seed: int = 1) -> list[Arrival]:
-    """Arrivals at 921600 baud."""
+    """Return arrivals at 921600 baud."""
     return list(ArrivalModel(profile, rate_hz, seed).run(count))
 
 
 def one_way(a: Arrival) -> int:
-    """Arrival less wire time, against the truth."""
+    """Return the arrival time minus wire time and true time, ns."""
     return a.t_rx_ns - (a.size_bytes + a.trailing_bytes) * 10_850 - a.t_ns
 
 
@@ -33,7 +33,7 @@ def one_way(a: Arrival) -> int:
 def test_nothing_arrives_before_it_was_sent(profile: ArrivalProfile, rate_hz: float) -> None:
     got = arrivals(profile, rate_hz)
     assert len(got) == 2000
-    assert min(one_way(a) for a in got) >= -10_850  # trailing bytes are whole, the truth is not
+    assert min(one_way(a) for a in got) >= -10_850  # trailing bytes are whole bytes, the true value is not
     assert all(a.t_rx_ns <= b.t_rx_ns and a.t_ns < b.t_ns for a, b in pairwise(got))
 
 
@@ -70,7 +70,7 @@ def test_wires_timers_and_packets() -> None:
     ("profile", "newest_ms"), [(replace(USB_16MS, timer_ppm=0), 37), (USB_16MS_PACKET, 5)], ids=lambda p: str(p)[:40]
 )
 def test_a_late_read_has_what_further_rounds_of_the_timer_brought(profile: ArrivalProfile, newest_ms: int) -> None:
-    """The adapter handed over at 5 ms, the read is at 45 ms. A packet adapter begins no round before it has data."""
+    """The adapter delivers at 5 ms, and the read is at 45 ms. A packet adapter starts its timer only with data."""
     newest_ns = ArrivalModel(profile, 1000, 1)._newest_hand_over(5 * NS_PER_MS, 45 * NS_PER_MS)
     assert newest_ns == newest_ms * NS_PER_MS
 

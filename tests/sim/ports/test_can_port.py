@@ -1,4 +1,4 @@
-"""Several datagrams in one system call, as the frames of a simulated module leave."""
+"""Several datagrams in one system call, like the frames of a simulated device."""
 
 import errno
 import socket

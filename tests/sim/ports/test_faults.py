@@ -33,7 +33,7 @@ def test_what_was_not_hit_arrives_as_it_was_and_what_was_is_noted(kind: FaultKin
     for number, (before, after) in enumerate(passed(faults)):
         if number in hit(faults):
             assert after != before
-        elif kind not in (FaultKind.DELAY, FaultKind.UNPLUG):  # these two reach beyond their own burst
+        elif kind not in (FaultKind.DELAY, FaultKind.UNPLUG):  # DELAY and UNPLUG also affect later bursts
             assert after == before
     assert set(faults.counts) == {kind}
     assert (1 if kind is FaultKind.UNPLUG else 10) <= faults.counts[kind] <= 60
@@ -82,7 +82,7 @@ def test_the_ledger_of_a_codec_tells_the_same() -> None:
     events += codec.flush()
     untouched = 400 - len(hit(faults))
     measured = sum(isinstance(event, Measurement) for event in events)
-    survivable = faults.counts[FaultKind.INSERT]  # bytes inserted at a frame's very start do not harm it
+    survivable = faults.counts[FaultKind.INSERT]  # bytes inserted directly before a frame do not damage it
     assert ledger.closes()
     assert untouched <= ledger.frames_in_samples <= untouched + survivable
     assert measured >= untouched

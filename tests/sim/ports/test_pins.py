@@ -1,4 +1,4 @@
-"""Pins reach lines when they are due, lose what a fault loses, and the same with the same seed."""
+"""Pins change lines at the due time and lose the edges of a fault. The same seed gives the same edges."""
 
 from itertools import pairwise
 

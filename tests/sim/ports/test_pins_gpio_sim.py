@@ -1,4 +1,4 @@
-"""Files of gpio-sim lines: pins are written as the kernel wants, SIN is read by its rising edges."""
+"""Files of gpio-sim lines: output values in the format of the kernel, and rising edges of SIN."""
 
 from collections.abc import Callable
 from pathlib import Path

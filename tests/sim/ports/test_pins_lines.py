@@ -1,4 +1,4 @@
-"""Lines inside the process keep the contract of real ones."""
+"""Lines in memory fulfill the contract of real lines."""
 
 from collections.abc import Sequence
 
@@ -47,7 +47,7 @@ async def test_edges() -> None:
         found.extend(edges)
         calls.append(len(edges))
 
-    line.edge(1, True)  # no program has the line
+    line.edge(1, True)  # no program has requested the line
     line.open()
     line.edge(10, False)
     line.drain()

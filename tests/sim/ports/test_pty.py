@@ -1,4 +1,4 @@
-"""A module behind a real pseudo-terminal, stepped by hand: no clock, no waiting."""
+"""A simulated device behind a real pseudo-terminal, stepped by the test: no clock, no waiting."""
 
 import fcntl
 import io
@@ -25,7 +25,7 @@ QUICK = HipnucHardware(skew_ppm=0, boot_ms=0)
 
 
 class PluggedPort:
-    """A port, a program that may have it open, and the time."""
+    """A port, a program that can open it, and the time."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class PluggedPort:
             self.fd = -1
 
     def run(self, duration_ms: float) -> bytes:
-        """Let time pass from deadline to deadline; return what the program read."""
+        """Let time pass from deadline to deadline. Return the data that the program has read."""
         end_ns, got = self.now_ns + round(duration_ms * NS_PER_MS), b""
         while self.now_ns < end_ns:
             self.now_ns = min(self.port.next_ns(self.now_ns), end_ns)
@@ -112,7 +112,7 @@ def test_the_wrong_rate_is_garbage_both_ways(rig: PluggedPort) -> None:
     rig.run(50)
     assert rig.port.summary()["bursts_wrong_baud"] > 40
     set_baud(rig.fd, 115_200)
-    assert frames_of(rig.run(200)) == pytest.approx(20, abs=1)  # and the command was not understood
+    assert frames_of(rig.run(200)) == pytest.approx(20, abs=1)  # the device did not receive the command
 
 
 def test_baud_follows_save_and_reboot(rig: PluggedPort) -> None:
@@ -130,7 +130,7 @@ def test_with_no_reader_bytes_are_lost_and_counted(rig: PluggedPort) -> None:
     assert counted["bytes_written"] == 0
     assert counted["bytes_unheard"] == pytest.approx(99 * 82, abs=82)
     rig.open(115_200)
-    assert frames_of(rig.run(100)) == pytest.approx(10, abs=1)  # nothing old
+    assert frames_of(rig.run(100)) == pytest.approx(10, abs=1)  # no frames from before
     rig.close()
     before = rig.port.summary()["bytes_written"]
     rig.run(100)
@@ -172,7 +172,7 @@ def test_unplugging_takes_the_node_away_and_brings_it_back(rig: PluggedPort) -> 
     codec = DRIVER.make_codec(Ledger(), DRIVER.settings())
     (measurement, *_) = [event for event in codec.feed(rig.run(50)) if isinstance(event, Measurement)]
     assert measurement.dev_ticks is not None
-    assert measurement.dev_ticks < 100  # the module lost power
+    assert measurement.dev_ticks < 100  # the device has restarted
     counted = rig.port.summary()
     assert counted["unplugs"] == 1
     assert counted["bytes_written"] + counted["bytes_unheard"] == pytest.approx(counted["frames_sent"] * 82, abs=3 * 82)

@@ -17,7 +17,7 @@ RATES = DRIVER.baud_rates
 def test_what_ends_at_equal_near_and_other_rates_hear() -> None:
     for baud in RATES:
         assert heard(DATA, baud, baud) == heard(DATA, baud, round(baud * 1.02)) == DATA
-    assert heard(DATA, 104_000, 100_000) == DATA  # past the shortcut: 4 % is still within half a bit at bit 10
+    assert heard(DATA, 104_000, 100_000) == DATA  # a difference of 4 % is within half a bit at bit 10
     assert heard(DATA, 100_000, 104_000) == DATA
     assert heard(DATA, 115_200, 100_000) != DATA
     assert heard(DATA, 115_200, 0) == b""
@@ -30,9 +30,9 @@ def test_what_ends_at_equal_near_and_other_rates_hear() -> None:
 @pytest.mark.parametrize(
     ("data", "sent", "listening", "expected"),
     [
-        (b"\xff", 100, 200, b"\xfe"),  # start bit of two half bits: 0, then ones
-        (b"\x00", 100, 200, b"\x00"),  # nine zeros are eighteen: a break, then the line waits for idle
-        (b"\x55", 100, 200, b"\x66\xe6"),  # every bit twice; no stop bit at 9, idle at 10, next start at 12
+        (b"\xff", 100, 200, b"\xfe"),  # two half bits: a start bit, then ones
+        (b"\x00", 100, 200, b"\x00"),  # nine zeros become eighteen: a break, then the UART waits for idle
+        (b"\x55", 100, 200, b"\x66\xe6"),  # every bit twice; stop bit wrong at 9, idle at 10, next start at 12
         (b"\xff", 400, 100, b""),  # the start bit is shorter than half a bit: a glitch
     ],
 )
