@@ -52,7 +52,7 @@ class FileSettings(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         if self.repeat and self.speed == "maximum":
             raise ValueError("repeat: expected false at speed maximum, got true")
         if self.path == "/":
-            raise ValueError("this is no file")
+            raise ValueError("this is not a file")
 
 
 class OutSettings(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -186,7 +186,7 @@ def test_defaults() -> None:
         ("devices:\n  a:\n    port: /dev/ttyUSB0", '3:11: devices.a.port: expected keys and values, got "/dev/ttyUSB0"'),
         ("devices:\n  a:\n    file: {path: x, repeat: no}", "3:29: devices.a.file.repeat: expected true or false, or text in quotes, got no"),
         ("devices:\n  a:\n    file: {path: x, repeat: true, speed: maximum}", "3:29: devices.a.file.repeat: expected false at speed maximum, got true"),
-        ("devices:\n  a:\n    file: {path: /}", "3:11: devices.a.file: this is no file"),
+        ("devices:\n  a:\n    file: {path: /}", "3:11: devices.a.file: this is not a file"),
         ("devices:\n  a:\n    identify: 1\n    port: {port: x}", "3:15: devices.a.identify: expected true or false, got 1"),
         ("devices:\n  a: {driver: auto}", "2:3: devices.a: expected exactly one link (port, file), got none"),
         ("devices:\n  a:\n    port: {port: x}\n    file: {path: x}", "2:3: devices.a: expected exactly one link (port, file), got port and file"),

@@ -1,5 +1,4 @@
-"""Rules for every codec after every piece of input: the ledger balances, the memory is limited, the codec counts its
-events."""
+"""Rules for every codec after each input: the ledger balances, the memory is limited, all events are counted."""
 
 from collections.abc import Iterable, Sequence
 from math import isnan
@@ -15,9 +14,9 @@ from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 
 PENDING_BYTES_MAX: Final = 2048
-"""No protocol has frames above 1 KiB or lines above 256 characters."""
+"""Maximum number of pending bytes. Protocols have frames up to 1 KiB and lines up to 256 characters."""
 PENDING_FRAMES_MAX: Final = 16
-"""No sample is made of more CAN frames."""
+"""Maximum number of pending CAN frames. No sample needs more frames."""
 
 
 def untimed(events: Iterable[CodecEvent]) -> list[CodecEvent]:
@@ -29,7 +28,7 @@ def untimed(events: Iterable[CodecEvent]) -> list[CodecEvent]:
 
 
 def cut(data: bytes, random: Random) -> list[bytes]:
-    """`data` in parts of random sizes, from single bytes to all of it."""
+    """Return `data` in parts of random sizes, from single bytes to all bytes."""
     longest = random.choice((1, 3, 20, 100, 1000, len(data) + 1))
     parts: list[bytes] = []
     while data:
@@ -40,7 +39,7 @@ def cut(data: bytes, random: Random) -> list[bytes]:
 
 
 def feed_stream(codec: StreamCodec, parts: Iterable[bytes]) -> list[CodecEvent]:
-    """Feed `parts`, checking after each that the ledger closes and memory is bounded."""
+    """Feed `parts`. After each part, check that the ledger balances and that the memory is limited."""
     events: list[CodecEvent] = []
     fed = 0
     for part in parts:
@@ -59,7 +58,7 @@ def feed_stream(codec: StreamCodec, parts: Iterable[bytes]) -> list[CodecEvent]:
 
 
 def feed_frames(codec: CanCodec, frames: Iterable[CanFrame]) -> list[CodecEvent]:
-    """Feed frames, checking after each that the ledger closes and memory is bounded."""
+    """Feed frames. After each frame, check that the ledger balances and that the memory is limited."""
     events: list[CodecEvent] = []
     fed = 0
     for frame in frames:
@@ -74,7 +73,7 @@ def feed_frames(codec: CanCodec, frames: Iterable[CanFrame]) -> list[CodecEvent]
 
 
 def decode_polled(codec: PolledCodec, poll: int, data: bytes) -> Sequence[PolledEvent]:
-    """Take one transfer, checking that every byte is in the ledger and that it closes."""
+    """Decode one transfer. Check that the ledger counts every byte and balances."""
     ledger = codec.ledger
     before, bad = ledger.bytes_in, ledger.frames_bad()
     events = codec.decode(poll, data)
@@ -86,7 +85,7 @@ def decode_polled(codec: PolledCodec, poll: int, data: bytes) -> Sequence[Polled
 
 
 def check_closed(ledger: Ledger) -> None:
-    """Fail unless every byte and frame is accounted for, and no counter is negative."""
+    """Fail if the ledger does not count every byte and frame, or if a counter is negative."""
     book = ledger
     bytes_known = book.bytes_in_good_frames + book.bytes_in_bad_frames + book.bytes_skipped + book.bytes_pending
     frames_known = book.frames_in_samples + book.frames_in_replies + book.frames_ignored + book.frames_pending

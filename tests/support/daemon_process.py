@@ -1,4 +1,4 @@
-"""A real daemon in a process of its own, for tests that look at it from outside."""
+"""A real daemon in a process of its own, for tests from outside."""
 
 import signal
 import subprocess
@@ -21,7 +21,7 @@ LIMIT_S = 60.0
 
 
 def wait_until(condition: Callable[[], object], what: str, limit_s: float = LIMIT_S) -> None:
-    """Look again until the condition holds; for conditions in another process, which has no event to wait on."""
+    """Poll a condition of another process until it is true. Use it only if the process has no event to wait for."""
     end = monotonic() + limit_s
     while not condition():
         assert monotonic() < end, f"not within {limit_s} s: {what}"
@@ -61,7 +61,7 @@ def write_config(folder: Path, devices: Mapping[str, Any], **more: Any) -> Path:
         **more,
     }
     file = folder / "imud.yaml"
-    file.write_bytes(msgspec.json.encode(tree))  # JSON is YAML
+    file.write_bytes(msgspec.json.encode(tree))  # each JSON text is a YAML text
     return file
 
 
@@ -79,13 +79,13 @@ def running_daemon(
     python: Sequence[str] = ("-X", "dev", "-W", "error"),
     **more: Any,
 ) -> Iterator[RunningDaemon]:
-    """Start it, wait for its socket, stop it at the end and see that it ended well.
+    """Start a daemon, wait for its socket, stop it at the end, and check its exit status.
 
-    `python` are options of the interpreter; without them it is as fast as in life.
+    `python` contains options of the interpreter. Without them, the daemon is as fast as in normal operation.
     """
     file = write_config(folder, devices, **more)
     argv = [sys.executable, *python, "-m", "imud", "run", "--config", str(file)]
-    stale = inode_of(folder / "imud.sock")  # a daemon that was killed leaves its socket
+    stale = inode_of(folder / "imud.sock")  # a killed daemon does not remove its socket
     with (
         (folder / "log").open("w") as log,
         subprocess.Popen(argv, stderr=log, stdin=subprocess.DEVNULL, text=True) as process,

@@ -1,6 +1,7 @@
-"""Devices with all that came out of them, on links inside the process or real ones, in real or virtual time.
+"""Devices with all their outputs, on links in memory or real links, in real or simulated time.
 
-`DeviceRigs` has what devices of one daemon share; `running` has them at work until the end of a block.
+`DeviceRigs` contains the common parts of the devices of one daemon. `running` runs the devices until the end of a
+block.
 """
 
 import asyncio
@@ -37,7 +38,7 @@ LIMIT_S = 60.0
 """Deadline of a wait, s. A loaded host delays a real device; virtual time does not wait."""
 STEP_S = 0.002
 TURN_S = 0.0005
-"""Pause between two looks at a condition, s: timers have their turn, also in virtual time."""
+"""Pause between two polls of a condition, s. Timers run during the pause, also in simulated time."""
 
 
 class DeviceRig:
@@ -65,7 +66,7 @@ class DeviceRig:
         return self.device.state
 
     def is_in(self, state: DeviceState) -> bool:
-        """Whether that is the state; a call, so that the type checker does not take it for constant."""
+        """Return whether the device is in this state. A call, so that the type checker does not assume a constant."""
         return self.device.state is state
 
     @property
@@ -83,7 +84,7 @@ class DeviceRig:
         return self.device.link
 
     def tick(self, ahead_ns: int = 0) -> None:
-        """Let the device look at its state, as if so much later."""
+        """Call `tick` of the device with the present time plus `ahead_ns`."""
         self.device.tick(self.now_ns() + ahead_ns)
 
     async def until(
@@ -95,7 +96,7 @@ class DeviceRig:
         step: Callable[[], object] = lambda: None,
         step_s: float = STEP_S,
     ) -> None:
-        """Tick until a condition holds, with `step` each time; the ledger closes all the while."""
+        """Call `tick` and `step` until a condition is true. Check that the ledger balances each time."""
         end_ns = self.now_ns() + int(limit_s * 1e9)
         while not holds():
             assert self.now_ns() < end_ns, f"not within {limit_s} s: {what}; {self.device.status()}"
@@ -105,14 +106,14 @@ class DeviceRig:
             assert self.ledger.closes(), self.ledger.snapshot()
 
     async def turn(self, holds: Callable[[], object]) -> None:
-        """Let the loop turn until a condition holds, without ticks."""
+        """Run the event loop without ticks until a condition is true."""
         end = asyncio.get_running_loop().time() + LIMIT_S
         while not holds():
             assert asyncio.get_running_loop().time() < end, f"does not come true: {self.device.status()}"
             await asyncio.sleep(TURN_S)
 
     async def until_samples(self, more: int, limit_s: float = LIMIT_S) -> None:
-        """Wait for more samples, and until the state is running."""
+        """Wait for `more` samples and for the state running."""
         wanted = len(self.samples) + more
         await self.until(
             lambda: len(self.samples) >= wanted and self.state is DeviceState.RUNNING, f"{more} more samples", limit_s
@@ -137,7 +138,7 @@ class DeviceOutput:
 
 
 class DeviceRigs:
-    """Makes devices that share time, buses and lines, and keeps apart what comes out of them."""
+    """Creates devices with common time, buses and lines, and keeps their outputs separate."""
 
     recording = bool(os.environ.get("IMUD_RECORD_RIGS"))
     """True: the rig records each device from start to end, and compares the replay with the live run.
@@ -155,7 +156,7 @@ class DeviceRigs:
         start_worker: StartWatchingWorker = BusThread,
         configured: Sequence[DeviceConfig] = (),
     ) -> None:
-        """Time, lines and workers are the real ones unless given; `configured` are all devices of the file."""
+        """Without arguments, use the real time, lines and workers. `configured` contains all devices of the file."""
         self.host = host or HostClock()
         self._host_tap = ClockObserver(self.host)
         self._configured = configured
@@ -181,7 +182,7 @@ class DeviceRigs:
 
     @asynccontextmanager
     async def at_work(self) -> AsyncIterator[list[DeviceRig]]:
-        """All devices at work; at the end they are closed, and their ledgers close."""
+        """Run all devices. Close them at the end and check that their ledgers balance."""
         mistakes: list[object] = []
         asyncio.get_running_loop().set_exception_handler(lambda _loop, context: mistakes.append(context))
         rigs = list(self.rigs.values())
@@ -219,7 +220,7 @@ class DeviceRigs:
 
 
 def is_replayed(rig: DeviceRig) -> bool:
-    """Whether a replay knows all drivers that the device had."""
+    """Return whether a replay supports all drivers of the device."""
     found = (record for one in rig.recorded for record in records_of(one) if record.kind == Kind.PATH)
     return {decode_object(record, PathRecord).driver for record in found} <= set(DRIVERS)
 
@@ -248,7 +249,7 @@ def device_config(name: str, driver: str, link: str, settings: dict[str, Any], *
 async def running(
     *configs: DeviceConfig, lines: LineFactory = GPIO_LINES, rigs: DeviceRigs | None = None
 ) -> AsyncIterator[list[DeviceRig]]:
-    """Devices as configured at work, in real time unless `rigs` are given; all closed at the end."""
+    """Run the configured devices, in real time if `rigs` is None. Close all devices at the end."""
     rigs = rigs or DeviceRigs(lines=lines)
     for config in configs:
         rigs.add(config)
@@ -261,7 +262,7 @@ def play(
     story: Callable[[list[DeviceRig]], Coroutine[Any, Any, None]],
     clock: VirtualClock | None = None,
 ) -> None:
-    """Run the devices of `rigs` during a story, in the time of `clock` if given; then no link in memory is open."""
+    """Run the devices of `rigs` during a story, in the time of `clock` if given. No memory link may stay open."""
 
     async def whole() -> None:
         async with rigs.at_work() as made:

@@ -1,9 +1,9 @@
-"""Event loops of tests: one for each test in real time, and one in virtual time, where hours pass in milliseconds.
+"""Event loops of tests: one loop per test in real time, and one in simulated time, where hours take milliseconds.
 
-    loop would sleep until t ──▶ the clock jumps to t ──▶ what is due then runs
+    the loop would sleep until t ──▶ the clock jumps to t ──▶ due callbacks run
 
-The rounds of a polled bus run in the loop as well (`LoopWorker`), where a thread runs them in life, so that nothing at
-all depends on how busy the machine is.
+The turns of a polled bus also run in the loop (`LoopWorker`), not in a thread as in the daemon. The result is therefore
+independent of the load of the host.
 """
 
 import asyncio
@@ -135,7 +135,7 @@ def virtual_buses(clock: VirtualClock) -> PolledBuses:
 
 
 def run_virtually(clock: VirtualClock, body: Coroutine[Any, Any, None]) -> None:
-    """Run to its end; nothing is left behind."""
+    """Run `body` to its end. Check that no task or descriptor remains."""
     with asyncio.Runner(loop_factory=lambda: VirtualLoop(clock)) as runner:
         runner.run(body)
         loop: Any = runner.get_loop()

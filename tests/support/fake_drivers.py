@@ -1,6 +1,9 @@
-"""Three small drivers for tests. `fake-uart`: frames of `5A A5`, u16 length, u16 CRC (XMODEM over all other bytes),
-payload; and lines of text. `fake-can`: a device of node n sends 0x180 + n, eight bytes, one sample per frame.
-`fake-module`: lines of text, and settings of every kind (`FakeModule` is the device)."""
+"""Three small drivers for tests.
+
+- `fake-uart`: frames of `5A A5`, u16 length, u16 CRC (XMODEM over all other bytes), payload; and lines of text.
+- `fake-can`: a device with node n sends 0x180 + n, eight bytes, one sample per frame.
+- `fake-module`: lines of text, and settings of every kind (`FakeModule` is the device).
+"""
 
 import asyncio
 import binascii
@@ -149,7 +152,7 @@ SYNC_ID: Final = 0x080
 
 
 class FakeCanSettings(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Which device, and whether it wants a SYNC."""
+    """Node of the device, and whether the device needs SYNC frames."""
 
     node: Annotated[int, Meta(ge=1, le=127)] = 1
     sync_ms: int = 0
@@ -192,7 +195,7 @@ def _renumber(target: Target, *, node: int) -> RequestScript[None]:
 
 
 def fake_can_driver(name: str = "fake-can", base: int = BASE) -> CanDriver:
-    """A row; another `base` makes it see devices that its codec does not understand."""
+    """Return a driver. With another `base`, it detects devices that its codec does not support."""
     return CanDriver(
         name=name,
         title="a fake",
@@ -226,7 +229,7 @@ def fake_can_frame(node: int, number: int = 0, t_ns: int = 0) -> CanFrame:
     return CanFrame(BASE + node, False, bytes([number, *bytes(7)]), t_ns)
 
 
-# --- a module with settings of its own --------------------------------------------------------------------------------
+# --- a device with settings of its own --------------------------------------------------------------------------------
 
 FACTORY: Final[Mapping[str, Any]] = {
     "mode": "6-axis",
@@ -237,12 +240,12 @@ FACTORY: Final[Mapping[str, Any]] = {
     "hours": 7,
     "baud": 115200,
 }
-"""Settings as delivered; `hours` can only be read, `secret` only be written."""
+"""Factory settings. `hours` is read-only, `secret` is write-only."""
 TOLD: Final = tuple(name for name in FACTORY if name != "secret")
 
 
 class LinesCodec:
-    """Lines that end with CR LF: `S` and ticks of 1 ms is a sample, everything else is text."""
+    """Codec of lines that end with CR LF. `S` and ticks of 1 ms is a sample. All other lines are text."""
 
     def __init__(self, ledger: Ledger) -> None:
         self.ledger = ledger
@@ -287,14 +290,14 @@ class FakeModule(MemoryLink):
         self.flash = dict(FACTORY)
         self.mounting = "level"
         self.refuses: set[str] = set()
-        """Names of settings that it answers with ERR."""
+        """Names of settings that the device answers with ERR."""
         self.forgets: set[str] = set()
-        """Names of settings that it confirms and does not keep."""
+        """Names of settings that the device confirms and does not store."""
         self.silent: set[str] = set()
         self.commands: list[str] = []
         self.saves = 0
         self.pauses_clock = False
-        """True: its clock starts again with each reply to GET."""
+        """Whether the device clock starts again with each reply to GET."""
         self._now_ns = now_ns
         self._boot_ns = now_ns()
 
@@ -349,7 +352,7 @@ class FakeModule(MemoryLink):
         elif name == "offset_deg":
             value = round(value, 2)
         if name == "baud" and name not in self.forgets:
-            self.flash[name] = value  # active after the restart, also without a save
+            self.flash[name] = value  # active after the restart, also if it was not saved
         elif name != "baud" and name not in self.forgets:
             self.set[name] = value
         return ["OK"]

@@ -30,11 +30,11 @@ def shared(name: str) -> Path:
 
 
 WRITE_BYTES_MAX: Final = 1 << 30
-"""Default bound of a capture being written: 1 GiB, 26 hours at 115200 baud."""
+"""Default size limit of a written capture: 1 GiB, 26 hours at 115200 baud."""
 
 
 class CaptureWriter:
-    """Writes a stamped capture, up to a bound. The file stays the caller's to flush and close."""
+    """Writes a capture with time stamps, up to a size limit. The caller flushes and closes the file."""
 
     def __init__(
         self,
@@ -45,12 +45,12 @@ class CaptureWriter:
         details: Mapping[str, str | int] | None = None,
         bytes_max: int = WRITE_BYTES_MAX,
     ) -> None:
-        """Writes the first line; empty and zero values are left out of it. Raises ValueError when it gets too long."""
+        """Write the first line without empty values and zeros. Raises ValueError if the line is too long."""
         self._file = file
         self._room = bytes_max
         self._newest_ns = -(1 << 63)
         self.bytes_refused = 0
-        """Bytes that were not written because the bound was reached."""
+        """Number of bytes that were not written because of the size limit."""
         values: dict[str, str | int] = {"driver": driver, "baud": baud, **(details or {})}
         pairs = [f"{key}={quote(str(value), safe='')}" for key, value in values.items() if value not in ("", 0)]
         header = MAGIC + " ".join([VERSION, *pairs]).encode("ascii") + b"\n"
@@ -75,7 +75,7 @@ class CaptureWriter:
 
 
 def candump_line(frame: CanFrame, bus: str = "can0") -> str:
-    """A frame as a line of a log, with `t_rx_ns` as its wall-clock time. Raises ValueError for no classical frame."""
+    """Return a frame as a log line with the wall-clock time `t_rx_ns`. Raises ValueError for a non-classical frame."""
     most = EXTENDED_ID_MAX if frame.extended else STANDARD_ID_MAX
     if not 0 <= frame.can_id <= most or len(frame.data) > DATA_BYTES_MAX or frame.t_rx_ns < 0:
         raise ValueError(f"no classical CAN frame: {frame}")
@@ -90,7 +90,7 @@ FRAME_NS = 250_000
 
 
 def imu61x_log(indices: Iterable[int]) -> str:
-    """Samples of an IMU61x at rest, 100 a second by their index."""
+    """Return samples of an IMU61x at rest, 100 per second according to their index."""
     lines = []
     for index in indices:
         frames = encode_set(

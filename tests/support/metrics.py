@@ -1,4 +1,4 @@
-"""Status records with made-up but consistent numbers, and HTTP requests to the server under test."""
+"""Status records with invented, consistent values, and HTTP requests to the server under test."""
 
 import asyncio
 import socket
@@ -100,7 +100,7 @@ LIMIT_S = 60.0
 
 
 async def ask(port: int, path: str = "/metrics", method: str = "GET", headers: str = "") -> tuple[str, str, str]:
-    """Status line, head and body of one answer, until the server ends the connection."""
+    """Return status line, head and body of one reply, after the server has closed the connection."""
     async with asyncio.timeout(LIMIT_S):
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         writer.write(f"{method} {path} HTTP/1.1\r\nHost: x\r\n{headers}\r\n".encode())
@@ -112,7 +112,7 @@ async def ask(port: int, path: str = "/metrics", method: str = "GET", headers: s
 
 
 def read_all(connection: socket.socket) -> bytes:
-    """Until the far end closes; a connection reset counts as closed."""
+    """Read until the far end closes or resets the connection."""
     parts = []
     try:
         while part := connection.recv(65536):
@@ -123,7 +123,7 @@ def read_all(connection: socket.socket) -> bytes:
 
 
 def shown(prefix: str, snapshot: Snapshot) -> dict[str, float]:
-    """Values of the metrics whose names begin with `prefix`, by the rest of the name and the values of the labels."""
+    """Return the values of the metrics that start with `prefix`, by the rest of the name and the label values."""
     body = Renderer(pause=lambda: None).render(snapshot, "").body.decode()
     lines = [line for metric in text_string_to_metric_families(body) for line in metric.samples]
     return {

@@ -87,19 +87,19 @@ def session() -> list[str]:
                 argv = [sys.executable, "-m", "imud", *words.split(), "--socket", path]
                 done = subprocess.run(argv, capture_output=True, text=True, timeout=30, check=True)
                 said = done.stdout.replace(str(folder / "port"), PORT)
-                if words == "status":  # its lines end where the name of the port makes them end
+                if words == "status":  # the length of the port's name decides the line breaks
                     said = page(found)
                 lines += [f"$ imud {words}", *said.splitlines(), ""]
     return lines[:-1]
 
 
-# --- the error of time stamps -------------------------------------------------------------------------------------
+# --- time stamp errors ------------------------------------------------------------------------------------------------
 
 
 class Stamp(NamedTuple):
     t_s: float
     arrival_ms: float
-    """Arrival of its last byte - truth."""
+    """Arrival time of the last byte minus true time, ms."""
     off_ms: float
     error_ms: float
 
@@ -162,9 +162,9 @@ class Panel:
 
 
 def time_stamps(samples: Sequence[Stamp]) -> str:
-    """Arrivals above, the stamps that imud makes of them below, both against the truth."""
+    """Draw arrival times at the top and time stamps of imud at the bottom, both relative to the true time."""
     above, below = Panel(top=40, low_ms=0, high_ms=25, step_ms=5), Panel(top=300, low_ms=-4, high_ms=4, step_ms=2)
-    drawn = samples[::3]  # a file of 80 kB; not in step with the timer
+    drawn = samples[::3]  # a file of 80 kB; every third sample is not in step with the timer
     parts = [
         "<rect width='760' height='540' fill='#fff'/>",
         *above.axes("Arrival of a sample's last byte: 7 to 24 ms after the measurement"),
@@ -185,7 +185,7 @@ BODY_PANEL, MOUNTING_PANEL = (250, 275), (250, 260)
 
 
 def on_page(vector: Vector3, scale: float) -> tuple[float, float]:
-    """Place on the page of a vector in the body (x forward, y left, z up), seen from behind, right and above."""
+    """Return the place of a body vector (x forward, y left, z up) on the page, seen from behind, right and above."""
     x, y, z = vector
     return (
         scale * (x * FORWARD[0] + y * LEFT[0] + z * UP[0]),
@@ -219,7 +219,7 @@ def block(centre: tuple[float, float], mounting: Matrix3, size: Vector3, scale: 
             normal = [0.0, 0.0, 0.0]
             normal[axis] = side
             outward = matrix_times(mounting, (normal[0], normal[1], normal[2]))
-            if outward[0] * -0.55 + outward[1] * -0.55 + outward[2] * 0.6 > 0.01:  # towards the eye
+            if outward[0] * -0.55 + outward[1] * -0.55 + outward[2] * 0.6 > 0.01:  # towards the viewer
                 faces.append([corners[key] for key in _around(axis, side)])
     for face in faces:
         points = " ".join(f"{centre[0] + x:.1f},{centre[1] + y:.1f}" for x, y in face)
@@ -279,11 +279,11 @@ MOUNTINGS = (
     ("on its right side", "x", "-z", "y"),
     ("its x axis points up", "-z", "y", "x"),
 )
-"""Title and `axes` of a sensor whose own axes are x forward, y left, z up on its top."""
+"""Title and `axes` of a sensor. Its own axes are x forward, y left, z up on its top."""
 
 
 def frame_mountings() -> str:
-    """Sensors in a body that points to the upper right, with the axes that are printed on them."""
+    """Draw sensors with their printed axes in a body that points to the upper right."""
     per_row = 3
     rows = -(-len(MOUNTINGS) // per_row)
     width, height = MOUNTING_PANEL[0] * per_row, MOUNTING_PANEL[1] * rows

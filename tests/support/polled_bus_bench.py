@@ -25,7 +25,7 @@ TRANSFER_NS = 160_000
 
 
 class PolledBusBench:
-    """An SPI bus and an I2C bus, which the links of the configuration open, and the time."""
+    """An SPI bus and an I2C bus for the links of the configuration, and the time."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, clock: VirtualClock | None = None) -> None:
         self.clock = clock or VirtualClock()
@@ -33,11 +33,11 @@ class PolledBusBench:
         self.node = folder / "spidev0.0"
         self.node.touch()
         self.spi = InProcessSpi()
-        """A device is put on it by `spi.device = …`."""
+        """SPI bus. `spi.device = …` connects a device."""
         self.i2c = InProcessI2c({})
         self.lines = MemoryLines(self.clock.now_ns)
         self.before_next_time: Callable[[], None] | None = None
-        """What happens right before a device or its bus looks at the time again."""
+        """Function that runs directly before a device or its bus reads the time again."""
         monkeypatch.setattr("imud.links.spi.LINK", LinkType("spi", SpiOptions, make_polled=self._make_spi))
         monkeypatch.setattr("imud.links.i2c.LINK", LinkType("i2c", I2cOptions, make_polled=self._make_i2c))
 

@@ -1,6 +1,6 @@
-"""Pseudo-terminals as serial ports: with the far end in the test's hand, or a simulated RS-485 line behind it.
+"""Pseudo-terminals as serial ports. The test controls the far end, or a simulated RS-485 bus is connected to it.
 
-`ModbusBench` is such a line without a port, in virtual time: transfer scripts run on it.
+`ModbusBench` is such a bus without a port, in simulated time. Transfer scripts run on it.
 """
 
 import array
@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 NOBODY_UID = 65534
 SETTLED_S = 0.05
-"""The kernel moves bytes from one of a port's buffers to the next within some ms."""
+"""Time in which the kernel moves bytes from one buffer of a port to the next, s."""
 
 
 class PtyPort:
@@ -43,7 +43,7 @@ class PtyPort:
         os.set_blocking(self.master, False)
         self.path = os.ttyname(slave)
         self.slave = slave
-        """The near end, held open so that the port has a holder between a close and the next open."""
+        """The near end. It stays open, so that the port exists between a close and the next open."""
 
     def send(self, data: bytes) -> None:
         assert os.write(self.master, data) == len(data)
@@ -55,7 +55,7 @@ class PtyPort:
             return b""
 
     def fill(self) -> int:
-        """Write to the near end until the port has no room left; return how many zeros it took."""
+        """Write zeros to the near end until the port is full. Return their number."""
         os.set_blocking(self.slave, False)
         size, full_since_s = 0, time.monotonic()
         while time.monotonic() < full_since_s + SETTLED_S:
@@ -73,7 +73,7 @@ class PtyPort:
 
 
 def waiting_bytes(fd: int) -> int:
-    """Bytes that a read would give now (FIONREAD)."""
+    """Return the number of bytes that a read would return now (FIONREAD)."""
     size = array.array("i", [0])
     fcntl.ioctl(fd, termios.FIONREAD, size)
     return size[0]
@@ -107,7 +107,7 @@ def slave(address: int, *, baud: int = BAUD, serial: int = 0, **more: object) ->
 
 @contextmanager
 def wired(folder: Path, *slaves: Slave, echo: bool = False, chunk_bytes: int = 0) -> Iterator[tuple[Path, ModbusLine]]:
-    """The path of a port with these modules on its line."""
+    """Yield the path of a port with these devices on its bus."""
     line = ModbusLine(time.monotonic_ns(), slaves, echo=echo, chunk_bytes=chunk_bytes)
     with plugged(folder / "line", line) as path:
         yield path, line
@@ -115,7 +115,7 @@ def wired(folder: Path, *slaves: Slave, echo: bool = False, chunk_bytes: int = 0
 
 @contextmanager
 def plugged(path: Path, module: StreamModule) -> Iterator[Path]:
-    """The path of a port with this module behind it, in real time."""
+    """Yield the path of a port with this device behind it, in real time."""
     now_ns = time.monotonic_ns()
     node = PtyNode(path)
     port = SimulatedPort(module, node, Adapter(BARE_UART, now_ns))
@@ -146,7 +146,7 @@ def plugged(path: Path, module: StreamModule) -> Iterator[Path]:
         assert not failed, failed
 
 
-# --- without a port, in virtual time ----------------------------------------------------------------------------------
+# --- without a port, in simulated time --------------------------------------------------------------------------------
 
 REPLY_MS = 20
 LINE_BAUD = 115200
@@ -156,7 +156,7 @@ BEGIN_NS = 5 * NS_PER_S
 def wait_for_reply(
     line: ModbusLine, finder: ReplyFinder, baud: int, now_ns: int, end_ns: int
 ) -> tuple[bytes | None, int]:
-    """Play a line until a reply arrives, or until `end_ns`. Return the reply (None if it is missing) and the time."""
+    """Run a bus until a reply arrives, or until `end_ns`. Return the reply (None if it is missing) and the time."""
     while (next_ns := line.next_ns()) is not None and next_ns <= end_ns:
         now_ns = max(next_ns, now_ns)
         for burst in line.advance(now_ns):
@@ -168,7 +168,7 @@ def wait_for_reply(
 
 
 class ModbusBench:
-    """A line whose port has a rate of its own, and the address at which the script's device is."""
+    """A bus with a baud rate of its own, and the address of the script's device."""
 
     def __init__(self, *slaves: Slave, at: int = 7, baud: int = LINE_BAUD) -> None:
         self.line = ModbusLine(BEGIN_NS, slaves or [modbus_slave(7)])

@@ -1,4 +1,4 @@
-"""Shared memory in a folder of its own, written by a publisher whose clock and ledger the test moves."""
+"""Shared memory in a folder of its own. The test controls clock and ledger of the publisher."""
 
 import struct
 import zlib
@@ -48,7 +48,7 @@ TORN = {
     "whole, but of another round": _reseal(WHOLE, 2 + SLOTS),
     "never written": bytes(SLOT_BYTES),
 }
-"""Slots of sample 2 that a reader must refuse, by the kind of damage."""
+"""Damaged slots of sample 2 that a reader must reject, by the kind of damage."""
 
 
 class Board:
@@ -93,7 +93,7 @@ class Board:
         copy.rename(self.path)
 
     def poke(self, at: int, data: bytes) -> None:
-        """Overwrite bytes of the file, as a writer that was interrupted leaves them."""
+        """Overwrite bytes of the file, like an interrupted writer."""
         with self.path.open("r+b") as file:
             file.seek(at)
             file.write(data)

@@ -1,4 +1,4 @@
-"""Contract: A source of RMC sentences that the test gives, and a receiver of sentences that keeps them."""
+"""A source of RMC sentences from the test, and a receiver that stores sentences."""
 
 import asyncio
 from collections.abc import Callable

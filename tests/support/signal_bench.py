@@ -1,4 +1,4 @@
-"""Signals without hardware: the lines of one device in memory and virtual time; a gpiod 2 with the test's own chips."""
+"""GPIO lines without hardware: one device in memory and simulated time, and gpiod 2 with simulated chips."""
 
 import errno
 import os
@@ -20,7 +20,7 @@ DEVICE = "bow"
 
 
 class HandWorker:
-    """A `Worker` without a thread: the test calls `work`."""
+    """A `Worker` without a thread. The test calls `work`."""
 
     def __init__(self, _name: str, work: Round, failed: Callable[[BaseException], None]) -> None:
         self.work, self.failed = work, failed
@@ -65,7 +65,7 @@ class SignalBench:
 
 
 class FakeRequest:
-    """A requested line; `feed` is the kernel writing events."""
+    """A requested line. `feed` adds events like the kernel."""
 
     def __init__(self, settings: Any) -> None:
         self.settings = settings
@@ -121,7 +121,7 @@ class FakeGpiod:
 
 
 class FakeChip:
-    """A chip that is open."""
+    """An open chip."""
 
     def __init__(self, label: str, names: tuple[str, ...], holder: str) -> None:
         self._label, self._names, self._holder = label, names, holder

@@ -1,7 +1,7 @@
-"""Simulated modules in virtual time without a link: bytes and frames go in and out by calls, requests run as scripts.
+"""Simulated devices in simulated time without a link. Tests pass bytes and frames with calls, and run scripts.
 
-`HipnucUartBench`, `HipnucLine`, `CanopenBench` and `Imu61xBench` each hold a module and the host's end of its line;
-registers behind I2C and SPI are read by single transfers.
+`HipnucUartBench`, `HipnucLine`, `CanopenBench` and `Imu61xBench` contain a device and the host's end of its link.
+Single transfers read registers on I2C and SPI.
 """
 
 import struct
@@ -75,14 +75,14 @@ class SerialLine(Generic[M]):
         self.module = module
         self.baud = module.baud
         self.connected = True
-        """Whether the host's transmit line reaches the module."""
+        """Whether the host's transmit line is connected to the device."""
         self.ledger = ledger
         self.codec = codec
         self.session = offline_runner(ledger)
         self.asked: list[str] = []
 
     def wait(self, duration_ms: float) -> list[CodecEvent]:
-        """Let time pass; return what the host heard."""
+        """Let time pass. Return the events of the received bytes."""
         events: list[CodecEvent] = []
         end_ns = self.now_ns + round(duration_ms * NS_PER_MS)
         while self.now_ns < end_ns:
@@ -154,7 +154,7 @@ class HipnucUartBench:
         self.wait(self.module.hardware.boot_ms)
 
     def wait(self, duration_ms: float) -> list[Burst]:
-        """Let time pass; return what the module sent."""
+        """Let time pass. Return the bursts that the device has sent."""
         self.now_ns += round(duration_ms * NS_PER_MS)
         return self.module.advance(self.now_ns)
 
@@ -211,7 +211,7 @@ class CanBench:
         self.driver = driver
         self.bus: tuple[CanModule, ...] = (module, *others)
         self.settings = settings
-        """Settings of the driver, which scripts change when they follow the module."""
+        """Settings of the driver. Scripts change them when they follow the device."""
         self.codec: CanCodec = driver.make_codec(Ledger(), settings)
         self.session = offline_runner(self.codec.ledger)
         self.sent: list[tuple[int, bytes]] = []
@@ -268,7 +268,7 @@ class CanBench:
         return self.run_script(self.driver.device_settings.read(self.target()))
 
     def set_for_good(self, name: str, value: object) -> Written:
-        """Write a setting as the driver does, save it and restart the module."""
+        """Write a setting like the driver, save it and restart the device."""
         settings = self.driver.device_settings
         assert settings is not None
         write, save, restart = settings.table[name].write, settings.save, settings.restart
@@ -342,7 +342,7 @@ class Imu61xBench(SerialLine[Imu61xModule]):
         self.wait(hardware.boot_ms)
 
     def streams(self) -> bool:
-        """Whether samples come at the rate of the line, at the latest when the device has been quiet for 800 ms."""
+        """Return whether samples arrive at the maximum rate of the link, at the latest after 800 ms of silence."""
         self.samples(800)
         return len(self.samples(100)) >= 5
 
@@ -368,7 +368,7 @@ def imu61x_bench(settings: Imu61xSettings | None = None, **more: object) -> Imu6
 
 
 every_variant = pytest.mark.parametrize("variant", VARIANTS)
-"""Calls a test with the name of each variant that the manual leaves open."""
+"""Runs a test with the name of each variant that the manual does not define."""
 
 
 def variant_bench(variant: str, settings: Imu61xSettings | None = None, **more: object) -> Imu61xBench:
@@ -376,7 +376,7 @@ def variant_bench(variant: str, settings: Imu61xSettings | None = None, **more: 
 
 
 def done(variant: str) -> int:
-    """The result that means done, which the configuration must say of a variant."""
+    """Return the result for success. The configuration must specify it for a variant."""
     return VARIANTS[variant].result_done
 
 

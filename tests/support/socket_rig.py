@@ -1,4 +1,4 @@
-"""A socket server with two devices, in the test's event loop (`serving`) or in a thread (`daemon`), and a bare peer."""
+"""A socket server with two devices in the test's event loop (`serving`) or in a thread (`daemon`), and a client."""
 
 import asyncio
 import grp
@@ -139,7 +139,7 @@ def context(
 
 
 def set_rate(_target: Target, *, message: Literal["HI91", "HI92"], rate_hz: int) -> None:
-    """The action `output`."""
+    """Action `output`."""
 
 
 ACTIONS = {"output": Action("send at a rate", set_rate)}
@@ -154,7 +154,7 @@ CALIBRATIONS = {
     )
 }
 done_late = asyncio.Event()
-"""`wait` is done when this is set."""
+"""Event that ends the action `wait`."""
 
 
 class FakeControl:
@@ -187,7 +187,7 @@ class FakeControl:
         return False
 
     async def settings_report(self, *, fresh: bool) -> SettingsReport:
-        """One setting, which differs."""
+        """Return one setting that differs."""
         differences = {"mode": SettingDifference("9-axis", "6-axis")}
         status = SettingsStatus(
             SettingsState.DIFFER, OnDifference.REPORT, differences=differences, flash_writes=3,
@@ -211,7 +211,7 @@ class FakeControl:
 
 
 def run(body: Callable[[], Awaitable[T]]) -> T:
-    """Run a test's coroutine in a new loop, for a limited time."""
+    """Run a test's coroutine in a new event loop with a time limit."""
 
     strays: list[dict[str, Any]] = []
 
@@ -298,7 +298,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 
 class Daemon:
-    """Runs a server's work in the loop of its thread and waits for it."""
+    """Runs coroutines of a server in the event loop of its thread and waits for them."""
 
     def __init__(self, server: SocketServer) -> None:
         self.server = server
@@ -345,7 +345,7 @@ def daemon(directory: Path) -> Iterator[Daemon]:
 
 
 class Peer:
-    """One bare client. Messages come out as JSON objects or as slots. `run` closes it at its end."""
+    """A simple client that returns messages as JSON objects or slots. `run` closes it at its end."""
 
     def __init__(self, sock: socket.socket) -> None:
         self.sock = sock
@@ -379,7 +379,7 @@ class Peer:
         await asyncio.get_running_loop().sock_sendall(self.sock, data)
 
     async def ask(self, method: str, **params: object) -> dict[str, Any]:
-        """Send a request and return the reply, which must be the next message but for notifications."""
+        """Send a request and return the reply. Only notifications may arrive before it."""
         self.ids += 1
         request = {"jsonrpc": "2.0", "id": self.ids, "method": method, "params": params}
         await self.send(json.dumps(request).encode() + b"\n")
@@ -394,7 +394,7 @@ class Peer:
         return reply["result"]
 
     async def error(self, method: str, **params: object) -> tuple[int, str]:
-        """Send a request that must fail; code and message."""
+        """Send a request that must fail. Return code and message."""
         error = (await self.ask(method, **params))["error"]
         return error["code"], error["message"]
 
@@ -411,7 +411,7 @@ class Peer:
         return [await self.message() for _ in range(count)]
 
     async def body(self) -> bytes:
-        """The next line or frame body. Raises EOFError at the end."""
+        """Return the next line or frame body. Raises EOFError at the end."""
         while (body := self._take()) is None:
             data = await asyncio.get_running_loop().sock_recv(self.sock, 1 << 16)
             if not data:

@@ -1,6 +1,6 @@
-"""Decorators of tests that are coroutines: each test is the story that a bench plays.
+"""Decorators of tests that are coroutines. Each test is a story that a bench runs.
 
-`played` makes a bench for each test. `told` calls a function that plays a story. `in_bench` uses the fixture `bench`.
+`played` makes a bench for each test. `told` calls a function that runs a story. `in_bench` uses the fixture `bench`.
 """
 
 import inspect
@@ -14,7 +14,7 @@ Story = Coroutine[Any, Any, None]
 
 
 class Bench(Protocol):
-    """The surroundings of a test, which run its story in their own time."""
+    """The environment of a test. It runs the test's story in its own time."""
 
     def play(self, story: Callable[[], Story], /) -> object: ...
 
@@ -23,9 +23,9 @@ B = TypeVar("B", bound=Bench)
 
 
 def played(make: Callable[..., B]) -> Callable[[Callable[Concatenate[B, P], Story]], Callable[P, None]]:
-    """Play a test on the bench that `make` returns. The bench is the first argument of the test.
+    """Run a test on the bench that `make` returns. The bench is the first argument of the test.
 
-    `make` gets the fixtures and parameters of the test that have the names of its own parameters.
+    `make` receives the fixtures and parameters of the test with the names of its own parameters.
     """
     names = inspect.signature(make).parameters
 
@@ -66,7 +66,7 @@ def in_bench(test: Callable[P, Story]) -> Callable[P, None]:
 
 
 def _without_first_argument(run: Callable[P, None], test: Callable[..., Story]) -> Callable[P, None]:
-    """Give `run` the name and the marks of a test, and its arguments without the first: that is not a fixture."""
+    """Give `run` the name and the marks of a test, and its arguments without the first, which is not a fixture."""
     made = wraps(test)(run)
     del made.__wrapped__
     _, *rest = inspect.signature(test).parameters.values()

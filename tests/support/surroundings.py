@@ -39,9 +39,10 @@ os.setuid({uid})
 
 @contextmanager
 def python_as(uid: int, program: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
-    """A Python program of the user `uid`, without groups; killed at the end.
+    """Run a Python program as user `uid`, without groups. Kill it at the end.
 
-    It changes to that user after its imports: the interpreter may lie in a home directory that only its owner enters.
+    The program changes to this user after its imports, because the interpreter may be in a home directory of another
+    user.
     """
     lines = program.strip().splitlines()
     imports = list(takewhile(lambda line: not line or line.startswith(("import ", "from ")), lines))
@@ -58,7 +59,7 @@ def python_as(uid: int, program: str, *arguments: str) -> Iterator[subprocess.Po
 
 @contextmanager
 def pipe(*, full: bool = False) -> Iterator[tuple[int, int]]:
-    """Both ends of a pipe, the reader's first; filled if so wanted. The caller may close them."""
+    """Yield both ends of a pipe, the reading end first. `full` fills the pipe. The caller may close the ends."""
     reader, writer = os.pipe()
     if full:
         os.set_blocking(writer, False)
@@ -75,7 +76,7 @@ def pipe(*, full: bool = False) -> Iterator[tuple[int, int]]:
 
 
 def read_until(descriptor: int, end: bytes) -> bytes:
-    """Read until some text."""
+    """Read until the text `end`."""
     data = b""
     while end not in data:
         assert select.select([descriptor], [], [], 60)[0], data[-200:]
@@ -89,11 +90,11 @@ PORT_TRIES_MAX: Final = 100
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    """A port of 127.0.0.1 that nothing has, for a server that a test starts.
+    """Return an unused port of 127.0.0.1 for a server of a test.
 
-    It is below `net.ipv4.ip_local_port_range`. A port of that range may be given to any connection before the server
-    takes it, and a client that tries to reach it may be connected to itself (RFC 9293, section 3.5). Drawn at random,
-    so that tests that run at the same time do not meet on one.
+    The port is below `net.ipv4.ip_local_port_range`. The kernel may assign a port of that range to any connection
+    before the server uses it, and a client could connect to itself (RFC 9293, section 3.5). The port is random, so that
+    parallel tests use different ports.
     """
     above = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
     assert above > LOWEST_PORT + PORT_TRIES_MAX, "net.ipv4.ip_local_port_range leaves no ports for servers"
@@ -106,7 +107,7 @@ def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
 
 
 class Machine:
-    """A made-up machine: a file tree, the output of commands, the state of a daemon."""
+    """A simulated host: a file tree, the output of commands, the state of a daemon."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -128,7 +129,7 @@ class Machine:
         return file
 
     def configure(self, *devices: str, more: str = "") -> None:
-        """Write the configuration, of devices as YAML flow mappings: `bow: {driver: …}`."""
+        """Write the configuration with devices as YAML flow mappings: `bow: {driver: …}`."""
         lines = ["devices:" if devices else "devices: {}", *(f"  {device}" for device in devices)]
         self.write("/etc/imud.yaml", more + "\n".join(lines) + "\n")
 

@@ -1,4 +1,4 @@
-"""A device on a serial wire in virtual time, received by a UART at any baud rate.
+"""A device on a serial wire in simulated time, received by a UART at any baud rate.
 
 The model works bit by bit: 8N1 at the rate of the device, sampled by a UART at the rate of the host (start edge, still
 low half a bit later, then the middle of each bit). The UART delivers a byte with a wrong stop bit as sampled, as Linux
@@ -26,7 +26,7 @@ TimedByte = tuple[int, int]
 
 
 def levels(data: bytes) -> list[int]:
-    """The bits on the line, start and stop bits included, least significant first."""
+    """Return the bits on the wire with start and stop bits, least significant bit first."""
     return [bit for byte in data for bit in (0, *((byte >> place) & 1 for place in range(8)), 1)]
 
 
@@ -48,7 +48,7 @@ def received(data: bytes, device_baud: int, host_baud: int) -> tuple[TimedByte, 
     t_ns = 0.0
     while (at := bisect_left(falling, t_ns)) < len(falling):
         start_ns = falling[at]
-        if level(start_ns + host_ns / 2):  # a glitch, no start bit
+        if level(start_ns + host_ns / 2):  # a glitch, not a start bit
             t_ns = start_ns + host_ns / 2
             continue
         value = sum(level(start_ns + (1.5 + place) * host_ns) << place for place in range(8))
@@ -64,14 +64,14 @@ class FakeDevice:
     rate_hz: float
     phase_ns: int = 0
     poll_ns: int = NS_PER_MS
-    """The host sees bytes at multiples of this: 1 ms of a scheduler, 16 ms of a USB adapter."""
+    """Interval at which the host reads bytes, ns: 1 ms for a scheduler, 16 ms for a USB adapter."""
     reply: bytes = b""
     query: bytes = b""
     make_frame: Callable[[Random], bytes] | None = None
     """Frames that the device sends; None for the example frames of the driver."""
     noise: bytes = b""
     damage: float = 0.0
-    """Share of frames with one bit flipped."""
+    """Share of frames with one inverted bit."""
     random: Random = field(default_factory=lambda: Random(1))
     sent_to: list[tuple[int, bytes]] = field(default_factory=list)
 
@@ -120,7 +120,7 @@ class FakeDevice:
 
 
 def run_search(search: Search, device: FakeDevice, start_ns: int = 0) -> tuple[StreamFound | GaveUp, int, list[Listen]]:
-    """Run a search to its end in virtual time. Returns the result, how long it took (ns), and every Listen."""
+    """Run a search to its end in simulated time. Return the result, its duration (ns), and every Listen."""
     now_ns, visits = start_ns, []
     step: Step | None = search.start(now_ns)
     while isinstance(step, Listen):

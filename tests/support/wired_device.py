@@ -1,5 +1,7 @@
-"""Simulated modules wired to a device in virtual time: a HiPNUC module with pins, whose bytes and edges come in step,
-and the line of an IMU61x."""
+"""Simulated devices connected to a device of imud in simulated time: a HiPNUC device with pins, and an IMU61x.
+
+The bytes and edges of the HiPNUC device arrive in step.
+"""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
@@ -56,7 +58,7 @@ class WiredDevice:
         self.memory = MemoryLines(self.clock.now_ns)
         self.cut: set[Pin] = set()
         self.instants: dict[int, int] = {}
-        """Instant of measurement by device time (ms) of the frames that arrived."""
+        """Time of the measurement by device time (ms) of the received frames."""
         self.frames: list[int] = []
         self._config = DeviceConfig(
             "bow", "hipnuc-uart", None, identify, "memory", MemoryOptions(baud=BAUD), lines=lines, rmc=rmc
@@ -101,7 +103,7 @@ class WiredDevice:
     def events(self) -> list[Event]:
         return self.rig.events
 
-    # --- what a story may do -----------------------------------------------------------------------------------------
+    # --- actions of a story -------------------------------------------------------------------------------------------
 
     async def wait(self, seconds: float) -> list[Sample]:
         before = len(self.samples)
@@ -127,10 +129,10 @@ class WiredDevice:
         self.source.sentences += 1
         self.source.give(build(unix_s * NS_PER_S), self.clock.now_ns())
 
-    # --- what is known of the truth ----------------------------------------------------------------------------------
+    # --- true values --------------------------------------------------------------------------------------------------
 
     def instant(self, sample: Sample) -> int:
-        """When it was measured, while the module's time runs from its power-on."""
+        """Return the time of the measurement, while the device time counts from power-on."""
         assert sample.t_dev_ns is not None
         return self.instants[sample.t_dev_ns // NS_PER_MS]
 
@@ -141,7 +143,7 @@ class WiredDevice:
     def of_kind(self, kind: EventKind) -> list[Event]:
         return [event for event in self.events if event.kind is kind]
 
-    # --- the machinery -----------------------------------------------------------------------------------------------
+    # --- implementation -----------------------------------------------------------------------------------------------
 
     def run_module(self) -> None:
         if self._timer is not None:
@@ -192,7 +194,7 @@ class WiredDevice:
             await asyncio.sleep(TICK_S)
 
 
-# --- a module on a line of which both ends have a rate ----------------------------------------------------------------
+# --- a device on a link with a baud rate at both ends -----------------------------------------------------------------
 
 
 class LinkedModule(MemoryLink):
@@ -261,7 +263,7 @@ class LinkedDevice:
 
 
 def play_on_line(line: "LinkedModule | Imu61xLine", rigs: DeviceRigs, story: Callable[[], Awaitable[None]]) -> None:
-    """Run the devices during a story, while the line carries; at the end their ledgers close."""
+    """Run the devices during a story while the link transfers data. Check at the end that their ledgers balance."""
 
     async def both() -> None:
         carrying = asyncio.create_task(line.carry())
@@ -281,7 +283,7 @@ LINE_STEP_S = 0.001
 
 
 class Imu61xLine(MemoryLink):
-    """A line in virtual time with a device at its far end; `carry` must run."""
+    """A link in simulated time with a device at its far end. `carry` must run."""
 
     def __init__(self, settings: MemoryOptions, module: Imu61xModule, clock: VirtualClock) -> None:
         super().__init__(settings)
