@@ -19,8 +19,8 @@ SHORT = (
     "nested", "empty-lines", "field-orders", "rates", "statuses", "watch-unread", "connects", "event-storm", "scrapes",
 )  # fmt: skip
 """Kinds of hostile clients in the short form, one kind for each part of the daemon."""
-MANY_DEVICES = 100
-HANG_UPS_S = 0.005
+MANY_DEVICES = 100  # devices in the attacks with a large daemon
+HANG_UPS_S = 0.005  # time between two SIGHUP
 STARVE_S, STARVE_SEED = 4.0, 5
 """Duration of the attack, s, and seed of the stops. The second stop takes 2 s, more than a port can buffer."""
 LINE_BYTES = 512

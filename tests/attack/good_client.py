@@ -18,7 +18,7 @@ from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.model.units import NS_PER_MS
 from tests.attack.hostile import become
 
-ASK_S = 0.01
+ASK_S = 0.01  # interval of poll requests
 
 
 @dataclass

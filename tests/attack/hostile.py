@@ -18,7 +18,7 @@ from enum import Enum, auto
 
 from imud.model.sample import SAMPLE_FIELDS
 
-RECONNECTS_PER_S = 200
+RECONNECTS_PER_S = 200  # limit of each process
 LOOPBACK = "127.0.0.1"
 
 

@@ -17,10 +17,10 @@ from imud.model.errors import ServerError
 from tests.attack.shared_memory import DEVICES
 from tests.attack.stage import SLOTS, AttackedDaemon
 
-PRIVATE_MODE: Final = 0o755
-STICKY_MODE: Final = 0o1777
-OTHER_SLOTS: Final = 2 * SLOTS
-READ_S: Final = 0.02
+PRIVATE_MODE: Final = 0o755  # like /run/imud/shm
+STICKY_MODE: Final = 0o1777  # like /dev/shm
+OTHER_SLOTS: Final = 2 * SLOTS  # another size, so that the daemon creates the rings again
+READ_S: Final = 0.02  # interval of reads
 SETTLE_S: Final = 0.3
 """Time until new rings contain samples and a heartbeat, s."""
 REMADE_MISSED_MAX: Final = 500

@@ -24,7 +24,7 @@ DEVICES: Final = ("a", "bow", "demo", "imu", "imu0", "stern")
 SLOTS: Final = 64
 HELD_MAX: Final = 64
 """Maximum number of descriptors that the attacker keeps open, with their locks."""
-FILLER_BYTES: Final = 1 << 20
+FILLER_BYTES: Final = 1 << 20  # size of a filler file
 FILLERS: Final = 8
 
 

@@ -34,15 +34,15 @@ READ_GID, CONTROL_GID = 65_534, 1
 RATE_HZ = 1000
 PRIORITY = 10
 """Real-time priority, above programs with the lowest priority. With an equal priority, turns would take 100 ms."""
-SETTLE_S = 3.0
+SETTLE_S = 3.0  # time before the first figures, s
 IDLE_DEVICES = 3
-REPLUG_LIMIT_S = 5.0
+REPLUG_LIMIT_S = 5.0  # time to open a device again
 CLIENTS_MAX = 320
 """Maximum number of clients: 256 hostile clients and the reserved places."""
 FDS_MAX = 16_384
 PIPE_BYTES = 4096
 """Minimum size of a pipe, bytes. The log is full soon."""
-FILL_S = 0.2
+FILL_S = 0.2  # time until the reader has processed its last data, s
 SLOTS = 1024
 """Slots of a ring, 256 KiB of memory: some attacks use a hundred devices."""
 LOST_SETTLE_S = 1.0
@@ -53,7 +53,7 @@ user."""
 LOG_SPOILT = b"the old configuration stays active"
 LOG_FILLER = b"-" * 63
 LOG_EXPECTED = (b"no byte arrives on", LOG_SPOILT, LOG_FILLER, b" is gone (hung up)")
-PROBLEMS = 20
+PROBLEMS = 20  # errors in the spoilt configuration
 
 
 class Scheduling(Enum):

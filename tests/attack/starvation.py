@@ -12,7 +12,7 @@ from typing import Final
 STOPS_S: Final = (0.05, 0.2, 0.7, 2.0)
 """Durations of the stops, s: shorter and longer than the buffer of a terminal lasts at 1 kHz (50 ms) and than the
 maximum delay of a frame (500 ms)."""
-BETWEEN_S: Final = (0.02, 0.3, 1.0)
+BETWEEN_S: Final = (0.02, 0.3, 1.0)  # time between two stops, s
 HOG: Final = "while True: pass"
 
 

@@ -18,10 +18,10 @@ from imud.model.sample import Measurement
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from imud.sim.ports.arrival import Arrival, ArrivalModel, ArrivalProfile
 
-SECONDS: Final = 120
+SECONDS: Final = 120  # duration of a cell
 WakeLaw = Callable[[Random, float], float]
 """Function from a generator and the host time, ns, to the wake-up time of a read above the host's minimum, ns."""
-STAMP_MODULUS: Final = 8192
+STAMP_MODULUS: Final = 8192  # counter of HI92: 13 bits, ms
 
 
 # --- machines -------------------------------------------------------------------------------------------------------
@@ -101,7 +101,7 @@ class Link:
 UART: Final = Link("uart")
 USB_1: Final = Link("usb-1ms", timer_ns=NS_PER_MS)
 USB_16: Final = Link("usb-16ms", timer_ns=16 * NS_PER_MS)
-FT232: Final = Link("ft232-16ms", timer_ns=16 * NS_PER_MS, packet_bytes=62)
+FT232: Final = Link("ft232-16ms", timer_ns=16 * NS_PER_MS, packet_bytes=62)  # sends a packet after 62 bytes
 FRAMES: Final = Link("usb-frames", 0, timer_ns=NS_PER_MS)
 """A device with a USB interface of its own. The host polls it in USB frames of 1 ms, and no serial wire exists."""
 CAN: Final = Link("can", 0)

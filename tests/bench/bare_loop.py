@@ -17,9 +17,9 @@ import msgspec
 
 from imud.drivers.hipnuc.uart.codec import encode_hi91  # noqa: F401 - same start-up cost as imud
 
-HEAD = struct.Struct("<2sHH")
-BODY = struct.Struct("<BHbfI16f")
-OUT = struct.Struct("<IQqqqqQIIIHBx3d3d3d4d3d2d2d32x")
+HEAD = struct.Struct("<2sHH")  # HiPNUC header: sync, length, CRC
+BODY = struct.Struct("<BHbfI16f")  # payload of an HI91 frame
+OUT = struct.Struct("<IQqqqqQIIIHBx3d3d3d4d3d2d2d32x")  # length prefix and slot of imud's binary encoding
 JSON = msgspec.json.Encoder()
 
 

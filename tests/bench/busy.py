@@ -49,7 +49,7 @@ while True:
 """
 LOCK = "import ctypes; ctypes.CDLL(None).mlockall(3)"
 DAEMON = "import os, runpy; os.setsid(); runpy.run_module('imud', run_name='__main__')"
-FIFO_OF_OTHERS = 40
+FIFO_OF_OTHERS = 40  # real-time priority of writer and reader, above imud's 10
 ROUNDS = 3
 
 

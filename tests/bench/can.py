@@ -21,11 +21,11 @@ from imud.links.socketcan import BATCH_FRAMES, FrameReader
 from tests.bench.rows import Row, at_least
 
 BUS = "vcanbench"
-BATCHES = {"one at a time": 1, "ten waiting": 10, "a batch waiting": BATCH_FRAMES}
-FRAMES = 6000
-RATIOS_REACHED = {1: 2.0, BATCH_FRAMES: 4.0}
+BATCHES = {"one at a time": 1, "ten waiting": 10, "a batch waiting": BATCH_FRAMES}  # frames in the socket before a read
+FRAMES = 6000  # frames per batch size
+RATIOS_REACHED = {1: 2.0, BATCH_FRAMES: 4.0}  # goals: python-can / imud by batch size
 ROOT = Path(__file__).parents[2]
-LAB_LIMIT_S = 600.0
+LAB_LIMIT_S = 600.0  # boot of the lab and the measurement
 
 
 def measure(interface: str, waiting: int, frames: int) -> tuple[float, float]:

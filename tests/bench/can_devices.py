@@ -25,9 +25,9 @@ from tests.lab.can_traffic import Module, fleet
 
 RATE_HZ = 100.0
 PERIOD_NS = round(1e9 / RATE_HZ)
-WAITING = {"read one by one": 1, "held for 50 ms": 5}
-LEARNING = 40
-CPU_SHARE_MOST = 0.5
+WAITING = {"read one by one": 1, "held for 50 ms": 5}  # frames per read, at 100 Hz
+LEARNING = 40  # samples before the measurement
+CPU_SHARE_MOST = 0.5  # goal: half of a CPU for nine devices
 
 
 class Device:

@@ -14,7 +14,7 @@ from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings, Output
 from imud.sim.sensor import StreamModule
 from tests.support.files import CaptureWriter
 
-BEGIN_NS: Final = 86_400 * NS_PER_S
+BEGIN_NS: Final = 86_400 * NS_PER_S  # a device that runs for a day
 BAUD: Final = 921_600
 
 

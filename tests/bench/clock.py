@@ -19,10 +19,10 @@ from imud.sim.ports.arrival import BARE_UART, LOADED, PROFILES, USB_1MS, USB_16M
 from tests.bench.clock_figures import ARRIVAL_HEAD, ArrivalFigures, Spread, keep
 from tests.bench.rows import Row, at_least, at_most
 
-TICK_NS = NS_PER_MS
-TICK_MODULUS = 1 << 32
-SETTLED_NS = 70 * NS_PER_S
-SECONDS = {1: 240, 100: 150, 200: 150, 400: 120, 1000: 120}
+TICK_NS = NS_PER_MS  # HI91 has a device time in ms
+TICK_MODULUS = 1 << 32  # u32, wraps after 49.7 days
+SETTLED_NS = 70 * NS_PER_S  # the fit and its error no longer change much
+SECONDS = {1: 240, 100: 150, 200: 150, 400: 120, 1000: 120}  # duration of a run by rate
 BAUD_OF_RATE = {1: 115_200, 100: 115_200, 200: 460_800, 400: 921_600, 1000: 921_600}
 CRYSTALS = {
     "0 ppm": Crystal(0.0),
@@ -138,6 +138,7 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
         yield at_least(f"{name}, share within 2 t_err", got.share, "", 0.95)
 
 
+# columns with a range over the crystals
 FIGURES = ("sigma_ns", "rms_ns", "p999_ns", "mean_t_err_ns")
 
 

@@ -18,7 +18,7 @@ LINE_HEAD: Final = (
     "| source | over | rate, Hz | σ, µs | mean, µs | p99.9, µs | mean t_err, µs | in 2 t_err | settling | by it |\n|"
     + "---|" * 10
 )
-WHOLE_FROM_US: Final = 10.0
+WHOLE_FROM_US: Final = 10.0  # larger values have no decimals
 ARRIVAL_COLUMNS: Final = (0, 1, 3, 5, 7)
 """Columns of docs/measurements.md: arrival, rate, rms, mean t_err, settling."""
 LINE_COLUMNS: Final = (0, 1, 2, 3, 4, 6)

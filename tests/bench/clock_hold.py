@@ -21,7 +21,7 @@ from tests.bench.clock import BAUD_OF_RATE, CRYSTALS, TICK_MODULUS, TICK_NS, Acc
 from tests.bench.rows import Row, at_most
 
 PROFILES = (BARE_UART, USB_1MS, USB_16MS, LOADED)
-HOLDS_MS = {1000: (10, 50), 200: (20, 50)}
+HOLDS_MS = {1000: (10, 50), 200: (20, 50)}  # by rate, Hz
 SECONDS = 150
 
 

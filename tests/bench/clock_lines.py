@@ -34,8 +34,8 @@ from tests.bench.line_runs import (
 )  # fmt: skip
 from tests.bench.rows import Row, at_least, at_most
 
-CHUNK = 500
-SETTLED_S = 20
+CHUNK = 500  # samples per measured chunk
+SETTLED_S = 20  # after this time, the clock uses the lines
 FAULTS = {
     "": LineFaults(),
     "1 % of edges lost": LineFaults(edge_loss=0.01),

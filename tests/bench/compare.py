@@ -22,7 +22,7 @@ from tests.bench.__main__ import OUTPUT, PARTS
 
 ROOT: Final = Path(__file__).parents[2]
 ROUNDS: Final = 3
-LIMIT_S: Final = 3600.0
+LIMIT_S: Final = 3600.0  # one part in one checkout
 
 
 class _Named(msgspec.Struct):

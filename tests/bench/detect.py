@@ -21,8 +21,8 @@ from imud.model.units import NS_PER_MS, NS_PER_S
 from tests.bench.rows import Row, at_most
 from tests.support.uart_wire import FakeDevice, run_search
 
-COLD_S = 2.0
-REMEMBERED_S = 0.3
+COLD_S = 2.0  # goal without a remembered driver
+REMEMBERED_S = 0.3  # goal with the remembered driver and baud rate
 # latency timers of the adapters: without an adapter, and an FT232 by default
 HOLDS_MS = (0, 16)
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 from tests.bench.rig import Load, Outcome, run
 from tests.bench.rows import Row, at_least, at_most
 
-CPU_LIMITS = {1: 1.6, 10: 1.5, 100: 2.0}
-P99_LIMIT = 2.0
+CPU_LIMITS = {1: 1.6, 10: 1.5, 100: 2.0}  # goals: imud / bare loop by number of clients
+P99_LIMIT = 2.0  # goal: p99 of imud / bare loop
 DEVICES_AIM = 32
-RSS_LIMIT_MB = 45.0
+RSS_LIMIT_MB = 45.0  # goal with one device
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:

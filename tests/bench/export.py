@@ -22,10 +22,10 @@ from imud.sim.imu61x.uart import Imu61xModule, Imu61xSettings
 from tests.bench.captures import BAUD, BEGIN_NS, Source, hi91_module, record
 from tests.bench.rows import Row, at_most
 
-SECONDS: Final = 3600
+SECONDS: Final = 3600  # recording of one hour
 QUICK_SECONDS: Final = 120
 RATE_HZ: Final = 400
-LIMIT_S: Final = 20.0
+LIMIT_S: Final = 20.0  # goal for one hour at 400 Hz
 FORMATS: Final = {
     "CSV": ("--to", "csv"),
     "MCAP, JSON": ("--to", "mcap", "--schema", "json"),

@@ -34,7 +34,7 @@ PROGRAM: Final = shutil.which("nats-server") or shutil.which("nats-server", path
 SERVERS: Final = 3
 OUTPUTS: Final = 3
 """Number of gateways that run the output `mqtt`."""
-LIMIT_S: Final = 60.0
+LIMIT_S: Final = 60.0  # start of the cluster, or the end of a spool
 ACCOUNT_WORDS: Final = ("p50_ms", "p99_ms", "max_ms", "duplicates", "missing", "open")
 
 

@@ -22,8 +22,8 @@ from imud.fleet.reader import VERSIONS, Fleet, FleetBatch
 from imud.host.threads import rare_garbage_collection
 from imud.model.units import NS_PER_MS
 
-END_S: Final = 180.0
-LOOK_S: Final = 0.05
+END_S: Final = 180.0  # wait for the last samples
+LOOK_S: Final = 0.05  # interval of polls
 
 
 class MeasuredStore:

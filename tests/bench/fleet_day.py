@@ -31,10 +31,11 @@ from tests.fleet.mosquitto import NO_MOSQUITTO, Collector, running_broker
 
 RATE_HZ: Final = 4
 """Sample rate, Hz. A message of statistics has the same size at each rate."""
-TOGETHER_S: Final = 60
-LIMIT_S: Final = 1800.0
-SPOOL_BYTES: Final = 4 << 30
+TOGETHER_S: Final = 60  # samples per transaction of the spool
+LIMIT_S: Final = 1800.0  # limit of the replay
+SPOOL_BYTES: Final = 4 << 30  # 4 GiB, larger than a day
 LIVE: Final = "bow"
+# configuration of the replayed devices and of the live device
 DAY: Final = {"whole": "none", "rate_hz": 1, "batch_s": 1}
 NOW: Final = {"whole": "slots", "rate_hz": None, "batch_s": 1}
 

@@ -33,10 +33,10 @@ from tests.support.surroundings import free_port
 
 CAUGHT_UP: Final = 30
 """Maximum number of messages in the spool of an up-to-date gateway: three transactions of ten messages."""
-LIMIT_S: Final = 300.0
+LIMIT_S: Final = 300.0  # time to catch up, or to fill the spool
 UP_S: Final = 3.0
 """Time between two restarts, s. mosquitto ignores SIGTERM during its start."""
-SMALL_MB: Final = 1.0
+SMALL_MB: Final = 1.0  # spool of kill-full
 
 
 class Scene:

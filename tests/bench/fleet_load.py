@@ -27,8 +27,8 @@ from tests.fleet.mosquitto import NO_MOSQUITTO, running_broker
 from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
 
 DEVICES: Final = ("bow", "mast")
-SAMPLES: Final = 100
-INTERVALS: Final = 10
+SAMPLES: Final = 100  # per second and device
+INTERVALS: Final = 10  # per message: rate_hz 10
 
 
 class SimulatedGateway:

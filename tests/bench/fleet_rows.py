@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from time import monotonic
 
-LOOK_S = 0.5
-LIMIT_S = 120.0
+LOOK_S = 0.5  # interval of queries
+LIMIT_S = 120.0  # wait for rows, and for the end of the process
 
 
 class RowCollector:

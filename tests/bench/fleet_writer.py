@@ -27,8 +27,8 @@ from imud.model.units import RAD_PER_DEG, STANDARD_GRAVITY_M_S2
 from imud.sim.ports.pty import sharpen_timers
 from tests.bench.writer import open_ptys, template
 
-BEGIN_NS: Final = 10_000_000
-SEED: Final = 25
+BEGIN_NS: Final = 10_000_000  # 10 ms until the first frame
+SEED: Final = 25  # noise of noisy_values
 VALUES: Final = 997
 """Number of different values before they repeat. A recording cannot compress this many values well."""
 # bytes of acceleration and rotation rate in an HI91 frame

@@ -17,9 +17,9 @@ from imud.sampling.clock import SampleClock
 from imud.sim.ports.arrival import BARE_UART, LOADED, USB_16MS, Arrival, ArrivalModel, ArrivalProfile, Crystal
 from tests.bench.clock import BAUD_OF_RATE, TICK_MODULUS, TICK_NS, Accuracy, Point, accuracy
 
-UTC_AHEAD_NS: Final = 1_795_000_000 * NS_PER_S
-DECODE_NS: Final = 20 * NS_PER_US
-BEGIN_NS: Final = 1000 * NS_PER_S
+UTC_AHEAD_NS: Final = 1_795_000_000 * NS_PER_S  # CLOCK_REALTIME minus CLOCK_MONOTONIC
+DECODE_NS: Final = 20 * NS_PER_US  # time from the arrival to the clock read
+BEGIN_NS: Final = 1000 * NS_PER_S  # steady time at the start
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,11 +12,12 @@ from statistics import median
 from tests.bench.rig import Load, Outcome, run
 from tests.bench.rows import Row, at_least, at_most
 
-CPU_AIM = 0.25
-DEVICES_AIM = 96
+CPU_AIM = 0.25  # goal: a quarter of the bare loop
+DEVICES_AIM = 96  # goal on one core
 LATENCY_MS = 10.0
+# loads with the goal CPU_AIM
 JUDGED = ("latency 10 ms", "at 100 Hz", "at 10 Hz, latency 20 ms")
-FLEETS = (48, 64, 80, 96, 112)
+FLEETS = (48, 64, 80, 96, 112)  # numbers of devices
 APART_FRAMES = 50
 """Number of frames between the starts of two devices. A clock needs more CPU time until its fit has settled. On a real
 gateway, imud also detects the devices one after another."""

@@ -15,11 +15,11 @@ from imud.contracts.lines import Edge, TriggerStamp
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from imud.sim.ports.arrival import Arrival, ArrivalModel
 
-PULSE_NS = 80 * NS_PER_US
-SIN_NS = 125 * NS_PER_US
-LATENCY_NS = 3 * NS_PER_US
-JITTER_NS = 4 * NS_PER_US
-STALL_SHARE = 0.01
+PULSE_NS = 80 * NS_PER_US  # SOUT pulse of HiPNUC devices
+SIN_NS = 125 * NS_PER_US  # from the trigger to the measurement
+LATENCY_NS = 3 * NS_PER_US  # minimum delay of the kernel's time stamp
+JITTER_NS = 4 * NS_PER_US  # mean of the exponential part
+STALL_SHARE = 0.01  # share of delayed edges on a busy host
 STALL_NS = 200 * NS_PER_US
 """Delay of the kernel's interrupt thread: minimum LATENCY_NS plus an exponential part with the mean JITTER_NS.
 STALL_SHARE of the edges on a busy host wait for another thread, with the mean STALL_NS."""

@@ -20,8 +20,8 @@ from tests.bench.line_model import (
     triggered,
 )  # fmt: skip
 
-UTC_OFFSET_NS = 1_790_000_000_123_456_789
-REFERENCE = UtcReference(UTC_OFFSET_NS, 20_000)
+UTC_OFFSET_NS = 1_790_000_000_123_456_789  # CLOCK_REALTIME minus CLOCK_MONOTONIC
+REFERENCE = UtcReference(UTC_OFFSET_NS, 20_000)  # with an error of 20 us
 
 
 class DatedSample(NamedTuple):

@@ -21,6 +21,7 @@ from tests.bench.rows import Row, at_least, at_most
 BAUD = 115200
 MODULES = 8
 REQUEST_BYTES, REPLY_BYTES = 8, 57
+# sum of wire time and silences, without the reply time of a device
 LIMIT_HZ = NS_PER_S / ((REQUEST_BYTES + REPLY_BYTES) * uart_byte_ns(BAUD) + 2 * frame_gap_ns(BAUD))
 
 

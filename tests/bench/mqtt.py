@@ -28,8 +28,8 @@ from tests.support.surroundings import free_port
 LOOP_RATIO_LIMIT: Final = 1.05
 """Maximum CPU ratio of the event loop's thread. With the output, the thread also puts each batch into a queue."""
 SAMPLES: Final[Mapping[str, object]] = {"whole": "slots", "rate_hz": 1}
-READ_BYTES: Final = 1000
-QUICK: Final = ("present", "gone", "stopped")
+READ_BYTES: Final = 1000  # 1 kB per second
+QUICK: Final = ("present", "gone", "stopped")  # brokers of the short form
 HOUR_S: Final = 3600
 Place = Callable[[Path], AbstractContextManager[int]]
 

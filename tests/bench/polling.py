@@ -30,10 +30,10 @@ from tests.bench.rows import Row, at_most
 from tests.support.device_rig import DeviceOutput
 
 RATE_HZ = 1000.0
-BURST_BYTES = 32
+BURST_BYTES = 32  # a standard burst: 16 words
 WIRE_S = BURST_BYTES * 8 / 2e6
 """Duration of a standard burst at 2 MHz, s."""
-PREPARED = 512
+PREPARED = 512  # number of prepared bursts
 
 
 class Stub:

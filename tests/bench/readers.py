@@ -22,10 +22,10 @@ import msgspec
 from imud.formats.slot import SLOT_BYTES
 from tests.bench.writer import FIRST_PA
 
-LENGTH = struct.Struct("<I")
+LENGTH = struct.Struct("<I")  # length prefix of binary messages
 SEQ_DEVICE_AND_PRESSURE = struct.Struct("<Q52xH138xd")
 """Members of a slot: sequence number, device id and pressure."""
-CHUNK = 1 << 18
+CHUNK = 1 << 18  # 256 KiB per receive
 PARTS = 5
 """Number of devices per watched device, with `--devices`."""
 

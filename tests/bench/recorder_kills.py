@@ -29,7 +29,7 @@ from imud.recording.player import Player
 from tests.support.files import CaptureWriter, hi91
 
 RATE_HZ = 1000
-SECONDS = 5
+SECONDS = 5  # length of the replayed capture
 
 
 def capture(file: Path) -> None:

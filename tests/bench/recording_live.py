@@ -27,8 +27,8 @@ from tests.support.daemon_process import running_daemon, wait_until
 
 RATE_HZ = 1000
 SECONDS = 30.0
-START_S = 60.0
-STILL_S = 1.0
+START_S = 60.0  # limit for the start and the end
+STILL_S = 1.0  # the device has stopped after this silence
 
 
 class Receiver:

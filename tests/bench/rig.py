@@ -19,9 +19,9 @@ from imud.client.connection import Client
 from imud.contracts.status import DeviceStatus
 
 CORES = sorted(os.sched_getaffinity(0))
-SERVER_CORE = {CORES[-1]}
-REST_CORES = set(CORES[:-1]) or SERVER_CORE
-START_LIMIT_S = 120.0
+SERVER_CORE = {CORES[-1]}  # the server has a core of its own
+REST_CORES = set(CORES[:-1]) or SERVER_CORE  # writer and readers use the other cores
+START_LIMIT_S = 120.0  # a busy host starts processes slowly
 END_S = 0.2
 """Time between the end of the CPU measurement and the last frame, s. The writer has to keep its deadlines, and this
 process may wake up late."""

@@ -54,21 +54,21 @@ DEADLINE_TOLERANCE: Final = 2
 """Tolerance in deadlines. The status may describe a moment shortly before or after the request."""
 REPLAYS: Final = 10
 REPLAY_HZ: Final = 10.0
-CLIENTS: Final = 20
-SCRAPE_S: Final = 5.0
+CLIENTS: Final = 20  # clients on the socket
+SCRAPE_S: Final = 5.0  # interval of Prometheus in the test
 MINUTE_S: Final = 60.0
-SETTLE_S: Final = 600.0
+SETTLE_S: Final = 600.0  # start-up is not part of the slope
 SLOPE_MIN_S: Final = 600.0
 """Minimum duration for a slope, s. The slope of a shorter run is mainly noise."""
-SLOPE_LIMIT_MB_PER_H: Final = 1.0
-GROWTH_LIMIT_MB: Final = 1.0
-BEHIND_AT_S: Final = 60.0
+SLOPE_LIMIT_MB_PER_H: Final = 1.0  # goal for a run with a slope
+GROWTH_LIMIT_MB: Final = 1.0  # goal for a shorter run
+BEHIND_AT_S: Final = 60.0  # start of the pause of the clients
 BEHIND_S: Final = 10.0
 """Time in which the clients do not read, s. The queues of some clients overflow in this time."""
-TAIL_S: Final = 1.0
+TAIL_S: Final = 1.0  # last samples on their way to the outputs
 END_LIMIT_S: Final = 20.0
 """Maximum time until the daemon has written its data and ended, s."""
-LOST_TOLERANCE: Final = 1
+LOST_TOLERANCE: Final = 1  # frames, if the pty rejected any
 
 
 @dataclass(frozen=True)

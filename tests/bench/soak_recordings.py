@@ -20,7 +20,7 @@ from imud.formats.records import Kind
 from imud.model.errors import ImudError
 from imud.recording.player import Player
 
-FILE_MB: Final = 1.0
+FILE_MB: Final = 1.0  # small, so that the budget removes files during the run
 KEEP_MB: Final = 3.0
 """Size limit of all files, MB: one file, and the data that the recorder writes until the file is read."""
 SCRAPE_LIMIT_S: Final = 5.0

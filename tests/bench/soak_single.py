@@ -8,7 +8,7 @@ from time import monotonic, sleep
 from tests.bench.rig import Load, ask, rss_mb, start_readers, start_server, start_writer
 
 SLOPE_LIMIT_MB_PER_H = 2.0
-SETTLE_S = 20.0
+SETTLE_S = 20.0  # start-up is not part of the slope
 
 
 def slope_mb_per_h(points: list[tuple[float, float]]) -> float:

@@ -21,12 +21,12 @@ from tests.bench.rig import Load, start_server
 from tests.bench.rows import Row, at_most
 
 ROOT: Final = Path(__file__).parents[2]
-STARTS: Final = 10
-LIMIT_MS: Final = 150.0
+STARTS: Final = 10  # the rows show their median
+LIMIT_MS: Final = 150.0  # goal for the elapsed time
 TIMEOUT_S: Final = 60.0
 NO_DAEMON: Final = 2
 """Exit status of `imud status` without a daemon."""
-NOT_STREAMING: Final = 1
+NOT_STREAMING: Final = 1  # exit status with a device without samples
 
 
 def start_rows(name: str, *arguments: str, status: int = 0) -> Iterator[Row]:

@@ -24,10 +24,10 @@ from tests.bench.rows import Row, at_most
 from tests.support.daemon_process import RunningDaemon, running_daemon, wait_until
 
 RATE_HZ = 1000
-LOOK_HZ = 20
+LOOK_HZ = 20  # display rate that a browser requests
 BROWSERS = (0, 1, 20)
-ACKNOWLEDGE_S = 0.25
-WARM_S = 3.0
+ACKNOWLEDGE_S = 0.25  # the page acknowledges at this interval
+WARM_S = 3.0  # time before the measurement
 SECONDS, QUICK_SECONDS = 8.0, 5.0
 ROUNDS, QUICK_ROUNDS = 5, 1
 

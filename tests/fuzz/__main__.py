@@ -28,7 +28,7 @@ from tests.fuzz.groups import all_names, load
 BUILD: Final = Path("build/fuzz")
 SECONDS: Final = 60.0
 JOBS: Final = 2
-NICE: Final = 10
+NICE: Final = 10  # fuzzing must not disturb other programs
 STARTING_S: Final = 600.0
 """Maximum time to import and instrument a target, s: 1 s of CPU time, which takes minutes on a busy host."""
 

@@ -13,7 +13,7 @@ from tests.fuzz.target import Target, check_printable
 WAITS: Final = 8
 """Number of `wait` calls, more than the packets of an input of `BYTES_MAX` need."""
 BYTES_MAX: Final = 256
-LIMIT_S: Final = 60.0
+LIMIT_S: Final = 60.0  # maximum time of a wait
 SETTINGS: Final = (MqttOptions(site="site", version="3.1.1"), MqttOptions(site="site", version="5"))
 
 

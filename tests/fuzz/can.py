@@ -16,10 +16,10 @@ from tests.fuzz.drivers import names_of, row, variants
 from tests.fuzz.target import FRAMES_BYTES_MAX, Target
 from tests.support.codec_invariants import check_closed, feed_frames, finite
 
-OWN = 240
-STEP_NS = 250_000
-PERIOD_STEPS = 40
-SETS = 12
+OWN = 240  # lower values select an identifier of the device
+STEP_NS = 250_000  # 250 us
+PERIOD_STEPS = 40  # 10 ms: the period of a sample at 100 Hz
+SETS = 12  # samples per seed
 EXTENDED_BIT = 1 << 31
 
 

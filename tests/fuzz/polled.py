@@ -16,8 +16,8 @@ from tests.fuzz.drivers import EXAMPLES, mend_reading, names_of, row, variants
 from tests.fuzz.target import FRAMES_BYTES_MAX, Target
 from tests.support.codec_invariants import check_closed, decode_polled
 
-CONVERSATION = 0x80
-FAILS = 0x40
+CONVERSATION = 0x80  # bit of the first byte: replies to a script
+FAILS = 0x40  # bit of a reply: the transfer fails
 TRANSFERS_MAX = 20
 """Maximum number of transfers of a script, for any replies."""
 

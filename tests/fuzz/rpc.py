@@ -24,7 +24,7 @@ from tests.support.socket_rig import DEVICES, EPOCH, NOW_NS, FakeControl, batch,
 
 T = TypeVar("T")
 
-ANSWER_S: Final = 5.0
+ANSWER_S: Final = 5.0  # limit for the replies of the server
 REPLIES_PER_LINE_MAX: Final = 1
 BLANK: Final = b" \t\r"
 """White space of JSON within a line (RFC 8259, section 2). `bytes.strip` also removes vertical tabs, for example."""

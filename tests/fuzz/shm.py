@@ -41,8 +41,8 @@ from imud.model.sample import Sample
 from tests.fuzz.target import Target, check_printable
 from tests.support.rings import DEVICE, START_NS, make_sample
 
-SLOTS: Final = 8
-NEWEST: Final = 20
+SLOTS: Final = 8  # slots of the ring
+NEWEST: Final = 20  # newest sequence number
 PID: Final = 4242
 BYTES: Final = HEADER_BYTES + SLOTS * SLOT_BYTES
 CUT_BYTES: Final = 64

@@ -11,7 +11,7 @@ from tests.fuzz.drivers import EXAMPLES, mender, names_of, row, spliced, variant
 from tests.fuzz.target import FRAMES_BYTES_MAX, Target
 from tests.support.codec_invariants import check_closed, check_counted, cut, feed_stream, untimed
 
-SPLICE_SHARE = 0.1
+SPLICE_SHARE = 0.1  # share of inputs with an inserted example frame
 
 
 def names() -> Sequence[str]:

@@ -11,7 +11,7 @@ from tests.fuzz import c_header, corpus
 from tests.fuzz.groups import all_names, load
 
 NAMES = all_names()
-CORPUS_BYTES_MAX = 2_000_000
+CORPUS_BYTES_MAX = 2_000_000  # the repository must stay small
 
 
 @pytest.mark.parametrize("name", NAMES)

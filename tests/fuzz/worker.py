@@ -20,8 +20,8 @@ from tests.fuzz.target import Target
 
 INPUT_S_MAX: Final = 120
 """Maximum time for one input, s. An input needs milliseconds, but a busy host gives a nice process little time."""
-MEMORY_MB_MAX: Final = 1024
-MEND_SHARE: Final = 0.5
+MEMORY_MB_MAX: Final = 1024  # libFuzzer ends a target with more memory
+MEND_SHARE: Final = 0.5  # share of inputs with corrected checksums
 
 
 class Atheris(Protocol):

@@ -24,7 +24,7 @@ from typing import Final
 from tests.bench.instructions import figures
 from tests.bench.instructions.measured import MARK, MARKS
 
-LIMIT_S: Final = 900.0
+LIMIT_S: Final = 900.0  # whole run under valgrind
 ROOT: Final = Path(__file__).parents[3]
 PASSED_ON: Final = ("PATH", "PYTHONPATH", "TMPDIR")
 """Environment variables for the measured program. imud removes all others, because their size moves the stack."""

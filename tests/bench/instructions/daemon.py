@@ -24,8 +24,8 @@ from tests.bench.instructions.module import BAUD, SETTLE_READS, Module, Read
 
 DRAIN_EVERY: Final = 16
 """Number of wake-ups between two reads of the clients. The socket buffers do not fill up in this time."""
-START_MS: Final = 1000
-CONNECT_MS: Final = 10
+START_MS: Final = 1000  # until the daemon has opened the port
+CONNECT_MS: Final = 10  # until the clients are subscribed
 BUFFER: Final = bytearray(1 << 20)
 
 

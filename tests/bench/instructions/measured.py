@@ -16,8 +16,8 @@ from typing import Any
 
 from tests.bench.instructions import virtual_time
 
-MARK = "getpgid"
-MARKS = 3
+MARK = "getpgid"  # system call that imud does not use
+MARKS = 3  # dumps per stage
 
 
 def mark() -> None:

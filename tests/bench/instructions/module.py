@@ -18,8 +18,8 @@ PAIR_STEP_MS: Final = 200
 """Time between two pairs, ms. After 64 s, the bins of the fit are 1 s wide, and the clock rarely computes a new fit."""
 SETTLE_READS: Final = 300
 """Number of reads after a gap, more than the 256 samples that the clock checks closely after a gap."""
-PPM: Final = 40
-DELAY_NS: Final = (20_000, 90_000, 35_000, 150_000, 60_000, 25_000, 110_000)
+PPM: Final = 40  # rate error of the device's crystal
+DELAY_NS: Final = (20_000, 90_000, 35_000, 150_000, 60_000, 25_000, 110_000)  # delays of arrivals, repeated
 HEADER_BYTES: Final = 6
 TIME_AT: Final = 8
 """Offset of the device time in an HI91 payload (u32, ms)."""

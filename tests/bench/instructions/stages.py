@@ -41,8 +41,8 @@ from tests.support.publisher_context import publisher_context
 Run = Callable[[int], None]
 
 READ_BYTES: Final = 4096
-WARM: Final = 200
-WARM_LEAST: Final = 20
+WARM: Final = 200  # operations before the count, for one frame per operation
+WARM_LEAST: Final = 20  # minimum for several frames per operation
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +130,7 @@ def _ahrs_single(total: int, _directory: str) -> Run:
     return _feeding(Imu61xCodec(Ledger()), _ahrs_frames(total))
 
 
-AHRS_BLOCK: Final = 75
+AHRS_BLOCK: Final = 75  # AHRS frames in about 4096 bytes
 
 
 def _ahrs_bulk(total: int, _directory: str) -> Run:
@@ -140,7 +140,7 @@ def _ahrs_bulk(total: int, _directory: str) -> Run:
 
 
 VECTOR: Final = (0.125, -0.25, 0.5)
-TPDO_IDS: Final = {1: 0x180, 2: 0x280, 3: 0x380, 4: 0x480, 6: 0x680, 7: 0x780}
+TPDO_IDS: Final = {1: 0x180, 2: 0x280, 3: 0x380, 4: 0x480, 6: 0x680, 7: 0x780}  # COB-IDs of node 0 by TPDO number
 
 
 def _imu61x_can(total: int, _directory: str) -> Run:

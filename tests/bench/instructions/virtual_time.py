@@ -11,7 +11,7 @@ from typing import Final
 from imud.model.units import NS_PER_S
 
 BEGIN_NS: Final = 1000 * NS_PER_S
-UTC_AHEAD_NS: Final = 1_795_000_000 * NS_PER_S
+UTC_AHEAD_NS: Final = 1_795_000_000 * NS_PER_S  # CLOCK_REALTIME minus CLOCK_MONOTONIC
 
 _ns = [BEGIN_NS, BEGIN_NS + UTC_AHEAD_NS]
 _by_clock = {time.CLOCK_MONOTONIC_RAW: BEGIN_NS, time.CLOCK_BOOTTIME: BEGIN_NS}
