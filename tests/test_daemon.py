@@ -188,10 +188,8 @@ def test_reload_changes_what_differs_and_keeps_the_rest(tmp_path: Path) -> None:
         stern.send(2)
         wait_until(lambda: samples(daemon, "stern") == 2, "samples of the new device")
         assert Ring(tmp_path / "imud.stern").newest_seq == 2
-        for place, newest in (
-            ("first", 5),
-            ("second", 7),
-        ):  # a new output receives the samples in place of the old output
+        # a new output receives the samples in place of the old output
+        for place, newest in (("first", 5), ("second", 7)):
             (tmp_path / place).mkdir(mode=0o755)
             ring = tmp_path / place / "imud.bow"
             reload(daemon, both, shm={"directory": str(tmp_path / place)})

@@ -126,9 +126,8 @@ class LogPipe:
     def stop_reading(self) -> None:
         """Stop reading and fill the socket, so that no later data fits into it."""
         self._reads.clear()
-        writer = os.open(
-            f"/proc/self/fd/{self.writer}", os.O_WRONLY | os.O_NONBLOCK
-        )  # the daemon's descriptor is blocking
+        # the daemon's descriptor is blocking
+        writer = os.open(f"/proc/self/fd/{self.writer}", os.O_WRONLY | os.O_NONBLOCK)
         try:
             end_s = monotonic() + FILL_S  # the reader processes its last data in one turn
             while monotonic() < end_s:

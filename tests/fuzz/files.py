@@ -104,9 +104,8 @@ def run_candump(data: bytes) -> None:
 
 def run_recording(data: bytes) -> None:
     """A reader accepts or rejects the blocks of a file and the records of a block. It counts every byte."""
-    reader = RecordingReader(
-        io.BytesIO(data), "a"
-    )  # a fuzzer cannot find the CRC of a block, so records are tested separately
+    # a fuzzer cannot find the CRC of a block, so records are tested separately
+    reader = RecordingReader(io.BytesIO(data), "a")
     for source in (reader, _records(data)):
         try:
             Player(lambda _batch: None).play(source)

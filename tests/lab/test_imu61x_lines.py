@@ -198,10 +198,8 @@ def test_edges_that_come_faster_than_reads_are_missed_and_counted(stepped: tuple
             rig.device.tick(monotonic_ns())
             polling = rig.device.status().polling
             assert polling is not None
-            lost, stale = (
-                rig.device.ledger.lost_queue,
-                polling.stale,
-            )  # a read before the edge makes the value stale at its edge
+            # a read before the edge makes the value stale at its edge
+            lost, stale = rig.device.ledger.lost_queue, polling.stale
             assert 0 < lost <= missed <= lost + stale
             assert numbers[-1] <= len(it.stamps_ns) <= numbers[-1] + stale
 

@@ -127,9 +127,8 @@ def test_a_drop_is_seen_after_reads_of_single_frames(wire: Wire) -> None:
     wire.receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 0)
     wire.send(1)
     assert wire.ids() == [(1, False)]
-    wire.sender.send(
-        pack_frame(2, False, b"") + bytes(4000)
-    )  # fills the buffer, and the reader truncates it to a frame
+    # fills the buffer, and the reader truncates it to a frame
+    wire.sender.send(pack_frame(2, False, b"") + bytes(4000))
     wire.send(3)
     assert wire.ids() == [(2, False)]
     wire.send(4)

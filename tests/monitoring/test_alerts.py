@@ -245,9 +245,8 @@ def test_every_alert_fires_and_clears(tmp_path: Path) -> None:
     print(table(fired, cleared, watcher, pace))
     for alert in watcher.texts.values():
         for text in alert.annotations.values():
-            assert "<" not in text, (
-                text
-            )  # Prometheus shows template errors with <error>, and missing values with <no value>
+            # Prometheus shows template errors with <error>, and missing values with <no value>
+            assert "<" not in text, text
 
 
 def wait_calm(prometheus: RealPrometheus) -> None:
