@@ -77,7 +77,7 @@ def main() -> int:
     measured: dict[Path, list[Figures]] = {}
     with checked_out(args.base) as base:
         for number in range(args.rounds):
-            # alternate the order: the second run of a round may find a warmer processor
+            # alternate the order, so that a drift of the load does not favor a checkout
             for tree in (base, ROOT) if number % 2 else (ROOT, base):
                 print(f"# round {number + 1}: {'here' if tree == ROOT else args.base}", flush=True)
                 measured.setdefault(tree, []).append(measure(tree, args.parts))

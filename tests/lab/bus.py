@@ -17,7 +17,7 @@ from typing import Generic, Self, TypeVar, cast
 
 from tests.lab import wire
 
-STOP_LIMIT_S = 10.0
+STOP_LIMIT_S = 10.0  # limit for the end of the thread
 OneTransfer = TypeVar("OneTransfer", wire.I2cTransfer, wire.SpiTransfer)
 
 

@@ -31,8 +31,8 @@ from tests.lab.can_phase import LOOP_S, Phased
 
 BURST_NS = 2_000_000
 AHEAD_NS = 300_000_000
-FRAMES_MAX = 256
-BEGIN_NS = 1_000_000_000
+FRAMES_MAX = 256  # frames per system call
+BEGIN_NS = 1_000_000_000  # time from the first line of standard input to the first sample
 LOOP_NS = round(LOOP_S * 1e9)
 INDEX = struct.Struct("<H")
 INDEX_AT = 8 + 6

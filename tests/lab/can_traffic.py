@@ -17,8 +17,8 @@ from imud.sim import CAN_SIMULATORS
 from imud.sim.physics import Truth
 from tests.lab.can_phase import LOOP_S, Phased
 
-GYRO_RAD_S: Final = 0.004
-ACCEL_M_S2: Final = 0.02
+GYRO_RAD_S: Final = 0.004  # tolerance of rotation rates
+ACCEL_M_S2: Final = 0.02  # tolerance of accelerations
 ANGLE_RAD: Final = 0.002
 """Tolerance of angles, rad: some counts of the coarsest protocol, less than the motion in 10 ms."""
 BEGIN_S: Final = 1.0

@@ -27,7 +27,7 @@ LIMIT_S = 60.0
 ALL_BYTES = bytes(range(256))
 QUIET_S = 0.5
 """Time without a byte after which a UART has delivered all bytes of the driver's FIFO probe, s."""
-TIOCGICOUNT = 0x545D
+TIOCGICOUNT = 0x545D  # ioctl for the counters of a UART
 COUNTERS = struct.Struct("=11i9i")
 COUNTERS_USED = {"rx": 4, "tx": 5, "frame": 6, "overrun": 7}
 """Offsets of counters in `struct serial_icounter_struct`."""

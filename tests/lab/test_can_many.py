@@ -14,10 +14,10 @@ from tests.lab.can_interface import CanInterface
 from tests.lab.can_traffic import Against, Module, fleet, traffic
 from tests.support.daemon_process import RunningDaemon, running_daemon
 
-SECONDS = float(os.environ.get("IMUD_LAB_SECONDS", "6"))
+SECONDS = float(os.environ.get("IMUD_LAB_SECONDS", "6"))  # duration of the measurement
 RATE_HZ = float(os.environ.get("IMUD_LAB_RATE_HZ", "20"))
 """Rate in whole hertz, with a period in whole milliseconds."""
-LATENCY_MS = float(os.environ.get("IMUD_LAB_LATENCY_MS", "50"))
+LATENCY_MS = float(os.environ.get("IMUD_LAB_LATENCY_MS", "50"))  # latency of the client
 LIMIT_S = 60.0
 ASK_S = 0.5
 EDGE_S = 0.5

@@ -24,7 +24,7 @@ from tests.support.event_loops import in_loop
 
 INTERRUPTS = Path("/proc/interrupts")
 LIMIT_S = 30
-TRIGGER_HZ = 10.0
+TRIGGER_HZ = 10.0  # slow enough for the emulated processor
 TRIGGERS = 20
 
 

@@ -17,7 +17,7 @@ from tests.lab.short_form import cases
 from tests.lab.wire import SpiTransfer
 from tests.support.device_rig import DeviceRig, device_config, running
 
-RESOLUTION_M_S2 = 0.02
+RESOLUTION_M_S2 = 0.02  # tolerance for the 16-bit registers
 PORTS = {"spi8": "/dev/spidev0.0", "spi16": "/dev/spidev1.0"}
 
 

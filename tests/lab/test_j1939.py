@@ -26,7 +26,7 @@ LIMIT_S = 30.0
 LEVEL = 100 + socket.CAN_J1939
 """SOL_CAN_J1939 of linux/can/j1939.h."""
 ALL = socket.J1939_NO_ADDR
-RAD_PER_COUNT = math.pi / 180_000
+RAD_PER_COUNT = math.pi / 180_000  # 0.001 degree per count
 
 
 @contextmanager

@@ -17,7 +17,7 @@ REQUEST = struct.Struct("=IIHHII")  # id, size, kind, segments, mode, chip_selec
 I2C_SEGMENT = struct.Struct("=HHI")  # address, flags, length
 SPI_SEGMENT = struct.Struct("=IIIIIBBBB")  # length, speed, delay, word delay, cs delay, bits, cs_change, tx, rx
 ANSWER = struct.Struct("=IiII")  # id, status, done, size
-MAX_BYTES = 64 * 1024
+MAX_BYTES = 64 * 1024  # maximum size of a message of the kernel module
 
 
 class Refuse(Exception):

@@ -15,7 +15,7 @@ from imud.links.socketcan import BATCH_FRAMES, FrameReader, SocketCanLink, Socke
 from imud.model.errors import LinkError, LinkMissing
 from tests.support.daemon_process import LIMIT_S
 
-GATHER_MS = 10
+GATHER_MS = 10  # hold of frames
 
 Ends = tuple[socket.socket, socket.socket, Path]
 

@@ -43,7 +43,7 @@ from tests.support.daemon_process import wait_until, write_config
 from tests.support.pty_port import BAUD, plugged, slave, wired
 from tests.test_daemon import Cable
 
-PERIOD_MS: Final = 50
+PERIOD_MS: Final = 50  # 20 Hz
 LIMIT_S: Final = 120.0
 WIRES: Final = ("quiet", "gone", "flapping", "lossy", "noisy", "hot", "late", "jumping", "tilted", "lines", "mute")
 WIRE_FAULTS: Final = ("silent", "lose_every", "flip_every", "temperature_c", "hold", "jump_ms", "behind_ms", "up_m_s2")

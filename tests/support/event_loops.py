@@ -41,7 +41,7 @@ DESCRIPTOR_LIMIT_S = 60.0
 """Maximum real time of a loop that waits only for descriptors, s."""
 
 
-UTC_AHEAD_NS = 1_795_000_000 * NS_PER_S
+UTC_AHEAD_NS = 1_795_000_000 * NS_PER_S  # CLOCK_REALTIME minus CLOCK_MONOTONIC
 
 
 class VirtualClock:

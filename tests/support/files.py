@@ -85,8 +85,8 @@ def candump_line(frame: CanFrame, bus: str = "can0") -> str:
 
 
 BEGIN_NS = 1_763_717_507_000_000_000
-PERIOD_NS = 10_000_000
-FRAME_NS = 250_000
+PERIOD_NS = 10_000_000  # 100 samples per second
+FRAME_NS = 250_000  # time between two frames of a sample
 
 
 def imu61x_log(indices: Iterable[int]) -> str:
@@ -106,7 +106,7 @@ def imu61x_log(indices: Iterable[int]) -> str:
     return "".join(lines)
 
 
-HI91_BYTES = 82
+HI91_BYTES = 82  # 6 bytes of header, 76 of payload
 
 
 def hi91(ms: int, accel_z_m_s2: float = 9.8) -> bytes:

@@ -148,7 +148,7 @@ def plugged(path: Path, module: StreamModule) -> Iterator[Path]:
 
 # --- without a port, in simulated time --------------------------------------------------------------------------------
 
-REPLY_MS = 20
+REPLY_MS = 20  # limit for a reply of a simulated device
 LINE_BAUD = 115200
 BEGIN_NS = 5 * NS_PER_S
 

@@ -43,7 +43,7 @@ from tests.support.script_runners import offline_runner
 T = TypeVar("T")
 
 BEGIN_NS = 1_234_567_890_123
-UART_STEP_MS = 2
+UART_STEP_MS = 2  # time step of UART benches
 AT_REST = Still(radians(2), radians(-3), radians(40))
 
 
@@ -193,7 +193,7 @@ class HipnucLine(SerialLine[HipnucModule]):
 
 # --- HiPNUC on CANopen ------------------------------------------------------------------------------------------------
 
-CAN_STEP_NS = 250 * NS_PER_US
+CAN_STEP_NS = 250 * NS_PER_US  # time step of CAN benches
 QUIET = NodeSettings(periods_ms=dict.fromkeys((1, 2, 3, 4, 6, 7), 0))
 
 

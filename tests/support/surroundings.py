@@ -86,7 +86,7 @@ def read_until(descriptor: int, end: bytes) -> bytes:
 
 LOWEST_PORT: Final = 15000
 """Lowest port of a test. Usual ports of servers, for example 1883, 2947 and 9090, are lower."""
-PORT_TRIES_MAX: Final = 100
+PORT_TRIES_MAX: Final = 100  # attempts to find an unused port
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:

@@ -32,8 +32,8 @@ from tests.lab.tool import tool
 from tests.lab.waiting import wait_until
 from tests.support.daemon_process import write_config
 
-CI_SECONDS: Final = 45.0
-STATE_SIZE: Final = "64k"
+CI_SECONDS: Final = 45.0  # three rounds
+STATE_SIZE: Final = "64k"  # size of the file system of the state directory
 CATCH_UP_S: Final = 30.0
 CALM_S: Final = 1.0
 """Time after all devices run again, s: pending connections are closed and the clocks have processed all samples."""

@@ -21,10 +21,10 @@ from imud.model.errors import ImudError
 from imud.model.sample import Sample
 from tests.lab.waiting import wait_until
 
-START_LIMIT_S: Final = 60.0
+START_LIMIT_S: Final = 60.0  # start of the daemon under emulation
 BACK_LIMIT_S: Final = 120.0
 """Maximum time until all devices run again after the last fault, s. The slowest detection waits for 15 s of silence."""
-ANSWER_LIMIT_S: Final = 30.0
+ANSWER_LIMIT_S: Final = 30.0  # reply on the socket
 CGROUP: Final = Path("/sys/fs/cgroup/imud-chaos")
 TOO_LITTLE: Final = "4M"
 ID_AT: Final = next(field.offset for field in SLOT_FIELDS if field.name == "device_id")

@@ -39,11 +39,11 @@ from tests.lab.imu61x_bus import on_i2c, on_spi
 from tests.lab.serial_port import uart_pair
 from tests.lab.wire import I2cTransfer, SpiTransfer
 
-RATE_HZ: Final = 10.0
+RATE_HZ: Final = 10.0  # rate of the sending devices
 BAUD: Final = 115200
 PERIOD_NS: Final = round(1e9 / RATE_HZ)
-MODBUS_HZ: Final = 5.0
-SETTLE_S: Final = 0.012
+MODBUS_HZ: Final = 5.0  # rate of the Modbus device
+SETTLE_S: Final = 0.012  # time for an edge of gpio-sim, see imu_process.py
 LOOK_S: Final = 0.02
 I2C_BURST: Final = b"\x12"
 SPI_BURST: Final = b"\x80\x00"

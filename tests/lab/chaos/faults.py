@@ -143,10 +143,10 @@ def play(
 
 STEP_MOST_S: Final = 3600.0
 ADJ_FREQUENCY: Final = 0x2
-TIMEX_BYTES: Final = 208
+TIMEX_BYTES: Final = 208  # size of struct timex on 64-bit Linux
 FREQUENCY_AT: Final = 16
 """Offset of `freq` in struct timex (64 bits). The unit is 2^-16 ppm."""
-SLEW_PPM: Final = 400
+SLEW_PPM: Final = 400  # less than the limit of the kernel, 500 ppm
 
 
 def slew(ppm: float) -> None:

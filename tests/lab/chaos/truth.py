@@ -18,7 +18,7 @@ from imud.sim.sensor import Burst, SensorHardware, StreamModule
 
 BASE: Final = 512
 """Base of the number in an acceleration: x contains the lower part, y the upper part."""
-STEP_M_S2: Final = 0.01
+STEP_M_S2: Final = 0.01  # acceleration per count of the number
 
 
 class Measured(NamedTuple):

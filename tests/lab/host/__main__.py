@@ -19,7 +19,7 @@ from tests.lab.host.errors import HungGuest, LabError
 from tests.lab.host.qemu import QEMU, Machine
 
 LAB_FAILED = 10
-MIN_MEMORY_MB = 256
+MIN_MEMORY_MB = 256  # minimum of --memory
 DEFAULT_MEMORY_MB = 1024
 MAX_PROCESSORS = 2  # the kernel's CONFIG_NR_CPUS
 DEFAULT_PROCESSORS = 1

@@ -22,9 +22,9 @@ from pathlib import Path
 
 from tests.lab.host.errors import LabError
 
-MAX_AGE_S = 14 * 86400
+MAX_AGE_S = 14 * 86400  # two weeks
 LOCK_WAIT_S = 45 * 60  # a cold build takes 5 minutes on two idle cores; a busy host is slower
-LOCK_POLL_S = 0.2
+LOCK_POLL_S = 0.2  # interval of lock attempts
 
 
 def cache_root(suffix: str = "") -> Path:

@@ -18,7 +18,7 @@ from tests.lab.host.errors import LabError
 
 ROOT = Path(__file__).resolve().parents[3]
 TEST_LIMIT_S = 120  # per test: twice the normal limit, because the guest is several times slower than the host
-PROBE_LIMIT_S = 300
+PROBE_LIMIT_S = 300  # start of Python on a busy host
 COMPILED = ("imud", "tests/conftest.py", "tests/lab", "tests/support")
 
 

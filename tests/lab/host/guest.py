@@ -21,7 +21,7 @@ from tests.lab.host.monitor import examine, stop_and_continue
 
 TICK_S = 0.5
 GOODBYE_S = 5.0  # time from the exit status to the end of QEMU; about 0.1 s
-CHUNK_BYTES = 65536
+CHUNK_BYTES = 65536  # bytes per read of QEMU's output
 MACHINE_LOG = "machine.log"
 STEADY_SILENCE_S = 300.0
 """Maximum time between two signs of life with `--steady`, s. The guest's 5 s took more than 60 s on a busy host."""

@@ -12,7 +12,7 @@ from tests.lab.host.errors import LabError
 
 LOGS = ("console.log", "qemu.log", "machine.log")
 REPORT = "junit.xml"
-LEFTOVER_S = 86400
+LEFTOVER_S = 86400  # age of a folder that no run uses
 
 
 @contextlib.contextmanager

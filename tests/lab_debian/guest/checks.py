@@ -17,8 +17,8 @@ T = TypeVar("T")
 
 LIMIT_S = 180.0
 """Default time limit, s. An emulated guest on a busy host is tens of times slower than a real system."""
-POLL_S = 0.1
-LINES_SHOWN = 12
+POLL_S = 0.1  # interval of polls
+LINES_SHOWN = 12  # last lines of an exception's text
 
 
 class Failed(Exception):

@@ -9,7 +9,7 @@ from tests.lab_debian.guest.system import CONFIG, Host, must, pid, run, shown, s
 STATE = Path("/var/lib/imud")
 KEPT = STATE / "kept"
 """File in place of the state of the daemon, which can exist or not."""
-LIMIT_S = 900
+LIMIT_S = 900  # apt and dpkg under emulation
 SETUP_LOCK = "/run/imud-setup.lock"
 """Lock of `imud setup`. The next boot removes it."""
 

@@ -6,7 +6,7 @@ from tests.lab_debian.guest.checks import Checks, Failed, expect, wait_until
 from tests.lab_debian.guest.system import Host, device, journal, mark, wait_streaming
 
 ROUNDS = 10
-ROUNDS_SHORT = 2
+ROUNDS_SHORT = 2  # rounds with --short
 
 
 def check(checks: Checks, host: Host) -> None:

@@ -20,7 +20,7 @@ PYTHON = "/usr/lib/imud/bin/python3"
 UNIT = "imud.service"
 NODE = Path("/dev/ttyUSB0")
 REQUESTS = "/dev/virtio-ports/requests"
-FRESH_NS = 1_000_000_000
+FRESH_NS = 1_000_000_000  # maximum age of the newest sample
 
 
 def run(*command: str, limit_s: float = LIMIT_S, user: str = "", text: str = "") -> subprocess.CompletedProcess[str]:

@@ -25,8 +25,8 @@ KERNEL = "kernel"
 INITRAMFS = "initramfs.gz"
 DISK_BYTES = 2 << 30
 """Size of the sparse disk file, bytes. Writes of the guest go to another file (`snapshot=on`)."""
-NEEDED_BYTES = 3 << 30
-STEP_LIMIT_S = 40 * 60
+NEEDED_BYTES = 3 << 30  # free space for a build of an image
+STEP_LIMIT_S = 40 * 60  # limit of one step on a busy host
 CLEAN = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root", "LC_ALL": "C"}
 """Environment of every step, without the host's settings of pip and apt."""
 BINFMT = Path("/proc/sys/fs/binfmt_misc")

@@ -42,9 +42,9 @@ PARTS = {
 bytes."""
 TEST_LIMIT_S = 600
 """Time limit per test, s: ten times the normal limit."""
-LIMIT_S = 3600.0
+LIMIT_S = 3600.0  # all tests under qemu-user
 REPORT = "unit-tests.xml"
-LINES_SHOWN = 12
+LINES_SHOWN = 12  # last lines of the output after a failure
 
 
 @dataclass

@@ -25,7 +25,7 @@ ROOT_NAME = "root"
 SITE = "/opt/site"
 PYCACHE = "pycache"
 """Folder of bytecode for later runs: compiling takes longer than the tests."""
-NEEDED_BYTES = 2 << 30
+NEEDED_BYTES = 2 << 30  # free space for a root file system
 PIP_LIMIT_S = 600
 
 ENTER = """\

@@ -17,8 +17,8 @@ from tests.support.pty_port import serial_of, slave
 
 BEGIN_NS = 5 * NS_PER_S
 BAUD = 115200
-BYTE_NS = 10 * NS_PER_S // BAUD
-GAP_NS = 1_750_000
+BYTE_NS = 10 * NS_PER_S // BAUD  # 10 bits per byte
+GAP_NS = 1_750_000  # silence between frames above 19200 baud
 
 
 class ModbusMaster:

@@ -13,7 +13,7 @@ from imud.sim.ports.pins import Pin, PinEdge
 from imud.sim.sensor import Burst
 from tests.support.simulated_modules import BEGIN_NS, FAST, HIPNUC_STILL, HipnucUartBench
 
-HIGH_NS = 80_000
+HIGH_NS = 80_000  # SOUT pulse, 80 us
 
 
 def pulses(edges: list[PinEdge], pin: Pin) -> list[tuple[PinEdge, PinEdge]]:
