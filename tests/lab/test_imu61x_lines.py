@@ -218,7 +218,7 @@ def test_edges_stop_and_come_back(stepped: tuple[Stepped, DeviceConfig]) -> None
             assert rig.samples[1].sync is Sync.ARRIVAL
             it.t_ns -= STEP_NS
             end_ns = monotonic_ns() + round(TASK_LIMIT_S * 1e9)
-            while not any("edges are back" in event.message for event in rig.events):
+            while not any("edges have returned" in event.message for event in rig.events):
                 assert monotonic_ns() < end_ns
                 it.renew()
                 await asyncio.sleep(0.05)
