@@ -74,6 +74,28 @@ PAUSES_S: Final = (0, 10, 60, 600, 3600)
 PAUSES_FORGOTTEN_S: Final = 2 * 3600  # time after which a repair no longer counts, s
 
 
+class RepairPauses:
+    """Pauses between the repairs of a device. The first repair of another device has no pause."""
+
+    def __init__(self) -> None:
+        self._device = ""
+        self._repaired_ns: list[int] = []  # CLOCK_MONOTONIC of the repairs within PAUSES_FORGOTTEN_S
+
+    def remaining_ns(self, device: str, now_ns: int) -> int:
+        """Return the remaining pause before the next repair of `device`, ns; 0 or less if a repair may start."""
+        if device != self._device:
+            self._device = device
+            self._repaired_ns.clear()
+        forgotten_ns = now_ns - PAUSES_FORGOTTEN_S * NS_PER_S
+        self._repaired_ns = [time_ns for time_ns in self._repaired_ns if time_ns > forgotten_ns]
+        pause_s = PAUSES_S[min(len(self._repaired_ns), len(PAUSES_S) - 1)]
+        return self._repaired_ns[-1] + pause_s * NS_PER_S - now_ns if self._repaired_ns else 0
+
+    def add(self, now_ns: int) -> None:
+        """Count a repair of the device of the last `remaining_ns`."""
+        self._repaired_ns.append(now_ns)
+
+
 class SettingsKeeper:
     """Settings of one device; an attachment. Synchronization: the loop's thread only."""
 
@@ -106,8 +128,7 @@ class SettingsKeeper:
         # resets of the device counter at a plan that no other script has followed; None without such a plan
         self._planned_resets: int | None = None
         self._repairs = 0
-        self._repaired_ns: list[int] = []  # CLOCK_MONOTONIC of the repairs within PAUSES_FORGOTTEN_S
-        self._repaired_module = ""  # the device of these repairs, as in `_module`
+        self._pauses = RepairPauses()
 
     # --- the attachment -----------------------------------------------------------------------------------------------
 
@@ -331,12 +352,12 @@ class SettingsKeeper:
         if plan.empty:
             return
         now_ns = self._host.now_ns()
-        wait_ns = self._pause_ns(now_ns)
+        wait_ns = self._pauses.remaining_ns(self._module, now_ns)
         if wait_ns > 0:
             self._due_ns = now_ns + wait_ns
             self._problem = f"the device loses its settings; imud sets them again in {wait_ns / NS_PER_S:.0f} s"
             return
-        self._repaired_ns.append(now_ns)
+        self._pauses.add(now_ns)
         self._repairs += 1
         applied = await self._apply(table, self._declared, actual, save=save, asked=False)
         self._announce(applied)
@@ -344,19 +365,6 @@ class SettingsKeeper:
     def _is_saved(self, actual: Values) -> bool:
         """Return whether flash contains the declared settings, because commands changed no value."""
         return actual == self._saved and all(name in actual for name in self._declared)
-
-    def _pause_ns(self, now_ns: int) -> int:
-        """Return the pause before the next repair, ns. It depends on the number of repairs within PAUSES_FORGOTTEN_S.
-
-        The first repair of another device has no pause.
-        """
-        if self._module != self._repaired_module:
-            self._repaired_module = self._module
-            self._repaired_ns.clear()
-        forgotten_ns = now_ns - PAUSES_FORGOTTEN_S * NS_PER_S
-        self._repaired_ns = [time_ns for time_ns in self._repaired_ns if time_ns > forgotten_ns]
-        pause_s = PAUSES_S[min(len(self._repaired_ns), len(PAUSES_S) - 1)]
-        return self._repaired_ns[-1] + pause_s * NS_PER_S - now_ns if self._repaired_ns else 0
 
     async def _read(self, table: SettingsTable) -> Values:
         def read(target: Target) -> Any:
@@ -423,7 +431,7 @@ class SettingsKeeper:
         if applied.problem:
             self._problem = applied.problem
             now_ns = self._host.now_ns()
-            self._due_ns = now_ns + max(self._pause_ns(now_ns), NS_PER_S)
+            self._due_ns = now_ns + max(self._pauses.remaining_ns(self._module, now_ns), NS_PER_S)
         detail = {step.name: str(step.outcome) for step in applied.steps}
         self._raise(_summary(applied), saved=applied.saved, **detail)
 
