@@ -234,7 +234,7 @@ def test_a_folder_has_three_modules() -> None:
 
 
 VERB_FORM = re.compile(r"[a-z_]+ing")
-NOUNS = {"edge_pairing", "reading", "recording", "ring", "setting", "steering", "thinning"}
+NOUNS = {"edge_pairing", "readdressing", "reading", "recording", "ring", "setting", "steering", "thinning"}
 SURROUNDINGS = {"ways", "moves", "contact", "attached", "questions", "helpers", "utils", "misc", "common_code"}
 
 

@@ -13,8 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from typing import Final, Literal
 
-from msgspec.structs import replace
-
 from imud.contracts.driver import Identity
 from imud.contracts.script import Message, Reply, ReplyFrame, Request, RequestScript, never
 from imud.contracts.setting import Written
@@ -42,6 +40,7 @@ from imud.drivers.hipnuc.canopen.cia301 import (
     write_object,
 )
 from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
+from imud.drivers.readdressing import Readdressing
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, pack_frame
 from imud.model.errors import BadArgument, DeviceRefused, NoReply
 from imud.model.units import NS_PER_MS, NS_PER_S
@@ -270,51 +269,22 @@ def _is_heartbeat(node: int) -> Callable[[Message], bool]:
 
 
 # Functions of frames that a node sends
-SENT_BY_NODE: Final = frozenset({*TPDO_FUNCTIONS.values(), SDO_REPLY, HEARTBEAT, EMERGENCY})
-# Time to listen for a node, ns: it sends each TPDO at least once per second (section 5.1)
-LISTEN_NS: Final = 1100 * NS_PER_MS
-BOOT_NS: Final = 3 * NS_PER_S  # maximum time to the boot-up message, ns; the manual states none
-ALL_BOOTS: Final = (CanFilter(HEARTBEAT, FUNCTION_MASK, False),)
+SENT_BY_NODE: Final = (*TPDO_FUNCTIONS.values(), SDO_REPLY, HEARTBEAT, EMERGENCY)
 
 
 def change_node(settings: HipnucCanopenOptions, new: int) -> RequestScript[Written]:
-    """Set the node number, 1 … 127, and follow a node that uses it immediately.
-
-    Raises BadArgument for a number in use on the bus, DeviceRefused, Aborted, and NoReply for a node without reply at
-    both numbers (imud then commands it back).
-    """
-    node = settings.node
-    if new == node:
-        return (yield from set_node_id(node, new))
-    if heard := (yield from _heard(new)):
-        raise BadArgument(f"node {new} is in use: received its frame 0x{heard:03X}; try another number")
-    first = yield from _write_number(node, new)
-    again = yield from _write_number(node, new)
-    if again:
-        return (yield from verify(node, NODE_ID, 0, new, pending=True))
-    if (yield from _write_number(new, new)):
-        yield _follow(settings, new)
-        return (yield from verify(new, NODE_ID, 0, new))
-    yield Request(
-        _number_frame(new, node), f"node {new}, back to number {node}", never, never, never, silent=True
-    )  # the node may already use the new number and not reply
-    confirmed = "confirmed the write and then " if first else ""
-    raise NoReply(
-        f"the node {confirmed}replied neither as node {new} nor as node {node}; imud commanded it back to {node}"
-    )
+    """Set the node number, 1 … 127, and follow the node (`Readdressing.change`)."""
+    return set_node_id(new, new) if new == settings.node else _readdressing(settings).change(new)
 
 
 def restart(settings: HipnucCanopenOptions, bus_bit_s: int) -> RequestScript[str]:
-    """Restart the node, as after power-on, follow it to its number, and return a report.
-
-    `bus_bit_s` is the bit rate of the bus; 0 if it is not known. Raises NoReply if the node does not reply afterwards.
-    """
-    return (yield from _reset(settings, bus_bit_s, restart_request(settings.node)))
+    """Restart the node, as after power-on, and follow it to its number (`Readdressing.restart`)."""
+    return _readdressing(settings).restart(restart_request(settings.node), bus_bit_s)
 
 
 def reset(settings: HipnucCanopenOptions, bus_bit_s: int, command: NmtCommand) -> RequestScript[str]:
     """Reset the node by an NMT command and follow it like `restart`."""
-    return (yield from _reset(settings, bus_bit_s, nmt_request(settings.node, command)))
+    return _readdressing(settings).restart(nmt_request(settings.node, command), bus_bit_s)
 
 
 def factory_reset_and_find(settings: HipnucCanopenOptions) -> RequestScript[str]:
@@ -322,58 +292,35 @@ def factory_reset_and_find(settings: HipnucCanopenOptions) -> RequestScript[str]
 
     Raises BadArgument if another node has number 8, Aborted, NoReply.
     """
-    if settings.node != NODE_DEFAULT and (yield from _heard(NODE_DEFAULT)):
-        raise BadArgument(f"node {NODE_DEFAULT}, the factory number, is in use by another node; change that node first")
+    yield from _readdressing(settings).check_factory()
     yield from factory_reset(settings.node)
     return f"restored; the device is node {NODE_DEFAULT} at 500 kbit/s after the next restart"
 
 
-def _reset(settings: HipnucCanopenOptions, bus_bit_s: int, request: Request) -> RequestScript[str]:
-    node = settings.node
-    saved = yield from read_values(node, ((NODE_ID, 0), (BIT_RATE, 0)), silent_is_fine=True)
-    number = saved.get((NODE_ID, 0), node)
-    if not 1 <= number <= NODE_MAX:  # not a valid number: the node keeps its present number
-        number = node
-    rate = BIT_RATE_OF.get(saved.get((BIT_RATE, 0), -1), bus_bit_s)
-    places = tuple(dict.fromkeys((node, number)))
-    booted = yield from _boot(request, (*places, NODE_DEFAULT) if saved else None)
-    if booted is None:
-        booted = yield from _find(places)
-    if booted is None:
-        if bus_bit_s and rate != bus_bit_s:
-            return f"restarted; the device now uses {rate} bit/s and the bus does not; set the bus to {rate} bit/s"
-        words = " or ".join(map(str, places))
-        raise NoReply(f"no frame of node {words} after the restart; does it use another bit rate now?")
-    if booted != node:
-        yield _follow(settings, booted)
-    return f"restarted, as node {booted}"
-
-
-def _boot(request: Request, numbers: Sequence[int] | None) -> RequestScript[int | None]:
-    """Send a request that restarts the node. Return the number in its boot-up message. `numbers`: None for any."""
-
-    def ends(message: Message) -> bool:
-        is_boot = isinstance(message, ReplyFrame) and message.payload == bytes([NmtState.BOOT_UP.value])
-        return is_boot and _is_of(message, HEARTBEAT) and (numbers is None or _number_of(message) in numbers)
-
-    outcome = yield Request(request.payload, request.name, ends, never, never, BOOT_NS, also=ALL_BOOTS)
-    return _number_of(outcome.frames[-1]) if isinstance(outcome, Reply) else None
-
-
-def _find(numbers: Sequence[int]) -> RequestScript[int | None]:
-    """Return the first number with a received frame."""
-    for number in numbers:
-        if (yield from _heard(number)):
-            return number
-    return None
-
-
-def _heard(node: int) -> RequestScript[int]:
-    """Request the device type of a node. Return the identifier of its first frame of any kind; 0 without a frame."""
-    also = tuple(CanFilter(function + node, STANDARD_ID_MAX, False) for function in sorted(SENT_BY_NODE))
-    payload = pack_frame(SDO_REQUEST + node, False, read_frame(DEVICE_TYPE, 0))
-    outcome = yield Request(payload, f"node {node}, present?", _is_from(node), never, never, LISTEN_NS, also=also)
-    return outcome.frames[-1].frame_id if isinstance(outcome, Reply) else 0
+def _readdressing(settings: HipnucCanopenOptions) -> Readdressing:
+    node, registers = settings.node, ((NODE_ID, 0), (BIT_RATE, 0))
+    return Readdressing(
+        options=settings,
+        present=node,
+        noun="node",
+        number="number",
+        words="as node",
+        lost="the node {confirmed}replied neither as node {new} nor as node {present}; "
+        "imud commanded it back to {present}",
+        factory=NODE_DEFAULT,
+        valid=range(1, NODE_MAX + 1),
+        registers=registers,
+        bit_rates=BIT_RATE_OF,
+        boot=CanFilter(HEARTBEAT, FUNCTION_MASK, False),
+        boot_data=bytes([NmtState.BOOT_UP.value]),
+        sender_mask=NODE_MASK,
+        frames=lambda at: tuple(CanFilter(function + at, STANDARD_ID_MAX, False) for function in sorted(SENT_BY_NODE)),
+        describe=lambda can_id: f"frame 0x{can_id:03X}",
+        query=lambda at: pack_frame(SDO_REQUEST + at, False, read_frame(DEVICE_TYPE, 0)),
+        write=_write_number,
+        verify=lambda at, new: verify(at, NODE_ID, 0, new, pending=at == node),
+        read_saved=lambda: read_values(node, registers, silent_is_fine=True),
+    )
 
 
 def _write_number(node: int, value: int) -> RequestScript[bool]:
@@ -384,29 +331,3 @@ def _write_number(node: int, value: int) -> RequestScript[bool]:
     except NoReply:
         return False
     return True
-
-
-def _number_frame(node: int, value: int) -> bytes:
-    return pack_frame(SDO_REQUEST + node, False, write_frame(NODE_ID, 0, value.to_bytes(4, "little")))
-
-
-def _follow(settings: HipnucCanopenOptions, node: int) -> Request:
-    """Return a request that makes imud use another node number."""
-    moved = replace(settings, node=node)
-    return Request(b"", f"node {settings.node}, now {node}", never, never, never, silent=True, settings=moved)
-
-
-def _is_from(node: int) -> Callable[[Message], bool]:
-    return lambda message: (
-        isinstance(message, ReplyFrame)
-        and message.frame_id & NODE_MASK == node
-        and message.frame_id & FUNCTION_MASK in SENT_BY_NODE
-    )
-
-
-def _is_of(message: Message, function: int) -> bool:
-    return isinstance(message, ReplyFrame) and message.frame_id & FUNCTION_MASK == function
-
-
-def _number_of(message: Message) -> int:
-    return message.frame_id & NODE_MASK if isinstance(message, ReplyFrame) else 0
