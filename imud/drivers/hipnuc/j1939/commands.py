@@ -20,12 +20,10 @@ are not readable.
 """
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
 from typing import Final, Literal, get_args
-
-from msgspec.structs import replace as with_fields
 
 from imud.contracts.driver import Identity
 from imud.contracts.script import Message, Outcome, Rejection, Reply, ReplyFrame, Request, RequestScript, Silence, never
@@ -38,9 +36,10 @@ from imud.drivers.hipnuc.j1939.codec import (
     HipnucJ1939Options,
     J1939Node,
 )
+from imud.drivers.readdressing import Readdressing
 from imud.formats.can import CanFilter, pack_frame
 from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, filter_of, join, split
-from imud.model.errors import BadArgument, NoReply, Rejected
+from imud.model.errors import NoReply, Rejected
 from imud.model.units import NS_PER_MS, NS_PER_S
 
 LAYOUT: Final = struct.Struct("<HBBI")  # register, command, status, value
@@ -290,65 +289,14 @@ def _value(outcome: Outcome) -> int:
     return value
 
 
-# Time to listen for a device, ns: it sends each message at least once per second (section 6.2.2)
-LISTEN_NS: Final = 1100 * NS_PER_MS
-BOOT_NS: Final = 3 * NS_PER_S  # maximum time to the address claim after a restart, ns; the manual states none
-SOURCE_MASK: Final = 0xFF
-
-
 def change_address(settings: HipnucJ1939Options, new: int) -> RequestScript[Written]:
-    """Set the address of a device, 1 … 128, and follow a device that uses it immediately.
-
-    Raises BadArgument for an address in use on the bus, Rejected, and NoReply for a device without reply at both
-    addresses (imud then commands it back).
-    """
-    peer = settings.peer
-    if new == peer.address:
-        return (yield from set_address(peer, new))
-    if heard := (yield from _heard(settings, new)):
-        raise BadArgument(f"address {new} is in use: received its PGN {split(heard).pgn:04X}; try another address")
-    there = J1939Node(new, peer.host)
-    first = yield from _write_address(peer, new)
-    if (yield from _write_address(peer, new)):
-        return (yield from verify(peer, ADDRESS, new, "address", pending=True))
-    if (yield from _write_address(there, new)):
-        yield _follow(settings, new)
-        return (yield from verify(there, ADDRESS, new, "address"))
-    back = exchange(there, ADDRESS, WRITE, peer.address, f"back to address {peer.address}")
-    yield Request(back.payload, back.name, never, never, never, silent=True)
-    confirmed = "confirmed the write and then " if first else ""
-    raise NoReply(
-        f"the device {confirmed}replied neither at address {new} nor at {peer.address}; imud commanded it back"
-    )
+    """Set the address of a device, 1 … 128, and follow the device (`Readdressing.change`)."""
+    return set_address(settings.peer, new) if new == settings.address else _readdressing(settings).change(new)
 
 
 def restart(settings: HipnucJ1939Options, bus_bit_s: int) -> RequestScript[str]:
-    """Restart the device, follow it to its address, and return a report.
-
-    `bus_bit_s` is the bit rate of the bus; 0 if it is not known. Raises Rejected, and NoReply if the device does not
-    reply afterwards.
-    """
-    peer = settings.peer
-    saved = yield from read_values(peer, (ADDRESS, BITRATE))
-    code = saved.get(BITRATE, len(BITRATES))
-    rate = BITRATES[code] if code < len(BITRATES) else bus_bit_s
-    saved_address = saved.get(ADDRESS, peer.address)
-    valid = 0 <= saved_address <= ADDRESS_MAX
-    address = saved_address if valid else peer.address  # not a valid address: the device keeps its present one
-    places = tuple(dict.fromkeys((peer.address, address)))
-    found = yield from _claim(restart_request(peer), (*places, FACTORY_ADDRESS) if saved else None)
-    for place in places if found is None else ():
-        if (yield from _heard(settings, place)):
-            found = place
-            break
-    if found is None:
-        if bus_bit_s and rate != bus_bit_s:
-            return f"restarted; the device now uses {rate} bit/s and the bus does not; set the bus to {rate} bit/s"
-        words = " or ".join(map(str, places))
-        raise NoReply(f"no frame of address {words} after the restart; does it use another bit rate now?")
-    if found != peer.address:
-        yield _follow(settings, found)
-    return f"restarted, at address {found}"
+    """Restart the device and follow it to its address (`Readdressing.restart`)."""
+    return _readdressing(settings).restart(restart_request(settings.peer), bus_bit_s)
 
 
 def factory_reset_and_find(settings: HipnucJ1939Options) -> RequestScript[str]:
@@ -356,54 +304,43 @@ def factory_reset_and_find(settings: HipnucJ1939Options) -> RequestScript[str]:
 
     Raises BadArgument if another device has address 8, Rejected.
     """
-    if settings.address != FACTORY_ADDRESS and (yield from _heard(settings, FACTORY_ADDRESS)):
-        raise BadArgument(
-            f"address {FACTORY_ADDRESS}, the factory address, is in use by another node; change that node first"
-        )
+    device = _readdressing(settings)
+    yield from device.check_factory()
     yield from factory_reset(settings.peer)
-    if settings.address != FACTORY_ADDRESS and (yield from _heard(settings, FACTORY_ADDRESS)):
-        yield _follow(settings, FACTORY_ADDRESS)
+    if settings.address != FACTORY_ADDRESS and (yield from device.heard(FACTORY_ADDRESS)):
+        yield device.move(FACTORY_ADDRESS)
         return f"restored, at address {FACTORY_ADDRESS}"
     return f"restored; the device has address {FACTORY_ADDRESS} after the next restart at the latest"
 
 
-def _claim(request: Request, places: Sequence[int] | None) -> RequestScript[int | None]:
-    """Send the request for a restart. Return the claimed address. `places`: None for any address."""
-
-    def ends(message: Message) -> bool:
-        if not isinstance(message, ReplyFrame) or split(message.frame_id).pgn != CLAIMED:
-            return False
-        return places is None or split(message.frame_id).source in places
-
-    claims = (filter_of(CLAIMED, None),)
-    outcome = yield Request(request.payload, request.name, ends, request.is_rejection, never, BOOT_NS, also=claims)
-    if isinstance(outcome, Rejection):
-        raise Rejected("restart: the device rejected the request")
-    return split(outcome.frames[-1].frame_id).source if isinstance(outcome, Reply) else None
-
-
-def _heard(settings: HipnucJ1939Options, address: int) -> RequestScript[int]:
-    """Request the address register. Return the identifier of the first frame from the address; 0 without a frame."""
-    asked = exchange(J1939Node(address, settings.host_address), ADDRESS, READ, READ_VALUE, f"address {address}")
-    also = (CanFilter(address, SOURCE_MASK, True),)
-    outcome = yield Request(asked.payload, asked.name, _is_from(address), never, never, LISTEN_NS, also=also)
-    return outcome.frames[-1].frame_id if isinstance(outcome, Reply) else 0
+def _readdressing(settings: HipnucJ1939Options) -> Readdressing:
+    peer, host = settings.peer, settings.host_address
+    return Readdressing(
+        options=settings,
+        present=peer.address,
+        noun="address",
+        number="address",
+        words="at address",
+        lost="the device {confirmed}replied neither at address {new} nor at {present}; imud commanded it back",
+        factory=FACTORY_ADDRESS,
+        valid=range(ADDRESS_MAX + 1),
+        registers=(ADDRESS, BITRATE),
+        bit_rates=dict(enumerate(BITRATES)),
+        boot=filter_of(CLAIMED, None),
+        boot_data=None,
+        sender_mask=0xFF,
+        frames=lambda at: (CanFilter(at, 0xFF, True),),
+        describe=lambda can_id: f"PGN {split(can_id).pgn:04X}",
+        query=lambda at: exchange(J1939Node(at, host), ADDRESS, READ, READ_VALUE, "").payload,
+        write=lambda at, new: _write_address(J1939Node(at, host), new),
+        verify=lambda at, new: verify(J1939Node(at, host), ADDRESS, new, "address", pending=at == peer.address),
+        read_saved=lambda: read_values(peer, (ADDRESS, BITRATE)),
+    )
 
 
 def _write_address(peer: J1939Node, value: int) -> RequestScript[bool]:
     """Write the address register. Return whether the device confirmed it. Raises Rejected."""
-    also = tuple(CanFilter(one, 0x03FF_FFFF, True) for one in sorted(peer.reply_ids()))
+    also = tuple(CanFilter(one, WITHOUT_PRIORITY, True) for one in sorted(peer.reply_ids()))
     outcome = yield exchange(peer, ADDRESS, WRITE, value, f"address {value}", also=also)
-    if isinstance(outcome, Rejection):
-        raise Rejected(f"address {value}: the device rejected the request with status {outcome.frames[-1].payload[3]}")
+    _refuse(f"address {value}", outcome)
     return isinstance(outcome, Reply)
-
-
-def _follow(settings: HipnucJ1939Options, address: int) -> Request:
-    """Return a request that makes imud use another address."""
-    moved = with_fields(settings, address=address)
-    return Request(b"", f"now at address {address}", never, never, never, silent=True, settings=moved)
-
-
-def _is_from(address: int) -> Callable[[Message], bool]:
-    return lambda message: isinstance(message, ReplyFrame) and split(message.frame_id).source == address
