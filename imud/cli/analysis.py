@@ -62,20 +62,20 @@ def spectrum_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bands", type=bands_hz, metavar="HZ-HZ,…", help="bands of the RMS (default: octaves)")
 
 
-def part(name: str) -> Any:
-    """Import a module of this package. Raises BadArgument where a library of the extra is missing."""
+def loaded(name: str) -> Any:
+    """Import a module of `imud.cli` that needs the extra. Raises BadArgument if a library of the extra is missing."""
     try:
         return import_module(f"imud.cli.{name}")
     except ModuleNotFoundError as error:
         library = (error.name or "a library").partition(".")[0]
         if library == "imud":
             raise
-        raise BadArgument(f"it needs {library} of the extra analysis: pip install 'imud[analysis]'") from None
+        raise BadArgument(f"cannot import {library}; install the extra: pip install 'imud[analysis]'") from None
 
 
 def noise(args: argparse.Namespace) -> int:
     """Print the noise of a device; with `-o` write the report."""
-    module = part("noise")
+    module = loaded("noise")
     kind = module.kind_of(args.output) if args.output is not None else ""
     given = module.read_sheet(args.sheet) if args.sheet is not None else None
     taken = take(args)
@@ -88,17 +88,17 @@ def noise(args: argparse.Namespace) -> int:
 
 def spectrum(args: argparse.Namespace) -> int:
     """Print the vibration of a device, live until interrupted where no duration is given; with `-o` write a picture."""
-    module, page = part("spectrum"), part("noise")
-    kind = page.kind_of(args.output) if args.output is not None else ""
+    module, files = loaded("spectrum"), loaded("noise")
+    kind = files.kind_of(args.output) if args.output is not None else ""
     if kind == ".html":
         raise BadArgument(f"{args.output}: expected a name that ends in .svg or .png")
     sensors = SENSORS if args.sensor is None else (args.sensor,)
-    settings = module.SpectrumOptions(sensors, args.resolution, args.bands)
+    options = module.SpectrumOptions(sensors, args.resolution, args.bands)
     if is_live(args) and args.duration is None and not args.json and args.output is None and sys.stdout.isatty():
-        return int(module.live(args, settings))
-    report = module.spectrum_report(take(args), settings)
+        return int(module.live(args, options))
+    report = module.spectrum_report(take(args), options)
     if args.output is not None:
-        page.write_file(args.output, module.spectrum_file(report, kind))
+        files.write_file(args.output, module.spectrum_file(report, kind))
     return show(args, report, module)
 
 
@@ -109,7 +109,7 @@ def is_live(args: argparse.Namespace) -> bool:
 
 def take(args: argparse.Namespace) -> Any:
     """Read the samples. Raises BadArgument for options that are for files only."""
-    samples = part("sample_set")
+    samples = loaded("sample_set")
     if not is_live(args):
         return samples.take_file(args)
     for option, default in (("device", None), ("driver", None), ("baud", None), ("option", [])):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from imud.cli import main
-from imud.cli import sample_set as taking
+from imud.cli import sample_set
 from imud.cli import spectrum as spectrum_live
 from imud.cli.analysis import bands_hz
 from imud.cli.output import COLUMNS
@@ -185,7 +185,7 @@ def test_the_extra_is_named_if_it_is_missing_and_the_daemon_does_not_load_it(res
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=LIMIT_S, check=True)
     assert done.stdout == "set()\n"
-    assert "imud noise: it needs scipy of the extra analysis: pip install 'imud[analysis]'" in done.stderr
+    assert "imud noise: cannot import scipy; install the extra: pip install 'imud[analysis]'" in done.stderr
 
 
 def test_bands(capsys: pytest.CaptureFixture[str]) -> None:
@@ -219,7 +219,7 @@ def test_spectrum_and_noise_of_a_live_device(tmp_path: Path, cli: Cli) -> None:
 def test_a_device_that_sends_nothing_at_all_is_named(
     tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch, on_a_terminal: bool
 ) -> None:
-    monkeypatch.setattr(taking, "SILENCE_S", 0.2)
+    monkeypatch.setattr(sample_set, "SILENCE_S", 0.2)
     monkeypatch.setattr(spectrum_live, "SILENCE_S", 0.2)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: on_a_terminal)
     device = {"driver": "hipnuc-uart", "uart": {"port": str(tmp_path / "none"), "baud": 115200}}
