@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from imud.cli import main
-from imud.cli import sample_set
+from imud.cli import main, sample_set
 from imud.cli import spectrum as spectrum_live
 from imud.cli.analysis import bands_hz
 from imud.cli.output import COLUMNS
