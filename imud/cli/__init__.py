@@ -1,6 +1,6 @@
-"""The command line, `imud COMMAND`. Each command is a `CliCommand` in its module, imported when it is called.
+"""Command line `imud COMMAND`. imud imports only the module of the called command, which defines a `CliCommand`.
 
-Exit status: 0 done, 1 it ran and the answer is no, 2 it could not run.
+Exit status: 0 success, 1 the command ran and found a problem, 2 the command could not run.
 """
 
 import argparse
@@ -21,61 +21,61 @@ class Subcommand(NamedTuple):
     """A row of the table of commands."""
 
     target: str
-    """`module:NAME` of its `CliCommand`."""
+    """`module:NAME` of the `CliCommand`."""
     help: str
     extra: str = ""
-    """Extra of the package whose libraries the module imports."""
+    """Extra of the package with the libraries that the module imports; empty if the module needs no extra."""
 
     def load(self) -> "CliCommand":
-        """Import the module of the command. Raises BadArgument if a library of the extra is missing."""
-        module, _, name = self.target.partition(":")
+        """Import the module of the command and return the command. Raises BadArgument if the extra is missing."""
+        path, _, name = self.target.partition(":")
         try:
-            return cast("CliCommand", getattr(import_module(module), name))
+            module = import_module(path)
         except ModuleNotFoundError as error:
-            if not self.extra:
+            library = (error.name or "a library").partition(".")[0]
+            if not self.extra or library == "imud":
                 raise
-            raise BadArgument(f"it needs {error.name}: pip install 'imud[{self.extra}]'") from None
+            raise BadArgument(f"cannot import {library}; install the extra: pip install 'imud[{self.extra}]'") from None
+        return cast("CliCommand", getattr(module, name))
 
 
 COMMANDS = {
-    "run": Subcommand("imud.cli.run:RUN", "own the configured devices and serve their samples"),
-    "demo": Subcommand("imud.cli.demo:DEMO", "run the daemon on a simulated sensor and show what it does"),
-    "check": Subcommand("imud.cli.run:CHECK", "check a configuration file without opening any port"),
-    "probe": Subcommand("imud.cli.probe:PROBE", "list what is attached"),
+    "run": Subcommand("imud.cli.run:RUN", "run the daemon in the foreground"),
+    "demo": Subcommand("imud.cli.demo:DEMO", "run the daemon with a simulated device and print samples"),
+    "check": Subcommand("imud.cli.run:CHECK", "check a configuration file; do not open any port"),
+    "probe": Subcommand("imud.cli.probe:PROBE", "list attached devices"),
     "setup": Subcommand(
-        "imud.cli.setup.command:SETUP", "find what is attached, configure it, start the service; or take that back"
+        "imud.cli.setup.command:SETUP", "detect attached devices, write the configuration, start the service"
     ),
-    "doctor": Subcommand("imud.cli.doctor.command:DOCTOR", "look for what is wrong, and say what to do next"),
-    "modbus": Subcommand("imud.cli.modbus:MODBUS", "find modules on an RS-485 line and give them addresses"),
-    "decode": Subcommand("imud.cli.decode:DECODE", "raw capture in, one JSON object per message out"),
-    "replay": Subcommand("imud.cli.replay:REPLAY", "run a recording or a capture through the daemon's whole path"),
-    "record": Subcommand("imud.cli.record:RECORD", "record what devices deliver, or save the last minutes"),
-    "info": Subcommand("imud.cli.record:INFO", "say what is in a recording, and whether it is whole"),
-    "noise": Subcommand("imud.cli.analysis:NOISE", "judge the noise of a sensor that lies still"),
-    "spectrum": Subcommand("imud.cli.analysis:SPECTRUM", "show vibration by frequency, live or of a file"),
-    "export": Subcommand("imud.cli.export:EXPORT", "write a recording or a capture as CSV or MCAP"),
+    "doctor": Subcommand("imud.cli.doctor.command:DOCTOR", "find problems and print the next steps"),
+    "modbus": Subcommand("imud.cli.modbus:MODBUS", "find devices on an RS-485 bus and set their addresses"),
+    "decode": Subcommand("imud.cli.decode:DECODE", "decode a capture to one JSON object per frame"),
+    "replay": Subcommand("imud.cli.replay:REPLAY", "replay a recording or a capture"),
+    "record": Subcommand("imud.cli.record:RECORD", "record the data of devices, or save a snapshot"),
+    "info": Subcommand("imud.cli.record:INFO", "print the content of a recording and check the file"),
+    "noise": Subcommand("imud.cli.analysis:NOISE", "measure the noise of a device at rest"),
+    "spectrum": Subcommand("imud.cli.analysis:SPECTRUM", "print the vibration spectrum of a device or a file"),
+    "export": Subcommand("imud.cli.export:EXPORT", "convert a recording or a capture to CSV or MCAP"),
     "devices": Subcommand("imud.cli.devices:DEVICES", "list the devices of the running daemon"),
-    "status": Subcommand("imud.cli.status:STATUS", "show state, rate, clock and ledger of each device"),
-    "top": Subcommand("imud.cli.top:TOP", "watch all devices in the terminal, redrawn in place", "top"),
+    "status": Subcommand("imud.cli.status:STATUS", "print state, rate, clock and ledger of each device"),
+    "top": Subcommand("imud.cli.top:TOP", "show all devices in a full-screen view of the terminal", extra="top"),
     "foxglove": Subcommand(
         "imud.cli.foxglove:FOXGLOVE", "serve samples, attitude, events and status to Foxglove and PlotJuggler"
     ),
-    "web": Subcommand("imud.cli.web:WEB", "show all devices in a browser, live"),
-    "fleet": Subcommand("imud.cli.fleet:FLEET", "collect or show what gateways send to an MQTT broker"),
-    "watch": Subcommand("imud.cli.watch:WATCH", "print samples as they come"),
-    "events": Subcommand("imud.cli.events:EVENTS", "print events as they come"),
-    "clock": Subcommand(
-        "imud.cli.clock:CLOCK", "show where time stamps come from, how good they are, and what limits them"
-    ),
-    "command": Subcommand("imud.cli.devices:COMMAND", "list the actions of a device, or carry one out"),
-    "settings": Subcommand("imud.cli.settings:SETTINGS", "show, set, save or restore a device's own settings"),
-    "calibrate": Subcommand("imud.cli.calibrate:CALIBRATE", "calibrate a device, guided step by step"),
-    "schema": Subcommand("imud.cli.schema:SCHEMA", "list the fields of a sample with units and frames"),
+    "web": Subcommand("imud.cli.web:WEB", "serve a web page that shows all devices"),
+    "fleet": Subcommand("imud.cli.fleet:FLEET", "collect or show the data of all gateways of an MQTT broker"),
+    "watch": Subcommand("imud.cli.watch:WATCH", "print samples"),
+    "events": Subcommand("imud.cli.events:EVENTS", "print events"),
+    "clock": Subcommand("imud.cli.clock:CLOCK", "print the source, error and limiting cause of the time stamps"),
+    "command": Subcommand("imud.cli.devices:COMMAND", "list the actions of a device, or run one action"),
+    "settings": Subcommand("imud.cli.settings:SETTINGS", "print, change, save, back up or restore device settings"),
+    "calibrate": Subcommand("imud.cli.calibrate:CALIBRATE", "guide a calibration of a device"),
+    "schema": Subcommand("imud.cli.schema:SCHEMA", "list the fields of a sample with units and coordinate frames"),
 }
 
 
 def build_parser(commands: Collection[str] = COMMANDS) -> argparse.ArgumentParser:
-    """Build the parser of the command line, with the arguments of these commands; it imports no other."""
+    """Build the parser of the command line. Only `commands` get their arguments; other modules are not imported."""
     parser = argparse.ArgumentParser(prog="imud", description="A daemon for inertial sensors.")
     parser.add_argument("--version", action="version", version=f"imud {__version__}")
     parsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -88,9 +88,10 @@ def build_parser(commands: Collection[str] = COMMANDS) -> argparse.ArgumentParse
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status. Expected errors are one line on standard error."""
+    """Run one command and return its exit status. Print an expected error as one line to standard error."""
     open_standard_streams()
     words = sys.argv[1:] if argv is None else argv
+    # without a known command, argparse prints the help or the error
     name = words[0] if words and words[0] in COMMANDS else ""
     try:
         try:
@@ -98,10 +99,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             return COMMANDS[args.command].load().run(args)
         finally:
             sys.stdout.flush()
-    except BrokenPipeError:  # the reader of our output has gone, as with `imud watch | head`
+    except BrokenPipeError:  # the reader closed the pipe, for example `imud watch | head`
         discard_output()
         return 0
-    except ConfigError as error:  # each line begins with its place in the file, for editors and scripts
+    except ConfigError as error:  # each line starts with file:line:column, for editors and scripts
         complain(str(error))
     except ImudError as error:
         complain(f"imud {name}: {error}")
@@ -110,5 +111,5 @@ def main(argv: Sequence[str] | None = None) -> int:
         place = f"{error.filename or 'standard output'}: " if error.errno is not None else ""
         complain(f"imud {name}: {place}{reason_of(error)}")
     except KeyboardInterrupt:
-        return 130
+        return 130  # 128 + SIGINT, as in a shell
     return 2

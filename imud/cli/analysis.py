@@ -1,4 +1,4 @@
-"""`imud noise`: noise of a sensor at rest, as data sheets have it; `imud spectrum`: its vibration, by frequency."""
+"""`imud noise`: noise of a device at rest, in the units of data sheets. `imud spectrum`: vibration by frequency."""
 
 import argparse
 import re
@@ -19,47 +19,55 @@ SENSORS: Final = ("accel", "gyro")
 
 
 def bands_hz(text: str) -> tuple[tuple[float, float], ...]:
-    """Read bands, for example `5-50,50-200`. Raises ArgumentTypeError."""
+    """Parse frequency bands, for example `5-50,50-200`. Raises ArgumentTypeError if the text has another form."""
     found = [BAND.fullmatch(one.strip()) for one in text.split(",")]
     if not all(found):
-        raise argparse.ArgumentTypeError(f"expected bands in Hz as 5-50,50-200, got {text!r}")
+        raise argparse.ArgumentTypeError(f"expected bands in Hz, for example 5-50,50-200, got {text!r}")
     return tuple((float(one[1]), float(one[2])) for one in found if one is not None)
 
 
 def common_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of both commands: where samples come from."""
+    """Add the arguments of both commands."""
     add_socket(parser)
-    parser.add_argument("input", metavar="FILE|DEVICE", help="recording or capture, or a device of the running daemon")
+    parser.add_argument("input", metavar="FILE|DEVICE", help="recording, capture, or device of the running daemon")
     parser.add_argument(
         "--for", dest="duration", type=duration_s, metavar="DURATION",
-        help="so much: 90s, 10min, 2h (default: all of a file; of a device until Ctrl-C)",
+        help="length of the analysed part, for example 90s, 10min, 2h (default: the complete file; a device until "
+        "Ctrl-C)",
     )  # fmt: skip
     parser.add_argument(
-        "--skip", type=duration_s, metavar="DURATION", help="leave out so much at the begin, for example to warm up"
-    )
-    parser.add_argument("--device", metavar="NAME", help="of a recording of several devices, this one")
-    parser.add_argument("--driver", choices=sorted(DRIVERS), help="of a capture (default: hipnuc-uart)")
-    parser.add_argument("--baud", type=int, help="rate of a raw capture (default: 115200)")
+        "--skip", type=duration_s, metavar="DURATION",
+        help="ignore the samples of this time at the start, for example while the device warms up",
+    )  # fmt: skip
+    parser.add_argument("--device", metavar="NAME", help="device in a recording of several devices")
+    parser.add_argument("--driver", choices=sorted(DRIVERS), help="driver for a capture (default: hipnuc-uart)")
+    parser.add_argument("--baud", type=int, help="baud rate of a raw capture (default: 115200)")
     add_option(parser)
-    parser.add_argument("--json", action="store_true", help="one JSON object, SI units")
+    parser.add_argument("--json", action="store_true", help="print one JSON object in SI units")
 
 
 def noise_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud noise`."""
     common_arguments(parser)
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="FILE", help="also write a report: .html (nothing else needed), .svg, .png"
+        "-o", "--output", type=Path, metavar="FILE", help="write a report to a file: .html (self-contained), .svg, .png"
     )
-    parser.add_argument("--sheet", type=Path, metavar="FILE", help="compare with the figures of a data sheet, YAML")
+    parser.add_argument(
+        "--sheet", type=Path, metavar="FILE", help="YAML file with the values of a data sheet, for a comparison"
+    )
 
 
 def spectrum_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud spectrum`."""
     common_arguments(parser)
-    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="also write a picture: .svg, .png")
-    parser.add_argument("--sensor", choices=SENSORS, help="this one only (default: both; live the accelerometer)")
-    parser.add_argument("--resolution", type=float, metavar="HZ", help="distance of frequencies (default: by length)")
-    parser.add_argument("--bands", type=bands_hz, metavar="HZ-HZ,…", help="bands of the RMS (default: octaves)")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="write a picture to a file: .svg, .png")
+    parser.add_argument(
+        "--sensor", choices=SENSORS, help="analyse this sensor only (default: both; live: the accelerometer)"
+    )
+    parser.add_argument(
+        "--resolution", type=float, metavar="HZ", help="distance of two frequencies (default: by the number of samples)"
+    )
+    parser.add_argument(
+        "--bands", type=bands_hz, metavar="HZ-HZ,…", help="frequency bands of the RMS (default: octaves)"
+    )
 
 
 def loaded(name: str) -> Any:
@@ -68,14 +76,15 @@ def loaded(name: str) -> Any:
         return import_module(f"imud.cli.{name}")
     except ModuleNotFoundError as error:
         library = (error.name or "a library").partition(".")[0]
-        if library == "imud":
+        if library == "imud":  # a defect of imud, not a missing library
             raise
         raise BadArgument(f"cannot import {library}; install the extra: pip install 'imud[analysis]'") from None
 
 
 def noise(args: argparse.Namespace) -> int:
-    """Print the noise of a device; with `-o` write the report."""
+    """Print the noise of a device. With `-o`, write a report file."""
     module = loaded("noise")
+    # check the arguments first: samples of a live device take minutes
     kind = module.kind_of(args.output) if args.output is not None else ""
     given = module.read_sheet(args.sheet) if args.sheet is not None else None
     taken = take(args)
@@ -87,11 +96,14 @@ def noise(args: argparse.Namespace) -> int:
 
 
 def spectrum(args: argparse.Namespace) -> int:
-    """Print the vibration of a device, live until interrupted where no duration is given; with `-o` write a picture."""
+    """Print the vibration of a device. With `-o`, write a picture.
+
+    Without a duration, redraw the spectrum of a live device on a terminal until Ctrl-C.
+    """
     module, files = loaded("spectrum"), loaded("noise")
     kind = files.kind_of(args.output) if args.output is not None else ""
     if kind == ".html":
-        raise BadArgument(f"{args.output}: expected a name that ends in .svg or .png")
+        raise BadArgument(f"{args.output}: expected a file name that ends in .svg or .png")
     sensors = SENSORS if args.sensor is None else (args.sensor,)
     options = module.SpectrumOptions(sensors, args.resolution, args.bands)
     if is_live(args) and args.duration is None and not args.json and args.output is None and sys.stdout.isatty():
@@ -103,25 +115,25 @@ def spectrum(args: argparse.Namespace) -> int:
 
 
 def is_live(args: argparse.Namespace) -> bool:
-    """Whether the input is a device: what exists as a file is a file."""
+    """Return whether the input is a device. If a file of this name exists, the input is the file."""
     return not Path(args.input).exists()
 
 
 def take(args: argparse.Namespace) -> Any:
-    """Read the samples. Raises BadArgument for options that are for files only."""
+    """Read the samples. Raises BadArgument if the input is a device and an option applies to files only."""
     samples = loaded("sample_set")
     if not is_live(args):
         return samples.take_file(args)
     for option, default in (("device", None), ("driver", None), ("baud", None), ("option", [])):
         if getattr(args, option) != default:
-            raise BadArgument(f"--{option}: expected none with a device of the daemon; {args.input} is no file")
+            raise BadArgument(f"--{option} applies to files only; the file {args.input} does not exist")
     return samples.take_live(args, samples.progress)
 
 
 def show(args: argparse.Namespace, report: Any, module: Any) -> int:
-    """Print a report."""
-    written: Callable[[Any], str] = module.text
-    print(msgspec.json.encode(module.as_object(report)).decode() if args.json else written(report))
+    """Print a report. Return the exit status."""
+    text: Callable[[Any], str] = module.text
+    print(msgspec.json.encode(module.as_object(report)).decode() if args.json else text(report))
     return 0
 
 

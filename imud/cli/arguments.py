@@ -1,4 +1,4 @@
-"""Parts that several commands share: the type of a command, the daemon's socket, and arguments `NAME=VALUE`."""
+"""Common code of the commands: the type of a command, the socket of the daemon, arguments `NAME=VALUE`."""
 
 import argparse
 import re
@@ -18,7 +18,7 @@ from imud.model.options import Options, unknown_name, value_problem, wrong_value
 from imud.model.sample import SAMPLE_FIELDS
 
 FILE_BYTES_MAX: Final = 64 << 20
-"""A report has every point of its curves: some MB."""
+"""Maximum size of a noise report, bytes. A report contains every point of its curves and has a few MB."""
 
 
 class _Spread(msgspec.Struct):
@@ -40,37 +40,36 @@ class _Measurement(msgspec.Struct):
 
 
 class _Report(msgspec.Struct):
-    """The members of the report that are used."""
+    """Used members of a noise report."""
 
     measurement: _Measurement
     sensors: dict[str, _Sensor]
 
 
 def read_noise(path: Path) -> tuple[str, Deviations]:
-    """Return the device of a report, and the deviations of its sensors: the quadratic mean of the three axes'.
+    """Return the device and the standard deviations in a report of `imud noise`. Raises ImudError.
 
-    The standard deviation of samples at rest has in it what drifted during the measurement. Raises ImudError.
+    The deviation of a sensor is the quadratic mean of its three axes. It includes the drift during the measurement.
     """
     try:
         report = msgspec.json.decode(read_regular(path, FILE_BYTES_MAX), type=_Report)
     except (OSError, ValueError) as error:
-        raise ImudError(f"{path}: expected a report of `imud noise --json`: {reason_of(error)}") from error
+        raise ImudError(f"{path}: expected a report of `imud noise --json`, got: {reason_of(error)}") from error
     return report.measurement.device, Deviations(
         accel_m_s2=_sigma(report.sensors.get("accel")), gyro_rad_s=_sigma(report.sensors.get("gyro"))
     )
 
 
 def _sigma(sensor: _Sensor | None) -> float | None:
-    """None for a sensor that was not measured, or whose values never changed."""
+    """Return the deviation of a sensor. None if the report does not contain the sensor, or if all values are equal."""
     if sensor is None or not sensor.axes:
         return None
     spreads = [axis.spread.value for axis in sensor.axes.values()]
     return hypot(*spreads) / sqrt(len(spreads)) or None
 
 
-if TYPE_CHECKING:  # what drivers promise takes as long to import as all that `imud status` needs
+if TYPE_CHECKING:  # importing contracts.driver would double the start time of `imud status`
     from imud.contracts.driver import Driver
-    from imud.contracts.status import Deviations
 
 SECONDS_OF: Final = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 DURATION: Final = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)")
@@ -80,9 +79,9 @@ class CliCommand(NamedTuple):
     """One command of the command line."""
 
     add_arguments: Callable[[argparse.ArgumentParser], None]
-    """Adds its arguments to its parser."""
+    """Adds the arguments of the command to a parser."""
     run: Callable[[argparse.Namespace], int]
-    """Carries it out and returns the exit status. Raises ImudError."""
+    """Runs the command and returns the exit status. Raises ImudError."""
 
 
 # --- the running daemon ---------------------------------------------------------------------------------------------
@@ -94,35 +93,35 @@ def add_socket(parser: argparse.ArgumentParser) -> None:
         "--socket",
         default=default_path(),
         metavar="PATH",
-        help="the daemon's socket (default: $IMUD_SOCKET or %(default)s)",
+        help="socket of the daemon (default: $IMUD_SOCKET or %(default)s)",
     )
 
 
 def connect(args: argparse.Namespace) -> Client:
-    """Connect to the daemon. Raises LinkMissing, LinkDenied, ServerError with what to look at."""
+    """Connect to the daemon. Raises LinkMissing, LinkDenied or ServerError. The error names the next step."""
     return Client(args.socket)
 
 
 def statuses(client: Client) -> list[DeviceStatus]:
-    """Ask for the status of every device."""
+    """Return the status of every device."""
     return msgspec.convert(client.status()["devices"], list[DeviceStatus])
 
 
 # --- questions ------------------------------------------------------------------------------------------------------
 
 
-def confirmed(what: str, risk: str, *, yes: bool) -> bool:
-    """Ask on the terminal whether to do something; True at once with `yes`. Say so where it is not done.
+def confirmed(operation: str, risk: str, *, yes: bool) -> bool:
+    """Ask the user on the terminal to confirm an operation. Return True without a question if `yes` is set.
 
-    Raises BadArgument where there is no terminal to ask on.
+    Raises BadArgument if standard input is not a terminal.
     """
     if yes:
         return True
     if not sys.stdin.isatty():
-        raise BadArgument(f"{risk}: expected a terminal to ask on, or --yes")
-    if input(f"{risk}; {what}? [y/N] ").strip().lower() in ("y", "yes"):
+        raise BadArgument(f"{risk}: cannot ask for confirmation without a terminal; confirm with --yes")
+    if input(f"{risk}; {operation}? [y/N] ").strip().lower() in ("y", "yes"):
         return True
-    print("nothing was done")
+    print("imud changed nothing")
     return False
 
 
@@ -130,7 +129,7 @@ def confirmed(what: str, risk: str, *, yes: bool) -> bool:
 
 
 def finite(text: str) -> float:
-    """Read a number. Raises ArgumentTypeError, also for infinity and for what is not a number."""
+    """Parse a finite number. Raises ArgumentTypeError for other texts, infinity and NaN."""
     try:
         number = float(text)
     except ValueError:
@@ -144,7 +143,7 @@ PORT_MAX: Final = 65535
 
 
 def check_port(port: int) -> None:
-    """Check the `--port` of a server, 0 for any. Raises BadArgument."""
+    """Check the `--port` of a server; 0 selects a free port. Raises BadArgument if the port is out of range."""
     if not 0 <= port <= PORT_MAX:
         raise BadArgument(f"--port: expected 0 to {PORT_MAX}, got {port}")
 
@@ -153,11 +152,11 @@ def check_port(port: int) -> None:
 
 
 def duration_s(text: str) -> float:
-    """Read a duration, for example `10min`, `90s` or `2h`; a number alone is seconds. Raises ArgumentTypeError."""
+    """Parse a duration: `10min`, `90s` or `2h`. A number without a unit is in seconds. Raises ArgumentTypeError."""
     found = DURATION.fullmatch(text.strip())
     seconds = float(found[1]) * SECONDS_OF.get(found[2], 0.0) if found is not None else 0.0
-    if not seconds or not isfinite(seconds):  # so many digits that they are infinity
-        raise argparse.ArgumentTypeError(f"expected a duration as 90s, 10min or 2h, got {text!r}")
+    if not seconds or not isfinite(seconds):  # float() returns infinity for more than 308 digits
+        raise argparse.ArgumentTypeError(f"expected a duration, for example 90s, 10min or 2h, got {text!r}")
     return seconds
 
 
@@ -165,7 +164,7 @@ def duration_s(text: str) -> float:
 
 
 def argument(text: str) -> tuple[str, object]:
-    """Parse `name=value`: numbers, true, false, null and lists as in JSON, everything else text. Raises BadArgument."""
+    """Parse `name=value`. The value is JSON if possible, otherwise a string. Raises BadArgument without `=`."""
     name, sign, value = text.partition("=")
     if not name or not sign:
         raise BadArgument(f"expected NAME=VALUE, got {text!r}")
@@ -176,18 +175,18 @@ def argument(text: str) -> tuple[str, object]:
 
 
 def add_option(parser: argparse.ArgumentParser) -> None:
-    """Add an argument that may be given several times."""
+    """Add `--option NAME=VALUE`."""
     parser.add_argument(
         "--option",
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="a setting of the driver, as below `options` in the configuration; may be given several times",
+        help="option of the driver, as in the key `options` of the configuration; repeat for more options",
     )
 
 
 def given_options(driver: "Driver", words: Sequence[str]) -> dict[str, object]:
-    """Check the options; return them by name. Raises BadArgument naming what was expected."""
+    """Return the values of `--option` by name. Raises BadArgument if the driver does not accept a name or a value."""
     options = dict(map(argument, words))
     fields = {field.name: field for field in msgspec.structs.fields(driver.settings)}
     for name, value in options.items():
@@ -199,7 +198,7 @@ def given_options(driver: "Driver", words: Sequence[str]) -> dict[str, object]:
 
 
 def driver_settings(driver: "Driver", options: Mapping[str, object]) -> Options:
-    """Make the driver's settings from these options. Raises BadArgument for options that exclude each other."""
+    """Return the options object of the driver. Raises BadArgument if two options exclude each other."""
     for wrong in wrong_values(driver.settings, options, "option"):
         raise BadArgument(f"--option {wrong}")
     return msgspec.convert(options, driver.settings)
@@ -209,17 +208,16 @@ def driver_settings(driver: "Driver", options: Mapping[str, object]) -> Options:
 
 
 def add_noise(parser: argparse.ArgumentParser) -> None:
-    """Add the option --noise."""
+    """Add `--noise REPORT`."""
     parser.add_argument(
         "--noise", action="append", type=Path, default=[], metavar="REPORT",
-        help="report of `imud noise --json`: its standard deviations become covariances; may be given several times",
+        help="report of `imud noise --json`; imud publishes its standard deviations as covariances; repeat for more "
+        "devices",
     )  # fmt: skip
 
 
-def noise_by_device(reports: Sequence[Path]) -> "dict[str, Deviations]":
-    """Return what reports say, by the name of the device; of two of one device the later wins. Raises ImudError."""
-    # not part of every command's start
-
+def noise_by_device(reports: Sequence[Path]) -> dict[str, Deviations]:
+    """Return the deviations in the reports by device. The last report of a device wins. Raises ImudError."""
     return dict(map(read_noise, reports))
 
 
@@ -227,11 +225,13 @@ def noise_by_device(reports: Sequence[Path]) -> "dict[str, Deviations]":
 
 
 def chosen_fields(text: str) -> tuple[str, ...]:
-    """Return the names in a list separated by commas, in its order. Raises BadArgument for one that is not known."""
+    """Return the field names in a comma-separated list. Raises BadArgument for an unknown or repeated name."""
     names = tuple(name.strip() for name in text.split(","))
     for number, name in enumerate(names):
         if name not in SAMPLE_FIELDS:
-            raise BadArgument(f"--fields: {unknown_name('a field', name, SAMPLE_FIELDS)} (`imud schema` explains them)")
+            raise BadArgument(
+                f"--fields: {unknown_name('a field', name, SAMPLE_FIELDS)}; `imud schema` lists all fields"
+            )
         if name in names[:number]:
             raise BadArgument(f"--fields: expected each field once, got {name} twice")
     return names

@@ -1,4 +1,4 @@
-"""`imud calibrate`: list the calibrations of a device, or be guided through one."""
+"""`imud calibrate`: list the calibrations of a device, or guide the user through one calibration."""
 
 import argparse
 import sys
@@ -18,26 +18,26 @@ from imud.model.units import RAD_PER_DEG
 
 HEAD: Final = ("CALIBRATION", "HANDLING", "RESULT LASTS", "EFFECT")
 LIMIT_S: Final = 600.0
-"""Longer than the daemon lets any calibration run."""
+"""Time limit of the request, s. The daemon stops every calibration earlier."""
 LOOK_S: Final = 0.5
+"""Maximum wait for the next event, s. After that, imud checks for the reply."""
 BAR: Final = 30
-"""Characters of the bar."""
+"""Length of the progress bar, characters."""
 CLEAR_LINE: Final = "\r\x1b[2K"
 T_PER_UT: Final = 1e-6
 
 
 def calibrate_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud calibrate`."""
     add_socket(parser)
-    parser.add_argument("device", metavar="DEVICE")
-    parser.add_argument("kind", nargs="?", metavar="KIND", help="without it: list the calibrations of the device")
-    parser.add_argument("--save", action="store_true", help="save the result when it is verified")
-    parser.add_argument("--yes", action="store_true", help="begin without asking, for scripts")
-    parser.add_argument("--json", action="store_true", help="print events and the result as JSON lines")
+    parser.add_argument("device", metavar="DEVICE", help="name of the device")
+    parser.add_argument("kind", nargs="?", metavar="KIND", help="calibration to run (default: list all calibrations)")
+    parser.add_argument("--save", action="store_true", help="save the result in the device after verification")
+    parser.add_argument("--yes", action="store_true", help="start without a question, for scripts")
+    parser.add_argument("--json", action="store_true", help="print the events and the result as JSON lines")
 
 
 def calibrate(args: argparse.Namespace) -> int:
-    """Guide through a calibration; 0 when it is verified, 1 when it is not. Needs permission to control."""
+    """Run a calibration. Return 0 if imud verified the result, otherwise 1. Requires the right to control devices."""
     with Client(args.socket) as watching:
         found = msgspec.convert(watching.call("calibrations", device=args.device), list[CalibrationInfo])
         if args.kind is None:
@@ -45,11 +45,11 @@ def calibrate(args: argparse.Namespace) -> int:
             return 0
         known = {one.kind: one for one in found}
         if args.kind not in known:
-            raise BadArgument(f"no calibration {args.kind!r}; there are: {', '.join(known) or 'none'}")
+            raise BadArgument(f"unknown calibration {args.kind!r}; {args.device} has: {', '.join(known) or 'none'}")
         if not args.json:
             _instruct(known[args.kind])
         if not args.yes and not _agreed(known[args.kind]):
-            print("nothing was done")
+            print("imud changed nothing")
             return 1
         result = _follow(args, watching)
     print(msgspec.json.encode(result).decode() if args.json else _account(result, asked_to_save=args.save))
@@ -63,16 +63,17 @@ def _instruct(calibration: CalibrationInfo) -> None:
 
 
 def _agreed(calibration: CalibrationInfo) -> bool:
-    """Ask whether to begin. Raises BadArgument where there is no terminal to ask on."""
+    """Ask the user to start. Raises BadArgument if standard input is not a terminal."""
     if not sys.stdin.isatty():
-        raise BadArgument("expected a terminal to ask on, or --yes")
-    doing = "Begin to turn it, and press Enter" if calibration.handling is Handling.TURN else "Press Enter"
-    return input(f"{doing} to begin, or type n: ").strip().lower() in ("", "y", "yes")
+        raise BadArgument("cannot ask for confirmation without a terminal; confirm with --yes")
+    request = "Start to turn the device, then press Enter" if calibration.handling is Handling.TURN else "Press Enter"
+    return input(f"{request} to start the calibration, or type n to cancel: ").strip().lower() in ("", "y", "yes")
 
 
 def _follow(args: argparse.Namespace, watching: Client) -> CalibrationResult:
-    """Run the calibration on a connection of its own, and show its events meanwhile."""
+    """Run the calibration. Print the events of the device until the reply arrives."""
     events = watching.events([args.device], timeout_s=LOOK_S)
+    # a second connection: the request blocks its connection until the calibration ends
     with Client(args.socket, timeout_s=LIMIT_S) as asking, ThreadPoolExecutor(1) as pool:
         reply: Future[object] = pool.submit(
             asking.call, "calibrate", device=args.device, kind=args.kind, save=args.save
@@ -82,7 +83,7 @@ def _follow(args: argparse.Namespace, watching: Client) -> CalibrationResult:
                 with suppress(TimeoutError):
                     _show(next(events), sys.stdout, as_json=args.json)
         finally:
-            if not reply.done():  # interrupted, or nobody reads the progress
+            if not reply.done():  # Ctrl-C, or the reader of standard output closed the pipe
                 watching.call("stop_calibration", device=args.device)
             if not args.json and sys.stdout.isatty():
                 sys.stdout.write("\n")
@@ -90,7 +91,6 @@ def _follow(args: argparse.Namespace, watching: Client) -> CalibrationResult:
 
 
 def _show(event: Event, out: TextIO, *, as_json: bool) -> None:
-    """Show one event of the device, if it is of a calibration."""
     if event.kind is not EventKind.CALIBRATION:
         return
     if as_json:
@@ -98,12 +98,12 @@ def _show(event: Event, out: TextIO, *, as_json: bool) -> None:
     elif out.isatty():
         out.write(CLEAR_LINE + progress_line(event))
         out.flush()
-    elif event.detail.get("phase") != "turn":
+    elif event.detail.get("phase") != "turn":  # several events per second: only for the progress bar
         print(event.message, file=out, flush=True)
 
 
 def progress_line(event: Event) -> str:
-    """Format the progress of turning as a bar with what was measured, other events as their message."""
+    """Format the progress of the rotation as a bar with the measured field. For other events, return the message."""
     progress, field_t, residual = (event.detail.get(name) for name in ("progress", "field_t", "residual"))
     if not isinstance(progress, float):
         return event.message
@@ -117,10 +117,10 @@ def progress_line(event: Event) -> str:
 
 
 def _account(result: CalibrationResult, *, asked_to_save: bool) -> str:
-    """Format the result for people."""
+    """Format the result as text."""
     lines = ["verified" if result.verified else f"NOT verified: {result.problem}"]
     if result.device:
-        lines.append(f"  the device says: {result.device}")
+        lines.append(f"  device reports: {result.device}")
     for check in result.checks:
         mark = "passed" if check.passed else "NOT passed"
         lines.append(
@@ -129,13 +129,13 @@ def _account(result: CalibrationResult, *, asked_to_save: bool) -> str:
     if result.saved:
         lines.append("  saved")
     else:
-        hint = "" if asked_to_save or not result.verified else "; `--save` saves it"
+        hint = "" if asked_to_save or not result.verified else "; save it with --save"
         lines.append(f"  not saved: lasts {result.kept}{hint if result.kept is Kept.BY_SAVE else ''}")
     return "\n".join(lines)
 
 
 def _value(value: float | None, unit: str) -> str:
-    """Format a value in the units that people use."""
+    """Format a value in everyday units."""
     if value is None:
         return "not reported"
     match unit:

@@ -1,4 +1,4 @@
-"""`imud clock`: where the time stamps of each device come from, how good they are, and what limits them."""
+"""`imud clock`: show the source, the error and the limiting cause of each device's time stamps."""
 
 import argparse
 import sys
@@ -19,36 +19,38 @@ from imud.model.sample import Sync
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 KEPT: Final = 2000
-"""Newest samples of a device that the histogram is made of."""
+"""Number of newest samples in the histogram of a device."""
 REFRESH_S: Final = 1.0
 CLEAR: Final = "\x1b[H\x1b[2J"
 ENOUGH: Final = 20
-"""Least number of arrivals for a statement about their spread."""
+"""Minimum number of arrivals for a verdict about their spread."""
 HELD_SHARE: Final = 0.5
-"""An adapter that holds bytes for up to its timer spreads arrivals over most of it."""
-TOO_FEW: Final = "too few samples to say"
+"""Minimum spread of the arrivals, as a share of the latency timer, that the latency timer explains."""
+TOO_FEW: Final = "too few samples for a verdict"
 LOADED_NS: Final = NS_PER_MS
-"""Arrivals of a wire and an idle system spread over some ten microseconds."""
+"""Maximum spread of the arrivals on an idle host, ns. The usual spread is some ten microseconds."""
 EDGES_ENOUGH: Final = 100
-"""Least number of edges for a judgement: the first ones come before their samples can be assigned."""
+"""Minimum number of edges for a verdict. imud cannot assign the first edges to samples."""
 UNPAIRED_SHARE: Final = 0.1
-"""Noise and losses leave less without their match; another wire or a divided pulse leaves half or more."""
+"""Maximum share of edges without a sample. Noise and lost samples cause a smaller share. A wrong wire causes 0.5 or
+more."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud clock`."""
     add_socket(parser)
-    parser.add_argument("device", nargs="*", metavar="DEVICE", help="devices to look at (default: all)")
-    parser.add_argument("--duration", type=finite, metavar="S", help="listen for S seconds, then print once and end")
-    parser.add_argument("--json", action="store_true", help="the clocks once, as the socket sends them")
+    parser.add_argument("device", nargs="*", metavar="DEVICE", help="devices to show (default: all)")
+    parser.add_argument(
+        "--duration", type=finite, metavar="S", help="collect samples for S seconds, then print one report"
+    )
+    parser.add_argument("--json", action="store_true", help="print the clocks once, as the socket reports them")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show the report, live until interrupted; return 1 when no sample came."""
+    """Print the report every second until Ctrl-C, or once after `--duration`. Return 1 if no sample arrived, else 0."""
     with connect(args) as asking:
         chosen = args.device or [status.name for status in statuses(asking)]
         if not chosen and not args.json:
-            raise ImudError("the daemon has no device; `imud setup` finds what is attached and configures it")
+            raise ImudError("the daemon has no device; configure the attached devices with `imud setup`")
         if args.json:
             clocks = {status.name: status.clock for status in statuses(asking) if status.name in chosen}
             print(msgspec.json.encode(clocks).decode())
@@ -64,11 +66,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def listen(client: Client, behind: dict[str, deque[int]], duration_s: float | None) -> Iterator[None]:
-    """Record how long after its measurement each sample was read; yield whenever a report is due.
+    """Append the delay from the measurement to the arrival of each sample to `behind`, ns.
 
-    With a duration it ends then, and nothing is drawn. Reports are due in silence, too.
+    Yield every REFRESH_S, also if no sample arrives. With `duration_s`, return after this time and do not yield.
     """
     begun = drawn = monotonic()
+    # the timeout of `next` causes a report while the device is silent
     samples = client.watch(list(behind), timeout_s=REFRESH_S if duration_s is None else min(REFRESH_S, duration_s))
     while True:
         with suppress(TimeoutError):
@@ -83,14 +86,13 @@ def listen(client: Client, behind: dict[str, deque[int]], duration_s: float | No
 
 
 def page(devices: list[DeviceStatus], behind: dict[str, deque[int]]) -> str:
-    """Format the blocks of all shown devices; those that left the configuration have a line."""
-    gone = [f"{name}: not in the configuration any more" for name in behind if name not in {d.name for d in devices}]
+    """Format a block for each shown device, and a line for each device that the configuration no longer contains."""
+    gone = [f"{name}: no longer in the configuration" for name in behind if name not in {d.name for d in devices}]
     shown = [block(status, behind[status.name]) for status in devices if status.name in behind]
     return "\n\n".join([*shown, *gone])
 
 
 def block(status: DeviceStatus, behind_ns: deque[int]) -> str:
-    """Format the block of one device."""
     clock = status.clock
     lines = [] if status.state is DeviceState.RUNNING else [f"{status.name} is {status.state}: {status.problem}"]
     lines += [
@@ -100,7 +102,7 @@ def block(status: DeviceStatus, behind_ns: deque[int]) -> str:
         f"  host      CLOCK_MONOTONIC is steered by {clock.steering_ppm:+.1f} ppm",
         f"  residual  {clock.residual_ns / NS_PER_US:.1f} µs (one sigma)",
         *(f"  {name:<10}{words}" for name, words in aids(status)),
-        f"  read after measurement, {len(behind_ns)} samples:",
+        f"  delay from measurement to arrival, {len(behind_ns)} samples:",
         *histogram([late_ns / NS_PER_US for late_ns in behind_ns], "µs"),
         f"  verdict   {verdict(clock, behind_ns)}",
     ]
@@ -108,80 +110,86 @@ def block(status: DeviceStatus, behind_ns: deque[int]) -> str:
 
 
 def aids(status: DeviceStatus) -> Iterator[tuple[str, str]]:
-    """List name and text of each aiding source that the device has."""
+    """Yield name and text of each additional time source of the device."""
     clock, lines, utc = status.clock, status.lines, status.utc
     if lines is not None and "sout" in lines.edges:
         yield (
             "SOUT",
             (
-                f"{clock.edges} pulses, {clock.edges_unpaired} belong to no sample;"
-                f" {clock.samples_unpaired} samples without theirs"
+                f"{clock.edges} pulses, {clock.edges_unpaired} without a sample;"
+                f" {clock.samples_unpaired} samples without a pulse"
             ),
         )
     if lines is not None and lines.sin:
-        yield "SIN", f"{lines.triggers} triggers, {clock.triggers_missed} not answered by a sample"
+        yield "SIN", f"{lines.triggers} triggers, {clock.triggers_missed} without a sample"
     if utc is not None and (utc.pulses or utc.pulses_ignored):
-        yield "PPS", f"{utc.pulses} pulses, {utc.pulses_ignored} in step with none"
+        yield "PPS", f"{utc.pulses} pulses, {utc.pulses_ignored} ignored because of their interval"
     if clock.reference_error_ns:
-        yield "UTC", f"the host knows it to {clock.reference_error_ns / NS_PER_US:.1f} µs (one sigma)"
+        yield "UTC", f"error of the host clock {clock.reference_error_ns / NS_PER_US:.1f} µs (one sigma)"
 
 
 def verdict(clock: ClockStatus, behind_ns: Sequence[int]) -> str:
-    """Judge the time stamps. `behind_ns`: delays from the measurement to the read, of the newest samples."""
+    """Return the limiting cause of the time stamp error. `behind_ns`: delays from measurement to arrival."""
     if mistake := miswired(clock):
         return mistake
     error = f"{clock.t_err_ns / NS_PER_US:.1f} µs"
     if clock.sync is Sync.UTC:
-        return f"the device keeps UTC itself; what the host knows of UTC limits: {error}"
+        return f"the device sends UTC; the UTC error of the host limits the time stamps: {error}"
     if clock.sync is Sync.EDGE:
-        return f"limited by the kernel's stamps of the line: {error}"
-    if clock.sync is Sync.ARRIVAL and not clock.t_err_ns:  # no sample came yet
+        return f"the kernel's time stamps of the GPIO line limit the time stamps: {error}"
+    if clock.sync is Sync.ARRIVAL and not clock.t_err_ns:  # t_err_ns is 0 until the first sample arrives
         return TOO_FEW
     if clock.sync is Sync.ARRIVAL:
-        return f"the device's time is not used, so arrivals are all there is: {error}; wire SOUT if it has one"
+        return f"imud uses arrival times only, not the device time: {error}; connect SOUT if the device has this pin"
     return _of_arrivals(clock, sorted(behind_ns))
 
 
 def miswired(clock: ClockStatus) -> str:
-    """Judge the wiring of the lines by their counts since start, in one sentence; empty when they fit the samples."""
+    """Return a wiring problem that the counters of the GPIO lines show; empty if the counters match the samples."""
     edges, most = clock.edges, UNPAIRED_SHARE * clock.edges
     if edges < EDGES_ENOUGH:
         return ""
     if clock.triggers_missed > most:
         return (
-            f"{clock.triggers_missed} triggers on SIN were not answered: is the wire at SIN, is a message sent on mark "
-            "(`output_on_mark`), can the line carry the rate?"
+            f"{clock.triggers_missed} triggers on SIN caused no sample: is the wire connected to SIN, does the device "
+            "send a frame on a trigger (`output_on_mark`), is the baud rate high enough for the rate?"
         )
     if clock.edges_unpaired > most:
         return (
-            f"{clock.edges_unpaired} of {edges} pulses belong to no sample: is the wire at SOUT of this device, "
-            "is its pull-down missing, or are its frames lost?"
+            f"{clock.edges_unpaired} of {edges} pulses have no sample: is the wire connected to SOUT of this device, "
+            "is the pull-down missing, or are frames lost?"
         )
     if clock.samples_unpaired > most:
         return (
-            f"{clock.samples_unpaired} samples came without the pulse of theirs, {edges} pulses in all: "
-            "is the wire at SOUT_DIV, which has one for several samples?"
+            f"{clock.samples_unpaired} samples have no pulse, {edges} pulses in total: "
+            "is the wire connected to SOUT_DIV, which sends one pulse for several samples?"
         )
     if clock.sync in (Sync.ARRIVAL, Sync.REGRESSION):
         return (
-            f"{edges} edges came, and none is matched to a sample now: do they still come, is the wire at SOUT of this "
-            "device, or do its bytes come too late for its rate?"
+            f"{edges} edges in total, but imud cannot match them to samples now: do edges still arrive, is the wire "
+            "connected to SOUT of this device, or do frames arrive too late for the rate?"
         )
     return ""
 
 
 def _of_arrivals(clock: ClockStatus, ordered: Sequence[int]) -> str:
-    """Judge the link by the spread of arrivals."""
+    """Return the verdict for the link from the spread of the arrivals."""
     if len(ordered) < ENOUGH:
         return TOO_FEW
-    spread_ns = ordered[int(0.99 * len(ordered))] - ordered[int(0.01 * len(ordered))]
-    spread = f"arrivals spread over {spread_ns / NS_PER_MS:.1f} ms"
+    spread_ns = ordered[int(0.99 * len(ordered))] - ordered[int(0.01 * len(ordered))]  # without 1 % outliers per side
+    spread = f"the arrivals spread over {spread_ns / NS_PER_MS:.1f} ms"
     if clock.hold_ns and spread_ns >= HELD_SHARE * clock.hold_ns:
         timer = f"{clock.hold_ns / NS_PER_MS:.0f} ms"
-        return f"{spread}: the USB adapter's latency timer of {timer}; `low_latency: true`, another adapter, or SOUT"
+        return (
+            f"{spread} because of the latency timer of the USB adapter, {timer}; set `low_latency: true`, use another "
+            "adapter, or connect SOUT"
+        )
     if spread_ns > LOADED_NS:
-        return f"{spread}, and no latency timer explains it: a loaded system; give imud a higher priority, or wire SOUT"
-    return f"{spread}; the constant delay between measuring and sending stays unseen without SOUT"
+        return (
+            f"{spread}, and a latency timer does not explain it: the host is loaded; give imud a higher priority, or "
+            "connect SOUT"
+        )
+    return f"{spread}; without SOUT, imud cannot measure the constant delay from measurement to transmission"
 
 
 CLOCK = CliCommand(add_arguments, run)

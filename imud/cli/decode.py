@@ -1,8 +1,8 @@
-"""`imud decode`: a capture in, one JSON object per message out, as gpsdecode does for GNSS receivers.
+"""`imud decode`: decode a capture to one JSON object per frame.
 
-A capture is bytes, raw or time-stamped, or for CAN drivers a log of `candump -L`. Objects: a measurement with the field
-names of a sample (`t_dev_ns` unwrapped, or `index` of a device that numbers its samples; no host time),
-`{"text": …}` for a line of text, `{"reply": kind, "payload": hex}` for a binary reply,
+A capture contains bytes, raw or time-stamped. For CAN drivers, the capture is a log of `candump -L`. The objects are:
+a measurement with the field names of a sample (`t_dev_ns` unwrapped, or `index` if the device numbers its samples; no
+host time), `{"text": …}` for a line of text, `{"reply": kind, "payload": hex}` for a binary reply,
 `{"bad_frame": reason, "raw": hex}` for a damaged frame.
 """
 
@@ -27,19 +27,18 @@ from imud.model.options import Options
 from imud.model.sample import Measurement
 
 FIFO_WAIT_MS = 5000
-"""Time for the first bytes of a FIFO."""
+"""Time limit for the first bytes of a FIFO, ms."""
 NOT_SHOWN = {"trailing_bytes", "dev_ticks"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud decode`."""
-    parser.add_argument("--driver", required=True, choices=sorted(DRIVERS), help="wire protocol of the capture")
+    parser.add_argument("--driver", required=True, choices=sorted(DRIVERS), help="driver of the captured device")
     parser.add_argument("file", metavar="FILE", help="capture file, or - for standard input")
     add_option(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Decode to standard output, the ledger to standard error; 1 when no message was found."""
+    """Print the objects to standard output and the ledger to standard error. Return 1 if no frame was found."""
     driver = DRIVERS[args.driver]
     settings = driver_settings(driver, given_options(driver, args.option))
     ledger = Ledger()
@@ -54,19 +53,19 @@ def run(args: argparse.Namespace) -> int:
 
 
 def open_capture(name: str) -> BinaryIO:
-    """Open the file or FIFO, or standard input for `-`. Raises ImudError."""
+    """Open the file or FIFO, or standard input for `-`. Raises ImudError if this fails."""
     try:
         return sys.stdin.buffer if name == "-" else open_stream(name, FIFO_WAIT_MS)
     except NotRegularFile as error:
-        raise ImudError(f"{name} {error.strerror}; `-` reads standard input") from error
+        raise ImudError(f"{name} {error.strerror}; to read standard input, use -") from error
     except OSError as error:
-        raise ImudError(f"{name}: {error.strerror}") from error
+        raise ImudError(f"cannot open {name}: {error.strerror}") from error
 
 
 def decode(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Options | None = None) -> Iterator[str]:
-    """Decode `file` to JSON lines; `settings` default to the driver's own defaults.
+    """Decode `file` to JSON lines. Without `settings`, use the default options of the driver.
 
-    Raises ImudError for a driver without captures, or a file that is no capture.
+    Raises ImudError if the driver does not support captures, or if the file is not a capture.
     """
     times = UnwrappedTime(driver)
     for event in events_in(file, driver, ledger, settings or driver.settings()):
@@ -74,7 +73,7 @@ def decode(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Options | N
 
 
 def events_in(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Options) -> Iterator[CodecEvent]:
-    """Decode a capture to the events of the driver's codec."""
+    """Yield the events of the driver's codec for a capture."""
     if isinstance(driver, StreamDriver):
         codec = driver.make_codec(ledger, settings)
         for _, data in CaptureReader(file):
@@ -89,11 +88,11 @@ def events_in(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Options)
         if log.problem:
             print(log.problem, file=sys.stderr)
     else:
-        raise ImudError(f"{driver.name} has no captures: a device on a polled bus sends nothing by itself")
+        raise ImudError(f"cannot decode a capture of {driver.name}: its devices reply only to requests on a polled bus")
 
 
 def as_object(event: CodecEvent, times: "UnwrappedTime") -> dict[str, object]:
-    """Convert a codec event to the object that is printed."""
+    """Convert a codec event to the printed object."""
     if isinstance(event, TextLine):
         return {"text": event.text}
     if isinstance(event, ReplyFrame):
@@ -111,18 +110,18 @@ def as_object(event: CodecEvent, times: "UnwrappedTime") -> dict[str, object]:
 
 
 class UnwrappedTime:
-    """Unwrapped device time without a host clock: a step back by more than half the range is a rollover."""
+    """Unwrapped device time without a host clock. A step back by more than half of the range is a rollover."""
 
     def __init__(self, driver: Driver) -> None:
         self._driver = driver
         self._tick = 1 if driver.tick_ns == SAMPLE_COUNTER else driver.tick_ns
         self.key = "index" if driver.tick_ns == SAMPLE_COUNTER else "t_dev_ns"
-        """Field name of the unwrapped ticks: device time in ns, or the number of the sample."""
+        """Field name of the unwrapped counter: `t_dev_ns` for device time, `index` for a sample counter."""
         self._last: int | None = None
         self._turns = 0
 
     def unwrap(self, ticks: int) -> int:
-        """Device time in ns since the device's zero, or the sample's number."""
+        """Return the device time since the zero of the counter, ns, or the index of the sample."""
         modulus = self._driver.tick_modulus
         if self._last is not None and self._last - ticks > modulus // 2:
             self._turns += 1

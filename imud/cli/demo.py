@@ -1,7 +1,7 @@
-"""`imud demo`: the real daemon on a simulated sensor behind a real pty or CAN interface, watched by a real client.
+"""`imud demo`: run the daemon with a simulated device behind a pty or a CAN interface, and show its samples.
 
-Three processes: the simulator plays the module, `imud run` owns its port, and this one is a client that
-shows what arrives. At the end it prints rates, latency and the ledger.
+The demo uses three processes: the simulator, `imud run`, and this client. At the end, the client prints the rate, the
+latency and the ledger.
 """
 
 import argparse
@@ -35,12 +35,13 @@ from imud.sim.ports.can_port import default_interface
 
 DRAW_NS = NS_PER_S // 10
 LATENCIES_KEPT = 100_000
+"""Number of newest latencies in the percentiles."""
 CLEAR_LINE = "\x1b[2K"
 UP = "\x1b[{}A"
 
 
 class View:
-    """View of one device: counts samples and their latency, and draws the newest ten times a second."""
+    """View of the samples: counts samples and latencies, and draws the newest sample ten times per second."""
 
     def __init__(self, out: TextIO, *, live: bool) -> None:
         self.samples = 0
@@ -52,11 +53,11 @@ class View:
         self._first_ns = 0
         self._last: Sample | None = None
         self._seqs: dict[str, int] = {}
-        """Number of the newest sample of each device."""
+        """Sequence number of the newest sample of each device."""
         self._latencies_ns: deque[int] = deque(maxlen=LATENCIES_KEPT)
 
     def add(self, sample: Sample) -> None:
-        """Count and draw one sample as it arrives."""
+        """Count one sample. Draw the sample if the next redraw is due."""
         now_ns = monotonic_ns()
         if self._last is None:
             self._first_ns = sample.t_ns
@@ -70,22 +71,23 @@ class View:
             self._draw(sample)
 
     def end(self) -> None:
-        """Leave the last picture on the terminal."""
-        self._drawn_lines = 0
+        """Keep the last drawing on the terminal."""
+        self._drawn_lines = 0  # the next output does not move the cursor up
         self._out.flush()
 
     def account(self) -> str:
-        """Format rate, losses and latency as this client saw them."""
+        """Format the rate, the lost samples and the latency of this client."""
         if self._last is None:
             return "  client    no sample arrived"
         span_ns = self._last.t_ns - self._first_ns
+        # n samples of a device span n - 1 periods
         rate = (self.samples + self.missed - len(self._seqs)) * NS_PER_S / span_ns if span_ns else 0.0
         ordered = sorted(self._latencies_ns)
         at = {
             share: ordered[min(len(ordered) - 1, int(share * len(ordered)))] / NS_PER_US for share in (0.5, 0.99, 1.0)
         }
         return (
-            f"  client    {self.samples} samples at {rate:.2f} Hz, {self.missed} missed; from the port to this client "
+            f"  client    {self.samples} samples at {rate:.2f} Hz, {self.missed} lost; delay from port to client "
             f"p50 {at[0.5]:.0f} µs, p99 {at[0.99]:.0f} µs, max {at[1.0]:.0f} µs"
         )
 
@@ -98,10 +100,10 @@ class View:
 
 
 def picture(sample: Sample) -> list[str]:
-    """Format the newest sample in everyday units."""
+    """Format a sample in everyday units."""
     degrees, rates = _in(sample.euler_rad, RAD_PER_DEG), _in(sample.gyro_rad_s, RAD_PER_DEG)
     return [
-        f"{sample.device} #{sample.seq}   stamp by {sample.sync}, ±{sample.t_err_ns / NS_PER_MS:.3f} ms",
+        f"{sample.device} #{sample.seq}   time stamp by {sample.sync}, ±{sample.t_err_ns / NS_PER_MS:.3f} ms",
         f"  roll pitch yaw  {degrees} °",
         f"  gyro            {rates} °/s",
         f"  accel           {_in(sample.accel_m_s2, 1.0)} m/s²",
@@ -114,47 +116,50 @@ def _in(vector: tuple[float, float, float] | None, unit: float) -> str:
 
 
 Devices = dict[str, dict[str, object]]
-"""The configuration of each device by its name."""
+"""Configuration of each device, by name."""
 
 METRICS_ADDRESS = "127.0.0.1"
 METRICS_PORT = 9321
 START_LIMIT_S = 10.0
 STOP_LIMIT_S = 5.0
 FOUND_LIMIT_S = 10.0
-"""Cold detection takes under two seconds; a loaded machine gets five times that."""
+"""Time limit of the detection, s. Detection takes less than 2 s on an idle host."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud demo`."""
     parser.add_argument(
         "--device",
         action="append",
         type=wanted_device,
         metavar="NAME[:NODE]",
-        help=f"what to simulate ({DEVICE}), one of {', '.join(sorted([*SIMULATORS, *CAN_SIMULATORS]))}; "
-        "several times for several devices on one CAN interface; "
-        "or imu61x-i2c, imu61x-spi: a real one, on --bus or --port",
+        help=f"simulated device (default: {DEVICE}), one of {', '.join(sorted([*SIMULATORS, *CAN_SIMULATORS]))}; "
+        "repeat for several devices on one CAN interface; "
+        "imu61x-i2c and imu61x-spi: a real device, with --bus or --port",
     )
-    parser.add_argument("--bus", type=int, metavar="N", help="I2C bus that a real device hangs on: 1 for /dev/i2c-1")
-    parser.add_argument("--port", metavar="NODE", help="SPI bus and chip select of a real device: /dev/spidev0.0")
-    parser.add_argument("--interface", metavar="NAME", help="CAN interface of a CAN device (the first that is up)")
+    parser.add_argument("--bus", type=int, metavar="N", help="I2C bus of a real device, for example 1 for /dev/i2c-1")
+    parser.add_argument(
+        "--port", metavar="NODE", help="SPI bus and chip select of a real device, for example /dev/spidev0.0"
+    )
+    parser.add_argument(
+        "--interface", metavar="NAME", help="CAN interface of CAN devices (default: the first interface that is up)"
+    )
     parser.add_argument("--duration", type=finite, metavar="S", help="stop after S seconds (default: at Ctrl-C)")
     parser.add_argument(
-        "--rate", type=finite, default=100.0, metavar="HZ", help="samples a second (default: %(default)s)"
+        "--rate", type=finite, default=100.0, metavar="HZ", help="samples per second (default: %(default)s)"
     )
-    parser.add_argument("--plain", action="store_true", help="no live view, only the account at the end")
+    parser.add_argument("--plain", action="store_true", help="print the summary at the end, no live view")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the demo; return 0 when samples flowed and the ledger closed."""
+    """Run the demo. Return 0 if samples arrived and the ledger balances, otherwise 1."""
     wanted: list[tuple[str, int]] = args.device or [(DEVICE, 0)]
     if any(bus_of(name) for name, _ in wanted):
         return run_on_bus(wanted, args)
     on_can = [name in CAN_SIMULATORS for name, _ in wanted]
     if len(wanted) > 1 and not all(on_can):
-        raise ImudError("expected one device on a port, or one or more on a CAN bus")
+        raise ImudError("several devices: expected CAN devices only; simulate one device of another kind at a time")
     if len({*wanted}) < len(wanted):
-        raise ImudError("expected devices that differ, for example --device imu61x-can:101 --device imu61x-can:201")
+        raise ImudError("expected different devices, for example --device imu61x-can:101 --device imu61x-can:201")
     interface = (args.interface or default_interface()) if all(on_can) else ""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-demo-")))
@@ -165,25 +170,25 @@ def run(args: argparse.Namespace) -> int:
 
 
 def wanted_device(text: str) -> tuple[str, int]:
-    """Parse `--device` to name and node. Raises ArgumentTypeError."""
+    """Parse `--device` to name and node. Raises ArgumentTypeError if the device or the node is unknown."""
     return (text, 0) if bus_of(text) else simulated(text)
 
 
 def bus_of(name: str) -> str:
-    """Return `i2c` or `spi` for a driver of a bus without a simulator, otherwise an empty string."""
+    """Return `i2c` or `spi` if the driver uses such a bus, which has no simulator. Otherwise return an empty string."""
     driver = DRIVERS.get(name)
     return driver.link if isinstance(driver, PolledDriver) and driver.link in ("i2c", "spi") else ""
 
 
 def run_on_bus(wanted: list[tuple[str, int]], args: argparse.Namespace) -> int:
-    """Run the daemon on a bus of this machine with the device that is there; nothing is simulated. As `run`."""
+    """Run the daemon with a real device on an I2C or SPI bus of this host. Return the exit status."""
     name, bus = wanted[0][0], bus_of(wanted[0][0])
     if len(wanted) > 1:
-        raise ImudError(f"expected {name} alone, got {len(wanted)} devices")
+        raise ImudError(f"expected {name} as the only device, got {len(wanted)} devices")
     key, value = ("bus", args.bus) if bus == "i2c" else ("port", args.port)
     if value is None:
         example = "--bus 1" if bus == "i2c" else "--port /dev/spidev0.0"
-        raise ImudError(f"{name} is not simulated: say where a real one is, for example {example}")
+        raise ImudError(f"cannot simulate {name}; name the bus of a real device, for example {example}")
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-demo-")))
         real: dict[str, object] = {"driver": name, bus: {key: value, "rate_hz": args.rate}}
@@ -191,16 +196,17 @@ def run_on_bus(wanted: list[tuple[str, int]], args: argparse.Namespace) -> int:
 
 
 def watch_daemon(stack: ExitStack, folder: Path, devices: Devices, args: argparse.Namespace) -> int:
-    """Start the daemon, print how to reach it, and show its samples. Returns the exit status."""
+    """Start the daemon, print commands that use the daemon, and show the samples. Return the exit status."""
     port = free_port()
     stack.enter_context(daemon(folder, devices, port))
     path = folder / "imud.sock"
-    print(f"daemon at {path}; in another terminal:\n{commands(folder, next(iter(devices)), port)}\n", flush=True)
+    words = commands(folder, next(iter(devices)), port)
+    print(f"socket of the daemon: {path}; try in another terminal:\n{words}\n", flush=True)
     return show(path, args)
 
 
 def commands(folder: Path, device: str, port: int) -> str:
-    """List commands to paste into another terminal: they reach this daemon from any directory."""
+    """Return commands for another terminal. The commands work in any directory."""
     python = shlex.quote(sys.executable)
     beside = Path(sys.executable).with_name("imud")
     imud = shlex.quote(str(beside)) if beside.exists() else f"{python} -m imud"
@@ -217,7 +223,7 @@ def commands(folder: Path, device: str, port: int) -> str:
 
 
 def free_port() -> int:
-    """Choose the documented port of metrics, or another one that is free."""
+    """Return the documented port of the metrics if it is free, otherwise another free port."""
     for port in (METRICS_PORT, 0):
         with suppress(OSError), socket.create_server((METRICS_ADDRESS, port)) as server:
             return int(server.getsockname()[1])
@@ -225,7 +231,7 @@ def free_port() -> int:
 
 
 def show(path: Path, args: argparse.Namespace) -> int:
-    """Show samples until the time is over or a signal ends it, then print the account. Returns the exit status."""
+    """Show samples until the duration ends or a signal arrives, then print the summary. Return the exit status."""
     view = View(sys.stdout, live=not args.plain and sys.stdout.isatty())
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -237,20 +243,20 @@ def show(path: Path, args: argparse.Namespace) -> int:
                     break
     except KeyboardInterrupt:
         pass
-    with Client(str(path)) as client:
+    with Client(str(path)) as client:  # the first connection may contain unread samples
         found = statuses(client)
     view.end()
     for status in found:
         print(block(status))
     print(view.account())
     good = view.samples > 0 and all(status.ledger["samples"] > 0 and closes(status.ledger) for status in found)
-    print("the ledger closes to zero" if good else "FAILED: no samples, or a ledger that does not close")
+    print("the ledger balances" if good else "FAILED: no samples arrived, or the ledger does not balance")
     return 0 if good else 1
 
 
 @contextmanager
 def simulator(folder: Path, devices: list[tuple[str, int]], rate_hz: float, interface: str) -> Iterator[None]:
-    """Start the simulated sensor with its port at `folder`/port, or sensors on a CAN interface."""
+    """Run the simulator during the context: one device with the port `folder`/port, or devices on a CAN interface."""
     argv = [
         sys.executable,
         "-m",
@@ -265,13 +271,13 @@ def simulator(folder: Path, devices: list[tuple[str, int]], rate_hz: float, inte
     ]
     with child(argv, "the simulator", stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
-        if not process.stdout.readline():
-            raise ImudError(f"the simulator ended with status {process.wait()} before it had a port")
+        if not process.stdout.readline():  # the simulator prints one line when its port exists
+            raise ImudError(f"the simulator ended with status {process.wait()} before it opened its port")
         yield
 
 
 def device(folder: Path, name: str, interface: str, node: int = 0) -> dict[str, object]:
-    """Write the configuration of a simulated device."""
+    """Return the configuration of a simulated device."""
     if interface:
         driver = DRIVERS[name]
         options = msgspec.to_builtins(driver.node_settings(node)) if isinstance(driver, CanDriver) and node else {}
@@ -283,7 +289,7 @@ def device(folder: Path, name: str, interface: str, node: int = 0) -> dict[str, 
 
 @contextmanager
 def daemon(folder: Path, devices: Devices, port: int) -> Iterator[None]:
-    """Start `imud run` on the simulated devices, with everything it needs below `folder`."""
+    """Run `imud run` during the context, with its files in `folder`."""
     tree = {
         "log_level": "error",
         "state_dir": str(folder),
@@ -298,20 +304,20 @@ def daemon(folder: Path, devices: Devices, port: int) -> Iterator[None]:
         end = monotonic() + START_LIMIT_S
         while not (folder / "imud.sock").exists():
             if process.poll() is not None:
-                raise ImudError(f"the daemon ended with status {process.returncode} at its start")
+                raise ImudError(f"the daemon ended during its start with status {process.returncode}")
             if monotonic() > end:
-                raise LinkMissing(f"the daemon opened no socket within {START_LIMIT_S:.0f} s")
+                raise LinkMissing(f"the daemon did not open its socket within {START_LIMIT_S:.0f} s")
             sleep(0.01)
         yield
 
 
 @contextmanager
 def child(argv: list[str], name: str, **options: int) -> Iterator[subprocess.Popen[str]]:
-    """Start a child process that does not receive Ctrl-C and is ended with this one."""
+    """Run a child process during the context. The child does not receive Ctrl-C."""
     environment = dict(os.environ, PYTHONUNBUFFERED="1")
     with subprocess.Popen(
         argv, stdin=subprocess.PIPE, text=True, env=environment, start_new_session=True, **options
-    ) as process:  # type: ignore[call-overload]  # the overloads do not know a mapping of options
+    ) as process:  # type: ignore[call-overload]  # the overloads of Popen do not accept a mapping of options
         try:
             yield process
         finally:
@@ -320,7 +326,7 @@ def child(argv: list[str], name: str, **options: int) -> Iterator[subprocess.Pop
                 process.wait(STOP_LIMIT_S)
             except subprocess.TimeoutExpired:
                 process.kill()
-                print(f"{name} had to be killed", file=sys.stderr)
+                print(f"{name} did not stop within {STOP_LIMIT_S:.0f} s; imud killed it", file=sys.stderr)
 
 
 DEMO = CliCommand(add_arguments, run)

@@ -1,4 +1,4 @@
-"""`imud devices`: one line per device of the running daemon; `imud command`: list and carry out actions of one."""
+"""`imud devices`: list the devices of the running daemon. `imud command`: list or run the actions of a device."""
 
 import argparse
 from typing import Final
@@ -12,16 +12,15 @@ from imud.contracts.command import ActionInfo
 
 HEAD: Final = ("DEVICE", "STATE", "RATE HZ", "DRIVER", "PRODUCT", "SERIAL NUMBER", "LINK")
 LIMIT_S: Final = 180.0
-"""The longest action, a calibration with its status asked again and again, ends within two minutes."""
+"""Time limit of an action, s. The longest action, a calibration, ends within two minutes."""
 
 
 def devices_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud devices`."""
     add_socket(parser)
 
 
 def devices(args: argparse.Namespace) -> int:
-    """Print the table; 1 when no device is running."""
+    """Print one line per device. Return 1 if no device is running, otherwise 0."""
     with connect(args) as client:
         found = statuses(client)
     rows = [
@@ -41,16 +40,17 @@ def devices(args: argparse.Namespace) -> int:
 
 
 def command_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud command`."""
     add_socket(parser)
-    parser.add_argument("device", metavar="DEVICE")
-    parser.add_argument("name", nargs="?", metavar="ACTION", help="without it: list the actions of the device")
-    parser.add_argument("arguments", nargs="*", default=[], metavar="NAME=VALUE", help="as the list says")
-    parser.add_argument("--yes", action="store_true", help="do not ask before an action that cannot be taken back")
+    parser.add_argument("device", metavar="DEVICE", help="name of the device")
+    parser.add_argument("name", nargs="?", metavar="ACTION", help="action to run (default: list all actions)")
+    parser.add_argument(
+        "arguments", nargs="*", default=[], metavar="NAME=VALUE", help="parameter of the action, as in the list"
+    )
+    parser.add_argument("--yes", action="store_true", help="do not ask before an action that cannot be undone")
 
 
 def command(args: argparse.Namespace) -> int:
-    """Print the list or the answer. All but the list needs permission to control."""
+    """Print the list of actions, or run an action and print its reply. An action requires the right to control."""
     with Client(args.socket, timeout_s=LIMIT_S) as client:
         known = msgspec.convert(client.call("actions", device=args.device), list[ActionInfo])
         if args.name is None:

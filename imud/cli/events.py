@@ -1,9 +1,9 @@
-"""`imud events`: print events as they come, each with its local time and priority.
+"""`imud events`: print new events with local time and priority.
 
     2026-11-23T14:05:09.123+01:00 warning bow: down: the adapter was pulled out
 
 The priority is the log level of this kind of event in the daemon (`imud.model.event.LEVELS`), a name of syslog(3).
-What happened before the command began is not sent: `imud status` shows what it led to, and the journal has all of it.
+The daemon does not send events from before the start of the command. The journal contains these events.
 """
 
 import argparse
@@ -25,9 +25,9 @@ from imud.model.errors import LinkMissing, ServerError
 from imud.model.event import LEVELS, Event
 
 RETRY_S: Final = 1.0
-"""Time between two attempts to connect: a restart of the service takes about two."""
+"""Time between two attempts to connect, s. A restart of the service takes about 2 s."""
 LOOK_S: Final = 2.0
-"""Time between two looks at the states of the watched devices, and how long a silence is waited for at once."""
+"""Time between two checks of the device states, and maximum wait for the next sample or event, s."""
 
 
 def keep_connected(
@@ -38,10 +38,10 @@ def keep_connected(
     follow: bool,
     wait: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Connect to the daemon at `path` and do the work; with `follow` again after each loss of the daemon, until done.
+    """Connect to the daemon at `path` and call `work`. With `follow`, wait for a daemon and connect again after a loss.
 
-    Where no daemon is there, `follow` waits for one. Raises LinkMissing and ServerError (a daemon that does not answer)
-    without `follow`; always LinkDenied, other ServerErrors, and BrokenPipeError when nobody reads the output any more.
+    Without `follow`, raises LinkMissing if no daemon runs, and ServerError if the daemon does not reply. Raises
+    LinkDenied, other ServerErrors, and BrokenPipeError if the reader of the output closed the pipe.
     """
     reason = ""
     while True:
@@ -65,19 +65,18 @@ def keep_connected(
 
 
 class DeviceLister(Protocol):
-    """What lists the devices of a daemon, as `imud.client.Client` does."""
+    """Source of the devices of a daemon: `imud.client.Client`, or a replacement in tests."""
 
     def devices(self) -> Sequence[Mapping[str, Any]]:
-        """Each with its name, state and problem."""
+        """Return name, state and problem of each device."""
         ...
 
 
 class DeviceNotes:
-    """Lines on standard error for devices that are watched and send no samples now, and for samples that were dropped
-    because the output was read too slowly."""
+    """Notes on standard error about watched devices without samples, and about dropped samples."""
 
     def __init__(self, client: DeviceLister, names: Sequence[str]) -> None:
-        """No `names` are all devices."""
+        """`names`: the watched devices; empty for all devices."""
         self._client = client
         self._names = list(names)
         self._due_s = 0.0
@@ -85,78 +84,75 @@ class DeviceNotes:
         self._dropped: dict[str, int] = {}
 
     def add_dropped(self, device: str, count: int) -> None:
-        """Note samples that the daemon dropped; they are reported with the next look."""
+        """Count samples that the daemon dropped. The next `look` reports them."""
         self._dropped[device] = self._dropped.get(device, 0) + count
 
     def look(self, now_s: float) -> None:
-        """Ask for the devices, once in LOOK_S at most, and note what has changed."""
+        """Request the device states, at most once per LOOK_S, and print the changes."""
         if now_s < self._due_s:
             return
         self._due_s = now_s + LOOK_S
         found = {str(device["name"]): device for device in self._client.devices()}
         for name in self._names or sorted({*found, *self._noted}):
-            words = _why_silent(found[name]) if name in found else "not in the configuration any more"
+            words = _why_silent(found[name]) if name in found else "no longer in the configuration"
             if words != self._noted.get(name, ""):
                 complain(f"imud watch: {name} is {words or 'running'}")
             self._noted[name] = words
         for name, count in self._dropped.items():
-            complain(f"imud watch: {count} samples of {name} were dropped: they were read too slowly")
+            complain(f"imud watch: the daemon dropped {count} samples of {name} because imud watch was too slow")
         self._dropped.clear()
 
 
 def _why_silent(device: Mapping[str, Any]) -> str:
-    """Describe state and problem of a device; empty for one that runs."""
+    """Describe state and problem of a device. Empty if the device runs."""
     state, problem = device["state"], device["problem"]
     return "" if state == DeviceState.RUNNING else f"{state}: {problem}" if problem else str(state)
 
 
 PRIORITIES: Final = {"warning": logging.WARNING, "info": logging.INFO, "debug": logging.DEBUG}
-"""Priorities by name, the most important first."""
+"""Log levels by the name of the priority, the highest priority first."""
 DAEMON: Final = "imud"
-"""Shown as the device of events of the daemon itself."""
+"""Printed device name for events of the daemon itself."""
 
 
 class PrintedEvent(msgspec.Struct, frozen=True, omit_defaults=True):
-    """An event as `--json` prints it: as the socket sends it, with its time and its priority."""
+    """Output of `--json`: an event as the socket sends it, with local time and priority."""
 
     time: str
-    """Local time with its offset from UTC, ISO 8601."""
+    """Local time with the offset from UTC, ISO 8601."""
     priority: str
     t_ns: int
-    """CLOCK_MONOTONIC when it was noticed."""
+    """CLOCK_MONOTONIC when the daemon noticed the event, ns."""
     device: str
-    """Empty for the daemon itself."""
+    """Empty for events of the daemon itself."""
     kind: str
     message: str
     detail: dict[str, str | int | float | bool | None] = {}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud events`."""
     add_socket(parser)
     parser.add_argument(
         "--device", action="append", default=[], metavar="DEVICE",
-        help="events of this device and of the daemon itself; may be given several times (default: of all)",
+        help="print events of this device and of the daemon; repeat for more devices (default: all devices)",
     )  # fmt: skip
     parser.add_argument(
         "--priority", choices=list(PRIORITIES), default="debug",
-        help="events of this priority and of more important ones (default: %(default)s, which are all)",
+        help="lowest printed priority (default: %(default)s, which prints all events)",
     )  # fmt: skip
-    parser.add_argument("--json", action="store_true", help="one JSON object per line")
+    parser.add_argument("--json", action="store_true", help="print one JSON object per line")
     parser.add_argument("--count", type=int, default=None, metavar="N", help="stop after N events")
-    parser.add_argument(
-        "--follow", action="store_true", help="wait for the daemon where it does not run, and go on after its restarts"
-    )
+    parser.add_argument("--follow", action="store_true", help="wait for the daemon, and continue after its restarts")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print until interrupted, until N events came, or until the daemon ends; with `--follow` also after that."""
+    """Print events until Ctrl-C, until `--count` events, or until the daemon stops. `--follow` survives restarts."""
     keep_connected("imud events", args.socket, _Printer(args).work, follow=args.follow)
     return 0
 
 
 class _Printer:
-    """What goes on from one connection to the next."""
+    """State of the command, across several connections."""
 
     def __init__(self, args: argparse.Namespace) -> None:
         self._args = args
@@ -171,7 +167,7 @@ class _Printer:
         while self._left is None or self._left > 0:
             try:
                 event = next(events)
-            except TimeoutError:  # nothing happens
+            except TimeoutError:  # no event for LOOK_S: without a write, only this check finds a closed pipe
                 raise_if_unread()
                 continue
             if level_of(event) < self._least:
@@ -183,12 +179,12 @@ class _Printer:
 
 
 def level_of(event: Event) -> int:
-    """Return the level with which the daemon logs events of this kind; that of a warning for a kind that is unknown."""
+    """Return the log level of this kind of event in the daemon; WARNING for an unknown kind."""
     return LEVELS.get(event.kind, logging.WARNING)
 
 
 def printed(event: Event, utc_offset_ns: int) -> PrintedEvent:
-    """Add time and priority to an event; `utc_offset_ns` is CLOCK_REALTIME minus CLOCK_MONOTONIC."""
+    """Add local time and priority to an event. `utc_offset_ns` is CLOCK_REALTIME minus CLOCK_MONOTONIC."""
     level = level_of(event)
     priority = next(name for name, least in PRIORITIES.items() if level >= least)
     when = local_time(event.t_ns + utc_offset_ns).isoformat(timespec="milliseconds")

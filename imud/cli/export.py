@@ -27,6 +27,7 @@ from imud.cli.export_sources import (
     CsvSink,
     Exported,
     ExportFeed,
+    McapSink,
     Progress,
     Sink,
     export_capture,
@@ -231,9 +232,11 @@ def _sink(args: argparse.Namespace, file: BinaryIO, out: ExportFile, *, is_recor
         return CsvSink(out, args.table or "samples", args.fields, without_times=times is KnownTimes.NONE)
     try:
         from imud.bridges.mcap import McapFile
-        from imud.cli.export_sources import McapSink
     except ModuleNotFoundError as error:
-        raise BadArgument(f"--to mcap: it needs {error.name}: pip install 'imud[export]'") from None
+        library = (error.name or "a library").partition(".")[0]
+        raise BadArgument(
+            f"--to mcap: cannot import {library}; install the extra: pip install 'imud[export]'"
+        ) from None
     dialect = Ros2Dialect() if args.schema == "ros2" else JsonDialect()
     convention = _convention(args)
     assert convention is not None

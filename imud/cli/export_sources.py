@@ -10,7 +10,7 @@ from fcntl import F_SETPIPE_SZ, fcntl
 from operator import attrgetter
 from pathlib import Path
 from time import monotonic
-from typing import IO, Any, BinaryIO, Final, NamedTuple, Protocol, TextIO
+from typing import IO, TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple, Protocol, TextIO
 
 import msgspec
 
@@ -27,7 +27,6 @@ from imud.bridges.channel import (
     RecordedDiagnosis,
     StampedEvent,
 )
-from imud.bridges.mcap import McapChannel, McapFile
 from imud.cli.output import paragraph
 from imud.cli.replay import device_block, play_to_end
 from imud.contracts.driver import CanDriver, Driver
@@ -46,6 +45,9 @@ from imud.model.options import Options
 from imud.model.sample import SAMPLE_FIELDS, Sample
 from imud.recording.capture_player import CapturePlayer, KnownTimes
 from imud.recording.player import PlayedDevice, Player, RecordedEvent
+
+if TYPE_CHECKING:  # imports libraries of the extra `export`, which CSV does not need
+    from imud.bridges.mcap import McapChannel, McapFile
 
 CSV_BYTES: Final = 1 << 16
 """Text that is gathered before it is written."""
@@ -274,12 +276,6 @@ def main(path: str, devices: Sequence[str]) -> None:
             sink.end(ERROR, str(error))
 
 
-if __name__ == "__main__":
-    try:
-        main(sys.argv[1], sys.argv[2:])
-    except (BrokenPipeError, KeyboardInterrupt):  # who started it has ended
-        sys.stdout = None  # nothing is flushed at the end
-
 EVERY_S: Final = 0.2
 """Time between two pictures."""
 LOOK_SAMPLES: Final = 2000
@@ -465,7 +461,7 @@ class McapSink:
 
     def __init__(
         self,
-        file: McapFile,
+        file: "McapFile",
         dialect: Dialect,
         convention: Convention,
         fields: Collection[str] | None,
@@ -549,7 +545,7 @@ class McapSink:
             if wanted is None or described.fields & set(wanted)
         ]
 
-    def _open(self, described: MessageChannel[Sample]) -> McapChannel:
+    def _open(self, described: MessageChannel[Sample]) -> "McapChannel":
         channel = self._shared.get(described.topic)
         if channel is None:
             channel = self._shared[described.topic] = self._file.add_channel(described)
@@ -560,7 +556,7 @@ class _SampleChannel:
     """A channel of samples, opened with its first message."""
 
     def __init__(
-        self, described: MessageChannel[Sample], open_: Callable[[MessageChannel[Sample]], McapChannel]
+        self, described: MessageChannel[Sample], open_: "Callable[[MessageChannel[Sample]], McapChannel]"
     ) -> None:
         self._described = described
         self._encode = described.encode
@@ -578,3 +574,10 @@ class _SampleChannel:
         if self._channel is None:
             self._channel = self._open(self._described)
         self._channel.add_run(times_ns, messages)
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1], sys.argv[2:])
+    except (BrokenPipeError, KeyboardInterrupt):  # the parent process has ended
+        sys.stdout = None  # prevents a flush at exit, which would fail

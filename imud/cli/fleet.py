@@ -1,4 +1,4 @@
-"""`imud fleet`: collect what the gateways of a broker send, or show them all in the terminal."""
+"""`imud fleet`: collect the data of all gateways of an MQTT broker, or show the gateways in the terminal."""
 
 import argparse
 import asyncio
@@ -36,11 +36,11 @@ TOP_HEAD: Final = (
 )
 NOT_SET: Final = "not set"
 RATE_NS: Final = 5 * NS_PER_S
-"""Rates are over so much time."""
+"""Time over which imud measures rates, ns."""
 
 
 class FleetOverview:
-    """What is shown of the gateways of a fleet. Synchronization: one thread."""
+    """Table of the gateways of a fleet. Synchronization: one thread."""
 
     def __init__(
         self, fleet: Fleet, now_ns: Callable[[], int] = monotonic_ns, utc_ns: Callable[[], int] = time_ns
@@ -49,14 +49,14 @@ class FleetOverview:
         self._fleet = fleet
         self._now_ns, self._utc_ns = now_ns, utc_ns
         self._counts: dict[tuple[str, Stream], deque[tuple[int, int]]] = {}
-        """Samples that came, by gateway and stream: when, and how many."""
+        """Arrival time and number of received samples, by gateway and stream."""
         self._newest_ns: dict[str, int] = {}
         self._error_ns: dict[str, int] = {}
         self._clocks: dict[str, GatewayClock] = {}
-        """What the last message of each gateway said of its wall clock."""
+        """State of the wall clock of each gateway, from its newest message."""
 
     def add(self, batch: FleetBatch) -> None:
-        """Note what came."""
+        """Process a received batch."""
         message = batch.message
         name = message.gateway
         if message.clock is not None:
@@ -70,7 +70,7 @@ class FleetOverview:
             self._error_ns[name] = max(errors)
 
     def text(self) -> str:
-        """The table, those that are away first, and below it how many there are and what is wrong with the broker."""
+        """Format the table, offline gateways first, and a summary with the problem of the broker connection."""
         fleet = self._fleet
         if not fleet.states:
             return f"no gateway yet; {fleet.problem or 'connected'}"
@@ -102,14 +102,14 @@ class FleetOverview:
         )
 
     def _utc_text(self, name: str, state: GatewayState) -> str:
-        """The error of a gateway's wall clock, by what came last; nothing of one that does not speak of it."""
+        """Format the error of a gateway's wall clock; `-` if the gateway does not report it."""
         clock = self._clocks.get(name, state.clock)
         if clock is None or (clock.synchronised and clock.error_ns is None):
             return "-"
         return f"{clock.error_ns / NS_PER_MS:.3g}" if clock.synchronised and clock.error_ns is not None else NOT_SET
 
     def _rate_hz(self, name: str) -> float:
-        """Samples a second that came, or that statistics and status count: the same samples can be in both streams."""
+        """Return the received samples per second. Both streams can count the same samples: take the larger rate."""
         begin_ns, most = self._now_ns() - RATE_NS, 0
         for stream in (Stream.SAMPLES, Stream.STATISTICS):
             counts = self._counts.get((name, stream), deque())
@@ -130,25 +130,26 @@ class _Screen(Protocol):
 
 
 class _Lines:
-    """One text after another."""
+    """Output of one text after another."""
 
     def show(self, text: str) -> None:
         print(text, flush=True)
 
-    def close(self) -> None:
-        """No-op."""
+    def close(self) -> None: ...
 
 
 class _Redrawn:
-    """Each text in the place of the one before, by rich. Raises BadArgument without the extra `top`."""
+    """Full-screen output: each text replaces the previous text. Raises BadArgument without the extra `top`."""
 
     def __init__(self) -> None:
         try:
             from rich.live import Live
             from rich.text import Text
         except ModuleNotFoundError as error:
-            words = f"imud fleet top: it needs {error.name}: pip install 'imud[top]'; or use --plain"
-            raise BadArgument(words) from None
+            library = (error.name or "rich").partition(".")[0]
+            raise BadArgument(
+                f"cannot import {library}; install the extra: pip install 'imud[top]', or use --plain"
+            ) from None
         self._text: Callable[[str], Text] = Text
         self._live = Live(screen=True, auto_refresh=False)
         self._live.start()
@@ -161,15 +162,17 @@ class _Redrawn:
 
 
 def add_top(parser: argparse.ArgumentParser) -> None:
-    """Add the options that only this action has."""
+    """Add the options of `imud fleet top`."""
     parser.add_argument(
-        "--interval", type=float, default=INTERVAL_S, metavar="S", help="time between pictures (default: %(default)g)"
+        "--interval", type=float, default=INTERVAL_S, metavar="S", help="time between two tables (default: %(default)g)"
     )
-    parser.add_argument("--plain", action="store_true", help="one table after another, as where it is no terminal")
+    parser.add_argument(
+        "--plain", action="store_true", help="print one table after another, as if the output is not a terminal"
+    )
 
 
 async def run_top(args: argparse.Namespace, fleet: Fleet) -> int:
-    """Show the gateways until SIGINT, SIGTERM, or --duration; 1 if there was none. Raises ImudError."""
+    """Show the gateways until SIGINT, SIGTERM or --duration. Return 1 if no gateway was found. Raises ImudError."""
     if not INTERVAL_LEAST_S <= args.interval <= INTERVAL_MOST_S:
         raise BadArgument(f"--interval: expected {INTERVAL_LEAST_S:g} to {INTERVAL_MOST_S:g}, got {args.interval:g}")
     loop, overview = asyncio.get_running_loop(), FleetOverview(fleet)
@@ -184,7 +187,7 @@ async def run_top(args: argparse.Namespace, fleet: Fleet) -> int:
             with suppress(asyncio.CancelledError):
                 await task
     if fleet.problem:
-        complain(f"nothing comes at the end: {fleet.problem}")
+        complain(f"the broker connection failed at the end: {fleet.problem}")
     return 0 if fleet.states else 1
 
 
@@ -215,63 +218,64 @@ HEAD: Final = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud fleet`."""
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    collecting = actions.add_parser("collect", help="write what the gateways send into a store")
+    collecting = actions.add_parser("collect", help="write the data of the gateways to a store")
     _broker(collecting)
     collecting.add_argument(
         "--to", required=True, metavar="STORE",
-        help="postgresql://USER@HOST/DATABASE writes rows, exactly once; - prints JSON lines",
+        help="postgresql://USER@HOST/DATABASE: write each row exactly once; -: print JSON lines",
     )  # fmt: skip
     collecting.add_argument(
         "--name", default=NAME,
-        help="of the session that the broker keeps for this one collector while it is away (default: %(default)s)",
+        help="name of this collector; the broker keeps messages for it while it does not run (default: %(default)s)",
     )  # fmt: skip
     collecting.add_argument(
         "--from-begin", action="store_true",
-        help="count as missing what a gateway had sent of its present boot before the collector first heard of it",
+        help="count samples as missing that a gateway sent since its boot, before the collector received its first "
+        "message",
     )  # fmt: skip
-    showing = actions.add_parser("top", help="show all gateways, redrawn in place")
+    showing = actions.add_parser("top", help="show all gateways in a full-screen view of the terminal")
     _broker(showing)
     add_top(showing)
 
 
 def _broker(parser: argparse.ArgumentParser) -> None:
-    """Arguments for the connection, and for what is read."""
+    """Add the arguments of the broker connection and of the selection."""
     parser.add_argument(
         "urls", nargs="+", metavar="URL",
-        help="broker: mqtt, mqtts, ws or wss, for example mqtts://HOST:8883; several of one cluster are tried in turn",
+        help="broker: mqtt, mqtts, ws or wss, for example mqtts://HOST:8883; name all brokers of a cluster",
     )  # fmt: skip
     parser.add_argument(
-        "--mqtt-version", choices=VERSIONS, default=VERSIONS[0], help="version of MQTT (default: %(default)s)"
+        "--mqtt-version", choices=VERSIONS, default=VERSIONS[0], help="MQTT version (default: %(default)s)"
     )
-    parser.add_argument("--user", default="", help="name for the broker")
-    parser.add_argument("--password-file", metavar="FILE", help="file that has the password in its first line")
+    parser.add_argument("--user", default="", help="user name for the broker")
+    parser.add_argument("--password-file", metavar="FILE", help="file with the password in its first line")
     parser.add_argument(
-        "--ca-file",
-        metavar="FILE",
-        help="certificates (PEM) that the broker's is to be signed by (default: the system's)",
+        "--ca-file", metavar="FILE",
+        help="CA certificates (PEM) that sign the certificate of the broker (default: the CAs of the system)",
+    )  # fmt: skip
+    parser.add_argument("--cert-file", metavar="FILE", help="client certificate (PEM)")
+    parser.add_argument("--key-file", metavar="FILE", help="client key (PEM), if --cert-file does not contain the key")
+    for name in ("site", "gateway", "device"):
+        parser.add_argument(f"--{name}", help=f"select this {name} only")
+    parser.add_argument(
+        "--duration", type=duration_s, metavar="TIME", help="stop after this time, for example 90s, 10min or 2h"
     )
-    parser.add_argument("--cert-file", metavar="FILE", help="certificate (PEM) of this client")
-    parser.add_argument("--key-file", metavar="FILE", help="its key (PEM), where the certificate's file has none")
-    for name, words in (("site", "this site"), ("gateway", "this gateway"), ("device", "this device")):
-        parser.add_argument(f"--{name}", help=f"of {words} only")
-    parser.add_argument("--duration", type=duration_s, metavar="TIME", help="end after so long, as 90s, 10min or 2h")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out one of the actions. Raises ImudError."""
+    """Run `collect` or `top`. Raises ImudError."""
     if args.action == "top":
         return asyncio.run(run_top(args, fleet_of(args, "", from_begin=False)))
     return asyncio.run(_collect(args))
 
 
 def fleet_of(args: argparse.Namespace, name: str, *, from_begin: bool) -> Fleet:
-    """The fleet that the arguments name. Raises BadArgument, ServerError."""
+    """Return the reader of the fleet for these arguments. Raises BadArgument, ServerError."""
     if args.password_file is not None and not args.user:
-        raise BadArgument("--password-file: expected --user as well")
+        raise BadArgument("--password-file: add --user")
     if args.key_file is not None and args.cert_file is None:
-        raise BadArgument("--key-file: expected --cert-file as well")
+        raise BadArgument("--key-file: add --cert-file")
     access = ReaderAccess(args.user, args.password_file, args.ca_file, args.cert_file, args.key_file)
     return Fleet(*args.urls, access=access, name=name, version=args.mqtt_version, from_begin=from_begin)
 
@@ -290,21 +294,21 @@ async def _collect(args: argparse.Namespace) -> int:
     if ledger := account_table(fleet.accounts):
         print(ledger, file=sys.stderr)
     if fleet.problem:
-        print(f"nothing comes at the end: {fleet.problem}", file=sys.stderr)
+        print(f"the broker connection failed at the end: {fleet.problem}", file=sys.stderr)
     return 1 if fleet.problem else 0
 
 
 def store_of(text: str) -> FleetStore:
-    """The store that `--to` names. Raises BadArgument, ServerError."""
+    """Open the store of `--to`. Raises BadArgument, ServerError."""
     if text == "-":
         return JsonLines(sys.stdout)
     if text.startswith(("postgresql://", "postgres://")):
         return PostgresStore(text)
-    raise BadArgument("--to: expected - for standard output, or a URL as postgresql://USER@HOST/DATABASE")
+    raise BadArgument("--to: expected - for standard output, or a URL like postgresql://USER@HOST/DATABASE")
 
 
 def account_table(accounts: Mapping[StreamKey, StreamAccount]) -> str:
-    """The ledger as a table; empty for none."""
+    """Format the ledger as a table; empty if there are no accounts."""
     rows = [
         (
             key.gateway, key.boot, key.device or "-", key.stream, str(one.sent), str(one.received),

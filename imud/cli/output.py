@@ -1,4 +1,4 @@
-"""Plain text for people: tables and histograms."""
+"""Output of the commands: tables, paragraphs and histograms as text; standard output and standard error."""
 
 import errno
 import io
@@ -16,22 +16,21 @@ from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
 from imud.model.units import NS_PER_US
 
 COLUMNS: Final = 80
-"""Width of a terminal that texts fit."""
+"""Maximum width of texts, characters."""
 WIDTH: Final = 40
-"""Characters of the longest bar."""
+"""Length of the longest bar of a histogram, characters."""
 BARS: Final = 12
-"""Most lines of a histogram."""
+"""Maximum number of bars of a histogram."""
 EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 NO_VALUE: Final = ("", "-")
-"""Cells of a column of numbers that are none."""
+"""Cells without a value in a column of numbers."""
 STEPS: Final = (1, 2, 5, 10, 20)
 TAIL: Final = 0.005
-"""Share of outliers on either side; they are counted in the outermost bars, so that one outlier hides nothing."""
+"""Share of outliers on each side of a histogram. The outermost bars count the outliers."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Format columns as wide as their widest cell, two spaces between, no final line end; numbers stand to the right in
-    columns that have nothing else."""
+    """Format a table. Columns of numbers are right-aligned. The text has no line end after the last row."""
     cells = [[str(cell) for cell in head], *([_word(cell) for cell in row] for row in rows)]
     widths = [max(len(line[i]) for line in cells) for i in range(len(head))]
     numbers = [all(_is_number(line[i]) for line in cells[1:] if line[i] not in NO_VALUE) for i in range(len(head))]
@@ -39,7 +38,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def shortened(text: str, width: int) -> str:
-    """Return `text` in at most `width` characters, with … for what is left out in its middle: both ends tell most."""
+    """Return `text` in at most `width` characters. A character … replaces the middle of a longer text."""
     if len(text) <= width:
         return text
     end = (width - 1) // 2
@@ -47,7 +46,7 @@ def shortened(text: str, width: int) -> str:
 
 
 def fitted(value: float, width: int, show: Callable[[float], str]) -> str:
-    """Format a number in `width` characters: as `show` does, without decimals, or by a power of ten."""
+    """Format a number in at most `width` characters: with `show`, with fewer decimals, or with a power of ten."""
     for text in (show(value), f"{value:.1f}", f"{value:.0f}", f"{value:.1e}", f"{value:.0e}"):
         short = text.replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
         if len(short) <= width:
@@ -56,12 +55,12 @@ def fitted(value: float, width: int, show: Callable[[float], str]) -> str:
 
 
 def local_time(utc_ns: int) -> datetime:
-    """Return a time given in ns since 1970-01-01 UTC in the local time zone, cut off to µs."""
+    """Convert a time in ns since 1970-01-01 UTC to the local time zone, truncated to µs."""
     return (EPOCH + timedelta(microseconds=utc_ns // NS_PER_US)).astimezone()
 
 
 def paragraph(label: str, text: str) -> list[str]:
-    """Lines of at most COLUMNS characters: the label, and beside it the text, whose longer words are shortened."""
+    """Format a label and a text as lines of at most COLUMNS characters. Long words are shortened."""
     room = COLUMNS - len(label)
     words = " ".join(shortened(word, room) for word in printable(text, MESSAGE_CHARACTERS_MAX).split())
     lines = textwrap.wrap(words, room, break_on_hyphens=False) or [""]
@@ -69,7 +68,7 @@ def paragraph(label: str, text: str) -> list[str]:
 
 
 def histogram(values: Sequence[float], unit: str) -> list[str]:
-    """Format a histogram: lower edge of each bar, its share and its length. Empty for no values."""
+    """Format a histogram, one line per bar: lower edge, share in percent, bar. Empty if `values` is empty."""
     if not values:
         return []
     ordered = sorted(values)
@@ -89,7 +88,7 @@ def histogram(values: Sequence[float], unit: str) -> list[str]:
 
 
 def bar_width(span: float) -> float:
-    """Choose the smallest of 1, 2, 5 · 10ⁿ of which at most BARS make up the span; 1 for none."""
+    """Return the smallest width 1, 2 or 5 · 10ⁿ with at most BARS bars over the span. Return 1 for an empty span."""
     if span <= 0:
         return 1.0
     power = 10.0 ** floor(log10(span / BARS))
@@ -97,7 +96,7 @@ def bar_width(span: float) -> float:
 
 
 def _word(cell: object) -> str:
-    """Format a cell; texts may come from devices and adapters, and are made printable."""
+    """Format a cell. Texts from devices and adapters can contain control characters, which are escaped."""
     return f"{cell:.1f}" if isinstance(cell, float) else printable(str(cell), MESSAGE_CHARACTERS_MAX)
 
 
@@ -111,19 +110,19 @@ def _is_number(cell: str) -> bool:
 
 
 def times(count: int) -> str:
-    """Format how often something happened, for example `1 time`."""
+    """Format a number of repetitions, for example `1 time`."""
     return f"{count} time{'' if count == 1 else 's'}"
 
 
 STANDARD_STREAMS: Final = 3
 ERROR_WAIT_MS: Final = 1000
-"""How long the end of a command waits for the reader of its standard error."""
+"""Maximum wait for the reader of standard error, ms."""
 
 
 def open_standard_streams() -> None:
-    """Open /dev/null in place of closed descriptors, which a port or socket would get else; escape what is not shown.
+    """Open /dev/null for closed standard descriptors. Write unencodable characters as backslash escapes.
 
-    Characters that the locale's encoding does not have are written as backslash escapes.
+    Without /dev/null, a port or socket would get the number of a closed descriptor and receive the printed text.
     """
     for descriptor in range(STANDARD_STREAMS):
         try:
@@ -139,24 +138,24 @@ def open_standard_streams() -> None:
 
 
 def discard_output() -> None:
-    """Throw away what is buffered for standard output, and all that follows: it cannot be written."""
+    """Discard the buffer of standard output and all later output."""
     _discard(sys.stdout)
 
 
 def raise_if_unread() -> None:
-    """Raise BrokenPipeError where standard output is a pipe or socket whose reader has gone, without writing to it."""
+    """Raise BrokenPipeError if the reader of standard output closed the pipe or socket. Write nothing."""
     try:
         descriptor = sys.stdout.fileno()
-    except OSError:  # a stream without a descriptor, in memory
+    except OSError:  # a stream in memory has no descriptor
         return
     poll = select.poll()
-    poll.register(descriptor, 0)  # errors are reported unasked
+    poll.register(descriptor, 0)  # poll reports POLLERR without a request
     if any(events & select.POLLERR for _, events in poll.poll(0)):
-        raise BrokenPipeError(errno.EPIPE, "nobody reads the output any more")
+        raise BrokenPipeError(errno.EPIPE, "the reader of the output closed the pipe")
 
 
 def complain(text: str) -> None:
-    """Write `text` to standard error, each line escaped; give up when it cannot be written, or nobody reads it."""
+    """Write `text` to standard error with control characters escaped. Discard the text if writing fails or blocks."""
     try:
         for line in text.splitlines():
             if not _writable(sys.stderr):
@@ -174,10 +173,10 @@ def _discard(stream: TextIO) -> None:
 
 
 def _writable(stream: TextIO) -> bool:
-    """Whether a write would not wait, now or soon."""
+    """Return whether the stream accepts data within ERROR_WAIT_MS."""
     try:
         descriptor = stream.fileno()
-    except OSError:  # a stream without a descriptor, in memory
+    except OSError:  # a stream in memory has no descriptor
         return True
     poll = select.poll()
     poll.register(descriptor, select.POLLOUT)

@@ -1,4 +1,4 @@
-"""`imud replay`: run a capture through the daemon's whole path, for clients to read, or printed."""
+"""`imud replay`: replay a recording or a capture. Print the samples, or serve them to clients."""
 
 import argparse
 import sys
@@ -33,25 +33,26 @@ from imud.recording.player import PlayedDevice, Player
 
 DIFFERENCES_SHOWN = 3
 LOOKED_AT_BYTES: Final = 1 << 20
-"""Of a file whose begin is damaged: a recorder's blocks hold 256 KiB at most, but for records that are larger."""
+"""Size of the searched part of a file with a damaged start. A block of a recording has about 256 KiB."""
 
 
 def looks_like_recording(path: str) -> bool:
-    """Whether a file is a recording by its first bytes, or by those of a later block. Raises OSError."""
+    """Return whether a file starts like a recording, or contains the start of a block. Raises OSError."""
     with open_regular(path) as file:
         begin = file.read(LOOKED_AT_BYTES)
     return is_recording(begin) or MAGIC in begin
 
 
 def play_recording(args: argparse.Namespace) -> int:
-    """Replay a recording; its ledgers go to standard error. 1 where it is not what the live run was, or has no sample.
+    """Replay a recording. Print the ledgers to standard error.
 
-    Raises BadArgument for options that are for captures only, ImudError.
+    Return 1 if the replay differs from the live run, or if the recording contains no sample. Raises BadArgument for
+    options that apply to captures only.
     """
     for option, default in (("socket", None), ("option", []), ("driver", None), ("speed", None), ("baud", None)):
         if getattr(args, option) != default:
             raise BadArgument(
-                f"--{option}: expected none with a recording, which has driver, options and times of the live run"
+                f"--{option} applies to captures only; a recording contains driver, options and times of the live run"
             )
     with open_regular(args.file) as file:
         return _play(file, args)
@@ -66,14 +67,14 @@ def _play(file: BinaryIO, args: argparse.Namespace) -> int:
 
 
 def print_samples(batch: Batch) -> None:
-    """Print one JSON line per sample. Raises OSError where it cannot be written."""
+    """Print one JSON line per sample. Raises OSError if writing fails."""
     print("".join(msgspec.json.encode(sample).decode() + "\n" for sample in batch.samples), end="")
 
 
 def play_to_end(file: BinaryIO, name: str, player: Player) -> tuple[str, int]:
-    """Play a recording to its end. Returns what came of it, for people, and the exit status of `imud replay`.
+    """Replay a recording to its end. Return the report as text, and the exit status of `imud replay`.
 
-    Raises ImudError, and what the player's publisher raises as OSError.
+    Raises ImudError, and any OSError of the player's publisher.
     """
     reader = RecordingReader(file, name)
     player.play(reader)
@@ -84,7 +85,7 @@ def play_to_end(file: BinaryIO, name: str, player: Player) -> tuple[str, int]:
 
 
 def device_block(device: PlayedDevice, without: Collection[str] = ()) -> list[str]:
-    """Format what came of a device, in 80 columns, without the rows of these names."""
+    """Format the result of a device in 80 columns, without the rows in `without`."""
     counts = device.ledger.snapshot()
     path = device.path
     newest = path.newest if path is not None else None
@@ -93,10 +94,10 @@ def device_block(device: PlayedDevice, without: Collection[str] = ()) -> list[st
         clock += f", {path.clock.expected_rate_hz:.1f} Hz by the device's clock"
     closes = not bytes_open(counts) and not frames_open(counts)
     rows = [
-        ("link", f"{device.described.where}, driver {device.driver.name if device.driver else 'not found'}"),
+        ("link", f"{device.described.where}, driver {device.driver.name if device.driver else 'unknown'}"),
         ("clock", clock),
         ("samples", f"{counts['samples']}; lost {lost(counts)}, {counts['lost_unknown']} gaps of unknown size"),
-        ("bytes", f"{counts['bytes_in']}: {'closed' if closes else 'DOES NOT CLOSE'}"),
+        ("bytes", f"{counts['bytes_in']}: {'balanced' if closes else 'NOT BALANCED'}"),
         ("compared", comparison(device)),
     ]
     lines = paragraph(f"{device.described.name}: ", "replayed")
@@ -107,57 +108,54 @@ def device_block(device: PlayedDevice, without: Collection[str] = ()) -> list[st
 
 
 def comparison(device: PlayedDevice) -> str:
-    """Format how the replay compares with what the recording says of the live run."""
+    """Format the comparison of the replay with the live run."""
     if device.fresh_starts:
         return (
-            f"not the live run's stamps: {device.fresh_starts[0]}; the clock begins anew here, and needs some seconds "
-            "until it is as good"
+            f"the time stamps differ from the live run: {device.fresh_starts[0]}; the clock restarted, and its error "
+            "is larger for some seconds"
         )
     if not device.differences:
-        return f"the same as the live run at {device.checks} of {device.checks} checks"
-    return f"OTHER than the live run at {len(device.differences)} of {device.checks} checks: " + "; ".join(
+        return f"equal to the live run at {device.checks} of {device.checks} checks"
+    return f"DIFFERENT from the live run at {len(device.differences)} of {device.checks} checks: " + "; ".join(
         device.differences[:DIFFERENCES_SHOWN]
     )
 
 
 def remarks(reader: RecordingReader, player: Player) -> list[str]:
-    """What else is to be known of the file."""
-    found = [f"the file: {problem}" for problem in reader.problems]
+    """Return the problems of the file."""
+    found = [f"file: {problem}" for problem in reader.problems]
     if player.lost:
-        found.append(f"records that were dropped when it was written: {player.lost}; what they held is missing")
+        found.append(f"the recorder dropped {player.lost} records; their data is missing")
     return ["\n".join(line for words in found for line in paragraph("", words))] if found else []
 
 
 class Printer:
-    """A publisher that prints samples as JSON lines, as long as they can be written."""
+    """Publisher that prints samples as JSON lines until writing fails."""
 
     def __init__(self, stop: Callable[[], None]) -> None:
-        """`stop` is called at the first line that cannot be written."""
+        """`stop` is called after the first failed write."""
         self.problem: OSError | None = None
-        """Why lines could not be written; None while they can."""
+        """Error of the first failed write; None if no write failed."""
         self._stop = stop
 
-    def start(self) -> None:
-        """No-op: there is nothing to open."""
+    # no state per device, no timer: most methods of a publisher do nothing
 
-    def add_device(self, name: str, device_id: int) -> None:
-        """No-op: every device is printed."""
+    def start(self) -> None: ...
 
-    def remove_device(self, name: str) -> None:
-        """No-op: nothing is kept per device."""
+    def add_device(self, name: str, device_id: int) -> None: ...
+
+    def remove_device(self, name: str) -> None: ...
+
+    def event(self, event: Event) -> None: ...
+
+    def tick(self, now_ns: int) -> None: ...
 
     def publish(self, batch: Batch) -> None:
-        """One line per sample."""
+        """Print one line per sample."""
         self._output("".join(msgspec.json.encode(sample).decode() + "\n" for sample in batch.samples))
 
-    def event(self, event: Event) -> None:
-        """No-op: events are in the log."""
-
-    def tick(self, now_ns: int) -> None:
-        """No-op: nothing depends on time."""
-
     def close(self) -> None:
-        """Leave nothing in the buffer."""
+        """Flush the output."""
         self._output("", flush=True)
 
     def _output(self, text: str, *, flush: bool = False) -> None:
@@ -173,36 +171,37 @@ class Printer:
 SPEEDS = ("recorded", "real", "maximum")
 DRIVER, SPEED, BAUD = "hipnuc-uart", "maximum", 115200
 NO_TIMES = (
-    "not known: the capture has bytes and no time of any read. Rate, skew, residual, error and latency are unknown, "
-    "and the host times of the samples are made of the baud rate"
+    "unknown: a raw capture does not contain arrival times. Rate, skew, residual, error and latency are unknown. imud "
+    "computes the host times of the samples from the baud rate"
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud replay`."""
     parser.add_argument(
         "file",
         type=Path,
         metavar="FILE",
-        help="recording of imud, which needs no option; or a capture, raw or time-stamped; for CAN a log of candump -L",
+        help="recording of imud (no options needed), raw or time-stamped capture, or for CAN a log of candump -L",
     )
-    parser.add_argument("--driver", choices=sorted(DRIVERS), help=f"of a capture (default: {DRIVER})")
-    parser.add_argument("--speed", choices=SPEEDS, help=f"of a capture (default: {SPEED})")
-    parser.add_argument("--baud", type=int, help=f"rate of a capture that names none (default: {BAUD})")
+    parser.add_argument("--driver", choices=sorted(DRIVERS), help=f"driver for a capture (default: {DRIVER})")
+    parser.add_argument("--speed", choices=SPEEDS, help=f"speed of a capture (default: {SPEED})")
     parser.add_argument(
-        "--socket", type=Path, metavar="PATH", help="serve the samples on this socket, as the daemon does"
+        "--baud", type=int, help=f"baud rate of a capture if the capture does not contain it (default: {BAUD})"
+    )
+    parser.add_argument(
+        "--socket", type=Path, metavar="PATH", help="serve the samples of a capture on this socket, as the daemon does"
     )
     add_option(parser)
     parser.add_argument(
-        "--fresh", action="store_true", help="of a recording: begin with empty clocks, not with those of the live run"
+        "--fresh", action="store_true", help="start the clocks of a recording without the state of the live run"
     )
-    parser.add_argument("--json", action="store_true", help="print every sample, one JSON object per line")
+    parser.add_argument("--json", action="store_true", help="print every sample as one JSON object per line")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play the file to its end; the ledger goes to standard error. 1 when it has no sample, or is damaged."""
+    """Replay the file to its end. Print the ledger to standard error. Return 1 without a sample or if damaged."""
     if not args.file.is_file():
-        raise ImudError(f"{args.file}: expected a recording or a capture, found none")
+        raise ImudError(f"{args.file}: expected a recording or a capture, found no file")
     with log_to(STDERR, "warning"):
         if looks_like_recording(str(args.file)):
             return play_recording(args)
@@ -216,10 +215,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def play(args: argparse.Namespace) -> DeviceStatus:
-    """Play the file to its end and return the state of its device then. Raises ImudError."""
+    """Replay a capture to its end. Return the final status of the device. Raises ImudError."""
     settings = config.parse(configuration(args), str(args.file))
     check(settings.devices[0])
-    printer = Printer(lambda: daemon.stop())  # noqa: PLW0108 - the daemon is made with the printer
+    printer = Printer(lambda: daemon.stop())  # noqa: PLW0108 - `daemon` does not exist yet
     daemon = Daemon(settings, extra={"print": printer} if args.json else {}, until_finished=True)
     event_loop.run(serve(daemon))
     if printer.problem is not None:
@@ -228,7 +227,7 @@ def play(args: argparse.Namespace) -> DeviceStatus:
 
 
 def has_times(args: argparse.Namespace) -> bool:
-    """Whether the file says when its bytes were read: a stamped capture, or a log of a CAN bus."""
+    """Return whether the file contains arrival times: a time-stamped capture or a log of candump."""
     if isinstance(DRIVERS[args.driver], CanDriver):
         return True
     with open_regular(args.file) as file:
@@ -236,7 +235,7 @@ def has_times(args: argparse.Namespace) -> bool:
 
 
 def names_rate(args: argparse.Namespace) -> bool:
-    """Whether the file says at which rate its bytes came: the first line of a stamped capture."""
+    """Return whether the first line of a time-stamped capture contains the baud rate."""
     if isinstance(DRIVERS[args.driver], CanDriver):
         return False
     with open_regular(args.file) as file:
@@ -244,7 +243,10 @@ def names_rate(args: argparse.Namespace) -> bool:
 
 
 def problem_of(args: argparse.Namespace) -> tuple[str, bool]:
-    """Read a capture without decoding it: what is wrong with the file, and whether that is damage, not a cut end."""
+    """Read a capture without decoding. Return the problem of the file, and whether the file is damaged.
+
+    A truncated end is a problem, but not damage.
+    """
     with open_regular(args.file) as file:
         if isinstance(DRIVERS[args.driver], CanDriver):
             log = CandumpReader(file)
@@ -257,7 +259,7 @@ def problem_of(args: argparse.Namespace) -> tuple[str, bool]:
 
 
 def check(device: config.DeviceConfig) -> None:
-    """Check that the file can be played, since the daemon would retry. Raises LinkError."""
+    """Open and close the file once: the daemon would retry forever. Raises LinkError if opening fails."""
     row = LINKS[device.link]
     is_can = isinstance(DRIVERS[device.driver], CanDriver)
     link = row.make_can(device.link_settings) if is_can else row.make(device.link_settings)
@@ -266,16 +268,13 @@ def check(device: config.DeviceConfig) -> None:
 
 
 async def serve(daemon: Daemon) -> None:
-    """Run until the capture ends or the user interrupts."""
+    """Run the daemon until the capture ends or the user presses Ctrl-C."""
     daemon.install_signals()
     await daemon.run()
 
 
 def configuration(args: argparse.Namespace) -> str:
-    """Write the configuration of a daemon for this replay alone, as text, read the same way as a file.
-
-    Raises BadArgument for options that the driver does not have.
-    """
+    """Return the configuration of a daemon for this replay, as JSON. Raises BadArgument for unknown driver options."""
     driver = DRIVERS[args.driver]
     options = given_options(driver, args.option)
     driver_settings(driver, options)

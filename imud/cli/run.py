@@ -1,4 +1,4 @@
-"""`imud run`: the daemon in the foreground, as the service manager starts it; `imud check`: its configuration alone."""
+"""`imud run`: run the daemon in the foreground. `imud check`: check a configuration file."""
 
 import argparse
 import logging
@@ -26,25 +26,25 @@ from imud.model.options import unknown_name
 log = logging.getLogger(__name__)
 
 EXIT_INTERNAL: Final = 1
-"""An internal error, which is in the log."""
+"""Exit status after an internal error. The log contains the error."""
 EXIT_OUTPUT: Final = 75
-"""An output that is required cannot start, for example the socket that another imud has (EX_TEMPFAIL, sysexits.h)."""
+"""Exit status if a required output cannot start, for example because another imud uses the socket (EX_TEMPFAIL)."""
 EXIT_CONFIGURATION: Final = 78
-"""The configuration cannot be used; starting again changes nothing (EX_CONFIG)."""
+"""Exit status for an invalid configuration. A restart does not help (EX_CONFIG, sysexits.h)."""
 DEFAULT_FILE = Path("/etc/imud.yaml")
 
 
 def run_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud run`."""
     parser.add_argument(
-        "-c", "--config", type=Path, default=DEFAULT_FILE, metavar="FILE", help="configuration (default: %(default)s)"
-    )
+        "-c", "--config", type=Path, default=DEFAULT_FILE, metavar="FILE",
+        help="configuration file (default: %(default)s)",
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until SIGTERM or SIGINT. The exit statuses are those of docs/operate.md."""
+    """Run the daemon until SIGTERM or SIGINT. docs/operate.md lists the exit statuses."""
     try:
-        settings = config.load(args.config, missing="give the file with --config")
+        settings = config.load(args.config, missing="name the file with --config")
     except ConfigError as error:
         refuse(error)
         return EXIT_CONFIGURATION
@@ -56,14 +56,14 @@ def run(args: argparse.Namespace) -> int:
             return EXIT_OUTPUT
         except ImudError:
             raise
-        except Exception:  # the top level of the daemon: the log has it, and the exit status says it
-            log.critical("imud ends because of an internal error", exc_info=True)
+        except Exception:  # top level of the daemon: log the error and set the exit status
+            log.critical("imud stops because of an internal error", exc_info=True)
             return EXIT_INTERNAL
     return 0
 
 
 def refuse(error: ConfigError) -> None:
-    """Say what is wrong with the configuration: with its priority to the journal, else as `imud check` does."""
+    """Report the problems of the configuration: to the journal with a priority, otherwise to standard error."""
     if not is_journal(STDERR):
         complain(str(error))
         return
@@ -73,15 +73,14 @@ def refuse(error: ConfigError) -> None:
 
 
 def check_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud check`."""
     parser.add_argument("file", metavar="FILE", help="configuration file, or - for standard input")
 
 
 def check(args: argparse.Namespace) -> int:
-    """Print one line when the file is good, and notes; the error with line and column goes to standard error."""
+    """Print one line if the file is valid, and notes. Raises ConfigError with line and column if it is invalid."""
     settings = config.parse(standard_input(), "standard input") if args.file == "-" else config.load(args.file)
     names = ", ".join(device.name for device in settings.devices) or "none"
-    print(f"{args.file}: good; devices: {names}")
+    print(f"{args.file}: valid; devices: {names}")
     for device in settings.devices:
         for note in (*limits_of(device), *absent_capture(device)):
             print(f"{args.file}:{device.line}: note: {device.name}: {note}")
@@ -91,7 +90,7 @@ def check(args: argparse.Namespace) -> int:
 
 
 def unknown_devices(settings: Config) -> Iterator[str]:
-    """Name the devices that outputs are configured for and that the configuration does not have."""
+    """Yield a note for each unknown device in the configuration of an output."""
     known = [*(device.name for device in settings.devices), *settings.disabled]
     for output, part in settings.publishers.items():
         for key in ("device", "devices"):
@@ -102,7 +101,7 @@ def unknown_devices(settings: Config) -> Iterator[str]:
 
 
 def limits_of(device: DeviceConfig) -> Sequence[str]:
-    """What the device cannot do of all that its configuration has, a sentence each."""
+    """Return a sentence for each configured function that the device does not support."""
     if device.driver not in DRIVERS:
         return ()
     return DRIVERS[device.driver].limits(
@@ -111,26 +110,26 @@ def limits_of(device: DeviceConfig) -> Sequence[str]:
 
 
 def absent_capture(device: DeviceConfig) -> Sequence[str]:
-    """Say that the recording of a replay is not there, which a port may be for a while and a file seldom is."""
+    """Return a note if the capture of a replay does not exist."""
+    # no note for a missing port: ports often appear later
     path = getattr(device.link_settings, "path", "") if device.link == "replay" else ""
-    return (f"{path} is not there: imud waits for it",) if path and not Path(path).exists() else ()
+    return (f"{path} does not exist; imud waits for the file",) if path and not Path(path).exists() else ()
 
 
 def standard_input() -> bytes:
-    """Return standard input, no more of it than a configuration may have."""
-    return sys.stdin.buffer.read(FILE_BYTES_MAX + 1)
+    return sys.stdin.buffer.read(FILE_BYTES_MAX + 1)  # one more byte: the reader then reports a file that is too long
 
 
 async def serve(settings: Config, file: Path) -> None:
-    """Run the daemon with its signals installed."""
+    """Run the daemon with its signal handlers."""
     daemon = Daemon(settings, file=file, state_dir=state_dir(settings))
     daemon.install_signals()
     await daemon.run()
 
 
 def state_dir(settings: Config) -> Path:
-    """Choose the service manager's state directory if it gave one, else the configured one."""
-    given = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    """Return the state directory of the service manager if it is set, otherwise the configured directory."""
+    given = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]  # systemd separates several directories with ":"
     return Path(given or settings.state_dir)
 
 

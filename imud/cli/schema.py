@@ -1,4 +1,4 @@
-"""`imud schema`: what the fields of a sample mean, in which units and frames, and how drivers differ in that."""
+"""`imud schema`: meaning, unit and coordinate frame of the fields of a sample, and the conventions of each driver."""
 
 import argparse
 from typing import Final, NamedTuple
@@ -12,25 +12,24 @@ from imud.model.sample import SAMPLE_SCHEMA
 
 FIELD_HEAD: Final = ("FIELD", "TYPE", "UNIT", "FRAME", "MEANING")
 DRIVER_HEAD: Final = ("DRIVER", "NAVIGATION FRAME", "EULER ANGLES")
-STATUS_HEAD: Final = ("DRIVER", "STATUS BIT", "MEANING WHILE IT IS SET")
+STATUS_HEAD: Final = ("DRIVER", "STATUS BIT", "MEANING IF SET")
 
 
 class DriverSchema(NamedTuple):
-    """What the values of a driver's samples mean where drivers differ."""
+    """Conventions of the samples of one driver."""
 
     navigation_frame: str
     euler_convention: str
     status_bits: dict[str, str]
-    """Names of the bits of `status` by number."""
+    """Names of the bits of `status`, by bit number."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud schema`."""
-    parser.add_argument("--json", action="store_true", help="one JSON object")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the fields and each driver's conventions. Needs no daemon."""
+    """Print the fields and the conventions of each driver. The daemon does not need to run."""
     drivers = driver_schemas()
     if args.json:
         objects = {name: one._asdict() for name, one in drivers.items()}
@@ -41,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def driver_schemas() -> dict[str, DriverSchema]:
-    """Return the conventions of every driver by its name."""
+    """Return the conventions of all drivers by name."""
     return {
         name: DriverSchema(
             driver.navigation_frame, driver.euler_convention,

@@ -1,4 +1,4 @@
-"""`imud settings`: a device's own settings beside the declared ones; apply, save, back up and restore them."""
+"""`imud settings`: compare device settings with declared settings; apply, save, back up and restore device settings."""
 
 import argparse
 import sys
@@ -23,29 +23,34 @@ from imud.model.options import shown
 HEAD: Final = ("SETTING", "DECLARED", "ACTUAL", "")
 MORE: Final = ("UNIT", "MANUAL", "IN FORCE", "VALUES")
 LIMIT_S: Final = 180.0
-"""A plan of many steps with a restart and another baud rate at its end takes some ten seconds."""
+"""Time limit of a request, s. A long plan with a restart and a new baud rate takes about 10 s."""
 
 
 def settings_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud settings`."""
     add_socket(parser)
-    parser.add_argument("device", metavar="DEVICE")
-    what = parser.add_mutually_exclusive_group()
-    what.add_argument("--apply", action="store_true", help="set what is not as declared")
-    what.add_argument("--set", nargs="+", metavar="NAME=VALUE", help="set these, whatever is declared")
-    what.add_argument("--yaml", action="store_true", help="print what the device has, to paste into the configuration")
-    what.add_argument("--backup", metavar="FILE", type=Path, help="write what the device has, with its identity")
-    what.add_argument("--restore", metavar="FILE", type=Path, help="set what a backup has")
-    parser.add_argument(
-        "--save", action="store_true", help="save to the device's flash, and restart it where that is needed"
+    parser.add_argument("device", metavar="DEVICE", help="name of the device")
+    operation = parser.add_mutually_exclusive_group()
+    operation.add_argument(
+        "--apply", action="store_true", help="set the settings that differ from the declared settings"
     )
-    parser.add_argument("--yes", action="store_true", help="do not ask, for scripts")
-    parser.add_argument("--verbose", action="store_true", help="units, sections of the manual, accepted values as well")
-    parser.add_argument("--json", action="store_true", help="what the socket answers, for programs")
+    operation.add_argument("--set", nargs="+", metavar="NAME=VALUE", help="set these settings")
+    operation.add_argument(
+        "--yaml", action="store_true", help="print the device settings as YAML for the configuration"
+    )
+    operation.add_argument(
+        "--backup", metavar="FILE", type=Path, help="write the device settings and the identity to a file"
+    )
+    operation.add_argument("--restore", metavar="FILE", type=Path, help="set the device settings from a backup")
+    parser.add_argument(
+        "--save", action="store_true", help="save the settings in the device's flash; restart the device if necessary"
+    )
+    parser.add_argument("--yes", action="store_true", help="do not ask for confirmation, for scripts")
+    parser.add_argument("--verbose", action="store_true", help="also print units, manual sections and accepted values")
+    parser.add_argument("--json", action="store_true", help="print the reply of the socket as JSON")
 
 
 def settings(args: argparse.Namespace) -> int:
-    """Show, set, save, back up or restore; 0 when all is as it should be, 1 when it is not."""
+    """Print, set, save, back up or restore device settings. Return 1 if a setting differs or an operation failed."""
     with Client(args.socket, timeout_s=LIMIT_S) as client:
         if args.restore is not None:
             return _restore(client, args)
@@ -61,13 +66,13 @@ def settings(args: argparse.Namespace) -> int:
     return 1 if report.status.state in (SettingsState.DIFFER, SettingsState.UNKNOWN) else 0
 
 
-# --- what there is ----------------------------------------------------------------------------------------------------
+# --- report -----------------------------------------------------------------------------------------------------------
 
 
 def _report(client: Client, device: str, *, needed: bool) -> SettingsReport:
-    """Ask for the settings: of the device itself where this user may, else what it reported last.
+    """Return the settings: from the device if this user may control devices, otherwise from the last report.
 
-    Raises ImudError where they are `needed` and the device does not tell them now.
+    Raises ImudError if `needed` is set and imud cannot read the settings now.
     """
     fresh = "control" in client.hello.rights
     try:
@@ -75,42 +80,42 @@ def _report(client: Client, device: str, *, needed: bool) -> SettingsReport:
     except RpcError as error:
         if needed or not fresh or error.code is not Code.FAILED:
             raise
-        print(f"{error}; what it reported last:", file=sys.stderr)
+        print(f"{error}; imud prints the last reported settings:", file=sys.stderr)
         found = client.call("settings.get", device=device)
     report = msgspec.convert(found, SettingsReport)
     if needed and report.status.read_ns is None:
-        who = "only members of the control group may ask for them"
-        raise BadArgument(f"{device} has not reported its settings yet, and {who}")
+        raise BadArgument(
+            f"{device} has not reported its settings yet, and only members of the control group can request them"
+        )
     return report
 
 
 def _shown(report: SettingsReport, *, verbose: bool) -> str:
-    """Format the table and what follows from it."""
+    """Format the table of the settings and a summary."""
     rows = [_row(one, verbose=verbose) for one in report.settings]
     status, count = report.status, len(report.status.differences)
     words = {
-        SettingsState.UNDECLARED: "nothing is declared; `--yaml` prints what to paste into the configuration",
+        SettingsState.UNDECLARED: "the configuration declares no settings; --yaml prints them for the configuration",
         SettingsState.UNKNOWN: "the device has not reported its settings",
-        SettingsState.AGREE: "all that can be read is as declared",
-        SettingsState.DIFFER: f"{count} of {len(report.settings)} differ; `--apply` sets them, `--save` keeps them",
+        SettingsState.AGREE: "all readable settings are as declared",
+        SettingsState.DIFFER: f"{count} of {len(report.settings)} differ; set them with --apply, save them with --save",
     }[status.state]
     lines = [table((*HEAD, *MORE) if verbose else HEAD, rows), "", words]
     if status.problem:
         lines.append(f"problem: {status.problem}")
-    lines.append(f"flash written by imud: {times(status.flash_writes)}, {status.flash_writes_day} within 24 hours")
+    lines.append(f"imud wrote the flash {times(status.flash_writes)}, {status.flash_writes_day} within 24 hours")
     return "\n".join(lines)
 
 
 def _row(one: SettingInfo, *, verbose: bool) -> Sequence[str]:
-    """Format one setting."""
     actual = _value(one.actual) if one.readable or one.actual is not None else "(not reported)"
-    mark = "differs" if one.differs else "" if one.declarable else "only read"
+    mark = "differs" if one.differs else "" if one.declarable else "read-only"
     row = (one.name, _value(one.declared), actual, mark)
     return (*row, one.unit, one.section, str(one.effect), one.values) if verbose else row
 
 
 def _value(value: Any) -> str:
-    """Format a value in one short text: plain words without quotes."""
+    """Format a value; strings without quotes."""
     if value is None:
         return "-"
     return value if isinstance(value, str) else shown(value)
@@ -121,7 +126,7 @@ def _settable(report: SettingsReport) -> dict[str, Any]:
 
 
 def _yaml(report: SettingsReport) -> str:
-    """Format the present settings as they are declared in the configuration."""
+    """Format the device settings as the key `settings` of the configuration."""
     who = " ".join(dict.fromkeys(report.identity.get(key, "") for key in ("product", "serial_number", "firmware")))
     comment = f"Settings of {report.device} ({report.driver} {who.strip()}); paste below `{report.device}:`"
     lines = [yaml_comment(comment)]
@@ -133,7 +138,7 @@ def _yaml(report: SettingsReport) -> str:
 
 
 def _note(one: SettingInfo) -> str:
-    """Describe a setting in a comment: meaning, unit, section of the manual."""
+    """Return the comment of a setting: description, unit, section of the manual."""
     texts = (one.description, one.unit, f"manual {one.section}" if one.section else "")
     return "; ".join("".join(c if c.isprintable() else " " for c in text) for text in texts if text)
 
@@ -146,47 +151,50 @@ def _back_up(report: SettingsReport, args: argparse.Namespace) -> int:
     if str(args.backup) == "-":
         print(text, end="")
         return 0
-    if args.backup.exists() and not confirmed(f"write over {args.backup}", "it is there already", yes=args.yes):
+    if args.backup.exists() and not confirmed(f"replace {args.backup}", "the file exists", yes=args.yes):
         return 1
     replace_file(args.backup, text.encode())
-    print(f"{len(_settable(report))} settings of {report.device} are in {args.backup}")
+    print(f"wrote {len(_settable(report))} settings of {report.device} to {args.backup}")
     return 0
 
 
 def _restore(client: Client, args: argparse.Namespace) -> int:
-    """Set what a backup has, after saying whether it is of this module."""
+    """Set the settings of a backup. Ask the user first if the backup is from another device."""
     backup = _read_backup(args.restore)
     report = _report(client, args.device, needed=True)
-    others = _other_module(backup, report)
+    others = _other_device(backup, report)
     if backup.get("driver", report.driver) != report.driver:
-        raise BadArgument(f"{args.restore} is of {backup['driver']}, {args.device} has driver {report.driver}")
+        raise BadArgument(
+            f"{args.restore}: expected a backup of driver {report.driver}, which {args.device} uses; "
+            f"got {backup['driver']}"
+        )
     given, known = backup["settings"], {one.name for one in report.settings if one.declarable}
     unknown = [name for name in given if name not in known]
-    for words in (*others, *(f"left out: {name}, which {report.driver} cannot set" for name in unknown)):
+    for words in (*others, *(f"ignored: {name}; {report.driver} cannot set it" for name in unknown)):
         print(words, file=sys.stderr)
-    if others and not confirmed(f"set {args.device} by it", "the backup is of another module", yes=args.yes):
+    if others and not confirmed(f"restore {args.device}", "the backup is from another device", yes=args.yes):
         return 1
     return _change(client, args, {name: value for name, value in given.items() if name in known})
 
 
 def _read_backup(file: Path) -> dict[str, Any]:
-    """Read a backup, or what `--yaml` printed. Raises BadArgument with what is wrong with it."""
+    """Read a backup, or the output of `--yaml`. Raises BadArgument with the position of the first error."""
     tree = read_yaml(read_regular(file, FILE_BYTES_MAX + 1), no_pause)
     if tree.problems:
         problem = tree.problems[0]
         raise BadArgument(f"{file}:{problem.mark.line}:{problem.mark.column}: {problem.message}")
     if not isinstance(tree.data, dict) or not isinstance(tree.data.get("settings"), dict):
-        raise BadArgument(f"{file}: expected the key settings with values, as `imud settings --backup` writes it")
+        raise BadArgument(f"{file}: expected the key settings with values, as in a file of `imud settings --backup`")
     return tree.data
 
 
-def _other_module(backup: Mapping[str, Any], report: SettingsReport) -> list[str]:
-    """List in which way a backup is of another module."""
+def _other_device(backup: Mapping[str, Any], report: SettingsReport) -> list[str]:
+    """Return the differences between the identity in a backup and the identity of the device."""
     identity = backup.get("identity")
     if not isinstance(identity, dict):
         return []
     return [
-        f"the backup is of {name.replace('_', ' ')} {identity[name]}, {report.device} has {report.identity[name]}"
+        f"{name.replace('_', ' ')}: the backup contains {identity[name]}, {report.device} has {report.identity[name]}"
         for name in ("product", "serial_number", "firmware")
         if name in identity and name in report.identity and identity[name] != report.identity[name]
     ]
@@ -196,7 +204,7 @@ def _other_module(backup: Mapping[str, Any], report: SettingsReport) -> list[str
 
 
 def _change(client: Client, args: argparse.Namespace, given: Mapping[str, Any] | None) -> int:
-    """Plan, show the plan, ask where that is needed, and apply."""
+    """Print the plan, ask the user if the plan has a risk, then apply the plan. Return the exit status."""
     params = {"device": args.device, "settings": given, "save": args.save}
     plan = msgspec.convert(client.call("settings.plan", **params), SettingsPlan)
     if not args.json:
@@ -213,20 +221,18 @@ def _change(client: Client, args: argparse.Namespace, given: Mapping[str, Any] |
 
 
 def _planned(plan: SettingsPlan) -> str:
-    """Format a plan for people."""
     lines = [f"  {one.name}: {_value(one.before)} → {_value(one.value)}" for one in plan.steps]
     lines += ["  save to flash"] * plan.save + ["  restart"] * plan.restart
-    lines = ["to do:", *lines] if lines else ["nothing to do"]
-    return "\n".join([*lines, *(f"left out: {name} {why} (--save)" for name, why in plan.left_out.items())])
+    lines = ["plan:", *lines] if lines else ["no changes needed"]
+    return "\n".join([*lines, *(f"not set: {name} {why} (add --save)" for name, why in plan.left_out.items())])
 
 
 def _account(done: AppliedSettings) -> str:
-    """Format what was done for people."""
     lines = [f"  {one.name}: {one.outcome}" + (f": {one.message}" if one.message else "") for one in done.steps]
     lines += ["  saved to flash"] * done.saved + ["  restarted"] * done.restarted
     if done.problem:
-        lines.append(f"NOT done: {done.problem}")
-    now = (f"{name} is {_value(one.actual)}, wanted {_value(one.declared)}" for name, one in done.differences.items())
+        lines.append(f"FAILED: {done.problem}")
+    now = (f"{name} is {_value(one.actual)}, expected {_value(one.declared)}" for name, one in done.differences.items())
     lines += [done.advice] if done.advice else []
     return "\n".join(["done:" if not done.problem else "tried:", *lines, *now])
 

@@ -23,17 +23,16 @@ from imud.model.options import shown
 from imud.model.units import NS_PER_MS, NS_PER_US
 
 WELL: Final = (DeviceState.RUNNING, DeviceState.FINISHED)
-"""States that need nobody's attention."""
+"""States without a problem."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud status`."""
     add_socket(parser)
-    parser.add_argument("--json", action="store_true", help="everything, as the socket sends it")
+    parser.add_argument("--json", action="store_true", help="print the complete status, as the socket sends it")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print one block per device; 1 when a ledger does not close or a device does not run."""
+    """Print one block per device. Return 1 if a ledger does not balance or a device does not run, otherwise 0."""
     with connect(args) as client:
         answer = client.status()
     devices = msgspec.convert(answer["devices"], list[DeviceStatus])
@@ -45,25 +44,25 @@ def run(args: argparse.Namespace) -> int:
 
 
 def page(devices: Sequence[DeviceStatus]) -> str:
-    """Format the blocks of all devices, and what to do where one does not run."""
+    """Format the blocks of all devices. If a device does not run, add the next step."""
     parts = [block(device) for device in devices]
     if any(device.state not in WELL for device in devices):
-        parts.append("`sudo imud doctor` looks for the cause, and says what to do next")
+        parts.append("to find the cause and the next step, run `sudo imud doctor`")
     return "\n\n".join(parts)
 
 
 def block(status: DeviceStatus, without_times: str = "", *, virtual: bool = False) -> str:
-    """Format the block of one device, in 80 columns.
+    """Format the block of one device in 80 columns.
 
-    `without_times` is why nothing is known that has to do with time. `virtual`: samples came as fast as they could be
-    read, with the times of a capture: how often they came and how late they were published says nothing.
+    `without_times`: the reason why times are unknown; the block then contains no rate, clock or latency. `virtual`: a
+    replay at maximum speed; the block then contains no measured rate and no latency.
     """
     clock, ledger = status.clock, status.ledger
     words = ", ".join(f"{name} {value}" for name, value in status.identity.items()) or "not known"
     rows = [
         ("link", f"{status.link}, driver {status.driver}, opened {times(status.connects)}"),
         ("identity", words),
-        ("rate", f"{status.rate_hz:.1f} Hz seen, {status.expected_rate_hz:.1f} Hz by the device's clock"),
+        ("rate", f"{status.rate_hz:.1f} Hz measured, {status.expected_rate_hz:.1f} Hz by the device's clock"),
         (
             "clock",
             f"{clock.sync}, skew {clock.skew_ppm:+.2f} ppm, residual {clock.residual_ns / NS_PER_US:.1f} µs, "
@@ -80,7 +79,7 @@ def block(status: DeviceStatus, without_times: str = "", *, virtual: bool = Fals
             "bytes",
             f"{ledger['bytes_in']} = {ledger['bytes_in_good_frames']} in good frames"
             f" + {ledger['bytes_in_bad_frames']} in bad frames + {ledger['bytes_skipped']} skipped"
-            f" + {ledger['bytes_pending']} pending: {'closed' if closes(ledger) else 'DOES NOT CLOSE'}",
+            f" + {ledger['bytes_pending']} pending: {'balanced' if closes(ledger) else 'NOT BALANCED'}",
         ),
         (
             "kernel",
@@ -103,20 +102,20 @@ def block(status: DeviceStatus, without_times: str = "", *, virtual: bool = Fals
 
 
 def axes(frame: FrameStatus) -> str:
-    """Format axes, heading, and what contradicts them."""
+    """Format axes and heading, and a problem with them."""
     own = frame.convention == "device"
     words = f"{frame.frame if own else f'{frame.convention}, {frame.frame}'}; heading {frame.heading}"
     if frame.declination_deg is not None:
-        words += f" by a declination of {frame.declination_deg:g}°"
+        words += f" with a declination of {frame.declination_deg:g}°"
     return words + (f" ({frame.problem})" if frame.problem else "")
 
 
 def parts(status: DeviceStatus) -> Iterator[tuple[str, str]]:
-    """List name and text of each row that only some devices have."""
+    """Yield name and text of the rows that exist for some devices only."""
     if status.declared is not None and status.declared.state is not SettingsState.UNDECLARED:
         yield "settings", declared(status.declared)
     if status.status_bit_names and status.status_bits is not None:
-        yield "status", ", ".join(status.status_words) or "no bit that is known is set"
+        yield "status", ", ".join(status.status_words) or "no known bit is set"
     if status.settings:
         yield "present", ", ".join(f"{name} {value}" for name, value in status.settings.items())
     if status.polling is not None:
@@ -135,7 +134,7 @@ def parts(status: DeviceStatus) -> Iterator[tuple[str, str]]:
 
 
 def declared(settings: SettingsStatus) -> str:
-    """Format how declared and actual settings compare."""
+    """Format the differences between declared settings and device settings."""
     words = str(settings.state)
     if settings.differences:
         words += ": " + ", ".join(
@@ -148,27 +147,27 @@ def declared(settings: SettingsStatus) -> str:
 
 
 def polling(polls: PollingStatus) -> str:
-    """Format deadlines and failures of a polled device."""
+    """Format the reads of a polled device."""
     return (
         f"{polls.polls} reads, {polls.late} late, {polls.missed} missed, {polls.stale} stale, {polls.failed} failed;"
-        f" {polls.late_mean_ns / NS_PER_US:.1f} µs after the deadline, {polls.late_worst_ns / NS_PER_US:.1f} at worst;"
-        f" vanished {times(polls.vanished)}"
+        f" {polls.late_mean_ns / NS_PER_US:.1f} µs after the deadline,"
+        f" maximum {polls.late_worst_ns / NS_PER_US:.1f} µs; vanished {times(polls.vanished)}"
     )
 
 
 def serial_line(line: SerialLineCounters) -> str:
-    """Format the bytes on a shared serial line that are no replies."""
+    """Format the faults of an RS-485 bus."""
     return (
-        f"{line.timeouts} requests unanswered; {line.late_bytes} bytes unasked, {line.strange_bytes} strange;"
-        f" {line.echoes} echoes (all devices of the line)"
+        f"{line.timeouts} requests without a reply; {line.late_bytes} bytes without a request, {line.strange_bytes} "
+        f"invalid bytes; {line.echoes} echoes (all devices of the bus)"
     )
 
 
 def watched(lines: LinesStatus, name: str, edges: int) -> str:
-    """Format the row of one input line."""
+    """Format the row of one GPIO input line."""
     words = f"{edges} edges, {lines.edges_lost.get(name, 0)} lost"
     if name == "alarm":
-        level = {True: "ACTIVE", False: "inactive", None: "level not known"}[lines.alarm]
+        level = {True: "ACTIVE", False: "inactive", None: "level unknown"}[lines.alarm]
         words = f"{level}, raised {times(lines.alarms)}; {words}"
     return words + problem_of(lines, name)
 
@@ -178,17 +177,17 @@ def driven(lines: LinesStatus) -> str:
     return (
         f"{lines.triggers} triggers, {lines.triggers_missed} missed;"
         f" {lines.trigger_late_mean_ns / NS_PER_US:.1f} µs after the deadline,"
-        f" {lines.trigger_late_worst_ns / NS_PER_US:.1f} at worst{problem_of(lines, 'sin')}"
+        f" maximum {lines.trigger_late_worst_ns / NS_PER_US:.1f} µs{problem_of(lines, 'sin')}"
     )
 
 
 def problem_of(lines: LinesStatus, name: str) -> str:
-    """Format why a line is not watched or driven, in brackets; empty when it is."""
+    """Format the problem of a GPIO line in brackets; empty if the line has no problem."""
     return f" ({lines.problems[name]})" if name in lines.problems else ""
 
 
 def utc(status: UtcStatus) -> str:
-    """Format RMC sentences and pulses of a device, and samples for chronyd."""
+    """Format the RMC sentences, the PPS pulses, and the samples for chronyd."""
     words = []
     if status.source:
         refused = ", ".join(f"{cause} {count}" for cause, count in status.refused.items())
@@ -200,11 +199,11 @@ def utc(status: UtcStatus) -> str:
         words.append(f"{status.pulses} pulses, {status.pulses_ignored} ignored")
     if status.chrony_sent or status.chrony_refused:
         words.append(f"chronyd accepted {status.chrony_sent}, refused {status.chrony_refused}")
-    return ("; ".join(words) or "nothing yet") + (f" ({status.problem})" if status.problem else "")
+    return ("; ".join(words) or "no pulse and no sentence yet") + (f" ({status.problem})" if status.problem else "")
 
 
 def closes(ledger: dict[str, int]) -> bool:
-    """Whether both sums of a ledger as shown are zero."""
+    """Return whether a ledger balances: both open sums are zero."""
     return bytes_open(ledger) == 0 and frames_open(ledger) == 0
 
 
@@ -216,9 +215,9 @@ def latency(status: DeviceStatus) -> str:
 
 
 def held(status: DeviceStatus) -> str:
-    """Format how long samples wait to be processed together, and who decides it."""
-    wanted = f"{status.hold_wanted_ns / NS_PER_MS:g} ms allowed by {status.hold_by or 'everybody'}"
-    return f"samples wait {status.hold_ns / NS_PER_MS:g} ms to be processed together, {wanted}"
+    """Format the hold of the samples, and the client or output that limits it."""
+    limit = f"limit {status.hold_wanted_ns / NS_PER_MS:g} ms" + (f" by {status.hold_by}" if status.hold_by else "")
+    return f"samples held for {status.hold_ns / NS_PER_MS:g} ms ({limit})"
 
 
 STATUS = CliCommand(add_arguments, run)

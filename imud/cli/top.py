@@ -672,14 +672,13 @@ class TopFeed(Feed):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud top`."""
     add_socket(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show the table until `q`. Raises BadArgument without a terminal."""
+    """Show the devices until the user presses `q`. Raises BadArgument if imud does not run in a terminal."""
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
-        raise BadArgument("expected a terminal; `imud status` and `imud watch` write to anything")
+        raise BadArgument("imud top needs a terminal; for files and pipes, use `imud status` or `imud watch`")
     TopApp(lambda on_news: TopFeed(args.socket, on_news)).run()
     return 0
 

@@ -1,4 +1,4 @@
-"""`imud watch`: print samples as they come, as a table for people, as JSON lines, or as CSV."""
+"""`imud watch`: print samples as a table, as JSON lines, or as CSV."""
 
 import argparse
 import csv
@@ -23,37 +23,37 @@ from imud.model.units import NS_PER_MS, NS_PER_S, RAD_PER_DEG, T_PER_UT
 
 NONE: Final = "-"
 INDENT: Final = "    "
-"""Of the second and further lines of a sample."""
+"""Indent of the second and later lines of a sample."""
 ROWS: Final = 24
-"""Of a terminal that does not say how many it has."""
+"""Number of rows of a terminal with unknown size."""
 ROWS_LEAST: Final = 10
-"""Samples between two headers on a very low terminal."""
+"""Minimum number of samples between two headers."""
 NAME_MAX: Final = 256
 
 Text = Callable[[Any], str]
 
 
 class TableColumn(NamedTuple):
-    """A column of one number or word."""
+    """Column of one number or word."""
 
     title: str
     wide: int
     narrow: int
     text: Text
-    """Formats the value, which is there."""
+    """Formats a value that is not None."""
     is_number: bool = True
 
 
 class FieldColumns(NamedTuple):
-    """What a field of a sample has in the table."""
+    """Columns of one field of a sample."""
 
     name: str
     label: str
-    """Stands above the columns of an array; empty for a single one."""
+    """Text above the columns of an array; empty for a single column."""
     columns: tuple[TableColumn, ...]
 
     def width(self, *, narrow: bool) -> int:
-        """Characters of all columns, one space between two."""
+        """Return the width of all columns with one space between two columns."""
         widths = [column.narrow if narrow else column.wide for column in self.columns]
         return sum(widths) + len(widths) - 1
 
@@ -67,12 +67,12 @@ def _one(name: str, title: str, width: int, text: Text, *, is_number: bool = Tru
 
 
 def _array(name: str, label: str, titles: Sequence[str], widths: tuple[int, int], text: Text) -> FieldColumns:
-    """Columns of an array; `widths`: wide, narrow."""
+    """Return the columns of an array. `widths`: wide and narrow width of a column."""
     return FieldColumns(name, label, tuple(TableColumn(title, *widths, text) for title in titles))
 
 
 def _clock_time(utc_ns: int) -> str:
-    """Format ns since 1970-01-01 UTC as local time of day, cut off to ms."""
+    """Format ns since 1970-01-01 UTC as local time of day, truncated to ms."""
     return local_time(utc_ns).isoformat(timespec="milliseconds")[11:23]
 
 
@@ -100,12 +100,12 @@ _LAYOUT: Final = (
     _one("edge_seq", "EDGE", 9, str),
 )  # fmt: skip
 FIELDS: Final = {field.name: field for field in _LAYOUT}
-"""What each field of a sample has in the table."""
+"""Columns of each field of a sample."""
 
 USUAL: Final = ("utc_ns", "accel_m_s2", "gyro_rad_s", "euler_rad")
-"""Fields without a choice."""
+"""Fields of the table without `--fields`."""
 MORE: Final = ("t_err_ns", "temperature_c", "mag_t", "sync", "pressure_pa")
-"""Fields that are added where they fit, in this order."""
+"""Fields that imud adds in this order if the terminal is wide enough."""
 USUAL_ORDER: Final = (
     "device", "utc_ns", "t_err_ns", "sync", "accel_m_s2", "gyro_rad_s", "euler_rad", "mag_t", "temperature_c",
     "pressure_pa",
@@ -113,14 +113,14 @@ USUAL_ORDER: Final = (
 
 
 class TableLine(NamedTuple):
-    """The columns of one line of a sample."""
+    """Layout of one line of a sample."""
 
     fields: tuple[FieldColumns, ...]
     narrow: bool
     indent: str
 
     def head(self, time_title: str) -> list[str]:
-        """Format the labels, where there are any, and the titles; that of the time has its zone."""
+        """Format the labels and the titles. `time_title` is the title of the time with its time zone."""
         labels = [field.label.center(self._width(field), "-") if field.label else "" for field in self.fields]
         above = " ".join(label.ljust(self._width(field)) for label, field in zip(labels, self.fields, strict=True))
         titles = self._joined(
@@ -160,7 +160,7 @@ class TableLine(NamedTuple):
 
 
 def usual_fields(width: int, *, several: bool) -> tuple[str, ...]:
-    """Return the fields for a terminal of that width; `several` devices are named."""
+    """Return the fields that fit the width of a terminal. `several`: include the name of the device."""
     chosen = {*USUAL, *(["device"] if several else [])}
     for name in MORE:
         if _width_of(_fields((*chosen, name)), narrow=False) > width:
@@ -170,7 +170,7 @@ def usual_fields(width: int, *, several: bool) -> tuple[str, ...]:
 
 
 def lines_of(names: Sequence[str], width: int) -> list[TableLine]:
-    """Arrange fields in as many lines as that width needs."""
+    """Arrange fields in lines of at most `width` characters."""
     fields = _fields(names)
     for narrow in (False, True):
         if _width_of(fields, narrow=narrow) <= width:
@@ -195,25 +195,25 @@ def _width_of(fields: Sequence[FieldColumns], *, narrow: bool) -> int:
 
 
 class SampleTable:
-    """The table as text, sample by sample; the header comes again with each screen of a terminal."""
+    """Text table of samples. On a terminal, the header is repeated on each screen."""
 
     def __init__(self, fields: Sequence[str] | None = None) -> None:
-        """Without `fields`: those that fit."""
+        """`fields`: None for the fields that fit the terminal."""
         self._chosen = fields
         self._lines: list[TableLine] = []
         self._devices: set[str] = set()
         self._rows_left = 0
-        """Samples until the next header; less than 0: there is none."""
+        """Number of samples until the next header; negative if there is no further header."""
 
     def add_devices(self, names: Iterable[str]) -> None:
-        """Note that samples of these devices may come: where there are several, each sample has its name."""
+        """Add devices. If the table shows several devices, each row contains the name of the device."""
         before = len(self._devices)
         self._devices.update(names)
         if before <= 1 < len(self._devices):
-            self._rows_left = 0
+            self._rows_left = 0  # new column DEVICE: print the header again
 
     def text(self, sample: Sample) -> str:
-        """Format a sample, with the header before it where one is due."""
+        """Format a sample. If a header is due, put it before the sample."""
         if sample.device not in self._devices:
             self.add_devices([sample.device])
         rows = [] if self._rows_left else self._head(sample)
@@ -222,7 +222,7 @@ class SampleTable:
         return "".join(f"{line}\n" for line in (*rows, *(line.row(sample) for line in self._lines)))
 
     def _head(self, sample: Sample) -> list[str]:
-        """Arrange the columns for the present width, and return the header."""
+        """Arrange the columns for the current width of the terminal. Return the header."""
         width, rows = COLUMNS, 0
         is_terminal = sys.stdout.isatty()
         if is_terminal:
@@ -236,14 +236,14 @@ class SampleTable:
 
 
 class SampleOutput(Protocol):
-    """A format of samples."""
+    """Output format of samples."""
 
     def begin(self, devices: Iterable[str]) -> str:
-        """Return what precedes the samples of these devices; called with every connection."""
+        """Return the text before the samples of these devices. Called after every connection."""
         ...
 
     def text(self, sample: Sample) -> str:
-        """Format a sample, with its line end."""
+        """Format a sample with a line end."""
         ...
 
 
@@ -298,47 +298,46 @@ OUTPUTS: Final[dict[str, Callable[[tuple[str, ...] | None], SampleOutput]]] = {
     "json": _JsonLines,
     "csv": _Csv,
 }
-"""What makes each format, of these fields or of all."""
+"""Constructor of each format. The argument is the tuple of the fields, or None for all fields."""
 
 TABLE_HZ: Final = 10.0
-"""Rate of the table without `--rate`: more cannot be read."""
+"""Maximum rate of the table without `--rate`, Hz."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud watch`."""
     add_socket(parser)
-    parser.add_argument("device", nargs="*", metavar="DEVICE", help="devices to watch (default: all)")
+    parser.add_argument("device", nargs="*", metavar="DEVICE", help="devices to print (default: all)")
     parser.add_argument(
         "--rate", type=finite, default=None, metavar="HZ",
-        help=f"at most this many samples a second each; 0: every sample (default: table {TABLE_HZ:g}, json and csv 0)",
+        help="maximum samples per second of each device; 0: every sample (default: "
+        f"{TABLE_HZ:g} for table, 0 for json and csv)",
     )  # fmt: skip
     parser.add_argument(
         "--fields", type=str, default=None, metavar="NAME,…",
-        help="these fields of a sample, in this order (`imud schema` lists them)",
+        help="fields to print, in this order; `imud schema` lists all fields",
     )  # fmt: skip
     form = parser.add_mutually_exclusive_group()
     form.add_argument(
         "--format", choices=sorted(OUTPUTS), default="table",
-        help="table: local time, degrees, µT; json: an object per line; csv: RFC 4180; both in SI units "
+        help="table: local time, degrees, µT; json: one object per line, SI units; csv: RFC 4180, SI units "
         "(default: %(default)s)",
     )  # fmt: skip
-    form.add_argument("--json", dest="format", action="store_const", const="json", help="the same as --format json")
+    form.add_argument("--json", dest="format", action="store_const", const="json", help="same as --format json")
     parser.add_argument(
         "--convention", choices=[str(one) for one in Convention], default=None,
-        help="axes and angles of the samples (default: as configured)",
+        help="convention of axes and angles (default: as configured)",
     )  # fmt: skip
     parser.add_argument(
         "--latency", type=finite, default=None, metavar="MS",
-        help="samples may be so late, which costs less CPU (default: a period of the rate, at most 20; without one, 0)",
+        help="accepted latency; a longer latency costs less CPU time (default: one period of --rate, at most 20; "
+        "without --rate: 0)",
     )  # fmt: skip
     parser.add_argument("--count", type=int, default=None, metavar="N", help="stop after N samples")
-    parser.add_argument(
-        "--follow", action="store_true", help="wait for the daemon where it does not run, and go on after its restarts"
-    )
+    parser.add_argument("--follow", action="store_true", help="wait for the daemon, and continue after its restarts")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print until interrupted, until N samples came, or until the daemon ends; with `--follow` also after that."""
+    """Print samples until Ctrl-C, until `--count` samples, or until the daemon stops. `--follow` survives restarts."""
     fields = None if args.fields is None else chosen_fields(args.fields)
     watching = _Watching(args, OUTPUTS[args.format](fields))
     keep_connected("imud watch", args.socket, watching.work, follow=args.follow)
@@ -346,7 +345,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 class _Watching:
-    """What goes on from one connection to the next: the output, and how many samples are left."""
+    """State of the command, across several connections."""
 
     def __init__(self, args: argparse.Namespace, output: SampleOutput) -> None:
         self._args = args
@@ -369,7 +368,7 @@ class _Watching:
             notes.look(monotonic())
             try:
                 sample = next(samples)
-            except TimeoutError:  # silence: its reason is looked for
+            except TimeoutError:  # no sample for LOOK_S: the next `look` prints the reason
                 raise_if_unread()
                 continue
             self._write(self._output.text(sample))

@@ -1,4 +1,4 @@
-"""`imud web`: show the devices in a browser."""
+"""`imud web`: serve a web page that shows and controls the devices."""
 
 import argparse
 import asyncio
@@ -17,59 +17,61 @@ if TYPE_CHECKING:
 
 ADDRESS: Final = "127.0.0.1"
 PORT: Final = 9322
-"""Beside that of the metrics."""
+"""Default port. The metrics use port 9321."""
 STOP_S: Final = 3.0
-"""How long the end waits for pages that are open."""
+"""Maximum wait for open pages at the end, s."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud web`."""
     add_socket(parser)
     parser.add_argument(
         "--address", default=ADDRESS, metavar="ADDRESS",
-        help="listen here (default: %(default)s, which only this machine reaches); another one needs --token-file",
+        help="address to listen on (default: %(default)s, reachable from this host only); other addresses need "
+        "--token-file",
     )  # fmt: skip
     parser.add_argument(
-        "--port", type=int, default=PORT, metavar="N", help="listen there (default: %(default)s; 0: any)"
+        "--port", type=int, default=PORT, metavar="N", help="port to listen on (default: %(default)s; 0: a free port)"
     )
     parser.add_argument(
         "--token-file", metavar="FILE",
-        help="its first line is what a browser has to give before it may change anything; without it nobody may",
+        help="file with the token in its first line; a browser needs the token to change devices (default: the page "
+        "cannot change devices)",
     )  # fmt: skip
     parser.add_argument(
         "--reading", choices=("open", "token"),
-        help="whether looking needs the token too (default: open on this machine's own address, else token)",
+        help="token: a browser needs the token also to see the page (default: open on a loopback address, otherwise "
+        "token)",
     )  # fmt: skip
     parser.add_argument(
         "--host", action="append", default=[], metavar="NAME",
-        help="a further name under which browsers may ask for the page; IP addresses and localhost are known",
+        help="additional host name of the page; IP addresses and localhost are always accepted",
     )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until a signal. Raises BadArgument without the library, and for what cannot be served, or not safely."""
+    """Serve the page until SIGINT or SIGTERM. Raises BadArgument for unsafe arguments or without the extra `web`."""
     check_port(args.port)
     guard = guard_of(args)
     try:
         from imud.web.server import WebServer
     except ModuleNotFoundError as error:
-        raise BadArgument(f"it needs {error.name}: pip install 'imud[web]'") from None
+        raise BadArgument(f"cannot import {error.name}; install the extra: pip install 'imud[web]'") from None
     asyncio.run(_serve(WebServer(args.socket, guard).make_app(), args))
     return 0
 
 
 def guard_of(args: argparse.Namespace) -> WebGuard:
-    """Make the rules that the arguments ask for. Raises BadArgument for an open address without a token."""
+    """Return the access rules. Raises BadArgument for an address that other hosts can reach, without a token."""
     token = read_token(args.token_file) if args.token_file else b""
     local = is_loopback(args.address)
     if not token and not local:
         raise BadArgument(
-            f"--address {args.address} can be reached from other machines: expected --token-file FILE as well, "
-            "or no --address, and a tunnel: ssh -L 9322:127.0.0.1:9322 GATEWAY"
+            f"--address {args.address}: other hosts can reach this address; add --token-file FILE, or omit --address "
+            "and use a tunnel: ssh -L 9322:127.0.0.1:9322 GATEWAY"
         )
     reading = args.reading or ("open" if local else "token")
     if reading == "token" and not token:
-        raise BadArgument("--reading token: expected --token-file FILE as well")
+        raise BadArgument("--reading token: add --token-file FILE")
     return WebGuard(token, time, reading_needs_token=reading == "token", names=args.host)
 
 
@@ -94,16 +96,16 @@ async def _serve(app: "web.Application", args: argparse.Namespace) -> None:
 
 
 def _say(args: argparse.Namespace, port: int) -> None:
-    """Print where the page is, and to whom it is open."""
+    """Print the address of the page and who can use the page."""
     host = f"[{args.address}]" if ":" in args.address else args.address
     print(f"http://{host}:{port}/", flush=True)
     if not args.token_file:
-        print("nothing can be changed here: there is no --token-file", flush=True)
+        print("the page cannot change devices, because --token-file is not set", flush=True)
     if not is_loopback(args.address):
-        who = "everybody on these networks can look" if args.reading == "open" else "who has the token can look"
+        who = "every user of these networks" if args.reading == "open" else "every user with the token"
         print(
-            f"OPEN: {args.address} port {port} is reached from other machines: {who}, and who has the token can change "
-            "devices. HTTP is not encrypted: on networks of others use ssh -L or a proxy with TLS.",
+            f"OPEN: other hosts can reach {args.address} port {port}: {who} can see the page, and every user with the "
+            "token can change devices. HTTP is not encrypted: on untrusted networks, use ssh -L or a proxy with TLS.",
             file=sys.stderr, flush=True,
         )  # fmt: skip
 

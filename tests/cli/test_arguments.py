@@ -37,7 +37,7 @@ def test_durations() -> None:
     texts = {"90": 90, "90s": 90, "10min": 600, "1.5h": 5400, "2 d": 172_800, " .5s ": 0.5}
     assert {text: duration_s(text) for text in texts} == texts
     for text in ["", "min", "0", "-1s", "1 week", "1e3", "10m", "nan", "9" * 400 + "s"]:
-        with pytest.raises(argparse.ArgumentTypeError, match="expected a duration as 90s, 10min or 2h"):
+        with pytest.raises(argparse.ArgumentTypeError, match="expected a duration, for example 90s, 10min or 2h"):
             duration_s(text)
 
 
@@ -58,10 +58,10 @@ def test_a_risk_is_confirmed_on_a_terminal(
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
     monkeypatch.setattr("builtins.input", answers.pop)
     assert confirmed("reset bow", "all is lost", yes=False) is agreed
-    assert capsys.readouterr().out == ("" if agreed else "nothing was done\n")
+    assert capsys.readouterr().out == ("" if agreed else "imud changed nothing\n")
     assert confirmed("reset bow", "all is lost", yes=True)
     monkeypatch.setattr("sys.stdin.isatty", lambda: False, raising=False)
-    with pytest.raises(BadArgument, match="all is lost: expected a terminal to ask on, or --yes"):
+    with pytest.raises(BadArgument, match="all is lost: cannot ask for confirmation without a terminal"):
         confirmed("reset bow", "all is lost", yes=False)
 
 

@@ -43,11 +43,13 @@ def test_calibrations_are_listed_verified_and_saved(daemon: RunningDaemon, cli: 
 @live
 def test_mistakes_are_explained(daemon: RunningDaemon, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ("calibrate", "--socket", daemon.socket, "bow")
-    cli.refuses("no calibration 'dance'; there are: magnetometer, ", *words, "dance", "--yes")
-    cli.refuses("cannot save: the result lasts until power-off", *words, "heading", "--yes", "--save")
+    cli.refuses("unknown calibration 'dance'; bow has: magnetometer, ", *words, "dance", "--yes")
+    cli.refuses("expected no `save`, for its result lasts until power-off", *words, "heading", "--yes", "--save")
     cli.refuses("expected 9-axis mode", *words, "magnetometer", "--yes")
-    cli.refuses("expected a terminal to ask on, or --yes", *words, "level")
-    asked = iter(["Press Enter to begin, or type n: ", "Begin to turn it, and press Enter to begin"])
+    cli.refuses("cannot ask for confirmation without a terminal; confirm with --yes", *words, "level")
+    asked = iter(
+        ["Press Enter to start the calibration, or type n", "Start to turn the device, then press Enter to start"]
+    )
 
     def refuse(question: str) -> str:
         assert question.startswith(next(asked))
@@ -56,7 +58,7 @@ def test_mistakes_are_explained(daemon: RunningDaemon, cli: Cli, monkeypatch: py
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
     monkeypatch.setattr("builtins.input", refuse)
     for kind in ("level", "magnetometer"):
-        assert cli(*words, kind, status=1).out.endswith("\nnothing was done\n")
+        assert cli(*words, kind, status=1).out.endswith("\nimud changed nothing\n")
 
 
 @live
@@ -151,10 +153,10 @@ def test_a_result_has_its_checks_in_units_of_people() -> None:
         Check("force", None, 1.0, "m/s²", False),
     )  # fmt: skip
     assert account(Kept.BY_SAVE, *checks) == [
-        "verified", "  the device says: bias 0", "  roll: 0.573°, limit 1.15°: passed",
+        "verified", "  device reports: bias 0", "  roll: 0.573°, limit 1.15°: passed",
         "  turn: 5.73 °/s, limit 2.86 °/s: NOT passed", "  field: 45.1 µT, limit 67 µT: passed",
         "  share: 50.0%, limit 100.0%: passed", "  force: not reported, limit 1 m/s²: NOT passed",
-        "  not saved: lasts until power-off, unless it is saved; `--save` saves it",
+        "  not saved: lasts until power-off, unless it is saved; save it with --save",
     ]  # fmt: skip
 
 

@@ -39,21 +39,21 @@ def test_a_missing_device_and_no_device(tmp_path: Path, cli: Cli) -> None:
         write_config(tmp_path, {})
         daemon.signal(signal.SIGHUP)
         wait_until(lambda: not daemon.statuses(), "the daemon has no device")
-        cli.refuses("imud clock: the daemon has no device; `imud setup` finds", "clock", "--socket", daemon.socket)
+        cli.refuses("imud clock: the daemon has no device; configure", "clock", "--socket", daemon.socket)
         assert cli("clock", "--socket", daemon.socket, "--json").out == "{}\n"
 
 
 def test_aids_of_the_clock_have_rows() -> None:
     assert list(aids(device("plain"))) == []
     assert list(aids(equipped("bow"))) == [
-        ("SOUT", "4998 pulses, 9 belong to no sample; 17 samples without theirs"),
-        ("SIN", "400 triggers, 21 not answered by a sample"),
-        ("PPS", "59 pulses, 1 in step with none"),
-        ("UTC", "the host knows it to 250.0 µs (one sigma)"),
+        ("SOUT", "4998 pulses, 9 without a sample; 17 samples without a pulse"),
+        ("SIN", "400 triggers, 21 without a sample"),
+        ("PPS", "59 pulses, 1 ignored because of their interval"),
+        ("UTC", "error of the host clock 250.0 µs (one sigma)"),
     ]
     page = block(equipped("bow"), deque([9_000_000] * 100))
     assert "\n  SOUT      4998 pulses" in page
-    assert "  verdict   limited by the kernel's stamps" in page
+    assert "  verdict   the kernel's time stamps of the GPIO line" in page
     lines = msgspec.structs.replace(LINES, edges={})
     assert [name for name, _ in aids(equipped("bow", lines=lines, utc=None))] == ["SIN", "UTC"]
 
@@ -67,25 +67,25 @@ TIMER = [2 * MS + (n * 160 % 16_000) * 1_000 for n in range(200)]
 
 def test_the_cause_is_named_and_wires_that_do_not_fit_first() -> None:
     for clock, behind_ns, expected in [
-        (ClockStatus(Sync.UTC, t_err_ns=300_000), WIRE, "the host knows of UTC limits: 300.0 µs"),
-        (ClockStatus(Sync.EDGE, t_err_ns=4_000), TIMER, "the kernel's stamps of the line: 4.0 µs"),
-        (ClockStatus(Sync.ARRIVAL, t_err_ns=4_000), WIRE, "arrivals are all there is"),
+        (ClockStatus(Sync.UTC, t_err_ns=300_000), WIRE, "limits the time stamps: 300.0 µs"),
+        (ClockStatus(Sync.EDGE, t_err_ns=4_000), TIMER, "limit the time stamps: 4.0 µs"),
+        (ClockStatus(Sync.ARRIVAL, t_err_ns=4_000), WIRE, "imud uses arrival times only"),
         (ClockStatus(Sync.ARRIVAL), [], "too few"),
         (ClockStatus(Sync.REGRESSION), WIRE[: ENOUGH - 1], "too few"),
-        (ClockStatus(Sync.REGRESSION), WIRE, "arrivals spread over 0.0 ms; the constant delay"),
-        (ClockStatus(Sync.REGRESSION, hold_ns=16 * MS), TIMER, "USB adapter's latency timer of 16 ms"),
+        (ClockStatus(Sync.REGRESSION), WIRE, "arrivals spread over 0.0 ms; without SOUT"),
+        (ClockStatus(Sync.REGRESSION, hold_ns=16 * MS), TIMER, "latency timer of the USB adapter, 16 ms"),
         (ClockStatus(Sync.REGRESSION, hold_ns=16 * MS), WIRE, "the constant delay"),
-        (ClockStatus(Sync.REGRESSION), TIMER, "a loaded system"),
+        (ClockStatus(Sync.REGRESSION), TIMER, "the host is loaded"),
     ]:
         assert expected in verdict(clock, behind_ns)
     for clock, expected in [
-        (ClockStatus(Sync.EDGE, edges=1000, edges_unpaired=100, samples_unpaired=100), "stamps of the line"),
-        (ClockStatus(Sync.EDGE, edges=1000, edges_unpaired=101), "101 of 1000 pulses belong to no sample: is the wire"),
-        (ClockStatus(Sync.EDGE, edges=1000, samples_unpaired=3000), "3000 samples came without the pulse of theirs"),
-        (ClockStatus(Sync.EDGE, edges=1000, triggers_missed=500), "500 triggers on SIN were not answered"),
-        (ClockStatus(Sync.UTC, edges=1000, edges_unpaired=500), "belong to no sample"),
-        (ClockStatus(Sync.UTC, edges=1000), "the device keeps UTC itself"),
-        (ClockStatus(Sync.REGRESSION, edges=1000), "1000 edges came, and none is matched to a sample now"),
+        (ClockStatus(Sync.EDGE, edges=1000, edges_unpaired=100, samples_unpaired=100), "stamps of the GPIO line"),
+        (ClockStatus(Sync.EDGE, edges=1000, edges_unpaired=101), "101 of 1000 pulses have no sample: is the wire"),
+        (ClockStatus(Sync.EDGE, edges=1000, samples_unpaired=3000), "3000 samples have no pulse"),
+        (ClockStatus(Sync.EDGE, edges=1000, triggers_missed=500), "500 triggers on SIN caused no sample"),
+        (ClockStatus(Sync.UTC, edges=1000, edges_unpaired=500), "pulses have no sample"),
+        (ClockStatus(Sync.UTC, edges=1000), "the device sends UTC"),
+        (ClockStatus(Sync.REGRESSION, edges=1000), "1000 edges in total, but imud cannot match them"),
         (ClockStatus(Sync.REGRESSION, edges=EDGES_ENOUGH - 1, edges_unpaired=99), "the constant delay"),
     ]:
         assert expected in verdict(clock, WIRE)

@@ -51,7 +51,10 @@ def test_standard_input(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
 def test_a_file_without_a_message_and_none(tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "noise").write_bytes(bytes(range(128, 256)) * 8)
     assert json.loads(cli(*DECODE, tmp_path / "noise", status=1).err)["bytes_in"] == 1024
-    assert cli(*DECODE, tmp_path / "none", status=2).err == f"imud decode: {tmp_path}/none: No such file or directory\n"
+    assert (
+        cli(*DECODE, tmp_path / "none", status=2).err
+        == f"imud decode: cannot open {tmp_path}/none: No such file or directory\n"
+    )
     cli.refuses("/dev/zero is a character device, expected a regular file", *DECODE, "/dev/zero")
 
 
@@ -76,7 +79,7 @@ def test_a_fifo_is_read_as_it_comes_and_not_waited_for_without_a_writer(
     path = tmp_path / "fifo"
     os.mkfifo(path)
     monkeypatch.setattr("imud.cli.decode.FIFO_WAIT_MS", 1)
-    cli.refuses(f"imud decode: {path} is a FIFO that no program writes to; `-` reads", *DECODE, path)
+    cli.refuses(f"imud decode: {path} is a FIFO that no program writes to; to read", *DECODE, path)
     monkeypatch.setattr("imud.cli.decode.FIFO_WAIT_MS", 60_000)
     reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     writer = os.open(path, os.O_WRONLY)

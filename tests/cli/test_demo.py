@@ -23,7 +23,7 @@ from tests.support.daemon_process import LIMIT_S, wait_until
 @contextmanager
 def demo(*words: str) -> Iterator[tuple[ImudProcess, Path]]:
     with imud_process("demo", "--plain", *words, start_new_session=True) as process:
-        found = re.match(r"daemon at (\S+)/imud.sock", process.out.readline())
+        found = re.match(r"socket of the daemon: (\S+)/imud.sock", process.out.readline())
         assert found is not None
         try:
             yield process, Path(found[1])
@@ -47,8 +47,8 @@ def test_samples_flow_and_the_ledger_closes(device: str, product: str) -> None:
 
             wait_until(watched_and_known, f"{product} is known and watched", 3 * LIMIT_S)
         out = process.end(signal.SIGTERM).out
-    assert "the ledger closes to zero" in out
-    assert re.search(r"client +\d+ samples at \d+\.\d+ Hz, 0 missed", out)
+    assert "the ledger balances" in out
+    assert re.search(r"client +\d+ samples at \d+\.\d+ Hz, 0 lost", out)
     assert product in out
     assert not folder.exists()
 
@@ -70,8 +70,8 @@ def test_the_commands_it_prints_reach_it_from_another_directory() -> None:
 def test_it_ends_after_its_duration(capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--duration", "0.2", "--rate", "200", "--plain"]) == 0
     out = capfd.readouterr().out
-    assert "the ledger closes to zero" in out
-    folder = re.search(r"daemon at (\S+)/imud.sock", out)
+    assert "the ledger balances" in out
+    folder = re.search(r"socket of the daemon: (\S+)/imud.sock", out)
     assert folder is not None
     assert not Path(folder[1]).exists()
 
@@ -89,14 +89,14 @@ def test_children_that_end_too_early_are_named(
 ) -> None:
     monkeypatch.setattr(command, "START_LIMIT_S", LIMIT_S)
     simulator = command.simulator(tmp_path / "no" / "folder", [("hipnuc-uart", 0)], 100.0, "")
-    with pytest.raises(ImudError, match=r"^the simulator ended with status \d+ before it had a port$"), simulator:
+    with pytest.raises(ImudError, match=r"^the simulator ended with status \d+ before it opened its port$"), simulator:
         pass
     daemon = command.daemon(tmp_path, {"bow": {"driver": "none"}}, 0)
-    with pytest.raises(ImudError, match=r"^the daemon ended with status 78 at its start$"), daemon:
+    with pytest.raises(ImudError, match=r"^the daemon ended during its start with status 78$"), daemon:
         pass
     monkeypatch.setattr(command, "START_LIMIT_S", 0.0)
     daemon = command.daemon(tmp_path, {}, 0)
-    with pytest.raises(LinkMissing, match="the daemon opened no socket within 0 s"), daemon:
+    with pytest.raises(LinkMissing, match="the daemon did not open its socket within 0 s"), daemon:
         pass
     monkeypatch.setattr(command, "STOP_LIMIT_S", 0.1)
     deaf = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(99)"
@@ -104,24 +104,24 @@ def test_children_that_end_too_early_are_named(
         assert process.stdout is not None
         process.stdout.readline()
     assert process.returncode == -signal.SIGKILL
-    assert capsys.readouterr().err.endswith("the child had to be killed\n")
+    assert capsys.readouterr().err.endswith("the child did not stop within 0 s; imud killed it\n")
 
 
 def test_devices_that_cannot_be_shown(cli: Cli) -> None:
     for words, said in [
-        (["--device", "imu61x-i2c"], "imu61x-i2c is not simulated: say where a real one is, for example --bus 1"),
+        (["--device", "imu61x-i2c"], "cannot simulate imu61x-i2c; name the bus of a real device, for example --bus 1"),
         (
             ["--device", "imu61x-spi", "--bus", "1"],
-            "imu61x-spi is not simulated: say where a real one is, for example --port /dev/spidev0.0",
+            "cannot simulate imu61x-spi; name the bus of a real device, for example --port /dev/spidev0.0",
         ),
         (["--device", "imu61x-i2c", "--device", "imu61x-uart"], "expected imu61x-i2c alone, got 2 devices"),
         (
             ["--device", "hipnuc-uart", "--device", "imu61x-can"],
-            "expected one device on a port, or one or more on a CAN bus",
+            "several devices: expected CAN devices only",
         ),
         (
             ["--device", "imu61x-can", "--device", "imu61x-can"],
-            "expected devices that differ, for example --device imu61x-can:101 --device imu61x-can:201",
+            "expected different devices, for example --device imu61x-can:101 --device imu61x-can:201",
         ),
     ]:
         assert cli("demo", *words, status=2).err == f"imud demo: {said}\n"

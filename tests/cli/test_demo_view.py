@@ -18,7 +18,7 @@ def test_view_counts_what_is_missing_of_each_device() -> None:
     for seq in (1, 2, 5):
         view.add(sample(seq))
     assert (view.samples, view.missed) == (3, 2)
-    assert "3 samples at 100.00 Hz, 2 missed" in view.account()
+    assert "3 samples at 100.00 Hz, 2 lost" in view.account()
     assert "no sample arrived" in View(io.StringIO(), live=False).account()
     view = View(io.StringIO(), live=False)
     for name, seq in (("a", 1), ("b", 7), ("a", 2), ("b", 9)):

@@ -119,9 +119,7 @@ def test_a_device_that_is_gone_is_reported_once_and_when_it_is_back(capsys: pyte
     notes.look(6.0)
     client.found = [{"name": "bow", "state": "running", "problem": ""}]
     notes.look(8.0)
-    assert (
-        capsys.readouterr().err == "imud watch: bow is not in the configuration any more\nimud watch: bow is running\n"
-    )
+    assert capsys.readouterr().err == "imud watch: bow is no longer in the configuration\nimud watch: bow is running\n"
 
 
 def test_dropped_samples_are_reported_together(capsys: pytest.CaptureFixture[str]) -> None:
@@ -133,4 +131,6 @@ def test_dropped_samples_are_reported_together(capsys: pytest.CaptureFixture[str
     assert capsys.readouterr().err == ""
     notes.look(2.0)
     notes.look(4.0)
-    assert capsys.readouterr().err == "imud watch: 12 samples of bow were dropped: they were read too slowly\n"
+    assert (
+        capsys.readouterr().err == "imud watch: the daemon dropped 12 samples of bow because imud watch was too slow\n"
+    )

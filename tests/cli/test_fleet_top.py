@@ -59,7 +59,7 @@ def test_on_a_terminal_the_picture_is_redrawn(gateway: tuple[Mosquitto, SendingG
 def test_no_gateway_is_an_answer_of_no_and_the_reason_is_told(cli: Cli) -> None:
     printed = cli("fleet", "top", "mqtt://127.0.0.1:1", "--plain", "--interval", "0.2", "--duration", "1s", status=1)
     assert "no gateway yet; " in printed.out
-    assert "nothing comes at the end: mqtt://127.0.0.1:1" in printed.err
+    assert "the broker connection failed at the end: mqtt://127.0.0.1:1" in printed.err
 
 
 def test_arguments_are_checked(cli: Cli) -> None:

@@ -127,7 +127,7 @@ def test_ascii_locale(folder: Path, tmp_path: Path) -> None:
     file.write_text("devices: {}\n")
     done = imud("check", file, env=ASCII, stdout=subprocess.PIPE)
     assert (done.returncode, done.stderr) == (0, b"")
-    assert rb"Gr\udcc3\udcb6\udcc3\udc9fe.yaml: good" in done.stdout
+    assert rb"Gr\udcc3\udcb6\udcc3\udc9fe.yaml: valid" in done.stdout
     file.write_text("devices: {größe: 1}\n", encoding="utf-8")
     done = imud("check", file, env=ASCII, stdout=subprocess.PIPE)
     assert done.returncode == 2
@@ -149,7 +149,7 @@ def test_a_configuration_from_standard_input(cli: Cli, monkeypatch: pytest.Monke
         monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(text)))
 
     given(b"devices: {}\n")
-    assert cli("check", "-") == ("-: good; devices: none\n", "")
+    assert cli("check", "-") == ("-: valid; devices: none\n", "")
     given(b"devices: {a: 1}\n")
     cli.refuses("standard input:1:", "check", "-")
 

@@ -42,9 +42,9 @@ def words(daemon: RunningDaemon) -> tuple[object, ...]:
 
 
 def replayed(file: Path, cli: Cli, *names: str) -> list[dict[str, Any]]:
-    """The samples of a replay, which must be the same as the live run at several checks, of these devices only."""
+    """The samples of a replay, which must be equal to the live run at several checks, of these devices only."""
     printed = cli("replay", "--json", file)
-    assert printed.err.count("the same as the live run") == len(names)
+    assert printed.err.count("equal to the live run") == len(names)
     assert "0 of 0" not in printed.err
     assert "the file" not in printed.err
     found = [json.loads(line) for line in printed.out.splitlines()]
@@ -107,7 +107,7 @@ def test_a_recording_or_file_that_cannot_be_made(words: tuple[object, ...], tmp_
     cli.refuses("the flight recorder is off", *words, "--snapshot", tmp_path / "e")
     for option in (("--for", "1s"), ("--device", "bow")):
         cli.refuses("--snapshot: expected neither --device nor --for", *words, "--snapshot", *option)
-    cli.refuses("expected a duration as 90s, 10min or 2h, got 'soon'", *words, "--for", "soon")
+    cli.refuses("expected a duration, for example 90s, 10min or 2h, got 'soon'", *words, "--for", "soon")
     assert there.read_bytes() == b"mine"
     assert sorted(tmp_path.iterdir()) == [there]
 

@@ -49,7 +49,7 @@ def test_a_snapshot_whose_begin_is_gone_replays_as_the_daemon_ran(
     directory = f"directory: {tmp_path / 'flight'}, " if place == "directory" else ""
     collector, (file,) = run_flying(tmp_path, f"{directory}memory_mb: 1, minutes: 0.1, acceleration_m_s2: 5")
     printed = cli("replay", "--json", file)
-    assert printed.err.count("the same as the live run") == 2
+    assert printed.err.count("equal to the live run") == 2
     assert "0 of 0 checks" not in printed.err
     for name in ("bow", "mast"):
         live = [msgspec.json.encode(one).decode() for one in collector.samples if one.device == name]
@@ -70,5 +70,5 @@ def test_a_client_saves_the_last_minutes(tmp_path: Path, cli: Cli) -> None:
         assert "samples of 1 device" in cli("record", "--socket", daemon.socket, "--snapshot", file).err
     printed = cli("replay", "--json", file)
     assert len(printed.out.splitlines()) > 150
-    assert "the same as the live run" in printed.err
+    assert "equal to the live run" in printed.err
     assert list((tmp_path / "recordings").iterdir()) == []

@@ -31,8 +31,8 @@ def test_the_samples_are_those_that_the_daemon_published(recorded: Recorded, cli
     for name, ledger in ledgers.items():
         assert f"{name}: replayed" in printed.err
         assert f"samples   {ledger['samples']}; lost 0" in printed.err
-        assert f"bytes     {ledger['bytes_in']}: closed" in printed.err
-    assert printed.err.count("the same as the live run") == 2
+        assert f"bytes     {ledger['bytes_in']}: balanced" in printed.err
+    assert printed.err.count("equal to the live run") == 2
     assert "the file" not in printed.err
 
 
@@ -42,12 +42,12 @@ def test_records_that_were_dropped_are_an_answer_of_no(recorded: Recorded) -> No
         player.lost = lost
         with recorded[0].open("rb") as file:
             report, got = play_to_end(file, "a", player)
-        assert (got, "dropped when it was written: 3" in report) == (status, lost == 3)
+        assert (got, "the recorder dropped 3 records" in report) == (status, lost == 3)
 
 
 def test_options_of_captures_are_refused(recorded: Recorded, cli: Cli) -> None:
     for words in (["--driver", "hipnuc-uart"], ["--baud", "9600"], ["--speed", "real"], ["--option", "a=1"]):
-        cli.refuses(f"{words[0]}: expected none with a recording", "replay", *words, str(recorded[0]))
+        cli.refuses(f"{words[0]} applies to captures only", "replay", *words, str(recorded[0]))
 
 
 def test_a_fresh_clock_gives_other_numbers_and_says_why(recorded: Recorded, cli: Cli) -> None:
@@ -94,7 +94,7 @@ def test_a_file_that_only_begins_as_a_recording_is_an_error(tmp_path: Path, cli:
 def test_a_raw_capture_says_what_it_cannot_know(tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "c.raw").write_bytes(b"".join(hi91(10 * i) for i in range(300)))
     printed = " ".join(cli("replay", tmp_path / "c.raw").err.split())
-    assert "times not known: the capture has bytes and no time of any read" in printed
+    assert "times unknown: a raw capture does not contain arrival times" in printed
     assert "ppm" not in printed
     assert "Hz" not in printed
     assert "samples 300; lost 0" in printed

@@ -85,7 +85,9 @@ def test_check_has_notes(tmp_path: Path, cli: Cli) -> None:
         f"devices:\n  a: {{driver: hipnuc-uart, replay: {{path: {there}, speed: maximum}}}}\n"
         f"  b: {{driver: hipnuc-uart, replay: {{path: {there}2}}}}\n"
     )
-    assert cli("check", file).out.splitlines()[1:] == [f"{file}:3: note: b: {there}2 is not there: imud waits for it"]
+    assert cli("check", file).out.splitlines()[1:] == [
+        f"{file}:3: note: b: {there}2 does not exist; imud waits for the file"
+    ]
     file = tmp_path / "imud.yaml"
     file.write_text(
         "devices: {bow: {uart: {port: /dev/a}}, mast: {enabled: false, uart: {port: /dev/b}}}\n"
@@ -104,8 +106,8 @@ def test_check_has_notes(tmp_path: Path, cli: Cli) -> None:
         "    settings: {output: {hi91: 50, hi92: 50}}\n  stern:\n    uart: {port: /dev/ttyUSB1}\n"
     )
     good, note = cli("check", file).out.splitlines()
-    assert good == f"{file}: good; devices: bow, stern"
-    assert note.startswith(f"{file}:2: note: bow: HI92 next to HI91 is time-stamped by its arrival")
+    assert good == f"{file}: valid; devices: bow, stern"
+    assert note.startswith(f"{file}:2: note: bow: HI92 beside HI91 is dated by its arrival")
 
 
 @pytest.mark.parametrize(
@@ -113,7 +115,7 @@ def test_check_has_notes(tmp_path: Path, cli: Cli) -> None:
     [
         (ServerError("the socket is in use"), 75, "<2>the socket is in use\n"),
         (ImudError("no such thing"), 2, "imud run: no such thing\n"),
-        (ValueError("a bug"), 1, "<2>imud ends because of an internal error"),
+        (ValueError("a bug"), 1, "<2>imud stops because of an internal error"),
         (None, 0, ""),
     ],
 )

@@ -45,7 +45,7 @@ def test_from_difference_to_agreement_and_back(
     assert [line.split() for line in out.splitlines() if line.startswith("mode")] == [
         ["mode", "9-axis", "6-axis", "differs"]
     ]
-    assert "2 of 10 differ; `--apply` sets them" in out
+    assert "2 of 10 differ; set them with --apply" in out
     assert "2.2.4" not in out
     assert "2.2.4" in cli(*words, "--verbose", status=1).out
     assert json.loads(cli(*words, "--json", status=1).out)["status"]["state"] == "differ"
@@ -64,10 +64,10 @@ def test_from_difference_to_agreement_and_back(
     assert "to do:\n  mode: 6-axis → 9-axis\n" in out
     assert "done:\n  mode: done\n  output: done" in out
     assert (actual(daemon)["mode"], actual(daemon)["output"]["hi91"]) == ("9-axis", 50)
-    assert "all that can be read is as declared" in cli(*words).out
-    assert cli(*words, "--apply").out == "nothing to do\n"
+    assert "all readable settings are as declared" in cli(*words).out
+    assert cli(*words, "--apply").out == "no changes needed\n"
     assert "saved to flash" in cli(*words, "--save").out
-    assert "flash written by imud: 1 time, 1 within 24 hours" in cli(*words).out
+    assert "imud wrote the flash 1 time, 1 within 24 hours" in cli(*words).out
     # and back
     assert json.loads(cli(*words, "--restore", file, "--json").out)["problem"] == ""
     assert actual(daemon) == before
@@ -79,16 +79,16 @@ def test_values_in_place_of_the_declared_ones(daemon: RunningDaemon, words: tupl
     cli(*words, "--set", "sout_divisor=4", 'output={"hi91": 20}')
     assert (actual(daemon)["sout_divisor"], actual(daemon)["output"]["hi91"]) == (4, 20)
     out = cli(*words, "--set", "mounting=x_up", status=1).out
-    assert "left out: mounting needs a save and a restart" in out
+    assert "not set: mounting comes into force by save and restart only" in out
 
 
 def test_another_rate_is_asked_for_and_followed(
     daemon: RunningDaemon, words: tuple[object, ...], cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     more = (*words, "--save", "--set", "baud=460800")
-    cli.refuses("the device may not be reached afterwards: expected a terminal to ask on, or --yes", *more)
+    cli.refuses("the device may not be reached afterwards: cannot ask for confirmation without a terminal", *more)
     monkeypatch.setattr(sys, "stdin", Terminal("n\n"))
-    assert "nothing was done" in cli(*more, status=1).out
+    assert "imud changed nothing" in cli(*more, status=1).out
     cli(*more, "--yes")
     assert actual(daemon)["baud"] == 460800
     daemon.wait_for("bow", "running")
@@ -110,7 +110,7 @@ def test_mistakes_are_explained(words: tuple[object, ...], cli: Cli, tmp_path: P
     for text, problem in {
         "[1]": "expected the key settings with values",
         "settings:\n  a: b: c": "bow.yaml:2:",
-        "driver: imu61x-uart\nsettings: {}": "is of imu61x-uart, bow has driver hipnuc-uart",
+        "driver: imu61x-uart\nsettings: {}": "expected a backup of driver hipnuc-uart, which bow uses; got imu61x-uart",
     }.items():
         file.write_text(text)
         cli.refuses(problem, *words, "--restore", file)
@@ -123,10 +123,10 @@ def test_a_backup_of_another_module_is_told_of(words: tuple[object, ...], cli: C
     )
     err = cli(*words, "--restore", file, status=2).err
     for problem in (
-        "the backup is of product CH020, bow has ",
-        "the backup is of serial number 77, bow has ",
+        "product: the backup contains CH020, bow has ",
+        "serial number: the backup contains 77, bow has ",
         "left out: strange, which hipnuc-uart cannot set",
-        "the backup is of another module: expected a terminal to ask on, or --yes",
+        "the backup is from another device: cannot ask for confirmation without a terminal",
     ):
         assert problem in err
     cli(*words, "--restore", file, "--yes")
@@ -144,7 +144,7 @@ def test_a_backup_is_not_written_over_unasked(words: tuple[object, ...], cli: Cl
 
 def test_a_factory_reset_is_asked_for_and_backed_up(daemon: RunningDaemon, cli: Cli) -> None:
     command = ("command", "--socket", daemon.socket, "bow", "factory_reset")
-    cli.refuses("all settings of the device are lost: expected a terminal to ask on, or --yes", *command)
+    cli.refuses("all settings of the device are lost: cannot ask for confirmation without a terminal", *command)
     backups = daemon.folder / "backups"
     assert not backups.exists()
     cli(*command, "--yes")

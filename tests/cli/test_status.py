@@ -25,22 +25,22 @@ def test_each_part_of_a_device_has_its_row() -> None:
     assert "  identity  not known" in block(replace(device("bow"), identity={})).splitlines()
     frame = FrameStatus("body: x forward", "ned-frd", "ZYX", "NED", Heading.TRUE, -3.5, {}, "its z axis points down")
     lines = block(replace(device("bow"), frame=frame)).splitlines()
-    at = lines.index("  axes      ned-frd, body: x forward; heading true by a declination of -3.5°")
+    at = lines.index("  axes      ned-frd, body: x forward; heading true with a declination of -3.5°")
     assert lines[at + 1] == "            (its z axis points down)"
     own = replace(frame, frame="sensor: x right", convention="device", declination_deg=None, problem="")
     assert axes(own) == "sensor: x right; heading true"
     assert block(device("front", polling=POLLING)).splitlines()[-2:] == [
         "  polling   1000 reads, 20 late, 3 missed, 4 stale, 5 failed; 70.0 µs after the",
-        "            deadline, 8000.0 at worst; vanished 6 times",
+        "            deadline, maximum 8000.0 µs; vanished 6 times",
     ]
     assert block(equipped("bow")).splitlines()[-10:] == [
-        "  line      11 requests unanswered; 12 bytes unasked, 13 strange; 14 echoes (all",
-        "            devices of the line)",
+        "  line      11 requests without a reply; 12 bytes without a request, 13 invalid",
+        "            bytes; 14 echoes (all devices of the bus)",
         "  sout      5000 edges, 7 lost",
         "  alarm     ACTIVE, raised 3 times; 2 edges, 0 lost (/dev/gpiochip0 is not",
         "            there)",
         "  pps       60 edges, 0 lost",
-        "  sin       400 triggers, 8 missed; 30.0 µs after the deadline, 900.0 at worst",
+        "  sin       400 triggers, 8 missed; 30.0 µs after the deadline, maximum 900.0 µs",
         "  utc       gpsd at 127.0.0.1:2947: 100 sentences, 90 sent, not sent: stale 7,",
         "            busy 3; 59 pulses, 1 ignored; chronyd accepted 40, refused 19",
         "            (chronyd does not take samples)",
@@ -73,12 +73,12 @@ def test_a_device_that_does_not_run_has_its_reason_and_the_next_step() -> None:
     assert "doctor" not in page([device("bow"), device("mast", state=DeviceState.FINISHED)])
     text = page([device("bow"), device("mast", state=DeviceState.MISSING, problem="/dev/x is not there: the cable?")])
     assert "mast: missing\n  /dev/x is not there: the cable?\n" in text
-    assert text.endswith("\n\n`sudo imud doctor` looks for the cause, and says what to do next")
+    assert text.endswith("\n\nto find the cause and the next step, run `sudo imud doctor`")
 
 
 def test_lines_and_utc_say_only_what_is_known() -> None:
     lines = LinesStatus({"sin": "GPIO4 is in use by another program"}, {}, {}, sin=True)
-    for alarm, words in ((True, "ACTIVE"), (False, "inactive"), (None, "level not known")):
+    for alarm, words in ((True, "ACTIVE"), (False, "inactive"), (None, "level unknown")):
         assert watched(replace(LINES, alarm=alarm), "alarm", 2).startswith(f"{words}, raised")
     assert driven(lines).endswith("(GPIO4 is in use by another program)")
     assert [name for name, _ in parts(device("bow", lines=LinesStatus({}, {}, {}, sin=True)))] == ["sin"]
@@ -99,4 +99,4 @@ def test_settings_and_status_bits_have_names() -> None:
         status_bit_names={"5": "accelerometer over range"},
     )
     assert dict(parts(shown)) == {"status": "accelerometer over range", "present": "mode 6-axis, output.hi91 100 Hz"}
-    assert dict(parts(replace(shown, status_bits=0, status_words=())))["status"] == "no bit that is known is set"
+    assert dict(parts(replace(shown, status_bits=0, status_words=())))["status"] == "no known bit is set"

@@ -52,7 +52,7 @@ def test_it_connects_again_to_a_daemon_that_was_restarted(tmp_path: Path) -> Non
 
 
 def test_without_a_terminal_or_the_library_it_says_what_to_do(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
-    words = "expected a terminal; `imud status` and `imud watch` write to anything"
+    words = "imud top needs a terminal; for files and pipes, use `imud status` or `imud watch`"
     assert cli("top", status=2).err == f"imud top: {words}\n"
     for stream in (sys.stdin, sys.stdout):
         monkeypatch.setattr(stream, "isatty", lambda: True)

@@ -30,11 +30,9 @@ def parsed(*words: str) -> object:
 
 def test_another_address_needs_a_token() -> None:
     for address in ("0.0.0.0", "::", "192.168.1.5", "gateway"):
-        with pytest.raises(
-            BadArgument, match="expected --token-file FILE as well, or no --address, and a tunnel: ssh -L"
-        ):
+        with pytest.raises(BadArgument, match="add --token-file FILE, or omit --address and use a tunnel: ssh -L"):
             parsed("--address", address)
-    with pytest.raises(BadArgument, match="--reading token: expected --token-file"):
+    with pytest.raises(BadArgument, match="--reading token: add --token-file"):
         parsed("--reading", "token")
 
 
@@ -89,9 +87,9 @@ def test_addresses_and_who_may_look_and_change_are_said(capsys: pytest.CaptureFi
         _say(build_parser(("web",)).parse_args(["web", *words]), 81)
         return capsys.readouterr()
 
-    assert said() == ("http://127.0.0.1:81/\nnothing can be changed here: there is no --token-file\n", "")
+    assert said() == ("http://127.0.0.1:81/\nthe page cannot change devices, because --token-file is not set\n", "")
     assert said("--address", "::1", "--token-file", "x") == ("http://[::1]:81/\n", "")
     out, err = said("--address", "::", "--token-file", "x", "--reading", "open")
     assert out == "http://[::]:81/\n"
-    assert "OPEN: :: port 81 is reached from other machines: everybody on these networks can look" in err
-    assert "who has the token can look" in said("--address", "0.0.0.0", "--token-file", "x")[1]
+    assert "OPEN: other hosts can reach :: port 81: every user of these networks can see the page" in err
+    assert "every user with the token can see" in said("--address", "0.0.0.0", "--token-file", "x")[1]

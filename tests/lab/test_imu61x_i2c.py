@@ -142,4 +142,4 @@ def test_demo_on_a_bus_that_exists(i2c: Bus[I2cTransfer]) -> None:
     printed = demo("--device", "imu61x-i2c", "--bus", "0", "--rate", "20", "--duration", "5")
     assert "link      /dev/i2c-0, address 0x1a, driver imu61x-i2c" in printed
     assert "reads, " in printed
-    assert printed.rstrip().endswith("the ledger closes to zero")
+    assert printed.rstrip().endswith("the ledger balances")

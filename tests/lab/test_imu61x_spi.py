@@ -178,4 +178,4 @@ def test_demo_on_a_bus_that_exists(spi8: Bus[SpiTransfer]) -> None:
     printed = demo("--device", "imu61x-spi", "--port", "/dev/spidev0.0", "--rate", "20", "--duration", "5")
     assert "link      /dev/spidev0.0, mode 0, driver imu61x-spi" in printed
     assert "reads, " in printed
-    assert printed.rstrip().endswith("the ledger closes to zero")
+    assert printed.rstrip().endswith("the ledger balances")

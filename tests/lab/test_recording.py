@@ -132,7 +132,7 @@ def replayed(file: Path) -> dict[str, list[Sample]]:
     command = [sys.executable, "-m", "imud", "replay", "--json", str(file)]
     done = subprocess.run(command, capture_output=True, timeout=SLOW_S, check=False)
     assert done.returncode == 0, done.stderr.decode()
-    assert b"the same as the live run" in done.stderr
+    assert b"equal to the live run" in done.stderr
     found: dict[str, list[Sample]] = {}
     for line in done.stdout.splitlines():
         sample = msgspec.json.decode(line, type=Sample)

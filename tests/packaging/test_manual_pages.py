@@ -36,7 +36,7 @@ def test_pages_are_valid_roff() -> None:
                 assert line[1:].split()[0] in (*REQUESTS, "br"), line
     roff = [escaped(text) for text in ("--json", ".5", "'a'", "a\\b", "~^")]
     assert roff == ["\\-\\-json", "\\&.5", "\\&'a'", "a\\eb", "\\(ti\\(ha"]
-    assert sentence("list what is attached") == "List what is attached."
+    assert sentence("list attached devices") == "List attached devices."
     assert marked("see `imud check`.") == "see \\fBimud check\\fR."
 
 
@@ -64,7 +64,7 @@ def test_synopsis_commands_and_summary() -> None:
     assert ".SS imud modbus scan List the module at every address." in text
     assert ".SS imud modbus assign" in text
     assert PAGES["imud-watch.1"].startswith('.TH "IMUD\\-WATCH" "1" ')
-    assert ".SH NAME\nimud\\-watch \\- print samples as they come\n" in PAGES["imud-watch.1"]
+    assert ".SH NAME\nimud\\-watch \\- print samples\n" in PAGES["imud-watch.1"]
     assert "RS\\-485" in PAGES["imud-modbus.1"]
 
 
