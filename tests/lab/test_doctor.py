@@ -146,27 +146,27 @@ def test_healthy_devices_then_a_newer_file_then_no_daemon(
         allowed = {"clock", "processor", "kernel log", "CAN state"}
         assert {check for check, _ in found.of("warning")} <= allowed
         found.has("clock", "warning", "synchronised", "chrony")
-        found.has("service", "not checked", "no systemd runs here")
+        found.has("service", "not checked", "does this host use systemd?")
         for check, seen in {
-            "configuration": "has no mistakes", "socket": "the daemon answers", "ports": "is there",
-            "rights": "may be opened by user root", "ports taken": "is used by no other program",
+            "configuration": "is valid", "socket": "the daemon replies", "ports": "exists",
+            "rights": "user root can open ", "ports taken": "no other program uses ",
             "serial data": "bow: ", "CAN interfaces": "can0 is up", "CAN state": "can0 is ERROR-ACTIVE",
-            "CAN bit rate": "can0 has 500000 bit/s", "bus nodes": "/dev/i2c-0 is there", "I2C": "keel: ",
-            "SPI": "deck: ", "stale configuration": "the daemon runs with what",
+            "CAN bit rate": "can0 has 500000 bit/s", "bus nodes": "/dev/i2c-0 exists", "I2C": "keel: ",
+            "SPI": "deck: ", "stale configuration": "the daemon uses the configuration in",
         }.items():  # fmt: skip
             found.has(check, "ok", seen)
-        found.has("Prometheus", "note", "nothing has scraped 127.0.0.1 port", "docs/monitoring.md")
+        found.has("Prometheus", "note", "no scrape of 127.0.0.1 port", "docs/monitoring.md")
         with urlopen(f"http://127.0.0.1:{METRICS_PORT}/metrics", timeout=LIMIT_S) as answer:
             assert answer.read()
         write_config(tmp_path, {**devices, "stern": uart("/dev/ttyUSB9")}, metrics=metrics)
         found = doctor(made)
-        found.has("Prometheus", "ok", "scraped 1 times")
-        found.has("stale configuration", "warning", "has bow, deck, keel, mast, stern", "systemctl reload imud")
-        found.has("ports", "error", "/dev/ttyUSB9 is not there; ports of this machine: ", "imud probe")
+        found.has("Prometheus", "ok", "1 scrapes")
+        found.has("stale configuration", "warning", "contains bow, deck, keel, mast, stern", "systemctl reload imud")
+        found.has("ports", "error", "/dev/ttyUSB9 does not exist; ports of this host: ", "imud probe")
     found = doctor(made)
     found.has("socket", "error", str(made.socket), "systemctl start imud")
     for check in ("devices", "serial data", "I2C", "SPI"):
-        found.has(check, "not checked", "the daemon does not answer")
+        found.has(check, "not checked", "the daemon does not reply")
     assert not found.complete
 
 
@@ -180,7 +180,7 @@ def test_mistakes_and_a_port_that_is_the_console(tmp_path: Path) -> None:
     write_config(tmp_path, {"bow": {"driver": "hipnuc-uart", "uart": {"prot": "/dev/ttyS1"}}})
     found = diagnose(config, tmp_path / "imud.sock")
     found.has("configuration", "error", "prot", "imud check")
-    found.has("stale configuration", "not checked", "no configuration that can be compared")
+    found.has("stale configuration", "not checked", "cannot compare the running daemon")
 
 
 @pytest.mark.thorough
@@ -210,16 +210,16 @@ def test_serial_ports(uarts: tuple[Path, Path], tmp_path: Path) -> None:
         wait_for(made, "deaf", lambda one: one.ledger["samples"] > enough_samples, "a minute of samples")
         found = doctor(made)
         assert found.status == 2
-        found.has("serial data", "error", "quiet: nothing is heard on", "exchange the two wires")
-        found.has("serial data", "error", "bits: only 40 bytes came", "an echo of what imud sends")
+        found.has("serial data", "error", "quiet: no byte arrives on", "Are TX and RX swapped")
+        found.has("serial data", "error", "bits: only 40 bytes arrived", "echoes of imud's requests")
         found.has("serial data", "error", "slow: ", "set `baud: auto`")
-        found.has("serial data", "warning", "deaf: samples come, but no answer", "wire TX of the adapter to RX")
-        found.has("RS-485", "error", "nothing heard on", "A and B swapped")
-        found.has("RS-485", "error", "echoes heard on", "switch its direction by itself")
-        found.has("ports taken", "error", f"{held.path} is open in ", "stop that program")
+        found.has("serial data", "warning", "deaf sends samples, but never replied", "connect TX of the adapter to RX")
+        found.has("RS-485", "error", "no byte arrived on", "A and B (swapped?)")
+        found.has("RS-485", "error", "echoes of its requests on", "`direction`")
+        found.has("ports taken", "error", f"{held.path} is open in another program: ", "stop the program")
         assert any(f"pid {holder.pid}" in seen for _, seen in found.of("error"))
         found.has("devices", "error", "held is ", "see the findings on its port or bus")
-        found.has("Prometheus", "error", "metrics do not answer at 127.0.0.1", "is the port taken?")
+        found.has("Prometheus", "error", "metrics do not reply at 127.0.0.1", "does another program use the port?")
         check_rights(made, near)
 
 
@@ -230,16 +230,18 @@ def check_rights(made: RunningDaemon, port: Path) -> None:
         os.chmod(port, 0o600)
         os.chown(port, 0, 0)
         found = doctor(made, *ORDINARY_USER)
-        refused = f"{port} may not be opened by user nobody: the node belongs to group "
+        refused = f"user nobody cannot open {port}: the node belongs to group "
         found.has("rights", "error", f"{refused}root, EACCES", 'udev rule SUBSYSTEM=="tty", KERNEL=="')
         found.has("socket", "not checked", "", "join the group and log in again")
-        found.has("ports taken", "not checked", f"whether {port} is open elsewhere", "`sudo imud doctor` sees them")
+        found.has(
+            "ports taken", "not checked", f"cannot check whether another program uses {port}", "run `sudo imud doctor`"
+        )
         os.chmod(port, 0o660)
         os.chown(port, 0, DIALOUT)
         found = doctor(made, *ORDINARY_USER)
         found.has("rights", "error", f"{refused}dialout, EACCES", "usermod --append --groups dialout nobody`")
         member = [f"--groups={DIALOUT}" if word == "--clear-groups" else word for word in ORDINARY_USER]
-        doctor(made, *member).has("rights", "ok", f"{port} may be opened by user nobody")
+        doctor(made, *member).has("rights", "ok", f"user nobody can open {port}")
     finally:
         os.chown(port, before.st_uid, before.st_gid)
         os.chmod(port, before.st_mode & 0o777)
@@ -261,28 +263,28 @@ def test_can(can_pair: tuple[CanInterface, CanInterface], tmp_path: Path) -> Non
         wait_for(made, "mast", lambda one: one.state is DeviceState.SEARCHING, "the interface is open")
         with near.error_counters(128, 0):
             found = doctor(made)
-            found.has("CAN bit rate", "error", "mast: no frame comes at 500000", "try 125000, 250000, 1000000")
+            found.has("CAN bit rate", "error", "mast: no frame arrives at 500000", "try 125000, 250000, 1000000")
             found.has("CAN state", "error", "tx 128, rx 0", "no other node acknowledges")
         with near.error_counters(0, 127):
             found = doctor(made)
-            found.has("CAN state", "error", "tx 0, rx 127", "a missing terminator or a wrong bit rate")
+            found.has("CAN state", "error", "tx 0, rx 127", "a terminator is missing, or the bit rate is wrong")
         with simulator("--device", "imu61x-can", "--interface", "can1", "--rate", "10"):
             wait_running(made, "mast")
             found = doctor(made)
             found.has("CAN state", "ok", f"{near.name} is ERROR-ACTIVE")
-            found.has("CAN state", "note", "does not return from bus-off by itself", "restart-ms 100")
+            found.has("CAN state", "note", "does not restart after bus-off", "restart-ms 100")
             check_states(made, near)
         wait_for(made, "mast", lambda one: one.state is not DeviceState.RUNNING, "its module is gone")
         with near.error_counters(128, 0):
             found = doctor(made)
             found.has("CAN state", "error", "tx 128", "no other node acknowledges")
-            found.has("CAN bit rate", "error", "mast: no frame comes at 500000", "power and wiring of the module")
+            found.has("CAN bit rate", "error", "mast: no frame arrives at 500000", "power and wiring of the device")
         near.down()
         found = doctor(made)
         found.has("CAN interfaces", "error", f"{near.name} is down", f"ip link set {near.name} up type can bitrate")
         tool("ip", "link", "set", near.name, "type", "can", "bitrate", "100000")
         near.up()
-        doctor(made).has("CAN bit rate", "warning", "100000 bit/s, which no supported module has", "one of 125000")
+        doctor(made).has("CAN bit rate", "warning", "100000 bit/s, which no supported device uses", "one of 125000")
 
 
 def check_states(made: RunningDaemon, near: CanInterface) -> None:
@@ -295,8 +297,8 @@ def check_states(made: RunningDaemon, near: CanInterface) -> None:
     advice = found.advice("CAN state", "error", f"{near.name} is BUS-OFF")
     commands = re.findall(r"`sudo (ip .*?)`", advice)
     assert len(commands) == 2, advice
-    assert "let it recover; 120 Ω at both ends" in advice
-    found.has("kernel log", "warning", "trouble of CAN controllers", "terminators, bit rate, wiring")
+    assert "restart-ms 100`; check: 120 Ω at both ends" in advice
+    found.has("kernel log", "warning", "errors of CAN controllers", "terminators, bit rate and wiring")
     for command in commands:
         tool(*command.split())  # the kernel refuses restart-ms while the interface is up
     wait_running(made, "mast")
@@ -334,14 +336,18 @@ def test_i2c_and_spi(i2c: Bus[I2cTransfer], spi8: Bus[SpiTransfer], spi16: Bus[S
         wait_running(made, "flaky", "noisy")
         found = doctor(made)
     assert found.status == 2
-    found.has("bus nodes", "error", "/dev/i2c-7 is not there; of its kind there are: /dev/i2c-0", "modprobe i2c-dev")
-    found.has("bus nodes", "error", "/dev/spidev7.0 is not there; of its kind there are: /dev/spidev0.0", "spi=on")
-    found.has("I2C", "error", "absent: no samples on", "no answer at address 0x18: SDA and SCL swapped")
+    found.has(
+        "bus nodes", "error", "/dev/i2c-7 does not exist; existing nodes of this kind: /dev/i2c-0", "modprobe i2c-dev"
+    )
+    found.has(
+        "bus nodes", "error", "/dev/spidev7.0 does not exist; existing nodes of this kind: /dev/spidev0.0", "spi=on"
+    )
+    found.has("I2C", "error", "absent: no samples on", "If no device replies at address 0x18")
     found.has("I2C", "warning", "transfers failed", "pull-ups of 2 to 5 kΩ")
-    found.has("I2C", "warning", "answers were damaged", "a lower bus clock")
-    found.has("SPI", "error", "dumb: no samples on", "all bytes 00: MISO or power")
-    found.has("SPI", "error", "mixed: no samples on", "both bytes of each word are exchanged")
-    found.has("SPI", "error", "late: no samples on", "shifted by one bit; imud has mode 0 by the configuration")
+    found.has("I2C", "warning", "replies were damaged", "a lower bus clock")
+    found.has("SPI", "error", "dumb: no samples on", "if all bytes are 00: check MISO and power")
+    found.has("SPI", "error", "mixed: no samples on", "the two bytes of each word are swapped")
+    found.has("SPI", "error", "late: no samples on", "shifted by one bit; imud uses the configured mode 0")
 
 
 def refusing(answer: Callable[[I2cTransfer], bytes], every: int) -> Callable[[I2cTransfer], bytes]:
@@ -376,9 +382,9 @@ def test_lines_and_restarts(gpio_chip: GpioChip, tmp_path: Path) -> None:
         made = stack.enter_context(daemon(tmp_path, devices))
         wait_for(made, "bow", lambda one: one.ledger["samples"] > 250, "enough samples")
         found = doctor(made)
-        found.has("lines", "warning", "bow: sout: no edge in", "is the line wired to this GPIO")
-        found.has("lines", "warning", "bow: pps: no pulse in", "has the receiver a fix?")
-        found.has("lines", "note", "bow: alarm: no edge so far", "tilt the module beyond its limit")
+        found.has("lines", "warning", "bow: sout: no edge in", "is the wire connected to this GPIO")
+        found.has("lines", "warning", "bow: pps: no pulse in", "does the receiver have a fix?")
+        found.has("lines", "note", "bow: alarm: no edge so far", "tilt the device beyond a limit")
         found.has("restarts", "ok", "bow has not restarted")
         assert imu.process.stdin is not None
         for number in range(1, 4):
@@ -388,7 +394,7 @@ def test_lines_and_restarts(gpio_chip: GpioChip, tmp_path: Path) -> None:
             imu.process.stdin.write("reboot\n")
             imu.process.stdin.flush()
             wait_for(made, "bow", lambda one, least=number: one.clock.resets >= least, "the restart in the status")  # type: ignore[misc]  # a lambda's default
-        doctor(made).has("restarts", "warning", "bow began its clock anew 3 times", "brown-out?")
+        doctor(made).has("restarts", "warning", "the device counter of bow restarted 3 times", "supply voltage")
 
 
 @pytest.mark.thorough
@@ -399,5 +405,5 @@ def test_a_line_of_another_program(gpio_chip: GpioChip, tmp_path: Path) -> None:
         with daemon(tmp_path, devices) as made:
             wait_for(made, "bow", lambda one: one.lines and one.lines.problems, "the line is busy")
             found = doctor(made)
-            found.has("lines", "error", "is in use by gpiomon", "`gpioinfo` lists lines and who uses them")
-            found.has("ports", "error", f"{tty(tmp_path)} is not there", "")
+            found.has("lines", "error", "is in use by gpiomon", "`gpioinfo` lists the lines and their users")
+            found.has("ports", "error", f"{tty(tmp_path)} does not exist", "")

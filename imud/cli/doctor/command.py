@@ -1,7 +1,7 @@
-"""`imud doctor`: run all checks, print what was found; the exit status says how bad it is.
+"""`imud doctor`: run all checks and print the findings. The exit status is the worst severity.
 
-Nothing is changed and no port is opened. It runs with the daemon up or down, as any user; what a user may not see is
-listed as not checked.
+The command changes nothing and opens no port. It works with and without the daemon, and for every user. A check that
+needs more rights has the severity "not checked".
 """
 
 import argparse
@@ -15,33 +15,7 @@ from typing import Final, NamedTuple
 import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket
-from imud.cli.doctor import (
-    buses,
-)
-from imud.cli.doctor import (
-    buses as can,
-)
-from imud.cli.doctor import (
-    daemon as outputs,
-)
-from imud.cli.doctor import (
-    daemon as service,
-)
-from imud.cli.doctor import (
-    daemon as traffic,
-)
-from imud.cli.doctor import (
-    machine as host,
-)
-from imud.cli.doctor import (
-    machine as kernel_log,
-)
-from imud.cli.doctor import (
-    ports as access,
-)
-from imud.cli.doctor import (
-    ports as serial_ports,
-)
+from imud.cli.doctor import buses, daemon, machine, ports
 from imud.cli.doctor.surroundings import DoctorCheck, DoctorFinding, Severity, Surroundings, ask_daemon
 from imud.cli.output import COLUMNS
 from imud.cli.run import DEFAULT_FILE
@@ -49,22 +23,22 @@ from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
 from imud.model.errors import ImudError
 
 MARGIN: Final = 13
-"""Width of the column of severities."""
+"""Width of the column with the severities, characters."""
 STATUS: Final = {Severity.ERROR: 2, Severity.WARNING: 1}
-"""Exit status by the worst severity; 0 for the others."""
+"""Exit status by the worst severity; 0 for other severities."""
 FINDINGS_MAX: Final = 300
-"""Of one check: 256 devices have some each."""
+"""Maximum number of findings of one check. imud supports 256 devices."""
 
 
 class Examined(NamedTuple):
-    """A check that ran, with what it found."""
+    """Findings of a check."""
 
     name: str
     findings: list[DoctorFinding]
 
 
 def examine(checks: Sequence[DoctorCheck], at: Surroundings) -> list[Examined]:
-    """Run all checks. One that cannot look is a finding and ends no other."""
+    """Run all checks. A check that fails returns the finding "not checked"; the other checks continue."""
     return [Examined(check.name, _findings(check, at)) for check in checks]
 
 
@@ -81,19 +55,19 @@ def _findings(check: DoctorCheck, at: Surroundings) -> list[DoctorFinding]:
 
 
 def _reason(problem: Exception) -> str:
-    """Why a check could not look."""
+    """Return the reason why a check failed."""
     if isinstance(problem, FileNotFoundError) and problem.filename:
-        return f"{problem.filename} is not there, or not installed"
+        return f"{problem.filename} does not exist or is not installed"
     return str(problem) or type(problem).__name__
 
 
 def exit_status(examined: Sequence[Examined]) -> int:
-    """0 for nothing wrong, 1 for warnings, 2 for errors."""
+    """Return 0 without problems, 1 for warnings, 2 for errors."""
     return max((STATUS.get(finding.severity, 0) for one in examined for finding in one.findings), default=0)
 
 
 def verdict(examined: Sequence[Examined]) -> str:
-    """The last line: what is wrong, and whether all was looked at."""
+    """Return the last line: the number of problems and of failed checks."""
     found = [finding.severity for one in examined for finding in one.findings]
     unseen = found.count(Severity.NOT_CHECKED)
     wrong = [
@@ -102,14 +76,14 @@ def verdict(examined: Sequence[Examined]) -> str:
         if severity in found
     ]
     if wrong:
-        return ", ".join(wrong) + (f"; {_counted(unseen, 'thing')} could not be checked" if unseen else "")
+        return ", ".join(wrong) + (f"; {_counted(unseen, 'item')} not checked" if unseen else "")
     if unseen:
-        return f"nothing wrong found in what could be checked; {_counted(unseen, 'thing')} could not"
-    return "nothing wrong found"
+        return f"no problem found; {_counted(unseen, 'item')} not checked"
+    return "no problem found"
 
 
 def page(examined: Sequence[Examined]) -> str:
-    """All findings by check, those in order first, and the verdict."""
+    """Format all findings, the worst severity last, and the verdict."""
     findings = [finding for one in examined for finding in one.findings]
     findings.sort(key=lambda finding: _RANK[finding.severity])
     return "\n".join([*(_block(finding) for finding in findings), "", *textwrap.wrap(verdict(examined), COLUMNS)])
@@ -134,7 +108,7 @@ def _wrapped(text: str) -> list[str]:
 
 
 def as_json(examined: Sequence[Examined]) -> bytes:
-    """All findings by check, for programs."""
+    """Return all findings by check, as JSON."""
     found = [finding for one in examined for finding in one.findings]
     return msgspec.json.encode(
         {
@@ -146,54 +120,54 @@ def as_json(examined: Sequence[Examined]) -> bytes:
     )
 
 
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 CHECKS: Final = (
-    DoctorCheck("configuration", service.configuration),
-    DoctorCheck("service", service.service),
-    DoctorCheck("socket", service.socket),
-    DoctorCheck("stale configuration", service.stale_configuration),
-    DoctorCheck("devices", service.device_states),
-    DoctorCheck("ports", serial_ports.ports_present),
-    DoctorCheck("rights", access.rights),
-    DoctorCheck("rules of the unit", access.unit_rules),
-    DoctorCheck("ports taken", serial_ports.ports_taken),
-    DoctorCheck("ModemManager", serial_ports.modem_manager),
-    DoctorCheck("latency timer", serial_ports.latency_timer),
-    DoctorCheck("serial data", traffic.heard),
-    DoctorCheck("RS-485", traffic.half_duplex),
-    DoctorCheck("restarts", traffic.restarts),
-    DoctorCheck("CAN interfaces", can.can_up),
-    DoctorCheck("CAN state", can.can_state),
-    DoctorCheck("CAN bit rate", can.can_bitrate),
+    DoctorCheck("configuration", daemon.configuration),
+    DoctorCheck("service", daemon.service),
+    DoctorCheck("socket", daemon.socket),
+    DoctorCheck("stale configuration", daemon.stale_configuration),
+    DoctorCheck("devices", daemon.device_states),
+    DoctorCheck("ports", ports.ports_present),
+    DoctorCheck("rights", ports.rights),
+    DoctorCheck("rules of the unit", ports.unit_rules),
+    DoctorCheck("ports taken", ports.ports_taken),
+    DoctorCheck("ModemManager", ports.modem_manager),
+    DoctorCheck("latency timer", ports.latency_timer),
+    DoctorCheck("serial data", daemon.heard),
+    DoctorCheck("RS-485", daemon.half_duplex),
+    DoctorCheck("restarts", daemon.restarts),
+    DoctorCheck("CAN interfaces", buses.can_up),
+    DoctorCheck("CAN state", buses.can_state),
+    DoctorCheck("CAN bit rate", buses.can_bitrate),
     DoctorCheck("bus nodes", buses.bus_nodes),
     DoctorCheck("I2C", buses.i2c_transfers),
     DoctorCheck("SPI", buses.spi_transfers),
-    DoctorCheck("lines", traffic.lines),
-    DoctorCheck("clock", host.host_clock),
-    DoctorCheck("storage", host.storage),
-    DoctorCheck("power", host.power),
-    DoctorCheck("processor", host.processor),
-    DoctorCheck("kernel log", kernel_log.kernel_log),
-    DoctorCheck("shared memory", outputs.shared_memory),
-    DoctorCheck("Prometheus", outputs.prometheus),
+    DoctorCheck("lines", daemon.lines),
+    DoctorCheck("clock", machine.host_clock),
+    DoctorCheck("storage", machine.storage),
+    DoctorCheck("power", machine.power),
+    DoctorCheck("processor", machine.processor),
+    DoctorCheck("kernel log", machine.kernel_log),
+    DoctorCheck("shared memory", daemon.shared_memory),
+    DoctorCheck("Prometheus", daemon.prometheus),
 )
-"""In the order in which they are explained by one another; docs/doctor.md has them all."""
+"""All checks, causes before their effects. docs/doctor.md describes each check."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud doctor`."""
     add_socket(parser)
     parser.add_argument(
-        "-c", "--config", type=Path, default=DEFAULT_FILE, metavar="FILE", help="configuration (default: %(default)s)"
-    )
-    parser.add_argument("--json", action="store_true", help="for programs: every check with its findings")
+        "-c", "--config", type=Path, default=DEFAULT_FILE, metavar="FILE",
+        help="configuration file (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="print every check with its findings as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the findings; 0 for nothing wrong, 1 for warnings, 2 for errors."""
+    """Print the findings. Return 0 without problems, 1 for warnings, 2 for errors."""
     at = Surroundings(args.config.absolute(), partial(ask_daemon, args.socket))
     examined = examine(CHECKS, at)
     sys.stdout.write((as_json(examined).decode() if args.json else page(examined)) + "\n")

@@ -1,8 +1,8 @@
-"""Checks of rights: whether the user of the daemon may open the nodes of the configuration, by group and by unit.
+"""Checks of ports: access rights of the daemon, serial ports, other programs, latency timers.
 
-Two things can refuse a node. Its mode and group do, with EACCES; a group for the user, or a udev rule, helps.
-The device rules of the service's control group do with EPERM, for root too; only `DeviceAllow=` in the unit helps
-(systemd.resource-control(5)). Both are judged from what is declared, and no node is opened.
+The kernel can refuse a device node for two reasons. Mode and group cause EACCES: add the user to the group, or add a
+udev rule. The device rules of the service's control group cause EPERM, also for root: add `DeviceAllow=` to the unit
+(systemd.resource-control(5)). The checks compare the declarations. They open no node.
 """
 
 import re
@@ -22,66 +22,69 @@ CLASSES: Final = (
     ("ttyS", "ttyS", "dialout"), ("tty", "tty*", "dialout"), ("i2c-", "i2c", "i2c"), ("spidev", "spi", "spi"),
     ("gpiochip", "gpiochip", "gpio"),
 )  # fmt: skip
-"""Beginning of a node's name, its class in /proc/devices, and the group that Debian or 60-imud.rules gives it to."""
+"""Start of a node's name, its class in /proc/devices, and its group in Debian or in 60-imud.rules."""
 SUBSYSTEMS: Final = {"dialout": "tty", "i2c": "i2c-dev", "spi": "spidev", "gpio": "gpio"}
 
 
 class Person(NamedTuple):
-    """The user that opens the nodes."""
+    """User that opens the nodes."""
 
     name: str
     uid: int
     gids: frozenset[int]
     listed_gids: frozenset[int]
-    """Groups by /etc/group, which a session from before a change does not have yet."""
+    """Groups in /etc/group. A login session from before a change does not have a new group."""
 
 
 def rights(at: Surroundings) -> Findings:
-    """Compare mode and group of each configured node with the daemon's user."""
+    """Compare mode and group of each configured node with the user of the daemon."""
     person = daemon_user(at)
     for path in nodes(at):
         node = at.at(path)
         try:
             seen = node.stat()
         except FileNotFoundError:
-            continue  # reported by the checks of ports and buses
+            continue  # the checks "ports" and "bus nodes" report it
         if person is None:
-            yield not_checked(f"{path}: the user of the daemon is not in /etc/passwd", "look at `ls -lL` of the node")
+            yield not_checked(f"{path}: the user of the daemon is not in /etc/passwd", "check the node with `ls -lL`")
         elif _may_open(person, seen.st_mode, seen.st_uid, seen.st_gid):
-            yield ok(f"{path} may be opened by user {person.name}")
+            yield ok(f"user {person.name} can open {path}")
         else:
             yield _refused(at, path, person, seen.st_gid, seen.st_mode)
 
 
 def _refused(at: Surroundings, path: str, person: Person, gid: int, mode: int) -> DoctorFinding:
-    """Say how the user gets access: by the node's group, or where that is root or may not either, by a udev rule."""
+    """Return the finding for a refused node. The next step is the group of the node, or a udev rule.
+
+    A udev rule is needed if the group is root or has no access.
+    """
     group = _names_of(at, "group").get(gid, "")
     wanted = next((group for begin, _, group in CLASSES if _name(at, path).startswith(begin)), "dialout")
-    seen = f"{path} may not be opened by user {person.name}: the node belongs to group {group or gid}, EACCES"
+    seen = f"user {person.name} cannot open {path}: the node belongs to group {group or gid}, EACCES"
     if gid == 0 or mode & GROUP_ACCESS != GROUP_ACCESS:
         rule = f'SUBSYSTEM=="{SUBSYSTEMS[wanted]}", KERNEL=="{_kind(_name(at, path))}", GROUP="{wanted}", MODE="0660"'
         return error(seen, f"add the udev rule {rule} in /etc/udev/rules.d; then `sudo udevadm trigger`")
     if gid in person.listed_gids:
-        return error(f"{seen} of a session that began before the user joined it", "log out and in again")
+        return error(f"{seen}; the login session is older than the group membership", "log out and log in again")
     again = "restart imud" if at.installed else "log in again"
     return error(seen, f"`sudo usermod --append --groups {group or gid} {person.name}`, then {again}")
 
 
 def _kind(name: str) -> str:
-    """Pattern of the nodes of the same kind, `ttyUSB*` for `ttyUSB0`; never one that has /dev/tty, of all users."""
+    """Return the pattern of similar nodes, for example `ttyUSB*` for `ttyUSB0`."""
     pattern = re.sub(r"[0-9].*", "*", name)
-    return name if fnmatch("tty", pattern) else pattern
+    return name if fnmatch("tty", pattern) else pattern  # /dev/tty must stay open for all users
 
 
 def unit_rules(at: Surroundings) -> Findings:
-    """Compare the unit's DeviceAllow= with the configured nodes."""
+    """Compare DeviceAllow= of the unit with the configured nodes."""
     if not at.installed:
         return
     policy = at.unit_value("DevicePolicy") or "auto"
     allowed = [line.split() for line in at.unit.get("DeviceAllow", []) if line.split()]
     if policy == "auto" and not allowed:
         if nodes(at):
-            yield ok("imud.service restricts no devices")
+            yield ok("imud.service does not restrict device nodes")
         return
     classes = at.text("/proc/devices") or ""
     for path in nodes(at):
@@ -89,20 +92,21 @@ def unit_rules(at: Surroundings) -> Findings:
         entries = [entry for entry in allowed if _matches(entry[0], path, own, at)]
         if not any({"r", "w"} <= set(entry[1] if len(entry) > 1 else "rwm") for entry in entries):
             yield error(
-                f"{path} is not allowed by the unit's DeviceAllow=: opening it fails with EPERM, whatever its group",
+                f"DeviceAllow= of imud.service does not allow {path}: opening the node fails with EPERM for every "
+                "group",
                 f"`sudo systemctl edit imud`, add `[Service]` and `DeviceAllow=char-{own} rw`, restart imud",
             )
         elif entries[0][0].startswith("char-") and classes and not _known(own, classes):
             yield warning(
-                f"the kernel has no devices of the class {own} yet: DeviceAllow= of imud.service took no effect for it",
-                f"have its module loaded at boot (/etc/modules-load.d), then restart imud, for {path}",
+                f"the kernel does not know the device class {own} yet, so DeviceAllow= of imud.service has no effect",
+                f"load the kernel module of {path} at boot (/etc/modules-load.d), then restart imud",
             )
         else:
-            yield ok(f"{path} is allowed by DeviceAllow= of imud.service")
+            yield ok(f"DeviceAllow= of imud.service allows {path}")
 
 
 def nodes(at: Surroundings) -> list[str]:
-    """Return the paths of all device nodes that the configuration names, each once."""
+    """Return the paths of all configured device nodes without duplicates."""
     return list(dict.fromkeys(_nodes(at)))
 
 
@@ -126,7 +130,7 @@ def _chips(lines: DeviceLines) -> Iterator[str]:
 
 
 def daemon_user(at: Surroundings) -> Person | None:
-    """The user of the service, with the groups that the unit adds; without a service the one that asks."""
+    """Return the user of the service with the groups of the unit. Without a service, return the current user."""
     users = entries(at, "passwd")
     if at.installed:
         wanted = at.unit_value("User") or "root"
@@ -158,7 +162,7 @@ def _may_open(person: Person, mode: int, uid: int, gid: int) -> bool:
 
 
 def entries(at: Surroundings, database: str) -> list[list[str]]:
-    """Lines of /etc/passwd or /etc/group that are whole."""
+    """Return the valid lines of /etc/passwd or /etc/group, split into fields."""
     lines = [line.split(":") for line in (at.text(f"/etc/{database}") or "").splitlines()]
     return [
         line
@@ -192,51 +196,52 @@ def _known(own: str, classes: str) -> bool:
 
 
 LATENCY_MS: Final = 1
-"""Shortest latency timer of FTDI's adapters, which imud sets where it may."""
+"""Minimum latency timer of FTDI adapters, ms. imud sets it if it has the permission."""
 STABLE: Final = "/dev/serial/"
 LATENCY_RULE: Final = 'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"'
 
 
 def serial_paths(at: Surroundings) -> list[str]:
-    """Return the configured serial ports, each once."""
+    """Return the configured serial ports without duplicates."""
     ports = {getattr(one.link_settings, "port", "") for one in at.devices("uart")}
     lines = {getattr(one.link_settings, "line", "") for one in at.devices("rs485")}
     return [path for path in nodes(at) if path in ports | lines]
 
 
 def ports_present(at: Surroundings) -> Findings:
-    """Look whether each configured port exists, and list those that do where one does not."""
+    """Check that each configured port exists. If one is missing, list the existing ports."""
     there = list_ports(at.at("/dev"), at.at("/sys"))
     names = ", ".join(at.outside(port.path) for port in there) or "none"
     paths = serial_paths(at)
     for path in paths:
         node = at.at(path)
         if not node.exists():
-            yield error(f"{path} is not there; ports of this machine: {names}", _absent(path, bool(there)))
+            yield error(f"{path} does not exist; ports of this host: {names}", _absent(path, bool(there)))
         elif path.startswith(("/dev/ttyUSB", "/dev/ttyACM")):
             stable = next((at.outside(port.path) for port in there if at.outside(port.node) == path), path)
             if stable.startswith(STABLE):
-                yield note(f"{path} may have another number after replugging", f"name it {stable} in the configuration")
+                yield note(
+                    f"{path} can get another number when the adapter is plugged in again",
+                    f"use the name {stable} in the configuration",
+                )
             else:
-                yield ok(f"{path} is there")
+                yield ok(f"{path} exists")
         else:
-            yield ok(f"{path} is there")
+            yield ok(f"{path} exists")
     if not paths:
-        yield ok(f"no serial port is configured; ports of this machine: {names}")
+        yield ok(f"no serial port is configured; ports of this host: {names}")
 
 
 def _absent(path: str, others: bool) -> str:
     if path.startswith("/dev/serial0") or "ttyAMA" in path:
-        return (
-            "enable the UART: `enable_uart=1` in /boot/firmware/config.txt, or raspi-config; then restart the machine"
-        )
+        return "enable the UART: `enable_uart=1` in /boot/firmware/config.txt, or raspi-config; then restart the host"
     if others:
-        return "is another of these ports the one? Is its cable plugged in? `imud probe` listens to all of them"
-    return "is the cable plugged in, is it more than a charging cable? `sudo dmesg --follow` while plugging it in"
+        return "is the cable plugged in, does the device use another of these ports? `imud probe` listens to all ports"
+    return "is the cable plugged in, is it a charging cable without data? `sudo dmesg --follow`, then plug it in again"
 
 
 def ports_taken(at: Surroundings) -> Findings:
-    """Look for other programs that have a configured port open, and for a login console on it."""
+    """Look for other programs that use a configured port, and for a login console on the port."""
     consoles = (at.text("/sys/class/tty/console/active") or "").split()
     for path in serial_paths(at):
         node = at.at(path)
@@ -245,29 +250,30 @@ def ports_taken(at: Surroundings) -> Findings:
         name = node.resolve().name
         if name in consoles:
             yield error(
-                f"{path} is a console of the kernel: it writes its messages and may offer a login there",
-                f"remove `console={name}` (or serial0) from the kernel's command line, "
+                f"{path} is a console of the kernel: the kernel writes messages to it, and it can offer a login",
+                f"remove `console={name}` (or serial0) from the kernel command line, "
                 f"`sudo systemctl disable --now serial-getty@{name}`",
             )
         others = [one for one in holders_of(str(node), at.at("/proc")).split(", ") if one and not _is_daemon(one)]
         taken = [one for one in at.status or () if "is in use by" in one.problem and path in one.problem]
         if others:
             yield error(
-                f"{path} is open in {', '.join(others)}", "stop that program; imud opens the port by itself then"
+                f"{path} is open in another program: {', '.join(others)}",
+                "stop the program; imud then opens the port without a restart",
             )
         elif taken:
-            yield error(taken[0].problem, "stop that program" if at.uid == 0 else "`sudo imud doctor` sees which it is")
+            yield error(taken[0].problem, "stop the program" if at.uid == 0 else "`sudo imud doctor` shows the program")
         elif at.uid == 0 or _runs_on(at, path):
-            yield ok(f"{path} is used by no other program")
+            yield ok(f"no other program uses {path}")
         else:
             yield not_checked(
-                f"whether {path} is open elsewhere: programs of other users are hidden from this one",
-                "`sudo imud doctor` sees them",
+                f"cannot check whether another program uses {path}: this user cannot see programs of other users",
+                "run `sudo imud doctor`",
             )
 
 
 def _runs_on(at: Surroundings, path: str) -> bool:
-    """Whether a device runs on this port: imud has it exclusively then."""
+    """Return whether a device runs on this port. imud then uses the port exclusively."""
     return any(
         status.state == "running"
         for one in (*at.devices("uart"), *at.devices("rs485"))
@@ -281,33 +287,33 @@ def _is_daemon(holder: str) -> bool:
 
 
 def modem_manager(at: Surroundings) -> Findings:
-    """Look whether ModemManager runs, which opens new USB ports and sends modem commands to them."""
+    """Check that ModemManager does not run. It opens new USB ports and sends modem commands."""
     usb = [path for path in serial_paths(at) if at.at(path).resolve().name.startswith(("ttyUSB", "ttyACM"))]
     if not usb:
         return
     state = at.run(["systemctl", "is-active", "ModemManager.service"]).text.strip()
     if state == "active":
         yield warning(
-            "ModemManager runs: it may open USB ports as they appear and send to the device",
+            "ModemManager runs: it can open new USB ports and send modem commands to the device",
             'udev rule `SUBSYSTEM=="tty", ENV{ID_MM_DEVICE_IGNORE}="1"`, or '
             "`sudo systemctl disable --now ModemManager`",
         )
     elif not state:
-        yield not_checked("systemctl does not say whether ModemManager runs")
+        yield not_checked("systemctl does not report whether ModemManager runs")
     else:
         yield ok("ModemManager does not run")
 
 
 def latency_timer(at: Surroundings) -> Findings:
-    """Look how long USB adapters hold bytes back."""
+    """Check the latency timers of USB adapters."""
     for path in serial_paths(at):
         timer_ms = read_latency_timer_ms(str(at.at(path)), at.at("/sys"))
         if timer_ms is None:
             continue
         if timer_ms > LATENCY_MS:
             yield warning(
-                f"the adapter of {path} holds bytes back for up to {timer_ms} ms (latency timer)",
-                f"udev rule in /etc/udev/rules.d: {LATENCY_RULE}; then plug it in again",
+                f"the latency timer of the adapter of {path} delays bytes by up to {timer_ms} ms",
+                f"add the udev rule {LATENCY_RULE} in /etc/udev/rules.d, then plug the adapter in again",
             )
         else:
             yield ok(f"the latency timer of {path} is {timer_ms} ms")

@@ -1,7 +1,7 @@
-"""What the checks of `imud doctor` look at: files below one root, the output of commands, the daemon, the clocks.
+"""Input of the checks of `imud doctor`: files, output of commands, status of the daemon, clocks.
 
-Nothing here changes anything, but for the file of a few bytes by which the speed of the storage is measured. No serial
-port is opened: that raises DTR, which resets some boards, and takes the port from the daemon for a moment.
+The checks change nothing, except for a small temporary file that measures the speed of the storage. They open no serial
+port: opening a port raises DTR, which resets some boards, and blocks the port for the daemon.
 """
 
 import os
@@ -27,39 +27,39 @@ from imud.model.units import NS_PER_S
 from imud.utc.system_clock import KernelClock, kernel_clock
 
 COMMAND_S: Final = 5.0
-"""Limit of the time that a command may take; each answers within a fraction of a second."""
+"""Time limit of a command, s. Each command usually ends in less than 1 s."""
 SYSTEM_PATH: Final = "/usr/sbin:/usr/bin:/sbin:/bin"
-"""Where commands of the system are, for users and services that have no such path."""
+"""Folders of system commands. The PATH of some users and services does not contain them."""
 OUTPUT_CHARACTERS_MAX: Final = 1 << 20
-"""Of a command's output that are looked at, from its end."""
+"""Maximum length of the used end of a command's output, characters."""
 TEXT_BYTES_MAX: Final = 65536
-"""Of a file that are looked at."""
+"""Maximum length of the used start of a file, bytes."""
 FETCH_S: Final = 3.0
 FETCH_BYTES_MAX: Final = 65536
 SYNC_BYTES: Final = 4096
-"""Size of the file that is written and synchronised: a block of a file system."""
+"""Size of the file that measures the storage, bytes: one block of a file system."""
 UNIT: Final = "imud.service"
 
 
 class CommandOutput(NamedTuple):
-    """What a command that ended wrote."""
+    """Output of a command."""
 
     status: int
     """Exit status."""
     text: str
     """Standard output."""
     complaint: str
-    """Standard error, its last line."""
+    """Last line of standard error."""
 
 
 Run = Callable[[Sequence[str]], CommandOutput]
-"""Runs a command. Raises FileNotFoundError where it is not installed, TimeoutError where it takes too long."""
+"""Runs a command. Raises FileNotFoundError if it is not installed, TimeoutError if it takes too long."""
 Fetch = Callable[[str, int, str], str]
-"""Reads address, port, path by HTTP; returns the body of status 200. Raises OSError."""
+"""Requests address, port and path by HTTP. Returns the body of a reply with status 200. Raises OSError."""
 
 
 class Surroundings:
-    """This machine, or a test's. Everything that costs time is asked once. Synchronization: one thread."""
+    """The host, or a simulated host of a test. Slow requests run once. Synchronization: one thread."""
 
     def __init__(
         self,
@@ -76,10 +76,10 @@ class Surroundings:
         boot_utc_ns: Callable[[], int] = lambda: time.time_ns() - time.monotonic_ns(),
         pause: Callable[[float], None] = time.sleep,
     ) -> None:
-        """`ask` returns the status of the daemon's devices, and raises ImudError or TimeoutError where it has none.
+        """`ask` returns the status of all devices; it raises ImudError or TimeoutError if the daemon does not reply.
 
-        `sync_s` measures the time of writing to a folder; `boot_utc_ns` is UTC at zero of CLOCK_MONOTONIC;
-        `pause` waits so many seconds.
+        `sync_s` measures the time of a write to a folder, s. `boot_utc_ns` returns UTC when CLOCK_MONOTONIC was 0.
+        `pause` waits for a time in seconds.
         """
         self.config_file = config_file
         self.root = root
@@ -96,15 +96,15 @@ class Surroundings:
     # --- files --------------------------------------------------------------------------------------------------------
 
     def at(self, path: str | Path) -> Path:
-        """Return where an absolute path lies below the root."""
+        """Return an absolute path below the root."""
         return self.root / str(path).lstrip("/")
 
     def outside(self, path: str | Path) -> str:
-        """Return a path below the root as it is without one."""
+        """Return a path below the root without the root."""
         return str(path).removeprefix(str(self.root).rstrip("/"))
 
     def text(self, path: str | Path) -> str | None:
-        """Return the content of a file without blanks around it; None where it cannot be read."""
+        """Return the content of a file without surrounding white space; None if imud cannot read the file."""
         try:
             with self.at(path).open("rb") as file:
                 return file.read(TEXT_BYTES_MAX).decode("utf-8", "replace").strip(" \n\t\0")
@@ -116,22 +116,22 @@ class Surroundings:
     @cached_property
     def _loaded(self) -> tuple[Config | None, str]:
         try:
-            return config.load(self.at(self.config_file), missing="give the file with --config"), ""
+            return config.load(self.at(self.config_file), missing="name the file with --config"), ""
         except ConfigError as error:
             return None, str(error)
 
     @property
     def config(self) -> Config | None:
-        """The configuration; None where it cannot be used."""
+        """Configuration; None if it is invalid."""
         return self._loaded[0]
 
     @property
     def config_problem(self) -> str:
-        """Why it cannot be used, a line per problem."""
+        """Problems of the configuration, one per line."""
         return self._loaded[1]
 
     def devices(self, link: str) -> list[DeviceConfig]:
-        """Return the configured devices on links of this kind."""
+        """Return the configured devices with this kind of link."""
         return [device for device in self.config.devices if device.link == link] if self.config else []
 
     # --- the daemon ---------------------------------------------------------------------------------------------------
@@ -144,31 +144,31 @@ class Surroundings:
             return None, error
 
     def status_now(self) -> list[DeviceStatus]:
-        """Ask the daemon for the status of every device. Raises ImudError, TimeoutError, msgspec.ValidationError."""
+        """Request the status of all devices again. Raises ImudError, TimeoutError, msgspec.ValidationError."""
         return self._ask()
 
     @property
     def status(self) -> list[DeviceStatus] | None:
-        """Status of every device; None where the daemon does not answer."""
+        """Status of all devices; None if the daemon does not reply."""
         return self._answer[0]
 
     @property
     def status_error(self) -> Exception | None:
-        """Why there is no status."""
+        """Reason why the status is unknown."""
         return self._answer[1]
 
     @property
     def daemon_down(self) -> bool:
-        """Whether there is no daemon at the socket, rather than one that may not be asked."""
+        """Whether no daemon runs. False if a daemon runs but refuses this user."""
         return isinstance(self.status_error, LinkMissing)
 
     def status_of(self, name: str) -> DeviceStatus | None:
-        """Return the status of one device."""
+        """Return the status of one device; None if it is unknown."""
         return next((status for status in self.status or () if status.name == name), None)
 
     @cached_property
     def unit(self) -> dict[str, list[str]]:
-        """Properties of imud.service; empty where there is no systemd. A property may have several values."""
+        """Properties of imud.service; empty without systemd. A property can have several values."""
         try:
             output = self.run(["systemctl", "show", UNIT])
         except OSError:
@@ -180,7 +180,7 @@ class Surroundings:
         return found
 
     def unit_value(self, name: str) -> str:
-        """Return one property of imud.service; empty where it is not known."""
+        """Return the first value of a property of imud.service; empty if it is unknown."""
         return next(iter(self.unit.get(name, [])), "")
 
     @property
@@ -190,7 +190,7 @@ class Surroundings:
 
 
 def run_command(words: Sequence[str], limit_s: float | None = None) -> CommandOutput:
-    """Run a command with the C locale, for COMMAND_S or `limit_s` at most.
+    """Run a command with the C locale. `limit_s`: time limit, default COMMAND_S.
 
     Raises FileNotFoundError, TimeoutError, OSError.
     """
@@ -202,21 +202,21 @@ def run_command(words: Sequence[str], limit_s: float | None = None) -> CommandOu
             env=os.environ | {"LC_ALL": "C", "SYSTEMD_COLORS": "0", "PATH": path},
         )  # fmt: skip
     except subprocess.TimeoutExpired:
-        raise TimeoutError(f"{words[0]} did not end within {limit_s:g} s") from None
+        raise TimeoutError(f"the command {words[0]} did not end within {limit_s:g} s") from None
     text = done.stdout.decode("utf-8", "replace")[-OUTPUT_CHARACTERS_MAX:]
     complaint = done.stderr.decode("utf-8", "replace").strip().splitlines()
     return CommandOutput(done.returncode, text, complaint[-1] if complaint else "")
 
 
 def fetch_over_http(address: str, port: int, path: str) -> str:
-    """Read a page by HTTP. Raises OSError."""
+    """Request a page by HTTP. Return the body. Raises OSError."""
     connection = HTTPConnection(address, port, timeout=FETCH_S)
     try:
         connection.request("GET", path)
         response = connection.getresponse()
         body = response.read(FETCH_BYTES_MAX)
     except HTTPException as error:
-        raise OSError(f"{type(error).__name__}: no HTTP server answers there") from error
+        raise OSError(f"{type(error).__name__}: the program at this port is not an HTTP server") from error
     finally:
         connection.close()
     if response.status != 200:
@@ -225,7 +225,7 @@ def fetch_over_http(address: str, port: int, path: str) -> str:
 
 
 def measure_sync_s(folder: Path) -> float:
-    """Write a small file, wait until it is on the medium, remove it; return the time, s. Raises OSError."""
+    """Write and synchronise a small file, then remove it. Return the time, s. Raises OSError."""
     with tempfile.NamedTemporaryFile(dir=folder, prefix=".imud-doctor-") as file:
         begin_ns = time.monotonic_ns()
         file.write(bytes(SYNC_BYTES))
@@ -235,34 +235,34 @@ def measure_sync_s(folder: Path) -> float:
 
 
 def ask_daemon(socket: str) -> list[DeviceStatus]:
-    """Ask the daemon for the status of every device. Raises ImudError, TimeoutError, msgspec.ValidationError."""
+    """Request the status of all devices. Raises ImudError, TimeoutError, msgspec.ValidationError."""
     with Client(socket) as client:
         return statuses(client)
 
 
 class Severity(StrEnum):
-    """What a finding means."""
+    """Severity of a finding."""
 
     OK = "ok"
-    """Looked at, and in order."""
+    """No problem."""
     NOTE = "note"
-    """Nothing wrong, but good to know."""
+    """Information, not a problem."""
     WARNING = "warning"
-    """imud works, but not as well as it could."""
+    """imud works, but with a disadvantage."""
     ERROR = "error"
     """A device or an output does not work."""
     NOT_CHECKED = "not checked"
-    """It could not be looked at; `seen` says why."""
+    """The check could not run; `seen` is the reason."""
 
 
 class DoctorFinding(msgspec.Struct, frozen=True):
-    """One thing that a check found."""
+    """One result of a check."""
 
     severity: Severity
     seen: str
-    """What was seen, for a person; with the device, port or interface that it is about."""
+    """Observation, with the name of the device, port or interface."""
     advice: str = ""
-    """What to do next; empty where there is nothing to do."""
+    """Next step; empty if no step is needed."""
 
 
 Findings = Iterator[DoctorFinding]
@@ -272,33 +272,28 @@ class DoctorCheck(NamedTuple):
     """One row of the list of checks."""
 
     name: str
-    """Short, unique, for people and for programs that read `--json`."""
+    """Unique short name, also in `--json`."""
     run: Callable[[Surroundings], Findings]
-    """Yields what it found; nothing where the configuration has nothing that it is about.
+    """Yields the findings; none if the configuration does not use the checked part.
 
-    Raises OSError, ValueError and ImudError where it cannot look."""
+    Raises OSError, ValueError and ImudError if the check cannot run."""
 
 
 def ok(seen: str) -> DoctorFinding:
-    """Looked at, and in order."""
     return DoctorFinding(Severity.OK, seen)
 
 
 def note(seen: str, advice: str = "") -> DoctorFinding:
-    """Good to know."""
     return DoctorFinding(Severity.NOTE, seen, advice)
 
 
 def warning(seen: str, advice: str) -> DoctorFinding:
-    """Not as good as it could be."""
     return DoctorFinding(Severity.WARNING, seen, advice)
 
 
 def error(seen: str, advice: str) -> DoctorFinding:
-    """Something does not work."""
     return DoctorFinding(Severity.ERROR, seen, advice)
 
 
-def not_checked(why: str, advice: str = "") -> DoctorFinding:
-    """It could not be looked at, for this reason."""
-    return DoctorFinding(Severity.NOT_CHECKED, why, advice)
+def not_checked(reason: str, advice: str = "") -> DoctorFinding:
+    return DoctorFinding(Severity.NOT_CHECKED, reason, advice)

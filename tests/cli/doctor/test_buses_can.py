@@ -56,7 +56,7 @@ def controller(state: str = "ERROR-ACTIVE", tx: int = 0, rx: int = 0, **more: ob
 
 
 def test_an_interface_that_is_absent_down_up_or_virtual(mast: Machine) -> None:
-    assert mast.told(UP)[0][1].startswith("can0 is not there; CAN interfaces of this machine: none →")
+    assert mast.told(UP)[0][1].startswith("can0 does not exist; CAN interfaces of this host: none →")
     up(mast, "0x40080")
     mast.prints(COMMAND, json.dumps(RECORDED["down"]))
     mast.tells(UP, "error", "can0 is down", "up type can bitrate")
@@ -64,7 +64,7 @@ def test_an_interface_that_is_absent_down_up_or_virtual(mast: Machine) -> None:
     interface(mast)
     assert mast.find(UP)[0].severity == "ok"
     interface(mast)
-    assert mast.told(STATE) == [("ok", "can0 is virtual: it has no controller → ")]
+    assert mast.told(STATE) == [("ok", "can0 is a virtual interface without a controller → ")]
     assert mast.find(RATE) == []
 
 
@@ -72,9 +72,9 @@ def test_an_interface_that_is_absent_down_up_or_virtual(mast: Machine) -> None:
     ("data", "packets", "severity", "words"),
     [
         (controller(), 100, "ok", "100 frames received"),
-        (controller("BUS-OFF", 248, 0), 100, "error", "has left the bus"),
+        (controller("BUS-OFF", 248, 0), 100, "error", "left the bus"),
         (controller("ERROR-PASSIVE", 128, 0), 0, "error", "no other node acknowledges"),
-        (controller("ERROR-WARNING", 0, 100), 0, "error", "a missing terminator or a wrong bit rate"),
+        (controller("ERROR-WARNING", 0, 100), 0, "error", "a terminator is missing, or the bit rate is wrong"),
         (controller("ERROR-PASSIVE", 0, 130), 100, "warning", "60 Ω"),
         (controller("ERROR-ACTIVE", 0, 96), 100, "warning", "60 Ω"),
         (controller("ERROR-ACTIVE", 0, 3), 100, "ok", "rx 3"),
@@ -91,7 +91,7 @@ def test_state_and_error_counters(
 def test_errors_on_a_bus_that_carried_frames_before(mast: Machine) -> None:
     """The module was unplugged, or the bit rate changed: the kernel goes on counting frames from before."""
     interface(mast, packets=100, data=controller("ERROR-PASSIVE", 128, 0))
-    mast.tells(STATE, "error", "100 frames received, none now → no other node acknowledges")
+    mast.tells(STATE, "error", "100 frames received, no frame arrives now → no other node acknowledges")
     mast.status = [device("mast", state=DeviceState.RUNNING)]  # one that sends when it is asked
     assert mast.find(STATE)[0].severity == "warning"
 
@@ -100,8 +100,16 @@ def test_errors_on_a_bus_that_carried_frames_before(mast: Machine) -> None:
     ("state", "severities", "words"),
     [
         ("error-active", ["ok", "note"], "can0 is ERROR-ACTIVE, error counters tx 0, rx 0, 2 frames received → "),
-        ("bus-off", ["error", "note"], "it has left the bus → `sudo ip link set can0 down`, then `sudo ip"),
-        ("error-passive", ["error", "warning", "note"], "2 frames received, none now → no other node acknowledges"),
+        (
+            "bus-off",
+            ["error", "note"],
+            "the controller left the bus → restart it: `sudo ip link set can0 down`, then `sudo ip",
+        ),
+        (
+            "error-passive",
+            ["error", "warning", "note"],
+            "2 frames received, no frame arrives now → no other node acknowledges",
+        ),
     ],
 )
 def test_states_as_they_were_recorded(mast: Machine, state: str, severities: list[str], words: str) -> None:
@@ -120,7 +128,7 @@ def test_bus_off_before_and_no_restart(mast: Machine) -> None:
     assert "bus-off 4 times" in found[1][1]
     interface(mast, data=controller("BUS-OFF", restart_ms=0))
     commands = "`sudo ip link set can0 down`, then `sudo ip link set can0 up type can restart-ms 100`"
-    assert f"{commands} let it recover" in mast.told(STATE)[0][1]
+    assert f"restart it: {commands}; check" in mast.told(STATE)[0][1]
     assert mast.told(STATE)[-1][1].endswith(commands)
 
 
@@ -147,7 +155,7 @@ def test_bit_rates(mast: Machine) -> None:
         ((got, text),) = mast.told(RATE)
         assert got == severity
         if severity == "error":
-            assert "mast: no frame comes at 500000 bit/s on can0 → try 125000, 250000, 1000000" in text
+            assert "mast: no frame arrives at 500000 bit/s on can0 → try 125000, 250000, 1000000" in text
     interface(mast, packets=9, data=controller())
     mast.status = [device("mast", state=DeviceState.SEARCHING)]
     mast.on_pause = lambda: interface(mast, packets=10, data=controller())
@@ -164,7 +172,7 @@ def test_ip_that_fails_is_missing_or_answers_in_another_form_is_not_checked(mast
     mast.prints("ip", "", 1, "Device does not exist")
     mast.outputs[COMMAND] = FileNotFoundError(2, "No such file", "ip")
     (examined,) = examine([STATE], mast.surroundings())
-    assert examined.findings[0].seen == "s: ip is not there, or not installed"
+    assert examined.findings[0].seen == "s: ip does not exist or is not installed"
 
 
 def test_interfaces_of_other_backends_are_not_the_kernels(machine: Machine) -> None:

@@ -15,10 +15,10 @@ UNSEEN = not_checked("hidden")
 
 def test_verdict_exit_status_json_and_page() -> None:
     for findings, status, words in [
-        ([], 0, "nothing wrong found"),
-        ([GOOD, NOTE], 0, "nothing wrong found"),
-        ([GOOD, UNSEEN], 0, "nothing wrong found in what could be checked; 1 thing could not"),
-        ([WARNING, UNSEEN, UNSEEN], 1, "1 warning; 2 things could not be checked"),
+        ([], 0, "no problem found"),
+        ([GOOD, NOTE], 0, "no problem found"),
+        ([GOOD, UNSEEN], 0, "no problem found; 1 item not checked"),
+        ([WARNING, UNSEEN, UNSEEN], 1, "1 warning; 2 items not checked"),
         ([WARNING, ERROR, ERROR], 2, "2 errors, 1 warning"),
     ]:
         examined = [Examined("a", findings[:1]), Examined("b", findings[1:])]
@@ -45,7 +45,7 @@ def test_verdict_exit_status_json_and_page() -> None:
 @pytest.mark.parametrize(
     ("problem", "why"),
     [
-        (FileNotFoundError(2, "No such file", "ip"), "x: ip is not there, or not installed"),
+        (FileNotFoundError(2, "No such file", "ip"), "x: ip does not exist or is not installed"),
         (LinkError("can0 is no CAN interface"), "x: can0 is no CAN interface"),
         (ValueError(), "x: ValueError"),
     ],

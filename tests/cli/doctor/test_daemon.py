@@ -19,10 +19,10 @@ ACTIVE = ("ActiveState=active", "UnitFileState=enabled", "Result=success", "NRes
 
 
 def test_configurations(machine: Machine) -> None:
-    machine.tells(CONFIGURATION, "error", "No such file", "`sudo imud setup` writes one")
+    machine.tells(CONFIGURATION, "error", "No such file", "`sudo imud setup`")
     machine.configure(BOW, "old: {enabled: false, driver: hipnuc-uart, uart: {port: /dev/ttyUSB1, baud: 115200}}")
     assert machine.told(CONFIGURATION) == [
-        ("ok", "/etc/imud.yaml has no mistakes; devices: bow → "),
+        ("ok", "/etc/imud.yaml is valid; devices: bow → "),
         ("note", "device old is disabled in /etc/imud.yaml → "),
     ]
     machine.configure()
@@ -41,7 +41,7 @@ def test_a_service_that_runs_and_what_is_wrong_with_one(machine: Machine) -> Non
         ("UnitFileState=disabled", "warning", "sudo systemctl enable imud"),
         ("UnitFileState=masked", "error", "sudo systemctl unmask imud"),
         ("ActiveState=inactive", "error", "sudo systemctl start imud"),
-        ("ActiveState=activating", "warning", "look again"),
+        ("ActiveState=activating", "warning", "again in a minute"),
         ("NRestarts=5", "warning", "restarted imud.service 5 times"),
         ("NeedDaemonReload=yes", "warning", "daemon-reload"),
     ]:
@@ -52,7 +52,7 @@ def test_a_service_that_runs_and_what_is_wrong_with_one(machine: Machine) -> Non
         assert wrong[0][0] == severity
         assert words in wrong[0][1]
     machine.unit("UnitFileState=enabled", "ActiveState=failed", "Result=exit-code", "ExecMainStatus=78")
-    assert "`imud check` says where" in machine.told(SERVICE)[-1][1]
+    assert "with `imud check`" in machine.told(SERVICE)[-1][1]
 
 
 def test_no_systemd_and_no_unit(machine: Machine) -> None:
@@ -85,7 +85,7 @@ def test_a_file_newer_than_the_last_reload(machine: Machine) -> None:
     assert machine.find(STALE)[0].severity == "ok"
     os.utime(file, (1007, 1007))
     assert machine.told(STALE) == [
-        ("warning", "/etc/imud.yaml was written after the daemon read it last → `sudo systemctl reload imud`")
+        ("warning", "/etc/imud.yaml changed after the last reload of the daemon → `sudo systemctl reload imud`")
     ]
 
 
@@ -95,7 +95,7 @@ def test_a_daemon_with_other_devices(machine: Machine) -> None:
     assert machine.find(STALE)[0].severity == "not checked"
     machine.configure(BOW)
     machine.status = [device("stern")]
-    machine.tells(STALE, "warning", "has the devices stern, /etc/imud.yaml has bow")
+    machine.tells(STALE, "warning", "uses the devices stern, /etc/imud.yaml contains bow")
     machine.status = [device("bow")]
     assert machine.find(STALE)[0].severity == "ok"
 

@@ -25,11 +25,11 @@ def running(machine: Machine) -> Machine:
 
 def test_scrapes(running: Machine) -> None:
     for page, severity, words in [
-        ('{"scrapes":0,"age_s":9.0}', "note", "nothing has scraped 127.0.0.1 port 9321 since it was opened 9 s ago"),
-        ('{"scrapes":0,"age_s":3000.0}', "note", "opened 50 minutes ago"),
-        ('{"scrapes":7,"age_s":9.0}', "ok", "scraped 7 times, last 9 s ago"),
-        ('{"scrapes":7,"age_s":301.0}', "warning", "for 5 minutes, 7 times before"),
-        ("<html>", "error", "another program than imud"),
+        ('{"scrapes":0,"age_s":9.0}', "note", "no scrape of 127.0.0.1 port 9321 since imud opened it 9 s ago"),
+        ('{"scrapes":0,"age_s":3000.0}', "note", "opened it 50 minutes ago"),
+        ('{"scrapes":7,"age_s":9.0}', "ok", "7 scrapes, the last 9 s ago"),
+        ('{"scrapes":7,"age_s":301.0}', "warning", "for 5 minutes, after 7 scrapes"),
+        ("<html>", "error", "is not imud"),
     ]:
         running.pages[AT] = page
         running.tells(PROMETHEUS, severity, words)
@@ -42,7 +42,7 @@ def test_scrapes(running: Machine) -> None:
 
 
 def test_no_answer_another_address_and_switched_off(running: Machine) -> None:
-    running.tells(PROMETHEUS, "error", "do not answer at 127.0.0.1 port 9321: Connection refused")
+    running.tells(PROMETHEUS, "error", "do not reply at 127.0.0.1 port 9321: Connection refused")
     running.configure(more="metrics: {enabled: false}\n")
     assert running.find(PROMETHEUS)[0].severity == "note"
     running.configure(more="metrics: {port: 0}\n")

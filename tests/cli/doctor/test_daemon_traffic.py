@@ -54,8 +54,8 @@ def test_without_the_daemon_a_port_or_samples(machine: Machine) -> None:
     ("status", "severity", "words"),
     [
         (counted(), "error", "are TX and RX swapped"),
-        (counted(bytes_in=40), "error", "is it an echo of what imud sends"),
-        (counted(bytes_in=5000), "error", "wrong rate, driver or device"),
+        (counted(bytes_in=40), "error", "echoes of imud's requests"),
+        (counted(bytes_in=5000), "error", "the baud rate, the driver or the device is wrong"),
         (
             msgspec.structs.replace(counted(bytes_in=5000), kernel=KernelCounters(framing=9)),
             "error",
@@ -63,7 +63,7 @@ def test_without_the_daemon_a_port_or_samples(machine: Machine) -> None:
         ),
         (counted(bytes_in=5000, frames_good=7, frames_in_replies=7), "error", "but no sample in 7 frames"),
         (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=3), "ok", "3 damaged"),
-        (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=6), "warning", "6 damaged frames"),
+        (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=6), "warning", "6 damaged and"),
         (msgspec.structs.replace(counted(**GOOD), kernel=KernelCounters(overrun=2)), "warning", "overrun"),
     ],
 )
@@ -98,7 +98,7 @@ def test_a_device_that_never_answers_does_not_hear_imud(
     machine.status = [status]
     told = machine.told(HEARD)
     assert [severity for severity, _ in told] == severities
-    assert all("RX of the module is not wired" in text for severity, text in told if severity == "warning")
+    assert all("RX of the device is not connected" in text for severity, text in told if severity == "warning")
     machine.configure(UART.replace("bow: {", "bow: {identify: false, "))
     assert [finding.severity for finding in machine.find(HEARD)] == ["ok"]
 
@@ -106,11 +106,11 @@ def test_a_device_that_never_answers_does_not_hear_imud(
 @pytest.mark.parametrize(
     ("state", "line", "severity", "words"),
     [
-        (DeviceState.RUNNING, SerialLineCounters(timeouts=10, echoes=1000), "ok", "echoes are expected"),
-        (DeviceState.RUNNING, SerialLineCounters(timeouts=11), "warning", "11 requests unanswered"),
-        (DeviceState.RUNNING, SerialLineCounters(strange_bytes=5), "warning", "5 strange bytes"),
-        (DeviceState.SEARCHING, SerialLineCounters(timeouts=9, echoes=9), "error", "only imud's own 9 echoes"),
-        (DeviceState.SEARCHING, SerialLineCounters(timeouts=9), "error", "nothing heard"),
+        (DeviceState.RUNNING, SerialLineCounters(timeouts=10, echoes=1000), "ok", "ignores the echoes"),
+        (DeviceState.RUNNING, SerialLineCounters(timeouts=11), "warning", "11 requests without a reply"),
+        (DeviceState.RUNNING, SerialLineCounters(strange_bytes=5), "warning", "5 invalid bytes"),
+        (DeviceState.SEARCHING, SerialLineCounters(timeouts=9, echoes=9), "error", "only 9 echoes"),
+        (DeviceState.SEARCHING, SerialLineCounters(timeouts=9), "error", "no byte arrived"),
     ],
 )
 def test_rs485(machine: Machine, state: DeviceState, line: SerialLineCounters, severity: str, words: str) -> None:
@@ -140,12 +140,12 @@ def test_restarts_count_by_the_hour(machine: Machine, resets: int, samples: int,
     ("samples", "found", "severity", "words"),
     [
         (5000, LinesStatus({}, {"sout": 4999}, {"sout": 0}), "ok", "4999 edges"),
-        (5000, LinesStatus({}, {"sout": 4990}, {"sout": 9}), "warning", "9 of 4999 edges were lost"),
+        (5000, LinesStatus({}, {"sout": 4990}, {"sout": 9}), "warning", "the kernel lost 9 of 4999 edges"),
         (5000, LinesStatus({}, {"sout": 0}, {}), "warning", "no edge in 5000 samples"),
         (50, LinesStatus({}, {"sout": 0}, {}), "not checked", "too few samples"),
         (5000, LinesStatus({}, {"alarm": 0}, {}), "note", "no edge so far"),
         (900, LinesStatus({}, {"pps": 0}, {}), "not checked", "too few samples"),
-        (1100, LinesStatus({}, {"pps": 0}, {}), "warning", "has the receiver a fix"),
+        (1100, LinesStatus({}, {"pps": 0}, {}), "warning", "does the receiver have a fix"),
         (5000, LinesStatus({"sout": "GPIO17 is in use"}, {"sout": 0}, {}), "error", "GPIO17 is in use"),
     ],
 )

@@ -22,23 +22,21 @@ def test_each_kind_of_trouble_a_quiet_log_and_other_sources(machine: Machine) ->
         ("usb usb1-port1: disabled by hub (EMI?), re-enabling...", "errors of USB transfers"),
         ("hwmon hwmon1: Undervoltage detected!", "low voltage"),
         ("Under-voltage detected! (0x00050005)", "low voltage"),
-        ("mmc0: Timeout waiting for hardware interrupt.", "trouble of the SD card"),
-        ("blk_update_request: I/O error, dev mmcblk0, sector 123", "trouble of the SD card"),
-        ("i2c-bcm2835 fe804000.i2c: i2c transfer timed out", "trouble of I2C"),
-        ("kvaser_pci 0000:00:06.0 can0: bus-off", "trouble of CAN controllers"),  # of the lab's kernel
-        ("mcp251x spi0.0 can0: bus-off", "trouble of CAN controllers"),
+        ("mmc0: Timeout waiting for hardware interrupt.", "errors of the SD card"),
+        ("blk_update_request: I/O error, dev mmcblk0, sector 123", "errors of the SD card"),
+        ("i2c-bcm2835 fe804000.i2c: i2c transfer timed out", "errors of I2C"),
+        ("kvaser_pci 0000:00:06.0 can0: bus-off", "errors of CAN controllers"),  # of the lab's kernel
+        ("mcp251x spi0.0 can0: bus-off", "errors of CAN controllers"),
         ("ttyAMA0: 4 input overrun(s)", "overruns of serial ports"),
         ("oom-kill:constraint=CONSTRAINT_NONE,task=python3", "lack of memory"),
     ]:
         machine.prints("journalctl", QUIET + line + "\n")
-        machine.tells(LOG, "warning", f"kernel log: 1 lines on {words}, the last: {line[:40]}")
+        machine.tells(LOG, "warning", f"kernel log: 1 lines about {words}, the last: {line[:40]}")
     machine.prints("journalctl", QUIET)
-    assert machine.told(LOG) == [
-        ("ok", "nothing on ports, buses, storage or voltage in 6 lines of the kernel's log → ")
-    ]
+    assert machine.told(LOG) == [("ok", "no fault of ports, buses, storage or voltage in 6 lines of the kernel log → ")]
     machine.prints("journalctl", QUIET * 3)
     ((_, text),) = machine.told(LOG)
-    assert "3 lines on unplugged serial adapters" in text
+    assert "3 lines about disconnected serial adapters" in text
     machine.prints("journalctl", "", 1, "No journal files were found.")
     machine.prints("dmesg", QUIET)
     assert machine.find(LOG)[0].severity == "ok"
@@ -51,9 +49,9 @@ def test_missing_programs_and_only_the_newest_lines(machine: Machine) -> None:
     machine.prints("journalctl", "usb 1-1: reset full-speed USB device\n" + "usb: fine\n" * 5000)
     machine.tells(LOG, "ok", "in 5000 lines")
     del machine.outputs["journalctl"]
-    machine.tells(LOG, "not checked", "the kernel's log cannot be read: journalctl: No such file", "join the group adm")
+    machine.tells(LOG, "not checked", "cannot read the kernel log: journalctl: No such file", "join the group adm")
     machine.outputs["journalctl"] = PermissionError(13, "Permission denied", "journalctl")
     machine.tells(LOG, "not checked", "journalctl: Permission denied")
     machine.prints("dmesg --notime", "", 1, "dmesg: unknown option --notime")
     machine.prints("dmesg", QUIET)
-    machine.tells(LOG, "ok", "in 6 lines of the kernel's log")
+    machine.tells(LOG, "ok", "in 6 lines of the kernel log")

@@ -32,7 +32,7 @@ def bow(machine: Machine) -> Machine:
 
 def test_a_service_with_the_group_and_one_without(bow: Machine) -> None:
     bow.unit("User=imud", "Group=imud", "SupplementaryGroups=i2c port spi")
-    assert bow.told(RIGHTS) == [("ok", "/dev/ttyUSB0 may be opened by user imud → ")]
+    assert bow.told(RIGHTS) == [("ok", "user imud can open /dev/ttyUSB0 → ")]
     bow.unit("User=imud", "Group=imud", "SupplementaryGroups=i2c spi")
     bow.tells(RIGHTS, "error", "EACCES", "`sudo usermod --append --groups port imud`, then restart imud")
 
@@ -65,7 +65,7 @@ def test_the_rule_is_for_nodes_of_the_kind_only(node: str, rule: str, bow: Machi
 
 def test_a_user_who_joined_the_group_after_login(bow: Machine) -> None:
     bow.write("/etc/group", f"port:x:{PORT_GID}:ann\n")
-    bow.tells(RIGHTS, "error", "log out and in again")
+    bow.tells(RIGHTS, "error", "log out and log in again")
     bow.gids = frozenset({4003, PORT_GID})
     assert bow.find(RIGHTS)[0].severity == "ok"
 
@@ -93,9 +93,9 @@ def test_root_may_an_unknown_user_is_not_judged_and_a_unit_can_have_no_rules(bow
 @pytest.mark.parametrize(
     ("line", "severity", "words"),
     [
-        ("DeviceAllow=char-ttyUSB rw", "ok", "allowed"),
-        ("DeviceAllow=char-tty* rw", "ok", "allowed"),
-        ("DeviceAllow=/dev/ttyUSB0 rw", "ok", "allowed"),
+        ("DeviceAllow=char-ttyUSB rw", "ok", "allows"),
+        ("DeviceAllow=char-tty* rw", "ok", "allows"),
+        ("DeviceAllow=/dev/ttyUSB0 rw", "ok", "allows"),
         ("DeviceAllow=char-ttyACM rw", "error", "EPERM"),
         ("DeviceAllow=/dev/ttyUSB1 rw", "error", "EPERM"),
         ("DeviceAllow=char-ttyUSB r", "error", "`DeviceAllow=char-ttyUSB rw`"),

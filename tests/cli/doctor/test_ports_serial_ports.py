@@ -28,23 +28,27 @@ def hold(machine: Machine, pid: int, name: str, *, command: str = "") -> None:
 
 
 def test_a_port_that_is_absent_and_one_with_a_stable_name(bow: Machine) -> None:
-    assert bow.told(PRESENT)[0][1].startswith("/dev/ttyUSB0 is not there; ports of this machine: none → is the cable")
+    assert bow.told(PRESENT)[0][1].startswith("/dev/ttyUSB0 does not exist; ports of this host: none → is the cable")
     bow.port("ttyUSB1")
-    bow.tells(PRESENT, "error", "ports of this machine: /dev/ttyUSB1 → is another of these ports the one?")
+    bow.tells(
+        PRESENT,
+        "error",
+        "ports of this host: /dev/ttyUSB1 → is the cable plugged in, does the device use another of these ports?",
+    )
     bow.port("ttyUSB0")
     assert bow.find(PRESENT)[0].severity == "ok"
     folder = bow.root / "dev/serial/by-id"
     folder.mkdir(parents=True)
     (folder / "usb-FTDI_1").symlink_to("../../ttyUSB0")
     assert bow.told(PRESENT) == [
-        ("note", "/dev/ttyUSB0 may have another number after replugging → name it /dev/serial/by-id/usb-FTDI_1 in the "
-         "configuration")
+        ("note", "/dev/ttyUSB0 can get another number when the adapter is plugged in again → "
+         "use the name /dev/serial/by-id/usb-FTDI_1 in the configuration")
     ]  # fmt: skip
 
 
 def test_without_serial_devices_the_ports_are_listed(machine: Machine) -> None:
     machine.port("ttyUSB1")
-    assert "ports of this machine: /dev/ttyUSB1" in machine.told(PRESENT)[0][1]
+    assert "ports of this host: /dev/ttyUSB1" in machine.told(PRESENT)[0][1]
 
 
 def test_another_program_and_the_daemon_on_a_port(bow: Machine) -> None:
@@ -53,7 +57,7 @@ def test_another_program_and_the_daemon_on_a_port(bow: Machine) -> None:
     hold(bow, 10, "python3", command="/usr/bin/python3 /usr/bin/imud run")
     assert bow.find(TAKEN)[0].severity == "ok"
     hold(bow, 11, "minicom")
-    bow.tells(TAKEN, "error", "/dev/ttyUSB0 is open in minicom (pid 11)")
+    bow.tells(TAKEN, "error", "/dev/ttyUSB0 is open in another program: minicom (pid 11)")
 
 
 def test_a_user_cannot_say_that_a_port_is_free(bow: Machine) -> None:
@@ -63,7 +67,7 @@ def test_a_user_cannot_say_that_a_port_is_free(bow: Machine) -> None:
     assert bow.find(TAKEN)[0].severity == "ok"
     problem = "/dev/ttyUSB0 is in use by gpsd (pid 3): stop that first"
     bow.status = [device("bow", state=DeviceState.FAILED, problem=problem)]
-    assert bow.told(TAKEN) == [("error", f"{problem} → `sudo imud doctor` sees which it is")]
+    assert bow.told(TAKEN) == [("error", f"{problem} → `sudo imud doctor` shows the program")]
 
 
 def test_a_console_and_latency_timers(bow: Machine) -> None:
