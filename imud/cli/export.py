@@ -1,4 +1,4 @@
-"""`imud export`: samples, losses and events of a recording or a capture as CSV or MCAP."""
+"""`imud export`: convert the samples, losses and events of a recording or a capture to CSV or MCAP."""
 
 import argparse
 import os
@@ -45,28 +45,27 @@ from imud.model.errors import BadArgument, ImudError, reason_of
 from imud.recording.capture_player import NAME, KnownTimes
 
 MODE: Final = 0o666
-"""Of a new file, from which the umask takes its bits."""
+"""Mode of a new file before the umask."""
 
 
 class ExportFile:
-    """The output of one export. As a context: what is written until an error is removed, unless it went to a pipe.
+    """Output of one export. Used as a context, it removes an incomplete file after an error.
 
-    A file grows under another name in the same folder, and gets its own when it is whole: a program that waits for it
-    never sees half of it, and a killed export leaves nothing that could be taken for one.
+    imud writes a temporary file in the same folder, and renames the complete file. Other programs therefore never see
+    an incomplete export.
     """
 
     def __init__(self, path: Path | None, *, source: Path, force: bool, binary: bool) -> None:
-        """None is standard output. Raises BadArgument where the file must not be written, or a terminal gets bytes."""
+        """`path`: None for standard output. Raises BadArgument if the file exists, or for binary data to a terminal."""
         self.written_bytes = 0
         self.name = "standard output" if path is None else str(path)
-        """For people."""
         self._path: Path | None = None
-        """The file to be; None where it is written in place."""
+        """Final path of the file; None if imud writes directly: to standard output, a FIFO or a device node."""
         self._part: Path | None = None
         self._file = self._open(path, source, force, binary)
 
     def write(self, data: bytes) -> None:
-        """Append bytes. Raises ImudError where the disk is full or fails, BrokenPipeError where nobody reads."""
+        """Append bytes. Raises ImudError if the disk fails, BrokenPipeError if the reader closed the pipe."""
         try:
             self._file.write(data)
         except BrokenPipeError:
@@ -95,7 +94,7 @@ class ExportFile:
     def _open(self, path: Path | None, source: Path, force: bool, binary: bool) -> BinaryIO:
         if path is None:
             if binary and sys.stdout.isatty():
-                raise BadArgument("-o: expected a file, or a pipe on standard output; MCAP is not for terminals")
+                raise BadArgument("cannot write MCAP to a terminal; name a file with -o, or use a pipe")
             return sys.stdout.buffer
         try:
             there = path.stat()
@@ -105,12 +104,12 @@ class ExportFile:
             raise self._failure(error) from error
         if there is not None and stat.S_ISREG(there.st_mode):
             if path.samefile(source):
-                raise BadArgument(f"-o {path}: expected another file than the one that is exported")
+                raise BadArgument(f"-o {path}: this is the input file; name another file")
             if not force:
-                raise BadArgument(f"-o {path}: expected no file of this name, there is one; --force replaces it")
+                raise BadArgument(f"-o {path}: the file exists; replace it with --force")
         try:
             if there is not None and not stat.S_ISREG(there.st_mode):
-                return path.open("wb", buffering=0)  # a FIFO or a device
+                return path.open("wb", buffering=0)  # a FIFO or a device node cannot be renamed
             self._path = path
             self._part = path.with_name(f".{path.name}.{os.getpid()}.part")
             return open(os.open(self._part, WRITE_FLAGS, MODE), "wb", buffering=0)
@@ -137,7 +136,7 @@ class ExportFile:
                 self._part.unlink()
 
     def _failure(self, error: OSError) -> ImudError:
-        return ImudError(f"{self.name}: {reason_of(error)}; nothing is left of this export")
+        return ImudError(f"cannot write {self.name}: {reason_of(error)}; imud removed the incomplete export")
 
 
 FORMATS: Final = ("csv", "mcap")
@@ -148,37 +147,35 @@ MEGABYTE: Final = 1_000_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud export`."""
     parser.add_argument(
         "file", type=Path, metavar="FILE",
-        help="recording of imud; or a capture, raw or time-stamped; for CAN a log of candump -L",
+        help="recording of imud, raw or time-stamped capture, or for CAN a log of candump -L",
     )  # fmt: skip
-    parser.add_argument("--to", choices=FORMATS, required=True, help="format")
+    parser.add_argument("--to", choices=FORMATS, required=True, help="output format")
+    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="output file (default: standard output)")
+    parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="OUT", help="file to write, whole or not at all (default: standard output)"
-    )
-    parser.add_argument("--force", action="store_true", help="replace OUT if it is there")
-    parser.add_argument(
-        "--device", action="append", default=[], metavar="NAME", help="only this one; may be given several times"
-    )
+        "--device", action="append", default=[], metavar="NAME",
+        help="export this device only; repeat for more devices (default: all devices)",
+    )  # fmt: skip
     parser.add_argument(
         "--fields", metavar="NAME,…",
-        help="columns of CSV; channels of MCAP that say something of one of them (default: all; `imud schema` lists)",
+        help="columns of CSV, or MCAP channels that contain one of these fields (default: all; list: `imud schema`)",
     )  # fmt: skip
     parser.add_argument("--table", choices=TABLES, help="rows of CSV (default: samples)")
-    parser.add_argument("--schema", choices=SCHEMAS, help="messages of MCAP (default: json)")
+    parser.add_argument("--schema", choices=SCHEMAS, help="message format of MCAP (default: json)")
     parser.add_argument(
         "--convention", choices=[str(one) for one in Convention],
-        help="axes and angles (default: of CSV as they were published, of MCAP enu-flu as of REP-103)",
+        help="convention of axes and angles (default: CSV as published, MCAP enu-flu as in REP-103)",
     )  # fmt: skip
     add_noise(parser)
-    parser.add_argument("--driver", choices=sorted(DRIVERS), help=f"of a capture (default: {DRIVER})")
-    parser.add_argument("--baud", type=int, help=f"rate of a raw capture (default: {BAUD})")
+    parser.add_argument("--driver", choices=sorted(DRIVERS), help=f"driver for a capture (default: {DRIVER})")
+    parser.add_argument("--baud", type=int, help=f"baud rate of a raw capture (default: {BAUD})")
     add_option(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Export; what came of it goes to standard error. 1 where `imud replay` of the same file says 1."""
+    """Export the file. Print the report to standard error. Return the exit status that `imud replay` would return."""
     check(args)
     args.fields = None if args.fields is None else chosen_fields(args.fields)
     is_recording = _is_recording(args)
@@ -196,27 +193,27 @@ def run(args: argparse.Namespace) -> int:
 
 
 def check(args: argparse.Namespace) -> None:
-    """Raises BadArgument for options that mean nothing together."""
+    """Raise BadArgument for options that exclude each other."""
     for option, to in (("table", "csv"), ("schema", "mcap")):
         if getattr(args, option) is not None and args.to != to:
-            raise BadArgument(f"--{option}: expected with --to {to} only, got --to {args.to}")
+            raise BadArgument(f"--{option} applies to --to {to} only, got --to {args.to}")
     if args.noise and args.to != "mcap":
-        raise BadArgument(f"--noise: expected with --to mcap only, got --to {args.to}")
+        raise BadArgument(f"--noise applies to --to mcap only, got --to {args.to}")
     if args.fields is not None and args.table not in (None, "samples"):
-        raise BadArgument(f"--fields: expected with samples only, got --table {args.table}")
+        raise BadArgument(f"--fields applies to --table samples only, got --table {args.table}")
 
 
 def _is_recording(args: argparse.Namespace) -> bool:
-    """Raises ImudError for a file that is not there, BadArgument for options of captures with a recording."""
+    """Return whether the file is a recording. Raises ImudError if it does not exist, BadArgument for wrong options."""
     try:
         found = looks_like_recording(str(args.file))
     except OSError as error:
         raise ImudError(f"{args.file}: expected a recording or a capture: {reason_of(error)}") from error
     for option, default in (("option", []), ("driver", None), ("baud", None)):
         if found and getattr(args, option) != default:
-            raise BadArgument(f"--{option}: expected none with a recording, which has that of the live run")
+            raise BadArgument(f"--{option} applies to captures only; a recording contains the value of the live run")
     if not found and args.device:
-        raise BadArgument("--device: expected with a recording only; a capture is of one device")
+        raise BadArgument("--device applies to recordings only; a capture contains one device")
     return found
 
 
@@ -245,7 +242,7 @@ def _sink(args: argparse.Namespace, file: BinaryIO, out: ExportFile, *, is_recor
         words["times"] = (times_of(file, DRIVERS[args.driver or DRIVER]) or KnownTimes.HOST).value
     noise = recorded_noise(file, str(args.file)) if is_recording else {}
     for device, given in noise_by_device(args.noise).items():
-        name = device if is_recording else NAME  # whatever it was called where the report was made
+        name = device if is_recording else NAME  # a capture does not contain the name of its device
         noise[name] = noise.get(name, Deviations()).updated(given)
     made = McapFile(out, dialect.profile, f"imud {__version__}", words)
     return McapSink(made, dialect, convention, args.fields, noise)

@@ -1,4 +1,8 @@
-"""What is exported: a recording or a capture, played into a sink in the axes that are wanted."""
+"""Export of a recording or a capture: players that read the file, and sinks that write CSV or MCAP.
+
+A large recording is played in a second process (`python -m imud.cli.export_sources`), which sends the samples through a
+pipe. Decoding and writing then use two CPU cores.
+"""
 
 import shutil
 import struct
@@ -50,101 +54,96 @@ if TYPE_CHECKING:  # imports libraries of the extra `export`, which CSV does not
     from imud.bridges.mcap import McapChannel, McapFile
 
 CSV_BYTES: Final = 1 << 16
-"""Text that is gathered before it is written."""
+"""Size of the text buffer, bytes."""
 TABLES: Final = ("samples", "events", "losses")
 
 
 class Sink(Protocol):
-    """What takes all that a file has, in its order."""
+    """Receiver of the content of a file, in the order of the file."""
 
     def samples(self, batch: Batch) -> None:
-        """Take samples, in the axes that are wanted."""
+        """Write samples in the requested axes."""
         ...
 
     def losses(self, losses: LossCounts) -> None:
-        """Take the losses of a device, which have grown."""
+        """Write the increased loss counters of a device."""
         ...
 
     def event(self, event: StampedEvent) -> None:
-        """Take an event."""
+        """Write an event."""
         ...
 
     def finish(self) -> None:
-        """Write what waits."""
+        """Write buffered data."""
         ...
 
     def close(self) -> None:
-        """Release everything; may be called twice."""
+        """Release all resources. A second call does nothing."""
         ...
 
 
 class CsvSink:
-    """One table as CSV."""
+    """Sink that writes one table as CSV."""
 
-    def __init__(self, out: ByteWriter, what: str, fields: Collection[str] | None, *, without_times: bool) -> None:
-        """`what` is one of TABLES; `fields` are those of samples, None for all."""
+    def __init__(self, out: ByteWriter, kind: str, fields: Collection[str] | None, *, without_times: bool) -> None:
+        """`kind`: one of TABLES. `fields`: the fields of the samples, None for all."""
         self._out = out
-        self._what = what
+        self._table = kind
         names = SAMPLE_FIELDS if fields is None else tuple(fields)
         self._rows = table.SampleText(names, without_times)
         heads = {"samples": table.sample_columns(names), "events": table.EVENT_COLUMNS, "losses": table.LOSS_COLUMNS}
-        self._text = bytearray(table.csv_text([heads[what]]))
+        self._text = bytearray(table.csv_text([heads[kind]]))
 
     def samples(self, batch: Batch) -> None:
-        """Write a row each."""
-        if self._what == "samples":
+        if self._table == "samples":
             self._text += self._rows.of(batch.samples)
             if len(self._text) >= CSV_BYTES:
                 self.finish()
 
     def losses(self, losses: LossCounts) -> None:
-        """Write a row."""
-        if self._what == "losses":
+        if self._table == "losses":
             self._text += table.csv_text([table.loss_row(losses)])
 
     def event(self, event: StampedEvent) -> None:
-        """Write a row."""
-        if self._what == "events":
+        if self._table == "events":
             self._text += table.csv_text([table.event_row(event)])
 
     def finish(self) -> None:
-        """Write what waits."""
         self._out.write(bytes(self._text))
         self._text.clear()
 
-    def close(self) -> None:
-        """No-op: nothing is held."""
+    def close(self) -> None: ...
 
 
 HEAD: Final = struct.Struct("<BIQ")
-"""Kind, length, and how many bytes of the file are read."""
+"""Header of a message in the pipe: kind, length in bytes, read position in the file in bytes."""
 LENGTH_MAX: Final = 1 << 26
-"""Far more than a message has: beyond it something else writes into the pipe."""
+"""Maximum length of a message, bytes. Valid messages are much shorter."""
 PIPE_BYTES: Final = 1 << 20
-"""Of the pipe, as far as the kernel allows it: playing goes on while a chunk of some hundred kilobytes is written."""
+"""Requested size of the pipe, bytes. The player continues while the writer compresses a chunk."""
 SAMPLES: Final = 64
-"""Samples in a message at most: a sixth of a second at 400 Hz, so that messages of a file are nearly in their order."""
+"""Maximum number of samples in a message: 0.16 s at 400 Hz, so that devices stay nearly in the order of time."""
 GC_ALLOCATIONS: Final = 50_000
-"""Objects between two looks for cycles, of which playing makes next to none; each look goes through all objects."""
+"""Number of allocated objects between two garbage collections. The player creates almost no reference cycles."""
 DEVICE, BATCH, LOSSES, EVENT, END, ERROR = range(1, 7)
 _LOST: Final = attrgetter("samples", *LossCounts._fields[4:])
 """Counters of a ledger in the order of `LossCounts`."""
 
 Played = tuple[str, int, list[str]]
-"""Report for people, exit status, names of the devices."""
+"""Report as text, exit status, names of the devices."""
 
 
 class LossWatch:
-    """Gives the samples of wanted devices and their events to a sink, and before samples what was lost."""
+    """Filter that passes the samples and events of selected devices to a sink, and new losses before the samples."""
 
     def __init__(self, sink: Sink, devices: Collection[str]) -> None:
-        """`devices` are those that are wanted, none: all."""
+        """`devices`: the selected devices; empty for all devices."""
         self._sink = sink
         self._devices = devices
         self._lost: dict[str, tuple[int, ...]] = {}
 
     def batch(self, batch: Batch, ledger: Ledger) -> None:
-        """Pass on samples."""
+        """Pass samples to the sink. If the ledger contains new losses, pass the losses first."""
         if self._devices and batch.device not in self._devices:
             return
         samples, *lost = _LOST(ledger)
@@ -156,7 +155,7 @@ class LossWatch:
         self._sink.samples(batch)
 
     def event(self, event: Event, utc_ns: int) -> None:
-        """Pass on an event of a device that is wanted, or of the daemon itself."""
+        """Pass an event of a selected device or of the daemon to the sink."""
         if not self._devices or not event.device or event.device in self._devices:
             self._sink.event(StampedEvent(event, utc_ns))
 
@@ -170,11 +169,11 @@ def play_here(file: BinaryIO, name: str, sink: Sink, devices: Collection[str]) -
 
 
 def play_beside(path: Path, sink: Sink, devices: Sequence[str], at: Callable[[int], None]) -> Played:
-    """Play a recording in a process of its own; `at` is called with the bytes read so far. Raises ImudError."""
+    """Play a recording in a second process. Call `at` with the read position in bytes. Raises ImudError."""
     argv = [sys.executable, "-I", "-m", "imud.cli.export_sources", str(path.absolute()), *devices]
     with subprocess.Popen(argv, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL) as process:
         assert process.stdout is not None
-        with suppress(OSError):  # more than pipe-max-size, or than this user may have: it is slower, and the same
+        with suppress(OSError):  # above fs.pipe-max-size or the user's limit: a smaller pipe is only slower
             fcntl(process.stdout, F_SETPIPE_SZ, PIPE_BYTES)
         try:
             return _take(process.stdout, path, sink, at)
@@ -183,7 +182,7 @@ def play_beside(path: Path, sink: Sink, devices: Sequence[str], at: Callable[[in
 
 
 def _take(pipe: IO[bytes], path: Path, sink: Sink, at: Callable[[int], None]) -> Played:
-    """Give a sink what comes through the pipe."""
+    """Pass the messages of the pipe to a sink until the end message. Return its content."""
     frames: dict[int, tuple[str, PublishedAxes]] = {}
     decode_samples = msgspec.msgpack.Decoder(list[Sample]).decode
     while len(head := pipe.read(HEAD.size)) == HEAD.size:
@@ -210,11 +209,11 @@ def _take(pipe: IO[bytes], path: Path, sink: Sink, at: Callable[[int], None]) ->
             return played
         else:
             raise ImudError(data.decode(errors="replace"))
-    raise ImudError(f"{path}: the process that plays it ended before its end; was it killed, is memory short?")
+    raise ImudError(f"cannot read {path}: the player process ended early; is there enough memory, was it killed?")
 
 
 class PipeSink:
-    """A sink that writes what it takes to a pipe."""
+    """Sink that writes messages to a pipe."""
 
     def __init__(self, out: BinaryIO, position: Callable[[], int]) -> None:
         self._out = out
@@ -225,7 +224,7 @@ class PipeSink:
         self._encode = msgspec.msgpack.Encoder().encode
 
     def samples(self, batch: Batch) -> None:
-        """Gather samples of one device."""
+        """Buffer samples of one device."""
         device_id = batch.device_id
         if device_id != self._device_id or batch.frame is not self._frames.get(device_id):
             self.finish()
@@ -238,36 +237,33 @@ class PipeSink:
             self.finish()
 
     def losses(self, losses: LossCounts) -> None:
-        """Write losses, after the samples before them."""
-        self.finish()
+        self.finish()  # keep the order of samples and losses
         self._put(LOSSES, self._encode(losses))
 
     def event(self, event: StampedEvent) -> None:
-        """Write an event, after the samples before it."""
         self.finish()
         self._put(EVENT, self._encode(event))
 
     def end(self, kind: int, value: Any) -> None:
-        """Write the end: what came of it, or why it failed."""
+        """Write the last message: the result (END), or the text of an error (ERROR)."""
         self.finish()
         self._put(kind, value.encode() if isinstance(value, str) else self._encode(value))
         self._out.flush()
 
     def finish(self) -> None:
-        """Write the samples that wait."""
+        """Write the buffered samples."""
         samples, self._waiting = self._waiting, []
         if samples:
             self._put(BATCH, self._device_id.to_bytes(2, "little") + self._encode(samples))
 
-    def close(self) -> None:
-        """No-op: the pipe is the caller's."""
+    def close(self) -> None: ...
 
     def _put(self, kind: int, data: bytes) -> None:
         self._out.write(HEAD.pack(kind, len(data), self._position()) + data)
 
 
 def main(path: str, devices: Sequence[str]) -> None:
-    """Play a recording into standard output."""
+    """Play a recording to standard output, as the second process of an export."""
     with rare_garbage_collection(GC_ALLOCATIONS), open_regular(path) as file:
         sink = PipeSink(sys.stdout.buffer, file.tell)
         try:
@@ -277,19 +273,19 @@ def main(path: str, devices: Sequence[str]) -> None:
 
 
 EVERY_S: Final = 0.2
-"""Time between two pictures."""
+"""Time between two updates of the progress bar, s."""
 LOOK_SAMPLES: Final = 2000
-"""Samples between two looks at the clock, which is 20 ms or so."""
+"""Number of samples between two reads of the clock, about 20 ms."""
 BAR: Final = 24
-"""Characters of the bar."""
+"""Length of the progress bar, characters."""
 CLEAR: Final = "\r\x1b[K"
 
 
 class Progress:
-    """The bar. It is nothing where standard error is no terminal."""
+    """Progress bar on standard error. It prints nothing if standard error is not a terminal."""
 
     def __init__(self, size_bytes: int, out: TextIO | None = None, now_s: Callable[[], float] = monotonic) -> None:
-        """`size_bytes` is that of the whole file."""
+        """`size_bytes`: size of the input file."""
         out = sys.stderr if out is None else out
         self._out = out if out.isatty() else None
         self._size = max(size_bytes, 1)
@@ -297,15 +293,15 @@ class Progress:
         self._begun_s = self._due_s = now_s()
         self._looked = 0
         self.samples = 0
-        """Samples so far."""
+        """Number of samples so far."""
 
     @property
     def spent_s(self) -> float:
-        """Time since the begin."""
+        """Time since the start, s."""
         return self._now_s() - self._begun_s
 
     def add(self, samples: int, position: Callable[[], int]) -> None:
-        """Count samples, and draw if it is time; `position` says how many bytes are read."""
+        """Count samples. Update the bar if it is due. `position` returns the read position in bytes."""
         self.samples += samples
         if self._out is None or self.samples < self._looked + LOOK_SAMPLES:
             return
@@ -316,7 +312,7 @@ class Progress:
             self._draw(position(), now_s - self._begun_s)
 
     def close(self) -> None:
-        """Remove the bar; may be called twice."""
+        """Remove the bar. A second call does nothing."""
         if self._out is not None:
             self._out.write(CLEAR)
             self._out.flush()
@@ -326,86 +322,80 @@ class Progress:
         assert self._out is not None
         share = min(read_bytes / self._size, 1.0)
         full = int(share * BAR)
-        left = f", {spent_s / share - spent_s:.0f} s left" if share > 0.02 else ""
+        left = f", {spent_s / share - spent_s:.0f} s left" if share > 0.02 else ""  # an earlier estimate is too rough
         text = f"[{'#' * full}{'.' * (BAR - full)}] {100 * share:3.0f} %  {self.samples} samples{left}"
         self._out.write(CLEAR + text[: shutil.get_terminal_size().columns - 1])
         self._out.flush()
 
 
 NOISE: Final = "noise"
-"""Key of the recorded configuration."""
+"""Key of the noise in the recorded configuration of a device."""
 BESIDE_BYTES: Final = 1_000_000
-"""From this size on a recording is played in a process of its own: a start of one takes as long as 20,000 samples."""
+"""Minimum size of a recording for a second process, bytes. The start of a process takes as long as 20,000 samples."""
 
 
 class Exported(NamedTuple):
-    """What came of an export."""
+    """Result of an export."""
 
     report: str
-    """Of each device, and of the file, for people."""
+    """Report about the devices and the file, as text."""
     status: int
-    """0: the file is whole, and its samples are those of the live run."""
+    """0 if the file is complete and its samples are equal to the live run, otherwise 1."""
 
 
 class ExportFeed:
-    """A sink that turns samples into the axes that are wanted for another one. Synchronization: one thread."""
+    """Sink that converts samples to the requested axes and passes them to another sink. Synchronization: one thread."""
 
     def __init__(self, sink: Sink, file: BinaryIO, progress: Progress, convention: Convention | None) -> None:
-        """None as `convention` leaves axes as they were published."""
+        """`convention`: None keeps the published axes."""
         self._sink = sink
         self._file = file
         self._read_bytes: int | None = None
         self._progress = progress
         self._convention = convention
         self.samples_taken = 0
-        """Samples passed on."""
+        """Number of exported samples."""
 
     def at(self, read_bytes: int) -> None:
-        """Note how far the file is read, where another process reads it."""
+        """Set the read position of the file, if another process reads the file."""
         self._read_bytes = read_bytes
 
     def samples(self, batch: Batch) -> None:
-        """Turn samples, and pass them on."""
         self._sink.samples(batch.converted(self._convention))
         self.samples_taken += len(batch.samples)
         self._progress.add(len(batch.samples), self._position)
 
     def losses(self, losses: LossCounts) -> None:
-        """Pass them on."""
         self._sink.losses(losses)
 
     def event(self, event: StampedEvent) -> None:
-        """Pass it on."""
         self._sink.event(event)
 
     def finish(self) -> None:
-        """Write what waits."""
         self._sink.finish()
 
-    def close(self) -> None:
-        """No-op: the other sink is the caller's."""
+    def close(self) -> None: ...
 
     def _position(self) -> int:
         return self._file.tell() if self._read_bytes is None else self._read_bytes
 
 
 def export_recording(file: BinaryIO, path: Path, feed: ExportFeed, devices: Sequence[str]) -> Exported:
-    """Play a recording. Raises ImudError, BadArgument for a device that it does not have."""
+    """Export a recording. Raises ImudError, and BadArgument if the recording does not contain a selected device."""
     if path.stat().st_size < BESIDE_BYTES:
         report, status, known = play_here(file, str(path), feed, devices)
     else:
         report, status, known = play_beside(path, feed, devices, feed.at)
     for name in devices:
         if name not in known:
-            there = ", ".join(known)
-            raise BadArgument(f"--device {name}: expected a device of the recording, which has {there}")
+            raise BadArgument(f"--device {name}: expected a device of the recording: {', '.join(known) or 'none'}")
     return Exported(report, status)
 
 
 def recorded_noise(file: BinaryIO, name: str) -> dict[str, Deviations]:
     """Return the configured noise of each device of a recording. Raises ImudError.
 
-    A device is described when it starts, which may be after the first samples of another device.
+    Read the complete file: the description of a device can come after the first samples of another device.
     """
     found: dict[str, Deviations] = {}
     for record in RecordingReader(file, name):
@@ -415,7 +405,7 @@ def recorded_noise(file: BinaryIO, name: str) -> dict[str, Deviations]:
                 try:
                     found[device.name] = msgspec.convert(device.configuration[NOISE], Deviations)
                 except msgspec.ValidationError as error:
-                    raise ImudError(f"{name}: the noise of {device.name} cannot be read: {reason_of(error)}") from None
+                    raise ImudError(f"{name}: cannot read the noise of {device.name}: {reason_of(error)}") from None
     file.seek(0)
     return found
 
@@ -423,7 +413,7 @@ def recorded_noise(file: BinaryIO, name: str) -> dict[str, Deviations]:
 def export_capture(
     file: BinaryIO, path: Path, feed: ExportFeed, driver: Driver, options: Options, baud: int
 ) -> Exported:
-    """Play a capture. Raises ImudError."""
+    """Export a capture. Raises ImudError."""
     watch = LossWatch(feed, ())
     player = CapturePlayer(lambda batch: watch.batch(batch, player.device.ledger), driver, options, str(path))
     reader: CaptureReader | CandumpReader
@@ -434,7 +424,7 @@ def export_capture(
         reader = CaptureReader(file)
         player.play_bytes(reader, baud)
     device = player.device
-    words = [(reader.problem, "the file: "), (player.times.value, "times: ")]
+    words = [(reader.problem, "file: "), (player.times.value, "times: ")]
     lines = [line for text, label in words if text for line in paragraph(label, text)]
     is_damaged = isinstance(reader, CaptureReader) and reader.is_damaged
     status = 0 if device.ledger.samples and not is_damaged else 1
@@ -442,7 +432,7 @@ def export_capture(
 
 
 def times_of(file: BinaryIO, driver: Driver) -> KnownTimes | None:
-    """Look at the begin of a capture: what its times will be; None: there are some, and playing it says which."""
+    """Return the kind of times in a capture. None if the capture is time-stamped: the player then finds the kind."""
     if isinstance(driver, CanDriver):
         return KnownTimes.WALL_CLOCK
     stamped = CaptureReader(file).stamped
@@ -451,13 +441,13 @@ def times_of(file: BinaryIO, driver: Driver) -> KnownTimes | None:
 
 
 def _block(device: PlayedDevice, times: KnownTimes) -> list[str]:
-    """Lines about the device, without those that need times that were recorded, or a live run."""
+    """Format the device without the rows that need recorded times or a live run."""
     without = ("compared",) if times.has_host_times else ("compared", "clock")
     return device_block(device, without)
 
 
 class McapSink:
-    """Channels of a dialect in a file of MCAP. A channel is there from its first message on."""
+    """Sink that writes the channels of a dialect to an MCAP file. The first message of a channel adds the channel."""
 
     def __init__(
         self,
@@ -467,7 +457,7 @@ class McapSink:
         fields: Collection[str] | None,
         noise: Mapping[str, Deviations],
     ) -> None:
-        """`fields` chooses the channels of samples that say something of one of them; None: all. `noise`: by device."""
+        """`fields`: write only channels of samples with one of these fields; None for all. `noise`: by device."""
         self._file = file
         self._dialect = dialect
         self._convention = convention
@@ -479,10 +469,9 @@ class McapSink:
         self._diagnosis = RecordedDiagnosis()
         self._diagnostics: tuple[MessageChannel[Diagnoses], McapChannel] | None = None
         self._shared: dict[str, McapChannel] = {}
-        """Channels by their topic: that of transforms is one for all devices."""
+        """Channels by topic. All devices share the channel of transforms."""
 
     def samples(self, batch: Batch) -> None:
-        """Write the messages of each."""
         channels = self._devices.get(batch.device)
         if channels is None:
             channels = self._devices[batch.device] = self._channels_of(batch)
@@ -493,7 +482,6 @@ class McapSink:
         self._diagnose(self._diagnosis.samples(batch.device, samples))
 
     def losses(self, losses: LossCounts) -> None:
-        """Write the message."""
         self._diagnosis.losses(losses)
         known = self._losses.get(losses.device)
         if known is None:
@@ -505,7 +493,6 @@ class McapSink:
             channel.add(losses.utc_ns, data)
 
     def event(self, event: StampedEvent) -> None:
-        """Write the message."""
         if self._events is None:
             described = self._dialect.events()
             self._events = described, self._file.add_channel(described)
@@ -516,7 +503,6 @@ class McapSink:
         self._diagnose(self._diagnosis.event(event))
 
     def _diagnose(self, diagnoses: Diagnoses | None) -> None:
-        """Write the message, where there is one."""
         if diagnoses is None:
             return
         if self._diagnostics is None:
@@ -528,11 +514,11 @@ class McapSink:
             channel.add(diagnoses.utc_ns, data)
 
     def finish(self) -> None:
-        """Write what waits, and the index."""
+        """Write buffered messages and the index."""
         self._file.finish()
 
     def close(self) -> None:
-        """End the thread that compresses."""
+        """Stop the compression thread."""
         self._file.close()
 
     def _channels_of(self, batch: Batch) -> "list[_SampleChannel]":
@@ -553,7 +539,7 @@ class McapSink:
 
 
 class _SampleChannel:
-    """A channel of samples, opened with its first message."""
+    """Channel of samples. The first message adds the channel to the file."""
 
     def __init__(
         self, described: MessageChannel[Sample], open_: "Callable[[MessageChannel[Sample]], McapChannel]"
@@ -564,7 +550,7 @@ class _SampleChannel:
         self._channel: McapChannel | None = None
 
     def add(self, samples: Sequence[Sample], times_ns: Sequence[int]) -> None:
-        """Write a message of each that has one, of these times."""
+        """Write the messages of the samples. `times_ns` are the times of the samples."""
         made = list(map(self._encode, samples))
         messages = [data for data in made if data is not None]
         if not messages:

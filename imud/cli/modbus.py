@@ -1,6 +1,7 @@
-"""`imud modbus`: find the modules of an RS-485 line and set their addresses. It sends, so the port must be named.
+"""`imud modbus`: find the devices on an RS-485 bus and set their addresses.
 
-Stop the daemon first, or take the line out of its configuration: a line has one master.
+The command sends requests, and an RS-485 bus has one master: stop the daemon first, or remove the bus from the
+configuration.
 """
 
 import argparse
@@ -36,11 +37,11 @@ T = TypeVar("T")
 
 TRIES: Final = 3
 SETTLE_S: Final = 0.3
-"""Time for modules to apply new addresses; the manual gives none."""
+"""Time for devices to apply new addresses, s. The manual does not specify this time."""
 
 
 class FoundModule(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A module that answered at one address."""
+    """Device that replied at an address."""
 
     baud: int
     address: int
@@ -48,12 +49,12 @@ class FoundModule(msgspec.Struct, frozen=True, omit_defaults=True):
     serial_number: str = ""
     firmware: str = ""
     problem: str = ""
-    """The fault at this address; the other fields are then unknown."""
+    """Fault at this address; the other fields are then empty."""
 
 
 @contextmanager
 def opened(port: str, baud: int, reply_ms: int) -> Iterator[Rs485Link]:
-    """Open the line for this program alone. Raises LinkError."""
+    """Open the RS-485 bus exclusively during the context. Raises LinkError."""
     link = Rs485Link(Rs485Options(line=port, baud=baud, reply_ms=reply_ms))
     link.open()
     try:
@@ -63,10 +64,10 @@ def opened(port: str, baud: int, reply_ms: int) -> Iterator[Rs485Link]:
 
 
 def scan(link: Rs485Link, baud: int, addresses: Iterable[int]) -> list[FoundModule]:
-    """Ask at every address which module is there. Raises LinkError.
+    """Request the identity at each address. Return the devices. Raises LinkError.
 
-    Where none answers, or not clearly, it is asked once more after all others; and a third time on a line on which
-    something was heard. Noise, or a module that is just busy, costs single answers.
+    Addresses without a valid reply get a second request, because noise or a busy device costs single replies. If at
+    least one device replied, they also get a third request.
     """
     asked = list(addresses)
     found: dict[int, FoundModule | None] = dict.fromkeys(asked)
@@ -81,7 +82,7 @@ def scan(link: Rs485Link, baud: int, addresses: Iterable[int]) -> list[FoundModu
 
 
 def assign_by_serial(link: Rs485Link, baud: int, serial_number: str, new_id: int) -> FoundModule:
-    """Set the address of the module with this serial number. Raises CommandError, LinkError."""
+    """Set the address of the device with this serial number. Raises CommandError, LinkError."""
     wanted = serial_bytes(serial_number).hex().upper()
     order = set_id_by_serial(serial_number, new_id)
     _check_free(link, new_id, wanted)
@@ -90,12 +91,12 @@ def assign_by_serial(link: Rs485Link, baud: int, serial_number: str, new_id: int
 
 
 def assign_by_address(link: Rs485Link, baud: int, address: int, new_id: int) -> FoundModule:
-    """Change the address of the module at one address. Raises CommandError, LinkError."""
+    """Change the address of the device at an address. Raises CommandError, LinkError."""
     check_id("address", address)
     script = set_id(new_id)
     before = _identity(link, address)
     if before is None:
-        raise CommandError(f"no module answers at address {address}")
+        raise CommandError(f"no device replies at address {address}")
     _check_free(link, new_id, before.serial_number)
     try:
         _run(link, address, script)
@@ -105,16 +106,16 @@ def assign_by_address(link: Rs485Link, baud: int, address: int, new_id: int) -> 
 
 
 def randomise(link: Rs485Link, lowest: int, highest: int) -> None:
-    """Make every module choose a random address of a range. Raises BadArgument, LinkError."""
+    """Command every device to choose a random address in a range. Raises BadArgument, LinkError."""
     _broadcast(link, randomise_ids(lowest, highest))
 
 
 def keep(link: Rs485Link, found: FoundModule) -> None:
-    """Make a module save its settings. Raises CommandError, LinkError."""
+    """Command a device to save its settings. Raises CommandError, LinkError."""
     try:
         _run(link, found.address, save())
     except (TransferError, DeviceRefused) as error:
-        raise CommandError(f"address {found.address}: not saved: {error}") from error
+        raise CommandError(f"cannot save the settings of the device at address {found.address}: {error}") from error
 
 
 def _look(link: Rs485Link, baud: int, address: int) -> FoundModule | None:
@@ -122,14 +123,14 @@ def _look(link: Rs485Link, baud: int, address: int) -> FoundModule | None:
     try:
         who = printable_identity(_run(link, address, probe(HipnucModbusOptions())))
     except DeviceRefused as error:
-        return FoundModule(baud, address, problem=f"{error}; are there two modules with this address?")
+        return FoundModule(baud, address, problem=f"{error}; do two devices have this address?")
     except TransferError as error:
         return FoundModule(baud, address, problem=str(error)) if link.heard.strange > strange else None
     return FoundModule(baud, address, who.product, who.serial_number, who.firmware)
 
 
 def _identity(link: Rs485Link, address: int) -> Identity | None:
-    """Read the identity of the module at an address; None for no answer. Raises CommandError for invalid replies."""
+    """Read the identity at an address; None if no device replies. Raises CommandError for invalid replies."""
     problem: Exception | None = None
     for _ in range(TRIES):
         try:
@@ -139,22 +140,22 @@ def _identity(link: Rs485Link, address: int) -> Identity | None:
         except DeviceRefused as error:
             problem = error
     if problem is not None:
-        raise CommandError(f"address {address}: {problem}; are there two modules with this address?")
+        raise CommandError(f"address {address}: {problem}; do two devices have this address?")
     return None
 
 
 def _check_free(link: Rs485Link, address: int, serial_number: str) -> None:
     there = _identity(link, address)
     if there is not None and there.serial_number != serial_number:
-        raise CommandError(f"address {address} is taken by {there.product}, serial number {there.serial_number}")
+        raise CommandError(f"address {address} is used by {there.product}, serial number {there.serial_number}")
 
 
 def _expect(link: Rs485Link, baud: int, address: int, serial_number: str) -> FoundModule:
     there = _identity(link, address)
     if there is None:
         raise CommandError(
-            f"no module answers at address {address}: is a module with serial number {serial_number} on this line, at "
-            f"{baud} baud, and does its firmware know function 0x50?"
+            f"no device replies at the new address {address}: is the device with serial number {serial_number} on this "
+            f"bus, does it use {baud} baud, does its firmware support function 0x50?"
         )
     if there.serial_number != serial_number:
         raise CommandError(f"expected serial number {serial_number} at address {address}, got {there.serial_number}")
@@ -176,32 +177,40 @@ HEAD = ("BAUD", "ADDRESS", "PRODUCT", "SERIAL NUMBER", "FIRMWARE", "")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud modbus`."""
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    scanning = actions.add_parser("scan", help="list the module at every address")
-    scanning.add_argument("port", metavar="PORT", help="port of the line, for example /dev/ttyUSB0")
-    scanning.add_argument("--baud", default=str(FACTORY_BAUD), help="bit/s, or all for every rate (%(default)s)")
+    scanning = actions.add_parser("scan", help="list the device at each address")
+    scanning.add_argument("port", metavar="PORT", help="port of the RS-485 bus, for example /dev/ttyUSB0")
     scanning.add_argument(
-        "--addresses", type=addresses, default=SLAVES, metavar="FIRST-LAST", help="addresses to ask (1-247)"
+        "--baud", default=str(FACTORY_BAUD), help="baud rate, or all for all baud rates (default: %(default)s)"
+    )
+    scanning.add_argument(
+        "--addresses", type=addresses, default=SLAVES, metavar="FIRST-LAST", help="addresses to scan (default: 1-247)"
     )
     _common(scanning)
-    giving = actions.add_parser("assign", help="set the address of a module, or random ones of all modules")
-    giving.add_argument("port", metavar="PORT", help="port of the line")
-    giving.add_argument("--baud", type=int, default=FACTORY_BAUD, help="bit/s (%(default)s)")
+    giving = actions.add_parser("assign", help="set the address of one device, or random addresses of all devices")
+    giving.add_argument("port", metavar="PORT", help="port of the RS-485 bus")
+    giving.add_argument("--baud", type=int, default=FACTORY_BAUD, help="baud rate (default: %(default)s)")
     which = giving.add_mutually_exclusive_group(required=True)
-    which.add_argument("--serial", metavar="SN", help="the module with this serial number (16 hexadecimal digits)")
-    which.add_argument("--from", type=int, metavar="ADDRESS", dest="address", help="the module at this address")
+    which.add_argument("--serial", metavar="SN", help="device with this serial number (16 hexadecimal digits)")
+    which.add_argument("--from", type=int, metavar="ADDRESS", dest="address", help="device at this address")
     which.add_argument(
-        "--random", type=addresses, metavar="FIRST-LAST", help="every module chooses a random address of this range"
+        "--random",
+        type=addresses,
+        metavar="FIRST-LAST",
+        help="all devices; each chooses a random address",
     )
-    giving.add_argument("--id", type=int, metavar="ADDRESS", help="the new address, with --serial and --from")
-    giving.add_argument("--no-save", action="store_true", help="until power-off only")
+    giving.add_argument("--id", type=int, metavar="ADDRESS", help="new address, with --serial or --from")
+    giving.add_argument(
+        "--no-save", action="store_true", help="do not save the new address in the device; it lasts until power-off"
+    )
     _common(giving)
 
 
 def _common(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--reply-ms", type=int, default=20, metavar="MS", help="longest time to a reply (%(default)s)")
-    parser.add_argument("--json", action="store_true", help="one JSON object per module")
+    parser.add_argument(
+        "--reply-ms", type=int, default=20, metavar="MS", help="maximum wait for a reply (default: %(default)s)"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object per device")
 
 
 def addresses(text: str) -> range:
@@ -211,12 +220,12 @@ def addresses(text: str) -> range:
         raise argparse.ArgumentTypeError(f"expected FIRST-LAST, got {text!r}")
     found = range(int(first), int(last or first) + 1)
     if not found or found[0] not in SLAVES or found[-1] not in SLAVES:
-        raise argparse.ArgumentTypeError(f"expected addresses of 1-247, lowest first, got {text!r}")
+        raise argparse.ArgumentTypeError(f"expected addresses from 1 to 247, lowest first, got {text!r}")
     return found
 
 
 def run(args: argparse.Namespace) -> int:
-    """Scan or assign; return 0 when modules were found or numbered, 1 for none or a faulty one."""
+    """Scan or assign. Return 1 if no device was found or a device has a fault, otherwise 0."""
     if not 1 <= args.reply_ms <= 1000:
         raise BadArgument(f"--reply-ms: expected 1 to 1000, got {args.reply_ms}")
     found = _scan(args) if args.action == "scan" else _assign(args)
@@ -226,7 +235,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _scan(args: argparse.Namespace) -> list[FoundModule]:
     found: list[FoundModule] = []
-    first = [address for address in (FACTORY_ID,) if address in args.addresses]
+    first = [address for address in (FACTORY_ID,) if address in args.addresses]  # most devices have this address
     order = list(dict.fromkeys([*first, *args.addresses]))
     for baud in BAUD_RATES if args.baud == "all" else (_baud(args.baud),):
         with opened(args.port, baud, args.reply_ms) as link:
@@ -237,7 +246,7 @@ def _scan(args: argparse.Namespace) -> list[FoundModule]:
 def _assign(args: argparse.Namespace) -> list[FoundModule]:
     baud = _baud(str(args.baud))
     if (args.random is None) == (args.id is None):
-        raise BadArgument("--id: expected the new address with --serial or --from, and none with --random")
+        raise BadArgument("--id: expected the new address with --serial or --from; omit --id with --random")
     with opened(args.port, baud, args.reply_ms) as link:
         if args.random is not None:
             randomise(link, args.random[0], args.random[-1])
@@ -273,7 +282,7 @@ def _show(found: list[FoundModule], *, as_json: bool) -> None:
         ]
         print(table(HEAD, rows))
     else:
-        print("no module answers: is the line wired and terminated, are A and B right, is the baud rate another one?")
+        print("no device replies: check the wires A and B, the termination, the power supply and --baud")
 
 
 MODBUS = CliCommand(add_arguments, run)

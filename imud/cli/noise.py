@@ -1,4 +1,4 @@
-"""Report of a noise analysis: the measurement, figures in units for people, comparison with a data sheet."""
+"""Report of a noise analysis: conditions of the measurement, noise values, comparison with a data sheet."""
 
 import io
 import re
@@ -53,23 +53,24 @@ TITLE_WIDTH: Final = 23
 UNIT_WIDTH: Final = 10
 CELL_WIDTH: Final = 15
 DISTURBED_SHARE: Final = 0.01
-"""With more disturbed seconds than that the report says that it was no measurement at rest."""
+"""Maximum share of disturbed seconds in a measurement at rest."""
 WITHIN: Final = 1.1
-"""A measured figure up to so much above that of the sheet is called within: coefficients are known to some per cent."""
+"""Maximum ratio of a measured value to the value of the data sheet for the verdict "within". The error of a measured
+value is some per cent."""
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseReport:
-    """All that the outputs are made of."""
+    """Result of the analysis, the input of all outputs."""
 
     taken: SampleSet
     sensors: dict[SensorName, SensorNoise]
     sheet: ModelFigures | None
-    """What to compare with; None for nothing."""
+    """Values of a data sheet for the comparison; None for no comparison."""
 
 
 def noise_report(taken: SampleSet, sheet: ModelFigures | None) -> NoiseReport:
-    """Analyse both sensors. Raises ImudError where neither has values."""
+    """Analyse both sensors. Raises ImudError if the device sends neither angular rate nor acceleration."""
     readings = readings_of(taken)
     sensors: dict[SensorName, SensorNoise] = {}
     if readings.gyro_rad_s is not None:
@@ -82,9 +83,9 @@ def noise_report(taken: SampleSet, sheet: ModelFigures | None) -> NoiseReport:
 
 
 def readings_of(taken: SampleSet) -> Readings:
-    """Return the samples. Raises ImudError where there are none."""
+    """Return the samples. Raises ImudError if there are no samples."""
     if taken.readings is None or not len(taken.readings.t_ns):
-        raise ImudError(f"{taken.source}: expected samples, found none")
+        raise ImudError(f"{taken.source}: found no samples")
     return taken.readings
 
 
@@ -92,21 +93,21 @@ def readings_of(taken: SampleSet) -> Readings:
 
 
 def circumstances(taken: SampleSet, *, full: bool = True) -> Iterator[tuple[str, str]]:
-    """Name and text of each thing to know about a measurement."""
+    """Yield name and text of the conditions of a measurement. `full`: include the device settings."""
     readings = readings_of(taken)
-    begun = "not known"
+    begun = "unknown"
     if taken.begun_utc_ns is not None:
         begun = f"{datetime.fromtimestamp(taken.begun_utc_ns // NS_PER_S, UTC):%Y-%m-%d %H:%M:%S} UTC"
     yield "source", taken.source
     yield "device", f"{taken.device}, driver {taken.driver}, {taken.link}" if taken.link else taken.driver
-    yield "identity", ", ".join(f"{key} {value}" for key, value in taken.identity.items()) or "not known"
+    yield "identity", ", ".join(f"{key} {value}" for key, value in taken.identity.items()) or "unknown"
     if full:
-        yield "settings", ", ".join(f"{key} {value}" for key, value in taken.settings.items()) or "not read"
-    yield "begun", begun
+        yield "settings", ", ".join(f"{key} {value}" for key, value in taken.settings.items()) or "unknown"
+    yield "start", begun
     yield "duration", f"{duration_words(readings.duration_s)}, {len(readings.t_ns)} samples"
-    yield "stamps", taken.stamps
+    yield "time stamps", taken.stamps
     lost = ", ".join(f"{cause.removeprefix('lost_')} {count}" for cause, count in taken.lost.items())
-    yield "lost", f"by the ledger: {lost}" if lost else "nothing, by the ledger"
+    yield "lost", f"{lost} (ledger)" if lost else "0 samples (ledger)"
     yield "temperature", temperature_words(readings)
     yield "software", f"imud {__version__}"
     for note in taken.notes:
@@ -114,7 +115,7 @@ def circumstances(taken: SampleSet, *, full: bool = True) -> Iterator[tuple[str,
 
 
 def duration_words(seconds: float) -> str:
-    """Format a duration."""
+    """Format a duration as hours, minutes and seconds."""
     if seconds < 120:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -127,40 +128,43 @@ def temperature_words(readings: Readings) -> str:
     if readings.temperature_c is None:
         return "not sent by the device"
     known = readings.temperature_c[np.isfinite(readings.temperature_c)]
-    return f"{known.min():.4g} to {known.max():.4g} °C, from {known[0]:.4g} at the begin to {known[-1]:.4g} at the end"
+    return f"{known.min():.4g} to {known.max():.4g} °C, from {known[0]:.4g} at the start to {known[-1]:.4g} at the end"
 
 
 def limits(report: NoiseReport, name: SensorName) -> Iterator[str]:
-    """Sentences about what limits the figures of a sensor."""
+    """Yield sentences about the limits of the values of a sensor."""
     sensor = report.sensors[name]
     yield sensor.grid.words()
     if sensor.corner_hz is not None:
         yield (
-            f"the noise has less than half its power above {sensor.corner_hz:.3g} Hz, as behind a low-pass filter: "
-            f"the coefficients are fitted from τ = {sensor.tau_least_s:.3g} s on"
+            f"low-pass filter: the noise has less than half of its power above {sensor.corner_hz:.3g} Hz; imud fits "
+            f"the coefficients from τ = {sensor.tau_least_s:.3g} s"
         )
     words = report.taken.sheet.filter_words(report.taken.settings, name)
     if words:
-        yield f"the device's own filter: {words}"
+        yield f"filter of the device: {words}"
     step = report.taken.sheet.gyro_step_rad_s if name == "gyro" else report.taken.sheet.accel_step_m_s2
     if step is not None or sensor.step is not None:
         size = step if step is not None else sensor.step
-        where = "by the manual" if step is not None else "as the values show"
-        yield f"values are whole counts of {size:.4g} {SI[name]} {where}"
+        origin = "in the manual" if step is not None else "found in the values"
+        yield f"resolution: the values are multiples of {size:.4g} {SI[name]} ({origin})"
     if sensor.disturbed_s > DISTURBED_SHARE * sensor.still_s:
         yield (
-            f"NOT AT REST: {sensor.disturbed_s} of {sensor.still_s} seconds scatter by far more than the others; the "
-            "device was moved or shaken, and the figures are those of that"
+            f"NOT AT REST: in {sensor.disturbed_s} of {sensor.still_s} seconds, the values scatter much more than in "
+            "the other seconds; the device moved or vibrated, and the results contain this motion"
         )
     longest = sensor.curve.tau_s[-1]
-    yield f"σ(τ) up to {longest:.3g} s; known to about a quarter up to {sensor.grid.duration_s / KNOWN_PARTS:.3g} s"
+    yield (
+        f"σ(τ) up to τ = {longest:.3g} s; the error is below about 25 % up to τ = "
+        f"{sensor.grid.duration_s / KNOWN_PARTS:.3g} s"
+    )
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
 
 
 def figure_of(axis: AxisNoise, quantity: Quantity) -> Coefficient | None:
-    """One figure of an axis, SI; None where it is not known."""
+    """Return one value of an axis in SI units; None if it is unknown."""
     if quantity.key in NoiseTerms._fields:
         found: Coefficient = getattr(axis.terms, quantity.key)
         return found
@@ -177,7 +181,7 @@ def figure_of(axis: AxisNoise, quantity: Quantity) -> Coefficient | None:
 
 
 def cell(figure: Coefficient | None, unit: ShownUnit) -> str:
-    """Format a figure: value and standard deviation, or what it is below."""
+    """Format a value with its standard deviation, or its upper bound."""
     if figure is None:
         return "-"
     if figure.value is None:
@@ -187,7 +191,7 @@ def cell(figure: Coefficient | None, unit: ShownUnit) -> str:
 
 
 def rows(name: SensorName, sensor: SensorNoise) -> Iterator[tuple[str, str, str, list[str]]]:
-    """Title, symbol, unit and a cell per axis of each figure."""
+    """Yield the rows of the table: title, symbol, unit, and one cell per axis."""
     for quantity in QUANTITIES[name]:
         figures = [figure_of(axis, quantity) for axis in sensor.axes]
         if quantity.key == "temperature_slope" and not any(figures):
@@ -196,30 +200,33 @@ def rows(name: SensorName, sensor: SensorNoise) -> Iterator[tuple[str, str, str,
             yield quantity.title, quantity.symbol, unit.name, [cell(figure, unit) for figure in figures]
         if quantity.key == "temperature_slope":
             shares = [f"{axis.drift.r2:.2f}" if axis.drift is not None else "-" for axis in sensor.axes]
-            yield "  of it explained", "R²", "", shares
+            yield "  explained share", "R²", "", shares
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """One figure of a sheet beside what was measured."""
+    """Comparison of one measured value with the value of a data sheet."""
 
     quantity: Quantity
     stated: float
-    """SI"""
+    """Value of the data sheet, SI."""
     measured: float | None
-    """Of the worst axis, SI, or its bound; None where the series leaves open whether it is within."""
+    """Measured value or upper bound of the worst axis, SI. None if the series is too short for a verdict."""
     ratio: float | None
 
     @property
     def verdict(self) -> str:
-        """One word."""
+        """Verdict as a word."""
         if self.ratio is None:
             return "not resolved"
         return "within" if self.ratio <= WITHIN else "ABOVE"
 
 
 def comparisons(report: NoiseReport, name: SensorName) -> list[Comparison]:
-    """Compare what the sheet states; a bias instability with the least deviation, which is what sheets mean."""
+    """Compare the values of the data sheet with the measured values.
+
+    The bias instability of a data sheet is compared with the minimum Allan deviation, as data sheets define it.
+    """
     if report.sheet is None:
         return []
     stated = getattr(report.sheet, name)
@@ -257,16 +264,16 @@ def text(report: NoiseReport) -> str:
 
 
 def without_sheet(report: NoiseReport) -> str:
-    """Say why nothing is compared."""
+    """Return the reason for no comparison, and the next step."""
     document = report.taken.sheet.document
     return (
-        f"Not compared with a data sheet: {document or 'the driver has none'}. --sheet FILE compares with figures that "
-        "you have"
+        f"No comparison with a data sheet: {document or 'the driver contains no data sheet'}. To compare with your own "
+        "values, use --sheet FILE"
     )
 
 
 def table(name: SensorName, sensor: SensorNoise) -> list[str]:
-    """The figures of a sensor."""
+    """Format the table of a sensor."""
     head = f"{TITLES[name]:<{TITLE_WIDTH + UNIT_WIDTH}}" + "".join(f"{axis:>{CELL_WIDTH}}" for axis in AXES)
     lines = [head]
     for title, symbol, unit, cells in rows(name, sensor):
@@ -277,11 +284,11 @@ def table(name: SensorName, sensor: SensorNoise) -> list[str]:
 
 
 def compared(report: NoiseReport, name: SensorName) -> list[str]:
-    """The comparison with the sheet."""
+    """Format the comparison with the data sheet."""
     found = comparisons(report, name)
     if not found or report.sheet is None:
         return []
-    lines = paragraph("  ", f"compared with {report.sheet.source}, the worst axis:")
+    lines = paragraph("  ", f"comparison with {report.sheet.source}, worst axis:")
     for one in found:
         unit = one.quantity.units[0]
         measured = "-" if one.measured is None else figure_text(one.measured * unit.factor)
@@ -297,7 +304,7 @@ def compared(report: NoiseReport, name: SensorName) -> list[str]:
 
 
 def as_object(report: NoiseReport) -> dict[str, Any]:
-    """The report for programs; figures in SI, and beside them in the units of data sheets."""
+    """Return the report for `--json`. Values are in SI units and in the units of data sheets."""
     return {
         "measurement": measurement_object(report.taken),
         "sensors": {name: _sensor_object(report, name, sensor) for name, sensor in report.sensors.items()},
@@ -307,7 +314,7 @@ def as_object(report: NoiseReport) -> dict[str, Any]:
 
 
 def measurement_object(taken: SampleSet) -> dict[str, Any]:
-    """What is known of a measurement, for programs."""
+    """Return the conditions of a measurement for `--json`."""
     readings = readings_of(taken)
     warm = readings.temperature_c
     return {
@@ -320,7 +327,7 @@ def measurement_object(taken: SampleSet) -> dict[str, Any]:
 
 
 def grid_object(name: SensorName, grid: Grid) -> dict[str, Any]:
-    """Unit of a sensor and the even grid of its samples, for programs."""
+    """Return the unit of a sensor and the time grid of its samples for `--json`."""
     return {
         "unit": SI[name],
         "rate_hz": grid.rate_hz,
@@ -381,7 +388,7 @@ def _axis_object(name: SensorName, axis: AxisNoise) -> dict[str, Any]:
 
 KINDS: Final = (".html", ".svg", ".png")
 REPEATABLE: Final[Any] = {"svg.hashsalt": "imud", "svg.fonttype": "none", "font.family": "DejaVu Sans"}
-"""The same input makes the same file; text stays text."""
+"""Options of matplotlib: the same input produces the same file, and SVG text stays text."""
 STYLE: Final = """
 body { font: 15px/1.45 'DejaVu Sans', Verdana, sans-serif; color: #222; max-width: 60em; margin: 2em auto;
        padding: 0 1em; }
@@ -395,30 +402,30 @@ svg { max-width: 100%; height: auto; } .above { color: #b00; font-weight: bold; 
 
 
 def kind_of(path: Path) -> str:
-    """Return the kind of a file by its end. Raises BadArgument for others than KINDS."""
+    """Return the suffix of a file. Raises BadArgument if it is not in KINDS."""
     kind = path.suffix.lower()
     if kind not in KINDS:
-        raise BadArgument(f"{path}: expected a name that ends in {', '.join(KINDS)}")
+        raise BadArgument(f"{path}: expected a file name that ends in {', '.join(KINDS)}")
     return kind
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write the file, over an older one. Raises BadArgument with the reason."""
+    """Write the file. Replace an existing file. Raises BadArgument if writing fails."""
     try:
         path.write_bytes(content)
     except OSError as error:
-        raise BadArgument(f"{path}: {reason_of(error)}") from error
+        raise BadArgument(f"cannot write {path}: {reason_of(error)}") from error
 
 
 def noise_file(report: NoiseReport, kind: str) -> bytes:
-    """The content of a report of one of KINDS."""
+    """Return the content of a report file of one of KINDS."""
     if kind == ".html":
         return html(report).encode()
     return picture(page_figure(report.sensors, text(report).splitlines()), kind)
 
 
 def picture(figure: MatplotlibFigure, kind: str) -> bytes:
-    """A figure as the content of an SVG or PNG file."""
+    """Return a figure as the content of an SVG or PNG file."""
     buffer = io.BytesIO()
     with rc_context(REPEATABLE):
         metadata = {"Date": None, "Creator": "imud"} if kind == ".svg" else {"Software": "imud"}
@@ -427,13 +434,13 @@ def picture(figure: MatplotlibFigure, kind: str) -> bytes:
 
 
 def inline_svg(figure: MatplotlibFigure) -> str:
-    """A figure as an element of an HTML page, without the head of a file of its own."""
+    """Return a figure as an element of an HTML page, without the head of an SVG file."""
     content = picture(figure, ".svg").decode()
     return re.sub(r"^.*?(?=<svg)", "", content, count=1, flags=re.DOTALL)
 
 
 def html(report: NoiseReport) -> str:
-    """The whole page; it loads nothing."""
+    """Return the HTML page. The page loads no other files."""
     device = escape(report.taken.device)
     parts = [
         "<!DOCTYPE html>", "<html lang='en'><head><meta charset='utf-8'>", f"<title>{device}: noise</title>",
@@ -443,16 +450,17 @@ def html(report: NoiseReport) -> str:
         parts += _sensor(report, name, sensor)
     if report.sheet is None:
         parts.append(f"<p>{escape(without_sheet(report))}.</p>")
-    parts += [f"<h2>How it was made</h2>{METHOD}", "</body></html>", ""]
+    parts += [f"<h2>Method</h2>{METHOD}", "</body></html>", ""]
     return "\n".join(parts)
 
 
 METHOD: Final = (
-    "<p>Overlapping Allan deviation with 68 % intervals by χ² and the equivalent degrees of freedom of the type of "
-    "noise at each τ (NIST SP 1065); coefficients by a weighted non-negative fit of "
-    "σ² = 3Q²/τ² + N²/τ + (2 ln 2/π)B² + K²τ/3 + R²τ²/2 (IEEE Std 952); ± is one standard deviation; a coefficient "
-    "that the series does not resolve has a bound of two. The noise density is one-sided, √2 N of white noise. Drift "
-    "with temperature by least squares over means. Axes as published by imud.</p>"
+    "<p>Overlapping Allan deviation. The 68 % intervals use χ² and the equivalent degrees of freedom of the noise type "
+    "at each τ (NIST SP 1065). The coefficients are a weighted non-negative fit of "
+    "σ² = 3Q²/τ² + N²/τ + (2 ln 2/π)B² + K²τ/3 + R²τ²/2 (IEEE Std 952). ± is one standard deviation. For a coefficient "
+    "that the series does not resolve, the table contains an upper bound of two standard deviations. The noise density "
+    "is one-sided; for white noise it is √2 N. The temperature drift is a least-squares fit of mean values. The axes "
+    "are the axes that imud publishes.</p>"
 )
 
 
@@ -476,13 +484,13 @@ def _sensor(report: NoiseReport, name: SensorName, sensor: SensorNoise) -> Itera
 
 
 def _figures(name: SensorName, sensor: SensorNoise) -> Iterator[str]:
-    """Figures in the units of data sheets, then the same in SI."""
+    """Yield the table in the units of data sheets, then the table in SI units."""
     heads = "".join(f"<th class='number'>{axis}</th>" for axis in AXES)
-    yield f"<table><tr><th>figure</th><th></th><th>unit</th>{heads}</tr>"
+    yield f"<table><tr><th>value</th><th></th><th>unit</th>{heads}</tr>"
     for title, symbol, unit, cells in rows(name, sensor):
         numbers = "".join(f"<td class='number'>{escape(one)}</td>" for one in cells)
         yield f"<tr><td>{title}</td><td>{symbol}</td><td>{unit}</td>{numbers}</tr>"
-    yield f"</table><details><summary>in SI units</summary><table><tr><th>figure</th><th>unit</th>{heads}</tr>"
+    yield f"</table><details><summary>in SI units</summary><table><tr><th>value</th><th>unit</th>{heads}</tr>"
     for quantity in QUANTITIES[name]:
         figures = [figure_of(axis, quantity) for axis in sensor.axes]
         words = ["-" if one is None or one.value is None else f"{one.value:.4g}" for one in figures]
@@ -495,8 +503,8 @@ def _compared(report: NoiseReport, name: SensorName) -> Iterator[str]:
     found = comparisons(report, name)
     if not found or report.sheet is None:
         return
-    yield f"<h3>Compared with {escape(report.sheet.source)}</h3>"
-    yield "<table><tr><th>figure</th><th>unit</th><th class='number'>stated</th>"
+    yield f"<h3>Comparison with {escape(report.sheet.source)}</h3>"
+    yield "<table><tr><th>value</th><th>unit</th><th class='number'>data sheet</th>"
     yield "<th class='number'>measured, worst axis</th><th class='number'>ratio</th><th></th></tr>"
     for one in found:
         unit = one.quantity.units[0]
@@ -512,11 +520,11 @@ def _compared(report: NoiseReport, name: SensorName) -> Iterator[str]:
 
 
 SHEET_BYTES_MOST: Final = 65_536
-"""A data sheet has some ten figures."""
+"""Maximum size of a file with data sheet values, bytes."""
 
 
 class GyroSheet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Figures of a gyroscope."""
+    """Data sheet values of a gyroscope."""
 
     random_walk_deg_sqrt_h: Figure = None
     """Angle random walk."""
@@ -537,7 +545,7 @@ class GyroSheet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class AccelSheet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Figures of an accelerometer."""
+    """Data sheet values of an accelerometer."""
 
     random_walk_m_s_sqrt_h: Figure = None
     """Velocity random walk."""
@@ -558,10 +566,10 @@ class AccelSheet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SheetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The file."""
+    """Content of a file with data sheet values."""
 
     source: str = ""
-    """Document, revision and place, for the report."""
+    """Document, revision and page, for the report."""
     gyro: GyroSheet = GyroSheet()
     accel: AccelSheet = AccelSheet()
 
@@ -571,7 +579,7 @@ def _si(value: float | None, factor: float) -> float | None:
 
 
 def read_sheet(path: Path) -> ModelFigures:
-    """Read a file of figures. Raises BadArgument naming what is wrong in it."""
+    """Read a file with data sheet values. Raises BadArgument if the file is invalid."""
     try:
         with open_regular(path) as file:
             text = file.read(SHEET_BYTES_MOST + 1)
@@ -583,7 +591,9 @@ def read_sheet(path: Path) -> ModelFigures:
         tree: Any = msgspec.yaml.decode(text)
     except msgspec.DecodeError as error:
         raise BadArgument(f"--sheet {path}: expected YAML: {reason_of(error)}") from None
-    wrong = [str(one) for one in wrong_values(SheetFile, tree, "figure")] if isinstance(tree, dict) else ["no mapping"]
+    if not isinstance(tree, dict):
+        raise BadArgument(f"--sheet {path}: expected a mapping with the keys source, gyro, accel")
+    wrong = [str(one) for one in wrong_values(SheetFile, tree, "figure")]
     if wrong:
         raise BadArgument(f"--sheet {path}: {'; '.join(wrong)}")
     try:
@@ -594,5 +604,5 @@ def read_sheet(path: Path) -> ModelFigures:
 
 
 def figures_for(sheet: DataSheet, product: str, given: ModelFigures | None) -> ModelFigures | None:
-    """Choose what to compare with: what the user gave, else what the driver's manual states of the model, else None."""
+    """Return the values for the comparison: the user's file, otherwise the manual of the model, otherwise None."""
     return given if given is not None else sheet.figures_of(product)

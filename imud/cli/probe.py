@@ -1,6 +1,6 @@
-"""`imud probe`: list what is attached to serial ports and CAN buses.
+"""`imud probe`: list the devices on serial ports and CAN buses.
 
-Listens only; sends a query only to ports and buses named with `--active`.
+The command only listens. It sends requests only to ports and buses of `--active`.
 """
 
 import argparse
@@ -40,12 +40,12 @@ class ProbeReport(msgspec.Struct, frozen=True, omit_defaults=True):
 
     port: str
     title: str = ""
-    """Product name of the adapter; the state of a bus."""
+    """Product name of the adapter, or the state of the CAN bus."""
     driver: str = ""
     device: str = ""
     """Address on a bus, for example `node 8`."""
     baud: int = 0
-    """Rate of port or bus, bit/s."""
+    """Baud rate of the port, or bit rate of the bus, bit/s."""
     identity: dict[str, str] = {}  # msgspec copies a mutable default
     problem: str = ""
 
@@ -85,7 +85,7 @@ class SerialRequestPort(LinkRequestPort):
 
 
 async def examine_bus(interface: str, may_ask: bool) -> list[ProbeReport]:
-    """List one report per device heard on an interface, or one that gives the reason for none."""
+    """Return one report per device on a CAN interface. If no device sends, return one report with the reason."""
     row = LINKS["socketcan"]
     link = row.make_can(msgspec.convert({"interface": interface}, row.settings))
     try:
@@ -105,7 +105,7 @@ async def examine_bus(interface: str, may_ask: bool) -> list[ProbeReport]:
 
 
 async def listen(link: CanLink) -> tuple[list[CanDevice], str]:
-    """Run one round of detection: the devices heard, and the reason for none. Raises LinkError."""
+    """Run one round of the detection. Return the devices, and the reason if there are none. Raises LinkError."""
     search = CanSearch(of_kind(DRIVERS.values(), CanDriver), link.title)
     finder = CanRound(search, Ledger(), HostClock())
     ended = asyncio.get_running_loop().create_future()
@@ -123,7 +123,7 @@ async def listen(link: CanLink) -> tuple[list[CanDevice], str]:
 
 
 def state_of(interface: str) -> str:
-    """Describe the state of the controller. Raises LinkError."""
+    """Return the state of the CAN controller as text. Raises LinkError."""
     details = can_details(interface)
     if details.bitrate is None or details.state is None or details.state >= len(ControllerState):
         return "bus without a bit rate" if details.bitrate is None else ""
@@ -138,7 +138,7 @@ async def _report(link: CanLink, title: str, device: CanDevice, may_ask: bool) -
 
 
 async def identity_of_node(device: CanDevice, link: CanLink) -> Identity:
-    """Ask a device for its identity; empty when it does not answer."""
+    """Request the identity of a CAN device. Return an empty identity if the device does not reply."""
     driver, settings = device.driver, device.driver.node_settings(device.node)
     ledger = Ledger()
     codec = driver.make_codec(ledger, settings)
@@ -158,14 +158,15 @@ async def identity_of_node(device: CanDevice, link: CanLink) -> Identity:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud probe`."""
     parser.add_argument("port", nargs="*", metavar="PORT", help="ports and CAN interfaces to listen on (default: all)")
-    parser.add_argument("--active", action="append", default=[], metavar="PORT", help="one that may be sent queries")
-    parser.add_argument("--json", action="store_true", help="one JSON object per port, or per device of a bus")
+    parser.add_argument(
+        "--active", action="append", default=[], metavar="PORT", help="port or CAN interface to send requests to"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object per port, or per device of a bus")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print one line per port, or per device of a bus; 1 when no device was found."""
+    """Print one line per port, or per device of a CAN bus. Return 1 if no device was found."""
     titles = {port.path: port.title for port in list_ports()}
     chosen = [*args.port, *args.active] or [*titles, *can_interfaces(down=True)]
     reports = asyncio.run(examine_all(list(dict.fromkeys(chosen)), set(args.active), titles))
@@ -175,7 +176,7 @@ def run(args: argparse.Namespace) -> int:
     elif reports:
         print(table(HEAD, [row(report) for report in reports]))
     else:
-        print("no serial port and no CAN interface here: is the adapter plugged in, is the UART switched on?")
+        print("found no serial port and no CAN interface: is the adapter plugged in, is the UART enabled?")
     return 0 if any(report.driver for report in reports) else 1
 
 
@@ -191,7 +192,7 @@ async def examine_all(ports: list[str], active: set[str], titles: dict[str, str]
 
 
 async def examine(port: str, may_ask: bool, title: str) -> list[ProbeReport]:
-    """Open a serial port, find what talks there, ask for its identity if that is permitted."""
+    """Detect the device on a serial port. Request its identity if `may_ask` is set."""
     settings = msgspec.convert({"port": port, "baud": "auto"}, LINKS["uart"].settings)
     config = DeviceConfig("probe", "auto", None, may_ask, "uart", settings)
     link = LINKS["uart"].make(settings)
@@ -208,7 +209,7 @@ async def examine(port: str, may_ask: bool, title: str) -> list[ProbeReport]:
 
 
 async def find(config: DeviceConfig, link: StreamLink) -> StreamFound:
-    """Run one round of detection. Raises NothingHeard and LinkError."""
+    """Run one round of the detection. Raises NothingHeard and LinkError."""
     findings: list[StreamFound] = []
     finder = StreamRound(config, link, Ledger(), None, HostClock())
     ended = asyncio.get_running_loop().create_future()
@@ -225,7 +226,7 @@ async def find(config: DeviceConfig, link: StreamLink) -> StreamFound:
 
 
 async def identity_of_device(found: StreamFound, link: StreamLink) -> Identity:
-    """Ask a device for its identity; empty when it does not answer."""
+    """Request the identity of a serial device. Return an empty identity if the device does not reply."""
     ledger = Ledger()
     codec = found.driver.make_codec(ledger, found.driver.settings())
     runner = ScriptRunner(SerialRequestPort(link), ledger, HostClock())

@@ -1,7 +1,7 @@
-"""`imud record`: a recording of what devices deliver from now on, or of the last minutes, into a file of the user's.
+"""`imud record`: write a recording or a snapshot to a file. `imud info`: print the content of a recording.
 
-The daemon sends the recording through a descriptor, this command writes it: the file belongs to who asked, and the
-daemon opens none. What comes is looked at on the way, which gives the figures, and shows that it is whole.
+The daemon sends the recording through a descriptor, and this command writes the file. The file therefore belongs to the
+user, and the daemon opens no file. The command decodes the data to count samples and to check the recording.
 """
 
 import argparse
@@ -45,25 +45,25 @@ INPUTS: Final = (Kind.DATA, Kind.FRAMES, Kind.READINGS)
 
 @dataclass
 class DeviceContents:
-    """What a recording has of one device."""
+    """Content of a recording for one device."""
 
     name: str = ""
     where: str = ""
     driver: str = ""
     identity: dict[str, str] = field(default_factory=dict)
     reads: int = 0
-    """Records of data: reads of a port, or groups of frames or transfers that were read together."""
+    """Number of data records: one read of a port, or one group of frames or transfers."""
     input_bytes: int = 0
     edges: int = 0
     events: int = 0
     spans: list[tuple[CheckRecord, CheckRecord]] = field(default_factory=list)
-    """First and last check of each time in which numbers and ledger went on: a device that was removed and added begins
-    both anew."""
+    """First and last check of each interval without a restart of sequence numbers and ledger. A device that the user
+    removed and added again restarts both."""
     begins_anew: bool = False
-    """Whether the next check begins a span."""
+    """Whether the next check starts a new span."""
 
     def check(self, found: CheckRecord) -> None:
-        """Take what the live run had at one place."""
+        """Add a check record of the live run."""
         if self.begins_anew or not self.spans or found.seq < self.spans[-1][1].seq:
             self.spans.append((found, found))
             self.begins_anew = False
@@ -71,40 +71,40 @@ class DeviceContents:
             self.spans[-1] = (self.spans[-1][0], found)
 
     def begin_path(self, ledger: Mapping[str, int]) -> None:
-        """Take the ledger with which a codec and its clock were made."""
+        """Compare the initial ledger of a new codec with the last check."""
         before = self.spans[-1][1].ledger if self.spans else {}
         self.begins_anew = ledger.get("samples", 0) < before.get("samples", 0)
 
     @property
     def samples(self) -> int:
-        """Samples between the first check and the last of each span."""
+        """Number of samples between the first and the last check of all spans."""
         return sum(last.seq - first.seq for first, last in self.spans)
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second between them; 0 for not known."""
+        """Samples per second; 0 if unknown."""
         spent_ns = sum(last.t_ns - first.t_ns for first, last in self.spans)
         return self.samples * NS_PER_S / spent_ns if spent_ns > 0 else 0.0
 
     @property
     def lost(self) -> int:
-        """Samples lost between them, by every cause."""
+        """Number of lost samples, all causes."""
         return sum(lost(last.ledger) - lost(first.ledger) for first, last in self.spans)
 
 
 class Contents:
-    """What a recording has."""
+    """Content of a recording."""
 
     def __init__(self) -> None:
         self.session: SessionRecord | None = None
         self.end: EndRecord | None = None
         self.devices: dict[int, DeviceContents] = {}
         self.dropped = 0
-        """Records that the recorder dropped."""
+        """Number of records that the recorder dropped."""
         self.newest_ns = 0
 
     def add(self, record: Record) -> None:
-        """Look at one record. Raises ImudError for one that cannot be what a recorder wrote."""
+        """Add one record. Raises ImudError if the content of the record is invalid."""
         device = self.devices.setdefault(record.device, DeviceContents())
         if record.kind in INPUTS:
             device.reads += 1
@@ -139,19 +139,18 @@ class Contents:
 
     @property
     def duration_s(self) -> float:
-        """From the begin to the newest record with a time; 0 for not known."""
+        """Time from the start to the newest record with a time, s; 0 if unknown."""
         begun_ns = self.session.t_ns if self.session is not None else 0
         return max(0, self.newest_ns - begun_ns) / NS_PER_S if begun_ns else 0.0
 
 
 def add_info_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud info`."""
     parser.add_argument("file", type=Path, metavar="FILE", help="recording")
-    parser.add_argument("--json", action="store_true", help="one JSON object")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def run_info(args: argparse.Namespace) -> int:
-    """Print what is in the file; 1 where something of it is damaged, missing or was dropped."""
+    """Print the content of the file. Return 1 if the file is damaged or the recorder dropped records."""
     contents = Contents()
     try:
         with open_regular(args.file) as file:
@@ -159,14 +158,14 @@ def run_info(args: argparse.Namespace) -> int:
             for record in reader:
                 contents.add(record)
     except OSError as error:
-        raise ImudError(f"{args.file}: {error.strerror}") from error
+        raise ImudError(f"cannot read {args.file}: {error.strerror}") from error
     report = summary(contents, reader)
     print(msgspec.json.encode(report).decode() if args.json else page(report))
     return 1 if report["damage"] or report["records_dropped"] else 0
 
 
 def summary(contents: Contents, reader: RecordingReader) -> dict[str, Any]:
-    """What is printed, as JSON has it."""
+    """Return the content for `--json`."""
     session = contents.session
     return {
         "begun_utc_ns": session.utc_ns if session is not None else None,
@@ -192,8 +191,8 @@ def summary(contents: Contents, reader: RecordingReader) -> dict[str, Any]:
 
 
 def page(report: dict[str, Any]) -> str:
-    """Format it for people, in 80 columns."""
-    begun, duration = "not known: the block that says it and names the devices is damaged or missing", "not known"
+    """Format the content as text in 80 columns."""
+    begun, duration = "unknown: the block with the start time and the device names is damaged or missing", "unknown"
     if report["begun_utc_ns"] is not None:
         time = datetime.fromtimestamp(report["begun_utc_ns"] // NS_PER_S, UTC)
         begun = (
@@ -205,22 +204,22 @@ def page(report: dict[str, Any]) -> str:
     size = f"{stored} bytes in {report['blocks']} blocks, {plain} unpacked"
     if samples:
         size += f"; {stored / samples:.1f} bytes per sample"
-    dropped = f"{report['records_dropped']} records, the disk was too slow"
+    dropped = f"{report['records_dropped']} records, because the disk was too slow"
     rows = [
-        ("begun", begun),
+        ("start", begun),
         ("duration", duration),
         ("size", size),
-        ("dropped", dropped if report["records_dropped"] else "nothing"),
-        ("integrity", "; ".join(report["problems"]) or "whole"),
+        ("dropped", dropped if report["records_dropped"] else "0 records"),
+        ("integrity", "; ".join(report["problems"]) or "complete"),
     ]
     lines = [line for name, text in rows for line in paragraph(f"{name:<11}", text)]
     for device in report["devices"]:
-        identity = ", ".join(f"{name} {value}" for name, value in device["identity"].items()) or "not known"
+        identity = ", ".join(f"{name} {value}" for name, value in device["identity"].items()) or "unknown"
         lines += ["", *paragraph(f"{device['name']}: ", f"{device['link']}, driver {device['driver']}")]
         parts = [
             ("identity", identity),
             ("samples", f"{device['samples']}, {device['rate_hz']:.1f} Hz; lost {device['lost']}"),
-            ("input", f"{device['input_bytes']} bytes in {device['reads']} records; {device['edges']} edges of lines"),
+            ("input", f"{device['input_bytes']} bytes in {device['reads']} records; {device['edges']} GPIO edges"),
             ("events", str(device["events"])),
         ]
         lines += [line for name, text in parts for line in paragraph(f"  {name:<9}", text)]
@@ -230,43 +229,43 @@ def page(report: dict[str, Any]) -> str:
 INFO = CliCommand(add_info_arguments, run_info)
 
 LOOK_S: Final = 0.2
-"""Interrupts, the end of `--for` and the line of progress are looked after so often."""
+"""Time between two checks for Ctrl-C, the end of `--for` and the progress line, s."""
 PROGRESS_S: Final = 1.0
 GIVE_UP_S: Final = 10.0
-"""How long the daemon may send nothing after it was asked to end the recording."""
+"""Maximum silence of the daemon after the request to stop the recording, s."""
 CHUNK_BYTES: Final = 1 << 16
 CLEAR_LINE: Final = "\r\x1b[2K"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud record`."""
     add_socket(parser)
     parser.add_argument(
-        "--device", action="append", metavar="NAME", help="record this one; may be given several times (default: all)"
+        "--device", action="append", metavar="NAME", help="record this device; repeat for more devices (default: all)"
     )
     parser.add_argument(
-        "--for", dest="for_s", type=duration_s, metavar="DURATION", help="end after 90s, 10min, 2h (default: Ctrl-C)"
-    )
+        "--for", dest="for_s", type=duration_s, metavar="DURATION",
+        help="stop after this time, for example 90s, 10min, 2h (default: at Ctrl-C)",
+    )  # fmt: skip
     parser.add_argument(
-        "--snapshot", action="store_true", help="save what the flight recorder has of the last minutes, and end"
+        "--snapshot", action="store_true", help="save the last minutes of the flight recorder, then stop"
     )
     parser.add_argument(
         "file",
         nargs="?",
         metavar="FILE",
-        help="a file that does not exist yet, or - for standard output (default: by time)",
+        help="new file, or - for standard output (default: a name with the current time)",
     )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Record; 1 where the recording lost something, or ended otherwise than asked for. Needs permission to control.
+    """Record. Return 1 if the recording is incomplete or ended early. Requires the right to control devices.
 
-    Raises ImudError where nothing can be recorded, or the file cannot be written.
+    Raises ImudError if the recording cannot start or the file cannot be written.
     """
     if args.snapshot and (args.device or args.for_s):
-        raise BadArgument("--snapshot: expected neither --device nor --for: it has what the flight recorder has")
+        raise BadArgument("--snapshot saves the complete flight recorder; omit --device and --for")
     if args.file == "-" and sys.stdout.isatty():
-        raise BadArgument("standard output is a terminal: expected a file, or a program that reads the recording")
+        raise BadArgument("cannot write a recording to a terminal; name a file, or use a pipe")
     with connect(args) as client, interrupts(are_noted=not args.snapshot) as interrupt:
         descriptor = client.snapshot()[0] if args.snapshot else client.record(args.device)
         with open(descriptor, "rb", buffering=0) as stream, output(args.file) as (name, out):
@@ -276,13 +275,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 class Interrupt:
-    """Whether the user, or who started the command, wants it to end."""
+    """Request to stop, from SIGINT or SIGTERM."""
 
     def __init__(self) -> None:
         self.asked = False
 
     def ask(self, _number: int, _frame: FrameType | None) -> None:
-        """Note it; the second time end at once. Raises KeyboardInterrupt."""
+        """Handle a signal: store the first request. Raises KeyboardInterrupt on the second request."""
         if self.asked:
             raise KeyboardInterrupt
         self.asked = True
@@ -290,7 +289,7 @@ class Interrupt:
 
 @contextmanager
 def interrupts(*, are_noted: bool) -> Iterator[Interrupt]:
-    """Note SIGINT and SIGTERM in place of ending by them, if `are_noted`."""
+    """Store SIGINT and SIGTERM in the returned object during the context, if `are_noted` is set."""
     interrupt = Interrupt()
     numbers = (signal.SIGINT, signal.SIGTERM) if are_noted else ()
     before = {number: signal.signal(number, interrupt.ask) for number in numbers}
@@ -303,38 +302,39 @@ def interrupts(*, are_noted: bool) -> Iterator[Interrupt]:
 
 @contextmanager
 def output(file: str | None) -> Iterator[tuple[str, BinaryIO]]:
-    """Make the file; its name, and what to write to. Raises ImudError, also for one that exists."""
+    """Create the file during the context. Yield its name and the open file. Raises ImudError if the file exists."""
     if file == "-":
         yield "standard output", sys.stdout.buffer
         return
     name = file or f"imud-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.imudrec"
     try:
-        made = open(name, "xb", buffering=0)  # noqa: SIM115 - closed below, and errors of opening are not those of writing
+        made = open(name, "xb", buffering=0)  # noqa: SIM115 - closed below; this `try` must not catch write errors
     except FileExistsError:
-        raise ImudError(f"{name} exists already: expected the name of a new file") from None
+        raise ImudError(f"{name} exists; name a new file") from None
     except (OSError, ValueError) as error:
-        raise ImudError(f"{name}: {error.strerror if isinstance(error, OSError) else error}") from None
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ImudError(f"cannot create {name}: {reason}") from None
     with made:
         yield name, made
         os.fsync(made.fileno())
 
 
 class Copy:
-    """What comes from the daemon, written on while it is read. It is read as a file is."""
+    """Readable stream of the recording from the daemon. A read also writes the data to the output file."""
 
     def __init__(self, stream: BinaryIO, out: BinaryIO, name: str) -> None:
         self.bytes = 0
         self.stopped = False
-        """Whether this side asked for the end."""
+        """Whether this command requested the end of the recording."""
         self.look: Callable[[], None] = lambda: None
-        """Called at least once in LOOK_S."""
+        """Callback that `read` calls at least once per LOOK_S."""
         self._stream = stream
         self._out = out
         self._name = name
         self._moved_s = monotonic()
 
     def read(self, size: int, /) -> bytes:
-        """Return what is there, or comes next; nothing at the end. Raises ImudError."""
+        """Return the next data; empty at the end. Raises ImudError if writing fails."""
         while True:
             self.look()
             if select.select((self._stream,), (), (), LOOK_S)[0]:
@@ -348,7 +348,7 @@ class Copy:
         return data
 
     def stop(self) -> None:
-        """Note that the end was asked for."""
+        """Mark the end of the recording as requested."""
         self.stopped, self._moved_s = True, monotonic()
 
     def _write(self, data: bytes) -> None:
@@ -357,15 +357,17 @@ class Copy:
             while rest:
                 rest = rest[self._out.write(rest) :]
             self._out.flush()
-        except BrokenPipeError:  # no `imud watch | head`: who asked for the recording does not have it
+        except BrokenPipeError:  # an error, unlike `imud watch | head`: the recording is incomplete
             discard_output()
-            raise ImudError(f"{self._name}: nobody reads it any more; the recording ended before it was to") from None
+            raise ImudError(
+                f"{self._name}: the reader closed the pipe; the recording ended before its planned end"
+            ) from None
         except OSError as error:
-            raise ImudError(f"{self._name}: {reason_of(error)}; what was written before is whole") from None
+            raise ImudError(f"cannot write {self._name}: {reason_of(error)}; the data before is complete") from None
 
 
 def follow(copy: Copy, client: Client, interrupt: Interrupt, for_s: float | None) -> tuple[Contents, RecordingReader]:
-    """Copy to the end of the recording, which is asked for when it is time; return what was in it."""
+    """Copy the recording to its end. Request the end after `for_s` or Ctrl-C. Return the content and the reader."""
     contents, begun_s = Contents(), monotonic()
     shown_s = begun_s
 
@@ -374,7 +376,7 @@ def follow(copy: Copy, client: Client, interrupt: Interrupt, for_s: float | None
         now_s = monotonic()
         if not copy.stopped and (interrupt.asked or (for_s is not None and now_s - begun_s >= for_s)):
             copy.stop()
-            with suppress(ImudError, OSError):  # a daemon that has gone has ended the recording
+            with suppress(ImudError, OSError):  # a stopped daemon has already ended the recording
                 client.stop_recording()
         if sys.stderr.isatty() and now_s - shown_s >= PROGRESS_S:
             shown_s = now_s
@@ -382,7 +384,7 @@ def follow(copy: Copy, client: Client, interrupt: Interrupt, for_s: float | None
             sys.stderr.flush()
 
     copy.look = look
-    reader = RecordingReader(copy, "what the daemon sent")
+    reader = RecordingReader(copy, "data from the daemon")
     try:
         for record in reader:
             contents.add(record)
@@ -393,7 +395,7 @@ def follow(copy: Copy, client: Client, interrupt: Interrupt, for_s: float | None
 
 
 def figures(copy: Copy, contents: Contents) -> str:
-    """Format what was recorded so far."""
+    """Format size, samples and dropped records so far."""
     devices = [one for one in contents.devices.values() if one.name]
     samples = sum(one.samples for one in devices)
     return (
@@ -403,13 +405,13 @@ def figures(copy: Copy, contents: Contents) -> str:
 
 
 def account(copy: Copy, found: tuple[Contents, RecordingReader], name: str, *, asked: bool) -> int:
-    """Say what was recorded, and what is wrong with it; return the exit status."""
+    """Print a summary and the problems of the recording. Return the exit status."""
     contents, reader = found
     problems = list(reader.problems)
     if reader.ended and not asked and contents.end is not None:
-        problems.append(f"the recording ended before it was to: {contents.end.reason}")
+        problems.append(f"the recording ended before its planned end: {contents.end.reason}")
     if contents.dropped:
-        problems.append(f"{contents.dropped} records are missing: this command was too slow")
+        problems.append(f"{contents.dropped} records are missing because imud record was too slow")
     print(f"{name}: {contents.duration_s:.1f} s, {figures(copy, contents)}", file=sys.stderr)
     for problem in problems:
         print(f"imud record: {problem}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Samples for an analysis, from a recording, a capture or a running daemon, with their origin and what is lost."""
+"""Samples for an analysis, from a recording, a capture or a running daemon, with their source and the lost samples."""
 
 import argparse
 import sys
@@ -35,63 +35,63 @@ from imud.model.units import NS_PER_S
 from imud.recording.player import PlayedDevice, Player
 
 SAMPLES_MOST: Final = 20_000_000
-"""14 hours at 400 Hz; they take 1.3 GB, and the analysis as much again."""
+"""Maximum number of samples: 14 hours at 400 Hz. They use 1.3 GB, and the analysis uses the same amount again."""
 SILENCE_S: Final = 5.0
-"""A live device that sends nothing for so long is named."""
+"""Time without a sample after which imud reports a silent device, s."""
 LATENCY_MS: Final = 200.0
-"""Samples of a live device may come so late, several at once: an analysis costs the daemon little then."""
+"""Accepted latency of live samples, ms. The daemon then sends batches, which cost less CPU time."""
 NOTE_S: Final = 1.0
-"""Time between two notes of progress."""
+"""Time between two progress updates, s."""
 _NONE3: Final = (nan, nan, nan)
 
 
 @dataclass(slots=True)
 class SampleSet:
-    """Samples and their provenance."""
+    """Samples of one device and their source."""
 
     source: str
-    """The file, or the daemon's socket."""
+    """Name of the file, or the socket of the daemon."""
     device: str = ""
     driver: str = ""
     link: str = ""
     identity: Mapping[str, str] = field(default_factory=dict)
     settings: Mapping[str, str] = field(default_factory=dict)
     begun_utc_ns: int | None = None
-    """UTC of the first sample; None where the capture has no time."""
+    """UTC of the first sample, ns; None if the capture contains no times."""
     readings: Readings | None = None
     lost: dict[str, int] = field(default_factory=dict)
-    """Samples lost meanwhile, by the daemon's causes, those that are not zero."""
+    """Number of lost samples by cause, without causes of 0 samples."""
     stamps: str = ""
-    """How the samples are dated, in words."""
+    """Sources and errors of the time stamps, as text."""
     notes: list[str] = field(default_factory=list)
-    """What else the reader of a report has to know."""
+    """Additional notes for the report."""
 
     @property
     def sheet(self) -> DataSheet:
-        """What the vendor's manual states."""
+        """Values of the vendor's manual."""
         return DRIVERS[self.driver].data_sheet if self.driver in DRIVERS else DataSheet()
 
 
 class Collector:
-    """Collector of the samples of one device, in the order of arrival; also a publisher of a daemon that replays.
+    """Collector of the samples of one device. The class is also a publisher for the daemon of a replay.
 
-    Before `skip_s` after the first sample nothing is kept, nor after `for_s` more.
+    The collector ignores samples in the first `skip_s`, and stops after `for_s` more.
     """
 
     def __init__(self, name: str = "", *, skip_s: float = 0.0, for_s: float | None = None) -> None:
         self.name = name
-        """The device; empty for the only one."""
+        """Name of the device; empty for the first device that sends a sample."""
         self.others: set[str] = set()
-        """Devices that were passed over although none was chosen."""
+        """Names of ignored devices if the user did not choose a device."""
         self.done = False
-        """Whether all that was asked for is there."""
+        """Whether the collector received samples after the end of the requested time."""
         self.first: Sample | None = None
         self.newest: Sample | None = None
         self.syncs: Counter[str] = Counter()
         self.by_device_time = False
-        """Whether to date samples by the device's clock."""
+        """Whether the times are device times."""
         self.look: Callable[[], None] = lambda: None
-        """Called after the first sample that is kept and the last that was asked for: losses are those between."""
+        """Callback after the first collected batch and after the end of the requested time, to count lost samples."""
         self._chosen = bool(name)
         self._skip_ns, self._for_ns = round(skip_s * NS_PER_S), None if for_s is None else round(for_s * NS_PER_S)
         self._begin_ns: int | None = None
@@ -103,7 +103,7 @@ class Collector:
         return len(self._times)
 
     def add(self, sample: Sample) -> None:
-        """Take one sample. Raises ImudError where there are more than fit."""
+        """Collect one sample. Raises BadArgument for more than SAMPLES_MOST samples."""
         if self.done:
             return
         if not self.name:
@@ -114,7 +114,7 @@ class Collector:
             return
         t_ns = sample.t_dev_ns if self.by_device_time else sample.t_ns
         if t_ns is None:
-            raise BadArgument("the capture has no time of any read, and its messages no time of the device")
+            raise BadArgument("the capture contains neither arrival times nor device times; use a time-stamped capture")
         if self._begin_ns is None:
             self._begin_ns = t_ns + self._skip_ns
         if t_ns < self._begin_ns:
@@ -123,7 +123,7 @@ class Collector:
             self.done = True
             return
         if len(self._times) >= SAMPLES_MOST:
-            raise BadArgument(f"expected at most {SAMPLES_MOST} samples: choose a part with --skip and --for")
+            raise BadArgument(f"expected at most {SAMPLES_MOST} samples; select a part with --skip and --for")
         self._keep(sample, t_ns)
 
     def _keep(self, sample: Sample, t_ns: int) -> None:
@@ -137,12 +137,12 @@ class Collector:
         self._temperature.append(nan if sample.temperature_c is None else sample.temperature_c)
 
     def drop_before(self, t_ns: int) -> None:
-        """Remove the samples before a time: a live view has no past."""
+        """Remove the samples before a time."""
         count = int(np.searchsorted(np.frombuffer(self._times, dtype=np.int64), t_ns)) if self._times else 0
         del self._times[:count], self._temperature[:count], self._gyro[: 3 * count], self._accel[: 3 * count]
 
     def readings(self) -> Readings:
-        """Copy what was collected into arrays."""
+        """Return the collected samples as arrays."""
         temperature = np.array(self._temperature)
         return Readings(
             np.array(self._times, dtype=np.int64), _sensor(self._gyro), _sensor(self._accel),
@@ -150,64 +150,61 @@ class Collector:
         )  # fmt: skip
 
     def stamps(self) -> str:
-        """Describe how the samples are dated."""
+        """Describe the sources and the mean error of the time stamps."""
         if self.by_device_time:
-            return "the device's own clock; the capture has no time of any read, so the rate is as true as its crystal"
+            return (
+                "device time, because the capture contains no arrival times; the error of the device's crystal is the "
+                "error of the rate"
+            )
         kinds = ", ".join(f"{100 * count / len(self):.3g} % {kind}" for kind, count in self.syncs.most_common())
-        return f"{kinds}; mean stated error {self._errors_ns / max(len(self), 1) / 1000:.3g} µs"
+        return f"{kinds}; mean time stamp error {self._errors_ns / max(len(self), 1) / 1000:.3g} µs"
 
-    # --- as a publisher of a daemon -----------------------------------------------------------------------------------
+    # --- methods of a publisher; most do nothing ----------------------------------------------------------------------
 
     def publish(self, batch: Batch) -> None:
-        """Take the samples."""
+        """Collect the samples of a batch."""
         before = self.first, self.done
         for sample in batch.samples:
             self.add(sample)
         if (self.first, self.done) != before:
             self.look()
 
-    def start(self) -> None:
-        """No-op: there is nothing to open."""
+    def start(self) -> None: ...
 
-    def add_device(self, name: str, device_id: int) -> None:
-        """No-op: a device is known by its samples."""
+    def add_device(self, name: str, device_id: int) -> None: ...
 
-    def remove_device(self, name: str) -> None:
-        """No-op: its samples stay."""
+    def remove_device(self, name: str) -> None: ...
 
-    def event(self, event: Event) -> None:
-        """No-op: events are in the log."""
+    def event(self, event: Event) -> None: ...
 
-    def tick(self, now_ns: int) -> None:
-        """No-op: nothing depends on time."""
+    def tick(self, now_ns: int) -> None: ...
 
-    def close(self) -> None:
-        """No-op: nothing is open."""
+    def close(self) -> None: ...
 
 
 class LossTally:
-    """Tally of how many samples a device lost by each cause while its ledger was looked at."""
+    """Counter of the lost samples of a device, by cause, between the first and the last `look`."""
 
     def __init__(self) -> None:
         self.lost: Counter[str] = Counter()
-        """By the ledger's names."""
+        """Number of lost samples by the names of the ledger."""
         self._newest: Mapping[str, int] | None = None
 
     @property
     def begun(self) -> bool:
-        """Whether the ledger was looked at."""
+        """Whether `look` was called."""
         return self._newest is not None
 
     def look(self, ledger: Mapping[str, int]) -> None:
-        """Add what was lost since the look before. A ledger with fewer samples than then has begun anew."""
+        """Add the samples that were lost since the previous call."""
         before = self._newest if self._newest is not None else ledger
-        if ledger.get("samples", 0) < before.get("samples", 0):
+        if ledger.get("samples", 0) < before.get("samples", 0):  # the ledger restarted
             before = {}
         self.lost.update({name: ledger.get(name, 0) - before.get(name, 0) for name in LOST_FIELDS})
         self._newest = ledger
 
     def found(self) -> dict[str, int]:
-        """Return the causes by which samples were lost."""
+        """Return the number of lost samples by cause, without causes of 0 samples."""
         return {name: count for name, count in self.lost.items() if count}
 
 
@@ -220,24 +217,23 @@ def _sensor(values: "array[float]") -> FloatArray | None:
 
 
 def take_file(args: argparse.Namespace) -> SampleSet:
-    """Read the samples of `args.input`, a recording or a capture. Raises ImudError, OSError."""
+    """Read the samples of a recording or a capture. Raises ImudError, also if there is no sample, and OSError."""
     with log_to(STDERR, "error"):
         taken = take_recording(args) if looks_like_recording(args.input) else take_capture(args)
     if taken.readings is None or not len(taken.readings.t_ns):
         after = f" of {args.device}" if args.device else ""
-        after += f" later than {args.skip:g} s after its first (--skip)" if args.skip else ""
+        after += f" after the first {args.skip:g} s (--skip)" if args.skip else ""
         raise ImudError(
-            f"{args.input}: expected samples{after}, found none; `imud info` says what is in a recording, "
-            "`imud decode` what is in a capture"
+            f"{args.input}: found no samples{after}; check a recording with `imud info`, a capture with `imud decode`"
         )
     return taken
 
 
 def take_recording(args: argparse.Namespace) -> SampleSet:
-    """Play a recording; the stamps are those of the live run."""
+    """Replay a recording. The time stamps are equal to the live run."""
     for option, default in (("driver", None), ("option", []), ("baud", None)):
         if getattr(args, option) != default:
-            raise BadArgument(f"--{option}: expected none with a recording, which has those of the live run")
+            raise BadArgument(f"--{option} applies to captures only; a recording contains the value of the live run")
     collector = Collector(args.device or "", skip_s=args.skip or 0.0, for_s=args.duration)
     taken, tally = SampleSet(args.input), LossTally()
     with open_regular(args.input) as file:
@@ -250,7 +246,7 @@ def take_recording(args: argparse.Namespace) -> SampleSet:
 
         collector.look = look
         for record in reader:
-            if record.kind == Kind.PATH:  # it may begin the ledger anew
+            if record.kind == Kind.PATH:  # the record can restart the ledger
                 look()
             player.play((record,))
             if record.kind in (Kind.PATH, Kind.CHECK):
@@ -261,24 +257,24 @@ def take_recording(args: argparse.Namespace) -> SampleSet:
             look()
     names = [device.described.name for device in player.devices.values()]
     if collector.others:
-        raise BadArgument(f"{args.input}: it has {', '.join(names)}: choose one with --device")
+        raise BadArgument(f"{args.input} contains several devices: {', '.join(names)}; select one with --device")
     if args.device and args.device not in names:
-        there = ", ".join(names) or "none: the block that names them is damaged or missing"
-        raise BadArgument(f"--device {args.device}: expected one of the recording's, {there}")
+        there = ", ".join(names) or "none, because the block with the device names is damaged or missing"
+        raise BadArgument(f"--device {args.device}: expected a device of the recording: {there}")
     _describe(taken, player, collector.name)
     taken.notes += list(reader.problems)
     if player.lost:
-        taken.notes.append(f"records that were dropped when the file was written: {player.lost}")
+        taken.notes.append(f"the recorder dropped {player.lost} records")
     return _finished(taken, collector, tally.found())
 
 
 def played(player: Player, name: str) -> PlayedDevice | None:
-    """Return the device of this name; None where there is none yet."""
+    """Return the device of this name; None before the player found it."""
     return next((device for device in player.devices.values() if device.described.name == name), None)
 
 
 def _describe(taken: SampleSet, player: Player, name: str) -> None:
-    """Note what the recording has of the device, and how it was replayed."""
+    """Copy the description of the device and notes about the replay."""
     if (device := played(player, name)) is None:
         return
     taken.driver = device.driver.name if device.driver is not None else device.described.driver
@@ -290,7 +286,7 @@ def _describe(taken: SampleSet, player: Player, name: str) -> None:
 
 
 def take_capture(args: argparse.Namespace) -> SampleSet:
-    """Run a capture through the daemon's whole path."""
+    """Replay a capture through the daemon."""
     replayed = argparse.Namespace(
         file=args.input, driver=args.driver or DRIVER, speed="maximum", baud=args.baud or BAUD, socket=None,
         option=args.option,
@@ -328,11 +324,10 @@ def _finished(taken: SampleSet, collector: Collector, lost: dict[str, int]) -> S
 def take_live(
     args: argparse.Namespace, note: Callable[[float, int], None] = lambda _passed_s, _count: None
 ) -> SampleSet:
-    """Collect the samples of the device `args.input` for `args.duration`, or until interrupted.
+    """Collect the samples of the device `args.input` for `args.duration`, or until Ctrl-C.
 
-    A device that falls silent is waited for until `args.duration` is over by the clock; what came is kept. `note` is
-    called about once a second with the time passed and the number of samples. Raises ImudError, BadArgument where
-    nothing comes from the begin.
+    If the device becomes silent, keep the samples and wait until the end of `args.duration`. Call `note` about once per
+    second with the elapsed time and the number of samples. Raises BadArgument if no sample arrives at all.
     """
     with connect(args) as asking, connect(args) as listening:
         before = status_of(statuses(asking), args.input)
@@ -367,14 +362,14 @@ def take_live(
 
 
 def heard(samples: Iterator[Sample], name: str) -> Iterator[Sample | None]:
-    """Yield the samples, and None after each SILENCE_S without one. Raises BadArgument where none comes at all."""
+    """Yield the samples, and None after each SILENCE_S without a sample. Raises BadArgument if no sample arrives."""
     silent = True
     while True:
         try:
             sample = next(samples)
         except TimeoutError:
             if silent:
-                raise BadArgument(f"{name}: it sends no samples; `imud status` says why") from None
+                raise BadArgument(f"{name} sends no samples; find the reason with `imud status`") from None
             yield None
         except StopIteration:
             return
@@ -384,19 +379,19 @@ def heard(samples: Iterator[Sample], name: str) -> Iterator[Sample | None]:
 
 
 def status_of(found: Iterable[DeviceStatus], name: str) -> DeviceStatus:
-    """Return the status of a device. Raises BadArgument with the names there are."""
+    """Return the status of a device. Raises BadArgument if the device is unknown."""
     known = {status.name: status for status in found}
     if name not in known:
-        raise BadArgument(f"{name}: expected a file, or a device of the daemon ({', '.join(known) or 'it has none'})")
+        raise BadArgument(f"{name}: expected a file, or a device of the daemon ({', '.join(known) or 'none'})")
     return known[name]
 
 
 def taken_of(status: DeviceStatus, socket: str) -> SampleSet:
-    """Begin the provenance of a live device."""
+    """Return a SampleSet without samples for a live device."""
     return SampleSet(f"live from {socket}", status.name, status.driver, status.link, status.identity, status.settings)
 
 
 def progress(passed_s: float, count: int) -> None:
-    """Say on a terminal how far it is, in a line that the next one replaces."""
+    """Print the progress on a terminal. The next call replaces the line."""
     if sys.stderr.isatty():
         print(f"{passed_s:.0f} s, {count} samples", end="\r", file=sys.stderr, flush=True)

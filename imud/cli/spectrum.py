@@ -37,30 +37,31 @@ from imud.model.units import NS_PER_S
 NAME_WIDTH: Final = 6
 NUMBER_WIDTH: Final = 10
 GRAM_PART: Final = 4
-"""Windows of the spectrogram are so much shorter than those of the spectrum: when, rather than which frequency."""
+"""Window of the spectrum divided by the window of the spectrogram. Shorter windows show times better, frequencies less
+well."""
 
 
 @dataclass(frozen=True, slots=True)
 class SpectrumOptions:
-    """What the user chose."""
+    """Options of the command line."""
 
     sensors: tuple[SensorName, ...] = ("accel", "gyro")
     resolution_hz: float | None = None
-    """Distance of bins; None: by the length of the series."""
+    """Distance of two frequency bins, Hz. None: depends on the number of samples."""
     bands_hz: tuple[tuple[float, float], ...] | None = None
-    """None: octaves."""
+    """Bands of the RMS, Hz. None: octaves."""
 
 
 @dataclass(frozen=True, slots=True)
 class SpectrumReport:
-    """All that the outputs are made of."""
+    """Result of the analysis, the input of all outputs."""
 
     taken: SampleSet
     sensors: dict[SensorName, SensorVibration]
 
 
 def spectrum_report(taken: SampleSet, settings: SpectrumOptions) -> SpectrumReport:
-    """Analyse the chosen sensors. Raises ImudError where none of them has values."""
+    """Analyse the chosen sensors. Raises ImudError if the device does not send values of these sensors."""
     readings = readings_of(taken)
     sensors: dict[SensorName, SensorVibration] = {}
     for name in settings.sensors:
@@ -73,7 +74,7 @@ def spectrum_report(taken: SampleSet, settings: SpectrumOptions) -> SpectrumRepo
 
 
 def sensor_vibration(readings: Readings, values: FloatArray, settings: SpectrumOptions) -> SensorVibration:
-    """Analyse one sensor, values (n, 3). Raises BadArgument where the series is too short."""
+    """Analyse one sensor; `values` has the shape (n, 3). Raises BadArgument if the series is too short."""
     t_ns, values = with_values(readings.t_ns, values)
     grid = grid_of(t_ns)
     runs = even_runs(grid, values, smooth=True)
@@ -86,33 +87,33 @@ def sensor_vibration(readings: Readings, values: FloatArray, settings: SpectrumO
     )  # fmt: skip
 
 
-# --- words ------------------------------------------------------------------------------------------------------------
+# --- text -------------------------------------------------------------------------------------------------------------
 
 
 def limits(taken: SampleSet, name: SensorName, sensor: SensorVibration) -> Iterator[str]:
-    """Sentences about what limits the spectrum of a sensor."""
+    """Yield sentences about the limits of the spectrum of a sensor."""
     half = sensor.spectrum.rate_hz / 2
     yield sensor.grid.words()
     yield sensor.spectrum.words()
     own = taken.sheet.filter_words(taken.settings, name)
     yield (
-        f"aliasing: what vibrates above {half:.4g} Hz, half the rate, and passes the device's own filter "
-        f"({own or 'which no manual states'}) stands below it: a line at f may be one at "
-        f"{sensor.spectrum.rate_hz:.4g} Hz - f. Measured at another rate, such a line moves"
+        f"aliasing: vibration above {half:.4g} Hz (half of the rate) that passes the filter of the device "
+        f"({own or 'unknown, no manual states it'}) appears below {half:.4g} Hz: a line at f can be a line at "
+        f"{sensor.spectrum.rate_hz:.4g} Hz - f. To check a line, measure at another rate: an alias moves"
     )
 
 
 def peak_words(number: int, peak: Peak) -> str:
-    """Name a peak: its number, and of which other it is a multiple."""
+    """Return the name of a peak: its number, and the peak of which it is a multiple."""
     if peak.harmonic_of is None:
         return f"P{number}"
     return f"P{number} = {peak.multiple} × P{peak.harmonic_of + 1}"
 
 
 def peak_lines(sensor: SensorVibration) -> list[str]:
-    """A table of the peaks."""
+    """Format the table of the peaks."""
     if not sensor.peaks:
-        return ["  no line stands out of the noise"]
+        return ["  no line is above the noise"]
     head = f"  {'peak':<13}{'Hz':>10}" + "".join(f"{axis:>{NUMBER_WIDTH}}" for axis in AXES)
     lines = [f"{head}{'over noise':>13}"]
     for number, peak in enumerate(sensor.peaks, start=1):
@@ -122,7 +123,7 @@ def peak_lines(sensor: SensorVibration) -> list[str]:
 
 
 def band_lines(sensor: SensorVibration) -> list[str]:
-    """A table of the bands."""
+    """Format the table of the bands."""
     lines = [f"  {'band, Hz':<23}" + "".join(f"{axis:>{NUMBER_WIDTH}}" for axis in AXES)]
     for band in sensor.bands:
         words = f"{band.low_hz:.4g} to {band.high_hz:.4g}"
@@ -144,13 +145,13 @@ def text(report: SpectrumReport) -> str:
 
 
 def spectrum_file(report: SpectrumReport, kind: str) -> bytes:
-    """The content of a picture, `.svg` or `.png`."""
+    """Return the content of a picture file of the kind `.svg` or `.png`."""
     facts = dict(circumstances(report.taken, full=False))
-    lines = [f"{facts['identity']}; {facts['begun']}; {facts['duration']}; {facts['software']}"]
+    lines = [f"{facts['identity']}; {facts['start']}; {facts['duration']}; {facts['software']}"]
     for name, sensor in report.sensors.items():
         grid, spectrum = sensor.grid, sensor.spectrum
         lines.append(
-            f"{TITLES[name]}: {grid.rate_hz:.4f} Hz, {grid.missing} samples missing, {spectrum.averages} windows, "
+            f"{TITLES[name]}: {grid.rate_hz:.4f} Hz, {grid.missing} samples lost, {spectrum.averages} windows, "
             f"{spectrum.window.capitalize()}, noise bandwidth {spectrum.bandwidth_hz:.3g} Hz"
         )
     return picture(spectrum_figure(report.sensors, f"Vibration of {report.taken.device}", lines), kind)
@@ -160,7 +161,7 @@ def spectrum_file(report: SpectrumReport, kind: str) -> bytes:
 
 
 def as_object(report: SpectrumReport) -> dict[str, Any]:
-    """The report for programs, SI."""
+    """Return the report for `--json` in SI units."""
     return {
         "measurement": measurement_object(report.taken),
         "sensors": {
@@ -198,11 +199,11 @@ def _sensor_object(taken: SampleSet, name: SensorName, sensor: SensorVibration) 
 
 REDRAW_S: Final = 1.0
 KEPT_S: Final = 10.0
-"""The spectrum is of so much: a longer past would hide what changes."""
+"""Time span of the live spectrum, s. A longer span would hide changes."""
 PAST_ROWS: Final = 8
-"""Rows of the spectrogram."""
+"""Number of rows of the spectrogram."""
 HEIGHT: Final = 8
-"""Rows of the curve."""
+"""Number of rows of the curve."""
 PEAKS_SHOWN: Final = 5
 RANGE_DB: Final = 60.0
 SHADES: Final = " ░▒▓█"
@@ -211,7 +212,7 @@ CLEAR: Final = "\x1b[H\x1b[2J"
 
 
 def live(args: argparse.Namespace, settings: SpectrumOptions) -> int:
-    """Redraw until interrupted. Raises ImudError."""
+    """Redraw the spectrum until Ctrl-C. Raises ImudError."""
     name = settings.sensors[0]
     with connect(args) as asking, connect(args) as listening:
         status_of(statuses(asking), args.input)
@@ -222,7 +223,7 @@ def live(args: argparse.Namespace, settings: SpectrumOptions) -> int:
             samples = listening.watch([args.input], timeout_s=SILENCE_S, latency_ms=LATENCY_MS)
             for sample in heard(samples, args.input):
                 if sample is None:
-                    sys.stdout.write(f"{CLEAR}{args.input} sends no samples now; `imud status` says why\n")
+                    sys.stdout.write(f"{CLEAR}{args.input} sends no samples; find the reason with `imud status`\n")
                     sys.stdout.flush()
                     continue
                 collector.add(sample)
@@ -235,7 +236,7 @@ def live(args: argparse.Namespace, settings: SpectrumOptions) -> int:
 
 
 class LiveView:
-    """Text of the view, and the rows of its spectrogram."""
+    """Live view: curve, spectrogram and peaks as text."""
 
     def __init__(self, device: str, name: SensorName) -> None:
         self._device = device
@@ -243,39 +244,39 @@ class LiveView:
         self._past: deque[str] = deque(maxlen=PAST_ROWS)
 
     def page(self, collector: Collector, settings: SpectrumOptions) -> str:
-        """Format the view of what the collector has now, in 80 columns."""
+        """Format the view of the collected samples in 80 columns."""
         readings = collector.readings()
         values = readings.accel_m_s2 if self._name == "accel" else readings.gyro_rad_s
         if values is None:
             return f"{self._device} sends no values of the {TITLES[self._name]}"
         try:
             sensor = sensor_vibration(readings, values, settings)
-        except BadArgument as error:  # too few samples yet
+        except BadArgument as error:  # still too few samples
             return f"{self._device}: {error}"
         return "\n".join(self._lines(sensor))
 
     def _lines(self, sensor: SensorVibration) -> list[str]:
         columns = in_columns(sensor.spectrum)
-        decibels = 10 * np.log10(np.maximum(columns, 1e-300))
+        decibels = 10 * np.log10(np.maximum(columns, 1e-300))  # log10(0) is -infinity
         top = 10 * int(np.ceil(decibels.max() / 10))
         level = np.clip((decibels - top + RANGE_DB) / RANGE_DB, 0, 1)
         self._past.appendleft("".join(SHADES[min(int(one * len(SHADES)), len(SHADES) - 1)] for one in level))
         grid, spectrum = sensor.grid, sensor.spectrum
         head = (
-            f"{shortened(self._device, 16)} {TITLES[self._name]}: {grid.rate_hz:.3f} Hz, {grid.missing} missing, "
+            f"{shortened(self._device, 16)} {TITLES[self._name]}: {grid.rate_hz:.3f} Hz, {grid.missing} lost, "
             f"bins of {spectrum.bin_hz:.3g} Hz"
         )
         unit = f"dB of ({SI[self._name]})²/Hz"
         return [
             head, f"{top} {unit}", *curve_rows(level), axis_line(spectrum.rate_hz / 2),
-            f"{top - RANGE_DB:.0f} {unit}; the last {len(self._past)} s, newest above:", *self._past,
+            f"{top - RANGE_DB:.0f} {unit}; last {len(self._past)} s, newest row first:", *self._past,
             f"lines, peak amplitude in {SI[self._name]}",
             *peak_lines(sensor)[: PEAKS_SHOWN + 1],
         ]  # fmt: skip
 
 
 def in_columns(spectrum: Spectrum) -> FloatArray:
-    """(COLUMNS,) the highest density of all axes together in each column: a line stays a line."""
+    """Return the maximum density in each column of the terminal, sum of all axes, shape (COLUMNS,)."""
     power = spectrum.density[1:].sum(axis=1)
     column = (np.arange(len(power)) * COLUMNS) // len(power)
     found = np.full(COLUMNS, 0.0)
@@ -286,7 +287,7 @@ def in_columns(spectrum: Spectrum) -> FloatArray:
 
 
 def curve_rows(level: FloatArray) -> list[str]:
-    """The curve as HEIGHT rows of bars; level (COLUMNS,) 0 to 1."""
+    """Format the curve as HEIGHT rows of bars. `level` has the shape (COLUMNS,) and values from 0 to 1."""
     eighths = np.rint(level * HEIGHT * (len(BARS) - 1)).astype(int)
     rows = []
     for row in range(HEIGHT - 1, -1, -1):
@@ -296,7 +297,7 @@ def curve_rows(level: FloatArray) -> list[str]:
 
 
 def axis_line(half_hz: float) -> str:
-    """Frequencies below the columns: 0, a quarter, the middle, three quarters, the end."""
+    """Format the frequency axis with five labels: 0, 1/4, 1/2, 3/4 and all of `half_hz`."""
     line = [" "] * COLUMNS
     for quarter in range(5):
         words = f"{half_hz * quarter / 4:.4g}" + (" Hz" if quarter == 4 else "")

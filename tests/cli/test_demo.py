@@ -114,7 +114,10 @@ def test_devices_that_cannot_be_shown(cli: Cli) -> None:
             ["--device", "imu61x-spi", "--bus", "1"],
             "cannot simulate imu61x-spi; name the bus of a real device, for example --port /dev/spidev0.0",
         ),
-        (["--device", "imu61x-i2c", "--device", "imu61x-uart"], "expected imu61x-i2c alone, got 2 devices"),
+        (
+            ["--device", "imu61x-i2c", "--device", "imu61x-uart"],
+            "expected imu61x-i2c as the only device, got 2 devices",
+        ),
         (
             ["--device", "hipnuc-uart", "--device", "imu61x-can"],
             "several devices: expected CAN devices only",

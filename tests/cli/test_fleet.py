@@ -70,7 +70,7 @@ def test_arguments_are_checked(cli: Cli) -> None:
     for words, problem in [
         (["mqtt://host", "--to", "elsewhere"], "--to: expected"),
         (["host", "--to", "-"], "expected a URL"),
-        (["mqtt://host", "--to", "-", "--password-file", "f"], "expected --user"),
-        (["mqtt://host", "--to", "-", "--key-file", "f"], "expected --cert-file"),
+        (["mqtt://host", "--to", "-", "--password-file", "f"], "add --user"),
+        (["mqtt://host", "--to", "-", "--key-file", "f"], "add --cert-file"),
     ]:
         cli.refuses(problem, "fleet", "collect", *words)

@@ -129,7 +129,7 @@ def test_scan_at_every_rate(modbus: Commands) -> None:
 def test_two_modules_with_one_address_get_different_addresses(modbus: Commands) -> None:
     modbus.bus = Bus(modbus_slave(80, serial=0x0F), modbus_slave(80, serial=0xF0))
     (found,) = modbus.scan("80", status=1)
-    assert "two modules with this address" in found["problem"]
+    assert "two devices have this address" in found["problem"]
     assert serial(0xF0) in modbus("assign", *ON, "--serial", serial(0xF0).lower(), "--id", "6")
     assert modbus.bus.paused_s == [0.3], "the modules need time to use the address"
     assert modbus.bus.slaves() == [one.flash.slave for one in modbus.bus.line.slaves] == [80, 6]
@@ -162,13 +162,13 @@ def test_an_address_is_changed_and_saved_unless_not_wanted(modbus: Commands) -> 
     ("words", "why"),
     [
         (("--from", "1", "--id", "2"), "address 2 is taken by HI14R2N-485-000"),
-        (("--from", "5", "--id", "6"), "no module answers at address 5"),
+        (("--from", "5", "--id", "6"), "no device replies at address 5"),
         (("--from", "1", "--id", "200"), "1 … 128"),
         (("--from", "0", "--id", "9"), "1 … 247"),
         (("--from", "1"), "--id: expected the new address"),
         (("--random", "1-9", "--id", "1"), "--id: expected the new address"),
         (("--random", "9"), "lowest below the highest"),
-        (("--serial", serial(9), "--id", "9"), "no module answers at address 9"),
+        (("--serial", serial(9), "--id", "9"), "no device replies at the new address 9"),
         (("--serial", serial(9), "--id", "2"), "address 2 is taken"),
         (("--serial", "12", "--id", "9"), "16 hexadecimal digits"),
         (("--from", "1", "--id", "9", "--reply-ms", "0"), "--reply-ms: expected 1 to 1000, got 0"),

@@ -61,21 +61,21 @@ def test_what_limits_the_figures() -> None:
     values = np.round(noise_of_three() / 1.7453293e-3) * 1.7453293e-3
     report = noise_report(taken_of(values), None)
     words = " ".join(limits(report, "gyro"))
-    assert "whole counts of 0.001745 rad/s by the manual" in words
+    assert "multiples of 0.001745 rad/s (in the manual)" in words
     moved = noise_of_three()
     moved[2000:4000] += np.sin(np.arange(2000) / 10)[:, None]
     words = " ".join(limits(noise_report(taken_of(moved, "imu61x-can"), None), "gyro"))
     assert "NOT AT REST: 20 of 100 seconds" in words
-    assert "the device's own filter: low-pass 47 Hz as delivered" in words
+    assert "filter of the device: low-pass 47 Hz as delivered" in words
 
 
 def test_the_text_names_what_is_not_compared_and_a_device_without_sensors_is_refused() -> None:
     words = text(noise_report(taken_of(noise_of_three()), None))
     assert "bow: noise" in words
     assert "product HI14" in words
-    assert "Not compared with a data sheet: HiPNUC" in words
+    assert "No comparison with a data sheet: HiPNUC" in words
     empty = Readings(stamps_ns(COUNT, RATE_HZ), None, None, None)
     with pytest.raises(ImudError, match="bow sends neither angular rate nor acceleration"):
         noise_report(SampleSet("a file", "bow", readings=empty), None)
-    with pytest.raises(ImudError, match="expected samples, found none"):
+    with pytest.raises(ImudError, match="found no samples"):
         noise_report(SampleSet("a file", "bow"), None)

@@ -132,5 +132,5 @@ def test_a_silent_port_a_port_that_ends_and_one_that_cannot_be_opened(ports: Por
 def test_a_host_without_ports_says_so(ports: Ports, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     ports(Port())
     monkeypatch.setattr(probe, "list_ports", list)
-    assert cli("probe", status=1).out.startswith("no serial port and no CAN interface here: is the adapter plugged in")
+    assert cli("probe", status=1).out.startswith("found no serial port and no CAN interface: is the adapter plugged in")
     assert cli("probe", "--json", status=1).out == ""

@@ -89,24 +89,24 @@ def test_a_full_disk_and_a_pipe_without_a_reader_end_it_with_a_message(words: tu
     with open("/dev/full", "wb") as full:
         done = written_to(full, *words, "--for", "50s")
     assert done.returncode == 2
-    assert "standard output: No space left on device; what was written before is whole" in done.stderr
+    assert "cannot write standard output: No space left on device; the data before is complete" in done.stderr
     with pipe() as (reader, writer):
         os.close(reader)
         done = written_to(writer, *words, "--for", "50s")
     assert done.returncode == 2
-    said = "imud record: standard output: nobody reads it any more; the recording ended before it was to\n"
+    said = "imud record: standard output: the reader closed the pipe; the recording ended before its planned end\n"
     assert done.stderr == said
 
 
 def test_a_recording_or_file_that_cannot_be_made(words: tuple[object, ...], tmp_path: Path, cli: Cli) -> None:
     there = tmp_path / "there"
     there.write_bytes(b"mine")
-    cli.refuses("exists already: expected the name of a new file", *words, there)
+    cli.refuses("exists; name a new file", *words, there)
     cli.refuses("No such file or directory", *words, tmp_path / "no" / "folder")
     cli.refuses("no device named 'keel'; there are: bow, mast", *words, "--device", "keel", tmp_path / "d")
     cli.refuses("the flight recorder is off", *words, "--snapshot", tmp_path / "e")
     for option in (("--for", "1s"), ("--device", "bow")):
-        cli.refuses("--snapshot: expected neither --device nor --for", *words, "--snapshot", *option)
+        cli.refuses("omit --device and --for", *words, "--snapshot", *option)
     cli.refuses("expected a duration, for example 90s, 10min or 2h, got 'soon'", *words, "--for", "soon")
     assert there.read_bytes() == b"mine"
     assert sorted(tmp_path.iterdir()) == [there]
@@ -119,7 +119,7 @@ def test_a_daemon_that_stops_ends_it_and_says_so(tmp_path: Path, cli: Cli) -> No
         with imud_process("record", "--socket", made.socket, file) as record:
             wait_until(lambda: file.exists() and file.stat().st_size > 10_000, "a second of records")
             made.process.terminate()
-            assert "the recording ended before it was to: imud stopped" in record.end(status=1).err
+            assert "the recording ended before its planned end: imud stopped" in record.end(status=1).err
     replayed(file, cli, "bow")
 
 

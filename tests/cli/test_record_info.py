@@ -46,7 +46,7 @@ def test_whole_damaged_cut_and_foreign_files(file: Path, cli: Cli, tmp_path: Pat
     data[100] ^= 1
     (tmp_path / "damaged").write_bytes(data)
     page = " ".join(cli("info", tmp_path / "damaged", status=1).out.split())
-    assert "begun not known: the block that says it and names the devices is damaged or missing" in page
+    assert "start unknown: the block with the start time and the device names is damaged or missing" in page
     assert "duration not known" in page
     assert "missing blocks according to their numbers: 1" in page
     (tmp_path / "a.csv").write_text("t_ns,accel\n" * 50)

@@ -61,7 +61,7 @@ def test_from_difference_to_agreement_and_back(
     assert declared_values(device.declared)["output"] == before["output"]
     # set what is declared
     out = cli(*words, "--apply").out
-    assert "to do:\n  mode: 6-axis → 9-axis\n" in out
+    assert "plan:\n  mode: 6-axis → 9-axis\n" in out
     assert "done:\n  mode: done\n  output: done" in out
     assert (actual(daemon)["mode"], actual(daemon)["output"]["hi91"]) == ("9-axis", 50)
     assert "all readable settings are as declared" in cli(*words).out
@@ -125,7 +125,7 @@ def test_a_backup_of_another_module_is_told_of(words: tuple[object, ...], cli: C
     for problem in (
         "product: the backup contains CH020, bow has ",
         "serial number: the backup contains 77, bow has ",
-        "left out: strange, which hipnuc-uart cannot set",
+        "ignored: strange; hipnuc-uart cannot set it",
         "the backup is from another device: cannot ask for confirmation without a terminal",
     ):
         assert problem in err

@@ -107,4 +107,4 @@ def test_it_is_redrawn_until_ctrl_c(tmp_path: Path) -> None:
     for page in pages:
         assert max(map(len, page.splitlines())) <= COLUMNS
         assert re.match(r"bow accelerometer: [0-9.]+ Hz, \d+ missing", page), page
-        assert re.search(r"the last \d+ s, newest above", page), page
+        assert re.search(r"last \d+ s, newest row first", page), page

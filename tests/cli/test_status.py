@@ -84,7 +84,7 @@ def test_lines_and_utc_say_only_what_is_known() -> None:
     assert [name for name, _ in parts(device("bow", lines=LinesStatus({}, {}, {}, sin=True)))] == ["sin"]
     lines = LinesStatus({"reset": "GPIO5 is in use by another program"}, {}, {})
     assert list(parts(device("bow", lines=lines))) == [("reset", "GPIO5 is in use by another program")]
-    assert utc(UtcStatus("", "")) == "nothing yet"
+    assert utc(UtcStatus("", "")) == "no pulse and no sentence yet"
     assert utc(UtcStatus("", "", pulses=3)) == "3 pulses, 0 ignored"
     assert utc(replace(UTC, refused={}, pulses=0, pulses_ignored=0, chrony_refused=0, chrony_sent=0,
                                        problem="")) == "gpsd at 127.0.0.1:2947: 100 sentences, 90 sent"  # fmt: skip

@@ -61,7 +61,7 @@ def test_synopsis_commands_and_summary() -> None:
     synopsis = plain(PAGES["imud-settings.1"].partition(".SH DESCRIPTION")[0])
     assert "[--apply | --set NAME=VALUE" in synopsis
     text = plain(PAGES["imud-modbus.1"])
-    assert ".SS imud modbus scan List the module at every address." in text
+    assert ".SS imud modbus scan List the device at each address." in text
     assert ".SS imud modbus assign" in text
     assert PAGES["imud-watch.1"].startswith('.TH "IMUD\\-WATCH" "1" ')
     assert ".SH NAME\nimud\\-watch \\- print samples\n" in PAGES["imud-watch.1"]
