@@ -1,7 +1,7 @@
-"""One change of this machine: announced before it is made, made, undone. Two kinds: a file's content, and a command.
+"""Changes of the host, and the journal that allows to undo them. A change is a new file content or a command.
 
-A file is exchanged as a whole; its owner and mode stay. It is taken back only while it is as it was left: what a person
-wrote since is never overwritten. A command names the commands that take it back, and one whose output shows its effect.
+imud replaces a file as a whole and keeps its owner and mode. It restores a file only if no other program changed the
+file after `imud setup`. A command change names the commands that undo it, and a command that shows its effect.
 """
 
 import difflib
@@ -21,64 +21,64 @@ from imud.host.files import read_regular, replace_file
 from imud.model.errors import ImudError, reason_of
 
 Words = tuple[str, ...]
-"""A command."""
+"""Words of a command line."""
 
 FILE_BYTES_MAX: Final = 1 << 20
-"""Of a file that is changed; a configuration is no larger."""
+"""Maximum size of a changed file, bytes: the maximum size of a configuration."""
 NEW_MODE: Final = 0o644
 FOLDER_MODE: Final = 0o755
 
 
 class ChangeRefused(ImudError):
-    """A change is not made, or not taken back, because something is not as expected. Example: a file edited since."""
+    """Error of a change or an undo. Example: another program changed the file."""
 
 
 class FileChange(msgspec.Struct, frozen=True, tag="file"):
-    """A file gets this content."""
+    """New content of a file."""
 
     why: str
-    """What for, a clause for people."""
+    """Purpose of the change, for the user."""
     path: str
     content: bytes
     then: tuple[Words, ...] = ()
-    """Commands that make programs see it; run after it was made and after it was taken back. They may fail."""
+    """Commands after the change and after its undo, so that programs use the file. They can fail."""
     copy_of: str = ""
-    """The file that this is a copy of, with its owner and mode; empty for others."""
+    """Original of a copy, which gets the same owner and mode; empty for other files."""
 
 
 class CommandChange(msgspec.Struct, frozen=True, tag="command"):
-    """A command is run."""
+    """Execution of a command."""
 
     why: str
     words: Words
     undo: tuple[Words, ...]
-    """What takes it back; nothing for a command that leaves nothing to take back."""
+    """Commands that undo the change; empty if nothing needs an undo."""
     look: Words
-    """Its output is the same again when the command is taken back."""
+    """Command with the same output before the change and after the undo."""
     optional: bool = False
-    """Whether it matters little that it fails, made or taken back."""
+    """Whether `imud setup` continues if the change or its undo fails."""
 
 
 Change = FileChange | CommandChange
 
 
 class ChangeRecord(msgspec.Struct):
-    """A change that was begun."""
+    """Started change, as stored in the journal."""
 
     change: Change
     content_before: bytes | None = None
-    """Of a file; None where there was none."""
+    """Previous content of a file; None if the file did not exist."""
     seen_before: str = ""
-    """Output of a command's `look`."""
+    """Previous output of the command `look`."""
     done: bool = False
-    """False for one that was interrupted: it may or may not have been made."""
+    """False after an interruption: the change is perhaps incomplete."""
 
 
-# --- announced --------------------------------------------------------------------------------------------------------
+# --- description ------------------------------------------------------------------------------------------------------
 
 
 def describe(at: Surroundings, change: Change) -> list[str]:
-    """What the change does, and the lines of a file that it adds and removes."""
+    """Describe a change: its purpose, and the added and removed lines of a file."""
     if isinstance(change, CommandChange):
         return [f"{change.why}: {shlex.join(change.words)}"]
     before = content_of(at, change.path)
@@ -87,12 +87,12 @@ def describe(at: Surroundings, change: Change) -> list[str]:
 
 
 def describe_undo(record: ChangeRecord) -> list[str]:
-    """What taking it back does."""
+    """Describe the undo of a change."""
     change = record.change
     if isinstance(change, FileChange):
-        what = "is removed" if record.content_before is None else "gets its former content"
-        return [f"{change.path} {what} ({change.why})"]
-    return [shlex.join(words) for words in change.undo] or [f"nothing to do ({shlex.join(change.words)})"]
+        verb = "remove" if record.content_before is None else "restore"
+        return [f"{verb} {change.path} ({change.why})"]
+    return [shlex.join(words) for words in change.undo] or [f"no undo needed ({shlex.join(change.words)})"]
 
 
 def _differences(before: bytes | None, change: FileChange) -> list[str]:
@@ -103,22 +103,22 @@ def _differences(before: bytes | None, change: FileChange) -> list[str]:
     return [f"  {line}" for line in compared if not line.startswith("@@")]
 
 
-# --- made and taken back ----------------------------------------------------------------------------------------------
+# --- change and undo --------------------------------------------------------------------------------------------------
 
 
 def begun(at: Surroundings, change: Change) -> ChangeRecord:
-    """Look at what is there before the change. Raises ChangeRefused, OSError."""
+    """Return a record with the state before the change. Raises ChangeRefused, OSError."""
     if isinstance(change, FileChange):
         return ChangeRecord(change, content_before=content_of(at, change.path))
     return ChangeRecord(change, seen_before=_output(at, change.look))
 
 
 def make(at: Surroundings, record: ChangeRecord) -> list[str]:
-    """Make the change; return what did not work and does not matter. Raises ChangeRefused, OSError."""
+    """Make the change. Return the errors of optional commands. Raises ChangeRefused, OSError."""
     change = record.change
     if isinstance(change, FileChange):
         if content_of(at, change.path) != record.content_before:
-            raise ChangeRefused(f"{change.path} has just been changed by another program: run `imud setup` again")
+            raise ChangeRefused(f"another program changed {change.path} in the meantime; run `imud setup` again")
         write(at, change.path, change.content, change.copy_of or change.path)
         return run_all(at, change.then)
     failed = run_all(at, (change.words,))
@@ -128,9 +128,10 @@ def make(at: Surroundings, record: ChangeRecord) -> list[str]:
 
 
 def take_back(at: Surroundings, record: ChangeRecord) -> list[str]:
-    """Restore what was there before; return what did not work and does not matter.
+    """Restore the state before the change. Return the errors of optional commands.
 
-    No-op for what is as it was before. Raises ChangeRefused where it was changed since, or a command fails.
+    Do nothing if the state is already restored. Raises ChangeRefused if another program changed the file, or if a
+    command fails.
     """
     change = record.change
     if isinstance(change, CommandChange):
@@ -144,8 +145,8 @@ def take_back(at: Surroundings, record: ChangeRecord) -> list[str]:
     if now == record.content_before:
         return []
     if now != change.content:
-        gone = " removed" if now is None else " changed"
-        raise ChangeRefused(f"{change.path} was{gone} since `imud setup` wrote it: it is left as it is")
+        verb = "removed" if now is None else "changed"
+        raise ChangeRefused(f"{change.path} was {verb} after `imud setup` wrote it, so imud does not change it")
     if record.content_before is None:
         at.at(change.path).unlink()
     else:
@@ -154,13 +155,13 @@ def take_back(at: Surroundings, record: ChangeRecord) -> list[str]:
 
 
 def run_all(at: Surroundings, commands: Sequence[Words]) -> list[str]:
-    """Run commands in order; return a sentence for each that failed."""
+    """Run commands in order. Return an error for each failed command."""
     failed = []
     for words in commands:
         try:
             output = at.run(words)
         except OSError as error:
-            failed.append(f"`{shlex.join(words)}` could not be run: {reason_of(error)}")
+            failed.append(f"cannot run `{shlex.join(words)}`: {reason_of(error)}")
             continue
         if output.status:
             failed.append(f"`{shlex.join(words)}` failed: {output.complaint or f'exit status {output.status}'}")
@@ -168,7 +169,7 @@ def run_all(at: Surroundings, commands: Sequence[Words]) -> list[str]:
 
 
 def _output(at: Surroundings, words: Words) -> str:
-    """What a command says; empty for one that is not installed."""
+    """Return the output of a command; empty if the command is not installed."""
     try:
         return at.run(words).text.strip()
     except OSError:
@@ -179,24 +180,24 @@ def _output(at: Surroundings, words: Words) -> str:
 
 
 def content_of(at: Surroundings, path: str) -> bytes | None:
-    """The content of a regular file; None where there is none. Raises ChangeRefused for links and others, OSError."""
+    """Return the content of a regular file; None if it does not exist. Raises ChangeRefused for links, OSError."""
     file = at.at(path)
     try:
         mode = file.lstat().st_mode
     except (FileNotFoundError, NotADirectoryError):
         return None
     if stat.S_ISLNK(mode):
-        raise ChangeRefused(f"{path} is a symbolic link to {os.readlink(file)}: imud setup does not change it")
+        raise ChangeRefused(f"cannot change {path}: it is a symbolic link to {os.readlink(file)}")
     content = read_regular(file, FILE_BYTES_MAX + 1)
     if len(content) > FILE_BYTES_MAX:
-        raise ChangeRefused(f"{path}: expected at most {FILE_BYTES_MAX} bytes, got more: imud setup does not change it")
+        raise ChangeRefused(f"cannot change {path}: expected at most {FILE_BYTES_MAX} bytes, got more")
     return content
 
 
 def write(at: Surroundings, path: str, content: bytes, like: str) -> None:
-    """Exchange a file as a whole, with owner and mode of the file `like`; it is on the medium when this returns.
+    """Replace a file as a whole, with the owner and mode of the file `like`, and synchronise it.
 
-    Raises OSError; the old file is left then.
+    Raises OSError; the previous file then stays.
     """
     file = at.at(path)
     file.parent.mkdir(mode=FOLDER_MODE, parents=True, exist_ok=True)
@@ -209,10 +210,10 @@ def write(at: Surroundings, path: str, content: bytes, like: str) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Have the names in a folder on the medium; no-op where its file system cannot."""
+    """Synchronise the names in a folder."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        with suppress(OSError):
+        with suppress(OSError):  # some file systems do not support fsync of a folder
             os.fsync(descriptor)
     finally:
         os.close(descriptor)
@@ -222,14 +223,14 @@ FOLDER: Final = "/var/lib/imud-setup"
 FILE: Final = f"{FOLDER}/journal.json"
 JOURNAL_FOLDER_MODE: Final = 0o700
 JOURNAL_BYTES_MAX: Final = 16 << 20
-"""Some hundred versions of a configuration."""
+"""Maximum size of the journal, bytes: some hundred versions of a configuration."""
 
 
 class Journal:
-    """The changes that were made, oldest first. One process at a time has it."""
+    """Journal of the changes, oldest first. Only one process uses it at a time."""
 
     def __init__(self, at: Surroundings, say: Callable[[str], None]) -> None:
-        """Read it. `say` gets a line for everything that is done. Raises ImudError for one that cannot be used."""
+        """Read the journal. `say` prints notes. Raises ImudError if the journal is invalid."""
         self._at = at
         self._say = say
         self._file = at.at(FILE)
@@ -241,13 +242,13 @@ class Journal:
         except FileNotFoundError:
             return []
         except (OSError, msgspec.DecodeError, UnicodeError) as error:
-            reason = reason_of(error) if isinstance(error, OSError) else "it is not what imud wrote"
-            raise ImudError(f"{self._file} cannot be used: {reason}") from error
+            reason = reason_of(error) if isinstance(error, OSError) else "the content is invalid"
+            raise ImudError(f"cannot read the journal {self._file}: {reason}") from error
 
     def carry_out(self, changes: Sequence[Change]) -> list[str]:
-        """Make all changes in order; return what did not work and does not matter.
+        """Make all changes in order. Return the errors of optional commands.
 
-        Raises ChangeRefused and OSError at the first that cannot be made; those before it are made, and recorded.
+        Raises ChangeRefused or OSError at the first failed change. The journal contains the changes before it.
         """
         notes: list[str] = []
         for change in changes:
@@ -260,10 +261,9 @@ class Journal:
         return notes
 
     def take_back(self) -> list[str]:
-        """Take all changes back, newest first; return why some of them were not. These stay in the journal.
+        """Undo all changes, newest first. Return the reasons of failed undos. Their changes stay in the journal.
 
-        The copy of a file stays as long as the file does: it has what the file was before.
-        Raises OSError where a file cannot be written.
+        If imud cannot restore a file, the backup of the file stays too. Raises OSError if writing a file fails.
         """
         refused: list[str] = []
         left: set[str] = set()
@@ -271,7 +271,7 @@ class Journal:
             change = self.records[place].change
             path, original = (change.path, change.copy_of) if isinstance(change, FileChange) else ("", "")
             if original in left:
-                refused.append(f"{path} stays, since it has the former content of {original}")
+                refused.append(f"imud keeps {path}, the backup of {original}")
                 continue
             try:
                 notes = take_back(self._at, self.records[place])
@@ -286,7 +286,7 @@ class Journal:
         return list(dict.fromkeys(refused))
 
     def _save(self) -> None:
-        """Have it on the medium; an empty one is removed. Raises OSError."""
+        """Write and synchronise the journal, or remove an empty journal. Raises OSError."""
         folder = self._file.parent
         if self.records:
             folder.mkdir(mode=JOURNAL_FOLDER_MODE, parents=True, exist_ok=True)
@@ -300,7 +300,7 @@ class Journal:
 
 @contextmanager
 def locked(at: Surroundings) -> Iterator[None]:
-    """Hold the lock against a second `imud setup`. Raises ImudError where one runs, OSError."""
+    """Hold the lock during the context. Raises ImudError if another `imud setup` runs, OSError."""
     path = at.at("/run/imud-setup.lock")
     path.parent.mkdir(exist_ok=True)
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -309,7 +309,7 @@ def locked(at: Surroundings) -> Iterator[None]:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ImudError("another `imud setup` is running: wait until it has ended") from None
+            raise ImudError("another `imud setup` is running; wait until it ends") from None
         yield
     finally:
         os.close(descriptor)

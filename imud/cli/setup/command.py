@@ -1,4 +1,4 @@
-"""`imud setup`: find what is attached, tell what would change, change it, wait for samples; `--undo` goes back."""
+"""`imud setup`: detect attached devices, configure imud, start the service. `--undo` restores the previous state."""
 
 import argparse
 import os
@@ -16,64 +16,71 @@ from imud.cli.setup.steps import Conversation, SetupSteps
 from imud.model.errors import BadArgument
 
 COMMAND_LIMIT_S: Final = 330.0
-"""Longer than the unit's own limit for a start, on a slow board."""
+"""Time limit of a command, s. Longer than the start limit of the unit on a slow board."""
 WAIT_S: Final = 30.0
-"""Searching all rates of a port takes two seconds; a slow board gets more."""
+"""Default wait for samples, s. Detection takes 2 s on a fast host, more on a slow board."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of `imud setup`."""
     add_socket(parser)
     parser.add_argument(
         "place", nargs="*", metavar="PORT",
-        help="look only at these ports and CAN interfaces (default: all that nobody uses); a console is taken off a "
-        "port that is named",
+        help="check these ports and CAN interfaces only (default: all unused ports); imud removes a console from a "
+        "named port",
     )  # fmt: skip
     parser.add_argument(
-        "-c", "--config", type=Path, default=DEFAULT_FILE, metavar="FILE", help="configuration (default: %(default)s)"
+        "-c", "--config", type=Path, default=DEFAULT_FILE, metavar="FILE",
+        help="configuration file (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--yes", action="store_true", help="make all proposed changes without questions")
+    parser.add_argument("--dry-run", action="store_true", help="print the changes, change nothing")
+    parser.add_argument("--undo", action="store_true", help="undo all changes of earlier runs of imud setup")
+    parser.add_argument(
+        "--active", action="append", default=[], metavar="PORT", help="port or CAN interface to send requests to"
     )
-    parser.add_argument("--yes", action="store_true", help="ask nothing, make all changes that are proposed")
-    parser.add_argument("--dry-run", action="store_true", help="only tell what would be changed")
-    parser.add_argument("--undo", action="store_true", help="take back all changes that imud setup has made")
-    parser.add_argument("--active", action="append", default=[], metavar="PORT", help="one that may be sent queries")
     parser.add_argument(
         "--can", action="append", default=[], type=numbered, metavar="NAME=BITRATE",
-        help="bring a CAN interface up, now and at every start",
+        help="bring a CAN interface up with this bit rate, now and at every boot",
     )  # fmt: skip
     parser.add_argument(
         "--rs485", action="append", default=[], type=numbered, metavar="PORT[=BAUD]",
-        help="ask for Modbus modules on the RS-485 line at this port",
+        help="send requests to Modbus devices on the RS-485 bus at this port",
     )  # fmt: skip
-    parser.add_argument("--i2c", action="append", default=[], metavar="BUS", help="ask on an I2C bus: 1 for /dev/i2c-1")
-    parser.add_argument("--spi", action="append", default=[], metavar="PORT", help="ask on SPI: /dev/spidev0.0")
     parser.add_argument(
-        "--control", action="store_true", help="the user that runs sudo may also change settings of modules"
+        "--i2c", action="append", default=[], metavar="BUS",
+        help="send requests on an I2C bus, for example 1 for /dev/i2c-1",
+    )  # fmt: skip
+    parser.add_argument(
+        "--spi", action="append", default=[], metavar="PORT", help="send requests on SPI, for example /dev/spidev0.0"
     )
     parser.add_argument(
-        "--wait", type=finite, default=WAIT_S, metavar="S", help="longest wait for samples (default: %(default)g s)"
+        "--control", action="store_true", help="allow the user of sudo to change device settings (group imud-control)"
     )
-    parser.add_argument("--json", action="store_true", help="one JSON object, with --yes or --dry-run")
+    parser.add_argument(
+        "--wait", type=finite, default=WAIT_S, metavar="S", help="maximum wait for samples (default: %(default)g s)"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object, with --yes or --dry-run")
 
 
 def numbered(text: str) -> tuple[str, int]:
-    """Parse `NAME=NUMBER`; 0 without a number. Raises ArgumentTypeError."""
+    """Parse `NAME=NUMBER`. Return 0 if the number is missing. Raises ArgumentTypeError."""
     name, sign, number = text.partition("=")
     if not name or (sign and not (number.isdecimal() and int(number) > 0)):
         raise argparse.ArgumentTypeError(
-            f"expected a name, or a name and a rate in bit/s as {name or 'can0'}=500000, got {text!r}"
+            f"expected a name, or a name with a rate in bit/s, for example {name or 'can0'}=500000, got {text!r}"
         )
     return name, int(number or 0)
 
 
 def check(args: argparse.Namespace) -> None:
-    """Raises BadArgument for arguments that do not go together."""
+    """Raise BadArgument for arguments that exclude each other."""
     if args.json and not (args.yes or args.dry_run):
-        raise BadArgument("--json: expected --yes or --dry-run beside it, since questions are asked on the terminal")
+        raise BadArgument("--json: add --yes or --dry-run, because imud setup otherwise asks questions")
     if args.json and args.undo:
-        raise BadArgument("--json: expected it without --undo, which has nothing to report but text")
+        raise BadArgument("--json: omit --undo, which prints text only")
     for bus in args.i2c:
         if not bus.isdecimal():
-            raise BadArgument(f"--i2c: expected the number of a bus, 1 for /dev/i2c-1, got {bus!r}")
+            raise BadArgument(f"--i2c: expected the number of a bus, for example 1 for /dev/i2c-1, got {bus!r}")
     for name, bitrate in args.can:
         if bitrate > BITRATE_MAX or "/" in name:
             raise BadArgument(f"--can: expected for example can0={BITRATE_DEFAULT}, got {name}={bitrate}")
@@ -82,7 +89,7 @@ def check(args: argparse.Namespace) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Set up, or take back; 0 when samples come, or nothing is left to take back."""
+    """Set up, or undo. Return 0 if all devices send samples, or if all changes are undone."""
     check(args)
     talk = Conversation(ask=not args.yes and not args.dry_run, silent=args.json)
     steps = SetupSteps(
@@ -105,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def sudo_user() -> str:
-    """The user that ran sudo; empty for root itself."""
+    """Return the user of sudo; empty for root."""
     user = os.environ.get("SUDO_USER", "")
     return "" if user == "root" else user
 

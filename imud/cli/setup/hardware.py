@@ -1,8 +1,8 @@
-"""What is attached to this machine, and what imud already knows of it.
+"""Detection of attached devices for `imud setup`, and changes that make ports and CAN interfaces usable.
 
-A serial port is listened to only where nobody has it open: root may open what another program has for itself, and would
-take bytes from it, and a port with a console is not for sensors until its user says so. What the running daemon has is
-taken from its status, so that it goes on.
+imud listens only on serial ports that no other program uses: root can open a port that another program has opened
+exclusively, and would steal its bytes. imud does not use a port with a console until the user names the port. For ports
+of the running daemon, imud reads the status of the daemon, so that the daemon continues to run.
 """
 
 import asyncio
@@ -33,73 +33,73 @@ from imud.model.errors import DeviceRefused, LinkError, TransferError
 from imud.model.options import wrong_values
 
 SHARED: Final = ("socketcan", "rs485", "i2c", "spi")
-"""Links on which several devices may be, and which nobody has for himself."""
-MODEM_MANAGER: Final = ", which looks for modems on new ports for half a minute: run this again then"
-CONSOLE: Final = "a console of the kernel is on it"
-ABSENT: Final = "it is not there: is it plugged in, and is the name right?"
-OTHER: Final = "it is no serial port with hardware behind it"
+"""Links with several devices. No program uses such a link exclusively."""
+MODEM_MANAGER: Final = ", which searches for modems on new ports for 30 s: run imud setup again after that"
+CONSOLE: Final = "the port is a console of the kernel"
+ABSENT: Final = "no such port or interface: is the adapter plugged in, is the name correct?"
+OTHER: Final = "this is not a serial port of a hardware device"
 
 
 class Attached(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A port, or a device of a bus."""
+    """A port, or a device on a bus."""
 
     place: str
-    """The port by its stable name, or the interface, for the configuration."""
+    """Stable name of the port, or the interface, for the configuration."""
     node: str
-    """The port's node, short and for people; of a bus the same as `place`."""
+    """Short name of the port's node, for messages; for a bus the same as `place`."""
     title: str = ""
-    """Product name of the adapter, state of the bus."""
+    """Product name of the adapter, or state of the bus."""
     driver: str = ""
-    """What was found there; empty for nothing."""
+    """Driver of the detected device; empty if there is none."""
     device: str = ""
     """Address on a bus, for example `node 8`."""
     baud: int = 0
-    """bit/s."""
+    """Baud rate or bit rate, bit/s."""
     keys: dict[str, Any] = {}  # msgspec copies a mutable default
     """Keys of the device in the configuration."""
     configured: str = ""
-    """Name of the configured device that has it."""
+    """Name of the device in the configuration; empty if it is not configured."""
     problem: str = ""
-    """Why nothing was found, or could not be looked for."""
+    """Reason why imud found no device."""
 
 
 class Finders(NamedTuple):
-    """How devices are looked for. Each raises ImudError."""
+    """Functions that search for devices. Each function raises ImudError."""
 
     listen: Callable[[Sequence[str], set[str]], list[ProbeReport]]
-    """Listens on ports and interfaces; those of the set may be sent queries."""
+    """Listens on ports and interfaces, and sends requests to the ports and interfaces in the set."""
     scan_rs485: Callable[[str, int], list[Attached]]
-    """Asks at every address of a line with this rate (0 for that of the factory)."""
+    """Sends a request to each address of an RS-485 bus with this baud rate (0: factory setting)."""
     ask_bus: Callable[[str, str], list[Attached]]
-    """Asks on a bus by its kind, `i2c` or `spi`, and its number or node."""
+    """Sends requests on a bus of the kind `i2c` or `spi`, with its number or node."""
 
 
 class Wanted(NamedTuple):
-    """What the user asked for; nothing means all ports and interfaces, listened to."""
+    """Ports and buses to search. Empty: listen on all ports and interfaces."""
 
     places: tuple[str, ...] = ()
-    """Only these ports and interfaces."""
+    """Ports and interfaces to search; empty for all."""
     active: tuple[str, ...] = ()
-    """Those that may be sent queries."""
+    """Ports and interfaces to send requests to."""
     rs485: tuple[tuple[str, int], ...] = ()
     buses: tuple[tuple[str, str], ...] = ()
 
 
 class PortNow(NamedTuple):
-    """A serial port before anything is listened to."""
+    """State of a serial port before the search."""
 
     place: str
     node: str
     title: str
     console: bool
-    """Whether the kernel writes its messages to it."""
+    """Whether the port is a console of the kernel."""
     holders: str
-    """Programs that have it open, as far as they can be seen."""
+    """Programs that use the port, if this user can see them."""
     configured: str
 
 
 def ports_now(at: Surroundings) -> list[PortNow]:
-    """Look at all serial ports without opening one."""
+    """Return the state of all serial ports without opening a port."""
     consoles = (at.text("/sys/class/tty/console/active") or "").split()
     found = []
     for port in list_ports(at.at("/dev"), at.at("/sys")):
@@ -116,9 +116,9 @@ def ports_now(at: Surroundings) -> list[PortNow]:
 def look(
     at: Surroundings, wanted: Wanted, finders: Finders, *, example: Iterable[str] = (), freed: Iterable[str] = ()
 ) -> list[Attached]:
-    """Find what is attached. Raises ImudError.
+    """Search for attached devices. Raises ImudError.
 
-    `example` has nodes that are configured by an example only; `freed` those whose console goes with the next start.
+    `example`: nodes that only the example configuration names. `freed`: nodes without a console after the next boot.
     """
     found, listen = [], []
     lines = [path for path, _ in wanted.rs485]
@@ -134,18 +134,17 @@ def look(
             found.append(_as_configured(at, here))
         elif others:
             waits = MODEM_MANAGER if port.holders.startswith("ModemManager") else ""
-            found.append(msgspec.structs.replace(here, problem=f"it is in use by {', '.join(others)}{waits}"))
+            found.append(msgspec.structs.replace(here, problem=f"in use by {', '.join(others)}{waits}"))
         elif port.console and node not in freed:
-            found.append(msgspec.structs.replace(here, problem=f"{CONSOLE}: name the port if a sensor is wired to it"))
+            problem = f"{CONSOLE}; if a device is connected to it, name the port: `imud setup {node}`"
+            found.append(msgspec.structs.replace(here, problem=problem))
         else:
             listen.append(port.place)
     for name in can_interfaces(at.at("/sys"), down=True):
         if chosen and name not in chosen:
             continue
         if absence(name, at.at("/sys")):
-            found.append(
-                Attached(name, name, problem=f"it is down: `--can {name}=500000` brings it up, with its bit rate")
-            )
+            found.append(Attached(name, name, problem=f"the interface is down; bring it up with --can {name}=BITRATE"))
         else:
             listen.append(name)
     found += _not_attached(at, wanted, ports)
@@ -160,7 +159,7 @@ def look(
 
 
 def _not_attached(at: Surroundings, wanted: Wanted, ports: Iterable[str]) -> list[Attached]:
-    """What is named as a port or an interface and is neither: not there, or something else."""
+    """Return the named places that are not existing ports or interfaces."""
     lines = {_node(at, path) for path, _ in wanted.rs485}
     known = {*ports, *lines, *can_interfaces(at.at("/sys"), down=True)}
     found = []
@@ -173,7 +172,7 @@ def _not_attached(at: Surroundings, wanted: Wanted, ports: Iterable[str]) -> lis
 
 
 def _node(at: Surroundings, place: str) -> str:
-    """The node of a port by any of its names; an interface stays as it is."""
+    """Return the node of a port for any of its names. Return the name of an interface unchanged."""
     return at.outside(at.at(place).resolve()) if place.startswith("/") else place
 
 
@@ -186,7 +185,7 @@ def _configured_on(at: Surroundings, node: str) -> str:
 
 
 def _as_configured(at: Surroundings, here: Attached) -> Attached:
-    """What the daemon says of a port that it has."""
+    """Add the status of the daemon to a configured port."""
     status = at.status_of(here.configured)
     if status is None:
         return here
@@ -195,7 +194,7 @@ def _as_configured(at: Surroundings, here: Attached) -> Attached:
 
 
 def _heard(at: Surroundings, report: ProbeReport, ports: Mapping[str, PortNow]) -> Attached:
-    """A report of detection with the keys that a configuration needs."""
+    """Convert a report of the detection, with the keys for the configuration."""
     if "/" in report.port:
         node = _node(at, report.port)
         keys: dict[str, Any] = {"driver": report.driver, "uart": {"port": report.port}}
@@ -214,7 +213,8 @@ def _heard(at: Surroundings, report: ProbeReport, ports: Mapping[str, PortNow]) 
 
 
 def _known(at: Surroundings, found: Sequence[Attached]) -> list[Attached]:
-    """Mark the devices of buses that are configured; a configured `driver: auto` has the first that no other has."""
+    """Add the names of the configured devices to the devices on buses."""
+    # exact matches first; after that, `driver: auto` gets the first device that is still free
     free = [device for device in (at.config.devices if at.config else ()) if device.link in SHARED]
     marked: dict[int, str] = {}
     for exact in (True, False):
@@ -232,7 +232,7 @@ def _known(at: Surroundings, found: Sequence[Attached]) -> list[Attached]:
 
 
 def _is_of(device: DeviceConfig, one: Attached, *, exact: bool) -> bool:
-    """Whether a configured device is this one: the same driver and numbers, or by `auto`."""
+    """Return whether a configured device is this device: equal driver and addresses, or `auto` if not `exact`."""
     keys = one.keys.get(device.link)
     if keys is None:
         return False
@@ -246,16 +246,16 @@ def _is_of(device: DeviceConfig, one: Attached, *, exact: bool) -> bool:
 
 MODBUS: Final = "hipnuc-modbus"
 REPLY_MS: Final = 20
-"""Longest time to the reply of a module."""
+"""Maximum wait for the reply of a device, ms."""
 
 
 def listen(places: Sequence[str], active: set[str]) -> list[ProbeReport]:
-    """Listen on all ports and interfaces at the same time; those of `active` may be sent queries."""
+    """Listen on all ports and interfaces at the same time. Send requests to the ports and interfaces in `active`."""
     return asyncio.run(examine_all(list(places), active, {}))
 
 
 def scan_rs485(path: str, baud: int) -> list[Attached]:
-    """Ask at every address of a line; 0 is the rate of the factory."""
+    """Send a request to each address of an RS-485 bus. `baud`: 0 for the factory setting."""
     rate = baud or FACTORY_BAUD
     order = list(dict.fromkeys([FACTORY_ID, *SLAVES]))
     try:
@@ -270,12 +270,12 @@ def scan_rs485(path: str, baud: int) -> list[Attached]:
         one = Attached(path, path, module.product, MODBUS, where, rate, keys)
         found.append(Attached(path, path, device=where, problem=module.problem) if module.problem else one)
     return found or [
-        Attached(path, path, baud=rate, problem="no module answers: wiring, termination, or another rate?")
+        Attached(path, path, baud=rate, problem="no device replies: check the wires, the termination and the baud rate")
     ]
 
 
 def ask_bus(kind: str, bus: str) -> list[Attached]:
-    """Ask every driver of an I2C or SPI bus at every address or in every mode that it knows."""
+    """Try every driver for an I2C or SPI bus at all its addresses or in all its modes."""
     try:
         row = LINKS[kind]
         given = {"bus": int(bus)} if kind == "i2c" else {"port": bus}
@@ -306,7 +306,7 @@ def _answers(kind: str, bus: str, link: PolledLink) -> list[Attached]:
             place = {"bus": int(bus), "address": target} if kind == "i2c" else {"port": bus}
             keys = {"driver": driver.name, kind: place}
             found.append(Attached(link.title, link.title, who.product, driver.name, link.place(target), keys=keys))
-            if kind == "spi":  # a chip select has one device; the other mode is none
+            if kind == "spi":  # a chip select has one device: do not try the other mode
                 return found
     return found or [Attached(link.title, link.title, problem="; ".join(dict.fromkeys(problems)))]
 
@@ -314,21 +314,21 @@ def _answers(kind: str, bus: str, link: PolledLink) -> list[Attached]:
 FINDERS = Finders(listen, scan_rs485, ask_bus)
 
 COMMAND_LINES: Final = ("/boot/firmware/cmdline.txt", "/boot/cmdline.txt")
-"""Of a Raspberry Pi, newer releases first."""
+"""Kernel command lines of a Raspberry Pi, newer releases first."""
 ALIASES: Final = ("serial0", "serial1")
-"""Names of UARTs on a Raspberry Pi."""
+"""Additional names of UARTs on a Raspberry Pi."""
 NETWORKS: Final = "/etc/systemd/network"
 NETWORKD: Final = "systemd-networkd.service"
 WAIT_ONLINE: Final = "systemd-networkd-wait-online.service"
 OTHERS: Final = (("NetworkManager.service", "NetworkManager"), ("networking.service", "ifupdown"))
-"""What else may manage the network: unit, and its name."""
+"""Other network managers: unit and name."""
 BITRATE_DEFAULT: Final = 500_000
 BITRATE_MAX: Final = 1_000_000
 VIRTUAL: Final = "/sys/devices/virtual/net"
 
 
 def free_console(at: Surroundings, node: str) -> tuple[list[Change], list[str]]:
-    """Return what takes the console off a UART, and what only its user can do. Raises ChangeRefused, OSError."""
+    """Return the changes that remove the console from a UART, and notes for the user. Raises ChangeRefused, OSError."""
     name = node.removeprefix("/dev/")
     changes: list[Change] = []
     notes: list[str] = []
@@ -339,12 +339,12 @@ def free_console(at: Surroundings, node: str) -> tuple[list[Change], list[str]]:
         before = content_of(at, file) or b""
         after = without_console(before.decode(), names).encode()
         if after != before:
-            changes.append(FileChange(f"no messages of the kernel on {node}, from the next start on", file, after))
-            notes.append("restart the machine afterwards: until then the kernel still writes messages to it")
+            changes.append(FileChange(f"no kernel messages on {node} after the next boot", file, after))
+            notes.append(f"reboot the host after setup: until then, the kernel writes messages to {node}")
     elif name in consoles:
         notes.append(
-            f"{node} stays a console of the kernel: take `console={name}` from the kernel's command line (often "
-            "GRUB_CMDLINE_LINUX in /etc/default/grub, then `update-grub`), and restart the machine"
+            f"{node} stays a console of the kernel: remove `console={name}` from the kernel command line (often "
+            "GRUB_CMDLINE_LINUX in /etc/default/grub, then `update-grub`), and reboot the host"
         )
     unit = f"serial-getty@{name}.service"
     active = state(at, unit, "is-active") == "active"
@@ -360,7 +360,7 @@ def free_console(at: Surroundings, node: str) -> tuple[list[Change], list[str]]:
 
 
 def without_console(line: str, names: set[str]) -> str:
-    """A kernel's command line without the consoles on these ports."""
+    """Return a kernel command line without the consoles on these ports."""
     words = line.split(" ")
     gone = [word for word in words if word.startswith("console=") and word.strip()[8:].partition(",")[0] in names]
     kept = [word for word in words if word not in gone]
@@ -369,45 +369,45 @@ def without_console(line: str, names: set[str]) -> str:
 
 
 def raise_can(at: Surroundings, name: str, bitrate: int) -> tuple[list[Change], list[str]]:
-    """Return what brings a CAN interface up now and at every start, and what is to be known.
+    """Return the changes that bring a CAN interface up now and at every boot, and notes for the user.
 
-    No change where a file says so already. Raises ChangeRefused, OSError.
+    Return no changes if another file already configures the interface. Raises ChangeRefused, OSError.
     """
     if name not in can_interfaces(at.at("/sys"), down=True):
         there = ", ".join(can_interfaces(at.at("/sys"), down=True)) or "none"
-        return [], [f"{name} is not there; CAN interfaces of this machine: {there}"]
+        return [], [f"{name} does not exist; CAN interfaces of this host: {there}"]
     path = f"{NETWORKS}/80-imud-{name}.network"
     own = network_file(name, 0 if at.at(f"{VIRTUAL}/{name}").exists() else bitrate)
     other = next((file for file in network_files(at) if file != path and _names(at, file, name)), None)
     if other is not None:
-        return [], [f"{name} is configured by {other}: it is left as it is; its bit rate is written there"]
+        return [], [f"{other} configures {name}, so imud does not change it; set the bit rate in this file"]
     if state(at, NETWORKD, "is-enabled") in ("", "not-found", "masked"):
-        return [], [f"systemd-networkd is not installed here, or masked: {name} is left as it is; docs/can.md"]
+        return [], [f"systemd-networkd is not installed or is masked, so imud does not change {name}; see docs/can.md"]
     changes: list[Change] = []
     notes: list[str] = []
     runs = state(at, NETWORKD, "is-active") == "active"
     if content_of(at, path) != own:
         then: tuple[Words, ...] = (("networkctl", "reload"),) if runs else ()
-        changes.append(FileChange(f"{name} comes up at every start", path, own, then))
+        changes.append(FileChange(f"bring {name} up at every boot", path, own, then))
     if not runs:
         manager = next((title for unit, title in OTHERS if state(at, unit, "is-active") == "active"), "")
         strangers = [file for file in network_files(at) if file != path]
         if strangers:
             notes.append(
-                f"systemd-networkd does not run, and would also use {', '.join(strangers)}: look at them, then "
+                f"systemd-networkd does not run, and would also use {', '.join(strangers)}: check these files, then "
                 f"`systemctl enable --now {NETWORKD}`"
             )
             return changes, notes
         if manager:
             notes.append(
-                f"{manager} manages the network here, but no CAN bit rates; systemd-networkd runs beside it, for "
-                f"{name} only"
+                f"{manager} manages the network, but cannot set CAN bit rates; systemd-networkd will run in addition, "
+                f"for {name} only"
             )
         changes += _enable_networkd(name)
     if changes:
         changes.append(
             CommandChange(
-                f"{name} comes up now", ("networkctl", "reconfigure", name), (("ip", "link", "set", name, "down"),),
+                f"bring {name} up now", ("networkctl", "reconfigure", name), (("ip", "link", "set", name, "down"),),
                 ("cat", f"/sys/class/net/{name}/flags"),
             )
         )  # fmt: skip
@@ -416,38 +416,38 @@ def raise_can(at: Surroundings, name: str, bitrate: int) -> tuple[list[Change], 
 
 def _enable_networkd(name: str) -> Sequence[Change]:
     enabled = CommandChange(
-        f"systemd-networkd brings {name} up", ("systemctl", "enable", "--now", NETWORKD),
+        f"start systemd-networkd for {name}", ("systemctl", "enable", "--now", NETWORKD),
         (("systemctl", "disable", "--now", NETWORKD, "systemd-networkd.socket"),),
         ("systemctl", "is-enabled", NETWORKD),
     )  # fmt: skip
     not_waited_for = CommandChange(
-        "the start of the machine does not wait for it", ("systemctl", "disable", WAIT_ONLINE), (),
+        "do not wait for systemd-networkd at boot", ("systemctl", "disable", WAIT_ONLINE), (),
         ("true",), optional=True,
     )  # fmt: skip
     return enabled, not_waited_for
 
 
 def network_file(name: str, bitrate: int) -> bytes:
-    """The .network file of an interface; 0 for a virtual one, which has no bit rate."""
-    lines = ["# Made by `imud setup`.", "[Match]", f"Name={name}", "", "[Link]", "RequiredForOnline=no"]
+    """Return the .network file of an interface. `bitrate`: 0 for a virtual interface."""
+    lines = ["# Created by `imud setup`.", "[Match]", f"Name={name}", "", "[Link]", "RequiredForOnline=no"]
     if bitrate:
         lines += ["", "[CAN]", f"BitRate={bitrate}", "RestartSec=100ms"]
     return ("\n".join(lines) + "\n").encode()
 
 
 def network_files(at: Surroundings) -> list[str]:
-    """The .network files of the administrator."""
+    """Return the .network files of the administrator."""
     return [at.outside(file) for file in sorted(at.at(NETWORKS).glob("*.network"))]
 
 
 def _names(at: Surroundings, file: str, name: str) -> bool:
-    """Whether a .network file is for this interface: `Name=` with patterns."""
+    """Return whether `Name=` in a .network file, with patterns, matches the interface."""
     lines = (line.partition("=") for line in (at.text(file) or "").splitlines())
     return any(fnmatch(name, one) for key, _, value in lines if key.strip() == "Name" for one in value.split())
 
 
 def state(at: Surroundings, unit: str, question: str) -> str:
-    """Answer of `systemctl is-active` or `is-enabled`; empty without systemd."""
+    """Return the output of `systemctl is-active` or `is-enabled`; empty without systemd."""
     try:
         return at.run(["systemctl", question, unit]).text.strip()
     except OSError:

@@ -1,7 +1,7 @@
-"""What is to be changed so that imud serves what was found: configuration, adapters, group, service.
+"""Plan of the changes of `imud setup`: configuration, udev rules of adapters, group, service.
 
-Devices are added, nothing is taken away: what a person wrote in the configuration stays. The one exception are the
-devices of the example that the package installs, which nobody wrote. A machine that is as it should be has no changes.
+The plan only adds devices to the configuration. It replaces only the device of the example configuration that the
+package installs. If the host is already set up, the plan contains no changes.
 """
 
 import re
@@ -20,28 +20,28 @@ from imud.config.yaml import YamlTree, plain, read_yaml
 from imud.model.errors import ImudError
 
 RULES: Final = "/etc/udev/rules.d/61-imud-setup.rules"
-RULES_HEAD: Final = "# Made by `imud setup` for the adapters of its devices; `imud setup --undo` removes it."
+RULES_HEAD: Final = "# Created by `imud setup` for the adapters of its devices; remove it with `imud setup --undo`."
 FTDI: Final = "ftdi_sio"
 MODEM_MANAGER: Final = "ModemManager.service"
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9_.:/ -]")
 
 
 class UsbAdapter(NamedTuple):
-    """The USB device that a serial port is of."""
+    """USB adapter of a serial port."""
 
     node: str
-    """Of the port, for example `ttyUSB0`."""
+    """Node of the port without its folder, for example `ttyUSB0`."""
     driver: str
-    """The kernel's driver of the port."""
+    """Kernel driver of the port."""
     vendor: str
-    """Number of the vendor, four hexadecimal digits."""
+    """USB vendor id, four hexadecimal digits."""
     product: str
     serial: str
-    """Serial number; empty where it has none."""
+    """Serial number; empty if the adapter has none."""
 
 
 def usb_adapter(at: Surroundings, node: str) -> UsbAdapter | None:
-    """Find the adapter of a port by its node; None for a port that is none of USB."""
+    """Return the adapter of a port; None if the port is not a USB port."""
     name = node.rpartition("/")[2]
     device = at.at(f"/sys/class/tty/{name}/device")
     if not device.exists():
@@ -58,7 +58,10 @@ def usb_adapter(at: Surroundings, node: str) -> UsbAdapter | None:
 
 
 def rules(at: Surroundings, adapters: Sequence[UsbAdapter]) -> FileChange | None:
-    """Return what these adapters need in the file of rules; None where it has all. Raises ChangeRefused, OSError."""
+    """Return the change of the udev rules for these adapters; None if no change is needed.
+
+    Raises ChangeRefused, OSError.
+    """
     before = (content_of(at, RULES) or b"").decode("utf-8", "replace")
     present = before.splitlines()
     ignore_modems = modem_manager_runs(at)
@@ -70,8 +73,8 @@ def rules(at: Surroundings, adapters: Sequence[UsbAdapter]) -> FileChange | None
     what = [
         words
         for word, words in (
-            ("latency_timer", "adapters send bytes after 1 ms"),
-            ("ID_MM_", "ModemManager leaves them alone"),
+            ("latency_timer", "set the latency timer of adapters to 1 ms"),
+            ("ID_MM_", "make ModemManager ignore adapters"),
         )
         if any(word in line for line in missing)
     ]
@@ -85,7 +88,7 @@ def rules(at: Surroundings, adapters: Sequence[UsbAdapter]) -> FileChange | None
 
 
 def modem_manager_runs(at: Surroundings) -> bool:
-    """Whether ModemManager runs, or will after the next start of the machine."""
+    """Return whether ModemManager runs, or will run after the next boot."""
     words = ["systemctl", "show", MODEM_MANAGER, "--property=LoadState,ActiveState,UnitFileState"]
     try:
         states = at.run(words).text.split()
@@ -108,38 +111,39 @@ def _lines(adapter: UsbAdapter, *, ignore_modems: bool) -> list[str]:
 
 
 def _pattern(text: str) -> str:
-    """A text as a pattern of udev: what means something there matches any character."""
+    """Return a text as a udev pattern. `?` replaces each special character."""
     return _UNSAFE.sub("?", text)
 
 
 Blocks = Mapping[str, Mapping[str, Any]]
-"""Keys of each device by its name."""
+"""Keys of each device, by name."""
 
 INDENT: Final = 2
 EXAMPLE: Final = {"imu": {"uart": {"port": "/dev/ttyUSB0"}}}
-"""The devices of etc/imud.yaml, which the package installs: nobody has written them."""
+"""Devices of etc/imud.yaml, the example that the package installs."""
 FILE_HEAD: Final = """\
-# Made by `imud setup`, yours to change: docs/configuration.md has every key.
-# `imud check FILE` says whether it is good, `systemctl reload imud` makes the daemon read it again.
+# Created by `imud setup`. You can change this file. docs/configuration.md describes every key.
+# Check the file with `imud check FILE`, then reload the daemon with `systemctl reload imud`.
 """
 _SAFE: Final = re.compile(r"[A-Za-z0-9_/.][A-Za-z0-9_/.:@+-]*")
 
 
 def is_example(content: bytes) -> bool:
-    """Whether the configuration has the devices of the example, as the package installs it, and no others."""
+    """Return whether the configuration contains exactly the devices of the installed example."""
     data = read_yaml(content).data
     return isinstance(data, dict) and data.get("devices") == EXAMPLE
 
 
 def device_names(content: bytes | None) -> list[str]:
-    """Names of all devices, disabled ones included."""
+    """Return the names of all devices, including disabled devices."""
     return list(_devices_of(read_yaml(content).data)) if content is not None else []
 
 
 def with_devices(content: bytes | None, blocks: Blocks, *, replace: str = "") -> bytes:
-    """Return the configuration with these devices, without the one named `replace`; None is no configuration yet.
+    """Return the configuration with these devices added and the device `replace` removed.
 
-    Raises ImudError with the block to paste where the text cannot be changed safely.
+    `content`: None if there is no configuration yet. Raises ImudError with the lines to add if imud cannot change the
+    text safely.
     """
     if content is None:
         return (FILE_HEAD + "devices:\n" + "\n".join(_block(blocks, INDENT)) + "\n").encode()
@@ -153,7 +157,7 @@ def with_devices(content: bytes | None, blocks: Blocks, *, replace: str = "") ->
     if not _has(changed, tree.data, {**wanted, **blocks}):
         paste = "\n".join(["devices:", *_block(blocks, INDENT)])
         raise ImudError(
-            f"the configuration is written in a way that only you can add to; add below `devices`:\n{paste}"
+            f"cannot add the devices to the configuration because of its YAML style; add these lines:\n{paste}"
         )
     return changed
 
@@ -164,7 +168,7 @@ def _devices_of(data: object) -> dict[str, Any]:
 
 
 def _has(content: bytes, before: object, devices: Mapping[str, object]) -> bool:
-    """Whether the text has these devices and everything else of `before`."""
+    """Return whether the text contains these devices and all other keys of `before`."""
     tree = read_yaml(content)
     others = {key: value for key, value in before.items() if key != "devices"} if isinstance(before, dict) else {}
     return not tree.problems and tree.data == {**others, "devices": devices}
@@ -210,7 +214,7 @@ def _keys(keys: Mapping[str, Any], column: int) -> list[str]:
 
 
 def _scalar(value: object) -> str:
-    """A value as YAML; text in quotes unless every reader takes it for text without them."""
+    """Format a value as YAML. Put a string in quotes if a reader could read it as another type."""
     if isinstance(value, str) and _SAFE.fullmatch(value):
         try:
             if plain(value) == value:
@@ -223,9 +227,9 @@ def _scalar(value: object) -> str:
 UNIT: Final = "imud.service"
 RELOAD: Final = ("systemctl", "try-reload-or-restart", UNIT)
 READERS: Final = "imud"
-"""Group that may read samples."""
+"""Group with the right to read samples."""
 CONTROLLERS: Final = "imud-control"
-"""Group that may also change settings of modules."""
+"""Group with the right to control devices."""
 SYSTEMD: Final = "/run/systemd/system"
 UDEV: Final = "/run/udev"
 EXAMPLE_NAME: Final = "imu"
@@ -234,7 +238,7 @@ EXAMPLE_NODE: Final = "/dev/ttyUSB0"
 
 @dataclass(frozen=True, slots=True)
 class SetupPlan:
-    """Changes in the order in which they are made, and what people should know of them."""
+    """Changes in the order of execution, and notes for the user."""
 
     changes: list[Change] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -242,31 +246,31 @@ class SetupPlan:
 
 @dataclass(frozen=True, slots=True)
 class Wishes:
-    """What the user decided."""
+    """Decisions of the user."""
 
     devices: Mapping[str, Attached]
     """Devices to add, by name."""
     user: str = ""
-    """The user that ran sudo; empty for none."""
+    """User of sudo; empty if there is none."""
     control: bool = False
-    """Whether that user may also change settings of modules."""
+    """Whether this user gets the right to control devices."""
     date: str = ""
-    """For the name of the backup, for example `2026-11-22T13-05-01`."""
+    """Date in the name of the backup, for example `2026-11-22T13-05-01`."""
 
 
 def real_path(at: Surroundings, path: str) -> str:
-    """Follow the links of a file's path; the configuration may be one, into a folder under version control."""
+    """Resolve symbolic links. The configuration can be a link to a folder under version control."""
     return at.outside(at.at(path).resolve())
 
 
 def example_is_untouched(at: Surroundings) -> bool:
-    """Whether the configuration is that of the package, and the daemon does not use it."""
+    """Return whether the configuration is the example of the package, and no daemon uses it."""
     content = content_of(at, real_path(at, str(at.config_file)))
     return content is not None and is_example(content) and at.status is None
 
 
 def proposed_names(found: Sequence[Attached], taken: Sequence[str]) -> list[str]:
-    """Return a name for each device: imu, imu2, imu3, without those that are taken."""
+    """Return a new name for each device: imu, imu2, imu3 and so on."""
     names: list[str] = []
     number = 1
     for _ in found:
@@ -277,7 +281,7 @@ def proposed_names(found: Sequence[Attached], taken: Sequence[str]) -> list[str]
 
 
 def plan(at: Surroundings, wishes: Wishes) -> SetupPlan:
-    """Plan all changes. Raises ImudError where the configuration cannot be added to, ChangeRefused, OSError."""
+    """Plan all changes. Raises ImudError if imud cannot change the configuration, ChangeRefused, OSError."""
     made = SetupPlan()
     _adapters(at, wishes, made)
     _configuration(at, wishes, made)
@@ -293,16 +297,16 @@ def _configuration(at: Surroundings, wishes: Wishes, made: SetupPlan) -> None:
     before = content_of(at, path)
     replace = EXAMPLE_NAME if example_is_untouched(at) else ""
     after = with_devices(before, {name: one.keys for name, one in wishes.devices.items()}, replace=replace)
-    config.parse(after, path)  # what is written is good
+    config.parse(after, path)  # raises ConfigError: never write an invalid file
     names = ", ".join(wishes.devices)
     if before is not None:
-        made.changes.append(FileChange(f"a copy of {path} as it is", f"{path}.{wishes.date}", before, copy_of=path))
+        made.changes.append(FileChange(f"backup of {path}", f"{path}.{wishes.date}", before, copy_of=path))
     then = (RELOAD,) if at.at(SYSTEMD).exists() and at.installed and service_reads(at) else ()
-    made.changes.append(FileChange(f"device{'s' if len(wishes.devices) > 1 else ''} {names}", path, after, then))
+    made.changes.append(FileChange(f"add device{'s' if len(wishes.devices) > 1 else ''} {names}", path, after, then))
 
 
 def used_adapters(at: Surroundings, wishes: Wishes) -> list[UsbAdapter]:
-    """The USB adapters of all devices, present and new."""
+    """Return the USB adapters of all configured and new devices."""
     paths = [getattr(one.link_settings, "port", "") or getattr(one.link_settings, "line", "")
              for one in (at.config.devices if at.config and not example_is_untouched(at) else ())]  # fmt: skip
     nodes = [real_path(at, path) for path in paths if path.startswith("/")]
@@ -314,7 +318,7 @@ def used_adapters(at: Surroundings, wishes: Wishes) -> list[UsbAdapter]:
 def _adapters(at: Surroundings, wishes: Wishes, made: SetupPlan) -> None:
     adapters = used_adapters(at, wishes)
     if adapters and not at.at(UDEV).exists():
-        made.notes.append("udev does not run: the latency timer of USB adapters is left as it is")
+        made.notes.append("udev does not run, so imud does not change the latency timer of USB adapters")
     elif adapters and (change := rules(at, adapters)) is not None:
         made.changes.append(change)
 
@@ -324,59 +328,59 @@ def _groups(at: Surroundings, wishes: Wishes, made: SetupPlan) -> None:
     groups = members(at)
     for name in wanted if wishes.user else ():
         if name not in groups:
-            made.notes.append(f"there is no group {name} here, so {wishes.user} is not made a member: docs/install.md")
+            made.notes.append(
+                f"the group {name} does not exist, so imud cannot add {wishes.user} to it: see docs/install.md"
+            )
         elif wishes.user not in groups[name]:
-            what = "may read samples" if name == READERS else "may change settings of modules"
+            right = "read samples" if name == READERS else "change device settings"
             words = ("usermod", "--append", "--groups", name, wishes.user)
             back = (("gpasswd", "--delete", wishes.user, name),)
             made.changes.append(
-                CommandChange(f"{wishes.user} {what}", words, back, ("getent", "group", name), optional=True)
+                CommandChange(f"allow {wishes.user} to {right}", words, back, ("getent", "group", name), optional=True)
             )
-            made.notes.append(f"{wishes.user} has to log in again before the group {name} counts")
+            made.notes.append(f"{wishes.user} must log in again before the group {name} takes effect")
 
 
 def members(at: Surroundings) -> dict[str, list[str]]:
-    """Members of each group of /etc/group by its name."""
+    """Return the members of each group in /etc/group, by name."""
     return {entry[0]: entry[3].split(",") for entry in entries(at, "group")}
 
 
 def _service(at: Surroundings, made: SetupPlan) -> None:
     if not at.at(SYSTEMD).exists():
-        made.notes.append("systemd does not run here, so no service is started: `imud run` runs the daemon")
+        made.notes.append("systemd does not run, so imud starts no service; start the daemon with `imud run`")
         return
     if not at.installed:
-        made.notes.append(f"systemd does not know {UNIT}, so nothing is started: docs/install.md has the steps")
+        made.notes.append(f"systemd does not know {UNIT}, so imud starts no service: see docs/install.md")
         return
     if not service_reads(at):
         made.notes.append(
-            f"{UNIT} reads another configuration than {at.config_file}, so it is left as it is: "
-            f"`imud run --config {at.config_file}` runs the daemon with this one"
+            f"{UNIT} uses another configuration than {at.config_file}, so imud does not change the service; start the "
+            f"daemon with `imud run --config {at.config_file}`"
         )
         return
     if (enabled := state(at, UNIT, "is-enabled")) != "enabled":
         if enabled == "masked":
-            raise ImudError(f"{UNIT} is masked: `sudo systemctl unmask {UNIT}` first")
+            raise ImudError(f"{UNIT} is masked; first run `sudo systemctl unmask {UNIT}`")
         words = ("systemctl", "enable", UNIT)
         back = (("systemctl", "disable", UNIT),)
-        made.changes.append(
-            CommandChange("imud starts with the machine", words, back, ("systemctl", "is-enabled", UNIT))
-        )
+        made.changes.append(CommandChange("start imud at every boot", words, back, ("systemctl", "is-enabled", UNIT)))
     if (activity := state(at, UNIT, "is-active")) != "active":
-        if activity == "failed":  # too many starts are refused for ten minutes else
+        if activity == "failed":  # otherwise systemd refuses further starts for ten minutes
             words = ("systemctl", "reset-failed", UNIT)
-            made.changes.append(CommandChange("its failures are forgotten", words, (), ("true",)))
+            made.changes.append(CommandChange("reset the failures of the service", words, (), ("true",)))
         words = ("systemctl", "restart", UNIT)
         back = (("systemctl", "stop", UNIT),)
-        made.changes.append(CommandChange("imud starts now", words, back, ("systemctl", "is-active", UNIT)))
+        made.changes.append(CommandChange("start imud now", words, back, ("systemctl", "is-active", UNIT)))
 
 
 def service_reads(at: Surroundings) -> bool:
-    """Whether the service runs with the configuration that is set up; True where its command line does not say."""
+    """Return whether the service uses this configuration. True if its command line contains no --config."""
     started = at.unit_value("ExecStart")
     return "--config" not in started or str(at.config_file) in started
 
 
 def present_names(at: Surroundings) -> list[str]:
-    """Names of the devices that the configuration has, without those of the example."""
+    """Return the names of the configured devices without the device of the example."""
     content = content_of(at, real_path(at, str(at.config_file)))
     return [] if example_is_untouched(at) else device_names(content)

@@ -1,8 +1,8 @@
-"""The course of `imud setup`: free the ports, look, propose, change, wait for samples; and all of it taken back.
+"""Steps of `imud setup`: make ports usable, search for devices, propose changes, make them, wait for samples; undo.
 
-Two rounds of changes, each announced and agreed before it is made: first what stands between imud and a port (a
-console, a CAN interface that is down), since what is behind it can only be seen afterwards; then configuration,
-adapters, group and service.
+There are two rounds of changes. imud prints the changes of a round and asks the user before it makes them. The first
+round removes consoles and brings CAN interfaces up, because imud can search these ports only after that. The second
+round changes the configuration, the udev rules of adapters, the group and the service.
 """
 
 import os
@@ -54,14 +54,14 @@ FOUND_HEAD: Final = ("PORT", "DRIVER", "RATE", "ADAPTER", "CONFIGURED")
 TITLE_WIDTH: Final = 16
 CONFIGURED_WIDTH: Final = 10
 ANSWERS_MAX: Final = 10
-"""Wrong answers to one question after which it is given up."""
+"""Maximum number of invalid answers to one question."""
 
 
 class Conversation:
-    """Standard output and the terminal. Synchronization: one thread."""
+    """Dialogue with the user on the terminal. Synchronization: one thread."""
 
     def __init__(self, *, ask: bool, silent: bool = False) -> None:
-        """Without `ask` every question has its default answer."""
+        """`ask`: if False, every question gets its default answer. `silent`: print nothing."""
         self.asks = ask
         self._silent = silent
 
@@ -74,35 +74,35 @@ class Conversation:
             )
 
     def show(self, lines: Sequence[str]) -> None:
-        """Print lines as they are: tables, lines of files."""
+        """Print lines without wrapping: tables, lines of files."""
         for line in lines if not self._silent else ():
             print(printable(line, MESSAGE_CHARACTERS_MAX))
 
     def agreed(self, question: str, *, default: bool) -> bool:
-        """Ask for yes or no. Raises BadArgument where there is no terminal to ask on."""
+        """Ask a yes-no question. Raises BadArgument if standard input is not a terminal."""
         if not self.asks:
             return default
         word = self.answer(f"{question} [{'Y/n' if default else 'y/N'}]", "y" if default else "n")
         return word.lower() in ("y", "yes")
 
     def answer(self, question: str, default: str) -> str:
-        """Ask for a word; an empty answer is the default. Raises BadArgument where there is no terminal to ask on."""
+        """Ask for a word; an empty answer is the default. Raises BadArgument if standard input is not a terminal."""
         if not self.asks:
             return default
         if not sys.stdin.isatty():
-            raise BadArgument("expected a terminal to ask on, or --yes")
+            raise BadArgument("cannot ask questions without a terminal; use --yes or --dry-run")
         try:
             return input(f"{question} ").strip() or default
         except KeyboardInterrupt:
-            self.show(["", "Nothing more was changed."])
+            self.show(["", "imud setup made no further changes."])
             raise
         except EOFError:
             self.show([""])
-            raise BadArgument("expected an answer, got the end of the input: nothing more was changed") from None
+            raise BadArgument("expected an answer, got the end of the input; imud made no further changes") from None
 
 
 def attached_table(found: Sequence[Attached]) -> list[str]:
-    """Format what is attached, and below it why nothing was found on a port."""
+    """Format the table of ports and devices, and the problems below it."""
     rows = [
         (
             one.node,
@@ -124,9 +124,9 @@ SAMPLES_HEAD: Final = ("DEVICE", "STATE", "RATE HZ", "PRODUCT", "CLOCK ERROR")
 NAME_WIDTH: Final = 24
 PRODUCT_WIDTH: Final = 20
 LOOK_S: Final = 0.5
-"""Time between two looks."""
+"""Time between two status requests, s."""
 SETTLE_S: Final = 4.0
-"""Time for the rate, a mean over seconds, and for the answer of the device to what it is."""
+"""Time until the rate, a mean over seconds, and the identity of a device are known, s."""
 
 
 def wait_for_samples(
@@ -136,9 +136,9 @@ def wait_for_samples(
     now_s: Callable[[], float],
     sleep: Callable[[float], None],
 ) -> list[DeviceStatus]:
-    """Wait until all devices of these names run, and SETTLE_S more; return their status, at `limit_s` whatever it is.
+    """Wait until these devices run, and SETTLE_S more, but at most `limit_s`. Return their status.
 
-    Raises ImudError where the daemon does not answer until then.
+    Raises ImudError if the daemon does not reply within `limit_s`.
     """
     end_s = now_s() + limit_s
     settled_s = end_s
@@ -153,25 +153,25 @@ def wait_for_samples(
         settled_s = min(settled_s, now + SETTLE_S) if runs else end_s
         if now >= min(end_s, settled_s):
             if problem is not None:
-                raise ImudError(f"the daemon does not answer: {problem}; `sudo imud doctor` says more")
+                raise ImudError(f"the daemon does not reply: {problem}; find the reason with `sudo imud doctor`")
             return found
         sleep(LOOK_S)
 
 
 def samples_table(found: Sequence[DeviceStatus]) -> str:
-    """Format rate, product and error of each device."""
+    """Format state, rate, product and time stamp error of each device."""
     return table(SAMPLES_HEAD, [_row(one) for one in found])
 
 
 def reasons(found: Sequence[DeviceStatus], names: Sequence[str]) -> list[str]:
-    """Say for each device of these names why it gives no samples; empty when all do."""
+    """Return the reason for each device without samples; empty if all devices send samples."""
     known = {one.name: one for one in found}
     return [_reason(name, known.get(name)) for name in names if name not in known or not _runs(known[name])]
 
 
 def _reason(name: str, one: DeviceStatus | None) -> str:
     return (
-        f"{name}: the daemon does not have it: `systemctl status imud`"
+        f"{name}: the daemon does not use this device: check `systemctl status imud`"
         if one is None
         else (f"{name}: {one.problem or one.state}")
     )
@@ -189,20 +189,20 @@ def _row(one: DeviceStatus) -> tuple[object, ...]:
 
 DONE, NOT_DONE = 0, 1
 CAN_UP_S: Final = 5.0
-"""Time that systemd-networkd gets to bring an interface up."""
+"""Time limit for systemd-networkd to bring an interface up, s."""
 CAN_LOOK_S: Final = 0.2
 NEXT: Final = (
-    "No sensor was found. Next steps:",
-    "  - Is it powered, are TX and RX crossed, is ground connected? Then run this again.",
-    "  - `imud probe --active PORT` also asks, and so finds modules that are silent.",
+    "imud found no device. Next steps:",
+    "  - Check power, ground, and TX to RX in both directions. Run imud setup again.",
+    "  - `imud probe --active PORT` sends requests, which finds silent devices.",
     "  - On RS-485: `sudo imud setup --rs485 PORT`. On I2C: `--i2c 1`. On SPI:",
     "    `--spi /dev/spidev0.0`. A CAN interface that is down: `--can can0=500000`.",
-    "  - `sudo imud doctor` looks for what is wrong with this machine.",
+    "  - `sudo imud doctor` finds problems of this host.",
 )
 
 
 class SetupSteps:
-    """One run. Synchronization: one thread."""
+    """One run of `imud setup`. Synchronization: one thread."""
 
     def __init__(
         self,
@@ -216,7 +216,7 @@ class SetupSteps:
         user: str,
         date: str,
     ) -> None:
-        """`look_around` gives the machine as it is now; `user` ran sudo, `date` is in the name of a backup."""
+        """`look_around` returns the current state of the host. `user`: user of sudo. `date`: suffix of backups."""
         self._look_around = look_around
         self._talk = talk
         self._finders = finders
@@ -229,14 +229,14 @@ class SetupSteps:
         self._status: list[DeviceStatus] = []
         self._changed = False
         self._freed: list[str] = []
-        """Nodes of ports that have a sensor in place of a console, as the user says."""
+        """Nodes of ports from which this run removes the console."""
 
-    # --- forwards -----------------------------------------------------------------------------------------------------
+    # --- set up -------------------------------------------------------------------------------------------------------
 
     def set_up(
         self, wanted: Wanted, can: Sequence[tuple[str, int]], *, control: bool = False, wait_s: float = 30.0
     ) -> int:
-        """Set up; DONE when samples come. Raises ImudError, OSError."""
+        """Set up the host. Return DONE if all devices send samples, otherwise NOT_DONE. Raises ImudError, OSError."""
         at = self._look_around()
         self._check_configuration(at)
         if wanted.places:
@@ -245,10 +245,10 @@ class SetupSteps:
             return NOT_DONE
         at = self._look_around()
         self._await_can([name for name, _ in can])
-        self._talk.say("Looking for sensors …")
+        self._talk.say("Searching for devices …")
         example = (EXAMPLE_NODE,) if example_is_untouched(at) else ()
         self._found = look(at, wanted, self._finders, example=example, freed=self._freed)
-        self._talk.show(attached_table(self._found) if self._found else ["no serial port and no CAN interface"])
+        self._talk.show(attached_table(self._found) if self._found else ["found no serial port and no CAN interface"])
         names = self._chosen(at)
         present = present_names(at)
         if not names and not present:
@@ -263,15 +263,15 @@ class SetupSteps:
 
     def _check_configuration(self, at: Surroundings) -> None:
         if at.config is None and at.at(real_path(at, str(at.config_file))).exists():
-            raise ConfigError(f"{at.config_problem}\ncorrect it, or move it away; nothing was changed")
+            raise ConfigError(f"{at.config_problem}\ncorrect or rename the file; imud changed nothing")
 
     def _ways(self, at: Surroundings, wanted: Wanted, can: Sequence[tuple[str, int]]) -> tuple[list[Change], list[str]]:
-        """What has to be freed before anything can be heard."""
+        """Return the changes that make ports and interfaces usable, and notes."""
         changes: list[Change] = []
         notes: list[str] = []
         for port in self._consoles(at, wanted):
             if port.node == own_terminal():
-                raise ImudError(f"{port.node} is the terminal that this runs on: use another one, for example ssh")
+                raise ImudError(f"imud setup runs on the terminal {port.node}; use another terminal, for example ssh")
             self._freed.append(port.node)
             more, words = free_console(at, port.node)
             changes += more
@@ -279,7 +279,7 @@ class SetupSteps:
         given = dict(can)
         for name in can_interfaces(at.at("/sys"), down=True) if not wanted.places else ():
             if self._talk.asks and name not in given and absence(name, at.at("/sys")):
-                question = f"The CAN interface {name} is down. Bring it up, now and at every start?"
+                question = f"The CAN interface {name} is down. Bring it up now and at every boot?"
                 if self._talk.agreed(question, default=False):
                     given[name] = 0
         for name, bitrate in given.items():
@@ -289,13 +289,13 @@ class SetupSteps:
         return changes, notes
 
     def _consoles(self, at: Surroundings, wanted: Wanted) -> list[PortNow]:
-        """Ports with a console or a login that a sensor is wired to, as the user says."""
+        """Return the ports with a console or a login to which a device is connected, according to the user."""
         named = {real_path(at, place) for place in (*wanted.places, *wanted.active) if place.startswith("/")}
         found = []
         for port in ports_now(at):
             if not (port.console or "getty" in port.holders):
                 continue
-            question = f"{port.node} has a console. Is a sensor wired to it, so that the console may go?"
+            question = f"{port.node} has a console. Is a device connected, so that imud can remove the console?"
             if port.node in named or (not named and self._talk.asks and self._talk.agreed(question, default=False)):
                 found.append(port)
         return found
@@ -306,7 +306,7 @@ class SetupSteps:
             if word.isdecimal() and 0 < int(word) <= BITRATE_MAX:
                 return int(word)
             self._talk.say(f"{word}: expected a whole number from 1 to {BITRATE_MAX}")
-        raise ImudError(f"expected a bit rate for {name}")
+        raise ImudError(f"expected a bit rate for {name}, got {ANSWERS_MAX} invalid answers; use --can {name}=BITRATE")
 
     def _await_can(self, names: Sequence[str]) -> None:
         end_s = self._now_s() + CAN_UP_S
@@ -315,23 +315,23 @@ class SetupSteps:
             self._sleep(CAN_LOOK_S)
 
     def _chosen(self, at: Surroundings) -> dict[str, Attached]:
-        """The devices to add, by the names that the user gives them."""
+        """Ask for the names of new devices. Return the devices to add, by name."""
         new = [one for one in self._found if one.driver and one.keys and not one.configured]
         taken = present_names(at)
         chosen: dict[str, Attached] = {}
         for one in new:
             (proposed,) = proposed_names([one], [*taken, *chosen])
             for _ in range(ANSWERS_MAX):
-                question = f"Name of {one.driver} {one.device} on {one.node}? (`-` leaves it out) [{proposed}]"
+                question = f"Name of {one.driver} {one.device} on {one.node}? (`-`: do not add) [{proposed}]"
                 name = self._talk.answer(" ".join(question.split()), proposed)
                 if name == "-":
                     break
                 if DEVICE_NAME.fullmatch(name) and name not in (*taken, *chosen):
                     chosen[name] = one
                     break
-                self._talk.say(f"{name}: expected a new name of a-z, 0-9, _ and -, at most 32 characters")
+                self._talk.say(f"{name}: expected an unused name of a-z, 0-9, _ and -, at most 32 characters")
             else:
-                self._talk.say(f"{one.node} is left out: {ANSWERS_MAX} answers were no new name")
+                self._talk.say(f"imud does not add {one.node} after {ANSWERS_MAX} invalid answers")
         return chosen
 
     def _may_control(self, at: Surroundings) -> bool:
@@ -339,12 +339,15 @@ class SetupSteps:
             return False
         if self._user in members(at).get(CONTROLLERS, [self._user]):
             return False
-        return self._talk.agreed(f"May {self._user} also change settings of modules (`imud command`)?", default=False)
+        return self._talk.agreed(f"Allow {self._user} to change device settings (`imud command`)?", default=False)
 
     # --- one round of changes -----------------------------------------------------------------------------------------
 
     def _round(self, changes: Sequence[Change], notes: Sequence[str]) -> bool:
-        """Tell, ask, make; False where the changes were not made. Raises ImudError, OSError."""
+        """Print the changes, ask the user, make the changes. Return False if imud did not make the changes.
+
+        Raises ImudError, OSError.
+        """
         at = self._look_around()
         if changes:
             self._talk.show(["", "Changes:"])
@@ -359,10 +362,10 @@ class SetupSteps:
         if not changes or self._dry_run:
             return True
         if at.uid != 0:
-            self._talk.show(["", "Nothing was changed: only root may. `sudo imud setup` makes the changes above."])
+            self._talk.show(["", "imud changed nothing: only root can. Make the changes with `sudo imud setup`."])
             return False
         if not self._talk.agreed("Make these changes?", default=True):
-            self._talk.say("nothing was changed")
+            self._talk.say("imud changed nothing")
             return False
         with locked(at):
             journal = Journal(at, self._talk.say)
@@ -371,19 +374,19 @@ class SetupSteps:
                 notes = journal.carry_out(changes)
             except (ImudError, OSError, KeyboardInterrupt):
                 done = sum(record.done for record in journal.records[before:])
-                self._talk.say(f"{done} of {len(changes)} changes were made; `sudo imud setup --undo` takes them back")
+                self._talk.say(f"imud made {done} of {len(changes)} changes; undo: `sudo imud setup --undo`")
                 raise
         self._changed = True
         for note in notes:
             self._talk.say(f"note: {note}", indent="      ")
-        self._talk.say(f"done; recorded in {FILE}, `sudo imud setup --undo` takes it back")
+        self._talk.say(f"done; recorded in {FILE}; undo: `sudo imud setup --undo`")
         return True
 
     def _samples(self, wait_s: float) -> int:
-        """Wait for samples and show them."""
+        """Wait for samples. Print the state of the devices. Return the exit status."""
         at = self._look_around()
         if not self._announced:
-            self._talk.say("Nothing to change.")
+            self._talk.say("No changes needed.")
         names = [device.name for device in at.config.devices] if at.config else []
         if not at.at(SYSTEMD).exists() or not service_reads(at) or state(at, UNIT, "is-active") != "active":
             return DONE
@@ -396,51 +399,51 @@ class SetupSteps:
         for reason in silent:
             self._talk.say(reason, indent="  ")
         if silent:
-            self._talk.say("`sudo imud doctor` says what to do next")
+            self._talk.say("Find the reason and the next step with `sudo imud doctor`.")
             return NOT_DONE
-        self._talk.say("Samples come. `imud watch` prints them, `imud status` says how they are.")
+        self._talk.say("All devices send samples. `imud watch` prints them, `imud status` prints their state.")
         return DONE
 
     def as_json(self) -> bytes:
-        """All that was found and done, for programs."""
+        """Return the found devices, the changes and the device states as JSON."""
         found: dict[str, Any] = {
             "found": self._found, "changes": self._announced, "made": self._changed, "notes": self._notes,
             "devices": self._status,
         }  # fmt: skip
         return msgspec.json.encode(found)
 
-    # --- backwards ----------------------------------------------------------------------------------------------------
+    # --- undo ---------------------------------------------------------------------------------------------------------
 
     def undo(self) -> int:
-        """Take back all changes; DONE when none is left. Raises ImudError, OSError."""
+        """Undo all changes. Return DONE if no change is left. Raises ImudError, OSError."""
         at = self._look_around()
         if at.uid != 0:
-            raise ImudError("only root may take changes back: `sudo imud setup --undo`")
+            raise ImudError("only root can undo changes; use `sudo imud setup --undo`")
         with locked(at):
             journal = Journal(at, self._talk.say)
             if not journal.records:
-                self._talk.say("nothing to take back: imud setup has changed nothing here")
+                self._talk.say("there are no changes to undo")
                 return DONE
-            self._talk.show(["Will be taken back, the newest first:"])
+            self._talk.show(["Undo, newest change first:"])
             for record in reversed(journal.records):
                 self._talk.show([f"  - {line}" for line in describe_undo(record)])
             if self._dry_run:
                 return DONE
-            if not self._talk.agreed("Take these changes back?", default=True):
-                self._talk.say("nothing was changed")
+            if not self._talk.agreed("Undo these changes?", default=True):
+                self._talk.say("imud changed nothing")
                 return NOT_DONE
             refused = journal.take_back()
         for reason in refused:
-            self._talk.say(f"not taken back: {reason}", indent="  ")
+            self._talk.say(f"not undone: {reason}", indent="  ")
         if refused:
-            self._talk.say("The rest was taken back. Run `sudo imud setup --undo` again when that is settled.")
+            self._talk.say("imud undid the other changes. Solve the problems, then run `sudo imud setup --undo` again.")
             return NOT_DONE
-        self._talk.say("Everything is as it was before `imud setup`.")
+        self._talk.say("imud undid all changes of `imud setup`.")
         return DONE
 
 
 def own_terminal() -> str:
-    """The node of the terminal that this program runs on; empty without one."""
+    """Return the node of the terminal of this program; empty without a terminal."""
     try:
         return os.ttyname(sys.stdin.fileno())
     except (OSError, ValueError):

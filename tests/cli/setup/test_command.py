@@ -24,8 +24,8 @@ def test_names_with_a_rate() -> None:
 
 def test_arguments_that_do_not_go_together(cli: Cli) -> None:
     for words, reason in [
-        (["--json"], "expected --yes or --dry-run"),
-        (["--json", "--yes", "--undo"], "expected it without --undo"),
+        (["--json"], "add --yes or --dry-run"),
+        (["--json", "--yes", "--undo"], "omit --undo"),
         (["--yes", "--can", "can0"], "expected the bit rate"),
         (["--yes", "--can", "can0=2000000"], "expected for example can0=500000"),
         (["--yes", "--can", "../x=500000"], "expected for example can0=500000"),

@@ -40,7 +40,7 @@ def test_a_port_that_is_asked_by_modbus_is_not_listened_to(gateway: LivingMachin
 
 def test_modem_manager_lets_go_of_a_port(gateway: LivingMachine, attachments: Attachments) -> None:
     gateway.hold("ttyUSB0", "ModemManager")
-    assert "run this again" in found(gateway, attachments)[0].problem
+    assert "run imud setup again" in found(gateway, attachments)[0].problem
 
 
 def test_a_configured_port_is_shown_with_what_the_daemon_says(gateway: LivingMachine, attachments: Attachments) -> None:
@@ -105,11 +105,11 @@ def test_what_is_named_and_not_there_is_said_to_be(gateway: LivingMachine, attac
     gateway.write("/etc/passwd")
     wanted = Wanted((USB0, "ttyUSB1", "can7", "/etc/passwd"), active=("/dev/ttyUSB9",))
     problems = {one.place: one.problem for one in found(gateway, attachments, wanted)}
-    missing = "it is not there: is it plugged in, and is the name right?"
+    missing = "no such port or interface: is the adapter plugged in, is the name correct?"
     assert problems == {
         USB0: "nothing is heard",
         "ttyUSB1": missing,
         "can7": missing,
         "/dev/ttyUSB9": missing,
-        "/etc/passwd": "it is no serial port with hardware behind it",
+        "/etc/passwd": "this is not a serial port of a hardware device",
     }

@@ -33,7 +33,7 @@ def test_only_the_consoles_of_the_port_leave_the_command_line(machine: LivingMac
     machine.write("/boot/cmdline.txt", "console=ttyAMA0,115200 root=/dev/x\n")
     changes, notes = free_console(machine.surroundings(), "/dev/ttyAMA0")
     assert [one.path for one in changes if isinstance(one, FileChange)] == ["/boot/cmdline.txt"]
-    assert "restart the machine" in notes[0]
+    assert "reboot the host" in notes[0]
 
 
 def test_an_alias_of_another_port_keeps_its_console(machine: LivingMachine) -> None:
@@ -48,7 +48,7 @@ def test_elsewhere_the_boot_loader_is_left_alone_and_the_login_ends(machine: Liv
     machine.uart("ttyS0", console=True)
     changes, notes = free_console(machine.surroundings(), "/dev/ttyS0")
     assert commands(changes) == ["systemctl mask --now serial-getty@ttyS0.service"]
-    assert "take `console=ttyS0` from the kernel's command line" in notes[0]
+    assert "remove `console=ttyS0` from the kernel command line" in notes[0]
     machine.units["serial-getty@ttyS0.service"] = ["masked", "inactive"]
     assert free_console(machine.surroundings(), "/dev/ttyS0")[0] == []
 
@@ -73,7 +73,7 @@ def test_networkd_is_enabled_beside_others_and_that_is_said(bus: LivingMachine, 
     assert commands(changes)[0] == "systemctl enable --now systemd-networkd.service"
     assert commands(changes)[1] == "systemctl disable systemd-networkd-wait-online.service"
     assert [one.optional for one in changes if isinstance(one, CommandChange)] == [False, True, False]
-    assert notes[0].startswith(f"{name} manages the network here")
+    assert notes[0].startswith(f"{name} manages the network")
 
 
 def test_networkd_is_not_enabled_where_it_would_use_more(bus: LivingMachine) -> None:
@@ -88,12 +88,12 @@ def test_a_file_of_the_administrator_is_left(bus: LivingMachine) -> None:
     bus.write("/etc/systemd/network/can.network", "[Match]\nName=vcan* can*\n")
     changes, notes = raise_can(bus.surroundings(), "can0", 500_000)
     assert changes == []
-    assert "is configured by /etc/systemd/network/can.network" in notes[0]
+    assert "/etc/systemd/network/can.network configures" in notes[0]
 
 
 def test_without_networkd_or_interface_nothing_is_changed(bus: LivingMachine) -> None:
     assert raise_can(bus.surroundings(), "can1", 500_000)[1] == [
-        "can1 is not there; CAN interfaces of this machine: can0"
+        "can1 does not exist; CAN interfaces of this host: can0"
     ]
     del bus.units["systemd-networkd.service"]
     changes, notes = raise_can(bus.surroundings(), "can0", 500_000)

@@ -45,7 +45,7 @@ def test_a_block_goes_behind_the_key_or_is_left_to_the_person() -> None:
         assert isinstance(old, dict)
         assert new == {**old, "devices": {**(old.get("devices") or {}), **NEW}}
     for before in ["devices: {bow: {uart: {port: /dev/ttyS0}}}\n", "{devices: {}}\n", "- a\n"]:
-        with pytest.raises(ImudError, match="only you can add") as refused:
+        with pytest.raises(ImudError, match="cannot add the devices") as refused:
             with_devices(before.encode(), NEW)
         assert BLOCK.rstrip() in str(refused.value)
 

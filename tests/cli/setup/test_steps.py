@@ -36,7 +36,14 @@ def test_a_new_gateway_is_set_up_and_taken_back(gateway: LivingMachine, setup: S
     before = gateway.files()
     assert setup.steps(user="ann").set_up(PORT, ()) == 0
     out = setup.said()
-    for words in ("/dev/ttyUSB0 hipnuc-uart", f"+ port: {BY_ID}", "999.5", "HI13", "0.045 ms", "Samples come."):
+    for words in (
+        "/dev/ttyUSB0 hipnuc-uart",
+        f"+ port: {BY_ID}",
+        "999.5",
+        "HI13",
+        "0.045 ms",
+        "All devices send samples.",
+    ):
         assert words in out, words
     text = (gateway.root / "etc/imud.yaml").read_text()
     (imu,) = config.parse(text, "imud.yaml").devices
@@ -50,11 +57,11 @@ def test_a_new_gateway_is_set_up_and_taken_back(gateway: LivingMachine, setup: S
     assert "imud:x:990:ann\n" in (gateway.root / "etc/group").read_text()
 
     assert setup.steps().undo() == 0
-    assert "Everything is as it was" in setup.said()
+    assert "imud undid all changes" in setup.said()
     assert gateway.files() == before
     assert gateway.units["imud.service"] == ["disabled", "inactive"]
     assert setup.steps().undo() == 0
-    assert "nothing to take back" in setup.said()
+    assert "there are no changes to undo" in setup.said()
 
 
 def test_a_second_run_changes_nothing(gateway: LivingMachine, setup: Setup) -> None:
@@ -64,7 +71,7 @@ def test_a_second_run_changes_nothing(gateway: LivingMachine, setup: Setup) -> N
     setup.said()
     assert setup.steps(user="ann", date="LATER").set_up(PORT, ()) == 0
     out = setup.said()
-    assert "Nothing to change." in out
+    assert "No changes needed." in out
     assert "Changes:" not in out
     assert setup.attachments.listened == []  # the daemon has the port
     assert (gateway.files(), gateway.ran) == (before, ran)
@@ -146,7 +153,7 @@ def test_nothing_attached(machine: LivingMachine, setup: Setup) -> None:
     assert setup.steps(user="ann").set_up(PORT, ()) == 1
     out = setup.said()
     assert "no serial port and no CAN interface" in out
-    assert "No sensor was found. Next steps:" in out
+    assert "imud found no device. Next steps:" in out
     assert "imud doctor" in out
     assert (machine.files(), machine.ran) == (before, [])
 
@@ -157,7 +164,7 @@ def test_a_user_without_rights_is_told_what_would_be_done(gateway: LivingMachine
     assert setup.steps().set_up(PORT, ()) == 1
     out = setup.said()
     assert "systemctl enable imud.service" in out
-    assert "Nothing was changed: only root may." in out
+    assert "imud changed nothing: only root can." in out
     assert gateway.files() == before
     with pytest.raises(ImudError, match="only root"):
         setup.steps().undo()
@@ -167,7 +174,7 @@ def test_without_systemd_the_configuration_is_written(gateway: LivingMachine, se
     shutil.rmtree(gateway.root / "run")
     assert setup.steps().set_up(PORT, ()) == 0
     out = setup.said()
-    assert "systemd does not run here, so no service is started" in out
+    assert "systemd does not run, so imud starts no service" in out
     assert "udev does not run" in out
     assert BY_ID in (gateway.root / "etc/imud.yaml").read_text()
     assert gateway.ran == []
@@ -190,7 +197,7 @@ def test_a_service_with_another_configuration_is_left_as_it_is(
     gateway.status = []
     assert setup.steps().set_up(PORT, ()) == 0
     out = setup.said()
-    assert "imud.service reads another configuration than /etc/imud.yaml, so it is left as it is" in out
+    assert "imud.service uses another configuration than /etc/imud.yaml, so imud does not change the service" in out
     assert gateway.units["imud.service"] == ["disabled", activity]
     assert not any("systemctl" in line for line in gateway.ran)
 
@@ -204,10 +211,10 @@ def test_a_service_that_is_not_known_is_told(gateway: LivingMachine, setup: Setu
 @pytest.mark.parametrize(
     ("program", "note"),
     [
-        ("udevadm", "note: `udevadm control --reload` could not be run: No such file or directory"),
-        ("usermod", "note: `usermod --append --groups imud ann` could not be run: No such file"),
-        ("getent", "Samples come."),
-        ("systemctl", "note: systemd does not know imud.service, so nothing is started"),
+        ("udevadm", "note: cannot run `udevadm control --reload`: No such file or directory"),
+        ("usermod", "note: cannot run `usermod --append --groups imud ann`: No such file"),
+        ("getent", "All devices send samples."),
+        ("systemctl", "note: systemd does not know imud.service, so imud starts no service"),
     ],
 )
 def test_a_missing_program_is_told_and_the_rest_is_done(
@@ -226,13 +233,13 @@ def test_a_missing_program_is_told_and_the_rest_is_done(
 def test_a_masked_service_and_a_missing_group_are_told(gateway: LivingMachine, setup: Setup) -> None:
     gateway.write("/etc/group", "root:x:0:\n")
     gateway.units["imud.service"] = ["masked", "inactive"]
-    with pytest.raises(ImudError, match=r"imud.service is masked: `sudo systemctl unmask imud.service` first"):
+    with pytest.raises(ImudError, match=r"imud.service is masked; first run `sudo systemctl unmask imud.service`"):
         setup.steps(user="ann").set_up(PORT, ())
     gateway.units["imud.service"] = ["disabled", "inactive"]
     assert setup.steps(user="ann").set_up(PORT, (), control=True) == 0
     said = setup.said()
     for name in ("imud", "imud-control"):
-        assert f"there is no group {name} here, so ann is not made a member" in said
+        assert f"the group {name} does not exist, so imud cannot add ann to it" in said
 
 
 def test_control_and_wait_have_an_effect(gateway: LivingMachine, setup: Setup) -> None:
@@ -242,12 +249,12 @@ def test_control_and_wait_have_an_effect(gateway: LivingMachine, setup: Setup) -
     assert 7 <= setup.time_s < 9
     said = setup.said()
     assert "imu: nothing is heard" in said
-    assert "`sudo imud doctor` says what to do next" in said
+    assert "the next step with `sudo imud doctor`" in said
 
 
 def test_a_file_that_is_too_large_is_not_changed(gateway: LivingMachine, setup: Setup) -> None:
     gateway.write("/etc/udev/rules.d/61-imud-setup.rules", "#" * (1 << 20) + "\n")
-    with pytest.raises(ImudError, match="expected at most 1048576 bytes, got more: imud setup does not change it"):
+    with pytest.raises(ImudError, match="expected at most 1048576 bytes, got more"):
         setup.steps().set_up(PORT, ())
     assert gateway.ran == []
 
@@ -268,7 +275,7 @@ def test_undo_leaves_what_is_already_as_before(gateway: LivingMachine, setup: Se
 def test_questions_name_and_leave_out(gateway: LivingMachine, setup: Setup, answers: dict[str, str]) -> None:
     gateway.usb_port("ttyUSB1", "usb-B", serial="B")
     setup.attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
-    answers |= {"on /dev/ttyUSB0?": "-", "on /dev/ttyUSB1?": "mast", "also change": "y"}
+    answers |= {"on /dev/ttyUSB0?": "-", "on /dev/ttyUSB1?": "mast", "to change device": "y"}
     gateway.status = [device("mast")]
     assert setup.steps(ask=True, user="ann").set_up(PORT, ()) == 0
     assert [one.name for one in config.load(gateway.root / "etc/imud.yaml").devices] == ["mast"]
@@ -291,7 +298,7 @@ def test_a_device_without_a_usable_name_is_left_out_and_that_is_said(
 ) -> None:
     answers["on /dev/ttyUSB0?"] = "My Sensor"
     assert setup.steps(ask=True).set_up(PORT, ()) == 1
-    assert "/dev/ttyUSB0 is left out: 10 answers were no new name" in setup.said()
+    assert "imud does not add /dev/ttyUSB0 after 10 invalid answers" in setup.said()
 
 
 def test_a_bit_rate_that_is_none_is_explained(gateway: LivingMachine, setup: Setup, answers: dict[str, str]) -> None:
@@ -309,10 +316,10 @@ def test_a_no_changes_nothing(gateway: LivingMachine, setup: Setup, answers: dic
     assert (gateway.files(), gateway.ran) == (before, [])
     setup.steps().set_up(PORT, ())
     after = gateway.files()
-    answers["Take these changes back?"] = "n"
+    answers["Undo these changes?"] = "n"
     assert setup.steps(ask=True).undo() == 1
     assert setup.steps(dry_run=True).undo() == 0
-    assert "Will be taken back, the newest first:" in setup.said()
+    assert "Undo, newest change first:" in setup.said()
     assert gateway.files() == after
 
 
@@ -331,8 +338,8 @@ def test_ports_of_others_and_consoles_are_not_opened(gateway: LivingMachine, set
     assert setup.steps().set_up(PORT, ()) == 1
     assert setup.attachments.listened == []
     out = setup.said()
-    assert "it is in use by gpsd (pid 10)" in out
-    assert "a console of the kernel is on it" in out
+    assert "in use by gpsd (pid 10)" in out
+    assert "the port is a console of the kernel" in out
 
 
 def test_a_console_is_taken_off_the_port_that_is_named(gateway: LivingMachine, setup: Setup) -> None:
@@ -347,7 +354,7 @@ def test_a_console_is_taken_off_the_port_that_is_named(gateway: LivingMachine, s
     assert (gateway.root / "boot/firmware/cmdline.txt").read_text() == line.removeprefix("console=serial0,115200 ")
     assert gateway.units["serial-getty@ttyAMA0.service"] == ["masked", "inactive"]
     assert setup.attachments.listened == ["/dev/ttyAMA0"]
-    assert "restart the machine" in setup.said()
+    assert "reboot the host" in setup.said()
     assert setup.steps().undo() == 0
     assert gateway.files() == before
     assert gateway.units["serial-getty@ttyAMA0.service"] == ["disabled", "active"]
@@ -438,15 +445,15 @@ def test_a_full_disk_stops_before_the_change_that_could_not_be_recorded(
     count = [0]
 
     def full(path: Path, content: bytes, **more: object) -> None:
-        count[0] += 1
-        if count[0] == 7:
+        count[0] += path.name == "journal.json"
+        if count[0] == 5:
             raise OSError(28, "No space left on device", str(path))
         replace(path, content, **more)  # type: ignore[arg-type]
 
     monkeypatch.setattr(journal, "replace_file", full)
     with pytest.raises(OSError, match="No space"):
         setup.steps().set_up(PORT, ())
-    assert "2 of 5 changes were made; `sudo imud setup --undo` takes them back" in setup.said()
+    assert "imud made 2 of 5 changes; undo: `sudo imud setup --undo`" in setup.said()
     assert (gateway.root / "etc/imud.yaml").read_text() == EXAMPLE
     monkeypatch.undo()
     assert setup.steps().undo() == 0
@@ -459,7 +466,7 @@ def test_a_file_changed_since_is_left_and_the_rest_taken_back(gateway: LivingMac
     gateway.write("/etc/imud.yaml", mine)
     assert setup.steps().undo() == 1
     out = setup.said()
-    assert "not taken back: /etc/imud.yaml was changed since `imud setup` wrote it: it is left as it is" in out
+    assert "not undone: /etc/imud.yaml was changed after `imud setup` wrote it, so imud does not change it" in out
     assert (gateway.root / "etc/imud.yaml").read_text() == mine
     assert gateway.units["imud.service"] == ["disabled", "inactive"]
     assert not (gateway.root / "etc/udev/rules.d/61-imud-setup.rules").exists()
@@ -480,7 +487,7 @@ def test_the_former_content_of_a_file_that_is_left_stays_to_be_put_back(
         file.unlink()
     assert setup.steps().undo() == 1
     out = setup.said()
-    assert "/etc/imud.yaml.DATE stays, since it has the former content of /etc/imud.yaml" in out
+    assert "imud keeps /etc/imud.yaml.DATE, the backup of /etc/imud.yaml" in out
     shutil.copy2(copy, file)  # the person settles it
     assert setup.steps().undo() == 0
     assert gateway.files() == before
@@ -494,7 +501,7 @@ def test_what_two_runs_changed_and_a_person_since_is_named_once(gateway: LivingM
     gateway.write("/etc/imud.yaml", "devices: {}\n")
     setup.said()
     assert setup.steps().undo() == 1
-    assert setup.said().count("/etc/imud.yaml was changed since") == 1
+    assert setup.said().count("/etc/imud.yaml was changed after") == 1
 
 
 def test_a_link_in_place_of_the_configuration_is_followed(gateway: LivingMachine, setup: Setup) -> None:
@@ -519,7 +526,7 @@ def test_a_command_that_fails_ends_it_and_what_was_done_is_told(gateway: LivingM
     gateway.failing["systemctl restart"] = "Job for imud.service failed."
     with pytest.raises(ImudError, match=r"`systemctl restart imud.service` failed: Job for imud.service failed\."):
         setup.steps().set_up(PORT, ())
-    assert "4 of 5 changes were made" in setup.said()
+    assert "imud made 4 of 5 changes" in setup.said()
     gateway.failing.clear()
     assert setup.steps().undo() == 0
     assert gateway.units["imud.service"] == ["disabled", "inactive"]
@@ -539,7 +546,7 @@ def test_two_at_a_time_are_refused(gateway: LivingMachine, setup: Setup) -> None
 
 def test_a_journal_that_nobody_can_read_is_an_error(gateway: LivingMachine, setup: Setup) -> None:
     gateway.write("/var/lib/imud-setup/journal.json", "[")
-    with pytest.raises(ImudError, match="not what imud wrote"):
+    with pytest.raises(ImudError, match="cannot read the journal"):
         setup.steps().undo()
 
 

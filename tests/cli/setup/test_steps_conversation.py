@@ -54,7 +54,7 @@ def test_an_interrupted_question_ends_it_with_a_word(
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
     with pytest.raises(KeyboardInterrupt):
         Conversation(ask=True).agreed("Sure?", default=True)
-    assert capsys.readouterr().out == "\nNothing more was changed.\n"
+    assert capsys.readouterr().out == "\nimud setup made no further changes.\n"
 
 
 def test_the_table_has_80_columns() -> None:

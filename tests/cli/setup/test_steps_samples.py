@@ -38,14 +38,14 @@ def test_a_daemon_that_never_answers_is_an_error() -> None:
     def gone(_: float) -> Sequence[DeviceStatus]:
         raise LinkMissing("no daemon")
 
-    with pytest.raises(ImudError, match="does not answer: no daemon"):
+    with pytest.raises(ImudError, match="does not reply: no daemon"):
         waited(gone, ["bow"])
 
 
 def test_reasons_and_table() -> None:
     assert reasons([device("bow")], ["bow"]) == []
     assert reasons([SEARCHING, device("mast")], ["bow", "mast", "keel"]) == [
-        "bow: nothing is heard", "keel: the daemon does not have it: `systemctl status imud`",
+        "bow: nothing is heard", "keel: the daemon does not use this device: check `systemctl status imud`",
     ]  # fmt: skip
     head, bow, mast = samples_table(
         [device("bow"), device("mast", state=DeviceState.MISSING, identity={})]
