@@ -1,8 +1,8 @@
-"""Noise of the sensors of a device that lies still: deviation, coefficients, density, drift with temperature.
+"""Noise of a device at rest: Allan deviation, coefficients, noise density, drift with temperature.
 
-What limits it is found first: the rate by the stamps, the missing samples (`series`), and the frequency above which the
-device's own low-pass filter takes the noise away. Below the τ that belongs to it the Allan deviation is that of the
-filter, so the coefficients are fitted from there on.
+The low-pass filter of the device removes noise above its corner frequency. At small τ, the Allan deviation shows the
+filter, not the sensor. Therefore imud first finds the corner frequency and fits the coefficients at larger τ only.
+Reference: NIST Special Publication 1065 (SP 1065).
 """
 
 from collections.abc import Sequence
@@ -19,50 +19,51 @@ from imud.analysis.spectrum import Spectrum, power_spectrum
 from imud.model.errors import BadArgument
 
 CONFIDENCE: Final = 0.683
-"""Share of intervals that hold the truth: one sigma."""
+"""Probability of the confidence intervals: one sigma."""
 PER_DECADE: Final = 12
+"""Number of τ per decade."""
 PARTS_LEAST: Final = 3
-"""The longest τ is this part of the longest run: beyond it there is hardly a degree of freedom."""
+"""Length of the longest run divided by the largest τ. A larger τ has about one degree of freedom."""
 CLUSTERS_LEAST: Final = 60
-"""Averages that the type of noise needs: with 30 (SP 1065, 5.5.6) its power is known to 0.4, often rounded wrong."""
+"""Minimum number of averages to find the noise type. With 30 (SP 1065, 5.5.6), the error of the power is 0.4."""
 DIFFERENCES_MOST: Final = 2
 
 
 class NoiseType(IntEnum):
-    """Types of noise of a rate by the power α of its spectrum, S(f) ∝ f^α."""
+    """Noise type of a rate. The value is the power α of the spectrum, S(f) ∝ f^α."""
 
     RATE_RANDOM_WALK = -2
-    """Slope +1/2 of the deviation."""
+    """Slope of the deviation: +1/2."""
     FLICKER = -1
     """Bias instability, slope 0."""
     WHITE = 0
     """Angle or velocity random walk, slope -1/2."""
     FLICKER_PHASE = 1
     QUANTISATION = 2
-    """Slope -1."""
+    """Slope of the deviation: -1."""
 
 
 class AllanCurve(NamedTuple):
-    """The deviation of three axes over τ; k values of τ."""
+    """Allan deviation of all axes over k values of τ."""
 
     tau_s: FloatArray
-    """(k,)"""
+    """Averaging times, s, shape (k,)."""
     factors: IntArray
-    """(k,) samples per average."""
+    """Number of samples per average, shape (k,)."""
     deviation: FloatArray
-    """(k, axes), unit of the rate."""
+    """Deviation in the unit of the rate, shape (k, axes)."""
     low: FloatArray
-    """(k, axes), lower end of the confidence interval."""
+    """Lower ends of the confidence intervals, shape (k, axes)."""
     high: FloatArray
-    """(k, axes), upper end."""
+    """Upper ends of the confidence intervals, shape (k, axes)."""
     freedom: FloatArray
-    """(k, axes), equivalent degrees of freedom."""
+    """Equivalent degrees of freedom, shape (k, axes)."""
     types: IntArray
-    """(k, axes), NoiseType."""
+    """Noise types (NoiseType), shape (k, axes)."""
 
 
 def averaging_factors(longest: int) -> IntArray:
-    """Numbers of samples per average: PER_DECADE, evenly in the logarithm, up to a third of the longest run."""
+    """Return the numbers of samples per average, PER_DECADE per decade, up to a third of the longest run."""
     most = longest // PARTS_LEAST
     if most < 1:
         raise BadArgument(f"expected a run of at least {PARTS_LEAST} samples, got {longest}")
@@ -71,9 +72,9 @@ def averaging_factors(longest: int) -> IntArray:
 
 
 def allan_curve(runs: Sequence[FloatArray], rate_hz: float, factors: IntArray | None = None) -> AllanCurve:
-    """Deviation of even runs, each (m, axes) at `rate_hz`, over all of them: no average reaches across a gap.
+    """Return the overlapping Allan deviation of runs of the shape (m, axes) at `rate_hz`.
 
-    Raises BadArgument where no run is long enough.
+    No average contains samples of two runs. Raises BadArgument if no run is long enough.
     """
     longest = max(runs, key=len)
     factors = averaging_factors(len(longest)) if factors is None else factors
@@ -93,13 +94,14 @@ def allan_curve(runs: Sequence[FloatArray], rate_hz: float, factors: IntArray | 
 
 
 def _phase(run: FloatArray, rate_hz: float) -> FloatArray:
-    """Integral of a run, (m + 1, axes); without its mean, of which sums of floats would suffer."""
+    """Return the integral of a run, shape (m + 1, axes)."""
+    # without the mean, which would increase the rounding errors of the sum
     total = np.cumsum(run - run.mean(axis=0), axis=0) / rate_hz
     return np.concatenate((np.zeros((1, run.shape[1])), total))
 
 
 def _deviation(phases: Sequence[FloatArray], m: int, tau_s: float) -> FloatArray:
-    """(axes,) at one τ."""
+    """Return the deviation of each axis at one τ, shape (axes,)."""
     squares, count = np.zeros(phases[0].shape[1]), 0
     for phase in phases:
         if len(phase) > 2 * m:
@@ -107,14 +109,14 @@ def _deviation(phases: Sequence[FloatArray], m: int, tau_s: float) -> FloatArray
             squares += np.einsum("ij,ij->j", second, second)
             count += len(second)
     if not count:
-        raise BadArgument(f"expected a run of at least {2 * m} samples for an average of {m}, got none")
+        raise BadArgument(f"expected a run of at least {2 * m} samples for averages of {m} samples, got shorter runs")
     return np.sqrt(squares / count / 2) / tau_s
 
 
 def interval(
     deviation: FloatArray, freedom: FloatArray, confidence: float = CONFIDENCE
 ) -> tuple[FloatArray, FloatArray]:
-    """Both ends of the interval in which the true deviation lies with this probability (SP 1065, 5.3)."""
+    """Return both ends of the confidence interval of the deviation (SP 1065, 5.3)."""
     tail = (1 - confidence) / 2
     high: FloatArray = deviation * np.sqrt(freedom / chi2.ppf(tail, freedom))
     low: FloatArray = deviation * np.sqrt(freedom / chi2.ppf(1 - tail, freedom))
@@ -122,9 +124,9 @@ def interval(
 
 
 def degrees_of_freedom(noise: NoiseType, m: int, n: int) -> float:
-    """Equivalent degrees of freedom of the overlapping estimate: `n` points of phase, `m` per average (table 5).
+    """Return the equivalent degrees of freedom of the overlapping estimate (SP 1065, table 5), at least 1.
 
-    At least 1, where the formulas of some types fall below it.
+    `n`: number of phase points; `m`: number of samples per average.
     """
     if noise is NoiseType.QUANTISATION:
         found = (n + 1) * (n - 2 * m) / (2 * (n - m))
@@ -140,9 +142,9 @@ def degrees_of_freedom(noise: NoiseType, m: int, n: int) -> float:
 
 
 def noise_types(run: FloatArray, factors: IntArray) -> IntArray:
-    """(k, axes) type of noise of a run (m, axes) at each average; where it is too short, as at the τ before.
+    """Return the noise types of a run, shape (m, axes), at each averaging factor; shape (k, axes).
 
-    Noise of the angle (flicker of it, quantisation) falls fastest with τ, so it is none once another type was there.
+    If the run is too short for a factor, the type is equal to the type at the previous factor.
     """
     found = np.full((len(factors), run.shape[1]), int(NoiseType.WHITE), dtype=np.int64)
     for row, m in enumerate(factors):
@@ -151,6 +153,7 @@ def noise_types(run: FloatArray, factors: IntArray) -> IntArray:
             averages = run[: clusters * int(m)].reshape(clusters, int(m), -1).mean(axis=1)
             found[row] = [int(_type_of(averages[:, axis])) for axis in range(run.shape[1])]
             if row:
+                # phase noise decreases fastest with τ: it cannot follow another noise type
                 over = found[row - 1] <= int(NoiseType.WHITE)
                 found[row, over] = np.minimum(found[row, over], int(NoiseType.WHITE))
         elif row:
@@ -159,7 +162,7 @@ def noise_types(run: FloatArray, factors: IntArray) -> IntArray:
 
 
 def _type_of(averages: FloatArray) -> NoiseType:
-    """Type of noise of averages (n,), by the autocorrelation at lag 1 (SP 1065, 5.5.6)."""
+    """Return the noise type of averages, shape (n,), from the autocorrelation at lag 1 (SP 1065, 5.5.6)."""
     for differences in range(DIFFERENCES_MOST + 1):
         centred = averages - averages.mean()
         power = float(centred @ centred)
@@ -173,65 +176,65 @@ def _type_of(averages: FloatArray) -> NoiseType:
 
 
 BIAS_FACTOR: Final = float(np.sqrt(2 * np.log(2) / np.pi))
-"""0.664: the floor of the deviation of flicker noise, in B."""
+"""Minimum deviation of flicker noise divided by B: 0.664."""
 ROUNDS: Final = 12
 POINTS_LEAST: Final = 6
 RESOLVED_SIGMAS: Final = 2.0
-"""A square that is so many of its own standard deviations above zero is resolved."""
+"""Minimum square of a coefficient in its standard deviations. Below that, the series does not resolve it."""
 POINTS_PER_OCTAVE: Final = PER_DECADE * float(np.log10(2))
-"""Points closer than an octave are made of nearly the same averages: so many count as one."""
+"""Number of points per octave. They use nearly the same averages and count as one independent point."""
 
 
 class Coefficient(NamedTuple):
-    """One coefficient of one axis, in the sensor's SI unit."""
+    """Coefficient of one axis, in the SI unit of the sensor."""
 
     value: float | None
-    """None where the series does not show it: other noise hides it, or it is too short."""
+    """Value; None if other noise hides the coefficient, or if the series is too short."""
     sigma: float
-    """Standard deviation of `value`, about; 0 where there is none."""
+    """Approximate standard deviation of `value`; 0 if `value` is None."""
     below: float
-    """It is below this, with two sigma."""
+    """Upper bound of the coefficient, two standard deviations."""
 
 
 class NoiseTerms(NamedTuple):
-    """All coefficients of one axis; units for a rate in rad/s."""
+    """Coefficients of one axis. The units are for a rate in rad/s."""
 
     quantisation: Coefficient
-    """Q, rad."""
+    """Quantisation Q, rad."""
     random_walk: Coefficient
-    """N, rad/s/√Hz = rad/√s; the line of slope -1/2 at τ = 1 s."""
+    """Random walk N, rad/s/√Hz = rad/√s: the line with the slope -1/2 at τ = 1 s."""
     bias_instability: Coefficient
-    """B, rad/s."""
+    """Bias instability B, rad/s."""
     rate_random_walk: Coefficient
-    """K, rad/s/√s."""
+    """Rate random walk K, rad/s/√s."""
     rate_ramp: Coefficient
-    """R, rad/s²."""
+    """Rate ramp R, rad/s²."""
 
     def deviation(self, tau_s: FloatArray) -> FloatArray:
-        """The curve that these coefficients make, (k,)."""
+        """Return the Allan deviation of these coefficients, shape (k,)."""
         squares = np.array([(term.value or 0.0) ** 2 for term in self])
         return np.asarray(np.sqrt(basis(tau_s) @ squares))
 
 
 def basis(tau_s: FloatArray) -> FloatArray:
-    """(k, 5) variance at each τ of coefficients of 1, in the order of NoiseTerms."""
+    """Return the variance at each τ of coefficients of 1, in the order of NoiseTerms, shape (k, 5)."""
     ones = np.ones_like(tau_s)
     return np.stack([3 / tau_s**2, 1 / tau_s, BIAS_FACTOR**2 * ones, tau_s / 3, tau_s**2 / 2], axis=1)
 
 
 def noise_terms(curve: AllanCurve, axis: int, tau_least_s: float = 0.0) -> NoiseTerms:
-    """Fit the coefficients of one axis, to the points from `tau_least_s` on. Raises BadArgument for too few points."""
+    """Fit the coefficients of one axis to the points with τ ≥ `tau_least_s`. Raises BadArgument for too few points."""
     used = curve.tau_s >= tau_least_s * (1 - 1e-9)
     if used.sum() < POINTS_LEAST:
         raise BadArgument(
-            f"expected at least {POINTS_LEAST} points of the Allan deviation from τ = {tau_least_s:.3g} s on, got "
-            f"{used.sum()}: a longer series is needed"
+            f"expected at least {POINTS_LEAST} points of the Allan deviation from τ = {tau_least_s:.3g} s, got "
+            f"{used.sum()}; record a longer series"
         )
     variance, freedom = curve.deviation[used, axis] ** 2, curve.freedom[used, axis]
     if not variance.any():
         return NoiseTerms(*(Coefficient(None, 0.0, 0.0) for _ in NoiseTerms._fields))
     shapes = basis(curve.tau_s[used])
-    scale = (variance[:, None] / shapes).min(axis=0)  # of each term, the most that it can be: near one for all
+    scale = (variance[:, None] / shapes).min(axis=0)  # upper bound of each term: scaled terms are near 1
     scale = np.where(scale > 0, scale, variance.max())
     chosen = list(range(shapes.shape[1]))
     squares, spread = _fit(shapes * scale, variance, freedom, chosen)
@@ -253,7 +256,7 @@ def noise_terms(curve: AllanCurve, axis: int, tau_least_s: float = 0.0) -> Noise
 def _fit(
     shapes: FloatArray, variance: FloatArray, freedom: FloatArray, chosen: list[int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Squares (5,) of the chosen terms, zero for the others, and their standard deviations."""
+    """Return the squares of the chosen terms, shape (5,), and their standard deviations. Other terms are zero."""
     fitted, squares, spread = variance, np.zeros(shapes.shape[1]), np.zeros(shapes.shape[1])
     floor = variance[variance > 0].min() * 1e-6
     weighted = shapes[:, chosen]
@@ -277,90 +280,90 @@ def _coefficient(square: float, spread: float, bound: float) -> Coefficient:
 
 AXES: Final = ("x", "y", "z")
 CORNER_SHARE: Final = 0.5
-"""Half the power: -3 dB."""
+"""Share of the power at the corner frequency: -3 dB."""
 CORNER_BINS: Final = 24
-"""Bands, evenly in the logarithm, in which the roll-off is looked for."""
+"""Number of logarithmic bands for the search of the corner frequency."""
 PLATEAU_LEAST, PLATEAU_MOST = 4, 8
-"""Bands below that have to be flat within a factor of two for a roll-off to be one."""
+"""Minimum and maximum number of bands below the corner frequency that must be flat within a factor of 2."""
 FILTER_PERIODS: Final = 5.0
-"""From so many periods of the corner frequency on, a first-order filter changes the Allan variance of white noise by
-less than 5 %: the change is 3 / (4π) periods over τ."""
+"""Minimum τ of the fit, in periods of the corner frequency. At this τ, a first-order filter changes the Allan variance
+of white noise by less than 5 %: 3 / (4π) periods divided by τ."""
 FLAT_LOW, FLAT_HIGH = 0.05, 0.6
-"""Band in which the density is read, in parts of the corner frequency."""
+"""Band of the noise density, as shares of the corner frequency."""
 KNOWN_PARTS: Final = 10
-"""The deviation is known to about a quarter up to this part of the duration."""
+"""Duration divided by the largest τ with an error of the deviation below about 25 %."""
 STILL_S: Final = 1.0
-"""Blocks in which rest is judged."""
+"""Length of the blocks that imud checks for motion, s."""
 STILL_FACTOR: Final = 4.0
-"""A block that scatters by so much more than the median block was disturbed."""
+"""Minimum standard deviation of a disturbed block, as a multiple of the median block."""
 BLOCKS_MOST: Final = 2000
-"""Means over which the drift is fitted, at most."""
+"""Maximum number of means for the fit of the drift."""
 SPAN_LEAST_C: Final = 2.0
-"""Least span of temperatures for a slope: many devices send whole degrees."""
+"""Minimum range of the temperature for a drift, °C. Many devices send whole degrees."""
 BLOCKS_LEAST: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """Change of one axis with temperature, by least squares over means of blocks."""
+    """Linear change of one axis with temperature: least-squares fit of block means."""
 
     slope: float
-    """ShownUnit of the rate per K."""
+    """Slope, unit of the rate per K."""
     sigma: float
-    """Standard deviation of the slope, were the blocks independent."""
+    """Standard deviation of the slope if the blocks are independent."""
     r2: float
-    """Share of the variance of the means that the line explains."""
+    """Share of the variance of the means that the line explains, R²."""
 
 
 @dataclass(frozen=True, slots=True)
 class AxisNoise:
-    """One axis, in the sensor's SI unit."""
+    """Noise of one axis, in the SI unit of the sensor."""
 
     mean: float
-    """The bias at rest; of an accelerometer gravity is in it."""
+    """Mean at rest: the bias; for an accelerometer with gravity."""
     spread: float
     """Standard deviation of the samples."""
     terms: NoiseTerms
     least_deviation: float
-    """The least Allan deviation; over 0.664 it is what data sheets call bias instability, and no less than B."""
+    """Minimum Allan deviation. Divided by 0.664, it is the bias instability of data sheets, which is at least B."""
     least_tau_s: float
     least_at_end: bool
-    """Whether it still falls where it is no longer known well: the true floor is lower."""
+    """Whether the minimum is at the largest reliable τ: the true minimum is then smaller."""
     density: float
-    """Root of the one-sided spectral density where it is flat, per √Hz: √2 N of white noise."""
+    """Root of the one-sided spectral density in its flat band, per √Hz. For white noise it is √2 N."""
     drift: Drift | None
-    """None where the temperature is not known, or hardly changed."""
+    """Drift with temperature; None if the temperature is unknown or nearly constant."""
 
     @property
     def bias_instability_most(self) -> float:
-        """The least deviation over 0.664."""
+        """Minimum Allan deviation divided by 0.664."""
         return self.least_deviation / BIAS_FACTOR
 
 
 @dataclass(frozen=True, slots=True)
 class SensorNoise:
-    """The noise of one sensor."""
+    """Noise of one sensor."""
 
     grid: Grid
     curve: AllanCurve
     spectrum: Spectrum
     axes: tuple[AxisNoise, AxisNoise, AxisNoise]
     corner_hz: float | None
-    """Frequency above which the noise has less than half the power: the device's low-pass; None for none seen."""
+    """Corner frequency of the device's low-pass filter, Hz; None if the noise shows no filter."""
     tau_least_s: float
-    """The coefficients are fitted from here on."""
+    """Minimum τ of the fit, s."""
     flat_hz: tuple[float, float]
-    """Band of the density."""
+    """Band of the noise density, Hz."""
     disturbed_s: int
-    """Seconds in which the device was moved or shaken, or which have an outlier."""
+    """Number of seconds with motion, vibration or an outlier."""
     still_s: int
-    """Seconds that were looked at."""
+    """Number of checked seconds."""
     step: float | None
-    """Least difference of two values, if the values are whole counts of it."""
+    """Resolution: minimum difference of two values, if all values are multiples of it. Otherwise None."""
 
 
 def sensor_noise(readings: Readings, values: FloatArray) -> SensorNoise:
-    """Analyse one sensor of `readings`; values (n, 3). Raises BadArgument where the series is too short."""
+    """Analyse one sensor of `readings`; `values` has the shape (n, 3). Raises BadArgument for too few samples."""
     t_ns, values = with_values(readings.t_ns, values)
     grid = grid_of(t_ns)
     runs = even_runs(grid, values)
@@ -399,9 +402,9 @@ def _axis(
 
 
 def corner_of(spectrum: Spectrum) -> float | None:
-    """Frequency from which on all axes together have less than half the power of the band below it; None for none.
+    """Return the frequency above which the power of all axes is less than half of the power below; None without one.
 
-    Noise that falls with frequency from the begin on (random walk) has no corner: the power below has to be flat.
+    The power below the corner must be flat. Noise that decreases at all frequencies (random walk) has no corner.
     """
     power = spectrum.density.mean(axis=0)
     if not power.any():
@@ -423,7 +426,7 @@ def corner_of(spectrum: Spectrum) -> float | None:
 
 
 def _disturbed(runs: list[FloatArray], rate_hz: float) -> tuple[int, int]:
-    """How many seconds scatter by far more than the others, and of how many."""
+    """Return the number of seconds with a much larger scatter than usual, and the number of checked seconds."""
     size = max(round(STILL_S * rate_hz), 2)
     blocks = [run[: len(run) // size * size].reshape(-1, size, run.shape[1]).std(axis=1) for run in runs]
     spread = np.concatenate(blocks)
@@ -434,7 +437,7 @@ def _disturbed(runs: list[FloatArray], rate_hz: float) -> tuple[int, int]:
 
 
 def _temperature(readings: Readings, t_ns: np.ndarray) -> FloatArray | None:
-    """Temperature at samples, (k,), by the nearest sample before that had one; None where there is none."""
+    """Return the temperature at each sample, shape (k,), from the newest earlier temperature; None without one."""
     if readings.temperature_c is None:
         return None
     known = np.isfinite(readings.temperature_c)
@@ -445,7 +448,8 @@ def _temperature(readings: Readings, t_ns: np.ndarray) -> FloatArray | None:
 
 
 def temperature_drift(temperature_c: FloatArray, values: FloatArray, rate_hz: float) -> Drift | None:
-    """Fit values (n,) against temperatures (n,), over means of at least a second; None for too little change."""
+    """Fit values to temperatures, both of the shape (n,). None if the temperature is nearly constant."""
+    # means over at least 1 s
     size = max(round(STILL_S * rate_hz), -(-len(values) // BLOCKS_MOST), 1)
     count = len(values) // size
     if count < BLOCKS_LEAST:
@@ -462,7 +466,7 @@ def temperature_drift(temperature_c: FloatArray, values: FloatArray, rate_hz: fl
 
 
 def step_of(values: FloatArray) -> float | None:
-    """Size of a count, where all values (n, axes) are whole counts of it; None for floats."""
+    """Return the resolution if all values, shape (n, axes), are multiples of it; otherwise None."""
     sorted_values = np.unique(values[:20_000])
     if len(sorted_values) < BLOCKS_LEAST:
         return None

@@ -1,4 +1,4 @@
-"""Plots of a noise analysis, as figures of matplotlib that the caller writes to a file."""
+"""Plots of noise and vibration as matplotlib figures. The caller writes the files."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,34 +15,34 @@ from imud.analysis.spectrum import Band, Peak, Spectrogram, Spectrum
 from imud.contracts.driver import SensorName
 
 COLOURS: Final = ("#c0392b", "#2e8b57", "#1f5fa8")
-"""Of x, y, z, as in all pictures of imud."""
+"""Colours of x, y and z, the same in all pictures of imud."""
 POINTS_PER_DECADE: Final = 60
-"""Points of a density; those between are averaged."""
+"""Number of points of a density per decade. Each point is a mean."""
 PAGE_INCHES: Final = (8.27, 11.69)
-"""A4."""
+"""Page size A4, inches."""
 PLOT_INCHES: Final = (7.6, 4.4)
 TEXT_POINTS: Final = 7.0
 LINE_PART: Final = 0.0105
-"""Height of a line of text on the page."""
+"""Height of a line of text as a share of the page."""
 DPI: Final = 150
 
 
 def deviation_figure(name: SensorName, sensor: SensorNoise) -> Figure:
-    """The Allan deviation of a sensor."""
+    """Return the plot of the Allan deviation of a sensor."""
     figure = Figure(figsize=PLOT_INCHES, layout="constrained")
     draw_deviation(figure.subplots(), name, sensor)
     return figure
 
 
 def density_figure(name: SensorName, sensor: SensorNoise) -> Figure:
-    """The root of the power spectral density of a sensor."""
+    """Return the plot of the noise density of a sensor."""
     figure = Figure(figsize=PLOT_INCHES, layout="constrained")
     draw_density(figure.subplots(), name, sensor)
     return figure
 
 
 def page_figure(sensors: Mapping[SensorName, SensorNoise], lines: Sequence[str]) -> Figure:
-    """Everything on a page: the text of the report above, its plots below."""
+    """Return a page with the text of the report and the plots below."""
     text_inches = PAGE_INCHES[1] * LINE_PART * len(lines) + 0.5
     plots_inches = 6.4
     figure = Figure(figsize=(PAGE_INCHES[0], text_inches + plots_inches))
@@ -65,7 +65,7 @@ def page_figure(sensors: Mapping[SensorName, SensorNoise], lines: Sequence[str])
 
 
 def draw_deviation(axes: Axes, name: SensorName, sensor: SensorNoise) -> None:
-    """Deviation over τ with its interval, the fitted curve, and the lines of N and B."""
+    """Draw the Allan deviation with its confidence interval and the fitted curve."""
     curve, unit = sensor.curve, DEVIATION[name]
     fitted_at = np.geomspace(max(curve.tau_s[0], sensor.tau_least_s), curve.tau_s[-1], 100)
     for number, (label, colour) in enumerate(zip(AXES, COLOURS, strict=True)):
@@ -79,6 +79,7 @@ def draw_deviation(axes: Axes, name: SensorName, sensor: SensorNoise) -> None:
         if (fitted > 0).all():
             axes.plot(fitted_at, fitted, color=colour, linewidth=0.8, linestyle=":")
     if sensor.corner_hz is not None:
+        # grey: the filter of the device dominates, the fit ignores these points
         axes.axvspan(curve.tau_s[0], sensor.tau_least_s, color="#999", alpha=0.12, linewidth=0)
     axes.set(xscale="log", yscale="log", xlabel="τ, s", ylabel=f"σ(τ), {unit.name}")
     axes.set_title(f"Allan deviation, {TITLES[name]}; band 68 %, dotted fit", fontsize=8)
@@ -86,7 +87,7 @@ def draw_deviation(axes: Axes, name: SensorName, sensor: SensorNoise) -> None:
 
 
 def draw_density(axes: Axes, name: SensorName, sensor: SensorNoise) -> None:
-    """Root of the density over frequency, and the band in which it is read."""
+    """Draw the root of the density, and the band in which imud reads the noise density."""
     spectrum, unit = sensor.spectrum, DENSITY[name]
     frequency, density = thinned(spectrum.frequency_hz[1:], spectrum.density[1:])
     for number, (label, colour) in enumerate(zip(AXES, COLOURS, strict=True)):
@@ -95,12 +96,12 @@ def draw_density(axes: Axes, name: SensorName, sensor: SensorNoise) -> None:
     if sensor.corner_hz is not None:
         axes.axvline(sensor.corner_hz, color="#555", linewidth=0.8, linestyle="--")
     axes.set(xscale="log", yscale="log", xlabel="f, Hz", ylabel=f"√S(f), {unit.name}")
-    axes.set_title(f"Noise density, {TITLES[name]}; read where shaded", fontsize=8)
+    axes.set_title(f"Noise density, {TITLES[name]}; measured in the shaded band", fontsize=8)
     _finish(axes)
 
 
 def thinned(frequency_hz: FloatArray, density: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Average a density (k, axes) in bands even in the logarithm: a plot of a long series is then no cloud."""
+    """Average a density, shape (k, axes), in logarithmic bands. Without averaging, a long series is a dense cloud."""
     bands = max(int(np.log10(frequency_hz[-1] / frequency_hz[0]) * POINTS_PER_DECADE), 1)
     edges = np.geomspace(frequency_hz[0], frequency_hz[-1], bands + 1)
     band = np.clip(np.searchsorted(edges, frequency_hz, side="right") - 1, 0, bands - 1)
@@ -114,7 +115,7 @@ def _finish(axes: Axes) -> None:
     axes.grid(visible=True, which="major", color="#ccc", linewidth=0.6)
     axes.grid(visible=True, which="minor", color="#eee", linewidth=0.4)
     low, high = axes.get_ylim()
-    if high < 10 * low:  # less than a decade has few numbers, and noise looks large
+    if high < 10 * low:  # show at least one decade: otherwise small noise looks large, and the axis has few numbers
         axes.set_ylim(low / np.sqrt(10 * low / high), high * np.sqrt(10 * low / high))
     axes.tick_params(which="both", labelsize=7)
     axes.xaxis.label.set_fontsize(8)
@@ -123,27 +124,27 @@ def _finish(axes: Axes) -> None:
 
 
 RANGE_DB: Final = 80.0
-"""Of the colours, below the strongest."""
+"""Range of the colours, dB."""
 LABELS_MOST: Final = 6
 SPAN_LEAST: Final = 100.0
-"""Of a density, from the lowest to the highest that is shown."""
+"""Minimum ratio of the largest to the smallest value on the axis of a density."""
 SPECTRUM_INCHES: Final = (9.0, 3.6)
 
 
 @dataclass(frozen=True, slots=True)
 class SensorVibration:
-    """Vibration as one sensor sees it."""
+    """Vibration that one sensor measures."""
 
     grid: Grid
     spectrum: Spectrum
     spectrogram: Spectrogram
     peaks: tuple[Peak, ...]
-    """The strongest first."""
+    """Peaks, the strongest first."""
     bands: tuple[Band, ...]
 
 
 def spectrum_figure(sensors: Mapping[SensorName, SensorVibration], title: str, lines: Sequence[str]) -> Figure:
-    """Density and spectrogram of each sensor, one below the other; what was measured stands below the title."""
+    """Return density and spectrogram of each sensor in rows. `lines`: text below the title."""
     rows = 2 * len(sensors)
     figure = Figure(
         figsize=(SPECTRUM_INCHES[0], SPECTRUM_INCHES[1] * rows * 0.8 + 0.2 * len(lines)), layout="constrained"
@@ -157,7 +158,7 @@ def spectrum_figure(sensors: Mapping[SensorName, SensorVibration], title: str, l
 
 
 def draw_spectrum(axes: Axes, name: SensorName, sensor: SensorVibration) -> None:
-    """Density of the three axes with the peaks named."""
+    """Draw the density of the three axes with the names of the peaks."""
     spectrum = sensor.spectrum
     for number, (label, colour) in enumerate(zip(AXES, COLOURS, strict=True)):
         axes.plot(
@@ -172,7 +173,7 @@ def draw_spectrum(axes: Axes, name: SensorName, sensor: SensorVibration) -> None
     axes.set(yscale="log", xlabel="f, Hz", ylabel=f"S(f), ({SI[name]})²/Hz", xlim=(0, spectrum.rate_hz / 2))
     axes.margins(y=0.15)
     low, high = axes.get_ylim()
-    if high < SPAN_LEAST * low:  # noise alone would look like lines
+    if high < SPAN_LEAST * low:  # otherwise noise looks like lines
         axes.set_ylim(low / 10, high * 10)
     axes.set_title(f"Power spectral density of the {TITLES[name]}", fontsize=9)
     axes.grid(visible=True, which="major", color="#ddd", linewidth=0.6)
@@ -181,7 +182,7 @@ def draw_spectrum(axes: Axes, name: SensorName, sensor: SensorVibration) -> None
 
 
 def draw_spectrogram(figure: Figure, axes: Axes, name: SensorName, sensor: SensorVibration) -> None:
-    """Density over time, of the axes together, in dB."""
+    """Draw the density over time, sum of all axes, in dB."""
     gram = sensor.spectrogram
     power = 10 * np.log10(np.maximum(gram.density[:, 1:], 1e-300))
     top = float(np.nanmax(power))
@@ -191,7 +192,7 @@ def draw_spectrogram(figure: Figure, axes: Axes, name: SensorName, sensor: Senso
         rasterized=True,
     )  # fmt: skip
     axes.set(xlabel="time, s", ylabel="f, Hz")
-    axes.set_title(f"Spectrogram of the {TITLES[name]}, axes together", fontsize=9)
+    axes.set_title(f"Spectrogram of the {TITLES[name]}, sum of all axes", fontsize=9)
     axes.tick_params(which="both", labelsize=8)
     bar = figure.colorbar(mesh, ax=axes, pad=0.01)
     bar.set_label(f"dB of ({SI[name]})²/Hz", fontsize=8)

@@ -1,6 +1,6 @@
-"""Table: the quantities of a noise analysis with the units in which people and data sheets have them.
+"""Quantities of a noise analysis, with the units of data sheets.
 
-A value in SI times the factor is the value in the unit. Gyroscopes: 1 rad/√s = 180/π · 60 deg/√h; accelerometers:
+Value in the unit = SI value × factor. Gyroscopes: 1 rad/√s = 180/π · 60 deg/√h. Accelerometers:
 1 m/s/√s = 1 (m/s²)/√Hz = 60 m/s/√h = 10⁶/g µg/√Hz, with g = 9.80665 m/s².
 """
 
@@ -19,7 +19,7 @@ UG_PER_M_S2: Final = 1e6 / STANDARD_GRAVITY_M_S2
 
 
 class ShownUnit(NamedTuple):
-    """A unit for people."""
+    """Unit of the reports."""
 
     name: str
     factor: float
@@ -27,16 +27,16 @@ class ShownUnit(NamedTuple):
 
 
 class Quantity(NamedTuple):
-    """One figure of a sensor."""
+    """Quantity of a sensor's noise."""
 
     key: str
-    """Its name in JSON, and of the coefficient in NoiseTerms where it is one."""
+    """Name in JSON. For a coefficient, also its name in NoiseTerms."""
     title: str
     symbol: str
     si: str
-    """ShownUnit in which it is computed."""
+    """SI unit."""
     units: tuple[ShownUnit, ...]
-    """Units for people, the most usual first."""
+    """Units of the reports, the most usual unit first."""
 
 
 GYRO: Final = (
@@ -84,7 +84,7 @@ DEVIATION: Final[Mapping[SensorName, ShownUnit]] = {
     "gyro": ShownUnit("deg/h", DEG_PER_RAD * S_PER_H),
     "accel": ShownUnit("mg", MG_PER_M_S2),
 }
-"""ShownUnit of the Allan deviation in plots."""
+"""Units of the Allan deviation in plots."""
 DENSITY: Final[Mapping[SensorName, ShownUnit]] = {
     "gyro": ShownUnit("deg/s/√Hz", DEG_PER_RAD),
     "accel": ShownUnit("µg/√Hz", UG_PER_M_S2),
@@ -94,7 +94,7 @@ SI: Final[Mapping[SensorName, str]] = {"gyro": "rad/s", "accel": "m/s²"}
 
 
 def figure_text(value: float) -> str:
-    """Three digits of a figure, without an exponent where one can do without."""
+    """Format a value with three digits, without an exponent if possible."""
     if value == 0 or 1e-4 <= abs(value) < 1e6:
         digits = f"{value:.3g}"
         return f"{value:.0f}" if "e" in digits else digits
@@ -102,5 +102,5 @@ def figure_text(value: float) -> str:
 
 
 def short_exponent(text: str) -> str:
-    """A number with its exponent as short as it can be, 1.61e6 for 1.61e+06, so that it fits into a column."""
+    """Shorten the exponent of a number, for example 1.61e+06 to 1.61e6."""
     return re.sub(r"e([+-])0*(?=\d)", lambda sign: "e" + sign[1].strip("+"), text)

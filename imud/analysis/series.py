@@ -1,9 +1,9 @@
-"""Even runs of samples from their time stamps: the true rate, which samples are missing, and where a run ends.
+"""Time grid of samples: true rate, lost samples, and runs with a constant period.
 
-A sensor samples evenly by its own crystal; stamps scatter about that grid by their error. The grid is fitted to the
-stamps, so the rate is the sensor's as the host's clock sees it, and every sample has a place on it. Places without a
-sample are missing ones: short gaps are filled by interpolation and counted, longer ones end the run. Nothing is
-shortened: the samples after a gap keep their time.
+A sensor samples with a constant period of its own crystal. The time stamps scatter around this grid because of their
+error. imud fits the grid to the time stamps. The rate is therefore the rate of the sensor in host time, and each sample
+has a place on the grid. A place without a sample is a lost sample. imud interpolates short gaps and counts them. A
+longer gap ends a run. Samples after a gap keep their time.
 """
 
 from dataclasses import dataclass
@@ -21,88 +21,88 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 SAMPLES_LEAST: Final = 64
-"""Fewer say nothing about rate or noise."""
+"""Minimum number of samples for an analysis."""
 FILL_MOST: Final = 4
-"""Missing samples in a row that are filled; more end a run. A longer line between two points changes the noise."""
+"""Maximum number of consecutive lost samples that imud interpolates. Longer interpolation changes the noise."""
 SCATTER_MOST: Final = 0.2
-"""Scatter of the stamps, in periods, up to which a missing sample is located: at half a period it is a guess."""
+"""Maximum scatter of the time stamps, in periods, to find single lost samples. With 0.5, the place would be a guess."""
 STEP_FOR_PERIOD: Final = 4
-"""The first guess of the period is from stamps so far apart: device time in whole ms makes single steps uneven."""
+"""Distance of time stamps for the first estimate, periods. Single steps of device time in whole ms are uneven."""
 REFINEMENTS: Final = 4
 PAUSE_S: Final = 1.0
-"""With stamps that scatter too much to locate a missing sample, silence of so long still ends a run."""
+"""Minimum silence that ends a run if imud cannot find single lost samples, s."""
 
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Samples of one device as they came, oldest first."""
+    """Samples of one device in the order of arrival."""
 
     t_ns: IntArray
-    """(n,) CLOCK_MONOTONIC of the measurement, rising."""
+    """Time stamps of the measurements (CLOCK_MONOTONIC), increasing, ns, shape (n,)."""
     gyro_rad_s: FloatArray | None
-    """(n, 3); NaN where a sample had none; None where no sample had."""
+    """Angular rate, shape (n, 3); NaN if a sample does not contain it, None if no sample contains it."""
     accel_m_s2: FloatArray | None
-    """(n, 3), specific force."""
+    """Specific force, shape (n, 3); NaN and None as above."""
     temperature_c: FloatArray | None
-    """(n,), NaN where a sample had none."""
+    """Temperature, shape (n,); NaN and None as above."""
 
     @property
     def duration_s(self) -> float:
-        """From the first sample to the last."""
+        """Time from the first to the last sample, s."""
         return float(self.t_ns[-1] - self.t_ns[0]) / NS_PER_S if len(self.t_ns) else 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Places of samples on an even grid of time."""
+    """Places of samples on a time grid with a constant period."""
 
     rate_hz: float
-    """Rate of the sensor by the stamps."""
+    """Rate of the sensor in host time, Hz."""
     place: IntArray
-    """(n,) number of the period of each sample, the first 0, rising."""
+    """Index of the period of each sample, increasing from 0, shape (n,)."""
     scatter_s: float
-    """Standard deviation of the stamps about the grid."""
+    """Standard deviation of the time stamps around the grid, s."""
     located: bool
-    """Whether the stamps are good enough to see a single missing sample."""
+    """Whether the time stamps are good enough to find single lost samples."""
     runs: tuple[tuple[int, int], ...]
-    """First and last + 1 of the samples of each run without a gap of more than FILL_MOST."""
+    """Index of the first sample and of the last sample plus 1, for each run without a gap longer than FILL_MOST."""
     missing: int
-    """Places without a sample."""
+    """Number of places without a sample."""
     filled: int
-    """Of these, those in short gaps, which are filled."""
+    """Number of interpolated samples in short gaps."""
 
     @property
     def duration_s(self) -> float:
-        """From the first place to the end of the last."""
+        """Time from the first place to the end of the last place, s."""
         return float(self.place[-1] + 1) / self.rate_hz
 
     def words(self) -> str:
-        """Describe what was done about missing samples, in one sentence."""
-        scatter = f"stamps scatter by {self.scatter_s * 1e6:.0f} µs about an even grid of {self.rate_hz:.4f} Hz"
+        """Describe the grid and the lost samples."""
+        scatter = f"the time stamps scatter by {self.scatter_s * 1e6:.0f} µs around a grid of {self.rate_hz:.4f} Hz"
         if not self.located:
             return (
-                f"{scatter}, too much to see single missing samples, which are therefore not made up for; silences of "
-                f"{PAUSE_S:g} s and more end a run: {len(self.runs)} runs"
+                f"{scatter}; because of this scatter, imud cannot find and interpolate single lost samples; gaps of "
+                f"{PAUSE_S:g} s and more divide the series into {len(self.runs)} runs"
             )
         if not self.missing:
-            return f"{scatter}; no sample is missing"
+            return f"{scatter}; no sample is lost"
         share = 100 * self.missing / int(self.place[-1] + 1)
         return (
-            f"{scatter}; {self.missing} samples are missing ({share:.2f} %): {self.filled} in gaps of at most "
-            f"{FILL_MOST} are interpolated, longer gaps part the series into {len(self.runs)} "
+            f"{scatter}; {self.missing} samples are lost ({share:.2f} %): imud interpolates {self.filled} samples in "
+            f"gaps of at most {FILL_MOST}; longer gaps divide the series into {len(self.runs)} "
             f"run{'s' if len(self.runs) > 1 else ''}"
         )
 
 
 def grid_of(t_ns: IntArray) -> Grid:
-    """Fit an even grid to stamps, (n,) rising, ns. Raises BadArgument for too few, or such that do not rise."""
+    """Fit a grid to increasing time stamps, ns, shape (n,). Raises BadArgument for too few or other time stamps."""
     if len(t_ns) < SAMPLES_LEAST:
         raise BadArgument(f"expected at least {SAMPLES_LEAST} samples with values, got {len(t_ns)}")
     t_s = (t_ns - t_ns[0]) / NS_PER_S
     steps_s = np.diff(t_s)
     if steps_s.min() <= 0:
         at = int(np.argmax(steps_s <= 0)) + 1
-        raise BadArgument(f"expected time stamps that rise, sample {at} has not: is it a file of two devices?")
+        raise BadArgument(f"expected increasing time stamps, got a step back at sample {at}; are there two devices?")
     period_s = _guess(t_s)
     steps = np.ones(len(steps_s), dtype=np.int64)
     for _ in range(REFINEMENTS):
@@ -125,12 +125,13 @@ def grid_of(t_ns: IntArray) -> Grid:
 
 
 def _guess(t_s: FloatArray) -> float:
-    """Period from the median over some steps."""
+    """Return a first estimate of the period from the median of some steps, s."""
     return float(np.median(t_s[STEP_FOR_PERIOD:] - t_s[:-STEP_FOR_PERIOD])) / STEP_FOR_PERIOD
 
 
 def _slope(place: IntArray, t_s: FloatArray, steps: IntArray) -> float:
-    """Least-squares period from places and times, of the parts between gaps: a pause need not be whole periods."""
+    """Return the least-squares period of places and times, s."""
+    # separately for each part between gaps: a pause of the device is perhaps not a whole number of periods
     part = np.concatenate(([0], np.cumsum(steps > FILL_MOST + 1)))
     count = np.bincount(part)
     x = place - (np.bincount(part, place) / count)[part]
@@ -139,15 +140,15 @@ def _slope(place: IntArray, t_s: FloatArray, steps: IntArray) -> float:
 
 
 def _scatter(residual_s: FloatArray) -> float:
-    """Standard deviation of one stamp, from those of differences of two, without outliers."""
+    """Return the standard deviation of a time stamp, from the differences of two time stamps, without outliers."""
     middle = np.median(residual_s)
     return float(1.4826 * np.median(np.abs(residual_s - middle)) / np.sqrt(2))
 
 
 def even_runs(grid: Grid, values: FloatArray, *, smooth: bool = False) -> list[FloatArray]:
-    """Values (n, …) of the grid's samples as even runs, each (m, …) at `grid.rate_hz`, short gaps filled.
+    """Return the values of the runs, each of the shape (m, …), with interpolated short gaps.
 
-    By straight lines, which add no power, for noise; with `smooth` by a cubic spline, for vibration.
+    The interpolation is linear for noise, because lines add no power. `smooth` selects a cubic spline for vibration.
     """
     found = []
     for first, end in grid.runs:
@@ -173,6 +174,6 @@ def _filled_smooth(place: IntArray, part: FloatArray, every: IntArray) -> FloatA
 
 
 def with_values(t_ns: IntArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Leave out the samples that have no finite value: t_ns (k,), values (k, …)."""
+    """Return the time stamps, shape (k,), and values, shape (k, …), of samples with finite values only."""
     good = np.isfinite(values.reshape(len(values), -1)).all(axis=1)
     return t_ns[good], values[good]

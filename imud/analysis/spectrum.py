@@ -1,8 +1,9 @@
-"""Power spectral density and spectrogram of even runs (P. D. Welch, 1967), at the true rate of the sensor.
+"""Power spectral density, spectrogram and peaks of runs at the true rate of the sensor (P. D. Welch, 1967).
 
-Windows of equal length, half overlapping, each without its mean, under a Hann window; they lie inside runs, so none
-reaches across a gap. The density is one-sided: its integral over 0 to half the rate is the power. A line of amplitude A
-stands in it with A²/2 over the equivalent noise bandwidth of the window, 1.5 bins for Hann (F. J. Harris, 1978).
+The windows have equal length, overlap by half, and contain samples of one run only. imud removes the mean of each
+window and applies a Hann window. The density is one-sided: its integral from 0 to half of the rate is the power. The
+density of a line with the amplitude A is A²/2 divided by the equivalent noise bandwidth, 1.5 bins for Hann (F. J.
+Harris, 1978).
 """
 
 from collections.abc import Sequence
@@ -20,15 +21,15 @@ from imud.model.errors import BadArgument
 
 WINDOW: Final = "hann"
 WINDOW_MOST: Final = 1 << 16
-"""Samples per window, at most; more bins than anybody looks at."""
+"""Maximum number of samples per window."""
 WINDOW_LEAST: Final = 16
 WINDOW_USUAL: Final = 1 << 12
 AVERAGES_WANTED: Final = 16
-"""Windows that are averaged, if there are samples enough: the spread of a bin is then about 1/4."""
+"""Wanted number of averaged windows. The relative standard deviation of a bin is then about 1/4."""
 ROWS_MOST: Final = 600
-"""Columns of a spectrogram, at most; of a longer series some windows each are averaged."""
+"""Maximum number of rows of a spectrogram. In a longer series, a row is the mean of several windows."""
 PIECE: Final = 256
-"""Windows that are transformed at once, so that memory does not grow with the series."""
+"""Number of windows in one transform. It limits the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,50 +38,50 @@ class Spectrum:
 
     rate_hz: float
     frequency_hz: FloatArray
-    """(k,) from 0 to half the rate."""
+    """Frequencies from 0 to half of the rate, Hz, shape (k,)."""
     density: FloatArray
-    """(k, axes), unit² per Hz."""
+    """Density, unit² per Hz, shape (k, axes)."""
     window: str
     size: int
-    """Samples per window."""
+    """Number of samples per window."""
     bandwidth_hz: float
-    """Equivalent noise bandwidth of the window."""
+    """Equivalent noise bandwidth of the window, Hz."""
     averages: int
-    """Windows averaged; half overlapping ones are nearly independent."""
+    """Number of averaged windows. Windows that overlap by half are nearly independent."""
     unused: int
-    """Samples in runs that are shorter than a window."""
+    """Number of samples in runs that are shorter than a window."""
 
     @property
     def bin_hz(self) -> float:
-        """Distance of two frequencies."""
+        """Distance of two frequencies, Hz."""
         return self.rate_hz / self.size
 
     def words(self) -> str:
-        """Describe how it was made, in one sentence."""
-        unused = f", {self.unused} samples in runs shorter than that are left out" if self.unused else ""
+        """Describe the parameters of the spectrum."""
+        unused = f"; imud ignores {self.unused} samples in shorter runs" if self.unused else ""
         return (
-            f"Welch, {self.averages} windows of {self.size} samples ({self.size / self.rate_hz:.3g} s), half "
-            f"overlapping, {self.window.capitalize()}; bins of {self.bin_hz:.4g} Hz, equivalent noise bandwidth "
+            f"Welch, {self.averages} windows of {self.size} samples ({self.size / self.rate_hz:.3g} s) with half "
+            f"overlap, {self.window.capitalize()}; bins of {self.bin_hz:.4g} Hz, equivalent noise bandwidth "
             f"{self.bandwidth_hz:.4g} Hz ({self.bandwidth_hz / self.bin_hz:.2f} bins){unused}"
         )
 
 
 @dataclass(frozen=True, slots=True)
 class Spectrogram:
-    """Density over time, of the axes together."""
+    """Density over time, sum of all axes."""
 
     time_s: FloatArray
-    """(r,) middle of each row, from the begin of the first run on."""
+    """Middle of each row after the start of the first run, s, shape (r,)."""
     frequency_hz: FloatArray
-    """(k,)"""
+    """Frequencies, Hz, shape (k,)."""
     density: FloatArray
-    """(r, k), the sum over the axes, unit² per Hz; rows of NaN where samples are missing."""
+    """Density, unit² per Hz, shape (r, k). A row of NaN marks a gap."""
 
 
 def window_size(runs: Sequence[FloatArray], rate_hz: float, resolution_hz: float | None = None) -> int:
-    """Samples per window: a power of two that gives averages enough, or of a resolution (distance of bins).
+    """Return the number of samples per window: for a resolution, or a power of two with enough averages.
 
-    Raises BadArgument for a resolution that the runs are too short for, or the rate too low.
+    Raises BadArgument if the runs are too short or the rate is too low for the resolution.
     """
     longest = max(len(run) for run in runs)
     if resolution_hz is not None:
@@ -94,18 +95,18 @@ def window_size(runs: Sequence[FloatArray], rate_hz: float, resolution_hz: float
             )
         return size
     if longest < WINDOW_LEAST:
-        raise BadArgument(f"expected a run of at least {WINDOW_LEAST} samples without a longer gap, got {longest}")
+        raise BadArgument(f"expected a run of at least {WINDOW_LEAST} samples without a long gap, got {longest}")
     wanted = min(2 * longest // (AVERAGES_WANTED + 1), WINDOW_USUAL)
     return max(1 << (wanted.bit_length() - 1), WINDOW_LEAST) if wanted else WINDOW_LEAST
 
 
 def power_spectrum(runs: Sequence[FloatArray], rate_hz: float, size: int | None = None) -> Spectrum:
-    """Density of even runs, each (m, axes) at `rate_hz`, over all of them. Raises BadArgument for runs too short."""
+    """Return the density of runs of the shape (m, axes) at `rate_hz`. Raises BadArgument if all runs are too short."""
     size = window_size(runs, rate_hz) if size is None else size
     window = get_window(WINDOW, size)
     used = [run for run in runs if len(run) >= size]
     if not used:
-        raise BadArgument(f"expected a run of at least {size} samples without a longer gap, got none")
+        raise BadArgument(f"expected a run of at least {size} samples without a long gap, got shorter runs")
     total, averages = np.zeros((size // 2 + 1, used[0].shape[1])), 0
     for run in used:
         for rows in _pieces(run, size):
@@ -118,40 +119,40 @@ def power_spectrum(runs: Sequence[FloatArray], rate_hz: float, size: int | None 
 
 
 def _frequencies(size: int, rate_hz: float) -> FloatArray:
-    """(k,) of a window of so many samples."""
+    """Return the frequencies of a window of `size` samples, Hz, shape (k,)."""
     return np.asarray(np.arange(size // 2 + 1) * (rate_hz / size), dtype=np.float64)
 
 
 def noise_bandwidth(window: FloatArray, rate_hz: float) -> float:
-    """Width of the rectangle that lets through as much of white noise, Hz."""
+    """Return the width of a rectangular filter that passes the same power of white noise, Hz."""
     return float(rate_hz * (window**2).sum() / window.sum() ** 2)
 
 
 def _pieces(run: FloatArray, size: int) -> list[FloatArray]:
-    """Half overlapping windows of a run, (some, axes, size) each."""
+    """Return the half-overlapping windows of a run as arrays of the shape (up to PIECE, axes, size)."""
     windows = sliding_window_view(run, size, axis=0)[:: size // 2]
     return [windows[at : at + PIECE] for at in range(0, len(windows), PIECE)]
 
 
 def _powers(rows: FloatArray, window: FloatArray, rate_hz: float) -> FloatArray:
-    """One-sided densities (rows, k, axes) of windows (rows, axes, size)."""
+    """Return the one-sided densities, shape (rows, k, axes), of windows of the shape (rows, axes, size)."""
     size = len(window)
     transformed = np.fft.rfft((rows - rows.mean(axis=2, keepdims=True)) * window, axis=2)
     power = np.abs(transformed) ** 2 / (rate_hz * (window**2).sum())
-    power[:, :, 1 : (size + 1) // 2] *= 2  # not the bins at 0 and, of an even number, at half the rate
+    power[:, :, 1 : (size + 1) // 2] *= 2  # negative frequencies; the bins at 0 and at half of the rate have none
     return np.asarray(np.moveaxis(power, 2, 1))
 
 
 def spectrogram(runs: Sequence[FloatArray], starts_s: Sequence[float], rate_hz: float, size: int) -> Spectrogram:
-    """Density over time of even runs, (m, axes) each, that begin at these times.
+    """Return the density over time of runs of the shape (m, axes). `starts_s`: start time of each run.
 
-    Where there are more than ROWS_MOST windows, neighbours are averaged; a row of NaN stands between two runs. Raises
-    BadArgument for runs too short.
+    For more than ROWS_MOST windows, a row is a mean of neighbours. A row of NaN separates two runs. Raises BadArgument
+    if all runs are too short.
     """
     window = get_window(WINDOW, size)
     used = [(run, start) for run, start in zip(runs, starts_s, strict=True) if len(run) >= size]
     if not used:
-        raise BadArgument(f"expected a run of at least {size} samples without a longer gap, got none")
+        raise BadArgument(f"expected a run of at least {size} samples without a long gap, got shorter runs")
     in_all = sum((len(run) - size) // (size // 2) + 1 for run, _ in used)
     together = -(-in_all // ROWS_MOST)
     times: list[FloatArray] = []
@@ -171,17 +172,17 @@ def spectrogram(runs: Sequence[FloatArray], starts_s: Sequence[float], rate_hz: 
 
 PEAKS_MOST: Final = 10
 FLOOR_BINS: Final = 61
-"""Bins whose median is the floor of the one in the middle."""
+"""Number of bins of the noise floor, the median around a bin."""
 FLOOR_FACTOR: Final = 4.0
-"""A peak is at least 6 dB above the floor,"""
+"""Minimum power of a peak divided by the noise floor: 6 dB."""
 FALSE_PEAKS: Final = 0.001
-"""and so far that noise makes so many peaks in a whole spectrum."""
+"""Expected number of false peaks in a spectrum of noise."""
 NEIGHBOURS: Final = 3
-"""A line is the highest bin within so many on either side: the main lobe of the window is four bins wide."""
+"""Number of lower bins on each side of a peak. The main lobe of the window is four bins wide."""
 FIRST_BIN: Final = 3
-"""Below are the means that each window is freed of."""
+"""Lowest bin of a peak. The removed mean disturbs the lower bins."""
 HARMONIC_BINS: Final = 0.6
-"""A peak so close to a multiple of a lower one is called its harmonic."""
+"""Maximum distance of a harmonic from the multiple of the fundamental frequency, bins."""
 HARMONICS_MOST: Final = 12
 BAND_RATIO: Final = 2.0
 BANDS_MOST: Final = 24
@@ -189,38 +190,38 @@ BANDS_MOST: Final = 24
 
 @dataclass(frozen=True, slots=True)
 class Peak:
-    """One line of a spectrum."""
+    """Peak of a spectrum: a line of vibration."""
 
     frequency_hz: float
     amplitude: tuple[float, ...]
-    """Of each axis, peak value, in the unit of the sensor: A of A sin(2π f t)."""
+    """Amplitude A of A sin(2π f t) for each axis, in the unit of the sensor."""
     floor_ratio: float
-    """Its power over that of the noise around it."""
+    """Power of the peak divided by the noise floor."""
     axis: int
-    """The axis with the largest amplitude."""
+    """Index of the axis with the largest amplitude."""
     harmonic_of: int | None
-    """Place in the list of the peak that it is a multiple of; None for none."""
+    """Index of the fundamental peak in the list; None if the peak is not a harmonic."""
     multiple: int
-    """Which multiple; 1 for none."""
+    """Frequency divided by the fundamental frequency; 1 if the peak is not a harmonic."""
 
     @property
     def total(self) -> float:
-        """Root of the sum of the squares of the axes' amplitudes."""
+        """Amplitude of all axes: root of the sum of squares."""
         return float(np.sqrt(sum(one**2 for one in self.amplitude)))
 
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """The power of a band."""
+    """RMS of a frequency band."""
 
     low_hz: float
     high_hz: float
     rms: tuple[float, ...]
-    """Of each axis, in the unit of the sensor."""
+    """RMS of each axis, in the unit of the sensor."""
 
 
 def peaks(spectrum: Spectrum, most: int = PEAKS_MOST) -> list[Peak]:
-    """Lines of the axes together, the strongest first."""
+    """Return the peaks in the sum of all axes, the strongest first."""
     power = spectrum.density.sum(axis=1)
     floor = np.maximum(median_filter(power, size=min(FLOOR_BINS, len(power)), mode="nearest"), 1e-300)
     ratio = power / floor
@@ -236,10 +237,8 @@ def peaks(spectrum: Spectrum, most: int = PEAKS_MOST) -> list[Peak]:
 
 
 def threshold(spectrum: Spectrum) -> float:
-    """Ratio to the floor that a peak has to reach: by χ², and at least FLOOR_FACTOR.
-
-    The least that averaging gives: axes that are alike add nothing.
-    """
+    """Return the minimum ratio of a peak to the noise floor, from χ², at least FLOOR_FACTOR."""
+    # axes are not counted as averages: their noise can be correlated
     freedom = 2 * spectrum.averages
     level = float(chi2.isf(FALSE_PEAKS / len(spectrum.frequency_hz), freedom) / chi2.median(freedom))
     return max(level, FLOOR_FACTOR)
@@ -247,7 +246,7 @@ def threshold(spectrum: Spectrum) -> float:
 
 def _line(spectrum: Spectrum, power: FloatArray, place: int, ratio: float) -> Peak:
     shift = _shift(power, place)
-    loss = (1 - shift**2) / np.sinc(shift)
+    loss = (1 - shift**2) / np.sinc(shift)  # of a Hann window for a line between two bins
     amplitude = np.sqrt(2 * spectrum.density[place] * spectrum.bandwidth_hz) * loss
     return Peak(
         float((place + shift) * spectrum.bin_hz), tuple(map(float, amplitude)), ratio, int(np.argmax(amplitude)), None,
@@ -256,7 +255,7 @@ def _line(spectrum: Spectrum, power: FloatArray, place: int, ratio: float) -> Pe
 
 
 def _shift(power: FloatArray, place: int) -> float:
-    """Bins from a bin to the line of which it is the largest, -0.5 to 0.5."""
+    """Return the distance from the largest bin of a line to the line, -0.5 to 0.5 bins."""
     above, below = power[place + 1], power[place - 1]
     side = 1 if above >= below else -1
     ratio = float(np.sqrt(max(above, below) / power[place]))
@@ -264,7 +263,7 @@ def _shift(power: FloatArray, place: int) -> float:
 
 
 def _named(line: Peak, lines: Sequence[Peak], bin_hz: float) -> Peak:
-    """Name the lowest stronger line of which this one is a multiple."""
+    """Return the line with the first stronger line of which it is a multiple."""
     for number, other in enumerate(lines):
         multiple = round(line.frequency_hz / other.frequency_hz)
         near = abs(line.frequency_hz - multiple * other.frequency_hz) <= HARMONIC_BINS * bin_hz
@@ -274,13 +273,13 @@ def _named(line: Peak, lines: Sequence[Peak], bin_hz: float) -> Peak:
 
 
 def bands_of(spectrum: Spectrum, edges_hz: Sequence[tuple[float, float]] | None = None) -> list[Band]:
-    """RMS of each band, octaves by default. Raises BadArgument for a band outside 0 to half the rate."""
+    """Return the RMS of each band, by default octaves. Raises BadArgument for a band outside 0 to half of the rate."""
     half = spectrum.rate_hz / 2
     found = []
     for low, high in _octaves(spectrum) if edges_hz is None else edges_hz:
         if not 0 <= low < high <= half * (1 + 1e-6):
             raise BadArgument(
-                f"band {low:g}-{high:g} Hz: expected 0 to {half:g} Hz, half the rate, the lower end first"
+                f"band {low:g}-{high:g} Hz: expected a band from 0 to {half:g} Hz (half of the rate), lower end first"
             )
         share = _shares(spectrum, low, high)
         rms = np.sqrt(share @ spectrum.density * spectrum.bin_hz)
@@ -289,7 +288,7 @@ def bands_of(spectrum: Spectrum, edges_hz: Sequence[tuple[float, float]] | None 
 
 
 def _shares(spectrum: Spectrum, low_hz: float, high_hz: float) -> FloatArray:
-    """(k,) part of each bin that lies in a band. A bin reaches half its width to both sides, but not below 0."""
+    """Return the share of each bin inside a band, shape (k,). A bin is one bin width wide, but does not go below 0."""
     half = spectrum.bin_hz / 2
     left = np.maximum(spectrum.frequency_hz - half, 0)
     right = np.minimum(spectrum.frequency_hz + half, spectrum.rate_hz / 2)
@@ -299,7 +298,7 @@ def _shares(spectrum: Spectrum, low_hz: float, high_hz: float) -> FloatArray:
 
 
 def _octaves(spectrum: Spectrum) -> list[tuple[float, float]]:
-    """Octaves downwards from half the rate to the third bin, the highest first cut at it."""
+    """Return the octaves from the third bin to half of the rate. The first and the last octave can be shorter."""
     high = spectrum.rate_hz / 2
     least = spectrum.bin_hz * FIRST_BIN
     exponent = int(np.floor(np.log2(high)))
@@ -313,5 +312,5 @@ def _octaves(spectrum: Spectrum) -> list[tuple[float, float]]:
 
 
 def images_hz(frequency_hz: float, rate_hz: float) -> tuple[float, float]:
-    """The two lowest frequencies above half the rate that stand at `frequency_hz` in the spectrum as well."""
+    """Return the two lowest frequencies above half of the rate that appear at `frequency_hz` (aliases)."""
     return rate_hz - frequency_hz, rate_hz + frequency_hz

@@ -418,7 +418,7 @@ def write_file(path: Path, content: bytes) -> None:
 
 
 def noise_file(report: NoiseReport, kind: str) -> bytes:
-    """Return the content of a report file of one of KINDS."""
+    """Return the content of a report file; `kind` is in KINDS."""
     if kind == ".html":
         return html(report).encode()
     return picture(page_figure(report.sensors, text(report).splitlines()), kind)

@@ -104,7 +104,7 @@ def limits(taken: SampleSet, name: SensorName, sensor: SensorVibration) -> Itera
 
 
 def peak_words(number: int, peak: Peak) -> str:
-    """Return the name of a peak: its number, and the peak of which it is a multiple."""
+    """Return the name of a peak: its number, and the fundamental peak of a harmonic."""
     if peak.harmonic_of is None:
         return f"P{number}"
     return f"P{number} = {peak.multiple} × P{peak.harmonic_of + 1}"

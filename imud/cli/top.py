@@ -1,4 +1,4 @@
-"""The screens and keys of `imud top`."""
+"""`imud top`: full-screen view of all devices. The module needs the extra `top`."""
 
 import argparse
 import math
@@ -30,18 +30,18 @@ from imud.model.sample import Sample, Vector3
 from imud.model.units import NS_PER_S, NS_PER_US, RAD_PER_DEG, T_PER_UT
 
 POINTS_MAX: Final = 1200
-"""Samples kept of a device: a minute at 20 Hz."""
+"""Maximum number of stored samples of a device: one minute at 20 Hz."""
 SPAN_NS: Final = 60 * NS_PER_S
-"""Older samples are not shown."""
+"""Maximum age of shown samples, ns."""
 
 
 class Curve(NamedTuple):
-    """One value over time that the page of a device shows."""
+    """Curve of one value on the page of a device."""
 
     name: str
     unit: str
     value: Callable[[Sample], float | None]
-    """Its value in a sample in that unit; None where the sample has none."""
+    """Returns the value of a sample in `unit`; None if the sample does not contain it."""
 
 
 def _part(member: str, index: int, unit: float) -> Callable[[Sample], float | None]:
@@ -58,19 +58,19 @@ CURVES: Final = (
     *(Curve(f"gyro {axis}", "°/s", _part("gyro_rad_s", index, RAD_PER_DEG)) for index, axis in enumerate("xyz")),
     *(Curve(f"mag {axis}", "µT", _part("mag_t", index, T_PER_UT)) for index, axis in enumerate("xyz")),
 )
-"""Rows of a device's page, in their order."""
+"""Curves on the page of a device, from top to bottom."""
 
 
 class Series(NamedTuple):
-    """A curve and what came of it."""
+    """Values of a curve."""
 
     curve: Curve
     values: list[float]
-    """Oldest first; empty where the device does not send it."""
+    """Values, oldest first; empty if the device does not send the value."""
 
 
 class DeviceHistory:
-    """One device."""
+    """Status and newest samples of one device."""
 
     def __init__(self, status: DeviceStatus) -> None:
         self.status = status
@@ -78,20 +78,20 @@ class DeviceHistory:
 
     @property
     def newest(self) -> Sample | None:
-        """The newest sample; None before the first."""
+        """Newest sample; None before the first sample."""
         return self._samples[-1] if self._samples else None
 
     def add(self, sample: Sample) -> None:
-        """Keep a sample; one that is older than the newest begins the history anew: the daemon was restarted."""
+        """Add a sample. Remove samples that are too old."""
         samples = self._samples
-        if samples and sample.t_ns < samples[-1].t_ns:
+        if samples and sample.t_ns < samples[-1].t_ns:  # the daemon, or its host, restarted
             samples.clear()
         samples.append(sample)
         while samples[0].t_ns < sample.t_ns - SPAN_NS:
             samples.popleft()
 
     def series(self) -> list[Series]:
-        """All curves, in the order of CURVES."""
+        """Return the values of all curves, in the order of CURVES."""
         found = []
         for curve in CURVES:
             values = (curve.value(sample) for sample in self._samples)
@@ -100,17 +100,17 @@ class DeviceHistory:
 
 
 class DeviceHistories:
-    """All devices of a daemon, by name, in the order of its configuration."""
+    """Histories of all devices by name, in the order of the configuration."""
 
     def __init__(self) -> None:
         self.devices: dict[str, DeviceHistory] = {}
         self.now_ns = 0
-        """CLOCK_MONOTONIC of the newest news."""
+        """CLOCK_MONOTONIC of the newest update, ns."""
         self.clients = 0
-        """Connected to the daemon, this one included."""
+        """Number of clients of the daemon, including this program."""
 
     def update(self, statuses: Iterable[DeviceStatus], clients: int) -> None:
-        """Take a status of all devices; one that is not in it any more is forgotten."""
+        """Store the status of all devices. Remove devices without a status."""
         before, self.devices = self.devices, {}
         for status in statuses:
             device = before.get(status.name)
@@ -121,14 +121,14 @@ class DeviceHistories:
         self.clients = clients
 
     def add(self, sample: Sample) -> None:
-        """Take a sample; one of a device that no status had yet is left out."""
+        """Add a sample. Ignore samples of unknown devices."""
         device = self.devices.get(sample.device)
         if device is not None:
             device.add(sample)
 
 
 def norm(vector: Vector3 | None) -> float | None:
-    """Length of a vector; None for none, or where it is not finite."""
+    """Return the length of a vector; None if the vector is missing or not finite."""
     if vector is None:
         return None
     length = math.hypot(*vector)
@@ -136,27 +136,27 @@ def norm(vector: Vector3 | None) -> float | None:
 
 
 WIDTH: Final = 78
-"""Of a row: a terminal of 80 columns less the scroll bar."""
+"""Maximum width of a row, characters: a terminal of 80 columns without the scroll bar."""
 NONE: Final = "-"
 NAME_WIDTH: Final = 10
 TEXT_MAX: Final = 256
 AGE_OLD_S: Final = 999.9
-"""Beyond this an age is shown in minutes, hours or days."""
+"""Maximum age that is shown in seconds, s."""
 
 Number = float | int | None
 
 
 class Column(NamedTuple):
-    """One column."""
+    """Column of the overview."""
 
     title: str
     width: int
     text: Callable[[DeviceHistory, int], str]
-    """Of a device at a time (CLOCK_MONOTONIC, ns)."""
+    """Formats the value of a device at a time (CLOCK_MONOTONIC, ns)."""
     key: Callable[[DeviceHistory, int], float | str]
-    """What rows are sorted by."""
+    """Returns the sort key of a device."""
     is_number: bool = True
-    """Numbers stand to the right, and the largest comes first."""
+    """Whether the column contains numbers: right-aligned, the largest number first."""
 
 
 def _number(
@@ -174,13 +174,13 @@ def _number(
 
 
 def age_s(device: DeviceHistory, now_ns: int) -> float | None:
-    """Time since the newest sample was measured, s; None before the first."""
+    """Return the age of the newest sample, s; None before the first sample."""
     newest = device.newest
     return None if newest is None else max(now_ns - newest.t_ns, 0) / NS_PER_S
 
 
 def duration(seconds: float) -> str:
-    """Format a time in at most five characters."""
+    """Format a duration in at most five characters."""
     if seconds < 10:
         return f"{seconds:.2f}s"
     if seconds <= AGE_OLD_S:
@@ -231,7 +231,7 @@ STATE_ORDER: Final = (
     DeviceState.FAILED, DeviceState.MISSING, DeviceState.SILENT, DeviceState.SEARCHING, DeviceState.RUNNING,
     DeviceState.FINISHED,
 )  # fmt: skip
-"""What needs attention comes first."""
+"""Device states in the sort order, problems first."""
 
 NAME: Final = Column(
     "DEVICE",
@@ -297,19 +297,19 @@ VIEWS: Final[dict[str, tuple[Column, ...]]] = {
         _number("UNPAIR", 6, lambda device, now_ns: device.status.clock.edges_unpaired, _whole),
     ),
 }  # fmt: skip
-"""Sets of columns, by name; each WIDTH wide at most, with a space between two columns."""
+"""Sets of columns by name. Each set has at most WIDTH characters, with one space between two columns."""
 
 SORTS: Final = (NAME, STATE, RATE, AGE, LOST, ERROR)
-"""What rows can be sorted by, in the order in which the key goes through them."""
+"""Sort columns. The key `s` selects the next one."""
 
 
 def head(columns: Iterable[Column]) -> str:
-    """Format the titles."""
+    """Format the titles of the columns."""
     return _line((column.title, column) for column in columns)
 
 
 def row(device: DeviceHistory, columns: Iterable[Column], now_ns: int) -> str:
-    """Format one device."""
+    """Format the row of one device."""
     return _line((column.text(device, now_ns), column) for column in columns)
 
 
@@ -324,13 +324,13 @@ def _line(cells: Iterable[tuple[str, Column]]) -> str:
 def chosen(
     devices: Iterable[DeviceHistory], sort: Column, now_ns: int, *, backwards: bool = False, words: str = ""
 ) -> list[DeviceHistory]:
-    """Sort devices, the largest number first, and leave out those in which not all `words` occur.
+    """Return the devices that contain all `words`, sorted; the largest number first.
 
-    Words are looked for in name, state, driver, link, problem and identity, whatever their case.
+    The search uses name, state, driver, link, problem and identity, and ignores the case.
     """
     wanted = words.casefold().split()
     found = [device for device in devices if all(word in _searched(device) for word in wanted)]
-    found.sort(key=lambda device: device.status.name)
+    found.sort(key=lambda device: device.status.name)  # the second sort is stable: equal keys stay sorted by name
     found.sort(key=lambda device: sort.key(device, now_ns), reverse=sort.is_number != backwards)
     return found
 
@@ -345,28 +345,24 @@ EVENTS_KEPT: Final = 200
 
 
 def event_line(event: Event, utc_offset_ns: int) -> str:
-    """Format an event as `imud events` does, in one line; `utc_offset_ns` is CLOCK_REALTIME minus CLOCK_MONOTONIC."""
+    """Format an event like `imud events`. `utc_offset_ns` is CLOCK_REALTIME minus CLOCK_MONOTONIC."""
     return as_text(printed(event, utc_offset_ns))[:TEXT_MAX]
 
 
 class NewsSource(Protocol):
-    """What reads the daemon."""
+    """Reader of the daemon: `TopFeed`, or a replacement in tests."""
 
-    def start(self) -> None:
-        """Begin to read."""
-        ...
+    def start(self) -> None: ...
 
     def look_at(self, device: str | None) -> None:
-        """Read samples of this device only, and more of them; None for all devices."""
+        """Read only samples of this device at a higher rate; None: read all devices at the lower rate."""
         ...
 
-    def close(self) -> None:
-        """End."""
-        ...
+    def close(self) -> None: ...
 
 
 class NewsCame(Message):
-    """News of the feed; a few a second."""
+    """Textual message with news of the feed, a few per second."""
 
     def __init__(self, news: News) -> None:
         super().__init__()
@@ -374,7 +370,7 @@ class NewsCame(Message):
 
 
 class TopApp(App[None]):
-    """The program. It takes `NewsCame`, from any thread."""
+    """Textual application. Any thread can post `NewsCame` to it."""
 
     TITLE = "imud top"
     CSS = """
@@ -398,31 +394,29 @@ class TopApp(App[None]):
     ]
 
     def __init__(self, make_feed: Callable[[Callable[[News], None]], NewsSource]) -> None:
-        """`make_feed` gets what takes news; from any thread."""
+        """`make_feed` creates the reader of the daemon. Its argument accepts news from any thread."""
         super().__init__()
         self.fleet = DeviceHistories()
         self.problem = "connecting"
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         self.paused = False
         self.ahead_ns = 0
-        """CLOCK_MONOTONIC of the daemon's machine minus that of this one."""
+        """CLOCK_MONOTONIC of the daemon's host minus CLOCK_MONOTONIC of this host, ns."""
         self._feed = make_feed(self._post)
 
     def on_mount(self) -> None:
-        """Show the table, and start the feed."""
         self.push_screen(Overview())
         self._feed.start()
 
     def on_unmount(self) -> None:
-        """End the feed."""
         self._feed.close()
 
     def look_at(self, device: str | None) -> None:
-        """Show more of this device, less of the others."""
+        """Read one device at a higher rate, or all devices at the lower rate."""
         self._feed.look_at(device)
 
     def on_news_came(self, message: NewsCame) -> None:
-        """Take news and redraw; in a pause the picture stays, and what came meanwhile is in the next one."""
+        """Store news. Redraw the screen, except during a pause."""
         news = message.news
         self.problem = news.problem
         if news.statuses is not None:
@@ -435,29 +429,28 @@ class TopApp(App[None]):
             self.redraw()
 
     def redraw(self) -> None:
-        """Draw the screen that is shown."""
         if isinstance(self.screen, TopScreen):
             self.screen.redraw()
 
     def action_pause(self) -> None:
-        """Stop drawing, or go on."""
+        """Start or end a pause."""
         self.paused = not self.paused
         self.redraw()
 
     def action_toggle_help(self) -> None:
-        """Show the keys, or hide them."""
+        """Show or hide the list of keys."""
         if self.screen.query("HelpPanel"):
             self.action_hide_help_panel()
         else:
             self.action_show_help_panel()
 
     def state_line(self) -> str:
-        """Format how the daemon is."""
+        """Format the problem of the connection, or the state of the daemon."""
         if self.problem:
             return printable(self.problem, TEXT_MAX)
         devices = self.fleet.devices.values()
         well = sum(device.status.state in WELL for device in devices)
-        words = f"imud: {well} of {len(devices)} devices well, {self.fleet.clients} client"
+        words = f"imud: {well} of {len(devices)} devices ok, {self.fleet.clients} client"
         words += "" if self.fleet.clients == 1 else "s"
         return words + ("  PAUSED" if self.paused else "")
 
@@ -466,33 +459,34 @@ class TopApp(App[None]):
 
 
 class TopScreen(Screen[None]):
-    """A screen of the program, which is drawn once all its parts are there."""
+    """Base class of the screens."""
 
     is_ready = False
+    """Whether all widgets exist."""
 
     @property
     def top(self) -> TopApp:
-        """The program."""
+        """Application of the screen."""
         assert isinstance(self.app, TopApp)
         return self.app
 
     def redraw(self) -> None:
-        """Draw what the program knows now."""
+        """Draw the screen if its widgets exist."""
         if self.is_ready:
             self.draw()
 
     def begin(self) -> None:
-        """Draw for the first time."""
+        """Draw the screen for the first time."""
         self.is_ready = True
         self.draw()
 
     def draw(self) -> None:
-        """Draw everything; all parts are there."""
+        """Draw the complete screen."""
         raise NotImplementedError
 
 
 class Overview(TopScreen):
-    """The table of all devices."""
+    """Screen with the table of all devices."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("v", "view", "Columns"),
@@ -510,20 +504,18 @@ class Overview(TopScreen):
         self.words = ""
 
     def compose(self) -> ComposeResult:
-        """State, titles, rows, the words of the filter, keys."""
         yield Static(id="state", markup=False)
         yield Static(id="head", markup=False)
         yield OptionList(id="rows", markup=False)
-        yield Input(placeholder="words of name, state, driver, link, problem", id="filter")
+        yield Input(placeholder="words in name, state, driver, link, problem", id="filter")
         yield Footer()
 
     def on_mount(self) -> None:
-        """Give the keys to the rows."""
         self.query_one("#rows").focus()
         self.begin()
 
     def draw(self) -> None:
-        """Draw what changed; the row that was marked stays so."""
+        """Draw the changes. The marked row stays marked."""
         top, columns = self.top, VIEWS[self.view]
         shown = chosen(
             top.fleet.devices.values(), self.sort, top.fleet.now_ns, backwards=self.backwards, words=self.words
@@ -535,7 +527,7 @@ class Overview(TopScreen):
         rows = self.query_one("#rows", OptionList)
         lines = {device.status.name: row(device, columns, top.fleet.now_ns) for device in shown}
         names = [str(option.id) for option in rows.options]
-        if names == list(lines):
+        if names == list(lines):  # same order: replacing the texts keeps the scroll position
             for name, line in lines.items():
                 rows.replace_option_prompt(name, line)
             return
@@ -549,44 +541,39 @@ class Overview(TopScreen):
         self.app.push_screen(DevicePage(str(event.option.id)))
 
     def on_screen_resume(self) -> None:
-        """Draw again after a device's page."""
+        """Draw again after the page of a device."""
         self.top.look_at(None)
         self.redraw()
 
     def on_input_changed(self, event: Input.Changed) -> None:
-        """Filter while the words are written."""
+        """Filter the rows while the user types."""
         self.words = event.value
         self.redraw()
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
-        """Keep the filter, and give the keys back to the rows."""
+        """Keep the filter and return the focus to the rows."""
         self.query_one("#rows").focus()
         event.input.display = bool(self.words)
 
     def action_view(self) -> None:
-        """Show the next set of columns."""
         names = list(VIEWS)
         self.view = names[(names.index(self.view) + 1) % len(names)]
         self.redraw()
 
     def action_sort(self) -> None:
-        """Sort by the next column."""
         self.sort = SORTS[(SORTS.index(self.sort) + 1) % len(SORTS)]
         self.redraw()
 
     def action_reverse(self) -> None:
-        """Reverse the order."""
         self.backwards = not self.backwards
         self.redraw()
 
     def action_filter(self) -> None:
-        """Ask for words."""
         words = self.query_one("#filter", Input)
         words.display = True
         words.focus()
 
     def action_no_filter(self) -> None:
-        """Show all devices again."""
         words = self.query_one("#filter", Input)
         words.value = ""
         words.display = False
@@ -594,7 +581,7 @@ class Overview(TopScreen):
 
 
 class DevicePage(TopScreen):
-    """One device: its values over the last minute, its whole status, and events as they come."""
+    """Screen of one device: values of the last minute, status, and new events."""
 
     BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,backspace", "app.pop_screen", "Back", key_display="esc")]
 
@@ -602,10 +589,9 @@ class DevicePage(TopScreen):
         super().__init__()
         self._device = name
         self._shown: Event | None = None
-        """The newest event in the list."""
+        """Newest event in the list."""
 
     def compose(self) -> ComposeResult:
-        """State, curves, status, events, keys."""
         yield Static(id="state", markup=False)
         with VerticalScroll():
             for index, _ in enumerate(CURVES):
@@ -617,16 +603,14 @@ class DevicePage(TopScreen):
         yield Footer()
 
     def on_mount(self) -> None:
-        """Ask for more samples of the device."""
         self.top.look_at(self._device)
         self.call_after_refresh(self.begin)
 
     def draw(self) -> None:
-        """Draw everything."""
         self.query_one("#state", Static).update(self.top.state_line())
         device = self.top.fleet.devices.get(self._device)
         self.query_one("#block", Static).update(
-            block(device.status) if device else f"{self._device} is not in the configuration any more"
+            block(device.status) if device else f"{self._device} is no longer in the configuration"
         )
         self._draw_curves(device)
         self._list_events()
@@ -661,13 +645,12 @@ DEVICE_HZ: Final = 20.0
 
 
 class TopFeed(Feed):
-    """What the screens read: all devices slowly, or one of them faster."""
+    """Feed of the screens: all devices at OVERVIEW_HZ, or one device at DEVICE_HZ."""
 
     def __init__(self, path: str, on_news: Callable[[News], None]) -> None:
         super().__init__(path, on_news, Wish(rate_hz=OVERVIEW_HZ))
 
     def look_at(self, device: str | None) -> None:
-        """Read samples of this device only, and more of them; None for all devices."""
         self.want(Wish(rate_hz=OVERVIEW_HZ) if device is None else Wish((device,), DEVICE_HZ))
 
 

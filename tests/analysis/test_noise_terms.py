@@ -81,5 +81,5 @@ def test_short_filtered_points_are_left_out() -> None:
     smooth = np.convolve(white(random, COUNT, RATE_HZ, 1e-3), np.ones(8) / 8, mode="same")
     curve = allan_curve([smooth[:, None]], RATE_HZ)
     assert noise_terms(curve, 0, tau_least_s=0.8).random_walk.value == pytest.approx(1e-3, rel=WITHIN)
-    with pytest.raises(BadArgument, match="a longer series is needed"):
+    with pytest.raises(BadArgument, match="record a longer series"):
         noise_terms(curve, 0, tau_least_s=curve.tau_s[-3])

@@ -32,7 +32,7 @@ def test_density_bandwidth_and_windows() -> None:
     assert found.unused == 300
     parts = [power_spectrum([runs[0]], RATE_HZ, 512), power_spectrum([runs[2]], RATE_HZ, 512)]
     assert found.density == pytest.approx((2 * parts[0].density + parts[1].density) / 3)
-    assert "300 samples in runs shorter" in found.words()
+    assert "ignores 300 samples in shorter runs" in found.words()
 
 
 def test_the_length_of_windows() -> None:

@@ -85,5 +85,5 @@ def test_bands() -> None:
     assert bands_of(spectrum, [(40, 60)])[0].rms[0] == pytest.approx(np.sqrt(2), rel=1e-3)
     for band in [(10.0, 300.0), (20.0, 10.0)]:
         spectrum = power_spectrum([three(line(2000, 50.0, 2.0))], RATE_HZ, 256)
-        with pytest.raises(BadArgument, match="expected 0 to 200 Hz"):
+        with pytest.raises(BadArgument, match="expected a band from 0 to 200 Hz"):
             bands_of(spectrum, [band])

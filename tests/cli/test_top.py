@@ -97,7 +97,7 @@ def devices_in(text: list[str]) -> list[str]:
 @played
 async def test_the_table_has_every_device_and_fits_80_columns(pilot: Pilot[None], app: TopApp) -> None:
     text = await give(pilot, app)
-    assert text[0] == "imud: 2 of 3 devices well, 2 clients  by DEVICE"
+    assert text[0] == "imud: 2 of 3 devices ok, 2 clients  by DEVICE"
     assert devices_in(text) == ["bow", "mast", "stern"]
     assert next(line for line in text if line.startswith("bow")).split()[:7] == [
         "bow", "running", "999.5", "0.25s", "4066", "12", "28.6",
@@ -139,7 +139,7 @@ async def test_the_page_of_a_device_has_curves_status_and_its_events(pilot: Pilo
     assert SilentFeed.looked_at[-2:] == ["bow", None], "more samples of the device while its page is shown"
     await press(pilot, app, "enter")
     lines_of_page = await give(pilot, app, News(statuses=(device("mast", 2),)))
-    assert any("bow is not in the configuration any more" in line for line in lines_of_page)
+    assert any("bow is no longer in the configuration" in line for line in lines_of_page)
 
 
 @played

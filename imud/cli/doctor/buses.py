@@ -15,7 +15,7 @@ from imud.links.socketcan import NATIVE
 FAILED_SHARE: Final = 0.001
 STALE_SHARE: Final = 0.5
 BROADCOM: Final = "bcm2835"
-"""Part of the name of the I2C controller of Raspberry Pi 1 to 4, which has a defect in clock stretching."""
+"""Name part of a Raspberry Pi 1 to 4 I2C controller, which has a defect in clock stretching."""
 READ_ID: Final = re.compile(r"PROD_ID: .* got ((?:[0-9a-f]{2} ){7}[0-9a-f]{2})")
 """Pattern of the eight bytes that the daemon read instead of a product id, in the problem of a device."""
 WORD_BITS: Final = 16

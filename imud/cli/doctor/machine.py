@@ -187,7 +187,7 @@ SHOWN_CHARACTERS: Final = 120
 
 
 class Pattern(NamedTuple):
-    """Pattern of the log lines of one kind of fault."""
+    """Pattern of log lines that show one kind of fault."""
 
     title: str
     expression: re.Pattern[str]

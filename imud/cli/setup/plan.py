@@ -37,7 +37,7 @@ class UsbAdapter(NamedTuple):
     """USB vendor id, four hexadecimal digits."""
     product: str
     serial: str
-    """Serial number; empty if the adapter has none."""
+    """Serial number; empty for an adapter without a serial number."""
 
 
 def usb_adapter(at: Surroundings, node: str) -> UsbAdapter | None:
