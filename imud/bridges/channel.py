@@ -1,7 +1,7 @@
-"""Channels of messages: what is said of a device, by topic, and how a sample becomes the bytes of a message.
+"""Channels of messages: topics of a device, and functions that encode samples, losses, events and diagnoses.
 
-A dialect makes the channels of a device; whoever writes a file or serves a viewer takes channels of either dialect and
-needs to know nothing of their messages. Axes and frames are those of REP-103, and of REP-145 for names of topics.
+A dialect makes the channels of a device. File writers and servers use the channels of both dialects in the same way.
+They do not depend on the message format. Axes and coordinate frames follow REP-103, names of topics follow REP-145.
 """
 
 import logging
@@ -21,11 +21,11 @@ T_contra = TypeVar("T_contra", contravariant=True)
 T = TypeVar("T")
 
 STEADY_NS: Final = 1_000_000_000
-"""A value that changes rarely (temperature) is said again after this time, so that a reader who comes later has it."""
+"""Maximum time between two messages of a constant value (temperature), ns. A late reader then gets the value."""
 
 
 class MessageSchema(NamedTuple):
-    """What describes the messages of a channel to programs that do not know them."""
+    """Schema of the messages of a channel, for programs that do not know the messages."""
 
     name: str
     encoding: str
@@ -35,27 +35,27 @@ class MessageSchema(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MessageChannel(Generic[T]):
-    """A channel: where its messages go, what they look like, and what makes them."""
+    """Channel: topic, schema and encoder of its messages."""
 
     topic: str
     schema: MessageSchema
     message_encoding: str
     """`json` or `cdr`."""
     encode: Callable[[T], bytes | None]
-    """Makes the message; None where there is nothing to say of this one."""
+    """Returns a message; None if there is no message for this object."""
     fields: frozenset[str] = frozenset()
-    """Fields of a sample that it says something of."""
+    """Names of the sample fields in the messages."""
 
 
 class LossCounts(NamedTuple):
-    """Losses of a device since its daemon's start, by cause, as its ledger has them."""
+    """Lost samples of a device since the start of the daemon, by the causes of its ledger."""
 
     t_ns: int
-    """CLOCK_MONOTONIC: of the first sample after a loss."""
+    """CLOCK_MONOTONIC of the first sample after a loss, ns."""
     utc_ns: int
     device: str
     samples: int
-    """Samples so far."""
+    """Number of samples so far."""
     lost_gap_device: int
     lost_crc: int
     lost_overrun: int
@@ -64,7 +64,7 @@ class LossCounts(NamedTuple):
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """What a loss changes."""
+        """Counters without the number of samples."""
         return self[4:]
 
 
@@ -76,7 +76,7 @@ class StampedEvent(NamedTuple):
 
     @property
     def is_warning(self) -> bool:
-        """Whether a viewer shows it as a warning, as the log does."""
+        """Whether the event is a warning, as in the log."""
         return LEVELS.get(self.event.kind, logging.WARNING) >= logging.WARNING
 
 
@@ -90,29 +90,29 @@ class DiagnosisLevel(IntEnum):
 
 
 class Diagnosis(NamedTuple):
-    """How one device is."""
+    """State of one device."""
 
     device: str
     level: DiagnosisLevel
     message: str
     hardware: str
-    """Its serial number; where that is not known its product, else empty."""
+    """Serial number, otherwise product, otherwise empty."""
     values: Mapping[str, str]
-    """Names end in units, as those of the status."""
+    """Values by name. The names are the names of the status and end in units."""
 
 
 class Diagnoses(NamedTuple):
-    """How all devices are, at one moment."""
+    """State of all devices at one time."""
 
     utc_ns: int
     devices: tuple[Diagnosis, ...]
 
 
 class MessageFrames(NamedTuple):
-    """Names of the frames of a device, and of what is known of its noise.
+    """Names of the coordinate frames of a device, and its noise.
 
-    Bodies have the name of their device; with axes other than REP-103's the suffix that it wants. Devices whose heading
-    has to do with north share a navigation frame; one whose heading has not has a level frame of its own.
+    The body frame has the name of the device, with the suffix of REP-103 for other axes. Devices with a heading from
+    north share a navigation frame. A device without a north reference has its own level frame.
     """
 
     device: str
@@ -122,55 +122,53 @@ class MessageFrames(NamedTuple):
 
     @property
     def body(self) -> str:
-        """Frame of vectors."""
+        """Coordinate frame of vectors."""
         return self.device if self.convention is Convention.ENU_FLU else f"{self.device}_frd"
 
     @property
     def navigation(self) -> str:
-        """Frame that the attitude turns into."""
+        """Reference frame of the attitude."""
         if self.has_north:
             return "enu" if self.convention is Convention.ENU_FLU else "ned"
         return f"{self.device}_level" if self.convention is Convention.ENU_FLU else f"{self.device}_level_ned"
 
 
 class ByteWriter(Protocol):
-    """Where bytes go."""
+    """Destination of bytes."""
 
-    def write(self, data: bytes) -> object:
-        """Append them."""
-        ...
+    def write(self, data: bytes) -> object: ...
 
 
 class Dialect(Protocol):
-    """A way to say samples, losses, events and diagnoses."""
+    """Message format of samples, losses, events and diagnoses."""
 
     @property
     def profile(self) -> str:
-        """Profile of an MCAP file of these messages."""
+        """Profile of an MCAP file with these messages."""
         ...
 
     def samples(self, frames: MessageFrames) -> Sequence[MessageChannel[Sample]]:
-        """Channels of the samples of a device."""
+        """Return the channels for the samples of a device."""
         ...
 
     def losses(self, device: str) -> MessageChannel[LossCounts]:
-        """Channel of the losses of a device."""
+        """Return the channel for the losses of a device."""
         ...
 
     def events(self) -> MessageChannel[StampedEvent]:
-        """Channel of the events of all devices."""
+        """Return the channel for the events of all devices."""
         ...
 
     def diagnostics(self) -> MessageChannel[Diagnoses]:
-        """Channel of how all devices are."""
+        """Return the channel for the diagnoses of all devices."""
         ...
 
 
 def covariance(sigma: float | None, *, present: bool = True) -> tuple[float, ...]:
-    """Return a covariance matrix, row by row, of three values with the same independent noise.
+    """Return the covariance matrix of three values with equal and independent noise, row by row.
 
-    As sensor_msgs/Imu and REP-145 have it: all zeros where it is not known, -1 as first element where the value itself
-    is missing.
+    As in sensor_msgs/Imu and REP-145: all elements are 0 if the noise is unknown; the first element is -1 if the value
+    is not present.
     """
     if not present:
         return (-1.0, *(8 * (0.0,)))
@@ -179,7 +177,7 @@ def covariance(sigma: float | None, *, present: bool = True) -> tuple[float, ...
 
 
 class Steady:
-    """Filter of a value that changes rarely: lets it pass when it changes, and once in STEADY_NS."""
+    """Filter for a value that changes rarely: passes each change, and the value once per STEADY_NS."""
 
     __slots__ = ("_due_ns", "_last")
 
@@ -188,7 +186,8 @@ class Steady:
         self._due_ns = 0
 
     def passes(self, value: float, t_ns: int) -> bool:
-        """Whether this value is to be said."""
+        """Return whether to send this value."""
+        # the last condition: a step back of the time also passes
         if value == self._last and t_ns < self._due_ns and t_ns > self._due_ns - 2 * STEADY_NS:
             return False
         self._last, self._due_ns = value, t_ns + STEADY_NS
@@ -196,24 +195,24 @@ class Steady:
 
 
 def topic(device: str, name: str) -> str:
-    """Return the topic of a device's channel; what a name may have and a topic of ROS 2 may not becomes `_`."""
+    """Return the topic of a device's channel. `_` replaces characters that ROS 2 does not allow in a topic."""
     plain = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in device)
     return f"/{'_' if plain[:1].isdigit() else ''}{plain}/{name}"
 
 
 def diagnosis_name(device: str) -> str:
-    """Return the name of a device's diagnosis: node and task, as diagnostic_updater makes it."""
+    """Return the name of a device's diagnosis: node and task, as in diagnostic_updater."""
     return f"imud: {device}"
 
 
 PERIOD_NS: Final = NS_PER_S
-"""Time between two diagnoses in a file: that of diagnostic_updater."""
+"""Time between two diagnoses in a file, ns, as in diagnostic_updater."""
 LOSS_SHOWN_NS: Final = 10 * NS_PER_S
-"""How long a loss is a warning: a person who looks away for a moment still sees it."""
+"""Duration of the warning after a loss, ns."""
 STALE_S: Final = 5
-"""Without samples for so long, while others send, a recorded device is stale: as long as viewers wait for diagnoses."""
+"""Time without samples after which a recorded device is stale, s. Viewers also wait 5 s for diagnoses."""
 RATE_LEAST: Final = 0.95
-"""Of the expected rate; the alert ImudRateLow has the same bound."""
+"""Minimum rate as a share of the expected rate. The alert ImudRateLow uses the same limit."""
 
 
 LEVEL_OF: Final = {
@@ -227,19 +226,19 @@ LEVEL_OF: Final = {
 
 
 class LiveDiagnosis:
-    """Diagnoses of a running daemon's devices. Synchronization: one thread."""
+    """Diagnoses of the devices of a running daemon. Synchronization: one thread."""
 
     def __init__(self) -> None:
         self._losses: dict[str, _LossWarning] = {}
         self._newest: dict[str, Diagnosis] = {}
 
     def of(self, statuses: Iterable[DeviceStatus], utc_ns: int) -> Diagnoses:
-        """Return the diagnoses of devices by their status."""
+        """Return the diagnoses for the status of all devices."""
         self._newest = {status.name: self._one(status, utc_ns) for status in statuses}
         return Diagnoses(utc_ns, tuple(self._newest.values()))
 
     def stale(self, reason: str, utc_ns: int) -> Diagnoses:
-        """Return the newest diagnoses as stale: nothing is known of the devices now, for this reason."""
+        """Return the newest diagnoses with the level STALE. `reason`: why the state is unknown now."""
         stale = (one._replace(level=DiagnosisLevel.STALE, message=reason) for one in self._newest.values())
         return Diagnoses(utc_ns, tuple(stale))
 
@@ -255,17 +254,16 @@ class LiveDiagnosis:
 
 
 class RecordedDiagnosis:
-    """Diagnoses of the devices of a recording, in its order. Synchronization: one thread.
+    """Diagnoses of the devices of a recording. Synchronization: one thread.
 
-    Each device counts seconds by its own samples: devices of replays have times that have nothing to do with those of
-    others.
+    Each device counts seconds with the times of its own samples, because the times of replayed devices are unrelated.
     """
 
     def __init__(self) -> None:
         self._devices: dict[str, _RecordedDevice] = {}
 
     def samples(self, device: str, samples: Sequence[Sample]) -> Diagnoses | None:
-        """Take samples of a device, at least one; return the diagnoses where they are due."""
+        """Process at least one sample of a device. Return the diagnoses if they are due."""
         newest = samples[-1]
         known = self._device(device)
         known.samples(newest, len(samples))
@@ -276,11 +274,11 @@ class RecordedDiagnosis:
         return self._all(newest.utc_ns)
 
     def losses(self, losses: LossCounts) -> None:
-        """Take what was lost since the daemon's start."""
+        """Process the losses of a device."""
         self._device(losses.device).losses(losses)
 
     def event(self, stamped: StampedEvent) -> Diagnoses | None:
-        """Take an event; return the diagnoses where a device came or went."""
+        """Process an event. Return the diagnoses if the event changes the state of a device."""
         event = stamped.event
         if event.kind not in (EventKind.UP, EventKind.DOWN) or not event.device:
             return None
@@ -295,10 +293,10 @@ class RecordedDiagnosis:
 
 
 class _LossWarning:
-    """Whether losses have grown within LOSS_SHOWN_NS. What was lost before the first look is no news."""
+    """Warning that samples were lost within LOSS_SHOWN_NS."""
 
     def __init__(self) -> None:
-        self._lost: int | None = None
+        self._lost: int | None = None  # None: losses before the first call cause no warning
         self._until_ns = 0
 
     def is_on(self, counts: Sequence[int], now_ns: int) -> bool:
@@ -310,20 +308,20 @@ class _LossWarning:
 
 
 class _RecordedDevice:
-    """What the recording has said of a device so far."""
+    """State of a device of a recording."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self._gone: tuple[DiagnosisLevel, str] | None = None
-        """How and why it is gone; None while it is there."""
+        """Level and reason after the event DOWN; None while the device is up."""
         self._newest: Sample | None = None
         self._begin: Sample | None = None
-        """The newest sample at the begin of the present second."""
+        """Newest sample at the start of the current second."""
         self._count = 0
-        """Samples since then."""
+        """Number of samples in the current second."""
         self._rate_hz: float | None = None
         self._idle_s = 0
-        """Seconds of the recording without a sample."""
+        """Number of seconds of the recording without a sample."""
         self._counts = dict.fromkeys(LOST_FIELDS, 0)
         self._warning = _LossWarning()
         self._losing = False
@@ -337,7 +335,7 @@ class _RecordedDevice:
         self._losing = self._warning.is_on(losses.counts, losses.t_ns)
 
     def change(self, event: Event) -> None:
-        """Take the event that it came or went."""
+        """Process the event UP or DOWN."""
         state = str(event.detail.get("state", event.kind))
         level = LEVEL_OF[DeviceState(state)] if state in list(DeviceState) else DiagnosisLevel.ERROR
         self._gone = (level, f"{state}: {event.message}") if event.kind == EventKind.DOWN else None
@@ -345,12 +343,12 @@ class _RecordedDevice:
 
     @property
     def is_due(self) -> bool:
-        """Whether a second has passed by its samples, forward or by a jump back."""
+        """Whether the sample times moved by one second or stepped back."""
         newest, begin = self._newest, self._begin
         return newest is not None and (begin is None or not 0 <= newest.t_ns - begin.t_ns < PERIOD_NS)
 
     def pass_second(self) -> None:
-        """Begin the next second."""
+        """Start the next second."""
         newest, begin = self._newest, self._begin
         self._idle_s = 0 if self._count else self._idle_s + 1
         if newest is not None and begin is not None and newest.t_ns > begin.t_ns:
@@ -386,11 +384,11 @@ _LOSING: Final = f"samples were lost within the last {LOSS_SHOWN_NS // NS_PER_S}
 
 
 def _warnings(status: DeviceStatus, *, losing: bool) -> Iterator[str]:
-    """What is to be looked at although the device runs."""
+    """Yield the problems of a device that runs."""
     if losing:
         yield _LOSING
     if status.state is DeviceState.RUNNING and status.rate_hz < RATE_LEAST * status.expected_rate_hz:
-        yield f"{status.rate_hz:.1f} Hz come of {status.expected_rate_hz:.1f} Hz"
+        yield f"rate {status.rate_hz:.1f} Hz, expected {status.expected_rate_hz:.1f} Hz"
     if status.frame is not None and status.frame.problem:
         yield status.frame.problem
     if status.lines is not None:

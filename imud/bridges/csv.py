@@ -1,11 +1,11 @@
-"""Samples, events and losses as rows of CSV (RFC 4180): a head with units in the names, then a row each.
+"""Samples, events and losses as CSV (RFC 4180): a header with units in the names, then one row per object.
 
-A row of samples is what was chosen of a sample, in that order; vectors take a column per axis. An empty
-cell is a value that the sample does not have, `nan` one that is not a number. Numbers have all their digits: reading
-them gives the same value, bit by bit.
+A row of a sample contains the chosen fields in the chosen order, vectors with one column per axis. An empty cell is a
+value that the sample does not contain; `nan` is not a number. Numbers have all digits: a reader gets the same value,
+bit by bit.
 
-`SampleText` makes the text of many rows at once. Python's own `repr` takes 0.4 µs for a number, and a row has twenty;
-msgspec takes a tenth of that. Its JSON has the same digits, and a few forms of exponents that are exchanged.
+`SampleText` formats many rows in one step. Python's `repr` takes 0.4 µs per number, and a row has 20 numbers. msgspec
+needs a tenth of this time. Its JSON has the same digits, but other forms of exponents, which `SampleText` replaces.
 """
 
 import csv
@@ -28,11 +28,11 @@ AXES: Final = {
     "euler_rad": ("roll_rad", "pitch_rad", "yaw_rad"),
     "incli_rad": ("incli_x_rad", "incli_y_rad"),
 }
-"""Columns of the fields that have more than one."""
+"""Columns of the array fields."""
 TIMES: Final = frozenset({"t_ns", "t_err_ns", "sync", "t_rx_ns", "utc_ns"})
-"""Fields that a file without times does not have."""
+"""Fields that are empty for a file without times."""
 REALS: Final = frozenset({"temperature_c", "pressure_pa"})
-"""Fields of one number that is none of those that count; a device may send whole degrees all the same."""
+"""Fields with a real number. A device can send whole degrees as an integer."""
 EVENT_COLUMNS: Final = ("utc_ns", "t_ns", "device", "kind", "message", "detail")
 LOSS_COLUMNS: Final = ("utc_ns", "t_ns", "device", *LossCounts._fields[3:])
 
@@ -41,7 +41,7 @@ Row = Sequence[Cell]
 
 _encode: Final = msgspec.json.Encoder().encode_lines
 _DEVICE: Final = "@"
-"""Stands for the device in encoded rows, where nothing else has this character."""
+"""Placeholder of the device name in encoded rows. No other cell contains this character."""
 _NOTHING: Final = b"null"
 _FORMS: Final = (
     (b"0.0000", re.compile(rb"0\.0000(?<!\d0\.0000)([1-9])(\d+)"), rb"\1.\2e-05"),
@@ -49,8 +49,8 @@ _FORMS: Final = (
     (b"e-", re.compile(rb"e-(\d)(?!\d)"), rb"e-0\1"),
     (b"e", re.compile(rb"e(?<=\de)(?=\d)"), b"e+"),
 )
-"""Numbers as msgspec writes them, and as Python does: 0.000025 and 2.5e-05, 3e-7 and 3e-07, 1e16 and 1e+16. A pattern
-begins with its literal, which comes first and quickly finds the places; most texts do not have it at all."""
+"""Literal, pattern and replacement for numbers that msgspec and Python format differently: 0.000025 and 2.5e-05, 3e-7
+and 3e-07, 1e16 and 1e+16. A fast search for the literal avoids most pattern searches."""
 
 
 def sample_columns(fields: Sequence[str]) -> list[str]:
@@ -59,7 +59,7 @@ def sample_columns(fields: Sequence[str]) -> list[str]:
 
 
 def sample_row(fields: Sequence[str], without_times: bool = False) -> Callable[[Sample], Row]:
-    """Return what makes the row of a sample, its cells as in `sample_columns`; `without_times` leaves TIMES empty."""
+    """Return a function that makes the row of a sample. `without_times`: leave the cells of TIMES empty."""
     plan = [(name, len(AXES.get(name, ())), without_times and name in TIMES) for name in fields]
 
     def row(sample: Sample) -> Row:
@@ -78,33 +78,32 @@ def sample_row(fields: Sequence[str], without_times: bool = False) -> Callable[[
 
 
 def event_row(stamped: StampedEvent) -> Row:
-    """Return the row of an event; its details are JSON."""
+    """Return the row of an event. The details are JSON."""
     event = stamped.event
     detail = msgspec.json.encode(event.detail).decode() if event.detail else None
     return stamped.utc_ns, event.t_ns, event.device, str(event.kind), event.message, detail
 
 
 def loss_row(losses: LossCounts) -> Row:
-    """Return the row of losses: what was lost since the daemon's start."""
+    """Return the row of the lost samples since the start of the daemon."""
     return losses.utc_ns, losses.t_ns, losses.device, *losses[3:]
 
 
 def csv_text(rows: Iterable[Row]) -> bytes:
-    """Return rows as CSV: CRLF, quotes only where they are needed, UTF-8."""
+    """Return rows as CSV in UTF-8 with CRLF, quotes only if they are needed."""
     text = StringIO()
     csv.writer(text).writerows(rows)
     return text.getvalue().encode(errors="backslashreplace")
 
 
 class SampleText:
-    """Maker of the rows of samples as CSV, the same as `csv_text` of `sample_row`, byte by byte. Immutable."""
+    """Fast formatter of samples as CSV. The output is equal to `csv_text` of `sample_row`, byte by byte. Immutable."""
 
     def __init__(self, fields: Sequence[str], without_times: bool = False) -> None:
-        """As of `sample_row`."""
         self._row = sample_row(fields, without_times)
         self._columns = [_column(name, without_times and name in TIMES) for name in fields]
         self._is_single = len(sample_columns(fields)) == 1
-        """An empty cell that is alone in its row has quotes, or the row would be an empty line."""
+        """Whether a row has one cell. An empty cell then needs quotes, because the row would be an empty line."""
 
     def of(self, samples: Sequence[Sample]) -> bytes:
         """Return the rows of samples of one device, at least one."""
@@ -114,7 +113,7 @@ class SampleText:
             columns.append(cells)
             missing += empty
         text = _encode(list(zip(*columns, strict=True)))
-        if self._is_single or text.count(_NOTHING) != missing:  # JSON has null for what is not finite, too
+        if self._is_single or text.count(_NOTHING) != missing:  # JSON also writes null for NaN and infinity
             return csv_text(map(self._row, samples))
         text = text.translate(None, b'[]"').replace(_NOTHING, b"").replace(b"\n", b"\r\n")
         for literal, pattern, form in _FORMS:
@@ -128,7 +127,10 @@ Column = Callable[[Sequence[Sample]], tuple[Sequence[Any], int]]
 
 
 def _column(name: str, is_unknown: bool) -> Column:
-    """Return what makes the cells of a field for all samples, and says how many are empty; axes are in one cell."""
+    """Return a function that makes the cells of a field for all samples and counts empty cells.
+
+    All axes of a vector are in one cell.
+    """
     width, get = len(AXES.get(name, ())), attrgetter(name)
     nothing = width * (None,) if width else None
 

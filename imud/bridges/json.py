@@ -1,19 +1,18 @@
-"""Samples as JSON messages with JSON schemas: attitude and events in those of Foxglove, diagnostics in that
-of ROS, the others imud's own.
+"""JSON messages with JSON schemas: attitude and events of Foxglove, diagnostics of ROS, other messages of imud.
 
     /NAME/imu/data       imud.Imu                  angular rate, specific force, attitude
     /NAME/imu/mag        imud.MagneticField
-    /NAME/temperature    imud.Temperature          when it changes, and once a second
-    /NAME/pressure       imud.FluidPressure        when it changes, and once a second
+    /NAME/temperature    imud.Temperature          after a change, and once per second
+    /NAME/pressure       imud.FluidPressure        after a change, and once per second
     /NAME/attitude       foxglove.FrameTransform   body in the navigation frame
-    /NAME/stamp          imud.SampleStamp          number, times and error of each sample, and what has no other place
+    /NAME/stamp          imud.SampleStamp          sequence number, times, time stamp error, other fields of each sample
     /NAME/losses         imud.Losses               after each loss
-    /NAME/status         imud.DeviceStatus         of a live device, as `imud status --json` has it
+    /NAME/status         imud.DeviceStatus         for a live device, as in `imud status --json`
     /events              foxglove.Log
     /diagnostics         diagnostic_msgs/DiagnosticArray   all devices
 
-Names of members are those of the ROS messages for the same thing, so that both dialects read the same in a viewer. What
-a sample does not have is left out; NaN is null. Covariances are there where they are known.
+The members have the names of the corresponding ROS messages, so that a viewer shows both dialects in the same way. A
+message contains only the members that the sample contains; NaN is null. It contains covariances only if they are known.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,18 +40,18 @@ from imud.model.sample import SAMPLE_SCHEMA, Pair, Quaternion, Sample, Sync, Vec
 from imud.model.units import NS_PER_S
 
 Matrix = tuple[float, ...]
-"""Of three by three, row by row."""
+"""Matrix of 3 × 3 elements, row by row."""
 
 
 class Timestamp(msgspec.Struct, frozen=True, gc=False):
-    """A time since 1970-01-01 UTC as Foxglove has it."""
+    """Time since 1970-01-01 UTC in the format of Foxglove."""
 
     sec: int
     nsec: int
 
 
 class VectorMember(msgspec.Struct, frozen=True, gc=False):
-    """Three axes."""
+    """Vector with three axes."""
 
     x: float
     y: float
@@ -60,7 +59,7 @@ class VectorMember(msgspec.Struct, frozen=True, gc=False):
 
 
 class RotationMember(msgspec.Struct, frozen=True, gc=False):
-    """A quaternion, scalar last."""
+    """Quaternion, scalar last."""
 
     x: float
     y: float
@@ -69,7 +68,7 @@ class RotationMember(msgspec.Struct, frozen=True, gc=False):
 
 
 class ImuMessage(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
-    """A message of imud.Imu."""
+    """Message imud.Imu."""
 
     timestamp: Timestamp
     frame_id: str
@@ -82,7 +81,7 @@ class ImuMessage(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
 
 
 class MagneticMessage(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
-    """A message of imud.MagneticField."""
+    """Message imud.MagneticField."""
 
     timestamp: Timestamp
     frame_id: str
@@ -91,7 +90,7 @@ class MagneticMessage(msgspec.Struct, frozen=True, gc=False, omit_defaults=True)
 
 
 class TransformMessage(msgspec.Struct, frozen=True, gc=False):
-    """A message of foxglove.FrameTransform."""
+    """Message foxglove.FrameTransform."""
 
     timestamp: Timestamp
     parent_frame_id: str
@@ -101,7 +100,7 @@ class TransformMessage(msgspec.Struct, frozen=True, gc=False):
 
 
 class StampMessage(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
-    """A message of imud.SampleStamp: the time, and fields of the sample by their names."""
+    """Message imud.SampleStamp: the time, and fields of the sample by name."""
 
     timestamp: Timestamp
     seq: int
@@ -119,18 +118,17 @@ class StampMessage(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
 
 
 STAMP_FIELDS = StampMessage.__struct_fields__[1:]
-"""Fields of a sample that its stamp has."""
+"""Fields of a sample in imud.SampleStamp."""
 
 
 def timestamp(utc_ns: int) -> Timestamp:
-    """Return the stamp of a time."""
     return Timestamp(*divmod(utc_ns, NS_PER_S))
 
 
 LEVEL_INFO: Final = 2
 LEVEL_WARNING: Final = 3
 TEXT_MAX: Final = 4096
-"""Characters of a line in the log: of an event more than that has never been seen."""
+"""Maximum length of a log line, characters."""
 _encode: Final = msgspec.json.Encoder().encode
 _stamp_values: Final = attrgetter(*STAMP_FIELDS)
 
@@ -234,18 +232,17 @@ DIAGNOSTICS_SCHEMA: Final = MessageSchema(
         )
     ),
 )  # fmt: skip
-"""The name is the one by which the diagnostics panels of Foxglove and Lichtblick find their topics."""
+"""Schema of the diagnostics. The diagnostics panels of Foxglove and Lichtblick find topics by its name."""
 
 # --- messages ---------------------------------------------------------------------------------------------------------
 
 
 class JsonDialect:
-    """Messages in JSON."""
+    """Dialect with JSON messages."""
 
     profile = ""
 
     def samples(self, frames: MessageFrames) -> Sequence[MessageChannel[Sample]]:
-        """Channels of the samples of a device."""
         name, noise = frames.device, frames.deviations
         rows: tuple[tuple[str, MessageSchema, Encoder, Sequence[str]], ...] = (
             ("imu/data", IMU_SCHEMA, _imu(frames), ("accel_m_s2", "gyro_rad_s", "quat_wxyz")),
@@ -261,22 +258,19 @@ class JsonDialect:
         ]
 
     def losses(self, device: str) -> MessageChannel[LossCounts]:
-        """Channel of the losses of a device."""
         return MessageChannel(topic(device, "losses"), LOSSES_SCHEMA, "json", _losses)
 
     def events(self) -> MessageChannel[StampedEvent]:
-        """Channel of the events of all devices."""
         return MessageChannel("/events", LOG_SCHEMA, "json", _log)
 
     def diagnostics(self) -> MessageChannel[Diagnoses]:
-        """Channel of how all devices are."""
         return MessageChannel("/diagnostics", DIAGNOSTICS_SCHEMA, "json", _diagnostics)
 
 
 def status_channel(device: str) -> MessageChannel[tuple[DeviceStatus, int]]:
-    """Channel of the status of a live device, each with the CLOCK_REALTIME at which it was asked for.
+    """Return the channel for the status of a live device with the CLOCK_REALTIME of the request.
 
-    It is JSON beside messages of either dialect: no message of ROS has a place for it.
+    The channel is JSON in both dialects, because no ROS message can contain the status.
     """
     return MessageChannel(topic(device, "status"), STATUS_SCHEMA, "json", _status)
 
@@ -327,7 +321,7 @@ def _mag(frames: MessageFrames) -> Encoder:
 def _scalar(
     frames: MessageFrames, name: str, title: str, sigma: float | None
 ) -> tuple[MessageSchema, Encoder, Sequence[str]]:
-    """A value without direction: its schema, what encodes it, its field."""
+    """Return the schema, the encoder and the field of a scalar value."""
     member = "temperature" if name == "temperature_c" else "fluid_pressure"
     schema = _schema(title, {"frame_id": _TEXT, member: _field(name), "variance": _NUMBER})
     known, steady = {} if sigma is None else {"variance": sigma * sigma}, Steady()

@@ -1,11 +1,10 @@
-"""A file of MCAP (https://mcap.dev/spec), written from its begin to its end, seekable or not.
+"""Writer of an MCAP file (https://mcap.dev/spec). The output does not need to be seekable.
 
     magic │ header │ metadata │ chunk, indexes of its messages │ chunk, … │ data end │ summary │ footer │ magic
 
-Chunks are compressed with Zstandard in a thread of their own, while the next is gathered; a chunk keeps some thousand
-messages. Records are those of the library `mcap`; only messages and their indexes are packed here, because the library
-takes several microseconds for a message and a sample has four. A file that is cut short has all chunks before the cut,
-as `mcap recover` reads them.
+A thread compresses a chunk of some thousand messages with Zstandard while the writer fills the next chunk. The library
+`mcap` encodes the records. This module encodes messages and their indexes, because the library takes several
+microseconds per message, and a sample has four messages. `mcap recover` reads the complete chunks of a truncated file.
 """
 
 import struct
@@ -37,19 +36,19 @@ from mcap.writer import MCAP0_MAGIC
 from imud.bridges.channel import ByteWriter, MessageChannel, MessageSchema
 
 CHUNK_BYTES: Final = 1 << 20
-"""Content of a chunk, as the library's own writer has it: larger ones are compressed 2 % better, and a reader of a
-second of one topic has to unpack a whole chunk."""
+"""Size of a chunk, bytes, as in the writer of the library. Larger chunks save 2 %, but a reader of one second of a
+topic must unpack a complete chunk."""
 LEVEL: Final = 1
-"""Of Zstandard: level 3 saves little of numbers with noise, and takes twice as long."""
+"""Compression level of Zstandard. Level 3 saves little for noisy numbers and takes twice the time."""
 TIME_MAX: Final = (1 << 64) - 1
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
-"""Opcode, length of what follows, channel, sequence, log time, publish time."""
+"""Header of a message: opcode, length of the rest, channel, sequence number, log time, publish time."""
 _MESSAGE_REST: Final = _MESSAGE.size - 9
 _SEQUENCE_MASK: Final = 0xFFFF_FFFF
 
 
 class McapChannel:
-    """A channel of a file, which takes its messages. Made by `McapFile.add_channel`."""
+    """Channel of a file. `McapFile.add_channel` creates it."""
 
     __slots__ = ("_file", "count", "id", "index")
 
@@ -57,12 +56,12 @@ class McapChannel:
         self._file = file
         self.id = number
         self.count = 0
-        """Messages so far."""
+        """Number of messages so far."""
         self.index: list[int] = []
-        """Time and place of each message in the present chunk."""
+        """Time and position of each message in the current chunk."""
 
     def add(self, t_ns: int, data: bytes) -> None:
-        """Append a message of this time (ns since 1970; before it counts as 1970). Raises OSError."""
+        """Append a message. `t_ns`: ns since 1970; an earlier time becomes 0. Raises OSError."""
         if not 0 <= t_ns <= TIME_MAX:
             t_ns = min(max(t_ns, 0), TIME_MAX)
         head = _MESSAGE.pack(
@@ -72,10 +71,8 @@ class McapChannel:
         self._file.append(self.index, t_ns, head, data)
 
     def add_run(self, times_ns: Sequence[int], messages: Sequence[bytes]) -> None:
-        """Append messages, one of each time, as `add` one after the other. Raises OSError.
-
-        Most runs fit the present chunk, and are packed without a call of Python's for each message.
-        """
+        """Append messages with their times. The result is equal to calls of `add`. Raises OSError."""
+        # fast path: most runs fit in the current chunk; C code packs them without a Python call per message
         sizes = list(map(len, messages))
         fits = self._file.has_room(sum(sizes) + len(sizes) * _MESSAGE.size)
         if not (fits and min(times_ns) >= 0 and max(times_ns) <= TIME_MAX and self.count + len(sizes) < _SEQUENCE_MASK):
@@ -91,13 +88,13 @@ class McapChannel:
 
 
 class McapFile:
-    """Writer of one file. Synchronization: one thread; it has another to compress."""
+    """Writer of one file. Synchronization: one thread; a second thread compresses."""
 
     def __init__(self, out: ByteWriter, profile: str, library: str, metadata: Mapping[str, str]) -> None:
-        """`metadata` is what is to be known of the whole file. Raises OSError."""
+        """`metadata`: names and values for the complete file. Raises OSError."""
         self._out = out
         self._at = 0
-        """Bytes written."""
+        """Number of written bytes."""
         self._schemas: dict[MessageSchema, Schema] = {}
         self._channels: list[tuple[Channel, McapChannel]] = []
         self._parts: list[bytes] = []
@@ -106,7 +103,7 @@ class McapFile:
         self._compressor = zstandard.ZstdCompressor(level=LEVEL)
         self._thread = ThreadPoolExecutor(1, "compress")
         self._waiting: tuple[Future[bytes], int, int, dict[int, list[int]]] | None = None
-        """The chunk that is compressed: it, its size and CRC, and indexes of its messages by channel."""
+        """Chunk that the thread compresses: result, size, CRC, and the message indexes by channel."""
         self._start_ns, self._end_ns = TIME_MAX, 0
         self._write(MCAP0_MAGIC)
         self._record(Header(profile, library))
@@ -115,7 +112,7 @@ class McapFile:
         self._metadata = MetadataIndex(begin, self._at - begin, "imud")
 
     def add_channel(self, described: MessageChannel[Any]) -> McapChannel:
-        """Return a channel for messages that are described so."""
+        """Add a channel to the file and return it."""
         schema = self._schemas.get(described.schema)
         if schema is None:
             name, encoding, data = described.schema
@@ -129,7 +126,7 @@ class McapFile:
         return channel
 
     def append(self, index: list[int], t_ns: int, head: bytes, data: bytes) -> None:
-        """Append a message, with its place to `index`; for `McapChannel`."""
+        """Append a message, and its time and position to `index`. Only `McapChannel` calls this method."""
         index += (t_ns, self._size)
         self._parts += (head, data)
         self._size += len(head) + len(data)
@@ -137,7 +134,7 @@ class McapFile:
             self._end_chunk()
 
     def has_room(self, size: int) -> bool:
-        """Whether the present chunk goes on after so many bytes more."""
+        """Return whether the current chunk stays open after `size` more bytes."""
         return self._size + size < CHUNK_BYTES
 
     def append_run(
@@ -148,13 +145,13 @@ class McapFile:
         messages: Sequence[bytes],
         sizes: Sequence[int],
     ) -> None:
-        """Append messages that the present chunk has room for, with their places to `index`; for `McapChannel`."""
+        """Append messages that fit in the current chunk, and their times and positions to `index`."""
         *places, self._size = accumulate(map(_MESSAGE.size.__add__, sizes), initial=self._size)
         index += chain.from_iterable(zip(times_ns, places, strict=True))
         self._parts += chain.from_iterable(zip(heads, messages, strict=True))
 
     def finish(self) -> None:
-        """Write what waits, and the summary; the file itself stays open. Raises OSError."""
+        """Write the last chunk and the summary. The file stays open. Raises OSError."""
         self._end_chunk()
         self._write_waiting()
         self._thread.shutdown()
@@ -163,7 +160,7 @@ class McapFile:
         self._write(MCAP0_MAGIC)
 
     def close(self) -> None:
-        """End the thread; without `finish` the file stays cut short. May be called twice."""
+        """Stop the thread. Without `finish`, the file is truncated. A second call does nothing."""
         self._thread.shutdown(cancel_futures=True)
 
     # --- chunks ------------------------------------------------------------------------------------------------------
@@ -187,7 +184,7 @@ class McapFile:
         self._waiting = compressed, len(content), zlib.crc32(content), indexes
 
     def _write_waiting(self) -> None:
-        """Write the chunk that was compressed meanwhile, and the indexes of its messages."""
+        """Write the compressed chunk and the indexes of its messages."""
         if self._waiting is None:
             return
         compressed, size, crc, indexes = self._waiting
@@ -248,5 +245,5 @@ class McapFile:
 def _bytes_of(record: McapRecord) -> bytes:
     builder = RecordBuilder()
     record.write(builder)
-    data: bytes = builder.end()  # type: ignore[no-untyped-call] # the library has none
+    data: bytes = builder.end()  # type: ignore[no-untyped-call] # the library has no type hints
     return data

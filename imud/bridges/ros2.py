@@ -1,17 +1,17 @@
-"""Samples as ROS 2 messages in CDR: sensor_msgs, tf2_msgs, diagnostic_msgs, and two types of imud's own (`ros2_types`).
+"""ROS 2 messages in CDR: sensor_msgs, tf2_msgs, diagnostic_msgs, and two message types of imud.
 
-    /NAME/imu/data       sensor_msgs/Imu            with the attitude; /NAME/imu/data_raw of a device that sends none
+    /NAME/imu/data       sensor_msgs/Imu            with attitude; /NAME/imu/data_raw for a device without attitude
     /NAME/imu/mag        sensor_msgs/MagneticField
-    /NAME/temperature    sensor_msgs/Temperature    when it changes, and once a second
-    /NAME/pressure       sensor_msgs/FluidPressure  when it changes, and once a second
+    /NAME/temperature    sensor_msgs/Temperature    after a change, and once per second
+    /NAME/pressure       sensor_msgs/FluidPressure  after a change, and once per second
     /tf                  tf2_msgs/TFMessage         attitude
-    /NAME/stamp          imud_msgs/SampleStamp      number, times and error of each sample, and what has no other place
+    /NAME/stamp          imud_msgs/SampleStamp      sequence number, times, error and other fields of each sample
     /NAME/losses         imud_msgs/Losses           after each loss
     /events              rcl_interfaces/Log
     /diagnostics         diagnostic_msgs/DiagnosticArray   all devices
 
-Names of the topics of Imu and MagneticField are those of REP-145. The encoders are made for a device once: frames and
-covariances are constant, so that a message is one call of `struct`. Measured: 1 µs per message.
+The topics of Imu and MagneticField have the names of REP-145. Coordinate frames and covariances of a device are
+constant, so that an encoder needs one call of `struct` per message (measured: 1 µs).
 """
 
 import re
@@ -38,17 +38,17 @@ from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_S
 
 ENCAPSULATION: Final = b"\x00\x01\x00\x00"
-"""CDR_LE, no options."""
+"""Encapsulation header: CDR_LE, no options."""
 SIZES: Final = {"B": 1, "b": 1, "?": 1, "s": 1, "H": 2, "h": 2, "I": 4, "i": 4, "f": 4, "Q": 8, "q": 8, "d": 8}
-"""Size and alignment of numbers by their code of `struct`; `s` is bytes that are encoded already."""
+"""Size and alignment by the code of `struct`, bytes. `s` is for encoded bytes."""
 _NUMBERS: Final = re.compile(r"(\d*)([a-zA-Z?])")
 
 
 class Layout:
-    """A layout of messages of one size: numbers by their codes, and texts that are always the same. Immutable."""
+    """Layout of messages of constant size: numbers and constant strings. Immutable."""
 
     def __init__(self, *parts: str) -> None:
-        """Each part is codes of numbers, as `iI` or `3d`, or a constant text after a `"`; in their order."""
+        """A part contains codes of numbers, for example `iI` or `3d`, or `"` and a constant string."""
         self._format, self._at = f"<{len(ENCAPSULATION)}s", 0
         texts: list[bytes] = []
         for part in parts:
@@ -61,9 +61,9 @@ class Layout:
                     self._align(SIZES[code])
                     self._add(int(count or 1), code)
         self.texts: Final = tuple(texts)
-        """The texts with their lengths, as `pack` takes them."""
+        """Encoded constant strings, arguments of `pack`."""
         self.pack: Final = struct.Struct(self._format).pack
-        """Packs a message from ENCAPSULATION, numbers, and each of `texts` where it stands among the parts."""
+        """Encodes a message. Arguments: ENCAPSULATION, then the numbers and `texts` in the order of the parts."""
 
     def _add(self, count: int, code: str) -> None:
         self._format += f"{count}{code}"
@@ -76,25 +76,24 @@ class Layout:
 
 
 class CdrWriter:
-    """Writer of one message. Synchronization: one thread."""
+    """Encoder of one message of variable size. Synchronization: one thread."""
 
     def __init__(self) -> None:
         self._buffer = bytearray(ENCAPSULATION)
 
     def number(self, code: str, value: Any) -> "CdrWriter":
-        """Append a number by its code of `struct`. Raises struct.error for one that does not fit."""
+        """Append a number with a code of `struct`. Raises struct.error if the number is out of range."""
         self._align(SIZES[code])
         self._buffer += struct.pack("<" + code, value)
         return self
 
     def text(self, value: str) -> "CdrWriter":
-        """Append a string."""
         self._align(4)
         self._buffer += _text(value)
         return self
 
     def done(self) -> bytes:
-        """Return the message."""
+        """Return the encoded message."""
         return bytes(self._buffer)
 
     def _align(self, size: int) -> None:
@@ -161,13 +160,13 @@ FIELDS: Final = {
         "uint64 lost_queue\nuint64 lost_unknown"
     ),
 }
-"""Fields of each type, as in its file with the ending `.msg`."""
+"""Fields of each type, as in its `.msg` file."""
 NONE: Final = -1
-"""Stands in an integer of imud_msgs/SampleStamp for a value that the sample does not have; in numbers it is NaN."""
+"""Integer of imud_msgs/SampleStamp for a value that the sample does not contain. For real numbers it is NaN."""
 
 
 def schema(name: str) -> MessageSchema:
-    """Return the definition of a type with those of all types that it is made of, each once."""
+    """Return the definition of a type and of all types that it contains."""
     parts, done, waiting = [FIELDS[name]], {name}, _parts_of(name)
     while waiting:
         part = waiting.pop(0)
@@ -187,7 +186,7 @@ def _parts_of(name: str) -> list[str]:
 LEVEL_INFO: Final = 20
 LEVEL_WARN: Final = 30
 SEC_MAX: Final = 0x7FFF_FFFF
-"""`builtin_interfaces/Time` ends in 2038."""
+"""Maximum `sec` of `builtin_interfaces/Time`, in the year 2038."""
 _MATRIX: Final = Struct("<9d")
 _NO_VECTOR: Final = (0.0, 0.0, 0.0)
 _NO_ROTATION: Final = (1.0, 0.0, 0.0, 0.0)
@@ -198,12 +197,11 @@ Encoder = Callable[[Sample], bytes | None]
 
 
 class Ros2Dialect:
-    """Messages of ROS 2."""
+    """Dialect with ROS 2 messages."""
 
     profile = "ros2"
 
     def samples(self, frames: MessageFrames) -> Sequence[MessageChannel[Sample]]:
-        """Channels of the samples of a device."""
         name = frames.device
         rows: tuple[tuple[str, str, Encoder, set[str]], ...] = (
             (topic(name, "imu/data"), "sensor_msgs/Imu", _imu(frames, with_attitude=True), _IMU),
@@ -226,7 +224,6 @@ class Ros2Dialect:
         ]
 
     def losses(self, device: str) -> MessageChannel[LossCounts]:
-        """Channel of the losses of a device."""
         layout = Layout("iI", f'"{device}', "6Q")
 
         def encode(losses: LossCounts) -> bytes:
@@ -236,11 +233,9 @@ class Ros2Dialect:
         return MessageChannel(topic(device, "losses"), schema("imud_msgs/Losses"), "cdr", encode)
 
     def events(self) -> MessageChannel[StampedEvent]:
-        """Channel of the events of all devices."""
         return MessageChannel("/events", schema("rcl_interfaces/Log"), "cdr", _log)
 
     def diagnostics(self) -> MessageChannel[Diagnoses]:
-        """Channel of how all devices are."""
         return MessageChannel("/diagnostics", schema("diagnostic_msgs/DiagnosticArray"), "cdr", _diagnostics)
 
 
@@ -252,7 +247,7 @@ _STAMP: Final = {
 
 
 def time_of(utc_ns: int) -> tuple[int, int]:
-    """Return `sec` and `nanosec` of a stamp, clipped to what they hold."""
+    """Return `sec` and `nanosec` of a time, limited to the range of `builtin_interfaces/Time`."""
     sec, nanosec = divmod(utc_ns, NS_PER_S)
     return (sec, nanosec) if -SEC_MAX <= sec <= SEC_MAX else (SEC_MAX if sec > 0 else -SEC_MAX, nanosec)
 
@@ -299,7 +294,7 @@ def _mag(frames: MessageFrames) -> Encoder:
 
 
 def _scalar(frames: MessageFrames, name: str, sigma: float | None) -> Encoder:
-    """A value without direction, with its variance; 0 where that is not known."""
+    """Return the encoder of a scalar value with its variance; 0 if the variance is unknown."""
     layout = Layout("iI", f'"{frames.body}', "2d")
     pack, (body,) = layout.pack, layout.texts
     variance, steady = (sigma or 0.0) ** 2, Steady()
@@ -320,7 +315,7 @@ def _transform(frames: MessageFrames) -> Encoder:
 
     def encode(sample: Sample) -> bytes | None:
         quat = sample.quat_wxyz
-        if quat is None or not isfinite(sum(quat)):  # tf refuses what is not finite, and warns of it each time
+        if quat is None or not isfinite(sum(quat)):  # tf refuses NaN and prints a warning for each message
             return None
         w, x, y, z = quat
         sec, nanosec = time_of(sample.utc_ns)

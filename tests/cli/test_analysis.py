@@ -61,7 +61,7 @@ def test_a_spectrum_in_words(shaken_file: Path, tmp_path: Path, cli: Cli) -> Non
     assert "P1" in out
     assert "60 to 70" in out
     assert "gyroscope" not in out
-    for word in ("aliasing", "no manual states", "noise bandwidth", "samples are", "Hann"):
+    for word in ("aliasing", "no manual states", "noise bandwidth", "are lost", "Hann"):
         assert word in out, word
     assert picture.read_bytes().startswith(b"\x89PNG")
 
@@ -149,7 +149,7 @@ def test_a_damaged_capture_is_named_and_a_raw_one_dated_by_the_device(tmp_path: 
     file = tmp_path / "raw"
     file.write_bytes(b"".join(frame(10 * number, accel[number], gyro[number]) for number in range(500)))
     out = " ".join(cli("spectrum", file).out.split())
-    assert "even grid of 100.0000 Hz" in out
+    assert "grid of 100.0000 Hz" in out
     assert "crystal is the" in out
 
 
@@ -161,7 +161,7 @@ def test_what_cannot_be_done_is_said(resting_file: Path, cli: Cli) -> None:
         (["noise", "-o", "a.pdf"], "ends in .html, .svg, .png"),
         (["spectrum", "-o", "a.html"], "ends in .svg or .png"),
         (["spectrum", "--resolution", "0.0001"], "resolution 0.0001 Hz: expected from"),
-        (["spectrum", "--bands", "10-900"], "expected 0 to 50 Hz"),
+        (["spectrum", "--bands", "10-900"], "expected a band from 0 to 50 Hz"),
         (["noise", "--skip", "1h"], "found no samples after the first 3600 s (--skip)"),
         (["noise", "--sheet", "/nowhere"], "--sheet /nowhere"),
         (["noise", "-o", "/nowhere/a.svg"], "/nowhere/a.svg"),

@@ -120,7 +120,7 @@ def test_devices_that_cannot_be_shown(cli: Cli) -> None:
         ),
         (
             ["--device", "hipnuc-uart", "--device", "imu61x-can"],
-            "several devices: expected CAN devices only",
+            "several devices: expected CAN devices only; simulate one device of another kind at a time",
         ),
         (
             ["--device", "imu61x-can", "--device", "imu61x-can"],

@@ -113,7 +113,7 @@ def test_a_player_that_ends_early_is_an_error(
     player.write_text(f"#!/bin/sh\ncat {tmp_path}/sent\n")
     player.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(player))
-    with pytest.raises(ImudError, match="ended before its end"):
+    with pytest.raises(ImudError, match="player process ended early"):
         play_beside(file, KeepingSink(), [], lambda _at: None)
 
 
@@ -142,4 +142,6 @@ def test_the_command_writes_the_same_file(
     monkeypatch.setattr("imud.cli.export_sources.BESIDE_BYTES", 0)
     cli("export", "--to", "csv", "-o", tmp_path / "beside", file)
     assert (tmp_path / "here").read_bytes() == (tmp_path / "beside").read_bytes()
-    cli.refuses("which has bow, mast", "export", "--to", "csv", "--device", "stern", str(file))
+    cli.refuses(
+        "expected a device of the recording: bow, mast", "export", "--to", "csv", "--device", "stern", str(file)
+    )
