@@ -1,10 +1,9 @@
 """Draws the pictures of docs/analysis.md: `python -m tests.analysis.pictures` (`make pictures`).
 
-They are what the commands draw of simulated sensors whose truth is known. `noise.svg`: a gyroscope with coefficients
-of the table in docs/analysis.md, two hours at 100 Hz. `noise_page.png`: the begin of the page that `imud noise -o`
-writes for that gyroscope and an accelerometer, in chromium; it is left as it is where there is none. `vibration.png`:
-an accelerometer that is set to 400 Hz and whose crystal is 2 % fast, on a machine that starts, with 1 % of the samples
-missing.
+The commands draw simulated sensors with known noise. `noise.svg`: a gyroscope with the coefficients of the table in
+docs/analysis.md, two hours at 100 Hz. `noise_page.png`: the start of the page of `imud noise -o` for this gyroscope and
+an accelerometer, in chromium; without chromium, the picture does not change. `vibration.png`: an accelerometer at 400
+Hz on a starting motor; its crystal is 2 % fast, and 1 % of the samples are lost.
 """
 
 import shutil
@@ -30,13 +29,13 @@ FOLDER: Final = ROOT / "docs/pictures"
 SEED: Final = 15
 RATE_HZ, HOURS = 100.0, 2
 N_DEG_SQRT_H, B_DEG_H, K_DEG_H_SQRT_H = 0.3, 4.0, 20.0
-"""Coefficients of all three axes."""
+"""Noise coefficients of all three axes."""
 VRW_M_S_SQRT_H = 0.03
 PRODUCT = "HI14R3"
 PAGE_SIZE, PAGE_LIMIT_S = "960,1240", 120.0
 VIBRATION_HZ, VIBRATION_S = 408.0, 60
 START_S, FULL_S, FULL_HZ = 15.0, 30.0, 48.3
-"""The machine starts, has its full speed, and turns so fast then."""
+"""Times of the start and the full speed of the motor, s, and the full speed, Hz."""
 
 
 def turn_rates() -> NDArray[np.float64]:
@@ -80,7 +79,7 @@ def noise_page_png(chromium: str) -> bytes:
 
 
 def machine() -> SensorVibration:
-    """The analysis of an accelerometer on a machine: imbalance, its double, and a resonance that it passes."""
+    """Return the vibration of a motor with an imbalance, its second harmonic, and a resonance during the start."""
     random, count = np.random.default_rng(SEED), int(VIBRATION_HZ * VIBRATION_S)
     t_s = np.arange(count) / VIBRATION_HZ
     speed_hz = FULL_HZ * np.clip((t_s - START_S) / (FULL_S - START_S), 0, 1)

@@ -1,8 +1,8 @@
-"""Noise of an inertial sensor with known coefficients, as means over each period of sampling, by exact methods.
+"""Synthetic noise of an inertial sensor with known coefficients. The values are exact means over a sampling period.
 
-White noise and random walk are drawn from the joint law of the integral over a period and the value at its end; flicker
-by fractional differences of order 1/2 (Hosking 1981, Kasdin 1995), whose spectrum is B²/(2π f) at frequencies far below
-the rate; quantisation is the difference of white noise of the angle.
+White noise and random walk use the joint distribution of the integral over a period and the value at its end. Flicker
+noise uses fractional differences of order 1/2 (Hosking 1981, Kasdin 1995); its spectrum is B²/(2π f) far below the
+rate. Quantisation is the difference of white noise of the angle.
 """
 
 import numpy as np
@@ -27,14 +27,14 @@ def random_walk(random: Generator, count: int, rate_hz: float, k: float) -> Floa
 
 
 def flicker(random: Generator, count: int, b: float) -> FloatArray:
-    """Bias instability B, unit; the same at every rate. The first half of the filter's run is left out."""
+    """Bias instability B, unit; independent of the rate. The first half of the filter output is discarded."""
     order = np.arange(1, 2 * count)
     response = np.concatenate(([1.0], np.cumprod((order - 0.5) / order)))
     return np.asarray(b * oaconvolve(random.standard_normal(2 * count), response)[count : 2 * count])
 
 
 def quantisation(random: Generator, count: int, rate_hz: float, q: float) -> FloatArray:
-    """Quantisation Q, unit · s: angles that are each off by Q (one sigma), differenced."""
+    """Quantisation Q, unit · s: differences of angles with a rounding error of Q (one sigma)."""
     return q * rate_hz * np.diff(random.standard_normal(count + 1))
 
 

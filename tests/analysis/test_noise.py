@@ -1,4 +1,4 @@
-"""A sensor at rest: density, corner of its filter, drift with temperature, disturbances, counts."""
+"""Noise of a sensor at rest: density, corner frequency, temperature drift, disturbances, resolution."""
 
 import numpy as np
 import pytest

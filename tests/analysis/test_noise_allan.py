@@ -1,4 +1,4 @@
-"""The Allan deviation against allantools, values by hand, and intervals that hold the truth as often as they say."""
+"""Allan deviation compared with allantools and with values by hand, and the coverage of the intervals."""
 
 import allantools
 import numpy as np
@@ -18,7 +18,7 @@ def test_a_deviation_and_an_interval_by_hand() -> None:
     rate = np.array([[1.0], [2.0], [4.0], [3.0]])  # differences of neighbours 1, 2, -1: 6 / (2 · 3) = 1
     curve = allan_curve([rate], 1.0, np.array([1]))
     assert curve.deviation[0, 0] == pytest.approx(1.0)
-    means = [1.5, 3.0, 3.5]  # two samples each, overlapping: the first and the last differ by 2
+    means = [1.5, 3.0, 3.5]  # averages of two samples, overlapping: the first and the last average differ by 2
     curve = allan_curve([rate], 1.0, np.array([2]))
     assert curve.deviation[0, 0] == pytest.approx((means[2] - means[0]) / np.sqrt(2))
     # χ² of 10 degrees of freedom at 5 and 95 %: 3.940 and 18.307 (any table)
@@ -51,7 +51,7 @@ def test_runs_are_taken_together_without_a_difference_across_the_gap() -> None:
 @pytest.mark.parametrize(("m", "n"), [(1, 1001), (4, 1001), (100, 1001), (7, 50)])
 def test_degrees_of_freedom_are_those_of_allantools(noise: NoiseType, m: int, n: int) -> None:
     if noise is NoiseType.FLICKER and m == 1:
-        theirs = 2 * (n - 2) ** 2 / (2.3 * n - 4.9)  # table 5; allantools 2024.6 lacks the square, and has 0.87 for it
+        theirs = 2 * (n - 2) ** 2 / (2.3 * n - 4.9)  # SP 1065, table 5; allantools 2024.6 returns 0.87
     else:
         theirs = allantools.edf_simple(n, m, ALPHAS[noise])
     assert degrees_of_freedom(noise, m, n) == pytest.approx(max(theirs, 1.0), rel=1e-9)

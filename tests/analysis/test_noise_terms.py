@@ -1,4 +1,4 @@
-"""Coefficients of synthetic noise are found within 5 %, and what a series cannot show is not made up."""
+"""Noise coefficients: synthetic noise within 5 %, and no value for a coefficient that the series does not resolve."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Plots: what is drawn are the figures of the analysis, on axes with units."""
+"""Plots show the values of the analysis on axes with units."""
 
 import numpy as np
 import pytest

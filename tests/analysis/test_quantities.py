@@ -1,4 +1,4 @@
-"""Units of data sheets, by hand, and the form of figures."""
+"""Units of data sheets compared with values by hand, and the format of numbers."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The grid of a series: rate, missing samples, runs, and what is filled."""
+"""Time grid of a series: rate, lost samples, runs, interpolated samples."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The density of known signals, its window, its runs, and the spectrogram."""
+"""Density of known signals, windows, runs, spectrogram."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Lines of known frequency and amplitude: between bins, with noise, with a clock that is off, with samples missing."""
+"""Peaks of known frequency and amplitude: between bins, with noise, with a wrong clock, with lost samples."""
 
 from itertools import pairwise
 
@@ -14,7 +14,7 @@ RATE_HZ = 400.0
 SIZE = 1024
 BIN_HZ = RATE_HZ / SIZE
 BIN_PART = 0.05
-"""Frequencies are right within so much of a bin, with 1 % of the samples missing too."""
+"""Maximum error of a frequency, bins, also with 1 % lost samples."""
 
 
 def line(count: int, frequency_hz: float, amplitude: float, rate_hz: float = RATE_HZ, phase: float = 0.3) -> FloatArray:
@@ -50,7 +50,7 @@ def test_lines_noise_and_harmonics() -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_clock_that_is_off_and_missing_samples(seed: int) -> None:
-    """A device set to 400 Hz whose crystal is 2 % fast: only the stamps say so. 1 % of the samples are missing."""
+    """The crystal of a device at 400 Hz is 2 % fast, and 1 % of the samples are lost. The time stamps show both."""
     random = np.random.default_rng(seed)
     true_hz, count = RATE_HZ * 1.02, 40_000
     frequency = 63.7
@@ -65,7 +65,7 @@ def test_a_clock_that_is_off_and_missing_samples(seed: int) -> None:
     assert abs(found.frequency_hz - frequency) < BIN_PART * spectrum.bin_hz
     assert found.axis == 0
     assert found.amplitude[0] == pytest.approx(0.5, rel=0.03)
-    naive = power_spectrum([values[keep]], RATE_HZ, SIZE)  # the nominal rate, gaps ignored
+    naive = power_spectrum([values[keep]], RATE_HZ, SIZE)  # nominal rate, without the gaps
     assert abs(peaks(naive)[0].frequency_hz - frequency) > spectrum.bin_hz, "or else this test shows nothing"
 
 

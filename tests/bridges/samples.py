@@ -1,4 +1,4 @@
-"""A sample with every value, another with next to none, and what they are in messages."""
+"""A sample with all fields, a sample with few fields, and the expected values in messages."""
 
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample, Sync

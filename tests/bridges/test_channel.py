@@ -1,4 +1,4 @@
-"""Names of topics and frames, covariances by the rules of sensor_msgs/Imu, and the filter of steady values."""
+"""Names of topics and coordinate frames, covariances of sensor_msgs/Imu, and the filter of steady values."""
 
 from imud.attitude.conventions import Convention
 from imud.bridges.channel import STEADY_NS, MessageFrames, StampedEvent, Steady, covariance, topic
@@ -14,8 +14,8 @@ def test_topics_frames_covariances_and_steady_values() -> None:
     assert MessageFrames("bow", Convention.NED_FRD).navigation == "ned"
     assert MessageFrames("bow", has_north=False).navigation == "bow_level"
     assert MessageFrames("bow", Convention.NED_FRD, has_north=False).navigation == "bow_level_ned"
-    assert covariance(None) == 9 * (0.0,)  # not known
-    assert covariance(None, present=False) == (-1.0, *(8 * (0.0,)))  # no such value
+    assert covariance(None) == 9 * (0.0,)  # unknown noise
+    assert covariance(None, present=False) == (-1.0, *(8 * (0.0,)))  # value not present
     assert covariance(0.5) == (0.25, 0, 0, 0, 0.25, 0, 0, 0, 0.25)
     assert covariance(0.5, present=False)[0] == -1
     assert StampedEvent(Event(1, "bow", EventKind.DOWN, "gone"), 2).is_warning

@@ -1,4 +1,4 @@
-"""Levels of diagnoses: of a running daemon's devices, and of those of a recording."""
+"""Levels of diagnoses for a running daemon and for a recording."""
 
 from itertools import pairwise
 from typing import Any
@@ -56,7 +56,7 @@ def test_levels_and_messages_of_a_running_daemon() -> None:
     assert one(status()).hardware == "HI13"
     taken, raised = LinesStatus({"sout": "line 5 is taken"}, {}, {}), LinesStatus({}, {}, {}, alarm=True)
     for found, words in (
-        (one(status(rate_hz=940.0)), "running; 940.0 Hz come of 1000.0 Hz"),
+        (one(status(rate_hz=940.0)), "running; rate 940.0 Hz, expected 1000.0 Hz"),
         (one(status(lines=taken)), "running; sout: line 5 is taken"),
         (one(status(lines=raised)), "running; the ALARM line is active"),
     ):

@@ -1,4 +1,4 @@
-"""Rows of CSV: columns with units in their names, empty cells for what is missing, all digits."""
+"""CSV rows: columns with units, empty cells for absent values, all digits."""
 
 import struct
 from collections.abc import Iterator, Sequence
@@ -50,12 +50,12 @@ def test_columns_and_rows() -> None:
 
 
 def by_rows(samples: Sequence[Sample], fields: Sequence[str] = SAMPLE_FIELDS) -> bytes:
-    """The text that Python's own writer makes of the rows."""
+    """Return the rows as Python's csv module formats them."""
     return table.csv_text(map(table.sample_row(fields), samples))
 
 
 def finite(random: Random, count: int) -> Iterator[float]:
-    """Numbers of every size: any bits, round ones, and those where the form of the exponent changes."""
+    """Yield numbers of all sizes: random bits, round numbers, and numbers near a change of the exponent format."""
     while count:
         value = random.choice(
             (

@@ -1,4 +1,4 @@
-"""JSON messages: each is what its own schema says, by the library jsonschema, and has the values of the sample."""
+"""JSON messages: each message is valid for its schema (library jsonschema) and contains the values of the sample."""
 
 import json
 from typing import Any
@@ -35,7 +35,7 @@ def read(channel: MessageChannel[Any], item: object) -> Any:
     message = json.loads(data)
     schema = json.loads(channel.schema.data)
     assert schema["title"] == channel.schema.name
-    if item is not BARE:  # NaN is null, which no schema of Foxglove has
+    if item is not BARE:  # NaN is null; no Foxglove schema allows null
         Draft202012Validator(schema).validate(message)
     assert set(message) <= set(schema["properties"]) or channel.schema.name == "imud.DeviceStatus"
     return message
@@ -67,7 +67,7 @@ def test_messages_and_schemas() -> None:
     made = channels()
     assert read(made["/bow/imu/mag"], FULL)["magnetic_field"] == {"x": 1e-5, "y": -2e-5, "z": 4e-5}
     assert read(made["/bow/temperature"], FULL) == {"timestamp": STAMP, "frame_id": "bow", "temperature": 31.5}
-    assert made["/bow/temperature"].encode(FULL) is None  # the same, at once again
+    assert made["/bow/temperature"].encode(FULL) is None  # the same value again, without a pause
     channel = channels(MessageFrames("bow", has_north=False))["/bow/attitude"]
     assert channel.schema.name == "foxglove.FrameTransform"
     assert read(channel, FULL) == {

@@ -1,4 +1,4 @@
-"""Files of MCAP, read by the readers of the library `mcap`, which check CRCs and indexes."""
+"""MCAP files, read by the readers of the library `mcap`, which check CRCs and indexes."""
 
 import struct
 import threading
@@ -22,7 +22,7 @@ SECOND: MessageChannel[bytes] = MessageChannel("/second", MessageSchema("c.D", "
 
 
 def written(out: BytesIO, count: int = 20_000, size: int = 200) -> list[tuple[str, int, bytes]]:
-    """Write a file with two channels, the second from the middle on; returns what is in it."""
+    """Write a file with two channels, the second from the middle. Return the expected messages."""
     file = McapFile(out, "ros2", "imud test", {"source": "a.imudrec"})
     first, second, messages = file.add_channel(FIRST), None, []
     for number in range(count):
@@ -137,7 +137,7 @@ def test_an_error_of_the_disk_comes_out_and_closing_ends_the_thread() -> None:
 
 
 def in_runs(sizes: Sequence[int], times_ns: Sequence[int], length: int) -> tuple[bytes, bytes]:
-    """The same messages in two channels, added one by one and in runs."""
+    """Write the same messages to two channels: one by one, and in runs."""
     files = []
     for one_by_one in (True, False):
         out = BytesIO()
@@ -159,7 +159,7 @@ def in_runs(sizes: Sequence[int], times_ns: Sequence[int], length: int) -> tuple
 
 @pytest.mark.parametrize("length", [1, 7, 64])
 def test_runs_are_written_as_one_message_after_the_other(length: int) -> None:
-    """Over several chunks, whose ends are in the middle of runs, and where a message fills a chunk exactly."""
+    """Chunks end inside runs, and one message fills a chunk exactly."""
     random = Random(length)
     sizes = [random.choice((0, 17, 300, 5000)) for _ in range(1500)]
     sizes[500] = CHUNK_BYTES - 31

@@ -1,4 +1,4 @@
-"""ROS 2 messages, read by rosbags with its own definitions of the types: what a node of ROS 2 would see."""
+"""ROS 2 messages, read by rosbags with its own definitions, as a ROS 2 node would read them."""
 
 import math
 from typing import Any
@@ -23,7 +23,7 @@ DIALECT = Ros2Dialect()
 BOW = MessageFrames("bow")
 OWN = {"imud_msgs/SampleStamp", "imud_msgs/Losses"}
 ROS = get_typestore(Stores.ROS2_HUMBLE)
-"""Types as rosbags has them, and the two of imud by the definition that imud writes."""
+"""Type definitions of rosbags, and imud's own definitions of its two types."""
 for own in OWN:
     ROS.register(get_types_from_msg(FIELDS[own], own.replace("/", "/msg/")))
 

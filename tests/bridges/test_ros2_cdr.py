@@ -1,4 +1,4 @@
-"""CDR: bytes by hand from the rules of alignment, and the reader of rosbags, which nobody here wrote."""
+"""CDR: compared with bytes by hand, and with the reader of rosbags."""
 
 import struct
 

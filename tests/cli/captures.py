@@ -1,4 +1,4 @@
-"""Captures of a HiPNUC module with chosen values, a crystal that may be off, and samples that are missing."""
+"""Captures of a HiPNUC device with chosen values, a crystal error and lost samples."""
 
 from collections.abc import Collection
 from pathlib import Path
@@ -37,9 +37,9 @@ def write_capture(
     missing: Collection[int] = (),
     temperature_c: FloatArray | None = None,
 ) -> Path:
-    """Write samples (n, 3) of a module that is set to `rate_hz` and whose crystal is `fast` (0.02: 2 %).
+    """Write samples, shape (n, 3), of a device at `rate_hz` with a crystal error of `fast` (0.02: 2 %).
 
-    Its messages have its own milliseconds; the host reads each right when it came.
+    The frames contain the device time in ms. The host reads each frame without a delay.
     """
     gone = set(missing)
     with file.open("wb") as out:
@@ -53,7 +53,7 @@ def write_capture(
 
 
 def shaken(count: int, rate_hz: float, frequency_hz: float, seed: int = 1) -> tuple[FloatArray, FloatArray]:
-    """Acceleration of 2 m/s² along z at a frequency over noise, and a gyroscope with noise alone."""
+    """Return 2 m/s² along z at one frequency plus noise, and noise of a gyroscope."""
     random = np.random.default_rng(seed)
     accel = 0.05 * random.standard_normal((count, 3)) + np.array([0.0, 0.0, 9.8])
     accel[:, 2] += 2.0 * np.sin(2 * np.pi * frequency_hz * np.arange(count) / rate_hz)

@@ -1,4 +1,4 @@
-"""`imud` in this process (fixture `cli`) and as a process of its own (`imud_process`)."""
+"""Fixtures that run `imud` in this process (`cli`) and in a second process (`imud_process`)."""
 
 import io
 import signal
@@ -38,14 +38,14 @@ class Cli:
         got: object = None
         try:
             got = main([str(word) for word in words])
-        except SystemExit as ended:  # argparse
+        except SystemExit as ended:  # argparse ends the program
             got = ended.code
         printed = Printed(*self._capsys.readouterr())
         assert got == status, f"expected exit status {status}, got {got}: {printed.err}"
         return printed
 
     def refuses(self, problem: str, *words: object) -> None:
-        """Run a command that ends with exit status 2 and names this problem on standard error."""
+        """Run a command. Check that it ends with status 2 and prints this problem to standard error."""
         assert problem in " ".join(self(*words, status=2).err.split())
 
 
@@ -62,7 +62,7 @@ class ImudProcess:
         self.err: IO[str] = process.stderr
 
     def end(self, number: signal.Signals | None = None, *, status: int = 0) -> Printed:
-        """Send a signal, wait for the end, check the exit status, and return the rest of the output."""
+        """Send a signal, wait for the end, check the exit status. Return the remaining output."""
         if number is not None:
             self.process.send_signal(number)
         out, err = self.process.communicate(timeout=LIMIT_S)

@@ -1,8 +1,8 @@
 """Draws pictures of docs/recording.md and docs/views.md: `python -m tests.cli.pictures` (`make pictures`).
 
-`recording_info.svg` is what `imud info` prints of a recording of two simulated modules; `top.svg` and `top_device.svg`
-are the two screens of `imud top` on the same daemon. `flight.svg` is a run of the real daemon's flight recorder on a
-module that hits something: what the module sent, and what the snapshot has of it.
+`recording_info.svg`: output of `imud info` for a recording of two simulated devices. `top.svg` and `top_device.svg`:
+the two screens of `imud top` with the same daemon. `flight.svg`: the flight recorder of a daemon with a device that
+hits an obstacle: the samples of the device, and the content of the snapshot.
 """
 
 import asyncio
@@ -72,10 +72,10 @@ async def screens(daemon: RunningDaemon) -> tuple[str, str]:
     async with app.run_test(size=SIZE) as pilot:
         await pilot.pause(RUN_S / 2)
         overview = app.export_screenshot(title="imud top")
-        await pilot.press("down", "enter")  # the module with faults: it has events
+        await pilot.press("down", "enter")  # the device with faults, which has events
         await pilot.pause(RUN_S)
         page = app.export_screenshot(title="imud top: Enter")
-        await pilot.press("p")  # nothing is drawn while the screens are taken away
+        await pilot.press("p")  # do not draw while the screens close
         return overview, page
 
 
@@ -127,7 +127,7 @@ def magnitude(sample: Sample) -> float:
 
 
 def hit_module(file: Path) -> None:
-    """A module that swings a little, and at HIT_S hits something."""
+    """Return a device that moves slowly and hits an obstacle at HIT_S."""
     with file.open("wb") as out:
         writer = CaptureWriter(out, driver="hipnuc-uart", baud=115200)
         for number in range(SENT_S * RATE_HZ):
@@ -144,7 +144,7 @@ def hit_module(file: Path) -> None:
 
 
 def flight() -> Flight:
-    """Run the daemon on that module until a snapshot is saved, and read it."""
+    """Run the daemon with this device until a snapshot exists. Return the content of the snapshot."""
     found = Flight()
     with tempfile.TemporaryDirectory(prefix="imud-") as made:
         folder = Path(made)

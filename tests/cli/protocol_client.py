@@ -1,4 +1,4 @@
-"""A client of Foxglove's WebSocket protocol, as a viewer is one: aiohttp as a bare WebSocket, rosbags for CDR."""
+"""Client of the Foxglove WebSocket protocol: aiohttp for WebSocket, rosbags for CDR."""
 
 import asyncio
 import json
@@ -27,7 +27,7 @@ def decoder_of(channel: dict[str, Any]) -> Callable[[bytes], Any]:
 
 
 class ProtocolClient:
-    """A client: channels by topic, and messages of those that it subscribes to, decoded by their own definitions."""
+    """Client with the channels by topic and the decoded messages of its subscriptions."""
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self._socket = socket

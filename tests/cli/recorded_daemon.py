@@ -1,4 +1,4 @@
-"""A daemon that records: its devices are captures that it replays, and what it published is kept beside the files."""
+"""A daemon that replays captures and records them. The published samples are stored for a comparison."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,7 +38,7 @@ class Collector:
 
 
 def stamped_capture(file: Path, seed: int = 1) -> Path:
-    """A capture of a module at 100 Hz behind an adapter that holds bytes back."""
+    """Return a capture of a device at 100 Hz behind an adapter that delays bytes."""
     random = Random(seed)
     with file.open("wb") as out:
         writer = CaptureWriter(out, driver="hipnuc-uart", baud=115200)
@@ -49,8 +49,10 @@ def stamped_capture(file: Path, seed: int = 1) -> Path:
 
 
 def run_recorded(folder: Path, *, more: str = "", recorder: str = "") -> tuple[Daemon, Collector, Sequence[Path]]:
-    """Run a daemon with a serial device and one on CAN to the end of their captures; returns it, what it published,
-    and the files that it recorded."""
+    """Run a daemon with a serial device and a CAN device to the end of their captures.
+
+    Return the daemon, the published samples, and the recorded files.
+    """
     stamped_capture(folder / "serial.capture")
     (folder / "can.log").write_text(imu61x_log(range(200)))
     text = f"""
@@ -70,7 +72,7 @@ devices:
     collector = Collector()
     daemon = Daemon(config.parse(text, "imud.yaml"), extra={"test": collector}, until_finished=True)
     with pytest.MonkeyPatch.context() as patch:
-        # On a busy host, the recorder would begin the second device at the next tick, in the middle of its replay.
+        # on a busy host, the recorder would start the second device at the next tick, in the middle of its replay
         patch.setattr("imud.publishers.recorder.writer.BEGIN_NS", NS_PER_S)
         event_loop.run(daemon.run())
     return daemon, collector, sorted((folder / "recordings").iterdir())

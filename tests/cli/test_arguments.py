@@ -1,4 +1,4 @@
-"""Arguments that several commands share: numbers, durations, settings of a driver, names of fields."""
+"""Common arguments: numbers, durations, driver options, field names."""
 
 import argparse
 import json
@@ -67,7 +67,7 @@ def test_a_risk_is_confirmed_on_a_terminal(
 
 @pytest.fixture
 def moved(tmp_path: Path) -> Path:
-    """A device whose identifiers begin at 512."""
+    """A device with identifiers from 512."""
     log = tmp_path / "drive.log"
     text = imu61x_log(range(10))
     for slot in range(5):

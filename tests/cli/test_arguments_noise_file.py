@@ -1,4 +1,4 @@
-"""Deviations from a report of `imud noise --json`, and what is none."""
+"""Deviations from a report of `imud noise --json`, and invalid reports."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from imud.model.errors import ImudError
 
 
 def report(**sensors: list[float]) -> dict[str, Any]:
-    """What is read of a report, and some of the rest."""
+    """Return a report with the used members and some others."""
     found: dict[str, Any] = {}
     for name, values in sensors.items():
         axes = zip("xyz", values, strict=True)

@@ -1,4 +1,4 @@
-"""`imud calibrate` on a running daemon with a simulated module at rest."""
+"""`imud calibrate` with a running daemon and a simulated device at rest."""
 
 import io
 import json

@@ -1,4 +1,4 @@
-"""`imud clock` on a running daemon."""
+"""`imud clock` with a running daemon."""
 
 import signal
 from collections import deque

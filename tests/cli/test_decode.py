@@ -1,4 +1,4 @@
-"""`imud decode`: a capture in, JSON lines out; the manual's own frame as it would come from a module."""
+"""`imud decode` of captures, among them the example frame of the manual."""
 
 import io
 import json
@@ -16,7 +16,7 @@ MANUAL_FRAME = bytes.fromhex(
     "5AA54C0014BB910815 2309A2C447 08151C00 CCE861BE9A35563E65EA723F 31D07CBD75DDC5BB6BD724BC"
     "8988FC4001006A41AB2A70C2 96D45041ED03434141F4F4C2 CCCAF8BE736A19BEF0001C3D8D375C3F".replace(" ", "")
 )
-"""Section 3.5 of the manual."""
+"""Frame of the manual, section 3.5."""
 DECODE = ("decode", "--driver", "hipnuc-uart")
 
 
@@ -31,7 +31,7 @@ def test_one_object_per_message(tmp_path: Path, cli: Cli) -> None:
     capture.write_bytes(MANUAL_FRAME + b"OK\r\n" + bytes(damaged) + b"\x00")
     printed = cli(*DECODE, capture)
     sample, text, bad = lines(printed.out)
-    assert sample["t_dev_ns"] == 1_840_392_000_000  # 1,840,392 ms in the manual's table
+    assert sample["t_dev_ns"] == 1_840_392_000_000  # 1,840,392 ms in the table of the manual
     assert sample["accel_m_s2"] == pytest.approx([-0.220615 * 9.8, 0.209189 * 9.8, 0.948889 * 9.8], rel=1e-5)
     assert sample["temperature_c"] == 35
     assert sample["pressure_pa"] == pytest.approx(100676, abs=1)

@@ -1,4 +1,4 @@
-"""`imud demo`: three real processes, the account at the end, and children that end too early."""
+"""`imud demo` with real processes: summary at the end, and children that end too early."""
 
 import itertools
 import re
@@ -42,7 +42,7 @@ def test_samples_flow_and_the_ledger_closes(device: str, product: str) -> None:
 
             def watched_and_known() -> bool:
                 state = client.status()
-                watching = any(one["sent"] > 20 for one in state["socket"]["clients"])  # enough to show a rate
+                watching = any(one["sent"] > 20 for one in state["socket"]["clients"])  # enough samples for a rate
                 return watching and state["devices"][0]["identity"].get("product", "").startswith(product)
 
             wait_until(watched_and_known, f"{product} is known and watched", 3 * LIMIT_S)

@@ -1,4 +1,4 @@
-"""The live view of `imud demo` and the account at its end."""
+"""Live view and summary of `imud demo`."""
 
 import io
 

@@ -1,4 +1,4 @@
-"""`imud devices`, and `imud command` on a running daemon with a simulated module."""
+"""`imud devices` and `imud command` with a running daemon and a simulated device."""
 
 from collections.abc import Iterator
 from pathlib import Path

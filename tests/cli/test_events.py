@@ -1,4 +1,4 @@
-"""`imud events`: a line or an object per event, with its local time and priority."""
+"""`imud events`: one line or object per event, with local time and priority."""
 
 import json
 from collections.abc import Iterator
@@ -47,7 +47,7 @@ def raising(event: Event, server: SocketServer) -> None:
 
 @contextmanager
 def events_of(served: Daemon) -> Iterator[tuple[object, ...]]:
-    """Two events of one device and one of another, again and again; the command for this daemon."""
+    """Send two events of one device and one of another device repeatedly. Return the command for this daemon."""
     ended = Flag()
 
     def send() -> None:
@@ -97,7 +97,7 @@ def test_events_as_they_come(words: tuple[object, ...], cli: Cli, options: list[
 
 @pytest.mark.live
 def test_the_time_is_right_where_the_daemons_clock_is_another(words: tuple[object, ...], cli: Cli) -> None:
-    """As through a socket that SSH forwards: the rig's CLOCK_MONOTONIC is not that of this host."""
+    """As with a forwarded socket (SSH): the daemon has another CLOCK_MONOTONIC than this host."""
     shown = datetime.fromisoformat(cli(*words, "--count", 1).out.split()[0])
     assert (datetime.now(UTC) - shown).total_seconds() == pytest.approx(3600, abs=120)
 

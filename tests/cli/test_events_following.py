@@ -1,4 +1,4 @@
-"""A connection that is made again after the daemon's restart, and what is said meanwhile on standard error."""
+"""Reconnection after a restart of the daemon, and the notes on standard error."""
 
 import os
 import sys

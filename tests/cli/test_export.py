@@ -1,4 +1,4 @@
-"""`imud export`: what comes out is what the daemon published, read back by csv, mcap and rosbags."""
+"""`imud export`: the output, read by csv, mcap and rosbags, is equal to the published samples."""
 
 import csv
 import json
@@ -41,7 +41,7 @@ class Recorded(NamedTuple):
     samples: list[Sample]
 
     def of(self, device: str) -> list[Sample]:
-        """Samples of a device in the axes of REP-103."""
+        """Return the samples of a device in the axes of REP-103."""
         mine = [sample for sample in self.samples if sample.device == device]
         frame = as_sent(RFU_ENU if device == "bow" else FLU_LEVEL)
         return list(Batch(device, 0, mine, frame).converted(Convention.ENU_FLU).samples)
@@ -54,7 +54,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 
 
 def with_events(file: Path) -> Path:
-    """Put an event of each device, and one of a newer imud, before the end of a recording."""
+    """Add an event of each device, and an event of a newer imud, before the end of a recording."""
     gatherer, data = BlockGatherer(), b""
     with file.open("rb") as stream:
         for record in RecordingReader(stream, file.name):
@@ -182,7 +182,7 @@ def test_mcap_with_ros_2_is_a_bag_for_rosbags(recorded: Recorded, tmp_path: Path
 def test_diagnostics_of_a_recording_have_its_losses_states_and_errors(
     recorded: Recorded, tmp_path: Path, cli: Cli
 ) -> None:
-    """Of a recording for the errors; of a capture in which 7 messages are missing for the losses."""
+    """Errors come from a recording, losses come from a capture with 7 lost samples."""
     accel, gyro = resting(1500, 100.0)
     gap = write_capture(tmp_path / "gap.capture", accel, gyro, rate_hz=100.0, missing=range(700, 707))
     for file in (recorded.file, gap):
@@ -235,7 +235,7 @@ def test_covariances_come_from_the_configuration_and_from_reports(tmp_path: Path
 
 
 def test_the_noise_of_a_device_that_is_described_after_samples_of_another_one(tmp_path: Path) -> None:
-    """The daemon describes a device when it starts. Another device may send samples before that."""
+    """The daemon describes a device at its start. Another device can send samples before that."""
     _, _, (file,) = run_recorded(tmp_path, more="noise: {gyro_rad_s: 0.5}")
     with file.open("rb") as stream:
         records = list(RecordingReader(stream, file.name))

@@ -1,4 +1,4 @@
-"""The file of an export: whole or not at all."""
+"""The output file of an export is complete, or it does not exist."""
 
 import os
 import threading

@@ -1,4 +1,4 @@
-"""A recording that is played in a process of its own gives what it gives in this one."""
+"""A recording played in a second process gives the same result as in this process."""
 
 import subprocess
 import sys
@@ -99,7 +99,7 @@ def test_an_error_of_the_player_comes_out(tmp_path: Path) -> None:
 
 
 WHOLE = HEAD.pack(EVENT, 4, 0)
-"""Head of a message with four bytes of data."""
+"""Header of a message with four bytes of data."""
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The bar: drawn on a terminal, at most so often, never elsewhere."""
+"""The progress bar: only on a terminal, with a limited number of updates."""
 
 from io import StringIO
 

@@ -1,4 +1,4 @@
-"""`imud fleet collect --to -` as a process, with a real broker: lines, acknowledgements, and the ledger at its end."""
+"""`imud fleet collect --to -` with a real broker: lines, acknowledgements, ledger."""
 
 import json
 import signal
@@ -56,7 +56,7 @@ def test_what_was_not_acknowledged_by_a_killed_collector_comes_again(broker: Mos
             gateway.send(samples_message(10 * round_ + 2, 10 * round_ + 11))
         seen.update(one["seq"] for one in lines(process, 30) if one["kind"] == "sample")
         process.process.kill()
-        printed = [line for line in process.out if line.endswith("\n")]  # what it had acknowledged is among them
+        printed = [line for line in process.out if line.endswith("\n")]  # the acknowledged messages are among them
         seen.update(one["seq"] for one in map(json.loads, printed) if one["kind"] == "sample")
     gateway.send(samples_message(202, 211))
     with collecting(broker) as process:

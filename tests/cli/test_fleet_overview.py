@@ -1,4 +1,4 @@
-"""The overview of a fleet: a row for each gateway, and what it says while there is none."""
+"""Overview of a fleet: one row per gateway, and the text without gateways."""
 
 from imud.cli.fleet import FleetOverview
 from imud.fleet.accounts import GatewayState, StreamPosition

@@ -1,4 +1,4 @@
-"""`imud fleet top` as a process: tables with a real broker, on a terminal, and what it refuses."""
+"""`imud fleet top` with a real broker: plain tables, a terminal, invalid arguments."""
 
 import os
 import pty
@@ -46,7 +46,7 @@ def test_on_a_terminal_the_picture_is_redrawn(gateway: tuple[Mosquitto, SendingG
     with imud_process(*words, stdin=slave, stdout=slave, env=environment) as process:
         os.close(slave)
         shown = b""
-        while b"mill/gw" not in shown or b"\x1b[?1049h" not in shown:  # the alternate screen
+        while b"mill/gw" not in shown or b"\x1b[?1049h" not in shown:  # switches to the alternate screen
             shown += os.read(master, 4096)
         process.process.send_signal(signal.SIGINT)
         while b"\x1b[?1049l" not in shown:

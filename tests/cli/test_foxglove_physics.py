@@ -1,7 +1,7 @@
-"""What a viewer gets over the protocol, in messages of ROS 2, is what the simulated module measured.
+"""ROS 2 messages of the Foxglove server are equal to the motion of the simulated device.
 
-The module moves in a known way and its file of truth says when each sample was taken, so that every message is compared
-with the ideal measurement of that instant: values, units, axes, frames, and the error that is stated with each time.
+The motion of the device is known, and its truth file contains the time of each sample. The test compares each message
+with the ideal measurement at this time: values, units, axes, coordinate frames, and the time stamp error.
 """
 
 import asyncio
@@ -96,7 +96,7 @@ def xyz(vector: Any) -> tuple[float, float, float]:
 
 
 def forward_left_up(sensor: tuple[float, float, float]) -> tuple[float, float, float]:
-    """A vector of the module, x right and y forward, in the axes of REP-103."""
+    """Convert a vector of the device (x right, y forward) to the axes of REP-103."""
     right, forward, up = sensor
     return forward, -right, up
 
@@ -115,14 +115,14 @@ def by_time(seen: Seen, topic: str) -> dict[int, Any]:
 
 
 def paired(seen: Seen, topic: str, other: str) -> list[tuple[Any, Any]]:
-    """Messages of a topic with those of another of the same time, all between the first and the last of the other."""
+    """Return pairs of messages of two topics with equal times, between the first and last message of `other`."""
     others = by_time(seen, other)
     first, last = min(others), max(others)
     return [(one, others[t_ns]) for t_ns, one in seen.messages[topic] if first <= t_ns <= last]
 
 
 def with_truth(seen: Seen, topic: str) -> list[tuple[Any, Truth]]:
-    """Messages of a topic, each with the truth of its instant, found by the stamp of the same time."""
+    """Return the messages of a topic with the true values at their time."""
     found = [(one, seen.truth[stamp.t_dev_ns // NS_PER_MS]) for one, stamp in paired(seen, topic, "/bow/stamp")]
     assert found
     return found

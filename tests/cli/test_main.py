@@ -1,4 +1,4 @@
-"""Every command is reachable, explains itself, and answers mistakes with one line."""
+"""All commands: help texts, and one line per error."""
 
 import subprocess
 import sys
@@ -22,7 +22,7 @@ def test_every_command_has_help(command: str, cli: Cli) -> None:
 
 
 def test_the_table_has_every_command_of_every_module() -> None:
-    """Finds a command without a row, and a row with the command of another row."""
+    """Find commands without a row, and rows with the wrong command."""
     modules = [import_module(name) for _, name, _ in walk_packages(imud.cli.__path__, "imud.cli.")]
     written = {id(value) for module in modules for value in vars(module).values() if isinstance(value, CliCommand)}
     loaded = [id(row.load()) for row in COMMANDS.values()]
@@ -68,7 +68,7 @@ CALLS: dict[str, tuple[list[str], set[str]]] = {
 @pytest.mark.live
 @pytest.mark.parametrize(("words", "foreign"), CALLS.values(), ids=CALLS)
 def test_a_command_that_is_called_often_imports_little(words: list[str], foreign: set[str]) -> None:
-    """Other imports take as long as the command itself (`python -m tests.bench.start`)."""
+    """Other imports would take as long as the command (`python -m tests.bench.start`)."""
     program = (
         "import sys\nbefore = set(sys.modules)\nfrom imud.cli import main\ntry:\n"
         f"    main({words!r})\nexcept SystemExit:\n    pass\nprint()\nprint(*sys.modules.keys() - before)"

@@ -1,4 +1,4 @@
-"""`imud modbus` on a simulated RS-485 bus in virtual time, and once on a real port."""
+"""`imud modbus` with a simulated RS-485 bus in virtual time, and with a real port."""
 
 import json
 from pathlib import Path
@@ -109,7 +109,7 @@ def test_scan_lists_the_modules_in_the_order_of_their_addresses(modbus: Commands
 
 
 def test_scan_asks_again_for_a_missing_reply(modbus: Commands) -> None:
-    """One reply is lost, one is damaged, and one is lost twice on a bus with other modules."""
+    """One reply is lost, one is damaged, and one is lost twice on a bus with other devices."""
     modbus.bus = Bus(modbus_slave(1), modbus_slave(2, mute=1), modbus_slave(3, bad_crc=1), modbus_slave(4, mute=2))
     assert [(one["address"], one.get("problem", "")) for one in modbus.scan("1-5")] == [(n, "") for n in (1, 2, 3, 4)]
     assert [address for address, _ in modbus.bus.sent].count(5) == 3
@@ -139,7 +139,7 @@ def test_two_modules_with_one_address_get_different_addresses(modbus: Commands) 
 @pytest.mark.manual("B 4.6 random addresses")
 def test_random_addresses(modbus: Commands) -> None:
     modbus.bus = Bus(*(modbus_slave(80, serial=number) for number in (1, 2, 3)))
-    out = modbus("assign", *ON, "--random", "1-9")  # by the seed, three different ones
+    out = modbus("assign", *ON, "--random", "1-9")  # the seed gives three different addresses
     assert all(serial(number) in out for number in (1, 2, 3))
     kept = {one.flash.slave for one in modbus.bus.line.slaves}
     assert len(kept) == 3
@@ -183,7 +183,7 @@ def test_a_refused_assignment_changes_nothing(modbus: Commands, words: tuple[str
 
 
 def test_another_module_at_the_new_address_is_not_taken_for_the_wanted_one(modbus: Commands) -> None:
-    asleep = modbus_slave(2, mute=4)  # three requests whether the address is free, and the one to all
+    asleep = modbus_slave(2, mute=4)  # three requests that check the new address, then the broadcast
     modbus.bus = Bus(asleep)
     said = modbus("assign", *ON, "--serial", serial(9), "--id", "2", status=2)
     assert f"expected serial number {serial(9)} at address 2" in said

@@ -1,4 +1,4 @@
-"""Cells and comparisons of a noise report; what a report says of a measurement that was none."""
+"""Cells, comparisons and limits in a noise report."""
 
 import numpy as np
 import pytest

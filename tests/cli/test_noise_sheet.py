@@ -1,4 +1,4 @@
-"""Figures of a data sheet in a file: units, and what is wrong with it."""
+"""Files with data sheet values: units and errors."""
 
 from pathlib import Path
 

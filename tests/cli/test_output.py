@@ -1,4 +1,4 @@
-"""A histogram in plain characters: its bars, their edges and their lengths."""
+"""Histograms: bars, edges, lengths. Tables and times."""
 
 import time
 
@@ -23,7 +23,7 @@ def test_a_histogram_has_bars_with_shares() -> None:
     values = [float(v % 10) for v in range(999)] + [1e9]
     lines = histogram(values, "µs")
     assert len(lines) == 10
-    assert float(lines[-1].split()[2]) == pytest.approx(10.0)  # the stray one is counted in the last bar
+    assert float(lines[-1].split()[2]) == pytest.approx(10.0)  # the last bar counts the outlier
     for span, width in [(0, 1), (11, 1), (11.1, 2), (22, 2), (50, 5), (100, 10), (0.011, 0.001)]:
         assert bar_width(span) == pytest.approx(width)
 
@@ -49,7 +49,7 @@ def test_a_table_aligns_numbers_and_cannot_write_to_the_terminal() -> None:
 
 
 def test_local_time_has_its_offset_then(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Summer and winter in a time zone with both: the offset is that of the moment, not that of today."""
+    """The offset is the offset at that time, not today's offset: summer and winter time differ."""
     monkeypatch.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
     time.tzset()
     try:

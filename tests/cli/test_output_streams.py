@@ -1,4 +1,4 @@
-"""No command ends in a traceback for what its standard streams are: a full disk, closed, ASCII, or not read."""
+"""No command ends with a traceback because of its standard streams: full disk, closed, ASCII, not read."""
 
 import io
 import os
@@ -50,7 +50,7 @@ COMMANDS: dict[str, Callable[[Path], list[str]]] = {
 
 
 def ended(words: list[str], output: int, monkeypatch: pytest.MonkeyPatch) -> object:
-    """Run a command with standard output at a descriptor; return its exit status."""
+    """Run a command with this descriptor as standard output. Return the exit status."""
     with open(os.dup(output), "w", encoding="utf-8") as out, monkeypatch.context() as patch:
         patch.setattr(sys, "stdout", out)
         try:
@@ -80,7 +80,7 @@ def test_a_full_disk_is_an_error_and_a_reader_that_has_gone_is_none(
 
 @pytest.mark.live
 def test_processes_with_a_full_disk_or_without_a_reader(folder: Path, tmp_path: Path) -> None:
-    """Also at the end of the interpreter, which writes what is buffered."""
+    """The interpreter writes its buffer at exit, which fails too."""
     good = folder / "imud.yaml"
     with open("/dev/full", "wb") as full:
         done = imud("check", good, stdout=full)
@@ -92,7 +92,7 @@ def test_processes_with_a_full_disk_or_without_a_reader(folder: Path, tmp_path: 
     argv = ["bash", "-c", script, sys.executable, str(capture)]
     done = subprocess.run(argv, capture_output=True, timeout=LIMIT_S, check=True)
     assert (done.stdout, done.stderr) == (b'{"text":"A"}\n0\n', b"")
-    with pipe(full=True) as (_, writer):  # the command ends although no program reads its error
+    with pipe(full=True) as (_, writer):  # the command ends even if no program reads its standard error
         assert imud("run", "--config", tmp_path / "none", stderr=writer).returncode == 78
 
 

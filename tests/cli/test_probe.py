@@ -1,4 +1,4 @@
-"""`imud probe` on serial ports in virtual time: detection, and queries only if they are permitted."""
+"""`imud probe` of serial ports in virtual time: detection, and requests only with permission."""
 
 import asyncio
 import json

@@ -1,4 +1,4 @@
-"""`imud probe` on CAN interfaces: all devices that are heard, silence, and queries only where they are permitted."""
+"""`imud probe` of CAN interfaces: detected devices, silence, and requests only with permission."""
 
 import asyncio
 from collections.abc import Sequence

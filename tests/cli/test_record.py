@@ -1,4 +1,4 @@
-"""`imud record`: a file that replays as the daemon ran, from the middle of its run, and what goes wrong meanwhile."""
+"""`imud record`: the recording replays like the live run, and errors during the recording."""
 
 import json
 import os
@@ -42,7 +42,7 @@ def words(daemon: RunningDaemon) -> tuple[object, ...]:
 
 
 def replayed(file: Path, cli: Cli, *names: str) -> list[dict[str, Any]]:
-    """The samples of a replay, which must be equal to the live run at several checks, of these devices only."""
+    """Return the samples of a replay. The replay must be equal to the live run and contain only these devices."""
     printed = cli("replay", "--json", file)
     assert printed.err.count("equal to the live run") == len(names)
     assert "0 of 0" not in printed.err
@@ -124,7 +124,7 @@ def test_a_daemon_that_stops_ends_it_and_says_so(tmp_path: Path, cli: Cli) -> No
 
 
 def example(word: str, **options: Any) -> str:
-    """The output of the program of docs/recording.md that has this word."""
+    """Return the output of the program in docs/recording.md that contains this word."""
     codes = re.findall(r"```python\n(.*?)```", (ROOT / "docs/recording.md").read_text(), re.DOTALL)
     (code,) = (one for one in codes if word in one)
     done = subprocess.run(
@@ -136,7 +136,7 @@ def example(word: str, **options: Any) -> str:
 def test_the_examples_of_the_document(
     daemon: RunningDaemon, words: tuple[object, ...], tmp_path: Path, cli: Cli
 ) -> None:
-    """The second one, without imud, finds the frames of HI91 in the order of their time."""
+    """The second program finds the HI91 frames in the order of time without imud."""
     assert example("imud.client", env=os.environ | {"IMUD_SOCKET": str(daemon.socket)}) == "b'\\x89imudREC'\n"
     cli(*words, "--for", "1s", "--device", "bow", tmp_path / "file")
     reads = [line.split() for line in example("zstandard", cwd=tmp_path).splitlines()]

@@ -1,4 +1,4 @@
-"""`imud info`: begin, size, devices, rates, losses and integrity of a recording."""
+"""`imud info`: start, size, devices, rates, losses and integrity of a recording."""
 
 import json
 from pathlib import Path
@@ -66,11 +66,11 @@ def test_a_device_that_was_removed_and_added_counts_from_the_begin_again() -> No
 
     check(10, 5000, 7)
     check(12, 5200, 9)
-    add(Kind.PATH, PathRecord("hipnuc-uart", {}, 0, {"samples": 5250}, b""))  # the port was opened again
+    add(Kind.PATH, PathRecord("hipnuc-uart", {}, 0, {"samples": 5250}, b""))  # the port opens again
     check(14, 5400, 9)
-    check(20, 50, 1)  # added again by a reload
+    check(20, 50, 1)  # a reload adds the device again
     check(21, 150, 4)
-    add(Kind.PATH, PathRecord("hipnuc-uart", {}, 0, {"samples": 0}, b""))  # and again, soon more than before
+    add(Kind.PATH, PathRecord("hipnuc-uart", {}, 0, {"samples": 0}, b""))  # a second reload
     check(30, 200, 0)
     check(32, 400, 5)
     device = contents.devices[0]

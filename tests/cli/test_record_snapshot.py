@@ -1,4 +1,4 @@
-"""Snapshots of the flight recorder, from the middle of a run: they replay as the daemon ran."""
+"""Snapshots of the flight recorder replay like the live run, from the middle of the run."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ from tests.support.files import imu61x_log
 
 
 def run_flying(folder: Path, settings: str) -> tuple[Collector, Sequence[Path]]:
-    """Run a daemon with a flight recorder to the end of its captures, 3 s; what it published, and the snapshots."""
+    """Run a daemon with a flight recorder for 3 s of captures. Return the published samples and the snapshots."""
     stamped_capture(folder / "serial.capture")
     (folder / "can.log").write_text(imu61x_log(range(FRAMES)))
     text = f"""
@@ -45,7 +45,7 @@ def test_a_snapshot_whose_begin_is_gone_replays_as_the_daemon_ran(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli, place: str
 ) -> None:
     monkeypatch.setattr(flight, "SEGMENT_NS_MIN", 300_000_000)
-    monkeypatch.setattr(flight, "MEGABYTE", 28_000)  # of 39,000 that the run makes: the oldest segments go
+    monkeypatch.setattr(flight, "MEGABYTE", 28_000)  # the run makes 39,000: the recorder removes the oldest segments
     directory = f"directory: {tmp_path / 'flight'}, " if place == "directory" else ""
     collector, (file,) = run_flying(tmp_path, f"{directory}memory_mb: 1, minutes: 0.1, acceleration_m_s2: 5")
     printed = cli("replay", "--json", file)

@@ -1,4 +1,4 @@
-"""`imud replay` of a recording: what the daemon published, line by line, from the file that it wrote meanwhile."""
+"""`imud replay` of a recording is equal to the published samples, line by line."""
 
 from io import BytesIO
 from pathlib import Path
@@ -58,7 +58,7 @@ def test_a_fresh_clock_gives_other_numbers_and_says_why(recorded: Recorded, cli:
 
 
 def test_a_cut_file_is_replayed_as_far_as_it_goes(recorded: Recorded) -> None:
-    """A slow machine writes several blocks, so the blocks before the cut can contain samples."""
+    """A slow host writes several blocks, so the blocks before the cut can contain samples."""
     file, lines, _ = recorded
     printed: list[str] = []
     player = Player(lambda batch: printed.extend(msgspec.json.encode(sample).decode() for sample in batch.samples))

@@ -1,4 +1,4 @@
-"""`imud check`; `imud run` is tested as a process in tests/test_daemon.py."""
+"""`imud check`. The tests of the process `imud run` are in tests/test_daemon.py."""
 
 import os
 import subprocess
@@ -30,7 +30,7 @@ def test_check_accepts_the_shipped_file_and_names_a_mistake(tmp_path: Path, cli:
     ("words", "hint", "status"), [(["check"], "is the path right?", 2), (["run", "--config"], "--config", 78)]
 )
 def test_a_file_that_is_not_there(words: list[str], hint: str, status: int, tmp_path: Path, cli: Cli) -> None:
-    """The hint names an argument that the command has."""
+    """The advice names an existing argument of the command."""
     error = cli(*words, tmp_path / "none", status=status).err
     assert error.startswith(f"{tmp_path}/none: cannot be read: No such file or directory; ")
     assert hint in error
@@ -38,7 +38,7 @@ def test_a_file_that_is_not_there(words: list[str], hint: str, status: int, tmp_
 
 @pytest.mark.live
 def test_what_is_wrong_has_its_priority_in_the_journal(tmp_path: Path) -> None:
-    """Else `journalctl --priority=err` shows no reason why the service does not start."""
+    """Otherwise `journalctl --priority=err` does not show why the service does not start."""
     bad = tmp_path / "bad.yaml"
     bad.write_text("device: {}\nlog_level: loud\n")
     with pipe() as (reader, writer):
@@ -78,7 +78,6 @@ def test_an_invalid_address_is_named(text: str, place: str, tmp_path: Path, cli:
 
 def test_check_has_notes(tmp_path: Path, cli: Cli) -> None:
     """A misspelled name is accepted with a note, because the device may be added later."""
-    """imud accepts a misspelled name, because the device may be added later. Until then imud records nothing of it."""
     there, file = tmp_path / "a.cap", tmp_path / "imud.yaml"
     there.touch()
     file.write_text(

@@ -1,4 +1,4 @@
-"""Samples into arrays: which are taken, which are passed over, and what is said of them."""
+"""Collected and ignored samples, and the description of their time stamps."""
 
 from argparse import Namespace
 from contextlib import nullcontext
@@ -112,7 +112,7 @@ def test_losses_are_those_between_the_looks_although_a_ledger_begins_anew() -> N
 
 
 class Live:
-    """A daemon whose device sends 10 samples a second, 8 by a virtual clock of the host, and then nothing."""
+    """A daemon with a device that sends 10 samples per second for 8 s of virtual time, then nothing."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, count: int, *, interrupted: bool = False) -> None:
         self.now_s = 0.0

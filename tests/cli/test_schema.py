@@ -1,4 +1,4 @@
-"""`imud schema` names the fields of a sample, and the differences between drivers."""
+"""`imud schema`: fields of a sample, and the conventions of the drivers."""
 
 import json
 

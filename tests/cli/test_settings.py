@@ -1,4 +1,4 @@
-"""`imud settings` on a running daemon with a simulated HiPNUC module on a pseudo-terminal, to the module and back."""
+"""`imud settings` with a running daemon and a simulated HiPNUC device on a pseudo-terminal."""
 
 import json
 import sys
@@ -39,7 +39,7 @@ def actual(daemon: RunningDaemon) -> dict[str, Any]:
 def test_from_difference_to_agreement_and_back(
     daemon: RunningDaemon, words: tuple[object, ...], cli: Cli, tmp_path: Path
 ) -> None:
-    # what there is
+    # report
     out = cli(*words, status=1).out
     assert out.splitlines()[0].split() == ["SETTING", "DECLARED", "ACTUAL"]
     assert [line.split() for line in out.splitlines() if line.startswith("mode")] == [
@@ -49,7 +49,7 @@ def test_from_difference_to_agreement_and_back(
     assert "2.2.4" not in out
     assert "2.2.4" in cli(*words, "--verbose", status=1).out
     assert json.loads(cli(*words, "--json", status=1).out)["status"]["state"] == "differ"
-    # a backup, and the module as YAML
+    # backup, and output as YAML
     file = tmp_path / "bow.yaml"
     cli(*words, "--backup", file)
     before = actual(daemon)
@@ -59,7 +59,7 @@ def test_from_difference_to_agreement_and_back(
     )
     (device,) = config.parse(text, "pasted").devices
     assert declared_values(device.declared)["output"] == before["output"]
-    # set what is declared
+    # apply the declared settings
     out = cli(*words, "--apply").out
     assert "plan:\n  mode: 6-axis → 9-axis\n" in out
     assert "done:\n  mode: done\n  output: done" in out
@@ -68,7 +68,7 @@ def test_from_difference_to_agreement_and_back(
     assert cli(*words, "--apply").out == "no changes needed\n"
     assert "saved to flash" in cli(*words, "--save").out
     assert "imud wrote the flash 1 time, 1 within 24 hours" in cli(*words).out
-    # and back
+    # restore the backup
     assert json.loads(cli(*words, "--restore", file, "--json").out)["problem"] == ""
     assert actual(daemon) == before
     out = cli("status", "--socket", daemon.socket).out

@@ -1,4 +1,4 @@
-"""The live spectrum: a page of at most 80 columns whose bars and shades are where the line is, drawn in a terminal."""
+"""Live spectrum in a terminal: at most 80 columns, bars and shades at the frequency of the line."""
 
 import os
 import re
@@ -87,17 +87,17 @@ def test_columns_bars_and_axis() -> None:
 def test_it_is_redrawn_until_ctrl_c(tmp_path: Path) -> None:
     accel, gyro = shaken(1000, 100.0, 12.0)
     terminal, inside = os.openpty()
-    tty.setraw(inside)  # line ends stay as they are written
+    tty.setraw(inside)  # no conversion of line ends
     text = b""
     with (
         sending_daemon(tmp_path, lambda n: frame(10 * n, accel[n % 1000], gyro[n % 1000])) as daemon,
         imud_process("spectrum", "--socket", daemon.socket, "bow", stdin=subprocess.DEVNULL, stdout=inside) as process,
     ):
         os.close(inside)
-        while text.count(b"newest above") < PAGES:  # the first pages have too few samples on a slow machine
+        while text.count(b"newest above") < PAGES:  # on a slow host, the first pages have too few samples
             text += os.read(terminal, 65536)
         process.process.send_signal(signal.SIGINT)
-        with suppress(OSError):  # EIO: the process has closed the terminal; it waits for a reader before that
+        with suppress(OSError):  # EIO: the process closed the terminal, after a reader read all data
             while True:
                 os.read(terminal, 65536)
         assert process.end().err == ""

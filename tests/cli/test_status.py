@@ -1,4 +1,4 @@
-"""What `imud status` prints of a device."""
+"""Output of `imud status` for a device."""
 
 import json
 from pathlib import Path
@@ -60,7 +60,7 @@ def test_long_names_fit_80_columns_and_keep_both_ends() -> None:
 
 
 def test_json_is_all_that_the_socket_sends(tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("imud.cli.status.closes", lambda ledger: True)  # the server of the test has not all of it
+    monkeypatch.setattr("imud.cli.status.closes", lambda ledger: True)  # the status of the test server is incomplete
     with daemon(tmp_path) as served:
         with Client(served.path) as client:
             said = client.status()

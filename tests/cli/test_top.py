@@ -1,4 +1,4 @@
-"""The screens of `imud top`, driven by keys in a terminal of 80 columns that is not drawn."""
+"""Screens of `imud top` in a terminal of 80 columns without output, controlled by keys."""
 
 import asyncio
 import re

@@ -1,4 +1,4 @@
-"""What `imud top` reads of the daemon, and the command where it cannot run."""
+"""The feed of `imud top`, and the errors of the command."""
 
 import sys
 from pathlib import Path

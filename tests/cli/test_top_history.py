@@ -1,4 +1,4 @@
-"""What `imud top` keeps of each device."""
+"""Stored samples of each device in `imud top`."""
 
 import math
 
@@ -45,7 +45,7 @@ def test_only_the_last_minute_of_one_start_is_kept() -> None:
 
 def test_devices_come_and_go_and_vectors_have_a_length() -> None:
     fleet = DeviceHistories()
-    fleet.add(sample("bow"))  # no status had it yet
+    fleet.add(sample("bow"))  # device without a status
     fleet.update([device("stern"), device("bow")], 3)
     assert list(fleet.devices) == ["stern", "bow"]
     assert fleet.devices["bow"].newest is None

@@ -1,4 +1,4 @@
-"""Rows of the table of `imud top`: width, order, filter."""
+"""Table of `imud top`: width, order, filter."""
 
 import msgspec
 import pytest

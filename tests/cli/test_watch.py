@@ -1,4 +1,4 @@
-"""`imud watch`: formats, rates and fields, the end of its reader, and a daemon that is restarted."""
+"""`imud watch`: formats, rates, fields, a closed pipe, and a restart of the daemon."""
 
 import csv
 import json
@@ -154,5 +154,5 @@ def test_follow_begins_before_the_daemon_and_goes_on_after_its_restart(tmp_path:
         assert watch.err.readline().endswith("; waiting for the daemon\n")
         with daemon(tmp_path) as served, samples_of(served, ["imu1"]):
             line = next(line for line in watch.out if not line.startswith("imu0,"))
-            assert line.startswith("imu1,")  # and no second header
+            assert line.startswith("imu1,")  # without a second header
         watch.end(signal.SIGINT, status=130)

@@ -1,4 +1,4 @@
-"""Samples as JSON and as CSV of chosen fields: names with units, absent values, and what RFC 4180 wants."""
+"""JSON and CSV of chosen fields: names with units, absent values, RFC 4180."""
 
 import csv
 import io

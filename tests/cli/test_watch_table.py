@@ -1,4 +1,4 @@
-"""The table of samples: its columns and units, what fits 80 columns, and when the header comes again."""
+"""Table of samples: columns, units, 80 columns, repeated header."""
 
 import os
 import sys

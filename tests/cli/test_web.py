@@ -1,4 +1,4 @@
-"""`imud web`: what it refuses to start with, and what it says of itself. The server is tested in tests/web."""
+"""`imud web`: invalid arguments and messages. The tests of the server are in tests/web."""
 
 import signal
 import socket

@@ -1,4 +1,4 @@
-"""A made-up machine for every test."""
+"""A simulated host for each test."""
 
 from pathlib import Path
 

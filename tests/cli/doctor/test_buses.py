@@ -1,4 +1,4 @@
-"""I2C and SPI: nodes, transfers, and what is likely wrong."""
+"""Checks of I2C and SPI: nodes, transfers, likely causes."""
 
 import errno
 
@@ -81,14 +81,14 @@ def test_a_device_that_does_not_answer(machine: Machine) -> None:
 
 
 def refused(product_id: str) -> str:
-    """The problem of a device on SPI that answers with these bytes, as the driver puts it."""
+    """Return the problem that the driver reports for a product id with these bytes."""
     with pytest.raises(DeviceRefused) as refusal:
         identity_of(bytes.fromhex(product_id))
     return f"mode 0: {refusal.value}"
 
 
 def unusable(**refuse: int) -> str:
-    """The problem of an SPI node whose kernel refuses requests with EINVAL: all of this number, from this mode on."""
+    """Return the problem of an SPI node. The kernel refuses requests of one number with EINVAL, from one mode."""
 
     def ioctl(_fd: int, request: int, argument: bytes) -> None:
         if request == refuse["request"] and argument[0] >= refuse.get("least", 0):

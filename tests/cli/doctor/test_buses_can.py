@@ -1,4 +1,4 @@
-"""CAN interfaces by a made-up /sys and the JSON of ip(8), recorded from a controller of the lab's kernel."""
+"""Checks of CAN interfaces with a simulated /sys and recorded JSON of ip(8)."""
 
 import json
 import re
@@ -30,7 +30,7 @@ def mast(machine: Machine) -> Machine:
 def interface(
     machine: Machine, flags: str = "0x40081", *, packets: int = 0, data: dict[str, Any] | None = None
 ) -> None:
-    """An interface with the recorded answer of `ip`, changed by these members; without `data` a virtual one."""
+    """Set the recorded reply of `ip` with changed members. Without `data`, the interface is virtual."""
     up(machine, flags)
     answer = deepcopy(RECORDED["error-active"])
     (link,) = answer
@@ -60,7 +60,7 @@ def test_an_interface_that_is_absent_down_up_or_virtual(mast: Machine) -> None:
     up(mast, "0x40080")
     mast.prints(COMMAND, json.dumps(RECORDED["down"]))
     mast.tells(UP, "error", "can0 is down", "up type can bitrate")
-    assert mast.find(STATE) == []  # nothing is known of an interface that is down
+    assert mast.find(STATE) == []  # the state of an interface that is down is unknown
     interface(mast)
     assert mast.find(UP)[0].severity == "ok"
     interface(mast)
@@ -89,10 +89,10 @@ def test_state_and_error_counters(
 
 
 def test_errors_on_a_bus_that_carried_frames_before(mast: Machine) -> None:
-    """The module was unplugged, or the bit rate changed: the kernel goes on counting frames from before."""
+    """The kernel also counts frames from before a change of the bit rate, or from before the device was unplugged."""
     interface(mast, packets=100, data=controller("ERROR-PASSIVE", 128, 0))
     mast.tells(STATE, "error", "100 frames received, no frame arrives now → no other node acknowledges")
-    mast.status = [device("mast", state=DeviceState.RUNNING)]  # one that sends when it is asked
+    mast.status = [device("mast", state=DeviceState.RUNNING)]  # a device that sends only after a request
     assert mast.find(STATE)[0].severity == "warning"
 
 
@@ -134,7 +134,7 @@ def test_bus_off_before_and_no_restart(mast: Machine) -> None:
 
 @pytest.mark.parametrize("file", ["docs/can.md", "docs/monitoring.md", "etc/prometheus/imud.rules.yml"])
 def test_documents_set_restart_ms_while_the_interface_is_down(file: str) -> None:
-    """Else the kernel refuses it with EBUSY (drivers/net/can/dev/netlink.c)."""
+    """Otherwise the kernel refuses restart-ms with EBUSY (drivers/net/can/dev/netlink.c)."""
     text = (ROOT / file).read_text()
     commands = re.findall(r"^.*?type can .*?restart-ms", text, re.MULTILINE)
     assert commands

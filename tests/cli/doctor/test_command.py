@@ -1,4 +1,4 @@
-"""`imud doctor` as a whole, on a made-up machine and on this one."""
+"""The complete `imud doctor` on a simulated host and on the real host."""
 
 import json
 import re
@@ -15,7 +15,7 @@ from tests.support.surroundings import Machine
 
 
 def healthy(machine: Machine) -> None:
-    """A machine on which everything is in order and everything can be seen."""
+    """Return a host without problems on which all checks can run."""
     machine.configure("bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}}")
     machine.port("ttyUSB0")
     machine.uid = 0
@@ -44,7 +44,7 @@ def test_nothing_wrong_is_said_only_where_all_was_seen(machine: Machine) -> None
 
 @pytest.mark.parametrize("program", ["journalctl", "systemctl", "ip", "vcgencmd"])
 def test_a_missing_program_is_not_checked_and_ends_no_check(machine: Machine, program: str) -> None:
-    """For example, a container has no systemd, and a small image has no ip."""
+    """A container has no systemd, and a small image has no `ip`."""
     healthy(machine)
     machine.write("/proc/device-tree/model", "Raspberry Pi 4 Model B")
     machine.prints("vcgencmd get_throttled", "throttled=0x0\n")

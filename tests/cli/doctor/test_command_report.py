@@ -1,4 +1,4 @@
-"""What is printed of findings, and the exit status."""
+"""Printed findings and the exit status."""
 
 import json
 

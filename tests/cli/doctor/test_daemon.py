@@ -1,4 +1,4 @@
-"""Configuration, unit, socket and states as `imud doctor` sees them."""
+"""Checks of the configuration, the unit, the socket and the device states."""
 
 import os
 
@@ -79,7 +79,7 @@ def test_answers_of_the_socket(machine: Machine, answer: Exception, severity: st
 def test_a_file_newer_than_the_last_reload(machine: Machine) -> None:
     machine.configure(BOW)
     machine.unit(*ACTIVE, "StateChangeTimestampMonotonic=5000000")
-    machine.boot_utc_ns = 1_000 * 10**9  # so the reload was at 1005 s
+    machine.boot_utc_ns = 1_000 * 10**9  # the reload was at 1005 s
     file = machine.root / "etc/imud.yaml"
     os.utime(file, (1004, 1004))
     assert machine.find(STALE)[0].severity == "ok"

@@ -1,4 +1,4 @@
-"""Files that end with the service; whether something scrapes the metrics, by what the endpoint says."""
+"""Checks of shared memory and of the scrapes of the metrics."""
 
 import asyncio
 

@@ -1,4 +1,4 @@
-"""What the daemon's counters say of wires, rates, supplies and lines."""
+"""Checks that find wrong wires, baud rates, supplies and GPIO lines in the counters of the daemon."""
 
 from typing import Any
 
@@ -33,7 +33,7 @@ GOOD: dict[str, Any] = {"frames_good": 5000, "samples": 5000}
 
 
 def counted(state: DeviceState = DeviceState.SEARCHING, **counts: int) -> DeviceStatus:
-    """A device with these counts, the others 0, and no errors of the kernel."""
+    """Return the status of a device with these counters. Other counters and kernel errors are 0."""
     made = device("bow", state=state, kernel=KernelCounters())
     return msgspec.structs.replace(made, ledger=dict.fromkeys(made.ledger, 0) | counts)
 
@@ -42,7 +42,7 @@ def test_without_the_daemon_a_port_or_samples(machine: Machine) -> None:
     machine.configure(WIRED)
     for check in (HEARD, RESTARTS, LINES):
         assert [finding.severity for finding in machine.find(check)] == ["not checked"]
-    assert machine.find(HALF) == []  # no such line is configured
+    assert machine.find(HALF) == []  # this line is not configured
     machine.configure(UART)
     machine.status = [counted(DeviceState.MISSING)]
     assert machine.find(HEARD) == []
@@ -74,7 +74,7 @@ def test_serial_data(machine: Machine, status: DeviceStatus, severity: str, word
 
 
 def one_way(**changes: object) -> DeviceStatus:
-    """A device whose samples come at 100 Hz for 70 s, and that never answered."""
+    """Return a device that sent samples at 100 Hz for 70 s and never replied."""
     made = counted(DeviceState.RUNNING, frames_good=7000, samples=7000)
     made = msgspec.structs.replace(made, identity={}, expected_rate_hz=100.0)
     return msgspec.structs.replace(made, **changes)
@@ -132,7 +132,7 @@ def test_rs485(machine: Machine, state: DeviceState, line: SerialLineCounters, s
 def test_restarts_count_by_the_hour(machine: Machine, resets: int, samples: int, severity: str) -> None:
     clock = ClockStatus(Sync.REGRESSION, resets=resets)
     running = counted(DeviceState.RUNNING, samples=samples)
-    machine.status = [msgspec.structs.replace(running, clock=clock, expected_rate_hz=100.0)]  # 360,000 samples an hour
+    machine.status = [msgspec.structs.replace(running, clock=clock, expected_rate_hz=100.0)]  # 360,000 samples per hour
     assert [finding.severity for finding in machine.find(RESTARTS)] == [severity]
 
 

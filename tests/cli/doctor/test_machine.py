@@ -1,4 +1,4 @@
-"""The machine's clock, storage, supply and processors, made up."""
+"""Checks of the clock, the storage, the power supply and the processors of a simulated host."""
 
 import msgspec
 import pytest
@@ -67,7 +67,7 @@ def test_power_of_a_raspberry_pi(machine: Machine, word: str, severities: list[s
 
 
 def test_vcgencmd_is_asked_where_sysfs_has_nothing(machine: Machine) -> None:
-    assert machine.find(POWER) == []  # no Raspberry Pi
+    assert machine.find(POWER) == []  # not a Raspberry Pi
     machine.write("/proc/device-tree/model", "Raspberry Pi 3 Model B\0")
     assert machine.find(POWER)[0].severity == "not checked"
     machine.prints("vcgencmd get_throttled", "throttled=0x1\n")

@@ -1,4 +1,4 @@
-"""Lines by kind of trouble, written by hand after the messages of the drivers: not from a recorded log but for one."""
+"""Checks of the kernel log. All lines except one are written by hand, from the sources of the drivers."""
 
 from imud.cli.doctor.machine import kernel_log
 from imud.cli.doctor.surroundings import DoctorCheck
@@ -25,7 +25,7 @@ def test_each_kind_of_trouble_a_quiet_log_and_other_sources(machine: Machine) ->
         ("mmc0: Timeout waiting for hardware interrupt.", "errors of the SD card"),
         ("blk_update_request: I/O error, dev mmcblk0, sector 123", "errors of the SD card"),
         ("i2c-bcm2835 fe804000.i2c: i2c transfer timed out", "errors of I2C"),
-        ("kvaser_pci 0000:00:06.0 can0: bus-off", "errors of CAN controllers"),  # of the lab's kernel
+        ("kvaser_pci 0000:00:06.0 can0: bus-off", "errors of CAN controllers"),  # recorded from the lab's kernel
         ("mcp251x spi0.0 can0: bus-off", "errors of CAN controllers"),
         ("ttyAMA0: 4 input overrun(s)", "overruns of serial ports"),
         ("oom-kill:constraint=CONSTRAINT_NONE,task=python3", "lack of memory"),

@@ -1,4 +1,4 @@
-"""Who may open the nodes: mode and group, and the unit's DeviceAllow=."""
+"""Checks of the access rights of nodes: mode, group, DeviceAllow= of the unit."""
 
 import os
 
@@ -12,12 +12,12 @@ RIGHTS, RULES = DoctorCheck("r", rights), DoctorCheck("u", unit_rules)
 BOW = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}}"
 ROOT = os.geteuid() == 0
 PORT_GID = 4500 if ROOT else os.getegid()
-"""Group of the port: only root can give a file to any group."""
+"""Group of the port. Only root can change the group of a file to any group."""
 
 
 @pytest.fixture
 def bow(machine: Machine) -> Machine:
-    """A machine with a port that user 4000 does not own; its group is `port`."""
+    """A host with a port of the group `port`. User 4000 does not own the port."""
     machine.configure(BOW)
     node = machine.port("ttyUSB0")
     if ROOT:
@@ -56,7 +56,7 @@ def test_a_node_of_group_root_needs_a_udev_rule(bow: Machine) -> None:
     ],
 )
 def test_the_rule_is_for_nodes_of_the_kind_only(node: str, rule: str, bow: Machine) -> None:
-    """Without it /dev/tty, of the same subsystem, would be closed to all users."""
+    """A wider rule would close /dev/tty, which has the same subsystem, for all users."""
     bow.configure(f"bow: {{driver: hipnuc-uart, uart: {{port: /dev/{node}}}}}")
     bow.port(node, mode=0o600)
     ((_, text),) = bow.told(RIGHTS)
@@ -74,9 +74,9 @@ def test_the_mode_counts_too(bow: Machine) -> None:
     bow.gids = frozenset({PORT_GID})
     (bow.root / "dev/ttyUSB0").chmod(0o640)
     assert bow.find(RIGHTS)[0].severity == "error"
-    assert "usermod" not in bow.find(RIGHTS)[0].advice  # whoever joins the group may not open it either
+    assert "usermod" not in bow.find(RIGHTS)[0].advice  # a member of the group cannot open the node either
     (bow.root / "dev/ttyUSB0").chmod(0o606)
-    assert bow.find(RIGHTS)[0].severity == "error"  # the group's bits count for a member, not those of others
+    assert bow.find(RIGHTS)[0].severity == "error"  # only the permissions of the group apply
     bow.gids = frozenset({4003})
     assert bow.find(RIGHTS)[0].severity == "ok"
 

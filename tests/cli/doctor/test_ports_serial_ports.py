@@ -1,4 +1,4 @@
-"""Serial ports in a made-up /dev, /sys and /proc."""
+"""Checks of serial ports with a simulated /dev, /sys and /proc."""
 
 import os
 
@@ -63,7 +63,7 @@ def test_another_program_and_the_daemon_on_a_port(bow: Machine) -> None:
 def test_a_user_cannot_say_that_a_port_is_free(bow: Machine) -> None:
     bow.port("ttyUSB0")
     bow.tells(TAKEN, "not checked", "sudo imud doctor")
-    bow.status = [device("bow")]  # runs on it, so has it alone
+    bow.status = [device("bow")]  # the device runs: imud uses the port exclusively
     assert bow.find(TAKEN)[0].severity == "ok"
     problem = "/dev/ttyUSB0 is in use by gpsd (pid 3): stop that first"
     bow.status = [device("bow", state=DeviceState.FAILED, problem=problem)]
@@ -78,7 +78,7 @@ def test_a_console_and_latency_timers(bow: Machine) -> None:
     assert severity == "error"
     assert "console=ttyUSB0" in text
     bow.port("ttyUSB0")
-    assert bow.find(LATENCY) == []  # an adapter without one
+    assert bow.find(LATENCY) == []  # an adapter without a latency timer
     bow.write("/sys/class/tty/ttyUSB0/device/latency_timer", "16\n")
     bow.tells(LATENCY, "warning", "up to 16 ms", 'ATTR{latency_timer}="1"')
     bow.write("/sys/class/tty/ttyUSB0/device/latency_timer", "1\n")

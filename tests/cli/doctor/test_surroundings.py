@@ -1,4 +1,4 @@
-"""Commands, files and the daemon as the checks get them; the real ones where they harm nothing."""
+"""Input of the checks: commands, files and the daemon; real ones if the test does no harm."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A made-up machine whose commands take effect, and what is on its ports."""
+"""A simulated host: commands change its state, and ports have simulated devices."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -127,7 +127,7 @@ class LivingMachine(Machine):
         (self.root / f"proc/{pid}/fd/3").symlink_to((self.root / "dev" / name).resolve())
 
     def files(self) -> dict[str, tuple[str, int]]:
-        """Content and mode of every file that setup may change."""
+        """Return content and mode of every file that setup can change."""
         found = {}
         for top in ("etc", "boot", "var"):
             for path in sorted((self.root / top).rglob("*")):
@@ -197,7 +197,7 @@ def setup(machine: LivingMachine, attachments: Attachments, capsys: pytest.Captu
 
 @pytest.fixture
 def answers(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, str]]:
-    """Answers to questions by a part of each; another question has its default. All are used."""
+    """Answers by a part of the question. Other questions get their default. The test must use all answers."""
     given: dict[str, str] = {}
     used: set[str] = set()
 

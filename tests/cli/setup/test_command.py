@@ -1,4 +1,4 @@
-"""`imud setup` as a command: its arguments, and a look at this machine that changes nothing."""
+"""The command `imud setup`: arguments, and a dry run on the real host."""
 
 import argparse
 import json
@@ -41,7 +41,7 @@ def test_the_user_that_ran_sudo(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_look_at_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
-    """With the ports of a folder that has none; nothing of the machine is opened."""
+    """The dry run uses a folder without ports. It opens nothing on the host."""
     real = Surroundings
 
     def elsewhere(file: Path, *arguments: object, **more: object) -> object:

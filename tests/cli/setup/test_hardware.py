@@ -1,4 +1,4 @@
-"""What is attached, and what of it is configured."""
+"""Attached devices, and the configured devices among them."""
 
 import pytest
 
@@ -101,7 +101,7 @@ def test_a_bus_that_is_asked_for(machine: LivingMachine, attachments: Attachment
 
 
 def test_what_is_named_and_not_there_is_said_to_be(gateway: LivingMachine, attachments: Attachments) -> None:
-    """Else a misspelled name looks like a machine without ports."""
+    """Otherwise a misspelled name looks like a host without ports."""
     gateway.write("/etc/passwd")
     wanted = Wanted((USB0, "ttyUSB1", "can7", "/etc/passwd"), active=("/dev/ttyUSB9",))
     problems = {one.place: one.problem for one in found(gateway, attachments, wanted)}

@@ -1,4 +1,4 @@
-"""The real finders: a sensor on a pseudo-terminal, modules on an RS-485 line, a sensor on an I2C bus."""
+"""Finders with a device on a pseudo-terminal, devices on an RS-485 bus, and a device on an I2C bus."""
 
 import os
 import threading

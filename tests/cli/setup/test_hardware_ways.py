@@ -1,4 +1,4 @@
-"""Consoles on UARTs and CAN interfaces that are down, on made-up machines."""
+"""Changes of consoles on UARTs and of CAN interfaces on simulated hosts."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Rules for adapters, from made-up /sys trees."""
+"""udev rules of adapters from simulated /sys trees."""
 
 import pytest
 

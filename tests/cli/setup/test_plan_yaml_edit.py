@@ -1,4 +1,4 @@
-"""Devices added to the text of a configuration: nothing that was written is lost, and the result is good."""
+"""Adding devices to a configuration keeps the existing text and produces a valid file."""
 
 import pytest
 
@@ -58,7 +58,7 @@ def test_the_example_of_the_package_is_known_and_only_its_device_is_replaced() -
     kept = made.decode().splitlines()
     lost = [line for line in EXAMPLE.decode().splitlines() if line not in kept]
     assert lost[0] == "  imu:"
-    assert len(lost) == 8  # its key, link and port, and the comments between them
+    assert len(lost) == 8  # key, link and port of the example, and the comments between them
     assert config.parse(made, "made").devices[0].name == "mast"
 
 

@@ -1,4 +1,4 @@
-"""`imud setup` as a whole on made-up machines: proposed, made, a second time, taken back, interrupted."""
+"""The complete `imud setup` on simulated hosts: first run, second run, undo, interruption."""
 
 import json
 import shutil
@@ -24,7 +24,7 @@ PORT = Wanted()
 
 @pytest.fixture
 def gateway(machine: LivingMachine, attachments: Attachments) -> LivingMachine:
-    """A gateway with the package installed, a sensor on a USB adapter, and a user who runs sudo."""
+    """A host with the installed package, a device on a USB adapter, and a user of sudo."""
     machine.usb_port("ttyUSB0", "usb-FTDI_FT232R_USB_UART_A1-if00-port0")
     machine.write("/etc/imud.yaml", EXAMPLE)
     attachments.hears(BY_ID, "hipnuc-uart")
@@ -73,7 +73,7 @@ def test_a_second_run_changes_nothing(gateway: LivingMachine, setup: Setup) -> N
     out = setup.said()
     assert "No changes needed." in out
     assert "Changes:" not in out
-    assert setup.attachments.listened == []  # the daemon has the port
+    assert setup.attachments.listened == []  # the daemon uses the port
     assert (gateway.files(), gateway.ran) == (before, ran)
 
 
@@ -132,7 +132,7 @@ def test_a_running_daemon_is_left_running_and_reads_the_new_file(gateway: Living
 
 
 def test_a_file_and_its_copy_keep_the_mode(gateway: LivingMachine, setup: Setup) -> None:
-    """Whatever the umask takes from new files."""
+    """The umask must not change the mode."""
     file, copy = gateway.root / "etc/imud.yaml", gateway.root / "etc/imud.yaml.DATE"
     file.chmod(0o662)
     assert setup.steps().set_up(PORT, ()) == 0
@@ -191,7 +191,7 @@ def test_a_configuration_with_a_mistake_is_not_touched(gateway: LivingMachine, s
 def test_a_service_with_another_configuration_is_left_as_it_is(
     activity: str, gateway: LivingMachine, setup: Setup
 ) -> None:
-    """It would not have the devices that are set up, and may have others."""
+    """Such a service would not use the new devices."""
     gateway.started = "/usr/bin/imud run --config /home/ann/bow.yaml"
     gateway.units["imud.service"] = ["disabled", activity]
     gateway.status = []
@@ -390,14 +390,14 @@ def test_a_can_interface_is_brought_up_before_the_search(gateway: LivingMachine,
 
 
 class Killed(BaseException):
-    """The process ends here."""
+    """Simulated end of the process."""
 
 
 @pytest.mark.parametrize("step", range(14))
 def test_killed_at_any_step_all_is_taken_back(
     gateway: LivingMachine, setup: Setup, monkeypatch: pytest.MonkeyPatch, step: int
 ) -> None:
-    """Before or after each write, of a file or of the journal, and each command."""
+    """The process ends before or after each write of a file or of the journal, and each command."""
     before = gateway.files()
     left = [step]
 
@@ -470,7 +470,7 @@ def test_a_file_changed_since_is_left_and_the_rest_taken_back(gateway: LivingMac
     assert (gateway.root / "etc/imud.yaml").read_text() == mine
     assert gateway.units["imud.service"] == ["disabled", "inactive"]
     assert not (gateway.root / "etc/udev/rules.d/61-imud-setup.rules").exists()
-    gateway.write("/etc/imud.yaml", mine.removesuffix("# mine\n"))  # the person takes it back
+    gateway.write("/etc/imud.yaml", mine.removesuffix("# mine\n"))  # the user undoes the edit
     assert setup.steps().undo() == 0
     assert (gateway.root / "etc/imud.yaml").read_text() == EXAMPLE
 
@@ -488,7 +488,7 @@ def test_the_former_content_of_a_file_that_is_left_stays_to_be_put_back(
     assert setup.steps().undo() == 1
     out = setup.said()
     assert "imud keeps /etc/imud.yaml.DATE, the backup of /etc/imud.yaml" in out
-    shutil.copy2(copy, file)  # the person settles it
+    shutil.copy2(copy, file)  # the user solves the problem
     assert setup.steps().undo() == 0
     assert gateway.files() == before
 

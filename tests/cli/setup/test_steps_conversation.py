@@ -1,4 +1,4 @@
-"""What setup says in 80 columns, and its questions."""
+"""Output of setup in 80 columns, and its questions."""
 
 import pytest
 
@@ -41,7 +41,7 @@ def test_the_end_of_the_input_is_no_answer(monkeypatch: pytest.MonkeyPatch, caps
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
     with pytest.raises(BadArgument, match="end of the input"):
         Conversation(ask=True).agreed("Sure?", default=True)
-    assert capsys.readouterr().out == "\n"  # the error begins a line
+    assert capsys.readouterr().out == "\n"  # the error starts on a new line
 
 
 def test_an_interrupted_question_ends_it_with_a_word(
