@@ -168,6 +168,7 @@ def _type_of(averages: FloatArray) -> NoiseType:
         power = float(centred @ centred)
         correlation = float(centred[1:] @ centred[:-1]) / power if power > 0 else 0.0
         delta = correlation / (1 + correlation)
+        # stationary enough: no further differencing
         if delta < 0.25 or differences == DIFFERENCES_MOST:
             break
         averages = np.diff(averages)
@@ -231,6 +232,7 @@ def noise_terms(curve: AllanCurve, axis: int, tau_least_s: float = 0.0) -> Noise
             f"{used.sum()}; record a longer series"
         )
     variance, freedom = curve.deviation[used, axis] ** 2, curve.freedom[used, axis]
+    # constant values have no noise
     if not variance.any():
         return NoiseTerms(*(Coefficient(None, 0.0, 0.0) for _ in NoiseTerms._fields))
     shapes = basis(curve.tau_s[used])
@@ -243,6 +245,7 @@ def noise_terms(curve: AllanCurve, axis: int, tau_least_s: float = 0.0) -> Noise
         weakest = min(chosen, key=lambda term: squares[term] / spread[term])
         if squares[weakest] > RESOLVED_SIGMAS * spread[weakest]:
             break
+        # fit again without the term that is least significant
         chosen.remove(weakest)
         squares, spread = _fit(shapes * scale, variance, freedom, chosen)
     return NoiseTerms(
@@ -258,6 +261,7 @@ def _fit(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the squares of the chosen terms, shape (5,), and their standard deviations. Other terms are zero."""
     fitted, squares, spread = variance, np.zeros(shapes.shape[1]), np.zeros(shapes.shape[1])
+    # avoids a division by zero in the weights
     floor = variance[variance > 0].min() * 1e-6
     weighted = shapes[:, chosen]
     for _ in range(ROUNDS):
@@ -409,6 +413,7 @@ def corner_of(spectrum: Spectrum) -> float | None:
     power = spectrum.density.mean(axis=0)
     if not power.any():
         return None
+    # equal weight for all axes; without the bin at 0 Hz
     whitened = (spectrum.density[:, power > 0] / power[power > 0]).mean(axis=1)[1:]
     frequency = spectrum.frequency_hz[1:]
     edges = np.geomspace(frequency[0], frequency[-1], CORNER_BINS + 1)
@@ -432,6 +437,7 @@ def _disturbed(runs: list[FloatArray], rate_hz: float) -> tuple[int, int]:
     spread = np.concatenate(blocks)
     if not len(spread):
         return 0, 0
+    # the median ignores disturbed seconds
     usual = np.median(spread, axis=0)
     return int((spread > STILL_FACTOR * np.maximum(usual, 1e-12)).any(axis=1).sum()), len(spread)
 
@@ -460,6 +466,7 @@ def temperature_drift(temperature_c: FloatArray, values: FloatArray, rate_hz: fl
         return None
     x, y = warm - warm.mean(), mean - mean.mean()
     slope = float(x @ y / (x @ x))
+    # sum of squares that the line does not explain
     rest = float(((y - slope * x) ** 2).sum())
     total = float(y @ y)
     return Drift(slope, float(np.sqrt(rest / (count - 2) / (x @ x))), 1 - rest / total if total > 0 else 0.0)
@@ -473,4 +480,5 @@ def step_of(values: FloatArray) -> float | None:
     steps = np.diff(sorted_values)
     least = float(steps.min())
     counts = steps / least
+    # float values have no common step
     return least if np.abs(counts - np.rint(counts)).max() < 0.02 and np.rint(counts).max() < 1e4 else None

@@ -186,6 +186,7 @@ def draw_spectrogram(figure: Figure, axes: Axes, name: SensorName, sensor: Senso
     gram = sensor.spectrogram
     power = 10 * np.log10(np.maximum(gram.density[:, 1:], 1e-300))
     top = float(np.nanmax(power))
+    # rows of NaN mark gaps
     low = max(top - RANGE_DB, float(np.nanpercentile(power, 2)))
     mesh = axes.pcolormesh(
         gram.time_s, gram.frequency_hz[1:], power.T, vmin=low, vmax=top, cmap="viridis", shading="nearest",

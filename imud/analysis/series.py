@@ -106,6 +106,7 @@ def grid_of(t_ns: IntArray) -> Grid:
     period_s = _guess(t_s)
     steps = np.ones(len(steps_s), dtype=np.int64)
     for _ in range(REFINEMENTS):
+        # the number of periods between two samples, at least 1
         steps = np.maximum(np.rint(steps_s / period_s).astype(np.int64), 1)
         period_s = _slope(np.concatenate(([0], np.cumsum(steps))), t_s, steps)
     scatter_s = _scatter(steps_s - steps * period_s)
@@ -142,6 +143,7 @@ def _slope(place: IntArray, t_s: FloatArray, steps: IntArray) -> float:
 def _scatter(residual_s: FloatArray) -> float:
     """Return the standard deviation of a time stamp, from the differences of two time stamps, without outliers."""
     middle = np.median(residual_s)
+    # 1.4826: standard deviation of a normal distribution per median deviation
     return float(1.4826 * np.median(np.abs(residual_s - middle)) / np.sqrt(2))
 
 
@@ -154,6 +156,7 @@ def even_runs(grid: Grid, values: FloatArray, *, smooth: bool = False) -> list[F
     for first, end in grid.runs:
         place, part = grid.place[first:end], values[first:end]
         every = np.arange(place[0], place[-1] + 1)
+        # no lost sample in this run
         if len(every) == len(place):
             found.append(np.asarray(part, dtype=np.float64))
         elif smooth and len(place) >= SAMPLES_LEAST:

@@ -96,6 +96,7 @@ def window_size(runs: Sequence[FloatArray], rate_hz: float, resolution_hz: float
         return size
     if longest < WINDOW_LEAST:
         raise BadArgument(f"expected a run of at least {WINDOW_LEAST} samples without a long gap, got {longest}")
+    # half-overlapping windows: n windows need (n + 1) / 2 lengths
     wanted = min(2 * longest // (AVERAGES_WANTED + 1), WINDOW_USUAL)
     return max(1 << (wanted.bit_length() - 1), WINDOW_LEAST) if wanted else WINDOW_LEAST
 
@@ -154,6 +155,7 @@ def spectrogram(runs: Sequence[FloatArray], starts_s: Sequence[float], rate_hz: 
     if not used:
         raise BadArgument(f"expected a run of at least {size} samples without a long gap, got shorter runs")
     in_all = sum((len(run) - size) // (size // 2) + 1 for run, _ in used)
+    # rounded up
     together = -(-in_all // ROWS_MOST)
     times: list[FloatArray] = []
     rows: list[FloatArray] = []
@@ -223,6 +225,7 @@ class Band:
 def peaks(spectrum: Spectrum, most: int = PEAKS_MOST) -> list[Peak]:
     """Return the peaks in the sum of all axes, the strongest first."""
     power = spectrum.density.sum(axis=1)
+    # not 0: it is a divisor
     floor = np.maximum(median_filter(power, size=min(FLOOR_BINS, len(power)), mode="nearest"), 1e-300)
     ratio = power / floor
     found = [
@@ -258,6 +261,7 @@ def _shift(power: FloatArray, place: int) -> float:
     """Return the distance from the largest bin of a line to the line, -0.5 to 0.5 bins."""
     above, below = power[place + 1], power[place - 1]
     side = 1 if above >= below else -1
+    # ratio of the two largest bins of a Hann window
     ratio = float(np.sqrt(max(above, below) / power[place]))
     return side * min(max((2 * ratio - 1) / (ratio + 1), 0.0), 0.5)
 

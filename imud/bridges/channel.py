@@ -197,6 +197,7 @@ class Steady:
 def topic(device: str, name: str) -> str:
     """Return the topic of a device's channel. `_` replaces characters that ROS 2 does not allow in a topic."""
     plain = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in device)
+    # a topic must not start with a digit
     return f"/{'_' if plain[:1].isdigit() else ''}{plain}/{name}"
 
 
@@ -301,6 +302,7 @@ class _LossWarning:
 
     def is_on(self, counts: Sequence[int], now_ns: int) -> bool:
         lost = sum(counts)
+        # a restarted ledger has fewer losses
         if self._lost is not None and lost > self._lost:
             self._until_ns = now_ns + LOSS_SHOWN_NS
         self._lost = lost

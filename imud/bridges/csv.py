@@ -115,6 +115,7 @@ class SampleText:
         text = _encode(list(zip(*columns, strict=True)))
         if self._is_single or text.count(_NOTHING) != missing:  # JSON also writes null for NaN and infinity
             return csv_text(map(self._row, samples))
+        # JSON rows become CSV rows
         text = text.translate(None, b'[]"').replace(_NOTHING, b"").replace(b"\n", b"\r\n")
         for literal, pattern, form in _FORMS:
             if literal in text:

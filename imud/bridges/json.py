@@ -340,6 +340,7 @@ def _transform(frames: MessageFrames) -> Encoder:
 
     def encode(sample: Sample) -> bytes | None:
         quat = sample.quat_wxyz
+        # a viewer cannot draw NaN
         if quat is None or not isfinite(sum(quat)):
             return None
         return _encode(TransformMessage(timestamp(sample.utc_ns), navigation, body, nowhere, _rotation(quat)))

@@ -155,6 +155,7 @@ class McapFile:
         self._end_chunk()
         self._write_waiting()
         self._thread.shutdown()
+        # 0: no CRC of the data section; each chunk has a CRC
         self._record(DataEnd(0))
         self._write_summary()
         self._write(MCAP0_MAGIC)

@@ -70,6 +70,7 @@ class Layout:
         self._at += count * SIZES[code]
 
     def _align(self, size: int) -> None:
+        # padding to a multiple of the size
         missing = -self._at % size
         self._format += f"{missing}x" if missing else ""
         self._at += missing
@@ -101,6 +102,7 @@ class CdrWriter:
 
 
 def _text(value: str) -> bytes:
+    # CDR strings end with NUL, which is part of the length
     data = value.replace("\0", "").encode(errors="replace") + b"\0"
     return len(data).to_bytes(4, "little") + data
 

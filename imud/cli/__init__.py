@@ -32,6 +32,7 @@ class Subcommand(NamedTuple):
         try:
             module = import_module(path)
         except ModuleNotFoundError as error:
+            # a missing module of imud is a defect, not a missing extra
             library = (error.name or "a library").partition(".")[0]
             if not self.extra or library == "imud":
                 raise
@@ -82,6 +83,7 @@ def build_parser(commands: Collection[str] = COMMANDS) -> argparse.ArgumentParse
     for name, command in COMMANDS.items():
         description = command.help[:1].upper() + command.help[1:] + "."
         sub = parsers.add_parser(name, help=command.help, description=description)
+        # importing the modules of all commands would slow down the start
         if name in commands:
             command.load().add_arguments(sub)
     return parser
@@ -89,6 +91,7 @@ def build_parser(commands: Collection[str] = COMMANDS) -> argparse.ArgumentParse
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. Print an expected error as one line to standard error."""
+    # first: an argparse error also needs a usable standard error
     open_standard_streams()
     words = sys.argv[1:] if argv is None else argv
     # without a known command, argparse prints the help or the error
@@ -98,6 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             args = build_parser((name,)).parse_args(words)
             return COMMANDS[args.command].load().run(args)
         finally:
+            # inside `try`: a full disk or a closed pipe often appears only here
             sys.stdout.flush()
     except BrokenPipeError:  # the reader closed the pipe, for example `imud watch | head`
         discard_output()

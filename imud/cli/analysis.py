@@ -125,6 +125,7 @@ def take(args: argparse.Namespace) -> Any:
     if not is_live(args):
         return samples.take_file(args)
     for option, default in (("device", None), ("driver", None), ("baud", None), ("option", [])):
+        # daemon and recording define these values for live samples
         if getattr(args, option) != default:
             raise BadArgument(f"--{option} applies to files only; the file {args.input} does not exist")
     return samples.take_live(args, samples.progress)

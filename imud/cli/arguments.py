@@ -65,6 +65,7 @@ def _sigma(sensor: _Sensor | None) -> float | None:
     if sensor is None or not sensor.axes:
         return None
     spreads = [axis.spread.value for axis in sensor.axes.values()]
+    # `or None`: a constant value has no measurable noise
     return hypot(*spreads) / sqrt(len(spreads)) or None
 
 
@@ -135,6 +136,7 @@ def finite(text: str) -> float:
     except ValueError:
         number = nan
     if not isfinite(number):
+        # argparse prints the message after the name of the argument
         raise argparse.ArgumentTypeError(f"expected a number, got {text!r}")
     return number
 
@@ -165,10 +167,12 @@ def duration_s(text: str) -> float:
 
 def argument(text: str) -> tuple[str, object]:
     """Parse `name=value`. The value is JSON if possible, otherwise a string. Raises BadArgument without `=`."""
+    # only the first "=" separates: values can contain "="
     name, sign, value = text.partition("=")
     if not name or not sign:
         raise BadArgument(f"expected NAME=VALUE, got {text!r}")
     try:
+        # numbers, true, false, null, lists, objects and quoted strings
         return name, msgspec.json.decode(value)
     except msgspec.DecodeError:
         return name, value
@@ -199,6 +203,7 @@ def given_options(driver: "Driver", words: Sequence[str]) -> dict[str, object]:
 
 def driver_settings(driver: "Driver", options: Mapping[str, object]) -> Options:
     """Return the options object of the driver. Raises BadArgument if two options exclude each other."""
+    # the first problem is enough: the user corrects one at a time
     for wrong in wrong_values(driver.settings, options, "option"):
         raise BadArgument(f"--option {wrong}")
     return msgspec.convert(options, driver.settings)

@@ -107,6 +107,7 @@ def progress_line(event: Event) -> str:
     progress, field_t, residual = (event.detail.get(name) for name in ("progress", "field_t", "residual"))
     if not isinstance(progress, float):
         return event.message
+    # progress is 0 to 1
     filled = int(progress * BAR)
     words = [f"[{'#' * filled}{'.' * (BAR - filled)}] {progress:4.0%}"]
     if isinstance(field_t, float) and isinstance(residual, float):
@@ -145,6 +146,7 @@ def _value(value: float | None, unit: str) -> str:
             return f"{value / RAD_PER_DEG:.3g} °/s"
         case "T":
             return f"{value / T_PER_UT:.3g} µT"
+        # an empty unit is a ratio
         case "":
             return f"{value:.1%}"
     return f"{value:.3g} {unit}"

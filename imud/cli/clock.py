@@ -76,6 +76,7 @@ def listen(client: Client, behind: dict[str, deque[int]], duration_s: float | No
     while True:
         with suppress(TimeoutError):
             sample = next(samples)
+            # the deque drops the oldest value
             behind[sample.device].append(sample.t_rx_ns - sample.t_ns)
         now = monotonic()
         if duration_s is not None and now - begun >= duration_s:
@@ -135,6 +136,7 @@ def verdict(clock: ClockStatus, behind_ns: Sequence[int]) -> str:
     error = f"{clock.t_err_ns / NS_PER_US:.1f} µs"
     if clock.sync is Sync.UTC:
         return f"the device sends UTC; the UTC error of the host limits the time stamps: {error}"
+    # the GPIO time stamps include the interrupt latency of the kernel
     if clock.sync is Sync.EDGE:
         return f"the kernel's time stamps of the GPIO line limit the time stamps: {error}"
     if clock.sync is Sync.ARRIVAL and not clock.t_err_ns:  # t_err_ns is 0 until the first sample arrives

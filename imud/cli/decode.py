@@ -48,6 +48,7 @@ def run(args: argparse.Namespace) -> int:
             write(line)
     sys.stdout.flush()
     shown = {name: value for name, value in ledger.snapshot().items() if value}
+    # standard error: standard output contains only JSON lines
     print(msgspec.json.encode(shown).decode(), file=sys.stderr)
     return 0 if ledger.frames_good else 1
 
@@ -78,6 +79,7 @@ def events_in(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Options)
         codec = driver.make_codec(ledger, settings)
         for _, data in CaptureReader(file):
             yield from codec.feed(data)
+        # complete frames at the end of the capture
         yield from codec.flush()
     elif isinstance(driver, CanDriver):
         frame_codec = driver.make_codec(ledger, settings)
@@ -123,6 +125,7 @@ class UnwrappedTime:
     def unwrap(self, ticks: int) -> int:
         """Return the device time since the zero of the counter, ns, or the index of the sample."""
         modulus = self._driver.tick_modulus
+        # a smaller step back is a duplicate or a restart, not a rollover
         if self._last is not None and self._last - ticks > modulus // 2:
             self._turns += 1
         self._last = ticks

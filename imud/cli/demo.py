@@ -224,6 +224,7 @@ def commands(folder: Path, device: str, port: int) -> str:
 
 def free_port() -> int:
     """Return the documented port of the metrics if it is free, otherwise another free port."""
+    # 0: the kernel selects a free port
     for port in (METRICS_PORT, 0):
         with suppress(OSError), socket.create_server((METRICS_ADDRESS, port)) as server:
             return int(server.getsockname()[1])
@@ -233,6 +234,7 @@ def free_port() -> int:
 def show(path: Path, args: argparse.Namespace) -> int:
     """Show samples until the duration ends or a signal arrives, then print the summary. Return the exit status."""
     view = View(sys.stdout, live=not args.plain and sys.stdout.isatty())
+    # SIGTERM ends the demo like Ctrl-C, with the summary
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with Client(str(path), timeout_s=FOUND_LIMIT_S) as client:
@@ -284,6 +286,7 @@ def device(folder: Path, name: str, interface: str, node: int = 0) -> dict[str, 
         return {"driver": name, "options": options, "socketcan": {"interface": interface}}
     if name == "hipnuc-modbus":
         return {"driver": name, "rs485": {"line": str(folder / "port")}}
+    # the demo also shows the detection
     return {"driver": "auto", "uart": {"port": str(folder / "port"), "baud": "auto"}}
 
 
@@ -291,6 +294,7 @@ def device(folder: Path, name: str, interface: str, node: int = 0) -> dict[str, 
 def daemon(folder: Path, devices: Devices, port: int) -> Iterator[None]:
     """Run `imud run` during the context, with its files in `folder`."""
     tree = {
+        # warnings would disturb the live view
         "log_level": "error",
         "state_dir": str(folder),
         "socket": {"path": str(folder / "imud.sock")},
@@ -302,6 +306,7 @@ def daemon(folder: Path, devices: Devices, port: int) -> Iterator[None]:
     file.write_bytes(msgspec.json.encode(tree))  # JSON is YAML
     with child([sys.executable, "-m", "imud", "run", "--config", str(file)], "the daemon") as process:
         end = monotonic() + START_LIMIT_S
+        # with its socket, the daemon accepts clients
         while not (folder / "imud.sock").exists():
             if process.poll() is not None:
                 raise ImudError(f"the daemon ended during its start with status {process.returncode}")
@@ -314,6 +319,7 @@ def daemon(folder: Path, devices: Devices, port: int) -> Iterator[None]:
 @contextmanager
 def child(argv: list[str], name: str, **options: int) -> Iterator[subprocess.Popen[str]]:
     """Run a child process during the context. The child does not receive Ctrl-C."""
+    # unbuffered: this process reads the first line immediately
     environment = dict(os.environ, PYTHONUNBUFFERED="1")
     with subprocess.Popen(
         argv, stdin=subprocess.PIPE, text=True, env=environment, start_new_session=True, **options

@@ -54,9 +54,11 @@ def keep_connected(
                 return
         except (LinkMissing, TimeoutError) as error:
             if not follow:
+                # the daemon accepted the connection, but did not reply
                 if isinstance(error, TimeoutError):
                     raise ServerError(str(error)) from error
                 raise
+            # print each reason once, not at every attempt
             if str(error) != reason:
                 complain(f"{command}: {error}; waiting for the daemon")
             reason = str(error)

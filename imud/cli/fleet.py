@@ -62,6 +62,7 @@ class FleetOverview:
         if message.clock is not None:
             self._clocks[name] = message.clock
         self._newest_ns[name] = max(message.utc_ns, self._newest_ns.get(name, 0))
+        # events are not counted in samples per second
         if batch.stream is not Stream.EVENTS:
             counts = self._counts.setdefault((name, batch.stream), deque())
             counts.append((self._now_ns(), message.last - message.first + 1))
@@ -77,6 +78,7 @@ class FleetOverview:
         found: dict[str, list[StreamAccount]] = {}
         for key, account in fleet.accounts.items():
             found.setdefault(key.gateway, []).append(account)
+        # False sorts first: offline gateways
         order = sorted(fleet.states, key=lambda key: (fleet.states[key].online, key))
         rows = [self._row(key, found.get(key[1], [])) for key in order]
         away = sum(not state.online for state in fleet.states.values())
@@ -113,6 +115,7 @@ class FleetOverview:
         begin_ns, most = self._now_ns() - RATE_NS, 0
         for stream in (Stream.SAMPLES, Stream.STATISTICS):
             counts = self._counts.get((name, stream), deque())
+            # drop counts older than RATE_NS
             while counts and counts[0][0] < begin_ns:
                 counts.popleft()
             most = max(most, sum(count for _, count in counts))
@@ -182,6 +185,7 @@ async def run_top(args: argparse.Namespace, fleet: Fleet) -> int:
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, drawing.cancel)
         await asyncio.wait((reading, drawing), timeout=args.duration, return_when=asyncio.FIRST_COMPLETED)
+        # cancel both tasks, also the task that ended
         for task in (drawing, reading):
             task.cancel()
             with suppress(asyncio.CancelledError):
@@ -287,6 +291,7 @@ async def _collect(args: argparse.Namespace) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, collector.stop)
     try:
+        # collections would take a large share of the CPU time at high rates
         with rare_garbage_collection(GC_ALLOCATIONS):
             await collector.run(stop_after_s=args.duration)
     finally:

@@ -72,17 +72,20 @@ def scan(link: Rs485Link, baud: int, addresses: Iterable[int]) -> list[FoundModu
     asked = list(addresses)
     found: dict[int, FoundModule | None] = dict.fromkeys(asked)
     for number in range(TRIES):
+        # a silent bus does not need a third request per address
         if number == TRIES - 1 and not any(found.values()):
             break
         for address in asked:
             before = found[address]
             if before is None or before.problem:
+                # keep an earlier problem if the device is silent now
                 found[address] = _look(link, baud, address) or before
     return [one for one in found.values() if one is not None]
 
 
 def assign_by_serial(link: Rs485Link, baud: int, serial_number: str, new_id: int) -> FoundModule:
     """Set the address of the device with this serial number. Raises CommandError, LinkError."""
+    # the form in which devices report their serial number
     wanted = serial_bytes(serial_number).hex().upper()
     order = set_id_by_serial(serial_number, new_id)
     _check_free(link, new_id, wanted)
@@ -119,6 +122,7 @@ def keep(link: Rs485Link, found: FoundModule) -> None:
 
 
 def _look(link: Rs485Link, baud: int, address: int) -> FoundModule | None:
+    # counts invalid bytes: they show a device that replies at a wrong baud rate
     strange = link.heard.strange
     try:
         who = printable_identity(_run(link, address, probe(HipnucModbusOptions())))
@@ -163,6 +167,7 @@ def _expect(link: Rs485Link, baud: int, address: int, serial_number: str) -> Fou
 
 
 def _broadcast(link: Rs485Link, order: Transfer) -> None:
+    # all devices execute a broadcast, and no device replies
     link.select(BROADCAST)
     link.transfer(order)
     sleep(SETTLE_S)

@@ -47,6 +47,7 @@ def shortened(text: str, width: int) -> str:
 
 def fitted(value: float, width: int, show: Callable[[float], str]) -> str:
     """Format a number in at most `width` characters: with `show`, with fewer decimals, or with a power of ten."""
+    # from exact to rough: the first text that fits
     for text in (show(value), f"{value:.1f}", f"{value:.0f}", f"{value:.1e}", f"{value:.0e}"):
         short = text.replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
         if len(short) <= width:
@@ -101,6 +102,7 @@ def _word(cell: object) -> str:
 
 
 def _line(cells: Sequence[str], widths: Sequence[int], numbers: Sequence[bool]) -> str:
+    # the title of a column of numbers is left-aligned
     padded = (c.rjust(w) if n and _is_number(c) else c.ljust(w) for c, w, n in zip(cells, widths, numbers, strict=True))
     return "  ".join(padded).rstrip()
 
@@ -128,6 +130,7 @@ def open_standard_streams() -> None:
         try:
             os.fstat(descriptor)
         except OSError:
+            # open() returns the lowest free number, which is `descriptor`
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
     sys.stdin = sys.stdin or open(0, closefd=False)  # noqa: SIM115 - open to the end of the process
     sys.stdout = sys.stdout or open(1, "w", closefd=False)  # noqa: SIM115
@@ -168,6 +171,7 @@ def complain(text: str) -> None:
 def _discard(stream: TextIO) -> None:
     with suppress(OSError):
         null = os.open(os.devnull, os.O_WRONLY)
+        # the interpreter flushes the stream at exit: this flush must not fail
         os.dup2(null, stream.fileno())
         os.close(null)
 

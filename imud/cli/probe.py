@@ -91,6 +91,7 @@ async def examine_bus(interface: str, may_ask: bool) -> list[ProbeReport]:
     try:
         if reason := link.absence():
             return [ProbeReport(interface, problem=reason)]
+        # the detection needs frames of all devices
         link.filters = EVERYTHING
         link.open()
         devices, summary = await listen(link)
@@ -184,6 +185,7 @@ async def examine_all(ports: list[str], active: set[str], titles: dict[str, str]
     """Probe all ports at the same time."""
     found = await asyncio.gather(
         *(
+            # a port is a path, an interface is a name
             examine(port, port in active, titles.get(port, "")) if "/" in port else examine_bus(port, port in active)
             for port in ports
         )

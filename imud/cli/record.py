@@ -64,6 +64,7 @@ class DeviceContents:
 
     def check(self, found: CheckRecord) -> None:
         """Add a check record of the live run."""
+        # a smaller sequence number: the device or the daemon restarted
         if self.begins_anew or not self.spans or found.seq < self.spans[-1][1].seq:
             self.spans.append((found, found))
             self.begins_anew = False
@@ -122,6 +123,7 @@ class Contents:
 
     def _add_object(self, record: Record, device: DeviceContents) -> None:
         if record.kind == Kind.SESSION:
+            # later blocks repeat the session record
             self.session = self.session or decode_object(record, SessionRecord)
         elif record.kind == Kind.END:
             self.end = decode_object(record, EndRecord)
@@ -306,6 +308,7 @@ def output(file: str | None) -> Iterator[tuple[str, BinaryIO]]:
     if file == "-":
         yield "standard output", sys.stdout.buffer
         return
+    # UTC: names sort by time, also in winter
     name = file or f"imud-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.imudrec"
     try:
         made = open(name, "xb", buffering=0)  # noqa: SIM115 - closed below; this `try` must not catch write errors
@@ -339,6 +342,7 @@ class Copy:
             self.look()
             if select.select((self._stream,), (), (), LOOK_S)[0]:
                 break
+            # the daemon does not end the recording
             if self.stopped and monotonic() - self._moved_s > GIVE_UP_S:
                 return b""
         data = self._stream.read(min(size, CHUNK_BYTES))
@@ -354,6 +358,7 @@ class Copy:
     def _write(self, data: bytes) -> None:
         try:
             rest = memoryview(data)
+            # a write to a pipe can be partial
             while rest:
                 rest = rest[self._out.write(rest) :]
             self._out.flush()

@@ -40,6 +40,7 @@ def looks_like_recording(path: str) -> bool:
     """Return whether a file starts like a recording, or contains the start of a block. Raises OSError."""
     with open_regular(path) as file:
         begin = file.read(LOOKED_AT_BYTES)
+    # MAGIC at a later place: the first block is damaged
     return is_recording(begin) or MAGIC in begin
 
 
@@ -206,6 +207,7 @@ def run(args: argparse.Namespace) -> int:
         if looks_like_recording(str(args.file)):
             return play_recording(args)
         args.driver, args.speed = args.driver or DRIVER, args.speed or SPEED
+        # 0: the baud rate of the capture
         args.baud = args.baud or (0 if names_rate(args) else BAUD)
         without_times = "" if has_times(args) else NO_TIMES
         status = play(args)

@@ -68,6 +68,7 @@ def refuse(error: ConfigError) -> None:
         complain(str(error))
         return
     with log_to(STDERR, "info"):
+        # one journal entry per problem
         for problem in str(error).splitlines():
             log.critical("%s", problem)
 

@@ -132,6 +132,7 @@ class Collector:
         self.syncs[str(sample.sync)] += 1
         self._errors_ns += sample.t_err_ns
         self._times.append(t_ns)
+        # NaN keeps the arrays at equal length
         self._gyro.extend(sample.gyro_rad_s or _NONE3)
         self._accel.extend(sample.accel_m_s2 or _NONE3)
         self._temperature.append(nan if sample.temperature_c is None else sample.temperature_c)
@@ -251,6 +252,7 @@ def take_recording(args: argparse.Namespace) -> SampleSet:
             player.play((record,))
             if record.kind in (Kind.PATH, Kind.CHECK):
                 look()
+            # with several devices, `others` causes an error below
             if collector.done or collector.others:
                 break
         if not collector.done:
@@ -334,6 +336,7 @@ def take_live(
         collector = Collector(args.input, skip_s=args.skip or 0.0, for_s=args.duration)
         samples = listening.watch([args.input], timeout_s=SILENCE_S, latency_ms=LATENCY_MS)
         tally = LossTally()
+        # without --skip, losses count from the start
         if not args.skip:
             tally.look(before.ledger)
         begun = noted = monotonic()
@@ -344,6 +347,7 @@ def take_live(
                         break
                     continue
                 collector.add(sample)
+                # with --skip, losses count from the first collected sample
                 if not tally.begun and collector.first is not None:
                     tally.look(status_of(statuses(asking), args.input).ledger)
                 now = monotonic()

@@ -74,10 +74,12 @@ def _report(client: Client, device: str, *, needed: bool) -> SettingsReport:
 
     Raises ImudError if `needed` is set and imud cannot read the settings now.
     """
+    # reading from the device sends requests, which needs the right to control
     fresh = "control" in client.hello.rights
     try:
         found = client.call("settings.get", device=device, fresh=fresh)
     except RpcError as error:
+        # for example, the device is missing: print the last report instead
         if needed or not fresh or error.code is not Code.FAILED:
             raise
         print(f"{error}; imud prints the last reported settings:", file=sys.stderr)
@@ -217,6 +219,7 @@ def _change(client: Client, args: argparse.Namespace, given: Mapping[str, Any] |
         return 1
     done = msgspec.convert(client.call("settings.apply", **params), AppliedSettings)
     print(msgspec.json.encode(done).decode() if args.json else _account(done))
+    # also 1 if the device did not keep a value
     return 1 if done.problem or done.left_out or done.differences else 0
 
 

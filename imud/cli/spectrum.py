@@ -258,6 +258,7 @@ class LiveView:
     def _lines(self, sensor: SensorVibration) -> list[str]:
         columns = in_columns(sensor.spectrum)
         decibels = 10 * np.log10(np.maximum(columns, 1e-300))  # log10(0) is -infinity
+        # next multiple of 10 dB: the scale does not move with each redraw
         top = 10 * int(np.ceil(decibels.max() / 10))
         level = np.clip((decibels - top + RANGE_DB) / RANGE_DB, 0, 1)
         self._past.appendleft("".join(SHADES[min(int(one * len(SHADES)), len(SHADES) - 1)] for one in level))
@@ -280,6 +281,7 @@ def in_columns(spectrum: Spectrum) -> FloatArray:
     power = spectrum.density[1:].sum(axis=1)
     column = (np.arange(len(power)) * COLUMNS) // len(power)
     found = np.full(COLUMNS, 0.0)
+    # the maximum, not the mean: a narrow line stays visible
     np.maximum.at(found, column, power)
     if len(power) < COLUMNS:
         found = power[np.arange(COLUMNS) * len(power) // COLUMNS]

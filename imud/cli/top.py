@@ -629,6 +629,7 @@ class DevicePage(TopScreen):
 
     def _list_events(self) -> None:
         events = self.query_one("#events", RichLog)
+        # events after the newest shown event, newest first
         fresh = []
         for event in reversed(self.top.events):
             if event is self._shown:

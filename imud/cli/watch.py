@@ -73,6 +73,7 @@ def _array(name: str, label: str, titles: Sequence[str], widths: tuple[int, int]
 
 def _clock_time(utc_ns: int) -> str:
     """Format ns since 1970-01-01 UTC as local time of day, truncated to ms."""
+    # characters of the time of day, for example 14:05:09.123
     return local_time(utc_ns).isoformat(timespec="milliseconds")[11:23]
 
 
@@ -146,6 +147,7 @@ class TableLine(NamedTuple):
         width = column.narrow if self.narrow else column.wide
         if len(text) <= width or not column.is_number or "." not in text:
             return text
+        # a number that is too wide gets fewer decimals or an exponent
         return fitted(float(text), width, lambda _: text)
 
     def _width(self, field: FieldColumns) -> int:
@@ -229,8 +231,10 @@ class SampleTable:
             width, rows = shutil.get_terminal_size((COLUMNS, ROWS))
         names = self._chosen or usual_fields(width, several=len(self._devices) > 1)
         self._lines = lines_of(names, width)
+        # offset from UTC, for example +01:00
         zone = local_time(sample.utc_ns).isoformat(timespec="seconds")[19:]
         head = [text for line in self._lines for text in line.head(f"TIME {zone}")]
+        # -1: no repeated header in files and pipes
         self._rows_left = max((rows - len(head) - 1) // len(self._lines), ROWS_LEAST) if is_terminal else -1
         return head
 
@@ -280,6 +284,7 @@ class _Csv:
         self._begun = False
 
     def begin(self, _devices: Iterable[str]) -> str:
+        # only one header, also after a reconnection
         begun, self._begun = self._begun, True
         return "" if begun else _csv_line(sample_columns(self._fields))
 

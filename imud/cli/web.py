@@ -53,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
     check_port(args.port)
     guard = guard_of(args)
     try:
+        # needs aiohttp of the extra `web`
         from imud.web.server import WebServer
     except ModuleNotFoundError as error:
         raise BadArgument(f"cannot import {error.name}; install the extra: pip install 'imud[web]'") from None
@@ -81,6 +82,7 @@ async def _serve(app: "web.Application", args: argparse.Namespace) -> None:
     stopped = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    # no log line per request
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=STOP_S)
     await runner.setup()
     try:

@@ -119,7 +119,9 @@ def _swapped(data: bytes) -> bytes:
 def _is_shifted(read: bytes, wanted: bytes) -> bool:
     """Return whether each word is the wanted word shifted by one bit. The added bit can have any value."""
     pairs = list(zip(_words(read), _words(wanted), strict=True))
+    # shifted left: the highest bit is lost
     early = all(got >> 1 == want & (1 << WORD_BITS - 1) - 1 for got, want in pairs)
+    # shifted right: the lowest bit is lost
     late = all(got & (1 << WORD_BITS - 1) - 1 == want >> 1 for got, want in pairs)
     return early or late
 
@@ -222,6 +224,7 @@ def can_state(at: Surroundings) -> Findings:
         if state == "BUS-OFF":
             restart = "" if data.get("restart_ms") else f"restart it: {_restarting(name)}; "
             yield error(f"{seen}: the controller left the bus", restart + BUS_ADVICE)
+        # errors without traffic show a wrong bit rate or wrong wires
         elif (tx or rx) and not _runs(at, name) and _silent(at, name, frames):
             yield error(f"{seen}, no frame arrives now", _without_traffic(tx, rx))
         elif state in ("ERROR-PASSIVE", "ERROR-WARNING") or max(tx, rx) >= COUNTER_LIMIT:
@@ -229,6 +232,7 @@ def can_state(at: Surroundings) -> Findings:
         else:
             yield ok(seen)
         offs = int(data.get("bus_off", 0))
+        # the controller restarted, but the cause can still exist
         if offs and state != "BUS-OFF":
             yield warning(f"{name} was bus-off {offs} times", BUS_ADVICE)
         if not data.get("restart_ms"):
@@ -253,6 +257,7 @@ def can_bitrate(at: Surroundings) -> Findings:
     for name in _up(at):
         data, frames = _details(at, name)
         bitrate = int(data.get("bittiming", {}).get("bitrate", 0))
+        # a virtual interface has no bit rate
         if not bitrate:
             continue
         down = [one.name for one in _devices(at, name) if one.state in ABSENT]
@@ -301,6 +306,7 @@ def _details(at: Surroundings, name: str) -> tuple[dict[str, Any], int]:
     Raises OSError, ValueError.
     """
     output = at.run(["ip", "-json", "-details", "-statistics", "link", "show", name])
+    # for example, the interface disappeared
     if output.status:
         raise OSError(f"ip link show {name}: {output.complaint}")
     found = json.loads(output.text)

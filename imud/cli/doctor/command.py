@@ -47,8 +47,10 @@ def _findings(check: DoctorCheck, at: Surroundings) -> list[DoctorFinding]:
     try:
         for finding in check.run(at):
             found.append(finding)
+            # the report stays readable, also for a daemon with a faulty configuration
             if len(found) == FINDINGS_MAX:
                 break
+    # for example, a command with unexpected JSON
     except (OSError, ImudError, ValueError, LookupError, TypeError, AttributeError) as problem:
         found.append(DoctorFinding(Severity.NOT_CHECKED, f"{check.name}: {_reason(problem)}"))
     return found
@@ -85,6 +87,7 @@ def verdict(examined: Sequence[Examined]) -> str:
 def page(examined: Sequence[Examined]) -> str:
     """Format all findings, the worst severity last, and the verdict."""
     findings = [finding for one in examined for finding in one.findings]
+    # the worst findings are last, next to the prompt of the shell
     findings.sort(key=lambda finding: _RANK[finding.severity])
     return "\n".join([*(_block(finding) for finding in findings), "", *textwrap.wrap(verdict(examined), COLUMNS)])
 
@@ -168,6 +171,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the findings. Return 0 without problems, 1 for warnings, 2 for errors."""
+    # absolute: messages then contain the complete path
     at = Surroundings(args.config.absolute(), partial(ask_daemon, args.socket))
     examined = examine(CHECKS, at)
     sys.stdout.write((as_json(examined).decode() if args.json else page(examined)) + "\n")

@@ -44,6 +44,7 @@ def configuration(at: Surroundings) -> Findings:
     try:
         at.at(at.config_file).open("rb").close()
     except OSError as problem:
+        # not an error: other users usually cannot read the file
         if problem.errno in (errno.EACCES, errno.EPERM):
             yield not_checked(f"this user cannot read {at.config_file}", "run `sudo imud doctor`")
             return
@@ -136,6 +137,7 @@ def stale_configuration(at: Surroundings) -> Findings:
     changed_us = at.unit_value("StateChangeTimestampMonotonic")
     if at.unit_value("ActiveState") == "active" and changed_us.isdecimal() and int(changed_us):
         looked = True
+        # systemd reports CLOCK_MONOTONIC, file times are UTC
         loaded_ns = int(changed_us) * NS_PER_US + at.boot_utc_ns()
         if at.at(at.config_file).stat().st_mtime_ns > loaded_ns + STALE_NS:
             yield warning(
@@ -243,6 +245,7 @@ def prometheus(at: Surroundings) -> Findings:
         yield error(f"the program at {place} is not imud", "configure another port for the metrics")
         return
     if not counted.scrapes:
+        # a warning only if the user configured the metrics
         missed = counted.age_s > NEVER_S and CONFIGURED.search(at.text(at.config_file) or "")
         yield (warning if missed else note)(
             f"no scrape of {place} since imud opened it {_ago(counted.age_s)} ago",
@@ -288,6 +291,7 @@ def heard(at: Surroundings) -> Findings:
         counts = one.ledger
         if one.state in (DeviceState.MISSING, DeviceState.FAILED, DeviceState.FINISHED):
             continue
+        # with samples, wires and baud rate are correct
         if counts["samples"]:
             yield from _damage(one)
             yield from _answers(at, one)
@@ -297,6 +301,7 @@ def heard(at: Surroundings) -> Findings:
                 "does the device have power? Are TX and RX swapped (connect TX of each side to RX of the other side)? "
                 "Is ground connected? Do both sides use the same levels (TTL 3.3 V, RS-232 or RS-485)?",
             )
+        # framing errors are typical of a wrong baud rate
         elif one.kernel.framing or one.kernel.break_:
             yield error(
                 f"{one.name}: {counts['bytes_in']} bytes, no valid frame; {one.kernel.framing} framing errors",
@@ -345,6 +350,7 @@ def _answers(at: Surroundings, one: DeviceStatus) -> Findings:
     """Check that a device with samples also replies to requests."""
     asked = any(device.name == one.name and device.identify for device in (at.config.devices if at.config else ()))
     rate_hz = one.expected_rate_hz or one.rate_hz
+    # a reply of any kind shows that RX of the device works
     if not asked or one.identity.get("product") or one.ledger["frames_in_replies"]:
         return
     if one.state is DeviceState.RUNNING and one.ledger["samples"] > ANSWERED_AFTER_S * rate_hz > 0:
@@ -393,6 +399,7 @@ def restarts(at: Surroundings) -> Findings:
             continue
         resets = one.clock.resets
         rate_hz = one.expected_rate_hz or one.rate_hz
+        # the number of samples is a clock of the running time
         hours = one.ledger["samples"] / rate_hz / S_PER_H if rate_hz else 0.0
         if resets >= RESETS and resets > RESETS_PER_H * hours:
             yield warning(

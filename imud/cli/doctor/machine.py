@@ -59,6 +59,7 @@ def storage(at: Surroundings) -> Findings:
         )
         return
     try:
+        # the longest time: a slow card is slow only sometimes
         worst_s = max(at.sync_s(place) for _ in range(SYNCS))
     except PermissionError:
         yield not_checked(
@@ -80,6 +81,7 @@ def _medium(at: Surroundings, folder: Path) -> str:
     """Return the block device or file system of a folder, from /proc/mounts."""
     mounts = [line.split() for line in (at.text("/proc/mounts") or "").splitlines()]
     fitting = [mount for mount in mounts if len(mount) > 2 and folder.is_relative_to(mount[1])]
+    # the longest mount point is the file system of the folder
     return max(fitting, key=lambda mount: len(mount[1]))[0] if fitting else "unknown storage"
 
 
@@ -95,6 +97,7 @@ def power(at: Surroundings) -> Findings:
             "`sudo vcgencmd get_throttled` (package raspi-utils or libraspberrypi-bin)",
         )
         return
+    # `before`: not at present, but at some time since boot
     now, before = word & 0xF, word >> SINCE_BOOT & 0xF & ~word
     if now & UNDER_VOLTAGE:
         yield error("the supply voltage is too low now (below 4.63 V)", SUPPLY)
@@ -136,6 +139,7 @@ def processor(at: Surroundings) -> Findings:
         waited = _pressure(at.text("/proc/pressure/cpu") or "")
         seen = f"load {minutes:.1f} over 5 minutes on {cpus} processors"
         seen += f", tasks waited for a processor in {waited:.0f} % of the last minute" if waited is not None else ""
+        # kernels without CONFIG_PSI have no /proc/pressure
         if minutes > LOAD_PER_CPU * cpus or (waited or 0.0) > PRESSURE_PERCENT:
             yield warning(
                 seen, "check with `top`; give other programs a nice value, reduce rates, or accept a latency "

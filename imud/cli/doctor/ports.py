@@ -89,7 +89,9 @@ def unit_rules(at: Surroundings) -> Findings:
     classes = at.text("/proc/devices") or ""
     for path in nodes(at):
         own = _class(at, path)
+        # systemd accepts a device that matches any entry
         entries = [entry for entry in allowed if _matches(entry[0], path, own, at)]
+        # without permissions, an entry allows rwm
         if not any({"r", "w"} <= set(entry[1] if len(entry) > 1 else "rwm") for entry in entries):
             yield error(
                 f"DeviceAllow= of imud.service does not allow {path}: opening the node fails with EPERM for every "
@@ -152,6 +154,7 @@ def daemon_user(at: Surroundings) -> Person | None:
 
 
 def _may_open(person: Person, mode: int, uid: int, gid: int) -> bool:
+    # root ignores mode and group
     if person.uid == 0:
         return True
     if uid == person.uid:
@@ -219,6 +222,7 @@ def ports_present(at: Surroundings) -> Findings:
             yield error(f"{path} does not exist; ports of this host: {names}", _absent(path, bool(there)))
         elif path.startswith(("/dev/ttyUSB", "/dev/ttyACM")):
             stable = next((at.outside(port.path) for port in there if at.outside(port.node) == path), path)
+            # a name in /dev/serial does not change with the order of plugging in
             if stable.startswith(STABLE):
                 yield note(
                     f"{path} can get another number when the adapter is plugged in again",
@@ -233,6 +237,7 @@ def ports_present(at: Surroundings) -> Findings:
 
 
 def _absent(path: str, others: bool) -> str:
+    # the UART of a Raspberry Pi is disabled by default
     if path.startswith("/dev/serial0") or "ttyAMA" in path:
         return "enable the UART: `enable_uart=1` in /boot/firmware/config.txt, or raspi-config; then restart the host"
     if others:
@@ -248,12 +253,14 @@ def ports_taken(at: Surroundings) -> Findings:
         if not node.exists():
             continue
         name = node.resolve().name
+        # writing to a console would mix kernel messages with requests
         if name in consoles:
             yield error(
                 f"{path} is a console of the kernel: the kernel writes messages to it, and it can offer a login",
                 f"remove `console={name}` (or serial0) from the kernel command line, "
                 f"`sudo systemctl disable --now serial-getty@{name}`",
             )
+        # without root, /proc shows only programs of this user
         others = [one for one in holders_of(str(node), at.at("/proc")).split(", ") if one and not _is_daemon(one)]
         taken = [one for one in at.status or () if "is in use by" in one.problem and path in one.problem]
         if others:

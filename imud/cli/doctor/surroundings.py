@@ -107,6 +107,7 @@ class Surroundings:
         """Return the content of a file without surrounding white space; None if imud cannot read the file."""
         try:
             with self.at(path).open("rb") as file:
+                # texts of the device tree end with NUL
                 return file.read(TEXT_BYTES_MAX).decode("utf-8", "replace").strip(" \n\t\0")
         except OSError:
             return None
@@ -174,6 +175,7 @@ class Surroundings:
         except OSError:
             return {}
         found: dict[str, list[str]] = {}
+        # the output has one line NAME=VALUE per property
         for line in output.text.splitlines() if output.status == 0 else ():
             name, _, value = line.partition("=")
             found.setdefault(name, []).append(value)
@@ -199,6 +201,7 @@ def run_command(words: Sequence[str], limit_s: float | None = None) -> CommandOu
     try:
         done = subprocess.run(
             list(words), stdin=subprocess.DEVNULL, capture_output=True, timeout=limit_s, check=False,
+            # the checks parse English output without colours
             env=os.environ | {"LC_ALL": "C", "SYSTEMD_COLORS": "0", "PATH": path},
         )  # fmt: skip
     except subprocess.TimeoutExpired:
@@ -230,6 +233,7 @@ def measure_sync_s(folder: Path) -> float:
         begin_ns = time.monotonic_ns()
         file.write(bytes(SYNC_BYTES))
         file.flush()
+        # without fsync, the write would end in the page cache
         os.fsync(file.fileno())
         return (time.monotonic_ns() - begin_ns) / NS_PER_S
 

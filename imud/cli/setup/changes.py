@@ -99,6 +99,7 @@ def _differences(before: bytes | None, change: FileChange) -> list[str]:
     if change.copy_of:
         return []
     old, new = ((text or b"").decode("utf-8", "replace").splitlines() for text in (before, change.content))
+    # without the two header lines with file names
     compared = list(difflib.unified_diff(old, new, n=0, lineterm=""))[2:]
     return [f"  {line}" for line in compared if not line.startswith("@@")]
 
@@ -135,6 +136,7 @@ def take_back(at: Surroundings, record: ChangeRecord) -> list[str]:
     """
     change = record.change
     if isinstance(change, CommandChange):
+        # already undone, for example by the user
         if _output(at, change.look) == record.seen_before:
             return []
         failed = run_all(at, change.undo)
@@ -144,6 +146,7 @@ def take_back(at: Surroundings, record: ChangeRecord) -> list[str]:
     now = content_of(at, change.path)
     if now == record.content_before:
         return []
+    # the user changed the file: never overwrite this change
     if now != change.content:
         verb = "removed" if now is None else "changed"
         raise ChangeRefused(f"{change.path} was {verb} after `imud setup` wrote it, so imud does not change it")
@@ -253,6 +256,7 @@ class Journal:
         notes: list[str] = []
         for change in changes:
             record = begun(self._at, change)
+            # store the record first: an interrupted change can then be undone
             self.records.append(record)
             self._save()
             notes += make(self._at, record)
@@ -277,10 +281,12 @@ class Journal:
                 notes = take_back(self._at, self.records[place])
             except ChangeRefused as reason:
                 refused.append(str(reason))
+                # keep the backup of a file that stays
                 left.add(path)
                 continue
             for note in notes:
                 self._say(f"  {note}")
+            # store each undo, so that an interrupted undo can continue
             del self.records[place]
             self._save()
         return list(dict.fromkeys(refused))
@@ -307,6 +313,7 @@ def locked(at: Surroundings) -> Iterator[None]:
     descriptor = os.open(path, flags, 0o600)
     try:
         try:
+            # the kernel releases the lock if the process ends
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise ImudError("another `imud setup` is running; wait until it ends") from None

@@ -84,6 +84,7 @@ def check(args: argparse.Namespace) -> None:
     for name, bitrate in args.can:
         if bitrate > BITRATE_MAX or "/" in name:
             raise BadArgument(f"--can: expected for example can0={BITRATE_DEFAULT}, got {name}={bitrate}")
+        # imud cannot ask for the bit rate
         if not bitrate and (args.yes or args.dry_run):
             raise BadArgument(f"--can {name}: expected the bit rate of the bus, for example {name}={BITRATE_DEFAULT}")
 

@@ -132,6 +132,7 @@ def look(
         others = [one for one in port.holders.split(", ") if one]
         if here.configured:
             found.append(_as_configured(at, here))
+        # opening the port would steal bytes from this program
         elif others:
             waits = MODEM_MANAGER if port.holders.startswith("ModemManager") else ""
             found.append(msgspec.structs.replace(here, problem=f"in use by {', '.join(others)}{waits}"))
@@ -148,6 +149,7 @@ def look(
         else:
             listen.append(name)
     found += _not_attached(at, wanted, ports)
+    # compare nodes: a port has several names
     active = {listened for listened in listen if _node(at, listened) in {_node(at, one) for one in wanted.active}}
     reports = finders.listen(listen, active) if listen else []
     heard = [_heard(at, report, ports) for report in reports]
@@ -204,6 +206,7 @@ def _heard(at: Surroundings, report: ProbeReport, ports: Mapping[str, PortNow]) 
         keys = {"driver": report.driver, "socketcan": {"interface": report.port}}
         option, _, number = report.device.partition(" ")
         driver = DRIVERS.get(report.driver)
+        # `node 8` becomes the option `node: 8`
         if isinstance(driver, CanDriver) and option in driver.settings.__struct_fields__ and number.isdecimal():
             keys = {"driver": report.driver, "options": {option: int(number)}, "socketcan": keys["socketcan"]}
     return Attached(
@@ -240,6 +243,7 @@ def _is_of(device: DeviceConfig, one: Attached, *, exact: bool) -> bool:
     options = msgspec.to_builtins(device.options) if device.options is not None else {}
     pairs = [(link.get(key), value) for key, value in keys.items()]
     pairs += [(options.get(key), value) for key, value in one.keys.get("options", {}).items()]
+    # `auto` matches any driver if not `exact`
     pairs.append((device.driver, one.driver))
     return all(have == value or (not exact and have in ("auto", None)) for have, value in pairs)
 
@@ -257,6 +261,7 @@ def listen(places: Sequence[str], active: set[str]) -> list[ProbeReport]:
 def scan_rs485(path: str, baud: int) -> list[Attached]:
     """Send a request to each address of an RS-485 bus. `baud`: 0 for the factory setting."""
     rate = baud or FACTORY_BAUD
+    # most devices have the factory address
     order = list(dict.fromkeys([FACTORY_ID, *SLAVES]))
     try:
         with opened(path, rate, REPLY_MS) as link:
@@ -364,6 +369,7 @@ def without_console(line: str, names: set[str]) -> str:
     words = line.split(" ")
     gone = [word for word in words if word.startswith("console=") and word.strip()[8:].partition(",")[0] in names]
     kept = [word for word in words if word not in gone]
+    # keep the line end if the last word is removed
     end = "\n" if gone and gone[-1].endswith("\n") and not kept[-1].endswith("\n") else ""
     return " ".join(kept) + end
 
@@ -377,6 +383,7 @@ def raise_can(at: Surroundings, name: str, bitrate: int) -> tuple[list[Change], 
         there = ", ".join(can_interfaces(at.at("/sys"), down=True)) or "none"
         return [], [f"{name} does not exist; CAN interfaces of this host: {there}"]
     path = f"{NETWORKS}/80-imud-{name}.network"
+    # a virtual interface refuses a bit rate
     own = network_file(name, 0 if at.at(f"{VIRTUAL}/{name}").exists() else bitrate)
     other = next((file for file in network_files(at) if file != path and _names(at, file, name)), None)
     if other is not None:
@@ -392,6 +399,7 @@ def raise_can(at: Surroundings, name: str, bitrate: int) -> tuple[list[Change], 
     if not runs:
         manager = next((title for unit, title in OTHERS if state(at, unit, "is-active") == "active"), "")
         strangers = [file for file in network_files(at) if file != path]
+        # enabling systemd-networkd would also activate these files
         if strangers:
             notes.append(
                 f"systemd-networkd does not run, and would also use {', '.join(strangers)}: check these files, then "

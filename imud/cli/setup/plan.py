@@ -48,6 +48,7 @@ def usb_adapter(at: Surroundings, node: str) -> UsbAdapter | None:
         return None
     driver = (device / "driver").resolve().name if (device / "driver").exists() else ""
     real = device.resolve()
+    # the USB device is above the port and its interface in /sys
     for parent in (real, *real.parents):
         if vendor := at.text(at.outside(parent / "idVendor")):
             product, serial = (at.text(at.outside(parent / key)) or "" for key in ("idProduct", "serial"))
@@ -80,6 +81,7 @@ def rules(at: Surroundings, adapters: Sequence[UsbAdapter]) -> FileChange | None
     ]
     nodes = dict.fromkeys(f"--sysname-match={adapter.node}" for adapter in adapters)
     then: tuple[Words, ...] = (("udevadm", "control", "--reload"),)
+    # trigger: apply the rules to adapters that are already plugged in
     then += (
         ("udevadm", "trigger", "--action=add", "--subsystem-match=tty", "--subsystem-match=usb-serial", *nodes),
         ("udevadm", "settle", "--timeout=5"),
@@ -149,11 +151,13 @@ def with_devices(content: bytes | None, blocks: Blocks, *, replace: str = "") ->
         return (FILE_HEAD + "devices:\n" + "\n".join(_block(blocks, INDENT)) + "\n").encode()
     tree = read_yaml(content)
     text = content.decode("utf-8-sig")
+    # keep the line ends of the file
     end = "\r\n" if "\r\n" in text else "\n"
     lines = text.splitlines()
     changed = end.join([*_inserted(lines, tree, blocks, replace), ""]).encode()
     wanted = _devices_of(tree.data)
     wanted.pop(replace, None)
+    # read the result again: all other keys must be unchanged
     if not _has(changed, tree.data, {**wanted, **blocks}):
         paste = "\n".join(["devices:", *_block(blocks, INDENT)])
         raise ImudError(
@@ -181,11 +185,13 @@ def _inserted(lines: list[str], tree: YamlTree, blocks: Blocks, replace: str) ->
     at, column = key.line, INDENT
     if names := list(_devices_of(tree.data)):
         column = tree.keys["devices", names[0]].column - 1
+    # an empty mapping becomes a block
     head = re.sub(r"^(devices:)\s*(\{\s*\}|null|~)", r"\1", lines[at - 1])
     rest = lines[at:]
     if replace:
         first = tree.keys["devices", replace].line - at - 1
         last = first + 1
+        # deeper lines belong to the replaced device
         while last < len(rest) and rest[last].strip() and _indent(rest[last]) > column:
             last += 1
         return [*lines[: at - 1], head, *rest[:first], *_block(blocks, column), *rest[last:]]
@@ -221,6 +227,7 @@ def _scalar(value: object) -> str:
                 return value
         except ValueError:
             pass
+    # JSON is YAML
     return msgspec.json.encode(value).decode()
 
 

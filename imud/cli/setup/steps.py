@@ -150,6 +150,7 @@ def wait_for_samples(
             found, problem = [], error
         now = now_s()
         runs = len(found) == len(names) and all(_runs(one) for one in found)
+        # a device that stops again restarts the wait
         settled_s = min(settled_s, now + SETTLE_S) if runs else end_s
         if now >= min(end_s, settled_s):
             if problem is not None:
@@ -270,6 +271,7 @@ class SetupSteps:
         changes: list[Change] = []
         notes: list[str] = []
         for port in self._consoles(at, wanted):
+            # removing this console would end the dialogue
             if port.node == own_terminal():
                 raise ImudError(f"imud setup runs on the terminal {port.node}; use another terminal, for example ssh")
             self._freed.append(port.node)
@@ -311,6 +313,7 @@ class SetupSteps:
     def _await_can(self, names: Sequence[str]) -> None:
         end_s = self._now_s() + CAN_UP_S
         sys_folder = self._look_around().at("/sys")
+        # networkd needs some time
         while self._changed and any(absence(name, sys_folder) for name in names) and self._now_s() < end_s:
             self._sleep(CAN_LOOK_S)
 
