@@ -18,48 +18,35 @@ from imud.analysis.series import FloatArray, Grid, IntArray, Readings, even_runs
 from imud.analysis.spectrum import Spectrum, power_spectrum
 from imud.model.errors import BadArgument
 
-CONFIDENCE: Final = 0.683
-"""Probability of the confidence intervals: one sigma."""
-PER_DECADE: Final = 12
-"""Number of τ per decade."""
+CONFIDENCE: Final = 0.683  # probability of the confidence intervals: one sigma
+PER_DECADE: Final = 12  # number of τ per decade
+# Length of the longest run divided by the largest τ. A larger τ has about one degree of freedom.
 PARTS_LEAST: Final = 3
-"""Length of the longest run divided by the largest τ. A larger τ has about one degree of freedom."""
+# Minimum number of averages to find the noise type. With 30 (SP 1065, 5.5.6), the error of the power is 0.4.
 CLUSTERS_LEAST: Final = 60
-"""Minimum number of averages to find the noise type. With 30 (SP 1065, 5.5.6), the error of the power is 0.4."""
 DIFFERENCES_MOST: Final = 2
 
 
 class NoiseType(IntEnum):
     """Noise type of a rate. The value is the power α of the spectrum, S(f) ∝ f^α."""
 
-    RATE_RANDOM_WALK = -2
-    """Slope of the deviation: +1/2."""
-    FLICKER = -1
-    """Bias instability, slope 0."""
-    WHITE = 0
-    """Angle or velocity random walk, slope -1/2."""
+    RATE_RANDOM_WALK = -2  # slope of the deviation: +1/2
+    FLICKER = -1  # bias instability, slope 0
+    WHITE = 0  # angle or velocity random walk, slope -1/2
     FLICKER_PHASE = 1
-    QUANTISATION = 2
-    """Slope of the deviation: -1."""
+    QUANTISATION = 2  # slope of the deviation: -1
 
 
 class AllanCurve(NamedTuple):
     """Allan deviation of all axes over k values of τ."""
 
-    tau_s: FloatArray
-    """Averaging times, s, shape (k,)."""
-    factors: IntArray
-    """Number of samples per average, shape (k,)."""
-    deviation: FloatArray
-    """Deviation in the unit of the rate, shape (k, axes)."""
-    low: FloatArray
-    """Lower ends of the confidence intervals, shape (k, axes)."""
-    high: FloatArray
-    """Upper ends of the confidence intervals, shape (k, axes)."""
-    freedom: FloatArray
-    """Equivalent degrees of freedom, shape (k, axes)."""
-    types: IntArray
-    """Noise types (NoiseType), shape (k, axes)."""
+    tau_s: FloatArray  # averaging times, s, shape (k,)
+    factors: IntArray  # number of samples per average, shape (k,)
+    deviation: FloatArray  # deviation in the unit of the rate, shape (k, axes)
+    low: FloatArray  # lower ends of the confidence intervals, shape (k, axes)
+    high: FloatArray  # upper ends of the confidence intervals, shape (k, axes)
+    freedom: FloatArray  # equivalent degrees of freedom, shape (k, axes)
+    types: IntArray  # noise types (NoiseType), shape (k, axes)
 
 
 def averaging_factors(longest: int) -> IntArray:
@@ -176,40 +163,31 @@ def _type_of(averages: FloatArray) -> NoiseType:
     return NoiseType(min(max(alpha, -2), 2))
 
 
-BIAS_FACTOR: Final = float(np.sqrt(2 * np.log(2) / np.pi))
-"""Minimum deviation of flicker noise divided by B: 0.664."""
+BIAS_FACTOR: Final = float(np.sqrt(2 * np.log(2) / np.pi))  # minimum deviation of flicker noise divided by B: 0.664
 ROUNDS: Final = 12
 POINTS_LEAST: Final = 6
+# Minimum square of a coefficient in its standard deviations. Below that, the series does not resolve it.
 RESOLVED_SIGMAS: Final = 2.0
-"""Minimum square of a coefficient in its standard deviations. Below that, the series does not resolve it."""
+# Number of points per octave. They use nearly the same averages and count as one independent point.
 POINTS_PER_OCTAVE: Final = PER_DECADE * float(np.log10(2))
-"""Number of points per octave. They use nearly the same averages and count as one independent point."""
 
 
 class Coefficient(NamedTuple):
     """Coefficient of one axis, in the SI unit of the sensor."""
 
-    value: float | None
-    """Value; None if other noise hides the coefficient, or if the series is too short."""
-    sigma: float
-    """Approximate standard deviation of `value`; 0 if `value` is None."""
-    below: float
-    """Upper bound of the coefficient, two standard deviations."""
+    value: float | None  # value; None if other noise hides the coefficient, or if the series is too short
+    sigma: float  # approximate standard deviation of `value`; 0 if `value` is None
+    below: float  # upper bound of the coefficient, two standard deviations
 
 
 class NoiseTerms(NamedTuple):
     """Coefficients of one axis. The units are for a rate in rad/s."""
 
-    quantisation: Coefficient
-    """Quantisation Q, rad."""
-    random_walk: Coefficient
-    """Random walk N, rad/s/√Hz = rad/√s: the line with the slope -1/2 at τ = 1 s."""
-    bias_instability: Coefficient
-    """Bias instability B, rad/s."""
-    rate_random_walk: Coefficient
-    """Rate random walk K, rad/s/√s."""
-    rate_ramp: Coefficient
-    """Rate ramp R, rad/s²."""
+    quantisation: Coefficient  # quantisation Q, rad
+    random_walk: Coefficient  # random walk N, rad/s/√Hz = rad/√s: the line with the slope -1/2 at τ = 1 s
+    bias_instability: Coefficient  # bias instability B, rad/s
+    rate_random_walk: Coefficient  # rate random walk K, rad/s/√s
+    rate_ramp: Coefficient  # rate ramp R, rad/s²
 
     def deviation(self, tau_s: FloatArray) -> FloatArray:
         """Return the Allan deviation of these coefficients, shape (k,)."""
@@ -283,27 +261,19 @@ def _coefficient(square: float, spread: float, bound: float) -> Coefficient:
 
 
 AXES: Final = ("x", "y", "z")
-CORNER_SHARE: Final = 0.5
-"""Share of the power at the corner frequency: -3 dB."""
-CORNER_BINS: Final = 24
-"""Number of logarithmic bands for the search of the corner frequency."""
+CORNER_SHARE: Final = 0.5  # share of the power at the corner frequency: -3 dB
+CORNER_BINS: Final = 24  # number of logarithmic bands for the search of the corner frequency
+# Minimum and maximum number of bands below the corner frequency that must be flat within a factor of 2
 PLATEAU_LEAST, PLATEAU_MOST = 4, 8
-"""Minimum and maximum number of bands below the corner frequency that must be flat within a factor of 2."""
+# Minimum τ of the fit, in periods of the corner frequency. At this τ, a first-order filter changes the Allan variance
+# of white noise by less than 5 %: 3 / (4π) periods divided by τ.
 FILTER_PERIODS: Final = 5.0
-"""Minimum τ of the fit, in periods of the corner frequency. At this τ, a first-order filter changes the Allan variance
-of white noise by less than 5 %: 3 / (4π) periods divided by τ."""
-FLAT_LOW, FLAT_HIGH = 0.05, 0.6
-"""Band of the noise density, as shares of the corner frequency."""
-KNOWN_PARTS: Final = 10
-"""Duration divided by the largest τ with an error of the deviation below about 25 %."""
-STILL_S: Final = 1.0
-"""Length of the blocks that imud checks for motion, s."""
-STILL_FACTOR: Final = 4.0
-"""Minimum standard deviation of a disturbed block, as a multiple of the median block."""
-BLOCKS_MOST: Final = 2000
-"""Maximum number of means for the fit of the drift."""
-SPAN_LEAST_C: Final = 2.0
-"""Minimum range of the temperature for a drift, °C. Many devices send whole degrees."""
+FLAT_LOW, FLAT_HIGH = 0.05, 0.6  # band of the noise density, as shares of the corner frequency
+KNOWN_PARTS: Final = 10  # duration divided by the largest τ with an error of the deviation below about 25 %
+STILL_S: Final = 1.0  # length of the blocks that imud checks for motion, s
+STILL_FACTOR: Final = 4.0  # minimum standard deviation of a disturbed block, as a multiple of the median block
+BLOCKS_MOST: Final = 2000  # maximum number of means for the fit of the drift
+SPAN_LEAST_C: Final = 2.0  # Minimum range of the temperature for a drift, °C. Many devices send whole degrees.
 BLOCKS_LEAST: Final = 8
 
 
@@ -311,32 +281,24 @@ BLOCKS_LEAST: Final = 8
 class Drift:
     """Linear change of one axis with temperature: least-squares fit of block means."""
 
-    slope: float
-    """Slope, unit of the rate per K."""
-    sigma: float
-    """Standard deviation of the slope if the blocks are independent."""
-    r2: float
-    """Share of the variance of the means that the line explains, R²."""
+    slope: float  # slope, unit of the rate per K
+    sigma: float  # standard deviation of the slope if the blocks are independent
+    r2: float  # share of the variance of the means that the line explains, R²
 
 
 @dataclass(frozen=True, slots=True)
 class AxisNoise:
     """Noise of one axis, in the SI unit of the sensor."""
 
-    mean: float
-    """Mean at rest: the bias; for an accelerometer with gravity."""
-    spread: float
-    """Standard deviation of the samples."""
+    mean: float  # mean at rest: the bias; for an accelerometer with gravity
+    spread: float  # standard deviation of the samples
     terms: NoiseTerms
+    # Minimum Allan deviation. Divided by 0.664, it is the bias instability of data sheets, which is at least B.
     least_deviation: float
-    """Minimum Allan deviation. Divided by 0.664, it is the bias instability of data sheets, which is at least B."""
     least_tau_s: float
-    least_at_end: bool
-    """Whether the minimum is at the largest reliable τ: the true minimum is then smaller."""
-    density: float
-    """Root of the one-sided spectral density in its flat band, per √Hz. For white noise it is √2 N."""
-    drift: Drift | None
-    """Drift with temperature; None if the temperature is unknown or nearly constant."""
+    least_at_end: bool  # whether the minimum is at the largest reliable τ: the true minimum is then smaller
+    density: float  # Root of the one-sided spectral density in its flat band, per √Hz. For white noise it is √2 N.
+    drift: Drift | None  # drift with temperature; None if the temperature is unknown or nearly constant
 
     @property
     def bias_instability_most(self) -> float:
@@ -352,18 +314,13 @@ class SensorNoise:
     curve: AllanCurve
     spectrum: Spectrum
     axes: tuple[AxisNoise, AxisNoise, AxisNoise]
-    corner_hz: float | None
-    """Corner frequency of the device's low-pass filter, Hz; None if the noise shows no filter."""
-    tau_least_s: float
-    """Minimum τ of the fit, s."""
-    flat_hz: tuple[float, float]
-    """Band of the noise density, Hz."""
-    disturbed_s: int
-    """Number of seconds with motion, vibration or an outlier."""
-    still_s: int
-    """Number of checked seconds."""
+    corner_hz: float | None  # corner frequency of the device's low-pass filter, Hz; None if the noise shows no filter
+    tau_least_s: float  # minimum τ of the fit, s
+    flat_hz: tuple[float, float]  # band of the noise density, Hz
+    disturbed_s: int  # number of seconds with motion, vibration or an outlier
+    still_s: int  # number of checked seconds
+    # Resolution: minimum difference of two values, if all values are multiples of it. Otherwise None.
     step: float | None
-    """Resolution: minimum difference of two values, if all values are multiples of it. Otherwise None."""
 
 
 def sensor_noise(readings: Readings, values: FloatArray) -> SensorNoise:

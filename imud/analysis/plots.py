@@ -14,16 +14,13 @@ from imud.analysis.series import FloatArray, Grid
 from imud.analysis.spectrum import Band, Peak, Spectrogram, Spectrum
 from imud.contracts.driver import SensorName
 
+# Colours of x, y and z, the same in all pictures of imud
 COLOURS: Final = ("#c0392b", "#2e8b57", "#1f5fa8")
-"""Colours of x, y and z, the same in all pictures of imud."""
-POINTS_PER_DECADE: Final = 60
-"""Number of points of a density per decade. Each point is a mean."""
-PAGE_INCHES: Final = (8.27, 11.69)
-"""Page size A4, inches."""
+POINTS_PER_DECADE: Final = 60  # Number of points of a density per decade. Each point is a mean.
+PAGE_INCHES: Final = (8.27, 11.69)  # page size A4, inches
 PLOT_INCHES: Final = (7.6, 4.4)
 TEXT_POINTS: Final = 7.0
-LINE_PART: Final = 0.0105
-"""Height of a line of text as a share of the page."""
+LINE_PART: Final = 0.0105  # height of a line of text as a share of the page
 DPI: Final = 150
 
 
@@ -123,11 +120,9 @@ def _finish(axes: Axes) -> None:
     axes.legend(fontsize=8, loc="best")
 
 
-RANGE_DB: Final = 80.0
-"""Range of the colours, dB."""
+RANGE_DB: Final = 80.0  # range of the colours, dB
 LABELS_MOST: Final = 6
-SPAN_LEAST: Final = 100.0
-"""Minimum ratio of the largest to the smallest value on the axis of a density."""
+SPAN_LEAST: Final = 100.0  # minimum ratio of the largest to the smallest value on the axis of a density
 SPECTRUM_INCHES: Final = (9.0, 3.6)
 
 
@@ -138,8 +133,7 @@ class SensorVibration:
     grid: Grid
     spectrum: Spectrum
     spectrogram: Spectrogram
-    peaks: tuple[Peak, ...]
-    """Peaks, the strongest first."""
+    peaks: tuple[Peak, ...]  # peaks, the strongest first
     bands: tuple[Band, ...]
 
 

@@ -22,21 +22,17 @@ class ShownUnit(NamedTuple):
     """Unit of the reports."""
 
     name: str
-    factor: float
-    """Value in the unit per SI value."""
+    factor: float  # value in the unit per SI value
 
 
 class Quantity(NamedTuple):
     """Quantity of a sensor's noise."""
 
-    key: str
-    """Name in JSON. For a coefficient, also its name in NoiseTerms."""
+    key: str  # Name in JSON. For a coefficient, also its name in NoiseTerms.
     title: str
     symbol: str
-    si: str
-    """SI unit."""
-    units: tuple[ShownUnit, ...]
-    """Units of the reports, the most usual unit first."""
+    si: str  # SI unit
+    units: tuple[ShownUnit, ...]  # units of the reports, the most usual unit first
 
 
 GYRO: Final = (
@@ -80,11 +76,11 @@ ACCEL: Final = (
 )  # fmt: skip
 QUANTITIES: Final[Mapping[SensorName, tuple[Quantity, ...]]] = {"gyro": GYRO, "accel": ACCEL}
 
+# Units of the Allan deviation in plots
 DEVIATION: Final[Mapping[SensorName, ShownUnit]] = {
     "gyro": ShownUnit("deg/h", DEG_PER_RAD * S_PER_H),
     "accel": ShownUnit("mg", MG_PER_M_S2),
 }
-"""Units of the Allan deviation in plots."""
 DENSITY: Final[Mapping[SensorName, ShownUnit]] = {
     "gyro": ShownUnit("deg/s/√Hz", DEG_PER_RAD),
     "accel": ShownUnit("µg/√Hz", UG_PER_M_S2),

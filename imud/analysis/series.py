@@ -20,31 +20,26 @@ from imud.model.units import NS_PER_S
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-SAMPLES_LEAST: Final = 64
-"""Minimum number of samples for an analysis."""
+SAMPLES_LEAST: Final = 64  # minimum number of samples for an analysis
+# Maximum number of consecutive lost samples that imud interpolates. Longer interpolation changes the noise.
 FILL_MOST: Final = 4
-"""Maximum number of consecutive lost samples that imud interpolates. Longer interpolation changes the noise."""
+# Maximum scatter of the time stamps, in periods, to find single lost samples. With 0.5, the place would be a guess.
 SCATTER_MOST: Final = 0.2
-"""Maximum scatter of the time stamps, in periods, to find single lost samples. With 0.5, the place would be a guess."""
+# Distance of time stamps for the first estimate, periods. Single steps of device time in whole ms are uneven.
 STEP_FOR_PERIOD: Final = 4
-"""Distance of time stamps for the first estimate, periods. Single steps of device time in whole ms are uneven."""
 REFINEMENTS: Final = 4
-PAUSE_S: Final = 1.0
-"""Minimum silence that ends a run if imud cannot find single lost samples, s."""
+PAUSE_S: Final = 1.0  # minimum silence that ends a run if imud cannot find single lost samples, s
 
 
 @dataclass(frozen=True, slots=True)
 class Readings:
     """Samples of one device in the order of arrival."""
 
-    t_ns: IntArray
-    """Time stamps of the measurements (CLOCK_MONOTONIC), increasing, ns, shape (n,)."""
+    t_ns: IntArray  # time stamps of the measurements (CLOCK_MONOTONIC), increasing, ns, shape (n,)
+    # Angular rate, shape (n, 3); NaN if a sample does not contain it, None if no sample contains it
     gyro_rad_s: FloatArray | None
-    """Angular rate, shape (n, 3); NaN if a sample does not contain it, None if no sample contains it."""
-    accel_m_s2: FloatArray | None
-    """Specific force, shape (n, 3); NaN and None as above."""
-    temperature_c: FloatArray | None
-    """Temperature, shape (n,); NaN and None as above."""
+    accel_m_s2: FloatArray | None  # specific force, shape (n, 3); NaN and None as above
+    temperature_c: FloatArray | None  # temperature, shape (n,); NaN and None as above
 
     @property
     def duration_s(self) -> float:
@@ -56,20 +51,14 @@ class Readings:
 class Grid:
     """Places of samples on a time grid with a constant period."""
 
-    rate_hz: float
-    """Rate of the sensor in host time, Hz."""
-    place: IntArray
-    """Index of the period of each sample, increasing from 0, shape (n,)."""
-    scatter_s: float
-    """Standard deviation of the time stamps around the grid, s."""
-    located: bool
-    """Whether the time stamps are good enough to find single lost samples."""
+    rate_hz: float  # rate of the sensor in host time, Hz
+    place: IntArray  # index of the period of each sample, increasing from 0, shape (n,)
+    scatter_s: float  # standard deviation of the time stamps around the grid, s
+    located: bool  # whether the time stamps are good enough to find single lost samples
+    # Index of the first sample and of the last sample plus 1, for each run without a gap longer than FILL_MOST
     runs: tuple[tuple[int, int], ...]
-    """Index of the first sample and of the last sample plus 1, for each run without a gap longer than FILL_MOST."""
-    missing: int
-    """Number of places without a sample."""
-    filled: int
-    """Number of interpolated samples in short gaps."""
+    missing: int  # number of places without a sample
+    filled: int  # number of interpolated samples in short gaps
 
     @property
     def duration_s(self) -> float:

@@ -20,16 +20,14 @@ from imud.analysis.series import FloatArray
 from imud.model.errors import BadArgument
 
 WINDOW: Final = "hann"
-WINDOW_MOST: Final = 1 << 16
-"""Maximum number of samples per window."""
+WINDOW_MOST: Final = 1 << 16  # maximum number of samples per window
 WINDOW_LEAST: Final = 16
 WINDOW_USUAL: Final = 1 << 12
+# Wanted number of averaged windows. The relative standard deviation of a bin is then about 1/4.
 AVERAGES_WANTED: Final = 16
-"""Wanted number of averaged windows. The relative standard deviation of a bin is then about 1/4."""
+# Maximum number of rows of a spectrogram. In a longer series, a row is the mean of several windows.
 ROWS_MOST: Final = 600
-"""Maximum number of rows of a spectrogram. In a longer series, a row is the mean of several windows."""
-PIECE: Final = 256
-"""Number of windows in one transform. It limits the memory."""
+PIECE: Final = 256  # Number of windows in one transform. It limits the memory.
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,19 +35,13 @@ class Spectrum:
     """One-sided power spectral density."""
 
     rate_hz: float
-    frequency_hz: FloatArray
-    """Frequencies from 0 to half of the rate, Hz, shape (k,)."""
-    density: FloatArray
-    """Density, unit² per Hz, shape (k, axes)."""
+    frequency_hz: FloatArray  # frequencies from 0 to half of the rate, Hz, shape (k,)
+    density: FloatArray  # density, unit² per Hz, shape (k, axes)
     window: str
-    size: int
-    """Number of samples per window."""
-    bandwidth_hz: float
-    """Equivalent noise bandwidth of the window, Hz."""
-    averages: int
-    """Number of averaged windows. Windows that overlap by half are nearly independent."""
-    unused: int
-    """Number of samples in runs that are shorter than a window."""
+    size: int  # number of samples per window
+    bandwidth_hz: float  # equivalent noise bandwidth of the window, Hz
+    averages: int  # Number of averaged windows. Windows that overlap by half are nearly independent.
+    unused: int  # number of samples in runs that are shorter than a window
 
     @property
     def bin_hz(self) -> float:
@@ -70,12 +62,9 @@ class Spectrum:
 class Spectrogram:
     """Density over time, sum of all axes."""
 
-    time_s: FloatArray
-    """Middle of each row after the start of the first run, s, shape (r,)."""
-    frequency_hz: FloatArray
-    """Frequencies, Hz, shape (k,)."""
-    density: FloatArray
-    """Density, unit² per Hz, shape (r, k). A row of NaN marks a gap."""
+    time_s: FloatArray  # middle of each row after the start of the first run, s, shape (r,)
+    frequency_hz: FloatArray  # frequencies, Hz, shape (k,)
+    density: FloatArray  # Density, unit² per Hz, shape (r, k). A row of NaN marks a gap.
 
 
 def window_size(runs: Sequence[FloatArray], rate_hz: float, resolution_hz: float | None = None) -> int:
@@ -173,18 +162,12 @@ def spectrogram(runs: Sequence[FloatArray], starts_s: Sequence[float], rate_hz: 
 
 
 PEAKS_MOST: Final = 10
-FLOOR_BINS: Final = 61
-"""Number of bins of the noise floor, the median around a bin."""
-FLOOR_FACTOR: Final = 4.0
-"""Minimum power of a peak divided by the noise floor: 6 dB."""
-FALSE_PEAKS: Final = 0.001
-"""Expected number of false peaks in a spectrum of noise."""
-NEIGHBOURS: Final = 3
-"""Number of lower bins on each side of a peak. The main lobe of the window is four bins wide."""
-FIRST_BIN: Final = 3
-"""Lowest bin of a peak. The removed mean disturbs the lower bins."""
-HARMONIC_BINS: Final = 0.6
-"""Maximum distance of a harmonic from the multiple of the fundamental frequency, bins."""
+FLOOR_BINS: Final = 61  # number of bins of the noise floor, the median around a bin
+FLOOR_FACTOR: Final = 4.0  # minimum power of a peak divided by the noise floor: 6 dB
+FALSE_PEAKS: Final = 0.001  # expected number of false peaks in a spectrum of noise
+NEIGHBOURS: Final = 3  # Number of lower bins on each side of a peak. The main lobe of the window is four bins wide.
+FIRST_BIN: Final = 3  # Lowest bin of a peak. The removed mean disturbs the lower bins.
+HARMONIC_BINS: Final = 0.6  # maximum distance of a harmonic from the multiple of the fundamental frequency, bins
 HARMONICS_MOST: Final = 12
 BAND_RATIO: Final = 2.0
 BANDS_MOST: Final = 24
@@ -195,16 +178,11 @@ class Peak:
     """Peak of a spectrum: a line of vibration."""
 
     frequency_hz: float
-    amplitude: tuple[float, ...]
-    """Amplitude A of A sin(2π f t) for each axis, in the unit of the sensor."""
-    floor_ratio: float
-    """Power of the peak divided by the noise floor."""
-    axis: int
-    """Index of the axis with the largest amplitude."""
-    harmonic_of: int | None
-    """Index of the fundamental peak in the list; None if the peak is not a harmonic."""
-    multiple: int
-    """Frequency divided by the fundamental frequency; 1 if the peak is not a harmonic."""
+    amplitude: tuple[float, ...]  # amplitude A of A sin(2π f t) for each axis, in the unit of the sensor
+    floor_ratio: float  # power of the peak divided by the noise floor
+    axis: int  # index of the axis with the largest amplitude
+    harmonic_of: int | None  # index of the fundamental peak in the list; None if the peak is not a harmonic
+    multiple: int  # frequency divided by the fundamental frequency; 1 if the peak is not a harmonic
 
     @property
     def total(self) -> float:
@@ -218,8 +196,7 @@ class Band:
 
     low_hz: float
     high_hz: float
-    rms: tuple[float, ...]
-    """RMS of each axis, in the unit of the sensor."""
+    rms: tuple[float, ...]  # RMS of each axis, in the unit of the sensor
 
 
 def peaks(spectrum: Spectrum, most: int = PEAKS_MOST) -> list[Peak]:

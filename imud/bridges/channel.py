@@ -20,16 +20,15 @@ from imud.model.units import NS_PER_S
 T_contra = TypeVar("T_contra", contravariant=True)
 T = TypeVar("T")
 
+# Maximum time between two messages of a constant value (temperature), ns. A late reader then gets the value.
 STEADY_NS: Final = 1_000_000_000
-"""Maximum time between two messages of a constant value (temperature), ns. A late reader then gets the value."""
 
 
 class MessageSchema(NamedTuple):
     """Schema of the messages of a channel, for programs that do not know the messages."""
 
     name: str
-    encoding: str
-    """`jsonschema` or `ros2msg`."""
+    encoding: str  # `jsonschema` or `ros2msg`
     data: bytes
 
 
@@ -39,23 +38,18 @@ class MessageChannel(Generic[T]):
 
     topic: str
     schema: MessageSchema
-    message_encoding: str
-    """`json` or `cdr`."""
-    encode: Callable[[T], bytes | None]
-    """Returns a message; None if there is no message for this object."""
-    fields: frozenset[str] = frozenset()
-    """Names of the sample fields in the messages."""
+    message_encoding: str  # `json` or `cdr`
+    encode: Callable[[T], bytes | None]  # returns a message; None if there is no message for this object
+    fields: frozenset[str] = frozenset()  # names of the sample fields in the messages
 
 
 class LossCounts(NamedTuple):
     """Lost samples of a device since the start of the daemon, by the causes of its ledger."""
 
-    t_ns: int
-    """CLOCK_MONOTONIC of the first sample after a loss, ns."""
+    t_ns: int  # CLOCK_MONOTONIC of the first sample after a loss, ns
     utc_ns: int
     device: str
-    samples: int
-    """Number of samples so far."""
+    samples: int  # number of samples so far
     lost_gap_device: int
     lost_crc: int
     lost_overrun: int
@@ -95,10 +89,8 @@ class Diagnosis(NamedTuple):
     device: str
     level: DiagnosisLevel
     message: str
-    hardware: str
-    """Serial number, otherwise product, otherwise empty."""
-    values: Mapping[str, str]
-    """Values by name. The names are the names of the status and end in units."""
+    hardware: str  # serial number, otherwise product, otherwise empty
+    values: Mapping[str, str]  # Values by name. The names are the names of the status and end in units.
 
 
 class Diagnoses(NamedTuple):
@@ -206,14 +198,11 @@ def diagnosis_name(device: str) -> str:
     return f"imud: {device}"
 
 
-PERIOD_NS: Final = NS_PER_S
-"""Time between two diagnoses in a file, ns, as in diagnostic_updater."""
-LOSS_SHOWN_NS: Final = 10 * NS_PER_S
-"""Duration of the warning after a loss, ns."""
+PERIOD_NS: Final = NS_PER_S  # time between two diagnoses in a file, ns, as in diagnostic_updater
+LOSS_SHOWN_NS: Final = 10 * NS_PER_S  # duration of the warning after a loss, ns
+# Time without samples after which a recorded device is stale, s. Viewers also wait 5 s for diagnoses.
 STALE_S: Final = 5
-"""Time without samples after which a recorded device is stale, s. Viewers also wait 5 s for diagnoses."""
-RATE_LEAST: Final = 0.95
-"""Minimum rate as a share of the expected rate. The alert ImudRateLow uses the same limit."""
+RATE_LEAST: Final = 0.95  # Minimum rate as a share of the expected rate. The alert ImudRateLow uses the same limit.
 
 
 LEVEL_OF: Final = {
@@ -314,16 +303,13 @@ class _RecordedDevice:
 
     def __init__(self, name: str) -> None:
         self.name = name
+        # Level and reason after the event DOWN; None while the device is up
         self._gone: tuple[DiagnosisLevel, str] | None = None
-        """Level and reason after the event DOWN; None while the device is up."""
         self._newest: Sample | None = None
-        self._begin: Sample | None = None
-        """Newest sample at the start of the current second."""
-        self._count = 0
-        """Number of samples in the current second."""
+        self._begin: Sample | None = None  # newest sample at the start of the current second
+        self._count = 0  # number of samples in the current second
         self._rate_hz: float | None = None
-        self._idle_s = 0
-        """Number of seconds of the recording without a sample."""
+        self._idle_s = 0  # number of seconds of the recording without a sample
         self._counts = dict.fromkeys(LOST_FIELDS, 0)
         self._warning = _LossWarning()
         self._losing = False

@@ -20,6 +20,7 @@ import msgspec
 from imud.bridges.channel import LossCounts, StampedEvent
 from imud.model.sample import Sample
 
+# Columns of the array fields
 AXES: Final = {
     "accel_m_s2": ("accel_x_m_s2", "accel_y_m_s2", "accel_z_m_s2"),
     "gyro_rad_s": ("gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s"),
@@ -28,11 +29,10 @@ AXES: Final = {
     "euler_rad": ("roll_rad", "pitch_rad", "yaw_rad"),
     "incli_rad": ("incli_x_rad", "incli_y_rad"),
 }
-"""Columns of the array fields."""
+# Fields that are empty for a file without times
 TIMES: Final = frozenset({"t_ns", "t_err_ns", "sync", "t_rx_ns", "utc_ns"})
-"""Fields that are empty for a file without times."""
+# Fields with a real number. A device can send whole degrees as an integer.
 REALS: Final = frozenset({"temperature_c", "pressure_pa"})
-"""Fields with a real number. A device can send whole degrees as an integer."""
 EVENT_COLUMNS: Final = ("utc_ns", "t_ns", "device", "kind", "message", "detail")
 LOSS_COLUMNS: Final = ("utc_ns", "t_ns", "device", *LossCounts._fields[3:])
 
@@ -40,17 +40,16 @@ Cell = str | int | float | None
 Row = Sequence[Cell]
 
 _encode: Final = msgspec.json.Encoder().encode_lines
-_DEVICE: Final = "@"
-"""Placeholder of the device name in encoded rows. No other cell contains this character."""
+_DEVICE: Final = "@"  # Placeholder of the device name in encoded rows. No other cell contains this character.
 _NOTHING: Final = b"null"
+# Literal, pattern and replacement for numbers that msgspec and Python format differently: 0.000025 and 2.5e-05, 3e-7
+# and 3e-07, 1e16 and 1e+16. A fast search for the literal avoids most pattern searches.
 _FORMS: Final = (
     (b"0.0000", re.compile(rb"0\.0000(?<!\d0\.0000)([1-9])(\d+)"), rb"\1.\2e-05"),
     (b"0.0000", re.compile(rb"0\.0000(?<!\d0\.0000)([1-9])"), rb"\1e-05"),
     (b"e-", re.compile(rb"e-(\d)(?!\d)"), rb"e-0\1"),
     (b"e", re.compile(rb"e(?<=\de)(?=\d)"), b"e+"),
 )
-"""Literal, pattern and replacement for numbers that msgspec and Python format differently: 0.000025 and 2.5e-05, 3e-7
-and 3e-07, 1e16 and 1e+16. A fast search for the literal avoids most pattern searches."""
 
 
 def sample_columns(fields: Sequence[str]) -> list[str]:
@@ -102,8 +101,8 @@ class SampleText:
     def __init__(self, fields: Sequence[str], without_times: bool = False) -> None:
         self._row = sample_row(fields, without_times)
         self._columns = [_column(name, without_times and name in TIMES) for name in fields]
+        # Whether a row has one cell. An empty cell then needs quotes, because the row would be an empty line.
         self._is_single = len(sample_columns(fields)) == 1
-        """Whether a row has one cell. An empty cell then needs quotes, because the row would be an empty line."""
 
     def of(self, samples: Sequence[Sample]) -> bytes:
         """Return the rows of samples of one device, at least one."""

@@ -39,8 +39,7 @@ from imud.host.log import printable
 from imud.model.sample import SAMPLE_SCHEMA, Pair, Quaternion, Sample, Sync, Vector3
 from imud.model.units import NS_PER_S
 
-Matrix = tuple[float, ...]
-"""Matrix of 3 × 3 elements, row by row."""
+Matrix = tuple[float, ...]  # matrix of 3 × 3 elements, row by row
 
 
 class Timestamp(msgspec.Struct, frozen=True, gc=False):
@@ -117,8 +116,7 @@ class StampMessage(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
     edge_seq: int | None = None
 
 
-STAMP_FIELDS = StampMessage.__struct_fields__[1:]
-"""Fields of a sample in imud.SampleStamp."""
+STAMP_FIELDS = StampMessage.__struct_fields__[1:]  # fields of a sample in imud.SampleStamp
 
 
 def timestamp(utc_ns: int) -> Timestamp:
@@ -127,8 +125,7 @@ def timestamp(utc_ns: int) -> Timestamp:
 
 LEVEL_INFO: Final = 2
 LEVEL_WARNING: Final = 3
-TEXT_MAX: Final = 4096
-"""Maximum length of a log line, characters."""
+TEXT_MAX: Final = 4096  # maximum length of a log line, characters
 _encode: Final = msgspec.json.Encoder().encode
 _stamp_values: Final = attrgetter(*STAMP_FIELDS)
 
@@ -212,6 +209,7 @@ LOG_SCHEMA: Final = _schema(
     "foxglove.Log", {"level": _INTEGER, "message": _TEXT, "name": _TEXT, "file": _TEXT, "line": _INTEGER}
 )
 
+# Schema of the diagnostics. The diagnostics panels of Foxglove and Lichtblick find topics by its name.
 DIAGNOSTICS_SCHEMA: Final = MessageSchema(
     "diagnostic_msgs/DiagnosticArray",
     "jsonschema",
@@ -232,7 +230,6 @@ DIAGNOSTICS_SCHEMA: Final = MessageSchema(
         )
     ),
 )  # fmt: skip
-"""Schema of the diagnostics. The diagnostics panels of Foxglove and Lichtblick find topics by its name."""
 
 # --- messages ---------------------------------------------------------------------------------------------------------
 

@@ -35,14 +35,13 @@ from mcap.writer import MCAP0_MAGIC
 
 from imud.bridges.channel import ByteWriter, MessageChannel, MessageSchema
 
+# Size of a chunk, bytes, as in the writer of the library. Larger chunks save 2 %, but a reader of one second of a topic
+# must unpack a complete chunk.
 CHUNK_BYTES: Final = 1 << 20
-"""Size of a chunk, bytes, as in the writer of the library. Larger chunks save 2 %, but a reader of one second of a
-topic must unpack a complete chunk."""
-LEVEL: Final = 1
-"""Compression level of Zstandard. Level 3 saves little for noisy numbers and takes twice the time."""
+LEVEL: Final = 1  # Compression level of Zstandard. Level 3 saves little for noisy numbers and takes twice the time.
 TIME_MAX: Final = (1 << 64) - 1
+# Header of a message: opcode, length of the rest, channel, sequence number, log time, publish time
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
-"""Header of a message: opcode, length of the rest, channel, sequence number, log time, publish time."""
 _MESSAGE_REST: Final = _MESSAGE.size - 9
 _SEQUENCE_MASK: Final = 0xFFFF_FFFF
 
@@ -55,10 +54,8 @@ class McapChannel:
     def __init__(self, file: "McapFile", number: int) -> None:
         self._file = file
         self.id = number
-        self.count = 0
-        """Number of messages so far."""
-        self.index: list[int] = []
-        """Time and position of each message in the current chunk."""
+        self.count = 0  # number of messages so far
+        self.index: list[int] = []  # time and position of each message in the current chunk
 
     def add(self, t_ns: int, data: bytes) -> None:
         """Append a message. `t_ns`: ns since 1970; an earlier time becomes 0. Raises OSError."""
@@ -93,8 +90,7 @@ class McapFile:
     def __init__(self, out: ByteWriter, profile: str, library: str, metadata: Mapping[str, str]) -> None:
         """`metadata`: names and values for the complete file. Raises OSError."""
         self._out = out
-        self._at = 0
-        """Number of written bytes."""
+        self._at = 0  # number of written bytes
         self._schemas: dict[MessageSchema, Schema] = {}
         self._channels: list[tuple[Channel, McapChannel]] = []
         self._parts: list[bytes] = []
@@ -102,8 +98,8 @@ class McapFile:
         self._chunks: list[ChunkIndex] = []
         self._compressor = zstandard.ZstdCompressor(level=LEVEL)
         self._thread = ThreadPoolExecutor(1, "compress")
+        # Chunk that the thread compresses: result, size, CRC, and the message indexes by channel
         self._waiting: tuple[Future[bytes], int, int, dict[int, list[int]]] | None = None
-        """Chunk that the thread compresses: result, size, CRC, and the message indexes by channel."""
         self._start_ns, self._end_ns = TIME_MAX, 0
         self._write(MCAP0_MAGIC)
         self._record(Header(profile, library))

@@ -37,10 +37,9 @@ from imud.formats.slot import SYNC_CODES
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_S
 
-ENCAPSULATION: Final = b"\x00\x01\x00\x00"
-"""Encapsulation header: CDR_LE, no options."""
+ENCAPSULATION: Final = b"\x00\x01\x00\x00"  # encapsulation header: CDR_LE, no options
+# Size and alignment by the code of `struct`, bytes. `s` is for encoded bytes.
 SIZES: Final = {"B": 1, "b": 1, "?": 1, "s": 1, "H": 2, "h": 2, "I": 4, "i": 4, "f": 4, "Q": 8, "q": 8, "d": 8}
-"""Size and alignment by the code of `struct`, bytes. `s` is for encoded bytes."""
 _NUMBERS: Final = re.compile(r"(\d*)([a-zA-Z?])")
 
 
@@ -60,10 +59,9 @@ class Layout:
                 for count, code in _NUMBERS.findall(part):
                     self._align(SIZES[code])
                     self._add(int(count or 1), code)
-        self.texts: Final = tuple(texts)
-        """Encoded constant strings, arguments of `pack`."""
+        self.texts: Final = tuple(texts)  # encoded constant strings, arguments of `pack`
+        # Encodes a message. Arguments: ENCAPSULATION, then the numbers and `texts` in the order of the parts.
         self.pack: Final = struct.Struct(self._format).pack
-        """Encodes a message. Arguments: ENCAPSULATION, then the numbers and `texts` in the order of the parts."""
 
     def _add(self, count: int, code: str) -> None:
         self._format += f"{count}{code}"
@@ -109,6 +107,7 @@ def _text(value: str) -> bytes:
 
 SEPARATOR: Final = "=" * 80
 
+# Fields of each type, as in its `.msg` file
 FIELDS: Final = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
     "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
@@ -162,9 +161,8 @@ FIELDS: Final = {
         "uint64 lost_queue\nuint64 lost_unknown"
     ),
 }
-"""Fields of each type, as in its `.msg` file."""
+# Integer of imud_msgs/SampleStamp for a value that the sample does not contain. For real numbers it is NaN.
 NONE: Final = -1
-"""Integer of imud_msgs/SampleStamp for a value that the sample does not contain. For real numbers it is NaN."""
 
 
 def schema(name: str) -> MessageSchema:
@@ -187,8 +185,7 @@ def _parts_of(name: str) -> list[str]:
 
 LEVEL_INFO: Final = 20
 LEVEL_WARN: Final = 30
-SEC_MAX: Final = 0x7FFF_FFFF
-"""Maximum `sec` of `builtin_interfaces/Time`, in the year 2038."""
+SEC_MAX: Final = 0x7FFF_FFFF  # maximum `sec` of `builtin_interfaces/Time`, in the year 2038
 _MATRIX: Final = Struct("<9d")
 _NO_VECTOR: Final = (0.0, 0.0, 0.0)
 _NO_ROTATION: Final = (1.0, 0.0, 0.0, 0.0)

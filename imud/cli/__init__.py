@@ -20,11 +20,10 @@ if TYPE_CHECKING:
 class Subcommand(NamedTuple):
     """A row of the table of commands."""
 
-    target: str
-    """`module:NAME` of the `CliCommand`."""
+    target: str  # `module:NAME` of the `CliCommand`
     help: str
+    # Extra of the package with the libraries that the module imports; empty if the module needs no extra
     extra: str = ""
-    """Extra of the package with the libraries that the module imports; empty if the module needs no extra."""
 
     def load(self) -> "CliCommand":
         """Import the module of the command and return the command. Raises BadArgument if the extra is missing."""

@@ -17,8 +17,8 @@ from imud.model.errors import BadArgument, ImudError, reason_of
 from imud.model.options import Options, unknown_name, value_problem, wrong_values
 from imud.model.sample import SAMPLE_FIELDS
 
+# Maximum size of a noise report, bytes. A report contains every point of its curves and has a few MB.
 FILE_BYTES_MAX: Final = 64 << 20
-"""Maximum size of a noise report, bytes. A report contains every point of its curves and has a few MB."""
 
 
 class _Spread(msgspec.Struct):
@@ -79,10 +79,8 @@ DURATION: Final = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)")
 class CliCommand(NamedTuple):
     """One command of the command line."""
 
-    add_arguments: Callable[[argparse.ArgumentParser], None]
-    """Adds the arguments of the command to a parser."""
-    run: Callable[[argparse.Namespace], int]
-    """Runs the command and returns the exit status. Raises ImudError."""
+    add_arguments: Callable[[argparse.ArgumentParser], None]  # adds the arguments of the command to a parser
+    run: Callable[[argparse.Namespace], int]  # Runs the command and returns the exit status. Raises ImudError.
 
 
 # --- the running daemon ---------------------------------------------------------------------------------------------

@@ -18,22 +18,19 @@ from imud.model.errors import ImudError
 from imud.model.sample import Sync
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
-KEPT: Final = 2000
-"""Number of newest samples in the histogram of a device."""
+KEPT: Final = 2000  # number of newest samples in the histogram of a device
 REFRESH_S: Final = 1.0
 CLEAR: Final = "\x1b[H\x1b[2J"
-ENOUGH: Final = 20
-"""Minimum number of arrivals for a verdict about their spread."""
+ENOUGH: Final = 20  # minimum number of arrivals for a verdict about their spread
+# Minimum spread of the arrivals, as a share of the latency timer, that the latency timer explains
 HELD_SHARE: Final = 0.5
-"""Minimum spread of the arrivals, as a share of the latency timer, that the latency timer explains."""
 TOO_FEW: Final = "too few samples for a verdict"
+# Maximum spread of the arrivals on an idle host, ns. The usual spread is some ten microseconds.
 LOADED_NS: Final = NS_PER_MS
-"""Maximum spread of the arrivals on an idle host, ns. The usual spread is some ten microseconds."""
-EDGES_ENOUGH: Final = 100
-"""Minimum number of edges for a verdict. imud cannot assign the first edges to samples."""
+EDGES_ENOUGH: Final = 100  # Minimum number of edges for a verdict. imud cannot assign the first edges to samples.
+# Maximum share of edges without a sample. Noise and lost samples cause a smaller share. A wrong wire causes 0.5 or
+# more.
 UNPAIRED_SHARE: Final = 0.1
-"""Maximum share of edges without a sample. Noise and lost samples cause a smaller share. A wrong wire causes 0.5 or
-more."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

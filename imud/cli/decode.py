@@ -26,8 +26,7 @@ from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement
 
-FIFO_WAIT_MS = 5000
-"""Time limit for the first bytes of a FIFO, ms."""
+FIFO_WAIT_MS = 5000  # time limit for the first bytes of a FIFO, ms
 NOT_SHOWN = {"trailing_bytes", "dev_ticks"}
 
 
@@ -117,8 +116,8 @@ class UnwrappedTime:
     def __init__(self, driver: Driver) -> None:
         self._driver = driver
         self._tick = 1 if driver.tick_ns == SAMPLE_COUNTER else driver.tick_ns
+        # Field name of the unwrapped counter: `t_dev_ns` for device time, `index` for a sample counter
         self.key = "index" if driver.tick_ns == SAMPLE_COUNTER else "t_dev_ns"
-        """Field name of the unwrapped counter: `t_dev_ns` for device time, `index` for a sample counter."""
         self._last: int | None = None
         self._turns = 0
 

@@ -34,8 +34,7 @@ from imud.sim.control import DEVICE, simulated
 from imud.sim.ports.can_port import default_interface
 
 DRAW_NS = NS_PER_S // 10
-LATENCIES_KEPT = 100_000
-"""Number of newest latencies in the percentiles."""
+LATENCIES_KEPT = 100_000  # number of newest latencies in the percentiles
 CLEAR_LINE = "\x1b[2K"
 UP = "\x1b[{}A"
 
@@ -52,8 +51,7 @@ class View:
         self._due_ns = 0
         self._first_ns = 0
         self._last: Sample | None = None
-        self._seqs: dict[str, int] = {}
-        """Sequence number of the newest sample of each device."""
+        self._seqs: dict[str, int] = {}  # sequence number of the newest sample of each device
         self._latencies_ns: deque[int] = deque(maxlen=LATENCIES_KEPT)
 
     def add(self, sample: Sample) -> None:
@@ -115,15 +113,13 @@ def _in(vector: tuple[float, float, float] | None, unit: float) -> str:
     return " ".join(f"{value / unit:9.3f}" for value in vector) if vector else "        -"
 
 
-Devices = dict[str, dict[str, object]]
-"""Configuration of each device, by name."""
+Devices = dict[str, dict[str, object]]  # configuration of each device, by name
 
 METRICS_ADDRESS = "127.0.0.1"
 METRICS_PORT = 9321
 START_LIMIT_S = 10.0
 STOP_LIMIT_S = 5.0
-FOUND_LIMIT_S = 10.0
-"""Time limit of the detection, s. Detection takes less than 2 s on an idle host."""
+FOUND_LIMIT_S = 10.0  # Time limit of the detection, s. Detection takes less than 2 s on an idle host.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

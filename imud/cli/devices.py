@@ -11,8 +11,7 @@ from imud.client.connection import Client
 from imud.contracts.command import ActionInfo
 
 HEAD: Final = ("DEVICE", "STATE", "RATE HZ", "DRIVER", "PRODUCT", "SERIAL NUMBER", "LINK")
-LIMIT_S: Final = 180.0
-"""Time limit of an action, s. The longest action, a calibration, ends within two minutes."""
+LIMIT_S: Final = 180.0  # Time limit of an action, s. The longest action, a calibration, ends within two minutes.
 
 
 def devices_arguments(parser: argparse.ArgumentParser) -> None:

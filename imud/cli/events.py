@@ -24,10 +24,8 @@ from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
 from imud.model.errors import LinkMissing, ServerError
 from imud.model.event import LEVELS, Event
 
-RETRY_S: Final = 1.0
-"""Time between two attempts to connect, s. A restart of the service takes about 2 s."""
-LOOK_S: Final = 2.0
-"""Time between two checks of the device states, and maximum wait for the next sample or event, s."""
+RETRY_S: Final = 1.0  # Time between two attempts to connect, s. A restart of the service takes about 2 s.
+LOOK_S: Final = 2.0  # time between two checks of the device states, and maximum wait for the next sample or event, s
 
 
 def keep_connected(
@@ -111,22 +109,18 @@ def _why_silent(device: Mapping[str, Any]) -> str:
     return "" if state == DeviceState.RUNNING else f"{state}: {problem}" if problem else str(state)
 
 
+# Log levels by the name of the priority, the highest priority first
 PRIORITIES: Final = {"warning": logging.WARNING, "info": logging.INFO, "debug": logging.DEBUG}
-"""Log levels by the name of the priority, the highest priority first."""
-DAEMON: Final = "imud"
-"""Printed device name for events of the daemon itself."""
+DAEMON: Final = "imud"  # printed device name for events of the daemon itself
 
 
 class PrintedEvent(msgspec.Struct, frozen=True, omit_defaults=True):
     """Output of `--json`: an event as the socket sends it, with local time and priority."""
 
-    time: str
-    """Local time with the offset from UTC, ISO 8601."""
+    time: str  # local time with the offset from UTC, ISO 8601
     priority: str
-    t_ns: int
-    """CLOCK_MONOTONIC when the daemon noticed the event, ns."""
-    device: str
-    """Empty for events of the daemon itself."""
+    t_ns: int  # CLOCK_MONOTONIC when the daemon noticed the event, ns
+    device: str  # empty for events of the daemon itself
     kind: str
     message: str
     detail: dict[str, str | int | float | bool | None] = {}

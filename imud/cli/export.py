@@ -44,8 +44,7 @@ from imud.host.log import STDERR, log_to
 from imud.model.errors import BadArgument, ImudError, reason_of
 from imud.recording.capture_player import NAME, KnownTimes
 
-MODE: Final = 0o666
-"""Mode of a new file before the umask."""
+MODE: Final = 0o666  # mode of a new file before the umask
 
 
 class ExportFile:
@@ -59,8 +58,8 @@ class ExportFile:
         """`path`: None for standard output. Raises BadArgument if the file exists, or for binary data to a terminal."""
         self.written_bytes = 0
         self.name = "standard output" if path is None else str(path)
+        # Final path of the file; None if imud writes directly: to standard output, a FIFO or a device node
         self._path: Path | None = None
-        """Final path of the file; None if imud writes directly: to standard output, a FIFO or a device node."""
         self._part: Path | None = None
         self._file = self._open(path, source, force, binary)
 

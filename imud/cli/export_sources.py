@@ -53,8 +53,7 @@ from imud.recording.player import PlayedDevice, Player, RecordedEvent
 if TYPE_CHECKING:  # imports libraries of the extra `export`, which CSV does not need
     from imud.bridges.mcap import McapChannel, McapFile
 
-CSV_BYTES: Final = 1 << 16
-"""Size of the text buffer, bytes."""
+CSV_BYTES: Final = 1 << 16  # size of the text buffer, bytes
 TABLES: Final = ("samples", "events", "losses")
 
 
@@ -115,22 +114,19 @@ class CsvSink:
     def close(self) -> None: ...
 
 
+# Header of a message in the pipe: kind, length in bytes, read position in the file in bytes
 HEAD: Final = struct.Struct("<BIQ")
-"""Header of a message in the pipe: kind, length in bytes, read position in the file in bytes."""
-LENGTH_MAX: Final = 1 << 26
-"""Maximum length of a message, bytes. Valid messages are much shorter."""
+LENGTH_MAX: Final = 1 << 26  # Maximum length of a message, bytes. Valid messages are much shorter.
+# Requested size of the pipe, bytes. The player continues while the writer compresses a chunk.
 PIPE_BYTES: Final = 1 << 20
-"""Requested size of the pipe, bytes. The player continues while the writer compresses a chunk."""
+# Maximum number of samples in a message: 0.16 s at 400 Hz, so that devices stay nearly in the order of time
 SAMPLES: Final = 64
-"""Maximum number of samples in a message: 0.16 s at 400 Hz, so that devices stay nearly in the order of time."""
+# Number of allocated objects between two garbage collections. The player creates almost no reference cycles.
 GC_ALLOCATIONS: Final = 50_000
-"""Number of allocated objects between two garbage collections. The player creates almost no reference cycles."""
 DEVICE, BATCH, LOSSES, EVENT, END, ERROR = range(1, 7)
-_LOST: Final = attrgetter("samples", *LossCounts._fields[4:])
-"""Counters of a ledger in the order of `LossCounts`."""
+_LOST: Final = attrgetter("samples", *LossCounts._fields[4:])  # counters of a ledger in the order of `LossCounts`
 
-Played = tuple[str, int, list[str]]
-"""Report as text, exit status, names of the devices."""
+Played = tuple[str, int, list[str]]  # report as text, exit status, names of the devices
 
 
 class LossWatch:
@@ -272,12 +268,9 @@ def main(path: str, devices: Sequence[str]) -> None:
             sink.end(ERROR, str(error))
 
 
-EVERY_S: Final = 0.2
-"""Time between two updates of the progress bar, s."""
-LOOK_SAMPLES: Final = 2000
-"""Number of samples between two reads of the clock, about 20 ms."""
-BAR: Final = 24
-"""Length of the progress bar, characters."""
+EVERY_S: Final = 0.2  # time between two updates of the progress bar, s
+LOOK_SAMPLES: Final = 2000  # number of samples between two reads of the clock, about 20 ms
+BAR: Final = 24  # length of the progress bar, characters
 CLEAR: Final = "\r\x1b[K"
 
 
@@ -292,8 +285,7 @@ class Progress:
         self._now_s = now_s
         self._begun_s = self._due_s = now_s()
         self._looked = 0
-        self.samples = 0
-        """Number of samples so far."""
+        self.samples = 0  # number of samples so far
 
     @property
     def spent_s(self) -> float:
@@ -328,19 +320,16 @@ class Progress:
         self._out.flush()
 
 
-NOISE: Final = "noise"
-"""Key of the noise in the recorded configuration of a device."""
+NOISE: Final = "noise"  # key of the noise in the recorded configuration of a device
+# Minimum size of a recording for a second process, bytes. The start of a process takes as long as 20,000 samples.
 BESIDE_BYTES: Final = 1_000_000
-"""Minimum size of a recording for a second process, bytes. The start of a process takes as long as 20,000 samples."""
 
 
 class Exported(NamedTuple):
     """Result of an export."""
 
-    report: str
-    """Report about the devices and the file, as text."""
-    status: int
-    """0 if the file is complete and its samples are equal to the live run, otherwise 1."""
+    report: str  # report about the devices and the file, as text
+    status: int  # 0 if the file is complete and its samples are equal to the live run, otherwise 1
 
 
 class ExportFeed:
@@ -353,8 +342,7 @@ class ExportFeed:
         self._read_bytes: int | None = None
         self._progress = progress
         self._convention = convention
-        self.samples_taken = 0
-        """Number of exported samples."""
+        self.samples_taken = 0  # number of exported samples
 
     def at(self, read_bytes: int) -> None:
         """Set the read position of the file, if another process reads the file."""
@@ -468,8 +456,7 @@ class McapSink:
         self._events: tuple[MessageChannel[StampedEvent], McapChannel] | None = None
         self._diagnosis = RecordedDiagnosis()
         self._diagnostics: tuple[MessageChannel[Diagnoses], McapChannel] | None = None
-        self._shared: dict[str, McapChannel] = {}
-        """Channels by topic. All devices share the channel of transforms."""
+        self._shared: dict[str, McapChannel] = {}  # Channels by topic. All devices share the channel of transforms.
 
     def samples(self, batch: Batch) -> None:
         channels = self._devices.get(batch.device)

@@ -35,8 +35,7 @@ TOP_HEAD: Final = (
     "UTC ms",
 )
 NOT_SET: Final = "not set"
-RATE_NS: Final = 5 * NS_PER_S
-"""Time over which imud measures rates, ns."""
+RATE_NS: Final = 5 * NS_PER_S  # time over which imud measures rates, ns
 
 
 class FleetOverview:
@@ -48,12 +47,11 @@ class FleetOverview:
         """`now_ns`: CLOCK_MONOTONIC; `utc_ns`: CLOCK_REALTIME."""
         self._fleet = fleet
         self._now_ns, self._utc_ns = now_ns, utc_ns
+        # Arrival time and number of received samples, by gateway and stream
         self._counts: dict[tuple[str, Stream], deque[tuple[int, int]]] = {}
-        """Arrival time and number of received samples, by gateway and stream."""
         self._newest_ns: dict[str, int] = {}
         self._error_ns: dict[str, int] = {}
-        self._clocks: dict[str, GatewayClock] = {}
-        """State of the wall clock of each gateway, from its newest message."""
+        self._clocks: dict[str, GatewayClock] = {}  # state of the wall clock of each gateway, from its newest message
 
     def add(self, batch: FleetBatch) -> None:
         """Process a received batch."""

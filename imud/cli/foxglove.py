@@ -15,13 +15,10 @@ from imud.model.errors import BadArgument
 from imud.web.guard import is_loopback
 
 ADDRESS: Final = "127.0.0.1"
-PORT: Final = 8765
-"""Default port of Foxglove WebSocket servers."""
-RATE_HZ: Final = 100.0
-"""Default maximum rate per device, Hz. A viewer draws 60 pictures per second."""
+PORT: Final = 8765  # default port of Foxglove WebSocket servers
+RATE_HZ: Final = 100.0  # Default maximum rate per device, Hz. A viewer draws 60 pictures per second.
 DIALECTS: Final[dict[str, Callable[[], Dialect]]] = {"ros2": Ros2Dialect, "json": JsonDialect}
-SCHEMA: Final = "ros2"
-"""Default schema. PlotJuggler ignores all channels except CDR with a definition of ROS 2 or IDL."""
+SCHEMA: Final = "ros2"  # Default schema. PlotJuggler ignores all channels except CDR with a definition of ROS 2 or IDL.
 OPEN: Final = (
     "WARNING: {address} is not a loopback address: every user who can reach port {port} can read all samples, events "
     "and device states; the server uses no password and no encryption"

@@ -36,8 +36,7 @@ from imud.model.errors import BadArgument, CommandError, DeviceRefused, Transfer
 T = TypeVar("T")
 
 TRIES: Final = 3
-SETTLE_S: Final = 0.3
-"""Time for devices to apply new addresses, s. The manual does not specify this time."""
+SETTLE_S: Final = 0.3  # Time for devices to apply new addresses, s. The manual does not specify this time.
 
 
 class FoundModule(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -48,8 +47,7 @@ class FoundModule(msgspec.Struct, frozen=True, omit_defaults=True):
     product: str = ""
     serial_number: str = ""
     firmware: str = ""
-    problem: str = ""
-    """Fault at this address; the other fields are then empty."""
+    problem: str = ""  # fault at this address; the other fields are then empty
 
 
 @contextmanager

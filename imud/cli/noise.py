@@ -52,11 +52,10 @@ from imud.model.units import NS_PER_S
 TITLE_WIDTH: Final = 23
 UNIT_WIDTH: Final = 10
 CELL_WIDTH: Final = 15
-DISTURBED_SHARE: Final = 0.01
-"""Maximum share of disturbed seconds in a measurement at rest."""
+DISTURBED_SHARE: Final = 0.01  # maximum share of disturbed seconds in a measurement at rest
+# Maximum ratio of a measured value to the value of the data sheet for the verdict "within". The error of a measured
+# value is some per cent.
 WITHIN: Final = 1.1
-"""Maximum ratio of a measured value to the value of the data sheet for the verdict "within". The error of a measured
-value is some per cent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +64,7 @@ class NoiseReport:
 
     taken: SampleSet
     sensors: dict[SensorName, SensorNoise]
-    sheet: ModelFigures | None
-    """Values of a data sheet for the comparison; None for no comparison."""
+    sheet: ModelFigures | None  # values of a data sheet for the comparison; None for no comparison
 
 
 def noise_report(taken: SampleSet, sheet: ModelFigures | None) -> NoiseReport:
@@ -208,10 +206,9 @@ class Comparison:
     """Comparison of one measured value with the value of a data sheet."""
 
     quantity: Quantity
-    stated: float
-    """Value of the data sheet, SI."""
+    stated: float  # value of the data sheet, SI
+    # Measured value or upper bound of the worst axis, SI. None if the series is too short for a verdict.
     measured: float | None
-    """Measured value or upper bound of the worst axis, SI. None if the series is too short for a verdict."""
     ratio: float | None
 
     @property
@@ -387,8 +384,8 @@ def _axis_object(name: SensorName, axis: AxisNoise) -> dict[str, Any]:
 
 
 KINDS: Final = (".html", ".svg", ".png")
+# Options of matplotlib: the same input produces the same file, and SVG text stays text
 REPEATABLE: Final[Any] = {"svg.hashsalt": "imud", "svg.fonttype": "none", "font.family": "DejaVu Sans"}
-"""Options of matplotlib: the same input produces the same file, and SVG text stays text."""
 STYLE: Final = """
 body { font: 15px/1.45 'DejaVu Sans', Verdana, sans-serif; color: #222; max-width: 60em; margin: 2em auto;
        padding: 0 1em; }
@@ -519,15 +516,13 @@ def _compared(report: NoiseReport, name: SensorName) -> Iterator[str]:
     yield "</table>"
 
 
-SHEET_BYTES_MOST: Final = 65_536
-"""Maximum size of a file with data sheet values, bytes."""
+SHEET_BYTES_MOST: Final = 65_536  # maximum size of a file with data sheet values, bytes
 
 
 class GyroSheet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Data sheet values of a gyroscope."""
 
-    random_walk_deg_sqrt_h: Figure = None
-    """Angle random walk."""
+    random_walk_deg_sqrt_h: Figure = None  # angle random walk
     noise_density_deg_s_sqrt_hz: Figure = None
     bias_instability_deg_h: Figure = None
     rate_random_walk_deg_h_sqrt_h: Figure = None
@@ -547,8 +542,7 @@ class GyroSheet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class AccelSheet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Data sheet values of an accelerometer."""
 
-    random_walk_m_s_sqrt_h: Figure = None
-    """Velocity random walk."""
+    random_walk_m_s_sqrt_h: Figure = None  # velocity random walk
     noise_density_ug_sqrt_hz: Figure = None
     bias_instability_mg: Figure = None
     rate_random_walk_mg_sqrt_h: Figure = None
@@ -568,8 +562,7 @@ class AccelSheet(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class SheetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Content of a file with data sheet values."""
 
-    source: str = ""
-    """Document, revision and page, for the report."""
+    source: str = ""  # document, revision and page, for the report
     gyro: GyroSheet = GyroSheet()
     accel: AccelSheet = AccelSheet()
 

@@ -15,18 +15,13 @@ from typing import Final, TextIO
 from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
 from imud.model.units import NS_PER_US
 
-COLUMNS: Final = 80
-"""Maximum width of texts, characters."""
-WIDTH: Final = 40
-"""Length of the longest bar of a histogram, characters."""
-BARS: Final = 12
-"""Maximum number of bars of a histogram."""
+COLUMNS: Final = 80  # maximum width of texts, characters
+WIDTH: Final = 40  # length of the longest bar of a histogram, characters
+BARS: Final = 12  # maximum number of bars of a histogram
 EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
-NO_VALUE: Final = ("", "-")
-"""Cells without a value in a column of numbers."""
+NO_VALUE: Final = ("", "-")  # cells without a value in a column of numbers
 STEPS: Final = (1, 2, 5, 10, 20)
-TAIL: Final = 0.005
-"""Share of outliers on each side of a histogram. The outermost bars count the outliers."""
+TAIL: Final = 0.005  # Share of outliers on each side of a histogram. The outermost bars count the outliers.
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -117,8 +112,7 @@ def times(count: int) -> str:
 
 
 STANDARD_STREAMS: Final = 3
-ERROR_WAIT_MS: Final = 1000
-"""Maximum wait for the reader of standard error, ms."""
+ERROR_WAIT_MS: Final = 1000  # maximum wait for the reader of standard error, ms
 
 
 def open_standard_streams() -> None:

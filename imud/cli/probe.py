@@ -39,13 +39,10 @@ class ProbeReport(msgspec.Struct, frozen=True, omit_defaults=True):
     """Result for one port, or for one device of a bus."""
 
     port: str
-    title: str = ""
-    """Product name of the adapter, or the state of the CAN bus."""
+    title: str = ""  # product name of the adapter, or the state of the CAN bus
     driver: str = ""
-    device: str = ""
-    """Address on a bus, for example `node 8`."""
-    baud: int = 0
-    """Baud rate of the port, or bit rate of the bus, bit/s."""
+    device: str = ""  # address on a bus, for example `node 8`
+    baud: int = 0  # baud rate of the port, or bit rate of the bus, bit/s
     identity: dict[str, str] = {}  # msgspec copies a mutable default
     problem: str = ""
 

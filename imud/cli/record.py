@@ -51,16 +51,14 @@ class DeviceContents:
     where: str = ""
     driver: str = ""
     identity: dict[str, str] = field(default_factory=dict)
-    reads: int = 0
-    """Number of data records: one read of a port, or one group of frames or transfers."""
+    reads: int = 0  # number of data records: one read of a port, or one group of frames or transfers
     input_bytes: int = 0
     edges: int = 0
     events: int = 0
+    # First and last check of each interval without a restart of sequence numbers and ledger. A device that the user
+    # removed and added again restarts both.
     spans: list[tuple[CheckRecord, CheckRecord]] = field(default_factory=list)
-    """First and last check of each interval without a restart of sequence numbers and ledger. A device that the user
-    removed and added again restarts both."""
-    begins_anew: bool = False
-    """Whether the next check starts a new span."""
+    begins_anew: bool = False  # whether the next check starts a new span
 
     def check(self, found: CheckRecord) -> None:
         """Add a check record of the live run."""
@@ -100,8 +98,7 @@ class Contents:
         self.session: SessionRecord | None = None
         self.end: EndRecord | None = None
         self.devices: dict[int, DeviceContents] = {}
-        self.dropped = 0
-        """Number of records that the recorder dropped."""
+        self.dropped = 0  # number of records that the recorder dropped
         self.newest_ns = 0
 
     def add(self, record: Record) -> None:
@@ -230,11 +227,9 @@ def page(report: dict[str, Any]) -> str:
 
 INFO = CliCommand(add_info_arguments, run_info)
 
-LOOK_S: Final = 0.2
-"""Time between two checks for Ctrl-C, the end of `--for` and the progress line, s."""
+LOOK_S: Final = 0.2  # time between two checks for Ctrl-C, the end of `--for` and the progress line, s
 PROGRESS_S: Final = 1.0
-GIVE_UP_S: Final = 10.0
-"""Maximum silence of the daemon after the request to stop the recording, s."""
+GIVE_UP_S: Final = 10.0  # maximum silence of the daemon after the request to stop the recording, s
 CHUNK_BYTES: Final = 1 << 16
 CLEAR_LINE: Final = "\r\x1b[2K"
 
@@ -327,10 +322,8 @@ class Copy:
 
     def __init__(self, stream: BinaryIO, out: BinaryIO, name: str) -> None:
         self.bytes = 0
-        self.stopped = False
-        """Whether this command requested the end of the recording."""
-        self.look: Callable[[], None] = lambda: None
-        """Callback that `read` calls at least once per LOOK_S."""
+        self.stopped = False  # whether this command requested the end of the recording
+        self.look: Callable[[], None] = lambda: None  # callback that `read` calls at least once per LOOK_S
         self._stream = stream
         self._out = out
         self._name = name

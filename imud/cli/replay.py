@@ -32,8 +32,8 @@ from imud.model.units import NS_PER_MS
 from imud.recording.player import PlayedDevice, Player
 
 DIFFERENCES_SHOWN = 3
+# Size of the searched part of a file with a damaged start. A block of a recording has about 256 KiB.
 LOOKED_AT_BYTES: Final = 1 << 20
-"""Size of the searched part of a file with a damaged start. A block of a recording has about 256 KiB."""
 
 
 def looks_like_recording(path: str) -> bool:
@@ -135,8 +135,7 @@ class Printer:
 
     def __init__(self, stop: Callable[[], None]) -> None:
         """`stop` is called after the first failed write."""
-        self.problem: OSError | None = None
-        """Error of the first failed write; None if no write failed."""
+        self.problem: OSError | None = None  # error of the first failed write; None if no write failed
         self._stop = stop
 
     # no state per device, no timer: most methods of a publisher do nothing

@@ -25,12 +25,11 @@ from imud.model.options import unknown_name
 
 log = logging.getLogger(__name__)
 
-EXIT_INTERNAL: Final = 1
-"""Exit status after an internal error. The log contains the error."""
+EXIT_INTERNAL: Final = 1  # Exit status after an internal error. The log contains the error.
+# Exit status if a required output cannot start, for example because another imud uses the socket (EX_TEMPFAIL)
 EXIT_OUTPUT: Final = 75
-"""Exit status if a required output cannot start, for example because another imud uses the socket (EX_TEMPFAIL)."""
+# Exit status for an invalid configuration. A restart does not help (EX_CONFIG, sysexits.h).
 EXIT_CONFIGURATION: Final = 78
-"""Exit status for an invalid configuration. A restart does not help (EX_CONFIG, sysexits.h)."""
 DEFAULT_FILE = Path("/etc/imud.yaml")
 
 

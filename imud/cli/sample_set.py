@@ -34,14 +34,12 @@ from imud.model.sample import Sample
 from imud.model.units import NS_PER_S
 from imud.recording.player import PlayedDevice, Player
 
+# Maximum number of samples: 14 hours at 400 Hz. They use 1.3 GB, and the analysis uses the same amount again.
 SAMPLES_MOST: Final = 20_000_000
-"""Maximum number of samples: 14 hours at 400 Hz. They use 1.3 GB, and the analysis uses the same amount again."""
-SILENCE_S: Final = 5.0
-"""Time without a sample after which imud reports a silent device, s."""
+SILENCE_S: Final = 5.0  # time without a sample after which imud reports a silent device, s
+# Accepted latency of live samples, ms. The daemon then sends batches, which cost less CPU time.
 LATENCY_MS: Final = 200.0
-"""Accepted latency of live samples, ms. The daemon then sends batches, which cost less CPU time."""
-NOTE_S: Final = 1.0
-"""Time between two progress updates, s."""
+NOTE_S: Final = 1.0  # time between two progress updates, s
 _NONE3: Final = (nan, nan, nan)
 
 
@@ -49,22 +47,17 @@ _NONE3: Final = (nan, nan, nan)
 class SampleSet:
     """Samples of one device and their source."""
 
-    source: str
-    """Name of the file, or the socket of the daemon."""
+    source: str  # name of the file, or the socket of the daemon
     device: str = ""
     driver: str = ""
     link: str = ""
     identity: Mapping[str, str] = field(default_factory=dict)
     settings: Mapping[str, str] = field(default_factory=dict)
-    begun_utc_ns: int | None = None
-    """UTC of the first sample, ns; None if the capture contains no times."""
+    begun_utc_ns: int | None = None  # UTC of the first sample, ns; None if the capture contains no times
     readings: Readings | None = None
-    lost: dict[str, int] = field(default_factory=dict)
-    """Number of lost samples by cause, without causes of 0 samples."""
-    stamps: str = ""
-    """Sources and errors of the time stamps, as text."""
-    notes: list[str] = field(default_factory=list)
-    """Additional notes for the report."""
+    lost: dict[str, int] = field(default_factory=dict)  # number of lost samples by cause, without causes of 0 samples
+    stamps: str = ""  # sources and errors of the time stamps, as text
+    notes: list[str] = field(default_factory=list)  # additional notes for the report
 
     @property
     def sheet(self) -> DataSheet:
@@ -79,19 +72,15 @@ class Collector:
     """
 
     def __init__(self, name: str = "", *, skip_s: float = 0.0, for_s: float | None = None) -> None:
-        self.name = name
-        """Name of the device; empty for the first device that sends a sample."""
-        self.others: set[str] = set()
-        """Names of ignored devices if the user did not choose a device."""
-        self.done = False
-        """Whether the collector received samples after the end of the requested time."""
+        self.name = name  # name of the device; empty for the first device that sends a sample
+        self.others: set[str] = set()  # names of ignored devices if the user did not choose a device
+        self.done = False  # whether the collector received samples after the end of the requested time
         self.first: Sample | None = None
         self.newest: Sample | None = None
         self.syncs: Counter[str] = Counter()
-        self.by_device_time = False
-        """Whether the times are device times."""
+        self.by_device_time = False  # whether the times are device times
+        # Callback after the first collected batch and after the end of the requested time, to count lost samples
         self.look: Callable[[], None] = lambda: None
-        """Callback after the first collected batch and after the end of the requested time, to count lost samples."""
         self._chosen = bool(name)
         self._skip_ns, self._for_ns = round(skip_s * NS_PER_S), None if for_s is None else round(for_s * NS_PER_S)
         self._begin_ns: int | None = None
@@ -187,8 +176,7 @@ class LossTally:
     """Counter of the lost samples of a device, by cause, between the first and the last `look`."""
 
     def __init__(self) -> None:
-        self.lost: Counter[str] = Counter()
-        """Number of lost samples by the names of the ledger."""
+        self.lost: Counter[str] = Counter()  # number of lost samples by the names of the ledger
         self._newest: Mapping[str, int] | None = None
 
     @property

@@ -20,8 +20,7 @@ class DriverSchema(NamedTuple):
 
     navigation_frame: str
     euler_convention: str
-    status_bits: dict[str, str]
-    """Names of the bits of `status`, by bit number."""
+    status_bits: dict[str, str]  # names of the bits of `status`, by bit number
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -22,8 +22,7 @@ from imud.model.options import shown
 
 HEAD: Final = ("SETTING", "DECLARED", "ACTUAL", "")
 MORE: Final = ("UNIT", "MANUAL", "IN FORCE", "VALUES")
-LIMIT_S: Final = 180.0
-"""Time limit of a request, s. A long plan with a restart and a new baud rate takes about 10 s."""
+LIMIT_S: Final = 180.0  # Time limit of a request, s. A long plan with a restart and a new baud rate takes about 10 s.
 
 
 def settings_arguments(parser: argparse.ArgumentParser) -> None:

@@ -36,9 +36,9 @@ from imud.model.units import NS_PER_S
 
 NAME_WIDTH: Final = 6
 NUMBER_WIDTH: Final = 10
+# Window of the spectrum divided by the window of the spectrogram. Shorter windows show times better, frequencies less
+# well.
 GRAM_PART: Final = 4
-"""Window of the spectrum divided by the window of the spectrogram. Shorter windows show times better, frequencies less
-well."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,10 +46,8 @@ class SpectrumOptions:
     """Options of the command line."""
 
     sensors: tuple[SensorName, ...] = ("accel", "gyro")
-    resolution_hz: float | None = None
-    """Distance of two frequency bins, Hz. None: depends on the number of samples."""
-    bands_hz: tuple[tuple[float, float], ...] | None = None
-    """Bands of the RMS, Hz. None: octaves."""
+    resolution_hz: float | None = None  # Distance of two frequency bins, Hz. None: depends on the number of samples.
+    bands_hz: tuple[tuple[float, float], ...] | None = None  # Bands of the RMS, Hz. None: octaves.
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,12 +196,9 @@ def _sensor_object(taken: SampleSet, name: SensorName, sensor: SensorVibration) 
 
 
 REDRAW_S: Final = 1.0
-KEPT_S: Final = 10.0
-"""Time span of the live spectrum, s. A longer span would hide changes."""
-PAST_ROWS: Final = 8
-"""Number of rows of the spectrogram."""
-HEIGHT: Final = 8
-"""Number of rows of the curve."""
+KEPT_S: Final = 10.0  # Time span of the live spectrum, s. A longer span would hide changes.
+PAST_ROWS: Final = 8  # number of rows of the spectrogram
+HEIGHT: Final = 8  # number of rows of the curve
 PEAKS_SHOWN: Final = 5
 RANGE_DB: Final = 60.0
 SHADES: Final = " ░▒▓█"

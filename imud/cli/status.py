@@ -22,8 +22,7 @@ from imud.model.ledger import bytes_open, frames_open, lost
 from imud.model.options import shown
 from imud.model.units import NS_PER_MS, NS_PER_US
 
-WELL: Final = (DeviceState.RUNNING, DeviceState.FINISHED)
-"""States without a problem."""
+WELL: Final = (DeviceState.RUNNING, DeviceState.FINISHED)  # states without a problem
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -29,10 +29,8 @@ from imud.model.ledger import lost
 from imud.model.sample import Sample, Vector3
 from imud.model.units import NS_PER_S, NS_PER_US, RAD_PER_DEG, T_PER_UT
 
-POINTS_MAX: Final = 1200
-"""Maximum number of stored samples of a device: one minute at 20 Hz."""
-SPAN_NS: Final = 60 * NS_PER_S
-"""Maximum age of shown samples, ns."""
+POINTS_MAX: Final = 1200  # maximum number of stored samples of a device: one minute at 20 Hz
+SPAN_NS: Final = 60 * NS_PER_S  # maximum age of shown samples, ns
 
 
 class Curve(NamedTuple):
@@ -40,8 +38,8 @@ class Curve(NamedTuple):
 
     name: str
     unit: str
+    # Returns the value of a sample in `unit`; None if the sample does not contain it
     value: Callable[[Sample], float | None]
-    """Returns the value of a sample in `unit`; None if the sample does not contain it."""
 
 
 def _part(member: str, index: int, unit: float) -> Callable[[Sample], float | None]:
@@ -52,21 +50,20 @@ def _part(member: str, index: int, unit: float) -> Callable[[Sample], float | No
     return value
 
 
+# Curves on the page of a device, from top to bottom
 CURVES: Final = (
     *(Curve(name, "°", _part("euler_rad", index, RAD_PER_DEG)) for index, name in enumerate(("roll", "pitch", "yaw"))),
     *(Curve(f"accel {axis}", "m/s²", _part("accel_m_s2", index, 1.0)) for index, axis in enumerate("xyz")),
     *(Curve(f"gyro {axis}", "°/s", _part("gyro_rad_s", index, RAD_PER_DEG)) for index, axis in enumerate("xyz")),
     *(Curve(f"mag {axis}", "µT", _part("mag_t", index, T_PER_UT)) for index, axis in enumerate("xyz")),
 )
-"""Curves on the page of a device, from top to bottom."""
 
 
 class Series(NamedTuple):
     """Values of a curve."""
 
     curve: Curve
-    values: list[float]
-    """Values, oldest first; empty if the device does not send the value."""
+    values: list[float]  # values, oldest first; empty if the device does not send the value
 
 
 class DeviceHistory:
@@ -104,10 +101,8 @@ class DeviceHistories:
 
     def __init__(self) -> None:
         self.devices: dict[str, DeviceHistory] = {}
-        self.now_ns = 0
-        """CLOCK_MONOTONIC of the newest update, ns."""
-        self.clients = 0
-        """Number of clients of the daemon, including this program."""
+        self.now_ns = 0  # CLOCK_MONOTONIC of the newest update, ns
+        self.clients = 0  # number of clients of the daemon, including this program
 
     def update(self, statuses: Iterable[DeviceStatus], clients: int) -> None:
         """Store the status of all devices. Remove devices without a status."""
@@ -135,13 +130,11 @@ def norm(vector: Vector3 | None) -> float | None:
     return length if math.isfinite(length) else None
 
 
-WIDTH: Final = 78
-"""Maximum width of a row, characters: a terminal of 80 columns without the scroll bar."""
+WIDTH: Final = 78  # maximum width of a row, characters: a terminal of 80 columns without the scroll bar
 NONE: Final = "-"
 NAME_WIDTH: Final = 10
 TEXT_MAX: Final = 256
-AGE_OLD_S: Final = 999.9
-"""Maximum age that is shown in seconds, s."""
+AGE_OLD_S: Final = 999.9  # maximum age that is shown in seconds, s
 
 Number = float | int | None
 
@@ -151,12 +144,9 @@ class Column(NamedTuple):
 
     title: str
     width: int
-    text: Callable[[DeviceHistory, int], str]
-    """Formats the value of a device at a time (CLOCK_MONOTONIC, ns)."""
-    key: Callable[[DeviceHistory, int], float | str]
-    """Returns the sort key of a device."""
-    is_number: bool = True
-    """Whether the column contains numbers: right-aligned, the largest number first."""
+    text: Callable[[DeviceHistory, int], str]  # formats the value of a device at a time (CLOCK_MONOTONIC, ns)
+    key: Callable[[DeviceHistory, int], float | str]  # returns the sort key of a device
+    is_number: bool = True  # whether the column contains numbers: right-aligned, the largest number first
 
 
 def _number(
@@ -227,11 +217,11 @@ def _hundredths(value: float) -> str:
     return f"{value:.2f}"
 
 
+# Device states in the sort order, problems first
 STATE_ORDER: Final = (
     DeviceState.FAILED, DeviceState.MISSING, DeviceState.SILENT, DeviceState.SEARCHING, DeviceState.RUNNING,
     DeviceState.FINISHED,
 )  # fmt: skip
-"""Device states in the sort order, problems first."""
 
 NAME: Final = Column(
     "DEVICE",
@@ -264,6 +254,7 @@ SYNC: Final = Column(
     is_number=False,
 )
 
+# Sets of columns by name. Each set has at most WIDTH characters, with one space between two columns.
 VIEWS: Final[dict[str, tuple[Column, ...]]] = {
     "motion": (
         NAME, STATE, RATE, AGE, LOST, ERROR,
@@ -297,10 +288,8 @@ VIEWS: Final[dict[str, tuple[Column, ...]]] = {
         _number("UNPAIR", 6, lambda device, now_ns: device.status.clock.edges_unpaired, _whole),
     ),
 }  # fmt: skip
-"""Sets of columns by name. Each set has at most WIDTH characters, with one space between two columns."""
 
-SORTS: Final = (NAME, STATE, RATE, AGE, LOST, ERROR)
-"""Sort columns. The key `s` selects the next one."""
+SORTS: Final = (NAME, STATE, RATE, AGE, LOST, ERROR)  # Sort columns. The key `s` selects the next one.
 
 
 def head(columns: Iterable[Column]) -> str:
@@ -400,8 +389,7 @@ class TopApp(App[None]):
         self.problem = "connecting"
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         self.paused = False
-        self.ahead_ns = 0
-        """CLOCK_MONOTONIC of the daemon's host minus CLOCK_MONOTONIC of this host, ns."""
+        self.ahead_ns = 0  # CLOCK_MONOTONIC of the daemon's host minus CLOCK_MONOTONIC of this host, ns
         self._feed = make_feed(self._post)
 
     def on_mount(self) -> None:
@@ -461,8 +449,7 @@ class TopApp(App[None]):
 class TopScreen(Screen[None]):
     """Base class of the screens."""
 
-    is_ready = False
-    """Whether all widgets exist."""
+    is_ready = False  # whether all widgets exist
 
     @property
     def top(self) -> TopApp:
@@ -588,8 +575,7 @@ class DevicePage(TopScreen):
     def __init__(self, name: str) -> None:
         super().__init__()
         self._device = name
-        self._shown: Event | None = None
-        """Newest event in the list."""
+        self._shown: Event | None = None  # newest event in the list
 
     def compose(self) -> ComposeResult:
         yield Static(id="state", markup=False)

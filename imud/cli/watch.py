@@ -22,12 +22,9 @@ from imud.model.sample import SAMPLE_FIELDS, Sample
 from imud.model.units import NS_PER_MS, NS_PER_S, RAD_PER_DEG, T_PER_UT
 
 NONE: Final = "-"
-INDENT: Final = "    "
-"""Indent of the second and later lines of a sample."""
-ROWS: Final = 24
-"""Number of rows of a terminal with unknown size."""
-ROWS_LEAST: Final = 10
-"""Minimum number of samples between two headers."""
+INDENT: Final = "    "  # indent of the second and later lines of a sample
+ROWS: Final = 24  # number of rows of a terminal with unknown size
+ROWS_LEAST: Final = 10  # minimum number of samples between two headers
 NAME_MAX: Final = 256
 
 Text = Callable[[Any], str]
@@ -39,8 +36,7 @@ class TableColumn(NamedTuple):
     title: str
     wide: int
     narrow: int
-    text: Text
-    """Formats a value that is not None."""
+    text: Text  # formats a value that is not None
     is_number: bool = True
 
 
@@ -48,8 +44,7 @@ class FieldColumns(NamedTuple):
     """Columns of one field of a sample."""
 
     name: str
-    label: str
-    """Text above the columns of an array; empty for a single column."""
+    label: str  # text above the columns of an array; empty for a single column
     columns: tuple[TableColumn, ...]
 
     def width(self, *, narrow: bool) -> int:
@@ -100,13 +95,11 @@ _LAYOUT: Final = (
     _one("pps_age_ms", "PPS ms", 6, str),
     _one("edge_seq", "EDGE", 9, str),
 )  # fmt: skip
-FIELDS: Final = {field.name: field for field in _LAYOUT}
-"""Columns of each field of a sample."""
+FIELDS: Final = {field.name: field for field in _LAYOUT}  # columns of each field of a sample
 
-USUAL: Final = ("utc_ns", "accel_m_s2", "gyro_rad_s", "euler_rad")
-"""Fields of the table without `--fields`."""
+USUAL: Final = ("utc_ns", "accel_m_s2", "gyro_rad_s", "euler_rad")  # fields of the table without `--fields`
+# Fields that imud adds in this order if the terminal is wide enough
 MORE: Final = ("t_err_ns", "temperature_c", "mag_t", "sync", "pressure_pa")
-"""Fields that imud adds in this order if the terminal is wide enough."""
 USUAL_ORDER: Final = (
     "device", "utc_ns", "t_err_ns", "sync", "accel_m_s2", "gyro_rad_s", "euler_rad", "mag_t", "temperature_c",
     "pressure_pa",
@@ -204,8 +197,7 @@ class SampleTable:
         self._chosen = fields
         self._lines: list[TableLine] = []
         self._devices: set[str] = set()
-        self._rows_left = 0
-        """Number of samples until the next header; negative if there is no further header."""
+        self._rows_left = 0  # number of samples until the next header; negative if there is no further header
 
     def add_devices(self, names: Iterable[str]) -> None:
         """Add devices. If the table shows several devices, each row contains the name of the device."""
@@ -298,15 +290,14 @@ def _csv_line(cells: Sequence[object]) -> str:
     return line.getvalue()
 
 
+# Constructor of each format. The argument is the tuple of the fields, or None for all fields.
 OUTPUTS: Final[dict[str, Callable[[tuple[str, ...] | None], SampleOutput]]] = {
     "table": _Table,
     "json": _JsonLines,
     "csv": _Csv,
 }
-"""Constructor of each format. The argument is the tuple of the fields, or None for all fields."""
 
-TABLE_HZ: Final = 10.0
-"""Maximum rate of the table without `--rate`, Hz."""
+TABLE_HZ: Final = 10.0  # maximum rate of the table without `--rate`, Hz
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -16,10 +16,8 @@ if TYPE_CHECKING:
     from aiohttp import web
 
 ADDRESS: Final = "127.0.0.1"
-PORT: Final = 9322
-"""Default port. The metrics use port 9321."""
-STOP_S: Final = 3.0
-"""Maximum wait for open pages at the end, s."""
+PORT: Final = 9322  # Default port. The metrics use port 9321.
+STOP_S: Final = 3.0  # maximum wait for open pages at the end, s
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

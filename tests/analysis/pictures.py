@@ -28,14 +28,13 @@ from tests.support.files import ROOT
 FOLDER: Final = ROOT / "docs/pictures"
 SEED: Final = 15
 RATE_HZ, HOURS = 100.0, 2
-N_DEG_SQRT_H, B_DEG_H, K_DEG_H_SQRT_H = 0.3, 4.0, 20.0
-"""Noise coefficients of all three axes."""
+N_DEG_SQRT_H, B_DEG_H, K_DEG_H_SQRT_H = 0.3, 4.0, 20.0  # noise coefficients of all three axes
 VRW_M_S_SQRT_H = 0.03
 PRODUCT = "HI14R3"
 PAGE_SIZE, PAGE_LIMIT_S = "960,1240", 120.0
 VIBRATION_HZ, VIBRATION_S = 408.0, 60
+# Times of the start and the full speed of the motor, s, and the full speed, Hz
 START_S, FULL_S, FULL_HZ = 15.0, 30.0, 48.3
-"""Times of the start and the full speed of the motor, s, and the full speed, Hz."""
 
 
 def turn_rates() -> NDArray[np.float64]:

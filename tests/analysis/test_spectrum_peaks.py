@@ -13,8 +13,7 @@ from tests.analysis.synthetic import stamps_ns, three, white
 RATE_HZ = 400.0
 SIZE = 1024
 BIN_HZ = RATE_HZ / SIZE
-BIN_PART = 0.05
-"""Maximum error of a frequency, bins, also with 1 % lost samples."""
+BIN_PART = 0.05  # maximum error of a frequency, bins, also with 1 % lost samples
 
 
 def line(count: int, frequency_hz: float, amplitude: float, rate_hz: float = RATE_HZ, phase: float = 0.3) -> FloatArray:

@@ -22,8 +22,7 @@ from tests.bridges.samples import BARE, EVENT, FULL, UTC_NS
 DIALECT = Ros2Dialect()
 BOW = MessageFrames("bow")
 OWN = {"imud_msgs/SampleStamp", "imud_msgs/Losses"}
-ROS = get_typestore(Stores.ROS2_HUMBLE)
-"""Type definitions of rosbags, and imud's own definitions of its two types."""
+ROS = get_typestore(Stores.ROS2_HUMBLE)  # type definitions of rosbags, and imud's own definitions of its two types
 for own in OWN:
     ROS.register(get_types_from_msg(FIELDS[own], own.replace("/", "/msg/")))
 

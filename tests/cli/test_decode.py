@@ -12,11 +12,11 @@ import pytest
 from tests.cli.conftest import Cli
 from tests.support.files import hi91, imu61x_log
 
+# Frame of the manual, section 3.5
 MANUAL_FRAME = bytes.fromhex(
     "5AA54C0014BB910815 2309A2C447 08151C00 CCE861BE9A35563E65EA723F 31D07CBD75DDC5BB6BD724BC"
     "8988FC4001006A41AB2A70C2 96D45041ED03434141F4F4C2 CCCAF8BE736A19BEF0001C3D8D375C3F".replace(" ", "")
 )
-"""Frame of the manual, section 3.5."""
 DECODE = ("decode", "--driver", "hipnuc-uart")
 
 

@@ -98,8 +98,7 @@ def test_an_error_of_the_player_comes_out(tmp_path: Path) -> None:
         play_beside(tmp_path / "a", KeepingSink(), [], lambda _at: None)
 
 
-WHOLE = HEAD.pack(EVENT, 4, 0)
-"""Header of a message with four bytes of data."""
+WHOLE = HEAD.pack(EVENT, 4, 0)  # header of a message with four bytes of data
 
 
 @pytest.mark.parametrize(

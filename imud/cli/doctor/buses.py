@@ -14,10 +14,9 @@ from imud.links.socketcan import NATIVE
 
 FAILED_SHARE: Final = 0.001
 STALE_SHARE: Final = 0.5
-BROADCOM: Final = "bcm2835"
-"""Name part of a Raspberry Pi 1 to 4 I2C controller, which has a defect in clock stretching."""
+BROADCOM: Final = "bcm2835"  # name part of a Raspberry Pi 1 to 4 I2C controller, which has a defect in clock stretching
+# Pattern of the eight bytes that the daemon read instead of a product id, in the problem of a device
 READ_ID: Final = re.compile(r"PROD_ID: .* got ((?:[0-9a-f]{2} ){7}[0-9a-f]{2})")
-"""Pattern of the eight bytes that the daemon read instead of a product id, in the problem of a device."""
 WORD_BITS: Final = 16
 STRETCHING: Final = (
     "this I2C controller has a defect in clock stretching: use a lower bus clock (dtparam=i2c_arm_baudrate=50000) or a "
@@ -166,14 +165,11 @@ def _transfers(one: DeviceStatus, failing: str) -> DoctorFinding:
     return ok(f"{one.name}: {polls.polls} transfers, {polls.failed} failed")
 
 
-BITRATES: Final = (125_000, 250_000, 500_000, 1_000_000)
-"""Bit rates that the devices of both families support, bit/s."""
-COUNTER_LIMIT: Final = 96
-"""Minimum error counter of a controller in the state ERROR-WARNING (ISO 11898-1)."""
+BITRATES: Final = (125_000, 250_000, 500_000, 1_000_000)  # bit rates that the devices of both families support, bit/s
+COUNTER_LIMIT: Final = 96  # minimum error counter of a controller in the state ERROR-WARNING (ISO 11898-1)
+# Transmit error counter without acknowledgement by another node. The controller stays error-passive, never bus-off.
 NO_ACKNOWLEDGEMENT: Final = 128
-"""Transmit error counter without acknowledgement by another node. The controller stays error-passive, never bus-off."""
-LISTEN_S: Final = 2.0
-"""Time without a frame after which a bus is silent, s. The lowest rate of a device is 1 Hz."""
+LISTEN_S: Final = 2.0  # Time without a frame after which a bus is silent, s. The lowest rate of a device is 1 Hz.
 ABSENT: Final = (DeviceState.SEARCHING, DeviceState.SILENT)
 BUS_ADVICE: Final = (
     "check: 120 Ω at both ends (60 Ω between CAN_H and CAN_L without power), CAN_H and CAN_L not swapped, the same bit "

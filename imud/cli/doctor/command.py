@@ -22,12 +22,9 @@ from imud.cli.run import DEFAULT_FILE
 from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
 from imud.model.errors import ImudError
 
-MARGIN: Final = 13
-"""Width of the column with the severities, characters."""
-STATUS: Final = {Severity.ERROR: 2, Severity.WARNING: 1}
-"""Exit status by the worst severity; 0 for other severities."""
-FINDINGS_MAX: Final = 300
-"""Maximum number of findings of one check. imud supports 256 devices."""
+MARGIN: Final = 13  # width of the column with the severities, characters
+STATUS: Final = {Severity.ERROR: 2, Severity.WARNING: 1}  # exit status by the worst severity; 0 for other severities
+FINDINGS_MAX: Final = 300  # Maximum number of findings of one check. imud supports 256 devices.
 
 
 class Examined(NamedTuple):
@@ -127,6 +124,7 @@ def _counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
+# All checks, causes before their effects. docs/doctor.md describes each check.
 CHECKS: Final = (
     DoctorCheck("configuration", daemon.configuration),
     DoctorCheck("service", daemon.service),
@@ -157,7 +155,6 @@ CHECKS: Final = (
     DoctorCheck("shared memory", daemon.shared_memory),
     DoctorCheck("Prometheus", daemon.prometheus),
 )
-"""All checks, causes before their effects. docs/doctor.md describes each check."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -16,16 +16,14 @@ from imud.publishers.recorder.directory import RecorderOptions
 from imud.publishers.shm import ShmOptions
 
 ENABLED: Final = ("enabled", "enabled-runtime", "linked", "static", "alias")
+# Advice by exit status of `imud run` (docs/operate.md)
 EXIT_ADVICE: Final = {
     "78": "the configuration is invalid: find the error with `imud check`, then `systemctl start imud`",
     "75": "a required output could not start: does another imud run? `journalctl -u imud -n 20`",
     "2": "the command line in the unit is invalid: `systemctl cat imud`",
 }
-"""Advice by exit status of `imud run` (docs/operate.md)."""
-STALE_NS: Final = 1 * NS_PER_S
-"""Minimum age difference of file and reload for a warning, ns. Both times are rounded."""
-RESTARTS: Final = 3
-"""Number of restarts by systemd that causes a warning."""
+STALE_NS: Final = 1 * NS_PER_S  # Minimum age difference of file and reload for a warning, ns. Both times are rounded.
+RESTARTS: Final = 3  # number of restarts by systemd that causes a warning
 
 
 def configuration(at: Surroundings) -> Findings:
@@ -176,16 +174,13 @@ def _names(names: set[str]) -> str:
     return ", ".join(sorted(names)) or "none"
 
 
-STALE_S: Final = 300.0
-"""Maximum time since the last scrape, s. Prometheus usually scrapes every 15 s to 1 min."""
-NEVER_S: Final = 300.0
-"""Maximum time without a first scrape, s. Prometheus can start later than imud."""
+STALE_S: Final = 300.0  # Maximum time since the last scrape, s. Prometheus usually scrapes every 15 s to 1 min.
+NEVER_S: Final = 300.0  # Maximum time without a first scrape, s. Prometheus can start later than imud.
+# Key of the metrics in the configuration. Without the key, metrics are enabled by default, but perhaps unused.
 CONFIGURED: Final = re.compile(r"^metrics:", re.MULTILINE)
-"""Key of the metrics in the configuration. Without the key, metrics are enabled by default, but perhaps unused."""
+# Folder in which RemoveIPC= of a unit removes the files of the service's user or group (systemd.exec(5))
 SHARED_MEMORY: Final = "/dev/shm"
-"""Folder in which RemoveIPC= of a unit removes the files of the service's user or group (systemd.exec(5))."""
-EVERYWHERE: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}
-"""Address to connect to, for wildcard addresses to listen on."""
+EVERYWHERE: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # address to connect to, for wildcard addresses to listen on
 
 
 def shared_memory(at: Surroundings) -> Findings:
@@ -265,17 +260,15 @@ def _ago(seconds: float) -> str:
     return f"{seconds / 60:.0f} minutes" if seconds >= 120 else f"{seconds:.0f} s"
 
 
+# Number of bytes that a device sends in 1 s at its lowest rate. Fewer bytes are noise or echoes of imud's requests.
 HEARD_BYTES: Final = 200
-"""Number of bytes that a device sends in 1 s at its lowest rate. Fewer bytes are noise or echoes of imud's requests."""
-DAMAGED_SHARE: Final = 0.001
-"""Maximum share of damaged frames. A good link has no damaged frame in days."""
+DAMAGED_SHARE: Final = 0.001  # Maximum share of damaged frames. A good link has no damaged frame in days.
+# Time without a reply that causes a warning, s. imud requests the identity at detection, and 5 s and 35 s later.
 ANSWERED_AFTER_S: Final = 60.0
-"""Time without a reply that causes a warning, s. imud requests the identity at detection, and 5 s and 35 s later."""
 RESETS: Final = 3
-RESETS_PER_H: Final = 1.0
-"""Maximum number of restarts of a device per hour. A user restarts a device less often."""
+RESETS_PER_H: Final = 1.0  # Maximum number of restarts of a device per hour. A user restarts a device less often.
+# Number of samples without an edge on SOUT after which the pin is not connected, or disabled in the device
 EDGES_AFTER_SAMPLES: Final = 100
-"""Number of samples without an edge on SOUT after which the pin is not connected, or disabled in the device."""
 PPS_AFTER_S: Final = 10.0
 S_PER_H: Final = 3600
 DOWN: Final = "the received data is unknown, because the daemon does not reply"

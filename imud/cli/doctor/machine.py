@@ -8,23 +8,21 @@ from imud.cli.doctor.surroundings import DoctorFinding, Findings, Surroundings, 
 from imud.contracts.status import DeviceStatus
 from imud.model.units import NS_PER_MS
 
-CLOCK_ERROR_NS: Final = 100 * NS_PER_MS
-"""Maximum one-sigma error of a clock with NTP over the Internet, ns."""
+CLOCK_ERROR_NS: Final = 100 * NS_PER_MS  # maximum one-sigma error of a clock with NTP over the Internet, ns
 SYNC_SLOW_S: Final = 0.2
+# Time of a synchronised write that is an error, s. A good SD card needs some 10 ms, a worn card up to seconds.
 SYNC_BAD_S: Final = 1.0
-"""Time of a synchronised write that is an error, s. A good SD card needs some 10 ms, a worn card up to seconds."""
 SYNCS: Final = 3
 LOAD_PER_CPU: Final = 1.5
+# Maximum share of a minute in which a task waited for a processor, percent (/proc/pressure/cpu)
 PRESSURE_PERCENT: Final = 20.0
-"""Maximum share of a minute in which a task waited for a processor, percent (/proc/pressure/cpu)."""
 LOST_SHARE: Final = 1e-4
 LATE_SHARE: Final = 0.05
 
+# State of the firmware in Raspberry Pi OS up to the Pi 4. On other systems, imud calls vcgencmd.
 THROTTLED: Final = "/sys/devices/platform/soc/soc:firmware/get_throttled"
-"""State of the firmware in Raspberry Pi OS up to the Pi 4. On other systems, imud calls vcgencmd."""
 UNDER_VOLTAGE, CAPPED, SLOWED, HOT = 0x1, 0x2, 0x4, 0x8
-SINCE_BOOT: Final = 16
-"""Shift of the bits with the state since boot. The lower bits contain the current state."""
+SINCE_BOOT: Final = 16  # Shift of the bits with the state since boot. The lower bits contain the current state.
 SUPPLY: Final = (
     "use the official supply (5.1 V) and a short, thick cable; move USB devices to a hub with its own supply"
 )
@@ -179,14 +177,13 @@ def _late(one: DeviceStatus) -> list[DoctorFinding]:
     return []
 
 
-LINES: Final = "5000"
-"""Number of the newest lines of the kernel log that imud reads."""
+LINES: Final = "5000"  # number of the newest lines of the kernel log that imud reads
+# Commands that read the kernel log, first choice first. The groups adm and systemd-journal can read the journal.
 COMMANDS: Final = (
     ("journalctl", "--dmesg", "--boot", "--quiet", "--no-pager", "--output=cat", f"--lines={LINES}"),
     ("dmesg", "--notime"),
     ("dmesg",),
 )
-"""Commands that read the kernel log, first choice first. The groups adm and systemd-journal can read the journal."""
 SHOWN_CHARACTERS: Final = 120
 
 
@@ -196,8 +193,7 @@ class Pattern(NamedTuple):
     title: str
     expression: re.Pattern[str]
     advice: str
-    least: int = 1
-    """Minimum number of lines for a warning. A user who unplugs a cable causes few lines."""
+    least: int = 1  # Minimum number of lines for a warning. A user who unplugs a cable causes few lines.
 
 
 USB_ADVICE: Final = "use a shorter cable without an extension, another port, or a hub with its own supply"

@@ -17,12 +17,12 @@ from imud.host.files import GROUP_ACCESS
 from imud.links.device_node import holders_of
 from imud.links.serial_port import list_ports, read_latency_timer_ms
 
+# Start of a node's name, its class in /proc/devices, and its group in Debian or in 60-imud.rules
 CLASSES: Final = (
     ("ttyUSB", "ttyUSB", "dialout"), ("ttyACM", "ttyACM", "dialout"), ("ttyAMA", "ttyAMA", "dialout"),
     ("ttyS", "ttyS", "dialout"), ("tty", "tty*", "dialout"), ("i2c-", "i2c", "i2c"), ("spidev", "spi", "spi"),
     ("gpiochip", "gpiochip", "gpio"),
 )  # fmt: skip
-"""Start of a node's name, its class in /proc/devices, and its group in Debian or in 60-imud.rules."""
 SUBSYSTEMS: Final = {"dialout": "tty", "i2c": "i2c-dev", "spi": "spidev", "gpio": "gpio"}
 
 
@@ -32,8 +32,7 @@ class Person(NamedTuple):
     name: str
     uid: int
     gids: frozenset[int]
-    listed_gids: frozenset[int]
-    """Groups in /etc/group. A login session from before a change does not have a new group."""
+    listed_gids: frozenset[int]  # Groups in /etc/group. A login session from before a change does not have a new group.
 
 
 def rights(at: Surroundings) -> Findings:
@@ -198,8 +197,7 @@ def _known(own: str, classes: str) -> bool:
     return any(fnmatch(name, own) for name in listed)
 
 
-LATENCY_MS: Final = 1
-"""Minimum latency timer of FTDI adapters, ms. imud sets it if it has the permission."""
+LATENCY_MS: Final = 1  # Minimum latency timer of FTDI adapters, ms. imud sets it if it has the permission.
 STABLE: Final = "/dev/serial/"
 LATENCY_RULE: Final = 'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"'
 

@@ -26,36 +26,29 @@ from imud.model.errors import ConfigError, ImudError, LinkMissing
 from imud.model.units import NS_PER_S
 from imud.utc.system_clock import KernelClock, kernel_clock
 
-COMMAND_S: Final = 5.0
-"""Time limit of a command, s. Each command usually ends in less than 1 s."""
+COMMAND_S: Final = 5.0  # Time limit of a command, s. Each command usually ends in less than 1 s.
+# Folders of system commands. The PATH of some users and services does not contain them.
 SYSTEM_PATH: Final = "/usr/sbin:/usr/bin:/sbin:/bin"
-"""Folders of system commands. The PATH of some users and services does not contain them."""
-OUTPUT_CHARACTERS_MAX: Final = 1 << 20
-"""Maximum length of the used end of a command's output, characters."""
-TEXT_BYTES_MAX: Final = 65536
-"""Maximum length of the used start of a file, bytes."""
+OUTPUT_CHARACTERS_MAX: Final = 1 << 20  # maximum length of the used end of a command's output, characters
+TEXT_BYTES_MAX: Final = 65536  # maximum length of the used start of a file, bytes
 FETCH_S: Final = 3.0
 FETCH_BYTES_MAX: Final = 65536
-SYNC_BYTES: Final = 4096
-"""Size of the file that measures the storage, bytes: one block of a file system."""
+SYNC_BYTES: Final = 4096  # size of the file that measures the storage, bytes: one block of a file system
 UNIT: Final = "imud.service"
 
 
 class CommandOutput(NamedTuple):
     """Output of a command."""
 
-    status: int
-    """Exit status."""
-    text: str
-    """Standard output."""
-    complaint: str
-    """Last line of standard error."""
+    status: int  # exit status
+    text: str  # standard output
+    complaint: str  # last line of standard error
 
 
+# Runs a command. Raises FileNotFoundError if it is not installed, TimeoutError if it takes too long.
 Run = Callable[[Sequence[str]], CommandOutput]
-"""Runs a command. Raises FileNotFoundError if it is not installed, TimeoutError if it takes too long."""
+# Requests address, port and path by HTTP. Returns the body of a reply with status 200. Raises OSError.
 Fetch = Callable[[str, int, str], str]
-"""Requests address, port and path by HTTP. Returns the body of a reply with status 200. Raises OSError."""
 
 
 class Surroundings:
@@ -247,26 +240,19 @@ def ask_daemon(socket: str) -> list[DeviceStatus]:
 class Severity(StrEnum):
     """Severity of a finding."""
 
-    OK = "ok"
-    """No problem."""
-    NOTE = "note"
-    """Information, not a problem."""
-    WARNING = "warning"
-    """imud works, but with a disadvantage."""
-    ERROR = "error"
-    """A device or an output does not work."""
-    NOT_CHECKED = "not checked"
-    """The check could not run; `seen` is the reason."""
+    OK = "ok"  # no problem
+    NOTE = "note"  # information, not a problem
+    WARNING = "warning"  # imud works, but with a disadvantage
+    ERROR = "error"  # A device or an output does not work
+    NOT_CHECKED = "not checked"  # the check could not run; `seen` is the reason
 
 
 class DoctorFinding(msgspec.Struct, frozen=True):
     """One result of a check."""
 
     severity: Severity
-    seen: str
-    """Observation, with the name of the device, port or interface."""
-    advice: str = ""
-    """Next step; empty if no step is needed."""
+    seen: str  # observation, with the name of the device, port or interface
+    advice: str = ""  # next step; empty if no step is needed
 
 
 Findings = Iterator[DoctorFinding]
@@ -275,12 +261,10 @@ Findings = Iterator[DoctorFinding]
 class DoctorCheck(NamedTuple):
     """One row of the list of checks."""
 
-    name: str
-    """Unique short name, also in `--json`."""
+    name: str  # unique short name, also in `--json`
+    # Yields the findings; none if the configuration does not use the checked part. Raises OSError, ValueError and
+    # ImudError if the check cannot run.
     run: Callable[[Surroundings], Findings]
-    """Yields the findings; none if the configuration does not use the checked part.
-
-    Raises OSError, ValueError and ImudError if the check cannot run."""
 
 
 def ok(seen: str) -> DoctorFinding:

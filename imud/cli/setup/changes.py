@@ -20,11 +20,9 @@ from imud.cli.doctor.surroundings import Surroundings
 from imud.host.files import read_regular, replace_file
 from imud.model.errors import ImudError, reason_of
 
-Words = tuple[str, ...]
-"""Words of a command line."""
+Words = tuple[str, ...]  # words of a command line
 
-FILE_BYTES_MAX: Final = 1 << 20
-"""Maximum size of a changed file, bytes: the maximum size of a configuration."""
+FILE_BYTES_MAX: Final = 1 << 20  # maximum size of a changed file, bytes: the maximum size of a configuration
 NEW_MODE: Final = 0o644
 FOLDER_MODE: Final = 0o755
 
@@ -36,14 +34,12 @@ class ChangeRefused(ImudError):
 class FileChange(msgspec.Struct, frozen=True, tag="file"):
     """New content of a file."""
 
-    why: str
-    """Purpose of the change, for the user."""
+    why: str  # purpose of the change, for the user
     path: str
     content: bytes
+    # Commands after the change and after its undo, so that programs use the file. They can fail.
     then: tuple[Words, ...] = ()
-    """Commands after the change and after its undo, so that programs use the file. They can fail."""
-    copy_of: str = ""
-    """Original of a copy, which gets the same owner and mode; empty for other files."""
+    copy_of: str = ""  # original of a copy, which gets the same owner and mode; empty for other files
 
 
 class CommandChange(msgspec.Struct, frozen=True, tag="command"):
@@ -51,12 +47,9 @@ class CommandChange(msgspec.Struct, frozen=True, tag="command"):
 
     why: str
     words: Words
-    undo: tuple[Words, ...]
-    """Commands that undo the change; empty if nothing needs an undo."""
-    look: Words
-    """Command with the same output before the change and after the undo."""
-    optional: bool = False
-    """Whether `imud setup` continues if the change or its undo fails."""
+    undo: tuple[Words, ...]  # commands that undo the change; empty if nothing needs an undo
+    look: Words  # command with the same output before the change and after the undo
+    optional: bool = False  # whether `imud setup` continues if the change or its undo fails
 
 
 Change = FileChange | CommandChange
@@ -66,12 +59,9 @@ class ChangeRecord(msgspec.Struct):
     """Started change, as stored in the journal."""
 
     change: Change
-    content_before: bytes | None = None
-    """Previous content of a file; None if the file did not exist."""
-    seen_before: str = ""
-    """Previous output of the command `look`."""
-    done: bool = False
-    """False after an interruption: the change is perhaps incomplete."""
+    content_before: bytes | None = None  # previous content of a file; None if the file did not exist
+    seen_before: str = ""  # previous output of the command `look`
+    done: bool = False  # false after an interruption: the change is perhaps incomplete
 
 
 # --- description ------------------------------------------------------------------------------------------------------
@@ -225,8 +215,7 @@ def sync_folder(folder: Path) -> None:
 FOLDER: Final = "/var/lib/imud-setup"
 FILE: Final = f"{FOLDER}/journal.json"
 JOURNAL_FOLDER_MODE: Final = 0o700
-JOURNAL_BYTES_MAX: Final = 16 << 20
-"""Maximum size of the journal, bytes: some hundred versions of a configuration."""
+JOURNAL_BYTES_MAX: Final = 16 << 20  # maximum size of the journal, bytes: some hundred versions of a configuration
 
 
 class Journal:

@@ -15,10 +15,8 @@ from imud.cli.setup.hardware import BITRATE_DEFAULT, BITRATE_MAX, FINDERS, Wante
 from imud.cli.setup.steps import Conversation, SetupSteps
 from imud.model.errors import BadArgument
 
-COMMAND_LIMIT_S: Final = 330.0
-"""Time limit of a command, s. Longer than the start limit of the unit on a slow board."""
-WAIT_S: Final = 30.0
-"""Default wait for samples, s. Detection takes 2 s on a fast host, more on a slow board."""
+COMMAND_LIMIT_S: Final = 330.0  # Time limit of a command, s. Longer than the start limit of the unit on a slow board.
+WAIT_S: Final = 30.0  # Default wait for samples, s. Detection takes 2 s on a fast host, more on a slow board.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -32,8 +32,8 @@ from imud.links.serial_port import list_ports
 from imud.model.errors import DeviceRefused, LinkError, TransferError
 from imud.model.options import wrong_values
 
+# Links with several devices. No program uses such a link exclusively.
 SHARED: Final = ("socketcan", "rs485", "i2c", "spi")
-"""Links with several devices. No program uses such a link exclusively."""
 MODEM_MANAGER: Final = ", which searches for modems on new ports for 30 s: run imud setup again after that"
 CONSOLE: Final = "the port is a console of the kernel"
 ABSENT: Final = "no such port or interface: is the adapter plugged in, is the name correct?"
@@ -43,44 +43,34 @@ OTHER: Final = "this is not a serial port of a hardware device"
 class Attached(msgspec.Struct, frozen=True, omit_defaults=True):
     """A port, or a device on a bus."""
 
-    place: str
-    """Stable name of the port, or the interface, for the configuration."""
-    node: str
-    """Short name of the port's node, for messages; for a bus the same as `place`."""
-    title: str = ""
-    """Product name of the adapter, or state of the bus."""
-    driver: str = ""
-    """Driver of the detected device; empty if there is none."""
-    device: str = ""
-    """Address on a bus, for example `node 8`."""
-    baud: int = 0
-    """Baud rate or bit rate, bit/s."""
+    place: str  # stable name of the port, or the interface, for the configuration
+    node: str  # short name of the port's node, for messages; for a bus the same as `place`
+    title: str = ""  # product name of the adapter, or state of the bus
+    driver: str = ""  # driver of the detected device; empty if there is none
+    device: str = ""  # address on a bus, for example `node 8`
+    baud: int = 0  # baud rate or bit rate, bit/s
+    # Keys of the device in the configuration
     keys: dict[str, Any] = {}  # msgspec copies a mutable default
-    """Keys of the device in the configuration."""
-    configured: str = ""
-    """Name of the device in the configuration; empty if it is not configured."""
-    problem: str = ""
-    """Reason why imud found no device."""
+    configured: str = ""  # name of the device in the configuration; empty if it is not configured
+    problem: str = ""  # reason why imud found no device
 
 
 class Finders(NamedTuple):
     """Functions that search for devices. Each function raises ImudError."""
 
+    # Listens on ports and interfaces, and sends requests to the ports and interfaces in the set
     listen: Callable[[Sequence[str], set[str]], list[ProbeReport]]
-    """Listens on ports and interfaces, and sends requests to the ports and interfaces in the set."""
+    # Sends a request to each address of an RS-485 bus with this baud rate (0: factory setting)
     scan_rs485: Callable[[str, int], list[Attached]]
-    """Sends a request to each address of an RS-485 bus with this baud rate (0: factory setting)."""
+    # Sends requests on a bus of the kind `i2c` or `spi`, with its number or node
     ask_bus: Callable[[str, str], list[Attached]]
-    """Sends requests on a bus of the kind `i2c` or `spi`, with its number or node."""
 
 
 class Wanted(NamedTuple):
     """Ports and buses to search. Empty: listen on all ports and interfaces."""
 
-    places: tuple[str, ...] = ()
-    """Ports and interfaces to search; empty for all."""
-    active: tuple[str, ...] = ()
-    """Ports and interfaces to send requests to."""
+    places: tuple[str, ...] = ()  # ports and interfaces to search; empty for all
+    active: tuple[str, ...] = ()  # ports and interfaces to send requests to
     rs485: tuple[tuple[str, int], ...] = ()
     buses: tuple[tuple[str, str], ...] = ()
 
@@ -91,10 +81,8 @@ class PortNow(NamedTuple):
     place: str
     node: str
     title: str
-    console: bool
-    """Whether the port is a console of the kernel."""
-    holders: str
-    """Programs that use the port, if this user can see them."""
+    console: bool  # whether the port is a console of the kernel
+    holders: str  # programs that use the port, if this user can see them
     configured: str
 
 
@@ -249,8 +237,7 @@ def _is_of(device: DeviceConfig, one: Attached, *, exact: bool) -> bool:
 
 
 MODBUS: Final = "hipnuc-modbus"
-REPLY_MS: Final = 20
-"""Maximum wait for the reply of a device, ms."""
+REPLY_MS: Final = 20  # maximum wait for the reply of a device, ms
 
 
 def listen(places: Sequence[str], active: set[str]) -> list[ProbeReport]:
@@ -318,15 +305,14 @@ def _answers(kind: str, bus: str, link: PolledLink) -> list[Attached]:
 
 FINDERS = Finders(listen, scan_rs485, ask_bus)
 
+# Kernel command lines of a Raspberry Pi, newer releases first
 COMMAND_LINES: Final = ("/boot/firmware/cmdline.txt", "/boot/cmdline.txt")
-"""Kernel command lines of a Raspberry Pi, newer releases first."""
-ALIASES: Final = ("serial0", "serial1")
-"""Additional names of UARTs on a Raspberry Pi."""
+ALIASES: Final = ("serial0", "serial1")  # additional names of UARTs on a Raspberry Pi
 NETWORKS: Final = "/etc/systemd/network"
 NETWORKD: Final = "systemd-networkd.service"
 WAIT_ONLINE: Final = "systemd-networkd-wait-online.service"
+# Other network managers: unit and name
 OTHERS: Final = (("NetworkManager.service", "NetworkManager"), ("networking.service", "ifupdown"))
-"""Other network managers: unit and name."""
 BITRATE_DEFAULT: Final = 500_000
 BITRATE_MAX: Final = 1_000_000
 VIRTUAL: Final = "/sys/devices/virtual/net"

@@ -29,15 +29,11 @@ _UNSAFE: Final = re.compile(r"[^A-Za-z0-9_.:/ -]")
 class UsbAdapter(NamedTuple):
     """USB adapter of a serial port."""
 
-    node: str
-    """Node of the port without its folder, for example `ttyUSB0`."""
-    driver: str
-    """Kernel driver of the port."""
-    vendor: str
-    """USB vendor id, four hexadecimal digits."""
+    node: str  # node of the port without its folder, for example `ttyUSB0`
+    driver: str  # kernel driver of the port
+    vendor: str  # USB vendor id, four hexadecimal digits
     product: str
-    serial: str
-    """Serial number; empty for an adapter without a serial number."""
+    serial: str  # serial number; empty for an adapter without a serial number
 
 
 def usb_adapter(at: Surroundings, node: str) -> UsbAdapter | None:
@@ -117,12 +113,11 @@ def _pattern(text: str) -> str:
     return _UNSAFE.sub("?", text)
 
 
-Blocks = Mapping[str, Mapping[str, Any]]
-"""Keys of each device, by name."""
+Blocks = Mapping[str, Mapping[str, Any]]  # keys of each device, by name
 
 INDENT: Final = 2
+# Devices of etc/imud.yaml, the example that the package installs
 EXAMPLE: Final = {"imu": {"uart": {"port": "/dev/ttyUSB0"}}}
-"""Devices of etc/imud.yaml, the example that the package installs."""
 FILE_HEAD: Final = """\
 # Created by `imud setup`. You can change this file. docs/configuration.md describes every key.
 # Check the file with `imud check FILE`, then reload the daemon with `systemctl reload imud`.
@@ -233,10 +228,8 @@ def _scalar(value: object) -> str:
 
 UNIT: Final = "imud.service"
 RELOAD: Final = ("systemctl", "try-reload-or-restart", UNIT)
-READERS: Final = "imud"
-"""Group with the right to read samples."""
-CONTROLLERS: Final = "imud-control"
-"""Group with the right to control devices."""
+READERS: Final = "imud"  # group with the right to read samples
+CONTROLLERS: Final = "imud-control"  # group with the right to control devices
 SYSTEMD: Final = "/run/systemd/system"
 UDEV: Final = "/run/udev"
 EXAMPLE_NAME: Final = "imu"
@@ -255,14 +248,10 @@ class SetupPlan:
 class Wishes:
     """Decisions of the user."""
 
-    devices: Mapping[str, Attached]
-    """Devices to add, by name."""
-    user: str = ""
-    """User of sudo; empty if there is none."""
-    control: bool = False
-    """Whether this user gets the right to control devices."""
-    date: str = ""
-    """Date in the name of the backup, for example `2026-11-22T13-05-01`."""
+    devices: Mapping[str, Attached]  # devices to add, by name
+    user: str = ""  # user of sudo; empty if there is none
+    control: bool = False  # whether this user gets the right to control devices
+    date: str = ""  # date in the name of the backup, for example `2026-11-22T13-05-01`
 
 
 def real_path(at: Surroundings, path: str) -> str:

@@ -53,8 +53,7 @@ from imud.model.units import NS_PER_MS
 FOUND_HEAD: Final = ("PORT", "DRIVER", "RATE", "ADAPTER", "CONFIGURED")
 TITLE_WIDTH: Final = 16
 CONFIGURED_WIDTH: Final = 10
-ANSWERS_MAX: Final = 10
-"""Maximum number of invalid answers to one question."""
+ANSWERS_MAX: Final = 10  # maximum number of invalid answers to one question
 
 
 class Conversation:
@@ -123,10 +122,8 @@ def attached_table(found: Sequence[Attached]) -> list[str]:
 SAMPLES_HEAD: Final = ("DEVICE", "STATE", "RATE HZ", "PRODUCT", "CLOCK ERROR")
 NAME_WIDTH: Final = 24
 PRODUCT_WIDTH: Final = 20
-LOOK_S: Final = 0.5
-"""Time between two status requests, s."""
-SETTLE_S: Final = 4.0
-"""Time until the rate, a mean over seconds, and the identity of a device are known, s."""
+LOOK_S: Final = 0.5  # time between two status requests, s
+SETTLE_S: Final = 4.0  # time until the rate, a mean over seconds, and the identity of a device are known, s
 
 
 def wait_for_samples(
@@ -189,8 +186,7 @@ def _row(one: DeviceStatus) -> tuple[object, ...]:
 
 
 DONE, NOT_DONE = 0, 1
-CAN_UP_S: Final = 5.0
-"""Time limit for systemd-networkd to bring an interface up, s."""
+CAN_UP_S: Final = 5.0  # time limit for systemd-networkd to bring an interface up, s
 CAN_LOOK_S: Final = 0.2
 NEXT: Final = (
     "imud found no device. Next steps:",
@@ -229,8 +225,7 @@ class SetupSteps:
         self._found: list[Attached] = []
         self._status: list[DeviceStatus] = []
         self._changed = False
-        self._freed: list[str] = []
-        """Nodes of ports from which this run removes the console."""
+        self._freed: list[str] = []  # nodes of ports from which this run removes the console
 
     # --- set up -------------------------------------------------------------------------------------------------------
 

@@ -11,8 +11,7 @@ from tests.support.surroundings import Machine
 RIGHTS, RULES = DoctorCheck("r", rights), DoctorCheck("u", unit_rules)
 BOW = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}}"
 ROOT = os.geteuid() == 0
-PORT_GID = 4500 if ROOT else os.getegid()
-"""Group of the port. Only root can change the group of a file to any group."""
+PORT_GID = 4500 if ROOT else os.getegid()  # Group of the port. Only root can change the group of a file to any group.
 
 
 @pytest.fixture
