@@ -87,9 +87,9 @@ def noise(args: argparse.Namespace) -> int:
     # check the arguments first: samples of a live device take minutes
     kind = module.kind_of(args.output) if args.output is not None else ""
     given = module.read_sheet(args.sheet) if args.sheet is not None else None
-    taken = take(args)
-    product = taken.identity.get("product", "")
-    report = module.noise_report(taken, module.figures_for(taken.sheet, product, given))
+    sample_set = take(args)
+    product = sample_set.identity.get("product", "")
+    report = module.noise_report(sample_set, module.figures_for(sample_set.sheet, product, given))
     if args.output is not None:
         module.write_file(args.output, module.noise_file(report, kind))
     return show(args, report, module)

@@ -36,7 +36,7 @@ from imud.cli.export_sources import (
     times_of,
 )
 from imud.cli.output import complain
-from imud.cli.replay import looks_like_recording
+from imud.cli.replay import BAUD, DRIVER, looks_like_recording
 from imud.contracts.status import Deviations
 from imud.drivers import DRIVERS
 from imud.host.files import WRITE_FLAGS, open_regular
@@ -140,8 +140,6 @@ class ExportFile:
 
 FORMATS: Final = ("csv", "mcap")
 SCHEMAS: Final = ("json", "ros2")
-DRIVER: Final = "hipnuc-uart"
-BAUD: Final = 115200
 MEGABYTE: Final = 1_000_000
 
 

@@ -62,53 +62,54 @@ WITHIN: Final = 1.1
 class NoiseReport:
     """Result of the analysis, the input of all outputs."""
 
-    taken: SampleSet
+    sample_set: SampleSet
     sensors: dict[SensorName, SensorNoise]
     sheet: ModelFigures | None  # values of a data sheet for the comparison; None for no comparison
 
 
-def noise_report(taken: SampleSet, sheet: ModelFigures | None) -> NoiseReport:
+def noise_report(sample_set: SampleSet, sheet: ModelFigures | None) -> NoiseReport:
     """Analyse both sensors. Raises ImudError if the device sends neither angular rate nor acceleration."""
-    readings = readings_of(taken)
+    readings = readings_of(sample_set)
     sensors: dict[SensorName, SensorNoise] = {}
     if readings.gyro_rad_s is not None:
         sensors["gyro"] = sensor_noise(readings, readings.gyro_rad_s)
     if readings.accel_m_s2 is not None:
         sensors["accel"] = sensor_noise(readings, readings.accel_m_s2)
     if not sensors:
-        raise ImudError(f"{taken.source}: {taken.device} sends neither angular rate nor acceleration")
-    return NoiseReport(taken, sensors, sheet)
+        raise ImudError(f"{sample_set.source}: {sample_set.device} sends neither angular rate nor acceleration")
+    return NoiseReport(sample_set, sensors, sheet)
 
 
-def readings_of(taken: SampleSet) -> Readings:
+def readings_of(sample_set: SampleSet) -> Readings:
     """Return the samples. Raises ImudError if there are no samples."""
-    if taken.readings is None or not len(taken.readings.t_ns):
-        raise ImudError(f"{taken.source}: found no samples")
-    return taken.readings
+    if sample_set.readings is None or not len(sample_set.readings.t_ns):
+        raise ImudError(f"{sample_set.source}: found no samples")
+    return sample_set.readings
 
 
 # --- the measurement --------------------------------------------------------------------------------------------------
 
 
-def circumstances(taken: SampleSet, *, full: bool = True) -> Iterator[tuple[str, str]]:
+def circumstances(sample_set: SampleSet, *, full: bool = True) -> Iterator[tuple[str, str]]:
     """Yield name and text of the conditions of a measurement. `full`: include the device settings."""
-    readings = readings_of(taken)
+    readings = readings_of(sample_set)
     begun = "unknown"
-    if taken.begun_utc_ns is not None:
-        begun = f"{datetime.fromtimestamp(taken.begun_utc_ns // NS_PER_S, UTC):%Y-%m-%d %H:%M:%S} UTC"
-    yield "source", taken.source
-    yield "device", f"{taken.device}, driver {taken.driver}, {taken.link}" if taken.link else taken.driver
-    yield "identity", ", ".join(f"{key} {value}" for key, value in taken.identity.items()) or "unknown"
+    if sample_set.begun_utc_ns is not None:
+        begun = f"{datetime.fromtimestamp(sample_set.begun_utc_ns // NS_PER_S, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    yield "source", sample_set.source
+    link = sample_set.link
+    yield "device", f"{sample_set.device}, driver {sample_set.driver}, {link}" if link else sample_set.driver
+    yield "identity", ", ".join(f"{key} {value}" for key, value in sample_set.identity.items()) or "unknown"
     if full:
-        yield "settings", ", ".join(f"{key} {value}" for key, value in taken.settings.items()) or "unknown"
+        yield "settings", ", ".join(f"{key} {value}" for key, value in sample_set.settings.items()) or "unknown"
     yield "start", begun
     yield "duration", f"{duration_words(readings.duration_s)}, {len(readings.t_ns)} samples"
-    yield "time stamps", taken.stamps
-    lost = ", ".join(f"{cause.removeprefix('lost_')} {count}" for cause, count in taken.lost.items())
+    yield "time stamps", sample_set.stamps
+    lost = ", ".join(f"{cause.removeprefix('lost_')} {count}" for cause, count in sample_set.lost.items())
     yield "lost", f"{lost} (ledger)" if lost else "0 samples (ledger)"
     yield "temperature", temperature_words(readings)
     yield "software", f"imud {__version__}"
-    for note in taken.notes:
+    for note in sample_set.notes:
         yield "note", note
 
 
@@ -138,10 +139,10 @@ def limits(report: NoiseReport, name: SensorName) -> Iterator[str]:
             f"low-pass filter: the noise has less than half of its power above {sensor.corner_hz:.3g} Hz; imud fits "
             f"the coefficients from τ = {sensor.tau_least_s:.3g} s"
         )
-    words = report.taken.sheet.filter_words(report.taken.settings, name)
+    words = report.sample_set.sheet.filter_words(report.sample_set.settings, name)
     if words:
         yield f"filter of the device: {words}"
-    step = report.taken.sheet.gyro_step_rad_s if name == "gyro" else report.taken.sheet.accel_step_m_s2
+    step = report.sample_set.sheet.gyro_step_rad_s if name == "gyro" else report.sample_set.sheet.accel_step_m_s2
     if step is not None or sensor.step is not None:
         size = step if step is not None else sensor.step
         origin = "in the manual" if step is not None else "found in the values"
@@ -247,8 +248,8 @@ def comparisons(report: NoiseReport, name: SensorName) -> list[Comparison]:
 
 def text(report: NoiseReport) -> str:
     """Format the report in 80 columns."""
-    lines = [f"{report.taken.device}: noise"]
-    for name, words in circumstances(report.taken):
+    lines = [f"{report.sample_set.device}: noise"]
+    for name, words in circumstances(report.sample_set):
         lines += paragraph(f"  {name:<13}", words)
     for sensor_name, sensor in report.sensors.items():
         lines += ["", *table(sensor_name, sensor)]
@@ -262,7 +263,7 @@ def text(report: NoiseReport) -> str:
 
 def without_sheet(report: NoiseReport) -> str:
     """Return the reason for no comparison, and the next step."""
-    document = report.taken.sheet.document
+    document = report.sample_set.sheet.document
     return (
         f"No comparison with a data sheet: {document or 'the driver contains no data sheet'}. To compare with your own "
         "values, use --sheet FILE"
@@ -303,22 +304,22 @@ def compared(report: NoiseReport, name: SensorName) -> list[str]:
 def as_object(report: NoiseReport) -> dict[str, Any]:
     """Return the report for `--json`. Values are in SI units and in the units of data sheets."""
     return {
-        "measurement": measurement_object(report.taken),
+        "measurement": measurement_object(report.sample_set),
         "sensors": {name: _sensor_object(report, name, sensor) for name, sensor in report.sensors.items()},
         "data_sheet": report.sheet.source if report.sheet is not None else None,
-        "manual": report.taken.sheet.document,
+        "manual": report.sample_set.sheet.document,
     }
 
 
-def measurement_object(taken: SampleSet) -> dict[str, Any]:
+def measurement_object(sample_set: SampleSet) -> dict[str, Any]:
     """Return the conditions of a measurement for `--json`."""
-    readings = readings_of(taken)
+    readings = readings_of(sample_set)
     warm = readings.temperature_c
     return {
-        "imud": __version__, "source": taken.source, "device": taken.device, "driver": taken.driver,
-        "link": taken.link, "identity": dict(taken.identity), "settings": dict(taken.settings),
-        "begun_utc_ns": taken.begun_utc_ns, "duration_s": readings.duration_s, "samples": len(readings.t_ns),
-        "stamps": taken.stamps, "lost": taken.lost, "notes": taken.notes,
+        "imud": __version__, "source": sample_set.source, "device": sample_set.device, "driver": sample_set.driver,
+        "link": sample_set.link, "identity": dict(sample_set.identity), "settings": dict(sample_set.settings),
+        "begun_utc_ns": sample_set.begun_utc_ns, "duration_s": readings.duration_s, "samples": len(readings.t_ns),
+        "stamps": sample_set.stamps, "lost": sample_set.lost, "notes": sample_set.notes,
         "temperature_c": None if warm is None else [float(np.nanmin(warm)), float(np.nanmax(warm))],
     }  # fmt: skip
 
@@ -438,7 +439,7 @@ def inline_svg(figure: MatplotlibFigure) -> str:
 
 def html(report: NoiseReport) -> str:
     """Return the HTML page. The page loads no other files."""
-    device = escape(report.taken.device)
+    device = escape(report.sample_set.device)
     parts = [
         "<!DOCTYPE html>", "<html lang='en'><head><meta charset='utf-8'>", f"<title>{device}: noise</title>",
         f"<style>{STYLE}</style></head><body>", f"<h1>Noise of {device}</h1>", *_facts(report),
@@ -463,7 +464,7 @@ METHOD: Final = (
 
 def _facts(report: NoiseReport) -> Iterator[str]:
     yield "<table>"
-    for name, words in circumstances(report.taken):
+    for name, words in circumstances(report.sample_set):
         yield f"<tr><th>{escape(name)}</th><td>{escape(words)}</td></tr>"
     yield "</table>"
 

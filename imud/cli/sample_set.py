@@ -208,14 +208,14 @@ def _sensor(values: "array[float]") -> FloatArray | None:
 def take_file(args: argparse.Namespace) -> SampleSet:
     """Read the samples of a recording or a capture. Raises ImudError, also if there is no sample, and OSError."""
     with log_to(STDERR, "error"):
-        taken = take_recording(args) if looks_like_recording(args.input) else take_capture(args)
-    if taken.readings is None or not len(taken.readings.t_ns):
+        sample_set = take_recording(args) if looks_like_recording(args.input) else take_capture(args)
+    if sample_set.readings is None or not len(sample_set.readings.t_ns):
         after = f" of {args.device}" if args.device else ""
         after += f" after the first {args.skip:g} s (--skip)" if args.skip else ""
         raise ImudError(
             f"{args.input}: found no samples{after}; check a recording with `imud info`, a capture with `imud decode`"
         )
-    return taken
+    return sample_set
 
 
 def take_recording(args: argparse.Namespace) -> SampleSet:
@@ -224,7 +224,7 @@ def take_recording(args: argparse.Namespace) -> SampleSet:
         if getattr(args, option) != default:
             raise BadArgument(f"--{option} applies to captures only; a recording contains the value of the live run")
     collector = Collector(args.device or "", skip_s=args.skip or 0.0, for_s=args.duration)
-    taken, tally = SampleSet(args.input), LossTally()
+    sample_set, tally = SampleSet(args.input), LossTally()
     with open_regular(args.input) as file:
         player = Player(collector.publish)
         reader = RecordingReader(file, args.input)
@@ -251,11 +251,11 @@ def take_recording(args: argparse.Namespace) -> SampleSet:
     if args.device and args.device not in names:
         there = ", ".join(names) or "none, because the block with the device names is damaged or missing"
         raise BadArgument(f"--device {args.device}: expected a device of the recording: {there}")
-    _describe(taken, player, collector.name)
-    taken.notes += list(reader.problems)
+    _describe(sample_set, player, collector.name)
+    sample_set.notes += list(reader.problems)
     if player.lost:
-        taken.notes.append(f"the recorder dropped {player.lost} records")
-    return _finished(taken, collector, tally.found())
+        sample_set.notes.append(f"the recorder dropped {player.lost} records")
+    return _finished(sample_set, collector, tally.found())
 
 
 def played(player: Player, name: str) -> PlayedDevice | None:
@@ -263,16 +263,16 @@ def played(player: Player, name: str) -> PlayedDevice | None:
     return next((device for device in player.devices.values() if device.described.name == name), None)
 
 
-def _describe(taken: SampleSet, player: Player, name: str) -> None:
+def _describe(sample_set: SampleSet, player: Player, name: str) -> None:
     """Copy the description of the device and notes about the replay."""
     if (device := played(player, name)) is None:
         return
-    taken.driver = device.driver.name if device.driver is not None else device.described.driver
-    taken.link, taken.identity = device.described.where, device.described.identity
-    taken.settings = device.described.settings
-    taken.notes += [f"clock: {why}" for why in device.fresh_starts[:1]]
+    sample_set.driver = device.driver.name if device.driver is not None else device.described.driver
+    sample_set.link, sample_set.identity = device.described.where, device.described.identity
+    sample_set.settings = device.described.settings
+    sample_set.notes += [f"clock: {why}" for why in device.fresh_starts[:1]]
     if device.differences:
-        taken.notes.append(f"replay: {len(device.differences)} of {device.checks} checks differ")
+        sample_set.notes.append(f"replay: {len(device.differences)} of {device.checks} checks differ")
 
 
 def take_capture(args: argparse.Namespace) -> SampleSet:
@@ -292,20 +292,20 @@ def take_capture(args: argparse.Namespace) -> SampleSet:
     if not collector.done:
         collector.look()
     status = daemon.status()[0]
-    taken = SampleSet(args.input, driver=status.driver, link=status.link, identity=status.identity)
-    taken.settings = status.settings
+    sample_set = SampleSet(args.input, driver=status.driver, link=status.link, identity=status.identity)
+    sample_set.settings = status.settings
     if problem := problem_of(replayed)[0]:
-        taken.notes.append(problem)
-    finished = _finished(taken, collector, tally.found())
+        sample_set.notes.append(problem)
+    finished = _finished(sample_set, collector, tally.found())
     finished.device, finished.begun_utc_ns = args.device or "capture", None
     return finished
 
 
-def _finished(taken: SampleSet, collector: Collector, lost: dict[str, int]) -> SampleSet:
-    taken.device, taken.lost = collector.name, lost
-    taken.readings, taken.stamps = collector.readings(), collector.stamps() if len(collector) else ""
-    taken.begun_utc_ns = collector.first.utc_ns if collector.first is not None else None
-    return taken
+def _finished(sample_set: SampleSet, collector: Collector, lost: dict[str, int]) -> SampleSet:
+    sample_set.device, sample_set.lost = collector.name, lost
+    sample_set.readings, sample_set.stamps = collector.readings(), collector.stamps() if len(collector) else ""
+    sample_set.begun_utc_ns = collector.first.utc_ns if collector.first is not None else None
+    return sample_set
 
 
 # --- a running daemon -------------------------------------------------------------------------------------------------
@@ -345,12 +345,12 @@ def take_live(
                 if collector.done:
                     break
         after = status_of(statuses(asking), args.input)
-        taken = taken_of(after, args.socket)
+        sample_set = sample_set_of(after, args.socket)
         dropped = samples.dropped.get(args.input, 0)
     if tally.begun:
         tally.look(after.ledger)
     lost = tally.found()
-    return _finished(taken, collector, lost | ({"dropped": dropped} if dropped else {}))
+    return _finished(sample_set, collector, lost | ({"dropped": dropped} if dropped else {}))
 
 
 def heard(samples: Iterator[Sample], name: str) -> Iterator[Sample | None]:
@@ -378,7 +378,7 @@ def status_of(found: Iterable[DeviceStatus], name: str) -> DeviceStatus:
     return known[name]
 
 
-def taken_of(status: DeviceStatus, socket: str) -> SampleSet:
+def sample_set_of(status: DeviceStatus, socket: str) -> SampleSet:
     """Return a SampleSet without samples for a live device."""
     return SampleSet(f"live from {socket}", status.name, status.driver, status.link, status.identity, status.settings)
 

@@ -54,21 +54,21 @@ class SpectrumOptions:
 class SpectrumReport:
     """Result of the analysis, the input of all outputs."""
 
-    taken: SampleSet
+    sample_set: SampleSet
     sensors: dict[SensorName, SensorVibration]
 
 
-def spectrum_report(taken: SampleSet, settings: SpectrumOptions) -> SpectrumReport:
+def spectrum_report(sample_set: SampleSet, settings: SpectrumOptions) -> SpectrumReport:
     """Analyse the chosen sensors. Raises ImudError if the device does not send values of these sensors."""
-    readings = readings_of(taken)
+    readings = readings_of(sample_set)
     sensors: dict[SensorName, SensorVibration] = {}
     for name in settings.sensors:
         values = readings.accel_m_s2 if name == "accel" else readings.gyro_rad_s
         if values is not None:
             sensors[name] = sensor_vibration(readings, values, settings)
     if not sensors:
-        raise ImudError(f"{taken.source}: {taken.device} sends no values of {' or '.join(settings.sensors)}")
-    return SpectrumReport(taken, sensors)
+        raise ImudError(f"{sample_set.source}: {sample_set.device} sends no values of {' or '.join(settings.sensors)}")
+    return SpectrumReport(sample_set, sensors)
 
 
 def sensor_vibration(readings: Readings, values: FloatArray, settings: SpectrumOptions) -> SensorVibration:
@@ -88,12 +88,12 @@ def sensor_vibration(readings: Readings, values: FloatArray, settings: SpectrumO
 # --- text -------------------------------------------------------------------------------------------------------------
 
 
-def limits(taken: SampleSet, name: SensorName, sensor: SensorVibration) -> Iterator[str]:
+def limits(sample_set: SampleSet, name: SensorName, sensor: SensorVibration) -> Iterator[str]:
     """Yield sentences about the limits of the spectrum of a sensor."""
     half = sensor.spectrum.rate_hz / 2
     yield sensor.grid.words()
     yield sensor.spectrum.words()
-    own = taken.sheet.filter_words(taken.settings, name)
+    own = sample_set.sheet.filter_words(sample_set.settings, name)
     yield (
         f"aliasing: vibration above {half:.4g} Hz (half of the rate) that passes the filter of the device "
         f"({own or 'unknown, no manual states it'}) appears below {half:.4g} Hz: a line at f can be a line at "
@@ -131,20 +131,20 @@ def band_lines(sensor: SensorVibration) -> list[str]:
 
 def text(report: SpectrumReport) -> str:
     """Format the report in 80 columns."""
-    lines = [f"{report.taken.device}: vibration"]
-    for name, words in circumstances(report.taken, full=False):
+    lines = [f"{report.sample_set.device}: vibration"]
+    for name, words in circumstances(report.sample_set, full=False):
         lines += paragraph(f"  {name:<13}", words)
     for sensor_name, sensor in report.sensors.items():
         lines += ["", f"{TITLES[sensor_name]}: lines, peak amplitude in {SI[sensor_name]}", *peak_lines(sensor)]
         lines += ["", f"{TITLES[sensor_name]}: RMS of bands in {SI[sensor_name]}", *band_lines(sensor)]
-        for words in limits(report.taken, sensor_name, sensor):
+        for words in limits(report.sample_set, sensor_name, sensor):
             lines += paragraph("  ", words)
     return "\n".join(lines)
 
 
 def spectrum_file(report: SpectrumReport, kind: str) -> bytes:
     """Return the content of a picture file of the kind `.svg` or `.png`."""
-    facts = dict(circumstances(report.taken, full=False))
+    facts = dict(circumstances(report.sample_set, full=False))
     lines = [f"{facts['identity']}; {facts['start']}; {facts['duration']}; {facts['software']}"]
     for name, sensor in report.sensors.items():
         grid, spectrum = sensor.grid, sensor.spectrum
@@ -152,7 +152,7 @@ def spectrum_file(report: SpectrumReport, kind: str) -> bytes:
             f"{TITLES[name]}: {grid.rate_hz:.4f} Hz, {grid.missing} samples lost, {spectrum.averages} windows, "
             f"{spectrum.window.capitalize()}, noise bandwidth {spectrum.bandwidth_hz:.3g} Hz"
         )
-    return picture(spectrum_figure(report.sensors, f"Vibration of {report.taken.device}", lines), kind)
+    return picture(spectrum_figure(report.sensors, f"Vibration of {report.sample_set.device}", lines), kind)
 
 
 # --- JSON -------------------------------------------------------------------------------------------------------------
@@ -161,14 +161,14 @@ def spectrum_file(report: SpectrumReport, kind: str) -> bytes:
 def as_object(report: SpectrumReport) -> dict[str, Any]:
     """Return the report for `--json` in SI units."""
     return {
-        "measurement": measurement_object(report.taken),
+        "measurement": measurement_object(report.sample_set),
         "sensors": {
-            name: _sensor_object(report.taken, name, sensor) for name, sensor in report.sensors.items()
+            name: _sensor_object(report.sample_set, name, sensor) for name, sensor in report.sensors.items()
         },
     }  # fmt: skip
 
 
-def _sensor_object(taken: SampleSet, name: SensorName, sensor: SensorVibration) -> dict[str, Any]:
+def _sensor_object(sample_set: SampleSet, name: SensorName, sensor: SensorVibration) -> dict[str, Any]:
     spectrum = sensor.spectrum
     return {
         **grid_object(name, sensor.grid),
@@ -177,7 +177,7 @@ def _sensor_object(taken: SampleSet, name: SensorName, sensor: SensorVibration) 
         "bin_hz": spectrum.bin_hz,
         "bandwidth_hz": spectrum.bandwidth_hz,
         "averages": spectrum.averages,
-        "device_filter": taken.sheet.filter_words(taken.settings, name),
+        "device_filter": sample_set.sheet.filter_words(sample_set.settings, name),
         "peaks": [
             {
                 "frequency_hz": peak.frequency_hz,

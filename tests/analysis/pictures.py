@@ -58,11 +58,11 @@ def page() -> str:
     random, count = np.random.default_rng(SEED + 1), len(gyro)
     axes = [white(random, count, RATE_HZ, VRW_M_S_SQRT_H / ROOT_S_PER_ROOT_H) for _ in range(3)]
     accel = np.stack(axes, axis=1) + np.array([0.0, 0.0, 9.8])
-    taken = SampleSet(
+    sample_set = SampleSet(
         "simulated", "bow", "hipnuc-uart", identity={"product": PRODUCT},
         readings=Readings(stamps_ns(count, RATE_HZ), gyro, accel, None), stamps="true",
     )  # fmt: skip
-    return html(noise_report(taken, figures_for(taken.sheet, PRODUCT, None)))
+    return html(noise_report(sample_set, figures_for(sample_set.sheet, PRODUCT, None)))
 
 
 def noise_page_png(chromium: str) -> bytes:

@@ -17,7 +17,7 @@ COUNT = 10_000
 MILLI = ShownUnit("m", 1000.0)
 
 
-def taken_of(values: FloatArray, driver: str = "hipnuc-canopen") -> SampleSet:
+def sample_set_of(values: FloatArray, driver: str = "hipnuc-canopen") -> SampleSet:
     readings = Readings(stamps_ns(len(values), RATE_HZ), values, None, None)
     return SampleSet("a file", "bow", driver, "can0", {"product": "HI14"}, readings=readings, stamps="edge")
 
@@ -42,14 +42,14 @@ def test_cells_and_durations() -> None:
 
 def test_figures_hold_or_not_and_open_ones_have_no_verdict() -> None:
     sheet = ModelFigures(gyro=SensorFigures(random_walk=1.2e-3, noise_density=1e-3), source="a sheet")
-    report = noise_report(taken_of(noise_of_three()), sheet)
+    report = noise_report(sample_set_of(noise_of_three()), sheet)
     walk, density = comparisons(report, "gyro")
     assert (walk.quantity.key, walk.verdict) == ("random_walk", "within")
     assert walk.ratio == pytest.approx(1 / 1.2, rel=0.05)
     assert (density.quantity.key, density.verdict) == ("noise_density", "ABOVE")
     assert density.ratio == pytest.approx(np.sqrt(2), rel=0.05)
     report = noise_report(
-        taken_of(noise_of_three()),
+        sample_set_of(noise_of_three()),
         ModelFigures(gyro=SensorFigures(bias_instability=1e-6, rate_random_walk=10.0), source="a sheet"),
     )
     bias, walk = comparisons(report, "gyro")
@@ -59,18 +59,18 @@ def test_figures_hold_or_not_and_open_ones_have_no_verdict() -> None:
 
 def test_what_limits_the_figures() -> None:
     values = np.round(noise_of_three() / 1.7453293e-3) * 1.7453293e-3
-    report = noise_report(taken_of(values), None)
+    report = noise_report(sample_set_of(values), None)
     words = " ".join(limits(report, "gyro"))
     assert "multiples of 0.001745 rad/s (in the manual)" in words
     moved = noise_of_three()
     moved[2000:4000] += np.sin(np.arange(2000) / 10)[:, None]
-    words = " ".join(limits(noise_report(taken_of(moved, "imu61x-can"), None), "gyro"))
+    words = " ".join(limits(noise_report(sample_set_of(moved, "imu61x-can"), None), "gyro"))
     assert "NOT AT REST: 20 of 100 seconds" in words
     assert "filter of the device: low-pass 47 Hz as delivered" in words
 
 
 def test_the_text_names_what_is_not_compared_and_a_device_without_sensors_is_refused() -> None:
-    words = text(noise_report(taken_of(noise_of_three()), None))
+    words = text(noise_report(sample_set_of(noise_of_three()), None))
     assert "bow: noise" in words
     assert "product HI14" in words
     assert "No comparison with a data sheet: HiPNUC" in words

@@ -148,16 +148,20 @@ class Live:
         return take_live(Namespace(**given), lambda passed_s, count: self.notes.append((passed_s, count)))
 
 
-def kept(taken: SampleSet) -> int:
-    assert taken.readings is not None
-    return len(taken.readings.t_ns)
+def kept(sample_set: SampleSet) -> int:
+    assert sample_set.readings is not None
+    return len(sample_set.readings.t_ns)
 
 
 def test_a_live_device_is_taken_until_the_duration_or_an_interrupt(monkeypatch: pytest.MonkeyPatch) -> None:
     live = Live(monkeypatch, 100)
-    taken = live.take(duration=3.0)
-    assert (kept(taken), live.now_s) == (31, 4.0), "the sample after the duration ends it"
-    assert (taken.device, taken.source, taken.lost) == ("bow", "live from /s", {"lost_crc": 4, "dropped": 3})
+    sample_set = live.take(duration=3.0)
+    assert (kept(sample_set), live.now_s) == (31, 4.0), "the sample after the duration ends it"
+    assert (sample_set.device, sample_set.source, sample_set.lost) == (
+        "bow",
+        "live from /s",
+        {"lost_crc": 4, "dropped": 3},
+    )
     assert live.notes == [(1.0, 8), (2.0, 16), (3.0, 24), (4.0, 31)]
     assert kept(Live(monkeypatch, 100).take(skip=2.0, duration=1.0)) == 11
     assert kept(Live(monkeypatch, 45, interrupted=True).take()) == 45
