@@ -172,10 +172,7 @@ def figure_of(axis: AxisNoise, quantity: Quantity) -> Coefficient | None:
     if quantity.key == "least_deviation":
         most = axis.bias_instability_most
         return Coefficient(None, 0.0, most) if axis.least_at_end else Coefficient(most, 0.0, 0.0)
-    plain = {
-        "noise_density": axis.density, "mean": axis.mean, "spread": axis.spread
-    }  # fmt: skip
-    value = plain[quantity.key]
+    value = {"noise_density": axis.density, "mean": axis.mean, "spread": axis.spread}[quantity.key]
     return Coefficient(value, 0.0, 0.0) if np.isfinite(value) else None
 
 
