@@ -105,7 +105,7 @@ def test_scan_lists_the_modules_in_the_order_of_their_addresses(modbus: Commands
     lines = modbus("scan", *ON, "--addresses", "7").splitlines()
     assert lines[0].split() == ["BAUD", "ADDRESS", "PRODUCT", "SERIAL", "NUMBER", "FIRMWARE"]
     assert lines[1].split() == [str(LINE_BAUD), "7", "HI14R2N-485-000", serial(7), "1.5.2"]
-    assert "no module answers" in modbus("scan", *ON, "--addresses", "8", status=1)
+    assert "no device replies" in modbus("scan", *ON, "--addresses", "8", status=1)
 
 
 def test_scan_asks_again_for_a_missing_reply(modbus: Commands) -> None:
@@ -161,7 +161,7 @@ def test_an_address_is_changed_and_saved_unless_not_wanted(modbus: Commands) -> 
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        (("--from", "1", "--id", "2"), "address 2 is taken by HI14R2N-485-000"),
+        (("--from", "1", "--id", "2"), "address 2 is used by HI14R2N-485-000"),
         (("--from", "5", "--id", "6"), "no device replies at address 5"),
         (("--from", "1", "--id", "200"), "1 … 128"),
         (("--from", "0", "--id", "9"), "1 … 247"),
@@ -169,7 +169,7 @@ def test_an_address_is_changed_and_saved_unless_not_wanted(modbus: Commands) -> 
         (("--random", "1-9", "--id", "1"), "--id: expected the new address"),
         (("--random", "9"), "lowest below the highest"),
         (("--serial", serial(9), "--id", "9"), "no device replies at the new address 9"),
-        (("--serial", serial(9), "--id", "2"), "address 2 is taken"),
+        (("--serial", serial(9), "--id", "2"), "address 2 is used"),
         (("--serial", "12", "--id", "9"), "16 hexadecimal digits"),
         (("--from", "1", "--id", "9", "--reply-ms", "0"), "--reply-ms: expected 1 to 1000, got 0"),
         (("--from", "1", "--id", "9", "--reply-ms", "1001"), "--reply-ms: expected 1 to 1000, got 1001"),

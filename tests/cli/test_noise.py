@@ -65,8 +65,8 @@ def test_what_limits_the_figures() -> None:
     moved = noise_of_three()
     moved[2000:4000] += np.sin(np.arange(2000) / 10)[:, None]
     words = " ".join(limits(noise_report(sample_set_of(moved, "imu61x-can"), None), "gyro"))
-    assert "NOT AT REST: 20 of 100 seconds" in words
-    assert "filter of the device: low-pass 47 Hz as delivered" in words
+    assert "NOT AT REST: in 20 of 100 seconds" in words
+    assert "filter of the device: low-pass 47 Hz (factory setting" in words
 
 
 def test_the_text_names_what_is_not_compared_and_a_device_without_sensors_is_refused() -> None:

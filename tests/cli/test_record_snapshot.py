@@ -56,7 +56,7 @@ def test_a_snapshot_whose_begin_is_gone_replays_as_the_daemon_ran(
         again = [line for line in printed.out.splitlines() if f'"device":"{name}"' in line]
         assert 20 < len(again) < len(live)
         assert again == live[len(live) - len(again) :]
-    assert "integrity  whole" in cli("info", file).out
+    assert "integrity  complete" in cli("info", file).out
 
 
 @pytest.mark.live

@@ -53,7 +53,7 @@ def test_a_damaged_capture_is_status_1_and_one_that_is_cut_short_is_not(tmp_path
     file = tmp_path / "stamped"
     records = b"".join(RECORD.pack(n * 10 * NS_PER_MS, len(hi91(0))) + hi91(10 * n) for n in range(50))
     for content, status, words in (
-        (records[:-20], 0, "are a record cut short"),
+        (records[:-20], 0, "are an incomplete record"),
         (records + records, 1, "damaged at byte"),  # the time steps back
     ):
         file.write_bytes(b"#imud-capture 1 driver=hipnuc-uart baud=115200\n" + content)

@@ -106,7 +106,7 @@ def test_check_has_notes(tmp_path: Path, cli: Cli) -> None:
     )
     good, note = cli("check", file).out.splitlines()
     assert good == f"{file}: valid; devices: bow, stern"
-    assert note.startswith(f"{file}:2: note: bow: HI92 beside HI91 is dated by its arrival")
+    assert note.startswith(f"{file}:2: note: bow: HI92 next to HI91 is time-stamped by its arrival")
 
 
 @pytest.mark.parametrize(

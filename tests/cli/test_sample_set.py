@@ -69,7 +69,7 @@ def test_the_devices_own_time_where_reads_have_none() -> None:
     collector.by_device_time = True
     collector.add(sample(7))
     assert collector.readings().t_ns.tolist() == [7 * NS_PER_S // 10]
-    assert "its crystal" in collector.stamps()
+    assert "the device's crystal" in collector.stamps()
     with pytest.raises(BadArgument, match="neither arrival times nor device times"):
         collector.add(sample(8, t_dev_ns=None))
 

@@ -79,7 +79,7 @@ def test_values_in_place_of_the_declared_ones(daemon: RunningDaemon, words: tupl
     cli(*words, "--set", "sout_divisor=4", 'output={"hi91": 20}')
     assert (actual(daemon)["sout_divisor"], actual(daemon)["output"]["hi91"]) == (4, 20)
     out = cli(*words, "--set", "mounting=x_up", status=1).out
-    assert "not set: mounting comes into force by save and restart only" in out
+    assert "not set: mounting needs a save and a restart" in out
 
 
 def test_another_rate_is_asked_for_and_followed(

@@ -40,14 +40,14 @@ def test_the_page() -> None:
     pages = [view.page(collected(hz), SpectrumOptions(("accel",))).splitlines() for hz in (25.0, 75.0)]
     for page in pages:
         assert max(map(len, page)) <= COLUMNS
-        assert page[0] == "bow accelerometer: 200.000 Hz, 0 missing, bins of 1.56 Hz"
+        assert page[0] == "bow accelerometer: 200.000 Hz, 0 lost, bins of 1.56 Hz"
     first, second = pages
     for page, hz in ((first, 25), (second, 75)):
         top = next(row for row in page[2:] if row.strip())
         assert len(top) - 1 == pytest.approx(COLUMNS * hz / 100, abs=2), "the highest bar"
     past = second[2 + HEIGHT + 2 :][:2]
     darkest = [max(range(len(row)), key=lambda at, row=row: SHADES.index(row[at])) for row in past]  # type: ignore[misc]
-    assert darkest == [pytest.approx(60, abs=2), pytest.approx(20, abs=2)], "newest above"
+    assert darkest == [pytest.approx(60, abs=2), pytest.approx(20, abs=2)], "newest row first"
     assert any(line.startswith("  P1") and " 75.0" in line for line in second)
 
 
@@ -94,7 +94,7 @@ def test_it_is_redrawn_until_ctrl_c(tmp_path: Path) -> None:
         imud_process("spectrum", "--socket", daemon.socket, "bow", stdin=subprocess.DEVNULL, stdout=inside) as process,
     ):
         os.close(inside)
-        while text.count(b"newest above") < PAGES:  # on a slow host, the first pages have too few samples
+        while text.count(b"newest row first") < PAGES:  # on a slow host, the first pages have too few samples
             text += os.read(terminal, 65536)
         process.process.send_signal(signal.SIGINT)
         with suppress(OSError):  # EIO: the process closed the terminal, after a reader read all data
@@ -102,9 +102,9 @@ def test_it_is_redrawn_until_ctrl_c(tmp_path: Path) -> None:
                 os.read(terminal, 65536)
         assert process.end().err == ""
     os.close(terminal)
-    pages = [page for page in text.decode(errors="replace").split(CLEAR)[:-1] if "newest above" in page]
+    pages = [page for page in text.decode(errors="replace").split(CLEAR)[:-1] if "newest row first" in page]
     assert pages
     for page in pages:
         assert max(map(len, page.splitlines())) <= COLUMNS
-        assert re.match(r"bow accelerometer: [0-9.]+ Hz, \d+ missing", page), page
+        assert re.match(r"bow accelerometer: [0-9.]+ Hz, \d+ lost", page), page
         assert re.search(r"last \d+ s, newest row first", page), page
