@@ -85,7 +85,7 @@ def check_complaints(checks: Checks, _host: Host) -> None:
         wait_until(lambda: f"{NODE}" in open_files(), "another program has the port")
         start_service()
         wait_until(lambda: "in use by" in (device("usb") or {}).get("problem", ""), "the port is in use")
-        expect_finding("ports taken", "error", f"{NODE} is open in ", "stop that program")
+        expect_finding("ports taken", "error", f"{NODE} is open in another program", "stop the program")
         must("systemctl", "stop", HOLDER)
         wait_streaming("usb")
     with checks("imud doctor reports a user without the port's group, and its advice gives access"):
@@ -93,7 +93,7 @@ def check_complaints(checks: Checks, _host: Host) -> None:
         start_service()
         wait_until(lambda: "may not be opened" in (device("usb") or {}).get("problem", ""), "the port is refused")
         command = "usermod --append --groups dialout imud"
-        expect_finding("rights", "error", f"{NODE} may not be opened by user imud", f"`sudo {command}`")
+        expect_finding("rights", "error", f"user imud cannot open {NODE}", f"`sudo {command}`")
         must(*command.split())
         start_service()
         wait_streaming("usb")
@@ -101,13 +101,13 @@ def check_complaints(checks: Checks, _host: Host) -> None:
         allow("char-pts rw")
         wait_until(lambda: "EPERM" in (device("usb") or {}).get("problem", ""), "the port is refused")
         entry = "char-ttyUSB rw"
-        expect_finding("rules of the unit", "error", f"{NODE} is not allowed by the unit's DeviceAllow=", entry)
+        expect_finding("rules of the unit", "error", f"DeviceAllow= of imud.service does not allow {NODE}", entry)
         allow("char-pts rw", entry)
         wait_streaming("usb")
     with checks("imud doctor warns of a service that is not enabled"):
         must("systemctl", "disable", UNIT)
         try:
-            expect_finding("service", "warning", "it does not start at boot", "`sudo systemctl enable imud`")
+            expect_finding("service", "warning", "systemd does not start imud at boot", "`sudo systemctl enable imud`")
         finally:
             must("systemctl", "enable", UNIT)
 
