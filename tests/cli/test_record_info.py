@@ -22,7 +22,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_whole_damaged_cut_and_foreign_files(file: Path, cli: Cli, tmp_path: Path) -> None:
     page = cli("info", file).out
     assert "integrity  complete" in page
-    assert "dropped    nothing" in page
+    assert "dropped    0 records" in page
     assert "bow: " in page
     assert "driver imu61x-can" in page
     assert "bytes per sample" in page
