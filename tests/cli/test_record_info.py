@@ -47,7 +47,7 @@ def test_whole_damaged_cut_and_foreign_files(file: Path, cli: Cli, tmp_path: Pat
     (tmp_path / "damaged").write_bytes(data)
     page = " ".join(cli("info", tmp_path / "damaged", status=1).out.split())
     assert "start unknown: the block with the start time and the device names is damaged or missing" in page
-    assert "duration not known" in page
+    assert "duration unknown" in page
     assert "missing blocks according to their numbers: 1" in page
     (tmp_path / "a.csv").write_text("t_ns,accel\n" * 50)
     cli.refuses("not a recording of imud", "info", str(tmp_path / "a.csv"))

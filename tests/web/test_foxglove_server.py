@@ -113,7 +113,7 @@ def test_the_command_shows_what_the_device_sent(tmp_path: Path) -> None:
 
 
 def test_arguments_that_are_refused(cli: Cli) -> None:
-    tunnel = "expected --open as well, or no --address, and a tunnel: ssh -L 8765:"
+    tunnel = "add --open, or omit --address and use a tunnel: ssh -L 8765:"
     for address in ("0.0.0.0", "::", "192.168.1.2", "gateway"):
         cli.refuses(tunnel, "foxglove", "--address", address, "--port", "0")
     for option, value in {"--port": "70000", "--rate": "-1", "--allow-origin": "viewer.example"}.items():
