@@ -31,10 +31,8 @@ from imud.utc.receivers import RmcOptions
 class Clash(NamedTuple):
     """Two devices that cannot have the same port, address or frames."""
 
-    path: KeyPath
-    """Key to change."""
-    message: str
-    """Expected value, received value, and the owner."""
+    path: KeyPath  # key to change
+    message: str  # expected value, received value, and the owner
 
 
 class _Owned(NamedTuple):
@@ -191,10 +189,9 @@ def _fixed(name: str, options: Options | None, link: Options) -> object:
 
 
 KEY: Final = "frame"
+# Keys of `frame` with keys of their own.
 NESTED: Final[Mapping[str, type[Options]]] = {"axes": MountingAxes, "euler": MountingAngles}
-"""Keys of `frame` with keys of their own."""
-WAYS: Final = ("axes", "euler", "quat_wxyz")
-"""Keys for a rotation."""
+WAYS: Final = ("axes", "euler", "quat_wxyz")  # keys for a rotation
 
 
 def read_frame(keys: Keys, path: KeyPath, device: Mapping[str, Any]) -> FrameOptions | None:
@@ -257,10 +254,8 @@ def check_declination(
 
 
 LINK: Final = "uart"
-PULSE: Final = "pps"
-"""Key of the line for a pulse per second. A device with this line uses PPS and RMC sentences."""
-TRIGGER: Final = "sin"
-"""Key of the line with which imud drives the pulse input of the device."""
+PULSE: Final = "pps"  # Key of the line for a pulse per second. A device with this line uses PPS and RMC sentences.
+TRIGGER: Final = "sin"  # key of the line with which imud drives the pulse input of the device
 
 
 def read_lines(
@@ -365,11 +360,11 @@ def _lines_of_driver(drivers: Mapping[str, Driver], driver: object) -> frozenset
         return frozenset({PULSE})  # another check reports this problem and an unknown driver
 
 
+# Maximum number of devices, more than one process can serve. A longer file is a mistake of a generator.
 DEVICES_MAX: Final = 256
-"""Maximum number of devices, more than one process can serve. A longer file is a mistake of a generator."""
 NOISE: Final = "noise"
+# Pattern of device names. They are file names of shared memory, label values and words on a command line.
 DEVICE_NAME: Final = pattern(r"[a-z0-9][a-z0-9_-]{0,31}")
-"""Pattern of device names. They are file names of shared memory, label values and words on a command line."""
 
 
 class DeviceReader:

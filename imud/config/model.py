@@ -15,32 +15,23 @@ from imud.utc.receivers import RmcOptions
 @dataclass(frozen=True, slots=True)
 class DeviceConfig:
     name: str
-    driver: str
-    """Name in DRIVERS, or `auto`."""
-    options: Options | None
-    """Options of the driver; None with driver `auto`."""
+    driver: str  # name in DRIVERS, or `auto`
+    options: Options | None  # options of the driver; None with driver `auto`
     identify: bool
-    link: str
-    """Name in LINKS."""
+    link: str  # name in LINKS
     link_settings: Options
-    line: int = 0
-    """Line number of the name in the file. It is not a property of the device."""
-    lines: DeviceLines | None = None
-    """GPIO lines of the device; None if it has no lines."""
-    rmc: RmcOptions | None = None
-    """Source of the RMC sentences for the device; None if imud sends no sentences."""
+    line: int = 0  # Line number of the name in the file. It is not a property of the device.
+    lines: DeviceLines | None = None  # GPIO lines of the device; None if it has no lines
+    rmc: RmcOptions | None = None  # source of the RMC sentences for the device; None if imud sends no sentences
+    # Declared settings, an instance of `SettingsTable.declarable`; None if the configuration declares no settings.
     declared: Options | None = None
-    """Declared settings, an instance of `SettingsTable.declarable`; None if the configuration declares no settings."""
-    on_difference: OnDifference = OnDifference.REPORT
-    """Reaction of imud if a setting differs from its declaration."""
-    frame: FrameOptions | None = None
-    """Mounting of the sensor in its body; None to publish the sensor axes."""
+    on_difference: OnDifference = OnDifference.REPORT  # reaction of imud if a setting differs from its declaration
+    frame: FrameOptions | None = None  # mounting of the sensor in its body; None to publish the sensor axes
+    # Convention of the published samples; None: the convention of the device, or enu-flu if `frame` is set.
     convention: Convention | None = None
-    """Convention of the published samples; None: the convention of the device, or enu-flu if `frame` is set."""
+    # True heading minus magnetic heading, degrees; None: the heading stays unchanged.
     declination_deg: float | None = None
-    """True heading minus magnetic heading, degrees; None: the heading stays unchanged."""
-    noise: Deviations | None = None
-    """Standard deviations of the samples; None if they are unknown."""
+    noise: Deviations | None = None  # standard deviations of the samples; None if they are unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +40,9 @@ class Config:
 
     log_level: str
     state_dir: str
-    publishers: Mapping[str, Options]
-    """Options of each row of PUBLISHERS, with defaults for absent keys."""
-    devices: tuple[DeviceConfig, ...]
-    """Enabled devices in the order of the file."""
-    disabled: tuple[str, ...] = ()
-    """Names of devices with `enabled: false`."""
+    publishers: Mapping[str, Options]  # options of each row of PUBLISHERS, with defaults for absent keys
+    devices: tuple[DeviceConfig, ...]  # enabled devices in the order of the file
+    disabled: tuple[str, ...] = ()  # names of devices with `enabled: false`
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +53,7 @@ class Differences:
     devices_removed: tuple[str, ...]
     devices_changed: tuple[str, ...]
     publishers_changed: tuple[str, ...]
-    keys_changed: tuple[str, ...]
-    """Changed keys of the daemon: `log_level`, `state_dir`."""
+    keys_changed: tuple[str, ...]  # changed keys of the daemon: `log_level`, `state_dir`
 
     def __str__(self) -> str:
         """Return for example `devices added: front, rear; publishers changed: metrics`, or `nothing differs`."""

@@ -23,17 +23,13 @@ import yaml
 
 from imud.model.options import shown
 
-FILE_BYTES_MAX: Final = 1 << 20
-"""Maximum size of a file, bytes. 256 devices with all keys need 0.1 MB."""
-DEPTH_MAX: Final = 32
-"""Maximum depth of the tree. A configuration needs five levels."""
+FILE_BYTES_MAX: Final = 1 << 20  # Maximum size of a file, bytes. 256 devices with all keys need 0.1 MB.
+DEPTH_MAX: Final = 32  # Maximum depth of the tree. A configuration needs five levels.
+# Maximum number of problems. The comparison of their places takes time in proportion to the square of their number.
 PROBLEMS_MAX: Final = 1000
-"""Maximum number of problems. The comparison of their places takes time in proportion to the square of their number."""
-EVENTS_PER_TURN: Final = 64
-"""Number of parser events between two calls of `pause`: a third of a millisecond."""
+EVENTS_PER_TURN: Final = 64  # number of parser events between two calls of `pause`: a third of a millisecond
 
-Path = tuple[str | int, ...]
-"""Keys and indices from the top of the file to a value."""
+Path = tuple[str | int, ...]  # keys and indices from the top of the file to a value
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -57,15 +53,12 @@ class Problem:
 class YamlTree:
     """The document of a file: mappings with text keys, lists, text, numbers, true, false, null."""
 
-    data: object = None
-    """Root of the tree; None if a problem prevents reading."""
+    data: object = None  # root of the tree; None if a problem prevents reading
+    # False if the reader stopped at the last problem. Then `data` contains only the values before it.
     complete: bool = True
-    """False if the reader stopped at the last problem. Then `data` contains only the values before it."""
     problems: list[Problem] = field(default_factory=list)
-    values: dict[Path, SourcePosition] = field(default_factory=dict)
-    """Position of the value at each path."""
-    keys: dict[Path, SourcePosition] = field(default_factory=dict)
-    """Position of the key of the value at each path."""
+    values: dict[Path, SourcePosition] = field(default_factory=dict)  # position of the value at each path
+    keys: dict[Path, SourcePosition] = field(default_factory=dict)  # position of the key of the value at each path
 
     def mark(self, path: Path) -> SourcePosition:
         """Return the position of the value at `path`, or of its nearest parent that exists."""
@@ -176,10 +169,8 @@ class _Open:
 
     path: Path
     into: dict[str, object] | list[object]
-    key: str | None = None
-    """Key of the next value in a mapping."""
-    again: bool = False
-    """True if the mapping already contains the key. The reader then only checks the value."""
+    key: str | None = None  # key of the next value in a mapping
+    again: bool = False  # True if the mapping already contains the key. The reader then only checks the value.
 
 
 class _Builder:
@@ -293,8 +284,8 @@ _NULL = re.compile(r"~|null|Null|NULL|")
 _BOOL = re.compile(r"true|True|TRUE|false|False|FALSE")
 _INT = re.compile(r"[-+]?(0|[1-9][0-9]*)|0x[0-9a-fA-F]+|0o[0-7]+")
 _FLOAT = re.compile(r"[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?")
+# Maximum length of a number. All 64-bit numbers are shorter in any notation. Python refuses more than 4300 digits.
 _NUMBER_CHARACTERS_MAX = 40
-"""Maximum length of a number. All 64-bit numbers are shorter in any notation. Python refuses more than 4300 digits."""
 _TRAPS = (
     (re.compile(r"yes|no|on|off", re.IGNORECASE), "expected true or false, or text in quotes, got {0}"),
     (
@@ -333,8 +324,8 @@ def plain(word: str) -> object:
 
 
 PLAIN_KEY: Final = pattern(r"[A-Za-z_][A-Za-z0-9_]*")
+# Words that some readers of YAML do not read as text.
 WORDS: Final = frozenset({"yes", "no", "on", "off", "true", "false", "null", "nan", "inf", "infinity", "y", "n"})
-"""Words that some readers of YAML do not read as text."""
 
 
 def yaml_block(values: Mapping[str, object], indent: int = 0) -> str:

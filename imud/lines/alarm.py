@@ -21,13 +21,11 @@ class AlarmVerdict(StrEnum):
 
     UNKNOWN = "unknown"  # settings or angles are unknown, or an angle is too close to its limit
     RIGHT = "right"  # the level agrees with the angles
+    # An angle is out of its range, and the line is low: not connected, another pin, or pulled down.
     STUCK_LOW = "stuck_low"
-    """An angle is out of its range, and the line is low: not connected, another pin, or pulled down."""
-    STUCK_HIGH = "stuck_high"
-    """The line is high, and no angle is out of its range: inverted, another pin, or pulled up."""
+    STUCK_HIGH = "stuck_high"  # the line is high, and no angle is out of its range: inverted, another pin, or pulled up
+    # The line always agrees with roll and pitch exchanged. Only `AlarmCheck` finds this, because it needs the history.
     OTHER_AXIS = "other_axis"
-    """The line always agrees with roll and pitch exchanged. Only `AlarmCheck` finds this, because it needs the history.
-    """
 
 
 def judge(ranges: Mapping[str, AlarmRange], euler_rad: Vector3 | None, level: bool) -> AlarmVerdict:

@@ -19,19 +19,15 @@ from imud.formats.can import EXTENDED_FLAG, CyclicFrame, pack_frame
 from imud.model.errors import LinkError
 from imud.model.units import NS_PER_S, NS_PER_US
 
-TX_SETUP: Final = 1
-"""Operation: send a frame cyclically."""
-SETTIMER: Final = 0x0001
-"""Flag: the intervals in this message hold."""
-STARTTIMER: Final = 0x0002
-"""Flag: start now and send one frame immediately."""
+TX_SETUP: Final = 1  # operation: send a frame cyclically
+SETTIMER: Final = 0x0001  # flag: the intervals in this message hold
+STARTTIMER: Final = 0x0002  # flag: start now and send one frame immediately
+# Errors of a kernel without CAN_BCM.
 NO_MANAGER: Final = frozenset({errno.EPROTONOSUPPORT, errno.ESOCKTNOSUPPORT, errno.EAFNOSUPPORT})
-"""Errors of a kernel without CAN_BCM."""
 
+# `struct bcm_msg_head`: operation, flags, count, s and us of the first and second interval, identifier, frames.
 _HEAD: Final = struct.Struct("@3I4l2I")
-"""`struct bcm_msg_head`: operation, flags, count, s and us of the first and second interval, identifier, frames."""
-_PAD: Final = bytes(-_HEAD.size % 8)
-"""Padding: the frames after the head are aligned to eight bytes."""
+_PAD: Final = bytes(-_HEAD.size % 8)  # padding: the frames after the head are aligned to eight bytes
 
 
 class Sender(Protocol):

@@ -25,13 +25,12 @@ IN_DELETE: Final = 0x0200
 IN_DELETE_SELF: Final = 0x0400
 IN_MOVE_SELF: Final = 0x0800
 IN_ONLYDIR: Final = 0x0100_0000
+# Events to watch. IN_ATTRIB: udev sets group and mode after the kernel made the node.
 WATCH_MASK: Final = IN_ATTRIB | IN_MOVED_TO | IN_CREATE | IN_DELETE | IN_DELETE_SELF | IN_MOVE_SELF | IN_ONLYDIR
-"""Events to watch. IN_ATTRIB: udev sets group and mode after the kernel made the node."""
 
+# Size of the event buffer: at least 15 events of 16 bytes plus a name of at most 256 bytes (inotify(7)).
 EVENT_BUFFER_BYTES: Final = 4096
-"""Size of the event buffer: at least 15 events of 16 bytes plus a name of at most 256 bytes (inotify(7))."""
-LINKS_MAX: Final = 40
-"""Maximum number of symbolic links to follow, as in the kernel (path_resolution(7))."""
+LINKS_MAX: Final = 40  # maximum number of symbolic links to follow, as in the kernel (path_resolution(7))
 
 libc = ctypes.CDLL(None, use_errno=True)
 
@@ -117,27 +116,25 @@ def _nearest_directory(directory: Path) -> Path:
     return directory
 
 
+# Error numbers of `open` if no device exists at the path.
 MISSING: Final = frozenset({errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.ENOTDIR, errno.ESHUTDOWN})
-"""Error numbers of `open` if no device exists at the path."""
 REFUSED: Final = frozenset({errno.EACCES, errno.EPERM})
+# Error numbers of `open` and of its locks if another process or a kernel driver uses the device.
 HELD: Final = frozenset({errno.EBUSY, errno.EAGAIN})
-"""Error numbers of `open` and of its locks if another process or a kernel driver uses the device."""
+# Errors of a transfer after the adapter was removed.
 GONE: Final = frozenset({errno.ENOENT, errno.ENODEV, errno.ENOTDIR, errno.ESHUTDOWN, errno.EBADF})
-"""Errors of a transfer after the adapter was removed."""
+# Error numbers of a missing acknowledge: ENXIO (Documentation/i2c/fault-codes.rst), EREMOTEIO (Raspberry Pi).
 NOT_ACKNOWLEDGED: Final = frozenset({errno.ENXIO, errno.EREMOTEIO})
-"""Error numbers of a missing acknowledge: ENXIO (Documentation/i2c/fault-codes.rst), EREMOTEIO (Raspberry Pi)."""
 STUCK: Final = frozenset({errno.ETIMEDOUT})
 
+# Time to wait for access, s. udev sets the group of a node some milliseconds after the kernel made it.
 ACCESS_WAIT_S: Final = 1.0
-"""Time to wait for access, s. udev sets the group of a node some milliseconds after the kernel made it."""
+# Group of serial ports on Debian. Error messages name it if imud cannot read the group of the node.
 SERIAL_GROUP: Final = "dialout"
-"""Group of serial ports on Debian. Error messages name it if imud cannot read the group of the node."""
 PROC: Final = Path("/proc")
 OWN_PROCESS: Final = "this imud"
-COMMAND_BYTES: Final = 1024
-"""Maximum number of bytes to read of a command line."""
-CABLE: Final = "is the cable plugged in, and is the path right?"
-"""Hint for a user whose serial port does not exist."""
+COMMAND_BYTES: Final = 1024  # maximum number of bytes to read of a command line
+CABLE: Final = "is the cable plugged in, and is the path right?"  # hint for a user whose serial port does not exist
 
 
 class DeviceNode:

@@ -19,13 +19,10 @@ from imud.links.device_node import DeviceNode, bus_open_problem, transfer_proble
 from imud.model.errors import LinkError
 from imud.model.options import Options
 
-I2C_TIMEOUT: Final = 0x0702
-"""ioctl: timeout of the adapter in units of 10 ms (<linux/i2c-dev.h>)."""
-TIMEOUT_10MS: Final = 5
-"""Timeout of the bus, 10 ms: 40 times the 1.2 ms of 48 bytes at 400 kHz."""
+I2C_TIMEOUT: Final = 0x0702  # ioctl: timeout of the adapter in units of 10 ms (<linux/i2c-dev.h>)
+TIMEOUT_10MS: Final = 5  # timeout of the bus, 10 ms: 40 times the 1.2 ms of 48 bytes at 400 kHz
 SWITCHED_ON: Final = "is I2C switched on (`dtparam=i2c_arm=on` on a Raspberry Pi), is module i2c-dev loaded?"
-BLOCK_BYTES_MAX: Final = 32
-"""Maximum length of an I2C block read of an SMBus controller, bytes."""
+BLOCK_BYTES_MAX: Final = 32  # maximum length of an I2C block read of an SMBus controller, bytes
 
 
 class I2cOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):

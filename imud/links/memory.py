@@ -42,10 +42,8 @@ class MemoryPort:
         self.title = settings.name
         self.baud: int = 0 if settings.baud == "auto" else settings.baud
         self.writable = settings.writable
-        self.written: list[bytes] = []
-        """All writes, in order."""
-        self.counters = KernelCounters()
-        """Result of `kernel_counters`. A test can set it."""
+        self.written: list[bytes] = []  # all writes, in order
+        self.counters = KernelCounters()  # Result of `kernel_counters`. A test can set it.
         self.is_open = False
         self._present = asyncio.Event()
         self._present.set()
@@ -105,11 +103,9 @@ class MemoryLink(MemoryPort):
         super().__init__(settings)
         self.auto_baud = settings.baud == "auto"
         self.hold_ns = settings.hold_ns
-        self.bauds: list[int] = []
-        """All rates of `set_baud`, in order."""
+        self.bauds: list[int] = []  # all rates of `set_baud`, in order
         self.waiting_bytes = settings.waiting_bytes
-        self.paused = False
-        """True while fed bytes wait."""
+        self.paused = False  # True while fed bytes wait
         self._waiting = b""
         self._on_data: OnData | None = None
 
@@ -163,10 +159,8 @@ class MemoryCanLink(MemoryPort):
         self.bus = settings.name
         self.bitrate = self.baud
         self.filters: Sequence[CanFilter] = ()
-        self.gather_ns = 0
-        """Time for which the link holds frames, ns. This link ignores it."""
-        self.cyclic: Sequence[CyclicFrame] = ()
-        """Frames of the last `send_cyclic`; empty if the link is closed."""
+        self.gather_ns = 0  # Time for which the link holds frames, ns. This link ignores it.
+        self.cyclic: Sequence[CyclicFrame] = ()  # frames of the last `send_cyclic`; empty if the link is closed
         self._on_frames: OnFrames | None = None
         self._on_news: OnBusNews | None = None
 

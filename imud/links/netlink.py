@@ -10,8 +10,7 @@ from typing import Final, NamedTuple
 
 from imud.model.errors import LinkError
 
-RTMGRP_LINK: Final = 1
-"""Multicast group for changes of interfaces (RTNLGRP_LINK as a bit)."""
+RTMGRP_LINK: Final = 1  # multicast group for changes of interfaces (RTNLGRP_LINK as a bit)
 RTM_NEWLINK: Final = 16
 RTM_GETLINK: Final = 18
 NLM_F_REQUEST: Final = 1
@@ -22,8 +21,7 @@ IFLA_CAN_STATE: Final = 4
 IFF_UP: Final = 1
 ARPHRD_CAN: Final = 280
 NEWS_BYTES: Final = 65536
-ANSWER_S: Final = 1.0
-"""Maximum time to wait for a reply, s. The kernel replies within the system call."""
+ANSWER_S: Final = 1.0  # Maximum time to wait for a reply, s. The kernel replies within the system call.
 SYS: Final = Path("/sys")
 
 _HEADER: Final = struct.Struct("=IHHII")
@@ -34,10 +32,8 @@ _ATTRIBUTE: Final = struct.Struct("=HH")
 class CanDetails(NamedTuple):
     """Bit rate and state of a CAN interface; None if the driver does not report the value (virtual interfaces)."""
 
-    bitrate: int | None
-    """Bit rate of the bus, bit/s."""
-    state: int | None
-    """`enum can_state`: 0 error-active, 1 warning, 2 error-passive, 3 bus-off."""
+    bitrate: int | None  # bit rate of the bus, bit/s
+    state: int | None  # `enum can_state`: 0 error-active, 1 warning, 2 error-passive, 3 bus-off
 
 
 def absence(name: str, sys: Path = SYS) -> str:

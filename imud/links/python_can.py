@@ -20,8 +20,7 @@ from imud.formats.can import EXTENDED_FLAG, EXTENDED_ID_MAX, RAW_FRAME, CanFilte
 from imud.links.cyclic_sender import LoopSender
 from imud.model.errors import LinkError, reason_of
 
-LOOK_S: Final = 0.05
-"""Timeout of a read, s. After it, the thread checks whether to end."""
+LOOK_S: Final = 0.05  # Timeout of a read, s. After it, the thread checks whether to end.
 BATCH_FRAMES: Final = 64
 
 
@@ -39,8 +38,8 @@ class PythonCanLink:
         self._on_end: OnEnd | None = None
         self.title = self.bus = f"{channel} ({backend})"
         self.bitrate = bitrate
+        # Time for which the link holds frames, ns. This link ignores it: the receiving thread decides.
         self.gather_ns = 0
-        """Time for which the link holds frames, ns. This link ignores it: the receiving thread decides."""
         self.writable = True
 
     @property

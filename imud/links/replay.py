@@ -111,8 +111,7 @@ def unreadable(path: str, error: OSError) -> LinkError:
     return LinkError(f"{path} cannot be read: {error.strerror}")
 
 
-TURN_FRAMES: Final = 512
-"""Maximum number of frames in one turn of the event loop: 1 ms of decoding."""
+TURN_FRAMES: Final = 512  # maximum number of frames in one turn of the event loop: 1 ms of decoding
 
 log = logging.getLogger(__name__)
 
@@ -132,8 +131,7 @@ class CanReplayLink(FileReplay):
         self.filters: Sequence[CanFilter] = ()
         self.bus = settings.path
         self.bitrate = 0
-        self.gather_ns = 0
-        """Time for which the link holds frames, ns. This link ignores it: the recording decides."""
+        self.gather_ns = 0  # Time for which the link holds frames, ns. This link ignores it: the recording decides.
 
     def open(self) -> None:
         """Open the log and check that it contains frames. Raises LinkMissing, LinkDenied or LinkError."""
@@ -200,15 +198,14 @@ class CanReplayLink(FileReplay):
             origin_ns = due_ns + max((due_ns - origin_ns) // max(count, 1), NS_PER_MS)
 
 
+# Time on the wire of one piece at speed `real`, ns. A native UART delivers pieces of about this size.
 PIECE_NS: Final = 2 * NS_PER_MS
-"""Time on the wire of one piece at speed `real`, ns. A native UART delivers pieces of about this size."""
+# Maximum size of a piece of a capture without times, bytes: the size of a read from a port.
 PIECE_BYTES_MAX: Final = 65536
-"""Maximum size of a piece of a capture without times, bytes: the size of a read from a port."""
-TURN_BYTES: Final = 16384
-"""Maximum number of bytes in one turn of the event loop: 0.5 ms of decoding."""
+TURN_BYTES: Final = 16384  # maximum number of bytes in one turn of the event loop: 0.5 ms of decoding
 
+# Number of bytes at the start of a log in which the check of a configuration looks for a frame.
 LOOKED_AT_BYTES: Final = 65536
-"""Number of bytes at the start of a log in which the check of a configuration looks for a frame."""
 
 
 class ReplayLink(FileReplay):

@@ -47,14 +47,13 @@ from imud.model.options import Options, shown
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
 READ_BYTES: Final = 4096
-BROADCAST_NS: Final = 100 * NS_PER_MS
-"""Pause after a broadcast, ns: 100 to 200 ms in "MODBUS over Serial Line" 2.4.1."""
+BROADCAST_NS: Final = 100 * NS_PER_MS  # pause after a broadcast, ns: 100 to 200 ms in "MODBUS over Serial Line" 2.4.1
+# Share of the wire time of the missing bytes for which the thread sleeps. It saves wake-ups and is never late.
 ASLEEP_SHARE: Final = 0.9
-"""Share of the wire time of the missing bytes for which the thread sleeps. It saves wake-ups and is never late."""
 TIOCGRS485: Final = 0x542E
 TIOCSRS485: Final = 0x542F
+# `struct serial_rs485`: flags, delay_rts_before_send ms, delay_rts_after_send ms, padding (linux/serial.h).
 SERIAL_RS485: Final = struct.Struct("8I")
-"""`struct serial_rs485`: flags, delay_rts_before_send ms, delay_rts_after_send ms, padding (linux/serial.h)."""
 ENABLED: Final = 1 << 0
 RTS_ON_SEND: Final = 1 << 1
 UNSUPPORTED: Final = frozenset({errno.ENOTTY, errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP})
@@ -74,8 +73,7 @@ class Direction:
         """
         self._fd = fd
         self._before: bytes | None = None
-        self.by_kernel = False
-        """True if the driver switches the direction."""
+        self.by_kernel = False  # True if the driver switches the direction
         try:
             before = fcntl.ioctl(fd, TIOCGRS485, bytes(SERIAL_RS485.size))
             if not SERIAL_RS485.unpack(before)[0] & ENABLED:
@@ -101,8 +99,7 @@ class PortSetup(NamedTuple):
     """Options that all devices of a bus share."""
 
     path: str
-    baud: int
-    """Baud rate, bit/s."""
+    baud: int  # baud rate, bit/s
     direction: DirectionWish = "auto"
     echo: Echo = "auto"
 
@@ -118,14 +115,10 @@ class LineCounters:
     __slots__ = ("echoed", "late", "strange", "timeouts")
 
     def __init__(self) -> None:
-        self.echoed = 0
-        """Number of requests whose echo was received."""
-        self.late = 0
-        """Bytes received without a pending request."""
-        self.strange = 0
-        """Bytes received before a reply or in place of a reply."""
-        self.timeouts = 0
-        """Number of requests without a reply."""
+        self.echoed = 0  # number of requests whose echo was received
+        self.late = 0  # bytes received without a pending request
+        self.strange = 0  # bytes received before a reply or in place of a reply
+        self.timeouts = 0  # number of requests without a reply
 
 
 class Rs485Line:
@@ -137,8 +130,8 @@ class Rs485Line:
         path, baud = setup.path, setup.baud
         self.setup = setup
         self.counters = LineCounters()
+        # True if the port receives its own transmission; None until imud has observed it.
         self.echoes: bool | None = None if setup.echo == "auto" else setup.echo
-        """True if the port receives its own transmission; None until imud has observed it."""
         self._path = path
         self._now_ns = now_ns
         self._port: serial.Serial | None = open_port(path, baud, proc)
@@ -343,8 +336,7 @@ def _check_agreement(first: PortSetup, other: PortSetup) -> None:
         raise LinkError(f"{first.path}: expected the same {key} for all its devices, got {got}")
 
 
-SHARED_PORTS: Final = SharedPorts()
-"""Open buses of this process."""
+SHARED_PORTS: Final = SharedPorts()  # open buses of this process
 
 
 class Rs485Options(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -27,28 +27,25 @@ from imud.links.device_node import CABLE, PROC, errno_of, open_problem
 from imud.model.errors import LinkError, reason_of
 from imud.model.units import NS_PER_MS
 
-TCGETS2: Final = 0x802C542A
-"""ioctl: struct termios2, with the baud rate as a number (asm-generic/termbits.h)."""
+TCGETS2: Final = 0x802C542A  # ioctl: struct termios2, with the baud rate as a number (asm-generic/termbits.h)
 TERMIOS2_INTS: Final = 11
+# Place of the output rate in termios2: c_iflag c_oflag c_cflag c_lflag, c_line and c_cc[19] in five words, c_ispeed,
+# c_ospeed.
 OSPEED_INDEX: Final = 10
-"""Place of the output rate in termios2: c_iflag c_oflag c_cflag c_lflag, c_line and c_cc[19] in five words, c_ispeed,
-c_ospeed."""
+# Maximum relative error of the baud rate. A receiver samples 8N1 until 9.5 bits after the start edge: half a bit is 5
+# %, and the device can use a part of it.
 BAUD_TOLERANCE: Final = 0.03
-"""Maximum relative error of the baud rate. A receiver samples 8N1 until 9.5 bits after the start edge: half a bit is 5
-%, and the device can use a part of it."""
+# Assumed latency timer of USB adapters whose driver does not report it, ns: the longest usual value.
 UNKNOWN_USB_HOLD_NS: Final = 16 * NS_PER_MS
-"""Assumed latency timer of USB adapters whose driver does not report it, ns: the longest usual value."""
 ACM_HOLD_NS: Final = 1 * NS_PER_MS
-TIOCGICOUNT: Final = 0x545D
-"""ioctl: error counters of the serial driver (ioctl_tty(2))."""
+TIOCGICOUNT: Final = 0x545D  # ioctl: error counters of the serial driver (ioctl_tty(2))
+# Number of integers in serial_icounter_struct: cts dsr rng dcd rx tx frame overrun parity brk buf_overrun reserved[9].
 ICOUNTER_INTS: Final = 20
-"""Number of integers in serial_icounter_struct: cts dsr rng dcd rx tx frame overrun parity brk buf_overrun
-reserved[9]."""
 FRAME, OVERRUN, PARITY, BREAK, BUFFER_OVERRUN = 6, 7, 8, 9, 10
 
 
+# Attributes of pyserial for its two pipes, with which another thread can end a wait in `read` or `write`.
 PIPE_ENDS: Final = ("pipe_abort_read_r", "pipe_abort_read_w", "pipe_abort_write_r", "pipe_abort_write_w")
-"""Attributes of pyserial for its two pipes, with which another thread can end a wait in `read` or `write`."""
 
 
 class DescriptorPort(serial.Serial):
@@ -213,22 +210,18 @@ class TtyCounters:
         return relative(self._start, self._newest)
 
 
+# Names of nodes: USB adapters, USB virtual ports, PL011 (Raspberry Pi), 8250 and mini-UART, SC16IS7xx, Tegra, i.MX,
+# OMAP.
 NODE_KINDS: Final = ("ttyUSB", "ttyACM", "ttyAMA", "ttyS", "ttySC", "ttyTHS", "ttymxc", "ttyO")
-"""Names of nodes: USB adapters, USB virtual ports, PL011 (Raspberry Pi), 8250 and mini-UART, SC16IS7xx, Tegra, i.MX,
-OMAP."""
-UNKNOWN_TYPE: Final = "0"
-"""PORT_UNKNOWN of linux/serial_core.h: the driver made a node (ttyS4…) but found no UART."""
+UNKNOWN_TYPE: Final = "0"  # PORT_UNKNOWN of linux/serial_core.h: the driver made a node (ttyS4…) but found no UART
 ALIAS_DIRECTORIES: Final = ("by-id", "by-path")
 
 
 @dataclass(frozen=True, slots=True)
 class SerialPort:
-    path: str
-    """Path for the configuration: the by-id name if it is unique, otherwise by-path, otherwise the node."""
-    node: str
-    """Device node, for example `/dev/ttyUSB0`."""
-    title: str
-    """Manufacturer, product and serial number of a USB adapter; empty for other ports."""
+    path: str  # path for the configuration: the by-id name if it is unique, otherwise by-path, otherwise the node
+    node: str  # device node, for example `/dev/ttyUSB0`
+    title: str  # manufacturer, product and serial number of a USB adapter; empty for other ports
 
 
 def list_ports(dev: Path = Path("/dev"), sys: Path = Path("/sys")) -> list[SerialPort]:

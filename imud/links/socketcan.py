@@ -43,28 +43,22 @@ from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 CLASS_CONTROLLER: Final = 0x0004
 CLASS_BUS_OFF: Final = 0x0040
 CLASS_RESTARTED: Final = 0x0100
+# Classes of error frames to receive. Single errors of the bus are excluded: a bad cable causes thousands per second.
 WATCHED: Final = CLASS_CONTROLLER | CLASS_BUS_OFF | CLASS_RESTARTED
-"""Classes of error frames to receive. Single errors of the bus are excluded: a bad cable causes thousands per
-second."""
 
 RECEIVE_OVERFLOW: Final = 0x01
 WARNING: Final = 0x04 | 0x08
 PASSIVE: Final = 0x10 | 0x20
-ACTIVE: Final = 0x40
-"""Bits of the second data byte, for receiver and transmitter."""
+ACTIVE: Final = 0x40  # bits of the second data byte, for receiver and transmitter
 
 
 class ControllerState(IntEnum):
     """Error states of a CAN controller, with the numbers of `enum can_state` (linux/can/netlink.h)."""
 
-    ACTIVE = 0
-    """The controller takes part in all traffic."""
-    WARNING = 1
-    """An error counter is above 96."""
-    PASSIVE = 2
-    """An error counter is above 127. The controller does not send active error flags."""
-    BUS_OFF = 3
-    """The transmit error counter is above 255. The controller has left the bus."""
+    ACTIVE = 0  # the controller takes part in all traffic
+    WARNING = 1  # an error counter is above 96
+    PASSIVE = 2  # An error counter is above 127. The controller does not send active error flags.
+    BUS_OFF = 3  # The transmit error counter is above 255. The controller has left the bus.
 
 
 _WORDS: Final = {
@@ -92,8 +86,7 @@ class BusState:
         self.state = ControllerState(state) if known else ControllerState.ACTIVE  # type: ignore[arg-type]  # not None
         self.passive_count = 0
         self.bus_off_count = 0
-        self.overflows = 0
-        """Number of overflows of the controller's receive buffer."""
+        self.overflows = 0  # number of overflows of the controller's receive buffer
 
     @property
     def problem(self) -> str:
@@ -127,15 +120,15 @@ class BusState:
         return None
 
 
+# Maximum number of frames per read: 8 ms of a full bus at 1 Mbit/s. The next turn of the loop reads the rest.
 BATCH_FRAMES: Final = 64
-"""Maximum number of frames per read: 8 ms of a full bus at 1 Mbit/s. The next turn of the loop reads the rest."""
+# Socket option and message type of arrival times: two 64-bit integers, s and ns (Linux 5.1, asm-generic).
 SO_TIMESTAMPNS_NEW: Final = 64
-"""Socket option and message type of arrival times: two 64-bit integers, s and ns (Linux 5.1, asm-generic)."""
+# Socket option and message type of the number of frames that a full receive buffer dropped: u32.
 SO_RXQ_OVFL: Final = 40
-"""Socket option and message type of the number of frames that a full receive buffer dropped: u32."""
+# Maximum distance of two clock reads, ns. A longer distance means an interruption: imud reads again, at most
+# STEADY_TRIES times.
 STEADY_NS: Final = 20 * NS_PER_US
-"""Maximum distance of two clock reads, ns. A longer distance means an interruption: imud reads again, at most
-STEADY_TRIES times."""
 STEADY_TRIES: Final = 3
 _COUNT_MASK: Final = 0xFFFF_FFFF
 _NO_DATA_FLAGS: Final = ERROR_FLAG | REMOTE_FLAG
@@ -144,18 +137,17 @@ _WORD_BYTES: Final = struct.calcsize("P")
 _CONTROL_BYTES: Final = 64
 _STAMP: Final = f"{_WORD_BYTES + 4}xiqq"  # length, level, type, s, ns
 _DROPS: Final = f"{_WORD_BYTES + 4}xiI"  # length, level, type, count
+# Layout of the two control messages of the kernel, without lengths and levels.
 _CONTROL: Final = struct.Struct(f"={_STAMP}{_DROPS}{_CONTROL_BYTES - struct.calcsize(f'={_STAMP}{_DROPS}')}x")
-"""Layout of the two control messages of the kernel, without lengths and levels."""
 
-_Rows = Iterable[tuple[tuple[Any, ...], tuple[Any, ...]]]
-"""Frames and their control messages."""
+_Rows = Iterable[tuple[tuple[Any, ...], tuple[Any, ...]]]  # frames and their control messages
+# Function for class bits and data of an error frame. It returns whether frames are lost.
 OnErrorFrame = Callable[[int, bytes], bool]
-"""Function for class bits and data of an error frame. It returns whether frames are lost."""
 
 
 libc: Final = ctypes.CDLL(None, use_errno=True)
+# `recvmmsg` that keeps the interpreter lock. The calls never block.
 _receive: Final = ctypes.PyDLL(None, use_errno=True).recvmmsg
-"""`recvmmsg` that keeps the interpreter lock. The calls never block."""
 
 
 class MessageHeader(ctypes.Structure):
@@ -185,18 +177,17 @@ class Vector(ctypes.Structure):
 
 
 _MESSAGE_BYTES: Final = ctypes.sizeof(MessageBuffers)
+# Place of `control_bytes` in a header. `recvmmsg` reads only this field of its own output again.
 _CONTROL_SIZE_WORD: Final = MessageHeader.control_bytes.offset // _WORD_BYTES
-"""Place of `control_bytes` in a header. `recvmmsg` reads only this field of its own output again."""
+# Constructor of `CanFrame` at a third of the usual cost.
 _new_frame: Final[Callable[[tuple[int, bool, bytes, int, bool]], CanFrame]] = partial(tuple.__new__, CanFrame)
-"""Constructor of `CanFrame` at a third of the usual cost."""
 
 
+# Minimum change of the clock offset that counts as a step, ns. A smaller change can be an error of the two readings.
 STEP_NS: Final = 100 * NS_PER_US
-"""Minimum change of the clock offset that counts as a step, ns. A smaller change can be an error of the two
-readings."""
+# Maximum time between the time stamp of a frame and its arrival in the queue of the socket, ns. The queue of the kernel
+# delays it.
 BACKLOG_NS: Final = 5 * NS_PER_MS
-"""Maximum time between the time stamp of a frame and its arrival in the queue of the socket, ns. The queue of the
-kernel delays it."""
 
 
 class FrameReader:
@@ -212,8 +203,7 @@ class FrameReader:
         """Enable time stamps and the drop counter of the socket."""
         receiver.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS_NEW, 1)
         receiver.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
-        self.dropped = 0
-        """Number of frames that the kernel dropped because the receive buffer was full."""
+        self.dropped = 0  # number of frames that the kernel dropped because the receive buffer was full
         self._on_error = on_error
         self._now_ns = now_ns
         self._wall_ns = wall_ns
@@ -230,8 +220,8 @@ class FrameReader:
         )
         self._empty_ns = now_ns()
         self._newest_ns = self._empty_ns
+        # CLOCK_REALTIME minus CLOCK_MONOTONIC at the last read that emptied the queue, ns.
         self._empty_offset_ns = self._clocks()[0]
-        """CLOCK_REALTIME minus CLOCK_MONOTONIC at the last read that emptied the queue, ns."""
         self._lost = False
 
     def read(self) -> list[CanFrame]:
@@ -320,18 +310,15 @@ class FrameReader:
 
 
 NATIVE: Final = "socketcan"
+# Memory that the kernel charges for one queued frame, bytes, about (222 frames fit the usual 208 KiB).
 FRAME_BUFFER_BYTES: Final = 960
-"""Memory that the kernel charges for one queued frame, bytes, about (222 frames fit the usual 208 KiB)."""
+# Length of a data frame of six bytes without stuff bits, bit. A full bus of these frames fills half the buffer during a
+# hold.
 FRAME_BITS: Final = 95
-"""Length of a data frame of six bytes without stuff bits, bit. A full bus of these frames fills half the buffer during
-a hold."""
 HIGHEST_BITRATE: Final = 1_000_000
-TURN_FRAMES: Final = 1024
-"""Maximum number of frames in one turn of the event loop."""
-CAN_RAW_ERR_FILTER: Final = 2
-"""Option of SOL_CAN_RAW: classes of error frames to receive (linux/can/raw.h)."""
-SO_RCVBUFFORCE: Final = 33
-"""Socket option: receive buffer above net.core.rmem_max, with CAP_NET_ADMIN (asm-generic)."""
+TURN_FRAMES: Final = 1024  # maximum number of frames in one turn of the event loop
+CAN_RAW_ERR_FILTER: Final = 2  # option of SOL_CAN_RAW: classes of error frames to receive (linux/can/raw.h)
+SO_RCVBUFFORCE: Final = 33  # socket option: receive buffer above net.core.rmem_max, with CAP_NET_ADMIN (asm-generic)
 
 log = logging.getLogger(__name__)
 

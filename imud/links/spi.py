@@ -24,19 +24,18 @@ from imud.links.device_node import DeviceNode, bus_open_problem, transfer_proble
 from imud.model.errors import LinkError
 from imud.model.options import Options
 
-WR_MODE: Final = 0x40016B01
-"""ioctl _IOW('k', 1, __u8): set the SPI mode."""
+WR_MODE: Final = 0x40016B01  # ioctl _IOW('k', 1, __u8): set the SPI mode
 WR_BITS_PER_WORD: Final = 0x40016B03
 WR_MAX_SPEED_HZ: Final = 0x40046B04
+# `struct spi_ioc_transfer`: tx_buf, rx_buf, len, speed_hz, delay_usecs, bits_per_word, cs_change, tx_nbits, rx_nbits,
+# word_delay_usecs, pad.
 ROW: Final = struct.Struct("=QQIIHBBBBBB")
-"""`struct spi_ioc_transfer`: tx_buf, rx_buf, len, speed_hz, delay_usecs, bits_per_word, cs_change, tx_nbits, rx_nbits,
-word_delay_usecs, pad."""
+# Maximum number of rows in one ioctl. A row has 32 bytes. fcntl.ioctl blocks all other threads if the argument is
+# longer than 1024 bytes.
 ROWS_MAX: Final = 32
-"""Maximum number of rows in one ioctl. A row has 32 bytes. fcntl.ioctl blocks all other threads if the argument is
-longer than 1024 bytes."""
 SWITCHED_ON: Final = "is SPI switched on (`dtparam=spi=on` on a Raspberry Pi)?"
+# Maximum number of transfers with stored buffers. A device uses about ten different transfers.
 PREPARED_MAX: Final = 64
-"""Maximum number of transfers with stored buffers. A device uses about ten different transfers."""
 
 Ioctl = Callable[[int, int, bytes], object]
 

@@ -22,15 +22,14 @@ from imud.model.errors import LinkError, LinkMissing
 from imud.model.options import Options
 
 READ_BYTES: Final = 65536
+# A read of this size can leave bytes behind (n_tty delivers at most 4095 bytes): the link reads again.
 FULL_READ_BYTES: Final = 2048
-"""A read of this size can leave bytes behind (n_tty delivers at most 4095 bytes): the link reads again."""
+# Maximum number of waiting bytes: half of the buffer of n_tty (4095 bytes). At three quarters, n_tty stops the driver
+# of a USB adapter, and the adapter itself can hold only 256 bytes.
 WAITING_BYTES: Final = 2048
-"""Maximum number of waiting bytes: half of the buffer of n_tty (4095 bytes). At three quarters, n_tty stops the driver
-of a USB adapter, and the adapter itself can hold only 256 bytes."""
+# Maximum number of bytes to send. Requests have some dozens of bytes: more bytes mean that the port does not send.
 WRITE_QUEUE_BYTES: Final = 4096
-"""Maximum number of bytes to send. Requests have some dozens of bytes: more bytes mean that the port does not send."""
-DEFAULT_BAUD: Final = 115200
-"""Baud rate of a port that imud opens for detection, bit/s."""
+DEFAULT_BAUD: Final = 115200  # baud rate of a port that imud opens for detection, bit/s
 
 
 class UartOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):

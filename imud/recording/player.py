@@ -58,10 +58,10 @@ class PlayedDevice:
     # overruns that the kernel counted in the live run
     overruns: int = 0
     checks: int = 0  # number of check records
+    # Differences between replay and live run, one sentence for each check record that differs.
     differences: list[str] = field(default_factory=list)
-    """Differences between replay and live run, one sentence for each check record that differs."""
+    # Reasons for each new clock that replaced the clock of the live run.
     fresh_starts: list[str] = field(default_factory=list)
-    """Reasons for each new clock that replaced the clock of the live run."""
 
 
 class RecordedEvent(msgspec.Struct, frozen=True):

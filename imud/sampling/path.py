@@ -121,8 +121,8 @@ class PathContext:
     device_id: int
     ledger: Ledger
     publish: Callable[[Batch], None]
+    # Called with a text line or reply frame, and with CLOCK_MONOTONIC of its arrival, ns.
     on_message: Callable[[Message, int], object]
-    """Called with a text line or reply frame, and with CLOCK_MONOTONIC of its arrival, ns."""
     on_bad_frame: Callable[[BadFrame], None]
     overruns: Callable[[], int]  # returns the number of overruns that the kernel counted since the link was opened
     host: HostClock
@@ -132,11 +132,11 @@ class PathContext:
 class SamplePath(ABC):
     """Path from the data of one device to published samples. The subclasses receive the data."""
 
+    # Attributes that a recorded state does not contain: parts of the daemon, and statistics.
     NOT_STATE: ClassVar = frozenset({
         "_device", "_device_id", "_drain_edges", "_ledger", "_listener", "_now_ns", "_on_bad_frame", "_on_message",
         "_overruns", "_publish", "_rotation", "_status_mask", "_status_seen", "_utc_offset_ns", "frame", "latency",
     })  # fmt: skip
-    """Attributes that a recorded state does not contain: parts of the daemon, and statistics."""
 
     def __init__(self, clock: SampleClock, context: PathContext) -> None:
         self.clock = clock

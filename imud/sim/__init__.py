@@ -4,6 +4,7 @@ from imud.contracts.registry import Registry
 from imud.sim.can_module import CanSimulator
 from imud.sim.sensor import Simulator
 
+# Simulated devices on a pseudo-terminal.
 SIMULATORS: Registry[Simulator] = Registry(
     "simulator",
     {
@@ -12,8 +13,8 @@ SIMULATORS: Registry[Simulator] = Registry(
         "imu61x-uart": "imud.sim.imu61x.uart:SIMULATOR",
     },
 )
-"""Simulated devices on a pseudo-terminal."""
 
+# Simulated devices on a CAN interface.
 CAN_SIMULATORS: Registry[CanSimulator] = Registry(
     "simulator on CAN",
     {
@@ -23,4 +24,3 @@ CAN_SIMULATORS: Registry[CanSimulator] = Registry(
         "imu61x-can": "imud.sim.imu61x.can:SIMULATOR",
     },
 )
-"""Simulated devices on a CAN interface."""

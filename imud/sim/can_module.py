@@ -16,28 +16,25 @@ from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.physics import Truth
 from imud.sim.sensor import SensorHardware, SimulatorOptions
 
+# Mean number of stuff bits in a frame. The model ignores that frames with fewer than eight bytes are shorter.
 STUFF_BITS: Final = 9
-"""Mean number of stuff bits in a frame. The model ignores that frames with fewer than eight bytes are shorter."""
 BITRATE: Final = 500_000
 
 
 class SentFrame(NamedTuple):
     """A frame that was sent completely."""
 
-    due_ns: int
-    """CLOCK_MONOTONIC of the end of the frame."""
+    due_ns: int  # CLOCK_MONOTONIC of the end of the frame
     can_id: int
     extended: bool
     data: bytes
-    sample_ns: int | None = None
-    """CLOCK_MONOTONIC of the measurement; None if the frame contains no measurement."""
+    sample_ns: int | None = None  # CLOCK_MONOTONIC of the measurement; None if the frame contains no measurement
 
 
 class CanModule(Protocol):
     """A simulated device. Times are CLOCK_MONOTONIC in ns and never go backwards. Synchronization: one thread."""
 
-    epoch_ns: int
-    """Zero of the motion, ns: the truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`."""
+    epoch_ns: int  # zero of the motion, ns: the truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`
 
     def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
         """Receive a frame of another node."""
@@ -68,13 +65,11 @@ class CanModule(Protocol):
 class CanSimulator:
     """Row of a simulated CAN device."""
 
-    name: str
-    """Name of the driver of the device."""
-    title: str
-    """Name of the product."""
+    name: str  # name of the driver of the device
+    title: str  # name of the product
+    # Function that makes the device, with power on at the given CLOCK_MONOTONIC. Raises ValueError for unsupported
+    # options.
     make: Callable[[SimulatorOptions, int], CanModule]
-    """Function that makes the device, with power on at the given CLOCK_MONOTONIC. Raises ValueError for unsupported
-    options."""
 
 
 class FrameWire:

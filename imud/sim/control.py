@@ -98,8 +98,7 @@ def _duration_ns(text: str) -> int:
 
 
 ADAPTERS: Final = {profile.name: profile for profile in (BARE_UART, USB_1MS, USB_16MS)}
-DEVICE: Final = "hipnuc-uart"
-"""Driver of the device that is simulated by default."""
+DEVICE: Final = "hipnuc-uart"  # driver of the device that is simulated by default
 
 
 def make_parser() -> argparse.ArgumentParser:

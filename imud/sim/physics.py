@@ -21,13 +21,11 @@ from typing import Final, NamedTuple, Protocol
 from imud.attitude.rotation import Matrix3, euler312_from_quat, quat_from_euler312, quat_from_matrix, quat_product
 from imud.model.sample import Quaternion, Vector3
 
-GRAVITY_M_S2: Final = 9.8
-"""1 G of HiPNUC, m/s². A device at rest then reads |accel| = 1."""
+GRAVITY_M_S2: Final = 9.8  # 1 G of HiPNUC, m/s². A device at rest then reads |accel| = 1.
+# Earth's magnetic field, east, north, up, T: about 45 µT, to the north and down as in the northern subtropics.
 FIELD_ENU_T: Final[Vector3] = (-3.0e-6, 36.0e-6, -27.0e-6)
-"""Earth's magnetic field, east, north, up, T: about 45 µT, to the north and down as in the northern subtropics."""
 SEA_LEVEL_PA: Final = 101_325.0
-PA_PER_M: Final = -12.0
-"""Change of air pressure with height near sea level, Pa/m."""
+PA_PER_M: Final = -12.0  # change of air pressure with height near sea level, Pa/m
 TEMPERATURE_C: Final = 35.0
 WARMING_C: Final = 1.5
 WARMING_PERIOD_S: Final = 600.0
@@ -36,14 +34,11 @@ WARMING_PERIOD_S: Final = 600.0
 class Truth(NamedTuple):
     """Measurement of an ideal sensor at one instant. Vectors are in the right-handed sensor frame."""
 
-    accel_m_s2: Vector3
-    """Specific force, m/s²: +g on the axis that points up at rest."""
+    accel_m_s2: Vector3  # specific force, m/s²: +g on the axis that points up at rest
     gyro_rad_s: Vector3
     mag_t: Vector3
-    euler_rad: Vector3
-    """Roll (about Y), pitch (about X), yaw (about Z, counter-clockwise), order 312."""
-    quat_wxyz: Quaternion
-    """Rotation from body to ENU."""
+    euler_rad: Vector3  # roll (about Y), pitch (about X), yaw (about Z, counter-clockwise), order 312
+    quat_wxyz: Quaternion  # rotation from body to ENU
     temperature_c: float
     pressure_pa: float
 
@@ -67,8 +62,7 @@ class Sine:
 
 Sines = tuple[Sine, ...]
 _Terms = tuple[tuple[float, float, float], ...]
-_Turn = tuple[float, float, float, float, float, float]
-"""Sine and cosine of roll, pitch and yaw."""
+_Turn = tuple[float, float, float, float, float, float]  # sine and cosine of roll, pitch and yaw
 
 
 class Swing:
@@ -186,12 +180,12 @@ class Still:
         return self._truth._replace(temperature_c=TEMPERATURE_C + warming_c)
 
 
+# Motions by name. The argument is the local gravity, m/s².
 MOTIONS: Final[dict[str, Callable[[float], Motion]]] = {
     "swing": swing,
     "tumble": tumble,
     "still": lambda gravity_m_s2: Still(gravity_m_s2=gravity_m_s2),
 }
-"""Motions by name. The argument is the local gravity, m/s²."""
 
 UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
@@ -258,9 +252,8 @@ def _cross(a: Vector3, b: Vector3) -> Vector3:
 
 NORMAL_BITS: Final = 12
 NORMAL_MASK: Final = (1 << NORMAL_BITS) - 1
+# Equally likely values of the normal distribution. The choice of one value takes a fifth of the time of `random.gauss`.
 NORMAL: Final = tuple(NormalDist().inv_cdf((i + 0.5) / (1 << NORMAL_BITS)) for i in range(1 << NORMAL_BITS))
-"""Equally likely values of the normal distribution. The choice of one value takes a fifth of the time of
-`random.gauss`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,8 +271,8 @@ class NoiseLevels:
     gyro_bias_rad_s: float = 0.0005
     mag_bias_t: float = 0.3e-6
     pressure_pa: float = 0.2
+    # Period of the bias of the first axis, s. The periods of the other axes are slightly longer.
     bias_period_s: float = 300.0
-    """Period of the bias of the first axis, s. The periods of the other axes are slightly longer."""
 
 
 class Noise:

@@ -10,13 +10,10 @@ from imud.sim.physics import GRAVITY_M_S2, MOTIONS, Motion, Noise, Truth, swing
 class Burst(NamedTuple):
     """Bytes that leave the device in one piece."""
 
-    due_ns: int
-    """CLOCK_MONOTONIC of the end of the last byte on the wire."""
+    due_ns: int  # CLOCK_MONOTONIC of the end of the last byte on the wire
     data: bytes
-    sample_ns: int | None = None
-    """CLOCK_MONOTONIC of the measurement; None for text."""
-    device_ms: int | None = None
-    """Device time of the measurement since power-on, ms, without wrap."""
+    sample_ns: int | None = None  # CLOCK_MONOTONIC of the measurement; None for text
+    device_ms: int | None = None  # device time of the measurement since power-on, ms, without wrap
 
 
 class StreamModule(Protocol):
@@ -27,8 +24,7 @@ class StreamModule(Protocol):
         """Current baud rate, bit/s."""
         ...
 
-    epoch_ns: int
-    """Zero of the motion, ns: the truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`."""
+    epoch_ns: int  # zero of the motion, ns: the truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`
 
     def receive(self, data: bytes, now_ns: int) -> None:
         """Receive bytes from the host, sampled at the baud rate of the device."""
@@ -92,13 +88,11 @@ class SimulatorOptions:
 class Simulator:
     """Row of a simulated device."""
 
-    name: str
-    """Name of the driver of the device."""
-    title: str
-    """Name of the product."""
+    name: str  # name of the driver of the device
+    title: str  # name of the product
+    # Function that makes the device, with power on at the given CLOCK_MONOTONIC. Raises ValueError for unsupported
+    # options.
     make: Callable[[SimulatorOptions, int], StreamModule]
-    """Function that makes the device, with power on at the given CLOCK_MONOTONIC. Raises ValueError for unsupported
-    options."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,12 +101,9 @@ class SensorHardware:
 
     motion: Motion = field(default_factory=swing)
     noise: Noise | None = None
-    skew_ppm: float = 20.0
-    """Rate error of the crystal relative to the host clock, 1e-6."""
-    boot_ms: int = 500
-    """Silence after power-on and restart, ms."""
-    processing_ns: int = 125_000
-    """Time from the measurement to the first bit on the wire, ns."""
+    skew_ppm: float = 20.0  # rate error of the crystal relative to the host clock, 1e-6
+    boot_ms: int = 500  # silence after power-on and restart, ms
+    processing_ns: int = 125_000  # time from the measurement to the first bit on the wire, ns
 
     def reading(self, t_s: float) -> Truth:
         """Return the measured values at `t_s` seconds after the zero of the motion."""

@@ -57,12 +57,9 @@ class RmcOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True)
 class RmcSource(Protocol):
     """Source of sentences, valid or not. It recovers from failures. Synchronization: the event loop's thread only."""
 
-    title: str
-    """Name of the source for the user. Example: `gpsd at 127.0.0.1:2947`."""
-    problem: str
-    """Reason why the source delivers no sentences, one sentence; empty if it delivers sentences."""
-    sentences: int
-    """Number of sentences since the start."""
+    title: str  # Name of the source for the user. Example: `gpsd at 127.0.0.1:2947`.
+    problem: str  # reason why the source delivers no sentences, one sentence; empty if it delivers sentences
+    sentences: int  # number of sentences since the start
 
     def start(self, on_sentence: OnSentence) -> None:
         """Start to deliver sentences. Needs a running event loop."""
@@ -75,10 +72,8 @@ class RmcSource(Protocol):
 
 class SourceContext(NamedTuple):
     make_port: MakePort
-    now_ns: Callable[[], int]
-    """CLOCK_MONOTONIC, ns."""
-    utc_offset_ns: Callable[[], int]
-    """CLOCK_REALTIME minus CLOCK_MONOTONIC, ns."""
+    now_ns: Callable[[], int]  # CLOCK_MONOTONIC, ns
+    utc_offset_ns: Callable[[], int]  # CLOCK_REALTIME minus CLOCK_MONOTONIC, ns
 
 
 # Makes a source. `imud.utc.RMC_SOURCES` contains one for each value of `RmcOptions.source`.

@@ -45,8 +45,8 @@ class KernelClock(NamedTuple):
     """State of the system clock in the kernel."""
 
     synchronised: bool  # whether a daemon synchronizes the clock
+    # One-sigma error according to the daemon, µs; 0 if the daemon sets none (systemd-timesyncd).
     estimated_error_us: int
-    """One-sigma error according to the daemon, µs; 0 if the daemon sets none (systemd-timesyncd)."""
     most_error_us: int  # bound of the error, µs
 
     @property

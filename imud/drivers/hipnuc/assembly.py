@@ -180,9 +180,9 @@ STRAYS_MAX: Final = 40
 # Limit and weight of frames without a place in a burst; each complete sample subtracts 1. Above the limit, imud learns
 # everything again: a device that sends a kind more often than the first kind of a burst causes such frames.
 STRAY_WEIGHT: Final = 2
+# Number of equal consecutive distances for the first m; for another m; for a multiple of the known m (losses can cause
+# a multiple).
 AGREE_FIRST, AGREE_OTHER, AGREE_MULTIPLE = 2, 3, 4
-"""Number of equal consecutive distances for the first m; for another m; for a multiple of the known m (losses can cause
-a multiple)."""
 # Number of equal consecutive distances for a kind in every burst. Lost bursts shorten the distance of a slow kind; as a
 # fast kind it would change the period.
 AGREE_FAST: Final = 6

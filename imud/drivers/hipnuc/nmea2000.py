@@ -48,8 +48,7 @@ ATTITUDE_LAYOUT: Final = struct.Struct("<BhhhB")
 RAD_PER_LSB: Final = 1e-4
 RATE_RAD_S_PER_LSB: Final = 1e-6 / 32
 
-I16_MOST, U16_MOST, I32_MOST, SID_MOST = 0x7FFC, 0xFFFC, 0x7FFF_FFFC, 252
-"""Maximum counts that are values."""
+I16_MOST, U16_MOST, I32_MOST, SID_MOST = 0x7FFC, 0xFFFC, 0x7FFF_FFFC, 252  # maximum counts that are values
 
 
 class Reference(IntEnum):

@@ -52,16 +52,15 @@ def random_vector(random: Random, spread: float) -> Vector3:
     return (random.gauss(0, spread), random.gauss(0, spread), random.gauss(0, spread))
 
 
+# Readable convention of `euler_rad`. The vendor's driver assumes this order.
+# The vendor contradicts itself about the axes: its ROS 1 driver reverses Y and Z, pitch and yaw, as for a device with Z
+# down. Its ROS 2 driver and its serial library do not. imud passes on the values as sent. If a level device reports
+# -9.8 m/s² in Z, its Z points down: `frame: {z_down: true}` in the configuration corrects it. imud reports this case
+# when the device is at rest (`imud.attitude.gravity`).
 EULER_CONVENTION: Final = (
     "ZYX, assumed (the manual states none): yaw about Z, then pitch about Y, then roll about X; right-handed; "
     "whether Z points up or down is not settled"
 )
-"""Readable convention of `euler_rad`. The vendor's driver assumes this order.
-
-The vendor contradicts itself about the axes: its ROS 1 driver reverses Y and Z, pitch and yaw, as for a device with Z
-down. Its ROS 2 driver and its serial library do not. imud passes on the values as sent. If a level device reports -9.8
-m/s² in Z, its Z points down: `frame: {z_down: true}` in the configuration corrects it. imud reports this case when the
-device is at rest (`imud.attitude.gravity`)."""
 # Destination frame of the rotation `quat_wxyz`, which imud computes from the Euler angles
 NAVIGATION_FRAME: Final = (
     "level, Z up (assumed, the manual states none; with the device's Z down it is Z down); "

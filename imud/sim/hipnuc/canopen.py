@@ -62,8 +62,8 @@ BAD_COMMAND: Final = 0x0504_0001
 
 DEVICE_TYPE: Final = 0
 NAME: Final = b"HI14"
+# Identity values, invented: the manual contains none.
 IDENTITY_VALUES: Final = {1: 0x0000_03E8, 2: 0x0000_0E14, 3: 0x0000_009C, 4: 0x1708_0042}
-"""Identity values, invented: the manual contains none."""
 PERIODS_MS: Final = (0, *range(5, 1001))
 _BIT_RATE_OF: Final = {code: bit_s for bit_s, code in BIT_RATES.items()}
 _COMMANDS: Final = {size: command for command, size in reversed(READ_SIZES.items())}
@@ -82,22 +82,18 @@ class Control(Enum):
 class NodeVariant:
     """Behavior that differs between devices or that the manuals do not define."""
 
-    reads: Literal["answered", "ignored", "aborted"] = "answered"
-    """Reply to SDO uploads."""
+    reads: Literal["answered", "ignored", "aborted"] = "answered"  # reply to SDO uploads
+    # True: a new node number applies immediately. False: after save and restart, as in the manual.
     number_at_once: bool = False
-    """True: a new node number applies immediately. False: after save and restart, as in the manual."""
-    confirms_from: Literal["old", "new"] = "old"
-    """Node number of the confirmation if a new number applies immediately."""
+    confirms_from: Literal["old", "new"] = "old"  # node number of the confirmation if a new number applies immediately
     sends_boot_up: bool = True
     confirms_restart: bool = True
-    flash_ms: int = 0
-    """Time of a save until its confirmation, ms."""
-    refuses: frozenset[int] = frozenset()
-    """Objects whose write the device aborts."""
-    ignores: frozenset[int] = frozenset()
-    """Objects whose write the device confirms without an effect."""
+    flash_ms: int = 0  # time of a save until its confirmation, ms
+    refuses: frozenset[int] = frozenset()  # objects whose write the device aborts
+    ignores: frozenset[int] = frozenset()  # objects whose write the device confirms without an effect
 
 
+# A variant for each undefined behavior. Drivers support all of them.
 NODE_VARIANTS: Final[Mapping[str, NodeVariant]] = {
     "manual": NodeVariant(),
     "ignores reads": NodeVariant(reads="ignored"),
@@ -109,7 +105,6 @@ NODE_VARIANTS: Final[Mapping[str, NodeVariant]] = {
     "restarts without a word": NodeVariant(sends_boot_up=False, confirms_restart=False),
     "slow flash": NodeVariant(flash_ms=1900),
 }
-"""A variant for each undefined behavior. Drivers support all of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +112,7 @@ class NodeSettings:
     """Settings that can be saved."""
 
     node: int = NODE_DEFAULT
-    bit_rate: int = 500_000
-    """Bit rate, bit/s; 0: frames take no time."""
+    bit_rate: int = 500_000  # bit rate, bit/s; 0: frames take no time
     periods_ms: Mapping[int, int] = field(default_factory=lambda: {1: 10, 2: 10, 3: 10, 4: 10, 6: 50, 7: 10})
     types: Mapping[int, int] = field(default_factory=lambda: dict.fromkeys(TPDO_FUNCTIONS, 0xFF))
     invert_x: int = 0
@@ -134,8 +128,7 @@ class NodeSettings:
 class _Entry(NamedTuple):
     size: int
     read: Callable[[NodeSettings], int] | None
-    values: Container[int] = ()
-    """Accepted values; empty if the object is read-only."""
+    values: Container[int] = ()  # accepted values; empty if the object is read-only
     write: Callable[[NodeSettings, int], NodeSettings] | None = None
 
 
@@ -257,8 +250,8 @@ _ENTRIES: Final = _entries()
 
 RATE_MIN_HZ, RATE_MAX_HZ = 1, 200
 TICKS_PER_S: Final = 1000
+# TPDOs that the device sends at the rate of the options. The pressure has a rate of at most 20 Hz (section 5.2).
 TPDOS_DEFAULT: Final = (1, 2, 3, 4, 7)
-"""TPDOs that the device sends at the rate of the options. The pressure has a rate of at most 20 Hz (section 5.2)."""
 PRESSURE_PERIOD_MS: Final = 50
 
 

@@ -24,19 +24,16 @@ from imud.sim.can_module import BITRATE, CanSimulator, FrameWire, SentFrame
 from imud.sim.physics import Truth
 from imud.sim.sensor import SensorHardware, SimulatorOptions, sensor_of
 
-INTERVAL_MS: Final = 100
-"""Default interval of each message, ms."""
-REPLY_NS: Final = 200_000
-"""Time from a request to its reply (assumed)."""
+INTERVAL_MS: Final = 100  # default interval of each message, ms
+REPLY_NS: Final = 200_000  # time from a request to its reply (assumed)
+# PGNs that are on, by the name of a message; empty name: the default of the factory.
 MESSAGES: Final = {
     "": (codec.ACCEL, codec.GYRO, codec.ROLL_PITCH, codec.HEADING),
     "all": codec.PGNS,
     "inclinometer": (codec.INCLINOMETER,),
 }
-"""PGNs that are on, by the name of a message; empty name: the default of the factory."""
 SLOW: Final = (codec.TEMPERATURE, codec.UTC)
-SLOW_MS: Final = 1000
-"""Interval of the slow messages of `all`, ms."""
+SLOW_MS: Final = 1000  # interval of the slow messages of `all`, ms
 YEAR: Final = 2025
 
 
@@ -44,23 +41,20 @@ YEAR: Final = 2025
 class J1939Variant:
     """Behavior that differs between devices or that the manuals do not define."""
 
+    # Reads with a reply: all reads, reads with the value 1, or none.
     reads: Literal["answered", "value_one", "ignored"] = "answered"
-    """Reads with a reply: all reads, reads with the value 1, or none."""
-    address_at_once: bool = False
-    """True: a new address applies immediately. False: after save and restart."""
+    address_at_once: bool = False  # True: a new address applies immediately. False: after save and restart.
+    # Source address of the confirmation if a new address applies immediately.
     confirms_from: Literal["old", "new"] = "old"
-    """Source address of the confirmation if a new address applies immediately."""
     claims_address: bool = True
     confirms_restart: bool = False
     confirms_once: bool = False
-    flash_ms: int = 0
-    """Time of a save until its confirmation, ms."""
-    refuses: frozenset[int] = frozenset()
-    """Registers whose write the device refuses with a status."""
-    ignores: frozenset[int] = frozenset()
-    """Registers whose write the device confirms without an effect."""
+    flash_ms: int = 0  # time of a save until its confirmation, ms
+    refuses: frozenset[int] = frozenset()  # registers whose write the device refuses with a status
+    ignores: frozenset[int] = frozenset()  # registers whose write the device confirms without an effect
 
 
+# A variant for each undefined behavior. Drivers support all of them.
 J1939_VARIANTS: Final[Mapping[str, J1939Variant]] = {
     "real": J1939Variant(),
     "confirms everything": J1939Variant(confirms_restart=True, confirms_once=True),
@@ -72,38 +66,33 @@ J1939_VARIANTS: Final[Mapping[str, J1939Variant]] = {
     "claims no address": J1939Variant(claims_address=False),
     "slow flash": J1939Variant(flash_ms=1900),
 }
-"""A variant for each undefined behavior. Drivers support all of them."""
 
-REFUSED: Final = 1
-"""Status of a refusal. Assumption: the programs of the vendor accept only 0."""
+REFUSED: Final = 1  # Status of a refusal. Assumption: the programs of the vendor accept only 0.
 PRODUCT: Final = "HI14R2N-CAN-000"
 FIRMWARE: Final = 169
+# NAME of the device, invented: arbitrary address capable, an identity number.
 NAME: Final = (1 << 63 | 0x2A_1708).to_bytes(8, "little")
-"""NAME of the device, invented: arbitrary address capable, an identity number."""
 
 
 @dataclass(frozen=True, slots=True)
 class J1939Settings:
     """Settings in flash."""
 
+    # Interval of each message that is on, ms.
     intervals_ms: Mapping[int, int] = field(default_factory=lambda: dict.fromkeys(MESSAGES[""], INTERVAL_MS))
-    """Interval of each message that is on, ms."""
     bitrate_code: int = commands.BITRATES.index(BITRATE)
     address: int = FACTORY_ADDRESS
     x_reversed: int = 0
     y_reversed: int = 0
-    zero_rad: tuple[float, float] = (0.0, 0.0)
-    """Physical angles that read as zero, rad."""
+    zero_rad: tuple[float, float] = (0.0, 0.0)  # physical angles that read as zero, rad
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class J1939Hardware(SensorHardware):
     """Hardware of a module."""
 
-    bitrate: int | None = None
-    """Bit rate of the bus, bit/s; 0: frames take no time; None: the rate of the settings."""
-    sends_heading_twice: bool = True
-    """True: the heading message appears twice, as in newer firmware."""
+    bitrate: int | None = None  # bit rate of the bus, bit/s; 0: frames take no time; None: the rate of the settings
+    sends_heading_twice: bool = True  # True: the heading message appears twice, as in newer firmware
     variant: J1939Variant = field(default_factory=J1939Variant)
 
 
@@ -120,8 +109,7 @@ class HipnucJ1939Module:
         self.instants_sent = 0
         self.frames_sent = 0
         self.requests = self.writes_to_flash = 0
-        self._leaving: list[SentFrame] = []
-        """Frames that were queued at the request of a restart, with its reply."""
+        self._leaving: list[SentFrame] = []  # frames that were queued at the request of a restart, with its reply
         self._ns_per_ms = NS_PER_MS / (1 + self.hardware.skew_ppm * 1e-6)
         self._power_on(now_ns)
 

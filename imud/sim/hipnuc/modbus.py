@@ -82,24 +82,20 @@ class SlaveSettings:
 class SlaveVariant:
     """Behavior that differs between devices or that the manuals do not define."""
 
+    # Reply of new firmware to a block that extends beyond 0x4B. Older firmware replies illegal_address or worse.
     long_block: Literal["answered", "illegal_address", "failure", "silent"] = "answered"
-    """Reply of new firmware to a block that extends beyond 0x4B. Older firmware replies illegal_address or worse."""
-    address_at_once: bool = True
-    """True: a new ID applies immediately, as in the manual. False: after save and restart."""
+    address_at_once: bool = True  # True: a new ID applies immediately, as in the manual. False: after save and restart.
+    # Address of the confirmation of a new ID that applies immediately.
     address_reply: Literal["old", "new", "none"] = "old"
-    """Address of the confirmation of a new ID that applies immediately."""
     rate_at_once: bool = False
-    flash_ms: int = 0
-    """Time of a save until its confirmation, ms."""
-    refuses: frozenset[str] = frozenset()
-    """Names of registers whose write the device refuses with exception 3."""
-    ignores: frozenset[str] = frozenset()
-    """Names of registers whose write the device confirms without an effect."""
+    flash_ms: int = 0  # time of a save until its confirmation, ms
+    refuses: frozenset[str] = frozenset()  # names of registers whose write the device refuses with exception 3
+    ignores: frozenset[str] = frozenset()  # names of registers whose write the device confirms without an effect
     confirms_restart: bool = True
-    boot_ms: int = 0
-    """Silence after a restart, ms."""
+    boot_ms: int = 0  # silence after a restart, ms
 
 
+# A variant for each undefined behavior. Drivers support all of them.
 SLAVE_VARIANTS: Final[Mapping[str, SlaveVariant]] = {
     "manual": SlaveVariant(),
     "no long block": SlaveVariant(long_block="illegal_address"),
@@ -113,7 +109,6 @@ SLAVE_VARIANTS: Final[Mapping[str, SlaveVariant]] = {
     "restarts without a word": SlaveVariant(confirms_restart=False, boot_ms=800),
     "slow to boot": SlaveVariant(boot_ms=1500),
 }
-"""A variant for each undefined behavior. Drivers support all of them."""
 
 
 @dataclass(slots=True)
@@ -129,29 +124,20 @@ class Slave:
     motion: Motion = field(default_factory=swing)
     noise: Noise | None = None
     skew_ppm: float = 20.0
-    inclinometer: str = ""
-    """`single`, `dual`, or empty if the product has no inclinometer."""
-    processing_ns: int = 300_000
-    """Time from the end of a request to the start of its reply, ns (assumption)."""
+    inclinometer: str = ""  # `single`, `dual`, or empty if the product has no inclinometer
+    processing_ns: int = 300_000  # time from the end of a request to the start of its reply, ns (assumption)
     dead: bool = False
-    bad_crc: int = 0
-    """Number of next replies with a wrong CRC."""
-    mute: int = 0
-    """Number of next requests without a reply."""
+    bad_crc: int = 0  # number of next replies with a wrong CRC
+    mute: int = 0  # number of next requests without a reply
     answered: int = 0
-    hard_iron_t: Vector3 = (0.0, 0.0, 0.0)
-    """Magnetic field of parts that turn with the device, T."""
+    hard_iron_t: Vector3 = (0.0, 0.0, 0.0)  # magnetic field of parts that turn with the device, T
     magnetometer: SelfCalibration = field(init=False)
     flash: SlaveSettings = field(init=False)
     writes_to_flash: int = field(init=False, default=0)
-    address: int = field(init=False)
-    """Current address."""
-    baud: int = field(init=False)
-    """Current baud rate, bit/s."""
-    since_ns: int = field(init=False, default=0)
-    """Power-on time (CLOCK_MONOTONIC)."""
-    ready_ns: int = field(init=False, default=0)
-    """Time at which the device has started and accepts requests, ns."""
+    address: int = field(init=False)  # current address
+    baud: int = field(init=False)  # current baud rate, bit/s
+    since_ns: int = field(init=False, default=0)  # power-on time (CLOCK_MONOTONIC)
+    ready_ns: int = field(init=False, default=0)  # time at which the device has started and accepts requests, ns
 
     def __post_init__(self) -> None:
         self.flash = self.settings

@@ -17,11 +17,9 @@ from imud.sim.can_module import CanSimulator, PeriodicCanModule
 from imud.sim.physics import Truth
 from imud.sim.sensor import SensorHardware, SimulatorOptions, sensor_of
 
-BITRATE: Final = 250_000
-"""Bit rate of NMEA 2000, bit/s."""
+BITRATE: Final = 250_000  # bit rate of NMEA 2000, bit/s
 RATE_MAX_HZ: Final = 100.0
-MESSAGES: Final = ("", "heading", "attitude")
-"""Messages to send: empty for all three, or the name of one."""
+MESSAGES: Final = ("", "heading", "attitude")  # messages to send: empty for all three, or the name of one
 SIDS: Final = messages.SID_MOST + 1
 
 

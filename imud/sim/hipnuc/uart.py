@@ -51,8 +51,7 @@ from imud.sim.sensor import Burst, Simulator, SimulatorOptions, sensor_of
 
 SOUT_HIGH_NS: Final = 80 * NS_PER_US
 ALARM_PERIOD_MS: Final = 10
-EDGES_MAX: Final = 8192
-"""Maximum number of stored edges. The newest edges stay if the owner does not collect them."""
+EDGES_MAX: Final = 8192  # Maximum number of stored edges. The newest edges stay if the owner does not collect them.
 
 
 class HipnucPins:
@@ -60,10 +59,8 @@ class HipnucPins:
 
     def __init__(self) -> None:
         self._waiting: list[PinEdge] = []
-        self._alarm = False
-        """Level of ALARM after all pending edges."""
-        self._pulses = 0
-        """Number of SOUT pulses since the last pulse of SOUT_DIV."""
+        self._alarm = False  # level of ALARM after all pending edges
+        self._pulses = 0  # number of SOUT pulses since the last pulse of SOUT_DIV
 
     def restart_divider(self) -> None:
         """Restart the counter of the divider after a change of its setting."""
@@ -130,22 +127,17 @@ def _due_ns(edge: PinEdge) -> int:
 
 
 FACTORY_BAUD: Final = ModuleSettings().baud
-MAIN_STATUS_FIRMWARE: Final = 169
-"""Firmware since which HI91 bytes 1-2 are MAIN_STATUS and not the PPS time."""
+MAIN_STATUS_FIRMWARE: Final = 169  # firmware since which HI91 bytes 1-2 are MAIN_STATUS and not the PPS time
+# Maximum number of bytes that wait for the wire. The device drops a frame that exceeds it.
 TX_BUFFER_BYTES: Final = 512
-"""Maximum number of bytes that wait for the wire. The device drops a frame that exceeds it."""
+# Maximum length of a command, bytes (assumption). The longest command of the manual, URFR, has 123 with nine decimals.
 COMMAND_BYTES_MAX: Final = 128
-"""Maximum length of a command, bytes (assumption). The longest command of the manual, URFR, has 123 with nine
-decimals."""
-REPLY_NS: Final = 200_000
-"""Time from the end of a command to its reply, ns (assumption)."""
+REPLY_NS: Final = 200_000  # time from the end of a command to its reply, ns (assumption)
 WRITES_FLASH: Final = ("SAVECONFIG", "FRESET")
+# Time from a reply to the change of the baud rate, ns, if the change follows the reply (assumption).
 RATE_CHANGE_NS: Final = 5 * NS_PER_MS
-"""Time from a reply to the change of the baud rate, ns, if the change follows the reply (assumption)."""
-PPS_MODULUS_MS: Final = 8192
-"""Modulus of the PPS time without edges, ms. A recording shows 0 to 8191."""
-NEAR_LEVEL_RAD: Final = radians(5)
-"""Maximum tilt at which ATT RST 3 acts, rad."""
+PPS_MODULUS_MS: Final = 8192  # Modulus of the PPS time without edges, ms. A recording shows 0 to 8191.
+NEAR_LEVEL_RAD: Final = radians(5)  # maximum tilt at which ATT RST 3 acts, rad
 _PRINTABLE = range(0x20, 0x7F)
 _FRAME_BYTES: Final = {OutputMessage.HI91: 82, OutputMessage.HI92: 54}
 
@@ -161,8 +153,7 @@ class HipnucModule:
         self.flash = self.settings = settings or ModuleSettings()
         self.epoch_ns = now_ns
         self.frames_sent = 0
-        self.frames_dropped = 0
-        """Number of frames that did not fit into the transmit buffer."""
+        self.frames_dropped = 0  # number of frames that did not fit into the transmit buffer
         self._scale = NS_PER_S + round(self.hardware.skew_ppm * 1000)  # device ns per 1e9 ns of the host
         self._before_reboot: list[Burst] = []
         self._pins = HipnucPins()

@@ -23,23 +23,17 @@ from imud.sim.sensor import SensorHardware
 class RateChange(Enum):
     """Moments at which SERIALCONFIG changes the baud rate."""
 
-    AFTER_RESTART = "after restart"
-    """After SAVECONFIG and REBOOT."""
-    BEFORE_ANSWER = "before answer"
-    """Immediately: the reply has the new rate."""
-    AFTER_ANSWER = "after answer"
-    """Immediately after the reply: the reply has the old rate."""
+    AFTER_RESTART = "after restart"  # after SAVECONFIG and REBOOT
+    BEFORE_ANSWER = "before answer"  # immediately: the reply has the new rate
+    AFTER_ANSWER = "after answer"  # immediately after the reply: the reply has the old rate
 
 
 class ResetEffect(Enum):
     """Moments at which FRESET applies the factory settings."""
 
-    RATE_AFTER_RESTART = "rate after restart"
-    """All settings immediately, the baud rate after a restart."""
-    AFTER_RESTART = "after restart"
-    """All settings after a restart."""
-    BEFORE_ANSWER = "before answer"
-    """All settings immediately: the reply has the rate of the factory."""
+    RATE_AFTER_RESTART = "rate after restart"  # all settings immediately, the baud rate after a restart
+    AFTER_RESTART = "after restart"  # all settings after a restart
+    BEFORE_ANSWER = "before answer"  # all settings immediately: the reply has the rate of the factory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,18 +42,15 @@ class Behaviour:
 
     rate_change: RateChange = RateChange.AFTER_RESTART
     factory_reset: ResetEffect = ResetEffect.RATE_AFTER_RESTART
-    flash_ms: int = 0
-    """Time of SAVECONFIG and FRESET until their reply, ms. The device sends no frame in this time."""
-    quiet_ms: int = 0
-    """Time after a reply without frames, ms."""
-    refuses: tuple[str, ...] = ()
-    """First words of commands that the device refuses with ERR."""
-    ignores: tuple[str, ...] = ()
-    """First words of commands that the device does not know. It sends no reply."""
+    flash_ms: int = 0  # Time of SAVECONFIG and FRESET until their reply, ms. The device sends no frame in this time.
+    quiet_ms: int = 0  # time after a reply without frames, ms
+    refuses: tuple[str, ...] = ()  # first words of commands that the device refuses with ERR
+    ignores: tuple[str, ...] = ()  # First words of commands that the device does not know. It sends no reply.
 
 
 AS_IN_MANUAL: Final = Behaviour()
 
+# Simulated variants by name.
 VARIANTS: Final[Mapping[str, Behaviour]] = {
     "as in the manual": AS_IN_MANUAL,
     "rate changes before the answer": Behaviour(rate_change=RateChange.BEFORE_ANSWER),
@@ -74,7 +65,6 @@ VARIANTS: Final[Mapping[str, Behaviour]] = {
         rate_change=RateChange.BEFORE_ANSWER, factory_reset=ResetEffect.BEFORE_ANSWER, flash_ms=2000, quiet_ms=300
     ),
 }
-"""Simulated variants by name."""
 
 Epoch = Literal["unix", "day"]
 MODULUS_MS: Final[dict[Epoch, int]] = {"unix": 2**32, "day": 86_400_000}
@@ -82,8 +72,8 @@ MS_PER_S: Final = 1000
 STEP_TOLERANCE_NS: Final = 10 * NS_PER_MS
 INTERVALS_NEEDED: Final = 2
 SENTENCES_NEEDED: Final = 2
+# Maximum distance of a pulse from a full second at which it counts without a sentence, ns.
 REGAIN_NS: Final = 100 * NS_PER_MS
-"""Maximum distance of a pulse from a full second at which it counts without a sentence, ns."""
 LOST_NS: Final = 2 * NS_PER_S
 UPTIME_MODULUS_MS: Final = 2**32
 
@@ -94,13 +84,10 @@ class UtcTime:
 
     def __init__(self, epoch: Epoch) -> None:
         self._modulus_ms = MODULUS_MS[epoch]
-        self._anchor: tuple[int, int] | None = None
-        """Device time of a pulse and the UTC second of this pulse."""
+        self._anchor: tuple[int, int] | None = None  # device time of a pulse and the UTC second of this pulse
         self._pulse_ns: int | None = None
-        self._intervals = 0
-        """Number of correct intervals up to the last pulse."""
-        self._claim_s: int | None = None
-        """UTC second that sentences give for the last pulse."""
+        self._intervals = 0  # number of correct intervals up to the last pulse
+        self._claim_s: int | None = None  # UTC second that sentences give for the last pulse
         self._agreed = 0
 
     def pulse(self, device_ns: int) -> None:
@@ -143,10 +130,9 @@ class UtcTime:
         return (second * MS_PER_S + (device_ns - anchor_ns) // NS_PER_MS) % self._modulus_ms
 
 
-PMUX_FIRMWARE: Final = 155
-"""Minimum firmware for PMUX commands, 1.5.5 (chapter 2.2.4)."""
+PMUX_FIRMWARE: Final = 155  # minimum firmware for PMUX commands, 1.5.5 (chapter 2.2.4)
+# Maximum deviation of a URFR matrix from a rotation (assumption). Users type three or four digits.
 URFR_TOLERANCE: Final = 1e-3
-"""Maximum deviation of a URFR matrix from a rotation (assumption). Users type three or four digits."""
 
 
 class CommandRefused(ValueError):
@@ -181,19 +167,15 @@ class ModuleSettings:
     """Settings that SAVECONFIG saves. The defaults are the defaults of the factory (chapter 3.2: HI91 at 100 Hz)."""
 
     baud: int = 115_200
-    att_mode: int = 0
-    """0: six axes; 1: nine axes, heading from the magnetic field."""
+    att_mode: int = 0  # 0: six axes; 1: nine axes, heading from the magnetic field
+    # Matrix C in v_before = C · v_after, row by row (CONFIG IMU URFR).
     urfr: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-    """Matrix C in v_before = C · v_after, row by row (CONFIG IMU URFR)."""
-    level: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    """Rotation of the attitude about the body from ATT RST."""
-    level_accel: bool = False
-    """True if the rotation also applies to the accelerometer (ATT RST 3)."""
+    level: Quaternion = (1.0, 0.0, 0.0, 0.0)  # rotation of the attitude about the body from ATT RST
+    level_accel: bool = False  # True if the rotation also applies to the accelerometer (ATT RST 3)
     mag_calibration: bool = True
     hi91: Output = Output(10)
     hi92: Output = Output()
-    pins: tuple[int, ...] = (1, 2, 5, 6, 9)
-    """IO pin of PMUX1 … PMUX5."""
+    pins: tuple[int, ...] = (1, 2, 5, 6, 9)  # IO pin of PMUX1 … PMUX5
     sout_div: int = 8
     alarm_x: AlarmSetting = AlarmSetting()
     alarm_y: AlarmSetting = AlarmSetting()
@@ -306,6 +288,7 @@ def _unlog_all(settings: ModuleSettings) -> ModuleSettings:
     return replace(settings, hi91=hi91, hi92=hi92)
 
 
+# Commands that only change settings.
 _CHANGES: Final[tuple[tuple[re.Pattern[str], Callable[..., ModuleSettings]], ...]] = (
     (re.compile(r"SERIALCONFIG (\S+)"), _baud),
     (re.compile(r"CONFIG ATT MODE (\S+)"), _att_mode),
@@ -318,11 +301,10 @@ _CHANGES: Final[tuple[tuple[re.Pattern[str], Callable[..., ModuleSettings]], ...
     (re.compile(r"LOG (IMU91|HI91|HI92) ONMARK (?!ONCE$)(\S+)"), _on_mark),
     (re.compile(r"UNLOGALL"), _unlog_all),
 )
-"""Commands that only change settings."""
 
 
+# Spread of the processing time, ns (assumption). Section 1.2.1 of the manual gives only the mean.
 MARK_SPREAD_NS: Final = 15_000
-"""Spread of the processing time, ns (assumption). Section 1.2.1 of the manual gives only the mean."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -334,25 +316,19 @@ class HipnucHardware(SensorHardware):
     uuid: str = "043995698D6E1708"
     firmware: int = 156
     bootloader: int = 109
-    mark_spread_ns: int = MARK_SPREAD_NS
-    """Maximum deviation of the processing time after an edge on SIN, ns."""
+    mark_spread_ns: int = MARK_SPREAD_NS  # maximum deviation of the processing time after an edge on SIN, ns
     mark_seed: int = 1
-    utc_epoch: Epoch = "unix"
-    """Epoch of UTC in ms."""
-    uptime_ms: int = 0
-    """Device time at the first power-on, ms, for a start near the end of the counter."""
-    mag_bias_t: Vector3 = (0.0, 0.0, 0.0)
-    """Result of an earlier magnetic calibration, T; zero: never calibrated."""
+    utc_epoch: Epoch = "unix"  # epoch of UTC in ms
+    uptime_ms: int = 0  # device time at the first power-on, ms, for a start near the end of the counter
+    mag_bias_t: Vector3 = (0.0, 0.0, 0.0)  # result of an earlier magnetic calibration, T; zero: never calibrated
+    # Magnetic field of parts that turn with the device, T. A calibration finds it.
     hard_iron_t: Vector3 = (0.0, 0.0, 0.0)
-    """Magnetic field of parts that turn with the device, T. A calibration finds it."""
-    behaviour: Behaviour = AS_IN_MANUAL
-    """Behavior that the manual does not define."""
+    behaviour: Behaviour = AS_IN_MANUAL  # behavior that the manual does not define
 
 
 STATIC_GYRO_RAD_S: Final = 0.02
 GYRO_SETTLED_MS: Final = 5000
-ATTITUDE_SETTLED_MS: Final = 1000
-"""Time after power-on until bias and attitude count as converged, ms (assumption)."""
+ATTITUDE_SETTLED_MS: Final = 1000  # time after power-on until bias and attitude count as converged, ms (assumption)
 
 GYRO_UNSETTLED, ATTITUDE_UNSETTLED = 1 << 3, 1 << 7
 STATIC, MAG_AIDING, NO_UTC, SYNC_OUT = 1 << 9, 1 << 10, 1 << 11, 1 << 12
@@ -372,11 +348,9 @@ def main_status(reading: Truth, uptime_ms: int, *, nine_axis: bool, utc: bool) -
     return status | MAG_AIDING if nine_axis else status
 
 
-NOT_CALIBRATED, CALIBRATED = 0, 1
-"""States of register 0x0A. No source contains the true numbers."""
+NOT_CALIBRATED, CALIBRATED = 0, 1  # States of register 0x0A. No source contains the true numbers.
 TURN_RAD: Final = tau
-STEP_MAX_NS: Final = NS_PER_S
-"""Maximum time between two samples that adds to the rotation, ns."""
+STEP_MAX_NS: Final = NS_PER_S  # maximum time between two samples that adds to the rotation, ns
 _NO_TURN: Final[Vector3] = (0.0, 0.0, 0.0)
 
 
@@ -388,8 +362,7 @@ class SelfCalibration:
         knows."""
         self._hard_iron_t = hard_iron_t
         self.found_t = found_t
-        self.finished = any(found_t)
-        """True after a calibration."""
+        self.finished = any(found_t)  # True after a calibration
         self._turned: Vector3 = _NO_TURN
         self._before_ns: int | None = None
 

@@ -26,8 +26,7 @@ class Imu61xCanHardware(SensorHardware):
     rate_hz: float = 100.0
     base_id: int = BASE_ID
     bitrate: int = BITRATE
-    index: int = 0
-    """INDEX of the first sample after the first power-on, for a start near the end of its range."""
+    index: int = 0  # INDEX of the first sample after the first power-on, for a start near the end of its range
 
 
 class Imu61xCanModule(PeriodicCanModule):

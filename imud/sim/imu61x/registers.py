@@ -24,8 +24,7 @@ from imud.model.units import NS_PER_MS, NS_PER_S, STANDARD_GRAVITY_M_S2
 from imud.sim.imu61x.uart import RegisterBehaviour
 from imud.sim.physics import Motion, Truth, swing
 
-UPDATE_NS: Final = NS_PER_MS
-"""Time between two updates of the registers, ns (assumption)."""
+UPDATE_NS: Final = NS_PER_MS  # time between two updates of the registers, ns (assumption)
 _WINDOW_0, _WINDOW_1 = 0, 1
 
 
@@ -33,19 +32,13 @@ _WINDOW_0, _WINDOW_1 = 0, 1
 class RegisterFaults:
     """Faults of the device or its wires. Tests can change them at any time."""
 
+    # Error number of each transaction: ENXIO for a missing acknowledge, ETIMEDOUT for a blocked bus; 0 for no error.
     error: int = 0
-    """Error number of each transaction: ENXIO for a missing acknowledge, ETIMEDOUT for a blocked bus; 0 for no
-    error."""
-    line: int | None = None
-    """Value of all read bytes: 0xFF or 0x00 for a data line without a driver; None for no fault."""
-    flips: int = 0
-    """Number of next transactions with one wrong bit."""
-    frozen: bool = False
-    """True: the device does not update its registers."""
-    ignores_writes: bool = False
-    """True: writes of settings have no effect."""
-    product_id: bytes = b""
-    """Product ID of another device at this place; empty for this device."""
+    line: int | None = None  # value of all read bytes: 0xFF or 0x00 for a data line without a driver; None for no fault
+    flips: int = 0  # number of next transactions with one wrong bit
+    frozen: bool = False  # True: the device does not update its registers
+    ignores_writes: bool = False  # True: writes of settings have no effect
+    product_id: bytes = b""  # product ID of another device at this place; empty for this device
 
 
 class Imu61xRegisters:
@@ -65,15 +58,14 @@ class Imu61xRegisters:
         """`now_ns` returns CLOCK_MONOTONIC. `modes` are the supported SPI modes."""
         self.faults = RegisterFaults()
         self.behaviour = behaviour or RegisterBehaviour()
+        # Zero of the motion, ns: the truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`.
         self.epoch_ns = now_ns()
-        """Zero of the motion, ns: the truth at an instant is `motion.at((instant - epoch_ns) / 1e9)`."""
         self.motion = motion or swing(STANDARD_GRAVITY_M_S2)
         self.transactions = 0
         self.filter = FILTER_DEFAULT
         self.extended = 0
         self.window = _WINDOW_0
-        self.latched_ns = self.epoch_ns
-        """Time of the measurement that the newest transaction read, ns."""
+        self.latched_ns = self.epoch_ns  # time of the measurement that the newest transaction read, ns
         self._now_ns = now_ns
         self._product_id = product_id_of(product)
         self._modes = modes

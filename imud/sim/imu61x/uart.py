@@ -46,45 +46,33 @@ from imud.sim.physics import Truth
 from imud.sim.ports.uart_wire import Transmitter
 from imud.sim.sensor import Burst, SensorHardware, Simulator, SimulatorOptions, sensor_of
 
-CALIBRATION_NS: Final = 3 * NS_PER_S
-"""Duration of each calibration, ns."""
+CALIBRATION_NS: Final = 3 * NS_PER_S  # duration of each calibration, ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Imu61xBehaviour:
     """One interpretation of the manual."""
 
-    answers_while_streaming: bool = True
-    """True: the device processes all commands in stream mode. False: only CMD 3."""
-    baud_acts_at_start: bool = False
-    """True: a new baud rate applies after the next start."""
-    reset_acts_at_start: bool = False
-    """True: CMD 15 changes only the flash and applies after the next start."""
-    changes_mode: bool = True
-    """True: the device applies the output mode that it acknowledges."""
-    acknowledges: bool = True
-    """True: the device sends K1."""
-    result_done: int = 0
-    """Result in K1 for a processed command."""
-    result_refused: int = 2
-    """Result in K1 for a refused command."""
-    refuses: frozenset[Command] = frozenset()
-    """Commands that the device refuses with `result_refused`."""
-    ignores: frozenset[Command] = frozenset()
-    """Commands that the device ignores without a reply."""
+    answers_while_streaming: bool = True  # True: the device processes all commands in stream mode. False: only CMD 3.
+    baud_acts_at_start: bool = False  # True: a new baud rate applies after the next start
+    reset_acts_at_start: bool = False  # True: CMD 15 changes only the flash and applies after the next start
+    changes_mode: bool = True  # True: the device applies the output mode that it acknowledges
+    acknowledges: bool = True  # True: the device sends K1
+    result_done: int = 0  # result in K1 for a processed command
+    result_refused: int = 2  # result in K1 for a refused command
+    refuses: frozenset[Command] = frozenset()  # commands that the device refuses with `result_refused`
+    ignores: frozenset[Command] = frozenset()  # commands that the device ignores without a reply
+    # Time of CMD 5 and CMD 15 until their reply, ms. The device sends and receives no bytes in this time.
     flash_ms: int = 0
-    """Time of CMD 5 and CMD 15 until their reply, ms. The device sends and receives no bytes in this time."""
-    quiet_ms: int = 0
-    """Time after K1 in which the device sends and receives no bytes, ms."""
-    acknowledges_at_end: bool = False
-    """True: the device sends K1 of a calibration at its end."""
-    reports_calibration: bool = True
-    """True: S1 is long enough for a calibration status."""
+    quiet_ms: int = 0  # time after K1 in which the device sends and receives no bytes, ms
+    acknowledges_at_end: bool = False  # True: the device sends K1 of a calibration at its end
+    reports_calibration: bool = True  # True: S1 is long enough for a calibration status
 
 
+# Commands whose reply is only K1.
 ORDERS: Final = frozenset(Command) - {Command.STATUS, Command.AHRS, Command.READ_PARAMETER}
-"""Commands whose reply is only K1."""
 
+# Simulated variants by name. Each variant processes its commands.
 VARIANTS: Final[Mapping[str, Imu61xBehaviour]] = {
     "obeys while it streams": Imu61xBehaviour(),
     "answers in command mode only": Imu61xBehaviour(answers_while_streaming=False),
@@ -101,21 +89,16 @@ VARIANTS: Final[Mapping[str, Imu61xBehaviour]] = {
         baud_acts_at_start=True, reset_acts_at_start=True,
     ),
 }  # fmt: skip
-"""Simulated variants by name. Each variant processes its commands."""
-REFUSING: Final = Imu61xBehaviour(refuses=ORDERS)
-"""A device that replies to queries and refuses all other commands."""
+REFUSING: Final = Imu61xBehaviour(refuses=ORDERS)  # A device that replies to queries and refuses all other commands
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegisterBehaviour:
     """One interpretation of chapter 2 of the manual."""
 
-    low_address: bool = True
-    """True: BURST_CTRL is the high byte of the word at 0x0C, as in the manual."""
-    high_address: bool = True
-    """True: BURST_CTRL is the low byte of the word at 0x0D, as in the program of the vendor."""
-    window_bits: int = 0
-    """Bits of WIN_CTRL that are set next to WINDOW_ID."""
+    low_address: bool = True  # True: BURST_CTRL is the high byte of the word at 0x0C, as in the manual
+    high_address: bool = True  # True: BURST_CTRL is the low byte of the word at 0x0D, as in the program of the vendor
+    window_bits: int = 0  # bits of WIN_CTRL that are set next to WINDOW_ID
 
     def burst_ctrl(self, address: int, extended: int) -> int:
         """Return the word at 0x0C or 0x0D."""
@@ -124,6 +107,7 @@ class RegisterBehaviour:
         return extended if self.high_address else 0
 
 
+# Simulated variants by name.
 REGISTER_VARIANTS: Final[Mapping[str, RegisterBehaviour]] = {
     "BURST_CTRL at both addresses": RegisterBehaviour(),
     "BURST_CTRL at 0x0C": RegisterBehaviour(high_address=False),
@@ -131,7 +115,6 @@ REGISTER_VARIANTS: Final[Mapping[str, RegisterBehaviour]] = {
     "BURST_CTRL reads zero": RegisterBehaviour(low_address=False, high_address=False),
     "other bits in WIN_CTRL": RegisterBehaviour(window_bits=0xA5FE),
 }
-"""Simulated variants by name."""
 
 GYRO_OFFSETS: Final = (Parameter.GYRO_X_OFF, Parameter.GYRO_Y_OFF, Parameter.GYRO_Z_OFF)
 INSTALLATION_ANGLES: Final = (Parameter.INSTALL_X_OFF, Parameter.INSTALL_Y_OFF, Parameter.INSTALL_Z_OFF)
@@ -151,8 +134,7 @@ class Imu61xSettings:
     bus_mode: BusMode = BusMode.SPI
     i2c_address: int = I2C_ADDRESSES[0]
     filter_control: int = FILTER_DEFAULT
-    gyro_off_deg_s: Vector3 = (0.0, 0.0, 0.0)
-    """Bias that the device subtracts from the angular rate, °/s."""
+    gyro_off_deg_s: Vector3 = (0.0, 0.0, 0.0)  # bias that the device subtracts from the angular rate, °/s
     install_off_deg: Vector3 = (0.0, 0.0, 0.0)
 
     def value(self, index: int) -> float:
@@ -188,25 +170,22 @@ def changed(settings: Imu61xSettings, index: int, value: float) -> Imu61xSetting
     raise ParameterRefused(f"parameter {index} = {value}")
 
 
+# Maximum number of bytes that wait for the wire. The device drops a frame that exceeds it.
 TX_BUFFER_BYTES: Final = 512
-"""Maximum number of bytes that wait for the wire. The device drops a frame that exceeds it."""
-REPLY_NS: Final = 200_000
-"""Time from the end of a command to its reply, ns (assumption)."""
-CALIBRATING: Final = 1
-"""`calibration_status` of S1 during a calibration, otherwise 0 (assumption)."""
-RESULT_BUSY: Final = 9
-"""Result of CMD 8 during a calibration."""
+REPLY_NS: Final = 200_000  # time from the end of a command to its reply, ns (assumption)
+CALIBRATING: Final = 1  # `calibration_status` of S1 during a calibration, otherwise 0 (assumption)
+RESULT_BUSY: Final = 9  # result of CMD 8 during a calibration
 STATIC_GYRO_RAD_S: Final = 0.02
 GYRO_CALIBRATION_SAMPLES: Final = 512
 US_PER_S: Final = 1_000_000
 
 
+# Contents of S1. Model number and units are invented.
 STATUS: Final = Status(
     software_version=10203, hardware_version=2, model=614, serial_number=(0x00320047, 0x3133510D, 0x33383736),
     system_status=0, cpu_load=120, drop_rate=0, i2c_master=0, voltage=50, user_config_status=0,
     calibration_status=0, imu_health=bytes(32),
 )  # fmt: skip
-"""Contents of S1. Model number and units are invented."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -214,8 +193,7 @@ class Imu61xHardware(SensorHardware):
     """A device, and its behavior where the manual defines nothing."""
 
     status: Status = STATUS
-    uptime_us: int = 0
-    """Timer at the first power-on, µs, for a start near the end of its range."""
+    uptime_us: int = 0  # timer at the first power-on, µs, for a start near the end of its range
     behaviour: Imu61xBehaviour = field(default_factory=Imu61xBehaviour)
 
 
@@ -230,8 +208,7 @@ class Imu61xModule:
         self.flash = self.settings = settings or Imu61xSettings()
         self.epoch_ns = now_ns
         self.frames_sent = 0
-        self.frames_dropped = 0
-        """Number of AHRS frames that did not fit into the transmit buffer."""
+        self.frames_dropped = 0  # number of AHRS frames that did not fit into the transmit buffer
         self._scale = NS_PER_S + round(self.hardware.skew_ppm * 1000)  # device ns per 1e9 ns of the host
         self._cut_off: list[Burst] = []
         self._power_on(now_ns, self.hardware.uptime_us)

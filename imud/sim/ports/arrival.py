@@ -21,37 +21,27 @@ from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US, uart_byte_ns
 class Crystal:
     """Clock of the device relative to the clock of the host."""
 
-    skew_ppm: float = 0.0
-    """Rate error at the start relative to the host clock, 1e-6."""
-    drift_ppm_s: float = 0.0
-    """Change of the rate error per second, 1e-6 (temperature)."""
-    drift_limit_ppm: float = 10.0
-    """Maximum change of the rate error, 1e-6. The drift reverses at this limit."""
-    start_ns: int = 5_000_000_123_456
-    """Device time of the first sample, ns."""
+    skew_ppm: float = 0.0  # rate error at the start relative to the host clock, 1e-6
+    drift_ppm_s: float = 0.0  # change of the rate error per second, 1e-6 (temperature)
+    drift_limit_ppm: float = 10.0  # Maximum change of the rate error, 1e-6. The drift reverses at this limit.
+    start_ns: int = 5_000_000_123_456  # device time of the first sample, ns
 
 
 @dataclass(frozen=True, slots=True)
 class ArrivalProfile:
     name: str
-    timer_ns: int = 0
-    """Period of the latency timer, ns; 0 for no timer."""
+    timer_ns: int = 0  # period of the latency timer, ns; 0 for no timer
+    # Rate error of the timer relative to the host clock, 1e-6; 0 runs in lockstep with an exact device.
     timer_ppm: float = 0.0
-    """Rate error of the timer relative to the host clock, 1e-6; 0 runs in lockstep with an exact device."""
+    # Number of bytes after which the adapter sends a packet and restarts its timer (FT232: 62); 0: never.
     packet_bytes: int = 0
-    """Number of bytes after which the adapter sends a packet and restarts its timer (FT232: 62); 0: never."""
-    poll_ns: int = 0
-    """Maximum time until the bus polls the adapter, ns, uniform distribution."""
+    poll_ns: int = 0  # maximum time until the bus polls the adapter, ns, uniform distribution
+    # Number of byte times after which a receive FIFO reports bytes below its trigger level (16550: 4).
     fifo_bytes: float = 0.0
-    """Number of byte times after which a receive FIFO reports bytes below its trigger level (16550: 4)."""
-    floor_ns: int = 0
-    """Minimum wake-up time, ns."""
-    wake_ns: int = 0
-    """Mean of the exponential part of the wake-up time, ns."""
-    stall_share: float = 0.0
-    """Share of reads with an additional delay."""
-    stall_ns: int = 0
-    """Mean of the additional delay, ns, exponential distribution."""
+    floor_ns: int = 0  # minimum wake-up time, ns
+    wake_ns: int = 0  # mean of the exponential part of the wake-up time, ns
+    stall_share: float = 0.0  # share of reads with an additional delay
+    stall_ns: int = 0  # mean of the additional delay, ns, exponential distribution
 
     @property
     def hold_ns(self) -> int:
@@ -78,18 +68,15 @@ USB_16MS_PACKET = ArrivalProfile(
 LOADED = ArrivalProfile(
     "loaded", fifo_bytes=4, floor_ns=40 * NS_PER_US, wake_ns=300 * NS_PER_US, stall_share=0.05, stall_ns=8 * NS_PER_MS
 )
-PROFILES = (PERFECT, BARE_UART, USB_1MS, USB_16MS, USB_16MS_PACKET, LOADED)
-"""All profiles, the best profile first."""
+PROFILES = (PERFECT, BARE_UART, USB_1MS, USB_16MS, USB_16MS_PACKET, LOADED)  # all profiles, the best profile first
 
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
     """A frame at the reader, with its true times."""
 
-    t_ns: int
-    """Truth: host time of the measurement, ns."""
-    dev_ns: int
-    """Device time of the measurement without wrap, ns. The device sends `dev_ns // tick_ns % tick_modulus`."""
+    t_ns: int  # truth: host time of the measurement, ns
+    dev_ns: int  # Device time of the measurement without wrap, ns. The device sends `dev_ns // tick_ns % tick_modulus`.
     size_bytes: int
     trailing_bytes: int
     t_rx_ns: int
@@ -103,10 +90,8 @@ class ArrivalModel:
     rate_hz: float
     seed: int
     crystal: Crystal = field(default_factory=Crystal)
-    baud: int = 921_600
-    """Baud rate, bit/s; 0: frames take no time on the wire."""
-    size_bytes: int = 82
-    """Size of a frame, bytes. HI91: six bytes of head, 76 of payload (manual B §3)."""
+    baud: int = 921_600  # baud rate, bit/s; 0: frames take no time on the wire
+    size_bytes: int = 82  # Size of a frame, bytes. HI91: six bytes of head, 76 of payload (manual B §3).
     begin_ns: int = 1_000 * NS_PER_S
 
     @property

@@ -24,8 +24,7 @@ READ_BYTES: Final = 4096
 class CanPort:
     """One device or several devices (`CanModules`) on one interface. Synchronization: one thread."""
 
-    is_open = True
-    """Always True: a bus needs no reader."""
+    is_open = True  # always True: a bus needs no reader
 
     def __init__(
         self, module: CanModule, interface: str, *, open_socket: Callable[[str], socket.socket] | None = None
@@ -34,8 +33,7 @@ class CanPort:
         self.module = module
         self.interface = interface
         self._unplugged_until_ns = 0
-        self.frames_refused = 0
-        """Number of frames that the queue of the interface did not accept."""
+        self.frames_refused = 0  # number of frames that the queue of the interface did not accept
         self._socket = (open_socket or open_can_socket)(interface)
 
     def fileno(self) -> int:

@@ -18,29 +18,20 @@ from imud.sim.sensor import Burst
 
 R = TypeVar("R")
 
-LOG_MAX: Final = 100_000
-"""Maximum number of faults in `Faults.log`. The counters have no limit."""
+LOG_MAX: Final = 100_000  # Maximum number of faults in `Faults.log`. The counters have no limit.
 INSERT_BYTES_MAX: Final = 16
 WRONG_BAUDS: Final = (9600, 115_200, 230_400, 256_000, 460_800, 921_600)
 
 
 class FaultKind(StrEnum):
-    CUT = "cut"
-    """The end of the burst is missing, at least one byte."""
-    FLIP = "flip"
-    """One bit is wrong."""
-    DROP = "drop"
-    """One byte is missing."""
-    INSERT = "insert"
-    """Up to 16 random bytes precede one of its bytes."""
-    DELAY = "delay"
-    """The burst and all later bursts are late."""
-    UNPLUG = "unplug"
-    """The port disappears. This burst and the bursts of the next `unplug_ns` are lost."""
-    WRONG_BAUD = "wrong_baud"
-    """The burst has another baud rate."""
-    LOSE = "lose"
-    """The complete burst is missing."""
+    CUT = "cut"  # the end of the burst is missing, at least one byte
+    FLIP = "flip"  # one bit is wrong
+    DROP = "drop"  # one byte is missing
+    INSERT = "insert"  # up to 16 random bytes precede one of its bytes
+    DELAY = "delay"  # the burst and all later bursts are late
+    UNPLUG = "unplug"  # The port disappears. This burst and the bursts of the next `unplug_ns` are lost.
+    WRONG_BAUD = "wrong_baud"  # the burst has another baud rate
+    LOSE = "lose"  # the complete burst is missing
 
 
 _Order = (
@@ -61,8 +52,7 @@ class FaultRates:
     unplug: float = 0.0
     wrong_baud: float = 0.0
     lose: float = 0.0
-    delay_ns: int = 5 * NS_PER_MS
-    """Maximum delay, ns."""
+    delay_ns: int = 5 * NS_PER_MS  # maximum delay, ns
     unplug_ns: int = 300 * NS_PER_MS
 
     def __post_init__(self) -> None:
@@ -77,12 +67,9 @@ class FaultRates:
 
 class Fault(NamedTuple):
     kind: FaultKind
-    due_ns: int
-    """Time of the end of the undisturbed burst, ns."""
-    burst: int
-    """Number of the burst, from 0."""
-    sample_ns: int | None
-    """Time of the measurement in the disturbed frame, ns; None for text."""
+    due_ns: int  # time of the end of the undisturbed burst, ns
+    burst: int  # number of the burst, from 0
+    sample_ns: int | None  # time of the measurement in the disturbed frame, ns; None for text
 
 
 class Faults:
@@ -90,13 +77,11 @@ class Faults:
 
     def __init__(self, seed: int, rates: FaultRates, baud: int = 115_200) -> None:
         self.rates = rates
-        self.baud = baud
-        """Baud rate of the device, bit/s. A wrong baud rate is any other rate."""
+        self.baud = baud  # Baud rate of the device, bit/s. A wrong baud rate is any other rate.
         self.log: list[Fault] = []
         self.counts: Counter[FaultKind] = Counter()
         self.bursts = 0
-        self.bursts_hit = 0
-        """Number of changed or lost bursts, without late bursts."""
+        self.bursts_hit = 0  # number of changed or lost bursts, without late bursts
         self.unplugged_until_ns = 0
         self._random = Random(seed)
         self._held_until_ns = 0

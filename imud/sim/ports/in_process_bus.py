@@ -13,10 +13,8 @@ from smbus2 import I2cFunc, i2c_msg
 from imud.links import spi
 from imud.sim.imu61x.registers import Imu61xRegisters
 
-I2C_M_RD = 0x0001
-"""Flag of a read message (<linux/i2c.h>)."""
-FD = 1_000_000
-"""First number of the simulated descriptors. No process has such descriptors."""
+I2C_M_RD = 0x0001  # flag of a read message (<linux/i2c.h>)
+FD = 1_000_000  # First number of the simulated descriptors. No process has such descriptors.
 
 
 class InProcessI2c:
@@ -27,10 +25,8 @@ class InProcessI2c:
         self.funcs = funcs
         self.fd: int | None = None
         self.opened = 0
-        self.open_error = 0
-        """Error number of `open`; 0 for no error."""
-        self.calls: list[tuple[int, tuple[bytes | int, ...]]] = []
-        """Address and parts of each transaction."""
+        self.open_error = 0  # error number of `open`; 0 for no error
+        self.calls: list[tuple[int, tuple[bytes | int, ...]]] = []  # address and parts of each transaction
 
     def open(self, _path: str) -> "InProcessI2c":
         if self.open_error:
@@ -76,10 +72,9 @@ class InProcessSpi:
         self.device = device
         self.mode = 0
         self.opened: list[int] = []
-        self.open_error = 0
-        """Error number of `open`; 0 for no error."""
+        self.open_error = 0  # error number of `open`; 0 for no error
+        # MOSI of each selection, word size and speed of each message.
         self.messages: list[tuple[tuple[bytes, ...], int, int]] = []
-        """MOSI of each selection, word size and speed of each message."""
         self.keep_messages = True
         self.word_bits = word_bits
 

@@ -22,34 +22,28 @@ from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.ports.faults import parse_rates
 from imud.sim.sensor import StreamModule
 
+# Function for an edge: its due time (CLOCK_MONOTONIC, ns), and True for a rising edge.
 OnEdge = Callable[[int, bool], None]
-"""Function for an edge: its due time (CLOCK_MONOTONIC, ns), and True for a rising edge."""
 EXTRA_HIGH_NS: Final = 80_000
 EXTRA_WITHIN_NS: Final = NS_PER_MS
-LOST_MAX: Final = 100_000
-"""Maximum number of pulses in `PinFaults.lost`. The counters have no limit."""
+LOST_MAX: Final = 100_000  # Maximum number of pulses in `PinFaults.lost`. The counters have no limit.
 
 
 class Pin(StrEnum):
     """Output pins with the names of lines in the configuration."""
 
-    SOUT = "sout"
-    """High before each frame. The frame follows the falling edge."""
-    SOUT_DIV = "sout_div"
-    """Every n-th pulse of SOUT."""
-    ALARM = "alarm"
-    """High while an angle is out of its range."""
+    SOUT = "sout"  # High before each frame. The frame follows the falling edge.
+    SOUT_DIV = "sout_div"  # every n-th pulse of SOUT
+    ALARM = "alarm"  # high while an angle is out of its range
 
 
 class PinEdge(NamedTuple):
     """A change of a pin's level."""
 
-    due_ns: int
-    """CLOCK_MONOTONIC of the change."""
+    due_ns: int  # CLOCK_MONOTONIC of the change
     pin: Pin
     rising: bool
-    sample_ns: int | None = None
-    """CLOCK_MONOTONIC of the measurement in the next frame; None if no frame follows."""
+    sample_ns: int | None = None  # CLOCK_MONOTONIC of the measurement in the next frame; None if no frame follows
 
 
 @runtime_checkable
@@ -69,12 +63,9 @@ class PinModule(Protocol):
 class PinFaultRates:
     """Probabilities of faults, 0 to 1."""
 
-    lose_pulse: float = 0.0
-    """Probability that both edges of a pulse are missing."""
-    lose_edge: float = 0.0
-    """Probability that an edge is missing."""
-    extra: float = 0.0
-    """Probability of an additional pulse within a millisecond, as from a disturbance."""
+    lose_pulse: float = 0.0  # probability that both edges of a pulse are missing
+    lose_edge: float = 0.0  # probability that an edge is missing
+    extra: float = 0.0  # probability of an additional pulse within a millisecond, as from a disturbance
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -88,8 +79,7 @@ class PinFaults:
     def __init__(self, seed: int, rates: PinFaultRates) -> None:
         self.rates = rates
         self.counts: Counter[str] = Counter()
-        self.lost: list[tuple[Pin, int | None]] = []
-        """Pin and measurement time of the pulses with a missing edge."""
+        self.lost: list[tuple[Pin, int | None]] = []  # pin and measurement time of the pulses with a missing edge
         self._random = Random(seed)
         self._losing: set[Pin] = set()
 
@@ -133,8 +123,7 @@ class Pins:
         step_ns, the time of the step."""
         self._module, self._on_edge, self._faults, self._truth = module, on_edge, faults, truth
         self._held: list[PinEdge] = []
-        self.edges = 0
-        """Number of delivered edges."""
+        self.edges = 0  # number of delivered edges
         if truth:
             truth.write("pin,level,due_ns,sample_ns,step_ns\n")
 
@@ -179,8 +168,7 @@ class MemoryInput:
 
     def __init__(self, title: str = "memory line", rising_only: bool = False) -> None:
         self.title = title
-        self.open_error: LinkError | None = None
-        """Error of `open`; None for no error."""
+        self.open_error: LinkError | None = None  # error of `open`; None for no error
         self.is_open = False
         self._rising_only = rising_only
         self._watch = True
@@ -275,14 +263,11 @@ class MemoryOutput:
         `on_change` is the device. It receives the time and the new level in the thread that drives the line.
         """
         self.title = title
-        self.open_error: LinkError | None = None
-        """Error of `open`; None for no error."""
-        self.set_error: LinkError | None = None
-        """Error of `set`; None for no error."""
+        self.open_error: LinkError | None = None  # error of `open`; None for no error
+        self.set_error: LinkError | None = None  # error of `set`; None for no error
         self.is_open = False
         self.active = False
-        self.history: list[tuple[int, bool]] = []
-        """Time (ns) and level of each change."""
+        self.history: list[tuple[int, bool]] = []  # time (ns) and level of each change
         self._now_ns = now_ns
         self._on_change = on_change
 
@@ -332,8 +317,7 @@ class MemoryLines:
         return self.outputs.setdefault(purpose, MemoryOutput(purpose, now_ns=self._now_ns))
 
 
-SIN_LOOK_NS: Final = 4 * NS_PER_MS
-"""Interval between two reads of SIN, ns. A pulse must be longer."""
+SIN_LOOK_NS: Final = 4 * NS_PER_MS  # Interval between two reads of SIN, ns. A pulse must be longer.
 
 
 class MarkedModule(Protocol):

@@ -29,14 +29,13 @@ from imud.sim.sensor import Burst, StreamModule
 
 TCGETS2: Final = 0x802C542A
 TCSETS2: Final = 0x402C542B
+# `struct termios2`: c_iflag c_oflag c_cflag c_lflag, c_line with c_cc[19], c_ispeed c_ospeed (asm-generic/termbits.h).
 TERMIOS2: Final = struct.Struct("4I20s2I")
-"""`struct termios2`: c_iflag c_oflag c_cflag c_lflag, c_line with c_cc[19], c_ispeed c_ospeed
-(asm-generic/termbits.h)."""
 BOTHER: Final = 0o010000
 CBAUD: Final = 0o010017
 READ_BYTES: Final = 4096
+# Interval of the checks whether a program has opened the port, ns. A pty does not report this event.
 LOOK_NS: Final = 20 * NS_PER_MS
-"""Interval of the checks whether a program has opened the port, ns. A pty does not report this event."""
 
 
 @dataclass(slots=True)
@@ -44,12 +43,9 @@ class PtyCounters:
     """Numbers of sent and lost bytes of the device."""
 
     bytes_written: int = 0
-    bytes_unheard: int = 0
-    """Number of bytes that were lost because no program had opened the port."""
-    bytes_lost_full: int = 0
-    """Number of bytes that were lost because the reader was too slow."""
-    bursts_wrong_baud: int = 0
-    """Number of bursts that were sent while the reader had another baud rate."""
+    bytes_unheard: int = 0  # number of bytes that were lost because no program had opened the port
+    bytes_lost_full: int = 0  # number of bytes that were lost because the reader was too slow
+    bursts_wrong_baud: int = 0  # number of bursts that were sent while the reader had another baud rate
     unplugs: int = 0
 
 

@@ -6,9 +6,9 @@ from typing import Final
 from imud.model.units import BITS_PER_UART_BYTE, NS_PER_S
 from imud.sim.sensor import Burst
 
+# Maximum difference of two rates at which bytes are readable. At ±5 %, the last of 10 bits is sampled half a bit late,
+# and edges are not ideal.
 TOLERANCE: Final = 0.03
-"""Maximum difference of two rates at which bytes are readable. At ±5 %, the last of 10 bits is sampled half a bit late,
-and edges are not ideal."""
 
 
 class Transmitter:

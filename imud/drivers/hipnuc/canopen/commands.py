@@ -66,11 +66,11 @@ BitRate = Literal[1_000_000, 500_000, 250_000, 125_000]
 BIT_RATES: Final[Mapping[int, int]] = {1_000_000: 0, 500_000: 2, 250_000: 3, 125_000: 4}
 BIT_RATE_OF: Final = {code: bit_s for bit_s, code in BIT_RATES.items()}
 Place = tuple[int, int]  # index and sub-index of an object
+# Writable objects that may be readable.
 SETTING_PLACES: Final[tuple[Place, ...]] = (
     *((index, sub) for index in TPDO_OBJECTS.values() for sub in (TPDO_TYPE, TPDO_TIMER)),
     *((index, 0) for index in (NODE_ID, BIT_RATE, INCLI_SIGN_X, INCLI_SIGN_Y, HEARTBEAT_TIME)),
 )
-"""Writable objects that may be readable."""
 # 200 Hz … 1 Hz for each TPDO (section 5.1)
 PERIOD_MIN_MS, PERIOD_MAX_MS = 5, 1000
 SAVE, FACTORY_RESET, RESTART = 0x00, 0x01, 0xFF

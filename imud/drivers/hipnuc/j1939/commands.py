@@ -63,8 +63,7 @@ REQUEST_PRIORITY: Final = 6
 CLAIMED: Final = 0xEE00  # PGN Address Claimed (J1939-81), a broadcast
 INTERVALS: Final = {pgn: 0x0100 | pgn & 0xFF for pgn in PGNS}  # register of the interval of each message, ms
 
-SAVE, FACTORY, RESTART = 0x00, 0x01, 0xFF
-"""values of CONTROL"""
+SAVE, FACTORY, RESTART = 0x00, 0x01, 0xFF  # values of CONTROL
 BitRate = Literal[1_000_000, 800_000, 500_000, 250_000, 125_000]
 BITRATES: Final[tuple[BitRate, ...]] = get_args(BitRate)  # bit rates by their code in BITRATE, bit/s
 MODULE_ADDRESS_MIN, MODULE_ADDRESS_MAX = 1, 128

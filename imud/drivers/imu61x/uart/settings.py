@@ -630,6 +630,9 @@ def _check(target: Target, values: Mapping[str, Any]) -> None:
             raise BadArgument(f"output_rate_hz and baud: {error}") from None
 
 
+# Settings of the device. `output_rate_hz` and `baud` depend on each other.
+# The two filters are halves of one parameter; each has its own write. The script of the baud rate saves only if the
+# device changes at its next start.
 SETTINGS: Final = SettingsTable(
     table={
         "output_rate_hz": Setting(type=OutputRate, write=lambda _target, hz: write_parameter(Parameter.AHRS_RATE, hz)),
@@ -662,7 +665,3 @@ SETTINGS: Final = SettingsTable(
     restart=lambda target: restart(done=codes_of(target).result_done),
     check=_check,
 )
-"""Settings of the device. `output_rate_hz` and `baud` depend on each other.
-
-The two filters are halves of one parameter; each has its own write. The script of the baud rate saves only if the
-device changes at its next start."""
