@@ -1,5 +1,4 @@
-"""Devices of the configuration: each has a driver and one link, and can have GPIO lines and a source of RMC
-sentences."""
+"""Devices of the configuration: driver, link, GPIO lines and source of RMC sentences."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -67,8 +66,7 @@ def clashes(
 
 
 def owner_of(device: DeviceConfig, others: Sequence[DeviceConfig], links: Mapping[str, LinkType[Any]]) -> str:
-    """Return the name of a device in `others` that uses the port of `device` exclusively or cannot share it; empty if
-    no device does."""
+    """Return the device in `others` with which `device` cannot share its port; empty if there is none."""
     mine = _claims(device, links)
     for other in others:
         for _, theirs in _claims(other, links) if other.name != device.name else ():
@@ -105,11 +103,11 @@ def _can_clash(name: str, use: CanUse, uses: Sequence[tuple[CanUse, str]]) -> It
     path: KeyPath = ("devices", name, "options")
     for other, owner in uses:
         if both := use.both_receive(other):
-            yield Clash(path, f"expected a device of its own on {use.bus}, got one that sends {both}; {owner} has that")
+            yield Clash(path, f"expected no device on {use.bus} with the frame {both} of {owner}, got this device")
             return
         if both := use.both_send(other):
-            message = f"expected one device on {use.bus} for which imud sends {both}, got it here and for {owner}"
-            yield Clash(path, f"{message}: leave it out here")
+            message = f"expected one device on {use.bus} for which imud sends {both}, got this device and {owner}"
+            yield Clash(path, f"{message}; remove the key here")
             return
 
 
@@ -127,18 +125,18 @@ class DeclaredReader:
             return None
         driver = device.get("driver", "auto")
         if driver == "auto":
-            message = f"expected settings only beside a named driver, got them with driver auto; {self._known()}"
+            message = f"expected the name of a driver next to settings, got auto; {self._known()}"
             self._keys.problem(key, message, at_key=True)
             return None
         if not isinstance(driver, str) or driver not in self._drivers:
             return None  # the driver reports this problem
         table = self._table(driver)
         if table is None:
-            message = f"expected settings only of a driver that knows those of its device, got them with {driver}; "
+            message = f"expected a driver with a table of settings, got {driver}; "
             self._keys.problem(key, message + self._known(), at_key=True)
             return None
         if device.get("identify") is False:
-            message = "expected identify: true, without which imud does not read settings, got false"
+            message = "expected identify: true, because imud reads the settings only then, got false"
             self._keys.problem(key, message, at_key=True)
             return None
         return self._keys.part(table.declarable, device["settings"], key)
@@ -152,8 +150,8 @@ class DeclaredReader:
         for name, value in values.items():
             place = _fixed(name, options, link) if table.table[name].connection else None
             if place not in (None, value):
-                message = f"expected {shown(place)}, where imud is configured to find the device, got {shown(value)}; "
-                hint = f"`imud command {path[-1]} {name} …` changes it, or let imud search for it where it can (auto)"
+                message = f"expected {shown(place)}, the value that imud uses to open the device, got {shown(value)}; "
+                hint = f"change it with `imud command {path[-1]} {name} …`, or use auto if the link supports it"
                 self._keys.problem((*key, name), message + hint)
         baud = getattr(link, "baud", 0)
         try:
@@ -166,7 +164,7 @@ class DeclaredReader:
         if self._table(driver) is not None:
             found = self._drivers[driver].declared_line_differences(declared_values(declared), lines)
             for key, words in found.items():
-                self._keys.problem((*path, "lines", key), f"with the settings declared here {words}", at_key=True)
+                self._keys.problem((*path, "lines", key), f"with the declared settings, {words}", at_key=True)
 
     def _table(self, driver: str) -> SettingsTable | None:
         try:
@@ -203,7 +201,7 @@ def read_frame(keys: Keys, path: KeyPath, device: Mapping[str, Any]) -> FrameOpt
         return None
     given = [way for way in WAYS if found.get(way) is not None]
     if len(given) > 1:
-        message = f"expected one way to give the rotation ({', '.join(WAYS)}), got {' and '.join(given)}"
+        message = f"expected one key for the rotation ({', '.join(WAYS)}), got {' and '.join(given)}"
         keys.problem((*path, given[1]), message, at_key=True)
     nested = _nested(keys, path, found)
     if nested is None:
@@ -241,15 +239,15 @@ def check_declination(
         return
     place = (*path, "declination_deg")
     if general.driver == "auto":
-        keys.problem(place, "expected declination_deg only beside a named driver, got it with driver auto", at_key=True)
+        keys.problem(place, "expected the name of a driver next to declination_deg, got auto", at_key=True)
         return
     heading = Heading.UNKNOWN
     if general.driver in drivers:
         with suppress(ImportError):  # another check reports this problem
             heading = drivers[general.driver].heading(options, {})
     if heading in (Heading.TRUE, Heading.RELATIVE):
-        why = "counts from power-on" if heading is Heading.RELATIVE else "is true already"
-        message = f"expected declination_deg only beside a magnetic heading, got it with {general.driver}"
+        why = "is relative to power-on" if heading is Heading.RELATIVE else "is already true"
+        message = f"expected declination_deg only with a magnetic heading, got {general.driver}"
         keys.problem(place, f"{message}, whose heading {why}", at_key=True)
 
 
@@ -287,7 +285,7 @@ def lines_once(keys: Keys, devices: Sequence[DeviceConfig]) -> None:
             first = next((place for other, place in owners if _same_line(other, settings)), None)
             if first is not None:
                 wire = f"{settings.chip} line {settings.line}" if settings.chip else f"line {settings.line}"
-                keys.problem(path, f"expected a line of its own, got {wire}, which {first} has", at_key=True)
+                keys.problem(path, f"expected an unused line, got {wire}, which {first} uses", at_key=True)
             owners.append((settings, f"{device.name}.lines.{name} (line {keys.tree.key_mark(path).line})"))
 
 
@@ -297,18 +295,16 @@ def read_rmc(keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapp
         return None
     driver = device.get("driver", "auto")
     if LINK not in device or (driver != "auto" and PULSE not in _lines_of_driver(drivers, driver)):
-        message = (
-            f"expected rmc only beside the link {LINK} of a device with SIN/PPS, got it with driver {shown(driver)}"
-        )
+        message = f"expected rmc only with the link {LINK} and a device with SIN/PPS, got driver {shown(driver)}"
         keys.problem(path, message, at_key=True)
     if driver == "auto":
-        keys.problem(path, "expected rmc only beside a named driver, got it with driver auto", at_key=True)
+        keys.problem(path, "expected the name of a driver next to rmc, got auto", at_key=True)
     lines = device.get("lines")
     if isinstance(lines, dict) and TRIGGER in lines:
         mark = keys.tree.key_mark((*path[:-1], "lines", TRIGGER))
         message = (
-            "expected a receiver's pulse per second on SIN beside rmc, got imud as what drives it by lines.sin "
-            f"(line {mark.line}): leave one of them out"
+            "expected the pulse per second of a receiver on SIN with rmc, got lines.sin, with which imud drives SIN "
+            f"(line {mark.line}); remove one of the keys"
         )
         keys.problem(path, message, at_key=True)
     return keys.part(RmcOptions, device["rmc"], path)
@@ -318,7 +314,7 @@ def _fit(keys: Keys, path: KeyPath, found: Mapping[str, Any], driver: object, dr
     """Refuse unknown lines, and lines that devices of this driver do not have."""
     keys.unknown_keys(path, found, list(LINE_SCHEMAS))
     if driver == "auto":
-        message = "expected lines only beside a named driver, got them with driver auto; drivers that have lines"
+        message = "expected the name of a driver next to lines, got auto; drivers with lines"
         keys.problem(path, f"{message}: {', '.join(_with_lines(drivers))}", at_key=True)
     if not isinstance(driver, str) or driver not in drivers:
         return
@@ -329,7 +325,7 @@ def _fit(keys: Keys, path: KeyPath, found: Mapping[str, Any], driver: object, dr
     for name in found:
         if name in LINE_SCHEMAS and name not in lines:
             known = ", ".join(key for key in LINE_SCHEMAS if key in lines) or "none"
-            message = f"expected a line that devices of {driver} have, got {shown(name)}; they have: {known}"
+            message = f"expected a line of {driver} devices ({known}), got {shown(name)}"
             keys.problem((*path, name), message, at_key=True)
 
 
@@ -400,7 +396,7 @@ class DeviceReader:
         self._pause()
         path: KeyPath = ("devices", name)
         if not DEVICE_NAME.fullmatch(name):
-            rule = "1 to 32 of a-z, 0-9, _ and -, beginning with a letter or digit"
+            rule = "1 to 32 characters of a-z, 0-9, _ and -, starting with a letter or digit"
             self._keys.problem(path, f"expected a device name of {rule}, got {got(name)}", at_key=True)
         keys = self._keys.mapping(path, data)
         if keys is None:
@@ -440,7 +436,7 @@ class DeviceReader:
         if driver == "auto":
             if keys.get("options") is not None:
                 names = ", ".join(self._tables.drivers)
-                message = f"expected options only beside a named driver, got them with driver auto; drivers: {names}"
+                message = f"expected the name of a driver next to options, got auto; drivers: {names}"
                 self._keys.problem((*path, "options"), message, at_key=True)
             return None
         if not isinstance(driver, str):
@@ -465,7 +461,7 @@ class DeviceReader:
         links, drivers = self._tables.links, self._tables.drivers
         if driver == "auto" and not links[link].searchable:
             known = ", ".join(self._fitting((name, name, link) for name in drivers))
-            self._keys.problem(path, f"expected a driver to be named for {link} ({known}), got auto", at_key=True)
+            self._keys.problem(path, f"expected the name of a driver for {link} ({known}), got auto", at_key=True)
             return False
         if driver in drivers and link not in (fitting := self._fitting((name, driver, name) for name in links)):
             message = f"expected a link that {driver} can use ({', '.join(fitting)}), got {link}"
@@ -511,10 +507,10 @@ class DeviceReader:
             before = shares.get((device.link, bus), 0.0)
             share = shares[device.link, bus] = before + rate_hz * read_ns / NS_PER_S
             if share > 1 and read_ns:
-                others = f" and {before:.0%} of it is taken by other devices" if before else ""
+                others = f", and other devices use {before:.0%} of it" if before else ""
                 most = int(max(0.0, 1 - before) * NS_PER_S / read_ns)
                 message = (
-                    f"expected at most {most}, got {rate_hz:g}: a read takes {read_ns / NS_PER_US:.0f} µs of "
-                    f"{bus} or more{others}"
+                    f"expected at most {most}, got {rate_hz:g}: a read takes at least {read_ns / NS_PER_US:.0f} µs of "
+                    f"{bus}{others}"
                 )
                 self._keys.problem(("devices", device.name, device.link, "rate_hz"), message)

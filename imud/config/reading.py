@@ -28,8 +28,8 @@ def load(
     try:
         content = read_regular(path, FILE_BYTES_MAX + 1)
     except OSError as error:
-        hint = "look at its owner and mode" if isinstance(error, PermissionError) else missing
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}; {hint}") from None
+        hint = "check its owner and mode" if isinstance(error, PermissionError) else missing
+        raise ConfigError(f"cannot read {path}: {error.strerror}; {hint}") from None
     return parse(content, str(path), tables, pause)
 
 

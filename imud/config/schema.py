@@ -104,7 +104,7 @@ class Keys:
         try:
             schema = table[name].settings
         except ImportError as error:
-            self.problem(path, f"expected the parts of {name} to be installed, got: {error}", at_key=True)
+            self.problem(path, f"expected the installed packages of {name}, got: {error}", at_key=True)
             return None
         return self.part(schema, data, path)
 
@@ -152,8 +152,7 @@ class Keys:
         return text is None
 
     def _check_inside(self, path: KeyPath, values: Mapping[str, Any], field_type: Any) -> None:
-        """Add the problems of the keys and values of a mapping, each at its own place, if `field_type` contains
-        mappings."""
+        """Add the problems of the keys and values of a mapping if `field_type` contains mappings."""
         for choice in _choices(field_type):
             if isinstance(choice, type) and issubclass(choice, Options):
                 self.part(choice, values, path)
@@ -180,8 +179,7 @@ def _choices(field_type: Any) -> Iterator[Any]:
 
 
 def _controlling(value: object) -> str | None:
-    """Return a text in `value` that contains control characters; None if there is no such text. No path or name
-    contains them."""
+    """Return a text in `value` with control characters, which no path or name contains; None without such text."""
     if isinstance(value, str):
         return value if _CONTROL.search(value) else None
     parts = value if isinstance(value, list) else value.values() if isinstance(value, dict) else ()

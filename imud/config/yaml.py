@@ -302,8 +302,7 @@ _TRAPS = (
 
 
 def plain(word: str) -> object:
-    """Return the value of an unquoted word: null, a truth value, a number, or text. Raises ValueError for ambiguous
-    words."""
+    """Return the value of an unquoted word: null, truth value, number, text. Raises ValueError if ambiguous."""
     for trap, message in _TRAPS:
         if trap.fullmatch(word):
             raise ValueError(message.format(word[:_NUMBER_CHARACTERS_MAX]))

@@ -101,7 +101,7 @@ def parse_request(line: bytes | bytearray) -> RpcRequest:
     if not isinstance(method, str):
         raise RpcError(Code.INVALID_REQUEST, f"method: expected a string, got {_kind(method)}", request_id)
     if isinstance(params, list):
-        raise RpcError(Code.INVALID_PARAMS, "params: expected an object, parameters are by name only", request_id)
+        raise RpcError(Code.INVALID_PARAMS, "params: expected an object, because parameters have names", request_id)
     if not isinstance(params, dict):
         raise RpcError(Code.INVALID_REQUEST, f"params: expected an object, got {_kind(params)}", request_id)
     return RpcRequest(method, params, request_id, "id" in value)
@@ -113,7 +113,7 @@ def _check_bounds(line: bytes | bytearray) -> None:
     if line.count(b"[") + line.count(b"{") > NESTED_MAX:
         raise RpcError(Code.PARSE, f"nested too deeply: expected at most {NESTED_MAX} arrays and objects")
     if line.count(b",") > ITEMS_MAX:
-        raise RpcError(Code.PARSE, f"too long a list: expected at most {ITEMS_MAX} members and elements")
+        raise RpcError(Code.PARSE, f"too many values: expected at most {ITEMS_MAX} members and elements")
 
 
 def encode_request(method: str, params: Mapping[str, Any], request_id: int) -> bytes:

@@ -66,7 +66,7 @@ class ServiceManager:
 def status_line(states: Mapping[str, str]) -> str:
     """Return the number of running devices and the names of the other devices, for `systemctl status`."""
     if not states:
-        return "No devices are configured."
+        return "The configuration has no devices."
     other = [f"{name} ({state})" for name, state in states.items() if state not in FINE]
     running = len(states) - len(other)
     counted = f"{running} of {len(states)} devices running" if len(states) > 1 else f"{running} of 1 device running"

@@ -44,11 +44,11 @@ def load_gpiod() -> Any:
     try:
         import gpiod
     except ImportError as error:
-        raise LinkError("GPIO lines need the Python package gpiod, got none: `pip install 'gpiod>=2.3'`") from error
+        raise LinkError("GPIO lines need the Python package gpiod, got none; run `pip install 'gpiod>=2.3'`") from error
     if not hasattr(gpiod, "request_lines"):
         raise LinkError(
-            f"GPIO lines need gpiod 2.3 or later, got that of libgpiod 1 ({gpiod.__file__}), the python3-libgpiod of "
-            "Debian 12: `pip install 'gpiod>=2.3'` into the environment of imud"
+            f"GPIO lines need gpiod 2.3 or later, got the module of libgpiod 1 ({gpiod.__file__}) of Debian 12; "
+            "run `pip install 'gpiod>=2.3'` in the environment of imud"
         )
     return gpiod
 
@@ -76,16 +76,16 @@ def chip_error(error: OSError, path: str) -> LinkError:
         return LinkMissing(f"{path} is missing, or is not a GPIO chip: {os.strerror(error.errno or 0)}")
     if error.errno == errno.EPERM:  # EPERM: the control group; the group of the node would cause EACCES
         return LinkDenied(
-            f"{path} may not be opened: the control group of this process does not allow the device (EPERM, not its "
+            f"cannot open {path}: the control group of this process does not allow the device (EPERM, not its "
             f"group); add a line `DeviceAllow={path} rw` to the unit (`systemctl edit imud`), and restart imud"
         )
     if error.errno == errno.EACCES:
         group, user = group_of(path, GROUP), user_name()
         return LinkDenied(
-            f"{path} may not be opened by user {user}: it must belong to group {group}, readable and writable, and "
-            f"{user} to that group (`sudo usermod -aG {group} {user}` and a new login)"
+            f"cannot open {path}: user {user} lacks the permission; the node must belong to group {group}, with read "
+            f"and write access, and {user} to that group; run `sudo usermod -aG {group} {user}` and log in again"
         )
-    return LinkError(f"{path} cannot be used as a GPIO chip: {os.strerror(error.errno or 0)}")
+    return LinkError(f"cannot use {path} as a GPIO chip: {os.strerror(error.errno or 0)}")
 
 
 def request_error(gpiod: Any, error: OSError, location: LineLocation) -> LinkError:

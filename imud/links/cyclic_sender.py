@@ -74,8 +74,7 @@ class LoopSender:
         frames: Sequence[CyclicFrame],
         now_ns: Callable[[], int] = monotonic_ns,
     ) -> None:
-        """Start sending. If a later `write` fails, the sender stops and passes the error to `on_error`. Raises
-        LinkError."""
+        """Start sending. After a failed `write`, stop and pass the error to `on_error`. Raises LinkError."""
         self._write = write
         self._on_error = on_error
         self._now_ns = now_ns

@@ -43,7 +43,7 @@ class DirectoryWatch:
         self._fd: int = libc.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
         if self._fd < 0:
             raise LinkError(
-                f"inotify: {os.strerror(ctypes.get_errno())}; look at /proc/sys/fs/inotify/max_user_instances"
+                f"cannot watch /dev: {os.strerror(ctypes.get_errno())}; raise fs.inotify.max_user_instances (sysctl)"
             )
 
     def add(self, directory: Path) -> bool:
@@ -62,11 +62,10 @@ class DirectoryWatch:
         os.read(self._fd, EVENT_BUFFER_BYTES)
 
     def close(self) -> None:
-        """Release the descriptor. A second call does nothing. A thread closes it, because the kernel needs 8 ms or
-        more."""
+        """Release the descriptor. A second call does nothing."""
         fd, self._fd = self._fd, -1
         if fd >= 0:
-            asyncio.get_running_loop().run_in_executor(None, os.close, fd)
+            asyncio.get_running_loop().run_in_executor(None, os.close, fd)  # the kernel needs 8 ms or more
 
 
 async def wait_until(path: Path, ready: Callable[[], bool]) -> None:
@@ -86,7 +85,7 @@ async def wait_until(path: Path, ready: Callable[[], bool]) -> None:
                 await asyncio.sleep(0)  # a directory changed while imud set the watches: check again
                 continue
             if not any(watched):
-                raise LinkDenied(f"cannot watch {directories[0]} for {path.name}: may this user read that directory?")
+                raise LinkDenied(f"cannot wait for {path}: user {user_name()} may not read {directories[0]}")
             if ready():
                 return
             await watch.changed()
@@ -147,7 +146,7 @@ class DeviceNode:
 
     def absence(self) -> str:
         """Return an error text if the node does not exist, otherwise an empty text."""
-        return "" if self._path.exists() else f"{self._path} is not there: {self._missing}"
+        return "" if self._path.exists() else f"{self._path} does not exist: {self._missing}"
 
     async def wait_present(self) -> None:
         """Return when the node exists and the user may open it, at the latest ACCESS_WAIT_S after the node appeared.
@@ -168,25 +167,23 @@ class DeviceNode:
 
 
 def open_problem(error: Exception, path: str, missing: str, proc: Path = PROC) -> LinkError | None:
-    """Return the LinkError of a failed `open`; None if the error has another cause than a missing, refused or used
-    node.
+    """Return the LinkError of a failed `open`; None if the node is not the cause of the error.
 
-    `missing` is the hint for a user whose node does not exist. `proc` is the folder to search for the processes that
-    use the node.
+    `missing` is the hint for a missing node. `proc` is searched for the processes that use the node.
     """
     number = errno_of(error)
     if number in MISSING:
-        return LinkMissing(f"{path} is not there: {missing}")
+        return LinkMissing(f"{path} does not exist: {missing}")
     if number == errno.EPERM:  # EPERM: a device cgroup refuses the node; missing group rights would be EACCES
         return LinkDenied(
-            f"{path} may not be opened: the control group of this process does not allow the device (EPERM, "
+            f"cannot open {path}: the control group of this process does not allow the device (EPERM, "
             f"not its group); add a line `DeviceAllow={path} rw` to the unit (`systemctl edit imud`), and restart imud"
         )
     if number in REFUSED:
-        return LinkDenied(f"{path} may not be opened by user {user_name()}: {_refusal(path)}")
+        return LinkDenied(f"cannot open {path}: user {user_name()} lacks the permission; {_refusal(path)}")
     if number in HELD:
-        holders = holders_of(path, proc) or "another program or by a driver of the kernel"
-        return LinkBusy(f"{path} is in use by {holders}: stop that first")
+        holders = holders_of(path, proc) or "another program or a driver of the kernel"
+        return LinkBusy(f"{path} is in use by {holders}; stop it first")
     return None
 
 
@@ -196,14 +193,16 @@ def _refusal(path: str) -> str:
         node = os.stat(path)
         if node.st_gid == 0 or node.st_mode & GROUP_ACCESS != GROUP_ACCESS:
             mode = f"{stat.S_IMODE(node.st_mode):04o}"
-            return f"it is for no group (mode {mode}, group {group_of(path, 'root')}); `imud doctor` has the udev rule"
+            return (
+                f"no group may open it (mode {mode}, group {group_of(path, 'root')}); `imud doctor` prints a udev rule"
+            )
     group = group_of(path, SERIAL_GROUP)
-    return f"it belongs to group {group}; `sudo usermod -aG {group} {user_name()}` and a new login give access"
+    return f"it belongs to group {group}; run `sudo usermod -aG {group} {user_name()}` and log in again"
 
 
 def bus_open_problem(error: OSError, path: str, missing: str) -> LinkError:
     """Return the LinkError of an I2C or SPI bus that cannot be opened. `missing` as in `open_problem`."""
-    return open_problem(error, path, missing) or LinkError(f"{path} cannot be used: {reason_of(error)}")
+    return open_problem(error, path, missing) or LinkError(f"cannot use {path}: {reason_of(error)}")
 
 
 def errno_of(error: Exception) -> int | None:
@@ -216,17 +215,16 @@ def errno_of(error: Exception) -> int | None:
 def transfer_problem(error: OSError, path: str, place: str) -> LinkError | TransferError:
     """Return the error of a failed transfer: LinkMissing if the bus was removed, otherwise TransferError."""
     if error.errno in GONE:
-        return LinkMissing(f"{path} is gone ({os.strerror(error.errno or 0)}): was an adapter pulled out?")
+        return LinkMissing(f"{path} is missing ({os.strerror(error.errno or 0)}): was its adapter unplugged?")
     if error.errno in NOT_ACKNOWLEDGED:
-        return TransferError(Trouble.ABSENT, f"no acknowledgement at {place} on {path}: is it powered, is it wired?")
+        return TransferError(Trouble.ABSENT, f"no acknowledgement at {place} on {path}; check power and wires")
     if error.errno in STUCK:
-        return TransferError(Trouble.STUCK, f"{path} timed out at {place}: is a line of the bus held low?")
+        return TransferError(Trouble.STUCK, f"{path} timed out at {place}: is a wire of the bus held low?")
     return TransferError(Trouble.DISTURBED, f"transfer failed at {place} on {path}: {os.strerror(error.errno or 0)}")
 
 
 def holders_of(path: str, proc: Path = PROC) -> str:
-    """Return the processes that use the node, for example `minicom (pid 123)`, as far as /proc shows them to this
-    user."""
+    """Return the processes that use the node and that this user may see, for example `minicom (pid 123)`."""
     target = os.path.realpath(path)
     holders = []
     for process in sorted(proc.glob("[0-9]*")):

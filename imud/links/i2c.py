@@ -21,7 +21,7 @@ from imud.model.options import Options
 
 I2C_TIMEOUT: Final = 0x0702  # ioctl: timeout of the adapter in units of 10 ms (<linux/i2c-dev.h>)
 TIMEOUT_10MS: Final = 5  # timeout of the bus, 10 ms: 40 times the 1.2 ms of 48 bytes at 400 kHz
-SWITCHED_ON: Final = "is I2C switched on (`dtparam=i2c_arm=on` on a Raspberry Pi), is module i2c-dev loaded?"
+SWITCHED_ON: Final = "is I2C enabled (Raspberry Pi: `dtparam=i2c_arm=on`), and is the kernel module i2c-dev loaded?"
 BLOCK_BYTES_MAX: Final = 32  # maximum length of an I2C block read of an SMBus controller, bytes
 
 

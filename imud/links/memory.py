@@ -56,7 +56,7 @@ class MemoryPort:
     def disappear(self) -> None:
         """Remove the port: `wait_present` waits, and an open link ends with LinkMissing."""
         self._present.clear()
-        self.end(LinkMissing(f"{self.title} is gone: the test pulled it out"))
+        self.end(LinkMissing(f"{self.title} is missing: the test unplugged it"))
 
     def end(self, error: LinkError | None = None) -> None:
         """End the link with an error, or regularly if `error` is None."""
@@ -66,7 +66,7 @@ class MemoryPort:
             on_end(error)
 
     def absence(self) -> str:
-        return "" if self._present.is_set() else f"{self.title} is not there: the test pulled it out"
+        return "" if self._present.is_set() else f"{self.title} does not exist: the test unplugged it"
 
     async def wait_present(self) -> None:
         await self._present.wait()
@@ -76,13 +76,13 @@ class MemoryPort:
         if reason := self.absence():
             raise LinkMissing(reason)
         if self.is_open:
-            raise LinkBusy(f"{self.title} is open already")
+            raise LinkBusy(f"{self.title} is already open")
         self.is_open = True
 
     def write(self, data: bytes) -> None:
         """Store the bytes in `written`. Raises LinkError if the port is closed."""
         if not self.is_open:
-            raise LinkError(f"{self.title} is not open: nothing can be sent")
+            raise LinkError(f"{self.title} is not open and cannot send")
         self.written.append(data)
 
     def kernel_counters(self) -> KernelCounters:
@@ -142,7 +142,7 @@ class MemoryLink(MemoryPort):
     def set_baud(self, baud: int) -> None:
         """Store the rate in `bauds`. Raises LinkError if the port is closed."""
         if not self.is_open:
-            raise LinkError(f"{self.title} is not open: its rate cannot be set")
+            raise LinkError(f"{self.title} is not open; cannot set its baud rate")
         self.bauds.append(baud)
         self.baud = baud
 
@@ -192,7 +192,7 @@ class MemoryCanLink(MemoryPort):
     def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
         """Store the frames in `cyclic`. Raises LinkError if the link is closed."""
         if not self.is_open:
-            raise LinkError(f"{self.title} is not open: nothing can be sent")
+            raise LinkError(f"{self.title} is not open and cannot send")
         self.cyclic = frames
 
     def close(self) -> None:

@@ -37,16 +37,15 @@ class CanDetails(NamedTuple):
 
 
 def absence(name: str, sys: Path = SYS) -> str:
-    """Return why a CAN interface cannot be used now; empty if it can. Raises LinkError if the interface is of another
-    kind."""
+    """Return why a CAN interface cannot be used now; empty if it can. Raises LinkError for other interfaces."""
     folder = sys / "class/net" / name
     try:
         kind = int((folder / "type").read_text())
         flags = int((folder / "flags").read_text(), 16)
     except OSError:
-        return f"{name} is not there: expected a CAN interface (`ip link` lists them)"
+        return f"{name} does not exist: expected a CAN interface (`ip link` lists them)"
     if kind != ARPHRD_CAN:
-        raise LinkError(f"{name} is no CAN interface (`ip -details link show type can` lists them)")
+        raise LinkError(f"{name} is not a CAN interface (`ip -details link show type can` lists them)")
     return "" if flags & IFF_UP else f"{name} is down: set its bit rate and bring it up (`ip link set {name} up`)"
 
 
@@ -97,7 +96,7 @@ def can_details(name: str) -> CanDetails:
             asking.send(_HEADER.pack(size, RTM_GETLINK, NLM_F_REQUEST, 1, 0) + _LINK.pack(0, 0, index, 0, 0))
             answer = asking.recv(NEWS_BYTES)
     except OSError as error:
-        raise LinkError(f"{name}: its settings cannot be read: {error.strerror}") from error
+        raise LinkError(f"cannot read the settings of {name}: {error.strerror}") from error
     return parse_details(answer)
 
 

@@ -65,7 +65,7 @@ class PythonCanLink:
         try:
             self._bus = can.Bus(self._channel, self._backend, can_filters=filters, ignore_config=True, **rate)
         except (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError) as error:
-            raise LinkError(f"{self.title} cannot be opened: {reason_of(error)}") from error
+            raise LinkError(f"cannot open {self.title}: {reason_of(error)}") from error
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
         """Start the delivery of frames. python-can does not report changes of the bus state."""
@@ -79,7 +79,7 @@ class PythonCanLink:
     def write(self, data: bytes) -> None:
         """Send frames (`struct can_frame`). Raises LinkError."""
         if self._bus is None:
-            raise LinkError(f"{self.title} is not open: nothing can be sent")
+            raise LinkError(f"{self.title} is not open and cannot send")
         try:
             for can_id, size, payload in RAW_FRAME.iter_unpack(data):
                 extended = can_id >= EXTENDED_FLAG
@@ -88,7 +88,7 @@ class PythonCanLink:
                 )
                 self._bus.send(message, timeout=0)
         except can.CanError as error:
-            raise LinkError(f"{self.title} does not send: {reason_of(error)}") from error
+            raise LinkError(f"{self.title} cannot send: {reason_of(error)}") from error
 
     def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
         """Send the frames from the event loop. The link ends if it cannot send a frame. Raises LinkError.

@@ -26,7 +26,7 @@ from imud.contracts.link import LinkType, OnBusNews, OnData, OnEnd, OnFrames
 from imud.contracts.status import KernelCounters
 from imud.formats.can import CandumpReader, CanFilter, CanFrame, CyclicFrame
 from imud.formats.capture import CaptureReader
-from imud.host.files import NotRegularFile
+from imud.host.files import NotRegularFile, user_name
 from imud.host.files import open_regular as open_file
 from imud.links.device_node import wait_until
 from imud.model.errors import ImudError, LinkDenied, LinkError, LinkMissing
@@ -50,7 +50,7 @@ class ReplayOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def __post_init__(self) -> None:
         """Raises ValueError for keys that exclude each other."""
         if self.repeat and self.speed == "maximum":
-            raise ValueError("repeat: expected false at speed maximum, whose time would run into the future, got true")
+            raise ValueError("repeat: expected false at speed maximum, or times would be in the future, got true")
 
 
 class FileReplay:
@@ -69,7 +69,7 @@ class FileReplay:
         self._timer: asyncio.Handle | None = None
 
     def absence(self) -> str:
-        return "" if Path(self.title).exists() else f"{self.title} is not there: expected a capture file"
+        return "" if Path(self.title).exists() else f"{self.title} does not exist: expected a capture file"
 
     async def wait_present(self) -> None:
         path = Path(self.title)
@@ -77,7 +77,7 @@ class FileReplay:
 
     def write(self, data: bytes) -> None:
         """Raises LinkError: a file cannot receive data."""
-        raise LinkError(f"{self.title} is a replay: nothing can be sent to it")
+        raise LinkError(f"{self.title} is a replay and cannot receive data")
 
     def kernel_counters(self) -> KernelCounters:
         """Return zeros: the kernel does not count errors of a file."""
@@ -97,18 +97,18 @@ def open_regular(path: str) -> BinaryIO:
     try:
         return open_file(path)
     except FileNotFoundError as error:
-        raise LinkMissing(f"{path} is not there: expected a capture file") from error
+        raise LinkMissing(f"{path} does not exist: expected a capture file") from error
     except PermissionError as error:
-        raise LinkDenied(f"{path} may not be read by this user") from error
+        raise LinkDenied(f"cannot read {path}: user {user_name()} lacks the permission") from error
     except NotRegularFile as error:
-        raise LinkError(f"{path} is not a regular file: a replay reads a capture file") from error
+        raise LinkError(f"{path} is not a regular file: expected a capture file") from error
     except OSError as error:
         raise unreadable(path, error) from error
 
 
 def unreadable(path: str, error: OSError) -> LinkError:
     """Return the error of a file that cannot be read."""
-    return LinkError(f"{path} cannot be read: {error.strerror}")
+    return LinkError(f"cannot read {path}: {error.strerror}")
 
 
 TURN_FRAMES: Final = 512  # maximum number of frames in one turn of the event loop: 1 ms of decoding
@@ -118,7 +118,7 @@ log = logging.getLogger(__name__)
 
 def no_log(path: str) -> str:
     """Return the error text of a file without frames."""
-    return f"{path} is no CAN log: expected frames as `candump -L` writes them, found none"
+    return f"{path} is not a CAN log: expected frames in the format of `candump -L`, got none"
 
 
 class CanReplayLink(FileReplay):
@@ -158,7 +158,7 @@ class CanReplayLink(FileReplay):
 
     def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
         """Raises LinkError: a file cannot receive data."""
-        raise LinkError(f"{self.title} is a replay: nothing can be sent to it")
+        raise LinkError(f"{self.title} is a replay and cannot receive data")
 
     def _turn(self, on_frames: OnFrames, on_end: OnEnd, waiting: CanFrame | None) -> None:
         """Deliver the due frames, at most TURN_FRAMES, then return to the event loop."""
@@ -253,7 +253,7 @@ class ReplayLink(FileReplay):
 
     def set_baud(self, baud: int) -> None:
         """Raises LinkError: the rate of a recording is fixed."""
-        raise LinkError(f"{self.title} is a replay: its rate cannot be changed")
+        raise LinkError(f"{self.title} is a replay with a fixed baud rate")
 
     def _turn(self, on_data: OnData, on_end: OnEnd, waiting: tuple[bytes, int] | None) -> None:
         """Deliver the due bytes, at most TURN_BYTES, then return to the event loop."""
@@ -335,9 +335,9 @@ class ReplayLink(FileReplay):
 def _unplayable(settings: ReplayOptions, reader: CaptureReader) -> str:
     """Return why a capture cannot be played at the configured speed; empty if it can."""
     if settings.speed == "recorded" and not reader.stamped:
-        return f"{settings.path} is a raw capture without times: use speed real with a baud, or maximum"
+        return f"{settings.path} is a raw capture without times: use speed real with the key baud, or speed maximum"
     if settings.speed == "real" and not (settings.baud or reader.baud):
-        return f"{settings.path} does not say its baud rate: speed real needs the key baud"
+        return f"{settings.path} does not contain its baud rate: speed real needs the key baud"
     return ""
 
 

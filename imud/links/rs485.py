@@ -83,8 +83,8 @@ class Direction:
         except OSError as error:
             if required or error.errno not in UNSUPPORTED:
                 raise LinkError(
-                    f"{title}: its driver cannot switch the direction of RS-485 ({error.strerror}); `direction: none` "
-                    "if the adapter does it by itself"
+                    f"the driver of {title} cannot switch the direction of RS-485 ({error.strerror}); set "
+                    "`direction: none` if the adapter switches it"
                 ) from error
 
     def restore(self) -> None:
@@ -225,10 +225,10 @@ class Rs485Line:
         return finder.feed(self._read())  # this thread may be late: read once more
 
     def _note_echo(self, finder: ReplyFinder, reply: bytes | None) -> None:
-        """Note whether the port echoes. Noise before an echo hides it: only a reply without bytes before it shows that
-        there is no echo."""
+        """Store whether the port echoes."""
         if finder.echo_seen:
             self.counters.echoed += 1
+        # noise can hide an echo: only a reply without bytes before it shows that there is no echo
         if self.echoes is None and (finder.echo_seen or (reply is not None and not finder.strange)):
             self.echoes = finder.echo_seen
 
@@ -236,11 +236,11 @@ class Rs485Line:
         rest = finder.rest()
         if rest or finder.strange:
             message = f"no reply from address {target} on {self._path}, but other bytes: {rest[:16].hex(' ')}"
-            return TransferError(Trouble.DISTURBED, f"{message}; is the baud rate right, is an address given twice?")
+            return TransferError(Trouble.DISTURBED, f"{message}; check the baud rate and the addresses")
         # DISTURBED, not ABSENT: noise can destroy a request; after three failures in a row the device counts as lost
         return TransferError(
             Trouble.DISTURBED,
-            f"no reply from address {target} on {self._path}: is it powered, are A and B not swapped?",
+            f"no reply from address {target} on {self._path}; check the power of the device and the wires A and B",
         )
 
     def _send(self, frame: bytes) -> None:
@@ -253,7 +253,7 @@ class Rs485Line:
         except OSError as error:
             raise port_problem(error, self._path, self._proc) from error
         if sent != len(frame):
-            raise TransferError(Trouble.STUCK, f"{self._path} does not send: is the port stuck?")
+            raise TransferError(Trouble.STUCK, f"{self._path} does not accept bytes: is the port stuck?")
         self._quiet_ns = self._now_ns() + len(frame) * self._byte_ns
 
     def _await_silence(self) -> None:
@@ -266,7 +266,7 @@ class Rs485Line:
             if not late and now_ns >= self._quiet_ns + self._gap_ns:
                 return
             if now_ns > limit_ns:
-                raise TransferError(Trouble.STUCK, f"{self._path} is never silent: does another master speak there?")
+                raise TransferError(Trouble.STUCK, f"{self._path} is never silent: is there another master on the bus?")
             self._sleep_until(self._quiet_ns + self._gap_ns)
 
     def _read(self) -> bytes:
@@ -283,7 +283,7 @@ class Rs485Line:
         return data
 
     def _gone(self, why: str) -> LinkMissing:
-        return LinkMissing(f"{self._path} is gone ({why}): was the cable or the adapter pulled out?")
+        return LinkMissing(f"{self._path} is missing ({why}): was the cable or the adapter unplugged?")
 
     def _sleep_until(self, deadline_ns: int) -> None:
         left_ns = deadline_ns - self._now_ns()
@@ -301,8 +301,7 @@ class SharedPorts:
         self._now_ns = now_ns
 
     def share(self, setup: PortSetup, sys: Path = Path("/sys"), proc: Path = PROC) -> Rs485Line:
-        """Return the bus of a path; open it if necessary. Raises LinkError, also if the options differ from the open
-        bus."""
+        """Return the bus of a path; open it if necessary. Raises LinkError, also for options other than its own."""
         with self._lock:
             line = self._open.get(setup.path)
             if line is None:
@@ -340,8 +339,7 @@ SHARED_PORTS: Final = SharedPorts()  # open buses of this process
 
 
 class Rs485Options(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of a device on an RS-485 bus. All but `address`, `rate_hz` and `reply_ms` must be the same for all
-    devices of the bus."""
+    """Options of a device on an RS-485 bus. `address`, `rate_hz` and `reply_ms` can differ on the same bus."""
 
     line: Annotated[str, Meta(min_length=1)]
     """Path of the port. Several devices can have the same path."""
@@ -409,8 +407,7 @@ class Rs485Link:
         return f"address {target}"
 
     def transfer(self, transfer: Transfer) -> bytes:
-        """Return the complete reply to a request, also a damaged reply or a Modbus exception. Raises TransferError or
-        LinkError."""
+        """Return the reply to a request, also if damaged or a Modbus exception. Raises TransferError or LinkError."""
         line, (request,) = self._line, transfer.sends
         if line is None:
             raise LinkError(f"{self.title} is not open")

@@ -49,8 +49,7 @@ PIPE_ENDS: Final = ("pipe_abort_read_r", "pipe_abort_read_w", "pipe_abort_write_
 
 
 class DescriptorPort(serial.Serial):
-    """A port without the pipes of pyserial: one descriptor instead of five. The link reads and writes the descriptor
-    itself."""
+    """A port without the pipes of pyserial: one descriptor instead of five."""
 
     def open(self) -> None:
         """Open the port. Raises OSError, ValueError or termios.error."""
@@ -69,8 +68,7 @@ class DescriptorPort(serial.Serial):
 
 
 def open_port(path: str, baud: int, proc: Path) -> serial.Serial:
-    """Open `path` exclusively as raw 8N1 without flow control. Raises LinkMissing, LinkDenied, LinkBusy or
-    LinkError."""
+    """Open `path` exclusively, raw 8N1, no flow control. Raises LinkMissing, LinkDenied, LinkBusy or LinkError."""
     try:
         # inter_byte_timeout=0 sets VMIN=1: a read without data then gives EAGAIN, and 0 bytes always mean a hang-up
         port = DescriptorPort(path, baud, exclusive=True, timeout=0, write_timeout=0, inter_byte_timeout=0)
@@ -90,8 +88,7 @@ def open_port(path: str, baud: int, proc: Path) -> serial.Serial:
 
 
 def change_baud(port: serial.Serial, path: str, baud: int, proc: Path) -> None:
-    """Set another rate and discard the bytes of the old rate. Raises LinkError if the port does not support the
-    rate."""
+    """Set another rate and discard the bytes of the old rate. Raises LinkError for an unsupported rate."""
     try:
         port.baudrate = baud
         termios.tcflush(port.fileno(), termios.TCIFLUSH)
@@ -112,11 +109,11 @@ def port_problem(error: Exception, path: str, proc: Path = PROC) -> LinkError:
     if known := open_problem(error, path, CABLE, proc):
         return known
     if errno_of(error) == errno.EIO:
-        return LinkError(f"{path} has a node but no hardware behind it: is this the right port, is it enabled?")
+        return LinkError(f"{path} exists without hardware; check the name of the port, and that it is enabled")
     reason = reason_of(error)
     if (os.path.exists(path) and not Path(path).is_char_device()) or reason == os.strerror(errno.ENOTTY):
-        return LinkError(f"{path} is not a serial port: expected one such as /dev/ttyUSB0")
-    return LinkError(f"{path} cannot be used as a serial port: {reason}")
+        return LinkError(f"{path} is not a serial port: expected a port such as /dev/ttyUSB0")
+    return LinkError(f"cannot use {path} as a serial port: {reason}")
 
 
 def _finish_raw(fd: int) -> None:
@@ -129,7 +126,7 @@ def _finish_raw(fd: int) -> None:
 def _check_rate(port: serial.Serial, path: str, baud: int) -> None:
     real = baud_of(port.fileno())
     if abs(real - baud) > baud * BAUD_TOLERANCE:
-        raise LinkError(f"{path} cannot do {baud} baud: asked for it, its driver set {real}")
+        raise LinkError(f"{path} does not support {baud} baud: its driver set {real} baud")
 
 
 def request_low_latency(port: serial.Serial, path: str, sys: Path) -> None:

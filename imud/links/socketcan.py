@@ -34,6 +34,7 @@ from imud.formats.can import (
     CanFrame,
     CyclicFrame,
 )
+from imud.host.files import user_name
 from imud.links import netlink
 from imud.links.cyclic_sender import NO_MANAGER, KernelSender, LoopSender, Sender
 from imud.model.errors import LinkDenied, LinkError, LinkMissing
@@ -68,10 +69,10 @@ _WORDS: Final = {
     ControllerState.BUS_OFF: "bus-off",
 }
 _HELP: Final = {
-    ControllerState.PASSIVE: "do all nodes have the same bit rate, is the bus terminated at both ends?",
+    ControllerState.PASSIVE: "check that all nodes have the same bit rate, and that the bus is terminated at both ends",
     ControllerState.BUS_OFF: (
-        "it left the bus; `ip link set {name} down`, then `ip link set {name} up type can restart-ms 100` let it "
-        "recover by itself"
+        "it left the bus; run `ip link set {name} down`, then `ip link set {name} up type can restart-ms 100` for an "
+        "automatic recovery"
     ),
 }
 
@@ -339,7 +340,7 @@ class SocketCanOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields
     def __post_init__(self) -> None:
         """Raises ValueError for keys that exclude each other."""
         if self.bitrate and self.backend == NATIVE:
-            raise ValueError("bitrate: expected none with backend socketcan, the system sets it (docs/can.md)")
+            raise ValueError("bitrate: expected no value with backend socketcan; the system sets it (docs/can.md)")
 
 
 OpenSocket = Callable[[SocketCanOptions, Sequence[CanFilter]], socket.socket]
@@ -369,7 +370,7 @@ def _enlarge(opened: socket.socket, settings: SocketCanOptions) -> None:
     got = opened.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
     if got < wanted:
         log.info(
-            "%s: receive buffer of %d bytes, wanted %d (sysctl net.core.rmem_max): room for about %d frames",
+            "%s: receive buffer of %d bytes, requested %d (sysctl net.core.rmem_max): room for about %d frames",
             settings.interface, got, wanted, got // FRAME_BUFFER_BYTES,
         )  # fmt: skip
 
@@ -429,8 +430,7 @@ class SocketCanLink:
             self._read_on_time()
 
     def absence(self) -> str:
-        """Return why the interface cannot be used now; empty if it can. Raises LinkError if it is not a CAN
-        interface."""
+        """Return why the interface cannot be used now; empty if it can. Raises LinkError for other interfaces."""
         return netlink.absence(self._settings.interface, self._sys)
 
     async def wait_present(self) -> None:
@@ -466,25 +466,24 @@ class SocketCanLink:
     def write(self, data: bytes) -> None:
         """Send frames (`struct can_frame`), one system call each. Raises LinkError."""
         if self._socket is None:
-            raise LinkError(f"{self.title} is not open: nothing can be sent")
+            raise LinkError(f"{self.title} is not open and cannot send")
         try:
             for at in range(0, len(data), RAW_FRAME.size):
                 self._socket.send(data[at : at + RAW_FRAME.size])
         except OSError as error:
             if error.errno in (errno.ENOBUFS, errno.EAGAIN):
-                raise LinkError(f"{self.title} does not send, its queue is full: is it alone on the bus?") from error
+                raise LinkError(f"{self.title} cannot send, its queue is full: is another node on the bus?") from error
             raise self._explained(error) from error
 
     def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
-        """Send frames cyclically from the kernel, or from the event loop if the kernel has no broadcast manager. Raises
-        LinkError."""
+        """Send frames cyclically from the kernel, or from the event loop without CAN_BCM. Raises LinkError."""
         self._end_sender()
         try:
             self._sender = KernelSender(self._settings.interface, frames)
         except OSError as error:
             if error.errno not in NO_MANAGER:
                 raise self._explained(error) from error
-            log.info("%s: this kernel has no CAN_BCM (module can_bcm): cyclic frames are less exact", self.title)
+            log.info("%s: this kernel has no CAN_BCM (kernel module can_bcm): cyclic frames are less exact", self.title)
             self._sender = LoopSender(self.write, self._on_end, frames)
 
     def kernel_counters(self) -> KernelCounters:
@@ -512,8 +511,7 @@ class SocketCanLink:
             sender.close()
 
     def _read(self) -> None:
-        """Read one batch. The event loop calls again for the rest. With a hold, the next read follows after
-        `gather_ns`."""
+        """Read one batch. The event loop calls again for the rest, or after `gather_ns` with a hold."""
         loop, opened = self._loop, self._socket
         count = self._read_batch()
         if self._gather_ns and count and loop is not None and opened is not None and opened is self._socket:
@@ -563,12 +561,12 @@ class SocketCanLink:
     def _explained(self, error: OSError) -> LinkError:
         name = self.title
         if error.errno in (errno.ENETDOWN, errno.ENODEV, errno.ENXIO):
-            reason = "was taken down" if error.errno == errno.ENETDOWN else "is gone"
-            return LinkMissing(f"{name} {reason}: waiting for it to come up")
+            reason = "is down" if error.errno == errno.ENETDOWN else "is missing"
+            return LinkMissing(f"{name} {reason}: imud waits until it is up")
         if error.errno == errno.EAFNOSUPPORT:
-            return LinkError(f"{name}: this kernel has no CAN (expected AF_CAN; is the module can_raw there?)")
+            return LinkError(f"{name}: this kernel has no CAN sockets; load the kernel module can_raw")
         if isinstance(error, PermissionError):
-            return LinkDenied(f"{name} may not be opened by this user")
+            return LinkDenied(f"cannot open {name}: user {user_name()} lacks the permission")
         return LinkError(f"{name}: {os.strerror(error.errno or 0)}")
 
 
@@ -591,8 +589,7 @@ def make(settings: SocketCanOptions) -> CanLink:
 
 
 def _claims(settings: SocketCanOptions) -> list[Claim]:
-    """Return the claim of a device: a bus that devices share. The port of a serial adapter (`slcan`) is for one device
-    only."""
+    """Return the claim of a device: a shared bus, or the port of a serial adapter (`slcan`) for one device."""
     name, port = settings.interface, settings.interface.startswith("/")
     place = name if port or settings.backend == NATIVE else f"{name} ({settings.backend})"
     return [Claim(place=place, key="interface", shared=not port, terms={"bitrate": settings.bitrate})]

@@ -33,7 +33,7 @@ ROW: Final = struct.Struct("=QQIIHBBBBBB")
 # Maximum number of rows in one ioctl. A row has 32 bytes. fcntl.ioctl blocks all other threads if the argument is
 # longer than 1024 bytes.
 ROWS_MAX: Final = 32
-SWITCHED_ON: Final = "is SPI switched on (`dtparam=spi=on` on a Raspberry Pi)?"
+SWITCHED_ON: Final = "is SPI enabled (Raspberry Pi: `dtparam=spi=on`)?"
 # Maximum number of transfers with stored buffers. A device uses about ten different transfers.
 PREPARED_MAX: Final = 64
 
@@ -100,15 +100,14 @@ class SpiLink:
         try:
             self._ioctl(self._fd, WR_MODE, bytes([target]))
         except OSError as error:
-            raise LinkError(f"{self.title} cannot do mode {target}: {os.strerror(error.errno or 0)}") from error
+            raise LinkError(f"{self.title} rejects SPI mode {target}: {os.strerror(error.errno or 0)}") from error
 
     def place(self, target: int) -> str:
         """Return a mode in the form of messages."""
         return f"mode {target}"
 
     def transfer(self, transfer: Transfer) -> bytes:
-        """Send the words of `transfer`. Return the words that the link received at the same time. Raises TransferError,
-        LinkMissing or LinkError."""
+        """Send words. Return the words received at the same time. Raises TransferError, LinkMissing or LinkError."""
         message = self._prepared.get(transfer) or self._prepare(transfer)
         try:
             self._ioctl(self._fd, message.request, message.rows)

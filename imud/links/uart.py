@@ -87,8 +87,7 @@ class UartLink:
         self._loop.add_reader(self._fd, self._read)
 
     def pause(self) -> None:
-        """Stop the delivery until `resume`. Bytes wait in the kernel. imud does not notice a removed port in this
-        time."""
+        """Stop the delivery until `resume`. Bytes wait in the kernel. imud does not detect a removed port."""
         if self._loop is not None:
             self._loop.remove_reader(self._fd)
 
@@ -117,12 +116,11 @@ class UartLink:
             self._loop.add_reader(self._fd, self._read)
 
     def write(self, data: bytes) -> None:
-        """Send bytes. Queue the bytes that the port does not accept now, at most WRITE_QUEUE_BYTES. Raises
-        LinkError."""
+        """Send bytes, or queue at most WRITE_QUEUE_BYTES that the port does not accept now. Raises LinkError."""
         if self._fd < 0:
-            raise LinkError(f"{self.title} is not open: nothing can be sent")
+            raise LinkError(f"{self.title} is not open and cannot send")
         if len(self._unsent) + len(data) > WRITE_QUEUE_BYTES:
-            raise LinkError(f"{self.title} does not send: {len(self._unsent)} bytes wait; is the port stuck?")
+            raise LinkError(f"{self.title} does not accept bytes: {len(self._unsent)} bytes wait; is the port stuck?")
         if self._unsent:
             self._unsent += data
             return
@@ -133,10 +131,9 @@ class UartLink:
             self._loop.add_writer(self._fd, self._write_more)
 
     def set_baud(self, baud: int) -> None:
-        """Change the rate and discard the bytes of the old rate. Raises LinkError if the port does not support the
-        rate."""
+        """Change the rate and discard the bytes of the old rate. Raises LinkError for an unsupported rate."""
         if self._port is None:
-            raise LinkError(f"{self.title} is not open: its rate cannot be set")
+            raise LinkError(f"{self.title} is not open; cannot set its baud rate")
         change_baud(self._port, self._settings.port, baud, self._proc)
         self.baud = baud
 
@@ -169,7 +166,7 @@ class UartLink:
     def _end(self, error: OSError | None) -> None:
         self._stop()
         reason = "hung up" if error is None else f"{os.strerror(error.errno or 0)}"
-        self._on_end(LinkMissing(f"{self.title} is gone ({reason}): was the cable or the adapter pulled out?"))
+        self._on_end(LinkMissing(f"{self.title} is missing ({reason}): was the cable or the adapter unplugged?"))
 
     def _send(self, data: bytes | bytearray) -> int:
         try:

@@ -39,7 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
     if all(name in CAN_SIMULATORS for name, _ in devices):
         return _run_on_can(options, devices, now_ns)
     if len(devices) > 1:
-        print("imud.sim: expected one device behind a terminal, or one or more on a CAN bus", file=sys.stderr)
+        print("imud.sim: expected one device on a terminal, or one or more devices on a CAN bus", file=sys.stderr)
         return 2
     ((name, node),) = devices
     try:

@@ -175,7 +175,7 @@ class CanModules:
     def __init__(self, modules: Sequence[CanModule]) -> None:
         """Raises ValueError if `modules` is empty."""
         if not modules:
-            raise ValueError("expected at least one module")
+            raise ValueError("expected at least one device, got none")
         self.modules = tuple(modules)
         self.epoch_ns = modules[0].epoch_ns
 

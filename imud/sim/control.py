@@ -104,7 +104,7 @@ DEVICE: Final = "hipnuc-uart"  # driver of the device that is simulated by defau
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     default = SimulatorOptions()
-    parser = argparse.ArgumentParser("python -m imud.sim", description="A simulated sensor behind a pseudo-terminal.")
+    parser = argparse.ArgumentParser("python -m imud.sim", description="A simulated sensor on a pseudo-terminal.")
     add = parser.add_argument
     add(
         "--device",
@@ -115,7 +115,7 @@ def make_parser() -> argparse.ArgumentParser:
         "several times for several devices on one CAN interface",
     )
     add("--node", type=int, default=default.node, metavar="N", help="node, address or first identifier on a CAN bus")
-    add("--at-once", action="store_true", help="CAN frames of one instant leave together, not paced by the bit rate")
+    add("--at-once", action="store_true", help="send the CAN frames of one instant together, not at the bit rate")
     add("--rate", type=float, default=default.rate_hz, metavar="HZ", help="samples per second (%(default)s)")
     add(
         "--baud",
@@ -123,7 +123,7 @@ def make_parser() -> argparse.ArgumentParser:
         default=0,
         help="baud rate of the port, bit/s (default: the slowest usual rate that carries the samples)",
     )
-    add("--message", default="", help="message to send (the factory's)")
+    add("--message", default="", help="message to send (factory setting)")
     add("--motion", choices=sorted(MOTIONS), default=default.motion, help="known motion (%(default)s)")
     add("--gravity", type=float, default=GRAVITY_M_S2, metavar="M_S2", help="local gravity (%(default)s m/s²)")
     add("--noise", action=argparse.BooleanOptionalAction, default=True, help="sensor noise and bias")
@@ -132,14 +132,19 @@ def make_parser() -> argparse.ArgumentParser:
     add("--boot", type=float, default=default.boot_ms / 1000, metavar="S", help="silence after power-on (%(default)s)")
     add("--processing-us", type=float, default=default.processing_ns / 1000, metavar="US",
         help="time from sample to wire (%(default)s)")  # fmt: skip
-    add("--adapter", choices=list(ADAPTERS), default=BARE_UART.name, help="how bytes are handed over (%(default)s)")
+    add(
+        "--adapter",
+        choices=list(ADAPTERS),
+        default=BARE_UART.name,
+        help="adapter with its delay (%(default)s)",
+    )
     add("--faults", default="", metavar="KIND=P,…", help="probability per burst: cut flip drop insert delay unplug …")
     add("--pins", default="", metavar="NAME=PATH,…", help="pins by name (sout sout_div alarm), each on a `pull` file "
         "of a gpio-sim line")  # fmt: skip
     add("--pin-faults", default="", metavar="KIND=P,…", help="probability per pulse: lose_pulse lose_edge extra")
     add("--pin-settle", type=float, default=0.0, metavar="MS", help="wait this time after each rising edge")
     add("--pin-truth", type=Path, metavar="FILE", help="write edges, CSV: pin,level,due_ns,sample_ns,step_ns")
-    add("--sin", type=Path, metavar="PATH", help="SIN: the `value` file of a gpio-sim line, looked at every "
+    add("--sin", type=Path, metavar="PATH", help="SIN: the `value` file of a gpio-sim line, read every "
         f"{SIN_LOOK_NS / NS_PER_MS:g} ms")  # fmt: skip
     add("--seed", type=int, default=default.seed, help="seed of noise and faults (%(default)s)")
     add("--interface", default="", metavar="NAME", help="CAN interface, for CAN devices (the first that is up)")

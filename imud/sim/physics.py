@@ -80,7 +80,7 @@ class Swing:
     ) -> None:
         """Angles in rad, position in m. Pitch stays within ±90°, where order 312 is unique."""
         if sum(abs(term.amplitude) for term in pitch) >= pi / 2:
-            raise ValueError("pitch would reach 90°, where roll and yaw are no longer defined")
+            raise ValueError("expected a pitch below 90°, because roll and yaw are undefined at 90°")
         self._roll, self._pitch, self._yaw = _terms(roll), _terms(pitch), _terms(yaw)
         self._east, self._north, self._up = (_terms(axis) for axis in position_enu)
         self.gravity_m_s2 = gravity_m_s2
@@ -141,8 +141,7 @@ def _into_body(v: Vector3, turn: _Turn) -> Vector3:
 
 
 def swing(gravity_m_s2: float = GRAVITY_M_S2) -> Motion:
-    """Return the default motion. All axes turn by tens of degrees and shake by some tenths of m/s². The period is very
-    long."""
+    """Return the default motion: all axes turn by tens of degrees and shake by some tenths of m/s²."""
     return Swing(
         roll=(Sine(0.44, 0.23), Sine(0.07, 1.3, 0.4)),
         pitch=(Sine(0.35, 0.31, 1.0), Sine(0.09, 0.97)),
@@ -153,8 +152,7 @@ def swing(gravity_m_s2: float = GRAVITY_M_S2) -> Motion:
 
 
 def tumble(gravity_m_s2: float = GRAVITY_M_S2) -> Motion:
-    """Return a slow rotation in all directions, as for the calibration of a magnetometer: more than 360° about each
-    axis within a minute."""
+    """Return a slow rotation for a magnetometer calibration: more than 360° about each axis within a minute."""
     return Swing(
         roll=(Sine(3.1, 0.043),), pitch=(Sine(1.4, 0.071),), yaw=(Sine(3.1, 0.037),), gravity_m_s2=gravity_m_s2
     )
@@ -276,8 +274,7 @@ class NoiseLevels:
 
 
 class Noise:
-    """Adds noise to a truth. The same seed and the same calls give the same noise. The attitude stays true, because
-    tests compare the output of the device's filter with it."""
+    """Adds noise to a truth, except to its attitude. The same seed and the same calls give the same noise."""
 
     def __init__(self, seed: int, levels: NoiseLevels | None = None) -> None:
         self._levels = levels = levels or NoiseLevels()

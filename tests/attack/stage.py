@@ -52,7 +52,7 @@ QUIET_LIMIT_S = 10.0
 user."""
 LOG_SPOILT = b"the old configuration stays active"
 LOG_FILLER = b"-" * 63
-LOG_EXPECTED = (b"no byte arrives on", LOG_SPOILT, LOG_FILLER, b" is gone (hung up)")
+LOG_EXPECTED = (b"no byte arrives on", LOG_SPOILT, LOG_FILLER, b" is missing (hung up)")
 PROBLEMS = 20  # errors in the spoilt configuration
 
 

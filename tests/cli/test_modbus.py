@@ -208,4 +208,4 @@ def test_a_real_port(tmp_path: Path, cli: Cli) -> None:
     with wired(tmp_path, slave(2)) as (path, line):
         words = ("modbus", "scan", path, "--baud", line.baud, "--reply-ms", "1000", "--addresses", "2")
         assert "HI14R2N-485-000" in cli(*words).out
-    cli.refuses("is not there", "modbus", "scan", tmp_path / "none")
+    cli.refuses("does not exist", "modbus", "scan", tmp_path / "none")

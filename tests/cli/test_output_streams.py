@@ -157,7 +157,7 @@ def test_a_configuration_from_standard_input(cli: Cli, monkeypatch: pytest.Monke
 @pytest.mark.parametrize("special", ["fifo", "/dev/zero", "/dev/tty", "."])
 def test_check_of_what_is_no_file(special: str, tmp_path: Path, cli: Cli) -> None:
     os.mkfifo(tmp_path / "fifo")
-    cli.refuses("cannot be read", "check", tmp_path / special)
+    cli.refuses("cannot read", "check", tmp_path / special)
 
 
 @pytest.mark.live

@@ -126,7 +126,7 @@ def test_a_silent_port_a_port_that_ends_and_one_that_cannot_be_opened(ports: Por
         assert not ending.is_open
     gone = ports(Port())
     gone.is_open = True
-    assert printed(cli, status=1) == ProbeReport(PORT, "FT232R", problem=f"{PORT} is open already")
+    assert printed(cli, status=1) == ProbeReport(PORT, "FT232R", problem=f"{PORT} is already open")
 
 
 def test_a_host_without_ports_says_so(ports: Ports, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -32,7 +32,7 @@ def test_check_accepts_the_shipped_file_and_names_a_mistake(tmp_path: Path, cli:
 def test_a_file_that_is_not_there(words: list[str], hint: str, status: int, tmp_path: Path, cli: Cli) -> None:
     """The advice names an existing argument of the command."""
     error = cli(*words, tmp_path / "none", status=status).err
-    assert error.startswith(f"{tmp_path}/none: cannot be read: No such file or directory; ")
+    assert error.startswith(f"cannot read {tmp_path}/none: No such file or directory; ")
     assert hint in error
 
 

@@ -58,23 +58,22 @@ CANOPEN = "{{driver: hipnuc-canopen, options: {{{}}}, socketcan: {{interface: {}
         ),
         (
             ["a " + CANOPEN.format("node: 8", "can0"), "b " + CANOPEN.format("", "can0")],
-            "3: devices.b.options: expected a device of its own on can0, got one that sends 0x188; a (line 2) has that",
+            "3: devices.b.options: expected no device on can0 with the frame 0x188 of a (line 2), got this device",
         ),
         (
             ["a " + CANOPEN.format("node: 8, sync_hz: 100", "can0"), "b " + CANOPEN.format("node: 9, sync_hz: 50", "can0")],
-            "3: devices.b.options: expected one device on can0 for which imud sends 0x080, got it here and for "
-            "a (line 2): leave it out here",
+            "3: devices.b.options: expected one device on can0 for which imud sends 0x080, got this device "
+            "and a (line 2); remove the key here",
         ),
         (
             ["a {driver: hipnuc-nmea2000, socketcan: {interface: can0}}",
              "b {driver: hipnuc-nmea2000, options: {source: 35}, socketcan: {interface: can0}}"],
-            "3: devices.b.options: expected a device of its own on can0, got one that sends 0x01F11223; "
-            "a (line 2) has that",
+            "3: devices.b.options: expected no device on can0 with the frame 0x01F11223 of a (line 2), got this device",
         ),
         (
             ["a {driver: imu61x-can, options: {base_id: 0x101}, socketcan: {interface: can0}}",
              "b {driver: imu61x-can, options: {base_id: 0x105}, socketcan: {interface: can0}}"],
-            "3: devices.b.options: expected a device of its own on can0, got one that sends 0x105; a (line 2) has that",
+            "3: devices.b.options: expected no device on can0 with the frame 0x105 of a (line 2), got this device",
         ),
         (
             ["a {driver: imu61x-can, socketcan: {interface: c, backend: virtual}}",
@@ -122,12 +121,15 @@ def test_what_they_can_have_together(devices: list[str]) -> None:
 @pytest.mark.parametrize(
     ("device", "message"),
     [
-        ("{replay: {path: PATH}}", "PATH is a raw capture without times: use speed real with a baud, or maximum"),
-        ("{replay: {path: PATH, speed: real}}", "PATH does not say its baud rate: speed real needs the key baud"),
+        (
+            "{replay: {path: PATH}}",
+            "PATH is a raw capture without times: use speed real with the key baud, or speed maximum",
+        ),
+        ("{replay: {path: PATH, speed: real}}", "PATH does not contain its baud rate: speed real needs the key baud"),
         ("{replay: {path: PATH, speed: real, baud: 9600}}", ""),
         ("{replay: {path: PATH, speed: maximum}}", ""),
         ("{replay: {path: PATH.none}}", ""),
-        ("{driver: imu61x-can, replay: {path: PATH}}", "PATH is no CAN log: expected frames"),
+        ("{driver: imu61x-can, replay: {path: PATH}}", "PATH is not a CAN log: expected frames"),
         ("{driver: imu61x-can, replay: {path: PATH.log}}", ""),
     ],
 )

@@ -56,7 +56,7 @@ def test_every_way() -> None:
         ("noise: {gyro_rad_s: 0}", "devices.bow.noise.gyro_rad_s"),
         ("noise: {gyro: 1}", "gyro"),
         ("noise: 3", "devices.bow.noise"),
-        ("frame: {axes: {x: x, y: y, z: z}, quat_wxyz: [1, 0, 0, 0]}", "f.yaml:5:39: devices.bow.frame.quat_wxyz: expected one way to give the rotation (axes, euler, quat_wxyz), got axes and quat_wxyz"),
+        ("frame: {axes: {x: x, y: y, z: z}, quat_wxyz: [1, 0, 0, 0]}", "f.yaml:5:39: devices.bow.frame.quat_wxyz: expected one key for the rotation (axes, euler, quat_wxyz), got axes and quat_wxyz"),
         ("frame: {axes: {x: y, y: x, z: z}}", "f.yaml:5:19: devices.bow.frame.axes: expected right-handed axes, got a mirror image"),
         ("frame: {axes: {x: y, y: x, z: z}}", "with these x and y, z is -z"),
         ("frame: {axes: {x: x, y: x, z: z}}", "three different axes"),
@@ -82,12 +82,12 @@ def test_what_is_refused(keys: str, message: str) -> None:
 def test_a_declination_needs_a_magnetic_heading() -> None:
     assert device("    declination_deg: 3\n").declination_deg == 3.0
     line = problem("    declination_deg: 3\n", "imu61x-uart")
-    assert line.endswith("got it with imu61x-uart, whose heading counts from power-on")
+    assert line.endswith("got imu61x-uart, whose heading is relative to power-on")
     assert line.startswith("f.yaml:5:5: devices.bow.declination_deg: ")
-    assert "only beside a named driver" in problem("    declination_deg: 3\n", "auto")
+    assert "the name of a driver next to declination_deg" in problem("    declination_deg: 3\n", "auto")
     nmea = "devices:\n  bow:\n    driver: hipnuc-nmea2000\n    socketcan: {interface: can0}\n    declination_deg: 1\n"
     assert config.parse(nmea, "f.yaml").devices[0].declination_deg == 1
-    with pytest.raises(ConfigError, match="whose heading is true already"):
+    with pytest.raises(ConfigError, match="whose heading is already true"):
         config.parse(nmea + "    options: {heading: 'true'}\n", "f.yaml")
 
 

@@ -76,11 +76,11 @@ def test_defaults() -> None:
     ("keys", "message"),
     [
         (hipnuc("sut: {line: A}"), '2:53: devices.a.lines.sut: expected a key that imud knows, got "sut"; did you mean sout? known: alarm, data_ready, pps, reset, sin, sout, sout_div'),
-        (hipnuc("reset: {line: A}"), '2:53: devices.a.lines.reset: expected a line that devices of hipnuc-uart have, got "reset"; they have: sout, sout_div, sin, alarm, pps'),
-        (spi("sout: {line: A}"), '2:51: devices.a.lines.sout: expected a line that devices of imu61x-spi have, got "sout"; they have: reset, data_ready'),
-        ("driver: imu61x-uart, uart: {port: x}, lines: {data_ready: {line: A}}", "they have: reset"),
-        ("driver: imu61x-can, socketcan: {interface: c}, lines: {reset: {line: A}}", "they have: none"),
-        ("uart: {port: x}, lines: {sout: {line: A}}", "2:24: devices.a.lines: expected lines only beside a named driver, got them with driver auto; drivers that have lines: hipnuc-uart"),
+        (hipnuc("reset: {line: A}"), '2:53: devices.a.lines.reset: expected a line of hipnuc-uart devices (sout, sout_div, sin, alarm, pps), got "reset"'),
+        (spi("sout: {line: A}"), '2:51: devices.a.lines.sout: expected a line of imu61x-spi devices (reset, data_ready), got "sout"'),
+        ("driver: imu61x-uart, uart: {port: x}, lines: {data_ready: {line: A}}", "expected a line of imu61x-uart devices (reset), got"),
+        ("driver: imu61x-can, socketcan: {interface: c}, lines: {reset: {line: A}}", "expected a line of imu61x-can devices (none), got"),
+        ("uart: {port: x}, lines: {sout: {line: A}}", "2:24: devices.a.lines: expected the name of a driver next to lines, got auto; drivers with lines: hipnuc-uart"),
         ("driver: nobody, uart: {port: x}, lines: {sout: {line: A}}", 'expected a driver that imud knows, got "nobody"'),
         (hipnuc("sout: {line: 17}"), "2:59: devices.a.lines.sout: expected the key chip next to the number of a line, got no chip"),
         (hipnuc("sout: {chip: gpiochip0}"), "2:53: devices.a.lines.sout: expected the key line (a whole number from 0 to 1023, or text that is not empty), got none"),
@@ -115,11 +115,11 @@ def test_refusals(keys: str, message: str) -> None:
 )
 def test_one_wire_under_two_keys(one: str, other: str) -> None:
     (found,) = errors(hipnuc(f"sout: {{{one}}}, pps: {{{other}}}"))
-    assert "devices.a.lines.pps: expected a line of its own, got " in found
-    assert found.endswith(", which a.lines.sout (line 2) has")
+    assert "devices.a.lines.pps: expected an unused line, got " in found
+    assert found.endswith(", which a.lines.sout (line 2) uses")
     (found,) = errors(hipnuc(f"sout: {{{one}}}"), hipnuc(f"sout: {{{other}}}", "z"))
-    assert "3:53: devices.b.lines.sout: expected a line of its own" in found
-    assert found.endswith(", which a.lines.sout (line 2) has")
+    assert "3:53: devices.b.lines.sout: expected an unused line" in found
+    assert found.endswith(", which a.lines.sout (line 2) uses")
 
 
 @pytest.mark.parametrize(
@@ -198,11 +198,11 @@ def test_each_rmc_source(keys: str, rmc: RmcOptions | None) -> None:
         (HIPNUC + ", rmc: {source: gpsd, tcp_port: 0}", "tcp_port"),
         (HIPNUC + ", rmc: {source: gpsd, error_ms: .nan}", "error_ms"),
         (HIPNUC + ", rmc: {source: gpsd, speed: 1}", "speed"),
-        ("driver: imu61x-uart, uart: {port: x}, rmc: {source: gpsd}", "expected rmc only beside"),
-        ("driver: hipnuc-uart, replay: {path: x}, rmc: {source: gpsd}", "expected rmc only beside"),
-        ("uart: {port: x}, rmc: {source: gpsd}", "expected rmc only beside"),
+        ("driver: imu61x-uart, uart: {port: x}, rmc: {source: gpsd}", "expected rmc only with"),
+        ("driver: hipnuc-uart, replay: {path: x}, rmc: {source: gpsd}", "expected rmc only with"),
+        ("uart: {port: x}, rmc: {source: gpsd}", "expected the name of a driver next to rmc, got auto"),
         # a device that imud triggers has no pulse per second
-        (hipnuc("sin: {line: GPIO17}") + ", rmc: {source: gpsd}", "by lines.sin (line 2): leave one of them out"),
+        (hipnuc("sin: {line: GPIO17}") + ", rmc: {source: gpsd}", "drives SIN (line 2); remove one of the keys"),
     ],
 )
 def test_what_is_wrong_with_an_rmc_source(keys: str, said: str) -> None:

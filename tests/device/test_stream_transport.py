@@ -82,7 +82,7 @@ async def test_after_a_replug_sequence_numbers_and_times_increase(rig: DeviceRig
     await rig.turn(lambda: rig.state is DeviceState.MISSING)
     assert rig.ledger.bytes_pending == 0
     assert rig.ledger.bytes_skipped == 40
-    assert "gone" in rig.problem
+    assert "missing" in rig.problem
     rig.link.appear()
     await rig.turn(lambda: rig.state is not DeviceState.MISSING)
     for i in range(3):
@@ -421,7 +421,7 @@ def test_the_time_unplugged_is_not_silence(baud: Any) -> None:
             await until_after(300, send, 0.01)
             rig.link.disappear()
             await until_after(6000)
-            assert "gone" in rig.problem
+            assert "missing" in rig.problem
             rig.link.appear()
             await until_after(3000)
         kinds = [kind for kind in rig.kinds if kind in (EventKind.UP, EventKind.DOWN)]
@@ -439,20 +439,20 @@ def test_a_missing_port_reports_what_to_check(caplog: pytest.LogCaptureFixture) 
 
     async def story(_made: list[DeviceRig]) -> None:
         await rig.turn(lambda: rig.problem)
-        assert (rig.state, rig.problem) == (DeviceState.MISSING, "memory is not there: the test pulled it out")
+        assert (rig.state, rig.problem) == (DeviceState.MISSING, "memory does not exist: the test unplugged it")
         assert rig.kinds == []
         rig.link.appear()
         await rig.turn(lambda: rig.link.listening)
         assert not rig.is_in(DeviceState.MISSING)
 
     play_rigs(rigs, story, clock)
-    assert caplog.text.count("is not there") == 1
+    assert caplog.text.count("does not exist") == 1
 
 
 def test_a_port_of_another_configured_device_reports_its_name() -> None:
     class Busy(MemoryLink):
         def open(self) -> None:
-            raise LinkBusy("memory is in use by this imud (pid 4711): stop that first")
+            raise LinkBusy("memory is in use by this imud (pid 4711); stop it first")
 
     first = DeviceConfig(
         "mast", "auto", None, True, "uart", msgspec.convert({"port": "/dev/x"}, LINKS["uart"].settings)

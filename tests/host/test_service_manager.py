@@ -48,7 +48,7 @@ def test_watchdog_interval(usec: str, pid: str, expected: float | None, monkeypa
 @pytest.mark.parametrize(
     ("states", "line"),
     [
-        ({}, "No devices are configured."),
+        ({}, "The configuration has no devices."),
         ({"bow": "running"}, "1 of 1 device running."),
         ({"bow": "missing"}, "0 of 1 device running; not: bow (missing)."),
         ({"a": "running", "b": "silent", "c": "finished"}, "2 of 3 devices running; not: b (silent)."),

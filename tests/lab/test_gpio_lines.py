@@ -157,7 +157,7 @@ def test_a_user_without_the_right(gpio_chip: GpioChip) -> None:
     GpioInput(InputOptions(line="ALARM")).close()
     os.seteuid(65534)
     try:
-        with pytest.raises(LinkDenied, match="may not be opened by user nobody: it must belong to group gpio"):
+        with pytest.raises(LinkDenied, match="user nobody lacks the permission; the node must belong to group gpio"):
             GpioInput(InputOptions(line="ALARM")).open()
     finally:
         os.seteuid(0)

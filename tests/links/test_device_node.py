@@ -64,7 +64,7 @@ async def test_access_is_waited_for_quietly(tmp_path: Path, monkeypatch: pytest.
 
     monkeypatch.setattr("imud.links.device_node.os.access", access)
     node = DeviceNode(str(path), "is it plugged in?")
-    assert node.absence() == f"{path} is not there: is it plugged in?"
+    assert node.absence() == f"{path} does not exist: is it plugged in?"
     waiting = asyncio.create_task(node.wait_present())
     await asyncio.sleep(0)
     path.touch()
@@ -89,7 +89,7 @@ def test_every_link_says_that_its_port_is_not_there_and_what_to_look_at(link: st
     row = LINKS[link.partition(" ")[0]]
     make = row.make_can if "frames" in link else row.make_polled if row.polled else row.make
     absence = make(msgspec.convert(settings, row.settings)).absence()
-    assert re.fullmatch(r"/\S+ is not there: (is .*\?|expected a capture file)", absence)
+    assert re.fullmatch(r"/\S+ does not exist: (is .*\?|expected a capture file)", absence)
 
 
 def test_access_that_is_not_granted_is_waited_for_no_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,8 +107,8 @@ def test_a_node_that_no_group_may_open_needs_a_udev_rule(gid: int, mode: int, tm
     os.chown(path, 0, gid)
     path.chmod(mode)
     message = str(open_problem(PermissionError(errno.EACCES, ""), str(path), ""))
-    assert f"it is for no group (mode {mode:04o}, group " in message
-    assert message.endswith("`imud doctor` has the udev rule")
+    assert f"no group may open it (mode {mode:04o}, group " in message
+    assert message.endswith("`imud doctor` prints a udev rule")
 
 
 @needs_root
@@ -118,7 +118,7 @@ def test_a_node_of_a_group_names_it(tmp_path: Path) -> None:
     os.chown(path, 0, DAEMON_UID)
     path.chmod(0o660)
     group = grp.getgrgid(DAEMON_UID).gr_name
-    assert f"it belongs to group {group}; `sudo usermod -aG {group} " in str(
+    assert f"it belongs to group {group}; run `sudo usermod -aG {group} " in str(
         open_problem(PermissionError(errno.EACCES, ""), str(path), "")
     )
     denied = open_problem(PermissionError(errno.EACCES, ""), str(tmp_path / "missing"), "")
@@ -131,10 +131,10 @@ def test_absent_held_and_refused_nodes(tmp_path: Path) -> None:
     absent = open_problem(OSError(errno.ENODEV, ""), "/dev/i2c-1", "is I2C on?")
     held = open_problem(OSError(errno.EBUSY, ""), "/dev/i2c-1", "", tmp_path)
     by_driver = open_problem(OSError(errno.EBUSY, ""), "/dev/i2c-2", "", tmp_path)
-    assert (type(absent), str(absent)) == (LinkMissing, "/dev/i2c-1 is not there: is I2C on?")
+    assert (type(absent), str(absent)) == (LinkMissing, "/dev/i2c-1 does not exist: is I2C on?")
     assert (type(held), type(by_driver)) == (LinkBusy, LinkBusy)
-    assert "in use by minicom (pid 10): stop" in str(held)
-    assert "in use by another program or by a driver of the kernel: stop" in str(by_driver)
+    assert "in use by minicom (pid 10); stop" in str(held)
+    assert "in use by another program or a driver of the kernel; stop" in str(by_driver)
     assert open_problem(OSError(errno.EMFILE, ""), "/dev/i2c-1", "") is None
     by_group = str(open_problem(OSError(errno.EACCES, "x"), "/dev/ttyS9", "?"))
     by_control_group = str(open_problem(OSError(errno.EPERM, "x"), "/dev/ttyS9", "?"))

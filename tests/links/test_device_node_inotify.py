@@ -121,7 +121,7 @@ def test_a_failed_watch_is_an_error_and_leaves_no_descriptor(tmp_path: Path, mon
     monkeypatch.setattr(inotify.DirectoryWatch, "close", noted_close)
     with monkeypatch.context() as patch:
         patch.setattr(inotify.DirectoryWatch, "add", lambda self, directory: False)
-        with pytest.raises(LinkError, match="may this user read"):
+        with pytest.raises(LinkError, match="may not read"):
             asyncio.run(wait_until(path, path.exists))
     assert closed == [True]
 

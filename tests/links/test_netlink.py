@@ -23,8 +23,8 @@ def test_absence_says_what_to_do(tmp_path: Path) -> None:
     interface(tmp_path, "eth0", 1, 0x1003)
     assert absence("can0", tmp_path) == ""
     assert "can1 is down" in absence("can1", tmp_path)
-    assert "can9 is not there" in absence("can9", tmp_path)
-    with pytest.raises(LinkError, match="eth0 is no CAN interface"):
+    assert "can9 does not exist" in absence("can9", tmp_path)
+    with pytest.raises(LinkError, match="eth0 is not a CAN interface"):
         absence("eth0", tmp_path)
     assert can_interfaces(tmp_path) == ["can0"]
     assert can_interfaces(tmp_path / "none") == []

@@ -214,7 +214,7 @@ def test_a_file_whose_read_fails_is_closed(
 ) -> None:
     file = BrokenFile()
     monkeypatch.setattr("imud.links.replay.open_regular", lambda _path: file)
-    with pytest.raises(LinkError, match="a cannot be read: Input/output error"):
+    with pytest.raises(LinkError, match="cannot read a: Input/output error"):
         kind(ReplayOptions(path="a")).open()
     assert file.closed
 
@@ -234,7 +234,7 @@ def test_a_replay_has_settings_and_refuses_commands(stamped: Path) -> None:
     with pytest.raises(msgspec.ValidationError, match="repeat: expected false at speed maximum"):
         msgspec.convert({"path": "a", "speed": "maximum", "repeat": True}, row.settings)
     link = ReplayLink(ReplayOptions(path=str(stamped)))
-    with pytest.raises(LinkError, match="nothing can be sent"):
+    with pytest.raises(LinkError, match="and cannot receive data"):
         link.write(b"x")
-    with pytest.raises(LinkError, match="cannot be changed"):
+    with pytest.raises(LinkError, match="fixed baud rate"):
         link.set_baud(9600)

@@ -93,10 +93,10 @@ def test_it_can_repeat_and_be_closed_by_the_receiver(tmp_path: Path) -> None:
 def test_what_cannot_be_played(tmp_path: Path) -> None:
     bad = tmp_path / "bad"
     bad.write_bytes(b"Z\xa5 no log\n")
-    with pytest.raises(LinkError, match="is no CAN log"):
+    with pytest.raises(LinkError, match="is not a CAN log"):
         make(bad).open()
     missing = make(tmp_path / "missing")
-    assert "not there" in missing.absence()
+    assert "does not exist" in missing.absence()
     with pytest.raises(LinkMissing):
         missing.open()
     with pytest.raises(LinkError, match="replay"):

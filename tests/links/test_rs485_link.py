@@ -254,7 +254,7 @@ def test_garbage_instead_of_a_reply_is_reported(pty: PtyPort) -> None:
     speaker.start()
     try:
         with opened(pty.path, reply_ms=1000) as link:
-            with pytest.raises(TransferError, match=r"other bytes: 81 00 fe .* is the baud rate right"):
+            with pytest.raises(TransferError, match=r"other bytes: 81 00 fe .* check the baud rate"):
                 link.transfer(SERIAL)
             assert link.serial_line() == SerialLineCounters(timeouts=1, strange_bytes=21)
     finally:

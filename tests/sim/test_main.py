@@ -142,7 +142,7 @@ def test_signals_end_it_well(start: Start, number: signal.Signals) -> None:
         (["--rate", "300"], "rate 300"),
         (["--faults", "flop=1"], "flop"),
         (["--baud", "1200"], "baud 1200"),
-        (["--device", "imu61x-can:101", "--device", "hipnuc-uart"], "one device behind a terminal"),
+        (["--device", "imu61x-can:101", "--device", "hipnuc-uart"], "one device on a terminal"),
         (["--device", "imu61x-can:x"], "with or without :NODE"),
         (["--device", "imu61x-can:9999", "--interface", "vcan0"], "node 9999"),
         (["--pins", "tx=/tmp/x"], "expected NAME=PATH with one of sout, sout_div, alarm"),

@@ -82,9 +82,9 @@ def spi_transfers(at: Surroundings) -> Findings:
 
 def _spi_cause(problem: str, has: str) -> str:
     """Return the advice for an SPI device without valid replies. `problem`: of the daemon; `has`: the SPI mode."""
-    if "cannot do mode" in problem:
+    if "rejects SPI mode" in problem:
         return "the controller does not support this mode: set `mode: auto`, or use spi-gpio, which supports all modes"
-    if "cannot be used: Invalid argument" in problem:
+    if problem.startswith("cannot use ") and "Invalid argument" in problem:
         return (
             "the controller refuses words of 16 and 8 bits, or the clock: set a lower `speed_hz`; otherwise use "
             "another "

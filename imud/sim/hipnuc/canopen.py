@@ -70,7 +70,7 @@ _COMMANDS: Final = {size: command for command, size in reversed(READ_SIZES.items
 
 
 class Control(Enum):
-    """Side effects that a write has on the module in addition to a new setting."""
+    """Side effects that a write has on the device in addition to a new setting."""
 
     NONE = auto()
     ZERO = auto()
@@ -102,7 +102,7 @@ NODE_VARIANTS: Final[Mapping[str, NodeVariant]] = {
     "number at once, confirmed from there": NodeVariant(number_at_once=True, confirms_from="new"),
     "number at once, ignores reads": NodeVariant(number_at_once=True, confirms_from="new", reads="ignored"),
     "no boot-up message": NodeVariant(sends_boot_up=False),
-    "restarts without a word": NodeVariant(sends_boot_up=False, confirms_restart=False),
+    "restarts without a reply": NodeVariant(sends_boot_up=False, confirms_restart=False),
     "slow flash": NodeVariant(flash_ms=1900),
 }
 
@@ -146,8 +146,7 @@ class ObjectDictionary:
         self.settings = self.saved
 
     def serve(self, data: bytes) -> tuple[bytes, Control]:
-        """Process an SDO request of eight bytes. Return the data of the reply, empty for no reply, and the side
-        effect."""
+        """Process an SDO request of eight bytes. Return the data of the reply (empty: none) and the side effect."""
         index, sub = int.from_bytes(data[1:3], "little"), data[3]
         entry = _ENTRIES.get((index, sub))
         if entry is None:
@@ -257,14 +256,14 @@ PRESSURE_PERIOD_MS: Final = 50
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HipnucCanopenHardware(SensorHardware):
-    """Hardware and factory settings of a module."""
+    """Hardware and factory settings of a device."""
 
     factory: NodeSettings = field(default_factory=NodeSettings)
     variant: NodeVariant = field(default_factory=NodeVariant)
 
 
 class HipnucCanopenModule:
-    """A simulated module, powered on from construction."""
+    """A simulated device. Its power is on from the start."""
 
     def __init__(self, now_ns: int, hardware: HipnucCanopenHardware | None = None) -> None:
         self.hardware = hardware or HipnucCanopenHardware()
@@ -423,7 +422,7 @@ def make(options: SimulatorOptions, now_ns: int) -> HipnucCanopenModule:
     if not RATE_MIN_HZ <= options.rate_hz <= RATE_MAX_HZ or period_ms % 1:
         raise ValueError(f"rate {options.rate_hz:g} Hz: expected a period of 5 … 1000 whole milliseconds")
     if options.message:
-        raise ValueError(f"message {options.message!r}: expected none, a TPDO is switched on by its rate")
+        raise ValueError(f"message {options.message!r}: expected no name, because a TPDO is enabled by its rate")
     if not 0 <= options.node <= NODE_MAX:
         raise ValueError(f"node {options.node}: expected 1 … {NODE_MAX}")
     pressure_ms = max(PRESSURE_PERIOD_MS // int(period_ms), 1) * int(period_ms)

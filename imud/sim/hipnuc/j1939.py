@@ -89,7 +89,7 @@ class J1939Settings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class J1939Hardware(SensorHardware):
-    """Hardware of a module."""
+    """Hardware of a device."""
 
     bitrate: int | None = None  # bit rate of the bus, bit/s; 0: frames take no time; None: the rate of the settings
     sends_heading_twice: bool = True  # True: the heading message appears twice, as in newer firmware
@@ -310,8 +310,7 @@ class HipnucJ1939Module:
 
 
 def physical_inclination(reading: Truth) -> tuple[float, float]:
-    """Return the tilt about Y and X of the sensor, as a dual-axis inclinometer measures it: the vertical in the sensor
-    frame."""
+    """Return the tilt about Y and X of the sensor, as a dual-axis inclinometer measures it."""
     roll, pitch, _ = reading.euler_rad
     up_x, up_y, up_z = -cos(pitch) * sin(roll), sin(pitch), cos(pitch) * cos(roll)
     return atan2(-up_x, up_z), atan2(up_y, up_z)

@@ -106,7 +106,7 @@ SLAVE_VARIANTS: Final[Mapping[str, SlaveVariant]] = {
     "does not confirm an address": SlaveVariant(address_reply="none"),
     "rate at once": SlaveVariant(rate_at_once=True),
     "slow flash": SlaveVariant(flash_ms=1900),
-    "restarts without a word": SlaveVariant(confirms_restart=False, boot_ms=800),
+    "restarts without a reply": SlaveVariant(confirms_restart=False, boot_ms=800),
     "slow to boot": SlaveVariant(boot_ms=1500),
 }
 
@@ -154,8 +154,7 @@ class Slave:
         return self.processing_ns + (self.variant.flash_ms * NS_PER_MS if saves else 0)
 
     def replies_from(self, request: bytes, before: int) -> int | None:
-        """Return the address of the reply to a request; None for no reply. `before` is the address before the
-        request."""
+        """Return the address of the reply to a request, `before` is the earlier address; None for no reply."""
         if request[0] == WRITE_SINGLE and len(request) == WRITE.size:
             _, register, value = WRITE.unpack(request)
             if register == BY_NAME["CTRL"].address and value == RESTART and not self.variant.confirms_restart:
@@ -269,8 +268,7 @@ class Slave:
 
 
 def incli_counts(truth: Truth, kind: str) -> tuple[int, int]:
-    """Return INCLI_X and INCLI_Y of a product of this kind: the angles of the vertical as in the example of the
-    manual."""
+    """Return INCLI_X and INCLI_Y of a product of this kind, as in the example of the manual."""
     if not kind:
         return 0, 0
     roll, pitch, _ = truth.euler_rad
@@ -419,14 +417,13 @@ def slaves_at(addresses: Iterable[int], options: SimulatorOptions) -> list[Slave
 
 
 def make(options: SimulatorOptions, now_ns: int) -> ModbusLine:
-    """Return a bus for the options. `message` contains the addresses of the devices, separated by commas. Raises
-    ValueError."""
+    """Return a bus for the options; `message` is a list of addresses, such as 1,2,3. Raises ValueError."""
     if options.baud and options.baud not in BAUD_RATES:
         raise ValueError(f"baud {options.baud}: expected one of {', '.join(map(str, BAUD_RATES))}")
     words = options.message.split(",") if options.message else [str(FACTORY_ID)]
     if not all(word.isdecimal() and int(word) in SLAVES for word in words):
-        raise ValueError(f"message {options.message!r}: expected addresses of modules, for example 1,2,3")
+        raise ValueError(f"message {options.message!r}: expected addresses of devices, for example 1,2,3")
     return ModbusLine(now_ns, slaves_at(map(int, words), options), seed=options.seed)
 
 
-SIMULATOR = Simulator("hipnuc-modbus", "HiPNUC HI14R2N on an RS-485 line (--message 1,2,3: their addresses)", make)
+SIMULATOR = Simulator("hipnuc-modbus", "HiPNUC HI14R2N on an RS-485 bus (--message 1,2,3: their addresses)", make)

@@ -392,8 +392,7 @@ class HipnucModule:
         self._quiet_until_ns = now_ns + self.hardware.behaviour.quiet_ms * NS_PER_MS
 
     def _make_actions(self) -> dict[str, Callable[[int], list[str] | None]]:
-        """Return the commands without a value that do more than change settings. They return the lines before `OK`;
-        None for no reply."""
+        """Return the commands that do more than change settings. They return the lines before `OK`, None: no reply."""
         hardware = self.hardware
         version = [
             f"PNAME={hardware.product}",

@@ -79,8 +79,7 @@ UPTIME_MODULUS_MS: Final = 2**32
 
 
 class UtcTime:
-    """UTC in the frames of the device. Arguments are ns of its own clock since power-on. Synchronization: one
-    thread."""
+    """UTC in the frames of the device. Arguments are device time since power-on, ns. Synchronization: one thread."""
 
     def __init__(self, epoch: Epoch) -> None:
         self._modulus_ms = MODULUS_MS[epoch]
@@ -358,8 +357,7 @@ class SelfCalibration:
     """Bias of one magnetometer, and the part of it that the device knows."""
 
     def __init__(self, hard_iron_t: Vector3, found_t: Vector3) -> None:
-        """`hard_iron_t` is the field of parts that turn with the device; `found_t` is the part that the device already
-        knows."""
+        """`hard_iron_t`: field of parts that turn with the device; `found_t`: the part that the device knows."""
         self._hard_iron_t = hard_iron_t
         self.found_t = found_t
         self.finished = any(found_t)  # True after a calibration

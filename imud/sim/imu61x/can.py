@@ -52,7 +52,7 @@ def make(options: SimulatorOptions, now_ns: int) -> Imu61xCanModule:
     if not 1 <= options.rate_hz <= RATE_MAX_HZ:
         raise ValueError(f"rate {options.rate_hz:g} Hz: expected 1 … {RATE_MAX_HZ:g}")
     if options.message:
-        raise ValueError(f"message {options.message!r}: expected none, there is only one")
+        raise ValueError(f"message {options.message!r}: expected no name, because the device has only one message")
     if not 0 <= options.node <= STANDARD_ID_MAX - SET_FRAMES + 1:
         raise ValueError(f"node {options.node}: expected the identifier of the first frame, or 0 for {BASE_ID}")
     hardware = Imu61xCanHardware(

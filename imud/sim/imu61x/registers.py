@@ -86,8 +86,7 @@ class Imu61xRegisters:
     # --- SPI ---------------------------------------------------------------------------------------------------------
 
     def spi(self, selections: Sequence[bytes], mode: int = 0) -> list[bytes]:
-        """Make a transaction. `selections` are the MOSI bytes of each active chip select. Return the MISO bytes. Raises
-        OSError by `faults.error`."""
+        """Return the MISO bytes for the MOSI bytes of each active chip select. Raises OSError by `faults.error`."""
         self._begin()
         answers = [self._selection(selection) for selection in selections]
         if mode not in self._modes:

@@ -74,8 +74,8 @@ ORDERS: Final = frozenset(Command) - {Command.STATUS, Command.AHRS, Command.READ
 
 # Simulated variants by name. Each variant processes its commands.
 VARIANTS: Final[Mapping[str, Imu61xBehaviour]] = {
-    "obeys while it streams": Imu61xBehaviour(),
-    "answers in command mode only": Imu61xBehaviour(answers_while_streaming=False),
+    "executes commands while it streams": Imu61xBehaviour(),
+    "replies in command mode only": Imu61xBehaviour(answers_while_streaming=False),
     "K1 = 1 means done": Imu61xBehaviour(result_done=1, result_refused=0),
     "no K1": Imu61xBehaviour(acknowledges=False),
     "slow flash": Imu61xBehaviour(flash_ms=2000),
@@ -430,8 +430,7 @@ class Imu61xModule:
         self._heading_rad = radians(heading_deg) - euler_zyx_from_quat(self._reading(now_ns).quat_wxyz)[2]
 
     def _save(self) -> None:
-        """Save all settings. Do not save command mode if the device processes CMD 5 only in this mode: it would never
-        stream again."""
+        """Save all settings, without command mode if CMD 5 works only in this mode: it would never stream again."""
         keeps_mode = self.hardware.behaviour.answers_while_streaming
         self.flash = self.settings if keeps_mode else replace(self.settings, mode=self.flash.mode)
 

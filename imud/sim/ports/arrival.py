@@ -151,8 +151,7 @@ class ArrivalModel:
         return [end - (end - phase_ns) % step_ns + step_ns for end in (begin + duration_ns for begin in begins)]
 
     def _packets(self, begins: list[float], timer_from_ns: float) -> list[float]:
-        """Return the same times for an adapter that sends full packets immediately and restarts its timer with each
-        packet."""
+        """Return the same times for an adapter that sends full packets and restarts its timer with each packet."""
         byte_ns, size, full, step_ns = self.byte_ns, self.size_bytes, self.profile.packet_bytes, self._timer_step_ns()
         handed = [0.0] * len(begins)
         sent = done = 0

@@ -89,7 +89,7 @@ def open_can_socket(interface: str) -> socket.socket:
     try:
         opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
     except OSError as error:
-        raise LinkError(f"this kernel has no CAN sockets ({error.strerror}): load the module can_raw") from error
+        raise LinkError(f"this kernel has no CAN sockets ({error.strerror}): load the kernel module can_raw") from error
     try:
         opened.bind((interface,))
         opened.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
@@ -105,7 +105,7 @@ def default_interface() -> str:
     found = can_interfaces()
     if not found:
         raise LinkError(
-            "expected a CAN interface that is up, found none; a virtual one: ip link add vcan0 type vcan; "
+            "expected a CAN interface that is up, got none; for a virtual one: ip link add vcan0 type vcan; "
             "ip link set vcan0 up"
         )
     return found[0]

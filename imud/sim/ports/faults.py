@@ -150,8 +150,7 @@ def rates_from(text: str) -> FaultRates:
 
 
 def parse_rates(kind: Callable[..., R], text: str, where: str = "") -> R:
-    """Return a dataclass of rates from `name=number,…`. Errors contain `where` after the name of a fault. Raises
-    ValueError."""
+    """Return a dataclass of rates from `name=number,…`. Raises ValueError with `where` after the name of a fault."""
     known = list(signature(kind).parameters)
     values: dict[str, float] = {}
     for part in filter(None, text.split(",")):

@@ -67,8 +67,7 @@ class InProcessSpi:
     def __init__(
         self, device: Callable[[Sequence[bytes], int], Sequence[bytes]] | None = None, *, word_bits: int = 8
     ) -> None:
-        """`device` is `Imu61xRegisters.spi`; without a device, all read bytes are zero. `word_bits` is the maximum word
-        size of the controller."""
+        """`device`: `Imu61xRegisters.spi`, None reads zeros. `word_bits`: maximum word size of the controller."""
         self.device = device
         self.mode = 0
         self.opened: list[int] = []

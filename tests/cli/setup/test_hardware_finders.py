@@ -48,7 +48,7 @@ def test_a_line_is_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert found.keys == {"driver": "hipnuc-modbus", "rs485": {"line": str(path), "baud": BAUD, "address": 2}}
     assert found.title == "HI14R2N-485-000"
     (absent,) = FINDERS.scan_rs485(str(tmp_path / "none"), 0)
-    assert "is not there" in absent.problem
+    assert "does not exist" in absent.problem
 
 
 def on_bus(monkeypatch: pytest.MonkeyPatch, bus: InProcessI2c) -> None:

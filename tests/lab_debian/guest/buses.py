@@ -102,7 +102,7 @@ def further_device(text: str) -> Iterator[str]:
     wait_until(lambda: (device("keel") or {}).get("problem"), "a problem of the device")
     problem: str = (device("keel") or {})["problem"]
     try:
-        if "may not" in problem or "may not be opened" in journal(since):
+        if "cannot open" in problem or "cannot open" in journal(since):
             raise Failed(problem)
         yield problem
     finally:

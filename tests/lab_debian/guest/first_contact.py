@@ -91,7 +91,7 @@ def check_complaints(checks: Checks, _host: Host) -> None:
     with checks("imud doctor reports a user without the port's group, and its advice gives access"):
         must("gpasswd", "--delete", "imud", "dialout")
         start_service()
-        wait_until(lambda: "may not be opened" in (device("usb") or {}).get("problem", ""), "the port is refused")
+        wait_until(lambda: "cannot open" in (device("usb") or {}).get("problem", ""), "the port is refused")
         command = "usermod --append --groups dialout imud"
         expect_finding("rights", "error", f"user imud cannot open {NODE}", f"`sudo {command}`")
         must(*command.split())

@@ -31,7 +31,7 @@ from tests.support.socket_rig import Peer, batch, in_server, run, serving
             None,
             "nested",
         ),
-        (b"[" + b"1," * 3000 + b"1]", -32700, None, "too long a list: expected at most 2048"),
+        (b"[" + b"1," * 3000 + b"1]", -32700, None, "too many values: expected at most 2048"),
         (b"7", -32600, None, "got a number"),
         (b'[{"jsonrpc":"2.0","id":1,"method":"devices"}]', -32600, None, "one JSON object per line, got an array"),
         (b"{}", -32600, None, '"2.0"'),

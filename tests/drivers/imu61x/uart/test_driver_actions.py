@@ -33,7 +33,7 @@ WITHOUT_K1 = ("save", "heading", "calibrate_gyro", "calibrate_installation", "in
 """Actions with no evidence but an acknowledgement; also CMD 8 without another reply."""
 
 
-@pytest.mark.parametrize("variant", ["obeys while it streams", "no K1", *CODED])
+@pytest.mark.parametrize("variant", ["executes commands while it streams", "no K1", *CODED])
 @pytest.mark.parametrize("name", ACTIONS)
 def test_every_action(variant: str, name: str) -> None:
     """Other tests run the scripts in every variant; here an action must pass its arguments to the script."""

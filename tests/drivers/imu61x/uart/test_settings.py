@@ -26,15 +26,15 @@ FACTORY = {
 }
 
 
-def target(far: Imu61xBench, variant: str = "obeys while it streams") -> Target:
+def target(far: Imu61xBench, variant: str = "executes commands while it streams") -> Target:
     return Target(Imu61xUartOptions(result_done=done(variant)), far.baud)
 
 
-def read(far: Imu61xBench, variant: str = "obeys while it streams") -> dict[str, Any]:
+def read(far: Imu61xBench, variant: str = "executes commands while it streams") -> dict[str, Any]:
     return dict(far.run(SETTINGS.read(target(far, variant))))
 
 
-def write(far: Imu61xBench, name: str, value: object, variant: str = "obeys while it streams") -> None:
+def write(far: Imu61xBench, name: str, value: object, variant: str = "executes commands while it streams") -> None:
     one = SETTINGS.table[name]
     assert one.write is not None
     far.run(one.write(target(far, variant), msgspec.convert(value, one.type)))
