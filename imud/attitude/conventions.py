@@ -67,9 +67,7 @@ class DeviceAxes:
 
     @property
     def to_z_up(self) -> Matrix3:
-        """Rotation from the device's navigation frame to the navigation frame with z up and the same horizontal
-        reference.
-        """
+        """Rotation from the device's navigation frame to the frame with z up and the same horizontal reference."""
         if not self.z_down:
             return IDENTITY
         return FLIP_Y if self.order is EulerOrder.ZXY else FLIP_X

@@ -79,8 +79,7 @@ class Rotation:
         from_angles: bool = False,
     ) -> None:
         """`vectors` is M, `navigation` is N, `orders` are the orders of the angles before and after the rotation.
-        `mounting` is the part of M that rotates the body. `from_angles`: ignore the quaternion of the device.
-        """
+        `mounting` is the part of M that rotates the body. `from_angles`: ignore the quaternion of the device."""
         self._turn = _vector_function(vectors)
         self._attitude = _quat_function(navigation, vectors)
         self._to_quat, self._to_euler = TO_QUAT[orders[0]], TO_EULER[orders[1]]
@@ -275,10 +274,8 @@ SNAP: Final = 1e-12  # maximum distance of an element from 0 and ±1 that is rou
 
 
 def matrix_from_axes(x: str, y: str, z: str) -> Matrix3:
-    """Return the rotation sensor → body from the sensor axes that point forward, left and up (names of AXES).
-
-    Raises ValueError for two names of one axis and for left-handed axes (a mirror image).
-    """
+    """Return the rotation sensor → body from the sensor axes that point forward, left and up (names of AXES). Raises
+    ValueError for two names of one axis and for left-handed axes (a mirror image)."""
     names = (x, y, z)
     for number, name in enumerate(names):
         for before in range(number):
@@ -312,11 +309,8 @@ def matrix_from_mounting_quat(quat_wxyz: Quaternion) -> Matrix3:
 
 
 def levelling(convention: Convention, roll_deg: float, pitch_deg: float, heading_deg: float) -> Matrix3:
-    """Return the rotation of the body axes (FLU) that corrects mounting errors.
-
-    `roll_deg` and `pitch_deg` are the published angles of a level body. `heading_deg` is added to the heading,
-    clockwise from above.
-    """
+    """Return the rotation of the body axes (FLU) that corrects mounting errors. `roll_deg` and `pitch_deg` are the
+    published angles of a level body. `heading_deg` is added to the heading, clockwise from above."""
     if not (roll_deg or pitch_deg or heading_deg):
         return IDENTITY
     up = pitch_deg if convention is Convention.ENU_FLU else -pitch_deg

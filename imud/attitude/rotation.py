@@ -36,9 +36,7 @@ def quat_normalized(quat_wxyz: Quaternion) -> Quaternion:
 
 
 def matrix_from_quat(quat_wxyz: Quaternion) -> Matrix3:
-    """Return the rotation matrix body → navigation (manual 9.2). Raises ValueError for a zero or infinite
-    quaternion.
-    """
+    """Return the rotation matrix body → navigation (manual 9.2). Raises ValueError for a zero or infinite one."""
     w, x, y, z = quat_normalized(quat_wxyz)
     return (
         (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -100,9 +98,7 @@ def matrix_from_euler312(euler_rad: Vector3) -> Matrix3:
 
 
 def quat_from_euler_zyx(euler_rad: Vector3) -> Quaternion:
-    """Return the unit quaternion of (roll, pitch, yaw), rad, order ZYX: the product of the quaternions about Z, Y,
-    X.
-    """
+    """Return the unit quaternion of (roll, pitch, yaw), rad, order ZYX: the product of rotations about Z, Y, X."""
     roll, pitch, yaw = euler_rad
     cr, sr = math.cos(roll / 2), math.sin(roll / 2)
     cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)

@@ -44,23 +44,17 @@ def message_of(event: CodecEvent) -> Message | None:
 
 
 class StreamCodec(Protocol):
-    """Decoder of a byte stream. The events do not depend on how the bytes are split into reads.
-
-    Synchronization: one thread. Maximum memory: the longest frame plus the longest text line.
-    """
+    """Decoder of a byte stream. The events do not depend on how the bytes are split into reads. Synchronization: one
+    thread. Maximum memory: the longest frame plus the longest text line."""
 
     ledger: Ledger
 
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
-        """Decode the next bytes of the stream. Return the events that these bytes complete. Never raises an
-        exception.
-        """
+        """Decode the next bytes of the stream. Return the completed events. Never raises an exception."""
         ...
 
     def flush(self) -> Sequence[CodecEvent]:
-        """Return the complete frames inside an incomplete longer frame. imud calls this method when the link is
-        idle.
-        """
+        """Return the complete frames inside an incomplete longer frame. imud calls it when the link is idle."""
         ...
 
     def reset(self) -> None:
@@ -69,17 +63,13 @@ class StreamCodec(Protocol):
 
 
 class CanCodec(Protocol):
-    """Decoder of the frames of one CAN device. Frames of other devices do not affect the decoder.
-
-    The ledger counts data bytes. Data bytes of other devices count as skipped. Synchronization: one thread.
-    """
+    """Decoder of the frames of one CAN device. Frames of other devices do not affect the decoder. The ledger counts
+    data bytes. Data bytes of other devices count as skipped. Synchronization: one thread."""
 
     ledger: Ledger
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
-        """Decode one frame that arrived at `t_rx_ns` (CLOCK_MONOTONIC). Return the completed events. Never raises an
-        exception.
-        """
+        """Decode a frame that arrived at `t_rx_ns` (CLOCK_MONOTONIC). Return the completed events. Never raises."""
         ...
 
     def flush(self) -> Sequence[CodecEvent]:

@@ -29,9 +29,7 @@ class Target:
 
 
 class Risk(StrEnum):
-    """Effect of an action that no other action can undo. Interactive programs ask for confirmation before such an
-    action.
-    """
+    """Effect that no other action can undo. Interactive programs ask for confirmation before such an action."""
 
     NONE = ""
     CONNECTION = "the device may not be reached afterwards"
@@ -64,9 +62,7 @@ class Action:
         return _parameters(self.begin)
 
     def arguments(self, given: Mapping[str, Any]) -> Options:
-        """Return the checked and converted arguments of a call. Raises BadArgument with the expected and the received
-        value.
-        """
+        """Return the checked and converted arguments of a call. Raises BadArgument."""
         if wrong := wrong_values(self.parameters, given, "argument"):
             known = ", ".join(str(parameter) for parameter in parameters_of(self)) or "none"
             raise BadArgument(f"{'; '.join(map(str, wrong))}; arguments: {known}")

@@ -156,10 +156,8 @@ class Driver:
     check: Callable[[Any, Any], Sequence[KeyProblem]] = no_problems
 
     def problems(self, options: Any, link: Any) -> Sequence[KeyProblem]:
-        """Return the problems of `options` together with the link options, for `imud check`.
-
-        The check looks for keys of the link options by name and skips keys that the link does not have.
-        """
+        """Return the problems of `options` together with the link options, for `imud check`. The check looks for keys
+        of the link options by name and skips keys that the link does not have."""
         return self.check(options, link)
 
 
@@ -242,9 +240,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PolledDriver(Driver):
-    """Driver of a device that sends only on request and has no device time. The host's deadlines time-stamp its
-    samples.
-    """
+    """Driver of a device that sends only on request and has no device time: its samples get the host's time."""
 
     tick_ns: int = SAMPLE_COUNTER
     tick_modulus: int = 2

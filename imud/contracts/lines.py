@@ -252,10 +252,8 @@ class InputLine(Protocol):
 
     @property
     def edges_lost(self) -> int:
-        """Number of edges that the kernel dropped from a full buffer, since the first request of the line.
-
-        The count does not include edges so close together that the interrupt thread of the kernel saw one edge.
-        """
+        """Number of edges that the kernel dropped from a full buffer, since the first request of the line. The count
+        does not include edges so close together that the interrupt thread of the kernel saw one edge."""
         ...
 
     def open(self) -> None:

@@ -129,9 +129,7 @@ class Link(Protocol):
         ...
 
     def write(self, data: bytes) -> None:
-        """Send bytes; on CAN, complete `struct can_frame`. A bounded queue holds them if the port is full. Raises
-        LinkError.
-        """
+        """Send bytes (CAN: complete `struct can_frame`), or queue a limited number of them. Raises LinkError."""
         ...
 
     def kernel_counters(self) -> KernelCounters:
@@ -189,11 +187,7 @@ class CanLink(Link, Protocol):
         ...
 
     def send_cyclic(self, frames: Sequence[CyclicFrame]) -> None:
-        """Send these frames at their periods until `close`, in place of all earlier frames. Requires the same as
-        `start`.
-
-        Raises LinkError.
-        """
+        """Send these frames at their periods until `close`, in place of all earlier frames. Raises LinkError."""
         ...
 
 
@@ -220,15 +214,11 @@ class PolledLink(Link, Protocol):
         ...
 
     def transfer(self, transfer: Transfer) -> bytes:
-        """Make a transfer and return all received bytes. Raises TransferError; LinkMissing or LinkError if the bus
-        fails.
-        """
+        """Make a transfer. Return all received bytes. Raises TransferError; LinkMissing, LinkError if the bus fails."""
         ...
 
     def serial_line(self) -> SerialLineCounters | None:
-        """Return the counters of unexpected bytes since `open`; None for buses with a clock, on which only the host
-        sends.
-        """
+        """Return the counters of unexpected bytes since `open`; None for buses with a clock (I2C, SPI)."""
         ...
 
 

@@ -16,10 +16,8 @@ class InputObserver(Protocol):
     """
 
     def data(self, data: bytes, t_rx_ns: int, waited_ns: int) -> None:
-        """Report the bytes of one read.
-
-        `waited_ns` is their maximum time in the kernel's buffer for `StreamPath.gather`, and -1 for `on_data`.
-        """
+        """Report the bytes of one read. `waited_ns` is their maximum time in the kernel's buffer for
+        `StreamPath.gather`, and -1 for `on_data`."""
         ...
 
     def frames(self, frames: Sequence[CanFrame]) -> None:

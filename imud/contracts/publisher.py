@@ -37,9 +37,7 @@ class RecordingSource(Protocol):
         ...
 
     def begin(self, device: str, put: PutRecord) -> None:
-        """Describe a device, then pass on all its data. Call again to repeat the description. Do nothing if it is
-        absent.
-        """
+        """Describe a device if it exists, then pass on all its data. A second call repeats the description."""
         ...
 
     def check(self, device: str, put: PutRecord) -> None:
@@ -95,10 +93,8 @@ class Publisher(Protocol):
 
     @property
     def publish(self) -> Callable[[Batch], None] | None:
-        """Method that sends samples to readers, and drops and counts samples for slow readers. None: no samples.
-
-        The daemon reads the property once, after `start`.
-        """
+        """Method that sends samples to readers, and drops and counts samples for slow readers. None: no samples. The
+        daemon reads the property once, after `start`."""
         ...
 
     def start(self) -> None:
@@ -177,10 +173,8 @@ class Latencies(Protocol):
 
 
 class Devices(Protocol):
-    """The devices of the daemon. Only `imud.daemon`, which no output may import, implements this type.
-
-    Synchronization: the event loop's thread only, the iterator included.
-    """
+    """The devices of the daemon. Only `imud.daemon`, which no output may import, implements this type. Synchronization:
+    the event loop's thread only, the iterator included."""
 
     @property
     def recording(self) -> RecordingSource:
@@ -218,9 +212,7 @@ class PublisherClock:
 @dataclass(frozen=True, slots=True)
 class OutputFacts:
     """Facts that outputs publish about themselves for other outputs. An output removes its facts when it closes.
-
-    Synchronization: the event loop's thread only.
-    """
+    Synchronization: the event loop's thread only."""
 
     # Functions that return the clients of an output
     clients: list[Callable[[], Sequence[ClientStatus]]] = field(default_factory=list)

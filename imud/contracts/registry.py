@@ -8,10 +8,8 @@ T = TypeVar("T")
 
 
 class Registry(Mapping[str, T], Generic[T]):
-    """Mapping from a name to the object of its row. A new plug-in needs one module and one row.
-
-    Raises KeyError for an unknown name; the message lists the known names.
-    """
+    """Mapping from a name to the object of its row. A new plug-in needs one module and one row. Raises KeyError for an
+    unknown name; the message lists the known names."""
 
     def __init__(self, kind: str, rows: Mapping[str, str]) -> None:
         self.kind = kind

@@ -27,9 +27,7 @@ class PolledFrameDecoder:
         bad: Callable[[bytes], BadReason | None],
         measure: Callable[[bytes], Measured],
     ) -> Sequence[PolledEvent]:
-        """Decode one frame. `bad` returns the reason for damage, `measure` decodes a new good frame. Never raises an
-        exception.
-        """
+        """Decode a frame. `bad` returns the reason for damage, `measure` decodes a new good frame. Never raises."""
         ledger = self._ledger
         ledger.bytes_in += len(data)
         if len(data) != self._size_bytes or (why := absence(data)):

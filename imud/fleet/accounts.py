@@ -147,12 +147,8 @@ class FleetLedger:
         self._accounts[key] = _Account(account.counts, account.gaps)
 
     def take(self, message: FleetMessage, stream: Stream) -> FleetMessage | None:
-        """Add a message.
-
-        Return its new part, or None if all of it is a duplicate. Raises OverflowError at STREAMS_MAX streams.
-
-        If only a part of a message with statistics is new, return the complete message.
-        """
+        """Add a message. Return its new part, None for a duplicate. Raises OverflowError at STREAMS_MAX streams. If
+        only a part of a message with statistics is new, return the complete message."""
         key = key_of(message, stream)
         account = self._accounts.get(key)
         if account is None:
@@ -220,10 +216,7 @@ class SpoolPositions:
     """Newest stream positions of all gateways. Synchronization: one thread."""
 
     def __init__(self, *, from_begin: bool = False) -> None:
-        """Create an empty table.
-
-        With `from_begin`, numbers before the first state of a stream count as not yet received.
-        """
+        """With `from_begin`, numbers before the first state of a stream count as not yet received."""
         self._from_begin = from_begin
         self._positions: dict[StreamKey, StreamPosition] = {}
         self._begins: dict[StreamKey, int] = {}  # first number of the ledger of each stream without a message
@@ -327,9 +320,7 @@ def offset_of(message: FleetMessage) -> BootOffset | None:
 
 def placed(utc_ns: int, t_ns: int | None, clock: GatewayClock | None, known: BootOffset | None) -> PlacedTime:
     """Return the UTC time of a record. `clock` is the clock of its message, `known` the newest offset of its boot.
-
-    `t_ns` is None if the message does not contain it.
-    """
+    `t_ns` is None if the message does not contain it."""
     if clock is None and utc_ns >= CLOCK_SET_NS:
         return PlacedTime(utc_ns, True, None)
     if clock is not None and clock.synchronised:

@@ -94,11 +94,8 @@ def paho_client(
 def open_client(
     client: Any, broker: Broker, keep_alive_s: int, receive_max: int, packet_bytes: int, session_s: int = 0
 ) -> None:
-    """Connect a client of `paho_client` and send CONNECT. Raises OSError or ValueError.
-
-    With MQTT 5, the broker sends at most `receive_max` messages without an acknowledgement, and no packet longer than
-    `packet_bytes`.
-    """
+    """Connect a client of `paho_client` and send CONNECT. Raises OSError or ValueError. With MQTT 5, the broker sends
+    at most `receive_max` messages without an acknowledgement, and no packet longer than `packet_bytes`."""
     if client.protocol != MQTT_5:
         client.connect(broker.host, broker.port, keep_alive_s)
         return
@@ -129,10 +126,7 @@ def properties_of(packet: str, **values: object) -> Any:
 
 
 def connection_problem(error: BaseException) -> str:
-    """Return the cause of an error.
-
-    For a TLS error, use the message of OpenSSL, because it describes the problem of the certificate.
-    """
+    """Return the cause of an error. For a TLS error, use the message of OpenSSL about the certificate."""
     import ssl
 
     if isinstance(error, ssl.SSLError):
@@ -221,10 +215,7 @@ class Received(NamedTuple):
 
 
 class BrokerConnection(Protocol):
-    """Connection to one broker.
-
-    Tests supply another implementation. Synchronization: one thread; any thread may call `ring`.
-    """
+    """Connection to one broker. Synchronization: one thread; any thread may call `ring`."""
 
     acknowledged: list[int]  # Packet identifiers of acknowledged messages. The reader clears the list.
     in_flight_max: int  # maximum number of messages without an acknowledgement
@@ -241,10 +232,8 @@ class BrokerConnection(Protocol):
         ...
 
     def wait(self, seconds: float) -> None:
-        """Read and write pending data. Return after `seconds`, after data arrived, or after `ring`.
-
-        Raises BrokerError if the connection is lost or if the broker refused a message.
-        """
+        """Read and write pending data. Return after `seconds`, after data arrived, or after `ring`. Raises BrokerError
+        if the connection is lost or if the broker refused a message."""
         ...
 
     def ring(self) -> None:
@@ -275,11 +264,8 @@ class PahoConnection:
         self, broker: Broker, settings: MqttOptions, client_id: str, will: Will,
         is_wanted: Callable[[], bool] = lambda: True,
     ) -> None:  # fmt: skip
-        """Connect and wait for CONNACK. Raises BrokerError.
-
-        This method calls `is_wanted` after the socket is open and then every LOOK_S. If it returns False, another
-        output may use the same client ID soon.
-        """
+        """Connect and wait for CONNACK. Raises BrokerError. This method calls `is_wanted` after the socket is open and
+        then every LOOK_S. If it returns False, another output may use the same client ID soon."""
         self.acknowledged: list[int] = []
         self.in_flight_max = IN_FLIGHT_MAX
         self.received: list[Received] = []
@@ -479,10 +465,8 @@ class BrokerTurn:
         self._up_ns = now_ns
 
     def failed(self, now_ns: int) -> float:
-        """Store a failed attempt or a lost connection. Return the pause before the next attempt, s.
-
-        After a lost connection, imud tries the same broker again. After a failed attempt, it tries the next broker.
-        """
+        """Store a failed attempt or a lost connection. Return the pause before the next attempt, s. After a lost
+        connection, imud tries the same broker again. After a failed attempt, it tries the next broker."""
         up_ns, self._up_ns = self._up_ns, None
         if up_ns is not None and now_ns - up_ns >= STABLE_NS:
             self._failed = 0

@@ -200,10 +200,7 @@ class CommandChannel:
     # -----------------------------------------------------------------------------------------------------
 
     def run_next(self) -> None:
-        """Start the next request if none is running.
-
-        The output calls this method ten times a second in the event loop.
-        """
+        """Start the next request if none is running. The output calls this method ten times a second."""
         if not self._asked or (self._task is not None and not self._task.done()):
             return
         asked = self._asked.popleft()

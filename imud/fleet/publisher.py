@@ -51,10 +51,7 @@ ANGLES: Final = ("roll", "pitch", "yaw")  # components of `euler_rad`
 
 
 def discovery_topic(gateway: Gateway, device: str) -> str:
-    """Return the discovery topic of a device.
-
-    Its checksum distinguishes device `c` of gateway `a_b` from device `b_c` of gateway `a`.
-    """
+    """Return the discovery topic. Its checksum distinguishes device `c` of gateway `a_b` from `b_c` of `a`."""
     return f"{PREFIX}/device/{_unique_id(gateway, device)}/config"
 
 
@@ -109,11 +106,8 @@ def _status_parts(topic: str) -> dict[str, dict[str, object]]:
 
 
 def _attitude_parts(topic: str) -> dict[str, dict[str, object]]:
-    """Return the entities of the mean attitude in the newest interval.
-
-    Their templates return an empty value for a message without intervals and for a device without angles. Home
-    Assistant ignores empty values.
-    """
+    """Return the entities of the mean attitude in the newest interval. Their templates return an empty value for a
+    message without intervals and for a device without angles. Home Assistant ignores empty values."""
     found: dict[str, dict[str, object]] = {}
     for at, name in enumerate(ANGLES):
         newest = "value_json.intervals[-1]['values']"

@@ -109,11 +109,8 @@ class ReaderConnection:
         *,
         is_v5: bool = True,
     ) -> "ReaderConnection":
-        """Connect and subscribe. Raises BrokerError.
-
-        `session_s` is the time for which the broker keeps the session without a connection, s; 0: no session. With MQTT
-        3.1.1 the configuration of the broker decides the time.
-        """
+        """Connect and subscribe. Raises BrokerError. `session_s` is the time for which the broker keeps the session
+        without a connection, s; 0: no session. With MQTT 3.1.1 the configuration of the broker decides the time."""
         self = cls(broker)
         try:
             await self._connect(access, client_id, session_s, is_v5=is_v5)
@@ -410,10 +407,8 @@ class Fleet:
                 session.acknowledge(delivery)
 
     def take(self, delivery: FleetDelivery, changed: set[StreamKey] | None = None) -> FleetBatch | None:
-        """Add a message to the ledger. Return its new part. Raises ServerError if there are too many streams.
-
-        This method adds the key of a changed ledger to `changed`, also after a duplicate.
-        """
+        """Add a message to the ledger. Return its new part. Raises ServerError if there are too many streams. This
+        method adds the key of a changed ledger to `changed`, also after a duplicate."""
         parts = parse_topic(delivery.topic)
         assert parts is not None  # FleetSession.next checks the topic
         try:

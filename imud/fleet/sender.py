@@ -30,10 +30,7 @@ FAREWELL_S: Final = 0.3  # part of CLOSE_S for the acknowledgement of the farewe
 
 
 class MqttSender:
-    """Thread of the connection.
-
-    Synchronization: the writer calls the methods, any thread reads counters, the thread calls `work`.
-    """
+    """Thread of the connection. The writer calls the methods, any thread reads counters, the thread calls `work`."""
 
     def __init__(
         self, settings: MqttOptions, client_id: str, will: Will, turn: BrokerTurn, connect: Connect,
@@ -115,10 +112,7 @@ class MqttSender:
         self._ring()
 
     def reply(self, reply: CommandReply) -> None:
-        """Send a reply before all other messages, and again after a lost connection.
-
-        Any thread may call this method.
-        """
+        """Send a reply before all other messages, and again after a lost connection. Any thread may call it."""
         with self._lock:
             self._replies.append(reply)
         self._ring()

@@ -443,10 +443,7 @@ class Spool:
         return self._given, self._ahead_from, self._ahead
 
     def _undamaged(self, base: sqlite3.Connection, where: str, values: Sequence[object]) -> list[SpoolRow]:
-        """Return undamaged rows.
-
-        Replace a damaged row by a `dropped` message, or delete it if its numbers are unknown.
-        """
+        """Return undamaged rows. Replace a damaged row by a `dropped` message; delete it if its numbers are unknown."""
         while True:
             rows = base.execute(f"SELECT {_COLUMNS} FROM message WHERE {where}", values).fetchall()
             found = [row for one in rows if (row := undamaged_row(one) or self._repaired(base, one)) is not None]
@@ -534,10 +531,7 @@ class Spool:
         return bool(found)
 
     def _drop(self, base: sqlite3.Connection, row: SpoolRow, cause: DropCause) -> None:
-        """Replace a message by a `dropped` message, or add it to the previous one.
-
-        Do nothing for a `dropped` message.
-        """
+        """Replace a message by a `dropped` message, or add it to the previous `dropped` message."""
         if row.kind == MessageKind.DROPPED.value:
             return
         self.dropped[cause.value] = self.dropped.get(cause.value, 0) + row.items

@@ -198,10 +198,7 @@ class DeviceStreams:
         return made
 
     def _is_over(self, begin_ns: int, now_ns: int) -> bool:
-        """Return whether the present time is in a later batch than `begin_ns`.
-
-        Batches start at multiples of `batch_s` of CLOCK_MONOTONIC.
-        """
+        """Return whether now is in a later batch than `begin_ns`; batches start at multiples of `batch_s`."""
         batch_ns = self._sending.batch_ns
         return begin_ns // batch_ns < now_ns // batch_ns
 

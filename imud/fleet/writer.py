@@ -145,10 +145,7 @@ class WriterQueue:
 
 
 class SpoolWriter:
-    """Thread with the spool and its streams.
-
-    Synchronization: any thread may read the counters; the thread owns the rest.
-    """
+    """Thread with the spool and its streams. Any thread may read the counters; the thread owns the rest."""
 
     def __init__(
         self, settings: MqttOptions, gateway: Gateway, queue: WriterQueue, spool: Spool, sender: MqttSender,
@@ -182,10 +179,8 @@ class SpoolWriter:
         sender.wanting = self._worker.ring
 
     def close(self) -> None:
-        """Store all waiting messages and end the thread. A second call does nothing.
-
-        If the disk blocks the thread, it stores the messages later, when the disk works again.
-        """
+        """Store all waiting messages and end the thread. A second call does nothing. If the disk blocks the thread, it
+        stores the messages later, when the disk works again."""
         self._sender.wanting = lambda: None
         self._is_closing = True
         if self._worker.end():
@@ -197,10 +192,7 @@ class SpoolWriter:
             )  # fmt: skip
 
     def _finish(self) -> None:
-        """Store all waiting messages and close the spool, once.
-
-        The thread calls this method, or `close` after the thread ended.
-        """
+        """Store all waiting messages and close the spool, once: in the thread, or in `close` after its end."""
         if self._is_closed:
             return
         self._is_closed = True
@@ -337,10 +329,8 @@ class SpoolWriter:
         self._acknowledged -= acknowledged
 
     def _commit(self, acknowledged: frozenset[int], now_ns: int) -> None:
-        """Store the waiting messages. Raises SpoolError.
-
-        After a problem, store them one by one, because a full disk may not have room for all.
-        """
+        """Store the waiting messages. Raises SpoolError. After a problem, store them one by one, because a full disk
+        may not have room for all."""
         utc_ns, most = self._stored_utc_ns(now_ns), 1 if self.problem else max(len(self._rows), 1)
         self._spool.commit(self._rows[:most], acknowledged, now_ns, utc_ns)
         del self._rows[:most]
@@ -349,8 +339,7 @@ class SpoolWriter:
             del self._rows[:most]
 
     def _stored_utc_ns(self, now_ns: int) -> int:
-        """Return CLOCK_REALTIME of the transaction; 0 before the clock was synchronized, because messages then have no
-        age."""
+        """Return CLOCK_REALTIME of the transaction; 0 before the clock was synchronized: then messages have no age."""
         clock = self._clock()
         self._is_set = self._is_set or clock is None or clock.synchronised
         return now_ns + self._utc_offset_ns() if self._is_set else 0

@@ -58,10 +58,8 @@ class CanFilter:
 
 @dataclass(frozen=True, slots=True)
 class CyclicFrame:
-    """Frame that imud sends periodically because devices need it, for example CANopen SYNC.
-
-    One device of a bus requests the frame for all devices. imud rejects a second device with the same identifier.
-    """
+    """Frame that imud sends periodically because devices need it, for example CANopen SYNC. One device of a bus
+    requests the frame for all devices. imud rejects a second device with the same identifier."""
 
     can_id: int
     extended: bool
@@ -93,9 +91,7 @@ _OTHER: Final = re.compile(
 
 
 class CandumpReader:
-    """Reader of a candump log from a binary stream. Iterate once. `t_rx_ns` is the time in the log and never
-    decreases.
-    """
+    """Reader of a candump log from a binary stream. Iterate once. `t_rx_ns` is the time in the log, never falling."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file

@@ -37,10 +37,8 @@ class Chunk(NamedTuple):
 
 
 class CaptureReader:
-    """Reader of a raw or stamped capture from a binary stream, seekable or not. Iterate once.
-
-    The first bytes of the file decide between raw and stamped.
-    """
+    """Reader of a raw or stamped capture from a binary stream, seekable or not. Iterate once. The first bytes of the
+    file decide between raw and stamped."""
 
     def __init__(self, file: BinaryIO) -> None:
         """Raises ImudError for a stamped capture of another version or with an invalid first line."""

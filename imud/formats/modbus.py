@@ -42,10 +42,7 @@ EXCEPTIONS: Final = {
 
 def crc16_modbus(data: bytes) -> int:
     """Return the CRC-16/MODBUS: reflected polynomial 0xA001, start value 0xFFFF, no final XOR. "123456789" gives
-    0x4B37.
-
-    The check value follows the data, low byte first. The CRC of data and check value is 0.
-    """
+    0x4B37. The check value follows the data, low byte first. The CRC of data and check value is 0."""
     # the table needs 60 ns per byte; a frame of 57 bytes needs 5 ms on the wire
     crc = 0xFFFF
     for byte in data:
@@ -98,9 +95,7 @@ class ReplyFinder:
 
     def __init__(self, request: bytes, reply_bytes: int, *, echoes: bool | None) -> None:
         """`request` is the complete frame. `echoes`: whether the port receives its own output; None if it is not known.
-
-        If it is not known, the request must not be WRITE_SINGLE: its reply is equal to its echo.
-        """
+        If it is not known, the request must not be WRITE_SINGLE: its reply is equal to its echo."""
         # Whether the port received the echo of the request; None before the decision
         self.echo_seen: bool | None = None
         self.strange = 0  # number of bytes outside echo and reply

@@ -44,10 +44,7 @@ def checksum(body: bytes) -> int:
 
 
 def sentence(body: str) -> bytes:
-    """Return a sentence with checksum and line end from the part between `$` and `*`.
-
-    Raises ValueError if the sentence is too long.
-    """
+    """Return a sentence with checksum and line end for `body`. Raises ValueError if it is too long."""
     data = body.encode("ascii")
     made = b"$%b*%02X\r\n" % (data, checksum(data))
     if len(made) > SENTENCE_BYTES_MAX:
@@ -66,9 +63,7 @@ def hdm(talker: str, heading_rad: float) -> bytes:
 
 
 def hdg(talker: str, heading_rad: float, variation_rad: float | None) -> bytes:
-    """Return a sentence with the heading from magnetic north and the known variation (east positive), without
-    deviation.
-    """
+    """Return a sentence with the heading from magnetic north and the known variation (east positive)."""
     variation = "," if variation_rad is None else f"{abs(math.degrees(variation_rad)):.1f},{'EW'[variation_rad < 0]}"
     return sentence(f"{talker}HDG,{_bearing(heading_rad)},,,{variation}")
 
@@ -85,10 +80,8 @@ def xdr(talker: str, transducers: Iterable[Transducer]) -> bytes:
 
 
 def pashr(utc_ns: int, heading_rad: float | None, roll_rad: float, pitch_rad: float) -> bytes:
-    """Return a sentence of attitude and time. An unknown heading, heave and the accuracies are empty.
-
-    Both flags are 0: no position, and an inertial sensor without satellites.
-    """
+    """Return a sentence of attitude and time. An unknown heading, heave and the accuracies are empty. Both flags are 0:
+    no position, and an inertial sensor without satellites."""
     seconds, rest_ns = divmod(utc_ns, NS_PER_S)
     at = gmtime(seconds)
     time = f"{at.tm_hour:02}{at.tm_min:02}{at.tm_sec:02}.{rest_ns // NS_PER_MS:03}"
@@ -160,10 +153,8 @@ def parse(sentence: bytes) -> Rmc | RmcFault:
 
 
 def build(utc_ns: int, *, valid: bool = True) -> bytes:
-    """Return a `$GPRMC` sentence for an instant (ns since 1970-01-01, from 1980 to 2079), truncated to 10 ms.
-
-    The sentence is for time only: the position is 0° N 0° E. Raises ValueError for other years.
-    """
+    """Return a `$GPRMC` sentence for an instant (ns since 1970-01-01, from 1980 to 2079), truncated to 10 ms. The
+    sentence is for time only: the position is 0° N 0° E. Raises ValueError for other years."""
     unix_s, rest_ns = divmod(utc_ns, NS_PER_S)
     at = gmtime(unix_s)
     if not FIRST_YEAR <= at.tm_year < FIRST_YEAR + 100:
@@ -176,10 +167,7 @@ def build(utc_ns: int, *, valid: bool = True) -> bytes:
 
 
 def as_gprmc(sentence: bytes) -> bytes:
-    """Return a valid RMC sentence of any talker as `$GPRMC` with line end, for devices that require this talker.
-
-    Raises ValueError if `parse` rejects the sentence.
-    """
+    """Return an RMC sentence of any talker as `$GPRMC` with line end. Raises ValueError for other sentences."""
     match = _SENTENCE.fullmatch(sentence)
     if match is None or isinstance(parse(sentence), RmcFault):
         raise ValueError(f"expected an RMC sentence, got {sentence[:RMC_BYTES_MAX]!r}")

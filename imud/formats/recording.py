@@ -83,10 +83,8 @@ def renumbered(block: bytes, number: int) -> bytes:
 
 
 class BlockReader:
-    """Reader of all complete blocks of a file, seekable or not. Iterate once.
-
-    It never raises an exception: it skips and counts all other bytes.
-    """
+    """Reader of all complete blocks of a file, seekable or not. Iterate once. It never raises an exception: it skips
+    and counts all other bytes."""
 
     def __init__(self, file: ByteSource) -> None:
         self._file = file
@@ -193,10 +191,8 @@ class BlockGatherer:
         self._bytes = 0
 
     def add(self, record: bytes) -> bytes:
-        """Add a record. Return the previous block if the record does not fit into it, otherwise no bytes.
-
-        Raises ValueError for a record of more than RECORD_BYTES_MAX.
-        """
+        """Add a record. Return the previous block if the record does not fit into it, otherwise no bytes. Raises
+        ValueError for a record of more than RECORD_BYTES_MAX."""
         if len(record) > RECORD_BYTES_MAX:
             raise ValueError(f"expected a record of at most {RECORD_BYTES_MAX} bytes, got {len(record)}")
         block = self.finish() if self._bytes + len(record) > BLOCK_BYTES else b""
@@ -217,10 +213,8 @@ _LOOKED_AT: Final = frozenset({int(Kind.SESSION)})  # records that the reader it
 
 
 class RecordingReader:
-    """Reader of the records of one file, seekable or not. Iterate once.
-
-    The first record raises ImudError for a file that is not a recording or has another version.
-    """
+    """Reader of the records of one file, seekable or not. Iterate once. The first record raises ImudError for a file
+    that is not a recording or has another version."""
 
     def __init__(self, file: ByteSource, name: str) -> None:
         """`name` is for messages."""

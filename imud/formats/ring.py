@@ -124,18 +124,14 @@ class LedgerBlock:
 
 
 def default_directories(environment: Mapping[str, str]) -> list[str]:
-    """Return the default directories: the directory of the system, then imud/shm in XDG_RUNTIME_DIR if that is set.
-
-    A daemon uses the first directory in which it can create files; a reader the first directory with the ring.
-    """
+    """Return the default directories: the directory of the system, then imud/shm in XDG_RUNTIME_DIR if that is set. A
+    daemon uses the first directory in which it can create files; a reader the first directory with the ring."""
     own = environment.get("XDG_RUNTIME_DIR", "")
     return [DIRECTORY, f"{own}/imud/shm"] if own.startswith("/") else [DIRECTORY]
 
 
 def ring_path(directory: str, device: str) -> Path:
-    """Return the ring file of `device`. Raises ServerError for a name outside `directory` or longer than the header
-    field.
-    """
+    """Return the ring file of `device`. Raises ServerError if the name contains `/` or is too long."""
     room = next(field.count for field in HEADER_FIELDS if field.name == "device") - 1  # readers in C need a final 0
     if not device or "/" in device or "\0" in device or len(device.encode()) > room:
         raise ServerError(f"device {device!r}: expected a name of 1 to {room} bytes without '/' for its shared memory")
@@ -178,9 +174,7 @@ def decode_header(raw: bytes, where: str) -> RingHeader:
 
 
 def encode_ledger_block(update: int, driver: str, ledger: Mapping[str, int]) -> bytes:
-    """Return LEDGER_BLOCK_BYTES bytes. Counters that are missing in `ledger` are 0. A driver name is cut to 31
-    bytes.
-    """
+    """Return LEDGER_BLOCK_BYTES bytes. Counters missing in `ledger` are 0. A driver name is cut to 31 bytes."""
     values = [ledger.get(name, 0) & _U64_MASK for name in LEDGER_FIELDS]
     body = _BLOCK.pack(update, driver.encode()[:31], *values, *[0] * (LEDGER_ROOM - len(values)))
     return body + _CRC.pack(zlib.crc32(body))

@@ -119,10 +119,7 @@ _ZERO2: Pair = (0.0, 0.0)
 
 
 def encode_slots(samples: Sequence[Sample], device_id: int) -> list[bytes]:
-    """Return `samples` as SLOT_BYTES bytes each, with CRC. `device_id` is the device number of the daemon, 0…65535.
-
-    `_fitted` replaces a value that its field cannot hold, so that no sample can stop the daemon.
-    """
+    """Return `samples` as SLOT_BYTES bytes each, with CRC. `device_id` is the device number of the daemon, 0…65535."""
     try:
         if len(samples) == 1:  # usual case: no call for the list
             return [_encode(samples[0], device_id)]
@@ -183,10 +180,8 @@ def _encode(sample: Sample, device_id: int) -> bytes:
 
 
 def _encode_alike(samples: Sequence[Sample], device_id: int) -> list[bytes]:
-    """Return `_encode` of samples with all values of an HI91 frame and no other values, in 0.85 of its time.
-
-    The function does not check each value for None. For other samples it returns an empty list or raises struct.error.
-    """
+    """Return `_encode` of samples with all values of an HI91 frame and no other values, in 0.85 of its time. The
+    function does not check each value for None. For other samples it returns an empty list or raises struct.error."""
     head, values, crc, codes, slots = _HEAD.pack, _VALUES.pack, _CRC.pack, SYNC_CODES, list[bytes]()
     for s in samples:
         if s.incli_rad is not None or s.edge_seq is not None:

@@ -48,10 +48,8 @@ class SteadyTime:
         self._even = 0  # index of the pair at `even_from_ns`
 
     def add_pair(self, monotonic_ns: int, raw_ns: int, held_raw_ns: int = 0, error_ns: int = 0) -> None:
-        """Add a reading of CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW at the same instant, within `error_ns`.
-
-        At `held_raw_ns`, the offset was still the offset of the newest pair. Ignored if it is older than that pair.
-        """
+        """Add a reading of CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW at the same instant, within `error_ns`. At
+        `held_raw_ns`, the offset was still the offset of the newest pair. Ignored if it is older than that pair."""
         if not self._steady:
             self._base_ns = monotonic_ns - raw_ns
         elif self._steady[-1] < held_raw_ns + self._base_ns < raw_ns + self._base_ns:
@@ -157,10 +155,8 @@ class HostClock:
         raw_ns: Callable[[], int] | None = None,
         boottime_ns: Callable[[], int] | None = None,
     ) -> None:
-        """`raw_ns` reads a clock without steering, `boottime_ns` a clock that continues during a suspend.
-
-        None: CLOCK_MONOTONIC_RAW and CLOCK_BOOTTIME. With `raw_ns` only, imud does not detect a suspend.
-        """
+        """`raw_ns` reads a clock without steering, `boottime_ns` a clock that continues during a suspend. None:
+        CLOCK_MONOTONIC_RAW and CLOCK_BOOTTIME. With `raw_ns` only, imud does not detect a suspend."""
         self.now_ns = monotonic_ns  # CLOCK_MONOTONIC, ns
         self.error_ns = 0  # maximum error of the kept offset, ns: half of the duration of its measurement
         # CLOCK_MONOTONIC relative to a time without steering, as of the last `utc_offset_ns`
@@ -183,10 +179,8 @@ class HostClock:
         return self._raw_ns is not self.now_ns
 
     def utc_offset_ns(self) -> int:
-        """Return CLOCK_REALTIME minus CLOCK_MONOTONIC, ns. Update `steady`.
-
-        Call this method between a reading of CLOCK_MONOTONIC and its conversion by `steady`.
-        """
+        """Return CLOCK_REALTIME minus CLOCK_MONOTONIC, ns. Update `steady`. Call this method between a reading of
+        CLOCK_MONOTONIC and its conversion by `steady`."""
         ahead_ns = self._realtime_ns() - (raw_ns := self._raw_ns())
         if self._least_ns <= ahead_ns <= self._most_ns and raw_ns < self._due_ns:
             self._held_ns = raw_ns

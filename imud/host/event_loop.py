@@ -83,10 +83,8 @@ class ReaderSelector(selectors.EpollSelector):
         return True
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        """Wait, call the readers of all readable descriptors, and return the events of asyncio.
-
-        Returns at an asyncio event, at the timeout, and if a reader gave the loop a callback, a timer or `stop`.
-        """
+        """Wait, call the readers of all readable descriptors, and return the events of asyncio. Returns at an asyncio
+        event, at the timeout, and if a reader gave the loop a callback, a timer or `stop`."""
         found: list[tuple[selectors.SelectorKey, int]] = []
         readers, removed, poll = self._readers, self._removed, self._poll
         if timeout is not None and timeout < 0:
@@ -154,9 +152,7 @@ class SampleLoop(asyncio.SelectorEventLoop):
         self._reader_selector.add(_number_of(fd), partial(callback, *args))
 
     def remove_reader(self, fd: Any) -> bool:
-        """Remove the reader of a descriptor. Return whether a reader existed, also of asyncio itself (`sock_recv`,
-        …).
-        """
+        """Remove the reader of a descriptor, also of asyncio itself (`sock_recv`, …). Return whether it existed."""
         number = _number_of(fd)
         return number >= 0 and (self._reader_selector.remove(number) or super().remove_reader(number))
 

@@ -53,10 +53,8 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
 
 
 def open_stream(path: str | os.PathLike[str], wait_ms: int) -> BinaryIO:
-    """Open a regular file, or a FIFO with a writer, for reading. Raises OSError, NotRegularFile.
-
-    Rejects a FIFO without data and without a writer after `wait_ms`. Otherwise opening it would wait forever.
-    """
+    """Open a regular file, or a FIFO with a writer, for reading. Raises OSError, NotRegularFile. Rejects a FIFO without
+    data and without a writer after `wait_ms`. Otherwise opening it would wait forever."""
     if not stat.S_ISFIFO(os.stat(path).st_mode):
         return open_regular(path)
     descriptor = os.open(path, READ_FLAGS)

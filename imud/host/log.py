@@ -85,9 +85,7 @@ _SHORT: Final = _ShortRepr()
 
 
 class LineFormatter(logging.Formatter):
-    """Formatter that makes one line of each message. The lines of a traceback are indented: they cannot imitate a
-    message.
-    """
+    """Formatter that makes one line of each message, and indents tracebacks: they cannot imitate a message."""
 
     def __init__(self, *, journal: bool) -> None:
         """Journal: each line starts with its priority (sd-daemon(3)). Otherwise: with the time and the level."""
@@ -146,10 +144,8 @@ class RepeatFilter(logging.Filter):
 
 
 def same_as(text: str) -> dict[str, str]:
-    """Return `extra` for a message whose text is a value. Messages with equal texts, except for numbers, are equal.
-
-    "3 samples lost" equals "5 samples lost" and differs from "the adapter is absent".
-    """
+    """Return `extra` for a message whose text is a value. Messages with equal texts, except for numbers, are equal. "3
+    samples lost" equals "5 samples lost" and differs from "the adapter is absent"."""
     return {SAME_AS: NUMBERS.sub("", text)}
 
 

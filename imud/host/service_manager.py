@@ -47,10 +47,8 @@ class ServiceManager:
         notify("STOPPING=1")
 
     def tick(self, now_ns: int, states: Callable[[], Mapping[str, str]]) -> None:
-        """Feed the watchdog. Report the device states if they changed. Call this method ten times per second.
-
-        `states` returns the state of each device by its name. It is called at most once per second.
-        """
+        """Feed the watchdog. Report the device states if they changed. Call this method ten times per second. `states`
+        returns the state of each device by its name. It is called at most once per second."""
         if self._watchdog_s is not None and now_ns >= self._watchdog_due_ns:
             notify("WATCHDOG=1")
             self._watchdog_due_ns = now_ns + int(self._watchdog_s * NS_PER_S)

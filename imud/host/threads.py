@@ -48,11 +48,8 @@ class WatchingWorker(Worker, Protocol):
     """Worker with descriptors that can end its sleep."""
 
     def watch(self, fd: int, callback: Callable[[], None]) -> bool:
-        """End the sleep when a descriptor becomes readable: the thread of the `Round` calls `callback` first.
-
-        One call for all data since the last call; the worker reads no data. Return whether this is possible. From any
-        thread.
-        """
+        """End the sleep when a descriptor becomes readable: the thread of the `Round` calls `callback` first. One call
+        for all data since the last call; the worker reads no data. Return whether this is possible. From any thread."""
         ...
 
     def unwatch(self, fd: int) -> None:
@@ -72,10 +69,7 @@ def share_interpreter() -> None:
 
 @contextmanager
 def rare_garbage_collection(allocations: int) -> Iterator[None]:
-    """Run the garbage collector after `allocations` new objects and exclude all present objects.
-
-    For a process with many objects and few cycles, because each collection visits all objects.
-    """
+    """Run the garbage collector after `allocations` new objects, without the objects that exist now."""
     before = gc.get_threshold()
     gc.freeze()
     gc.set_threshold(allocations)

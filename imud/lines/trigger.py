@@ -184,10 +184,7 @@ class Trigger:
         on_stamps(found)
 
     def stop(self) -> None:
-        """Stop the thread, deliver the remaining time stamps, and leave the line inactive and open.
-
-        A second call does nothing.
-        """
+        """Stop the thread, deliver the remaining time stamps, and leave the line inactive and open."""
         if self._worker is None:
             return
         self._worker.end()

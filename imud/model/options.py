@@ -48,9 +48,7 @@ def is_host(text: str) -> bool:
 
 
 def expected(field_type: Any) -> str:
-    """Return a description of the values of `field_type`, for example `a whole number from 50 to 4000000, or
-    "auto"`.
-    """
+    """Return a description of the values of `field_type`, for example `a number from 0 to 60, or "auto"`."""
     return _words(inspect.type_info(field_type))
 
 
@@ -85,9 +83,7 @@ class WrongValue(NamedTuple):
 
 
 def wrong_values(schema: type[msgspec.Struct], given: Mapping[str, Any], what: str = "key") -> list[WrongValue]:
-    """Return all errors of values for the fields of `schema`. `what` is the word for a value in messages: key,
-    argument.
-    """
+    """Return all errors of values for the fields of `schema`. `what` names a value in messages: key, argument."""
     fields = {field.name: field for field in msgspec.structs.fields(schema)}
     found = []
     if schema.__struct_config__.forbid_unknown_fields:
@@ -146,9 +142,7 @@ def _inside(value: object, place: str) -> str:
 
 
 def unknown_name(what: str, name: str, known: Sequence[str]) -> str:
-    """Return the error for a name that is not in `known`, with the most similar name. `what` is for example `a
-    driver`.
-    """
+    """Return the error for a name that is not in `known`, with the most similar name. `what`: `a driver`, …."""
     near = get_close_matches(name, known, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]}? " if near else ""
     return f"expected {what} that imud knows, got {got(name)}; {hint}known: {', '.join(sorted(known)) or 'none'}"

@@ -380,10 +380,8 @@ class HeadingReference:
 
 
 def make(kind: Formatter, sample: Sample, reference: HeadingReference, talker: str = "") -> bytes | None:
-    """Return the sentence of a sample in `ned-frd`; None if the sample does not contain the values.
-
-    A non-empty `talker` replaces the talker of TALKERS.
-    """
+    """Return the sentence of a sample in `ned-frd`; None if the sample does not contain the values. A non-empty
+    `talker` replaces the talker of TALKERS."""
     return _MAKERS[kind](talker or TALKERS[kind], sample, reference)
 
 

@@ -71,11 +71,8 @@ class RingDirectory:
     """Open directory of rings. Synchronization: one thread."""
 
     def __init__(self, path: str) -> None:
-        """Open `path`. Remove the temporary files of a daemon that died while it created a ring.
-
-        Raises ServerError if the directory is missing, if other users can replace its files, or if this user cannot
-        create files.
-        """
+        """Open `path`. Remove the temporary files of a daemon that died while it created a ring. Raises ServerError if
+        the directory is missing, if other users can replace its files, or if this user cannot create files."""
         self.path = path
         self._fd = _open(path)
         try:
@@ -101,10 +98,8 @@ class RingDirectory:
             return False
 
     def refuse_second_writer(self, name: str) -> None:
-        """Raise ServerError if another daemon of this user or of root writes the ring `name`.
-
-        `make` replaces any other file with this name.
-        """
+        """Raise ServerError if another daemon of this user or of root writes the ring `name`. `make` replaces any other
+        file with this name."""
         try:
             found = os.stat(name, dir_fd=self._fd, follow_symlinks=False)
         except OSError:
@@ -196,10 +191,8 @@ class RingDirectory:
 
 
 def open_directory(configured: str, environment: Mapping[str, str]) -> RingDirectory:
-    """Open the configured directory. If the default directory cannot be used, open the directory of the user.
-
-    This function creates missing default directories. Raises ServerError.
-    """
+    """Open the configured directory. If the default directory cannot be used, open the directory of the user. This
+    function creates missing default directories. Raises ServerError."""
     if configured != DIRECTORY:
         return RingDirectory(configured)
     first, *others = default_directories(environment)
@@ -337,9 +330,7 @@ class ShmRing:
 
     def _write_run(self, first: int, last: int, slots: Sequence[bytes]) -> bool:
         """Write consecutive slots. All slots are invalid from before the first payload until after the last payload.
-
-        Return False without a write if a number is missing, or if the run reaches the end of the ring.
-        """
+        Return False without a write if a number is missing, or if the run reaches the end of the ring."""
         count, begin = len(slots), first & self._mask
         if first != self._newest + 1 or last != self._newest + count or begin + count > self._mask + 1:
             return False
@@ -405,10 +396,8 @@ class ShmRing:
         return whole
 
     def _restore_size(self) -> None:
-        """Restore the size of a truncated file and mark it as closed, without the mapping.
-
-        Readers can have the file mapped. imud does not write to it after that.
-        """
+        """Restore the size of a truncated file and mark it as closed, without the mapping. Readers can have the file
+        mapped. imud does not write to it after that."""
         self._least_bytes = sys.maxsize
         with suppress(OSError):
             os.ftruncate(self._fd, self._size_bytes)
@@ -482,10 +471,8 @@ class ShmPublisher:
         self._context.latencies.ask(ASKER, round(self._settings.latency_ms * NS_PER_MS))
 
     def add_device(self, name: str, device_id: int) -> None:
-        """Create the ring of a device. If that fails, log the cause and try again later.
-
-        Raises ServerError if another daemon writes the ring, or if the directory cannot be used.
-        """
+        """Create the ring of a device. If that fails, log the cause and try again later. Raises ServerError if another
+        daemon writes the ring, or if the directory cannot be used."""
         self.remove_device(name)
         try:
             directory = self._opened_directory()

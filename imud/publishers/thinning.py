@@ -34,10 +34,8 @@ class Pace:
         self.due_ns = 0  # earliest time stamp of the next selected sample
 
     def is_due(self, t_ns: int, step_ns: int) -> bool:
-        """Return whether the sample at `t_ns` is selected. If so, advance the due time.
-
-        `step_ns` is the time since the previous sample; 0 for the first sample.
-        """
+        """Return whether the sample at `t_ns` is selected. If so, advance the due time. `step_ns` is the time since the
+        previous sample; 0 for the first sample."""
         if t_ns < self.due_ns:
             return False
         period_ns, start_ns = self._period_ns, self._start_ns

@@ -202,10 +202,7 @@ class RecordedDevice(Protocol):
 
 
 class RecordableDevices:
-    """Devices and host clocks of a daemon that a recorder can record.
-
-    Synchronization: the event loop's thread only.
-    """
+    """Devices and host clocks of a daemon for recorders. Synchronization: the event loop's thread only."""
 
     def __init__(self, devices: Mapping[str, RecordedDevice], host: HostClock) -> None:
         """`devices` contains the present devices at each call."""

@@ -157,10 +157,8 @@ class ArrivalFit:
         self._pause_ns, self._pause_count = pause_ns, count
 
     def add_arrival(self, device_ns: int, arrival_ns: int, trailing_ns: int, above_ns: float) -> bool:
-        """Add an arrival `above_ns` above the fit. Return whether the fit changed.
-
-        `device_ns` must not fall. `trailing_ns` is the time on the wire of the bytes after the frame in the same read.
-        """
+        """Add an arrival `above_ns` above the fit. Return whether the fit changed. `device_ns` must not fall.
+        `trailing_ns` is the time on the wire of the bytes after the frame in the same read."""
         self.count += 1
         wait = above_ns + trailing_ns
         late_ns = 0.0

@@ -29,10 +29,8 @@ WIRE_SLACK: Final = 1.05
 
 
 class LinkDelay:
-    """Bounds of the constant delay, which arrivals cannot show: from 0 to the largest bias of the link.
-
-    `byte_ns` is the time of a byte on the wire, 0 if unknown. `hold_ns` is the period of an adapter's latency timer.
-    """
+    """Bounds of the constant delay, which arrivals cannot show: from 0 to the largest bias of the link. `byte_ns` is
+    the time of a byte on the wire, 0 if unknown. `hold_ns` is the period of an adapter's latency timer."""
 
     __slots__ = ("byte_ns", "hold_ns")
 
@@ -69,10 +67,8 @@ class LinkDelay:
         return SIGMA_OF_RANGE * self.floor_ns + SIGMA_OF_HIDDEN * hidden_ns
 
     def before(self, arrival_ns: int, size_bytes: int, period_ns: float, sigma_ns: float) -> tuple[int, float]:
-        """Return (time of transmission, its error), ns, of a frame that arrived at `arrival_ns`.
-
-        `sigma_ns` is the spread of the arrivals.
-        """
+        """Return (time of transmission, its error), ns, of a frame that arrived at `arrival_ns`. `sigma_ns` is the
+        spread of the arrivals."""
         bias_ns = self.floor_ns + self.held_ns(period_ns, size_bytes)
         return arrival_ns - int(bias_ns / 2), SIGMA_OF_RANGE * bias_ns + sigma_ns
 

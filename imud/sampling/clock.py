@@ -360,10 +360,8 @@ class SampleClock:
             self.observer.call("clock", "link_changed", byte_ns=byte_ns, hold_ns=hold_ns)
 
     def restart(self) -> None:
-        """Start again after the device or the link was missing. This does not count as a reset.
-
-        If the device counter continued, the clock counts the lost samples. Otherwise the gap has an unknown size.
-        """
+        """Start again after the device or the link was missing. This does not count as a reset. If the device counter
+        continued, the clock counts the lost samples. Otherwise the gap has an unknown size."""
         self._known = False
         self._time.period.restart()
         self._arrivals.restart()

@@ -90,10 +90,8 @@ class PeriodLearner:
         return self.steps_in(ticks) - 1
 
     def restart(self, *, was_added: bool = False) -> None:
-        """Forget the newest step: the counter restarted, or imud did not receive frames for a time.
-
-        `was_added`: the last added step was not a step of one counter, and the caller reports the gap.
-        """
+        """Forget the newest step: the counter restarted, or imud did not receive frames for a time. `was_added`: the
+        last added step was not a step of one counter, and the caller reports the gap."""
         if was_added and self._unjudged and not self.is_gap:
             self._unjudged.pop()
         self._run, self.is_gap = 0, False
@@ -293,9 +291,7 @@ class DeviceTime:
 
     def missed_since(self, line: CounterLine, ticks: int, arrival_ns: int) -> int | None:
         """Return the number of lost samples since the newest sample; None if the counter did not continue to `ticks`.
-
-        `arrival_ns` is the arrival of the frame. The counter may have wrapped several times.
-        """
+        `arrival_ns` is the arrival of the frame. The counter may have wrapped several times."""
         step_ns, turn_ns, period = self.elapsed_ns(ticks), self.modulus * self.tick_ns, self.period
         turns = line.turns(self.even_ns + step_ns, arrival_ns, turn_ns)
         if not period.period_ticks or not line.is_on_time(self.even_ns + step_ns + turns * turn_ns, arrival_ns):
@@ -480,10 +476,8 @@ class JumpDetector:
     def is_jump(
         self, fit: ArrivalFit, above_ns: float, elapsed_ns: int, error_ns: float | None, t_rx_ns: int, t_before_ns: int
     ) -> bool:
-        """Return whether a frame above or below the fit shows a jump of the device counter.
-
-        `t_before_ns` is the read of the previous frame. `error_ns` is None before the fit is in use.
-        """
+        """Return whether a frame above or below the fit shows a jump of the device counter. `t_before_ns` is the read
+        of the previous frame. `error_ns` is None before the fit is in use."""
         if above_ns < -JUMP_EARLY_NS:
             return self.is_early(fit, above_ns, elapsed_ns, error_ns)
         return self.is_late(fit, above_ns, elapsed_ns, t_rx_ns, new_read=t_rx_ns > t_before_ns)
@@ -545,11 +539,8 @@ class StampTime:
         self.in_use = False  # whether the ticks come from `pps_age_ms`
 
     def ticks(self, stamp: int, arrival_ns: int, known_ticks: int | None) -> int | None:
-        """Return the ticks of a frame; None if `stamp` does not show its time.
-
-        `known_ticks` are the last ticks of the clock, None without ticks. If other frames of the device contain the
-        time, the clock prefers these frames.
-        """
+        """Return the ticks of a frame; None if `stamp` does not show its time. `known_ticks` are the last ticks of the
+        clock, None without ticks. If other frames of the device contain the time, the clock prefers these frames."""
         if self._is_foreign(known_ticks, arrival_ns):
             return None
         if self._stamp < 0:

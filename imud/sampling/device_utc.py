@@ -48,10 +48,8 @@ class _Bin:
 
 
 class IntervalFit:
-    """Lowest and highest possible time of a sample, from the intervals of the last 32 s.
-
-    The width of the result is at least `narrowest_ns`.
-    """
+    """Lowest and highest possible time of a sample, from the intervals of the last 32 s. The width of the result is at
+    least `narrowest_ns`."""
 
     __slots__ = (
         "_bins", "_fan", "_middle", "_narrowest_ns", "_ref_device_ns", "_ref_ns", "_slope", "_width_ns", "known",
@@ -75,9 +73,7 @@ class IntervalFit:
 
     def add_interval(self, device_ns: int, low: int, high: int, arrival_ns: int, slope: float) -> None:
         """Add that the sample at `device_ns` is between `low` and `high`, and not after the arrival of its frame.
-
-        `slope` is the approximate host ns per device ns.
-        """
+        `slope` is the approximate host ns per device ns."""
         if low < arrival_ns < high:
             high = arrival_ns
         bins = self._bins
@@ -195,9 +191,7 @@ class DeviceUtc:
 
     def above(self, ticks: int, t_ns: int, error_ns: float) -> int | None:
         """Return the time from `t_ns` to the start of the tick by UTC, ns; None if the counter does not agree with UTC.
-
-        `error_ns` is the one-sigma error of `t_ns`.
-        """
+        `error_ns` is the one-sigma error of `t_ns`."""
         reference = self.reference
         if reference is None:
             return None
@@ -215,10 +209,8 @@ class DeviceUtc:
         self, ticks: int, device_ns: int, arrival_ns: int, fit_ns: int, fit_error_ns: float, slope: float, *,
         refused: bool,
     ) -> None:  # fmt: skip
-        """Compare the sample at `device_ns`, at `fit_ns` according to the fit, with UTC.
-
-        `arrival_ns` is the latest start of its frame. `refused`: the device reports that it is not on UTC.
-        """
+        """Compare the sample at `device_ns`, at `fit_ns` according to the fit, with UTC. `arrival_ns` is the latest
+        start of its frame. `refused`: the device reports that it is not on UTC."""
         if refused or self.reference is None:
             if self.active or self._agreed:
                 self.reset()

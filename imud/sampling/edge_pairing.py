@@ -120,10 +120,8 @@ class EdgeTracker:
 
 
 class EdgePairing:
-    """Pairing of the events of one source with samples.
-
-    `lead_ns` is the time from the event to the first byte of the frame.
-    """
+    """Pairing of the events of one source with samples. `lead_ns` is the time from the event to the first byte of the
+    frame."""
 
     __slots__ = (
         "_first", "_lead_ns", "_pairs", "_queue", "_tracker", "_wrong", "delay_error_ns", "delay_ns", "due_ns",

@@ -48,11 +48,8 @@ RESUME_STEPS: Final = 8  # maximum distance of a number from its due value after
 
 
 class CounterLine:
-    """Host time of a device counter, from the fit with the smallest delay.
-
-    Arrivals are above the line if the counter continues. On an overloaded host, all frames are late and the fit follows
-    them. This line does not follow them.
-    """
+    """Host time of a device counter, from the fit with the smallest delay. Arrivals are above the line if the counter
+    continues. On an overloaded host, all frames are late and the fit follows them. This line does not follow them."""
 
     __slots__ = ("_device_ns", "_error_ns", "_fitted_ns", "_host_ns", "_slope_error", "slope")
 
@@ -143,10 +140,8 @@ class ArrivalPace:
         return self.is_known and arrival_ns - self._due_ns < STEPS_FACTOR * self.period_ns
 
     def resume(self, steps: int, arrival_ns: int) -> int:
-        """Return the number of samples to a frame whose number is `steps` ahead, with lost whole turns.
-
-        Return 0 if the number does not fit the elapsed time: the device restarted, or is another device.
-        """
+        """Return the number of samples to a frame whose number is `steps` ahead, with lost whole turns. Return 0 if the
+        number does not fit the elapsed time: the device restarted, or is another device."""
         if not self.is_known:
             return 0
         passed = (arrival_ns - self._due_ns) / self.period_ns
@@ -155,10 +150,8 @@ class ArrivalPace:
         return steps if doubt < self._turn / RESUME_STEPS and abs(steps - passed) <= doubt else 0
 
     def add_arrival(self, arrival_ns: int, steps: int = 1) -> tuple[int, bool]:
-        """Add a frame `steps` samples after the newest sample. Return (number of lost samples, is certain).
-
-        Losses that earlier frames have shown are not counted again. The number is certain within one sample or turn.
-        """
+        """Add a frame `steps` samples after the newest sample. Return (number of lost samples, is certain). Losses that
+        earlier frames have shown are not counted again. The number is certain within one sample or turn."""
         self._due_ns += steps * self.period_ns
         late_ns = arrival_ns - self._due_ns
         self._count += 1
@@ -222,10 +215,8 @@ class ArrivalPace:
 
 
 class SampleNumber:
-    """Wrapping counter that numbers the samples of a device without device time.
-
-    The pace of arrivals shows whether a number is plausible, and the number of turns while imud received no frames.
-    """
+    """Wrapping counter that numbers the samples of a device without device time. The pace of arrivals shows whether a
+    number is plausible, and the number of turns while imud received no frames."""
 
     __slots__ = ("_arrival_ns", "_modulus", "_number", "_pace", "_was_known", "known")
 
@@ -243,10 +234,8 @@ class SampleNumber:
         self.known = False
 
     def steps(self, number: int, arrival_ns: int, period_ns: float) -> int:
-        """Return the number of samples from the newest sample to this number.
-
-        Return 0 for the first number and after a restart. `period_ns` replaces the period while the pace is unknown.
-        """
+        """Return the number of samples from the newest sample to this number. Return 0 for the first number and after a
+        restart. `period_ns` replaces the period while the pace is unknown."""
         steps = (number - self._number) % self._modulus
         if not self.known:
             return self._pace.resume(steps, arrival_ns) if self._was_known else 0
@@ -277,10 +266,8 @@ class SampleNumber:
 
 
 class ArrivalLosses:
-    """Counter of lost samples for a device without device time: by the frame number, else by the pace.
-
-    `modulus` is the modulus of the number, 0 without a number. `on_unknown_gap` is called for each gap of unknown size.
-    """
+    """Counter of lost samples for a device without device time: by the frame number, else by the pace. `modulus` is the
+    modulus of the number, 0 without a number. `on_unknown_gap` is called for each gap of unknown size."""
 
     __slots__ = ("_number", "_on_unknown_gap", "_pace", "missed", "resets")
 
@@ -310,10 +297,8 @@ class ArrivalLosses:
         return steps if goes_on else 0
 
     def add_arrival(self, arrival_ns: int, *, is_first: bool) -> int:
-        """Add a frame without a number. Return the number of lost samples that it shows.
-
-        `is_first`: the first frame of the device.
-        """
+        """Add a frame without a number. Return the number of lost samples that it shows. `is_first`: the first frame of
+        the device."""
         pace = self._pace
         if pace is None:
             self._pace = pace = ArrivalPace()

@@ -334,9 +334,7 @@ class StreamPath(SamplePath):
 
     def gather(self, data: bytes, t_rx_ns: int, waited_ns: int = 0) -> bool:
         """Process bytes, and hold their samples until `publish_gathered`. Return whether the bytes contained samples.
-
-        `waited_ns` is the maximum time of the bytes in the kernel's buffer; 0 if imud read them on arrival.
-        """
+        `waited_ns` is the maximum time of the bytes in the kernel's buffer; 0 if imud read them on arrival."""
         self.last_data_ns = t_rx_ns
         try:
             events = self.codec.feed(data)
@@ -501,10 +499,8 @@ class ReadyEdges:
             self.observer.call("edges", "restart")
 
     def match(self, start_ns: int, end_ns: int) -> Stamp | None:
-        """Return the time stamp of a read from `start_ns` to `end_ns`; None without an edge.
-
-        Failed reads count too. Call this method in the order of the reads.
-        """
+        """Return the time stamp of a read from `start_ns` to `end_ns`; None without an edge. Failed reads count too.
+        Call this method in the order of the reads."""
         edges = self._edges
         while len(edges) > 1 and edges[1].t_ns <= start_ns:
             edges.popleft()

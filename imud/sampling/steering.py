@@ -73,10 +73,8 @@ class Slew:
 
 
 class Holdover:
-    """Line from the end of the old fit, in use until the new fit is accurate. Its error grows with time.
-
-    By default, its rate is the rate of UTC: after a jump to UTC, the old fit of the crystal is no longer valid.
-    """
+    """Line from the end of the old fit, in use until the new fit is accurate. Its error grows with time. By default,
+    its rate is the rate of UTC: after a jump to UTC, the old fit of the crystal is no longer valid."""
 
     __slots__ = ("_device_ns", "_error_ns", "_t_ns", "least_ns", "slope", "slope_error")
 
@@ -129,10 +127,8 @@ class EdgeSource:
 
 
 class AidingSources:
-    """All aiding sources of a device's time. Each source is in use after its first edge.
-
-    Add edges in the order of time, before the frames that follow them. Synchronization: none; one thread.
-    """
+    """All aiding sources of a device's time. Each source is in use after its first edge. Add edges in the order of
+    time, before the frames that follow them. Synchronization: none; one thread."""
 
     __slots__ = (
         "_bits", "_device_ns", "_fix_ns", "_host", "_pps", "_pulses", "_sin_timing", "_source", "_sources",

@@ -143,10 +143,7 @@ HALF_NS: Final = NS_PER_S // 2
 
 
 def encode(system_ns: int, offset_ns: int, *, pulse: bool, leap: int = 0) -> bytes:
-    """Encode a sample for chronyd: at CLOCK_REALTIME `system_ns`, the true time was `offset_ns` later.
-
-    With `pulse`, the offset is modulo one second.
-    """
+    """Encode a sample for chronyd: at `system_ns`, true time was `offset_ns` later (`pulse`: modulo 1 s)."""
     seconds, rest_ns = divmod(system_ns, NS_PER_S)
     return SAMPLE.pack(seconds, rest_ns // NS_PER_US, offset_ns / NS_PER_S, pulse, leap, 0, MAGIC)
 
@@ -168,9 +165,7 @@ class ChronyFeed:
 
     def send_pulse(self, t_ns: int, unix_s: int | None = None) -> bool:
         """Send a pulse at CLOCK_MONOTONIC `t_ns`, the start of `unix_s` if known. Return whether chronyd accepted it.
-
-        Call this method soon after the pulse. Without the second, chronyd needs another source for it (`lock`).
-        """
+        Call this method soon after the pulse. Without the second, chronyd needs another source for it (`lock`)."""
         system_ns = t_ns + self._utc_offset_ns()
         second_s = (system_ns + HALF_NS) // NS_PER_S if unix_s is None else unix_s
         offset_ns = second_s * NS_PER_S - system_ns

@@ -86,10 +86,7 @@ LONGEST_PAUSE_S: Final = 30.0
 
 
 class SentenceSplitter:
-    """Finder of RMC sentences between other sentences, JSON and noise. It buffers at most LINE_BYTES_MAX.
-
-    Synchronization: one thread.
-    """
+    """Finder of RMC sentences between other data. It buffers at most LINE_BYTES_MAX. Synchronization: one thread."""
 
     def __init__(self) -> None:
         self._tail = b""
@@ -110,10 +107,7 @@ class SentenceSplitter:
 
 
 class Retry:
-    """Pauses between attempts. Each pause is twice as long as the previous one, until a success.
-
-    Synchronization: one task.
-    """
+    """Pauses between attempts. Each pause is twice as long as the previous pause, until a success."""
 
     def __init__(self, sleep: Callable[[float], Awaitable[None]] = asyncio.sleep) -> None:
         self._sleep = sleep

@@ -280,9 +280,7 @@ class Assembly:
         self._is_whole = False
 
     def _fits(self, kind: _Kind, t_rx_ns: int) -> bool:
-        """Return whether a frame has a place in the present burst or starts the next burst. It may start the next
-        burst.
-        """
+        """Return whether a frame has a place in the present burst or the next burst. It may start the next burst."""
         if self._kinds.get(kind.number) is not kind:  # the end of the previous sample removed this kind
             return False
         return self._fits_fast(kind, t_rx_ns) if kind.every == 1 else self._fits_slow(kind, t_rx_ns)

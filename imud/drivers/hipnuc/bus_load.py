@@ -61,9 +61,7 @@ def _percent(bits_per_s: float, bus_bits_per_s: int) -> str:
 
 
 def refuse_other_rate(target: Target, values: Mapping[str, Any]) -> None:
-    """Raise BadArgument for a `bit_rate` other than the bit rate of the bus. Such a device is lost and disturbs the
-    bus.
-    """
+    """Raise BadArgument for a `bit_rate` other than the rate of the bus: such a device disturbs the bus."""
     rate = values.get("bit_rate")
     if rate is not None and target.baud and rate != target.baud:
         raise BadArgument(

@@ -140,9 +140,7 @@ def check_settings(target: Target, values: Mapping[str, Any]) -> None:
 
 
 def _require_as_configured(settings: RegisterOptions, **wanted: FilterChoice | None) -> None:
-    """Raise BadArgument for a filter that differs from `options`, because imud writes `options` again at every
-    setup.
-    """
+    """Raise BadArgument for a filter that differs from `options`, which imud writes again at every setup."""
     for name, choice in wanted.items():
         configured: FilterChoice | None = getattr(settings, name)
         if choice is not None and configured is not None and not same_filter(choice, configured):

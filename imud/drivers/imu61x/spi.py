@@ -194,9 +194,7 @@ class State:
         self.window = window & WINDOW_ID
 
     def differences(self, settings: SpiDeviceOptions) -> str:
-        """Return the difference of filter and window from the options; empty if there is none. Bursts are checked
-        separately.
-        """
+        """Return the difference of filter and window from the options; empty if there is none."""
         wanted = wanted_filter(settings, self.filter)
         if self.filter != wanted:
             return f"expected FILTER_CTRL {wanted:#04x}, got {self.filter:#04x}"

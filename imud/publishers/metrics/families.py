@@ -606,10 +606,7 @@ def _snapshots(snapshot: Snapshot) -> Lines:
 
 
 def _disk(snapshot: Snapshot) -> Lines:
-    """Return the size of all recordings.
-
-    Both recorders share one directory, and only the continuous recorder knows the size of its open file.
-    """
+    """Return the size of all recordings. Only the continuous recorder knows the size of its open file."""
     always = [status.disk_bytes for status in snapshot.recorders]
     return [((), size) for size in always or [status.disk_bytes for status in snapshot.flights]]
 

@@ -90,10 +90,7 @@ class Scrapes(msgspec.Struct, frozen=True):
 
 
 class ClientTotals:
-    """Sums of the samples sent and dropped for all clients.
-
-    A sum over the connected clients would decrease when a client disconnects.
-    """
+    """Sums of the samples sent and dropped for all clients, also for disconnected clients."""
 
     def __init__(self) -> None:
         self.sent = 0
@@ -173,9 +170,7 @@ class Renderer:
 
 def encoder_for(accept: str) -> tuple[Callable[[CollectorRegistry], bytes], str]:
     """Return the encoder and the content type for an Accept header; the defaults if the header is invalid.
-
-    `choose_encoder` of prometheus_client raises if `version` is not a number (seen with 0.26).
-    """
+    `choose_encoder` of prometheus_client raises if `version` is not a number (seen with 0.26)."""
     try:
         return choose_encoder(accept)
     except (TypeError, ValueError):
@@ -255,10 +250,8 @@ class MetricsPublisher:
         return await self._page(request.accept)
 
     async def _page(self, accept: str) -> HttpResponse:
-        """Return a page, together with other requests that wait for a snapshot.
-
-        Otherwise imud would first serve clients that no longer wait, and each would need a snapshot.
-        """
+        """Return a page, together with other requests that wait for a snapshot. Otherwise imud would first serve
+        clients that no longer wait, and each would need a snapshot."""
         content_type = encoder_for(accept)[1]
         page = self._pages.get(content_type)
         if page is None:

@@ -137,10 +137,8 @@ def _pread_slots(fd: int, first: int, end: int) -> bytes:
 
 
 def motion_of(slots: bytes, since_ns: int, used: Callable[[int], None] = lambda _: None) -> MotionValues | None:
-    """Return the motion over the slots with time stamps from `since_ns`, oldest first; None if there is no slot.
-
-    This function calls `used` with the number of values after each part of the work.
-    """
+    """Return the motion over the slots with time stamps from `since_ns`, oldest first; None if there is no slot. This
+    function calls `used` with the number of values after each part of the work."""
     view = memoryview(slots)
     times = view.cast("q")[_T_NS::_WORDS].tolist()
     first = bisect_left(times, since_ns)

@@ -158,8 +158,7 @@ class ScrapeServer:
 
 
 async def _read_head(loop: asyncio.AbstractEventLoop, client: socket.socket) -> bytes | None:
-    """Return the data up to the empty line; None if the client disconnects first or sends more than
-    REQUEST_BYTES_MAX."""
+    """Return the data up to the empty line; None if the client disconnects or sends more than REQUEST_BYTES_MAX."""
     data = b""
     while b"\r\n\r\n" not in data:
         part = await loop.sock_recv(client, REQUEST_BYTES_MAX)

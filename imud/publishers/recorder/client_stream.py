@@ -55,10 +55,8 @@ class BlockSender:
         self._moved_ns = now_ns()  # time of the last progress
 
     def send(self, block: bytes = b"") -> bool:
-        """Send the rest of the previous block and then `block`. Return whether all is sent.
-
-        Do not give the next block before. Data for a disconnected client is discarded.
-        """
+        """Send the rest of the previous block and then `block`. Return whether all is sent. Do not give the next block
+        before. Data for a disconnected client is discarded."""
         if block:
             self._rest = memoryview(block)
         try:

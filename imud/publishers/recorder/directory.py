@@ -58,9 +58,7 @@ class RecordingDirectory:
 
     def new_file(self, utc_ns: int, epoch: int, number: int, kind: str = "") -> Path:
         """Return the path of the next file. Names sort by time; the files of one run of the daemon share the epoch.
-
-        `kind` is SNAPSHOT for a snapshot. Snapshots have their own numbers.
-        """
+        `kind` is SNAPSHOT for a snapshot. Snapshots have their own numbers."""
         begun = datetime.fromtimestamp(utc_ns // NS_PER_S, UTC).strftime("%Y%m%dT%H%M%SZ")
         return self.path / f"{begun}-{epoch & 0xFFFF_FFFF:08x}-{number:06d}{kind}{SUFFIX}"
 
@@ -77,12 +75,7 @@ class RecordingDirectory:
         return sorted(found)
 
     def make_room(self, reserve_bytes: int) -> Sequence[str]:
-        """Remove the oldest closed files until the size of the rest plus `reserve_bytes` is below the limit.
-
-        Return their names.
-
-        Raises OSError.
-        """
+        """Remove the oldest closed files, so that `reserve_bytes` fit. Return their names. Raises OSError."""
         with self._lock:
             files = self.files()
             total, removed = sum(file.size for file in files), list[str]()

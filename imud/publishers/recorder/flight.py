@@ -49,12 +49,7 @@ class Alert(NamedTuple):
 
 
 class AlertGate:
-    """Limit of alerts: one pending alert at a time, and a maximum number per hour.
-
-    A snapshot also contains the alerts after its alert.
-
-    Synchronization: one thread.
-    """
+    """Limit of alerts: one pending alert at a time, and a maximum number per hour. Synchronization: one thread."""
 
     def __init__(self, after_ns: int, per_hour: int) -> None:
         """`after_ns` is the time from an alert to its snapshot."""
@@ -147,10 +142,7 @@ class SegmentRing:
         self.oldest_ns, self.newest_bytes = segments[0].t_ns, 0
 
     def append(self, block: bytes) -> None:
-        """Append a block to the newest segment.
-
-        Drop the oldest segments if there is no room. Raises OSError if all are dropped.
-        """
+        """Append a block. Drop the oldest segments if there is no room. Raises OSError if all are dropped."""
         segments = self._segments
         while len(segments) > 1 and self.bytes + len(block) > self._bytes_max:
             self._drop_oldest()
@@ -205,10 +197,8 @@ class SegmentReader:
     """Reader of the blocks of a snapshot. It closes its descriptors at the end. Synchronization: one thread."""
 
     def __init__(self, opened: Sequence[tuple[int, int]], ending: bytes) -> None:
-        """`opened` are descriptors of segments with the number of bytes to read.
-
-        `ending` is the last record; empty for a recording without an end record.
-        """
+        """`opened` are descriptors of segments with the number of bytes to read. `ending` is the last record; empty for
+        a recording without an end record."""
         self.bytes = sum(size for _, size in opened)  # approximate size of the snapshot
         self._opened = list(opened)
         self._blocks = self._read(ending)

@@ -124,19 +124,14 @@ class Recorder:
     # --- files --------------------------------------------------------------------------------------------------------
 
     def _begin_file(self, end_of_last: str = "") -> None:
-        """Start a file with the state that a replay needs.
-
-        First end the previous file if `end_of_last` contains a reason.
-
-        Reading a clock can make a record. All clocks are therefore read before the end of the previous file.
-        """
+        """Start a file with the state that a replay needs. `end_of_last`: reason to end the previous file first."""
         context, now_ns = self._context, self._context.clock.now_ns()
         utc_ns = now_ns + context.clock.utc_offset_ns()
         self._directory.in_use.discard(self._path.name)
         self._path = self._directory.new_file(utc_ns, context.epoch, self._number)
         self._directory.in_use.add(self._path.name)
         session = self._feed.session(self._number, now_ns)
-        if end_of_last:
+        if end_of_last:  # after all reads of clocks, because a read can make a record
             self._end_file(end_of_last)
         self._queue.mark(self._path)
         self._feed.put(session)

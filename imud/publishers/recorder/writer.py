@@ -227,11 +227,8 @@ class RecordFeed:
                     return
 
     def describe(self, *, at_once: bool) -> None:
-        """Record the clocks of the host and the state of each device.
-
-        Without `at_once`, the next calls of `follow` describe the devices. Use this at a place where a replay still has
-        their earlier state.
-        """
+        """Record the clocks of the host and the state of each device. Without `at_once`, the next calls of `follow`
+        describe the devices. Use this at a place where a replay still has their earlier state."""
         self._source.begin_host(self._put)
         if not at_once:
             self._due |= self._recorded

@@ -190,9 +190,7 @@ def set_inclinometer_signs(node: int, *, invert_x: bool, invert_y: bool) -> Requ
 
 
 def set_heartbeat(node: int, period_ms: int) -> RequestScript[Written]:
-    """Set the interval of the heartbeat of CiA 301, ms; 0: never; effective immediately. The manual omits the
-    object.
-    """
+    """Set the interval of the heartbeat of CiA 301, ms; 0: never; effective immediately. Not in the manual."""
     return (yield from _set(node, HEARTBEAT_TIME, 0, period_ms, 2))
 
 

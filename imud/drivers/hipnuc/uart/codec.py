@@ -307,9 +307,7 @@ class HipnucCodec:
         return self._scan(self._tail + data if self._tail else data, 0)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """Drop an incomplete frame that contains a complete frame or line. imud calls this method when the link is
-        idle.
-        """
+        """Drop an incomplete frame that contains a complete frame or line. imud calls it when the link is idle."""
         events: list[CodecEvent] = []
         while give_up := self._whole_inside():
             events += self._scan(self._tail, give_up)
@@ -435,9 +433,7 @@ class HipnucCodec:
         return at + len(SYNC)
 
     def _whole_inside(self) -> int:
-        """Return the start of the first complete frame in the tail, or the end of a line at the end of the tail;
-        otherwise 0.
-        """
+        """Return the start of the first complete frame in the tail, or the end of a line at its end; otherwise 0."""
         tail = self._tail
         at = tail.find(SYNC, len(SYNC))
         while at >= 0:

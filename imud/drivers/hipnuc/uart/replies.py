@@ -48,9 +48,7 @@ def is_version_line(line: str) -> bool:
 
 
 def is_setting_line(line: str) -> bool:
-    """Return whether `line` can be part of another report. Their form is not documented: anything but a version
-    line.
-    """
+    """Return whether `line` can be part of another report (not documented): anything but a version line."""
     return not is_version_line(line)
 
 
@@ -256,9 +254,7 @@ class LineFinder:
             self._drop(characters)
 
     def _end(self, bad: bool, barred: bool, lines: list[TextLine]) -> None:
-        """Finish a line at its LF. `bad`: the LF is inside a damaged frame, `barred`: inside a complete damaged
-        frame.
-        """
+        """Finish a line at its LF. `bad`: LF inside a damaged frame, `barred`: inside a complete damaged frame."""
         ledger = self._ledger
         text = self._held.removesuffix(b"\r")
         if text and not (self._overlong or barred or self._held_barred):

@@ -409,9 +409,7 @@ def _divisor(divisor: int | None, lines: DeviceLines) -> Iterator[tuple[str, str
 
 
 def _marks(output: Mapping[str, Any] | None, baud: int | None, lines: DeviceLines) -> Iterator[tuple[str, str]]:
-    """Yield contradictions of messages on mark: triggers need a message on mark, a pulse per second must not have
-    one.
-    """
+    """Yield contradictions of messages on mark: triggers need such a message, a pulse per second forbids it."""
     if output is None:
         return
     marked = [OutputMessage(name.upper()) for name, rate in output.items() if rate == ON_MARK]

@@ -165,9 +165,7 @@ class FrameFinder:
         return at + len(self._sync)
 
     def _whole_inside(self) -> int:
-        """Return the start of the first frame with a correct CRC in the tail, after its own sync word; 0 if there is
-        none.
-        """
+        """Return the start of the first frame with a correct CRC in the tail, after its own sync word; otherwise 0."""
         tail, sync = self._tail, self._sync
         at = tail.find(sync, len(sync))
         while at > 0:
@@ -369,9 +367,7 @@ class Imu61xCodec:
         return self._decode(data)
 
     def flush(self) -> Sequence[CodecEvent]:
-        """Return the complete frames inside an incomplete longer frame. imud calls this method when the link is
-        idle.
-        """
+        """Return the complete frames inside an incomplete longer frame. imud calls it when the link is idle."""
         events: list[CodecEvent] = []
         self._add_found(self._finder.flush(), events)
         return events

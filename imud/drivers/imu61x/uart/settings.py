@@ -206,9 +206,7 @@ def _number(value: float) -> str:
 
 
 def start_streaming(*, done: int = RESULT_DONE) -> RequestScript[None]:
-    """Start streaming of AHRS frames (CMD 3, mode 1) and wait for a frame. Raises Rejected; NoReply without a
-    sample.
-    """
+    """Start streaming of AHRS frames (CMD 3, mode 1). Raises Rejected; NoReply without a sample."""
     for _ in range(CONTACT_TRIES):
         if (yield from ordered(commands.output_mode(OutputMode.STREAM), done)):
             break
@@ -220,9 +218,7 @@ def start_streaming(*, done: int = RESULT_DONE) -> RequestScript[None]:
 
 
 def wake() -> RequestScript[bool]:
-    """Start streaming if the device replies. Return whether it acknowledged with any result. Not saved. Raises
-    NoReply.
-    """
+    """Start streaming, unsaved. Return whether the device acknowledged with any result. Raises NoReply."""
     yield from answered(commands.ask_status())
     return (yield from resume_streaming())
 
