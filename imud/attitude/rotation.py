@@ -154,7 +154,6 @@ def matrix_product(a: Matrix3, b: Matrix3) -> Matrix3:
 
 
 def matrix_times(matrix: Matrix3, vector: Vector3) -> Vector3:
-    """Return matrix · vector."""
     return (dot(matrix[0], vector), dot(matrix[1], vector), dot(matrix[2], vector))
 
 

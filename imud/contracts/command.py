@@ -232,8 +232,6 @@ class Check(msgspec.Struct, frozen=True):
 
 
 class CalibrationResult(msgspec.Struct, frozen=True):
-    """Result of a calibration."""
-
     kind: str
     verified: bool  # whether the device reports success and all checks passed
     problem: str  # fault and next step, one sentence; empty if `verified`

@@ -38,8 +38,6 @@ class Deviations(Options, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 
 class DeviceState(StrEnum):
-    """States of a device."""
-
     MISSING = "missing"  # the link is absent; imud waits for it
     SEARCHING = "searching"  # the link is open; imud has not received a valid frame
     RUNNING = "running"  # imud receives samples
@@ -216,8 +214,6 @@ class DeviceStatus(msgspec.Struct, frozen=True):
 
 
 class RecorderStatus(msgspec.Struct, frozen=True):
-    """Status of the recorder."""
-
     file: str  # name of the present file; empty if the recorder is not recording
     problem: str  # reason why the recorder is not recording, one sentence; empty while it is recording
     written_bytes: int  # number of bytes written to files since start
@@ -229,8 +225,6 @@ class RecorderStatus(msgspec.Struct, frozen=True):
 
 
 class FlightStatus(msgspec.Struct, frozen=True):
-    """Status of the flight recorder."""
-
     problem: str  # reason why the flight recorder keeps no data, one sentence; empty while it keeps data
     kept_ns: int  # time span of the data in memory
     kept_bytes: int
@@ -253,8 +247,6 @@ class OutputStatus(msgspec.Struct, frozen=True):
 
 
 class MqttStatus(msgspec.Struct, frozen=True):
-    """Status of the output `mqtt`."""
-
     broker: str  # connected broker; empty if no broker is connected
     problem: str  # reason why imud sends nothing, one sentence; empty while imud sends
     spool_problem: str  # reason why imud does not use the spool, one sentence; empty while imud uses it

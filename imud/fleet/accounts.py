@@ -39,7 +39,6 @@ class StreamKey(NamedTuple):
 
 
 def key_of(message: FleetMessage, stream: Stream) -> StreamKey:
-    """Return the key of the stream of a message."""
     return StreamKey(message.gateway, message.boot, message.device, stream.value)
 
 
@@ -302,7 +301,6 @@ class PlacedTime(NamedTuple):
 
 
 def boot_of(message: FleetMessage) -> BootKey:
-    """Return the boot of a message."""
     return BootKey(message.gateway, message.boot.partition("-")[0])
 
 

@@ -54,8 +54,6 @@ _GATEWAY_TOPICS: Final = frozenset((STATE, Stream.EVENTS))
 
 
 class TopicParts(NamedTuple):
-    """Parts of a topic."""
-
     site: str
     gateway: str
     device: str  # device name; empty for a topic of the gateway
@@ -281,7 +279,6 @@ def check_numbers(numbers: Iterable[int | None]) -> None:
 
 
 def clock_numbers(clock: GatewayClock | None) -> tuple[int | None, ...]:
-    """Return the numbers of a gateway clock."""
     return () if clock is None else (clock.t_ns, clock.utc_offset_ns, clock.error_ns)
 
 

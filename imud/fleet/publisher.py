@@ -220,12 +220,10 @@ class MqttPublisher:
             self._queue.put_state(SentState({}, dict.fromkeys(topics)))
 
     def publish(self, batch: Batch) -> None:
-        """Put samples into the queue."""
         if batch.device in self._sent:
             self._queue.put_batch(batch)
 
     def event(self, event: Event) -> None:
-        """Put an event into the queue."""
         self._is_changed = self._is_changed or event.kind in STATE_KINDS
         if not event.device or event.device in self._sent:
             self._queue.put_event(event)
@@ -262,7 +260,6 @@ class MqttPublisher:
             self._lock = -1
 
     def status(self) -> MqttStatus:
-        """Return the state of the output."""
         writer, sender, spool = self._writer, self._sender, self._spool
         if writer is None or sender is None or spool is None:
             return MqttStatus("", "", "", self._queue.queued, 0, 0, 0, 0, 0, 0, {}, 0)

@@ -80,7 +80,6 @@ class _Numbered:
         )  # fmt: skip
 
     def row(self, message: FleetMessage, stored_utc_ns: int, payload: bytes | None = None) -> SpoolRow:
-        """Return a message as a row of the spool."""
         return row_of(self._topic, self._stream, message, payload or encode_message(message), stored_utc_ns)
 
     def resume(self, position: StreamPosition) -> None:

@@ -126,8 +126,6 @@ class ReadingRecord(NamedTuple):
 
 
 class EdgeRecord(NamedTuple):
-    """One edge."""
-
     t_ns: int
     rising: bool
     number: int
@@ -199,7 +197,6 @@ def encode_data(device: int, data: bytes, t_rx_ns: int, waited_ns: int) -> bytes
 
 
 def encode_frames(device: int, frames: Sequence[CanFrame]) -> bytes:
-    """Return a FRAMES record."""
     parts = []
     for can_id, extended, data, t_rx_ns, after_loss in frames:
         flags = (_EXTENDED if extended else 0) | (_AFTER_LOSS if after_loss else 0)
@@ -209,7 +206,6 @@ def encode_frames(device: int, frames: Sequence[CanFrame]) -> bytes:
 
 
 def encode_readings(device: int, readings: Sequence[ReadingRecord]) -> bytes:
-    """Return a READINGS record."""
     parts = []
     for poll, start_ns, end_ns, trouble, data in readings:
         parts.append(_READING.pack(start_ns, end_ns, poll, trouble, len(data)))
@@ -224,12 +220,10 @@ def encode_edges(device: int, line: str, edges: Sequence[tuple[int, bool, int]])
 
 
 def encode_clocks(clocks: ClocksRecord) -> bytes:
-    """Return a CLOCKS record."""
     return encode(Kind.CLOCKS, NO_DEVICE, _CLOCKS.pack(*clocks))
 
 
 def encode_lost(lost: LostRecord) -> bytes:
-    """Return a LOST record."""
     return encode(Kind.LOST, NO_DEVICE, _LOST.pack(*lost))
 
 

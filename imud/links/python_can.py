@@ -128,8 +128,6 @@ class PythonCanLink:
         on_frames: OnFrames,
         on_end: OnEnd,
     ) -> None:
-        """Receive frames in the thread."""
-
         def deliver(frames: list[CanFrame]) -> None:
             if not stop.is_set():
                 on_frames(frames)

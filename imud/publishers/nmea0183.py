@@ -64,8 +64,6 @@ class SentenceOutput(Protocol):
 
 
 class TcpClient:
-    """TCP client."""
-
     def __init__(self, sock: socket.socket, peer: str) -> None:
         self.sock = sock
         self.peer = peer
@@ -141,7 +139,6 @@ class TcpOutput:
                 self._drop_client(number)
 
     def status(self) -> OutputStatus:
-        """Return the counters of the server."""
         name = f"tcp {self._address}:{self.port}"
         return OutputStatus(name, self._sent, self._dropped, len(self._clients), "")
 
@@ -233,7 +230,6 @@ class UdpOutput:
         """Do nothing: UDP has no connection."""
 
     def status(self) -> OutputStatus:
-        """Return the counters of the port."""
         address, port = self._address
         return OutputStatus(f"udp {address}:{port}", self._sent, self._dropped, int(not self._problem), self._problem)
 
@@ -298,7 +294,6 @@ class SerialOutput:
             self._opening.add_done_callback(self._opened)
 
     def status(self) -> OutputStatus:
-        """Return the counters of the port."""
         is_open = self._fd is not None
         return OutputStatus(f"serial {self._port}", self._sent, self._dropped, int(is_open), self._problem)
 
@@ -584,7 +579,6 @@ class Nmea0183:
         self._choose()
 
     def remove_device(self, name: str) -> None:
-        """Remove a device."""
         self._names.pop(name, None)
         self._choose()
 

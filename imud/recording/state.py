@@ -46,8 +46,6 @@ def attributes(value: object) -> Attributes:
 
 
 class StateWriter:
-    """Writer of one state."""
-
     def __init__(self, external: Mapping[str, object], excluded: frozenset[str] = frozenset()) -> None:
         """`external` are the objects of the daemon by name, `excluded` the attributes of the roots that it omits."""
         self._external = {id(one): name for name, one in external.items()}
@@ -142,8 +140,6 @@ def _named(name: Any) -> Any:
 
 
 class StateReader:
-    """Reader of one state."""
-
     def __init__(self, state: bytes, external: Mapping[str, object]) -> None:
         """`external` are the objects of the daemon by name. Raises StateError for an invalid state."""
         self._external = external

@@ -80,7 +80,6 @@ def _with_alarm(device: DeviceStatus) -> LinesStatus | None:
 
 
 def _with_sin(device: DeviceStatus) -> LinesStatus | None:
-    """Return the lines of a device with a SIN line."""
     return device.lines if device.lines is not None and device.lines.sin else None
 
 
@@ -94,7 +93,6 @@ def _fed(device: DeviceStatus) -> UtcStatus | None:
 
 
 def _declared(device: DeviceStatus) -> SettingsStatus | None:
-    """Return the settings of a device with declared settings."""
     found = device.declared
     return found if found is not None and found.state is not SettingsState.UNDECLARED else None
 

@@ -222,7 +222,6 @@ class MetricsPublisher:
             del self._events[key]
 
     def event(self, event: Event) -> None:
-        """Count an event."""
         self._events[event.device, event.kind.value] += 1
 
     def tick(self, now_ns: int) -> None:

@@ -181,11 +181,9 @@ class ClientRecording:
         self._feed.add_device(name, device_id)
 
     def remove_device(self, name: str) -> None:
-        """Remove a device."""
         self._feed.remove_device(name)
 
     def event(self, event: Event) -> None:
-        """Record an event."""
         if not self._stopped:
             self._feed.event(event)
 

@@ -525,7 +525,6 @@ class FlightRecorder:
         self._feed.add_device(name, device_id)
 
     def remove_device(self, name: str) -> None:
-        """Remove a device."""
         self._feed.remove_device(name)
 
     def publish(self, batch: Batch) -> None:
@@ -597,7 +596,6 @@ class FlightRecorder:
         return (self._context.clock.now_ns() - oldest_ns) / NS_PER_S
 
     def status(self) -> FlightStatus:
-        """Return the state of the flight recorder."""
         oldest_ns = self._ring.oldest_ns
         kept_ns = self._context.clock.now_ns() - oldest_ns if oldest_ns and not self._problem else 0
         return FlightStatus(

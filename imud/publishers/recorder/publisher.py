@@ -61,14 +61,12 @@ class Recorder:
         self._feed.add_device(name, device_id)
 
     def remove_device(self, name: str) -> None:
-        """Remove a device."""
         self._feed.remove_device(name)
 
     def publish(self, batch: Batch) -> None:
         """Do nothing: the recording contains the input of the devices, not samples."""
 
     def event(self, event: Event) -> None:
-        """Record an event."""
         if not self._problem and self._writer is not None:
             self._feed.event(event)
 
@@ -108,7 +106,6 @@ class Recorder:
         self._directory.in_use.discard(self._path.name)
 
     def status(self) -> RecorderStatus:
-        """Return the state of the recorder."""
         writer, queue = self._writer, self._queue
         return RecorderStatus(
             file=self._path.name if not self._problem else "",

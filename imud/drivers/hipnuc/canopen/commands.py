@@ -223,7 +223,6 @@ def nmt(node: int, command: NmtCommand) -> RequestScript[None]:
 
 
 def nmt_request(node: int, command: NmtCommand) -> Request:
-    """Return the request of an NMT command."""
     payload = pack_frame(NMT, False, bytes([command.value, node]))
     return Request(payload, f"node {node}, NMT {command.name}", never, never, never, silent=True)
 

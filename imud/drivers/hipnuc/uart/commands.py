@@ -51,8 +51,6 @@ ROTATION_TOLERANCE: Final = 1e-3  # tolerance of a rotation matrix of nine numbe
 
 
 class OutputMessage(StrEnum):
-    """Output messages."""
-
     HI91 = "HI91"  # floats, with device time; also called `IMU91`
     HI92 = "HI92"  # integers, without device time
 
