@@ -159,7 +159,9 @@ def test_the_manager_knows_of_reloads_and_one_may_be_stopped(tmp_path: Path, mon
             for _ in range(20):
                 daemon.signal(signal.SIGHUP)
             wait_until(lambda: len(daemon.statuses()) == MISSING, "all devices are there")
-            wait_until(lambda: manager.status.startswith(f"0 of {MISSING} devices running; not: "), "it is told")
+            wait_until(
+                lambda: manager.status.startswith(f"0 of {MISSING} devices running; not running: "), "it is told"
+            )
             write_config(tmp_path, {}, **quiet)
             daemon.signal(signal.SIGHUP)
             wait_until(lambda: not daemon.statuses(), "the newest file counts")

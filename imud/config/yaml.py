@@ -1,8 +1,8 @@
 """YAML as plain data with the position of each value, without the implicit conversions of YAML.
 
-The module builds a tree from parser events with an explicit stack. `yaml.compose` recurses in C and ends the process
+imud builds a tree from parser events with an explicit stack. `yaml.compose` recurses in C and ends the process
 with a segmentation fault at 200 000 open brackets (measured, PyYAML 6.0.3 with libyaml). The rules of YAML for plain
-words turn `1:20` into 80, `010` into 8 and `no` into false, and the last of two equal keys wins. The module refuses
+words turn `1:20` into 80, `010` into 8 and `no` into false, and the last of two equal keys wins. imud refuses
 such words with line and column, unless they are quoted.
 
 No library meets these needs. 500 devices (124 kB) take 63 ms here, 809 ms in ruamel.yaml 0.19.1 and 10.7 s in
@@ -110,7 +110,7 @@ class _Refused(Exception):
 
 
 class _Event(Protocol):
-    """Fields of PyYAML's events that this module uses. The stubs of PyYAML do not type them."""
+    """Fields of PyYAML's events that imud uses. The stubs of PyYAML do not type them."""
 
     start_mark: yaml.Mark
     anchor: str | None

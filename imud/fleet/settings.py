@@ -67,7 +67,7 @@ class CommandOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=T
         for entry in self.actions:
             device, slash, action = entry.rpartition("/")
             if not is_name(action) or (slash and not is_name(device)):
-                raise ValueError(f"actions: expected names of actions, or DEVICE/ACTION, got {shown(entry)}")
+                raise ValueError(f"actions: expected names of commands, or DEVICE/COMMAND, got {shown(entry)}")
 
     def allows(self, device: str, action: str) -> bool:
         """Return whether the configuration allows this command."""

@@ -3,17 +3,17 @@
     commit(new, acknowledged) ──one transaction──▶ SQLite, write-ahead log ──after(id)──▶ sender
 
 - A committed transaction survives the end of the process. imud synchronizes the log with the disk every SYNC_NS, so a
-power failure can lose the transactions of this time.
+  power failure can lose the transactions of this time.
 
 - If the pages in use exceed the configured size, imud replaces the oldest complete samples by statistics. If there are
-none left, it drops the oldest messages. It also drops messages that are too old. A message of the kind `dropped`
-replaces dropped messages; adjacent ones are joined.
+  none left, it drops the oldest messages. It also drops messages that are too old. A message of the kind `dropped`
+  replaces dropped messages; adjacent ones are joined.
 
 - imud does not change messages that the sender received until `rewind`. `after` returns messages in their order. With
-`newest_first`, messages that are newer than `rewind` come first.
+  `newest_first`, messages that are newer than `rewind` come first.
 
 - A full disk (SpoolError) does not change the spool. Removing messages also needs room in the log. imud therefore keeps
-a reserve file, removes it if necessary, and creates it again later.
+  a reserve file, removes it if necessary, and creates it again later.
 
 - imud renames a damaged file and creates a new one. A damaged row becomes a message of the kind `dropped`.
 """

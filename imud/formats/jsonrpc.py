@@ -101,7 +101,7 @@ def parse_request(line: bytes | bytearray) -> RpcRequest:
     if not isinstance(method, str):
         raise RpcError(Code.INVALID_REQUEST, f"method: expected a string, got {_kind(method)}", request_id)
     if isinstance(params, list):
-        raise RpcError(Code.INVALID_PARAMS, "params: expected an object, because parameters have names", request_id)
+        raise RpcError(Code.INVALID_PARAMS, "params: expected an object with the parameters by name", request_id)
     if not isinstance(params, dict):
         raise RpcError(Code.INVALID_REQUEST, f"params: expected an object, got {_kind(params)}", request_id)
     return RpcRequest(method, params, request_id, "id" in value)

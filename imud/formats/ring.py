@@ -17,7 +17,7 @@ the fields that change with every sample, bytes 256 to 771 the fields that chang
 Rules for a reader, because the writer has no memory fence:
 - Accept a slot only if its `seq` before the copy, its CRC-32, and its `seq` after the copy agree.
 - Accept the ledger block only if `ledger_update` before and after the copy is equal and the CRC-32 over bytes 256…767
-matches.
+  matches.
 - Samples `max(first_seq, newest_seq - slot_count + 1)` … `newest_seq` are in the ring. Older samples are lost.
 - `newest_seq`, `first_seq`, `heartbeat_ns`, `state` and every `seq` are aligned. The writer sets each with one store.
 """

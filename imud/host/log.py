@@ -65,7 +65,7 @@ def shown(value: object, characters_max: int = VALUE_CHARACTERS_MAX) -> str:
     try:
         return printable(_SHORT.repr(value), characters_max)
     except Exception as error:  # noqa: BLE001 - a value's own __repr__ may raise anything
-        return f"<{type(value).__name__} that cannot be shown: {type(error).__name__}>"
+        return f"<{type(value).__name__} without a text form: {type(error).__name__}>"
 
 
 class _ShortRepr(reprlib.Repr):
@@ -137,7 +137,7 @@ class RepeatFilter(logging.Filter):
             return False
         if known.left_out:
             since_s = now_s - known.told_s
-            record.msg, record.args = f"{_message(record)}, {known.left_out} more like it in {since_s:.0f} s", None
+            record.msg, record.args = f"{_message(record)}, {known.left_out} similar messages in {since_s:.0f} s", None
         known.pause_s = min(2 * known.pause_s, PAUSE_MOST_S)
         known.due_s, known.told_s, known.left_out = now_s + known.pause_s, now_s, 0
         return True

@@ -71,7 +71,7 @@ def status_line(states: Mapping[str, str]) -> str:
     if not other:
         return f"{counted}."
     more = f" and {len(other) - NAMES_SHOWN} more" if len(other) > NAMES_SHOWN else ""
-    return f"{counted}; not: {', '.join(other[:NAMES_SHOWN])}{more}."
+    return f"{counted}; not running: {', '.join(other[:NAMES_SHOWN])}{more}."
 
 
 def watchdog_interval_s() -> float | None:

@@ -107,7 +107,7 @@ class ResetLine:
         """
         if self._due_at_start and self._is_open:
             self._due_at_start = False
-            self._raise_event(self._now_ns(), EventKind.LINK, "reset by its line at the start", line="reset")
+            self._raise_event(self._now_ns(), EventKind.LINK, "restarted by its reset line at the start", line="reset")
             with suppress(CommandError):  # `pulse` has raised the event
                 await self.pulse()
         async with self._pulsing:
@@ -127,7 +127,7 @@ class ResetLine:
         if self._rounds < ROUNDS or searched_ns < patience_ns or now_ns < self._again_ns or not self._is_open:
             return
         self._again_ns = now_ns + AGAIN_NS
-        words = f"not found for {searched_ns / NS_PER_S:.0f} s: reset by its line"
+        words = f"not found for {searched_ns / NS_PER_S:.0f} s: restarted by its reset line"
         self._raise_event(now_ns, EventKind.LINK, words, line="reset", rounds=self._rounds)
         try:
             await self.pulse()

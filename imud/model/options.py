@@ -177,7 +177,7 @@ def _words(info: inspect.Type) -> str:
 def _words_of_several(info: inspect.Type) -> str:
     match info:
         case inspect.ListType(item_type=item) | inspect.VarTupleType(item_type=item) | inspect.SetType(item_type=item):
-            return f"a list{_length(info)}, each of it {_words(item)}"
+            return f"a list{_length(info)}, each item {_words(item)}"
         case inspect.DictType(key_type=inspect.LiteralType(values=keys), value_type=item):
             return f"keys {', '.join(map(str, sorted(keys, key=_natural)))}, each with {_words(item)}"
         case inspect.DictType(value_type=item):

@@ -1,8 +1,9 @@
 """Simulated devices on a CAN bus: their contract, their wire, and their common parts.
 
-CanModule           contract: receives frames of other nodes, returns sent frames FrameWire           sends frames one
-after the other at the bit rate of the bus PeriodicCanModule   device that only sends, with the same frames in each
-period CanModules          several devices on one bus, with the interface of one device
+CanModule           contract: receives frames of other nodes, returns sent frames
+FrameWire           sends frames one after the other at the bit rate of the bus
+PeriodicCanModule   device that only sends, with the same frames in each period
+CanModules          several devices on one bus, with the interface of one device
 """
 
 from collections import deque

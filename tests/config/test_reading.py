@@ -206,7 +206,7 @@ def test_defaults() -> None:
         ("just text", '1:1: expected keys and values, got "just text"'),
         ("", "1:1: expected keys and values, got an empty file"),
         ("divices: {}\ndevices: {}", '1:1: divices: expected a key that imud knows, got "divices"; did you mean devices? known: devices, log_level, none, out, state_dir'),
-        ("out: {ids: [1, x]}\ndevices: {}", "1:12: out.ids: expected a list, each of it a whole number, got a list with \"x\" at [1]"),
+        ("out: {ids: [1, x]}\ndevices: {}", "1:12: out.ids: expected a list, each item a whole number, got a list with \"x\" at [1]"),
         ("logg: 1\nb: c: d\n", "2:5: expected YAML: mapping values are not allowed in this context"),
         ("out: 5\ndevices: {}", "1:6: out: expected keys and values, got 5"),
     ],

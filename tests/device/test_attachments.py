@@ -101,7 +101,7 @@ async def test_a_device_that_hangs_is_reset_and_set_up_again(bench: PolledBusBen
         (up_ns, _), (released_ns, _) = it.line.history
         assert 4.4e9 < up_ns - down_ns < 5.1e9
         assert released_ns - up_ns == pytest.approx(10e6, abs=10)
-        assert it.told == ["not found for 4 s: reset by its line"]
+        assert it.told == ["not found for 4 s: restarted by its reset line"]
         assert it.rig.kinds.count(EventKind.UP) == 2
         assert (it.device.extended, it.device.filter & 0x0F) == (1, 2)
         assert bench.clock.now_ns() - up_ns < 4e9
@@ -202,7 +202,7 @@ class Uart:
 async def test_a_device_without_bytes_on_a_uart_is_reset(it: Uart, baud: Any) -> None:
     await it.until(lambda: it.device.state is DeviceState.RUNNING and it.clock.now_ns() > 1015e9)
     assert [active for _, active in it.wires.outputs["imu reset"].history] == [True, False]
-    assert sum(e.message.endswith("reset by its line") for e in it.events) == 1
+    assert sum(e.message.endswith("restarted by its reset line") for e in it.events) == 1
     it.streams = False
     await it.until(lambda: it.device.state is DeviceState.SILENT)
     it.streams = True
@@ -262,7 +262,7 @@ async def test_at_start_a_device_on_a_bus_is_reset_before_the_first_request(benc
         it.boot()
         await it.rig.until_samples(5)
         assert it.pulses == 1
-        assert it.told == ["reset by its line at the start"]
+        assert it.told == ["restarted by its reset line at the start"]
 
 
 @played(lambda: Uart(DeviceLines(reset=ResetOptions(line="R", at_start=True)), baud=115200))
@@ -270,4 +270,6 @@ async def test_at_start_a_device_on_a_uart_is_reset(it: Uart) -> None:
     begin_ns = it.clock.now_ns()
     await it.until(lambda: len(it.rig.samples) > 10)
     assert it.clock.now_ns() - begin_ns < 5e9  # without at_start: after a search of more than 4 s
-    assert [e.message for e in it.events if e.detail.get("line") == "reset"] == ["reset by its line at the start"]
+    assert [e.message for e in it.events if e.detail.get("line") == "reset"] == [
+        "restarted by its reset line at the start"
+    ]

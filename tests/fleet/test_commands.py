@@ -120,7 +120,7 @@ def test_commands_that_are_not_allowed_are_denied() -> None:
     bench.run()
     assert (bench.device.done, bench.channel.refused, len(bench.replies)) == ([], 3, 2)
     (wrong,) = wrong_values(CommandOptions, {"actions": ["a b"]})
-    assert "expected names of actions, or DEVICE/ACTION" in str(wrong)
+    assert "expected names of commands, or DEVICE/COMMAND" in str(wrong)
     assert wrong_values(CommandOptions, {"actions": ["a", "bow/a"]}) == []
 
 

@@ -50,11 +50,11 @@ def test_watchdog_interval(usec: str, pid: str, expected: float | None, monkeypa
     [
         ({}, "The configuration has no devices."),
         ({"bow": "running"}, "1 of 1 device running."),
-        ({"bow": "missing"}, "0 of 1 device running; not: bow (missing)."),
-        ({"a": "running", "b": "silent", "c": "finished"}, "2 of 3 devices running; not: b (silent)."),
+        ({"bow": "missing"}, "0 of 1 device running; not running: bow (missing)."),
+        ({"a": "running", "b": "silent", "c": "finished"}, "2 of 3 devices running; not running: b (silent)."),
         (
             {f"d{n}": "missing" for n in range(8)},
-            "0 of 8 devices running; not: "
+            "0 of 8 devices running; not running: "
             "d0 (missing), d1 (missing), d2 (missing), d3 (missing), d4 (missing) and 3 more.",
         ),
     ],
@@ -82,7 +82,7 @@ def test_status_is_sent_when_it_changes_and_the_watchdog_is_fed(
     assert sent == [
         "READY=1",
         "WATCHDOG=1",
-        "STATUS=0 of 1 device running; not: bow (searching).",
+        "STATUS=0 of 1 device running; not running: bow (searching).",
         "WATCHDOG=1",
         "STATUS=1 of 1 device running.",
         "STOPPING=1",

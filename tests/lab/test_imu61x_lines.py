@@ -70,7 +70,7 @@ def test_a_device_that_hangs_is_reset_by_its_line(i2c: Bus[I2cTransfer], gpio_ch
             await rig.until(lambda: rig.kinds.count(EventKind.UP) == 2, "back", LIMIT_S)
             await rig.until_samples(3, LIMIT_S)
             assert device.filter == 0xB3, "set up again"
-            told = [event.t_ns for event in rig.events if "reset by its line" in event.message]
+            told = [event.t_ns for event in rig.events if "restarted by its reset line" in event.message]
             (down, fall_ns), (up, rise_ns) = [await asyncio.to_thread(seen.__next__) for _ in range(2)]
             assert (down, up) == (False, True)
             assert HOLD_MS * 1e6 < rise_ns - fall_ns < HOLD_MS * 1e6 + 1e9

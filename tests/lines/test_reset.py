@@ -105,7 +105,7 @@ def test_after_three_rounds_and_the_time_a_device_needs_and_then_once_a_minute(e
     assert it.pulses_s[0] == pytest.approx(first_s, abs=0.01)
     assert all(AGAIN_NS / 1e9 <= b - a < AGAIN_NS / 1e9 + 2 * every_s for a, b in pairwise(it.pulses_s))
     assert len(it.pulses_s) == it.announced == 3
-    assert it.events[0].message == f"not found for {first_s - every_s:.0f} s: reset by its line"
+    assert it.events[0].message == f"not found for {first_s - every_s:.0f} s: restarted by its reset line"
     assert [event.detail["line"] for event in it.events] == ["reset"] * 3
     held = [b - a for (a, up), (b, _) in pairwise(it.line.history) if up]
     assert held == pytest.approx([20e6] * 3, abs=10)
@@ -124,7 +124,10 @@ async def test_a_line_that_fails_in_a_search_does_not_end_it(it: Scene) -> None:
     it.tick()
     it.line.set_error = LinkMissing("gone")
     await it.search(6)
-    assert [event.message for event in it.events] == ["not found for 4 s: reset by its line", "line reset: gone"]
+    assert [event.message for event in it.events] == [
+        "not found for 4 s: restarted by its reset line",
+        "line reset: gone",
+    ]
 
 
 @played(Scene)
@@ -193,7 +196,7 @@ async def test_at_the_start_it_is_pulsed_once_before_the_device_is_asked(it: Sce
     await it.reset.settled()
     assert it.clock.now_ns() - 1000 * NS_PER_S - waited_ns < 1e8
     assert it.announced == len(it.pulses_s) == at_start
-    assert [event.message for event in it.events] == ["reset by its line at the start"] * at_start
+    assert [event.message for event in it.events] == ["restarted by its reset line at the start"] * at_start
 
 
 @played(lambda: Scene(ResetOptions(line="RESET", at_start=True)))

@@ -5,19 +5,19 @@ PGN) has its own rate. The fast kinds are in every burst, a slow kind is in ever
 frames of two periods.** The rules:
 
 - imud learns the kinds, their order, the period and every m from the received frames. It ignores all frames until then:
-four periods of the fast kinds and two periods of each slow kind. It ignores a new fast kind for six bursts.
+  four periods of the fast kinds and two periods of each slow kind. It ignores a new fast kind for six bursts.
 - The first frame of a burst starts a sample. The sample is complete when it contains all due kinds: the fast kinds and
-each slow kind whose last frame is m bursts old (or 2 m, 3 m … after a loss).
+  each slow kind whose last frame is m bursts old (or 2 m, 3 m … after a loss).
 - A sample ends early at a kind that it already contains (except an exact repetition), at a fast kind before the newest
-frame in the order, at a frame more than 3/4 of a period after the first frame, and at lost frames (`reset`). imud then
-counts a lost sample. If only slow kinds are missing, imud makes the sample without them. It does not do so after
-`reset`, or with one fast kind, because then the next sample is already complete.
+  frame in the order, at a frame more than 3/4 of a period after the first frame, and at lost frames (`reset`). imud
+  then counts a lost sample. If only slow kinds are missing, imud makes the sample without them. It does not do so after
+  `reset`, or with one fast kind, because then the next sample is already complete.
 - Without a started sample, imud ignores all frames except the first kind of a burst. It ignores a slow kind that is not
-due and learns its m again.
+  due and learns its m again.
 - imud counts bursts without any frame by time (`Cadence`): a gap up to 1 s is loss. If a host or a sender stalls and
-the bursts then arrive late and back to back, no sample is lost.
+  the bursts then arrive late and back to back, no sample is lost.
 - A kind that is missing for ten of its periods counts as switched off. A new kind joins. If too many frames do not fit,
-imud learns everything again.
+  imud learns everything again.
 
 A kind with a period that is not a multiple of the fast period is never part of a sample. If the end of one burst and
 the start of the next burst are lost, only the arrival times show the loss. They must be exact within 1/4 of a period,

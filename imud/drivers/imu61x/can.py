@@ -14,13 +14,14 @@ Frame 105 completes the sample of the frames 101 … 104 since the previous 105.
 65536. Rules against mixing two samples:
 
 - A repeated identifier before a 105 means a lost 105: the codec drops the held frames. It ignores an exact copy
-immediately after the frame, which is a repetition by the bus.
+  immediately after the frame, which is a repetition by the bus.
 - A set in another order than 101, 102, 103, 104, 105 counts only if INDEX follows the INDEX of the previous 105.
 - After lost frames (`reset`), the codec drops the held frames.
 - A set in order with a jump of INDEX may contain 101 … 103 of one sample and 104, 105 of a later sample. The time
-decides. A set takes S from its first to its last frame; a mixed set takes at least one period P more. The codec accepts
-a set up to S + P/2. It learns S and P from sets without a jump of INDEX, which cannot be mixed. Before SURE_SETS such
-sets, every set in order counts. If a stalled host or adapter compresses the arrival times, the codec cannot decide.
+  decides. A set takes S from its first to its last frame; a mixed set takes at least one period P more. The codec
+  accepts a set up to S + P/2. It learns S and P from sets without a jump of INDEX, which cannot be mixed. Before
+  SURE_SETS such sets, every set in order counts. If a stalled host or adapter compresses the arrival times, the codec
+  cannot decide.
 
 Frames of an incomplete set are valid and ignored (`frames_ignored`). The jump of INDEX to the next complete set is the
 number of lost samples. The device accepts no commands over CAN.

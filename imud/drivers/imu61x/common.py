@@ -59,7 +59,7 @@ def random_vector(random: Random, spread: float) -> Vector3:
 # when the device is at rest (`imud.attitude.gravity`).
 EULER_CONVENTION: Final = (
     "ZYX, assumed (the manual states none): yaw about Z, then pitch about Y, then roll about X; right-handed; "
-    "whether Z points up or down is not settled"
+    "it is not known whether Z points up or down"
 )
 # Destination frame of the rotation `quat_wxyz`, which imud computes from the Euler angles
 NAVIGATION_FRAME: Final = (

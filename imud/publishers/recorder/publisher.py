@@ -137,7 +137,7 @@ class Recorder:
         self._feed.describe(at_once=True)
 
     def _next_file(self, now_ns: int) -> None:
-        self._begin_file("a new file begins")
+        self._begin_file("start of a new file")
         try:
             removed = self._directory.make_room(self._file_bytes)
         except OSError as error:

@@ -1,1 +1,1 @@
-"""Part of imud."""
+"""Simulated HiPNUC devices."""

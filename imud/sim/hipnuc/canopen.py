@@ -1,9 +1,9 @@
 """A HiPNUC device on a CAN bus with CANopen. Manual "IMU配置手冊" V1.5.9, chapter 5; CiA 301.
 
-The module contains no I/O and reads no clock. Its timers count milliseconds of its own crystal, which runs `skew_ppm`
-fast. The device measures all due values of one instant together and sends them back to back `processing_ns` later,
-TPDO1 first. After power-on it sends its boot-up message and becomes operational (section 5.1). The heartbeat (0x1017)
-is off by default.
+The simulator contains no I/O and reads no clock. Its timers count milliseconds of its own crystal, which runs
+`skew_ppm` fast. The device measures all due values of one instant together and sends them back to back `processing_ns`
+later, TPDO1 first. After power-on it sends its boot-up message and becomes operational (section 5.1). The heartbeat
+(0x1017) is off by default.
 
 Section 5.4 describes no reads of objects. Assumption: settings can be read, but 0x2000 and 0x20A5 cannot. TPDO
 parameters, signs, zero and heartbeat apply immediately; node number and bit rate apply after a restart. A restart loses

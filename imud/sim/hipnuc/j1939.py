@@ -1,13 +1,13 @@
 """A HiPNUC device on SAE J1939: IMU configuration manual V1.5.9, chapter 6.
 
-The module contains no I/O and reads no clock. The device samples at whole milliseconds of its own crystal, which runs
-`skew_ppm` fast. Messages that are due in the same millisecond belong to one instant. They leave back to back, lowest
-PGN first, `processing_ns` later. The device processes requests on PGN EF00 of any sender immediately and replies to
-0x55. It does not reply to a restart, nor to a request for one message, because the message is the reply. After power-on
-and after a request (PGN EA00), it claims its address (J1939-81). Registers 0x70 to 0x78 are the Modbus registers.
-`J1939Variant` contains behavior that the manuals do not define. Assumptions: no reply for an unknown register; a value
-out of range is answered with the unchanged value; an interval applies from its next whole multiple; the zero concerns
-the inclinometer only; the direction applies after the zero.
+The simulator contains no I/O and reads no clock. The device samples at whole milliseconds of its own crystal, which
+runs `skew_ppm` fast. Messages that are due in the same millisecond belong to one instant. They leave back to back,
+lowest PGN first, `processing_ns` later. The device processes requests on PGN EF00 of any sender immediately and replies
+to 0x55. It does not reply to a restart, nor to a request for one message, because the message is the reply. After
+power-on and after a request (PGN EA00), it claims its address (J1939-81). Registers 0x70 to 0x78 are the Modbus
+registers. `J1939Variant` contains behavior that the manuals do not define. Assumptions: no reply for an unknown
+register; a value out of range is answered with the unchanged value; an interval applies from its next whole multiple;
+the zero concerns the inclinometer only; the direction applies after the zero.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,6 +1,6 @@
 """HiPNUC devices on one RS-485 bus behind a serial port. IMU configuration manual V1.5.9, chapter 4.
 
-The module contains no I/O and reads no clock. It behaves as a real bus:
+The simulator contains no I/O and reads no clock. It behaves as a real bus:
 
 - Each byte takes its time on the wire, in both directions. A frame ends with a silence of 3.5 characters. A device
   replies `processing_ns` later. With `chunk_bytes`, a reply arrives in pieces of this size.

@@ -1,6 +1,6 @@
 """A HiPNUC device or another heading and attitude sensor on NMEA 2000: PGNs 127250, 127251 and 127257.
 
-The module contains no I/O and reads no clock. The device samples at whole periods of its own crystal, which runs
+The simulator contains no I/O and reads no clock. The device samples at whole periods of its own crystal, which runs
 `skew_ppm` fast. It sends the three messages of an instant back to back with the same SID, `processing_ns` later. It
 ignores other nodes and claims no address. Vessel and sensor frame: see `imud.drivers.hipnuc.nmea2000`. The rate of turn
 is the angular rate about z of the sensor.

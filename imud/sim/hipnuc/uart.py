@@ -1,7 +1,7 @@
 """A HiPNUC device (CH0x0, CH10x, HI14) on a UART: IMU configuration manual V1.5.9, chapters 1-3, 8.
 
-The module contains no I/O and reads no clock: its owner passes the bytes of the host to `receive` and gets the bytes of
-the device from `advance`. It behaves as a real device:
+The simulator contains no I/O and reads no clock: its owner passes the bytes of the host to `receive` and gets the bytes
+of the device from `advance`. It behaves as a real device:
 
 - It samples at whole milliseconds of its own crystal, which runs `skew_ppm` fast. `system_time` counts from power-on.
 - A frame leaves `processing_ns` after its sample, when the wire is free. Text is sent between complete frames. The

@@ -1,1 +1,1 @@
-"""Part of imud."""
+"""Simulated Forsense IMU61x devices."""

@@ -1,6 +1,6 @@
 """A Forsense IMU61x on a CAN bus: manual "IMU61X Interface Protocol and Instructions", chapter 4.
 
-The module contains no I/O and reads no clock. The device samples at whole periods of its own crystal, which runs
+The simulator contains no I/O and reads no clock. The device samples at whole periods of its own crystal, which runs
 `skew_ppm` fast. It sends the five frames of a sample back to back `processing_ns` later. INDEX counts samples from
 power-on. The device accepts no commands. The heading starts at the truth.
 """

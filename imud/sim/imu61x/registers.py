@@ -1,7 +1,7 @@
 """A Forsense IMU61x on SPI or I2C: windows, pipeline of SPI, latched values, and faults on request.
 
-Manual "IMU61X Interface Protocol and Instructions", chapters 2 and 3. The module contains no I/O: its owner passes the
-bytes of one transaction and gets the bytes of the device.
+Manual "IMU61X Interface Protocol and Instructions", chapters 2 and 3. The simulator contains no I/O: its owner passes
+the bytes of one transaction and gets the bytes of the device.
 
 - The device updates its registers every `update_ns`. A transaction reads the values of its start (latched).
 - SPI: the reply to a word is the second word after it, also across selections. A burst lasts as long as its selection.

@@ -1,7 +1,7 @@
 """A Forsense IMU61x on a UART: manual "IMU61X Interface Protocol and Instructions", chapter 1.
 
-The module contains no I/O and reads no clock: its owner passes the bytes of the host to `receive` and gets the bytes of
-the device from `advance`. Behavior, with assumptions where the manual defines nothing:
+The simulator contains no I/O and reads no clock: its owner passes the bytes of the host to `receive` and gets the bytes
+of the device from `advance`. Behavior, with assumptions where the manual defines nothing:
 
 - In stream mode, the device sends AHRS frames at 1 to 400 Hz, at whole multiples of the period of its own timer. The
   timer runs `skew_ppm` fast and counts µs from power-on. The device drops frames that do not fit into the transmit

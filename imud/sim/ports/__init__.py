@@ -1,1 +1,1 @@
-"""Part of imud."""
+"""Ports, buses and pins of simulated devices, their faults, and a model of arrival times."""

@@ -10,10 +10,9 @@ Differences from the manual's table:
 - The interval row of FF4A prints command 0x60 in place of 0x06.
 - The value of a read is reserved there, and 1 here, as in the vendor's programs.
 - Register 0x0096 (send a message once) is from these programs. imud assumes that its value is the PGN, and that the
-  PGNs
-of newer firmware have their intervals at the same offset. The register has no reply: the message is the reply.
+  PGNs of newer firmware have their intervals at the same offset. The register has no reply: the message is the reply.
 - Registers 0x70 to 0x78 are the Modbus registers. imud assumes two characters of the name per value, the first in the
-high byte. It ignores a name that is not text.
+  high byte. It ignores a name that is not text.
 
 Settings are lost at a restart unless they are saved. imud reads back every written value; zero, save and factory reset
 are not readable.

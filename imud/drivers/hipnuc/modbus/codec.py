@@ -11,9 +11,9 @@ first reply to the longer block, and imud tries the longer block again after the
 Two scales depend on the device. imud decides them by the values and keeps them:
 - Quaternion: the scale that gives unit length.
 - Inclinometer: two axes (±180°, ±90°, 180/32768 degrees per count) or one axis (0 … 360°, 360/32768). Y is reserved in
-single-axis products. A Y other than zero or a negative X means two axes. A Y of zero at a pitched device means one axis
-(assumption: the reserved register reads zero). Before the decision, and while both are zero (a product without
-inclinometer), the value is None.
+  single-axis products. A Y other than zero or a negative X means two axes. A Y of zero at a pitched device means one
+  axis (assumption: the reserved register reads zero). Before the decision, and while both are zero (a product without
+  inclinometer), the value is None.
 
 Assumptions from the manual's example: a magnetic field of zero, and a temperature and pressure that are both zero, mean
 that the product lacks the sensor. `pressure_of` decides which pressures are valid.

@@ -93,7 +93,7 @@ HALF_TURN = "a number from -180 to 180"
         ("output_once", {"message": None}, 'one of "HI91", "HI92"'),
         ("mode", {"axes": 7}, "one of 6, 9"),
         ("level", {"level": None}, '"automatic", "cancel", "relative"'),
-        ("mounting", {"turned": [1.0] * 8}, "or a list of 9, each of it a number"),
+        ("mounting", {"turned": [1.0] * 8}, "or a list of 9, each item a number"),
         ("mounting", {"turned": [2, 0, 0, 0, 1, 0, 0, 0, 1]}, "expected a rotation"),
         ("magnetic_calibration", {"enabled": None}, "true or false"),
         ("yaw", {"angle_deg": 180.1}, HALF_TURN),
