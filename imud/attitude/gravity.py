@@ -130,8 +130,8 @@ def _explained(device: DeviceAxes, member: str, gravity: Vector3, up: Vector3) -
     """Return the finding with the first cause that makes the two directions agree."""
     angle = _angle_deg(gravity, up)
     seen = (
-        f"at rest up is {axis_words(gravity)} of the sensor by the acceleration and "
-        f"{axis_words(up)} by {member}, {angle:.0f}° apart"
+        f"at rest, up is {axis_words(gravity)} of the sensor by the acceleration, but {axis_words(up)} by "
+        f"{member}, {angle:.0f}° apart"
     )
     for kind, direction, advice in _causes(device, up):
         if _angle_deg(gravity, direction) < min(EXPLAINED_DEG, angle / 2):
@@ -181,8 +181,9 @@ def _not_level(mounting: Matrix3, gravity: Vector3) -> Finding:
     advice = "correct the mounting" if near is None else f"up is the sensor's {near} axis, so axes needs z: {near}"
     return Finding(
         Contradiction.MOUNTING,
-        f"at rest up is {axis_words(gravity)} of the sensor and with frame {_direction(body)} of the body: if the "
-        f"body is level now, {advice}; if it is not always level at rest, set frame: {{level_at_rest: false}} "
+        f"at rest, up is {axis_words(gravity)} of the sensor, and {_direction(body)} of the body by the key frame: if "
+        f"the body is level now, {advice}; if the body is not always level at rest, set "
+        "frame: {level_at_rest: false} "
         "(docs/frames.md)",
         angle,
     )

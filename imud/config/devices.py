@@ -142,7 +142,7 @@ class DeclaredReader:
         return self._keys.part(table.declarable, device["settings"], key)
 
     def check(self, path: KeyPath, driver: str, declared: Options, options: Options | None, link: Options) -> None:
-        """Refuse settings that exclude each other or contradict the address of the device."""
+        """Report settings that exclude each other or contradict the address of the device."""
         table = self._table(driver)
         if table is None:
             return
@@ -160,7 +160,7 @@ class DeclaredReader:
             self._keys.problem(key, str(error))
 
     def check_lines(self, path: KeyPath, driver: str, declared: Options, lines: DeviceLines) -> None:
-        """Refuse lines that have no function with the declared settings."""
+        """Report lines that have no function with the declared settings."""
         if self._table(driver) is not None:
             found = self._drivers[driver].declared_line_differences(declared_values(declared), lines)
             for key, words in found.items():
@@ -234,7 +234,7 @@ def _nested(keys: Keys, path: KeyPath, found: Mapping[str, Any]) -> dict[str, Op
 def check_declination(
     keys: Keys, path: KeyPath, general: DeviceGeneral, options: Options | None, drivers: Mapping[str, Driver]
 ) -> None:
-    """Refuse a declination if the heading is not magnetic or the configuration does not name the driver."""
+    """Report a declination if the heading is not magnetic or the configuration does not name the driver."""
     if general.declination_deg is None:
         return
     place = (*path, "declination_deg")
@@ -277,7 +277,7 @@ def read_lines(
 
 
 def lines_once(keys: Keys, devices: Sequence[DeviceConfig]) -> None:
-    """Refuse a GPIO line that is used twice, by one device or by two devices."""
+    """Report a GPIO line that is used twice, by one device or by two devices."""
     owners: list[tuple[LineOptions, str]] = []
     for device in devices:
         for name, settings in _lines_of_device(device):
@@ -311,7 +311,7 @@ def read_rmc(keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapp
 
 
 def _fit(keys: Keys, path: KeyPath, found: Mapping[str, Any], driver: object, drivers: Mapping[str, Driver]) -> None:
-    """Refuse unknown lines, and lines that devices of this driver do not have."""
+    """Report unknown lines, and lines that devices of this driver do not have."""
     keys.unknown_keys(path, found, list(LINE_SCHEMAS))
     if driver == "auto":
         message = "expected the name of a driver next to lines, got auto; drivers with lines"
@@ -457,7 +457,7 @@ class DeviceReader:
         return None if settings is None else (names[0], settings)
 
     def _driver_fits(self, path: KeyPath, driver: str, link: str) -> bool:
-        """Refuse a driver if the link cannot carry its protocol."""
+        """Report a driver if the link cannot carry its protocol."""
         links, drivers = self._tables.links, self._tables.drivers
         if driver == "auto" and not links[link].searchable:
             known = ", ".join(self._fitting((name, name, link) for name in drivers))
@@ -470,13 +470,13 @@ class DeviceReader:
         return True
 
     def _go_together(self, path: KeyPath, driver: str, options: Options, link: str, link_settings: Options) -> None:
-        """Refuse values of options and link that the driver does not support."""
+        """Report values of options and link that the driver does not support."""
         for problem in self._tables.drivers[driver].problems(options, link_settings):
             part = link if problem.part == "link" else problem.part
             self._keys.problem((*path, part, problem.key), problem.message)
 
     def _usable(self, path: KeyPath, driver: str, link: str, settings: Options) -> None:
-        """Refuse options that the link does not support."""
+        """Report options that the link does not support."""
         frames = False
         with suppress(ImportError, KeyError):  # another check reports a missing or failing driver
             frames = isinstance(self._tables.drivers[driver], CanDriver)
@@ -493,7 +493,7 @@ class DeviceReader:
         return found
 
     def _buses_carry(self, devices: Sequence[DeviceConfig]) -> None:
-        """Refuse rates whose reads take more time than a bus has for all its devices."""
+        """Report rates whose reads take more time than a bus has for all its devices."""
         shares: dict[tuple[str, str], float] = {}
         for device in devices:
             driver = self._tables.drivers.get(device.driver)

@@ -181,7 +181,7 @@ def encode_ledger_block(update: int, driver: str, ledger: Mapping[str, int]) -> 
 
 
 def decode_ledger_block(block: bytes, ledger_count: int) -> LedgerBlock | None:
-    """Return the decoded ledger block without counters that the writer lacks; None for a torn block."""
+    """Return the decoded ledger block without unknown counters; None if it changed during the copy."""
     body = block[:-4]
     if len(block) != LEDGER_BLOCK_BYTES or zlib.crc32(body) != _CRC.unpack_from(block, len(body))[0]:
         return None

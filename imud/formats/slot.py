@@ -239,7 +239,8 @@ def decode_slot(slot: bytes, device: str) -> Sample:
     """Return the sample in `slot`. Raises ValueError for a wrong CRC or an unknown `sync`."""
     if not slot_is_whole(slot):
         raise ValueError(
-            f"slot of {len(slot)} bytes: expected {SLOT_BYTES} bytes with a matching CRC-32; is it torn or incomplete?"
+            f"slot of {len(slot)} bytes: expected {SLOT_BYTES} bytes with a matching CRC-32; "
+            "was it written during the copy?"
         )
     v = _BODY.unpack_from(slot)
     has = v[7]

@@ -122,7 +122,7 @@ REFUSED: Final = frozenset({errno.EACCES, errno.EPERM})
 HELD: Final = frozenset({errno.EBUSY, errno.EAGAIN})
 # Errors of a transfer after the adapter was removed.
 GONE: Final = frozenset({errno.ENOENT, errno.ENODEV, errno.ENOTDIR, errno.ESHUTDOWN, errno.EBADF})
-# Error numbers of a missing acknowledge: ENXIO (Documentation/i2c/fault-codes.rst), EREMOTEIO (Raspberry Pi).
+# Error numbers of a missing acknowledgement: ENXIO (Documentation/i2c/fault-codes.rst), EREMOTEIO (Raspberry Pi).
 NOT_ACKNOWLEDGED: Final = frozenset({errno.ENXIO, errno.EREMOTEIO})
 STUCK: Final = frozenset({errno.ETIMEDOUT})
 

@@ -111,8 +111,8 @@ def make_parser() -> argparse.ArgumentParser:
         action="append",
         type=simulated,
         metavar="NAME[:NODE]",
-        help=f"what to simulate ({DEVICE}), one of {', '.join(sorted([*SIMULATORS, *CAN_SIMULATORS]))}; "
-        "several times for several devices on one CAN interface",
+        help=f"device to simulate (default: {DEVICE}), one of {', '.join(sorted([*SIMULATORS, *CAN_SIMULATORS]))}; "
+        "repeat the option for several devices on one CAN interface",
     )
     add("--node", type=int, default=default.node, metavar="N", help="node, address or first identifier on a CAN bus")
     add("--at-once", action="store_true", help="send the CAN frames of one instant together, not at the bit rate")
@@ -123,7 +123,7 @@ def make_parser() -> argparse.ArgumentParser:
         default=0,
         help="baud rate of the port, bit/s (default: the slowest usual rate that carries the samples)",
     )
-    add("--message", default="", help="message to send (factory setting)")
+    add("--message", default="", help="message to send (default: factory setting)")
     add("--motion", choices=sorted(MOTIONS), default=default.motion, help="known motion (%(default)s)")
     add("--gravity", type=float, default=GRAVITY_M_S2, metavar="M_S2", help="local gravity (%(default)s m/s²)")
     add("--noise", action=argparse.BooleanOptionalAction, default=True, help="sensor noise and bias")
@@ -147,8 +147,8 @@ def make_parser() -> argparse.ArgumentParser:
     add("--sin", type=Path, metavar="PATH", help="SIN: the `value` file of a gpio-sim line, read every "
         f"{SIN_LOOK_NS / NS_PER_MS:g} ms")  # fmt: skip
     add("--seed", type=int, default=default.seed, help="seed of noise and faults (%(default)s)")
-    add("--interface", default="", metavar="NAME", help="CAN interface, for CAN devices (the first that is up)")
-    add("--path", type=Path, help="node to make (a temporary one)")
+    add("--interface", default="", metavar="NAME", help="interface of CAN devices (default: the first that is up)")
+    add("--path", type=Path, help="device node to create (default: a temporary node)")
     add("--truth", type=Path, metavar="FILE", help="write true sample times, CSV: sample_ns,device_ms,written_ns")
     return parser
 

@@ -112,8 +112,8 @@ ORDER, SIGN = Contradiction.ORDER, Contradiction.SIGN
         (FRD, zyx(10, 5), Contradiction.Z_AXIS, "remove z_down from frame"),
         (
             FLU_LEVEL, zyx(0, 0, z_down=True), Contradiction.Z_AXIS,
-            "at rest up is -z of the sensor by the acceleration and +z by quat_wxyz, 180° apart: the z axis points in "
-            "the opposite direction; set frame: {z_down: true} (docs/frames.md)",
+            "at rest, up is -z of the sensor by the acceleration, but +z by quat_wxyz, 180° apart: the z axis points "
+            "in the opposite direction; set frame: {z_down: true} (docs/frames.md)",
         ),
         # a device with ZXY that is configured as ZYX, and the reverse
         *((FLU_LEVEL, turned(zxy(*at), quat_from_euler_zyx), ORDER, "{euler_order: zxy}") for at in LEANING),
@@ -148,7 +148,7 @@ def test_a_contradiction_has_its_cause(device: DeviceAxes, sample: Sample, kind:
     ],
 )
 def test_a_body_that_is_not_level(axes: tuple[str, str, str], sample: Sample, side: str) -> None:
-    words = f"with frame the {side} of the body"
+    words = f"and the {side} of the body"
     finding = contradiction(FLU_LEVEL, sample, Contradiction.MOUNTING, words, matrix_from_axes(*axes))
     up = nearest_axis(sample.accel_m_s2 or (0, 0, 0))
     assert f"axes needs z: {up};" in finding.message

@@ -32,7 +32,7 @@ _WINDOW_0, _WINDOW_1 = 0, 1
 class RegisterFaults:
     """Faults of the device or its wires. Tests can change them at any time."""
 
-    # Error number of each transaction: ENXIO for a missing acknowledge, ETIMEDOUT for a blocked bus; 0 for no error.
+    # Error number of each transaction: ENXIO for a missing acknowledgement, ETIMEDOUT for a blocked bus; 0: no error.
     error: int = 0
     line: int | None = None  # value of all read bytes: 0xFF or 0x00 for a data line without a driver; None for no fault
     flips: int = 0  # number of next transactions with one wrong bit

@@ -8,7 +8,7 @@ of the device from `advance`. Behavior, with assumptions where the manual define
   buffer.
 - In command mode, it only replies: to queries with S1, P1 or an AHRS frame, to other commands with K1.
   `Imu61xBehaviour` contains different interpretations of the manual.
-- A baud rate applies after its acknowledge, or after the next start.
+- A baud rate applies after its acknowledgement, or after the next start.
 - CMD 5 saves all settings with the mode. CMD 9 and a power failure lose unsaved settings. CMD 15 restores the flash
   immediately, and the RAM immediately or after the next start.
 - CMD 7 takes some seconds and measures the present attitude. In this time, S1 reports a calibration and the result of
@@ -291,7 +291,7 @@ class Imu61xModule:
             self._next_us += US_PER_S // self.settings.rate_hz
 
     def _finish_orders(self, now_ns: int) -> None:
-        # a rate applies after its acknowledge was sent and collected
+        # a rate applies after its acknowledgement was sent and collected
         if self._new_baud_ns is not None and now_ns > self._new_baud_ns and self._wire.next_ns() is None:
             self._new_baud_ns = None
             self._wire = Transmitter(self.settings.baud, TX_BUFFER_BYTES, now_ns)
@@ -410,7 +410,7 @@ class Imu61xModule:
         orders[command]()
 
     def _after(self, command: Command, now_ns: int) -> None:
-        """Process the part of a command that follows its acknowledge."""
+        """Process the part of a command that follows its acknowledgement."""
         if command is Command.RESTART:
             self._next_us = None
             self._restart_ns = self._wire.due_ns(now_ns, 0)
