@@ -151,7 +151,6 @@ SMALL_LINES = 130
 LONG_MODULES = {
     "imud.cli.top": "the display of one command: table, details of a device, keys",
     "imud.drivers.imu61x.uart.settings": "the table of settings with its scripts",
-    "imud.links.socketcan": "one link: socket, bus state and reader",
     "imud.publishers.metrics.families": "one table: the metric families",
     "imud.publishers.nmea0183": "one output: sentences, ports and TCP",
     "imud.publishers.recorder.flight": "one state machine: the flight recorder",
