@@ -6,7 +6,7 @@ import sys
 PATIENT = """
 import sys
 from imud.cli import main
-from imud.cli.demo import command as demo
+from imud.cli import demo
 demo.START_LIMIT_S = demo.FOUND_LIMIT_S = demo.STOP_LIMIT_S = 60.0
 sys.exit(main(["demo", "--plain", *sys.argv[1:]]))
 """

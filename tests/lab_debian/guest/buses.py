@@ -50,7 +50,7 @@ PULSES = 12
 FEED = f"""
 import sys, time
 sys.path[:0] = [{{path!r}}]
-from imud.utc.chrony import ChronyFeed
+from imud.utc.pps import ChronyFeed
 feed = ChronyFeed({CHRONY_SOCKET!r}, lambda: time.time_ns() - time.monotonic_ns())
 for _ in range({PULSES}):
     time.sleep(1 - time.time() % 1)
