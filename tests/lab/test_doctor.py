@@ -218,7 +218,7 @@ def test_serial_ports(uarts: tuple[Path, Path], tmp_path: Path) -> None:
         found.has("RS-485", "error", "echoes of its requests on", "`direction`")
         found.has("ports taken", "error", f"{held.path} is open in another program: ", "stop the program")
         assert any(f"pid {holder.pid}" in seen for _, seen in found.of("error"))
-        found.has("devices", "error", "held is ", "see the findings on its port or bus")
+        found.has("devices", "error", "held is ", "see the findings about its port or bus")
         found.has("Prometheus", "error", "metrics do not reply at 127.0.0.1", "does another program use the port?")
         check_rights(made, near)
 

@@ -148,7 +148,7 @@ def test_a_busy_line_names_who_holds_it(gpio_chip: GpioChip) -> None:
     with running("gpiomon", gpio_chip.path.name, "3"):
         wait_until(lambda: "gpiomon" in INTERRUPTS.read_text(encoding="ascii"), "gpiomon has its interrupt")
         for line in (GpioInput(InputOptions(line="ALARM")), GpioOutput(OutputOptions(line="ALARM"))):
-            with pytest.raises(LinkBusy, match=r"line 3 \(ALARM\) is in use by gpiomon: stop that"):
+            with pytest.raises(LinkBusy, match=r"line 3 \(ALARM\) is in use by gpiomon: stop it"):
                 line.open()
 
 

@@ -202,7 +202,7 @@ def test_interface_that_is_missing_is_waited_for() -> None:
     tool("ip", "link", "delete", "vcan7")
 
     async def story(rig: Rig) -> None:
-        await rig.until(lambda: "not there" in rig.runner.status().problem, "the problem in the status")
+        await rig.until(lambda: "does not exist" in rig.runner.status().problem, "the problem in the status")
         tool("ip", "link", "add", "dev", config.interface, "type", "vcan")
         tool("ip", "link", "set", config.interface, "up")
         await rig.until(lambda: rig.runner.state is DeviceState.SEARCHING, "open")
