@@ -43,7 +43,7 @@ def test_a_canopen_node_is_made_as_declared(vcan: CanInterface, variant: str) ->
 
     async def story() -> None:
         taken = await rig.done(rig.device.settings_apply({"node": 12}, save=True))
-        assert "node 12 is taken" in taken.problem
+        assert "node 12 is in use" in taken.problem
         assert module.objects.writes_to_flash == 0
         wanted = {"tpdo2_interval_ms": 200, "incli_x_reversed": True, "node": 9}
         await made_so(rig, wanted, verified=kind.reads == "answered")
@@ -65,7 +65,7 @@ def test_a_j1939_module_is_made_as_declared(vcan: CanInterface, variant: str) ->
 
     async def story() -> None:
         taken = await rig.done(rig.device.settings_apply({"address": 12}, save=True))
-        assert "address 12 is taken" in taken.problem
+        assert "address 12 is in use" in taken.problem
         assert module.writes_to_flash == 0
         wanted = {"ff37_interval_ms": 50, "y_reversed": True, "address": 9}
         await made_so(rig, wanted, verified=kind.reads != "ignored")
