@@ -93,9 +93,8 @@ class ReaderConnection:
         # True while the socket is not read: after received messages, or because the queue is full
         self._is_paused = False
         self._pause_timer: asyncio.TimerHandle | None = None
-        self._descriptor = (
-            -1
-        )  # descriptor of the socket: paho-mqtt can close the socket before the event loop removes it
+        # descriptor of the socket: paho-mqtt can close the socket before the event loop removes it
+        self._descriptor = -1
         self._timer: asyncio.TimerHandle | None = None
 
     @classmethod

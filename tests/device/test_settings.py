@@ -597,9 +597,8 @@ async def test_commands_that_save_count_and_are_limited(bench: ModuleBench) -> N
             await bench.doing(saving)
     applied = await bench.doing(bench.device.settings_apply({"mode": "6-axis"}, save=True))
     assert "not saved: its flash was written 40 times" in applied.problem
-    applied = await bench.doing(
-        bench.device.settings_apply({"baud": 921600}, save=True)
-    )  # the step of this setting saves
+    # the step of this setting saves
+    applied = await bench.doing(bench.device.settings_apply({"baud": 921600}, save=True))
     assert applied.problem.startswith("baud: its flash was written 40 times")
     assert (bench.module.saves, bench.module.commands.count("ZERO"), bench.module.baud) == (LIMIT_ASKED, sent, 115200)
     assert (await bench.doing(bench.device.calibrate("zero", save=False))).verified

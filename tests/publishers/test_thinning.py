@@ -44,9 +44,8 @@ def test_the_selection_does_not_drift_in_a_day() -> None:
     pace, instants = Pace(3.0), 259_200
     times_ns = [START_NS + ceil(k * 1e9 / 3.0) for k in range(instants)]
     assert sum(pace.is_due(t_ns, 333_333_333) for t_ns in times_ns) == instants
-    assert (
-        pace.due_ns == START_NS + 86_400 * 1_000_000_000 - 166_666_667 + 1
-    )  # half a sample period before due time number 259,200
+    # half a sample period before due time number 259,200
+    assert pace.due_ns == START_NS + 86_400 * 1_000_000_000 - 166_666_667 + 1
 
 
 def test_a_rate_above_the_sample_rate_selects_all_samples() -> None:

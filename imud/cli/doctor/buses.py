@@ -87,16 +87,14 @@ def _spi_cause(problem: str, has: str) -> str:
     if problem.startswith("cannot use ") and "Invalid argument" in problem:
         return (
             "the controller refuses words of 16 and 8 bits, or the clock: set a lower `speed_hz`; otherwise use "
-            "another "
-            "controller, for example spi-gpio"
+            "another controller, for example spi-gpio"
         )
     for found in READ_ID.finditer(problem.replace("; ", "\n")):
         read = bytes.fromhex(found[1])
         if any(read == _swapped(product) for product in _ids()):
             return (
                 "word size: the two bytes of each word are swapped; the driver of the controller has a defect with "
-                "words "
-                "of 16 bits"
+                "words of 16 bits"
             )
         if any(_is_shifted(read, product) for product in _ids()):
             return f"SPI mode: the reply is shifted by one bit; imud uses {has}; otherwise set a lower `speed_hz`"

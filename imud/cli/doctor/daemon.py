@@ -350,8 +350,7 @@ def _answers(at: Surroundings, one: DeviceStatus) -> Findings:
         yield warning(
             f"{one.name} sends samples, but never replied: RX of the device is not connected to TX of this port",
             "connect TX of the adapter to RX of the device, with the correct level (3.3 V or RS-232); without this "
-            "wire, "
-            "imud cannot change its settings. If the wire is not wanted: `identify: false`",
+            "wire, imud cannot change its settings. If the wire is not wanted: `identify: false`",
         )
 
 
@@ -370,8 +369,7 @@ def half_duplex(at: Surroundings) -> Findings:
             yield error(
                 f"{one.name}: {line.timeouts} requests without a reply; {heard} on {one.link}",
                 "check the power, A and B (swapped?), the address and the baud rate: stop the daemon, then run `imud "
-                "modbus "
-                "scan`. Does the adapter need `direction` to switch between send and receive?",
+                "modbus scan`. Does the adapter need `direction` to switch between send and receive?",
             )
         elif line.strange_bytes > max(line.timeouts, 1) or line.timeouts * 100 > polls:
             yield warning(
@@ -398,8 +396,7 @@ def restarts(at: Surroundings) -> Findings:
             yield warning(
                 f"the device counter of {one.name} restarted {resets} times in {hours:.1f} h of samples",
                 "is the supply voltage too low? Measure it at the device: the cable can be too thin, or the USB port "
-                "or "
-                "regulator too weak; then look for commands that restart the device",
+                "or regulator too weak; then look for commands that restart the device",
             )
         elif resets:
             yield note(f"the device counter of {one.name} restarted {resets} times since the daemon started")

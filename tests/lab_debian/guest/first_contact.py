@@ -196,9 +196,8 @@ def check_made(checks: Checks, host: Host, before: AdapterNow) -> None:
         expect("ignored without the rules", before.ignored, False)
         assert before.latency_ms != LATENCY_MS, f"the latency timer is {LATENCY_MS} ms without the rules"
         expect("as it is", adapter().ignored, True)
-        must(
-            "systemctl", "stop", UNIT
-        )  # a request of the daemon for low latency makes the driver report 1 for any value of udev
+        # a request of the daemon for low latency makes the driver report 1 for any value of udev
+        must("systemctl", "stop", UNIT)
         try:
             expect("plugged in again", replugged(host), AdapterNow(LATENCY_MS, ignored=True))
         finally:
