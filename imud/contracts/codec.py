@@ -21,7 +21,7 @@ class BadReason(StrEnum):
     # The check value is correct and the content is impossible, for example a sub-packet longer than the rest of the
     # frame
     CONTENT = "content"
-    # The frame is valid. Its measurement follows, without the values that were NaN or infinity.
+    # The frame is valid. Its measurement follows, without NaN, infinity and physically impossible values.
     NOT_FINITE = "not-finite"
 
 

@@ -32,7 +32,7 @@ LEDGER_FIELDS: Final = (
     "lost_queue",  # samples dropped from a full queue of the daemon
     "replies_late",  # replies after the timeout
     "replies_unsolicited",  # text without a request
-    "frames_not_finite",  # valid frames from which imud removed NaN or infinite values
+    "frames_not_finite",  # valid frames from which imud removed NaN, infinite or physically impossible values
     "lost_unknown",  # gaps with an unknown number of lost samples
 )
 

@@ -559,6 +559,7 @@ class Nmea0183:
         self._reference_ns = self._newest_ns = 0
         self._rate = MeanRate()
         self._warned = ""
+        self._not_made = 0  # number of sentences that would exceed the length limit of the standard
 
     def start(self) -> None:
         """Open the ports. Raises ServerError if the TCP port cannot be used."""
@@ -598,8 +599,7 @@ class Nmea0183:
             newest = msgspec.structs.replace(newest, gyro_rad_s=self._rate.take())
         rotation = batch.frame.rotation_to(Convention.NED_FRD)
         turned = newest if rotation is None else rotation.sample(newest)
-        made = [make(kind, turned, self._reference, self._settings.talker) for kind in due]
-        sentences = b"".join([one for one in made if one is not None])
+        sentences = b"".join([self._made(kind, turned) for kind in due])
         if sentences:
             for output in self._outputs:
                 output.put(sentences)
@@ -626,7 +626,17 @@ class Nmea0183:
 
     def status(self) -> list[OutputStatus]:
         """Return the state of each port."""
-        return [output.status() for output in self._outputs]
+        found = [output.status() for output in self._outputs]
+        return [msgspec.structs.replace(one, dropped=one.dropped + self._not_made) for one in found]
+
+    def _made(self, kind: Formatter, sample: Sample) -> bytes:
+        """Return the sentence of a sample; empty without values, or with values that do not fit into a sentence."""
+        try:
+            return make(kind, sample, self._reference, self._settings.talker) or b""
+        except ValueError as error:
+            self._not_made += 1
+            self._warn(f"NMEA 0183: cannot make a {kind} sentence: {error}")
+            return b""
 
     def _choose(self) -> None:
         """Choose the device and request the latency for the fastest sentence."""

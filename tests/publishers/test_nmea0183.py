@@ -181,6 +181,18 @@ async def test_pynmea2_reads_the_attitude_of_pashr(bench: OutputBench) -> None:
         assert (found.roll, found.pitch) == (roll, pitch)
 
 
+@in_output(sentences={"HDT": 1.0, "PASHR": 1.0, "ROT": 1.0, "XDR": 1.0})
+async def test_values_that_do_not_fit_into_a_sentence_are_counted_and_the_others_sent(
+    bench: OutputBench, caplog: pytest.LogCaptureFixture
+) -> None:
+    bench.publish(gyro_z=-1e90)
+    assert len(bench.received()) == 3
+    assert [status.dropped for status in bench.output.status()] == [1]
+    assert "cannot make a ROT sentence: expected a sentence of at most 82 bytes" in caplog.text
+    bench.publish(1000)
+    assert len(bench.received()) == 4
+
+
 @in_output(sentences={"ROT": 10.0})
 async def test_the_rate_of_turn_is_the_mean_since_the_previous_sentence(bench: OutputBench) -> None:
     bench.publish(1, euler=(0.0, 0.0, 0.0))

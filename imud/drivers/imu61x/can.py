@@ -29,7 +29,6 @@ number of lost samples. The device accepts no commands over CAN.
 
 import struct
 from collections.abc import Sequence
-from math import isfinite
 from random import Random
 from typing import Annotated, Final
 
@@ -48,8 +47,8 @@ from imud.drivers.imu61x.common import (
     SHEET,
     random_vector,
     relative_heading,
-    scaled,
 )
+from imud.drivers.value_limits import is_possible, possible_temperature_c, scaled
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame
 from imud.model.ledger import Ledger
 from imud.model.options import Options
@@ -186,23 +185,26 @@ class Imu61xCanCodec:
         ledger.frames_pending -= _CLOSING
         ledger.frames_in_samples += SET_FRAMES
         *values, temperature, _ = SET.unpack(raw)
-        if isfinite(sum(values)):  # 9 finite 32-bit values cannot overflow a 64-bit sum
+        if is_possible(values) and possible_temperature_c(temperature * C_PER_COUNT) is not None:
             return (_measurement(values, temperature, index),)
         return (*self._not_finite(raw), _measurement(values, temperature, index))
 
     def _not_finite(self, raw: bytes) -> list[CodecEvent]:
-        """Return a `BadFrame` for every frame with NaN or infinity."""
+        """Return a `BadFrame` for every frame with a value that is not possible."""
         events: list[CodecEvent] = []
         for slot, layout in enumerate(_FLOATS):
             data = raw[slot * FRAME_BYTES : (slot + 1) * FRAME_BYTES]
-            if not isfinite(sum(layout.unpack(data))):
+            is_good = is_possible(layout.unpack(data))
+            if slot == _CLOSING:
+                is_good = is_good and possible_temperature_c(SET.unpack(raw)[9] * C_PER_COUNT) is not None
+            if not is_good:
                 self.ledger.frames_not_finite += 1
                 events.append(BadFrame(BadReason.NOT_FINITE, data))
         return events
 
 
 def _measurement(values: Sequence[float], temperature: int, index: int) -> Measurement:
-    """Return the measurement of a complete set, without groups with a value that is not finite."""
+    """Return the measurement of a complete set, without groups with a value that is not possible."""
     euler = scaled(values[:3], RAD_PER_DEG)
     return Measurement(
         SET.size, 0, index,
@@ -210,7 +212,7 @@ def _measurement(values: Sequence[float], temperature: int, index: int) -> Measu
         gyro_rad_s=scaled(values[3:6], RAD_S_PER_DEG_S),
         quat_wxyz=None if euler is None else quat_from_euler_zyx(euler),
         euler_rad=euler,
-        temperature_c=temperature * C_PER_COUNT,
+        temperature_c=possible_temperature_c(temperature * C_PER_COUNT),
     )  # fmt: skip
 
 

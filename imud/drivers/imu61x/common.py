@@ -5,8 +5,7 @@ imud follows the vendor's programs in both cases.
 """
 
 import zlib
-from collections.abc import Mapping, Sequence
-from math import isfinite
+from collections.abc import Mapping
 from random import Random
 from types import MappingProxyType
 from typing import Annotated, Final, Literal, get_args
@@ -38,13 +37,6 @@ def crc32(data: bytes | bytearray | memoryview) -> int:
 # 1 g of the device is standard gravity (not defined in the manual; the vendor's driver uses 9.80665)
 M_S2_PER_G: Final = STANDARD_GRAVITY_M_S2
 RAD_S_PER_DEG_S: Final = RAD_PER_DEG  # 1 °/s of the device
-
-
-def scaled(values: Sequence[float], factor: float) -> Vector3 | None:
-    """Return three 32-bit floats times `factor`; None if one is NaN or infinite."""
-    x, y, z = values
-    # 3 finite 32-bit values cannot overflow a 64-bit sum
-    return (x * factor, y * factor, z * factor) if isfinite(x + y + z) else None
 
 
 def random_vector(random: Random, spread: float) -> Vector3:

@@ -9,7 +9,6 @@ periodically.
 
 import struct
 from collections.abc import Mapping, Sequence
-from math import isfinite
 from random import Random
 from typing import Any, Final
 
@@ -43,6 +42,7 @@ from imud.drivers.imu61x.registers import (
     wanted_filter,
 )
 from imud.drivers.polled_frames import Measured, PolledFrameDecoder
+from imud.drivers.value_limits import possible_temperature_c, scaled
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Vector3
 from imud.model.units import NS_PER_S
@@ -141,16 +141,11 @@ def _check(data: bytes) -> BadReason | None:
 
 
 def _measure(data: bytes) -> Measured:
-    ax, ay, az, gx, gy, gz, temperature, _ = FRAME.unpack(data)
-    g, rad = M_S2_PER_G, RAD_S_PER_DEG_S
-    accel, gyro = isfinite(ax + ay + az), isfinite(gx + gy + gz)  # 3 finite 32-bit values cannot overflow a 64-bit sum
-    measurement = Measurement(
-        FRAME.size, 0, None,
-        (ax * g, ay * g, az * g) if accel else None,
-        (gx * rad, gy * rad, gz * rad) if gyro else None,
-        temperature_c=temperature if isfinite(temperature) else None,
-    )  # fmt: skip
-    return measurement, accel and gyro and isfinite(temperature)
+    *values, temperature_c, _ = FRAME.unpack(data)
+    accel, gyro = scaled(values[:3], M_S2_PER_G), scaled(values[3:], RAD_S_PER_DEG_S)
+    temperature = possible_temperature_c(temperature_c)
+    measurement = Measurement(FRAME.size, 0, None, accel, gyro, temperature_c=temperature)
+    return measurement, None not in (accel, gyro, temperature)
 
 
 # --- encoder for simulated devices ------------------------------------------------------------------------------

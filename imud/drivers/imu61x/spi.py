@@ -4,7 +4,6 @@
 
 import struct
 from collections.abc import Mapping, Sequence
-from math import isfinite
 from random import Random
 from typing import Annotated, Any, Final, Literal
 
@@ -16,7 +15,7 @@ from imud.contracts.command import Target
 from imud.contracts.driver import Identity
 from imud.contracts.script import Transfer, TransferScript
 from imud.contracts.setting import Setting, SettingsTable
-from imud.drivers.imu61x.common import M_S2_PER_G, RAD_S_PER_DEG_S, crc32, random_vector, scaled
+from imud.drivers.imu61x.common import M_S2_PER_G, RAD_S_PER_DEG_S, crc32, random_vector
 from imud.drivers.imu61x.registers import (
     BURST,
     BURST_CTRL,
@@ -41,6 +40,7 @@ from imud.drivers.imu61x.registers import (
     wanted_filter,
 )
 from imud.drivers.polled_frames import Measured, PolledFrameDecoder, absence
+from imud.drivers.value_limits import possible_temperature_c, scaled
 from imud.model.errors import DeviceRefused, TransferError
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Vector3
@@ -392,7 +392,7 @@ def _extended(frame: bytes) -> Measured:
             (values[0:3], RAD_S_PER_DEG_S), (values[3:6], M_S2_PER_G), (values[7:10], RAD_PER_DEG),
         )
     )  # fmt: skip
-    temperature = values[6] if isfinite(values[6]) else None
+    temperature = possible_temperature_c(values[6])
     measurement = Measurement(
         len(frame), 0, None, accel, gyro,
         quat_wxyz=None if euler is None else quat_from_euler_zyx(euler),

@@ -201,7 +201,7 @@ DEVICE_FAMILIES: Final = (
     ),
     _gauge("imud_frames_pending", "Good frames of an incomplete sample.", _ledger("frames_pending")),
     _counter(
-        "imud_frames_bad_total", "Damaged frames by reason; imud uses a not_finite frame without its invalid values.",
+        "imud_frames_bad_total", "Damaged frames by reason; imud uses the possible values of a not_finite frame.",
         _ledger_by("reason", crc="frames_bad_crc", length="frames_bad_length", content="frames_bad_content",
                    not_finite="frames_not_finite"),
     ),

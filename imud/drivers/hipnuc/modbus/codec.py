@@ -49,6 +49,7 @@ from imud.drivers.hipnuc.modbus.registers import (
     read_registers,
 )
 from imud.drivers.polled_frames import Measured, PolledFrameDecoder, absence
+from imud.drivers.value_limits import possible_temperature_c
 from imud.formats.modbus import (
     CRC_BYTES,
     ILLEGAL_ADDRESS,
@@ -211,7 +212,7 @@ class HipnucModbusCodec:
             len(data), 0, UPTIME.unpack_from(data, DATA_AT + BLOCK.size)[0] if has_time else None,
             (ax * a, ay * a, az * a), (gx * w, gy * w, gz * w), (mx * b, my * b, mz * b) if mx or my or mz else None,
             self._quaternion(qw, qx, qy, qz), (roll * angle, pitch * angle, yaw * angle),
-            celsius * TEMPERATURE_C_PER_LSB if celsius or pressure else None,
+            possible_temperature_c(celsius * TEMPERATURE_C_PER_LSB) if celsius or pressure else None,
             pressure_of(pressure * PRESSURE_PA_PER_LSB),
             self._inclination(ix, iy, roll * angle, pitch * angle), self._status,
         ), True  # fmt: skip

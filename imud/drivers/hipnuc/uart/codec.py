@@ -42,6 +42,7 @@ from imud.drivers.hipnuc.common import (
     temperature_beside,
 )
 from imud.drivers.hipnuc.uart.replies import LINE_CHARACTERS_MAX, LineFinder
+from imud.drivers.value_limits import is_possible, values_possible
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Quaternion, Vector3
@@ -66,14 +67,18 @@ PRESSURE_OFFSET_PA: Final = 100_000
 
 # HI91 after its tag, the word as two bytes. In the native layout, `struct` reads a float in half the time.
 HI91_VALUES: Final = struct.Struct(("@" if sys.byteorder == "little" else "<") + "xBBbfI16f")
-# Slice of the high bytes of all floats and of system_time in adjacent HI91 sub-packets (76 is a multiple of 4). The
-# high byte of NaN and infinity is 0x7F or 0xFF. Finite values above 1.7e38 have the same high bytes, and system_time in
-# 9 of 1193 hours.
-HI91_HIGH_BYTES: Final = slice(7, None, 4)
+# Slices of the high bytes in HI91 sub-packets: pressure, system_time, 16 floats and the next temperature of adjacent
+# sub-packets (76 is a multiple of 4); the temperatures in these bytes; system_time in the rest
+_RUN_HIGH_BYTES: Final = slice(7, None, 4)
+_RUN_TEMPERATURES: Final = slice(18, None, 19)
+_RUN_TIMES: Final = slice(1, None, 18)
+_PRESSURE_HIGH_BYTE: Final = 7
+_HIGH_BYTES: Final = slice(15, None, 4)  # high bytes of the 16 floats of one sub-packet
+_NOT_FINITE_BYTES: Final = b"\x7f\xff"  # high bytes of NaN and infinity
 
 
 def decode_hi91(values: Sequence[Any], word_is_status: bool, size: int, trailing: int) -> Measurement:
-    """Return the measurement of HI91_VALUES with NaN and infinity. `size` and `trailing` describe the frame."""
+    """Return the measurement of HI91_VALUES with all values. `size` and `trailing` describe the frame."""
     low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz = values
     # a global name costs twice as much as a local name, and a frame uses thirty of them
     g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
@@ -118,18 +123,21 @@ def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int
 def _decode_hi91(data: bytes, at: int, word_is_status: bool, size: int, trailing: int) -> tuple[Measurement, bool]:
     values = HI91_VALUES.unpack_from(data, at)
     measurement = decode_hi91(values, word_is_status, size, trailing)
-    if all(map(isfinite, values)):
+    if isfinite(values[3]) and is_possible(values[5:]):
         return measurement, True
-    return _finite_groups(measurement), False
+    return _possible_groups(measurement, values), False
 
 
-_GROUPS: Final = ("accel_m_s2", "gyro_rad_s", "mag_t", "quat_wxyz", "euler_rad")
+# values of each group in HI91_VALUES
+_GROUPS: Final = {
+    "accel_m_s2": slice(5, 8), "gyro_rad_s": slice(8, 11), "mag_t": slice(11, 14), "euler_rad": slice(14, 17),
+    "quat_wxyz": slice(17, 21),
+}  # fmt: skip
 
 
-def _finite_groups(m: Measurement) -> Measurement:
-    """Return the measurement without groups that contain NaN or infinity."""
-    absent = [name for name in _GROUPS if not all(map(isfinite, getattr(m, name)))]
-    return msgspec.structs.replace(m, **dict.fromkeys(absent))
+def _possible_groups(m: Measurement, values: Sequence[Any]) -> Measurement:
+    """Return the measurement without groups with a value that is not possible."""
+    return msgspec.structs.replace(m, **{name: None for name, at in _GROUPS.items() if not is_possible(values[at])})
 
 
 def _decode_hi92(data: bytes, at: int, _word_is_status: bool, size: int, trailing: int) -> tuple[Measurement, bool]:
@@ -292,12 +300,11 @@ class HipnucCodec:
         self.ledger.bytes_in += len(data)
         if len(data) == _HI91_FRAME_BYTES and data.startswith(_HI91_HEAD) and not (self._tail or self._bad_ahead):
             payload = data[HEADER.size :]  # fast path: the read is exactly one HI91 frame, as at 1 kHz
-            high_bytes = payload[HI91_HIGH_BYTES]
             if (
                 crc16_xmodem(payload, _RUN_SEED) == data[4] | data[5] << 8
                 and payload[0] == TAG_HI91
-                and 0x7F not in high_bytes
-                and 0xFF not in high_bytes
+                and payload[_PRESSURE_HIGH_BYTE] not in _NOT_FINITE_BYTES
+                and values_possible(payload[_HIGH_BYTES])
             ):
                 ledger = self.ledger
                 ledger.bytes_in_good_frames += _HI91_FRAME_BYTES
@@ -374,8 +381,9 @@ class HipnucCodec:
         count = len(payloads)
         end = at + count * size
         hi91s = b"".join(payloads)
-        high_bytes = hi91s[HI91_HIGH_BYTES]
-        if 0x7F in high_bytes or 0xFF in high_bytes:  # maybe NaN: `_decode_payload` checks it at three times the cost
+        high_bytes = bytearray(hi91s[_RUN_HIGH_BYTES])
+        del high_bytes[_RUN_TEMPERATURES], high_bytes[_RUN_TIMES]
+        if not values_possible(high_bytes):  # `_decode_payload` checks each value at three times the cost
             for begin in range(at, end, size):
                 self._decode_payload(data, begin, begin + size, events)
             return end

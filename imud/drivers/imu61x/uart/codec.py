@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import takewhile
-from math import cos, isfinite, sin
+from math import cos, sin
 from typing import Any, Final
 from zlib import crc32 as inverted_crc32
 
@@ -26,7 +26,8 @@ import msgspec
 from imud.attitude.rotation import quat_from_euler_zyx
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
 from imud.contracts.script import Message, ReplyFrame
-from imud.drivers.imu61x.common import CRC_INVERSION, CRC_START, M_S2_PER_G, RAD_S_PER_DEG_S, crc32, scaled
+from imud.drivers.imu61x.common import CRC_INVERSION, CRC_START, M_S2_PER_G, RAD_S_PER_DEG_S, crc32
+from imud.drivers.value_limits import possible_temperature_c, scaled, temperatures_possible, values_possible
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
@@ -326,27 +327,30 @@ _HEAD: Final = HEADER.pack(DEVICE_SYNC, AHRS_FRAME, AHRS.size)
 _ONLY: Final = struct.Struct(
     f"<{HEADER.size}xI10f{CRC_BYTES}x"
 )  # timer and 10 floats of one frame; skips header and CRC
-# Slice of the high bytes of all floats in a frame. The high byte of NaN and infinity is 0x7F or 0xFF. Finite values
-# above 1.7e38 have the same high bytes.
-_ONLY_HIGH_BYTES: Final = slice(HEADER.size + 7, AHRS_FRAME_BYTES - CRC_BYTES, 4)
+# high bytes of the temperature and of the other floats in a frame
+_ONLY_TEMPERATURE: Final = slice(AHRS_FRAME_BYTES - CRC_BYTES - 1, AHRS_FRAME_BYTES - CRC_BYTES)
+_ONLY_HIGH_BYTES: Final = slice(HEADER.size + 7, AHRS_FRAME_BYTES - CRC_BYTES - 4, 4)
 # pattern of adjacent AHRS frames by their headers
 _RUN: Final = re.compile(rb"(?s:%b.{%d})+" % (re.escape(_HEAD), AHRS_FRAME_BYTES - HEADER.size))
 _RUN_PARTS: Final = struct.Struct(f"<{HEADER.size}x{AHRS.size}sI")  # payload and CRC
 _RUN_SEED: Final = inverted_crc32(_HEAD, CRC_START)
 # AHRS in the native layout, in which `struct` reads a float in half the time
 _RUN_VALUES: Final = struct.Struct(("@" if sys.byteorder == "little" else "<") + "I10f")
-# Slice of the high bytes of all timers and floats in adjacent payloads. The high byte of the timer is 0x7F or 0xFF for
-# 34 s in 71.6 minutes.
+# Slices of the high bytes of adjacent payloads: timer, nine floats and temperature of each; the temperatures in these
+# bytes; the timers in the rest
 _RUN_HIGH_BYTES: Final = slice(3, None, 4)
-_HIGH_BYTES_APART: Final = slice(7, None, 4)  # slice of the high bytes of the floats of a payload
+_RUN_TEMPERATURES: Final = slice(10, None, 11)
+_RUN_TIMERS: Final = slice(0, None, 10)
+_HIGH_BYTES: Final = slice(7, AHRS.size - 4, 4)  # in a payload: high bytes of the floats without the temperature
+_TEMPERATURE: Final = slice(AHRS.size - 1, AHRS.size)  # in a payload: high byte of the temperature
 
 
 class Imu61xCodec:
     """Decoder of a byte stream into measurements and reply frames. Synchronization: one thread.
 
     It counts frames of an unknown kind (`frames_ignored`) and drops them. Short frames of a known kind are bad. For a
-    frame with NaN or infinity, it returns a `BadFrame` (not-finite) and the measurement without these values; the frame
-    counts as good.
+    frame with values that are not possible, it returns a `BadFrame` (not-finite) and the measurement without these
+    values; the frame counts as good.
     """
 
     def __init__(self, ledger: Ledger, _settings: Options | None = None) -> None:
@@ -355,15 +359,20 @@ class Imu61xCodec:
 
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
         """Decode the next bytes of the stream. Return the completed events. Never raises an exception."""
-        if len(data) == AHRS_FRAME_BYTES and self._finder.idle and inverted_crc32(data, CRC_START) == CRC_INVERSION:
-            high_bytes = data[_ONLY_HIGH_BYTES]
-            if data.startswith(_HEAD) and 0x7F not in high_bytes and 0xFF not in high_bytes:
-                ledger = self.ledger
-                ledger.bytes_in += AHRS_FRAME_BYTES
-                ledger.bytes_in_good_frames += AHRS_FRAME_BYTES
-                ledger.frames_good += 1
-                ledger.frames_in_samples += 1
-                return _finite_measurements((_ONLY.unpack(data),), AHRS_FRAME_BYTES, 0)
+        if (
+            len(data) == AHRS_FRAME_BYTES
+            and self._finder.idle
+            and inverted_crc32(data, CRC_START) == CRC_INVERSION
+            and data.startswith(_HEAD)
+            and values_possible(data[_ONLY_HIGH_BYTES])
+            and temperatures_possible(data[_ONLY_TEMPERATURE])
+        ):
+            ledger = self.ledger
+            ledger.bytes_in += AHRS_FRAME_BYTES
+            ledger.bytes_in_good_frames += AHRS_FRAME_BYTES
+            ledger.frames_good += 1
+            ledger.frames_in_samples += 1
+            return _measurements((_ONLY.unpack(data),), AHRS_FRAME_BYTES, 0)
         return self._decode(data)
 
     def flush(self) -> Sequence[CodecEvent]:
@@ -382,7 +391,7 @@ class Imu61xCodec:
         return events
 
     def _decode_run(self, data: bytes, events: list[CodecEvent]) -> int:
-        """Decode the adjacent AHRS frames at the start, up to a damaged or not finite frame. Return their size."""
+        """Decode the adjacent AHRS frames at the start, up to a damaged or impossible frame. Return their size."""
         run = _RUN.match(data)
         if run is None:
             return 0
@@ -394,12 +403,14 @@ class Imu61xCodec:
                 break
             keep(payload)
         joined = b"".join(payloads)
-        high_bytes = joined[_RUN_HIGH_BYTES]
-        if 0x7F in high_bytes or 0xFF in high_bytes:
-            finite: list[bytes] = list(takewhile(_is_finite, payloads))
-            joined = b"".join(finite)
+        high_bytes = bytearray(joined[_RUN_HIGH_BYTES])
+        temperatures = high_bytes[_RUN_TEMPERATURES]
+        del high_bytes[_RUN_TEMPERATURES], high_bytes[_RUN_TIMERS]
+        if not (values_possible(high_bytes) and temperatures_possible(temperatures)):
+            possible: list[bytes] = list(takewhile(_is_possible, payloads))
+            joined = b"".join(possible)
         count = len(joined) // AHRS.size
-        events += _finite_measurements(_RUN_VALUES.iter_unpack(joined), size, len(data) - size)
+        events += _measurements(_RUN_VALUES.iter_unpack(joined), size, len(data) - size)
         ledger = self.ledger
         ledger.bytes_in_good_frames += count * size
         ledger.frames_good += count
@@ -437,10 +448,8 @@ class Imu61xCodec:
     def _measure(self, frame: Frame, events: list[CodecEvent]) -> None:
         values = AHRS.unpack_from(frame.payload)
         size, trailing = len(frame.raw), frame.trailing_bytes
-        if isfinite(
-            sum(values)
-        ):  # 11 finite 32-bit values cannot overflow a 64-bit sum: the sum is finite only if all values are finite
-            events += _finite_measurements((values,), size, trailing)
+        if _is_possible(frame.payload):
+            events += _measurements((values,), size, trailing)
             return
         self.ledger.frames_not_finite += 1
         events.append(BadFrame(BadReason.NOT_FINITE, frame.raw))
@@ -450,13 +459,12 @@ class Imu61xCodec:
 _REPLY_FRAMES: Final = (STATUS_FRAME, PARAMETER_FRAME)
 
 
-def _is_finite(payload: bytes) -> bool:
-    high_bytes = payload[_HIGH_BYTES_APART]
-    return 0x7F not in high_bytes and 0xFF not in high_bytes
+def _is_possible(payload: bytes) -> bool:
+    return values_possible(payload[_HIGH_BYTES]) and temperatures_possible(payload[_TEMPERATURE])
 
 
-def _finite_measurements(frames: Iterable[Sequence[Any]], size: int, trailing: int) -> list[Measurement]:
-    """Return the measurements of adjacent AHRS frames with finite values; `trailing` bytes follow the first frame."""
+def _measurements(frames: Iterable[Sequence[Any]], size: int, trailing: int) -> list[Measurement]:
+    """Return the measurements of adjacent AHRS frames with possible values; `trailing` bytes follow the first frame."""
     made: list[Measurement] = []
     keep, make, g, rad, cosine, sine = made.append, Measurement, M_S2_PER_G, RAD_PER_DEG, cos, sin
     # quat_from_euler_zyx inline: a call costs a twentieth of a frame
@@ -479,7 +487,7 @@ def _finite_measurements(frames: Iterable[Sequence[Any]], size: int, trailing: i
 
 
 def _partial_measurement(values: Sequence[Any], size: int, trailing: int) -> Measurement:
-    """Return the measurement without groups that contain NaN or infinity."""
+    """Return the measurement without groups with a value that is not possible."""
     us, pitch, roll, yaw = values[:4]
     euler = scaled((roll, pitch, yaw), RAD_PER_DEG)
     return Measurement(
@@ -488,7 +496,7 @@ def _partial_measurement(values: Sequence[Any], size: int, trailing: int) -> Mea
         gyro_rad_s=scaled(values[7:10], RAD_S_PER_DEG_S),
         quat_wxyz=None if euler is None else quat_from_euler_zyx(euler),
         euler_rad=euler,
-        temperature_c=values[10] if isfinite(values[10]) else None,
+        temperature_c=possible_temperature_c(values[10]),
     )  # fmt: skip
 
 

@@ -45,6 +45,8 @@ HI92_PAYLOAD = bytes.fromhex(
     "90 5F 01 00  38 50 FF FF  20 BF 02 00"  # roll 90°, pitch -45°, yaw 180°
     "10 27  00 00  78 EC  01 00"  # quaternion 10000, 0, -5000, 1
 )
+# SI value of one unit of the device: 1 g (manual B: 9.8 m/s²), 1 °/s, 1 µT, 1 °
+SI_PER_UNIT = {"accel_m_s2": 9.8, "gyro_rad_s": math.pi / 180, "mag_t": 1e-6, "euler_rad": math.pi / 180}
 LEVEL: dict[str, Any] = {
     "accel_m_s2": (0.0, 0.0, 9.8),
     "gyro_rad_s": (0.0, 0.0, 0.0),
@@ -300,11 +302,12 @@ def test_bytes_of_damaged_frames_count_as_bad() -> None:
     assert (codec.ledger.bytes_in_bad_frames, codec.ledger.bytes_skipped) == (9, 1)
 
 
-def test_values_that_are_not_finite_are_removed_and_reported() -> None:
+def test_impossible_values_are_removed_and_reported() -> None:
     names = ("accel_m_s2", "gyro_rad_s", "mag_t", "euler_rad", "quat_wxyz", "pressure_pa")
     for name in names:
         good = LEVEL[name]
-        for bad in (math.nan, math.inf, -math.inf):
+        limit = 131072.0 * SI_PER_UNIT.get(name, 1)
+        for bad in (math.nan, math.inf, -math.inf, *((limit, -3e38) if name != "pressure_pa" else ())):
             frame = hi91(5, **{name: (*good[:-1], bad) if isinstance(good, tuple) else bad})
             codec = make()
             events = codec.feed(MANUAL_HI91 + frame + MANUAL_HI91)
@@ -315,6 +318,11 @@ def test_values_that_are_not_finite_are_removed_and_reported() -> None:
             assert len(events) == 4
             assert (codec.ledger.frames_good, codec.ledger.frames_not_finite, codec.ledger.frames_bad()) == (3, 1, 0)
             assert codec.ledger.closes()
+            assert make().feed(frame)[1] == msgspec.structs.replace(m, trailing_bytes=0)
+        if name != "pressure_pa":
+            most = {name: (*good[:-1], -limit * (1 - 1e-6))}
+            for event in make().feed(hi91(5, **most) * 2):
+                assert getattr(event, name) == pytest.approx(most[name])
 
     for top in (0x7F, 0xFF):
         assert one(make().feed(hi91(top << 24))).dev_ticks == top << 24
@@ -399,11 +407,12 @@ def test_clipping_the_check_value_and_a_driver_of_other_settings() -> None:
     assert m.accel_m_s2 == pytest.approx((159.994, -159.9996, 0.0), abs=1e-2)
     assert m.gyro_rad_s == pytest.approx((32.767, -32.768, 0.0))
     assert (m.temperature_c, m.pressure_pa, m.pps_age_ms) == (127, None, 65535)  # 132767 Pa is not an air pressure
-    m = one(make().feed(encode_hi91(system_time_ms=2**32 + 7, **(far | {"accel_m_s2": (1e300, 0.0, 0.0)}))))
-    assert m.dev_ticks == 7
-    assert (m.temperature_c, m.pressure_pa) == (None, None)  # 1e6 Pa: bytes that the firmware did not write
-    assert m.accel_m_s2 is not None
-    assert m.accel_m_s2[0] == pytest.approx(3.4028e38 * 9.8, rel=1e-4)
+    bad, last = make().feed(encode_hi91(system_time_ms=2**32 + 7, **(far | {"accel_m_s2": (1e300, 0.0, 0.0)})))
+    assert isinstance(bad, BadFrame)
+    assert isinstance(last, Measurement)
+    assert last.dev_ticks == 7
+    assert (last.temperature_c, last.pressure_pa) == (None, None)  # 1e6 Pa: bytes that the firmware did not write
+    assert struct.unpack_from("<f", bad.raw, 6 + 12)[0] == pytest.approx(3.4028e38, rel=1e-4)
     assert crc_hqx(b"123456789", 0) == 0x31C3
     assert crc_hqx(b"6789", crc_hqx(b"12345", 0)) == 0x31C3
     codec = replace(DRIVER, name="other").make_codec(Ledger(), HipnucOptions(hi91_word="status"))

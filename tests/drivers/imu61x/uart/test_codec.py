@@ -145,9 +145,9 @@ def test_a_run_ends_before_a_frame_that_is_damaged_or_not_finite() -> None:
 
 
 def test_values_near_infinity_and_quaternions_to_the_last_bit() -> None:
-    """High bytes 0x7F and 0xFF, which may mean NaN or infinity: of the timer, and of finite 2e38."""
+    """A timer can have the high bytes 0x7F and 0xFF; -127.9 °C is a possible temperature."""
     late = [with_crc(AHRS_HEX.replace("78563412", f"785634{high}")) for high in ("7F", "FF")]
-    large = with_crc(AHRS_HEX.replace("00001242", struct.pack("<f", -2e38).hex()))
+    large = with_crc(AHRS_HEX.replace("00001242", struct.pack("<f", -127.9).hex()))
     for frame in (*late, large):
         run, alone = codec(), codec()
         events = run.feed(GOLDEN + frame + GOLDEN)
@@ -180,7 +180,7 @@ def test_values_near_infinity_and_quaternions_to_the_last_bit() -> None:
     assert measurement.quat_wxyz == pytest.approx(whole.quat_wxyz, abs=1e-15)
 
 
-@pytest.mark.parametrize("value", [nan, inf, -inf])
+@pytest.mark.parametrize("value", [nan, inf, -inf, 131072.0, -3e38])
 @pytest.mark.parametrize(
     ("place", "missing"),
     [

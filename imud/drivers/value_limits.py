@@ -1,0 +1,46 @@
+"""Limits of values that a device sends as 32-bit floats. A value outside is not a measurement.
+
+A damaged device or a hostile frame with a correct check value can send any 32-bit float. No inertial sensor measures
+131,072 g, °/s, µT or °, or a temperature outside -128 … 512 °C. The limits are powers of two: the high byte of a float
+shows whether the value is inside, so that one call checks all values of many frames.
+"""
+
+from collections.abc import Sequence
+from typing import Final
+
+from imud.model.sample import Vector3
+
+VALUE_LIMIT: Final = 131_072.0  # magnitude that no value reaches, in g, °/s, µT, ° or as part of a quaternion
+TEMPERATURE_LIMITS_C: Final = (-128.0, 512.0)  # a measured temperature is between these values, °C
+
+# High bytes of little-endian 32-bit floats inside the limits, for `bytes.translate`. The high byte is the sign and the
+# upper seven bits of the exponent: 131,072 is 0x48000000, -128 is 0xC3000000, 512 is 0x44000000.
+_VALUE_HIGH_BYTES: Final = bytes(byte for byte in range(256) if byte & 0x7F < 0x48)
+_TEMPERATURE_HIGH_BYTES: Final = bytes([*range(0x44), *range(0x80, 0xC3)])
+
+
+def values_possible(high_bytes: bytes | bytearray) -> bool:
+    """Return whether all floats with these high bytes are inside VALUE_LIMIT. NaN and infinity are outside."""
+    return not high_bytes.translate(None, _VALUE_HIGH_BYTES)
+
+
+def temperatures_possible(high_bytes: bytes | bytearray) -> bool:
+    """Return whether all temperatures with these high bytes are inside TEMPERATURE_LIMITS_C."""
+    return not high_bytes.translate(None, _TEMPERATURE_HIGH_BYTES)
+
+
+def is_possible(values: Sequence[float]) -> bool:
+    """Return whether all values are inside VALUE_LIMIT. NaN and infinity are outside."""
+    return all(-VALUE_LIMIT < value < VALUE_LIMIT for value in values)
+
+
+def scaled(values: Sequence[float], factor: float) -> Vector3 | None:
+    """Return three values times `factor`; None if one is not possible."""
+    x, y, z = values
+    return (x * factor, y * factor, z * factor) if is_possible(values) else None
+
+
+def possible_temperature_c(temperature_c: float) -> float | None:
+    """Return a temperature, °C; None if it is not possible."""
+    low_c, high_c = TEMPERATURE_LIMITS_C
+    return temperature_c if low_c < temperature_c < high_c else None

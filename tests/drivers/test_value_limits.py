@@ -1,0 +1,44 @@
+"""The rule on high bytes and the rule on numbers accept the same 32-bit floats."""
+
+import struct
+from math import inf, nan, nextafter
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imud.drivers.value_limits import (
+    is_possible,
+    possible_temperature_c,
+    scaled,
+    temperatures_possible,
+    values_possible,
+)
+
+
+def high_byte(value: float) -> bytes:
+    return struct.pack("<f", value)[3:]
+
+
+@given(st.floats(width=32))
+def test_both_rules_agree(value: float) -> None:
+    assert values_possible(high_byte(value)) == is_possible([0.0, value])
+    assert temperatures_possible(high_byte(value)) == (possible_temperature_c(value) is not None)
+
+
+@pytest.mark.parametrize("value", [131072.0, 3e38, inf, nan])
+def test_the_smallest_impossible_value_is_131072(value: float) -> None:
+    assert not is_possible([value])
+    assert scaled((0.0, value, 0.0), 2.0) is None
+    assert not values_possible(high_byte(-value) + high_byte(0.0))
+
+
+def test_the_largest_possible_value_is_scaled() -> None:
+    assert scaled((0.0, 131071.5, -131071.5), 2.0) == (0.0, 262143.0, -262143.0)
+
+
+def test_a_temperature_is_between_128_below_zero_and_512() -> None:
+    for impossible in (-128.0, 512.0):
+        assert possible_temperature_c(impossible) is None
+        inside = nextafter(impossible, 0.0)
+        assert possible_temperature_c(inside) == inside
