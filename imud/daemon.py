@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from time import thread_time_ns
-from typing import Final, NamedTuple
+from typing import Final
 
 from imud import __version__
 from imud import config as configuration
@@ -44,8 +44,7 @@ from imud.lines.gpio import GPIO_LINES
 from imud.lines.watched_line import watching
 from imud.model.errors import CommandError, ConfigError, ServerError
 from imud.model.event import Event, EventKind
-from imud.model.units import NS_PER_S
-from imud.publishers import PUBLISHERS
+from imud.publishers.outputs import Outputs
 from imud.recording.observer import RecordableDevices
 from imud.utc.system_clock import kernel_clock, system_reference
 
@@ -129,16 +128,6 @@ def _give(answer: "asyncio.Future[Config]", config: Config | None, error: Config
 
 
 TICK_S = 0.1  # interval of ticks, s
-RETRY_FIRST_NS = NS_PER_S
-"""First pause before imud starts a failed output again, ns. The pause doubles up to RETRY_MOST_NS."""
-RETRY_MOST_NS = 60 * NS_PER_S  # maximum pause before imud starts a failed output again, ns
-
-
-class _PutOff(NamedTuple):
-    """Next start of a failed output."""
-
-    due_ns: int  # CLOCK_MONOTONIC of the next start
-    pause_ns: int
 
 
 class Daemon:
@@ -182,17 +171,14 @@ class Daemon:
             watch_line=watching(lines, host.now_ns),
             raise_event=self.send_event,
         )
-        self._extra = dict(extra or {})
+        self._outputs = Outputs(self._context, extra or {})
         self._until_finished = until_finished
-        self._publishers: dict[str, Publisher] = {}
-        self._outputs: tuple[Callable[[Batch], None], ...] = ()  # `publish` of all outputs that process samples
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._ids: dict[str, int] = {}
         self._stop = asyncio.Event()
         self._timer: asyncio.TimerHandle | None = None
         self._failure: BaseException | None = None
         self._manager = ServiceManager()
-        self._put_off: dict[str, _PutOff] = {}  # outputs that imud must start again
 
     # --- life ------------------------------------------------------------------------------------------------------
 
@@ -207,11 +193,7 @@ class Daemon:
         if self._file is not None:
             self._reloader = Reloader(self._file, self, self._host)
         try:
-            for name in self.config.publishers:
-                self._start_or_put_off(name)
-            for name, publisher in self._extra.items():
-                self._start_publisher(name, publisher)
-                self._latencies.ask(name, 0)
+            self._outputs.start(self.config.publishers)
             for device in self.config.devices:
                 self._start_device(device)
             gc.collect()
@@ -260,15 +242,16 @@ class Daemon:
     async def change_to(self, new: Config) -> None:
         """Stop, restart and start the changed devices and outputs. Run the event loop after each change."""
         change = configuration.differences(self.config, new)
-        old, self.config = self.config, new
+        self.config = new
         logging.getLogger().setLevel(new.log_level.upper())
         for name in (*change.devices_removed, *change.devices_changed):
             self._stop_device(name)
             await asyncio.sleep(0)
         problems = ["a new state_dir needs a restart of imud"] if "state_dir" in change.keys_changed else []
         for name in change.publishers_changed:
-            problems.append(self._restart_publisher(name, old))
+            problems.append(self._outputs.change_to(name, new.publishers[name]))
             await asyncio.sleep(0)
+        self.config = replace(new, publishers=self._outputs.options)
         for device in new.devices:
             if device.name not in self._devices:
                 problems.append(self._try_device(device))
@@ -276,21 +259,6 @@ class Daemon:
         words = "; ".join([f"configuration read again: {change}", *filter(None, problems)])
         log.info("%s", words)
         self.send_event(Event(self._host.now_ns(), "", EventKind.CONFIGURATION, words))
-
-    def _restart_publisher(self, name: str, old: Config) -> str:
-        """Restart an output with its new options, or with the old options if it fails. Return the problem, or empty."""
-        self._put_off.pop(name, None)
-        if name in self._publishers:
-            self._publishers.pop(name).close()
-            self._note_outputs()
-        try:
-            self._start_configured(name)
-        except ServerError as error:
-            log.error("%s keeps its old options: %s", name, error)
-            self.config = replace(self.config, publishers={**self.config.publishers, name: old.publishers[name]})
-            self._start_or_put_off(name)
-            return f"{name} keeps its old options: {error}"
-        return ""
 
     def _try_device(self, device: DeviceConfig) -> str:
         try:
@@ -328,50 +296,15 @@ class Daemon:
         """Return all devices of the present configuration."""
         return self.config.devices
 
-    def _start_configured(self, name: str) -> None:
-        settings = self.config.publishers[name]
-        if PUBLISHERS[name].wanted(settings):
-            self._start_publisher(name, PUBLISHERS[name].make(settings, self._context))
-
-    def _start_or_put_off(self, name: str) -> None:
-        """Start an output. Start a failed optional output again later. Raises ServerError for a required output."""
-        before = self._put_off.pop(name, None)
-        try:
-            self._start_configured(name)
-        except ServerError as error:
-            if PUBLISHERS[name].required:
-                raise
-            pause_ns = RETRY_FIRST_NS if before is None else min(2 * before.pause_ns, RETRY_MOST_NS)
-            self._put_off[name] = _PutOff(self._host.now_ns() + pause_ns, pause_ns)
-            if before is None:
-                log.error("%s: %s; imud continues without this output and tries again", name, error)
-        else:
-            if before is not None:
-                log.info("%s: started", name)
-
     def _summary(self) -> str:
         """Return file, devices and outputs for the log."""
-        outputs = ", ".join(self._publishers) or "none"
-        missing = f" (not yet: {', '.join(self._put_off)})" if self._put_off else ""
         file = f"configuration {self._file}; " if self._file is not None else ""
         devices = f"{len(self._devices)} device{'s' * (len(self._devices) != 1)}"
-        return f"{file}{devices}; outputs: {outputs}{missing}"
-
-    def _start_publisher(self, name: str, publisher: Publisher) -> None:
-        for device_name, device in self._devices.items():
-            publisher.add_device(device_name, device.device_id)
-        publisher.start()
-        self._publishers[name] = publisher
-        self._note_outputs()
-
-    def _note_outputs(self) -> None:
-        found = [publisher.publish for publisher in self._publishers.values()]
-        self._outputs = tuple(publish for publish in found if publish is not None)
+        return f"{file}{devices}; outputs: {self._outputs.summary()}"
 
     def _start_device(self, config: DeviceConfig) -> None:
         device_id = self._ids.setdefault(config.name, len(self._ids))
-        for publisher in self._publishers.values():
-            publisher.add_device(config.name, device_id)
+        self._outputs.add_device(config.name, device_id)
         device = self._factory.make(config, device_id)
         self._devices[config.name] = device
         self._latencies.add_device(config.name, device.set_need)
@@ -383,8 +316,7 @@ class Daemon:
         self._tasks.pop(name).cancel()
         self._latencies.remove_device(name)
         self._devices.pop(name).close()
-        for publisher in self._publishers.values():
-            publisher.remove_device(name)
+        self._outputs.remove_device(name)
 
     def _on_done(self, task: asyncio.Task[None]) -> None:
         """Stop after an error in the task of a device. The service manager restarts imud."""
@@ -401,21 +333,21 @@ class Daemon:
             self._stop.set()
 
     def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
-        """Stop after an exception in a callback, which is an internal error."""
+        """Restart the output that raised an exception in a callback. Stop after any other internal error."""
         error = context.get("exception")
+        if isinstance(error, Exception) and self._outputs.take_error(error):
+            return
         log.error("%s", context.get("message"), exc_info=error if isinstance(error, BaseException) else None)
         self._failure = error if isinstance(error, BaseException) else RuntimeError(str(context.get("message")))
         self._stop.set()
 
     def publish(self, batch: Batch) -> None:
         """Pass samples of a device to the outputs."""
-        for publish in self._outputs:
-            publish(batch)
+        self._outputs.publish(batch)
 
     def send_event(self, event: Event) -> None:
         """Pass an event to the outputs."""
-        for publisher in self._publishers.values():
-            publisher.event(event)
+        self._outputs.send_event(event)
 
     # --- time -------------------------------------------------------------------------------------------------------
 
@@ -434,11 +366,8 @@ class Daemon:
         self._host.utc_offset_ns()  # without samples too: the rate of the clock is a mean between two reads
         for device in self._devices.values():
             device.tick(now_ns)
-        for publisher in self._publishers.values():
-            publisher.tick(now_ns)
+        self._outputs.tick(now_ns)
         self._manager.tick(now_ns, self._states)
-        for name in [name for name, one in self._put_off.items() if now_ns >= one.due_ns]:
-            self._start_or_put_off(name)
         self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
 
     def _states(self) -> dict[str, str]:
@@ -454,9 +383,8 @@ class Daemon:
         for name, device in self._devices.items():
             self._end_part(name, device.close)
         self._end_part("devices", self._factory.close)
-        for name, publisher in self._publishers.items():
-            self._end_part(name, lambda publisher=publisher: publisher.tick(self._host.now_ns()))  # type: ignore[misc]
-            self._end_part(name, publisher.close)
+        failure = self._outputs.close()
+        self._failure = self._failure or failure
 
     def _end_part(self, name: str, step: Callable[[], None]) -> None:
         """Close a part. Log an error and continue; the first error is the result of `run`."""

@@ -26,6 +26,9 @@ class EventKind(StrEnum):
     ATTITUDE = "attitude"
     RECORDER = "recorder"  # the recorder stopped (for example: full disk), continued, lost records, or saved a snapshot
     MQTT = "mqtt"  # the output `mqtt` stopped spooling (for example: full disk) or continued
+    OUTPUT = (
+        "output"  # an exception in an output. imud starts this output again; the devices and other outputs continue.
+    )
     BAD_FRAME = "bad-frame"  # imud received a damaged or unknown frame. At most once per second and device.
 
 

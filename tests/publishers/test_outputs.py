@@ -1,0 +1,218 @@
+"""An output that fails is closed and started again; devices and other outputs continue."""
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import pytest
+
+from imud.contracts.publisher import Batch, Publisher, PublisherType
+from imud.model.errors import ServerError
+from imud.model.event import Event, EventKind
+from imud.model.options import Options
+from imud.model.units import NS_PER_S
+from imud.publishers import outputs as module
+from imud.publishers.outputs import FORGOTTEN_NS, RETRY_MOST_NS, Outputs
+from tests.support.event_loops import VirtualClock
+from tests.support.publisher_context import publisher_context
+
+
+class Switch(Options, frozen=True):
+    """Options of an output of the test."""
+
+    enabled: bool = True
+
+
+class FakeOutput:
+    """An output that notes its calls, and raises an exception in the methods of `failing`."""
+
+    def __init__(self, rig: "Rig", name: str) -> None:
+        self._rig, self._name = rig, name
+        self.publish: Callable[[Batch], None] = lambda batch: self._do("publish", batch)
+
+    def __getattr__(self, method: str) -> Any:
+        return lambda *arguments: self._do(method, *arguments)
+
+    def _do(self, method: str, *arguments: object) -> None:
+        self._rig.did.append((self._name, method, *arguments))
+        if error := self._rig.failing.get((self._name, method)):
+            raise error
+
+
+class Rig:
+    """Outputs of these names and modules. The output `must` is required, the others are optional."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, modules: dict[str, str]) -> None:
+        self.did: list[tuple[object, ...]] = []
+        self.failing: dict[tuple[str, str], Exception] = {}
+        self.clock = VirtualClock()
+        rows = {name: self._row(name, at) for name, at in modules.items()}
+        monkeypatch.setattr(module, "PUBLISHERS", rows)
+        self.outputs = Outputs(publisher_context(now_ns=self.clock.now_ns), {})
+        self.options = dict.fromkeys(rows, Switch())
+
+    def _row(self, name: str, module_name: str) -> PublisherType:
+        def make(_settings: object, _context: object) -> Publisher:
+            return cast("Publisher", type(name, (FakeOutput,), {"__module__": module_name})(self, name))
+
+        return PublisherType(name, Switch, make, required=name == "must")
+
+    def start(self, *extra: tuple[str, int]) -> None:
+        self.outputs.start(self.options)
+        for device in (("bow", 0), *extra):
+            self.outputs.add_device(*device)
+        self.did.clear()
+
+    def run(self, seconds: float) -> None:
+        self.clock.advance(round(seconds * NS_PER_S))
+        self.outputs.tick(self.clock.now_ns())
+
+    def done(self, *methods: str) -> list[tuple[object, ...]]:
+        """Return output and method of all calls of `methods` since the last call."""
+        found, self.did = [call for call in self.did if call[1] in methods], []
+        return [call[:2] for call in found]
+
+
+@pytest.fixture
+def rig(monkeypatch: pytest.MonkeyPatch) -> Rig:
+    return Rig(monkeypatch, dict.fromkeys(("one", "two", "must"), "a"))
+
+
+BATCH = cast("Batch", object())
+EVENT = Event(0, "bow", EventKind.UP, "found")
+CALLS: dict[str, Callable[[Rig], None]] = {
+    "publish": lambda rig: rig.outputs.publish(BATCH),
+    "event": lambda rig: rig.outputs.send_event(EVENT),
+    "tick": lambda rig: rig.run(0),
+    "add_device": lambda rig: rig.outputs.add_device("mast", 1),
+    "remove_device": lambda rig: rig.outputs.remove_device("bow"),
+}
+
+
+@pytest.mark.parametrize("method", CALLS)
+@pytest.mark.parametrize("name", ["one", "must"])
+def test_an_exception_in_a_method_restarts_only_this_output(
+    rig: Rig, caplog: pytest.LogCaptureFixture, name: str, method: str
+) -> None:
+    rig.start()
+    rig.failing[(name, method)] = OverflowError("too large")
+    CALLS[method](rig)
+    others = [other for other in rig.options if other != name]
+    events = [call for call in rig.did if call[1] == "event" and call[2] is not EVENT]
+    assert [call[0] for call in events] == others
+    assert cast("Event", events[0][2]).message.startswith(f"{name}: internal error OverflowError: too large")
+    assert set(rig.done(method, "close")) >= {*((other, method) for other in others), (name, method), (name, "close")}
+    assert "Traceback" in caplog.text
+
+    rig.failing.clear()
+    rig.outputs.publish(BATCH)
+    assert rig.done("publish") == [(other, "publish") for other in others]
+    rig.run(0.9)
+    assert rig.done("start") == []
+    rig.run(0.1)
+    devices = 2 if method == "add_device" else 0 if method == "remove_device" else 1
+    assert rig.done("add_device", "start") == [(name, "add_device")] * devices + [(name, "start")]
+    rig.outputs.publish(BATCH)
+    assert len(rig.done("publish")) == 3
+
+
+def test_the_pause_doubles_and_is_short_again_after_a_long_run(rig: Rig) -> None:
+    rig.start()
+    rig.failing[("one", "publish")] = ValueError("always")
+    for pause_s in (1, 2, 4, 8, 16, 32, 60, 60):
+        rig.outputs.publish(BATCH)
+        assert rig.outputs.summary() == "two, must (not yet: one)"
+        rig.run(pause_s - 0.1)
+        assert rig.done("start") == []
+        rig.run(0.1)
+        assert rig.done("start") == [("one", "start")]
+    assert RETRY_MOST_NS == 60 * NS_PER_S
+    rig.run(FORGOTTEN_NS / NS_PER_S + 1)
+    rig.outputs.publish(BATCH)
+    rig.run(1)
+    assert rig.done("start") == [("one", "start")]
+
+
+@pytest.mark.parametrize("error", [ServerError("port in use"), OSError(97, "no IPv6")])
+def test_an_optional_output_that_cannot_start_is_tried_again(
+    rig: Rig, caplog: pytest.LogCaptureFixture, error: Exception
+) -> None:
+    rig.failing[("two", "start")] = error
+    rig.start()
+    assert rig.outputs.summary() == "one, must (not yet: two)"
+    assert ("Traceback" in caplog.text) == isinstance(error, OSError)
+    rig.run(1)
+    rig.failing.clear()
+    rig.run(2)
+    assert rig.done("start") == [("two", "start"), ("two", "start")]
+    assert rig.outputs.summary() == "one, must, two"
+
+
+def test_a_required_output_that_cannot_start_stops_imud_only_at_the_start(rig: Rig) -> None:
+    rig.failing[("must", "start")] = ServerError("no permission")
+    with pytest.raises(ServerError, match="no permission"):
+        rig.outputs.start(rig.options)
+    rig.failing.clear()
+    rig.outputs.close()
+    rig.start()
+    rig.failing |= {("must", "publish"): ValueError(), ("must", "start"): ServerError("gone")}
+    rig.outputs.publish(BATCH)
+    rig.run(1)
+    rig.run(2)
+    assert rig.done("start") == [("must", "start")] * 2
+
+
+def test_changed_options_that_fail_keep_the_old_options(rig: Rig) -> None:
+    rig.start()
+    rig.failing[("must", "start")] = OSError("no such directory")
+    problem = rig.outputs.change_to("must", Switch())
+    assert problem == "must keeps its old options: no such directory"
+    assert rig.outputs.options == rig.options
+    rig.failing.clear()
+    rig.run(1)
+    assert rig.outputs.summary() == "one, two, must"
+    assert rig.outputs.change_to("one", Switch(enabled=False)) == ""
+    assert rig.outputs.summary() == "two, must"
+
+
+def error_through(*modules: str) -> Exception:
+    """Return an exception that passed a function of each module, outermost first."""
+    call: Callable[[], object] = [].__iter__().__next__
+    for name in reversed(modules):
+        names: dict[str, Any] = {"__name__": name, "inner": call}
+        exec("def call(): inner()", names)
+        call = names["call"]
+    try:
+        call()
+    except StopIteration as error:
+        return error
+    raise AssertionError
+
+
+@pytest.mark.parametrize(
+    ("modules", "taken"),
+    [
+        (("asyncio.events", "imud.fleet.broker"), "mqtt"),
+        (("asyncio.events", "imud.publishers.nmea0183", "imud.formats.nmea0183"), "nmea0183"),
+        (("asyncio.events", "imud.publishers.socket.client"), "socket"),
+        (("asyncio.events", "imud.device.transport"), None),
+    ],
+)
+def test_an_error_in_a_callback_restarts_the_output_whose_code_it_passed(
+    monkeypatch: pytest.MonkeyPatch, modules: tuple[str, ...], taken: str | None
+) -> None:
+    places = {
+        "nmea0183": "imud.publishers.nmea0183", "socket": "imud.publishers.socket.server",
+        "mqtt": "imud.fleet.publisher",
+    }  # fmt: skip
+    rig = Rig(monkeypatch, places)
+    rig.start()
+    assert rig.outputs.take_error(error_through(*modules)) == (taken is not None)
+    assert rig.done("close") == ([(taken, "close")] if taken else [])
+
+
+def test_an_exception_in_an_output_of_the_program_reaches_the_program(rig: Rig) -> None:
+    outputs = Outputs(publisher_context(), {"mine": cast("Publisher", FakeOutput(rig, "mine"))})
+    outputs.start({})
+    rig.failing[("mine", "publish")] = ValueError("mine")
+    with pytest.raises(ValueError, match="mine"):
+        outputs.publish(BATCH)
