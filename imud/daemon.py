@@ -156,10 +156,13 @@ class Daemon:
         self._devices: dict[str, Device] = {}
         self._latencies = LatencyBudget()
         self.recording = RecordableDevices(self._devices, host)
+        host.utc_offset_ns()
+        # Threads of outputs use the offset of the last reading, which is at most one tick old. A reading by a thread
+        # would change the steady time between two samples, and a recording would contain it at the wrong place.
         clock = PublisherClock(
             host.now_ns,
-            host.utc_offset_ns,
-            lambda: system_reference(kernel_clock(), host.utc_offset_ns()),
+            host.kept_utc_offset_ns,
+            lambda: system_reference(kernel_clock(), host.kept_utc_offset_ns()),
             thread_time_ns,
         )
         self._context = PublisherContext(

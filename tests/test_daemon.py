@@ -24,6 +24,7 @@ from imud.client.ring import Ring
 from imud.config.model import Config
 from imud.contracts.publisher import Publisher
 from imud.daemon import Daemon
+from imud.host.clock import HostClock
 from imud.model.errors import CommandError
 from imud.model.units import NS_PER_S
 from imud.utc.system_clock import KernelClock
@@ -123,6 +124,15 @@ def test_outputs_learn_whether_the_clock_is_kept(monkeypatch: pytest.MonkeyPatch
     if found is not None:
         assert found.error_ns == 50_000
         assert abs(found.offset_ns - (time_ns() - monotonic_ns())) < NS_PER_S
+
+
+def test_outputs_do_not_read_the_clocks_that_stamp_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread of an output that read them changed the steady time between two samples, and a replay differed."""
+    monkeypatch.setattr("imud.daemon.kernel_clock", lambda: KernelClock(True, 50, 0))
+    clock = Daemon(Config("info", "", {}, ()))._context.clock
+    monkeypatch.delattr(HostClock, "utc_offset_ns")
+    assert abs(clock.utc_offset_ns() - (time_ns() - monotonic_ns())) < NS_PER_S
+    assert clock.utc_reference() is not None
 
 
 def test_a_device_that_there_is_not_is_an_error_of_who_asks() -> None:

@@ -203,7 +203,8 @@ class PublisherClock:
     """Clocks of the host and of the event loop."""
 
     now_ns: Callable[[], int]  # Returns CLOCK_MONOTONIC, ns. Any thread may call it.
-    utc_offset_ns: Callable[[], int]  # returns CLOCK_REALTIME minus CLOCK_MONOTONIC, ns
+    # Returns CLOCK_REALTIME minus CLOCK_MONOTONIC, ns, at most one tick old. Any thread may call it.
+    utc_offset_ns: Callable[[], int]
     # Returns this offset with its error; None if CLOCK_REALTIME is not synchronized. Any thread may call it.
     utc_reference: Callable[[], UtcReference | None]
     cpu_ns: Callable[[], int]  # returns the CPU time of the event loop's thread, ns

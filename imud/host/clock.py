@@ -141,7 +141,8 @@ def kernel_clock(name: str) -> Callable[[], int]:
 
 
 class HostClock:
-    """Reader of the host clocks. Synchronization: `now_ns` from any thread, all other methods from one thread."""
+    """Reader of the host clocks. Synchronization: `now_ns` and `kept_utc_offset_ns` from any thread, all other
+    methods from one thread."""
 
     __slots__ = (
         "_asleep_ns", "_boottime_ns", "_due_ns", "_held_ns", "_least_ns", "_most_ns", "_offset_ns", "_raw_ns",
@@ -186,6 +187,10 @@ class HostClock:
             self._held_ns = raw_ns
         else:
             self._measure()
+        return self._offset_ns
+
+    def kept_utc_offset_ns(self) -> int:
+        """Return the result of the last `utc_offset_ns`, without a reading. Any thread may call this method."""
         return self._offset_ns
 
     def utc_ns(self) -> int:

@@ -203,11 +203,14 @@ class SamplePath(ABC):
 
     def flush(self, now_ns: int) -> None:
         """Process an incomplete frame or sample: the link is idle."""
+        samples: list[Sample] = []
         try:
-            self._flush(now_ns)
+            self._flush(now_ns, samples)
         finally:
             if self.observer is not None:
                 self.observer.call("path", "flush", now_ns)
+        if samples:
+            self._finish(samples, now_ns)
 
     def reset(self) -> None:
         """Discard an incomplete frame or sample: the link was closed."""
@@ -219,17 +222,11 @@ class SamplePath(ABC):
         """Prepare for the data of a link after `begin`."""
 
     @abstractmethod
-    def _flush(self, now_ns: int) -> None: ...
+    def _flush(self, now_ns: int, samples: list[Sample]) -> None:
+        """Append the samples that waited for more data to `samples`."""
 
     @abstractmethod
     def _reset(self) -> None: ...
-
-    def publish_events(self, events: Sequence[CodecEvent], t_rx_ns: int) -> None:
-        """Publish the samples of `events` as one batch. The data of the events arrived at `t_rx_ns`."""
-        samples: list[Sample] = []
-        self._sort(events, t_rx_ns, self._utc_offset_ns(), samples)
-        if samples:
-            self._finish(samples, t_rx_ns)
 
     def _sort(
         self,
@@ -272,6 +269,8 @@ class SamplePath(ABC):
             self.observer.overruns(overruns)
 
     def _finish(self, samples: list[Sample], t_rx_ns: int) -> None:
+        """Publish samples as one batch. Their data arrived at `t_rx_ns`, and the path has reported it to its observer:
+        an output may read the host clocks, and this reading must follow the data in a recording."""
         self._ledger.samples += len(samples)
         self.newest = samples[-1]
         self.last_sample_ns = t_rx_ns
@@ -317,20 +316,23 @@ class StreamPath(SamplePath):
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
         """Process the bytes of one read. `t_rx_ns` is CLOCK_MONOTONIC right after the read."""
         self.last_data_ns = t_rx_ns
+        samples: list[Sample] = []
         try:
             if self._drain_edges is not None:
                 self._drain_edges()
             events = self.codec.feed(data)
             if events:
-                self.publish_events(events, t_rx_ns)
-                listener = self._listener
-                if listener is not None and listener.wants_samples:
-                    for event in events:
-                        if type(event) is Measurement:
-                            listener.on_sample(event)
+                self._sort(events, t_rx_ns, self._utc_offset_ns(), samples)
         finally:  # a recording must contain the data that caused an exception
             if self.observer is not None:
                 self.observer.data(data, t_rx_ns, -1)
+        if samples:
+            self._finish(samples, t_rx_ns)
+        listener = self._listener
+        if listener is not None and listener.wants_samples:
+            for event in events:
+                if type(event) is Measurement:
+                    listener.on_sample(event)
 
     def gather(self, data: bytes, t_rx_ns: int, waited_ns: int = 0) -> bool:
         """Process bytes, and hold their samples until `publish_gathered`. Return whether the bytes contained samples.
@@ -352,19 +354,17 @@ class StreamPath(SamplePath):
     def publish_gathered(self) -> None:
         """Publish the held samples as one batch."""
         samples, self.gathered = self.gathered, []
-        try:
-            if samples:
-                self._finish(samples, samples[-1].t_rx_ns)
-        finally:
-            if self.observer is not None:
-                self.observer.call("path", "publish_gathered")
+        if self.observer is not None:
+            self.observer.call("path", "publish_gathered")
+        if samples:
+            self._finish(samples, samples[-1].t_rx_ns)
 
-    def _flush(self, now_ns: int) -> None:
+    def _flush(self, now_ns: int, samples: list[Sample]) -> None:
         """Process complete frames inside an incomplete longer frame."""
         if self._ledger.bytes_pending:
             events = self.codec.flush()
             if events:
-                self.publish_events(events, now_ns)
+                self._sort(events, now_ns, self._utc_offset_ns(), samples)
 
     def _reset(self) -> None:
         self.codec.reset()
@@ -389,10 +389,11 @@ class CanPath(SamplePath):
         """Process the CAN frames of one read. Each frame has its own arrival time."""
         # A sample can consist of several frames. The measurement was made before the arrival of its first frame. Frames
         # of other devices can arrive between the frames of a sample.
+        samples: list[Sample] = []
+        t_rx_ns = self.last_data_ns
         try:
-            feed, ledger, samples = self.codec.feed_frame, self._ledger, list[Sample]()
+            feed, ledger = self.codec.feed_frame, self._ledger
             utc_offset_ns = self._utc_offset_ns()
-            t_rx_ns = self.last_data_ns
             for can_id, extended, data, t_rx_ns, after_loss in frames:
                 if after_loss:
                     self.codec.reset()
@@ -405,17 +406,17 @@ class CanPath(SamplePath):
                 if pending and ledger.frames_pending == 1:  # this frame is the first frame of the next sample
                     self._first_ns = t_rx_ns
             self.last_data_ns = t_rx_ns
-            if samples:
-                self._finish(samples, t_rx_ns)
         finally:
             if self.observer is not None:
                 self.observer.frames(frames)
+        if samples:
+            self._finish(samples, t_rx_ns)
 
-    def _flush(self, now_ns: int) -> None:
+    def _flush(self, now_ns: int, samples: list[Sample]) -> None:
         """Process a sample whose missing frames are not required."""
         events = self.codec.flush()
         if events:
-            self.publish_events(events, now_ns)
+            self._sort(events, now_ns, self._utc_offset_ns(), samples)
 
     def _reset(self) -> None:
         self.codec.reset()
@@ -565,7 +566,7 @@ class PolledPath(SamplePath):
         self._reset()
         self._is_back = True
 
-    def _flush(self, now_ns: int) -> None:
+    def _flush(self, now_ns: int, samples: list[Sample]) -> None:
         """Do nothing. A reading is complete or failed."""
 
     def _reset(self) -> None:
@@ -576,10 +577,10 @@ class PolledPath(SamplePath):
 
     def on_readings(self, readings: Sequence[Reading]) -> str:
         """Process readings, oldest first. Return the reason to identify the device again; empty without a reason."""
+        samples: list[Sample] = []
+        gone = ""
         try:
             utc_offset_ns = self._utc_offset_ns()
-            samples: list[Sample] = []
-            gone = ""
             edges = self.edges
             for reading in readings:
                 if gone:
@@ -593,12 +594,12 @@ class PolledPath(SamplePath):
                     gone = self._failed(reading)
                 else:
                     gone = self._decode(reading, stamp, utc_offset_ns, samples)
-            if samples:
-                self._finish(samples, samples[-1].t_rx_ns)
-            return gone
         finally:
             if self.observer is not None:
                 self.observer.readings(readings)
+        if samples:
+            self._finish(samples, samples[-1].t_rx_ns)
+        return gone
 
     def skip(self, reading: Reading) -> None:
         """Count the bytes of an unidentified device as skipped."""
