@@ -439,7 +439,7 @@ class PolledBus:
         # Claimed targets of a shared bus. Only the loop's thread uses them.
         self._owners: dict[int, BusMember] = {}
         self._failure: BaseException | None = None
-        self._worker = start_worker(name, self._round, self._failed)
+        self._worker = start_worker(name, self)
 
     # --- the loop's side ---------------------------------------------------------------------------------------------
 
@@ -488,7 +488,7 @@ class PolledBus:
         self._polling.remove(polling)
         polling.link.close()
 
-    def _round(self) -> int:
+    def do_round(self) -> int:
         """Run the commands, then due reads or one transfer of a script. Return the time until the next work, ns."""
         commands = self._commands
         while commands:
@@ -543,7 +543,7 @@ class PolledBus:
         with suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(callback)
 
-    def _failed(self, error: BaseException) -> None:
+    def round_failed(self, error: BaseException) -> None:
         """Raise an exception of a round again in the loop's thread."""
         self._failure = error
         self._call_loop(self._raise)

@@ -175,7 +175,7 @@ class SpoolWriter:
         # number of messages that `messages_per_s` allows now, and the time of this number
         self._allowed, self._allowed_ns = 1.0, now_ns()
         self._resume()
-        self._worker = start_worker("mqtt spool", self.work, self._failed)
+        self._worker = start_worker("mqtt spool", self)
         sender.wanting = self._worker.ring
 
     def close(self) -> None:
@@ -212,7 +212,7 @@ class SpoolWriter:
 
     # --- thread -------------------------------------------------------------------------------------------------------
 
-    def work(self) -> int:
+    def do_round(self) -> int:
         """Do the due work. Return the time until the next round, ns."""
         rest_ns = self._do_due()
         if self._is_closing:
@@ -373,5 +373,5 @@ class SpoolWriter:
             self.problem = self.problem or str(error)
         return COMMIT_NS if rate_hz is None else round(max(1.0 - self._allowed, 0.0) * NS_PER_S / rate_hz) or COMMIT_NS
 
-    def _failed(self, error: BaseException) -> None:
+    def round_failed(self, error: BaseException) -> None:
         self.failure = error

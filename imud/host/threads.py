@@ -1,7 +1,7 @@
 """Thread for a polled bus or a trigger line. It sleeps until the next deadline or the next edge of a line.
 
-A worker calls a function that returns the time of the next sleep. Tests call the function themselves at times of their
-choice (`tests/support/virtual_time.py`).
+A worker calls `do_round` of its job, which returns the time of the next sleep. Tests call this method themselves at
+times of their choice (`tests/support/event_loops.py`).
 """
 
 import gc
@@ -29,11 +29,21 @@ SWITCH_INTERVAL_S: Final = 0.0003
 
 SELECT_FDS: Final = 1024  # limit of descriptor numbers for `select` (FD_SETSIZE)
 
-Round = Callable[[], int]  # does the due work and returns the time until its next call, ns; 0: immediately
+
+class Job(Protocol):
+    """Work of a thread."""
+
+    def do_round(self) -> int:
+        """Do the due work. Return the time until the next call, ns; 0: immediately."""
+        ...
+
+    def round_failed(self, error: BaseException) -> None:
+        """Process an exception of `do_round`, in the thread. The worker makes no further call."""
+        ...
 
 
 class Worker(Protocol):
-    """Caller of a `Round` in a loop, one call at a time."""
+    """Caller of `Job.do_round` in a loop, one call at a time."""
 
     def ring(self) -> None:
         """End the present sleep, or skip the next sleep, because there is work. From any thread."""
@@ -48,7 +58,7 @@ class WatchingWorker(Worker, Protocol):
     """Worker with descriptors that can end its sleep."""
 
     def watch(self, fd: int, callback: Callable[[], None]) -> bool:
-        """End the sleep when a descriptor becomes readable: the thread of the `Round` calls `callback` first. One call
+        """End the sleep when a descriptor becomes readable: the thread of the job calls `callback` first. One call
         for all data since the last call; the worker reads no data. Return whether this is possible. From any thread."""
         ...
 
@@ -57,9 +67,8 @@ class WatchingWorker(Worker, Protocol):
         ...
 
 
-# Starts a worker: its name, its `Round`, and a function for an exception, which ends the worker
-StartWorker = Callable[[str, Round, Callable[[BaseException], None]], Worker]
-StartWatchingWorker = Callable[[str, Round, Callable[[BaseException], None]], WatchingWorker]
+StartWorker = Callable[[str, Job], Worker]  # starts a worker with a name
+StartWatchingWorker = Callable[[str, Job], WatchingWorker]
 
 
 def share_interpreter() -> None:
@@ -146,8 +155,8 @@ class DescriptorWait:
 class BusThread:
     """Thread that is a `WatchingWorker`."""
 
-    def __init__(self, name: str, work: Round, failed: Callable[[BaseException], None]) -> None:
-        self._work, self._failed = work, failed
+    def __init__(self, name: str, job: Job) -> None:
+        self._job = job
         self._wake = WakeEvent()
         # Used after the first `watch`. It costs twice as much as a WakeEvent.
         self._descriptors: DescriptorWait | None = None
@@ -191,14 +200,14 @@ class BusThread:
 
     def _run(self) -> None:
         _sharpen_timer()
-        work = self._work
+        do_round = self._job.do_round
         try:
             while not self._ended:
-                rest_ns = work()
+                rest_ns = do_round()
                 if rest_ns > 0 and not self._ended:
                     (self._descriptors or self._wake).wait(rest_ns / NS_PER_S)
         except BaseException as error:  # noqa: BLE001 - an internal error must end the daemon, not just this thread
-            self._failed(error)
+            self._job.round_failed(error)
 
 
 def _sharpen_timer() -> None:

@@ -163,7 +163,7 @@ class Trigger:
         self._on_stamps, self._on_end = on_stamps, on_end
         self._problem = None
         self._wave = SquareWave(self._line, self._rate_hz, self.counts, self._now_ns, self._pulse_ns)
-        self._worker = self._start_worker(f"trigger {self._line.title}", self._round, self._failed)
+        self._worker = self._start_worker(f"trigger {self._line.title}", self)
 
     def once(self) -> None:
         """Request one edge as soon as the line is low. Its time stamp is delivered as usual. Raises LinkError."""
@@ -197,7 +197,7 @@ class Trigger:
     # --- the trigger's thread
     # --------------------------------------------------------------------------------------------
 
-    def _round(self) -> int:
+    def do_round(self) -> int:
         wave = self._wave
         assert wave is not None
         if self._problem is not None:
@@ -218,7 +218,7 @@ class Trigger:
             self._handed_over_ns = now_ns
             self._call_loop(self.drain)
 
-    def _failed(self, error: BaseException) -> None:
+    def round_failed(self, error: BaseException) -> None:
         def fail() -> None:
             raise error
 

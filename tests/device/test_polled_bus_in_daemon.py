@@ -58,8 +58,12 @@ def test_an_internal_error_in_the_bus_thread_ends_the_daemon(bench: PolledBusBen
         asyncio.run(body())
 
 
-def _raise(error: BaseException) -> NoReturn:
-    raise error
+class SleepingJob:
+    def do_round(self) -> int:
+        return 1_000_000_000
+
+    def round_failed(self, error: BaseException) -> NoReturn:
+        raise error
 
 
 @pytest.mark.parametrize(("before_s", "after_s"), [(0.005, SWITCH_INTERVAL_S), (0.0001, 0.0001)])
@@ -68,7 +72,7 @@ def test_the_daemon_shortens_the_switch_interval_for_a_bus_thread(before_s: floa
     kept = sys.getswitchinterval()
     try:
         sys.setswitchinterval(before_s)
-        BusThread("bus", lambda: 1_000_000_000, _raise).end()
+        BusThread("bus", SleepingJob()).end()
         assert sys.getswitchinterval() == pytest.approx(after_s, abs=2e-6)
     finally:
         sys.setswitchinterval(kept)

@@ -19,6 +19,7 @@ from imud.contracts.status import DeviceState, DeviceStatus
 from imud.fleet.broker import EXTRA_MISSING
 from imud.fleet.publisher import MqttPublisher
 from imud.fleet.settings import Broker, MqttOptions, broker_of
+from imud.host.threads import Job
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.model.options import wrong_values
@@ -56,8 +57,8 @@ class PublisherBench:
         self.asked += 1
         return self.statuses
 
-    def _start(self, *args: object) -> HandWorker:
-        self.workers.append(HandWorker(*args))  # type: ignore[arg-type]  # same parameters as StartWorker
+    def _start(self, name: str, job: Job) -> HandWorker:
+        self.workers.append(HandWorker(name, job))
         return self.workers[-1]
 
     def tick(self, seconds: float = 1.0) -> None:

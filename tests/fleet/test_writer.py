@@ -17,7 +17,7 @@ from imud.fleet.settings import Broker, MqttOptions
 from imud.fleet.spool import Spool, SpoolError
 from imud.fleet.streams import Gateway
 from imud.fleet.writer import COMMIT_NS, DISK_RETRY_NS, MissedEvents, SentState, SpoolWriter, WriterQueue
-from imud.host.threads import BusThread, StartWorker
+from imud.host.threads import BusThread, Job, StartWorker
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S
@@ -61,8 +61,8 @@ class WriterBench:
         )  # fmt: skip
         self.seq = 0
 
-    def _start(self, *args: object) -> HandWorker:
-        self.workers.append(HandWorker(*args))  # type: ignore[arg-type]  # same parameters as StartWorker
+    def _start(self, name: str, job: Job) -> HandWorker:
+        self.workers.append(HandWorker(name, job))
         return self.workers[-1]
 
     def put(self, count: int) -> None:

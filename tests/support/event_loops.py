@@ -15,7 +15,7 @@ from typing import Any, ParamSpec
 from imud.device.polled_bus import PolledBuses
 from imud.host import event_loop
 from imud.host.clock import HostClock
-from imud.host.threads import Round
+from imud.host.threads import Job
 from imud.model.units import NS_PER_S
 
 P = ParamSpec("P")
@@ -99,8 +99,8 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 class LoopWorker:
     """A `Worker` of a bus without a thread. Callbacks of the loop make its turns."""
 
-    def __init__(self, _name: str, work: Round, failed: Callable[[BaseException], None]) -> None:
-        self._work, self._failed = work, failed
+    def __init__(self, _name: str, job: Job) -> None:
+        self._job = job
         self._loop = asyncio.get_running_loop()
         self._next: asyncio.Handle | None = self._loop.call_soon(self._run)
 
@@ -122,10 +122,10 @@ class LoopWorker:
 
     def _run(self) -> None:
         try:
-            rest_ns = self._work()
+            rest_ns = self._job.do_round()
         except Exception as error:  # noqa: BLE001 - as in the thread
             self._next = None
-            self._failed(error)
+            self._job.round_failed(error)
             return
         self._next = self._loop.call_later(rest_ns / NS_PER_S, self._run)
 

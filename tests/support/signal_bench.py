@@ -2,7 +2,6 @@
 
 import errno
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +9,7 @@ from typing import Any
 
 import gpiod as real
 
-from imud.host.threads import Round
+from imud.host.threads import Job
 from imud.lines.gpio import EVENT
 from imud.model.event import Event, EventKind
 from imud.sim.ports.pins import MemoryInput, MemoryLines, MemoryOutput
@@ -22,8 +21,8 @@ DEVICE = "bow"
 class HandWorker:
     """A `Worker` without a thread. The test calls `work`."""
 
-    def __init__(self, _name: str, work: Round, failed: Callable[[BaseException], None]) -> None:
-        self.work, self.failed = work, failed
+    def __init__(self, _name: str, job: Job) -> None:
+        self.work, self.failed = job.do_round, job.round_failed
         self.rung = 0
         self.ended = False
 
@@ -49,8 +48,8 @@ class SignalBench:
     def output(self, key: str) -> MemoryOutput:
         return self.memory.outputs[f"{DEVICE} {key}"]
 
-    def start_worker(self, name: str, work: Round, failed: Callable[[BaseException], None]) -> HandWorker:
-        self.workers.append(HandWorker(name, work, failed))
+    def start_worker(self, name: str, job: Job) -> HandWorker:
+        self.workers.append(HandWorker(name, job))
         return self.workers[-1]
 
     def raise_event(

@@ -97,7 +97,7 @@ class StreamWriter:
         self.is_ending = False  # True if the last records are in the queue; set by the event loop
         self._is_last = False  # True if the last records are in the present block
         self._hurry = False
-        self._worker = start_worker("record", self._round, self._failed)
+        self._worker = start_worker("record", self)
         queue.ring = self._worker.ring
 
     @property
@@ -113,14 +113,14 @@ class StreamWriter:
         self._hurry = False
         poll = select.poll()
         for _ in range(CLOSE_TRIES if flush else 0):
-            self._round()
+            self.do_round()
             if self.ended:
                 break
             poll.register(self._sock, select.POLLOUT)
             poll.poll(CLOSE_WAIT_MS)
         self._sender.close()
 
-    def _round(self) -> int:
+    def do_round(self) -> int:
         """Send waiting records until the socket is full. Return the time until the next round, ns."""
         sender = self._sender
         while not (self._hurry or sender.ended):
@@ -143,7 +143,7 @@ class StreamWriter:
                 break
         return WRITE_NS
 
-    def _failed(self, error: BaseException) -> None:
+    def round_failed(self, error: BaseException) -> None:
         self.failure = error
 
 

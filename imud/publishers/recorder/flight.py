@@ -307,14 +307,14 @@ class FlightWriter:
         self._is_open = False
         self.sends_ended = 0  # number of finished snapshots for clients
         self._sends: list[tuple[BlockSender, SegmentReader]] = []
-        self._worker = start_worker("flight", self._round, self._failed)
+        self._worker = start_worker("flight", self)
         queue.ring = self._worker.ring
 
     def close(self) -> None:
         """Do the queued work and end the thread. A second call does nothing."""
         self._queue.ring = lambda: None
         self._worker.end()
-        self._round()
+        self.do_round()
         for sender, reader in self._sends:
             sender.close()
             reader.close()
@@ -323,7 +323,7 @@ class FlightWriter:
 
     # --- thread -------------------------------------------------------------------------------------------------------
 
-    def _round(self) -> int:
+    def do_round(self) -> int:
         """Process the queue. Return the time until the next round, ns."""
         while (item := self._queue.take()) is not None:
             try:
@@ -407,7 +407,7 @@ class FlightWriter:
         self._is_open = False
         self.problem = reason_of(error)
 
-    def _failed(self, error: BaseException) -> None:
+    def round_failed(self, error: BaseException) -> None:
         self.failure = error
 
 

@@ -102,19 +102,19 @@ class RecordingWriter:
         self._gatherer = BlockGatherer()
         self._descriptor = -1
         self._synced_ns = now_ns()
-        self._worker = start_worker("recorder", self._round, self._failed)
+        self._worker = start_worker("recorder", self)
         queue.ring = self._worker.ring
 
     def close(self) -> None:
         """Write the waiting records and end the thread. A second call does nothing."""
         self._queue.ring = lambda: None
         self._worker.end()
-        self._round()
+        self.do_round()
         self._close_file()
 
     # --- thread -------------------------------------------------------------------------------------------------------
 
-    def _round(self) -> int:
+    def do_round(self) -> int:
         """Write the waiting records. Return the time until the next round, ns."""
         queue = self._queue
         while (item := queue.take()) is not None:
@@ -172,7 +172,7 @@ class RecordingWriter:
                 os.fdatasync(descriptor)
             os.close(descriptor)
 
-    def _failed(self, error: BaseException) -> None:
+    def round_failed(self, error: BaseException) -> None:
         self.failure = error
 
 

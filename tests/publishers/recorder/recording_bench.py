@@ -8,7 +8,7 @@ from imud.contracts.publisher import PutRecord
 from imud.formats import records
 from imud.formats.recording import RecordingReader
 from imud.formats.records import Kind, Record
-from imud.host.threads import Round
+from imud.host.threads import Job
 from imud.model.event import Event
 from imud.model.units import NS_PER_S
 from tests.support.event_loops import VirtualClock
@@ -64,8 +64,8 @@ class RecordingBench:
             raise_event=self.events.append,
         )  # fmt: skip
 
-    def start_worker(self, name: str, work: Round, failed: Callable[[BaseException], None]) -> HandWorker:
-        self.workers.append(HandWorker(name, work, failed))
+    def start_worker(self, name: str, job: Job) -> HandWorker:
+        self.workers.append(HandWorker(name, job))
         return self.workers[-1]
 
     def _utc_offset_ns(self) -> int:

@@ -8,6 +8,7 @@ import pytest
 
 from imud.formats import records
 from imud.formats.recording import RecordingReader
+from imud.host.threads import Job
 from imud.publishers.recorder.writer import RecordingWriter, RecordQueue
 from tests.support.event_loops import VirtualClock
 from tests.support.signal_bench import HandWorker
@@ -22,8 +23,8 @@ class WriterBench:
         self.workers: list[HandWorker] = []
         self.writer = RecordingWriter(self.queue, self.clock.now_ns, self._start)
 
-    def _start(self, *args: object) -> HandWorker:
-        self.workers.append(HandWorker(*args))  # type: ignore[arg-type]  # same parameters as StartWorker
+    def _start(self, name: str, job: Job) -> HandWorker:
+        self.workers.append(HandWorker(name, job))
         return self.workers[-1]
 
     def work(self) -> None:
