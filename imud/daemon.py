@@ -171,7 +171,7 @@ class Daemon:
             devices=self,
             outputs=OutputFacts(),
             latencies=self._latencies,
-            watch_line=watching(lines, host.now_ns),
+            watch_line=watching(lines, host),
             raise_event=self.send_event,
         )
         self._outputs = Outputs(self._context, extra or {})

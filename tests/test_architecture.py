@@ -166,7 +166,6 @@ LARGE_CONSTRUCTORS = {
     "imud.cli.doctor.surroundings.Surroundings",
     "imud.cli.setup.steps.SetupSteps",
     "imud.fleet.writer.SpoolWriter",
-    "imud.lines.sync.SyncSignals",
     "imud.sampling.clock.SampleClock",
     "imud.sampling.steering.Holdover",
     "imud.sim.can_module.PeriodicCanModule",

@@ -293,9 +293,33 @@ class WatchedInput(Protocol):
         ...
 
 
-# Returns a watched line from its options and a readable purpose. The third argument receives rising edges. The last
-# argument receives a message when the line fails for a new reason, and when it is open again.
-WatchLine = Callable[[InputOptions, str, OnEdges, Callable[[str], None]], WatchedInput]
+class PulseReceiver(Protocol):
+    """Receiver of a pulse per second. `imud.device` implements it; `imud.lines` cannot import `imud.device`."""
+
+    def on_pulses(self, edges: Sequence[Edge], /) -> None:
+        """Process edges of the line in their order."""
+        ...
+
+
+class LineOwner(Protocol):
+    """Owner of watched lines, which have different keys. Synchronization: the thread of the loop only."""
+
+    def on_edges(self, key: str, edges: Sequence[Edge], /) -> None:
+        """Process edges of a line in their order."""
+        ...
+
+    def on_level(self, key: str, active: bool | None, /) -> None:
+        """Process the level after each opening and after lost edges; None when the line is closed."""
+        ...
+
+    def on_line_report(self, key: str, message: str, /) -> None:
+        """Report that the line failed for a new reason, or that it is open again."""
+        ...
+
+
+# Returns a watched line from its options, a readable purpose, and its owner. The purpose is also the key of the line.
+# The line has only rising edges.
+WatchLine = Callable[[InputOptions, str, LineOwner], WatchedInput]
 
 
 class OutputLine(Protocol):

@@ -141,6 +141,29 @@ class Link(Protocol):
         ...
 
 
+class DeviceLink(Protocol):
+    """Link of one device, for the attachments of the device. `imud.device` implements it; `imud.lines` and `imud.utc`
+    cannot import `imud.device`."""
+
+    @property
+    def bit_rate(self) -> int:
+        """Bit rate of the link, bit/s."""
+        ...
+
+    @property
+    def is_free(self) -> bool:
+        """Whether other parts may send bytes: no request script runs, and no search changes the rate."""
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Send bytes. Raises LinkError."""
+        ...
+
+    def on_reset(self) -> None:
+        """Prepare for a reset of the device by its line."""
+        ...
+
+
 class StreamLink(Link, Protocol):
     """Source of bytes. It opens the port exclusively and runs in the asyncio loop."""
 

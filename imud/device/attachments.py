@@ -12,6 +12,7 @@ from imud.config.model import DeviceConfig
 from imud.contracts.command import Action
 from imud.contracts.driver import Driver
 from imud.contracts.lines import AlarmRanges, LineFactory
+from imud.contracts.link import DeviceLink
 from imud.contracts.status import LinesStatus, UtcStatus
 from imud.device.health import DeviceEvents
 from imud.device.utc import UtcFeed, make_utc_feed
@@ -21,7 +22,6 @@ from imud.lines.sync import LineActions, SyncSignals
 from imud.model.event import EventKind
 from imud.model.sample import Sample
 from imud.sampling.clock import SampleClock
-from imud.utc.rmc_feed import SentencePort
 
 
 class Attachment(Protocol):
@@ -44,36 +44,22 @@ class Attachment(Protocol):
         ...
 
 
-class DevicePort(SentencePort, Protocol):
-    """Transport of the device, for its attachments. `imud.device.transport` imports this module."""
-
-    def on_reset(self) -> None:
-        """Prepare for a reset of the device by its line."""
-        ...
-
-
 class Attachments:
     """Attachments of one device. Synchronization: the loop's thread only."""
 
     def __init__(
-        self, config: DeviceConfig, lines: LineFactory, port: DevicePort, events: DeviceEvents, host: HostClock
+        self, config: DeviceConfig, lines: LineFactory, link: DeviceLink, events: DeviceEvents, host: HostClock
     ) -> None:
-        """Create the configured attachments. `lines` opens the GPIO lines, `port` is the transport of the device."""
+        """Create the configured attachments. `lines` opens the GPIO lines, `link` is the transport of the device."""
         self._config = config
         self._events = events
         self._host = host
         raise_event = events.raise_event
-        self._utc: UtcFeed | None = make_utc_feed(config, port, host)
+        self._utc: UtcFeed | None = make_utc_feed(config, link, host)
         self._signals: SyncSignals | None = None
         if config.lines is not None:
-            on_pulses = self._utc.on_pulses if self._utc is not None else None
-            self._signals = SyncSignals(
-                config.name, config.lines, lines, raise_event, host.now_ns, on_pulses=on_pulses,
-                follow=host.utc_offset_ns,
-            )  # fmt: skip
-        self._reset: ResetLine | None = make_reset(
-            config.name, config.lines, lines, raise_event, host.now_ns, port.on_reset
-        )
+            self._signals = SyncSignals(config.name, config.lines, lines, raise_event, host, self._utc)
+        self._reset: ResetLine | None = make_reset(config.name, config.lines, lines, raise_event, host, link)
         self._line_actions = LineActions(self._reset, self._signals)
         # differences between the GPIO lines and the device settings, by the key of the line
         self._differences: Mapping[str, str] = {}

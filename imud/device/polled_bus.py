@@ -224,7 +224,7 @@ class BusMember:
         self._on_readings = on_readings
         self._left = False
         self._latency_ns = 0
-        self._polling = _Polling(self, bus.now_ns)
+        self._polling = _Polling(self, bus.host)
         bus.command(lambda: bus.add(self._polling))
 
     async def run(self, script: TransferScript[T], target: int, on_target: Callable[[int], None] = ignore_target) -> T:
@@ -249,7 +249,7 @@ class BusMember:
 
     def start(self, polls: Sequence[Poll], timetable: Timetable | None = None) -> None:
         """Start reads at the times of `timetable`. Without it: at deadlines, or in turns if the link has no rate."""
-        rate_hz, begin_ns, counts = self.link.rate_hz, self._bus.now_ns(), self.deadlines
+        rate_hz, begin_ns, counts = self.link.rate_hz, self._bus.host.now_ns(), self.deadlines
         schedule = timetable or (Schedule(rate_hz, begin_ns, counts) if rate_hz else RoundRobin(begin_ns, counts))
         self.command(lambda: self._polling.start(polls, schedule))
 
@@ -295,13 +295,13 @@ class BusMember:
 class _Polling:
     """Reads and scripts of one device. Synchronization: the bus's thread only."""
 
-    def __init__(self, member: BusMember, now_ns: Callable[[], int]) -> None:
+    def __init__(self, member: BusMember, host: HostClock) -> None:
         self.link = member.link
         self.scripts: deque[_ScriptRun] = deque()  # waiting transfer scripts; the first script is running
         self.schedule: Timetable | None = None  # times of the reads; None while imud does not read the device
         self.held = False  # whether a script forbids reads until its next transfer
         self._member = member
-        self._now_ns = now_ns
+        self._now_ns = host.now_ns
         self._polls: Sequence[Poll] = ()
         self._due_ns: list[int] = []
         self._readings: list[Reading] = []
@@ -429,7 +429,7 @@ class PolledBus:
     def __init__(
         self, name: str, loop: asyncio.AbstractEventLoop, host: HostClock, start_worker: StartWatchingWorker
     ) -> None:
-        self.now_ns = host.now_ns  # CLOCK_MONOTONIC
+        self.host = host
         self._loop = loop
         # Members of the bus. Only the bus's thread uses this list.
         self._polling: list[_Polling] = []
@@ -494,7 +494,7 @@ class PolledBus:
         while commands:
             commands.popleft()()
         polling, schedule = self._next()
-        if schedule is not None and schedule.due_ns <= self.now_ns() and self._in_row < POLLS_IN_ROW:
+        if schedule is not None and schedule.due_ns <= self.host.now_ns() and self._in_row < POLLS_IN_ROW:
             assert polling is not None
             self._in_row += 1
             polling.poll(schedule)
@@ -507,7 +507,7 @@ class PolledBus:
         self._hand_over(schedule.due_ns if schedule is not None else FAR_NS)
         if commands:
             return 0
-        return max(0, schedule.due_ns - self.now_ns()) if schedule is not None else IDLE_NS
+        return max(0, schedule.due_ns - self.host.now_ns()) if schedule is not None else IDLE_NS
 
     def _next(self) -> tuple[_Polling | None, Timetable | None]:
         """Return the device with the next read, and its timetable."""

@@ -58,7 +58,7 @@ class DataReady:
         self._events = events
         self._host = host
         line = lines.make_input(_rising(settings), f"{device} data_ready", True)
-        self._watched = WatchedLine(line, self._on_edges, self._on_level, self._report, host.now_ns)
+        self._watched = WatchedLine(line, "data_ready", self, host)
         self.edges = ReadyEdges(settings, round(NS_PER_S / rate_hz))
         """Edges for the path, which time-stamps the readings with them."""
         self._member: BusMember | None = None
@@ -129,7 +129,7 @@ class DataReady:
             edges_lost={**lines.edges_lost, "data_ready": watched.line.edges_lost},
         )
 
-    def _on_edges(self, edges: Sequence[Edge]) -> None:
+    def on_edges(self, _key: str, edges: Sequence[Edge]) -> None:
         self.edges.on_edges(edges)
         member, schedule = self._member, self._schedule
         if member is not None and schedule is not None:
@@ -138,7 +138,7 @@ class DataReady:
             run = member.note if schedule.has_read(times_ns[-1]) else member.command
             run(lambda: schedule.on_edges(times_ns, interval_ns))
 
-    def _on_level(self, active: bool | None) -> None:
+    def on_level(self, _key: str, active: bool | None) -> None:
         """Follow the line: imud has opened it, or closed it (None)."""
         if active is None:
             self._unwatch()
@@ -158,8 +158,8 @@ class DataReady:
             self._member.unwatch(self._watched_fd)
         self._watched_fd = -1
 
-    def _report(self, problem: str) -> None:
-        self._raise_event(problem)
+    def on_line_report(self, _key: str, message: str) -> None:
+        self._raise_event(message)
 
     def _raise_event(self, message: str, **detail: bool) -> None:
         words = f"line data_ready: {message}"

@@ -11,7 +11,7 @@ import msgspec
 
 from imud.config.model import DeviceConfig
 from imud.contracts.lines import Edge, UtcReference
-from imud.contracts.link import StreamLink
+from imud.contracts.link import DeviceLink, StreamLink
 from imud.contracts.status import UtcStatus
 from imud.host.clock import HostClock
 from imud.links import LINKS
@@ -21,7 +21,7 @@ from imud.sampling.clock import SampleClock
 from imud.utc import RMC_SOURCES
 from imud.utc.pps import ChronyFeed, PpsReference
 from imud.utc.receivers import RmcSource, SourceContext
-from imud.utc.rmc_feed import RmcFeed, SentencePort
+from imud.utc.rmc_feed import RmcFeed
 from imud.utc.system_clock import kernel_clock, system_reference
 
 ASK_NS = NS_PER_S  # interval between two updates of the reference, ns
@@ -42,7 +42,7 @@ class UtcFeed:
         self._source = source
         self._feed = feed
         self._chrony = chrony
-        self._pps = PpsReference(self._on_second if chrony is not None else None)
+        self._pps = PpsReference()
         self._system = system
         self._steady = host.steady  # pulses drift against a clock that NTP slews
         self._reference: UtcReference | None = None
@@ -82,7 +82,9 @@ class UtcFeed:
         """Add edges of the pulse per second at the SIN input of the device."""
         for edge in edges:
             if edge.rising:
-                self._pps.on_pulse(self._steady.steady_ns(edge.t_ns))
+                accepted = self._pps.on_pulse(self._steady.steady_ns(edge.t_ns))
+                if accepted and self._chrony is not None and (unix_s := self._pps.second_s) is not None:
+                    self._chrony.send_pulse(edge.t_ns, unix_s)
                 if self._feed is not None:
                     self._feed.on_pulse(edge.t_ns)
 
@@ -123,10 +125,6 @@ class UtcFeed:
         if self._feed is not None:
             self._feed.on_sentence(sentence, t_rx_ns)
 
-    def _on_second(self, t_ns: int, unix_s: int) -> None:
-        if self._chrony is not None:
-            self._chrony.send_pulse(self._steady.monotonic_ns(t_ns), unix_s)
-
 
 def _better(one: UtcReference | None, other: UtcReference | None) -> UtcReference | None:
     """Return the reference with the smaller error; the first if the errors are equal."""
@@ -135,7 +133,7 @@ def _better(one: UtcReference | None, other: UtcReference | None) -> UtcReferenc
     return one if one.error_ns <= other.error_ns else other
 
 
-def make_utc_feed(config: DeviceConfig, port: SentencePort, host: HostClock) -> UtcFeed | None:
+def make_utc_feed(config: DeviceConfig, port: DeviceLink, host: HostClock) -> UtcFeed | None:
     """Return the feed of a device; None if neither sentences nor a pulse per second are configured."""
     rmc, pps = config.rmc, config.lines.pps if config.lines is not None else None
     if rmc is None and pps is None:

@@ -11,6 +11,8 @@ from contextlib import suppress
 from typing import Final
 
 from imud.contracts.lines import DeviceLines, LineFactory, OutputLine, ResetOptions
+from imud.contracts.link import DeviceLink
+from imud.host.clock import HostClock
 from imud.lines.watched_line import RETRY_NS
 from imud.model.errors import CommandError, LinkError
 from imud.model.event import EventKind, RaiseEvent
@@ -47,15 +49,15 @@ class ResetLine:
         line: OutputLine,
         settings: ResetOptions,
         raise_event: RaiseEvent,
-        now_ns: Callable[[], int],
-        on_pulse: Callable[[], None],
+        host: HostClock,
+        link: DeviceLink,
     ) -> None:
-        """`now_ns` returns CLOCK_MONOTONIC. `on_pulse` is called right before each pulse."""
+        """`link.on_reset` is called right before each pulse."""
         self.problem = ""  # reason why imud cannot drive the line, one sentence; empty if it can
         self._line = line
         self._settings = settings
-        self._raise_event, self._now_ns = raise_event, now_ns
-        self._on_pulse = on_pulse
+        self._raise_event, self._host = raise_event, host
+        self._link = link
         self._is_open = False
         self._closed = False
         self._open_ns = 0
@@ -93,11 +95,11 @@ class ResetLine:
             if not self._is_open:
                 raise CommandError(f"reset: {self.problem or 'the line is not open'}")
             self._rounds = 0
-            self._on_pulse()
+            self._link.on_reset()
             try:
                 await reset(self._line, self._settings)
             except LinkError as error:
-                self._fail(error, self._now_ns())
+                self._fail(error, self._host.now_ns())
                 raise CommandError(f"reset: {error}") from error
 
     async def settled(self) -> None:
@@ -107,7 +109,9 @@ class ResetLine:
         """
         if self._due_at_start and self._is_open:
             self._due_at_start = False
-            self._raise_event(self._now_ns(), EventKind.LINK, "restarted by its reset line at the start", line="reset")
+            self._raise_event(
+                self._host.now_ns(), EventKind.LINK, "restarted by its reset line at the start", line="reset"
+            )
             with suppress(CommandError):  # `pulse` has raised the event
                 await self.pulse()
         async with self._pulsing:
@@ -148,11 +152,11 @@ def make_reset(
     lines: DeviceLines | None,
     factory: LineFactory,
     raise_event: RaiseEvent,
-    now_ns: Callable[[], int],
-    on_pulse: Callable[[], None],
+    host: HostClock,
+    link: DeviceLink,
 ) -> ResetLine | None:
     """Return the reset line of a device; None if it has no reset line."""
     if lines is None or lines.reset is None:
         return None
     output = factory.make_output(lines.reset, f"{device} reset")
-    return ResetLine(output, lines.reset, raise_event, now_ns, on_pulse)
+    return ResetLine(output, lines.reset, raise_event, host, link)

@@ -8,8 +8,9 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, Final
 
 from imud.contracts.command import Action
-from imud.contracts.lines import AlarmRanges, DeviceLines, Edge, LineFactory, Mark, OnEdges, TriggerStamp
+from imud.contracts.lines import AlarmRanges, DeviceLines, Edge, LineFactory, Mark, PulseReceiver
 from imud.contracts.status import LinesStatus
+from imud.host.clock import HostClock
 from imud.lines.alarm import AlarmMonitor
 from imud.lines.reset import ResetLine
 from imud.lines.trigger import SinTrigger, TriggerCounts
@@ -35,49 +36,34 @@ class SyncSignals:
         lines: DeviceLines,
         factory: LineFactory,
         raise_event: RaiseEvent,
-        now_ns: Callable[[], int],
-        *,
-        on_pulses: OnEdges | None = None,
-        follow: Callable[[], object] = int,
+        host: HostClock,
+        pulses: PulseReceiver | None = None,
     ) -> None:
-        """`now_ns` returns CLOCK_MONOTONIC. `on_pulses` receives the edges of PPS after the clock.
-
-        `follow` updates the steady time. It is called before edges are delivered, because the clock converts them.
-        """
-        self._raise_event, self._now_ns, self._follow = raise_event, now_ns, follow
-        self._on_pulses = on_pulses
+        """`pulses` receives the edges of PPS after the clock."""
+        self._raise_event, self._host = raise_event, host
+        self._pulses = pulses
         self._clock: SampleClock | None = None
         self._alarm = AlarmMonitor(raise_event)
         self._closed = False
         self._watched: dict[str, WatchedLine] = {}
-        handlers: dict[str, OnEdges] = {
-            "sout": self._on_sout, "sout_div": self._on_divided, "pps": self._on_pps, "alarm": self._on_alarm
-        }  # fmt: skip
-        for key, on_edges in handlers.items():
+        for key in ("sout", "sout_div", "pps", "alarm"):
             settings = getattr(lines, key)
             if settings is not None:
                 line = factory.make_input(settings, f"{device} {key}", key != "alarm")
-                self._watched[key] = WatchedLine(
-                    line,
-                    on_edges,
-                    self._on_alarm_level if key == "alarm" else _ignore_level,
-                    self._reporter(key),
-                    now_ns,
-                    watch=key not in WITH_FRAMES,
-                )
+                self._watched[key] = WatchedLine(line, key, self, host, watch=key not in WITH_FRAMES)
         self._drained = [watched for key, watched in self._watched.items() if key != "alarm"]
         self._sin: SinTrigger | None = None
         if lines.sin is not None:
             output = factory.make_output(lines.sin, f"{device} sin")
-            self._sin = SinTrigger(
-                output, lines.sin, self._on_stamps, self._reporter("sin"), now_ns, factory.start_worker
-            )
+            self._sin = SinTrigger(output, lines.sin, raise_event, host, factory.start_worker)
 
     def start(self, clock: SampleClock) -> None:
         """Deliver edges to the clock of the detected device, and drive SIN."""
         self._clock = clock
+        if self._sin is not None:
+            self._sin.start(clock)
         self._show_alarm()
-        self.tick(self._now_ns(), None)
+        self.tick(self._host.now_ns(), None)
 
     def tick(self, now_ns: int, newest: Sample | None) -> None:
         """Open due lines, raise pending events, and compare ALARM with the newest sample. Call this method at 10 Hz."""
@@ -156,36 +142,28 @@ class SyncSignals:
             trigger_late_sum_ns=counts.sum_late_ns,
         )
 
-    # --- edges by line -----------------------------------------------------------------------------------------------
+    # --- events of the lines -----------------------------------------------------------------------------------------
 
-    def _on_sout(self, edges: Sequence[Edge]) -> None:
+    def on_edges(self, key: str, edges: Sequence[Edge]) -> None:
+        if key == "alarm":
+            self._alarm.line.on_edges(edges)
+            self._show_alarm()
+            return
+        if key != "sout_div":
+            self._host.utc_offset_ns()  # updates the steady time, by which the clock converts the edges
         if self._clock is not None:
-            self._follow()
-            self._clock.add_edges("sout", edges)
+            self._clock.add_edges(key, edges)
+        if key == "pps" and self._pulses is not None:
+            self._pulses.on_pulses(edges)
 
-    def _on_divided(self, edges: Sequence[Edge]) -> None:
-        if self._clock is not None:
-            self._clock.add_edges("sout_div", edges)
+    def on_level(self, key: str, active: bool | None) -> None:
+        """Follow the level of ALARM. The edges of the other lines carry the information."""
+        if key == "alarm":
+            self._alarm.line.on_level(self._host.now_ns(), active)
+            self._show_alarm()
 
-    def _on_pps(self, edges: Sequence[Edge]) -> None:
-        self._follow()
-        if self._clock is not None:
-            self._clock.add_edges("pps", edges)
-        if self._on_pulses is not None:
-            self._on_pulses(edges)
-
-    def _on_stamps(self, stamps: Sequence[TriggerStamp]) -> None:
-        if self._clock is not None:
-            self._follow()
-            self._clock.add_triggers(stamps)
-
-    def _on_alarm(self, edges: Sequence[Edge]) -> None:
-        self._alarm.line.on_edges(edges)
-        self._show_alarm()
-
-    def _on_alarm_level(self, active: bool | None) -> None:
-        self._alarm.line.on_level(self._now_ns(), active)
-        self._show_alarm()
+    def on_line_report(self, key: str, message: str) -> None:
+        self._raise_event(self._host.now_ns(), EventKind.LINK, f"line {key}: {message}", line=key)
 
     def _show_alarm(self) -> None:
         if self._clock is not None:
@@ -197,13 +175,6 @@ class SyncSignals:
             mark.t_ns, EventKind.MARK, f"pulse {mark.number} on SOUT_DIV belongs to {words}",
             t_ns=mark.t_ns, edge_seq=mark.number, seq=mark.seq,
         )  # fmt: skip
-
-    def _reporter(self, key: str) -> Callable[[str], None]:
-        return lambda message: self._raise_event(self._now_ns(), EventKind.LINK, f"line {key}: {message}", line=key)
-
-
-def _ignore_level(_active: bool | None) -> None:
-    """Ignore the level of a line whose edges carry the information."""
 
 
 def _no_script(_target: object) -> None:

@@ -13,10 +13,13 @@ from contextlib import suppress
 from typing import Final
 
 from imud.contracts.lines import OnLineEnd, OutputLine, TriggerOptions, TriggerStamp
+from imud.host.clock import HostClock
 from imud.host.threads import BusThread, StartWorker, Worker
 from imud.lines.watched_line import RETRY_NS
 from imud.model.errors import LinkError
+from imud.model.event import EventKind, RaiseEvent
 from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sampling.clock import SampleClock
 
 # Length of a pulse, ns, at most half a period. The manual gives no length. 1 ms passes each level shifter.
 PULSE_NS: Final = NS_PER_MS
@@ -248,16 +251,15 @@ class SinTrigger:
         self,
         line: OutputLine,
         settings: TriggerOptions,
-        on_stamps: OnStamps,
-        report: Callable[[str], None],
-        now_ns: Callable[[], int],
+        raise_event: RaiseEvent,
+        host: HostClock,
         start_worker: StartWorker,
     ) -> None:
-        """`report` receives a message if the line fails for a new reason."""
         self.problem = ""  # reason why imud cannot drive SIN, one sentence; empty if it can
-        self._line, self._on_stamps, self._report, self._now_ns = line, on_stamps, report, now_ns
+        self._line, self._raise_event, self._host = line, raise_event, host
+        self._clock: SampleClock | None = None
         pulse_ns = round(settings.pulse_ms * NS_PER_MS)
-        self._trigger = Trigger(line, settings.rate_hz, now_ns, start_worker=start_worker, pulse_ns=pulse_ns)
+        self._trigger = Trigger(line, settings.rate_hz, host.now_ns, start_worker=start_worker, pulse_ns=pulse_ns)
         # Delivers the time stamps of all edges so far. Does not block.
         self.drain: Callable[[], None] = self._trigger.drain
         self._running = False
@@ -266,6 +268,10 @@ class SinTrigger:
     @property
     def counts(self) -> TriggerCounts:
         return self._trigger.counts
+
+    def start(self, clock: SampleClock) -> None:
+        """Deliver time stamps to the clock of the detected device. `tick` drives the line."""
+        self._clock = clock
 
     def tick(self, now_ns: int) -> None:
         """Start to drive the line if due. Call this method at 10 Hz."""
@@ -286,15 +292,22 @@ class SinTrigger:
 
     def stop(self) -> None:
         """Leave the line inactive and release it. The next `tick` opens it again. A second call does nothing."""
+        self._clock = None
         self._trigger.stop()
         self._line.close()
         self._running = False
         self._due_ns = 0
 
+    def _on_stamps(self, stamps: Sequence[TriggerStamp]) -> None:
+        if self._clock is not None:
+            self._host.utc_offset_ns()  # updates the steady time, by which the clock converts the time stamps
+            self._clock.add_triggers(stamps)
+
     def _end(self, error: LinkError) -> None:
         self._line.close()
         self._running = False
-        self._due_ns = self._now_ns() + RETRY_NS
+        now_ns = self._host.now_ns()
+        self._due_ns = now_ns + RETRY_NS
         if str(error) != self.problem:
             self.problem = str(error)
-            self._report(self.problem)
+            self._raise_event(now_ns, EventKind.LINK, f"line sin: {self.problem}", line="sin")

@@ -1,9 +1,10 @@
 """Input line that imud keeps open. It reports a failure once, and opens the line again when possible."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
-from imud.contracts.lines import Edge, InputLine, InputOptions, LineFactory, OnEdges, WatchedInput, WatchLine
+from imud.contracts.lines import Edge, InputLine, InputOptions, LineFactory, LineOwner, WatchedInput, WatchLine
+from imud.host.clock import HostClock
 from imud.model.errors import LinkError
 from imud.model.units import NS_PER_S
 
@@ -14,28 +15,14 @@ RETRY_NS: Final = 5 * NS_PER_S
 class WatchedLine:
     """Input line that imud keeps open. Synchronization: the event loop's thread only."""
 
-    def __init__(
-        self,
-        line: InputLine,
-        on_edges: OnEdges,
-        on_level: Callable[[bool | None], None],
-        report: Callable[[str], None],
-        now_ns: Callable[[], int],
-        *,
-        watch: bool = True,
-    ) -> None:
-        """`on_level` receives the level after each opening and after lost edges, and None when the line is closed.
-
-        `report` receives a message if the line fails for a new reason, and when it is open again. Without `watch`, the
-        event loop does not wake up for edges. `drain` and `tick` then deliver them.
-        """
+    def __init__(self, line: InputLine, key: str, owner: LineOwner, host: HostClock, *, watch: bool = True) -> None:
+        """The event loop wakes up for edges if `watch` is true. Otherwise `drain` and `tick` deliver them."""
         self.line = line
         self.problem = ""  # reason why the line is closed, one sentence; empty if it is open
         self.edges = 0  # number of edges since the start
-        self._on_edges = on_edges
-        self._on_level = on_level
-        self._report = report
-        self._now_ns = now_ns
+        self._key = key
+        self._owner = owner
+        self._host = host
         self._watch = watch
         self._is_open = False
         self._due_ns = 0
@@ -68,7 +55,7 @@ class WatchedLine:
         self._is_open = False
         self._due_ns = 0
         self.line.close()
-        self._on_level(None)
+        self._owner.on_level(self._key, None)
 
     def _open(self, now_ns: int) -> None:
         try:
@@ -81,34 +68,34 @@ class WatchedLine:
         self._is_open = True
         if self.problem:
             self.problem = ""
-            self._report("watched again")
+            self._owner.on_line_report(self._key, "watched again")
         self._read_level()
 
     def _count_edges(self, edges: Sequence[Edge]) -> None:
         self.edges += len(edges)
-        self._on_edges(edges)
+        self._owner.on_edges(self._key, edges)
 
     def _read_level(self) -> None:
         try:
-            self._on_level(self.line.level())
+            self._owner.on_level(self._key, self.line.level())
         except LinkError as error:
             self._end(error)
 
     def _end(self, error: LinkError) -> None:
         self.close()
-        self._fail(error, self._now_ns())
+        self._fail(error, self._host.now_ns())
 
     def _fail(self, error: LinkError, now_ns: int) -> None:
         self._due_ns = now_ns + RETRY_NS
         if str(error) != self.problem:
             self.problem = str(error)
-            self._report(self.problem)
+            self._owner.on_line_report(self._key, self.problem)
 
 
-def watching(lines: LineFactory, now_ns: Callable[[], int]) -> WatchLine:
+def watching(lines: LineFactory, host: HostClock) -> WatchLine:
     """Return a function that keeps lines open that belong to no device."""
 
-    def watch(settings: InputOptions, purpose: str, on_edges: OnEdges, report: Callable[[str], None]) -> WatchedInput:
-        return WatchedLine(lines.make_input(settings, purpose, True), on_edges, lambda _level: None, report, now_ns)
+    def watch(settings: InputOptions, purpose: str, owner: LineOwner) -> WatchedInput:
+        return WatchedLine(lines.make_input(settings, purpose, True), purpose, owner, host)
 
     return watch

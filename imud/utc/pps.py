@@ -40,12 +40,10 @@ MAD_TO_SIGMA: Final = 1.4826  # ratio of sigma to the median absolute deviation 
 class PpsReference:
     """Estimator of UTC from pulses and sentences. Synchronization: one thread."""
 
-    def __init__(self, on_second: Callable[[int, int], None] | None = None) -> None:
-        """`on_second(t_ns, unix_s)` is called for each pulse with a known second."""
+    def __init__(self) -> None:
         self.pulses = 0  # number of accepted pulses
         self.pulses_ignored = 0
         self.sentences_ignored = 0  # number of sentences that were damaged, invalid, or matched no pulse
-        self._on_second = on_second
         self._stamps: deque[int] = deque(maxlen=PULSES_KEPT)
         self._seconds: deque[int] = deque(maxlen=PULSES_KEPT)  # seconds of the time stamps, from an arbitrary start
         self._candidates: list[int] = []
@@ -64,9 +62,12 @@ class PpsReference:
         self._seconds.append(self._seconds[-1] + seconds)
         self._fit = None
         self.pulses += 1
-        if self._base_s is not None and self._on_second is not None:
-            self._on_second(t_ns, self._base_s + self._seconds[-1])
         return True
+
+    @property
+    def second_s(self) -> int | None:
+        """Unix second that the newest accepted pulse starts; None if it is unknown."""
+        return None if self._base_s is None else self._base_s + self._seconds[-1]
 
     def on_sentence(self, sentence: bytes, t_rx_ns: int) -> None:
         """Add an RMC sentence of the receiver of the pulses. `t_rx_ns` is CLOCK_MONOTONIC at its arrival."""

@@ -9,9 +9,10 @@ writes a sentence completely or not at all, and never while a script runs on the
 from collections import Counter
 from collections.abc import Callable
 from enum import StrEnum
-from typing import Final, Protocol
+from typing import Final
 
 from imud.contracts.lines import UtcReference
+from imud.contracts.link import DeviceLink
 from imud.formats.nmea0183 import Rmc, RmcFault, as_gprmc, parse
 from imud.model.errors import LinkError
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
@@ -36,28 +37,10 @@ class Refusal(StrEnum):
     LINK = "link"  # the port did not accept the bytes
 
 
-class SentencePort(Protocol):
-    """Port of a device for sentences. `imud.device` implements it; this part cannot import `imud.device`."""
-
-    @property
-    def bit_rate(self) -> int:
-        """Baud rate of the port."""
-        ...
-
-    @property
-    def is_free(self) -> bool:
-        """Whether other parts may send bytes: no request script runs, and no search changes the rate."""
-        ...
-
-    def write(self, data: bytes) -> None:
-        """Send bytes. Raises LinkError."""
-        ...
-
-
 class RmcFeed:
     """Feed of sentences to the device's port. Synchronization: the event loop's thread only."""
 
-    def __init__(self, port: SentencePort, now_ns: Callable[[], int], rate_hz: int = 1) -> None:
+    def __init__(self, port: DeviceLink, now_ns: Callable[[], int], rate_hz: int = 1) -> None:
         """`rate_hz` is the maximum rate of sentences to the device."""
         self.sent = 0
         self.refused: Counter[str] = Counter()  # number of rejected sentences for each `Refusal`

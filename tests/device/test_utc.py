@@ -33,6 +33,8 @@ class FakePort:
     def write(self, data: bytes) -> None:
         self.written.append(data)
 
+    def on_reset(self) -> None: ...
+
 
 class FakeChrony:
     problem = ""

@@ -57,6 +57,8 @@ class FreePort:
 
     def write(self, data: bytes) -> None: ...
 
+    def on_reset(self) -> None: ...
+
 
 def _feed(reference: UtcReference | None) -> RmcFeed:
     feed = RmcFeed(FreePort(), lambda: NOW_NS)

@@ -65,8 +65,9 @@ class Scene:
         signals = SignalBench()
         self.clock, self.events = signals.clock, signals.events
         self.announced = 0
+        self.bit_rate, self.is_free = 115_200, True
         made = make_reset(
-            DEVICE, DeviceLines(reset=settings), signals.factory, signals.raise_event, self.clock.now_ns, self._on_pulse
+            DEVICE, DeviceLines(reset=settings), signals.factory, signals.raise_event, self.clock.host, self
         )
         assert made is not None
         self.reset: ResetLine = made
@@ -92,7 +93,9 @@ class Scene:
             self.tick()
             await self.reset.not_found(self.clock.now_ns())
 
-    def _on_pulse(self) -> None:
+    def write(self, data: bytes) -> None: ...
+
+    def on_reset(self) -> None:
         assert not self.line.active
         self.announced += 1
 

@@ -1,6 +1,7 @@
 """Lines of one device: the edges and their order, failures, and the release of all lines."""
 
 import asyncio
+from collections.abc import Sequence
 
 import pytest
 
@@ -37,10 +38,11 @@ class SyncBench(SignalBench):
     def __init__(self, lines: DeviceLines = ALL) -> None:
         super().__init__()
         self.pulses: list[Edge] = []
-        self.signals = SyncSignals(
-            DEVICE, lines, self.factory, self.raise_event, self.clock.now_ns, on_pulses=self.pulses.extend
-        )
+        self.signals = SyncSignals(DEVICE, lines, self.factory, self.raise_event, self.clock.host, self)
         self.sample_clock = sample_clock()
+
+    def on_pulses(self, edges: Sequence[Edge]) -> None:
+        self.pulses += edges
 
     def start(self) -> None:
         self.signals.start(self.sample_clock)

@@ -1,6 +1,7 @@
 """Input line that imud keeps open: due openings, failures reported once, and reads of the level."""
 
 import asyncio
+from collections.abc import Sequence
 
 from imud.contracts.lines import Edge, InputOptions, OnEdges, OnLineEnd
 from imud.lines.watched_line import WatchedLine, watching
@@ -20,10 +21,16 @@ class Watched:
         self.edges: list[Edge] = []
         self.levels: list[bool | None] = []
         self.reports: list[str] = []
-        self.watched = WatchedLine(
-            self.line, self.edges.extend, self.levels.append, self.reports.append, self.clock.now_ns,
-            watch=watch,
-        )  # fmt: skip
+        self.watched = WatchedLine(self.line, "sout", self, self.clock.host, watch=watch)
+
+    def on_edges(self, _key: str, edges: Sequence[Edge]) -> None:
+        self.edges += edges
+
+    def on_level(self, _key: str, active: bool | None) -> None:
+        self.levels.append(active)
+
+    def on_line_report(self, _key: str, message: str) -> None:
+        self.reports.append(message)
 
 
 @in_loop
@@ -141,18 +148,17 @@ async def test_a_failed_read_of_the_level_closes_the_line() -> None:
 
 @in_loop
 async def test_a_line_of_no_device_is_kept_open_by_its_settings() -> None:
-    clock, edges, reports = VirtualClock(), list[Edge](), list[str]()
-    memory = MemoryLines(clock.now_ns)
-    watch = watching(memory.maker, clock.now_ns)
-    watched = watch(InputOptions(line="GPIO5"), "flight recorder", edges.extend, reports.append)
+    it = Watched()
+    memory = MemoryLines(it.clock.now_ns)
+    watched = watching(memory.maker, it.clock.host)(InputOptions(line="GPIO5"), "flight recorder", it)
     line = memory.inputs["flight recorder"]
     line.open_error = BUSY
     watched.tick(0)
-    assert reports == [str(BUSY)]
+    assert it.reports == [str(BUSY)]
     line.open_error = None
     watched.tick(RETRY_NS)
     line.pulse(10, 5)
     await asyncio.sleep(0)
-    assert edges == [Edge(10, True, 1)]  # imud requests only rising edges
+    assert it.edges == [Edge(10, True, 1)]  # imud requests only rising edges
     watched.close()
     assert not line.is_open

@@ -38,6 +38,8 @@ class FeedBench:
             raise LinkError("the port is gone")
         self.sent.append(data)
 
+    def on_reset(self) -> None: ...
+
     def give(self, named_s: float, at_s: float, sentence: bytes | None = None, *, waited_s: float = 0.0) -> str:
         """Give the sentence of second `named_s` at `at_s`, both after UTC_S. Return the reason to reject it, or ""."""
         before = dict(self.feed.refused)

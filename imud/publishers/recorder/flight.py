@@ -514,7 +514,7 @@ class FlightRecorder:
             self._queue.mark(mark)
         self._begin_segment(context.clock.now_ns())
         if self._settings.line is not None:
-            self._line = context.watch_line(self._settings.line, "flight recorder", self._on_edges, self._on_line)
+            self._line = context.watch_line(self._settings.line, "flight recorder", self)
         context.outputs.snapshots.append(self.snapshot)
         context.outputs.flights.append(self.status)
         where = f"in {self._settings.directory}" if self._own is not None else "in memory"
@@ -670,12 +670,15 @@ class FlightRecorder:
 
     # --- GPIO line ----------------------------------------------------------------------------------------------------
 
-    def _on_edges(self, edges: Sequence[Edge]) -> None:
+    def on_edges(self, _key: str, edges: Sequence[Edge]) -> None:
         if any(edge.rising for edge in edges):
             self._alert("", "the line of the flight recorder became active")
 
-    def _on_line(self, problem: str) -> None:
-        self._raise(self._context.clock.now_ns(), f"flight recorder: GPIO line: {problem}")
+    def on_level(self, _key: str, _active: bool | None) -> None:
+        """Ignore the level: only an edge is an alert."""
+
+    def on_line_report(self, _key: str, message: str) -> None:
+        self._raise(self._context.clock.now_ns(), f"flight recorder: GPIO line: {message}")
 
     def _raise(self, now_ns: int, message: str, device: str = "", **detail: str | int) -> None:
         log.warning("%s", message)

@@ -1,12 +1,12 @@
 """Flight recorder: kept data, saved alerts, and reports."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from imud.contracts.lines import Edge, InputOptions, OnEdges
+from imud.contracts.lines import Edge, InputOptions, LineOwner
 from imud.contracts.publisher import Batch
 from imud.formats import records
 from imud.formats.recording import RecordingReader
@@ -34,18 +34,15 @@ class FlightBench(RecordingBench):
             directory=str(self.folder), devices=devices,
             flight=FlightOptions(**{"enabled": True, "minutes": 1, "after_s": 10, **flight}),
         )  # fmt: skip
-        self.edges: list[OnEdges] = []
-        self.reports: list[Callable[[str], None]] = []
         object.__setattr__(self.context, "watch_line", self._watch)
         directory = RecordingDirectory(self.folder, settings.keep_bytes)
         self.flight = FlightRecorder(settings, self.context, directory, self.start_worker)
         self.flight.start()
         self.tick()
 
-    def _watch(self, _settings: InputOptions, purpose: str, on_edges: OnEdges, report: Callable[[str], None]) -> NoLine:
+    def _watch(self, _settings: InputOptions, purpose: str, owner: LineOwner) -> NoLine:
         assert purpose == "flight recorder"
-        self.edges.append(on_edges)
-        self.reports.append(report)
+        assert owner is self.flight
         return NoLine()
 
     def tick(self, seconds: float = 0.1) -> None:
@@ -139,13 +136,13 @@ def test_a_missing_device_is_an_alert_if_it_is_recorded(tmp_path: Path) -> None:
 
 def test_an_active_line_is_an_alert(tmp_path: Path) -> None:
     bench = FlightBench(tmp_path, line=InputOptions(line="GPIO5"), after_s=0)
-    bench.edges[0]([Edge(1, False, 1)])
+    bench.flight.on_edges("", [Edge(1, False, 1)])
     bench.tick(2)
     assert bench.files == []
-    bench.edges[0]([Edge(1, True, 2), Edge(2, False, 3)])
+    bench.flight.on_edges("", [Edge(1, True, 2), Edge(2, False, 3)])
     bench.tick(2)
     (file,) = bench.files
-    bench.reports[0]("no line GPIO5")
+    bench.flight.on_line_report("", "no line GPIO5")
     assert bench.messages == [
         f"saved {file}: the line of the flight recorder became active", "flight recorder: GPIO line: no line GPIO5"
     ]  # fmt: skip
