@@ -165,7 +165,6 @@ LONG_CLASSES = {
 LARGE_CONSTRUCTORS = {
     "imud.cli.doctor.surroundings.Surroundings",
     "imud.cli.setup.steps.SetupSteps",
-    "imud.fleet.writer.SpoolWriter",
     "imud.sampling.clock.SampleClock",
     "imud.sampling.steering.Holdover",
     "imud.sim.can_module.PeriodicCanModule",

@@ -27,7 +27,6 @@ from imud.fleet.messages import (
     STATE,
     STATUS,
     VERSION,
-    GatewayClock,
     Stream,
     boot_text,
     is_name,
@@ -36,7 +35,7 @@ from imud.fleet.messages import (
 from imud.fleet.sender import MqttSender
 from imud.fleet.settings import DeviceSending, MqttOptions, broker_of
 from imud.fleet.spool import Spool
-from imud.fleet.streams import Gateway
+from imud.fleet.streams import Gateway, gateway_clock
 from imud.fleet.writer import SentState, SpoolWriter, WriterQueue
 from imud.formats.slot import PRESENT_BITS, SLOT_BYTES, SLOT_FIELDS, SLOT_LAYOUT_VERSION, SYNC_CODES
 from imud.host.threads import BusThread, StartWorker
@@ -189,10 +188,8 @@ class MqttPublisher:
             )
             self._commands.answer = self._sender.reply
             self._sender.commands = self._commands
-        self._writer = SpoolWriter(
-            settings, self._gateway, self._queue, self._spool, self._sender, now_ns, utc_offset_ns, self._start_worker,
-            self._clock,
-        )  # fmt: skip
+        self._writer = SpoolWriter(settings, self._gateway, self._queue, self._spool, self._sender, context.clock)
+        self._writer.start(self._start_worker)
         lock, self._lock = self._lock, -1
         self._writer.closed = lambda: os.close(lock)  # if the disk blocks the writer, its thread keeps the lock
         self._sender.retain({will.topic: self._state(online=True)})
@@ -324,18 +321,10 @@ class MqttPublisher:
         """Return the state of the gateway: birth, death or last will."""
         found: dict[str, object] = {"v": VERSION, "online": online, "boot": boot_text(self._context.epoch)}
         if online:
-            found |= {"imud": __version__, "devices": sorted(self._sent), "clock": self._clock()}
+            found |= {"imud": __version__, "devices": sorted(self._sent), "clock": gateway_clock(self._context.clock)}
         else:
             found["reason"] = reason
         return msgspec.json.encode(found)
-
-    def _clock(self) -> GatewayClock:
-        """Return the wall clock. The writer's thread also calls this method."""
-        context = self._context
-        reference = context.clock.utc_reference()
-        if reference is None:
-            return GatewayClock(context.clock.now_ns(), context.clock.utc_offset_ns(), synchronised=False)
-        return GatewayClock(context.clock.now_ns(), reference.offset_ns, synchronised=True, error_ns=reference.error_ns)
 
     # --- problems -----------------------------------------------------------------------------------------------------
 

@@ -7,9 +7,10 @@
 Samples that had no room in the queue cause a gap in `seq`. A message of the kind `dropped` covers the gap.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
+from imud.contracts.publisher import PublisherClock
 from imud.fleet.accounts import StreamPosition
 from imud.fleet.messages import (
     SAMPLES_MAX,
@@ -40,12 +41,12 @@ INTERVALS_MAX: Final = 100  # maximum number of intervals in one message, about 
 LATE_NS: Final = NS_PER_S
 
 
-ReadClock = Callable[[], GatewayClock | None]  # reads the wall clock of this gateway and its state
-
-
-def no_clock() -> GatewayClock | None:
-    """Return None: the messages contain no clock."""
-    return None
+def gateway_clock(clock: PublisherClock) -> GatewayClock:
+    """Return the wall clock of this gateway and its state. Any thread may call this function."""
+    reference = clock.utc_reference()
+    if reference is None:
+        return GatewayClock(clock.now_ns(), clock.utc_offset_ns(), synchronised=False)
+    return GatewayClock(clock.now_ns(), reference.offset_ns, synchronised=True, error_ns=reference.error_ns)
 
 
 class Gateway(NamedTuple):
@@ -59,7 +60,7 @@ class Gateway(NamedTuple):
 class _Numbered:
     """One stream: makes messages and counts their numbers."""
 
-    def __init__(self, gateway: Gateway, device: str, stream: Stream, clock: ReadClock) -> None:
+    def __init__(self, gateway: Gateway, device: str, stream: Stream, clock: PublisherClock | None) -> None:
         self._gateway, self._device, self._stream, self._clock = gateway, device, stream, clock
         self._topic = topic_of(gateway.site, gateway.gateway, device, stream)
         self._begin = 0
@@ -75,7 +76,8 @@ class _Numbered:
         self.next = last + 1
         return FleetMessage(
             v=VERSION, gateway=self._gateway.gateway, boot=self._gateway.boot, device=self._device, kind=kind,
-            begin=self._begin, first=first, last=last, count=count, utc_ns=utc_ns, clock=self._clock(), cause=cause,
+            begin=self._begin, first=first, last=last, count=count, utc_ns=utc_ns,
+            clock=None if self._clock is None else gateway_clock(self._clock), cause=cause,
             samples=samples or [], intervals=intervals or [], events=events or [],
         )  # fmt: skip
 
@@ -98,9 +100,14 @@ class DeviceStreams:
     """Streams of one device, or of the gateway (empty name). Synchronization: one thread."""
 
     def __init__(
-        self, gateway: Gateway, device: str, device_id: int, sending: DeviceSending, clock: ReadClock = no_clock
+        self,
+        gateway: Gateway,
+        device: str,
+        device_id: int,
+        sending: DeviceSending,
+        clock: PublisherClock | None = None,
     ) -> None:
-        """`clock` is called for each message."""
+        """The messages contain no clock if `clock` is None."""
         self._device_id, self._sending = device_id, sending
         self._whole = _Numbered(gateway, device, Stream.SAMPLES, clock) if device else None
         self._statistics = _Numbered(gateway, device, Stream.STATISTICS, clock) if device else None

@@ -18,15 +18,15 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from imud.contracts.publisher import Batch
+from imud.contracts.publisher import Batch, PublisherClock
 from imud.contracts.status import DeviceStatus
 from imud.fleet.accounts import StreamPosition
 from imud.fleet.messages import DropCause, Stream
 from imud.fleet.sender import MqttSender
 from imud.fleet.settings import DeviceSending, MqttOptions
 from imud.fleet.spool import Spool, SpoolError, SpoolRow
-from imud.fleet.streams import DeviceStreams, Gateway, ReadClock, no_clock, notes_of
-from imud.host.threads import END_LIMIT_S, StartWorker
+from imud.fleet.streams import DeviceStreams, Gateway, notes_of
+from imud.host.threads import END_LIMIT_S, StartWorker, Worker
 from imud.model.event import Event
 from imud.model.units import NS_PER_S
 
@@ -149,10 +149,9 @@ class SpoolWriter:
 
     def __init__(
         self, settings: MqttOptions, gateway: Gateway, queue: WriterQueue, spool: Spool, sender: MqttSender,
-        now_ns: Callable[[], int], utc_offset_ns: Callable[[], int], start_worker: StartWorker,
-        clock: ReadClock = no_clock,
+        clock: PublisherClock,
     ) -> None:  # fmt: skip
-        """`clock` reads the wall clock. Messages have no age before the clock is synchronized."""
+        """Messages have no age before the clock is synchronized."""
         self.problem = ""  # cause of a failed transaction, one sentence; empty if the spool works
         self.lost_on_disk = 0  # number of samples and events that imud lost because the disk failed
         self.failure: BaseException | None = None  # internal error that ended the thread
@@ -162,7 +161,8 @@ class SpoolWriter:
         self._is_closing = self._is_closed = False
         self._settings, self._gateway = settings, gateway
         self._queue, self._spool, self._sender = queue, spool, sender
-        self._now_ns, self._utc_offset_ns, self._clock = now_ns, utc_offset_ns, clock
+        self._clock = clock
+        self._worker: Worker | None = None
         # True after the first synchronized reading: the clock stays accurate enough without the network
         self._is_set = False
         self._streams: dict[str, DeviceStreams] = {}
@@ -173,17 +173,20 @@ class SpoolWriter:
         self._session = 0
         self._due_ns = 0
         # number of messages that `messages_per_s` allows now, and the time of this number
-        self._allowed, self._allowed_ns = 1.0, now_ns()
+        self._allowed, self._allowed_ns = 1.0, clock.now_ns()
         self._resume()
+
+    def start(self, start_worker: StartWorker) -> None:
+        """Start the thread."""
         self._worker = start_worker("mqtt spool", self)
-        sender.wanting = self._worker.ring
+        self._sender.wanting = self._worker.ring
 
     def close(self) -> None:
         """Store all waiting messages and end the thread. A second call does nothing. If the disk blocks the thread, it
         stores the messages later, when the disk works again."""
         self._sender.wanting = lambda: None
         self._is_closing = True
-        if self._worker.end():
+        if self._worker is None or self._worker.end():
             self._finish()
         else:
             log.error(
@@ -201,7 +204,7 @@ class SpoolWriter:
         for streams in self._streams.values():
             self._rows += streams.flush()
         self._due_ns = 0
-        self._store(self._now_ns())
+        self._store(self._clock.now_ns())
         if self._rows:
             log.error(
                 "mqtt: %d messages are lost at the end because the spool failed: %s",
@@ -222,13 +225,13 @@ class SpoolWriter:
     def _do_due(self) -> int:
         self._take_answers()
         self._take_all()
-        now_ns = self._now_ns()
+        now_ns = self._clock.now_ns()
         if now_ns >= self._due_ns:
             for streams in self._streams.values():
                 self._rows += streams.take_due(now_ns)
             self._store(now_ns)
         pause_ns = self._give(now_ns)
-        return max(1, min(COMMIT_NS, self._due_ns - self._now_ns(), pause_ns))
+        return max(1, min(COMMIT_NS, self._due_ns - self._clock.now_ns(), pause_ns))
 
     def _take_answers(self) -> None:
         """Take the acknowledgements. After a new connection, give the oldest messages again."""
@@ -248,11 +251,11 @@ class SpoolWriter:
             elif isinstance(item, Event):
                 streams = self._streams_of(item.device, 0)
                 if streams is not None:
-                    self._rows += streams.event(item, item.t_ns + self._utc_offset_ns())
+                    self._rows += streams.event(item, item.t_ns + self._clock.utc_offset_ns())
             elif isinstance(item, MissedEvents):
                 streams = self._streams_of(item.device, 0)
                 if streams is not None:
-                    self._rows += streams.missed_events(item.count, item.t_ns + self._utc_offset_ns())
+                    self._rows += streams.missed_events(item.count, item.t_ns + self._clock.utc_offset_ns())
             else:
                 made = {topic: msgspec.json.encode(status) for topic, status in item.statuses.items()}
                 made |= {
@@ -340,9 +343,8 @@ class SpoolWriter:
 
     def _stored_utc_ns(self, now_ns: int) -> int:
         """Return CLOCK_REALTIME of the transaction; 0 before the clock was synchronized: then messages have no age."""
-        clock = self._clock()
-        self._is_set = self._is_set or clock is None or clock.synchronised
-        return now_ns + self._utc_offset_ns() if self._is_set else 0
+        self._is_set = self._is_set or self._clock.utc_reference() is not None
+        return now_ns + self._clock.utc_offset_ns() if self._is_set else 0
 
     def _make_room(self, acknowledged: frozenset[int], now_ns: int) -> None:
         """Remove acknowledged messages. A full disk can have room for this although it has no room for new messages."""

@@ -8,10 +8,11 @@ from typing import Any
 import msgspec
 import pytest
 
-from imud.contracts.publisher import Batch
+from imud.contracts.lines import UtcReference
+from imud.contracts.publisher import Batch, PublisherClock
 from imud.fleet.accounts import FleetLedger, StreamCounts
 from imud.fleet.broker import BrokerTurn, Will
-from imud.fleet.messages import GatewayClock, Stream, decode_message
+from imud.fleet.messages import Stream, decode_message
 from imud.fleet.sender import MqttSender
 from imud.fleet.settings import Broker, MqttOptions
 from imud.fleet.spool import Spool, SpoolError
@@ -45,7 +46,7 @@ class WriterBench:
         spool: Spool | None = None, start_worker: StartWorker | None = None, **settings: object,
     ) -> None:  # fmt: skip
         self.clock, self.broker = VirtualClock(), FakeBroker()
-        self.wall_clock: GatewayClock | None = None
+        self.reference: UtcReference | None = UtcReference(0, 0)
         self.utc_offset_ns = 0
         devices = {"bow": {"rate_hz": None, "whole": "slots", **settings}}
         made = msgspec.convert({"devices": devices, "messages_per_s": messages_per_s}, MqttOptions)
@@ -55,10 +56,9 @@ class WriterBench:
         turn = BrokerTurn([Broker("a", 1, False, False, "")], 60.0, lambda: 0.5)
         self.sender = MqttSender(made, "me", Will("t", b""), turn, self.broker.connect, self.clock.now_ns)
         self.workers: list[HandWorker] = []
-        self.writer = SpoolWriter(
-            made, Gateway("site", "gw", boot), self.queue, self.spool, self.sender, self.clock.now_ns,
-            lambda: self.utc_offset_ns, start_worker or self._start, lambda: self.wall_clock,
-        )  # fmt: skip
+        clock = PublisherClock(self.clock.now_ns, lambda: self.utc_offset_ns, lambda: self.reference, lambda: 0)
+        self.writer = SpoolWriter(made, Gateway("site", "gw", boot), self.queue, self.spool, self.sender, clock)
+        self.writer.start(start_worker or self._start)
         self.seq = 0
 
     def _start(self, name: str, job: Job) -> HandWorker:
@@ -334,28 +334,30 @@ LIFTED_NS = 1_750_000_000 * NS_PER_S  # time to which systemd sets a clock witho
 
 def test_each_message_contains_the_clock_of_its_creation(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path)
-    bench.wall_clock = GatewayClock(5, LIFTED_NS, synchronised=False)
+    bench.utc_offset_ns, bench.reference, begin_ns = LIFTED_NS, None, bench.clock.now_ns()
     bench.put(1000)
     bench.work(2)
-    bench.wall_clock = GatewayClock(7, 2 * LIFTED_NS, synchronised=True, error_ns=30)
+    bench.reference = UtcReference(2 * LIFTED_NS, 30)
     bench.put(1000)
     bench.work(3)
-    clocks = [decode_message(payload).clock for payload in bench.arrived()]
-    assert clocks == [GatewayClock(5, LIFTED_NS, synchronised=False)] * 2 + [bench.wall_clock] * 2
+    clocks = [clock for payload in bench.arrived() if (clock := decode_message(payload).clock)]
+    states = [(clock.utc_offset_ns, clock.synchronised, clock.error_ns) for clock in clocks]
+    assert states == [(LIFTED_NS, False, None)] * 2 + [(2 * LIFTED_NS, True, 30)] * 2
+    assert begin_ns < clocks[0].t_ns < clocks[-1].t_ns < bench.clock.now_ns()
 
 
 def test_messages_spooled_before_the_clock_was_set_do_not_expire(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path)
     bench.broker.problem = "no route"
-    bench.utc_offset_ns, bench.wall_clock = LIFTED_NS, GatewayClock(0, LIFTED_NS, synchronised=False)
+    bench.utc_offset_ns, bench.reference = LIFTED_NS, None
     bench.put(1000)
     bench.work(2)
     bench.utc_offset_ns += 10_000 * HOUR_NS
-    bench.wall_clock = GatewayClock(0, bench.utc_offset_ns, synchronised=True, error_ns=30)
+    bench.reference = UtcReference(bench.utc_offset_ns, 30)
     bench.put(1000)
     bench.work(2)
     assert bench.counts().dropped == {}
-    bench.wall_clock = GatewayClock(0, bench.utc_offset_ns, synchronised=False)
+    bench.reference = None
     bench.clock.advance(2 * HOUR_NS)
     bench.put(1000)
     bench.work(2)
@@ -372,7 +374,7 @@ def test_positions_of_this_boot_are_kept_with_an_unset_clock(tmp_path: Path, mon
         old.clock.advance(COMMIT_NS)
     old.writer.close()
     new = WriterBench(tmp_path, "new")
-    new.wall_clock = GatewayClock(0, 0, synchronised=False)
+    new.reference = None
     for _ in range(3):
         new.put(1000)
         new.work()
