@@ -513,12 +513,12 @@ class McapSink:
         frames = MessageFrames(batch.device, self._convention, batch.frame.device.has_north, noise)
         wanted = self._fields
         return [
-            _SampleChannel(described, self._open)
+            _SampleChannel(described, self)
             for described in self._dialect.samples(frames)
             if wanted is None or described.fields & set(wanted)
         ]
 
-    def _open(self, described: MessageChannel[Sample]) -> "McapChannel":
+    def open_channel(self, described: MessageChannel[Sample]) -> "McapChannel":
         channel = self._shared.get(described.topic)
         if channel is None:
             channel = self._shared[described.topic] = self._file.add_channel(described)
@@ -528,12 +528,10 @@ class McapSink:
 class _SampleChannel:
     """Channel of samples. The first message adds the channel to the file."""
 
-    def __init__(
-        self, described: MessageChannel[Sample], open_: "Callable[[MessageChannel[Sample]], McapChannel]"
-    ) -> None:
+    def __init__(self, described: MessageChannel[Sample], sink: McapSink) -> None:
         self._described = described
         self._encode = described.encode
-        self._open = open_
+        self._sink = sink
         self._channel: McapChannel | None = None
 
     def add(self, samples: Sequence[Sample], times_ns: Sequence[int]) -> None:
@@ -545,7 +543,7 @@ class _SampleChannel:
         if len(messages) < len(made):
             times_ns = [t_ns for t_ns, data in zip(times_ns, made, strict=True) if data is not None]
         if self._channel is None:
-            self._channel = self._open(self._described)
+            self._channel = self._sink.open_channel(self._described)
         self._channel.add_run(times_ns, messages)
 
 

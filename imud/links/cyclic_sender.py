@@ -30,6 +30,18 @@ _HEAD: Final = struct.Struct("@3I4l2I")
 _PAD: Final = bytes(-_HEAD.size % 8)  # padding: the frames after the head are aligned to eight bytes
 
 
+class CyclicLink(Protocol):
+    """Link that sends cyclic frames from the event loop."""
+
+    def write(self, data: bytes, /) -> None:
+        """Send frames (`struct can_frame`). Raises LinkError."""
+        ...
+
+    def sender_failed(self, error: LinkError, /) -> None:
+        """Process the failure of a cyclic frame, which ended the sender."""
+        ...
+
+
 class Sender(Protocol):
     """Sender of cyclic frames until it is closed."""
 
@@ -69,20 +81,18 @@ class LoopSender:
 
     def __init__(
         self,
-        write: Callable[[bytes], None],
-        on_error: Callable[[LinkError], None],
+        link: CyclicLink,
         frames: Sequence[CyclicFrame],
         now_ns: Callable[[], int] = monotonic_ns,
     ) -> None:
-        """Start sending. After a failed `write`, stop and pass the error to `on_error`. Raises LinkError."""
-        self._write = write
-        self._on_error = on_error
+        """Start sending. After a failed `write`, stop and call `link.sender_failed`. Raises LinkError."""
+        self._link = link
         self._now_ns = now_ns
         self._timers: dict[int, asyncio.TimerHandle] = {}
         begin_ns = now_ns()
         try:
             for number, frame in enumerate(frames):
-                write(pack_frame(frame.can_id, frame.extended, frame.data))
+                link.write(pack_frame(frame.can_id, frame.extended, frame.data))
                 self._wait(number, frame, begin_ns + frame.every_ns)
         except LinkError:
             self.close()  # stop the timers of the earlier frames
@@ -103,9 +113,9 @@ class LoopSender:
             self._wait(number, frame, due_ns)
             return
         try:
-            self._write(pack_frame(frame.can_id, frame.extended, frame.data))
+            self._link.write(pack_frame(frame.can_id, frame.extended, frame.data))
         except LinkError as error:
             self.close()
-            self._on_error(error)
+            self._link.sender_failed(error)
             return
         self._wait(number, frame, due_ns + ((now_ns - due_ns) // frame.every_ns + 1) * frame.every_ns)

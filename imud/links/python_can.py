@@ -97,7 +97,7 @@ class PythonCanLink:
         """
         if self._sender is not None:
             self._sender.close()
-        self._sender = LoopSender(self.write, self._failed, frames)
+        self._sender = LoopSender(self, frames)
 
     def kernel_counters(self) -> KernelCounters:
         """Return zeros: python-can does not count errors."""
@@ -116,7 +116,7 @@ class PythonCanLink:
         if bus is not None:
             bus.shutdown()
 
-    def _failed(self, error: LinkError) -> None:
+    def sender_failed(self, error: LinkError) -> None:
         if self._on_end is not None:
             self._on_end(error)
 

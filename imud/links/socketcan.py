@@ -142,8 +142,6 @@ _DROPS: Final = f"{_WORD_BYTES + 4}xiI"  # length, level, type, count
 _CONTROL: Final = struct.Struct(f"={_STAMP}{_DROPS}{_CONTROL_BYTES - struct.calcsize(f'={_STAMP}{_DROPS}')}x")
 
 _Rows = Iterable[tuple[tuple[Any, ...], tuple[Any, ...]]]  # frames and their control messages
-# Function for class bits and data of an error frame. It returns whether frames are lost.
-OnErrorFrame = Callable[[int, bytes], bool]
 
 
 libc: Final = ctypes.CDLL(None, use_errno=True)
@@ -197,15 +195,17 @@ class FrameReader:
     def __init__(
         self,
         receiver: socket.socket,
-        on_error: OnErrorFrame,
+        state: BusState,
         now_ns: Callable[[], int] = time.monotonic_ns,
         wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Enable time stamps and the drop counter of the socket."""
+        """Enable time stamps and the drop counter of the socket. `state` records error frames."""
         receiver.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS_NEW, 1)
         receiver.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
         self.dropped = 0  # number of frames that the kernel dropped because the receive buffer was full
-        self._on_error = on_error
+        # Changes of the controller state with the problem of the new state. The caller removes them.
+        self.news: list[tuple[str, str]] = []
+        self._state = state
         self._now_ns = now_ns
         self._wall_ns = wall_ns
         self._frames = bytearray(RAW_FRAME.size * BATCH_FRAMES)
@@ -263,7 +263,7 @@ class FrameReader:
                 dropped, lost = drops, True
             if can_id & _NO_DATA_FLAGS:
                 if can_id & ERROR_FLAG:
-                    lost |= self._on_error(can_id ^ ERROR_FLAG, data)
+                    lost |= self._add_error_frame(can_id ^ ERROR_FLAG, data)
                 continue
             t_ns = seconds * NS_PER_S + ns - offset_ns if kind == SO_TIMESTAMPNS_NEW else now_ns
             if stepped_ns and not newest_ns < t_ns <= now_ns and newest_ns < t_ns + stepped_ns <= now_ns:
@@ -279,6 +279,14 @@ class FrameReader:
             lost = False
         self._newest_ns, self._lost = newest_ns, lost
         return frames
+
+    def _add_error_frame(self, classes: int, data: bytes) -> bool:
+        """Record an error frame. Return whether the controller lost frames."""
+        state = self._state
+        overflows = state.overflows
+        if news := state.add_error_frame(classes, data):
+            self.news.append((news, state.problem))
+        return state.overflows > overflows
 
     def _clocks(self) -> tuple[int, int]:
         """Return CLOCK_REALTIME minus CLOCK_MONOTONIC, and CLOCK_MONOTONIC, ns."""
@@ -445,7 +453,7 @@ class SocketCanLink:
         self._state = BusState(self._settings.interface, details.state)
         try:
             self._socket = self._open_socket(self._settings, self._filters)
-            self._reader = FrameReader(self._socket, self._on_error_frame)
+            self._reader = FrameReader(self._socket, self._state)
             room_bytes = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         except OSError as error:
             self.close()
@@ -484,7 +492,10 @@ class SocketCanLink:
             if error.errno not in NO_MANAGER:
                 raise self._explained(error) from error
             log.info("%s: this kernel has no CAN_BCM (kernel module can_bcm): cyclic frames are less exact", self.title)
-            self._sender = LoopSender(self.write, self._on_end, frames)
+            self._sender = LoopSender(self, frames)
+
+    def sender_failed(self, error: LinkError) -> None:
+        self._on_end(error)
 
     def kernel_counters(self) -> KernelCounters:
         """Return the frames that kernel and controller dropped, and the states of the controller, since `open`."""
@@ -535,23 +546,19 @@ class SocketCanLink:
 
     def _read_batch(self) -> int:
         """Read and deliver one batch. Return the number of frames; -1 if the bus ended."""
-        if self._reader is None:
+        reader = self._reader
+        if reader is None:
             return -1
         try:
-            frames = self._reader.read()
+            frames = reader.read()
         except OSError as error:
             self._end(error)
             return -1
+        while reader.news:
+            self._on_news(*reader.news.pop(0))
         if frames:
             self._on_frames(frames)
         return len(frames)
-
-    def _on_error_frame(self, classes: int, data: bytes) -> bool:
-        state = self._state
-        overflows = state.overflows
-        if news := state.add_error_frame(classes, data):
-            self._on_news(news, state.problem)
-        return state.overflows > overflows
 
     def _end(self, error: OSError) -> None:
         if self._loop is not None and self._socket is not None:

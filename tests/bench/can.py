@@ -17,7 +17,7 @@ import can
 import msgspec
 
 from imud.formats.can import pack_frame
-from imud.links.socketcan import BATCH_FRAMES, FrameReader
+from imud.links.socketcan import BATCH_FRAMES, BusState, FrameReader
 from tests.bench.rows import Row, at_least
 
 BUS = "vcanbench"
@@ -36,7 +36,7 @@ def measure(interface: str, waiting: int, frames: int) -> tuple[float, float]:
     ):
         ours.bind((interface,))
         far.bind((interface,))
-        reader = FrameReader(ours, lambda _classes, _data: False)
+        reader = FrameReader(ours, BusState("can0"))
         sent = [pack_frame(0x100 + number, False, bytes(8)) for number in range(waiting)]
         taken_ns = [0, 0]
         rounds = max(frames // waiting, 1)

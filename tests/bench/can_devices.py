@@ -15,7 +15,7 @@ from imud.drivers import DRIVERS
 from imud.formats.can import RAW_FRAME, CanFilter
 from imud.formats.slot import encode_slot
 from imud.host.clock import HostClock
-from imud.links.socketcan import FrameReader
+from imud.links.socketcan import BusState, FrameReader
 from imud.model.ledger import Ledger
 from imud.sampling.clock import SampleClock
 from imud.sampling.path import CanPath, PathContext
@@ -43,7 +43,7 @@ class Device:
         # the buffer must hold all frames of one turn
         receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         self.sender.connect(receiver.getsockname())
-        self.reader = FrameReader(receiver, lambda _classes, _data: False)
+        self.reader = FrameReader(receiver, BusState("can0"))
         self.ledger = Ledger()
         clock = SampleClock(module.name, tick_ns=driver.tick_ns, tick_modulus=driver.tick_modulus, byte_ns=0, hold_ns=0)
         codec = driver.make_codec(self.ledger, options)

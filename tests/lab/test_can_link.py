@@ -15,7 +15,7 @@ from imud.device.factory import DeviceFactory
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame, pack_frame
 from imud.host.clock import HostClock
 from imud.links.cyclic_sender import KernelSender, LoopSender
-from imud.links.socketcan import FrameReader, SocketCanLink, SocketCanOptions
+from imud.links.socketcan import BusState, FrameReader, SocketCanLink, SocketCanOptions
 from imud.model.errors import LinkMissing
 from imud.sim.can_module import CanModules
 from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
@@ -39,7 +39,7 @@ def test_the_kernel_sends_cyclically_and_stops_with_the_link(vcan: CanInterface)
     heard: list[CanFrame] = []
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW) as far:
         far.bind((vcan.name,))
-        reader = FrameReader(far, lambda classes, data: False)
+        reader = FrameReader(far, BusState("can0"))
 
         async def story() -> None:
             link = SocketCanLink(SocketCanOptions(interface=vcan.name))
@@ -96,7 +96,7 @@ def test_a_kernel_without_the_manager_is_helped_by_the_loop(
         heard: list[CanFrame] = []
         with socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW) as far:
             far.bind((vcan.name,))
-            reader = FrameReader(far, lambda classes, data: False)
+            reader = FrameReader(far, BusState("can0"))
             link.start(lambda frames: None, lambda news, problem: None, lambda error: None)
             link.send_cyclic([SYNC])
             assert isinstance(link._sender, LoopSender)  # the tested case

@@ -41,15 +41,16 @@ def run(late_ns: list[int], *, fail_after: int = 1 << 30) -> tuple[list[int], li
     async def story() -> None:
         loop, done = asyncio.get_running_loop(), asyncio.Event()
 
-        def write(data: bytes) -> None:
-            if len(sent_at) >= fail_after:
-                raise LinkError("full")
-            assert data == pack_frame(0x80, False, b"\7")
-            sent_at.append(clock.now_ns)
+        class Link:
+            def write(self, data: bytes) -> None:
+                if len(sent_at) >= fail_after:
+                    raise LinkError("full")
+                assert data == pack_frame(0x80, False, b"\7")
+                sent_at.append(clock.now_ns)
 
-        def fail(error: LinkError) -> None:
-            errors.append(str(error))
-            done.set()
+            def sender_failed(self, error: LinkError) -> None:
+                errors.append(str(error))
+                done.set()
 
         def call_later(delay_s: float, callback: object, *arguments: object) -> asyncio.TimerHandle:
             if not late_ns:
@@ -60,7 +61,7 @@ def run(late_ns: list[int], *, fail_after: int = 1 << 30) -> tuple[list[int], li
 
         loop_call_later = loop.call_later
         loop.call_later = call_later  # type: ignore[assignment]  # the test's own time
-        sender = LoopSender(write, fail, [SYNC], clock)
+        sender = LoopSender(Link(), [SYNC], clock)
         await done.wait()
         sender.close()
         sender.close()

@@ -123,13 +123,17 @@ async def test_a_sender_whose_second_frame_is_refused_leaves_no_timer() -> None:
     written: list[bytes] = []
     errors: list[LinkError] = []
 
-    def write(data: bytes) -> None:
-        if len(written) == 1:
-            raise LinkError("full")
-        written.append(data)
+    class Link:
+        def write(self, data: bytes) -> None:
+            if len(written) == 1:
+                raise LinkError("full")
+            written.append(data)
+
+        def sender_failed(self, error: LinkError) -> None:
+            errors.append(error)
 
     with pytest.raises(LinkError, match="full"):
-        LoopSender(write, errors.append, FRAMES)
+        LoopSender(Link(), FRAMES)
     await asyncio.sleep(0.01)  # ten periods of the first frame
     assert (len(written), errors) == (1, [])
 

@@ -10,7 +10,7 @@ from contextlib import closing
 import pytest
 
 from imud.formats.can import RAW_FRAME, CanFrame, pack_frame
-from imud.links.socketcan import BATCH_FRAMES, FrameReader
+from imud.links.socketcan import BATCH_FRAMES, BusState, FrameReader
 from tests.support.daemon_process import LIMIT_S
 
 HOUR_NS = 3600 * 10**9
@@ -36,12 +36,11 @@ class Wire:
         self.receiver.setblocking(False)
         self.sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.sender.connect(self.receiver.getsockname())
-        self.errors: list[tuple[int, bytes]] = []
-        self.error_means_loss = False
+        self.state = BusState("can0")
         self.wall_ahead_ns = 0
         self.now_ns = real_ns()
         self.reader = FrameReader(
-            self.receiver, self._on_error, lambda: self.now_ns, lambda: self.now_ns + OFFSET_NS + self.wall_ahead_ns
+            self.receiver, self.state, lambda: self.now_ns, lambda: self.now_ns + OFFSET_NS + self.wall_ahead_ns
         )
         self._wait_for_stamps()
 
@@ -64,10 +63,6 @@ class Wire:
     def close(self) -> None:
         self.receiver.close()
         self.sender.close()
-
-    def _on_error(self, classes: int, data: bytes) -> bool:
-        self.errors.append((classes, data))
-        return self.error_means_loss
 
     def _wait_for_stamps(self) -> None:
         """Wait until the kernel time-stamps datagrams, some ms after the first socket has requested time stamps."""
@@ -139,10 +134,9 @@ def test_a_drop_is_seen_after_reads_of_single_frames(wire: Wire) -> None:
 def test_error_frames_go_their_own_way_and_can_mean_a_loss(wire: Wire) -> None:
     wire.sender.send(ERROR_FRAME)
     wire.sender.send(RAW_FRAME.pack(0x4000_0123, 0, b""))  # a remote frame
-    wire.error_means_loss = True
     wire.send(5, 6)
     assert wire.ids() == [(5, True), (6, False)]
-    assert wire.errors == [(4, bytes([0, 1, 0, 0, 0, 0, 0, 0]))]
+    assert (wire.state.overflows, wire.reader.news) == (1, [])
     wire.sender.send(ERROR_FRAME)
     assert wire.ids() == []
     wire.send(7)
@@ -204,7 +198,7 @@ def test_clocks_that_are_always_read_apart_give_the_closest_of_some_readings(wir
         gone_ns += away_ns[next(calls)] if begun else 0
         return base_ns + gone_ns
 
-    reader = FrameReader(wire.receiver, lambda _classes, _data: False, now_ns, lambda: base_ns + gone_ns + OFFSET_NS)
+    reader = FrameReader(wire.receiver, BusState("can0"), now_ns, lambda: base_ns + gone_ns + OFFSET_NS)
     before_ns, after_ns = wire.send(1)
     base_ns, begun = after_ns, True
     (frame,) = reader.read()

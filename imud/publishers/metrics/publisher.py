@@ -208,8 +208,8 @@ class MetricsPublisher:
         if not self._settings.enabled:
             return
         self._loop = asyncio.get_running_loop()
-        server = ScrapeServer(self._settings.address, self._settings.port, self._answer)
-        server.start()
+        server = ScrapeServer(self._settings.address, self._settings.port)
+        server.start(self._answer)
         self._server = server
         log.info("metrics at http://%s:%d/metrics", self._settings.address, self.port)
 

@@ -47,21 +47,27 @@ class HttpResponse:
     content_type: str = TEXT
 
 
+Answer = Callable[[HttpRequest], Awaitable[HttpResponse]]  # returns the reply to a request, in the thread of the server
+
+
+async def _no_answer(_request: HttpRequest) -> HttpResponse:
+    raise AssertionError("the server has not started")
+
+
 class ScrapeServer:
-    """HTTP server that calls `answer` for each request."""
+    """HTTP server with its own thread."""
 
     def __init__(
         self,
         address: str,
         port: int,
-        answer: Callable[[HttpRequest], Awaitable[HttpResponse]],
         *,
         connection_s: float = CONNECTION_S,
         connections_max: int = CONNECTIONS_MAX,
     ) -> None:
         self.address = address
         self.port = port  # bound port after the start, also if the configured port is 0
-        self._answer = answer
+        self._answer: Answer = _no_answer
         self._connection_s = connection_s
         self._connections_max = connections_max
         self._connections: dict[asyncio.Task[None], None] = {}
@@ -75,9 +81,12 @@ class ScrapeServer:
         """Return the number of open connections."""
         return len(self._connections)
 
-    def start(self) -> None:
-        """Start the server. Raises ServerError if address and port cannot be used."""
+    def start(self, answer: Answer) -> None:
+        """Start the server, which calls `answer` for each request.
+
+        Raises ServerError if address and port cannot be used."""
         share_interpreter()
+        self._answer = answer
         self._listener = _listen(self.address, self.port)
         self.port = self._listener.getsockname()[1]
         ready = threading.Event()

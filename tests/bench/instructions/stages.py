@@ -24,7 +24,7 @@ from imud.formats.can import pack_frame
 from imud.formats.jsonrpc import encode_request, line_of
 from imud.formats.slot import encode_slot, encode_slots
 from imud.host.clock import HostClock
-from imud.links.socketcan import FrameReader
+from imud.links.socketcan import BusState, FrameReader
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Sample
 from imud.model.units import NS_PER_MS, uart_byte_ns
@@ -175,7 +175,7 @@ def _can_read(frames: int, total: int, _directory: str) -> Run:
     receiver.bind(("127.0.0.1", 0))
     receiver.setblocking(False)
     sender.connect(receiver.getsockname())
-    reader, raw = FrameReader(receiver, lambda _classes, _data: False), pack_frame(BASE_ID, False, bytes(8))
+    reader, raw = FrameReader(receiver, BusState("can0")), pack_frame(BASE_ID, False, bytes(8))
 
     # the default argument keeps the receiver open
     def read(_kept_open: socket.socket = receiver) -> None:

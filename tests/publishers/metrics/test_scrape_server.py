@@ -3,7 +3,7 @@
 import asyncio
 import errno
 import socket
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from time import monotonic
 from typing import Any
@@ -12,17 +12,15 @@ import pytest
 
 from imud.model.errors import ServerError
 from imud.publishers.metrics import scrape_server
-from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer, parse_request
+from imud.publishers.metrics.scrape_server import Answer, HttpRequest, HttpResponse, ScrapeServer, parse_request
 from tests.support.event_loops import in_loop
 from tests.support.metrics import LIMIT_S, ask, read_all
 
 
 @asynccontextmanager
-async def server(
-    answer: Callable[[HttpRequest], Awaitable[HttpResponse]], **limits: float
-) -> AsyncIterator[ScrapeServer]:
-    made = ScrapeServer("127.0.0.1", 0, answer, **limits)  # type: ignore[arg-type]  # limits by name
-    made.start()
+async def server(answer: Answer, **limits: float) -> AsyncIterator[ScrapeServer]:
+    made = ScrapeServer("127.0.0.1", 0, **limits)  # type: ignore[arg-type]  # limits by name
+    made.start(answer)
     try:
         yield made
     finally:
@@ -124,4 +122,4 @@ def test_parse_request() -> None:
 @pytest.mark.parametrize("address", ["192.0.2.1", "not an address"])
 def test_an_unusable_address_is_reported(address: str) -> None:
     with pytest.raises(ServerError, match=f"{address} port 0: .*; set metrics.address"):
-        ScrapeServer(address, 0, hello).start()
+        ScrapeServer(address, 0).start(hello)
