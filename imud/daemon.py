@@ -34,7 +34,7 @@ from imud.contracts.publisher import (
     PublisherContext,
 )
 from imud.contracts.status import DeviceState, DeviceStatus
-from imud.device.device import Device
+from imud.device.device import Device, RecordableDevices
 from imud.device.factory import DeviceFactory
 from imud.device.latency import LatencyBudget
 from imud.host.clock import HostClock
@@ -45,7 +45,6 @@ from imud.lines.watched_line import watching
 from imud.model.errors import CommandError, ConfigError, ServerError
 from imud.model.event import Event, EventKind
 from imud.publishers.outputs import Outputs
-from imud.recording.observer import RecordableDevices
 from imud.utc.system_clock import kernel_clock, system_reference
 
 log = logging.getLogger(__name__)

@@ -6,7 +6,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from math import inf
-from typing import ClassVar, Final, NamedTuple, Protocol
+from typing import ClassVar, Final, NamedTuple
 
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
@@ -338,16 +338,18 @@ def event_line(event: Event, utc_offset_ns: int) -> str:
     return as_text(printed(event, utc_offset_ns))[:TEXT_MAX]
 
 
-class NewsSource(Protocol):
-    """Reader of the daemon: `TopFeed`, or a replacement in tests."""
+OVERVIEW_HZ: Final = 4.0
+DEVICE_HZ: Final = 20.0
 
-    def start(self) -> None: ...
+
+class TopFeed(Feed):
+    """Feed of the screens: all devices at OVERVIEW_HZ, or one device at DEVICE_HZ."""
+
+    def __init__(self, path: str) -> None:
+        super().__init__(path, Wish(rate_hz=OVERVIEW_HZ))
 
     def look_at(self, device: str | None) -> None:
-        """Read only samples of this device at a higher rate; None: read all devices at the lower rate."""
-        ...
-
-    def close(self) -> None: ...
+        self.want(Wish(rate_hz=OVERVIEW_HZ) if device is None else Wish((device,), DEVICE_HZ))
 
 
 class NewsCame(Message):
@@ -382,19 +384,18 @@ class TopApp(App[None]):
         Binding("question_mark", "toggle_help", "Help", key_display="?"),
     ]
 
-    def __init__(self, make_feed: Callable[[Callable[[News], None]], NewsSource]) -> None:
-        """`make_feed` creates the reader of the daemon. Its argument accepts news from any thread."""
+    def __init__(self, feed: TopFeed) -> None:
         super().__init__()
         self.fleet = DeviceHistories()
         self.problem = "connecting"
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         self.paused = False
         self.ahead_ns = 0  # CLOCK_MONOTONIC of the daemon's host minus CLOCK_MONOTONIC of this host, ns
-        self._feed = make_feed(self._post)
+        self._feed = feed
 
     def on_mount(self) -> None:
         self.push_screen(Overview())
-        self._feed.start()
+        self._feed.start(self._post)
 
     def on_unmount(self) -> None:
         self._feed.close()
@@ -627,20 +628,6 @@ class DevicePage(TopScreen):
         self._shown = self.top.events[-1] if self.top.events else None
 
 
-OVERVIEW_HZ: Final = 4.0
-DEVICE_HZ: Final = 20.0
-
-
-class TopFeed(Feed):
-    """Feed of the screens: all devices at OVERVIEW_HZ, or one device at DEVICE_HZ."""
-
-    def __init__(self, path: str, on_news: Callable[[News], None]) -> None:
-        super().__init__(path, on_news, Wish(rate_hz=OVERVIEW_HZ))
-
-    def look_at(self, device: str | None) -> None:
-        self.want(Wish(rate_hz=OVERVIEW_HZ) if device is None else Wish((device,), DEVICE_HZ))
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_socket(parser)
 
@@ -649,7 +636,7 @@ def run(args: argparse.Namespace) -> int:
     """Show the devices until the user presses `q`. Raises BadArgument if imud does not run in a terminal."""
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise BadArgument("imud top needs a terminal; for files and pipes, use `imud status` or `imud watch`")
-    TopApp(lambda on_news: TopFeed(args.socket, on_news)).run()
+    TopApp(TopFeed(args.socket)).run()
     return 0
 
 

@@ -1,7 +1,7 @@
 """Thread that reads status, samples and events of the daemon for a view. It connects again after a restart.
 
-    feed = Feed("/run/imud/imud.sock", on_news, Wish(rate_hz=4.0))
-    feed.start()
+    feed = Feed("/run/imud/imud.sock", Wish(rate_hz=4.0))
+    feed.start(on_news)
 
 `imud top` and `imud web` use it. `Feed.want` changes the wish at any time. With the wish None, the feed disconnects.
 """
@@ -61,18 +61,20 @@ class News(NamedTuple):
 
 
 class Feed:
-    """Reader of the daemon at `path`. Synchronization: the feed's thread calls `on_news`."""
+    """Reader of the daemon at `path`. Any thread may call its methods."""
 
-    def __init__(self, path: str, on_news: Callable[[News], None], wanted: Wish | None) -> None:
+    def __init__(self, path: str, wanted: Wish | None) -> None:
         self._path = path
-        self._on_news = on_news
+        self._on_news: Callable[[News], None] = _ignore
         self._wanted = wanted
         self._changed = Condition()
         self._stopped = False
         self._ahead_ns = 0
         self._thread = Thread(target=self._run, name="feed", daemon=True)
 
-    def start(self) -> None:
+    def start(self, on_news: Callable[[News], None]) -> None:
+        """Start the thread, which calls `on_news`."""
+        self._on_news = on_news
         self._thread.start()
 
     def close(self) -> None:
@@ -115,6 +117,10 @@ class Feed:
             self._ahead_ns = news.ahead_ns
             self._on_news(news._replace(hello=hello))
             hello = None
+
+
+def _ignore(_news: News) -> None:
+    """Ignore the news: `start` sets the receiver."""
 
 
 def clock_ahead_ns(daemon_now_ns: int) -> int:

@@ -242,7 +242,7 @@ class CanRound(SearchRound[CanFound]):
     """Search round on a CAN bus."""
 
     def __init__(self, search: CanSearch, ledger: Ledger, host: HostClock) -> None:
-        super().__init__(search, ledger, host)
+        super().__init__(ledger, host)
         self._search = search
 
     def on_frames(self, frames: Sequence[CanFrame]) -> None:
@@ -250,6 +250,12 @@ class CanRound(SearchRound[CanFound]):
         self._count(sum(len(frame.data) for frame in frames))
         if not self._done.done():
             self._follow(self._search.on_frames(frames))
+
+    def _first(self, now_ns: int) -> Listen:
+        return self._search.start(now_ns)
+
+    def _due(self, now_ns: int) -> CanStep | None:
+        return self._search.on_time(now_ns)
 
     def _listen(self, step: Listen) -> None:
         """Do nothing: the filters of the link pass all frames."""

@@ -190,7 +190,7 @@ class CanTransport(ReceivingTransport):
         self._options = options
         self._codec = driver.make_codec(context.ledger, options)
         self.path = CanPath(self._codec, clock, context.path_context(driver, self.link, self.scripts.on_message))
-        context.tap.path_made(self.path, driver.name, options)
+        context.observer.path_made(self.path, driver.name, options)
 
     def _begin(self) -> None:
         """Pass the frames to the codec of the device."""
@@ -257,7 +257,7 @@ class CanTransport(ReceivingTransport):
     def _apply(self, identity: Identity) -> None:
         if self.driver is not None and self._codec is not None:
             self.driver.apply_identity(self._codec, identity)
-            self._context.tap.codec_changed()
+            self._context.observer.codec_changed()
 
     def follow(self, request: Request) -> None:
         """Follow a script that has given the device another number: change the filters and create a new codec."""

@@ -10,7 +10,7 @@ A device has a transport, which owns the link and the sample path, and attachmen
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,7 +38,7 @@ from imud.links import LINKS
 from imud.model.errors import BadArgument, CommandError, ImudError, LinkBusy, LinkError, LinkMissing
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, NS_PER_S
-from imud.recording.observer import PathObserver
+from imud.recording.observer import ClockObserver, PathObserver
 from imud.sampling.path import LatencyMeter, RateMeter, SamplePath
 
 log = logging.getLogger(__name__)
@@ -79,9 +79,9 @@ class Device:
         self._suspends = host.suspends
         self._events = DeviceEvents(config.name, self.ledger, shared.owner.send_event)
         self._health = Health(self._events)
-        self._tap = PathObserver(config, device_id, self.ledger, host)
+        self.observer = PathObserver(config, device_id, self.ledger, host)
         context = DeviceContext(
-            config, device_id, shared.owner, host, shared.lines, self.ledger, self._events, self._health, self._tap
+            config, device_id, shared.owner, host, shared.lines, self.ledger, self._events, self._health, self.observer
         )
         self._transport = transport = make_transport(context)
         self._identity = transport.identity
@@ -101,11 +101,6 @@ class Device:
     @property
     def state(self) -> DeviceState:
         return self._health.state
-
-    @property
-    def tap(self) -> PathObserver:
-        """Observer that records the device; `record` starts it."""
-        return self._tap
 
     @property
     def driver_name(self) -> str:
@@ -222,8 +217,8 @@ class Device:
     # --- recording ---------------------------------------------------------------------------------------------------
 
     def record(self, put: PutRecord) -> None:
-        """Start a recording: write the description of the device, then its data. `tap.end` stops the recording."""
-        self._tap.begin(
+        """Start a recording: write the description of the device, then its data. `observer.end` stops the recording."""
+        self.observer.begin(
             put, self._transport.where, identity_words(self._identity.identity), self._identity.shown_settings
         )
 
@@ -393,3 +388,41 @@ class Device:
             noise=self.config.noise,
         )
         return transport.add_status(status)
+
+
+class RecordableDevices:
+    """Devices and host clocks of a daemon for recorders. Synchronization: the event loop's thread only."""
+
+    def __init__(self, devices: Mapping[str, Device], host: HostClock) -> None:
+        """`devices` contains the present devices at each call."""
+        self._devices = devices
+        self._clocks = ClockObserver(host)
+
+    def names(self) -> Sequence[str]:
+        """Return the names of the present devices."""
+        return list(self._devices)
+
+    def begin_host(self, put: PutRecord) -> None:
+        """Send the state of the host's clocks to `put`, then each reading. A second call sends the state again."""
+        self._clocks.begin(put)
+
+    def begin(self, device: str, put: PutRecord) -> None:
+        """Send the description of a device to `put`, then each input. Do nothing if the device does not exist.
+
+        A second call sends the description again.
+        """
+        found = self._devices.get(device)
+        if found is not None:
+            found.record(put)
+
+    def check(self, device: str, put: PutRecord) -> None:
+        """Send the newest sample and the ledger of a device to `put`. Do nothing if the device does not exist."""
+        found = self._devices.get(device)
+        if found is not None:
+            found.observer.check(put)
+
+    def end(self, put: PutRecord) -> None:
+        """Send no more records of the devices and of the host to `put`."""
+        for device in self._devices.values():
+            device.observer.end(put)
+        self._clocks.end(put)

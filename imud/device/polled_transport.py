@@ -323,7 +323,7 @@ class PolledTransport(Transport):
         )
         self.driver = driver
         self.path = PolledPath(codec, timing, clock, context.path_context(driver, self.link, _ignore_message))
-        context.tap.path_made(self.path, driver.name, device.options)
+        context.observer.path_made(self.path, driver.name, device.options)
         return self.path
 
     def _candidates(self) -> list[PolledDriver]:

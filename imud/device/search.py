@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Final, Generic, TypeVar
 
 import msgspec
 
@@ -76,27 +76,13 @@ class GaveUp:
 EARLY_S: Final = 0.001  # additional wait if the timer of the loop fires before the deadline, s
 
 F = TypeVar("F")
-F_co = TypeVar("F_co", covariant=True)
-
-
-class TimedSearch(Protocol[F_co]):
-    """Search without I/O, on a serial port or a CAN bus. All times are CLOCK_MONOTONIC in ns."""
-
-    def start(self, now_ns: int) -> Listen | F_co | GaveUp:
-        """Return the first step."""
-        ...
-
-    def on_time(self, now_ns: int) -> Listen | F_co | GaveUp | None:
-        """Return the next step, or None before `until_ns` of the last `Listen`."""
-        ...
 
 
 class SearchRound(ABC, Generic[F]):
     """Execution of the steps of one search. Synchronization: the loop's thread only."""
 
-    def __init__(self, search: TimedSearch[F], ledger: Ledger, host: HostClock) -> None:
+    def __init__(self, ledger: Ledger, host: HostClock) -> None:
         """`ledger` counts the received bytes as skipped. Needs a running loop."""
-        self._steps = search
         self._on_found: Callable[[F], None] = _ignore
         self._ledger = ledger
         self._host = host
@@ -110,7 +96,7 @@ class SearchRound(ABC, Generic[F]):
         that follow.
         """
         self._on_found = on_found
-        self._follow(self._steps.start(self._host.now_ns()))
+        self._follow(self._first(self._host.now_ns()))
 
     async def finished(self) -> None:
         """Return when the round has found a device. Raises NothingHeard with a summary, or LinkError."""
@@ -127,6 +113,14 @@ class SearchRound(ABC, Generic[F]):
             self._done.cancel()
         elif not self._done.cancelled():
             self._done.exception()  # retrieved, so that asyncio does not log it
+
+    @abstractmethod
+    def _first(self, now_ns: int) -> Listen | F | GaveUp:
+        """Return the first step. `now_ns` is CLOCK_MONOTONIC."""
+
+    @abstractmethod
+    def _due(self, now_ns: int) -> Listen | F | GaveUp | None:
+        """Return the next step, or None before `until_ns` of the last `Listen`."""
 
     @abstractmethod
     def _listen(self, step: Listen) -> Listen | F | GaveUp | None:
@@ -159,7 +153,7 @@ class SearchRound(ABC, Generic[F]):
     def _on_time(self) -> None:
         if self._done.done():
             return
-        step = self._steps.on_time(self._host.now_ns())
+        step = self._due(self._host.now_ns())
         if step is None:
             self._call_later(EARLY_S)
         else:

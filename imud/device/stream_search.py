@@ -338,7 +338,7 @@ class StreamRound(SearchRound[StreamFound]):
             hold_ns=link.hold_ns,
             options=config.options if named else None,
         )
-        super().__init__(self._search, ledger, host)
+        super().__init__(ledger, host)
         self._link = link
 
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
@@ -346,6 +346,12 @@ class StreamRound(SearchRound[StreamFound]):
         self._count(len(data))
         if not self._done.done():
             self._follow(self._search.on_data(data, t_rx_ns))
+
+    def _first(self, now_ns: int) -> Step:
+        return self._search.start(now_ns)
+
+    def _due(self, now_ns: int) -> Step | None:
+        return self._search.on_time(now_ns)
 
     def _found(self, found: StreamFound) -> None:
         self._count(-sum(len(data) for data, _ in found.chunks))

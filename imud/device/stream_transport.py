@@ -200,7 +200,7 @@ class StreamTransport(ReceivingTransport):
         path_context = context.path_context(driver, self.link, self.scripts.on_message)
         self.driver = driver
         self.path = StreamPath(codec, clock, path_context, self.attachments.drain_edges, self.scripts)
-        context.tap.path_made(self.path, driver.name, options)
+        context.observer.path_made(self.path, driver.name, options)
         return self.path
 
     def _remember(self) -> None:
@@ -266,7 +266,7 @@ class StreamTransport(ReceivingTransport):
     def _apply(self, identity: Identity) -> None:
         if self.driver is not None and self.path is not None:
             self.driver.apply_identity(self.path.codec, identity)
-            self._context.tap.codec_changed()
+            self._context.observer.codec_changed()
 
     def write(self, data: bytes) -> None:
         """Send a request at the baud rate of the device. Raises CommandError during a search, and LinkError."""

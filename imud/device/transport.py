@@ -75,7 +75,7 @@ class DeviceContext:
     ledger: Ledger
     events: DeviceEvents
     health: Health
-    tap: PathObserver
+    observer: PathObserver
 
     def path_context(self, driver: Driver, link: Link, on_message: Callable[[Message, int], object]) -> PathContext:
         """Return the context of a sample path for `driver`. The path passes text lines and replies to `on_message`."""
@@ -169,7 +169,7 @@ class Transport(ABC):
         """Store the settings of the device, and compare the GPIO lines with them."""
         identity = self.identity
         identity.update_settings(settings, self.driver)
-        self._context.tap.described(self.where, identity_words(identity.identity), identity.shown_settings)
+        self._context.observer.described(self.where, identity_words(identity.identity), identity.shown_settings)
         self.attachments.compare_settings(identity.settings, self.driver)
 
     # --- the samples -------------------------------------------------------------------------------------------------

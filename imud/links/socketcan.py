@@ -88,6 +88,8 @@ class BusState:
         self.passive_count = 0
         self.bus_off_count = 0
         self.overflows = 0  # number of overflows of the controller's receive buffer
+        # Changes of the state, each with the problem of the new state. The owner removes them.
+        self.news: list[tuple[str, str]] = []
 
     @property
     def problem(self) -> str:
@@ -95,18 +97,18 @@ class BusState:
         advice = _HELP.get(self.state)
         return f"{self._name} is {_WORDS[self.state]}: {advice.format(name=self._name)}" if advice else ""
 
-    def add_error_frame(self, classes: int, data: bytes) -> str:
-        """Record an error frame. Return the change of state in one sentence; empty without a change."""
+    def add_error_frame(self, classes: int, data: bytes) -> bool:
+        """Record an error frame. Return whether the controller lost frames."""
         status = data[1] if classes & CLASS_CONTROLLER else 0
-        if status & RECEIVE_OVERFLOW:
-            self.overflows += 1
+        is_overflow = bool(status & RECEIVE_OVERFLOW)
+        self.overflows += is_overflow
         state = self._named(classes, status)
-        if state is None or state is self.state:
-            return ""
-        self.passive_count += state is ControllerState.PASSIVE
-        self.bus_off_count += state is ControllerState.BUS_OFF
-        self.state = state
-        return self.problem or f"{self._name} is {_WORDS[state]}"
+        if state is not None and state is not self.state:
+            self.passive_count += state is ControllerState.PASSIVE
+            self.bus_off_count += state is ControllerState.BUS_OFF
+            self.state = state
+            self.news.append((self.problem or f"{self._name} is {_WORDS[state]}", self.problem))
+        return is_overflow
 
     def _named(self, classes: int, status: int) -> ControllerState | None:
         """Return the state that an error frame names; None if it names no state."""
@@ -203,8 +205,6 @@ class FrameReader:
         receiver.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS_NEW, 1)
         receiver.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
         self.dropped = 0  # number of frames that the kernel dropped because the receive buffer was full
-        # Changes of the controller state with the problem of the new state. The caller removes them.
-        self.news: list[tuple[str, str]] = []
         self._state = state
         self._now_ns = now_ns
         self._wall_ns = wall_ns
@@ -263,7 +263,7 @@ class FrameReader:
                 dropped, lost = drops, True
             if can_id & _NO_DATA_FLAGS:
                 if can_id & ERROR_FLAG:
-                    lost |= self._add_error_frame(can_id ^ ERROR_FLAG, data)
+                    lost |= self._state.add_error_frame(can_id ^ ERROR_FLAG, data)
                 continue
             t_ns = seconds * NS_PER_S + ns - offset_ns if kind == SO_TIMESTAMPNS_NEW else now_ns
             if stepped_ns and not newest_ns < t_ns <= now_ns and newest_ns < t_ns + stepped_ns <= now_ns:
@@ -279,14 +279,6 @@ class FrameReader:
             lost = False
         self._newest_ns, self._lost = newest_ns, lost
         return frames
-
-    def _add_error_frame(self, classes: int, data: bytes) -> bool:
-        """Record an error frame. Return whether the controller lost frames."""
-        state = self._state
-        overflows = state.overflows
-        if news := state.add_error_frame(classes, data):
-            self.news.append((news, state.problem))
-        return state.overflows > overflows
 
     def _clocks(self) -> tuple[int, int]:
         """Return CLOCK_REALTIME minus CLOCK_MONOTONIC, and CLOCK_MONOTONIC, ns."""
@@ -546,16 +538,15 @@ class SocketCanLink:
 
     def _read_batch(self) -> int:
         """Read and deliver one batch. Return the number of frames; -1 if the bus ended."""
-        reader = self._reader
-        if reader is None:
+        if self._reader is None:
             return -1
         try:
-            frames = reader.read()
+            frames = self._reader.read()
         except OSError as error:
             self._end(error)
             return -1
-        while reader.news:
-            self._on_news(*reader.news.pop(0))
+        while self._state.news:
+            self._on_news(*self._state.news.pop(0))
         if frames:
             self._on_frames(frames)
         return len(frames)

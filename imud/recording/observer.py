@@ -6,7 +6,7 @@ Synchronization: the event loop's thread only.
 
 import logging
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import msgspec
 
@@ -186,57 +186,6 @@ class ClockObserver:
         record = records.encode_clocks(clocks)
         for put in self._listeners:
             put(record)
-
-
-class RecordedDevice(Protocol):
-    """A device with an observer. `imud.device` implements it, and this part may not import `imud.device`."""
-
-    @property
-    def tap(self) -> PathObserver:
-        """Observer of the device's path."""
-        ...
-
-    def record(self, put: PutRecord) -> None:
-        """Send the description of the device to `put`, then each input."""
-        ...
-
-
-class RecordableDevices:
-    """Devices and host clocks of a daemon for recorders. Synchronization: the event loop's thread only."""
-
-    def __init__(self, devices: Mapping[str, RecordedDevice], host: HostClock) -> None:
-        """`devices` contains the present devices at each call."""
-        self._devices = devices
-        self._host = ClockObserver(host)
-
-    def names(self) -> Sequence[str]:
-        """Return the names of the present devices."""
-        return list(self._devices)
-
-    def begin_host(self, put: PutRecord) -> None:
-        """Send the state of the host's clocks to `put`, then each reading. A second call sends the state again."""
-        self._host.begin(put)
-
-    def begin(self, device: str, put: PutRecord) -> None:
-        """Send the description of a device to `put`, then each input. Do nothing if the device does not exist.
-
-        A second call sends the description again.
-        """
-        found = self._devices.get(device)
-        if found is not None:
-            found.record(put)
-
-    def check(self, device: str, put: PutRecord) -> None:
-        """Send the newest sample and the ledger of a device to `put`. Do nothing if the device does not exist."""
-        found = self._devices.get(device)
-        if found is not None:
-            found.tap.check(put)
-
-    def end(self, put: PutRecord) -> None:
-        """Send no more records of the devices and of the host to `put`."""
-        for device in self._devices.values():
-            device.tap.end(put)
-        self._host.end(put)
 
 
 def _reading(reading: Reading) -> records.ReadingRecord:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Literal, NamedTuple, Protocol, TypedDict
 
 from imud.sim.physics import GRAVITY_M_S2, MOTIONS, Motion, Noise, Truth, swing
@@ -14,6 +15,23 @@ class Burst(NamedTuple):
     data: bytes
     sample_ns: int | None = None  # CLOCK_MONOTONIC of the measurement; None for text
     device_ms: int | None = None  # device time of the measurement since power-on, ms, without wrap
+
+
+class Pin(StrEnum):
+    """Output pins with the names of lines in the configuration."""
+
+    SOUT = "sout"  # High before each frame. The frame follows the falling edge.
+    SOUT_DIV = "sout_div"  # every n-th pulse of SOUT
+    ALARM = "alarm"  # high while an angle is out of its range
+
+
+class PinEdge(NamedTuple):
+    """A change of a pin's level."""
+
+    due_ns: int  # CLOCK_MONOTONIC of the change
+    pin: Pin
+    rising: bool
+    sample_ns: int | None = None  # CLOCK_MONOTONIC of the measurement in the next frame; None if no frame follows
 
 
 class StreamModule(Protocol):

@@ -145,9 +145,9 @@ class WebServer:
     async def _reading(self, _app: web.Application) -> Any:
         """Run the feed while the application runs."""
         self.hub = hub = BrowserHub(asyncio.get_running_loop().call_soon_threadsafe)
-        feed = Feed(self._path, hub.take, None)
+        feed = Feed(self._path, None)
         hub.attach(feed)
-        feed.start()
+        feed.start(hub.take)
         yield
         await asyncio.get_running_loop().run_in_executor(None, feed.close)
 

@@ -68,7 +68,7 @@ def renamed(words: str, devices: dict[str, dict[str, object]]) -> str:
 
 
 async def screens(daemon: RunningDaemon) -> tuple[str, str]:
-    app = TopApp(lambda on_news: TopFeed(str(daemon.socket), on_news))
+    app = TopApp(TopFeed(str(daemon.socket)))
     async with app.run_test(size=SIZE) as pilot:
         await pilot.pause(RUN_S / 2)
         overview = app.export_screenshot(title="imud top")

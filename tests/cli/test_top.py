@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from time import monotonic
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import msgspec
 import pytest
@@ -32,7 +32,6 @@ NEWS = News(
     samples=(msgspec.structs.replace(sample("bow"), euler_rad=(0.5, -0.25, 3.0)), sample("mast")),
 )  # fmt: skip
 
-MakeFeed = Callable[[Callable[[News], None]], Any]
 Steps = Callable[[Pilot[None], TopApp], Awaitable[None]]
 
 
@@ -41,10 +40,13 @@ def lines(app: TopApp) -> list[str]:
     return ["".join(segment.text for segment in strip).rstrip() for strip in strips]
 
 
-class SilentFeed:
+class SilentFeed(TopFeed):
     looked_at: ClassVar[list[str | None]] = []
 
-    def start(self) -> None:
+    def __init__(self) -> None:
+        super().__init__("")
+
+    def start(self, on_news: Callable[[News], None]) -> None:
         pass
 
     def look_at(self, device: str | None) -> None:
@@ -54,12 +56,10 @@ class SilentFeed:
         pass
 
 
-def played(
-    steps: Steps, make_feed: Callable[[Callable[[News], None]], Any] = lambda _: SilentFeed()
-) -> Callable[[], None]:
+def played(steps: Steps, feed: TopFeed | None = None) -> Callable[[], None]:
     def test() -> None:
         async def run() -> None:
-            app = TopApp(make_feed)
+            app = TopApp(feed or SilentFeed())
             async with app.run_test(size=SIZE) as pilot:
                 await pilot.pause()
                 await steps(pilot, app)
@@ -167,7 +167,7 @@ def test_without_a_daemon_it_says_so_and_tries_again(tmp_path: Path) -> None:
         while "no daemon at" not in lines(app)[0]:
             await pilot.pause(LOOK_S)
 
-    played(steps, lambda on_news: TopFeed(str(tmp_path / "nobody"), on_news))()
+    played(steps, TopFeed(str(tmp_path / "nobody")))()
 
 
 def test_what_a_device_sends_cannot_write_to_the_terminal() -> None:

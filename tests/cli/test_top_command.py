@@ -16,9 +16,9 @@ from tests.support.socket_rig import batch, daemon
 def test_status_samples_and_events_come_and_a_page_gets_those_of_its_device(tmp_path: Path) -> None:
     heard = Listener()
     with daemon(tmp_path) as served:
-        feed = TopFeed(str(served.path), heard.on_news)
+        feed = TopFeed(str(served.path))
         feed.look_at("imu1")
-        feed.start()
+        feed.start(heard.on_news)
         first = heard.wait_for(lambda news: news.statuses)
         assert first.statuses is not None
         assert [status.name for status in first.statuses] == ["imu0", "imu1"]
@@ -42,8 +42,8 @@ def test_it_connects_again_to_a_daemon_that_was_restarted(tmp_path: Path) -> Non
     heard = Listener()
     with daemon(tmp_path) as served:
         path = str(served.path)
-        feed = TopFeed(path, heard.on_news)
-        feed.start()
+        feed = TopFeed(path)
+        feed.start(heard.on_news)
         heard.wait_for(lambda news: news.statuses)
     assert path in heard.wait_for(lambda news: news.problem).problem
     with daemon(tmp_path):

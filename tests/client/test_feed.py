@@ -22,8 +22,8 @@ OVERVIEW = Wish((), news_s=0.02, newest=True, newest_s=0.02)
 @contextmanager
 def feeding(path: str, wanted: Wish | None) -> Iterator[tuple[Feed, Listener]]:
     heard = Listener()
-    feed = Feed(path, heard.on_news, wanted)
-    feed.start()
+    feed = Feed(path, wanted)
+    feed.start(heard.on_news)
     try:
         yield feed, heard
     finally:
@@ -103,8 +103,8 @@ def test_it_connects_again_to_a_daemon_that_was_restarted(tmp_path: Path) -> Non
     with daemon(tmp_path) as served:
         path = str(served.path)
         heard = Listener()
-        feed = Feed(path, heard.on_news, OVERVIEW)
-        feed.start()
+        feed = Feed(path, OVERVIEW)
+        feed.start(heard.on_news)
         heard.wait_for(lambda news: news.statuses)
     assert path in heard.wait_for(lambda news: news.problem).problem
     with daemon(tmp_path):

@@ -12,7 +12,8 @@ from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.hipnuc.uart_settings import AlarmSetting, HipnucHardware, ModuleSettings, Output
 from imud.sim.physics import Still
 from imud.sim.ports.faults import FaultRates, Faults
-from imud.sim.ports.pins import Pin, PinFaultRates, PinFaults
+from imud.sim.ports.pins import PinFaultRates, PinFaults
+from imud.sim.sensor import Pin
 from imud.utc.receivers import RmcOptions
 from tests.support.stories import played
 from tests.support.wired_device import BEGIN_NS, EDGE_LATE_NS, WiredDevice

@@ -136,7 +136,7 @@ def test_error_frames_go_their_own_way_and_can_mean_a_loss(wire: Wire) -> None:
     wire.sender.send(RAW_FRAME.pack(0x4000_0123, 0, b""))  # a remote frame
     wire.send(5, 6)
     assert wire.ids() == [(5, True), (6, False)]
-    assert (wire.state.overflows, wire.reader.news) == (1, [])
+    assert (wire.state.overflows, wire.state.news) == (1, [])
     wire.sender.send(ERROR_FRAME)
     assert wire.ids() == []
     wire.send(7)

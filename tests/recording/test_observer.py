@@ -5,11 +5,12 @@ from typing import cast
 
 from imud.config.model import DeviceConfig
 from imud.contracts.lines import Edge
+from imud.device.device import Device, RecordableDevices
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.formats.records import CheckRecord, Kind, decode_object, records_of
 from imud.model.ledger import Ledger
 from imud.model.options import NoOptions
-from imud.recording.observer import ClockObserver, PathObserver, RecordableDevices, RecordedDevice
+from imud.recording.observer import ClockObserver, PathObserver
 from imud.sampling.path import PathContext, StreamPath, make_clock
 from tests.support.event_loops import VirtualClock
 from tests.support.files import hi91
@@ -104,7 +105,7 @@ def test_readings_of_the_clocks_are_recorded() -> None:
 
 def test_recordable_devices_ignore_an_unknown_device() -> None:
     one, put = ObservedPath(), list[bytes]()
-    devices = RecordableDevices({"bow": cast("RecordedDevice", SimpleNamespace(tap=one.observer))}, one.host)
+    devices = RecordableDevices({"bow": cast(Device, SimpleNamespace(observer=one.observer))}, one.host)
     assert devices.names() == ["bow"]
     for name in ("stern", "bow"):
         devices.check(name, put.append)

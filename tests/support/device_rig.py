@@ -227,7 +227,7 @@ def is_replayed(rig: DeviceRig) -> bool:
 
 def check_replay(rig: DeviceRig) -> PlayedDevice:
     """Replay the records of a device, and compare samples and ledger with the live run."""
-    rig.device.tap.check(rig.recorded.append)
+    rig.device.observer.check(rig.recorded.append)
     samples: list[Sample] = []
     player = Player(lambda batch: samples.extend(batch.samples))
     player.play(record for one in rig.recorded for record in records_of(one))

@@ -22,8 +22,9 @@ from imud.sim.hipnuc.uart import HipnucModule
 from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings
 from imud.sim.imu61x.uart import Imu61xModule
 from imud.sim.ports.faults import Faults
-from imud.sim.ports.pins import MemoryInput, MemoryLines, MemoryOutput, OnEdge, Pin, PinFaults, Pins
+from imud.sim.ports.pins import MemoryInput, MemoryLines, MemoryOutput, OnEdge, PinFaults, Pins
 from imud.sim.ports.uart_wire import heard
+from imud.sim.sensor import Pin
 from imud.utc.receivers import RmcOptions
 from imud.utc.system_clock import KernelClock
 from tests.support.device_rig import DeviceRigs

@@ -22,7 +22,7 @@ class FakeFeed(Feed):
     """A feed without a thread. It keeps the wishes."""
 
     def __init__(self) -> None:
-        super().__init__("", lambda _news: None, None)
+        super().__init__("", None)
         self.wanted: list[Wish | None] = []
 
     def want(self, wanted: Wish | None) -> None:

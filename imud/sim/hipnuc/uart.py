@@ -45,9 +45,8 @@ from imud.sim.hipnuc.uart_settings import (
     rows,
 )
 from imud.sim.physics import MountingRotation, Truth, frame_of, level_of
-from imud.sim.ports.pins import Pin, PinEdge
 from imud.sim.ports.uart_wire import Transmitter
-from imud.sim.sensor import Burst, Simulator, SimulatorOptions, sensor_of
+from imud.sim.sensor import Burst, Pin, PinEdge, Simulator, SimulatorOptions, sensor_of
 
 SOUT_HIGH_NS: Final = 80 * NS_PER_US
 ALARM_PERIOD_MS: Final = 10

@@ -10,53 +10,23 @@ from bisect import bisect_right, insort
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from enum import StrEnum
 from pathlib import Path
 from random import Random
 from time import sleep
-from typing import Final, NamedTuple, Protocol, TextIO, runtime_checkable
+from typing import Final, Protocol, TextIO
 
 from imud.contracts.lines import Edge, InputOptions, LineFactory, OnEdges, OnLineEnd, OutputOptions
 from imud.model.errors import LinkError
 from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sim.hipnuc.uart import HipnucModule
 from imud.sim.ports.faults import parse_rates
-from imud.sim.sensor import StreamModule
+from imud.sim.sensor import Pin, PinEdge, StreamModule
 
 # Function for an edge: its due time (CLOCK_MONOTONIC, ns), and True for a rising edge.
 OnEdge = Callable[[int, bool], None]
 EXTRA_HIGH_NS: Final = 80_000
 EXTRA_WITHIN_NS: Final = NS_PER_MS
 LOST_MAX: Final = 100_000  # Maximum number of pulses in `PinFaults.lost`. The counters have no limit.
-
-
-class Pin(StrEnum):
-    """Output pins with the names of lines in the configuration."""
-
-    SOUT = "sout"  # High before each frame. The frame follows the falling edge.
-    SOUT_DIV = "sout_div"  # every n-th pulse of SOUT
-    ALARM = "alarm"  # high while an angle is out of its range
-
-
-class PinEdge(NamedTuple):
-    """A change of a pin's level."""
-
-    due_ns: int  # CLOCK_MONOTONIC of the change
-    pin: Pin
-    rising: bool
-    sample_ns: int | None = None  # CLOCK_MONOTONIC of the measurement in the next frame; None if no frame follows
-
-
-@runtime_checkable
-class PinModule(Protocol):
-    """A simulated device with pins. Its inputs are methods (`mark`). Times as in `StreamModule`."""
-
-    def pins(self, now_ns: int) -> list[PinEdge]:
-        """Return the edges since the last call, in order. All pins are low at the start."""
-        ...
-
-    def next_pin_ns(self) -> int | None:
-        """Return the time of the next edge of `pins`; None if no edge is due."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +84,7 @@ class Pins:
 
     def __init__(
         self,
-        module: PinModule,
+        module: HipnucModule,
         on_edge: Mapping[Pin, OnEdge],
         faults: PinFaults | None = None,
         truth: TextIO | None = None,
@@ -377,7 +347,7 @@ class SimulatedLines:
         self._files, self._truth = files, truth
         self._pins: Pins | None = None
         if files:
-            if not isinstance(module, PinModule):
+            if not isinstance(module, HipnucModule):
                 raise ValueError("pins: expected a device with simulated pins, got one without pins")
             self._pins = Pins(module, files, faults, truth)
         self._sin = SinFile(sin, module) if sin else None

@@ -27,9 +27,9 @@ from imud.sim import SIMULATORS
 from imud.sim.ports.arrival import BARE_UART
 from imud.sim.ports.can_port import CanPort
 from imud.sim.ports.faults import FaultRates, Faults
-from imud.sim.ports.pins import Pin, PinFaultRates, PinFaults, PullFile, SimulatedLines
+from imud.sim.ports.pins import PinFaultRates, PinFaults, PullFile, SimulatedLines
 from imud.sim.ports.pty import Adapter, PtyNode, SimulatedPort, set_baud
-from imud.sim.sensor import SimulatorOptions, StreamModule
+from imud.sim.sensor import Pin, SimulatorOptions, StreamModule
 from tests.lab.bus import Bus, i2c_bus, spi_bus
 from tests.lab.can_interface import CanInterface, controller_pair, virtual_can
 from tests.lab.chaos.polls import LoggedRegisters, PollLog, block_replies

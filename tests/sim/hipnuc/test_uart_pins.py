@@ -9,8 +9,7 @@ from imud.drivers.hipnuc.uart.commands import AlarmAxis, alarm, sout_divider
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.hipnuc.uart_settings import AlarmSetting, HipnucHardware, ModuleSettings, Output
 from imud.sim.physics import Still, swing
-from imud.sim.ports.pins import Pin, PinEdge
-from imud.sim.sensor import Burst
+from imud.sim.sensor import Burst, Pin, PinEdge
 from tests.support.simulated_modules import BEGIN_NS, FAST, HIPNUC_STILL, HipnucUartBench
 
 HIGH_NS = 80_000  # SOUT pulse, 80 us

@@ -6,7 +6,8 @@ import pytest
 
 from imud.model.units import NS_PER_MS
 from imud.sim.ports.faults import FaultKind, FaultRates, Faults
-from imud.sim.ports.pins import MemoryInput, Pin, PinFaultRates, PinFaults, Pins
+from imud.sim.ports.pins import MemoryInput, PinFaultRates, PinFaults, Pins
+from imud.sim.sensor import Pin
 from tests.support.simulated_modules import FAST, HipnucUartBench
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from imud.model.units import NS_PER_MS
-from imud.sim.ports.pins import Pin, PinEdge, PullFile, SinFile, pull_files
+from imud.sim.ports.pins import PullFile, SinFile, pull_files
+from imud.sim.sensor import Pin, PinEdge
 
 
 def test_pull_files_are_written_as_the_kernel_wants(tmp_path: Path) -> None:
