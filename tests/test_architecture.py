@@ -7,6 +7,7 @@ import ast
 import re
 from functools import cache
 from pathlib import Path
+from typing import TypeGuard
 
 PACKAGE = Path(__file__).parent.parent / "imud"
 
@@ -202,6 +203,113 @@ def limits_exceeded(module: str, node: ast.ClassDef) -> list[str]:
             if (parameters > PARAMETERS_MAX) != (f"{module}.{node.name}" in LARGE_CONSTRUCTORS):
                 found.append(f"{node.name}: {parameters} parameters")
     return found
+
+
+@cache
+def classes() -> dict[str, ast.ClassDef]:
+    """Return all classes of the package by name. A name is public once (see below)."""
+    trees = [tree_of(path) for path in MODULES.values()]
+    return {node.name: node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+
+
+def bases_of(node: ast.ClassDef) -> list[ast.ClassDef]:
+    """Return a class and its base classes in this package."""
+    found = [node]
+    for base in node.bases:
+        named = classes().get(ast.unparse(base).partition("[")[0])
+        found += bases_of(named) if named is not None and named is not node else []
+    return found
+
+
+def is_protocol(node: ast.ClassDef) -> bool:
+    return any(ast.unparse(base).startswith("Protocol") for base in node.bases)
+
+
+FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+def members(node: ast.ClassDef) -> set[str]:
+    """Return the public methods, fields and attributes of a class and its bases."""
+    found = set()
+    for owner in bases_of(node):
+        found |= {
+            one.attr for one in ast.walk(owner) if isinstance(one, ast.Attribute) and isinstance(one.ctx, ast.Store)
+        }
+        found |= {one.name for one in owner.body if isinstance(one, FUNCTIONS)}
+        fields = [one for one in owner.body if isinstance(one, ast.Assign | ast.AnnAssign)]
+        found |= {ast.unparse(target) for one in fields for target in getattr(one, "targets", ())}
+        found |= {ast.unparse(one.target) for one in fields if isinstance(one, ast.AnnAssign)}
+    return {name for name in found if not name.startswith("_")}
+
+
+def own_functions_passed(owner: ast.ClassDef) -> list[str]:
+    """Return the calls of constructors with a method of `owner`, or with a function that uses `self`."""
+    names = {one.name for base in bases_of(owner) for one in base.body if isinstance(one, FUNCTIONS)}
+    properties = {
+        one.name
+        for base in bases_of(owner)
+        for one in base.body
+        if isinstance(one, FUNCTIONS) and "property" in " ".join(map(ast.unparse, one.decorator_list))
+    }
+    local = {
+        one.name for one in ast.walk(owner) if isinstance(one, FUNCTIONS) and one not in owner.body and uses_self(one)
+    }
+    return [
+        f"{owner.name}: {ast.unparse(call.func)}({ast.unparse(argument)})"
+        for call in ast.walk(owner)
+        if isinstance(call, ast.Call) and ast.unparse(call.func).rpartition(".")[2] in classes().keys() - RECORDS
+        for argument in (*call.args, *(keyword.value for keyword in call.keywords))
+        if (isinstance(argument, ast.Lambda) and uses_self(argument))
+        or (isinstance(argument, ast.Name) and argument.id in local)
+        or ast.unparse(argument) in {f"self.{name}" for name in names - properties}
+    ]
+
+
+def uses_self(node: ast.AST) -> bool:
+    return any(isinstance(one, ast.Name) and one.id == "self" for one in ast.walk(node))
+
+
+RECORDS = {"LineFactory", "PublisherContext", "Reader", "Request"}
+"""Records of functions, without behavior."""
+
+
+def test_a_constructor_receives_no_function_of_the_object_that_calls_it() -> None:
+    nodes = [node for path in MODULES.values() for node in ast.walk(tree_of(path)) if isinstance(node, ast.ClassDef)]
+    wrong = [call for node in nodes for call in own_functions_passed(node)]
+    assert not wrong, wrong
+
+
+FOR_TESTS = {
+    "BrokerConnection": "tests connect without a broker",
+    "Viewer": "tests record the messages",
+    "WatchingWorker": "tests do the rounds of a bus in the event loop",
+    "Worker": "tests do the rounds themselves",
+}
+"""Protocols with one implementation in `imud/` and another implementation in `tests/`."""
+OTHER_LIBRARIES = {"I2cBus": "smbus2", "Poller": "select.epoll", "_Event": "PyYAML"}
+"""Protocols that describe an object of another library."""
+
+
+def test_a_protocol_has_two_implementations_or_a_reason() -> None:
+    """One implementation is enough if the docstring names its part, which the users may not import."""
+    wrong = []
+    parts = {node.name: part_of(m) for m, path in MODULES.items() for node in tree_of(path).body if is_class(node)}
+    found = {name: members(node) for name, node in classes().items() if not is_protocol(node)}
+    for name, node in classes().items():
+        wanted = members(node)
+        if not is_protocol(node) or not wanted or name in FOR_TESTS or name in OTHER_LIBRARIES:
+            continue  # a protocol without a public member is the type of a function (`__call__`)
+        made_by = [one for one, has in found.items() if wanted <= has]
+        words = ast.get_docstring(node) or ""
+        is_named = any(f"`{parts.get(one)}`" in words and "import" in words for one in made_by)
+        if len(made_by) < 2 and not is_named:
+            wrong.append(f"{name}: {made_by}")
+    assert not wrong, wrong
+    assert not (FOR_TESTS.keys() | OTHER_LIBRARIES.keys()) - classes().keys()
+
+
+def is_class(node: ast.stmt) -> TypeGuard[ast.ClassDef]:
+    return isinstance(node, ast.ClassDef)
 
 
 def test_a_small_module_has_several_importers() -> None:

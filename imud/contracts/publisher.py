@@ -26,7 +26,8 @@ TakeSnapshot = Callable[[socket], float]
 
 
 class RecordingSource(Protocol):
-    """Data of devices and host clocks for recorders. Synchronization: the thread of the loop only."""
+    """Data of devices and host clocks for recorders. `imud.device` implements it, and outputs may not import that part.
+    Synchronization: the thread of the loop only."""
 
     def names(self) -> Sequence[str]:
         """Return the names of the present devices."""
@@ -123,7 +124,8 @@ class Publisher(Protocol):
 
 
 class DeviceControl(Protocol):
-    """Operations on one device for clients with permission. Results are values that JSON can represent."""
+    """Operations on one device for clients with permission. Results are values that JSON can represent. `imud.device`
+    implements it, and outputs may not import that part."""
 
     @property
     def actions(self) -> Actions:
@@ -161,7 +163,8 @@ class DeviceControl(Protocol):
 
 
 class Latencies(Protocol):
-    """Latency requests of publishers. The strictest request limits the hold of a device."""
+    """Latency requests of publishers. The strictest request limits the hold of a device. `imud.device` implements it,
+    and outputs may not import that part."""
 
     def ask(self, who: str, latency_ns: int, devices: Collection[str] | None = None) -> None:
         """Request a latency for samples of `devices` (None: of all), in place of the previous request of `who`."""

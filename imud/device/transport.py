@@ -48,7 +48,7 @@ IDENTIFY_AGAIN_S = (5, 30, 120, 300)
 
 
 class DeviceOwner(Protocol):
-    """Owner of devices: the daemon, which imports this part, or a test."""
+    """Owner of devices. `imud.daemon` implements it, and this part may not import `imud.daemon`."""
 
     def publish(self, batch: Batch) -> None:
         """Process samples of a device."""

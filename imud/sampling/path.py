@@ -286,7 +286,8 @@ class SamplePath(ABC):
 
 
 class SampleListener(Protocol):
-    """Listener to the measurements of a codec, for a command that waits for one."""
+    """Listener to the measurements of a codec, for a command that waits for one. `imud.device` implements it, and this
+    part may not import `imud.device`."""
 
     wants_samples: bool  # whether the listener is active
 
