@@ -10,6 +10,7 @@ of one form share: messages, or a batch that `publish` had no time to encode.
 """
 
 import array
+import os
 import socket
 from abc import ABC, abstractmethod
 from collections import Counter, deque
@@ -297,6 +298,13 @@ class Outbox(ABC):
     Synchronization: the event loop's thread.
     """
 
+    # a client has more attributes than the interpreter keeps in its fast form
+    __slots__ = (
+        "_fd", "_limits", "_partial", "_partial_fd", "_pool", "_replies", "_request_bytes", "_sample_bytes",
+        "_sample_count", "_samples", "_send", "_skip", "_sock", "_unreported", "dropped", "held_bytes", "progress",
+        "reply_bytes", "sent", "uid", "waiting",
+    )  # fmt: skip
+
     def __init__(self, sock: socket.socket, pool: Pool, uid: int) -> None:
         self.uid = uid
         self.sent = 0  # number of samples passed to the socket
@@ -307,7 +315,9 @@ class Outbox(ABC):
         self.progress = 0  # count of the pool at the last progress of this client
         self._request_bytes = 0
         self._sock = sock
-        self._send = sock.send
+        # `write` needs 15 % fewer instructions than `socket.send`. Python ignores SIGPIPE, so it also raises EPIPE.
+        self._send: Callable[[int, bytes], int] = os.write
+        self._fd = sock.fileno()  # -1 after `discard`, because another socket can get the number
         self._limits = pool.limits
         self._pool = pool
         self._samples: deque[Delivery] = deque()
@@ -365,7 +375,7 @@ class Outbox(ABC):
                 outbox._queue_samples(delivery)
                 continue
             try:
-                count = outbox._send(whole)
+                count = outbox._send(outbox._fd, whole)
             except BlockingIOError:
                 count = 0
             except OSError as error:
@@ -427,6 +437,7 @@ class Outbox(ABC):
     def discard(self) -> None:
         """Discard the queue, because the connection ends."""
         self.waiting = False
+        self._fd = -1
         self._samples.clear()
         self._replies.clear()
         self._partial = b""
@@ -535,7 +546,7 @@ class Outbox(ABC):
 
     def _send_partial(self) -> int:
         if self._partial_fd == NO_FD:
-            return self._send(self._partial)
+            return self._send(self._fd, self._partial)
         rights = (socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", [self._partial_fd]))
         count = self._sock.sendmsg([self._partial], [rights])
         self._partial_fd = NO_FD  # sent with the first byte

@@ -275,7 +275,7 @@ class Trickle:
     def fileno(self) -> int:
         return self.sock.fileno()
 
-    def send(self, data: bytes) -> int:
+    def send(self, _fd: int, data: bytes) -> int:
         if self.rng.random() < 0.3:
             raise BlockingIOError
         return self.sock.send(data[: self.rng.choice([1, 3, 10, 1000, 100_000])])
@@ -291,6 +291,8 @@ class TestOutbox(Outbox):
 
     def __init__(self, sock: object, pool: Pool, uid: int = 0) -> None:
         super().__init__(sock, pool, uid)  # type: ignore[arg-type]  # a part of a socket is enough
+        if isinstance(sock, Trickle | Blocked):
+            self._send = sock.send
 
     def on_broken(self, reason: str) -> None:
         pytest.fail(reason)
@@ -353,6 +355,26 @@ def test_messages_stay_whole_wherever_a_send_is_cut(seed: int) -> None:
         theirs.close()
 
     run(body)
+
+
+class EndedOutbox(TestOutbox):
+    def on_broken(self, reason: str) -> None:
+        assert reason == "Bad file descriptor"
+
+
+def test_a_client_that_left_sends_nothing_to_the_next_owner_of_its_descriptor() -> None:
+    """A client can leave while imud sends a batch to its list."""
+    ours, theirs = socket.socketpair()
+    outbox, number = EndedOutbox(ours, Pool(1 << 26, MANY)), ours.fileno()
+    outbox.discard()
+    ours.close()
+    for sock in (theirs, *(others := socket.socketpair())):
+        sock.setblocking(False)
+    assert others[0].fileno() == number
+    put(outbox, 1, 1)
+    assert drained(others[1]) == b""
+    for sock in (theirs, *others):
+        sock.close()
 
 
 def test_queued_messages_hold_no_samples() -> None:
@@ -438,7 +460,10 @@ class Blocked:
         self.room = False
         self.sent: list[int] = []
 
-    def send(self, data: bytes) -> int:
+    def fileno(self) -> int:
+        return -1
+
+    def send(self, _fd: int, data: bytes) -> int:
         if not self.room:
             raise BlockingIOError
         self.sent.append(len(data))
