@@ -166,7 +166,8 @@ def play_here(file: BinaryIO, name: str, sink: Sink, devices: Collection[str]) -
 
 def play_beside(path: Path, sink: Sink, devices: Sequence[str], at: Callable[[int], None]) -> Played:
     """Play a recording in a second process. Call `at` with the read position in bytes. Raises ImudError."""
-    argv = [sys.executable, "-I", "-m", "imud.cli.export_sources", str(path.absolute()), *devices]
+    # -P: the module comes from the tree of this process, never from the current directory
+    argv = [sys.executable, "-P", "-m", "imud.cli.export_sources", str(path.absolute()), *devices]
     with subprocess.Popen(argv, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL) as process:
         assert process.stdout is not None
         with suppress(OSError):  # above fs.pipe-max-size or the user's limit: a smaller pipe is only slower

@@ -116,6 +116,15 @@ def test_a_player_that_ends_early_is_an_error(
         play_beside(file, KeepingSink(), [], lambda _at: None)
 
 
+def test_the_player_uses_the_tree_of_this_process(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "imud.py").write_text("raise SystemExit('another tree')")
+    monkeypatch.chdir(tmp_path)
+    play_beside(file, KeepingSink(), [], lambda _at: None)  # not of the current directory
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(ImudError, match="player process ended early"):
+        play_beside(file, KeepingSink(), [], lambda _at: None)
+
+
 def test_an_error_of_the_sink_ends_the_player(file: Path) -> None:
     class Full(KeepingSink):
         def samples(self, batch: Batch) -> None:

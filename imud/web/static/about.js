@@ -13,12 +13,12 @@ export function aboutRows({ status, lost, bytes_open, frames_open }) {
   const rows = [
     ["link", `${status.link}, driver ${status.driver}, opened ${times(status.connects)}`],
     ["identity", pairs(status.identity) || "unknown"],
-    ["rate", `${number(status.rate_hz, 1)} Hz measured, ${number(status.expected_rate_hz, 1)} Hz by the device time`],
+    ["rate", `${number(status.rate_hz, 1)} Hz measured, ${number(status.expected_rate_hz, 1)} Hz by the device's clock`],
     ["clock", `${clock.sync}, skew ${number(clock.skew_ppm, 2)} ppm, residual ${seconds(clock.residual_ns)}, error ${seconds(clock.t_err_ns)}, ${number(clock.resets)} resets`],
     ["latency", latency(status)],
     ["samples", `${number(ledger.samples)}; lost ${number(lost)} (device ${number(ledger.lost_gap_device)}, damaged ${number(ledger.lost_crc)}, ` +
       `overrun ${number(ledger.lost_overrun)}, queue ${number(ledger.lost_queue)}), ${number(ledger.lost_unknown)} gaps of unknown size`],
-    ["bytes", `${number(ledger.bytes_in)}: the ledger ${bytes_open || frames_open ? "DOES NOT BALANCE" : "balances"}`],
+    ["bytes", `${number(ledger.bytes_in)}: ${bytes_open || frames_open ? "NOT BALANCED" : "balanced"}`],
     ["kernel", `${number(kernel.overrun)} overruns, ${number(kernel.framing)} framing, ${number(kernel.parity)} parity`],
   ];
   if (status.temperature_c !== null) rows.splice(3, 0, ["temperature", `${number(status.temperature_c, 1)} °C`]);
@@ -48,7 +48,7 @@ function latency(status) {
 
 function axes(frame) {
   const words = frame.convention === "device" ? frame.frame : `${frame.convention}, ${frame.frame}`;
-  const declination = frame.declination_deg === null ? "" : ` by a declination of ${shown(frame.declination_deg)}°`;
+  const declination = frame.declination_deg === null ? "" : ` with a declination of ${shown(frame.declination_deg)}°`;
   return `${words}; heading ${frame.heading}${declination}${inBrackets(frame.problem)}`;
 }
 
@@ -62,12 +62,12 @@ function declared(settings) {
 
 function polling(polls) {
   return `${number(polls.polls)} reads, ${number(polls.late)} late, ${number(polls.missed)} missed, ${number(polls.stale)} stale, ` +
-    `${number(polls.failed)} failed; ${seconds(polls.late_mean_ns)} after the deadline, ${seconds(polls.late_worst_ns)} at worst; ` +
-    `disappeared ${times(polls.vanished)}`;
+    `${number(polls.failed)} failed; ${seconds(polls.late_mean_ns)} after the deadline, maximum ${seconds(polls.late_worst_ns)}; ` +
+    `vanished ${times(polls.vanished)}`;
 }
 
 function serialLine(line) {
-  return `${number(line.timeouts)} requests without reply; ${number(line.late_bytes)} late bytes, ${number(line.strange_bytes)} unexpected bytes; ` +
+  return `${number(line.timeouts)} requests without a reply; ${number(line.late_bytes)} bytes without a request, ${number(line.strange_bytes)} invalid bytes; ` +
     `${number(line.echoes)} echoes (all devices of the bus)`;
 }
 
@@ -83,7 +83,7 @@ function lines(status, clock) {
     rows.push(["pulses", `${number(clock.edges)}, ${number(clock.edges_unpaired)} without a sample; ${number(clock.samples_unpaired)} samples without a pulse`]);
   if (status.sin)
     rows.push(["sin", `${number(status.triggers)} triggers, ${number(status.triggers_missed)} missed; ${seconds(status.trigger_late_mean_ns)} after the ` +
-      `deadline, ${seconds(status.trigger_late_worst_ns)} at worst; ${number(clock.triggers_missed)} without reply${inBrackets(problems.sin)}`]);
+      `deadline, maximum ${seconds(status.trigger_late_worst_ns)}; ${number(clock.triggers_missed)} without a frame${inBrackets(problems.sin)}`]);
   const others = Object.keys(problems).filter((name) => !(name in status.edges) && name !== "sin");
   return [...rows, ...others.sort().map((name) => [name, problems[name]])];
 }
@@ -101,5 +101,5 @@ function utc(status) {
   if (status.pulses || status.pulses_ignored) words.push(`${number(status.pulses)} pulses, ${number(status.pulses_ignored)} ignored`);
   if (status.chrony_sent || status.chrony_refused)
     words.push(`chronyd accepted ${number(status.chrony_sent)}, refused ${number(status.chrony_refused)}`);
-  return (words.join("; ") || "no data yet") + inBrackets(status.problem);
+  return (words.join("; ") || "no pulse and no sentence yet") + inBrackets(status.problem);
 }
