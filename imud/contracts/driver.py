@@ -17,6 +17,7 @@ from imud.contracts.setting import SettingsTable
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame
 from imud.model.ledger import Ledger
 from imud.model.options import Options
+from imud.model.sample import Vector3
 
 SensorName = Literal["gyro", "accel"]
 Figure = Annotated[float, Meta(gt=0)] | None  # positive number; None if the vendor does not state it
@@ -192,6 +193,11 @@ class StreamDriver(Driver):
             expected = f"a baud rate of {self.name} ({', '.join(map(str, sorted(self.baud_rates)))}) or auto"
             found.append(KeyProblem("link", "baud", f"expected {expected}, got {baud}"))
         return found
+
+
+def random_vector(random: Random, spread: float) -> Vector3:
+    """Return three random numbers around zero, for the examples of the property tests."""
+    return (random.gauss(0, spread), random.gauss(0, spread), random.gauss(0, spread))
 
 
 D = TypeVar("D", bound=Driver)

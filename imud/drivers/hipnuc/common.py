@@ -35,7 +35,7 @@ from imud.contracts.command import (
     Target,
 )
 from imud.contracts.driver import DataSheet, StatusBit
-from imud.model.sample import Quaternion, Vector3
+from imud.model.sample import Quaternion
 from imud.model.units import RAD_PER_DEG, T_PER_UT
 
 M_S2_PER_G: Final = 9.8  # G of the firmware, m/s²: it divides by 9.8, not by standard gravity
@@ -54,11 +54,6 @@ def counts_of(value: float, bits: int) -> int:
         raise ValueError("NaN has no count")
     most = 1 << bits - 1
     return round(max(-most, min(most - 1, value)))
-
-
-def random_vector(random: Random, spread: float) -> Vector3:
-    """Return three random numbers around zero, for the examples of the property tests."""
-    return (random.gauss(0, spread), random.gauss(0, spread), random.gauss(0, spread))
 
 
 def random_quaternion(random: Random) -> Quaternion:

@@ -37,7 +37,7 @@ from msgspec import Meta
 from imud.attitude.conventions import FLU_LEVEL
 from imud.attitude.rotation import quat_from_euler_zyx
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
-from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Identity
+from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Identity, random_vector
 from imud.contracts.script import says_nothing
 from imud.drivers.imu61x.common import (
     EULER_CONVENTION,
@@ -45,7 +45,6 @@ from imud.drivers.imu61x.common import (
     NAVIGATION_FRAME,
     RAD_S_PER_DEG_S,
     SHEET,
-    random_vector,
     relative_heading,
 )
 from imud.drivers.value_limits import is_possible, possible_temperature_c, scaled

@@ -6,7 +6,6 @@ imud follows the vendor's programs in both cases.
 
 import zlib
 from collections.abc import Mapping
-from random import Random
 from types import MappingProxyType
 from typing import Annotated, Final, Literal, get_args
 
@@ -14,7 +13,6 @@ from msgspec import Meta
 
 from imud.attitude.conventions import Heading
 from imud.contracts.driver import DataSheet, SensorName
-from imud.model.sample import Vector3
 from imud.model.units import RAD_PER_DEG, STANDARD_GRAVITY_M_S2
 
 CRC_START: Final = 0xFFFFFFFE  # start value for `zlib.crc32`, which inverts start value and result: register value 1
@@ -37,11 +35,6 @@ def crc32(data: bytes | bytearray | memoryview) -> int:
 # 1 g of the device is standard gravity (not defined in the manual; the vendor's driver uses 9.80665)
 M_S2_PER_G: Final = STANDARD_GRAVITY_M_S2
 RAD_S_PER_DEG_S: Final = RAD_PER_DEG  # 1 °/s of the device
-
-
-def random_vector(random: Random, spread: float) -> Vector3:
-    """Return three random numbers around zero, for the examples of the property tests."""
-    return (random.gauss(0, spread), random.gauss(0, spread), random.gauss(0, spread))
 
 
 # Readable convention of `euler_rad`. The vendor's driver assumes this order.

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from imud.contracts.codec import BadReason, Poll, PolledEvent, Vanished
 from imud.contracts.command import Target
-from imud.contracts.driver import Identity
+from imud.contracts.driver import Identity, random_vector
 from imud.contracts.script import Transfer, TransferScript
 from imud.contracts.setting import SettingsTable
 from imud.drivers.imu61x.common import (
@@ -24,7 +24,6 @@ from imud.drivers.imu61x.common import (
     RAD_S_PER_DEG_S,
     crc32,
     product_of,
-    random_vector,
 )
 from imud.drivers.imu61x.registers import (
     CHECK_NS,

@@ -12,10 +12,10 @@ from msgspec import Meta
 from imud.attitude.rotation import quat_from_euler_zyx
 from imud.contracts.codec import BadReason, Poll, PolledEvent, Vanished
 from imud.contracts.command import Target
-from imud.contracts.driver import Identity
+from imud.contracts.driver import Identity, random_vector
 from imud.contracts.script import Transfer, TransferScript
 from imud.contracts.setting import Setting, SettingsTable
-from imud.drivers.imu61x.common import M_S2_PER_G, RAD_S_PER_DEG_S, crc32, random_vector
+from imud.drivers.imu61x.common import M_S2_PER_G, RAD_S_PER_DEG_S, crc32
 from imud.drivers.imu61x.registers import (
     BURST,
     BURST_CTRL,

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final, Literal, get_args
 from msgspec import Meta
 
 from imud.contracts.command import Action, Actions, Risk, Target
-from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, DataSheet
+from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, DataSheet, random_vector
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import Effect, Setting, SettingsTable, Written
 from imud.drivers.hipnuc.bus_load import MS_PER_S, CyclicMessage, refuse_other_rate, refuse_overload
@@ -49,7 +49,7 @@ from imud.drivers.hipnuc.canopen.commands import (
     identify,
     read_settings,
 )
-from imud.drivers.hipnuc.common import DOCUMENT, inclinometer_zero, random_vector
+from imud.drivers.hipnuc.common import DOCUMENT, inclinometer_zero
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
 from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_S, NS_PER_US

@@ -9,11 +9,11 @@ from msgspec import Meta
 
 from imud.attitude.rotation import euler312_from_quat
 from imud.contracts.command import Action, Actions, Risk, Target
-from imud.contracts.driver import SAMPLE_COUNTER, CanDriver
+from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, random_vector
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import Effect, Setting, SettingsTable, Written
 from imud.drivers.hipnuc.bus_load import CyclicMessage, refuse_other_rate, refuse_overload
-from imud.drivers.hipnuc.common import REGISTERS, inclinometer_zero, random_quaternion, random_vector
+from imud.drivers.hipnuc.common import REGISTERS, inclinometer_zero, random_quaternion
 from imud.drivers.hipnuc.j1939 import codec, commands
 from imud.drivers.hipnuc.j1939.codec import (
     CONFIGURE,

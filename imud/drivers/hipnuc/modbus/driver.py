@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from imud.attitude.rotation import euler312_from_quat
 from imud.contracts.command import Action, Actions, Calibrations, Risk, Target, Verdict
-from imud.contracts.driver import PolledDriver
+from imud.contracts.driver import PolledDriver, random_vector
 from imud.contracts.script import TransferScript
 from imud.contracts.setting import Effect, Setting, SettingsTable
 from imud.drivers.hipnuc.common import (
@@ -22,7 +22,6 @@ from imud.drivers.hipnuc.common import (
     levels,
     magnetometer,
     random_quaternion,
-    random_vector,
 )
 from imud.drivers.hipnuc.modbus import commands
 from imud.drivers.hipnuc.modbus.codec import HipnucModbusCodec, HipnucModbusOptions, pack_block, update_ns

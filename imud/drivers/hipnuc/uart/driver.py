@@ -21,7 +21,7 @@ from imud.contracts.command import (
     Target,
     Verdict,
 )
-from imud.contracts.driver import Identity, StreamDriver
+from imud.contracts.driver import Identity, StreamDriver, random_vector
 from imud.contracts.script import Request, RequestScript, Silence
 from imud.drivers.hipnuc.common import (
     FLOATS,
@@ -33,7 +33,6 @@ from imud.drivers.hipnuc.common import (
     levels,
     magnetometer,
     random_quaternion,
-    random_vector,
 )
 from imud.drivers.hipnuc.uart import commands
 from imud.drivers.hipnuc.uart.codec import (

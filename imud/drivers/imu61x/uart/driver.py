@@ -19,7 +19,7 @@ from imud.contracts.command import (
     Risk,
     Target,
 )
-from imud.contracts.driver import StreamDriver
+from imud.contracts.driver import StreamDriver, random_vector
 from imud.contracts.script import RequestScript, pause
 from imud.drivers.imu61x.common import (
     EULER_CONVENTION,
@@ -28,7 +28,6 @@ from imud.drivers.imu61x.common import (
     SHEET,
     filter_code,
     i2c_address,
-    random_vector,
     relative_heading,
 )
 from imud.drivers.imu61x.uart import commands, settings
