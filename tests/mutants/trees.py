@@ -14,16 +14,13 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import count
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from tests.mutants.changes import ROOT
 
 DOCUMENT_TESTS: Final = {"tests/test_docs.py", "tests/test_architecture.py"}
 LIMIT_S: Final = 900
 """Maximum time of one run of pytest."""
-NO_MIRROR: Final = {
-    "audit", "bench", "lab", "lab_debian", "fuzz", "attack", "support", "packaging", "monitoring",
-}  # fmt: skip
 
 
 def tests_in(folder: Path) -> list[str]:
@@ -33,12 +30,11 @@ def tests_in(folder: Path) -> list[str]:
 
 
 @cache
-def tested_in() -> dict[str, str]:
-    """Return TESTED_IN of tests/test_architecture.py: test modules of modules without one of their own."""
-    for node in ast.parse((ROOT / "tests/test_architecture.py").read_bytes()).body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "TESTED_IN":
-            return dict(ast.literal_eval(node.value))
-    return {}
+def rules() -> dict[str, Any]:
+    """Return the constants TESTED_IN and ELSEWHERE of tests/test_architecture.py in the tree of ROOT."""
+    nodes = ast.parse((ROOT / "tests/test_architecture.py").read_bytes()).body
+    found = {ast.unparse(node.targets[0]): node.value for node in nodes if isinstance(node, ast.Assign)}
+    return {name: ast.literal_eval(found[name]) for name in ("TESTED_IN", "ELSEWHERE")}
 
 
 def stages(path: str) -> list[list[str]]:
@@ -51,12 +47,15 @@ def stages(path: str) -> list[list[str]]:
     folders = [ROOT / "tests" / folder for folder in module.relative_to("imud").parents]
     name = re.compile(rf".*/test_{module.name.strip('_')}(_\w+)?\.py")
     own = [test for test in tests_in(folders[0]) if name.fullmatch(test)]
-    first = own or ([f"tests/{tested_in()[dotted]}"] if dotted in tested_in() else [])
+    tested_in = rules()["TESTED_IN"]
+    first = own or ([f"tests/{tested_in[dotted]}"] if dotted in tested_in else [])
     below = sorted(folders[0].glob("*/**/")) if len(folders) > 1 else []
     found = [first, tests_in(folders[0]), [test for folder in below for test in tests_in(folder)]]
     found += map(tests_in, folders[1:-1])
     if not first:
-        tests = [path for path in sorted((ROOT / "tests").rglob("test_*.py")) if path.parts[-2] not in NO_MIRROR]
+        tests = [
+            path for path in sorted((ROOT / "tests").rglob("test_*.py")) if path.parts[-2] not in rules()["ELSEWHERE"]
+        ]
         found.append([path.relative_to(ROOT).as_posix() for path in tests if dotted in path.read_text()])
     stage_of = {test: number for number, stage in reversed(list(enumerate(found))) for test in stage}
     return [new for number, stage in enumerate(found) if (new := [test for test in stage if stage_of[test] == number])]
