@@ -136,10 +136,10 @@ soak: $(VENV)/made
 	$(BIN)/python -m tests.bench.soak $(ARGS)
 
 pictures: $(VENV)/made
-	$(BIN)/python -m tests.support.pictures
-	$(BIN)/python -m tests.cli.pictures
-	$(BIN)/python -m tests.analysis.pictures
-	$(BIN)/python -m tests.bench.clock_pictures
+	$(BIN)/python -m docs.generate.pictures
+	$(BIN)/python -m docs.generate.terminal_pictures
+	$(BIN)/python -m docs.generate.analysis_pictures
+	$(BIN)/python -m docs.generate.clock_pictures
 
 # Coverage-guided fuzzing: ARGS="--seconds 60 --seed 25" in CI, ARGS="--seconds 3600 --target stream/" by hand.
 $(VENV)/made-fuzz: $(VENV)/made
@@ -168,7 +168,7 @@ web-deps:
 	apt-get install --yes --no-install-recommends chromium chromium-driver
 
 web-pictures: $(VENV)/made
-	$(BIN)/python -m tests.web.pictures
+	$(BIN)/python -m docs.generate.web_pictures
 
 monitoring-deps:
 	apt-get install --yes --no-install-recommends prometheus prometheus-alertmanager

@@ -14,11 +14,11 @@ from xml.etree import ElementTree
 
 import pytest
 
+from docs.generate import pictures, references
 from imud import config
 from imud.cli import COMMANDS, build_parser
 from imud.drivers import DRIVERS
 from imud.model.sample import Sample
-from tests.support import pictures, references
 from tests.support.daemon_process import LIMIT_S, sending_daemon
 from tests.support.files import ROOT, hi91
 
@@ -169,7 +169,7 @@ def test_make_targets_of_the_readme_exist() -> None:
 
 @pytest.mark.parametrize("page", references.PAGES)
 def test_generated_parts_are_those_of_the_code(page: str) -> None:
-    assert references.generated(page) == references.current(page), "run python -m tests.support.references"
+    assert references.generated(page) == references.current(page), "run python -m docs.generate.references"
 
 
 def test_layout_tables_have_their_fields() -> None:

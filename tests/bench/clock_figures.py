@@ -1,7 +1,7 @@
 """Measured figures of docs/measurements.md, stored in `clock_figures.json`: two tables and two plots.
 
 `python -m tests.bench.clock --keep` and `python -m tests.bench.clock_lines --keep` measure and store the figures.
-`python -m tests.support.references` creates the tables, and `python -m tests.bench.clock_pictures` the plots.
+`python -m docs.generate.references` creates the tables, and `python -m docs.generate.clock_pictures` the plots.
 """
 
 from collections.abc import Iterable, Iterator, Sequence

@@ -96,7 +96,7 @@ async def measure(directory: str, clients: int, encoding: str, rate_hz: float, r
     server.publish(next(batches))
     # 700 bytes if the subscription has a lower rate and no sample arrived
     message = b"x" * (empty(socks) or 700)
-    sends = [connection._send for connection in server.hub.connections.values()]
+    sends = [(connection._send, connection.fd) for connection in server.hub.connections.values()]
 
     def publish() -> None:
         for _ in range(SAMPLES_PER_ROUND):
@@ -104,8 +104,8 @@ async def measure(directory: str, clients: int, encoding: str, rate_hz: float, r
 
     def bare() -> None:
         for _ in range(SAMPLES_PER_ROUND):
-            for send in sends:
-                send(message)
+            for send, fd in sends:
+                send(fd, message)
 
     gc.collect()
     cost_ns, bare_ns = per_sample_ns((publish, bare), lambda: empty(socks), rounds)

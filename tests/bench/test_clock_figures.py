@@ -1,7 +1,7 @@
 """The figures of docs/measurements.md: rows by hand, stored and read back, and plots with every row."""
 
+from docs.generate.clock_pictures import LEAST_US, arrivals_figure, lines_figure
 from tests.bench.clock_figures import ArrivalFigures, LineFigures, kept, microseconds, spread
-from tests.bench.clock_pictures import LEAST_US, arrivals_figure, lines_figure
 
 ARRIVAL = ArrivalFigures("usb-1ms", 100, (6, 125), (88, 262), (110, 542), (90, 271), 1.0, 0.9985)
 LINE = LineFigures("SOUT", "loaded", 1000, 4.3, -7.1, 44, 30, 1.0, 0.999, 0.84)

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import Meta
 
+from docs.generate import references
 from imud import config
 from imud.attitude.conventions import Heading
 from imud.config.devices import DEVICES_MAX
@@ -31,7 +32,6 @@ from imud.links import LINKS
 from imud.model.errors import ConfigError
 from imud.model.options import NoOptions, Options, expected, got
 from imud.publishers import PUBLISHERS
-from tests.support import references
 from tests.support.files import ROOT
 
 SHIPPED = ROOT / "etc/imud.yaml"

@@ -8,11 +8,11 @@ import msgspec
 import pytest
 from msgspec import Meta
 
+from docs.generate import references
 from imud.contracts.lines import LINE_SCHEMAS
 from imud.drivers import DRIVERS
 from imud.model.options import Options, WrongValue, wrong_values
 from imud.publishers.socket.methods import METHODS
-from tests.support import references
 
 LEAKS = re.compile(r"`|\$|Object|missing required|ValidationError|<class|Expected|NoneType|\bstr\b|\bint\b|\bfloat\b")
 """Words of msgspec and of Python that a user does not know."""

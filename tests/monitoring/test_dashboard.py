@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.monitoring import dashboard
+from docs.generate import dashboard
 from tests.monitoring.faults import Site, site
 from tests.monitoring.prometheus import LIMIT_S, Pace, RealPrometheus, needs, real_prometheus
 from tests.support.files import ROOT
@@ -16,7 +16,7 @@ from tests.support.surroundings import free_port
 
 
 def test_panels_stand_beside_each_other() -> None:
-    assert dashboard.FILE.read_text() == dashboard.text(), "run python -m tests.monitoring.dashboard"
+    assert dashboard.FILE.read_text() == dashboard.text(), "run python -m docs.generate.dashboard"
     taken: set[tuple[int, int]] = set()
     panels = json.loads(dashboard.text())["panels"]
     for panel in panels:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.monitoring.alert_table import PARTS
+from docs.generate.alert_table import PARTS
 from tests.monitoring.prometheus import DURATION, RULES, UNIT_MS, alerts_of, needs, shortened
 from tests.support.files import ROOT
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from docs.generate.completions import FILES, completions
 from imud.cli import COMMANDS
-from tests.packaging.completions import FILES, completions
 from tests.support.daemon_process import LIMIT_S
 
 pytestmark = pytest.mark.live

@@ -8,11 +8,11 @@ import subprocess
 import msgspec
 import pytest
 
+from docs.generate import references
+from docs.generate.completions import every_parser
+from docs.generate.manual_pages import escaped, help_of, marked, pages, sentence
 from imud.cli import COMMANDS, build_parser
 from imud.cli.doctor.command import STATUS
-from tests.packaging.completions import every_parser
-from tests.packaging.manual_pages import escaped, help_of, marked, pages, sentence
-from tests.support import references
 from tests.support.daemon_process import LIMIT_S
 from tests.support.files import ROOT
 

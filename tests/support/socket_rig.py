@@ -54,7 +54,7 @@ from imud.model.errors import Rejected
 from imud.model.sample import Sample, Sync
 from imud.publishers.socket.methods import METHODS
 from imud.publishers.socket.server import SocketOptions, SocketServer
-from tests.publishers.socket.schema import MessageChecker
+from tests.support.message_checker import MessageChecker
 from tests.support.publisher_context import publisher_context
 
 T = TypeVar("T")

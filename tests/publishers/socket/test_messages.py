@@ -10,12 +10,12 @@ from typing import Any, get_args
 import msgspec
 import pytest
 
+from docs.generate.socket_schema import socket_document, socket_schema
 from imud.model.event import Event, EventKind
 from imud.publishers.shm import ShmOptions, ShmPublisher
 from imud.publishers.socket.messages import NOTIFICATIONS
 from imud.publishers.socket.methods import METHODS
 from imud.publishers.socket.server import SocketServer
-from tests.publishers.socket.schema import socket_document, socket_schema
 from tests.support.daemon_process import LIMIT_S, sending_daemon
 from tests.support.files import ROOT, hi91
 from tests.support.socket_rig import CHECKER, EPOCH, NOW_NS, Peer, batch, in_server
@@ -26,7 +26,7 @@ UTC_NS = 1_790_000_000_000_000_000 + 1_000_000
 
 def test_the_file_in_docs_is_of_these_types() -> None:
     current = (ROOT / "docs" / "socket.schema.json").read_text()
-    assert current == socket_schema(), "run python -m tests.support.references"
+    assert current == socket_schema(), "run python -m docs.generate.references"
 
 
 @needs_jsonschema

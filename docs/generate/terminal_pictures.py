@@ -1,4 +1,4 @@
-"""Draws pictures of docs/recording.md and docs/views.md: `python -m tests.cli.pictures` (`make pictures`).
+"""Draws pictures of docs/recording.md and docs/views.md: `python -m docs.generate.terminal_pictures` (`make pictures`).
 
 `recording_info.svg`: output of `imud info` for a recording of two simulated devices. `top.svg` and `top_device.svg`:
 the two screens of `imud top` with the same daemon. `flight.svg`: the flight recorder of a daemon with a device that
@@ -20,6 +20,7 @@ from secrets import token_hex
 
 import msgspec
 
+from docs.generate.pictures import FOLDER, svg, terminal, text
 from imud.cli.top import TopApp, TopFeed
 from imud.contracts.publisher import Batch
 from imud.drivers.hipnuc.uart.codec import encode_hi91
@@ -31,7 +32,6 @@ from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.recording.player import Player
 from tests.support.daemon_process import RunningDaemon, running_daemon
 from tests.support.files import CaptureWriter
-from tests.support.pictures import FOLDER, svg, terminal, text
 
 MODULES = {
     "bow": ("hipnuc-uart", "/dev/ttyUSB0", "--rate", "100"),

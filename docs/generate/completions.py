@@ -1,4 +1,4 @@
-"""Creates shell completions from the parsers with shtab: `python -m tests.packaging.completions FOLDER`.
+"""Creates shell completions from the parsers with shtab: `python -m docs.generate.completions FOLDER`.
 
 FOLDER contains one file per shell, with the name that the shell expects: `bash/imud`, `zsh/_imud`, `fish/imud.fish`.
 """

@@ -1,4 +1,4 @@
-"""Creates manual pages in roff: `python -m tests.packaging.manual_pages FOLDER`.
+"""Creates manual pages in roff: `python -m docs.generate.manual_pages FOLDER`.
 
 imud(1) and one page per command, imud-COMMAND(1), come from the parsers that print `--help`. imud.yaml(5) comes from
 the option classes, like docs/configuration.md. The Debian package installs the pages.
@@ -14,11 +14,11 @@ from typing import Final
 
 import msgspec
 
+from docs.generate import references
 from imud import __version__
 from imud.cli import COMMANDS, build_parser
 from imud.formats.jsonrpc import DEFAULT_PATH
 from imud.model.options import expected
-from tests.support import references
 
 EXIT_STATUS: Final = (
     ("0", "Done."),

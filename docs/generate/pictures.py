@@ -1,4 +1,4 @@
-"""Draws the pictures of README.md and docs/frames.md: `python -m tests.support.pictures` (`make pictures`).
+"""Draws the pictures of README.md and docs/frames.md: `python -m docs.generate.pictures` (`make pictures`).
 
 `terminal.svg` shows the output of commands for a simulated device. `time_stamps.svg` shows a simulation with a known
 truth: a device at 100 Hz behind a USB adapter that holds bytes for up to 16 ms. `frame_axes.svg` and

@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/analysis.md: `python -m tests.analysis.pictures` (`make pictures`).
+"""Draws the pictures of docs/analysis.md: `python -m docs.generate.analysis_pictures` (`make pictures`).
 
 The commands draw simulated sensors with known noise. `noise.svg`: a gyroscope with the coefficients of the table in
 docs/analysis.md, two hours at 100 Hz. `noise_page.png`: the start of the page of `imud noise -o` for this gyroscope and

@@ -1,12 +1,10 @@
-"""JSON Schema of every message of the UNIX socket, made from the types, and a checker of messages.
+"""JSON Schema of every message of the UNIX socket, made from the types.
 
-docs/socket.schema.json allows unknown members, as the protocol does. `MessageChecker` allows only described
-members in the messages of a test server.
+docs/socket.schema.json allows unknown members, as the protocol does.
 """
 
 import json
 from copy import deepcopy
-from importlib.util import find_spec
 from typing import Any, Final
 
 import msgspec
@@ -58,45 +56,6 @@ def socket_document() -> Schema:
 def socket_schema() -> str:
     """Return the text of docs/socket.schema.json."""
     return json.dumps(socket_document(), indent=1, ensure_ascii=False) + "\n"
-
-
-class MessageChecker:
-    """Checks messages by the closed schema. Without the package jsonschema it checks nothing."""
-
-    def __init__(self) -> None:
-        self.checked: dict[str, int] = {}
-        """Number of checked messages, by name."""
-        self._whole = socket_document()
-        _close(self._whole)
-        self._validators: dict[str, Any] = {}
-
-    @property
-    def able(self) -> bool:
-        """Whether the package jsonschema is installed."""
-        return find_spec("jsonschema") is not None
-
-    def check(self, name: str, message: object) -> None:
-        """Raise AssertionError unless `message` is valid for the entry `name` of `$defs`."""
-        if not self.able:
-            return
-        validator = self._validators.get(name)
-        if validator is None:
-            from jsonschema import Draft202012Validator
-
-            schema = {"$ref": f"#/$defs/{name}", "$defs": self._whole["$defs"]}
-            validator = self._validators[name] = Draft202012Validator(schema)
-        self.checked[name] = self.checked.get(name, 0) + 1
-        errors = [f"{error.json_path}: {error.message}" for error in validator.iter_errors(message)]
-        assert not errors, f"{name}: {errors[:3]}"
-
-    def check_sent(self, message: dict[str, Any], method: str | None) -> None:
-        """Check a message of the server. `method` is the method of its request, None if unknown."""
-        if message.get("method") in NOTIFICATIONS:
-            self.check(f"notification.{message['method']}", message)
-        elif "error" in message:
-            self.check("reply.error", message)
-        elif method is not None:
-            self.check(f"reply.{method}", message)
 
 
 def _components(types: list[Any]) -> tuple[list[Schema], dict[str, Schema]]:
@@ -164,15 +123,3 @@ def _finish(components: dict[str, Schema]) -> None:
     for name in OPEN_ENUMS:
         components[name]["examples"] = components[name].pop("enum")
         components[name]["type"] = "string"
-
-
-def _close(schema: Any) -> None:
-    """Allow only described members."""
-    if isinstance(schema, dict):
-        if "properties" in schema:
-            schema.setdefault("additionalProperties", False)
-        for one in schema.values():
-            _close(one)
-    elif isinstance(schema, list):
-        for one in schema:
-            _close(one)

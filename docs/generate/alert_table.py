@@ -1,4 +1,4 @@
-"""Table of the alerts in docs/monitoring.md, created from the rules (`python -m tests.support.references`)."""
+"""Table of the alerts in docs/monitoring.md, created from the rules (`python -m docs.generate.references`)."""
 
 import re
 from typing import Final

@@ -1,4 +1,4 @@
-"""Draws both plots of docs/measurements.md from `clock_figures.json`: `python -m tests.bench.clock_pictures`."""
+"""Draws both plots of docs/measurements.md from `clock_figures.json`: `python -m docs.generate.clock_pictures`."""
 
 from collections.abc import Sequence
 from typing import Final

@@ -1,4 +1,4 @@
-"""The dashboard for Grafana, from one description: `python -m tests.monitoring.dashboard` writes etc/grafana/imud.json.
+"""The dashboard for Grafana, from one description: `python -m docs.generate.dashboard` writes etc/grafana/imud.json.
 
 A row has a title and panels. A panel has a title, a unit of Grafana, and queries with their legends. The module
 computes the places and the other parts of Grafana's JSON. `QUERIES` contains every query as Grafana sends it, for the

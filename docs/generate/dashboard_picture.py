@@ -1,4 +1,4 @@
-"""The picture of the dashboard in docs/monitoring.md: `python -m tests.monitoring.picture` writes it (four minutes).
+"""The picture of the dashboard in docs/monitoring.md: `python -m docs.generate.dashboard_picture` (four minutes).
 
 A real Prometheus scrapes the real daemon, which runs on two simulated sensors. The link of one sensor is disturbed, and
 the sensor is silent for SILENT_S. Places, titles, queries and legends come from the dashboard. Grafana draws them in
@@ -17,12 +17,12 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from docs.generate.dashboard import dashboard, filled_in
+from docs.generate.pictures import svg, text
 from imud.cli.demo import child, daemon
 from imud.client.connection import Client
-from tests.monitoring.dashboard import dashboard, filled_in
 from tests.monitoring.prometheus import RealPrometheus, real_prometheus
 from tests.support.files import ROOT
-from tests.support.pictures import svg, text
 from tests.support.surroundings import free_port
 
 FILE: Final = ROOT / "docs/pictures/dashboard.svg"

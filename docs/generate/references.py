@@ -1,4 +1,4 @@
-"""Generate parts of the documents from the code: `python -m tests.support.references`.
+"""Generate parts of the documents from the code: `python -m docs.generate.references`.
 
 | document | source |
 |---|---|
@@ -7,7 +7,7 @@
 | docs/shm.md | layout of shared memory |
 | docs/monitoring.md | rules for Prometheus |
 | docs/measurements.md | measured figures (tests/bench/clock_figures.py) |
-| docs/socket.schema.json | messages of the socket (tests/publishers/socket/schema.py) |
+| docs/socket.schema.json | messages of the socket (docs/generate/socket_schema.py) |
 """
 
 import ast
@@ -20,6 +20,8 @@ from typing import Final, NamedTuple
 
 import msgspec
 
+from docs.generate.alert_table import alert_table
+from docs.generate.socket_schema import socket_schema
 from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes
 from imud.config.schema import TABLES, DeviceGeneral, General
 from imud.contracts.command import Action, Actions, Handling, parameters_of
@@ -45,8 +47,6 @@ from imud.model.ledger import LEDGER_FIELDS
 from imud.model.options import Options, expected, shown
 from imud.utc.receivers import RmcOptions
 from tests.bench import clock_figures
-from tests.monitoring.alert_table import alert_table
-from tests.publishers.socket.schema import socket_schema
 from tests.support.files import ROOT
 
 # --- values in cells --------------------------------------------------------------------------------------------------
