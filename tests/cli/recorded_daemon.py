@@ -48,25 +48,27 @@ def stamped_capture(file: Path, seed: int = 1) -> Path:
     return file
 
 
-def run_recorded(folder: Path, *, more: str = "", recorder: str = "") -> tuple[Daemon, Collector, Sequence[Path]]:
+def run_recorded(
+    folder: Path, *, more: str = "", recorder: str = "enabled: true", speed: str = "maximum", can_frames: int = 200
+) -> tuple[Daemon, Collector, Sequence[Path]]:
     """Run a daemon with a serial device and a CAN device to the end of their captures.
 
     Return the daemon, the published samples, and the recorded files.
     """
     stamped_capture(folder / "serial.capture")
-    (folder / "can.log").write_text(imu61x_log(range(200)))
+    (folder / "can.log").write_text(imu61x_log(range(can_frames)))
     text = f"""
-recorder: {{enabled: true, directory: {folder / "recordings"}{recorder}}}
+recorder: {{directory: {folder / "recordings"}, {recorder}}}
 socket: {{enabled: false}}
 shm: {{enabled: false}}
 metrics: {{enabled: false}}
 devices:
   bow:
     driver: hipnuc-uart
-    replay: {{path: {folder / "serial.capture"}, speed: maximum}}
+    replay: {{path: {folder / "serial.capture"}, speed: {speed}}}
   mast:
     driver: imu61x-can
-    replay: {{path: {folder / "can.log"}, speed: maximum}}
+    replay: {{path: {folder / "can.log"}, speed: {speed}}}
     {more}
 """
     collector = Collector()

@@ -1,42 +1,14 @@
 """Snapshots of the flight recorder replay like the live run, from the middle of the run."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from imud import config
-from imud.daemon import Daemon
-from imud.host import event_loop
 from imud.publishers.recorder import flight
 from tests.cli.conftest import Cli
-from tests.cli.recorded_daemon import FRAMES, Collector, stamped_capture
+from tests.cli.recorded_daemon import FRAMES, run_recorded, stamped_capture
 from tests.support.daemon_process import running_daemon, wait_until
-from tests.support.files import imu61x_log
-
-
-def run_flying(folder: Path, settings: str) -> tuple[Collector, Sequence[Path]]:
-    """Run a daemon with a flight recorder for 3 s of captures. Return the published samples and the snapshots."""
-    stamped_capture(folder / "serial.capture")
-    (folder / "can.log").write_text(imu61x_log(range(FRAMES)))
-    text = f"""
-recorder: {{directory: {folder / "recordings"}, flight: {{enabled: true, {settings}}}}}
-socket: {{enabled: false}}
-shm: {{enabled: false}}
-metrics: {{enabled: false}}
-devices:
-  bow:
-    driver: hipnuc-uart
-    replay: {{path: {folder / "serial.capture"}, speed: recorded}}
-  mast:
-    driver: imu61x-can
-    replay: {{path: {folder / "can.log"}, speed: recorded}}
-"""
-    collector = Collector()
-    daemon = Daemon(config.parse(text, "imud.yaml"), extra={"test": collector}, until_finished=True)
-    event_loop.run(daemon.run())
-    return collector, sorted((folder / "recordings").iterdir())
 
 
 @pytest.mark.live
@@ -47,7 +19,8 @@ def test_a_snapshot_whose_begin_is_gone_replays_as_the_daemon_ran(
     monkeypatch.setattr(flight, "SEGMENT_NS_MIN", 300_000_000)
     monkeypatch.setattr(flight, "MEGABYTE", 28_000)  # the run makes 39,000: the recorder removes the oldest segments
     directory = f"directory: {tmp_path / 'flight'}, " if place == "directory" else ""
-    collector, (file,) = run_flying(tmp_path, f"{directory}memory_mb: 1, minutes: 0.1, acceleration_m_s2: 5")
+    recorder = f"flight: {{enabled: true, {directory}memory_mb: 1, minutes: 0.1, acceleration_m_s2: 5}}"
+    _, collector, (file,) = run_recorded(tmp_path, recorder=recorder, speed="recorded", can_frames=FRAMES)
     printed = cli("replay", "--json", file)
     assert printed.err.count("equal to the live run") == 2
     assert "0 of 0 checks" not in printed.err

@@ -54,10 +54,6 @@ class CanInterface:
         tool("ip", "link", "set", self.name, "type", "can", "restart-ms", str(after_ms))
         self.up()
 
-    def statistic(self, name: str) -> int:
-        """Return a counter of the kernel, such as rx_packets or tx_packets."""
-        return int(Path(f"/sys/class/net/{self.name}/statistics/{name}").read_text(encoding="ascii"))
-
 
 @contextmanager
 def virtual_can(name: str) -> Iterator[CanInterface]:

@@ -119,3 +119,15 @@ def test_impossible_options_are_refused(name: str) -> None:
     for options in IMPOSSIBLE[name]:
         with pytest.raises(ValueError, match=next(iter(options)).removesuffix("_hz")):
             CAN_SIMULATORS[name].make(SimulatorOptions(**options), 0)
+
+
+@pytest.mark.parametrize("driver", CAN_SIMULATORS)
+def test_a_device_sends_at_the_time_of_its_next_frame(driver: str) -> None:
+    module = CAN_SIMULATORS[driver].make(SimulatorOptions(rate_hz=100.0), 0)
+    now_ns = 0
+    for _ in range(60):
+        due_ns = module.next_ns()
+        assert due_ns is not None
+        assert due_ns >= now_ns
+        now_ns = due_ns
+        assert module.advance(now_ns)

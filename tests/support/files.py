@@ -106,9 +106,6 @@ def imu61x_log(indices: Iterable[int]) -> str:
     return "".join(lines)
 
 
-HI91_BYTES = 82  # 6 bytes of header, 76 of payload
-
-
 def hi91(ms: int, accel_z_m_s2: float = 9.8) -> bytes:
     return encode_hi91(
         system_time_ms=ms,

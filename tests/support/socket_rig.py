@@ -229,6 +229,17 @@ def run(body: Callable[[], Awaitable[T]]) -> T:
     return result
 
 
+class SteppingClock:
+    """A clock that advances by `step_ns` with each reading."""
+
+    def __init__(self) -> None:
+        self.step_ns, self._now_ns = 0, NOW_NS
+
+    def __call__(self) -> int:
+        self._now_ns += self.step_ns
+        return self._now_ns
+
+
 @asynccontextmanager
 async def serving(
     directory: Path,

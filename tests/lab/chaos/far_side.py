@@ -46,7 +46,6 @@ MODBUS_HZ: Final = 5.0  # rate of the Modbus device
 SETTLE_S: Final = 0.012  # time for an edge of gpio-sim, see imu_process.py
 LOOK_S: Final = 0.02
 I2C_BURST: Final = b"\x12"
-SPI_BURST: Final = b"\x80\x00"
 Port = SimulatedPort | CanPort
 
 

@@ -20,7 +20,6 @@ EMULATORS = {
 }
 """QEMU's package for the virtual machine and for emulated maintainer scripts, by foreign architecture."""
 BUILD = ROOT / "packaging" / "debian" / "build"
-BUILT = ROOT / "build" / "deb"
 BUILD_LIMIT_S = 30 * 60  # limit for make deb
 NEXT = "+lab1"
 

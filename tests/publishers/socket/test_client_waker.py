@@ -12,7 +12,7 @@ from imud.formats.jsonrpc import encode_notification
 from imud.publishers.socket.client import BYTE, ClientConnection, Waker
 from imud.publishers.socket.outbox import NO_FD
 from imud.publishers.socket.server import SocketServer
-from tests.support.socket_rig import NOW_NS, Peer, batch, in_server, run, serving, until
+from tests.support.socket_rig import Peer, SteppingClock, batch, in_server, run, serving, until
 
 
 async def notified(peer: Peer, device: str = "imu0") -> int:
@@ -83,18 +83,12 @@ async def test_notify_again_ends_the_old_descriptor(server: SocketServer) -> Non
 
 def test_many_clients_are_woken_in_several_turns(tmp_path: Path) -> None:
     """imud wakes clients for 0.3 ms per turn, and reads the clock after 16 clients."""
-    now_ns, step_ns = NOW_NS, 0
-
-    def clock() -> int:
-        nonlocal now_ns
-        now_ns += step_ns
-        return now_ns
+    clock = SteppingClock()
 
     async def body() -> None:
-        nonlocal step_ns
         async with serving(tmp_path, clock) as server:
             fds = [await notified(await Peer.greeted(server)) for _ in range(40)]
-            step_ns = 200_000
+            clock.step_ns = 200_000
             server.publish(batch("imu0"))
             woken = []
             for _ in range(2):

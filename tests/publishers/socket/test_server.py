@@ -22,6 +22,7 @@ from tests.support.socket_rig import (
     EPOCH,
     NOW_NS,
     Peer,
+    SteppingClock,
     batch,
     done_late,
     in_server,
@@ -226,24 +227,18 @@ async def test_a_user_s_clients_watch_a_limited_number_of_selections(server: Soc
 
 
 def test_to_many_clients_samples_go_in_several_turns_and_none_is_lost(tmp_path: Path) -> None:
-    now_ns, step_ns = NOW_NS, 0
-
-    def clock() -> int:
-        nonlocal now_ns
-        now_ns += step_ns
-        return now_ns
+    clock = SteppingClock()
 
     async def body() -> None:
-        nonlocal step_ns
         async with serving(tmp_path, clock) as server:
             peers = [await Peer.greeted(server) for _ in range(100)]
             for number, peer in enumerate(peers):
                 await peer.result("watch", **({"rate_hz": 1000.0} if number % 3 else {}))
-            step_ns = 400_000  # each read of the clock adds 0.4 ms
+            clock.step_ns = 400_000  # each read of the clock adds 0.4 ms
             for seq in range(1, 6):
                 server.publish(batch("imu0", seq))
                 waiting = sum(client.queue_samples > 0 for client in server.hub.clients())
-            step_ns = 0
+            clock.step_ns = 0
             assert waiting == 34  # `publish` ends after 1 ms; it reads the clock after 32 clients
             for peer in peers:
                 assert [message["params"]["seq"] for message in await peer.messages(5)] == list(range(1, 6))
@@ -324,20 +319,14 @@ async def test_out_of_descriptors_pauses_accepting_until_the_next_tick_and_is_lo
 @pytest.mark.parametrize(("step_ns", "accepted"), [(0, [16, 32, 40]), (100_000, [2, 4, 6])])
 def test_accepting_takes_a_limited_part_of_a_turn(tmp_path: Path, step_ns: int, accepted: list[int]) -> None:
     """At most 16 clients, and at most 0.3 ms."""
-    now_ns, step = NOW_NS, 0
-
-    def clock() -> int:
-        nonlocal now_ns
-        now_ns += step
-        return now_ns
+    clock = SteppingClock()
 
     async def body() -> None:
-        nonlocal step
         async with serving(tmp_path, clock) as server:
             for _ in range(40):
                 await Peer.connect(server)
             found = []
-            step = step_ns
+            clock.step_ns = step_ns
             for _ in range(3):
                 await asyncio.sleep(0)
                 found.append(server.hub.accepted)
