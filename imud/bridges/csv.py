@@ -18,6 +18,7 @@ from typing import Any, Final
 import msgspec
 
 from imud.bridges.channel import LossCounts, StampedEvent
+from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
 from imud.model.sample import Sample
 
 # Columns of the array fields
@@ -77,10 +78,16 @@ def sample_row(fields: Sequence[str], without_times: bool = False) -> Callable[[
 
 
 def event_row(stamped: StampedEvent) -> Row:
-    """Return the row of an event. The details are JSON."""
+    """Return the row of an event. The details are JSON. A recording can contain texts of an unknown program."""
     event = stamped.event
-    detail = msgspec.json.encode(event.detail).decode() if event.detail else None
-    return stamped.utc_ns, event.t_ns, event.device, str(event.kind), event.message, detail
+    detail = _text(msgspec.json.encode(event.detail).decode()) if event.detail else None
+    return stamped.utc_ns, event.t_ns, event.device, _text(str(event.kind)), _text(event.message), detail
+
+
+def _text(text: str) -> str:
+    """Return a cell of printable characters. A table program would compute a text that starts with one of `=+-@`."""
+    cell = printable(text, MESSAGE_CHARACTERS_MAX)
+    return f"'{cell}" if cell.startswith(("=", "+", "-", "@")) else cell
 
 
 def loss_row(losses: LossCounts) -> Row:

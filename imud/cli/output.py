@@ -57,7 +57,7 @@ def local_time(utc_ns: int) -> datetime:
 
 def paragraph(label: str, text: str) -> list[str]:
     """Format a label and a text as lines of at most COLUMNS characters. Long words are shortened."""
-    room = COLUMNS - len(label)
+    room = max(COLUMNS - len(label), COLUMNS // 2)
     words = " ".join(shortened(word, room) for word in printable(text, MESSAGE_CHARACTERS_MAX).split())
     lines = textwrap.wrap(words, room, break_on_hyphens=False) or [""]
     return [f"{label if not number else ' ' * len(label)}{line}".rstrip() for number, line in enumerate(lines)]

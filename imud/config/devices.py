@@ -23,6 +23,7 @@ from imud.contracts.setting import SettingsTable, declared_values
 from imud.contracts.status import Deviations
 from imud.model.errors import BadArgument
 from imud.model.options import Options, got, shown, unknown_name
+from imud.model.sample import DEVICE_NAME_PATTERN
 from imud.model.units import NS_PER_S, NS_PER_US
 from imud.utc.receivers import RmcOptions
 
@@ -359,8 +360,7 @@ def _lines_of_driver(drivers: Mapping[str, Driver], driver: object) -> frozenset
 # Maximum number of devices, more than one process can serve. A longer file is a mistake of a generator.
 DEVICES_MAX: Final = 256
 NOISE: Final = "noise"
-# Pattern of device names. They are file names of shared memory, label values and words on a command line.
-DEVICE_NAME: Final = pattern(r"[a-z0-9][a-z0-9_-]{0,31}")
+DEVICE_NAME: Final = pattern(DEVICE_NAME_PATTERN)
 
 
 class DeviceReader:

@@ -34,7 +34,14 @@ PLAIN_MAX: Final = 4 << 20
 STORED: Final = 0
 ZSTANDARD: Final = 1
 LEVEL: Final = 3  # Default level of Zstandard. Level 9 saves 3 % more on IMU data and takes four times as long.
+# Maximum ratio of plain and stored size. IMU data has about 4, repeated frames have less than 100. Zeros have 8,000: a
+# small forged file of zeros would take hours.
+RATIO_MAX: Final = 256
 CHUNK_BYTES: Final = 1 << 16
+# Maximum size of all possible blocks with a wrong CRC: VAIN_BYTES_MIN plus VAIN_FACTOR times the size of the read part.
+# Each head of 28 bytes can announce a block of 4 MB, so that a small forged file would take hours.
+VAIN_BYTES_MIN: Final = 64 << 20
+VAIN_FACTOR: Final = 8
 
 
 class Block(NamedTuple):
@@ -57,7 +64,7 @@ class BlockEncoder:
         if len(content) > PLAIN_MAX:
             raise ValueError(f"expected a block of at most {PLAIN_MAX} bytes, got {len(content)}")
         method, stored = ZSTANDARD, self._compressor.compress(content)
-        if len(stored) >= len(content):
+        if not len(content) / RATIO_MAX <= len(stored) < len(content):
             method, stored = STORED, content
         head = HEAD.pack(MAGIC, method, self.number, len(content), len(stored), 0)[:-_CRC_BYTES]
         self.number = (self.number + 1) & 0xFFFF_FFFF
@@ -88,13 +95,14 @@ class BlockReader:
 
     def __init__(self, file: ByteSource) -> None:
         self._file = file
-        self._buffer = b""
+        self._buffer = bytearray()  # its front is deleted without a copy
         self._at = 0  # offset of the first byte of the buffer in the file
         self._is_at_end = False
         self.bytes_bad = 0  # number of bytes outside complete blocks, without an incomplete block at the end
         self.first_bad = -1  # offset of the first of these bytes; -1 if there are none
         self.bytes_cut = 0  # size of an incomplete block at the end of the file
         self.blocks_missing = 0  # number of blocks that are missing according to the block numbers
+        self._vain_bytes = 0  # size of all possible blocks with a wrong CRC
         self._decompressor = zstandard.ZstdDecompressor()
 
     def __iter__(self) -> Iterator[Block]:
@@ -107,22 +115,23 @@ class BlockReader:
                 self._drop(size)
                 yield block
             else:
-                self._skip(cut=bool(size) and len(self._buffer) < size)
+                self._skip(size)
         self.bytes_cut += len(self._buffer) if self._begins_magic() else 0
         self._count_bad(0 if self._begins_magic() else len(self._buffer))
 
     def _block_size(self) -> int:
         """Return the size of the block at the start of the buffer; 0 if there is no block."""
         magic, method, _number, plain, stored, _crc = HEAD.unpack_from(self._buffer)
-        fits = plain <= PLAIN_MAX and (stored == plain if method == STORED else stored < plain)
+        fits = plain <= PLAIN_MAX and (stored == plain if method == STORED else stored < plain <= RATIO_MAX * stored)
         return HEAD.size + stored if magic == MAGIC and method in (STORED, ZSTANDARD) and fits else 0
 
     def _decode(self, size: int) -> Block | None:
         """Return the block at the start of the buffer; None if it is damaged."""
         buffer = self._buffer
         _magic, method, number, plain, _stored, crc = HEAD.unpack_from(buffer)
-        stored = buffer[HEAD.size : size]
+        stored = bytes(buffer[HEAD.size : size])
         if zlib.crc32(stored, zlib.crc32(buffer[: HEAD.size - _CRC_BYTES])) != crc:
+            self._vain_bytes += size
             return None
         if method == ZSTANDARD:
             try:
@@ -133,10 +142,12 @@ class BlockReader:
                 return None
         return Block(number, stored, size) if len(stored) == plain else None
 
-    def _skip(self, *, cut: bool) -> None:
-        """Skip to the next magic. `cut`: the file ends before the end of the possible block here."""
+    def _skip(self, size: int) -> None:
+        """Skip to the next magic. `size`: size of the possible block here; 0 if there is no block."""
         found = self._buffer.find(MAGIC, 1)
-        if cut and found < 0:
+        if found > 0 and self._vain_bytes > VAIN_BYTES_MIN + VAIN_FACTOR * self._at:
+            found = max(found, min(size, len(self._buffer)))  # false heads in a forged file: skip the possible block
+        if size > len(self._buffer) and found < 0:
             self.bytes_cut += len(self._buffer)
             self._drop(len(self._buffer))
             return
@@ -154,7 +165,7 @@ class BlockReader:
         return bool(self._buffer) and self._buffer[: len(MAGIC)] == MAGIC[: len(self._buffer)]
 
     def _drop(self, count: int) -> None:
-        self._buffer = self._buffer[count:]
+        del self._buffer[:count]
         self._at += count
 
     def _fill(self, size: int) -> bool:

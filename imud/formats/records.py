@@ -14,12 +14,13 @@ needs are before this read. A reader skips unknown kinds.
 import struct
 from collections.abc import Iterator, Sequence
 from enum import IntEnum
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import msgspec
 
 from imud.formats.can import CanFrame
 from imud.model.errors import ImudError, reason_of
+from imud.model.sample import DEVICE_NAME_PATTERN
 
 VERSION: Final = 1  # Version of the layout of records. A reader rejects other versions.
 HEAD: Final = struct.Struct("<BHI")
@@ -74,10 +75,15 @@ class SessionRecord(msgspec.Struct, frozen=True):
     utc_ns: int  # CLOCK_REALTIME at the start of the file
 
 
+# A name outside this pattern is forged: it could control the terminal of a program that prints it
+DeviceName = Annotated[str, msgspec.Meta(pattern=rf"^{DEVICE_NAME_PATTERN}\Z")]
+DeviceNameOrEmpty = Annotated[str, msgspec.Meta(pattern=rf"^({DEVICE_NAME_PATTERN})?\Z")]
+
+
 class DeviceRecord(msgspec.Struct, frozen=True):
     """Device of the configuration."""
 
-    name: str
+    name: DeviceName
     driver: str  # driver as configured, may be `auto`
     link: str  # name of the link in the configuration, for example `uart`
     where: str  # readable name of the port

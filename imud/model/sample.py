@@ -15,6 +15,8 @@ Quaternion = tuple[float, float, float, float]
 Pair = tuple[float, float]
 
 
+# Regular expression of device names. They are file names of shared memory, label values and words on a command line.
+DEVICE_NAME_PATTERN: Final = r"[a-z0-9][a-z0-9_-]{0,31}"
 T_ERR_MOST: Final = 0xFFFF_FFFF  # maximum of `t_err_ns`, which has 32 bits in all outputs
 
 

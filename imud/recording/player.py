@@ -68,7 +68,7 @@ class RecordedEvent(msgspec.Struct, frozen=True):
     """An event of a recording. `kind` may be unknown to this version of imud."""
 
     t_ns: int
-    device: str
+    device: records.DeviceNameOrEmpty
     kind: str
     message: str
     detail: dict[str, str | int | float | bool | None] = {}  # msgspec copies a mutable default
@@ -331,7 +331,7 @@ def _repeat(device: PlayedDevice, path: Any, call: CallRecord) -> None:
         case "path", "overruns":
             device.overruns = arguments[0]
         case "ledger", "set":
-            _set_ledger(device.ledger, arguments[0])
+            _set_ledger(device.ledger, msgspec.convert(arguments[0], dict[str, int]))
         case "loss", "link_opened":
             path.link_opened()
         case "edges", "restart":

@@ -42,6 +42,10 @@ def test_columns_and_rows() -> None:
     losses = LossCounts(1, UTC_NS, "bow", 100, 1, 2, 3, 4, 5)
     counts = dict(zip(table.LOSS_COLUMNS, table.loss_row(losses), strict=True))
     assert (counts["samples"], counts["lost_crc"], counts["lost_unknown"]) == (100, 2, 5)
+    for message, cell in (("=1+1", "'=1+1"), ("@x", "'@x"), ("a\x1b[2J\n", "a\\x1b[2J\\n"), ("-", "'-"), ("+", "'+")):
+        forged = msgspec.structs.replace(EVENT, message=message, kind=message, detail={"\u202e": "x"})
+        made = dict(zip(table.EVENT_COLUMNS, table.event_row(StampedEvent(forged, UTC_NS)), strict=True))
+        assert (made["message"], made["kind"], made["detail"]) == (cell, cell, '{"\\u202e":"x"}')
     lengths = {field.name: int(field.type[7:-1]) for field in SAMPLE_SCHEMA if field.type.startswith("number[")}
     assert {name: len(columns) for name, columns in table.AXES.items()} == lengths
 

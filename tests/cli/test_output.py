@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from imud.cli.output import BARS, WIDTH, bar_width, fitted, histogram, local_time, table
+from imud.cli.output import BARS, WIDTH, bar_width, fitted, histogram, local_time, paragraph, table
 
 
 def test_a_histogram_has_bars_with_shares() -> None:
@@ -26,6 +26,10 @@ def test_a_histogram_has_bars_with_shares() -> None:
     assert float(lines[-1].split()[2]) == pytest.approx(10.0)  # the last bar counts the outlier
     for span, width in [(0, 1), (11, 1), (11.1, 2), (22, 2), (50, 5), (100, 10), (0.011, 0.001)]:
         assert bar_width(span) == pytest.approx(width)
+
+
+def test_a_paragraph_with_a_label_longer_than_a_line_has_room_for_its_text() -> None:
+    assert paragraph("x" * 200, "some words") == ["x" * 200 + "some words"]
 
 
 def test_a_table_aligns_numbers_and_cannot_write_to_the_terminal() -> None:

@@ -4,6 +4,7 @@ import io
 import struct
 import zlib
 from random import Random
+from types import SimpleNamespace
 
 import pytest
 import zstandard
@@ -137,3 +138,30 @@ def test_a_block_with_another_number_is_whole() -> None:
     found = list(BlockReader(io.BytesIO(renumbered(blocks[1], 0) + renumbered(blocks[0], 1))))
     assert [(block.number, block.content) for block in found] == [(0, b"b" * 1000), (1, b"a")]
     assert renumbered(blocks[1], 1) == blocks[1]
+
+
+def test_false_heads_cost_a_limited_number_of_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each head announces 100 kB: without a limit, a reader checks 700 MB in this file of 300 kB."""
+    head = HEAD.pack(MAGIC, 0, 0, 100_000, 100_000, 1)
+    checked = 0
+
+    def crc32(data: bytes, value: int = 0) -> int:
+        nonlocal checked
+        checked += len(data)
+        return zlib.crc32(data, value)
+
+    monkeypatch.setattr("imud.formats.recording.zlib", SimpleNamespace(crc32=crc32))
+    good = BlockEncoder().encode(b"abc" * 100)
+    found, reader = blocks_of(good + head * (300_000 // len(head)) + good)
+    assert found == [b"abc" * 100] * 2
+    assert reader.bytes_bad == 300_000 // len(head) * len(head)
+    assert checked < 70 << 20
+
+
+def test_a_block_that_grows_too_much_is_no_block_and_zeros_are_stored_without_compression() -> None:
+    zeros = bytes(100_000)
+    assert blocks_of(BlockEncoder().encode(zeros))[0] == [zeros]
+    bomb = zstandard.ZstdCompressor().compress(zeros)
+    found, reader = blocks_of(valid_crc(bomb, len(zeros)))
+    assert not found
+    assert reader.bytes_bad == HEAD.size + len(bomb)

@@ -14,7 +14,7 @@ import pytest
 
 from imud.drivers import DRIVERS
 from imud.formats import records
-from imud.formats.records import CheckRecord, Kind, PathRecord, Record, records_of
+from imud.formats.records import CallRecord, CheckRecord, Kind, PathRecord, Record, records_of
 from imud.host.clock import HostClock
 from imud.links.memory import MemoryLink
 from imud.model.errors import ImudError
@@ -202,6 +202,31 @@ def test_damaged_records_raise_imud_error(recorded: pytest.MonkeyPatch, seed: in
             Player(lambda _batch: None).play([*found[:at], Record(kind, device, damaged), *found[at + 1 :]])
         except ImudError:
             continue
+
+
+@pytest.mark.parametrize("name", ["", "a" * 33, "\x1b[2J", "bow\n", "=1+1", "Bow", "bow\u202e"])
+def test_a_device_name_that_no_configuration_accepts_is_an_error(recorded: pytest.MonkeyPatch, name: str) -> None:
+    for kind, key in ((Kind.DEVICE, "name"), (Kind.EVENT, "device")):
+        event = {"t_ns": 7, "device": "bow", "kind": "up", "message": "hello"}
+        record = next(
+            (one for one in recorded_run() if one.kind == kind), Record(kind, 0, msgspec.msgpack.encode(event))
+        )
+        forged = record._replace(body=msgspec.msgpack.encode(msgspec.msgpack.decode(record.body) | {key: name}))
+        if kind == Kind.EVENT and not name:  # an event of the daemon
+            continue
+        with pytest.raises(ImudError, match="cannot read a record of kind"):
+            Player(lambda _batch: None).play([forged])
+
+
+@pytest.mark.parametrize("values", [{"samples": "many"}, {"samples": None}, ["samples"], 7])
+def test_counters_of_the_ledger_that_are_not_integers_are_an_error(
+    recorded: pytest.MonkeyPatch, values: object
+) -> None:
+    call = msgspec.msgpack.encode(CallRecord("ledger", "set", [values]))
+    found = recorded_run()
+    made = next(number for number, record in enumerate(found) if record.kind == Kind.PATH)
+    with pytest.raises(ImudError, match="cannot replay a record"):
+        Player(lambda _batch: None).play([*found[: made + 1], Record(Kind.CALL, found[made].device, call)])
 
 
 def test_lost_records_and_events_are_passed_on_and_an_unknown_trouble_is_the_last_known() -> None:
