@@ -16,7 +16,9 @@ from scipy.stats import chi2
 
 from imud.analysis.series import FloatArray, Grid, IntArray, Readings, even_runs, grid_of, with_values
 from imud.analysis.spectrum import Spectrum, power_spectrum
+from imud.attitude.gravity import REST_M_S2, REST_RAD_S
 from imud.model.errors import BadArgument
+from imud.model.units import NS_PER_S, STANDARD_GRAVITY_M_S2
 
 CONFIDENCE: Final = 0.683  # probability of the confidence intervals: one sigma
 PER_DECADE: Final = 12  # number of τ per decade
@@ -272,6 +274,7 @@ FLAT_LOW, FLAT_HIGH = 0.05, 0.6  # band of the noise density, as shares of the c
 KNOWN_PARTS: Final = 10  # duration divided by the largest τ with an error of the deviation below about 25 %
 STILL_S: Final = 1.0  # length of the blocks that imud checks for motion, s
 STILL_FACTOR: Final = 4.0  # minimum standard deviation of a disturbed block, as a multiple of the median block
+MOVED_SHARE: Final = 0.01  # maximum share of blocks with motion in a measurement at rest
 BLOCKS_MOST: Final = 2000  # maximum number of means for the fit of the drift
 SPAN_LEAST_C: Final = 2.0  # Minimum range of the temperature for a drift, °C. Many devices send whole degrees.
 BLOCKS_LEAST: Final = 8
@@ -397,6 +400,56 @@ def _disturbed(runs: list[FloatArray], rate_hz: float) -> tuple[int, int]:
     # the median ignores disturbed seconds
     usual = np.median(spread, axis=0)
     return int((spread > STILL_FACTOR * np.maximum(usual, 1e-12)).any(axis=1).sum()), len(spread)
+
+
+class RestLimits(NamedTuple):
+    """Limits of one second of a sensor at rest, SI. They hold for any sensor, with or without noise."""
+
+    quantity: str
+    unit: str
+    length: float  # length of the mean vector at rest
+    mean: float  # maximum difference from `length`
+    scatter: float  # maximum standard deviation of an axis
+    change: float  # maximum difference of the mean of an axis from its median
+
+
+# A gyroscope with a noise density of 0.05 °/s/√Hz scatters by 1.1 °/s at 1 kHz. Its bias changes by less than 0.5 °/s
+# while it warms up.
+GYRO_AT_REST: Final = RestLimits("angular rate", "rad/s", 0.0, REST_RAD_S, 0.05, 0.01)
+ACCEL_AT_REST: Final = RestLimits("acceleration", "m/s²", STANDARD_GRAVITY_M_S2, REST_M_S2, 0.5, 0.2)
+
+
+def motion_words(readings: Readings) -> str:
+    """Return how the device moved in the worst seconds; empty if it was at rest."""
+    found: list[str] = []
+    for values, limits in ((readings.gyro_rad_s, GYRO_AT_REST), (readings.accel_m_s2, ACCEL_AT_REST)):
+        if values is not None and (motion := _motion(*with_values(readings.t_ns, values), limits)):
+            found.append(motion)
+    return "; ".join(found)
+
+
+def _motion(t_ns: IntArray, values: FloatArray, limits: RestLimits) -> str:
+    if len(t_ns) < BLOCKS_LEAST:
+        return ""
+    size = max(round(STILL_S * NS_PER_S / float(np.median(np.diff(t_ns)))), 2)
+    blocks = values[: len(values) // size * size].reshape(-1, size, values.shape[1])
+    mean = blocks.mean(axis=1)
+    for words, found, limit in (
+        (
+            f"difference of the mean from {limits.length:.4g} {limits.unit}",
+            np.abs(np.sqrt((mean**2).sum(axis=1)) - limits.length),
+            limits.mean,
+        ),
+        ("standard deviation", blocks.std(axis=1).max(axis=1), limits.scatter),
+        ("change of the mean", np.abs(mean - np.median(mean, axis=0)).max(axis=1), limits.change),
+    ):
+        count = int((found > limit).sum())
+        if count > MOVED_SHARE * len(found):
+            return (
+                f"{limits.quantity}: expected a {words} of at most {limit:.3g} {limits.unit} in each second, got up to "
+                f"{found.max():.3g} {limits.unit} in {count} of {len(found)} seconds"
+            )
+    return ""
 
 
 def _temperature(readings: Readings, t_ns: np.ndarray) -> FloatArray | None:

@@ -11,6 +11,7 @@ from typing import Any, Final
 import msgspec
 
 from imud.cli.arguments import CliCommand, add_option, add_socket, duration_s
+from imud.cli.output import complain
 from imud.drivers import DRIVERS
 from imud.model.errors import BadArgument
 
@@ -92,7 +93,11 @@ def noise(args: argparse.Namespace) -> int:
     report = module.noise_report(sample_set, module.figures_for(sample_set.sheet, product, given))
     if args.output is not None:
         module.write_file(args.output, module.noise_file(report, kind))
-    return show(args, report, module)
+    show(args, report, module)
+    if report.motion:
+        complain(f"imud noise: the device was not at rest: {report.motion}; measure again with the device at rest")
+        return 1
+    return 0
 
 
 def spectrum(args: argparse.Namespace) -> int:

@@ -44,6 +44,7 @@ class _Report(msgspec.Struct):
 
     measurement: _Measurement
     sensors: dict[str, _Sensor]
+    motion: str | None = None
 
 
 def read_noise(path: Path) -> tuple[str, Deviations]:
@@ -55,6 +56,8 @@ def read_noise(path: Path) -> tuple[str, Deviations]:
         report = msgspec.json.decode(read_regular(path, FILE_BYTES_MAX), type=_Report)
     except (OSError, ValueError) as error:
         raise ImudError(f"{path}: expected a report of `imud noise --json`, got: {reason_of(error)}") from error
+    if report.motion:
+        raise ImudError(f"{path}: expected a measurement at rest, got motion ({report.motion}); measure again at rest")
     return report.measurement.device, Deviations(
         accel_m_s2=_sigma(report.sensors.get("accel")), gyro_rad_s=_sigma(report.sensors.get("gyro"))
     )

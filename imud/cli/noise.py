@@ -18,11 +18,13 @@ from imud import __version__
 from imud.analysis.noise import (
     AXES,
     KNOWN_PARTS,
+    MOVED_SHARE,
     AxisNoise,
     Coefficient,
     NoiseTerms,
     NoiseType,
     SensorNoise,
+    motion_words,
     sensor_noise,
 )
 from imud.analysis.plots import DPI, density_figure, deviation_figure, page_figure
@@ -52,7 +54,6 @@ from imud.model.units import NS_PER_S
 TITLE_WIDTH: Final = 23
 UNIT_WIDTH: Final = 10
 CELL_WIDTH: Final = 15
-DISTURBED_SHARE: Final = 0.01  # maximum share of disturbed seconds in a measurement at rest
 # Maximum ratio of a measured value to the value of the data sheet for the verdict "within". The error of a measured
 # value is some per cent.
 WITHIN: Final = 1.1
@@ -65,6 +66,7 @@ class NoiseReport:
     sample_set: SampleSet
     sensors: dict[SensorName, SensorNoise]
     sheet: ModelFigures | None  # values of a data sheet for the comparison; None for no comparison
+    motion: str  # how the device moved; empty at rest
 
 
 def noise_report(sample_set: SampleSet, sheet: ModelFigures | None) -> NoiseReport:
@@ -77,7 +79,7 @@ def noise_report(sample_set: SampleSet, sheet: ModelFigures | None) -> NoiseRepo
         sensors["accel"] = sensor_noise(readings, readings.accel_m_s2)
     if not sensors:
         raise ImudError(f"{sample_set.source}: {sample_set.device} sends neither angular rate nor acceleration")
-    return NoiseReport(sample_set, sensors, sheet)
+    return NoiseReport(sample_set, sensors, sheet, motion_words(readings))
 
 
 def readings_of(sample_set: SampleSet) -> Readings:
@@ -147,9 +149,9 @@ def limits(report: NoiseReport, name: SensorName) -> Iterator[str]:
         size = step if step is not None else sensor.step
         origin = "in the manual" if step is not None else "found in the values"
         yield f"resolution: the values are multiples of {size:.4g} {SI[name]} ({origin})"
-    if sensor.disturbed_s > DISTURBED_SHARE * sensor.still_s:
+    if sensor.disturbed_s > MOVED_SHARE * sensor.still_s:
         yield (
-            f"NOT AT REST: in {sensor.disturbed_s} of {sensor.still_s} seconds, the values scatter much more than in "
+            f"DISTURBED: in {sensor.disturbed_s} of {sensor.still_s} seconds, the values scatter much more than in "
             "the other seconds; the device moved or vibrated, and the results contain this motion"
         )
     longest = sensor.curve.tau_s[-1]
@@ -246,6 +248,8 @@ def comparisons(report: NoiseReport, name: SensorName) -> list[Comparison]:
 def text(report: NoiseReport) -> str:
     """Format the report in 80 columns."""
     lines = [f"{report.sample_set.device}: noise"]
+    if report.motion:
+        lines += paragraph("  ", not_at_rest(report))
     for name, words in circumstances(report.sample_set):
         lines += paragraph(f"  {name:<13}", words)
     for sensor_name, sensor in report.sensors.items():
@@ -256,6 +260,14 @@ def text(report: NoiseReport) -> str:
     if report.sheet is None:
         lines += ["", *paragraph("", without_sheet(report))]
     return "\n".join(lines)
+
+
+def not_at_rest(report: NoiseReport) -> str:
+    """Return the warning about a device that moved."""
+    return (
+        f"NOT AT REST: {report.motion}. All values below contain this motion; they are not the noise of the sensor. "
+        "Measure again with the device at rest"
+    )
 
 
 def without_sheet(report: NoiseReport) -> str:
@@ -302,6 +314,8 @@ def as_object(report: NoiseReport) -> dict[str, Any]:
     """Return the report for `--json`. Values are in SI units and in the units of data sheets."""
     return {
         "measurement": measurement_object(report.sample_set),
+        "at_rest": not report.motion,
+        "motion": report.motion or None,
         "sensors": {name: _sensor_object(report, name, sensor) for name, sensor in report.sensors.items()},
         "data_sheet": report.sheet.source if report.sheet is not None else None,
         "manual": report.sample_set.sheet.document,
@@ -441,6 +455,8 @@ def html(report: NoiseReport) -> str:
         "<!DOCTYPE html>", "<html lang='en'><head><meta charset='utf-8'>", f"<title>{device}: noise</title>",
         f"<style>{STYLE}</style></head><body>", f"<h1>Noise of {device}</h1>", *_facts(report),
     ]  # fmt: skip
+    if report.motion:
+        parts.append(f"<p class='above'>{escape(not_at_rest(report))}.</p>")
     for name, sensor in report.sensors.items():
         parts += _sensor(report, name, sensor)
     if report.sheet is None:

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
 
-from imud.analysis.noise import corner_of, sensor_noise, step_of, temperature_drift
+from imud.analysis.noise import corner_of, motion_words, sensor_noise, step_of, temperature_drift
 from imud.analysis.series import FloatArray, Readings
 from imud.analysis.spectrum import power_spectrum
+from imud.model.units import STANDARD_GRAVITY_M_S2
 from tests.analysis.synthetic import random_walk, stamps_ns, three, white
 
 RATE_HZ = 200.0
@@ -92,3 +93,42 @@ def test_disturbances_and_counts() -> None:
     assert step_of(values) == pytest.approx(1.065e-3)
     assert step_of(noise_of_three(10)) is None
     assert step_of(np.zeros((100, 3))) is None
+
+
+SECONDS = np.arange(COUNT) / RATE_HZ
+AT_REST = np.array([0.0, 0.0, STANDARD_GRAVITY_M_S2])
+
+
+def shaken(amplitude: float, frequency_hz: float, offset: float = 0.0) -> FloatArray:
+    """Return a motion of the x axis with noise."""
+    motion = noise_of_three(7)
+    motion[:, 0] += offset + amplitude * np.sin(2 * np.pi * frequency_hz * SECONDS)
+    return motion
+
+
+@pytest.mark.parametrize(
+    ("gyro", "accel", "words"),
+    [
+        (shaken(0.0, 1.0), shaken(0.0, 1.0) + AT_REST, ""),
+        (shaken(0.0, 1.0, 0.04), shaken(0.0, 1.0) * 20 + AT_REST * 1.02, ""),  # an uncalibrated sensor with much noise
+        (shaken(0.0, 1.0, 0.06), None, "angular rate: expected a difference of the mean from 0 rad/s of at most 0.05"),
+        (shaken(0.1, 10.0), None, "angular rate: expected a standard deviation of at most 0.05 rad/s"),
+        (shaken(0.02, 0.05), None, "angular rate: expected a change of the mean of at most 0.01 rad/s"),
+        (None, shaken(0.0, 1.0, 5.0) + AT_REST, "acceleration: expected a difference of the mean from 9.807 m/s² of"),
+        (None, shaken(1.0, 10.0) + AT_REST, "acceleration: expected a standard deviation of at most 0.5 m/s²"),
+        (None, shaken(0.5, 0.05) + AT_REST, "acceleration: expected a change of the mean of at most 0.2 m/s²"),
+    ],
+)  # fmt: skip
+def test_rest_has_limits_that_do_not_depend_on_the_motion(
+    gyro: FloatArray | None, accel: FloatArray | None, words: str
+) -> None:
+    found = motion_words(Readings(stamps_ns(COUNT, RATE_HZ), gyro, accel, None))
+    assert found.startswith(words) if words else not found
+
+
+def test_one_disturbed_second_in_a_hundred_seconds_is_no_motion() -> None:
+    gyro = noise_of_three(8, count=20_000)
+    gyro[:200] += 1.0
+    assert not motion_words(readings_of(gyro))
+    gyro[200:400] += 1.0
+    assert "in 2 of 100 seconds" in motion_words(readings_of(gyro))

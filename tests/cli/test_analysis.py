@@ -204,8 +204,10 @@ def test_spectrum_and_noise_of_a_live_device(tmp_path: Path, cli: Cli) -> None:
         assert (measurement["device"], measurement["source"]) == ("bow", f"live from {daemon.socket}")
         assert measurement["duration_s"] == pytest.approx(1.5, abs=0.1)
         assert measurement["begun_utc_ns"] > 0
-        text = cli("noise", "--skip", "0.2s", "--for", "1.5s", *live).out
+        text, error = cli("noise", "--skip", "0.2s", "--for", "1.5s", *live, status=1)
         assert max(map(len, text.splitlines())) <= COLUMNS
+        assert text.splitlines()[1].startswith("  NOT AT REST: a")
+        assert error.startswith("imud noise: the device was not at rest: a")
         for word in ("live from", "angle random walk N", "bow, driver hipnuc-uart"):
             assert word in text, word
         cli.refuses("stern: expected a file, or a device of the daemon (bow)", "noise", *live[:2], "stern")

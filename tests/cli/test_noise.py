@@ -65,7 +65,7 @@ def test_what_limits_the_figures() -> None:
     moved = noise_of_three()
     moved[2000:4000] += np.sin(np.arange(2000) / 10)[:, None]
     words = " ".join(limits(noise_report(sample_set_of(moved, "imu61x-can"), None), "gyro"))
-    assert "NOT AT REST: in 20 of 100 seconds" in words
+    assert "DISTURBED: in 20 of 100 seconds" in words
     assert "filter of the device: low-pass 47 Hz (factory setting" in words
 
 
