@@ -180,5 +180,5 @@ def test_tables_of_actions_are_those_of_the_drivers() -> None:
     text = references.current("docs/commands.md")
     assert text.count("\n### `") == len(DRIVERS)
     for driver in DRIVERS.values():
-        for action in driver.actions:
+        for action in driver.verbs:
             assert f"\n| `{action}` | " in text, action

@@ -24,7 +24,7 @@ from docs.generate.alert_table import alert_table
 from docs.generate.socket_schema import socket_schema
 from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes
 from imud.config.schema import TABLES, DeviceGeneral, General
-from imud.contracts.command import Action, Actions, Handling, parameters_of
+from imud.contracts.command import Handling, Verb, Verbs, parameters_of
 from imud.contracts.driver import Driver
 from imud.contracts.lines import LINE_SCHEMAS, DeviceLines
 from imud.contracts.status import Deviations
@@ -204,7 +204,7 @@ def cell(text: str) -> str:
     return text.replace("|", "\\|")
 
 
-def meanings_of(action: Action) -> dict[str, str]:
+def meanings_of(action: Verb) -> dict[str, str]:
     found = {}
     for field in msgspec.structs.fields(action.parameters):
         info = msgspec.inspect.type_info(field.type)
@@ -215,7 +215,7 @@ def meanings_of(action: Action) -> dict[str, str]:
     return found
 
 
-def arguments_of(action: Action, lists: LongLists) -> str:
+def arguments_of(action: Verb, lists: LongLists) -> str:
     """Return the cell of the arguments of an action: name, values and meaning."""
     docs = meanings_of(action)
     words = []
@@ -227,7 +227,7 @@ def arguments_of(action: Action, lists: LongLists) -> str:
     return ".<br>".join(words) or "none"
 
 
-def actions_table(actions: Actions, lists: LongLists) -> Iterator[str]:
+def actions_table(actions: Verbs, lists: LongLists) -> Iterator[str]:
     yield "| action | arguments | effect |"
     yield "|---|---|---|"
     for name, action in actions.items():
@@ -236,9 +236,9 @@ def actions_table(actions: Actions, lists: LongLists) -> Iterator[str]:
 
 def actions_part(driver: Driver, lists: LongLists, first_of: dict[str, str]) -> list[str]:
     """Return title and table of the actions of a driver; a table that an earlier driver has becomes a reference."""
-    table = "\n".join(actions_table(driver.actions, lists)) if driver.actions else "No actions."
+    table = "\n".join(actions_table(driver.verbs, lists)) if driver.verbs else "No actions."
     first = first_of.setdefault(table, driver.name)
-    same = bool(driver.actions) and first != driver.name
+    same = bool(driver.verbs) and first != driver.name
     return [f"### `{driver.name}`: {driver.title}", "", f"As `{first}`." if same else table, ""]
 
 

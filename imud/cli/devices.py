@@ -8,7 +8,7 @@ import msgspec
 from imud.cli.arguments import CliCommand, add_socket, argument, confirmed, connect, statuses
 from imud.cli.output import table
 from imud.client.connection import Client
-from imud.contracts.command import ActionInfo
+from imud.contracts.command import VerbInfo
 
 HEAD: Final = ("DEVICE", "STATE", "RATE HZ", "DRIVER", "PRODUCT", "SERIAL NUMBER", "LINK")
 LIMIT_S: Final = 180.0  # Time limit of an action, s. The longest action, a calibration, ends within two minutes.
@@ -51,7 +51,7 @@ def command_arguments(parser: argparse.ArgumentParser) -> None:
 def command(args: argparse.Namespace) -> int:
     """Print the list of actions, or run an action and print its reply. An action requires the right to control."""
     with Client(args.socket, timeout_s=LIMIT_S) as client:
-        known = msgspec.convert(client.call("actions", device=args.device), list[ActionInfo])
+        known = msgspec.convert(client.call("actions", device=args.device), list[VerbInfo])
         if args.name is None:
             for action in known:
                 print("\n".join([f"{action.name:24} {action.help}", *(f"{'':24}   {p}" for p in action.parameters)]))

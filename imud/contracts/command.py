@@ -1,4 +1,4 @@
-"""Contract of an action: a command that a device executes by name, for example calibrate, save, restart, baud rate."""
+"""Contract of a verb: an operation that a device executes once on request, for example save, restart, level."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from imud.model.units import RAD_PER_DEG
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """The device that executes an action."""
+    """The device that executes a verb."""
 
     settings: Any  # options of the device's driver
     baud: int  # present bit rate of the link, bit/s; 0 if the link has no bit rate
@@ -29,7 +29,7 @@ class Target:
 
 
 class Risk(StrEnum):
-    """Effect that no other action can undo. Interactive programs ask for confirmation before such an action."""
+    """Effect that no other verb can undo. Interactive programs ask for confirmation before such a verb."""
 
     NONE = ""
     CONNECTION = "the device may not be reached afterwards"
@@ -37,23 +37,23 @@ class Risk(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Action:
-    """An action of a device: help text, arguments and request script.
+class Verb:
+    """A verb of a device: help text, arguments and request script.
 
     The arguments are the keyword-only parameters of `begin`. The annotation of a parameter gives its type and its
     bounds (`msgspec.Meta`). The name of a parameter contains its unit. A parameter with a default is optional.
     """
 
-    help: str  # effect of the action, one sentence
+    help: str  # effect of the verb, one sentence
     begin: Callable[..., Any]
     """`begin(target, *, name: type = default, …)` returns the request script (polled drivers: the transfer script).
 
-    The script returns the result of the action, a value that JSON can represent. `begin` and the script raise
+    The script returns the result of the verb, a value that JSON can represent. `begin` and the script raise
     BadArgument."""
     risk: Risk = Risk.NONE
-    # Whether the action writes the flash of the device. imud counts these writes and limits them per day.
+    # Whether the verb writes the flash of the device. imud counts these writes and limits them per day.
     saves: bool = False
-    # Whether the action can change the identity or a setting. imud reads both again after such an action.
+    # Whether the verb can change the identity or a setting. imud reads both again after such a verb.
     changes: bool = True
 
     @property
@@ -69,7 +69,7 @@ class Action:
         return msgspec.convert(dict(given), self.parameters)
 
     def script(self, target: Target, arguments: Options) -> Any:
-        """Return the script of the action for `arguments`, a result of the method `arguments`."""
+        """Return the script of the verb for `arguments`, a result of the method `arguments`."""
         return self.begin(target, **msgspec.structs.asdict(arguments))
 
 
@@ -84,11 +84,11 @@ def _parameters(begin: Callable[..., Any]) -> type[Options]:
     return cast(type[Options], made)
 
 
-Actions = Mapping[str, Action]
+Verbs = Mapping[str, Verb]
 
 
-class ActionParameter(msgspec.Struct, frozen=True):
-    """Description of one argument of an action."""
+class VerbParameter(msgspec.Struct, frozen=True):
+    """Description of one argument of a verb."""
 
     name: str
     values: str  # accepted values, for example `a whole number from 1 to 127`
@@ -100,26 +100,26 @@ class ActionParameter(msgspec.Struct, frozen=True):
         return f"{self.name} ({self.values}{'' if self.default is None else f'; default {self.default}'})"
 
 
-class ActionInfo(msgspec.Struct, frozen=True):
-    """Description of one action."""
+class VerbInfo(msgspec.Struct, frozen=True):
+    """Description of one verb."""
 
     name: str
     help: str
-    parameters: tuple[ActionParameter, ...]
+    parameters: tuple[VerbParameter, ...]
     risk: Risk = Risk.NONE  # reason for a confirmation, one clause; empty if no confirmation is necessary
 
 
-def parameters_of(action: Action) -> tuple[ActionParameter, ...]:
-    """Return the descriptions of the arguments of an action."""
+def parameters_of(verb: Verb) -> tuple[VerbParameter, ...]:
+    """Return the descriptions of the arguments of a verb."""
     return tuple(
-        ActionParameter(one.name, expected(one.type), None if one.required else shown(one.default), one.required)
-        for one in msgspec.structs.fields(action.parameters)
+        VerbParameter(one.name, expected(one.type), None if one.required else shown(one.default), one.required)
+        for one in msgspec.structs.fields(verb.parameters)
     )
 
 
-def described(actions: Actions) -> list[ActionInfo]:
-    """Return the descriptions of actions in the same order."""
-    return [ActionInfo(name, action.help, parameters_of(action), action.risk) for name, action in actions.items()]
+def described(verbs: Verbs) -> list[VerbInfo]:
+    """Return the descriptions of verbs in the same order."""
+    return [VerbInfo(name, verb.help, parameters_of(verb), verb.risk) for name, verb in verbs.items()]
 
 
 class Handling(StrEnum):

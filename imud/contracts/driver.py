@@ -10,7 +10,7 @@ from msgspec import Meta
 
 from imud.attitude.conventions import RFU_ENU, DeviceAxes, Heading
 from imud.contracts.codec import CanCodec, PolledCodec, StreamCodec
-from imud.contracts.command import Actions, Calibrations
+from imud.contracts.command import Calibrations, Verbs
 from imud.contracts.lines import NO_TIME_BITS, AlarmRanges, DeviceLines, TimeBits
 from imud.contracts.script import RequestScript, TransferScript
 from imud.contracts.setting import SettingsTable
@@ -133,7 +133,7 @@ class Driver:
     axes: DeviceAxes = RFU_ENU  # axes, angles and navigation frame for conversions
     # Returns the reference of yaw from the driver options and the device settings (empty: not read yet)
     heading: Callable[[Any, Mapping[str, str]], Heading] = _unknown_heading
-    actions: Actions = field(default_factory=dict)  # actions of the device, by name
+    verbs: Verbs = field(default_factory=dict)  # verbs of the device, by name
     calibrations: Calibrations = field(default_factory=dict)  # guided calibrations, by kind
     device_settings: SettingsTable | None = None  # table of the device settings; None if the driver does not know them
     # GPIO lines that the device can have: names of fields of `imud.contracts.lines.DeviceLines`

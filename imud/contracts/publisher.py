@@ -8,7 +8,7 @@ from typing import Any, Final, Protocol
 
 from imud.attitude.conventions import Convention
 from imud.attitude.published import PublishedAxes, as_sent
-from imud.contracts.command import Actions, CalibrationResult, Calibrations
+from imud.contracts.command import CalibrationResult, Calibrations, Verbs
 from imud.contracts.lines import UtcReference, WatchLine
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import ClientStatus, DeviceStatus, FlightStatus, MqttStatus, OutputStatus, RecorderStatus
@@ -128,12 +128,12 @@ class DeviceControl(Protocol):
     implements it, and outputs may not import that part."""
 
     @property
-    def actions(self) -> Actions:
-        """Present actions of the device, by name."""
+    def verbs(self) -> Verbs:
+        """Present verbs of the device, by name."""
         ...
 
     async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
-        """Run an action and return its result. Raises ImudError."""
+        """Run a verb and return its result. Raises ImudError."""
         ...
 
     @property

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import msgspec
 
 from imud.config.model import DeviceConfig
-from imud.contracts.command import Action
+from imud.contracts.command import Verb
 from imud.contracts.driver import Driver
 from imud.contracts.lines import AlarmRanges, LineFactory
 from imud.contracts.link import DeviceLink
@@ -18,7 +18,7 @@ from imud.device.health import DeviceEvents
 from imud.device.utc import UtcFeed, make_utc_feed
 from imud.host.clock import HostClock
 from imud.lines.reset import ResetLine, make_reset
-from imud.lines.sync import LineActions, SyncSignals
+from imud.lines.sync import LineVerbs, SyncSignals
 from imud.model.event import EventKind
 from imud.model.sample import Sample
 from imud.sampling.clock import SampleClock
@@ -60,7 +60,7 @@ class Attachments:
         if config.lines is not None:
             self._signals = SyncSignals(config.name, config.lines, lines, raise_event, host, self._utc)
         self._reset: ResetLine | None = make_reset(config.name, config.lines, lines, raise_event, host, link)
-        self._line_actions = LineActions(self._reset, self._signals)
+        self._line_verbs = LineVerbs(self._reset, self._signals)
         # differences between the GPIO lines and the device settings, by the key of the line
         self._differences: Mapping[str, str] = {}
         made: tuple[Attachment | None, ...] = (self._signals, self._reset, self._utc)
@@ -144,13 +144,13 @@ class Attachments:
         """Whether the device has a reset line."""
         return self._reset is not None
 
-    # --- actions -----------------------------------------------------------------------------------------------------
+    # --- verbs -----------------------------------------------------------------------------------------------------
 
     @property
-    def actions(self) -> Mapping[str, Action]:
-        """Actions with GPIO lines by name. They do not depend on the driver."""
-        return self._line_actions.rows
+    def verbs(self) -> Mapping[str, Verb]:
+        """Verbs with GPIO lines by name. They do not depend on the driver."""
+        return self._line_verbs.rows
 
-    def run_action(self, name: str, arguments: Mapping[str, Any]) -> Awaitable[object]:
-        """Run one of `actions`. Raises BadArgument or CommandError."""
-        return self._line_actions.run(name, arguments)
+    def run_verb(self, name: str, arguments: Mapping[str, Any]) -> Awaitable[object]:
+        """Run one of `verbs`. Raises BadArgument or CommandError."""
+        return self._line_verbs.run(name, arguments)

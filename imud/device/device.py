@@ -16,7 +16,7 @@ from typing import Any
 
 from imud.config.devices import owner_of
 from imud.config.model import DeviceConfig
-from imud.contracts.command import Action, Actions, CalibrationResult, Calibrations, Risk
+from imud.contracts.command import CalibrationResult, Calibrations, Risk, Verb, Verbs
 from imud.contracts.driver import status_words
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link
@@ -222,24 +222,24 @@ class Device:
             put, self._transport.where, identity_words(self._identity.identity), self._identity.shown_settings
         )
 
-    # --- actions -----------------------------------------------------------------------------------------------------
+    # --- verbs -----------------------------------------------------------------------------------------------------
 
     @property
-    def actions(self) -> Actions:
-        """Actions by name. Before imud has found the device: only the actions of its GPIO lines."""
+    def verbs(self) -> Verbs:
+        """Verbs by name. Before imud has found the device: only the verbs of its GPIO lines."""
         driver = self._transport.driver
-        return {**(driver.actions if driver is not None else {}), **self._attachments.actions}
+        return {**(driver.verbs if driver is not None else {}), **self._attachments.verbs}
 
     async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
-        """Run an action and return its result. Raises CommandError, TransferError, DeviceRefused, LinkError."""
+        """Run a verb and return its result. Raises CommandError, TransferError, DeviceRefused, LinkError."""
         log.info("%s: run %s%s", self.config.name, printable(name), f" {shown(arguments)}" if arguments else "")
-        action = self.actions.get(name)
-        if action is None:
-            raise BadArgument(f"{self.config.name}: unknown action {name[:64]!r}; expected: {self._known_actions()}")
-        if name in self._attachments.actions:
-            return await self._attachments.run_action(name, arguments)
+        verb = self.verbs.get(name)
+        if verb is None:
+            raise BadArgument(f"{self.config.name}: unknown command {name[:64]!r}; expected: {self._known_verbs()}")
+        if name in self._attachments.verbs:
+            return await self._attachments.run_verb(name, arguments)
         self._require_replies()
-        return await self._run_action(name, action, arguments)
+        return await self._run_verb(name, verb, arguments)
 
     @property
     def calibrations(self) -> Calibrations:
@@ -267,28 +267,28 @@ class Device:
         """Stop the running calibration; return whether one was running."""
         return self._calibration.cancel()
 
-    async def _run_action(self, name: str, action: Action, arguments: Mapping[str, Any]) -> object:
-        params = action.arguments(arguments)
+    async def _run_verb(self, name: str, verb: Verb, arguments: Mapping[str, Any]) -> object:
+        params = verb.arguments(arguments)
         async with self._settings.exclusive():
-            if action.saves:
+            if verb.saves:
                 self._settings.spend_flash()
-            if action.risk is Risk.RESET:
+            if verb.risk is Risk.RESET:
                 await self._settings.back_up(name)
-            if action.changes:
-                self._attachments.set_alarm_ranges(None)  # the action can change the ranges
+            if verb.changes:
+                self._attachments.set_alarm_ranges(None)  # the verb can change the ranges
             done = False
             try:
-                answer = await self._transport.run_script(lambda target: action.script(target, params))
+                answer = await self._transport.run_script(lambda target: verb.script(target, params))
                 done = True
             except ImudError:  # the state of the device is unknown
                 await self._transport.read_back()
                 raise
             finally:
-                if action.changes or not done:
-                    self._settings.commanded(saved=done and action.saves)
-                elif action.saves:
+                if verb.changes or not done:
+                    self._settings.commanded(saved=done and verb.saves)
+                elif verb.saves:
                     self._settings.saved()
-            if action.changes:
+            if verb.changes:
                 await self._transport.read_back()
             return answer
 
@@ -319,8 +319,8 @@ class Device:
             problem = self._health.problem or "it cannot reply to commands now"
             raise CommandError(f"{self.config.name} is {self._health.state}: {problem}")
 
-    def _known_actions(self) -> str:
-        return ", ".join(self.actions) or "none" + " while no device is found" * (self._transport.driver is None)
+    def _known_verbs(self) -> str:
+        return ", ".join(self.verbs) or "none" + " while no device is found" * (self._transport.driver is None)
 
     # --- the samples -------------------------------------------------------------------------------------------------
 

@@ -384,7 +384,7 @@ class StreamTransport(ReceivingTransport):
         firmware = f"firmware {known.identity.firmware}" if known.identity.firmware else ""
         names = ", ".join(filter(None, (known.identity.product, firmware)))
         why = driver.why_silent(known.settings)
-        hint = "; the action wake starts its output" if "wake" in driver.actions else ""
+        hint = "; the command wake starts its output" if "wake" in driver.verbs else ""
         return f"it replies{f' ({names})' if names else ''} but sends no samples: {why}{hint}"
 
     # --- state -------------------------------------------------------------------------------------------------------

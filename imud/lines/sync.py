@@ -7,7 +7,7 @@ data of a read. A failed line affects only its own function. imud opens it again
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, Final
 
-from imud.contracts.command import Action
+from imud.contracts.command import Verb
 from imud.contracts.lines import AlarmRanges, DeviceLines, Edge, LineFactory, Mark, PulseReceiver
 from imud.contracts.status import LinesStatus
 from imud.host.clock import HostClock
@@ -178,18 +178,18 @@ class SyncSignals:
 
 
 def _no_script(_target: object) -> None:
-    raise AssertionError("a line is driven by `LineActions.run`")
+    raise AssertionError("a line is driven by `LineVerbs.run`")
 
 
-RESET: Final = Action("pulse the reset line, and wait until the device works again", _no_script)
-TRIGGER: Final = Action("make one additional edge on SIN", _no_script)
+RESET: Final = Verb("pulse the reset line, and wait until the device works again", _no_script)
+TRIGGER: Final = Verb("make one additional edge on SIN", _no_script)
 
 
-class LineActions:
-    """Actions that use the GPIO lines of one device. Synchronization: the event loop's thread only."""
+class LineVerbs:
+    """Verbs that use the GPIO lines of one device. Synchronization: the event loop's thread only."""
 
     def __init__(self, reset: ResetLine | None, signals: SyncSignals | None) -> None:
-        self.rows: dict[str, Action] = {}  # actions by name
+        self.rows: dict[str, Verb] = {}  # verbs by name
         self._coroutines: dict[str, Callable[[], Awaitable[None]]] = {}
         if reset is not None:
             self.rows["reset"], self._coroutines["reset"] = RESET, reset.pulse
@@ -201,7 +201,7 @@ class LineActions:
             self.rows["trigger"], self._coroutines["trigger"] = TRIGGER, trigger
 
     async def run(self, name: str, arguments: Mapping[str, Any]) -> object:
-        """Run an action. It returns None. Raises BadArgument, CommandError."""
+        """Run a verb. It returns None. Raises BadArgument, CommandError."""
         self.rows[name].arguments(arguments)
         await self._coroutines[name]()
         return None

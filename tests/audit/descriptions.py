@@ -26,7 +26,7 @@ def described() -> dict[str, list[str]]:
 
 
 def _of(driver: Driver) -> Iterator[tuple[str, str]]:
-    for name, action in driver.actions.items():
+    for name, action in driver.verbs.items():
         for field in msgspec.structs.fields(action.parameters):
             if section := _section(field.type):
                 yield section, f"action {name} ({field.name})"

@@ -35,7 +35,7 @@ MANUAL_B: Final = (
     Item("B 2.2.4 rest", "ATT RST at rest only", "device.calibration:CalibrationRun"),
     Item("B 2.2.4 YAW 1", "absolute heading", "drivers.hipnuc.uart.commands:yaw"),
     Item("B 2.2.4 YAW 0", "relative heading", "drivers.hipnuc.uart.commands:yaw"),
-    Item("B 2.2.4 YAW range", "±180°, lost at power-off", "drivers.hipnuc.uart.driver:ACTIONS"),
+    Item("B 2.2.4 YAW range", "±180°, lost at power-off", "drivers.hipnuc.uart.driver:VERBS"),
     Item("B 2.2.4 URFR", "a rotation, in force after a restart", "drivers.hipnuc.uart.commands:mounting"),
     Item("B 2.2.4 URFR presets", "nine mountings (ERRATA B30)", "drivers.hipnuc.uart.commands:Mounting"),
     Item("B 2.2.4 PMUX", "functions of IO1 to IO9", "drivers.hipnuc.uart.commands:pin_function"),

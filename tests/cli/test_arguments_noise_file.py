@@ -37,9 +37,7 @@ def test_deviations_are_the_quadratic_mean_of_the_axes(tmp_path: Path) -> None:
     with pytest.raises(ImudError, match=r"nothing\.json: expected a report"):
         read_noise(tmp_path / "nothing.json")
     moved = report(gyro=[0.001, 0.007, 0.005]) | {"at_rest": False, "motion": "angular rate: too large"}
-    with pytest.raises(
-        ImudError, match=r"at rest, got motion \(angular rate: too large\); measure again"
-    ):
+    with pytest.raises(ImudError, match=r"at rest, got motion \(angular rate: too large\); measure again"):
         read_noise(written(tmp_path, moved))
     had = Deviations(gyro_rad_s=1.0, mag_t=2.0)
     assert had.updated(Deviations(gyro_rad_s=3.0, accel_m_s2=4.0)) == Deviations(

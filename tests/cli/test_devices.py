@@ -34,7 +34,7 @@ def test_devices_and_actions_are_listed_and_a_module_obeys(daemon: RunningDaemon
     ("words", "expected"),
     [
         (["mode", "axes=7"], "arguments: axes (one of 6, 9)"),
-        (["dance"], "unknown action 'dance'; expected: save, restart"),
+        (["dance"], "unknown command 'dance'; expected: save, restart"),
         (["mode", "nine"], "expected NAME=VALUE, got 'nine'"),
     ],
 )

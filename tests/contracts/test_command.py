@@ -1,4 +1,4 @@
-"""Actions: check and description of arguments, and the actions in the rows of all drivers."""
+"""Verbs: check and description of arguments, and the actions in the rows of all drivers."""
 
 from typing import Annotated
 
@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from msgspec import Meta
 
-from imud.contracts.command import Action, Risk, Target, described, parameters_of
+from imud.contracts.command import Risk, Target, Verb, described, parameters_of
 from imud.drivers import DRIVERS
 from imud.model.errors import BadArgument
 
@@ -20,7 +20,7 @@ RISKS = {
 
 @pytest.mark.parametrize("driver", DRIVERS)
 def test_every_action_is_described_and_says_what_it_saves_and_risks(driver: str) -> None:
-    for name, action in DRIVERS[driver].actions.items():
+    for name, action in DRIVERS[driver].verbs.items():
         (info,) = described({name: action})
         assert info.help, name
         assert not info.help.endswith("."), name
@@ -37,7 +37,7 @@ def _turn(target: Target, *, angle_deg: Annotated[float, Meta(ge=-180, le=180)],
     return f"{target.baud} {angle_deg} {relative}"
 
 
-ACTION = Action("turn it", _turn)
+ACTION = Verb("turn it", _turn)
 
 
 def test_arguments_are_converted_and_completed_by_defaults() -> None:

@@ -131,11 +131,11 @@ async def test_no_request_during_a_reset_and_for_3_s(bench: PolledBusBench) -> N
 @in_bench
 async def test_reset_needs_a_line_but_no_device(bench: PolledBusBench) -> None:
     async with bench.running(bench.on_spi()) as (rig,):
-        assert "reset" not in rig.device.actions
-        with pytest.raises(BadArgument, match="unknown action 'reset'"):
+        assert "reset" not in rig.device.verbs
+        with pytest.raises(BadArgument, match="unknown command 'reset'"):
             await rig.device.act("reset", {})
     async with polled(bench) as it:
-        assert "trigger" not in it.rig.device.actions  # it has lines, but no SIN line
+        assert "trigger" not in it.rig.device.verbs  # it has lines, but no SIN line
         it.hang()
         await it.rig.until(lambda: "received only 0xFF" in it.rig.device.status().problem, "searching")
         with pytest.raises(BadArgument, match="hard"):
@@ -222,7 +222,7 @@ async def test_a_device_with_bytes_on_a_uart_is_not_reset(it: Uart) -> None:
 @in_loop
 async def test_the_trigger_action_needs_a_sin_line(monkeypatch: pytest.MonkeyPatch) -> None:
     it = Uart(DeviceLines(sin=TriggerOptions(line="S")), baud=115200)
-    assert list(it.device.actions) == ["trigger"]
+    assert list(it.device.verbs) == ["trigger"]
     once: list[str] = []
     monkeypatch.setattr(SyncSignals, "trigger_once", lambda _self: once.append("edge"))
     assert await it.device.act("trigger", {}) is None

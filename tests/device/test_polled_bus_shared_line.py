@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from imud.config.model import DeviceConfig
-from imud.contracts.command import Action, Target
+from imud.contracts.command import Target, Verb
 from imud.contracts.link import LinkType
 from imud.contracts.script import Transfer, TransferScript
 from imud.contracts.status import DeviceState, KernelCounters
@@ -197,7 +197,7 @@ async def test_a_module_with_a_new_address_is_followed(bench: LineBench, monkeyp
             yield replace(next(session.set_id(address)), then_at=address)
         yield next(session.read(BY_NAME["MD_ID"]))
 
-    monkeypatch.setattr(driver, "DRIVER", replace(driver.DRIVER, actions={"move": Action("move it", moving)}))
+    monkeypatch.setattr(driver, "DRIVER", replace(driver.DRIVER, verbs={"move": Verb("move it", moving)}))
     module, other = modbus_slave(1), modbus_slave(3)
     async with bench.running(module, other) as rigs:
         for rig in rigs:

@@ -94,7 +94,7 @@ class OnBus:
 @played(Bus)
 async def test_the_only_device_is_found_without_a_sent_frame(bus: Bus) -> None:
     bench = bus.add()
-    assert bench.device.actions == {}
+    assert bench.device.verbs == {}
     await bench.until(lambda: bench.link.listening)
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING, 8)
     status = bench.device.status()

@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 from imud.config.model import DeviceConfig
-from imud.contracts.command import Action
+from imud.contracts.command import Verb
 from imud.contracts.link import OnData, OnEnd
 from imud.contracts.script import Request, RequestScript, never
 from imud.contracts.status import DeviceState, KernelCounters
@@ -489,7 +489,7 @@ def test_an_action_that_changes_the_rate_changes_port_and_stored_rate(monkeypatc
     def at_921600(_target: object) -> RequestScript[None]:
         yield Request(b"?", "?", never, never, never, silent=True, baud=921600)
 
-    monkeypatch.setattr(driver, "DRIVER", replace(driver.DRIVER, actions={"rate": Action("set it", at_921600)}))
+    monkeypatch.setattr(driver, "DRIVER", replace(driver.DRIVER, verbs={"rate": Verb("set it", at_921600)}))
 
     async def story(rigs: DeviceRigs, rig: DeviceRig) -> None:
         for ms in range(0, 400, 10):

@@ -52,7 +52,7 @@ async def test_a_module_with_its_output_off_is_known_and_stays_silent(
     await device.wait(35)
     assert device.rig.is_in(DeviceState.SILENT)
     assert device.problem == (
-        f"it replies (HI14R3, firmware 1.5.6) but sends no samples: {why}; the action wake starts its output"
+        f"it replies (HI14R3, firmware 1.5.6) but sends no samples: {why}; the command wake starts its output"
     )
     assert device.device.status().identity["serial_number"] == "043995698D6E1708"
     assert device.module.settings == settings
@@ -69,7 +69,7 @@ async def test_a_module_with_its_output_off_is_known_and_stays_silent(
 
 @played(lambda: LinkedDevice(NO_RATE))
 async def test_commands_are_accepted_after_the_first_reply(device: LinkedDevice) -> None:
-    await device.until(lambda: device.device.actions, limit_s=0.1)
+    await device.until(lambda: device.device.verbs, limit_s=0.1)
     with pytest.raises(CommandError, match="bow is searching"):
         await device.device.act("wake", {})
     await device.until(lambda: device.device.status().settings, limit_s=1.9)

@@ -26,7 +26,7 @@ TOPIC: Final = topic_of("site", "gw", "bow", COMMAND)
 OWN: Final = topic_of("site", "gw", "bow", ANSWER)
 SEPARATOR: Final = b"\t"
 """Separator between topic, response topic and payload. Messages are lines, and JSON needs no tab."""
-ACTIONS: Final = DRIVERS["hipnuc-uart"].actions
+VERBS: Final = DRIVERS["hipnuc-uart"].verbs
 
 
 def names() -> Sequence[str]:
@@ -46,9 +46,9 @@ class _Control(FakeControl):
 
     async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
         self._asked.append((self._device, name))
-        if name not in ACTIONS:
+        if name not in VERBS:
             raise Rejected(f"no action {name}")
-        ACTIONS[name].arguments(arguments)
+        VERBS[name].arguments(arguments)
         return {"done": name}
 
 
@@ -97,7 +97,7 @@ def _message(identifier: str, action: str, arguments: object, *, topic: str = TO
 
 
 def seeds() -> list[bytes]:
-    every = [_message(f"id-{n}", action, {"rate_hz": 100}) for n, action in enumerate(ACTIONS)]
+    every = [_message(f"id-{n}", action, {"rate_hz": 100}) for n, action in enumerate(VERBS)]
     twice = _message("a", "save", {})
     odd = [
         b"",
@@ -118,5 +118,5 @@ def seeds() -> list[bytes]:
 
 
 def words() -> list[bytes]:
-    own = ["v", "id", "action", "arguments", "issued_utc_ns", *ACTIONS]
+    own = ["v", "id", "action", "arguments", "issued_utc_ns", *VERBS]
     return [TOPIC.encode(), OWN.encode(), SEPARATOR, str(UTC_NS + AGE_NS).encode(), *(f'"{w}"'.encode() for w in own)]

@@ -33,7 +33,7 @@ METHODS: Final = (
     "devices", "status", "schema", "watch", "unwatch", "poll", "events", "notify", "actions", "command",
     "calibrations", "calibrate", "stop_calibration",
 )  # fmt: skip
-ACTIONS: Final = DRIVERS["hipnuc-uart"].actions
+VERBS: Final = DRIVERS["hipnuc-uart"].verbs
 
 
 def names() -> Sequence[str]:
@@ -140,12 +140,12 @@ def _rig() -> _Rig:
 class _Control(FakeControl):
     """A device with the actions of a real driver. It checks the arguments like the daemon and executes nothing."""
 
-    actions = ACTIONS
+    actions = VERBS
 
     async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
-        if name not in ACTIONS:
+        if name not in VERBS:
             raise Rejected(f"no action {name}")
-        ACTIONS[name].arguments(arguments)
+        VERBS[name].arguments(arguments)
         return {"done": name}
 
 
@@ -173,7 +173,7 @@ def seeds() -> list[bytes]:
         ("events", {"devices": ["imu0"], "enable": False}),
         ("notify", {"device": "imu0"}),
         ("actions", {"device": "imu0"}),
-        *(("command", {"device": "imu0", "name": name, "arguments": arguments}) for name in ACTIONS),
+        *(("command", {"device": "imu0", "name": name, "arguments": arguments}) for name in VERBS),
     ]
     requests += [{"jsonrpc": "2.0", "id": "a", "method": method, "params": given} for method, given in params]
     lines = [json.dumps(request).encode() + b"\n" for request in requests]
@@ -191,5 +191,5 @@ def seeds() -> list[bytes]:
 
 def words() -> list[bytes]:
     own = ["jsonrpc", "2.0", "id", "method", "params", "devices", "fields", "rate_hz", "encoding", "binary", "json"]
-    known = [*own, "enable", "device", "name", "arguments", *METHODS, *DEVICES, *SAMPLE_FIELDS, *ACTIONS]
+    known = [*own, "enable", "device", "name", "arguments", *METHODS, *DEVICES, *SAMPLE_FIELDS, *VERBS]
     return [json.dumps(word).encode() for word in known]

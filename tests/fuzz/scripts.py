@@ -64,7 +64,7 @@ def _scripts(driver: Driver) -> list[Script]:
     elif isinstance(driver, CanDriver):
         found = [lambda: driver.identify(settings), lambda: driver.read_settings(settings)]
     target = ActionTarget(settings, BAUD)
-    for action in driver.actions.values():
+    for action in driver.verbs.values():
         try:
             arguments = action.arguments({})
         except BadArgument:

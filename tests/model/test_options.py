@@ -29,7 +29,7 @@ def schemas() -> Iterator[Any]:
     for name, schema in LINE_SCHEMAS.items():
         yield pytest.param(schema, id=f"line {name}")
     for name, driver in DRIVERS.items():
-        for action, one in driver.actions.items():
+        for action, one in driver.verbs.items():
             yield pytest.param(one.parameters, id=f"{name} {action}")
         if driver.device_settings is not None:
             yield pytest.param(driver.device_settings.declarable, id=f"{name} settings")

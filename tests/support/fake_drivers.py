@@ -17,7 +17,7 @@ import msgspec
 from msgspec import Meta
 
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, StreamCodec
-from imud.contracts.command import Action, Calibration, Handling, Kept, Risk, Target
+from imud.contracts.command import Calibration, Handling, Kept, Risk, Target, Verb
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Identity, StreamDriver
 from imud.contracts.script import (
     Outcome,
@@ -217,9 +217,9 @@ def fake_can_driver(name: str = "fake-can", base: int = BASE) -> CanDriver:
         sample_frames=1,
         example_frames=lambda _random: [CanFrame(BASE + 1, False, bytes(8), 0)],
         cyclic=_cyclic,
-        actions={
-            "node": Action("its number", lambda target: says_nothing(target.settings.node)),
-            "renumber": Action("give it another number", _renumber),
+        verbs={
+            "node": Verb("its number", lambda target: says_nothing(target.settings.node)),
+            "renumber": Verb("give it another number", _renumber),
         },
     )
 
@@ -478,10 +478,10 @@ FAKE_MODULE_DRIVER: Final = replace(
     read_settings=_get_words,
     device_settings=FAKE_SETTINGS,
     calibrations={"zero": ZERO},
-    actions={
-        "set_mode": Action("set it", _set_mode),
-        "wait": Action("take an hour", lambda _target: (pause(3600 * 1_000_000_000) for _ in range(1))),
-        "save": Action("save all", _save_all, saves=True, changes=False),
-        "factory_reset": Action("forget all", _restart, Risk.RESET),
+    verbs={
+        "set_mode": Verb("set it", _set_mode),
+        "wait": Verb("take an hour", lambda _target: (pause(3600 * 1_000_000_000) for _ in range(1))),
+        "save": Verb("save all", _save_all, saves=True, changes=False),
+        "factory_reset": Verb("forget all", _restart, Risk.RESET),
     },
 )

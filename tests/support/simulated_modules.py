@@ -22,7 +22,7 @@ from imud.drivers.hipnuc.canopen.driver import DRIVER as CANOPEN_DRIVER
 from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
 from imud.drivers.hipnuc.j1939.driver import DRIVER as J1939_DRIVER
 from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucOptions
-from imud.drivers.hipnuc.uart.driver import ACTIONS
+from imud.drivers.hipnuc.uart.driver import VERBS
 from imud.drivers.imu61x.uart.codec import Imu61xCodec
 from imud.formats.can import EXTENDED_FLAG, RAW_FRAME, CanFilter
 from imud.model.ledger import Ledger
@@ -187,7 +187,7 @@ class HipnucLine(SerialLine[HipnucModule]):
         self.wait(hardware.boot_ms)
 
     def act(self, name: str, *, fixed_baud: int = 0, **arguments: Any) -> Any:
-        action = ACTIONS[name]
+        action = VERBS[name]
         return self.run(action.script(Target(None, self.baud, fixed_baud), action.arguments(arguments)))
 
 
@@ -259,7 +259,7 @@ class CanBench:
         return run_script(script, self._ask)
 
     def act(self, name: str, **given: object) -> object:
-        action = self.driver.actions[name]
+        action = self.driver.verbs[name]
         result: object = self.run_script(action.script(self.target(), action.arguments(given)))
         return result
 

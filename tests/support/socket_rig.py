@@ -17,8 +17,6 @@ from typing import Any, Literal, Self, TypeVar
 
 from imud.attitude.conventions import Convention, Heading
 from imud.contracts.command import (
-    Action,
-    Actions,
     Calibration,
     CalibrationResult,
     Calibrations,
@@ -26,6 +24,8 @@ from imud.contracts.command import (
     Handling,
     Kept,
     Target,
+    Verb,
+    Verbs,
 )
 from imud.contracts.publisher import (
     AS_SENT,
@@ -139,10 +139,10 @@ def context(
 
 
 def set_rate(_target: Target, *, message: Literal["HI91", "HI92"], rate_hz: int) -> None:
-    """Action `output`."""
+    """Verb `output`."""
 
 
-ACTIONS = {"output": Action("send at a rate", set_rate)}
+VERBS = {"output": Verb("send at a rate", set_rate)}
 CALIBRATIONS = {
     "heading": Calibration(
         help="make the present heading zero",
@@ -158,7 +158,7 @@ done_late = asyncio.Event()
 
 
 class FakeControl:
-    actions: Actions = ACTIONS
+    verbs: Verbs = VERBS
     calibrations: Calibrations = CALIBRATIONS
 
     def __init__(self, device: str) -> None:
@@ -172,7 +172,7 @@ class FakeControl:
             raise ZeroDivisionError("a mistake in an action")
         if name != "output":
             raise Rejected(f"{self._device} refuses {name}")
-        ACTIONS[name].arguments(arguments)
+        VERBS[name].arguments(arguments)
         return None
 
     async def calibrate(self, kind: str, *, save: bool) -> CalibrationResult:

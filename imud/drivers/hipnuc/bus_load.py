@@ -66,5 +66,5 @@ def refuse_other_rate(target: Target, values: Mapping[str, Any]) -> None:
     if rate is not None and target.baud and rate != target.baud:
         raise BadArgument(
             f"bit_rate: expected {target.baud}, the bit rate of the bus, got {rate}; to change it, set it in all "
-            "devices with the actions `bitrate`, `save` and `restart`, and in the interface"
+            "devices with the verbs `bitrate`, `save` and `restart`, and in the interface"
         )

@@ -27,12 +27,12 @@ from imud.contracts.command import (
     INCLINATION_ZERO,
     PITCH_ZERO,
     ROLL_ZERO,
-    Actions,
     Calibration,
     Calibrations,
     Handling,
     Kept,
     Target,
+    Verbs,
 )
 from imud.contracts.driver import DataSheet, StatusBit
 from imud.model.sample import Quaternion
@@ -186,11 +186,11 @@ def levels(section: str, limit_deg: int, begin: Callable[[LevelReset], Script], 
     return {"level": relative, "accelerometer_level": automatic}
 
 
-def inclinometer_zero(section: str, actions: Actions) -> Calibrations:
-    """Return the calibrations of an inclinometer on a bus, from its actions `zero` and `save`."""
+def inclinometer_zero(section: str, verbs: Verbs) -> Calibrations:
+    """Return the calibrations of an inclinometer on a bus, from its verbs `zero` and `save`."""
 
     def zero_here(target: Target) -> object:
-        return actions["zero"].begin(target, zero="here")
+        return verbs["zero"].begin(target, zero="here")
 
     zero = Calibration(
         help="make the present position the zero of the inclinometer",
@@ -200,6 +200,6 @@ def inclinometer_zero(section: str, actions: Actions) -> Calibrations:
         begin=zero_here,
         expected=(INCLINATION_ZERO,),
         kept=Kept.BY_SAVE,
-        save=actions["save"].begin,
+        save=verbs["save"].begin,
     )
     return {"zero": zero}

@@ -1,4 +1,4 @@
-"""Options, setup, action and registry row of the Forsense IMU61x on SPI and I2C. Only the transfers differ.
+"""Options, setup, verb and registry row of the Forsense IMU61x on SPI and I2C. Only the transfers differ.
 
 Users change only the low-pass filters over these buses; the UART changes all other settings.
 """
@@ -12,7 +12,7 @@ from msgspec import Meta
 
 from imud.attitude.conventions import FLU_LEVEL
 from imud.contracts.codec import PolledCodec
-from imud.contracts.command import Action, Target
+from imud.contracts.command import Target, Verb
 from imud.contracts.driver import Identity, KeyProblem, PolledDriver
 from imud.contracts.script import TransferScript
 from imud.contracts.setting import Setting, SettingsTable
@@ -94,7 +94,7 @@ def filter_words(control: int) -> Mapping[str, str]:
     return {"accel_filter": FILTERS[accel], "gyro_filter": FILTERS[gyro]}
 
 
-# --- settings and action ----------------------------------------------------------------------------------------------
+# --- settings and verb ----------------------------------------------------------------------------------------------
 
 AccelFilter = Annotated[FilterChoice, ACCEL_FILTER]
 GyroFilter = Annotated[FilterChoice, GYRO_FILTER]
@@ -151,8 +151,8 @@ def _shown(choice: FilterChoice) -> str:
     return f"{FILTERS[filter_code(choice)]} (code {filter_code(choice)})"
 
 
-def _filter_action(set_up: SetUp[S]) -> Action:
-    """Return the action that sets the filters with the driver's `set_up`."""
+def _filter_verb(set_up: SetUp[S]) -> Verb:
+    """Return the verb that sets the filters with the driver's `set_up`."""
 
     def set_filter(
         target: Target, *, accel_filter: _AccelFilterOrNone = None, gyro_filter: _GyroFilterOrNone = None
@@ -163,7 +163,7 @@ def _filter_action(set_up: SetUp[S]) -> Action:
         wanted = {name: choice for name, choice in given.items() if choice is not None}
         return set_up(msgspec.structs.replace(settings, **wanted))
 
-    return Action(
+    return Verb(
         "set the low-pass filters until the device restarts, by name or by code in the order of the names, null: "
         "unchanged; returns the filters; imud sets the filters in `options` at every start",
         set_filter,
@@ -215,7 +215,7 @@ def register_driver(
         read_ns=read_ns,
         check=check,
         device_settings=device_settings,
-        actions={"filter": _filter_action(set_up)},
+        verbs={"filter": _filter_verb(set_up)},
     )
 
 

@@ -8,7 +8,7 @@ import msgspec
 
 from imud import __version__
 from imud.attitude.conventions import Convention
-from imud.contracts.command import ActionInfo, CalibrationInfo, CalibrationResult, described, infos
+from imud.contracts.command import CalibrationInfo, CalibrationResult, VerbInfo, described, infos
 from imud.contracts.publisher import Batch, DeviceControl
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus
@@ -343,7 +343,7 @@ def _control(hub: Hub, device: str) -> DeviceControl:
 
 
 def _actions(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> MethodReply:
-    return MethodReply(described(_control(hub, params.device).actions))
+    return MethodReply(described(_control(hub, params.device).verbs))
 
 
 def _command(hub: Hub, connection: ClientConnection, params: CommandParams) -> Later:
@@ -430,7 +430,7 @@ METHODS: Final[Mapping[str, Method[Any]]] = {
     "poll": Method(PollParams, _poll, result=PollResult),
     "events": Method(EventsParams, _events, acts=True, result=EventsResult),
     "notify": Method(NotifyParams, _notify, result=NotifyResult),
-    "actions": Method(DeviceParams, _actions, result=list[ActionInfo]),
+    "actions": Method(DeviceParams, _actions, result=list[VerbInfo]),
     "command": Method(CommandParams, _command, Rights.CONTROL, acts=True),
     "calibrations": Method(DeviceParams, _calibrations, result=list[CalibrationInfo]),
     "calibrate": Method(CalibrateParams, _calibrate, Rights.CONTROL, acts=True, result=CalibrationResult),

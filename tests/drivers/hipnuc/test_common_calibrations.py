@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from imud.contracts.command import Action, RestMeans, Target
+from imud.contracts.command import RestMeans, Target, Verb
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.drivers.hipnuc.common import inclinometer_zero
@@ -16,14 +16,14 @@ class Began:
     zero: str = ""
 
 
-ACTIONS = {
-    "zero": Action("zero", lambda _target, *, zero: Began("zero", zero)),
-    "save": Action("save", lambda _target: Began("save")),
+VERBS = {
+    "zero": Verb("zero", lambda _target, *, zero: Began("zero", zero)),
+    "save": Verb("save", lambda _target: Began("save")),
 }
 
 
 def test_it_is_made_of_actions() -> None:
-    zero = inclinometer_zero("5.4.1", ACTIONS)["zero"]
+    zero = inclinometer_zero("5.4.1", VERBS)["zero"]
     target = Target(None, 0)
     assert zero.begin(target) == Began("zero", "here")
     assert zero.save is not None

@@ -208,7 +208,7 @@ def test_a_lost_device_is_commanded_back(protocol: Protocol) -> None:
         sent.append(request.payload)
         return Reply(()) if request.silent else Silence(())
 
-    action = protocol.make().driver.actions[protocol.noun]
+    action = protocol.make().driver.verbs[protocol.noun]
     script = action.script(Target(protocol.options(8), 500_000), action.arguments({protocol.noun: 9}))
     with pytest.raises(NoReply, match=r"replied neither (as node 9 nor as node 8|at address 9 nor at 8)"):
         run_script(script, silent)
@@ -255,7 +255,7 @@ def test_an_invalid_number_is_not_searched(protocol: Protocol, told: int, monkey
         yield  # makes it a generator
 
     monkeypatch.setattr(protocol.session, "read_values", read_values)
-    action = protocol.make().driver.actions["restart"]
+    action = protocol.make().driver.verbs["restart"]
     script = action.script(Target(protocol.options(8), 500_000), action.arguments({}))
     with pytest.raises(NoReply, match=f"no frame of {protocol.noun} 8 after the restart"):
         run_script(script, lambda _request: Silence(()))
@@ -319,7 +319,7 @@ def test_j1939_values_that_do_not_go_together_are_refused() -> None:
     J1939_SETTINGS.check(bench.target(125_000), fast)
     with pytest.raises(BadArgument, match=r"got 105 % of it: FF34 every 5 ms 21 %, .*"):
         J1939_SETTINGS.check(bench.target(125_000), fast | {"ff43_interval_ms": 5})
-    action = bench.driver.actions["interval"]
+    action = bench.driver.verbs["interval"]
 
     def interval(others_bit_s: float) -> object:
         arguments = action.arguments({"pgn": "FF34", "interval_ms": 5})

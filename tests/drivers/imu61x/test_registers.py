@@ -25,7 +25,7 @@ class Wires:
         self.transfers = 0
 
     def act(self, driver: PolledDriver, settings: RegisterOptions, **given: object) -> object:
-        action = driver.actions["filter"]
+        action = driver.verbs["filter"]
         return run_transfer_script(action.script(Target(settings, 0), action.arguments(given)), self.over(driver))
 
     def over(self, driver: PolledDriver) -> Callable[[Transfer], bytes]:
@@ -78,7 +78,7 @@ def test_configured_filters_stay(driver: PolledDriver) -> None:
 def test_filters_that_there_are_not_are_answered_with_the_table(code: object) -> None:
     names = r'one of "0\.2 Hz", "1 Hz", "2 Hz", .*"47 Hz", "average 4", "average 16", .* or a whole number from 0 to 15'
     with pytest.raises(BadArgument, match=f"accel_filter.*{names}"):
-        I2C.actions["filter"].arguments({"accel_filter": code})
+        I2C.verbs["filter"].arguments({"accel_filter": code})
 
 
 def read_table(wires: Wires, driver: PolledDriver, target: Target) -> Mapping[str, object]:

@@ -2,7 +2,7 @@
 
 Manual "IMU配置手冊" V1.5.9, section 5.4; otherwise objects of CiA 301. Settings are lost at power-off unless `save`
 follows. TPDO rate and type, inclinometer signs and zero take effect immediately; node number and bit rate after `save`
-and a restart. All scripts raise NoReply and Aborted. The actions in `driver.py` check the ranges of arguments; other
+and a restart. All scripts raise NoReply and Aborted. The verbs in `driver.py` check the ranges of arguments; other
 rules raise BadArgument here.
 
 The manual names no readable object. imud reads back every written value. If the node does not support the read, the

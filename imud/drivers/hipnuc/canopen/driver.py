@@ -1,4 +1,4 @@
-"""Row `DRIVER` of HiPNUC devices on CANopen: settings and actions."""
+"""Row `DRIVER` of HiPNUC devices on CANopen: settings and verbs."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final, Literal, get_args
 
 from msgspec import Meta
 
-from imud.contracts.command import Action, Actions, Risk, Target
+from imud.contracts.command import Risk, Target, Verb, Verbs
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, DataSheet, random_vector
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import Effect, Setting, SettingsTable, Written
@@ -214,8 +214,8 @@ Reversed = Annotated[bool, Meta(extra={"section": "5.4.1"})]
 _ZEROS: Final = {"here": InclinometerZero.SET, "cancel": InclinometerZero.CANCEL}
 
 
-def _simple(words: str, begin: Callable[[int], RequestScript[None]], risk: Risk = Risk.NONE) -> Action:
-    return Action(words, lambda target: begin(target.settings.node), risk)
+def _simple(words: str, begin: Callable[[int], RequestScript[None]], risk: Risk = Risk.NONE) -> Verb:
+    return Verb(words, lambda target: begin(target.settings.node), risk)
 
 
 def _interval(
@@ -295,39 +295,37 @@ def _nmt(
     return commands.nmt(target.settings.node, made)
 
 
-ACTIONS: Final[Actions] = {
+VERBS: Final[Verbs] = {
     "save": replace(_simple("write all settings to flash", commands.save), saves=True, changes=False),
-    "restart": Action(
+    "restart": Verb(
         "restart the device and wait for its frames, also from a new node number; unsaved settings are lost",
         lambda target: commands.restart(target.settings, target.baud),
     ),
-    "factory_reset": Action(
+    "factory_reset": Verb(
         "restore the factory settings with node 8 and 500 kbit/s, effective after a restart; imud rejects it if "
         "another node on the bus has number 8",
         lambda target: commands.factory_reset_and_find(target.settings),
         Risk.RESET,
     ),
-    "interval": Action(
+    "interval": Verb(
         "set the timer of a TPDO, effective immediately; imud rejects more than the bus can carry", _interval
     ),
-    "transmission": Action("send a TPDO by its timer or at each SYNC, effective immediately", _transmission),
-    "bitrate": Action(
+    "transmission": Verb("send a TPDO by its timer or at each SYNC, effective immediately", _transmission),
+    "bitrate": Verb(
         "set the bit rate, effective after `save` and `restart`: then the node disturbs the bus until the "
         "interface and all other nodes use the same bit rate",
         _bitrate,
         Risk.CONNECTION,
     ),
-    "node": Action(
+    "node": Verb(
         "set the node number, effective after `save` and `restart`, in some devices immediately; imud follows the "
         "device and rejects a number that is in use",
         _node,
         Risk.CONNECTION,
     ),
-    "zero": Action(
-        "make the present position the zero of the inclinometer, or cancel it; effective immediately", _zero
-    ),
-    "direction": Action("reverse the signs of the inclinometer, or restore them; effective immediately", _direction),
-    "nmt": Action("start or stop the TPDOs, or reset the node and follow it", _nmt),
+    "zero": Verb("make the present position the zero of the inclinometer, or cancel it; effective immediately", _zero),
+    "direction": Verb("reverse the signs of the inclinometer, or restore them; effective immediately", _direction),
+    "nmt": Verb("start or stop the TPDOs, or reset the node and follow it", _nmt),
 }
 
 US_PER_S: Final = NS_PER_S // NS_PER_US
@@ -372,8 +370,8 @@ DRIVER: Final = CanDriver(
     euler_convention="312 (Z-X-Y): pitch about X, roll about Y, yaw about Z counter-clockwise from above",
     navigation_frame="ENU",
     data_sheet=DataSheet(document=DOCUMENT, gyro_step_rad_s=GYRO_RAD_S_PER_LSB, accel_step_m_s2=ACCEL_M_S2_PER_LSB),
-    actions=ACTIONS,
-    calibrations=inclinometer_zero("5.4.1", ACTIONS),
+    verbs=VERBS,
+    calibrations=inclinometer_zero("5.4.1", VERBS),
     device_settings=SETTINGS,
     node_of=_node_of,
     node_settings=lambda node: HipnucCanopenOptions(node=node),

@@ -1,4 +1,4 @@
-"""Row `DRIVER` of HiPNUC devices on SAE J1939: settings and actions."""
+"""Row `DRIVER` of HiPNUC devices on SAE J1939: settings and verbs."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final, Literal
 from msgspec import Meta
 
 from imud.attitude.rotation import euler312_from_quat
-from imud.contracts.command import Action, Actions, Risk, Target
+from imud.contracts.command import Risk, Target, Verb, Verbs
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, random_vector
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import Effect, Setting, SettingsTable, Written
@@ -161,8 +161,8 @@ SETTINGS: Final = SettingsTable(
 Pgn = Annotated[PgnName, Meta(description="last four digits of the PGN", extra={"section": "6.1"})]
 
 
-def _simple(words: str, begin: Callable[[J1939Node], RequestScript[None]], risk: Risk = Risk.NONE) -> Action:
-    return Action(words, lambda target: begin(target.settings.peer), risk)
+def _simple(words: str, begin: Callable[[J1939Node], RequestScript[None]], risk: Risk = Risk.NONE) -> Verb:
+    return Verb(words, lambda target: begin(target.settings.peer), risk)
 
 
 def _interval(
@@ -214,34 +214,34 @@ def _direction(
     return commands.set_direction(target.settings.peer, axis, reversed)
 
 
-ACTIONS: Final[Actions] = {
+VERBS: Final[Verbs] = {
     "save": replace(_simple("write all settings to flash", commands.save), saves=True, changes=False),
-    "restart": Action(
+    "restart": Verb(
         "restart the device and wait for its frames, also from a new address; unsaved settings are lost",
         lambda target: commands.restart(target.settings, target.baud),
     ),
-    "factory_reset": Action(
+    "factory_reset": Verb(
         "restore the factory settings with address 8 and its bit rate, effective after a restart at the latest; "
         "imud rejects it if another node on the bus has address 8",
         lambda target: commands.factory_reset_and_find(target.settings),
         Risk.RESET,
     ),
-    "interval": Action("set the interval of a message; imud rejects more than the bus can carry", _interval),
-    "send_once": Action("send a message once immediately and wait for it", _send_once, changes=False),
-    "bitrate": Action(
+    "interval": Verb("set the interval of a message; imud rejects more than the bus can carry", _interval),
+    "send_once": Verb("send a message once immediately and wait for it", _send_once, changes=False),
+    "bitrate": Verb(
         "set the bit rate, effective after `save` and `restart`: then the device disturbs the bus until the "
         "interface and all other devices use the same bit rate",
         _bitrate,
         Risk.CONNECTION,
     ),
-    "address": Action(
+    "address": Verb(
         "set the address, effective after `save` and `restart`, in some devices immediately; imud follows the device "
         "and rejects an address that is in use",
         _address,
         Risk.CONNECTION,
     ),
-    "zero": Action("make the present position zero, or cancel it", _zero),
-    "direction": Action("reverse the sign of an angle", _direction),
+    "zero": Verb("make the present position zero, or cancel it", _zero),
+    "direction": Verb("reverse the sign of an angle", _direction),
 }
 
 
@@ -282,9 +282,9 @@ DRIVER: Final = CanDriver(
     "NaN for an angle that the device does not send",
     navigation_frame="ENU",
     data_sheet=REGISTERS,
-    actions=ACTIONS,
+    verbs=VERBS,
     device_settings=SETTINGS,
-    calibrations=inclinometer_zero("6.2.2", ACTIONS),
+    calibrations=inclinometer_zero("6.2.2", VERBS),
     node_of=_node_of,
     node_settings=lambda address: HipnucJ1939Options(address=address),
     node_title=lambda address: f"address {address}",

@@ -1,4 +1,4 @@
-"""Row `DRIVER` of HiPNUC devices on RS-485: actions, calibrations and settings."""
+"""Row `DRIVER` of HiPNUC devices on RS-485: verbs, calibrations and settings."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final, Literal
 from msgspec import Meta
 
 from imud.attitude.rotation import euler312_from_quat
-from imud.contracts.command import Action, Actions, Calibrations, Risk, Target, Verdict
+from imud.contracts.command import Calibrations, Risk, Target, Verb, Verbs, Verdict
 from imud.contracts.driver import PolledDriver, random_vector
 from imud.contracts.script import TransferScript
 from imud.contracts.setting import Effect, Setting, SettingsTable
@@ -40,8 +40,8 @@ from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_MS
 
 
-def _simple(words: str, begin: Callable[[], TransferScript[None]], risk: Risk = Risk.NONE) -> Action:
-    return Action(words, lambda _target: begin(), risk)
+def _simple(words: str, begin: Callable[[], TransferScript[None]], risk: Risk = Risk.NONE) -> Verb:
+    return Verb(words, lambda _target: begin(), risk)
 
 
 def _address(
@@ -103,30 +103,30 @@ def _read(
     return commands.read(found)
 
 
-ACTIONS: Final[Actions] = {
+VERBS: Final[Verbs] = {
     "save": replace(_simple("write all settings to flash", commands.save), saves=True, changes=False),
-    "restart": Action("restart the device and wait until it replies; unsaved settings are lost", _restart),
-    "factory_reset": Action(
+    "restart": Verb("restart the device and wait until it replies; unsaved settings are lost", _restart),
+    "factory_reset": Verb(
         "restore the factory settings and restart: imud follows the device to address 80 if no other device uses it "
         "and the bus has the factory baud rate 115200",
         _factory_reset,
         Risk.RESET,
     ),
-    "address": Action(
+    "address": Verb(
         "set the address without saving and follow the device; imud rejects an address that is in use",
         _address,
         Risk.CONNECTION,
     ),
-    "baud": Action(
+    "baud": Verb(
         "set the baud rate, effective after `save` and `restart`: then imud receives nothing from the device until the "
         "bus and all other devices use the same baud rate",
         _baud,
         Risk.CONNECTION,
     ),
-    "attitude_mode": Action("set 6-axis mode, or 9-axis mode with the magnetometer", _attitude_mode),
-    "level": Action("make the present attitude level, or cancel it; the device must be at rest", _level),
-    "mounting": Action("set the mounting of the device", _mounting),
-    "read": Action("read a register as words of 16 bits", _read, changes=False),
+    "attitude_mode": Verb("set 6-axis mode, or 9-axis mode with the magnetometer", _attitude_mode),
+    "level": Verb("make the present attitude level, or cancel it; the device must be at rest", _level),
+    "mounting": Verb("set the mounting of the device", _mounting),
+    "read": Verb("read a register as words of 16 bits", _read, changes=False),
 }
 
 DONE_PERCENT: Final = 100
@@ -135,7 +135,7 @@ DONE_PERCENT: Final = 100
 def _nine_axes_needed(_target: Target) -> TransferScript[str]:
     (mode,) = yield from commands.read(BY_NAME["HEADING_MODE"])
     if mode == AttitudeMode.SIX_AXIS.value:
-        return f"{NINE_AXES_NEEDED}: action attitude_mode, axes=9"
+        return f"{NINE_AXES_NEEDED}: verb attitude_mode, axes=9"
     return ""
 
 
@@ -181,7 +181,7 @@ def _check(target: Target, values: Mapping[str, Any]) -> None:
     if baud is not None and target.baud and baud != target.baud:
         raise BadArgument(
             f"baud: expected {target.baud}, the baud rate of the bus, got {baud}; to change it, set it in all "
-            "devices with the actions `baud`, `save` and `restart`, then in `rs485.baud`"
+            "devices with the verbs `baud`, `save` and `restart`, then in `rs485.baud`"
         )
 
 
@@ -261,7 +261,7 @@ DRIVER: Final = PolledDriver(
     update_ns=update_ns,
     example_reading=_example_reading,
     status_bits=MAIN_STATUS,
-    actions=ACTIONS,
+    verbs=VERBS,
     device_settings=SETTINGS,
     calibrations=CALIBRATIONS,
 )

@@ -5,7 +5,7 @@ r"""ASCII commands of HiPNUC devices (replies: `replies.py`). Manual "IMU配置�
                                →   (nothing)     unknown command: the device does not reply
     LOG VERSION\r\n            →   PNAME=HI14R3\r\n … OK\r\n
 
-Most functions return a `Request`. Types define the arguments; the actions in `driver.py` define ranges; other rules
+Most functions return a `Request`. Types define the arguments; the verbs in `driver.py` define ranges; other rules
 raise BadArgument here. Settings are lost at power-off unless `save_config` follows; `mounting` takes effect after
 `save_config` and `reboot`.
 """

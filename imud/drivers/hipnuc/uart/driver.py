@@ -1,4 +1,4 @@
-"""Row `DRIVER` of HiPNUC devices on a UART: actions and calibrations."""
+"""Row `DRIVER` of HiPNUC devices on a UART: verbs and calibrations."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -11,14 +11,14 @@ from imud.attitude.rotation import euler312_from_quat
 from imud.contracts.codec import StreamCodec
 from imud.contracts.command import (
     YAW_ZERO,
-    Action,
-    Actions,
     Calibration,
     Calibrations,
     Handling,
     Kept,
     Risk,
     Target,
+    Verb,
+    Verbs,
     Verdict,
 )
 from imud.contracts.driver import Identity, StreamDriver, random_vector
@@ -85,8 +85,8 @@ Enabled = Annotated[bool, Meta(extra={"section": "2.2.4"})]
 _MOUNTINGS: Final = {mounting.name.lower(): mounting for mounting in Mounting}
 
 
-def _simple(words: str, make: Callable[[], Request], risk: Risk = Risk.NONE) -> Action:
-    return Action(words, lambda _target: send(make()), risk)
+def _simple(words: str, make: Callable[[], Request], risk: Risk = Risk.NONE) -> Verb:
+    return Verb(words, lambda _target: send(make()), risk)
 
 
 def _restart(target: Target) -> RequestScript[Identity]:
@@ -204,44 +204,44 @@ def _sout_divider(
     return send(commands.sout_divider(divisor))
 
 
-ACTIONS: Final[Actions] = {
+VERBS: Final[Verbs] = {
     "save": replace(_simple("write all settings to flash", commands.save_config), saves=True, changes=False),
-    "restart": Action("restart the device and wait until it replies; unsaved settings are lost", _restart),
-    "factory_reset": Action(
+    "restart": Verb("restart the device and wait until it replies; unsaved settings are lost", _restart),
+    "factory_reset": Verb(
         "restore the factory settings with 115200 baud, restart the device and follow it",
         _factory_reset,
         Risk.RESET,
     ),
-    "wake": Action(
+    "wake": Verb(
         "enable frames, and send HI91 if no message has a rate, also in place of output on mark; not saved", _wake
     ),
-    "baud": Action(
+    "baud": Verb(
         "set the baud rate, save all settings, restart the device and follow it", _baud, Risk.CONNECTION, saves=True
     ),
-    "output": Action("set the output rate of a message; 0: off", _output),
-    "output_on_mark": Action("send a message for each pulse on SIN", _output_on_mark),
-    "output_once": Action("send a message once, as after a pulse on SIN", _output_once, changes=False),
+    "output": Verb("set the output rate of a message; 0: off", _output),
+    "output_on_mark": Verb("send a message for each pulse on SIN", _output_on_mark),
+    "output_once": Verb("send a message once, as after a pulse on SIN", _output_once, changes=False),
     "output_none": _simple("set the output rate of all messages to 0", commands.unlog_all),
-    "output_enabled": Action("enable or disable the frames of all rates", _output_enabled),
-    "mode": Action("set 6-axis mode, or 9-axis mode with the magnetometer", _mode),
-    "level": Action(
+    "output_enabled": Verb("enable or disable the frames of all rates", _output_enabled),
+    "mode": Verb("set 6-axis mode, or 9-axis mode with the magnetometer", _mode),
+    "level": Verb(
         "make the present pitch and roll zero, or level a nearly level device, or cancel; only at rest", _level
     ),
-    "yaw": Action("set the heading; lost at power-off", _yaw),
-    "mounting": Action("set the mounting of the device; requires save and restart", _mounting),
-    "magnetic_calibration": Action(
+    "yaw": Verb("set the heading; lost at power-off", _yaw),
+    "mounting": Verb("set the mounting of the device; requires save and restart", _mounting),
+    "magnetic_calibration": Verb(
         "enable or disable the background calibration of the magnetometer", _magnetic_calibration
     ),
-    "pin": Action("set the function of a pin", _pin),
-    "alarm": Action("watch an angle with the alarm pin", _alarm),
-    "sout_divider": Action("set the divisor of SOUT pulses for SOUT_DIV", _sout_divider),
+    "pin": Verb("set the function of a pin", _pin),
+    "alarm": Verb("watch an angle with the alarm pin", _alarm),
+    "sout_divider": Verb("set the divisor of SOUT pulses for SOUT_DIV", _sout_divider),
 }
 
 
 def _nine_axes_needed(_target: Target) -> RequestScript[str]:
     settings = yield from read_settings()
     if settings.get("ATT_MODE") == "0":
-        return f"{NINE_AXES_NEEDED}: action mode, axes=9"
+        return f"{NINE_AXES_NEEDED}: verb mode, axes=9"
     return ""
 
 
@@ -341,7 +341,7 @@ DRIVER: Final = StreamDriver(
     line_differences=line_differences,
     declared_line_differences=declared_line_differences,
     limits=message_limits,
-    actions=ACTIONS,
+    verbs=VERBS,
     device_settings=SETTINGS,
     calibrations=CALIBRATIONS,
     identify=identify,

@@ -264,7 +264,7 @@ def _described(value_type: Any, description: str, section: str, unit: str = "") 
 
 
 # Settings of a device, in writing order. Level (CONFIG ATT RST) and heading (CONFIG YAW) depend on the present
-# attitude, so they are actions.
+# attitude, so they are verbs.
 SETTINGS: Final = SettingsTable(
     table={
         "mode": Setting(
@@ -398,7 +398,7 @@ def _shared_pins(pins: Mapping[str, int], lines: DeviceLines) -> Iterator[tuple[
         if others:
             yield (
                 key,
-                f"the device has {function} and {' and '.join(others)} on IO{pins[function]}: move one (action pin)",
+                f"the device has {function} and {' and '.join(others)} on IO{pins[function]}: move one (verb pin)",
             )
 
 
@@ -429,10 +429,10 @@ def _marks(output: Mapping[str, Any] | None, baud: int | None, lines: DeviceLine
     if lines.pps is not None and marked:
         yield (
             "pps",
-            f"{' and '.join(marked)} on mark: each pulse per second makes a sample; set a rate with the action output",
+            f"{' and '.join(marked)} on mark: each pulse per second makes a sample; set a rate with the verb output",
         )
 
 
 def _alarm_differences(alarm: Mapping[str, Any] | None, lines: DeviceLines) -> Iterator[tuple[str, str]]:
     if alarm is not None and lines.alarm is not None and not any(one.enabled for one in alarm.values()):
-        yield "alarm", "the device watches no angle, so the line stays low: set a range with the action alarm"
+        yield "alarm", "the device watches no angle, so the line stays low: set a range with the verb alarm"

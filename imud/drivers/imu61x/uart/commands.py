@@ -2,7 +2,7 @@
 
     55 AA | command u16 | 24 u16 | param1 f32 | 0 f32 | param3 u32 | 0 u32 | 0 i32 | 0 i32 | CRC-32
 
-The annotations of the actions and settings check all values, because the device uses a default in place of an
+The annotations of the verbs and settings check all values, because the device uses a default in place of an
 unsupported value without an error. Settings are lost at power-off unless `save` follows. The manual does not state
 whether the device accepts commands other than `output_mode` while it streams; `in_command_mode` handles both cases.
 

@@ -1,4 +1,4 @@
-"""Row `DRIVER` of the Forsense IMU61x on a UART: actions and calibrations."""
+"""Row `DRIVER` of the Forsense IMU61x on a UART: verbs and calibrations."""
 
 from collections.abc import Callable, Mapping
 from random import Random
@@ -10,14 +10,14 @@ from imud.attitude.conventions import FLU_LEVEL
 from imud.contracts.command import (
     GYRO_ZERO,
     YAW_ZERO,
-    Action,
-    Actions,
     Calibration,
     Calibrations,
     Handling,
     Kept,
     Risk,
     Target,
+    Verb,
+    Verbs,
 )
 from imud.contracts.driver import StreamDriver, random_vector
 from imud.contracts.script import RequestScript, pause
@@ -164,7 +164,7 @@ def _until_changed(before: Vector3) -> RequestScript[None]:
 Heading = Annotated[
     float, Meta(ge=0, le=360, description="the new heading", extra={"unit": "°", "section": "1.6, table 12, CMD 4"})
 ]
-Answer = Mapping[str, Any]  # result of an action, by name
+Answer = Mapping[str, Any]  # result of a verb, by name
 
 _BUS_NOTE: Final = (
     "effective immediately or after the next start (not documented); a host on the previously selected bus "
@@ -195,7 +195,7 @@ def _rate(target: Target, *, rate_hz: OutputRate) -> RequestScript[None]:
         try:
             require_fit(rate_hz, target.baud)
         except BadArgument as error:
-            raise BadArgument(f"rate_hz: {error}; first change the baud rate with the action `baud`") from None
+            raise BadArgument(f"rate_hz: {error}; first change the baud rate with the verb `baud`") from None
     return settings.write_parameter(Parameter.AHRS_RATE, rate_hz)
 
 
@@ -233,74 +233,72 @@ def _installation(target: Target) -> RequestScript[Vector3]:
     return calibrate_installation(done=_done(target), rest=codes_of(target).calibration_done)
 
 
-ACTIONS: Final[Actions] = {
-    "status": Action(
+VERBS: Final[Verbs] = {
+    "status": Verb(
         "read versions, model and state; names that end in _raw have no documented unit",
         lambda _target: settings.device_status(),
         changes=False,
     ),
-    "settings": Action(
+    "settings": Verb(
         "read all settings from the device, with units in their names",
         lambda _target: settings.read_settings(),
         changes=False,
     ),
-    "sample_once": Action(
+    "sample_once": Verb(
         "read and publish one sample, also in command mode", lambda _target: settings.sample_once(), changes=False
     ),
-    "start_streaming": Action(
+    "start_streaming": Verb(
         "start sending samples and wait for the first sample",
         lambda target: settings.start_streaming(done=_done(target)),
     ),
-    "stop_streaming": Action(
+    "stop_streaming": Verb(
         "enter command mode: send only replies until `start_streaming`; no program receives samples",
         _stop,
     ),
-    "save": Action(
+    "save": Verb(
         "write all parameters to flash", lambda target: settings.save(done=_done(target)), saves=True, changes=False
     ),
-    "restart": Action(
+    "restart": Verb(
         "restart the device, wait until it replies and check that its timer restarted; unsaved settings are lost",
         lambda target: settings.restart(done=_done(target)),
     ),
-    "factory_reset": Action(
+    "factory_reset": Verb(
         "restore, check and save the factory settings and follow the device to 115200 baud; then change a fixed "
         "`uart.baud`",
         _factory_reset,
         Risk.RESET,
         saves=True,
     ),
-    "baud": Action(
+    "baud": Verb(
         "set and save the baud rate and follow the device; then change a fixed `uart.baud` in the configuration",
         _baud,
         Risk.CONNECTION,
         saves=True,
     ),
-    "rate": Action("set the output rate; the baud rate limits it", _rate),
-    "filter": Action("set the low-pass filters, by name or by code in the order of the names", _filter),
-    "i2c_address": Action(
+    "rate": Verb("set the output rate; the baud rate limits it", _rate),
+    "filter": Verb("set the low-pass filters, by name or by code in the order of the names", _filter),
+    "i2c_address": Verb(
         "set the I2C address; a host that uses the old address loses the device until you change its `i2c.address`",
         _i2c_address,
     ),
-    "bus": Action(
+    "bus": Verb(
         "select the bus in addition to the UART; a host on the other bus loses the device and needs another link and "
         "driver",
         _bus,
     ),
-    "heading": Action("set the heading", _heading),
-    "calibrate_gyro": Action(
-        "measure the bias of the gyroscope at rest and wait for the end; returns it in °/s", _gyro
-    ),
-    "calibrate_installation": Action(
+    "heading": Verb("set the heading", _heading),
+    "calibrate_gyro": Verb("measure the bias of the gyroscope at rest and wait for the end; returns it in °/s", _gyro),
+    "calibrate_installation": Verb(
         "measure the mounting error and wait for the end; returns the angles in °", _installation
     ),
-    "installation_status": Action(
+    "installation_status": Verb(
         "read the state of the installation calibration, as sent",
         lambda _target: installation_status(),
         changes=False,
     ),
 }
 
-_SAVE: Final = ACTIONS["save"].begin
+_SAVE: Final = VERBS["save"].begin
 
 CALIBRATIONS: Final[Calibrations] = {
     "gyro": Calibration(
@@ -308,7 +306,7 @@ CALIBRATIONS: Final[Calibrations] = {
         section="1.6, CMD 10",
         handling=Handling.REST,
         instructions=("Put the device down, away from vibration, and do not touch it.",),
-        begin=ACTIONS["calibrate_gyro"].begin,
+        begin=VERBS["calibrate_gyro"].begin,
         expected=(GYRO_ZERO,),
         kept=Kept.BY_SAVE,
         save=_SAVE,
@@ -319,7 +317,7 @@ CALIBRATIONS: Final[Calibrations] = {
         section="1.6, CMD 7 and 8",
         handling=Handling.REST,
         instructions=("Mount the device, level the body with the device, and let it rest.",),
-        begin=ACTIONS["calibrate_installation"].begin,
+        begin=VERBS["calibrate_installation"].begin,
         kept=Kept.BY_SAVE,
         save=_SAVE,
     ),
@@ -328,7 +326,7 @@ CALIBRATIONS: Final[Calibrations] = {
         section="1.6, CMD 4",
         handling=Handling.REST,
         instructions=("Point the device in the direction of heading zero, and do not touch it.",),
-        begin=ACTIONS["heading"].begin,
+        begin=VERBS["heading"].begin,
         expected=(YAW_ZERO,),
         kept=Kept.NEVER,
     ),
@@ -359,7 +357,7 @@ DRIVER: Final = StreamDriver(
     axes=FLU_LEVEL,
     heading=relative_heading,
     lines=frozenset({"reset"}),
-    actions=ACTIONS,
+    verbs=VERBS,
     calibrations=CALIBRATIONS,
     device_settings=SETTINGS,
     identify=identify,

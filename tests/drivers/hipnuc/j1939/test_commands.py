@@ -180,7 +180,7 @@ def test_which_frames_answer_a_request() -> None:
 )
 def test_arguments_are_checked_before_anything_is_sent(name: str, arguments: dict[str, object]) -> None:
     with pytest.raises(BadArgument, match=f"arguments: {next(iter(arguments))} "):
-        DRIVER.actions[name].arguments(arguments)
+        DRIVER.verbs[name].arguments(arguments)
 
 
 @pytest.mark.parametrize(
@@ -245,4 +245,4 @@ def test_identity(variant: str) -> None:
     claims = {"J1939 NAME": "80000000002A1708"} if J1939_VARIANTS[variant].claims_address else {}
     assert identity.details == {"address": "8", **claims}
     assert HOST_ADDRESS == 0x55
-    assert {name for name, _, _ in ROWS} == set(DRIVER.actions)
+    assert {name for name, _, _ in ROWS} == set(DRIVER.verbs)

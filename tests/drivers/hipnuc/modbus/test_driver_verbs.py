@@ -1,4 +1,4 @@
-"""Actions of a device on RS-485, with the simulated device."""
+"""Verbs of a device on RS-485, with the simulated device."""
 
 import pytest
 
@@ -11,7 +11,7 @@ from tests.support.pty_port import modbus_slave as module
 
 
 def act(bench: ModbusBench, name: str, **given: object) -> object:
-    action = DRIVER.actions[name]
+    action = DRIVER.verbs[name]
     result: object = bench.run(action.script(bench.target, action.arguments(given)))
     return result
 
@@ -42,7 +42,7 @@ def test_requests_as_sent(name: str, given: dict[str, object], sent: str) -> Non
 
 
 def test_actions_without_an_address_and_reading_by_name() -> None:
-    action = DRIVER.actions["address"]
+    action = DRIVER.verbs["address"]
     with pytest.raises(BadArgument, match="expected a device on an RS-485 bus with a known address"):
         action.script(Target(HipnucModbusOptions(), 0), action.arguments({"address": 9}))
     bench = ModbusBench(module(7))
@@ -51,8 +51,8 @@ def test_actions_without_an_address_and_reading_by_name() -> None:
     for name in ("CTRL", "nothing"):
         with pytest.raises(BadArgument, match="HEADING_MODE"):
             act(bench, "read", register=name)
-    assert all(action.help for action in DRIVER.actions.values())
-    assert [str(one) for one in parameters_of(DRIVER.actions["attitude_mode"])] != []
+    assert all(action.help for action in DRIVER.verbs.values())
+    assert [str(one) for one in parameters_of(DRIVER.verbs["attitude_mode"])] != []
 
 
 @pytest.mark.parametrize(

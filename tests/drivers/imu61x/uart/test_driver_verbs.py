@@ -1,4 +1,4 @@
-"""Actions of an IMU61x on a UART, with the simulated device."""
+"""Verbs of an IMU61x on a UART, with the simulated device."""
 
 from math import nan
 from typing import Any
@@ -7,7 +7,7 @@ import pytest
 
 from imud.contracts.command import Target
 from imud.drivers.imu61x.uart.commands import Imu61xUartOptions
-from imud.drivers.imu61x.uart.driver import ACTIONS
+from imud.drivers.imu61x.uart.driver import VERBS
 from imud.drivers.imu61x.uart.settings import BaudChange
 from imud.model.errors import BadArgument, CommandError
 from imud.sim.imu61x.uart import REFUSING, VARIANTS, Imu61xSettings
@@ -15,7 +15,7 @@ from tests.support.simulated_modules import Imu61xBench, done, imu61x_bench, var
 
 
 def act(far: Imu61xBench, name: str, options: Imu61xUartOptions | None = None, **arguments: Any) -> Any:
-    action = ACTIONS[name]
+    action = VERBS[name]
     return far.run(action.script(Target(options, far.baud), action.arguments(arguments)))
 
 
@@ -30,11 +30,11 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
 CODED = [name for name, one in VARIANTS.items() if one.result_done]
 """Variants with another result than 0 for done."""
 WITHOUT_K1 = ("save", "heading", "calibrate_gyro", "calibrate_installation", "installation_status")
-"""Actions with no evidence but an acknowledgement; also CMD 8 without another reply."""
+"""Verbs with no evidence but an acknowledgement; also CMD 8 without another reply."""
 
 
 @pytest.mark.parametrize("variant", ["executes commands while it streams", "no K1", *CODED])
-@pytest.mark.parametrize("name", ACTIONS)
+@pytest.mark.parametrize("name", VERBS)
 def test_every_action(variant: str, name: str) -> None:
     """Other tests run the scripts in every variant; here an action must pass its arguments to the script."""
     far = variant_bench(variant, uptime_us=20_000_000)
@@ -129,7 +129,7 @@ def test_a_rate_that_the_line_does_not_carry_is_refused_before_anything_is_sent(
     with pytest.raises(BadArgument, match="lower the output rate first"):
         act(far, "baud", baud=115200)
     assert len(far.samples(100)) >= 35
-    assert "by code in the order of the names" in ACTIONS["filter"].help
+    assert "by code in the order of the names" in VERBS["filter"].help
     for name, words in (
         ("stop_streaming", "no program receives samples"),
         ("baud", "`uart.baud`"),
@@ -137,17 +137,17 @@ def test_a_rate_that_the_line_does_not_carry_is_refused_before_anything_is_sent(
         ("i2c_address", "`i2c.address`"),
         ("bus", "loses the device"),
     ):
-        assert words in ACTIONS[name].help
+        assert words in VERBS[name].help
 
 
 @pytest.mark.parametrize("name", ["baud", "factory_reset"])
 def test_a_fixed_rate_in_the_configuration_is_to_be_changed(name: str) -> None:
     far = imu61x_bench(Imu61xSettings(baud=921600))
-    action = ACTIONS[name]
+    action = VERBS[name]
     arguments = action.arguments({"baud": 115200} if name == "baud" else {})
     answer = far.run(action.script(Target(None, 921600, fixed_baud=921600), arguments))
     assert answer.configuration == "change `uart.baud` from 921600 to 115200 or auto: imud uses it at its next start"
-    back = ACTIONS["baud"]
+    back = VERBS["baud"]
     assert far.run(back.script(Target(None, 115200, 921600), back.arguments({"baud": 921600}))).configuration == ""
 
 

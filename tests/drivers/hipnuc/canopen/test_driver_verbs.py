@@ -1,4 +1,4 @@
-"""Actions of a CANopen device: frames on the bus, and their effect on the simulated device."""
+"""Verbs of a CANopen device: frames on the bus, and their effect on the simulated device."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from tests.support.simulated_modules import QUIET, CanopenBench
 
 def begun(name: str, at: int = 8, /, **given: object) -> RequestScript[Any]:
     """Return the script of an action for the node in the options."""
-    action = DRIVER.actions[name]
+    action = DRIVER.verbs[name]
     conversation: RequestScript[Any] = action.script(
         Target(HipnucCanopenOptions(node=at), 500_000), action.arguments(given)
     )
@@ -73,7 +73,7 @@ def test_network_management(command: str, code: int) -> None:
     bench = CanopenBench(NodeSettings(node=5))
     bench.run_script(begun("nmt", 5, command=command))
     assert (0, bytes([code, 5])) in bench.sent
-    assert {name for name, _, _ in ROWS} | {"nmt"} == set(DRIVER.actions)
+    assert {name for name, _, _ in ROWS} | {"nmt"} == set(DRIVER.verbs)
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_an_interval_above_the_bus_load_is_rejected_with_numbers() -> None:
     bench = CanopenBench(NodeSettings(node=8))
 
     def interval(bit_rate: int, others_bit_s: float) -> object:
-        action = DRIVER.actions["interval"]
+        action = DRIVER.verbs["interval"]
         target = bench.target(bit_rate, others_bit_s)
         return bench.run_script(action.script(target, action.arguments({"tpdo": 1, "interval_ms": 5})))
 

@@ -1,4 +1,4 @@
-"""Actions of a HiPNUC device: bytes on the wire, and their effect on the simulated device."""
+"""Verbs of a HiPNUC device: bytes on the wire, and their effect on the simulated device."""
 
 import math
 from typing import Any
@@ -7,7 +7,7 @@ import pytest
 
 from imud.contracts.command import Target
 from imud.contracts.script import Outcome, Rejection, Reply, Request, Silence
-from imud.drivers.hipnuc.uart.driver import ACTIONS
+from imud.drivers.hipnuc.uart.driver import VERBS
 from imud.model.errors import BadArgument, NoReply, Rejected
 from tests.support.simulated_modules import run_script
 
@@ -17,7 +17,7 @@ VERSION = Reply(("PNAME=HI14R3", "OK"))
 
 def sent(name: str, answers: list[Outcome] | None = None, **arguments: Any) -> tuple[list[Request], object]:
     """Return the requests of an action, with one reply each, and its result."""
-    action = ACTIONS[name]
+    action = VERBS[name]
     left = list(answers or [OK])
     requests: list[Request] = []
 
@@ -76,7 +76,7 @@ def test_one_command(name: str, arguments: dict[str, Any], command: str) -> None
 
 
 def test_the_actions_that_write_to_flash_say_so() -> None:
-    assert [name for name, action in ACTIONS.items() if action.saves] == ["save", "baud"]
+    assert [name for name, action in VERBS.items() if action.saves] == ["save", "baud"]
 
 
 RATES = r"rate_hz \(one of 0, 1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 100, 125, 200, 250, 500, 1000\)"
