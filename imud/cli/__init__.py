@@ -67,7 +67,7 @@ COMMANDS = {
     "watch": Subcommand("imud.cli.watch:WATCH", "print samples"),
     "events": Subcommand("imud.cli.events:EVENTS", "print events"),
     "clock": Subcommand("imud.cli.clock:CLOCK", "print the source, error and limiting cause of the time stamps"),
-    "command": Subcommand("imud.cli.devices:COMMAND", "list the actions of a device, or run one action"),
+    "command": Subcommand("imud.cli.devices:COMMAND", "list the commands of a device, or run one command"),
     "settings": Subcommand("imud.cli.settings:SETTINGS", "print, change, save, back up or restore device settings"),
     "calibrate": Subcommand("imud.cli.calibrate:CALIBRATE", "guide a calibration of a device"),
     "schema": Subcommand("imud.cli.schema:SCHEMA", "list the fields of a sample with units and coordinate frames"),

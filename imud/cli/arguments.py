@@ -3,7 +3,7 @@
 import argparse
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import hypot, isfinite, nan, sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -14,7 +14,7 @@ from imud.client.connection import Client, default_path
 from imud.contracts.status import Deviations, DeviceStatus
 from imud.host.files import read_regular
 from imud.model.errors import BadArgument, ImudError, reason_of
-from imud.model.options import Options, unknown_name, value_problem, wrong_values
+from imud.model.options import Options, shown, unknown_name, value_problem, wrong_values
 from imud.model.sample import SAMPLE_FIELDS
 
 # Maximum size of a noise report, bytes. A report contains every point of its curves and has a few MB.
@@ -179,6 +179,16 @@ def argument(text: str) -> tuple[str, object]:
         return name, value
 
 
+def named_values(words: Iterable[str]) -> dict[str, object]:
+    """Return the values of the arguments NAME=VALUE by name. Raises BadArgument if a name occurs twice."""
+    values: dict[str, object] = {}
+    for name, value in map(argument, words):
+        if name in values:
+            raise BadArgument(f"{name}: expected one value, got {shown(values[name])} and {shown(value)}")
+        values[name] = value
+    return values
+
+
 def add_option(parser: argparse.ArgumentParser) -> None:
     """Add `--option NAME=VALUE`."""
     parser.add_argument(
@@ -192,7 +202,7 @@ def add_option(parser: argparse.ArgumentParser) -> None:
 
 def given_options(driver: "Driver", words: Sequence[str]) -> dict[str, object]:
     """Return the values of `--option` by name. Raises BadArgument if the driver does not accept a name or a value."""
-    options = dict(map(argument, words))
+    options = named_values(words)
     fields = {field.name: field for field in msgspec.structs.fields(driver.settings)}
     for name, value in options.items():
         if name not in fields:

@@ -1,17 +1,17 @@
-"""`imud devices`: list the devices of the running daemon. `imud command`: list or run the actions of a device."""
+"""`imud devices`: list the devices of the running daemon. `imud command`: list or run the commands of a device."""
 
 import argparse
 from typing import Final
 
 import msgspec
 
-from imud.cli.arguments import CliCommand, add_socket, argument, confirmed, connect, statuses
+from imud.cli.arguments import CliCommand, add_socket, confirmed, connect, named_values, statuses
 from imud.cli.output import table
 from imud.client.connection import Client
 from imud.contracts.command import VerbInfo
 
 HEAD: Final = ("DEVICE", "STATE", "RATE HZ", "DRIVER", "PRODUCT", "SERIAL NUMBER", "LINK")
-LIMIT_S: Final = 180.0  # Time limit of an action, s. The longest action, a calibration, ends within two minutes.
+LIMIT_S: Final = 180.0  # Time limit of a command, s. The longest command, a calibration, ends within two minutes.
 
 
 def devices_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,23 +41,23 @@ def devices(args: argparse.Namespace) -> int:
 def command_arguments(parser: argparse.ArgumentParser) -> None:
     add_socket(parser)
     parser.add_argument("device", metavar="DEVICE", help="name of the device")
-    parser.add_argument("name", nargs="?", metavar="ACTION", help="action to run (default: list all actions)")
+    parser.add_argument("name", nargs="?", metavar="COMMAND", help="command to run (default: list all commands)")
     parser.add_argument(
-        "arguments", nargs="*", default=[], metavar="NAME=VALUE", help="parameter of the action, as in the list"
+        "arguments", nargs="*", default=[], metavar="NAME=VALUE", help="argument of the command, as in the list"
     )
-    parser.add_argument("--yes", action="store_true", help="do not ask before an action that cannot be undone")
+    parser.add_argument("--yes", action="store_true", help="do not ask before a command that cannot be undone")
 
 
 def command(args: argparse.Namespace) -> int:
-    """Print the list of actions, or run an action and print its reply. An action requires the right to control."""
+    """Print the list of verbs, or run a verb and print its reply. A verb requires the right to control."""
     with Client(args.socket, timeout_s=LIMIT_S) as client:
         known = msgspec.convert(client.call("actions", device=args.device), list[VerbInfo])
         if args.name is None:
-            for action in known:
-                print("\n".join([f"{action.name:24} {action.help}", *(f"{'':24}   {p}" for p in action.parameters)]))
+            for verb in known:
+                print("\n".join([f"{verb.name:24} {verb.help}", *(f"{'':24}   {p}" for p in verb.parameters)]))
             return 0
-        arguments = dict(map(argument, args.arguments))
-        risk = next((action.risk for action in known if action.name == args.name), "")
+        arguments = named_values(args.arguments)
+        risk = next((verb.risk for verb in known if verb.name == args.name), "")
         if risk and not confirmed(f"{args.name} on {args.device}", risk, yes=args.yes):
             return 1
         answer = client.call("command", device=args.device, name=args.name, arguments=arguments)

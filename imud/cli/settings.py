@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import msgspec
 
-from imud.cli.arguments import CliCommand, add_socket, argument, confirmed
+from imud.cli.arguments import CliCommand, add_socket, confirmed, named_values
 from imud.cli.output import table, times
 from imud.client.connection import Client
 from imud.config.yaml import FILE_BYTES_MAX, no_pause, read_yaml, yaml_block, yaml_comment
@@ -32,7 +32,13 @@ def settings_arguments(parser: argparse.ArgumentParser) -> None:
     operation.add_argument(
         "--apply", action="store_true", help="set the settings that differ from the declared settings"
     )
-    operation.add_argument("--set", nargs="+", metavar="NAME=VALUE", help="set these settings")
+    operation.add_argument(
+        "--set",
+        nargs="+",
+        action="extend",
+        metavar="NAME=VALUE",
+        help="set these settings; NAME.PART=VALUE sets one part, for example output.hi91=200",
+    )
     operation.add_argument(
         "--yaml", action="store_true", help="print the device settings as YAML for the configuration"
     )
@@ -54,7 +60,7 @@ def settings(args: argparse.Namespace) -> int:
         if args.restore is not None:
             return _restore(client, args)
         if args.apply or args.set or (args.save and not args.yaml and args.backup is None):
-            return _change(client, args, None if args.apply else dict(map(argument, args.set or ())))
+            return _change(client, args, None if args.apply else named_values(args.set or ()))
         report = _report(client, args.device, needed=args.yaml or args.backup is not None)
     if args.yaml:
         print(_yaml(report))

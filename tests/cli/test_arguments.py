@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from imud.cli.arguments import argument, check_port, chosen_fields, confirmed, duration_s
+from imud.cli.arguments import argument, check_port, chosen_fields, confirmed, duration_s, named_values
 from imud.model.errors import BadArgument
 from tests.cli.conftest import Cli
 from tests.cli.test_decode import MANUAL_FRAME
@@ -48,6 +48,9 @@ def test_values_are_json_or_text() -> None:
     for text in ("axes", "=9"):
         with pytest.raises(BadArgument, match="expected NAME=VALUE"):
             argument(text)
+    assert named_values(["a=1", "b=1"]) == {"a": 1, "b": 1}
+    with pytest.raises(BadArgument, match='a: expected one value, got 1 and "x"'):
+        named_values(["a=1", "b=1", "a=x"])
 
 
 @pytest.mark.parametrize(("typed", "agreed"), [("y", True), (" YES ", True), ("n", False), ("", False)])

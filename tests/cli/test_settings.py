@@ -78,6 +78,8 @@ def test_from_difference_to_agreement_and_back(
 def test_values_in_place_of_the_declared_ones(daemon: RunningDaemon, words: tuple[object, ...], cli: Cli) -> None:
     cli(*words, "--set", "sout_divisor=4", 'output={"hi91": 20}')
     assert (actual(daemon)["sout_divisor"], actual(daemon)["output"]["hi91"]) == (4, 20)
+    cli(*words, "--set", "sout_divisor=5", "magnetic_calibration=false", "--set", "mode=6-axis")
+    assert [actual(daemon)[name] for name in ("sout_divisor", "magnetic_calibration", "mode")] == [5, False, "6-axis"]
     out = cli(*words, "--set", "mounting=x_up", status=1).out
     assert "not set: mounting needs a save and a restart" in out
 
