@@ -38,6 +38,7 @@ from imud.device.settings_plan import (
     Values,
     advice,
     as_json,
+    completed,
     described_settings,
     differences,
     make_plan,
@@ -265,7 +266,9 @@ class SettingsKeeper:
         table = self._table()
         wanted = self._wanted_values(table, given)
         async with self.exclusive():
-            plan = self._make_plan(table, wanted, await self._read(table), save=save, unsaved=self._unsaved)
+            actual = await self._read(table)
+            wanted = completed(table, wanted, actual)
+            plan = self._make_plan(table, wanted, actual, save=save, unsaved=self._unsaved)
             self._planned_resets = self._counter_resets
             return plan
 
@@ -279,7 +282,7 @@ class SettingsKeeper:
         planned = self._planned_values()
         async with self.exclusive():
             actual = planned if planned is not None else await self._read(table)
-            return await self._apply(table, wanted, actual, save=save, asked=True)
+            return await self._apply(table, completed(table, wanted, actual), actual, save=save, asked=True)
 
     def _planned_values(self) -> Values | None:
         """Return the values of a plan that are still valid; None if there are none."""

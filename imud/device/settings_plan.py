@@ -4,9 +4,9 @@ imud writes settings in the order of the driver's table. The settings that chang
 are last. Without a save, imud leaves out the settings that need a restart, because the restart loses unsaved values.
 """
 
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Annotated, Any, Final, get_args, get_origin
 
 import msgspec
 
@@ -27,7 +27,7 @@ from imud.contracts.setting import (
 )
 from imud.device.flash import ModuleFlash
 from imud.model.errors import BadArgument, CommandError, DeviceRefused, LinkError, TransferError
-from imud.model.options import expected, shown, unknown_name
+from imud.model.options import expected, shown, unknown_name, value_problem
 
 Values = Mapping[str, Any]  # values of settings by name, in the types of the table
 
@@ -74,14 +74,88 @@ def as_json(value: Any) -> Any:
 def wanted_values(table: SettingsTable, given: Mapping[str, Any]) -> dict[str, Any]:
     """Convert values of JSON or YAML to the types of the table, in its order.
 
-    Raises BadArgument if a setting is unknown or read-only, or if a value is invalid.
+    A name with dots selects a part of a setting, for example `output.hi91`. Then the value is a `Parts` object, which
+    `completed` converts. Raises BadArgument if a setting is unknown or read-only, or if a value is invalid.
     """
     settable = [name for name, setting in table.table.items() if setting.write is not None]
-    for name in given:
+    parts: dict[str, dict[Path, Any]] = {}
+    for given_name, value in given.items():
+        name, *path = given_name.split(".")
         if name not in settable:
             only_read = f"{name}: it is read-only" if name in table.table else ""
             raise BadArgument(only_read or unknown_name("a setting", name, settable))
-    return {name: _converted(name, given[name], table.table[name].type) for name in settable if name in given}
+        if path and (problem := value_problem(value, _part_type(name, table.table[name].type, path))):
+            raise BadArgument(f"{given_name}: {problem}")
+        _refuse_overlap(name, parts.setdefault(name, {}), tuple(path))
+        parts[name][tuple(path)] = value
+    return {
+        name: _converted(name, parts[name][()], table.table[name].type) if () in parts[name] else Parts(parts[name])
+        for name in settable
+        if name in parts
+    }
+
+
+Path = tuple[str, ...]  # names of the parts that select a value in a setting, from the outside to the inside
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """Values of some parts of a setting, by path, for example `{("x", "min_deg"): -10}` for `alarm`."""
+
+    values: Mapping[Path, Any]
+
+
+def completed(table: SettingsTable, wanted: Values, actual: Values) -> dict[str, Any]:
+    """Replace `Parts` by values of the table's type. The other parts of the same entry keep their actual values.
+
+    Raises BadArgument if an entry lacks a part that the device does not report.
+    """
+    return {
+        name: _joined(name, value, actual.get(name), table.table[name].type) if isinstance(value, Parts) else value
+        for name, value in wanted.items()
+    }
+
+
+def _joined(name: str, parts: Parts, actual: Any, value_type: Any) -> Any:
+    present = as_json(actual) if isinstance(actual, Mapping) else {}
+    tree: dict[str, Any] = {}
+    for (first, *path), value in parts.values.items():
+        if not path:
+            tree[first] = value
+            continue
+        node = tree.setdefault(first, dict(present.get(first) or {}))
+        for key in path[:-1]:
+            node = node.setdefault(key, {})
+        node[path[-1]] = value
+    if problem := value_problem(tree, value_type):
+        raise BadArgument(f"{name}: {problem}; the device does not report the missing parts: set them too")
+    return msgspec.convert(tree, value_type)
+
+
+def _part_type(name: str, value_type: Any, path: Sequence[str]) -> Any:
+    """Return the type of a part of a setting. Raises BadArgument if the setting has no such part."""
+    for key in path:
+        if get_origin(value_type) is Annotated:
+            value_type = get_args(value_type)[0]
+        if get_origin(value_type) is dict:
+            keys, item = get_args(value_type)
+            types = dict.fromkeys(get_args(keys), item)
+        elif isinstance(value_type, type) and issubclass(value_type, msgspec.Struct):
+            types = {field.encode_name: field.type for field in msgspec.structs.fields(value_type)}
+        else:
+            raise BadArgument(f"{name}: expected a setting without parts, got {shown('.'.join((name, key)))}")
+        if key not in types:
+            raise BadArgument(unknown_name(f"a part of {name}", key, list(types)))
+        name, value_type = f"{name}.{key}", types[key]
+    return value_type
+
+
+def _refuse_overlap(name: str, others: Iterable[Path], path: Path) -> None:
+    """Raise BadArgument if a value is given for a part and also for its whole."""
+    for other in others:
+        if other[: len(path)] == path or path[: len(other)] == other:
+            both = " and ".join(".".join((name, *one)) for one in (other, path))
+            raise BadArgument(f"{name}: expected one value for each part, got {both}")
 
 
 def described_settings(table: SettingsTable, declared: Values, actual: Values | None) -> tuple[SettingInfo, ...]:

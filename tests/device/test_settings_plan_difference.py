@@ -2,10 +2,13 @@
 
 from typing import Any
 
+import msgspec
 import pytest
 
 from imud.contracts.setting import SettingDifference
-from imud.device.settings_plan import described_settings, differences, unverified, wanted_values, words
+from imud.device.settings_plan import completed, described_settings, differences, unverified, wanted_values, words
+from imud.drivers import DRIVERS
+from imud.drivers.hipnuc.uart.settings import AngleAlarm
 from imud.model.errors import BadArgument
 from tests.support.fake_drivers import FACTORY, FAKE_SETTINGS
 
@@ -71,3 +74,47 @@ def test_every_setting_is_described() -> None:
     assert (hours.actual, hours.declarable) == (7, False)
     assert (offset.unit, offset.section, offset.description) == ("°", "2.3", "added to the heading")
     assert all(one.actual is None for one in described_settings(FAKE_SETTINGS, {}, None))
+
+
+HIPNUC = DRIVERS["hipnuc-uart"].device_settings
+ALARM = {"x": {"min_deg": -20, "max_deg": 20, "enabled": True}}
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"output.hi91": 200, "output.hi92": 0}, {"output": {"hi91": 200, "hi92": 0}}),
+        ({"alarm.x.min_deg": -10}, {"alarm": {"x": {"min_deg": -10, "max_deg": 20, "enabled": True}}}),
+        ({"alarm.y.min_deg": -1, "alarm.y.max_deg": 1}, {"alarm": {"y": {**ALARM["x"], "min_deg": -1, "max_deg": 1}}}),
+        ({"alarm.x": ALARM["x"], "alarm.y": ALARM["x"]}, {"alarm": {"x": ALARM["x"], "y": ALARM["x"]}}),
+    ],
+)  # fmt: skip
+def test_a_dot_selects_a_part_of_a_setting(given: dict[str, Any], expected: dict[str, Any]) -> None:
+    assert HIPNUC is not None
+    actual = {"output": {"hi91": 100, "hi92": 50}, "alarm": msgspec.convert(ALARM, dict[str, AngleAlarm])}
+    made = completed(HIPNUC, wanted_values(HIPNUC, given), actual)
+    assert msgspec.to_builtins(made) == expected
+    assert made == wanted_values(HIPNUC, expected)  # the types of the table
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"output.hi93": 1}, 'expected a part of output that imud knows, got "hi93"; did you mean hi92?'),
+        ({"output.hi91.rate": 1}, 'output.hi91: expected a setting without parts, got "output.hi91.rate"'),
+        ({"output.hi91": 3}, "output.hi91: expected one of 0, 1, 2, 4"),
+        ({"mode.axes": 9}, 'mode: expected a setting without parts, got "mode.axes"'),
+        ({"mod.axes": 9}, 'expected a setting that imud knows, got "mod"'),
+        ({"alarm.x.low": 9}, 'expected a part of alarm.x that imud knows, got "low"'),
+        ({"alarm.x.min_deg": 181}, "alarm.x.min_deg: expected a number from -180 to 180, got 181"),
+        ({"alarm.y.min_deg": 1}, "the device does not report the missing parts"),
+        ({"output": {"hi91": 1}, "output.hi92": 1}, "expected one value for each part, got output and output.hi92"),
+        ({"alarm.x.min_deg": 1, "alarm.x": ALARM["x"]}, "got alarm.x.min_deg and alarm.x"),
+        ({"output.": 1}, 'expected a part of output that imud knows, got ""'),
+    ],
+)  # fmt: skip
+def test_an_error_names_the_wrong_part(given: dict[str, Any], message: str) -> None:
+    assert HIPNUC is not None
+    with pytest.raises(BadArgument) as caught:
+        completed(HIPNUC, wanted_values(HIPNUC, given), {"alarm": msgspec.convert(ALARM, dict[str, AngleAlarm])})
+    assert message in str(caught.value)
