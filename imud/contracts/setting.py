@@ -71,6 +71,10 @@ class Setting:
     # requested, counts one write to flash, and runs no `save` after it.
     saves: bool = False
     readable: bool = True  # Whether the device reports the value. Otherwise the result is `written, not verified`.
+    # Whether it is the bit rate of a bus that other devices use too. A declared value must be the present rate of the
+    # bus. A user can set another rate by name: imud saves it and does not restart the device.
+    bus_rate: bool = False
+    note: str = ""  # next step of the user after a change, one sentence; part of the plan and of the reply
     # `agrees(declared, actual)` compares two values: equality, or a comparison with tolerances or optional parts
     agrees: Callable[[Any, Any], bool] = eq
 
@@ -201,6 +205,7 @@ class SettingsPlan(msgspec.Struct, frozen=True):
     # Reason for each setting that differs and that imud will not write, by name
     left_out: dict[str, str] = {}  # msgspec copies a mutable default
     risk: Risk = Risk.NONE
+    advice: str = ""  # next step of the user after the plan; empty if no step is necessary
 
     @property
     def empty(self) -> bool:
@@ -238,6 +243,6 @@ class AppliedSettings(msgspec.Struct, frozen=True):
     left_out: dict[str, str] = {}  # msgspec copies a mutable default
     # Remaining differences from the wanted values
     differences: dict[str, SettingDifference] = {}  # msgspec copies a mutable default
-    # Necessary change of the configuration, so that imud finds the device at its next start; empty if no change is
-    # necessary
+    # Next step of the user, for example a change of the configuration, so that imud finds the device at its next start;
+    # empty if no step is necessary
     advice: str = ""

@@ -268,7 +268,7 @@ class SettingsKeeper:
         async with self.exclusive():
             actual = await self._read(table)
             wanted = completed(table, wanted, actual)
-            plan = self._make_plan(table, wanted, actual, save=save, unsaved=self._unsaved)
+            plan = self._make_plan(table, wanted, actual, save=save, unsaved=self._unsaved, by_name=given is not None)
             self._planned_resets = self._counter_resets
             return plan
 
@@ -282,7 +282,8 @@ class SettingsKeeper:
         planned = self._planned_values()
         async with self.exclusive():
             actual = planned if planned is not None else await self._read(table)
-            return await self._apply(table, completed(table, wanted, actual), actual, save=save, asked=True)
+            wanted = completed(table, wanted, actual)
+            return await self._apply(table, wanted, actual, save=save, asked=True, by_name=given is not None)
 
     def _planned_values(self) -> Values | None:
         """Return the values of a plan that are still valid; None if there are none."""
@@ -379,9 +380,9 @@ class SettingsKeeper:
         return actual
 
     async def _apply(
-        self, table: SettingsTable, wanted: Values, actual: Values, *, save: bool, asked: bool
+        self, table: SettingsTable, wanted: Values, actual: Values, *, save: bool, asked: bool, by_name: bool = False
     ) -> AppliedSettings:
-        plan = self._make_plan(table, wanted, actual, save=save, unsaved=self._unsaved)
+        plan = self._make_plan(table, wanted, actual, save=save, unsaved=self._unsaved, by_name=by_name)
         flash = ModuleFlash(self._writes, self._module, asked=asked)
         applying = Applying(table, self._transport.run_script, flash, wanted, actual)
         try:
@@ -400,13 +401,14 @@ class SettingsKeeper:
         self._report_differences(self._differences(table), quiet=True)
         if applying.changed:
             await self._transport.read_back(identity=done.restarted)
-        return msgspec.structs.replace(done, advice=advice(self._config, done))
+        return msgspec.structs.replace(done, advice=advice(self._config, plan, done))
 
     def _make_plan(
-        self, table: SettingsTable, wanted: Values, actual: Values, *, save: bool, unsaved: bool
+        self, table: SettingsTable, wanted: Values, actual: Values, *, save: bool, unsaved: bool, by_name: bool = False
     ) -> SettingsPlan:
         assert self._target is not None
-        return make_plan(table, self._target, wanted, actual, self._all_written(table), save=save, unsaved=unsaved)
+        written = self._all_written(table)
+        return make_plan(table, self._target, wanted, actual, written, save=save, unsaved=unsaved, by_name=by_name)
 
     def _all_written(self, table: SettingsTable) -> dict[str, Any]:
         """Return the written values of settings that the device does not report: saved, or since its restart."""

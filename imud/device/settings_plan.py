@@ -5,7 +5,7 @@ are last. Without a save, imud leaves out the settings that need a restart, beca
 """
 
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Final, get_args, get_origin
 
 import msgspec
@@ -209,17 +209,27 @@ def make_plan(
     *,
     save: bool,
     unsaved: bool,
+    by_name: bool = False,
 ) -> SettingsPlan:
     """Return the plan that changes the settings of a device from `actual` to `wanted`.
 
     `unreadable` contains written values of settings that the device does not report. `unsaved` means that flash does
-    not contain the last write. Raises BadArgument if the values contradict each other.
+    not contain the last write. `by_name` means that a user has named the settings, not the configuration. Raises
+    BadArgument if the values contradict each other.
     """
+    if by_name:  # write again: a command or another program may have changed a value that imud cannot read
+        unreadable = {}
     differing = [name for name in table.table if name in wanted and not has(table, name, wanted, actual, unreadable)]
     left_out = {name: why for name in differing if (why := _why_left_out(table, table.table[name], save))}
     written = [name for name in differing if name not in left_out]
+    values = merged(actual, {name: wanted[name] for name in written})
+    rate = next((name for name, setting in table.table.items() if setting.bus_rate and name in values), "")
+    is_moved = by_name and rate in written  # the user moves the whole bus to another rate
     if written:
-        table.check(target, merged(actual, {name: wanted[name] for name in written}))
+        _require_agreement(table, replace(target, baud=values[rate]) if is_moved else target, actual, values)
+    # at another rate than the bus, a device is lost after its restart and disturbs the bus
+    is_other_rate = bool(rate) and values[rate] != target.baud and (is_moved or target.baud != 0)
+    notes = [name for name in written if table.table[name].note and (name != rate or is_other_rate)]
     names = list(table.table)
     written.sort(key=lambda name: (table.table[name].connection, table.table[name].saves, names.index(name)))
     steps = tuple(_step(name, table.table[name], wanted, actual) for name in written)
@@ -227,10 +237,29 @@ def make_plan(
     return SettingsPlan(
         steps,
         save=save and table.save is not None and (bool(steps) or unsaved) and not by_itself,
-        restart=any(step.effect is Effect.AFTER_RESTART for step in steps) and not by_itself and bool(table.restart),
+        restart=any(step.effect is Effect.AFTER_RESTART for step in steps)
+        and not (by_itself or is_other_rate)
+        and table.restart is not None,
         left_out=left_out,
         risk=Risk.CONNECTION if any(step.connection for step in steps) else Risk.NONE,
+        advice="; ".join(f"{name}: {table.table[name].note}" for name in notes),
     )
+
+
+def _require_agreement(table: SettingsTable, target: Target, actual: Values, values: Values) -> None:
+    """Raise BadArgument if the new values contradict each other.
+
+    A contradiction that the device already has is no reason to reject a change of another setting.
+    """
+    try:
+        table.check(target, values)
+    except BadArgument as error:
+        try:
+            table.check(target, actual)
+        except BadArgument as before:
+            if str(before) == str(error):
+                return
+        raise
 
 
 def merged(actual: Values, wanted: Values) -> dict[str, Any]:
@@ -294,12 +323,17 @@ class Applying:
             done.append(await self._do(step) if not self.problem else _applied(step, StepOutcome.NOT_DONE))
         if not self.problem and plan.save:
             await self._save()
-        if not self.problem and (plan.restart or (self.pending and self.saved and self.table.restart is not None)):
+        if not self.problem and self._restarts(plan):
             done = await self._restart(done)
         found = differences(self.table, self.wanted, self.actual, self.written)
         return AppliedSettings(
             tuple(done), self.saved, self.restarted, self.problem + self._present(), plan.left_out, found
         )
+
+    def _restarts(self, plan: SettingsPlan) -> bool:
+        # a plan with such a setting and without a restart keeps the device at the present rate of its bus
+        is_planned = any(step.effect is Effect.AFTER_RESTART for step in plan.steps)
+        return plan.restart or (bool(self.pending) and self.saved and self.table.restart is not None and not is_planned)
 
     async def _do(self, step: PlannedStep) -> AppliedStep:
         setting, value = self.table.table[step.name], self.wanted[step.name]
@@ -398,9 +432,9 @@ class Applying:
         return "" if self.saved else "; the previous writes last until the device restarts"
 
 
-def advice(config: DeviceConfig, done: AppliedSettings) -> str:
-    """Return the necessary change of the configuration if the device has a new address or baud rate; empty if none."""
-    found = []
+def advice(config: DeviceConfig, plan: SettingsPlan, done: AppliedSettings) -> str:
+    """Return the next step of the user, for example a change of the configuration; empty if none."""
+    found: list[str] = []
     for step in done.steps:
         if step.outcome not in (StepOutcome.DONE, StepOutcome.WRITTEN):
             continue
@@ -408,7 +442,8 @@ def advice(config: DeviceConfig, done: AppliedSettings) -> str:
             place = getattr(part, step.name, None)
             if place not in (None, "auto", step.value) and type(place) is type(step.value) and step.name in PLACES:
                 found.append(f"change `{key}.{step.name}: {place}` in the configuration to {step.value}")
-    return "; ".join(found) + (": imud uses this value at its next start" if found else "")
+    changes = "; ".join(found) + (": imud uses this value at its next start" if found else "")
+    return "; ".join(text for text in (changes, "" if done.problem else plan.advice) if text)
 
 
 def _applied(step: PlannedStep, outcome: StepOutcome, message: str = "") -> AppliedStep:

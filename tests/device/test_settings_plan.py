@@ -8,6 +8,7 @@ import pytest
 from imud.contracts.command import Risk, Target
 from imud.contracts.setting import PlannedStep, SettingsPlan
 from imud.device.settings_plan import CANNOT_SAVE, NEEDS_SAVE, SAVES_ITSELF, make_plan, merged
+from imud.drivers import DRIVERS
 from imud.model.errors import BadArgument
 from tests.support.fake_drivers import FACTORY, FAKE_SETTINGS
 
@@ -77,3 +78,53 @@ def test_values_of_several_keys_are_merged() -> None:
     assert merged({"output": {"a": 1, "b": 2}, "mode": "6"}, {"output": {"b": 3}, "mode": "9"}) == {
         "output": {"a": 1, "b": 3}, "mode": "9",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("driver", "name", "present", "other"),
+    [
+        ("hipnuc-modbus", "baud", 115200, 921600),
+        ("hipnuc-canopen", "bit_rate", 500_000, 250_000),
+        ("hipnuc-j1939", "bit_rate", 500_000, 250_000),
+    ],
+)
+def test_a_user_moves_a_bus_to_another_rate_in_two_steps(driver: str, name: str, present: int, other: int) -> None:
+    """imud saves the rate in each device. The device keeps the rate of the bus until its restart."""
+    row = DRIVERS[driver]
+    table, target, actual = row.device_settings, Target(row.settings(), present), {name: present}
+    assert table is not None
+    plan = make_plan(table, target, {name: other}, actual, {}, save=True, unsaved=False, by_name=True)
+    assert (names(plan), plan.save, plan.restart, plan.risk) == ([name], True, False, Risk.CONNECTION)
+    assert f"{name}: the device uses the new rate after its restart" in plan.advice
+    with pytest.raises(BadArgument, match=f"{name}: expected {present}.*, got {other}"):
+        make_plan(table, target, {name: other}, actual, {}, save=True, unsaved=False)  # declared
+    actual = {name: other}  # saved, before the restart
+    plan = make_plan(table, target, {name: present}, actual, {}, save=True, unsaved=False, by_name=True)
+    assert (names(plan), plan.save, plan.restart, plan.advice) == ([name], True, True, "")
+    restarting = (
+        {"mounting": "x_up"} if driver == "hipnuc-modbus" else {"node" if "canopen" in driver else "address": 9}
+    )
+    plan = make_plan(table, target, restarting, actual, {}, save=True, unsaved=False, by_name=True)
+    assert (names(plan), plan.save, plan.restart) == (list(restarting), True, False)
+
+
+def test_a_present_contradiction_does_not_prevent_another_change() -> None:
+    table = DRIVERS["hipnuc-uart"].device_settings
+    assert table is not None
+    actual = {"mode": "6-axis", "pins": {"sin": 1, "sout": 2, "led": 1}}
+
+    def plan(**wanted: Any) -> SettingsPlan:
+        return make_plan(table, TARGET, wanted, actual, {}, save=False, unsaved=False, by_name=True)
+
+    assert names(plan(mode="9-axis")) == ["mode"]
+    assert names(plan(pins={"led": 5})) == ["pins"]
+    for pins, problem in ({"sout": 1}, "sout, got IO1; sin"), ({"alarm": 2}, "alarm, got IO2; sout"):
+        with pytest.raises(BadArgument, match=f"pins: expected an unused pin for {problem} uses it"):
+            plan(pins=pins)
+
+
+def test_a_user_writes_an_unreadable_value_again() -> None:
+    plan = make_plan(
+        FAKE_SETTINGS, TARGET, {"secret": 5}, ACTUAL, {"secret": 5}, save=False, unsaved=False, by_name=True
+    )
+    assert names(plan) == ["secret"]

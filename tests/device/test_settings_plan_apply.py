@@ -120,3 +120,15 @@ def test_errors_of_device_and_link_are_part_of_the_result(error: Exception) -> N
     found = applied(device)
     assert found.problem == f"x: {error}; no other setting was written"
     assert device.done == ["x=2", "read"]
+
+
+def test_a_device_with_another_rate_than_its_bus_is_not_restarted() -> None:
+    device = TableOfOne(Written.PENDING, effect=Effect.AFTER_RESTART, connection=True, bus_rate=True)
+
+    async def run(make: Callable[[Target], Any]) -> Any:
+        return make(TARGET)
+
+    plan = make_plan(device.table, TARGET, {"x": 2}, device.active, {}, save=True, unsaved=False, by_name=True)
+    done = asyncio.run(Applying(device.table, run, CountedFlash(), {"x": 2}, device.active).carry_out(plan))
+    assert (done.saved, done.restarted, done.problem) == (True, False, "")
+    assert [one for one in device.done if one != "read"] == ["x=2", "save"]

@@ -18,6 +18,10 @@ from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_MS, NS_PER_S
 
 MS_PER_S: Final = NS_PER_S // NS_PER_MS
+RATE_NOTE: Final = (
+    "the device uses the new rate after its restart; set and save it in all devices of the bus, restart them with "
+    "`imud command NAME restart`, then change the interface"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,5 +70,5 @@ def refuse_other_rate(target: Target, values: Mapping[str, Any]) -> None:
     if rate is not None and target.baud and rate != target.baud:
         raise BadArgument(
             f"bit_rate: expected {target.baud}, the bit rate of the bus, got {rate}; to change it, set it in all "
-            "devices with the verbs `bitrate`, `save` and `restart`, and in the interface"
+            "devices with `imud settings NAME --set bit_rate=… --save`, restart them, then change the interface"
         )

@@ -145,7 +145,9 @@ TURNING: Final = (
     "Turn it slowly, in one place, for one to two minutes: at least one full turn about each axis, also upside down.",
 )
 LEVELLING: Final = ("Put the device down in the attitude that must be level, and do not touch it.",)
-NINE_AXES_NEEDED: Final = "expected 9-axis mode, which uses the magnetometer; set this mode first"
+NINE_AXES_NEEDED: Final = (
+    "expected 9-axis mode, which uses the magnetometer; set it first: `imud settings NAME --set mode=9-axis`"
+)
 
 
 def magnetometer(begin: Script, verdict: Script, unready: Script) -> Calibration:

@@ -11,7 +11,7 @@ from imud.contracts.command import Risk, Target, Verb, Verbs
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, DataSheet, random_vector
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import Effect, Setting, SettingsTable, Written
-from imud.drivers.hipnuc.bus_load import MS_PER_S, CyclicMessage, refuse_other_rate, refuse_overload
+from imud.drivers.hipnuc.bus_load import MS_PER_S, RATE_NOTE, CyclicMessage, refuse_other_rate, refuse_overload
 from imud.drivers.hipnuc.canopen import commands
 from imud.drivers.hipnuc.canopen.cia301 import (
     EMERGENCY,
@@ -182,13 +182,15 @@ SETTINGS: Final = SettingsTable(
             type=Annotated[
                 BitRate,
                 Meta(
-                    description="bit rate of the bus; use it to undo a changed bit rate before the restart",
+                    description="bit rate of the bus; another rate takes effect after `imud command NAME restart`",
                     extra={"unit": "bit/s", "section": "5.4.1"},
                 ),
             ],
             write=lambda target, rate: commands.set_bit_rate(target.settings.node, rate),
             effect=Effect.AFTER_RESTART,
             connection=True,
+            bus_rate=True,
+            note=RATE_NOTE,
         ),
         "node": Setting(
             type=Annotated[

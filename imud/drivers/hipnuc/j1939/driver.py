@@ -12,7 +12,7 @@ from imud.contracts.command import Risk, Target, Verb, Verbs
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, random_vector
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import Effect, Setting, SettingsTable, Written
-from imud.drivers.hipnuc.bus_load import CyclicMessage, refuse_other_rate, refuse_overload
+from imud.drivers.hipnuc.bus_load import RATE_NOTE, CyclicMessage, refuse_other_rate, refuse_overload
 from imud.drivers.hipnuc.common import REGISTERS, inclinometer_zero, random_quaternion
 from imud.drivers.hipnuc.j1939 import codec, commands
 from imud.drivers.hipnuc.j1939.codec import (
@@ -129,13 +129,15 @@ SETTINGS: Final = SettingsTable(
             type=Annotated[
                 BitRate,
                 Meta(
-                    description="bit rate of the bus; use it to undo a changed bit rate before the restart",
+                    description="bit rate of the bus; another rate takes effect after `imud command NAME restart`",
                     extra={"unit": "bit/s", "section": "6.2.2"},
                 ),
             ],
             write=lambda target, rate: commands.set_bitrate(target.settings.peer, rate),
             effect=Effect.AFTER_RESTART,
             connection=True,
+            bus_rate=True,
+            note=RATE_NOTE,
         ),
         "address": Setting(
             type=Annotated[

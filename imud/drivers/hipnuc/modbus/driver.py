@@ -135,7 +135,7 @@ DONE_PERCENT: Final = 100
 def _nine_axes_needed(_target: Target) -> TransferScript[str]:
     (mode,) = yield from commands.read(BY_NAME["HEADING_MODE"])
     if mode == AttitudeMode.SIX_AXIS.value:
-        return f"{NINE_AXES_NEEDED}: verb attitude_mode, axes=9"
+        return NINE_AXES_NEEDED
     return ""
 
 
@@ -181,7 +181,7 @@ def _check(target: Target, values: Mapping[str, Any]) -> None:
     if baud is not None and target.baud and baud != target.baud:
         raise BadArgument(
             f"baud: expected {target.baud}, the baud rate of the bus, got {baud}; to change it, set it in all "
-            "devices with the verbs `baud`, `save` and `restart`, then in `rs485.baud`"
+            "devices with `imud settings NAME --set baud=… --save`, restart them, then change `rs485.baud`"
         )
 
 
@@ -204,13 +204,16 @@ SETTINGS: Final = SettingsTable(
             type=Annotated[
                 BaudRate,
                 Meta(
-                    description="baud rate of the bus; use it to undo a changed baud rate before the restart",
+                    description="baud rate of the bus; another rate takes effect after `imud command NAME restart`",
                     extra={"unit": "bit/s", "section": "4.3.2"},
                 ),
             ],
             write=lambda _target, baud: commands.set_baud(baud),
             effect=Effect.AFTER_RESTART,
             connection=True,
+            bus_rate=True,
+            note="the device uses the new rate after its restart; set and save it in all devices of the bus, restart "
+            "them with `imud command NAME restart`, then change `rs485.baud` in the configuration",
         ),
         "address": Setting(
             type=Annotated[

@@ -241,7 +241,7 @@ VERBS: Final[Verbs] = {
 def _nine_axes_needed(_target: Target) -> RequestScript[str]:
     settings = yield from read_settings()
     if settings.get("ATT_MODE") == "0":
-        return f"{NINE_AXES_NEEDED}: verb mode, axes=9"
+        return NINE_AXES_NEEDED
     return ""
 
 

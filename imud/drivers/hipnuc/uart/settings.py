@@ -172,6 +172,8 @@ def _read(_target: Target) -> RequestScript[dict[str, Any]]:
 
 def _output(_target: Target, value: Output) -> RequestScript[None]:
     """Set each named message. `check` compares the load with the baud rate, which imud sets later."""
+    if value.keys() == set(get_args(MessageName)) and not any(value.values()):
+        yield from send(commands.unlog_all())  # also messages that imud does not decode
     for name, rate in value.items():
         message = OutputMessage(name.upper())
         yield from send(commands.log_ontime(message, 0 if rate == ON_MARK else rate))
@@ -243,20 +245,28 @@ def _same_mounting(declared: MountingName | list[float], actual: MountingName | 
 
 def _check(target: Target, values: Mapping[str, Any]) -> None:
     """Raise BadArgument for too much output, two functions on one pin, and an empty range of an alarm."""
+    if problems := list(_contradictions(target, values)):
+        raise BadArgument("; ".join(problems))
+
+
+def _contradictions(target: Target, values: Mapping[str, Any]) -> Iterator[str]:
     baud = values.get("baud", target.baud)
     output = values.get("output", {})
     if baud in BAUD_RATES:
         rates = {OutputMessage(name.upper()): float(rate) for name, rate in output.items() if rate != ON_MARK}
-        commands.require_room(rates, baud)
+        try:
+            commands.require_room(rates, baud)
+        except BadArgument as error:
+            yield str(error)
     taken: dict[int, str] = {}
     for function, pin in values.get("pins", {}).items():
         if pin in taken:
-            raise BadArgument(f"pins: expected an unused pin for {function}, got IO{pin}; {taken[pin]} uses it")
+            yield f"pins: expected an unused pin for {function}, got IO{pin}; {taken[pin]} uses it"
         taken[pin] = function
     for axis, one in msgspec.to_builtins(values.get("alarm", {})).items():
         if not one["min_deg"] < one["max_deg"]:
             low, high = one["min_deg"], one["max_deg"]
-            raise BadArgument(f"alarm.{axis}: expected the minimum below the maximum, got {low:g}° and {high:g}°")
+            yield f"alarm.{axis}: expected the minimum below the maximum, got {low:g}° and {high:g}°"
 
 
 def _described(value_type: Any, description: str, section: str, unit: str = "") -> Any:
@@ -398,7 +408,7 @@ def _shared_pins(pins: Mapping[str, int], lines: DeviceLines) -> Iterator[tuple[
         if others:
             yield (
                 key,
-                f"the device has {function} and {' and '.join(others)} on IO{pins[function]}: move one (verb pin)",
+                f"the device has {function} and {' and '.join(others)} on IO{pins[function]}: move one (setting pins)",
             )
 
 
@@ -417,7 +427,7 @@ def _marks(output: Mapping[str, Any] | None, baud: int | None, lines: DeviceLine
         if not marked:
             yield (
                 "sin",
-                "no message of the device is on mark, so triggers make no samples: try output_on_mark",
+                "no message of the device is on mark, so triggers make no samples: try output.hi91=on_mark",
             )
         for message in marked:
             most_hz = MAX_RATE_HZ[message].get(baud or 0)
@@ -429,10 +439,10 @@ def _marks(output: Mapping[str, Any] | None, baud: int | None, lines: DeviceLine
     if lines.pps is not None and marked:
         yield (
             "pps",
-            f"{' and '.join(marked)} on mark: each pulse per second makes a sample; set a rate with the verb output",
+            f"{' and '.join(marked)} on mark: each pulse per second makes a sample; set a rate with the setting output",
         )
 
 
 def _alarm_differences(alarm: Mapping[str, Any] | None, lines: DeviceLines) -> Iterator[tuple[str, str]]:
     if alarm is not None and lines.alarm is not None and not any(one.enabled for one in alarm.values()):
-        yield "alarm", "the device watches no angle, so the line stays low: set a range with the verb alarm"
+        yield "alarm", "the device watches no angle, so the line stays low: set a range with the setting alarm"

@@ -645,11 +645,15 @@ SETTINGS: Final = SettingsTable(
         "second_bus": Setting(
             type=SecondBus,
             write=lambda _target, bus: write_parameter(Parameter.BUS_MODE, BusMode[bus.upper()]),
+            note="effective immediately or after the next start (not documented); a host on the previous bus "
+            "loses the device: change driver and link in its configuration",
         ),
         "i2c_address": Setting(
             type=Address,
             write=lambda _target, address: write_parameter(Parameter.I2C_ADDRESS, i2c_address(address)),
             agrees=same_address,
+            note="effective immediately or after the next start (not documented); a host that uses the old address "
+            "loses the device: change `i2c.address` in its configuration to the new address or `auto`",
         ),
         "gyro_offset_deg_s": Setting(type=GyroOffset),
         "installation_angles_deg": Setting(type=InstallationAngles),

@@ -51,7 +51,7 @@ def test_verdict_by_progress(percent: int, verdict: Verdict) -> None:
     assert found == verdict
 
 
-@pytest.mark.parametrize(("mode", "words"), [(0, "action attitude_mode, axes=9"), (1, "")])
+@pytest.mark.parametrize(("mode", "words"), [(0, "`imud settings NAME --set mode=9-axis`"), (1, "")])
 def test_nine_axes_are_needed(mode: int, words: str) -> None:
     calibration = CALIBRATIONS["magnetometer"]
     assert calibration.unready is not None
