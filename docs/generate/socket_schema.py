@@ -80,7 +80,7 @@ def _reply(result: Schema) -> Schema:
 
 def _error() -> Schema:
     codes = {"type": "integer", "examples": [int(code) for code in Code]}
-    error = {"type": "object", "properties": {"code": codes, "message": {"type": "string"}}}
+    error = {"type": "object", "properties": {"code": codes, "message": {"type": "string"}, "data": {"type": "object"}}}
     error["required"] = ["code", "message"]
     properties = {"jsonrpc": {"const": "2.0"}, "id": ID, "error": error}
     return {"type": "object", "properties": properties, "required": ["jsonrpc", "id", "error"]}

@@ -14,7 +14,7 @@ from imud.client.connection import Client, default_path
 from imud.contracts.status import Deviations, DeviceStatus
 from imud.host.files import read_regular
 from imud.model.errors import BadArgument, ImudError, reason_of
-from imud.model.options import Options, shown, unknown_name, value_problem, wrong_values
+from imud.model.options import Options, json_or_text, shown, unknown_name, value_problem, wrong_values
 from imud.model.sample import SAMPLE_FIELDS
 
 # Maximum size of a noise report, bytes. A report contains every point of its curves and has a few MB.
@@ -172,11 +172,7 @@ def argument(text: str) -> tuple[str, object]:
     name, sign, value = text.partition("=")
     if not name or not sign:
         raise BadArgument(f"expected NAME=VALUE, got {text!r}")
-    try:
-        # numbers, true, false, null, lists, objects and quoted strings
-        return name, msgspec.json.decode(value)
-    except msgspec.DecodeError:
-        return name, value
+    return name, json_or_text(value)
 
 
 def named_values(words: Iterable[str]) -> dict[str, object]:

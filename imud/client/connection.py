@@ -516,7 +516,9 @@ def default_path() -> str:
 def rpc_error(error: object) -> RpcError:
     """Return the exception for the member `error` of a reply."""
     if isinstance(error, dict):
-        return RpcError(error.get("code", 0), str(error.get("message", "without a message")))
+        data = error.get("data")
+        message = str(error.get("message", "without a message"))
+        return RpcError(error.get("code", 0), message, data=data if isinstance(data, dict) else None)
     return RpcError(0, f"cannot decode the error {error!r}")
 
 

@@ -134,6 +134,9 @@ class Driver:
     # Returns the reference of yaw from the driver options and the device settings (empty: not read yet)
     heading: Callable[[Any, Mapping[str, str]], Heading] = _unknown_heading
     verbs: Verbs = field(default_factory=dict)  # verbs of the device, by name
+    # Arguments of `imud settings NAME --set` in place of a removed command, by the name of the command. {NAME} is the
+    # argument NAME of the command, {NAME|VALUE} has a default. Empty: `imud settings NAME` replaces the command.
+    renamed: Mapping[str, str] = field(default_factory=dict)
     calibrations: Calibrations = field(default_factory=dict)  # guided calibrations, by kind
     device_settings: SettingsTable | None = None  # table of the device settings; None if the driver does not know them
     # GPIO lines that the device can have: names of fields of `imud.contracts.lines.DeviceLines`

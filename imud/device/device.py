@@ -30,6 +30,7 @@ from imud.device.health import DeviceEvents, Health
 from imud.device.identity import identity_words
 from imud.device.latency import Need
 from imud.device.settings import SettingsKeeper
+from imud.device.settings_plan import setting_instead
 from imud.device.transport import UNHEARD_NS, DeviceContext, DeviceOwner, Transport
 from imud.device.watches import AttitudeWatch, StatusWatch
 from imud.host.clock import HostClock
@@ -235,6 +236,8 @@ class Device:
         log.info("%s: run %s%s", self.config.name, printable(name), f" {shown(arguments)}" if arguments else "")
         verb = self.verbs.get(name)
         if verb is None:
+            if instead := setting_instead(self.config.name, name, self._transport.driver, arguments):
+                raise instead
             raise BadArgument(f"{self.config.name}: unknown command {name[:64]!r}; expected: {self._known_verbs()}")
         if name in self._attachments.verbs:
             return await self._attachments.run_verb(name, arguments)

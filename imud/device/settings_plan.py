@@ -4,14 +4,17 @@ imud writes settings in the order of the driver's table. The settings that chang
 are last. Without a save, imud leaves out the settings that need a restart, because the restart loses unsaved values.
 """
 
+import re
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from shlex import quote
 from typing import Annotated, Any, Final, get_args, get_origin
 
 import msgspec
 
 from imud.config.model import DeviceConfig
 from imud.contracts.command import Risk, Target
+from imud.contracts.driver import Driver
 from imud.contracts.setting import (
     AppliedSettings,
     AppliedStep,
@@ -26,8 +29,9 @@ from imud.contracts.setting import (
     Written,
 )
 from imud.device.flash import ModuleFlash
-from imud.model.errors import BadArgument, CommandError, DeviceRefused, LinkError, TransferError
-from imud.model.options import expected, shown, unknown_name, value_problem
+from imud.host.log import printable
+from imud.model.errors import BadArgument, CommandError, DeviceRefused, IsSetting, LinkError, TransferError
+from imud.model.options import expected, json_or_text, shown, unknown_name, value_problem
 
 Values = Mapping[str, Any]  # values of settings by name, in the types of the table
 
@@ -195,6 +199,50 @@ def _converted(name: str, value: Any, value_type: Any) -> Any:
         raise BadArgument(f"{name}: expected {expected(value_type)}, got {shown(value)[:60]}") from None
 
 
+_ARGUMENT: Final = re.compile(r"\{(\w+)(?:\|(\w+))?\}")  # argument of a removed command, with its default
+SHOWN_MAX: Final = 400  # maximum length of the arguments in an error message, characters
+TEXT_MAX: Final = 1000  # maximum length of the command in an error message, with escapes, characters
+SAVE: Final = "--save"
+
+
+def setting_instead(device: str, name: str, driver: Driver | None, given: Mapping[str, Any]) -> IsSetting | None:
+    """Return the error for a command that a setting replaces, with the new command; None for another name.
+
+    `given` contains the arguments of the call. Without them, the new command contains their names.
+    """
+    table = driver.device_settings if driver is not None else None
+    if driver is None or table is None:
+        return None
+    template = driver.renamed.get(name)
+    if template is None:
+        setting = table.table.get(name)
+        if setting is None or setting.write is None:
+            return None
+        needs_save = setting.saves or setting.effect is Effect.AFTER_RESTART
+        template = f"{name}={{{name}}}" + f" {SAVE}" * needs_save
+    assignments = [word for word in template.split() if word != SAVE]
+    save = SAVE in template.split()
+    values = dict(one for word in assignments if (one := _assignment(word, given)) is not None)
+    texts = [f"{key}={value if isinstance(value, str) else shown(value)}" for key, value in values.items()]
+    if not texts or len(" ".join(texts)) > SHOWN_MAX:
+        values, texts = {}, [_ARGUMENT.sub(lambda found: found[1].upper(), word) for word in assignments]
+    command = [f"imud settings {device}", *(["--set", *map(quote, texts)] if texts else []), *[SAVE] * save]
+    words = "is a setting" if assignments else "is not a command any more"
+    return IsSetting(f"{name} {words}: {printable(' '.join(command), TEXT_MAX)}", values, save=save)
+
+
+def _assignment(word: str, given: Mapping[str, Any]) -> tuple[str, Any] | None:
+    """Return name and value of a setting from `NAME=VALUE` with arguments; None if an argument is missing."""
+    arguments = {name: default or None for name, default in _ARGUMENT.findall(word)} | dict(given)
+    if any(arguments[name] is None for name, _ in _ARGUMENT.findall(word)):
+        return None
+    key, _, value = word.partition("=")
+    key = _ARGUMENT.sub(lambda found: str(arguments[found[1]]).lower(), key)
+    if (whole := _ARGUMENT.fullmatch(value)) and whole[1] in given:
+        return key, given[whole[1]]
+    return key, json_or_text(_ARGUMENT.sub(lambda found: str(arguments[found[1]]), value))
+
+
 NEEDS_SAVE: Final = "needs a save and a restart, and no save was requested"
 SAVES_ITSELF: Final = "saves to flash and restarts the device, and no save was requested"
 CANNOT_SAVE: Final = "needs a save and a restart, and this driver cannot save"
@@ -249,7 +297,7 @@ def make_plan(
 def _require_agreement(table: SettingsTable, target: Target, actual: Values, values: Values) -> None:
     """Raise BadArgument if the new values contradict each other.
 
-    A contradiction that the device already has is no reason to reject a change of another setting.
+    imud accepts a contradiction that the device already has, because the user changes another setting.
     """
     try:
         table.check(target, values)

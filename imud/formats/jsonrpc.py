@@ -55,9 +55,12 @@ class Code(IntEnum):
 class RpcError(ServerError):
     """Error reply of the server. `code` is a value of `Code` or a code of a newer server."""
 
-    def __init__(self, code: int, message: str, request_id: RequestId = None) -> None:
+    def __init__(
+        self, code: int, message: str, request_id: RequestId = None, data: Mapping[str, Any] | None = None
+    ) -> None:
         super().__init__(message)
         self.code = code
+        self.data = data
         self.request_id = request_id  # the id of the request, if it was readable
 
 
@@ -151,7 +154,9 @@ def _texts(value: object) -> object:
 
 def encode_error(error: RpcError) -> bytes:
     """Return an error reply without newline."""
-    body = {"code": int(error.code), "message": str(error)}
+    body: dict[str, Any] = {"code": int(error.code), "message": str(error)}
+    if error.data is not None:
+        body["data"] = error.data
     return encode({"jsonrpc": "2.0", "id": error.request_id, "error": body})
 
 

@@ -8,6 +8,7 @@ ImudError
  │   └─ LinkBusy         in use by another program
  ├─ CommandError         failed command to a device
  │   ├─ BadArgument      imud cannot send it: an argument is out of range
+ │   │   └─ IsSetting    the command was removed: a setting replaces it
  │   ├─ NoReply          no reply before the timeout
  │   └─ Rejected         the device rejected the command
  ├─ TransferError        one failed transfer on a bus; the next transfer may succeed
@@ -18,13 +19,17 @@ ImudError
 
 import os
 import re
+from collections.abc import Mapping
 from enum import StrEnum
+from typing import Any
 
 _NUMBER = re.compile(r"\[Errno (\d+)\]|\((\d+), ['\"]")  # error number in the text of a library's error
 
 
 class ImudError(Exception):
     """Base class of all errors that imud raises on purpose."""
+
+    data: Mapping[str, Any] | None = None  # values for programs, which JSON can represent; None if there are none
 
 
 class ConfigError(ImudError):
@@ -53,6 +58,14 @@ class CommandError(ImudError):
 
 class BadArgument(CommandError, ValueError):
     """Command that imud cannot encode. Example: a baud rate that the device does not support."""
+
+
+class IsSetting(BadArgument):
+    """Removed command. Example: `mode` is a setting. `data` contains `settings` and `save` for `settings.apply`."""
+
+    def __init__(self, message: str, settings: Mapping[str, Any], *, save: bool) -> None:
+        super().__init__(message)
+        self.data: Mapping[str, Any] = {"settings": settings, "save": save}
 
 
 class NoReply(CommandError):

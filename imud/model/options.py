@@ -71,6 +71,15 @@ def shown(value: object) -> str:
     return "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text)
 
 
+def json_or_text(text: str) -> Any:
+    """Return the value of JSON; another text unchanged."""
+    try:
+        # numbers, true, false, null, lists, objects and quoted strings
+        return msgspec.json.decode(text)
+    except msgspec.DecodeError:
+        return text
+
+
 class WrongValue(NamedTuple):
     """One invalid value of several named values."""
 

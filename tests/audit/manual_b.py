@@ -136,7 +136,7 @@ MANUAL_B: Final = (
     Item("B 5.4.1 bit rate", "0x209A, four codes", "drivers.hipnuc.canopen.commands:set_bit_rate"),
     Item("B 5.4.1 output rates", "0x1800 to 0x1805, sub-index 5", "drivers.hipnuc.canopen.commands:set_tpdo_period"),
     Item(
-        "B 5.4.1 signs of the inclinometer", "0x209E, 0x209F", "drivers.hipnuc.canopen.commands:set_inclinometer_signs"
+        "B 5.4.1 signs of the inclinometer", "0x209E, 0x209F", "drivers.hipnuc.canopen.commands:set_inclinometer_sign"
     ),
     Item(
         "B 5.4.1 zero of the inclinometer",

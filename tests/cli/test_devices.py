@@ -18,22 +18,28 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
 
 
 @live
-def test_devices_and_actions_are_listed_and_a_module_obeys(daemon: RunningDaemon, cli: Cli) -> None:
+def test_devices_and_verbs_are_listed_and_a_module_obeys(daemon: RunningDaemon, cli: Cli) -> None:
     head, bow = cli("devices", "--socket", daemon.socket).out.splitlines()
     assert head.split() == ["DEVICE", "STATE", "RATE", "HZ", "DRIVER", "PRODUCT", "SERIAL", "NUMBER", "LINK"]
     assert bow.split()[:2] == ["bow", "running"]
     assert f"{daemon.folder}/port at 115200 baud" in bow
     out = cli("command", "--socket", daemon.socket, "bow").out
-    assert "sout_divider" in out
-    assert "divisor (a whole number from 1 to 64)" in out
-    assert cli("command", "--socket", daemon.socket, "bow", "mode", "axes=9").out == "done\n"
+    assert [line.split()[0] for line in out.splitlines() if not line.startswith(" ")] == [
+        "save", "restart", "factory_reset", "wake", "output_once", "level", "yaw",
+    ]  # fmt: skip
+    assert "angle_deg (a number from -180 to 180)" in out
+    assert cli("command", "--socket", daemon.socket, "bow", "yaw", "angle_deg=16").out == "done\n"
 
 
 @live
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["mode", "axes=7"], "arguments: axes (one of 6, 9)"),
+        (["yaw", "angle_deg=181"], "arguments: angle_deg (a number from -180 to 180)"),
+        (["mode", "axes=9"], "mode is a setting: imud settings bow --set mode=9-axis"),
+        (["output", "message=HI91", "rate_hz=200"], "output is a setting: imud settings bow --set output.hi91=200"),
+        (["baud"], "baud is a setting: imud settings bow --set baud=BAUD --save"),
+        (["yaw", "angle_deg=1", "angle_deg=2"], "angle_deg: expected one value, got 1 and 2"),
         (["dance"], "unknown command 'dance'; expected: save, restart"),
         (["mode", "nine"], "expected NAME=VALUE, got 'nine'"),
     ],

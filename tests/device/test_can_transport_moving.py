@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from imud.config.model import DeviceConfig
-from imud.contracts.setting import OnDifference, SettingsState, Written
+from imud.contracts.setting import OnDifference, SettingsState
 from imud.contracts.status import DeviceState
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
@@ -143,8 +143,7 @@ def test_a_found_node_with_another_number_is_followed(monkeypatch: pytest.Monkey
     bus = BusInProcess(clock, "auto", None, module, identify=False)
 
     async def story() -> None:
-        answer = await bus.done(bus.rig.device.act("interval", {"tpdo": 1, "interval_ms": 20}))
-        assert answer is Written.VERIFIED
+        await bus.done(bus.rig.device.settings_apply({"tpdo1_interval_ms": 20}, save=False))
         assert module.objects.settings.periods_ms[1] == 20
 
     bus.play(story)

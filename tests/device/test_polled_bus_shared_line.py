@@ -20,12 +20,13 @@ from imud.drivers.hipnuc.modbus import commands as session
 from imud.drivers.hipnuc.modbus import driver
 from imud.drivers.hipnuc.modbus.registers import BY_NAME
 from imud.links.rs485 import LineCounters, Rs485Link, Rs485Options
-from imud.model.errors import BadArgument, TransferError
+from imud.model.errors import CommandError, TransferError
 from imud.model.event import EventKind
 from imud.model.units import NS_PER_MS
 from imud.sim.hipnuc.modbus import SLAVE_VARIANTS, Slave
 from tests.support.device_rig import DeviceRig, DeviceRigs, device_config, running
 from tests.support.event_loops import LoopWorker, VirtualClock, in_loop, run_virtually
+from tests.support.old_spellings import act
 from tests.support.pty_port import BAUD, BEGIN_NS, LINE_BAUD, ModbusBench, modbus_slave, serial_of, slave, wired
 from tests.support.stories import in_bench
 
@@ -182,7 +183,7 @@ async def test_a_command_runs_between_reads(bench: LineBench) -> None:
         for rig in rigs:
             await rig.until_samples(5)
         assert rigs[0].device.status().status_words == ("time not UTC",)  # register 0x0800 of the simulated module
-        await rigs[0].device.act("attitude_mode", {"axes": 9})
+        await act(rigs[0].device, "attitude_mode", {"axes": 9})
         assert rigs[0].device.status().settings["heading_mode"] == "nine axes"  # imud reads again without a request
         assert await rigs[0].device.act("read", {"register": "HEADING_MODE"}) == (1,)
         assert (module.settings.heading_mode, other.settings.heading_mode) == (1, 0)
@@ -249,16 +250,16 @@ async def test_a_module_is_followed_to_another_address_and_back(bench: LineBench
     async with bench.running(module, other) as (rig, beside):
         await rig.until_samples(5)
         await beside.until_samples(5)
-        with pytest.raises(BadArgument, match="address 2 is in use"):
-            await rig.device.act("address", {"address": 2})
-        await rig.device.act("address", {"address": 9})
+        with pytest.raises(CommandError, match="address 2 is in use"):
+            await act(rig.device, "address", {"address": 2})
+        await act(rig.device, "address", {"address": 9})
         await rig.device.act("save", {})
         await rig.device.act("restart", {})
         await rig.until_samples(10)
         assert rig.device.status().link == f"{bench.path}, address 9"
         assert module.address == module.flash.slave == 9
         assert "change address 1 in the configuration" in told(rig)
-        await rig.device.act("address", {"address": 1})
+        await act(rig.device, "address", {"address": 1})
         await rig.device.act("restart", {})  # not saved: address 9 after the restart
         await rig.until_samples(10)
         assert rig.device.status().link == f"{bench.path}, address 9"
@@ -294,6 +295,6 @@ async def test_on_a_real_port(tmp_path: Path) -> None:
             for rig, module in zip(rigs, modules, strict=True):
                 await rig.until_samples(5)
                 assert rig.device.status().identity["serial_number"] == module.serial.hex().upper()
-            await rigs[0].device.act("attitude_mode", {"axes": 9})
+            await act(rigs[0].device, "attitude_mode", {"axes": 9})
             assert [module.settings.heading_mode for module in modules] == [1, 0]
             await rigs[0].until_samples(5)

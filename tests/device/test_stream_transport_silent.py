@@ -18,6 +18,7 @@ from imud.model.event import EventKind
 from imud.sim.hipnuc.uart import HipnucModule
 from imud.sim.hipnuc.uart_settings import VARIANTS, Behaviour, ModuleSettings, Output
 from tests.support.device_rig import device_config, running
+from tests.support.old_spellings import act
 from tests.support.pty_port import plugged
 from tests.support.simulated_modules import hardware_of
 from tests.support.stories import played
@@ -121,7 +122,7 @@ async def test_no_command_is_sent_during_a_search(device: LinkedDevice) -> None:
     for _ in range(200):
         bauds.add(device.link.baud)
         try:
-            await device.device.act("output", {"message": "HI91", "rate_hz": 50})
+            await act(device.device, "output", {"message": "HI91", "rate_hz": 50})
         except CommandError:
             refused += 1
         await device.wait(0.05)
@@ -156,10 +157,10 @@ async def test_every_variant_is_followed_to_another_rate_and_back(
     device: LinkedDevice, variant: str, link: dict[str, Any]
 ) -> None:
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
-    answer = await device.act("baud", baud=921600)
-    assert isinstance(answer, dict)
-    assert answer["baud"] == device.link.baud == device.module.baud == device.module.flash.baud == 921600
-    assert ("configuration" in answer) is (not link)
+    applying = asyncio.ensure_future(device.device.settings_apply({"baud": 921600}, save=True))
+    await device.until(applying.done, "the new rate", 60)
+    assert device.link.baud == device.module.baud == device.module.flash.baud == 921600
+    assert ("in the configuration" in applying.result().advice) is (not link)
     count = len(device.samples)
     await device.until(lambda: len(device.samples) > count + 20)
     assert device.device.status().settings["baud"] == "921600 bit/s"
@@ -268,9 +269,8 @@ def test_on_a_real_port(tmp_path: Path) -> None:
             assert "no message has a rate" in rig.problem
             await rig.device.act("wake", {})
             await rig.until_samples(20)
-            answer = await rig.device.act("baud", {"baud": 460800})
-            assert isinstance(answer, dict)
-            assert (answer["baud"], module.baud, module.flash.baud) == (460800, 460800, 460800)
+            await act(rig.device, "baud", {"baud": 460800})
+            assert (module.baud, module.flash.baud) == (460800, 460800)
             await rig.until_samples(20)
             assert await rig.device.act("factory_reset", {}) == {"baud": 115200}
             assert (module.baud, module.settings) == (115200, ModuleSettings())

@@ -18,7 +18,14 @@ from imud.client.connection import Client
 from imud.config.yaml import yaml_block
 from imud.contracts.command import Target
 from imud.contracts.setting import Effect, SettingInfo, SettingsTable, declared_values
-from imud.device.settings_plan import described_settings, differences, make_plan, wanted_values
+from imud.device.settings_plan import (
+    completed,
+    described_settings,
+    differences,
+    make_plan,
+    setting_instead,
+    wanted_values,
+)
 from imud.drivers import DRIVERS
 from imud.formats.jsonrpc import RpcError
 from imud.links import LINKS
@@ -189,3 +196,77 @@ def takes(client: Client, name: str, value: Any) -> bool:
     assert (done["problem"], done["differences"]) == ("", {}), (name, value, done)
     assert {step["outcome"] for step in done["steps"]} <= {"done", "written, not verified"}
     return True
+
+
+REMOVED: list[tuple[str, str, dict[str, Any], str]] = [
+    ("hipnuc-uart", "baud", {"baud": 921600}, "--set baud=921600 --save"),
+    ("hipnuc-uart", "output", {"message": "HI91", "rate_hz": 200}, "--set output.hi91=200"),
+    ("hipnuc-uart", "output_on_mark", {"message": "HI92"}, "--set output.hi92=on_mark"),
+    ("hipnuc-uart", "output_none", {}, "--set output.hi91=0 output.hi92=0"),
+    ("hipnuc-uart", "output_enabled", {"enabled": False}, "--set output_enabled=false"),
+    ("hipnuc-uart", "mode", {"axes": 9}, "--set mode=9-axis"),
+    ("hipnuc-uart", "mounting", {"turned": [1, 0, 0, 0, 1, 0, 0, 0, 1]}, "--set 'mounting=[1,0,0,0,1,0,0,0,1]' --save"),
+    ("hipnuc-uart", "magnetic_calibration", {"enabled": True}, "--set magnetic_calibration=true"),
+    ("hipnuc-uart", "pin", {"function": "sout", "pin": 5}, "--set pins.sout=5"),
+    (
+        "hipnuc-uart", "alarm", {"axis": "X", "min_deg": -10, "max_deg": 10},
+        "--set alarm.x.min_deg=-10 alarm.x.max_deg=10 alarm.x.enabled=true",
+    ),
+    ("hipnuc-uart", "sout_divider", {"divisor": 4}, "--set sout_divisor=4"),
+    ("hipnuc-modbus", "address", {"address": 9}, "--set address=9"),
+    ("hipnuc-modbus", "baud", {"baud": 921600}, "--set baud=921600 --save"),
+    ("hipnuc-modbus", "attitude_mode", {"axes": 6}, "--set mode=6-axis"),
+    ("hipnuc-modbus", "mounting", {"mounting": "x_up"}, "--set mounting=x_up --save"),
+    ("hipnuc-canopen", "interval", {"tpdo": 3, "interval_ms": 20}, "--set tpdo3_interval_ms=20"),
+    ("hipnuc-canopen", "transmission", {"tpdo": 3, "by": "sync"}, "--set tpdo3_by=sync"),
+    ("hipnuc-canopen", "bitrate", {"bitrate": 250_000}, "--set bit_rate=250000 --save"),
+    ("hipnuc-canopen", "node", {"node": 9}, "--set node=9 --save"),
+    (
+        "hipnuc-canopen", "direction", {"x_reversed": True, "y_reversed": False},
+        "--set incli_x_reversed=true incli_y_reversed=false",
+    ),
+    ("hipnuc-j1939", "interval", {"pgn": "FF3D", "interval_ms": 20}, "--set ff3d_interval_ms=20"),
+    ("hipnuc-j1939", "bitrate", {"bitrate": 250_000}, "--set bit_rate=250000 --save"),
+    ("hipnuc-j1939", "address", {"address": 9}, "--set address=9 --save"),
+    ("hipnuc-j1939", "direction", {"axis": "X", "reversed": True}, "--set x_reversed=true"),
+    ("imu61x-uart", "settings", {}, ""),
+    ("imu61x-uart", "baud", {"baud": 230400}, "--set baud=230400 --save"),
+    ("imu61x-uart", "rate", {"rate_hz": 200}, "--set output_rate_hz=200"),
+    ("imu61x-uart", "filter", {"accel_filter": "5 Hz", "gyro_filter": 3}, "--set 'accel_filter=5 Hz' gyro_filter=3"),
+    ("imu61x-uart", "i2c_address", {"address": "0x19"}, "--set i2c_address=0x19"),
+    ("imu61x-uart", "bus", {"bus": "i2c"}, "--set second_bus=i2c"),
+    ("imu61x-i2c", "filter", {"accel_filter": "5 Hz"}, "--set 'accel_filter=5 Hz'"),
+    ("imu61x-spi", "filter", {"accel_filter": None, "gyro_filter": 3}, "--set gyro_filter=3"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("driver", "name", "given", "words"), REMOVED)
+def test_a_removed_command_names_the_new_command(driver: str, name: str, given: dict[str, Any], words: str) -> None:
+    row, table = DRIVERS[driver], table_of(driver)
+    assert name not in row.verbs
+    instead = setting_instead("bow", name, row, given)
+    assert instead is not None
+    assert str(instead).partition(": ")[2] == f"imud settings bow {words}".strip()
+    assert instead.data["save"] is ("--save" in words)
+    wanted = wanted_values(table, instead.data["settings"])
+    for setting in completed(table, wanted, {}):
+        setting_of = table.table[setting]
+        assert "--save" in words or not (setting_of.saves or setting_of.effect is Effect.AFTER_RESTART)
+    if given:  # names in place of values, and no values for programs
+        instead = setting_instead("bow", name, row, {})
+        assert instead is not None
+        assert instead.data["settings"] == {}
+        assert all(argument.upper() in str(instead) for argument in given)
+
+
+def test_every_removed_command_is_tested_and_a_setting_without_a_command_too() -> None:
+    assert {(driver, name) for driver, name, *_ in REMOVED} == {
+        (driver, name) for driver, row in DRIVERS.items() for name in row.renamed
+    }
+    row = DRIVERS["hipnuc-canopen"]
+    assert str(setting_instead("bow", "heartbeat_ms", row, {"heartbeat_ms": 5})).endswith("--set heartbeat_ms=5")
+    assert str(setting_instead("bow", "node", row, {"node": "\x1b[31m"})).endswith(r"--set 'node=\x1b[31m' --save")
+    assert str(setting_instead("bow", "node", row, {"node": "9" * 500})).endswith("--set node=NODE --save")
+    for name in ("dance", "magnetometer_bias"):
+        assert setting_instead("bow", name, DRIVERS["hipnuc-uart"], {}) is None
+    assert not any("save" in table.table for table in TABLES.values()), "`save` is an argument of the verb set"

@@ -74,9 +74,9 @@ def test_kind_of_burst_in_every_variant(spi8: Bus[SpiTransfer], variant: str, bu
             await rig.until_samples(10, LIMIT_S)
             assert rig.device.status().settings["burst"] == burst
             assert device.extended == (burst == "extended")
-            answer = await rig.device.act("filter", {"gyro_filter": "10 Hz"})
+            applied = await rig.device.settings_apply({"gyro_filter": "10 Hz"}, save=False)
             assert device.filter == 0xB4
-            assert rig.device.status().settings["gyro_filter"] == "10 Hz", answer
+            assert rig.device.status().settings["gyro_filter"] == "10 Hz", applied
             await rig.until_samples(5, LIMIT_S)
             assert rig.device.ledger.frames_bad_crc == 0
             assert device.window == 0

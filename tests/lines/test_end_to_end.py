@@ -15,6 +15,7 @@ from imud.sim.ports.faults import FaultRates, Faults
 from imud.sim.ports.pins import PinFaultRates, PinFaults
 from imud.sim.sensor import Pin
 from imud.utc.receivers import RmcOptions
+from tests.support.old_spellings import act
 from tests.support.stories import played
 from tests.support.wired_device import BEGIN_NS, EDGE_LATE_NS, WiredDevice
 
@@ -175,7 +176,7 @@ async def test_an_alarm_wire_that_is_cut_is_reported(wired: WiredDevice) -> None
     status = wired.device.status()
     assert status.lines is not None
     assert status.lines.problems == {"alarm": event.message.removeprefix("line alarm: ")}
-    await wired.device.act("alarm", {"axis": "Y", "min_deg": -60, "max_deg": 60})
+    await act(wired.device, "alarm", {"axis": "Y", "min_deg": -60, "max_deg": 60})
     status = wired.device.status()
     assert status.lines is not None
     assert status.lines.problems == {}  # the settings are unknown again

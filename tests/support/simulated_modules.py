@@ -22,7 +22,7 @@ from imud.drivers.hipnuc.canopen.driver import DRIVER as CANOPEN_DRIVER
 from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
 from imud.drivers.hipnuc.j1939.driver import DRIVER as J1939_DRIVER
 from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucOptions
-from imud.drivers.hipnuc.uart.driver import VERBS
+from imud.drivers.hipnuc.uart.driver import DRIVER as HIPNUC_UART
 from imud.drivers.imu61x.uart.codec import Imu61xCodec
 from imud.formats.can import EXTENDED_FLAG, RAW_FRAME, CanFilter
 from imud.model.ledger import Ledger
@@ -38,6 +38,7 @@ from imud.sim.imu61x.uart import VARIANTS, Imu61xBehaviour, Imu61xHardware, Imu6
 from imud.sim.physics import Still
 from imud.sim.ports.uart_wire import heard
 from imud.sim.sensor import Burst
+from tests.support.old_spellings import script_of
 from tests.support.script_runners import offline_runner
 
 T = TypeVar("T")
@@ -187,8 +188,7 @@ class HipnucLine(SerialLine[HipnucModule]):
         self.wait(hardware.boot_ms)
 
     def act(self, name: str, *, fixed_baud: int = 0, **arguments: Any) -> Any:
-        action = VERBS[name]
-        return self.run(action.script(Target(None, self.baud, fixed_baud), action.arguments(arguments)))
+        return self.run(script_of(HIPNUC_UART, Target(None, self.baud, fixed_baud), name, arguments))
 
 
 # --- HiPNUC on CANopen ------------------------------------------------------------------------------------------------
@@ -259,8 +259,7 @@ class CanBench:
         return run_script(script, self._ask)
 
     def act(self, name: str, **given: object) -> object:
-        action = self.driver.verbs[name]
-        result: object = self.run_script(action.script(self.target(), action.arguments(given)))
+        result: object = self.run_script(script_of(self.driver, self.target(), name, given))
         return result
 
     def present(self) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from imud.utc.receivers import RmcOptions
 from imud.utc.system_clock import KernelClock
 from tests.support.device_rig import DeviceRigs
 from tests.support.event_loops import LoopWorker, VirtualClock, run_virtually
+from tests.support.old_spellings import act
 from tests.support.rmc_sources import FakeSource
 from tests.support.simulated_modules import HIPNUC_STILL
 
@@ -255,7 +256,7 @@ class LinkedDevice:
         await self.until(lambda: self.clock.now_ns() >= end_ns, limit_s=seconds + 1)
 
     async def act(self, name: str, **arguments: Any) -> object:
-        acting = asyncio.ensure_future(self.device.act(name, arguments))
+        acting = asyncio.ensure_future(act(self.device, name, arguments))
         await self.until(acting.done, f"the end of {name}", 60)
         return acting.result()
 

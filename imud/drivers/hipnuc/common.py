@@ -35,6 +35,7 @@ from imud.contracts.command import (
     Verbs,
 )
 from imud.contracts.driver import DataSheet, StatusBit
+from imud.model.errors import BadArgument
 from imud.model.sample import Quaternion
 from imud.model.units import RAD_PER_DEG, T_PER_UT
 
@@ -54,6 +55,18 @@ def counts_of(value: float, bits: int) -> int:
         raise ValueError("NaN has no count")
     most = 1 << bits - 1
     return round(max(-most, min(most - 1, value)))
+
+
+def refuse_all(*checks: Callable[[], None]) -> None:
+    """Run all checks. Raises BadArgument with the problems of all of them."""
+    problems = []
+    for check in checks:
+        try:
+            check()
+        except BadArgument as error:
+            problems.append(str(error))
+    if problems:
+        raise BadArgument("; ".join(problems))
 
 
 def random_quaternion(random: Random) -> Quaternion:

@@ -1,4 +1,4 @@
-"""Options, setup, verb and registry row of the Forsense IMU61x on SPI and I2C. Only the transfers differ.
+"""Options, setup, settings and registry row of the Forsense IMU61x on SPI and I2C. Only the transfers differ.
 
 Users change only the low-pass filters over these buses; the UART changes all other settings.
 """
@@ -7,12 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from random import Random
 from typing import Annotated, Any, Final, NamedTuple, TypeVar
 
-import msgspec
 from msgspec import Meta
 
 from imud.attitude.conventions import FLU_LEVEL
 from imud.contracts.codec import PolledCodec
-from imud.contracts.command import Target, Verb
+from imud.contracts.command import Target
 from imud.contracts.driver import Identity, KeyProblem, PolledDriver
 from imud.contracts.script import TransferScript
 from imud.contracts.setting import Setting, SettingsTable
@@ -98,8 +97,6 @@ def filter_words(control: int) -> Mapping[str, str]:
 
 AccelFilter = Annotated[FilterChoice, ACCEL_FILTER]
 GyroFilter = Annotated[FilterChoice, GYRO_FILTER]
-_AccelFilterOrNone = Annotated[FilterChoice | None, ACCEL_FILTER]
-_GyroFilterOrNone = Annotated[FilterChoice | None, GYRO_FILTER]
 
 
 class FilterControl(NamedTuple):
@@ -151,25 +148,6 @@ def _shown(choice: FilterChoice) -> str:
     return f"{FILTERS[filter_code(choice)]} (code {filter_code(choice)})"
 
 
-def _filter_verb(set_up: SetUp[S]) -> Verb:
-    """Return the verb that sets the filters with the driver's `set_up`."""
-
-    def set_filter(
-        target: Target, *, accel_filter: _AccelFilterOrNone = None, gyro_filter: _GyroFilterOrNone = None
-    ) -> TransferScript[Mapping[str, str]]:
-        settings: S = target.settings
-        given = {"accel_filter": accel_filter, "gyro_filter": gyro_filter}
-        _require_as_configured(settings, **given)
-        wanted = {name: choice for name, choice in given.items() if choice is not None}
-        return set_up(msgspec.structs.replace(settings, **wanted))
-
-    return Verb(
-        "set the low-pass filters until the device restarts, by name or by code in the order of the names, null: "
-        "unchanged; returns the filters; imud sets the filters in `options` at every start",
-        set_filter,
-    )
-
-
 # --- row --------------------------------------------------------------------------------------------------------------
 
 
@@ -215,7 +193,7 @@ def register_driver(
         read_ns=read_ns,
         check=check,
         device_settings=device_settings,
-        verbs={"filter": _filter_verb(set_up)},
+        renamed={"filter": "accel_filter={accel_filter} gyro_filter={gyro_filter}"},
     )
 
 

@@ -80,7 +80,7 @@ LATENCY_MAX_MS: Final = 60_000
 LATENCY_OF_RATE_MAX_MS: Final = 20.0
 """Maximum latency of a client that only defines `rate_hz`, ms."""
 NAME_MAX: Final = 64
-"""Maximum length of the name of an action or calibration, more than twice the longest name."""
+"""Maximum length of the name of a command or calibration, more than twice the longest name."""
 
 SLOT_SCHEMA: Final = SlotSchema(
     bytes=SLOT_BYTES,
@@ -190,7 +190,7 @@ async def _reply_later(connection: ClientConnection, request: RpcRequest, later:
             result = await later
             body = encode_result(request.request_id, result, texts=connection.text_numbers)
         except ImudError as error:
-            body = encode_error(RpcError(Code.FAILED, str(error), request.request_id))
+            body = encode_error(RpcError(Code.FAILED, str(error), request.request_id, error.data))
         if request.wants_reply:
             connection.post(body)
     except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon

@@ -24,6 +24,7 @@ from imud.formats.can import EXTENDED_ID_MAX, RAW_FRAME
 from imud.model.errors import BadArgument, DeviceRefused, NoReply, Rejected
 from imud.sim.hipnuc.canopen import NODE_VARIANTS, NodeSettings, NodeVariant
 from imud.sim.hipnuc.j1939 import J1939_VARIANTS, J1939Settings, J1939Variant
+from tests.support.old_spellings import script_of
 from tests.support.simulated_modules import CanBench, CanopenBench, J1939Bench, run_script
 
 BOOTED_NS = 500_000_000
@@ -208,8 +209,8 @@ def test_a_lost_device_is_commanded_back(protocol: Protocol) -> None:
         sent.append(request.payload)
         return Reply(()) if request.silent else Silence(())
 
-    action = protocol.make().driver.verbs[protocol.noun]
-    script = action.script(Target(protocol.options(8), 500_000), action.arguments({protocol.noun: 9}))
+    target = Target(protocol.options(8), 500_000)
+    script = script_of(protocol.make().driver, target, protocol.noun, {protocol.noun: 9})
     with pytest.raises(NoReply, match=r"replied neither (as node 9 nor as node 8|at address 9 nor at 8)"):
         run_script(script, silent)
     can_id, _, data = RAW_FRAME.unpack(sent[-1])
@@ -319,11 +320,12 @@ def test_j1939_values_that_do_not_go_together_are_refused() -> None:
     J1939_SETTINGS.check(bench.target(125_000), fast)
     with pytest.raises(BadArgument, match=r"got 105 % of it: FF34 every 5 ms 21 %, .*"):
         J1939_SETTINGS.check(bench.target(125_000), fast | {"ff43_interval_ms": 5})
-    action = bench.driver.verbs["interval"]
 
     def interval(others_bit_s: float) -> object:
-        arguments = action.arguments({"pgn": "FF34", "interval_ms": 5})
-        return bench.run_script(action.script(bench.target(125_000, others_bit_s), arguments))
+        bench = J1939Bench()
+        target = bench.target(125_000, others_bit_s)
+        given = {"pgn": "FF34", "interval_ms": 5}
+        return bench.run_script(script_of(bench.driver, target, "interval", given, **bench.present()))
 
     # 131 · (200 + 3 · 10) = 30,130 bit/s
     assert interval(94_000) is Written.VERIFIED

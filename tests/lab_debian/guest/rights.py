@@ -20,8 +20,8 @@ def check(checks: Checks, _host: Host) -> None:
         must("runuser", "-u", "reader", "--", "imud", "devices")
         expect("ring", run(PYTHON, "-c", READ_RING, user="reader").stdout.strip(), "True")
     with checks("a member of imud cannot change settings"):
-        refused = run("imud", "command", "usb", "output", "message=HI91", f"rate_hz={RATE_HZ}", user="reader")
-        assert refused.returncode, "expected an error for the command"
+        refused = run("imud", "settings", "usb", "--set", f"output.hi91={RATE_HZ}", user="reader")
+        assert refused.returncode, "expected an error for the change"
         expect_in("imud-control", refused.stdout, "refusal")
         expect_in("Permission denied", run(PYTHON, "-c", WRITE_RING, user="reader").stdout, "writing to a ring")
     with checks("a member of imud-control changes a device"):
@@ -31,12 +31,11 @@ def check(checks: Checks, _host: Host) -> None:
             "chief",
             "--",
             "imud",
-            "command",
-            "--yes",
+            "settings",
             "usb",
-            "output",
-            "message=HI91",
-            f"rate_hz={RATE_HZ}",
+            "--yes",
+            "--set",
+            f"output.hi91={RATE_HZ}",
         )
     with checks("another user can read neither socket nor ring, and receives the reason"):
         refused = run("imud", "devices", user="stranger")

@@ -53,8 +53,8 @@ except OSError as error:
 LOOK = json.dumps({"method": "actions", "params": {"device": "usb"}})
 CHANGE = json.dumps(
     {
-        "method": "command",
-        "params": {"device": "usb", "name": "output", "arguments": {"message": "HI91", "rate_hz": RATE_HZ}},
+        "method": "settings.apply",
+        "params": {"device": "usb", "settings": {"output.hi91": RATE_HZ}},
     }
 )
 NO_BROKER = "mqtt: {enabled: true, brokers: ['mqtt://127.0.0.1:1']}\n"
@@ -133,7 +133,7 @@ def check_token(checks: Checks) -> None:
             for token in ("", TOKEN[:-1] + "x"):
                 expect("a read without the token", fetch("/api/call", PRIVATE, token, LOOK)[0], 401)
                 expect("a change without the token", fetch("/api/call", PRIVATE, token, CHANGE)[0], 401)
-            expect_in("output", fetch("/api/call", PRIVATE, TOKEN, LOOK)[1], "actions")
+            expect_in("output_once", fetch("/api/call", PRIVATE, TOKEN, LOOK)[1], "actions")
             expect_in('"result"', fetch("/api/call", PRIVATE, TOKEN, CHANGE)[1], "reply to a change")
         finally:
             run("systemctl", "stop", UNIT)

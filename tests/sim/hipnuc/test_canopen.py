@@ -143,7 +143,7 @@ def test_inclinometer_signs_and_zero() -> None:
     bench = CanopenBench(NodeSettings(periods_ms={**QUIET.periods_ms, 7: 5}))
     bench.run(700 * MS)
     x, y = incli()
-    bench.run_script(session.set_inclinometer_signs(8, invert_x=True, invert_y=False))
+    bench.run_script(session.set_inclinometer_sign(8, "x", invert=True))
     turned = incli()
     assert math.copysign(1, turned[0]) == -math.copysign(1, x)
     assert math.copysign(1, turned[1]) == math.copysign(1, y)

@@ -182,13 +182,6 @@ def set_inclinometer_sign(node: int, axis: Literal["x", "y"], *, invert: bool) -
     return (yield from _set(node, INCLI_SIGN_X if axis == "x" else INCLI_SIGN_Y, 0, int(invert), 4))
 
 
-def set_inclinometer_signs(node: int, *, invert_x: bool, invert_y: bool) -> RequestScript[Written]:
-    """Set the signs of both axes; effective immediately."""
-    x = yield from set_inclinometer_sign(node, "x", invert=invert_x)
-    y = yield from set_inclinometer_sign(node, "y", invert=invert_y)
-    return Written.VERIFIED if x is y is Written.VERIFIED else Written.UNVERIFIED
-
-
 def set_heartbeat(node: int, period_ms: int) -> RequestScript[Written]:
     """Set the interval of the heartbeat of CiA 301, ms; 0: never; effective immediately. Not in the manual."""
     return (yield from _set(node, HEARTBEAT_TIME, 0, period_ms, 2))

@@ -10,7 +10,7 @@ from msgspec import Meta
 from imud.contracts.command import Risk, Target, Verb, Verbs
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, DataSheet, random_vector
 from imud.contracts.script import RequestScript
-from imud.contracts.setting import Effect, Setting, SettingsTable, Written
+from imud.contracts.setting import Effect, Setting, SettingsTable
 from imud.drivers.hipnuc.bus_load import MS_PER_S, RATE_NOTE, CyclicMessage, refuse_other_rate, refuse_overload
 from imud.drivers.hipnuc.canopen import commands
 from imud.drivers.hipnuc.canopen.cia301 import (
@@ -49,7 +49,7 @@ from imud.drivers.hipnuc.canopen.commands import (
     identify,
     read_settings,
 )
-from imud.drivers.hipnuc.common import DOCUMENT, inclinometer_zero
+from imud.drivers.hipnuc.common import DOCUMENT, inclinometer_zero, refuse_all
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
 from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_S, NS_PER_US
@@ -91,16 +91,6 @@ def values_of(values: Mapping[Place, int]) -> dict[str, Any]:
     return {name: value for name, value in reported.items() if value is not None}
 
 
-def set_interval(target: Target, tpdo: TpdoNumber, interval_ms: int) -> RequestScript[Written]:
-    """Set the interval of a TPDO. Raises BadArgument if the TPDOs of the node then exceed the bit rate of the bus."""
-    commands.check_period(interval_ms)
-    if interval_ms and target.baud:
-        places = [(index, sub) for index in TPDO_OBJECTS.values() for sub in (TPDO_TYPE, TPDO_TIMER)]
-        present = yield from commands.read_values(target.settings.node, places, silent_is_fine=True)
-        _refuse_overload(target, values_of(present) | {interval_name(tpdo): interval_ms})
-    return (yield from commands.set_tpdo_period(target.settings.node, tpdo, interval_ms))
-
-
 def _refuse_overload(target: Target, values: Mapping[str, Any]) -> None:
     sync_ms = MS_PER_S / target.settings.sync_hz if target.settings.sync_hz else 0.0
     messages = {
@@ -116,12 +106,18 @@ def _refuse_overload(target: Target, values: Mapping[str, Any]) -> None:
 
 def _check(target: Target, values: Mapping[str, Any]) -> None:
     """Raise BadArgument for another bit rate than the bus, and for TPDOs that exceed it."""
-    refuse_other_rate(target, values)
+    refuse_all(
+        lambda: _refuse_short_intervals(values),
+        lambda: refuse_other_rate(target, values),
+        lambda: _refuse_overload(target, values),
+    )
+
+
+def _refuse_short_intervals(values: Mapping[str, Any]) -> None:
     for tpdo in TPDOS:
         if 0 < values.get(interval_name(tpdo), 0) < PERIOD_MIN_MS:
             got = values[interval_name(tpdo)]
             raise BadArgument(f"{interval_name(tpdo)}: expected 0 or {PERIOD_MIN_MS} … {PERIOD_MAX_MS}, got {got}")
-    _refuse_overload(target, values)
 
 
 def _read(target: Target) -> RequestScript[dict[str, Any]]:
@@ -210,9 +206,6 @@ SETTINGS: Final = SettingsTable(
     check=_check,
 )
 
-Tpdo = Annotated[TpdoNumber, Meta(extra={"section": "5.2"})]
-Reversed = Annotated[bool, Meta(extra={"section": "5.4.1"})]
-
 _ZEROS: Final = {"here": InclinometerZero.SET, "cancel": InclinometerZero.CANCEL}
 
 
@@ -220,64 +213,10 @@ def _simple(words: str, begin: Callable[[int], RequestScript[None]], risk: Risk 
     return Verb(words, lambda target: begin(target.settings.node), risk)
 
 
-def _interval(
-    target: Target,
-    *,
-    tpdo: Tpdo,
-    interval_ms: Annotated[
-        int,
-        Meta(
-            ge=0,
-            le=PERIOD_MAX_MS,
-            description="time between two messages, at least 5; 0: never",
-            extra={"unit": "ms", "section": "5.4.1"},
-        ),
-    ],
-) -> RequestScript[str]:
-    return set_interval(target, tpdo, interval_ms)
-
-
-def _transmission(
-    target: Target,
-    *,
-    tpdo: Tpdo,
-    by: Annotated[
-        Literal["timer", "sync"],
-        Meta(
-            description="for `sync`, a node must send SYNC; with `options.sync_hz`, imud sends it",
-            extra={"section": "5.4.2"},
-        ),
-    ],
-) -> RequestScript[str]:
-    return commands.set_tpdo_type(target.settings.node, tpdo, TRANSMISSIONS[by])
-
-
-def _bitrate(
-    target: Target,
-    *,
-    bitrate: Annotated[BitRate, Meta(description="rate of the bus", extra={"unit": "bit/s", "section": "5.4.1"})],
-) -> RequestScript[str]:
-    return commands.set_bit_rate(target.settings.node, bitrate)
-
-
-def _node(
-    target: Target,
-    *,
-    node: Annotated[
-        int, Meta(ge=1, le=NODE_MAX, description="node number that is unused on the bus", extra={"section": "5.4.1"})
-    ],
-) -> RequestScript[str]:
-    return commands.change_node(target.settings, node)
-
-
 def _zero(
     target: Target, *, zero: Annotated[Literal["here", "cancel"], Meta(extra={"section": "5.4.1"})]
 ) -> RequestScript[None]:
     return commands.set_inclinometer_zero(target.settings.node, _ZEROS[zero])
-
-
-def _direction(target: Target, *, x_reversed: Reversed, y_reversed: Reversed) -> RequestScript[str]:
-    return commands.set_inclinometer_signs(target.settings.node, invert_x=x_reversed, invert_y=y_reversed)
 
 
 def _nmt(
@@ -309,25 +248,16 @@ VERBS: Final[Verbs] = {
         lambda target: commands.factory_reset_and_find(target.settings),
         Risk.RESET,
     ),
-    "interval": Verb(
-        "set the timer of a TPDO, effective immediately; imud rejects more than the bus can carry", _interval
-    ),
-    "transmission": Verb("send a TPDO by its timer or at each SYNC, effective immediately", _transmission),
-    "bitrate": Verb(
-        "set the bit rate, effective after `save` and `restart`: then the node disturbs the bus until the "
-        "interface and all other nodes use the same bit rate",
-        _bitrate,
-        Risk.CONNECTION,
-    ),
-    "node": Verb(
-        "set the node number, effective after `save` and `restart`, in some devices immediately; imud follows the "
-        "device and rejects a number that is in use",
-        _node,
-        Risk.CONNECTION,
-    ),
     "zero": Verb("make the present position the zero of the inclinometer, or cancel it; effective immediately", _zero),
-    "direction": Verb("reverse the signs of the inclinometer, or restore them; effective immediately", _direction),
     "nmt": Verb("start or stop the TPDOs, or reset the node and follow it", _nmt),
+}
+
+RENAMED: Final[Mapping[str, str]] = {
+    "interval": "tpdo{tpdo}_interval_ms={interval_ms}",
+    "transmission": "tpdo{tpdo}_by={by}",
+    "bitrate": "bit_rate={bitrate} --save",
+    "node": "node={node} --save",
+    "direction": "incli_x_reversed={x_reversed} incli_y_reversed={y_reversed}",
 }
 
 US_PER_S: Final = NS_PER_S // NS_PER_US
@@ -373,6 +303,7 @@ DRIVER: Final = CanDriver(
     navigation_frame="ENU",
     data_sheet=DataSheet(document=DOCUMENT, gyro_step_rad_s=GYRO_RAD_S_PER_LSB, accel_step_m_s2=ACCEL_M_S2_PER_LSB),
     verbs=VERBS,
+    renamed=RENAMED,
     calibrations=inclinometer_zero("5.4.1", VERBS),
     device_settings=SETTINGS,
     node_of=_node_of,

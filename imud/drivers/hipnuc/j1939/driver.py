@@ -11,9 +11,9 @@ from imud.attitude.rotation import euler312_from_quat
 from imud.contracts.command import Risk, Target, Verb, Verbs
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, random_vector
 from imud.contracts.script import RequestScript
-from imud.contracts.setting import Effect, Setting, SettingsTable, Written
+from imud.contracts.setting import Effect, Setting, SettingsTable
 from imud.drivers.hipnuc.bus_load import RATE_NOTE, CyclicMessage, refuse_other_rate, refuse_overload
-from imud.drivers.hipnuc.common import REGISTERS, inclinometer_zero, random_quaternion
+from imud.drivers.hipnuc.common import REGISTERS, inclinometer_zero, random_quaternion, refuse_all
 from imud.drivers.hipnuc.j1939 import codec, commands
 from imud.drivers.hipnuc.j1939.codec import (
     CONFIGURE,
@@ -71,15 +71,6 @@ def values_of(values: Mapping[int, int]) -> dict[str, Any]:
     return {name: value for name, value in reported.items() if value is not None}
 
 
-def set_interval(target: Target, pgn: int, interval_ms: int) -> RequestScript[Written]:
-    """Set the interval of a message. Raises BadArgument if the messages then exceed the bit rate of the bus."""
-    peer = target.settings.peer
-    if target.baud:
-        present = yield from commands.read_values(peer, tuple(INTERVALS.values()))
-        _refuse_overload(target, values_of(present) | {interval_name(pgn): interval_ms})
-    return (yield from commands.set_interval(peer, pgn, interval_ms))
-
-
 def _refuse_overload(target: Target, values: Mapping[str, Any]) -> None:
     sent = {
         f"{pgn:04X}": CyclicMessage(codec.MESSAGE_BYTES, True, values.get(interval_name(pgn), 0)) for pgn in INTERVALS
@@ -89,8 +80,7 @@ def _refuse_overload(target: Target, values: Mapping[str, Any]) -> None:
 
 def _check(target: Target, values: Mapping[str, Any]) -> None:
     """Raise BadArgument for another bit rate than the bus, and for messages that exceed it."""
-    refuse_other_rate(target, values)
-    _refuse_overload(target, values)
+    refuse_all(lambda: refuse_other_rate(target, values), lambda: _refuse_overload(target, values))
 
 
 def _read(target: Target) -> RequestScript[dict[str, Any]]:
@@ -167,53 +157,14 @@ def _simple(words: str, begin: Callable[[J1939Node], RequestScript[None]], risk:
     return Verb(words, lambda target: begin(target.settings.peer), risk)
 
 
-def _interval(
-    target: Target,
-    *,
-    pgn: Pgn,
-    interval_ms: Annotated[int, Meta(ge=INTERVAL_MIN_MS, le=INTERVAL_MAX_MS, extra={"unit": "ms", "section": "6.2.2"})],
-) -> RequestScript[str]:
-    return set_interval(target, int(pgn, 16), interval_ms)
-
-
 def _send_once(target: Target, *, pgn: Pgn) -> RequestScript[None]:
     return commands.send_once(target.settings.peer, int(pgn, 16))
-
-
-def _bitrate(
-    target: Target,
-    *,
-    bitrate: Annotated[BitRate, Meta(description="rate of the bus", extra={"unit": "bit/s", "section": "6.2.2"})],
-) -> RequestScript[str]:
-    return commands.set_bitrate(target.settings.peer, bitrate)
-
-
-def _address(
-    target: Target,
-    *,
-    address: Annotated[
-        int,
-        Meta(
-            ge=MODULE_ADDRESS_MIN,
-            le=MODULE_ADDRESS_MAX,
-            description="address that is unused on the bus",
-            extra={"section": "6.2.2"},
-        ),
-    ],
-) -> RequestScript[str]:
-    return commands.change_address(target.settings, address)
 
 
 def _zero(
     target: Target, *, zero: Annotated[Literal["here", "cancel"], Meta(extra={"section": "6.2.2"})]
 ) -> RequestScript[None]:
     return commands.zero(target.settings.peer, Zero[zero.upper()])
-
-
-def _direction(
-    target: Target, *, axis: Annotated[Literal["X", "Y"], Meta(extra={"section": "6.2.2"})], reversed: bool
-) -> RequestScript[str]:
-    return commands.set_direction(target.settings.peer, axis, reversed)
 
 
 VERBS: Final[Verbs] = {
@@ -228,22 +179,16 @@ VERBS: Final[Verbs] = {
         lambda target: commands.factory_reset_and_find(target.settings),
         Risk.RESET,
     ),
-    "interval": Verb("set the interval of a message; imud rejects more than the bus can carry", _interval),
     "send_once": Verb("send a message once immediately and wait for it", _send_once, changes=False),
-    "bitrate": Verb(
-        "set the bit rate, effective after `save` and `restart`: then the device disturbs the bus until the "
-        "interface and all other devices use the same bit rate",
-        _bitrate,
-        Risk.CONNECTION,
-    ),
-    "address": Verb(
-        "set the address, effective after `save` and `restart`, in some devices immediately; imud follows the device "
-        "and rejects an address that is in use",
-        _address,
-        Risk.CONNECTION,
-    ),
     "zero": Verb("make the present position zero, or cancel it", _zero),
-    "direction": Verb("reverse the sign of an angle", _direction),
+}
+
+
+RENAMED: Final[Mapping[str, str]] = {
+    "interval": "{pgn}_interval_ms={interval_ms}",
+    "bitrate": "bit_rate={bitrate} --save",
+    "address": "address={address} --save",
+    "direction": "{axis}_reversed={reversed}",
 }
 
 
@@ -285,6 +230,7 @@ DRIVER: Final = CanDriver(
     navigation_frame="ENU",
     data_sheet=REGISTERS,
     verbs=VERBS,
+    renamed=RENAMED,
     device_settings=SETTINGS,
     calibrations=inclinometer_zero("6.2.2", VERBS),
     node_of=_node_of,

@@ -44,17 +44,6 @@ def _simple(words: str, begin: Callable[[], TransferScript[None]], risk: Risk = 
     return Verb(words, lambda _target: begin(), risk)
 
 
-def _address(
-    target: Target,
-    *,
-    address: Annotated[
-        int,
-        Meta(ge=1, le=ID_MAX, description="address that is unused on the bus", extra={"section": "4.3.3"}),
-    ],
-) -> TransferScript[str]:
-    return commands.change_address(commands.places_of(target)[0], address)
-
-
 def _restart(target: Target) -> TransferScript[str]:
     return commands.restart(commands.places_of(target), target.baud)
 
@@ -63,32 +52,10 @@ def _factory_reset(target: Target) -> TransferScript[str]:
     return commands.factory_reset(commands.places_of(target), target.baud)
 
 
-def _baud(
-    _target: Target,
-    *,
-    baud: Annotated[BaudRate, Meta(description="baud rate of the bus", extra={"unit": "bit/s", "section": "4.3.2"})],
-) -> TransferScript[str]:
-    return commands.set_baud(baud)
-
-
-def _attitude_mode(
-    _target: Target, *, axes: Annotated[Literal[6, 9], Meta(extra={"section": "4.3.6"})]
-) -> TransferScript[str]:
-    return commands.set_heading_mode(AttitudeMode.NINE_AXIS if axes == 9 else AttitudeMode.SIX_AXIS)
-
-
 def _level(
     _target: Target, *, level: Annotated[Literal["relative", "automatic", "cancel"], Meta(extra={"section": "4.3.5"})]
 ) -> TransferScript[None]:
     return commands.auto_level(LevelReset[level.upper()])
-
-
-def _mounting(
-    _target: Target,
-    *,
-    mounting: Annotated[Literal["level", "y_down", "y_up", "x_up", "x_down"], Meta(extra={"section": "4.3.4"})],
-) -> TransferScript[str]:
-    return commands.set_mounting(LineMounting[mounting.upper()])
 
 
 def _read(
@@ -112,21 +79,15 @@ VERBS: Final[Verbs] = {
         _factory_reset,
         Risk.RESET,
     ),
-    "address": Verb(
-        "set the address without saving and follow the device; imud rejects an address that is in use",
-        _address,
-        Risk.CONNECTION,
-    ),
-    "baud": Verb(
-        "set the baud rate, effective after `save` and `restart`: then imud receives nothing from the device until the "
-        "bus and all other devices use the same baud rate",
-        _baud,
-        Risk.CONNECTION,
-    ),
-    "attitude_mode": Verb("set 6-axis mode, or 9-axis mode with the magnetometer", _attitude_mode),
     "level": Verb("make the present attitude level, or cancel it; the device must be at rest", _level),
-    "mounting": Verb("set the mounting of the device", _mounting),
     "read": Verb("read a register as words of 16 bits", _read, changes=False),
+}
+
+RENAMED: Final[Mapping[str, str]] = {
+    "address": "address={address}",
+    "baud": "baud={baud} --save",
+    "attitude_mode": "mode={axes}-axis",
+    "mounting": "mounting={mounting} --save",
 }
 
 DONE_PERCENT: Final = 100
@@ -265,6 +226,7 @@ DRIVER: Final = PolledDriver(
     example_reading=_example_reading,
     status_bits=MAIN_STATUS,
     verbs=VERBS,
+    renamed=RENAMED,
     device_settings=SETTINGS,
     calibrations=CALIBRATIONS,
 )

@@ -364,15 +364,6 @@ def rates_hz(config: ComConfig | None) -> dict[OutputMessage, float]:
     return {OutputMessage(name): 1 / period_s for name, period_s in periods_s.items() if period_s > 0}
 
 
-def set_output(message: OutputMessage, rate_hz: OutputRate, baud: int) -> RequestScript[None]:
-    """Set the rate of a message; 0: off. Raises BadArgument if the serial port cannot carry all messages."""
-    if rate_hz and baud in BAUD_RATES:
-        require_room({message: rate_hz}, baud)
-        present = rates_hz((yield from ask_outputs()))
-        require_room({**present, message: rate_hz}, baud)
-    yield from send(log_ontime(message, rate_hz))
-
-
 def wake() -> RequestScript[bool | None]:
     """Enable frames (LOG ENABLE) if a message has a rate in the device settings.
 

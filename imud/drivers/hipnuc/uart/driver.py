@@ -27,7 +27,6 @@ from imud.drivers.hipnuc.common import (
     FLOATS,
     MAIN_STATUS,
     NINE_AXES_NEEDED,
-    AttitudeMode,
     LevelReset,
     heading_by_mode,
     levels,
@@ -47,16 +46,7 @@ from imud.drivers.hipnuc.uart.codec import (
 )
 from imud.drivers.hipnuc.uart.commands import (
     BAUD_RATES,
-    PIN_MAX,
-    SOUT_DIVIDER_MAX,
-    AlarmAxis,
-    BaudRate,
-    Mounting,
-    MountingName,
     OutputMessage,
-    OutputRate,
-    PinFunction,
-    PinName,
     Query,
     YawMode,
     ask,
@@ -80,9 +70,6 @@ from imud.model.units import NS_PER_MS
 
 Message = Annotated[OutputMessage, Meta(extra={"section": "2.2.5"})]
 Degrees = Annotated[float, Meta(ge=-180, le=180, extra={"unit": "°", "section": "2.2.4"})]
-Enabled = Annotated[bool, Meta(extra={"section": "2.2.4"})]
-
-_MOUNTINGS: Final = {mounting.name.lower(): mounting for mounting in Mounting}
 
 
 def _simple(words: str, make: Callable[[], Request], risk: Risk = Risk.NONE) -> Verb:
@@ -110,39 +97,8 @@ def _wake(target: Target) -> RequestScript[str]:
     return commands.wake_by_force(target.baud)
 
 
-def _baud(
-    target: Target,
-    *,
-    baud: Annotated[
-        BaudRate, Meta(description="baud rate of the serial port", extra={"unit": "bit/s", "section": "2.2.3"})
-    ],
-) -> RequestScript[dict[str, int | str]]:
-    return _followed(target, commands.change_baud(baud, target.baud))
-
-
-def _output(
-    target: Target,
-    *,
-    message: Message,
-    rate_hz: Annotated[OutputRate, Meta(description="output rate, 0: off", extra={"unit": "Hz", "section": "2.2.5"})],
-) -> RequestScript[None]:
-    return commands.set_output(message, rate_hz, target.baud)
-
-
-def _output_on_mark(_target: Target, *, message: Message) -> RequestScript[None]:
-    return send(commands.log_onmark(message))
-
-
 def _output_once(_target: Target, *, message: Message) -> RequestScript[None]:
     return send(commands.log_once(message))
-
-
-def _output_enabled(_target: Target, *, enabled: Enabled) -> RequestScript[None]:
-    return send(commands.log_enable() if enabled else commands.log_disable())
-
-
-def _mode(_target: Target, *, axes: Annotated[Literal[6, 9], Meta(extra={"section": "2.2.4"})]) -> RequestScript[None]:
-    return send(commands.attitude_mode(AttitudeMode.NINE_AXIS if axes == 9 else AttitudeMode.SIX_AXIS))
 
 
 def _level(
@@ -162,48 +118,6 @@ def _yaw(
     return send(commands.yaw(YawMode.RELATIVE if relative else YawMode.ABSOLUTE, angle_deg))
 
 
-def _mounting(
-    _target: Target,
-    *,
-    turned: Annotated[
-        MountingName | Annotated[list[float], Meta(min_length=9, max_length=9)],
-        Meta(
-            description="new axis that points up or down in place of Z, or the nine numbers C00 … C22 of URFR",
-            extra={"section": "2.2.4"},
-        ),
-    ],
-) -> RequestScript[None]:
-    if isinstance(turned, str):
-        return send(commands.mounting(_MOUNTINGS[turned]))
-    a, b, c, d, e, f, g, h, i = turned
-    return send(commands.mounting(((a, b, c), (d, e, f), (g, h, i))))
-
-
-def _magnetic_calibration(_target: Target, *, enabled: Enabled) -> RequestScript[None]:
-    return send(commands.magnetic_calibration(enabled))
-
-
-def _pin(
-    _target: Target,
-    *,
-    function: Annotated[PinName, Meta(extra={"section": "2.2.4"})],
-    pin: Annotated[int, Meta(ge=1, le=PIN_MAX, description="number of the pin, 1 for IO1", extra={"section": "2.2.4"})],
-) -> RequestScript[None]:
-    return send(commands.pin_function(PinFunction[function.upper()], pin))
-
-
-def _alarm(
-    _target: Target, *, axis: AlarmAxis, min_deg: Degrees, max_deg: Degrees, enabled: Enabled = True
-) -> RequestScript[None]:
-    return send(commands.alarm(axis, min_deg, max_deg, enabled))
-
-
-def _sout_divider(
-    _target: Target, *, divisor: Annotated[int, Meta(ge=1, le=SOUT_DIVIDER_MAX, extra={"section": "2.2.4"})]
-) -> RequestScript[None]:
-    return send(commands.sout_divider(divisor))
-
-
 VERBS: Final[Verbs] = {
     "save": replace(_simple("write all settings to flash", commands.save_config), saves=True, changes=False),
     "restart": Verb("restart the device and wait until it replies; unsaved settings are lost", _restart),
@@ -215,26 +129,26 @@ VERBS: Final[Verbs] = {
     "wake": Verb(
         "enable frames, and send HI91 if no message has a rate, also in place of output on mark; not saved", _wake
     ),
-    "baud": Verb(
-        "set the baud rate, save all settings, restart the device and follow it", _baud, Risk.CONNECTION, saves=True
-    ),
-    "output": Verb("set the output rate of a message; 0: off", _output),
-    "output_on_mark": Verb("send a message for each pulse on SIN", _output_on_mark),
     "output_once": Verb("send a message once, as after a pulse on SIN", _output_once, changes=False),
-    "output_none": _simple("set the output rate of all messages to 0", commands.unlog_all),
-    "output_enabled": Verb("enable or disable the frames of all rates", _output_enabled),
-    "mode": Verb("set 6-axis mode, or 9-axis mode with the magnetometer", _mode),
     "level": Verb(
         "make the present pitch and roll zero, or level a nearly level device, or cancel; only at rest", _level
     ),
     "yaw": Verb("set the heading; lost at power-off", _yaw),
-    "mounting": Verb("set the mounting of the device; requires save and restart", _mounting),
-    "magnetic_calibration": Verb(
-        "enable or disable the background calibration of the magnetometer", _magnetic_calibration
-    ),
-    "pin": Verb("set the function of a pin", _pin),
-    "alarm": Verb("watch an angle with the alarm pin", _alarm),
-    "sout_divider": Verb("set the divisor of SOUT pulses for SOUT_DIV", _sout_divider),
+}
+
+
+RENAMED: Final[Mapping[str, str]] = {
+    "baud": "baud={baud} --save",
+    "output": "output.{message}={rate_hz}",
+    "output_on_mark": "output.{message}=on_mark",
+    "output_none": "output.hi91=0 output.hi92=0",
+    "output_enabled": "output_enabled={enabled}",
+    "mode": "mode={axes}-axis",
+    "mounting": "mounting={turned} --save",
+    "magnetic_calibration": "magnetic_calibration={enabled}",
+    "pin": "pins.{function}={pin}",
+    "alarm": "alarm.{axis}.min_deg={min_deg} alarm.{axis}.max_deg={max_deg} alarm.{axis}.enabled={enabled|true}",
+    "sout_divider": "sout_divisor={divisor}",
 }
 
 
@@ -342,6 +256,7 @@ DRIVER: Final = StreamDriver(
     declared_line_differences=declared_line_differences,
     limits=message_limits,
     verbs=VERBS,
+    renamed=RENAMED,
     device_settings=SETTINGS,
     calibrations=CALIBRATIONS,
     identify=identify,

@@ -23,11 +23,8 @@ from imud.contracts.driver import StreamDriver, random_vector
 from imud.contracts.script import RequestScript, pause
 from imud.drivers.imu61x.common import (
     EULER_CONVENTION,
-    FILTERS,
     NAVIGATION_FRAME,
     SHEET,
-    filter_code,
-    i2c_address,
     relative_heading,
 )
 from imud.drivers.imu61x.uart import commands, settings
@@ -35,38 +32,29 @@ from imud.drivers.imu61x.uart.codec import (
     RESULT_DONE,
     TIMER_MODULUS,
     Imu61xCodec,
-    Parameter,
     encode_ahrs,
     parse_acknowledgement,
     parse_status,
 )
 from imud.drivers.imu61x.uart.commands import (
     BAUD_RATES,
-    BusMode,
     Imu61xUartOptions,
     acknowledged,
     answered,
     in_command_mode,
     read3,
-    require_fit,
     settled,
 )
 from imud.drivers.imu61x.uart.settings import (
     GYRO_OFFSETS,
     INSTALLATION_ANGLES,
     SETTINGS,
-    AccelFilter,
-    Address,
-    Baud,
-    GyroFilter,
-    OutputRate,
-    SecondBus,
     codes_of,
     identify,
     read_settings,
     wake,
 )
-from imud.model.errors import BadArgument, NoReply
+from imud.model.errors import NoReply
 from imud.model.sample import Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
@@ -166,14 +154,6 @@ Heading = Annotated[
 ]
 Answer = Mapping[str, Any]  # result of a verb, by name
 
-_BUS_NOTE: Final = (
-    "effective immediately or after the next start (not documented); a host on the previously selected bus "
-    "loses the device: change driver and link in its configuration"
-)
-_ADDRESS_NOTE: Final = (
-    "effective immediately or after the next start (not documented); a host that uses the old address "
-    "loses the device: change `i2c.address` in its configuration to the new address or `auto`"
-)
 _STOP_NOTE: Final = "no samples until `start_streaming`; with `save`, the device is silent after every power-on"
 
 
@@ -183,37 +163,6 @@ def _done(target: Target) -> int:
 
 def _factory_reset(target: Target) -> RequestScript[settings.BaudChange]:
     return settings.with_advice(settings.factory_reset(target.baud, done=_done(target)), target.fixed_baud)
-
-
-def _baud(target: Target, *, baud: Baud) -> RequestScript[settings.BaudChange]:
-    script = settings.change_baud(baud, target.baud, done=_done(target))
-    return settings.with_advice(script, target.fixed_baud)
-
-
-def _rate(target: Target, *, rate_hz: OutputRate) -> RequestScript[None]:
-    if target.baud:
-        try:
-            require_fit(rate_hz, target.baud)
-        except BadArgument as error:
-            raise BadArgument(f"rate_hz: {error}; first change the baud rate with the verb `baud`") from None
-    return settings.write_parameter(Parameter.AHRS_RATE, rate_hz)
-
-
-def _filter(_target: Target, *, accel_filter: AccelFilter, gyro_filter: GyroFilter) -> RequestScript[Answer]:
-    accel, gyro = filter_code(accel_filter), filter_code(gyro_filter)
-    yield from settings.write_filters(accel, gyro)
-    return {"accel_filter": FILTERS[accel], "gyro_filter": FILTERS[gyro]}
-
-
-def _i2c_address(_target: Target, *, address: Address) -> RequestScript[Answer]:
-    number = i2c_address(address)
-    yield from settings.write_parameter(Parameter.I2C_ADDRESS, number)
-    return {"i2c_address": f"{number:#04x}", "configuration": _ADDRESS_NOTE}
-
-
-def _bus(_target: Target, *, bus: SecondBus) -> RequestScript[Answer]:
-    yield from settings.write_parameter(Parameter.BUS_MODE, BusMode[bus.upper()])
-    return {"second_bus": bus, "configuration": _BUS_NOTE}
 
 
 def _stop(target: Target) -> RequestScript[Answer]:
@@ -237,11 +186,6 @@ VERBS: Final[Verbs] = {
     "status": Verb(
         "read versions, model and state; names that end in _raw have no documented unit",
         lambda _target: settings.device_status(),
-        changes=False,
-    ),
-    "settings": Verb(
-        "read all settings from the device, with units in their names",
-        lambda _target: settings.read_settings(),
         changes=False,
     ),
     "sample_once": Verb(
@@ -269,23 +213,6 @@ VERBS: Final[Verbs] = {
         Risk.RESET,
         saves=True,
     ),
-    "baud": Verb(
-        "set and save the baud rate and follow the device; then change a fixed `uart.baud` in the configuration",
-        _baud,
-        Risk.CONNECTION,
-        saves=True,
-    ),
-    "rate": Verb("set the output rate; the baud rate limits it", _rate),
-    "filter": Verb("set the low-pass filters, by name or by code in the order of the names", _filter),
-    "i2c_address": Verb(
-        "set the I2C address; a host that uses the old address loses the device until you change its `i2c.address`",
-        _i2c_address,
-    ),
-    "bus": Verb(
-        "select the bus in addition to the UART; a host on the other bus loses the device and needs another link and "
-        "driver",
-        _bus,
-    ),
     "heading": Verb("set the heading", _heading),
     "calibrate_gyro": Verb("measure the bias of the gyroscope at rest and wait for the end; returns it in °/s", _gyro),
     "calibrate_installation": Verb(
@@ -296,6 +223,15 @@ VERBS: Final[Verbs] = {
         lambda _target: installation_status(),
         changes=False,
     ),
+}
+
+RENAMED: Final[Mapping[str, str]] = {
+    "settings": "",
+    "baud": "baud={baud} --save",
+    "rate": "output_rate_hz={rate_hz}",
+    "filter": "accel_filter={accel_filter} gyro_filter={gyro_filter}",
+    "i2c_address": "i2c_address={address}",
+    "bus": "second_bus={bus}",
 }
 
 _SAVE: Final = VERBS["save"].begin
@@ -358,6 +294,7 @@ DRIVER: Final = StreamDriver(
     heading=relative_heading,
     lines=frozenset({"reset"}),
     verbs=VERBS,
+    renamed=RENAMED,
     calibrations=CALIBRATIONS,
     device_settings=SETTINGS,
     identify=identify,

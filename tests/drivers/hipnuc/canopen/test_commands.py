@@ -34,7 +34,7 @@ def test_a_restart_a_slow_save_and_a_refused_write() -> None:
 
     for invert in (False, True):
         bench = CanopenBench()
-        bench.run_script(session.set_inclinometer_signs(8, invert_x=False, invert_y=invert))
+        bench.run_script(session.set_inclinometer_sign(8, "y", invert=invert))
         assert (0x608, bytes([0x23, 0x9F, 0x20, 0, invert, 0, 0, 0])) in bench.sent
 
 
@@ -106,7 +106,7 @@ def test_a_confirmed_write_to_an_unreadable_node_is_unverified(reads: Literal["i
     bench = CanopenBench(variant=NodeVariant(reads=reads))
     assert bench.run_script(session.set_tpdo_period(8, 7, 20)) is Written.UNVERIFIED
     assert bench.module.objects.settings.periods_ms[7] == 20
-    assert bench.run_script(session.set_inclinometer_signs(8, invert_x=True, invert_y=False)) is Written.UNVERIFIED
+    assert bench.run_script(session.set_inclinometer_sign(8, "x", invert=True)) is Written.UNVERIFIED
     assert bench.run_script(session.set_bit_rate(8, 250_000)) is Written.UNVERIFIED_PENDING
 
 

@@ -11,15 +11,13 @@ from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.drivers.hipnuc.canopen.driver import DRIVER
 from imud.model.errors import BadArgument
 from imud.sim.hipnuc.canopen import NodeSettings
+from tests.support.old_spellings import script_of
 from tests.support.simulated_modules import QUIET, CanopenBench
 
 
 def begun(name: str, at: int = 8, /, **given: object) -> RequestScript[Any]:
-    """Return the script of an action for the node in the options."""
-    action = DRIVER.verbs[name]
-    conversation: RequestScript[Any] = action.script(
-        Target(HipnucCanopenOptions(node=at), 500_000), action.arguments(given)
-    )
+    """Return the script of a verb or of a setting for the node in the options."""
+    conversation: RequestScript[Any] = script_of(DRIVER, Target(HipnucCanopenOptions(node=at), 500_000), name, given)
     return conversation
 
 
@@ -73,7 +71,7 @@ def test_network_management(command: str, code: int) -> None:
     bench = CanopenBench(NodeSettings(node=5))
     bench.run_script(begun("nmt", 5, command=command))
     assert (0, bytes([code, 5])) in bench.sent
-    assert {name for name, _, _ in ROWS} | {"nmt"} == set(DRIVER.verbs)
+    assert {name for name, _, _ in ROWS} | {"nmt"} == {*DRIVER.verbs, *DRIVER.renamed}
 
 
 @pytest.mark.parametrize(
@@ -116,12 +114,10 @@ def test_the_module_obeys() -> None:
 
 
 def test_an_interval_above_the_bus_load_is_rejected_with_numbers() -> None:
-    bench = CanopenBench(NodeSettings(node=8))
-
     def interval(bit_rate: int, others_bit_s: float) -> object:
-        action = DRIVER.verbs["interval"]
+        bench = CanopenBench(NodeSettings(node=8))
         target = bench.target(bit_rate, others_bit_s)
-        return bench.run_script(action.script(target, action.arguments({"tpdo": 1, "interval_ms": 5})))
+        return bench.run_script(script_of(DRIVER, target, "interval", {"tpdo": 1, "interval_ms": 5}, **bench.present()))
 
     # 95 bits · 200 + (95 + 95 + 111 + 111) · 100 + 79 · 20 = 61,780 bit/s: 49.4 % of 125 kbit/s (TPDO1: 15.2 %)
     assert interval(125_000, 63_000.0) is Written.VERIFIED

@@ -6,13 +6,13 @@ from imud.contracts.command import Target, parameters_of
 from imud.drivers.hipnuc.modbus.codec import HipnucModbusOptions
 from imud.drivers.hipnuc.modbus.driver import DRIVER
 from imud.model.errors import BadArgument
+from tests.support.old_spellings import script_of
 from tests.support.pty_port import ModbusBench
 from tests.support.pty_port import modbus_slave as module
 
 
 def act(bench: ModbusBench, name: str, **given: object) -> object:
-    action = DRIVER.verbs[name]
-    result: object = bench.run(action.script(bench.target, action.arguments(given)))
+    result: object = bench.run(script_of(DRIVER, bench.target, name, given))
     return result
 
 
@@ -42,27 +42,26 @@ def test_requests_as_sent(name: str, given: dict[str, object], sent: str) -> Non
 
 
 def test_actions_without_an_address_and_reading_by_name() -> None:
-    action = DRIVER.verbs["address"]
     with pytest.raises(BadArgument, match="expected a device on an RS-485 bus with a known address"):
-        action.script(Target(HipnucModbusOptions(), 0), action.arguments({"address": 9}))
+        script_of(DRIVER, Target(HipnucModbusOptions(), 0), "address", {"address": 9})
     bench = ModbusBench(module(7))
     assert act(bench, "read", register="MD_ID") == (7,)
     assert act(bench, "read", register="sn") == (0xA000, 0, 0, 7)
     for name in ("CTRL", "nothing"):
         with pytest.raises(BadArgument, match="HEADING_MODE"):
             act(bench, "read", register=name)
-    assert all(action.help for action in DRIVER.verbs.values())
-    assert [str(one) for one in parameters_of(DRIVER.verbs["attitude_mode"])] != []
+    assert all(verb.help for verb in DRIVER.verbs.values())
+    assert [str(one) for one in parameters_of(DRIVER.verbs["level"])] != []
 
 
 @pytest.mark.parametrize(
     ("name", "given", "names"),
     [
         ("address", {"address": 129}, "from 1 to 128"),
-        ("address", {}, "from 1 to 128"),
+        ("address", {}, "address is a setting: imud settings bow --set address=ADDRESS"),
         ("baud", {"baud": 12345}, "4800, 9600"),
         ("mounting", {"mounting": 1}, "level"),
-        ("attitude_mode", {"axes": 1}, "6, 9"),
+        ("attitude_mode", {"axes": 1}, '"6-axis", "9-axis"'),
         ("level", {"level": 3}, "automatic"),
     ],
 )

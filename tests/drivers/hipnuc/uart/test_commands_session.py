@@ -5,6 +5,7 @@ from typing import TypeVar
 
 import pytest
 
+from imud.contracts.command import Target
 from imud.contracts.script import Outcome, Rejection, Reply, Request, RequestScript, Silence
 from imud.drivers.hipnuc.uart.commands import (
     OutputMessage,
@@ -16,9 +17,11 @@ from imud.drivers.hipnuc.uart.commands import (
     read_settings,
     wake,
 )
+from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.model.errors import BadArgument, NoReply, Rejected
 from imud.model.ledger import Ledger
 from imud.sim.hipnuc.uart_settings import VARIANTS, Behaviour, ModuleSettings, Output, RateChange
+from tests.support.old_spellings import script_of
 from tests.support.script_runners import offline_runner
 from tests.support.simulated_modules import HipnucLine, hardware_of, run_script
 
@@ -109,7 +112,7 @@ every_variant = pytest.mark.parametrize("behaviour", VARIANTS.values(), ids=VARI
 @pytest.mark.manual("B 2.2.3 SERIALCONFIG")
 def test_another_baud_rate_is_followed_and_saved(behaviour: Behaviour, baud: int) -> None:
     line = HipnucLine(ModuleSettings(hi91=Output(200)), hardware_of(behaviour))
-    assert line.act("baud", baud=baud) == {"baud": baud}
+    assert line.act("baud", baud=baud) == baud
     assert line.baud == line.module.baud == line.module.flash.baud == baud
     line.module.reboot(line.now_ns)
     line.wait(line.module.hardware.boot_ms)
@@ -167,14 +170,18 @@ def test_a_baud_rate_that_does_not_carry_the_present_output_is_refused(
 @pytest.mark.manual("B 2.2.5 output and line", "B 2.2.5 ONTIME")
 def test_the_sum_of_all_messages_is_refused_and_a_sum_that_fits_is_not() -> None:
     """100 Hz of HI91 need 82000 of 115200 bit/s. HI92 needs 540 bits per frame: 95 % leave 50 Hz and not 100."""
-    line = HipnucLine()
+    line, actual = HipnucLine(), {"output": {"hi91": 100, "hi92": 0}}
+
+    def output(message: str, rate_hz: int) -> None:
+        given = {"message": message, "rate_hz": rate_hz}
+        line.run(script_of(DRIVER, Target(None, 115200), "output", given, **actual))
+
     with pytest.raises(BadArgument, match="got 136000 bit/s by HI91 at 100 Hz and HI92 at 100 Hz"):
-        line.act("output", message="HI92", rate_hz=100)
+        output("HI92", 100)
     assert "LOG HI92 ONTIME 0.01" not in line.asked
-    line.act("output", message="HI92", rate_hz=50)
+    output("HI92", 50)
     assert line.module.settings.hi92 == Output(20)
-    line = HipnucLine()
-    line.act("output", message="HI91", rate_hz=25)
+    output("HI91", 25)
     assert line.module.settings.hi91 == Output(40)
 
 
