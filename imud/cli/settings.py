@@ -225,7 +225,7 @@ def _change(client: Client, args: argparse.Namespace, given: Mapping[str, Any] |
     done = msgspec.convert(client.call("settings.apply", **params), AppliedSettings)
     print(msgspec.json.encode(done).decode() if args.json else _account(done))
     # also 1 if the device did not keep a value
-    return 1 if done.problem or done.left_out or done.differences else 0
+    return 1 if done.failure else 0
 
 
 def _planned(plan: SettingsPlan) -> str:

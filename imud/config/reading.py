@@ -53,6 +53,9 @@ def _config(keys: Keys, tables: Tables, pause: Callable[[], None]) -> Config | N
     keys.unknown_keys((), top, known)
     general = keys.settings(General, (), {key: top[key] for key in General.__struct_fields__ if key in top})
     publishers = {name: keys.row(tables.publishers, name, top.get(name)) for name in tables.publishers}
+    for name, options in publishers.items():
+        for path, message in tables.publishers[name].check(options, tables.drivers).items() if options else ():
+            keys.problem((name, *path), message)
     devices = DeviceReader(keys, tables, pause).devices(top)
     if general is None or devices is None or keys.problems:
         return None

@@ -19,6 +19,7 @@ from imud.model.errors import LinkError
 from imud.model.options import Options
 
 # Width of a SOUT pulse, µs. The first byte follows the falling edge (HiPNUC manual 1.2.2, PMUX2).
+LINE_VERBS: Final = ("reset", "trigger")  # commands of a device with the line `reset` or `sin`
 SOUT_WIDTH_US: Final = 80.0
 SIN_DELAY_US: Final = 125.0  # mean time from the rising edge on SIN to the start of the frame, µs (HiPNUC manual 1.2.1)
 

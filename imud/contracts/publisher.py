@@ -9,6 +9,7 @@ from typing import Any, Final, Protocol
 from imud.attitude.conventions import Convention
 from imud.attitude.published import PublishedAxes, as_sent
 from imud.contracts.command import CalibrationResult, Calibrations, Verbs
+from imud.contracts.driver import Driver
 from imud.contracts.lines import UtcReference, WatchLine
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import ClientStatus, DeviceStatus, FlightStatus, MqttStatus, OutputStatus, RecorderStatus
@@ -254,3 +255,5 @@ class PublisherType:
     wanted: Callable[[Any], bool] = attrgetter("enabled")  # whether these options enable the publisher
     # Whether the daemon exits if the first start of the publisher fails. Otherwise the daemon tries again periodically.
     required: bool = True
+    # Finds keys that contradict the drivers. Returns a reason, one sentence, by the path of the key.
+    check: Callable[[Any, Mapping[str, Driver]], Mapping[tuple[str, ...], str]] = lambda _options, _drivers: {}

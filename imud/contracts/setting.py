@@ -246,3 +246,10 @@ class AppliedSettings(msgspec.Struct, frozen=True):
     # Next step of the user, for example a change of the configuration, so that imud finds the device at its next start;
     # empty if no step is necessary
     advice: str = ""
+
+    @property
+    def failure(self) -> str:
+        """Reason why the device lacks a wanted value; empty if it has all wanted values."""
+        left_out = [f"{name} {why}" for name, why in self.left_out.items()]
+        others = [f"{name}: expected {one.declared}, got {one.actual}" for name, one in self.differences.items()]
+        return "; ".join([self.problem] if self.problem else [*left_out, *others])

@@ -4,7 +4,7 @@
     broker ◀── sender ◀───────────────────── reply ◀──────────────────────────────────────┘
 
 The access rights of the broker decide who may send requests. The configuration of the gateway decides which commands
-are allowed. The device checks the arguments, as for the socket.
+are allowed. The device checks the arguments, as for the socket. The command `set` changes device settings.
 
 imud runs each request once. It stores the ID of a request until the request is too old, and rejects requests from
 before its start. A reply can be lost with its connection. If the sender repeats the same request with the same ID, imud
@@ -34,14 +34,16 @@ from imud.fleet.messages import (
     decode_request,
     parse_topic,
 )
-from imud.fleet.settings import CommandOptions
+from imud.fleet.settings import SET, CommandOptions
 from imud.fleet.streams import Gateway
 from imud.host.log import SAME_AS, shown
-from imud.model.errors import ImudError
+from imud.model.errors import BadArgument, ImudError
+from imud.model.options import got
 from imud.model.units import NS_PER_S
 
 log = logging.getLogger(__name__)
 
+SAVE: Final = "save"  # argument of the command `set`: whether to write the settings to flash
 WAITING_MAX: Final = 8  # Maximum number of waiting requests. A command takes at most one second, a calibration longer.
 MINUTE_NS: Final = 60 * NS_PER_S
 ANSWERS_KEPT: Final = 32  # number of stored replies for repeated requests
@@ -149,7 +151,8 @@ class CommandChannel:
             del self._known[next(iter(self._known))]
         if request.id in self._known:
             return Outcome.DUPLICATE, "the gateway already received a request with this id"
-        if not self._settings.allows(asked.device, request.action):
+        settings = [name for name in request.arguments if name != SAVE]
+        if not self._settings.allows(asked.device, request.action, settings):
             return (
                 Outcome.DENIED,
                 "mqtt.commands.actions in the configuration of the gateway does not allow the command",
@@ -220,7 +223,11 @@ class CommandChannel:
             extra=_own_log_line(asked),
         )  # fmt: skip
         try:
-            result = await self._control(asked.device).act(request.action, request.arguments)
+            control = self._control(asked.device)
+            if request.action == SET:
+                await self._set(asked, control)
+                return
+            result = await control.act(request.action, request.arguments)
         except ImudError as error:
             log.warning("mqtt: %s: request %s failed: %s", asked.device, request.id, error, extra=_own_log_line(asked))
             self._end(asked, Outcome.FAILED, error=str(error))
@@ -230,6 +237,19 @@ class CommandChannel:
         else:
             log.info("mqtt: %s: request %s is done: %s", asked.device, request.id, shown(result))
             self._end(asked, Outcome.DONE, result=result)
+
+    async def _set(self, asked: _Request, control: DeviceControl) -> None:
+        """Set settings and send the reply. Raises ImudError if imud did not begin."""
+        settings = dict(asked.request.arguments)
+        save = settings.pop(SAVE, False)
+        if not isinstance(save, bool):
+            raise BadArgument(f"{SAVE}: expected true or false, got {got(save)}")
+        if not settings and not save:
+            raise BadArgument(f"{SET}: expected at least one setting by name, or `{SAVE}`, got neither")
+        applied = await control.settings_apply(settings, save=save)
+        failure, result = applied.failure, msgspec.to_builtins(applied)
+        log.info("mqtt: %s: request %s set %s", asked.device, asked.request.id, failure or shown(settings))
+        self._end(asked, Outcome.FAILED if failure else Outcome.DONE, result=result, error=failure)
 
     def close(self) -> None:
         """Stop the running request without a reply. A second call does nothing."""

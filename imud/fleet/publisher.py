@@ -33,7 +33,7 @@ from imud.fleet.messages import (
     topic_of,
 )
 from imud.fleet.sender import MqttSender
-from imud.fleet.settings import DeviceSending, MqttOptions, broker_of
+from imud.fleet.settings import DeviceSending, MqttOptions, broker_of, check_commands
 from imud.fleet.spool import Spool
 from imud.fleet.streams import Gateway, gateway_clock
 from imud.fleet.writer import SentState, SpoolWriter, WriterQueue
@@ -410,4 +410,4 @@ def settings_of(status: DeviceStatus) -> dict[str, object] | None:
     return found
 
 
-PUBLISHER = PublisherType("mqtt", MqttOptions, MqttPublisher, required=False)
+PUBLISHER = PublisherType("mqtt", MqttOptions, MqttPublisher, required=False, check=check_commands)

@@ -1,18 +1,23 @@
 """Options of the output `mqtt`."""
 
+import re
+from collections.abc import Collection, Iterator, Mapping
 from enum import StrEnum
 from typing import Annotated, Final, Literal, NamedTuple
 from urllib.parse import urlsplit
 
 import msgspec
 
+from imud.contracts.driver import Driver
+from imud.contracts.lines import LINE_VERBS
 from imud.fleet.messages import NAME_PATTERN, is_name
-from imud.model.options import Options, is_host, shown
+from imud.model.options import Options, is_host, shown, unknown_name
 from imud.model.units import NS_PER_S
 
 MEGABYTE: Final = 1_000_000
 BROKERS_MAX: Final = 16  # Maximum number of brokers. imud tries them in order, and more brokers would take minutes.
 EVERY: Final = "*"  # key for all devices without an entry of their own
+SET: Final = "set"  # command that changes settings; `set.NAME` allows it for one setting
 Measure = Literal["mean", "min", "max", "rms"]
 Name = Annotated[str, msgspec.Meta(pattern=f"^({NAME_PATTERN})?$", extra={"words": "letters, digits, _ and -"})]
 
@@ -56,7 +61,8 @@ class CommandOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=T
     enabled: bool = False
     """Accept commands for devices over the broker. The rights on the broker decide who can send commands."""
     actions: Annotated[list[str], msgspec.Meta(max_length=256)] = msgspec.field(default_factory=list[str])
-    """Allowed actions: `ACTION` for all devices, `DEVICE/ACTION` for one device. imud rejects all other actions."""
+    """Allowed commands: `COMMAND` for all devices, `DEVICE/COMMAND` for one device. `set` allows the change of all
+    settings, `set.NAME` of one setting. imud rejects all other commands."""
     max_age_s: Annotated[float, msgspec.Meta(ge=1, le=600)] = 30.0
     """Maximum difference between `issued_utc_ns` of a request and the clock of the gateway, s."""
     per_minute: Annotated[int, msgspec.Meta(ge=1, le=600)] = 30
@@ -66,12 +72,17 @@ class CommandOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=T
         """Raise ValueError if an entry is not the name of a command."""
         for entry in self.actions:
             device, slash, action = entry.rpartition("/")
-            if not is_name(action) or (slash and not is_name(device)):
-                raise ValueError(f"actions: expected names of commands, or DEVICE/COMMAND, got {shown(entry)}")
+            name = action.removeprefix(f"{SET}.")
+            if not is_name(name) or (slash and not is_name(device)):
+                raise ValueError(
+                    f"actions: expected names of commands, {SET}.SETTING, or DEVICE/COMMAND, got {shown(entry)}"
+                )
 
-    def allows(self, device: str, action: str) -> bool:
-        """Return whether the configuration allows this command."""
-        return action in self.actions or f"{device}/{action}" in self.actions
+    def allows(self, device: str, action: str, settings: Collection[str] = ()) -> bool:
+        """Return whether the configuration allows this command. `settings`: names of settings that `set` changes."""
+        allowed = {entry.removeprefix(f"{device}/") for entry in self.actions}
+        each = {f"{SET}.{name.partition('.')[0]}" for name in settings}
+        return action in allowed or (action == SET and bool(each) and each <= allowed)
 
     @property
     def max_age_ns(self) -> int:
@@ -194,3 +205,43 @@ class MqttOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
     @property
     def spool_age_ns(self) -> int:
         return round(self.spool_hours * 3600 * NS_PER_S)
+
+
+def check_commands(options: MqttOptions, drivers: Mapping[str, Driver]) -> Mapping[tuple[str, ...], str]:
+    """Return the error of each allowed command that no driver has, by the path of the key."""
+    problems = list(_unknown_commands(options.commands.actions, drivers)) if options.commands.actions else []
+    return {("commands", "actions"): "; ".join(problems)} if problems else {}
+
+
+def _unknown_commands(entries: Collection[str], drivers: Mapping[str, Driver]) -> Iterator[str]:
+    verbs, settings, renamed = {SET, *LINE_VERBS}, set[str](), dict[str, set[str]]()
+    for name in drivers:
+        try:
+            driver = drivers[name]
+        except ImportError:  # an extra is missing
+            continue
+        table = driver.device_settings.table if driver.device_settings is not None else {}
+        writable = {setting for setting, one in table.items() if one.write is not None}
+        verbs |= set(driver.verbs)
+        settings |= writable
+        for old, words in driver.renamed.items():
+            renamed.setdefault(old, set()).update(_settings_in(words, writable))
+    for entry in entries:
+        device, slash, action = entry.rpartition("/")
+        if action in verbs:
+            continue
+        if action in renamed:
+            new = ", ".join(f"{device}{slash}{SET}.{name}" for name in sorted(renamed[action]))
+            step = f"use {new}" if new else "remove it"
+            yield f"expected a command, got {shown(entry)}, which is a setting now; {step}"
+        elif not action.startswith(f"{SET}."):
+            yield unknown_name("a command", action, sorted(verbs))
+        elif (name := action.removeprefix(f"{SET}.")) not in settings:
+            yield unknown_name(f"a setting after {SET}.", name, sorted(settings))
+
+
+def _settings_in(words: str, known: Collection[str]) -> set[str]:
+    """Return the settings in a value of `Driver.renamed`. An argument in a name stands for any text."""
+    names = [word.partition("=")[0].partition(".")[0] for word in words.split() if "=" in word]
+    patterns = [re.compile(re.sub(r"\\{\w+\\}", r"\\w+", re.escape(name))) for name in names]
+    return {name for name in known if any(pattern.fullmatch(name) for pattern in patterns)}

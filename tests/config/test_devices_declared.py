@@ -49,7 +49,7 @@ def test_nothing_is_declared(lines: list[str]) -> None:
         ({"lines": ["settings: {mode: 9-axis}"], "driver": "fake-uart"}, "5:5: devices.bow.settings: expected a driver with a table of settings, got fake-uart; drivers with settings: fake-module"),
         ({"lines": ["settings: {mode: 9-axis}", "identify: false"]}, "5:5: devices.bow.settings: expected identify: true, because imud reads the settings only then, got false"),
         ({"lines": ["settings: {output: {a: 1000, b: 500}}"]}, "5:15: devices.bow.settings: output: expected at most 1152 Hz in all at 115200 baud, got 1500 Hz"),
-        ({"lines": ["settings: {baud: 921600}"]}, "5:22: devices.bow.settings.baud: expected 115200, the value that imud uses to open the device, got 921600; change it with `imud command bow baud …`, or use auto if the link supports it"),
+        ({"lines": ["settings: {baud: 921600}"]}, "5:22: devices.bow.settings.baud: expected 115200, the value that imud uses to open the device, got 921600; change it with `imud settings bow --set baud=… --save`, or use auto if the link supports it"),
         ({"lines": ["on_difference: repair"]}, '5:20: devices.bow.on_difference: expected one of "report", "apply", "apply_and_save", got "repair"'),
     ],
 )  # fmt: skip

@@ -85,6 +85,7 @@ class FakeRow:
 
     claims: Callable[[Any], Sequence[Claim]] = lambda _settings: ()
     problem: Callable[[Any, bool], str] = lambda _settings, _frames: ""
+    check: Callable[[Any, Any], Mapping[tuple[str, ...], str]] = lambda _settings, _drivers: {}
 
     def fits(self, driver: "FakeRow") -> bool:
         return driver.settings is not self.refuses
@@ -224,6 +225,10 @@ def test_error_with_its_place(text: str, line: str) -> None:
         ("nmea0183: {sentences: {HTD: 1}}", '1:24: nmea0183.sentences.HTD: expected a key that imud knows, got "HTD"; did you mean HDT?'),
         ("nmea0183:\n  sentences: {HDT: 1, ROT: 1000}", "2:28: nmea0183.sentences.ROT: expected a number from 0.01 to 100, got 1000"),
         ("mqtt: {commands: {per_minute: 0}}", "1:31: mqtt.commands.per_minute: expected a whole number from 1 to 600, got 0"),
+        ("mqtt: {commands: {actions: [save, bow/output, rate, settings, reset]}}", '1:28: mqtt.commands.actions: expected a command, got "bow/output", which is a setting now; use bow/set.output; expected a command, got "rate", which is a setting now; use set.output_rate_hz; expected a command, got "settings", which is a setting now; remove it'),
+        ("mqtt: {commands: {actions: [set, bow/set.mode, restrat]}}", '1:28: mqtt.commands.actions: expected a command that imud knows, got "restrat"; did you mean restart?'),
+        ("mqtt: {commands: {actions: [set.mod]}}", '1:28: mqtt.commands.actions: expected a setting after set. that imud knows, got "mod"; did you mean mode?'),
+        ("mqtt: {commands: {actions: [direction]}}", '1:28: mqtt.commands.actions: expected a command, got "direction", which is a setting now; use set.incli_x_reversed, set.incli_y_reversed, set.x_reversed, set.y_reversed'),
         ("mqtt: {devices: {bow: {rate: 1}}}", '1:24: mqtt.devices.bow.rate: expected a key that imud knows, got "rate"; did you mean rate_hz?'),
         ("mqtt: {devices: {bow: {rate_hz: fast}}}", '1:33: mqtt.devices.bow.rate_hz: expected a number from 0.01 to 100, or null, got "fast"'),
     ],

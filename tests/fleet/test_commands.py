@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from imud.contracts.setting import AppliedSettings, SettingDifference
 from imud.fleet.broker import Received
 from imud.fleet.commands import ANSWERS_KEPT, WAITING_MAX, CommandChannel, CommandReply
 from imud.fleet.messages import REQUEST_BYTES, CommandAnswer, Outcome, answer_topic
@@ -34,7 +35,8 @@ DOCS = Path(__file__).parents[2] / "docs" / "fleet.md"
 
 class FakeDevice:
     def __init__(self) -> None:
-        self.done: list[tuple[str, Mapping[str, Any]]] = []
+        self.done: list[tuple[object, ...]] = []
+        self.applied = AppliedSettings()
         self.go_on: asyncio.Event | None = None
 
     async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
@@ -46,6 +48,10 @@ class FakeDevice:
         if self.go_on is not None:
             await self.go_on.wait()
         return {"serial": 7}
+
+    async def settings_apply(self, given: Mapping[str, Any], *, save: bool) -> AppliedSettings:
+        self.done.append(("set", given, save))
+        return self.applied
 
 
 class ChannelBench:
@@ -120,8 +126,60 @@ def test_commands_that_are_not_allowed_are_denied() -> None:
     bench.run()
     assert (bench.device.done, bench.channel.refused, len(bench.replies)) == ([], 3, 2)
     (wrong,) = wrong_values(CommandOptions, {"actions": ["a b"]})
-    assert "expected names of commands, or DEVICE/COMMAND" in str(wrong)
-    assert wrong_values(CommandOptions, {"actions": ["a", "bow/a"]}) == []
+    assert "expected names of commands, set.SETTING, or DEVICE/COMMAND" in str(wrong)
+    assert wrong_values(CommandOptions, {"actions": ["a", "bow/a", "set", "set.mode", "bow/set.mode"]}) == []
+    for entry in ("set.", "set.output.hi91", "get.mode"):
+        assert wrong_values(CommandOptions, {"actions": [entry]})
+
+
+@pytest.mark.parametrize(
+    ("actions", "arguments", "allowed"),
+    [
+        (["set"], {"mode": "9-axis", "output.hi91": 200, "save": True}, True),
+        (["set"], {"save": True}, True),
+        (["bow/set"], {"mode": "9-axis"}, True),
+        (["mast/set", "save"], {"mode": "9-axis"}, False),
+        (["set.mode"], {"mode": "9-axis", "save": True}, True),
+        (["set.mode", "bow/set.output"], {"mode": "9-axis", "output.hi91": 200}, True),
+        (["set.mode"], {"mode": "9-axis", "output.hi91": 200}, False),
+        (["set.mode", "mast/set.output"], {"output": {"hi91": 200}}, False),
+        (["set.mode"], {"save": True}, False),
+        (["set.mode"], {}, False),
+    ],
+)
+def test_settings_are_set_if_the_configuration_allows_each(
+    actions: list[str], arguments: dict[str, Any], allowed: bool
+) -> None:
+    bench = ChannelBench(actions=actions)
+    assert (bench.ask(1, "set", **arguments) is None) is allowed
+    bench.run()
+    (answer,) = bench.answers()
+    assert answer.outcome is (Outcome.DONE if allowed else Outcome.DENIED)
+    settings = {name: value for name, value in arguments.items() if name != "save"}
+    assert bench.device.done == ([("set", settings, arguments.get("save", False))] if allowed else [])
+
+
+def test_the_reply_of_set_reports_what_the_device_lacks() -> None:
+    bench = ChannelBench(actions=["set"])
+    for applied, failure in (
+        (AppliedSettings(saved=True), ""),
+        (AppliedSettings(problem="mode: the device rejected it"), "mode: the device rejected it"),
+        (AppliedSettings(left_out={"mounting": "needs a save"}), "mounting needs a save"),
+        (AppliedSettings(differences={"mode": SettingDifference(9, 6)}), "mode: expected 9, got 6"),
+    ):
+        bench.device.applied = applied
+        bench.ask(len(bench.replies), "set", mode=9)
+        bench.run()
+        answer = bench.answers()[-1]
+        assert (answer.outcome, answer.error) == (Outcome.FAILED if failure else Outcome.DONE, failure)
+        assert msgspec.convert(answer.result, AppliedSettings) == applied
+    wrong: list[tuple[dict[str, Any], str]] = [
+        ({}, "expected at least one setting by name"), ({"save": 1}, "save: expected true or false, got 1"),
+    ]  # fmt: skip
+    for arguments, error in wrong:
+        bench.ask(len(bench.replies), "set", **arguments)
+        bench.run()
+        assert (bench.answers()[-1].outcome, error in bench.answers()[-1].error) == (Outcome.FAILED, True)
 
 
 @pytest.mark.parametrize(

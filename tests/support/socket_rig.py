@@ -50,7 +50,7 @@ from imud.contracts.setting import (
 )
 from imud.contracts.status import ClockStatus, Deviations, DeviceState, DeviceStatus, FrameStatus, KernelCounters
 from imud.host import event_loop
-from imud.model.errors import Rejected
+from imud.model.errors import IsSetting, Rejected
 from imud.model.sample import Sample, Sync
 from imud.publishers.socket.methods import METHODS
 from imud.publishers.socket.server import SocketOptions, SocketServer
@@ -170,6 +170,8 @@ class FakeControl:
             return {"waited": self._device}
         if name == "break":
             raise ZeroDivisionError("a mistake in an action")
+        if name == "mode":
+            raise IsSetting("mode is a setting", {"mode": "9-axis"}, save=False)
         if name != "output":
             raise Rejected(f"{self._device} refuses {name}")
         VERBS[name].arguments(arguments)

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from imud.client.connection import rpc_error
 from imud.publishers.socket.admission import Guard, Rights
 from imud.publishers.socket.server import SocketServer
 from tests.support import socket_rig
@@ -56,6 +57,16 @@ async def test_a_failed_command_gives_a_reason(
     assert error["code"] == -32005
     assert words in error["message"]
     assert not server.hub.busy(next(iter(server.hub.connections.values())))
+
+
+@in_server()
+async def test_the_error_of_a_removed_command_contains_the_setting(server: SocketServer) -> None:
+    error = {"code": -32005, "message": "mode is a setting", "data": {"settings": {"mode": "9-axis"}, "save": False}}
+    peer = await Peer.greeted(server)
+    await peer.send(request(1, "mode", axes=9))
+    assert (await peer.message())["error"] == error
+    assert rpc_error(error).data == error["data"]
+    assert (await peer.ask("command", device="imu0", name="explode"))["error"].keys() == {"code", "message"}
 
 
 @in_server(control_group="imud-test-control")
