@@ -3,7 +3,7 @@
 | document | source |
 |---|---|
 | docs/configuration.md | classes of the configuration |
-| docs/commands.md, docs/calibration.md, docs/settings.md | actions, calibrations and device settings of the drivers |
+| docs/commands.md, docs/calibration.md, docs/settings.md | commands, calibrations and device settings of the drivers |
 | docs/shm.md | layout of shared memory |
 | docs/monitoring.md | rules for Prometheus |
 | docs/measurements.md | measured figures (tests/bench/clock_figures.py) |
@@ -228,18 +228,29 @@ def arguments_of(action: Verb, lists: LongLists) -> str:
 
 
 def actions_table(actions: Verbs, lists: LongLists) -> Iterator[str]:
-    yield "| action | arguments | effect |"
+    yield "| command | arguments | effect |"
     yield "|---|---|---|"
     for name, action in actions.items():
         yield f"| `{name}` | {arguments_of(action, lists)} | {cell(action.help.rstrip('.'))} |"
 
 
 def actions_part(driver: Driver, lists: LongLists, first_of: dict[str, str]) -> list[str]:
-    """Return title and table of the actions of a driver; a table that an earlier driver has becomes a reference."""
-    table = "\n".join(actions_table(driver.verbs, lists)) if driver.verbs else "No actions."
+    """Return title and table of the commands of a driver; a table that an earlier driver has becomes a reference."""
+    table = "\n".join(actions_table(driver.verbs, lists)) if driver.verbs else "No commands."
     first = first_of.setdefault(table, driver.name)
     same = bool(driver.verbs) and first != driver.name
     return [f"### `{driver.name}`: {driver.title}", "", f"As `{first}`." if same else table, ""]
+
+
+def removed_part(driver: Driver) -> Iterator[str]:
+    """Yield the removed commands of a driver with the settings in their place."""
+    if driver.renamed:
+        yield f"| removed command of `{driver.name}` | arguments of `imud settings DEVICE` |"
+        yield "|---|---|"
+        for name, words in driver.renamed.items():
+            shown = re.sub(r"\{(\w+)(\|\w+)?\}", lambda found: found[1].upper(), words)
+            yield f"| `{name}` | {f'`--set {shown}`' if words else 'none'} |"
+        yield ""
 
 
 def actions_tables() -> str:
@@ -251,7 +262,8 @@ def actions_tables() -> str:
         *actions_table({"reset": RESET, "trigger": TRIGGER}, lists),
         "",
     ]
-    return "\n".join([*lines, *by_lines])
+    removed = [line for driver in DRIVERS.values() for line in removed_part(driver)]
+    return "\n".join([*lines, *by_lines, "## Removed commands", "", *removed])
 
 
 # --- docs/calibration.md ----------------------------------------------------------------------------------------------

@@ -152,8 +152,8 @@ class DeclaredReader:
             place = _fixed(name, options, link) if table.table[name].connection else None
             if place not in (None, value):
                 message = f"expected {shown(place)}, the value that imud uses to open the device, got {shown(value)}; "
-                hint = f"change it with `imud settings {path[-1]} --set {name}=… --save`, or use auto if the link supports it"
-                self._keys.problem((*key, name), message + hint)
+                hint = f"change it with `imud settings {path[-1]} --set {name}=… --save`, "
+                self._keys.problem((*key, name), f"{message}{hint}or use auto if the link supports it")
         baud = getattr(link, "baud", 0)
         try:
             table.check(Target(options, baud if isinstance(baud, int) else 0), values)

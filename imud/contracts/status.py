@@ -259,7 +259,7 @@ class MqttStatus(msgspec.Struct, frozen=True):
     thinned: int  # number of samples that imud reduced to statistics to save disk space
     dropped: dict[str, int]  # number of dropped samples and events, by cause
     reconnects: int  # number of connections after the first connection
-    commands: int = 0  # number of requested actions that imud ran or tried to run
+    commands: int = 0  # number of requested commands that imud ran or tried to run
     commands_refused: int = 0  # number of rejected requests
 
 

@@ -295,10 +295,10 @@ class SettingsKeeper:
     def _counter_resets(self) -> int:
         return self._clock.status().resets if self._clock is not None else 0
 
-    async def back_up(self, action: str) -> None:
-        """Write a backup before an action that resets all settings, and report its file. The caller holds `exclusive`.
+    async def back_up(self, verb: str) -> None:
+        """Write a backup before a verb that resets all settings, and report its file. The caller holds `exclusive`.
 
-        If the backup fails, imud raises an event and runs the action anyway: the action may repair the device.
+        If the backup fails, imud raises an event and runs the verb anyway: the verb may repair the device.
         """
         table = self._known_table()
         if table is None:
@@ -313,15 +313,15 @@ class SettingsKeeper:
             writing = asyncio.to_thread(self._files.backups.write, device, text, utc_ns)
             file = await asyncio.wait_for(writing, BACKUP_LIMIT_S)
         except TimeoutError:
-            self._raise(f"no backup of the settings before {action}: the disk does not respond")
+            self._raise(f"no backup of the settings before {verb}: the disk does not respond")
             return
         except (*DEVICE_ERRORS, OSError) as error:
-            self._raise(f"no backup of the settings before {action}: {reason_of(error)}")
+            self._raise(f"no backup of the settings before {verb}: {reason_of(error)}")
             return
         if file is not None:
-            self._raise(f"settings before {action} are in {file}", file=str(file))
+            self._raise(f"settings before {verb} are in {file}", file=str(file))
         else:
-            self._raise(f"no backup of the settings before {action}: there is no state directory")
+            self._raise(f"no backup of the settings before {verb}: there is no state directory")
 
     # --- comparison ---------------------------------------------------------------------------------------------------
 

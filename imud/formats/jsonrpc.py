@@ -26,7 +26,7 @@ PROTOCOL: Final = 1
 DEFAULT_PATH: Final = "/run/imud/imud.sock"
 # Maximum length of a request without newline, bytes. A `watch` with every field of 1,000 devices needs half of it.
 LINE_MAX_BYTES: Final = 65536
-# Maximum number of arrays and objects in a request. It limits the nesting; arguments of actions have at most three.
+# Maximum number of arrays and objects in a request. It limits the nesting; arguments of commands have at most three.
 NESTED_MAX: Final = 64
 # Maximum number of members and elements in a request, counted by commas. Enough for all devices with all fields.
 ITEMS_MAX: Final = 2048

@@ -7,6 +7,8 @@ from typing import Any, Final
 
 import msgspec
 
+from imud.contracts.setting import AppliedSettings
+from imud.device.settings_plan import wanted_values
 from imud.drivers import DRIVERS
 from imud.fleet.broker import Received
 from imud.fleet.commands import WAITING_MAX, CommandChannel, CommandReply
@@ -20,13 +22,14 @@ from tests.support.socket_rig import FakeControl
 
 UTC_NS: Final = 1_800_000_000 * NS_PER_S
 AGE_NS: Final = NS_PER_S
-SETTINGS: Final = CommandOptions(enabled=True, actions=["output", "mode", "bow/save"], per_minute=12)
+SETTINGS: Final = CommandOptions(enabled=True, actions=["wake", "set.mode", "bow/save"], per_minute=12)
 GATEWAY: Final = Gateway("site", "gw", "0")
 TOPIC: Final = topic_of("site", "gw", "bow", COMMAND)
 OWN: Final = topic_of("site", "gw", "bow", ANSWER)
 SEPARATOR: Final = b"\t"
 """Separator between topic, response topic and payload. Messages are lines, and JSON needs no tab."""
-VERBS: Final = DRIVERS["hipnuc-uart"].verbs
+DRIVER: Final = DRIVERS["hipnuc-uart"]
+VERBS: Final = DRIVER.verbs
 
 
 def names() -> Sequence[str]:
@@ -51,6 +54,12 @@ class _Control(FakeControl):
         VERBS[name].arguments(arguments)
         return {"done": name}
 
+    async def settings_apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
+        self._asked.append((self._device, f"set.{next(iter(given or {'': None})).partition('.')[0]}"))
+        assert DRIVER.device_settings is not None
+        wanted_values(DRIVER.device_settings, given or {})
+        return AppliedSettings(saved=save)
+
 
 @cache
 def _loop() -> asyncio.AbstractEventLoop:
@@ -71,7 +80,7 @@ def run(data: bytes) -> None:
     _loop().run_until_complete(_carry_out(channel))
     answers = [msgspec.json.decode(reply.payload, type=CommandAnswer) for reply in replies]
     carried_out = [answer for answer in answers if answer.outcome in (Outcome.DONE, Outcome.FAILED)]
-    assert channel.run == len(asked) == len(carried_out) <= min(SETTINGS.per_minute, WAITING_MAX)
+    assert len(asked) <= channel.run == len(carried_out) <= min(SETTINGS.per_minute, WAITING_MAX)
     assert channel.run + channel.refused == len(messages)
     assert len({answer.id for answer in carried_out}) == len(carried_out)
     assert all(SETTINGS.allows(device, action) for device, action in asked)
@@ -98,6 +107,8 @@ def _message(identifier: str, action: str, arguments: object, *, topic: str = TO
 
 def seeds() -> list[bytes]:
     every = [_message(f"id-{n}", action, {"rate_hz": 100}) for n, action in enumerate(VERBS)]
+    settings = ({"mode": "9-axis"}, {"mode": 9, "save": True}, {"mode.axes": 9}, {"baud": 1}, {"save": 1})
+    every += [_message(f"set-{n}", "set", given) for n, given in enumerate(settings)]
     twice = _message("a", "save", {})
     odd = [
         b"",

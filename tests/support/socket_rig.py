@@ -13,7 +13,7 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager, context
 from functools import wraps
 from inspect import Parameter, signature
 from pathlib import Path
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from imud.attitude.conventions import Convention, Heading
 from imud.contracts.command import (
@@ -138,11 +138,11 @@ def context(
     )  # fmt: skip
 
 
-def set_rate(_target: Target, *, message: Literal["HI91", "HI92"], rate_hz: int) -> None:
-    """Verb `output`."""
+def turn(_target: Target, *, angle_deg: float, relative: bool = False) -> None:
+    """Verb `yaw`."""
 
 
-VERBS = {"output": Verb("send at a rate", set_rate)}
+VERBS = {"yaw": Verb("set the heading", turn)}
 CALIBRATIONS = {
     "heading": Calibration(
         help="make the present heading zero",
@@ -171,8 +171,10 @@ class FakeControl:
         if name == "break":
             raise ZeroDivisionError("a mistake in an action")
         if name == "mode":
-            raise IsSetting("mode is a setting", {"mode": "9-axis"}, save=False)
-        if name != "output":
+            raise IsSetting(
+                f"mode is a setting: imud settings {self._device} --set mode=9-axis", {"mode": "9-axis"}, save=False
+            )
+        if name != "yaw":
             raise Rejected(f"{self._device} refuses {name}")
         VERBS[name].arguments(arguments)
         return None

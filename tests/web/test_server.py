@@ -156,7 +156,7 @@ def test_nothing_is_loaded_from_elsewhere_and_the_bundled_library_is_the_publish
 async def test_control_needs_the_token_and_a_cookie_does_for_it(tmp_path: Path) -> None:
     orders: tuple[tuple[str, dict[str, object]], ...] = (
         ("settings.plan", {}), ("settings.apply", {}),
-        ("command", {"name": "output", "arguments": {"message": "HI91", "rate_hz": 5}}),
+        ("command", {"name": "yaw", "arguments": {"angle_deg": 5}}),
         ("calibrate", {"kind": "heading"}), ("stop_calibration", {}), ("settings.get", {"fresh": True}),
     )  # fmt: skip
     async with running(tmp_path) as site:

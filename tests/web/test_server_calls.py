@@ -17,8 +17,7 @@ async def test_a_request_uses_a_connection_that_ends_after_the_reply(tmp_path: P
         calls = Calls(server.hub.path)
         report = await calls.call("settings.get", {"device": "imu0"})
         assert report["settings"][0]["actual"] == "6-axis"
-        arguments = {"message": "HI91", "rate_hz": 5}
-        request = {"device": "imu0", "name": "output", "arguments": arguments}
+        request = {"device": "imu0", "name": "yaw", "arguments": {"angle_deg": 5}}
         assert await calls.call("command", request) is None
         await socket_rig.until(lambda: not server.hub.connections)
         with pytest.raises(RpcError, match="no device named 'none'") as caught:

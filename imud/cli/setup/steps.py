@@ -337,7 +337,7 @@ class SetupSteps:
             return False
         if self._user in members(at).get(CONTROLLERS, [self._user]):
             return False
-        return self._talk.agreed(f"Allow {self._user} to change device settings (`imud command`)?", default=False)
+        return self._talk.agreed(f"Allow {self._user} to change device settings (`imud settings`)?", default=False)
 
     # --- one round of changes -----------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-// Guided calibrations with the sphere of covered directions, and the actions of a device.
+// Guided calibrations with the sphere of covered directions, and the commands of a device.
 
 import { CoverageSphere } from "./sphere.js";
 import { call, DEGREE, el, facts, marked, number, quantity, shown } from "./util.js";
@@ -128,25 +128,25 @@ export class ActionsView {
     try {
       const found = await call("actions", { device: this.device });
       const entries = found.map((one) => this.entry(one));
-      this.list.replaceChildren(...entries, ...(found.length ? [] : [el("p", { class: "quiet", text: "This device has no actions." })]));
+      this.list.replaceChildren(...entries, ...(found.length ? [] : [el("p", { class: "quiet", text: "This device has no commands." })]));
     } catch (error) {
       this.list.replaceChildren(el("p", { class: "quiet", text: error.message }));
     }
   }
 
-  entry(action) {
-    const inputs = action.parameters.map((one) => {
+  entry(verb) {
+    const inputs = verb.parameters.map((one) => {
       const input = el("input", { type: "text", size: 12, placeholder: one.default ?? "", "aria-label": one.name });
       return { ...one, input, node: el("label", {}, `${one.name} (${one.values}) `, input) };
     });
-    const run = el("button", { type: "button", text: `Run ${action.name}`, onclick: () => this.run(action, inputs) });
-    const risk = action.risk ? [el("p", { class: "problem", text: action.risk })] : [];
+    const run = el("button", { type: "button", text: `Run ${verb.name}`, onclick: () => this.run(verb, inputs) });
+    const risk = verb.risk ? [el("p", { class: "problem", text: verb.risk })] : [];
     const words = this.session.control ? run : el("p", { class: "quiet", text: "Log in to run it." });
-    return el("details", {}, el("summary", {}, el("b", { text: action.name }), ": ", ...marked(action.help)), ...risk, ...inputs.map((one) => one.node), words);
+    return el("details", {}, el("summary", {}, el("b", { text: verb.name }), ": ", ...marked(verb.help)), ...risk, ...inputs.map((one) => one.node), words);
   }
 
-  async run(action, inputs) {
-    if (action.risk && !confirm(`${action.risk}; run ${action.name}?`)) return;
+  async run(verb, inputs) {
+    if (verb.risk && !confirm(`${verb.risk}; run ${verb.name}?`)) return;
     const values = {};
     for (const { name, input } of inputs) {
       if (!input.value.trim()) continue;
@@ -156,10 +156,10 @@ export class ActionsView {
         values[name] = input.value.trim();
       }
     }
-    this.result.replaceChildren(el("p", { text: `${action.name}…` }));
+    this.result.replaceChildren(el("p", { text: `${verb.name}…` }));
     try {
-      const answer = await call("command", { device: this.device, name: action.name, arguments: values });
-      this.result.replaceChildren(el("p", { class: "good", text: `${action.name} is done${answer === null ? "" : `: ${shown(answer)}`}` }));
+      const answer = await call("command", { device: this.device, name: verb.name, arguments: values });
+      this.result.replaceChildren(el("p", { class: "good", text: `${verb.name} is done${answer === null ? "" : `: ${shown(answer)}`}` }));
     } catch (error) {
       this.result.replaceChildren(el("p", { class: "problem", text: error.message }));
     }

@@ -80,7 +80,7 @@ export class DevicePage {
     this.control.replaceChildren(
       panel("settings", "Settings", this.settings.node),
       panel("calibration", "Calibration", this.calibration.node),
-      panel("actions", "Actions", new ActionsView(this.name, this.session).node));
+      panel("actions", "Commands", new ActionsView(this.name, this.session).node));
   }
 
   onRestart() {

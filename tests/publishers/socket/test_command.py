@@ -34,7 +34,7 @@ async def test_other_requests_get_replies_before_a_late_reply(server: SocketServ
     assert (refused["id"], refused["error"]["code"]) == (71, -32004)
     socket_rig.done_late.set()
     assert await peer.message() == {"jsonrpc": "2.0", "id": 70, "result": {"waited": "imu0"}}
-    await peer.send(request(72, "output", message="HI91", rate_hz=5))
+    await peer.send(request(72, "yaw", angle_deg=5))
     assert (await peer.message())["result"] is None
 
 
@@ -42,9 +42,9 @@ async def test_other_requests_get_replies_before_a_late_reply(server: SocketServ
     ("name", "arguments", "words"),
     [
         ("explode", {}, "imu0 refuses explode"),
-        ("output", {"message": "HI91"}, "expected the argument rate_hz (a whole number), got none; arguments: message"),
-        ("output", {"message": "HI91", "rate_hz": "x"}, 'rate_hz: expected a whole number, got "x"'),
-        ("output", {"message": "HI91", "rate_hz": 1, "speed": 2}, 'expected an argument that imud knows, got "speed"'),
+        ("yaw", {}, "expected the argument angle_deg (a number), got none; arguments: angle_deg"),
+        ("yaw", {"angle_deg": "x"}, 'angle_deg: expected a number, got "x"'),
+        ("yaw", {"angle_deg": 1, "speed": 2}, 'expected an argument that imud knows, got "speed"'),
     ],
 )
 @in_server()
@@ -61,7 +61,8 @@ async def test_a_failed_command_gives_a_reason(
 
 @in_server()
 async def test_the_error_of_a_removed_command_contains_the_setting(server: SocketServer) -> None:
-    error = {"code": -32005, "message": "mode is a setting", "data": {"settings": {"mode": "9-axis"}, "save": False}}
+    words = "mode is a setting: imud settings imu0 --set mode=9-axis"
+    error = {"code": -32005, "message": words, "data": {"settings": {"mode": "9-axis"}, "save": False}}
     peer = await Peer.greeted(server)
     await peer.send(request(1, "mode", axes=9))
     assert (await peer.message())["error"] == error
@@ -73,8 +74,8 @@ async def test_the_error_of_a_removed_command_contains_the_setting(server: Socke
 async def test_reading_is_not_enough(server: SocketServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Guard, "rights_of", lambda _guard, _peer: Rights.READ)
     peer = await Peer.greeted(server)
-    assert (await peer.result("actions", device="imu0"))[0]["name"] == "output"
-    code, message = await peer.error("command", device="imu0", name="output")
+    assert (await peer.result("actions", device="imu0"))[0]["name"] == "yaw"
+    code, message = await peer.error("command", device="imu0", name="yaw")
     assert code == -32001
     assert message.startswith("command: expected root or a member of group 'imud-test-control', which does not")
     assert "make it with `sudo groupadd --system imud-test-control`" in message
@@ -92,7 +93,7 @@ async def test_reading_is_not_enough(server: SocketServer, monkeypatch: pytest.M
 async def test_a_group_that_exists_is_named(server: SocketServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Guard, "rights_of", lambda _guard, _peer: Rights.READ)
     peer = await Peer.greeted(server)
-    assert await peer.error("command", device="imu0", name="output") == (
+    assert await peer.error("command", device="imu0", name="yaw") == (
         -32001,
         "command: expected root or a member of group 'root'",
     )
@@ -137,7 +138,7 @@ async def test_a_connection_runs_one_change_at_a_time(server: SocketServer) -> N
     await peer.send(json.dumps(line).encode() + b"\n")
     for method, more in (
         ("settings.plan", {}), ("settings.apply", {}), ("settings.get", {"fresh": True}),
-        ("command", {"name": "output"}), ("calibrate", {"kind": "heading"}),
+        ("command", {"name": "yaw"}), ("calibrate", {"kind": "heading"}),
     ):  # fmt: skip
         code, message = await peer.error(method, device="imu0", **more)
         assert (code, "is not finished; wait for its reply" in message) == (-32004, True)
