@@ -80,6 +80,12 @@ def test_values_in_place_of_the_declared_ones(daemon: RunningDaemon, words: tupl
     assert (actual(daemon)["sout_divisor"], actual(daemon)["output"]["hi91"]) == (4, 20)
     cli(*words, "--set", "sout_divisor=5", "magnetic_calibration=false", "--set", "mode=6-axis")
     assert [actual(daemon)[name] for name in ("sout_divisor", "magnetic_calibration", "mode")] == [5, False, "6-axis"]
+    cli(*words, "--set", "output.hi91=50", "alarm.x.min_deg=-10", "alarm.x.max_deg=10")
+    cli(*words, "--set", "alarm.x.min_deg=-5", "--set", "pins.led=7")
+    found = actual(daemon)
+    assert (found["output"]["hi91"], found["alarm"]["x"]["min_deg"], found["alarm"]["x"]["max_deg"]) == (50, -5, 10)
+    assert (found["pins"]["led"], found["pins"]["sin"]) == (7, 1)
+    cli.refuses("pins: expected an unused pin for led, got IO1; sin uses it", *words, "--set", "pins.led=1")
     out = cli(*words, "--set", "mounting=x_up", status=1).out
     assert "not set: mounting needs a save and a restart" in out
 

@@ -85,6 +85,7 @@ export class SettingsView {
       const words = plan.steps.length ? "Planned changes:" : "No change is necessary.";
       const apply = el("button", { type: "button", text: "Apply", onclick: () => this.apply(asked) });
       this.result.replaceChildren(el("p", { text: words }), el("ul", {}, ...steps, ...left),
+        ...(plan.advice ? [el("p", { text: plan.advice })] : []),
         ...(plan.risk ? [el("p", { class: "problem", text: plan.risk })] : []), ...(plan.steps.length ? [apply] : []));
     } catch (error) {
       this.result.replaceChildren(el("p", { class: "problem", text: error.message }));
