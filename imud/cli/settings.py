@@ -231,7 +231,7 @@ def _change(client: Client, args: argparse.Namespace, given: Mapping[str, Any] |
 def _planned(plan: SettingsPlan) -> str:
     lines = [f"  {one.name}: {_value(one.before)} → {_value(one.value)}" for one in plan.steps]
     lines += ["  save to flash"] * plan.save + ["  restart"] * plan.restart
-    lines = ["plan:", *lines] if lines else ["no changes needed"]
+    lines = ["plan:", *lines] if lines else [] if plan.left_out else ["no changes needed"]
     lines += [f"not set: {name} {why} (add --save)" for name, why in plan.left_out.items()]
     return "\n".join([*lines, *([f"then: {plan.advice}"] if plan.advice else [])])
 

@@ -286,6 +286,21 @@ async def test_declared_settings_are_applied_to_every_kind_of_module(bench: Line
         assert beside.kinds.count(EventKind.DOWN) == 0
 
 
+@in_bench
+async def test_a_device_with_another_rate_keeps_the_rate_of_its_bus_until_the_restart(bench: LineBench) -> None:
+    module, other = modbus_slave(1), modbus_slave(2)
+    async with bench.running(module, other) as (rig, beside):
+        await rig.until_samples(5)
+        applied = await rig.device.settings_apply({"baud": 921600}, save=True)
+        assert (applied.failure, applied.saved, applied.restarted) == ("", True, False)
+        assert "restart them with `imud command NAME restart`" in applied.advice
+        assert module.flash.baud == 921600
+        await rig.until_samples(5)
+        applied = await rig.device.settings_apply({"mode": "9-axis"}, save=False)
+        assert applied.failure == ""
+        assert (rig.kinds.count(EventKind.DOWN), beside.kinds.count(EventKind.DOWN)) == (0, 0)
+
+
 @pytest.mark.live
 @in_loop
 async def test_on_a_real_port(tmp_path: Path) -> None:

@@ -402,20 +402,17 @@ def _back() -> RequestScript[tuple[Identity, int]]:
 # --- baud rate --------------------------------------------------------------------------------------------------------
 
 
-def change_baud(
-    baud: int, present_baud: int, *, done: int = RESULT_DONE, save: bool = True
-) -> RequestScript[BaudChange]:
-    """Set the baud rate of device and serial port from `present_baud` to `baud`, and save it. The device streams
-    afterwards.
+def change_baud(baud: int, present_baud: int, *, done: int = RESULT_DONE) -> RequestScript[BaudChange]:
+    """Set the baud rate of device and serial port from `present_baud` to `baud`. The device streams afterwards.
 
-    Raises BadArgument for a baud rate that is too low for the output rate, Rejected if the device keeps the old baud
-    rate (the serial port then too) or rejects the save, and NoReply if it does not reply; if nothing was saved,
-    power-off restores the old baud rate.
+    The script saves only if the device changes at its next start. Raises BadArgument for a baud rate that is too low
+    for the output rate, Rejected if the device keeps the old baud rate (the serial port then too), and NoReply if it
+    does not reply; if nothing was saved, power-off restores the old baud rate.
     """
-    return with_undo(_change_baud(baud, present_baud, done, save), STREAM)
+    return with_undo(_change_baud(baud, present_baud, done), STREAM)
 
 
-def _change_baud(baud: int, present_baud: int, done: int, save: bool) -> RequestScript[BaudChange]:
+def _change_baud(baud: int, present_baud: int, done: int) -> RequestScript[BaudChange]:
     request = commands.set_baud(baud)
     if (yield from _look((present_baud,))) is None:
         yield from resume_streaming()
@@ -429,7 +426,7 @@ def _change_baud(baud: int, present_baud: int, done: int, save: bool) -> Request
     yield request
     saved = False
     # The manual does not state whether the change is immediate or at the next start: look at both baud rates. Save only
-    # after a reply at the new baud rate, or if the device reports it at the old one (then also without `save`).
+    # after a reply at the new baud rate, or if the device reports it at the old one.
     found = yield from _look((baud, present_baud))
     if found == (present_baud, baud) != (baud, baud):  # set, but effective only after the next start
         yield from resume_streaming()
@@ -444,8 +441,6 @@ def _change_baud(baud: int, present_baud: int, done: int, save: bool) -> Request
     yield from resume_streaming()
     if found[0] != baud:
         raise Rejected(f"{request.name}: the device keeps {present_baud} baud")
-    if save:
-        saved = (yield from _save(done)) or saved
     return BaudChange(baud, saved)
 
 
@@ -609,7 +604,7 @@ def settings_of(values: ParameterValues) -> Mapping[str, Any]:
 
 
 def _write_baud(target: Target, baud: BaudRate) -> RequestScript[BaudChange]:
-    return change_baud(baud, target.baud, done=codes_of(target).result_done, save=False)
+    return change_baud(baud, target.baud, done=codes_of(target).result_done)
 
 
 def _write_mode(target: Target, mode: str) -> RequestScript[None]:
