@@ -135,7 +135,8 @@ class Driver:
     heading: Callable[[Any, Mapping[str, str]], Heading] = _unknown_heading
     verbs: Verbs = field(default_factory=dict)  # verbs of the device, by name
     # Arguments of `imud settings NAME --set` in place of a removed command, by the name of the command. {NAME} is the
-    # argument NAME of the command, {NAME|VALUE} has a default. Empty: `imud settings NAME` replaces the command.
+    # argument NAME of the command, {NAME|VALUE} has a default. Empty: `imud settings NAME` replaces the command. Remove
+    # the table in the third release after version 0.1.
     renamed: Mapping[str, str] = field(default_factory=dict)
     calibrations: Calibrations = field(default_factory=dict)  # guided calibrations, by kind
     device_settings: SettingsTable | None = None  # table of the device settings; None if the driver does not know them

@@ -18,8 +18,10 @@ from imud.host.threads import BusThread, StartWorker
 from imud.model.errors import LinkError
 from imud.model.options import Options
 
+RESET_VERB: Final = "reset"  # command of a device with the line `reset`
+TRIGGER_VERB: Final = "trigger"  # command of a device with the line `sin`
+LINE_VERBS: Final = (RESET_VERB, TRIGGER_VERB)
 # Width of a SOUT pulse, µs. The first byte follows the falling edge (HiPNUC manual 1.2.2, PMUX2).
-LINE_VERBS: Final = ("reset", "trigger")  # commands of a device with the line `reset` or `sin`
 SOUT_WIDTH_US: Final = 80.0
 SIN_DELAY_US: Final = 125.0  # mean time from the rising edge on SIN to the start of the frame, µs (HiPNUC manual 1.2.1)
 

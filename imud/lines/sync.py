@@ -8,7 +8,16 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, Final
 
 from imud.contracts.command import Verb
-from imud.contracts.lines import AlarmRanges, DeviceLines, Edge, LineFactory, Mark, PulseReceiver
+from imud.contracts.lines import (
+    RESET_VERB,
+    TRIGGER_VERB,
+    AlarmRanges,
+    DeviceLines,
+    Edge,
+    LineFactory,
+    Mark,
+    PulseReceiver,
+)
 from imud.contracts.status import LinesStatus
 from imud.host.clock import HostClock
 from imud.lines.alarm import AlarmMonitor
@@ -192,13 +201,13 @@ class LineVerbs:
         self.rows: dict[str, Verb] = {}  # verbs by name
         self._coroutines: dict[str, Callable[[], Awaitable[None]]] = {}
         if reset is not None:
-            self.rows["reset"], self._coroutines["reset"] = RESET, reset.pulse
+            self.rows[RESET_VERB], self._coroutines[RESET_VERB] = RESET, reset.pulse
         if signals is not None and signals.can_trigger:
 
             async def trigger() -> None:
                 signals.trigger_once()
 
-            self.rows["trigger"], self._coroutines["trigger"] = TRIGGER, trigger
+            self.rows[TRIGGER_VERB], self._coroutines[TRIGGER_VERB] = TRIGGER, trigger
 
     async def run(self, name: str, arguments: Mapping[str, Any]) -> object:
         """Run a verb. It returns None. Raises BadArgument, CommandError."""
