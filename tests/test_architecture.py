@@ -492,6 +492,7 @@ CROSS_CUTTING = {
     "drivers/imu61x/test_one_truth.py": "one motion through every protocol of the family",
     "drivers/test_every_can_driver.py": "every driver on CAN",
     "drivers/test_every_device_settings.py": "the settings of every driver",
+    "drivers/test_every_documented_value.py": "options, settings and counters of every driver, as documented",
     "drivers/test_every_polled_driver.py": "every polled driver",
     "drivers/test_every_row.py": "the rows, calibrations and data sheets of every driver",
     "drivers/test_every_stream_driver.py": "every driver of byte streams",

@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 
 from imud.formats.can import CyclicFrame, pack_frame
-from imud.links import netlink
+from imud.links import LINKS, netlink
 from imud.links.cyclic_sender import KernelSender, LoopSender
 from imud.links.socketcan import SO_RCVBUFFORCE, SocketCanLink, SocketCanOptions, open_raw
 from imud.model.errors import LinkDenied, LinkError, LinkMissing
+from tests.support.documented import check_schema
 from tests.support.event_loops import in_loop
 
 FRAMES = [CyclicFrame(number, False, b"", 1_000_000) for number in (1, 2)]
@@ -157,3 +158,8 @@ def test_a_link_has_one_cyclic_sender_at_a_time(monkeypatch: pytest.MonkeyPatch,
         assert [sender.closed for sender in made] == expected
     link.close()
     assert [sender.closed for sender in made] == [True, True]
+
+
+@pytest.mark.parametrize("name", [name for name in LINKS if name != "memory"])
+def test_keys_of_a_link_accept_the_documented_values(name: str) -> None:
+    assert check_schema(f"Link `{name}`", LINKS[name].settings)

@@ -11,6 +11,7 @@ from imud.formats.nmea0183 import build
 from imud.model.errors import LinkError, LinkMissing
 from imud.model.units import NS_PER_S
 from imud.utc.receivers import FIRST_PAUSE_S, GpsdSource, NmeaPortSource, Retry, RmcOptions, SourceContext, make_nmea
+from tests.support.documented import check_schema
 from tests.support.event_loops import in_loop
 from tests.support.rmc_sources import LIMIT_S, Sentences, soon
 
@@ -236,3 +237,7 @@ async def test_make_nmea_uses_the_configured_port() -> None:
     source = make_nmea(RmcOptions(source="nmea", port="/dev/ttyGNSS", baud=38400), context)
     assert source.title == "NMEA receiver on /dev/ttyGNSS"
     assert asked == [("/dev/ttyGNSS", 38400)]
+
+
+def test_keys_of_rmc_accept_the_documented_values() -> None:
+    assert check_schema("RMC sentences", RmcOptions) == 8
