@@ -2,7 +2,7 @@
 
 import pytest
 
-from imud.formats.can import EXTENDED_FLAG, RAW_FRAME, frame_bits, pack_frame
+from imud.formats.can import EXTENDED_FLAG, RAW_FRAME, CanFilter, frame_bits, pack_frame
 
 
 @pytest.mark.parametrize(
@@ -21,3 +21,20 @@ def test_frames_in_the_layout_of_the_kernel() -> None:
     for can_id, extended, data in wrong:
         with pytest.raises(ValueError, match="invalid CAN frame"):
             pack_frame(can_id, extended, data)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "expected"),
+    [
+        (CanFilter(0x180, 0x7F0, False), CanFilter(0x185, 0x7FF, False), True),
+        (CanFilter(0x180, 0x7FF, False), CanFilter(0x185, 0x7FF, False), False),
+        (CanFilter(0x180, 0x7F0, False), CanFilter(0x185, 0x7FF, True), False),
+        (CanFilter(0, 0, True), CanFilter(0x1FFF_FFFF, 0x1FFF_FFFF, True), True),
+    ],
+)
+def test_filters_overlap_if_one_frame_passes_both(one: CanFilter, other: CanFilter, expected: bool) -> None:
+    assert one.overlaps(other) == other.overlaps(one) == expected
+    if expected:  # the identifier with all bits of both masks
+        can_id = (one.can_id & one.mask) | (other.can_id & other.mask)
+        assert one.matches(can_id, one.extended)
+        assert other.matches(can_id, other.extended)

@@ -6,7 +6,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imud.formats.modbus import ReplyFinder, crc16_modbus, exception_text, frame_gap_ns, framed, is_exception, is_whole
+from imud.formats.modbus import (
+    SLAVES,
+    ReplyFinder,
+    crc16_modbus,
+    exception_text,
+    frame_gap_ns,
+    framed,
+    is_exception,
+    is_whole,
+)
 
 REQUEST = framed(5, bytes.fromhex("03 0034 0002"))
 REPLY = framed(5, bytes.fromhex("03 04 11 22 33 44"))
@@ -94,3 +103,8 @@ def test_confirmation_is_distinguished_from_the_echo() -> None:
         assert found.feed(b"\xee" * 100) is None
     assert len(found.rest()) <= 256
     assert found.strange + len(found.rest()) == 10_000
+
+
+def test_addresses_of_slaves() -> None:
+    """0 is the broadcast, 248 to 255 are reserved (Modbus over serial line V1.02, section 2.2)."""
+    assert [address for address in range(256) if address not in SLAVES] == [0, *range(248, 256)]

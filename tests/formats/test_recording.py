@@ -165,3 +165,13 @@ def test_a_block_that_grows_too_much_is_no_block_and_zeros_are_stored_without_co
     found, reader = blocks_of(valid_crc(bomb, len(zeros)))
     assert not found
     assert reader.bytes_bad == HEAD.size + len(bomb)
+
+
+def test_blocks_inside_a_cut_block_are_read_and_the_first_bad_byte_is_known() -> None:
+    """The head of a large block before other blocks: the file ends before the end of the large block."""
+    large = BlockEncoder().encode(Random(1).randbytes(1000))[: HEAD.size]
+    found, reader = blocks_of(large + GOLDEN + b"foreign" + GOLDEN)
+    assert found == [b"abc", b"abc"]
+    assert (reader.bytes_bad, reader.bytes_cut, reader.first_bad) == (HEAD.size + 7, 0, 0)
+    assert blocks_of(GOLDEN + b"foreign" + GOLDEN)[1].first_bad == len(GOLDEN)
+    assert blocks_of(GOLDEN)[1].first_bad == -1

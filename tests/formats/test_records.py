@@ -1,5 +1,6 @@
 """Records of recordings: round trip of each kind, layouts by hand, and errors for invalid records."""
 
+import re
 import struct
 from collections.abc import Callable
 from contextlib import suppress
@@ -14,6 +15,7 @@ from imud.formats import records
 from imud.formats.can import CanFrame
 from imud.formats.records import CallRecord, ClocksRecord, EdgeRecord, Kind, LostRecord, ReadingRecord, Record
 from imud.model.errors import ImudError
+from tests.support.documented import DOCS
 
 DECODERS: dict[Kind, Callable[[bytes], Any]] = {
     Kind.DATA: records.decode_data,
@@ -63,6 +65,34 @@ CLOCKS, LOST = ClocksRecord(1, -2, 3, 4, 5, 6), LostRecord(1, 2, -3)
 def test_round_trip_of_records(kind: Kind, data: bytes, value: object) -> None:
     assert only(data).kind == kind
     assert DECODERS[kind](only(data).body) == value
+
+
+def int64(*values: int) -> str:
+    return b"".join(value.to_bytes(8, "little", signed=True) for value in values).hex()
+
+
+GOLDEN = [
+    (
+        records.encode_frames(258, [CanFrame(0x0CFF3408, True, b"\xab\xcd", 10, True), CanFrame(0x188, False, b"", 9)]),
+        "06 0201 1e000000" + int64(10) + "0834ff0c 03 02 abcd" + int64(9) + "88010000 00 00",
+    ),
+    (
+        records.encode_readings(1, [ReadingRecord(3, 5, 9, 2, b"no")]),
+        "07 0100 18000000" + int64(5, 9) + "03 02 02000000 6e6f",
+    ),
+    (records.encode_edges(0, "alarm", [(-5, True, 258)]), "08 0000 12000000 04" + int64(-5) + "01" + int64(258)),
+    (records.encode_clocks(CLOCKS), "04 ffff 2c000000" + int64(1, -2, 3, 4, 5) + "06000000"),
+    (records.encode_lost(LOST), "0b ffff 18000000" + int64(1, 2, -3)),
+]  # fmt: skip
+"""Records written by hand from the tables of docs/recording.md."""
+
+
+def test_records_have_the_documented_bytes() -> None:
+    for data, expected in GOLDEN:
+        assert data == bytes.fromhex(expected)
+    table = (DOCS / "recording.md").read_text().partition("| kind | record |")[2]
+    documented = re.findall(r"^\| (\d+) \| (\w+) \|", table, re.MULTILINE)
+    assert [(str(kind.value), kind.name.lower()) for kind in Kind] == documented
 
 
 @pytest.mark.parametrize("line", records.LINES)

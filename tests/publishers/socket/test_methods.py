@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from imud.contracts.publisher import Batch
-from imud.formats.jsonrpc import LINE_MAX_BYTES
+from imud.formats.jsonrpc import LINE_MAX_BYTES, RpcError, parse_request
 from imud.publishers.socket.admission import Rights
 from imud.publishers.socket.methods import METHODS
 from imud.publishers.socket.scheduler import BYTES_BURST
@@ -244,3 +244,22 @@ async def test_nan_and_infinity_are_null(server: SocketServer) -> None:
     values = (float("nan"), float("inf"), -float("inf"))
     server.publish(Batch("imu0", 0, [replace(nan.samples[0], gyro_rad_s=values)]))
     assert (await peer.message())["params"]["gyro_rad_s"] == [None, None, None]
+
+
+@pytest.mark.parametrize(("part", "count"), [(b"[", 64), (b"{", 64), (b",", 2048)])
+def test_the_limits_of_a_request_are_the_documented_ones(part: bytes, count: int) -> None:
+    """At most 64 arrays and objects and 2048 commas, docs/socket.md."""
+    start = b'{"jsonrpc":"2.0","id":1,"method":"m","params":{"a":'
+    body = {b"[": (b"[", b"]"), b"{": (b'{"b":', b"}")}
+    for more in (0, 1):
+        if part == b",":
+            line = start + b"[" + b",".join([b"1"] * (count - 3 + more + 1)) + b"]}}"
+        else:
+            opened, closed = body[part]
+            line = start + opened * (count - 2 + more) + b"1" + closed * (count - 2 + more) + b"}}"
+        assert line.count(part) + (line.count(b"{") if part == b"[" else 0) == count + more
+        if more:
+            with pytest.raises(RpcError, match="expected at most"):
+                parse_request(line)
+        else:
+            assert parse_request(line).method == "m"
