@@ -171,3 +171,24 @@ def test_filters_of_the_row_pass_its_frames(name: str) -> None:
     filters = driver.filters(driver.settings())
     assert all(pack_frame(wanted.can_id, wanted.extended, b"") for wanted in filters)
     assert all(is_own(driver, frame) for frame in driver.example_frames(Random(1)))
+
+
+@every_driver
+def test_frames_name_their_node_and_its_options(name: str) -> None:
+    """Detection makes the driver options from the node of a frame. These options accept all frames of the device."""
+    driver = DRIVERS[name]
+    frames = driver.example_frames(Random(1))
+    nodes = {driver.node_of(frame.can_id, frame.extended, frame.data) for frame in frames} - {None}
+    (node,) = nodes
+    assert node is not None
+    assert str(node) in driver.node_title(node)
+    filters = driver.filters(driver.node_settings(node))
+    for frame in frames:
+        assert any(wanted.matches(frame.can_id, frame.extended) for wanted in filters)
+        assert driver.node_of(frame.can_id, not frame.extended, frame.data) is None
+        if driver.node_of(frame.can_id, frame.extended, frame.data) is not None:
+            assert driver.node_of(frame.can_id, frame.extended, b"") is None
+    codec = driver.make_codec(Ledger(), driver.node_settings(node))
+    codec.feed_frame(*timed(driver, Random(1), 0)[0][:4])
+    assert list(measurements(codec.flush())) == []  # a part of a set does not make a sample
+    assert codec.ledger.closes()

@@ -57,6 +57,8 @@ def test_good_frames_make_one_measurement_each(name: str, seed: int) -> None:
     assert codec.stale == codec.ledger.frames_ignored == 1
     codec.reset()
     assert len(decode_polled(codec, 0, data)) == 1
+    silent = [event for poll in range(len(codec.polls)) for event in codec.on_silence(poll)]
+    assert not any(isinstance(event, Measurement) for event in silent)
 
 
 @every_driver_and_seed
@@ -133,4 +135,31 @@ def test_targets_and_link_of_the_row(name: str) -> None:
     assert LINKS[driver.link].fits(driver)
     assert [link for link in LINKS if LINKS[link].fits(driver)] == [driver.link]
     assert make(driver).polls[0].every_ns == 0
+    assert driver.update_ns(driver.settings()) == 0  # not known
+    assert driver.update_ns(msgspec.convert({"update_hz": 200}, driver.settings)) == 5_000_000
     assert msgspec.structs.fields(driver.settings)
+
+
+READ_NS: list[tuple[str, object, object, int]] = [
+    # 16 words of 16 bits at 1 µs: the burst command, two cycles of the pipeline and 13 values
+    ("imu61x-spi", {}, {"port": "x", "speed_hz": 1_000_000}, 256_000),
+    ("imu61x-spi", {}, {"port": "x", "speed_hz": 2_000_000}, 128_000),
+]
+
+
+@pytest.mark.parametrize(("name", "options", "link", "expected_ns"), READ_NS)
+def test_the_time_of_a_read_on_the_bus(name: str, options: object, link: object, expected_ns: int) -> None:
+    driver = row(name)
+    made = msgspec.convert(options, driver.settings), msgspec.convert(link, LINKS[driver.link].settings)
+    assert driver.read_ns(*made) == expected_ns
+
+
+@every_driver
+def test_an_address_outside_the_targets_is_a_problem(name: str) -> None:
+    driver = row(name)
+    addresses = (driver.targets[0], driver.targets[-1], "auto", 0x77)
+    links = [object(), *(type("Link", (), {"address": address})() for address in addresses)]
+    expected = [0, 0, 0, 0, int(name.startswith("imu61x"))]  # 0x77 is a valid address of Modbus
+    found = [list(driver.problems(driver.settings(), link)) for link in links]
+    assert [len(problems) for problems in found] == expected
+    assert all("got 0x77" in problem.message for problem in found[-1])
