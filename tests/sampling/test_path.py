@@ -1,0 +1,392 @@
+"""The three paths with scripted codecs: batches, losses, faults, gaps, and the reports to an observer."""
+
+from collections.abc import Sequence
+from math import sqrt
+from typing import Any
+
+import pytest
+
+from imud.contracts.codec import BadFrame, BadReason, Poll, PolledEvent, Reading, Vanished
+from imud.contracts.lines import Edge, ReadyOptions, TriggerStamp
+from imud.contracts.publisher import Batch
+from imud.contracts.script import Message, ReplyFrame, TextLine
+from imud.drivers import DRIVERS
+from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucOptions
+from imud.formats.can import CanFrame
+from imud.model.errors import TransferError, Trouble
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement, Sample, Sync
+from imud.model.units import NS_PER_MS
+from imud.sampling.path import CanPath, PathContext, PolledPath, PollTiming, ReadyEdges, StreamPath, make_clock
+from tests.support.event_loops import UTC_AHEAD_NS, VirtualClock
+from tests.support.files import hi91
+
+MS = NS_PER_MS
+WAKE_NS = 50_000
+"""Half of the maximum wake-up time of the host: the mean delay of an arrival without a latency timer."""
+VALUES = Measurement(8, 0, None, accel_m_s2=(0.0, 0.0, 9.8), status=0b110)
+
+
+class Noted:
+    """An observer that notes its reports."""
+
+    def __init__(self) -> None:
+        self.reports: list[tuple[Any, ...]] = []
+
+    def data(self, *given: object) -> None:
+        self.reports.append(("data", *given))
+
+    def frames(self, frames: Sequence[CanFrame]) -> None:
+        self.reports.append(("frames", len(frames)))
+
+    def readings(self, readings: Sequence[Reading]) -> None:
+        self.reports.append(("readings", len(readings)))
+
+    def edges(self, line: str, edges: Sequence[Edge]) -> None:
+        self.reports.append(("edges", line, len(edges)))
+
+    def overruns(self, count: int) -> None:
+        self.reports.append(("overruns", count))
+
+    def call(self, *given: object, **keywords: object) -> None:
+        self.reports.append((*given, *sorted(keywords.items())))
+
+    def named(self) -> list[tuple[Any, ...]]:
+        return [report[:2] for report in self.reports]
+
+
+class Scripted:
+    """A codec whose next results are set by the test."""
+
+    polls: Sequence[Poll] = ()
+    stale = 0
+
+    def __init__(self, ledger: Ledger) -> None:
+        self.ledger = ledger
+        self.results: list[tuple[Sequence[Any], int]] = []  # events and pending frames after each frame
+        self.silence: Sequence[PolledEvent] = ()
+        self.flushed: Sequence[Any] = ()
+        self.resets = 0
+
+    def feed_frame(self, _can_id: int, _extended: bool, _data: bytes, _t_rx_ns: int) -> Sequence[Any]:
+        events, self.ledger.frames_pending = self.results.pop(0)
+        return events
+
+    def decode(self, _poll: int, _data: bytes) -> Sequence[Any]:
+        return self.results.pop(0)[0]
+
+    def on_silence(self, _poll: int) -> Sequence[PolledEvent]:
+        return self.silence
+
+    def flush(self) -> Sequence[Any]:
+        return self.flushed
+
+    def reset(self) -> None:
+        self.resets += 1
+        self.ledger.frames_pending = 0
+
+
+class PathRig:
+    """The parts around a path."""
+
+    def __init__(self, driver: str) -> None:
+        self.clock = VirtualClock()
+        self.now = self.clock.now_ns()
+        self.ledger, self.noted = Ledger(), Noted()
+        self.codec: Any = Scripted(self.ledger)
+        self.batches: list[list[Sample]] = []
+        self.messages: list[tuple[Message, int]] = []
+        self.bad: list[BadReason] = []
+        self.overruns = 0
+        self.sample_clock = make_clock("bow", None, DRIVERS[driver], None, on_unknown_gap=self.ledger.add_unknown_gap)
+        self.context = PathContext(
+            "bow", 3, self.ledger, self._publish, lambda message, t_ns: self.messages.append((message, t_ns)),
+            lambda frame: self.bad.append(frame.reason), lambda: self.overruns, self.clock.host,
+        )  # fmt: skip
+
+    def _publish(self, batch: Batch) -> None:
+        self.batches.append(list(batch.samples))
+
+    @property
+    def sizes(self) -> list[int]:
+        return [len(samples) for samples in self.batches]
+
+    def stream(self) -> StreamPath:
+        return StreamPath(HipnucCodec(self.ledger, HipnucOptions()), self.sample_clock, self.context)
+
+    def can(self) -> CanPath:
+        return CanPath(self.codec, self.sample_clock, self.context)
+
+    def polled(self, update_ns: int = 0, edges: ReadyEdges | None = None) -> PolledPath:
+        return PolledPath(self.codec, PollTiming(10 * MS, update_ns, edges), self.sample_clock, self.context)
+
+    def reading(self, at_ms: float, results: Sequence[Any], error: TransferError | None = None) -> Reading:
+        """Return a reading of 1 ms at a time, and let the codec return `results` for it."""
+        if error is None:
+            self.codec.results.append((results, 0))
+        start_ns = self.now + round(at_ms * MS)
+        return Reading(0, b"12345678", error, start_ns, start_ns + MS)
+
+
+# --- bytes ------------------------------------------------------------------------------------------------------------
+
+
+def test_bytes_are_published_on_arrival_or_together() -> None:
+    rig = PathRig("hipnuc-uart")
+    path, now = rig.stream(), rig.now
+    path.watch_status(0b10)
+    path.begin(now)
+    assert (path.begun_ns, path.last_data_ns, path.fresh, path.period_ns) == (now, now, False, 0)
+    assert not path.gather(b"O", now + MS)
+    path.on_data(b"K\r\n" + hi91(1000), now + 2 * MS)
+    assert rig.messages == [("OK", now + 2 * MS)]
+    assert (path.last_data_ns, path.last_sample_ns, path.fresh) == (now + 2 * MS, now + 2 * MS, True)
+    assert path.gather(hi91(1010), now + 12 * MS)
+    assert path.gather(hi91(1020), now + 22 * MS, waited_ns=MS)
+    assert path.clock.waited_ns == 0
+    assert rig.sizes == [1]
+    path.publish_gathered()
+    path.publish_gathered()
+    assert rig.sizes == [1, 2]
+    assert rig.ledger.samples == 3
+    assert path.newest == rig.batches[-1][-1]
+    assert path.last_sample_ns == now + 22 * MS
+    assert sum(path.latency.buckets) == 3
+    head = hi91(1030)[:3]
+    path.on_data(head + hi91(1030), now + 32 * MS)  # the length of the cut frame contains the next frame
+    path.flush(now + 40 * MS)
+    assert rig.sizes == [1, 2, 1]
+    path.on_data(hi91(1040)[:9], now + 42 * MS)
+    path.reset()
+    assert rig.ledger.bytes_pending == 0
+    assert rig.ledger.closes()
+
+
+def test_samples_of_one_batch_come_in_order_between_messages_and_bad_frames() -> None:
+    rig = PathRig("hipnuc-uart")
+    path = rig.stream()
+    reply = ReplyFrame(1, b"")
+    bad = [BadFrame(reason, b"") for reason in (BadReason.CRC, BadReason.NOT_FINITE)]
+    path.publish_events([VALUES, TextLine("a"), VALUES, reply, *bad], rig.now)
+    assert [sample.seq for sample in rig.batches[0]] == [1, 2]
+    assert [message for message, _ in rig.messages] == ["a", reply]
+    assert rig.bad == [BadReason.CRC, BadReason.NOT_FINITE]
+    assert path.loss.bad_frames == 1  # the sample of a frame with NaN follows
+    path.publish_events([VALUES], rig.now)
+    assert path.loss.bad_frames == 0
+    assert path.take_status() == 0
+    path.watch_status(0b010)
+    path.publish_events([VALUES], rig.now)
+    assert (path.take_status(), path.take_status()) == (0b010, 0)
+
+
+def test_a_listener_gets_measurements_while_it_waits_and_edges_come_first() -> None:
+    rig, order = PathRig("hipnuc-uart"), list[str]()
+
+    class Listener:
+        wants_samples = True
+
+        def on_sample(self, sample: Measurement) -> None:
+            order.append(f"sample {sample.dev_ticks}")
+
+    listener = Listener()
+    codec = HipnucCodec(rig.ledger, HipnucOptions())
+    path = StreamPath(codec, rig.sample_clock, rig.context, lambda: order.append("edges"), listener)
+    path.on_data(hi91(7) + b"OK\r\n", rig.now)
+    listener.wants_samples = False
+    path.on_data(hi91(17), rig.now + 10 * MS)
+    assert order == ["edges", "sample 7", "edges"]
+
+
+def test_lost_samples_take_the_overruns_of_the_kernel() -> None:
+    rig = PathRig("hipnuc-uart")
+    path = rig.stream()
+    path.observe(rig.noted)
+    rig.overruns = 4
+    for number in (0, 1, 2, 3, 4, 5, 6, 7, 10):
+        path.on_data(hi91(1000 + 10 * number), rig.now + 10 * number * MS)
+    assert (rig.ledger.lost_overrun, rig.ledger.lost()) == (2, 2)
+    assert ("overruns", 4) in rig.noted.reports
+
+
+def test_an_observer_receives_each_input_of_path_and_clock() -> None:
+    rig = PathRig("hipnuc-uart")
+    path, now = rig.stream(), rig.now
+    path.observe(rig.noted)
+    path.begin(now)
+    path.link_opened()
+    path.on_data(hi91(1000), now)
+    path.gather(b"x", now + 1, 7)
+    path.publish_gathered()
+    path.flush(now + 2)
+    path.reset()
+    clock = path.clock
+    edges = [Edge(now, True, 1)]
+    for line in ("sout", "sout_div", "pps"):
+        clock.add_edges(line, edges)
+    clock.add_triggers([TriggerStamp(now, 1, 1)])
+    clock.set_utc_reference(None)
+    clock.set_own_status(4)
+    clock.link_changed(byte_ns=1, hold_ns=2)
+    clock.restart()
+    assert rig.noted.reports == [
+        ("ledger", "set", rig.noted.reports[0][2]), ("path", "begin", now), ("loss", "link_opened"),
+        ("data", hi91(1000), now, -1), ("data", b"x", now + 1, 7), ("path", "publish_gathered"),
+        ("path", "flush", now + 2), ("path", "reset"), ("edges", "sout", 1), ("edges", "sout_div", 1),
+        ("edges", "pps", 1), ("aiding", "on_trigger_stamps", [TriggerStamp(now, 1, 1)]),
+        ("clock", "set_utc_reference", None), ("clock", "set_own_status", 4),
+        ("clock", "link_changed", ("byte_ns", 1), ("hold_ns", 2)), ("clock", "restart"),
+    ]  # fmt: skip
+    path.observe(None)
+    path.on_data(hi91(1010), now + 10 * MS)
+    clock.restart()
+    assert len(rig.noted.reports) == 16
+
+
+# --- CAN frames -------------------------------------------------------------------------------------------------------
+
+
+def frame(t_rx_ns: int, after_loss: bool = False) -> CanFrame:
+    return CanFrame(1, False, b"", t_rx_ns, after_loss)
+
+
+def test_a_sample_was_measured_before_its_first_frame() -> None:
+    """Three frames at 0, 1 and 2 ms, 0.2 ms each on the wire: the first one started at -0.2 ms."""
+    rig = PathRig("imu61x-can")
+    path, now = rig.can(), rig.now
+    path.observe(rig.noted)
+    path.set_frame_time(200_000)
+    rig.codec.results = [((), 1), ((), 2), ((VALUES,), 0)]
+    path.on_frames([frame(now + at * MS) for at in (0, 1, 2)])
+    (sample,) = rig.batches.pop()
+    begin_ns = now - 200_000 - WAKE_NS
+    assert (sample.t_ns, sample.t_rx_ns, sample.utc_ns) == (begin_ns, now + 2 * MS, begin_ns + UTC_AHEAD_NS)
+    assert (path.last_data_ns, path.last_sample_ns) == (now + 2 * MS, now + 2 * MS)
+    # the frame at 13 ms completes the sample from 10 ms, and is the first frame of the next sample
+    rig.codec.results = [((), 1), ((), 2), ((VALUES,), 1), ((VALUES,), 0)]
+    path.on_frames([frame(now + at * MS) for at in (10, 11, 13, 14)])
+    (samples,) = rig.batches
+    assert [sample.t_rx_ns - now for sample in samples] == [13 * MS, 14 * MS]
+    assert [sample.t_ns - now for sample in samples] == [at * MS - 200_000 - WAKE_NS for at in (10, 13)]
+    assert rig.noted.named() == [("path", "set_frame_time"), ("frames", 3), ("frames", 4)]
+
+
+def test_lost_frames_and_a_closed_link_discard_a_part_of_a_sample() -> None:
+    rig = PathRig("imu61x-can")
+    path, now = rig.can(), rig.now
+    rig.codec.results = [((), 1), ((), 1), ((VALUES,), 0)]
+    path.on_frames([frame(now), frame(now + MS, after_loss=True), frame(now + 2 * MS)])
+    assert rig.codec.resets == 1
+    assert [sample.t_ns for sample in rig.batches[0]] == [now + MS - WAKE_NS]
+    path.reset()
+    assert rig.codec.resets == 2
+    path.flush(now + 5 * MS)
+    rig.codec.flushed = [VALUES]
+    path.flush(now + 6 * MS)
+    assert rig.sizes == [1, 1]
+    assert rig.batches[1][0].t_rx_ns == now + 6 * MS
+
+
+# --- polled devices ---------------------------------------------------------------------------------------------------
+
+
+def sigma_ns(age_ms: float) -> int:
+    """Standard error of an instant that is uniform over an interval, ns, rounded up."""
+    return int(age_ms * MS / sqrt(3)) + 1
+
+
+@pytest.mark.parametrize(("update_ms", "errors_ms"), [(0, [11, 11, 21]), (4, [5, 5, 5])])
+def test_the_error_of_a_read_covers_the_age_of_its_registers(update_ms: int, errors_ms: list[int]) -> None:
+    """A read of 1 ms: the registers are as old as the time since the last read, or one update."""
+    rig = PathRig("imu61x-i2c")
+    path = rig.polled(update_ms * MS)
+    path.begin(rig.now)
+    assert path.period_ns == 10 * MS
+    for at in (0, 10, 30):
+        assert path.on_readings([rig.reading(at, [VALUES])]) == ""
+    samples = [sample for batch in rig.batches for sample in batch]
+    assert [sample.t_ns - rig.now for sample in samples] == [0, 10 * MS, 30 * MS]
+    assert [sample.t_rx_ns - sample.t_ns for sample in samples] == [MS] * 3
+    assert [sample.t_err_ns for sample in samples] == [sigma_ns(error_ms) for error_ms in errors_ms]
+
+
+def test_readings_of_one_turn_are_one_batch_and_end_at_a_vanished_device() -> None:
+    rig = PathRig("imu61x-i2c")
+    path = rig.polled()
+    path.observe(rig.noted)
+    path.begin(rig.now)
+    readings = [rig.reading(at, [VALUES]) for at in (0, 10)]
+    gone = rig.reading(20, [Vanished("another device")])
+    later = [rig.reading(30, [VALUES])]
+    assert path.on_readings([*readings, gone, *later]) == "another device"
+    assert rig.sizes == [2]
+    assert (rig.ledger.bytes_in, rig.ledger.bytes_skipped) == (8, 8)  # only the path counts the bytes of `later`
+    path.skip(readings[0])
+    assert (rig.ledger.bytes_in, rig.ledger.bytes_skipped) == (16, 16)
+    assert rig.noted.reports[-2:] == [("readings", 4), ("path", "skip", 8)]
+
+
+@pytest.mark.parametrize("kind", ["damaged", "disturbed"])
+def test_three_faults_in_a_row_identify_the_device_again(kind: str) -> None:
+    rig = PathRig("imu61x-i2c")
+    path = rig.polled()
+    disturbed = TransferError(Trouble.DISTURBED, "noise")
+    fault = rig.reading(0, [], disturbed) if kind == "disturbed" else None
+
+    def turn() -> str:
+        return path.on_readings([fault or rig.reading(0, [BadFrame(BadReason.CRC, b"")])])
+
+    assert [bool(turn()) for _ in range(2)] == [False, False]
+    path.on_readings([rig.reading(0, [VALUES])])  # a good read ends the row
+    assert [bool(turn()) for _ in range(3)] == [False, False, True]
+    path.begin(rig.now)  # so does a new begin
+    assert not turn()
+    assert (rig.ledger.lost_crc, rig.ledger.lost_gap_device) == ((6, 0) if kind == "damaged" else (0, 6))
+    assert path.failed == (0 if kind == "damaged" else 6)
+    path.on_readings([rig.reading(0, [BadFrame(BadReason.NOT_FINITE, b"")])])
+    assert rig.ledger.lost() == 6  # the sample of this frame follows
+
+
+def test_another_error_ends_the_reads_and_so_does_a_codec_without_replies() -> None:
+    rig = PathRig("imu61x-i2c")
+    path = rig.polled()
+    missing = rig.reading(0, [], TransferError(Trouble.ABSENT, "no reply"))
+    assert path.on_readings([missing]) == "no reply"
+    rig.codec.silence = [Vanished("silent")]
+    assert path.on_readings([missing]) == "silent"
+    path.on_readings([rig.reading(10, [VALUES])])
+    assert rig.batches[0][0].t_err_ns == sigma_ns(11)  # the age counts from the period, because the last read failed
+
+
+@pytest.mark.parametrize(("pause_ms", "gaps"), [(14, 0), (15, 1)])
+def test_a_long_pause_before_an_identified_device_is_an_unknown_gap(pause_ms: int, gaps: int) -> None:
+    """One and a half periods of 10 ms, only for the first read after the identification."""
+    rig = PathRig("imu61x-i2c")
+    path = rig.polled()
+    path.begin(rig.now)
+    path.on_readings([rig.reading(0, [VALUES])])
+    path.on_readings([rig.reading(20_000, [VALUES])])  # imud did not identify the device again
+    assert rig.ledger.lost_unknown == 0
+    path.begin(rig.now)
+    path.on_readings([rig.reading(20_000 + pause_ms, [VALUES]), rig.reading(20_010 + pause_ms, [VALUES])])
+    assert rig.ledger.lost_unknown == gaps
+    rig.ledger.samples = 1  # another path of the device published a sample
+    rig.polled().on_readings([rig.reading(20_020 + pause_ms, [VALUES])])
+    assert rig.ledger.lost_unknown == gaps + 1
+
+
+def test_edges_of_a_data_ready_line_time_stamp_the_reads() -> None:
+    rig = PathRig("imu61x-i2c")
+    edges = ReadyEdges(ReadyOptions(line="Y", bias_us=0), 10 * MS)
+    path = rig.polled(edges=edges)
+    path.observe(rig.noted)
+    path.begin(rig.now)
+    edges.restart()
+    edges.on_edges([Edge(rig.now - MS, True, 7)])
+    path.on_readings([rig.reading(0, [VALUES]), rig.reading(1, [VALUES])])
+    first, second = rig.batches[0]
+    assert (first.t_ns, first.sync, first.edge_seq) == (rig.now - MS, Sync.EDGE, 7)
+    assert second.seq == 2
+    assert rig.noted.named()[-3:] == [("edges", "restart"), ("edges", "data_ready"), ("readings", 2)]
+    path.observe(None)
+    assert edges.observer is None
