@@ -35,6 +35,13 @@ async def _without_readers_left(body: Coroutine[Any, Any, None]) -> None:
     loop = asyncio.get_running_loop()
     assert isinstance(loop, event_loop.SampleLoop)
     assert not loop._reader_selector._readers, "a descriptor is still watched"
+    assert not timers_left(loop)
+
+
+def timers_left(loop: Any) -> list[str]:
+    """Return the timers of imud that are neither cancelled nor due. A closed object must not be called again."""
+    pending = (timer for timer in loop._scheduled if not timer.cancelled())
+    return [repr(timer) for timer in pending if str(getattr(timer._callback, "__module__", "")).startswith("imud.")]
 
 
 DESCRIPTOR_LIMIT_S = 60.0
@@ -141,3 +148,4 @@ def run_virtually(clock: VirtualClock, body: Coroutine[Any, Any, None]) -> None:
         loop: Any = runner.get_loop()
         watched = {key.fd for key in loop._selector.get_map().values()} - {loop._ssock.fileno()}
         assert not watched, "a descriptor is still watched"
+        assert not timers_left(loop)

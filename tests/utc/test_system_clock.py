@@ -111,6 +111,7 @@ async def test_each_names_its_instant_after_it_was_and_within_its_second(rate_hz
     names = [rmc.utc_ns for s, _ in bench.got if isinstance(rmc := parse(s), Rmc)]
     assert len(set(names)) == len(names)
     assert sum(name % NS_PER_S == 0 for name in names) >= 18
+    bench.source.close()
 
 
 @in_loop
@@ -122,6 +123,7 @@ async def test_an_early_wakeup_waits_and_a_late_wakeup_skips_edges() -> None:
     assert len(bench.got) == 1
     bench.go(1, late_ns=51 * NS_PER_MS)
     assert len(bench.got) == 1
+    bench.source.close()
 
 
 @pytest.mark.parametrize(
@@ -142,6 +144,7 @@ async def test_an_inaccurate_clock_gives_no_sentence_and_reports_the_reason(cloc
     bench.go(1)
     assert len(bench.got) == 1
     assert bench.source.problem == ""
+    bench.source.close()
 
 
 def test_the_timer_runs_in_the_event_loop_and_stops() -> None:
