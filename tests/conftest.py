@@ -73,6 +73,11 @@ def board(tmp_path: Path) -> "Iterator[Board]":
     made.publisher.close()
 
 
+DESCRIPTORS_CHECKED: Final = tuple(
+    f"tests/{folder}/" for folder in ("publishers", "client", "links", "lines", "utc", "device", "recording", "sim")
+)
+
+
 def open_descriptors() -> dict[int, str]:
     """Return the files of the open descriptors of this process."""
     found = {}
@@ -86,9 +91,9 @@ def open_descriptors() -> dict[int, str]:
 
 @pytest.fixture(autouse=True)
 def _no_descriptor_left(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Fail if a test of an output or of the client leaves a descriptor open."""
+    """Fail if a test of an output, a link, a line or the client leaves a descriptor open."""
     path = request.node.nodeid
-    if not path.startswith(("tests/publishers/", "tests/client/")) or path.startswith("tests/fleet/"):
+    if not path.startswith(DESCRIPTORS_CHECKED):
         yield
         return
     before = open_descriptors()
