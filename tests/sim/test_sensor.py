@@ -2,6 +2,8 @@
 
 import pytest
 
+from imud.model.units import NS_PER_S
+from imud.sim import CAN_SIMULATORS, SIMULATORS
 from imud.sim.physics import Noise, swing
 from imud.sim.sensor import SensorHardware, SimulatorOptions, sensor_of
 
@@ -19,3 +21,28 @@ def test_every_option_of_the_sensor_arrives() -> None:
     assert sensor.reading(0.5) == Noise(3).add(swing().at(0.5), 0.5) != swing().at(0.5)
     with pytest.raises(ValueError, match="motion 'dance': expected"):
         sensor_of(SimulatorOptions(motion="dance"))
+
+
+BEGIN_NS = 5 * NS_PER_S
+
+
+@pytest.mark.parametrize("name", [*(name for name in SIMULATORS if name != "hipnuc-modbus"), *CAN_SIMULATORS])
+def test_a_device_sends_exactly_at_the_time_of_next_ns(name: str) -> None:
+    """Before this time nothing is sent. The same is valid after a restart, which cuts the frames on the wire."""
+    simulator = SIMULATORS[name] if name in SIMULATORS else CAN_SIMULATORS[name]
+    module = simulator.make(SimulatorOptions(noise="none", skew_ppm=50.0), BEGIN_NS)
+    now_ns, sent = BEGIN_NS, 0
+    for number in range(60):
+        next_ns = module.next_ns()
+        assert next_ns is not None
+        assert next_ns > now_ns or not number
+        assert not list(module.advance(next_ns - 1))
+        now_ns = next_ns
+        frames = list(module.advance(now_ns))
+        assert frames
+        assert all(frame.due_ns == now_ns for frame in frames)
+        sent += len(frames)
+        if number == 30:
+            module.reboot(now_ns + 500_000)
+    counters = module.counters()
+    assert sent - 1 <= counters["frames_sent"] <= sent + 6  # a restart drops a frame, and a set is not complete

@@ -1,6 +1,6 @@
 """Simulated devices on one bus: time of a byte, replies, saved settings. No clock, no waiting."""
 
-from math import dist
+from math import dist, radians
 from typing import Any
 
 import pytest
@@ -11,7 +11,8 @@ from imud.formats.modbus import framed, is_exception, is_whole
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_S
-from imud.sim.hipnuc.modbus import ModbusLine, Slave, SlaveVariant, make
+from imud.sim.hipnuc.modbus import ModbusLine, Slave, SlaveVariant, incli_counts, make
+from imud.sim.physics import swing
 from imud.sim.sensor import Burst, SimulatorOptions
 from tests.support.pty_port import serial_of, slave
 
@@ -41,6 +42,7 @@ class ModbusMaster:
         return b"".join(burst.data for burst in self.bursts(framed(address, request)))
 
 
+STILL = swing().at(0.0)
 READ_BLOCK = read_registers(0x34, 26).sends[0]
 
 
@@ -151,3 +153,16 @@ def test_an_ignored_write_is_confirmed_and_changes_nothing() -> None:
         rig = ModbusMaster(here(1, variant=SlaveVariant(ignores=ignores)))
         assert rig.ask(1, request) == framed(1, request)
         assert rig.line.slaves[0].settings.heading_mode == mode
+
+
+@pytest.mark.parametrize(
+    ("kind", "roll_deg", "pitch_deg", "counts"),
+    [
+        ("single", 90, 0, (8192, 0)), ("single", -90, 0, (24576, 0)), ("single", 360, 0, (0, 0)),
+        ("dual", 90, 0, (16384, 0)), ("dual", -45, 60, (-8192, 12341)), ("", 90, 45, (0, 0)),
+    ],
+)  # fmt: skip
+def test_counts_of_an_inclinometer(kind: str, roll_deg: float, pitch_deg: float, counts: tuple[int, int]) -> None:
+    """One count of 360°/32768 for X from 0 to 360°, of 180°/32768 for ±180°. Y is 67.8° at pitch 60° and roll -45°."""
+    truth = STILL._replace(euler_rad=(radians(roll_deg), radians(pitch_deg), 0.3))
+    assert incli_counts(truth, kind) == pytest.approx(counts, abs=1)

@@ -181,6 +181,9 @@ def test_commands_at_another_rate_or_damaged() -> None:
     for index, value in ((27, 4.0), (30, 0x1C), (31, 256.0), (31, 0.5), (8, 0.0), (99, 1.0), (27, float("nan"))):
         with pytest.raises(ParameterRefused):
             changed(settings, index, value)
+    valid = {27: (0, 1, 2, 3), 30: (0x18, 0x19, 0x1A, 0x1B), 31: (0, 0x44, 0xFF)}  # table 12
+    for index, values in valid.items():
+        assert [changed(settings, index, float(value)).value(index) for value in values] == list(values)
     for which in Parameter:
         Imu61xSettings().value(which)
     with pytest.raises(ParameterRefused):

@@ -3,11 +3,16 @@
 import errno
 import socket
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
+from imud.formats.can import ERROR_FLAG, RAW_FRAME, REMOTE_FLAG, pack_frame
 from imud.links.socketcan import libc
+from imud.model.errors import LinkError
+from imud.sim.can_module import SentFrame
 from imud.sim.ports import can_port
+from imud.sim.ports.can_port import CanPort, default_interface, open_can_socket
 
 
 @pytest.fixture
@@ -54,3 +59,82 @@ def test_those_that_are_refused_are_reported_one_by_one(pair: tuple[socket.socke
     assert {error.errno for error in refused} == {errno.EAGAIN}
     got = [far.recv(64) for _ in range(len(datagrams) - len(refused))]
     assert got == datagrams[: len(got)]
+
+
+class Module:
+    """A device that sends the frames in `due` at the next `advance`."""
+
+    epoch_ns = 7
+
+    def __init__(self) -> None:
+        self.due: list[SentFrame] = []
+        self.next: int | None = None
+        self.received: list[tuple[int, bool, bytes, int]] = []
+        self.reboots: list[int] = []
+
+    def receive(self, *frame: Any) -> None:
+        self.received.append(frame)
+
+    def advance(self, _now_ns: int) -> list[SentFrame]:
+        due, self.due = self.due, []
+        return due
+
+    def next_ns(self) -> int | None:
+        return self.next
+
+    def counters(self) -> dict[str, int]:
+        return {"frames_sent": 3}
+
+    def mark(self, now_ns: int) -> None: ...
+
+    def reboot(self, now_ns: int) -> None:
+        self.reboots.append(now_ns)
+
+
+def test_a_port_passes_frames_in_both_directions(pair: tuple[socket.socket, socket.socket]) -> None:
+    near, far = pair
+    module = Module()
+    port = CanPort(module, "vcan9", open_socket=lambda name: near if name == "vcan9" else far)
+    assert (port.fileno(), port.node, port.is_open) == (near.fileno(), port, True)
+    far.send(pack_frame(0x7FF, False, b"abc"))
+    far.send(pack_frame(0, True, b""))
+    for flag in (ERROR_FLAG, REMOTE_FLAG):
+        far.send(RAW_FRAME.pack(0x123 | flag, 8, bytes(8)))
+    port.step(5, readable=False)
+    assert module.received == []
+    port.step(6, readable=True)
+    assert module.received == [(0x7FF, False, b"abc", 6), (0, True, b"", 6)]
+
+    frame = SentFrame(10, 0x188, False, b"x")
+    module.due = [frame]
+    port.step(10, readable=False)
+    assert far.recv(64) == pack_frame(0x188, False, b"x")
+    assert port.next_ns(10) == 10
+    module.next = 30
+    assert port.next_ns(10) == 30
+    port.unplug(10, 90)  # no power until 100
+    assert module.reboots == [100]
+    assert port.next_ns(10) == 100
+    module.due = [frame]
+    port.step(99, readable=False)
+    assert module.due == [frame]
+    port.step(100, readable=False)
+    assert far.recv(64) == pack_frame(0x188, False, b"x")
+    assert port.summary() == {"frames_sent": 3, "frames_refused": 0, "epoch_ns": 7}
+    port.close()
+    assert near.fileno() == -1
+    module.due = [frame, frame]
+    port.step(101, readable=False)
+    assert port.summary()["frames_refused"] == 2
+    port.step(102, readable=True)  # a failed read is ignored: an interface can return
+    assert len(module.received) == 2
+
+
+def test_an_interface_that_is_not_there_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(LinkError, match="CAN"):
+        open_can_socket("no-such-can")
+    monkeypatch.setattr(can_port, "can_interfaces", lambda: ["can7", "can8"])
+    assert default_interface() == "can7"
+    monkeypatch.setattr(can_port, "can_interfaces", list)
+    with pytest.raises(LinkError, match="got none"):
+        default_interface()
