@@ -29,7 +29,6 @@ STEP_TOLERANCE_NS: Final = 500 * NS_PER_US
 GAP_S_MAX: Final = 10
 PULSES_NEEDED: Final = 3
 PULSES_KEPT: Final = 16
-SENTENCES_NEEDED: Final = 2
 HOLD_NS: Final = 600 * NS_PER_S  # time after the last pulse until UTC is unknown, ns
 # One-sigma error of the constant delay of time stamps, ns. The entry of an interrupt needs some µs.
 STAMP_NS: Final = 5 * NS_PER_US

@@ -143,3 +143,52 @@ def test_sentences_that_name_no_pulse_are_ignored(sentence: bytes, after_s: floa
         receiver.reference.on_sentence(sentence, receiver.t_ns(after_s))
     assert receiver.reference.sentences_ignored == 3
     assert receiver.reference.reference(receiver.t_ns()) is None
+
+
+def accepted(*steps_ns: int) -> list[bool]:
+    """Return whether a reference with five exact pulses accepts pulses after these steps, each alone."""
+    found = []
+    for step_ns in steps_ns:
+        receiver = Receiver(0)
+        receiver.go(5)
+        found.append(receiver.reference.on_pulse(receiver.t_ns() + step_ns))
+    return found
+
+
+def test_a_pulse_follows_by_one_to_ten_seconds_within_half_a_millisecond_each() -> None:
+    second, off = NS_PER_S, NS_PER_MS // 2
+    assert accepted(second - off, second + off, 10 * second - 10 * off, 10 * second + 10 * off) == [True] * 4
+    assert accepted(second - off - 1, second + off + 1, 10 * second + 10 * off + 1, 11 * second, 0) == [False] * 5
+
+
+def test_utc_is_known_with_three_pulses_and_until_ten_minutes_after_the_last() -> None:
+    receiver = Receiver(0)
+    receiver.go(3, says=None)
+    for after_s in (0.3, 0.4):  # a receiver with 10 Hz
+        assert receiver.reference.reference(receiver.t_ns()) is None
+        receiver.reference.on_sentence(build((UTC_S + 3) * NS_PER_S), receiver.t_ns(after_s))
+    assert receiver.known(600).offset_ns == UTC_S * NS_PER_S - BEGIN_NS
+    assert receiver.reference.reference(receiver.t_ns(600) + 1) is None
+
+
+def test_the_fit_uses_the_last_16_pulses_and_their_spread() -> None:
+    receiver = Receiver(100)
+    receiver.go(40)
+    begin_ns = receiver.t_ns()
+    for number in range(1, 17):  # the oscillator has no error any longer
+        receiver.reference.on_pulse(begin_ns + number * NS_PER_S)
+    (reference, later) = (receiver.reference.reference(begin_ns + (16 + wait) * NS_PER_S) for wait in (0, 100))
+    assert reference is not None
+    assert later is not None
+    assert abs(later.offset_ns - reference.offset_ns) <= 1
+    assert reference.error_ns == 5000
+    assert later.error_ns == pytest.approx(100_000, rel=0.01)  # 5 µs, and 1 µs per second
+
+    # every second time stamp is 10 µs late: the median is at 5 µs, sigma is 1.4826 · 5 µs, the quartile is 5 µs higher
+    receiver = Receiver(0)
+    receiver.go(4)
+    for number in range(1, 17):
+        receiver.reference.on_pulse(receiver.t_ns(number) + 10_000 * (number % 2))
+    found = receiver.reference.reference(receiver.t_ns(16))
+    assert found is not None
+    assert found.error_ns == pytest.approx((5_000**2 + (1.4826 * 5_000) ** 2 + 5_000**2) ** 0.5, rel=0.15)
