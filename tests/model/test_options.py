@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import pytest
@@ -11,7 +11,7 @@ from msgspec import Meta
 from docs.generate import references
 from imud.contracts.lines import LINE_SCHEMAS
 from imud.drivers import DRIVERS
-from imud.model.options import Options, WrongValue, wrong_values
+from imud.model.options import Options, WrongValue, expected, got, is_host, value_problem, wrong_values
 from imud.publishers.socket.methods import METHODS
 
 LEAKS = re.compile(r"`|\$|Object|missing required|ValidationError|<class|Expected|NoneType|\bstr\b|\bint\b|\bfloat\b")
@@ -87,3 +87,56 @@ class Trip(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
 )  # fmt: skip
 def test_wrong_values(given: dict[str, Any], expected: list[tuple[str, str]]) -> None:
     assert wrong_values(Trip, given, "word") == [WrongValue(*one) for one in expected]
+
+
+@pytest.mark.parametrize(
+    ("field_type", "words"),
+    [
+        (Annotated[float, Meta(gt=0, lt=2.5)], "a number above 0 below 2.5"),
+        (Annotated[int, Meta(ge=0, le=3)] | None, "a whole number from 0 to 3, or null"),
+        (Annotated[int, Meta(ge=-4)], "a whole number from -4"),
+        (list[bool], "a list, each item true or false"),
+        (Annotated[list[int], Meta(min_length=2, max_length=2)], "a list of 2, each item a whole number"),
+        (Annotated[list[int], Meta(min_length=2)], "a list of at least 2, each item a whole number"),
+        (Annotated[list[int], Meta(min_length=1, max_length=3)], "a list of 1 to 3, each item a whole number"),
+        (Annotated[list[int], Meta(max_length=3)], "a list of 0 to 3, each item a whole number"),
+        (Literal["2 Hz", "10 Hz", 5], 'one of 5, "2 Hz", "10 Hz"'),
+        (Literal["auto"], '"auto"'),
+        (dict[str, Any], "keys, each with any value"),
+        (dict[Literal["b", "a"], int], "keys a, b, each with a whole number"),
+        (Annotated[str, Meta(min_length=1)], "text that is not empty"),
+        (Annotated[str, Meta(pattern="^/", extra={"words": "an absolute path"})], "an absolute path"),
+    ],
+)
+def test_types_in_words(field_type: Any, words: str) -> None:
+    assert expected(field_type) == words
+
+
+@pytest.mark.parametrize(
+    ("value", "field_type", "place"),
+    [
+        ([1, "x"], list[int], ' with "x" at [1]'),
+        ({"rate_hz": 1, "names": ["a", 2]}, Trip, " with 2 at names[1]"),
+    ],
+)
+def test_the_place_of_a_wrong_part(value: object, field_type: Any, place: str) -> None:
+    assert value_problem(value, field_type).endswith(place)
+
+
+def test_texts_in_errors_are_short() -> None:
+    assert got("a" * 60) == '"' + "a" * 60 + '"'
+    assert len(got("a" * 61)) < len(got("a" * 60)) + 2
+    assert "a" * 61 not in got("a" * 61)
+
+
+@pytest.mark.parametrize(
+    ("text", "is_valid"),
+    [
+        ("gateway.example", True), ("gateway.example.", True), ("::1", True), ("192.0.2.1", True), ("a", True),
+        ("192.0.2.256", False), ("a.1", False), ("-a", False), ("a-", False), ("a..b", False), ("", False),
+        ("a" * 63, True), ("a" * 64, False),
+        (".".join(["a" * 63] * 3) + "." + "a" * 61, True), (".".join(["a" * 63] * 3) + "." + "a" * 62, False),
+    ],
+)  # fmt: skip
+def test_hosts_have_at_most_253_characters_and_labels_63(text: str, is_valid: bool) -> None:
+    assert is_host(text) == is_valid

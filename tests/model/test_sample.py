@@ -1,7 +1,12 @@
 """The schema of a sample describes every member in its order."""
 
+import struct
+
+import pytest
+
 from imud.lines.sync import ALARM_STATUS
-from imud.model.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA, Sample
+from imud.model.event import EventKind, kind_of
+from imud.model.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA, T_ERR_MOST, Sample
 
 BY_NAME = {field.name: field for field in SAMPLE_SCHEMA}
 
@@ -23,3 +28,16 @@ def test_the_meaning_of_edge_seq() -> None:
     assert "trigger on SIN" in meaning
     assert "PPS" not in meaning
     assert (BY_NAME["pps_age_ms"].unit, BY_NAME["pps_age_ms"].frame) == ("ms", "device clock")
+
+
+def test_the_largest_time_stamp_error_fits_into_32_bits() -> None:
+    assert struct.pack("<I", T_ERR_MOST) == b"\xff" * 4
+    with pytest.raises(struct.error):
+        struct.pack("<I", T_ERR_MOST + 1)
+
+
+def test_kinds_of_events_by_name() -> None:
+    """A newer daemon can send an unknown kind."""
+    assert [kind_of(kind.value) for kind in EventKind] == list(EventKind)
+    assert type(kind_of("mark")) is EventKind
+    assert kind_of("eclipse") == "eclipse"
