@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imud import drivers as devices
-from imud.contracts.codec import CodecEvent, StreamCodec
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent, StreamCodec
 from imud.contracts.driver import StreamDriver, of_kind
 from imud.contracts.script import TextLine
 from imud.model.ledger import Ledger
@@ -172,3 +172,18 @@ def test_rates_of_the_row(name: str) -> None:
     assert all(baud > 0 for baud in driver.baud_rates)
     assert len(set(driver.baud_rates)) == len(driver.baud_rates) > 0
     assert driver.tick_ns > 0
+
+
+@every_driver
+def test_damage_is_counted_by_its_kind(name: str) -> None:
+    """A wrong bit in the payload is a CRC error, a length without a frame type is a length error."""
+    driver = DRIVERS[name]
+    frame = driver.example_frame(Random(1))
+    length_at = {"hipnuc-uart": 2, "imu61x-uart": 4}[name]
+    wrong_length = frame[:length_at] + b"\xff\xff" + frame[length_at + 2 :]
+    for data, reason in ((frame[:-1] + bytes([frame[-1] ^ 1]), BadReason.CRC), (wrong_length, BadReason.LENGTH)):
+        codec = make(driver)
+        bad = [event for event in feed_checked(codec, [data + bytes(IDLE)]) if isinstance(event, BadFrame)]
+        assert [event.reason for event in bad] == [reason]
+        counts = codec.ledger.frames_bad_crc, codec.ledger.frames_bad_length, codec.ledger.frames_good
+        assert counts == ((1, 0, 0) if reason is BadReason.CRC else (0, 1, 0))

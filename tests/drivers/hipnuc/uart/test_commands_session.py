@@ -16,6 +16,7 @@ from imud.drivers.hipnuc.uart.commands import (
     log_ontime,
     read_settings,
     wake,
+    why_silent,
 )
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.model.errors import BadArgument, NoReply, Rejected
@@ -258,3 +259,17 @@ def test_by_itself_only_frames_that_have_a_rate_are_let_out(settings: ModuleSett
     assert line.run(wake()) is woken
     assert ("LOG ENABLE" in line.asked) is (woken is True)
     assert line.module.settings == settings
+
+
+@pytest.mark.parametrize(
+    ("report", "words"),
+    [
+        (("LOG HI91 ONTIME 0.01", "LOG HI92 ONTIME 0.005"), "LOG DISABLE); HI92 has the rate 200 Hz"),
+        (("LOG HI92 ONMARK 1", "LOG HI91 ONMARK 1"), "HI91 and HI92 on mark"),
+        (("LOG HI91 ONTIME 0",), "no message has a rate"),
+        ((), "its output is off, or on mark"),
+    ],
+)
+def test_the_reason_of_a_silent_device(report: tuple[str, ...], words: str) -> None:
+    lines = {f"COMCONFIG {number}": line for number, line in enumerate(report)}
+    assert words in why_silent({"BAUD": "115200", **lines})
