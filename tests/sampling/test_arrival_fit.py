@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from itertools import pairwise
+from math import ceil
 from random import Random
 
 import pytest
@@ -116,6 +117,50 @@ def test_messages_between_stalls_bound_what_a_timer_hides() -> None:
     assert fit.hidden_ns < 2 * pause_ns
     device_ns = 70 * NS_PER_S
     assert abs(at(fit, device_ns) - fit.shift_ns - device_ns) < 2 * pause_ns
+
+
+@pytest.mark.parametrize(("seconds", "ppm"), [(20, 20), (20, 100), (60, 0), (60, -20)])
+def test_the_slope_error_covers_the_part_that_a_slow_beat_hides(seconds: int, ppm: float) -> None:
+    """Frames every 16 ms behind a timer of 16 ms: the wait changes by some µs per second, and the spread is small."""
+    period_ns = 16 * NS_PER_MS
+    timer_ns = period_ns * (1 + ppm * 1e-6)
+    fit = ArrivalFit(0, 0, period_ns)
+    fit.set_pause(15 * NS_PER_MS, 2)
+    for number in range(1, seconds * NS_PER_S // period_ns):
+        sent_ns = number * period_ns
+        handed_ns = int(ceil((sent_ns + 3 * NS_PER_MS) / timer_ns) * timer_ns) - 3 * NS_PER_MS
+        add(fit, sent_ns, handed_ns)
+    assert abs(fit.slope - 1) <= fit.slope_error <= period_ns / (seconds * NS_PER_S)
+    off_ns = at(fit, sent_ns) - fit.shift_ns - sent_ns
+    assert abs(off_ns) <= fit.hidden_ns / 2 <= period_ns / 2
+
+
+@pytest.mark.parametrize(("hold_ms", "span_ms"), [(0, 100), (1, 100), (16, 320)])
+def test_a_fit_is_known_after_8_points_and_100_ms_or_20_periods_of_the_timer(hold_ms: int, span_ms: int) -> None:
+    for last_ms, known in ((span_ms - 1, False), (span_ms, True)):
+        fit = ArrivalFit(0, 0, hold_ms * NS_PER_MS)
+        for number in range(1, 7):
+            add(fit, number * NS_PER_MS, number * NS_PER_MS)
+        assert not fit.is_known(0)
+        add(fit, last_ms * NS_PER_MS, last_ms * NS_PER_MS)
+        assert fit.count == 8
+        assert fit.is_known(100 * NS_PER_MS) == known
+    assert fit.is_known(span_ms * NS_PER_MS)
+    assert not fit.is_known(span_ms * NS_PER_MS + 1)
+
+
+@pytest.mark.parametrize(("reported_ms", "true_ms"), [(1, 16), (1, 4), (4, 16)])
+def test_a_timer_that_is_longer_than_reported_is_measured(reported_ms: int, true_ms: int) -> None:
+    random, fit = Random(1), ArrivalFit(0, 0, reported_ms * NS_PER_MS)
+    for number in range(1, 2000):
+        sent_ns = number * 10 * NS_PER_MS
+        add(fit, sent_ns, sent_ns + int(random.uniform(0, 0.9 * true_ms * NS_PER_MS)))
+    assert fit.measured_hold_ns == true_ms * NS_PER_MS
+    fit = ArrivalFit(0, 0, reported_ms * NS_PER_MS)
+    for number in range(1, 2000):
+        sent_ns = number * 10 * NS_PER_MS
+        add(fit, sent_ns, sent_ns + int(random.uniform(0, 0.9 * reported_ms * NS_PER_MS)))
+    assert fit.measured_hold_ns == 0
 
 
 # --- feasible lines ---------------------------------------------------------------------------------------------------

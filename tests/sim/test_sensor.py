@@ -1,5 +1,7 @@
 """The sensor inside every simulated device follows the options."""
 
+from typing import Any
+
 import pytest
 
 from imud.model.units import NS_PER_S
@@ -38,7 +40,7 @@ def test_a_device_sends_exactly_at_the_time_of_next_ns(name: str) -> None:
         assert next_ns > now_ns or not number
         assert not list(module.advance(next_ns - 1))
         now_ns = next_ns
-        frames = list(module.advance(now_ns))
+        frames: list[Any] = [*module.advance(now_ns)]
         assert frames
         assert all(frame.due_ns == now_ns for frame in frames)
         sent += len(frames)
