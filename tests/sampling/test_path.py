@@ -1,12 +1,13 @@
 """The three paths with scripted codecs: batches, losses, faults, gaps, and the reports to an observer."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import sqrt
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from imud.contracts.codec import BadFrame, BadReason, Poll, PolledEvent, Reading, Vanished
+from imud.contracts.codec import BadFrame, BadReason, PolledEvent, Reading, Vanished
 from imud.contracts.lines import Edge, ReadyOptions, TriggerStamp
 from imud.contracts.publisher import Batch
 from imud.contracts.script import Message, ReplyFrame, TextLine
@@ -28,58 +29,37 @@ VALUES = Measurement(8, 0, None, accel_m_s2=(0.0, 0.0, 9.8), status=0b110)
 
 
 class Noted:
-    """An observer that notes its reports."""
+    """An observer that notes its reports: method and arguments."""
 
     def __init__(self) -> None:
         self.reports: list[tuple[Any, ...]] = []
 
-    def data(self, *given: object) -> None:
-        self.reports.append(("data", *given))
-
-    def frames(self, frames: Sequence[CanFrame]) -> None:
-        self.reports.append(("frames", len(frames)))
-
-    def readings(self, readings: Sequence[Reading]) -> None:
-        self.reports.append(("readings", len(readings)))
-
-    def edges(self, line: str, edges: Sequence[Edge]) -> None:
-        self.reports.append(("edges", line, len(edges)))
-
-    def overruns(self, count: int) -> None:
-        self.reports.append(("overruns", count))
-
-    def call(self, *given: object, **keywords: object) -> None:
-        self.reports.append((*given, *sorted(keywords.items())))
+    def __getattr__(self, name: str) -> Any:
+        return lambda *given, **keywords: self.reports.append((name, *given, *keywords.items()))
 
     def named(self) -> list[tuple[Any, ...]]:
-        return [report[:2] for report in self.reports]
+        return [report[:3] if report[0] == "call" else report[:1] for report in self.reports]
 
 
 class Scripted:
-    """A codec whose next results are set by the test."""
-
-    polls: Sequence[Poll] = ()
-    stale = 0
+    """A codec for CAN frames and polls whose next results are set by the test."""
 
     def __init__(self, ledger: Ledger) -> None:
         self.ledger = ledger
         self.results: list[tuple[Sequence[Any], int]] = []  # events and pending frames after each frame
         self.silence: Sequence[PolledEvent] = ()
-        self.flushed: Sequence[Any] = ()
+        self.flush: Callable[[], Sequence[Any]] = tuple
         self.resets = 0
 
-    def feed_frame(self, _can_id: int, _extended: bool, _data: bytes, _t_rx_ns: int) -> Sequence[Any]:
+    def feed_frame(self, *_frame: object) -> Sequence[Any]:
         events, self.ledger.frames_pending = self.results.pop(0)
         return events
 
-    def decode(self, _poll: int, _data: bytes) -> Sequence[Any]:
+    def decode(self, *_poll: object) -> Sequence[Any]:
         return self.results.pop(0)[0]
 
     def on_silence(self, _poll: int) -> Sequence[PolledEvent]:
         return self.silence
-
-    def flush(self) -> Sequence[Any]:
-        return self.flushed
 
     def reset(self) -> None:
         self.resets += 1
@@ -92,7 +72,8 @@ class PathRig:
     def __init__(self, driver: str) -> None:
         self.clock = VirtualClock()
         self.now = self.clock.now_ns()
-        self.ledger, self.noted = Ledger(), Noted()
+        self.ledger = Ledger()
+        self.noted: Any = Noted()
         self.codec: Any = Scripted(self.ledger)
         self.batches: list[list[Sample]] = []
         self.messages: list[tuple[Message, int]] = []
@@ -182,14 +163,7 @@ def test_samples_of_one_batch_come_in_order_between_messages_and_bad_frames() ->
 
 def test_a_listener_gets_measurements_while_it_waits_and_edges_come_first() -> None:
     rig, order = PathRig("hipnuc-uart"), list[str]()
-
-    class Listener:
-        wants_samples = True
-
-        def on_sample(self, sample: Measurement) -> None:
-            order.append(f"sample {sample.dev_ticks}")
-
-    listener = Listener()
+    listener = SimpleNamespace(wants_samples=True, on_sample=lambda m: order.append(f"sample {m.dev_ticks}"))
     codec = HipnucCodec(rig.ledger, HipnucOptions())
     path = StreamPath(codec, rig.sample_clock, rig.context, lambda: order.append("edges"), listener)
     path.on_data(hi91(7) + b"OK\r\n", rig.now)
@@ -220,22 +194,22 @@ def test_an_observer_receives_each_input_of_path_and_clock() -> None:
     path.publish_gathered()
     path.flush(now + 2)
     path.reset()
-    clock = path.clock
-    edges = [Edge(now, True, 1)]
+    clock, edges, triggers = path.clock, [Edge(now, True, 1)], [TriggerStamp(now, 1, 1)]
     for line in ("sout", "sout_div", "pps"):
         clock.add_edges(line, edges)
-    clock.add_triggers([TriggerStamp(now, 1, 1)])
+    clock.add_triggers(triggers)
     clock.set_utc_reference(None)
     clock.set_own_status(4)
     clock.link_changed(byte_ns=1, hold_ns=2)
     clock.restart()
     assert rig.noted.reports == [
-        ("ledger", "set", rig.noted.reports[0][2]), ("path", "begin", now), ("loss", "link_opened"),
-        ("data", hi91(1000), now, -1), ("data", b"x", now + 1, 7), ("path", "publish_gathered"),
-        ("path", "flush", now + 2), ("path", "reset"), ("edges", "sout", 1), ("edges", "sout_div", 1),
-        ("edges", "pps", 1), ("aiding", "on_trigger_stamps", [TriggerStamp(now, 1, 1)]),
-        ("clock", "set_utc_reference", None), ("clock", "set_own_status", 4),
-        ("clock", "link_changed", ("byte_ns", 1), ("hold_ns", 2)), ("clock", "restart"),
+        ("call", "ledger", "set", Ledger().snapshot()), ("call", "path", "begin", now), ("call", "loss", "link_opened"),
+        ("data", hi91(1000), now, -1), ("data", b"x", now + 1, 7), ("call", "path", "publish_gathered"),
+        ("call", "path", "flush", now + 2), ("call", "path", "reset"),
+        *(("edges", line, edges) for line in ("sout", "sout_div", "pps")),
+        ("call", "aiding", "on_trigger_stamps", triggers), ("call", "clock", "set_utc_reference", None),
+        ("call", "clock", "set_own_status", 4), ("call", "clock", "link_changed", ("byte_ns", 1), ("hold_ns", 2)),
+        ("call", "clock", "restart"),
     ]  # fmt: skip
     path.observe(None)
     path.on_data(hi91(1010), now + 10 * MS)
@@ -268,7 +242,7 @@ def test_a_sample_was_measured_before_its_first_frame() -> None:
     (samples,) = rig.batches
     assert [sample.t_rx_ns - now for sample in samples] == [13 * MS, 14 * MS]
     assert [sample.t_ns - now for sample in samples] == [at * MS - 200_000 - WAKE_NS for at in (10, 13)]
-    assert rig.noted.named() == [("path", "set_frame_time"), ("frames", 3), ("frames", 4)]
+    assert rig.noted.named() == [("call", "path", "set_frame_time"), ("frames",), ("frames",)]
 
 
 def test_lost_frames_and_a_closed_link_discard_a_part_of_a_sample() -> None:
@@ -281,7 +255,7 @@ def test_lost_frames_and_a_closed_link_discard_a_part_of_a_sample() -> None:
     path.reset()
     assert rig.codec.resets == 2
     path.flush(now + 5 * MS)
-    rig.codec.flushed = [VALUES]
+    rig.codec.flush = lambda: [VALUES]
     path.flush(now + 6 * MS)
     assert rig.sizes == [1, 1]
     assert rig.batches[1][0].t_rx_ns == now + 6 * MS
@@ -323,7 +297,7 @@ def test_readings_of_one_turn_are_one_batch_and_end_at_a_vanished_device() -> No
     assert (rig.ledger.bytes_in, rig.ledger.bytes_skipped) == (8, 8)  # only the path counts the bytes of `later`
     path.skip(readings[0])
     assert (rig.ledger.bytes_in, rig.ledger.bytes_skipped) == (16, 16)
-    assert rig.noted.reports[-2:] == [("readings", 4), ("path", "skip", 8)]
+    assert rig.noted.reports[-2:] == [("readings", [*readings, gone, *later]), ("call", "path", "skip", 8)]
 
 
 @pytest.mark.parametrize("kind", ["damaged", "disturbed"])
@@ -387,6 +361,6 @@ def test_edges_of_a_data_ready_line_time_stamp_the_reads() -> None:
     first, second = rig.batches[0]
     assert (first.t_ns, first.sync, first.edge_seq) == (rig.now - MS, Sync.EDGE, 7)
     assert second.seq == 2
-    assert rig.noted.named()[-3:] == [("edges", "restart"), ("edges", "data_ready"), ("readings", 2)]
+    assert rig.noted.named()[-3:] == [("call", "edges", "restart"), ("edges",), ("readings",)]
     path.observe(None)
     assert edges.observer is None

@@ -3,6 +3,7 @@
 import errno
 import socket
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -61,39 +62,13 @@ def test_those_that_are_refused_are_reported_one_by_one(pair: tuple[socket.socke
     assert got == datagrams[: len(got)]
 
 
-class Module:
-    """A device that sends the frames in `due` at the next `advance`."""
-
-    epoch_ns = 7
-
-    def __init__(self) -> None:
-        self.due: list[SentFrame] = []
-        self.next: int | None = None
-        self.received: list[tuple[int, bool, bytes, int]] = []
-        self.reboots: list[int] = []
-
-    def receive(self, *frame: Any) -> None:
-        self.received.append(frame)
-
-    def advance(self, _now_ns: int) -> list[SentFrame]:
-        due, self.due = self.due, []
-        return due
-
-    def next_ns(self) -> int | None:
-        return self.next
-
-    def counters(self) -> dict[str, int]:
-        return {"frames_sent": 3}
-
-    def mark(self, now_ns: int) -> None: ...
-
-    def reboot(self, now_ns: int) -> None:
-        self.reboots.append(now_ns)
-
-
 def test_a_port_passes_frames_in_both_directions(pair: tuple[socket.socket, socket.socket]) -> None:
     near, far = pair
-    module = Module()
+    due, received, reboots = list[SentFrame](), list[tuple[object, ...]](), list[int]()
+    module: Any = SimpleNamespace(
+        advance=lambda _now_ns: [due.pop() for _ in due[:]], receive=lambda *frame: received.append(frame),
+        next_ns=lambda: None, counters=lambda: {"frames_sent": 3}, reboot=reboots.append, epoch_ns=7,
+    )  # fmt: skip
     port = CanPort(module, "vcan9", open_socket=lambda name: near if name == "vcan9" else far)
     assert (port.fileno(), port.node, port.is_open) == (near.fileno(), port, True)
     far.send(pack_frame(0x7FF, False, b"abc"))
@@ -101,33 +76,33 @@ def test_a_port_passes_frames_in_both_directions(pair: tuple[socket.socket, sock
     for flag in (ERROR_FLAG, REMOTE_FLAG):
         far.send(RAW_FRAME.pack(0x123 | flag, 8, bytes(8)))
     port.step(5, readable=False)
-    assert module.received == []
+    assert received == []
     port.step(6, readable=True)
-    assert module.received == [(0x7FF, False, b"abc", 6), (0, True, b"", 6)]
+    assert received == [(0x7FF, False, b"abc", 6), (0, True, b"", 6)]
 
     frame = SentFrame(10, 0x188, False, b"x")
-    module.due = [frame]
+    due.append(frame)
     port.step(10, readable=False)
     assert far.recv(64) == pack_frame(0x188, False, b"x")
     assert port.next_ns(10) == 10
-    module.next = 30
+    module.next_ns = lambda: 30
     assert port.next_ns(10) == 30
     port.unplug(10, 90)  # no power until 100
-    assert module.reboots == [100]
+    assert reboots == [100]
     assert port.next_ns(10) == 100
-    module.due = [frame]
+    due.append(frame)
     port.step(99, readable=False)
-    assert module.due == [frame]
+    assert due == [frame]
     port.step(100, readable=False)
     assert far.recv(64) == pack_frame(0x188, False, b"x")
     assert port.summary() == {"frames_sent": 3, "frames_refused": 0, "epoch_ns": 7}
     port.close()
     assert near.fileno() == -1
-    module.due = [frame, frame]
+    due.extend([frame, frame])
     port.step(101, readable=False)
     assert port.summary()["frames_refused"] == 2
     port.step(102, readable=True)  # a failed read is ignored: an interface can return
-    assert len(module.received) == 2
+    assert len(received) == 2
 
 
 def test_an_interface_that_is_not_there_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
