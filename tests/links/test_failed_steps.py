@@ -6,6 +6,7 @@ import os
 import socket
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from imud.formats.can import CyclicFrame, pack_frame
@@ -163,3 +164,25 @@ def test_a_link_has_one_cyclic_sender_at_a_time(monkeypatch: pytest.MonkeyPatch,
 @pytest.mark.parametrize("name", [name for name in LINKS if name != "memory"])
 def test_keys_of_a_link_accept_the_documented_values(name: str) -> None:
     assert check_schema(f"Link `{name}`", LINKS[name].settings)
+
+
+TERMS = {"baud": 115200, "direction": "auto", "echo": "auto"}
+CLAIMS: list[tuple[str, dict[str, object], tuple[object, ...]]] = [
+    ("uart", {"port": "/dev/a"}, ("/dev/a", "port", False, None, "", {})),
+    ("spi", {"port": "/dev/spidev0.0"}, ("/dev/spidev0.0", "port", False, None, "", {})),
+    ("i2c", {"bus": 3}, ("/dev/i2c-3", "bus", True, None, "address", {})),
+    ("i2c", {"bus": 3, "address": 25}, ("/dev/i2c-3", "bus", True, 25, "address", {})),
+    ("rs485", {"line": "/dev/b", "address": 7}, ("/dev/b", "line", True, 7, "address", TERMS)),
+    ("rs485", {"line": "/dev/b"}, ("/dev/b", "line", True, None, "address", TERMS)),
+    ("socketcan", {"interface": "can0"}, ("can0", "interface", True, None, "", {"bitrate": 0})),
+    ("socketcan", {"interface": "1", "backend": "x"}, ("1 (x)", "interface", True, None, "", {"bitrate": 0})),
+    ("socketcan", {"interface": "/d", "backend": "x"}, ("/d", "interface", False, None, "", {"bitrate": 0})),
+]
+
+
+@pytest.mark.parametrize(("name", "keys", "expected"), CLAIMS)
+def test_claims_of_a_link(name: str, keys: dict[str, object], expected: tuple[object, ...]) -> None:
+    """Two devices may not use the same serial port or chip select. They may share a bus with other addresses."""
+    row = LINKS[name]
+    (claim,) = row.claims(msgspec.convert(keys, row.settings))
+    assert (claim.place, claim.key, claim.shared, claim.part, claim.part_key, claim.terms) == expected

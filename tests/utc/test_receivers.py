@@ -10,7 +10,9 @@ from imud.contracts.status import KernelCounters
 from imud.formats.nmea0183 import build
 from imud.model.errors import LinkError, LinkMissing
 from imud.model.units import NS_PER_S
+from imud.utc import RMC_SOURCES
 from imud.utc.receivers import FIRST_PAUSE_S, GpsdSource, NmeaPortSource, Retry, RmcOptions, SourceContext, make_nmea
+from imud.utc.system_clock import SystemClockSource
 from tests.support.documented import check_schema
 from tests.support.event_loops import in_loop
 from tests.support.rmc_sources import LIMIT_S, Sentences, soon
@@ -241,3 +243,10 @@ async def test_make_nmea_uses_the_configured_port() -> None:
 
 def test_keys_of_rmc_accept_the_documented_values() -> None:
     assert check_schema("RMC sentences", RmcOptions) == 8
+
+
+def test_sources_by_their_name() -> None:
+    """`nmea` needs a port, the others read gpsd or the clock of the host."""
+    context = SourceContext(lambda *_where: Port(), time.monotonic_ns, lambda: 0)
+    kinds = {name: type(RMC_SOURCES[name](RmcOptions(source=name, port="/dev/a"), context)) for name in RMC_SOURCES}
+    assert kinds == {"gpsd": GpsdSource, "nmea": NmeaPortSource, "system": SystemClockSource}
