@@ -10,7 +10,7 @@ import pytest
 
 from imud.contracts.command import GYRO_ZERO, Calibration, CalibrationResult, Handling, Kept, Target, Verdict
 from imud.contracts.lines import DeviceLines
-from imud.device.calibration import CalibrationRun
+from imud.device.calibration import CalibrationRun, _words
 from imud.device.health import DeviceEvents
 from imud.device.transport import Transport
 from imud.model.errors import BadArgument, CommandError, Rejected
@@ -393,3 +393,11 @@ async def test_a_module_that_moves_is_not_levelled(it: WiredDevice) -> None:
         await it.device.calibrate("level", save=True)
     assert it.module.settings.level == before
     assert not it.device.stop_calibration()
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [(None, ""), (True, ""), (False, "False"), ((1 / 3, 2), "0.333333, 2"), (["a"], "a"), ("done", "done"), (7, "7")],
+)
+def test_the_reply_of_a_device_in_words(answer: object, words: str) -> None:
+    assert _words(answer) == words

@@ -10,7 +10,9 @@ import pytest
 
 from imud.config.model import DeviceConfig
 from imud.contracts.driver import CanDriver
+from imud.contracts.script import RequestScript, pause
 from imud.contracts.status import DeviceState, KernelCounters
+from imud.device.latency import Need
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
@@ -271,3 +273,25 @@ async def test_a_silent_device_reports_the_received_frames(bench: CanDeviceBench
         bench.link.feed(bench.frames(1, lost=lost))
     bench.rig.tick(ahead_ns=3000 * MS)
     assert words in bench.rig.problem
+
+
+@told(play, configured(bitrate=500_000))
+async def test_frames_are_not_held_while_a_script_runs(bench: CanDeviceBench) -> None:
+    bench.feed(1, 2)
+    bench.rig.tick()
+    assert bench.link.gather_ns == 0
+    bench.rig.device.set_need(Need(20 * MS, "client 1"))
+    assert bench.link.gather_ns == 20 * MS
+    transport = bench.rig.device._transport
+    script = asyncio.create_task(transport.run_script(lambda _target: with_pause(5 * MS)))
+    await asyncio.sleep(0)
+    assert (transport.busy, transport.is_free, bench.link.gather_ns) == (True, False, 0)
+    assert await script == "ended"
+    assert (transport.busy, transport.is_free, bench.link.gather_ns) == (False, True, 20 * MS)
+    bench.rig.device.set_need(Need(0, "client 1"))
+    assert bench.link.gather_ns == 0
+
+
+def with_pause(pause_ns: int) -> RequestScript[str]:
+    yield pause(pause_ns)
+    return "ended"

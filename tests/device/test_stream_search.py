@@ -263,3 +263,14 @@ def test_a_reply_behind_other_frames_and_frames_of_several_visits_count() -> Non
     assert isinstance(step, GaveUp)
     assert visits > 1
     assert f"9600: {visits * 164} bytes, {visits} valid frames, {visits} damaged" in step.summary
+
+
+@pytest.mark.parametrize("bauds", [(115200,), BAUD_RATES])
+def test_only_received_bytes_make_longer_visits_of_several_rates(bauds: tuple[int, ...]) -> None:
+    """Foreign bytes: three passes with longer visits, one rate: one visit. No bytes: only the quiet time."""
+    foreign = replace(device(115200, 10), noise=b"$GPGGA,123519,4807.038,N,01131.000,E*47\r\n")
+    result, _, listens = run_search(Search([FAKE_DRIVER], bauds=bauds), foreign)
+    assert isinstance(result, GaveUp)
+    assert [listen.baud for listen in listens] == [*bauds] * (3 if len(bauds) > 1 else 1)
+    _, took_ns, _ = run_search(Search([FAKE_DRIVER], bauds=bauds), device(115200, 0))
+    assert QUIET_NS <= took_ns < QUIET_NS + 100 * NS_PER_MS
