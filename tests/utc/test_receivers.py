@@ -5,6 +5,8 @@ import json
 import time
 from collections.abc import Awaitable, Callable
 
+import msgspec
+
 from imud.contracts.link import OnData, OnEnd
 from imud.contracts.status import KernelCounters
 from imud.formats.nmea0183 import build
@@ -248,5 +250,8 @@ def test_keys_of_rmc_accept_the_documented_values() -> None:
 def test_sources_by_their_name() -> None:
     """`nmea` needs a port, the others read gpsd or the clock of the host."""
     context = SourceContext(lambda *_where: Port(), time.monotonic_ns, lambda: 0)
-    kinds = {name: type(RMC_SOURCES[name](RmcOptions(source=name, port="/dev/a"), context)) for name in RMC_SOURCES}
+    kinds = {
+        name: type(RMC_SOURCES[name](msgspec.convert({"source": name, "port": "/dev/a"}, RmcOptions), context))
+        for name in RMC_SOURCES
+    }
     assert kinds == {"gpsd": GpsdSource, "nmea": NmeaPortSource, "system": SystemClockSource}
