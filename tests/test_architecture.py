@@ -498,6 +498,7 @@ CROSS_CUTTING = {
     "drivers/test_every_stream_driver.py": "every driver of byte streams",
     "lines/test_end_to_end.py": "pins of a simulated device through the whole device",
     "links/test_failed_steps.py": "every step after the opening of a CAN link",
+    "links/test_kernel_constants.py": "numbers of the kernel in all links",
     "publishers/recorder/test_kills.py": "daemons that record and are killed",
     "publishers/socket/test_command.py": "`command` through connection, rights and RPC",
     "publishers/socket/test_documentation.py": "docs/protocol.md",

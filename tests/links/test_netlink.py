@@ -8,6 +8,7 @@ import pytest
 
 from imud.links.netlink import CanDetails, absence, can_details, can_interfaces, parse_details, wait_until
 from imud.model.errors import LinkError
+from tests.support.event_loops import in_loop
 
 
 def interface(sys: Path, name: str, kind: int, flags: int) -> None:
@@ -51,4 +52,13 @@ def test_details_of_an_interface() -> None:
     assert can_details("lo") == CanDetails(None, None)
     with pytest.raises(LinkError, match="nosuch0"):
         can_details("nosuch0")
-    asyncio.run(wait_until(lambda: True))
+
+
+@in_loop
+async def test_a_wait_ends_without_a_reader() -> None:
+    held = iter([False, True])
+    waiting = asyncio.create_task(wait_until(lambda: next(held)))
+    await asyncio.sleep(0)
+    waiting.cancel()
+    await asyncio.gather(waiting, return_exceptions=True)
+    await wait_until(lambda: next(held))

@@ -135,3 +135,17 @@ async def test_cyclic_frames_are_replaced_and_end_with_the_link(monkeypatch: pyt
     link.close()
     assert all(timer.cancelled() for timer in asyncio.get_running_loop()._scheduled)  # type: ignore[attr-defined]
     assert [message.arbitration_id for message in bus.sent] == [1, 2]
+
+
+@pytest.mark.parametrize(("bitrate", "rate"), [(0, {}), (250_000, {"bitrate": 250_000})])
+def test_the_bit_rate_is_set_only_if_it_is_configured(
+    bitrate: int, rate: dict[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[dict[str, object]] = []
+    monkeypatch.setattr(can, "Bus", lambda *_where, **keys: opened.append(keys))
+    link = PythonCanLink("virtual", "x", bitrate)
+    link.filters = wanted = [CanFilter(0x65, 0x7FF, False)]
+    assert link.filters == wanted
+    link.open()
+    filters = [{"can_id": 0x65, "can_mask": 0x7FF, "extended": False}]
+    assert opened == [{"can_filters": filters, "ignore_config": True, **rate}]
