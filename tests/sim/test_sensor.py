@@ -48,3 +48,17 @@ def test_a_device_sends_exactly_at_the_time_of_next_ns(name: str) -> None:
             module.reboot(now_ns + 500_000)
     counters = module.counters()
     assert sent - 1 <= counters["frames_sent"] <= sent + 6  # a restart drops a frame, and a set is not complete
+
+
+@pytest.mark.parametrize("name", [*(name for name in SIMULATORS if name != "hipnuc-modbus"), *CAN_SIMULATORS])
+def test_the_crystal_and_the_boot_time_decide_the_times_of_frames(name: str) -> None:
+    """A crystal that is 1 % fast makes all periods 1 % shorter. A device is silent while it boots."""
+    simulator = SIMULATORS[name] if name in SIMULATORS else CAN_SIMULATORS[name]
+    spans_ns = []
+    for skew_ppm in (0.0, 10_000.0):
+        module = simulator.make(SimulatorOptions(noise="none", skew_ppm=skew_ppm, boot_ms=300), BEGIN_NS)
+        frames: list[Any] = [*module.advance(BEGIN_NS + 20 * NS_PER_S)]
+        times_ns = [one.due_ns for one in frames if one.sample_ns is not None]
+        assert BEGIN_NS + 300_000_000 < times_ns[0] < BEGIN_NS + 500_000_000
+        spans_ns.append(times_ns[1000] - times_ns[0])
+    assert spans_ns[0] / spans_ns[1] == pytest.approx(1.01, rel=1e-3)

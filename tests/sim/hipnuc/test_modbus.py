@@ -166,3 +166,12 @@ def test_counts_of_an_inclinometer(kind: str, roll_deg: float, pitch_deg: float,
     """One count of 360°/32768 for X from 0 to 360°, of 180°/32768 for ±180°. Y is 67.8° at pitch 60° and roll -45°."""
     truth = STILL._replace(euler_rad=(radians(roll_deg), radians(pitch_deg), 0.3))
     assert incli_counts(truth, kind) == pytest.approx(counts, abs=1)
+
+
+def test_a_slave_is_silent_while_it_boots() -> None:
+    rig = ModbusMaster(here(1, variant=SlaveVariant(boot_ms=500)))
+    rig.ask(1, write_register(0, 0xFF).sends[0])
+    begin_ns = rig.now_ns
+    for after_ms, answers in ((450, False), (510, True)):
+        rig.now_ns = begin_ns + after_ms * 1_000_000
+        assert bool(rig.ask(1, READ_BLOCK)) == answers
