@@ -8,7 +8,19 @@ import pytest
 from msgspec.structs import replace
 
 from imud.contracts.publisher import Batch
-from imud.formats.jsonrpc import LINE_MAX_BYTES, RpcError, parse_request
+from imud.formats.jsonrpc import (
+    LINE_MAX_BYTES,
+    Code,
+    RpcError,
+    encode_error,
+    encode_notification,
+    encode_request,
+    encode_result,
+    frame_of,
+    line_of,
+    parse_request,
+)
+from imud.formats.slot import SLOT_BYTES
 from imud.publishers.socket.admission import Rights
 from imud.publishers.socket.methods import METHODS
 from imud.publishers.socket.scheduler import BYTES_BURST
@@ -263,3 +275,23 @@ def test_the_limits_of_a_request_are_the_documented_ones(part: bytes, count: int
                 parse_request(line)
         else:
             assert parse_request(line).method == "m"
+
+
+def test_messages_as_bytes() -> None:
+    """Integers that can exceed 2⁵³ are strings on request: `epoch` and times in ns (docs/socket.md)."""
+    assert encode_request("watch", {"rate_hz": 1}, 3) == (
+        b'{"jsonrpc":"2.0","id":3,"method":"watch","params":{"rate_hz":1}}'
+    )
+    value = {"epoch": 1, "t_ns": 2**60, "seq": 5, "list": [{"utc_ns": -1, "is_ns": True}], "r_ns": 1.5, "x_ns": None}
+    plain = b'{"epoch":1,"t_ns":%d,"seq":5,"list":[{"utc_ns":-1,"is_ns":true}],"r_ns":1.5,"x_ns":null}' % (2**60)
+    texts = b'{"epoch":"1","t_ns":"%d","seq":5,"list":[{"utc_ns":"-1","is_ns":true}],"r_ns":1.5,"x_ns":null}' % (2**60)
+    for is_text, body in ((False, plain), (True, texts)):
+        assert encode_result("a", value, texts=is_text) == b'{"jsonrpc":"2.0","id":"a","result":' + body + b"}"
+        notified = encode_notification("event", value, texts=is_text)
+        assert notified == b'{"jsonrpc":"2.0","method":"event","params":' + body + b"}"
+    error = encode_error(RpcError(Code.INVALID_PARAMS, "no", 4))
+    assert error == b'{"jsonrpc":"2.0","id":4,"error":{"code":-32602,"message":"no"}}'
+    assert line_of(b"{}") == b"{}\n"
+    assert frame_of(b"{}") == b"\3\0\0\0{}\n"
+    whole = b"x" * (SLOT_BYTES - 1)  # a multiple of the size of a slot would be slots
+    assert frame_of(whole) == (SLOT_BYTES + 1).to_bytes(4, "little") + whole + b"\n\n"
