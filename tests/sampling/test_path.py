@@ -42,7 +42,7 @@ class Noted:
 
 
 class Scripted:
-    """A codec for CAN frames and polls whose next results are set by the test."""
+    """A codec for bytes, CAN frames and polls whose next results are set by the test."""
 
     def __init__(self, ledger: Ledger) -> None:
         self.ledger = ledger
@@ -57,6 +57,8 @@ class Scripted:
 
     def decode(self, *_poll: object) -> Sequence[Any]:
         return self.results.pop(0)[0]
+
+    feed = decode
 
     def on_silence(self, _poll: int) -> Sequence[PolledEvent]:
         return self.silence
@@ -145,19 +147,20 @@ def test_bytes_are_published_on_arrival_or_together() -> None:
 
 def test_samples_of_one_batch_come_in_order_between_messages_and_bad_frames() -> None:
     rig = PathRig("hipnuc-uart")
-    path = rig.stream()
+    path = StreamPath(rig.codec, rig.sample_clock, rig.context)
     reply = ReplyFrame(1, b"")
     bad = [BadFrame(reason, b"") for reason in (BadReason.CRC, BadReason.NOT_FINITE)]
-    path.publish_events([VALUES, TextLine("a"), VALUES, reply, *bad], rig.now)
+    rig.codec.results = [([VALUES, TextLine("a"), VALUES, reply, *bad], 0), ([VALUES], 0), ([VALUES], 0)]
+    path.on_data(b"1", rig.now)
     assert [sample.seq for sample in rig.batches[0]] == [1, 2]
     assert [message for message, _ in rig.messages] == ["a", reply]
     assert rig.bad == [BadReason.CRC, BadReason.NOT_FINITE]
     assert path.loss.bad_frames == 1  # the sample of a frame with NaN follows
-    path.publish_events([VALUES], rig.now)
+    path.on_data(b"2", rig.now)
     assert path.loss.bad_frames == 0
     assert path.take_status() == 0
     path.watch_status(0b010)
-    path.publish_events([VALUES], rig.now)
+    path.on_data(b"3", rig.now)
     assert (path.take_status(), path.take_status()) == (0b010, 0)
 
 
