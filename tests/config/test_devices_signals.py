@@ -17,10 +17,12 @@ from imud.contracts.lines import (
     SoutOptions,
     TriggerOptions,
 )
+from imud.contracts.status import Deviations
 from imud.drivers import DRIVERS
 from imud.model.errors import ConfigError
 from imud.utc import RMC_SOURCES
 from imud.utc.receivers import RmcOptions
+from tests.support.documented import check_schema
 
 
 def parse(*devices: str) -> tuple[DeviceConfig, ...]:
@@ -214,3 +216,12 @@ def test_what_is_wrong_with_an_rmc_source(keys: str, said: str) -> None:
 def test_every_source_has_its_row() -> None:
     assert set(RMC_SOURCES) == set(RmcOptions.__annotations__["source"].__args__)
     assert all(callable(RMC_SOURCES[name]) for name in RMC_SOURCES)
+
+
+@pytest.mark.parametrize("name", LINE_SCHEMAS)
+def test_keys_of_a_line_accept_the_documented_values(name: str) -> None:
+    check_schema(f"Line `{name}`", LINE_SCHEMAS[name])
+
+
+def test_deviations_are_above_zero() -> None:
+    assert check_schema("Noise of a device", Deviations) == 6
