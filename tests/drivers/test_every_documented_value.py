@@ -64,6 +64,7 @@ def test_counters_have_the_width_of_the_manual(name: str) -> None:
         ("imu61x-uart", {115_200, 230_400, 460_800, 921_600, 1_500_000}),  # table 9
     ],
 )
+@pytest.mark.manual("A 1.1 rates")
 def test_detection_tries_the_rates_of_the_manual(name: str, rates: set[int]) -> None:
     driver = DRIVERS[name]
     assert isinstance(driver, StreamDriver)

@@ -166,15 +166,6 @@ def test_text_interrupted_by_frames_is_one_line() -> None:
 
 
 @every_driver
-@pytest.mark.manual("A 1.1 rates")
-def test_rates_of_the_row(name: str) -> None:
-    driver = DRIVERS[name]
-    assert all(baud > 0 for baud in driver.baud_rates)
-    assert len(set(driver.baud_rates)) == len(driver.baud_rates) > 0
-    assert driver.tick_ns > 0
-
-
-@every_driver
 def test_damage_is_counted_by_its_kind(name: str) -> None:
     """A wrong bit in the payload is a CRC error, a length without a frame type is a length error."""
     driver = DRIVERS[name]
