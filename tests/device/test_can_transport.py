@@ -18,6 +18,7 @@ from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
 from imud.drivers.imu61x.can import Imu61xCanOptions, encode_set
 from imud.formats.can import CanFrame
+from imud.formats.records import Kind, records_of
 from imud.host.clock import HostClock
 from imud.links.memory import MemoryOptions
 from imud.model.event import EventKind
@@ -295,3 +296,16 @@ async def test_frames_are_not_held_while_a_script_runs(bench: CanDeviceBench) ->
 def with_pause(pause_ns: int) -> RequestScript[str]:
     yield pause(pause_ns)
     return "ended"
+
+
+@told(play, configured(bitrate=500_000))
+async def test_a_recording_starts_with_the_device_and_its_state(bench: CanDeviceBench) -> None:
+    records: list[bytes] = []
+    bench.feed(1)
+    bench.rig.device.record(records.append)
+    bench.feed(2)
+    bench.rig.device.tap.end(records.append)
+    bench.feed(3)
+    kinds = [record.kind for block in records for record in records_of(block)]
+    assert [kinds[0], kinds[1], kinds[-1]] == [Kind.DEVICE, Kind.PATH, Kind.FRAMES]
+    assert kinds.count(Kind.FRAMES) == 1
