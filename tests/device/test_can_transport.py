@@ -304,7 +304,7 @@ async def test_a_recording_starts_with_the_device_and_its_state(bench: CanDevice
     bench.feed(1)
     bench.rig.device.record(records.append)
     bench.feed(2)
-    bench.rig.device.tap.end(records.append)
+    bench.rig.device.observer.end(records.append)
     bench.feed(3)
     kinds = [record.kind for block in records for record in records_of(block)]
     assert [kinds[0], kinds[1], kinds[-1]] == [Kind.DEVICE, Kind.PATH, Kind.FRAMES]
