@@ -198,7 +198,7 @@ class HipnucJ1939Module:
             codec.MAG: lambda: codec.pack_mag(reading.mag_t),
             codec.ROLL_PITCH: lambda: codec.pack_roll_pitch(roll, pitch),
             codec.HEADING: lambda: codec.pack_heading(yaw, twice=self.hardware.sends_heading_twice),
-            codec.TEMPERATURE: lambda: codec.pack_temperature(reading.temperature_c, reading.pressure_pa),
+            codec.TEMPERATURE: lambda: codec.pack_temperature(reading.temperature_c),
             codec.QUATERNION: lambda: codec.pack_quaternion(reading.quat_wxyz),
             codec.INCLINOMETER: lambda: codec.pack_inclinometer(*self._inclination(reading)),
             codec.UTC: lambda: codec.pack_utc(YEAR, 1, 1, (sample_ns - self.epoch_ns) / NS_PER_S % 86_400),

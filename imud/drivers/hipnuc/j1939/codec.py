@@ -27,11 +27,9 @@ from imud.drivers.hipnuc.common import (
     EULER_RAD_PER_LSB,
     GYRO_RAD_S_PER_LSB,
     MAG_T_PER_LSB,
-    PRESSURE_PA_PER_LSB,
     QUAT_PER_LSB,
     TEMPERATURE_C_PER_LSB,
     counts_of,
-    pressure_of,
 )
 from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, join
 from imud.model.ledger import Ledger
@@ -53,11 +51,12 @@ VECTOR: Final = struct.Struct("<3hH")
 TWO_ANGLES: Final = struct.Struct("<2i")
 HEADING_LAYOUT: Final = struct.Struct("<Ii")
 QUATERNION_LAYOUT: Final = struct.Struct("<4h")
-TEMPERATURE_LAYOUT: Final = struct.Struct("<hHi")
+TEMPERATURE_LAYOUT: Final = struct.Struct("<hHi")  # temperature, reserved, reserved
 UTC_LAYOUT: Final = struct.Struct("<6BH")
 
 TURN: Final = 360_000  # counts of a full turn
 HALF_TURN: Final = TURN // 2
+PLACEHOLDER: Final = 999  # reserved bytes 4-7 of FF43 as devices without barometer send them
 TEMPERATURE_MOST_C: Final = 150.0  # maximum valid temperature, °C: above the operating range of all devices
 UNIT_TOLERANCE: Final = 0.02
 # year 0 in FF2F (assumed)
@@ -77,14 +76,14 @@ def measurement_of(messages: Sequence[tuple[int, bytes]]) -> Measurement:
         quat = quat_from_euler312(euler)
     return Measurement(
         MESSAGE_BYTES * len(messages), 0, None,
-        parts.accel, parts.gyro, parts.mag, quat, euler, parts.temperature_c, parts.pressure_pa, parts.incli,
+        parts.accel, parts.gyro, parts.mag, quat, euler, parts.temperature_c, None, parts.incli,
     )  # fmt: skip
 
 
 class _Parts:
     """Values of the messages of one sample."""
 
-    __slots__ = ("accel", "gyro", "incli", "mag", "pitch", "pressure_pa", "quat", "roll", "temperature_c", "yaw")
+    __slots__ = ("accel", "gyro", "incli", "mag", "pitch", "quat", "roll", "temperature_c", "yaw")
 
     def __init__(self) -> None:
         self.accel: Vector3 | None = None
@@ -94,7 +93,6 @@ class _Parts:
         self.roll = self.pitch = self.yaw = nan
         self.incli: tuple[float, float] | None = None
         self.temperature_c: float | None = None
-        self.pressure_pa: float | None = None
 
     @property
     def euler(self) -> Vector3 | None:
@@ -107,7 +105,8 @@ class _Parts:
             self.accel = _vector(data, ACCEL_M_S2_PER_LSB)
 
     def decode_gyro(self, data: bytes) -> None:
-        self.gyro = _vector(data, GYRO_RAD_S_PER_LSB)
+        if data != _NOTHING:
+            self.gyro = _vector(data, GYRO_RAD_S_PER_LSB)
 
     def decode_mag(self, data: bytes) -> None:
         if data != _NOTHING and data[:6] != _ZERO_VECTOR:
@@ -128,11 +127,10 @@ class _Parts:
             self.incli = x, y
 
     def decode_temperature(self, data: bytes) -> None:
-        celsius, _, pressure = TEMPERATURE_LAYOUT.unpack(data)
-        celsius, pressure = celsius * TEMPERATURE_C_PER_LSB, pressure * PRESSURE_PA_PER_LSB
-        if abs(celsius) <= TEMPERATURE_MOST_C and (celsius or pressure) and data != _NOTHING:
+        celsius, _, reserved = TEMPERATURE_LAYOUT.unpack(data)
+        celsius *= TEMPERATURE_C_PER_LSB
+        if abs(celsius) <= TEMPERATURE_MOST_C and (celsius or reserved) and data != _NOTHING:
             self.temperature_c = celsius
-        self.pressure_pa = pressure_of(pressure)
 
     def decode_quaternion(self, data: bytes) -> None:
         w, x, y, z = QUATERNION_LAYOUT.unpack(data)
@@ -198,10 +196,9 @@ def pack_inclinometer(x_rad: float, y_rad: float) -> bytes:
     return pack_roll_pitch(x_rad, y_rad)
 
 
-def pack_temperature(temperature_c: float, pressure_pa: float) -> bytes:
+def pack_temperature(temperature_c: float, reserved: int = PLACEHOLDER) -> bytes:
     """Return FF43."""
-    celsius, pressure = temperature_c / TEMPERATURE_C_PER_LSB, pressure_pa / PRESSURE_PA_PER_LSB
-    return TEMPERATURE_LAYOUT.pack(counts_of(celsius, 16), 0, counts_of(pressure, 32))
+    return TEMPERATURE_LAYOUT.pack(counts_of(temperature_c / TEMPERATURE_C_PER_LSB, 16), 0, reserved)
 
 
 def pack_quaternion(quat_wxyz: Quaternion) -> bytes:

@@ -51,13 +51,14 @@ from imud.model.units import RAD_PER_DEG, T_PER_UT
 # tag, pps_sync_stamp or status, temperature °C, pressure Pa, system_time ms, accel G, gyro °/s, mag µT, roll pitch yaw
 # °, quaternion wxyz (section 3.3.1)
 HI91: Final = struct.Struct("<BHbfI3f3f3f3f4f")
-# tag, status, temperature °C, pps_sync_stamp ms, pressure - 100000 Pa, reserved, gyro, accel, mag, roll pitch yaw,
-# quaternion wxyz (section 3.3.2). In HI92, gyro is before accel.
+# tag, reserved status, temperature °C, pps_sync_stamp ms, pressure - 100000 Pa, reserved, gyro, accel, mag, roll pitch
+# yaw, quaternion wxyz (section 3.3.2). In HI92, gyro is before accel.
 HI92: Final = struct.Struct("<BHbHh2x3h3h3h3i4h")
 TAG_HI91: Final = 0x91
 TAG_HI92: Final = 0x92
 
-# Modulus of pps_sync_stamp without an edge, ms (in a recording at 100 Hz, 8 follows 8190)
+# Modulus of pps_sync_stamp without an edge, ms (in a recording at 100 Hz, 8 follows 8190). The manual gives the range
+# 0 … 8192. Larger values are filler bytes of firmware that does not write the field.
 PPS_STAMP_MODULUS_MS: Final = 8192
 
 ACCEL_M_S2_PER_LSB: Final = 0.0048828  # scale of HI92 as printed; 160 / 32768 would be 2.6e-6 larger
@@ -87,18 +88,20 @@ def decode_hi91(values: Sequence[Any], word_is_status: bool, size: int, trailing
     ):  # `pressure_of` without a call, which costs a tenth of a frame
         temperature, pressure = temperature_beside(temperature, pressure), None
     word = low + 256 * high
+    # a device without magnetometer sends zeros, and no rotation has a quaternion of zeros
     return Measurement(
-        size, trailing, ms,
-        (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad), (mx * tesla, my * tesla, mz * tesla),
-        (qw, qx, qy, qz), (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
-        word if word_is_status else None, None if word_is_status else word,
+        size, trailing, ms, (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad),
+        (mx * tesla, my * tesla, mz * tesla) if mx or my or mz else None,
+        (qw, qx, qy, qz) if qw or qx or qy or qz else None,
+        (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
+        word if word_is_status else None, None if word_is_status or word > PPS_STAMP_MODULUS_MS else word,
     )  # fmt: skip
 
 
 def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int) -> list[Measurement]:
     """Return `decode_hi91` of adjacent sub-packets, one per frame. `trailing` bytes follow the first frame."""
     g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
-    low_pa, high_pa = PRESSURE_MIN_PA, PRESSURE_MAX_PA
+    low_pa, high_pa, most_ms = PRESSURE_MIN_PA, PRESSURE_MAX_PA, PPS_STAMP_MODULUS_MS
     made: list[Measurement] = []
     make, keep = Measurement, made.append
     # decode_hi91 inline: the call costs a twentieth of the time
@@ -110,10 +113,11 @@ def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int
         word = low + 256 * high
         keep(
             make(
-                size, trailing, ms,
-                (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad), (mx * tesla, my * tesla, mz * tesla),
-                (qw, qx, qy, qz), (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
-                word if word_is_status else None, None if word_is_status else word,
+                size, trailing, ms, (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad),
+                (mx * tesla, my * tesla, mz * tesla) if mx or my or mz else None,
+                (qw, qx, qy, qz) if qw or qx or qy or qz else None,
+                (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
+                word if word_is_status else None, None if word_is_status or word > most_ms else word,
             )
         )  # fmt: skip
         trailing -= size
@@ -142,15 +146,16 @@ def _possible_groups(m: Measurement, values: Sequence[Any]) -> Measurement:
 
 def _decode_hi92(data: bytes, at: int, _word_is_status: bool, size: int, trailing: int) -> tuple[Measurement, bool]:
     (
-        _, status, temperature, pps_ms, pressure, gx, gy, gz, ax, ay, az, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
+        _, _, temperature, pps_ms, pressure, gx, gy, gz, ax, ay, az, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
     ) = HI92.unpack_from(data, at)  # fmt: skip
     a, w, b, angle, q = ACCEL_M_S2_PER_LSB, GYRO_RAD_S_PER_LSB, MAG_T_PER_LSB, EULER_RAD_PER_LSB, QUAT_PER_LSB
-    # no device time: `dev_ticks` is None
+    # no device time: `dev_ticks` is None; the manual reserves the status
     return Measurement(
-        size, trailing, None,
-        (ax * a, ay * a, az * a), (gx * w, gy * w, gz * w), (mx * b, my * b, mz * b),
-        (qw * q, qx * q, qy * q, qz * q), (roll * angle, pitch * angle, yaw * angle),
-        temperature, pressure_of(pressure + PRESSURE_OFFSET_PA), None, status, pps_ms,
+        size, trailing, None, (ax * a, ay * a, az * a), (gx * w, gy * w, gz * w),
+        (mx * b, my * b, mz * b) if mx or my or mz else None,
+        (qw * q, qx * q, qy * q, qz * q) if qw or qx or qy or qz else None,
+        (roll * angle, pitch * angle, yaw * angle), temperature, pressure_of(pressure + PRESSURE_OFFSET_PA), None, None,
+        pps_ms if pps_ms <= PPS_STAMP_MODULUS_MS else None,
     ), True  # fmt: skip
 
 

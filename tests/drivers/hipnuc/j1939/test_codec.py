@@ -76,8 +76,8 @@ def test_messages_in_si_units() -> None:
     assert measured(0xFF4A, "ffffff7fffffff7f").incli_rad is None
     # 1000 · 0.030517 µT
     assert measured(0xFF3A, "e80318fc01000000").mag_t == pytest.approx((3.0517e-5, -3.0517e-5, 3.0517e-8), abs=1e-15)
-    air = measured(0xFF43, "c409000052c59a00")  # 2500, 10143058
-    assert (air.temperature_c, air.pressure_pa) == pytest.approx((25.0, 101430.58))
+    air = measured(0xFF43, "c409000052c59a00")  # 2500; bytes 4 to 7 are reserved, also if they look like a pressure
+    assert (air.temperature_c, air.pressure_pa) == (25.0, None)
     assert measured(0xFF43, "18fc000052c59a00").temperature_c == pytest.approx(-10.0)
 
 
@@ -125,7 +125,7 @@ def test_packing_gives_the_golden_messages_and_clips_them() -> None:
     assert messages.pack_accel((9.8, -9.8, 0.0048)) == bytes.fromhex("000800f801000000")
     assert messages.pack_gyro((math.radians(61.035), -1e9, 1e9)).hex() == "e8030080ff7f0000"
     assert messages.pack_roll_pitch(math.radians(10.5), math.radians(-20.25)).hex() == "04290000e6b0ffff"
-    assert messages.pack_temperature(25.0, 101430.58).hex() == "c409000052c59a00"
+    assert messages.pack_temperature(25.0).hex() == "c4090000e7030000"
     assert messages.pack_utc(2025, 3, 14, 15 * 3600 + 9 * 60 + 26.535).hex() == "19030e0f091a1702"
 
 
@@ -133,6 +133,7 @@ def test_packing_gives_the_golden_messages_and_clips_them() -> None:
     ("pgn", "data", "field"),
     [
         (0xFF34, NONE, "accel_m_s2"),
+        (0xFF37, NONE, "gyro_rad_s"),
         (0xFF3A, NONE, "mag_t"),
         (0xFF3A, bytes(8), "mag_t"),
         (0xFF3D, bytes.fromhex("ffffff7fffffff7f"), "euler_rad"),
@@ -154,15 +155,10 @@ def test_absent_is_not_zero(pgn: int, data: bytes, field: str) -> None:
 
 
 def test_one_negative_count_is_a_value() -> None:
-    assert measured(0xFF37, "ffffffffffffffff").gyro_rad_s == pytest.approx((-0.00106526,) * 3, abs=1e-8)
+    assert measured(0xFF37, "ffffffffffff0000").gyro_rad_s == pytest.approx((-0.00106526,) * 3, abs=1e-8)
     assert measured(0xFF34, "ffffffffffff0000").accel_m_s2 == pytest.approx((-0.00478514,) * 3, abs=1e-8)
     assert measured(0xFF3D, "ffffffff00000000").euler_rad == pytest.approx((-1.74532925e-5, 0, math.nan), nan_ok=True)
-    assert measured(0xFF43, "0000000052c59a00").temperature_c == 0.0  # with a pressure it is 0 °C
-    placeholder = measured(0xFF43, "9a090000e7030000")  # 24.58 °C, 999: a device without a barometer
-    assert placeholder.temperature_c == pytest.approx(24.58)
-    assert placeholder.pressure_pa is None
-    assert measured(0xFF43, "9a090000a0860100").pressure_pa == pytest.approx(1000)  # 100000 counts of 0.01 Pa
-    assert measured(0xFF43, "9a090000011bb700").pressure_pa is None  # 12000001 counts
+    assert measured(0xFF43, "00000000e7030000").temperature_c == 0.0  # with the placeholder it is 0 °C
 
 
 SIGNALS = {
@@ -182,7 +178,8 @@ def test_the_vendors_signal_definitions_agree() -> None:
             theirs = definition.decode(data)
             ours = messages.measurement_of([(pgn, data)])
             compared += compare(ours, theirs)
-    assert compared == 50 * (3 + 3 + 3 + 2 + 1 + 2 + 4 + 2)
+    # all signals without the pressure, which newer definitions replace by reserved bytes
+    assert compared == 50 * (3 + 3 + 3 + 2 + 1 + 1 + 4 + 2)
     theirs = database.decode_message(encode(messages.UTC, b"")[0], messages.pack_utc(2025, 3, 14, 54566.535))
     expected = {"Year": 25, "Month": 3, "Day": 14, "Hour": 15, "Minute": 9, "Second": 26, "Millisecond": 535}
     assert theirs == {f"UTC_{name}": value for name, value in expected.items()}
@@ -215,8 +212,8 @@ def compare(ours: Measurement, theirs: dict[str, float]) -> int:
         values |= {"Incli_X": math.degrees(ours.incli_rad[0]), "Incli_Y": math.degrees(ours.incli_rad[1])}
     if ours.quat_wxyz is not None:
         values |= {f"Quat_{axis}": value for axis, value in zip("WXYZ", ours.quat_wxyz, strict=True)}
-    if ours.temperature_c is not None and ours.pressure_pa is not None:
-        values |= {"Temperature": ours.temperature_c, "Pressure": ours.pressure_pa}
+    if ours.temperature_c is not None:
+        values |= {"Temperature": ours.temperature_c}
     for name, value in values.items():
         there = theirs[name] % 360 if name == "Yaw_360" else theirs[name]
         assert value == pytest.approx(there, rel=1e-9, abs=1e-9), name
@@ -258,7 +255,7 @@ def test_samples_of_several_modules_slow_messages_and_loss() -> None:
         assert len(values) >= 15
 
     codec = make()
-    slow = messages.TEMPERATURE, messages.pack_temperature(21.5, 100_000)
+    slow = messages.TEMPERATURE, messages.pack_temperature(21.5)
     events: list[CodecEvent] = []
     for n in range(100):
         events += feed(codec, burst(n, 8, *([slow] if n % 10 == 0 else [])), n * 10 * MS)

@@ -50,7 +50,7 @@ SI_PER_UNIT = {"accel_m_s2": 9.8, "gyro_rad_s": math.pi / 180, "mag_t": 1e-6, "e
 LEVEL: dict[str, Any] = {
     "accel_m_s2": (0.0, 0.0, 9.8),
     "gyro_rad_s": (0.0, 0.0, 0.0),
-    "mag_t": (0.0, 0.0, 0.0),
+    "mag_t": (30.517e-6, 0.0, 0.0),
     "euler_rad": (0.0, 0.0, 0.0),
     "quat_wxyz": (1.0, 0.0, 0.0, 0.0),
     "temperature_c": 25.0,
@@ -164,7 +164,7 @@ def test_frames_back_to_back_are_decoded_like_one(word: str) -> None:
 def test_hand_made_hi92() -> None:
     m = one(make().feed(framed(HI92_PAYLOAD)))
     assert m.dev_ticks is None
-    assert m.status == 0x1234
+    assert m.status is None  # section 3.3.2: reserved
     assert m.pps_age_ms == 1000
     assert m.temperature_c == -5
     assert m.pressure_pa == 102000
@@ -197,7 +197,7 @@ def test_the_word_and_sub_packets() -> None:
     first, second = codec.feed(frame + b"\x00\x00\x00")
     assert isinstance(first, Measurement)
     assert isinstance(second, Measurement)
-    assert (first.dev_ticks, second.status) == (1840392, 0x1234)
+    assert (first.dev_ticks, second.pps_age_ms) == (1840392, 1000)
     assert [(m.size_bytes, m.trailing_bytes) for m in (first, second)] == [(130, 3)] * 2
     assert codec.ledger.frames_good == codec.ledger.frames_in_samples == 1
     codec = make()
@@ -403,10 +403,10 @@ def test_clipping_the_check_value_and_a_driver_of_other_settings() -> None:
     far: dict[str, Any] = LEVEL | {
         "accel_m_s2": (1e9, -1e9, 0.0), "gyro_rad_s": (1e3, -1e3, 0.0), "temperature_c": 300.0, "pressure_pa": 1e6,
     }  # fmt: skip
-    m = one(make().feed(encode_hi92(pps_stamp_ms=99999, **far)))
+    m = one(make().feed(encode_hi92(pps_stamp_ms=-1, **far)))
     assert m.accel_m_s2 == pytest.approx((159.994, -159.9996, 0.0), abs=1e-2)
     assert m.gyro_rad_s == pytest.approx((32.767, -32.768, 0.0))
-    assert (m.temperature_c, m.pressure_pa, m.pps_age_ms) == (127, None, 65535)  # 132767 Pa is not an air pressure
+    assert (m.temperature_c, m.pressure_pa, m.pps_age_ms) == (127, None, 0)  # 132767 Pa is not an air pressure
     bad, last = make().feed(encode_hi91(system_time_ms=2**32 + 7, **(far | {"accel_m_s2": (1e300, 0.0, 0.0)})))
     assert isinstance(bad, BadFrame)
     assert isinstance(last, Measurement)
@@ -418,6 +418,40 @@ def test_clipping_the_check_value_and_a_driver_of_other_settings() -> None:
     codec = replace(DRIVER, name="other").make_codec(Ledger(), HipnucOptions(hi91_word="status"))
     assert one(codec.feed(hi91(word_1_2=3))).status == 3
     assert DRIVER.example_frame(Random(0))
+
+
+FILLER = [
+    ("pps_age_ms", {"word_1_2": 8193}, {"pps_stamp_ms": 8193}),
+    ("pps_age_ms", {"word_1_2": 0x2323}, {"pps_stamp_ms": 0x2323}),
+    ("mag_t", {"mag_t": (0.0, 0.0, 0.0)}, {"mag_t": (0.0, 0.0, 0.0)}),
+    ("quat_wxyz", {"quat_wxyz": (0.0, 0.0, 0.0, 0.0)}, {"quat_wxyz": (0.0, 0.0, 0.0, 0.0)}),
+]
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize(("field", "hi91_values", "hi92_values"), FILLER)
+def test_filler_bytes_are_no_values(
+    field: str, hi91_values: dict[str, Any], hi92_values: dict[str, Any], count: int
+) -> None:
+    """Alone (fast path), in a run, and in a frame with NaN. The values next to the filler bytes stay."""
+    floats = hi91(**hi91_values)
+    integers = encode_hi92(**({"pps_stamp_ms": 8192, "status": 0x2323} | LEVEL | hi92_values))
+    with_nan = hi91(**({"gyro_rad_s": (0.0, math.nan, 0.0)} | hi91_values))
+    for data in (floats * count, integers * count, with_nan * count):
+        events = [event for event in make().feed(data) if isinstance(event, Measurement)]
+        assert len(events) == count
+        for one_event in events:
+            assert getattr(one_event, field) is None
+            assert one_event.status is None
+            assert one_event.accel_m_s2 == pytest.approx((0, 0, 9.8), abs=1e-3)
+            assert (one_event.mag_t is None) == (field == "mag_t")
+
+
+def test_the_limit_of_the_time_since_a_pulse_is_a_value() -> None:
+    for data in (hi91(word_1_2=8192) * 2, encode_hi92(pps_stamp_ms=8192, **LEVEL)):
+        assert [m.pps_age_ms for m in make().feed(data) if isinstance(m, Measurement)] == [8192] * data.count(
+            b"\x5a\xa5"
+        )
 
 
 def test_damaged_frames_among_lines() -> None:
