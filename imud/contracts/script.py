@@ -49,6 +49,12 @@ class Request:
     silent: bool = False
     # Minimum number of messages in a positive reply, with its end. An earlier end belongs to a late reply.
     messages_min: int = 1
+    # Kind of the reply. The replies to two requests of the same kind look alike. Empty: only the replies to two equal
+    # requests look alike.
+    kind: str = ""
+    # The reply to an equal earlier request also answers this request, if imud sent no other request between them: the
+    # request reads a value.
+    repeatable: bool = False
     # New baud rate of the link for this and all following requests, bit/s; 0: unchanged. Serial ports only.
     baud: int = 0
     # New driver options for this and all following requests, after the node number changed; None: unchanged. CAN only.

@@ -13,10 +13,16 @@ from imud.host.clock import HostClock
 from imud.model.errors import CommandError, LinkError
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
-from imud.model.units import NS_PER_S
+from imud.model.units import NS_PER_MS, NS_PER_S
 
 REPLY_MESSAGES_MAX = 256  # maximum number of messages in a reply. The longest reply of any manual has some dozens.
 LATE_WINDOW_NS = 5 * NS_PER_S  # time after a timeout in which a matching message counts as part of the late reply, ns
+PATIENCE_MAX_NS = 3 * NS_PER_S  # maximum timeout by the observed replies, ns
+PATIENCE_FACTOR = 2  # timeout as a multiple of the slowest reply
+# Requests with a longer timeout do not change the timeout of other requests: the device writes flash or calibrates.
+ORDINARY_TIMEOUT_NS = NS_PER_S // 2
+OWED_NS = 5 * NS_PER_S // 2  # time after a timeout in which no request with a similar reply is sent, ns
+OWED_MAX = 16  # maximum number of requests whose late replies imud recognizes
 
 T = TypeVar("T")
 
@@ -44,12 +50,32 @@ class RequestPort(ABC):
         """Note that a script starts (True) or has ended (False)."""
 
 
+class _Owed:
+    """A request without a reply: its late reply can still arrive."""
+
+    __slots__ = ("ended_ns", "partial", "request", "sent_ns")
+
+    def __init__(self, request: Request, sent_ns: int, ended_ns: int, partial: bool) -> None:
+        self.request = request
+        self.sent_ns = sent_ns  # CLOCK_MONOTONIC when imud sent the request
+        self.ended_ns = ended_ns  # CLOCK_MONOTONIC of the timeout or of the cancellation
+        self.partial = partial  # whether a part of the reply arrived before the timeout
+
+    def resembles(self, request: Request) -> bool:
+        """Return whether a late reply could count as the reply to `request`."""
+        mine = self.request
+        return self.partial or (mine.kind, mine.kind or mine.payload) == (request.kind, request.kind or request.payload)
+
+
 class ScriptRunner:
     """Runner of one request script at a time. Synchronization: one thread.
 
-    Devices reply in the order of the requests. A message is late if it can belong to the request that timed out and
-    not to the outstanding request, or if it ends a reply with late messages. Two requests with the same one-message
-    reply cannot be distinguished: the first message counts for the outstanding request.
+    Devices reply in the order of the requests. A message is late if it can belong to a request that timed out and not
+    to the outstanding request, or if it ends a reply with late messages. The runner sends a request whose reply looks
+    like a late reply only when the late reply has arrived, or OWED_NS after the timeout.
+
+    The timeout of a request is at least PATIENCE_FACTOR times the slowest reply of the device, at most
+    PATIENCE_MAX_NS. Before the first reply, each timeout doubles the next timeout.
 
     `run` needs the event loop. A test without a loop calls `start`, `on_message`, `on_sample`, and `on_time` at
     `deadline_ns`.
@@ -63,8 +89,13 @@ class ScriptRunner:
         self._outcome: asyncio.Future[Outcome] | None = None
         self._request: Request | None = None
         self._messages: deque[Message] = deque(maxlen=REPLY_MESSAGES_MAX)
-        self._timed_out: Request | None = None
-        self._timed_out_ns = 0
+        self._sent_ns = 0  # CLOCK_MONOTONIC when imud sent the outstanding request
+        # time of the slowest ordinary reply, ns; before the first reply, the newest timeout
+        self._slowest_ns = 0
+        self._replied = False  # whether the time of a reply is known
+        self._owed: deque[_Owed] = deque(maxlen=OWED_MAX)  # requests without a reply, oldest first
+        self._arrived: asyncio.Future[None] | None = None  # completed by the next late reply
+        self._baud = 0  # baud rate that a script has set; 0: unchanged
         self._late_messages = 0  # number of messages of the late reply that is arriving
         self.deadline_ns: int | None = None
         """CLOCK_MONOTONIC of the deadline of the outstanding request; None without a request."""
@@ -107,14 +138,18 @@ class ScriptRunner:
 
     async def _ask(self, request: Request) -> Outcome:
         port = self._port
+        await self._late_reply_arrived(request)
         if request.baud:
             port.change_rate(request)
+            if request.baud != self._baud:
+                self._baud = request.baud
+                self._owed.clear()  # at the new rate, a reply at the old rate is not readable
         if request.settings is not None:
             port.follow(request)
         if request.also:
             port.listen(request, request.also)
         loop = asyncio.get_running_loop()
-        timer = loop.call_later(request.timeout_ns / NS_PER_S, self._expire)
+        self._timer = loop.call_later(self._timeout_ns(request) / NS_PER_S, self._expire)
         try:
             payload = self.start(request, self._host.now_ns())
             if not request.silent:
@@ -123,15 +158,45 @@ class ScriptRunner:
                 port.write(payload)
             return Reply(()) if self._outcome is None else await self._outcome
         finally:
-            timer.cancel()
+            self._timer.cancel()
             self._outcome = None
             self.cancel()
             if request.also:
                 port.listen(request, ())
 
+    async def _late_reply_arrived(self, request: Request) -> None:
+        """Return when no late reply can count as the reply to `request`."""
+        while (wait_ns := self.owed_ns(request, self._host.now_ns())) > 0:
+            self._arrived = asyncio.get_running_loop().create_future()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(wait_ns / NS_PER_S):
+                    await self._arrived
+            self._arrived = None
+
+    def owed_ns(self, request: Request, now_ns: int) -> int:
+        """Return the time for which `request` must wait for a late reply that looks like its reply, ns."""
+        if not request.payload or (request.baud and request.baud != self._baud):
+            return 0
+        if request.repeatable and all(owed.request.payload == request.payload for owed in self._owed):
+            return 0
+        similar = (owed.ended_ns + OWED_NS - now_ns for owed in self._owed if owed.resembles(request))
+        return max(0, *similar, 0)
+
+    def _timeout_ns(self, request: Request) -> int:
+        """Return the timeout of a request by the slowest reply. A pause keeps its time."""
+        if not request.payload or request.silent:
+            return request.timeout_ns
+        return max(request.timeout_ns, min(PATIENCE_FACTOR * self._slowest_ns, PATIENCE_MAX_NS))
+
     def _expire(self) -> None:
-        if self.deadline_ns is not None:  # the timer of the loop can fire a little early
-            self.on_time(max(self._host.now_ns(), self.deadline_ns))
+        if self.deadline_ns is None:
+            return
+        now_ns = self._host.now_ns()
+        left_ns = self.deadline_ns - now_ns
+        if left_ns > NS_PER_MS:  # a late reply has extended the timeout
+            self._timer = asyncio.get_running_loop().call_later(left_ns / NS_PER_S, self._expire)
+        else:  # the timer of the loop can fire a little early
+            self.on_time(max(now_ns, self.deadline_ns))
 
     # --- a request ---------------------------------------------------------------------------------------------------
 
@@ -142,7 +207,8 @@ class ScriptRunner:
         self._messages.clear()
         if not request.silent:
             self._request = request
-            self.deadline_ns = now_ns + request.timeout_ns
+            self._sent_ns = now_ns
+            self.deadline_ns = now_ns + self._timeout_ns(request)
             self.wants_samples = request.is_sample is not None
         return request.payload
 
@@ -154,11 +220,11 @@ class ScriptRunner:
             return None
         self._late_messages = 0
         self._messages.append(message)
-        if request.is_rejection(message):
-            return self._finish(Rejection(tuple(self._messages)))
-        if request.is_end(message):
-            return self._finish(Reply(tuple(self._messages)))
-        return None
+        if not _ends(request, message):
+            return None
+        self._learn(request, now_ns)
+        made = Rejection if request.is_rejection(message) else Reply
+        return self._finish(made(tuple(self._messages)))
 
     def on_sample(self, sample: Measurement) -> Outcome | None:
         """Process a measurement. Return the outcome if it ends the outstanding request."""
@@ -171,13 +237,12 @@ class ScriptRunner:
         """Return `Silence` if the deadline has passed."""
         if self._request is None or self.deadline_ns is None or now_ns < self.deadline_ns:
             return None
-        if self._request.payload:  # a pause sends nothing: no late reply can follow
-            self._timed_out, self._timed_out_ns = self._request, now_ns
-            self._late_messages = len(self._messages)
+        self._expect_late(now_ns)
         return self._finish(Silence(tuple(self._messages)))
 
     def cancel(self) -> None:
-        """Discard the outstanding request."""
+        """Discard the outstanding request. Its reply can arrive late."""
+        self._expect_late(self._host.now_ns())
         self._request = self.deadline_ns = None
         self.wants_samples = False
         self._messages.clear()
@@ -193,27 +258,56 @@ class ScriptRunner:
 
     # --- late replies ------------------------------------------------------------------------------------------------
 
+    def _learn(self, request: Request, now_ns: int) -> None:
+        """Process the end of a reply. Devices reply in order: no earlier reply of another kind can follow."""
+        if request.timeout_ns <= ORDINARY_TIMEOUT_NS and not self._owed:
+            self._note_reply_time(now_ns - self._sent_ns)
+        similar = [owed for owed in self._owed if owed.resembles(request)]
+        if not similar:
+            self._owed.clear()
+
+    def _note_reply_time(self, duration_ns: int) -> None:
+        """Follow the slowest reply, also with the timeout of the outstanding request."""
+        self._slowest_ns = max(self._slowest_ns, duration_ns) if self._replied else duration_ns
+        self._replied = True
+        if self._request is not None and self.deadline_ns is not None:
+            self.deadline_ns = max(self.deadline_ns, self._sent_ns + self._timeout_ns(self._request))
+
+    def _expect_late(self, now_ns: int) -> None:
+        """Expect the late reply to the outstanding request. A pause sends nothing: no late reply can follow."""
+        request = self._request
+        if request is not None and request.payload:
+            self._owed.append(_Owed(request, self._sent_ns, now_ns, bool(self._messages)))
+            if not self._replied:
+                self._slowest_ns = max(self._slowest_ns, now_ns - self._sent_ns)
+            self._late_messages = len(self._messages)
+
     def _ends_late(self, request: Request, message: Message, now_ns: int) -> bool:
         """Return whether `message` ends a late reply: no message of the outstanding reply has arrived yet."""
         if not _ends(request, message) or self._messages:
             return False
-        late_is_arriving = self._late_messages > 0 and self._expects_late(now_ns)
+        late_is_arriving = self._late_messages > 0 and bool(self._expected(now_ns))
         return late_is_arriving or (request.is_end(message) and request.messages_min > 1)
 
-    def _expects_late(self, now_ns: int) -> bool:
-        return self._timed_out is not None and now_ns - self._timed_out_ns <= LATE_WINDOW_NS
+    def _expected(self, now_ns: int) -> list[_Owed]:
+        """Return the requests whose late replies can still arrive, oldest first."""
+        return [owed for owed in self._owed if now_ns - owed.ended_ns <= LATE_WINDOW_NS]
 
     def _count_stray(self, message: Message, now_ns: int) -> None:
         """Count a message that belongs to no outstanding request: part of a late reply, or unsolicited."""
-        late = self._timed_out
-        if late is None or not self._expects_late(now_ns) or not _belongs(late, message):
+        late = next((owed for owed in self._expected(now_ns) if _belongs(owed.request, message)), None)
+        if late is None:
             self._ledger.replies_unsolicited += 1
             return
         self._late_messages += 1
-        if _ends(late, message):
+        if _ends(late.request, message):
             self._ledger.replies_late += 1
-            self._timed_out = None
+            if late.request.timeout_ns <= ORDINARY_TIMEOUT_NS:
+                self._note_reply_time(now_ns - late.sent_ns)
+            self._owed.remove(late)
             self._late_messages = 0
+            if self._arrived is not None and not self._arrived.done():
+                self._arrived.set_result(None)
 
 
 def _belongs(request: Request, message: Message) -> bool:

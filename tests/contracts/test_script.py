@@ -150,7 +150,7 @@ def test_cancel_forgets_the_request(session: ScriptRunner, ledger: Ledger) -> No
     assert session.deadline_ns is None
     assert session.on_time(TIMEOUT_NS) is None
     session.on_message("OK", 2)
-    assert strays(ledger) == (0, 1)
+    assert strays(ledger) == (1, 0)
     session.start(command("ask", "a"), 3)
     session.on_message("a=2", 4)
     assert session.on_message("OK", 4) == Reply(("a=2", "OK"))

@@ -16,7 +16,7 @@ from imud.model.errors import CommandError, LinkMissing, NoReply
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from tests.support.event_loops import VirtualClock, in_loop, run_virtually
-from tests.support.script_runners import ListPort, offline_runner
+from tests.support.script_runners import ListPort, of_fast_device, offline_runner
 
 
 def request(name: str, timeout_ns: int = 10**10, *, silent: bool = False) -> Request:
@@ -61,11 +61,11 @@ class CallingPort(RequestPort):
 
 def made() -> tuple[ScriptRunner, list[bytes]]:
     port = ListPort()
-    return ScriptRunner(port, Ledger(), HostClock()), port.written
+    return of_fast_device(ScriptRunner(port, Ledger(), HostClock())), port.written
 
 
-def runner_of(write: Callable[[bytes], None]) -> ScriptRunner:
-    return ScriptRunner(CallingPort(write), Ledger(), HostClock())
+def runner_of(write: Callable[[bytes], None], clock: VirtualClock | None = None) -> ScriptRunner:
+    return ScriptRunner(CallingPort(write), Ledger(), clock.host if clock else HostClock())
 
 
 @in_loop
@@ -218,3 +218,77 @@ async def test_a_request_can_change_rate_number_or_filters(change: dict[str, Any
     with pytest.raises(CommandError, match=words):
         await runner.run(ask(replace(silent, **change)))
     assert written == []
+
+
+# --- slow devices -----------------------------------------------------------------------------------------------------
+
+MS = 1_000_000
+
+
+def on_slow_device(delays_ms: Sequence[float | None], *requests: Request) -> tuple[list[str], list[int]]:
+    """Send requests to a device that replies OK in order, after each delay or not at all (None).
+
+    Return the end of each outcome, and the times in ms at which imud sent the requests.
+    """
+    clock, sent_ms, texts = VirtualClock(), list[int](), list[str]()
+    begin_ns, due_ms = clock.now_ns(), [0.0]
+
+    async def body() -> None:
+        def write(_data: bytes) -> None:
+            delay_ms = delays_ms[len(sent_ms)]
+            sent_ms.append((clock.now_ns() - begin_ns) // MS)
+            if delay_ms is not None:
+                number = len(sent_ms)
+                due_ms.append(max(due_ms[-1], sent_ms[-1] + delay_ms))
+                wait_s = (due_ms[-1] - sent_ms[-1]) / 1000
+                later(wait_s, lambda: runner.on_message(f"{number} OK", clock.now_ns()))
+
+        later = asyncio.get_running_loop().call_later
+        runner = runner_of(write, clock)
+        texts.extend("".join(one.lines) for one in await runner.run(ask(*requests)))
+
+    run_virtually(clock, body())
+    return texts, sent_ms
+
+
+def ok(name: str, *, kind: str = "OK", repeatable: bool = False) -> Request:
+    numbered = of_text(lambda text: text.endswith("OK"))
+    return Request(name.encode(), name, numbered, of_text(lambda _: False), numbered, kind=kind, repeatable=repeatable)
+
+
+def test_the_timeout_follows_the_slowest_reply() -> None:
+    """Twice the slowest reply, at most 3 s, and at least the own timeout of the request."""
+    texts, sent_ms = on_slow_device([400, 750, 1400, 2700, None, 0], *map(ok, "ABCDE"), ok("F", kind="F"))
+    assert texts == ["1 OK", "2 OK", "3 OK", "4 OK", "", "6 OK"]
+    assert sent_ms == [0, 400, 1150, 2550, 5250, 8250]
+    assert on_slow_device([100, None, 0], ok("A"), ok("B"), ok("C", kind="C"))[1] == [0, 100, 600]
+
+
+@pytest.mark.parametrize(
+    ("delay_ms", "outcomes"),
+    [(450, ["1 OK"]), (700, ["", "1 OK"]), (1300, ["", "1 OK"]), (2900, ["", "", "1 OK"]), (None, [""] * 5)],
+)
+def test_the_first_contact_is_patient(delay_ms: int | None, outcomes: list[str]) -> None:
+    """Each timeout doubles the next timeout up to 3 s. The reply to the first read answers an equal later read."""
+    read = ok("read", kind="read", repeatable=True)
+    texts, sent_ms = on_slow_device([delay_ms] * 5, *[read] * len(outcomes))
+    assert (texts, sent_ms) == (outcomes, [0, 500, 1500, 3500, 6500][: len(outcomes)])
+
+
+@pytest.mark.parametrize(
+    ("late_ms", "next_ms"), [(700, 800), (2900, 3000), (None, 3100)], ids=["late", "very late", "never"]
+)
+def test_a_late_reply_never_answers_the_next_similar_request(late_ms: int | None, next_ms: int) -> None:
+    """The next request waits for the late reply, or until no late reply can arrive. The timeout then follows it."""
+    texts, sent_ms = on_slow_device([100, late_ms, 50, 900], ok("A"), ok("B"), ok("C"), ok("D"))
+    assert texts == ["1 OK", "", "3 OK", "4 OK" if late_ms else ""]
+    assert sent_ms[:3] == [0, 100, next_ms]
+
+
+def test_a_request_with_another_reply_or_the_same_read_is_sent_immediately() -> None:
+    assert on_slow_device([1, None, 1], ok("A"), ok("B"), ok("C", kind="C"))[1] == [0, 1, 501]
+    read = ok("read", kind="read", repeatable=True)
+    assert on_slow_device([1, None, 1], ok("A"), read, read) == (["1 OK", "", "3 OK"], [0, 1, 501])
+    # a write between two equal reads: the late reply has the old value
+    texts, sent_ms = on_slow_device([1, 2000, 1, 1], ok("A"), read, ok("write"), read)
+    assert (texts, sent_ms) == (["1 OK", "", "", "4 OK"], [0, 1, 501, 2001])

@@ -303,9 +303,9 @@ async def test_a_device_without_reply_gets_a_query_per_five_minutes(module: Deaf
     await module.pass_s(1500)
     pauses_s = [(after - before) / 1e9 for before, after in pairwise(module.asked_ns)]
     for pause_s, wanted_s in zip(pauses_s[2:5], (5, 30, 120), strict=True):
-        assert wanted_s <= pause_s < wanted_s + 3  # a request waits for its reply before the pause
+        assert wanted_s <= pause_s < wanted_s + 5  # a request waits for its reply before the pause
     assert len(pauses_s[5:]) == 4
-    assert all(300 <= pause_s < 303 for pause_s in pauses_s[5:])
+    assert all(300 <= pause_s < 305 for pause_s in pauses_s[5:])
     assert module.product is None
     assert module.rig.is_in(DeviceState.RUNNING)  # samples arrive anyway
     assert len(module.rig.samples) > 5000

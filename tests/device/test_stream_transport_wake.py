@@ -67,7 +67,7 @@ async def test_the_output_of_a_device_in_command_mode_is_started(bench: WakeBenc
     ("hardware", "wait_s", "woken", "writes"),
     [
         ({"identify": False}, 8, [], range(1)),
-        ({"boot_ms": 10**6}, 20, [], range(11, 10**6)),
+        ({"boot_ms": 10**6}, 20, [], range(7, 10**6)),
         ({"boot_ms": 0, "changes_mode": False}, 10, [WOKEN], range(1, 10**6)),  # it acknowledges, but sends no samples
     ],
     ids=["may not be asked", "never answers", "does not stream"],
@@ -92,9 +92,9 @@ async def test_a_streaming_or_silenced_device_is_not_woken(bench: WakeBench) -> 
     assert bench.woken == []
 
 
-@played(lambda: WakeBench(boot_ms=20_000, acknowledges=False))
+@played(lambda: WakeBench(boot_ms=18_000, acknowledges=False))
 async def test_a_late_device_is_woken_and_reported_once(bench: WakeBench) -> None:
-    """The module boots for 20 s and does not acknowledge."""
+    """The module boots for 18 s and does not acknowledge."""
     await bench.until(lambda: bench.woken and len(bench.samples) > 500, 60)
     assert bench.woken == [WOKEN]
     assert [e.detail["acknowledged"] for e in bench.events if "acknowledged" in e.detail] == [False]

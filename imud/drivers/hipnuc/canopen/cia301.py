@@ -189,7 +189,10 @@ def write_object(
 
 def _request(node: int, name: str, frame: bytes, ends: Callable[[Message], bool], index: int, sub: int) -> Request:
     refuses = _answers(node, index, sub, (ABORT,))
-    return Request(pack_frame(SDO_REQUEST + node, False, frame), name, ends, refuses, never, TIMEOUT_NS)
+    reads = frame[0] == READ
+    kind = f"node {node}, 0x{index:04X}.{sub}"  # an abort does not contain the direction of the transfer
+    payload = pack_frame(SDO_REQUEST + node, False, frame)
+    return Request(payload, name, ends, refuses, never, TIMEOUT_NS, kind=kind, repeatable=reads)
 
 
 def _reply(name: str, outcome: Outcome) -> bytes:

@@ -112,7 +112,10 @@ def exchange(
 
     can_id = join(J1939Id(PRIORITY, CONFIGURE, peer.host, peer.address))
     frame = pack_frame(can_id, True, LAYOUT.pack(register, command, 0, value))
-    return Request(frame, name, accepts, refuses, is_reply, timeout_ns, also=also)
+    kind = f"register {register} of {peer.address}, command {command}"
+    return Request(
+        frame, name, accepts, refuses, is_reply, timeout_ns, kind=kind, repeatable=command == READ, also=also
+    )
 
 
 def read(peer: J1939Node, register: int) -> RequestScript[int]:

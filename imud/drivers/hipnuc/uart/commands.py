@@ -229,7 +229,8 @@ def log_once(message: OutputMessage) -> Request:
 def ask(query: Query) -> Request:
     """Request one of the four reports."""
     is_part = is_version_line if query is Query.VERSION else is_setting_line
-    return _command(f"LOG {query}", is_part=is_part, messages_min=2)
+    kind = "version" if query is Query.VERSION else "report"
+    return _command(f"LOG {query}", is_part=is_part, messages_min=2, kind=kind, repeatable=True)
 
 
 def max_rate_hz(message: OutputMessage, baud: int) -> int:
@@ -269,11 +270,14 @@ def _command(
     silent: bool = False,
     is_part: Callable[[str], bool] = _never,
     messages_min: int = 1,
+    kind: str = "OK",
+    repeatable: bool = False,
 ) -> Request:
     payload = (text + LINE_END).encode("ascii")
     return Request(
-        payload, text, of_text(is_end), of_text(is_rejection), of_text(is_part), timeout_ns, silent, messages_min
-    )
+        payload, text, of_text(is_end), of_text(is_rejection), of_text(is_part), timeout_ns, silent, messages_min,
+        kind, repeatable,
+    )  # fmt: skip
 
 
 def _text(value: float) -> str:

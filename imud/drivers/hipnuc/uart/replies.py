@@ -32,13 +32,13 @@ _DIVISOR: Final = re.compile(r"(?:.*\bDIV)?\s*(\d{1,2})\b")
 
 
 def is_end(line: str) -> bool:
-    """Return whether `line` ends a positive reply."""
-    return line.strip() == "OK"
+    """Return whether `line` ends a positive reply: OK in any case."""
+    return line.strip().upper() == "OK"
 
 
 def is_rejection(line: str) -> bool:
     """Return whether `line` is a rejection: ERR with any text, but not a setting with a name that starts with ERR."""
-    return line.startswith("ERR") and "=" not in line
+    return line.lstrip().upper().startswith("ERR") and "=" not in line
 
 
 def is_version_line(line: str) -> bool:
@@ -48,8 +48,11 @@ def is_version_line(line: str) -> bool:
 
 
 def is_setting_line(line: str) -> bool:
-    """Return whether `line` can be part of another report (not documented): anything but a version line."""
-    return not is_version_line(line)
+    """Return whether `line` can be part of another report (not documented).
+
+    A version line and an NMEA sentence of newer firmware, which can arrive between the lines, are not part of it.
+    """
+    return not is_version_line(line) and not line.startswith("$")
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,7 +85,7 @@ class BusMode(Enum):
 
 def ask_status() -> Request:
     """Return the request for S1: versions, model, serial number, status (CMD 1)."""
-    return _command(Command.STATUS, "status", is_end=lambda message: parse_status(message) is not None)
+    return _command(Command.STATUS, "status", is_end=lambda message: parse_status(message) is not None, repeatable=True)
 
 
 def ask_ahrs() -> Request:
@@ -113,7 +113,9 @@ def read_parameter(parameter: Parameter) -> Request:
         value = parse_parameter(message)
         return value is not None and value.index == parameter
 
-    return _command(Command.READ_PARAMETER, f"read parameter {parameter.name}", param3=parameter, is_end=is_end)
+    return _command(
+        Command.READ_PARAMETER, f"read parameter {parameter.name}", param3=parameter, is_end=is_end, repeatable=True
+    )
 
 
 def ask_installation_status() -> Request:
@@ -135,7 +137,7 @@ def ask_installation_status() -> Request:
 
 def output_mode(mode: OutputMode, *, baud: int = 0) -> Request:
     """Stream AHRS frames, or only reply (CMD 3). With `baud`, imud first sets the baud rate of the serial port."""
-    return _command(Command.OUTPUT_MODE, f"output mode {mode.name}", param1=mode.value, baud=baud)
+    return _command(Command.OUTPUT_MODE, f"output mode {mode.name}", param1=mode.value, baud=baud, repeatable=True)
 
 
 def reset_heading(heading_deg: float) -> Request:
@@ -237,12 +239,18 @@ def _command(
     timeout_ns: int = REPLY_TIMEOUT_NS,
     baud: int = 0,
     is_sample: Callable[[Measurement], bool] | None = None,
+    repeatable: bool = False,
 ) -> Request:
     acknowledged = _acknowledges(command)
     payload = encode_command(command, param1, param3)
     # an acknowledgement of a request for values is part of its reply and does not end it
     ends = is_end or acknowledged
-    return Request(payload, name, ends, never, acknowledged, timeout_ns, baud=baud, is_sample=is_sample)
+    # the acknowledgement contains the command and not the parameter
+    kind = f"{command.name} {param3 if is_end else ''}"
+    return Request(
+        payload, name, ends, never, acknowledged, timeout_ns,
+        kind=kind, repeatable=repeatable, baud=baud, is_sample=is_sample,
+    )  # fmt: skip
 
 
 def _acknowledges(command: Command) -> Callable[[Message], bool]:
