@@ -196,7 +196,8 @@ class Calibration:
     section: str  # section of the vendor's manual
     handling: Handling
     instructions: tuple[str, ...]  # steps of the user before and during the calibration, one sentence per step
-    # Returns the script that starts the calibration. If the device reports the end, the script waits for the end.
+    # Returns the script that starts the calibration. If the device shows the end, the script waits for the end. A
+    # Verdict with `done` False as its result is the reason of a result that is not verified.
     begin: Callable[[Target], Any]
     # Returns the script that requests the progress and returns a Verdict; None if `begin` waits for the end
     verdict: Callable[[Target], Any] | None = None

@@ -389,7 +389,8 @@ class CalibrationRun:
             )
         await self._pause(SETTLE_NS)
         means = await self._rest(kind)
-        return _words(answer), tuple(_check(one, means) for one in calibration.expected), ""
+        problem = answer.words if isinstance(answer, Verdict) and not answer.done else ""
+        return _words(answer), tuple(_check(one, means) for one in calibration.expected), problem
 
     async def _turned(self, kind: str, calibration: Calibration) -> tuple[str, tuple[Check, ...], str]:
         """Calibrate a turned device. Return the reply of the device, the checks, and the problem."""
@@ -551,6 +552,8 @@ def _words(answer: object) -> str:
     """Return the reply of the device as text."""
     if answer is None or answer is True:
         return ""
+    if isinstance(answer, Verdict):
+        return answer.words
     if isinstance(answer, tuple | list):
         return ", ".join(f"{value:.6g}" if isinstance(value, float) else str(value) for value in answer)
     return str(answer)

@@ -128,6 +128,16 @@ async def test_a_result_is_saved_only_on_request(rig: GuideRig) -> None:
 
 
 @played(GuideRig)
+async def test_a_result_that_the_device_does_not_show_is_not_verified_and_not_saved(rig: GuideRig) -> None:
+    for done in (True, False):
+        begin = rig.does("begin", Verdict(done, "the parameters are 0, 0, 0"))
+        result = await rig.guide.run("gyro", gyro(rig, begin=begin), save=True)
+        assert (result.verified, result.saved, result.device) == (done, done, "the parameters are 0, 0, 0")
+        assert result.problem == ("" if done else "the parameters are 0, 0, 0")
+    assert rig.ran == ["begin", "save", "begin"]
+
+
+@played(GuideRig)
 async def test_a_remaining_bias_is_reported_and_not_saved(rig: GuideRig) -> None:
     rig.motion = lambda _t_s: (0.0, radians(0.3), 0.0)
     result = await rig.guide.run("gyro", gyro(rig), save=True)

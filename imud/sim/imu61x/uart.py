@@ -11,9 +11,9 @@ of the device from `advance`. Behavior, with assumptions where the manual define
 - A baud rate applies after its acknowledgement, or after the next start.
 - CMD 5 saves all settings with the mode. CMD 9 and a power failure lose unsaved settings. CMD 15 restores the flash
   immediately, and the RAM immediately or after the next start.
-- CMD 7 takes some seconds and measures the present attitude. In this time, S1 reports a calibration and the result of
-  CMD 8 differs from "done". The measured angles can be read but have no effect. CMD 10 takes the same time, subtracts
-  the bias of the gyroscope, and is refused while the device moves (all assumptions).
+- CMD 7 takes some seconds and measures the present attitude. In this time, the result of CMD 8 differs from "done". The
+  measured angles can be read but have no effect. CMD 10 takes the same time, subtracts the bias of the gyroscope, and
+  is refused while the device moves (all assumptions).
 - The heading starts at the truth and is not saved.
 """
 
@@ -66,7 +66,7 @@ class Imu61xBehaviour:
     flash_ms: int = 0
     quiet_ms: int = 0  # time after K1 in which the device sends and receives no bytes, ms
     acknowledges_at_end: bool = False  # True: the device sends K1 of a calibration at its end
-    reports_calibration: bool = True  # True: S1 is long enough for a calibration status
+    whole_status: bool = True  # True: S1 contains all fields
 
 
 # Commands whose reply is only K1.
@@ -83,7 +83,7 @@ VARIANTS: Final[Mapping[str, Imu61xBehaviour]] = {
     "baud rate at the next start": Imu61xBehaviour(baud_acts_at_start=True),
     "factory reset at the next start": Imu61xBehaviour(reset_acts_at_start=True),
     "K1 at the end of a calibration": Imu61xBehaviour(acknowledges_at_end=True),
-    "short status": Imu61xBehaviour(reports_calibration=False),
+    "short status": Imu61xBehaviour(whole_status=False),
     "all at once": Imu61xBehaviour(
         answers_while_streaming=False, result_done=1, result_refused=0, flash_ms=2000, quiet_ms=700,
         baud_acts_at_start=True, reset_acts_at_start=True,
@@ -173,7 +173,6 @@ def changed(settings: Imu61xSettings, index: int, value: float) -> Imu61xSetting
 # Maximum number of bytes that wait for the wire. The device drops a frame that exceeds it.
 TX_BUFFER_BYTES: Final = 512
 REPLY_NS: Final = 200_000  # time from the end of a command to its reply, ns (assumption)
-CALIBRATING: Final = 1  # `calibration_status` of S1 during a calibration, otherwise 0 (assumption)
 RESULT_BUSY: Final = 9  # result of CMD 8 during a calibration
 STATIC_GYRO_RAD_S: Final = 0.02
 GYRO_CALIBRATION_SAMPLES: Final = 512
@@ -183,8 +182,8 @@ US_PER_S: Final = 1_000_000
 # Contents of S1. Model number and units are invented.
 STATUS: Final = Status(
     software_version=10203, hardware_version=2, model=614, serial_number=(0x00320047, 0x3133510D, 0x33383736),
-    system_status=0, cpu_load=120, drop_rate=0, i2c_master=0, voltage=50, user_config_status=0,
-    calibration_status=0, imu_health=bytes(32),
+    system_status=0, cpu_load=120, drop_rate=0, i2c_master=0, voltage=50, user_config_fault=0,
+    calibration_fault=0, imu_health=bytes(32),
 )  # fmt: skip
 
 
@@ -391,9 +390,7 @@ class Imu61xModule:
 
     def _status(self) -> Status:
         status = self.hardware.status
-        if not self.hardware.behaviour.reports_calibration:
-            return replace(status, system_status=None)
-        return replace(status, calibration_status=CALIBRATING if self._calibration is not None else 0)
+        return status if self.hardware.behaviour.whole_status else replace(status, system_status=None)
 
     def _order(self, command: Command, param1: float, param3: int, now_ns: int) -> None:
         """Process a command whose reply is only K1. Raises ParameterRefused."""

@@ -21,7 +21,7 @@ from imud.drivers.imu61x.uart.codec import (
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_S
 from imud.sim import SIMULATORS
-from imud.sim.imu61x.uart import CALIBRATING, RESULT_BUSY, Imu61xModule, Imu61xSettings, ParameterRefused, changed, make
+from imud.sim.imu61x.uart import RESULT_BUSY, Imu61xModule, Imu61xSettings, ParameterRefused, changed, make
 from imud.sim.physics import Noise, swing
 from imud.sim.sensor import SimulatorOptions
 from tests.support.simulated_modules import BEGIN_NS, IMU61X_STILL, Imu61xBench, imu61x_bench
@@ -200,14 +200,6 @@ def test_commands_at_another_rate_or_damaged() -> None:
         assert parse_acknowledgement(reply) == Acknowledgement(3, 2)
 
 
-def calibration_status(far: Imu61xBench) -> int | None:
-    outcome = far.ask(c.ask_status())
-    assert isinstance(outcome, Reply)
-    status = parse_status(outcome.messages[-1])
-    assert status is not None
-    return status.calibration_status
-
-
 def heard(far: Imu61xBench, request: Request, duration_ms: float) -> list[tuple[float, int]]:
     """Send a request without waiting. Return the times (ms) and the results of its acknowledgements."""
     far.send(request.payload)
@@ -248,19 +240,15 @@ def test_behaviour_of_the_variants() -> None:
     far = imu61x_bench(ignores=frozenset({c.Command.SAVE}))
     assert heard(far, c.save(), 20) == []
 
-    assert calibration_status(imu61x_bench(reports_calibration=False)) is None
-
 
 def test_installation_calibration_takes_its_time() -> None:
     far = imu61x_bench()
     assert acknowledged(far, c.ask_installation_status()) == 0
     assert acknowledged(far, c.start_installation_calibration()) == 0
     assert acknowledged(far, c.ask_installation_status()) == RESULT_BUSY
-    assert calibration_status(far) == CALIBRATING
     assert parameter(far, Parameter.INSTALL_X_OFF) == 0
     far.wait(3000)
     assert acknowledged(far, c.ask_installation_status()) == 0
-    assert calibration_status(far) == 0
     assert parameter(far, Parameter.INSTALL_X_OFF) == pytest.approx(-2.998, abs=0.01)
 
     far = imu61x_bench()

@@ -145,7 +145,7 @@ def _measurement(frames: Mapping[int, bytes]) -> Measurement:
     """Return the measurement of a set of TPDOs. Without a quaternion, the attitude is computed from the angles."""
     euler = _vector(frames.get(3), EULER_RAD_PER_LSB)
     quat: Quaternion | None = None
-    if any(frames.get(4, b"")):  # zeros are no rotation
+    if any(frames.get(4, b"")):  # four zeros are not a rotation
         w, x, y, z = FOUR.unpack(frames[4])
         quat = (w * QUAT_PER_LSB, x * QUAT_PER_LSB, y * QUAT_PER_LSB, z * QUAT_PER_LSB)
     elif euler is not None:

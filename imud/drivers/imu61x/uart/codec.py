@@ -225,8 +225,8 @@ class Status:
     drop_rate: int | None = None
     i2c_master: int | None = None
     voltage: int | None = None
-    user_config_status: int | None = None
-    calibration_status: int | None = None
+    user_config_fault: int | None = None  # fault code of the flash sector with the settings
+    calibration_fault: int | None = None  # fault code of the flash sector with the calibration: not its progress
     imu_health: bytes | None = None  # 32 bytes
 
 
@@ -297,7 +297,7 @@ def pack_status(status: Status) -> bytes:
     head = _STATUS_HEAD.pack(status.software_version, status.hardware_version, status.model, *status.serial_number)
     rest = (
         status.system_status, status.cpu_load, status.drop_rate, status.i2c_master, status.voltage,
-        status.user_config_status, status.calibration_status, status.imu_health,
+        status.user_config_fault, status.calibration_fault, status.imu_health,
     )  # fmt: skip
     there = next((n for n, value in enumerate(rest) if value is None), len(rest))
     values = [b"" if n == 7 else 0 for n in range(8)]

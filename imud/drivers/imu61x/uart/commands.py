@@ -43,8 +43,9 @@ RATES_HZ: Final[tuple[RateHz, ...]] = get_args(RateHz)
 # Timeout of a reply, ns. 76 bytes take 7 ms at 115200 baud, and a USB adapter holds them for 16 ms.
 REPLY_TIMEOUT_NS: Final = 300 * NS_PER_MS
 FLASH_TIMEOUT_NS: Final = 5 * NS_PER_S  # timeout while the device erases and writes flash, which may take 2 s, ns
-# Timeout of a calibration, ns; the acknowledgement may arrive at its start or at its end (assumed)
+# Timeout of the acknowledgement of a calibration, ns: it may arrive at its start or at its end (assumed)
 CALIBRATION_TIMEOUT_NS: Final = 10 * NS_PER_S
+Parameters3 = tuple[Parameter, Parameter, Parameter]  # parameters of X, Y and Z
 
 
 class Command(Enum):
@@ -151,7 +152,7 @@ def save() -> Request:
 
 
 def start_installation_calibration() -> Request:
-    """Start the measurement of the mounting error (CMD 7). `ask_installation_status` requests the progress."""
+    """Start the measurement of the mounting error (CMD 7)."""
     return _command(Command.CALIBRATE_INSTALLATION, "installation calibration", timeout_ns=CALIBRATION_TIMEOUT_NS)
 
 
@@ -273,12 +274,10 @@ STREAM: Final = output_mode(OutputMode.STREAM).payload
 
 
 class Imu61xUartOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of an IMU61x on a UART: codes that the manual does not state."""
+    """Options of an IMU61x on a UART: a code that the manual does not state."""
 
     result_done: Annotated[int, Meta(ge=0, le=0xFFFF)] = RESULT_DONE
     """Result in acknowledgements (K1) of an executed command; 0 is assumed."""
-    calibration_done: Annotated[int, Meta(ge=0, le=0xFF)] = 0
-    """Value of `calibration_status` in the device status (S1) without a running calibration; 0 is assumed."""
 
 
 # --- command mode -----------------------------------------------------------------------------------------------
@@ -375,10 +374,15 @@ def acknowledged(request: Request, done: int) -> RequestScript[None]:
     """Send a command with an unreadable effect. Raises NoReply without an acknowledgement, and Rejected."""
     if not (yield from ordered(request, done)):
         yield from settled()  # raises NoReply if the device does not reply at all
-        raise NoReply(
-            f"{request.name}: expected an acknowledgement, got none from a device that replies: "
-            "it is not known whether the device executed the command"
-        )
+        raise no_acknowledgement(request)
+
+
+def no_acknowledgement(request: Request) -> NoReply:
+    """Return the error of a command that a device with other replies did not acknowledge."""
+    return NoReply(
+        f"{request.name}: expected an acknowledgement, got none from a device that replies: "
+        "it is not known whether the device executed the command"
+    )
 
 
 def result_of(outcome: Outcome) -> int | None:
@@ -420,7 +424,7 @@ def _value_in(message: Message) -> float:
     return value.value
 
 
-def read3(parameters: tuple[Parameter, Parameter, Parameter]) -> RequestScript[Vector3]:
-    """Read the parameters of three axes. Raises NoReply."""
+def read3(parameters: Parameters3, tries: int = CONTACT_TRIES) -> RequestScript[Vector3]:
+    """Read the parameters of three axes with at most `tries` requests each. Raises NoReply."""
     x, y, z = parameters
-    return ((yield from read(x)), (yield from read(y)), (yield from read(z)))
+    return ((yield from read(x, tries)), (yield from read(y, tries)), (yield from read(z, tries)))

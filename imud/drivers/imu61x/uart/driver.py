@@ -1,6 +1,7 @@
 """Row `DRIVER` of the Forsense IMU61x on a UART: verbs and calibrations."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from random import Random
 from typing import Annotated, Any, Final
 
@@ -18,9 +19,10 @@ from imud.contracts.command import (
     Target,
     Verb,
     Verbs,
+    Verdict,
 )
 from imud.contracts.driver import StreamDriver, random_vector
-from imud.contracts.script import RequestScript, pause
+from imud.contracts.script import ReplyFrame, Request, RequestScript, pause
 from imud.drivers.imu61x.common import (
     EULER_CONVENTION,
     NAVIGATION_FRAME,
@@ -33,15 +35,15 @@ from imud.drivers.imu61x.uart.codec import (
     TIMER_MODULUS,
     Imu61xCodec,
     encode_ahrs,
-    parse_acknowledgement,
-    parse_status,
 )
 from imud.drivers.imu61x.uart.commands import (
     BAUD_RATES,
     Imu61xUartOptions,
-    acknowledged,
+    Parameters3,
     answered,
     in_command_mode,
+    no_acknowledgement,
+    ordered,
     read3,
     settled,
 )
@@ -59,94 +61,76 @@ from imud.model.sample import Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 POLL_NS: Final = 500 * NS_PER_MS
-POLLS_MAX: Final = 120  # one minute; the manual states no time
-# Time for the gyroscope calibration of a device that does not report its end, ns (assumed)
-GYRO_NS: Final = 10 * NS_PER_S
-
-# Returns whether the calibration has ended, and the state of the device as text
-Finished = Callable[[], RequestScript[tuple[bool, str]]]
+# Maximum time of a calibration until its parameters change, ns (assumed: the manual states no time)
+CALIBRATION_NS: Final = 30 * NS_PER_S
+GYRO_KEY: Final = "gyro_offset_deg_s"
+INSTALLATION_KEY: Final = "installation_angles_deg"
 
 
-def calibrate_gyro(*, done: int = RESULT_DONE, rest: int = 0) -> RequestScript[Vector3]:
-    """Measure the zero bias of the gyroscope at rest (CMD 10). Return it in °/s. Not saved.
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """Result of a calibration."""
 
-    `done`: result of an acknowledgement, `rest`: calibration status, that mean finished. Raises NoReply, Rejected.
+    values: Vector3  # parameters after the calibration: °/s for the gyroscope, ° for the mounting error
+    changed: bool  # whether the parameters changed, which shows the end of the calibration
+
+    @property
+    def words(self) -> str:
+        """Evidence, or the reason of a result that is not verified."""
+        values = ", ".join(f"{value:g}" for value in self.values)
+        if self.changed:
+            return f"verified: the parameters changed to {values}"
+        return (
+            f"sent, not verified: the parameters stayed at {values} for {CALIBRATION_NS // NS_PER_S} s; nothing else "
+            "shows the end of a calibration: keep the device at rest, check the samples, and repeat the calibration"
+        )
+
+
+def calibrate_gyro(*, done: int = RESULT_DONE) -> RequestScript[Calibrated]:
+    """Measure the zero bias of the gyroscope at rest (CMD 10). Return the offsets, °/s. Not saved.
+
+    `done`: result of an acknowledgement that means executed. Raises NoReply, Rejected.
     """
-
-    def calibrate() -> RequestScript[Vector3]:
-        before = yield from read3(GYRO_OFFSETS)
-        yield from acknowledged(commands.calibrate_gyro(), done)
-        status = yield from settled()
-        if status.calibration_status is None:
-            yield from _until_changed(before)
-        else:
-            yield from _until("gyro calibration", lambda: _by_status(rest))
-        return (yield from read3(GYRO_OFFSETS))
-
-    return in_command_mode(calibrate)
+    return in_command_mode(lambda: _calibrated(commands.calibrate_gyro(), GYRO_OFFSETS, done))
 
 
-def calibrate_installation(*, done: int = RESULT_DONE, rest: int = 0) -> RequestScript[Vector3]:
-    """Measure the mounting error (CMD 7) and wait for the end. Return the angles about X, Y, Z in °. Not saved.
+def calibrate_installation(*, done: int = RESULT_DONE) -> RequestScript[Calibrated]:
+    """Measure the mounting error (CMD 7). Return the angles about X, Y, Z, °. Not saved. Raises NoReply, Rejected."""
+    return in_command_mode(lambda: _calibrated(commands.start_installation_calibration(), INSTALLATION_ANGLES, done))
 
-    `done` and `rest` as for the gyroscope. Raises NoReply, Rejected.
+
+def _calibrated(request: Request, parameters: Parameters3, done: int) -> RequestScript[Calibrated]:
+    """Start a calibration, and wait until its parameters changed and are constant, at most CALIBRATION_NS.
+
+    An acknowledgement shows only that the device received the command. S1 contains no progress, and no document states
+    the reply to CMD 8.
     """
+    before = last = yield from read3(parameters)
+    is_acknowledged = yield from ordered(request, done)
+    for _ in range(CALIBRATION_NS // POLL_NS):
+        yield pause(POLL_NS)
+        try:
+            values = yield from read3(parameters, tries=1)
+        except NoReply:  # the device is busy
+            continue
+        if values != before and values == last:
+            return Calibrated(values, changed=True)
+        last = values
+    if not is_acknowledged:
+        yield from settled()  # raises NoReply if the device does not reply at all
+        raise no_acknowledgement(request)
+    return Calibrated(last, changed=False)
 
-    def calibrate() -> RequestScript[Vector3]:
-        yield from acknowledged(commands.start_installation_calibration(), done)
-        status = yield from settled()
-        by_result = status.calibration_status is None
-        finished = (lambda: _by_result(done)) if by_result else (lambda: _by_status(rest))
-        yield from _until("installation calibration", finished)
-        return (yield from read3(INSTALLATION_ANGLES))
 
-    return in_command_mode(calibrate)
-
-
-def installation_status() -> RequestScript[int | None]:
-    """Read the state of the installation calibration (CMD 8); None if the reply does not contain it. Raises NoReply."""
+def installation_status() -> RequestScript[Mapping[str, str]]:
+    """Request the state of the installation calibration (CMD 8). Return the frame as sent. Raises NoReply."""
     return in_command_mode(_installation_status)
 
 
-def _installation_status() -> RequestScript[int | None]:
-    message = yield from answered(commands.ask_installation_status())
-    if (reply := parse_acknowledgement(message)) is not None:
-        return reply.result
-    status = parse_status(message)
-    return status.calibration_status if status is not None else None
-
-
-# --- end of a calibration ---------------------------------------------------------------------------------------
-
-
-def _until(what: str, finished: Finished) -> RequestScript[None]:
-    words = "none"
-    for _ in range(POLLS_MAX):
-        yield pause(POLL_NS)
-        over, words = yield from finished()
-        if over:
-            return
-    raise NoReply(
-        f"{what}: expected its end within {POLLS_MAX * POLL_NS / NS_PER_S:.0f} s, got {words}; keep the device at rest"
-    )
-
-
-def _by_status(rest: int) -> RequestScript[tuple[bool, str]]:
-    status = (yield from settled()).calibration_status
-    return status == rest, f"calibration status {status} (`options.calibration_done`: {rest})"
-
-
-def _by_result(done: int) -> RequestScript[tuple[bool, str]]:
-    result = yield from _installation_status()
-    return result == done, f"result {result} (`options.result_done`: {done})"
-
-
-def _until_changed(before: Vector3) -> RequestScript[None]:
-    """Wait for new offsets, at most GYRO_NS, because the new offsets may be equal to the old ones."""
-    for _ in range(GYRO_NS // POLL_NS):
-        yield pause(POLL_NS)
-        if (yield from read3(GYRO_OFFSETS)) != before:
-            return
+def _installation_status() -> RequestScript[Mapping[str, str]]:
+    frame = yield from answered(commands.ask_installation_status())
+    assert isinstance(frame, ReplyFrame)  # nothing else ends the request
+    return {"frame_id": f"{frame.frame_id:#06x}", "payload": frame.payload.hex(" ")}
 
 
 Heading = Annotated[
@@ -174,12 +158,22 @@ def _heading(target: Target, *, heading_deg: Heading = 0.0) -> RequestScript[Non
     return settings.reset_heading(heading_deg, done=_done(target))
 
 
-def _gyro(target: Target) -> RequestScript[Vector3]:
-    return calibrate_gyro(done=_done(target), rest=codes_of(target).calibration_done)
+def _gyro(target: Target) -> RequestScript[Answer]:
+    result = yield from calibrate_gyro(done=_done(target))
+    return {"result": result.words, GYRO_KEY: result.values}
 
 
-def _installation(target: Target) -> RequestScript[Vector3]:
-    return calibrate_installation(done=_done(target), rest=codes_of(target).calibration_done)
+def _installation(target: Target) -> RequestScript[Answer]:
+    result = yield from calibrate_installation(done=_done(target))
+    return {"result": result.words, INSTALLATION_KEY: result.values}
+
+
+def _verdict(calibrate: Callable[..., RequestScript[Calibrated]]) -> Callable[[Target], RequestScript[Verdict]]:
+    def begin(target: Target) -> RequestScript[Verdict]:
+        result = yield from calibrate(done=_done(target))
+        return Verdict(result.changed, result.words)
+
+    return begin
 
 
 VERBS: Final[Verbs] = {
@@ -214,12 +208,14 @@ VERBS: Final[Verbs] = {
         saves=True,
     ),
     "heading": Verb("set the heading", _heading),
-    "calibrate_gyro": Verb("measure the bias of the gyroscope at rest and wait for the end; returns it in °/s", _gyro),
+    "calibrate_gyro": Verb(
+        "measure the bias of the gyroscope at rest, and wait until the offsets change, at most 30 s", _gyro
+    ),
     "calibrate_installation": Verb(
-        "measure the mounting error and wait for the end; returns the angles in °", _installation
+        "measure the mounting error, and wait until the angles change, at most 30 s", _installation
     ),
     "installation_status": Verb(
-        "read the state of the installation calibration, as sent",
+        "request the state of the installation calibration; returns the frame as sent (no document describes it)",
         lambda _target: installation_status(),
         changes=False,
     ),
@@ -242,18 +238,18 @@ CALIBRATIONS: Final[Calibrations] = {
         section="1.6, CMD 10",
         handling=Handling.REST,
         instructions=("Put the device down, away from vibration, and do not touch it.",),
-        begin=VERBS["calibrate_gyro"].begin,
+        begin=_verdict(calibrate_gyro),
         expected=(GYRO_ZERO,),
         kept=Kept.BY_SAVE,
         save=_SAVE,
     ),
     # no document states the effect of the angles on the samples: imud returns and does not check them
     "installation": Calibration(
-        help="measure the mounting error and wait for the end",
-        section="1.6, CMD 7 and 8",
+        help="measure the mounting error",
+        section="1.6, CMD 7",
         handling=Handling.REST,
         instructions=("Mount the device, level the body with the device, and let it rest.",),
-        begin=VERBS["calibrate_installation"].begin,
+        begin=_verdict(calibrate_installation),
         kept=Kept.BY_SAVE,
         save=_SAVE,
     ),

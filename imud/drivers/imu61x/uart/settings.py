@@ -115,8 +115,8 @@ def status_words(status: Status) -> Mapping[str, Any]:
         "drop_rate_raw": status.drop_rate,
         "i2c_master_raw": status.i2c_master,
         "voltage_raw": status.voltage,
-        "user_config_status_raw": status.user_config_status,
-        "calibration_status_raw": status.calibration_status,
+        "user_config_fault_raw": status.user_config_fault,
+        "calibration_fault_raw": status.calibration_fault,
         "imu_health_bits": None if status.imu_health is None else status.imu_health.hex(),
     }
     return {name: value for name, value in words.items() if value is not None}

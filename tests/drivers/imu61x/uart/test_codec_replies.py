@@ -53,7 +53,7 @@ def test_s1() -> None:
 def test_s1_of_any_length_contains_its_complete_members(size: int) -> None:
     ends = {
         "system_status": 26, "cpu_load": 28, "drop_rate": 30, "i2c_master": 31, "voltage": 32,
-        "user_config_status": 33, "calibration_status": 34, "imu_health": 66,
+        "user_config_fault": 33, "calibration_fault": 34, "imu_health": 66,
     }  # fmt: skip
     status = parse_status(ReplyFrame(0xFF, S1.ljust(90, b"\x77")[:size]))
     assert status is not None

@@ -46,7 +46,7 @@ def test_result_is_judged_by_the_option() -> None:
         far.run(contact.ordered(commands.reset_heading(0), 0))
     far = imu61x_bench(Imu61xSettings(mode=OutputMode.COMMAND), acknowledges=False)
     assert far.run(contact.ordered(commands.reset_heading(0), 0)) is False
-    assert Imu61xUartOptions() == Imu61xUartOptions(result_done=0, calibration_done=0)
+    assert Imu61xUartOptions() == Imu61xUartOptions(result_done=0)
     assert contact.result_of(Silence(())) is None
     assert contact.result_of(Reply(("text",))) is None
 

@@ -78,8 +78,8 @@ def test_identity_settings_and_modes(variant: str) -> None:
         "drop_rate_raw": 0,
         "i2c_master_raw": 0,
         "voltage_raw": 50,
-        "user_config_status_raw": 0,
-        "calibration_status_raw": 0,
+        "user_config_fault_raw": 0,
+        "calibration_fault_raw": 0,
         "imu_health_bits": "00" * 32,
     }
     assert words == (head if variant == "short status" else head | rest)
