@@ -37,7 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the objects to standard output and the ledger to standard error. Return 1 if no frame was found."""
+    """Print the objects to standard output and the ledger to standard error.
+
+    Return 1 without samples, unless the capture contains only replies.
+    """
     driver = DRIVERS[args.driver]
     settings = driver_settings(driver, given_options(driver, args.option))
     ledger = Ledger()
@@ -49,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     shown = {name: value for name, value in ledger.snapshot().items() if value}
     # standard error: standard output contains only JSON lines
     print(msgspec.json.encode(shown).decode(), file=sys.stderr)
-    return 0 if ledger.frames_good else 1
+    return 0 if ledger.frames_in_samples or (ledger.frames_in_replies and not ledger.frames_ignored) else 1
 
 
 def open_capture(name: str) -> BinaryIO:
@@ -80,6 +83,8 @@ def events_in(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Options)
             yield from codec.feed(data)
         # complete frames at the end of the capture
         yield from codec.flush()
+        if codec.unknown and not ledger.frames_in_samples:
+            print(f"found {driver.unknown_words(codec.unknown)}", file=sys.stderr)
     elif isinstance(driver, CanDriver):
         frame_codec = driver.make_codec(ledger, settings)
         log = CandumpReader(file)

@@ -200,11 +200,20 @@ async def examine(port: str, may_ask: bool, title: str) -> list[ProbeReport]:
         found = await find(config, link)
         identity = await identity_of_device(found, link) if may_ask else Identity()
         words = identity_words(printable_identity(identity))
-        return [ProbeReport(port, title, found.driver.name, baud=link.baud, identity=words)]
+        return [ProbeReport(port, title, found.driver.name, baud=link.baud, identity=words, problem=_unknown(found))]
     except ImudError as error:
         return [ProbeReport(port, title, problem=str(error))]
     finally:
         link.close()
+
+
+def _unknown(found: StreamFound) -> str:
+    """Describe received frames of unknown types; empty if the device sends samples."""
+    ledger = Ledger()
+    codec = found.driver.make_codec(ledger, found.driver.settings())
+    for data, _ in found.chunks:
+        codec.feed(data)
+    return "" if ledger.frames_in_samples or not codec.unknown else found.driver.unknown_words(codec.unknown)
 
 
 async def find(config: DeviceConfig, link: StreamLink) -> StreamFound:

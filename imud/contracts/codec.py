@@ -43,11 +43,21 @@ def message_of(event: CodecEvent) -> Message | None:
     return event if isinstance(event, ReplyFrame) else None
 
 
+UNKNOWN_TYPES_MAX = 8  # maximum number of unknown frame types of which a codec counts the frames
+
+
+def count_unknown(counts: dict[int, int], frame_type: int) -> None:
+    """Count a valid frame of an unknown type. Ignore further types above UNKNOWN_TYPES_MAX."""
+    if frame_type in counts or len(counts) < UNKNOWN_TYPES_MAX:
+        counts[frame_type] = counts.get(frame_type, 0) + 1
+
+
 class StreamCodec(Protocol):
     """Decoder of a byte stream. The events do not depend on how the bytes are split into reads. Synchronization: one
     thread. Maximum memory: the longest frame plus the longest text line."""
 
     ledger: Ledger
+    unknown: dict[int, int]  # number of valid frames or sub-packets of each unknown type, by the number of the type
 
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
         """Decode the next bytes of the stream. Return the completed events. Never raises an exception."""

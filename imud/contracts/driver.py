@@ -188,6 +188,15 @@ class StreamDriver(Driver):
     why_silent: Callable[[Mapping[str, str]], str] = lambda _settings: "its output is off"
     # Returns one valid frame with random values, for property tests and fault injection
     example_frame: Callable[[Random], bytes]
+    # Returns the name of an unknown frame type (`StreamCodec.unknown`), for example `HI83 (tag 0x83)`
+    unknown_name: Callable[[int], str] = str
+    # Decoded frame types, and how to select one of them, one clause. `NAME` stands for the name of the device.
+    decoded: str = "select another frame type on the device"
+
+    def unknown_words(self, unknown: Mapping[int, int], device: str = "NAME") -> str:
+        """Describe valid frames that the codec cannot decode, with the next step, one sentence without its start."""
+        types = ", ".join(self.unknown_name(one) for one in unknown)
+        return f"valid frames of unknown types ({types}), but no sample; {self.decoded.replace('NAME', device)}"
 
     def problems(self, options: Any, link: Any) -> Sequence[KeyProblem]:
         """Return the problems of the driver options, and an unsupported baud rate."""

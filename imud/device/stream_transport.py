@@ -144,6 +144,8 @@ class StreamTransport(ReceivingTransport):
         self._hold: StreamHold | None = None  # holds the samples; None if the path receives each read on arrival
         self._fixed_baud = 0 if link.auto_baud else link.baud
         self._samples_before = 0  # number of samples before the link was opened
+        self._ignored = 0  # number of valid frames without samples at the last check
+        self._ignored_ns = -UNHEARD_NS  # CLOCK_MONOTONIC of the last change of this number
 
     # --- the link ----------------------------------------------------------------------------------------------------
 
@@ -247,7 +249,8 @@ class StreamTransport(ReceivingTransport):
         is_off = declared_values(self._config.declared).get("output_enabled") is False
         while driver.wake is not None and not is_off:
             await asyncio.sleep(UNHEARD_NS / NS_PER_S)
-            if self._ledger.samples != self._samples_before or self._search.requested:
+            samples_arrived = self._ledger.samples != self._samples_before
+            if samples_arrived or self._search.requested or self._hears_unknown(self._host.now_ns()):
                 return
             try:
                 acknowledged = await self.scripts.run(driver.wake())
@@ -333,6 +336,12 @@ class StreamTransport(ReceivingTransport):
     def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
         """Report the received bytes or replies, and search again if a search can find the device."""
         health = self._health
+        if self._hears_unknown(now_ns):
+            assert self.driver is not None
+            assert self.path is not None
+            problem = f"on {self.where}: {self.driver.unknown_words(self.path.codec.unknown, self._config.name)}"
+            self._report_silence(problem, now_ns, ended=health.state is not DeviceState.SILENT)
+            return  # the baud rate and the driver are right: no search can find samples
         unheard = self._is_unheard(path)
         if unheard:
             problem = f"bytes arrive on {self.where}, but no valid frame; check the baud rate and the driver"
@@ -347,6 +356,13 @@ class StreamTransport(ReceivingTransport):
                 self._search.search_again()
         if not self.busy and ((unheard and self._searchable) or self._is_overdue(path, now_ns)):
             self._search.search_again()
+
+    def _hears_unknown(self, now_ns: int) -> bool:
+        """Return whether valid frames of an unknown type arrive."""
+        ignored = self._ledger.frames_ignored
+        if ignored != self._ignored:
+            self._ignored, self._ignored_ns = ignored, now_ns
+        return now_ns - self._ignored_ns <= UNHEARD_NS
 
     def _is_overdue(self, path: SamplePath, now_ns: int) -> bool:
         """Return whether imud must query a silent device or search for it: once when it becomes silent, then later."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from imud.drivers.hipnuc.uart.codec import encode_frame
 from tests.cli.conftest import Cli
 from tests.support.files import hi91, imu61x_log
 
@@ -56,6 +57,28 @@ def test_a_file_without_a_message_and_none(tmp_path: Path, cli: Cli) -> None:
         == f"imud decode: cannot open {tmp_path}/none: No such file or directory\n"
     )
     cli.refuses("/dev/zero is a character device, expected a regular file", *DECODE, "/dev/zero")
+
+
+@pytest.mark.parametrize(
+    ("capture", "status", "words"),
+    [
+        (
+            encode_frame(b"\x83" + bytes(55)) * 3,
+            1,
+            "found valid frames of unknown types (HI83 (tag 0x83)), but no sample; ",
+        ),
+        (encode_frame(b"\x83" + bytes(55)) + b"OK\r\n", 1, "`imud settings NAME --set output.hi91=100`"),
+        (encode_frame(b"\x83" + bytes(55)) + MANUAL_FRAME, 0, ""),
+        (b"OK\r\n", 0, ""),  # a capture of replies
+    ],
+)
+def test_a_capture_without_samples_names_its_frames(
+    capture: bytes, status: int, words: str, tmp_path: Path, cli: Cli
+) -> None:
+    (tmp_path / "capture").write_bytes(capture)
+    err = cli(*DECODE, tmp_path / "capture", status=status).err
+    assert words in err
+    assert ("unknown types" in err) == bool(words)
 
 
 def test_log_of_a_can_bus(tmp_path: Path, cli: Cli) -> None:

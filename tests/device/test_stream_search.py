@@ -219,6 +219,7 @@ def test_the_frames_determine_the_driver() -> None:
 class DeafCodec:
     def __init__(self, ledger: Ledger) -> None:
         self.ledger = ledger
+        self.unknown: dict[int, int] = {}
 
     def feed(self, data: bytes) -> list[CodecEvent]:
         return []

@@ -18,6 +18,9 @@ from imud.contracts.script import Request, RequestScript, never
 from imud.contracts.status import DeviceState, KernelCounters
 from imud.device.search import RememberedDevice
 from imud.drivers.hipnuc.uart import driver
+from imud.drivers.hipnuc.uart.codec import encode_frame
+from imud.drivers.imu61x.uart.codec import DEVICE_SYNC
+from imud.drivers.imu61x.uart.codec import encode_frame as imu61x_frame
 from imud.links import LINKS
 from imud.links.memory import MemoryLink, MemoryOptions
 from imud.model.errors import LinkBusy, LinkError, Rejected
@@ -474,6 +477,56 @@ async def test_bytes_without_frames_are_reported(rig: DeviceRig) -> None:
     rig.link.feed(b"\x00" * 100, later_ns)
     rig.device.tick(later_ns + 100 * MS)
     assert rig.problem.startswith("bytes arrive on memory at 115200 baud, but no valid frame")
+
+
+HI83, HI81, OTHER = (encode_frame(bytes([tag]) + bytes(size)) for tag, size in ((0x83, 55), (0x81, 103), (0x77, 9)))
+RAW = imu61x_frame(DEVICE_SYNC, 0x0666, bytes(28))
+HI_NEXT = "imud decodes HI91 and HI92: select one with `imud settings bow --set output.hi91=100`"
+AHRS_NEXT = "imud decodes the AHRS frame (identifier 0x0002): select this output with the program of the vendor"
+
+
+@pytest.mark.parametrize("baud", [115200, "auto"])
+@pytest.mark.parametrize(
+    ("driver", "frames", "types", "next_step"),
+    [
+        ("hipnuc-uart", HI83, "HI83 (tag 0x83)", HI_NEXT),
+        ("hipnuc-uart", HI81 + b"$GPRMC,123519,A*6A\r\n" + HI83, "HI81 (tag 0x81), HI83 (tag 0x83)", HI_NEXT),
+        ("hipnuc-uart", OTHER, "tag 0x77", HI_NEXT),
+        ("imu61x-uart", RAW, "raw data (identifier 0x0666)", AHRS_NEXT),
+        ("imu61x-uart", imu61x_frame(DEVICE_SYNC, 0x0777, bytes(9)), "identifier 0x0777", AHRS_NEXT),
+    ],
+    ids=["HI83", "HI81, HI83 and NMEA", "other tag", "raw data", "other identifier"],
+)
+def test_valid_frames_of_unknown_types_are_named(
+    driver: str, frames: bytes, types: str, next_step: str, baud: Any
+) -> None:
+    """imud does not search for another rate, does not start the output, and accepts samples later."""
+
+    async def story(rig: DeviceRig) -> None:
+        def step() -> None:
+            if rig.link.baud == 115200:
+                replies = (
+                    VERSION % b"1" + b"ATT_MODE: 0\r\nOK\r\n" if rig.link.written and driver == "hipnuc-uart" else b""
+                )
+                feed(rig, frames + replies)
+                rig.link.written.clear()
+            rig.tick()
+
+        await rig.until(lambda: "unknown" in rig.problem, step=step, step_s=0.1)
+        expected = f"on memory at 115200 baud: valid frames of unknown types ({types}), but no sample; {next_step}"
+        assert rig.problem == expected
+        for _ in range(200):
+            step()
+            await asyncio.sleep(0.1)
+        assert rig.problem == expected
+        assert rig.link.baud == 115200
+        if driver == "hipnuc-uart":
+            feed(rig, hi91(10))
+            rig.tick()
+            assert rig.is_in(DeviceState.RUNNING)
+            assert rig.problem == ""
+
+    play(story, configured(driver=driver, baud=baud, identify=True))
 
 
 @told(play)

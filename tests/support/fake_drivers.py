@@ -56,6 +56,7 @@ def fake_frame(payload: bytes) -> bytes:
 class FakeCodec:
     def __init__(self, ledger: Ledger) -> None:
         self.ledger = ledger
+        self.unknown: dict[int, int] = {}
         self._pending = bytearray()
 
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
@@ -249,6 +250,7 @@ class LinesCodec:
 
     def __init__(self, ledger: Ledger) -> None:
         self.ledger = ledger
+        self.unknown: dict[int, int] = {}
         self._pending = b""
 
     def feed(self, data: bytes) -> Sequence[CodecEvent]:

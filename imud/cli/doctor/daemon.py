@@ -294,6 +294,12 @@ def heard(at: Surroundings) -> Findings:
                 "does the device have power? Are TX and RX swapped (connect TX of each side to RX of the other side)? "
                 "Is ground connected? Do both sides use the same levels (TTL 3.3 V, RS-232 or RS-485)?",
             )
+        # frames with a correct check value: the baud rate and the driver are right
+        elif counts["frames_ignored"]:
+            yield error(
+                f"{one.name}: {one.problem or 'valid frames of unknown types, but no sample'}",
+                "select a frame type that imud decodes, in the settings of the device",
+            )
         # framing errors are typical of a wrong baud rate
         elif one.kernel.framing or one.kernel.break_:
             yield error(

@@ -62,6 +62,11 @@ def test_without_the_daemon_a_port_or_samples(machine: Machine) -> None:
             "9 framing errors",
         ),
         (counted(bytes_in=5000, frames_good=7, frames_in_replies=7), "error", "but no sample in 7 frames"),
+        (
+            counted(bytes_in=5000, frames_good=7, frames_ignored=7),
+            "error",
+            "valid frames of unknown types, but no sample",
+        ),
         (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=3), "ok", "3 damaged"),
         (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=6), "warning", "6 damaged and"),
         (msgspec.structs.replace(counted(**GOOD), kernel=KernelCounters(overrun=2)), "warning", "overrun"),

@@ -29,7 +29,7 @@ from typing import Any, Final, Literal, ParamSpec
 
 import msgspec
 
-from imud.contracts.codec import BadFrame, BadReason, CodecEvent
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
 from imud.contracts.lines import TimeBits
 from imud.drivers.hipnuc.common import (
     EULER_RAD_PER_LSB,
@@ -168,6 +168,16 @@ class Packet:
     decode: Callable[[bytes, int, bool, int, int], tuple[Measurement, bool]]
 
 
+# Tags of newer firmware that imud does not decode
+UNKNOWN_TAGS: Final = {0x81: "HI81", 0x83: "HI83"}
+
+
+def tag_name(tag: int) -> str:
+    """Return the name of an unknown tag, for example `HI83 (tag 0x83)`."""
+    name = UNKNOWN_TAGS.get(tag)
+    return f"{name} (tag {tag:#04x})" if name else f"tag {tag:#04x}"
+
+
 PACKETS: Final = {TAG_HI91: Packet(HI91.size, _decode_hi91), TAG_HI92: Packet(HI92.size, _decode_hi92)}
 
 
@@ -288,6 +298,7 @@ class HipnucCodec:
 
     def __init__(self, ledger: Ledger, settings: HipnucOptions) -> None:
         self.ledger = ledger
+        self.unknown: dict[int, int] = {}  # number of sub-packets by unknown tag
         self.word_is_status = settings.hi91_word == "status"  # whether bytes 1-2 of HI91 are status bits
         self._word_is_fixed = settings.hi91_word != "auto"
         self._lines = LineFinder(ledger)
@@ -409,6 +420,7 @@ class HipnucCodec:
             packet = PACKETS.get(data[begin])
             if packet is None:
                 ledger.unknown_tags += 1
+                count_unknown(self.unknown, data[begin])
                 break
             if begin + packet.size > end:
                 ledger.frames_bad_content += 1

@@ -43,6 +43,7 @@ from imud.drivers.hipnuc.uart.codec import (
     encode_frame,
     encode_hi91,
     encode_hi92,
+    tag_name,
 )
 from imud.drivers.hipnuc.uart.commands import (
     BAUD_RATES,
@@ -265,4 +266,6 @@ DRIVER: Final = StreamDriver(
     wake=wake,
     why_silent=why_silent,
     example_frame=_example_frame,
+    unknown_name=tag_name,
+    decoded="imud decodes HI91 and HI92: select one with `imud settings NAME --set output.hi91=100`",
 )

@@ -24,7 +24,7 @@ from zlib import crc32 as inverted_crc32
 import msgspec
 
 from imud.attitude.rotation import quat_from_euler_zyx
-from imud.contracts.codec import BadFrame, BadReason, CodecEvent
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
 from imud.contracts.script import Message, ReplyFrame
 from imud.drivers.imu61x.common import CRC_INVERSION, CRC_START, M_S2_PER_G, RAD_S_PER_DEG_S, crc32
 from imud.drivers.value_limits import possible_temperature_c, scaled, temperatures_possible, values_possible
@@ -355,6 +355,7 @@ class Imu61xCodec:
 
     def __init__(self, ledger: Ledger, _settings: Options | None = None) -> None:
         self.ledger = ledger
+        self.unknown: dict[int, int] = {}  # number of frames by unknown identifier
         self._finder = FrameFinder(ledger, DEVICE_SYNC)
 
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
@@ -444,6 +445,7 @@ class Imu61xCodec:
             self._measure(frame, events)
         else:
             ledger.frames_ignored += 1
+            count_unknown(self.unknown, frame.frame_id)
 
     def _measure(self, frame: Frame, events: list[CodecEvent]) -> None:
         values = AHRS.unpack_from(frame.payload)
@@ -454,6 +456,15 @@ class Imu61xCodec:
         self.ledger.frames_not_finite += 1
         events.append(BadFrame(BadReason.NOT_FINITE, frame.raw))
         events.append(_partial_measurement(values, size, trailing))
+
+
+UNKNOWN_FRAMES: Final = {0x0166: "navigation", 0x0666: "raw data"}  # frames of other models
+
+
+def frame_name(frame_id: int) -> str:
+    """Return the name of an unknown frame, for example `raw data (identifier 0x0666)`."""
+    name = UNKNOWN_FRAMES.get(frame_id)
+    return f"{name} (identifier {frame_id:#06x})" if name else f"identifier {frame_id:#06x}"
 
 
 _REPLY_FRAMES: Final = (STATUS_FRAME, PARAMETER_FRAME)

@@ -35,6 +35,7 @@ from imud.drivers.imu61x.uart.codec import (
     TIMER_MODULUS,
     Imu61xCodec,
     encode_ahrs,
+    frame_name,
 )
 from imud.drivers.imu61x.uart.commands import (
     BAUD_RATES,
@@ -297,4 +298,6 @@ DRIVER: Final = StreamDriver(
     read_settings=read_settings,
     wake=wake,
     example_frame=_example_frame,
+    unknown_name=frame_name,
+    decoded="imud decodes the AHRS frame (identifier 0x0002): select this output with the program of the vendor",
 )
