@@ -13,12 +13,13 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
-from imud.attitude.rotation import IDENTITY, Matrix3
+from imud.attitude.rotation import IDENTITY, Matrix3, matrix_product
 
 FLIP_X: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))  # half a turn about x: FLU ↔ FRD
 FLIP_Y: Final[Matrix3] = ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))  # half a turn about y
 ENU_TO_NED: Final[Matrix3] = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 RFU_TO_FLU: Final[Matrix3] = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+NWU_TO_ENU: Final[Matrix3] = ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 LFD_TO_FLU: Final[Matrix3] = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))  # LFD: x left, y forward, z down
 
 
@@ -50,9 +51,11 @@ class DeviceAxes:
     """Axes and angles that a device sends."""
 
     order: EulerOrder = EulerOrder.ZXY  # Order of the angles. It also selects the forward axis: y with ZXY, x with ZYX.
-    # Whether the navigation frame is east, north, up with any north reference. Otherwise it is level with z up.
+    # Whether the navigation frame has a north axis with any north reference. Otherwise it is level with z up.
     has_north: bool = True
     z_down: bool = False  # whether the z axes of the device and of its navigation frame point down
+    # Whether the x axis of the navigation frame is north (NWU). Otherwise it is east, or the direction of heading 0.
+    x_north: bool = False
 
     def with_order(self, order: EulerOrder | None) -> "DeviceAxes":
         """Return the axes with another order of angles; None keeps the order."""
@@ -68,9 +71,10 @@ class DeviceAxes:
     @property
     def to_z_up(self) -> Matrix3:
         """Rotation from the device's navigation frame to the frame with z up and the same horizontal reference."""
-        if not self.z_down:
-            return IDENTITY
-        return FLIP_Y if self.order is EulerOrder.ZXY else FLIP_X
+        up = IDENTITY
+        if self.z_down:
+            up = FLIP_Y if self.order is EulerOrder.ZXY else FLIP_X
+        return matrix_product(NWU_TO_ENU, up) if self.x_north else up
 
     @property
     def words(self) -> str:
@@ -81,6 +85,8 @@ class DeviceAxes:
 
 # HiPNUC devices: x right, y forward, z up; navigation frame ENU; ZXY (manual V1.5.9, chapter 9)
 RFU_ENU: Final = DeviceAxes()
+# HiPNUC devices of newer firmware with COORD 4: x forward, y left, z up; navigation frame NWU; ZYX
+FLU_NWU: Final = DeviceAxes(order=EulerOrder.ZYX, x_north=True)
 # Forsense IMU61x, assumed: x forward, y left, z up; level navigation frame; ZYX. The manual states no axes.
 FLU_LEVEL: Final = DeviceAxes(order=EulerOrder.ZYX, has_north=False)
 

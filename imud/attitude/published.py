@@ -16,7 +16,7 @@ the body were level.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import hypot, isfinite, nan, radians
 from typing import Annotated, Final, Literal
@@ -399,7 +399,7 @@ NO_FRAME: Final = FrameOptions()
 def axes_of(frame: FrameOptions, device: DeviceAxes) -> DeviceAxes:
     """Return the axes and angles of a device from the configuration, otherwise from its driver."""
     order = device.order if frame.euler_order is None else frame.euler_order
-    return DeviceAxes(order=order, has_north=device.has_north, z_down=frame.z_down)
+    return replace(device, order=order, z_down=frame.z_down)
 
 
 def mounting_of(frame: FrameOptions, device: DeviceAxes) -> Matrix3:

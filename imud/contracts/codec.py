@@ -43,7 +43,7 @@ def message_of(event: CodecEvent) -> Message | None:
     return event if isinstance(event, ReplyFrame) else None
 
 
-UNKNOWN_TYPES_MAX = 8  # maximum number of unknown frame types of which a codec counts the frames
+UNKNOWN_TYPES_MAX = 8  # maximum number of unknown frame types that a codec counts separately
 
 
 def count_unknown(counts: dict[int, int], frame_type: int) -> None:

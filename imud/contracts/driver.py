@@ -116,6 +116,16 @@ def _unknown_heading(_settings: object, _read_back: Mapping[str, str]) -> Headin
     return Heading.UNKNOWN
 
 
+@dataclass(frozen=True, slots=True)
+class SentAxes:
+    """Axes and angles that a device sends."""
+
+    axes: DeviceAxes
+    euler_convention: str  # as `Driver.euler_convention`
+    navigation_frame: str  # as `Driver.navigation_frame`
+    problem: str = ""  # reason if the axes are uncertain, one sentence; empty otherwise
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Driver:
     """Description of one wire protocol. The subclass decides which links a driver can use."""
@@ -131,6 +141,8 @@ class Driver:
     euler_convention: str  # order, axes and signs of `euler_rad`, as readable text
     navigation_frame: str  # destination frame of the rotation `quat_wxyz`, for example `ENU`
     axes: DeviceAxes = RFU_ENU  # axes, angles and navigation frame for conversions
+    # Returns the axes that the readable device settings select; None: the fields above
+    axes_by_settings: Callable[[Mapping[str, str]], SentAxes | None] = lambda _settings: None
     # Returns the reference of yaw from the driver options and the device settings (empty: not read yet)
     heading: Callable[[Any, Mapping[str, str]], Heading] = _unknown_heading
     verbs: Verbs = field(default_factory=dict)  # verbs of the device, by name
@@ -159,6 +171,11 @@ class Driver:
     limits: Callable[[Mapping[str, Any], DeviceLines, bool], Sequence[str]] = lambda _declared, _lines, _fed: ()
     # Finds problems of driver options together with link options. Both are valid on their own.
     check: Callable[[Any, Any], Sequence[KeyProblem]] = no_problems
+
+    def sent_axes(self, settings: Mapping[str, str]) -> SentAxes:
+        """Return axes and angles of a device with these readable settings (empty: not read yet)."""
+        sent = self.axes_by_settings(settings)
+        return sent or SentAxes(self.axes, self.euler_convention, self.navigation_frame)
 
     def problems(self, options: Any, link: Any) -> Sequence[KeyProblem]:
         """Return the problems of `options` together with the link options, for `imud check`. The check looks for keys

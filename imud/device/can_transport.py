@@ -189,7 +189,7 @@ class CanTransport(ReceivingTransport):
         self.driver = driver
         self._options = options
         self._codec = driver.make_codec(context.ledger, options)
-        self.path = CanPath(self._codec, clock, context.path_context(driver, self.link, self.scripts.on_message))
+        self.path = CanPath(self._codec, clock, context.path_context(driver, self.link, self.scripts.on_message, {}))
         context.observer.path_made(self.path, driver.name, options)
 
     def _begin(self) -> None:

@@ -356,7 +356,7 @@ class Device:
         path, driver = transport.path, transport.driver
         newest = path.newest if path is not None else None
         latency = path.latency if path is not None else LatencyMeter()
-        frame = self._attitude.status(driver, path, self._identity.settings)
+        frame = self._attitude.status(driver, path, self._identity.settings, self._identity.shown_settings)
         status = DeviceStatus(
             name=self.config.name,
             device_id=self.device_id,

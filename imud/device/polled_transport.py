@@ -322,7 +322,7 @@ class PolledTransport(Transport):
             self._ready.edges if self._ready is not None else None,
         )
         self.driver = driver
-        self.path = PolledPath(codec, timing, clock, context.path_context(driver, self.link, _ignore_message))
+        self.path = PolledPath(codec, timing, clock, context.path_context(driver, self.link, _ignore_message, {}))
         context.observer.path_made(self.path, driver.name, device.options)
         return self.path
 

@@ -199,7 +199,7 @@ class StreamTransport(ReceivingTransport):
         clock = context.new_clock(driver, self.path)
         options = self._config.options or driver.settings()
         codec = driver.make_codec(self._ledger, options)
-        path_context = context.path_context(driver, self.link, self.scripts.on_message)
+        path_context = context.path_context(driver, self.link, self.scripts.on_message, self.identity.shown_settings)
         self.driver = driver
         self.path = StreamPath(codec, clock, path_context, self.attachments.drain_edges, self.scripts)
         context.observer.path_made(self.path, driver.name, options)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import chain, repeat
 from typing import Any, Protocol
 
-from imud.attitude.published import published_frame
+from imud.attitude.published import PublishedAxes, published_frame
 from imud.config.model import DeviceConfig
 from imud.contracts.command import Target
 from imud.contracts.driver import Driver, Identity
@@ -29,7 +29,7 @@ from imud.device.scripts import RequestPort, ScriptRunner
 from imud.device.search import Remembered, SearchRound
 from imud.host.clock import HostClock
 from imud.model.errors import CommandError, LinkError, NothingHeard
-from imud.model.event import Event
+from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_S
 from imud.recording.observer import PathObserver
@@ -77,16 +77,23 @@ class DeviceContext:
     health: Health
     observer: PathObserver
 
-    def path_context(self, driver: Driver, link: Link, on_message: Callable[[Message, int], object]) -> PathContext:
-        """Return the context of a sample path for `driver`. The path passes text lines and replies to `on_message`."""
+    def published(self, driver: Driver, settings: Mapping[str, str]) -> PublishedAxes:
+        """Return the published axes of a device with these readable settings (empty: not read yet)."""
         config = self.config
+        axes = driver.sent_axes(settings).axes
+        return published_frame(config.frame, config.convention, config.declination_deg, axes)
+
+    def path_context(
+        self, driver: Driver, link: Link, on_message: Callable[[Message, int], object], settings: Mapping[str, str]
+    ) -> PathContext:
+        """Return the context of a sample path for `driver`. The path passes text lines and replies to `on_message`."""
 
         def overruns() -> int:
             return link.kernel_counters().overrun
 
         return PathContext(
-            config.name, self.device_id, self.ledger, self.owner.publish, on_message, self.events.bad_frame, overruns,
-            self.host, published_frame(config.frame, config.convention, config.declination_deg, driver.axes),
+            self.config.name, self.device_id, self.ledger, self.owner.publish, on_message, self.events.bad_frame,
+            overruns, self.host, self.published(driver, settings),
         )  # fmt: skip
 
     def new_clock(self, driver: Driver, path: SamplePath | None) -> SampleClock:
@@ -117,6 +124,7 @@ class Transport(ABC):
         self._health = context.health
         self._host = context.host
         self._latency_ns = 0
+        self._axes_problem = ""  # reason for which the axes of the device are uncertain
 
     def serve(self, attachments: Attachments) -> None:
         """Set the attachments of the device, before the first use of the link."""
@@ -171,6 +179,19 @@ class Transport(ABC):
         identity.update_settings(settings, self.driver)
         self._context.observer.described(self.where, identity_words(identity.identity), identity.shown_settings)
         self.attachments.compare_settings(identity.settings, self.driver)
+        self._use_axes(identity.shown_settings)
+
+    def _use_axes(self, settings: Mapping[str, str]) -> None:
+        """Publish samples in the axes that the device settings select. Report unknown axes once."""
+        driver, path = self.driver, self.path
+        if driver is None or path is None:
+            return
+        if (frame := self._context.published(driver, settings)) != path.frame:
+            path.set_frame(frame)
+        problem, before = driver.sent_axes(settings).problem, self._axes_problem
+        self._axes_problem = problem
+        if problem and problem != before:
+            self._context.events.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, problem)
 
     # --- the samples -------------------------------------------------------------------------------------------------
 

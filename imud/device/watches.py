@@ -9,6 +9,7 @@ from typing import Final
 
 from imud.attitude.conventions import Convention, Heading
 from imud.attitude.gravity import Contradiction, GravityCheck
+from imud.attitude.published import PublishedAxes
 from imud.config.model import DeviceConfig
 from imud.contracts.driver import Driver, StatusBit
 from imud.contracts.status import FrameStatus
@@ -26,14 +27,15 @@ class AttitudeWatch:
     def __init__(self, config: DeviceConfig, events: DeviceEvents) -> None:
         self._config = config
         self._events = events
+        self._frame: PublishedAxes | None = None
         self._path: SamplePath | None = None
         self._check: GravityCheck | None = None
         self._raised: set[Contradiction] = set()
 
     def tick(self, now_ns: int, path: SamplePath) -> None:
         """Check the newest sample. Raise an event for the first contradiction of each kind."""
-        if path is not self._path:
-            self._path, self._check = path, self._new_check(path)
+        if path is not self._path or path.frame is not self._frame:
+            self._path, self._frame, self._check = path, path.frame, self._new_check(path)
             self._raised.clear()
         check, sample = self._check, path.newest
         if check is None or sample is None or not check.add(sample) or check.finding is None:
@@ -50,14 +52,17 @@ class AttitudeWatch:
             )
 
     def status(
-        self, driver: Driver | None, path: SamplePath | None, read_back: Mapping[str, str]
+        self, driver: Driver | None, path: SamplePath | None, read_back: Mapping[str, str], shown: Mapping[str, str]
     ) -> FrameStatus | None:
-        """Return axes and angles of the published samples; None before imud has found the device."""
+        """Return axes and angles of the published samples; None before imud has found the device.
+
+        `read_back` contains the settings by the names of the device, `shown` the readable settings.
+        """
         if driver is None or path is None:
             return None
-        frame, config = path.frame, self._config
+        frame, config, sent = path.frame, self._config, driver.sent_axes(shown)
         device_heading = driver.heading(config.options, read_back)
-        words = frame.words(driver.euler_convention, driver.navigation_frame)
+        words = frame.words(sent.euler_convention, sent.navigation_frame)
         return FrameStatus(
             frame=words.frame,
             convention=AS_DEVICE if frame.convention is None else str(frame.convention),
@@ -66,7 +71,7 @@ class AttitudeWatch:
             heading=frame.heading(device_heading),
             declination_deg=frame.declination_deg,
             conventions={str(one): frame.words_of(one) for one in Convention},
-            problem=self._problem(device_heading),
+            problem=self._problem(device_heading) or sent.problem,
         )
 
     def _new_check(self, path: SamplePath) -> GravityCheck:

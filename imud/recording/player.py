@@ -12,7 +12,7 @@ import msgspec
 
 from imud import __version__
 from imud.attitude.conventions import Convention
-from imud.attitude.published import FrameOptions, published_frame
+from imud.attitude.published import FrameOptions, PublishedAxes, published_frame
 from imud.config.model import DeviceConfig
 from imud.contracts.codec import BadFrame, Reading
 from imud.contracts.driver import CanDriver, Driver, PolledDriver, StreamDriver
@@ -55,6 +55,7 @@ class PlayedDevice:
     ledger: Ledger = field(default_factory=Ledger)
     path: SamplePath | None = None
     driver: Driver | None = None
+    config: DeviceConfig | None = None
     # overruns that the kernel counted in the live run
     overruns: int = 0
     checks: int = 0  # number of check records
@@ -195,13 +196,16 @@ class Player:
             self.devices[device_id] = PlayedDevice(device_id, described)
         else:
             known.described = described
+            if known.path is not None and known.config is not None and known.driver is not None:
+                # the settings can select other axes
+                known.path.set_frame(_frame_of(known.config, known.driver, described))
 
     def _make_path(self, device: PlayedDevice, made: PathRecord) -> None:
         try:
             driver = DRIVERS[made.driver]
         except KeyError as error:
             raise ImudError(f"{device.described.name}: {error.args[0]}") from None
-        config = _config_of(device.described, driver, made)
+        config = device.config = _config_of(device.described, driver, made)
         before = device.path
         device.path = self._path(device, driver, config, made, before=None)
         _set_ledger(device.ledger, made.ledger)
@@ -235,7 +239,7 @@ class Player:
         context = PathContext(
             config.name, device.device_id, ledger, self._publish, ignore_message, ignore_frame,
             lambda: device.overruns, self._host,
-            published_frame(config.frame, config.convention, config.declination_deg, driver.axes),
+            _frame_of(config, driver, device.described),
         )  # fmt: skip
         if isinstance(driver, StreamDriver):
             return StreamPath(driver.make_codec(ledger, options), clock, context)
@@ -254,6 +258,11 @@ class Player:
             self._restore_host(*call.arguments)
         elif device is not None and device.path is not None:
             _repeat(device, device.path, call)
+
+
+def _frame_of(config: DeviceConfig, driver: Driver, described: DeviceRecord) -> PublishedAxes:
+    axes = driver.sent_axes(described.settings).axes
+    return published_frame(config.frame, config.convention, config.declination_deg, axes)
 
 
 def _config_of(described: DeviceRecord, driver: Driver, made: PathRecord) -> DeviceConfig:

@@ -162,6 +162,11 @@ class SamplePath(ABC):
         self._now_ns = context.host.now_ns
         self._utc_offset_ns = context.host.utc_offset_ns
 
+    def set_frame(self, frame: PublishedAxes) -> None:
+        """Publish the following samples in other axes."""
+        self.frame = frame
+        self._rotation = frame.rotation
+
     def observe(self, observer: InputObserver | None) -> None:
         """Report each input of the path and of its clock to `observer`. None stops the reports."""
         self.observer = self.clock.observer = observer
@@ -556,6 +561,11 @@ class PolledPath(SamplePath):
     @property
     def period_ns(self) -> int:
         return self._period_ns
+
+    def set_frame(self, frame: PublishedAxes) -> None:
+        """Publish the following samples in other axes."""
+        self.frame = frame
+        self._rotation = frame.rotation
 
     def observe(self, observer: InputObserver | None) -> None:
         """Report each input of the path, of its clock and of its data-ready line to `observer`."""

@@ -1,10 +1,13 @@
 """Axes of conventions and devices, compared with drawings: directions of front, left and up."""
 
+from dataclasses import replace
+
 import pytest
 
 from imud.attitude.conventions import (
     ENU_TO_NED,
     FLU_LEVEL,
+    FLU_NWU,
     RFU_ENU,
     Convention,
     DeviceAxes,
@@ -56,6 +59,15 @@ def test_a_frame_with_z_down_keeps_the_direction_that_yaw_is_counted_from() -> N
     assert matrix_times(DeviceAxes(order=EulerOrder.ZYX, z_down=True).to_z_up, (1, 2, 3)) == (1, -2, -3)
     assert matrix_times(DeviceAxes(order=EulerOrder.ZXY, z_down=True).to_z_up, (1, 2, 3)) == (-1, 2, -3)
     assert matrix_times(RFU_ENU.to_z_up, (1, 2, 3)) == (1, 2, 3)
+
+
+def test_the_navigation_frame_nwu() -> None:
+    """North, west, up: the x axis is north, the y axis is west."""
+    north, west, up = 1.0, 2.0, 3.0
+    assert matrix_times(FLU_NWU.to_z_up, (north, west, up)) == (-west, north, up)
+    ned = replace(FLU_NWU, z_down=True)  # north, east, down
+    assert matrix_times(ned.to_z_up, (north, -west, -up)) == (-west, north, up)
+    assert [matrix_times(FLU_NWU.to_body, v) for v in FRONT_LEFT_UP] == list(FRONT_LEFT_UP)
 
 
 def test_another_order_is_another_device() -> None:

@@ -70,6 +70,7 @@ class Played:
     def __init__(self, rig: DeviceRig) -> None:
         self.samples = rig.samples
         self.events: list[Event] = [one for one in rig.events if one.kind is EventKind.ATTITUDE]
+        self.changes = [one.message for one in rig.events if one.kind is EventKind.CONFIGURATION]
         status = rig.device.status().frame
         assert status is not None
         self.status: FrameStatus = status
@@ -82,12 +83,16 @@ class Played:
         return (roll, pitch, yaw)
 
 
-def played(driver: str, motion: Motion, seconds: float = 12.0, identify: bool = False, **keys: Any) -> Played:
+def played(
+    driver: str, motion: Motion, seconds: float = 12.0, identify: bool = False, coord: int = 0, **keys: Any
+) -> Played:
     """Run a module on a link in memory in virtual time, with these keys of the configuration."""
     clock = VirtualClock()
     module: StreamModule
     if driver == "hipnuc-uart":
-        module = HipnucModule(clock.now_ns(), ModuleSettings(att_mode=1), HipnucHardware(motion=motion, skew_ppm=0))
+        module = HipnucModule(
+            clock.now_ns(), ModuleSettings(att_mode=1, coord=coord), HipnucHardware(motion=motion, skew_ppm=0)
+        )
     else:
         module = Imu61xModule(clock.now_ns(), hardware=Imu61xHardware(motion=motion, skew_ppm=0))
     rigs = DeviceRigs(clock.host)
@@ -251,7 +256,7 @@ def test_a_replaced_device_is_checked_again() -> None:
     for number, path in enumerate(paths, 1):
         path.newest = None
         watch.tick(0, path)
-        status = watch.status(driver, path, {})
+        status = watch.status(driver, path, {}, {})
         assert status is not None
         assert status.problem == "", "nothing is known of this device yet"
         rest(path)
@@ -298,3 +303,41 @@ def test_each_published_sample_is_rotated_once() -> None:
     assert frame.rotation is not None
     assert frame.rotation.sample(path.newest) == batch.samples[-1]
     assert batch.frame is frame
+
+
+# --- axes of newer firmware -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("keys", [{}, {"declination_deg": 3.0}, {"frame": FrameOptions(level_roll_deg=1.0)}], ids=str)
+@pytest.mark.parametrize("convention", Convention)
+def test_both_coordinates_of_a_device_give_the_same_published_samples(
+    convention: Convention, keys: dict[str, Any]
+) -> None:
+    """COORD 4: the device sends x forward, the navigation frame NWU, and the order 321."""
+    both = [
+        played("hipnuc-uart", in_body(FrameOptions()), 6.0, identify=True, coord=coord, convention=convention, **keys)
+        for coord in (0, 4)
+    ]
+    manual, newer = both
+    assert newer.euler_deg == pytest.approx(manual.euler_deg, abs=1e-3)
+    for name in ("accel_m_s2", "gyro_rad_s", "mag_t", "quat_wxyz"):
+        assert getattr(newer.newest, name) == pytest.approx(getattr(manual.newest, name), abs=1e-4)
+    assert newer.status == manual.status
+    assert newer.events == []
+    assert newer.changes == []
+
+
+def test_coordinates_are_described_and_an_unknown_value_is_reported() -> None:
+    newer = played("hipnuc-uart", in_body(FrameOptions()), identify=True, coord=4)
+    assert newer.euler_deg == pytest.approx((5, -10, 30 - 90), abs=1e-3)  # yaw counts from north
+    assert newer.status.frame == "sensor: x forward, y left, z up, right-handed"
+    assert newer.status.navigation_frame == "NWU"
+    assert newer.status.euler_convention.startswith("ZYX (321)")
+    assert newer.status.problem == ""
+    assert newer.changes == []
+    assert newer.events == []  # gravity agrees with the attitude
+    unknown = played("hipnuc-uart", in_body(FrameOptions()), 4.0, identify=True, coord=2)
+    (change,) = unknown.changes
+    assert change == unknown.status.problem
+    assert change.startswith("coordinates: expected 0 or 4 from the device (COORD), got 2: imud describes")
+    assert unknown.status.navigation_frame == "ENU"

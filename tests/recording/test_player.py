@@ -25,6 +25,7 @@ from tests.device import test_can_transport as can
 from tests.device import test_polled_transport as polled
 from tests.device import test_polled_transport_data_ready as data_ready
 from tests.device import test_stream_transport_stream_hold as waiting
+from tests.device import test_watches as watches
 from tests.lines import test_end_to_end as signals
 from tests.support.device_rig import DeviceRig, DeviceRigs, device_config, play
 from tests.support.event_loops import LoopWorker, VirtualClock
@@ -56,6 +57,7 @@ def bench(tmp_path: Path, recorded: pytest.MonkeyPatch) -> PolledBusBench:
         can.test_frames_from_before_a_loss_are_not_mixed_with_those_after,
         can.test_bus_down_and_up,
         can.test_a_suspend_of_the_host_is_a_gap_of_unknown_size,
+        watches.test_coordinates_are_described_and_an_unknown_value_is_reported,
     ],
     ids=[
         "edges",
@@ -66,6 +68,7 @@ def bench(tmp_path: Path, recorded: pytest.MonkeyPatch) -> PolledBusBench:
         "loss within a sample",
         "bus down",
         "suspended",
+        "axes by a setting",
     ],
 )
 def test_a_run_on_a_line_or_can_bus_is_replayed(run: Callable[[], None]) -> None:

@@ -31,6 +31,7 @@ from imud.drivers.hipnuc.uart.commands import BAUD_RATES, MAX_RATE_HZ, OutputMes
 from imud.model.sample import Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US, T_PER_UT
 from imud.sim.hipnuc.uart_settings import (
+    NWU,
     CommandRefused,
     HipnucHardware,
     ModuleSettings,
@@ -40,6 +41,7 @@ from imud.sim.hipnuc.uart_settings import (
     SelfCalibration,
     UtcTime,
     changed,
+    in_nwu,
     main_status,
     number,
     rows,
@@ -341,7 +343,8 @@ class HipnucModule:
     def _truth(self, at_ns: int) -> Truth:
         """Return the measurement of an ideal device with the same mounting and levelling."""
         truth = self.hardware.motion.at(self._t_s(at_ns))
-        return self._mounting.turned(truth) if self._mounting.active else truth
+        truth = self._mounting.turned(truth) if self._mounting.active else truth
+        return in_nwu(truth) if self.settings.coord == NWU else truth
 
     def _t_s(self, at_ns: int) -> float:
         return (at_ns - self.epoch_ns) / NS_PER_S

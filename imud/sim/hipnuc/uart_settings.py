@@ -11,7 +11,7 @@ from enum import Enum
 from math import tau
 from typing import Final, Literal
 
-from imud.attitude.rotation import Matrix3, is_rotation
+from imud.attitude.rotation import Matrix3, euler_zyx_from_quat, is_rotation, quat_product
 from imud.drivers.hipnuc.uart.commands import BAUD_RATES
 from imud.formats.nmea0183 import Rmc, parse
 from imud.model.sample import Quaternion, Vector3
@@ -178,6 +178,7 @@ class ModuleSettings:
     sout_div: int = 8
     alarm_x: AlarmSetting = AlarmSetting()
     alarm_y: AlarmSetting = AlarmSetting()
+    coord: int = 0  # axes of newer firmware: 0 as in the manual, 4 NWU
 
     def user_lines(self) -> list[str]:
         """Return the lines of the reply to LOG USRCONFIG."""
@@ -189,11 +190,33 @@ class ModuleSettings:
             f"SOUT_DIV: {self.sout_div}",
             f"ALARM_X: {self.alarm_x}",
             f"ALARM_Y: {self.alarm_y}",
+            *([f"COORD {self.coord}"] if self.coord else []),
         ]
 
     def port_lines(self) -> list[str]:
         """Return the lines of the reply to LOG COMCONFIG."""
         return [f"BAUD: {self.baud}", f"LOG HI91 {self.hi91}", f"LOG HI92 {self.hi92}"]
+
+
+NWU: Final = 4  # value of COORD
+_QUARTER: Final = (0.5**0.5, 0.0, 0.0, 0.5**0.5)  # quarter turn about Z: from FLU to RFU axes, and from ENU to NWU
+
+
+def in_nwu(truth: Truth) -> Truth:
+    """Return the measurement with x forward, y left, z up, the navigation frame NWU, and the order 321."""
+    w, x, y, z = _QUARTER
+    to_nwu = quat_product((w, -x, -y, -z), truth.quat_wxyz)
+    quat = quat_product(to_nwu, _QUARTER)
+    return truth._replace(
+        accel_m_s2=_forward(truth.accel_m_s2), gyro_rad_s=_forward(truth.gyro_rad_s), mag_t=_forward(truth.mag_t),
+        quat_wxyz=quat, euler_rad=euler_zyx_from_quat(quat),
+    )  # fmt: skip
+
+
+def _forward(vector: Vector3) -> Vector3:
+    """Return a vector of right, forward, up in forward, left, up."""
+    right, forward, up = vector
+    return forward, -right, up
 
 
 def changed(settings: ModuleSettings, line: str, firmware: int) -> ModuleSettings | None:

@@ -18,13 +18,13 @@ export function rotate([w, x, y, z], [a, b, c]) {
 export class AttitudeView {
   constructor() {
     this.canvas = el("canvas", { role: "img", "aria-label": "attitude of the device" });
-    this.isNed = false;
+    this.frame = "ENU";
     this.quaternion = null;
   }
 
   /** frame: the navigation frame of the quaternion (member of `status`). */
   set(quaternion, frame) {
-    this.isNed = frame.startsWith("NED");
+    this.frame = frame.slice(0, 3);
     this.quaternion = quaternion;
     this.draw();
   }
@@ -32,7 +32,8 @@ export class AttitudeView {
   /** Return a vector of the device in east, north, up. */
   toEnu(vector) {
     const [a, b, c] = rotate(this.quaternion, vector);
-    return this.isNed ? [b, a, -c] : [a, b, c];
+    if (this.frame === "NED") return [b, a, -c];
+    return this.frame === "NWU" ? [-b, a, c] : [a, b, c];
   }
 
   /** Return the position on the canvas of east, north, up: x, y, and depth (larger is nearer). */

@@ -59,8 +59,10 @@ from imud.drivers.hipnuc.uart.commands import (
 )
 from imud.drivers.hipnuc.uart.replies import parse_magconfig
 from imud.drivers.hipnuc.uart.settings import (
+    RFU_312,
     SETTINGS,
     alarm_ranges,
+    axes_by_settings,
     declared_line_differences,
     line_differences,
     message_limits,
@@ -244,8 +246,9 @@ DRIVER: Final = StreamDriver(
     tick_ns=NS_PER_MS,
     tick_modulus=2**32,
     stamp_modulus=PPS_STAMP_MODULUS_MS,
-    euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above",
-    navigation_frame="ENU",
+    euler_convention=RFU_312.euler_convention,
+    navigation_frame=RFU_312.navigation_frame,
+    axes_by_settings=axes_by_settings,
     heading=heading_by_mode,
     lines=frozenset({"sout", "sout_div", "sin", "alarm", "pps"}),
     alarm_ranges=alarm_ranges,

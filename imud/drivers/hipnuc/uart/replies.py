@@ -27,6 +27,8 @@ _VALUE_LINE: Final = re.compile(r"\s*([A-Za-z][A-Za-z0-9_.\-]*)\s*[=:]\s*(.*?)\s
 _COMMENT: Final = re.compile(r"\s*/\*.*?(\*/|$)")
 _OUTPUT: Final = re.compile(r"\b(?:IMU|HI)(91|92)\s+(?:COM\d+\s+)?ONTIME\s+(\d+(?:\.\d*)?|\.\d+)")
 _MARKED: Final = re.compile(r"\b(?:IMU|HI)(91|92)\s+(?:COM\d+\s+)?ONMARK\s+1\b")
+# `COORD 4`, `COORD=4` or `COORD: 4`; no document of the vendor shows the line
+_COORD: Final = re.compile(r"(?<![A-Za-z])COORD(?![A-Za-z])\s*[=:]?\s*0*(\w+)")
 _PIN: Final = re.compile(r"IO([1-9])\b")
 _DIVISOR: Final = re.compile(r"(?:.*\bDIV)?\s*(\d{1,2})\b")
 
@@ -84,6 +86,7 @@ class UserConfig:
     magnetic_calibration: bool | None  # whether the background calibration is enabled (EN_MCAL)
     pins: Mapping[int, int]  # pin (1 for IO1) by the number of its function (1 for PMUX1)
     sout_divisor: int | None
+    coordinates: str  # value of COORD (newer firmware); empty if the device does not report it
     report: Report
 
 
@@ -147,6 +150,7 @@ def parse_usrconfig(lines: Sequence[str]) -> UserConfig:
         None if calibrates is None else calibrates != 0,
         {number: int(pin[1]) for number, pin in pins.items() if pin},
         int(divisor[1]) if divisor else None,
+        next((match[1] for line in lines if (match := _COORD.search(line))), ""),
         report,
     )
 

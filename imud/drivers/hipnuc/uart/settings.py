@@ -6,13 +6,16 @@ imud ignores values of an unknown form. `values_of` returns the known values by 
 
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Annotated, Any, Final, Literal, get_args
 
 import msgspec
 from msgspec import Meta
 
+from imud.attitude.conventions import FLU_NWU, RFU_ENU, EulerOrder
 from imud.attitude.rotation import Matrix3
 from imud.contracts.command import Target
+from imud.contracts.driver import SentAxes
 from imud.contracts.lines import AlarmRange, AlarmRanges, DeviceLines
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import Effect, Setting, SettingsTable
@@ -38,9 +41,37 @@ from imud.drivers.hipnuc.uart.replies import lines_of, parse_comconfig, parse_ma
 from imud.model.errors import BadArgument
 from imud.model.options import Options
 
+# Values of COORD (newer firmware): axes and angles that the device sends
+RFU_312: Final = SentAxes(
+    RFU_ENU, "312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above", "ENU"
+)
+COORDINATES: Final = {
+    "0": RFU_312,
+    "4": SentAxes(
+        FLU_NWU,
+        "ZYX (321): yaw about Z, then pitch about Y, then roll about X; yaw counter-clockwise from above",
+        "NWU",
+    ),
+}
+
+
+def axes_by_settings(settings: Mapping[str, str]) -> SentAxes:
+    """Return the axes of the setting `coordinates`; without the setting, the axes of the manual."""
+    value = settings.get("coordinates", "0")
+    if value in COORDINATES:
+        return COORDINATES[value]
+    known = " or ".join(COORDINATES)
+    problem = (
+        f"coordinates: expected {known} from the device (COORD), got {value}: imud describes axes and angles as with "
+        "0, which can be wrong; set 0 or 4 with the program of the vendor (CONFIG IMU COORD), or configure `frame`"
+    )
+    return replace(RFU_312, problem=problem)
+
+
 PIN_SETTING: Final = "PMUX5"  # selects the function of the pin
 MOUNTING_SETTING: Final = "URFR"  # rotates the sensor axes, also X and Y of the alarm
-EULER_INDEX: Final = {"X": 1, "Y": 0}
+# Index of the angle about an axis in `euler_rad`: with 312, pitch is about X. With 321, roll is about X.
+EULER_INDEX: Final = {EulerOrder.ZXY: {"X": 1, "Y": 0}, EulerOrder.ZYX: {"X": 0, "Y": 1}}
 
 _NUMBER = r"[-+]?[0-9]+(?:\.[0-9]*)?"
 _NAME: Final = re.compile(rf"(?:{PIN_SETTING}|.*ALARM)(?:[_ ]?([XY]))?", re.IGNORECASE)
@@ -51,6 +82,8 @@ _VALUES: Final = re.compile(
 
 def alarm_ranges(settings: Mapping[str, str]) -> AlarmRanges:
     """Return the alarm ranges in the device settings, without axes that the settings lack."""
+    coordinates = parse_usrconfig(lines_of(settings)).coordinates
+    index = EULER_INDEX[axes_by_settings({"coordinates": coordinates or "0"}).axes.order]
     by_axis: dict[str, AlarmRange] = {}
     for name, value in settings.items():
         named, values = _NAME.fullmatch(name.strip()), _VALUES.fullmatch(value.strip())
@@ -58,7 +91,7 @@ def alarm_ranges(settings: Mapping[str, str]) -> AlarmRanges:
             continue
         axis = (values[1] or named[1] or "").upper()
         if axis:
-            by_axis[axis] = AlarmRange(EULER_INDEX[axis], float(values[2]), float(values[3]), values[4] == "1")
+            by_axis[axis] = AlarmRange(index[axis], float(values[2]), float(values[3]), values[4] == "1")
     return AlarmRanges(by_axis, PIN_SETTING, MOUNTING_SETTING)
 
 
@@ -99,6 +132,7 @@ def values_of(raw: Mapping[str, str]) -> dict[str, Any]:
         "pins": {PinFunction(number).name.lower(): pin for number, pin in user.pins.items()} or None,
         "sout_divisor": user.sout_divisor,
         "alarm": alarms or None,
+        "coordinates": user.coordinates or None,
         "magnetometer_bias": None if mag.bias_ut is None else list(mag.bias_ut),
         "baud": com.baud if com.baud in BAUD_RATES else None,
     }
@@ -331,6 +365,13 @@ SETTINGS: Final = SettingsTable(
             type=_described(bool, "whether the device sends frames of any rate", "2.2.5"),
             write=_output_enabled,
             readable=False,
+        ),
+        "coordinates": Setting(
+            type=_described(
+                str,
+                "axes and angles of newer firmware (COORD): 0 as in the manual (ENU), 4 NWU with x forward",
+                "2.2.4",
+            )
         ),
         "magnetometer_bias": Setting(
             type=_described(
