@@ -50,7 +50,7 @@ class Request:
     # Minimum number of messages in a positive reply, with its end. An earlier end belongs to a late reply.
     messages_min: int = 1
     # Kind of the reply. The replies to two requests of the same kind look alike. Empty: only the replies to two equal
-    # requests look alike.
+    # requests look alike. A request with a kind and without payload waits for a further reply to the last request.
     kind: str = ""
     # The reply to an equal earlier request also answers this request, if imud sent no other request between them: the
     # request reads a value.

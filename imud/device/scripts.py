@@ -184,7 +184,7 @@ class ScriptRunner:
 
     def _timeout_ns(self, request: Request) -> int:
         """Return the timeout of a request by the slowest reply. A pause keeps its time."""
-        if not request.payload or request.silent:
+        if request.silent or not (request.payload or request.kind):
             return request.timeout_ns
         return max(request.timeout_ns, min(PATIENCE_FACTOR * self._slowest_ns, PATIENCE_MAX_NS))
 
@@ -274,9 +274,9 @@ class ScriptRunner:
             self.deadline_ns = max(self.deadline_ns, self._sent_ns + self._timeout_ns(self._request))
 
     def _expect_late(self, now_ns: int) -> None:
-        """Expect the late reply to the outstanding request. A pause sends nothing: no late reply can follow."""
+        """Expect the late reply to the outstanding request. No late reply can follow a pause."""
         request = self._request
-        if request is not None and request.payload:
+        if request is not None and (request.payload or request.kind):
             self._owed.append(_Owed(request, self._sent_ns, now_ns, bool(self._messages)))
             if not self._replied:
                 self._slowest_ns = max(self._slowest_ns, now_ns - self._sent_ns)

@@ -58,7 +58,7 @@ MANUAL_B: Final = (
     Item("B 2.2.5 names", "IMU91 is HI91", "drivers.hipnuc.uart.commands:OutputMessage"),
     Item("B 2.2.5 output and line", "a high rate needs a high baud rate", "drivers.hipnuc.uart.commands:require_room"),
     Item("B 2.2.5 ONMARK 1", "a frame per pulse", "drivers.hipnuc.uart.commands:log_onmark"),
-    Item("B 2.2.5 ONMARK ONCE", "a frame by command", "drivers.hipnuc.uart.commands:log_once"),
+    Item("B 2.2.5 ONMARK ONCE", "a frame by command", "drivers.hipnuc.uart.commands:send_once"),
     Item("B 2.2.6 UNLOGALL", "all timed output off", "drivers.hipnuc.uart.commands:unlog_all"),
     Item("B 2.2.7 FRESET", "factory settings", "drivers.hipnuc.uart.commands:reset_to_factory"),
     Item("B 3 characters", "8N1", "links.uart:UartLink"),

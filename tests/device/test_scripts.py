@@ -285,6 +285,13 @@ def test_a_late_reply_never_answers_the_next_similar_request(late_ms: int | None
     assert sent_ms[:3] == [0, 100, next_ms]
 
 
+def test_a_wait_for_a_further_reply_follows_the_slowest_reply_and_its_late_reply_counts_for_no_request() -> None:
+    further = replace(ok("A"), payload=b"", name="A, further reply")
+    texts, sent_ms = on_slow_device([400, 700], ok("A"), further, ok("B"))
+    # no reply within twice 400 ms, and no late reply within 2.5 s
+    assert (texts, sent_ms) == (["1 OK", "", "2 OK"], [0, 400 + 800 + 2500])
+
+
 def test_a_request_with_another_reply_or_the_same_read_is_sent_immediately() -> None:
     assert on_slow_device([1, None, 1], ok("A"), ok("B"), ok("C", kind="C"))[1] == [0, 1, 501]
     read = ok("read", kind="read", repeatable=True)

@@ -11,6 +11,7 @@ raise BadArgument here. Settings are lost at power-off unless `save_config` foll
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from enum import Enum, StrEnum
 from typing import Final, Literal, get_args
 
@@ -351,6 +352,19 @@ def send(request: Request) -> RequestScript[None]:
 
 
 # --- output -----------------------------------------------------------------------------------------------------------
+
+
+def send_once(message: OutputMessage) -> RequestScript[None]:
+    """Send `message` once. The reply is OK, or only a frame from newer firmware. Raises NoReply, Rejected."""
+    request = replace(log_once(message), is_sample=lambda _sample: True)
+    outcome = yield request
+    if isinstance(outcome, Reply) and outcome.sample is not None:
+        outcome = yield replace(request, payload=b"", is_sample=None)  # OK can follow the frame
+        raise_if_rejected(request.name, outcome)
+        return
+    if isinstance(outcome, Silence):
+        raise NoReply(f"{request.name}: expected OK or a frame, got no reply; check the transmit wire of the host")
+    raise_if_rejected(request.name, outcome)
 
 
 def ask_outputs() -> RequestScript[ComConfig | None]:

@@ -101,7 +101,7 @@ def _wake(target: Target) -> RequestScript[str]:
 
 
 def _output_once(_target: Target, *, message: Message) -> RequestScript[None]:
-    return send(commands.log_once(message))
+    return commands.send_once(message)
 
 
 def _level(

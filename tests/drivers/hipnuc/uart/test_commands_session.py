@@ -15,12 +15,14 @@ from imud.drivers.hipnuc.uart.commands import (
     identify,
     log_ontime,
     read_settings,
+    send_once,
     wake,
     why_silent,
 )
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.model.errors import BadArgument, NoReply, Rejected
 from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
 from imud.sim.hipnuc.uart_settings import VARIANTS, Behaviour, ModuleSettings, Output, RateChange
 from tests.support.old_spellings import script_of
 from tests.support.script_runners import offline_runner
@@ -273,3 +275,36 @@ def test_by_itself_only_frames_that_have_a_rate_are_let_out(settings: ModuleSett
 def test_the_reason_of_a_silent_device(report: tuple[str, ...], words: str) -> None:
     lines = {f"COMCONFIG {number}": line for number, line in enumerate(report)}
     assert words in why_silent({"BAUD": "115200", **lines})
+
+
+FRAME = Reply((), Measurement(82, 0, 5))
+OK = Reply(("OK",))
+ERR = Rejection(("ERR",))
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "error"),
+    [
+        ([OK], ""),  # the frame follows
+        ([FRAME, OK], ""),  # the frame first, or a frame of the timed output
+        ([FRAME, Silence(())], ""),  # newer firmware: the frame is the reply
+        ([FRAME, ERR], "the device rejected the request: ERR"),
+        ([ERR], "the device rejected the request: ERR"),
+        ([Silence(())], "expected OK or a frame, got no reply"),
+    ],
+)
+@pytest.mark.manual("B 2.2.5 ONMARK ONCE")
+def test_a_frame_without_ok_answers_a_request_for_one_frame(outcomes: list[Outcome], error: str) -> None:
+    asked: list[Request] = []
+
+    def answer(request: Request) -> Outcome:
+        asked.append(request)
+        return outcomes[len(asked) - 1]
+
+    if error:
+        with pytest.raises((NoReply, Rejected), match=error):
+            run_script(send_once(OutputMessage.HI91), answer)
+    else:
+        run_script(send_once(OutputMessage.HI91), answer)
+    assert [one.payload for one in asked] == [b"LOG HI91 ONMARK ONCE\r\n", b""][: len(outcomes)]
+    assert all(one.kind == "OK" and one.is_end("OK") for one in asked)
