@@ -95,6 +95,38 @@ class Direction:
                 fcntl.ioctl(self._fd, TIOCSRS485, before)
 
 
+PATIENCE_NS: Final = 3 * NS_PER_S  # maximum time until a device starts its reply, by the observed replies, ns
+PATIENCE_FACTOR: Final = 2  # this time as a multiple of the slowest reply
+DECAY: Final = 8  # each faster reply reduces the slowest reply by this share of it, so that a stall has a short effect
+
+
+class ReplyTimes:
+    """Times of the replies of one bus. Before the first reply, the first device on the bus gets PATIENCE_NS.
+
+    Other devices do not get this time: a search over all addresses would take minutes. After a reply, all devices get
+    a multiple of the slowest reply.
+    """
+
+    __slots__ = ("_first", "_slowest_ns")
+
+    def __init__(self) -> None:
+        self._first: int | None = None  # address of the first request on the bus
+        self._slowest_ns = 0  # time of the slowest reply, ns; 0 before the first reply
+
+    def wait_ns(self, target: int, reply_ns: int) -> int:
+        """Return the maximum time until a device starts its reply, at least `reply_ns`."""
+        if self._first is None:
+            self._first = target
+        if not self._slowest_ns and target != self._first:
+            return reply_ns
+        patience_ns = PATIENCE_FACTOR * self._slowest_ns if self._slowest_ns else PATIENCE_NS
+        return max(reply_ns, min(patience_ns, PATIENCE_NS))
+
+    def add(self, duration_ns: int) -> None:
+        """Note the time of a reply."""
+        self._slowest_ns = max(duration_ns, self._slowest_ns - self._slowest_ns // DECAY, 1)
+
+
 class PortSetup(NamedTuple):
     """Options that all devices of a bus share."""
 
@@ -143,6 +175,7 @@ class Rs485Line:
         self._byte_ns, self._gap_ns = uart_byte_ns(baud), frame_gap_ns(baud)
         self._quiet_ns = now_ns()
         self._owing: dict[int, bytes] = {}
+        self._times = ReplyTimes()
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
         try:
@@ -198,8 +231,9 @@ class Rs485Line:
         wire_ns = (
             2 * len(frame) + reply_bytes
         ) * self._byte_ns  # wire time of the request and of its echo, which the port receives at the same time
-        deadline_ns = self._now_ns() + wire_ns + 2 * self._gap_ns + reply_ns + self._hold_ns
-        reply = self._wait(finder, deadline_ns)
+        sent_ns = self._now_ns()
+        overhead_ns = wire_ns + 2 * self._gap_ns + self._hold_ns
+        reply = self._wait(finder, sent_ns + overhead_ns + self._times.wait_ns(target, reply_ns))
         self._note_echo(finder, reply)
         self.counters.strange += finder.strange
         if reply is None and finder.looks_damaged:
@@ -210,6 +244,7 @@ class Rs485Line:
             self.counters.strange += len(finder.rest())
             raise self._no_reply(target, finder)
         self._owing.pop(target, None)
+        self._times.add(self._now_ns() - sent_ns - overhead_ns)
         return reply
 
     def _wait(self, finder: ReplyFinder, deadline_ns: int) -> bytes | None:
@@ -350,7 +385,8 @@ class Rs485Options(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     rate_hz: Annotated[float, Meta(ge=0, le=1000)] = 0.0
     """Rate of the reads, Hz. 0: as often as the bus allows, in turns with the other devices."""
     reply_ms: Annotated[int, Meta(ge=1, le=1000)] = 20
-    """Maximum time until the device starts its reply, ms, without the time on the wire."""
+    """Minimum timeout for the start of a reply, ms, without the time on the wire. imud waits up to twice the slowest
+    reply, at most 3 s."""
     direction: Literal["auto", "kernel", "none"] = "auto"
     """Direction control: `kernel` by the driver (RTS), `none` by the adapter, `auto` by the driver if it supports
     it."""

@@ -26,6 +26,7 @@ from imud.links.rs485 import (
     TIOCGRS485,
     TIOCSRS485,
     Direction,
+    ReplyTimes,
     Rs485Line,
     Rs485Link,
     Rs485Options,
@@ -188,13 +189,38 @@ def test_silent_module_costs_its_time_out_and_comes_back(tmp_path: Path) -> None
 
 def test_late_reply_is_never_taken_for_the_next(tmp_path: Path) -> None:
     """The late reply has the value 0. It arrives 100 ms after its timeout, during a request with the value 1."""
-    late = slave(1, processing_ns=100_000_000)
+    late = slave(1)
     with wired(tmp_path, late, slave(2)) as (path, line), opened(path, reply_ms=1) as link:
+        sure(link, SERIAL)
+        late.processing_ns, line.requests = 100_000_000, 0
         time_out(link, SETTINGS)
         wait_until(lambda: line.requests, "the request is received")
         late.processing_ns, late.settings = 0, replace(late.settings, heading_mode=1)
         assert sure(link, SETTINGS)[3:9] == bytes.fromhex("0008 0001 0001")
         assert link.heard.strange + link.heard.late >= SETTINGS.read_bytes
+
+
+def test_slow_devices_of_a_bus_reply_in_time(tmp_path: Path) -> None:
+    """The first device gets 3 s. All devices then get twice the slowest reply."""
+    slow = [slave(number, processing_ns=400_000_000) for number in (1, 2)]
+    with wired(tmp_path, *slow) as (path, _), opened(path, reply_ms=20) as link:
+        for number in (1, 2):
+            link.select(number)
+            assert link.transfer(SERIAL)[3:11] == serial_of(number)
+        assert link.heard.timeouts == 0
+
+
+def test_the_time_for_a_reply_follows_the_slowest_reply() -> None:
+    times, ms = ReplyTimes(), 1_000_000
+    assert [times.wait_ns(target, 20 * ms) for target in (80, 1, 80, 2)] == [3000 * ms, 20 * ms, 3000 * ms, 20 * ms]
+    times.add(700 * ms)
+    assert [times.wait_ns(target, 20 * ms) for target in (80, 1)] == [1400 * ms] * 2
+    times.add(2000 * ms)
+    assert times.wait_ns(1, 20 * ms) == 3000 * ms
+    assert times.wait_ns(1, 5000 * ms) == 5000 * ms  # a request that writes the flash
+    for _ in range(60):  # a stall of the host has a short effect
+        times.add(-ms)
+    assert times.wait_ns(80, 20 * ms) == 20 * ms
 
 
 def test_after_a_time_out_one_register_is_read_first_and_then_no_more(pty: PtyPort) -> None:
