@@ -24,7 +24,7 @@ import serial
 
 from imud.contracts.status import KernelCounters
 from imud.links.device_node import CABLE, PROC, errno_of, open_problem
-from imud.model.errors import LinkError, reason_of
+from imud.model.errors import LinkBusy, LinkError, reason_of
 from imud.model.units import NS_PER_MS
 
 TCGETS2: Final = 0x802C542A  # ioctl: struct termios2, with the baud rate as a number (asm-generic/termbits.h)
@@ -61,9 +61,13 @@ class DescriptorPort(serial.Serial):
                 setattr(self, name, None)
 
     def close(self) -> None:
+        """Release the exclusive mode and close the port. The kernel keeps this mode while another program has the port
+        open, and a pseudo-terminal keeps it until its program ends."""
         if self.is_open:
             descriptor = self.fileno()
             self.fd, self.is_open = None, False
+            with contextlib.suppress(OSError):  # the port was removed
+                fcntl.ioctl(descriptor, termios.TIOCNXCL)
             os.close(descriptor)
 
 
@@ -107,6 +111,8 @@ def baud_of(fd: int) -> int:
 def port_problem(error: Exception, path: str, proc: Path = PROC) -> LinkError:
     """Return the LinkError of an error of a serial port, with the next step for the user."""
     if known := open_problem(error, path, CABLE, proc):
+        if errno_of(error) == errno.EBUSY and os.path.realpath(path).startswith("/dev/pts/"):
+            return LinkBusy(f"{known}, or start the program again that made the pseudo-terminal (for example socat)")
         return known
     if errno_of(error) == errno.EIO:
         return LinkError(f"{path} exists without hardware; check the name of the port, and that it is enabled")

@@ -1,6 +1,7 @@
 """Serial port: error messages, latency timers of adapters from a simulated /sys, and error counters of the kernel."""
 
 import errno
+import fcntl
 import os
 import termios
 from pathlib import Path
@@ -12,7 +13,7 @@ from imud.links.device_node import PROC
 from imud.links.serial_port import TtyCounters, hold_ns, open_port, port_problem, read_latency_timer_ms, relative
 from imud.model.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
 from imud.model.units import NS_PER_MS
-from tests.support.pty_port import PtyPort
+from tests.support.pty_port import PtyPort, unprivileged
 
 START = (0, 0, 0, 0, 1000, 0, 5, 7, 11, 13, 17, *[0] * 9)
 """Counters cts dsr rng dcd rx tx, then frame overrun parity brk buf_overrun, in the order of linux/serial.h."""
@@ -48,9 +49,18 @@ def test_an_open_port_has_one_descriptor_and_leaves_none() -> None:
     port.close()
     port.close()
     assert descriptors() == before
-    again = open_port(str(pty.path), 115200, PROC)  # no lock and no exclusive mode remain
-    again.baudrate = 9600
-    again.close()
+    os.chmod(pty.path, 0o666)
+    with unprivileged():  # no lock and no exclusive mode remain; root can open a port in exclusive mode
+        again = open_port(str(pty.path), 115200, PROC)
+        again.baudrate = 9600
+        again.close()
+        killed = os.open(pty.path, os.O_RDWR | os.O_NOCTTY)
+        fcntl.ioctl(killed, termios.TIOCEXCL)
+        os.close(killed)  # as the kernel closes the port of a killed program
+        with pytest.raises(
+            LinkBusy, match=r"; stop it first, or start the program again that made the pseudo-terminal"
+        ):
+            open_port(str(pty.path), 115200, PROC)
     pty.unplug()
 
 
