@@ -29,10 +29,12 @@ from imud.cli.export_sources import (
     ExportFeed,
     McapSink,
     Progress,
+    RecordedClock,
+    RecordedFacts,
     Sink,
     export_capture,
     export_recording,
-    recorded_noise,
+    recorded_facts,
     times_of,
 )
 from imud.cli.output import complain
@@ -179,11 +181,12 @@ def run(args: argparse.Namespace) -> int:
     with log_to(STDERR, "warning"), open_regular(args.file) as file:
         progress = Progress(args.file.stat().st_size)
         out = ExportFile(args.output, source=args.file, force=args.force, binary=args.to == "mcap")
-        with closing(progress), out, closing(_sink(args, file, out, is_recording=is_recording)) as sink:
-            convention = _convention(args)
-            feed = ExportFeed(sink, file, progress, convention)
-            done = _play(args, file, feed, is_recording=is_recording)
-            sink.finish()
+        with closing(progress), out:
+            facts = recorded_facts(file, str(args.file)) if is_recording else RecordedFacts({}, RecordedClock())
+            with closing(_sink(args, file, out, facts.noise, is_recording=is_recording)) as sink:
+                feed = ExportFeed(sink, file, progress, _convention(args), facts.clock)
+                done = _play(args, file, feed, is_recording=is_recording)
+                sink.finish()
     size = f"{out.written_bytes / MEGABYTE:.1f} MB"
     complain(f"{done.report}\n\n{feed.samples_taken} samples to {out.name}, {size} in {progress.spent_s:.1f} s")
     return done.status if feed.samples_taken else 1
@@ -220,7 +223,9 @@ def _convention(args: argparse.Namespace) -> Convention | None:
     return Convention.ENU_FLU if args.to == "mcap" else None
 
 
-def _sink(args: argparse.Namespace, file: BinaryIO, out: ExportFile, *, is_recording: bool) -> Sink:
+def _sink(
+    args: argparse.Namespace, file: BinaryIO, out: ExportFile, noise: dict[str, Deviations], *, is_recording: bool
+) -> Sink:
     if args.to == "csv":
         times = None if is_recording else times_of(file, DRIVERS[args.driver or DRIVER])
         return CsvSink(out, args.table or "samples", args.fields, without_times=times is KnownTimes.NONE)
@@ -237,7 +242,6 @@ def _sink(args: argparse.Namespace, file: BinaryIO, out: ExportFile, *, is_recor
     words = {"imud": __version__, "source": args.file.name, "convention": str(convention)}
     if not is_recording:
         words["times"] = (times_of(file, DRIVERS[args.driver or DRIVER]) or KnownTimes.HOST).value
-    noise = recorded_noise(file, str(args.file)) if is_recording else {}
     for device, given in noise_by_device(args.noise).items():
         name = device if is_recording else NAME  # a capture does not contain the name of its device
         noise[name] = noise.get(name, Deviations()).updated(given)

@@ -8,6 +8,7 @@ import shutil
 import struct
 import subprocess
 import sys
+from bisect import bisect_right
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from fcntl import F_SETPIPE_SZ, fcntl
@@ -17,6 +18,7 @@ from time import monotonic
 from typing import IO, TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple, Protocol, TextIO
 
 import msgspec
+from msgspec.structs import replace
 
 from imud.attitude.conventions import Convention
 from imud.attitude.published import PublishedAxes
@@ -39,7 +41,7 @@ from imud.contracts.status import Deviations
 from imud.formats.can import CandumpReader
 from imud.formats.capture import CaptureReader
 from imud.formats.recording import RecordingReader
-from imud.formats.records import DeviceRecord, Kind, decode_object
+from imud.formats.records import NO_DEVICE, CallRecord, DeviceRecord, Kind, decode_clocks, decode_object
 from imud.host.files import open_regular
 from imud.host.threads import rare_garbage_collection
 from imud.model.errors import BadArgument, ImudError, reason_of
@@ -47,6 +49,7 @@ from imud.model.event import Event, kind_of
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import SAMPLE_FIELDS, Sample
+from imud.model.units import NS_PER_MS
 from imud.recording.capture_player import CapturePlayer, KnownTimes
 from imud.recording.player import PlayedDevice, Player, RecordedEvent
 
@@ -333,12 +336,92 @@ class Exported(NamedTuple):
     status: int  # 0 if the file is complete and its samples are equal to the live run, otherwise 1
 
 
+# Minimum difference of two offsets for a step of the wall clock, ns. A more exact reading differs by some microseconds.
+STEP_NS: Final = 1 * NS_PER_MS
+
+
+class RecordedClock:
+    """CLOCK_REALTIME of a recording: CLOCK_MONOTONIC plus the last recorded offset. Times before a step of the wall
+    clock then match the corrected clock. CLOCK_MONOTONIC stops during a suspend, so each suspend starts a new offset.
+    """
+
+    def __init__(self) -> None:
+        self._suspends = 0
+        self._starts_ns: list[int] = []  # CLOCK_MONOTONIC at the start of each offset
+        self._offsets_ns: list[int] = []
+
+    def add(self, monotonic_ns: int, offset_ns: int, suspends: int) -> None:
+        """Add a reading of the clocks, in the order of the file."""
+        if self._offsets_ns and suspends == self._suspends:
+            self._offsets_ns[-1] = offset_ns
+            return
+        self._suspends = suspends
+        self._starts_ns.append(monotonic_ns)
+        self._offsets_ns.append(offset_ns)
+
+    def utc_ns(self, t_ns: int, recorded_ns: int) -> int:
+        """Return CLOCK_REALTIME at a CLOCK_MONOTONIC time; `recorded_ns` if the wall clock did not step after it."""
+        if not self._offsets_ns:
+            return recorded_ns
+        utc_ns = t_ns + self._offsets_ns[max(bisect_right(self._starts_ns, t_ns) - 1, 0)]
+        return utc_ns if abs(utc_ns - recorded_ns) > STEP_NS else recorded_ns
+
+    def placed(self, batch: Batch) -> Batch:
+        """Return samples with `utc_ns` of this clock."""
+        times_ns = [self.utc_ns(sample.t_ns, sample.utc_ns) for sample in batch.samples]
+        if times_ns == [sample.utc_ns for sample in batch.samples]:
+            return batch
+        placed = [replace(sample, utc_ns=utc_ns) for sample, utc_ns in zip(batch.samples, times_ns, strict=True)]
+        return Batch(batch.device, batch.device_id, placed, batch.frame)
+
+
+class RecordedFacts(NamedTuple):
+    """Facts of a recording that an export needs before the first sample."""
+
+    noise: dict[str, Deviations]  # configured noise of each device
+    clock: RecordedClock
+
+
+def recorded_facts(file: BinaryIO, name: str) -> RecordedFacts:
+    """Return the noise and the clock of a recording. Raises ImudError.
+
+    Read the complete file: the description of a device can come after the first samples of another device.
+    """
+    found, clock = dict[str, Deviations](), RecordedClock()
+    for record in RecordingReader(file, name):
+        if record.kind == Kind.CLOCKS:
+            read = decode_clocks(record.body)
+            clock.add(read.monotonic_ns, read.utc_offset_ns, read.suspends)
+        elif record.kind == Kind.CALL and record.device == NO_DEVICE:
+            call = decode_object(record, CallRecord)
+            match (call.target, call.method, *call.arguments):
+                case ("host", "restore", _, int(offset_ns), int(suspends)):
+                    clock.add(0, offset_ns, suspends)
+        elif record.kind == Kind.DEVICE:
+            device = decode_object(record, DeviceRecord)
+            if device is not None and NOISE in device.configuration:
+                try:
+                    found[device.name] = msgspec.convert(device.configuration[NOISE], Deviations)
+                except msgspec.ValidationError as error:
+                    raise ImudError(f"{name}: cannot read the noise of {device.name}: {reason_of(error)}") from None
+    file.seek(0)
+    return RecordedFacts(found, clock)
+
+
 class ExportFeed:
     """Sink that converts samples to the requested axes and passes them to another sink. Synchronization: one thread."""
 
-    def __init__(self, sink: Sink, file: BinaryIO, progress: Progress, convention: Convention | None) -> None:
+    def __init__(
+        self,
+        sink: Sink,
+        file: BinaryIO,
+        progress: Progress,
+        convention: Convention | None,
+        clock: RecordedClock,
+    ) -> None:
         """`convention`: None keeps the published axes."""
         self._sink = sink
+        self._clock = clock
         self._file = file
         self._read_bytes: int | None = None
         self._progress = progress
@@ -350,15 +433,15 @@ class ExportFeed:
         self._read_bytes = read_bytes
 
     def samples(self, batch: Batch) -> None:
-        self._sink.samples(batch.converted(self._convention))
+        self._sink.samples(self._clock.placed(batch).converted(self._convention))
         self.samples_taken += len(batch.samples)
         self._progress.add(len(batch.samples), self._position)
 
     def losses(self, losses: LossCounts) -> None:
-        self._sink.losses(losses)
+        self._sink.losses(losses._replace(utc_ns=self._clock.utc_ns(losses.t_ns, losses.utc_ns)))
 
     def event(self, event: StampedEvent) -> None:
-        self._sink.event(event)
+        self._sink.event(event._replace(utc_ns=self._clock.utc_ns(event.event.t_ns, event.utc_ns)))
 
     def finish(self) -> None:
         self._sink.finish()
@@ -379,24 +462,6 @@ def export_recording(file: BinaryIO, path: Path, feed: ExportFeed, devices: Sequ
         if name not in known:
             raise BadArgument(f"--device {name}: expected a device of the recording: {', '.join(known) or 'none'}")
     return Exported(report, status)
-
-
-def recorded_noise(file: BinaryIO, name: str) -> dict[str, Deviations]:
-    """Return the configured noise of each device of a recording. Raises ImudError.
-
-    Read the complete file: the description of a device can come after the first samples of another device.
-    """
-    found: dict[str, Deviations] = {}
-    for record in RecordingReader(file, name):
-        if record.kind == Kind.DEVICE:
-            device = decode_object(record, DeviceRecord)
-            if device is not None and NOISE in device.configuration:
-                try:
-                    found[device.name] = msgspec.convert(device.configuration[NOISE], Deviations)
-                except msgspec.ValidationError as error:
-                    raise ImudError(f"{name}: cannot read the noise of {device.name}: {reason_of(error)}") from None
-    file.seek(0)
-    return found
 
 
 def export_capture(

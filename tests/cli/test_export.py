@@ -15,11 +15,11 @@ from rosbags.highlevel import AnyReader
 from imud.attitude.conventions import FLU_LEVEL, RFU_ENU, Convention
 from imud.attitude.published import as_sent
 from imud.cli import main
-from imud.cli.export_sources import recorded_noise
+from imud.cli.export_sources import recorded_facts
 from imud.contracts.publisher import Batch
 from imud.contracts.status import Deviations
 from imud.formats.recording import BlockGatherer, RecordingReader
-from imud.formats.records import Kind, encode, encode_object
+from imud.formats.records import ClocksRecord, Kind, encode, encode_clocks, encode_object
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_MS, NS_PER_S
@@ -242,7 +242,34 @@ def test_the_noise_of_a_device_that_is_described_after_samples_of_another_one(tm
     gatherer, data = BlockGatherer(), b""
     for record in [*(one for one in records if one is not late and one.device != late.device), late]:
         data += gatherer.add(encode(Kind(record.kind), record.device, record.body))
-    assert recorded_noise(BytesIO(data + gatherer.finish()), "a") == {"mast": Deviations(gyro_rad_s=0.5)}
+    assert recorded_facts(BytesIO(data + gatherer.finish()), "a").noise == {"mast": Deviations(gyro_rad_s=0.5)}
+
+
+@pytest.mark.parametrize("suspends", [0, 1])
+def test_rows_before_a_step_of_the_wall_clock(recorded: Recorded, tmp_path: Path, cli: Cli, suspends: int) -> None:
+    """imud places all rows with the last offset of the recording, and rows before a suspend with the last offset before
+    it, because CLOCK_MONOTONIC stops during a suspend."""
+    step_ns, newest = 1168 * 86_400 * NS_PER_S, recorded.samples[-1]
+    gatherer, data = BlockGatherer(), b""
+    with recorded.file.open("rb") as stream:
+        for record in RecordingReader(stream, "a"):
+            if record.kind == Kind.END:
+                offset_ns = newest.utc_ns - newest.t_ns + step_ns
+                last = ClocksRecord(newest.t_ns + 1, 1, 1, 1, offset_ns, suspends)
+                data += gatherer.add(encode_clocks(last))
+            data += gatherer.add(encode(Kind(record.kind), record.device, record.body))
+    (tmp_path / "a.imudrec").write_bytes(data + gatherer.finish())
+    shift_ns = 0 if suspends else step_ns
+    found = rows(cli("export", "--to", "csv", tmp_path / "a.imudrec").out)
+    for row, sample in zip(found, recorded.samples, strict=True):
+        assert abs(int(row["utc_ns"]) - sample.utc_ns - shift_ns) < NS_PER_MS
+    cli("export", "--to", "mcap", "-o", tmp_path / "a.mcap", tmp_path / "a.imudrec")
+    (first, *_), (*_, last_event) = (
+        [t_ns for topic, _, t_ns, _ in messages(tmp_path / "a.mcap") if topic == wanted]
+        for wanted in ("/bow/stamp", "/events")
+    )
+    assert abs(first - recorded.of("bow")[0].utc_ns - shift_ns) < NS_PER_MS
+    assert abs(last_event - (newest.utc_ns - newest.t_ns + EVENTS[-1].t_ns) - shift_ns) < NS_PER_MS
 
 
 def test_fields_choose_channels_and_ned_has_frames_of_its_own(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
