@@ -99,7 +99,7 @@ def live_pictures() -> Iterator[tuple[str, str]]:
             overview, page = asyncio.run(screens(daemon))
         yield "top.svg", offline(renamed(overview, devices))
         yield "top_device.svg", offline(renamed(page, devices))
-        (file,) = (folder / "recordings").iterdir()
+        (file,) = (folder / "recordings").glob("*.imudrec")
         argv = [sys.executable, "-m", "imud", "info", file.name]
         done = subprocess.run(argv, capture_output=True, text=True, timeout=LIMIT_S, check=True, cwd=file.parent)
         lines = [f"$ imud info {file.name}", *renamed(done.stdout, devices).splitlines()]

@@ -57,5 +57,5 @@ devices:
     # speed `maximum`: the daemon reads the capture without pauses
     event_loop.run(Daemon(config.parse(text, "imud.yaml"), until_finished=True, **more).run())
     capture.unlink()
-    (made,) = recordings.iterdir()
+    (made,) = recordings.glob("*.imudrec")
     return made

@@ -120,7 +120,7 @@ def live_rows(seconds: float = SECONDS) -> Iterator[Row]:
     with tempfile.TemporaryDirectory(prefix="imud-bench-") as made:
         folder = Path(made)
         receiver, ledger = live_run(folder, seconds)
-        (file,) = (folder / "recordings").iterdir()
+        (file,) = (folder / "recordings").glob("*.imudrec")
         player, wrong = differing(file, folder / "slots")
         (device,) = player.devices.values()
         other = sum(device.ledger.snapshot()[key] != value for key, value in ledger.items())

@@ -77,4 +77,4 @@ devices:
         # on a busy host, the recorder would start the second device at the next tick, in the middle of its replay
         patch.setattr("imud.publishers.recorder.writer.BEGIN_NS", NS_PER_S)
         event_loop.run(daemon.run())
-    return daemon, collector, sorted((folder / "recordings").iterdir())
+    return daemon, collector, sorted((folder / "recordings").glob("*.imudrec"))

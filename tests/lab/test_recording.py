@@ -72,7 +72,7 @@ def test_every_link_is_replayed_as_it_ran(tmp_path: Path) -> None:
         life.terminate()
     live = received(life)
     assert life.recorder.dropped == []
-    (recording,) = directory.iterdir()
+    (recording,) = directory.glob("*.imudrec")
     again = replayed(recording)
     for name, samples in live.items():
         begin = again[name][0].seq - samples[0].seq

@@ -1,10 +1,13 @@
 """Directory of recordings: file names, and removal of the oldest files above the limit of disk space."""
 
+import logging
 import os
 import re
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
+from itertools import count
+from operator import attrgetter
 from pathlib import Path
 from threading import Lock
 from typing import Annotated, Final, NamedTuple
@@ -12,15 +15,23 @@ from typing import Annotated, Final, NamedTuple
 import msgspec
 
 from imud.contracts.lines import InputOptions
+from imud.host.files import read_regular, replace_file
 from imud.model.options import Options
 from imud.model.units import NS_PER_S
+
+log = logging.getLogger(__name__)
 
 SUFFIX: Final = ".imudrec"
 SNAPSHOT: Final = "-snapshot"  # suffix of the name of a snapshot
 # File names of the recorder. imud removes only these files.
-NAME: Final = re.compile(r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{6}(-snapshot)?\.imudrec")
+NAME: Final = re.compile(r"\d{8}T\d{6}Z-(?P<run>[0-9a-f]{8})-(?P<number>\d{6,9})(?P<kind>-snapshot)?\.imudrec")
 FILES_MAX: Final = 100_000  # maximum number of files that imud reads from the directory
 RETRY_NS: Final = 60 * NS_PER_S  # time between two attempts on a full or failed disk, ns
+# File with the runs of the daemon in their order, one line each. The wall clock of a host without RTC does not give
+# this order: it can be years behind or ahead until NTP sets it.
+RUNS_FILE: Final = ".runs"
+RUNS_BYTES: Final = FILES_MAX * len("0123abcd\n")  # maximum size of this file, bytes
+RUN: Final = re.compile("[0-9a-f]{8}")
 
 
 class RecordingFile(NamedTuple):
@@ -28,6 +39,11 @@ class RecordingFile(NamedTuple):
 
     name: str
     size: int
+    mtime_ns: int  # CLOCK_REALTIME of the last write
+    uid: int
+    run: str  # eight digits of the epoch of its daemon
+    number: int
+    kind: str  # SNAPSHOT, or empty
 
 
 class RecordingDirectory:
@@ -41,10 +57,22 @@ class RecordingDirectory:
         self.kept_bytes = 0
         self._keep_bytes = keep_bytes
         self._lock = Lock()
+        self._run = ""  # run of this daemon
+        self._runs: dict[str, int] = {}  # known runs, with their places in the order
+        self._made: dict[str, int] = {}  # files of this daemon, with their places in the order
+        self._next_place = count(1)
 
     def make(self) -> None:
         """Create the directory if it does not exist. Raises OSError."""
         self.path.mkdir(mode=0o750, parents=True, exist_ok=True)
+
+    def begin_run(self, epoch: int, kind: str = "") -> int:
+        """Add the run of this daemon after all known runs of the directory. Return the number of its next file of this
+        kind: after a reload, the directory contains files of this run. Raises OSError."""
+        with self._lock:
+            self._run, files = _run_of(epoch), self.files()
+            self._note_run(files)
+        return max((file.number + 1 for file in files if (file.run, file.kind) == (self._run, kind)), default=0)
 
     def measure(self) -> None:
         """Measure the size of the files. Raises OSError."""
@@ -57,25 +85,36 @@ class RecordingDirectory:
             self.kept_bytes += size
 
     def new_file(self, utc_ns: int, epoch: int, number: int, kind: str = "") -> Path:
-        """Return the path of the next file. Names sort by time; the files of one run of the daemon share the epoch.
-        `kind` is SNAPSHOT for a snapshot. Snapshots have their own numbers."""
+        """Return the path of the next file. The files of one run of the daemon share the epoch. `kind` is SNAPSHOT for
+        a snapshot. Snapshots have their own numbers."""
         begun = datetime.fromtimestamp(utc_ns // NS_PER_S, UTC).strftime("%Y%m%dT%H%M%SZ")
-        return self.path / f"{begun}-{epoch & 0xFFFF_FFFF:08x}-{number:06d}{kind}{SUFFIX}"
+        name = f"{begun}-{_run_of(epoch)}-{number:06d}{kind}{SUFFIX}"
+        self._made[name] = next(self._next_place)
+        return self.path / name
 
     def files(self) -> list[RecordingFile]:
         """Return the recordings in the directory, oldest first. Raises OSError."""
-        found = []
+        runs, found = dict[str, list[RecordingFile]](), 0
         with os.scandir(self.path) as entries:
             for entry in entries:
-                if NAME.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
+                name = NAME.fullmatch(entry.name)
+                if name is not None and entry.is_file(follow_symlinks=False):
                     with suppress(FileNotFoundError):
-                        found.append(RecordingFile(entry.name, entry.stat(follow_symlinks=False).st_size))
-                if len(found) >= FILES_MAX:
+                        status, run = entry.stat(follow_symlinks=False), name["run"]
+                        file = RecordingFile(
+                            entry.name, status.st_size, status.st_mtime_ns, status.st_uid, run, int(name["number"]),
+                            name["kind"] or "",
+                        )  # fmt: skip
+                        runs.setdefault(run, []).append(file)
+                        found += 1
+                if found >= FILES_MAX:
                     break
-        return sorted(found)
+        # imud does not know the place of a run before the first line of RUNS_FILE
+        order = sorted(runs, key=lambda run: (self._runs.get(run, -1), max(file.mtime_ns for file in runs[run]), run))
+        return [file for run in order for file in self._in_order(runs[run])]
 
     def make_room(self, reserve_bytes: int) -> Sequence[str]:
-        """Remove the oldest closed files, so that `reserve_bytes` fit. Return their names. Raises OSError."""
+        """Remove the oldest closed files, so that `reserve_bytes` fit. Return and log their names. Raises OSError."""
         with self._lock:
             files = self.files()
             total, removed = sum(file.size for file in files), list[str]()
@@ -87,12 +126,44 @@ class RecordingDirectory:
                     (self.path / file.name).unlink(missing_ok=True)
                     total -= file.size
                     self.kept_bytes -= file.size
+                    self._made.pop(file.name, None)
                     removed.append(file.name)
+                    log.info(
+                        "removed the oldest recording %s (%.1f MB) to stay below %g GB",
+                        self.path / file.name, file.size / 1e6, self._keep_bytes / 1e9,
+                    )  # fmt: skip
             self.removed += len(removed)
+            if self._run:
+                self._note_run(files)
         return removed
 
     def _note(self, files: Sequence[RecordingFile]) -> None:
         self.kept_bytes = sum(file.size for file in files if file.name not in self.in_use)
+
+    def _in_order(self, files: Sequence[RecordingFile]) -> list[RecordingFile]:
+        """Return the files of one run, oldest first. The numbers give the order of the files of one kind. The time of
+        the last write is only the order of recordings and snapshots, because the wall clock can step."""
+        by_number = {kind: iter(sorted(files, key=attrgetter("number"))) for kind in ("", SNAPSHOT)}
+        by_time = sorted(files, key=lambda file: (self._made.get(file.name, 0), file.mtime_ns, file.number))
+        return [next(other for other in by_number[file.kind] if other.kind == file.kind) for file in by_time]
+
+    def _note_run(self, files: Sequence[RecordingFile]) -> None:
+        """Read RUNS_FILE. If it lacks the run of this daemon, add the run and remove the runs without files."""
+        path = self.path / RUNS_FILE
+        try:
+            known = RUN.findall(read_regular(path, RUNS_BYTES).decode("ascii", "replace"))
+        except OSError:
+            known = []
+        if self._run not in known:
+            present = {file.run for file in files}
+            known = [*(run for run in known if run in present), self._run]
+            with suppress(OSError):  # a full disk: the next call tries again
+                replace_file(path, "".join(f"{run}\n" for run in known).encode())
+        self._runs = {run: place for place, run in enumerate(known)}
+
+
+def _run_of(epoch: int) -> str:
+    return f"{epoch & 0xFFFF_FFFF:08x}"
 
 
 MEGABYTE: Final = 1_000_000

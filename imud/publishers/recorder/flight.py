@@ -501,6 +501,7 @@ class FlightRecorder:
         """Start recording. Raises ServerError."""
         try:
             self._directory.make()
+            self._snapshots = self._directory.begin_run(self._context.epoch, SNAPSHOT)
             self._directory.measure()
             if self._own is not None:
                 self._own.make()
@@ -622,7 +623,7 @@ class FlightRecorder:
         runs: dict[str, list[Path]] = {}
         for file in self._own.files() if self._own is not None else ():
             assert self._own is not None
-            runs.setdefault(file.name.split("-")[1], []).append(self._own.path / file.name)
+            runs.setdefault(file.run, []).append(self._own.path / file.name)
         return [
             Rescue(self._directory.path / files[0].name.replace(SUFFIX, SNAPSHOT + SUFFIX), files)
             for files in runs.values()

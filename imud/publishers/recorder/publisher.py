@@ -48,6 +48,7 @@ class Recorder:
         """Create the directory and start a file. Raises ServerError."""
         try:
             self._directory.make()
+            self._number = self._directory.begin_run(self._context.epoch)
             self._directory.make_room(self._file_bytes)
         except OSError as error:
             raise ServerError(f"recordings in {self._settings.directory}: {reason_of(error)}") from error
@@ -139,12 +140,9 @@ class Recorder:
     def _next_file(self, now_ns: int) -> None:
         self._begin_file("start of a new file")
         try:
-            removed = self._directory.make_room(self._file_bytes)
+            self._directory.make_room(self._file_bytes)
         except OSError as error:
             self._stop_recording(reason_of(error), now_ns)
-            return
-        if removed:
-            log.info("removed recordings to stay below %g GB: %s", self._settings.keep_gb, ", ".join(removed))
 
     def _end_file(self, reason: str) -> None:
         self._feed.put(self._feed.ending(reason))

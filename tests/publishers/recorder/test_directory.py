@@ -1,9 +1,12 @@
 """Directory of recordings: names, order, and a limit that removes only recordings."""
 
+import os
 from pathlib import Path
 
+import pytest
+
 from imud.model.units import NS_PER_S
-from imud.publishers.recorder.directory import NAME, RecordingDirectory
+from imud.publishers.recorder.directory import NAME, SNAPSHOT, RecordingDirectory
 
 
 def filled(folder: Path, keep_bytes: int, *sizes: int) -> RecordingDirectory:
@@ -55,3 +58,71 @@ def test_the_measured_size_excludes_open_files(tmp_path: Path) -> None:
     assert directory.kept_bytes == 30  # imud removed the oldest file, and the newest is open
     directory.add(7)
     assert directory.kept_bytes == 37
+
+
+CASES = {
+    "the numbers decide within a run": ([("aa", 9, "", 2), ("aa", 10, "", 1)], "", ["aa 9", "aa 10"]),
+    "snapshots between recordings": (
+        [("aa", 0, "", 1), ("aa", 0, SNAPSHOT, 2), ("aa", 1, "", 3)], "", ["aa 0", "aa 0-snapshot", "aa 1"],
+    ),
+    "unknown runs by time": ([("aa", 5, "", 2), ("bb", 0, "", 3), ("cc", 7, "", 1)], "", ["cc 7", "aa 5", "bb 0"]),
+    "the clock was years ahead in an earlier run": (
+        [("aa", 0, "", 9), ("bb", 0, "", 2), ("cc", 0, "", 3)], "aa bb", ["cc 0", "aa 0", "bb 0"],
+    ),
+    "the clock is behind now": (
+        [("01", 0, "", 1), ("01", 1, "", 2), ("aa", 3, "", 8), ("bb", 4, "", 9)], "aa bb",
+        ["aa 3", "bb 4", "01 0", "01 1"],
+    ),
+    "damaged list of runs": ([("01", 0, "", 1), ("aa", 0, "", 9)], "\0 \x80x", ["aa 0", "01 0"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("files", "known", "removed"), CASES.values(), ids=CASES)
+def test_the_order_of_removal_does_not_depend_on_the_wall_clock(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, files: list[tuple[str, int, str, int]], known: str,
+    removed: list[str],
+) -> None:  # fmt: skip
+    """Files as (run, number, kind, time of the last write). The time in the name is the same for all files."""
+    caplog.set_level("INFO")
+    for run, number, kind, time_s in files:
+        path = tmp_path / f"20260101T000000Z-{run:0>8}-{number:06d}{kind}.imudrec"
+        path.write_bytes(bytes(10))
+        os.utime(path, (time_s, time_s))
+    (tmp_path / ".runs").write_bytes(
+        b"".join(b"%08s\n" % run.encode("latin-1") for run in known.split()).replace(b" ", b"0")
+    )
+    directory = RecordingDirectory(tmp_path, 0)
+    following = max([number + 1 for run, number, kind, _ in files if (run, kind) == ("01", "")], default=0)
+    assert directory.begin_run(1) == following  # the files after a reload continue the numbers
+    words = [name.removesuffix(".imudrec").split("-", 2)[1:] for name in directory.make_room(0)]
+    assert [f"{run[6:]} {int(number[:6])}{number[6:]}" for run, number in words] == removed
+    logged = [record.getMessage() for record in caplog.records]
+    assert [text.startswith(f"removed the oldest recording {tmp_path}/") for text in logged] == [True] * len(files)
+
+
+def test_files_of_this_run_have_the_order_of_their_creation(tmp_path: Path) -> None:
+    """The wall clock was years ahead and is then set back, so that the snapshot has the oldest time."""
+    directory = RecordingDirectory(tmp_path, 0)
+    directory.begin_run(1)
+    made = [directory.new_file(2_000_000_000 * NS_PER_S, 1, 0), directory.new_file(0, 1, 0, SNAPSHOT)]
+    for path, time_s in zip(made, (2_000_000_000, 1), strict=True):
+        path.write_bytes(b"1")
+        os.utime(path, (time_s, time_s))
+    assert [file.name for file in directory.files()] == [path.name for path in made]
+
+
+def test_the_order_of_runs_after_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_arguments: object) -> None:
+        raise OSError
+
+    directory, runs = RecordingDirectory(tmp_path, 100), tmp_path / ".runs"
+    with monkeypatch.context() as patch:
+        patch.setattr("imud.publishers.recorder.directory.replace_file", refuse)
+        directory.begin_run(0xAA)
+    assert not runs.exists()
+    directory.new_file(0, 0xAA, 0).touch()
+    directory.make_room(0)
+    RecordingDirectory(tmp_path, 100).begin_run(0xBB)
+    assert runs.read_text().split() == ["000000aa", "000000bb"]
+    RecordingDirectory(tmp_path, 100).begin_run(0xCC)
+    assert runs.read_text().split() == ["000000aa", "000000cc"]  # the second run has no file

@@ -63,7 +63,7 @@ class FlightBench(RecordingBench):
 
     @property
     def files(self) -> Sequence[Path]:
-        return sorted(self.folder.iterdir())
+        return sorted(self.folder.glob("*.imudrec"))
 
     @property
     def messages(self) -> list[str]:

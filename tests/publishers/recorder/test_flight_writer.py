@@ -148,7 +148,7 @@ def test_a_full_disk_leaves_no_incomplete_snapshot(bench: FlightWriterBench, mon
     bench.queue.mark(Save(bench.folder / "a", END))
     bench.work()
     assert [saved.problem for saved in bench.writer.saved] == ["No space left on device"]
-    assert list(bench.folder.iterdir()) == []
+    assert list(bench.folder.glob("*.imudrec")) == []
     assert bench.writer.problem == ""
     monkeypatch.undo()
     bench.queue.mark(Save(bench.folder / "b", END))
@@ -165,7 +165,7 @@ def test_after_a_failed_segment_nothing_is_saved_until_the_next_segment(
     bench.work()
     assert bench.writer.problem == "No such file or directory"
     assert [saved.problem for saved in bench.writer.saved] == ["nothing was kept"]
-    assert list(bench.folder.iterdir()) == []
+    assert list(bench.folder.glob("*.imudrec")) == []
     bench.begin()
     bench.put(1)
     bench.queue.mark(Save(bench.folder / "b", END))
@@ -183,8 +183,8 @@ def test_snapshots_stay_below_the_limit(tmp_path: Path) -> None:
         bench.ring.clear()
         bench.queue.mark(Save(path, END))
         bench.work()
-        assert sum(file.stat().st_size for file in bench.folder.iterdir()) <= 100_000
-    assert len(list(bench.folder.iterdir())) == 3 - 1 + 1
+        assert sum(file.stat().st_size for file in bench.folder.glob("*.imudrec")) <= 100_000
+    assert len(list(bench.folder.glob("*.imudrec"))) == 3 - 1 + 1
     bench.writer.close()
 
 

@@ -21,7 +21,7 @@ def test_files_are_written(tmp_path: Path) -> None:
     made.tick(bench.advance(0.1))
     made.event(Event(1, "bow", EventKind.UP, "up"))
     made.close()
-    (file,) = (tmp_path / "a").iterdir()
+    (file,) = (tmp_path / "a").glob("*.imudrec")
     assert {Kind.SESSION, Kind.DEVICE, Kind.EVENT, Kind.END} <= set(kinds_in(file))
 
 
@@ -39,7 +39,9 @@ def test_both_write_to_one_directory_and_one_alone_does_not_start_the_other(tmp_
         made.remove_device("imu0")
         made.close()
         made.close()
-    ends = [sorted(file.name.split("-", 2)[2] for file in (tmp_path / str(one)).iterdir()) for one in (True, False)]
+    ends = [
+        sorted(file.name.split("-", 2)[2] for file in (tmp_path / str(one)).glob("*.imudrec")) for one in (True, False)
+    ]
     assert ends == [["000000-snapshot.imudrec", "000000.imudrec"], ["000000-snapshot.imudrec"]]
 
 

@@ -38,7 +38,7 @@ class RecorderBench(RecordingBench):
         return [record.kind for record in self.read(number)]
 
     def read(self, number: int = 0) -> list[records.Record]:
-        path = sorted(self.folder.iterdir())[number]
+        path = sorted(self.folder.glob("*.imudrec"))[number]
         with path.open("rb") as file:
             return list(RecordingReader(file, path.name))
 
@@ -75,7 +75,7 @@ def test_a_new_file_starts_by_size_or_time_with_all_states(tmp_path: Path) -> No
     bench.tick(1.1)
     bench.tick(121)
     bench.recorder.close()
-    assert len(list(bench.folder.iterdir())) == 3
+    assert len(list(bench.folder.glob("*.imudrec"))) == 3
     for number in range(3):
         found = bench.kinds(number)
         assert [found[0], found[-1]] == [Kind.SESSION, Kind.END]
@@ -97,7 +97,7 @@ def test_clock_readings_are_within_a_file(
     bench.on_clocks_read = record_reading
     bench.tick(59.9)
     bench.recorder.close()
-    assert len(list(bench.folder.iterdir())) == 2
+    assert len(list(bench.folder.glob("*.imudrec"))) == 2
     for number in range(2):
         found = bench.kinds(number)
         assert Kind.CLOCKS in found
@@ -160,11 +160,11 @@ def test_old_files_are_removed_for_new_files(tmp_path: Path) -> None:
         bench.source.deliver(1_000_000)
         bench.tick(1.1)
         bench.tick(1.1)
-    there = sum(path.stat().st_size for path in bench.folder.iterdir())
+    there = sum(path.stat().st_size for path in bench.folder.glob("*.imudrec"))
     # imud writes the end of a file after it starts the next
     assert abs(bench.recorder.status().disk_bytes - there) <= 1000
     bench.recorder.close()
-    assert sum(path.stat().st_size for path in bench.folder.iterdir()) <= 2_100_000
+    assert sum(path.stat().st_size for path in bench.folder.glob("*.imudrec")) <= 2_100_000
     assert bench.recorder.status().files_removed >= 3
 
 
