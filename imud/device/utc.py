@@ -5,7 +5,10 @@ source ──RMC──▶ RmcFeed ──▶ port of the device           (UTC be
                      └─ or the system clock, if its error is smaller ──▶ clock
 """
 
+import logging
 from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from typing import Final
 
 import msgspec
 
@@ -13,6 +16,7 @@ from imud.config.model import DeviceConfig
 from imud.contracts.lines import Edge, UtcReference
 from imud.contracts.link import DeviceLink, StreamLink
 from imud.contracts.status import UtcStatus
+from imud.formats.nmea0183 import Rmc, parse
 from imud.host.clock import HostClock
 from imud.links import LINKS
 from imud.model.sample import Sample
@@ -21,10 +25,17 @@ from imud.sampling.clock import SampleClock
 from imud.utc import RMC_SOURCES
 from imud.utc.pps import ChronyFeed, PpsReference
 from imud.utc.receivers import RmcSource, SourceContext
-from imud.utc.rmc_feed import RmcFeed
+from imud.utc.rmc_feed import Refusal, RmcFeed
 from imud.utc.system_clock import kernel_clock, system_reference
 
+log = logging.getLogger(__name__)
+
 ASK_NS = NS_PER_S  # interval between two updates of the reference, ns
+# 2026-11-01. A receiver after a GPS week rollover is 1024 weeks early: its dates precede the release of imud.
+RELEASE_NS: Final = 1_793_491_200 * NS_PER_S
+SENTENCE_LATE_NS: Final = 2 * NS_PER_S  # maximum delay of a sentence that does not contradict the system clock, ns
+PULSE_OFF_NS: Final = NS_PER_S // 2  # maximum difference of the start of a second from the system clock, ns
+SIGMAS: Final = 3
 
 
 class UtcFeed:
@@ -48,6 +59,7 @@ class UtcFeed:
         self._reference: UtcReference | None = None
         self._clock: SampleClock | None = None
         self._due_ns = 0
+        self._doubts: dict[str, str] = {}  # why imud rejects sentences or pulses, one sentence each
         self._begun = self._closed = False
 
     def start(self, clock: SampleClock) -> None:
@@ -84,7 +96,9 @@ class UtcFeed:
             if edge.rising:
                 accepted = self._pps.on_pulse(self._steady.steady_ns(edge.t_ns))
                 if accepted and self._chrony is not None and (unix_s := self._pps.second_s) is not None:
-                    self._chrony.send_pulse(edge.t_ns, unix_s)
+                    offset_ns = unix_s * NS_PER_S - edge.t_ns
+                    if not self._is_doubtful("pulses", offset_ns, PULSE_OFF_NS, self._system()):
+                        self._chrony.send_pulse(edge.t_ns, unix_s)
                 if self._feed is not None:
                     self._feed.on_pulse(edge.t_ns)
 
@@ -92,7 +106,18 @@ class UtcFeed:
         source, feed, chrony = self._source, self._feed, self._chrony
         return UtcStatus(
             source=source.title if source is not None else "",
-            problem=(source.problem if source is not None else "") or (chrony.problem if chrony is not None else ""),
+            problem=next(
+                (
+                    one
+                    for one in (
+                        source.problem if source is not None else "",
+                        *self._doubts.values(),
+                        chrony.problem if chrony is not None else "",
+                    )
+                    if one
+                ),
+                "",
+            ),
             sentences=source.sentences if source is not None else 0,
             sent=feed.sent if feed is not None else 0,
             refused=dict(feed.refused) if feed is not None else {},
@@ -105,8 +130,12 @@ class UtcFeed:
     def _update_reference(self, now_ns: int) -> None:
         self._due_ns = now_ns + ASK_NS
         by_system, by_pulses = self._system(), self._pps.reference(self._steady.steady_ns(now_ns))
-        if by_pulses is not None:
+        if by_pulses is None:
+            self._doubts.pop("pulses", None)
+        else:
             by_pulses = UtcReference(by_pulses.offset_ns - self._steady.offset_ns, by_pulses.error_ns)
+            if self._is_doubtful("pulses", by_pulses.offset_ns, PULSE_OFF_NS, by_system):
+                by_pulses = None
         if by_system is not None:
             # the clock of the device uses this reference in steady time until the next update
             steered_ns = round(abs(self._steady.rate) * ASK_NS)
@@ -118,12 +147,42 @@ class UtcFeed:
             self._clock.set_utc_reference(self._reference)
 
     def _on_sentence(self, sentence: bytes, t_rx_ns: int) -> None:
+        rmc = parse(sentence)
+        if isinstance(rmc, Rmc) and rmc.valid:
+            offset_ns = rmc.utc_ns - t_rx_ns
+            if self._is_doubtful("sentences", offset_ns, SENTENCE_LATE_NS, self._system(), rmc.utc_ns):
+                if self._feed is not None:
+                    self._feed.refused[str(Refusal.IMPLAUSIBLE)] += 1
+                return
         # the clock must know UTC before UTC becomes the device time: otherwise it assumes a jump of the device time
         self._pps.on_sentence(sentence, self._steady.steady_ns(t_rx_ns))
         if self._reference is None:
             self._update_reference(t_rx_ns)
         if self._feed is not None:
             self._feed.on_sentence(sentence, t_rx_ns)
+
+    def _is_doubtful(
+        self, what: str, offset_ns: int, most_ns: int, system: UtcReference | None, utc_ns: int = RELEASE_NS
+    ) -> bool:
+        """Return whether UTC minus CLOCK_MONOTONIC of the receiver differs from the synchronized system clock by more
+        than `most_ns`, or `utc_ns` precedes the release of imud. Log each new problem."""
+        title, doubt = self._source.title if self._source is not None else "the receiver", ""
+        if utc_ns < RELEASE_NS:
+            date = datetime.fromtimestamp(utc_ns // NS_PER_S, UTC).date()
+            doubt = (
+                f"imud ignores the {what} of {title}: its date {date} precedes the release of imud; does the receiver "
+                f"have a GPS week rollover?"
+            )
+        elif system is not None and abs(offset_ns - system.offset_ns) > most_ns + SIGMAS * system.error_ns:
+            off_s = (offset_ns - system.offset_ns) / NS_PER_S
+            doubt = (
+                f"imud ignores the {what} of {title}: they differ by {off_s:+.1f} s from the synchronized system "
+                f"clock; check the receiver, and `chronyc tracking`"
+            )
+        if doubt and not self._doubts.get(what):
+            log.warning("%s", doubt)
+        self._doubts[what] = doubt
+        return bool(doubt)
 
 
 def _better(one: UtcReference | None, other: UtcReference | None) -> UtcReference | None:

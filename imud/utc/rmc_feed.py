@@ -30,6 +30,8 @@ class Refusal(StrEnum):
 
     DAMAGED = "damaged"  # not an RMC sentence, or a wrong checksum
     NOT_VALID = "not_valid"  # marked as invalid by the receiver (status V), or without a time
+    # before the release of imud, or in contradiction to a synchronized system clock: `imud.device.utc` rejects them
+    IMPLAUSIBLE = "implausible"
     STALE = "stale"  # the transmission would not end before the next second
     AHEAD = "ahead"  # the time is in the future according to the PPS line or to the host's UTC reference
     TOO_MANY = "too_many"  # above the configured rate

@@ -73,13 +73,13 @@ class KeeperBench:
         self.keeper.tick(self.now_ns, None)
         self.keeper.start(self.clock)
 
-    def second(self, number: int, *, pulse: bool = True, sentence: bool = True) -> None:
+    def second(self, number: int, *, pulse: bool = True, sentence: bool = True, off_s: int = 0) -> None:
         t_ns = BEGIN_NS + number * NS_PER_S
         if pulse:
             self.keeper.on_pulses([Edge(t_ns, True, 2 * number), Edge(t_ns + NS_PER_MS, False, 2 * number + 1)])
         self.now_ns = t_ns + NS_PER_S // 5
         if sentence:
-            self.source.give(build((UTC_S + number) * NS_PER_S), self.now_ns)
+            self.source.give(build((UTC_S + number + off_s) * NS_PER_S), self.now_ns)
         self.keeper.tick(self.now_ns, None)
 
 
@@ -133,6 +133,42 @@ def test_the_better_of_two_references_counts(bench: KeeperBench) -> None:
     by_pulses = bench.clock.utc_reference
     assert by_pulses is not None
     assert by_pulses.offset_ns != good.offset_ns
+
+
+ROLLOVER_S = 1024 * 7 * 86_400  # GPS week rollover
+
+
+@pytest.mark.parametrize(
+    ("off_s", "error_ns", "refused", "pulses", "problem"),
+    [
+        (-ROLLOVER_S, None, 6, 0, "date 2007-04-04 precedes the release of imud"),
+        (-ROLLOVER_S, NS_PER_MS, 6, 0, "date 2007-04-04 precedes the release of imud"),
+        (ROLLOVER_S, None, 0, 2, ""),  # the host knows no UTC
+        (ROLLOVER_S, NS_PER_MS, 6, 0, "the sentences of test: they differ by +619315199.8 s from the synchronized"),
+        (-3, NS_PER_MS, 6, 0, "the sentences of test: they differ by -3.2 s from"),
+        (-3, NS_PER_S, 0, 2, ""),
+        (1, NS_PER_MS, 0, 0, "the pulses of test: they differ by +1.0 s from"),
+        (0, NS_PER_MS, 0, 2, ""),
+    ],
+)
+def test_a_receiver_with_a_wrong_date(
+    caplog: pytest.LogCaptureFixture, off_s: int, error_ns: int | None, refused: int, pulses: int, problem: str
+) -> None:
+    bench = KeeperBench(system=None if error_ns is None else UtcReference(OFFSET_NS, error_ns))
+    for number in range(6):
+        bench.second(number, off_s=off_s)
+    status = bench.keeper.status()
+    assert status.refused.get("implausible", 0) == refused
+    assert len(bench.chrony.pulses) == pulses
+    assert (problem in status.problem) == (not problem or bool(status.problem))
+    assert sum(record.getMessage() == status.problem for record in caplog.records) == (1 if problem else 0)
+    if problem:
+        assert bench.written == []
+        assert bench.clock.utc_reference == bench.system
+        for number in range(6, 9):
+            bench.second(number)
+        assert bench.keeper.status().problem == ""
+        assert len(bench.written) == 3
 
 
 def test_a_clock_has_the_reference_of_each_second_from_its_start_to_the_end_of_the_link() -> None:
