@@ -113,6 +113,23 @@ def _check_regular(status: os.stat_result, path: str | os.PathLike[str]) -> None
         raise NotRegularFile(errno.EINVAL, f"is {kind}, expected a regular file", os.fspath(path))
 
 
+_OTHERS_WRITE: Final = stat.S_IWGRP | stat.S_IWOTH
+
+
+def can_replace(status: os.stat_result, path: str | os.PathLike[str], content: str) -> str:
+    """Return why other users can replace the files of a directory; empty if only root and this user can. `content`
+    names the files. In a directory with the sticky bit, other users can create files, but not replace them."""
+    if status.st_uid not in (0, os.geteuid()):
+        return (
+            f"{os.fspath(path)} belongs to user {status.st_uid}, who can replace {content}: expected root or "
+            f"{user_name()} as its owner"
+        )
+    if status.st_mode & _OTHERS_WRITE and not status.st_mode & stat.S_ISVTX:
+        mode = f"{stat.S_IMODE(status.st_mode):04o}"
+        return f"{os.fspath(path)} has mode {mode}: other users can replace {content}; chmod go-w {os.fspath(path)}"
+    return ""
+
+
 GROUP_ACCESS: Final = stat.S_IRGRP | stat.S_IWGRP  # bits of a mode that let the group read and write
 
 

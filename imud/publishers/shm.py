@@ -46,7 +46,7 @@ from imud.formats.ring import (
     ring_path,
 )
 from imud.formats.slot import SEQ_INVALID, SLOT_BYTES
-from imud.host.files import user_name
+from imud.host.files import can_replace, user_name
 from imud.model.errors import ServerError
 from imud.model.event import Event
 from imud.model.options import Options
@@ -62,7 +62,6 @@ LEFTOVERS_MAX: Final = 10_000
 _DIRECTORY_MODE = 0o755
 _OPEN_DIRECTORY = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 _CREATE = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _FLOCK = struct.Struct("hhqqi0q")  # struct flock of fcntl(2): type, whence, start, length (0: to the end), pid
 _TEMPORARY = ".new"
 
@@ -230,15 +229,8 @@ def _open(path: str) -> int:
 def _checked(descriptor: int, path: str) -> os.stat_result:
     """Return the status of the directory. Raises ServerError if other users can replace its files."""
     status = os.fstat(descriptor)
-    if status.st_uid not in (0, os.geteuid()):
-        raise ServerError(
-            f"{path} belongs to user {status.st_uid}, who can replace the rings: expected root or {user_name()} as its "
-            f"owner; set shm.directory"
-        )
-    if status.st_mode & _OTHERS_WRITE and not status.st_mode & stat.S_ISVTX:
-        raise ServerError(
-            f"{path} has mode {stat.S_IMODE(status.st_mode):04o}: other users can replace the rings; chmod go-w {path}"
-        )
+    if problem := can_replace(status, path, "the rings"):
+        raise ServerError(f"{problem}; set shm.directory")
     if not os.access(".", os.W_OK | os.X_OK, dir_fd=descriptor):
         raise ServerError(f"user {user_name()} cannot create files in {path}; check its permissions (ls -ld {path})")
     return status

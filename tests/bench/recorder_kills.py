@@ -54,7 +54,7 @@ devices:
 
 
 def new_files(folder: Path, before: set[Path], least_bytes: int) -> list[Path]:
-    found = (one for one in (folder / "recordings").glob("*") if one not in before)
+    found = (one for one in (folder / "recordings").glob("*.imudrec") if one not in before)
     return [one for one in found if one.stat().st_size >= least_bytes]
 
 
@@ -63,7 +63,7 @@ def run_and_kill(folder: Path, after_s: float, least_bytes: int = 1) -> tuple[Pa
 
     Return the file, and the time of the kill, CLOCK_MONOTONIC, ns.
     """
-    before = set((folder / "recordings").glob("*"))
+    before = set((folder / "recordings").glob("*.imudrec"))
     daemon = subprocess.Popen(
         [sys.executable, "-m", "imud", "run", "--config", str(configured(folder))], stderr=subprocess.DEVNULL
     )

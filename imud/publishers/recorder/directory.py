@@ -3,6 +3,7 @@
 import logging
 import os
 import re
+import stat
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -15,7 +16,7 @@ from typing import Annotated, Final, NamedTuple
 import msgspec
 
 from imud.contracts.lines import InputOptions
-from imud.host.files import read_regular, replace_file
+from imud.host.files import can_replace, read_regular, replace_file
 from imud.model.options import Options
 from imud.model.units import NS_PER_S
 
@@ -40,7 +41,6 @@ class RecordingFile(NamedTuple):
     name: str
     size: int
     mtime_ns: int  # CLOCK_REALTIME of the last write
-    uid: int
     run: str  # eight digits of the epoch of its daemon
     number: int
     kind: str  # SNAPSHOT, or empty
@@ -49,8 +49,10 @@ class RecordingFile(NamedTuple):
 class RecordingDirectory:
     """Directory of recordings. Synchronization: any thread."""
 
-    def __init__(self, path: Path, keep_bytes: int) -> None:
+    def __init__(self, path: Path, keep_bytes: int, *, own_only: bool = False) -> None:
+        """`own_only`: ignore the files of other users."""
         self.path = path
+        self._owners = {0, os.geteuid()} if own_only else None
         self.removed = 0  # number of files removed since the start
         self.in_use: set[str] = set()  # names of open files, which imud does not remove
         # Size of the files that are not open, from the last measurement and the files added after it
@@ -65,6 +67,20 @@ class RecordingDirectory:
     def make(self) -> None:
         """Create the directory if it does not exist. Raises OSError."""
         self.path.mkdir(mode=0o750, parents=True, exist_ok=True)
+
+    def problem(self) -> str:
+        """Return why other users can replace the files; empty if they cannot, or if the directory is missing."""
+        above = {*self.path.parents, *(real := self.path.resolve()).parents, self.path}
+        try:
+            found = [(level, level.lstat()) for level in sorted(above)]
+            problems = [can_replace(real.stat(), real, "its files")]
+        except OSError:
+            return ""
+        for level, status in found:
+            is_open = stat.S_ISDIR(status.st_mode) and status.st_mode & stat.S_IWOTH
+            if is_open or status.st_uid not in (0, os.geteuid()):  # also the owner of a symbolic link
+                problems.append(can_replace(status, level, "its files"))
+        return next(filter(None, problems), "")
 
     def begin_run(self, epoch: int, kind: str = "") -> int:
         """Add the run of this daemon after all known runs of the directory. Return the number of its next file of this
@@ -101,10 +117,11 @@ class RecordingDirectory:
                 if name is not None and entry.is_file(follow_symlinks=False):
                     with suppress(FileNotFoundError):
                         status, run = entry.stat(follow_symlinks=False), name["run"]
+                        if self._owners is not None and status.st_uid not in self._owners:
+                            continue
                         file = RecordingFile(
-                            entry.name, status.st_size, status.st_mtime_ns, status.st_uid, run, int(name["number"]),
-                            name["kind"] or "",
-                        )  # fmt: skip
+                            entry.name, status.st_size, status.st_mtime_ns, run, int(name["number"]), name["kind"] or ""
+                        )
                         runs.setdefault(run, []).append(file)
                         found += 1
                 if found >= FILES_MAX:

@@ -480,7 +480,9 @@ class FlightRecorder:
         self._segment_ns = max(SEGMENT_NS_MIN, (self._keep_ns + after_ns) // (SEGMENTS_MAX // 2))
         self._bytes_max = round(flight.memory_mb * MEGABYTE)
         # directory of the segments; None in memory
-        self._own = RecordingDirectory(Path(flight.directory), self._bytes_max) if flight.directory else None
+        self._own = (
+            RecordingDirectory(Path(flight.directory), self._bytes_max, own_only=True) if flight.directory else None
+        )
         self._ring = SegmentRing(self._bytes_max)
         self._queue = RecordQueue[Mark]()
         self._feed = RecordFeed(context, self._queue, settings.devices)
@@ -494,6 +496,7 @@ class FlightRecorder:
         self._segments = self._snapshots = self._sends = 0  # numbers since the start
         self._saved = self._failed = 0  # snapshots by result
         self._problem = ""
+        self._own_problem = ""  # why the flight recorder does not use its directory
 
     # --- publisher ----------------------------------------------------------------------------------------------------
 
@@ -503,9 +506,6 @@ class FlightRecorder:
             self._directory.make()
             self._snapshots = self._directory.begin_run(self._context.epoch, SNAPSHOT)
             self._directory.measure()
-            if self._own is not None:
-                self._own.make()
-                self._own.make_room(0)
             left = self._left_behind()
         except OSError as error:
             raise ServerError(f"flight recorder: {error.filename or ''}: {reason_of(error)}") from error
@@ -518,7 +518,7 @@ class FlightRecorder:
             self._line = context.watch_line(self._settings.line, "flight recorder", self)
         context.outputs.snapshots.append(self.snapshot)
         context.outputs.flights.append(self.status)
-        where = f"in {self._settings.directory}" if self._own is not None else "in memory"
+        where = f"in {self._settings.directory}" if self._own is not None and not self._own_problem else "in memory"
         log.info("flight recorder: keeping the last %g minutes %s", self._settings.minutes, where)
 
     def add_device(self, name: str, device_id: int) -> None:
@@ -609,7 +609,7 @@ class FlightRecorder:
     def _begin_segment(self, now_ns: int) -> None:
         context, pending = self._context, self._gate.pending
         path = None
-        if self._own is not None:
+        if self._own is not None and not self._check_own(self._own, now_ns):
             path = self._own.new_file(now_ns + context.clock.utc_offset_ns(), context.epoch, self._segments)
         keep_from_ns = (now_ns if pending is None else pending.t_ns) - self._keep_ns
         self._queue.mark(SegmentBegin(now_ns, self._feed.session(0, now_ns), path, keep_from_ns))
@@ -618,12 +618,27 @@ class FlightRecorder:
         self._feed.describe(at_once=False)
         self._feed.follow()
 
+    def _check_own(self, own: RecordingDirectory, now_ns: int) -> str:
+        """Return why other users can replace the segments; empty if they cannot. Report each change."""
+        before, self._own_problem = self._own_problem, own.problem()
+        if before != self._own_problem:
+            words = (
+                f"{self._own_problem}; it keeps the data in memory"
+                if self._own_problem
+                else f"it uses {own.path} again"
+            )
+            self._raise(now_ns, f"flight recorder: {words}")
+        return self._own_problem
+
     def _left_behind(self) -> list[Rescue]:
         """Return the segments of killed daemons, one snapshot for each run. Raises OSError."""
-        runs: dict[str, list[Path]] = {}
-        for file in self._own.files() if self._own is not None else ():
-            assert self._own is not None
-            runs.setdefault(file.run, []).append(self._own.path / file.name)
+        runs, own = dict[str, list[Path]](), self._own
+        if own is not None:
+            own.make()
+            if not own.problem():
+                own.make_room(0)
+                for file in own.files():
+                    runs.setdefault(file.run, []).append(own.path / file.name)
         return [
             Rescue(self._directory.path / files[0].name.replace(SUFFIX, SNAPSHOT + SUFFIX), files)
             for files in runs.values()

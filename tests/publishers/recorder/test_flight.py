@@ -1,5 +1,6 @@
 """Flight recorder: kept data, saved alerts, and reports."""
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from imud.publishers.recorder.flight import FlightRecorder
 from tests.publishers.recorder.recording_bench import RecordingBench, records_in
 from tests.support.publisher_context import NoLine
 from tests.support.socket_rig import sample
+from tests.support.surroundings import HOSTILE_UID, needs_root
 
 SENDS_MAX, RETRY_NS = 4, 60 * NS_PER_S
 
@@ -218,6 +220,59 @@ def test_a_client_receives_the_present_data(tmp_path: Path) -> None:
     for pair in pairs:
         for sock in pair:
             sock.close()
+
+
+@needs_root
+@pytest.mark.parametrize(
+    "untrusted", ["owner", "owner with sticky bit", "0777", "0770", "link", "parent", "file of another user"]
+)
+def test_a_directory_that_another_user_can_change(tmp_path: Path, untrusted: str) -> None:
+    """imud rescues and removes no file there, keeps the data in memory, and uses the directory again later."""
+    parent, folder = tmp_path / "parent", tmp_path / "parent" / "flight"
+    killed = FlightBench(tmp_path, directory=str(folder))
+    killed.tick(12)
+    forged = folder / "20260101T000000Z-00000001-000000.imudrec"
+    forged.touch()
+    os.truncate(forged, 200_000_000)  # above the limit of the directory: imud would remove the other files
+    left = sorted(folder.iterdir())
+    match untrusted:
+        case "link":
+            folder.rename(tmp_path / "elsewhere")
+            folder.symlink_to(tmp_path / "elsewhere")
+            os.chown(folder, HOSTILE_UID, HOSTILE_UID, follow_symlinks=False)
+        case "parent":
+            os.chown(parent, HOSTILE_UID, HOSTILE_UID)
+        case "file of another user":
+            os.chown(forged, HOSTILE_UID, HOSTILE_UID)
+            folder.chmod(0o1777)
+        case "0777" | "0770":
+            folder.chmod(int(untrusted, 8))
+        case _:
+            folder.chmod(0o1777 if "sticky" in untrusted else 0o755)
+            os.chown(folder, HOSTILE_UID, HOSTILE_UID)
+    bench = FlightBench(tmp_path, directory=str(folder))
+    bench.tick(12)
+    if untrusted == "file of another user":  # only the other files are segments
+        assert forged.stat().st_size == 200_000_000
+        (file,) = bench.files
+        assert bench.messages == [f"saved {file}: data of an imud process that was killed"]
+        bench.flight.close()
+        killed.flight.close()
+        return
+    assert sorted(folder.iterdir()) == left
+    assert bench.files == []
+    assert bench.flight.status().kept_ns > 0
+    (message,) = bench.messages
+    assert message.startswith(f"flight recorder: {parent}")
+    assert message.endswith("; it keeps the data in memory")
+    for path in (folder, parent):
+        os.chown(path, 0, 0, follow_symlinks=False)
+    folder.chmod(0o750)
+    bench.tick(12)
+    assert bench.messages[1:] == [f"flight recorder: it uses {folder} again"]
+    assert len(list(folder.iterdir())) > len(left)
+    bench.flight.close()
+    killed.flight.close()
 
 
 def test_a_failed_segment_is_reported_once_and_tried_again(tmp_path: Path) -> None:
