@@ -27,6 +27,7 @@ from imud.daemon import Daemon
 from imud.host.clock import HostClock
 from imud.model.errors import CommandError
 from imud.model.units import NS_PER_S
+from imud.publishers.shm import ShmOptions
 from imud.utc.system_clock import KernelClock
 from tests.support.daemon_process import LIMIT_S, RunningDaemon, running_daemon, wait_until, write_config
 from tests.support.event_loops import in_loop
@@ -138,6 +139,27 @@ def test_outputs_do_not_read_the_clocks_that_stamp_samples(monkeypatch: pytest.M
 def test_a_device_that_there_is_not_is_an_error_of_who_asks() -> None:
     with pytest.raises(CommandError, match=r"^nobody: no such device$"):
         Daemon(Config("info", "", {}, ())).control("nobody")
+
+
+@in_loop
+async def test_a_reload_without_any_usable_directory_keeps_the_daemon(tmp_path: Path) -> None:
+    """Both the old and the new directory of shared memory are missing."""
+    old, new = tmp_path / "old", tmp_path / "new"
+    old.mkdir()
+    daemon = Daemon(Config("info", "", {"shm": ShmOptions(directory=str(old))}, ()))
+    running = asyncio.create_task(daemon.run())
+    await asyncio.sleep(0)
+    old.rmdir()
+    await daemon.change_to(Config("info", "", {"shm": ShmOptions(directory=str(new))}, ()))
+    assert daemon.config.publishers["shm"] == ShmOptions(directory=str(old))
+    assert "not yet: shm" in daemon._summary()
+    daemon._outputs.tick(monotonic_ns() + 100 * NS_PER_S)  # a later attempt
+    assert not running.done()
+    old.mkdir()
+    daemon._outputs.tick(monotonic_ns() + 1000 * NS_PER_S)
+    assert "outputs: shm" in daemon._summary()
+    daemon.stop()
+    await running
 
 
 class EndingOutput:

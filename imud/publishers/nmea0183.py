@@ -25,6 +25,7 @@ from imud.contracts.publisher import Batch, PublisherContext, PublisherType
 from imud.contracts.status import OutputStatus
 from imud.formats import nmea0183
 from imud.formats.nmea0183 import Transducer
+from imud.host.network import listen, open_socket
 from imud.model.errors import ServerError, reason_of
 from imud.model.event import Event
 from imud.model.options import Options, is_ip_address, shown
@@ -34,7 +35,6 @@ from imud.publishers.thinning import MeanRate, Pace
 
 log = logging.getLogger(__name__)
 
-BACKLOG: Final = 8
 CLIENTS_MAX: Final = 32  # maximum number of clients: plotters and instruments of one vessel
 STUCK_NS: Final = 30 * NS_PER_S  # time without progress after which imud disconnects a client, ns
 RECV_BYTES: Final = 4096
@@ -102,19 +102,13 @@ class TcpOutput:
 
     def open(self) -> None:
         """Listen. Raises ServerError if address and port cannot be used."""
-        family = socket.AF_INET6 if ":" in self._address else socket.AF_INET
-        listener = socket.socket(family, socket.SOCK_STREAM)
         try:
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            listener.bind((self._address, self.port))
-            listener.listen(BACKLOG)
+            listener = listen(self._address, self.port)
         except OSError as error:
-            listener.close()
             raise ServerError(
                 f"cannot open the NMEA 0183 server at {self._address} port {self.port}: {reason_of(error)}; "
                 f"set nmea0183.tcp_port to another port, or to null"
             ) from error
-        listener.setblocking(False)
         self.port = listener.getsockname()[1]
         self._listener = listener
         asyncio.get_running_loop().add_reader(listener, self._accept)
@@ -203,11 +197,7 @@ class UdpOutput:
 
     def __init__(self, address: str, port: int) -> None:
         self._address = (address, port)
-        family = socket.AF_INET6 if ":" in address else socket.AF_INET
-        self._sock = socket.socket(family, socket.SOCK_DGRAM)
-        self._sock.setblocking(False)
-        if family == socket.AF_INET:
-            self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        self._sock: socket.socket | None = None
         self._sent = self._dropped = 0
         self._problem = ""
 
@@ -215,8 +205,8 @@ class UdpOutput:
         """Send sentences as one datagram."""
         count = sentences.count(b"\n")
         try:
-            self._sock.sendto(sentences, self._address)
-        except OSError as error:  # no route, network down, or no receiver: the next datagram can arrive
+            self._opened().sendto(sentences, self._address)
+        except OSError as error:  # no IPv6, no route, network down, or no receiver: the next datagram can arrive
             self._dropped += count
             problem = reason_of(error)
             if problem != self._problem:
@@ -235,7 +225,15 @@ class UdpOutput:
 
     def close(self) -> None:
         """Close the socket. A second call does nothing."""
-        self._sock.close()
+        if self._sock is not None:
+            self._sock.close()
+
+    def _opened(self) -> socket.socket:
+        if self._sock is None:
+            self._sock = open_socket(self._address[0], socket.SOCK_DGRAM)
+            if self._sock.family == socket.AF_INET:
+                self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        return self._sock
 
 
 def open_serial(port: str, baud: int) -> int:

@@ -17,6 +17,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Final
 
+from imud.host.network import listen
 from imud.host.threads import share_interpreter
 from imud.model.errors import ServerError
 
@@ -87,7 +88,10 @@ class ScrapeServer:
         Raises ServerError if address and port cannot be used."""
         share_interpreter()
         self._answer = answer
-        self._listener = _listen(self.address, self.port)
+        try:
+            self._listener = listen(self.address, self.port)
+        except OSError as error:
+            raise ServerError(_bind_message(self.address, self.port, error)) from error
         self.port = self._listener.getsockname()[1]
         ready = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(self._listener, ready), name="scrape", daemon=True)
@@ -197,20 +201,6 @@ def _response(answer: HttpResponse, *, with_body: bool) -> bytes:
         f"Content-Length: {len(answer.body)}\r\nConnection: close\r\n\r\n"
     )
     return head.encode("latin-1") + (answer.body if with_body else b"")
-
-
-def _listen(address: str, port: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in address else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((address, port))
-        listener.listen()
-        listener.setblocking(False)
-    except OSError as error:
-        listener.close()
-        raise ServerError(_bind_message(address, port, error)) from error
-    return listener
 
 
 def _bind_message(address: str, port: int, error: OSError) -> str:
