@@ -70,6 +70,7 @@ class TcpClient:
         self._rest = b""  # rest of a sentence that the kernel accepted in part
         # Time since which the socket buffer is full; None if it has room or imud sends nothing
         self.full_ns: int | None = None
+        self.is_half_closed = False  # whether the client has shut down its sending direction, or closed the connection
 
     def put(self, sentences: bytes, now_ns: int) -> bool:
         """Send or drop sentences. Return whether imud sent them. Raises OSError if the connection ended."""
@@ -159,6 +160,9 @@ class TcpOutput:
             loop.call_later(ACCEPT_PAUSE_S, self._listen_again)
             return
         peer = f"{address[0]} port {address[1]}"
+        half_closed = [number for number, client in self._clients.items() if client.is_half_closed]
+        if len(self._clients) >= CLIENTS_MAX and half_closed:  # without sentences, imud does not see which are closed
+            self._drop_client(half_closed[0])
         if len(self._clients) >= CLIENTS_MAX:
             log.info("nmea0183: rejecting %s: the limit of %d clients is reached", peer, CLIENTS_MAX)
             sock.close()
@@ -178,13 +182,13 @@ class TcpOutput:
         if client is None:
             return
         try:
-            if client.sock.recv(RECV_BYTES):
-                return
+            if not client.sock.recv(RECV_BYTES):  # the next sentences show whether the client still reads
+                client.is_half_closed = True
+                asyncio.get_running_loop().remove_reader(client.sock)
         except BlockingIOError:
             return
-        except OSError:
-            pass  # the client reset the connection
-        self._drop_client(number)
+        except OSError:  # the client reset the connection
+            self._drop_client(number)
 
     def _drop_client(self, number: int) -> None:
         client = self._clients.pop(number)

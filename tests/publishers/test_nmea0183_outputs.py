@@ -1,6 +1,7 @@
 """Ports: accepted sentences arrive complete, other sentences are dropped and counted, and no port waits."""
 
 import asyncio
+import errno
 import os
 import socket
 import tty
@@ -13,6 +14,7 @@ import pytest
 from imud.contracts.status import OutputStatus
 from imud.model.errors import ServerError
 from imud.model.units import NS_PER_S
+from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 from imud.publishers.nmea0183 import SerialOutput, TcpOutput, UdpOutput
 from imud.publishers.nmea0183 import open_serial as open_real_port
 from tests.support.event_loops import VirtualClock, in_loop
@@ -64,9 +66,19 @@ async def test_every_client_gets_every_sentence(made: Server) -> None:
     assert first.recv(100) == second.recv(100) == ONE * 2
     assert made.status().sent == 4
     assert made.status().dropped == 0
-    for sock in (first, second):
-        sock.close()
-    await until(lambda: made.status().readers == 0)
+    first.shutdown(socket.SHUT_WR)  # kplex direction=in, ncat </dev/null
+    second.close()
+
+    def is_alone() -> bool:
+        made.put(ONE)
+        return made.status().readers == 1
+
+    await until(is_alone)
+    first.recv(10_000)
+    for _ in range(5):
+        made.put(ONE)
+        assert first.recv(100) == ONE
+    assert made.status().readers == 1
 
 
 @in_context("made", serving)
@@ -129,6 +141,14 @@ async def test_clients_above_the_limit_are_rejected(made: Server) -> None:
     await until(is_closed)
     assert closed == [b""]
     assert made.status().readers == CLIENTS_MAX
+    made.clients[3].shutdown(socket.SHUT_WR)
+    for _ in range(10):
+        await asyncio.sleep(0)
+    made.connect()  # in place of the client that can be closed
+    made.clients[3].setblocking(False)
+    one_more = made.clients[3]
+    await until(is_closed)
+    assert made.status().readers == CLIENTS_MAX
 
 
 @in_context("made", serving)
@@ -156,6 +176,29 @@ def test_datagrams_without_a_route_are_counted_and_logged_once(caplog: pytest.Lo
     assert "too long" in made.status().problem
     assert len(caplog.records) == 1
     made.close()
+
+
+@in_loop
+async def test_a_kernel_without_ipv6(monkeypatch: pytest.MonkeyPatch) -> None:
+    def make(family: int, kind: int) -> socket.socket:
+        if family == socket.AF_INET6:
+            raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
+        return real(family, kind)
+
+    async def answer(_request: HttpRequest) -> HttpResponse:
+        raise AssertionError
+
+    real = socket.socket
+    monkeypatch.setattr(socket, "socket", make)
+    made = UdpOutput("::1", 9)
+    made.put(ONE)
+    assert (made.status().dropped, made.status().readers) == (1, 0)
+    assert "not supported" in made.status().problem
+    made.close()
+    with pytest.raises(ServerError, match="::1 port 0: Address family not supported by protocol"):
+        TcpOutput("::1", 0, VirtualClock().now_ns).open()
+    with pytest.raises(ServerError, match="::1 port 0: Address family not supported by protocol"):
+        ScrapeServer("::1", 0, answer).start()
 
 
 class Port:

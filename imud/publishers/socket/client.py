@@ -171,6 +171,10 @@ class Clients(ABC):
     def remove(self, connection: "ClientConnection") -> None:
         """Remove a client that has ended. Do nothing if it is unknown."""
 
+    @abstractmethod
+    def has_news_for(self, connection: "ClientConnection") -> bool:
+        """Return whether a client gets more messages or wakes without another request."""
+
     def count_failed(self, error: Exception) -> None:
         """Count a client that an internal error ended. Log the error at most once a minute."""
         self._failed += 1
@@ -203,6 +207,7 @@ class ClientConnection(Outbox, ScheduledClient):
         self._work_bytes = 0
         self._readable = self._writable = False
         self._linger_ticks: int | None = None
+        self._input_ended = False  # whether the client has shut down its sending direction
 
     def post(self, body: bytes, fd: int = NO_FD) -> None:
         """Send one JSON object, with a copy of `fd` if given."""
@@ -253,7 +258,10 @@ class ClientConnection(Outbox, ScheduledClient):
             self.close()
 
     def tick(self) -> None:
-        """Close the connection LINGER_TICKS after `finish`. The server calls this method every 100 ms."""
+        """Close the connection LINGER_TICKS after `finish`. Finish it after the last reply to a client that has shut
+        down its sending direction. The server calls this method every 100 ms."""
+        if self._input_ended:
+            self._finish_if_done()
         if self._linger_ticks is not None:
             self._linger_ticks -= 1
             if self._linger_ticks <= 0:
@@ -292,7 +300,9 @@ class ClientConnection(Outbox, ScheduledClient):
         return self._has_work()
 
     def wanted_events(self) -> int:
-        events = 0 if self.finishing or self._readable else select.EPOLLIN
+        # a client that has shut down its sending direction stays readable: EPOLLHUP reports that it closes the socket
+        waits_for = select.EPOLLHUP if self._input_ended else select.EPOLLIN
+        events = 0 if self.finishing or self._readable else waits_for
         return events | select.EPOLLOUT if self.waiting and not self._writable else events
 
     def on_failure(self, error: Exception) -> None:
@@ -353,12 +363,20 @@ class ClientConnection(Outbox, ScheduledClient):
         except OSError:  # reset by the peer
             self.close()
             return
-        if not data:
+        if not data and self._input_ended:  # EPOLLHUP
             self.finish()
+            return
+        if not data:
+            self._input_ended, self._readable = True, False
+            self._finish_if_done()
             return
         self._readable = len(data) == RECV_BYTES
         self.count_bytes(len(data))
         self._input += data if self._input else data.lstrip(BLANK)
+
+    def _finish_if_done(self) -> None:
+        if self._work is None and not self._clients.has_news_for(self):
+            self.finish()
 
     def _next_line(self) -> bytes | None:
         """Take the next complete line from the input; None if there is none. A line above the limit ends the client."""

@@ -36,16 +36,16 @@ class ClientRecordings:
         self._context = context
         self._check_fds = check_fds
         self._ids: dict[str, int] = {}
-        self._running: dict[int, ClientRecording] = {}  # recordings by client number
+        self.running: dict[int, ClientRecording] = {}  # recordings by client number
         self._ending: list[ClientRecording] = []  # stopped recordings that still send their queue
 
     # --- requests of a client -----------------------------------------------------------------------------------------
 
     def start(self, connection: ClientConnection, devices: Collection[str] | None) -> int:
         """Start the recording of a client. Return the descriptor for the reply. Raises RpcError."""
-        if connection.number in self._running:
+        if connection.number in self.running:
             raise RpcError(Code.UNAVAILABLE, "record.start: this connection already records; stop it with record.stop")
-        count = len(self._running) + len(self._ending)
+        count = len(self.running) + len(self._ending)
         if count >= RECORDINGS_MAX:
             raise RpcError(Code.UNAVAILABLE, f"record.start: {count} recordings are running, the maximum")
         ours, fd = self._make_pair(connection, "record.start")
@@ -56,13 +56,13 @@ class ClientRecordings:
             raise RpcError(Code.UNAVAILABLE, f"record.start: the daemon cannot record: {error}") from None
         for name, device_id in self._ids.items():
             made.add_device(name, device_id)
-        self._running[connection.number] = made
+        self.running[connection.number] = made
         log.info("client %d (pid %d, uid %d) records", connection.number, connection.peer.pid, connection.uid)
         return fd
 
     def stop(self, connection: ClientConnection) -> tuple[bool, int]:
         """Stop the recording of a client. Return whether it had one, and the number of dropped records."""
-        made = self._running.pop(connection.number, None)
+        made = self.running.pop(connection.number, None)
         if made is None:
             return False, 0
         made.stop("it was stopped")
@@ -86,7 +86,7 @@ class ClientRecordings:
 
     def remove(self, connection: ClientConnection) -> None:
         """Abort the recording, if any, of a client that has ended."""
-        made = self._running.pop(connection.number, None)
+        made = self.running.pop(connection.number, None)
         if made is not None:
             made.close()
             log.info("client %d stopped recording: its connection has ended", connection.number)
@@ -110,25 +110,25 @@ class ClientRecordings:
 
     def add_device(self, name: str, device_id: int) -> None:
         self._ids[name] = device_id
-        for made in self._running.values():
+        for made in self.running.values():
             made.add_device(name, device_id)
 
     def remove_device(self, name: str) -> None:
         """Remove a device, which may be added again."""
         self._ids.pop(name, None)
-        for made in self._running.values():
+        for made in self.running.values():
             made.remove_device(name)
 
     def event(self, event: Event) -> None:
-        for made in self._running.values():
+        for made in self.running.values():
             made.event(event)
 
     def tick(self, now_ns: int) -> None:
         """Check all recordings, and close the finished ones."""
-        for number, made in list(self._running.items()):
+        for number, made in list(self.running.items()):
             made.tick(now_ns)
             if made.ended:
-                self._running.pop(number).close()
+                self.running.pop(number).close()
                 log.info("client %d stopped recording: it has closed its descriptor", number)
         for made in list(self._ending):
             made.tick(now_ns)
@@ -138,11 +138,11 @@ class ClientRecordings:
 
     def close(self) -> None:
         """Stop all recordings regularly. A second call does nothing."""
-        for made in self._running.values():
+        for made in self.running.values():
             made.stop("imud stopped")
-        for made in (*self._running.values(), *self._ending):
+        for made in (*self.running.values(), *self._ending):
             made.close(flush=True)
-        self._running.clear()
+        self.running.clear()
         self._ending.clear()
 
 
@@ -337,6 +337,11 @@ class Hub(Clients):
     def busy(self, connection: ClientConnection) -> bool:
         """Return whether a request of the client still runs."""
         return connection.number in self._work
+
+    def has_news_for(self, connection: ClientConnection) -> bool:
+        number = connection.number
+        sources = (self._subscriptions, self._events, self._work, self.recordings.running)
+        return bool(connection.wakers) or any(number in source for source in sources)
 
     def do_later(self, connection: ClientConnection, work: Coroutine[Any, Any, None]) -> None:
         """Run a request that takes time. It continues if the client leaves."""

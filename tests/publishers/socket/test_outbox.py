@@ -11,9 +11,11 @@ from contextlib import suppress
 from typing import Any
 
 import pytest
+from msgspec.json import encode
 
 from imud.formats.jsonrpc import encode_notification
 from imud.formats.slot import SLOT_BYTES, decode_slot
+from imud.model.event import Event, EventKind
 from imud.publishers.socket.client import BYTE, ClientConnection
 from imud.publishers.socket.outbox import (
     NO_FD,
@@ -27,7 +29,7 @@ from imud.publishers.socket.outbox import (
     Pool,
 )
 from imud.publishers.socket.server import SocketServer
-from tests.support.socket_rig import Peer, batch, in_server, run, until
+from tests.support.socket_rig import Peer, batch, done_late, in_server, run, until
 
 
 async def read_samples(peer: Peer, last: dict[str, int]) -> list[tuple[str, int, dict[str, int]]]:
@@ -250,6 +252,34 @@ async def test_large_replies_reach_a_client_that_has_shut_down_its_side(server: 
     await until(lambda: connection.finishing)
     assert await peer.body() == note
     assert await peer.ended()
+
+
+@pytest.mark.parametrize("method", ["watch", "events", "command", "status"])
+@in_server()
+async def test_a_client_that_has_shut_down_its_side_gets_everything_that_it_asked_for(
+    server: SocketServer, method: str
+) -> None:
+    peer = await Peer.greeted(server)
+    (connection,) = server.hub.connections.values()
+    parameters = {"device": "imu0", "name": "wait"} if method == "command" else {}
+    done_late.clear()
+    await peer.send(encode({"jsonrpc": "2.0", "id": 1, "method": method, "params": parameters}) + b"\n")
+    peer.sock.shutdown(socket.SHUT_WR)
+    if method == "command":
+        await until(lambda: server.hub.busy(connection))
+        server.tick(0)
+        done_late.set()
+    assert (await peer.message())["id"] == 1
+    for number in range(3 if method in ("watch", "events") else 0):
+        server.tick(0)
+        server.publish(batch(first=1 + number))
+        server.event(Event(1, "imu0", EventKind.UP, "is there"))
+        assert (await peer.message())["method"] == {"watch": "sample", "events": "event"}[method]
+    if method in ("command", "status"):
+        server.tick(0)
+        assert await peer.ended()
+    peer.close()
+    await until(lambda: connection.closed)
 
 
 @in_server()
