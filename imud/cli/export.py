@@ -29,7 +29,6 @@ from imud.cli.export_sources import (
     ExportFeed,
     McapSink,
     Progress,
-    RecordedClock,
     RecordedFacts,
     Sink,
     export_capture,
@@ -45,6 +44,7 @@ from imud.host.files import WRITE_FLAGS, open_regular
 from imud.host.log import STDERR, log_to
 from imud.model.errors import BadArgument, ImudError, reason_of
 from imud.recording.capture_player import NAME, KnownTimes
+from imud.recording.player import RecordedClock
 
 MODE: Final = 0o666  # mode of a new file before the umask
 

@@ -8,7 +8,6 @@ import shutil
 import struct
 import subprocess
 import sys
-from bisect import bisect_right
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from fcntl import F_SETPIPE_SZ, fcntl
@@ -18,7 +17,6 @@ from time import monotonic
 from typing import IO, TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple, Protocol, TextIO
 
 import msgspec
-from msgspec.structs import replace
 
 from imud.attitude.conventions import Convention
 from imud.attitude.published import PublishedAxes
@@ -49,9 +47,8 @@ from imud.model.event import Event, kind_of
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import SAMPLE_FIELDS, Sample
-from imud.model.units import NS_PER_MS
 from imud.recording.capture_player import CapturePlayer, KnownTimes
-from imud.recording.player import PlayedDevice, Player, RecordedEvent
+from imud.recording.player import PlayedDevice, Player, RecordedClock, RecordedEvent
 
 if TYPE_CHECKING:  # imports libraries of the extra `export`, which CSV does not need
     from imud.bridges.mcap import McapChannel, McapFile
@@ -334,45 +331,6 @@ class Exported(NamedTuple):
 
     report: str  # report about the devices and the file, as text
     status: int  # 0 if the file is complete and its samples are equal to the live run, otherwise 1
-
-
-# Minimum difference of two offsets for a step of the wall clock, ns. A more exact reading differs by some microseconds.
-STEP_NS: Final = 1 * NS_PER_MS
-
-
-class RecordedClock:
-    """CLOCK_REALTIME of a recording: CLOCK_MONOTONIC plus the last recorded offset. Times before a step of the wall
-    clock then match the corrected clock. CLOCK_MONOTONIC stops during a suspend, so each suspend starts a new offset.
-    """
-
-    def __init__(self) -> None:
-        self._suspends = 0
-        self._starts_ns: list[int] = []  # CLOCK_MONOTONIC at the start of each offset
-        self._offsets_ns: list[int] = []
-
-    def add(self, monotonic_ns: int, offset_ns: int, suspends: int) -> None:
-        """Add a reading of the clocks, in the order of the file."""
-        if self._offsets_ns and suspends == self._suspends:
-            self._offsets_ns[-1] = offset_ns
-            return
-        self._suspends = suspends
-        self._starts_ns.append(monotonic_ns)
-        self._offsets_ns.append(offset_ns)
-
-    def utc_ns(self, t_ns: int, recorded_ns: int) -> int:
-        """Return CLOCK_REALTIME at a CLOCK_MONOTONIC time; `recorded_ns` if the wall clock did not step after it."""
-        if not self._offsets_ns:
-            return recorded_ns
-        utc_ns = t_ns + self._offsets_ns[max(bisect_right(self._starts_ns, t_ns) - 1, 0)]
-        return utc_ns if abs(utc_ns - recorded_ns) > STEP_NS else recorded_ns
-
-    def placed(self, batch: Batch) -> Batch:
-        """Return samples with `utc_ns` of this clock."""
-        times_ns = [self.utc_ns(sample.t_ns, sample.utc_ns) for sample in batch.samples]
-        if times_ns == [sample.utc_ns for sample in batch.samples]:
-            return batch
-        placed = [replace(sample, utc_ns=utc_ns) for sample, utc_ns in zip(batch.samples, times_ns, strict=True)]
-        return Batch(batch.device, batch.device_id, placed, batch.frame)
 
 
 class RecordedFacts(NamedTuple):

@@ -4,11 +4,13 @@ The replay makes the samples, time stamps, errors and ledger counters of the liv
 values of the live run. The player compares them with its own values and counts the differences.
 """
 
+from bisect import bisect_right
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 import msgspec
+from msgspec.structs import replace
 
 from imud import __version__
 from imud.attitude.conventions import Convention
@@ -28,6 +30,7 @@ from imud.model.errors import ImudError, TransferError, reason_of
 from imud.model.event import Event, kind_of
 from imud.model.ledger import LEDGER_FIELDS, Ledger
 from imud.model.options import NoOptions
+from imud.model.units import NS_PER_MS
 from imud.recording.observer import TROUBLES
 from imud.recording.state import StateError, StateReader
 from imud.sampling.path import (
@@ -87,6 +90,45 @@ class PlayedClock(HostClock):
     def utc_offset_ns(self) -> int:
         """Return CLOCK_REALTIME minus CLOCK_MONOTONIC of the newest record, ns."""
         return self.offset_ns
+
+
+# Minimum difference of two offsets for a step of the wall clock, ns. A more exact reading differs by some microseconds.
+STEP_NS: Final = 1 * NS_PER_MS
+
+
+class RecordedClock:
+    """CLOCK_REALTIME of a recording: CLOCK_MONOTONIC plus the last recorded offset. Times before a step of the wall
+    clock then match the corrected clock. CLOCK_MONOTONIC stops during a suspend, so each suspend starts a new offset.
+    """
+
+    def __init__(self) -> None:
+        self._suspends = 0
+        self._starts_ns: list[int] = []  # CLOCK_MONOTONIC at the start of each offset
+        self._offsets_ns: list[int] = []
+
+    def add(self, monotonic_ns: int, offset_ns: int, suspends: int) -> None:
+        """Add a reading of the clocks, in the order of the file."""
+        if self._offsets_ns and suspends == self._suspends:
+            self._offsets_ns[-1] = offset_ns
+            return
+        self._suspends = suspends
+        self._starts_ns.append(monotonic_ns)
+        self._offsets_ns.append(offset_ns)
+
+    def utc_ns(self, t_ns: int, recorded_ns: int) -> int:
+        """Return CLOCK_REALTIME at a CLOCK_MONOTONIC time; `recorded_ns` if the wall clock did not step after it."""
+        if not self._offsets_ns:
+            return recorded_ns
+        utc_ns = t_ns + self._offsets_ns[max(bisect_right(self._starts_ns, t_ns) - 1, 0)]
+        return utc_ns if abs(utc_ns - recorded_ns) > STEP_NS else recorded_ns
+
+    def placed(self, batch: Batch) -> Batch:
+        """Return samples with `utc_ns` of this clock."""
+        times_ns = [self.utc_ns(sample.t_ns, sample.utc_ns) for sample in batch.samples]
+        if times_ns == [sample.utc_ns for sample in batch.samples]:
+            return batch
+        placed = [replace(sample, utc_ns=utc_ns) for sample, utc_ns in zip(batch.samples, times_ns, strict=True)]
+        return Batch(batch.device, batch.device_id, placed, batch.frame)
 
 
 class Player:

@@ -1,7 +1,6 @@
 """Ports: accepted sentences arrive complete, other sentences are dropped and counted, and no port waits."""
 
 import asyncio
-import errno
 import os
 import socket
 import tty
@@ -14,7 +13,6 @@ import pytest
 from imud.contracts.status import OutputStatus
 from imud.model.errors import ServerError
 from imud.model.units import NS_PER_S
-from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 from imud.publishers.nmea0183 import SerialOutput, TcpOutput, UdpOutput
 from imud.publishers.nmea0183 import open_serial as open_real_port
 from tests.support.event_loops import VirtualClock, in_loop
@@ -176,29 +174,6 @@ def test_datagrams_without_a_route_are_counted_and_logged_once(caplog: pytest.Lo
     assert "too long" in made.status().problem
     assert len(caplog.records) == 1
     made.close()
-
-
-@in_loop
-async def test_a_kernel_without_ipv6(monkeypatch: pytest.MonkeyPatch) -> None:
-    def make(family: int, kind: int) -> socket.socket:
-        if family == socket.AF_INET6:
-            raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
-        return real(family, kind)
-
-    async def answer(_request: HttpRequest) -> HttpResponse:
-        raise AssertionError
-
-    real = socket.socket
-    monkeypatch.setattr(socket, "socket", make)
-    made = UdpOutput("::1", 9)
-    made.put(ONE)
-    assert (made.status().dropped, made.status().readers) == (1, 0)
-    assert "not supported" in made.status().problem
-    made.close()
-    with pytest.raises(ServerError, match="::1 port 0: Address family not supported by protocol"):
-        TcpOutput("::1", 0, VirtualClock().now_ns).open()
-    with pytest.raises(ServerError, match="::1 port 0: Address family not supported by protocol"):
-        ScrapeServer("::1", 0, answer).start()
 
 
 class Port:
