@@ -29,7 +29,7 @@ from imud.utc.receivers import RmcOptions
 
 
 class Clash(NamedTuple):
-    """Two devices that cannot have the same port, address or frames."""
+    """Two devices, or an output and a device, that cannot have the same port, address or frames."""
 
     path: KeyPath  # key to change
     message: str  # expected value, received value, and the owner
@@ -45,8 +45,10 @@ def clashes(
     links: Mapping[str, LinkType[Any]],
     drivers: Mapping[str, Driver],
     pause: Callable[[], None] = no_pause,
+    outputs: Mapping[str, Sequence[Claim]] = {},
 ) -> Iterator[Clash]:
-    """Return the conflicts of each device with the devices before it. imud follows symbolic links and opens no port."""
+    """Return the conflicts of each device with the devices before it, and of each output with the devices. imud follows
+    symbolic links and opens no port."""
     places: dict[str, list[_Owned]] = {}
     buses: dict[str, list[tuple[CanUse, str]]] = {}
     for device in devices:
@@ -64,6 +66,12 @@ def clashes(
             yield from _can_clash(device.name, use, uses)
             uses.append((use, owner))
         pause()
+    for output, claims in outputs.items():
+        for claim in claims:
+            for other in places.get(_place(claim), ()):
+                if conflict := conflict_of(claim, other.claim, other.owner):
+                    yield Clash((output, conflict.key), conflict.message)
+                    break
 
 
 def owner_of(device: DeviceConfig, others: Sequence[DeviceConfig], links: Mapping[str, LinkType[Any]]) -> str:
@@ -364,9 +372,12 @@ DEVICE_NAME: Final = pattern(DEVICE_NAME_PATTERN)
 
 
 class DeviceReader:
-    def __init__(self, keys: Keys, tables: Tables, pause: Callable[[], None]) -> None:
-        """imud calls `pause` after each device."""
+    def __init__(
+        self, keys: Keys, tables: Tables, pause: Callable[[], None], outputs: Mapping[str, Sequence[Claim]]
+    ) -> None:
+        """imud calls `pause` after each device. `outputs` contains the ports that each output uses."""
         self._keys = keys
+        self._outputs = outputs
         self._tables = tables
         self._declared = DeclaredReader(keys, tables.drivers)
         self._pause = pause
@@ -386,7 +397,7 @@ class DeviceReader:
         devices = [self._device(name, data) for name, data in islice(found.items(), DEVICES_MAX)]
         made = [device for device in devices if device is not None]
         used = [device for device, enabled in made if enabled]
-        for clash in clashes(used, self._tables.links, self._tables.drivers, self._pause):
+        for clash in clashes(used, self._tables.links, self._tables.drivers, self._pause, self._outputs):
             self._keys.problem(*clash)
         self._buses_carry(used)
         lines_once(self._keys, used)

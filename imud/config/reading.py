@@ -56,7 +56,8 @@ def _config(keys: Keys, tables: Tables, pause: Callable[[], None]) -> Config | N
     for name, options in publishers.items():
         for path, message in tables.publishers[name].check(options, tables.drivers).items() if options else ():
             keys.problem((name, *path), message)
-    devices = DeviceReader(keys, tables, pause).devices(top)
+    outputs = {name: tables.publishers[name].claims(one) for name, one in publishers.items() if one is not None}
+    devices = DeviceReader(keys, tables, pause, outputs).devices(top)
     if general is None or devices is None or keys.problems:
         return None
     used = tuple(device for device, enabled in devices if enabled)

@@ -11,6 +11,7 @@ from imud.attitude.published import PublishedAxes, as_sent
 from imud.contracts.command import CalibrationResult, Calibrations, Verbs
 from imud.contracts.driver import Driver
 from imud.contracts.lines import UtcReference, WatchLine
+from imud.contracts.link import Claim
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import ClientStatus, DeviceStatus, FlightStatus, MqttStatus, OutputStatus, RecorderStatus
 from imud.formats.slot import encode_slots
@@ -245,6 +246,10 @@ class PublisherContext:
     raise_event: Callable[[Event], None]  # sends an event of the daemon to all outputs
 
 
+def _claims_nothing(_settings: Options) -> Sequence[Claim]:
+    return ()
+
+
 @dataclass(frozen=True, slots=True)
 class PublisherType:
     """Row of a publisher."""
@@ -253,6 +258,8 @@ class PublisherType:
     settings: type[Options]
     make: Callable[[Any, PublisherContext], Publisher]
     wanted: Callable[[Any], bool] = attrgetter("enabled")  # whether these options enable the publisher
+    # Returns the ports that these options use. No device can use them.
+    claims: Callable[[Any], Sequence[Claim]] = _claims_nothing
     # Whether the daemon exits if the first start of the publisher fails. Otherwise the daemon tries again periodically.
     required: bool = True
     # Finds keys that contradict the drivers. Returns a reason, one sentence, by the path of the key.

@@ -33,7 +33,7 @@ from imud.fleet.messages import (
     topic_of,
 )
 from imud.fleet.sender import MqttSender
-from imud.fleet.settings import DeviceSending, MqttOptions, broker_of, check_commands
+from imud.fleet.settings import LOCALHOST, DeviceSending, MqttOptions, broker_of, check_commands
 from imud.fleet.spool import Spool
 from imud.fleet.streams import Gateway, gateway_clock
 from imud.fleet.writer import SentState, SpoolWriter, WriterQueue
@@ -165,10 +165,10 @@ class MqttPublisher:
             check_extra()
         settings, context = self._settings, self._context
         gateway = settings.gateway or self._host_name().partition(".")[0]
-        if not is_name(gateway):
+        if not is_name(gateway) or gateway.lower() == LOCALHOST:
             raise ServerError(
-                f"mqtt.gateway: expected 1 to 64 letters, digits, '_' or '-', got the host name {gateway!r}; "
-                f"set mqtt.gateway"
+                f"mqtt.gateway: expected 1 to 64 letters, digits, '_' or '-', and a name that no other gateway has, "
+                f"got the host name {gateway!r}; set mqtt.gateway"
             )
         self._gateway = Gateway(settings.site, gateway, boot_text(context.epoch))
         directory = Path(settings.spool_directory)

@@ -22,6 +22,9 @@ Measure = Literal["mean", "min", "max", "rms"]
 Name = Annotated[str, msgspec.Meta(pattern=f"^({NAME_PATTERN})?$", extra={"words": "letters, digits, _ and -"})]
 
 
+LOCALHOST: Final = "localhost"  # host name of many hosts, so it does not identify a gateway
+
+
 class Whole(StrEnum):
     """Formats of complete samples."""
 
@@ -179,7 +182,9 @@ class MqttOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Messages by device name; `*`: all other devices."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError if a URL, a device name, or a combination of keys is invalid."""
+        """Raise ValueError if a URL, a name, or a combination of keys is invalid."""
+        if self.gateway.lower() == LOCALHOST:
+            raise ValueError(f"gateway: expected a name that no other gateway has, got {shown(self.gateway)}")
         for url in self.brokers:
             if broker_of(url) is None:
                 raise ValueError(

@@ -21,6 +21,7 @@ import msgspec
 import serial
 
 from imud.attitude.conventions import Convention, Heading
+from imud.contracts.link import Claim
 from imud.contracts.publisher import Batch, PublisherContext, PublisherType
 from imud.contracts.status import OutputStatus
 from imud.formats import nmea0183
@@ -673,4 +674,9 @@ class Nmea0183:
             log.warning("%s", message)
 
 
-PUBLISHER = PublisherType("nmea0183", Nmea0183Options, Nmea0183, required=False)
+def _claims(settings: Nmea0183Options) -> list[Claim]:
+    used = settings.serial_port if settings.enabled else None
+    return [] if used is None else [Claim(place=used, key="serial_port")]
+
+
+PUBLISHER = PublisherType("nmea0183", Nmea0183Options, Nmea0183, claims=_claims, required=False)

@@ -149,6 +149,33 @@ def test_a_full_bus_and_a_full_line_are_compared() -> None:
     assert len(problems(*nodes, *slaves[:-1], "last " + MODBUS.format("/dev/x", 1, 9600))) == 1
 
 
+@pytest.mark.parametrize("enabled", [True, False])
+@pytest.mark.parametrize("link", [True, False])
+@pytest.mark.parametrize(
+    ("device", "line"),
+    [
+        ("{{uart: {{port: {}}}}}", 3), ("{{driver: hipnuc-modbus, rs485: {{line: {}, address: 80, baud: 9600}}}}", 3),
+        ("{{driver: hipnuc-uart, rmc: {{source: nmea, port: {}}}, uart: {{port: /dev/x}}}}", 3),
+    ],
+)  # fmt: skip
+def test_an_output_cannot_use_the_port_of_a_device(
+    tmp_path: Path, device: str, line: int, link: bool, enabled: bool
+) -> None:
+    port, other = tmp_path / "port", tmp_path / "other"
+    other.symlink_to(port)
+    text = (
+        f"nmea0183: {{enabled: {str(enabled).lower()}, sentences: {{XDR: 1}}, serial_port: {other if link else port}}}\n"
+        f"devices:\n  a: {device.format(port)}\n"
+    )
+    if not enabled:
+        config.parse(text, "f")
+        return
+    with pytest.raises(
+        ConfigError, match=rf"f:1:\d+: nmea0183.serial_port: expected an unused .*; a \(line {line}\) uses"
+    ):
+        config.parse(text, "f")
+
+
 def test_two_names_of_one_port_are_one_port(tmp_path: Path) -> None:
     port, late = tmp_path / "port", tmp_path / "late"
     late.touch()

@@ -229,12 +229,15 @@ class RecorderOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=
     """Options of the flight recorder."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError if the limit has no room for two files or for a snapshot."""
+        """Raise ValueError if the limit has no room for two files or for a snapshot, or if both recorders share a
+        directory: the flight recorder removes the files of its directory."""
         if self.keep_gb * 1000 < 2 * self.file_mb:
             raise ValueError(
                 f"keep_gb: expected room for two files of file_mb ({self.file_mb:g}), {self.file_mb / 500:g} or more, "
                 f"got {self.keep_gb:g}"
             )
+        if self.flight.directory and os.path.realpath(self.flight.directory) == os.path.realpath(self.directory):
+            raise ValueError(f"flight: expected another directory than {self.directory}, got the same")
         room_mb = (2 * self.file_mb if self.enabled else 0) + self.flight.memory_mb
         if self.flight.enabled and self.keep_gb * 1000 < room_mb:
             raise ValueError(
