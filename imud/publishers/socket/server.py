@@ -24,6 +24,7 @@ from imud.contracts.publisher import PublisherContext, PublisherType
 from imud.formats.jsonrpc import DEFAULT_PATH, Code, RpcError, encode_error, line_of
 from imud.model.errors import ServerError, reason_of
 from imud.model.options import Options, shown
+from imud.model.units import NS_PER_S
 from imud.publishers.socket.admission import (
     Guard,
     Quota,
@@ -111,6 +112,14 @@ class Listener:
             raise ServerError(f"another daemon has just taken {self.path}; set another socket.path for one of them")
         if left_behind:
             log.info("replaced the socket %s of a daemon that no longer runs", self.path)
+
+    @property
+    def has_file(self) -> bool:
+        """Return whether `path` still names the socket file of this listener."""
+        try:
+            return _inode_of(self.path) == self._inode
+        except OSError:
+            return False
 
     def close(self) -> None:
         """Stop listening, and remove the file if it is still ours. A second call does nothing."""
@@ -243,6 +252,8 @@ ACCEPTS_PER_TURN: Final = 16
 ACCEPT_NS: Final = 300_000
 """Maximum time of accepting clients in one turn of the event loop, ns: three clients with their greetings."""
 MIB: Final = 1 << 20
+RETRY_NS: Final = NS_PER_S
+"""Time between two attempts to create a removed socket file again, ns."""
 
 
 class SocketOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -298,16 +309,38 @@ class SocketServer:
         self._guard = Guard(own_uid, None, None)
         self._paused = False  # whether imud accepts no client until the next tick
         self._pauses = RateLimitedLog(context.clock.now_ns)
+        self._file_problem = ""  # why imud cannot create the removed socket file again
+        self._retry_ns = 0
 
     def start(self) -> None:
         """Listen. Raises ServerError, and leaves no file behind, if that is not possible."""
         settings = self._settings
         self._guard = Guard(os.geteuid(), gid_of(settings.group), gid_of(settings.control_group))
         self._name_control_group(settings.control_group)
-        self._listener = Listener(Path(settings.path), settings.group, settings.control_group)
+        self._listener = self._listen()
         self._scheduler = Scheduler(self._context.clock.now_ns, self._context.clock.cpu_ns, self._time)
         asyncio.get_running_loop().add_reader(self._listener.sock, self._accept)
         self._context.outputs.clients.append(self.hub.clients)
+
+    def _listen(self) -> Listener:
+        return Listener(Path(self._settings.path), self._settings.group, self._settings.control_group)
+
+    def _replace_file(self, listener: Listener, now_ns: int) -> None:
+        """Create a removed socket file again. Connected clients are not affected."""
+        try:
+            new = self._listen()
+        except ServerError as error:
+            if str(error) != self._file_problem:
+                log.error("socket: the file %s was removed or replaced: %s; trying again", listener.path, error)
+            self._file_problem, self._retry_ns = str(error), now_ns + RETRY_NS
+            return
+        self._accept()  # clients that connected before the removal
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(listener.sock)
+        listener.close()
+        self._listener, self._paused, self._file_problem = new, False, ""
+        loop.add_reader(new.sock, self._accept)
+        log.warning("socket: the file %s was removed or replaced; created it again", new.path)
 
     def _name_control_group(self, group: str) -> None:
         """Set the name of the group for error messages. Warn if the group does not exist."""
@@ -324,6 +357,8 @@ class SocketServer:
             self._scheduler.tick()
             self.hub.pool.trim()
         self._quota.tick()
+        if self._listener is not None and now_ns >= self._retry_ns and not self._listener.has_file:
+            self._replace_file(self._listener, now_ns)
         if self._paused and self._listener is not None:
             self._paused = False
             asyncio.get_running_loop().add_reader(self._listener.sock, self._accept)

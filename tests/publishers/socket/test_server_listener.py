@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from imud.model.errors import ServerError
+from imud.model.units import NS_PER_S
 from imud.publishers.socket.server import PATH_MAX_BYTES, SOCKET_MODE, Listener, SocketOptions, SocketServer
 from tests.support.socket_rig import Peer, alone, context, in_server, serving
 
@@ -88,6 +89,39 @@ async def test_a_missing_group_is_a_warning_only(server: SocketServer, caplog: p
 
 
 GROUP = "no-such-group-here"
+
+
+@pytest.mark.parametrize("blocked", ["", "another daemon", "a file"])
+@in_server()
+async def test_a_removed_socket_file_is_created_again(
+    server: SocketServer, tmp_path: Path, caplog: pytest.LogCaptureFixture, blocked: str
+) -> None:
+    path, peer = tmp_path / "imud.sock", await Peer.greeted(server)
+    unaccepted = socket.socket(socket.AF_UNIX)
+    unaccepted.connect(str(path))
+    path.unlink()
+    other = Listener(path, "") if blocked == "another daemon" else None
+    if blocked == "a file":
+        path.touch()
+    caplog.clear()
+    for _ in range(10):
+        server.tick(0)
+    if blocked:
+        (problem,) = [one.getMessage() for one in caplog.records if one.levelname == "ERROR"]
+        assert f"the file {path} was removed or replaced: " in problem
+        if other is not None:
+            other.close()
+        path.unlink(missing_ok=True)
+        server.tick(NS_PER_S - 1)
+        assert not path.exists()
+        server.tick(NS_PER_S)
+    assert path.stat().st_mode & 0o777 == 0o660
+    assert await peer.result("unwatch") == {}
+    second = await Peer.greeted(server)
+    assert await second.result("unwatch") == {}
+    assert len(server.hub.connections) == 3
+    assert sum("created it again" in one.getMessage() for one in caplog.records) == 1
+    unaccepted.close()
 
 
 def leave_socket(path: Path) -> None:
