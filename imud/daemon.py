@@ -172,6 +172,7 @@ class Daemon:
             latencies=self._latencies,
             watch_line=watching(lines, host),
             raise_event=self.send_event,
+            configuration="" if file is None else str(file.absolute()),
         )
         self._outputs = Outputs(self._context, extra or {})
         self._until_finished = until_finished

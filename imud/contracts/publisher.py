@@ -244,6 +244,7 @@ class PublisherContext:
     latencies: Latencies  # register of the latencies that readers need
     watch_line: WatchLine  # watches a GPIO line that belongs to no device
     raise_event: Callable[[Event], None]  # sends an event of the daemon to all outputs
+    configuration: str = ""  # absolute path of the configuration file; empty without a file
 
 
 def _claims_nothing(_settings: Options) -> Sequence[Claim]:

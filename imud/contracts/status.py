@@ -211,6 +211,7 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     declared: SettingsStatus | None = None
     # Noise of the samples from the configuration; None if the configuration does not give it
     noise: Deviations | None = None
+    resets_requested: int = 0  # restarts of the device counter (`clock.resets`) that commands or settings caused
 
 
 class RecorderStatus(msgspec.Struct, frozen=True):

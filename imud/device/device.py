@@ -389,6 +389,7 @@ class Device:
             utc=self._attachments.utc_status(),
             declared=self._settings.status(),
             noise=self.config.noise,
+            resets_requested=self._settings.resets_requested,
         )
         return transport.add_status(status)
 

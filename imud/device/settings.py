@@ -63,6 +63,8 @@ SETTLE_NS: Final = NS_PER_S // 2
 AGAIN_NS: Final = 60 * NS_PER_S
 """Interval of comparisons of a polled device, ns. It has no counter that shows a restart."""
 OWN_NS: Final = 2 * NS_PER_S
+# Additional time until the first sample after a requested restart, ns
+BOOT_NS: Final = 8 * NS_PER_S
 """Time after a script in which a restart of the device counter is a result of the script, ns. imud compares the
 settings at the end of the script. A second comparison would pause the samples again."""
 WAIT_S: Final = 10.0  # maximum wait of a command for another command, s
@@ -113,6 +115,7 @@ class SettingsKeeper:
         # CLOCK_MONOTONIC until which a restart of the device counter is a result of a script of imud
         self._own_until_ns = 0
         self._resets = 0
+        self.resets_requested = 0  # number of restarts of the device counter that a script of imud caused
         self._lock = asyncio.Lock()
         self._wanted = asyncio.Event()
         self._due_ns: int | None = None  # CLOCK_MONOTONIC of the next comparison; None: after the next event
@@ -141,12 +144,14 @@ class SettingsKeeper:
 
     def tick(self, now_ns: int, _newest: Sample | None) -> None:
         """Wake `run` if a comparison is due and the device can reply. Detect a restart of the device counter."""
+        if self._clock is not None and (resets := self._clock.status().resets) != self._resets:
+            if self.busy or now_ns < self._own_until_ns + BOOT_NS:
+                self.resets_requested += resets - self._resets
+            self._resets = resets
+            if self._declared and not self.busy and now_ns >= self._own_until_ns:
+                self._after_start(SETTLE_NS)
         if not self._declared:
             return
-        if self._clock is not None and (resets := self._clock.status().resets) != self._resets:
-            self._resets = resets
-            if not self.busy and now_ns >= self._own_until_ns:
-                self._after_start(SETTLE_NS)
         if self._due_ns is not None and now_ns >= self._due_ns and not self.busy and self._transport.can_be_asked:
             self._wanted.set()
 

@@ -225,6 +225,25 @@ async def test_settings_are_compared_after_replug_restart_and_command(bench: Mod
     assert bench.messages == [differ, differ, "settings agree with the declared settings again"]
 
 
+@pytest.mark.parametrize("declared", [None, {"mode": "6-axis"}])
+def test_restarts_after_commands_are_counted_as_requested(declared: dict[str, Any] | None) -> None:
+    @played(lambda: ModuleBench(declared=declared))
+    async def story(bench: ModuleBench) -> None:
+        await bench.pass_s(60)
+        counts = list[tuple[int, int]]()
+        for pause_s in (0.1, 5.0, 30.0, None):
+            if pause_s is not None:
+                await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
+                await bench.pass_s(pause_s)
+            bench.module.restart()
+            await bench.pass_s(30)
+            status = bench.device.status()
+            counts.append((status.clock.resets, status.resets_requested))
+        assert counts == [(1, 1), (2, 2), (3, 2), (4, 2)]
+
+    story()
+
+
 @played(lambda: ModuleBench(declared={"mode": "6-axis"}, pauses_clock=True))
 async def test_a_counter_restart_by_a_read_causes_no_second_read(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.is_in(SettingsState.AGREE))

@@ -16,7 +16,7 @@ import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket
 from imud.cli.doctor import buses, daemon, machine, ports
-from imud.cli.doctor.surroundings import DoctorCheck, DoctorFinding, Severity, Surroundings, ask_daemon
+from imud.cli.doctor.surroundings import DoctorCheck, DoctorFinding, Severity, Surroundings, ask_daemon, file_of_daemon
 from imud.cli.output import COLUMNS
 from imud.cli.run import DEFAULT_FILE
 from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
@@ -160,8 +160,8 @@ CHECKS: Final = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_socket(parser)
     parser.add_argument(
-        "-c", "--config", type=Path, default=DEFAULT_FILE, metavar="FILE",
-        help="configuration file (default: %(default)s)",
+        "-c", "--config", type=Path, metavar="FILE",
+        help=f"configuration file (default: the file of the running daemon, otherwise {DEFAULT_FILE})",
     )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print every check with its findings as JSON")
 
@@ -169,7 +169,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the findings. Return 0 without problems, 1 for warnings, 2 for errors."""
     # absolute: messages then contain the complete path
-    at = Surroundings(args.config.absolute(), partial(ask_daemon, args.socket))
+    file = args.config or file_of_daemon(args.socket) or DEFAULT_FILE
+    at = Surroundings(file.absolute(), partial(ask_daemon, args.socket))
     examined = examine(CHECKS, at)
     sys.stdout.write((as_json(examined).decode() if args.json else page(examined)) + "\n")
     return exit_status(examined)

@@ -394,7 +394,7 @@ def restarts(at: Surroundings) -> Findings:
             return
         if not one.ledger["samples"]:
             continue
-        resets = one.clock.resets
+        resets = one.clock.resets - one.resets_requested
         rate_hz = one.expected_rate_hz or one.rate_hz
         # the number of samples is a clock of the running time
         hours = one.ledger["samples"] / rate_hz / S_PER_H if rate_hz else 0.0

@@ -237,6 +237,15 @@ def ask_daemon(socket: str) -> list[DeviceStatus]:
         return statuses(client)
 
 
+def file_of_daemon(socket: str) -> Path | None:
+    """Return the configuration file of the running daemon; None if the daemon does not reply or has no file."""
+    try:
+        with Client(socket) as client:
+            return Path(found) if (found := str(client.status().get("configuration", ""))) else None
+    except (ImudError, OSError, msgspec.ValidationError):  # TimeoutError is an OSError
+        return None
+
+
 class Severity(StrEnum):
     """Severity of a finding."""
 

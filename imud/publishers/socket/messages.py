@@ -129,6 +129,7 @@ class StatusResult(msgspec.Struct):
     now_ns: int  # CLOCK_MONOTONIC
     devices: list[DeviceStatus]
     socket: SocketStatus
+    configuration: str  # absolute path of the daemon's configuration file; empty without a file
 
 
 class DeviceFrame(msgspec.Struct, omit_defaults=True):

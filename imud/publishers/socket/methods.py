@@ -224,9 +224,11 @@ def _status(hub: Hub, connection: ClientConnection, _params: NoParams) -> Pieces
     clients = yield from _encoded(hub.each_client(), CLIENTS_PER_PIECE, texts, held_bytes)
     now_ns = hub.context.clock.now_ns()
     socket = msgspec.structs.asdict(hub.status(())) | {"clients": clients}
-    return MethodReply(
-        {"now_ns": str(now_ns) if texts else now_ns, "devices": made, "socket": socket}, big_numbers=False
-    )
+    result = {
+        "now_ns": str(now_ns) if texts else now_ns, "devices": made, "socket": socket,
+        "configuration": hub.context.configuration,
+    }  # fmt: skip
+    return MethodReply(result, big_numbers=False)
 
 
 def _schema(hub: Hub, _connection: ClientConnection, _params: NoParams) -> Pieces:

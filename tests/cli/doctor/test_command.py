@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from imud.cli import main
 from imud.cli.doctor.command import CHECKS, examine, exit_status, verdict
 from imud.contracts.status import KernelCounters
 from tests.cli.conftest import Cli
+from tests.support.daemon_process import running_daemon
 from tests.support.files import ROOT
 from tests.support.metrics import device
 from tests.support.surroundings import Machine
@@ -94,6 +96,20 @@ def test_on_this_machine_without_a_daemon(tmp_path: Path, cli: Cli) -> None:
     (storage,) = [check for check in told["checks"] if check["name"] == "storage"]
     assert "writing 4 KiB" in storage["findings"][0]["seen"]
     assert sorted(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.live
+def test_the_file_of_the_running_daemon_is_checked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def found(*words: object) -> str:
+        main(["doctor", "--json", "--socket", f"{tmp_path}/imud.sock", *map(str, words)])
+        checks = json.loads(capsys.readouterr().out)["checks"]
+        (check,) = [check for check in checks if check["name"] == "configuration"]
+        return str(check["findings"][0]["seen"])
+
+    with running_daemon(tmp_path, {}):
+        assert found() == f"{tmp_path}/imud.yaml contains no device"
+        assert f"{tmp_path}/none" in found("--config", tmp_path / "none")
+    assert "/etc/imud.yaml" in found()
 
 
 def test_documents_name_each_check_and_each_provoked_problem() -> None:

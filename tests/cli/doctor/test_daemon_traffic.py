@@ -125,19 +125,25 @@ def test_rs485(machine: Machine, state: DeviceState, line: SerialLineCounters, s
 
 
 @pytest.mark.parametrize(
-    ("resets", "samples", "severity"),
+    ("resets", "requested", "samples", "severity"),
     [
-        (0, 1000, "ok"),
-        (2, 1000, "note"),
-        (3, 360_000, "warning"),
-        (3, 2 * 360_000, "warning"),
-        (3, 4 * 360_000, "note"),
+        (0, 0, 1000, "ok"),
+        (9, 9, 1000, "ok"),
+        (2, 0, 1000, "note"),
+        (3, 0, 360_000, "warning"),
+        (9, 6, 360_000, "warning"),
+        (9, 7, 360_000, "note"),
+        (3, 0, 2 * 360_000, "warning"),
+        (3, 0, 4 * 360_000, "note"),
     ],
 )
-def test_restarts_count_by_the_hour(machine: Machine, resets: int, samples: int, severity: str) -> None:
+def test_restarts_without_a_request_count_by_the_hour(
+    machine: Machine, resets: int, requested: int, samples: int, severity: str
+) -> None:
     clock = ClockStatus(Sync.REGRESSION, resets=resets)
     running = counted(DeviceState.RUNNING, samples=samples)
-    machine.status = [msgspec.structs.replace(running, clock=clock, expected_rate_hz=100.0)]  # 360,000 samples per hour
+    running = msgspec.structs.replace(running, clock=clock, resets_requested=requested)
+    machine.status = [msgspec.structs.replace(running, expected_rate_hz=100.0)]  # 360,000 samples per hour
     assert [finding.severity for finding in machine.find(RESTARTS)] == [severity]
 
 
