@@ -1,6 +1,9 @@
-"""TCP and UDP sockets for an IP address."""
+"""TCP and UDP sockets for an IP address, and addresses of a host name."""
 
+import asyncio
 import socket
+import threading
+from contextlib import suppress
 from typing import Final
 
 BACKLOG: Final = 128  # number of connections that wait for `accept`
@@ -13,6 +16,38 @@ def open_socket(address: str, kind: socket.SocketKind) -> socket.socket:
     made = socket.socket(family, kind)
     made.setblocking(False)
     return made
+
+
+async def resolve(host: str, port: int) -> list[str]:
+    """Return the IP addresses of a host name. Raises OSError.
+
+    The request runs in a thread of its own: a silent name server delays neither the end of the process nor other work.
+    A thread of the event loop's executor would do both, because the request cannot be cancelled.
+    """
+    loop = asyncio.get_running_loop()
+    answer: asyncio.Future[list[str]] = loop.create_future()
+
+    def give(found: list[str], error: OSError | None) -> None:
+        if answer.done():  # the caller no longer waits
+            return
+        if error is None:
+            answer.set_result(found)
+        else:
+            answer.set_exception(error)
+
+    def ask() -> None:
+        found, problem = list[str](), None
+        try:
+            found = [str(one[4][0]) for one in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)]
+        except OSError as error:
+            problem = error
+        except UnicodeError as error:  # a name that IDNA cannot encode
+            problem = OSError(f"{host}: {error}")
+        with suppress(RuntimeError):  # the loop has ended
+            loop.call_soon_threadsafe(give, list(dict.fromkeys(found)), problem)
+
+    threading.Thread(target=ask, name="name server", daemon=True).start()
+    return await answer
 
 
 def listen(address: str, port: int) -> socket.socket:

@@ -17,6 +17,7 @@ from msgspec import Meta
 
 from imud.contracts.link import StreamLink
 from imud.formats.nmea0183 import RMC_BYTES_MAX
+from imud.host.network import resolve
 from imud.model.errors import LinkError, reason_of
 from imud.model.options import Options, is_host, shown
 
@@ -201,7 +202,7 @@ class GpsdSource(ReconnectingSource):
     async def _connect_and_read(self) -> None:
         try:
             async with asyncio.timeout(CONNECT_LIMIT_S):
-                reader, writer = await asyncio.open_connection(*self._address)
+                reader, writer = await _connect(*self._address)
         except (OSError, TimeoutError) as error:
             reason = "no answer" if isinstance(error, TimeoutError) else reason_of(error)
             self.problem = f"cannot connect to {self.title}: {reason}; is gpsd running?"
@@ -256,6 +257,15 @@ class NmeaPortSource(ReconnectingSource):
     def _on_end(self, error: LinkError | None) -> None:
         self.problem = str(error) if error else f"{self.title} ended"
         self._ended.set()
+
+
+async def _connect(host: str, port: int) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """Connect to the first address of a host that accepts the connection. Raises OSError."""
+    *others, last = await resolve(host, port)
+    for address in others:
+        with suppress(OSError):
+            return await asyncio.open_connection(address, port)
+    return await asyncio.open_connection(last, port)
 
 
 def _watch_request(device: str) -> bytes:

@@ -1,13 +1,18 @@
-"""Sockets of outputs on a kernel without IPv6."""
+"""Sockets of outputs on a kernel without IPv6, and name servers that do not reply."""
 
+import asyncio
 import errno
 import socket
+import threading
+from typing import Any
 
 import pytest
 
+from imud.host.network import resolve
 from imud.model.errors import ServerError
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 from imud.publishers.nmea0183 import TcpOutput, UdpOutput
+from imud.utc.receivers import GpsdSource, RmcOptions
 from tests.support.event_loops import VirtualClock, in_loop
 
 
@@ -32,3 +37,38 @@ async def test_a_kernel_without_ipv6(monkeypatch: pytest.MonkeyPatch) -> None:
         TcpOutput("::1", 0, VirtualClock().now_ns).open()
     with pytest.raises(ServerError, match="::1 port 0: Address family not supported by protocol"):
         ScrapeServer("::1", 0, answer).start()
+
+
+@in_loop
+async def test_a_silent_name_server_does_not_occupy_the_executor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The event loop's executor delays the end of the process until its threads end."""
+    release = threading.Event()
+    threads: list[threading.Thread] = []
+
+    def silent(*_arguments: Any, **_names: Any) -> Any:
+        threads.append(threading.current_thread())
+        release.wait()
+        raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
+
+    monkeypatch.setattr(socket, "getaddrinfo", silent)
+    source = GpsdSource(RmcOptions(source="gpsd", host="gps.example"), lambda: 0)
+    source.start(lambda _sentence, _t_rx_ns: None)
+    given_up, waiting = (asyncio.create_task(resolve("gps.example", 2947)) for _ in range(2))
+    while len(threads) < 3:
+        await asyncio.sleep(0)
+    assert all(thread.daemon for thread in threads)
+    await asyncio.get_running_loop().run_in_executor(None, int)  # no thread of the executor waits
+    source.close()
+    given_up.cancel()
+    release.set()
+    with pytest.raises(socket.gaierror, match="Temporary failure"):
+        await waiting
+    for thread in threads:
+        thread.join()
+
+
+@in_loop
+async def test_addresses_of_a_name() -> None:
+    assert await resolve("127.0.0.1", 1) == ["127.0.0.1"]
+    with pytest.raises(OSError, match="label"):
+        await resolve("a" * 64 + ".example", 1)
