@@ -22,6 +22,7 @@ from imud.host import event_loop
 from imud.host.log import STDERR, is_journal, log_to
 from imud.model.errors import ConfigError, ImudError, ServerError
 from imud.model.options import unknown_name
+from imud.publishers.shm import ShmOptions, directory_problem
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +85,7 @@ def check(args: argparse.Namespace) -> int:
     for device in settings.devices:
         for note in (*limits_of(device), *absent_capture(device)):
             print(f"{args.file}:{device.line}: note: {device.name}: {note}")
-    for note in unknown_devices(settings):
+    for note in (*unknown_devices(settings), *missing_directories(settings)):
         print(f"{args.file}: note: {note}")
     return 0
 
@@ -98,6 +99,13 @@ def unknown_devices(settings: Config) -> Iterator[str]:
             for name in [given] if isinstance(given, str) else given or ():
                 if name not in (*known, EVERY):
                     yield f"{output}.{key}: {unknown_name('a device', name, known)}"
+
+
+def missing_directories(settings: Config) -> Iterator[str]:
+    """Yield a note if `imud run` of this user cannot create shared memory. Another user may run the daemon."""
+    shm = settings.publishers.get("shm")
+    if isinstance(shm, ShmOptions) and shm.enabled and (problem := directory_problem(shm.directory, os.environ)):
+        yield f"shm: {problem}"
 
 
 def limits_of(device: DeviceConfig) -> Sequence[str]:

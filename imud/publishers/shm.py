@@ -202,7 +202,21 @@ def open_directory(configured: str, environment: Mapping[str, str]) -> RingDirec
             directory = _made(other)
             log.warning("shm: %s; using %s", error, other)
             return directory
-        raise
+        raise ServerError(f"{error}; or set XDG_RUNTIME_DIR") from None
+
+
+def directory_problem(configured: str, environment: Mapping[str, str]) -> str:
+    """Return why this user cannot create rings; empty if it can. Create nothing."""
+    is_default = configured == DIRECTORY
+    paths = default_directories(environment) if is_default else [configured]
+    for path in paths:
+        level = Path(path)
+        while is_default and not os.path.exists(level):  # imud creates the default directories
+            level = level.parent
+        if os.path.isdir(level) and os.access(level, os.W_OK | os.X_OK, effective_ids=True):
+            return ""
+    hint = "set shm.directory, or XDG_RUNTIME_DIR" if is_default else "create it, or set shm.directory"
+    return f"user {user_name()} cannot create shared memory in {' or '.join(paths)}; {hint}"
 
 
 def _made(path: str) -> RingDirectory:

@@ -15,13 +15,15 @@ from typing import Final
 
 import pytest
 
+from imud.cli import main
 from imud.client.ring import Ring
 from imud.formats.ring import HEADER_BYTES, STATE_CLOSED, STATE_LIVE, RingHeader, decode_header, encode_header
 from imud.formats.slot import SLOT_BYTES
 from imud.model.errors import ServerError
 from imud.publishers import shm as directory
-from imud.publishers.shm import RingDirectory, open_directory
+from imud.publishers.shm import RingDirectory, directory_problem, open_directory
 from tests.support.daemon_process import running_daemon, wait_until, write_config
+from tests.support.pty_port import NOBODY_UID, unprivileged
 from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample
 from tests.support.surroundings import DAEMON_UID, HOSTILE_UID, needs_root, python_as
 
@@ -217,6 +219,34 @@ def test_directory_of_the_user_replaces_a_missing_default(
     found = open_directory(str(system), {"XDG_RUNTIME_DIR": str(own)})
     assert found.path == str(system)
     found.close()
+
+
+@needs_root
+def test_a_user_without_a_directory_is_told_before_the_start(
+    shared: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`imud check` reports that `imud run` of this user cannot create rings, and creates nothing."""
+    shared.chmod(0o755)
+    system, own, file = shared / "imud" / "shm", shared / "run", shared / "bow.yaml"
+    own.mkdir()
+    os.chown(own, NOBODY_UID, NOBODY_UID)
+    for name in ("imud.publishers.shm.DIRECTORY", "imud.formats.ring.DIRECTORY"):
+        monkeypatch.setattr(name, str(system))
+    problem = f"cannot create shared memory in {system}; set shm.directory, or XDG_RUNTIME_DIR"
+    with unprivileged():
+        for environment, expected in (({}, problem), ({"XDG_RUNTIME_DIR": str(own)}, "")):
+            assert directory_problem(str(system), environment).endswith(expected)
+            assert bool(directory_problem(str(system), environment)) == bool(expected)
+        assert directory_problem(str(own), {}) == ""
+        assert "create it, or set shm.directory" in directory_problem(str(own / "none"), {})
+    assert directory_problem(str(system), {}) == ""  # root
+    with unprivileged(), pytest.raises(ServerError, match="; or set XDG_RUNTIME_DIR"):
+        open_directory(str(system), {})
+    file.write_text(f"shm: {{directory: {own}/none}}\ndevices: {{}}\n")
+    note = f"{file}: note: shm: user root cannot create shared memory in {own}/none; create it, or set shm.directory"
+    assert main(["check", str(file)]) == 0
+    assert note in capsys.readouterr().out.splitlines()
+    assert sorted(shared.rglob("*")) == [file, own]
 
 
 def test_reader_searches_all_directories_of_the_daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
