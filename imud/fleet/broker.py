@@ -453,6 +453,7 @@ class BrokerTurn:
         self._draw = draw
         self._at = 0
         self._failed = 0
+        self.short_runs = 0  # number of connections in sequence that were lost within STABLE_NS
         self._up_ns: int | None = None
 
     @property
@@ -468,8 +469,9 @@ class BrokerTurn:
         """Store a failed attempt or a lost connection. Return the pause before the next attempt, s. After a lost
         connection, imud tries the same broker again. After a failed attempt, it tries the next broker."""
         up_ns, self._up_ns = self._up_ns, None
-        if up_ns is not None and now_ns - up_ns >= STABLE_NS:
-            self._failed = 0
+        if up_ns is not None:
+            self.short_runs = self.short_runs + 1 if now_ns - up_ns < STABLE_NS else 0
+            self._failed = self._failed if self.short_runs else 0
         if up_ns is None:
             self._at = (self._at + 1) % len(self._brokers)
         length_s: float = min(self._most_s, FIRST_S * 2.0 ** min(self._failed // len(self._brokers), 16))

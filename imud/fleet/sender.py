@@ -26,6 +26,9 @@ OUTBOX_MAX: Final = 60  # maximum number of messages in memory, 6 MB at most: th
 WAIT_S: Final = 1.0  # Maximum wait, s. The thread then checks keep-alives and the end.
 # Maximum wait of `close` for the thread, s. Samples wait for it during a reload of the configuration.
 CLOSE_S: Final = 0.5
+# Number of connections in sequence that were lost soon, after which imud names the usual cause: the broker closes a
+# connection if another client connects with the same client ID. Most brokers do not report this reason.
+SHORT_RUNS: Final = 3
 FAREWELL_S: Final = 0.3  # part of CLOSE_S for the acknowledgement of the farewell, s
 
 
@@ -159,8 +162,11 @@ class MqttSender:
                 self._take_acknowledgements(connection)
                 self._take_requests(connection)
         except BrokerError as error:
-            self._disconnect(str(error))
-            return self._turn.failed(self._now_ns())
+            pause_s, problem = self._turn.failed(self._now_ns()), str(error)
+            if self._turn.short_runs >= SHORT_RUNS:
+                problem += f"; does another gateway use the client ID {self._client_id} (mqtt.gateway)?"
+            self._disconnect(problem)
+            return pause_s
         return 0.0
 
     def _open(self) -> None:

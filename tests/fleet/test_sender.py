@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from imud.fleet.broker import BrokerTurn, Will
+from imud.fleet.broker import STABLE_NS, BrokerTurn, Will
 from imud.fleet.commands import CommandReply
 from imud.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
 from imud.fleet.sender import OUTBOX_MAX, REPLIES_MAX, MqttSender
@@ -61,6 +61,20 @@ def test_messages_are_sent_in_order_within_the_window() -> None:
     bench.sender.work()
     bench.sender.work()
     assert bench.broker.connections[0].types[6:] == [SLOTS_TYPE]
+
+
+@pytest.mark.parametrize("stable", [False, True])
+def test_connections_that_are_lost_soon_name_a_gateway_with_the_same_name(stable: bool) -> None:
+    bench, problems = SenderBench(), list[str]()
+    for number in range(4):
+        bench.broker.problem = ""
+        bench.sender.work()
+        bench.clock.advance(STABLE_NS if stable and number == 1 else STABLE_NS - 1)
+        bench.broker.problem = "the connection was lost"
+        bench.sender.work()
+        problems.append(bench.sender.problem)
+    named = "the connection was lost; does another gateway use the client ID me (mqtt.gateway)?"
+    assert [problem == named for problem in problems] == [False, False, not stable, not stable]
 
 
 def test_a_lost_connection_clears_the_outbox_and_starts_a_new_session() -> None:
