@@ -102,10 +102,10 @@ def unknown_devices(settings: Config) -> Iterator[str]:
 
 
 def missing_directories(settings: Config) -> Iterator[str]:
-    """Yield a note if `imud run` of this user cannot create shared memory. Another user may run the daemon."""
+    """Yield a note if `imud run` of this user cannot create shared memory."""
     shm = settings.publishers.get("shm")
     if isinstance(shm, ShmOptions) and shm.enabled and (problem := directory_problem(shm.directory, os.environ)):
-        yield f"shm: {problem}"
+        yield f"shm: {problem}; ignore this note if another user runs the daemon"
 
 
 def limits_of(device: DeviceConfig) -> Sequence[str]:

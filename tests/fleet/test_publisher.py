@@ -212,7 +212,7 @@ def test_the_host_name_is_the_default_gateway_name(tmp_path: Path) -> None:
     for name in ("Gerät", "localhost", "localhost.localdomain"):
         odd = MqttPublisher(
             MqttOptions(spool_directory=str(tmp_path)), bench.context, connect=bench.broker.connect,
-            host_name=lambda name=name: name,
+            host_name=name.__str__,
         )  # fmt: skip
         with pytest.raises(ServerError, match=f"mqtt.gateway: expected 1 to 64 .* '{name.partition('.')[0]}'"):
             odd.start()
