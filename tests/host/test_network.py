@@ -36,7 +36,7 @@ async def test_a_kernel_without_ipv6(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ServerError, match="::1 port 0: Address family not supported by protocol"):
         TcpOutput("::1", 0, VirtualClock().now_ns).open()
     with pytest.raises(ServerError, match="::1 port 0: Address family not supported by protocol"):
-        ScrapeServer("::1", 0, answer).start()
+        ScrapeServer("::1", 0).start(answer)
 
 
 @in_loop
