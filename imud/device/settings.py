@@ -113,8 +113,7 @@ class SettingsKeeper:
         self._writes = files.flash
         self._clock: SampleClock | None = None
         # CLOCK_MONOTONIC until which a restart of the device counter is a result of a script of imud
-        self._own_until_ns = 0
-        self._resets = 0
+        self._own_until_ns = self._resets = 0
         self.resets_requested = 0  # number of restarts of the device counter that a script of imud caused
         self._lock = asyncio.Lock()
         self._wanted = asyncio.Event()
@@ -145,14 +144,12 @@ class SettingsKeeper:
     def tick(self, now_ns: int, _newest: Sample | None) -> None:
         """Wake `run` if a comparison is due and the device can reply. Detect a restart of the device counter."""
         if self._clock is not None and (resets := self._clock.status().resets) != self._resets:
-            if self.busy or now_ns < self._own_until_ns + BOOT_NS:
-                self.resets_requested += resets - self._resets
-            self._resets = resets
+            is_own = self.busy or now_ns < self._own_until_ns + BOOT_NS
+            self.resets_requested, self._resets = self.resets_requested + is_own * (resets - self._resets), resets
             if self._declared and not self.busy and now_ns >= self._own_until_ns:
                 self._after_start(SETTLE_NS)
-        if not self._declared:
-            return
-        if self._due_ns is not None and now_ns >= self._due_ns and not self.busy and self._transport.can_be_asked:
+        is_due = self._declared and self._due_ns is not None and now_ns >= self._due_ns
+        if is_due and not self.busy and self._transport.can_be_asked:
             self._wanted.set()
 
     def commanded(self, *, saved: bool = False) -> None:
