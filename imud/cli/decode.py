@@ -27,7 +27,7 @@ from imud.model.options import Options
 from imud.model.sample import Measurement
 
 FIFO_WAIT_MS = 5000  # time limit for the first bytes of a FIFO, ms
-NOT_SHOWN = {"trailing_bytes", "dev_ticks"}
+NOT_SHOWN = {"trailing_bytes", "dev_ticks", "t_first_ns"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

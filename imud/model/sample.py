@@ -30,7 +30,7 @@ class Sync(StrEnum):
 
 
 class Measurement(msgspec.Struct, frozen=True, gc=False):
-    """Values of one frame in SI units, without host time."""
+    """Values of one frame in SI units, without the host time of the measurement."""
 
     size_bytes: int  # size of the frame on the wire, bytes, with all framing
     # Number of bytes after the frame in the same read. The frame arrived earlier than the read by their wire time.
@@ -49,6 +49,8 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     status: int | None = None  # status bits as sent
     # Time from the last edge on the PPS/SIN input of the device to this measurement, ms, not unwrapped
     pps_age_ms: int | None = None
+    # Arrival of the first CAN frame of the measurement, CLOCK_MONOTONIC, ns; None on other links
+    t_first_ns: int | None = None
 
 
 class Sample(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):

@@ -161,6 +161,7 @@ class SamplePath(ABC):
         self._overruns = context.overruns
         self._now_ns = context.host.now_ns
         self._utc_offset_ns = context.host.utc_offset_ns
+        self._frame_ns = 0  # shortest time of a CAN frame on the wire
 
     def set_frame(self, frame: PublishedAxes) -> None:
         """Publish the following samples in other axes."""
@@ -218,10 +219,15 @@ class SamplePath(ABC):
             self._finish(samples, now_ns)
 
     def reset(self) -> None:
-        """Discard an incomplete frame or sample: the link was closed."""
-        self._reset()
-        if self.observer is not None:
-            self.observer.call("path", "reset")
+        """Discard an incomplete frame, and publish an incomplete sample: the link was closed."""
+        samples: list[Sample] = []
+        try:
+            self._reset(samples)
+        finally:
+            if self.observer is not None:
+                self.observer.call("path", "reset")
+        if samples:
+            self._finish(samples, self.last_data_ns)
 
     def _on_begin(self) -> None:  # noqa: B027 - most paths have nothing to prepare
         """Prepare for the data of a link after `begin`."""
@@ -231,7 +237,8 @@ class SamplePath(ABC):
         """Append the samples that waited for more data to `samples`."""
 
     @abstractmethod
-    def _reset(self) -> None: ...
+    def _reset(self, samples: list[Sample]) -> None:
+        """Discard an incomplete frame. Append an incomplete sample to `samples`."""
 
     def _sort(
         self,
@@ -239,14 +246,12 @@ class SamplePath(ABC):
         t_rx_ns: int,
         utc_offset_ns: int,
         samples: list[Sample],
-        t_begin_ns: int | None = None,
     ) -> None:
         """Append the samples of `events` to `samples`. Pass messages and bad frames to the device."""
-        # `t_begin_ns`: see `SampleClock.sample`.
         clock, loss = self.clock, self.loss
         at, count = 0, len(events)
         while at < count:
-            if t_begin_ns is None and count - at > 1:
+            if count - at > 1:
                 after = clock.add_run(samples, events, at, t_rx_ns, utc_offset_ns)
                 if after > at:
                     loss.bad_frames, at = 0, after
@@ -254,7 +259,8 @@ class SamplePath(ABC):
             event = events[at]
             at += 1
             if type(event) is Measurement:
-                samples.append(clock.sample(event, t_rx_ns, utc_offset_ns, t_begin_ns))
+                begin_ns = None if event.t_first_ns is None else event.t_first_ns - self._frame_ns
+                samples.append(clock.sample(event, t_rx_ns, utc_offset_ns, begin_ns))
                 if clock.missed:
                     self._add_loss(clock.missed)
                 loss.bad_frames = 0
@@ -372,8 +378,11 @@ class StreamPath(SamplePath):
             if events:
                 self._sort(events, now_ns, self._utc_offset_ns(), samples)
 
-    def _reset(self) -> None:
+    def _reset(self, _samples: list[Sample]) -> None:
         self.codec.reset()
+
+
+FLUSH_PERIODS: Final = 2  # time without frames after which imud publishes an incomplete sample, in periods
 
 
 class CanPath(SamplePath):
@@ -382,8 +391,6 @@ class CanPath(SamplePath):
     def __init__(self, codec: CanCodec, clock: SampleClock, context: PathContext) -> None:
         super().__init__(clock, context)
         self.codec = codec
-        self._frame_ns = 0  # shortest time of a frame on the wire
-        self._first_ns = 0  # arrival of the first frame of the present sample
 
     def set_frame_time(self, frame_ns: int) -> None:
         """Set the shortest time of a frame on the wire, ns; 0 if the bit rate is unknown."""
@@ -398,19 +405,15 @@ class CanPath(SamplePath):
         samples: list[Sample] = []
         t_rx_ns = self.last_data_ns
         try:
-            feed, ledger = self.codec.feed_frame, self._ledger
+            feed = self.codec.feed_frame
             utc_offset_ns = self._utc_offset_ns()
             for can_id, extended, data, t_rx_ns, after_loss in frames:
                 if after_loss:
+                    self._sort(self.codec.flush(), t_rx_ns, utc_offset_ns, samples)
                     self.codec.reset()
-                pending = ledger.frames_pending
-                if not pending:
-                    self._first_ns = t_rx_ns
                 events = feed(can_id, extended, data, t_rx_ns)
                 if events:
-                    self._sort(events, t_rx_ns, utc_offset_ns, samples, self._first_ns - self._frame_ns)
-                if pending and ledger.frames_pending == 1:  # this frame is the first frame of the next sample
-                    self._first_ns = t_rx_ns
+                    self._sort(events, t_rx_ns, utc_offset_ns, samples)
             self.last_data_ns = t_rx_ns
         finally:
             if self.observer is not None:
@@ -419,12 +422,12 @@ class CanPath(SamplePath):
             self._finish(samples, t_rx_ns)
 
     def _flush(self, now_ns: int, samples: list[Sample]) -> None:
-        """Process a sample whose missing frames are not required."""
-        events = self.codec.flush()
-        if events:
-            self._sort(events, now_ns, self._utc_offset_ns(), samples)
+        """Append an incomplete sample if the next sample is overdue."""
+        if now_ns - self.last_data_ns >= FLUSH_PERIODS * self.period_ns:
+            self._reset(samples)
 
-    def _reset(self) -> None:
+    def _reset(self, samples: list[Sample]) -> None:
+        self._sort(self.codec.flush(), self.last_data_ns, self._utc_offset_ns(), samples)
         self.codec.reset()
 
 
@@ -574,13 +577,13 @@ class PolledPath(SamplePath):
             self.edges.observer = observer
 
     def _on_begin(self) -> None:
-        self._reset()
+        self._reset([])
         self._is_back = True
 
     def _flush(self, now_ns: int, samples: list[Sample]) -> None:
         """Do nothing. A reading is complete or failed."""
 
-    def _reset(self) -> None:
+    def _reset(self, _samples: list[Sample]) -> None:
         """Discard the previous reading: the codec does not compare the next reading with it."""
         self.codec.reset()
         self._before_ns = 0

@@ -1,222 +1,339 @@
 """Assembly of samples from frames without counter and time (CANopen TPDOs, J1939 and NMEA 2000 PGNs).
 
-A device sends the frames of one instant back to back, always in the same order: a burst. Each kind of frame (a TPDO, a
-PGN) has its own rate. The fast kinds are in every burst, a slow kind is in every m-th burst. **A sample never contains
-frames of two periods.** The rules:
+A device sends several kinds of frames (a TPDO, a PGN), each kind with its own period. Some devices send the frames of
+one instant back to back (a burst), some devices send each kind by its own timer. The rules:
 
-- imud learns the kinds, their order, the period and every m from the received frames. It ignores all frames until then:
-  four periods of the fast kinds and two periods of each slow kind. It ignores a new fast kind for six bursts.
-- The first frame of a burst starts a sample. The sample is complete when it contains all due kinds: the fast kinds and
-  each slow kind whose last frame is m bursts old (or 2 m, 3 m … after a loss).
-- A sample ends early at a kind that it already contains (except an exact repetition), at a fast kind before the newest
-  frame in the order, at a frame more than 3/4 of a period after the first frame, and at lost frames (`reset`). imud
-  then counts a lost sample. If only slow kinds are missing, imud makes the sample without them. It does not do so after
-  `reset`, or with one fast kind, because then the next sample is already complete.
-- Without a started sample, imud ignores all frames except the first kind of a burst. It ignores a slow kind that is not
-  due and learns its m again.
-- imud counts bursts without any frame by time (`Cadence`): a gap up to 1 s is loss. If a host or a sender stalls and
-  the bursts then arrive late and back to back, no sample is lost.
-- A kind that is missing for ten of its periods counts as switched off. A new kind joins. If too many frames do not fit,
-  imud learns everything again.
+- The fastest kind is the *anchor*; of several equally fast kinds, the anchor is the first kind after the longest pause.
+  Each frame of the anchor makes one sample, with the arrival of this frame as its time.
+- A sample contains every frame that arrived since the previous sample. **Each frame is part of exactly one sample.** A
+  sample lacks the kinds that did not arrive.
+- A kind is *near* if it arrives within a quarter of a period of the anchor. The anchor waits for the near kinds that
+  are due. A near frame that arrives more than half a period from the anchor is from another burst. It becomes a sample
+  of its own, without the anchor. A kind that is not near waits for the next anchor.
+- A kind that arrives again ends the sample. imud ignores a copy: the same frame immediately after the frame.
+- If the SIDs of two kinds agree, the SID decides in place of the time.
+- Until the anchor is known (LEARNING_STEPS periods), a sample ends when a kind arrives again, before the longest pause.
+- imud counts a lost sample only if the SID or the period of the anchor proves the loss (`SidSeries`, `Cadence`).
+- If many samples lack the anchor, imud selects another anchor.
 
-A kind with a period that is not a multiple of the fast period is never part of a sample. If the end of one burst and
-the start of the next burst are lost, only the arrival times show the loss. They must be exact within 1/4 of a period,
-as the time stamps of the kernel are.
+If each kind arrives twice per period at fixed phases, two devices have the same address (`Alternation`).
 """
 
+from collections import deque
 from collections.abc import Container, Sequence
 from itertools import pairwise
-from statistics import fmean, median
+from statistics import median
 from typing import Final, NamedTuple
 
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, NS_PER_S
 
-PERIODS: Final = 4  # number of equal periods before imud uses a period
-STEPS_MAX: Final = 64  # number of periods for a mean if the arrival times vary too much for PERIODS equal periods
-FRAMES_MAX: Final = 128  # maximum number of frames during learning: enough for four periods of any device
+LEARNING_STEPS: Final = 8  # number of periods of the fastest kind before imud selects the anchor
+EQUAL_RATES: Final = 1.1  # maximum ratio of the mean periods of two equally fast kinds
+# Ratios of a distance across lost frames to the median: minimum, and maximum during learning
+GAP_LEAST, GAP_MOST = 1.5, 4.5
 
 
 class Learned(NamedTuple):
-    """Properties of the bursts of a device."""
+    """Properties of the frames of a device."""
 
-    order: tuple[int, ...]  # kinds in every burst, in their order
-    period_ns: int  # time between two bursts, ns
-
-
-class BurstLearning:
-    """Learning of the bursts from frames in the order of their arrival. Synchronization: one thread."""
-
-    def __init__(self) -> None:
-        self._frames: list[tuple[int, int]] = []
-        self._steps: list[int] = []
-
-    def add_frame(self, kind: int, t_ns: int) -> Learned | None:
-        """Add the kind and the arrival time of one frame. Return the properties of the bursts once they are known."""
-        frames = self._frames
-        frames.append((kind, t_ns))
-        places = [place for place, (other, _) in enumerate(frames) if other == kind]
-        if len(places) <= PERIODS:
-            if len(frames) > FRAMES_MAX:
-                del frames[: FRAMES_MAX // 2]
-            return None
-        slices = [frames[begin:end] for begin, end in pairwise(places)]
-        order = _in_every(slices)
-        if order is None:
-            del frames[: places[1]]
-            return None
-        times = [frames[place][1] for place in places]
-        steps = [b - a for a, b in pairwise(times)]
-        self._steps += steps[-1:]
-        if 2 * max(steps) > 3 * min(steps) and len(self._steps) < STEPS_MAX:
-            del frames[: places[1]]
-            return None
-        period = median(steps) if len(self._steps) < STEPS_MAX else fmean(self._steps)
-        return Learned(_from_head(order, frames), int(period))
+    anchor: int  # kind whose frames make the samples
+    period_ns: int  # time between two frames of the anchor, ns
 
 
-def _in_every(slices: Sequence[Sequence[tuple[int, int]]]) -> tuple[int, ...] | None:
-    """Return the kinds that occur once in every slice, if their order is the same in all slices; otherwise None."""
-    common = set.intersection(*({kind for kind, _ in one} for one in slices))
-    orders = {tuple(kind for kind, _ in one if kind in common) for one in slices}
-    order = orders.pop()
-    return order if not orders and len(order) == len(common) else None
-
-
-def _from_head(order: tuple[int, ...], frames: Sequence[tuple[int, int]]) -> tuple[int, ...]:
-    """Return the cycle of kinds, started after the longest pause; with the lowest kind if all pauses are equal."""
-    heard = [(kind, t_ns) for kind, t_ns in frames if kind in order]
-    pauses: dict[int, list[int]] = {kind: [0] for kind in order}
-    for (_, before_ns), (kind, t_ns) in pairwise(heard):
+def learned_from(frames: Sequence[tuple[int, int]]) -> Learned | None:
+    """Return the anchor of frames (kind, arrival time in ns). Return None before LEARNING_STEPS periods of a kind."""
+    times: dict[int, list[int]] = {}
+    for kind, t_ns in frames:
+        times.setdefault(kind, []).append(t_ns)
+    if max(map(len, times.values())) <= LEARNING_STEPS:
+        return None
+    steps = {kind: (of[-1] - of[0]) / (len(of) - 1) for kind, of in times.items() if 2 * len(of) > LEARNING_STEPS}
+    limit_ns = EQUAL_RATES * min(steps.values())
+    fast = [kind for kind, step_ns in steps.items() if step_ns <= limit_ns]
+    pauses: dict[int, list[int]] = {kind: [0] for kind in fast}
+    for (_, before_ns), (kind, t_ns) in pairwise(frame for frame in frames if frame[0] in pauses):
         pauses[kind].append(t_ns - before_ns)
-    head = max(order, key=lambda kind: (median(pauses[kind][1:] or [0]), -kind))
-    begin = order.index(head)
-    return order[begin:] + order[:begin]
+    anchor = max(fast, key=lambda kind: (median(pauses[kind][1:] or [0]), -kind))
+    distances = [b - a for a, b in pairwise(times[anchor])]
+    middle_ns = median(distances)
+    # few lost frames change the mean; distances that alternate change the median
+    gaps = [step_ns for step_ns in distances if step_ns > GAP_LEAST * middle_ns]
+    has_gap = 0 < len(gaps) <= len(distances) // 4 and max(gaps) < GAP_MOST * middle_ns
+    return Learned(anchor, int(middle_ns if has_gap else steps[anchor]))
 
 
 SILENCE_NS: Final = NS_PER_S  # Maximum gap that counts as loss, ns. After a longer gap the device was silent.
+SILENCE_PERIODS: Final = 4  # minimum length of a silence, in periods
 PERIOD_LEAST_NS: Final = NS_PER_MS  # minimum period, ns: no device sends faster than 1 kHz
-STEADY_BURSTS: Final = 2  # number of bursts at the normal distance after which imud expects no delayed burst
+STEADY: Final = 1 / 8  # maximum spread of the lateness of a steady device, in periods
+STEADY_BURSTS: Final = 3  # number of equally late bursts that prove a loss by a steady device
+UNSTEADY_BURSTS: Final = 16  # the same number for an unsteady device
+NEAR_SHARE: Final = 0.25  # maximum difference of two times that count as equal, in periods
 # Number of consecutive distances, all shorter or all longer and equal within 1/4, that mean a new rate
 ODD_BURSTS: Final = 8
-SMOOTHING: Final = 16  # weight of the known period against one new distance
+PHASE_SHARE, PERIOD_SHARE = 8, 128  # divisors of the lateness of one burst that correct the phase and the period
 
 
 class Cadence:
-    """Period and missing bursts of one device. Synchronization: one thread."""
+    """Period of the bursts of one device, and the losses that it proves. Synchronization: one thread."""
 
-    __slots__ = ("_late_ns", "_newest_ns", "_odd_ns", "_silent", "_steady", "period_ns")
+    __slots__ = ("_due_ns", "_is_silent", "_late_ns", "_newest_ns", "_odd_ns", "_room", "_usual_ns", "period_ns")
 
     def __init__(self, period_ns: int, newest_ns: int) -> None:
         """`newest_ns`: arrival time of the newest burst."""
         self.period_ns = max(period_ns, PERIOD_LEAST_NS)  # time between two bursts, ns
         self._newest_ns = newest_ns
-        self._late_ns = 0  # delay that short distances may still make up for, ns
-        self._silent = False
-        self._steady = 0
+        self._due_ns = newest_ns  # expected arrival of the newest burst
+        self._usual_ns: deque[int] = deque(maxlen=UNSTEADY_BURSTS)  # lateness of the newest punctual bursts
+        self._late_ns: list[int] = []  # lateness of the bursts since a gap, relative to the bursts before the gap
+        self._room = 0  # number of bursts that fit into the long distances since the gap
+        self._is_silent = False
         self._odd_ns: list[int] = []
 
-    @property
-    def is_late(self) -> bool:
-        """Whether the number of missing bursts in the newest gap is still unknown."""
-        return self._late_ns > 0
+    def steps_to(self, t_ns: int) -> int:
+        """Return the number of periods from the newest burst to a time."""
+        return (2 * (t_ns - self._newest_ns) + self.period_ns) // (2 * self.period_ns)
 
-    def begin(self, t_ns: int) -> tuple[int, int]:
-        """Start a burst. Return the number of bursts that are now known to be missing in the last gap, and how many of
-        them are lost.
-        """
+    def begin(self, t_ns: int) -> tuple[int, bool]:
+        """Start a burst. Return the number of lost bursts that are now proven, and whether their number is unknown."""
         step_ns, period_ns = t_ns - self._newest_ns, self.period_ns
+        late_ns = t_ns - self._due_ns - period_ns
         self._newest_ns = t_ns
-        if 4 * step_ns > 5 * period_ns:
-            self._long(step_ns)
-            return 0, 0
-        if 4 * step_ns < 3 * period_ns:
-            self._short(step_ns)
-            return 0, 0
-        self.period_ns += (step_ns - period_ns) // SMOOTHING
-        self._odd_ns.clear()
-        if not self._late_ns:
-            return 0, 0
-        self._late_ns += min(0, step_ns - period_ns)
-        self._steady += 1
-        return self._settle() if self._steady >= STEADY_BURSTS else (0, 0)
+        if self._add_odd(step_ns, late_ns):
+            self.rebase(t_ns)
+            return 0, False
+        if 2 * late_ns < -period_ns:  # another burst of the same period
+            return 0, False
+        self._due_ns += period_ns
+        least_ns = min(self._usual_ns, default=0)
+        if 2 * (late_ns - least_ns) < period_ns:
+            self._close_gap()
+            self._usual_ns.append(late_ns)
+            self._due_ns += late_ns // PHASE_SHARE
+            self.period_ns = max(period_ns + late_ns // PERIOD_SHARE, PERIOD_LEAST_NS)
+            return 0, False
+        self._is_silent |= step_ns > max(SILENCE_NS, SILENCE_PERIODS * period_ns)
+        self._late_ns.append(late_ns)
+        self._room += max(int(step_ns / period_ns + NEAR_SHARE) - 1, 0)
+        return self._judge(least_ns)
 
-    def _long(self, step_ns: int) -> None:
-        self._late_ns += step_ns - self.period_ns
-        self._silent |= step_ns > SILENCE_NS
-        self._steady = 0
-        self._add_odd(step_ns, 1)
+    def rebase(self, t_ns: int) -> None:
+        """Expect the next burst one period after this burst, which does not prove a loss."""
+        self._newest_ns = self._due_ns = t_ns
+        self._close_gap()
 
-    def _short(self, step_ns: int) -> None:
-        made_up_ns = self.period_ns - step_ns
-        self._steady = 0
-        if self._late_ns:
-            self._late_ns = max(0, self._late_ns - made_up_ns)
-            self._odd_ns.clear()
-        else:
-            self._add_odd(step_ns, -1)
+    def _close_gap(self) -> None:
+        self._late_ns.clear()
+        self._room = 0
+        self._is_silent = False
 
-    def _add_odd(self, step_ns: int, side: int) -> None:
-        """Use a new rate after ODD_BURSTS similar distances. A delay relative to the old rate is then not a delay."""
-        odd = self._odd_ns
-        if odd and ((odd[0] - self.period_ns) * side < 0 or 4 * abs(step_ns - odd[0]) > odd[0]):
+    def _judge(self, least_ns: int) -> tuple[int, bool]:
+        """Return the losses if enough bursts are equally late: a delay would decrease."""
+        period_ns, spread_ns = self.period_ns, max(self._usual_ns, default=0) - least_ns
+        is_steady = spread_ns < STEADY * period_ns
+        late_ns = self._late_ns[-(STEADY_BURSTS if is_steady else UNSTEADY_BURSTS) :]
+        limit_ns = max(NEAR_SHARE * period_ns, 1.5 * spread_ns)
+        if len(late_ns) < (STEADY_BURSTS if is_steady else UNSTEADY_BURSTS) or max(late_ns) - min(late_ns) > limit_ns:
+            del self._late_ns[:-UNSTEADY_BURSTS]
+            return 0, False
+        shift_ns, was_silent, room = min(late_ns) - least_ns, self._is_silent, self._room
+        missed = (2 * shift_ns + period_ns) // (2 * period_ns)
+        self._due_ns += shift_ns
+        self._close_gap()
+        if was_silent:
+            return 0, True
+        # a shift by a part of a period, or by several short delays, is another phase and not a loss
+        is_loss = abs(shift_ns - missed * period_ns) <= NEAR_SHARE * period_ns and missed <= room
+        return (missed if is_loss else 0), False
+
+    def _add_odd(self, step_ns: int, late_ns: int) -> bool:
+        """Use a new rate after ODD_BURSTS similar distances. Return whether the rate changed."""
+        odd, period_ns = self._odd_ns, self.period_ns
+        if 3 * period_ns <= 4 * step_ns <= 5 * period_ns or (step_ns < period_ns and 4 * late_ns > -period_ns):
+            odd.clear()  # a short distance can make up for a delay
+            return False
+        if odd and ((odd[0] > period_ns) is not (step_ns > period_ns) or 4 * abs(step_ns - odd[0]) > odd[0]):
             odd.clear()
         odd.append(step_ns)
-        if len(odd) >= ODD_BURSTS:
-            self.period_ns = max(int(median(odd)), PERIOD_LEAST_NS)
-            self._late_ns, self._silent = 0, False
-            odd.clear()
-
-    def _settle(self) -> tuple[int, int]:
-        missed = (2 * self._late_ns + self.period_ns) // (2 * self.period_ns)
-        lost = 0 if self._silent else missed
-        self._late_ns, self._silent, self._steady = 0, False, 0
-        return missed, lost
+        if len(odd) < ODD_BURSTS:
+            return False
+        self.period_ns = max(int(median(odd)), PERIOD_LEAST_NS)
+        self._usual_ns.clear()
+        odd.clear()
+        return True
 
 
-AWAY_PERIODS: Final = 10  # number of periods without a kind after which the kind counts as switched off
-DROPPED_MAX: Final = 16  # number of consecutive dropped samples after which imud learns everything again
-STRAYS_MAX: Final = 40
-# Limit and weight of frames without a place in a burst; each complete sample subtracts 1. Above the limit, imud learns
-# everything again: a device that sends a kind more often than the first kind of a burst causes such frames.
-STRAY_WEIGHT: Final = 2
+SID_RUN: Final = 8  # number of equal steps of the SID after which imud knows the step
+SID_MODULUS_LEAST, SID_MODULUS_MOST = 250, 256  # Range of the modulus of SIDs. The standard has 253.
+
+LATE_BURSTS: Final = 4  # number of bursts that can arrive together
+
+
+class SidSeries:
+    """Series of the SIDs of one kind. Synchronization: one thread."""
+
+    __slots__ = ("_modulus", "_newest", "_run", "_step")
+
+    def __init__(self) -> None:
+        self._newest: int | None = None
+        self._modulus = 0  # 0: unknown
+        self._step = 0  # newest difference of two SIDs
+        self._run = 0  # number of consecutive differences of this size
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the SIDs rise by equal steps: they are from one device."""
+        return self._run >= SID_RUN
+
+    def add(self, sid: int | None, *, is_next: bool) -> int | None:
+        """Add a SID. Return the number of missing SIDs before it; None if the SIDs do not show this number.
+
+        `is_next`: the period shows no loss before the SID.
+        """
+        newest, self._newest = self._newest, sid
+        if sid is None or newest is None:
+            return None
+        rise = sid - newest
+        if rise < 0 and self._modulus:
+            rise += self._modulus
+        elif rise < 0 and self.is_known:
+            modulus = newest + self._step - sid
+            if is_next and SID_MODULUS_LEAST <= modulus <= SID_MODULUS_MOST:
+                self._modulus = modulus
+            return None
+        if self.is_known and rise > 0 and rise % self._step == 0:
+            return rise // self._step - 1
+        self._run = self._run + 1 if rise == self._step and rise > 0 else 0
+        self._step = rise
+        return None
+
+
+ALTERNATIONS: Final = 64  # number of alternating distances after which two devices have the same address
+ALTERNATIONS_MAX: Final = 2 * ALTERNATIONS
+PHASE_LEAST: Final = 0.1  # Minimum phase of the second device, in periods. A gateway can send two frames back to back.
+STABLE: Final = 4  # minimum ratio of the difference of adjacent distances to the change of every second distance
+
+
+class Alternation:
+    """Distances of one kind that alternate between two values, as the frames of two devices. One thread."""
+
+    __slots__ = ("_count", "_newest_ns", "_steps_ns")
+
+    def __init__(self) -> None:
+        self._newest_ns = 0
+        self._steps_ns = (0, 0)  # the two newest distances
+        self._count = 0
+
+    @property
+    def steps_ns(self) -> tuple[int, int] | None:
+        """Return the shorter and the longer distance, ns; None if the frames are from one device."""
+        return (min(self._steps_ns), max(self._steps_ns)) if self._count >= ALTERNATIONS else None
+
+    def add_arrival(self, t_ns: int) -> None:
+        """Add the arrival time of a frame."""
+        step_ns, self._newest_ns = t_ns - self._newest_ns, t_ns
+        before_ns, previous_ns = self._steps_ns
+        self._steps_ns = (previous_ns, step_ns)
+        is_stable = STABLE * abs(step_ns - before_ns) < abs(step_ns - previous_ns)
+        if is_stable and min(step_ns, previous_ns) > PHASE_LEAST * (step_ns + previous_ns):
+            self._count = min(self._count + 1, ALTERNATIONS_MAX)
+        elif self._count:
+            self._count -= 1 if self._count >= ALTERNATIONS else self._count
+
+
+COPY_NS: Final = 2 * NS_PER_MS  # maximum time from a frame to its copy, ns: a repetition by the bus
+# Number of frames near the anchor, less FAR_WEIGHT for each other frame, from which a kind is near
+NEAR_FRAMES: Final = 4
+NEAR_FRAMES_MAX, FAR_WEIGHT = 8, 4
+AWAY_PERIODS: Final = 10  # number of its periods without a kind after which imud no longer waits for the kind
+SIDS_AGREE: Final = 4  # number of equal SIDs, less the different SIDs, after which the SID decides
+SIDS_AGREE_MAX: Final = 8
+STRAYS_MAX: Final = (
+    40  # Limit of samples without the anchor, see STRAY_WEIGHT. Above the limit, imud selects an anchor.
+)
+STRAY_WEIGHT: Final = 2  # weight of a sample without the anchor; each sample with the anchor subtracts 1
 # Number of equal consecutive distances for the first m; for another m; for a multiple of the known m (losses can cause
 # a multiple).
 AGREE_FIRST, AGREE_OTHER, AGREE_MULTIPLE = 2, 3, 4
-# Number of equal consecutive distances for a kind in every burst. Lost bursts shorten the distance of a slow kind; as a
-# fast kind it would change the period.
-AGREE_FAST: Final = 6
 
 
 class _Kind:
     """State of one kind of frame."""
 
-    __slots__ = ("every", "number", "run", "seen", "step")
+    __slots__ = (
+        "agree", "alternation", "anchors", "behind_ns", "every", "leads", "missed", "near", "run", "seen_ns", "step",
+        "step_ns",
+    )  # fmt: skip
 
-    def __init__(self, number: int, every: int, seen: int) -> None:
-        self.number = number
-        self.every = every  # bursts between two frames of this kind; 0 if unknown
-        self.seen = seen  # burst of the newest frame
-        self.step = 0  # bursts between the two newest frames
+    def __init__(self) -> None:
+        self.every = 0  # periods of the anchor between two frames of this kind; 0 if unknown
+        self.seen_ns: int | None = None  # arrival of the newest frame
+        self.anchors = 0  # number of anchors since the newest frame
+        self.leads = False  # whether the frames arrive before the anchor
+        self.step_ns = 0  # time between the two newest frames
+        self.step = 0  # the same time in periods of the anchor
         self.run = 0  # number of consecutive steps of this length
+        self.near = NEAR_FRAMES  # frames near the anchor, less the other frames
+        self.agree = 0  # frames with the SID of the anchor, less the other frames
+        self.missed = 0  # number of samples that waited for this kind in vain since its newest frame
+        self.behind_ns = 0  # delay that short distances may still make up for, ns
+        self.alternation = Alternation()
 
-    def is_due(self, since: int) -> bool:
-        """Return whether the kind is due `since` bursts after its last burst."""
-        return self.every > 0 and since > 0 and since % self.every == 0
+    @property
+    def is_near(self) -> bool:
+        return self.near >= NEAR_FRAMES
 
-    def learn(self, since: int) -> bool:
-        """Learn from the step to one more frame. Return whether `every` changed."""
-        self.run = self.run + 1 if since == self.step else 1
-        self.step = since
-        every = self.every
-        if since == 1:
-            needed = AGREE_FAST
-        else:
-            needed = AGREE_FIRST if not every else AGREE_OTHER if since % every else AGREE_MULTIPLE
-        if since < 1 or since == every or self.run < needed:
+    @property
+    def has_shared_sid(self) -> bool:
+        return self.agree >= SIDS_AGREE
+
+    def is_due(self, t_ns: int, period_ns: int, *, is_even: bool) -> bool:
+        """Return whether an anchor at `t_ns` waits for the kind. `is_even`: one period after the previous anchor."""
+        if not self.is_near or not self.every or self.seen_ns is None or self.missed >= AWAY_PERIODS:
             return False
-        self.every = since
-        return True
+        since = round((t_ns - self.seen_ns) / period_ns)
+        # after a loss, the time shows the number of periods; if frames arrive together, the number of anchors
+        by_count = not is_even and self.anchors - self.leads == self.every
+        return self.every == 1 or by_count or (since > 0 and since % self.every == 0)
+
+    def arrive(self, t_ns: int, anchor_ns: int, period_ns: int) -> None:
+        """Add the arrival of a frame. `anchor_ns`: arrival of the newest anchor."""
+        offset_ns = (t_ns - anchor_ns) % period_ns
+        is_near = min(offset_ns, period_ns - offset_ns) <= NEAR_SHARE * period_ns
+        self.near = min(self.near + 1, NEAR_FRAMES_MAX) if is_near else max(self.near - FAR_WEIGHT, 0)
+        if self.seen_ns is not None:
+            self.step_ns = t_ns - self.seen_ns
+            late_ns = self.behind_ns + self.step_ns - self.every * period_ns
+            self.behind_ns = late_ns if self.every and late_ns > NEAR_SHARE * period_ns else 0
+            if 4 * self.step_ns > period_ns:
+                self.leads = 2 * offset_ns > period_ns
+            self._learn(round(self.step_ns / period_ns))
+        self.seen_ns, self.missed, self.anchors = t_ns, 0, 0
+        self.alternation.add_arrival(t_ns)
+
+    def _learn(self, step: int) -> None:
+        self.run = self.run + 1 if step == self.step else 1
+        self.step = step
+        every = self.every
+        needed = AGREE_FIRST if not every else AGREE_OTHER if step % every else AGREE_MULTIPLE
+        if step > 0 and step != every and self.run >= needed:
+            self.every = step
+
+
+class Part(NamedTuple):
+    """Frame of the present sample."""
+
+    data: bytes
+    t_ns: int  # arrival time
+    sid: int | None
+
+
+class Assembled(NamedTuple):
+    """Frames of one sample."""
+
+    frames: list[tuple[int, bytes]]  # kind and data, in the order of arrival
+    t_first_ns: int  # arrival of the anchor; of the first frame in a sample without the anchor
 
 
 class Assembly:
@@ -228,226 +345,231 @@ class Assembly:
         """`kinds`: kinds that the assembly uses; None: all."""
         self._ledger = ledger
         self._allowed = kinds
-        self._held: dict[int, bytes] = {}  # data of the incomplete sample by kind, in the order of arrival
-        self._newest = 0  # kind of the newest frame with a place, in the incomplete sample or in a complete sample
+        self._parts: dict[int, Part] = {}  # present sample by kind, in the order of arrival
+        self._newest: tuple[int, bytes, int] | None = None  # kind, data and arrival of the newest frame
+        self._learning: list[tuple[int, int]] = []  # kinds and arrivals of the frames since the start of learning
         self._kinds: dict[int, _Kind] = {}
-        self._order: list[int] = []
-        self._place: dict[int, int] = {}
-        self._fast: frozenset[int] = frozenset()  # kinds in every burst; the first kind starts the burst
-        self._slow: list[_Kind] = []
-        self._head = 0
-        self._due: frozenset[int] = frozenset()  # kinds that complete the present burst
-        self._burst = 0  # number of the present or newest burst
-        self._gap = 0  # number of the first burst after the gap of unknown size
-        self._first_ns = self._newest_ns = 0
-        self._is_whole = False  # whether the newest burst became a sample and no frame without a place followed
-        self._dropped = self._strays = 0
+        self._anchor: int | None = None  # None: unknown
+        self._anchor_ns = 0  # arrival of the newest anchor
+        self._anchor_sid: int | None = None
+        self._due: set[int] = set()  # kinds for which the anchor of the present sample waits
         self._cadence = Cadence(0, 0)
-        self._learning: BurstLearning | None = BurstLearning()
+        self._sids = SidSeries()
+        self._strays = 0
+        self._incomplete = 0  # number of bursts without the anchor since the newest anchor
 
     @property
     def period_ns(self) -> int:
         """Time between two samples, ns; 0 if unknown."""
-        return self._cadence.period_ns if self._learning is None else 0
+        return 0 if self._anchor is None else self._cadence.period_ns
 
-    def add_frame(self, kind: int, data: bytes, t_rx_ns: int) -> Sequence[tuple[int, bytes]] | None:
-        """Add one frame. If it completes a sample, return the frames of the sample in the order of arrival."""
-        known = self._kinds.get(kind)
-        if self._learning is not None or known is None:
+    @property
+    def problem(self) -> str:
+        """Address conflict that the frames show, one sentence; empty without a conflict."""
+        if self._anchor is None or self._sids.is_known:
+            return ""
+        own = self._kinds[self._anchor]
+        found = [kind.alternation.steps_ns for kind in self._kinds.values() if kind is own or kind.every == 1]
+        steps_ns = own.alternation.steps_ns
+        if steps_ns is None or None in found:
+            return ""
+        return (
+            f"each frame arrives twice per period of {sum(steps_ns) / NS_PER_MS:.1f} ms, "
+            f"{steps_ns[0] / NS_PER_MS:.1f} ms apart; do two devices on the bus have this address?"
+        )
+
+    def add_frame(self, kind: int, data: bytes, t_rx_ns: int, sid: int | None = None) -> Sequence[Assembled]:
+        """Add one frame. Return the samples that it completes, oldest first."""
+        if (self._allowed is not None and kind not in self._allowed) or self._is_copy(kind, data, t_rx_ns):
             self._ledger.frames_ignored += 1
-            self._meet(kind, t_rx_ns)
-            return None
-        held, done = self._held, None
-        if held:
-            if kind == self._newest and held[kind] == data:
-                self._ledger.frames_ignored += 1
-                return None
-            if self._ends(known, t_rx_ns):
-                done = self._end()
-        if not self._fits(known, t_rx_ns):
-            self._ledger.frames_ignored += 1
-            return done
-        held[kind] = data
-        self._newest = kind
-        self._newest_ns = t_rx_ns
-        self._ledger.frames_pending += 1
-        return self._close() if self._due <= held.keys() else done
+            return ()
+        self._newest = (kind, data, t_rx_ns)
+        if self._anchor is None:
+            return self._add_unknown(kind, Part(data, t_rx_ns, sid))
+        done = []
+        if self._parts and (kind in self._parts or self._separates(kind, t_rx_ns, sid)):
+            done.append(self._take())
+            if self._anchor is None:
+                return done + self._add_unknown(kind, Part(data, t_rx_ns, sid))
+        self._add(kind, Part(data, t_rx_ns, sid))
+        self._track(kind, t_rx_ns)
+        if self._anchor in self._parts and not self._due:
+            done.append(self._take())
+        return done
+
+    def flush(self) -> Sequence[Assembled]:
+        """Return the incomplete sample: no frame follows."""
+        return [self._take()] if self._parts else ()
 
     def reset(self) -> None:
-        """Drop the incomplete sample after lost frames. Ignore all frames until the next burst starts."""
-        if self._held:
-            self._drop_sample()
-        self._is_whole = False
+        """Drop the incomplete sample."""
+        ledger = self._ledger
+        ledger.frames_ignored += len(self._parts)
+        ledger.frames_pending -= len(self._parts)
+        self._parts.clear()
+        self._due.clear()
+        self._newest = None
 
-    def _fits(self, kind: _Kind, t_rx_ns: int) -> bool:
-        """Return whether a frame has a place in the present burst or the next burst. It may start the next burst."""
-        if self._kinds.get(kind.number) is not kind:  # the end of the previous sample removed this kind
+    def _is_copy(self, kind: int, data: bytes, t_rx_ns: int) -> bool:
+        """Return whether the bus repeated the newest frame."""
+        if self._newest is None or (kind, data) != self._newest[:2]:
             return False
-        return self._fits_fast(kind, t_rx_ns) if kind.every == 1 else self._fits_slow(kind, t_rx_ns)
+        known, after_ns = self._kinds.get(kind), t_rx_ns - self._newest[2]
+        if known is None or not known.every or self._anchor is None:
+            return after_ns < COPY_NS
+        period_ns = known.every * self._cadence.period_ns
+        # frames that waited arrive together, and their data can be equal
+        return after_ns < min(COPY_NS, period_ns // 8) and 2 * known.behind_ns < period_ns
 
-    # --- frames of every burst --------------------------------------------------------------------------------------
+    def _separates(self, kind: int, t_rx_ns: int, sid: int | None) -> bool:
+        """Return whether a frame is from another burst than the present sample."""
+        kinds, parts, period_ns = self._kinds, self._parts, self._cadence.period_ns
+        known = kinds.get(kind)
+        anchor = parts.get(self._anchor) if self._anchor is not None else None
+        near_ns = [part.t_ns for number, part in parts.items() if kinds[number].is_near]
+        age_ns = t_rx_ns - near_ns[0] if near_ns and known is not None and known.is_near else 0
+        if known is not None and sid is not None and known.has_shared_sid:
+            for number, part in parts.items():
+                if part.sid is not None and kinds[number].has_shared_sid:
+                    if part.sid == sid:
+                        return 4 * age_ns > 3 * period_ns
+                    if 2 * age_ns <= period_ns:  # a loss, or the SIDs no longer agree
+                        kinds[kind if number == self._anchor else number].agree -= 1
+                    return True
+        return 2 * age_ns > period_ns or (anchor is not None and 2 * (t_rx_ns - anchor.t_ns) > period_ns)
 
-    def _fits_fast(self, kind: _Kind, t_rx_ns: int) -> bool:
-        if not self._held:
-            if kind.number != self._head:
-                self._stray()
-                return False
-            self._begin(t_rx_ns)
-        since = self._burst - kind.seen
-        kind.seen = self._burst
-        if since == 1:
-            kind.run = 0
-        elif kind.learn(since):
-            self._plan()
-        return self._learning is None
+    def _add(self, kind: int, part: Part) -> None:
+        self._parts[kind] = part
+        self._ledger.frames_pending += 1
 
-    def _begin(self, t_rx_ns: int) -> None:
-        was_late = self._cadence.is_late
-        missed, lost = self._cadence.begin(t_rx_ns)
-        if missed:
-            self._ledger.lost_gap_device += lost
-            self._ledger.lost_unknown += not lost
-            for kind in self._kinds.values():
-                if kind.seen < self._gap:
-                    kind.seen -= missed
-        self._burst += 1
-        if not was_late:
-            self._gap = self._burst
-        self._first_ns = t_rx_ns
-        self._is_whole = False
-        self._due = self._fast
-        if self._slow:
-            due = [kind.number for kind in self._slow if kind.is_due(self._burst - kind.seen)]
-            self._due = self._fast.union(due) if due else self._fast
-
-    def _close(self) -> list[tuple[int, bytes]]:
-        """Return the frames of the complete sample."""
-        held, ledger = self._held, self._ledger
-        frames = list(held.items())
-        held.clear()
-        ledger.frames_pending -= len(frames)
-        ledger.frames_in_samples += len(frames)
-        self._is_whole = True
-        self._dropped = 0
-        if self._strays:
-            self._strays -= 1
-        return frames
-
-    # --- slow kinds -------------------------------------------------------------------------------------------------
-
-    def _fits_slow(self, kind: _Kind, t_rx_ns: int) -> bool:
-        """Return whether a frame of a slow kind has a place in the present burst or starts the next burst."""
-        begins = not self._held and self._place[kind.number] < self._place[self._head]
-        if not self._held and ((not begins and not self._is_whole) or kind.number == self._newest):
-            return False  # the start of the burst is lost, or a repetition
-        since = self._burst + begins - kind.seen
-        is_due = kind.is_due(since)
-        in_order = not self._held or self._place[kind.number] > self._place[self._newest]
-        fits = is_due and in_order and (begins or bool(self._held))
-        if begins and fits:
-            self._begin(t_rx_ns)
-            since = self._burst - kind.seen
-        if not fits:
-            self._put(kind.number, t_rx_ns)
-            begins = not self._held and self._place[kind.number] < self._place[self._head]
-            since = self._burst + begins - kind.seen
-        kind.seen += since
-        if kind.learn(since):
-            self._plan()
-        return fits and self._learning is None
-
-    def _meet(self, kind: int, t_rx_ns: int) -> None:
-        """Learn from a frame of an unknown kind, or from any frame during learning."""
-        if self._allowed is not None and kind not in self._allowed:
+    def _track(self, kind: int, t_rx_ns: int) -> None:
+        """Update the state of a kind. An anchor then waits for the kinds that are due."""
+        period_ns, kinds = self._cadence.period_ns, self._kinds
+        known = kinds.get(kind)
+        if known is None:
+            known = kinds[kind] = _Kind()
+        if kind != self._anchor:
+            known.arrive(t_rx_ns, self._anchor_ns, period_ns)
+            self._due.discard(kind)
             return
-        if self._learning is not None:
-            learned = self._learning.add_frame(kind, t_rx_ns)
-            if learned is not None:
-                self._learn(learned, t_rx_ns)
-        elif self._held or self._is_whole:
-            self._put(kind, t_rx_ns)
-            begins = not self._held and self._place[kind] < self._place[self._head]
-            self._kinds[kind] = _Kind(kind, 0, self._burst + begins)
-            self._plan()
+        is_even = 3 * period_ns <= 4 * (t_rx_ns - self._anchor_ns) <= 5 * period_ns
+        known.arrive(t_rx_ns, t_rx_ns, period_ns)
+        known.every = 1
+        self._anchor_ns = t_rx_ns
+        for number, one in kinds.items():
+            one.anchors += 1
+            if number not in self._parts and one.is_due(t_rx_ns, period_ns, is_even=is_even):
+                self._due.add(number)
 
-    def _put(self, kind: int, t_rx_ns: int) -> None:
-        """Place a kind by its newest frame: after the newest frame of the burst, or before the next burst."""
-        order = [other for other in self._order if other != kind]
-        follows = bool(self._held) or 2 * (t_rx_ns - self._newest_ns) < self._cadence.period_ns
-        order.insert(order.index(self._newest) + 1 if follows else 0, kind)
-        self._order = order
-        self._place = {other: place for place, other in enumerate(order)}
-
-    # --- frames without a place -------------------------------------------------------------------------------------
-
-    def _ends(self, kind: _Kind, t_rx_ns: int) -> bool:
-        """Return whether a frame shows that the rest of the incomplete sample is lost."""
-        # in quarters of a period; 2 if a slow kind started the burst: the first fast kind must follow soon
-        limit = 3 if self._head in self._held else 2
-        if 4 * (t_rx_ns - self._first_ns) > limit * self._cadence.period_ns or kind.number in self._held:
-            return True
-        return kind.every == 1 and self._place[kind.number] < self._place[self._newest]
-
-    def _end(self) -> list[tuple[int, bytes]] | None:
-        """End the incomplete sample: return it without its slow kinds, or drop it."""
-        frames = self._close() if len(self._fast) > 1 and self._fast <= self._held.keys() else None
-        if frames is None:
-            self._drop_sample()
-        self._is_whole = False
-        away = [kind for kind in self._kinds.values() if self._is_away(kind)]
-        for kind in away:
-            del self._kinds[kind.number]
-        if away:
-            self._plan()
-        return frames
-
-    def _drop_sample(self) -> None:
-        self._drop()
-        self._ledger.lost_gap_device += 1
-        self._is_whole = False
-        self._dropped += 1
-        if self._dropped >= DROPPED_MAX:
-            self._relearn()
-
-    def _drop(self) -> None:
-        held, ledger = self._held, self._ledger
-        ledger.frames_ignored += len(held)
-        ledger.frames_pending -= len(held)
-        held.clear()
-
-    def _is_away(self, kind: _Kind) -> bool:
-        return kind.number in self._due and self._burst - kind.seen >= AWAY_PERIODS * kind.every
-
-    def _stray(self) -> None:
-        self._strays += STRAY_WEIGHT
+    def _take(self) -> Assembled:
+        """End the present sample and return its frames."""
+        parts, ledger, kinds = self._parts, self._ledger, self._kinds
+        frames = [(kind, part.data) for kind, part in parts.items()]
+        ledger.frames_pending -= len(parts)
+        ledger.frames_in_samples += len(parts)
+        for kind in self._due:
+            kinds[kind].missed += 1
+        first_ns = next(iter(parts.values())).t_ns
+        anchor = parts.get(self._anchor) if self._anchor is not None else None
+        if anchor is not None:
+            first_ns = anchor.t_ns
+            self._strays = max(self._strays - 1, 0)
+            self._compare_sids(anchor)
+            shares = any(one.has_shared_sid for number, one in kinds.items() if number != self._anchor)
+            self._count_losses(first_ns, anchor.sid, is_instant=shares)
+        elif self._anchor is not None:
+            burst_ns = [part.t_ns for kind, part in parts.items() if kinds[kind].is_near and kinds[kind].every]
+            if any(kinds[kind].has_shared_sid for kind in parts) or self._cadence.steps_to(first_ns) > 0:
+                self._incomplete += 1  # the anchor is lost, the sample is not
+            if burst_ns and self._cadence.steps_to(burst_ns[0]) > 0:
+                self._count_by_period(burst_ns[0])
+            self._strays += STRAY_WEIGHT
+        parts.clear()
+        self._due.clear()
         if self._strays >= STRAYS_MAX:
-            self._relearn()
+            self._learn_again()
+        return Assembled(frames, first_ns)
 
-    # --- learning ------------------------------------------------------------------------------------------------
+    # --- losses -------------------------------------------------------------------------------------------------------
 
-    def _relearn(self) -> None:
-        self._drop()
-        self._kinds = {}
-        self._is_whole = False
-        self._dropped = self._strays = 0
-        self._learning = BurstLearning()
-
-    def _learn(self, learned: Learned, t_rx_ns: int) -> None:
-        """Use the learned bursts. The next burst is the first burst that counts."""
-        self._learning = None
-        self._cadence = Cadence(learned.period_ns, t_rx_ns)
-        self._kinds = {number: _Kind(number, 1, self._burst) for number in learned.order}
-        self._order = list(learned.order)
-        self._place = {number: place for place, number in enumerate(self._order)}
-        self._plan()
-
-    def _plan(self) -> None:
-        """Update the plan after a change of kinds or rates."""
-        kinds = self._kinds
-        fast = [number for number in self._order if number in kinds and kinds[number].every == 1]
-        if not fast:
-            self._relearn()
+    def _compare_sids(self, anchor: Part) -> None:
+        """Compare the SIDs of a sample. Constant SIDs do not show the instant."""
+        before, self._anchor_sid = self._anchor_sid, anchor.sid
+        if anchor.sid is None or anchor.sid == before:
             return
-        self._head = fast[0]
-        self._fast = frozenset(fast)
-        self._slow = [kind for kind in kinds.values() if kind.every != 1]
+        for kind, part in self._parts.items():
+            known = self._kinds[kind]
+            known.agree = min(known.agree + 1, SIDS_AGREE_MAX) if part.sid == anchor.sid else max(known.agree - 1, 0)
+
+    def _count_losses(self, t_ns: int, sid: int | None, *, is_instant: bool) -> None:
+        """Count the lost samples before an anchor. `is_instant`: the SID numbers the bursts, not the frames."""
+        cadence = self._cadence
+        steps = cadence.steps_to(t_ns)
+        missing = self._sids.add(sid, is_next=steps == 1)
+        if missing is not None:
+            missing = max(missing - self._incomplete, 0)
+        self._incomplete = 0
+        # after a longer time, whole turns can be missing
+        if missing is not None and steps < SID_MODULUS_LEAST // 2 and self._fits_time(missing, steps, is_instant):
+            self._ledger.lost_gap_device += missing
+            if missing or steps != 1:
+                cadence.rebase(t_ns)
+                return
+        self._count_by_period(t_ns)
+
+    def _fits_time(self, missing: int, steps: int, is_instant: bool) -> bool:
+        """Return whether this number of SIDs can be missing in `steps` periods."""
+        if not missing:
+            return True
+        # SIDs of a counter that other messages share rise without a gap in time, as the SIDs of late bursts
+        return missing <= steps + LATE_BURSTS if is_instant else abs(steps - 1 - missing) <= missing // 8
+
+    def _count_by_period(self, t_ns: int) -> None:
+        before_ns = self._cadence.period_ns
+        lost, is_unknown = self._cadence.begin(t_ns)
+        period_ns = self._cadence.period_ns
+        if abs(period_ns - before_ns) > NEAR_SHARE * before_ns:  # another rate
+            for kind in self._kinds.values():
+                kind.every = max(round(kind.step_ns / period_ns), 1) if kind.every else 0
+        self._ledger.lost_gap_device += lost
+        self._ledger.lost_unknown += is_unknown
+
+    # --- learning -----------------------------------------------------------------------------------------------------
+
+    def _add_unknown(self, kind: int, part: Part) -> list[Assembled]:
+        """Add a frame during learning."""
+        done = []
+        while kind in self._parts:
+            times = [*(one.t_ns for one in self._parts.values()), part.t_ns]
+            pauses = [after - before for before, after in pairwise(times)]
+            cut = 1 + next(place for place, pause_ns in enumerate(pauses) if 4 * pause_ns >= 3 * max(pauses))
+            parts = list(self._parts.items())
+            self._parts = dict(parts[:cut])
+            done.append(self._take())
+            self._parts = dict(parts[cut:])
+        self._add(kind, part)
+        self._learning.append((kind, part.t_ns))
+        learned = learned_from(self._learning)
+        if learned is not None:
+            self._use(learned)
+            if self._anchor in self._parts and not self._due:
+                done.append(self._take())
+        return done
+
+    def _use(self, learned: Learned) -> None:
+        """Use an anchor. The frames of the learning show the properties of the other kinds."""
+        frames, self._learning = self._learning, []
+        self._anchor = learned.anchor
+        self._cadence = Cadence(learned.period_ns, frames[-1][1])
+        self._sids = SidSeries()
+        self._kinds = {kind: _Kind() for kind, _ in frames}
+        self._kinds[learned.anchor].near = NEAR_FRAMES_MAX
+        begin = next(place for place, (kind, _) in enumerate(frames) if kind == learned.anchor)
+        for kind, t_ns in frames[begin:]:
+            self._track(kind, t_ns)
+        if learned.anchor not in self._parts:
+            self._due.clear()
+
+    def _learn_again(self) -> None:
+        self._anchor, self._strays = None, 0
+        self._kinds = {}

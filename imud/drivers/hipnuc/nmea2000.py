@@ -6,9 +6,8 @@ ss is the address of the sender, which NMEA 2000 can change each time the bus is
 first sender of these messages and keeps it; after SILENT_NS without a message, it selects the next sender. imud claims
 no address and sends no requests.
 
-Messages of one instant have the same SID. `assembly.py` makes samples by order and time. imud drops frames with another
-SID than the newest frame. A sender with different SIDs for one instant, against the standard, would never make a
-sample: after SID_DOUBTS such samples in a row, imud ignores SIDs until they agree in the same number of samples.
+Messages of one instant should have the same SID. Real senders also number each PGN independently, or send a constant
+SID. `assembly.py` makes samples by the period of each PGN, and uses SIDs only while they agree.
 
 A sender may send its heading twice, from true and from magnetic north. `heading` selects one; `auto` selects the first
 received reference and keeps it. imud ignores the other heading. It does not apply deviation and variation.
@@ -28,7 +27,7 @@ from imud.attitude.rotation import euler312_from_quat, quat_from_euler312
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Identity
 from imud.contracts.script import says_nothing
-from imud.drivers.hipnuc.assembly import Assembly
+from imud.drivers.hipnuc.assembly import Assembled, Assembly
 from imud.drivers.hipnuc.common import FLOATS, random_quaternion
 from imud.formats.can import CanFilter, CanFrame
 from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, filter_of, join, sender_of
@@ -73,7 +72,9 @@ def head_of(pgn: int, data: bytes) -> Head:
     return Head(data[0] if data[0] <= SID_MOST else None, reference)
 
 
-def measurement_of(messages: Sequence[tuple[int, bytes]], *, heading_elsewhere: bool = False) -> Measurement:
+def measurement_of(
+    messages: Sequence[tuple[int, bytes]], t_first_ns: int | None = None, *, heading_elsewhere: bool = False
+) -> Measurement:
     """Return the measurement of messages (PGN, data) of one instant, each PGN at most once.
 
     Yaw is from the heading, otherwise from the attitude. `heading_elsewhere`: the device sends its heading in other
@@ -102,6 +103,7 @@ def measurement_of(messages: Sequence[tuple[int, bytes]], *, heading_elsewhere: 
         gyro_rad_s=(nan, nan, rate) if isfinite(rate) else None,
         quat_wxyz=quat_from_euler312(euler) if is_whole else None,
         euler_rad=euler if is_whole or any(map(isfinite, euler)) else None,
+        t_first_ns=t_first_ns,
     )  # fmt: skip
 
 
@@ -142,7 +144,6 @@ def _clip(value: float, most: int) -> int:
 
 # Time without a message after which imud selects another sender, ns. The slowest message has a period of 1 s.
 SILENT_NS: Final = 3 * NS_PER_S
-SID_DOUBTS: Final = 8
 
 _PGNS: Final = {join(J1939Id(0, pgn, 0)): pgn for pgn in PGNS}  # PGN by identifier without priority and source
 _REFERENCES: Final = {"true": Reference.TRUE, "magnetic": Reference.MAGNETIC, "auto": None}
@@ -186,17 +187,12 @@ class HipnucNmea2000Codec:
         if reference is not None and not self._is_reference(reference):
             ledger.frames_ignored += 1
             return ()
-        self._match(sid)
-        whole = self._assembly.add_frame(pgn, data, t_rx_ns)
-        if whole is None:
-            return ()
-        self._count_sids(whole)
-        self._has_heading |= any(kind == HEADING for kind, _ in whole)
-        return (measurement_of(whole, heading_elsewhere=self._has_heading),)
+        self._has_heading |= pgn == HEADING
+        return self._measurements(self._assembly.add_frame(pgn, data, t_rx_ns, sid))
 
     def flush(self) -> Sequence[CodecEvent]:
-        """Do nothing: the next frame shows the loss."""
-        return ()
+        """Return the incomplete sample."""
+        return self._measurements(self._assembly.flush())
 
     def reset(self) -> None:
         """Drop the incomplete sample after lost frames."""
@@ -220,37 +216,15 @@ class HipnucNmea2000Codec:
         self._assembly = Assembly(self.ledger)
         self._reference = self._wanted_reference
         self._has_heading = False
-        self._held_sid: int | None = None
-        self._uses_sids = True
-        self._sid_doubts = 0
+
+    def _measurements(self, samples: Sequence[Assembled]) -> list[CodecEvent]:
+        return [measurement_of(*one, heading_elsewhere=self._has_heading) for one in samples]
 
     def _is_reference(self, reference: Reference) -> bool:
         """Return whether imud uses this heading. An error counts for both references, without a value."""
         if self._reference is None and reference is not Reference.ERROR:
             self._reference = reference
         return reference in (self._reference, Reference.ERROR)
-
-    # --- messages of one instant ------------------------------------------------------------------------------------
-
-    def _match(self, sid: int | None) -> None:
-        """Drop the frames of another instant."""
-        differs = sid is not None and self._held_sid is not None and sid != self._held_sid
-        self._held_sid = sid
-        if self._uses_sids and differs and self.ledger.frames_pending:
-            self._assembly.reset()
-            self._sid_doubts += 1
-            if self._sid_doubts >= SID_DOUBTS:
-                self._uses_sids, self._sid_doubts = False, 0
-
-    def _count_sids(self, whole: Sequence[tuple[int, bytes]]) -> None:
-        """Count complete samples with equal SIDs."""
-        if self._uses_sids:
-            self._sid_doubts = 0
-        elif len(whole) > 1:
-            agree = len({data[0] for _, data in whole}) == 1
-            self._sid_doubts = self._sid_doubts + 1 if agree else 0
-            if self._sid_doubts >= SID_DOUBTS:
-                self._uses_sids, self._sid_doubts = True, 0
 
 
 # --- encoder for simulated devices ------------------------------------------------------------------------------

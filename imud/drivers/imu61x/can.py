@@ -178,15 +178,15 @@ class Imu61xCanCodec:
             return ()
         if follows:
             pace.learn(span_ns, t_rx_ns - before_ns)
-        raw = b"".join(held[slot] for slot in _IN_ORDER) + data
+        raw, first_ns = b"".join(held[slot] for slot in _IN_ORDER) + data, self._first_ns
         held.clear()
         self._newest = -1
         ledger.frames_pending -= _CLOSING
         ledger.frames_in_samples += SET_FRAMES
         *values, temperature, _ = SET.unpack(raw)
         if is_possible(values) and possible_temperature_c(temperature * C_PER_COUNT) is not None:
-            return (_measurement(values, temperature, index),)
-        return (*self._not_finite(raw), _measurement(values, temperature, index))
+            return (_measurement(values, temperature, index, first_ns),)
+        return (*self._not_finite(raw), _measurement(values, temperature, index, first_ns))
 
     def _not_finite(self, raw: bytes) -> list[CodecEvent]:
         """Return a `BadFrame` for every frame with a value that is not possible."""
@@ -202,7 +202,7 @@ class Imu61xCanCodec:
         return events
 
 
-def _measurement(values: Sequence[float], temperature: int, index: int) -> Measurement:
+def _measurement(values: Sequence[float], temperature: int, index: int, first_ns: int) -> Measurement:
     """Return the measurement of a complete set, without groups with a value that is not possible."""
     euler = scaled(values[:3], RAD_PER_DEG)
     return Measurement(
@@ -212,6 +212,7 @@ def _measurement(values: Sequence[float], temperature: int, index: int) -> Measu
         quat_wxyz=None if euler is None else quat_from_euler_zyx(euler),
         euler_rad=euler,
         temperature_c=possible_temperature_c(temperature * C_PER_COUNT),
+        t_first_ns=first_ns,
     )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """Assembly of samples from frames without a counter. The data of the test frames identify the burst."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from random import Random
 from typing import NamedTuple
@@ -14,8 +15,6 @@ from imud.model.ledger import Ledger
 MS = 1_000_000
 PERIOD_NS = 5 * MS
 FRAME_NS = 240_000
-LEARNING = 6
-"""Number of bursts until the fast kinds are known, with the first incomplete burst."""
 EQUAL = {1: 1, 2: 1, 3: 1}
 MIXED = {1: 1, 2: 1, 3: 2, 6: 10}
 """200, 200, 100 and 20 Hz, as multiples of the burst period."""
@@ -28,6 +27,7 @@ class Frame(NamedTuple):
     data: bytes
     t_ns: int
     burst: int
+    sid: int | None = None
 
 
 def stream(kinds: Mapping[int, int], bursts: Iterable[int], period_ns: int = PERIOD_NS) -> list[Frame]:
@@ -47,27 +47,35 @@ class AssemblyBench:
         self.assembly = Assembly(self.ledger, None if kinds is None else set(kinds))
         self.made: list[tuple[int, tuple[int, ...]]] = []
         """Burst and kinds of each sample."""
+        self.times_ns: list[int] = []
+        self.ages_ns: list[int] = []
+        """Time from each value to its sample, ns."""
 
-    def feed(self, frames: Iterable[Frame]) -> list[int]:
-        """Return the bursts that became samples. Check that no sample is mixed and that the ledger balances."""
-        before = len(self.made)
+    def feed(self, frames: Iterable[Frame], *, bursts: bool = True) -> list[int]:
+        """Return the bursts that became samples. Check that each frame is part of one sample or ignored, and the
+        ledger. `bursts`: check also that no sample is mixed.
+        """
+        before, arrivals = len(self.made), dict[bytes, int]()
         for frame in frames:
+            arrivals[frame.data] = frame.t_ns
             self.ledger.frames_good += 1
-            made = self.assembly.add_frame(frame.kind, frame.data, frame.t_ns)
+            for made in self.assembly.add_frame(*frame[:3], frame.sid):
+                numbers = {int.from_bytes(data[:4], "little") for _, data in made.frames}
+                assert not bursts or len(numbers) == 1, "mixed"
+                assert all(data[4] == kind for kind, data in made.frames)
+                self.made.append((numbers.pop(), tuple(kind for kind, _ in made.frames)))
+                self.times_ns.append(made.t_first_ns)
+                self.ages_ns += [abs(made.t_first_ns - arrivals.get(data, made.t_first_ns)) for _, data in made.frames]
             assert self.ledger.closes(), self.ledger.snapshot()
             assert min(self.ledger.values()) >= 0
-            if made is not None:
-                bursts = {int.from_bytes(data[:4], "little") for _, data in made}
-                assert len(bursts) == 1, "mixed"
-                assert all(data[4] == kind for kind, data in made)
-                self.made.append((bursts.pop(), tuple(kind for kind, _ in made)))
+        assert self.times_ns == sorted(self.times_ns)
         return [burst for burst, _ in self.made[before:]]
 
     def kinds_of(self, burst: int) -> tuple[int, ...]:
         return dict(self.made)[burst]
 
 
-def learnt(kinds: Mapping[int, int], bursts: int = 40) -> AssemblyBench:
+def learnt(kinds: Mapping[int, int], bursts: int = 60) -> AssemblyBench:
     rig = AssemblyBench()
     rig.feed(stream(kinds, range(bursts)))
     assert rig.ledger.lost_gap_device == 0
@@ -84,21 +92,89 @@ def whole(kinds: Mapping[int, int], burst: int) -> tuple[int, ...]:
 
 @pytest.mark.parametrize("kinds", [EQUAL, MIXED, LEADING, {4: 1}, {1: 3, 2: 1, 4: 3, 6: 7}])
 @pytest.mark.parametrize("begin", [0, 2])
-def test_every_burst_becomes_one_sample_once_learnt(kinds: dict[int, int], begin: int) -> None:
+def test_every_burst_becomes_one_sample(kinds: dict[int, int], begin: int) -> None:
+    """Also the first bursts: imud ignores no frame while it learns."""
     rig = AssemblyBench()
-    frames = stream(kinds, range(200))[begin:]
-    made = rig.feed(frames)
-    assert made[0] <= LEARNING + 2
-    assert made == list(range(made[0], 200))
-    late = 3 * max(kinds.values()) + LEARNING
-    assert all(names == whole(kinds, burst) for burst, names in rig.made if burst >= late)
-    assert rig.ledger.lost_gap_device == 0
+    made = rig.feed(stream(kinds, range(200))[begin:])
+    late = 4 * max(kinds.values())
+    assert set(made) >= set(range(2, 199))
+    assert [one for one in rig.made if late <= one[0] < 199] == [(b, whole(kinds, b)) for b in range(late, 199)]
+    assert rig.ledger.lost_gap_device == rig.ledger.frames_ignored == 0
     assert rig.assembly.period_ns == pytest.approx(PERIOD_NS, rel=1e-3)
+    if kinds in (EQUAL, MIXED):
+        assert rig.times_ns[-20:] == [10**9 + burst * PERIOD_NS for burst in made[-20:]]
+
+
+FREE = {
+    "an autopilot at 40, 10 and 1 Hz": {1: 25.0, 2: 100.0, 3: 1000.0},
+    "40, 10 and 1 Hz, elsewhere in the period": {1: (25.0, 24.0), 2: (100.0, 13.0), 3: (1000.0, 26.0)},
+    "timers that slide": {1: 100.0, 2: (100.3, 0.6), 3: (100.7, 1.2)},
+    "the faster kind slides": {1: (100.3, 3.0), 2: 100.0},
+    "half the rate, sliding": {1: 10.0, 2: (20.05, 0.4)},
+    "no common multiple": {1: 20.0, 2: 50.0, 3: (33.0, 5.0)},
+    "the slow kind is first": {1: (1000.0, 0.0), 2: (50.0, 20.0)},
+    "opposite phases": {1: 100.0, 2: (100.0, 50.0)},
+    "one kind": {1: 1000.0},
+}
+SIDS: dict[str, Callable[[int, int, int], int | None]] = {
+    "no SID": lambda kind, number, message: None,
+    "always 0": lambda kind, number, message: 0,
+    "a counter of each kind": lambda kind, number, message: (number + 50 * kind) % 251,
+    "counters that start together": lambda kind, number, message: number % 253,
+    "one counter of all messages": lambda kind, number, message: message % 256,
+    "steps of four": lambda kind, number, message: 4 * number % 252,
+}
+
+
+def free_frames(kinds: Mapping[int, object], jitter: float, random: Random, until_ms: int = 0) -> list[Frame]:
+    """Return the frames of kinds with timers of their own: period, or (period, phase), in ms."""
+    timers = {kind: one if isinstance(one, tuple) else (float(str(one)), 0.0) for kind, one in kinds.items()}
+    fastest = min(period for period, _ in timers.values())
+    until_ms = until_ms or int(max(400 * fastest, *(8 * period for period, _ in timers.values()), 0))
+    frames = []
+    for kind, (period, phase) in timers.items():
+        for number in range(int((until_ms - phase) / period)):
+            t_ms = phase + number * period + jitter * fastest * random.random()
+            data = number.to_bytes(4, "little") + bytes([kind])
+            frames.append(Frame(kind, data, 10**9 + round(t_ms * MS), number))
+    return sorted(frames, key=lambda frame: frame.t_ns)
+
+
+@pytest.mark.parametrize("sid", SIDS.values(), ids=SIDS)
+@pytest.mark.parametrize("jitter", [0.0, 0.1, 0.4])
+@pytest.mark.parametrize("kinds", FREE.values(), ids=FREE)
+def test_kinds_with_own_timers_lose_nothing(
+    kinds: dict[int, object], jitter: float, sid: Callable[[int, int, int], int | None]
+) -> None:
+    """The SID and the period prove no loss. Each value has about the time of its sample."""
+    frames = free_frames(kinds, jitter, Random(1))
+    frames = [f._replace(sid=sid(f.kind, f.burst, place)) for place, f in enumerate(frames)]
+    rig = AssemblyBench()
+    rig.feed(frames, bursts=False)
+    rest = [len(made.frames) for made in rig.assembly.flush()]
+    counts = Counter(kind for _, kinds_of in rig.made for kind in kinds_of)
+    assert sum(counts.values()) + sum(rest) == len(frames)
+    assert rig.ledger.frames_ignored == rig.ledger.lost() == rig.ledger.lost_unknown == 0
+    fastest = max(Counter(f.kind for f in frames).values())
+    assert fastest - 1 <= len(rig.made) <= 1.2 * fastest + 8
+    # two kinds with nearly the same period slide by up to one period
+    assert max(rig.ages_ns) <= (1.05 + jitter) * rig.assembly.period_ns
+    assert rig.assembly.problem == ""
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.3])
+def test_the_period_of_the_fastest_kind_proves_its_losses(jitter: float) -> None:
+    kinds = {1: 25.0, 2: (100.0, 7.0), 3: (1000.0, 16.0)}
+    frames = free_frames(kinds, jitter, Random(2))
+    lost = {(1, 100), (1, 200), (1, 201), (1, 202), (2, 30), (3, 4), (1, 300)}
+    rig = AssemblyBench()
+    rig.feed((f for f in frames if (f.kind, f.burst) not in lost), bursts=False)
+    assert rig.ledger.lost_gap_device == 5
 
 
 def test_samples_are_complete_after_silence_and_after_a_reset() -> None:
     rig = learnt(MIXED)
-    for burst in range(40, 61):
+    for burst in range(60, 81):
         *head, last = stream(MIXED, [burst])
         assert rig.feed(head) == []
         assert rig.ledger.frames_pending == len(head)
@@ -106,62 +182,53 @@ def test_samples_are_complete_after_silence_and_after_a_reset() -> None:
         assert rig.ledger.frames_pending == 0
 
     rig = learnt(MIXED)
-    made = rig.feed(without(stream(MIXED, range(40, 400)), lambda f: 61 <= f.burst < 270))
-    assert made == [*range(40, 61), *range(270, 400)]
-    assert rig.ledger.lost_gap_device == 0
+    made = rig.feed(without(stream(MIXED, range(60, 400)), lambda f: 81 <= f.burst < 290))
+    assert made == [*range(60, 81), *range(290, 400)]
+    assert (rig.ledger.lost_gap_device, rig.ledger.lost_unknown) == (0, 1)
 
     rig = learnt(EQUAL)
-    first, second = stream(EQUAL, [40]), stream(EQUAL, [41])
+    first, second = stream(EQUAL, [60]), stream(EQUAL, [61])
     rig.feed(first[:2])
     rig.assembly.reset()
     assert rig.ledger.frames_pending == 0
-    assert rig.ledger.closes()
-    assert rig.feed(first[2:] + second) == [41]
-    assert rig.ledger.lost_gap_device == 1
-    assert rig.ledger.closes()
+    assert rig.feed(first[2:] + second) == [60, 61]
 
 
 @pytest.mark.parametrize("kind", EQUAL)
-def test_a_lost_frame_costs_its_sample(kind: int) -> None:
+def test_a_lost_frame_costs_its_value_only(kind: int) -> None:
     rig = learnt(EQUAL)
-    made = rig.feed(without(stream(EQUAL, range(40, 60)), lambda f: f.burst == 50 and f.kind == kind))
-    assert made == [burst for burst in range(40, 60) if burst != 50]
-    assert rig.ledger.lost_gap_device == 1
-
-
-@pytest.mark.parametrize("kind", [3, 6])
-def test_a_lost_frame_of_a_slower_kind_costs_its_value_only(kind: int) -> None:
-    rig = learnt(MIXED)
-    made = rig.feed(without(stream(MIXED, range(40, 90)), lambda f: f.burst == 60 and f.kind == kind))
-    assert made == list(range(40, 90))
-    assert rig.kinds_of(60) == tuple(other for other in whole(MIXED, 60) if other != kind)
-    assert all(names == whole(MIXED, burst) for burst, names in rig.made if burst >= 40 and burst != 60)
+    made = rig.feed(without(stream(EQUAL, range(60, 80)), lambda f: f.burst == 70 and f.kind == kind))
+    assert made == list(range(60, 80))
+    assert rig.kinds_of(70) == tuple(other for other in EQUAL if other != kind)
     assert rig.ledger.lost_gap_device == 0
+    rig = learnt(MIXED)
+    made = rig.feed(without(stream(MIXED, range(60, 110)), lambda f: f.burst == 80 and f.kind == 6))
+    assert rig.made[-50:] == [(b, (1, 2, 3) if b == 80 else whole(MIXED, b)) for b in range(60, 110)]
+    assert made == list(range(60, 110))
 
 
 @pytest.mark.parametrize("cut", [1, 2])
 @pytest.mark.parametrize("bursts", [1, 3])
 def test_the_end_of_one_burst_and_the_beginning_of_another_are_not_joined(cut: int, bursts: int) -> None:
     rig = learnt(EQUAL)
-    last = 50 + bursts
+    last = 70 + bursts
 
     def is_lost(frame: Frame) -> bool:
-        order = 10 * frame.burst + frame.kind
-        return 500 + cut < order <= 10 * last + cut
+        return 700 + cut < 10 * frame.burst + frame.kind <= 10 * last + cut
 
-    made = rig.feed(without(stream(EQUAL, range(40, 70)), is_lost))
-    assert made == [*range(40, 50), *range(last + 1, 70)]
-    assert rig.ledger.lost_gap_device == 1 + bursts
+    made = rig.feed(without(stream(EQUAL, range(60, 90)), is_lost))
+    assert made == [*range(60, 71), *range(last, 90)]
+    assert rig.ledger.lost_gap_device == bursts - 1
 
 
 @pytest.mark.parametrize("kinds", [EQUAL, MIXED, LEADING])
 @pytest.mark.parametrize("lost", [1, 2, 100])
 def test_bursts_that_are_lost_whole_are_counted(kinds: dict[int, int], lost: int) -> None:
     rig = learnt(kinds)
-    made = rig.feed(without(stream(kinds, range(40, 300)), lambda f: 61 <= f.burst < 61 + lost))
-    assert made == [*range(40, 61), *range(61 + lost, 300)]
+    made = rig.feed(without(stream(kinds, range(60, 300)), lambda f: 81 <= f.burst < 81 + lost))
+    assert made == [*range(60, 81), *range(81 + lost, 300)]
     assert rig.ledger.lost_gap_device == lost
-    assert all(names == whole(kinds, burst) for burst, names in rig.made if burst >= 61 + lost + 4)
+    assert all(names == whole(kinds, burst) for burst, names in rig.made if burst >= 81 + lost + 4)
 
 
 @pytest.mark.parametrize("kinds", [EQUAL, MIXED, LEADING])
@@ -169,79 +236,75 @@ def test_bursts_that_are_lost_whole_are_counted(kinds: dict[int, int], lost: int
 def test_a_stall_between_two_bursts_costs_nothing(kinds: dict[int, int], stall_ns: int) -> None:
     """All frames of the stall arrive together at its end."""
     rig = learnt(kinds)
-    begin_ns = 10**9 + 60 * PERIOD_NS - MS
+    begin_ns = 10**9 + 80 * PERIOD_NS - MS
     frames = [
         frame._replace(t_ns=begin_ns + stall_ns) if begin_ns < frame.t_ns < begin_ns + stall_ns else frame
-        for frame in stream(kinds, range(40, 500))
+        for frame in stream(kinds, range(60, 500))
     ]
-    made = rig.feed(frames)
+    made = rig.feed(frames, bursts=kinds is EQUAL)
+    assert len(set(made)) >= 439
+    assert rig.ledger.lost() == rig.ledger.lost_unknown == rig.ledger.frames_ignored == 0
     if kinds is EQUAL:
-        assert made == list(range(40, 500))
-        assert rig.ledger.lost_gap_device == 0
-    held_up = {frame.burst for frame in frames if frame.t_ns == begin_ns + stall_ns}
-    whole_bursts = {b for b in held_up if all(f.t_ns == begin_ns + stall_ns for f in frames if f.burst == b)}
-    assert whole_bursts <= set(made)
-    assert set(range(40, 60)) <= set(made)
+        assert made == list(range(60, 500))
 
 
 @pytest.mark.parametrize("kinds", [EQUAL, MIXED])
 def test_repeated_frames_cost_no_sample(kinds: dict[int, int]) -> None:
     rig, random = learnt(kinds), Random(3)
-    frames = [frame for frame in stream(kinds, range(40, 140)) for _ in range(random.choice((1, 1, 2)))]
-    assert rig.feed(frames) == list(range(40, 140))
+    frames = [frame for frame in stream(kinds, range(60, 160)) for _ in range(random.choice((1, 1, 2)))]
+    assert rig.feed(frames) == list(range(60, 160))
     assert rig.ledger.lost_gap_device == 0
+    assert rig.ledger.frames_ignored == len(frames) - len(set(frames))
+
+
+def test_equal_values_after_a_stall_are_not_copies() -> None:
+    rig = learnt({1: 1})
+    late = [frame._replace(data=bytes([0, 0, 0, 0, 1])) for frame in stream({1: 1}, range(60, 70))]
+    rig.feed(frame._replace(t_ns=late[-1].t_ns) for frame in late)
+    assert rig.ledger.frames_ignored == 0
+    assert len(rig.made) == 70
 
 
 def test_kinds_that_are_switched_off_or_stay_out() -> None:
-    """Also kinds that are not selected, and a kind of 50 ms next to a period of 20 ms, between bursts."""
+    """Also kinds that are not selected, and the anchor."""
     rig = learnt(EQUAL)
-    made = rig.feed(stream({1: 1, 3: 1}, range(40, 80)))
-    assert made == list(range(50, 80))
-    assert rig.ledger.lost_gap_device == 10
+    assert rig.feed(stream({1: 1, 3: 1}, range(60, 100))) == list(range(60, 99 + (rig.ledger.frames_pending == 0)))
+    *head, last = stream({1: 1, 3: 1}, [100])
+    assert 100 not in rig.feed(head)
+    assert 100 in rig.feed([last])  # imud no longer waits for kind 2
+    assert rig.ledger.lost_gap_device == 0
     rig = learnt(EQUAL)
-    made = rig.feed(stream({2: 1, 3: 1}, range(40, 80)))
-    assert made == list(range(made[0], 80))
-    assert made[0] <= 60
+    assert rig.feed(stream({2: 1, 3: 1}, range(60, 120))) == list(range(60, 120))
     rig = learnt(MIXED)
-    off, on = stream({1: 1, 2: 1, 3: 2}, range(40, 300)), stream(MIXED, range(300, 400))
-    assert rig.feed(off) == list(range(40, 300))
-    *head, last = stream({1: 1, 2: 1, 3: 2}, [300])  # the assembly no longer waits for kind 6
-    assert rig.feed([*head, last]) == [300]
-    assert rig.feed(on[4:]) == list(range(301, 400))
+    off, on = stream({1: 1, 2: 1, 3: 2}, range(60, 300)), stream(MIXED, range(300, 400))
+    assert rig.feed(off) == list(range(60, 300))
+    assert set(rig.feed(on)) == set(range(300, 400))
     assert rig.kinds_of(380) == (1, 2, 3, 6)
-
     rig = AssemblyBench({1, 3})
     made = rig.feed(stream(MIXED, range(60)))
-    assert made == list(range(made[0], 60))
+    assert made == list(range(60))
     assert all(names == tuple(k for k in whole(MIXED, b) if k in (1, 3)) for b, names in rig.made if b > 12)
-    frames = sorted(
-        [*stream({1: 1, 2: 1}, range(200), 20 * MS), *stream({6: 1}, range(80), 50 * MS)], key=lambda frame: frame.t_ns
-    )
-    rig = AssemblyBench()
-    rig.feed(frames)
-    assert all(names == (1, 2) for _, names in rig.made)
-    assert len(rig.made) >= 190
 
 
 @pytest.mark.parametrize("new", [{4: 1}, {4: 2}, {6: 10}])
 def test_a_kind_that_is_switched_on_joins(new: dict[int, int]) -> None:
     rig = learnt(EQUAL)
     kinds = {**EQUAL, **new}
-    assert rig.feed(stream(kinds, range(40, 120))) == list(range(40, 120))
-    every = next(iter(new.values()))
-    joined = 40 + (7 if every == 1 else 3 * every)
+    made = rig.feed(stream(kinds, range(60, 140)))
+    assert set(made) == set(range(60, 140))
+    joined = 60 + 7 * next(iter(new.values()))
     assert all(names == whole(kinds, burst) for burst, names in rig.made if burst >= joined)
 
 
 @pytest.mark.parametrize("period_ns", [PERIOD_NS // 2, 2 * PERIOD_NS, 4 * PERIOD_NS])
 def test_a_new_rate_is_not_a_loss(period_ns: int) -> None:
     rig = learnt(EQUAL)
-    begin_ns = 10**9 + 40 * PERIOD_NS
+    begin_ns = 10**9 + 60 * PERIOD_NS
     frames = [
-        frame._replace(t_ns=frame.t_ns - 10**9 + begin_ns - 40 * period_ns)
-        for frame in stream(EQUAL, range(40, 90), period_ns)
+        frame._replace(t_ns=frame.t_ns - 10**9 + begin_ns - 60 * period_ns)
+        for frame in stream(EQUAL, range(60, 110), period_ns)
     ]
-    assert rig.feed(frames) == list(range(40, 90))
+    assert rig.feed(frames) == list(range(60, 110))
     assert rig.ledger.lost_gap_device == 0
     assert rig.assembly.period_ns == pytest.approx(period_ns, rel=0.05)
 
@@ -257,40 +320,14 @@ def test_a_new_rate_is_not_a_loss(period_ns: int) -> None:
 )
 def test_another_rate_of_some_is_learnt(before: dict[int, int], after: dict[int, int]) -> None:
     rig = learnt(before)
-    rig.feed(stream(after, range(40, 300)))
-    settled = [made for made in rig.made if made[0] >= 150]
-    assert settled == [(burst, whole(after, burst)) for burst in range(150, 300)]
-
-
-def test_order_alone_and_learning_under_loss() -> None:
-    """Without times: 1 and 3 of a burst, then 2 and 3 of the next burst. 2 is before the held 3 in the order."""
-    rig = AssemblyBench()
-    rig.feed(frame._replace(t_ns=0) for frame in stream(EQUAL, range(30)))
-    frames = without(stream(EQUAL, range(30, 40)), lambda f: (f.burst, f.kind) in ((32, 2), (33, 1)))
-    assert rig.feed(frame._replace(t_ns=0) for frame in frames) == [30, 31, *range(34, 40)]
-    rig = AssemblyBench()
-    made = rig.feed(frame._replace(t_ns=0) for frame in stream(EQUAL, range(30)))
-    assert made == list(range(5, 30))
-
-    rig = AssemblyBench()
-    frames = without(stream(EQUAL, range(30)), lambda f: f.burst in (2, 4) and f.kind == 2)
-    made = rig.feed(frames)
-    assert made == list(range(made[0], 30))
-    assert made[0] <= 12
-    assert all(names == (1, 2, 3) for burst, names in rig.made if burst > made[0] + 7)
-    rig = AssemblyBench()
-    lost = {(7, 1), (9, 1), (10, 1), (14, 1), (19, 1)}
-    rig.feed(frame for frame in stream({1: 1, 2: 2}, range(1, 80)) if (frame.burst, frame.kind) not in lost)
-    assert [made for made in rig.made if made[0] >= 25] == [
-        (burst, whole({1: 1, 2: 2}, burst)) for burst in range(25, 80)
-    ]
+    rig.feed(stream(after, range(60, 300)))
+    settled = [made for made in rig.made if made[0] >= 160]
+    assert settled == [(burst, whole(after, burst)) for burst in range(160, 300)]
 
 
 @given(seed=st.integers(0, 2**32), kinds=st.sampled_from([EQUAL, MIXED, LEADING, {1: 1, 6: 20}, {1: 1, 2: 2, 3: 4}]))
-def test_periods_are_never_mixed(seed: int, kinds: dict[int, int]) -> None:
-    """Any loss, of single frames and of runs, at any time, also during learning. Each sample is from one burst
-    (`feed`).
-    """
+def test_frames_reach_one_sample_each_under_any_loss(seed: int, kinds: dict[int, int]) -> None:
+    """Losses of single frames and of runs, at any time. imud counts at most the bursts that were lost whole."""
     random = Random(seed)
     rig = AssemblyBench()
     rate = random.choice((0.0, 0.02, 0.2))
@@ -301,12 +338,11 @@ def test_periods_are_never_mixed(seed: int, kinds: dict[int, int]) -> None:
         if run or random.random() < rate:
             continue
         frames.append(frame._replace(t_ns=frame.t_ns + random.randrange(FRAME_NS // 2)))
-    made = rig.feed(frames)
-    assert made == sorted(set(made))
-    heard = {b for b in range(300) if {f.kind for f in frames if f.burst == b} == set(whole(kinds, b))}
-    assert len(heard & set(made)) >= 0.5 * len(heard) - 20
-    if rate == 0.0:
-        assert rig.ledger.lost_gap_device == 0
+    rig.feed(frames, bursts=False)
+    rig.assembly.flush()
+    assert rig.ledger.frames_in_samples == len(frames)
+    lost = 300 - len({frame.burst for frame in frames})
+    assert rig.ledger.lost() <= 1.25 * lost + 3 * (rate > 0)
 
 
 @given(seed=st.integers(0, 2**32))
@@ -318,8 +354,64 @@ def test_any_frames_at_any_time_keep_the_ledger_closed(seed: int) -> None:
     for _ in range(600):
         t_ns += random.choice((0, 1000, FRAME_NS, PERIOD_NS, 10**9))
         ledger.frames_good += 1
-        assembly.add_frame(random.choice((1, 2, 2, 3, 6)), random.choice((b"a", b"b")), t_ns)
+        sid = random.choice((None, 0, 1, 2, 250))
+        assembly.add_frame(random.choice((1, 2, 2, 3, 6)), random.choice((b"a", b"b")), t_ns, sid)
         if random.random() < 0.01:
             assembly.reset()
         assert ledger.closes()
         assert 0 <= ledger.frames_pending <= 4
+
+
+@pytest.mark.parametrize("modulus", [251, 253, 256])
+def test_equal_sids_decide_in_place_of_the_time(modulus: int) -> None:
+    """Some bursts arrive together without some frames. The SIDs also count a lost burst."""
+    frames = [f._replace(sid=f.burst % modulus) for f in stream(EQUAL, range(700))]
+    lost = {(70, 3), (71, 1), (71, 2), (620, 1), (620, 2), (620, 3)}
+    late_ns = 10**9 + 75 * PERIOD_NS - MS
+    rig = AssemblyBench()
+    rig.feed(
+        f._replace(t_ns=max(f.t_ns, late_ns) if 60 <= f.burst < 75 else f.t_ns)
+        for f in frames
+        if (f.burst, f.kind) not in lost
+    )
+    assert rig.kinds_of(70) == (1, 2)
+    assert rig.kinds_of(71) == (3,)
+    assert rig.ledger.lost() == 1
+    assert rig.ledger.frames_ignored == 0
+
+
+def test_sids_without_a_loss_and_sids_that_no_longer_agree() -> None:
+    """A pause of the sender is not a loss. After it, kind 2 has another SID."""
+    frames = [
+        f._replace(sid=(f.burst + 3 * (f.kind == 2 and f.burst >= 100)) % 253, t_ns=f.t_ns + (f.burst >= 100) * 33 * MS)
+        for f in stream(EQUAL, range(200))
+    ]
+    rig = AssemblyBench()
+    rig.feed(frames)
+    assert rig.ledger.lost() == 0
+    assert rig.ledger.lost_unknown == 0
+    assert all(rig.kinds_of(burst) == (1, 2, 3) for burst in range(120, 199))
+
+
+@pytest.mark.parametrize("phase", [0.15, 0.33, 0.45, 0.7, 0.85])
+@pytest.mark.parametrize("kinds", [{1: 1}, EQUAL])
+def test_two_devices_with_one_address_are_reported(phase: float, kinds: dict[int, int]) -> None:
+    """The second device has a crystal of its own, 100 ppm slower."""
+
+    def frames(bursts: range) -> list[Frame]:
+        first = stream(kinds, bursts)
+        second = [
+            f._replace(
+                t_ns=f.t_ns + round(phase * PERIOD_NS) + f.burst * PERIOD_NS // 10_000, data=b"\0\0\0\1" + f.data
+            )
+            for f in first
+        ]
+        return sorted(first + second, key=lambda frame: frame.t_ns)
+
+    assembly = Assembly(Ledger())
+    for frame in frames(range(150)):
+        assembly.add_frame(frame.kind, frame.data, frame.t_ns)
+    assert "each frame arrives twice per period of 5.0 ms, " in assembly.problem
+    for frame in stream(kinds, range(160, 500)):
+        assembly.add_frame(frame.kind, frame.data, frame.t_ns)
+    assert assembly.problem == ""

@@ -38,10 +38,11 @@ def decoded(frames: Sequence[SentFrame], address: int = 8) -> list[tuple[Measure
     """Return measurements with the time of each."""
     codec = HipnucJ1939Codec(Ledger(), HipnucJ1939Options(address=address))
     found: list[tuple[Measurement, int]] = []
+    instants = {frame.due_ns: frame.sample_ns or 0 for frame in frames}
     for frame in frames:
         for event in codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.due_ns):
             if isinstance(event, Measurement):
-                found.append((event, frame.sample_ns or 0))
+                found.append((event, instants[event.t_first_ns or 0]))
     assert codec.ledger.closes()
     assert codec.ledger.lost() == 0
     return found

@@ -19,7 +19,7 @@ reply frame if the state changed or is not operational. Emergencies (0x080 + nod
 """
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Final, Literal
 
 from msgspec import Meta
@@ -27,7 +27,7 @@ from msgspec import Meta
 from imud.attitude.rotation import quat_from_euler312
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
 from imud.contracts.script import ReplyFrame
-from imud.drivers.hipnuc.assembly import Assembly
+from imud.drivers.hipnuc.assembly import Assembled, Assembly
 from imud.drivers.hipnuc.canopen.cia301 import (
     EMERGENCY,
     HEARTBEAT,
@@ -100,12 +100,11 @@ class HipnucCanopenCodec:
             return self._bad_length(data)
         ledger.bytes_in_good_frames += size
         ledger.frames_good += 1
-        frames = self._assembly.add_frame(number, data, t_rx_ns)
-        return () if frames is None else (_measurement(dict(frames)),)
+        return [_measurement(one) for one in self._assembly.add_frame(number, data, t_rx_ns)]
 
     def flush(self) -> Sequence[CodecEvent]:
-        """Do nothing: the next frame shows the loss."""
-        return ()
+        """Return the incomplete sample."""
+        return [_measurement(one) for one in self._assembly.flush()]
 
     def reset(self) -> None:
         """Drop the incomplete sample after lost frames."""
@@ -141,8 +140,9 @@ class HipnucCanopenCodec:
         return (BadFrame(BadReason.LENGTH, data),)
 
 
-def _measurement(frames: Mapping[int, bytes]) -> Measurement:
+def _measurement(assembled: Assembled) -> Measurement:
     """Return the measurement of a set of TPDOs. Without a quaternion, the attitude is computed from the angles."""
+    frames = dict(assembled.frames)
     euler = _vector(frames.get(3), EULER_RAD_PER_LSB)
     quat: Quaternion | None = None
     if any(frames.get(4, b"")):  # four zeros are not a rotation
@@ -162,6 +162,7 @@ def _measurement(frames: Mapping[int, bytes]) -> Measurement:
         euler_rad=euler,
         pressure_pa=pressure_of(float(ONE_LONG.unpack(frames[6])[0])) if 6 in frames else None,
         incli_rad=incli,
+        t_first_ns=assembled.t_first_ns,
     )  # fmt: skip
 
 

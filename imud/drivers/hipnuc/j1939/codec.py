@@ -66,7 +66,7 @@ _NOTHING: Final = bytes([0xFF]) * MESSAGE_BYTES
 _ZERO_VECTOR: Final = bytes(6)
 
 
-def measurement_of(messages: Sequence[tuple[int, bytes]]) -> Measurement:
+def measurement_of(messages: Sequence[tuple[int, bytes]], t_first_ns: int | None = None) -> Measurement:
     """Return the measurement of messages of one instant (PGN, eight bytes), each PGN at most once."""
     parts = _Parts()
     for pgn, data in messages:
@@ -77,6 +77,7 @@ def measurement_of(messages: Sequence[tuple[int, bytes]]) -> Measurement:
     return Measurement(
         MESSAGE_BYTES * len(messages), 0, None,
         parts.accel, parts.gyro, parts.mag, quat, euler, parts.temperature_c, None, parts.incli,
+        t_first_ns=t_first_ns,
     )  # fmt: skip
 
 
@@ -292,12 +293,11 @@ class HipnucJ1939Codec:
         if pgn == UTC:
             ledger.frames_ignored += 1
             return ()
-        whole = self._assembly.add_frame(pgn, data, t_rx_ns)
-        return () if whole is None else (measurement_of(whole),)
+        return [measurement_of(*one) for one in self._assembly.add_frame(pgn, data, t_rx_ns)]
 
     def flush(self) -> Sequence[CodecEvent]:
-        """Do nothing: the next frame shows the loss."""
-        return ()
+        """Return the incomplete sample."""
+        return [measurement_of(*one) for one in self._assembly.flush()]
 
     def reset(self) -> None:
         """Drop the incomplete sample after lost frames."""

@@ -86,7 +86,7 @@ def test_all_tpdos_in_si_units() -> None:
 @pytest.mark.manual("B 5.2 TPDO6")
 def test_a_node_without_barometer_has_no_pressure(sent: int, pressure_pa: float | None) -> None:
     codec = make()
-    for burst in range(6):
+    for burst in range(10):
         events = codec.feed_frame(0x688, False, sent.to_bytes(4, "little", signed=True), burst * 50 * MS)
     (event,) = events
     assert isinstance(event, Measurement)
@@ -118,7 +118,7 @@ def test_which_frames_count() -> None:
     codec = make(node=9)
     assert feed_bursts(codec, [1, 2]) == []
     assert codec.ledger.bytes_skipped == codec.ledger.bytes_in == 72
-    assert len(feed_bursts(codec, [1, 2], node=9)) == 1
+    assert len(feed_bursts(codec, [1, 2], node=9)) == 5
     event = feed_bursts(make(tpdos=[1, 4]), [1, 2, 3, 4])[-1]
     assert isinstance(event, Measurement)
     assert event.accel_m_s2 is not None
@@ -139,7 +139,7 @@ def test_heartbeats_are_news_when_the_state_changes_or_is_not_operational() -> N
     assert codec.ledger.frames_pending == 1
     assert codec.feed_frame(0x708, False, b"\0", 60 * MS)
     assert codec.ledger.frames_pending == 0
-    assert codec.flush() == ()
+    assert not codec.flush()
 
 
 @pytest.mark.manual("B 5.4.2 SYNC", "B 5.1 defaults")
@@ -215,4 +215,4 @@ def test_random_payloads_decode_alike() -> None:
             assert m.incli_rad == pytest.approx(scaled(values, "Incli_X Incli_Y", math.pi / 180), rel=1e-12)
             compared += len(values)
     assert len(values) == 16
-    assert compared >= 16 * (BURSTS - 6)
+    assert compared == 16 * (BURSTS - 8)  # imud learns during the other bursts
