@@ -78,6 +78,11 @@ class CanCodec(Protocol):
 
     ledger: Ledger
 
+    @property
+    def problem(self) -> str:
+        """Lasting problem of the device that the frames show, one sentence; empty if there is none."""
+        ...
+
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
         """Decode a frame that arrived at `t_rx_ns` (CLOCK_MONOTONIC). Return the completed events. Never raises."""
         ...

@@ -112,6 +112,8 @@ class CanTransport(ReceivingTransport):
         # number of the device that the search found; None if the configuration names the driver
         self._node: int | None = None
         self._joined = False
+        self._bus_problem = ""  # present problem of the bus; empty if there is none
+        self._conflict = ""  # present conflict of two devices with one address; empty without a conflict
         if not self._searchable:
             driver = DRIVERS[self._config.driver]
             if not isinstance(driver, CanDriver):
@@ -130,10 +132,12 @@ class CanTransport(ReceivingTransport):
         await self.link.wait_present()
 
     def start(self, on_end: OnEnd) -> None:
+        self._bus_problem = self._conflict = ""
         self._search.start()
         self.link.start(self._on_frames, self._on_news, on_end)
 
     def stop(self) -> None:
+        self._report_conflict()
         self._search.stop()
         if self._searchable:
             self._leave()
@@ -311,9 +315,21 @@ class CanTransport(ReceivingTransport):
             if any(wanted.matches(frame.can_id, frame.extended) for wanted in self._also):
                 self.scripts.on_message(ReplyFrame(frame.can_id, frame.data), frame.t_rx_ns)
 
+    def tick(self, now_ns: int) -> None:
+        self._report_conflict()
+
+    def _report_conflict(self) -> None:
+        """Report the start and the end of a conflict of two devices with one address."""
+        conflict = self._codec.problem if self._codec is not None and self._round is None else ""
+        if bool(conflict) is not bool(self._conflict):
+            self._conflict = conflict
+            self._on_news(conflict or "all frames are from one device again", self._bus_problem)
+
     def _on_news(self, news: str, problem: str) -> None:
-        """Report a change of the bus state."""
-        self._health.on_link_news(self._host.now_ns(), news, problem)
+        """Report a change of the bus state, or of a conflict."""
+        self._bus_problem = problem
+        problems = "; ".join(filter(None, (problem, self._conflict)))
+        self._health.on_link_news(self._host.now_ns(), news, problems)
 
     def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
         """Report the received frames, and search again after a long silence."""

@@ -121,8 +121,8 @@ class Health:
         self.problem = self.problem or SEARCH_BEGUN
 
     def finished(self) -> None:
-        """Enter FINISHED after the end of a replay."""
-        self.state, self.problem = DeviceState.FINISHED, ""
+        """Enter FINISHED after the end of a replay. A problem of the link stays in the status."""
+        self.state, self.problem = DeviceState.FINISHED, self.link_problem
 
     def up(self, now_ns: int, driver: str, where: str, bit_rate: int) -> None:
         """Enter RUNNING: samples of `driver` arrive on the link `where`."""

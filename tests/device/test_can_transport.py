@@ -309,3 +309,19 @@ async def test_a_recording_starts_with_the_device_and_its_state(bench: CanDevice
     kinds = [record.kind for block in records for record in records_of(block)]
     assert [kinds[0], kinds[1], kinds[-1]] == [Kind.DEVICE, Kind.PATH, Kind.FRAMES]
     assert kinds.count(Kind.FRAMES) == 1
+
+
+@told(play)
+async def test_the_status_shows_two_devices_with_one_address(bench: CanDeviceBench) -> None:
+    rig = bench.rig
+    bench.feed(*(index for n in range(60) for index in (n, 5000 + n)))
+    rig.tick()
+    rig.tick()
+    assert "do two devices on the bus have this base_id?" in rig.device.status().problem
+    assert [event.kind for event in rig.events].count(EventKind.LINK) == 1
+    bench.link.news("error-passive", "the bus is error-passive")
+    assert "error-passive; INDEX alternates" in rig.device.status().problem
+    bench.link.news("error-active", "")
+    bench.feed(*range(6000, 6010))
+    rig.tick()
+    assert rig.device.status().problem == ""

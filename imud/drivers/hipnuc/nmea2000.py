@@ -169,6 +169,11 @@ class HipnucNmea2000Codec:
         self._set_sender(self._fixed)
         self._heard_ns = 0
 
+    @property
+    def problem(self) -> str:
+        """Return the address conflict that the frames show; empty without a conflict."""
+        return self._assembly.problem
+
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
         """Add one frame. Return the completed events. Never raises an exception."""
         ledger, size = self.ledger, len(data)

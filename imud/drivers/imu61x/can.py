@@ -66,6 +66,7 @@ DOWN: Final = 4
 UP: Final = 16  # Divisors: part of a difference by which the learned times decrease or increase
 SURE_SETS: Final = 8  # number of sets before the learned times count: a late set would have too much weight
 _NEVER_NS: Final = 1 << 63
+ALTERNATIONS: Final = 32  # number of alternating INDEX values after which two devices have the same identifiers
 
 _CLOSING: Final = SET_FRAMES - 1
 _FLOATS: Final = tuple(struct.Struct(layout) for layout in ("<2f", "<2f", "<2f", "<2f", "<f4x"))
@@ -120,6 +121,15 @@ class Imu61xCanCodec:
         self._index: int | None = None  # INDEX of the newest 105
         self._closed_ns = 0  # arrival of the newest 105, ns
         self._pace = _Pace()
+        self._before: int | None = None  # INDEX of the 105 before the newest 105
+        self._alternations = 0  # number of consecutive 105 that continue `_before` and not the newest 105
+
+    @property
+    def problem(self) -> str:
+        """Return the conflict of two devices with the same identifiers; empty without a conflict."""
+        if self._alternations < ALTERNATIONS:
+            return ""
+        return "INDEX alternates between two series; do two devices on the bus have this base_id?"
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
         """Decode one frame. Return the completed events. Never raises an exception."""
@@ -169,6 +179,9 @@ class Imu61xCanCodec:
         before_ns, self._closed_ns = self._closed_ns, t_rx_ns
         span_ns = t_rx_ns - self._first_ns
         follows = before is not None and (index - before) % INDEX_MODULUS == 1
+        alternates = self._before is not None and not follows and (index - self._before) % INDEX_MODULUS == 1
+        self._alternations = self._alternations + 1 if alternates else 0
+        self._before = before
         places = tuple(held)
         in_time = places == _IN_ORDER and span_ns <= pace.longest_ns
         is_whole = in_time or (follows and len(places) == _CLOSING)

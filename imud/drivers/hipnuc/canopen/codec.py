@@ -88,6 +88,11 @@ class HipnucCanopenCodec:
         self._assembly = Assembly(ledger, None if wanted == "auto" else frozenset(wanted))
         self._state = NmtState.OPERATIONAL.value
 
+    @property
+    def problem(self) -> str:
+        """Return the address conflict that the frames show; empty without a conflict."""
+        return self._assembly.problem
+
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
         """Add one frame. Return the completed events. Never raises an exception."""
         ledger, size = self.ledger, len(data)
