@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import msgspec
 
-from imud.cli.arguments import CliCommand, add_option, add_socket, duration_s
+from imud.cli.arguments import CliCommand, add_interface, add_option, add_socket, duration_s
 from imud.cli.output import complain
 from imud.drivers import DRIVERS
 from imud.model.errors import BadArgument
@@ -44,6 +44,7 @@ def common_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--driver", choices=sorted(DRIVERS), help="driver for a capture (default: hipnuc-uart)")
     parser.add_argument("--baud", type=int, help="baud rate of a raw capture (default: 115200)")
     add_option(parser)
+    add_interface(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object in SI units")
 
 
@@ -129,7 +130,9 @@ def take(args: argparse.Namespace) -> Any:
     samples = loaded("sample_set")
     if not is_live(args):
         return samples.take_file(args)
-    for option, default in (("device", None), ("driver", None), ("baud", None), ("option", [])):
+    for option, default in (
+        ("device", None), ("driver", None), ("baud", None), ("option", []), ("interface", None),
+    ):  # fmt: skip
         # daemon and recording define these values for live samples
         if getattr(args, option) != default:
             raise BadArgument(f"--{option} applies to files only; the file {args.input} does not exist")

@@ -196,6 +196,20 @@ def add_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_interface(parser: argparse.ArgumentParser) -> None:
+    """Add `--interface`."""
+    parser.add_argument("--interface", metavar="NAME", help="interface in a CAN log of several interfaces, as can0")
+
+
+def chosen_interface(driver: "Driver", interface: str | None) -> str:
+    """Return the value of `--interface`; empty if it is not given. Raises BadArgument if the driver is not for CAN."""
+    from imud.contracts.driver import CanDriver  # most commands need no driver
+
+    if interface is not None and not isinstance(driver, CanDriver):
+        raise BadArgument(f"--interface applies to logs of a CAN bus; {driver.name} is not a driver for CAN")
+    return interface or ""
+
+
 def given_options(driver: "Driver", words: Sequence[str]) -> dict[str, object]:
     """Return the values of `--option` by name. Raises BadArgument if the driver does not accept a name or a value."""
     options = named_values(words)

@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 import msgspec
 
-from imud.cli.arguments import CliCommand, add_option, driver_settings, given_options
+from imud.cli.arguments import CliCommand, add_interface, add_option, chosen_interface, driver_settings, given_options
 from imud.contracts.codec import BadFrame, CodecEvent
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Driver, StreamDriver
 from imud.contracts.script import ReplyFrame, TextLine
@@ -34,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--driver", required=True, choices=sorted(DRIVERS), help="driver of the captured device")
     parser.add_argument("file", metavar="FILE", help="capture file, or - for standard input")
     add_option(parser)
+    add_interface(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -46,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     ledger = Ledger()
     write = sys.stdout.write
     with open_capture(args.file) as file:
-        for line in decode(file, driver, ledger, settings):
+        for line in decode(file, driver, ledger, settings, chosen_interface(driver, args.interface)):
             write(line)
     sys.stdout.flush()
     shown = {name: value for name, value in ledger.snapshot().items() if value}
@@ -65,17 +66,21 @@ def open_capture(name: str) -> BinaryIO:
         raise ImudError(f"cannot open {name}: {error.strerror}") from error
 
 
-def decode(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Options | None = None) -> Iterator[str]:
+def decode(
+    file: BinaryIO, driver: Driver, ledger: Ledger, settings: Options | None = None, interface: str = ""
+) -> Iterator[str]:
     """Decode `file` to JSON lines. Without `settings`, use the default options of the driver.
 
     Raises ImudError if the driver does not support captures, or if the file is not a capture.
     """
     times = UnwrappedTime(driver)
-    for event in events_in(file, driver, ledger, settings or driver.settings()):
+    for event in events_in(file, driver, ledger, settings or driver.settings(), interface):
         yield msgspec.json.encode(as_object(event, times)).decode() + "\n"
 
 
-def events_in(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Options) -> Iterator[CodecEvent]:
+def events_in(
+    file: BinaryIO, driver: Driver, ledger: Ledger, settings: Options, interface: str
+) -> Iterator[CodecEvent]:
     """Yield the events of the driver's codec for a capture."""
     if isinstance(driver, StreamDriver):
         codec = driver.make_codec(ledger, settings)
@@ -87,12 +92,15 @@ def events_in(file: BinaryIO, driver: Driver, ledger: Ledger, settings: Options)
             print(f"found {driver.unknown_words(codec.unknown)}", file=sys.stderr)
     elif isinstance(driver, CanDriver):
         frame_codec = driver.make_codec(ledger, settings)
-        log = CandumpReader(file)
+        log = CandumpReader(file, interface)
         for frame in log:
+            if frame.after_loss:
+                yield from frame_codec.flush()
+                frame_codec.reset()
             yield from frame_codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns)
         yield from frame_codec.flush()
-        if log.problem:
-            print(log.problem, file=sys.stderr)
+        for problem in filter(None, (log.problem, frame_codec.problem)):
+            print(problem, file=sys.stderr)
     else:
         raise ImudError(f"cannot decode a capture of {driver.name}: its devices reply only to requests on a polled bus")
 

@@ -15,9 +15,11 @@ from imud.bridges.json import JsonDialect
 from imud.bridges.ros2 import Ros2Dialect
 from imud.cli.arguments import (
     CliCommand,
+    add_interface,
     add_noise,
     add_option,
     chosen_fields,
+    chosen_interface,
     driver_settings,
     given_options,
     noise_by_device,
@@ -38,8 +40,11 @@ from imud.cli.export_sources import (
 )
 from imud.cli.output import complain
 from imud.cli.replay import BAUD, DRIVER, looks_like_recording
+from imud.contracts.driver import CanDriver
 from imud.contracts.status import Deviations
 from imud.drivers import DRIVERS
+from imud.formats.can import CandumpReader
+from imud.formats.capture import CaptureReader
 from imud.host.files import WRITE_FLAGS, open_regular
 from imud.host.log import STDERR, log_to
 from imud.model.errors import BadArgument, ImudError, reason_of
@@ -171,6 +176,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--driver", choices=sorted(DRIVERS), help=f"driver for a capture (default: {DRIVER})")
     parser.add_argument("--baud", type=int, help=f"baud rate of a raw capture (default: {BAUD})")
     add_option(parser)
+    add_interface(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -209,7 +215,7 @@ def _is_recording(args: argparse.Namespace) -> bool:
         found = looks_like_recording(str(args.file))
     except OSError as error:
         raise ImudError(f"{args.file}: expected a recording or a capture: {reason_of(error)}") from error
-    for option, default in (("option", []), ("driver", None), ("baud", None)):
+    for option, default in (("option", []), ("driver", None), ("baud", None), ("interface", None)):
         if found and getattr(args, option) != default:
             raise BadArgument(f"--{option} applies to captures only; a recording contains the value of the live run")
     if not found and args.device:
@@ -254,7 +260,9 @@ def _play(args: argparse.Namespace, file: BinaryIO, feed: ExportFeed, *, is_reco
         return export_recording(file, args.file, feed, args.device)
     driver = DRIVERS[args.driver or DRIVER]
     options = driver_settings(driver, given_options(driver, args.option))
-    return export_capture(file, args.file, feed, driver, options, args.baud or BAUD)
+    interface = chosen_interface(driver, args.interface)
+    reader = CandumpReader(file, interface) if isinstance(driver, CanDriver) else CaptureReader(file)
+    return export_capture(reader, args.file, feed, driver, options, args.baud or BAUD)
 
 
 EXPORT = CliCommand(add_arguments, run)

@@ -423,20 +423,17 @@ def export_recording(file: BinaryIO, path: Path, feed: ExportFeed, devices: Sequ
 
 
 def export_capture(
-    file: BinaryIO, path: Path, feed: ExportFeed, driver: Driver, options: Options, baud: int
+    reader: CaptureReader | CandumpReader, path: Path, feed: ExportFeed, driver: Driver, options: Options, baud: int
 ) -> Exported:
     """Export a capture. Raises ImudError."""
     watch = LossWatch(feed, ())
     player = CapturePlayer(lambda batch: watch.batch(batch, player.device.ledger), driver, options, str(path))
-    reader: CaptureReader | CandumpReader
-    if isinstance(driver, CanDriver):
-        reader = CandumpReader(file)
+    if isinstance(reader, CandumpReader):
         player.play_frames(reader)
     else:
-        reader = CaptureReader(file)
         player.play_bytes(reader, baud)
     device = player.device
-    words = [(reader.problem, "file: "), (player.times.value, "times: ")]
+    words = [(reader.problem, "file: "), (player.problem, "device: "), (player.times.value, "times: ")]
     lines = [line for text, label in words if text for line in paragraph(label, text)]
     is_damaged = isinstance(reader, CaptureReader) and reader.is_damaged
     status = 0 if device.ledger.samples and not is_damaged else 1

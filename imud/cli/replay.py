@@ -10,7 +10,7 @@ from typing import BinaryIO, Final
 import msgspec
 
 from imud import config
-from imud.cli.arguments import CliCommand, add_option, driver_settings, given_options
+from imud.cli.arguments import CliCommand, add_interface, add_option, chosen_interface, driver_settings, given_options
 from imud.cli.output import paragraph
 from imud.cli.status import block
 from imud.contracts.driver import CanDriver
@@ -50,7 +50,9 @@ def play_recording(args: argparse.Namespace) -> int:
     Return 1 if the replay differs from the live run, or if the recording contains no sample. Raises BadArgument for
     options that apply to captures only.
     """
-    for option, default in (("socket", None), ("option", []), ("driver", None), ("speed", None), ("baud", None)):
+    for option, default in (
+        ("socket", None), ("option", []), ("driver", None), ("speed", None), ("baud", None), ("interface", None),
+    ):  # fmt: skip
         if getattr(args, option) != default:
             raise BadArgument(
                 f"--{option} applies to captures only; a recording contains driver, options and times of the live run"
@@ -192,6 +194,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--socket", type=Path, metavar="PATH", help="serve the samples of a capture on this socket, as the daemon does"
     )
     add_option(parser)
+    add_interface(parser)
     parser.add_argument(
         "--fresh", action="store_true", help="start the clocks of a recording without the state of the live run"
     )
@@ -250,7 +253,7 @@ def problem_of(args: argparse.Namespace) -> tuple[str, bool]:
     """
     with open_regular(args.file) as file:
         if isinstance(DRIVERS[args.driver], CanDriver):
-            log = CandumpReader(file)
+            log = CandumpReader(file, args.interface or "")
             deque(log, maxlen=0)
             return log.problem, False
         reader = CaptureReader(file)
@@ -288,7 +291,12 @@ def configuration(args: argparse.Namespace) -> str:
                 "driver": args.driver,
                 "options": options,
                 "identify": False,
-                "replay": {"path": str(args.file), "speed": args.speed, "baud": args.baud},
+                "replay": {
+                    "path": str(args.file),
+                    "speed": args.speed,
+                    "baud": args.baud,
+                    "interface": chosen_interface(driver, args.interface),
+                },
             }
         },
     }

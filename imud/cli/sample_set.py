@@ -220,7 +220,7 @@ def take_file(args: argparse.Namespace) -> SampleSet:
 
 def take_recording(args: argparse.Namespace) -> SampleSet:
     """Replay a recording. The time stamps are equal to the live run."""
-    for option, default in (("driver", None), ("option", []), ("baud", None)):
+    for option, default in (("driver", None), ("option", []), ("baud", None), ("interface", None)):
         if getattr(args, option) != default:
             raise BadArgument(f"--{option} applies to captures only; a recording contains the value of the live run")
     collector = Collector(args.device or "", skip_s=args.skip or 0.0, for_s=args.duration)
@@ -279,7 +279,7 @@ def take_capture(args: argparse.Namespace) -> SampleSet:
     """Replay a capture through the daemon."""
     replayed = argparse.Namespace(
         file=args.input, driver=args.driver or DRIVER, speed="maximum", baud=args.baud or BAUD, socket=None,
-        option=args.option,
+        option=args.option, interface=args.interface,
     )  # fmt: skip
     settings = config.parse(configuration(replayed), str(args.input))
     check(settings.devices[0])
@@ -294,8 +294,7 @@ def take_capture(args: argparse.Namespace) -> SampleSet:
     status = daemon.status()[0]
     sample_set = SampleSet(args.input, driver=status.driver, link=status.link, identity=status.identity)
     sample_set.settings = status.settings
-    if problem := problem_of(replayed)[0]:
-        sample_set.notes.append(problem)
+    sample_set.notes += filter(None, (problem_of(replayed)[0], status.problem))
     finished = _finished(sample_set, collector, tally.found())
     finished.device, finished.begun_utc_ns = args.device or "capture", None
     return finished

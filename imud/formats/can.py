@@ -6,11 +6,13 @@ bytes on every kind of link.
 
 import re
 import struct
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import BinaryIO, Final, NamedTuple
 
-from imud.model.units import NS_PER_S
+from imud.model.errors import BadArgument
+from imud.model.units import NS_PER_MS, NS_PER_S
 
 DATA_BYTES_MAX: Final = 8  # maximum number of data bytes of a classical CAN frame (ISO 11898-1)
 STANDARD_ID_MAX: Final = 0x7FF
@@ -90,38 +92,136 @@ _OTHER: Final = re.compile(
 )
 
 
-class CandumpReader:
-    """Reader of a candump log from a binary stream. Iterate once. `t_rx_ns` is the time in the log, never falling."""
+# Maximum fall of the time from line to line that is not a step of the clock, ns: lines of candump can change places
+DISORDER_NS: Final = NS_PER_MS
+# Minimum rise of the time from line to line that counts as a step of the clock, ns. A shorter rise is a pause.
+STEP_NS: Final = 3600 * NS_PER_S
+PAUSE_NS: Final = 10 * NS_PER_S  # minimum pause that imud reports, ns
+PAUSES_KEPT: Final = 16  # number of known distances. The longest one replaces the unknown distance at a step.
+JUMPS_SHOWN: Final = 5  # maximum number of steps and pauses in a text
+INTERFACES_MAX: Final = 16  # maximum number of interfaces in a text
 
-    def __init__(self, file: BinaryIO) -> None:
+
+def _text(name: bytes) -> str:
+    return name.decode("ascii", "backslashreplace")
+
+
+def _listed(names: Iterable[str], word: str) -> str:
+    *rest, last = list(names)[:INTERFACES_MAX]
+    return f"{', '.join(rest)} {word} {last}" if rest else last
+
+
+def _several(names: Iterable[str]) -> BadArgument:
+    return BadArgument(
+        f"the log has frames of the interfaces {_listed(names, 'and')}: select one of them (--interface, key interface)"
+    )
+
+
+class CandumpReader:
+    """Reader of one interface of a candump log from a binary stream. Iterate once.
+
+    `t_rx_ns` is the time in the log and does not fall. After a step of the clock, it continues with a new offset, and
+    the frame has `after_loss`.
+    """
+
+    def __init__(self, file: BinaryIO, interface: str = "") -> None:
+        """`interface`: interface of the frames; empty if the log has one interface."""
         self._file = file
+        self.interface = interface
         self.passed_over = 0  # number of valid lines without a data frame
         self.bad_lines = 0
         self.first_bad = 0  # number of the first invalid line, starting at 1; 0 if all lines are valid
+        self._is_chosen = bool(interface)
+        self._has_frames = False
+        self._others: dict[str, None] = {}  # names of the ignored interfaces
+        self._jumps: list[str] = []  # descriptions of the first steps and pauses
+        self._jump_count = 0
+        self._newest_ns: int | None = None  # newest time in the log
+        self._offset_ns = 0  # offset of the newest time to `t_rx_ns`
+        self._distances_ns: deque[int] = deque(maxlen=PAUSES_KEPT)
 
     @property
     def problem(self) -> str:
-        """Error of the file after the iteration, one sentence; empty if there is no error."""
-        if not self.bad_lines:
-            return ""
-        return f"expected a candump log (candump -L), got {self.bad_lines} invalid lines (first: line {self.first_bad})"
+        """Problems of the file after the iteration, one sentence; empty if there is no problem."""
+        found = list(self._jumps)
+        if self._jump_count > len(found):
+            found.append(f"{self._jump_count - len(found)} more steps or pauses")
+        if self.bad_lines:
+            found.append(
+                f"expected a candump log (candump -L), got {self.bad_lines} invalid lines "
+                f"(first: line {self.first_bad})"
+            )
+        return "; ".join(found)
 
     def __iter__(self) -> Iterator[CanFrame]:
-        newest_ns, number = 0, 0
+        """Yield the frames of the interface. Raises BadArgument for several interfaces, or for an unknown interface."""
+        number = 0
+        if not self.interface and self._file.seekable():
+            self._choose_interface()
         while line := self._file.readline(LINE_BYTES_MAX):
             number += 1
             match = _FRAME.fullmatch(line)
             if match is None:
                 self._note(line, number)
                 continue
-            seconds, fraction, _, digits, data = match.groups()
+            seconds, fraction, name, digits, data = match.groups()
             can_id = int(digits, 16)
             if can_id & ERROR_FLAG or can_id > EXTENDED_ID_MAX or (len(digits) == 3 and can_id > STANDARD_ID_MAX):
                 self._note(line if can_id & ERROR_FLAG else b"bad", number, passed=bool(can_id & ERROR_FLAG))
                 continue
-            # the clock can step backwards during the log
-            newest_ns = max(newest_ns, int(seconds) * NS_PER_S + int(fraction.ljust(9, b"0")))
-            yield CanFrame(can_id, len(digits) == 8, bytes.fromhex(data.decode("ascii")), newest_ns)
+            if not self._is_own(_text(name)):
+                continue
+            t_ns, is_jump = self._time(int(seconds) * NS_PER_S + int(fraction.ljust(9, b"0")), number)
+            yield CanFrame(can_id, len(digits) == 8, bytes.fromhex(data.decode("ascii")), t_ns, is_jump)
+        if self._others and not self._has_frames:
+            raise BadArgument(f"interface {self.interface}: expected {_listed(self._others, 'or')}, as in the log")
+
+    def _choose_interface(self) -> None:
+        """Read the log once for the names of its interfaces. Raises BadArgument for several names."""
+        begin, names = self._file.tell(), dict[str, None]()
+        while line := self._file.readline(LINE_BYTES_MAX):
+            match = _FRAME.fullmatch(line)
+            if match is not None:
+                names[_text(match[3])] = None
+        self._file.seek(begin)
+        if len(names) > 1:
+            raise _several(names)
+        self.interface, self._is_chosen = next(iter(names), ""), False
+
+    def _is_own(self, interface: str) -> bool:
+        """Return whether a frame is from the interface. Raises BadArgument for several interfaces without a choice."""
+        if not self.interface:
+            self.interface, self._is_chosen = interface, False
+        if interface == self.interface:
+            self._has_frames = True
+            return True
+        if not self._is_chosen:
+            raise _several([self.interface, interface])
+        if len(self._others) < INTERFACES_MAX:
+            self._others[interface] = None
+        return False
+
+    def _time(self, log_ns: int, number: int) -> tuple[int, bool]:
+        """Return the time of a frame, and whether the clock stepped before it."""
+        if self._newest_ns is None:
+            self._newest_ns = log_ns
+        rise_ns = log_ns - self._newest_ns
+        is_step = rise_ns < -DISORDER_NS or rise_ns >= STEP_NS
+        if is_step or rise_ns >= PAUSE_NS:
+            self._note_jump(rise_ns, number, is_step=is_step)
+        if is_step:
+            self._offset_ns += rise_ns - max(self._distances_ns, default=0)
+            self._newest_ns = log_ns
+        elif rise_ns > 0:
+            self._distances_ns.append(rise_ns)
+            self._newest_ns = log_ns
+        return self._newest_ns - self._offset_ns, is_step
+
+    def _note_jump(self, rise_ns: int, number: int, *, is_step: bool) -> None:
+        self._jump_count += 1
+        if len(self._jumps) < JUMPS_SHOWN:
+            what = "a step of the clock, removed by imud" if is_step else "a pause or a step of the clock"
+            self._jumps.append(f"line {number}: the time changes by {rise_ns / NS_PER_S:+.3f} s ({what})")
 
     def _note(self, line: bytes, number: int, *, passed: bool = False) -> None:
         if passed or _OTHER.fullmatch(line):

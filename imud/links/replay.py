@@ -29,7 +29,7 @@ from imud.formats.capture import CaptureReader
 from imud.host.files import NotRegularFile, user_name
 from imud.host.files import open_regular as open_file
 from imud.links.device_node import wait_until
-from imud.model.errors import ImudError, LinkDenied, LinkError, LinkMissing
+from imud.model.errors import BadArgument, ImudError, LinkDenied, LinkError, LinkMissing
 from imud.model.options import Options
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
@@ -46,6 +46,8 @@ class ReplayOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Rate of the wire, bit/s; 0: the rate of the capture. A raw capture at speed `real` needs this key."""
     repeat: bool = False
     """Start again at the end of the file. Not possible at speed `maximum`."""
+    interface: str = ""
+    """Interface in a log of a CAN bus, for example can0. A log with one interface does not need this key."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for keys that exclude each other."""
@@ -127,6 +129,7 @@ class CanReplayLink(FileReplay):
     def __init__(self, settings: ReplayOptions, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         super().__init__(settings, now_ns)
         self._span_ns = 0
+        self._interface = settings.interface
         self._frames: Iterator[CanFrame] = iter(())
         self.filters: Sequence[CanFilter] = ()
         self.bus = settings.path
@@ -136,7 +139,7 @@ class CanReplayLink(FileReplay):
     def open(self) -> None:
         """Open the log and check that it contains frames. Raises LinkMissing, LinkDenied or LinkError."""
         self._file = open_regular(self.title)
-        reader = CandumpReader(self._file)
+        reader = CandumpReader(self._file, self._settings.interface)
         first_ns = newest_ns = -1
         try:
             for frame in reader:
@@ -147,9 +150,13 @@ class CanReplayLink(FileReplay):
         except OSError as error:
             self.close()
             raise unreadable(self.title, error) from error
+        except BadArgument as error:
+            self.close()
+            raise LinkError(f"{self.title}: {error}") from error
         if first_ns < 0:
             self.close()
             raise LinkError(no_log(self.title))
+        self._interface = reader.interface
         self._span_ns = newest_ns - first_ns
 
     def start(self, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
@@ -183,14 +190,16 @@ class CanReplayLink(FileReplay):
         """Yield the frames that pass the filters, each with its due time in CLOCK_MONOTONIC."""
         while self._file is not None:
             self._file.seek(0)
-            reader = CandumpReader(self._file)
-            first_ns, count, due_ns = None, 0, origin_ns
+            reader = CandumpReader(self._file, self._interface)
+            first_ns, count, due_ns, after_loss = None, 0, origin_ns, False
             for frame in reader:
                 first_ns = frame.t_rx_ns if first_ns is None else first_ns
                 due_ns = origin_ns + frame.t_rx_ns - first_ns
                 count += 1
+                after_loss |= frame.after_loss
                 if any(wanted.matches(frame.can_id, frame.extended) for wanted in self.filters):
-                    yield frame._replace(t_rx_ns=due_ns)
+                    yield frame._replace(t_rx_ns=due_ns, after_loss=after_loss)
+                    after_loss = False
             if reader.problem:
                 log.warning("%s: %s", self.title, reader.problem)
             if not self._settings.repeat:
@@ -346,7 +355,9 @@ def _problem(settings: ReplayOptions, frames: bool) -> str:
     try:
         with open_regular(settings.path) as file:
             if frames:
-                return _without_frames(settings.path, file.read(LOOKED_AT_BYTES))
+                return _without_frames(settings, file.read(LOOKED_AT_BYTES))
+            if settings.interface:
+                return f"interface: expected a log of a CAN bus, got {settings.path} for a driver of bytes"
             return _unplayable(settings, CaptureReader(file))
     except LinkMissing:
         return ""
@@ -354,10 +365,12 @@ def _problem(settings: ReplayOptions, frames: bool) -> str:
         return str(error)
 
 
-def _without_frames(path: str, begin: bytes) -> str:
-    """Return an error text if `begin` is the whole log and contains no frame."""
-    found = len(begin) == LOOKED_AT_BYTES or next(iter(CandumpReader(BytesIO(begin))), None) is not None
-    return "" if found else no_log(path)
+def _without_frames(settings: ReplayOptions, begin: bytes) -> str:
+    """Return an error text if `begin` is the whole log and contains no frame, or if it has several interfaces."""
+    if len(begin) == LOOKED_AT_BYTES and settings.interface:
+        return ""  # the frames of the interface can follow
+    found = next(iter(CandumpReader(BytesIO(begin), settings.interface)), None) is not None
+    return "" if found or len(begin) == LOOKED_AT_BYTES else no_log(settings.path)
 
 
 LINK = LinkType("replay", ReplayOptions, ReplayLink, CanReplayLink, problem=_problem)

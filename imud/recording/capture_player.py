@@ -37,7 +37,10 @@ class KnownTimes(Enum):
     MONOTONIC = (
         "the capture contains CLOCK_MONOTONIC of its reads and no time of day: utc_ns counts from the first read"
     )
-    WALL_CLOCK = "the log of candump contains only the wall clock: t_ns and utc_ns are this clock, including its steps"
+    WALL_CLOCK = (
+        "the log of candump contains only the wall clock: t_ns and utc_ns are this clock until its first step; after a "
+        "step, they continue with a new offset"
+    )
     NONE = (
         "the capture contains bytes without the times of the reads: host times, their error and their source are "
         "unknown. The times are the device time, or the time on the wire if the device does not send its time"
@@ -62,6 +65,7 @@ class CapturePlayer:
         self.device: Final = PlayedDevice(DEVICE_ID, described)
         self.device.driver = driver
         self.times = KnownTimes.NONE  # meaning of the times; valid after the first sample
+        self.problem = ""  # problem that the frames show, valid at the end; empty if there is none
         self._publish = publish
         self._driver = driver
         self._options = options
@@ -87,7 +91,7 @@ class CapturePlayer:
         driver = self._driver
         assert isinstance(driver, CanDriver)
         self.times = KnownTimes.WALL_CLOCK
-        filters = driver.filters(self._options)
+        filters, after_loss = driver.filters(self._options), False
         codec = driver.make_codec(self.device.ledger, self._options)
         path = CanPath(codec, self._clock(0, 0), self._context(self._publish))
         self.device.path = path
@@ -95,15 +99,17 @@ class CapturePlayer:
         for frame in reader:
             if not t_ns:
                 path.begin(frame.t_rx_ns)
-            t_ns = frame.t_rx_ns
+            t_ns, after_loss = frame.t_rx_ns, after_loss or frame.after_loss
             if any(wanted.matches(frame.can_id, frame.extended) for wanted in filters):
-                waiting.append(frame)
+                waiting.append(frame._replace(after_loss=after_loss))
+                after_loss = False
             if len(waiting) >= GATHERED:
                 path.on_frames(waiting)
                 waiting = []
         if waiting:
             path.on_frames(waiting)
         self._end(path, t_ns)
+        self.problem = codec.problem
 
     def _set_times(self, reader: CaptureReader, first_ns: int) -> None:
         utc = reader.details.get(START_UTC, "")

@@ -391,6 +391,7 @@ class CanPath(SamplePath):
     def __init__(self, codec: CanCodec, clock: SampleClock, context: PathContext) -> None:
         super().__init__(clock, context)
         self.codec = codec
+        self._idle_ns = 0  # arrival of the newest frame at the previous `flush`, ns
 
     def set_frame_time(self, frame_ns: int) -> None:
         """Set the shortest time of a frame on the wire, ns; 0 if the bit rate is unknown."""
@@ -422,13 +423,18 @@ class CanPath(SamplePath):
             self._finish(samples, t_rx_ns)
 
     def _flush(self, now_ns: int, samples: list[Sample]) -> None:
-        """Append an incomplete sample if the next sample is overdue."""
-        if now_ns - self.last_data_ns >= FLUSH_PERIODS * self.period_ns:
-            self._reset(samples)
+        """Append an incomplete sample if the next sample is overdue, and no frame arrived since the previous call."""
+        # the arrival times of a replay at maximum speed are in the past
+        was_idle, self._idle_ns = self._idle_ns == self.last_data_ns, self.last_data_ns
+        if was_idle and now_ns - self.last_data_ns >= FLUSH_PERIODS * self.period_ns:
+            self._take_incomplete(samples)
 
     def _reset(self, samples: list[Sample]) -> None:
-        self._sort(self.codec.flush(), self.last_data_ns, self._utc_offset_ns(), samples)
+        self._take_incomplete(samples)
         self.codec.reset()
+
+    def _take_incomplete(self, samples: list[Sample]) -> None:
+        self._sort(self.codec.flush(), self.last_data_ns, self._utc_offset_ns(), samples)
 
 
 def make_clock(

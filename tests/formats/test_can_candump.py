@@ -1,23 +1,25 @@
 """Logs of `candump -L`: data frames are read, other valid lines are skipped, invalid lines are reported."""
 
 import io
+from collections.abc import Sequence
 from random import Random
 
 import pytest
 
 from imud.formats.can import EXTENDED_ID_MAX, STANDARD_ID_MAX, CandumpReader, CanFrame
+from imud.model.errors import BadArgument
 from tests.support.files import candump_line
 
 US = 1000
 LOG = b"""\
-(1436509052.249713) vcan0 044#2A366C2B
+(1436509052.249713) can1 044#2A366C2B
 (1436509053.6507) can1 18FEE9AA#0102030405060708 R
 (1436509053.650700) can1 7FF# T
 
-(1436509053.700000) can0 123#R8
-(1436509053.700001) can0 123##1001122
-(1436509053.700002) can0 20000040#0000000000000000
-(1436509053.700003) can0 1A2#1122334455667788_9
+(1436509053.700000) can1 123#R8
+(1436509053.700001) can1 123##1001122
+(1436509053.700002) can1 20000040#0000000000000000
+(1436509053.700003) can1 1A2#1122334455667788_9
 """
 
 
@@ -36,8 +38,38 @@ def test_lines_of_candump() -> None:
     ]
     assert reader.passed_over == 3
     assert reader.problem == ""
-    frames, _ = read(b"(5.0) a 001#\n(4.0) a 001#\n(6.5) a 001#\n")
-    assert [frame.t_rx_ns for frame in frames] == [5_000_000_000, 5_000_000_000, 6_500_000_000]
+
+
+@pytest.mark.parametrize(
+    ("times_s", "expected_s", "words"),
+    [
+        ((5, 4.9995, 6), (5, 5, 6), ""),  # two lines in another order
+        ((5, 5.01, 4, 4.01), (5, 5.01, 5.02, 5.03), "line 3: the time changes by -1.010 s (a step of"),
+        ((5, 5.01, 9000, 9000.1), (5, 5.01, 5.02, 5.12), "line 3: the time changes by +8994.990 s (a step of"),
+        ((5, 5.01, 35.01), (5, 5.01, 35.01), "line 3: the time changes by +30.000 s (a pause or a step"),
+        ((9, 8, 7, 6, 5, 4, 3, 2), (9,) * 8, "s (a step of the clock, removed by imud); 2 more steps"),
+    ],
+)  # fmt: skip
+def test_steps_of_the_clock(times_s: Sequence[float], expected_s: Sequence[float], words: str) -> None:
+    frames, reader = read("".join(f"({t_s:.6f}) a 001#\n" for t_s in times_s).encode())
+    assert [frame.t_rx_ns for frame in frames] == [round(t_s * 1e9) for t_s in expected_s]
+    assert words in reader.problem
+    assert bool(words) == bool(reader.problem)
+    assert sum(frame.after_loss for frame in frames) == reader.problem.count("removed") + 2 * ("2 more" in words)
+
+
+def test_interfaces() -> None:
+    log = b"(1.0) can1 001#\n(2.0) can0 002#\n(3.0) can1 003#\n"
+    for name, ids in (("can0", [2]), ("can1", [1, 3])):
+        assert [frame.can_id for frame in CandumpReader(io.BytesIO(log), name)] == ids
+    with pytest.raises(BadArgument, match="interfaces can1 and can0: select one"):
+        read(log)
+    with pytest.raises(BadArgument, match="interface x: expected can1 or can0"):
+        list(CandumpReader(io.BytesIO(log), "x"))
+    piped = io.BytesIO(log)
+    piped.seekable = lambda: False  # type: ignore[method-assign]
+    with pytest.raises(BadArgument, match="interfaces can1 and can0: select one"):
+        list(CandumpReader(piped))
 
 
 @pytest.mark.parametrize(
@@ -48,7 +80,7 @@ def test_lines_of_candump() -> None:
     ],
 )  # fmt: skip  # 0x900 is above 11 bits
 def test_other_lines_are_reported(line: bytes) -> None:
-    frames, reader = read(b"(1.0) a 001#00\n" + line + b"\n(2.0) a 002#00\n")
+    frames, reader = read(b"(1.0) can0 001#00\n" + line + b"\n(2.0) can0 002#00\n")
     assert [frame.can_id for frame in frames] == [1, 2]
     assert reader.bad_lines >= 1
     assert "line 2" in reader.problem
