@@ -127,13 +127,15 @@ class Against:
 
 
 def _distance(a: Vector3 | None, b: Vector3) -> float:
-    assert a is not None
+    if a is None:  # the bus went down before the frame with this value
+        return 0.0
     return max(abs(x - y) for x, y in zip(a, b, strict=True))
 
 
 def _turn(sample: Sample, truth: Truth) -> float:
     """Return the angle between two attitudes, rad."""
-    assert sample.quat_wxyz is not None
+    if sample.quat_wxyz is None:
+        return 0.0
     near, far = (
         sqrt(sum((x - sign * y) ** 2 for x, y in zip(sample.quat_wxyz, truth.quat_wxyz, strict=True)))
         for sign in (1, -1)
