@@ -200,5 +200,6 @@ def test_frames_name_their_node_and_its_options(name: str) -> None:
             assert driver.node_of(frame.can_id, frame.extended, b"") is None
     codec = driver.make_codec(Ledger(), driver.node_settings(node))
     codec.feed_frame(*timed(driver, Random(1), 0)[0][:4])
-    assert list(measurements(codec.flush())) == []  # a part of a set does not make a sample
+    # an incomplete sample; the IMU61x splits its vectors into two frames and makes no incomplete samples
+    assert len(measurements(codec.flush())) == (name != "imu61x-can")
     assert codec.ledger.closes()

@@ -163,6 +163,8 @@ class FakeCanCodec:
     """Each frame of the node is a sample with its first byte as its number. Frames that start with 0xFF are not
     samples."""
 
+    problem = ""
+
     def __init__(self, ledger: Ledger, settings: FakeCanSettings) -> None:
         self.ledger = ledger
         self._can_id = BASE + settings.node

@@ -16,16 +16,18 @@ one instant back to back (a burst), some devices send each kind by its own timer
 - imud counts a lost sample only if the SID or the period of the anchor proves the loss (`SidSeries`, `Cadence`).
 - If many samples lack the anchor, imud selects another anchor.
 
-If each kind arrives twice per period at fixed phases, two devices have the same address (`Alternation`).
+If each kind arrives twice per period at fixed phases, or if the values alternate, two devices have the same address.
 """
 
 from collections import deque
 from collections.abc import Container, Sequence
 from itertools import pairwise
+from math import isfinite
 from statistics import median
 from typing import Final, NamedTuple
 
 from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
 from imud.model.units import NS_PER_MS, NS_PER_S
 
 LEARNING_STEPS: Final = 8  # number of periods of the fastest kind before imud selects the anchor
@@ -209,37 +211,62 @@ class SidSeries:
         return None
 
 
-ALTERNATIONS: Final = 64  # number of alternating distances after which two devices have the same address
-ALTERNATIONS_MAX: Final = 2 * ALTERNATIONS
+# Number of alternating distances, and of alternating values, after which two devices have the same address
+DISTANCES, VALUES = 64, 256
 PHASE_LEAST: Final = 0.1  # Minimum phase of the second device, in periods. A gateway can send two frames back to back.
-STABLE: Final = 4  # minimum ratio of the difference of adjacent distances to the change of every second distance
+ANGLE_LEAST_RAD, ACCEL_LEAST_M_S2 = 0.02, 5.0  # minimum differences of the values of two devices; vibration is smaller
+STABLE: Final = 4  # minimum ratio of the difference of adjacent numbers to the change of every second number
 
 
 class Alternation:
-    """Distances of one kind that alternate between two values, as the frames of two devices. One thread."""
+    """Numbers that alternate between two values, as from two devices. Synchronization: one thread."""
 
-    __slots__ = ("_count", "_newest_ns", "_steps_ns")
+    __slots__ = ("_count", "_needed", "newest")
 
-    def __init__(self) -> None:
-        self._newest_ns = 0
-        self._steps_ns = (0, 0)  # the two newest distances
+    def __init__(self, needed: int) -> None:
+        """`needed`: number of alternating numbers that show two devices."""
+        self.newest = (0.0, 0.0)  # the two newest numbers
+        self._needed = needed
         self._count = 0
 
     @property
-    def steps_ns(self) -> tuple[int, int] | None:
-        """Return the shorter and the longer distance, ns; None if the frames are from one device."""
-        return (min(self._steps_ns), max(self._steps_ns)) if self._count >= ALTERNATIONS else None
+    def is_found(self) -> bool:
+        return self._count >= self._needed
 
-    def add_arrival(self, t_ns: int) -> None:
-        """Add the arrival time of a frame."""
-        step_ns, self._newest_ns = t_ns - self._newest_ns, t_ns
-        before_ns, previous_ns = self._steps_ns
-        self._steps_ns = (previous_ns, step_ns)
-        is_stable = STABLE * abs(step_ns - before_ns) < abs(step_ns - previous_ns)
-        if is_stable and min(step_ns, previous_ns) > PHASE_LEAST * (step_ns + previous_ns):
-            self._count = min(self._count + 1, ALTERNATIONS_MAX)
+    def add(self, number: float, *, differs: bool) -> None:
+        """Add a number. `differs`: the number and the previous number can be from two devices."""
+        before, previous = self.newest
+        self.newest = (previous, number)
+        if differs and STABLE * abs(number - before) < abs(number - previous):
+            self._count = min(self._count + 1, 2 * self._needed)
         elif self._count:
-            self._count -= 1 if self._count >= ALTERNATIONS else self._count
+            self._count -= 1 if self.is_found else self._count
+
+
+class ValueAlternation:
+    """Alternating values of consecutive samples: two devices with the same address and opposite phases."""
+
+    def __init__(self) -> None:
+        self._yaw, self._tilt, self._accel = (Alternation(VALUES) for _ in range(3))
+
+    @property
+    def is_found(self) -> bool:
+        return self._yaw.is_found or self._tilt.is_found or self._accel.is_found
+
+    def add(self, m: Measurement) -> None:
+        """Add a measurement."""
+        if m.euler_rad is not None:
+            roll, pitch, yaw = m.euler_rad
+            _add_value(self._yaw, yaw, ANGLE_LEAST_RAD)
+            _add_value(self._tilt, roll + 2 * pitch, ANGLE_LEAST_RAD)
+        if m.accel_m_s2 is not None:
+            x, y, z = m.accel_m_s2
+            _add_value(self._accel, x + 2 * y + 3 * z, ACCEL_LEAST_M_S2)
+
+
+def _add_value(found: Alternation, value: float, least: float) -> None:
+    if isfinite(value):
+        found.add(value, differs=abs(value - found.newest[1]) >= least)
 
 
 COPY_NS: Final = 2 * NS_PER_MS  # maximum time from a frame to its copy, ns: a repetition by the bus
@@ -278,7 +305,7 @@ class _Kind:
         self.agree = 0  # frames with the SID of the anchor, less the other frames
         self.missed = 0  # number of samples that waited for this kind in vain since its newest frame
         self.behind_ns = 0  # delay that short distances may still make up for, ns
-        self.alternation = Alternation()
+        self.alternation = Alternation(DISTANCES)
 
     @property
     def is_near(self) -> bool:
@@ -310,7 +337,8 @@ class _Kind:
                 self.leads = 2 * offset_ns > period_ns
             self._learn(round(self.step_ns / period_ns))
         self.seen_ns, self.missed, self.anchors = t_ns, 0, 0
-        self.alternation.add_arrival(t_ns)
+        step_ns, previous_ns = self.step_ns, self.alternation.newest[1]
+        self.alternation.add(step_ns, differs=min(step_ns, previous_ns) > PHASE_LEAST * (step_ns + previous_ns))
 
     def _learn(self, step: int) -> None:
         self.run = self.run + 1 if step == self.step else 1
@@ -356,6 +384,7 @@ class Assembly:
         self._cadence = Cadence(0, 0)
         self._sids = SidSeries()
         self._strays = 0
+        self._values = ValueAlternation()
         self._incomplete = 0  # number of bursts without the anchor since the newest anchor
 
     @property
@@ -368,15 +397,16 @@ class Assembly:
         """Address conflict that the frames show, one sentence; empty without a conflict."""
         if self._anchor is None or self._sids.is_known:
             return ""
-        own = self._kinds[self._anchor]
-        found = [kind.alternation.steps_ns for kind in self._kinds.values() if kind is own or kind.every == 1]
-        steps_ns = own.alternation.steps_ns
-        if steps_ns is None or None in found:
-            return ""
-        return (
-            f"each frame arrives twice per period of {sum(steps_ns) / NS_PER_MS:.1f} ms, "
-            f"{steps_ns[0] / NS_PER_MS:.1f} ms apart; do two devices on the bus have this address?"
-        )
+        own = self._kinds[self._anchor].alternation
+        often = [kind.alternation for kind in self._kinds.values() if kind.every == 1]
+        if own.is_found and all(one.is_found for one in often):
+            return (
+                f"each frame arrives twice per period of {sum(own.newest) / NS_PER_MS:.1f} ms, "
+                f"{min(own.newest) / NS_PER_MS:.1f} ms apart; do two devices on the bus have this address?"
+            )
+        if self._values.is_found:
+            return "the values alternate from sample to sample; do two devices on the bus have this address?"
+        return ""
 
     def add_frame(self, kind: int, data: bytes, t_rx_ns: int, sid: int | None = None) -> Sequence[Assembled]:
         """Add one frame. Return the samples that it completes, oldest first."""
@@ -400,6 +430,12 @@ class Assembly:
     def flush(self) -> Sequence[Assembled]:
         """Return the incomplete sample: no frame follows."""
         return [self._take()] if self._parts else ()
+
+    def watched(self, measurements: list[Measurement]) -> list[Measurement]:
+        """Return the measurements of samples. Watch their values for an address conflict."""
+        for one in measurements:
+            self._values.add(one)
+        return measurements
 
     def reset(self) -> None:
         """Drop the incomplete sample."""

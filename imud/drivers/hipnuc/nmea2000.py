@@ -222,8 +222,9 @@ class HipnucNmea2000Codec:
         self._reference = self._wanted_reference
         self._has_heading = False
 
-    def _measurements(self, samples: Sequence[Assembled]) -> list[CodecEvent]:
-        return [measurement_of(*one, heading_elsewhere=self._has_heading) for one in samples]
+    def _measurements(self, samples: Sequence[Assembled]) -> Sequence[CodecEvent]:
+        made = [measurement_of(*one, heading_elsewhere=self._has_heading) for one in samples]
+        return self._assembly.watched(made)
 
     def _is_reference(self, reference: Reference) -> bool:
         """Return whether imud uses this heading. An error counts for both references, without a value."""

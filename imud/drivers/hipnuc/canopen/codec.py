@@ -105,11 +105,12 @@ class HipnucCanopenCodec:
             return self._bad_length(data)
         ledger.bytes_in_good_frames += size
         ledger.frames_good += 1
-        return [_measurement(one) for one in self._assembly.add_frame(number, data, t_rx_ns)]
+        made = self._assembly.add_frame(number, data, t_rx_ns)
+        return self._assembly.watched([_measurement(one) for one in made]) if made else ()
 
     def flush(self) -> Sequence[CodecEvent]:
         """Return the incomplete sample."""
-        return [_measurement(one) for one in self._assembly.flush()]
+        return self._assembly.watched([_measurement(one) for one in self._assembly.flush()])
 
     def reset(self) -> None:
         """Drop the incomplete sample after lost frames."""

@@ -298,11 +298,12 @@ class HipnucJ1939Codec:
         if pgn == UTC:
             ledger.frames_ignored += 1
             return ()
-        return [measurement_of(*one) for one in self._assembly.add_frame(pgn, data, t_rx_ns)]
+        made = self._assembly.add_frame(pgn, data, t_rx_ns)
+        return self._assembly.watched([measurement_of(*one) for one in made]) if made else ()
 
     def flush(self) -> Sequence[CodecEvent]:
         """Return the incomplete sample."""
-        return [measurement_of(*one) for one in self._assembly.flush()]
+        return self._assembly.watched([measurement_of(*one) for one in self._assembly.flush()])
 
     def reset(self) -> None:
         """Drop the incomplete sample after lost frames."""
