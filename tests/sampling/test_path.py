@@ -5,6 +5,7 @@ from math import sqrt
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import pytest
 
 from imud.contracts.codec import BadFrame, BadReason, PolledEvent, Reading, Vanished
@@ -227,20 +228,25 @@ def frame(t_rx_ns: int, after_loss: bool = False) -> CanFrame:
     return CanFrame(1, False, b"", t_rx_ns, after_loss)
 
 
+def since(t_first_ns: int) -> Measurement:
+    """Return values whose first frame arrived at `t_first_ns`."""
+    return msgspec.structs.replace(VALUES, t_first_ns=t_first_ns)
+
+
 def test_a_sample_was_measured_before_its_first_frame() -> None:
     """Three frames at 0, 1 and 2 ms, 0.2 ms each on the wire: the first one started at -0.2 ms."""
     rig = PathRig("imu61x-can")
     path, now = rig.can(), rig.now
     path.observe(rig.noted)
     path.set_frame_time(200_000)
-    rig.codec.results = [((), 1), ((), 2), ((VALUES,), 0)]
+    rig.codec.results = [((), 1), ((), 2), ((since(now),), 0)]
     path.on_frames([frame(now + at * MS) for at in (0, 1, 2)])
     (sample,) = rig.batches.pop()
     begin_ns = now - 200_000 - WAKE_NS
     assert (sample.t_ns, sample.t_rx_ns, sample.utc_ns) == (begin_ns, now + 2 * MS, begin_ns + UTC_AHEAD_NS)
     assert (path.last_data_ns, path.last_sample_ns) == (now + 2 * MS, now + 2 * MS)
     # the frame at 13 ms completes the sample from 10 ms, and is the first frame of the next sample
-    rig.codec.results = [((), 1), ((), 2), ((VALUES,), 1), ((VALUES,), 0)]
+    rig.codec.results = [((), 1), ((), 2), ((since(now + 10 * MS),), 1), ((since(now + 13 * MS),), 0)]
     path.on_frames([frame(now + at * MS) for at in (10, 11, 13, 14)])
     (samples,) = rig.batches
     assert [sample.t_rx_ns - now for sample in samples] == [13 * MS, 14 * MS]
@@ -248,20 +254,21 @@ def test_a_sample_was_measured_before_its_first_frame() -> None:
     assert rig.noted.named() == [("call", "path", "set_frame_time"), ("frames",), ("frames",)]
 
 
-def test_lost_frames_and_a_closed_link_discard_a_part_of_a_sample() -> None:
+def test_lost_frames_and_a_closed_link_end_a_sample_and_an_idle_bus_publishes_it() -> None:
     rig = PathRig("imu61x-can")
     path, now = rig.can(), rig.now
-    rig.codec.results = [((), 1), ((), 1), ((VALUES,), 0)]
+    rig.codec.results = [((), 1), ((), 1), ((since(now + MS),), 0)]
     path.on_frames([frame(now), frame(now + MS, after_loss=True), frame(now + 2 * MS)])
     assert rig.codec.resets == 1
     assert [sample.t_ns for sample in rig.batches[0]] == [now + MS - WAKE_NS]
     path.reset()
     assert rig.codec.resets == 2
+    rig.codec.flush = lambda: [since(now + 2 * MS)]
     path.flush(now + 5 * MS)
-    rig.codec.flush = lambda: [VALUES]
-    path.flush(now + 6 * MS)
+    assert rig.sizes == [1]
+    path.flush(now + 6 * MS)  # no frame since the previous call
     assert rig.sizes == [1, 1]
-    assert rig.batches[1][0].t_rx_ns == now + 6 * MS
+    assert rig.batches[1][0].t_rx_ns == now + 2 * MS
 
 
 # --- polled devices ---------------------------------------------------------------------------------------------------
