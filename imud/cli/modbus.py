@@ -17,7 +17,7 @@ from imud.cli.arguments import CliCommand
 from imud.cli.output import table
 from imud.contracts.driver import Identity
 from imud.contracts.script import Transfer, TransferScript, run_transfer_script
-from imud.device.identity import printable_identity
+from imud.device.settings import printable_identity
 from imud.drivers.hipnuc.modbus.codec import HipnucModbusOptions
 from imud.drivers.hipnuc.modbus.commands import probe, save, set_id
 from imud.drivers.hipnuc.modbus.registers import (

@@ -19,8 +19,8 @@ from imud.contracts.driver import CanDriver, Identity, of_kind
 from imud.contracts.link import CanLink, StreamLink
 from imud.contracts.script import Request
 from imud.device.can_search import EVERYTHING, CanDevice, CanRound, CanSearch
-from imud.device.identity import identity_words, printable_identity
 from imud.device.scripts import RequestPort, ScriptRunner
+from imud.device.settings import identity_words, printable_identity
 from imud.device.stream_search import StreamFound, StreamRound
 from imud.drivers import DRIVERS
 from imud.formats.can import CanFrame

@@ -242,7 +242,7 @@ def _account(done: AppliedSettings) -> str:
     if done.problem:
         lines.append(f"FAILED: {done.problem}")
     now = (f"{name} is {_value(one.actual)}, expected {_value(one.declared)}" for name, one in done.differences.items())
-    lines += [done.advice] if done.advice else []
+    lines += [words for words in (done.not_saved, done.advice) if words]
     return "\n".join(["done:" if not done.problem else "tried:", *lines, *now])
 
 

@@ -53,8 +53,9 @@ class Verb:
     risk: Risk = Risk.NONE
     # Whether the verb writes the flash of the device. imud counts these writes and limits them per day.
     saves: bool = False
-    # Whether the verb can change the identity or a setting. imud reads both again after such a verb.
-    changes: bool = True
+    changes: bool = True  # Whether the verb can change a setting. imud reads all settings again after such a verb.
+    # Whether the device has the settings of its flash afterwards. imud also reads the identity again.
+    restarts: bool = False
 
     @property
     def parameters(self) -> type[Options]:

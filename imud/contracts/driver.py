@@ -13,7 +13,7 @@ from imud.contracts.codec import CanCodec, PolledCodec, StreamCodec
 from imud.contracts.command import Calibrations, Verbs
 from imud.contracts.lines import NO_TIME_BITS, AlarmRanges, DeviceLines, TimeBits
 from imud.contracts.script import RequestScript, TransferScript
-from imud.contracts.setting import SettingsTable
+from imud.contracts.setting import Reports, SettingsTable
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame
 from imud.model.ledger import Ledger
 from imud.model.options import Options
@@ -112,7 +112,7 @@ def no_problems(_options: Any, _link: Any) -> Sequence[KeyProblem]:
     return ()
 
 
-def _unknown_heading(_settings: object, _read_back: Mapping[str, str]) -> Heading:
+def _unknown_heading(_options: object, _settings: Mapping[str, Any]) -> Heading:
     return Heading.UNKNOWN
 
 
@@ -143,8 +143,8 @@ class Driver:
     axes: DeviceAxes = RFU_ENU  # axes, angles and navigation frame for conversions
     # Returns the axes that the readable device settings select; None: the fields above
     axes_by_settings: Callable[[Mapping[str, str]], SentAxes | None] = lambda _settings: None
-    # Returns the reference of yaw from the driver options and the device settings (empty: not read yet)
-    heading: Callable[[Any, Mapping[str, str]], Heading] = _unknown_heading
+    # Returns the reference of yaw from the driver options and the values of the device settings (empty: not read yet)
+    heading: Callable[[Any, Mapping[str, Any]], Heading] = _unknown_heading
     verbs: Verbs = field(default_factory=dict)  # verbs of the device, by name
     # Arguments of `imud settings NAME --set` in place of a removed command, by the name of the command. {NAME} is the
     # argument NAME of the command, {NAME|VALUE} has a default. Empty: `imud settings NAME` replaces the command. Remove
@@ -154,16 +154,17 @@ class Driver:
     device_settings: SettingsTable | None = None  # table of the device settings; None if the driver does not know them
     # GPIO lines that the device can have: names of fields of `imud.contracts.lines.DeviceLines`
     lines: frozenset[str] = frozenset()
-    # Returns the meaning of the ALARM line from the device settings; None if no setting describes it
-    alarm_ranges: Callable[[Mapping[str, str]], AlarmRanges] | None = None
+    # Returns the meaning of the ALARM line from the values of the device settings; None if no setting describes it
+    alarm_ranges: Callable[[Mapping[str, Any]], AlarmRanges] | None = None
     time_bits: TimeBits = NO_TIME_BITS  # bits of `Measurement.status` about time
     # Meaning of the known bits of `Measurement.status`, by bit number
     status_bits: Mapping[int, StatusBit] = field(default_factory=dict)
     data_sheet: DataSheet = field(default_factory=DataSheet)  # noise, resolution and filters from the vendor's manual
-    # Returns device settings with readable names and units
+    # Returns the text of the device settings with readable names and units
     shown_settings: Callable[[Mapping[str, str]], Mapping[str, str]] = lambda settings: settings
-    # Finds GPIO lines in the configuration that contradict the device settings. Returns a reason, one sentence, by key.
-    line_differences: Callable[[Mapping[str, str], DeviceLines], Mapping[str, str]] = lambda _settings, _lines: {}
+    # Finds GPIO lines in the configuration that contradict the values of the device settings. Returns a reason, one
+    # sentence, by key.
+    line_differences: Callable[[Mapping[str, Any], DeviceLines], Mapping[str, str]] = lambda _settings, _lines: {}
     # Finds GPIO lines that contradict the values of the declared settings, before imud has read the device settings
     declared_line_differences: Callable[[Mapping[str, Any], DeviceLines], Mapping[str, str]] = lambda _declared, _: {}
     # Returns restrictions that `imud check` prints, one sentence each. The arguments are the values of the declared
@@ -193,16 +194,14 @@ class StreamDriver(Driver):
     make_codec: Callable[[Ledger, Any], StreamCodec]
     # Returns the script that reads the identity and does not change the device
     identify: Callable[[], RequestScript[Identity]]
-    # Returns the script that reads the device settings, by the names of the device, and does not change the device
-    read_settings: Callable[[], RequestScript[Mapping[str, str]]]
     # Passes the identity to the codec. The meaning of a field can depend on the firmware.
     apply_identity: Callable[[StreamCodec, Identity], None] = lambda _codec, _identity: None
     # Returns the script that makes a silent device send samples; None if the device always sends. The script saves
     # nothing. Its result: whether the device acknowledged, or None if the device settings disable the output (then the
     # script changes nothing). Raises NoReply if the device does not reply.
     wake: Callable[[], RequestScript[bool | None]] | None = None
-    # Returns why a device with these settings replies and sends no samples, one clause
-    why_silent: Callable[[Mapping[str, str]], str] = lambda _settings: "its output is off"
+    # Returns why a device with these values of its settings replies and sends no samples, one clause
+    why_silent: Callable[[Mapping[str, Any]], str] = lambda _settings: "its output is off"
     # Returns one valid frame with random values, for property tests and fault injection
     example_frame: Callable[[Random], bytes]
     # Returns the name of an unknown frame type (`StreamCodec.unknown`), for example `HI83 (tag 0x83)`
@@ -260,8 +259,6 @@ class CanDriver(Driver):
     node_title: Callable[[int], str]  # returns a readable name of this device, for example `node 8`
     # Returns the script that reads the identity and does not change the device
     identify: Callable[[Any], RequestScript[Identity]]
-    # Returns the script that reads the device settings, by the names of the device, and does not change the device
-    read_settings: Callable[[Any], RequestScript[Mapping[str, str]]]
     # Passes the identity to the codec. The frames can depend on the identity.
     apply_identity: Callable[[CanCodec, Identity], None] = lambda _codec, _identity: None
     sample_frames: int  # number of frames per sample
@@ -285,9 +282,8 @@ class PolledDriver(Driver):
     targets: tuple[int, ...]
     # Returns the script that reads the identity and changes nothing. Raises DeviceRefused if another device replies.
     probe: Callable[[Any], TransferScript[Identity]]
-    # Returns the script that writes the options to the device, reads them back and returns them by the names of the
-    # device. Raises DeviceRefused.
-    set_up: Callable[[Any], TransferScript[Mapping[str, str]]]
+    # Returns the script that writes the options to the device and returns its settings. Raises DeviceRefused.
+    set_up: Callable[[Any], TransferScript[Reports]]
     # Returns a codec that counts into the ledger, from the driver options
     make_codec: Callable[[Ledger, Any], PolledCodec]
     # Returns the maximum time between two updates of the device registers, ns; 0 if it is not known

@@ -7,8 +7,8 @@ transfer scripts on a polled bus. The second half of this module describes decla
 settings.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cache
 from operator import eq
@@ -46,6 +46,28 @@ class Written(StrEnum):
     UNVERIFIED_PENDING = "written, not verified; in force after save and restart"
 
 
+@dataclass(frozen=True, slots=True)
+class DeviceReport:
+    """Settings in one reply of the device."""
+
+    words: Mapping[str, str] = field(default_factory=dict)  # text by the names that the device uses
+    # Values by the names and in the types of the table, without values that the table does not know
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+
+Reports = Mapping[str, DeviceReport]  # reports of a device by name, without reports that the device does not send
+
+
+def words_of(reports: Reports) -> dict[str, str]:
+    """Return the text of all settings in the reports, by the names that the device uses."""
+    return {name: text for report in reports.values() for name, text in report.words.items()}
+
+
+def values_of(reports: Reports) -> dict[str, Any]:
+    """Return the values of all settings in the reports."""
+    return {name: value for report in reports.values() for name, value in report.values.items()}
+
+
 def nothing_wrong(_target: Target, _values: Mapping[str, Any]) -> None:
     """Accept every combination of values. Default of devices without such rules."""
 
@@ -70,7 +92,9 @@ class Setting:
     # Whether the script itself saves all settings to flash and restarts the device. imud runs it only if saving is
     # requested, counts one write to flash, and runs no `save` after it.
     saves: bool = False
-    readable: bool = True  # Whether the device reports the value. Otherwise the result is `written, not verified`.
+    readable: bool = True  # Whether the device reports the value. Otherwise the result is `sent, not verified`.
+    # Name of the report that contains the value. imud reads this report again after a write. Empty: the only report.
+    report: str = ""
     # Whether it is the bit rate of a bus that other devices use too. A declared value must be the present rate of the
     # bus. A user can set another rate by name: imud saves it and does not restart the device.
     bus_rate: bool = False
@@ -84,10 +108,10 @@ class SettingsTable:
     """All settings of the devices of one driver. The steps of a plan have the order of the table."""
 
     table: Mapping[str, Setting]
-    read: Callable[[Target], Any]
-    """Returns the script that reads the present values, by name and in the types of the table.
+    read: Callable[[Target, Collection[str] | None], Any]
+    """`read(target, names)` returns the script that reads the reports with these names, None: all reports.
 
-    The result does not contain settings that the device lacks or does not report. The script changes nothing."""
+    Its result has the type `Reports`. The script changes nothing."""
     # Returns the script that writes all settings to flash; None if the device has no flash for settings
     save: Callable[[Target], Any] | None = None
     # Returns the script that restarts the device and waits for it; None if imud cannot restart the device
@@ -156,6 +180,8 @@ class SettingsStatus(msgspec.Struct, frozen=True):
     repairs: int = 0  # number of automatic attempts of imud to write the declared settings since start
     flash_writes: int = 0  # number of writes to the flash of this device by imud in all runs, automatic or by command
     flash_writes_day: int = 0  # number of these writes in the last 24 hours
+    # Whether the device would lose a change at power-off: imud changed a setting, and no save followed
+    unsaved: bool = False
 
 
 class SettingInfo(msgspec.Struct, frozen=True):
@@ -216,10 +242,10 @@ class SettingsPlan(msgspec.Struct, frozen=True):
 class StepOutcome(StrEnum):
     """Result of one step."""
 
-    DONE = "done"  # the setting was written and read back with the wanted value
+    VERIFIED = "verified"  # the device reports the wanted value after the write
     WRITTEN = "written, in force after a restart"
-    NOT_VERIFIED = "written, not verified"  # the device does not report this setting
-    FAILED = "failed"
+    NOT_VERIFIED = "sent, not verified"  # the device does not report this setting
+    NOT_APPLIED = "not applied"  # the device rejected the value or reports another value
     NOT_DONE = "not done"  # a previous step failed
 
 
@@ -230,7 +256,7 @@ class AppliedStep(msgspec.Struct, frozen=True):
     value: Any
     before: Any
     outcome: StepOutcome
-    message: str = ""  # reason of a failure; empty otherwise
+    message: str = ""  # reason if the setting is not applied or not verified; empty otherwise
 
 
 class AppliedSettings(msgspec.Struct, frozen=True):
@@ -246,6 +272,7 @@ class AppliedSettings(msgspec.Struct, frozen=True):
     # Next step of the user, for example a change of the configuration, so that imud finds the device at its next start;
     # empty if no step is necessary
     advice: str = ""
+    not_saved: str = ""  # that the flash lacks a change, and the next step; empty if the flash contains all settings
 
     @property
     def failure(self) -> str:

@@ -97,8 +97,8 @@ class Attachments:
         if self._signals is not None:
             self._signals.set_alarm_ranges(ranges)
 
-    def compare_settings(self, settings: Mapping[str, str], driver: Driver | None) -> None:
-        """Compare the GPIO lines with the device settings. Raise an event for each new difference."""
+    def compare_settings(self, settings: Mapping[str, Any], driver: Driver | None) -> None:
+        """Compare the GPIO lines with the values of the device settings. Raise an event for each new difference."""
         read_ranges = driver.alarm_ranges if driver is not None else None
         self.set_alarm_ranges(read_ranges(settings) if read_ranges is not None else None)
         lines = self._config.lines

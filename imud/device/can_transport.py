@@ -1,7 +1,6 @@
 """Transport of a device on a CAN bus: the configuration names the driver, or a search finds the device."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from random import Random
 from typing import Any
 
@@ -9,7 +8,7 @@ from imud.contracts.codec import CanCodec
 from imud.contracts.command import Target
 from imud.contracts.driver import CanDriver, Identity, of_kind
 from imud.contracts.link import CanLink, CanUse, OnEnd
-from imud.contracts.script import ReplyFrame, Request
+from imud.contracts.script import ReplyFrame, Request, RequestScript
 from imud.contracts.status import DeviceState
 from imud.device.can_search import EVERYTHING, CanFound, CanRound, CanSearch
 from imud.device.search import Remembered, RememberedDevice
@@ -18,7 +17,6 @@ from imud.device.transport import (
     SILENT_SEARCH_NS,
     UNHEARD_NS,
     DeviceContext,
-    Queries,
     ReceivingTransport,
 )
 from imud.drivers import DRIVERS
@@ -252,11 +250,8 @@ class CanTransport(ReceivingTransport):
             self.link.send_cyclic(frames)
         await self._identify(IDENTIFY_TRIES)
 
-    def _queries(self) -> Queries | None:
-        driver, options = self.driver, self._options
-        if driver is None:
-            return None
-        return partial(driver.identify, options), partial(driver.read_settings, options)
+    def _identity_script(self) -> RequestScript[Identity] | None:
+        return self.driver.identify(self._options) if self.driver is not None else None
 
     def _apply(self, identity: Identity) -> None:
         if self.driver is not None and self._codec is not None:

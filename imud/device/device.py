@@ -16,7 +16,7 @@ from typing import Any
 
 from imud.config.devices import owner_of
 from imud.config.model import DeviceConfig
-from imud.contracts.command import CalibrationResult, Calibrations, Risk, Verb, Verbs
+from imud.contracts.command import CalibrationResult, Calibrations, Kept, Verbs
 from imud.contracts.driver import status_words
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link
@@ -27,16 +27,15 @@ from imud.device.attachments import Attachments
 from imud.device.calibration import CalibrationRun
 from imud.device.flash import SettingsFiles
 from imud.device.health import DeviceEvents, Health
-from imud.device.identity import identity_words
 from imud.device.latency import Need
-from imud.device.settings import SettingsKeeper
+from imud.device.settings import DeviceSettings, identity_words
 from imud.device.settings_plan import setting_instead
 from imud.device.transport import UNHEARD_NS, DeviceContext, DeviceOwner, Transport
 from imud.device.watches import AttitudeWatch, StatusWatch
 from imud.host.clock import HostClock
 from imud.host.log import printable, shown
 from imud.links import LINKS
-from imud.model.errors import BadArgument, CommandError, ImudError, LinkBusy, LinkError, LinkMissing
+from imud.model.errors import BadArgument, CommandError, LinkBusy, LinkError, LinkMissing
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.recording.observer import ClockObserver, PathObserver
@@ -85,12 +84,11 @@ class Device:
             config, device_id, shared.owner, host, shared.lines, self.ledger, self._events, self._health, self.observer
         )
         self._transport = transport = make_transport(context)
-        self._identity = transport.identity
         self._attachments = Attachments(config, shared.lines, transport, self._events, host)
-        transport.serve(self._attachments)
+        self._settings = DeviceSettings(config, transport, self._events, self.observer, host, shared.files)
+        transport.serve(self._attachments, self._settings)
         self._calibration = CalibrationRun(transport, self._events)
         self._attachments.add(self._calibration)
-        self._settings = SettingsKeeper(context, transport, shared.files)
         self._attachments.add(self._settings)
         self._attitude = AttitudeWatch(config, self._events)
         self._status = StatusWatch(self._events)
@@ -181,7 +179,7 @@ class Device:
             transport.start(self._on_end)
             tasks = [
                 asyncio.create_task(transport.work(), name=f"{self.config.name} work"),
-                asyncio.create_task(self._settings.run(), name=f"{self.config.name} settings"),
+                asyncio.create_task(self._settings.comparison.run(), name=f"{self.config.name} settings"),
             ]
             await asyncio.wait({*tasks, ended}, return_when=asyncio.FIRST_COMPLETED)
             if not ended.done():
@@ -219,9 +217,7 @@ class Device:
 
     def record(self, put: PutRecord) -> None:
         """Start a recording: write the description of the device, then its data. `observer.end` stops the recording."""
-        self.observer.begin(
-            put, self._transport.where, identity_words(self._identity.identity), self._identity.shown_settings
-        )
+        self.observer.begin(put, self._transport.where, identity_words(self._settings.identity), self._settings.shown)
 
     # --- verbs -----------------------------------------------------------------------------------------------------
 
@@ -242,7 +238,7 @@ class Device:
         if name in self._attachments.verbs:
             return await self._attachments.run_verb(name, arguments)
         self._require_replies()
-        return await self._run_verb(name, verb, arguments)
+        return await self._settings.execute(name, verb, arguments)
 
     @property
     def calibrations(self) -> Calibrations:
@@ -261,39 +257,17 @@ class Device:
         async with self._settings.exclusive():
             if save:
                 self._settings.spend_flash()
+            result = None
             try:
-                return await self._calibration.run(kind, calibration, save=save)
+                result = await self._calibration.run(kind, calibration, save=save)
+                return result
             finally:
-                self._settings.commanded()
+                saved = result is not None and (result.saved or result.kept is not Kept.BY_SAVE)
+                self._settings.changed(unsaved=not saved)
 
     def stop_calibration(self) -> bool:
         """Stop the running calibration; return whether one was running."""
         return self._calibration.cancel()
-
-    async def _run_verb(self, name: str, verb: Verb, arguments: Mapping[str, Any]) -> object:
-        params = verb.arguments(arguments)
-        async with self._settings.exclusive():
-            if verb.saves:
-                self._settings.spend_flash()
-            if verb.risk is Risk.RESET:
-                await self._settings.back_up(name)
-            if verb.changes:
-                self._attachments.set_alarm_ranges(None)  # the verb can change the ranges
-            done = False
-            try:
-                answer = await self._transport.run_script(lambda target: verb.script(target, params))
-                done = True
-            except ImudError:  # the state of the device is unknown
-                await self._transport.read_back()
-                raise
-            finally:
-                if verb.changes or not done:
-                    self._settings.commanded(saved=done and verb.saves)
-                elif verb.saves:
-                    self._settings.saved()
-            if verb.changes:
-                await self._transport.read_back()
-            return answer
 
     # --- settings -----------------------------------------------------------------------------------------------------
 
@@ -314,7 +288,6 @@ class Device:
     async def settings_apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
         """Set the values `given` (None: the declared settings). Raises as `settings_report`, before the first write."""
         self._require_replies()
-        self._attachments.set_alarm_ranges(None)  # the new settings can change the ranges
         return await self._settings.apply(given, save=save)
 
     def _require_replies(self) -> None:
@@ -356,7 +329,7 @@ class Device:
         path, driver = transport.path, transport.driver
         newest = path.newest if path is not None else None
         latency = path.latency if path is not None else LatencyMeter()
-        frame = self._attitude.status(driver, path, self._identity.settings, self._identity.shown_settings)
+        frame = self._attitude.status(driver, path, self._settings.values, self._settings.shown)
         status = DeviceStatus(
             name=self.config.name,
             device_id=self.device_id,
@@ -367,8 +340,8 @@ class Device:
             link=transport.where,
             state=health.state,
             problem=health.problem,
-            identity=identity_words(self._identity.identity),
-            settings=dict(self._identity.shown_settings),
+            identity=identity_words(self._settings.identity),
+            settings=dict(self._settings.shown),
             rate_hz=self._rate.rate_hz(),
             expected_rate_hz=path.clock.expected_rate_hz if path else 0.0,
             newest_seq=newest.seq if newest else 0,

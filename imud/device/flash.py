@@ -4,6 +4,7 @@ The flash of such devices endures about 10,000 writes. imud by itself makes at m
 this rate the flash lasts about seven years. Users and programs may make LIMIT_ASKED writes in 24 hours.
 """
 
+import asyncio
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -113,6 +114,7 @@ class ModuleFlash:
 
 
 FOLDER: Final = "backups"
+BACKUP_LIMIT_S: Final = 5.0  # maximum wait of a command for the disk, s
 BACKUPS_MAX: Final = 10  # maximum number of backups of one device
 
 
@@ -125,16 +127,24 @@ def backup_text(device: str, driver: str, identity: Mapping[str, str], settings:
 
 
 class BackupFolder:
-    """Folder of automatic backups. `write` waits for the disk: call it in another thread than the loop's."""
+    """Folder of automatic backups."""
 
     def __init__(self, state_dir: Path | None) -> None:
         """`state_dir` contains the folder; None: imud writes no backups."""
         self._folder = state_dir / FOLDER if state_dir else None
 
-    def write(self, device: str, text: str, utc_ns: int) -> Path | None:
-        """Write a backup and remove old backups. Return its path; None without a folder. Raises OSError."""
+    async def write_soon(self, device: str, text: str, utc_ns: int) -> Path:
+        """Write a backup in another thread and return its path. Raises OSError also without a folder or a reply."""
+        writing = asyncio.to_thread(self.write, device, text, utc_ns)
+        try:
+            return await asyncio.wait_for(writing, BACKUP_LIMIT_S)
+        except TimeoutError:
+            raise OSError("the disk does not respond") from None
+
+    def write(self, device: str, text: str, utc_ns: int) -> Path:
+        """Write a backup and remove old backups. Return its path. Raises OSError also without a folder."""
         if self._folder is None:
-            return None
+            raise OSError("there is no state directory")
         self._folder.mkdir(mode=0o750, parents=True, exist_ok=True)
         file = self._folder / f"{device}.{_time(utc_ns):%Y%m%dT%H%M%S.%fZ}.yaml"
         replace_file(file, text.encode())

@@ -9,7 +9,7 @@ The path decodes readings only between an identification and the first sign that
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,12 +25,13 @@ from imud.contracts.status import DeviceState, DeviceStatus, LinesStatus, Pollin
 from imud.device.attachments import Attachments
 from imud.device.health import DeviceEvents
 from imud.device.polled_bus import BusMember, Deadlines, PolledBuses, ReadySchedule
+from imud.device.settings import DeviceSettings
 from imud.device.transport import UNHEARD_NS, DeviceContext, Transport
 from imud.drivers import DRIVERS
 from imud.host.clock import HostClock
 from imud.lines.watched_line import WatchedLine
 from imud.links import LINKS
-from imud.model.errors import CommandError, DeviceRefused, ImudError, LinkError, TransferError, Trouble
+from imud.model.errors import CommandError, DeviceRefused, LinkError, TransferError, Trouble
 from imud.model.event import EventKind
 from imud.model.options import Options
 from imud.model.sample import Sample
@@ -212,9 +213,9 @@ class PolledTransport(Transport):
         self._vanished = 0
         self._lost_counted = 0
 
-    def serve(self, attachments: Attachments) -> None:
-        """Set the attachments of the device, and add the data-ready line."""
-        super().serve(attachments)
+    def serve(self, attachments: Attachments, settings: DeviceSettings) -> None:
+        """Set the other parts of the device, and add the data-ready line."""
+        super().serve(attachments, settings)
         if self._ready is not None:
             attachments.add(self._ready)
 
@@ -270,17 +271,14 @@ class PolledTransport(Transport):
     async def _set_up(self, member: BusMember, device: IdentifiedDevice) -> bool:
         """Set up the device as configured; return whether this succeeded."""
         try:
-            settings = await member.run(device.driver.set_up(device.options), device.target)
+            reports = await member.run(device.driver.set_up(device.options), device.target)
         except (TransferError, DeviceRefused) as error:
             member.release()
             self._health.report(f"{self.link.place(device.target)}: {error}")
             return False
-        self._update_identity(device, settings)
+        self.settings.update_identity(device.identity)
+        self.settings.update(reports)
         return True
-
-    def _update_identity(self, device: IdentifiedDevice, settings: Mapping[str, str]) -> None:
-        self.identity.update_identity(device.identity)
-        self._update_settings(settings)
 
     async def _read(self, member: BusMember, device: IdentifiedDevice) -> None:
         """Read the device until it is missing. Raises LinkError if the bus is missing."""
@@ -351,21 +349,6 @@ class PolledTransport(Transport):
     def _places(self, device: IdentifiedDevice) -> tuple[int, ...]:
         given = () if self.link.target is None else (self.link.target,)
         return tuple(dict.fromkeys((device.target, *self._former, *given)))
-
-    async def read_back(self, *, identity: bool = True) -> None:
-        """Set up the device again as configured, and store the settings that it reports.
-
-        If the device does not reply, imud sets it up when it returns.
-        """
-        member, device = self._member, self._device
-        if member is None or device is None or not self._identified:
-            return
-        try:
-            settings = await member.run(device.driver.set_up(device.options), device.target)
-        except ImudError as error:
-            log.info("%s: settings not read back: %s", self._config.name, error)
-            return
-        self._update_identity(device, settings)
 
     def _follow(self, target: int) -> None:
         """Follow a script that has given the device another address."""

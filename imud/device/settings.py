@@ -1,4 +1,4 @@
-"""Settings of one device: comparison with the declared settings, and repair if `on_difference` requests it.
+"""Identity and settings of one device: read, compared with the declared settings, and repaired if this is configured.
 
     link opened, device identified, device restarted, command executed ─▶ read ─▶ compare ─▶ event, status
                                                                                     │ on_difference
@@ -12,15 +12,18 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
+from itertools import islice
 from typing import Any, Final
 
 import msgspec
 
-from imud.contracts.command import Target
-from imud.contracts.driver import PolledDriver
+from imud.config.model import DeviceConfig
+from imud.contracts.command import Risk, Target, Verb
+from imud.contracts.driver import Identity, PolledDriver
 from imud.contracts.setting import (
     AppliedSettings,
     OnDifference,
+    Reports,
     SettingDifference,
     SettingsPlan,
     SettingsReport,
@@ -29,12 +32,15 @@ from imud.contracts.setting import (
     SettingsTable,
     StepOutcome,
     declared_values,
+    values_of,
+    words_of,
 )
 from imud.device.flash import ModuleFlash, SettingsFiles, backup_text
-from imud.device.identity import identity_words
+from imud.device.health import DeviceEvents
 from imud.device.settings_plan import (
     DEVICE_ERRORS,
     Applying,
+    SettingsPort,
     Values,
     advice,
     as_json,
@@ -43,15 +49,18 @@ from imud.device.settings_plan import (
     differences,
     make_plan,
     unverified,
+    valid_values,
     wanted_values,
     words,
 )
-from imud.device.transport import DeviceContext, Transport
-from imud.model.errors import BadArgument, CommandError, reason_of
+from imud.host.clock import HostClock
+from imud.host.log import printable
+from imud.model.errors import BadArgument, CommandError, ImudError, reason_of
 from imud.model.event import EventKind
 from imud.model.options import shown
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_S
+from imud.recording.observer import PathObserver
 from imud.sampling.clock import SampleClock
 
 log = logging.getLogger(__name__)
@@ -69,11 +78,11 @@ BOOT_NS: Final = 8 * NS_PER_S
 settings at the end of the script. A second comparison would pause the samples again."""
 WAIT_S: Final = 10.0  # maximum wait of a command for another command, s
 PLAN_NS: Final = 10 * NS_PER_S  # maximum age of the values of a plan that `apply` uses without a new read, ns
-BACKUP_LIMIT_S: Final = 5.0  # maximum wait of a command for the disk, s
 READ_AGAIN_NS: Final = 5 * NS_PER_S  # pause before imud reads the settings again after an error, ns
 READ_TRIES: Final = 3  # number of reads before imud waits for the next restart, replug or command
 PAUSES_S: Final = (0, 10, 60, 600, 3600)
 """Pauses before the first, second, … repair within PAUSES_FORGOTTEN_S, s. The last pause repeats."""
+WORDS_MAX: Final = 200  # maximum number of settings or details of one device. The HI14 has the most, about 60.
 PAUSES_FORGOTTEN_S: Final = 2 * 3600  # time after which a repair no longer counts, s
 
 
@@ -99,82 +108,185 @@ class RepairPauses:
         self._repaired_ns.append(now_ns)
 
 
-class SettingsKeeper:
-    """Settings of one device; an attachment. Synchronization: the loop's thread only."""
+class SettingsComparison:
+    """Comparison of the declared settings of a device with its settings, and their repair if this is configured."""
 
-    def __init__(self, context: DeviceContext, transport: Transport, files: SettingsFiles) -> None:
+    def __init__(self, settings: "DeviceSettings", config: DeviceConfig, host: HostClock) -> None:
+        self.problem = ""  # reason why imud could not read or write the settings, one sentence
+        self.repairs = 0  # number of repairs since start
+        self._settings = settings
+        self._on_difference = config.on_difference
+        self._host = host
+        self._wanted = asyncio.Event()
+        self._due_ns: int | None = None  # CLOCK_MONOTONIC of the next comparison; None: after the next event
+        self._tries = 0
+        self._pauses = RepairPauses()
+
+    def schedule(self, after_ns: int) -> None:
+        """Compare after this time, because the settings can have changed."""
+        self._tries, self._due_ns = 0, self._host.now_ns() + after_ns
+
+    @property
+    def is_scheduled(self) -> bool:
+        return self._due_ns is not None
+
+    def start_if_due(self, now_ns: int | None) -> None:
+        """Start the scheduled comparison if its time has passed; None: in any case."""
+        if self._due_ns is not None and (now_ns is None or now_ns >= self._due_ns):
+            self._wanted.set()
+
+    def cancel(self) -> None:
+        self._due_ns = None
+        self._wanted.clear()
+
+    async def run(self) -> None:
+        """Compare the settings when a comparison is due. Ends only by an internal error."""
+        settings = self._settings
+        while True:
+            await self._wanted.wait()
+            self._wanted.clear()
+            with suppress(CommandError):  # another command is running: imud compares after it
+                async with settings.exclusive():
+                    self._due_ns = None
+                    if settings.table is not None:
+                        await self._compare(settings.table)
+
+    async def _compare(self, table: SettingsTable) -> None:
+        """Compare the settings, report differences, and repair them if this is configured."""
+        settings = self._settings
+        try:
+            actual = await settings.valid_values()
+        except DEVICE_ERRORS as error:
+            self._not_read(error)
+            return
+        self._tries, self.problem = 0, ""
+        settings.report_differences()
+        if settings.is_polled:
+            self._due_ns = self._host.now_ns() + AGAIN_NS
+        if self._on_difference is not OnDifference.REPORT:
+            await self._repair(table, actual)
+
+    async def _repair(self, table: SettingsTable, actual: Values) -> None:
+        """Apply the declared settings, or set the time of the next repair."""
+        settings, save = self._settings, self._on_difference is OnDifference.APPLY_AND_SAVE
+        try:
+            plan = settings.plan_repair(table, actual, save=save)
+        except BadArgument as error:
+            self._complain(f"cannot set the settings: {error}")
+            return
+        self.problem = "; ".join(f"{name} {why}" for name, why in plan.left_out.items())
+        if plan.empty:
+            return
+        now_ns = self._host.now_ns()
+        wait_ns = self._pauses.remaining_ns(settings.module, now_ns)
+        if wait_ns > 0:
+            self._due_ns = now_ns + wait_ns
+            self.problem = f"the device loses its settings; imud sets them again in {wait_ns / NS_PER_S:.0f} s"
+            return
+        self._pauses.add(now_ns)
+        self.repairs += 1
+        self._announce(await settings.carry_out(table, settings.declared, actual, save=save, asked=False))
+
+    def _announce(self, applied: AppliedSettings) -> None:
+        """Raise an event for a repair."""
+        if applied.problem:
+            self.problem = applied.problem
+            now_ns = self._host.now_ns()
+            self._due_ns = now_ns + max(self._pauses.remaining_ns(self._settings.module, now_ns), NS_PER_S)
+        detail = {step.name: str(step.outcome) for step in applied.steps}
+        self._settings.raise_event(_summary(applied), saved=applied.saved, **detail)
+
+    def _not_read(self, error: Exception) -> None:
+        """Set the time of the next read; after READ_TRIES report the error."""
+        self._tries += 1
+        self._settings.forget()
+        if self._tries < READ_TRIES:
+            self.problem = f"cannot read the settings: {error}"
+            self._due_ns = self._host.now_ns() + READ_AGAIN_NS
+        else:
+            self._complain(f"cannot read the settings after {self._tries} tries: {error}")
+
+    def _complain(self, problem: str) -> None:
+        if problem != self.problem:
+            self._settings.raise_event(problem)
+        self.problem = problem
+
+
+class DeviceSettings:
+    """Identity and settings of one device; an attachment. Synchronization: the loop's thread only."""
+
+    def __init__(
+        self, config: DeviceConfig, transport: SettingsPort, events: DeviceEvents, observer: PathObserver,
+        host: HostClock, files: SettingsFiles,
+    ) -> None:  # fmt: skip
         """All devices share `files`."""
-        self._config = context.config
+        self.identity = Identity()
+        self.shown: Mapping[str, str] = {}  # settings with readable names and values
+        self.answered = False  # whether the device replied to all requests of the newest query; set by the transport
+        self._config = config
+        self.declared = declared_values(config.declared)
         self._transport = transport
-        self._identity = transport.identity
-        self._events = context.events
-        self._host = context.host
+        self._events = events
+        self._observer = observer
+        self._host = host
         self._files = files
-        self._writes = files.flash
+        self._reports: Reports = {}
+        self._is_current = False  # whether the device still has the settings of `_reports`
+        self._read_ns: int | None = None
+        # resets of the device counter at the newest read of all reports if no other script followed; None otherwise
+        self._read_resets: int | None = None
+        self._target: Target | None = None
         self._clock: SampleClock | None = None
         # CLOCK_MONOTONIC until which a restart of the device counter is a result of a script of imud
         self._own_until_ns = self._resets = 0
         self.resets_requested = 0  # number of restarts of the device counter that a script of imud caused
         self._lock = asyncio.Lock()
-        self._wanted = asyncio.Event()
-        self._due_ns: int | None = None  # CLOCK_MONOTONIC of the next comparison; None: after the next event
-        self._tries = 0
-        self._actual: Values | None = None
-        self._target: Target | None = None
         # values that imud wrote since the last restart, of settings that the device does not report
         self._written: dict[str, Any] = {}
         self._unsaved = False  # whether a write since the last restart may be missing in flash
         self._saved: Values | None = None  # while `_unsaved`: the values before the write; None if they are unknown
-        self._reported: Mapping[str, SettingDifference] = {}
-        self._problem = ""
-        self._read_ns: int | None = None
-        # resets of the device counter at a plan that no other script has followed; None without such a plan
-        self._planned_resets: int | None = None
-        self._repairs = 0
-        self._pauses = RepairPauses()
+        self._differing: Mapping[str, SettingDifference] = {}
+        self.comparison = SettingsComparison(self, config, host)
 
     # --- the attachment -----------------------------------------------------------------------------------------------
 
     def start(self, clock: SampleClock) -> None:
-        """Forget the settings: imud has found the device again, or another device."""
+        """Note that the settings may differ: imud has found the device again, or another device."""
         self._clock, self._resets = clock, clock.status().resets
-        self._actual = self._planned_resets = None
+        self._is_current = False
         self._after_start(BEGIN_NS)
 
     def tick(self, now_ns: int, _newest: Sample | None) -> None:
-        """Wake `run` if a comparison is due and the device can reply. Detect a restart of the device counter."""
-        if self._clock is not None and (resets := self._clock.status().resets) != self._resets:
+        """Detect a restart of the device counter. Start a comparison if one is due and the device can reply."""
+        if (resets := self._counter_resets) != self._resets:
             is_own = self.busy or now_ns < self._own_until_ns + BOOT_NS
             self.resets_requested, self._resets = self.resets_requested + is_own * (resets - self._resets), resets
-            if self._declared and not self.busy and now_ns >= self._own_until_ns:
+            if (self.declared or self._unsaved) and not self.busy and now_ns >= self._own_until_ns:
                 self._after_start(SETTLE_NS)
-        is_due = self._declared and self._due_ns is not None and now_ns >= self._due_ns
-        if is_due and not self.busy and self._transport.can_be_asked:
-            self._wanted.set()
+        if self.declared and not self.busy and self._transport.can_be_asked:
+            self.comparison.start_if_due(now_ns)
 
-    def commanded(self, *, saved: bool = False) -> None:
-        """Note that a command was executed. It may have changed any setting, or `saved` all settings."""
-        if not self._unsaved:
-            self._saved = self._actual
-        self._unsaved, self._tries = not saved, 0
-        self._due_ns = self._host.now_ns()
+    def forget(self) -> None:
+        """Note that the settings of the device may differ from the last values."""
+        self._is_current = False
 
-    def saved(self) -> None:
-        """Note that the flash contains the present settings: a command saved them and changed no value."""
-        self._unsaved = False
+    @property
+    def is_polled(self) -> bool:
+        """Whether imud must compare the settings regularly, because no counter shows a restart."""
+        return isinstance(self._transport.driver, PolledDriver)
 
     def stop(self) -> None:
-        """Forget the settings: the link ended. A second call does nothing."""
-        self._actual = self._due_ns = self._planned_resets = None
-        self._wanted.clear()
+        """Note that the settings may differ: the link ended. A second call does nothing."""
+        self._is_current = False
+        self.comparison.cancel()
 
-    def close(self) -> None:
-        self.stop()
+    close = stop
 
     def _after_start(self, after_ns: int) -> None:
         """Note that the device has the settings of its flash, and compare them after `after_ns`."""
-        self._reported, self._written, self._unsaved, self._tries = {}, {}, False, 0
-        self._due_ns = self._host.now_ns() + after_ns
+        self._differing, self._written, self._unsaved = {}, {}, False
+        self._read_resets = None
+        self.comparison.schedule(after_ns)
 
     @property
     def busy(self) -> bool:
@@ -183,7 +295,7 @@ class SettingsKeeper:
 
     @asynccontextmanager
     async def exclusive(self) -> AsyncIterator[None]:
-        """Lock the settings for a command. The values of an earlier plan are then out of date.
+        """Lock the settings for a command.
 
         Raises CommandError if another command, for example a calibration, does not end within WAIT_S.
         """
@@ -194,55 +306,104 @@ class SettingsKeeper:
             raise CommandError(
                 f"{self._config.name}: another command or a calibration is still running; try again later"
             ) from None
-        self._planned_resets = None
         try:
             yield
         finally:
             self._own_until_ns = self._host.now_ns() + OWN_NS
             self._lock.release()
 
+    # --- reports of the device ----------------------------------------------------------------------------------------
+
     @property
-    def flash(self) -> ModuleFlash:
-        """Flash of the present device, for writes that a user or program requested."""
-        return ModuleFlash(self._writes, self._module, asked=True)
+    def values(self) -> Values:
+        """Values of the settings that the device reported last."""
+        return values_of(self._reports)
 
-    def spend_flash(self) -> None:
-        """Count a write to flash before a command makes it. Raises CommandError if the limit is reached."""
-        if refusal := self.flash.refusal():
-            raise CommandError(f"{self._config.name}: {refusal}")
-        self.flash.count()
+    def update_identity(self, identity: Identity) -> None:
+        """Store a new identity. Raise an event if another device has replied."""
+        before = self.identity
+        self.identity = identity = completed_identity(printable_identity(identity), before)
+        if before.serial_number and identity.serial_number != before.serial_number:
+            message = f"another device: serial number {identity.serial_number}, was {before.serial_number}"
+            self.raise_event(message, serial_number=identity.serial_number)
 
-    async def run(self) -> None:
-        """Compare the settings when a comparison is due. Ends only by an internal error."""
-        while True:
-            await self._wanted.wait()
-            self._wanted.clear()
-            with suppress(CommandError):  # another command is running: imud compares after it
-                async with self.exclusive():
-                    self._due_ns = None
-                    await self._keep()
+    def update(self, reports: Reports) -> None:
+        """Store all reports. Raise an event if a known setting has another value, and compare the GPIO lines."""
+        driver, known = self._transport.driver, self.shown
+        self._reports, self._is_current, self._read_ns = reports, True, self._host.now_ns()
+        text = printable_words(words_of(reports))
+        self.shown = printable_words(driver.shown_settings(text)) if driver is not None else text
+        changed = {name: value for name, value in self.shown.items() if known.get(name, value) != value}
+        if changed:
+            now = ", ".join(f"{name} is {value}, was {known[name]}" for name, value in changed.items())
+            self.raise_event(f"settings of the device changed: {now}", **changed)
+        self._observer.described(self._transport.where, identity_words(self.identity), self.shown)
+        self._transport.attachments.compare_settings(self.values, driver)
+        self._transport.use_axes(self.shown)
+
+    async def read(self) -> Values:
+        """Read all reports; no report if the driver has no table of settings. Raises as `report`."""
+        table = self.table
+        if table is None:
+            self.update({})
+            return {}
+
+        def script(target: Target) -> Any:
+            self._target = target
+            return table.read(target, None)
+
+        self.update(await self._transport.run_script(script))
+        self._read_resets = self._counter_resets
+        if self.comparison.is_scheduled and self._transport.can_be_asked:
+            self.comparison.start_if_due(None)
+        return self.values
+
+    async def _read_again(self, *, identity: bool) -> None:
+        """Read all reports after a command, and the identity if the device may have restarted."""
+        self._is_current = False
+        if not self._transport.may_ask:
+            return
+        try:
+            if identity:
+                await self._transport.read_identity()
+            await self.read()
+        except DEVICE_ERRORS as error:
+            log.info("%s: settings not read back: %s", self._config.name, error)
+
+    async def valid_values(self) -> Values:
+        """Return the present values: of the newest read, or of a new read if they can be out of date.
+
+        They are valid for PLAN_NS if no other script and no restart followed. Raises as `report`.
+        """
+        is_valid = self._is_current and self._read_ns is not None and self._read_resets == self._counter_resets
+        if is_valid and self._host.now_ns() - (self._read_ns or 0) <= PLAN_NS:
+            return self.values
+        return await self.read()
+
+    @property
+    def _counter_resets(self) -> int:
+        return self._clock.status().resets if self._clock is not None else 0
 
     # --- requests -----------------------------------------------------------------------------------------------------
 
     def status(self) -> SettingsStatus | None:
         """Return the newest comparison; None if the driver has no table of settings."""
-        table = self._known_table()
+        table = self.table
         if table is None:
             return None
-        found = self._differences(table)
+        found = self.differences()
         state = SettingsState.DIFFER if found else SettingsState.AGREE
-        state = SettingsState.UNKNOWN if self._actual is None else state
+        state = state if self._is_current else SettingsState.UNKNOWN
         return SettingsStatus(
-            state if self._declared else SettingsState.UNDECLARED,
+            state if self.declared else SettingsState.UNDECLARED,
             self._config.on_difference,
-            self._problem,
+            self.comparison.problem,
             found,
-            unverified(table, self._declared, self._actual or {}) if self._actual is not None else (),
-            self._read_ns,
-            self._repairs,
-            self._writes.writes(self._module),
-            self._writes.writes_day(self._module),
-        )
+            unverified(table, self.declared, self.values) if self._is_current else (),
+            self._read_ns, self.comparison.repairs,
+            self._files.flash.writes(self.module), self._files.flash.writes_day(self.module),
+            self._unsaved and table.save is not None,
+        )  # fmt: skip
 
     async def report(self, *, fresh: bool) -> SettingsReport:
         """Return all settings: read now if `fresh`, otherwise the last values.
@@ -252,158 +413,139 @@ class SettingsKeeper:
         table = self._table()
         if fresh:
             async with self.exclusive():
-                await self._read(table)
+                await self.read()
         status = self.status()
         assert status is not None
-        return SettingsReport(
-            self._config.name,
-            self._driver_name,
-            identity_words(self._identity.identity),
-            status,
-            described_settings(table, self._declared, self._actual),
-        )
+        found = described_settings(table, self.declared, self.values if self._is_current else None)
+        return SettingsReport(self._config.name, self._driver_name, identity_words(self.identity), status, found)
 
     async def plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
         """Return the plan to set the values `given` (None: the declared settings). Raises as `report`."""
         table = self._table()
         wanted = self._wanted_values(table, given)
         async with self.exclusive():
-            actual = await self._read(table)
+            actual = await self.read()
             wanted = completed(table, wanted, actual)
-            plan = self._make_plan(table, wanted, actual, save=save, unsaved=self._unsaved, by_name=given is not None)
-            self._planned_resets = self._counter_resets
-            return plan
+            return self._make_plan(table, wanted, actual, save=save, unsaved=self._unsaved, by_name=given is not None)
 
     async def apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
-        """Set the values `given` (None: the declared settings). Raises as `report`, before the first write.
-
-        imud uses the values of a plan if they are younger than PLAN_NS and no other script or restart followed.
-        """
+        """Set the values `given` (None: the declared settings). Raises as `report`, before the first write."""
         table = self._table()
         wanted = self._wanted_values(table, given)
-        planned = self._planned_values()
         async with self.exclusive():
-            actual = planned if planned is not None else await self._read(table)
+            actual = await self.valid_values()
             wanted = completed(table, wanted, actual)
-            return await self._apply(table, wanted, actual, save=save, asked=True, by_name=given is not None)
+            return await self.carry_out(table, wanted, actual, save=save, asked=True, by_name=given is not None)
 
-    def _planned_values(self) -> Values | None:
-        """Return the values of a plan that are still valid; None if there are none."""
-        if self.busy or self._read_ns is None or self._planned_resets != self._counter_resets:
-            return None
-        return self._actual if self._host.now_ns() - self._read_ns <= PLAN_NS else None
+    async def execute(self, name: str, verb: Verb, arguments: Mapping[str, Any]) -> object:
+        """Run a verb of the driver and return its result. Raises as `report`."""
+        params = verb.arguments(arguments)
+        async with self.exclusive():
+            if verb.saves:
+                self.spend_flash()
+            if verb.risk is Risk.RESET:
+                await self._back_up(name)
+            self._read_resets = None
+            if verb.changes:
+                self._transport.attachments.set_alarm_ranges(None)  # the action can change the ranges
+            try:
+                answer = await self._transport.run_script(lambda target: verb.script(target, params))
+            except BadArgument:  # a script checks its arguments before it changes anything
+                raise
+            except BaseException as error:  # the state of the device is unknown
+                self.changed(unsaved=verb.changes and not verb.restarts)
+                if isinstance(error, ImudError):
+                    await self._read_again(identity=True)
+                raise
+            if verb.changes:
+                self.changed(unsaved=not (verb.saves or verb.restarts))
+                await self._read_again(identity=verb.restarts)
+            if verb.saves or verb.restarts:
+                self._unsaved = False
+            return answer
 
-    @property
-    def _counter_resets(self) -> int:
-        return self._clock.status().resets if self._clock is not None else 0
+    def changed(self, *, unsaved: bool) -> None:
+        """Note that a command can have changed any setting, and whether the flash may not contain the change."""
+        if unsaved:
+            self._mark_unsaved(self.values if self._is_current else None)
+        self._read_resets = None
+        self.comparison.schedule(0)
 
-    async def back_up(self, verb: str) -> None:
-        """Write a backup before a verb that resets all settings, and report its file. The caller holds `exclusive`.
+    def _mark_unsaved(self, before: Values | None) -> None:
+        """Note that the flash does not contain the present settings. `before`: the values before the write."""
+        if not self._unsaved:
+            self._unsaved, self._saved, self._resets = True, before, self._counter_resets
+
+    def spend_flash(self) -> None:
+        """Count a write to flash before a command makes it. Raises CommandError if the limit is reached."""
+        flash = ModuleFlash(self._files.flash, self.module, asked=True)
+        if refusal := flash.refusal():
+            raise CommandError(f"{self._config.name}: {refusal}")
+        flash.count()
+
+    async def _back_up(self, verb: str) -> None:
+        """Write a backup before a verb that resets all settings, and report its file.
 
         If the backup fails, imud raises an event and runs the verb anyway: the verb may repair the device.
         """
-        table = self._known_table()
+        table = self.table
         if table is None:
             return
         try:
-            actual = await self._read(table)
+            actual = await self.read()
             settable = [name for name, setting in table.table.items() if setting.write is not None and name in actual]
-            values = {name: as_json(actual[name]) for name in settable}
-            device, utc_ns = self._config.name, self._host.utc_ns()
-            words = identity_words(self._identity.identity)
-            text = backup_text(device, self._driver_name, words, values, utc_ns)
-            writing = asyncio.to_thread(self._files.backups.write, device, text, utc_ns)
-            file = await asyncio.wait_for(writing, BACKUP_LIMIT_S)
-        except TimeoutError:
-            self._raise(f"no backup of the settings before {verb}: the disk does not respond")
-            return
+            values, utc_ns = {name: as_json(actual[name]) for name in settable}, self._host.utc_ns()
+            identity = identity_words(self.identity)
+            text = backup_text(self._config.name, self._driver_name, identity, values, utc_ns)
+            file = await self._files.backups.write_soon(self._config.name, text, utc_ns)
         except (*DEVICE_ERRORS, OSError) as error:
-            self._raise(f"no backup of the settings before {verb}: {reason_of(error)}")
+            self.raise_event(f"no backup of the settings before {verb}: {reason_of(error)}")
             return
-        if file is not None:
-            self._raise(f"settings before {verb} are in {file}", file=str(file))
-        else:
-            self._raise(f"no backup of the settings before {verb}: there is no state directory")
+        self.raise_event(f"settings before {verb} are in {file}", file=str(file))
 
     # --- comparison ---------------------------------------------------------------------------------------------------
 
-    async def _keep(self) -> None:
-        """Read the settings, report differences, and repair them if `on_difference` requests it."""
-        table = self._known_table()
-        if table is None:
-            return
-        try:
-            actual = await self._read(table)
-        except DEVICE_ERRORS as error:
-            self._not_read(error)
-            return
-        self._tries, self._problem = 0, ""
-        found = self._differences(table)
-        self._report_differences(found)
-        if isinstance(self._transport.driver, PolledDriver):
-            self._due_ns = self._host.now_ns() + AGAIN_NS
-        if self._config.on_difference is not OnDifference.REPORT:
-            await self._repair(table, actual)
-
-    async def _repair(self, table: SettingsTable, actual: Values) -> None:
-        """Apply the declared settings, or set the time of the next repair."""
-        save = self._config.on_difference is OnDifference.APPLY_AND_SAVE
-        try:
-            unsaved = self._unsaved and not self._is_saved(actual)
-            plan = self._make_plan(table, self._declared, actual, save=save, unsaved=unsaved)
-        except BadArgument as error:
-            self._complain(f"cannot set the settings: {error}")
-            return
-        self._problem = "; ".join(f"{name} {why}" for name, why in plan.left_out.items())
-        if plan.empty:
-            return
-        now_ns = self._host.now_ns()
-        wait_ns = self._pauses.remaining_ns(self._module, now_ns)
-        if wait_ns > 0:
-            self._due_ns = now_ns + wait_ns
-            self._problem = f"the device loses its settings; imud sets them again in {wait_ns / NS_PER_S:.0f} s"
-            return
-        self._pauses.add(now_ns)
-        self._repairs += 1
-        applied = await self._apply(table, self._declared, actual, save=save, asked=False)
-        self._announce(applied)
-
-    def _is_saved(self, actual: Values) -> bool:
-        """Return whether flash contains the declared settings, because commands changed no value."""
-        return actual == self._saved and all(name in actual for name in self._declared)
-
-    async def _read(self, table: SettingsTable) -> Values:
-        def read(target: Target) -> Any:
-            self._target = target
-            return table.read(target)
-
-        actual: Values = await self._transport.run_script(read)
-        self._actual, self._read_ns = actual, self._host.now_ns()
-        return actual
-
-    async def _apply(
+    async def carry_out(
         self, table: SettingsTable, wanted: Values, actual: Values, *, save: bool, asked: bool, by_name: bool = False
     ) -> AppliedSettings:
+        """Set the values `wanted`. `asked`: a user or program requested it. The caller holds `exclusive`."""
         plan = self._make_plan(table, wanted, actual, save=save, unsaved=self._unsaved, by_name=by_name)
-        flash = ModuleFlash(self._writes, self._module, asked=asked)
-        applying = Applying(table, self._transport.run_script, flash, wanted, actual)
+        flash = ModuleFlash(self._files.flash, self.module, asked=asked)
+        applying = Applying(table, self._transport, flash, wanted, self._reports)
+        self._transport.attachments.set_alarm_ranges(None)  # the new settings can change the ranges
+        self._read_resets = None
         try:
             done = await applying.carry_out(plan)
         finally:
             self._written |= applying.written
-            self._unsaved |= applying.changed
-            self._actual = applying.actual if applying.heard else None
-            self._read_ns = self._host.now_ns()
+            if applying.changed:
+                self._mark_unsaved(actual)
+            self.update(applying.reports)
+            self._is_current = applying.heard
             if applying.saved:
                 self._unsaved = False
                 unreadable = {name: as_json(value) for name, value in self._all_written(table).items()}
-                self._writes.keep_unreadable(self._module, unreadable)
+                self._files.flash.keep_unreadable(self.module, unreadable)
         if asked:  # a repair raises an event, which the log contains
             log.info("%s: %s", self._config.name, _summary(done) or "all settings already have these values")
-        self._report_differences(self._differences(table), quiet=True)
-        if applying.changed:
-            await self._transport.read_back(identity=done.restarted)
-        return msgspec.structs.replace(done, advice=advice(self._config, plan, done))
+        self.report_differences(quiet=True)
+        if done.restarted and self._transport.may_ask:
+            with suppress(*DEVICE_ERRORS):
+                await self._transport.read_identity()
+        not_saved = "" if done.problem else self.not_saved
+        return msgspec.structs.replace(done, advice=advice(self._config, plan, done), not_saved=not_saved)
+
+    @property
+    def not_saved(self) -> str:
+        """That the flash lacks a change, and the next step; empty if it contains all settings or cannot be written."""
+        is_lost = self._unsaved and self.table is not None and self.table.save is not None
+        return f"not saved; run `imud command {self._config.name} save`" if is_lost else ""
+
+    def plan_repair(self, table: SettingsTable, actual: Values, *, save: bool) -> SettingsPlan:
+        """Return the plan to set the declared settings. Raises BadArgument."""
+        # flash contains the declared settings if commands changed no value
+        saved = actual == self._saved and all(name in actual for name in self.declared)
+        return self._make_plan(table, self.declared, actual, save=save, unsaved=self._unsaved and not saved)
 
     def _make_plan(
         self, table: SettingsTable, wanted: Values, actual: Values, *, save: bool, unsaved: bool, by_name: bool = False
@@ -414,57 +556,24 @@ class SettingsKeeper:
 
     def _all_written(self, table: SettingsTable) -> dict[str, Any]:
         """Return the written values of settings that the device does not report: saved, or since its restart."""
-        found: dict[str, Any] = {}
-        for name, value in self._writes.unreadable(self._module).items():
-            try:
-                found |= wanted_values(table, {name: value})
-            except BadArgument:
-                log.debug("%s: %s of an earlier version is not used", self._config.name, name)
-        return found | self._written
+        return valid_values(table, self._files.flash.unreadable(self.module)) | self._written
 
     # --- events -------------------------------------------------------------------------------------------------------
 
-    def _report_differences(self, found: Mapping[str, SettingDifference], *, quiet: bool = False) -> None:
+    def report_differences(self, *, quiet: bool = False) -> None:
         """Raise an event for new differences. With `quiet` a reply or another event already reports them."""
-        if found and found != self._reported and not quiet:
+        found = self.differences()
+        if found and found != self._differing and not quiet:
             detail = {name: shown(one.actual) for name, one in found.items()}
-            self._raise(f"settings differ from the declared settings: {words(found)}", **detail)
-        elif not found and self._reported:
-            self._raise("settings agree with the declared settings again")
-        self._reported = found
+            self.raise_event(f"settings differ from the declared settings: {words(found)}", **detail)
+        elif not found and self._differing:
+            self.raise_event("settings agree with the declared settings again")
+        self._differing = found
 
-    def _announce(self, applied: AppliedSettings) -> None:
-        """Raise an event for a repair."""
-        if applied.problem:
-            self._problem = applied.problem
-            now_ns = self._host.now_ns()
-            self._due_ns = now_ns + max(self._pauses.remaining_ns(self._module, now_ns), NS_PER_S)
-        detail = {step.name: str(step.outcome) for step in applied.steps}
-        self._raise(_summary(applied), saved=applied.saved, **detail)
-
-    def _not_read(self, error: Exception) -> None:
-        """Set the time of the next read; after READ_TRIES report the error."""
-        self._tries += 1
-        self._actual = None
-        if self._tries < READ_TRIES:
-            self._problem = f"cannot read the settings: {error}"
-            self._due_ns = self._host.now_ns() + READ_AGAIN_NS
-        else:
-            self._complain(f"cannot read the settings after {self._tries} tries: {error}")
-
-    def _complain(self, problem: str) -> None:
-        if problem != self._problem:
-            self._raise(problem)
-        self._problem = problem
-
-    def _raise(self, message: str, **detail: str | bool) -> None:
+    def raise_event(self, message: str, /, **detail: str | bool) -> None:
         self._events.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message, **detail)
 
     # --- parts --------------------------------------------------------------------------------------------------------
-
-    @property
-    def _declared(self) -> Values:
-        return declared_values(self._config.declared)
 
     @property
     def _driver_name(self) -> str:
@@ -472,33 +581,36 @@ class SettingsKeeper:
         return driver.name if driver is not None else self._config.driver
 
     @property
-    def _module(self) -> str:
+    def module(self) -> str:
         """Key of the device in the counts of flash writes: serial number; without one the name of the device."""
-        serial_number = self._identity.identity.serial_number
+        serial_number = self.identity.serial_number
         return f"{self._driver_name} {serial_number}" if serial_number else f"device {self._config.name}"
 
-    def _differences(self, table: SettingsTable) -> dict[str, SettingDifference]:
-        if self._actual is None:
+    def differences(self) -> dict[str, SettingDifference]:
+        """Return the differences of the present settings from the declared settings."""
+        table = self.table
+        if table is None or not self._is_current:
             return {}
-        return differences(table, self._declared, self._actual, self._all_written(table))
+        return differences(table, self.declared, self.values, self._all_written(table))
 
-    def _known_table(self) -> SettingsTable | None:
+    @property
+    def table(self) -> SettingsTable | None:
+        """Table of the driver; None before imud has found the device, and for a driver without a table."""
         driver = self._transport.driver
         return driver.device_settings if driver is not None else None
 
     def _table(self) -> SettingsTable:
-        table = self._known_table()
+        table = self.table
         if table is None:
-            name = self._driver_name
-            raise CommandError(f"{self._config.name}: driver {name} cannot read or write device settings")
+            raise CommandError(f"{self._config.name}: {self._driver_name} cannot read or write device settings")
         return table
 
     def _wanted_values(self, table: SettingsTable, given: Mapping[str, Any] | None) -> Values:
         if given is not None:
             return wanted_values(table, given)
-        if not self._declared:
+        if not self.declared:
             raise BadArgument(f"{self._config.name}: expected values, or `settings` in the configuration, got neither")
-        return self._declared
+        return self.declared
 
 
 def _summary(applied: AppliedSettings) -> str:
@@ -508,8 +620,46 @@ def _summary(applied: AppliedSettings) -> str:
         if step.outcome is StepOutcome.NOT_DONE:
             continue
         before = f" (was {shown(step.before)})" if step.before is not None else ""
-        note = "" if step.outcome is StepOutcome.DONE else f": {step.outcome}"
+        note = "" if step.outcome is StepOutcome.VERIFIED else f": {step.outcome}"
         parts.append(f"{step.name} set to {shown(step.value)}{before}{note}")
     ends = ["saved to flash"] * applied.saved + ["restarted"] * applied.restarted
     ends += [applied.problem] if applied.problem else []
     return "settings: " + "; ".join([", ".join(parts), *ends] if parts else ends) if parts or ends else ""
+
+
+def completed_identity(identity: Identity, before: Identity) -> Identity:
+    """Return `identity` with its empty members from `before`, unless both belong to different devices.
+
+    An adapter that was just plugged in can lose bytes of the first replies.
+    """
+    pairs = ((identity.product, before.product), (identity.serial_number, before.serial_number))
+    if any(new and old and new != old for new, old in pairs):
+        return identity
+    return Identity(
+        identity.product or before.product,
+        identity.serial_number or before.serial_number,
+        identity.firmware or before.firmware,
+        before.details if identity.details is None else identity.details,
+    )
+
+
+def printable_identity(identity: Identity) -> Identity:
+    """Return an identity with texts of limited length in printable characters."""
+    product, serial, firmware = map(printable, (identity.product, identity.serial_number, identity.firmware))
+    return Identity(product, serial, firmware, None if identity.details is None else printable_words(identity.details))
+
+
+def printable_words(words: Mapping[str, str]) -> dict[str, str]:
+    """Return the first WORDS_MAX names and texts of a device, in printable characters of limited length."""
+    return {printable(name): printable(text) for name, text in islice(words.items(), WORDS_MAX)}
+
+
+def identity_words(identity: Identity) -> dict[str, str]:
+    """Return an identity as the mapping in `DeviceStatus`, without empty members."""
+    words = {
+        "product": identity.product,
+        "serial_number": identity.serial_number,
+        "firmware": identity.firmware,
+        **(identity.details or {}),
+    }
+    return {name: value for name, value in words.items() if value}

@@ -1,12 +1,16 @@
 """Plan and execution of a change of device settings.
 
-imud writes settings in the order of the driver's table. The settings that change the connection (baud rate, address)
-are last. Without a save, imud leaves out the settings that need a restart, because the restart loses unsaved values.
+imud writes settings in the order of the driver's table, reads back the reports that contain them, and then saves. The
+settings that change the connection (baud rate, address) are last; imud checks each of them by itself. Without a save,
+imud leaves out the settings that need a restart, because the restart loses unsaved values.
 """
 
 import re
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from shlex import quote
 from typing import Annotated, Any, Final, get_args, get_origin
 
@@ -20,6 +24,7 @@ from imud.contracts.setting import (
     AppliedStep,
     Effect,
     PlannedStep,
+    Reports,
     Setting,
     SettingDifference,
     SettingInfo,
@@ -27,10 +32,12 @@ from imud.contracts.setting import (
     SettingsTable,
     StepOutcome,
     Written,
+    values_of,
 )
+from imud.device.attachments import Attachments
 from imud.device.flash import ModuleFlash
 from imud.host.log import printable
-from imud.model.errors import BadArgument, CommandError, DeviceRefused, IsSetting, LinkError, TransferError
+from imud.model.errors import BadArgument, CommandError, DeviceRefused, IsSetting, LinkError, Rejected, TransferError
 from imud.model.options import expected, json_or_text, shown, unknown_name, value_problem
 
 Values = Mapping[str, Any]  # values of settings by name, in the types of the table
@@ -160,6 +167,15 @@ def _refuse_overlap(name: str, others: Iterable[Path], path: Path) -> None:
         if other[: len(path)] == path or path[: len(other)] == other:
             both = " and ".join(".".join((name, *one)) for one in (other, path))
             raise BadArgument(f"{name}: expected one value for each part, got {both}")
+
+
+def valid_values(table: SettingsTable, saved: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the saved values in the types of the table, without values of another version of imud."""
+    found: dict[str, Any] = {}
+    for name, value in saved.items():
+        with suppress(BadArgument):
+            found |= wanted_values(table, {name: value})
+    return found
 
 
 def described_settings(table: SettingsTable, declared: Values, actual: Values | None) -> tuple[SettingInfo, ...]:
@@ -339,41 +355,75 @@ DEVICE_ERRORS: Final = (CommandError, DeviceRefused, LinkError, TransferError)
 """Errors of a device that does not reply, rejects a value, or is missing."""
 
 PLACES: Final = ("baud", "address", "node")  # settings that the link or the options repeat to find the device
-UNVERIFIED: Final = (Written.UNVERIFIED, Written.UNVERIFIED_PENDING)
 PENDING: Final = (Written.PENDING, Written.UNVERIFIED_PENDING)
+NOT_REPORTED: Final = "the device does not report this setting"
 
-RunScript = Callable[[Callable[[Target], Any]], Awaitable[Any]]  # `run_script` of a transport
+
+class SettingsPort(ABC):
+    """Transport of a device, as its settings use it. `imud.device.transport` imports this module."""
+
+    driver: Driver | None  # driver of the device; None before imud has found the device
+    attachments: Attachments
+
+    @property
+    @abstractmethod
+    def where(self) -> str:
+        """Name of the link with its rate or address."""
+
+    @property
+    @abstractmethod
+    def can_be_asked(self) -> bool:
+        """Whether imud can run a script on the device now."""
+
+    @property
+    def may_ask(self) -> bool:
+        """Whether the configuration allows requests that no user made."""
+        return True
+
+    @abstractmethod
+    async def run_script(self, make: Callable[[Target], Any]) -> Any:
+        """Run the script that `make` returns, and return its result.
+
+        Raises LinkError and the errors of the script and of `make`: CommandError, TransferError, DeviceRefused.
+        """
+
+    def use_axes(self, settings: Mapping[str, str]) -> None:  # noqa: B027  # most devices have fixed axes
+        """Publish samples in the axes that the readable settings select."""
+
+    async def read_identity(self) -> None:  # noqa: B027  # a polled device is identified before its samples are read
+        """Query the identity again after a restart. Raises as `run_script`."""
 
 
 @dataclass
 class Applying:
-    """Execution of one plan. `wanted` has the types of the table, `actual` contains the values of the last read."""
+    """Execution of one plan. `wanted` has the types of the table, `reports` contains the last read."""
 
     table: SettingsTable
-    run: RunScript
+    transport: SettingsPort
     flash: ModuleFlash
     wanted: Values
-    actual: Values
+    reports: Reports
     written: dict[str, Any] = field(default_factory=dict)
     """Written values of settings that the device does not report."""
     saved: bool = False
     restarted: bool = False
     changed: bool = False  # whether imud has written a setting
-    pending: bool = False
-    """Whether a script has reported that its value needs a restart, although the table does not require it."""
+    # Settings whose script has reported that the value needs a restart, although the table does not require it
+    pending: set[str] = field(default_factory=set)
     heard: bool = True  # whether the device has replied to the newest read
     problem: str = ""
 
     async def carry_out(self, plan: SettingsPlan) -> AppliedSettings:
         """Execute the plan up to the first failure. Raises no error of the device or its link."""
         done: list[AppliedStep] = []
-        for step in plan.steps:
-            done.append(await self._do(step) if not self.problem else _applied(step, StepOutcome.NOT_DONE))
+        while len(done) < len(plan.steps) and not self.problem:
+            done += await self._write(_next_group(plan.steps[len(done) :]))
+        done += [_applied(step, StepOutcome.NOT_DONE) for step in plan.steps[len(done) :]]
         if not self.problem and plan.save:
             await self._save()
         if not self.problem and self._restarts(plan):
             done = await self._restart(done)
-        found = differences(self.table, self.wanted, self.actual, self.written)
+        found = differences(self.table, self.wanted, values_of(self.reports), self.written)
         return AppliedSettings(
             tuple(done), self.saved, self.restarted, self.problem + self._present(), plan.left_out, found
         )
@@ -383,49 +433,69 @@ class Applying:
         is_planned = any(step.effect is Effect.AFTER_RESTART for step in plan.steps)
         return plan.restart or (bool(self.pending) and self.saved and self.table.restart is not None and not is_planned)
 
-    async def _do(self, step: PlannedStep) -> AppliedStep:
-        setting, value = self.table.table[step.name], self.wanted[step.name]
-        assert setting.write is not None
-        write = setting.write
-        if step.saves and (refusal := self.flash.refusal()):
-            return self._failed(step, refusal)
-        try:
-            if step.saves:
-                self.flash.count()
-            result = await self.run(lambda target: write(target, value))
-        except DEVICE_ERRORS as error:
-            await self._read_again()
-            return self._failed(step, str(error))
-        self.changed = True
+    async def _write(self, group: Sequence[PlannedStep]) -> list[AppliedStep]:
+        """Write settings up to the first error, read back their reports once, and compare each setting."""
+        sent: list[PlannedStep] = []
+        failure: Exception | None = None
+        for step in group:
+            sent.append(step)
+            try:
+                result = await self._send(step)
+            except DEVICE_ERRORS as error:
+                failure = error
+                break
+            self.changed = True
+            if result in PENDING:
+                self.pending.add(step.name)
+        settings = [self.table.table[step.name] for step in sent]
+        names = {setting.report for setting in settings if setting.readable}
+        # an error can be the sign of a restart, which loses unsaved values
+        why = await self._read(None if failure or sent[-1].saves else names) if names else ""
+        last = self._judged(sent[-1], failure, why)
+        return [*(self._judged(step, None, why) for step in sent[:-1]), last]
+
+    async def _send(self, step: PlannedStep) -> Any:
+        write, value = self.table.table[step.name].write, self.wanted[step.name]
+        assert write is not None
+        if step.saves:
+            if refusal := self.flash.refusal():
+                raise CommandError(refusal)
+            self.flash.count()
+        result = await self.transport.run_script(lambda target: write(target, value))
         self.saved |= step.saves
-        if not await self._read_again():
-            return self._failed(step, "written, but the device has not reported its settings after the write")
-        if not setting.readable or (result in UNVERIFIED and step.name not in self.actual):
-            self.written[step.name] = value
-            return _applied(step, StepOutcome.NOT_VERIFIED)
-        if result in PENDING:
-            self.pending = True
-            return _applied(step, StepOutcome.WRITTEN)
-        return self._judged(step, setting)
+        return result
 
-    def _judged(self, step: PlannedStep, setting: Setting) -> AppliedStep:
+    def _judged(self, step: PlannedStep, error: Exception | None, why_unread: str) -> AppliedStep:
+        """Return the result of a write: `error` of its script, and the reason if imud could not read the report."""
+        setting, actual = self.table.table[step.name], values_of(self.reports)
+        is_read = setting.readable and not why_unread and step.name in actual
+        agrees = is_read and setting.agrees(self.wanted[step.name], actual[step.name])
+        if error is not None and not agrees:
+            is_known = is_read or isinstance(error, Rejected | BadArgument | DeviceRefused)
+            return self._failed(step, str(error), StepOutcome.NOT_APPLIED if is_known else StepOutcome.NOT_VERIFIED)
+        self.changed = True  # also if only the reply was lost
+        if why_unread and setting.readable:
+            words = f"the device has not reported its settings after the write: {why_unread}"
+            return self._failed(step, words, StepOutcome.NOT_VERIFIED)
+        if is_read and (step.name in self.pending or (step.effect is Effect.AFTER_RESTART and not step.saves)):
+            return _applied(step, StepOutcome.WRITTEN)
+        return self._compared(step)
+
+    def _compared(self, step: PlannedStep | AppliedStep) -> AppliedStep:
         """Compare the written value with the value that imud read back."""
-        if step.effect is Effect.AFTER_RESTART and not step.saves:
-            return _applied(step, StepOutcome.WRITTEN)
-        if message := self._mismatch(step.name, setting):
-            return self._failed(step, message)
-        return _applied(step, StepOutcome.DONE)
+        setting, actual, wanted = self.table.table[step.name], values_of(self.reports), self.wanted[step.name]
+        if not setting.readable or step.name not in actual:
+            self.written[step.name] = wanted
+            return _applied(step, StepOutcome.NOT_VERIFIED, NOT_REPORTED)
+        if setting.agrees(wanted, actual[step.name]):
+            return _applied(step, StepOutcome.VERIFIED)
+        return self._failed(step, f"wrote {shown(as_json(wanted))}, read back {shown(as_json(actual[step.name]))}")
 
-    def _mismatch(self, name: str, setting: Setting) -> str:
-        if name not in self.actual:
-            return "written, but the device does not report this setting"
-        if setting.agrees(self.wanted[name], self.actual[name]):
-            return ""
-        return f"wrote {shown(as_json(self.wanted[name]))}, read back {shown(as_json(self.actual[name]))}"
-
-    def _failed(self, step: PlannedStep, message: str) -> AppliedStep:
-        self.problem = f"{step.name}: {message}"
-        return _applied(step, StepOutcome.FAILED, message)
+    def _failed(
+        self, step: PlannedStep | AppliedStep, message: str, outcome: StepOutcome = StepOutcome.NOT_APPLIED
+    ) -> AppliedStep:
+        self.problem = self.problem or f"{step.name}: {message}"
+        return _applied(step, outcome, message)
 
     async def _save(self) -> None:
         save = self.table.save
@@ -435,7 +505,7 @@ class Applying:
             return
         self.flash.count()
         try:
-            await self.run(save)
+            await self.transport.run_script(save)
             self.saved = True
         except DEVICE_ERRORS as error:
             self.problem = f"not saved: {error}"
@@ -445,29 +515,25 @@ class Applying:
         restart = self.table.restart
         assert restart is not None
         try:
-            await self.run(restart)
+            await self.transport.run_script(restart)
             self.restarted = True
         except DEVICE_ERRORS as error:
             self.problem = f"restart: {error}"
-        if not await self._read_again():
+        if await self._read(None):
             self.problem = self.problem or "the device does not report its settings after its restart"
+        if self.problem:
             return done
-        return [self._after_restart(one) for one in done]
+        return [self._compared(one) if one.outcome is StepOutcome.WRITTEN else one for one in done]
 
-    def _after_restart(self, done: AppliedStep) -> AppliedStep:
-        if done.outcome is not StepOutcome.WRITTEN or self.problem:
-            return done
-        step = PlannedStep(done.name, done.value, done.before)
-        return self._judged(step, self.table.table[done.name])
-
-    async def _read_again(self) -> bool:
-        """Read all settings; return whether the device replied. Without a reply the values are unknown."""
+    async def _read(self, names: Collection[str] | None) -> str:
+        """Read reports, None: all. Return an empty text, or the reason if the device did not reply."""
         try:
-            self.actual = await self.run(self.table.read)
-            self.heard = True
-        except DEVICE_ERRORS:
-            self.actual, self.heard = {}, False
-        return self.heard
+            read = await self.transport.run_script(lambda target: self.table.read(target, names))
+        except DEVICE_ERRORS as error:
+            self.heard = False
+            return str(error)
+        self.reports, self.heard = joined(self.reports, read, names), True
+        return ""
 
     def _present(self) -> str:
         """Describe the state of the device after a failure, for the end of the message."""
@@ -480,11 +546,23 @@ class Applying:
         return "" if self.saved else "; the previous writes last until the device restarts"
 
 
+def joined(reports: Reports, read: Reports, names: Collection[str] | None) -> Reports:
+    """Return `reports` with the newer reports `read` in place of the reports `names`, None: of all reports."""
+    if names is None:
+        return read
+    return {name: report for name, report in reports.items() if name in read or name not in names} | {**read}
+
+
+def _next_group(steps: Sequence[PlannedStep]) -> Sequence[PlannedStep]:
+    """Return the next settings to write before a read-back. imud checks a setting of the connection by itself."""
+    return list(takewhile(lambda step: not (step.connection or step.saves), steps)) or steps[:1]
+
+
 def advice(config: DeviceConfig, plan: SettingsPlan, done: AppliedSettings) -> str:
     """Return the next step of the user, for example a change of the configuration; empty if none."""
     found: list[str] = []
     for step in done.steps:
-        if step.outcome not in (StepOutcome.DONE, StepOutcome.WRITTEN):
+        if step.outcome not in (StepOutcome.VERIFIED, StepOutcome.WRITTEN):
             continue
         for key, part in ((config.link, config.link_settings), ("options", config.options)):
             place = getattr(part, step.name, None)
@@ -494,5 +572,5 @@ def advice(config: DeviceConfig, plan: SettingsPlan, done: AppliedSettings) -> s
     return "; ".join(text for text in (changes, "" if done.problem else plan.advice) if text)
 
 
-def _applied(step: PlannedStep, outcome: StepOutcome, message: str = "") -> AppliedStep:
+def _applied(step: PlannedStep | AppliedStep, outcome: StepOutcome, message: str = "") -> AppliedStep:
     return AppliedStep(step.name, step.value, step.before, outcome, message)

@@ -8,7 +8,7 @@ from typing import Any, Final, Protocol
 from imud.contracts.command import Target
 from imud.contracts.driver import Identity, StreamDriver
 from imud.contracts.link import OnEnd, StreamLink
-from imud.contracts.script import Request
+from imud.contracts.script import Request, RequestScript
 from imud.contracts.setting import declared_values
 from imud.contracts.status import DeviceState
 from imud.device.latency import MOST_NS
@@ -20,7 +20,6 @@ from imud.device.transport import (
     SILENT_SEARCH_NS,
     UNHEARD_NS,
     DeviceContext,
-    Queries,
     ReceivingTransport,
 )
 from imud.drivers import DRIVERS
@@ -199,7 +198,7 @@ class StreamTransport(ReceivingTransport):
         clock = context.new_clock(driver, self.path)
         options = self._config.options or driver.settings()
         codec = driver.make_codec(self._ledger, options)
-        path_context = context.path_context(driver, self.link, self.scripts.on_message, self.identity.shown_settings)
+        path_context = context.path_context(driver, self.link, self.scripts.on_message, self.settings.shown)
         self.driver = driver
         self.path = StreamPath(codec, clock, path_context, self.attachments.drain_edges, self.scripts)
         context.observer.path_made(self.path, driver.name, options)
@@ -214,13 +213,12 @@ class StreamTransport(ReceivingTransport):
     async def ask(self) -> None:
         """Query identity and settings, and start the output of a silent device, if the configuration allows it."""
         driver = self.driver
-        if self._may_ask and driver is not None:
+        if self.may_ask and driver is not None:
             await self._identify(IDENTIFY_TRIES)
             await self._wake(driver)
 
-    def _queries(self) -> Queries | None:
-        driver = self.driver
-        return (driver.identify, driver.read_settings) if driver is not None else None
+    def _identity_script(self) -> RequestScript[Identity] | None:
+        return self.driver.identify() if self.driver is not None else None
 
     async def still_answers(self) -> bool:
         """Query a silent device at its last baud rate; return whether no search is needed.
@@ -366,10 +364,10 @@ class StreamTransport(ReceivingTransport):
 
     def _is_overdue(self, path: SamplePath, now_ns: int) -> bool:
         """Return whether imud must query a silent device or search for it: once when it becomes silent, then later."""
-        if not (self._searchable or self._may_ask):
+        if not (self._searchable or self.may_ask):
             return False
         just_silent = self._health.state is DeviceState.SILENT and self._asked_ns < self._health.silent_since_ns
-        if just_silent and self._may_ask and not self._has_answered(path):
+        if just_silent and self.may_ask and not self._has_answered(path):
             return True
         return now_ns - max(self._silent_since_ns(path), self._asked_ns) > SILENT_SEARCH_NS
 
@@ -395,11 +393,11 @@ class StreamTransport(ReceivingTransport):
 
     def _words_of_silence(self) -> str:
         """Describe a device that replies and sends no samples."""
-        driver, known = self.driver, self.identity
+        driver, identity = self.driver, self.settings.identity
         assert driver is not None
-        firmware = f"firmware {known.identity.firmware}" if known.identity.firmware else ""
-        names = ", ".join(filter(None, (known.identity.product, firmware)))
-        why = driver.why_silent(known.settings)
+        firmware = f"firmware {identity.firmware}" if identity.firmware else ""
+        names = ", ".join(filter(None, (identity.product, firmware)))
+        why = driver.why_silent(self.settings.values)
         hint = "; the command wake starts its output" if "wake" in driver.verbs else ""
         return f"it replies{f' ({names})' if names else ''} but sends no samples: {why}{hint}"
 

@@ -6,7 +6,7 @@ A transport owns the link, finds the device on the link, and passes received dat
 
 import asyncio
 import logging
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,7 +15,6 @@ from typing import Any, Protocol
 
 from imud.attitude.published import PublishedAxes, published_frame
 from imud.config.model import DeviceConfig
-from imud.contracts.command import Target
 from imud.contracts.driver import Driver, Identity
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link, OnEnd
@@ -24,11 +23,12 @@ from imud.contracts.script import Message, RequestScript
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.device.attachments import Attachments
 from imud.device.health import DeviceEvents, Health
-from imud.device.identity import KnownIdentity, identity_words
 from imud.device.scripts import RequestPort, ScriptRunner
 from imud.device.search import Remembered, SearchRound
+from imud.device.settings import DeviceSettings
+from imud.device.settings_plan import SettingsPort
 from imud.host.clock import HostClock
-from imud.model.errors import CommandError, LinkError, NothingHeard
+from imud.model.errors import CommandError, NothingHeard
 from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_S
@@ -105,7 +105,7 @@ class DeviceContext:
         )
 
 
-class Transport(ABC):
+class Transport(SettingsPort):
     """Transport of one device. Synchronization: the loop's thread only.
 
     Order of calls: `serve` once; then `wait_present`, `link.open`, `start`, `work` until it or the link ends, `stop`,
@@ -113,12 +113,10 @@ class Transport(ABC):
     """
 
     link: Link
-    driver: Driver | None  # driver of the device; None before imud has found the device
     path: SamplePath | None  # sample path of the device; None before imud has found the device
-    attachments: Attachments
+    settings: DeviceSettings
 
     def __init__(self, context: DeviceContext) -> None:
-        self.identity = KnownIdentity(context.events, context.host)
         self._context = context
         self._config = context.config
         self._health = context.health
@@ -126,9 +124,10 @@ class Transport(ABC):
         self._latency_ns = 0
         self._axes_problem = ""  # reason for which the axes of the device are uncertain
 
-    def serve(self, attachments: Attachments) -> None:
-        """Set the attachments of the device, before the first use of the link."""
+    def serve(self, attachments: Attachments, settings: DeviceSettings) -> None:
+        """Set the other parts of the device, before the first use of the link."""
         self.attachments = attachments
+        self.settings = settings
 
     # --- the link ----------------------------------------------------------------------------------------------------
 
@@ -155,34 +154,12 @@ class Transport(ABC):
 
     # --- requests ----------------------------------------------------------------------------------------------------
 
-    @abstractmethod
-    async def run_script(self, make: Callable[[Target], Any]) -> Any:
-        """Run the script that `make` returns, and return its result.
-
-        Raises LinkError and the errors of the script and of `make`: CommandError, TransferError, DeviceRefused.
-        """
-
-    @abstractmethod
-    async def read_back(self, *, identity: bool = True) -> None:
-        """Query the settings and, if `identity`, the identity again after a change.
-
-        Keep the old values if the device does not reply.
-        """
-
     def write(self, data: bytes) -> None:
         """Send bytes to the device. Raises LinkError."""
         self.link.write(data)
 
-    def _update_settings(self, settings: Mapping[str, str]) -> None:
-        """Store the settings of the device, and compare the GPIO lines with them."""
-        identity = self.identity
-        identity.update_settings(settings, self.driver)
-        self._context.observer.described(self.where, identity_words(identity.identity), identity.shown_settings)
-        self.attachments.compare_settings(identity.settings, self.driver)
-        self._use_axes(identity.shown_settings)
-
-    def _use_axes(self, settings: Mapping[str, str]) -> None:
-        """Publish samples in the axes that the device settings select. Report unknown axes once."""
+    def use_axes(self, settings: Mapping[str, str]) -> None:
+        """Publish samples in the axes that the readable device settings select. Report unknown axes once."""
         driver, path = self.driver, self.path
         if driver is None or path is None:
             return
@@ -203,18 +180,13 @@ class Transport(ABC):
     def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
         """Report the received data, or search again. Called after UNHEARD_NS without a sample."""
 
-    def tick(self, now_ns: int) -> None:  # noqa: B027  # only a polled bus counts deadlines
+    def tick(self, now_ns: int) -> None:  # only a polled bus counts deadlines
         """Do periodic work, ten times per second, before the device checks its samples."""
 
-    def on_reset(self) -> None:  # noqa: B027  # a stream or CAN device sends again without a request
+    def on_reset(self) -> None:  # a stream or CAN device sends again without a request
         """Prepare for a reset of the device by its line."""
 
     # --- state -------------------------------------------------------------------------------------------------------
-
-    @property
-    @abstractmethod
-    def where(self) -> str:
-        """Name of the link with its rate or address."""
 
     @property
     @abstractmethod
@@ -262,10 +234,6 @@ class Transport(ABC):
         return status
 
 
-Queries = tuple[Callable[[], RequestScript[Identity]], Callable[[], RequestScript[Mapping[str, str]]]]
-"""Scripts that query identity and settings."""
-
-
 class ReceivingTransport(Transport, RequestPort):
     """Transport of a device that sends samples without a request, on a serial port or a CAN bus."""
 
@@ -291,8 +259,8 @@ class ReceivingTransport(Transport, RequestPort):
         return False
 
     @abstractmethod
-    def _queries(self) -> Queries | None:
-        """Return the scripts that query identity and settings; None before imud has found the device."""
+    def _identity_script(self) -> RequestScript[Identity] | None:
+        """Return the script that queries the identity; None before imud has found the device."""
 
     @abstractmethod
     def _apply(self, identity: Identity) -> None:
@@ -307,26 +275,25 @@ class ReceivingTransport(Transport, RequestPort):
         """Query identity and settings once."""
         await self._identify(1)
 
-    async def read_back(self, *, identity: bool = True) -> None:
-        with suppress(LinkError):  # the device receives the end of the link from `on_end`
-            await self._identify(1, is_new=identity)
+    async def read_identity(self) -> None:
+        script = self._identity_script()
+        if script is not None:
+            identity = await self.scripts.run(script)
+            self._apply(identity)
+            self.settings.update_identity(identity)
 
-    async def _identify(self, tries: int, *, is_new: bool = True) -> bool:
-        """Query the settings and, if it `is_new`, the identity. Return whether the device replied to all queries."""
-        queries, identity = self._queries(), self.identity
-        if queries is None or not self._may_ask:
+    async def _identify(self, tries: int) -> bool:
+        """Query identity and settings. Return whether the device replied to all queries."""
+        settings = self.settings
+        if self.driver is None or not self.may_ask:
             return False
         self._asked_ns = self._host.now_ns()
-        identity.answered = False
-        identify, read_settings = queries
+        settings.answered = False
         for attempt in range(1, tries + 1):
             try:
-                if is_new:
-                    found = await self.scripts.run(identify())
-                    self._apply(found)
-                    identity.update_identity(found)
-                self._update_settings(await self.scripts.run(read_settings()))
-                identity.answered = True
+                await self.read_identity()
+                await settings.read()
+                settings.answered = True
                 return True
             except CommandError as error:
                 log.info("%s: %s (try %d of %d)", self._config.name, error, attempt, tries)
@@ -335,14 +302,14 @@ class ReceivingTransport(Transport, RequestPort):
     @property
     def unanswered(self) -> bool:
         """Whether imud must query the identity again."""
-        return self._may_ask and not self.identity.answered
+        return self.may_ask and not self.settings.answered
 
     @property
     def busy(self) -> bool:
         return self.scripts.busy
 
     @property
-    def _may_ask(self) -> bool:
+    def may_ask(self) -> bool:
         return self._config.identify and self.link.writable
 
 

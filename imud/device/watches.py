@@ -5,7 +5,7 @@ one event per path. The status shows the contradiction until a later rest withou
 """
 
 from collections.abc import Mapping
-from typing import Final
+from typing import Any, Final
 
 from imud.attitude.conventions import Convention, Heading
 from imud.attitude.gravity import Contradiction, GravityCheck
@@ -52,16 +52,16 @@ class AttitudeWatch:
             )
 
     def status(
-        self, driver: Driver | None, path: SamplePath | None, read_back: Mapping[str, str], shown: Mapping[str, str]
+        self, driver: Driver | None, path: SamplePath | None, settings: Mapping[str, Any], shown: Mapping[str, str]
     ) -> FrameStatus | None:
         """Return axes and angles of the published samples; None before imud has found the device.
 
-        `read_back` contains the settings by the names of the device, `shown` the readable settings.
+        `settings` contains the values of the settings, `shown` their readable text.
         """
         if driver is None or path is None:
             return None
         frame, config, sent = path.frame, self._config, driver.sent_axes(shown)
-        device_heading = driver.heading(config.options, read_back)
+        device_heading = driver.heading(config.options, settings)
         words = frame.words(sent.euler_convention, sent.navigation_frame)
         return FrameStatus(
             frame=words.frame,

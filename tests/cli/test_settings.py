@@ -62,7 +62,7 @@ def test_from_difference_to_agreement_and_back(
     # apply the declared settings
     out = cli(*words, "--apply").out
     assert "plan:\n  mode: 6-axis → 9-axis\n" in out
-    assert "done:\n  mode: done\n  output: done" in out
+    assert "done:\n  mode: verified\n  output: verified" in out
     assert (actual(daemon)["mode"], actual(daemon)["output"]["hi91"]) == ("9-axis", 50)
     assert "all readable settings are as declared" in cli(*words).out
     assert cli(*words, "--apply").out == "no changes needed\n"

@@ -278,7 +278,7 @@ async def test_declared_settings_are_applied_to_every_kind_of_module(bench: Line
         assert "address 2 is in use" in taken.problem
         applied = await rig.device.settings_apply({"mode": "9-axis", "mounting": "x_up", "address": 9}, save=True)
         assert applied.problem == "", applied
-        assert {step.name: str(step.outcome) for step in applied.steps}["mounting"] == "written, not verified"
+        assert {step.name: str(step.outcome) for step in applied.steps}["mounting"] == "sent, not verified"
         await rig.until_samples(5)
         assert rig.device.status().link == f"{bench.path}, address 9"
         assert (module.flash.heading_mode, module.flash.slave, module.address) == (1, 9, 9)

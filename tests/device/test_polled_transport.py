@@ -396,7 +396,7 @@ async def test_settings_are_applied_and_read_again_after_an_action(bench: Polled
         actual = {one.name: one.actual for one in report.settings}
         assert actual == {"accel_filter": "47 Hz", "gyro_filter": "47 Hz", "burst": "extended"}
         applied = await rig.device.settings_apply({"accel_filter": "average 16"}, save=False)
-        assert [(step.name, str(step.outcome)) for step in applied.steps] == [("accel_filter", "done")]
+        assert [(step.name, str(step.outcome)) for step in applied.steps] == [("accel_filter", "verified")]
         assert device.filter == 0xDB
         assert rig.device.status().settings["gyro_filter"] == "47 Hz"
         await act(rig.device, "filter", {"gyro_filter": "10 Hz"})

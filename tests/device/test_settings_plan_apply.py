@@ -1,15 +1,24 @@
 """Results of writes, and the order of save and restart. test_settings.py tests failures."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import pytest
 
 from imud.contracts.command import Target
-from imud.contracts.setting import AppliedSettings, Effect, Setting, SettingsTable, StepOutcome, Written
+from imud.contracts.setting import (
+    AppliedSettings,
+    DeviceReport,
+    Effect,
+    Reports,
+    Setting,
+    SettingsTable,
+    StepOutcome,
+    Written,
+)
 from imud.device.flash import FlashWrites, ModuleFlash
-from imud.device.settings_plan import Applying, make_plan
+from imud.device.settings_plan import Applying, SettingsPort, make_plan
 from imud.host.clock import HostClock
 from imud.model.errors import LinkMissing, NoReply
 
@@ -41,13 +50,22 @@ class TableOfOne:
             raise self.result
         return self.result
 
-    def _read(self, _target: Target) -> dict[str, Any]:
+    def _read(self, _target: Target, _names: Collection[str] | None) -> Reports:
         self._do("read")
-        return dict(self.active)
+        return {"": DeviceReport(values=dict(self.active))}
 
     def _restart(self) -> None:
         self._do("restart")
         self.active = dict(self.actual) if self.active else {}
+
+
+class OnePort(SettingsPort):
+    """Port that runs each script when it is created."""
+
+    driver, where, can_be_asked = None, "", True
+
+    async def run_script(self, make: Callable[[Target], Any]) -> Any:
+        return make(TARGET)
 
 
 class CountedFlash(ModuleFlash):
@@ -62,12 +80,12 @@ class CountedFlash(ModuleFlash):
         return self._counts.writes("module")
 
 
-def applied(device: TableOfOne, *, save: bool = True, flash: CountedFlash | None = None) -> AppliedSettings:
-    async def run(make: Callable[[Target], Any]) -> Any:
-        return make(TARGET)
-
-    plan = make_plan(device.table, TARGET, {"x": 2}, device.active, {}, save=save, unsaved=False)
-    applying = Applying(device.table, run, flash or CountedFlash(), {"x": 2}, device.active)
+def applied(
+    device: TableOfOne, *, save: bool = True, flash: CountedFlash | None = None, by_name: bool = False
+) -> AppliedSettings:
+    plan = make_plan(device.table, TARGET, {"x": 2}, device.active, {}, save=save, unsaved=False, by_name=by_name)
+    port, reports = OnePort(), {"": DeviceReport(values=device.active)}
+    applying = Applying(device.table, port, flash or CountedFlash(), {"x": 2}, reports)
     return asyncio.run(applying.carry_out(plan))
 
 
@@ -76,7 +94,7 @@ def test_values_are_written_read_back_saved_and_compared() -> None:
     found = applied(device, flash=flash)
     assert device.done == ["x=2", "read", "save"]
     assert (found.steps[0].outcome, found.saved, found.restarted, found.differences) == (
-        StepOutcome.DONE,
+        StepOutcome.VERIFIED,
         True,
         False,
         {},
@@ -85,11 +103,11 @@ def test_values_are_written_read_back_saved_and_compared() -> None:
     device = TableOfOne(Written.PENDING, effect=Effect.AFTER_RESTART)
     found = applied(device)
     assert device.done == ["x=2", "read", "save", "restart", "read"]
-    assert (found.steps[0].outcome, found.restarted) == (StepOutcome.DONE, True)
+    assert (found.steps[0].outcome, found.restarted) == (StepOutcome.VERIFIED, True)
     device = TableOfOne(Written.PENDING)
     found = applied(device)
     assert device.done == ["x=2", "read", "save", "restart", "read"]
-    assert found.steps[0].outcome is StepOutcome.DONE
+    assert found.steps[0].outcome is StepOutcome.VERIFIED
     device = TableOfOne(Written.PENDING)
     found = applied(device, save=False)
     assert device.done == ["x=2", "read"]
@@ -124,11 +142,6 @@ def test_errors_of_device_and_link_are_part_of_the_result(error: Exception) -> N
 
 def test_a_device_with_another_rate_than_its_bus_is_not_restarted() -> None:
     device = TableOfOne(Written.PENDING, effect=Effect.AFTER_RESTART, connection=True, bus_rate=True)
-
-    async def run(make: Callable[[Target], Any]) -> Any:
-        return make(TARGET)
-
-    plan = make_plan(device.table, TARGET, {"x": 2}, device.active, {}, save=True, unsaved=False, by_name=True)
-    done = asyncio.run(Applying(device.table, run, CountedFlash(), {"x": 2}, device.active).carry_out(plan))
+    done = applied(device, by_name=True)
     assert (done.saved, done.restarted, done.problem) == (True, False, "")
     assert [one for one in device.done if one != "read"] == ["x=2", "save"]

@@ -197,7 +197,7 @@ def takes(client: Client, name: str, value: Any) -> bool:
         assert "expected" in str(error)  # noqa: PT017 - with what it does not go together, which no match can know
         return False
     assert (done["problem"], done["differences"]) == ("", {}), (name, value, done)
-    assert {step["outcome"] for step in done["steps"]} <= {"done", "written, not verified"}
+    assert {step["outcome"] for step in done["steps"]} <= {"verified", "sent, not verified"}
     return True
 
 

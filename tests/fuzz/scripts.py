@@ -60,10 +60,12 @@ def _scripts(driver: Driver) -> list[Script]:
     settings = driver.settings()
     found: list[Script] = []
     if isinstance(driver, StreamDriver):
-        found = [driver.identify, driver.read_settings, *([driver.wake] if driver.wake else [])]
+        found = [driver.identify, *([driver.wake] if driver.wake else [])]
     elif isinstance(driver, CanDriver):
-        found = [lambda: driver.identify(settings), lambda: driver.read_settings(settings)]
+        found = [lambda: driver.identify(settings)]
     target = ActionTarget(settings, BAUD)
+    if driver.device_settings is not None:
+        found.append(partial(driver.device_settings.read, target, None))
     for action in driver.verbs.values():
         try:
             arguments = action.arguments({})

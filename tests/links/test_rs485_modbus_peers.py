@@ -19,6 +19,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 from imud.contracts.codec import Vanished
 from imud.contracts.script import run_transfer_script
+from imud.contracts.setting import words_of
 from imud.drivers.hipnuc.common import AttitudeMode
 from imud.drivers.hipnuc.modbus.codec import READ_BLOCK, READ_SHORT_BLOCK, HipnucModbusCodec, HipnucModbusOptions
 from imud.drivers.hipnuc.modbus.commands import LineMounting, set_heading_mode, set_mounting
@@ -131,7 +132,7 @@ def test_pymodbus_server_as_modules_under_our_driver() -> None:
             assert identity.product == "HI14R2N-485-000"
             assert identity.firmware == firmware
             assert identity.serial_number == serial_of(address).hex().upper()
-            found = run_transfer_script(DRIVER.set_up(settings), link.transfer)
+            found = words_of(run_transfer_script(DRIVER.set_up(settings), link.transfer))
             assert found == {"baud": "921600", "id": str(address), "heading_mode": "six axes"}
             codec = HipnucModbusCodec(Ledger(), settings)
             if address == 1:
@@ -145,7 +146,7 @@ def test_pymodbus_server_as_modules_under_our_driver() -> None:
             assert codec.decode(1, link.transfer(codec.polls[1].transfer)) == ()
             run_transfer_script(set_heading_mode(AttitudeMode.NINE_AXIS), link.transfer)
             run_transfer_script(set_mounting(LineMounting.Y_UP), link.transfer)
-            assert run_transfer_script(DRIVER.set_up(settings), link.transfer)["heading_mode"] == "nine axes"
+            assert words_of(run_transfer_script(DRIVER.set_up(settings), link.transfer))["heading_mode"] == "nine axes"
             assert link.heard.strange == link.heard.late == link.heard.timeouts == 0
 
 

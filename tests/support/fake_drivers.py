@@ -9,7 +9,7 @@ import asyncio
 import binascii
 import re
 import struct
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Final, Literal
 
@@ -31,7 +31,7 @@ from imud.contracts.script import (
     pause,
     says_nothing,
 )
-from imud.contracts.setting import Effect, Setting, SettingsTable
+from imud.contracts.setting import DeviceReport, Effect, Reports, Setting, SettingsTable
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
 from imud.links.memory import MemoryLink, MemoryOptions
 from imud.model.errors import BadArgument, NoReply, Rejected
@@ -123,11 +123,6 @@ def _identify() -> Generator[Request, Outcome, Identity]:
     return Identity("FAKE")
 
 
-def _read_settings() -> Generator[Request, Outcome, Mapping[str, str]]:
-    yield _query(b"SET\r\n", "SET")
-    return {}
-
-
 def _apply(codec: StreamCodec, identity: Identity) -> None: ...
 
 
@@ -142,7 +137,6 @@ FAKE_DRIVER: Final = StreamDriver(
     euler_convention="",
     navigation_frame="ENU",
     identify=_identify,
-    read_settings=_read_settings,
     apply_identity=_apply,
     example_frame=lambda random: fake_frame(b"\x91" + random.randbytes(75)),
 )
@@ -215,7 +209,6 @@ def fake_can_driver(name: str = "fake-can", base: int = BASE) -> CanDriver:
         node_settings=lambda node: FakeCanSettings(node=node),
         node_title=lambda node: f"node {node}",
         identify=lambda _settings: says_nothing(Identity("FAKE")),
-        read_settings=lambda _settings: says_nothing({}),
         apply_identity=lambda _codec, _identity: None,
         sample_frames=1,
         example_frames=lambda _random: [CanFrame(BASE + 1, False, bytes(8), 0)],
@@ -380,13 +373,9 @@ def _who() -> RequestScript[Identity]:
     return Identity(found["NAME"], found["SN"], "1.0")
 
 
-def _get_words() -> RequestScript[Mapping[str, str]]:
-    return (yield from _send_command("GET"))
-
-
-def _get_values(_target: Target) -> RequestScript[Mapping[str, Any]]:
+def _get(_target: Target, _names: Collection[str] | None) -> RequestScript[Reports]:
     found = yield from _send_command("GET")
-    return {name: msgspec.json.decode(text) for name, text in found.items()}
+    return {"": DeviceReport(found, {name: msgspec.json.decode(text) for name, text in found.items()})}
 
 
 def _setter(name: str) -> Callable[[Target, Any], RequestScript[None]]:
@@ -460,7 +449,7 @@ FAKE_SETTINGS: Final = SettingsTable(
         ),
         "hours": Setting(type=Annotated[int, _told("time in use", "2.6", "h")]),
     },
-    read=_get_values, save=_save_all, restart=_restart, check=_carried,
+    read=_get, save=_save_all, restart=_restart, check=_carried,
 )  # fmt: skip
 
 
@@ -479,13 +468,12 @@ FAKE_MODULE_DRIVER: Final = replace(
     name="fake-module",
     make_codec=lambda ledger, options: LinesCodec(ledger),
     identify=_who,
-    read_settings=_get_words,
     device_settings=FAKE_SETTINGS,
     calibrations={"zero": ZERO},
     verbs={
         "set_mode": Verb("set it", _set_mode),
         "wait": Verb("take an hour", lambda _target: (pause(3600 * 1_000_000_000) for _ in range(1))),
         "save": Verb("save all", _save_all, saves=True, changes=False),
-        "factory_reset": Verb("forget all", _restart, Risk.RESET),
+        "factory_reset": Verb("forget all", _restart, Risk.RESET, restarts=True),
     },
 )

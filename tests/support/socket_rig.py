@@ -57,6 +57,8 @@ from imud.publishers.socket.server import SocketOptions, SocketServer
 from tests.support.message_checker import MessageChecker
 from tests.support.publisher_context import publisher_context
 
+NOT_SAVED = "not saved; run `imud command imu0 save`"
+
 T = TypeVar("T")
 CHECKER = MessageChecker()
 """Checker of all messages that a `Peer` receives against docs/socket.schema.json."""
@@ -210,8 +212,8 @@ class FakeControl:
         if given and "wait" in given:
             await done_late.wait()
         plan = await self.settings_plan(given, save=save)
-        steps = [AppliedStep(one.name, one.value, one.before, StepOutcome.DONE) for one in plan.steps]
-        return AppliedSettings(tuple(steps), saved=save)
+        steps = [AppliedStep(one.name, one.value, one.before, StepOutcome.VERIFIED) for one in plan.steps]
+        return AppliedSettings(tuple(steps), saved=save, not_saved="" if save else NOT_SAVED)
 
 
 def run(body: Callable[[], Awaitable[T]]) -> T:

@@ -21,7 +21,7 @@ from imud.config.model import DeviceConfig
 from imud.contracts.driver import CanDriver, PolledDriver, of_kind
 from imud.contracts.link import PolledLink
 from imud.contracts.script import run_transfer_script
-from imud.device.identity import printable_identity
+from imud.device.settings import printable_identity
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.modbus.registers import FACTORY_BAUD, FACTORY_ID
 from imud.formats.modbus import SLAVES

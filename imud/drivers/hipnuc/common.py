@@ -99,25 +99,10 @@ FLOATS: Final = DataSheet(document=DOCUMENT)  # data sheet of the UART protocol
 # Data sheet of Modbus and J1939
 REGISTERS: Final = DataSheet(document=DOCUMENT, gyro_step_rad_s=GYRO_RAD_S_PER_LSB, accel_step_m_s2=ACCEL_M_S2_PER_LSB)
 
-# Names of the setting for the attitude mode in ASCII commands and Modbus
-SETTINGS: Final = ("ATT_MODE", "heading_mode", "mode")
-HEADINGS: Final = {
-    "0": Heading.RELATIVE,
-    "six axes": Heading.RELATIVE,
-    "6-axis": Heading.RELATIVE,
-    "1": Heading.MAGNETIC,
-    "nine axes": Heading.MAGNETIC,
-    "9-axis": Heading.MAGNETIC,
-}
 
-
-def heading_by_mode(_settings: object, read_back: Mapping[str, str]) -> Heading:
-    """Return the reference of yaw from the device settings."""
-    for name in SETTINGS:
-        value = read_back.get(name, "").strip().lower()
-        if value in HEADINGS:
-            return HEADINGS[value]
-    return Heading.UNKNOWN
+def heading_by_mode(_options: object, settings: Mapping[str, Any]) -> Heading:
+    """Return the reference of yaw from the values of the device settings."""
+    return {"6-axis": Heading.RELATIVE, "9-axis": Heading.MAGNETIC}.get(settings.get("mode", ""), Heading.UNKNOWN)
 
 
 MAIN_STATUS: Final[Mapping[int, StatusBit]] = {

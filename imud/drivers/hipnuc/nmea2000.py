@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from math import isfinite, nan, pi, tau
 from random import Random
-from typing import Annotated, Final, Literal, NamedTuple
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from msgspec import Meta
 
@@ -265,7 +265,7 @@ def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
     return sender_of(can_id, extended, data, PGNS)
 
 
-def _heading(settings: object, _read_back: Mapping[str, str]) -> Heading:
+def _heading(settings: object, _read_back: Mapping[str, Any]) -> Heading:
     """Return the reference of the selected heading; with `auto` it is not known in advance."""
     chosen = settings.heading if isinstance(settings, HipnucNmea2000Options) else "auto"
     return Heading.UNKNOWN if chosen == "auto" else Heading(chosen)
@@ -288,7 +288,6 @@ DRIVER: Final = CanDriver(
     node_settings=lambda source: HipnucNmea2000Options(source=source),
     node_title=lambda source: f"source {source}",
     identify=lambda _settings: says_nothing(Identity()),
-    read_settings=lambda _settings: says_nothing({}),
     sample_frames=len(PGNS),
     example_frames=_example_frames,
 )

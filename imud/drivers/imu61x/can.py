@@ -294,7 +294,6 @@ DRIVER: Final = CanDriver(
     node_settings=lambda base_id: Imu61xCanOptions(base_id=base_id),
     node_title=lambda base_id: f"base_id {base_id}",
     identify=lambda _settings: says_nothing(Identity()),
-    read_settings=lambda _settings: says_nothing({}),
     sample_frames=SET_FRAMES,
     example_frames=_example_frames,
 )

@@ -7,7 +7,7 @@ imud follows the vendor's programs in both cases.
 import zlib
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Annotated, Final, Literal, get_args
+from typing import Annotated, Any, Final, Literal, get_args
 
 from msgspec import Meta
 
@@ -53,7 +53,7 @@ NAVIGATION_FRAME: Final = (
 )
 
 
-def relative_heading(_settings: object, _read_back: Mapping[str, str]) -> Heading:
+def relative_heading(_options: object, _settings: Mapping[str, Any]) -> Heading:
     """Return the reference of yaw: the device has no magnetometer (assumed, like NAVIGATION_FRAME)."""
     return Heading.RELATIVE
 

@@ -8,7 +8,7 @@ periodically.
 """
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from random import Random
 from typing import Any, Final
 
@@ -16,7 +16,7 @@ from imud.contracts.codec import BadReason, Poll, PolledEvent, Vanished
 from imud.contracts.command import Target
 from imud.contracts.driver import Identity, random_vector
 from imud.contracts.script import Transfer, TransferScript
-from imud.contracts.setting import SettingsTable
+from imud.contracts.setting import Reports, SettingsTable
 from imud.drivers.imu61x.common import (
     I2C_ADDRESSES,
     M_S2_PER_G,
@@ -35,9 +35,9 @@ from imud.drivers.imu61x.registers import (
     check_filter,
     check_settings,
     filter_settings,
-    filter_words,
     identity_of,
     register_driver,
+    report_of,
     wanted_filter,
 )
 from imud.drivers.polled_frames import Measured, PolledFrameDecoder
@@ -60,13 +60,13 @@ def probe(_settings: RegisterOptions) -> TransferScript[Identity]:
     return identity_of((yield READ_ID))
 
 
-def set_up(settings: RegisterOptions) -> TransferScript[Mapping[str, str]]:
+def set_up(settings: RegisterOptions) -> TransferScript[Reports]:
     """Write FILTER_CTRL if it differs and read it back. Raises DeviceRefused if it still differs."""
     present = yield from read_control()
     wanted = wanted_filter(settings, present)
     if present != wanted:
         yield from write_control(wanted)
-    return filter_words(wanted)
+    return report_of(wanted)
 
 
 def read_control() -> TransferScript[int]:
@@ -157,8 +157,8 @@ def encode_burst(*, accel_m_s2: Vector3, gyro_rad_s: Vector3, temperature_c: flo
     return values + struct.pack("<I", crc32(values))
 
 
-def _read(_target: Target) -> TransferScript[Mapping[str, Any]]:
-    return filter_words((yield from read_control()))
+def _read(_target: Target, _names: Collection[str] | None) -> TransferScript[Reports]:
+    return report_of((yield from read_control()))
 
 
 # Settings that a restart of the device resets to parameter 31 of its UART

@@ -14,7 +14,7 @@ from imud.contracts.codec import PolledCodec
 from imud.contracts.command import Target
 from imud.contracts.driver import Identity, KeyProblem, PolledDriver
 from imud.contracts.script import TransferScript
-from imud.contracts.setting import Setting, SettingsTable
+from imud.contracts.setting import DeviceReport, Reports, Setting, SettingsTable
 from imud.drivers.imu61x.common import (
     ACCEL_FILTER,
     EULER_CONVENTION,
@@ -55,7 +55,7 @@ class RegisterOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 S = TypeVar("S", bound=RegisterOptions)
-SetUp = Callable[[S], TransferScript[Mapping[str, str]]]
+SetUp = Callable[[S], TransferScript[Reports]]
 
 
 # --- identity and filters --------------------------------------------------------------------------------------------
@@ -87,10 +87,11 @@ def check_filter(wanted: int, got: int) -> None:
         )
 
 
-def filter_words(control: int) -> Mapping[str, str]:
-    """Return the names of the filters."""
+def report_of(control: int, **more: str) -> Reports:
+    """Return the only report of the device: the names of the filters, and more settings with the same text."""
     accel, gyro = filter_codes(control)
-    return {"accel_filter": FILTERS[accel], "gyro_filter": FILTERS[gyro]}
+    settings = {"accel_filter": FILTERS[accel], "gyro_filter": FILTERS[gyro], **more}
+    return {"": DeviceReport(settings, settings)}
 
 
 # --- settings and verb ----------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 """
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from random import Random
 from typing import Annotated, Any, Final, Literal
 
@@ -14,7 +14,7 @@ from imud.contracts.codec import BadReason, Poll, PolledEvent, Vanished
 from imud.contracts.command import Target
 from imud.contracts.driver import Identity, random_vector
 from imud.contracts.script import Transfer, TransferScript
-from imud.contracts.setting import Setting, SettingsTable
+from imud.contracts.setting import Reports, Setting, SettingsTable
 from imud.drivers.imu61x.common import M_S2_PER_G, RAD_S_PER_DEG_S, crc32
 from imud.drivers.imu61x.registers import (
     BURST,
@@ -33,9 +33,9 @@ from imud.drivers.imu61x.registers import (
     check_filter,
     check_settings,
     filter_settings,
-    filter_words,
     identity_of,
     register_driver,
+    report_of,
     temperature_c,
     wanted_filter,
 )
@@ -215,7 +215,7 @@ def probe(_settings: SpiDeviceOptions) -> TransferScript[Identity]:
     return identity_of((yield from read_state()).product_id)
 
 
-def set_up(settings: SpiDeviceOptions) -> TransferScript[Mapping[str, str]]:
+def set_up(settings: SpiDeviceOptions) -> TransferScript[Reports]:
     """Write FILTER_CTRL and BURST_CTRL if they differ and read them back. Raises DeviceRefused if they still differ."""
     state = yield from read_state()
     wanted = wanted_filter(settings, state.filter)
@@ -226,7 +226,7 @@ def set_up(settings: SpiDeviceOptions) -> TransferScript[Mapping[str, str]]:
     # the place of BURST_CTRL in a read is not certain: a burst decides the selected kind
     if settings.burst != "registers":
         yield from _select(settings.burst, state, settings.checksum_bits)
-    return {**filter_words(wanted), "burst": state.kind if settings.burst == "registers" else settings.burst}
+    return report_of(wanted, burst=state.kind if settings.burst == "registers" else settings.burst)
 
 
 def read_state() -> TransferScript[State]:
@@ -407,9 +407,9 @@ Burst = Annotated[
 ]
 
 
-def _read(_target: Target) -> TransferScript[Mapping[str, Any]]:
+def _read(_target: Target, _names: Collection[str] | None) -> TransferScript[Reports]:
     state = yield from read_state()
-    return {**filter_words(state.filter), "burst": state.kind}
+    return report_of(state.filter, burst=state.kind)
 
 
 # Settings that a restart of the device resets. The filters after a restart are parameter 31 of its UART.

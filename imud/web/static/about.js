@@ -30,6 +30,7 @@ export function aboutRows({ status, lost, bytes_open, frames_open }) {
 function parts(status) {
   const rows = [];
   if (status.declared && status.declared.state !== "undeclared") rows.push(["settings", declared(status.declared)]);
+  if (status.declared && status.declared.unsaved) rows.push(["unsaved", "the flash of the device lacks a change: run the command save"]);
   if (Object.keys(status.status_bit_names).length && status.status_bits !== null)
     rows.push(["status", status.status_words.join(", ") || "no known bit is set"]);
   if (Object.keys(status.settings).length) rows.push(["present", pairs(status.settings)]);

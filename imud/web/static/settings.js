@@ -99,7 +99,7 @@ export class SettingsView {
       const steps = done.steps.map((step) => el("li", { text: `${step.name} = ${shown(step.value)}: ${step.outcome}${step.message ? ` (${step.message})` : ""}` }));
       const words = done.problem || `Done${done.saved ? ", and saved" : ""}.`;
       this.result.replaceChildren(el("p", { class: done.problem ? "problem" : "good", text: words }), el("ul", {}, ...steps),
-        ...(done.advice ? [el("p", { text: done.advice })] : []));
+        ...[done.not_saved, done.advice].filter(Boolean).map((text) => el("p", { text })));
     } catch (error) {
       this.result.replaceChildren(el("p", { class: "problem", text: error.message }));
     }

@@ -9,24 +9,20 @@ from imud.drivers.hipnuc.nmea2000 import HipnucNmea2000Options
 
 
 @pytest.mark.parametrize(
-    ("read_back", "heading"),
+    ("values", "heading"),
     [
-        ({"ATT_MODE": "0"}, Heading.RELATIVE),
-        ({"ATT_MODE": " 1"}, Heading.MAGNETIC),
-        ({"heading_mode": "six axes"}, Heading.RELATIVE),
-        ({"heading_mode": "nine axes"}, Heading.MAGNETIC),
-        ({"heading_mode": "code 7"}, Heading.UNKNOWN),
+        ({"mode": "6-axis"}, Heading.RELATIVE),
         ({"mode": "9-axis"}, Heading.MAGNETIC),
         ({}, Heading.UNKNOWN),
     ],
 )
-def test_by_mode(read_back: dict[str, str], heading: Heading) -> None:
-    assert heading_by_mode(None, read_back) is heading
+def test_by_mode(values: dict[str, str], heading: Heading) -> None:
+    assert heading_by_mode(None, values) is heading
 
 
 def test_drivers_that_read_it_back_and_that_know_it_beforehand() -> None:
     for name in ("hipnuc-uart", "hipnuc-modbus"):
-        assert DRIVERS[name].heading(None, {"ATT_MODE": "1"}) is Heading.MAGNETIC
+        assert DRIVERS[name].heading(None, {"mode": "9-axis"}) is Heading.MAGNETIC
     for name in ("imu61x-uart", "imu61x-can", "imu61x-i2c", "imu61x-spi"):
         assert DRIVERS[name].heading(None, {}) is Heading.RELATIVE
     nmea = DRIVERS["hipnuc-nmea2000"].heading

@@ -3,6 +3,7 @@
 import pytest
 
 from imud.contracts.script import Transfer, run_transfer_script
+from imud.contracts.setting import words_of
 from imud.drivers.imu61x.i2c import probe, set_up
 from imud.drivers.imu61x.registers import RegisterOptions
 from imud.model.errors import DeviceRefused
@@ -30,7 +31,7 @@ def test_set_up_writes_reads_back_and_leaves_alone() -> None:
         log.append(one)
         return over_i2c(device, one)
 
-    words = run_transfer_script(set_up(RegisterOptions(accel_filter=4)), transfer)
+    words = words_of(run_transfer_script(set_up(RegisterOptions(accel_filter=4)), transfer))
     assert words == {"accel_filter": "10 Hz", "gyro_filter": "47 Hz"}
     assert [(one.sends[0].hex(), one.read_bytes) for one in log] == [("06", 1), ("064b", 0), ("06", 1)]
     log.clear()

@@ -4,7 +4,7 @@ The simulated devices measure at common instants, without noise and without real
 hand from the layouts in the manual; half a step is the maximum rounding error.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 
 import pytest
@@ -12,6 +12,7 @@ import pytest
 from imud.attitude.rotation import euler_zyx_from_quat
 from imud.contracts.codec import CodecEvent, PolledCodec, PolledEvent
 from imud.contracts.script import Transfer, TransferScript, run_transfer_script
+from imud.contracts.setting import Reports
 from imud.drivers.imu61x.can import Imu61xCanCodec, Imu61xCanOptions
 from imud.drivers.imu61x.i2c import DRIVER as I2C
 from imud.drivers.imu61x.i2c import Imu61xI2cCodec
@@ -72,7 +73,7 @@ def by_can() -> list[Measurement]:
 
 
 def by_polls(
-    set_up: TransferScript[Mapping[str, str]],
+    set_up: TransferScript[Reports],
     codec: PolledCodec,
     transfer: Callable[[Imu61xRegisters, Transfer], bytes],
 ) -> list[Measurement]:

@@ -8,6 +8,7 @@ import pytest
 from imud.contracts.command import Target
 from imud.contracts.driver import PolledDriver
 from imud.contracts.script import Transfer, run_transfer_script
+from imud.contracts.setting import values_of
 from imud.drivers.imu61x.i2c import DRIVER as I2C
 from imud.drivers.imu61x.registers import RegisterOptions
 from imud.drivers.imu61x.spi import DRIVER as SPI
@@ -77,9 +78,7 @@ def test_filters_that_there_are_not_are_answered_with_the_table(code: object) ->
 
 def read_table(wires: Wires, driver: PolledDriver, target: Target) -> Mapping[str, object]:
     assert driver.device_settings is not None
-    found = run_transfer_script(driver.device_settings.read(target), wires.over(driver))
-    assert isinstance(found, dict)
-    return found
+    return values_of(run_transfer_script(driver.device_settings.read(target, None), wires.over(driver)))
 
 
 @pytest.mark.parametrize(("driver", "settings"), BUSES)

@@ -5,12 +5,16 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import pytest
 
+from imud.contracts.command import Target
 from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request, RequestScript, Silence
+from imud.contracts.setting import words_of
 from imud.drivers.hipnuc.j1939 import codec, commands
 from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Options, J1939Node
+from imud.drivers.hipnuc.j1939.driver import SETTINGS
 from imud.formats.can import EXTENDED_ID_MAX, RAW_FRAME
 from imud.formats.j1939 import split
 from imud.model.errors import NoReply, Rejected
@@ -131,8 +135,8 @@ def test_what_is_set_read_back_saved_and_lost_at_a_restart() -> None:
     assert counts[0xFF34] == pytest.approx(100, abs=1)
     assert counts[0xFF37] == pytest.approx(50, abs=1)
     assert counts[0xFF4A] == 2
-    settings = bench.talk(commands.read_settings)
-    assert isinstance(settings, dict)
+    reports: Any = bench.talk(lambda peer: SETTINGS.read(Target(HipnucJ1939Options(), 0), None))
+    settings = words_of(reports)
     assert settings["interval_ms_FF37"] == "20"
     assert settings["address"] == "8"
     assert settings["bitrate"] == "500000"

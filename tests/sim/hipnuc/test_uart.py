@@ -6,7 +6,9 @@ from typing import TypeVar
 
 import pytest
 
+from imud.contracts.command import Target
 from imud.contracts.script import Outcome, Request, RequestScript, TextLine
+from imud.contracts.setting import words_of
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
@@ -171,7 +173,8 @@ def converse(bench: HipnucUartBench, script: RequestScript[T]) -> T:
 def test_identity_and_settings_are_read_amid_frames() -> None:
     identity = converse(HipnucUartBench(FAST), DRIVER.identify())
     assert (identity.product, identity.serial_number, identity.firmware) == ("HI14R3", "043995698D6E1708", "1.5.6")
-    settings = converse(HipnucUartBench(FAST), DRIVER.read_settings())
+    assert DRIVER.device_settings is not None
+    settings = words_of(converse(HipnucUartBench(FAST), DRIVER.device_settings.read(Target(None, 0), None)))
     assert settings["ATT_MODE"] == "0"
     assert settings["BAUD"] == "921600"
     module = SIMULATORS["hipnuc-uart"].make(SimulatorOptions(), BEGIN_NS)

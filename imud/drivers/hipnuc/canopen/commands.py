@@ -113,23 +113,18 @@ def identify(node: int) -> RequestScript[Identity]:
     return Identity(product, details.get("serial number", ""), details.get("revision", ""), details)
 
 
-def read_settings(node: int) -> RequestScript[Mapping[str, str]]:
-    """Read all settings by object and sub-index, without unreadable objects. Raises NoReply."""
-    values = yield from read_values(node, SETTING_PLACES)
-    return {f"{index:04X}.{sub}": str(value) for (index, sub), value in values.items()}
-
-
 def read_values(node: int, places: Sequence[Place], *, silent_is_fine: bool = False) -> RequestScript[dict[Place, int]]:
-    """Read objects as numbers, without objects that the node does not read. Raises NoReply.
+    """Read objects as numbers, without objects that the node does not read.
 
-    With `silent_is_fine`, the script ends at the first missing reply and does not raise.
+    The result is empty if the node does not reply to the first read: such a node ignores reads. Raises NoReply for
+    another missing reply. With `silent_is_fine`, the script ends there and does not raise.
     """
     values: dict[Place, int] = {}
     for index, sub in places:
         try:
             value = yield from _try_read(node, index, sub)
         except NoReply:
-            if silent_is_fine:
+            if silent_is_fine or (index, sub) == places[0]:
                 return values
             raise
         if value is not None:

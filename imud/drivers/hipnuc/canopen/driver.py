@@ -1,6 +1,6 @@
 """Row `DRIVER` of HiPNUC devices on CANopen: settings and verbs."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from random import Random
 from typing import Annotated, Any, Final, Literal, get_args
@@ -10,7 +10,7 @@ from msgspec import Meta
 from imud.contracts.command import Risk, Target, Verb, Verbs
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, DataSheet, random_vector
 from imud.contracts.script import RequestScript
-from imud.contracts.setting import Effect, Setting, SettingsTable
+from imud.contracts.setting import DeviceReport, Effect, Reports, Setting, SettingsTable
 from imud.drivers.hipnuc.bus_load import MS_PER_S, RATE_NOTE, CyclicMessage, refuse_other_rate, refuse_overload
 from imud.drivers.hipnuc.canopen import commands
 from imud.drivers.hipnuc.canopen.cia301 import (
@@ -47,7 +47,6 @@ from imud.drivers.hipnuc.canopen.commands import (
     Place,
     Transmission,
     identify,
-    read_settings,
 )
 from imud.drivers.hipnuc.common import DOCUMENT, inclinometer_zero, refuse_all
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
@@ -120,8 +119,22 @@ def _refuse_short_intervals(values: Mapping[str, Any]) -> None:
             raise BadArgument(f"{interval_name(tpdo)}: expected 0 or {PERIOD_MIN_MS} … {PERIOD_MAX_MS}, got {got}")
 
 
-def _read(target: Target) -> RequestScript[dict[str, Any]]:
-    return values_of((yield from commands.read_values(target.settings.node, SETTING_PLACES, silent_is_fine=True)))
+def report_name(place: Place) -> str:
+    """Return the name of the report of an object, for example `1800.5`."""
+    index, sub = place
+    return f"{index:04X}.{sub}"
+
+
+REPORTS: Final = {report_name(place): place for place in SETTING_PLACES}
+
+
+def _read(target: Target, names: Collection[str] | None) -> RequestScript[Reports]:
+    places = [place for name, place in REPORTS.items() if names is None or name in names]
+    values = yield from commands.read_values(target.settings.node, places)
+    return {
+        report_name(place): DeviceReport({report_name(place): str(value)}, values_of({place: value}))
+        for place, value in values.items()
+    }
 
 
 def _interval_setting(tpdo: TpdoNumber) -> Setting:
@@ -136,6 +149,7 @@ def _interval_setting(tpdo: TpdoNumber) -> Setting:
             ),
         ],
         write=lambda target, interval_ms: commands.set_tpdo_period(target.settings.node, tpdo, interval_ms),
+        report=report_name((TPDO_OBJECTS[tpdo], TPDO_TIMER)),
     )
 
 
@@ -144,7 +158,11 @@ def _transmission_setting(tpdo: TpdoNumber) -> Setting:
     return Setting(
         type=Annotated[By, Meta(description=words, extra={"section": "5.4.2"})],
         write=lambda target, by: commands.set_tpdo_type(target.settings.node, tpdo, TRANSMISSIONS[by]),
+        report=report_name((TPDO_OBJECTS[tpdo], TPDO_TYPE)),
     )
+
+
+SIGNS: Final = {"x": commands.INCLI_SIGN_X, "y": commands.INCLI_SIGN_Y}
 
 
 def _sign(axis: Literal["x", "y"]) -> Setting:
@@ -153,6 +171,7 @@ def _sign(axis: Literal["x", "y"]) -> Setting:
             bool, Meta(description="whether the sign of the inclinometer is reversed", extra={"section": "5.4.1"})
         ],
         write=lambda target, invert: commands.set_inclinometer_sign(target.settings.node, axis, invert=invert),
+        report=report_name((SIGNS[axis], 0)),
     )
 
 
@@ -173,6 +192,7 @@ SETTINGS: Final = SettingsTable(
                 ),
             ],
             write=lambda target, period_ms: commands.set_heartbeat(target.settings.node, period_ms),
+            report=report_name((commands.HEARTBEAT_TIME, 0)),
         ),
         "bit_rate": Setting(
             type=Annotated[
@@ -183,6 +203,7 @@ SETTINGS: Final = SettingsTable(
                 ),
             ],
             write=lambda target, rate: commands.set_bit_rate(target.settings.node, rate),
+            report=report_name((commands.BIT_RATE, 0)),
             effect=Effect.AFTER_RESTART,
             connection=True,
             bus_rate=True,
@@ -196,6 +217,7 @@ SETTINGS: Final = SettingsTable(
                 ),
             ],
             write=lambda target, node: commands.change_node(target.settings, node),
+            report=report_name((commands.NODE_ID, 0)),
             effect=Effect.AFTER_RESTART,
             connection=True,
         ),
@@ -241,15 +263,17 @@ VERBS: Final[Verbs] = {
     "restart": Verb(
         "restart the device and wait for its frames, also from a new node number; unsaved settings are lost",
         lambda target: commands.restart(target.settings, target.baud),
+        restarts=True,
     ),
     "factory_reset": Verb(
         "restore the factory settings with node 8 and 500 kbit/s, effective after a restart; imud rejects it if "
         "another node on the bus has number 8",
         lambda target: commands.factory_reset_and_find(target.settings),
         Risk.RESET,
+        restarts=True,
     ),
     "zero": Verb("make the present position the zero of the inclinometer, or cancel it; effective immediately", _zero),
-    "nmt": Verb("start or stop the TPDOs, or reset the node and follow it", _nmt),
+    "nmt": Verb("start or stop the TPDOs, or reset the node and follow it", _nmt, restarts=True),
 }
 
 RENAMED: Final[Mapping[str, str]] = {
@@ -310,7 +334,6 @@ DRIVER: Final = CanDriver(
     node_settings=lambda node: HipnucCanopenOptions(node=node),
     node_title=lambda node: f"node {node}",
     identify=lambda settings: identify(settings.node),
-    read_settings=lambda settings: read_settings(settings.node),
     sample_frames=4,
     example_frames=_example_frames,
     cyclic=_cyclic,

@@ -140,20 +140,6 @@ def identify(peer: J1939Node) -> RequestScript[Identity]:
     return Identity(_product(values), "", ".".join(str(firmware)) if firmware else "", details)
 
 
-def read_settings(peer: J1939Node) -> RequestScript[Mapping[str, str]]:
-    """Read all readable settings. Ignores registers without reply, except the first. Raises NoReply."""
-    settings = {"address": str((yield from read(peer, ADDRESS)))}
-    rows = {"bitrate": BITRATE, "x_reversed": X_SIGN, "y_reversed": Y_SIGN}
-    rows |= {f"interval_ms_{pgn:04X}": register for pgn, register in INTERVALS.items()}
-    values = yield from read_values(peer, tuple(rows.values()))
-    for name, register in rows.items():
-        if register in values:
-            value = values[register]
-            in_list = register == BITRATE and value < len(BITRATES)
-            settings[name] = str(BITRATES[value] if in_list else value)
-    return settings
-
-
 def read_values(peer: J1939Node, registers: Sequence[int]) -> RequestScript[dict[int, int]]:
     """Read registers. The result does not contain registers without reply; it is empty if the first ones do not
     reply.

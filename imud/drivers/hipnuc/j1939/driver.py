@@ -1,6 +1,6 @@
 """Row `DRIVER` of HiPNUC devices on SAE J1939: settings and verbs."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from random import Random
 from typing import Annotated, Any, Final, Literal
@@ -11,7 +11,7 @@ from imud.attitude.rotation import euler312_from_quat
 from imud.contracts.command import Risk, Target, Verb, Verbs
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, random_vector
 from imud.contracts.script import RequestScript
-from imud.contracts.setting import Effect, Setting, SettingsTable
+from imud.contracts.setting import DeviceReport, Effect, Reports, Setting, SettingsTable
 from imud.drivers.hipnuc.bus_load import RATE_NOTE, CyclicMessage, refuse_other_rate, refuse_overload
 from imud.drivers.hipnuc.common import REGISTERS, inclinometer_zero, random_quaternion, refuse_all
 from imud.drivers.hipnuc.j1939 import codec, commands
@@ -83,8 +83,25 @@ def _check(target: Target, values: Mapping[str, Any]) -> None:
     refuse_all(lambda: refuse_other_rate(target, values), lambda: _refuse_overload(target, values))
 
 
-def _read(target: Target) -> RequestScript[dict[str, Any]]:
-    return values_of((yield from commands.read_values(target.settings.peer, tuple(SETTING_REGISTERS.values()))))
+def _read(target: Target, names: Collection[str] | None) -> RequestScript[Reports]:
+    """Read registers; each register is a report with the name of its setting."""
+    wanted = [number for name, number in SETTING_REGISTERS.items() if names is None or name in names]
+    values = yield from commands.read_values(target.settings.peer, wanted)
+    return {
+        name: DeviceReport({_WORDS[number]: _text(number, values[number])}, values_of({number: values[number]}))
+        for name, number in SETTING_REGISTERS.items()
+        if number in values
+    }
+
+
+_WORDS: Final = {
+    commands.ADDRESS: "address", commands.BITRATE: "bitrate", commands.X_SIGN: "x_reversed",
+    commands.Y_SIGN: "y_reversed", **{register: f"interval_ms_{pgn:04X}" for pgn, register in INTERVALS.items()},
+}  # fmt: skip
+
+
+def _text(register: int, value: int) -> str:
+    return str(BITRATES[value] if register == commands.BITRATE and value < len(BITRATES) else value)
 
 
 def _interval_setting(pgn: int) -> Setting:
@@ -99,6 +116,7 @@ def _interval_setting(pgn: int) -> Setting:
             ),
         ],
         write=lambda target, interval_ms: commands.set_interval(target.settings.peer, pgn, interval_ms),
+        report=interval_name(pgn),
     )
 
 
@@ -107,6 +125,7 @@ def _sign(axis: Literal["X", "Y"]) -> Setting:
     return Setting(
         type=Annotated[bool, Meta(description=words, extra={"section": "6.2.2"})],
         write=lambda target, is_reversed: commands.set_direction(target.settings.peer, axis, is_reversed),
+        report=f"{axis.lower()}_reversed",
     )
 
 
@@ -124,6 +143,7 @@ SETTINGS: Final = SettingsTable(
                 ),
             ],
             write=lambda target, rate: commands.set_bitrate(target.settings.peer, rate),
+            report="bit_rate",
             effect=Effect.AFTER_RESTART,
             connection=True,
             bus_rate=True,
@@ -140,6 +160,7 @@ SETTINGS: Final = SettingsTable(
                 ),
             ],
             write=lambda target, address: commands.change_address(target.settings, address),
+            report="address",
             effect=Effect.AFTER_RESTART,
             connection=True,
         ),
@@ -172,12 +193,14 @@ VERBS: Final[Verbs] = {
     "restart": Verb(
         "restart the device and wait for its frames, also from a new address; unsaved settings are lost",
         lambda target: commands.restart(target.settings, target.baud),
+        restarts=True,
     ),
     "factory_reset": Verb(
         "restore the factory settings with address 8 and its bit rate, effective after a restart at the latest; "
         "imud rejects it if another node on the bus has address 8",
         lambda target: commands.factory_reset_and_find(target.settings),
         Risk.RESET,
+        restarts=True,
     ),
     "send_once": Verb("send a message once immediately and wait for it", _send_once, changes=False),
     "zero": Verb("make the present position zero, or cancel it", _zero),
@@ -237,7 +260,6 @@ DRIVER: Final = CanDriver(
     node_settings=lambda address: HipnucJ1939Options(address=address),
     node_title=lambda address: f"address {address}",
     identify=lambda settings: commands.identify(settings.peer),
-    read_settings=lambda settings: commands.read_settings(settings.peer),
     sample_frames=4,
     example_frames=_example_frames,
 )

@@ -14,12 +14,12 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from enum import Enum
-from typing import Final
+from typing import Any, Final, Literal
 
 from imud.contracts.command import Target
 from imud.contracts.driver import Identity
 from imud.contracts.script import TransferScript
-from imud.contracts.setting import Written
+from imud.contracts.setting import DeviceReport, Reports, Written
 from imud.drivers.hipnuc.common import AttitudeMode, LevelReset
 from imud.drivers.hipnuc.modbus.registers import (
     BAUD_RATES,
@@ -58,6 +58,11 @@ BOOT_TRIES: Final = 30
 BOOT_REPLY_MS: Final = 100
 
 
+Mode = Literal["6-axis", "9-axis"]
+MODES: Final[Mapping[Mode, AttitudeMode]] = {"6-axis": AttitudeMode.SIX_AXIS, "9-axis": AttitudeMode.NINE_AXIS}
+MODE_OF: Final = {mode.value: name for name, mode in MODES.items()}
+
+
 class LineMounting(Enum):
     """The five mountings of register URFR."""
 
@@ -91,14 +96,20 @@ def identity_of(data: bytes) -> Identity:
     return Identity(name.decode("ascii"), serial, ".".join(str(firmware)), {"BL_VERSION": str(loader)})
 
 
-def set_up(_settings: object) -> TransferScript[Mapping[str, str]]:
-    """Read baud rate, ID and heading mode without writing. Raises DeviceRefused."""
+def read_settings() -> TransferScript[Reports]:
+    """Read baud rate, address and heading mode in one report. Raises DeviceRefused, TransferError."""
     baud, slave, heading = registers_of((yield READ_SETTINGS), 3)
-    return {
+    words = {
         "baud": str(BAUD_RATES[baud]) if baud < len(BAUD_RATES) else f"code {baud}",
         "id": str(slave),
         "heading_mode": {0: "six axes", 1: "nine axes"}.get(heading, f"code {heading}"),
     }
+    values: dict[str, Any] = {"address": slave}
+    if heading in MODE_OF:
+        values["mode"] = MODE_OF[heading]
+    if baud < len(BAUD_RATES):
+        values["baud"] = BAUD_RATES[baud]
+    return {"": DeviceReport(words, values)}
 
 
 def save() -> TransferScript[None]:

@@ -25,9 +25,8 @@ from imud.drivers.hipnuc.common import (
 )
 from imud.drivers.hipnuc.modbus import commands
 from imud.drivers.hipnuc.modbus.codec import HipnucModbusCodec, HipnucModbusOptions, pack_block, update_ns
-from imud.drivers.hipnuc.modbus.commands import LineMounting, probe, set_up
+from imud.drivers.hipnuc.modbus.commands import MODES, LineMounting, Mode, probe
 from imud.drivers.hipnuc.modbus.registers import (
-    BAUD_RATES,
     BY_NAME,
     FACTORY_ID,
     ID_MAX,
@@ -72,12 +71,13 @@ def _read(
 
 VERBS: Final[Verbs] = {
     "save": replace(_simple("write all settings to flash", commands.save), saves=True, changes=False),
-    "restart": Verb("restart the device and wait until it replies; unsaved settings are lost", _restart),
+    "restart": Verb("restart the device and wait until it replies; unsaved settings are lost", _restart, restarts=True),
     "factory_reset": Verb(
         "restore the factory settings and restart: imud follows the device to address 80 if no other device uses it "
         "and the bus has the factory baud rate 115200",
         _factory_reset,
         Risk.RESET,
+        restarts=True,
     ),
     "level": Verb("make the present attitude level, or cancel it; the device must be at rest", _level),
     "read": Verb("read a register as words of 16 bits", _read, changes=False),
@@ -117,23 +117,7 @@ CALIBRATIONS: Final[Calibrations] = {
     **levels("4.3.5", 15, lambda kind: lambda _target: commands.auto_level(kind), lambda _target: commands.save()),
 }
 
-Mode = Literal["6-axis", "9-axis"]
 Mounting = Literal["level", "x_up", "x_down", "y_up", "y_down"]
-
-MODES: Final[Mapping[Mode, AttitudeMode]] = {"6-axis": AttitudeMode.SIX_AXIS, "9-axis": AttitudeMode.NINE_AXIS}
-_MODE_OF: Final = {mode.value: name for name, mode in MODES.items()}
-
-
-def _read_settings(_target: Target) -> TransferScript[dict[str, object]]:
-    baud, address, heading = yield from commands.read_present()
-    found: dict[str, object] = {}
-    if heading in _MODE_OF:
-        found["mode"] = _MODE_OF[heading]
-    if address is not None:
-        found["address"] = address
-    if baud is not None and baud < len(BAUD_RATES):
-        found["baud"] = BAUD_RATES[baud]
-    return found
 
 
 def _check(target: Target, values: Mapping[str, Any]) -> None:
@@ -190,7 +174,7 @@ SETTINGS: Final = SettingsTable(
             connection=True,
         ),
     },
-    read=_read_settings,
+    read=lambda _target, _names: commands.read_settings(),
     save=lambda _target: commands.save(),
     restart=lambda target: commands.restart(commands.places_of(target), target.baud),
     check=_check,
@@ -220,7 +204,7 @@ DRIVER: Final = PolledDriver(
     link="rs485",
     targets=(FACTORY_ID, *(slave for slave in SLAVES if slave != FACTORY_ID)),
     probe=probe,
-    set_up=set_up,
+    set_up=lambda _options: commands.read_settings(),
     make_codec=HipnucModbusCodec,
     update_ns=update_ns,
     example_reading=_example_reading,

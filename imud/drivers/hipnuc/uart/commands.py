@@ -25,7 +25,6 @@ from imud.drivers.hipnuc.uart.replies import (
     is_rejection,
     is_setting_line,
     is_version_line,
-    lines_of,
     parse_comconfig,
     parse_report,
     parse_version,
@@ -310,21 +309,17 @@ def identify() -> RequestScript[Identity]:
     return Identity(version.product, version.uuid, firmware, version.report.values)
 
 
-def read_settings() -> RequestScript[Mapping[str, str]]:
-    """Read all settings (LOG USRCONFIG, COMCONFIG, MAGCONFIG) as one mapping, by the names of the device.
+def read_report(query: Query) -> RequestScript[Mapping[str, str] | None]:
+    """Read one report of settings, by the names of the device.
 
-    A line without a name gets the name "COMCONFIG 1", "COMCONFIG 2" and so on. No reply to MAGCONFIG is not an error,
-    because a device without magnetometer may not know it (assumption). Raises NoReply, Rejected.
+    A line without a name gets the name "COMCONFIG 1", "COMCONFIG 2" and so on. Raises NoReply, Rejected. Returns None
+    for MAGCONFIG in these cases, because a device without magnetometer may not know it (assumption).
     """
-    settings: dict[str, str] = {}
-    for query in (Query.USRCONFIG, Query.COMCONFIG, Query.MAGCONFIG):
-        outcome = yield ask(query)
-        if query is Query.MAGCONFIG and isinstance(outcome, Silence | Rejection):
-            break
-        report = parse_report(_lines(outcome, query))
-        settings.update(report.values)
-        settings.update({f"{query} {number}": line for number, line in enumerate(report.other, 1)})
-    return settings
+    outcome = yield ask(query)
+    if query is Query.MAGCONFIG and isinstance(outcome, Silence | Rejection):
+        return None
+    report = parse_report(_lines(outcome, query))
+    return {**report.values, **{f"{query} {number}": line for number, line in enumerate(report.other, 1)}}
 
 
 def _lines(outcome: Outcome, query: Query) -> tuple[str, ...]:
@@ -393,17 +388,6 @@ def wake() -> RequestScript[bool | None]:
         return None
     yield from send(log_enable())
     return True
-
-
-def why_silent(settings: Mapping[str, str]) -> str:
-    """Return why a device with these settings (`read_settings`) replies and sends no samples."""
-    config = parse_comconfig(lines_of(settings))
-    if rates := rates_hz(config):
-        message, rate_hz = max(rates.items(), key=lambda item: item[1])
-        return f"its output is disabled (LOG DISABLE); {message} has the rate {rate_hz:g} Hz"
-    if config.on_mark:
-        return f"{' and '.join(sorted(config.on_mark))} on mark, one frame for each pulse on SIN"
-    return "no message has a rate" if config.periods_s else "its output is off, or on mark"
 
 
 def wake_by_force(baud: int) -> RequestScript[str]:

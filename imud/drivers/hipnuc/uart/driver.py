@@ -52,10 +52,8 @@ from imud.drivers.hipnuc.uart.commands import (
     YawMode,
     ask,
     identify,
-    read_settings,
     send,
     wake,
-    why_silent,
 )
 from imud.drivers.hipnuc.uart.replies import parse_magconfig
 from imud.drivers.hipnuc.uart.settings import (
@@ -67,6 +65,7 @@ from imud.drivers.hipnuc.uart.settings import (
     line_differences,
     message_limits,
     shown,
+    why_silent,
 )
 from imud.model.errors import NoReply
 from imud.model.units import NS_PER_MS
@@ -123,11 +122,12 @@ def _yaw(
 
 VERBS: Final[Verbs] = {
     "save": replace(_simple("write all settings to flash", commands.save_config), saves=True, changes=False),
-    "restart": Verb("restart the device and wait until it replies; unsaved settings are lost", _restart),
+    "restart": Verb("restart the device and wait until it replies; unsaved settings are lost", _restart, restarts=True),
     "factory_reset": Verb(
         "restore the factory settings with 115200 baud, restart the device and follow it",
         _factory_reset,
         Risk.RESET,
+        restarts=True,
     ),
     "wake": Verb(
         "enable frames, and send HI91 if no message has a rate, also in place of output on mark; not saved", _wake
@@ -156,8 +156,8 @@ RENAMED: Final[Mapping[str, str]] = {
 
 
 def _nine_axes_needed(_target: Target) -> RequestScript[str]:
-    settings = yield from read_settings()
-    if settings.get("ATT_MODE") == "0":
+    settings = yield from commands.read_report(Query.USRCONFIG)
+    if settings is not None and settings.get("ATT_MODE") == "0":
         return NINE_AXES_NEEDED
     return ""
 
@@ -264,7 +264,6 @@ DRIVER: Final = StreamDriver(
     device_settings=SETTINGS,
     calibrations=CALIBRATIONS,
     identify=identify,
-    read_settings=read_settings,
     apply_identity=_apply_identity,
     wake=wake,
     why_silent=why_silent,

@@ -1,11 +1,11 @@
 """Settings of a HiPNUC device on a UART: manual "IMU配置手冊" V1.5.9, chapter 2 and section 8.2.
 
 imud reads them from LOG USRCONFIG, COMCONFIG and MAGCONFIG (`replies.py`). The manual shows one line of each report, so
-imud ignores values of an unknown form. `values_of` returns the known values by name, `shown` as readable text.
+imud ignores values of an unknown form. `report_values` returns the known values by name, `shown` as readable text.
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from typing import Annotated, Any, Final, Literal, get_args
 
@@ -18,7 +18,7 @@ from imud.contracts.command import Target
 from imud.contracts.driver import SentAxes
 from imud.contracts.lines import AlarmRange, AlarmRanges, DeviceLines
 from imud.contracts.script import RequestScript
-from imud.contracts.setting import Effect, Setting, SettingsTable
+from imud.contracts.setting import DeviceReport, Effect, Reports, Setting, SettingsTable
 from imud.drivers.hipnuc.common import AttitudeMode
 from imud.drivers.hipnuc.uart import commands
 from imud.drivers.hipnuc.uart.commands import (
@@ -35,6 +35,7 @@ from imud.drivers.hipnuc.uart.commands import (
     OutputRate,
     PinFunction,
     PinName,
+    Query,
     send,
 )
 from imud.drivers.hipnuc.uart.replies import lines_of, parse_comconfig, parse_magconfig, parse_usrconfig
@@ -80,18 +81,13 @@ _VALUES: Final = re.compile(
 )
 
 
-def alarm_ranges(settings: Mapping[str, str]) -> AlarmRanges:
-    """Return the alarm ranges in the device settings, without axes that the settings lack."""
-    coordinates = parse_usrconfig(lines_of(settings)).coordinates
-    index = EULER_INDEX[axes_by_settings({"coordinates": coordinates or "0"}).axes.order]
-    by_axis: dict[str, AlarmRange] = {}
-    for name, value in settings.items():
-        named, values = _NAME.fullmatch(name.strip()), _VALUES.fullmatch(value.strip())
-        if not named or not values:
-            continue
-        axis = (values[1] or named[1] or "").upper()
-        if axis:
-            by_axis[axis] = AlarmRange(index[axis], float(values[2]), float(values[3]), values[4] == "1")
+def alarm_ranges(settings: Mapping[str, Any]) -> AlarmRanges:
+    """Return the alarm ranges in the values of the device settings."""
+    index = EULER_INDEX[axes_by_settings({"coordinates": settings.get("coordinates") or "0"}).axes.order]
+    by_axis = {
+        axis.upper(): AlarmRange(index[axis.upper()], one.min_deg, one.max_deg, one.enabled)
+        for axis, one in settings.get("alarm", {}).items()
+    }
     return AlarmRanges(by_axis, PIN_SETTING, MOUNTING_SETTING)
 
 
@@ -115,15 +111,11 @@ class AngleAlarm(Options, frozen=True, kw_only=True, forbid_unknown_fields=True)
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
-def values_of(raw: Mapping[str, str]) -> dict[str, Any]:
-    """Return the reported settings by name, from the device's text (`read_settings`)."""
+def report_values(raw: Mapping[str, str]) -> dict[str, Any]:
+    """Return the settings in reports (`commands.read_report`) by name."""
     lines = lines_of(raw)
     user, com, mag = parse_usrconfig(lines), parse_comconfig(lines), parse_magconfig(lines)
     rates = {name.lower(): _whole_rate(period_s) for name, period_s in com.periods_s.items()}
-    alarms = {
-        axis.lower(): AngleAlarm(min_deg=one.low_deg, max_deg=one.high_deg, enabled=one.enabled)
-        for axis, one in alarm_ranges(raw).by_axis.items()
-    }
     reported: dict[str, Any] = {
         "output": {**rates, **{name.lower(): ON_MARK for name in com.on_mark}} or None,
         "mode": {0: "6-axis", 1: "9-axis"}.get(-1 if user.att_mode is None else user.att_mode),
@@ -131,12 +123,35 @@ def values_of(raw: Mapping[str, str]) -> dict[str, Any]:
         "magnetic_calibration": user.magnetic_calibration,
         "pins": {PinFunction(number).name.lower(): pin for number, pin in user.pins.items()} or None,
         "sout_divisor": user.sout_divisor,
-        "alarm": alarms or None,
+        "alarm": _alarms(raw) or None,
         "coordinates": user.coordinates or None,
         "magnetometer_bias": None if mag.bias_ut is None else list(mag.bias_ut),
         "baud": com.baud if com.baud in BAUD_RATES else None,
     }
     return {name: value for name, value in reported.items() if value is not None}
+
+
+def _alarms(raw: Mapping[str, str]) -> dict[str, AngleAlarm]:
+    """Return the alarm ranges by axis, without axes that the device does not report."""
+    found = {}
+    for name, text in raw.items():
+        named, values = _NAME.fullmatch(name.strip()), _VALUES.fullmatch(text.strip())
+        if named and values and (axis := (values[1] or named[1] or "").lower()):
+            low, high = float(values[2]), float(values[3])
+            found[axis] = AngleAlarm(min_deg=low, max_deg=high, enabled=values[4] == "1")
+    return found
+
+
+def why_silent(settings: Mapping[str, Any]) -> str:
+    """Return why a device with these values of its settings replies and sends no samples."""
+    output = settings.get("output", {})
+    rates = {name: rate for name, rate in output.items() if rate not in (0, ON_MARK)}
+    if rates:
+        name, rate_hz = max(rates.items(), key=lambda item: item[1])
+        return f"its output is disabled (LOG DISABLE); {name.upper()} has the rate {rate_hz:g} Hz"
+    if marked := sorted(name.upper() for name, rate in output.items() if rate == ON_MARK):
+        return f"{' and '.join(marked)} on mark, one frame for each pulse on SIN"
+    return "no message has a rate" if output else "its output is off, or on mark"
 
 
 def shown(raw: Mapping[str, str]) -> dict[str, str]:
@@ -145,7 +160,7 @@ def shown(raw: Mapping[str, str]) -> dict[str, str]:
 
 
 def _words(raw: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    for name, value in values_of(raw).items():
+    for name, value in report_values(raw).items():
         match name, value:
             case "output", dict():
                 yield from ((f"output.{message}", _rate_words(rate)) for message, rate in sorted(value.items()))
@@ -165,8 +180,10 @@ def _words(raw: Mapping[str, str]) -> Iterator[tuple[str, str]]:
 
 def _unknown(raw: Mapping[str, str]) -> dict[str, str]:
     """Return the lines of the device that contain no known setting."""
-    known = values_of(raw)
-    return {name: text for name, text in raw.items() if values_of({k: v for k, v in raw.items() if k != name}) == known}
+    known = report_values(raw)
+    return {
+        name: text for name, text in raw.items() if report_values({k: v for k, v in raw.items() if k != name}) == known
+    }
 
 
 def _rate_words(rate: object) -> str:
@@ -197,8 +214,14 @@ def _near(one: list[float], other: list[float]) -> bool:
     return len(one) == len(other) and all(abs(a - b) <= ROTATION_TOLERANCE for a, b in zip(one, other, strict=True))
 
 
-def _read(_target: Target) -> RequestScript[dict[str, Any]]:
-    return values_of((yield from commands.read_settings()))
+def _read(_target: Target, names: Collection[str] | None) -> RequestScript[Reports]:
+    reports = {}
+    for query in (Query.USRCONFIG, Query.COMCONFIG, Query.MAGCONFIG):
+        if names is None or query in names:
+            words = yield from commands.read_report(query)
+            if words is not None:
+                reports[str(query)] = DeviceReport(words, report_values(words))
+    return reports
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -312,7 +335,9 @@ def _described(value_type: Any, description: str, section: str, unit: str = "") 
 SETTINGS: Final = SettingsTable(
     table={
         "mode": Setting(
-            type=_described(Modes, "attitude without or with the magnetometer for the heading", "2.2.4"), write=_mode
+            type=_described(Modes, "attitude without or with the magnetometer for the heading", "2.2.4"),
+            write=_mode,
+            report=Query.USRCONFIG,
         ),
         "mounting": Setting(
             type=_described(
@@ -321,18 +346,21 @@ SETTINGS: Final = SettingsTable(
                 "2.2.4",
             ),
             write=_mounting,
+            report=Query.USRCONFIG,
             effect=Effect.AFTER_RESTART,
             agrees=_same_mounting,
         ),
         "magnetic_calibration": Setting(
             type=_described(bool, "whether the background calibration of the magnetometer is enabled", "8.2"),
             write=_magnetic_calibration,
+            report=Query.USRCONFIG,
         ),
         "pins": Setting(
             type=_described(
                 dict[PinName, Pin], "pin of each function, 1 for IO1; other functions are unchanged", "2.2.4"
             ),
             write=_pins,
+            report=Query.USRCONFIG,
             agrees=_has_all,
         ),
         "sout_divisor": Setting(
@@ -340,6 +368,7 @@ SETTINGS: Final = SettingsTable(
                 Annotated[int, Meta(ge=1, le=SOUT_DIVIDER_MAX)], "pulses on SOUT per pulse on SOUT_DIV", "2.2.4"
             ),
             write=_sout_divisor,
+            report=Query.USRCONFIG,
         ),
         "alarm": Setting(
             type=_described(
@@ -349,6 +378,7 @@ SETTINGS: Final = SettingsTable(
                 "°",
             ),
             write=_write_alarm,
+            report=Query.USRCONFIG,
             agrees=_has_all,
         ),
         "output": Setting(
@@ -359,6 +389,7 @@ SETTINGS: Final = SettingsTable(
                 "Hz",
             ),
             write=_output,
+            report=Query.COMCONFIG,
             agrees=_has_all,
         ),
         "output_enabled": Setting(
@@ -371,7 +402,8 @@ SETTINGS: Final = SettingsTable(
                 str,
                 "axes and angles of newer firmware (COORD): 0 as in the manual (ENU), 4 NWU with x forward",
                 "2.2.4",
-            )
+            ),
+            report=Query.USRCONFIG,
         ),
         "magnetometer_bias": Setting(
             type=_described(
@@ -379,11 +411,13 @@ SETTINGS: Final = SettingsTable(
                 "offset from the calibration of the magnetometer; zero: not calibrated",
                 "8.1.1",
                 "µT",
-            )
+            ),
+            report=Query.MAGCONFIG,
         ),
         "baud": Setting(
             type=_described(BaudRate, "baud rate of the serial port; saves all other settings too", "2.2.3", "bit/s"),
             write=_baud,
+            report=Query.COMCONFIG,
             connection=True,
             saves=True,
         ),
@@ -398,18 +432,13 @@ SETTINGS: Final = SettingsTable(
 FUNCTIONS: Final = {"sin": "sin", "pps": "sin", "sout": "sout", "sout_div": "sout_div", "alarm": "alarm"}
 
 
-def line_differences(settings: Mapping[str, str], lines: DeviceLines) -> dict[str, str]:
-    """Return contradictions of GPIO lines and device settings (`read_settings`), one sentence by key of the line."""
-    return _differences(values_of(settings), lines)
-
-
 def declared_line_differences(values: Mapping[str, Any], lines: DeviceLines) -> dict[str, str]:
     """Return contradictions of GPIO lines and declared settings. A partial declaration is not compared."""
     known = dict(values)
     if set(known.get("output") or ()) != set(get_args(MessageName)):
         known.pop("output", None)
     known.pop("alarm", None)
-    return _differences(known, lines)
+    return line_differences(known, lines)
 
 
 def message_limits(values: Mapping[str, Any], lines: DeviceLines, fed: bool) -> list[str]:
@@ -428,7 +457,8 @@ def message_limits(values: Mapping[str, Any], lines: DeviceLines, fed: bool) -> 
     return found
 
 
-def _differences(values: Mapping[str, Any], lines: DeviceLines) -> dict[str, str]:
+def line_differences(values: Mapping[str, Any], lines: DeviceLines) -> dict[str, str]:
+    """Return contradictions of GPIO lines and device settings, one sentence by key of the line."""
     found: dict[str, list[str]] = {}
     for key, words in (
         *_shared_pins(values.get("pins", {}), lines),

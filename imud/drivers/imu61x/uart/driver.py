@@ -54,7 +54,6 @@ from imud.drivers.imu61x.uart.settings import (
     SETTINGS,
     codes_of,
     identify,
-    read_settings,
     wake,
 )
 from imud.model.errors import NoReply
@@ -200,6 +199,7 @@ VERBS: Final[Verbs] = {
     "restart": Verb(
         "restart the device, wait until it replies and check that its timer restarted; unsaved settings are lost",
         lambda target: settings.restart(done=_done(target)),
+        restarts=True,
     ),
     "factory_reset": Verb(
         "restore, check and save the factory settings and follow the device to 115200 baud; then change a fixed "
@@ -207,6 +207,7 @@ VERBS: Final[Verbs] = {
         _factory_reset,
         Risk.RESET,
         saves=True,
+        restarts=True,
     ),
     "heading": Verb("set the heading", _heading),
     "calibrate_gyro": Verb(
@@ -295,7 +296,6 @@ DRIVER: Final = StreamDriver(
     calibrations=CALIBRATIONS,
     device_settings=SETTINGS,
     identify=identify,
-    read_settings=read_settings,
     wake=wake,
     example_frame=_example_frame,
     unknown_name=frame_name,

@@ -4,7 +4,7 @@ Values are numbers with the unit in the name of the setting, or names in place o
 not state whether parameters 27 and 30 take effect immediately or after the next start.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Annotated, Any, Final, Literal
@@ -14,7 +14,7 @@ from msgspec import Meta
 from imud.contracts.command import Target
 from imud.contracts.driver import Identity
 from imud.contracts.script import Reply, Request, RequestScript, pause, with_undo
-from imud.contracts.setting import Setting, SettingsTable
+from imud.contracts.setting import DeviceReport, Reports, Setting, SettingsTable
 from imud.drivers.imu61x.common import (
     ACCEL_FILTER,
     FILTER_DEFAULT,
@@ -146,24 +146,14 @@ def sample_words(measurement: Measurement) -> Mapping[str, Any]:
 # --- settings ---------------------------------------------------------------------------------------------------------
 
 
-def read_settings() -> RequestScript[Mapping[str, str]]:
-    """Read all parameters of table 9 (CMD 6) as readable text, by the names of imud's settings. Raises NoReply.
+def read_parameters(wanted: Collection[Parameter] = tuple(Parameter)) -> RequestScript[ParameterValues]:
+    """Read parameters of table 9. Raises NoReply if the device does not reply for the first parameter either.
 
-    The result does not contain parameters without a reply: some models lack some parameters (assumed).
+    The result does not contain other parameters without a reply: some models lack some parameters (assumed).
     """
-
-    def ask() -> RequestScript[Mapping[str, str]]:
-        return parameter_words((yield from read_parameters()))
-
-    return in_command_mode(ask)
-
-
-def read_parameters() -> RequestScript[ParameterValues]:
-    """Read all parameters of table 9. Raises NoReply if the device does not reply for the baud rate either."""
-    values = {Parameter.BAUD: (yield from read(Parameter.BAUD))}
-    for parameter in Parameter:
-        if parameter is Parameter.BAUD:
-            continue
+    first, *others = sorted(wanted, key=lambda parameter: parameter is not Parameter.BAUD)
+    values = {first: (yield from read(first))}
+    for parameter in others:
         try:
             values[parameter] = yield from read(parameter, 1)
         except NoReply:
@@ -577,10 +567,32 @@ def codes_of(target: Target) -> Imu61xUartOptions:
 # --- scripts ----------------------------------------------------------------------------------------------------------
 
 
-def _read(_target: Target) -> RequestScript[Mapping[str, Any]]:
-    streams = isinstance((yield commands.await_sample(QUIET_NS)), Reply)
-    values = yield from in_command_mode(read_parameters)
-    return {**settings_of(values), "output_mode": "stream" if streams else "command"}
+MODE_REPORT: Final = "output mode"
+# Parameters of each report
+REPORTS: Final[Mapping[str, tuple[Parameter, ...]]] = {
+    **{
+        parameter.name: (parameter,)
+        for parameter in Parameter
+        if parameter not in (*GYRO_OFFSETS, *INSTALLATION_ANGLES)
+    },
+    "gyro offsets": GYRO_OFFSETS,
+    "installation angles": INSTALLATION_ANGLES,
+}
+
+
+def _read(_target: Target, names: Collection[str] | None) -> RequestScript[Reports]:
+    reports = {}
+    if names is None or MODE_REPORT in names:
+        streams = isinstance((yield commands.await_sample(QUIET_NS)), Reply)
+        reports[MODE_REPORT] = DeviceReport({}, {"output_mode": "stream" if streams else "command"})
+    groups = {name: group for name, group in REPORTS.items() if names is None or name in names}
+    if groups:
+        wanted = [parameter for group in groups.values() for parameter in group]
+        values = yield from in_command_mode(lambda: read_parameters(wanted))
+        for name, group in groups.items():
+            found = {parameter: values[parameter] for parameter in group if parameter in values}
+            reports[name] = DeviceReport(parameter_words(found), settings_of(found))
+    return reports
 
 
 def settings_of(values: ParameterValues) -> Mapping[str, Any]:
@@ -626,15 +638,21 @@ def _check(target: Target, values: Mapping[str, Any]) -> None:
 # device changes at its next start.
 SETTINGS: Final = SettingsTable(
     table={
-        "output_rate_hz": Setting(type=OutputRate, write=lambda _target, hz: write_parameter(Parameter.AHRS_RATE, hz)),
+        "output_rate_hz": Setting(
+            type=OutputRate,
+            write=lambda _target, hz: write_parameter(Parameter.AHRS_RATE, hz),
+            report=Parameter.AHRS_RATE.name,
+        ),
         "accel_filter": Setting(
             type=AccelFilter,
             write=lambda _target, choice: write_filters(filter_code(choice), None),
+            report=Parameter.FILTER.name,
             agrees=same_filter,
         ),
         "gyro_filter": Setting(
             type=GyroFilter,
             write=lambda _target, choice: write_filters(None, filter_code(choice)),
+            report=Parameter.FILTER.name,
             agrees=same_filter,
         ),
         "second_bus": Setting(
@@ -642,18 +660,20 @@ SETTINGS: Final = SettingsTable(
             write=lambda _target, bus: write_parameter(Parameter.BUS_MODE, BusMode[bus.upper()]),
             note="effective immediately or after the next start (not documented); a host on the previous bus "
             "loses the device: change driver and link in its configuration",
+            report=Parameter.BUS_MODE.name,
         ),
         "i2c_address": Setting(
             type=Address,
             write=lambda _target, address: write_parameter(Parameter.I2C_ADDRESS, i2c_address(address)),
+            report=Parameter.I2C_ADDRESS.name,
             agrees=same_address,
             note="effective immediately or after the next start (not documented); a host that uses the old address "
             "loses the device: change `i2c.address` in its configuration to the new address or `auto`",
         ),
-        "gyro_offset_deg_s": Setting(type=GyroOffset),
-        "installation_angles_deg": Setting(type=InstallationAngles),
-        "output_mode": Setting(type=OutputModeName, write=_write_mode),
-        "baud": Setting(type=Baud, write=_write_baud, connection=True),
+        "gyro_offset_deg_s": Setting(type=GyroOffset, report="gyro offsets"),
+        "installation_angles_deg": Setting(type=InstallationAngles, report="installation angles"),
+        "output_mode": Setting(type=OutputModeName, write=_write_mode, report=MODE_REPORT),
+        "baud": Setting(type=Baud, write=_write_baud, connection=True, report=Parameter.BAUD.name),
     },
     read=_read,
     save=lambda target: save(done=codes_of(target).result_done),

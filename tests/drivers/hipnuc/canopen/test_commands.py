@@ -4,13 +4,15 @@ from typing import Literal
 
 import pytest
 
+from imud.contracts.command import Target
 from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request
-from imud.contracts.setting import Written
+from imud.contracts.setting import Written, words_of
 from imud.drivers.hipnuc.canopen import cia301
 from imud.drivers.hipnuc.canopen import commands as moves
 from imud.drivers.hipnuc.canopen import commands as session
 from imud.drivers.hipnuc.canopen.cia301 import Aborted, NmtCommand, TpdoNumber
 from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
+from imud.drivers.hipnuc.canopen.driver import SETTINGS
 from imud.model.errors import BadArgument, DeviceRefused, NoReply
 from imud.sim.hipnuc.canopen import NodeSettings, NodeVariant
 from tests.support.simulated_modules import QUIET, CanopenBench, run_script, unpack
@@ -63,7 +65,7 @@ def test_identify_and_read_settings() -> None:
     with pytest.raises(NoReply, match="node 9"):
         CanopenBench().run_script(session.identify(9))
 
-    settings = CanopenBench(NodeSettings()).run_script(session.read_settings(8))
+    settings = words_of(CanopenBench(NodeSettings()).run_script(SETTINGS.read(Target(HipnucCanopenOptions(), 0), None)))
     assert settings["1800.2"] == "255"
     assert settings["1804.5"] == "50"
     assert settings["1805.5"] == "10"
@@ -83,7 +85,7 @@ def test_identify_and_read_settings() -> None:
     identity = run_script(session.identify(8), refuse)
     assert (identity.product, identity.details) == ("", {})
     assert asked[:6] == [(0x1000, 0), (0x1008, 0), (0x1018, 1), (0x1018, 2), (0x1018, 3), (0x1018, 4)]
-    assert run_script(session.read_settings(8), refuse) == {}
+    assert run_script(SETTINGS.read(Target(HipnucCanopenOptions(), 0), None), refuse) == {}
 
 
 def test_settings_are_read_back_and_compared() -> None:

@@ -14,12 +14,15 @@ import pytest
 from canopen.objectdictionary import ODRecord, ODVariable, datatypes
 
 from imud.contracts.codec import CodecEvent, message_of
+from imud.contracts.command import Target
 from imud.contracts.script import Outcome, Reply, ReplyFrame, Request
+from imud.contracts.setting import words_of
 from imud.drivers.hipnuc.canopen import cia301
 from imud.drivers.hipnuc.canopen import commands as session
 from imud.drivers.hipnuc.canopen.cia301 import NmtCommand
 from imud.drivers.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenOptions
 from imud.drivers.hipnuc.canopen.commands import Transmission
+from imud.drivers.hipnuc.canopen.driver import SETTINGS
 from imud.model.errors import NoReply
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
@@ -247,7 +250,7 @@ def test_our_conversations_with_their_node(local: canopen.LocalNode, host: Host)
     run_script(session.set_bit_rate(NODE, 250_000), host.ask)
     assert local.get_data(0x209A, 0) == b"\x03\0\0\0"
     run_script(session.save(NODE), host.ask)
-    settings = run_script(session.read_settings(NODE), host.ask)
+    settings = words_of(run_script(SETTINGS.read(Target(HipnucCanopenOptions(node=NODE), 0), None), host.ask))
     assert settings["1804.5"] == "50"
     assert settings["1801.2"] == "1"
     assert settings["209A.0"] == "3"

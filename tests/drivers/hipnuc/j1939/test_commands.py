@@ -1,15 +1,17 @@
 """Every row of table 6.2.2 in the manual as frames on the bus, reply matching, and rejected values."""
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
+from imud.contracts.command import Target
 from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request, RequestScript, Silence
-from imud.contracts.setting import Written
+from imud.contracts.setting import Written, words_of
 from imud.drivers.hipnuc.j1939 import commands as session
-from imud.drivers.hipnuc.j1939.codec import HOST_ADDRESS, J1939Node
+from imud.drivers.hipnuc.j1939.codec import HOST_ADDRESS, HipnucJ1939Options, J1939Node
 from imud.drivers.hipnuc.j1939.commands import X_SIGN, Y_SIGN, Zero
-from imud.drivers.hipnuc.j1939.driver import DRIVER
+from imud.drivers.hipnuc.j1939.driver import DRIVER, SETTINGS
 from imud.formats.can import EXTENDED_FLAG, RAW_FRAME
 from imud.model.errors import BadArgument, NoReply, Rejected
 from imud.model.ledger import Ledger
@@ -209,13 +211,16 @@ def test_a_reply_is_matched_by_sender_register_and_command(can_id: int, data: st
 
 def test_all_that_can_be_read() -> None:
     replies = [
-        "9C00030008000000", "9A00030002000000", "9E00030001000000", "9F00030000000000", None,  # FF2F is unknown
+        None,  # FF2F is unknown
         "3401030064000000", "370103000A000000", None, "3D01030064000000", "4101030064000000", None, None, None,
+        "9E00030001000000", "9F00030000000000", "9A00030002000000", "9C00030008000000",
     ]  # fmt: skip
-    frames, settings = played(
-        session.read_settings(PEER), *(None if text is None else bytes.fromhex(text) for text in replies)
+    reports: Any
+    frames, reports = played(
+        SETTINGS.read(Target(HipnucJ1939Options(), 0), None),
+        *(None if text is None else bytes.fromhex(text) for text in replies),
     )
-    assert settings == {
+    assert words_of(reports) == {
         "address": "8", "bitrate": "500000", "x_reversed": "1", "y_reversed": "0", "interval_ms_FF34": "100",
         "interval_ms_FF37": "10", "interval_ms_FF3D": "100", "interval_ms_FF41": "100",
     }  # fmt: skip

@@ -6,6 +6,7 @@ import pytest
 
 from imud.contracts.codec import BadFrame, BadReason, Vanished
 from imud.contracts.script import Transfer, run_transfer_script
+from imud.contracts.setting import words_of
 from imud.drivers.hipnuc.common import QUAT_PER_LSB
 from imud.drivers.hipnuc.modbus.codec import (
     READ_BLOCK,
@@ -15,7 +16,7 @@ from imud.drivers.hipnuc.modbus.codec import (
     HipnucModbusOptions,
     pack_block,
 )
-from imud.drivers.hipnuc.modbus.commands import probe, set_up
+from imud.drivers.hipnuc.modbus.commands import probe, read_settings
 from imud.drivers.hipnuc.modbus.driver import DRIVER
 from imud.drivers.hipnuc.modbus.registers import QUAT_OLD_PER_LSB, registers_reply
 from imud.formats.modbus import framed
@@ -268,6 +269,6 @@ def test_identity_is_watched_and_settings_are_read() -> None:
         asked.append(transfer)
         return framed(7, registers_reply(bytes.fromhex("0008 0007 0001")))
 
-    found = run_transfer_script(set_up(HipnucModbusOptions()), answer)
+    found = words_of(run_transfer_script(read_settings(), answer))
     assert found == {"baud": "921600", "id": "7", "heading_mode": "nine axes"}
     assert [transfer.sends[0][0] for transfer in asked] == [3]

@@ -5,9 +5,9 @@ from typing import Any
 import msgspec
 import pytest
 
-from imud.contracts.setting import Effect, Written
+from imud.contracts.setting import Effect, Written, values_of
 from imud.drivers.hipnuc.modbus.driver import DRIVER, SETTINGS
-from imud.model.errors import BadArgument
+from imud.model.errors import BadArgument, TransferError
 from imud.sim.hipnuc.modbus import SLAVE_VARIANTS, SlaveVariant
 from tests.support.pty_port import ModbusBench
 from tests.support.pty_port import modbus_slave as module
@@ -32,8 +32,7 @@ def write(bench: ModbusBench, name: str, value: object) -> object:
 
 
 def present(bench: ModbusBench) -> dict[str, Any]:
-    found: dict[str, Any] = bench.run(SETTINGS.read(bench.target))
-    return found
+    return values_of(bench.run(SETTINGS.read(bench.target, None)))
 
 
 def test_the_table_has_effects_and_types() -> None:
@@ -83,7 +82,8 @@ def test_values_that_are_refused_left_out_or_ignored() -> None:
     with pytest.raises(BadArgument, match="expected 115200, the baud rate of the bus, got 9600"):
         SETTINGS.check(bench.target, {"baud": 9600})
     bench = ModbusBench(module(7, dead=True))
-    assert present(bench) == {}
+    with pytest.raises(TransferError):
+        present(bench)
     strange = ModbusBench(module(7))
     strange.slave.settings = strange.slave.settings.__class__(7, 115200, 5)
     assert present(strange) == {"baud": 115200, "address": 7}

@@ -7,6 +7,7 @@ import pytest
 
 from imud.contracts.command import Target
 from imud.contracts.script import Outcome, Rejection, Reply, Request, RequestScript, Silence
+from imud.contracts.setting import words_of
 from imud.drivers.hipnuc.uart.commands import (
     OutputMessage,
     Query,
@@ -14,12 +15,12 @@ from imud.drivers.hipnuc.uart.commands import (
     ask,
     identify,
     log_ontime,
-    read_settings,
     send_once,
     wake,
     why_silent,
 )
 from imud.drivers.hipnuc.uart.driver import DRIVER
+from imud.drivers.hipnuc.uart.settings import SETTINGS
 from imud.model.errors import BadArgument, NoReply, Rejected
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
@@ -58,18 +59,28 @@ def test_identity_refusal_and_flat_settings() -> None:
     with pytest.raises(Rejected, match="ERR 3"):
         hold(identify(), lambda _: Rejection(("ERR 3",)))
 
-    assert hold(read_settings(), lambda name: Reply(REPLIES[name])) == {
+    assert words_of(hold(SETTINGS.read(Target(None, 0), None), lambda name: Reply(REPLIES[name]))) == {
         "ATT_MODE": "0",
         "BAUD": "115200",
         "COMCONFIG 1": "LOG HI91 ONTIME 0.01",
         "MB": "14.14, -2.08, -8.75",
     }
-    settings = hold(read_settings(), lambda n: Silence(()) if n == "LOG MAGCONFIG" else Reply(REPLIES[n]))
+    without = hold(
+        SETTINGS.read(Target(None, 0), None), lambda n: Silence(()) if n == "LOG MAGCONFIG" else Reply(REPLIES[n])
+    )
+    settings = words_of(without)
     assert "ATT_MODE" in settings
     assert "MB" not in settings
     for silent in ("LOG USRCONFIG", "LOG COMCONFIG"):
+        script = SETTINGS.read(Target(None, 0), None)
         with pytest.raises(NoReply, match=silent):
-            hold(read_settings(), lambda n, silent=silent: Silence(()) if n == silent else Reply(REPLIES[n]))  # type: ignore[misc]  # bound now
+            hold(script, lambda n, silent=silent: Silence(()) if n == silent else Reply(REPLIES[n]))  # type: ignore[misc]  # bound now
+
+    def user_report(name: str) -> Outcome:
+        assert name == "LOG USRCONFIG"
+        return Reply(REPLIES[name])
+
+    assert set(hold(SETTINGS.read(Target(None, 0), {SETTINGS.table["mode"].report}), user_report)) == {"USRCONFIG"}
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,8 @@ import msgspec
 import pytest
 
 from imud.contracts.command import Target
-from imud.contracts.setting import Effect
-from imud.drivers.hipnuc.uart.commands import read_settings
-from imud.drivers.hipnuc.uart.settings import SETTINGS, shown, values_of
+from imud.contracts.setting import Effect, values_of, words_of
+from imud.drivers.hipnuc.uart.settings import SETTINGS, report_values, shown
 from imud.model.errors import BadArgument
 from imud.sim.hipnuc.uart_settings import VARIANTS, AlarmSetting, Behaviour, ModuleSettings, Output
 from tests.support.simulated_modules import HipnucLine, hardware_of
@@ -30,7 +29,7 @@ DELIVERED = {
 
 def read(line: HipnucLine) -> dict[str, Any]:
     """Return the settings that the table reads, as JSON values."""
-    values: dict[str, Any] = msgspec.to_builtins(line.run(SETTINGS.read(Target(None, line.baud))))
+    values: dict[str, Any] = msgspec.to_builtins(values_of(line.run(SETTINGS.read(Target(None, line.baud), None))))
     return values
 
 
@@ -64,7 +63,13 @@ def test_the_same_in_words_with_units() -> None:
         urfr=(0.8, -0.6, 0, 0.6, 0.8, 0, 0, 0, 1),
     )  # fmt: skip
     line = HipnucLine(settings, hardware_of(Behaviour(), mag_bias_t=(14.14e-6, -2.08e-6, -8.75e-6)))
-    words = shown({**line.run(read_settings()), "TEMP_COEF": "1.5", "COMCONFIG 7": "a line of another form"})
+    words = shown(
+        {
+            **words_of(line.run(SETTINGS.read(Target(None, 0), None))),
+            "TEMP_COEF": "1.5",
+            "COMCONFIG 7": "a line of another form",
+        }
+    )
     assert words == {
         "output.hi91": "25 Hz",
         "output.hi92": "on mark",
@@ -84,7 +89,10 @@ def test_the_same_in_words_with_units() -> None:
         "TEMP_COEF": "1.5",
         "COMCONFIG 7": "a line of another form",
     }
-    assert shown(HipnucLine().run(read_settings()))["magnetometer_bias"] == "0, 0, 0 µT: not calibrated"
+    assert (
+        shown(words_of(HipnucLine().run(SETTINGS.read(Target(None, 0), None))))["magnetometer_bias"]
+        == "0, 0, 0 µT: not calibrated"
+    )
 
 
 @pytest.mark.parametrize(
@@ -96,7 +104,7 @@ def test_the_same_in_words_with_units() -> None:
     ],
 )
 def test_lines_of_an_unknown_form_are_shown_unchanged(raw: dict[str, str]) -> None:
-    assert values_of(raw) == {}
+    assert report_values(raw) == {}
     assert shown(raw) == raw
 
 
@@ -133,12 +141,12 @@ def test_written_read_back_saved_and_kept_over_a_restart(
     assert SETTINGS.save is not None
     assert SETTINGS.restart is not None
     value = msgspec.convert(given, setting.type)
-    assert not setting.agrees(value, values_of(line.run(read_settings()))[name])
+    assert not setting.agrees(value, values_of(line.run(SETTINGS.read(Target(None, 0), None)))[name])
     line.run(setting.write(Target(None, line.baud), value))
-    assert setting.agrees(value, values_of(line.run(read_settings()))[name])
+    assert setting.agrees(value, values_of(line.run(SETTINGS.read(Target(None, 0), None)))[name])
     line.run(SETTINGS.save(Target(None, line.baud)))
     line.run(SETTINGS.restart(Target(None, line.baud)))
-    assert setting.agrees(value, values_of(line.run(read_settings()))[name])
+    assert setting.agrees(value, values_of(line.run(SETTINGS.read(Target(None, 0), None)))[name])
     assert {field: getattr(line.module.settings, field) for field in changed} == changed
 
 

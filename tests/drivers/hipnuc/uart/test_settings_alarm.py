@@ -5,7 +5,7 @@ import pytest
 from imud.contracts.lines import AlarmRange, AlarmRanges
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.drivers.hipnuc.uart.replies import parse_report
-from imud.drivers.hipnuc.uart.settings import alarm_ranges, shown, values_of
+from imud.drivers.hipnuc.uart.settings import alarm_ranges, report_values, shown
 from imud.sim.hipnuc.uart_settings import AlarmSetting, ModuleSettings
 
 
@@ -24,7 +24,9 @@ def test_the_modules_own_lines_are_read() -> None:
     settings = ModuleSettings(alarm_x=AlarmSetting(-5, 5.5, False), alarm_y=AlarmSetting(-30.25, 12, True))
     report = parse_report([*settings.user_lines(), "OK"]).values
     assert DRIVER.alarm_ranges is not None
-    assert DRIVER.alarm_ranges(report) == AlarmRanges({**x(-5, 5.5, False), **y(-30.25, 12)}, "PMUX5", "URFR")
+    assert DRIVER.alarm_ranges(report_values(report)) == AlarmRanges(
+        {**x(-5, 5.5, False), **y(-30.25, 12)}, "PMUX5", "URFR"
+    )
 
 
 @pytest.mark.parametrize(
@@ -37,11 +39,11 @@ def test_coordinates_select_axes_and_the_angles_of_the_alarm(line: str, value: s
     settings = ModuleSettings(alarm_x=AlarmSetting(-5, 5.5, False), alarm_y=AlarmSetting(-30.25, 12, True))
     report = parse_report([*settings.user_lines(), line])
     raw = {**report.values, **{f"USRCONFIG {n}": other for n, other in enumerate(filter(None, report.other), 1)}}
-    assert values_of(raw).get("coordinates") == value
+    assert report_values(raw).get("coordinates") == value
     sent = DRIVER.sent_axes(shown(raw))
     assert (sent.navigation_frame == "NWU") == (value == "4")
     assert bool(sent.problem) == (value == "2")
-    by_axis = alarm_ranges(raw).by_axis
+    by_axis = alarm_ranges(report_values(raw)).by_axis
     assert (by_axis["X"].euler_index, by_axis["Y"].euler_index) == ((0, 1) if value == "4" else (1, 0))
 
 
@@ -60,4 +62,4 @@ def test_coordinates_select_axes_and_the_angles_of_the_alarm(line: str, value: s
     ],
 )
 def test_other_forms(name: str, value: str, expected: dict[str, AlarmRange]) -> None:
-    assert alarm_ranges({name: value}).by_axis == expected
+    assert alarm_ranges(report_values({name: value})).by_axis == expected

@@ -4,9 +4,10 @@ import pytest
 
 from imud import config
 from imud.config.schema import TABLES
+from imud.contracts.command import Target
 from imud.contracts.lines import DeviceLines, DividedOptions, InputOptions, PpsOptions, SoutOptions, TriggerOptions
-from imud.drivers.hipnuc.uart.commands import read_settings
-from imud.drivers.hipnuc.uart.settings import declared_line_differences, line_differences, message_limits
+from imud.contracts.setting import values_of
+from imud.drivers.hipnuc.uart.settings import SETTINGS, declared_line_differences, line_differences, message_limits
 from imud.model.errors import ConfigError
 from imud.sim.hipnuc.uart_settings import AlarmSetting, ModuleSettings, Output
 from tests.support.simulated_modules import HipnucLine
@@ -47,7 +48,7 @@ MARKED = Output(on_mark=True)
 def test_contradictions_of_the_device_are_found(
     lines: DeviceLines, settings: ModuleSettings, found: dict[str, str]
 ) -> None:
-    differences = line_differences(HipnucLine(settings).run(read_settings()), lines)
+    differences = line_differences(values_of(HipnucLine(settings).run(SETTINGS.read(Target(None, 0), None))), lines)
     assert differences.keys() == found.keys()
     for key, words in found.items():
         assert words in differences[key]
@@ -55,7 +56,7 @@ def test_contradictions_of_the_device_are_found(
 
 @pytest.mark.parametrize("lines", [SOUT, DIVIDED, SIN, PPS, ALARM])
 def test_unreported_settings_are_not_compared(lines: DeviceLines) -> None:
-    assert line_differences({"ATT_MODE": "0"}, lines) == {}
+    assert line_differences({"mode": "6-axis"}, lines) == {}
 
 
 @pytest.mark.parametrize(

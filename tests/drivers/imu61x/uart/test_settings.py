@@ -6,6 +6,7 @@ import msgspec
 import pytest
 
 from imud.contracts.command import Target
+from imud.contracts.setting import values_of
 from imud.drivers.imu61x.uart.codec import Parameter
 from imud.drivers.imu61x.uart.commands import Command, Imu61xUartOptions, OutputMode
 from imud.drivers.imu61x.uart.settings import SETTINGS, settings_of
@@ -31,7 +32,7 @@ def target(far: Imu61xBench, variant: str = "executes commands while it streams"
 
 
 def read(far: Imu61xBench, variant: str = "executes commands while it streams") -> dict[str, Any]:
-    return dict(far.run(SETTINGS.read(target(far, variant))))
+    return values_of(far.run(SETTINGS.read(target(far, variant), None)))
 
 
 def write(far: Imu61xBench, name: str, value: object, variant: str = "executes commands while it streams") -> None:

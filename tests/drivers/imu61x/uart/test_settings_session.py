@@ -6,7 +6,9 @@ from math import radians
 
 import pytest
 
+from imud.contracts.command import Target
 from imud.contracts.script import RequestScript, Silence
+from imud.contracts.setting import words_of
 from imud.drivers.imu61x.uart import commands
 from imud.drivers.imu61x.uart import settings as session
 from imud.drivers.imu61x.uart.codec import Parameter, Status
@@ -42,7 +44,7 @@ def test_identity_settings_and_modes(variant: str) -> None:
     far = variant_bench(
         variant, Imu61xSettings(rate_hz=50, filter_control=0x4B, i2c_address=0x1A, gyro_off_deg_s=(0.5, -0.25, 0.0))
     )
-    assert far.run(session.read_settings()) == {
+    assert words_of(far.run(session.SETTINGS.read(Target(None, 0), None))) == {
         "baud": "115200",
         "output_rate_hz": "50",
         "accel_filter": "10 Hz",
@@ -118,8 +120,8 @@ def test_modes_at_any_rate_words_of_unusual_values_and_questions_only() -> None:
     assert session.parameter_words({Parameter.FILTER: float("nan")}) == {"filter": "nan"}
     far = imu61x_bench()
     far.run(session.identify())
-    far.run(session.read_settings())
-    assert all(name == "status" or name.startswith("read parameter") for name in far.asked)
+    far.run(session.SETTINGS.read(Target(None, 0), None))
+    assert all(name in ("status", "sample") or name.startswith("read parameter") for name in far.asked)
 
 
 @every_variant

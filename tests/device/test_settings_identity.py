@@ -1,40 +1,50 @@
 """Identity and settings of a device, and events about changes."""
 
 from collections.abc import Mapping
+from unittest.mock import Mock
 
 import msgspec
 
+from imud.config.model import DeviceConfig
 from imud.contracts.driver import Identity
+from imud.contracts.setting import DeviceReport
+from imud.device.flash import SettingsFiles
 from imud.device.health import DeviceEvents
-from imud.device.identity import KnownIdentity, identity_words
+from imud.device.settings import DeviceSettings, identity_words
 from imud.host.clock import HostClock
+from imud.links.memory import MemoryOptions
 from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
 
 
-def update(known: KnownIdentity, identity: Identity, settings: Mapping[str, str]) -> None:
+def known_by(events: list[Event], host: HostClock | None = None) -> DeviceSettings:
+    """Return the settings of a device without a driver."""
+    host = host or HostClock(lambda: 5)
+    config = DeviceConfig("bow", "auto", None, True, "memory", MemoryOptions(name="/dev/fake", baud=115200))
+    told = DeviceEvents("bow", Ledger(), events.append)
+    return DeviceSettings(config, Mock(driver=None), told, Mock(), host, SettingsFiles(None, host))
+
+
+def update(known: DeviceSettings, identity: Identity, settings: Mapping[str, str]) -> None:
     known.update_identity(identity)
-    known.update_settings(settings, None)
+    known.update({"": DeviceReport(settings)})
 
 
 def test_only_differences_to_a_known_device_are_reported() -> None:
     events: list[Event] = []
-    times_ns = iter((3, 4))  # one time for each event
-    host = HostClock(lambda: 5)
-    host.now_ns = lambda: next(times_ns)
-    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), host)
+    known = known_by(events)
     update(known, Identity("HI14", "A1"), {"ATT_MODE": "0", "BAUD": "115200"})
     update(known, Identity("HI14", "A1"), {"ATT_MODE": "0", "BAUD": "115200", "NEW": "1"})
     assert not events
     update(known, Identity("HI14", "A1"), {"ATT_MODE": "1"})
     update(known, Identity("HI14", "B2"), {"ATT_MODE": "1"})
-    assert [(event.t_ns, event.kind, event.message) for event in events] == [
-        (3, EventKind.CONFIGURATION, "settings of the device changed: ATT_MODE is 1, was 0"),
-        (4, EventKind.CONFIGURATION, "another device: serial number B2, was A1"),
+    assert [(event.kind, event.message) for event in events] == [
+        (EventKind.CONFIGURATION, "settings of the device changed: ATT_MODE is 1, was 0"),
+        (EventKind.CONFIGURATION, "another device: serial number B2, was A1"),
     ]
-    assert (known.identity.serial_number, known.settings) == ("B2", {"ATT_MODE": "1"})
+    assert (known.identity.serial_number, known.shown) == ("B2", {"ATT_MODE": "1"})
     events = []
-    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), HostClock(lambda: 5))
+    known = known_by(events)
     update(known, Identity("HI14"), {})
     update(known, Identity("HI14", "B2"), {})
     assert not events
@@ -43,7 +53,7 @@ def test_only_differences_to_a_known_device_are_reported() -> None:
 def test_lost_members_of_an_identity_are_kept() -> None:
     """A new adapter can lose bytes of the first replies."""
     events: list[Event] = []
-    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), HostClock(lambda: 5))
+    known = known_by(events)
     whole = Identity("HI14", "A1", "1.5.6", {"BUILD": "x"})
     update(known, whole, {})
     for damaged in (Identity("HI14"), Identity("", "A1", "1.5.6"), Identity()):
@@ -53,7 +63,7 @@ def test_lost_members_of_an_identity_are_kept() -> None:
     update(known, Identity("HI14", "A1", "1.6.9", {"BUILD": "y"}), {})
     assert known.identity == Identity("HI14", "A1", "1.6.9", {"BUILD": "y"})
     events = []
-    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), HostClock(lambda: 5))
+    known = known_by(events)
     update(known, Identity("HI14", "A1", "1.5.6"), {})
     update(known, Identity("", "B2"), {})
     assert known.identity == Identity("", "B2")
@@ -74,7 +84,7 @@ HOSTILE = "\x1b[2J\n\udc80\ud800\u202e" + "x" * 10_000
 def test_texts_of_a_device_have_limited_printable_characters() -> None:
     """Long, unprintable, not UTF-8, and with the names of parameters of imud."""
     events: list[Event] = []
-    known = KnownIdentity(DeviceEvents("bow", Ledger(), events.append), HostClock(lambda: 5))
+    known = known_by(events)
     names = ("message", "kind", "now_ns", "self", "device", HOSTILE)
     many = {f"n{number}": HOSTILE for number in range(10_000)}
     update(known, Identity(HOSTILE, HOSTILE, HOSTILE, many), dict.fromkeys(names, "old"))
@@ -82,7 +92,7 @@ def test_texts_of_a_device_have_limited_printable_characters() -> None:
     update(known, Identity(HOSTILE, HOSTILE, HOSTILE, many), {})
     assert len(events) == 3
     assert set(names[:-1]) <= set(events[1].detail)
-    shown = [known.identity, known.settings, identity_words(known.identity), *events]
+    shown = [known.identity, known.shown, identity_words(known.identity), *events]
     for one in shown:
         assert len(msgspec.json.encode(one)) < 100_000
     texts = [text for event in events for text in (event.message, *event.detail, *event.detail.values())]
