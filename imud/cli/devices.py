@@ -1,7 +1,7 @@
 """`imud devices`: list the devices of the running daemon. `imud command`: list or run the commands of a device."""
 
 import argparse
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
@@ -61,8 +61,17 @@ def command(args: argparse.Namespace) -> int:
         if risk and not confirmed(f"{args.name} on {args.device}", risk, yes=args.yes):
             return 1
         answer = client.call("command", device=args.device, name=args.name, arguments=arguments)
-    print(msgspec.json.encode(answer).decode() if answer is not None else "done")
+    print(_verb_words(answer))
     return 0
+
+
+def _verb_words(answer: Any) -> str:
+    """Format the result of a verb: evidence for its effect, and its values."""
+    if not isinstance(answer, dict) or not {"verified", "evidence"} <= answer.keys():
+        return msgspec.json.encode(answer).decode() if answer is not None else "done"
+    lines = [f"{'verified' if answer['verified'] else 'sent, not verified'}: {answer['evidence']}"]
+    lines += [] if answer["result"] is None else [msgspec.json.encode(answer["result"]).decode()]
+    return "\n".join([*lines, *filter(None, [answer["not_saved"]])])
 
 
 DEVICES = CliCommand(devices_arguments, devices)

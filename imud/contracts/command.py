@@ -1,11 +1,11 @@
 """Contract of a verb: an operation that a device executes once on request, for example save, restart, level."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
 from inspect import signature
-from math import hypot
+from math import hypot, remainder, tau
 from typing import Any, Final, cast, get_type_hints
 
 import msgspec
@@ -36,6 +36,32 @@ class Risk(StrEnum):
     RESET = "all settings of the device are lost"  # imud first writes a backup of all readable settings
 
 
+class Proof(StrEnum):
+    """Evidence for the effect of a verb."""
+
+    VALUE = "value"  # the verb has no effect: its result is the requested value
+    SCRIPT = "script"  # the script has checked the effect; it may return a `VerbResult`
+    NONE = "none"  # the device does not show the effect
+    RESTART = "restart"  # the device counter restarts; without a counter the samples pause
+    SETTINGS = "settings"  # the device reports other settings than before
+    SAMPLES = "samples"  # the samples at rest have the values of `Verb.expected`
+    STREAM = "stream"  # a sample arrives
+    ONE_SAMPLE = "one sample"  # a sample arrives, and none arrived before
+
+
+class VerbResult(msgspec.Struct, frozen=True):
+    """Result of a verb with an effect."""
+
+    verified: bool
+    evidence: str  # evidence for the effect, or the reason why imud could not verify the effect
+    result: Any = None  # values that the verb returns
+    not_saved: str = ""  # that the flash lacks a change, and the next step; empty if the flash contains all settings
+
+
+def _nothing_expected(_arguments: Any) -> "Sequence[Expectation]":
+    return ()
+
+
 @dataclass(frozen=True, slots=True)
 class Verb:
     """A verb of a device: help text, arguments and request script.
@@ -56,6 +82,10 @@ class Verb:
     changes: bool = True  # Whether the verb can change a setting. imud reads all settings again after such a verb.
     # Whether the device has the settings of its flash afterwards. imud also reads the identity again.
     restarts: bool = False
+    proof: Proof = Proof.VALUE
+    evidence: str = ""  # evidence of `Proof.SCRIPT`, or the reason of `Proof.NONE`, one clause
+    # Returns the expected means of the samples after the verb, from its arguments; empty if no sample shows the effect
+    expected: "Callable[[Any], Sequence[Expectation]]" = _nothing_expected
 
     @property
     def parameters(self) -> type[Options]:
@@ -183,6 +213,17 @@ YAW_ZERO: Final = Expectation(
 INCLINATION_ZERO: Final = Expectation(
     "inclination", "rad", 0.5 * RAD_PER_DEG, lambda m: None if m.incli_rad is None else max(map(abs, m.incli_rad))
 )
+
+
+def yaw_at(angle_deg: float) -> Expectation:
+    """Return the expectation of a heading."""
+
+    def difference(means: RestMeans) -> float | None:
+        return None if means.euler_rad is None else abs(remainder(means.euler_rad[2] - angle_deg * RAD_PER_DEG, tau))
+
+    return Expectation("yaw", "rad", 1.0 * RAD_PER_DEG, difference)
+
+
 # 0.1 m/s² is a tilt of 0.6°.
 ACCEL_LEVEL: Final = Expectation(
     "horizontal acceleration", "m/s²", 0.1, lambda m: None if m.accel_m_s2 is None else hypot(*m.accel_m_s2[:2])

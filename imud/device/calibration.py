@@ -390,7 +390,7 @@ class CalibrationRun:
         await self._pause(SETTLE_NS)
         means = await self._rest(kind)
         problem = answer.words if isinstance(answer, Verdict) and not answer.done else ""
-        return _words(answer), tuple(_check(one, means) for one in calibration.expected), problem
+        return _words(answer), tuple(check(one, means) for one in calibration.expected), problem
 
     async def _turned(self, kind: str, calibration: Calibration) -> tuple[str, tuple[Check, ...], str]:
         """Calibrate a turned device. Return the reply of the device, the checks, and the problem."""
@@ -497,7 +497,8 @@ def _turned_enough(turning: Turning) -> bool:
     return share >= COVERAGE_WANTED and min(turning.turned_rad) >= TURNS_WANTED_RAD
 
 
-def _check(expectation: Expectation, means: RestMeans) -> Check:
+def check(expectation: Expectation, means: RestMeans) -> Check:
+    """Compare the means of the samples with an expectation."""
     value = expectation.value(means)
     return _bounded(expectation.name, value, expectation.limit, expectation.unit)
 

@@ -12,11 +12,11 @@ import asyncio
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from imud.config.devices import owner_of
 from imud.config.model import DeviceConfig
-from imud.contracts.command import CalibrationResult, Calibrations, Kept, Verbs
+from imud.contracts.command import CalibrationResult, Calibrations, Kept, Proof, Risk, Verb, VerbResult, Verbs
 from imud.contracts.driver import status_words
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link
@@ -24,20 +24,23 @@ from imud.contracts.publisher import PutRecord
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
 from imud.device.attachments import Attachments
-from imud.device.calibration import CalibrationRun
+from imud.device.calibration import CalibrationRun, RestWindow, check
+from imud.device.evidence import STEP_S
 from imud.device.flash import SettingsFiles
 from imud.device.health import DeviceEvents, Health
 from imud.device.latency import Need
 from imud.device.settings import DeviceSettings, identity_words
-from imud.device.settings_plan import setting_instead
+from imud.device.settings_plan import Values, as_json, setting_instead
 from imud.device.transport import UNHEARD_NS, DeviceContext, DeviceOwner, Transport
 from imud.device.watches import AttitudeWatch, StatusWatch
 from imud.host.clock import HostClock
 from imud.host.log import printable, shown
 from imud.links import LINKS
-from imud.model.errors import BadArgument, CommandError, LinkBusy, LinkError, LinkMissing
+from imud.model.errors import BadArgument, CommandError, ImudError, LinkBusy, LinkError, LinkMissing
 from imud.model.ledger import Ledger
-from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.model.options import Options
+from imud.model.options import shown as json_words
+from imud.model.units import NS_PER_MS, NS_PER_S, RAD_PER_DEG
 from imud.recording.observer import ClockObserver, PathObserver
 from imud.sampling.path import LatencyMeter, RateMeter, SamplePath
 
@@ -52,6 +55,8 @@ IDLE_FLUSH_NS = 50 * NS_PER_MS
 SILENCE_NS = 1 * NS_PER_S  # minimum time without a sample that makes a device silent, ns
 SILENCE_PERIODS = 5  # minimum number of sample periods without a sample that makes a device silent
 
+CHANGES_MAX: Final = 5  # maximum number of changed settings in the evidence of a reset
+
 MakeTransport = Callable[[DeviceContext], Transport]
 
 
@@ -63,6 +68,112 @@ class SharedParts:
     host: HostClock
     lines: LineFactory
     files: SettingsFiles
+
+
+class VerbRun:
+    """Execution of verbs. Synchronization: the loop's thread only."""
+
+    def __init__(self, settings: DeviceSettings, transport: Transport) -> None:
+        self._settings = settings
+        self._transport = transport
+        self._samples = transport.samples
+
+    # --- a verb -----------------------------------------------------------------------------------------------------
+
+    async def run(self, name: str, verb: Verb, given: Mapping[str, Any]) -> object:
+        """Run a verb of the driver and return its result: a value, or a `VerbResult` if the verb has an effect.
+
+        Raises CommandError, TransferError, DeviceRefused, LinkError.
+        """
+        settings, arguments = self._settings, verb.arguments(given)
+        async with settings.exclusive():
+            if verb.saves:
+                settings.spend_flash()
+            if verb.risk is Risk.RESET:
+                await settings.back_up(name)
+            before, was_unsaved = settings.values, settings.is_unsaved
+            is_quiet = await self._samples.is_quiet() if verb.proof is Proof.ONE_SAMPLE else True
+            self._samples.mark()
+            answer = await self._changed(verb, arguments)
+            verified: bool | None = True
+            evidence = verb.evidence
+            match verb.proof:
+                case Proof.SCRIPT if isinstance(answer, VerbResult):
+                    verified, evidence, answer = answer.verified, answer.evidence, answer.result
+                case Proof.VALUE:
+                    return answer
+                case Proof.NONE:
+                    verified = False
+                case Proof.RESTART:
+                    verified, evidence = await self._samples.restarted()
+                case Proof.SETTINGS:
+                    verified, evidence = _reset(before, settings.values, was_unsaved)
+                case Proof.SAMPLES:
+                    verified, evidence = await self._agrees(verb, arguments)
+                case Proof.ONE_SAMPLE if not is_quiet:
+                    verified, evidence = False, "the device sends other samples too"
+                case Proof.STREAM | Proof.ONE_SAMPLE:
+                    verified = await self._samples.arrived()
+                    evidence = "a sample arrived" if verified else "no sample arrived; check the output of the device"
+            not_saved = settings.not_saved if verb.changes and not (verb.saves or verb.restarts) else ""
+            return VerbResult(bool(verified), evidence, answer, not_saved)
+
+    async def _changed(self, verb: Verb, arguments: Options) -> object:
+        """Run the script, and read the values that it can change."""
+        settings = self._settings
+        settings.script_follows(changes=verb.changes)
+        try:
+            answer: object = await self._transport.run_script(lambda target: verb.script(target, arguments))
+        except BadArgument:  # a script checks its arguments before it changes anything
+            raise
+        except BaseException as error:  # the state of the device is unknown
+            settings.changed(unsaved=verb.changes and not verb.restarts)
+            if isinstance(error, ImudError):
+                await settings.read_again(identity=True)
+            raise
+        if verb.saves or verb.restarts:
+            settings.flash_is_current()
+        if verb.changes:
+            settings.changed(unsaved=not (verb.saves or verb.restarts))
+            await settings.read_again(identity=verb.restarts)
+        return answer
+
+    # --- evidence ----------------------------------------------------------------------------------------------------
+
+    async def _agrees(self, verb: Verb, arguments: Options) -> tuple[bool, str]:
+        """Return whether the samples at rest have the values that the verb sets."""
+        expected = verb.expected(arguments)
+        if not expected:
+            return False, "the device confirmed it, and no sample shows its effect"
+        window, sample = RestWindow(), self._samples.newest
+        while not window.full:
+            sample = await self._samples.next(sample)
+            if sample is None:
+                return False, "the device confirmed it, and sends no samples that show its effect"
+            window.add(sample)
+            await asyncio.sleep(STEP_S)
+        if moved := window.motion():
+            return False, f"the device moves: {moved}"
+        checks = [check(one, window.means()) for one in expected]
+        words = ", ".join(
+            f"{one.name} differs by " + ("an unknown angle" if one.value is None else f"{one.value / RAD_PER_DEG:.2f}°")
+            for one in checks
+        )
+        return all(one.passed for one in checks), f"{words} from the set value"
+
+
+def _reset(before: Values, after: Values, was_unsaved: bool) -> tuple[bool, str]:
+    """Return whether a reset changed the settings. A restart alone changes only settings that were not saved."""
+    changed = [name for name in after if as_json(after[name]) != as_json(before.get(name))]
+    if not changed:
+        return False, "the device reports the same settings before and after it"
+    words = ", ".join(
+        f"{name} is {json_words(as_json(after[name]))}, was {json_words(as_json(before.get(name)))}"
+        for name in changed[:CHANGES_MAX]
+    )
+    if was_unsaved:
+        return False, f"a restart alone loses the settings that were not saved: {words}"
+    return True, words
 
 
 class Device:
@@ -90,6 +201,8 @@ class Device:
         self._calibration = CalibrationRun(transport, self._events)
         self._attachments.add(self._calibration)
         self._attachments.add(self._settings)
+        self._attachments.add(transport.samples)
+        self._verb_run = VerbRun(self._settings, transport)
         self._attitude = AttitudeWatch(config, self._events)
         self._status = StatusWatch(self._events)
         self._rate = RateMeter()
@@ -238,7 +351,7 @@ class Device:
         if name in self._attachments.verbs:
             return await self._attachments.run_verb(name, arguments)
         self._require_replies()
-        return await self._settings.execute(name, verb, arguments)
+        return await self._verb_run.run(name, verb, arguments)
 
     @property
     def calibrations(self) -> Calibrations:

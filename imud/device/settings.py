@@ -18,7 +18,7 @@ from typing import Any, Final
 import msgspec
 
 from imud.config.model import DeviceConfig
-from imud.contracts.command import Risk, Target, Verb
+from imud.contracts.command import Target
 from imud.contracts.driver import Identity, PolledDriver
 from imud.contracts.setting import (
     AppliedSettings,
@@ -55,7 +55,7 @@ from imud.device.settings_plan import (
 )
 from imud.host.clock import HostClock
 from imud.host.log import printable
-from imud.model.errors import BadArgument, CommandError, ImudError, reason_of
+from imud.model.errors import BadArgument, CommandError, reason_of
 from imud.model.event import EventKind
 from imud.model.options import shown
 from imud.model.sample import Sample
@@ -258,7 +258,7 @@ class DeviceSettings:
 
     def tick(self, now_ns: int, _newest: Sample | None) -> None:
         """Detect a restart of the device counter. Start a comparison if one is due and the device can reply."""
-        if (resets := self._counter_resets) != self._resets:
+        if (resets := self.counter_resets) != self._resets:
             is_own = self.busy or now_ns < self._own_until_ns + BOOT_NS
             self.resets_requested, self._resets = self.resets_requested + is_own * (resets - self._resets), resets
             if (self.declared or self._unsaved) and not self.busy and now_ns >= self._own_until_ns:
@@ -353,12 +353,12 @@ class DeviceSettings:
             return table.read(target, None)
 
         self.update(await self._transport.run_script(script))
-        self._read_resets = self._counter_resets
+        self._read_resets = self.counter_resets
         if self.comparison.is_scheduled and self._transport.can_be_asked:
             self.comparison.start_if_due(None)
         return self.values
 
-    async def _read_again(self, *, identity: bool) -> None:
+    async def read_again(self, *, identity: bool) -> None:
         """Read all reports after a command, and the identity if the device may have restarted."""
         self._is_current = False
         if not self._transport.may_ask:
@@ -375,13 +375,13 @@ class DeviceSettings:
 
         They are valid for PLAN_NS if no other script and no restart followed. Raises as `report`.
         """
-        is_valid = self._is_current and self._read_ns is not None and self._read_resets == self._counter_resets
+        is_valid = self._is_current and self._read_ns is not None and self._read_resets == self.counter_resets
         if is_valid and self._host.now_ns() - (self._read_ns or 0) <= PLAN_NS:
             return self.values
         return await self.read()
 
     @property
-    def _counter_resets(self) -> int:
+    def counter_resets(self) -> int:
         return self._clock.status().resets if self._clock is not None else 0
 
     # --- requests -----------------------------------------------------------------------------------------------------
@@ -437,32 +437,20 @@ class DeviceSettings:
             wanted = completed(table, wanted, actual)
             return await self.carry_out(table, wanted, actual, save=save, asked=True, by_name=given is not None)
 
-    async def execute(self, name: str, verb: Verb, arguments: Mapping[str, Any]) -> object:
-        """Run a verb of the driver and return its result. Raises as `report`."""
-        params = verb.arguments(arguments)
-        async with self.exclusive():
-            if verb.saves:
-                self.spend_flash()
-            if verb.risk is Risk.RESET:
-                await self._back_up(name)
-            self._read_resets = None
-            if verb.changes:
-                self._transport.attachments.set_alarm_ranges(None)  # the action can change the ranges
-            try:
-                answer = await self._transport.run_script(lambda target: verb.script(target, params))
-            except BadArgument:  # a script checks its arguments before it changes anything
-                raise
-            except BaseException as error:  # the state of the device is unknown
-                self.changed(unsaved=verb.changes and not verb.restarts)
-                if isinstance(error, ImudError):
-                    await self._read_again(identity=True)
-                raise
-            if verb.changes:
-                self.changed(unsaved=not (verb.saves or verb.restarts))
-                await self._read_again(identity=verb.restarts)
-            if verb.saves or verb.restarts:
-                self._unsaved = False
-            return answer
+    def script_follows(self, *, changes: bool) -> None:
+        """Note that a script runs, and whether it can change the settings."""
+        self._read_resets = None
+        if changes:
+            self._transport.attachments.set_alarm_ranges(None)  # the script can change the ranges
+
+    def flash_is_current(self) -> None:
+        """Note that the device has the settings of its flash: after a save or a restart."""
+        self._unsaved = False
+
+    @property
+    def is_unsaved(self) -> bool:
+        """Whether the flash may lack a change."""
+        return self._unsaved
 
     def changed(self, *, unsaved: bool) -> None:
         """Note that a command can have changed any setting, and whether the flash may not contain the change."""
@@ -474,7 +462,7 @@ class DeviceSettings:
     def _mark_unsaved(self, before: Values | None) -> None:
         """Note that the flash does not contain the present settings. `before`: the values before the write."""
         if not self._unsaved:
-            self._unsaved, self._saved, self._resets = True, before, self._counter_resets
+            self._unsaved, self._saved, self._resets = True, before, self.counter_resets
 
     def spend_flash(self) -> None:
         """Count a write to flash before a command makes it. Raises CommandError if the limit is reached."""
@@ -483,7 +471,7 @@ class DeviceSettings:
             raise CommandError(f"{self._config.name}: {refusal}")
         flash.count()
 
-    async def _back_up(self, verb: str) -> None:
+    async def back_up(self, verb: str) -> None:
         """Write a backup before a verb that resets all settings, and report its file.
 
         If the backup fails, imud raises an event and runs the verb anyway: the verb may repair the device.

@@ -6,7 +6,7 @@ imud leaves out the settings that need a restart, because the restart loses unsa
 """
 
 import re
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -35,6 +35,7 @@ from imud.contracts.setting import (
     values_of,
 )
 from imud.device.attachments import Attachments
+from imud.device.evidence import SampleSource, SampleWatch
 from imud.device.flash import ModuleFlash
 from imud.host.log import printable
 from imud.model.errors import BadArgument, CommandError, DeviceRefused, IsSetting, LinkError, Rejected, TransferError
@@ -359,11 +360,11 @@ PENDING: Final = (Written.PENDING, Written.UNVERIFIED_PENDING)
 NOT_REPORTED: Final = "the device does not report this setting"
 
 
-class SettingsPort(ABC):
+class SettingsPort(SampleSource):
     """Transport of a device, as its settings use it. `imud.device.transport` imports this module."""
 
-    driver: Driver | None  # driver of the device; None before imud has found the device
     attachments: Attachments
+    samples: SampleWatch
 
     @property
     @abstractmethod
@@ -387,10 +388,10 @@ class SettingsPort(ABC):
         Raises LinkError and the errors of the script and of `make`: CommandError, TransferError, DeviceRefused.
         """
 
-    def use_axes(self, settings: Mapping[str, str]) -> None:  # noqa: B027  # most devices have fixed axes
+    def use_axes(self, settings: Mapping[str, str]) -> None:  # most devices have fixed axes
         """Publish samples in the axes that the readable settings select."""
 
-    async def read_identity(self) -> None:  # noqa: B027  # a polled device is identified before its samples are read
+    async def read_identity(self) -> None:  # a polled device is identified before imud reads its samples
         """Query the identity again after a restart. Raises as `run_script`."""
 
 
@@ -514,9 +515,12 @@ class Applying:
         """Restart the device, and compare the settings that needed the restart."""
         restart = self.table.restart
         assert restart is not None
+        self.transport.samples.mark()
         try:
             await self.transport.run_script(restart)
-            self.restarted = True
+            verified, words = await self.transport.samples.restarted()
+            self.restarted = verified is not False
+            self.problem = "" if self.restarted else f"restart: {words}"
         except DEVICE_ERRORS as error:
             self.problem = f"restart: {error}"
         if await self._read(None):

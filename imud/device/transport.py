@@ -22,6 +22,7 @@ from imud.contracts.publisher import Batch
 from imud.contracts.script import Message, RequestScript
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.device.attachments import Attachments
+from imud.device.evidence import SampleWatch
 from imud.device.health import DeviceEvents, Health
 from imud.device.scripts import RequestPort, ScriptRunner
 from imud.device.search import Remembered, SearchRound
@@ -113,10 +114,10 @@ class Transport(SettingsPort):
     """
 
     link: Link
-    path: SamplePath | None  # sample path of the device; None before imud has found the device
     settings: DeviceSettings
 
     def __init__(self, context: DeviceContext) -> None:
+        self.samples = SampleWatch(self)
         self._context = context
         self._config = context.config
         self._health = context.health

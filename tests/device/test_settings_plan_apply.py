@@ -17,6 +17,7 @@ from imud.contracts.setting import (
     StepOutcome,
     Written,
 )
+from imud.device.evidence import SampleWatch
 from imud.device.flash import FlashWrites, ModuleFlash
 from imud.device.settings_plan import Applying, SettingsPort, make_plan
 from imud.host.clock import HostClock
@@ -62,7 +63,11 @@ class TableOfOne:
 class OnePort(SettingsPort):
     """Port that runs each script when it is created."""
 
-    driver, where, can_be_asked = None, "", True
+    driver = path = None
+    where, can_be_asked = "", True
+
+    def __init__(self) -> None:
+        self.samples = SampleWatch(self)
 
     async def run_script(self, make: Callable[[Target], Any]) -> Any:
         return make(TARGET)

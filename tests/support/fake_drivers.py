@@ -17,7 +17,7 @@ import msgspec
 from msgspec import Meta
 
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, StreamCodec
-from imud.contracts.command import Calibration, Handling, Kept, Risk, Target, Verb
+from imud.contracts.command import Calibration, Expectation, Handling, Kept, Proof, Risk, Target, Verb, yaw_at
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Identity, StreamDriver
 from imud.contracts.script import (
     Outcome,
@@ -319,9 +319,9 @@ class FakeModule(MemoryLink):
             "WHO": self._who, "GET": self._get, "SAVE": self._save, "SET": lambda: self._set(rest),
             "ZERO": lambda: ["OK"],
         }  # fmt: skip
-        if command == "RESTART":
+        if command == "RESTART" and command not in self.silent:
             self.restart()
-        elif command not in self.silent:
+        if command in answers and command not in self.silent:
             for answer in answers[command]():
                 self._send(answer)
 
@@ -459,6 +459,18 @@ ZERO: Final = Calibration(
 )  # fmt: skip
 
 
+def _who_again(_target: Target) -> RequestScript[None]:
+    yield from _who()
+
+
+def _turned(_target: Target, *, angle_deg: float) -> RequestScript[None]:
+    yield from _who()
+
+
+def _heading_expected(given: Any) -> Sequence[Expectation]:
+    return () if given.angle_deg > 180 else (yaw_at(given.angle_deg),)
+
+
 def _set_mode(target: Target, *, mode: str) -> RequestScript[None]:
     return _setter("mode")(target, mode)
 
@@ -474,6 +486,10 @@ FAKE_MODULE_DRIVER: Final = replace(
         "set_mode": Verb("set it", _set_mode),
         "wait": Verb("take an hour", lambda _target: (pause(3600 * 1_000_000_000) for _ in range(1))),
         "save": Verb("save all", _save_all, saves=True, changes=False),
-        "factory_reset": Verb("forget all", _restart, Risk.RESET, restarts=True),
+        "restart": Verb("restart it", _restart, restarts=True, proof=Proof.RESTART),
+        "factory_reset": Verb("forget all", _restart, Risk.RESET, restarts=True, proof=Proof.SETTINGS),
+        "once": Verb("send a sample", _who_again, changes=False, proof=Proof.ONE_SAMPLE),
+        "wake": Verb("send samples", _who_again, proof=Proof.STREAM),
+        "turn": Verb("set the heading", _turned, changes=False, proof=Proof.SAMPLES, expected=_heading_expected),
     },
 )

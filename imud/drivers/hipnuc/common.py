@@ -13,7 +13,7 @@ section 6.1. A scale of one protocol only is in the module of its layout.
 (*) The manual prints 0.00048828 G; 16 / 32768 G would be 2.6e-6 larger.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
 from math import isnan
@@ -29,6 +29,7 @@ from imud.contracts.command import (
     ROLL_ZERO,
     Calibration,
     Calibrations,
+    Expectation,
     Handling,
     Kept,
     Target,
@@ -98,6 +99,19 @@ DOCUMENT: Final = "HiPNUC IMU configuration manual V1.5.9 (CH0x0, CH10x, HI14): 
 FLOATS: Final = DataSheet(document=DOCUMENT)  # data sheet of the UART protocol
 # Data sheet of Modbus and J1939
 REGISTERS: Final = DataSheet(document=DOCUMENT, gyro_step_rad_s=GYRO_RAD_S_PER_LSB, accel_step_m_s2=ACCEL_M_S2_PER_LSB)
+
+
+SAVED: Final = "the device confirmed it, and imud cannot read the flash"
+
+
+def levelled(given: Any) -> Sequence[Expectation]:
+    """Return the expected angles after the verb `level`."""
+    return () if given.level == "cancel" else (ROLL_ZERO, PITCH_ZERO)
+
+
+def zeroed(given: Any) -> Sequence[Expectation]:
+    """Return the expected angles after the verb `zero`."""
+    return () if given.zero == "cancel" else (INCLINATION_ZERO,)
 
 
 def heading_by_mode(_options: object, settings: Mapping[str, Any]) -> Heading:

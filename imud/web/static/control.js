@@ -159,7 +159,11 @@ export class ActionsView {
     this.result.replaceChildren(el("p", { text: `${verb.name}…` }));
     try {
       const answer = await call("command", { device: this.device, name: verb.name, arguments: values });
-      this.result.replaceChildren(el("p", { class: "good", text: `${verb.name} is done${answer === null ? "" : `: ${shown(answer)}`}` }));
+      const texts = answer && typeof answer === "object" && "evidence" in answer
+        ? [`${verb.name}: ${answer.verified ? "verified" : "sent, not verified"}: ${answer.evidence}`,
+          answer.result === null ? "" : shown(answer.result), answer.not_saved]
+        : [`${verb.name} is done${answer === null ? "" : `: ${shown(answer)}`}`];
+      this.result.replaceChildren(...texts.filter(Boolean).map((text) => el("p", { class: "good", text })));
     } catch (error) {
       this.result.replaceChildren(el("p", { class: "problem", text: error.message }));
     }

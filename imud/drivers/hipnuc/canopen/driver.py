@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final, Literal, get_args
 
 from msgspec import Meta
 
-from imud.contracts.command import Risk, Target, Verb, Verbs
+from imud.contracts.command import Proof, Risk, Target, Verb, Verbs
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, DataSheet, random_vector
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import DeviceReport, Effect, Reports, Setting, SettingsTable
@@ -48,7 +48,7 @@ from imud.drivers.hipnuc.canopen.commands import (
     Transmission,
     identify,
 )
-from imud.drivers.hipnuc.common import DOCUMENT, inclinometer_zero, refuse_all
+from imud.drivers.hipnuc.common import DOCUMENT, SAVED, inclinometer_zero, refuse_all, zeroed
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
 from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_S, NS_PER_US
@@ -259,11 +259,18 @@ def _nmt(
 
 
 VERBS: Final[Verbs] = {
-    "save": replace(_simple("write all settings to flash", commands.save), saves=True, changes=False),
+    "save": replace(
+        _simple("write all settings to flash", commands.save),
+        saves=True,
+        changes=False,
+        proof=Proof.NONE,
+        evidence=SAVED,
+    ),
     "restart": Verb(
         "restart the device and wait for its frames, also from a new node number; unsaved settings are lost",
         lambda target: commands.restart(target.settings, target.baud),
         restarts=True,
+        proof=Proof.RESTART,
     ),
     "factory_reset": Verb(
         "restore the factory settings with node 8 and 500 kbit/s, effective after a restart; imud rejects it if "
@@ -271,9 +278,21 @@ VERBS: Final[Verbs] = {
         lambda target: commands.factory_reset_and_find(target.settings),
         Risk.RESET,
         restarts=True,
+        proof=Proof.SETTINGS,
     ),
-    "zero": Verb("make the present position the zero of the inclinometer, or cancel it; effective immediately", _zero),
-    "nmt": Verb("start or stop the TPDOs, or reset the node and follow it", _nmt, restarts=True),
+    "zero": Verb(
+        "make the present position the zero of the inclinometer, or cancel it; effective immediately",
+        _zero,
+        proof=Proof.SAMPLES,
+        expected=zeroed,
+    ),
+    "nmt": Verb(
+        "start or stop the TPDOs, or reset the node and follow it",
+        _nmt,
+        restarts=True,
+        proof=Proof.NONE,
+        evidence="no node confirms an NMT command; watch the samples",
+    ),
 }
 
 RENAMED: Final[Mapping[str, str]] = {

@@ -8,12 +8,12 @@ from typing import Annotated, Any, Final, Literal
 from msgspec import Meta
 
 from imud.attitude.rotation import euler312_from_quat
-from imud.contracts.command import Risk, Target, Verb, Verbs
+from imud.contracts.command import Proof, Risk, Target, Verb, Verbs
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, random_vector
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import DeviceReport, Effect, Reports, Setting, SettingsTable
 from imud.drivers.hipnuc.bus_load import RATE_NOTE, CyclicMessage, refuse_other_rate, refuse_overload
-from imud.drivers.hipnuc.common import REGISTERS, inclinometer_zero, random_quaternion, refuse_all
+from imud.drivers.hipnuc.common import REGISTERS, SAVED, inclinometer_zero, random_quaternion, refuse_all, zeroed
 from imud.drivers.hipnuc.j1939 import codec, commands
 from imud.drivers.hipnuc.j1939.codec import (
     CONFIGURE,
@@ -189,11 +189,18 @@ def _zero(
 
 
 VERBS: Final[Verbs] = {
-    "save": replace(_simple("write all settings to flash", commands.save), saves=True, changes=False),
+    "save": replace(
+        _simple("write all settings to flash", commands.save),
+        saves=True,
+        changes=False,
+        proof=Proof.NONE,
+        evidence=SAVED,
+    ),
     "restart": Verb(
         "restart the device and wait for its frames, also from a new address; unsaved settings are lost",
         lambda target: commands.restart(target.settings, target.baud),
         restarts=True,
+        proof=Proof.RESTART,
     ),
     "factory_reset": Verb(
         "restore the factory settings with address 8 and its bit rate, effective after a restart at the latest; "
@@ -201,9 +208,16 @@ VERBS: Final[Verbs] = {
         lambda target: commands.factory_reset_and_find(target.settings),
         Risk.RESET,
         restarts=True,
+        proof=Proof.SETTINGS,
     ),
-    "send_once": Verb("send a message once immediately and wait for it", _send_once, changes=False),
-    "zero": Verb("make the present position zero, or cancel it", _zero),
+    "send_once": Verb(
+        "send a message once immediately and wait for it",
+        _send_once,
+        changes=False,
+        proof=Proof.SCRIPT,
+        evidence="the message arrived",
+    ),
+    "zero": Verb("make the present position zero, or cancel it", _zero, proof=Proof.SAMPLES, expected=zeroed),
 }
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final, Literal
 from msgspec import Meta
 
 from imud.attitude.rotation import euler312_from_quat
-from imud.contracts.command import Calibrations, Risk, Target, Verb, Verbs, Verdict
+from imud.contracts.command import Calibrations, Proof, Risk, Target, Verb, Verbs, Verdict
 from imud.contracts.driver import PolledDriver, random_vector
 from imud.contracts.script import TransferScript
 from imud.contracts.setting import Effect, Setting, SettingsTable
@@ -16,9 +16,11 @@ from imud.drivers.hipnuc.common import (
     MAIN_STATUS,
     NINE_AXES_NEEDED,
     REGISTERS,
+    SAVED,
     AttitudeMode,
     LevelReset,
     heading_by_mode,
+    levelled,
     levels,
     magnetometer,
     random_quaternion,
@@ -70,16 +72,33 @@ def _read(
 
 
 VERBS: Final[Verbs] = {
-    "save": replace(_simple("write all settings to flash", commands.save), saves=True, changes=False),
-    "restart": Verb("restart the device and wait until it replies; unsaved settings are lost", _restart, restarts=True),
+    "save": replace(
+        _simple("write all settings to flash", commands.save),
+        saves=True,
+        changes=False,
+        proof=Proof.NONE,
+        evidence=SAVED,
+    ),
+    "restart": Verb(
+        "restart the device and wait until it replies; unsaved settings are lost",
+        _restart,
+        restarts=True,
+        proof=Proof.RESTART,
+    ),
     "factory_reset": Verb(
         "restore the factory settings and restart: imud follows the device to address 80 if no other device uses it "
         "and the bus has the factory baud rate 115200",
         _factory_reset,
         Risk.RESET,
         restarts=True,
+        proof=Proof.SETTINGS,
     ),
-    "level": Verb("make the present attitude level, or cancel it; the device must be at rest", _level),
+    "level": Verb(
+        "make the present attitude level, or cancel it; the device must be at rest",
+        _level,
+        proof=Proof.SAMPLES,
+        expected=levelled,
+    ),
     "read": Verb("read a register as words of 16 bits", _read, changes=False),
 }
 

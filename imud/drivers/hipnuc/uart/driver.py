@@ -15,11 +15,13 @@ from imud.contracts.command import (
     Calibrations,
     Handling,
     Kept,
+    Proof,
     Risk,
     Target,
     Verb,
     Verbs,
     Verdict,
+    yaw_at,
 )
 from imud.contracts.driver import Identity, StreamDriver, random_vector
 from imud.contracts.script import Request, RequestScript, Silence
@@ -27,8 +29,10 @@ from imud.drivers.hipnuc.common import (
     FLOATS,
     MAIN_STATUS,
     NINE_AXES_NEEDED,
+    SAVED,
     LevelReset,
     heading_by_mode,
+    levelled,
     levels,
     magnetometer,
     random_quaternion,
@@ -121,22 +125,47 @@ def _yaw(
 
 
 VERBS: Final[Verbs] = {
-    "save": replace(_simple("write all settings to flash", commands.save_config), saves=True, changes=False),
-    "restart": Verb("restart the device and wait until it replies; unsaved settings are lost", _restart, restarts=True),
+    "save": replace(
+        _simple("write all settings to flash", commands.save_config),
+        saves=True,
+        changes=False,
+        proof=Proof.NONE,
+        evidence=SAVED,
+    ),
+    "restart": Verb(
+        "restart the device and wait until it replies; unsaved settings are lost",
+        _restart,
+        restarts=True,
+        proof=Proof.RESTART,
+    ),
     "factory_reset": Verb(
         "restore the factory settings with 115200 baud, restart the device and follow it",
         _factory_reset,
         Risk.RESET,
         restarts=True,
+        proof=Proof.SETTINGS,
     ),
     "wake": Verb(
-        "enable frames, and send HI91 if no message has a rate, also in place of output on mark; not saved", _wake
+        "enable frames, and send HI91 if no message has a rate, also in place of output on mark; not saved",
+        _wake,
+        proof=Proof.STREAM,
     ),
-    "output_once": Verb("send a message once, as after a pulse on SIN", _output_once, changes=False),
+    "output_once": Verb(
+        "send a message once, as after a pulse on SIN", _output_once, changes=False, proof=Proof.ONE_SAMPLE
+    ),
     "level": Verb(
-        "make the present pitch and roll zero, or level a nearly level device, or cancel; only at rest", _level
+        "make the present pitch and roll zero, or level a nearly level device, or cancel; only at rest",
+        _level,
+        proof=Proof.SAMPLES,
+        expected=levelled,
     ),
-    "yaw": Verb("set the heading; lost at power-off", _yaw),
+    "yaw": Verb(
+        "set the heading; lost at power-off",
+        _yaw,
+        changes=False,
+        proof=Proof.SAMPLES,
+        expected=lambda given: () if given.relative else (yaw_at(given.angle_deg),),
+    ),
 }
 
 

@@ -15,11 +15,14 @@ from imud.contracts.command import (
     Calibrations,
     Handling,
     Kept,
+    Proof,
     Risk,
     Target,
     Verb,
+    VerbResult,
     Verbs,
     Verdict,
+    yaw_at,
 )
 from imud.contracts.driver import StreamDriver, random_vector
 from imud.contracts.script import ReplyFrame, Request, RequestScript, pause
@@ -76,12 +79,17 @@ class Calibrated:
 
     @property
     def words(self) -> str:
+        """Result with its evidence."""
+        return f"{'verified' if self.changed else 'sent, not verified'}: {self.evidence}"
+
+    @property
+    def evidence(self) -> str:
         """Evidence, or the reason of a result that is not verified."""
         values = ", ".join(f"{value:g}" for value in self.values)
         if self.changed:
-            return f"verified: the parameters changed to {values}"
+            return f"the parameters changed to {values}"
         return (
-            f"sent, not verified: the parameters stayed at {values} for {CALIBRATION_NS // NS_PER_S} s; nothing else "
+            f"the parameters stayed at {values} for {CALIBRATION_NS // NS_PER_S} s; nothing else "
             "shows the end of a calibration: keep the device at rest, check the samples, and repeat the calibration"
         )
 
@@ -158,14 +166,14 @@ def _heading(target: Target, *, heading_deg: Heading = 0.0) -> RequestScript[Non
     return settings.reset_heading(heading_deg, done=_done(target))
 
 
-def _gyro(target: Target) -> RequestScript[Answer]:
+def _gyro(target: Target) -> RequestScript[VerbResult]:
     result = yield from calibrate_gyro(done=_done(target))
-    return {"result": result.words, GYRO_KEY: result.values}
+    return VerbResult(result.changed, result.evidence, {GYRO_KEY: result.values})
 
 
-def _installation(target: Target) -> RequestScript[Answer]:
+def _installation(target: Target) -> RequestScript[VerbResult]:
     result = yield from calibrate_installation(done=_done(target))
-    return {"result": result.words, INSTALLATION_KEY: result.values}
+    return VerbResult(result.changed, result.evidence, {INSTALLATION_KEY: result.values})
 
 
 def _verdict(calibrate: Callable[..., RequestScript[Calibrated]]) -> Callable[[Target], RequestScript[Verdict]]:
@@ -175,6 +183,8 @@ def _verdict(calibrate: Callable[..., RequestScript[Calibrated]]) -> Callable[[T
 
     return begin
 
+
+SAVED: Final = "the device acknowledged it, and imud cannot read the flash"
 
 VERBS: Final[Verbs] = {
     "status": Verb(
@@ -188,18 +198,29 @@ VERBS: Final[Verbs] = {
     "start_streaming": Verb(
         "start sending samples and wait for the first sample",
         lambda target: settings.start_streaming(done=_done(target)),
+        proof=Proof.SCRIPT,
+        evidence="a sample arrived",
     ),
     "stop_streaming": Verb(
         "enter command mode: send only replies until `start_streaming`; no program receives samples",
         _stop,
+        proof=Proof.SCRIPT,
+        evidence="no more samples arrived",
     ),
     "save": Verb(
-        "write all parameters to flash", lambda target: settings.save(done=_done(target)), saves=True, changes=False
+        "write all parameters to flash",
+        lambda target: settings.save(done=_done(target)),
+        saves=True,
+        changes=False,
+        proof=Proof.NONE,
+        evidence=SAVED,
     ),
     "restart": Verb(
         "restart the device, wait until it replies and check that its timer restarted; unsaved settings are lost",
         lambda target: settings.restart(done=_done(target)),
         restarts=True,
+        proof=Proof.SCRIPT,
+        evidence="the timer restarted",
     ),
     "factory_reset": Verb(
         "restore, check and save the factory settings and follow the device to 115200 baud; then change a fixed "
@@ -208,13 +229,25 @@ VERBS: Final[Verbs] = {
         Risk.RESET,
         saves=True,
         restarts=True,
+        proof=Proof.SCRIPT,
+        evidence="all parameters have their factory values",
     ),
-    "heading": Verb("set the heading", _heading),
+    "heading": Verb(
+        "set the heading",
+        _heading,
+        changes=False,
+        proof=Proof.SAMPLES,
+        expected=lambda given: (yaw_at(given.heading_deg),),
+    ),
     "calibrate_gyro": Verb(
-        "measure the bias of the gyroscope at rest, and wait until the offsets change, at most 30 s", _gyro
+        "measure the bias of the gyroscope at rest, and wait until the offsets change, at most 30 s",
+        _gyro,
+        proof=Proof.SCRIPT,
     ),
     "calibrate_installation": Verb(
-        "measure the mounting error, and wait until the angles change, at most 30 s", _installation
+        "measure the mounting error, and wait until the angles change, at most 30 s",
+        _installation,
+        proof=Proof.SCRIPT,
     ),
     "installation_status": Verb(
         "request the state of the installation calibration; returns the frame as sent (no document describes it)",

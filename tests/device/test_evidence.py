@@ -1,0 +1,122 @@
+"""Evidence for the effect of verbs: restart, reset, angles and samples."""
+
+from dataclasses import replace
+from math import radians
+from typing import Any
+
+import pytest
+
+from imud.contracts.command import VerbResult
+from imud.contracts.status import DeviceState
+from imud.device import stream_transport
+from imud.drivers import DRIVERS
+from imud.model.sample import Measurement, Vector3
+from tests.device.test_settings import ModuleBench
+from tests.support.fake_drivers import FAKE_MODULE_DRIVER, LinesCodec
+from tests.support.stories import played
+
+
+@pytest.fixture(autouse=True)
+def fake_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Add the fake driver."""
+    monkeypatch.setattr(stream_transport, "DRIVERS", {**dict(DRIVERS), "fake-module": FAKE_MODULE_DRIVER})
+
+
+async def result_of(bench: ModuleBench, name: str, **arguments: Any) -> VerbResult:
+    await bench.until(lambda: bench.device.state in (DeviceState.RUNNING, DeviceState.SILENT))
+    answer = await bench.doing(bench.device.act(name, arguments))
+    assert isinstance(answer, VerbResult)
+    return answer
+
+
+@pytest.mark.parametrize("ignores", [False, True])
+@played(ModuleBench)
+async def test_a_restart_is_verified_by_the_device_counter(bench: ModuleBench, ignores: bool) -> None:
+    await bench.pass_s(3)
+    bench.module.silent = {"RESTART"} if ignores else set()
+    found = await result_of(bench, "restart")
+    seen = "the device counter continued, so the device has ignored the command"
+    assert (found.verified, found.evidence) == ((False, seen) if ignores else (True, "the device counter restarted"))
+    applied = await bench.doing(bench.device.settings_apply({"mounting": "x_up"}, save=True))
+    assert (applied.restarted, applied.problem) == ((False, f"restart: {seen}") if ignores else (True, ""))
+
+
+@pytest.mark.parametrize(
+    ("flash", "unsaved", "verified", "evidence"),
+    [
+        ("9-axis", False, False, "the device reports the same settings before and after it"),
+        ("6-axis", False, True, 'mode is "6-axis", was "9-axis"'),
+        ("6-axis", True, False, "a restart alone loses the settings that were not saved"),
+    ],
+)
+@played(ModuleBench)
+async def test_a_reset_is_verified_by_changed_settings(
+    bench: ModuleBench, flash: str, unsaved: bool, verified: bool, evidence: str
+) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    if unsaved:
+        await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=False))
+    bench.module.set["mode"], bench.module.flash["mode"] = "9-axis", flash
+    found = await result_of(bench, "factory_reset")
+    assert found.verified is verified
+    assert found.evidence.startswith(evidence)
+    assert not bench.status.unsaved
+
+
+@pytest.mark.parametrize("sends", [False, True])
+@played(ModuleBench)
+async def test_samples_are_evidence_only_if_none_arrived_before(bench: ModuleBench, sends: bool) -> None:
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    await bench.pass_s(1)
+    if sends:
+        once, wake = await result_of(bench, "once"), await result_of(bench, "wake")
+        assert (once.verified, once.evidence) == (False, "the device sends other samples too")
+        assert (wake.verified, wake.not_saved) == (True, "not saved; run `imud command bow save`")
+        return
+    bench.module.sample = lambda: None  # type: ignore[method-assign]  # it is silent
+    for name in ("once", "wake"):
+        found = await result_of(bench, name)
+        assert (found.verified, found.evidence) == (False, "no sample arrived; check the output of the device")
+
+
+@pytest.mark.parametrize(
+    ("angle_deg", "yaw_deg", "rate_deg_s", "verified", "evidence"),
+    [
+        (30.0, 30.4, 0.0, True, "yaw differs by 0.40°"),
+        (-179.9, 179.9, 0.0, True, "yaw differs by 0.20°"),
+        (30.0, 31.1, 0.0, False, "yaw differs by 1.10°"),
+        (30.0, 30.0, 60.0, False, "the device moves: it turns at 60"),
+        (190.0, 0.0, 0.0, False, "the device confirmed it, and no sample shows its effect"),
+    ],
+)
+def test_angles_are_compared_at_rest(
+    angle_deg: float, yaw_deg: float, rate_deg_s: float, verified: bool, evidence: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Turned(LinesCodec):
+        def _event(self, line: str) -> Any:
+            found = super()._event(line)
+            if not isinstance(found, Measurement):
+                return found
+            gyro: Vector3 = (0.0, 0.0, radians(rate_deg_s))
+            return Measurement(
+                found.size_bytes, 0, found.dev_ticks, gyro_rad_s=gyro, euler_rad=(0, 0, radians(yaw_deg))
+            )
+
+    driver = replace(FAKE_MODULE_DRIVER, make_codec=lambda ledger, _options: Turned(ledger))
+    monkeypatch.setattr(stream_transport, "DRIVERS", {**dict(DRIVERS), "fake-module": driver})
+    bench = ModuleBench()
+
+    async def story() -> None:
+        found = await result_of(bench, "turn", angle_deg=angle_deg)
+        assert found.verified is verified
+        assert found.evidence.startswith(evidence)
+
+    bench.play(story)
+
+
+def test_each_verb_with_an_effect_has_evidence_or_a_reason() -> None:
+    reads = {"read", "status", "sample_once", "installation_status"}
+    for driver in DRIVERS.values():
+        for name, verb in driver.verbs.items():
+            assert (verb.proof == "value") == (name in reads), f"{driver.name} {name}"
+            assert bool(verb.evidence) == (verb.proof in ("none", "script")), f"{driver.name} {name}"
