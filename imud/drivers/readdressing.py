@@ -80,12 +80,12 @@ class Readdressing:
         if found is None:
             if bus_bit_s and bit_s != bus_bit_s:
                 rate = f"{bit_s} bit/s"
-                return f"restarted; the device now uses {rate} and the bus does not; set the bus to {rate}"
+                return f"the device now uses {rate} and the bus does not; set the bus to {rate}"
             words = " or ".join(map(str, places))
             raise NoReply(f"no frame of {self.noun} {words} after the restart; does it use another bit rate now?")
         if found != self.present:
             yield self.move(found)
-        return f"restarted, {self.words} {found}"
+        return f"found {self.words} {found}"
 
     def check_factory(self) -> RequestScript[None]:
         """Raise BadArgument if another device uses the factory place."""

@@ -193,13 +193,13 @@ def test_a_restarted_device_is_found_at_its_saved_or_present_place(
     saved: dict[str, int], place: int, boots: bool
 ) -> None:
     bench = Bench(FakeDevice(saved=saved, booted=place, boots=boots))
-    assert bench.restart() == f"restarted, as node {place}"
+    assert bench.restart() == f"found as node {place}"
     assert bench.options == FakeOptions(place)
 
 
 def test_the_factory_place_is_accepted_by_its_boot_frame_only() -> None:
     bench = Bench(FakeDevice(saved={"place": 9}, booted=FACTORY))
-    assert bench.restart() == "restarted, as node 8"
+    assert bench.restart() == "found as node 8"
     bench = Bench(FakeDevice(saved={"place": 9}, booted=FACTORY, boots=False))
     with pytest.raises(NoReply, match="no frame of node 5 or 9 after the restart"):
         bench.restart()
@@ -209,20 +209,18 @@ def test_the_factory_place_is_accepted_by_its_boot_frame_only() -> None:
 def test_frames_of_other_devices_are_ignored() -> None:
     bench = Bench(FakeDevice(saved={"place": 9}, booted=5))
     bench.beside = [ReplyFrame(BOOTS + 12, b"\0"), ReplyFrame(BOOTS + 9, b"\5"), ReplyFrame(REPLIES + 12, b"\0")]
-    assert bench.restart() == "restarted, as node 5"
+    assert bench.restart() == "found as node 5"
 
 
 def test_any_boot_frame_is_accepted_if_the_device_reports_no_settings() -> None:
     bench = Bench(FakeDevice(booted=33))
-    assert bench.restart() == "restarted, as node 33"
+    assert bench.restart() == "found as node 33"
     assert bench.options == FakeOptions(33)
 
 
 def test_a_lost_device_is_reported_with_its_saved_bit_rate() -> None:
     bench = Bench(FakeDevice(saved={"place": 9, "rate": 0}))
-    assert bench.restart() == (
-        "restarted; the device now uses 250000 bit/s and the bus does not; set the bus to 250000 bit/s"
-    )
+    assert bench.restart() == ("the device now uses 250000 bit/s and the bus does not; set the bus to 250000 bit/s")
     assert bench.sent == [(5, RESTART, 0), (5, QUERY, 0), (9, QUERY, 0)]
     for saved, bus_bit_s in (({"rate": 1}, BUS_BIT_S), ({"rate": 7}, BUS_BIT_S), ({}, BUS_BIT_S), ({"rate": 0}, 0)):
         with pytest.raises(NoReply, match="no frame of node 5 after the restart; does it use another bit rate now"):

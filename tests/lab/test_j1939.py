@@ -10,6 +10,7 @@ from time import monotonic, monotonic_ns
 
 import pytest
 
+from imud.contracts.command import VerbResult
 from imud.contracts.status import DeviceState
 from imud.drivers.hipnuc.j1939 import codec, commands
 from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
@@ -147,10 +148,12 @@ def test_driver_and_simulator_with_every_message_and_changes(vcan: CanInterface)
     module = HipnucJ1939Module(monotonic_ns(), J1939Settings(fast), quiet)
     other = HipnucJ1939Module(monotonic_ns(), J1939Settings(fast, address=9), quiet)
     rig = BusRig(vcan.name, "hipnuc-j1939", HipnucJ1939Options(), module, other)
-    results: dict[str, object] = {}
+    results: dict[str, VerbResult] = {}
 
     async def told(name: str, **arguments: object) -> None:
-        results[name] = await rig.done(rig.device.act(name, arguments))
+        answer = await rig.done(rig.device.act(name, arguments))
+        assert isinstance(answer, VerbResult)
+        results[name] = answer
 
     async def story() -> None:
         await rig.until(lambda: len(rig.samples) >= 20, "twenty samples")
@@ -164,7 +167,8 @@ def test_driver_and_simulator_with_every_message_and_changes(vcan: CanInterface)
         assert "restart them" in applied.advice
         await told("save")
         await told("restart")
-        assert results == {"zero": None, "save": None, "restart": "restarted, at address 8"}
+        found = {name: one.result for name, one in results.items()}
+        assert found == {"zero": None, "save": None, "restart": "found at address 8"}
         assert module.flash.x_reversed == 1
         assert module.settings == module.flash
         count = len(rig.samples)

@@ -63,7 +63,7 @@ class Protocol(NamedTuple):
 
 CANOPEN = Protocol(
     noun="node",
-    restarted="restarted, as node",
+    restarted="found as node",
     make=lambda number=8, **more: CanopenBench(NodeSettings(node=number), **more),
     variants=NODE_VARIANTS,
     variant=NodeVariant,
@@ -97,7 +97,7 @@ CANOPEN = Protocol(
 )
 J1939 = Protocol(
     noun="address",
-    restarted="restarted, at address",
+    restarted="found at address",
     make=lambda number=8, **more: J1939Bench(J1939Settings(address=number), **more),
     variants=J1939_VARIANTS,
     variant=J1939Variant,
@@ -223,10 +223,7 @@ def test_a_restart_that_loses_the_device_is_reported(protocol: Protocol) -> None
     bench.run(BOOTED_NS)
     bench.act("bitrate", bitrate=250_000)
     bench.module.hardware = type(bench.module.hardware)(boot_ms=60_000)  # afterwards, the host cannot read its frames
-    assert (
-        bench.act("restart")
-        == "restarted; the device now uses 250000 bit/s and the bus does not; set the bus to 250000 bit/s"
-    )
+    assert bench.act("restart") == "the device now uses 250000 bit/s and the bus does not; set the bus to 250000 bit/s"
     bench = protocol.make(boot_ms=60_000)
     bench.now_ns += 70_000_000_000
     with pytest.raises(NoReply, match=f"no frame of {protocol.noun} 8 after the restart"):

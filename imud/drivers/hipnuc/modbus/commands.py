@@ -128,7 +128,7 @@ def restart(places: tuple[int, ...], line_baud: int) -> TransferScript[str]:
     yield from send_control(RESTART)
     rate = BAUD_RATES[baud] if baud is not None and baud < len(BAUD_RATES) else line_baud
     if line_baud and rate != line_baud:
-        return f"restarted; the device now uses {rate} baud and the RS-485 bus does not; set the bus to {rate} baud"
+        return f"the device now uses {rate} baud and the RS-485 bus does not; set the bus to {rate} baud"
     known = (address, *places) if address is not None and address in SLAVES else places
     return (yield from _await(serial, tuple(dict.fromkeys(known)), places[0]))
 
@@ -316,6 +316,6 @@ def _await(serial: tuple[int, ...], places: tuple[int, ...], at: int) -> Transfe
         if (yield from _is_at(serial, place, BOOT_REPLY_MS)):
             if place != at:
                 yield from _move(place)
-            return f"restarted, at address {place}"
+            return f"found at address {place}"
     words = " or ".join(map(str, places))
     raise NoReply(f"the device does not reply at address {words} after its restart; does it use another baud rate now?")

@@ -129,5 +129,5 @@ def test_a_restart_is_followed_by_nmt_too() -> None:
     bench = CanopenBench(NodeSettings(node=8), boot_ms=300)
     bench.run_script(moves.change_node(bench.settings, 9))
     bench.run_script(session.save(bench.settings.node))
-    assert bench.run_script(moves.reset(bench.settings, 500_000, NmtCommand.RESET_NODE)) == "restarted, as node 9"
+    assert bench.run_script(moves.reset(bench.settings, 500_000, NmtCommand.RESET_NODE)) == "found as node 9"
     assert bench.settings.node == bench.module.node == 9

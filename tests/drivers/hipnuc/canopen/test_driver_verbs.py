@@ -103,13 +103,13 @@ def test_the_module_obeys() -> None:
     assert 0x288 in {can_id for can_id, _ in bench.heard}
     assert bench.module.objects.settings.invert_y
     assert not bench.module.objects.settings.invert_x
-    assert bench.run_script(begun("nmt", command="reset_node")) == "restarted, as node 8"
+    assert bench.run_script(begun("nmt", command="reset_node")) == "found as node 8"
     assert not bench.module.objects.settings.invert_y  # nothing was saved
     bench = CanopenBench()
     bench.run_script(begun("node", node=9))
     assert bench.module.node == 8
     bench.run_script(begun("save"))
-    assert bench.run_script(begun("restart")) == "restarted, as node 9"
+    assert bench.run_script(begun("restart")) == "found as node 9"
     assert bench.module.node == bench.settings.node == 9
 
 

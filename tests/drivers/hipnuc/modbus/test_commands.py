@@ -70,7 +70,7 @@ def test_a_module_is_followed_to_another_address(bench: ModbusBench) -> None:
     else:
         assert (written, bench.at, bench.slave.address) == (Written.PENDING, 7, 7)
     bench.run(save())
-    assert restarted(bench) == "restarted, at address 9"
+    assert restarted(bench) == "found at address 9"
     assert (bench.at, bench.slave.address) == (9, 9)
     assert bench.run(read(BY_NAME["MD_ID"])) == (9,)
 
@@ -83,7 +83,7 @@ def test_an_address_that_another_module_has_is_refused_before_anything_is_writte
     assert bench.run(change_address(7, 7)) is Written.VERIFIED
     assert bench.at == 7
     bench.run(change_address(7, 9))
-    assert restarted(bench) == "restarted, at address 7"
+    assert restarted(bench) == "found at address 7"
     assert bench.at == bench.slave.address == 7
 
 
@@ -131,10 +131,7 @@ def test_a_rate_is_in_force_after_saving_and_restarting(bench: ModbusBench) -> N
     assert bench.run(set_baud(9600)) is Written.PENDING
     assert bench.slave.baud == BAUD
     bench.run(save())
-    assert (
-        restarted(bench)
-        == "restarted; the device now uses 9600 baud and the RS-485 bus does not; set the bus to 9600 baud"
-    )
+    assert restarted(bench) == "the device now uses 9600 baud and the RS-485 bus does not; set the bus to 9600 baud"
     assert bench.slave.baud == 9600
 
 
@@ -152,7 +149,7 @@ def test_mounting_level_and_factory_settings(bench: ModbusBench) -> None:
     bench.run(auto_level(LevelReset.AUTOMATIC))
     assert [request.hex() for _, request in bench.sent] == ["0600a60003", "0600a50003"]
     bench.run(set_heading_mode(NINE))
-    assert bench.run(factory_reset((7,), BAUD)) == "restarted, at address 80"
+    assert bench.run(factory_reset((7,), BAUD)) == "found at address 80"
     assert bench.slave.settings == SlaveSettings()
     assert bench.at == 80
 
