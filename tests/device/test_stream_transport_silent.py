@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from imud.contracts.command import VerbResult
 from imud.contracts.lines import DeviceLines, DividedOptions
 from imud.contracts.setting import StepOutcome
 from imud.contracts.status import DeviceState
@@ -165,7 +166,7 @@ async def test_every_variant_is_followed_to_another_rate_and_back(
     await device.until(lambda: len(device.samples) > count + 20)
     assert device.device.status().settings["baud"] == "921600 bit/s"
     answer = await device.act("factory_reset")
-    assert answer == {"baud": 115200}
+    assert answer == VerbResult(True, "baud is 115200, was 921600", {"baud": 115200})
     count = len(device.samples)
     await device.until(lambda: len(device.samples) > count + 20)
     assert device.device.status().settings["baud"] == "115200 bit/s"
@@ -272,7 +273,8 @@ def test_on_a_real_port(tmp_path: Path) -> None:
             await act(rig.device, "baud", {"baud": 460800})
             assert (module.baud, module.flash.baud) == (460800, 460800)
             await rig.until_samples(20)
-            assert await rig.device.act("factory_reset", {}) == {"baud": 115200}
+            answer = await rig.device.act("factory_reset", {})
+            assert answer == VerbResult(True, "baud is 115200, was 460800", {"baud": 115200})
             assert (module.baud, module.settings) == (115200, ModuleSettings())
             await rig.until_samples(20)
             assert rig.device.status().settings["baud"] == "115200 bit/s"
