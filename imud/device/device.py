@@ -106,8 +106,10 @@ class VerbRun:
                     verified = False
                 case Proof.RESTART:
                     verified, evidence = await self._samples.restarted()
+                    if verified is None and (changes := _changes(before, settings.values)):
+                        verified, evidence = True, f"the device has lost settings that its flash lacks: {changes}"
                 case Proof.SETTINGS:
-                    verified, evidence = _reset(before, settings.values, was_unsaved)
+                    verified, evidence = _reset(_changes(before, settings.values), was_unsaved)
                 case Proof.SAMPLES:
                     verified, evidence = await self._agrees(verb, arguments)
                 case Proof.ONE_SAMPLE if not is_quiet:
@@ -162,18 +164,22 @@ class VerbRun:
         return all(one.passed for one in checks), f"{words} from the set value"
 
 
-def _reset(before: Values, after: Values, was_unsaved: bool) -> tuple[bool, str]:
-    """Return whether a reset changed the settings. A restart alone changes only settings that were not saved."""
+def _changes(before: Values, after: Values) -> str:
+    """Describe the settings with another value than before; empty if there are none."""
     changed = [name for name in after if as_json(after[name]) != as_json(before.get(name))]
-    if not changed:
-        return False, "the device reports the same settings before and after it"
-    words = ", ".join(
+    return ", ".join(
         f"{name} is {json_words(as_json(after[name]))}, was {json_words(as_json(before.get(name)))}"
         for name in changed[:CHANGES_MAX]
     )
+
+
+def _reset(changes: str, was_unsaved: bool) -> tuple[bool, str]:
+    """Return whether a reset changed the settings. A restart alone changes only settings that were not saved."""
+    if not changes:
+        return False, "the device reports the same settings before and after it"
     if was_unsaved:
-        return False, f"a restart alone loses the settings that were not saved: {words}"
-    return True, words
+        return False, f"a restart alone loses the settings that were not saved: {changes}"
+    return True, changes
 
 
 class Device:

@@ -424,7 +424,7 @@ class Applying:
             await self._save()
         if not self.problem and self._restarts(plan):
             done = await self._restart(done)
-        found = differences(self.table, self.wanted, values_of(self.reports), self.written)
+        found = differences(self.table, self.wanted, values_of(self.reports) if self.heard else {}, self.written)
         return AppliedSettings(
             tuple(done), self.saved, self.restarted, self.problem + self._present(), plan.left_out, found
         )
