@@ -17,10 +17,9 @@ from imud.drivers.hipnuc.uart.commands import (
     log_ontime,
     send_once,
     wake,
-    why_silent,
 )
 from imud.drivers.hipnuc.uart.driver import DRIVER
-from imud.drivers.hipnuc.uart.settings import SETTINGS
+from imud.drivers.hipnuc.uart.settings import SETTINGS, report_values, why_silent
 from imud.model.errors import BadArgument, NoReply, Rejected
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
@@ -285,7 +284,7 @@ def test_by_itself_only_frames_that_have_a_rate_are_let_out(settings: ModuleSett
 )
 def test_the_reason_of_a_silent_device(report: tuple[str, ...], words: str) -> None:
     lines = {f"COMCONFIG {number}": line for number, line in enumerate(report)}
-    assert words in why_silent({"BAUD": "115200", **lines})
+    assert words in why_silent(report_values({"BAUD": "115200", **lines}))
 
 
 FRAME = Reply((), Measurement(82, 0, 5))
