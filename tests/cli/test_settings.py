@@ -45,7 +45,7 @@ def test_from_difference_to_agreement_and_back(
     assert [line.split() for line in out.splitlines() if line.startswith("mode")] == [
         ["mode", "9-axis", "6-axis", "differs"]
     ]
-    assert "2 of 10 differ; set them with --apply" in out
+    assert "2 of 11 differ; set them with --apply" in out
     assert "2.2.4" not in out
     assert "2.2.4" in cli(*words, "--verbose", status=1).out
     assert json.loads(cli(*words, "--json", status=1).out)["status"]["state"] == "differ"

@@ -119,4 +119,6 @@ def test_each_verb_with_an_effect_has_evidence_or_a_reason() -> None:
     for driver in DRIVERS.values():
         for name, verb in driver.verbs.items():
             assert (verb.proof == "value") == (name in reads), f"{driver.name} {name}"
-            assert bool(verb.evidence) == (verb.proof in ("none", "script")), f"{driver.name} {name}"
+            # the scripts of the two calibrations return their evidence
+            states = verb.proof in ("none", "script") and not name.startswith("calibrate_")
+            assert bool(verb.evidence) == states, f"{driver.name} {name}"

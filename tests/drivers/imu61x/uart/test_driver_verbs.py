@@ -88,11 +88,9 @@ def test_answers_of_actions() -> None:
 
     far = imu61x_bench(noise=Noise(3))
     answer = act(far, "calibrate_gyro")
-    assert (
-        answer["result"]
-        == f"verified: the parameters changed to {', '.join(f'{one:g}' for one in answer['gyro_offset_deg_s'])}"
-    )
-    assert len(act(far, "calibrate_installation")["installation_angles_deg"]) == 3
+    values = ", ".join(f"{one:g}" for one in answer.result["gyro_offset_deg_s"])
+    assert (answer.verified, answer.evidence) == (True, f"the parameters changed to {values}")
+    assert len(act(far, "calibrate_installation").result["installation_angles_deg"]) == 3
 
     far = imu61x_bench(result_done=4)
     act(far, "save", Imu61xUartOptions(result_done=4))
