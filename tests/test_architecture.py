@@ -529,7 +529,6 @@ TESTED_IN = {
     "imud.drivers.polled_frames": "drivers/test_every_polled_driver.py",
     "imud.fleet.settings": "fleet/test_publisher.py",
     "imud.formats.jsonrpc": "publishers/socket/test_methods.py",
-    "imud.host.threads": "device/test_polled_bus_in_daemon.py",
     "imud.publishers.metrics.metric": "publishers/metrics/test_families.py",
     "imud.sim.ports.in_process_bus": "links/test_spi.py",
     "imud.web.messages": "web/test_hub.py",

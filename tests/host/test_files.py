@@ -1,13 +1,16 @@
 """imud reads only regular files. The check of the type never blocks and has no side effect."""
 
+import errno
+import grp
 import os
 import socket
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 
-from imud.host.files import NotRegularFile, open_regular, read_regular, replace_file
+from imud.host.files import NotRegularFile, StateFile, group_of, open_regular, open_stream, read_regular, replace_file
 
 
 def fifo(path: Path) -> None:
@@ -71,6 +74,95 @@ def test_no_more_is_read_than_wanted(tmp_path: Path) -> None:
     replace_file(path, b"short")
     assert read_regular(path, 1000) == b"short"
     assert path.stat().st_mode & 0o777 == 0o640 & ~_umask()
+
+
+@pytest.mark.parametrize("failing", ["os.fsync", "os.replace", "os.fchown"])
+def test_a_failed_replacement_keeps_the_old_file(failing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"old")
+    (tmp_path / "file.new").symlink_to(path)
+
+    def fail(*_: object) -> None:
+        raise OSError(errno.EIO, "failed")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(f"imud.host.files.{failing}", fail)
+        with pytest.raises(OSError, match="failed"):
+            replace_file(path, b"new", owner=(os.getuid() + 1, 0))
+    assert [one.name for one in tmp_path.iterdir()] == ["file"]
+    assert path.read_bytes() == b"old"
+
+
+def test_owner_and_mode_change_only_if_they_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[tuple[int, ...]] = []
+    monkeypatch.setattr("imud.host.files.os.fchown", lambda _, *owner: calls.append(owner))
+    monkeypatch.setattr("imud.host.files.os.fchmod", lambda _, mode: calls.append((mode,)))
+    own = os.getuid(), os.getgid()
+    replace_file(tmp_path / "file", b"", mode=0o600, owner=own)
+    assert calls == []
+    replace_file(tmp_path / "file", b"", mode=0o4600, owner=(own[0], own[1] + 1))
+    replace_file(tmp_path / "file", b"", mode=0o600, owner=(own[0] + 1, own[1]))
+    assert (calls[0], calls[-1]) == ((own[0], own[1] + 1), (own[0] + 1, own[1]))
+
+
+def test_a_fifo_is_opened_only_with_data(tmp_path: Path) -> None:
+    path = tmp_path / "fifo"
+    os.mkfifo(path)
+    with pytest.raises(NotRegularFile, match="no program writes"):
+        open_stream(path, 1)
+    writer = os.open(path, os.O_RDWR)
+    os.write(writer, b"data")
+    with open_stream(path, 1) as file:
+        assert os.get_blocking(file.fileno())
+        assert file.read(4) == b"data"
+    os.close(writer)
+    (tmp_path / "file").write_bytes(b"regular")
+    with open_stream(tmp_path / "file", 1) as file:
+        assert file.read() == b"regular"
+    with pytest.raises(NotRegularFile, match="directory"):
+        open_stream(tmp_path, 1)
+
+
+def test_group_of_a_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gid, name = next((one.gr_gid, one.gr_name) for one in grp.getgrall() if one.gr_gid)
+    status = list(tmp_path.stat())
+    for found, expected in ((gid, name), (0, "other"), (4_000_000_000, "other")):
+        status[5] = found
+        monkeypatch.setattr("imud.host.files.os.stat", lambda _: os.stat_result(status))
+        assert group_of("/dev/ttyUSB0", "other") == expected
+    monkeypatch.undo()
+    assert group_of(str(tmp_path / "absent"), "other") == "other"
+
+
+def test_a_state_file_keeps_the_newest_content(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "state" / "file"
+    for content in ({"a": 1}, {"b": 2}):
+        state = StateFile(path, "saving", "is empty")
+        state.read(dict[str, int])
+        state.write({"old": 0})
+        state.write(content)
+        state.close()
+        state.close()
+        state.write({"after": 1})  # ignored: the thread has ended
+        assert path.read_bytes() == msgspec.json.encode(content)
+        assert StateFile(None, "", "").read(dict[str, int]) == {}
+    assert path.parent.stat().st_mode & 0o777 == 0o750 & ~_umask()
+    state = StateFile(path, "saving", "is empty")
+    assert (state.read(dict[str, int]), caplog.messages) == ({"b": 2}, [])
+    path.unlink()
+    assert (state.read(dict[str, int]), caplog.messages) == ({}, [])
+    for wrong in (b"{", b'{"a": "text"}', b"\xff", b'{"a":1}' + b" " * (1 << 20) + b"}"):
+        path.write_bytes(wrong)
+        expected = {"a": 1} if len(wrong) > 1 << 20 else {}  # imud reads at most 1 MiB
+        assert state.read(dict[str, int]) == expected
+    assert len(caplog.messages) == 3
+    assert all("it does not contain the JSON that imud writes; is empty" in one for one in caplog.messages)
+    path.unlink()
+    path.mkdir()
+    state.write({})
+    state.close()
+    assert f"cannot write {path}: Is a directory; after the next start is empty" in caplog.messages[-1]
+    assert StateFile(None, "", "").read(dict[str, int]) == {}
 
 
 def _umask() -> int:

@@ -285,7 +285,8 @@ def test_messages_that_cannot_be_written_are_counted(kind: str) -> None:
     reader, descriptor = os.pipe()
     os.close(reader)
     if kind == "full disk":
-        os.dup2(os.open("/dev/full", os.O_WRONLY), descriptor)
+        os.close(descriptor)
+        descriptor = os.open("/dev/full", os.O_WRONLY)
     elif kind == "closed":
         os.close(descriptor)
     with log_to(descriptor, "info") as writer:

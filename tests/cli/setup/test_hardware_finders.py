@@ -36,6 +36,8 @@ def test_a_port_is_listened_to() -> None:
     finally:
         stop.set()
         feeder.join()
+    os.close(port.master)
+    os.close(port.slave)
     assert (report.port, report.driver, report.problem) == (port.path, "hipnuc-uart", "")
 
 
