@@ -78,7 +78,7 @@ class _ShortRepr(reprlib.Repr):
         self.maxstring = self.maxother = self.maxlong = VALUE_CHARACTERS_MAX
 
     def repr_bytes(self, data: bytes, _level: int) -> str:
-        return repr(data[: self.maxother]) + ("…" if len(data) > self.maxother else "")
+        return repr(data[: self.maxother])  # `shown` cuts this text and adds an ellipsis
 
 
 _SHORT: Final = _ShortRepr()

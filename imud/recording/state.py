@@ -25,7 +25,9 @@ from imud.model.errors import ImudError, reason_of
 MODULES: Final = (
     "imud.sampling.", "imud.contracts.", "imud.drivers.", "imud.formats.", "imud.model.sample:", "imud.host.clock:",
 )  # fmt: skip
-DEPTH_MAX: Final = 200  # Maximum depth of objects inside objects. Codecs and clocks have a depth of ten.
+# Maximum depth of objects inside objects. Codecs and clocks have a depth of ten. The reader needs four calls per
+# object, and Python allows 1000 nested calls.
+DEPTH_MAX: Final = 100
 
 Attributes = dict[str, Any]
 

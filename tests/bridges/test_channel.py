@@ -27,3 +27,5 @@ def test_topics_frames_covariances_and_steady_values() -> None:
     assert steady.passes(20.0, 100 * STEADY_NS)
     assert steady.passes(20.0, 50 * STEADY_NS)
     assert not steady.passes(20.0, 50 * STEADY_NS + 1)
+    assert not steady.passes(20.0, 49 * STEADY_NS + 1)
+    assert steady.passes(20.0, 49 * STEADY_NS)  # a step back by the period

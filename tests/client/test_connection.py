@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from imud.client.connection import Client, default_path, event_of
+from imud.client.connection import Client, EventStream, default_path, event_of
 from imud.contracts.publisher import Batch
 from imud.formats.jsonrpc import RpcError
 from imud.model.errors import LinkDenied, LinkMissing, ServerError
@@ -291,3 +291,42 @@ def test_a_daemon_without_conventions_raises_an_error(tmp_path: Path, method: st
         ask = client.watch if method == "watch" else client.poll
         with pytest.raises(ServerError, match="does not know the convention ned-frd"):
             ask(convention="ned-frd")
+
+
+WATCHING = HELLO + b'{"id":1,"result":{"devices":{}}}\n'
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        (HELLO + b'{"method":5}\n', "expected a string as method"),
+        (HELLO + b'{"id":1,"error":5}\n', "cannot decode the error 5"),
+        (HELLO + b'{"id":1,"result":{"devices":5}}\n', "cannot decode the reply to watch"),
+        (WATCHING + b'{"method":"sample","params":5}\n', "cannot decode the notification 'sample': expected an object"),
+        (WATCHING + b'{"method":"sample","params":{"seq":"x"}}\n', "cannot decode a sample: .*seq"),
+        (WATCHING + b'{"method":"dropped","params":{"device":"a","dropped":"x"}}\n', "dropped"),
+    ],
+)
+def test_invalid_json_raises_errors(tmp_path: Path, answer: bytes, words: str) -> None:
+    with answering(tmp_path / "s", answer), Client(tmp_path / "s", timeout_s=60) as client:
+        with pytest.raises((ServerError, RpcError), match=words):
+            next(client.watch(encoding="json", timeout_s=60))
+        assert client.fileno() >= 0
+
+
+@pytest.mark.parametrize("surplus", [0, 1])
+def test_waiting_messages_are_limited(tmp_path: Path, surplus: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("imud.client.connection.INBOX_MAX", 3)
+    event = b'{"method":"event","params":{"t_ns":%d,"device":"bow","kind":"loss","message":""}}\n'
+    events = b"".join(event % number for number in range(3 + surplus))
+    with answering(tmp_path / "s", HELLO + events + b'{"id":1,"result":5}\n'), Client(tmp_path / "s") as client:
+        assert client.call("anything") == 5
+        assert client.discarded == surplus
+        assert next(EventStream(client, 60)).t_ns == surplus  # the oldest message was discarded
+
+
+def test_a_reply_without_its_descriptor_is_an_error(tmp_path: Path) -> None:
+    reply = b'{"id":1,"result":{"seconds":1.0}}\n'
+    missing = pytest.raises(ServerError, match=r"expected a descriptor in the reply to record\.snapshot, got a reply")
+    with answering(tmp_path / "s", HELLO + reply), Client(tmp_path / "s", timeout_s=60) as client, missing:
+        client.snapshot()

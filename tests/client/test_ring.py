@@ -1,3 +1,4 @@
+import errno
 import mmap
 import os
 import struct
@@ -71,6 +72,32 @@ def test_directory_of_the_environment(board: Board, tmp_path: Path, monkeypatch:
     assert default_directory() == "/run/imud/shm"
     monkeypatch.delenv("IMUD_SHM")
     assert default_directory() == "/run/imud/shm"
+    first, second = tmp_path / "first", tmp_path / "second"
+    monkeypatch.setattr("imud.client.ring.default_directories", lambda _: [str(first), str(second)])
+    for folder, expected in ((first, first), (second, second), (first, first)):  # the first folder has priority
+        folder.mkdir(exist_ok=True)
+        (folder / board.path.name).touch()
+        assert default_directory(DEVICE) == str(expected)
+        assert (default_directory(), default_directory("other")) == (str(first), str(first))
+        if expected == first:
+            (folder / board.path.name).unlink()
+    (first / board.path.name).touch()
+    assert default_directory(DEVICE) == str(first)
+
+
+def test_errors_of_the_operating_system_are_named(
+    board: Board, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(ServerError, match=r"cannot read .*loop: Too many levels of symbolic links"):
+        Ring(tmp_path / "loop")
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOMEM, "Cannot allocate memory")
+
+    monkeypatch.setattr(mmap, "mmap", fail)
+    with pytest.raises(ServerError, match="Cannot allocate memory"):
+        Ring(board.path)
 
 
 @needs_root

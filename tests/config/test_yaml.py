@@ -53,6 +53,12 @@ def test_plain_words(word: str, value: object) -> None:
     assert type(plain(word)) is type(value)
 
 
+def test_the_length_of_numbers_is_limited() -> None:
+    assert plain("9" * 40) == int("9" * 40)
+    with pytest.raises(ValueError, match="at most 40 characters, got 41"):
+        plain("9" * 41)
+
+
 @pytest.mark.parametrize(
     ("word", "says"),
     [

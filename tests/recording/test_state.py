@@ -81,7 +81,9 @@ def test_an_object_that_is_not_part_of_a_codec_cannot_be_written(value: object) 
         ["f", "imud.sampling.clock:SampleClock.__init__"], ["f", "imud.sampling.clock:Callable"],
         [0, "object", "subprocess:Popen", {}], [0, "object", "imud.sampling.none:None", {}],
         [0, "object", "imud.model.errors:ImudError", {}], [0, "object", "imud.model.ledger:Ledger", {"__class__": 1}],
-        [0, "object", "imud.sampling.path:LossMeter", {"__class__": 1}], ["b", ["x", "ledger"], "__class__"],
+        [0, "object", "imud.sampling.path:LossMeter", {"__class__": 1}],
+        [0, "object", "imud.sampling.path:LossMeter", {"__doc__": "x"}], [0, "nothing", []],
+        ["b", ["x", "ledger"], "__class__"],
         ["r", 9], ["x", "nothing"], ["e", "imud.model.sample:Sync", "NONE"], ["what"], [],
         [5, "set", [[0, "list", []]]], [0, "partial", ["f", "os:system"], [1, "tuple", []], [2, "dict", []]],
     ],
@@ -90,6 +92,21 @@ def test_a_forged_state_is_an_error(written: Any) -> None:
     state = msgspec.msgpack.encode({"root": (0, {"value": written})})
     with pytest.raises(StateError):
         StateReader(state, {"ledger": Ledger()}).restore("root", Holder(value=None))
+
+
+def nested(levels: int) -> list[Any]:
+    return [nested(levels - 1)] if levels > 1 else []
+
+
+def test_the_depth_of_objects_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert there_and_back(nested(101)) == nested(101)  # 100 objects inside the first object
+    with pytest.raises(StateError, match=r"cannot write the state: root\.value is deeper than 100 objects"):
+        there_and_back(nested(102))
+    monkeypatch.setattr("imud.recording.state.DEPTH_MAX", 1000)
+    state = StateWriter({}).write({"root": Holder(value=nested(102))})
+    monkeypatch.undo()
+    with pytest.raises(StateError, match="cannot restore the state: it is deeper than 100 objects"):
+        StateReader(state, {}).restore("root", Holder(value=None))
 
 
 def test_an_attribute_that_this_version_does_not_have_is_an_error() -> None:

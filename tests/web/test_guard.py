@@ -71,12 +71,20 @@ def test_a_session_ends_and_cannot_be_prolonged_or_forged() -> None:
         assert not guard.is_session(forged), forged
     clock.now_s += SESSION_S
     assert not guard.is_session(cookie)
+    for end_s, valid in ((10**12 - 1, True), (10**12, False)):  # an end has at most 12 digits
+        clock.now_s = end_s - SESSION_S
+        assert guard.is_session(guard.new_session()) is valid
 
 
 def test_a_token_comes_from_the_first_line_of_a_file(tmp_path: Path) -> None:
     file = tmp_path / "token"
     file.write_text(f"  {TOKEN} \nmore\n")
     assert read_token(str(file)) == TOKEN.encode()
+    file.write_text("x" * 20)  # docs: at least 20 characters
+    assert read_token(str(file)) == b"x" * 20
+    file.write_text("x" * 19)
+    with pytest.raises(BadArgument, match="got 19"):
+        read_token(str(file))
     file.write_text("short\n")
     with pytest.raises(BadArgument, match="at least 20 characters, got 5; make one with: openssl rand"):
         read_token(str(file))
