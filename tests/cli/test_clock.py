@@ -72,9 +72,12 @@ def test_the_cause_is_named_and_wires_that_do_not_fit_first() -> None:
         (ClockStatus(Sync.ARRIVAL, t_err_ns=4_000), WIRE, "imud uses arrival times only"),
         (ClockStatus(Sync.ARRIVAL), [], "too few"),
         (ClockStatus(Sync.REGRESSION), WIRE[: ENOUGH - 1], "too few"),
-        (ClockStatus(Sync.REGRESSION), WIRE, "arrivals spread over 0.0 ms; without SOUT"),
+        (ClockStatus(Sync.REGRESSION), WIRE[:ENOUGH], "arrivals spread over 0.0 ms; without SOUT"),
         (ClockStatus(Sync.REGRESSION, hold_ns=16 * MS), TIMER, "latency timer of the USB adapter, 16 ms"),
         (ClockStatus(Sync.REGRESSION, hold_ns=16 * MS), WIRE, "the constant delay"),
+        (ClockStatus(Sync.REGRESSION, hold_ns=16 * MS), [0] * 10 + [8 * MS] * 10, "latency timer of the USB adapter"),
+        (ClockStatus(Sync.REGRESSION, hold_ns=16 * MS), [0] * 10 + [8 * MS - 1] * 10, "the host is loaded"),
+        (ClockStatus(Sync.REGRESSION), [0] * 10 + [MS] * 10, "the constant delay"),
         (ClockStatus(Sync.REGRESSION), TIMER, "the host is loaded"),
     ]:
         assert expected in verdict(clock, behind_ns)
@@ -82,6 +85,7 @@ def test_the_cause_is_named_and_wires_that_do_not_fit_first() -> None:
         (ClockStatus(Sync.EDGE, edges=1000, edges_unpaired=100, samples_unpaired=100), "stamps of the GPIO line"),
         (ClockStatus(Sync.EDGE, edges=1000, edges_unpaired=101), "101 of 1000 pulses have no sample: is the wire"),
         (ClockStatus(Sync.EDGE, edges=1000, samples_unpaired=3000), "3000 samples have no pulse"),
+        (ClockStatus(Sync.EDGE, edges=1000, triggers_missed=100), "stamps of the GPIO line"),
         (ClockStatus(Sync.EDGE, edges=1000, triggers_missed=500), "500 triggers on SIN caused no sample"),
         (ClockStatus(Sync.UTC, edges=1000, edges_unpaired=500), "pulses have no sample"),
         (ClockStatus(Sync.UTC, edges=1000), "the device sends UTC"),

@@ -22,6 +22,16 @@ def test_a_bar_with_share_samples_and_time() -> None:
     assert progress.spent_s == 10.0
 
 
+def test_it_is_drawn_immediately_and_after_each_fifth_of_a_second() -> None:
+    terminal, now_s = Terminal(), [100.0]
+    progress = Progress(1000, terminal, lambda: now_s[0])
+    for samples, second, expected in [(1999, 100.0, 0), (1, 100.0, 1), (2000, 100.19, 1), (2000, 100.2, 2)]:
+        now_s[0] = second
+        progress.add(samples, lambda: 20)
+        assert len(pictures(terminal)) == expected
+    assert pictures(terminal)[-1] == "[........................]   2 %  6000 samples"  # no estimate up to 2 %
+
+
 def test_it_is_not_drawn_more_often_than_it_can_be_read_or_without_a_terminal() -> None:
     terminal, now_s = Terminal(), [0.0]
     progress = Progress(1000, terminal, lambda: now_s[0])

@@ -54,9 +54,9 @@ def names(devices: list[DeviceHistory]) -> list[str]:
 
 
 def test_ages_order_and_filter() -> None:
-    seconds = (0.0, 9.994, 10.0, 999.0, 1000.0, 59_900.0, 60_000.0, 360_000.0, 8.64e7)
+    seconds = (0.0, 9.994, 10.0, 999.9, 1000.0, 59_900.0, 60_000.0, 360_000.0, 8.64e7)
     ages = [duration(one) for one in seconds]
-    assert ages == ["0.00s", "9.99s", "10s", "999s", "17m", "998m", "17h", "4d", "1000d"]
+    assert ages == ["0.00s", "9.99s", "10s", "1000s", "17m", "998m", "17h", "4d", "1000d"]
     devices = [history("b", 1), history("c", 0, state=DeviceState.FAILED), history("a", 2)]
     assert names(chosen(devices, NAME, NOW_NS)) == ["a", "b", "c"]
     assert names(chosen(devices, NAME, NOW_NS, backwards=True)) == ["c", "b", "a"]

@@ -1,5 +1,6 @@
 """Ledger of a reader: it balances after each message, for any order and any repetition."""
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -48,6 +49,24 @@ def test_each_number_counts_once_and_is_delivered_once() -> None:
     assert counts == StreamCounts(1, 12, whole=12, duplicates=13)
     ledger.take(message(1, 3, boot="2"), Stream.SAMPLES)
     assert [one.whole for one in ledger.counts.values()] == [12, 3]
+
+
+def test_a_duplicate_fills_no_gap() -> None:
+    counts = counts_of(message(3, 4), message(8, 9), message(4, 4), message(8, 8), message(5, 7), message(5, 7))
+    assert counts == StreamCounts(1, 9, whole=7, missing=2, duplicates=5)
+
+
+def test_the_number_of_streams_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("imud.fleet.accounts.STREAMS_MAX", 2)
+    ledger = FleetLedger()
+    for boot in ("1", "2"):
+        ledger.take(message(1, 2, boot=boot), Stream.SAMPLES)
+    with pytest.raises(OverflowError, match="at most 2 streams"):
+        ledger.take(message(1, 2, boot="3"), Stream.SAMPLES)
+    first, second = ledger.counts
+    ledger.restore(first, ledger.stored(second))
+    with pytest.raises(OverflowError, match="at most 2 streams"):
+        ledger.restore(first._replace(boot="3"), ledger.stored(second))
 
 
 RANGES = st.tuples(st.integers(1, 40), st.integers(0, 12)).map(lambda pair: (pair[0], pair[0] + pair[1]))

@@ -93,7 +93,8 @@ def test_birth_states_and_farewell(tmp_path: Path) -> None:
     assert topics["imud/default/gw/imu0/schema"]["slot"]["bytes"] == 256
     assert topics["imud/default/gw/imu0/status"]["state"] == "running"
     assert bench.broker.will is not None
-    assert json.loads(bench.broker.will.payload)["reason"] == "connection lost"
+    will = json.loads(bench.broker.will.payload)
+    assert (will["online"], will["reason"]) == (False, "connection lost")
 
 
 def test_states_are_published_after_events_and_periodically(tmp_path: Path) -> None:

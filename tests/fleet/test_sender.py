@@ -170,6 +170,7 @@ def test_a_reply_without_acknowledgement_is_sent_again() -> None:
     bench.sender.work()
     assert bench.sent() == [b"1", b"2", b"3"]
     assert bench.broker.connections[-1].correlations == [b"c", b"c", None]
+    assert not any(retained for _, _, retained in bench.broker.connections[-1].sent)
 
 
 def test_the_number_of_waiting_replies_is_limited() -> None:

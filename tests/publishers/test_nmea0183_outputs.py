@@ -5,7 +5,7 @@ import os
 import socket
 import tty
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -223,6 +223,27 @@ async def test_a_lost_serial_port_is_opened_again() -> None:
     made.close()
     made.close()
     ports[0].close()
+
+
+@in_loop
+async def test_a_serial_port_finishes_a_sentence_before_the_next() -> None:
+    clock, (reader, writer) = VirtualClock(), os.pipe2(os.O_NONBLOCK)
+    made = SerialOutput("/dev/ttyUSB9", 4800, clock.now_ns, lambda *_: writer)
+    made.tick(clock.now_ns())
+    await until(lambda: made.status().readers == 1)
+    made.put(2 * BUSY)  # a pipe has room for 65,536 bytes
+    data, written, puts = b"", 2, 0
+    while len(data) < len(2 * BUSY):
+        data += os.read(reader, 4096)
+        made.put(ONE)
+        puts += 1
+    with suppress(BlockingIOError):
+        data += os.read(reader, 65_536)
+    written += data.count(ONE)
+    assert data == 2 * BUSY + data.count(ONE) * ONE
+    assert (made.status().sent, made.status().dropped) == (written, puts - data.count(ONE))
+    made.close()
+    os.close(reader)
 
 
 @in_loop

@@ -226,6 +226,7 @@ class SetupSteps:
         self._status: list[DeviceStatus] = []
         self._changed = False
         self._freed: list[str] = []  # nodes of ports from which this run removes the console
+        self._raised: list[str] = []  # CAN interfaces that this run brings up
 
     # --- set up -------------------------------------------------------------------------------------------------------
 
@@ -240,7 +241,7 @@ class SetupSteps:
         if not self._round(*self._ways(at, wanted, can)):
             return NOT_DONE
         at = self._look_around()
-        self._await_can([name for name, _ in can])
+        self._await_can()
         self._talk.say("Searching for devices …")
         example = (EXAMPLE_NODE,) if example_is_untouched(at) else ()
         self._found = look(at, wanted, self._finders, example=example, freed=self._freed)
@@ -279,6 +280,7 @@ class SetupSteps:
                 question = f"The CAN interface {name} is down. Bring it up now and at every boot?"
                 if self._talk.agreed(question, default=False):
                     given[name] = 0
+        self._raised = list(given)
         for name, bitrate in given.items():
             more, words = raise_can(at, name, bitrate or self._bitrate(name))
             changes += more
@@ -305,11 +307,11 @@ class SetupSteps:
             self._talk.say(f"{word}: expected a whole number from 1 to {BITRATE_MAX}")
         raise ImudError(f"expected a bit rate for {name}, got {ANSWERS_MAX} invalid answers; use --can {name}=BITRATE")
 
-    def _await_can(self, names: Sequence[str]) -> None:
+    def _await_can(self) -> None:
         end_s = self._now_s() + CAN_UP_S
         sys_folder = self._look_around().at("/sys")
         # networkd needs some time
-        while self._changed and any(absence(name, sys_folder) for name in names) and self._now_s() < end_s:
+        while self._changed and any(absence(name, sys_folder) for name in self._raised) and self._now_s() < end_s:
             self._sleep(CAN_LOOK_S)
 
     def _chosen(self, at: Surroundings) -> dict[str, Attached]:

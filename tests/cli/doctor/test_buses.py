@@ -50,6 +50,7 @@ def test_failed_transfers_damaged_answers_and_clock_stretching(machine: Machine)
         ({"polls": 10_000, "failed": 10}, "ok", "10 failed"),
         ({"polls": 10_000, "failed": 11}, "warning", "11 of 10000 transfers failed"),
         ({"polls": 10_000, "vanished": 1}, "warning", "vanished 1 times"),
+        ({"polls": 10_000, "stale": 5000}, "ok", "0 failed"),
         ({"polls": 10_000, "stale": 5001}, "note", "returned no new sample"),
         ({}, "not checked", "has not read the device yet"),
     ]:
@@ -58,6 +59,8 @@ def test_failed_transfers_damaged_answers_and_clock_stretching(machine: Machine)
         machine.tells(I2C, severity, words)
     machine.configure(MAST)
     one = polled("mast", counts={"polls": 1000})
+    machine.status = [msgspec.structs.replace(one, ledger=one.ledger | {"frames_bad_crc": 1})]
+    machine.tells(SPI, "ok", "1000 transfers")
     machine.status = [msgspec.structs.replace(one, ledger=one.ledger | {"frames_bad_crc": 2})]
     assert (
         "2 of 1000 replies were damaged → use shorter wires, or a lower clock than 1000000 Hz"

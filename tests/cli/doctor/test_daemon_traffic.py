@@ -67,7 +67,7 @@ def test_without_the_daemon_a_port_or_samples(machine: Machine) -> None:
             "error",
             "valid frames of unknown types, but no sample",
         ),
-        (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=3), "ok", "3 damaged"),
+        (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=5), "ok", "5 damaged"),
         (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=6), "warning", "6 damaged and"),
         (msgspec.structs.replace(counted(**GOOD), kernel=KernelCounters(overrun=2)), "warning", "overrun"),
     ],
@@ -134,7 +134,7 @@ def test_rs485(machine: Machine, state: DeviceState, line: SerialLineCounters, s
         (9, 6, 360_000, "warning"),
         (9, 7, 360_000, "note"),
         (3, 0, 2 * 360_000, "warning"),
-        (3, 0, 4 * 360_000, "note"),
+        (3, 0, 3 * 360_000, "note"),
     ],
 )
 def test_restarts_without_a_request_count_by_the_hour(
@@ -152,11 +152,11 @@ def test_restarts_without_a_request_count_by_the_hour(
     [
         (5000, LinesStatus({}, {"sout": 4999}, {"sout": 0}), "ok", "4999 edges"),
         (5000, LinesStatus({}, {"sout": 4990}, {"sout": 9}), "warning", "the kernel lost 9 of 4999 edges"),
-        (5000, LinesStatus({}, {"sout": 0}, {}), "warning", "no edge in 5000 samples"),
-        (50, LinesStatus({}, {"sout": 0}, {}), "not checked", "too few samples"),
+        (101, LinesStatus({}, {"sout": 0}, {}), "warning", "no edge in 101 samples"),
+        (100, LinesStatus({}, {"sout": 0}, {}), "not checked", "too few samples"),
         (5000, LinesStatus({}, {"alarm": 0}, {}), "note", "no edge so far"),
-        (900, LinesStatus({}, {"pps": 0}, {}), "not checked", "too few samples"),
-        (1100, LinesStatus({}, {"pps": 0}, {}), "warning", "does the receiver have a fix"),
+        (1000, LinesStatus({}, {"pps": 0}, {}), "not checked", "too few samples"),
+        (1001, LinesStatus({}, {"pps": 0}, {}), "warning", "does the receiver have a fix"),
         (5000, LinesStatus({"sout": "GPIO17 is in use"}, {"sout": 0}, {}), "error", "GPIO17 is in use"),
     ],
 )

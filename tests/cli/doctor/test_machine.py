@@ -20,7 +20,7 @@ CLOCK, STORAGE, POWER, PROCESSOR = (
 
 def test_clock_and_storage(machine: Machine) -> None:
     for clock, severity in [
-        (KernelClock(True, 50, 1000), "ok"),
+        (KernelClock(True, 100_000, 1000), "ok"),
         (KernelClock(True, 100_001, 1000), "note"),
         (KernelClock(False, 0, 0), "warning"),
     ]:
@@ -80,7 +80,7 @@ def test_vcgencmd_is_asked_where_sysfs_has_nothing(machine: Machine) -> None:
 
 @pytest.mark.parametrize(
     ("load", "pressure", "severity"),
-    [("2.9", "19.00", "ok"), ("3.1", "19.00", "warning"), ("0.1", "21.50", "warning"), ("0.1", None, "ok")],
+    [("3.0", "20.00", "ok"), ("3.1", "19.00", "warning"), ("0.1", "20.01", "warning"), ("0.1", None, "ok")],
 )
 def test_load_of_two_processors(machine: Machine, load: str, pressure: str | None, severity: str) -> None:
     for name in ("cpu0", "cpu1", "cpufreq"):
@@ -99,7 +99,8 @@ def test_samples_lost_and_reads_late_by_a_busy_machine(machine: Machine) -> None
     late = device("b", polling=PollingStatus(polls=1000, late=51, late_worst_ns=3_000_000))
     late = msgspec.structs.replace(late, ledger=late.ledger | {"lost_queue": 0})
     good = msgspec.structs.replace(late, polling=PollingStatus(polls=1000, late=50))
-    machine.status = [busy, late, good]
+    level = msgspec.structs.replace(busy, ledger=busy.ledger | {"lost_queue": 10})
+    machine.status = [busy, late, good, level]
     found = machine.told(PROCESSOR)
     assert [severity for severity, _ in found] == ["ok", "warning", "warning"]
     assert "a: 11 samples lost" in found[1][1]

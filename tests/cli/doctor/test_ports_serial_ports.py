@@ -52,6 +52,7 @@ def test_without_serial_devices_the_ports_are_listed(machine: Machine) -> None:
 
 
 def test_another_program_and_the_daemon_on_a_port(bow: Machine) -> None:
+    assert bow.find(TAKEN) == []  # the port does not exist
     bow.port("ttyUSB0")
     bow.uid = 0
     hold(bow, 10, "python3", command="/usr/bin/python3 /usr/bin/imud run")

@@ -92,6 +92,22 @@ def test_an_rs485_module_that_is_configured_is_known(gateway: LivingMachine, att
     assert [one.configured for one in here if one.driver] == ["deck", ""]
 
 
+def test_devices_of_other_buses_are_not_the_configured_device(machine: LivingMachine, attachments: Attachments) -> None:
+    machine.configure(f"deck: {{driver: auto, rs485: {{line: {USB0}, address: 80}}}}")
+    machine.can("can0", up=True)
+    attachments.hears("can0", "hipnuc-canopen", "node 8", 500_000)
+    assert [one.configured for one in found(machine, attachments)] == [""]
+
+
+def test_an_interface_that_is_down_is_not_listened_to(machine: LivingMachine, attachments: Attachments) -> None:
+    machine.can("can0")
+    machine.can("can1")
+    problem = "the interface is down; bring it up with --can {0}=BITRATE"
+    for wanted, names in ((Wanted(("can0",)), ["can0"]), (Wanted(), ["can0", "can1"])):
+        assert [one.problem for one in found(machine, attachments, wanted)] == list(map(problem.format, names))
+    assert attachments.listened == []
+
+
 def test_a_bus_that_is_asked_for(machine: LivingMachine, attachments: Attachments) -> None:
     machine.configure("keel: {driver: imu61x-i2c, i2c: {bus: 1}}")
     keys = {"driver": "imu61x-i2c", "i2c": {"bus": 1, "address": 0x18}}

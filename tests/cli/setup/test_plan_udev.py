@@ -1,8 +1,10 @@
 """udev rules of adapters from simulated /sys trees."""
 
+from typing import NoReturn
+
 import pytest
 
-from imud.cli.setup.plan import RULES, UsbAdapter, rules, usb_adapter
+from imud.cli.setup.plan import RULES, UsbAdapter, modem_manager_runs, rules, usb_adapter
 from tests.cli.setup.conftest import LivingMachine
 
 WHICH = 'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6001", ATTRS{serial}=="A1"'
@@ -35,6 +37,15 @@ def test_modem_manager_ignores_all_where_it_may_run(machine: LivingMachine, stat
     other = 'ATTRS{idVendor}=="10c4", ATTRS{idProduct}=="ea60"'
     both = [LATENCY, MODEM, MODEM.replace(WHICH, other)] if ignores else [LATENCY]
     assert lines(machine, FTDI, OTHER) == both
+
+
+def test_a_host_without_systemctl_has_no_modem_manager(machine: LivingMachine) -> None:
+    def missing(_words: object) -> NoReturn:
+        raise FileNotFoundError(2, "No such file or directory")
+
+    at = machine.surroundings()
+    at.run = missing
+    assert not modem_manager_runs(at)
 
 
 def test_lines_that_are_there_stay_and_are_not_proposed_again(machine: LivingMachine) -> None:

@@ -279,6 +279,7 @@ def test_questions_name_and_leave_out(gateway: LivingMachine, setup: Setup, answ
     gateway.status = [device("mast")]
     assert setup.steps(ask=True, user="ann").set_up(PORT, ()) == 0
     assert [one.name for one in config.load(gateway.root / "etc/imud.yaml").devices] == ["mast"]
+    assert "-: expected an unused name" not in setup.said()
     assert (gateway.root / "etc/group").read_text().count(":ann\n") == 2
 
 
@@ -298,7 +299,9 @@ def test_a_device_without_a_usable_name_is_left_out_and_that_is_said(
 ) -> None:
     answers["on /dev/ttyUSB0?"] = "My Sensor"
     assert setup.steps(ask=True).set_up(PORT, ()) == 1
-    assert "imud does not add /dev/ttyUSB0 after 10 invalid answers" in setup.said()
+    said = setup.said()
+    assert "imud does not add /dev/ttyUSB0 after 10 invalid answers" in said
+    assert said.count("My Sensor: expected an unused name") == 10
 
 
 def test_a_bit_rate_that_is_none_is_explained(gateway: LivingMachine, setup: Setup, answers: dict[str, str]) -> None:
@@ -306,7 +309,38 @@ def test_a_bit_rate_that_is_none_is_explained(gateway: LivingMachine, setup: Set
     answers |= {"can0 is down": "y", "Bit rate": "500k"}
     with pytest.raises(ImudError, match="expected a bit rate for can0"):
         setup.steps(ask=True).set_up(PORT, ())
-    assert "500k: expected a whole number from 1 to 1000000" in setup.said()
+    assert setup.said().count("500k: expected a whole number from 1 to 1000000") == 10
+    for word in ("0", "1000001"):
+        answers["Bit rate"] = word
+        with pytest.raises(ImudError, match="got 10 invalid answers"):
+            setup.steps(ask=True).set_up(PORT, ())
+
+
+@pytest.mark.parametrize("rate", [1, 1_000_000])
+def test_an_interface_comes_up_with_the_given_bit_rate(
+    gateway: LivingMachine, setup: Setup, answers: dict[str, str], rate: int
+) -> None:
+    gateway.can("can0")
+    gateway.units["systemd-networkd.service"] = ["enabled", "active"]
+    answers |= {"can0 is down": "y", "Bit rate": str(rate)}
+    setup.steps(ask=True).set_up(PORT, ())
+    text = (gateway.root / "etc/systemd/network/80-imud-can0.network").read_text()
+    assert f"[CAN]\nBitRate={rate}\n" in text
+    assert setup.slept[:25] == [0.2] * 25, "imud waits 5 s for the interface, which stays down here"
+
+
+def test_only_a_port_with_a_console_is_asked_about(
+    gateway: LivingMachine, setup: Setup, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    questions: list[str] = []
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("builtins.input", lambda question: questions.append(question) or "")
+    gateway.uart("ttyAMA0", console=True)
+    setup.steps(ask=True).set_up(PORT, ())
+    assert [one for one in questions if "console" in one] == [
+        "/dev/ttyAMA0 has a console. Is a device connected, so that imud can remove the console? [y/N] "
+    ]
+    assert "console=" not in str(gateway.ran)
 
 
 def test_a_no_changes_nothing(gateway: LivingMachine, setup: Setup, answers: dict[str, str]) -> None:

@@ -61,6 +61,7 @@ def test_a_recording_starts_with_all_states_and_ends_with_an_end_record() -> Non
     assert not bench.read()
     bench.recording.event(Event(1, "", EventKind.CONFIGURATION, "read again"))
     bench.recording.stop("it was stopped")
+    bench.recording.stop("again")
     bench.recording.event(Event(1, "", EventKind.CONFIGURATION, "too late"))
     bench.tick()
     assert bench.read()
