@@ -247,6 +247,7 @@ async def test_the_only_device_or_the_configured_device_is_used(caplog: pytest.L
         ({"udp": ["plotter:10110"]}, "expected IP address and port such as"),
         ({"udp": ["192.168.1.255"]}, "expected IP address and port such as"),
         ({"udp": ["192.168.1.255:0"]}, "expected IP address and port such as"),
+        ({"udp": ["192.168.1.255:65536"]}, "expected IP address and port such as"),
         ({"udp": ["fe80::1:10110"]}, "expected IP address and port such as"),
         ({"tcp_address": "boat"}, "expected an IP address"),
         ({"sentences": {}}, "expected at least one sentence"),
@@ -261,7 +262,7 @@ def test_invalid_options_are_rejected(given: dict[str, object], words: str) -> N
 
 
 def test_addresses() -> None:
-    assert address_of("192.168.1.255:10110") == ("192.168.1.255", 10110)
+    assert address_of("192.168.1.255:65535") == ("192.168.1.255", 65535)
     assert address_of("[fe80::1]:2000") == ("fe80::1", 2000)
 
 

@@ -112,6 +112,8 @@ def test_a_device_that_never_answers_does_not_hear_imud(
     ("state", "line", "severity", "words"),
     [
         (DeviceState.RUNNING, SerialLineCounters(timeouts=10, echoes=1000), "ok", "ignores the echoes"),
+        (DeviceState.RUNNING, SerialLineCounters(timeouts=10, strange_bytes=10), "ok", "bus works"),
+        (DeviceState.RUNNING, SerialLineCounters(strange_bytes=1), "ok", "bus works"),
         (DeviceState.RUNNING, SerialLineCounters(timeouts=11), "warning", "11 requests without a reply"),
         (DeviceState.RUNNING, SerialLineCounters(strange_bytes=5), "warning", "5 invalid bytes"),
         (DeviceState.SEARCHING, SerialLineCounters(timeouts=9, echoes=9), "error", "only 9 echoes"),

@@ -329,18 +329,25 @@ def test_an_interface_comes_up_with_the_given_bit_rate(
     assert setup.slept[:25] == [0.2] * 25, "imud waits 5 s for the interface, which stays down here"
 
 
-def test_only_a_port_with_a_console_is_asked_about(
+def test_the_default_keeps_consoles_and_interfaces(
     gateway: LivingMachine, setup: Setup, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     questions: list[str] = []
+
+    def take_default(question: str) -> str:
+        questions.append(question)
+        return ""
+
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
-    monkeypatch.setattr("builtins.input", lambda question: questions.append(question) or "")
+    monkeypatch.setattr("builtins.input", take_default)
     gateway.uart("ttyAMA0", console=True)
+    gateway.can("can0")
     setup.steps(ask=True).set_up(PORT, ())
-    assert [one for one in questions if "console" in one] == [
-        "/dev/ttyAMA0 has a console. Is a device connected, so that imud can remove the console? [y/N] "
+    assert questions[:2] == [
+        "/dev/ttyAMA0 has a console. Is a device connected, so that imud can remove the console? [y/N] ",
+        "The CAN interface can0 is down. Bring it up now and at every boot? [y/N] ",
     ]
-    assert "console=" not in str(gateway.ran)
+    assert "can0" not in str(gateway.ran)
 
 
 def test_a_no_changes_nothing(gateway: LivingMachine, setup: Setup, answers: dict[str, str]) -> None:
