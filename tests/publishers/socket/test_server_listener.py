@@ -1,10 +1,12 @@
 """Socket file: imud replaces the file of a dead daemon, keeps the file of a live one, and removes its own."""
 
+import errno
 import os
 import socket
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
@@ -252,3 +254,51 @@ def test_a_file_in_the_way_of_the_first_name(tmp_path: Path) -> None:
     with pytest.raises(ServerError, match=f"{file.name} exists; remove it"):
         Listener(tmp_path / "imud.sock", GROUP)
     assert list(tmp_path.iterdir()) == [file]
+
+
+def failing(error: OSError) -> Callable[..., NoReturn]:
+    def fail(*_: object, **__: object) -> NoReturn:
+        raise error
+
+    return fail
+
+
+@pytest.mark.parametrize(
+    ("function", "error", "words"),
+    [
+        ("socket.socket.connect", TimeoutError(), "another daemon serves .*imud.sock; stop it"),
+        ("socket.socket.connect", BlockingIOError(errno.EAGAIN, ""), "another daemon serves .*imud.sock; stop it"),
+        ("socket.socket.connect", PermissionError(errno.EACCES, "Permission denied"), "cannot check whether a daemon"),
+        ("Path.lstat", OSError(errno.EIO, "Input/output error"), "cannot check .*imud.sock: Input/output error"),
+    ],
+)
+def test_an_existing_socket_that_cannot_be_checked_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, function: str, error: OSError, words: str
+) -> None:
+    path = tmp_path / "imud.sock"
+    leave_socket(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(f"imud.publishers.socket.server.{function}", failing(error))
+        with pytest.raises(ServerError, match=words):
+            Listener(path, GROUP)
+    assert path.is_socket()
+
+
+def test_missing_permissions_are_warnings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    denied = failing(PermissionError(errno.EPERM, "Operation not permitted"))
+    monkeypatch.setattr("imud.publishers.socket.server.os.chown", denied)
+    monkeypatch.setattr("imud.publishers.socket.server.os.setxattr", denied)
+    listener = Listener(tmp_path / "imud.sock", "root", "root")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", denied)
+        listener.close()
+    assert [one.split(":")[0].replace(str(tmp_path), "") for one in caplog.messages] == [
+        "cannot give /imud.sock to group 'root'",
+        "cannot set the ACL of /imud.sock",
+        "cannot remove /imud.sock",
+    ]
+    again = Listener(tmp_path / "imud.sock", "root")
+    (tmp_path / "imud.sock").unlink()
+    again.close()
