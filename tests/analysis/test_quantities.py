@@ -1,30 +1,25 @@
 """Units of data sheets compared with values by hand, and the format of numbers."""
 
+from itertools import chain
+from math import pi
+
 import pytest
 
-from imud.analysis.quantities import ACCEL, GYRO, QUANTITIES, figure_text
+from imud.analysis.quantities import ACCEL, DENSITY, DEVIATION, GYRO, QUANTITIES, figure_text
 
-
-def unit_of(sensor: str, key: str, place: int = 0) -> float:
-    quantities = GYRO if sensor == "gyro" else ACCEL
-    return next(one for one in quantities if one.key == key).units[place].factor
+SI = {"deg": pi / 180, "h": 3600.0, "√h": 60.0, "mm": 1e-3, "mg": 9.80665e-3, "µg": 9.80665e-6}
+"""Values of the units in SI units; 1 for other units. g is the standard acceleration of gravity, 9.80665 m/s²."""
 
 
 def test_units_and_digits() -> None:
-    # 1 deg/√h = 1 deg / 60 √s: 2.9088821e-4 rad/√s
-    assert 2.9088821e-4 * unit_of("gyro", "random_walk") == pytest.approx(1.0, rel=1e-7)
-    # 1 deg/h = π / 180 / 3600: 4.8481368e-6 rad/s
-    assert 4.8481368e-6 * unit_of("gyro", "bias_instability") == pytest.approx(1.0, rel=1e-7)
-    # 1 deg/h/√h = 4.8481368e-6 / 60
-    assert 8.0802280e-8 * unit_of("gyro", "rate_random_walk") == pytest.approx(1.0, rel=1e-7)
-    # 1 deg/h/h = 4.8481368e-6 / 3600
-    assert 1.3467047e-9 * unit_of("gyro", "rate_ramp") == pytest.approx(1.0, rel=1e-7)
-    assert 0.017453293 * unit_of("gyro", "noise_density") == pytest.approx(1.0, rel=1e-7)
-    assert unit_of("accel", "random_walk") / 60 == pytest.approx(1.0), "1 m/s/√h = 1 m/s / 60 √s"
-    assert 9.80665e-6 * unit_of("accel", "random_walk", 1) == pytest.approx(1.0)
-    assert 9.80665e-3 * unit_of("accel", "bias_instability") == pytest.approx(1.0)
-    assert 9.80665e-6 * unit_of("accel", "noise_density") == pytest.approx(1.0)
-    assert 9.80665e-3 / 60 * unit_of("accel", "rate_random_walk") == pytest.approx(1.0)
+    units = list(chain.from_iterable(one.units for one in (*GYRO, *ACCEL)))
+    for unit in (*units, *DENSITY.values(), *DEVIATION.values()):
+        first, *others = unit.name.split("/")
+        si_value = SI.get(first, 1.0)
+        for other in others:
+            si_value /= SI.get(other, 1.0)
+        assert si_value * unit.factor == pytest.approx(1.0, rel=1e-9), unit
+    assert next(one for one in GYRO if one.key == "rate_ramp").units[0].factor * 1.3467047e-9 == pytest.approx(1.0)
     gyro, accel = ([one.key for one in QUANTITIES[name]] for name in QUANTITIES)
     assert gyro == accel
     values = (0.0, 0.34321, 12345.6, 1e-5, -9.81, 2e7)

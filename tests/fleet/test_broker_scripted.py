@@ -53,7 +53,7 @@ def scripted(*replies: bytes) -> Iterator[Broker]:
 
 
 def gateway(broker: Broker) -> PahoConnection:
-    return PahoConnection(broker, msgspec.convert({}, MqttOptions), "gateway", Will("imud/s/g/state", b"{}"))
+    return PahoConnection(broker, MqttOptions(user="without-password"), "gateway", Will("imud/s/g/state", b"{}"))
 
 
 async def reader(broker: Broker) -> ReaderConnection:

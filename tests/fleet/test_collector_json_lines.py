@@ -36,14 +36,14 @@ def test_the_line_of_a_sample_contains_its_values() -> None:
 
 
 def test_lines_of_dropped_records_intervals_and_events_have_kinds() -> None:
-    out = io.StringIO()
+    out = io.TextIOWrapper(io.BytesIO())
     batches = [
         FleetBatch("mill", Stream.SAMPLES, dropped_message(1, 4)),
         FleetBatch("mill", Stream.SAMPLES, intervals_message(1, 2)),
         FleetBatch("mill", Stream.EVENTS, event_message(1, 5)),
     ]
     JsonLines(out).write(batches, {}, {})
-    dropped, found, up = map(json.loads, out.getvalue().splitlines())
+    dropped, found, up = map(json.loads, out.buffer.getvalue().splitlines())
     assert dropped == HEAD | {
         "kind": "dropped", "first": 1, "last": 4, "cause": "space", "utc_ns": UTC_NS + 4_000_000,
     }  # fmt: skip

@@ -103,13 +103,22 @@ def test_readings_of_the_clocks_are_recorded() -> None:
     assert len(records) == 2
 
 
-def test_recordable_devices_ignore_an_unknown_device() -> None:
+def test_recordable_devices_ignore_an_unknown_device_and_end() -> None:
     one, put = ObservedPath(), list[bytes]()
-    devices = RecordableDevices({"bow": cast(Device, SimpleNamespace(observer=one.observer))}, one.host)
+    device = SimpleNamespace(observer=one.observer, record=lambda send: one.observer.begin(send, "", {}, {}))
+    devices = RecordableDevices({"bow": cast(Device, device)}, one.host)
     assert devices.names() == ["bow"]
     for name in ("stern", "bow"):
+        devices.begin(name, put.append)
         devices.check(name, put.append)
-    assert [record.kind for data in put for record in records_of(data)] == [Kind.CHECK]
+    devices.begin_host(put.append)
+    kinds = [record.kind for data in put for record in records_of(data)]
+    assert kinds == [Kind.DEVICE, Kind.PATH, Kind.CHECK, Kind.CALL]
+    devices.end(put.append)
+    assert one.observers == {None}
+    one.clock.advance(2_000_000_000)
+    one.host.utc_offset_ns()
+    assert len(put) == 4
 
 
 def test_a_check_contains_the_newest_sample() -> None:
