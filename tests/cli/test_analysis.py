@@ -93,6 +93,7 @@ def test_a_report_for_a_supplier(resting_file: Path, tmp_path: Path, cli: Cli, e
         text = content.decode()
         assert "angle random walk" in text
         assert "Allan deviation" in text
+        assert "<svg" in text
         assert "src=" not in text
         assert "<script" not in text
         assert "hipnuc-uart" in text

@@ -3,6 +3,7 @@
 import io
 
 import msgspec
+import pytest
 
 from imud.cli.demo import View
 from imud.model.sample import Sample, Sync
@@ -24,6 +25,15 @@ def test_view_counts_what_is_missing_of_each_device() -> None:
     for name, seq in (("a", 1), ("b", 7), ("a", 2), ("b", 9)):
         view.add(msgspec.structs.replace(sample(seq), device=name))
     assert (view.samples, view.missed) == (4, 1)
+
+
+def test_live_view_draws_ten_times_per_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    out = io.StringIO()
+    view = View(out, live=True)
+    for number, now_ms in enumerate((1000, 1099, 1100, 1199, 1200), 1):
+        monkeypatch.setattr("imud.cli.demo.monotonic_ns", lambda now_ms=now_ms: now_ms * 1_000_000)
+        view.add(sample(number))
+    assert [number for number in range(1, 6) if f"demo #{number}" in out.getvalue()] == [1, 3, 5]
 
 
 def test_live_view_draws_in_place() -> None:
