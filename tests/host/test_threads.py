@@ -5,12 +5,14 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
-from imud.host.threads import BusThread, DescriptorWait, WakeEvent, rare_garbage_collection, share_interpreter
+from imud.host.threads import BusThread, DescriptorWait, Job, WakeEvent, rare_garbage_collection, share_interpreter
 
 LIMIT_S = 60.0
 NEVER_NS = 10**12
@@ -18,6 +20,12 @@ NEVER_NS = 10**12
 
 def unexpected(error: BaseException) -> None:
     raise error
+
+
+def started(work: Callable[[], object], failed: Callable[[BaseException], None] = unexpected) -> BusThread:
+    """Start a worker that calls `work`. If `work` returns None, the worker sleeps until it is woken."""
+    job = SimpleNamespace(do_round=lambda: NEVER_NS if (rest := work()) is None else rest, round_failed=failed)
+    return BusThread("worker", cast(Job, job))
 
 
 @pytest.fixture
@@ -70,7 +78,7 @@ def test_a_worker_sleeps_until_a_ring_or_a_descriptor_and_ends(
     pipe: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rounds, arrived = threading.Semaphore(0), threading.Event()
-    worker = BusThread("worker", lambda: rounds.release() or NEVER_NS, unexpected)  # type: ignore[func-returns-value]
+    worker = started(rounds.release)
     assert rounds.acquire(timeout=LIMIT_S)
     assert "worker" in [thread.name for thread in threading.enumerate() if thread.daemon]
     worker.ring()
@@ -100,7 +108,7 @@ def test_a_worker_that_does_not_sleep_repeats_its_round_with_an_exact_timer() ->
         rounds.release()
         return 0
 
-    worker = BusThread("worker", work, unexpected)
+    worker = started(work)
     assert all(rounds.acquire(timeout=LIMIT_S) for _ in range(3))
     assert worker.end()
     assert slack == {"1"}
@@ -116,7 +124,7 @@ def test_an_error_of_a_round_ends_the_worker_and_is_reported() -> None:
         errors.append(error)
         reported.set()
 
-    worker = BusThread("worker", fail, report)
+    worker = started(fail, report)
     assert reported.wait(LIMIT_S)
     assert worker.end()
     assert [str(error) for error in errors] == ["'wrong'"]
@@ -131,7 +139,7 @@ def test_a_worker_in_a_transfer_does_not_end_yet(pipe: tuple[int, int], monkeypa
         free.wait(LIMIT_S)
         return 0
 
-    worker = BusThread("worker", work, unexpected)
+    worker = started(work)
     assert begun.wait(LIMIT_S)
     assert worker.watch(pipe[0], begun.clear)
     descriptors = worker._descriptors
