@@ -74,11 +74,6 @@ def board(tmp_path: Path) -> "Iterator[Board]":
     made.publisher.close()
 
 
-DESCRIPTORS_CHECKED: Final = tuple(
-    f"tests/{folder}/" for folder in ("publishers", "client", "links", "lines", "utc", "device", "recording", "sim")
-)
-
-
 def open_descriptors() -> dict[int, str]:
     """Return the files of the open descriptors of this process."""
     found = {}
