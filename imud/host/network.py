@@ -6,6 +6,8 @@ import threading
 from contextlib import suppress
 from typing import Final
 
+from imud.model.errors import reason_of
+
 BACKLOG: Final = 128  # number of connections that wait for `accept`
 
 
@@ -42,7 +44,7 @@ async def resolve(host: str, port: int) -> list[str]:
         except OSError as error:
             problem = error
         except UnicodeError as error:  # a name that IDNA cannot encode
-            problem = OSError(f"{host}: {error}")
+            problem = OSError(f"{host}: {reason_of(error)}")
         with suppress(RuntimeError):  # the loop has ended
             loop.call_soon_threadsafe(give, list(dict.fromkeys(found)), problem)
 

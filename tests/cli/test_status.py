@@ -65,7 +65,7 @@ def test_json_is_all_that_the_socket_sends(tmp_path: Path, cli: Cli, monkeypatch
         with Client(served.path) as client:
             said = client.status()
         shown = json.loads(cli("status", "--socket", served.path, "--json").out)
-        assert shown.keys() == said.keys() == {"now_ns", "devices", "socket"}
+        assert shown.keys() == said.keys() == {"now_ns", "devices", "socket", "configuration"}
         assert shown["devices"] == said["devices"]
 
 
