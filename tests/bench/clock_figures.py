@@ -28,6 +28,7 @@ SAME_WITH_SOUT: Final = {
     "usb-16ms, 1 % of edges lost", "usb-16ms, 5 % extra edges",
 }  # fmt: skip
 """Rows that docs/measurements.md omits: SOUT has the same error on each link."""
+SHOWN_RATES_HZ: Final = (1, 100, 1000)  # rates in the table of docs/measurements.md; the plot has all rates
 
 Spread = tuple[float, float]
 """Minimum and maximum over all crystals, µs."""
@@ -105,9 +106,15 @@ def tables() -> dict[str, str]:
     """Return the tables of docs/measurements.md by their markers, with the most important columns and rows."""
     figures = kept()
     return {
-        "arrivals": _table(ARRIVAL_HEAD, figures.arrivals, ARRIVAL_COLUMNS),
-        "lines": _table(LINE_HEAD, (one for one in figures.lines if one.over not in SAME_WITH_SOUT), LINE_COLUMNS),
+        "arrivals": _table(
+            ARRIVAL_HEAD, (one for one in figures.arrivals if one.rate_hz in SHOWN_RATES_HZ), ARRIVAL_COLUMNS
+        ),
+        "lines": _table(LINE_HEAD, (one for one in figures.lines if _is_shown(one)), LINE_COLUMNS),
     }
+
+
+def _is_shown(figures: LineFigures) -> bool:
+    return figures.over not in SAME_WITH_SOUT and (figures.source != "SOUT" or figures.rate_hz == 100)
 
 
 def _table(head: str, found: Iterable[ArrivalFigures | LineFigures], columns: Sequence[int]) -> str:

@@ -1,4 +1,4 @@
-"""Simulates late pulses per second: `python -m tests.bench.pps` prints a table of docs/measurements.md."""
+"""Simulates late pulses per second: `python -m tests.bench.pps` prints the errors of UTC."""
 
 from statistics import mean, pstdev
 
