@@ -8,14 +8,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from imud.attitude.conventions import FLU_LEVEL, RFU_ENU, Convention, DeviceAxes, EulerOrder, Heading
-from imud.attitude.published import (
-    FrameOptions,
-    MountingAngles,
-    MountingAxes,
-    PublishedAxes,
-    as_sent,
-    published_frame,
-)
+from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes, PublishedAxes, as_sent, published_frame
 from imud.attitude.rotation import (
     euler312_from_quat,
     euler_zyx_from_quat,

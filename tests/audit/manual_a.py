@@ -35,9 +35,7 @@ MANUAL_A: Final = (
     Item("A 1.5 frame", "ID 0x0006, 24 bytes", "drivers.imu61x.uart.codec:PARAMETER_FRAME"),
     Item("A 1.5 parameter 3", "baud rate", "drivers.imu61x.uart.codec:Parameter"),
     Item(
-        "A 1.5 parameters 8 to 10",
-        "results of the gyroscope calibration",
-        "drivers.imu61x.uart.settings:GYRO_OFFSETS",
+        "A 1.5 parameters 8 to 10", "results of the gyroscope calibration", "drivers.imu61x.uart.settings:GYRO_OFFSETS"
     ),
     Item("A 1.5 parameters 16 to 18", "mounting error angles", "drivers.imu61x.uart.settings:INSTALLATION_ANGLES"),
     Item("A 1.5 parameter 21", "output rate", "drivers.imu61x.uart.codec:Parameter"),
@@ -72,9 +70,7 @@ MANUAL_A: Final = (
     ),
     Item("A 1.6 CMD 15", "factory settings", "drivers.imu61x.uart.settings:factory_reset"),
     Item(
-        "A 1.7 K1",
-        "acknowledgement: command and result (ERRATA A4, A22)",
-        "drivers.imu61x.uart.codec:Acknowledgement",
+        "A 1.7 K1", "acknowledgement: command and result (ERRATA A4, A22)", "drivers.imu61x.uart.codec:Acknowledgement"
     ),
     Item(
         "A 1.8 two hosts",
@@ -110,9 +106,7 @@ MANUAL_A: Final = (
         "drivers.imu61x.registers:M_S2_PER_COUNT_REGISTER",
     ),
     Item(
-        "A 2.4.1 scale of the temperature",
-        "−1 / 263.4 °C, zero at 172621824",
-        "drivers.imu61x.registers:temperature_c",
+        "A 2.4.1 scale of the temperature", "−1 / 263.4 °C, zero at 172621824", "drivers.imu61x.registers:temperature_c"
     ),
     Item(
         "A 2.4.1 scale of the attitude",
@@ -133,11 +127,7 @@ MANUAL_A: Final = (
     Item("A 3.1 rate", "400 kHz", "links.i2c:I2cLink"),
     Item("A 3.1 address", "0x18, 7 bits", "drivers.imu61x.common:I2C_ADDRESSES"),
     Item("A 3.2 pull-ups", "4.7 kΩ", left="wiring; in README.md and docs/buses.md"),
-    Item(
-        "A 3.3.1 reading",
-        "register 0x12, 32 bytes, one transaction (ERRATA A13)",
-        "drivers.imu61x.i2c:READ_BURST",
-    ),
+    Item("A 3.3.1 reading", "register 0x12, 32 bytes, one transaction (ERRATA A13)", "drivers.imu61x.i2c:READ_BURST"),
     Item("A 3.3.1 order", "accelerometer in g, gyroscope in °/s, temperature in °C", "drivers.imu61x.i2c:FRAME"),
     Item("A 3.3.1 CRC", "over the first 28 bytes", "drivers.imu61x.i2c:CRC_OFFSET"),
     Item("A 3.3.2 filters", "register 0x06, read and written", "drivers.imu61x.i2c:write_filter"),

@@ -165,11 +165,7 @@ MANUAL_B: Final = (
     Item("B 6.2.2 zero", "0x00A5, set and cancelled", "drivers.hipnuc.j1939.commands:zero"),
     Item("B 6.2.2 directions", "0x009E, 0x009F", "drivers.hipnuc.j1939.commands:set_direction"),
     Item("B 6.2.2 source address", "any", "drivers.hipnuc.j1939.codec:HOST_ADDRESS"),
-    Item(
-        "B 7 NMEA 2000",
-        "heading, rate of turn, attitude by the standard",
-        "drivers.hipnuc.nmea2000:measurement_of",
-    ),
+    Item("B 7 NMEA 2000", "heading, rate of turn, attitude by the standard", "drivers.hipnuc.nmea2000:measurement_of"),
     Item("B 8.1.1 procedure", "steps and conditions", "drivers.hipnuc.common:TURNING"),
     Item("B 8.1.1 result", "bias of MAGCONFIG, zero before", "drivers.hipnuc.uart.replies:parse_magconfig"),
     Item("B 8.1.2 disturbance", "a field that does not turn with the module", "device.calibration:RESIDUAL_MAX"),

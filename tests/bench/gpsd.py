@@ -77,10 +77,7 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
         return
     load = replace(LOAD, seconds=2.0 if quick else 6.0)
     figures = [
-        (
-            gpsd_us(program, load),
-            *(run(replace(load, latency_ms=held)).cpu_us_per_sample for held in (0.0, HELD_MS)),
-        )
+        (gpsd_us(program, load), *(run(replace(load, latency_ms=held)).cpu_us_per_sample for held in (0.0, HELD_MS)))
         for _ in range(1 if quick else ROUNDS)
     ]
     theirs, at_once, held_cpu = zip(*figures, strict=True)
@@ -88,9 +85,6 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
     yield Row(f"{name}: CPU per sample, gpsd", median(theirs), "us")
     yield Row(f"{name}: CPU per sample, imud in the same run", median(at_once), "us")
     yield Row(f"{name}: CPU per sample, imud, {HELD_MS:g} ms hold", median(held_cpu), "us")
-    for words, ours, most in (
-        ("", at_once, RATIO_MOST),
-        (f", {HELD_MS:g} ms hold", held_cpu, HELD_RATIO_MOST),
-    ):
+    for words, ours, most in (("", at_once, RATIO_MOST), (f", {HELD_MS:g} ms hold", held_cpu, HELD_RATIO_MOST)):
         ratio = median(a / b for a, b in zip(ours, theirs, strict=True))
         yield at_most(f"{name}: imud / gpsd{words}", ratio, "x", most)

@@ -137,11 +137,7 @@ def rss_mb(pid: int) -> float:
 
 def configuration(folder: Path, ports: Sequence[str], load: Load) -> Path:
     devices = {
-        f"d{i}": {
-            "driver": "hipnuc-uart",
-            "identify": False,
-            "uart": {"port": port, "baud": 921600},
-        }
+        f"d{i}": {"driver": "hipnuc-uart", "identify": False, "uart": {"port": port, "baud": 921600}}
         for i, port in enumerate(ports)
     }
     if load.sout:

@@ -14,10 +14,7 @@ STILL: Vector3 = (0.0, 0.0, 0.0)
 
 
 def sample(
-    accel: Vector3 | None = UP,
-    gyro: Vector3 | None = STILL,
-    euler: Vector3 | None = None,
-    incli: Pair | None = None,
+    accel: Vector3 | None = UP, gyro: Vector3 | None = STILL, euler: Vector3 | None = None, incli: Pair | None = None
 ) -> Sample:
     return Sample(
         "bow", 1, 1, 0, Sync.ARRIVAL, 1, 1, accel_m_s2=accel, gyro_rad_s=gyro, euler_rad=euler, incli_rad=incli

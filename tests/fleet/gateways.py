@@ -123,9 +123,7 @@ class KilledGateway:
         words = [ports, str(spool), str(epoch), str(megabytes), str(authority.folder) if authority else ""]
         words += [str(newest_seq), str(statements), name, version]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "tests.fleet.gateway_process", *words],
-            stdout=subprocess.PIPE,
-            bufsize=0,
+            [sys.executable, "-m", "tests.fleet.gateway_process", *words], stdout=subprocess.PIPE, bufsize=0
         )
 
     def wait_until(self, waiting: int) -> None:

@@ -15,14 +15,7 @@ from imud.fleet.accounts import (
     placed,
 )
 from imud.fleet.messages import CLOCK_SET_NS, FleetMessage, GatewayClock
-from tests.fleet.fleet_gateway import (
-    UTC_NS,
-    event_message,
-    intervals_message,
-    not_set,
-    samples_message,
-    synchronised,
-)
+from tests.fleet.fleet_gateway import UTC_NS, event_message, intervals_message, not_set, samples_message, synchronised
 
 SET = GatewayClock(0, UTC_NS, synchronised=True, error_ns=40)
 NOT_SET = GatewayClock(0, 123, synchronised=False)

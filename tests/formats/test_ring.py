@@ -60,8 +60,7 @@ COUNTS = [("slot_count", 0), ("slot_count", 4095), ("ledger_count", LEDGER_ROOM 
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "words"),
-    [(*one, "the same version") for one in VERSIONS] + [(*one, "damaged") for one in COUNTS],
+    ("name", "value", "words"), [(*one, "the same version") for one in VERSIONS] + [(*one, "damaged") for one in COUNTS]
 )
 def test_another_version_and_impossible_counts_are_refused(name: str, value: int, words: str) -> None:
     raw = bytearray(encode_header(HEADER))

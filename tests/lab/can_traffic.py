@@ -39,12 +39,7 @@ class Module:
         driver = DRIVERS[self.driver]
         assert isinstance(driver, CanDriver)
         options = msgspec.to_builtins(driver.node_settings(self.node))
-        return {
-            "driver": self.driver,
-            "options": options,
-            "identify": False,
-            "socketcan": {"interface": interface},
-        }
+        return {"driver": self.driver, "options": options, "identify": False, "socketcan": {"interface": interface}}
 
 
 def fleet() -> list[Module]:

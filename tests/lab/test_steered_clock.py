@@ -27,14 +27,7 @@ ADJ_FREQUENCY, ADJ_TICK = 0x2, 0x4000
 PERIOD_NS = 20 * NS_PER_MS
 WIRE_NS = 82 * uart_byte_ns(115_200)
 """Wire time of a frame, ns. A pseudo-terminal has no wire time."""
-STEPS = (
-    (6.0, 0, 10_000),
-    (5.0, 500, 10_000),
-    (5.0, -500, 10_000),
-    (3.0, 0, 11_000),
-    (3.0, 0, 9_000),
-    (4.0, 0, 10_000),
-)
+STEPS = ((6.0, 0, 10_000), (5.0, 500, 10_000), (5.0, -500, 10_000), (3.0, 0, 11_000), (3.0, 0, 9_000), (4.0, 0, 10_000))
 """Steps of (time in s, rate error in ppm, length of a tick in µs). The last steps change the tick by ±10 %."""
 
 

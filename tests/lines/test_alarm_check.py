@@ -63,10 +63,7 @@ def test_a_lasting_contradiction_is_reported_once() -> None:
         change = check.add_sample(number * step_ns, angles(0, 9.0 if out else 0.0), level)
         if change:
             changes.append((number, change))
-    assert changes == [
-        (SETTLE_NS // step_ns, AlarmVerdict.RIGHT),
-        (300 + FAULT_NS // step_ns, AlarmVerdict.STUCK_LOW),
-    ]
+    assert changes == [(SETTLE_NS // step_ns, AlarmVerdict.RIGHT), (300 + FAULT_NS // step_ns, AlarmVerdict.STUCK_LOW)]
     assert check.verdict is AlarmVerdict.STUCK_LOW
 
 

@@ -87,11 +87,7 @@ async def test_edges_that_stop_and_come_back(wired: WiredDevice) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [100, 20])
-@pytest.mark.parametrize(
-    ("edges", "frames"),
-    [(0.1, 0.0), (0.0, 0.1), (0.1, 0.1)],
-    ids=["edges", "frames", "both"],
-)
+@pytest.mark.parametrize(("edges", "frames"), [(0.1, 0.0), (0.0, 0.1), (0.1, 0.1)], ids=["edges", "frames", "both"])
 @played(
     lambda edges, frames, rate_hz: WiredDevice(
         SOUT,
@@ -214,9 +210,7 @@ WITHOUT_S = 30
 
 
 @pytest.mark.parametrize(
-    ("lines", "skew_ppm"),
-    [(PPS, 30.0), (DeviceLines(pps=PPS.pps, sout=SOUT.sout), -30.0)],
-    ids=["pps", "pps and sout"],
+    ("lines", "skew_ppm"), [(PPS, 30.0), (DeviceLines(pps=PPS.pps, sout=SOUT.sout), -30.0)], ids=["pps", "pps and sout"]
 )
 @pytest.mark.manual("B 1.2.1 UTC by PPS and RMC")
 @played(

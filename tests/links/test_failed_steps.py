@@ -99,8 +99,7 @@ def test_a_link_that_cannot_be_set_up_is_closed(
 
 
 @pytest.mark.parametrize(
-    ("error", "words"),
-    [(errno.ENOBUFS, "queue is full"), (errno.EAGAIN, "queue is full"), (errno.ENETDOWN, "is down")],
+    ("error", "words"), [(errno.ENOBUFS, "queue is full"), (errno.EAGAIN, "queue is full"), (errno.ENETDOWN, "is down")]
 )
 def test_a_refused_frame_is_explained(sys_with_can0: Path, error: int, words: str) -> None:
     made = FakeSocket(4, error)  # after two options and the buffer size

@@ -114,10 +114,7 @@ def test_types_in_words(field_type: Any, words: str) -> None:
 
 @pytest.mark.parametrize(
     ("value", "field_type", "place"),
-    [
-        ([1, "x"], list[int], ' with "x" at [1]'),
-        ({"rate_hz": 1, "names": ["a", 2]}, Trip, " with 2 at names[1]"),
-    ],
+    [([1, "x"], list[int], ' with "x" at [1]'), ({"rate_hz": 1, "names": ["a", 2]}, Trip, " with 2 at names[1]")],
 )
 def test_the_place_of_a_wrong_part(value: object, field_type: Any, place: str) -> None:
     assert value_problem(value, field_type).endswith(place)

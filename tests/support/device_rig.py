@@ -258,9 +258,7 @@ async def running(
 
 
 def play(
-    rigs: DeviceRigs,
-    story: Callable[[list[DeviceRig]], Coroutine[Any, Any, None]],
-    clock: VirtualClock | None = None,
+    rigs: DeviceRigs, story: Callable[[list[DeviceRig]], Coroutine[Any, Any, None]], clock: VirtualClock | None = None
 ) -> None:
     """Run the devices of `rigs` during a story, in the time of `clock` if given. No memory link may stay open."""
 

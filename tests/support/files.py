@@ -94,11 +94,7 @@ def imu61x_log(indices: Iterable[int]) -> str:
     lines = []
     for index in indices:
         frames = encode_set(
-            index=index,
-            accel_m_s2=(0, 0, 9.80665),
-            gyro_rad_s=(0, 0, 0),
-            euler_rad=(0.1, 0.2, 0.3),
-            temperature_c=25.5,
+            index=index, accel_m_s2=(0, 0, 9.80665), gyro_rad_s=(0, 0, 0), euler_rad=(0.1, 0.2, 0.3), temperature_c=25.5
         )
         t_ns = BEGIN_NS + index * PERIOD_NS
         for place, (can_id, data) in enumerate(frames):

@@ -90,10 +90,7 @@ def test_a_device_gets_the_sentences_of_gpsd(receiver: Receiver, port: Port, tmp
         "rmc": {"source": "gpsd", "tcp_port": tcp_port},
     }
     fed: list[Rmc] = []
-    with (
-        gpsd(tcp_port, receiver.path, tmp_path),
-        running_daemon(tmp_path, {"bow": device}) as daemon,
-    ):
+    with gpsd(tcp_port, receiver.path, tmp_path), running_daemon(tmp_path, {"bow": device}) as daemon:
         receiver.second = 0
         end = time.monotonic() + LIMIT_S
         while len(fed) < WANTED:

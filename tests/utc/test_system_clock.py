@@ -82,10 +82,7 @@ class SystemClockBench:
         self.clock = clock
         self.got: list[tuple[bytes, int]] = []
         self.source = SystemClockSource(
-            RmcOptions(source="system", rate_hz=rate_hz),
-            lambda: self.now_ns,
-            lambda: OFFSET_NS,
-            lambda: self.clock,
+            RmcOptions(source="system", rate_hz=rate_hz), lambda: self.now_ns, lambda: OFFSET_NS, lambda: self.clock
         )
         self.source.start(lambda sentence, t_rx_ns: self.got.append((sentence, t_rx_ns)))
 

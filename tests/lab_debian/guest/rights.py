@@ -25,18 +25,7 @@ def check(checks: Checks, _host: Host) -> None:
         expect_in("imud-control", refused.stdout, "refusal")
         expect_in("Permission denied", run(PYTHON, "-c", WRITE_RING, user="reader").stdout, "writing to a ring")
     with checks("a member of imud-control changes a device"):
-        must(
-            "runuser",
-            "-u",
-            "chief",
-            "--",
-            "imud",
-            "settings",
-            "usb",
-            "--yes",
-            "--set",
-            f"output.hi91={RATE_HZ}",
-        )
+        must("runuser", "-u", "chief", "--", "imud", "settings", "usb", "--yes", "--set", f"output.hi91={RATE_HZ}")
     with checks("another user can read neither socket nor ring, and receives the reason"):
         refused = run("imud", "devices", user="stranger")
         assert refused.returncode, "expected an error for another user"

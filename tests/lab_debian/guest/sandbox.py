@@ -12,13 +12,7 @@ from pathlib import Path
 
 from tests.lab_debian.guest import buses
 from tests.lab_debian.guest.checks import Checks, Failed, expect, expect_in
-from tests.lab_debian.guest.system import (
-    Host,
-    confined,
-    confinement,
-    must,
-    pid,
-)
+from tests.lab_debian.guest.system import Host, confined, confinement, must, pid
 
 SCORE_MAX = 2.0
 """Maximum score. 0.4 of it is due to adjtimex, which reports whether the clock is synchronised (docs/operate.md)."""

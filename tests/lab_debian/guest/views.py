@@ -51,12 +51,7 @@ except OSError as error:
 """
 """Program that sends a request as the page does. It prints status and text of the reply; 0 without a reply."""
 LOOK = json.dumps({"method": "actions", "params": {"device": "usb"}})
-CHANGE = json.dumps(
-    {
-        "method": "settings.apply",
-        "params": {"device": "usb", "settings": {"output.hi91": RATE_HZ}},
-    }
-)
+CHANGE = json.dumps({"method": "settings.apply", "params": {"device": "usb", "settings": {"output.hi91": RATE_HZ}}})
 NO_BROKER = "mqtt: {enabled: true, brokers: ['mqtt://127.0.0.1:1']}\n"
 STAYS_S = 30.0
 

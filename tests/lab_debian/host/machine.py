@@ -11,10 +11,7 @@ from tests.lab.host.errors import LabError
 from tests.lab_debian.host.image import Image
 from tests.lab_debian.host.release import Release
 
-PLATFORMS = {
-    "amd64": ("q35", "max", "ttyS0"),
-    "arm64": ("virt,gic-version=3", "cortex-a72", "ttyAMA0"),
-}
+PLATFORMS = {"amd64": ("q35", "max", "ttyS0"), "arm64": ("virt,gic-version=3", "cortex-a72", "ttyAMA0")}
 """Machine, processor and console by architecture. Processors are always emulated: results do not depend on KVM."""
 
 ADAPTER = {"driver": "usb-serial", "chardev": "imu", "id": "imu", "bus": "xhci.0", "serial": "LAB0001"}

@@ -94,9 +94,7 @@ async def test_a_request_above_the_limit_is_disconnected(size: int, is_answered:
 
 
 @in_loop
-async def test_the_server_pauses_without_descriptors(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_the_server_pauses_without_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
     accept, calls_s = socket.socket.accept, list[float]()
 
     def refuse_twice(listener: socket.socket) -> tuple[socket.socket, Any]:

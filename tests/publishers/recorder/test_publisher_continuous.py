@@ -84,9 +84,7 @@ def test_a_new_file_starts_by_size_or_time_with_all_states(tmp_path: Path) -> No
     assert [one.number for one in sessions] == [0, 1, 2]
 
 
-def test_clock_readings_are_within_a_file(
-    tmp_path: Path,
-) -> None:
+def test_clock_readings_are_within_a_file(tmp_path: Path) -> None:
     bench = RecorderBench(tmp_path, file_minutes=1)
     bench.tick()
 

@@ -132,10 +132,7 @@ def test_a_rate_that_the_line_does_not_carry_is_refused_before_anything_is_sent(
     with pytest.raises(BadArgument, match="lower the output rate first"):
         act(far, "baud", baud=115200)
     assert len(far.samples(100)) >= 35
-    for name, words in (
-        ("stop_streaming", "no program receives samples"),
-        ("factory_reset", "`uart.baud`"),
-    ):
+    for name, words in (("stop_streaming", "no program receives samples"), ("factory_reset", "`uart.baud`")):
         assert words in DRIVER.verbs[name].help
 
 
