@@ -12,19 +12,13 @@ from typing import TypeGuard
 PACKAGE = Path(__file__).parent.parent / "imud"
 
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("imud", "imud.model"),
-    ("imud.host", "imud.formats", "imud.attitude"),
-    ("imud.contracts",),
+    ("imud", "imud.model"), ("imud.host", "imud.formats", "imud.attitude"), ("imud.contracts",),
     (
         "imud.drivers", "imud.sampling", "imud.links", "imud.publishers", "imud.fleet", "imud.utc", "imud.client",
         "imud.analysis", "imud.bridges",
     ),
-    ("imud.config", "imud.lines", "imud.sim", "imud.web"),
-    ("imud.recording",),
-    ("imud.device",),
-    ("imud.daemon",),
-    ("imud.cli",),
-    ("imud.__main__",),
+    ("imud.config", "imud.lines", "imud.sim", "imud.web"), ("imud.recording",), ("imud.device",), ("imud.daemon",),
+    ("imud.cli",), ("imud.__main__",),
 )  # fmt: skip
 """Parts of imud. A part imports from lower layers and from itself; it never imports another part of its own layer."""
 PARTS = tuple(name for names in LAYERS for name in names)
@@ -167,13 +161,10 @@ LONG_CLASSES = {
     "SampleClock": "one state machine with a fast path",
 }
 LARGE_CONSTRUCTORS = {
-    "imud.cli.doctor.surroundings.Surroundings",
-    "imud.cli.setup.steps.SetupSteps",
-    "imud.sampling.clock.SampleClock",
-    "imud.sampling.steering.Holdover",
-    "imud.sim.can_module.PeriodicCanModule",
+    "imud.cli.doctor.surroundings.Surroundings", "imud.cli.setup.steps.SetupSteps", "imud.sampling.clock.SampleClock",
+    "imud.sampling.steering.Holdover", "imud.sim.can_module.PeriodicCanModule",
     "imud.sim.imu61x.registers.Imu61xRegisters",
-}
+}  # fmt: skip
 """Constructors with more parameters, from before this rule. Add none."""
 
 
@@ -386,12 +377,10 @@ MAY_READ_CLOCKS = (
     "imud.host.clock",
     "imud.host.event_loop",  # the remaining time of a wait, by the clock of asyncio's timers
     "imud.cli",  # a process of its own, like the client, the fleet reader and the simulator
-    "imud.client",
-    "imud.fleet.reader",
-    "imud.sim.__main__",
+    "imud.client", "imud.fleet.reader", "imud.sim.__main__",
     "imud.links",  # in the callback that reads, and in waits for the end of a transfer
     "imud.web.foxglove",  # the server of `imud foxglove`, a process of its own
-)
+)  # fmt: skip
 
 
 def clock_uses(path: Path) -> list[str]:
@@ -473,17 +462,8 @@ def test_tests_write_no_private_members() -> None:
 # --- a test by the path of its module ---------------------------------------------------------------------------------
 
 ELSEWHERE = (
-    "audit",
-    "bench",
-    "lab",
-    "lab_debian",
-    "include",
-    "fuzz",
-    "attack",
-    "support",
-    "packaging",
-    "monitoring",
-)
+    "audit", "bench", "lab", "lab_debian", "include", "fuzz", "attack", "support", "packaging", "monitoring",
+)  # fmt: skip
 """Folders of tests that do not belong to one package: measurements, kernels, the C header, fuzzing, helpers, packages,
 and monitoring."""
 

@@ -148,17 +148,12 @@ class Attack:
 
 
 ATTACKS: dict[str, Attack] = {
-    "calm": Attack(calm),
-    **{kind: Attack(partial(hostile, kind=kind), kind in SHORT) for kind in KINDS},
-    "mix": Attack(partial(hostile, kind="mix")),
-    "replug": Attack(replug),
+    "calm": Attack(calm), **{kind: Attack(partial(hostile, kind=kind), kind in SHORT) for kind in KINDS},
+    "mix": Attack(partial(hostile, kind="mix")), "replug": Attack(replug),
     "shared-memory": Attack(partial(shared_memory, sticky=False)),
-    "sticky-memory": Attack(partial(shared_memory, sticky=True)),
-    "reloads": Attack(reloads),
-    "event-flood": Attack(event_flood),
-    "unread-log": Attack(unread_log),
+    "sticky-memory": Attack(partial(shared_memory, sticky=True)), "reloads": Attack(reloads),
+    "event-flood": Attack(event_flood), "unread-log": Attack(unread_log),
     "schemas-100": Attack(partial(hostile, kind="schemas"), devices=MANY_DEVICES),
     "statuses-100": Attack(partial(hostile, kind="statuses"), devices=MANY_DEVICES),
-    "mix-100": Attack(partial(hostile, kind="mix"), False, devices=MANY_DEVICES),
-    "starved": Attack(starved),
-}
+    "mix-100": Attack(partial(hostile, kind="mix"), False, devices=MANY_DEVICES), "starved": Attack(starved),
+}  # fmt: skip

@@ -326,13 +326,11 @@ class AttackedDaemon:
         if os.geteuid():
             groups = {"group": grp.getgrgid(os.getegid()).gr_name}
         tree = {
-            "log_level": "warning",
-            "state_dir": str(self.folder),
+            "log_level": "warning", "state_dir": str(self.folder),
             "socket": {"path": str(self.socket), "clients_max": CLIENTS_MAX, **groups},
             "shm": {"directory": str(self.rings), "slots": slots, "group": groups["group"]},
-            "metrics": {"port": self.metrics_port},
-            "devices": devices,
-        }
+            "metrics": {"port": self.metrics_port}, "devices": devices,
+        }  # fmt: skip
         new = self._file.with_suffix(".new")
         new.write_bytes(msgspec.json.encode(tree))  # each JSON text is a YAML text
         new.replace(self._file)

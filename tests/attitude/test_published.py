@@ -29,23 +29,18 @@ ENU, NED = Convention.ENU_FLU, Convention.NED_FRD
 
 
 def sample(
-    accel: Vector3 | None = None,
-    euler_deg: Vector3 | None = None,
-    quat: Quaternion | None = None,
-    gyro: Vector3 | None = None,
-    mag: Vector3 | None = None,
-) -> Sample:
+    accel: Vector3 | None = None, euler_deg: Vector3 | None = None, quat: Quaternion | None = None,
+    gyro: Vector3 | None = None, mag: Vector3 | None = None,
+) -> Sample:  # fmt: skip
     euler = None if euler_deg is None else (radians(euler_deg[0]), radians(euler_deg[1]), radians(euler_deg[2]))
     times = (7, 100, 2, Sync.EDGE, 101, 102, 103)
     return Sample("bow", *times, accel, gyro, mag, quat, euler, 20.5, 1e5, (0.1, 0.2), 5, 6, 8)
 
 
 def frame(
-    settings: FrameOptions | None = None,
-    convention: Convention | None = None,
-    declination_deg: float | None = None,
+    settings: FrameOptions | None = None, convention: Convention | None = None, declination_deg: float | None = None,
     device: DeviceAxes = FLU_LEVEL,
-) -> PublishedAxes:
+) -> PublishedAxes:  # fmt: skip
     return published_frame(settings, convention, declination_deg, device)
 
 
@@ -340,11 +335,9 @@ MOUNTINGS = st.builds(
     euler=st.builds(
         MountingAngles, roll_deg=st.floats(-180, 180), pitch_deg=st.floats(-90, 90), yaw_deg=st.floats(-180, 180)
     ),
-    z_down=st.booleans(),
-    level_roll_deg=st.floats(-45, 45),
-    level_pitch_deg=st.floats(-45, 45),
+    z_down=st.booleans(), level_roll_deg=st.floats(-45, 45), level_pitch_deg=st.floats(-45, 45),
     heading_offset_deg=st.floats(-180, 180),
-)
+)  # fmt: skip
 DEVICES = st.sampled_from([RFU_ENU, FLU_LEVEL])
 FRAMES = st.builds(
     published_frame, st.none() | MOUNTINGS, st.sampled_from([ENU, NED]), st.none() | st.floats(-30, 30), DEVICES

@@ -137,12 +137,10 @@ def test_quaternions_without_direction_are_refused(quat: Quaternion, convert: Ca
 @pytest.mark.parametrize(
     "matrix",
     [
-        ((1, 0, 0), (0, 1, 0), (0, 0, -1)),
-        ((1, 0, 0), (0, 2, 0), (0, 0, 1)),
-        ((1, 0, 0), (1, 0, 0), (0, 0, 1)),
+        ((1, 0, 0), (0, 1, 0), (0, 0, -1)), ((1, 0, 0), (0, 2, 0), (0, 0, 1)), ((1, 0, 0), (1, 0, 0), (0, 0, 1)),
         ((math.nan, 0, 0), (0, 1, 0), (0, 0, 1)),
     ],
-)
+)  # fmt: skip
 def test_other_matrices_are_rejected(matrix: Matrix3) -> None:
     assert not is_rotation(matrix)
     with pytest.raises(ValueError, match="orthonormal"):

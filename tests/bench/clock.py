@@ -25,13 +25,9 @@ SETTLED_NS = 70 * NS_PER_S  # the fit and its error no longer change much
 SECONDS = {1: 240, 100: 150, 200: 150, 400: 120, 1000: 120}  # duration of a run by rate
 BAUD_OF_RATE = {1: 115_200, 100: 115_200, 200: 460_800, 400: 921_600, 1000: 921_600}
 CRYSTALS = {
-    "0 ppm": Crystal(0.0),
-    "+50 ppm": Crystal(50.0),
-    "-50 ppm": Crystal(-50.0),
-    "+5 %": Crystal(50_000.0),
-    "-5 %": Crystal(-50_000.0),
-    "drift": Crystal(20.0, 0.1),
-}
+    "0 ppm": Crystal(0.0), "+50 ppm": Crystal(50.0), "-50 ppm": Crystal(-50.0), "+5 %": Crystal(50_000.0),
+    "-5 %": Crystal(-50_000.0), "drift": Crystal(20.0, 0.1),
+}  # fmt: skip
 """Crystals by name. `drift`: 20 ppm, then a change of 0.1 ppm/s between -10 and +10 ppm around it."""
 
 
@@ -84,10 +80,8 @@ def summary(settled: Sequence[Point], settling: Sequence[Point]) -> Accuracy:
         rms_ns=sqrt(sum(p.off_ns**2 for p in settled) / n),
         sigma_ns=sqrt(sum((p.off_ns - mean) ** 2 for p in settled) / n),
         p999_ns=sorted(abs(p.off_ns) for p in settled)[int(n * 0.999)],
-        mean_t_err_ns=sum(p.t_err_ns for p in settled) / n,
-        share=_share(settled),
-        share_settling=_share(settling),
-    )
+        mean_t_err_ns=sum(p.t_err_ns for p in settled) / n, share=_share(settled), share_settling=_share(settling),
+    )  # fmt: skip
 
 
 def _share(points: Sequence[Point]) -> float:

@@ -32,15 +32,9 @@ def random_hi91(random: Random) -> bytes:
         return (random.gauss(0, scale), random.gauss(0, scale), random.gauss(0, scale))
 
     return encode_hi91(
-        system_time_ms=random.randrange(1 << 32),
-        accel_m_s2=three(9.8),
-        gyro_rad_s=three(0.01),
-        mag_t=three(5e-5),
-        euler_rad=three(1.0),
-        quat_wxyz=(1.0, *three(0.1)),
-        temperature_c=25.0,
-        pressure_pa=random.gauss(101_325, 10),
-    )
+        system_time_ms=random.randrange(1 << 32), accel_m_s2=three(9.8), gyro_rad_s=three(0.01), mag_t=three(5e-5),
+        euler_rad=three(1.0), quat_wxyz=(1.0, *three(0.1)), temperature_c=25.0, pressure_pa=random.gauss(101_325, 10),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -56,12 +50,10 @@ class Family:
 FAMILIES = (
     Family(HIPNUC, random_hi91, b"LOG VERSION\r\n", b"PNAME=HI14R3\r\nAPP_VER=156\r\nOK\r\n"),
     Family(
-        IMU61X,
-        IMU61X.example_frame,
-        ask_status().payload,
+        IMU61X, IMU61X.example_frame, ask_status().payload,
         encode_status(Status(10203, 2, 614, (1, 2, 3), 0, 0, 0, 0, 0, 0, 0, bytes(32))),
     ),
-)
+)  # fmt: skip
 DRIVERS = [family.driver for family in FAMILIES]
 
 

@@ -119,11 +119,9 @@ def restarted(model: ArrivalModel, count: int, silent_ns: int) -> Iterator[Arriv
         yield last
     assert last is not None
     again = replace(
-        model,
-        crystal=replace(model.crystal, start_ns=3_000_000_000),
-        begin_ns=last.t_rx_ns + silent_ns,
+        model, crystal=replace(model.crystal, start_ns=3_000_000_000), begin_ns=last.t_rx_ns + silent_ns,
         seed=model.seed + 1,
-    )
+    )  # fmt: skip
     yield from again.run(count - count // 2)
 
 

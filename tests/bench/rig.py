@@ -85,12 +85,9 @@ class Outcome:
 class Process:
     def __init__(self, cores: set[int], *argv: str) -> None:
         self.popen = subprocess.Popen(
-            [sys.executable, *argv],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
+            [sys.executable, *argv], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
             cwd=Path(__file__).parents[2],
-        )
+        )  # fmt: skip
         os.sched_setaffinity(self.popen.pid, cores)
 
     def line(self) -> str:
@@ -144,16 +141,14 @@ def configuration(folder: Path, ports: Sequence[str], load: Load) -> Path:
         # the name of a line has at most 31 bytes
         devices["d0"]["lines"] = {"sout": {"line": str(folder / "edges")[-31:]}}
     tree = {
-        "log_level": "error",
-        "state_dir": str(folder),
-        "socket": {"path": str(folder / "s")},
+        "log_level": "error", "state_dir": str(folder), "socket": {"path": str(folder / "s")},
         "shm": {"enabled": load.shm, "directory": str(folder)}
         | ({} if load.latency_ms is None else {"latency_ms": load.latency_ms}),
         "metrics": {"port": 0},
         "recorder": {"enabled": bool(load.record_to), "directory": load.record_to or str(folder)},
         **({"mqtt": load.mqtt} if load.mqtt else {}),
         "devices": devices,
-    }
+    }  # fmt: skip
     file = folder / "imud.yaml"
     file.write_bytes(msgspec.json.encode(tree))  # each JSON text is a YAML text
     return file
@@ -246,20 +241,13 @@ def run(load: Load) -> Outcome:
     total = load.frames * load.devices - load.apart * sum(range(load.devices))
     counted = used.elapsed_s * load.rate_hz * load.devices
     return Outcome(
-        cpu_us_per_sample=used.cpu_ns / 1e3 / counted,
-        loop_us_per_sample=used.loop_ns / 1e3 / counted,
-        written_bytes_s=used.written_bytes / used.elapsed_s,
-        cpu_share=used.cpu_ns / 1e9 / used.elapsed_s,
-        p50_us=figures["p50_us"],
-        p99_us=figures["p99_us"],
-        max_us=figures["max_us"],
-        received=figures["samples"],
+        cpu_us_per_sample=used.cpu_ns / 1e3 / counted, loop_us_per_sample=used.loop_ns / 1e3 / counted,
+        written_bytes_s=used.written_bytes / used.elapsed_s, cpu_share=used.cpu_ns / 1e9 / used.elapsed_s,
+        p50_us=figures["p50_us"], p99_us=figures["p99_us"], max_us=figures["max_us"], received=figures["samples"],
         # a client with `rate_hz` receives only a part of the samples
         gaps=figures["gaps"] + total - figures["samples"] if load.clients and load.client_hz is None else 0,
-        refused=used.refused,
-        rss_mb=memory_mb,
-        statuses=statuses,
-    )
+        refused=used.refused, rss_mb=memory_mb, statuses=statuses,
+    )  # fmt: skip
 
 
 def ask(path: Path) -> list[DeviceStatus]:

@@ -94,12 +94,10 @@ def write_configuration(folder: Path, ports: list[str], line: str, port: int) ->
     written = written_devices()
     devices: dict[str, Any] = {
         f"{name.partition(':')[0]}-{n}": {
-            "driver": name.partition(":")[0],
-            "identify": False,
-            "uart": {"port": path, "baud": 921600},
+            "driver": name.partition(":")[0], "identify": False, "uart": {"port": path, "baud": 921600},
         }
         for n, (name, path) in enumerate(zip(written, ports, strict=True))
-    }
+    }  # fmt: skip
     for n in range(REPLAYS):
         replay = {"path": str(folder / "capture"), "speed": "recorded"}
         devices[f"replay-{n}"] = {"driver": "hipnuc-uart", "identify": False, "replay": replay}
@@ -107,14 +105,10 @@ def write_configuration(folder: Path, ports: list[str], line: str, port: int) ->
         link = {"line": line, "baud": MODULE_BAUD, "address": address, "rate_hz": MODULE_HZ}
         devices[f"modbus-{address}"] = {"driver": "hipnuc-modbus", "rs485": link}
     tree = {
-        "log_level": "error",
-        "state_dir": str(folder),
-        "socket": {"path": str(folder / "s")},
-        "shm": {"directory": str(folder)},
-        "metrics": {"port": port},
-        "recorder": soak_recordings.settings(folder / "recordings"),
-        "devices": devices,
-    }
+        "log_level": "error", "state_dir": str(folder), "socket": {"path": str(folder / "s")},
+        "shm": {"directory": str(folder)}, "metrics": {"port": port},
+        "recorder": soak_recordings.settings(folder / "recordings"), "devices": devices,
+    }  # fmt: skip
     file = folder / "imud.yaml"
     file.write_bytes(msgspec.json.encode(tree))
     return Fleet(tuple(name for name in devices if not name.startswith(("replay", "modbus"))), file)

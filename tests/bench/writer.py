@@ -50,15 +50,9 @@ def open_ptys(count: int) -> list[tuple[int, int]]:
 def template() -> bytearray:
     """Return an HI91 frame with pressure at offset 10, device time at 14 and CRC at 4."""
     frame = encode_hi91(
-        system_time_ms=0,
-        accel_m_s2=(0.1, 0.2, 9.8),
-        gyro_rad_s=(0.01, 0.02, 0.03),
-        mag_t=(2e-5, 1e-6, -4e-5),
-        euler_rad=(0.1, 0.2, 0.3),
-        quat_wxyz=(1.0, 0.0, 0.0, 0.0),
-        temperature_c=30.0,
-        pressure_pa=0.0,
-    )
+        system_time_ms=0, accel_m_s2=(0.1, 0.2, 9.8), gyro_rad_s=(0.01, 0.02, 0.03), mag_t=(2e-5, 1e-6, -4e-5),
+        euler_rad=(0.1, 0.2, 0.3), quat_wxyz=(1.0, 0.0, 0.0, 0.0), temperature_c=30.0, pressure_pa=0.0,
+    )  # fmt: skip
     return bytearray(frame)
 
 

@@ -43,12 +43,10 @@ def read(channel: MessageChannel[Any], item: object) -> Any:
 
 def test_messages_and_schemas() -> None:
     assert read(channels()["/bow/imu/data"], FULL) == {
-        "timestamp": STAMP,
-        "frame_id": "bow",
-        "orientation": {"x": 0.5, "y": -0.5, "z": 0.5, "w": 0.5},
+        "timestamp": STAMP, "frame_id": "bow", "orientation": {"x": 0.5, "y": -0.5, "z": 0.5, "w": 0.5},
         "angular_velocity": {"x": 0.25, "y": 0.5, "z": -0.75},
         "linear_acceleration": {"x": 0.125, "y": -0.5, "z": 9.75},
-    }
+    }  # fmt: skip
     assert read(channels()["/bow/imu/data"], BARE) == {
         "timestamp": {"sec": 1_790_000_000, "nsec": 133_456_789},
         "frame_id": "bow",
@@ -71,12 +69,9 @@ def test_messages_and_schemas() -> None:
     channel = channels(MessageFrames("bow", has_north=False))["/bow/attitude"]
     assert channel.schema.name == "foxglove.FrameTransform"
     assert read(channel, FULL) == {
-        "timestamp": STAMP,
-        "parent_frame_id": "bow_level",
-        "child_frame_id": "bow",
-        "translation": {"x": 0.0, "y": 0.0, "z": 0.0},
-        "rotation": {"x": 0.5, "y": -0.5, "z": 0.5, "w": 0.5},
-    }
+        "timestamp": STAMP, "parent_frame_id": "bow_level", "child_frame_id": "bow",
+        "translation": {"x": 0.0, "y": 0.0, "z": 0.0}, "rotation": {"x": 0.5, "y": -0.5, "z": 0.5, "w": 0.5},
+    }  # fmt: skip
     message = read(channels()["/bow/stamp"], FULL)
     assert message.pop("timestamp") == STAMP
     assert message == {

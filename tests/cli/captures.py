@@ -16,27 +16,16 @@ BAUD = 921_600
 
 def frame(system_time_ms: int, accel: FloatArray, gyro: FloatArray, temperature_c: float = 25.0) -> bytes:
     return encode_hi91(
-        system_time_ms=system_time_ms,
-        accel_m_s2=(float(accel[0]), float(accel[1]), float(accel[2])),
-        gyro_rad_s=(float(gyro[0]), float(gyro[1]), float(gyro[2])),
-        mag_t=(0.0, 0.0, 0.0),
-        euler_rad=(0.0, 0.0, 0.0),
-        quat_wxyz=(1.0, 0.0, 0.0, 0.0),
-        temperature_c=round(temperature_c),
-        pressure_pa=1e5,
-    )
+        system_time_ms=system_time_ms, accel_m_s2=(float(accel[0]), float(accel[1]), float(accel[2])),
+        gyro_rad_s=(float(gyro[0]), float(gyro[1]), float(gyro[2])), mag_t=(0.0, 0.0, 0.0), euler_rad=(0.0, 0.0, 0.0),
+        quat_wxyz=(1.0, 0.0, 0.0, 0.0), temperature_c=round(temperature_c), pressure_pa=1e5,
+    )  # fmt: skip
 
 
 def write_capture(
-    file: Path,
-    accel: FloatArray,
-    gyro: FloatArray,
-    *,
-    rate_hz: float,
-    fast: float = 0.0,
-    missing: Collection[int] = (),
-    temperature_c: FloatArray | None = None,
-) -> Path:
+    file: Path, accel: FloatArray, gyro: FloatArray, *, rate_hz: float, fast: float = 0.0,
+    missing: Collection[int] = (), temperature_c: FloatArray | None = None,
+) -> Path:  # fmt: skip
     """Write samples, shape (n, 3), of a device at `rate_hz` with a crystal error of `fast` (0.02: 2 %).
 
     The frames contain the device time in ms. The host reads each frame without a delay.

@@ -348,14 +348,9 @@ def test_files_that_are_no_recordings(tmp_path: Path, cli: Cli) -> None:
     cli.refuses("expected a recording or a capture", "export", "--to", "csv", str(tmp_path / "none"))
     (tmp_path / "c.raw").write_bytes(hi91(0))
     cli.refuses(
-        "expected a driver of bytes or CAN frames",
-        "export",
-        "--to",
-        "csv",
-        "--driver",
-        "hipnuc-modbus",
+        "expected a driver of bytes or CAN frames", "export", "--to", "csv", "--driver", "hipnuc-modbus",
         str(tmp_path / "c.raw"),
-    )
+    )  # fmt: skip
 
 
 def test_options_that_mean_nothing(recorded: Recorded, cli: Cli) -> None:

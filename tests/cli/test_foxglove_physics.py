@@ -25,14 +25,11 @@ pytestmark = pytest.mark.live
 SAMPLES = 100
 ENOUGH = 50
 TOPICS = {
-    "/bow/imu/data": "sensor_msgs/msg/Imu",
-    "/bow/imu/mag": "sensor_msgs/msg/MagneticField",
-    "/bow/temperature": "sensor_msgs/msg/Temperature",
-    "/bow/pressure": "sensor_msgs/msg/FluidPressure",
-    "/tf": "tf2_msgs/msg/TFMessage",
-    "/bow/stamp": "imud_msgs/msg/SampleStamp",
+    "/bow/imu/data": "sensor_msgs/msg/Imu", "/bow/imu/mag": "sensor_msgs/msg/MagneticField",
+    "/bow/temperature": "sensor_msgs/msg/Temperature", "/bow/pressure": "sensor_msgs/msg/FluidPressure",
+    "/tf": "tf2_msgs/msg/TFMessage", "/bow/stamp": "imud_msgs/msg/SampleStamp",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
-}
+}  # fmt: skip
 NOISE = {"accel_m_s2": 0.5, "gyro_rad_s": 0.25, "mag_t": 2.0, "attitude_rad": 0.125, "temperature_c": 3.0}
 
 Messages = dict[str, list[tuple[int, Any]]]

@@ -42,16 +42,12 @@ def test_figures_become_si_and_those_of_the_user_come_first(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("gyro: {random_walk: 0.3}", "random_walk"),
-        ("gyro: {random_walk_deg_sqrt_h: -1}", "gyro"),
-        ("gyro: {random_walk_deg_sqrt_h: .nan}", "gyro"),
-        ("gyroscope: {}", "gyroscope"),
-        ("- 1", "mapping"),
-        ("a: [", "YAML"),
-        ("x" * (SHEET_BYTES_MOST + 1), "at most"),
+        ("gyro: {random_walk: 0.3}", "random_walk"), ("gyro: {random_walk_deg_sqrt_h: -1}", "gyro"),
+        ("gyro: {random_walk_deg_sqrt_h: .nan}", "gyro"), ("gyroscope: {}", "gyroscope"), ("- 1", "mapping"),
+        ("a: [", "YAML"), ("x" * (SHEET_BYTES_MOST + 1), "at most"),
     ],
     ids=["unknown figure", "negative", "not a number", "unknown sensor", "a list", "no YAML", "too long"],
-)
+)  # fmt: skip
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, words: str) -> None:
     file = tmp_path / "sheet.yaml"
     file.write_text(text)

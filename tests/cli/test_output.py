@@ -36,11 +36,9 @@ def test_a_table_aligns_numbers_and_cannot_write_to_the_terminal() -> None:
     assert table(("A",), [("x\x1b[2J\ny",)]) == "A\nx\\x1b[2J\\ny"
     rows = [("mode", "6-axis, slowly", 7), ("baud", 115200, 11), ("node", "-", "-")]
     assert table(("SETTING", "ACTUAL", "N"), rows).splitlines() == [
-        "SETTING  ACTUAL          N",
-        "mode     6-axis, slowly   7",
-        "baud     115200          11",
+        "SETTING  ACTUAL          N", "mode     6-axis, slowly   7", "baud     115200          11",
         "node     -               -",
-    ]
+    ]  # fmt: skip
     for value, width, text in [
         (12.34, 5, "12.34"),
         (12345.6, 5, "12346"),

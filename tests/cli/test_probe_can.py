@@ -97,13 +97,10 @@ def test_a_bus_that_ends_is_reported(bus: type[Bus], monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("details", "words"),
     [
-        ((None, None), "bus without a bit rate"),
-        ((500_000, 3), "bus-off"),
-        ((500_000, 2), "error-passive"),
-        ((1, 9), ""),
-        ((1, len(ControllerState)), ""),
+        ((None, None), "bus without a bit rate"), ((500_000, 3), "bus-off"), ((500_000, 2), "error-passive"),
+        ((1, 9), ""), ((1, len(ControllerState)), ""),
     ],
-)
+)  # fmt: skip
 def test_the_state_in_words(
     details: tuple[int | None, int | None], words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -158,10 +158,8 @@ def test_a_live_device_is_taken_until_the_duration_or_an_interrupt(monkeypatch: 
     sample_set = live.take(duration=3.0)
     assert (kept(sample_set), live.now_s) == (31, 4.0), "the sample after the duration ends it"
     assert (sample_set.device, sample_set.source, sample_set.lost) == (
-        "bow",
-        "live from /s",
-        {"lost_crc": 4, "dropped": 3},
-    )
+        "bow", "live from /s", {"lost_crc": 4, "dropped": 3},
+    )  # fmt: skip
     assert live.notes == [(1.0, 8), (2.0, 16), (3.0, 24), (4.0, 31)]
     assert kept(Live(monkeypatch, 100).take(skip=2.0, duration=1.0)) == 11
     assert kept(Live(monkeypatch, 45, interrupted=True).take()) == 45

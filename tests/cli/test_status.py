@@ -92,11 +92,8 @@ def test_lines_and_utc_say_only_what_is_known() -> None:
 
 def test_settings_and_status_bits_have_names() -> None:
     shown = replace(
-        device("bow"),
-        settings={"mode": "6-axis", "output.hi91": "100 Hz"},
-        status_bits=1 << 5,
-        status_words=("accelerometer over range",),
-        status_bit_names={"5": "accelerometer over range"},
-    )
+        device("bow"), settings={"mode": "6-axis", "output.hi91": "100 Hz"}, status_bits=1 << 5,
+        status_words=("accelerometer over range",), status_bit_names={"5": "accelerometer over range"},
+    )  # fmt: skip
     assert dict(parts(shown)) == {"status": "accelerometer over range", "present": "mode 6-axis, output.hi91 100 Hz"}
     assert dict(parts(replace(shown, status_bits=0, status_words=())))["status"] == "no known bit is set"

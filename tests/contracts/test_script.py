@@ -30,15 +30,11 @@ TIMEOUT_NS = 100
 def command(name: str, part: str = "", silent: bool = False) -> Request:
     """Return a request. Its reply is lines that start with `part`, then OK; without `part`, only OK."""
     return Request(
-        payload=name.encode(),
-        name=name,
-        is_end=of_text(lambda line: line == "OK"),
+        payload=name.encode(), name=name, is_end=of_text(lambda line: line == "OK"),
         is_rejection=of_text(lambda line: line == "ERR"),
-        is_part=of_text(lambda line: bool(part) and line.startswith(part)),
-        timeout_ns=TIMEOUT_NS,
-        silent=silent,
+        is_part=of_text(lambda line: bool(part) and line.startswith(part)), timeout_ns=TIMEOUT_NS, silent=silent,
         messages_min=2 if part else 1,
-    )
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -167,13 +163,10 @@ def test_endless_reply_is_bounded(session: ScriptRunner) -> None:
 
 def frame_command(frame_id: int) -> Request:
     return Request(
-        payload=b"?",
-        name=f"frame {frame_id}",
-        is_end=lambda message: isinstance(message, ReplyFrame) and message.frame_id == frame_id,
-        is_rejection=never,
-        is_part=never,
-        timeout_ns=TIMEOUT_NS,
-    )
+        payload=b"?", name=f"frame {frame_id}",
+        is_end=lambda message: isinstance(message, ReplyFrame) and message.frame_id == frame_id, is_rejection=never,
+        is_part=never, timeout_ns=TIMEOUT_NS,
+    )  # fmt: skip
 
 
 def test_a_frame_answers_as_a_line_does(session: ScriptRunner, ledger: Ledger) -> None:

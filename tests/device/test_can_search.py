@@ -22,13 +22,9 @@ DRIVERS = (FAKE, IMU61X)
 
 def imu61x(index: int, base_id: int = 101) -> list[CanFrame]:
     frames = encode_set(
-        index=index,
-        accel_m_s2=(0, 0, 9.8),
-        gyro_rad_s=(0, 0, 0),
-        euler_rad=(0, 0, 0),
-        temperature_c=20,
+        index=index, accel_m_s2=(0, 0, 9.8), gyro_rad_s=(0, 0, 0), euler_rad=(0, 0, 0), temperature_c=20,
         base_id=base_id,
-    )
+    )  # fmt: skip
     return [CanFrame(can_id, False, data, 0) for can_id, data in frames]
 
 

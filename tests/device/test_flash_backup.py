@@ -17,12 +17,9 @@ T_NS = 1_795_000_000 * NS_PER_S
 def test_a_backup_has_identity_time_and_settings() -> None:
     text = backup_text("bow", "hipnuc-uart", {"product": "HI14", "serial_number": "04"}, {"mode": "6-axis"}, T_NS)
     assert yaml.safe_load(text) == {
-        "device": "bow",
-        "driver": "hipnuc-uart",
-        "time": "2026-11-18T11:06:40Z",
-        "identity": {"product": "HI14", "serial_number": "04"},
-        "settings": {"mode": "6-axis"},
-    }
+        "device": "bow", "driver": "hipnuc-uart", "time": "2026-11-18T11:06:40Z",
+        "identity": {"product": "HI14", "serial_number": "04"}, "settings": {"mode": "6-axis"},
+    }  # fmt: skip
     assert text.startswith("# Settings of bow as the device reported them. `imud settings bow --restore FILE`")
 
 

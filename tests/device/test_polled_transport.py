@@ -96,12 +96,10 @@ async def test_without_a_known_update_rate_the_error_is_the_time_since_the_last_
 
 
 SPI_FAULTS: list[tuple[dict[str, Any], str]] = [
-    ({"line": 0xFF}, "received only 0xFF"),
-    ({"line": 0x00}, "received only 0x00"),
-    ({"error": errno.EIO}, "transfer failed"),
-    ({"error": errno.ETIMEDOUT}, "held low"),
+    ({"line": 0xFF}, "received only 0xFF"), ({"line": 0x00}, "received only 0x00"),
+    ({"error": errno.EIO}, "transfer failed"), ({"error": errno.ETIMEDOUT}, "held low"),
     ({"flips": 10**6}, "damaged frames"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("fault", "why"), SPI_FAULTS, ids=[why for _, why in SPI_FAULTS])

@@ -21,14 +21,10 @@ from tests.support.script_runners import ListPort, of_fast_device, offline_runne
 
 def request(name: str, timeout_ns: int = 10**10, *, silent: bool = False) -> Request:
     return Request(
-        payload=name.encode() + b"\r\n",
-        name=name,
-        is_end=of_text(lambda text: text == "OK"),
-        is_rejection=of_text(lambda text: text.startswith("ERR")),
-        is_part=of_text(lambda text: text.startswith(name)),
-        timeout_ns=timeout_ns,
-        silent=silent,
-    )
+        payload=name.encode() + b"\r\n", name=name, is_end=of_text(lambda text: text == "OK"),
+        is_rejection=of_text(lambda text: text.startswith("ERR")), is_part=of_text(lambda text: text.startswith(name)),
+        timeout_ns=timeout_ns, silent=silent,
+    )  # fmt: skip
 
 
 def ask(*requests: Request) -> RequestScript[list[Outcome]]:

@@ -63,12 +63,9 @@ class KeeperBench:
         host, port = HostClock(lambda: self.now_ns, lambda: self.now_ns, lambda: self.now_ns), FakePort()
         self.port, self.written = port, port.written
         self.keeper = UtcFeed(
-            self.source if source else None,
-            RmcFeed(port, host.now_ns) if source else None,
-            lambda: self.system,
-            host,
+            self.source if source else None, RmcFeed(port, host.now_ns) if source else None, lambda: self.system, host,
             cast(ChronyFeed, self.chrony),
-        )
+        )  # fmt: skip
         self.clock = SampleClock("bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=0, hold_ns=0)
         self.keeper.tick(self.now_ns, None)
         self.keeper.start(self.clock)

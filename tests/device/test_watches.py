@@ -123,13 +123,11 @@ def axes(x: str, y: str, z: str) -> FrameOptions:
 
 
 MOUNTINGS = {
-    "as the manual draws it": FrameOptions(),
-    "on its side": axes("y", "z", "x"),
-    "upside down": axes("y", "x", "-z"),
+    "as the manual draws it": FrameOptions(), "on its side": axes("y", "z", "x"), "upside down": axes("y", "x", "-z"),
     "turned 90° in yaw": axes("x", "y", "z"),  # a module with x right, y forward
     "by angles": FrameOptions(euler=MountingAngles(roll_deg=90, pitch_deg=20, yaw_deg=-70)),
     "by a quaternion": FrameOptions(quat_wxyz=[0.5, -0.5, 0.5, -0.5]),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MOUNTINGS)
@@ -277,16 +275,9 @@ def test_each_published_sample_is_rotated_once() -> None:
     frame = published_frame(MOUNTINGS["upside down"], None, None, RFU_ENU)
     clock, ledger, batches = VirtualClock(), Ledger(), list[Batch]()
     context = PathContext(
-        "bow",
-        0,
-        ledger,
-        batches.append,
-        lambda _message, _t_ns: None,
-        lambda _frame: None,
-        lambda: 0,
-        clock.host,
+        "bow", 0, ledger, batches.append, lambda _message, _t_ns: None, lambda _frame: None, lambda: 0, clock.host,
         frame,
-    )
+    )  # fmt: skip
     driver = DRIVERS["hipnuc-uart"]
     path = StreamPath(HipnucCodec(ledger, HipnucOptions()), make_clock("bow", None, driver, None), context)
     data = encode_hi91(

@@ -141,13 +141,10 @@ def test_any_frames_in_any_order_never_raise(name: str, seed: int) -> None:
     for group in sets(driver, random, 12):
         for frame in group:
             kinds = (
-                frame,
-                frame,
-                foreign(driver, random),
-                frame._replace(data=random.randbytes(len(frame.data))),
+                frame, frame, foreign(driver, random), frame._replace(data=random.randbytes(len(frame.data))),
                 frame._replace(data=random.randbytes(random.randint(0, 8))),
                 frame._replace(data=b"\x00\x00\x80\x7f\xff\xff\xff\xff"),  # infinity and NaN as floats
-            )
+            )  # fmt: skip
             frames += random.choices(kinds, k=random.choice((0, 1, 1, 1, 3)))
     random.shuffle(frames)
     codec = make(driver)

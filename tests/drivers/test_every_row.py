@@ -89,12 +89,10 @@ def test_calibrations_are_complete(_driver: str, kind: str, calibration: Calibra
     ("name", "gyro", "accel"),
     [
         ("hipnuc-modbus", 0.061035 * RAD_PER_DEG, 0.00048828 * 9.8),
-        ("hipnuc-j1939", 0.061035 * RAD_PER_DEG, 0.00048828 * 9.8),
-        ("hipnuc-canopen", 0.1 * RAD_PER_DEG, 0.001 * 9.8),
-        ("hipnuc-uart", None, None),
-        ("imu61x-spi", None, None),
+        ("hipnuc-j1939", 0.061035 * RAD_PER_DEG, 0.00048828 * 9.8), ("hipnuc-canopen", 0.1 * RAD_PER_DEG, 0.001 * 9.8),
+        ("hipnuc-uart", None, None), ("imu61x-spi", None, None),
     ],
-)
+)  # fmt: skip
 def test_steps_on_the_wire(name: str, gyro: float | None, accel: float | None) -> None:
     sheet = DRIVERS[name].data_sheet
     assert sheet.gyro_step_rad_s == (None if gyro is None else pytest.approx(gyro))

@@ -88,26 +88,14 @@ class Bench:
             return Written.PENDING if at == present else Written.VERIFIED
 
         return Readdressing(
-            options=self.options,
-            present=present,
-            noun="node",
-            number="number",
-            words="as node",
-            lost="{confirmed}lost at {new} or {present}",
-            factory=FACTORY,
-            valid=range(1, 128),
-            registers=("place", "rate"),
-            bit_rates={0: 250_000, 1: BUS_BIT_S},
-            boot=CanFilter(BOOTS, 0x780, False),
-            boot_data=b"\0",
-            sender_mask=0x7F,
+            options=self.options, present=present, noun="node", number="number", words="as node",
+            lost="{confirmed}lost at {new} or {present}", factory=FACTORY, valid=range(1, 128),
+            registers=("place", "rate"), bit_rates={0: 250_000, 1: BUS_BIT_S}, boot=CanFilter(BOOTS, 0x780, False),
+            boot_data=b"\0", sender_mask=0x7F,
             frames=lambda at: (CanFilter(REPLIES + at, 0x7FF, False), CanFilter(BOOTS + at, 0x7FF, False)),
-            describe=hex,
-            query=lambda at: frame(at, QUERY),
-            write=write,
-            verify=verify,
+            describe=hex, query=lambda at: frame(at, QUERY), write=write, verify=verify,
             read_saved=lambda: says_nothing(self.device.saved),
-        )
+        )  # fmt: skip
 
     def change(self, new: int) -> Written:
         return run_script(self.readdressing().change(new), self.ask)
@@ -181,14 +169,10 @@ def test_the_command_back_does_not_wait() -> None:
 @pytest.mark.parametrize(
     ("saved", "place"),
     [
-        ({"place": 9}, 9),
-        ({"place": 9}, 5),
-        ({}, 5),
-        ({"rate": 1}, 5),
-        ({"place": 200}, 5),
+        ({"place": 9}, 9), ({"place": 9}, 5), ({}, 5), ({"rate": 1}, 5), ({"place": 200}, 5),
         ({"place": FACTORY}, FACTORY),
     ],
-)
+)  # fmt: skip
 def test_a_restarted_device_is_found_at_its_saved_or_present_place(
     saved: dict[str, int], place: int, boots: bool
 ) -> None:

@@ -43,9 +43,7 @@ def ended_with(words: Sequence[str], log: Path) -> Iterator[None]:
 def configuration(folder: Path, gateway: str, port: int) -> Path:
     """Return the configuration of a daemon with all files in `folder`."""
     tree = {
-        "state_dir": str(folder),
-        "socket": {"path": str(folder / "imud.sock")},
-        "shm": {"enabled": False},
+        "state_dir": str(folder), "socket": {"path": str(folder / "imud.sock")}, "shm": {"enabled": False},
         "metrics": {"enabled": False},
         "mqtt": {
             "enabled": True, "brokers": [f"mqtt://127.0.0.1:{port}"], "site": "demo", "gateway": gateway,

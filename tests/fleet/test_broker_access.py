@@ -17,11 +17,9 @@ TLS_BROKER = BROKER._replace(tls=True)
 
 def of_tls(authority: Authority) -> MqttOptions:
     return MqttOptions(
-        user="reader",
-        ca_file=authority["ca.pem"],
-        cert_file=authority["gateway.pem"],
+        user="reader", ca_file=authority["ca.pem"], cert_file=authority["gateway.pem"],
         key_file=authority["gateway.key"],
-    )
+    )  # fmt: skip
 
 
 def test_a_password_file_has_the_password_in_its_first_line(tmp_path: Path) -> None:

@@ -31,15 +31,9 @@ def test_an_invalid_name_raises_an_error(name: str) -> None:
 @pytest.mark.parametrize(
     "topic",
     [
-        "",
-        "imud",
-        "imud/a/b",
-        "imud/a/b/status",
-        "imud/a/b/c/state",
-        "imud/a/b/c/d/e",
-        "other/a/b/state",
+        "", "imud", "imud/a/b", "imud/a/b/status", "imud/a/b/c/state", "imud/a/b/c/d/e", "other/a/b/state",
         "imud/a//state",
     ],
-)
+)  # fmt: skip
 def test_other_topics_are_not_parsed(topic: str) -> None:
     assert parse_topic(topic) is None

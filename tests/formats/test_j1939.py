@@ -8,15 +8,13 @@ from imud.formats.can import EXTENDED_ID_MAX
 from imud.formats.j1939 import GLOBAL, J1939Id, filter_of, join, sender_of, split
 
 KNOWN = [
-    (0x0CFF3408, J1939Id(3, 0xFF34, 0x08)),
-    (0x0CEF0855, J1939Id(3, 0xEF00, 0x55, 0x08)),
-    (0x0CEF5508, J1939Id(3, 0xEF00, 0x08, 0x55)),
-    (0x09F11223, J1939Id(2, 127250, 0x23)),
+    (0x0CFF3408, J1939Id(3, 0xFF34, 0x08)), (0x0CEF0855, J1939Id(3, 0xEF00, 0x55, 0x08)),
+    (0x0CEF5508, J1939Id(3, 0xEF00, 0x08, 0x55)), (0x09F11223, J1939Id(2, 127250, 0x23)),
     (0x0DF119FE, J1939Id(3, 127257, 0xFE)),
     (0x18EAFF00, J1939Id(6, 0xEA00, 0x00, GLOBAL)),  # a request to all
     (0x1CEFFF01, J1939Id(7, 0xEF00, 0x01, 0xFF)),
     (0x02F00400, J1939Id(0, 0x2F004, 0x00)),  # EDP set: J1939's upper half
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("can_id", "parts"), KNOWN, ids=[f"{can_id:08X}" for can_id, _ in KNOWN])
@@ -33,15 +31,12 @@ def test_round_trip_of_every_identifier(can_id: int) -> None:
 @pytest.mark.parametrize(
     "parts",
     [
-        J1939Id(8, 0xFF34, 8),
-        J1939Id(3, 0x40000, 8),
-        J1939Id(3, 0xFF34, 256),
-        J1939Id(3, 0xEF00, 8, 256),
+        J1939Id(8, 0xFF34, 8), J1939Id(3, 0x40000, 8), J1939Id(3, 0xFF34, 256), J1939Id(3, 0xEF00, 8, 256),
         J1939Id(3, 0xEF01, 8, 5),  # a destination in the number
         J1939Id(3, 0xFF34, 8, 5),  # a destination in a broadcast
         J1939Id(-1, 0xFF34, 8),
     ],
-)
+)  # fmt: skip
 def test_invalid_identifiers(parts: J1939Id) -> None:
     with pytest.raises(ValueError, match="J1939"):
         join(parts)

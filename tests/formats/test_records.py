@@ -18,13 +18,9 @@ from imud.model.errors import ImudError
 from tests.support.documented import DOCS
 
 DECODERS: dict[Kind, Callable[[bytes], Any]] = {
-    Kind.DATA: records.decode_data,
-    Kind.FRAMES: records.decode_frames,
-    Kind.READINGS: records.decode_readings,
-    Kind.EDGES: records.decode_edges,
-    Kind.CLOCKS: records.decode_clocks,
-    Kind.LOST: records.decode_lost,
-}
+    Kind.DATA: records.decode_data, Kind.FRAMES: records.decode_frames, Kind.READINGS: records.decode_readings,
+    Kind.EDGES: records.decode_edges, Kind.CLOCKS: records.decode_clocks, Kind.LOST: records.decode_lost,
+}  # fmt: skip
 
 
 def only(data: bytes) -> Record:

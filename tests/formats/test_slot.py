@@ -118,20 +118,12 @@ def test_bytes_that_are_not_a_slot(slot: bytes) -> None:
     ("field", "value", "stored"),
     [
         ("t_err_ns", 1 << 32, 0xFFFF_FFFF),  # 4.3 s is clipped to the maximum
-        ("t_err_ns", -1, 0),
-        ("status", 0x1_8000_0001, 0x8000_0001),
-        ("status", -1, 0xFFFF_FFFF),
-        ("pps_age_ms", 1 << 32, 0xFFFF_FFFF),
-        ("pps_age_ms", -5, 0),
-        ("edge_seq", -1, 0),
-        ("t_dev_ns", -5, -5),
-        ("t_dev_ns", 1 << 63, (1 << 63) - 1),
-        ("t_dev_ns", -(1 << 63) - 1, -(1 << 63)),
-        ("t_ns", 1 << 63, (1 << 63) - 1),
-        ("t_rx_ns", 1 << 63, (1 << 63) - 1),
-        ("utc_ns", 1 << 63, (1 << 63) - 1),
+        ("t_err_ns", -1, 0), ("status", 0x1_8000_0001, 0x8000_0001), ("status", -1, 0xFFFF_FFFF),
+        ("pps_age_ms", 1 << 32, 0xFFFF_FFFF), ("pps_age_ms", -5, 0), ("edge_seq", -1, 0), ("t_dev_ns", -5, -5),
+        ("t_dev_ns", 1 << 63, (1 << 63) - 1), ("t_dev_ns", -(1 << 63) - 1, -(1 << 63)),
+        ("t_ns", 1 << 63, (1 << 63) - 1), ("t_rx_ns", 1 << 63, (1 << 63) - 1), ("utc_ns", 1 << 63, (1 << 63) - 1),
     ],
-)
+)  # fmt: skip
 def test_values_that_do_not_fit_are_clipped_or_cut(field: str, value: int, stored: int) -> None:
     expected = msgspec.structs.replace(FULL, **{field: stored})
     assert decode_slot(encode_slot(msgspec.structs.replace(FULL, **{field: value}), 1), "imu0") == expected

@@ -163,13 +163,9 @@ def capture_seeds() -> list[bytes]:
     head = MAGIC + b"1 baud=%s\n" % (b"9" * 30)
     record = RECORD.pack(5, 3) + b"abc"
     return [
-        *found,
-        MAGIC,
-        MAGIC + b"2\n",
-        head + record,
-        head + record + RECORD.pack(4, 0),
+        *found, MAGIC, MAGIC + b"2\n", head + record, head + record + RECORD.pack(4, 0),
         head + RECORD.pack(0, 1 << 31),
-    ]
+    ]  # fmt: skip
 
 
 def candump_seeds() -> list[bytes]:

@@ -107,10 +107,8 @@ def message_seeds() -> list[bytes]:
     rows = b"\n".join(encode_message(_message(MessageKind.DROPPED, *pair, cause=DropCause.AGE)) for pair in row)
     return [
         *(PLAIN + encode_message(message) for message in messages),
-        PACKED + encode_message(_message(MessageKind.SLOTS, 5, 7)) + b"\n" + slots,
-        PLAIN + MAGIC,
-        SEVERAL + rows,
-    ]
+        PACKED + encode_message(_message(MessageKind.SLOTS, 5, 7)) + b"\n" + slots, PLAIN + MAGIC, SEVERAL + rows,
+    ]  # fmt: skip
 
 
 def topic_seeds() -> list[bytes]:

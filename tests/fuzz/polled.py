@@ -111,9 +111,6 @@ def _seeds(driver: PolledDriver, count: int) -> list[bytes]:
         seeds += [bytes([variant]) + b"".join(polls), bytes([variant]) + readings[0] + b"".join(polls) + readings[0]]
         seeds.append(bytes([variant | CONVERSATION]) + b"".join(_record(1, random.randbytes(20)) for _ in range(6)))
     return [
-        *seeds,
-        b"\0" + b"".join(readings[:3]),
-        b"\0\0\0",
-        b"\0" + _record(0, bytes(30)),
+        *seeds, b"\0" + b"".join(readings[:3]), b"\0\0\0", b"\0" + _record(0, bytes(30)),
         b"\x80" + _record(FAILS, b""),
-    ]
+    ]  # fmt: skip

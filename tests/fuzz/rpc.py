@@ -187,14 +187,9 @@ def seeds() -> list[bytes]:
     requests += [{"jsonrpc": "2.0", "id": "a", "method": method, "params": given} for method, given in params]
     lines = [json.dumps(request).encode() + b"\n" for request in requests]
     odd = [
-        b"{}\n",
-        b"[]\n",
-        b"\n\r\n \n",
-        b"\x0b\n\r",
-        b"[" * 200 + b"\n",
-        b'{"jsonrpc":"2.0","method":"poll"}\n',
+        b"{}\n", b"[]\n", b"\n\r\n \n", b"\x0b\n\r", b"[" * 200 + b"\n", b'{"jsonrpc":"2.0","method":"poll"}\n',
         b"x" * 70_000,
-    ]
+    ]  # fmt: skip
     return [*lines, b"".join(lines[:12]), b"".join(lines), *odd]
 
 

@@ -94,49 +94,22 @@ def seeds() -> list[bytes]:
     )
     curl = b"GET /metrics?name[]=up HTTP/1.1\r\nHost: x\r\nAccept: */*\r\n\r\n"
     lines = [
-        b"HEAD / HTTP/1.0",
-        b"POST /metrics HTTP/1.1",
-        b"GET  /metrics HTTP/1.1",
-        b"GET /\xff HTTP/1.1",
-        b"GET",
-        b"",
-    ]
+        b"HEAD / HTTP/1.0", b"POST /metrics HTTP/1.1", b"GET  /metrics HTTP/1.1", b"GET /\xff HTTP/1.1", b"GET", b"",
+    ]  # fmt: skip
     odd = [
-        b"accept : text/plain",
-        b"Accept: application/openmetrics-text; version=x",
-        b"ACCEPT:;;;,,,=",
-        b":",
-        b"\xff\0",
-    ]
+        b"accept : text/plain", b"Accept: application/openmetrics-text; version=x", b"ACCEPT:;;;,,,=", b":", b"\xff\0",
+    ]  # fmt: skip
     heads = [b"GET /metrics HTTP/1.1\r\n" + header + b"\r\n\r\n" for header in odd]
     return [
-        *page_seeds(),
-        prometheus,
-        curl,
-        *(line + b"\r\n\r\n" for line in lines),
-        *heads,
-        b"\r\n\r\n",
+        *page_seeds(), prometheus, curl, *(line + b"\r\n\r\n" for line in lines), *heads, b"\r\n\r\n",
         b"GET /" + b"a" * 8000,
-    ]
+    ]  # fmt: skip
 
 
 def words() -> list[bytes]:
     media = [b"application/openmetrics-text", b"text/plain", b";version=1.0.0", b";escaping=allow-utf-8", b";q=0.5"]
     return [
-        b"GET ",
-        b"HEAD ",
-        b" HTTP/1.1\r\n",
-        b"Accept: ",
-        b"\r\nHost: ",
-        b"\r\nOrigin: http://",
-        b"\r\nCookie: ",
-        b"\r\nAuthorization: Bearer ",
-        TOKEN,
-        b'"method":',
-        b'"params":',
-        b"\r\n\r\n",
-        b"escaping=values",
-        b"version=",
-        b",",
-        *media,
-    ]
+        b"GET ", b"HEAD ", b" HTTP/1.1\r\n", b"Accept: ", b"\r\nHost: ", b"\r\nOrigin: http://", b"\r\nCookie: ",
+        b"\r\nAuthorization: Bearer ", TOKEN, b'"method":', b'"params":', b"\r\n\r\n", b"escaping=values", b"version=",
+        b",", *media,
+    ]  # fmt: skip

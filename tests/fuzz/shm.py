@@ -199,12 +199,8 @@ def _latest(ring: Ring) -> None:
 
 
 _READINGS: Final[dict[int, Callable[[Ring], object]]] = {
-    READ: _read,
-    LATEST: _latest,
-    LEDGER: Ring.ledger,
-    HEALTH: lambda ring: ring.alive(START_NS),
-    REPLACE: Ring.reopen,
-}
+    READ: _read, LATEST: _latest, LEDGER: Ring.ledger, HEALTH: lambda ring: ring.alive(START_NS), REPLACE: Ring.reopen,
+}  # fmt: skip
 
 
 @cache

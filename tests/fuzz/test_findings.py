@@ -94,12 +94,10 @@ def test_invalid_result_raises_server_error(result: object) -> None:
 @pytest.mark.parametrize(
     ("name", "params"),
     [
-        ("sample", []),
-        ("sample", {"device": "bow", "dropped": "x"}),
-        ("device", {"device": "bow"}),
+        ("sample", []), ("sample", {"device": "bow", "dropped": "x"}), ("device", {"device": "bow"}),
         ("device", {"device": "bow", "device_id": []}),
     ],
-)
+)  # fmt: skip
 def test_invalid_notification_raises_server_error(name: str, params: object) -> None:
     """client/answers: a TypeError or KeyError ended the iterator."""
     message = {"method": name, "params": params}

@@ -108,16 +108,9 @@ def stream_seeds() -> list[bytes]:
     long = [b"x" * size + sentences[0] for size in (LINE_BYTES_MAX - 100, LINE_BYTES_MAX, LINE_BYTES_MAX + 100)]
     mixed = b"".join(line for pair in zip(gpsd, sentences, strict=False) for line in pair)
     return [
-        *sentences,
-        *gpsd,
-        b"".join(gpsd),
-        mixed,
-        b"".join(sentences),
-        joined,
-        *long,
-        long[2] + sentences[0],
+        *sentences, *gpsd, b"".join(gpsd), mixed, b"".join(sentences), joined, *long, long[2] + sentences[0],
         b"\n" * 50,
-    ]
+    ]  # fmt: skip
 
 
 def words() -> list[bytes]:

@@ -29,14 +29,11 @@ def link_to(target: str) -> Callable[[Path], None]:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (fifo, "is a FIFO"),
-        (bound_socket, "is a socket"),
-        (Path.mkdir, "Is a directory"),
-        (link_to("/dev/zero"), "is a character device"),
-        (link_to("/dev/ptmx"), "is a character device"),
+        (fifo, "is a FIFO"), (bound_socket, "is a socket"), (Path.mkdir, "Is a directory"),
+        (link_to("/dev/zero"), "is a character device"), (link_to("/dev/ptmx"), "is a character device"),
         (link_to("/dev/stdin/none"), "Not a directory|No such file"),
     ],
-)
+)  # fmt: skip
 def test_other_file_types_are_rejected_immediately(make: Callable[[Path], None], words: str, tmp_path: Path) -> None:
     make(tmp_path / "it")
     with pytest.raises(OSError, match=words):

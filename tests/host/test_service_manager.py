@@ -80,10 +80,6 @@ def test_status_is_sent_when_it_changes_and_the_watchdog_is_fed(
         manager.stopping()
         sent = [receiver.recv(100).decode() for _ in range(6)]
     assert sent == [
-        "READY=1",
-        "WATCHDOG=1",
-        "STATUS=0 of 1 device running; not running: bow (searching).",
-        "WATCHDOG=1",
-        "STATUS=1 of 1 device running.",
-        "STOPPING=1",
-    ]
+        "READY=1", "WATCHDOG=1", "STATUS=0 of 1 device running; not running: bow (searching).", "WATCHDOG=1",
+        "STATUS=1 of 1 device running.", "STOPPING=1",
+    ]  # fmt: skip

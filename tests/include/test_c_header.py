@@ -26,11 +26,9 @@ INCLUDE = Path(__file__).parents[2] / "imud" / "include"
 READER = Path(__file__).with_name("reader.c")
 STRICT = ("-Wall", "-Wextra", "-Werror", "-pedantic", "-Wshadow", "-O2", f"-I{INCLUDE}")
 LANGUAGES: Final = {
-    "c99": ("cc", "-std=c99", "-x", "c"),
-    "gnu17": ("cc", "-std=gnu17", "-x", "c"),
-    "c++11": ("c++", "-std=c++11", "-x", "c++"),
-    "c++17": ("c++", "-std=c++17", "-x", "c++"),
-}
+    "c99": ("cc", "-std=c99", "-x", "c"), "gnu17": ("cc", "-std=gnu17", "-x", "c"),
+    "c++11": ("c++", "-std=c++11", "-x", "c++"), "c++17": ("c++", "-std=c++17", "-x", "c++"),
+}  # fmt: skip
 STRESS_SAMPLES, STRESS_NS = 10_000, 200_000_000  # the stress test ends at the first of both limits
 
 Build = Callable[[Path, str], Path]
@@ -375,18 +373,12 @@ def header_with(name: str, value: int) -> bytes:
 @pytest.mark.parametrize(
     ("content", "code"),
     [
-        (None, -1),
-        (b"", -3),
-        (bytes(shm_layout.HEADER_BYTES), -3),
-        (header_with("layout_version", 2), -4),
-        (header_with("slot_layout_version", 2), -4),
-        (header_with("slot_bytes", 512), -4),
-        (header_with("header_bytes", 8192), -4),
-        (header_with("slot_count", 63), -3),
-        (header_with("slot_count", 2 * SLOTS), -3),
-        (header_with("ledger_count", 60), -3),
+        (None, -1), (b"", -3), (bytes(shm_layout.HEADER_BYTES), -3), (header_with("layout_version", 2), -4),
+        (header_with("slot_layout_version", 2), -4), (header_with("slot_bytes", 512), -4),
+        (header_with("header_bytes", 8192), -4), (header_with("slot_count", 63), -3),
+        (header_with("slot_count", 2 * SLOTS), -3), (header_with("ledger_count", 60), -3),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_opened(build: Build, tmp_path: Path, content: bytes | None, code: int) -> None:
     path = tmp_path / "imud.x"
     if content is not None:

@@ -119,11 +119,9 @@ def test_nine_devices_on_one_bus(vcan: CanInterface, tmp_path: Path) -> None:
 
 
 def show(
-    modules: list[Module],
-    before: dict[str, DeviceStatus],
-    after: dict[str, DeviceStatus],
+    modules: list[Module], before: dict[str, DeviceStatus], after: dict[str, DeviceStatus],
     found: dict[str, list[Sample]],
-) -> None:
+) -> None:  # fmt: skip
     print(f"\n{len(modules)} devices at {RATE_HZ:g} Hz for {SECONDS:g} s")
     for module in modules:
         was, now, samples = before[module.name].ledger, after[module.name].ledger, found[module.name]

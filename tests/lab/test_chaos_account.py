@@ -33,19 +33,12 @@ TWO_RESTARTS = ([0, 1, 6, 7, 10, 11], [restart(2, 5), restart(8, 9)])
 @pytest.mark.parametrize(
     ("case", "unknown", "accepted"),
     [
-        (([1, 2, 5, 6, 8], []), 0, {3}),
-        (([1, 2, 5, 6, 8], []), 1, set()),
-        (COUNTER_KNOWN, 0, {4}),
-        (COUNTER_KNOWN, 1, set()),
-        (COUNTER_NEW, 0, {3, 4, 5}),
-        (COUNTER_NEW, 1, {0, 1, 2, 3, 4, 5}),
-        (COUNTER_NEW, 2, set()),
-        (RESTARTED, 0, {5, 6, 7}),
-        (RESTARTED, 1, {2, 3, 4, 5, 6, 7}),
-        (TWO_RESTARTS, 1, set(range(1, 9))),
-        (TWO_RESTARTS, 2, set(range(9))),
+        (([1, 2, 5, 6, 8], []), 0, {3}), (([1, 2, 5, 6, 8], []), 1, set()), (COUNTER_KNOWN, 0, {4}),
+        (COUNTER_KNOWN, 1, set()), (COUNTER_NEW, 0, {3, 4, 5}), (COUNTER_NEW, 1, {0, 1, 2, 3, 4, 5}),
+        (COUNTER_NEW, 2, set()), (RESTARTED, 0, {5, 6, 7}), (RESTARTED, 1, {2, 3, 4, 5, 6, 7}),
+        (TWO_RESTARTS, 1, set(range(1, 9))), (TWO_RESTARTS, 2, set(range(9))),
     ],
-)
+)  # fmt: skip
 def test_losses_that_the_rule_accepts(case: tuple[list[int], list[Interval]], unknown: int, accepted: set[int]) -> None:
     numbers, outages = case
     holes = find_holes(received(numbers), numbers, outages)

@@ -125,11 +125,9 @@ def test_bias(gpio_chip: GpioChip) -> None:
 def test_ways_to_name_a_line(gpio_chip: GpioChip, by: str) -> None:
     label = tool("gpiodetect").split("[")[1].split("]")[0]
     settings = {
-        "name": InputOptions(line="ALARM"),
-        "number": InputOptions(line=3, chip=gpio_chip.path.name),
-        "label": InputOptions(line="ALARM", chip=label),
-        "path": InputOptions(line=3, chip=str(gpio_chip.path)),
-    }[by]
+        "name": InputOptions(line="ALARM"), "number": InputOptions(line=3, chip=gpio_chip.path.name),
+        "label": InputOptions(line="ALARM", chip=label), "path": InputOptions(line=3, chip=str(gpio_chip.path)),
+    }[by]  # fmt: skip
     line = GpioInput(settings, "bow alarm")
     line.open()
     assert line.title == f"{gpio_chip.path.name} line 3 (ALARM)"

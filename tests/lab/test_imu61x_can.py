@@ -239,10 +239,8 @@ def test_error_states_are_counted_and_shown(vcan: CanInterface) -> None:
     kernel = rig.runner.status().kernel
     news = [event.message for event in rig.events if event.kind is EventKind.LINK]
     assert [message.partition(":")[0] for message in news] == [
-        "vcan0 is error-passive",
-        "vcan0 is bus-off",
-        "vcan0 is error-active again",
-    ]
+        "vcan0 is error-passive", "vcan0 is bus-off", "vcan0 is error-active again",
+    ]  # fmt: skip
     assert rig.runner.ledger.lost_overrun == 1
     assert (kernel.error_passive, kernel.bus_off) == (1, 1)
 

@@ -80,12 +80,8 @@ def test_a_device_that_hangs_is_reset_by_its_line(i2c: Bus[I2cTransfer], gpio_ch
             assert len(told) == 1
 
     command = (
-        "gpiomon",
-        "--line-buffered",
-        "--format=%e %s %n",
-        gpio_chip.path.name,
-        str(gpio_chip.names.index("PPS")),
-    )
+        "gpiomon", "--line-buffered", "--format=%e %s %n", gpio_chip.path.name, str(gpio_chip.names.index("PPS")),
+    )  # fmt: skip
     with tool_running(*command) as monitor:
         assert monitor.stdout is not None
         wait_until(lambda: "gpiomon" in INTERRUPTS.read_text(encoding="ascii"), "gpiomon has its interrupt")

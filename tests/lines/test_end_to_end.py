@@ -90,12 +90,10 @@ async def test_edges_that_stop_and_come_back(wired: WiredDevice) -> None:
 @pytest.mark.parametrize(("edges", "frames"), [(0.1, 0.0), (0.0, 0.1), (0.1, 0.1)], ids=["edges", "frames", "both"])
 @played(
     lambda edges, frames, rate_hz: WiredDevice(
-        SOUT,
-        ModuleSettings(hi91=Output(1000 // rate_hz)),
-        frame_faults=Faults(3, FaultRates(lose=frames)),
+        SOUT, ModuleSettings(hi91=Output(1000 // rate_hz)), frame_faults=Faults(3, FaultRates(lose=frames)),
         pin_faults=PinFaults(4, PinFaultRates(lose_pulse=edges, extra=edges / 5)),
     )
-)
+)  # fmt: skip
 async def test_pairing_is_right_under_loss(wired: WiredDevice, edges: float, frames: float, rate_hz: int) -> None:
     await wired.wait(400 / rate_hz)
     samples = await wired.wait(1000 / rate_hz)

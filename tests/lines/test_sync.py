@@ -26,12 +26,9 @@ from tests.support.signal_bench import DEVICE, SignalBench
 RETRY_NS = 5 * 10**9
 
 ALL = DeviceLines(
-    sout=SoutOptions(line="A"),
-    sout_div=DividedOptions(line="B"),
-    pps=PpsOptions(line="C"),
-    alarm=InputOptions(line="D"),
-    sin=TriggerOptions(line="E", rate_hz=0, pulse_ms=2),
-)
+    sout=SoutOptions(line="A"), sout_div=DividedOptions(line="B"), pps=PpsOptions(line="C"),
+    alarm=InputOptions(line="D"), sin=TriggerOptions(line="E", rate_hz=0, pulse_ms=2),
+)  # fmt: skip
 
 
 class SyncBench(SignalBench):

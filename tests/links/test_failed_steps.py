@@ -191,12 +191,10 @@ def test_claims_of_a_link(name: str, keys: dict[str, object], expected: tuple[ob
 @pytest.mark.parametrize(
     ("bus", "can_id", "extended", "receive", "send"),
     [
-        ("can0", 0x80, False, "0x080", "0x080"),
-        ("can0", 0x81, False, "", ""),
-        ("can0", 0x80, True, "", ""),
+        ("can0", 0x80, False, "0x080", "0x080"), ("can0", 0x81, False, "", ""), ("can0", 0x80, True, "", ""),
         ("can1", 0x80, False, "", ""),
     ],
-)
+)  # fmt: skip
 def test_devices_of_one_bus_differ_in_their_identifiers(
     bus: str, can_id: int, extended: bool, receive: str, send: str
 ) -> None:

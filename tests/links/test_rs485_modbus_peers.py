@@ -51,12 +51,10 @@ def device(address: int, *, new: bool) -> SimDevice:
     return SimDevice(
         address,
         [
-            registers(0, [0, 0, 0, 0, 8, address, 0]),
-            registers(0x34, block, readonly=True),
-            registers(0x70, identity, readonly=True),
-            registers(0xA5, [0, 0]),
+            registers(0, [0, 0, 0, 0, 8, address, 0]), registers(0x34, block, readonly=True),
+            registers(0x70, identity, readonly=True), registers(0xA5, [0, 0]),
         ],
-    )
+    )  # fmt: skip
 
 
 @contextmanager

@@ -40,12 +40,9 @@ KEPT: Final = {
 }
 """Files of a backup by path, as in the page."""
 LEFT_OUT: Final = (
-    f"{RecorderOptions().directory}/one.imudrec",
-    f"{MqttOptions().spool_directory}/{SPOOL_FILE}",
-    f"{SETUP_FOLDER}/journal.json",
-    "/etc/systemd/network/10-other.network",
-    "/etc/hostname",
-)
+    f"{RecorderOptions().directory}/one.imudrec", f"{MqttOptions().spool_directory}/{SPOOL_FILE}",
+    f"{SETUP_FOLDER}/journal.json", "/etc/systemd/network/10-other.network", "/etc/hostname",
+)  # fmt: skip
 STUB: Final = '#!/bin/sh\necho "${0##*/} $*" >>"$CALLS"\n'
 
 

@@ -49,16 +49,12 @@ def test_row_and_defaults() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"slots": 1000}, "power of two, got 1000; try 512 or 1024"),
-        ({"slots": 32}, ">= 64"),
-        ({"slots": 1 << 21}, "<= 1048576"),
-        ({"mode": 640}, "<= 511"),
+        ({"slots": 1000}, "power of two, got 1000; try 512 or 1024"), ({"slots": 32}, ">= 64"),
+        ({"slots": 1 << 21}, "<= 1048576"), ({"mode": 640}, "<= 511"),
         ({"mode": 0o660}, "mode: expected no write permission for group and others, got 0o660"),
-        ({"mode": 0o602}, "got 0o602"),
-        ({"directory": "shm"}, "absolute path"),
-        ({"slotz": 64}, "slotz"),
+        ({"mode": 0o602}, "got 0o602"), ({"directory": "shm"}, "absolute path"), ({"slotz": 64}, "slotz"),
     ],
-)
+)  # fmt: skip
 def test_invalid_options_are_reported(values: dict[str, object], message: str) -> None:
     with pytest.raises(msgspec.ValidationError, match=message):
         msgspec.convert(values, ShmOptions)
@@ -172,22 +168,17 @@ def test_order_of_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     board.publish([1])
     slot = encode_slot(make_sample(1), 3)
     assert notes == [
-        (slot_at(1), 8, SEQ_INVALID),
-        (slot_at(1) + 8, SLOT_BYTES - 8, slot[8:]),
-        (slot_at(1), 8, 1),
+        (slot_at(1), 8, SEQ_INVALID), (slot_at(1) + 8, SLOT_BYTES - 8, slot[8:]), (slot_at(1), 8, 1),
         (layout.OFFSETS["newest_seq"], 8, 1),
-    ]
+    ]  # fmt: skip
     notes.clear()
     board.publish([2, 3])
     slots = [encode_slot(make_sample(seq), 3)[8:] for seq in (2, 3)]
     assert notes == [
-        (slot_at(2), 8, SEQ_INVALID),
-        (slot_at(3), 8, SEQ_INVALID),
-        (slot_at(2) + 8, 2 * SLOT_BYTES - 8, SEQ_INVALID.to_bytes(8, "little").join(slots)),
-        (slot_at(2), 8, 2),
-        (slot_at(3), 8, 3),
-        (layout.OFFSETS["newest_seq"], 8, 3),
-    ]
+        (slot_at(2), 8, SEQ_INVALID), (slot_at(3), 8, SEQ_INVALID),
+        (slot_at(2) + 8, 2 * SLOT_BYTES - 8, SEQ_INVALID.to_bytes(8, "little").join(slots)), (slot_at(2), 8, 2),
+        (slot_at(3), 8, 3), (layout.OFFSETS["newest_seq"], 8, 3),
+    ]  # fmt: skip
     notes.clear()
     board.tick()
     update = layout.OFFSETS["ledger_update"]

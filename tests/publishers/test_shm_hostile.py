@@ -52,17 +52,15 @@ def make_huge_file(path: Path) -> None:
 
 
 HOSTILE: Final[dict[str, Callable[[Path], object]]] = {
-    "FIFO": os.mkfifo,
-    "symbolic link to a file": lambda path: path.symlink_to("/etc/passwd"),
+    "FIFO": os.mkfifo, "symbolic link to a file": lambda path: path.symlink_to("/etc/passwd"),
     "symbolic link to nothing": lambda path: path.symlink_to("/nowhere/at/all"),
-    "directory": lambda path: path.mkdir(),
-    "directory with content": make_full_directory,
+    "directory": lambda path: path.mkdir(), "directory with content": make_full_directory,
     "device node": lambda path: os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(5, 0)),  # /dev/tty
     "forged ring": lambda path: path.write_bytes(FORGED + bytes(SLOTS * SLOT_BYTES)),
     "forged header": lambda path: path.write_bytes(FORGED),
     "empty file": lambda path: path.touch(),
     "huge file": make_huge_file,
-}
+}  # fmt: skip
 
 
 def plant(path: Path, kind: str) -> None:

@@ -60,17 +60,10 @@ def bench(tmp_path: Path, recorded: pytest.MonkeyPatch) -> PolledBusBench:
         watches.test_coordinates_are_described_and_an_unknown_value_is_reported,
     ],
     ids=[
-        "edges",
-        "triggers",
-        "alarm",
-        "held samples",
-        "losses on CAN",
-        "loss within a sample",
-        "bus down",
-        "suspended",
+        "edges", "triggers", "alarm", "held samples", "losses on CAN", "loss within a sample", "bus down", "suspended",
         "axes by a setting",
     ],
-)
+)  # fmt: skip
 def test_a_run_on_a_line_or_can_bus_is_replayed(run: Callable[[], None]) -> None:
     run()
 

@@ -11,11 +11,9 @@ from imud.sim.ports.arrival import LOADED, PROFILES, USB_1MS, USB_16MS, ArrivalM
 from tests.bench.clock import BAUD_OF_RATE, accuracy, run
 
 CRYSTALS = {
-    "exact": Crystal(0.0),
-    "5 % fast": Crystal(50_000.0),
-    "50 ppm slow": Crystal(-50.0),
+    "exact": Crystal(0.0), "5 % fast": Crystal(50_000.0), "50 ppm slow": Crystal(-50.0),
     "drifting": Crystal(20.0, 0.1),
-}
+}  # fmt: skip
 
 
 USUAL = [*product(PROFILES, ("5 % fast",)), (USB_1MS, "50 ppm slow"), (LOADED, "exact"), (USB_16MS, "drifting")]

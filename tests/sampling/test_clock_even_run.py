@@ -43,16 +43,11 @@ class Trial:
 
 
 TRIALS: Final = (
-    Trial("even"),
-    Trial("waits", waits=True),
-    Trial("waits at 200 Hz", period_ms=5.0, most=6, waits=True),
-    Trial("USB adapter", hold_ns=16 * NS_PER_MS),
-    Trial("400 Hz in ms", period_ms=2.5),
-    Trial("slewed host", waits=True, slewed=20e-6),
-    Trial("losses", lost=0.0005, waits=True),
-    Trial("jumps", odd=0.001, waits=True),
-    Trial("early reads", early_ns=200 * NS_PER_US, waits=True),
-)
+    Trial("even"), Trial("waits", waits=True), Trial("waits at 200 Hz", period_ms=5.0, most=6, waits=True),
+    Trial("USB adapter", hold_ns=16 * NS_PER_MS), Trial("400 Hz in ms", period_ms=2.5),
+    Trial("slewed host", waits=True, slewed=20e-6), Trial("losses", lost=0.0005, waits=True),
+    Trial("jumps", odd=0.001, waits=True), Trial("early reads", early_ns=200 * NS_PER_US, waits=True),
+)  # fmt: skip
 
 
 class Device:

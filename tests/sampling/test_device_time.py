@@ -91,10 +91,8 @@ def test_a_loss_is_counted_with_the_step() -> None:
     ("steps", "missed", "period"),
     [
         ([10, 30, 10, 50, 10], [0] * 5, 0),  # no lost samples before the period is known
-        ([10] * 10 + [20, 10, 10], [1, 0, 0], 10),
-        ([10] * 10 + [30, 10, 10], [2, 0, 0], 10),
-        ([1] * 10 + [2, 1, 1], [1, 0, 0], 1),
-        ([1] * 10 + [5, 1, 1], [4, 0, 0], 1),
+        ([10] * 10 + [20, 10, 10], [1, 0, 0], 10), ([10] * 10 + [30, 10, 10], [2, 0, 0], 10),
+        ([1] * 10 + [2, 1, 1], [1, 0, 0], 1), ([1] * 10 + [5, 1, 1], [4, 0, 0], 1),
         ([1000] * 10 + [3000, 1000], [2, 0], 1000),
         ([1] * 10 + [2, 1, 3, 1] * 500, [1, 0, 2, 0] * 500, 1),  # losses between normal steps do not change the period
         ([10, 0] * 50, [0] * 100, 10),  # ignores repeated counter values
@@ -102,7 +100,7 @@ def test_a_loss_is_counted_with_the_step() -> None:
         ([10] * 20 + [20] * 12 + [40], [0, 1], 20),  # uses a slower rate after twelve steps
         ([1, 2, 1, 1] + [1] * 100, [0] * 100, 1),  # losses at the start leave no fraction
     ],
-)
+)  # fmt: skip
 def test_missing_samples_of_steps(steps: list[int], missed: list[int], period: int) -> None:
     """`missed` contains the results of the last steps."""
     learner = PeriodLearner()
@@ -218,14 +216,9 @@ JITTER_STEP_NS = 60_000
 
 
 def run(
-    profile: ArrivalProfile,
-    rate_hz: int,
-    set_ms: float,
-    *,
-    edges: bool,
-    reference: UtcReference | None = None,
+    profile: ArrivalProfile, rate_hz: int, set_ms: float, *, edges: bool, reference: UtcReference | None = None,
     faults: LineFaults | None = None,
-) -> tuple[list[DatedSample], Callable[[], int]]:
+) -> tuple[list[DatedSample], Callable[[], int]]:  # fmt: skip
     """Return the samples of a device on UTC with a corrected counter, and the number of resets."""
     model = ArrivalModel(profile, rate_hz, SEED, Crystal(0.0), BAUD_OF_RATE[rate_hz])
     clock, dated = sout_clock(model), []

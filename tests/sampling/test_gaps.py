@@ -61,14 +61,9 @@ class Device:
 def make_clock(device: Device, unknown: list[int]) -> SampleClock:
     """Return a clock that appends a gap of unknown size to `unknown`."""
     return SampleClock(
-        "imu",
-        tick_ns=device.tick_ns if device.tick_ns >= 0 else NS_PER_MS,
-        tick_modulus=device.modulus,
-        byte_ns=0,
-        hold_ns=0,
-        stamp_modulus=device.stamp_modulus,
-        on_unknown_gap=lambda: unknown.append(1),
-    )
+        "imu", tick_ns=device.tick_ns if device.tick_ns >= 0 else NS_PER_MS, tick_modulus=device.modulus, byte_ns=0,
+        hold_ns=0, stamp_modulus=device.stamp_modulus, on_unknown_gap=lambda: unknown.append(1),
+    )  # fmt: skip
 
 
 @dataclass

@@ -52,14 +52,9 @@ class RunningDaemon:
 
 def write_config(folder: Path, devices: Mapping[str, Any], **more: Any) -> Path:
     tree = {
-        "log_level": "debug",
-        "state_dir": str(folder),
-        "socket": {"path": str(folder / "imud.sock")},
-        "shm": {"directory": str(folder)},
-        "metrics": {"port": 0},
-        "devices": devices,
-        **more,
-    }
+        "log_level": "debug", "state_dir": str(folder), "socket": {"path": str(folder / "imud.sock")},
+        "shm": {"directory": str(folder)}, "metrics": {"port": 0}, "devices": devices, **more,
+    }  # fmt: skip
     file = folder / "imud.yaml"
     file.write_bytes(msgspec.json.encode(tree))  # each JSON text is a YAML text
     return file

@@ -88,14 +88,9 @@ class DeviceRig:
         self.device.tick(self.now_ns() + ahead_ns)
 
     async def until(
-        self,
-        holds: Callable[[], object],
-        what: str = "the condition",
-        limit_s: float = LIMIT_S,
-        *,
-        step: Callable[[], object] = lambda: None,
-        step_s: float = STEP_S,
-    ) -> None:
+        self, holds: Callable[[], object], what: str = "the condition", limit_s: float = LIMIT_S, *,
+        step: Callable[[], object] = lambda: None, step_s: float = STEP_S,
+    ) -> None:  # fmt: skip
         """Call `tick` and `step` until a condition is true. Check that the ledger balances each time."""
         end_ns = self.now_ns() + int(limit_s * 1e9)
         while not holds():
@@ -148,14 +143,9 @@ class DeviceRigs:
     """
 
     def __init__(
-        self,
-        host: HostClock | None = None,
-        *,
-        state_dir: Path | None = None,
-        lines: LineFactory = GPIO_LINES,
-        start_worker: StartWatchingWorker = BusThread,
-        configured: Sequence[DeviceConfig] = (),
-    ) -> None:
+        self, host: HostClock | None = None, *, state_dir: Path | None = None, lines: LineFactory = GPIO_LINES,
+        start_worker: StartWatchingWorker = BusThread, configured: Sequence[DeviceConfig] = (),
+    ) -> None:  # fmt: skip
         """Without arguments, use the real time, lines and workers. `configured` contains all devices of the file."""
         self.host = host or HostClock()
         self._host_tap = ClockObserver(self.host)

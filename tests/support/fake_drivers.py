@@ -228,14 +228,9 @@ def fake_can_frame(node: int, number: int = 0, t_ns: int = 0) -> CanFrame:
 # --- a device with settings of its own --------------------------------------------------------------------------------
 
 FACTORY: Final[Mapping[str, Any]] = {
-    "mode": "6-axis",
-    "output": {"a": 100, "b": 0},
-    "offset_deg": 0.0,
-    "mounting": "level",
-    "secret": 1,
-    "hours": 7,
+    "mode": "6-axis", "output": {"a": 100, "b": 0}, "offset_deg": 0.0, "mounting": "level", "secret": 1, "hours": 7,
     "baud": 115200,
-}
+}  # fmt: skip
 """Factory settings. `hours` is read-only, `secret` is write-only."""
 TOLD: Final = tuple(name for name in FACTORY if name != "secret")
 

@@ -37,14 +37,9 @@ class CaptureWriter:
     """Writes a capture with time stamps, up to a size limit. The caller flushes and closes the file."""
 
     def __init__(
-        self,
-        file: BinaryIO,
-        *,
-        driver: str = "",
-        baud: int = 0,
-        details: Mapping[str, str | int] | None = None,
+        self, file: BinaryIO, *, driver: str = "", baud: int = 0, details: Mapping[str, str | int] | None = None,
         bytes_max: int = WRITE_BYTES_MAX,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Write the first line without empty values and zeros. Raises ValueError if the line is too long."""
         self._file = file
         self._room = bytes_max
@@ -104,12 +99,6 @@ def imu61x_log(indices: Iterable[int]) -> str:
 
 def hi91(ms: int, accel_z_m_s2: float = 9.8) -> bytes:
     return encode_hi91(
-        system_time_ms=ms,
-        accel_m_s2=(0.0, 0.0, accel_z_m_s2),
-        gyro_rad_s=(0.0, 0.0, 0.0),
-        mag_t=(2e-5, 0.0, -4e-5),
-        euler_rad=(0.0, 0.0, 0.0),
-        quat_wxyz=(1.0, 0.0, 0.0, 0.0),
-        temperature_c=20.0,
-        pressure_pa=1e5,
-    )
+        system_time_ms=ms, accel_m_s2=(0.0, 0.0, accel_z_m_s2), gyro_rad_s=(0.0, 0.0, 0.0), mag_t=(2e-5, 0.0, -4e-5),
+        euler_rad=(0.0, 0.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0), temperature_c=20.0, pressure_pa=1e5,
+    )  # fmt: skip

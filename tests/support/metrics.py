@@ -36,28 +36,14 @@ def device(name: str, number: int = 0, **changes: object) -> DeviceStatus:
         ledger[key] for key in ("frames_in_samples", "frames_in_replies", "frames_ignored", "frames_pending")
     )
     status = DeviceStatus(
-        name=name,
-        device_id=number,
-        driver="hipnuc-uart",
-        link=f"/dev/ttyUSB{number} at 115200 baud",
-        state=DeviceState.RUNNING,
-        problem="",
-        identity={"product": "HI13", "serial_number": f"{number:08d}", "firmware": "1.7.6", "other": "x"},
-        settings={},
-        rate_hz=999.5 + number,
-        expected_rate_hz=1000.25,
-        hold_ns=5_000_000,
-        hold_wanted_ns=20_000_000,
-        newest_seq=123,
-        clock=ClockStatus(Sync.REGRESSION, 5_250_000_000, -40.0, 30_000, 45_000, 2, steering_ppm=500.0),
-        ledger=ledger,
-        kernel=KernelCounters(7, 8, 9, 10),
-        latency_buckets=tuple(range(1, len(LATENCY_BOUNDS_NS) + 2)),
-        latency_sum_ns=2_500_000_000,
-        temperature_c=36.5,
-        status_bits=4,
-        connects=3,
-    )
+        name=name, device_id=number, driver="hipnuc-uart", link=f"/dev/ttyUSB{number} at 115200 baud",
+        state=DeviceState.RUNNING, problem="",
+        identity={"product": "HI13", "serial_number": f"{number:08d}", "firmware": "1.7.6", "other": "x"}, settings={},
+        rate_hz=999.5 + number, expected_rate_hz=1000.25, hold_ns=5_000_000, hold_wanted_ns=20_000_000, newest_seq=123,
+        clock=ClockStatus(Sync.REGRESSION, 5_250_000_000, -40.0, 30_000, 45_000, 2, steering_ppm=500.0), ledger=ledger,
+        kernel=KernelCounters(7, 8, 9, 10), latency_buckets=tuple(range(1, len(LATENCY_BOUNDS_NS) + 2)),
+        latency_sum_ns=2_500_000_000, temperature_c=36.5, status_bits=4, connects=3,
+    )  # fmt: skip
     return msgspec.structs.replace(status, **changes)
 
 

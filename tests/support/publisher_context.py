@@ -70,35 +70,19 @@ class FakeDevices:
 
 
 def publisher_context(
-    status: Callable[[], Sequence[DeviceStatus]] = list,
-    epoch: int = 1,
-    now_ns: Callable[[], int] = lambda: 0,
-    control: Callable[[str], DeviceControl] = _no_device,
-    *,
-    cpu_ns: Callable[[], int] = lambda: 0,
-    utc_offset_ns: Callable[[], int] = lambda: 0,
-    utc_reference: Callable[[], UtcReference | None] = lambda: None,
+    status: Callable[[], Sequence[DeviceStatus]] = list, epoch: int = 1, now_ns: Callable[[], int] = lambda: 0,
+    control: Callable[[str], DeviceControl] = _no_device, *, cpu_ns: Callable[[], int] = lambda: 0,
+    utc_offset_ns: Callable[[], int] = lambda: 0, utc_reference: Callable[[], UtcReference | None] = lambda: None,
     each_status: Callable[[], Iterator[DeviceStatus]] | None = None,
-    ledgers: Callable[[], Sequence[DeviceLedger]] | None = None,
-    recording: RecordingSource | None = None,
-    outputs: OutputFacts | None = None,
-    latencies: Latencies | None = None,
-    watch_line: WatchLine = _no_line,
+    ledgers: Callable[[], Sequence[DeviceLedger]] | None = None, recording: RecordingSource | None = None,
+    outputs: OutputFacts | None = None, latencies: Latencies | None = None, watch_line: WatchLine = _no_line,
     raise_event: Callable[[Event], None] = lambda _event: None,
-) -> PublisherContext:
+) -> PublisherContext:  # fmt: skip
     devices = FakeDevices(
-        status,
-        control,
-        recording or NothingRecorded(),
-        each_status or (lambda: iter(status())),
+        status, control, recording or NothingRecorded(), each_status or (lambda: iter(status())),
         ledgers or (lambda: [(one.name, one.driver, one.ledger) for one in status()]),
-    )
+    )  # fmt: skip
     return PublisherContext(
-        epoch,
-        PublisherClock(now_ns, utc_offset_ns, utc_reference, cpu_ns),
-        devices,
-        outputs or OutputFacts(),
-        latencies or NoLatencies(),
-        watch_line,
-        raise_event,
-    )
+        epoch, PublisherClock(now_ns, utc_offset_ns, utc_reference, cpu_ns), devices, outputs or OutputFacts(),
+        latencies or NoLatencies(), watch_line, raise_event,
+    )  # fmt: skip

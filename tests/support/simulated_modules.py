@@ -297,12 +297,9 @@ class CanBench:
 
 class CanopenBench(CanBench):
     def __init__(
-        self,
-        factory: NodeSettings | None = None,
-        boot_ms: int = 0,
-        variant: NodeVariant | None = None,
+        self, factory: NodeSettings | None = None, boot_ms: int = 0, variant: NodeVariant | None = None,
         others: tuple[int, ...] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         made = NodeVariant() if variant is None else variant
         hardware = HipnucCanopenHardware(factory=factory or QUIET, boot_ms=boot_ms, skew_ppm=0, variant=made)
         self.module = HipnucCanopenModule(BEGIN_NS, hardware)
@@ -316,12 +313,9 @@ class CanopenBench(CanBench):
 
 class J1939Bench(CanBench):
     def __init__(
-        self,
-        settings: J1939Settings | None = None,
-        boot_ms: int = 0,
-        variant: J1939Variant | None = None,
+        self, settings: J1939Settings | None = None, boot_ms: int = 0, variant: J1939Variant | None = None,
         others: tuple[int, ...] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         hardware = J1939Hardware(boot_ms=boot_ms, skew_ppm=0, variant=variant or J1939Variant())
         flash = settings or J1939Settings()
         self.module = HipnucJ1939Module(BEGIN_NS, flash, hardware)

@@ -74,18 +74,10 @@ SAMPLES_CHECKED = 50
 def sample(device: str = "imu0", seq: int = 1, period_ns: int = 1_000_000) -> Sample:
     t_ns = 80_000_000_000_000 + seq * period_ns
     return Sample(
-        device=device,
-        seq=seq,
-        t_ns=t_ns,
-        t_err_ns=12_000,
-        sync=Sync.REGRESSION,
-        t_rx_ns=t_ns + 200_000,
-        utc_ns=1_790_000_000_000_000_000 + seq * period_ns,
-        t_dev_ns=seq * period_ns,
-        accel_m_s2=(0.125, -0.5, 9.75),
-        gyro_rad_s=(0.25, 0.5, -0.75),
-        temperature_c=31.5,
-    )
+        device=device, seq=seq, t_ns=t_ns, t_err_ns=12_000, sync=Sync.REGRESSION, t_rx_ns=t_ns + 200_000,
+        utc_ns=1_790_000_000_000_000_000 + seq * period_ns, t_dev_ns=seq * period_ns, accel_m_s2=(0.125, -0.5, 9.75),
+        gyro_rad_s=(0.25, 0.5, -0.75), temperature_c=31.5,
+    )  # fmt: skip
 
 
 def batch(device: str = "imu0", first: int = 1, count: int = 1, period_ns: int = 1_000_000) -> Batch:
@@ -95,38 +87,18 @@ def batch(device: str = "imu0", first: int = 1, count: int = 1, period_ns: int =
 
 def device_status(name: str, device_id: int) -> DeviceStatus:
     return DeviceStatus(
-        name=name,
-        device_id=device_id,
-        driver="hipnuc-uart",
-        link="/dev/ttyUSB0 at 115200 baud",
-        state=DeviceState.RUNNING,
-        problem="",
-        identity={"product": "HI13"},
-        settings={},
-        rate_hz=1000.0,
-        expected_rate_hz=1000.0,
-        newest_seq=1,
-        clock=ClockStatus(sync=Sync.REGRESSION),
-        ledger={"bytes_in": 82},
-        kernel=KernelCounters(),
-        latency_buckets=(1, 0),
-        latency_sum_ns=200_000,
-        temperature_c=31.5,
-        status_bits=0,
-        connects=1,
-        euler_convention="roll, pitch, yaw; 312 order",
-        navigation_frame="ENU",
+        name=name, device_id=device_id, driver="hipnuc-uart", link="/dev/ttyUSB0 at 115200 baud",
+        state=DeviceState.RUNNING, problem="", identity={"product": "HI13"}, settings={}, rate_hz=1000.0,
+        expected_rate_hz=1000.0, newest_seq=1, clock=ClockStatus(sync=Sync.REGRESSION), ledger={"bytes_in": 82},
+        kernel=KernelCounters(), latency_buckets=(1, 0), latency_sum_ns=200_000, temperature_c=31.5, status_bits=0,
+        connects=1, euler_convention="roll, pitch, yaw; 312 order", navigation_frame="ENU",
         frame=FrameStatus(
-            frame=AS_SENT.device.words,
-            convention="device",
-            euler_convention="roll, pitch, yaw; 312 order",
-            navigation_frame="ENU",
-            heading=Heading.MAGNETIC,
-            declination_deg=None,
+            frame=AS_SENT.device.words, convention="device", euler_convention="roll, pitch, yaw; 312 order",
+            navigation_frame="ENU", heading=Heading.MAGNETIC, declination_deg=None,
             conventions={str(one): AS_SENT.words_of(one) for one in Convention},
         ),
         noise=Deviations(accel_m_s2=0.01),
-    )
+    )  # fmt: skip
 
 
 def context(
@@ -147,14 +119,10 @@ def turn(_target: Target, *, angle_deg: float, relative: bool = False) -> None:
 VERBS = {"yaw": Verb("set the heading", turn)}
 CALIBRATIONS = {
     "heading": Calibration(
-        help="make the present heading zero",
-        section="2.2.4",
-        handling=Handling.REST,
-        instructions=("Do not touch it.",),
-        begin=lambda _target: None,
-        kept=Kept.BY_SAVE,
+        help="make the present heading zero", section="2.2.4", handling=Handling.REST,
+        instructions=("Do not touch it.",), begin=lambda _target: None, kept=Kept.BY_SAVE,
     )
-}
+}  # fmt: skip
 done_late = asyncio.Event()
 """Event that ends the action `wait`."""
 

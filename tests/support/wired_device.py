@@ -45,16 +45,10 @@ EDGE_LATE_NS = 45_000
 
 class WiredDevice:
     def __init__(
-        self,
-        lines: DeviceLines,
-        settings: ModuleSettings | None = None,
-        hardware: HipnucHardware | None = None,
-        *,
-        frame_faults: Faults | None = None,
-        pin_faults: PinFaults | None = None,
-        identify: bool = False,
+        self, lines: DeviceLines, settings: ModuleSettings | None = None, hardware: HipnucHardware | None = None, *,
+        frame_faults: Faults | None = None, pin_faults: PinFaults | None = None, identify: bool = False,
         rmc: RmcOptions | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.clock = VirtualClock(BEGIN_NS)
         self.source = FakeSource()
         self.memory = MemoryLines(self.clock.now_ns)

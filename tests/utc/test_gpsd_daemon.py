@@ -84,11 +84,9 @@ def port() -> Iterator[Port]:
 def test_a_device_gets_the_sentences_of_gpsd(receiver: Receiver, port: Port, tmp_path: Path) -> None:
     tcp_port = free_port()
     device = {
-        "driver": "hipnuc-uart",
-        "identify": False,
-        "uart": {"port": port.path, "baud": 115200},
+        "driver": "hipnuc-uart", "identify": False, "uart": {"port": port.path, "baud": 115200},
         "rmc": {"source": "gpsd", "tcp_port": tcp_port},
-    }
+    }  # fmt: skip
     fed: list[Rmc] = []
     with gpsd(tcp_port, receiver.path, tmp_path), running_daemon(tmp_path, {"bow": device}) as daemon:
         receiver.second = 0

@@ -128,14 +128,12 @@ def test_two_sentences_are_needed_for_another_second() -> None:
 @pytest.mark.parametrize(
     ("sentence", "after_s"),
     [
-        (build(UTC_S * NS_PER_S, valid=False), 0.3),
-        (build(UTC_S * NS_PER_S)[:-6], 0.3),
-        (build(UTC_S * NS_PER_S + 500 * NS_PER_MS), 0.3),
-        (build(UTC_S * NS_PER_S), 1.1),
+        (build(UTC_S * NS_PER_S, valid=False), 0.3), (build(UTC_S * NS_PER_S)[:-6], 0.3),
+        (build(UTC_S * NS_PER_S + 500 * NS_PER_MS), 0.3), (build(UTC_S * NS_PER_S), 1.1),
         (build(UTC_S * NS_PER_S), -0.1),
     ],
     ids=["status V", "damaged", "not yet", "after the next pulse", "before the pulse"],
-)
+)  # fmt: skip
 def test_sentences_that_name_no_pulse_are_ignored(sentence: bytes, after_s: float) -> None:
     receiver = Receiver()
     receiver.go(5, says=None)

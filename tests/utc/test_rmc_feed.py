@@ -63,13 +63,11 @@ def test_a_sentence_is_passed_on_at_once() -> None:
 @pytest.mark.parametrize(
     ("sentence", "refusal"),
     [
-        (b"noise", Refusal.DAMAGED),
-        (build(UTC_S * NS_PER_S)[:-4] + b"00\r\n", Refusal.DAMAGED),
-        (b"", Refusal.DAMAGED),
-        (build(UTC_S * NS_PER_S, valid=False), Refusal.NOT_VALID),
+        (b"noise", Refusal.DAMAGED), (build(UTC_S * NS_PER_S)[:-4] + b"00\r\n", Refusal.DAMAGED),
+        (b"", Refusal.DAMAGED), (build(UTC_S * NS_PER_S, valid=False), Refusal.NOT_VALID),
         (b"$GPRMC,,V,,,,,,,,,,N*53\r\n", Refusal.NOT_VALID),
     ],
-)
+)  # fmt: skip
 def test_bad_sentences_are_refused(sentence: bytes, refusal: Refusal) -> None:
     bench = FeedBench()
     assert bench.give(0, 0.1, sentence or b"\x00") == refusal

@@ -28,11 +28,9 @@ PLOTTED = """return Object.fromEntries([...window.imud.view.plots].map(([member,
     [member, plot.data.map((values) => [...values])]))"""
 """For each plot: times, then maximum and minimum of each axis."""
 RISE = {
-    "accel_m_s2": (0.004, -0.003, 0.002),
-    "gyro_rad_s": (0.005, -0.006, 0.007),
-    "mag_t": (1e-8, -2e-8, 3e-8),
+    "accel_m_s2": (0.004, -0.003, 0.002), "gyro_rad_s": (0.005, -0.006, 0.007), "mag_t": (1e-8, -2e-8, 3e-8),
     "euler_rad": (0.0004, -0.0003, 0.0),
-}
+}  # fmt: skip
 """Increase of each axis between two measurements."""
 TURN_RAD = 0.02
 """Increase of yaw, which passes ±180° every 314 measurements (1.6 s)."""
@@ -118,34 +116,21 @@ def test_the_corners_of_the_block_are_round_and_it_hides_no_name(scripts: Page) 
 STATUS = msgspec.structs.replace(
     device("bow"),
     clock=ClockStatus(t_err_ns=31_000, edges=4101, edges_unpaired=17, samples_unpaired=19, triggers_missed=23),
-    settings={"mode": "6-axis"},
-    status_bits=4,
-    status_words=("gyroscope-saturated",),
-    status_bit_names={"2": "gyroscope-saturated"},
-    hold_ns=5_000_000,
-    hold_by="shared memory",
+    settings={"mode": "6-axis"}, status_bits=4, status_words=("gyroscope-saturated",),
+    status_bit_names={"2": "gyroscope-saturated"}, hold_ns=5_000_000, hold_by="shared memory",
     polling=PollingStatus(4211, 223, 227, 229, 233, 1, 41_000, 913_000),
     serial_line=SerialLineCounters(311, 313, 317, 331),
     lines=LinesStatus(
-        {"sin": "it is used by another program", "pps": "no such line"},
-        {"sout": 5003, "alarm": 6},
-        {"sout": 509},
-        alarm=True,
-        alarms=3,
-        sin=True,
-        triggers=6007,
-        triggers_missed=601,
-        trigger_late_mean_ns=61_000,
+        {"sin": "it is used by another program", "pps": "no such line"}, {"sout": 5003, "alarm": 6}, {"sout": 509},
+        alarm=True, alarms=3, sin=True, triggers=6007, triggers_missed=601, trigger_late_mean_ns=61_000,
         trigger_late_worst_ns=613_000,
     ),
     utc=UtcStatus("gpsd at localhost", "no fix", 7001, 701, {"no fix": 709}, 719, 727, 733, 739),
     declared=SettingsStatus(
-        SettingsState.DIFFER,
-        OnDifference.REPORT,
-        differences={"mode": SettingDifference("9-axis", "6-axis")},
+        SettingsState.DIFFER, OnDifference.REPORT, differences={"mode": SettingDifference("9-axis", "6-axis")},
         unverified=("baud",),
     ),
-)
+)  # fmt: skip
 """A status with all optional parts. Each counter has another value."""
 WORDS = {
     "clock": ("error 31.0 µs", "0 resets"),

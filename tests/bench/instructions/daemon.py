@@ -114,13 +114,10 @@ class VirtualDaemon:
 
 def _settings(directory: str, port: str) -> config.Config:
     tree = {
-        "log_level": "error",
-        "state_dir": directory,
-        "socket": {"path": f"{directory}/s", "group": own_group()},
-        "shm": {"directory": directory, "group": own_group()},
-        "metrics": {"port": 0},
+        "log_level": "error", "state_dir": directory, "socket": {"path": f"{directory}/s", "group": own_group()},
+        "shm": {"directory": directory, "group": own_group()}, "metrics": {"port": 0},
         "devices": {"d0": {"driver": "hipnuc-uart", "identify": False, "uart": {"port": port, "baud": BAUD}}},
-    }
+    }  # fmt: skip
     return config.parse(msgspec.json.encode(tree), "measurement")
 
 

@@ -64,13 +64,10 @@ def test_no_systemd_and_no_unit(machine: Machine) -> None:
 @pytest.mark.parametrize(
     ("answer", "severity"),
     [
-        ([device("bow")], "ok"),
-        (LinkMissing("no daemon"), "error"),
-        (LinkDenied("group imud?"), "not checked"),
-        (ServerError("another protocol"), "error"),
-        (TimeoutError("waited in vain"), "error"),
+        ([device("bow")], "ok"), (LinkMissing("no daemon"), "error"), (LinkDenied("group imud?"), "not checked"),
+        (ServerError("another protocol"), "error"), (TimeoutError("waited in vain"), "error"),
     ],
-)
+)  # fmt: skip
 def test_answers_of_the_socket(machine: Machine, answer: Exception, severity: str) -> None:
     machine.status = answer
     assert [finding.severity for finding in machine.find(SOCKET)] == [severity]

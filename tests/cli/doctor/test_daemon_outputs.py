@@ -86,14 +86,11 @@ RINGS, FLIGHT = "shm: {directory: /dev/shm}\n", "recorder: {flight: {enabled: tr
 @pytest.mark.parametrize(
     ("more", "removes", "severities"),
     [
-        (RINGS + FLIGHT, "yes", ["warning", "warning"]),
-        (RINGS + FLIGHT, "no", ["ok", "ok"]),
-        (FLIGHT, "yes", ["warning"]),
-        (FLIGHT.replace("true", "false"), "yes", []),
-        ("shm: {directory: /dev/shmem}\n", "yes", []),
-        ("", "yes", []),
+        (RINGS + FLIGHT, "yes", ["warning", "warning"]), (RINGS + FLIGHT, "no", ["ok", "ok"]),
+        (FLIGHT, "yes", ["warning"]), (FLIGHT.replace("true", "false"), "yes", []),
+        ("shm: {directory: /dev/shmem}\n", "yes", []), ("", "yes", []),
     ],
-)
+)  # fmt: skip
 def test_files_in_shared_memory_that_systemd_removes(
     machine: Machine, more: str, removes: str, severities: list[str]
 ) -> None:

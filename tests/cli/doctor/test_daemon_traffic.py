@@ -20,11 +20,8 @@ from tests.support.metrics import POLLING, device
 from tests.support.surroundings import Machine
 
 HEARD, HALF, RESTARTS, LINES = (
-    DoctorCheck("h", heard),
-    DoctorCheck("d", half_duplex),
-    DoctorCheck("r", restarts),
-    DoctorCheck("l", lines),
-)
+    DoctorCheck("h", heard), DoctorCheck("d", half_duplex), DoctorCheck("r", restarts), DoctorCheck("l", lines),
+)  # fmt: skip
 UART = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}}"
 WIRED = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}, lines: {sout: {line: GPIO17}}}"
 RS485 = "bow: {driver: hipnuc-modbus, rs485: {line: /dev/ttyUSB0, address: 80}}"

@@ -11,11 +11,8 @@ from tests.support.metrics import device
 from tests.support.surroundings import Machine
 
 CLOCK, STORAGE, POWER, PROCESSOR = (
-    DoctorCheck("c", host_clock),
-    DoctorCheck("s", storage),
-    DoctorCheck("p", power),
-    DoctorCheck("u", processor),
-)
+    DoctorCheck("c", host_clock), DoctorCheck("s", storage), DoctorCheck("p", power), DoctorCheck("u", processor),
+)  # fmt: skip
 
 
 def test_clock_and_storage(machine: Machine) -> None:
@@ -53,13 +50,10 @@ def test_storage_that_is_not_there_or_may_not_be_written(machine: Machine) -> No
 @pytest.mark.parametrize(
     ("word", "severities"),
     [
-        ("0", ["ok"]),
-        ("50005", ["error", "warning"]),
-        ("50000", ["warning", "note"]),
-        ("80008", ["warning"]),
+        ("0", ["ok"]), ("50005", ["error", "warning"]), ("50000", ["warning", "note"]), ("80008", ["warning"]),
         ("20000", ["note"]),
     ],
-)
+)  # fmt: skip
 def test_power_of_a_raspberry_pi(machine: Machine, word: str, severities: list[str]) -> None:
     machine.write("/proc/device-tree/model", "Raspberry Pi 4 Model B Rev 1.4\0")
     machine.write("/sys/devices/platform/soc/soc:firmware/get_throttled", word + "\n")

@@ -83,16 +83,8 @@ def test_options_have_an_effect(
     monkeypatch.setattr(command, "SetupSteps", Steps)
     monkeypatch.setenv("SUDO_USER", "ann")
     places = (
-        "/dev/ttyS0",
-        "--active",
-        "/dev/ttyS1",
-        "--rs485",
-        "/dev/ttyS2=9600",
-        "--i2c",
-        "1",
-        "--spi",
-        "/dev/spidev0.0",
-    )
+        "/dev/ttyS0", "--active", "/dev/ttyS1", "--rs485", "/dev/ttyS2=9600", "--i2c", "1", "--spi", "/dev/spidev0.0",
+    )  # fmt: skip
     cli("setup", *places, *words, status=1)
     wanted = Wanted(
         ("/dev/ttyS0",), ("/dev/ttyS1",), (("/dev/ttyS2", 9600),), (("i2c", "1"), ("spi", "/dev/spidev0.0"))

@@ -123,9 +123,6 @@ def test_what_is_named_and_not_there_is_said_to_be(gateway: LivingMachine, attac
     problems = {one.place: one.problem for one in found(gateway, attachments, wanted)}
     missing = "no such port or interface: is the adapter plugged in, is the name correct?"
     assert problems == {
-        USB0: "nothing is heard",
-        "ttyUSB1": missing,
-        "can7": missing,
-        "/dev/ttyUSB9": missing,
+        USB0: "nothing is heard", "ttyUSB1": missing, "can7": missing, "/dev/ttyUSB9": missing,
         "/etc/passwd": "this is not a serial port of a hardware device",
-    }
+    }  # fmt: skip

@@ -100,10 +100,8 @@ def test_what_a_person_wrote_stays_and_devices_are_added(gateway: LivingMachine,
     gateway.can("can0", up=True)
     setup.attachments.hears("can0", "hipnuc-canopen", "node 8", 500000)
     gateway.status = [
-        device("bow", state=DeviceState.MISSING, problem="it is not there"),
-        device("imu"),
-        device("imu2"),
-    ]
+        device("bow", state=DeviceState.MISSING, problem="it is not there"), device("imu"), device("imu2"),
+    ]  # fmt: skip
     assert setup.steps().set_up(PORT, (), wait_s=2) == 1  # bow is still missing
     text = (gateway.root / "etc/imud.yaml").read_text()
     assert [line for line in mine.splitlines() if line not in text.splitlines()] == []

@@ -312,12 +312,10 @@ def test_a_new_rate_is_not_a_loss(period_ns: int) -> None:
 @pytest.mark.parametrize(
     ("before", "after"),
     [
-        (EQUAL, {1: 1, 2: 2, 3: 2}),
-        (EQUAL, {1: 2, 2: 1, 3: 1}),
-        (MIXED, {1: 1, 2: 1, 3: 1, 6: 10}),
+        (EQUAL, {1: 1, 2: 2, 3: 2}), (EQUAL, {1: 2, 2: 1, 3: 1}), (MIXED, {1: 1, 2: 1, 3: 1, 6: 10}),
         (MIXED, {1: 1, 2: 1, 3: 4, 6: 5}),
     ],
-)
+)  # fmt: skip
 def test_another_rate_of_some_is_learnt(before: dict[int, int], after: dict[int, int]) -> None:
     rig = learnt(before)
     rig.feed(stream(after, range(60, 300)))

@@ -38,12 +38,9 @@ def feed(codec: Imu61xCanCodec, frames: list[tuple[int, bytes]]) -> list[CodecEv
 
 def sample(index: int, value: float = 1.0) -> list[tuple[int, bytes]]:
     return encode_set(
-        index=index,
-        accel_m_s2=(value,) * 3,
-        gyro_rad_s=(value,) * 3,
-        euler_rad=(0.1, 0.1, value / 10),
+        index=index, accel_m_s2=(value,) * 3, gyro_rad_s=(value,) * 3, euler_rad=(0.1, 0.1, value / 10),
         temperature_c=25,
-    )
+    )  # fmt: skip
 
 
 def indices(events: list[CodecEvent]) -> list[int | None]:
@@ -65,12 +62,10 @@ def test_golden_set_in_si_units_and_back() -> None:
     # half angles 0.75°, -1°, 45°: w = 0.70710678 (0.99984770 · 0.99991433 - 0.01745241 · 0.01308960) and so on
     assert measured.quat_wxyz == pytest.approx((0.7067770, 0.0215940, -0.0030853, 0.7071000), abs=1e-7)
     made = encode_set(
-        index=65535,
-        accel_m_s2=(9.80665, 2.4516625, -9.80665),
+        index=65535, accel_m_s2=(9.80665, 2.4516625, -9.80665),
         gyro_rad_s=(math.radians(10), math.radians(-20), math.radians(0.5)),
-        euler_rad=(math.radians(1.5), math.radians(-2), math.radians(90)),
-        temperature_c=25.0,
-    )
+        euler_rad=(math.radians(1.5), math.radians(-2), math.radians(90)), temperature_c=25.0,
+    )  # fmt: skip
     assert made == GOLDEN
     codec = make()
     for can_id, data in GOLDEN:

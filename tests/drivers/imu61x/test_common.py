@@ -56,13 +56,10 @@ def test_crc_gravity_products_and_filters() -> None:
 @pytest.mark.parametrize(
     ("product_id", "product"),
     [
-        ("0000494D55363132", "IMU612"),
-        ("0000494D55363134", "IMU614"),
-        ("0000494D55363138", "IMU618"),
-        ("0000494D55363141", "IMU6132A"),
-        ("0000494D55363142", "IMU6132B"),
+        ("0000494D55363132", "IMU612"), ("0000494D55363134", "IMU614"), ("0000494D55363138", "IMU618"),
+        ("0000494D55363141", "IMU6132A"), ("0000494D55363142", "IMU6132B"),
     ],
-)
+)  # fmt: skip
 @pytest.mark.manual("A 2.4.3 products")
 def test_product_ids_of_tables_22_and_28(product_id: str, product: str) -> None:
     assert product_of(bytes.fromhex(product_id)) == product

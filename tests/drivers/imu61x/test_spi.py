@@ -48,12 +48,9 @@ def one(events: Sequence[PolledEvent]) -> Measurement:
 
 
 @pytest.mark.manual(
-    "A 2.4 BURST",
-    "A 2.4.1 order",
-    "A 2.4.1 scale of the gyroscope",
-    "A 2.4.1 scale of the accelerometer",
+    "A 2.4 BURST", "A 2.4.1 order", "A 2.4.1 scale of the gyroscope", "A 2.4.1 scale of the accelerometer",
     "A 2.4.1 checksum",
-)
+)  # fmt: skip
 def test_standard_burst_in_si() -> None:
     made = codec()
     m = one(made.decode(0, PIPELINE + GOLDEN))
@@ -212,16 +209,12 @@ EXTENDED = bursts.encode_extended(
 @pytest.mark.parametrize(
     ("kind", "frame", "why"),
     [
-        ("standard", STANDARD, ""),
-        ("extended", EXTENDED, ""),
-        ("standard", EXTENDED[:28], "wrong check value"),
-        ("extended", STANDARD + bytes(20), "wrong check value"),
-        ("standard", bytes(28), "received only 0x00"),
-        ("extended", b"\xff" * 48, "received only 0xFF"),
-        ("standard", STANDARD[:-1], "expected 28 bytes, got 27"),
+        ("standard", STANDARD, ""), ("extended", EXTENDED, ""), ("standard", EXTENDED[:28], "wrong check value"),
+        ("extended", STANDARD + bytes(20), "wrong check value"), ("standard", bytes(28), "received only 0x00"),
+        ("extended", b"\xff" * 48, "received only 0xFF"), ("standard", STANDARD[:-1], "expected 28 bytes, got 27"),
         ("extended", b"", "expected 48 bytes, got 0"),
     ],
-)
+)  # fmt: skip
 def test_which_bytes_are_a_burst_of_a_kind(kind: BurstKind, frame: bytes, why: str) -> None:
     found = burst_problem(kind, PIPELINE + frame, 32)
     assert found.startswith(why)

@@ -266,11 +266,9 @@ def main(arguments: list[str] | None = None) -> int:
         "--seed", type=int, default=time.time_ns() % 1_000_000, help="seed of the plan (default: from the clock)"
     )
     parser.add_argument(
-        "--seconds",
-        type=float,
-        default=CI_SECONDS,
+        "--seconds", type=float, default=CI_SECONDS,
         help="duration of the faults in the guest's time, s (default: %(default)g)",
-    )
+    )  # fmt: skip
     parser.add_argument("--short", action="store_true", help="run two rounds with each kind of fault once")
     options = parser.parse_args(arguments)
     how = "--short" if options.short else f"--seconds {options.seconds:g}"

@@ -105,12 +105,9 @@ def _each_once(random: Random, faults: list[Fault]) -> list[Planned]:
 
 
 def play(
-    planned: list[Planned],
-    begin: Callable[[Planned], None],
-    end: Callable[[Fault], None],
-    now_s: Callable[[], float] = monotonic,
-    wait: Callable[[float], None] = sleep,
-) -> None:
+    planned: list[Planned], begin: Callable[[Planned], None], end: Callable[[Fault], None],
+    now_s: Callable[[], float] = monotonic, wait: Callable[[float], None] = sleep,
+) -> None:  # fmt: skip
     """Play one round: each fault starts and ends at its time.
 
     A fault that starts late, because host or guest was busy, ends late. Faults with the same resources wait for it.

@@ -69,15 +69,10 @@ def pytest_command(python: Python, arguments: list[str]) -> list[str]:
 def script(python: Python, command: list[str]) -> str:
     """Return the shell script that runs `command` from the repository's root in a clean environment."""
     variables = {
-        "PATH": f"{python.venv}/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
-        "HOME": "/tmp",
-        "LANG": "C.UTF-8",
-        "TERM": os.environ.get("TERM", "dumb"),
-        "COLUMNS": str(shutil.get_terminal_size().columns),
-        "PYTHONDONTWRITEBYTECODE": "1",
-        "PYTHONUNBUFFERED": "1",
-        "IMUD_LAB": "/run/lab",
-    }
+        "PATH": f"{python.venv}/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/tmp",
+        "LANG": "C.UTF-8", "TERM": os.environ.get("TERM", "dumb"), "COLUMNS": str(shutil.get_terminal_size().columns),
+        "PYTHONDONTWRITEBYTECODE": "1", "PYTHONUNBUFFERED": "1", "IMUD_LAB": "/run/lab",
+    }  # fmt: skip
     settings = [f"{name}={value}" for name, value in variables.items()]
     return f"cd {shlex.quote(str(ROOT))} &&\nexec {shlex.join(['env', '-i', *settings, *command])}\n"
 

@@ -58,11 +58,9 @@ class Folder:
 
 
 def run(
-    make_command: Callable[[tuple[int, int], int], list[str]],
-    folder: Folder,
-    limits: Limits,
+    make_command: Callable[[tuple[int, int], int], list[str]], folder: Folder, limits: Limits,
     write: Callable[[bytes], object],
-) -> int:
+) -> int:  # fmt: skip
     """Run the command of `make_command(uart_fds, monitor_fd)`. Return the guest's exit status.
 
     `write` receives the guest's output immediately. Raises LabError if the guest has no exit status. QEMU ends with
@@ -74,13 +72,10 @@ def run(
     try:
         with open(folder.path / "qemu.log", "wb") as errors:
             process = subprocess.Popen(
-                ["setpriv", "--pdeathsig", "KILL", *make_command(fds, monitor_fd)],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=errors,
-                pass_fds=(*fds, monitor_fd),
+                ["setpriv", "--pdeathsig", "KILL", *make_command(fds, monitor_fd)], stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE, stderr=errors, pass_fds=(*fds, monitor_fd),
                 start_new_session=True,  # Ctrl-C only reaches the runner, which then ends QEMU
-            )
+            )  # fmt: skip
     finally:
         for end in (*ends, far_monitor):
             end.close()
@@ -102,12 +97,9 @@ def run(
 
 
 def _watch(
-    process: subprocess.Popen[bytes],
-    folder: Folder,
-    limits: Limits,
-    write: Callable[[bytes], object],
+    process: subprocess.Popen[bytes], folder: Folder, limits: Limits, write: Callable[[bytes], object],
     monitor: socket.socket,
-) -> None:
+) -> None:  # fmt: skip
     """Return when QEMU has closed its output, or when the exit status exists. Raises LabError after a time limit."""
     assert process.stdout is not None
     start_s = restarted_s = time.monotonic()

@@ -118,15 +118,9 @@ def step(command: list[str], folder: Path, log: Path) -> None:
     with open(log, "ab") as output:
         try:
             result = subprocess.run(
-                ["nice", *command],
-                cwd=folder,
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                timeout=STEP_LIMIT_S,
-                check=False,
-            )
+                ["nice", *command], cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=output,
+                stderr=subprocess.STDOUT, timeout=STEP_LIMIT_S, check=False,
+            )  # fmt: skip
         except subprocess.TimeoutExpired as error:
             raise LabError(f"build: {command[0]} took more than {STEP_LIMIT_S} s") from error
     if result.returncode:

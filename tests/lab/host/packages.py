@@ -14,25 +14,15 @@ from tests.lab.host.errors import LabError
 KERNEL_SOURCE = "linux-source-6.12"
 
 PACKAGES = {
-    "qemu-system-x86": "boots the kernel",
-    KERNEL_SOURCE: "the kernel's source",
-    "gcc": "builds the kernel",
-    "libc6-dev": "builds the kernel",
-    "make": "builds the kernel",
-    "flex": "builds the kernel",
-    "bison": "builds the kernel",
-    "bc": "builds the kernel",
-    "libelf-dev": "builds the kernel",
-    "xz-utils": "unpacks the kernel's source",
-    "kmod": "loads the module in the guest",
-    "iproute2": "sets up interfaces in the guest",
-    "i2c-tools": "independent peer of the tests",
-    "spi-tools": "independent peer of the tests",
-    "can-utils": "independent peer of the tests",
-    "gpiod": "independent peer of the tests",
-    "gpsd": "independent peer of the tests, also outside of the lab",
+    "qemu-system-x86": "boots the kernel", KERNEL_SOURCE: "the kernel's source", "gcc": "builds the kernel",
+    "libc6-dev": "builds the kernel", "make": "builds the kernel", "flex": "builds the kernel",
+    "bison": "builds the kernel", "bc": "builds the kernel", "libelf-dev": "builds the kernel",
+    "xz-utils": "unpacks the kernel's source", "kmod": "loads the module in the guest",
+    "iproute2": "sets up interfaces in the guest", "i2c-tools": "independent peer of the tests",
+    "spi-tools": "independent peer of the tests", "can-utils": "independent peer of the tests",
+    "gpiod": "independent peer of the tests", "gpsd": "independent peer of the tests, also outside of the lab",
     "chrony": "independent peer of the tests, also outside of the lab",
-}
+}  # fmt: skip
 
 
 def installed_versions(names: list[str]) -> dict[str, str]:

@@ -26,20 +26,11 @@ from tests.lab_debian.guest.system import SHARE, Host, uptime_s
 Group: TypeAlias = Callable[[Checks, Host], None]
 
 GROUPS: dict[str, Group] = {
-    "installation": installation.check,
-    "service": service.check,
-    "rights": rights.check,
-    "sandbox": sandbox.check,
-    "outputs": outputs.check,
-    "views": views.check,
-    "buses": buses.check,
-    "replug": replug.check,
-    "doctor": first_contact.check_doctor,
-    "complaints": first_contact.check_complaints,
-    "setup": first_contact.check_setup,
-    "streaming": service.check_streaming,
-    "removal": removal.check,
-}
+    "installation": installation.check, "service": service.check, "rights": rights.check, "sandbox": sandbox.check,
+    "outputs": outputs.check, "views": views.check, "buses": buses.check, "replug": replug.check,
+    "doctor": first_contact.check_doctor, "complaints": first_contact.check_complaints,
+    "setup": first_contact.check_setup, "streaming": service.check_streaming, "removal": removal.check,
+}  # fmt: skip
 """Groups in the order of execution. The first installs the package, the second leaves the service running."""
 RUNS = {
     "amd64": (

@@ -51,19 +51,9 @@ def check(checks: Checks, _host: Host) -> None:
     with checks("a purge removes all except the users and groups"):
         must("apt-get", "--quiet", "--yes", "purge", "imud-daemon", limit_s=LIMIT_S)
         left = must(
-            "find",
-            "/etc",
-            "/usr",
-            "/var/lib",
-            "/run",
-            "/dev/shm",
-            "-xdev",
-            "-iname",
-            "*imud*",
-            "-not",
-            "-path",
+            "find", "/etc", "/usr", "/var/lib", "/run", "/dev/shm", "-xdev", "-iname", "*imud*", "-not", "-path",
             "/run/lab/*",
-        )
+        )  # fmt: skip
         expect("left", [line for line in left.splitlines() if "/var/lib/dpkg/" not in line and line != SETUP_LOCK], [])
         must("getent", "group", "imud")
     with checks("no unit has failed at the end"):

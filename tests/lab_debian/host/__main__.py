@@ -107,11 +107,9 @@ def boot(options: argparse.Namespace, release: Release, groups: list[str], made:
         try:
             with simulator(python, Path(sockets) / SENSOR) as sensor, requests.answered(Path(sockets), sensor):
                 status = guest.run(
-                    lambda _uart_fds, monitor_fd: machine.command(monitor_fd),
-                    guest.Folder(folder),
-                    LIMITS,
+                    lambda _uart_fds, monitor_fd: machine.command(monitor_fd), guest.Folder(folder), LIMITS,
                     guest.to_terminal,
-                )
+                )  # fmt: skip
             failed = status != 0
         finally:
             kept = keep(folder, output, failed)

@@ -40,13 +40,10 @@ MASKED = (
     *("apt-daily.timer", "apt-daily-upgrade.timer", "dpkg-db-backup.timer", "fstrim.timer", "e2scrub_all.timer"),
     *("e2scrub_reap.service", "systemd-binfmt.service", "proc-sys-fs-binfmt_misc.automount"),
     *(
-        "gpsd.service",
-        "gpsd.socket",
-        "chrony.service",
-        "systemd-pcrphase.service",
+        "gpsd.service", "gpsd.socket", "chrony.service", "systemd-pcrphase.service",
         "systemd-networkd-wait-online.service",
     ),
-)
+)  # fmt: skip
 """Units that slow down an emulated system or disturb the checks. The checks start their own gpsd and chronyd."""
 
 INIT = """\

@@ -55,16 +55,8 @@ class DebianMachine:
         return [
             *(self.release.qemu, "-nodefaults", "-no-user-config", "-no-reboot", "-display", "none"),
             *(
-                "-machine",
-                machine,
-                "-accel",
-                "tcg,thread=multi",
-                "-cpu",
-                processor,
-                "-smp",
-                str(self.processors),
-                "-m",
-                str(self.memory_mb),
+                "-machine", machine, "-accel", "tcg,thread=multi", "-cpu", processor, "-smp", str(self.processors),
+                "-m", str(self.memory_mb),
             ),
             *("-kernel", str(self.image.kernel), "-initrd", str(self.image.initramfs)),
             *("-append", f"console={console} panic=-1 mitigations=off {CONSOLE_OPTIONS}"),
@@ -81,7 +73,7 @@ class DebianMachine:
             *BUSES[self.release.architecture],
             *("-device", "qemu-xhci,id=xhci", "-chardev", f"serial,id=imu,path={_escaped(self.sockets / SENSOR)}"),
             *("-device", ",".join([ADAPTER["driver"], *(f"{k}={v}" for k, v in ADAPTER.items() if k != "driver")])),
-        ]
+        ]  # fmt: skip
 
 
 class Qmp:

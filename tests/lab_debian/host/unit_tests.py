@@ -84,10 +84,8 @@ def pytest(made: Path, work: Path, site: str) -> subprocess.CompletedProcess[str
     """Run the tests with the libraries at `site`. The report is in `work`. Raises LabError after a time limit."""
     words = ["/usr/bin/env", "--chdir=/mnt/tree", "/usr/bin/python3", "-m", "pytest", "-q", "-p", "no:cacheprovider"]
     words += [
-        f"--timeout={TEST_LIMIT_S}",
-        f"--junit-xml=/mnt/{REPORT}",
-        *(path for part in PARTS.values() for path in part),
-    ]
+        f"--timeout={TEST_LIMIT_S}", f"--junit-xml=/mnt/{REPORT}", *(path for part in PARTS.values() for path in part),
+    ]  # fmt: skip
     try:
         return subprocess.run(
             user_mode.command(made, work, ROOT, words), env=user_mode.environment(user_mode.SITE, site), text=True,

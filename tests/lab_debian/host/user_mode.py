@@ -101,9 +101,6 @@ def command(made: Path, work: Path, tree: Path, words: list[str]) -> list[str]:
 def environment(*paths: str) -> dict[str, str]:
     """Return the environment of such a program, without variables of the host, and with `paths` for Python."""
     return {
-        **CLEAN,
-        "LC_ALL": "C.UTF-8",
-        "PYTHONPYCACHEPREFIX": "/mnt/pycache",
-        "HYPOTHESIS_STORAGE_DIRECTORY": "/mnt/hypothesis",
-        "PYTHONPATH": os.pathsep.join(paths),
-    }
+        **CLEAN, "LC_ALL": "C.UTF-8", "PYTHONPYCACHEPREFIX": "/mnt/pycache",
+        "HYPOTHESIS_STORAGE_DIRECTORY": "/mnt/hypothesis", "PYTHONPATH": os.pathsep.join(paths),
+    }  # fmt: skip

@@ -126,20 +126,12 @@ def test_values_in_base_units() -> None:
     shown = rendered(Snapshot(DEVICES, heartbeat_age_ns=250_000_000, log_messages_dropped=3))
     front = {"device": "front"}
     expected = {
-        "imud_clock_offset_seconds": 5.25,
-        "imud_clock_skew_ratio": -4e-05,
-        "imud_clock_steering_ratio": 5e-04,
-        "imud_clock_residual_seconds": 3e-05,
-        "imud_clock_error_seconds": 4.5e-05,
-        "imud_clock_resets_total": 2,
-        "imud_sample_rate_hertz": 999.5,
-        "imud_sample_rate_expected_hertz": 1000.25,
-        "imud_sample_hold_seconds": 0.005,
-        "imud_sample_hold_wanted_seconds": 0.02,
-        "imud_temperature_celsius": 36.5,
-        "imud_status_bits": 4,
+        "imud_clock_offset_seconds": 5.25, "imud_clock_skew_ratio": -4e-05, "imud_clock_steering_ratio": 5e-04,
+        "imud_clock_residual_seconds": 3e-05, "imud_clock_error_seconds": 4.5e-05, "imud_clock_resets_total": 2,
+        "imud_sample_rate_hertz": 999.5, "imud_sample_rate_expected_hertz": 1000.25, "imud_sample_hold_seconds": 0.005,
+        "imud_sample_hold_wanted_seconds": 0.02, "imud_temperature_celsius": 36.5, "imud_status_bits": 4,
         "imud_device_connects_total": 3,
-    }
+    }  # fmt: skip
     for name, value in expected.items():
         assert shown[key(name, **front)] == pytest.approx(value, rel=1e-12), name
     kinds = {"overrun": 7, "framing": 8, "parity": 9, "break": 10}
@@ -158,50 +150,27 @@ def test_absent_is_not_zero() -> None:
 
 # All lines of the parts that only some devices have
 PARTS: dict[tuple[str, tuple[tuple[str, str], ...]], float] = {
-    ("imud_polls_total", ()): 1000,
-    ("imud_polls_late_total", ()): 20,
-    ("imud_polls_missed_total", ()): 3,
-    ("imud_polls_stale_total", ()): 4,
-    ("imud_transfers_failed_total", ()): 5,
-    ("imud_device_vanished_total", ()): 6,
-    ("imud_poll_delay_seconds_total", ()): 0.070000123,
-    ("imud_poll_delay_worst_seconds", ()): 0.008,
-    ("imud_serial_line_timeouts_total", ()): 11,
-    ("imud_serial_line_late_bytes_total", ()): 12,
-    ("imud_serial_line_strange_bytes_total", ()): 13,
-    ("imud_serial_line_echoes_total", ()): 14,
-    ("imud_clock_hold_seconds", ()): 0.016,
-    ("imud_clock_edges_total", ()): 4998,
-    ("imud_clock_edges_unpaired_total", ()): 9,
-    ("imud_clock_samples_unpaired_total", ()): 17,
-    ("imud_triggers_unanswered_total", ()): 21,
-    ("imud_clock_reference_error_seconds", ()): 0.00025,
-    ("imud_utc_problem", ()): 1,
-    ("imud_utc_sentences_total", ()): 100,
-    ("imud_utc_sentences_sent_total", ()): 90,
+    ("imud_polls_total", ()): 1000, ("imud_polls_late_total", ()): 20, ("imud_polls_missed_total", ()): 3,
+    ("imud_polls_stale_total", ()): 4, ("imud_transfers_failed_total", ()): 5, ("imud_device_vanished_total", ()): 6,
+    ("imud_poll_delay_seconds_total", ()): 0.070000123, ("imud_poll_delay_worst_seconds", ()): 0.008,
+    ("imud_serial_line_timeouts_total", ()): 11, ("imud_serial_line_late_bytes_total", ()): 12,
+    ("imud_serial_line_strange_bytes_total", ()): 13, ("imud_serial_line_echoes_total", ()): 14,
+    ("imud_clock_hold_seconds", ()): 0.016, ("imud_clock_edges_total", ()): 4998,
+    ("imud_clock_edges_unpaired_total", ()): 9, ("imud_clock_samples_unpaired_total", ()): 17,
+    ("imud_triggers_unanswered_total", ()): 21, ("imud_clock_reference_error_seconds", ()): 0.00025,
+    ("imud_utc_problem", ()): 1, ("imud_utc_sentences_total", ()): 100, ("imud_utc_sentences_sent_total", ()): 90,
     ("imud_utc_sentences_refused_total", (("cause", "stale"),)): 7,
-    ("imud_utc_sentences_refused_total", (("cause", "busy"),)): 3,
-    ("imud_pps_pulses_total", ()): 59,
-    ("imud_pps_pulses_ignored_total", ()): 1,
-    ("imud_chrony_samples_total", (("fate", "sent"),)): 40,
-    ("imud_chrony_samples_total", (("fate", "refused"),)): 19,
-    ("imud_line_problem", (("line", "sout"),)): 0,
-    ("imud_line_problem", (("line", "alarm"),)): 1,
-    ("imud_line_problem", (("line", "pps"),)): 0,
-    ("imud_line_problem", (("line", "sin"),)): 0,
-    ("imud_line_edges_total", (("line", "sout"),)): 5000,
-    ("imud_line_edges_total", (("line", "alarm"),)): 2,
-    ("imud_line_edges_total", (("line", "pps"),)): 60,
-    ("imud_line_edges_lost_total", (("line", "sout"),)): 7,
-    ("imud_line_edges_lost_total", (("line", "alarm"),)): 0,
-    ("imud_line_edges_lost_total", (("line", "pps"),)): 0,
-    ("imud_alarm_active", ()): 1,
-    ("imud_alarms_total", ()): 3,
-    ("imud_triggers_total", ()): 400,
-    ("imud_triggers_missed_total", ()): 8,
-    ("imud_trigger_delay_seconds_total", ()): 0.012000456,
-    ("imud_trigger_delay_worst_seconds", ()): 0.0009,
-}
+    ("imud_utc_sentences_refused_total", (("cause", "busy"),)): 3, ("imud_pps_pulses_total", ()): 59,
+    ("imud_pps_pulses_ignored_total", ()): 1, ("imud_chrony_samples_total", (("fate", "sent"),)): 40,
+    ("imud_chrony_samples_total", (("fate", "refused"),)): 19, ("imud_line_problem", (("line", "sout"),)): 0,
+    ("imud_line_problem", (("line", "alarm"),)): 1, ("imud_line_problem", (("line", "pps"),)): 0,
+    ("imud_line_problem", (("line", "sin"),)): 0, ("imud_line_edges_total", (("line", "sout"),)): 5000,
+    ("imud_line_edges_total", (("line", "alarm"),)): 2, ("imud_line_edges_total", (("line", "pps"),)): 60,
+    ("imud_line_edges_lost_total", (("line", "sout"),)): 7, ("imud_line_edges_lost_total", (("line", "alarm"),)): 0,
+    ("imud_line_edges_lost_total", (("line", "pps"),)): 0, ("imud_alarm_active", ()): 1, ("imud_alarms_total", ()): 3,
+    ("imud_triggers_total", ()): 400, ("imud_triggers_missed_total", ()): 8,
+    ("imud_trigger_delay_seconds_total", ()): 0.012000456, ("imud_trigger_delay_worst_seconds", ()): 0.0009,
+}  # fmt: skip
 
 
 def parts_of(name: str, shown: dict[Key, float]) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
@@ -346,11 +315,8 @@ def test_clients_are_summed_and_totals_never_fall() -> None:
     totals.update([])
     assert (totals.sent, totals.dropped) == (10 + 6 + 4, 2 + 1)
     clients: Sequence[states.ClientStatus] = [
-        client(1, queue=7),
-        client(2, "binary", queue=2),
-        client(3, ""),
-        client(4),
-    ]
+        client(1, queue=7), client(2, "binary", queue=2), client(3, ""), client(4),
+    ]  # fmt: skip
     shown = rendered(Snapshot(clients=clients))
     assert {e: shown[key("imud_clients", encoding=e)] for e in ("json", "binary", "none")} == {
         "json": 2, "binary": 1, "none": 1,
@@ -402,15 +368,9 @@ def shown_names() -> set[str]:
     output = states.OutputStatus("tcp 127.0.0.1:10110", 1, 2, 3, "")
     mqtt = states.MqttStatus("mqtt://127.0.0.1:1883", "", "", 1, 2, 3, 4, 5, 6, 7, {"age": 8}, 9)
     snapshot = Snapshot(
-        DEVICES,
-        (client(1),),
-        ((("front", "up"), 1),),
-        1,
-        recorders=(recorder,),
-        flights=(flight,),
-        outputs=(output,),
+        DEVICES, (client(1),), ((("front", "up"), 1),), 1, recorders=(recorder,), flights=(flight,), outputs=(output,),
         mqtts=(mqtt,),
-    )
+    )  # fmt: skip
     body = Renderer(pause=lambda: None).render(snapshot, "").body.decode()
     return set(re.findall(r"^# HELP (\S+)", body, re.MULTILINE))
 

@@ -24,12 +24,9 @@ NONE, READ, ALL = Rights.NONE, Rights.READ, Rights.READ | Rights.CONTROL
     [
         (0, (), ALL),
         (500, (), READ),  # the user of the daemon
-        (1000, (), NONE),
-        (1000, (7, 80), READ),
-        (1000, (7, 90), ALL),
-        (500, (90,), ALL),
+        (1000, (), NONE), (1000, (7, 80), READ), (1000, (7, 90), ALL), (500, (90,), ALL),
     ],
-)
+)  # fmt: skip
 def test_rules(uid: int, groups: tuple[int, ...], expected: Rights) -> None:
     assert Guard(500, 80, 90).rights_of(Peer(1, uid, frozenset(groups))) == expected
 
@@ -77,13 +74,10 @@ MANY_GROUPS = [*map(str, range(70_000, 70_300)), "daemon", "bin"]
 @pytest.mark.parametrize(
     ("groups", "mode", "expected"),
     [
-        ([], 0o660, "PermissionError"),
-        ([], 0o666, '"code":-32001'),
-        (["daemon"], 0o660, '"rights":["read"]'),
-        (["bin"], 0o666, '"rights":["read","control"]'),
-        (MANY_GROUPS, None, '"rights":["read","control"]'),
+        ([], 0o660, "PermissionError"), ([], 0o666, '"code":-32001'), (["daemon"], 0o660, '"rights":["read"]'),
+        (["bin"], 0o666, '"rights":["read","control"]'), (MANY_GROUPS, None, '"rights":["read","control"]'),
     ],
-)
+)  # fmt: skip
 def test_other_users(open_directory: Path, groups: list[str], mode: int | None, expected: str) -> None:
     async def body() -> str:
         async with serving(open_directory, group="daemon", control_group="bin") as server:
@@ -97,10 +91,7 @@ def test_other_users(open_directory: Path, groups: list[str], mode: int | None, 
 
 def ask(path: str, groups: Sequence[int | None]) -> str:
     done = subprocess.run(
-        [sys.executable, "-I", "-S", "-c", CLIENT, path, *map(str, groups)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=True,
-    )
+        [sys.executable, "-I", "-S", "-c", CLIENT, path, *map(str, groups)], capture_output=True, text=True,
+        timeout=60, check=True,
+    )  # fmt: skip
     return done.stdout

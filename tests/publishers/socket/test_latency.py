@@ -39,18 +39,11 @@ async def listening(directory: Path) -> AsyncIterator[tuple[SocketServer, Asked,
 @pytest.mark.parametrize(
     ("params", "latency_ms"),
     [
-        ({}, 0.0),
-        ({"rate_hz": 0}, 0.0),
-        ({"rate_hz": 1000}, 1.0),
-        ({"rate_hz": 100}, 10.0),
-        ({"rate_hz": 40}, 20.0),
-        ({"rate_hz": 1}, 20.0),
-        ({"rate_hz": 1, "latency_ms": 0}, 0.0),
-        ({"latency_ms": 7.5}, 7.5),
-        ({"rate_hz": 1000, "latency_ms": 60_000}, 60_000.0),
-        ({"rate_hz": 10, "latency_ms": None}, 20.0),
+        ({}, 0.0), ({"rate_hz": 0}, 0.0), ({"rate_hz": 1000}, 1.0), ({"rate_hz": 100}, 10.0), ({"rate_hz": 40}, 20.0),
+        ({"rate_hz": 1}, 20.0), ({"rate_hz": 1, "latency_ms": 0}, 0.0), ({"latency_ms": 7.5}, 7.5),
+        ({"rate_hz": 1000, "latency_ms": 60_000}, 60_000.0), ({"rate_hz": 10, "latency_ms": None}, 20.0),
     ],
-)
+)  # fmt: skip
 @in_context("scene", listening)
 async def test_a_watch_requests_its_latency_or_a_period_of_its_rate(
     scene: Scene, params: dict[str, Any], latency_ms: float

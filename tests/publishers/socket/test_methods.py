@@ -38,9 +38,7 @@ from tests.support.socket_rig import Peer, batch, in_server, run, serving
         (b'{"jsonrpc":"2.0","id":1,"method":"watch","params":{"rate_hz":NaN}}', -32700, None, "not JSON"),
         (b'{"jsonrpc":"2.0","id":1,"method":"watch","params":{"rate_hz":1e999}}', -32700, None, "not JSON"),
         (
-            b'{"jsonrpc":"2.0","id":1,"method":"x","params":' + b'{"a":' * 974 + b"1" + b"}" * 975,
-            -32700,
-            None,
+            b'{"jsonrpc":"2.0","id":1,"method":"x","params":' + b'{"a":' * 974 + b"1" + b"}" * 975, -32700, None,
             "nested",
         ),
         (b"[" + b"1," * 3000 + b"1]", -32700, None, "too many values: expected at most 2048"),
@@ -57,7 +55,7 @@ from tests.support.socket_rig import Peer, batch, in_server, run, serving
         (b'{"jsonrpc":"2.0","id":1,"method":"config.get"}', -32601, 1, "there are: devices, status"),
         (b'{"jsonrpc":"2.0","id":null,"method":"x"}', -32601, None, "no method 'x'"),
     ],
-)
+)  # fmt: skip
 @in_server()
 async def test_bad_lines(server: SocketServer, line: bytes, code: int, request_id: object, words: str) -> None:
     peer = await Peer.greeted(server)

@@ -77,18 +77,10 @@ async def test_json_samples_have_the_names_of_the_design_and_only_the_selected_m
     first, second, other = await peer.messages(3)
     assert first["method"] == "sample"
     assert first["params"] == {
-        "device": "imu0",
-        "seq": 7,
-        "t_ns": 80_000_007_000_000,
-        "t_err_ns": 12_000,
-        "sync": "regression",
-        "t_rx_ns": 80_000_007_200_000,
-        "utc_ns": 1_790_000_000_007_000_000,
-        "t_dev_ns": 7_000_000,
-        "accel_m_s2": [0.125, -0.5, 9.75],
-        "gyro_rad_s": [0.25, 0.5, -0.75],
-        "temperature_c": 31.5,
-    }
+        "device": "imu0", "seq": 7, "t_ns": 80_000_007_000_000, "t_err_ns": 12_000, "sync": "regression",
+        "t_rx_ns": 80_000_007_200_000, "utc_ns": 1_790_000_000_007_000_000, "t_dev_ns": 7_000_000,
+        "accel_m_s2": [0.125, -0.5, 9.75], "gyro_rad_s": [0.25, 0.5, -0.75], "temperature_c": 31.5,
+    }  # fmt: skip
     assert (second["params"]["seq"], other["params"]["device"]) == (8, "imu1")
     reply = await peer.result("watch", devices=["imu1"], fields=["gyro_rad_s", "mag_t"])
     assert reply["devices"] == {"imu1": 1}

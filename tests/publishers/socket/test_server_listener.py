@@ -239,13 +239,9 @@ def test_leftovers_of_dead_daemons_go_and_nothing_else(tmp_path: Path) -> None:
         alive.listen()
         Listener(path, GROUP).close()
     assert {file.name for file in tmp_path.iterdir()} == {
-        f"imud.sock.{other.pid}",
-        f"imud.sock.{ended.pid}.x",
-        "imud.sock.x",
-        f"other.{ended.pid}",
-        f"imud.sock.0{ended.pid}",
-        f"imud.sock.00{ended.pid}",
-    }
+        f"imud.sock.{other.pid}", f"imud.sock.{ended.pid}.x", "imud.sock.x", f"other.{ended.pid}",
+        f"imud.sock.0{ended.pid}", f"imud.sock.00{ended.pid}",
+    }  # fmt: skip
 
 
 def test_a_file_in_the_way_of_the_first_name(tmp_path: Path) -> None:

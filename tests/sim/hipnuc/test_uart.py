@@ -210,16 +210,11 @@ def test_baud_follows_from_the_rate(rate_hz: float, message: str, baud: int) -> 
 @pytest.mark.parametrize(
     "options",
     [
-        SimulatorOptions(rate_hz=0),
-        SimulatorOptions(rate_hz=-1),
-        SimulatorOptions(rate_hz=2000),
-        SimulatorOptions(rate_hz=300),
-        SimulatorOptions(rate_hz=float("nan")),
-        SimulatorOptions(baud=57_600),
-        SimulatorOptions(message="HI93"),
-        SimulatorOptions(motion="dance"),
+        SimulatorOptions(rate_hz=0), SimulatorOptions(rate_hz=-1), SimulatorOptions(rate_hz=2000),
+        SimulatorOptions(rate_hz=300), SimulatorOptions(rate_hz=float("nan")), SimulatorOptions(baud=57_600),
+        SimulatorOptions(message="HI93"), SimulatorOptions(motion="dance"),
     ],
-)
+)  # fmt: skip
 def test_impossible_options_are_refused(options: SimulatorOptions) -> None:
     with pytest.raises(ValueError, match="expected"):
         make(options, 0)

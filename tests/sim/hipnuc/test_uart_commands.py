@@ -62,13 +62,10 @@ def test_replies_stand_between_whole_frames() -> None:
 @pytest.mark.parametrize(
     "line",
     [
-        "LOG VERSION\n",
-        "LOG VERSION\r\n",
-        "\xff\x80\x01LOG VERSION\r\n",
-        "\r\n\r\nLOG VERSION\n",
+        "LOG VERSION\n", "LOG VERSION\r\n", "\xff\x80\x01LOG VERSION\r\n", "\r\n\r\nLOG VERSION\n",
         "LOG D\xffLOG VERSION\n",
     ],
-)
+)  # fmt: skip
 @pytest.mark.manual("B 2 line end")
 def test_line_ends_and_garbage_before_a_command(line: str) -> None:
     bench = HipnucUartBench()

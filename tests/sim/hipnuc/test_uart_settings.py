@@ -74,28 +74,14 @@ def test_rates_pins_unlogall_and_reports() -> None:
 @pytest.mark.parametrize(
     "line",
     [
-        "SERIALCONFIG 57600",
-        "SERIALCONFIG fast",
-        "SERIALCONFIG 115200.0",
-        "CONFIG ATT MODE 2",
-        "CONFIG IMU URFR 1,0,0,0,1,0,0,0,-1",
-        "CONFIG IMU URFR 1,0,0,0,1,0,0,0",
-        "CONFIG IMU URFR 1,0,0,0,1,0,0,0,nan",
-        "CONFIG IMU URFR 1,0,0,1,0,0,0,0,1",
-        "CONFIG IMU EN_MCAL 2",
-        "CONFIG PMUX1 IO0",
-        "CONFIG PMUX4 DIV0",
-        "CONFIG PMUX4 DIV65",
-        "CONFIG PMUX5 X,5,-5,0,1",
-        "CONFIG PMUX5 X,-5,5,1,1",
-        "CONFIG PMUX5 X,-5,5,0,2",
-        "CONFIG PMUX5 X,-5,inf,0,1",
-        "LOG HI91 ONTIME 2",
-        "LOG HI91 ONTIME -0.01",
-        "LOG HI91 ONTIME 0.0005",
+        "SERIALCONFIG 57600", "SERIALCONFIG fast", "SERIALCONFIG 115200.0", "CONFIG ATT MODE 2",
+        "CONFIG IMU URFR 1,0,0,0,1,0,0,0,-1", "CONFIG IMU URFR 1,0,0,0,1,0,0,0", "CONFIG IMU URFR 1,0,0,0,1,0,0,0,nan",
+        "CONFIG IMU URFR 1,0,0,1,0,0,0,0,1", "CONFIG IMU EN_MCAL 2", "CONFIG PMUX1 IO0", "CONFIG PMUX4 DIV0",
+        "CONFIG PMUX4 DIV65", "CONFIG PMUX5 X,5,-5,0,1", "CONFIG PMUX5 X,-5,5,1,1", "CONFIG PMUX5 X,-5,5,0,2",
+        "CONFIG PMUX5 X,-5,inf,0,1", "LOG HI91 ONTIME 2", "LOG HI91 ONTIME -0.01", "LOG HI91 ONTIME 0.0005",
         "LOG HI91 ONMARK 2",
     ],
-)
+)  # fmt: skip
 def test_bad_values_are_refused(line: str) -> None:
     with pytest.raises(CommandRefused):
         changed(FACTORY, line, 156)

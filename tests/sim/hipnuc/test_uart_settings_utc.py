@@ -142,14 +142,12 @@ def test_both_are_needed(pulse: bool, says: int | None) -> None:
 @pytest.mark.parametrize(
     "spoil",
     [
-        lambda utc_ns: build(utc_ns, valid=False),
-        lambda utc_ns: build(utc_ns).replace(b"A*", b"D*"),
-        lambda utc_ns: build(utc_ns).replace(b"RMC", b"GGA"),
-        lambda utc_ns: build(utc_ns + 500 * NS_PER_MS),
+        lambda utc_ns: build(utc_ns, valid=False), lambda utc_ns: build(utc_ns).replace(b"A*", b"D*"),
+        lambda utc_ns: build(utc_ns).replace(b"RMC", b"GGA"), lambda utc_ns: build(utc_ns + 500 * NS_PER_MS),
         lambda utc_ns: build(utc_ns)[:40],
     ],
     ids=["status V", "checksum", "another sentence", "not yet", "cut"],
-)
+)  # fmt: skip
 def test_bad_sentences_say_nothing(spoil: Callable[[int], bytes]) -> None:
     receiver = Receiver(still())
     for _ in range(8):

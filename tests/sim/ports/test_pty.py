@@ -28,13 +28,9 @@ class PluggedPort:
     """A port, a program that can open it, and the time."""
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        settings: ModuleSettings | None = None,
-        profile: ArrivalProfile = BARE_UART,
+        self, path: Path, *, settings: ModuleSettings | None = None, profile: ArrivalProfile = BARE_UART,
         faults: Faults | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.now_ns = BEGIN_NS
         self.path = path
         self.truth = io.StringIO()

@@ -43,14 +43,10 @@ def test_write_and_its_confirmation() -> None:
 @pytest.mark.parametrize(
     "other",
     [
-        frame("60 A1 20 00 00 00 00 00"),
-        frame("60 A0 20 01 00 00 00 00"),
-        frame("60 A0 20 00 00 00 00 00", 0x589),
-        frame("43 A0 20 00 09 00 00 00"),
-        frame("60 A0 20 00"),
-        "60 A0 20 00",
+        frame("60 A1 20 00 00 00 00 00"), frame("60 A0 20 01 00 00 00 00"), frame("60 A0 20 00 00 00 00 00", 0x589),
+        frame("43 A0 20 00 09 00 00 00"), frame("60 A0 20 00"), "60 A0 20 00",
     ],
-)
+)  # fmt: skip
 def test_invalid_confirmations(other: ReplyFrame | str) -> None:
     request = next(write_object(8, 0x20A0, 0, 9, 4))
     assert not request.is_end(other)

@@ -64,13 +64,9 @@ def test_all_tpdos_in_si_units() -> None:
     assert event.dev_ticks is None
     assert (event.mag_t, event.temperature_c, event.status) == (None, None, None)
     made = encode_tpdos(
-        accel_m_s2=event.accel_m_s2,
-        gyro_rad_s=event.gyro_rad_s,
-        euler_rad=event.euler_rad,
-        quat_wxyz=event.quat_wxyz,
-        pressure_pa=event.pressure_pa,
-        incli_rad=event.incli_rad,
-    )
+        accel_m_s2=event.accel_m_s2, gyro_rad_s=event.gyro_rad_s, euler_rad=event.euler_rad, quat_wxyz=event.quat_wxyz,
+        pressure_pa=event.pressure_pa, incli_rad=event.incli_rad,
+    )  # fmt: skip
     assert made == {number: bytes.fromhex(text) for number, text in GOLDEN.items()}
     # half angles: roll 22.5° (cos 0.92388, sin 0.38268), pitch -25° (0.90631, -0.42262), yaw -90° (0, -1)
     assert measured([3]).quat_wxyz == pytest.approx((-0.161729, 0.346830, 0.390450, -0.837321), abs=2e-6)
@@ -157,15 +153,10 @@ def test_filters_sync_and_names_of_the_row() -> None:
 @pytest.mark.parametrize(
     ("can_id", "size", "node"),
     [
-        (0x188, 6, 8),
-        (0x1FF, 6, 127),
-        (0x180, 6, None),
-        (0x188, 8, None),
-        (0x688, 4, 8),
-        (0x788, 8, 8),
+        (0x188, 6, 8), (0x1FF, 6, 127), (0x180, 6, None), (0x188, 8, None), (0x688, 4, 8), (0x788, 8, 8),
         (0x588, 8, None),
     ],
-)
+)  # fmt: skip
 def test_identifier_and_length_identify_the_node(can_id: int, size: int, node: int | None) -> None:
     assert DRIVER.node_of(can_id, False, bytes(size)) == node
     assert DRIVER.node_of(can_id, True, bytes(size)) is None

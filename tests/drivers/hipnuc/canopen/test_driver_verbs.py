@@ -46,14 +46,9 @@ ROWS: list[tuple[str, dict[str, object], str]] = [
 @pytest.mark.parametrize(("name", "given", "data"), ROWS)
 @pytest.mark.parametrize("node", [8, 127])
 @pytest.mark.manual(
-    "B 5.4.1 node number",
-    "B 5.4.1 save",
-    "B 5.4.1 restart",
-    "B 5.4.1 factory settings",
-    "B 5.4.1 bit rate",
-    "B 5.4.1 zero of the inclinometer",
-    "B 5.4.2 transmission type",
-)
+    "B 5.4.1 node number", "B 5.4.1 save", "B 5.4.1 restart", "B 5.4.1 factory settings", "B 5.4.1 bit rate",
+    "B 5.4.1 zero of the inclinometer", "B 5.4.2 transmission type",
+)  # fmt: skip
 def test_commands_of_the_manual_go_to_the_node_of_the_settings(
     name: str, given: dict[str, object], data: str, node: int
 ) -> None:
@@ -77,18 +72,12 @@ def test_network_management(command: str, code: int) -> None:
 @pytest.mark.parametrize(
     ("name", "given"),
     [
-        ("node", {"node": 128}),
-        ("node", {"node": True}),
-        ("bitrate", {"bitrate": 800_000}),
-        ("interval", {"tpdo": 5, "interval_ms": 10}),
-        ("interval", {"tpdo": 1, "interval_ms": 4}),
-        ("interval", {"tpdo": 1, "interval_ms": 1001}),
-        ("transmission", {"tpdo": 1, "by": "remote"}),
-        ("direction", {"x_reversed": 1, "y_reversed": False}),
-        ("zero", {"zero": 2}),
-        ("nmt", {"command": "sleep"}),
+        ("node", {"node": 128}), ("node", {"node": True}), ("bitrate", {"bitrate": 800_000}),
+        ("interval", {"tpdo": 5, "interval_ms": 10}), ("interval", {"tpdo": 1, "interval_ms": 4}),
+        ("interval", {"tpdo": 1, "interval_ms": 1001}), ("transmission", {"tpdo": 1, "by": "remote"}),
+        ("direction", {"x_reversed": 1, "y_reversed": False}), ("zero", {"zero": 2}), ("nmt", {"command": "sleep"}),
     ],
-)
+)  # fmt: skip
 def test_arguments_that_cannot_be_send_nothing(name: str, given: dict[str, object]) -> None:
     with pytest.raises(BadArgument, match=r"(?i)expected|invalid enum value"):
         next(begun(name, **given))

@@ -40,11 +40,9 @@ def feed(codec: HipnucJ1939Codec, frames: list[tuple[int, bytes]], t_ns: int) ->
 def burst(value: int, address: int = 8, *more: tuple[int, bytes]) -> list[tuple[int, bytes]]:
     """Return the four messages of every device; `value` is roll in counts and identifies the sample."""
     rows = (
-        (messages.ACCEL, bytes.fromhex("000000000008") + bytes(2)),
-        (messages.GYRO, bytes(8)),
-        (messages.ROLL_PITCH, value.to_bytes(4, "little") + bytes(4)),
-        (messages.HEADING, bytes(8)),
-    )
+        (messages.ACCEL, bytes.fromhex("000000000008") + bytes(2)), (messages.GYRO, bytes(8)),
+        (messages.ROLL_PITCH, value.to_bytes(4, "little") + bytes(4)), (messages.HEADING, bytes(8)),
+    )  # fmt: skip
     return [encode(pgn, data, address) for pgn, data in (*rows, *more)]
 
 
@@ -132,24 +130,16 @@ def test_packing_gives_the_golden_messages_and_clips_them() -> None:
 @pytest.mark.parametrize(
     ("pgn", "data", "field"),
     [
-        (0xFF34, NONE, "accel_m_s2"),
-        (0xFF37, NONE, "gyro_rad_s"),
-        (0xFF3A, NONE, "mag_t"),
-        (0xFF3A, bytes(8), "mag_t"),
-        (0xFF3D, bytes.fromhex("ffffff7fffffff7f"), "euler_rad"),
-        (0xFF3D, bytes.fromhex("0000008000000080"), "euler_rad"),
-        (0xFF41, NONE, "euler_rad"),
+        (0xFF34, NONE, "accel_m_s2"), (0xFF37, NONE, "gyro_rad_s"), (0xFF3A, NONE, "mag_t"),
+        (0xFF3A, bytes(8), "mag_t"), (0xFF3D, bytes.fromhex("ffffff7fffffff7f"), "euler_rad"),
+        (0xFF3D, bytes.fromhex("0000008000000080"), "euler_rad"), (0xFF41, NONE, "euler_rad"),
         (0xFF41, bytes.fromhex("000000fe00000000"), "euler_rad"),
         (0xFF41, bytes.fromhex("417e050000000000"), "euler_rad"),  # 360.001°
-        (0xFF43, NONE, "temperature_c"),
-        (0xFF43, NONE, "pressure_pa"),
-        (0xFF43, bytes(8), "temperature_c"),
-        (0xFF43, bytes(8), "pressure_pa"),
-        (0xFF43, bytes.fromhex("ff7f000000000000"), "temperature_c"),
-        (0xFF46, NONE, "quat_wxyz"),
-        (0xFF46, bytes(8), "quat_wxyz"),
+        (0xFF43, NONE, "temperature_c"), (0xFF43, NONE, "pressure_pa"), (0xFF43, bytes(8), "temperature_c"),
+        (0xFF43, bytes(8), "pressure_pa"), (0xFF43, bytes.fromhex("ff7f000000000000"), "temperature_c"),
+        (0xFF46, NONE, "quat_wxyz"), (0xFF46, bytes(8), "quat_wxyz"),
     ],
-)
+)  # fmt: skip
 def test_absent_is_not_zero(pgn: int, data: bytes, field: str) -> None:
     assert getattr(messages.measurement_of([(pgn, data)]), field) is None
 

@@ -79,16 +79,9 @@ READABLE = ("interval", "bitrate", "address", "direction")
 
 @pytest.mark.parametrize(("name", "arguments", "data"), ROWS, ids=[f"{name} {data}" for name, _, data in ROWS])
 @pytest.mark.manual(
-    "B 6.2.2 intervals",
-    "B 6.2.2 save",
-    "B 6.2.2 factory settings",
-    "B 6.2.2 restart",
-    "B 6.2.2 bit rate",
-    "B 6.2.2 address",
-    "B 6.2.2 zero",
-    "B 6.2.2 directions",
-    "B 6.2.2 source address",
-)
+    "B 6.2.2 intervals", "B 6.2.2 save", "B 6.2.2 factory settings", "B 6.2.2 restart", "B 6.2.2 bit rate",
+    "B 6.2.2 address", "B 6.2.2 zero", "B 6.2.2 directions", "B 6.2.2 source address",
+)  # fmt: skip
 def test_every_row_of_the_manual(name: str, arguments: dict[str, object], data: str) -> None:
     bench = J1939Bench()
     result = bench.act(name, **arguments)
@@ -101,12 +94,9 @@ def test_missing_replies_and_unchanged_values_are_reported() -> None:
     with pytest.raises(Rejected, match="restart: the device rejected the request"):
         J1939Bench(variant=J1939Variant(refuses=frozenset({session.CONTROL}))).act("restart")
     begins: list[Callable[[], RequestScript[object]]] = [
-        lambda: session.save(PEER),
-        lambda: session.zero(PEER, Zero.HERE),
-        lambda: session.send_once(PEER, 0xFF34),
-        lambda: session.set_interval(PEER, 0xFF34, 10),
-        lambda: session.set_address(PEER, 9),
-    ]
+        lambda: session.save(PEER), lambda: session.zero(PEER, Zero.HERE), lambda: session.send_once(PEER, 0xFF34),
+        lambda: session.set_interval(PEER, 0xFF34, 10), lambda: session.set_address(PEER, 9),
+    ]  # fmt: skip
     for begin in begins:
         with pytest.raises(NoReply, match="address 8"):
             played(begin(), None)
@@ -170,17 +160,12 @@ def test_which_frames_answer_a_request() -> None:
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
-        ("interval", {"pgn": "FF34", "interval_ms": 4}),
-        ("interval", {"pgn": "FF34", "interval_ms": 1001}),
-        ("interval", {"pgn": "FF35", "interval_ms": 10}),
-        ("bitrate", {"bitrate": 100_000}),
-        ("address", {"address": 0}),
-        ("address", {"address": 129}),
-        ("direction", {"axis": "Z", "reversed": True}),
-        ("zero", {"zero": "there"}),
-        ("send_once", {"pgn": "FF35"}),
+        ("interval", {"pgn": "FF34", "interval_ms": 4}), ("interval", {"pgn": "FF34", "interval_ms": 1001}),
+        ("interval", {"pgn": "FF35", "interval_ms": 10}), ("bitrate", {"bitrate": 100_000}),
+        ("address", {"address": 0}), ("address", {"address": 129}), ("direction", {"axis": "Z", "reversed": True}),
+        ("zero", {"zero": "there"}), ("send_once", {"pgn": "FF35"}),
     ],
-)
+)  # fmt: skip
 def test_arguments_are_checked_before_anything_is_sent(name: str, arguments: dict[str, object]) -> None:
     with pytest.raises(BadArgument, match=r"expected (a|one of)"):
         script_of(DRIVER, J1939Bench().target(), name, arguments)

@@ -51,13 +51,10 @@ def short(**options: object) -> HipnucModbusCodec:
 
 def block(
     *,
-    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
-    per_lsb: float = QUAT_PER_LSB,
-    incli: tuple[int, int] = (0, 0),
-    pitch_deg: float = 0.0,
-    uptime_ms: int = 5,
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0), per_lsb: float = QUAT_PER_LSB,
+    incli: tuple[int, int] = (0, 0), pitch_deg: float = 0.0, uptime_ms: int = 5,
     mag_t: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> bytes:
+) -> bytes:  # fmt: skip
     data = pack_block(
         accel_m_s2=(0, 0, 9.8), gyro_rad_s=(0, 0, 0), mag_t=mag_t, euler_rad=(0, radians(pitch_deg), 0),
         quat_wxyz=quat, temperature_c=0, pressure_pa=0, uptime_ms=uptime_ms, incli_counts=incli, quat_per_lsb=per_lsb,
@@ -73,16 +70,9 @@ def measured(made: HipnucModbusCodec, data: bytes) -> Measurement:
 
 
 @pytest.mark.manual(
-    "B 4.2 identity",
-    "B 4.4 example",
-    "B 4.2 acceleration",
-    "B 4.2 angular rate",
-    "B 4.2 magnetic field",
-    "B 4.2 angles",
-    "B 4.5 example",
-    "B 4.2 temperature and pressure",
-    "B 4 defaults",
-)
+    "B 4.2 identity", "B 4.4 example", "B 4.2 acceleration", "B 4.2 angular rate", "B 4.2 magnetic field",
+    "B 4.2 angles", "B 4.5 example", "B 4.2 temperature and pressure", "B 4 defaults",
+)  # fmt: skip
 def test_identity_sensors_and_the_block_of_newer_firmware() -> None:
     """26 registers by hand: uptime 0x00012345 ms is 74.565 s, 2512 is 25.12 °C, 10132500 is 101325 Pa."""
     identity = run_transfer_script(probe(HipnucModbusOptions()), lambda _: IDENTITY)

@@ -179,11 +179,8 @@ def test_devices_with_unexpected_replies() -> None:
 def test_absence_and_rejections_are_reported() -> None:
     bench = ModbusBench(module(7, dead=True))
     begins: list[Callable[[], TransferScript[Any]]] = [
-        lambda: restart((7,), BAUD),
-        lambda: set_baud(9600),
-        lambda: change_address(7, 9),
-        save,
-    ]
+        lambda: restart((7,), BAUD), lambda: set_baud(9600), lambda: change_address(7, 9), save,
+    ]  # fmt: skip
     for begin in begins:
         with pytest.raises((TransferError, NoReply)):
             bench.run(begin())

@@ -40,11 +40,9 @@ def test_the_table_has_effects_and_types() -> None:
     assert set(VALUES) == set(SETTINGS.table)
     effects = {name: (one.effect, one.connection) for name, one in SETTINGS.table.items()}
     assert effects == {
-        "mode": (Effect.AT_ONCE, False),
-        "mounting": (Effect.AFTER_RESTART, False),
-        "baud": (Effect.AFTER_RESTART, True),
-        "address": (Effect.AT_ONCE, True),
-    }
+        "mode": (Effect.AT_ONCE, False), "mounting": (Effect.AFTER_RESTART, False),
+        "baud": (Effect.AFTER_RESTART, True), "address": (Effect.AT_ONCE, True),
+    }  # fmt: skip
     for name, values in VALUES.items():
         for value in values:
             assert msgspec.convert(value, SETTINGS.table[name].type) == value

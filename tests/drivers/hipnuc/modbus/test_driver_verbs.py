@@ -19,21 +19,14 @@ def act(bench: ModbusBench, name: str, **given: object) -> object:
 @pytest.mark.parametrize(
     ("name", "given", "sent"),
     [
-        ("save", {}, "0600000000"),
-        ("factory_reset", {}, "0600000001"),
-        ("restart", {}, "06000000ff"),
-        ("address", {"address": 128}, "0600050080"),
-        ("baud", {"baud": 4800}, "0600040000"),
-        ("baud", {"baud": 256000}, "0600040009"),
-        ("attitude_mode", {"axes": 9}, "0600060001"),
-        ("attitude_mode", {"axes": 6}, "0600060000"),
-        ("level", {"level": "relative"}, "0600a50002"),
-        ("level", {"level": "cancel"}, "0600a50005"),
-        ("mounting", {"mounting": "level"}, "0600a60000"),
-        ("mounting", {"mounting": "y_down"}, "0600a60001"),
-        ("mounting", {"mounting": "x_up"}, "0600a60003"),
+        ("save", {}, "0600000000"), ("factory_reset", {}, "0600000001"), ("restart", {}, "06000000ff"),
+        ("address", {"address": 128}, "0600050080"), ("baud", {"baud": 4800}, "0600040000"),
+        ("baud", {"baud": 256000}, "0600040009"), ("attitude_mode", {"axes": 9}, "0600060001"),
+        ("attitude_mode", {"axes": 6}, "0600060000"), ("level", {"level": "relative"}, "0600a50002"),
+        ("level", {"level": "cancel"}, "0600a50005"), ("mounting", {"mounting": "level"}, "0600a60000"),
+        ("mounting", {"mounting": "y_down"}, "0600a60001"), ("mounting", {"mounting": "x_up"}, "0600a60003"),
     ],
-)
+)  # fmt: skip
 @pytest.mark.manual("B 4.3.1 save", "B 4.3.4 mounting", "B 4.3.5 level", "B 4.3.6 axes")
 def test_requests_as_sent(name: str, given: dict[str, object], sent: str) -> None:
     bench = ModbusBench()
@@ -59,12 +52,10 @@ def test_actions_without_an_address_and_reading_by_name() -> None:
     [
         ("address", {"address": 129}, "from 1 to 128"),
         ("address", {}, "address is a setting: imud settings bow --set address=ADDRESS"),
-        ("baud", {"baud": 12345}, "4800, 9600"),
-        ("mounting", {"mounting": 1}, "level"),
-        ("attitude_mode", {"axes": 1}, '"6-axis", "9-axis"'),
-        ("level", {"level": 3}, "automatic"),
+        ("baud", {"baud": 12345}, "4800, 9600"), ("mounting", {"mounting": 1}, "level"),
+        ("attitude_mode", {"axes": 1}, '"6-axis", "9-axis"'), ("level", {"level": 3}, "automatic"),
     ],
-)
+)  # fmt: skip
 def test_unsupported_values_are_not_sent(name: str, given: dict[str, object], names: str) -> None:
     bench = ModbusBench()
     with pytest.raises(BadArgument, match=names):

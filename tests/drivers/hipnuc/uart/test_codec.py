@@ -48,14 +48,9 @@ HI92_PAYLOAD = bytes.fromhex(
 # SI value of one unit of the device: 1 g (manual B: 9.8 m/s²), 1 °/s, 1 µT, 1 °
 SI_PER_UNIT = {"accel_m_s2": 9.8, "gyro_rad_s": math.pi / 180, "mag_t": 1e-6, "euler_rad": math.pi / 180}
 LEVEL: dict[str, Any] = {
-    "accel_m_s2": (0.0, 0.0, 9.8),
-    "gyro_rad_s": (0.0, 0.0, 0.0),
-    "mag_t": (30.517e-6, 0.0, 0.0),
-    "euler_rad": (0.0, 0.0, 0.0),
-    "quat_wxyz": (1.0, 0.0, 0.0, 0.0),
-    "temperature_c": 25.0,
-    "pressure_pa": 101325.0,
-}
+    "accel_m_s2": (0.0, 0.0, 9.8), "gyro_rad_s": (0.0, 0.0, 0.0), "mag_t": (30.517e-6, 0.0, 0.0),
+    "euler_rad": (0.0, 0.0, 0.0), "quat_wxyz": (1.0, 0.0, 0.0, 0.0), "temperature_c": 25.0, "pressure_pa": 101325.0,
+}  # fmt: skip
 
 
 def crc_bit_by_bit(data: bytes) -> int:
@@ -108,19 +103,10 @@ def check_manual_values(m: Measurement) -> None:
 
 
 @pytest.mark.manual(
-    "B 3.1 header",
-    "B 3.3.1 pps_sync_stamp",
-    "B 3.3.1 temperature",
-    "B 3.3.1 air_pressure",
-    "B 3.3.1 system_time",
-    "B 3.3.1 acceleration",
-    "B 3.3.1 angular rate",
-    "B 3.3.1 magnetic field",
-    "B 3.3.1 angles",
-    "B 3.3.1 quaternion",
-    "B 3.5 example",
-    "B 3.6 check of an example",
-)
+    "B 3.1 header", "B 3.3.1 pps_sync_stamp", "B 3.3.1 temperature", "B 3.3.1 air_pressure", "B 3.3.1 system_time",
+    "B 3.3.1 acceleration", "B 3.3.1 angular rate", "B 3.3.1 magnetic field", "B 3.3.1 angles", "B 3.3.1 quaternion",
+    "B 3.5 example", "B 3.6 check of an example",
+)  # fmt: skip
 def test_manual_hi91() -> None:
     m = one(make().feed(MANUAL_HI91))
     check_manual_values(m)
@@ -151,16 +137,9 @@ def test_frames_back_to_back_are_decoded_like_one(word: str) -> None:
 
 
 @pytest.mark.manual(
-    "B 3.3.2 status",
-    "B 3.3.2 temperature",
-    "B 3.3.2 pps_sync_stamp",
-    "B 3.3.2 air_pressure",
-    "B 3.3.2 angular rate",
-    "B 3.3.2 acceleration",
-    "B 3.3.2 magnetic field",
-    "B 3.3.2 angles",
-    "B 3.3.2 quaternion",
-)
+    "B 3.3.2 status", "B 3.3.2 temperature", "B 3.3.2 pps_sync_stamp", "B 3.3.2 air_pressure", "B 3.3.2 angular rate",
+    "B 3.3.2 acceleration", "B 3.3.2 magnetic field", "B 3.3.2 angles", "B 3.3.2 quaternion",
+)  # fmt: skip
 def test_hand_made_hi92() -> None:
     m = one(make().feed(framed(HI92_PAYLOAD)))
     assert m.dev_ticks is None
@@ -344,12 +323,10 @@ OLD_MANUAL = bytes.fromhex("5AA54C006C519100A03B01A80297BDBB04009CA0653EA226453F
         (0.0, 21, (21, None)),  # firmware without a barometer
         (999.0, 21, (21, None)),
         (-4.2e-25, 59, (None, None)),  # old content of the buffer
-        (999.9, 59, (None, None)),
-        (1000.0, 21, (21, 1000.0)),
-        (120_000.0, 21, (21, 120_000.0)),
+        (999.9, 59, (None, None)), (1000.0, 21, (21, 1000.0)), (120_000.0, 21, (21, 120_000.0)),
         (120_001.0, 59, (None, None)),
     ],
-)
+)  # fmt: skip
 @pytest.mark.manual("B 3.3.1 air_pressure")
 def test_no_barometer_no_pressure(
     pressure_pa: float, temperature_c: int, expected: tuple[float | None, float | None], frames: int

@@ -55,20 +55,10 @@ def sent(name: str, answers: list[Outcome] | None = None, **arguments: Any) -> t
     ],
 )
 @pytest.mark.manual(
-    "B 2.2.4 ATT MODE 0",
-    "B 2.2.4 ATT MODE 1",
-    "B 2.2.4 YAW 1",
-    "B 2.2.4 YAW 0",
-    "B 2.2.4 PMUX",
-    "B 2.2.4 alarm range",
-    "B 2.2.5 LOG ENABLE",
-    "B 2.2.5 LOG DISABLE",
-    "B 2.2.5 output off",
-    "B 2.2.5 ONMARK 1",
-    "B 2.2.5 ONMARK ONCE",
-    "B 2.2.6 UNLOGALL",
-    "B 8.2 EN_MCAL",
-)
+    "B 2.2.4 ATT MODE 0", "B 2.2.4 ATT MODE 1", "B 2.2.4 YAW 1", "B 2.2.4 YAW 0", "B 2.2.4 PMUX",
+    "B 2.2.4 alarm range", "B 2.2.5 LOG ENABLE", "B 2.2.5 LOG DISABLE", "B 2.2.5 output off", "B 2.2.5 ONMARK 1",
+    "B 2.2.5 ONMARK ONCE", "B 2.2.6 UNLOGALL", "B 8.2 EN_MCAL",
+)  # fmt: skip
 def test_one_command(name: str, arguments: dict[str, Any], command: str) -> None:
     requests, value = sent(name, **arguments)
     assert [request.payload for request in requests] == [f"{one}\r\n".encode() for one in command.split("; ")]

@@ -15,16 +15,11 @@ from tests.support.simulated_modules import HipnucLine, hardware_of
 
 TABLE = SETTINGS.table
 DELIVERED = {
-    "output": {"hi91": 100, "hi92": 0},
-    "mode": "6-axis",
-    "mounting": "level",
-    "magnetic_calibration": True,
-    "pins": {"sin": 1, "sout": 2, "led": 5, "sout_div": 6, "alarm": 9},
-    "sout_divisor": 8,
+    "output": {"hi91": 100, "hi92": 0}, "mode": "6-axis", "mounting": "level", "magnetic_calibration": True,
+    "pins": {"sin": 1, "sout": 2, "led": 5, "sout_div": 6, "alarm": 9}, "sout_divisor": 8,
     "alarm": {axis: {"min_deg": -5.0, "max_deg": 5.0, "enabled": False} for axis in "xy"},
-    "magnetometer_bias": [0.0, 0.0, 0.0],
-    "baud": 115200,
-}
+    "magnetometer_bias": [0.0, 0.0, 0.0], "baud": 115200,
+}  # fmt: skip
 
 
 def read(line: HipnucLine) -> dict[str, Any]:
@@ -180,18 +175,11 @@ def test_possible_combinations_are_accepted() -> None:
 @pytest.mark.parametrize(
     "given",
     [
-        {"output": {"hi93": 1}},
-        {"output": {"hi91": 300}},
-        {"mode": "7-axis"},
-        {"mounting": "x+90"},
-        {"pins": {"sin": 10}},
-        {"sout_divisor": 65},
-        {"alarm": {"z": {"min_deg": 0, "max_deg": 1}}},
-        {"alarm": {"x": {"min_deg": -181, "max_deg": 1}}},
-        {"baud": 57600},
-        {"magnetometer_bias": [0, 0, 0]},
+        {"output": {"hi93": 1}}, {"output": {"hi91": 300}}, {"mode": "7-axis"}, {"mounting": "x+90"},
+        {"pins": {"sin": 10}}, {"sout_divisor": 65}, {"alarm": {"z": {"min_deg": 0, "max_deg": 1}}},
+        {"alarm": {"x": {"min_deg": -181, "max_deg": 1}}}, {"baud": 57600}, {"magnetometer_bias": [0, 0, 0]},
     ],
-)
+)  # fmt: skip
 def test_a_declaration_is_checked_by_its_types(given: dict[str, Any]) -> None:
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert(given, SETTINGS.declarable)

@@ -98,13 +98,11 @@ def test_check_refuses_a_line_that_declared_settings_contradict() -> None:
         ({"output": {"hi92": 100}}, DeviceLines(), True, ["HI92 has no UTC"]),
         ({"output": {"hi92": 100}}, DeviceLines(pps=PpsOptions(line="GPIO1")), False, ["HI92 has no UTC"]),
         (
-            {"output": {"hi91": 50, "hi92": 50}},
-            DeviceLines(),
-            False,
+            {"output": {"hi91": 50, "hi92": 50}}, DeviceLines(), False,
             ["HI92 next to HI91 is time-stamped by its arrival"],
         ),
     ],
-)
+)  # fmt: skip
 def test_limits_of_hi92_are_reported(
     declared: dict[str, object], lines: DeviceLines, fed: bool, found: list[str]
 ) -> None:

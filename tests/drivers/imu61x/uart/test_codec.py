@@ -58,16 +58,9 @@ def only(events: object) -> Measurement:
 
 
 @pytest.mark.manual(
-    "A 1.2 headers",
-    "A 1.3 frame",
-    "A 1.3 pitch",
-    "A 1.3 roll",
-    "A 1.3 yaw",
-    "A 1.3 acceleration",
-    "A 1.3 angular rate",
-    "A 1.3 temperature",
-    "A 1.3 timer",
-)
+    "A 1.2 headers", "A 1.3 frame", "A 1.3 pitch", "A 1.3 roll", "A 1.3 yaw", "A 1.3 acceleration",
+    "A 1.3 angular rate", "A 1.3 temperature", "A 1.3 timer",
+)  # fmt: skip
 def test_golden_ahrs_frame() -> None:
     """Directions of the body axes at roll -45°, pitch 30°, yaw 90°, by hand: Rz(90°) Ry(30°) Rx(-45°)."""
     measurement = only(codec().feed(GOLDEN))
@@ -84,14 +77,11 @@ def test_golden_ahrs_frame() -> None:
     assert "assumed" in DRIVER.euler_convention
     assert (
         encode_ahrs(
-            timer_us=0x12345678 + 2**32,
-            accel_m_s2=(9.80665, -4.903325, 19.6133),
-            gyro_rad_s=(pi, -pi / 2, pi / 180),
-            euler_rad=(-pi / 4, pi / 6, pi / 2),
-            temperature_c=36.5,
+            timer_us=0x12345678 + 2**32, accel_m_s2=(9.80665, -4.903325, 19.6133), gyro_rad_s=(pi, -pi / 2, pi / 180),
+            euler_rad=(-pi / 4, pi / 6, pi / 2), temperature_c=36.5,
         )
         == GOLDEN
-    )
+    )  # fmt: skip
     quat = measurement.quat_wxyz
     assert quat is not None
     x, y, z = zip(*matrix_from_quat(quat), strict=True)
@@ -184,13 +174,10 @@ def test_values_near_infinity_and_quaternions_to_the_last_bit() -> None:
 @pytest.mark.parametrize(
     ("place", "missing"),
     [
-        (0, {"euler_rad", "quat_wxyz"}),
-        (2, {"euler_rad", "quat_wxyz"}),
-        (3, {"accel_m_s2"}),
-        (8, {"gyro_rad_s"}),
+        (0, {"euler_rad", "quat_wxyz"}), (2, {"euler_rad", "quat_wxyz"}), (3, {"accel_m_s2"}), (8, {"gyro_rad_s"}),
         (9, {"temperature_c"}),
     ],
-)
+)  # fmt: skip
 def test_groups_that_are_not_finite_are_removed_and_reported(place: int, missing: set[str], value: float) -> None:
     values = [1.0] * 10
     values[place] = value

@@ -50,31 +50,20 @@ def test_commands_and_the_ends_of_their_replies() -> None:
 @pytest.mark.parametrize(
     ("request_", "command", "param1", "param3"),
     [
-        (c.ask_status(), 1, "00000000", 0),
-        (c.ask_ahrs(), 2, "00000000", 0),
+        (c.ask_status(), 1, "00000000", 0), (c.ask_ahrs(), 2, "00000000", 0),
         (c.output_mode(c.OutputMode.STREAM), 3, "0000803F", 0),
-        (c.output_mode(c.OutputMode.COMMAND), 3, "0000C842", 0),
-        (c.reset_heading(0), 4, "00000000", 0),
-        (c.reset_heading(360), 4, "0000B443", 0),
-        (c.reset_heading(22.5), 4, "0000B441", 0),
-        (c.save(), 5, "00000000", 0),
-        (c.read_parameter(Parameter.AHRS_RATE), 6, "00000000", 21),
-        (c.start_installation_calibration(), 7, "00000000", 0),
-        (c.ask_installation_status(), 8, "00000000", 0),
-        (c.restart(), 9, "00000000", 0),
-        (c.calibrate_gyro(), 10, "00000000", 0),
-        (c.set_baud(115200), 14, "0000E147", 3),
-        (c.set_baud(1500000), 14, "001BB749", 3),
-        (c.set_rate(400), 14, "0000C843", 21),
-        (c.set_bus_mode(c.BusMode.UART_ONLY), 14, "00000000", 27),
-        (c.set_bus_mode(c.BusMode.BY_PIN), 14, "00004040", 27),
-        (c.set_i2c_address(0x18), 14, "0000C041", 30),
-        (c.set_i2c_address(0x1B), 14, "0000D841", 30),
-        (c.set_filter(0xB, 0xB), 14, "00003B43", 31),
-        (c.set_filter(0, 4), 14, "00008040", 31),
-        (c.factory_reset(), 15, "00000000", 0),
+        (c.output_mode(c.OutputMode.COMMAND), 3, "0000C842", 0), (c.reset_heading(0), 4, "00000000", 0),
+        (c.reset_heading(360), 4, "0000B443", 0), (c.reset_heading(22.5), 4, "0000B441", 0),
+        (c.save(), 5, "00000000", 0), (c.read_parameter(Parameter.AHRS_RATE), 6, "00000000", 21),
+        (c.start_installation_calibration(), 7, "00000000", 0), (c.ask_installation_status(), 8, "00000000", 0),
+        (c.restart(), 9, "00000000", 0), (c.calibrate_gyro(), 10, "00000000", 0),
+        (c.set_baud(115200), 14, "0000E147", 3), (c.set_baud(1500000), 14, "001BB749", 3),
+        (c.set_rate(400), 14, "0000C843", 21), (c.set_bus_mode(c.BusMode.UART_ONLY), 14, "00000000", 27),
+        (c.set_bus_mode(c.BusMode.BY_PIN), 14, "00004040", 27), (c.set_i2c_address(0x18), 14, "0000C041", 30),
+        (c.set_i2c_address(0x1B), 14, "0000D841", 30), (c.set_filter(0xB, 0xB), 14, "00003B43", 31),
+        (c.set_filter(0, 4), 14, "00008040", 31), (c.factory_reset(), 15, "00000000", 0),
     ],
-)
+)  # fmt: skip
 @pytest.mark.manual("A 1.6 request")
 def test_bytes(request_: Request, command: int, param1: str, param3: int) -> None:
     body = (

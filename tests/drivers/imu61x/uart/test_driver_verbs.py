@@ -21,13 +21,9 @@ def act(far: Imu61xBench, name: str, options: Imu61xUartOptions | None = None, *
 
 
 ARGUMENTS: dict[str, dict[str, Any]] = {
-    "rate": {"rate_hz": 50},
-    "filter": {"accel_filter": "5 Hz", "gyro_filter": 13},
-    "i2c_address": {"address": "0x1A"},
-    "bus": {"bus": "i2c"},
-    "heading": {"heading_deg": 90},
-    "baud": {"baud": 230400},
-}
+    "rate": {"rate_hz": 50}, "filter": {"accel_filter": "5 Hz", "gyro_filter": 13}, "i2c_address": {"address": "0x1A"},
+    "bus": {"bus": "i2c"}, "heading": {"heading_deg": 90}, "baud": {"baud": 230400},
+}  # fmt: skip
 CODED = [name for name, one in VARIANTS.items() if one.result_done]
 """Variants with another result than 0 for done."""
 WITHOUT_K1 = ("save", "heading", "installation_status")

@@ -15,16 +15,10 @@ from imud.sim.imu61x.uart import Imu61xSettings
 from tests.support.simulated_modules import Imu61xBench, done, every_variant, imu61x_bench, variant_bench
 
 FACTORY = {
-    "output_rate_hz": 100,
-    "accel_filter": "47 Hz",
-    "gyro_filter": "47 Hz",
-    "second_bus": "spi",
-    "i2c_address": "0x18",
-    "gyro_offset_deg_s": [0.0, 0.0, 0.0],
-    "installation_angles_deg": [0.0, 0.0, 0.0],
-    "output_mode": "stream",
+    "output_rate_hz": 100, "accel_filter": "47 Hz", "gyro_filter": "47 Hz", "second_bus": "spi", "i2c_address": "0x18",
+    "gyro_offset_deg_s": [0.0, 0.0, 0.0], "installation_angles_deg": [0.0, 0.0, 0.0], "output_mode": "stream",
     "baud": 115200,
-}
+}  # fmt: skip
 
 
 def target(far: Imu61xBench, variant: str = "executes commands while it streams") -> Target:
@@ -54,16 +48,11 @@ def test_settings_are_read_in_the_types_of_the_table(variant: str) -> None:
 @pytest.mark.parametrize(
     ("name", "value", "shown"),
     [
-        ("output_rate_hz", 200, 200),
-        ("accel_filter", "10 Hz", "10 Hz"),
-        ("gyro_filter", 13, "average 16"),
-        ("second_bus", "by_pin", "by_pin"),
-        ("i2c_address", "0x1B", "0x1b"),
-        ("i2c_address", 0x1A, "0x1a"),
-        ("output_mode", "command", "command"),
-        ("baud", 460800, 460800),
+        ("output_rate_hz", 200, 200), ("accel_filter", "10 Hz", "10 Hz"), ("gyro_filter", 13, "average 16"),
+        ("second_bus", "by_pin", "by_pin"), ("i2c_address", "0x1B", "0x1b"), ("i2c_address", 0x1A, "0x1a"),
+        ("output_mode", "command", "command"), ("baud", 460800, 460800),
     ],
-)
+)  # fmt: skip
 def test_each_setting_is_written_and_reads_back(variant: str, name: str, value: object, shown: object) -> None:
     far = variant_bench(variant)
     write(far, name, value, variant)

@@ -22,15 +22,9 @@ QUIET = Imu61xSettings(mode=OutputMode.COMMAND)
 
 @every_variant
 @pytest.mark.manual(
-    "A 1.4 serial number",
-    "A 1.5 parameter 21",
-    "A 1.5 parameter 27",
-    "A 1.5 parameter 30",
-    "A 1.5 parameter 31",
-    "A 1 stream mode",
-    "A 1 command mode",
-    "A 1.4 status members",
-)
+    "A 1.4 serial number", "A 1.5 parameter 21", "A 1.5 parameter 27", "A 1.5 parameter 30", "A 1.5 parameter 31",
+    "A 1 stream mode", "A 1 command mode", "A 1.4 status members",
+)  # fmt: skip
 def test_identity_settings_and_modes(variant: str) -> None:
     far = variant_bench(variant)
     identity = far.run(session.identify())
@@ -69,33 +63,23 @@ def test_identity_settings_and_modes(variant: str) -> None:
 
     words = variant_bench(variant).run(session.device_status())
     head = {
-        "serial_number": "003200473133510D33383736",
-        "software_version": 10203,
-        "hardware_version": 2,
+        "serial_number": "003200473133510D33383736", "software_version": 10203, "hardware_version": 2,
         "model_number": 614,
-    }
+    }  # fmt: skip
     rest = {
-        "system_status_bits": "0x00000000",
-        "cpu_load_raw": 120,
-        "drop_rate_raw": 0,
-        "i2c_master_raw": 0,
-        "voltage_raw": 50,
-        "user_config_fault_raw": 0,
-        "calibration_fault_raw": 0,
-        "imu_health_bits": "00" * 32,
-    }
+        "system_status_bits": "0x00000000", "cpu_load_raw": 120, "drop_rate_raw": 0, "i2c_master_raw": 0,
+        "voltage_raw": 50, "user_config_fault_raw": 0, "calibration_fault_raw": 0, "imu_health_bits": "00" * 32,
+    }  # fmt: skip
     assert words == (head if variant == "short status" else head | rest)
 
 
 @pytest.mark.parametrize(
     ("parameter", "value"),
     [
-        (Parameter.AHRS_RATE, 200),
-        (Parameter.BUS_MODE, BusMode.I2C),
-        (Parameter.I2C_ADDRESS, 0x1B),
+        (Parameter.AHRS_RATE, 200), (Parameter.BUS_MODE, BusMode.I2C), (Parameter.I2C_ADDRESS, 0x1B),
         (Parameter.FILTER, 0xF0),
     ],
-)
+)  # fmt: skip
 def test_a_parameter_is_set_and_not_saved(parameter: Parameter, value: int | BusMode) -> None:
     far = imu61x_bench()
     far.run(session.write_parameter(parameter, value))
