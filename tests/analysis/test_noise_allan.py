@@ -79,8 +79,7 @@ def test_types_of_noise_factors_and_short_runs() -> None:
         assert types[0, 0] == expected
         assert types[2, 0] == types[1, 0], "too few averages: as at the τ before"
     factors = averaging_factors(3000)
-    assert factors[0] == 1
-    assert factors[-1] == 1000
+    assert (factors[0], factors[-1]) == (1, 1000)
     assert len(factors) > 24
     with pytest.raises(BadArgument, match="at least 3 samples"):
         averaging_factors(2)

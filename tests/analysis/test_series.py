@@ -11,15 +11,13 @@ from tests.analysis.synthetic import stamps_ns
 def test_rate_missing_samples_and_runs() -> None:
     grid = grid_of(stamps_ns(1000, 408.0))
     assert grid.rate_hz == pytest.approx(408.0, rel=1e-6)
-    assert grid.missing == 0
-    assert grid.runs == ((0, 1000),)
+    assert (grid.missing, grid.runs) == (0, ((0, 1000),))
     assert grid.duration_s == pytest.approx(1000 / 408)
     assert "no sample is lost" in grid.words()
     t_ns = np.delete(stamps_ns(1000, 100.0), [10, 500, 501])
     grid = grid_of(t_ns)
     assert (grid.missing, grid.filled, grid.runs) == (3, 3, ((0, 997),))
-    assert grid.place[9] == 9
-    assert grid.place[10] == 11
+    assert (grid.place[9], grid.place[10]) == (9, 11)
     assert "3 samples are lost (0.30 %)" in grid.words()
     gone = list(range(300, 300 + FILL_MOST + 1))
     grid = grid_of(np.delete(stamps_ns(1000, 100.0), gone))

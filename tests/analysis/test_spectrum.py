@@ -28,8 +28,7 @@ def test_density_bandwidth_and_windows() -> None:
     random = np.random.default_rng(4)
     runs = [white(random, count, RATE_HZ, 1.0)[:, None] for count in (1000, 300, 600)]
     found = power_spectrum(runs, RATE_HZ, 512)
-    assert found.averages == 2 + 0 + 1
-    assert found.unused == 300
+    assert (found.averages, found.unused) == (2 + 0 + 1, 300)
     parts = [power_spectrum([runs[0]], RATE_HZ, 512), power_spectrum([runs[2]], RATE_HZ, 512)]
     assert found.density == pytest.approx((2 * parts[0].density + parts[1].density) / 3)
     assert "ignores 300 samples in shorter runs" in found.words()

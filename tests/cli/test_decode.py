@@ -40,8 +40,7 @@ def test_one_object_per_message(tmp_path: Path, cli: Cli) -> None:
     assert text == {"text": "OK"}
     assert bad == {"bad_frame": "crc", "raw": bytes(damaged).hex()}
     ledger = json.loads(printed.err)
-    assert ledger["bytes_in"] == 82 + 4 + 82 + 1
-    assert ledger["frames_in_samples"] == 1
+    assert (ledger["bytes_in"], ledger["frames_in_samples"]) == (82 + 4 + 82 + 1, 1)
 
 
 def test_standard_input(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:

@@ -161,8 +161,7 @@ def test_mcap_with_ros_2_is_a_bag_for_rosbags(recorded: Recorded, tmp_path: Path
     assert types["/bow/imu/data"] == "sensor_msgs/msg/Imu"
     assert types["/bow/imu/mag"] == "sensor_msgs/msg/MagneticField"
     assert types["/bow/pressure"] == "sensor_msgs/msg/FluidPressure"
-    assert types["/tf"] == "tf2_msgs/msg/TFMessage"
-    assert types["/events"] == "rcl_interfaces/msg/Log"
+    assert (types["/tf"], types["/events"]) == ("tf2_msgs/msg/TFMessage", "rcl_interfaces/msg/Log")
     assert types["/diagnostics"] == "diagnostic_msgs/msg/DiagnosticArray"
     for device in ("bow", "mast"):
         for (t_ns, imu), (_, stamp), sample in zip(

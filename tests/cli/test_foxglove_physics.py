@@ -53,8 +53,7 @@ def served(daemon: RunningDaemon) -> Iterator[str]:
 async def look(client: ProtocolClient, messages: Messages) -> None:
     for topic, schema in TOPICS.items():
         await client.subscribe(topic)
-        assert client.channels[topic]["schemaName"] == schema
-        assert client.channels[topic]["encoding"] == "cdr"
+        assert (client.channels[topic]["schemaName"], client.channels[topic]["encoding"]) == (schema, "cdr")
         messages[topic] = []
     while len(messages["/bow/imu/data"]) < SAMPLES or not all(messages.values()):
         topic, t_ns, message = await client.receive(lambda topic, *_: topic)

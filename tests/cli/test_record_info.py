@@ -33,9 +33,7 @@ def test_whole_damaged_cut_and_foreign_files(file: Path, cli: Cli, tmp_path: Pat
     assert (bow["samples"], bow["reads"], bow["lost"]) == (300, 300, 0)
     assert bow["input_bytes"] == 300 * (82 + 17)
     assert mast["samples"] > 190
-    assert told["stored_bytes"] == file.stat().st_size
-    assert told["problems"] == []
-    assert told["file_number"] == 0
+    assert (told["stored_bytes"], told["problems"], told["file_number"]) == (file.stat().st_size, [], 0)
     data = bytearray(file.read_bytes())
     (tmp_path / "cut").write_bytes(data[:-3])
     assert "no regular end" in " ".join(cli("info", tmp_path / "cut").out.split())
@@ -74,6 +72,5 @@ def test_a_device_that_was_removed_and_added_counts_from_the_begin_again() -> No
     check(30, 200, 0)
     check(32, 400, 5)
     device = contents.devices[0]
-    assert device.samples == 400 + 100 + 200
-    assert device.lost == 2 + 3 + 5
+    assert (device.samples, device.lost) == (400 + 100 + 200, 2 + 3 + 5)
     assert device.rate_hz == pytest.approx(700 / (4 + 1 + 2))

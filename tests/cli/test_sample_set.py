@@ -51,8 +51,7 @@ def test_a_part_of_the_time() -> None:
     assert collector.done
     assert collector.readings().gyro_rad_s is not None
     taken = collector.readings().t_ns
-    assert taken[0] == 2 * NS_PER_S
-    assert taken[-1] == 4 * NS_PER_S
+    assert (taken[0], taken[-1]) == (2 * NS_PER_S, 4 * NS_PER_S)
 
 
 def test_other_devices_are_passed_over_and_named_where_none_was_chosen() -> None:

@@ -70,9 +70,7 @@ def test_columns_bars_and_axis() -> None:
     assert (few > 0).all()
     rows = curve_rows(np.concatenate(([1.0, 0.5, 1 / (8 * HEIGHT)], np.zeros(COLUMNS - 3))))
     assert len(rows) == HEIGHT
-    assert rows[0] == "█"
-    assert rows[HEIGHT // 2] == "██"
-    assert rows[-1] == "██▁"
+    assert (rows[0], rows[HEIGHT // 2], rows[-1]) == ("█", "██", "██▁")
     line = axis_line(200.0)
     assert len(line) == COLUMNS
     assert line.startswith("0")

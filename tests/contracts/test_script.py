@@ -175,8 +175,7 @@ def test_a_frame_answers_as_a_line_does(session: ScriptRunner, ledger: Ledger) -
     assert session.on_message(ReplyFrame(7, b""), 2) is None
     reply = session.on_message(ReplyFrame(6, b"x"), 3)
     assert reply == Reply((ReplyFrame(6, b"x"),))
-    assert reply.frames == (ReplyFrame(6, b"x"),)
-    assert reply.lines == ()
+    assert (reply.frames, reply.lines) == ((ReplyFrame(6, b"x"),), ())
     assert strays(ledger) == (0, 2)
 
 

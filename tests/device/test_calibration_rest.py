@@ -66,8 +66,7 @@ def test_the_newest_samples_count_and_have_means() -> None:
         sample((1.0, 0.0, 9.0), (0.1, 0.0, 0.0), (0.1, 0.0, pi - 0.1), (0.2, pi)),
         sample((3.0, 0.0, 10.0), (0.3, 0.0, 0.0), (0.3, 0.0, -pi + 0.3), (0.4, -pi)),
     ).means()
-    assert means.accel_m_s2 == (2.0, 0.0, 9.5)
-    assert means.gyro_rad_s == (0.2, 0.0, 0.0)
+    assert (means.accel_m_s2, means.gyro_rad_s) == ((2.0, 0.0, 9.5), (0.2, 0.0, 0.0))
     assert means.euler_rad == pytest.approx((0.2, 0.0, -pi + 0.1))  # angles on both sides of ±180°
     assert means.incli_rad is not None
     assert means.incli_rad[0] == pytest.approx(0.3)

@@ -247,8 +247,7 @@ async def test_the_end_of_the_bus_is_reported_once_and_stops_reads(buses: Polled
     wire.fail = None
     count = wire.count
     assert await member.run(three(), 1) == 3 * count + 6  # no other transfer in the meantime
-    assert str(sink.problem) == "gone"
-    assert sink.calls == 1
+    assert (str(sink.problem), sink.calls) == ("gone", 1)
 
 
 @told(run)
@@ -344,8 +343,7 @@ async def test_a_blocked_loop_does_not_delay_the_read_of_an_edge() -> None:
         buses.end()
         os.close(edges)
         os.close(device)
-    assert wire.count == 51 + 3
-    assert wire.threads == {"wire"}
+    assert (wire.count, wire.threads) == (51 + 3, {"wire"})
     assert [thread for thread in threading.enumerate() if thread.name == "wire"] == []
 
 

@@ -55,8 +55,7 @@ async def test_spi_samples_have_the_values_of_their_time_stamp(
     async with bench.running(bench.on_spi(burst=burst, update_hz=1000)) as (rig,):
         await rig.until_samples(60)
         status = rig.device.status()
-        assert status.identity == {"product": "IMU614"}
-        assert status.link == f"{bench.node}, mode 3"
+        assert (status.identity, status.link) == ({"product": "IMU614"}, f"{bench.node}, mode 3")
         assert status.settings["burst"] == ("extended" if burst == "extended" else "standard")
         assert status.expected_rate_hz == RATE_HZ
     errors = []

@@ -77,8 +77,7 @@ async def test_requests_and_scripts_run_one_at_a_time() -> None:
     assert written == [b"A\r\n", b"B\r\n"]
     runner.on_message("ERR", 0)
     outcomes = await task
-    assert outcomes[0] == Reply(("A=1", "OK"))
-    assert outcomes[1].lines == ("ERR",)
+    assert (outcomes[0], outcomes[1].lines) == (Reply(("A=1", "OK")), ("ERR",))
     runner, written = made()
     first = asyncio.create_task(runner.run(ask(request("A"))))
     second = asyncio.create_task(runner.run(ask(request("B"))))

@@ -541,8 +541,7 @@ def test_a_failed_step_ends_the_plan_without_save() -> None:
     assert not applied.saved
     assert not applied.restarted
     assert list(applied.differences) == ["output", "mounting", "offset_deg"]  # the present values
-    assert bench.module.flash == FACTORY
-    assert bench.module.set == {**FACTORY, "mode": "9-axis"}
+    assert (bench.module.flash, bench.module.set) == (FACTORY, {**FACTORY, "mode": "9-axis"})
     bench, applied = applied_with(WANTED, lambda module: module.refuses.add("mode"))
     assert applied.problem == 'mode: SET mode="9-axis": the module refused; no other setting was written'
     assert bench.module.set == FACTORY

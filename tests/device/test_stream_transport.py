@@ -83,8 +83,7 @@ async def test_after_a_replug_sequence_numbers_and_times_increase(rig: DeviceRig
     rig.tick()
     rig.link.disappear()
     await rig.turn(lambda: rig.state is DeviceState.MISSING)
-    assert rig.ledger.bytes_pending == 0
-    assert rig.ledger.bytes_skipped == 40
+    assert (rig.ledger.bytes_pending, rig.ledger.bytes_skipped) == (0, 40)
     assert "missing" in rig.problem
     rig.link.appear()
     await rig.turn(lambda: rig.state is not DeviceState.MISSING)
@@ -518,8 +517,7 @@ def test_valid_frames_of_unknown_types_are_named(
         for _ in range(200):
             step()
             await asyncio.sleep(0.1)
-        assert rig.problem == expected
-        assert rig.link.baud == 115200
+        assert (rig.problem, rig.link.baud) == (expected, 115200)
         if driver == "hipnuc-uart":
             feed(rig, hi91(10))
             rig.tick()
@@ -549,8 +547,7 @@ def test_an_action_that_changes_the_rate_changes_port_and_stored_rate(monkeypatc
             feed(rig, hi91(ms))
         rig.tick()
         await rig.device.act("rate", {})
-        assert rig.link.baud == 921600
-        assert rig.link.written[-1] == b"?"
+        assert (rig.link.baud, rig.link.written[-1]) == (921600, b"?")
         assert rigs.factory.remembered.get("bow") == RememberedDevice("hipnuc-uart", 921600)
         feed(rig, hi91(400))
         assert len(rig.samples) == 41

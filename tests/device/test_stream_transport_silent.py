@@ -204,8 +204,7 @@ async def test_status_bits_and_settings_are_shown_by_name(device: LinkedDevice) 
     assert status.status_words == (
         "gyroscope bias not converged", "attitude not converged", "at rest", "time not UTC", "frame with SOUT pulse"
     )  # fmt: skip
-    assert status.status_bit_names["4"] == "magnetic disturbance"
-    assert status.settings["output.hi91"] == "100 Hz"
+    assert (status.status_bit_names["4"], status.settings["output.hi91"]) == ("magnetic disturbance", "100 Hz")
     assert status.settings["magnetometer_bias"] == "0, 0, 0 µT: not calibrated"
     await device.wait(10)
     assert device.device.status().status_words == ("at rest", "time not UTC", "frame with SOUT pulse")

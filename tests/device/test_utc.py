@@ -160,8 +160,7 @@ def test_a_receiver_with_a_wrong_date(
     assert (problem in status.problem) == (not problem or bool(status.problem))
     assert sum(record.getMessage() == status.problem for record in caplog.records) == (1 if problem else 0)
     if problem:
-        assert bench.written == []
-        assert bench.clock.utc_reference == bench.system
+        assert (bench.written, bench.clock.utc_reference) == ([], bench.system)
         for number in range(6, 9):
             bench.second(number)
         assert bench.keeper.status().problem == ""

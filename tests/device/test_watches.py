@@ -141,8 +141,7 @@ def test_a_module_in_any_mounting_shows_the_attitude_of_the_body(name: str) -> N
     assert made.newest.gyro_rad_s == pytest.approx((0, 0, 0), abs=1e-6)
     up = matrix_from_quat(made.newest.quat_wxyz or (0, 0, 0, 0))[2]
     assert made.newest.accel_m_s2 == pytest.approx([9.8 * one for one in up], abs=1e-3)
-    assert made.events == []
-    assert made.status.problem == ""
+    assert (made.events, made.status.problem) == ([], "")
 
 
 def test_the_same_body_in_ned_frd_and_without_the_keys() -> None:
@@ -158,8 +157,7 @@ def test_the_same_body_in_ned_frd_and_without_the_keys() -> None:
     assert made.newest.quat_wxyz == pytest.approx(truth.quat_wxyz, abs=1e-6)
     assert made.newest.euler_rad == pytest.approx(truth.euler_rad, abs=1e-6)
     assert made.newest.accel_m_s2 == pytest.approx(truth.accel_m_s2, abs=1e-5)
-    assert made.status.convention == "device"
-    assert made.status.frame == RFU_ENU.words
+    assert (made.status.convention, made.status.frame) == ("device", RFU_ENU.words)
     assert made.status.euler_convention == DRIVERS["hipnuc-uart"].euler_convention
     assert set(made.status.conventions) == {"enu-flu", "ned-frd"}
 
@@ -313,9 +311,7 @@ def test_both_coordinates_of_a_device_give_the_same_published_samples(
     assert newer.euler_deg == pytest.approx(manual.euler_deg, abs=1e-3)
     for name in ("accel_m_s2", "gyro_rad_s", "mag_t", "quat_wxyz"):
         assert getattr(newer.newest, name) == pytest.approx(getattr(manual.newest, name), abs=1e-4)
-    assert newer.status == manual.status
-    assert newer.events == []
-    assert newer.changes == []
+    assert (newer.status, newer.events, newer.changes) == (manual.status, [], [])
 
 
 def test_coordinates_are_described_and_an_unknown_value_is_reported() -> None:
@@ -324,8 +320,7 @@ def test_coordinates_are_described_and_an_unknown_value_is_reported() -> None:
     assert newer.status.frame == "sensor: x forward, y left, z up, right-handed"
     assert newer.status.navigation_frame == "NWU"
     assert newer.status.euler_convention.startswith("ZYX (321)")
-    assert newer.status.problem == ""
-    assert newer.changes == []
+    assert (newer.status.problem, newer.changes) == ("", [])
     assert newer.events == []  # gravity agrees with the attitude
     unknown = played("hipnuc-uart", in_body(FrameOptions()), 4.0, identify=True, coord=2)
     (change,) = unknown.changes

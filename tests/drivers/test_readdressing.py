@@ -144,8 +144,7 @@ def test_a_silent_device_is_commanded_back(replies: int, words: str, immediate: 
     bench = Bench(FakeDevice(immediate=immediate, replies=replies))
     with pytest.raises(NoReply, match=words):
         bench.change(9)
-    assert bench.options == FakeOptions(5)
-    assert bench.sent[-1] == (9, WRITE, 5)
+    assert (bench.options, bench.sent[-1]) == (FakeOptions(5), (9, WRITE, 5))
     assert bench.device.place == 5  # also if the device used the new place in the meantime
 
 

@@ -113,8 +113,7 @@ def test_states_are_published_after_events_and_periodically(tmp_path: Path) -> N
     assert bench.asked == 2
     for _ in range(30):
         bench.tick()
-    assert bench.asked == 3
-    assert bench.events == []
+    assert (bench.asked, bench.events) == (3, [])
     bench.close()
 
 

@@ -124,8 +124,7 @@ def test_the_oldest_messages_are_dropped_and_counted_if_all_are_thinned(tmp_path
         bench.commit(batch(100 * number + 1), batch(number + 1, 1, whole=False))
         assert bench.spool.used_bytes <= 100_000
     counts = bench.counts()
-    assert counts.missing == 0
-    assert counts.newest == 20_000
+    assert (counts.missing, counts.newest) == (0, 20_000)
     assert counts.dropped["space"] > 5_000
     rows = bench.all()
     events = sum(row.items for row in rows if row.stream == "events" and row.kind == "dropped")
@@ -370,8 +369,7 @@ def test_a_damaged_row_with_known_numbers_becomes_a_dropped_message(tmp_path: Pa
     counts = bench.counts()
     assert (counts.whole, counts.dropped, counts.missing) == (200, {"damaged": 100}, 0)
     assert bench.counts() == counts, "the note is stored, and counts once"
-    assert bench.spool.dropped == {"damaged": 100}
-    assert bench.spool.messages == 3
+    assert (bench.spool.dropped, bench.spool.messages) == ({"damaged": 100}, 3)
 
 
 def test_messages_after_deleted_damaged_rows_are_given(tmp_path: Path) -> None:

@@ -240,8 +240,7 @@ def test_a_long_failure_of_the_disk_keeps_only_the_numbers(tmp_path: Path, monke
     bench.disk.fails = False
     bench.work(DISK_RETRY_NS // NS_PER_S + 5)
     counts = bench.counts()
-    assert counts.missing == 0
-    assert counts.dropped["disk"] == bench.writer.lost_on_disk
+    assert (counts.missing, counts.dropped["disk"]) == (0, bench.writer.lost_on_disk)
     assert counts.whole + counts.dropped["disk"] == bench.seq
 
 

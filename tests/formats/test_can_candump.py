@@ -36,8 +36,7 @@ def test_lines_of_candump() -> None:
         CanFrame(0x7FF, False, b"", 1436509053_650700_000),
         CanFrame(0x1A2, False, bytes.fromhex("1122334455667788"), 1436509053_700003_000),
     ]
-    assert reader.passed_over == 3
-    assert reader.problem == ""
+    assert (reader.passed_over, reader.problem) == (3, "")
 
 
 @pytest.mark.parametrize(

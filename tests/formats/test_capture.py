@@ -53,12 +53,10 @@ def written(**details: str | int) -> bytes:
 def test_the_golden_capture_is_read_and_written() -> None:
     reader = CaptureReader(io.BytesIO(GOLDEN))
     assert (reader.stamped, reader.details["driver"], reader.baud, reader.hold_ns) == (True, "hipnuc-uart", 115200, 0)
-    assert list(reader) == [(258, b"abc"), (259, b"d")]
-    assert reader.problem == ""
+    assert (list(reader), reader.problem) == ([(258, b"abc"), (259, b"d")], "")
     assert written() == GOLDEN
     reader = CaptureReader(io.BytesIO(written(note="20 °C, 5 = five %\n", hold_ns=16_000_000)))
-    assert reader.details["note"] == "20 °C, 5 = five %\n"
-    assert reader.hold_ns == 16_000_000
+    assert (reader.details["note"], reader.hold_ns) == ("20 °C, 5 = five %\n", 16_000_000)
     assert list(reader) == [(258, b"abc"), (259, b"d")]
 
 

@@ -85,8 +85,7 @@ def passed(repeats: RepeatFilter, t_s: float, message: str, *values: object, lev
 def test_repeated_messages_pass_less_and_less_often() -> None:
     repeats = RepeatFilter()
     told = {t: line for t in range(200) if (line := passed(repeats, 1000 + t, "%s: %d lost", "bow", t))}
-    assert list(told) == [0, 1, 3, 7, 15, 31, 63, 123, 183]
-    assert told[1] == "<4>bow: 1 lost"
+    assert (list(told), told[1]) == ([0, 1, 3, 7, 15, 31, 63, 123, 183], "<4>bow: 1 lost")
     assert told[7] == "<4>bow: 7 lost, 3 similar messages in 4 s"
     assert told[183] == "<4>bow: 183 lost, 59 similar messages in 60 s"
     assert passed(repeats, 1300, "%s: %d lost", "bow", 1) == "<4>bow: 1 lost"  # new after one quiet minute

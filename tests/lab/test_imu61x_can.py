@@ -135,8 +135,7 @@ def test_two_devices_share_a_bus_and_see_only_their_own(vcan: CanInterface) -> N
     first.play(other)
     second.far.close()
     for rig, frames in ((first, 15), (second, 10)):
-        assert rig.runner.ledger.bytes_in == 8 * frames
-        assert rig.runner.ledger.bytes_skipped == 0
+        assert (rig.runner.ledger.bytes_in, rig.runner.ledger.bytes_skipped) == (8 * frames, 0)
 
 
 def test_frames_dropped_by_a_small_buffer_are_overruns(vcan: CanInterface) -> None:
@@ -167,8 +166,7 @@ def test_a_jump_of_index_without_drops_is_the_devices(vcan: CanInterface) -> Non
         await rig.until(lambda: len(rig.samples) == 3, "three samples")
 
     rig.play(story)
-    assert rig.runner.ledger.lost_gap_device == 2
-    assert rig.runner.ledger.lost_overrun == 0
+    assert (rig.runner.ledger.lost_gap_device, rig.runner.ledger.lost_overrun) == (2, 0)
 
 
 def test_interface_down_and_up_again(vcan: CanInterface) -> None:

@@ -34,8 +34,7 @@ def test_found_by_its_id_and_streams_the_truth(i2c: Bus[I2cTransfer]) -> None:
         async with running(config) as (rig,):
             await rig.until_samples(20, LIMIT_S)
             status = rig.device.status()
-            assert status.identity == {"product": "IMU6132B"}
-            assert status.link == "/dev/i2c-0, address 0x1a"
+            assert (status.identity, status.link) == ({"product": "IMU6132B"}, "/dev/i2c-0, address 0x1a")
             assert status.settings == {"accel_filter": "2 Hz", "gyro_filter": "47 Hz"}
             assert device.filter == 0x2B
             physics_holds(rig, device, RESOLUTION_M_S2)

@@ -209,8 +209,7 @@ async def test_marks_are_raised_with_their_samples() -> None:
     bench.tick()
     marks = [event for event in bench.events if event.kind is EventKind.MARK]
     last = marks[-1]
-    assert last.detail["edge_seq"] == 8
-    assert last.detail["seq"] == 57
+    assert (last.detail["edge_seq"], last.detail["seq"]) == (8, 57)
     assert last.message == "pulse 8 on SOUT_DIV belongs to sample 57"
     bench.tick()
     assert len(bench.messages(EventKind.MARK)) == len(marks)

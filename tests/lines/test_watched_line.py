@@ -68,16 +68,13 @@ async def test_a_line_that_fails_to_open_is_reported_once_and_opened_again() -> 
     assert it.reports == [str(BUSY)]
     it.line.open_error = LinkMissing("gpiochip0 is not there")
     it.watched.tick(2 * RETRY_NS)
-    assert it.reports[1:] == ["gpiochip0 is not there"]
-    assert it.watched.problem == "gpiochip0 is not there"
+    assert (it.reports[1:], it.watched.problem) == (["gpiochip0 is not there"], "gpiochip0 is not there")
     it.line.open_error = None
     it.watched.tick(3 * RETRY_NS - 1)
     assert not it.line.is_open
     it.watched.tick(3 * RETRY_NS)
     assert it.line.is_open
-    assert it.watched.problem == ""
-    assert it.reports[2:] == ["watched again"]
-    assert it.levels == [False]
+    assert (it.watched.problem, it.reports[2:], it.levels) == ("", ["watched again"], [False])
 
 
 @in_loop
@@ -86,8 +83,7 @@ async def test_a_line_that_goes_has_no_level_and_comes_back() -> None:
     it.watched.tick(it.clock.now_ns())
     it.line.edge(5, True)
     it.line.vanish(LinkMissing("it was pulled out"))
-    assert it.levels == [False, None]
-    assert it.reports == ["it was pulled out"]
+    assert (it.levels, it.reports) == ([False, None], ["it was pulled out"])
     it.watched.tick(it.clock.now_ns() + RETRY_NS - 1)
     assert not it.line.is_open
     it.watched.tick(it.clock.now_ns() + RETRY_NS)
@@ -134,8 +130,7 @@ async def test_a_failed_read_of_the_level_closes_the_line() -> None:
     it = Watched(Blind())
     it.watched.tick(it.clock.now_ns())
     assert not it.line.is_open
-    assert it.watched.problem == "no level"
-    assert it.levels == [None]
+    assert (it.watched.problem, it.levels) == ("no level", [None])
     it = Watched()
     it.watched.tick(0)
     it.watched.close()

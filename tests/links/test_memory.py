@@ -39,8 +39,7 @@ def test_what_is_fed_arrives_with_its_time() -> None:
     link.close()
     link.close()
     assert not link.feed(b"b", 6)
-    assert listener.chunks == [(b"a", 5)]
-    assert listener.ends == []
+    assert (listener.chunks, listener.ends) == ([(b"a", 5)], [])
     link, listener = opened()
     link.write(b"LOG VERSION\r\n")
     link.set_baud(9600)

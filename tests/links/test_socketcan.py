@@ -121,8 +121,7 @@ def test_frames_gather(ends: Ends) -> None:
     bus = Bus(ends, GATHER_MS)
     bus.run(story)
     assert [[frame.can_id for frame in batch] for batch in bus.batches] == [[1], [2, 3, 4]]
-    assert bus.delays_s == [GATHER_MS / 1000] * 2
-    assert bus.by_timer == [False, True]
+    assert (bus.delays_s, bus.by_timer) == ([GATHER_MS / 1000] * 2, [False, True])
 
 
 def test_what_is_more_than_a_batch_is_read_at_once(ends: Ends) -> None:

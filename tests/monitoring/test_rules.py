@@ -80,8 +80,7 @@ def test_shortened_rules_differ_in_times_only() -> None:
 
     for name, alert in ALERTS.items():
         quick = fast[name]
-        assert quick["annotations"] == alert["annotations"]
-        assert quick["labels"] == alert["labels"]
+        assert (quick["annotations"], quick["labels"]) == (alert["annotations"], alert["labels"])
         assert quick.get("for", "0ms") == f"{sum(milliseconds(alert.get('for', '')), 0) // 60}ms"
         ranges = [time // 60 for text in re.findall(r"\[\w+\]", alert["expr"]) for time in milliseconds(text)]
         assert [int(time) for time in re.findall(r"\[(\d+)ms\]", quick["expr"])] == ranges

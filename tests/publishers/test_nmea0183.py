@@ -223,8 +223,7 @@ async def test_the_only_device_or_the_configured_device_is_used(caplog: pytest.L
     bench.output.remove_device("bow")
     assert bench.asked.of == {WHO: (10 * NS_PER_MS, ("mast",))}
     bench.output.close()
-    assert bench.asked.of == {}
-    assert bench.context.outputs.sentences == []
+    assert (bench.asked.of, bench.context.outputs.sentences) == ({}, [])
 
     named = OutputBench(device="mast", sentences={"HDT": 100.0})
     assert named.asked.of == {}

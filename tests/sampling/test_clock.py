@@ -151,8 +151,7 @@ def test_without_device_time() -> None:
     samples = feed(clock, points)
     assert {(s.sync, s.t_dev_ns) for s in samples} == {(Sync.ARRIVAL, None)}
     assert far(samples, points) < NEAR_NS
-    assert clock.missed == 0
-    assert clock.expected_rate_hz == 0.0
+    assert (clock.missed, clock.expected_rate_hz) == (0, 0.0)
     clock = make_clock(byte_ns=1000)  # frames of one burst keep their distance
     samples = [clock.sample(message(None, 82 * (3 - i)), BEGIN_NS, 0) for i in range(4)]
     assert [b.t_ns - a.t_ns for a, b in pairwise(samples)] == [82_000] * 3

@@ -138,9 +138,7 @@ def test_a_run_gives_the_same_samples_as_single_frames(trial: Trial, seed: int) 
             if not number % 50:
                 dated.clock.set_own_status(own)
             dated.take(events, t_rx_ns, waited_ns, runs=dated is many)
-    assert many.samples == one.samples
-    assert many.missed == one.missed
-    assert many.states == one.states
+    assert (many.samples, many.missed, many.states) == (one.samples, one.missed, one.states)
     assert many.unknown == one.unknown
     if trial.period_ms == int(trial.period_ms):  # otherwise no step equals the period
         assert many.in_runs > 0.05 * len(many.samples)

@@ -36,9 +36,7 @@ def test_it_wraps_any_number_of_times() -> None:
     time.begin(990)
     for i in range(1, 1001):
         time.advance((990 + 10 * i) % 1000)
-    assert time.raw_ns == (990 + 10_000) * NS_PER_MS
-    assert time.even_ns == time.raw_ns
-    assert time.error_ns == 0
+    assert (time.raw_ns, time.even_ns, time.error_ns) == ((990 + 10_000) * NS_PER_MS, time.raw_ns, 0)
 
 
 def test_a_backward_step_counts_as_a_long_forward_step() -> None:
@@ -105,8 +103,7 @@ def test_missing_samples_of_steps(steps: list[int], missed: list[int], period: i
     """`missed` contains the results of the last steps."""
     learner = PeriodLearner()
     assert [learner.add_step(step) for step in steps][-len(missed) :] == missed
-    assert learner.period_ticks == period
-    assert learner.changes == 0
+    assert (learner.period_ticks, learner.changes) == (period, 0)
 
 
 @pytest.mark.parametrize(

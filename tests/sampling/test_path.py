@@ -131,10 +131,8 @@ def test_bytes_are_published_on_arrival_or_together() -> None:
     assert rig.sizes == [1]
     path.publish_gathered()
     path.publish_gathered()
-    assert rig.sizes == [1, 2]
-    assert rig.ledger.samples == 3
-    assert path.newest == rig.batches[-1][-1]
-    assert path.last_sample_ns == now + 22 * MS
+    assert (rig.sizes, rig.ledger.samples) == ([1, 2], 3)
+    assert (path.newest, path.last_sample_ns) == (rig.batches[-1][-1], now + 22 * MS)
     assert sum(path.latency.buckets) == 3
     head = hi91(1030)[:3]
     path.on_data(head + hi91(1030), now + 32 * MS)  # the length of the cut frame contains the next frame
@@ -267,8 +265,7 @@ def test_lost_frames_and_a_closed_link_end_a_sample_and_an_idle_bus_publishes_it
     path.flush(now + 5 * MS)
     assert rig.sizes == [1]
     path.flush(now + 6 * MS)  # no frame since the previous call
-    assert rig.sizes == [1, 1]
-    assert rig.batches[1][0].t_rx_ns == now + 2 * MS
+    assert (rig.sizes, rig.batches[1][0].t_rx_ns) == ([1, 1], now + 2 * MS)
 
 
 # --- polled devices ---------------------------------------------------------------------------------------------------

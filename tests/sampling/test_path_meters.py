@@ -28,8 +28,7 @@ def test_latencies_go_into_the_buckets_whose_bounds_they_do_not_exceed() -> None
     meter = LatencyMeter()
     for latency_ns in (50_000, 50_001, 10**12):
         meter.add(2 * 10**12, published_after(latency_ns))
-    assert meter.buckets[0] == 1
-    assert meter.buckets[1] == 1
+    assert (meter.buckets[0], meter.buckets[1]) == (1, 1)
     assert meter.buckets[len(LATENCY_BOUNDS_NS)] == 1
     assert meter.sum_ns == 100_001 + 10**12
     latencies = [10**12, 50_000_001, 50_000_000, 20_000_000, 20_000_000, 5_000_001, 49_999, 7]
@@ -37,9 +36,7 @@ def test_latencies_go_into_the_buckets_whose_bounds_they_do_not_exceed() -> None
     together.add(2 * 10**12, published_after(*latencies))
     for latency_ns in latencies:
         alone.add(2 * 10**12, published_after(latency_ns))
-    assert together.buckets == alone.buckets
-    assert together.buckets[-1] == 2
-    assert together.buckets[0] == 2
+    assert (together.buckets, together.buckets[-1], together.buckets[0]) == (alone.buckets, 2, 2)
     assert together.sum_ns == alone.sum_ns == sum(latencies)
 
 

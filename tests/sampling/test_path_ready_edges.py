@@ -41,8 +41,7 @@ def test_a_read_is_of_the_newest_edge_before_it_and_the_others_are_missed() -> N
     made = edges(1, 5)
     assert read(made, 1.1, 1.2) == (1, MS)
     assert read(made, 5.1, 5.2) == (5, 5 * MS)
-    assert made.missed == 3
-    assert made.interval_ns == MS
+    assert (made.missed, made.interval_ns) == (3, MS)
 
 
 def test_edges_read_twice_or_before_a_restart_are_not_missed() -> None:

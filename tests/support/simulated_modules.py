@@ -141,8 +141,7 @@ class Hi91(NamedTuple):
 
 def unpack_hi91(data: bytes) -> Hi91:
     """Unpack a frame by offsets of manual 3.3.1, without the codec."""
-    assert data[:4] == b"\x5a\xa5\x4c\x00"
-    assert data[6] == 0x91
+    assert (data[:4], data[6]) == (b"\x5a\xa5\x4c\x00", 0x91)
     _, word, temperature, pressure, time, *rest = struct.unpack("<BHbfI16f", data[6:])
     parts = [tuple(rest[i:j]) for i, j in ((0, 3), (3, 6), (6, 9), (9, 12), (12, 16))]
     return Hi91(word, temperature, pressure, time, *parts)

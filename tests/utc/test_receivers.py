@@ -64,8 +64,7 @@ def test_it_asks_for_nmea_and_gives_rmc_with_its_time() -> None:
 
     async def scene(source: GpsdSource, sentences: Sentences) -> None:
         await sentences.until(lambda: len(sentences.got) == 2)
-        assert source.problem == ""
-        assert source.sentences == 2
+        assert (source.problem, source.sentences) == ("", 2)
         source.close()
         await ended.wait()
 

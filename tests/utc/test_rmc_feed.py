@@ -71,8 +71,7 @@ def test_a_sentence_is_passed_on_at_once() -> None:
 def test_bad_sentences_are_refused(sentence: bytes, refusal: Refusal) -> None:
     bench = FeedBench()
     assert bench.give(0, 0.1, sentence or b"\x00") == refusal
-    assert bench.sent == []
-    assert bench.feed.refused == {refusal.value: 1}
+    assert (bench.sent, bench.feed.refused) == ([], {refusal.value: 1})
 
 
 REFERENCES = [GOOD, UtcReference(OFFSET_NS, 0), None]

@@ -103,8 +103,7 @@ async def test_buckets_and_raw_samples_go_to_the_pages_that_want_them() -> None:
     hub.spread(news(5, 30))
     assert await heard(plain, "raw") == []
     (raw,) = await heard(wanting, "raw")
-    assert raw["seq"] == [*range(5, 35)]
-    assert raw["axes"][2] == [-0.75] * 30
+    assert (raw["seq"], raw["axes"][2]) == ([*range(5, 35)], [-0.75] * 30)
 
 
 async def test_a_message_is_encoded_once_for_all_browsers() -> None:

@@ -35,8 +35,7 @@ def test_verdict_exit_status_json_and_page() -> None:
     long = error("word " * 60, "another " * 40)
     lines = page([Examined("a", [long, GOOD, UNSEEN])]).splitlines()
     assert max(map(len, lines)) <= 80
-    assert lines[0] == "ok           fine"
-    assert lines[1] == "not checked  hidden"
+    assert (lines[0], lines[1]) == ("ok           fine", "not checked  hidden")
     assert lines[2].startswith("error        word word")
     assert any(line.startswith("             → another") for line in lines)
     assert "\x1b" not in page([Examined("a", [error("\x1b[2J", "")])])
@@ -59,8 +58,7 @@ def test_a_check_that_cannot_look_ends_no_other(machine: Machine, problem: Excep
         yield NOTE
 
     examined = examine([DoctorCheck("x", broken), DoctorCheck("y", fine)], machine.surroundings())
-    assert examined[0].findings == [GOOD, not_checked(why)]
-    assert examined[1].findings == [NOTE]
+    assert (examined[0].findings, examined[1].findings) == ([GOOD, not_checked(why)], [NOTE])
 
 
 def test_findings_of_one_check_are_bounded(machine: Machine) -> None:

@@ -57,8 +57,7 @@ def test_golden_set_in_si_units_and_back() -> None:
     assert measured.gyro_rad_s == pytest.approx((0.1745329252, -0.3490658504, 0.0087266463), abs=1e-9)
     assert measured.accel_m_s2 == pytest.approx((9.80665, 2.4516625, -9.80665), abs=1e-12)
     assert measured.temperature_c == pytest.approx(25.0)
-    assert measured.dev_ticks == 65535
-    assert measured.size_bytes == 40
+    assert (measured.dev_ticks, measured.size_bytes) == (65535, 40)
     # half angles 0.75°, -1°, 45°: w = 0.70710678 (0.99984770 · 0.99991433 - 0.01745241 · 0.01308960) and so on
     assert measured.quat_wxyz == pytest.approx((0.7067770, 0.0215940, -0.0030853, 0.7071000), abs=1e-7)
     made = encode_set(
@@ -104,8 +103,7 @@ def test_incomplete_mixed_and_disordered_sets() -> None:
         frames = sample(7)
         del frames[missing]
         assert indices(feed(codec, frames + sample(8, 2.0))) == [8]
-        assert codec.ledger.frames_ignored == 4
-        assert codec.ledger.frames_in_samples == 5
+        assert (codec.ledger.frames_ignored, codec.ledger.frames_in_samples) == (4, 5)
 
     codec = make()
     first, second = sample(1, 1.0), sample(2, 2.0)
@@ -211,5 +209,4 @@ def test_wrong_length_is_a_bad_frame() -> None:
     assert isinstance(measured, Measurement)
     assert (measured.euler_rad, measured.quat_wxyz, measured.accel_m_s2) == (None, None, None)
     assert measured.gyro_rad_s is not None
-    assert codec.ledger.frames_not_finite == 2
-    assert codec.ledger.frames_in_samples == 5
+    assert (codec.ledger.frames_not_finite, codec.ledger.frames_in_samples) == (2, 5)

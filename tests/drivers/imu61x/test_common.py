@@ -41,8 +41,7 @@ def test_crc_gravity_products_and_filters() -> None:
     assert len(PRODUCTS) == 5
     for data in (b"", bytes(8), b"\xff" * 8, b"\x00\x00IMU613", b"\x00\x00IMU614\x00", b"IMU61400"):
         assert product_of(data) is None
-    assert FILTERS[4] == "10 Hz"
-    assert FILTERS[0xB] == "47 Hz"
+    assert (FILTERS[4], FILTERS[0xB]) == ("10 Hz", "47 Hz")
     assert len(FILTERS) == 16
     assert filter_control(4, 4) == 0x44
     assert filter_control(0xB, 1) == 0xB1

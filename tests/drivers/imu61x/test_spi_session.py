@@ -73,8 +73,7 @@ def test_window_is_closed_after_a_failure(fail_at: int) -> None:
     wire = Wire(fail_at=fail_at)
     with pytest.raises(TransferError):
         run_transfer_script(set_up(SpiDeviceOptions(gyro_filter=1)), wire.transfer)
-    assert wire.sent[-1] == "fe00 7e00 7e00"
-    assert wire.device.window == 0
+    assert (wire.sent[-1], wire.device.window) == ("fe00 7e00 7e00", 0)
     wire = Wire(fail_at=3)  # the burst that shows its kind
     with pytest.raises(TransferError):
         run_transfer_script(set_up(SpiDeviceOptions(gyro_filter=1)), wire.transfer)

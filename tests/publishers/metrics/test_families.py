@@ -206,8 +206,7 @@ def test_missing_parts_of_a_device_are_absent() -> None:
         "imud_pps_pulses_total", "imud_pps_pulses_ignored_total", "imud_chrony_samples_total",
         "imud_line_problem", "imud_line_edges_total", "imud_line_edges_lost_total",
     }  # fmt: skip
-    assert found["imud_utc_problem", ()] == 0
-    assert found["imud_line_problem", (("line", "sout"),)] == 0
+    assert (found["imud_utc_problem", ()], found["imud_line_problem", (("line", "sout"),)]) == (0, 0)
     assert ("imud_line_problem", (("line", "sin"),)) not in found
 
 
@@ -321,8 +320,7 @@ def test_clients_are_summed_and_totals_never_fall() -> None:
     assert {e: shown[key("imud_clients", encoding=e)] for e in ("json", "binary", "none")} == {
         "json": 2, "binary": 1, "none": 1,
     }  # fmt: skip
-    assert shown[key("imud_client_queue_samples")] == 9
-    assert shown[key("imud_client_queue_samples_max")] == 7
+    assert (shown[key("imud_client_queue_samples")], shown[key("imud_client_queue_samples_max")]) == (9, 7)
     assert shown[key("imud_client_queue_bytes")] == 9 * 256
 
 

@@ -58,5 +58,4 @@ def test_a_failed_start_leaves_no_recorder_running(tmp_path: Path) -> None:
     made = PUBLISHER.make(RecorderOptions(enabled=True, directory=str(tmp_path / "a"), flight=flight), bench.context)
     with pytest.raises(ServerError):
         made.start()
-    assert bench.context.outputs.recorders == []
-    assert bench.context.outputs.snapshots == []
+    assert (bench.context.outputs.recorders, bench.context.outputs.snapshots) == ([], [])

@@ -52,8 +52,7 @@ def test_a_file_starts_with_session_host_and_devices_and_has_an_end_record(tmp_p
     assert bench.kinds() == [
         Kind.SESSION, Kind.CALL, Kind.DEVICE, Kind.DEVICE, *checks, Kind.DATA, *checks, Kind.END
     ]  # fmt: skip
-    assert bench.source.listening == []
-    assert bench.context.outputs.recorders == []
+    assert (bench.source.listening, bench.context.outputs.recorders) == ([], [])
 
 
 def test_only_the_selected_devices_are_recorded_including_new_devices(tmp_path: Path) -> None:

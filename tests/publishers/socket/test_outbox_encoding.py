@@ -53,8 +53,7 @@ def assert_is(values: dict[str, Any], convention: str | None) -> None:
         if name == "quat_wxyz" and sum(a * b for a, b in zip(found, expected, strict=True)) < 0:
             found = [-value for value in found]
         assert found == pytest.approx(expected, abs=1e-12), (convention, name)
-    assert values["temperature_c"] == 31.5
-    assert values["seq"] == 1
+    assert (values["temperature_c"], values["seq"]) == (31.5, 1)
 
 
 def members_of(one: Sample) -> dict[str, Any]:

@@ -125,13 +125,11 @@ def test_what_applies_at_once_and_what_after_a_restart() -> None:
     bench.run_script(session.set_tpdo_period(8, 2, 100))
     bench.run_script(session.save(8))
     bench.send(0x608, cia301.write_frame(0x2000, 0, b"\xff\0\0\0"))
-    assert bench.module.node == 20
-    assert bench.module.objects.settings.periods_ms[2] == 100
+    assert (bench.module.node, bench.module.objects.settings.periods_ms[2]) == (20, 100)
     bench.send(0x614, cia301.write_frame(0x2000, 0, b"\1\0\0\0"))
     assert bench.module.node == 20
     bench.module.reboot(bench.now_ns)
-    assert bench.module.node == 8
-    assert bench.module.objects.settings == QUIET
+    assert (bench.module.node, bench.module.objects.settings) == (8, QUIET)
 
 
 @pytest.mark.manual("B 5.4.1 zero of the inclinometer")

@@ -66,8 +66,7 @@ def test_time_of_bytes_pieces_and_echo() -> None:
     rig = ModbusMaster(here(1), echo=True)
     frame = framed(1, READ_BLOCK)
     echo, reply = rig.bursts(frame)
-    assert echo.data == frame
-    assert echo.due_ns == BEGIN_NS + 8 * BYTE_NS
+    assert (echo.data, echo.due_ns) == (frame, BEGIN_NS + 8 * BYTE_NS)
     assert is_whole(reply.data)
 
 

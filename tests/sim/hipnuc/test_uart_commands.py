@@ -118,8 +118,7 @@ def test_reboot_baud_rate_and_factory_reset() -> None:
     assert bench.ask("FRESET") == ["OK"]
     assert bench.module.baud == 921_600
     bench.reboot()
-    assert bench.module.settings == ModuleSettings()
-    assert bench.module.baud == 115_200
+    assert (bench.module.settings, bench.module.baud) == (ModuleSettings(), 115_200)
     assert len(bench.frames(1000.0)) == pytest.approx(100, abs=1)
 
 

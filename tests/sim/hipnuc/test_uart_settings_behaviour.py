@@ -42,8 +42,7 @@ def test_when_a_factory_reset_acts(effect: ResetEffect, rate: int, mode: int, an
     assert bench.ask("FRESET") == answer
     assert (bench.module.baud, bench.module.settings.att_mode) == (rate, mode)
     bench.reboot()
-    assert bench.module.settings == ModuleSettings()
-    assert bench.module.baud == 115_200
+    assert (bench.module.settings, bench.module.baud) == (ModuleSettings(), 115_200)
 
 
 def test_slow_flash_quiet_refusals_and_all_variants() -> None:

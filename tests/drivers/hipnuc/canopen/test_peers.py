@@ -128,8 +128,7 @@ def remote(network: canopen.Network, pump: Pump) -> canopen.RemoteNode:
 
 
 def test_their_client_reads_and_writes_our_objects(remote: canopen.RemoteNode, pump: Pump) -> None:
-    assert remote.sdo[0x1008].raw == "HI14"
-    assert remote.sdo[0x1018][4].raw == 0x1708_0042
+    assert (remote.sdo[0x1008].raw, remote.sdo[0x1018][4].raw) == ("HI14", 0x1708_0042)
     assert remote.sdo[0x1805][1].raw == 0x788
     remote.sdo[0x1804][5].raw = 100
     assert remote.sdo[0x1804][5].raw == 100
@@ -268,8 +267,7 @@ def test_our_conversations_with_their_node(local: canopen.LocalNode, host: Host)
 
     local.set_data(0x1008, 0, b"a name of many letters")
     identity = run_script(session.identify(NODE), host.ask)
-    assert identity.product == ""
-    assert identity.serial_number == "0x00000014"
+    assert (identity.product, identity.serial_number) == ("", "0x00000014")
 
 
 def test_their_node_executes_our_nmt_and_sends_its_heartbeat(local: canopen.LocalNode, host: Host) -> None:

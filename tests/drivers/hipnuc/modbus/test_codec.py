@@ -76,10 +76,8 @@ def measured(made: HipnucModbusCodec, data: bytes) -> Measurement:
 def test_identity_sensors_and_the_block_of_newer_firmware() -> None:
     """26 registers by hand: uptime 0x00012345 ms is 74.565 s, 2512 is 25.12 °C, 10132500 is 101325 Pa."""
     identity = run_transfer_script(probe(HipnucModbusOptions()), lambda _: IDENTITY)
-    assert identity.product == "HI14R2N-485-000"
-    assert identity.firmware == "1.5.2"
-    assert identity.serial_number == "047D955F8D2A1708"
-    assert identity.details == {"BL_VERSION": "107"}
+    assert (identity.product, identity.firmware) == ("HI14R2N-485-000", "1.5.2")
+    assert (identity.serial_number, identity.details) == ("047D955F8D2A1708", {"BL_VERSION": "107"})
 
     m = measured(short(), SENSORS)
     assert m.size_bytes == 53
@@ -95,8 +93,7 @@ def test_identity_sensors_and_the_block_of_newer_firmware() -> None:
 
     words = "0000 0000 0800 0000 0000 0000 0000 0000 0000" + "0000 0000" * 3 + "09D0 009A9C14" + "2710 0000 0000 0000"
     m = measured(codec(), framed(1, registers_reply(bytes.fromhex(words + "0000 0000 0001 2345"))))
-    assert m.size_bytes == 57
-    assert m.dev_ticks == 74_565
+    assert (m.size_bytes, m.dev_ticks) == (57, 74_565)
     assert m.accel_m_s2 == pytest.approx((0, 0, 9.799975), abs=1e-6)
     assert m.temperature_c == pytest.approx(25.12)
     assert m.pressure_pa == pytest.approx(101_325.0)
@@ -108,8 +105,7 @@ def test_identity_sensors_and_the_block_of_newer_firmware() -> None:
         (event,) = codec().decode(0, framed(9, inner))
         assert isinstance(event, BadFrame)
         assert event.reason is BadReason.CONTENT
-    assert DRIVER.targets[0] == 0x50
-    assert sorted(DRIVER.targets) == list(range(1, 248))
+    assert (DRIVER.targets[0], sorted(DRIVER.targets)) == (0x50, list(range(1, 248)))
 
 
 @pytest.mark.parametrize(
@@ -153,8 +149,7 @@ def test_the_short_block_is_read_from_older_firmware() -> None:
     busy = framed(0x50, b"\x83\x06")
     assert list(made.decode(0, busy)) == [BadFrame(BadReason.CONTENT, busy)]
     assert [made.on_silence(0) for _ in range(5)] == [()] * 5
-    assert made.polls[0].transfer == READ_BLOCK
-    assert made.ledger.frames_bad_content == 1
+    assert (made.polls[0].transfer, made.ledger.frames_bad_content) == (READ_BLOCK, 1)
 
     made = codec()
     made.decode(0, EXCEPTION)

@@ -53,8 +53,7 @@ def test_settings_are_read_back_and_saved_only_on_request(bench: ModbusBench) ->
     bench.run(set_heading_mode(NINE))
     bench.run(save())
     restarted(bench)
-    assert bench.slave.settings.heading_mode == 1
-    assert bench.slave.writes_to_flash == 1
+    assert (bench.slave.settings.heading_mode, bench.slave.writes_to_flash) == (1, 1)
     before_ns = bench.now_ns
     bench.run(save())
     assert bench.now_ns - before_ns >= bench.slave.variant.flash_ms * 1_000_000
@@ -139,8 +138,7 @@ def test_a_rate_is_in_force_after_saving_and_restarting(bench: ModbusBench) -> N
 def test_code_nine_is_256000(bench: ModbusBench) -> None:
     if not bench.slave.variant.rate_at_once:
         bench.run(set_baud(256000))
-        assert bench.sent[0] == (7, bytes.fromhex("0600040009"))
-        assert bench.slave.settings.baud == 256000
+        assert (bench.sent[0], bench.slave.settings.baud) == ((7, bytes.fromhex("0600040009")), 256000)
 
 
 @pytest.mark.manual("B 4.3.1 factory settings")

@@ -87,8 +87,7 @@ def hi91(system_time_ms: int = 0, **values: Any) -> bytes:
 
 
 def check_manual_values(m: Measurement) -> None:
-    assert m.dev_ticks == 1840392
-    assert m.temperature_c == 35
+    assert (m.dev_ticks, m.temperature_c) == (1840392, 35)
     assert m.pressure_pa == pytest.approx(100676, abs=0.5)
     # -0.220615, 0.209189, 0.948889 G at 9.8 m/s²
     assert m.accel_m_s2 == pytest.approx((-2.162027, 2.050052, 9.299112), abs=1e-5)
@@ -144,9 +143,7 @@ def test_hand_made_hi92() -> None:
     m = one(make().feed(framed(HI92_PAYLOAD)))
     assert m.dev_ticks is None
     assert m.status is None  # section 3.3.2: reserved
-    assert m.pps_age_ms == 1000
-    assert m.temperature_c == -5
-    assert m.pressure_pa == 102000
+    assert (m.pps_age_ms, m.temperature_c, m.pressure_pa) == (1000, -5, 102000)
     assert m.gyro_rad_s == pytest.approx((1.0, -1.0, 0.5), rel=1e-12)
     assert m.accel_m_s2 == pytest.approx((9.9999744, -9.9999744, 9.7656), rel=1e-12)
     assert m.mag_t == pytest.approx((30.517e-6, -30.517e-6, 0.0), rel=1e-12)

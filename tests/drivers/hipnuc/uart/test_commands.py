@@ -64,8 +64,7 @@ PRINTED = [
     "B 2 line end", "B 2.2.3 SERIALCONFIG", "B 2.2.4 URFR presets", "B 2.2.4 PMUX3 LED", "B 2.2.5 ONTIME"
 )
 def test_commands_are_as_printed(request_: Request, text: str) -> None:
-    assert request_.payload == text.encode() + b"\r\n"
-    assert request_.name == text
+    assert (request_.payload, request_.name) == (text.encode() + b"\r\n", text)
 
 
 IDENTITY = ((1, 0, 0), (0, 1, 0), (0, 0, 1))

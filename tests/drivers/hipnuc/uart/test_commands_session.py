@@ -248,8 +248,7 @@ def test_a_silent_module_is_woken_by_an_action(settings: ModuleSettings, done: s
     line.module.receive(b"LOG DISABLE\r\n", line.now_ns)
     line.wait(300)
     assert line.act("wake") == done
-    assert line.module.settings.hi91 == hi91
-    assert line.module.flash == settings
+    assert (line.module.settings.hi91, line.module.flash) == (hi91, settings)
     line.wait(300)
     assert line.ledger.frames_in_samples > 1
 

@@ -33,8 +33,7 @@ def test_reports_of_the_module() -> None:
     assert not r.is_version_line("ATT_MODE: 0")
 
     port = r.parse_comconfig(("BAUD=115200", "LOG IMU91 ONTIME 0.01", "LOG HI92 COM1 ONTIME 0", "OK"))
-    assert port.periods_s == {"HI91": 0.01, "HI92": 0.0}
-    assert port.report.values == {"BAUD": "115200"}
+    assert (port.periods_s, port.report.values) == ({"HI91": 0.01, "HI92": 0.0}, {"BAUD": "115200"})
     assert port.report.other == ("LOG IMU91 ONTIME 0.01", "LOG HI92 COM1 ONTIME 0")
 
 

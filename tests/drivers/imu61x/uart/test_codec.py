@@ -65,8 +65,7 @@ def test_golden_ahrs_frame() -> None:
     """Directions of the body axes at roll -45°, pitch 30°, yaw 90°, by hand: Rz(90°) Ry(30°) Rx(-45°)."""
     measurement = only(codec().feed(GOLDEN))
     assert measurement.size_bytes == len(GOLDEN) == 54
-    assert measurement.trailing_bytes == 0
-    assert measurement.dev_ticks == 0x12345678
+    assert (measurement.trailing_bytes, measurement.dev_ticks) == (0, 0x12345678)
     assert measurement.accel_m_s2 == pytest.approx((9.80665, -4.903325, 19.6133), abs=1e-12)
     assert measurement.gyro_rad_s == pytest.approx((pi, -pi / 2, 0.017453292519943295), abs=1e-15)
     assert measurement.euler_rad == pytest.approx((-pi / 4, pi / 6, pi / 2), abs=1e-15)  # roll, pitch, yaw
@@ -120,8 +119,7 @@ def test_a_run_ends_before_a_frame_that_is_damaged_or_not_finite() -> None:
         for event, same in zip(events, apart, strict=True):
             if isinstance(event, Measurement):
                 assert isinstance(same, Measurement)
-                assert event.dev_ticks == same.dev_ticks
-                assert event.accel_m_s2 == same.accel_m_s2
+                assert (event.dev_ticks, event.accel_m_s2) == (same.dev_ticks, same.accel_m_s2)
             else:
                 assert event == same
         assert run.ledger.snapshot() == one_by_one.ledger.snapshot()
@@ -215,8 +213,7 @@ def test_frames_of_other_kinds_and_lengths() -> None:
 
     longer = encode_frame(DEVICE_SYNC, AHRS_FRAME, GOLDEN[6:-4] + bytes(8))
     measurement = only(codec().feed(longer))
-    assert measurement.temperature_c == 36.5
-    assert measurement.size_bytes == 62
+    assert (measurement.temperature_c, measurement.size_bytes) == (36.5, 62)
 
     tested = codec()
     command = bytes.fromhex("55AA 0300 1800 0000803F") + bytes(20) + bytes.fromhex("52D88EE8")

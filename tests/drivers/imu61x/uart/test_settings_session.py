@@ -28,8 +28,7 @@ QUIET = Imu61xSettings(mode=OutputMode.COMMAND)
 def test_identity_settings_and_modes(variant: str) -> None:
     far = variant_bench(variant)
     identity = far.run(session.identify())
-    assert identity.product == "IMU61x"
-    assert identity.serial_number == "003200473133510D33383736"
+    assert (identity.product, identity.serial_number) == ("IMU61x", "003200473133510D33383736")
     assert identity.firmware == "10203"
     assert identity.details == {"hardware_version": "2", "model_number": "614"}
     assert far.streams()
@@ -96,8 +95,7 @@ def test_modes_at_any_rate_words_of_unusual_values_and_questions_only() -> None:
         far.run(session.start_streaming())
         assert far.samples(2500)
     words = session.status_words(replace(STATUS, system_status=0x8000_0001, imu_health=bytes([1]) + bytes(31)))
-    assert words["system_status_bits"] == "0x80000001"
-    assert words["imu_health_bits"] == "01" + "00" * 31
+    assert (words["system_status_bits"], words["imu_health_bits"]) == ("0x80000001", "01" + "00" * 31)
     assert session.status_words(Status(1, 2, 3, (4, 5, 6)))["serial_number"] == "000000040000000500000006"
     values = {Parameter.BAUD: 9600.0, Parameter.FILTER: 300.0, Parameter.BUS_MODE: 7.0, Parameter.I2C_ADDRESS: -1.0}
     assert session.parameter_words(values) == {"baud": "9600", "filter": "300", "second_bus": "7", "i2c_address": "-1"}
