@@ -166,16 +166,6 @@ def test_corrections_are_slewed() -> None:
     assert max(abs(step - 10 * NS_PER_MS) for step in steps) <= 5_001
 
 
-def test_wall_clock_steps_move_only_utc() -> None:
-    clock, same = make_clock(), make_clock()
-    for i in range(300):
-        at = BEGIN_NS + 10 * i * NS_PER_MS
-        a = clock.sample(message(10 * i), at, 1_700_000_000 * NS_PER_S if i < 150 else 5)
-        b = same.sample(message(10 * i), at, 0)
-        assert a.t_ns == b.t_ns
-        assert a.utc_ns - a.t_ns == (1_700_000_000 * NS_PER_S if i < 150 else 5)
-
-
 def test_a_changed_link_restarts_the_arrivals_and_not_the_time() -> None:
     clock = make_clock()
     samples = feed(clock, steady(0, 0, 300))
