@@ -27,7 +27,7 @@ class PortSettings(Options, frozen=True, kw_only=True):
     baud: str
 
 
-class Port(LinkedModule):
+class Port(LinkedModule[HipnucModule]):
     def __init__(self, baud: int = 460_800, hardware: HipnucHardware = HIPNUC_STILL) -> None:
         clock = VirtualClock()
         module = HipnucModule(clock.now_ns(), ModuleSettings(baud=baud), hardware)

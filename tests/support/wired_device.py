@@ -6,7 +6,7 @@ The bytes and edges of the HiPNUC device arrive in step.
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import pytest
 
@@ -193,10 +193,17 @@ class WiredDevice:
 # --- a device on a link with a baud rate at both ends -----------------------------------------------------------------
 
 
-class LinkedModule(MemoryLink):
-    def __init__(self, settings: MemoryOptions, module: HipnucModule, clock: VirtualClock) -> None:
+SimulatedModule = TypeVar("SimulatedModule", HipnucModule, Imu61xModule)
+
+
+class LinkedModule(MemoryLink, Generic[SimulatedModule]):
+    """A link in simulated time with a device at its far end. `carry` must run."""
+
+    step_s = STEP_S
+
+    def __init__(self, settings: MemoryOptions, module: SimulatedModule, clock: VirtualClock) -> None:
         super().__init__(settings)
-        self.module = module
+        self.module: SimulatedModule = module
         self.clock = clock
         self.sent_at: list[tuple[int, bytes]] = []
         self.module_is_on = True
@@ -213,7 +220,11 @@ class LinkedModule(MemoryLink):
             for burst in self.module.advance(self.clock.now_ns()):
                 if self.module_is_on:
                     self.feed(heard(burst.data, baud, self.baud), self.clock.now_ns())
-            await asyncio.sleep(STEP_S)
+            await asyncio.sleep(self.step_s)
+
+
+class Imu61xLine(LinkedModule[Imu61xModule]):
+    step_s = 0.001
 
 
 class LinkedDevice:
@@ -258,7 +269,7 @@ class LinkedDevice:
         play_on_line(self.link, self.rigs, story)
 
 
-def play_on_line(line: "LinkedModule | Imu61xLine", rigs: DeviceRigs, story: Callable[[], Awaitable[None]]) -> None:
+def play_on_line(line: LinkedModule[Any], rigs: DeviceRigs, story: Callable[[], Awaitable[None]]) -> None:
     """Run the devices during a story while the link transfers data. Check at the end that their ledgers balance."""
 
     async def both() -> None:
@@ -271,28 +282,3 @@ def play_on_line(line: "LinkedModule | Imu61xLine", rigs: DeviceRigs, story: Cal
             await asyncio.gather(carrying, return_exceptions=True)
 
     run_virtually(line.clock, both())
-
-
-# --- IMU61x ----------------------------------------------------------------------------------------------------------
-
-LINE_STEP_S = 0.001
-
-
-class Imu61xLine(MemoryLink):
-    """A link in simulated time with a device at its far end. `carry` must run."""
-
-    def __init__(self, settings: MemoryOptions, module: Imu61xModule, clock: VirtualClock) -> None:
-        super().__init__(settings)
-        self.module = module
-        self.clock = clock
-
-    def write(self, data: bytes) -> None:
-        super().write(data)
-        self.module.receive(heard(data, self.baud, self.module.baud), self.clock.now_ns())
-
-    async def carry(self) -> None:
-        while True:
-            baud = self.module.baud
-            for burst in self.module.advance(self.clock.now_ns()):
-                self.feed(heard(burst.data, baud, self.baud), self.clock.now_ns())
-            await asyncio.sleep(LINE_STEP_S)
