@@ -30,7 +30,7 @@ from imud.contracts.setting import SettingsTable
 from imud.drivers import DRIVERS
 from imud.links import LINKS
 from imud.model.errors import ConfigError
-from imud.model.options import NoOptions, Options, expected, got
+from imud.model.options import NoOptions, Options, got
 from imud.publishers import PUBLISHERS
 from tests.support.files import ROOT
 
@@ -347,20 +347,6 @@ def test_any_tree_is_a_configuration_or_a_config_error(tree: Any) -> None:
 
 
 # --- words ------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("field_type", "words"),
-    [
-        (bool, "true or false"), (int, "a whole number"), (float | None, "a number, or null"), (str, "text"),
-        (Annotated[float, Meta(gt=0, lt=2.5)], "a number above 0 below 2.5"), (Literal["a"], '"a"'),
-        (Annotated[str, Meta(pattern="^x")], "text matching ^x"), (dict[str, int], "keys, each with a whole number"),
-        (dict[Literal["y", "x"], bool], "keys x, y, each with true or false"),
-        (FileSettings, 'the keys path (text), speed (one of "maximum", "real"), repeat (true or false)'),
-    ],
-)  # fmt: skip
-def test_expected(field_type: Any, words: str) -> None:
-    assert expected(field_type) == words
 
 
 def test_got() -> None:

@@ -19,7 +19,6 @@ from imud.contracts.status import DeviceState, DeviceStatus
 from imud.fleet.broker import EXTRA_MISSING
 from imud.fleet.publisher import MqttPublisher
 from imud.fleet.settings import Broker, MqttOptions, broker_of
-from imud.host.threads import Job
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.model.options import wrong_values
@@ -28,7 +27,7 @@ from imud.model.units import NS_PER_MS, NS_PER_S
 from tests.fleet.fake_broker import FakeBroker
 from tests.support.event_loops import VirtualClock
 from tests.support.publisher_context import publisher_context
-from tests.support.signal_bench import HandWorker
+from tests.support.signal_bench import HandWorkers
 from tests.support.socket_rig import device_status, sample
 
 pytestmark = pytest.mark.live
@@ -42,7 +41,7 @@ class PublisherBench:
         self.events: list[Event] = []
         self.statuses: list[DeviceStatus] = [device_status("imu0", 0)]
         self.asked = 0
-        self.workers: list[HandWorker] = []
+        self.workers = HandWorkers()
         self.reference: UtcReference | None = None
         self.context = publisher_context(
             self._status, 77, self.clock.now_ns, raise_event=self.events.append, utc_offset_ns=lambda: 99,
@@ -50,16 +49,13 @@ class PublisherBench:
         )  # fmt: skip
         made = msgspec.convert({"spool_directory": str(path), "gateway": "gw", **settings}, MqttOptions)
         self.output = MqttPublisher(
-            made, self.context, connect=self.broker.connect, start_worker=self._start, host_name=lambda: "host.example"
-        )
+            made, self.context, connect=self.broker.connect, start_worker=self.workers.start,
+            host_name=lambda: "host.example",
+        )  # fmt: skip
 
     def _status(self) -> list[DeviceStatus]:
         self.asked += 1
         return self.statuses
-
-    def _start(self, name: str, job: Job) -> HandWorker:
-        self.workers.append(HandWorker(name, job))
-        return self.workers[-1]
 
     def tick(self, seconds: float = 1.0) -> None:
         self.clock.advance(round(seconds * NS_PER_S))

@@ -18,14 +18,14 @@ from imud.fleet.settings import Broker, MqttOptions
 from imud.fleet.spool import Spool, SpoolError
 from imud.fleet.streams import Gateway
 from imud.fleet.writer import COMMIT_NS, DISK_RETRY_NS, MissedEvents, SentState, SpoolWriter, WriterQueue
-from imud.host.threads import BusThread, Job, StartWorker
+from imud.host.threads import BusThread, StartWorker
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S
 from tests.fleet.fake_broker import FakeBroker
 from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import VirtualClock
-from tests.support.signal_bench import HandWorker
+from tests.support.signal_bench import HandWorkers
 from tests.support.socket_rig import device_status
 
 HOUR_NS = 3600 * NS_PER_S
@@ -55,15 +55,11 @@ class WriterBench:
         self.spool = spool or self.disk
         turn = BrokerTurn([Broker("a", 1, False, False, "")], 60.0, lambda: 0.5)
         self.sender = MqttSender(made, "me", Will("t", b""), turn, self.broker.connect, self.clock.now_ns)
-        self.workers: list[HandWorker] = []
+        self.workers = HandWorkers()
         clock = PublisherClock(self.clock.now_ns, lambda: self.utc_offset_ns, lambda: self.reference, lambda: 0)
         self.writer = SpoolWriter(made, Gateway("site", "gw", boot), self.queue, self.spool, self.sender, clock)
-        self.writer.start(start_worker or self._start)
+        self.writer.start(start_worker or self.workers.start)
         self.seq = 0
-
-    def _start(self, name: str, job: Job) -> HandWorker:
-        self.workers.append(HandWorker(name, job))
-        return self.workers[-1]
 
     def put(self, count: int) -> None:
         """Put samples of `count` milliseconds."""

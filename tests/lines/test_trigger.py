@@ -161,7 +161,7 @@ class TriggerBench:
         self.line.open()
         signals = SignalBench()
         self.workers = signals.workers
-        self.trigger = Trigger(self.line, rate_hz, self.time, start_worker=signals.start_worker)
+        self.trigger = Trigger(self.line, rate_hz, self.time, start_worker=signals.workers.start)
         self.batches: list[Sequence[TriggerStamp]] = []
         self.ends: list[LinkError] = []
 

@@ -1,7 +1,6 @@
 """Waits for files with inotify."""
 
 import asyncio
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from imud.links.device_node import directories_of, wait_until
 from imud.model.errors import LinkError
 from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import in_loop
+from tests.support.leaks import open_descriptors
 
 
 async def turns(count: int = 20) -> None:
@@ -96,17 +96,14 @@ async def test_a_wait_does_not_poll_and_leaves_no_descriptor_when_it_is_cancelle
         asked += 1
         return False
 
-    def descriptors() -> int:
-        return len(os.listdir("/proc/self/fd"))
-
-    before = descriptors()
+    before = len(open_descriptors())
     waiting = asyncio.create_task(wait_until(tmp_path / "tty", ready))
     await turns(1000)
-    assert descriptors() == before + 1
+    assert len(open_descriptors()) == before + 1
     waiting.cancel()
     await asyncio.gather(waiting, return_exceptions=True)
     await asyncio.get_running_loop().shutdown_default_executor()
-    assert descriptors() == before
+    assert len(open_descriptors()) == before
     assert asked == 2  # before and after the watch
 
 

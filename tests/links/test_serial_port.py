@@ -13,6 +13,7 @@ from imud.links.device_node import PROC
 from imud.links.serial_port import TtyCounters, hold_ns, open_port, port_problem, read_latency_timer_ms, relative
 from imud.model.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
 from imud.model.units import NS_PER_MS
+from tests.support.leaks import open_descriptors
 from tests.support.pty_port import PtyPort, unprivileged
 
 START = (0, 0, 0, 0, 1000, 0, 5, 7, 11, 13, 17, *[0] * 9)
@@ -37,18 +38,14 @@ def test_each_number_has_its_error_which_names_the_port(number: int, kind: type[
     assert "no such thing" in str(port_problem(ValueError("no such thing"), "/dev/ttyS9", tmp_path))
 
 
-def descriptors() -> int:
-    return len(os.listdir("/proc/self/fd"))
-
-
 def test_an_open_port_has_one_descriptor_and_leaves_none() -> None:
     pty = PtyPort()
-    before = descriptors()
+    before = len(open_descriptors())
     port = open_port(str(pty.path), 115200, PROC)
-    assert descriptors() == before + 1
+    assert len(open_descriptors()) == before + 1
     port.close()
     port.close()
-    assert descriptors() == before
+    assert len(open_descriptors()) == before
     os.chmod(pty.path, 0o666)
     with unprivileged():  # no lock and no exclusive mode remain; root can open a port in exclusive mode
         again = open_port(str(pty.path), 115200, PROC)

@@ -92,7 +92,13 @@ def test_wrong_values(given: dict[str, Any], expected: list[tuple[str, str]]) ->
 @pytest.mark.parametrize(
     ("field_type", "words"),
     [
+        (bool, "true or false"), (int, "a whole number"), (float | None, "a number, or null"), (str, "text"),
         (Annotated[float, Meta(gt=0, lt=2.5)], "a number above 0 below 2.5"),
+        (Annotated[str, Meta(pattern="^x")], "text matching ^x"), (dict[str, int], "keys, each with a whole number"),
+        (
+            Trip, "the keys rate_hz (a number above 0), names (a list, each item text), groups (keys, each with a "
+            "list, each item a whole number)",
+        ),
         (Annotated[int, Meta(ge=0, le=3)] | None, "a whole number from 0 to 3, or null"),
         (Annotated[int, Meta(ge=-4)], "a whole number from -4"),
         (list[bool], "a list, each item true or false"),
@@ -107,7 +113,7 @@ def test_wrong_values(given: dict[str, Any], expected: list[tuple[str, str]]) ->
         (Annotated[str, Meta(min_length=1)], "text that is not empty"),
         (Annotated[str, Meta(pattern="^/", extra={"words": "an absolute path"})], "an absolute path"),
     ],
-)
+)  # fmt: skip
 def test_types_in_words(field_type: Any, words: str) -> None:
     assert expected(field_type) == words
 

@@ -34,12 +34,18 @@ class HandWorker:
         return True
 
 
+class HandWorkers(list[HandWorker]):
+    def start(self, name: str, job: Job) -> HandWorker:
+        self.append(HandWorker(name, job))
+        return self[-1]
+
+
 class SignalBench:
     def __init__(self) -> None:
         self.clock = VirtualClock()
         self.memory = MemoryLines(self.clock.now_ns)
-        self.workers: list[HandWorker] = []
-        self.factory = replace(self.memory.maker, start_worker=self.start_worker)
+        self.workers = HandWorkers()
+        self.factory = replace(self.memory.maker, start_worker=self.workers.start)
         self.events: list[Event] = []
 
     def input(self, key: str) -> MemoryInput:
@@ -47,10 +53,6 @@ class SignalBench:
 
     def output(self, key: str) -> MemoryOutput:
         return self.memory.outputs[f"{DEVICE} {key}"]
-
-    def start_worker(self, name: str, job: Job) -> HandWorker:
-        self.workers.append(HandWorker(name, job))
-        return self.workers[-1]
 
     def raise_event(
         self, now_ns: int, kind: EventKind, message: str, /, **detail: str | int | float | bool | None

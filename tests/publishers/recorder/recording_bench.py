@@ -8,12 +8,11 @@ from imud.contracts.publisher import PutRecord
 from imud.formats import records
 from imud.formats.recording import RecordingReader
 from imud.formats.records import Kind, Record
-from imud.host.threads import Job
 from imud.model.event import Event
 from imud.model.units import NS_PER_S
 from tests.support.event_loops import VirtualClock
 from tests.support.publisher_context import publisher_context
-from tests.support.signal_bench import HandWorker
+from tests.support.signal_bench import HandWorkers
 
 UTC_OFFSET_NS = 1_763_717_507 * NS_PER_S
 EPOCH = 0x5F3A9C01
@@ -56,17 +55,13 @@ class RecordingBench:
     def __init__(self) -> None:
         self.clock, self.source = VirtualClock(), HandSource()
         self.events: list[Event] = []
-        self.workers: list[HandWorker] = []
+        self.workers = HandWorkers()
         # Called when the recorder reads the clocks, which can make a record
         self.on_clocks_read: Callable[[], None] = lambda: None
         self.context = publisher_context(
             list, EPOCH, self.clock.now_ns, recording=self.source, utc_offset_ns=self._utc_offset_ns,
             raise_event=self.events.append,
         )  # fmt: skip
-
-    def start_worker(self, name: str, job: Job) -> HandWorker:
-        self.workers.append(HandWorker(name, job))
-        return self.workers[-1]
 
     def _utc_offset_ns(self) -> int:
         self.on_clocks_read()

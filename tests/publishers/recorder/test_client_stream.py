@@ -25,7 +25,7 @@ class StreamBench(RecordingBench):
         ours, self.client = stream_pair()
         self.client.setblocking(False)
         self.got = b""
-        self.recording = ClientRecording(self.context, devices or None, ours, self.start_worker)
+        self.recording = ClientRecording(self.context, devices or None, ours, self.workers.start)
 
     def tick(self, seconds: float = 1.1) -> None:
         self.recording.tick(self.advance(seconds))

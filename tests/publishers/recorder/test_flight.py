@@ -38,7 +38,7 @@ class FlightBench(RecordingBench):
         )  # fmt: skip
         object.__setattr__(self.context, "watch_line", self._watch)
         directory = RecordingDirectory(self.folder, settings.keep_bytes)
-        self.flight = FlightRecorder(settings, self.context, directory, self.start_worker)
+        self.flight = FlightRecorder(settings, self.context, directory, self.workers.start)
         self.flight.start()
         self.tick()
 

@@ -27,7 +27,7 @@ class FlightWriterBench(RecordingBench):
         self.queue = RecordQueue[Mark]()
         self.ring = SegmentRing(1 << 30)
         directory = RecordingDirectory(self.folder, keep_bytes)
-        self.writer = FlightWriter(self.queue, self.ring, directory, self.clock.now_ns, self.start_worker)
+        self.writer = FlightWriter(self.queue, self.ring, directory, self.clock.now_ns, self.workers.start)
 
     def begin(self, path: Path | None = None) -> None:
         self.queue.mark(SegmentBegin(self.advance(1), SESSION, path, 0))

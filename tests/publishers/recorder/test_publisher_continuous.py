@@ -26,7 +26,7 @@ class RecorderBench(RecordingBench):
         self.folder = folder / "recordings"
         made = RecorderOptions(directory=str(self.folder), **settings)  # type: ignore[arg-type]  # options by name
         directory = RecordingDirectory(self.folder, made.keep_bytes)
-        self.recorder = Recorder(made, self.context, directory, self.start_worker)
+        self.recorder = Recorder(made, self.context, directory, self.workers.start)
         self.recorder.start()
 
     def tick(self, seconds: float = 0.1, *, work: bool = True) -> None:

@@ -8,10 +8,9 @@ import pytest
 
 from imud.formats import records
 from imud.formats.recording import RecordingReader
-from imud.host.threads import Job
 from imud.publishers.recorder.writer import RecordingWriter, RecordQueue
 from tests.support.event_loops import VirtualClock
-from tests.support.signal_bench import HandWorker
+from tests.support.signal_bench import HandWorkers
 
 RING_BYTES, SYNC_NS = 256 << 10, 5_000_000_000
 
@@ -20,12 +19,8 @@ class WriterBench:
     def __init__(self, bytes_max: int = 1 << 24) -> None:
         self.clock = VirtualClock()
         self.queue = RecordQueue[Path](bytes_max)
-        self.workers: list[HandWorker] = []
-        self.writer = RecordingWriter(self.queue, self.clock.now_ns, self._start)
-
-    def _start(self, name: str, job: Job) -> HandWorker:
-        self.workers.append(HandWorker(name, job))
-        return self.workers[-1]
+        self.workers = HandWorkers()
+        self.writer = RecordingWriter(self.queue, self.clock.now_ns, self.workers.start)
 
     def work(self) -> None:
         self.workers[0].work()
