@@ -108,17 +108,21 @@ class Scene:
         self.broker.stop()
 
 
-Fault = Callable[[Scene, float], None]
+Fault = Callable[[Scene, float], object]
 
 
-def nothing(scene: Scene, seconds: float) -> None:
-    scene.watch(seconds)
+def during(begin: Callable[[Scene], object], end: Callable[[Scene], object]) -> Fault:
+    """Return a fault that lasts from `begin` to `end`."""
+
+    def fault(scene: Scene, seconds: float) -> None:
+        begin(scene)
+        scene.watch(seconds)
+        end(scene)
+
+    return fault
 
 
-def restart(scene: Scene, seconds: float) -> None:
-    scene.broker.stop()
-    scene.watch(seconds)
-    scene.broker.start()
+restart = during(lambda scene: scene.broker.stop(), lambda scene: scene.broker.start())
 
 
 def kill_broker(scene: Scene, seconds: float) -> None:
@@ -127,58 +131,18 @@ def kill_broker(scene: Scene, seconds: float) -> None:
         scene.watch(UP_S)
 
 
-def freeze(scene: Scene, seconds: float) -> None:
-    scene.broker.freeze()
-    scene.watch(seconds)
-    scene.broker.thaw()
-
-
-def refuse(scene: Scene, seconds: float) -> None:
-    rights = scene.folder / "rights"
-    rights.write_text("topic read #\n")
-    scene.broker.reload()
-    scene.watch(seconds)
-    rights.write_text("topic readwrite #\n")
+def give_rights(scene: Scene, rights: str) -> None:
+    (scene.folder / "rights").write_text(f"topic {rights} #\n")
     scene.broker.reload()
 
 
-def half_open(scene: Scene, seconds: float) -> None:
-    scene.proxy.stall()
-    scene.watch(seconds)
-    scene.proxy.restore()
+def limit_network(scene: Scene, bytes_s: float | None) -> None:
+    scene.proxy.bytes_s = bytes_s
 
 
-def cut(scene: Scene, seconds: float) -> None:
+def kill_gateway(scene: Scene, seconds: float, full: int = 0) -> None:
+    """Kill the gateway three times while the network is cut, after the spool has `full` bytes."""
     scene.proxy.cut()
-    scene.watch(seconds)
-    scene.proxy.restore()
-
-
-def slow_network(scene: Scene, seconds: float) -> None:
-    scene.proxy.bytes_s = 20_000.0
-    scene.watch(seconds)
-    scene.proxy.bytes_s = None
-
-
-def slow_collector(scene: Scene, seconds: float) -> None:
-    scene.held.set()
-    scene.watch(seconds)
-    scene.held.clear()
-
-
-def kill_gateway(scene: Scene, seconds: float) -> None:
-    scene.proxy.cut()
-    for _ in range(3):
-        scene.watch(seconds / 3)
-        scene.gateway.kill()
-        scene.start_gateway()
-    scene.proxy.restore()
-
-
-def kill_full(scene: Scene, seconds: float) -> None:
-    scene.proxy.cut()
-    # 95 % of the size limit, because the spool stays below the limit
-    full = round(SMALL_MB * 950_000)
     end = monotonic() + LIMIT_S
     while scene.high_water < full:
         scene.watch(1.0)
@@ -189,6 +153,11 @@ def kill_full(scene: Scene, seconds: float) -> None:
         scene.gateway.kill()
         scene.start_gateway()
     scene.proxy.restore()
+
+
+def kill_full(scene: Scene, seconds: float) -> None:
+    # 95 % of the size limit, because the spool stays below the limit
+    kill_gateway(scene, seconds, round(SMALL_MB * 950_000))
 
 
 def kill_collector(scene: Scene, seconds: float) -> None:
@@ -203,15 +172,30 @@ def kill_collector(scene: Scene, seconds: float) -> None:
 
 # by name: function and description in the table
 FAULTS: Final[Mapping[str, tuple[Fault, str]]] = {
-    "none": (nothing, "none"),
+    "none": (lambda scene, seconds: scene.watch(seconds), "none"),
     "restart": (restart, "the broker restarts"),
     "restarts": (kill_broker, "the broker restarts three times"),
-    "freeze": (freeze, "the broker's process is stopped (SIGSTOP)"),
-    "refuse": (refuse, "the broker rejects the messages of the gateway"),
-    "half-open": (half_open, "the network drops all data, and the connection stays open"),
-    "cut": (cut, "the network is cut"),
-    "slow-network": (slow_network, "the network is limited to 20 kB/s"),
-    "slow-collector": (slow_collector, "the collector reads 5 messages per second"),
+    "freeze": (
+        during(lambda scene: scene.broker.freeze(), lambda scene: scene.broker.thaw()),
+        "the broker's process is stopped (SIGSTOP)",
+    ),
+    "refuse": (
+        during(lambda scene: give_rights(scene, "read"), lambda scene: give_rights(scene, "readwrite")),
+        "the broker rejects the messages of the gateway",
+    ),
+    "half-open": (
+        during(lambda scene: scene.proxy.stall(), lambda scene: scene.proxy.restore()),
+        "the network drops all data, and the connection stays open",
+    ),
+    "cut": (during(lambda scene: scene.proxy.cut(), lambda scene: scene.proxy.restore()), "the network is cut"),
+    "slow-network": (
+        during(lambda scene: limit_network(scene, 20_000.0), lambda scene: limit_network(scene, None)),
+        "the network is limited to 20 kB/s",
+    ),
+    "slow-collector": (
+        during(lambda scene: scene.held.set(), lambda scene: scene.held.clear()),
+        "the collector reads 5 messages per second",
+    ),
     "kill": (kill_gateway, "SIGKILL of the gateway, three times, while the network is cut"),
     "kill-full": (kill_full, "SIGKILL of the gateway, three times, with a full spool of 1 MB"),
     "kill-collector": (kill_collector, "SIGKILL of the collector with rows, three times"),
