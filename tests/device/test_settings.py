@@ -183,8 +183,7 @@ async def test_without_declared_settings_imud_reads_no_settings(bench: ModuleBen
 async def test_equal_settings_are_reported_as_agreeing(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.is_in(SettingsState.AGREE))
     await bench.pass_s(5)
-    assert bench.module.commands == ["WHO", "GET"]
-    assert bench.status.unverified == ("secret",)
+    assert (bench.module.commands, bench.status.unverified) == (["WHO", "GET"], ("secret",))
     assert (bench.messages, bench.written()) == ([], [])
 
 
@@ -285,8 +284,7 @@ async def test_apply_does_not_write_flash(bench: ModuleBench) -> None:
     await bench.until(lambda: list(bench.status.differences) == ["mounting"])
     await bench.pass_s(50)
     assert bench.written() == ['SET mode="9-axis"', "SET secret=5"]
-    assert bench.module.flash == FACTORY
-    assert bench.status.flash_writes == 0
+    assert (bench.module.flash, bench.status.flash_writes) == (FACTORY, 0)
     assert "mounting needs a save and a restart" in bench.status.problem
     last = bench.told[-1]
     assert last.message == ('settings: mode set to "9-axis" (was "6-axis"), secret set to 5: sent, not verified')

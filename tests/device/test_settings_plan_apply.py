@@ -99,11 +99,8 @@ def test_values_are_written_read_back_saved_and_compared() -> None:
     found = applied(device, flash=flash)
     assert device.done == ["x=2", "read", "save"]
     assert (found.steps[0].outcome, found.saved, found.restarted, found.differences) == (
-        StepOutcome.VERIFIED,
-        True,
-        False,
-        {},
-    )
+        StepOutcome.VERIFIED, True, False, {},
+    )  # fmt: skip
     assert flash.counted == 1
     device = TableOfOne(Written.PENDING, effect=Effect.AFTER_RESTART)
     found = applied(device)

@@ -169,8 +169,7 @@ def test_driver_and_simulator_with_every_message_and_changes(vcan: CanInterface)
         await told("restart")
         found = {name: one.result for name, one in results.items()}
         assert found == {"zero": None, "save": None, "restart": "found at address 8"}
-        assert module.flash.x_reversed == 1
-        assert module.settings == module.flash
+        assert (module.flash.x_reversed, module.settings) == (1, module.flash)
         count = len(rig.samples)
         await rig.until(lambda: len(rig.samples) >= count + 30, "faster samples")
 

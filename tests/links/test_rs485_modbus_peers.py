@@ -127,8 +127,7 @@ def test_pymodbus_server_as_modules_under_our_driver() -> None:
         for address, firmware in ((80, "1.6.9"), (1, "1.5.2")):
             link.select(address)
             identity = run_transfer_script(DRIVER.probe(settings), link.transfer)
-            assert identity.product == "HI14R2N-485-000"
-            assert identity.firmware == firmware
+            assert (identity.product, identity.firmware) == ("HI14R2N-485-000", firmware)
             assert identity.serial_number == serial_of(address).hex().upper()
             found = words_of(run_transfer_script(DRIVER.set_up(settings), link.transfer))
             assert found == {"baud": "921600", "id": str(address), "heading_mode": "six axes"}

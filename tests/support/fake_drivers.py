@@ -127,19 +127,11 @@ def _apply(codec: StreamCodec, identity: Identity) -> None: ...
 
 
 FAKE_DRIVER: Final = StreamDriver(
-    name="fake-uart",
-    title="a fake",
-    baud_rates=BAUD_RATES,
-    settings=NoOptions,
-    make_codec=lambda ledger, options: FakeCodec(ledger),
-    tick_ns=1_000_000,
-    tick_modulus=1 << 32,
-    euler_convention="",
-    navigation_frame="ENU",
-    identify=_identify,
-    apply_identity=_apply,
+    name="fake-uart", title="a fake", baud_rates=BAUD_RATES, settings=NoOptions,
+    make_codec=lambda ledger, options: FakeCodec(ledger), tick_ns=1_000_000, tick_modulus=1 << 32, euler_convention="",
+    navigation_frame="ENU", identify=_identify, apply_identity=_apply,
     example_frame=lambda random: fake_frame(b"\x91" + random.randbytes(75)),
-)
+)  # fmt: skip
 
 
 BASE: Final = 0x180
@@ -194,30 +186,20 @@ def _renumber(target: Target, *, node: int) -> RequestScript[None]:
 def fake_can_driver(name: str = "fake-can", base: int = BASE) -> CanDriver:
     """Return a driver. With another `base`, it detects devices that its codec does not support."""
     return CanDriver(
-        name=name,
-        title="a fake",
-        settings=FakeCanSettings,
-        make_codec=FakeCanCodec,
-        filters=lambda settings: [CanFilter(BASE + settings.node, STANDARD_ID_MAX, False)],
-        tick_ns=SAMPLE_COUNTER,
-        tick_modulus=0xFF,
-        euler_convention="",
-        navigation_frame="",
+        name=name, title="a fake", settings=FakeCanSettings, make_codec=FakeCanCodec,
+        filters=lambda settings: [CanFilter(BASE + settings.node, STANDARD_ID_MAX, False)], tick_ns=SAMPLE_COUNTER,
+        tick_modulus=0xFF, euler_convention="", navigation_frame="",
         node_of=lambda can_id, extended, data: (
             can_id - base if base < can_id <= base + 127 and not extended and len(data) == 8 else None
         ),
-        node_settings=lambda node: FakeCanSettings(node=node),
-        node_title=lambda node: f"node {node}",
-        identify=lambda _settings: says_nothing(Identity("FAKE")),
-        apply_identity=lambda _codec, _identity: None,
-        sample_frames=1,
-        example_frames=lambda _random: [CanFrame(BASE + 1, False, bytes(8), 0)],
-        cyclic=_cyclic,
+        node_settings=lambda node: FakeCanSettings(node=node), node_title=lambda node: f"node {node}",
+        identify=lambda _settings: says_nothing(Identity("FAKE")), apply_identity=lambda _codec, _identity: None,
+        sample_frames=1, example_frames=lambda _random: [CanFrame(BASE + 1, False, bytes(8), 0)], cyclic=_cyclic,
         verbs={
             "node": Verb("its number", lambda target: says_nothing(target.settings.node)),
             "renumber": Verb("give it another number", _renumber),
         },
-    )
+    )  # fmt: skip
 
 
 def fake_can_frame(node: int, number: int = 0, t_ns: int = 0) -> CanFrame:
@@ -471,12 +453,8 @@ def _set_mode(target: Target, *, mode: str) -> RequestScript[None]:
 
 
 FAKE_MODULE_DRIVER: Final = replace(
-    FAKE_DRIVER,
-    name="fake-module",
-    make_codec=lambda ledger, options: LinesCodec(ledger),
-    identify=_who,
-    device_settings=FAKE_SETTINGS,
-    calibrations={"zero": ZERO},
+    FAKE_DRIVER, name="fake-module", make_codec=lambda ledger, options: LinesCodec(ledger), identify=_who,
+    device_settings=FAKE_SETTINGS, calibrations={"zero": ZERO},
     verbs={
         "set_mode": Verb("set it", _set_mode),
         "wait": Verb("take an hour", lambda _target: (pause(3600 * 1_000_000_000) for _ in range(1))),
@@ -487,4 +465,4 @@ FAKE_MODULE_DRIVER: Final = replace(
         "wake": Verb("send samples", _who_again, proof=Proof.STREAM),
         "turn": Verb("set the heading", _turned, changes=False, proof=Proof.SAMPLES, expected=_heading_expected),
     },
-)
+)  # fmt: skip

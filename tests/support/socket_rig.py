@@ -27,13 +27,7 @@ from imud.contracts.command import (
     Verb,
     Verbs,
 )
-from imud.contracts.publisher import (
-    AS_SENT,
-    Batch,
-    Latencies,
-    PublisherContext,
-    RecordingSource,
-)
+from imud.contracts.publisher import AS_SENT, Batch, Latencies, PublisherContext, RecordingSource
 from imud.contracts.setting import (
     AppliedSettings,
     AppliedStep,

@@ -126,16 +126,11 @@ def test_rs485(machine: Machine, state: DeviceState, line: SerialLineCounters, s
 @pytest.mark.parametrize(
     ("resets", "requested", "samples", "severity"),
     [
-        (0, 0, 1000, "ok"),
-        (9, 9, 1000, "ok"),
-        (2, 0, 1000, "note"),
-        (3, 0, 360_000, "warning"),
-        (9, 6, 360_000, "warning"),
-        (9, 7, 360_000, "note"),
-        (3, 0, 2 * 360_000, "warning"),
+        (0, 0, 1000, "ok"), (9, 9, 1000, "ok"), (2, 0, 1000, "note"), (3, 0, 360_000, "warning"),
+        (9, 6, 360_000, "warning"), (9, 7, 360_000, "note"), (3, 0, 2 * 360_000, "warning"),
         (3, 0, 3 * 360_000, "note"),
     ],
-)
+)  # fmt: skip
 def test_restarts_without_a_request_count_by_the_hour(
     machine: Machine, resets: int, requested: int, samples: int, severity: str
 ) -> None:

@@ -10,11 +10,7 @@ from imud.drivers.hipnuc.nmea2000 import HipnucNmea2000Options
 
 @pytest.mark.parametrize(
     ("values", "heading"),
-    [
-        ({"mode": "6-axis"}, Heading.RELATIVE),
-        ({"mode": "9-axis"}, Heading.MAGNETIC),
-        ({}, Heading.UNKNOWN),
-    ],
+    [({"mode": "6-axis"}, Heading.RELATIVE), ({"mode": "9-axis"}, Heading.MAGNETIC), ({}, Heading.UNKNOWN)],
 )
 def test_by_mode(values: dict[str, str], heading: Heading) -> None:
     assert heading_by_mode(None, values) is heading

@@ -62,69 +62,44 @@ class Protocol(NamedTuple):
 
 
 CANOPEN = Protocol(
-    noun="node",
-    restarted="found as node",
-    make=lambda number=8, **more: CanopenBench(NodeSettings(node=number), **more),
-    variants=NODE_VARIANTS,
-    variant=NodeVariant,
-    register=0x20A0,
+    noun="node", restarted="found as node",
+    make=lambda number=8, **more: CanopenBench(NodeSettings(node=number), **more), variants=NODE_VARIANTS,
+    variant=NodeVariant, register=0x20A0,
     values={
         **{f"tpdo{tpdo}_interval_ms": (5, 1000, 0) for tpdo in TPDOS},
         **{f"tpdo{tpdo}_by": ("sync", "timer") for tpdo in TPDOS},
-        **dict.fromkeys(("incli_x_reversed", "incli_y_reversed"), (True, False)),
-        "heartbeat_ms": (500, 0),
-        "bit_rate": (500_000,),
-        "node": (127, 1),
+        **dict.fromkeys(("incli_x_reversed", "incli_y_reversed"), (True, False)), "heartbeat_ms": (500, 0),
+        "bit_rate": (500_000,), "node": (127, 1),
     },
     of_each_form=("tpdo1_interval_ms", "tpdo1_by", "bit_rate", "node"),
     delivered={
         **{f"tpdo{tpdo}_interval_ms": 50 if tpdo == 6 else 10 for tpdo in TPDOS},
-        **{f"tpdo{tpdo}_by": "timer" for tpdo in TPDOS},
-        "incli_x_reversed": False,
-        "incli_y_reversed": False,
-        "heartbeat_ms": 0,
-        "bit_rate": 500_000,
-        "node": 8,
+        **{f"tpdo{tpdo}_by": "timer" for tpdo in TPDOS}, "incli_x_reversed": False, "incli_y_reversed": False,
+        "heartbeat_ms": 0, "bit_rate": 500_000, "node": 8,
     },
     wrong={"tpdo1_interval_ms": 1001, "tpdo1_by": "remote", "bit_rate": 800_000, "node": 128, "incli_x_reversed": 1},
-    settings=CANOPEN_SETTINGS,
-    options=lambda number: HipnucCanopenOptions(node=number),
-    session=canopen,
-    place=(canopen.NODE_ID, 0),
-    number_of=lambda module: module.node,
-    go_back=(0x609, "23 A0 20 00 08 00 00 00"),
+    settings=CANOPEN_SETTINGS, options=lambda number: HipnucCanopenOptions(node=number), session=canopen,
+    place=(canopen.NODE_ID, 0), number_of=lambda module: module.node, go_back=(0x609, "23 A0 20 00 08 00 00 00"),
     is_write=lambda data: data[0] != 0x40,
-)
+)  # fmt: skip
 J1939 = Protocol(
-    noun="address",
-    restarted="found at address",
-    make=lambda number=8, **more: J1939Bench(J1939Settings(address=number), **more),
-    variants=J1939_VARIANTS,
-    variant=J1939Variant,
-    register=j1939.ADDRESS,
+    noun="address", restarted="found at address",
+    make=lambda number=8, **more: J1939Bench(J1939Settings(address=number), **more), variants=J1939_VARIANTS,
+    variant=J1939Variant, register=j1939.ADDRESS,
     values={
         **{f"{pgn}_interval_ms": (5, 1000) for pgn in PGNS},
-        **dict.fromkeys(("x_reversed", "y_reversed"), (True, False)),
-        "bit_rate": (500_000,),
-        "address": (128, 1),
+        **dict.fromkeys(("x_reversed", "y_reversed"), (True, False)), "bit_rate": (500_000,), "address": (128, 1),
     },
     of_each_form=("ff34_interval_ms", "x_reversed", "bit_rate", "address"),
     delivered={
         **{f"{pgn}_interval_ms": 100 for pgn in ("ff34", "ff37", "ff3d", "ff41")},  # the other messages are off
-        "x_reversed": False,
-        "y_reversed": False,
-        "bit_rate": 500_000,
-        "address": 8,
+        "x_reversed": False, "y_reversed": False, "bit_rate": 500_000, "address": 8,
     },
     wrong={"ff34_interval_ms": 0, "ff41_interval_ms": 1001, "bit_rate": 100_000, "address": 129},
-    settings=J1939_SETTINGS,
-    options=lambda number: HipnucJ1939Options(address=number),
-    session=j1939,
-    place=j1939.ADDRESS,
-    number_of=lambda module: module.settings.address,
-    go_back=(0x0CEF0955, "9C 00 06 00 08 00 00 00"),
-    is_write=lambda data: data[2] == 6,
-)
+    settings=J1939_SETTINGS, options=lambda number: HipnucJ1939Options(address=number), session=j1939,
+    place=j1939.ADDRESS, number_of=lambda module: module.settings.address,
+    go_back=(0x0CEF0955, "9C 00 06 00 08 00 00 00"), is_write=lambda data: data[2] == 6,
+)  # fmt: skip
 both = pytest.mark.parametrize("protocol", [CANOPEN, J1939], ids=["CANopen", "J1939"])
 EVERY = [(protocol, name) for protocol in (CANOPEN, J1939) for name in protocol.variants]
 

@@ -73,9 +73,7 @@ def by_can() -> list[Measurement]:
 
 
 def by_polls(
-    set_up: TransferScript[Reports],
-    codec: PolledCodec,
-    transfer: Callable[[Imu61xRegisters, Transfer], bytes],
+    set_up: TransferScript[Reports], codec: PolledCodec, transfer: Callable[[Imu61xRegisters, Transfer], bytes]
 ) -> list[Measurement]:
     """Set up the device, then read it at each instant."""
     now_ns = EPOCH_NS

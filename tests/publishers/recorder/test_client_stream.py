@@ -74,9 +74,7 @@ def test_a_recording_starts_with_all_states_and_ends_with_an_end_record() -> Non
     bench.close()
 
 
-def test_the_recording_contains_the_number_of_records_lost_by_a_slow_client(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_recording_contains_the_number_of_records_lost_by_a_slow_client(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "RecordQueue", {module.LastRecords: lambda: RecordQueue[module.LastRecords](1 << 20)})
     bench = StreamBench()
     delivered = 0

@@ -291,10 +291,8 @@ def test_missing_permissions_are_warnings(
         patch.setattr(Path, "unlink", denied)
         listener.close()
     assert [one.split(":")[0].replace(str(tmp_path), "") for one in caplog.messages] == [
-        "cannot give /imud.sock to group 'root'",
-        "cannot set the ACL of /imud.sock",
-        "cannot remove /imud.sock",
-    ]
+        "cannot give /imud.sock to group 'root'", "cannot set the ACL of /imud.sock", "cannot remove /imud.sock",
+    ]  # fmt: skip
     again = Listener(tmp_path / "imud.sock", "root")
     (tmp_path / "imud.sock").unlink()
     again.close()

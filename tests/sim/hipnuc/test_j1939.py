@@ -137,9 +137,7 @@ def test_what_is_set_read_back_saved_and_lost_at_a_restart() -> None:
     assert counts[0xFF4A] == 2
     reports: Any = bench.talk(lambda peer: SETTINGS.read(Target(HipnucJ1939Options(), 0), None))
     settings = words_of(reports)
-    assert settings["interval_ms_FF37"] == "20"
-    assert settings["address"] == "8"
-    assert settings["bitrate"] == "500000"
+    assert (settings["interval_ms_FF37"], settings["address"], settings["bitrate"]) == ("20", "8", "500000")
 
     bench = J1939Host(made(boot_ms=200))
     bench.wait(300 * MS)

@@ -175,11 +175,9 @@ def test_identity_and_settings_are_read_amid_frames() -> None:
     assert (identity.product, identity.serial_number, identity.firmware) == ("HI14R3", "043995698D6E1708", "1.5.6")
     assert DRIVER.device_settings is not None
     settings = words_of(converse(HipnucUartBench(FAST), DRIVER.device_settings.read(Target(None, 0), None)))
-    assert settings["ATT_MODE"] == "0"
-    assert settings["BAUD"] == "921600"
+    assert (settings["ATT_MODE"], settings["BAUD"]) == ("0", "921600")
     module = SIMULATORS["hipnuc-uart"].make(SimulatorOptions(), BEGIN_NS)
-    assert module.baud == 115_200
-    assert module.epoch_ns == BEGIN_NS
+    assert (module.baud, module.epoch_ns) == (115_200, BEGIN_NS)
     assert SIMULATORS["hipnuc-uart"].name in SIMULATORS
 
 

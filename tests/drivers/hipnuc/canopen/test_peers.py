@@ -250,9 +250,7 @@ def test_our_conversations_with_their_node(local: canopen.LocalNode, host: Host)
     assert local.get_data(0x209A, 0) == b"\x03\0\0\0"
     run_script(session.save(NODE), host.ask)
     settings = words_of(run_script(SETTINGS.read(Target(HipnucCanopenOptions(node=NODE), 0), None), host.ask))
-    assert settings["1804.5"] == "50"
-    assert settings["1801.2"] == "1"
-    assert settings["209A.0"] == "3"
+    assert (settings["1804.5"], settings["1801.2"], settings["209A.0"]) == ("50", "1", "3")
     assert "20A0.0" not in settings  # never written there: no data available
 
     assert local.id == NODE

@@ -148,8 +148,7 @@ def test_mounting_level_and_factory_settings(bench: ModbusBench) -> None:
     assert [request.hex() for _, request in bench.sent] == ["0600a60003", "0600a50003"]
     bench.run(set_heading_mode(NINE))
     assert bench.run(factory_reset((7,), BAUD)) == "found at address 80"
-    assert bench.slave.settings == SlaveSettings()
-    assert bench.at == 80
+    assert (bench.slave.settings, bench.at) == (SlaveSettings(), 80)
 
 
 def test_devices_with_unexpected_replies() -> None:

@@ -13,11 +13,9 @@ from tests.support.pty_port import ModbusBench
 from tests.support.pty_port import modbus_slave as module
 
 VALUES: dict[str, tuple[object, ...]] = {
-    "mode": ("9-axis", "6-axis"),
-    "mounting": ("x_up", "x_down", "y_up", "y_down", "level"),
-    "baud": (115200,),
+    "mode": ("9-axis", "6-axis"), "mounting": ("x_up", "x_down", "y_up", "y_down", "level"), "baud": (115200,),
     "address": (1, 128),
-}
+}  # fmt: skip
 
 
 @pytest.fixture(params=SLAVE_VARIANTS)

@@ -8,16 +8,7 @@ import pytest
 from imud.contracts.command import Target
 from imud.contracts.script import Outcome, Rejection, Reply, Request, RequestScript, Silence
 from imud.contracts.setting import words_of
-from imud.drivers.hipnuc.uart.commands import (
-    OutputMessage,
-    Query,
-    advice,
-    ask,
-    identify,
-    log_ontime,
-    send_once,
-    wake,
-)
+from imud.drivers.hipnuc.uart.commands import OutputMessage, Query, advice, ask, identify, log_ontime, send_once, wake
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.drivers.hipnuc.uart.settings import SETTINGS, report_values, why_silent
 from imud.model.errors import BadArgument, NoReply, Rejected
@@ -59,11 +50,8 @@ def test_identity_refusal_and_flat_settings() -> None:
         hold(identify(), lambda _: Rejection(("ERR 3",)))
 
     assert words_of(hold(SETTINGS.read(Target(None, 0), None), lambda name: Reply(REPLIES[name]))) == {
-        "ATT_MODE": "0",
-        "BAUD": "115200",
-        "COMCONFIG 1": "LOG HI91 ONTIME 0.01",
-        "MB": "14.14, -2.08, -8.75",
-    }
+        "ATT_MODE": "0", "BAUD": "115200", "COMCONFIG 1": "LOG HI91 ONTIME 0.01", "MB": "14.14, -2.08, -8.75",
+    }  # fmt: skip
     without = hold(
         SETTINGS.read(Target(None, 0), None), lambda n: Silence(()) if n == "LOG MAGCONFIG" else Reply(REPLIES[n])
     )

@@ -66,24 +66,12 @@ def test_the_same_in_words_with_units() -> None:
         }
     )
     assert words == {
-        "output.hi91": "25 Hz",
-        "output.hi92": "on mark",
-        "mode": "9-axis",
-        "mounting": "0.8, -0.6, 0, 0.6, 0.8, 0, 0, 0, 1",
-        "magnetic_calibration": "on",
-        "pins.sin": "IO1",
-        "pins.sout": "IO2",
-        "pins.led": "IO5",
-        "pins.sout_div": "IO6",
-        "pins.alarm": "IO9",
-        "sout_divisor": "4",
-        "alarm.x": "-5° … 5°, off",
-        "alarm.y": "-5° … 7.5°, on",
-        "magnetometer_bias": "14.14, -2.08, -8.75 µT",
-        "baud": "115200 bit/s",
-        "TEMP_COEF": "1.5",
-        "COMCONFIG 7": "a line of another form",
-    }
+        "output.hi91": "25 Hz", "output.hi92": "on mark", "mode": "9-axis",
+        "mounting": "0.8, -0.6, 0, 0.6, 0.8, 0, 0, 0, 1", "magnetic_calibration": "on", "pins.sin": "IO1",
+        "pins.sout": "IO2", "pins.led": "IO5", "pins.sout_div": "IO6", "pins.alarm": "IO9", "sout_divisor": "4",
+        "alarm.x": "-5° … 5°, off", "alarm.y": "-5° … 7.5°, on", "magnetometer_bias": "14.14, -2.08, -8.75 µT",
+        "baud": "115200 bit/s", "TEMP_COEF": "1.5", "COMCONFIG 7": "a line of another form",
+    }  # fmt: skip
     assert (
         shown(words_of(HipnucLine().run(SETTINGS.read(Target(None, 0), None))))["magnetometer_bias"]
         == "0, 0, 0 µT: not calibrated"

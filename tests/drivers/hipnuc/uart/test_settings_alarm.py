@@ -50,16 +50,11 @@ def test_coordinates_select_axes_and_the_angles_of_the_alarm(line: str, value: s
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
-        ("PMUX5", "Y,-5,5,0,1", y(-5, 5)),
-        ("ALARM X", " +1.5 , 2 , 0 , 0 ", x(1.5, 2, False)),
-        ("pmux5_y", "-5,5,0,1", y(-5, 5)),
-        ("IO_ALARM", "x,-5,5,0,1", x(-5, 5)),
-        ("PMUX5", "IO9", {}),
+        ("PMUX5", "Y,-5,5,0,1", y(-5, 5)), ("ALARM X", " +1.5 , 2 , 0 , 0 ", x(1.5, 2, False)),
+        ("pmux5_y", "-5,5,0,1", y(-5, 5)), ("IO_ALARM", "x,-5,5,0,1", x(-5, 5)), ("PMUX5", "IO9", {}),
         ("PMUX5", "-5,5,0,1", {}),  # the axis is missing
-        ("ALARM_X", "-5,5,0,2", {}),
-        ("ALARM_X", "-5,5,1", {}),
-        ("URFR", "1,0,0,0,1,0,0,0,1", {}),
+        ("ALARM_X", "-5,5,0,2", {}), ("ALARM_X", "-5,5,1", {}), ("URFR", "1,0,0,0,1,0,0,0,1", {}),
     ],
-)
+)  # fmt: skip
 def test_other_forms(name: str, value: str, expected: dict[str, AlarmRange]) -> None:
     assert alarm_ranges(report_values({name: value})).by_axis == expected

@@ -26,11 +26,7 @@ MARKED = Output(on_mark=True)
         (SOUT, ModuleSettings(), {}),
         (SOUT, ModuleSettings(pins=(1, 2, 2, 6, 9)), {"sout": "the device has sout and led on IO2: move one"}),
         (DIVIDED, ModuleSettings(sout_div=4), {}),
-        (
-            DIVIDED,
-            ModuleSettings(),
-            {"sout_div": "expected divisor 4 from the configuration, got 8 from the device"},
-        ),
+        (DIVIDED, ModuleSettings(), {"sout_div": "expected divisor 4 from the configuration, got 8 from the device"}),
         (SIN, ModuleSettings(baud=921600, hi91=MARKED), {}),
         (SIN, ModuleSettings(), {"sin": "no message of the device is on mark"}),
         (
