@@ -272,11 +272,9 @@ def test_a_constructor_receives_no_function_of_the_object_that_calls_it() -> Non
 
 
 FOR_TESTS = {
-    "BrokerConnection": "tests connect without a broker",
-    "Viewer": "tests record the messages",
-    "WatchingWorker": "tests do the rounds of a bus in the event loop",
-    "Worker": "tests do the rounds themselves",
-}
+    "BrokerConnection": "tests connect without a broker", "Viewer": "tests record the messages",
+    "WatchingWorker": "tests do the rounds of a bus in the event loop", "Worker": "tests do the rounds themselves",
+}  # fmt: skip
 """Protocols with one implementation in `imud/` and another implementation in `tests/`."""
 OTHER_LIBRARIES = {"I2cBus": "smbus2", "Poller": "select.epoll", "_Event": "PyYAML"}
 """Protocols that describe an object of another library."""
@@ -496,21 +494,16 @@ CROSS_CUTTING = {
 """Test modules without a single module, and their subjects."""
 
 TESTED_IN = {
-    "imud.cli.setup.changes": "cli/setup/test_steps.py",
-    "imud.config.model": "config/test_reading.py",
-    "imud.config.schema": "config/test_reading.py",
-    "imud.device.device": "device/test_can_transport.py",
-    "imud.device.factory": "device/test_search.py",
-    "imud.device.transport": "device/test_stream_transport.py",
+    "imud.cli.setup.changes": "cli/setup/test_steps.py", "imud.config.model": "config/test_reading.py",
+    "imud.config.schema": "config/test_reading.py", "imud.device.device": "device/test_can_transport.py",
+    "imud.device.factory": "device/test_search.py", "imud.device.transport": "device/test_stream_transport.py",
     "imud.drivers.hipnuc.bus_load": "drivers/hipnuc/test_common.py",
     "imud.drivers.hipnuc.j1939.driver": "drivers/test_every_can_driver.py",
     "imud.drivers.polled_frames": "drivers/test_every_polled_driver.py",
-    "imud.fleet.settings": "fleet/test_publisher.py",
-    "imud.formats.jsonrpc": "publishers/socket/test_methods.py",
+    "imud.fleet.settings": "fleet/test_publisher.py", "imud.formats.jsonrpc": "publishers/socket/test_methods.py",
     "imud.publishers.metrics.metric": "publishers/metrics/test_families.py",
-    "imud.sim.ports.in_process_bus": "links/test_spi.py",
-    "imud.web.messages": "web/test_hub.py",
-}
+    "imud.sim.ports.in_process_bus": "links/test_spi.py", "imud.web.messages": "web/test_hub.py",
+}  # fmt: skip
 """Modules without a test module of their own, and the test module that covers them."""
 
 TYPES_ONLY = ("imud.contracts", "imud.model.errors", "imud.model.event", "imud.model.units")

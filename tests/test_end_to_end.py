@@ -65,16 +65,14 @@ def frame(row: Row) -> bytes:
     three = {name: tuple(float(row[f"{name}_{axis}"]) for axis in "xyz") for name in ("acc", "gyr", "mag")}
     acc, gyr, mag = three["acc"], three["gyr"], three["mag"]
     return encode_hi91(
-        system_time_ms=int(row["sys_time"]),
-        accel_m_s2=(acc[0] * G, acc[1] * G, acc[2] * G),
+        system_time_ms=int(row["sys_time"]), accel_m_s2=(acc[0] * G, acc[1] * G, acc[2] * G),
         gyro_rad_s=(radians(gyr[0]), radians(gyr[1]), radians(gyr[2])),
         mag_t=(mag[0] * 1e-6, mag[1] * 1e-6, mag[2] * 1e-6),
         euler_rad=(radians(float(row["roll"])), radians(float(row["pitch"])), radians(float(row["yaw"]))),
         quat_wxyz=(float(row["quat_w"]), float(row["quat_x"]), float(row["quat_y"]), float(row["quat_z"])),
-        temperature_c=float(row["temperature"]),
-        pressure_pa=float(row["pressure"]),
+        temperature_c=float(row["temperature"]), pressure_pa=float(row["pressure"]),
         word_1_2=round(float(row["pps_sync_stamp"]) * 1000),
-    )
+    )  # fmt: skip
 
 
 def check(sample: Sample, row: Row) -> None:

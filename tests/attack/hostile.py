@@ -88,19 +88,12 @@ def all_wakers(_rng: random.Random) -> bytes:
 
 
 KINDS: dict[str, Kind] = {
-    "nested": Kind(lambda _rng: b"[" * 65_000 + b"\n"),
-    "deep-arguments": Kind(deep_arguments),
-    "empty-lines": Kind(lambda _rng: b"\n" * 65_536),
-    "spaces": Kind(lambda _rng: b" " * 65_000 + b"\n"),
-    "long-lines": Kind(padded_line),
-    "many-names": Kind(many_names),
-    "half-lines": Kind(lambda _rng: b"x" * 65_000, once=True),
-    "field-orders": Kind(any_watch, once=True),
-    "watch-storm": Kind(any_watch),
-    "rates": Kind(any_rate),
-    "polls": Kind(lambda _rng: request("poll") * 16),
-    "statuses": Kind(lambda _rng: request("status") * 4),
-    "schemas": Kind(lambda _rng: request("schema") * 4),
+    "nested": Kind(lambda _rng: b"[" * 65_000 + b"\n"), "deep-arguments": Kind(deep_arguments),
+    "empty-lines": Kind(lambda _rng: b"\n" * 65_536), "spaces": Kind(lambda _rng: b" " * 65_000 + b"\n"),
+    "long-lines": Kind(padded_line), "many-names": Kind(many_names),
+    "half-lines": Kind(lambda _rng: b"x" * 65_000, once=True), "field-orders": Kind(any_watch, once=True),
+    "watch-storm": Kind(any_watch), "rates": Kind(any_rate), "polls": Kind(lambda _rng: request("poll") * 16),
+    "statuses": Kind(lambda _rng: request("status") * 4), "schemas": Kind(lambda _rng: request("schema") * 4),
     "event-watch": Kind(lambda _rng: request("events"), once=True),
     "event-storm": Kind(lambda _rng: request("events") * 16),
     "scrapes": Kind(lambda _rng: b"GET /metrics HTTP/1.1\r\nHost: localhost\r\n\r\n", once=True, scrapes=True),
@@ -108,9 +101,8 @@ KINDS: dict[str, Kind] = {
     "watch-unread": Kind(lambda _rng: request("watch"), Reading.NEVER, once=True),
     "reads-slowly": Kind(lambda _rng: request("watch") + request("events"), Reading.SLOWLY, once=True),
     "connects": Kind(lambda _rng: request("watch"), leaves=True, once=True),
-    "wakers": Kind(all_wakers, Reading.NEVER, once=True),
-    "waker-storm": Kind(all_wakers),
-}
+    "wakers": Kind(all_wakers, Reading.NEVER, once=True), "waker-storm": Kind(all_wakers),
+}  # fmt: skip
 
 
 class Hostile:

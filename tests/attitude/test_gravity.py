@@ -257,14 +257,12 @@ def recorded() -> Iterator[Sample]:
     for number, row in enumerate(rows[::10]):
         accel, gyro = ([float(row[f"{name}_{axis}"]) for axis in "xyz"] for name in ("acc", "gyr"))
         yield replace(
-            zyx(0, 0),
-            seq=number + 1,
-            t_ns=number * TICK_NS,
+            zyx(0, 0), seq=number + 1, t_ns=number * TICK_NS,
             accel_m_s2=(accel[0] * 9.8, accel[1] * 9.8, accel[2] * 9.8),
             gyro_rad_s=(radians(gyro[0]), radians(gyro[1]), radians(gyro[2])),
             euler_rad=(radians(float(row["roll"])), radians(float(row["pitch"])), radians(float(row["yaw"]))),
             quat_wxyz=(float(row["quat_w"]), float(row["quat_x"]), float(row["quat_y"]), float(row["quat_z"])),
-        )
+        )  # fmt: skip
 
 
 @pytest.mark.skipif(not RECORDING.exists(), reason=f"the recording {RECORDING} is not on this machine")

@@ -68,16 +68,14 @@ class Setting:
 
 
 SETTINGS = (
-    Setting("default"),
-    Setting("Nice=-15", nice=-15),
-    Setting("CPUWeight=10000", weight=True),
+    Setting("default"), Setting("Nice=-15", nice=-15), Setting("CPUWeight=10000", weight=True),
     Setting("Nice=-15, CPUWeight=10000", nice=-15, weight=True),
     Setting("CPUSchedulingPolicy=rr, 10", policy=os.SCHED_RR, priority=10),
     Setting("CPUSchedulingPolicy=fifo, 10", policy=os.SCHED_FIFO, priority=10),
     Setting("fifo, 10 and one core", policy=os.SCHED_FIFO, priority=10, core=True),
     Setting("fifo, 10 and mlockall", policy=os.SCHED_FIFO, priority=10, lock=True),
     Setting("default and mlockall", lock=True),
-)
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

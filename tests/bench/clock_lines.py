@@ -37,11 +37,9 @@ from tests.bench.rows import Row, at_least, at_most
 CHUNK = 500  # samples per measured chunk
 SETTLED_S = 20  # after this time, the clock uses the lines
 FAULTS = {
-    "": LineFaults(),
-    "1 % of edges lost": LineFaults(edge_loss=0.01),
-    "5 % extra edges": LineFaults(extra=0.05),
+    "": LineFaults(), "1 % of edges lost": LineFaults(edge_loss=0.01), "5 % extra edges": LineFaults(extra=0.05),
     "10 % of pulses and of frames lost, loaded": LineFaults(pulse_loss=0.1, frame_loss=0.1, loaded=True),
-}
+}  # fmt: skip
 Case = tuple[str, str, int, Callable[[], list[DatedSample]]]
 """Source of the time, condition, rate in Hz, and the function that runs the case."""
 

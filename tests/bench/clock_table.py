@@ -237,12 +237,10 @@ def figures_of(cell: Cell, seeds: Sequence[int], seconds: int = SECONDS) -> Cell
     settling = [d for d in samples if d.settling]
     rms_ns = sqrt(sum(d.off_ns**2 for d in settled) / len(settled))
     return CellFigures(
-        round(sqrt(sum(d.off_ns**2 for d in samples) / len(samples)) / 1000, 1),
-        round(_share(settling), 4),
-        round(_share(settled), 4),
-        round(median(d.t_err_ns for d in settled) / rms_ns, 2),
+        round(sqrt(sum(d.off_ns**2 for d in samples) / len(samples)) / 1000, 1), round(_share(settling), 4),
+        round(_share(settled), 4), round(median(d.t_err_ns for d in settled) / rms_ns, 2),
         round(sqrt(sum(d.t_err_ns**2 for d in settled) / len(settled)) / rms_ns, 2),
-    )
+    )  # fmt: skip
 
 
 def _share(samples: Sequence[Dated]) -> float:

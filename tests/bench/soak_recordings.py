@@ -130,11 +130,9 @@ class Recordings:
 def _compare(counts: list[Count], before: Mapping[str, int], after: Mapping[str, int], files_left: int) -> list[str]:
     """Return the values of the files that are not between the counters before and after."""
     pairs = {
-        "records": sum(count.records for count in counts),
-        "records_dropped": sum(count.lost for count in counts),
-        "written_bytes": sum(count.bytes for count in counts),
-        "files_removed": len(counts) - files_left,
-    }
+        "records": sum(count.records for count in counts), "records_dropped": sum(count.lost for count in counts),
+        "written_bytes": sum(count.bytes for count in counts), "files_removed": len(counts) - files_left,
+    }  # fmt: skip
     return [
         f"recorder: expected {name} from {before[name]} to {after[name]}, got {value} in the files"
         for name, value in pairs.items()

@@ -54,12 +54,10 @@ def test_every_line() -> None:
         spi("reset: {line: R, hold_ms: 5, open_drain: true}, data_ready: {line: Y, edge: falling}"),
     )
     assert bow.lines == DeviceLines(
-        sout=SoutOptions(line=17, chip="gpiochip0", bias="pull-down"),
-        sout_div=DividedOptions(line="D", divisor=64),
-        sin=TriggerOptions(line="S", rate_hz=0.0),
-        alarm=InputOptions(line="A", active_low=True),
+        sout=SoutOptions(line=17, chip="gpiochip0", bias="pull-down"), sout_div=DividedOptions(line="D", divisor=64),
+        sin=TriggerOptions(line="S", rate_hz=0.0), alarm=InputOptions(line="A", active_low=True),
         pps=PpsOptions(line="P", chrony="/run/chrony.imud.sock"),
-    )
+    )  # fmt: skip
     assert gimbal.lines == DeviceLines(
         reset=ResetOptions(line="R", hold_ms=5.0, open_drain=True), data_ready=ReadyOptions(line="Y", edge="falling")
     )

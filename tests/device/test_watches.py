@@ -211,15 +211,13 @@ def test_a_wrong_order_of_angles_is_detected() -> None:
 @pytest.mark.parametrize(
     ("is_so", "said"),
     [
-        ("upside down", FrameOptions()),
-        ("as the manual draws it", axes("y", "x", "-z")),
-        ("on its side", axes("y", "-x", "z")),
-        ("on its side", axes("y", "-z", "-x")),
+        ("upside down", FrameOptions()), ("as the manual draws it", axes("y", "x", "-z")),
+        ("on its side", axes("y", "-x", "z")), ("on its side", axes("y", "-z", "-x")),
         ("by angles", FrameOptions(level_roll_deg=1.0)),
         ("as the manual draws it", FrameOptions(euler=MountingAngles(roll_deg=90))),
         ("as the manual draws it", FrameOptions(quat_wxyz=[0.5, -0.5, 0.5, -0.5])),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_mounting_is_detected(is_so: str, said: FrameOptions) -> None:
     motion = in_body(MOUNTINGS[is_so])
     made = played("hipnuc-uart", motion, frame=said)

@@ -49,17 +49,15 @@ def test_utc_time_of_a_record(
     ("message", "expected"),
     [
         (synchronised(event_message(1, 5), t_ns=3, error_ns=40), BootOffset(3, UTC_NS, 40)),
-        (not_set(samples_message(1, 2)), None),
-        (samples_message(1, 2), BootOffset(2_000_000, UTC_NS, None)),
-        (intervals_message(4, 6), BootOffset(4_000_000, UTC_NS, None)),
-        (intervals_message(4, 6, utc_ns=0), None),
+        (not_set(samples_message(1, 2)), None), (samples_message(1, 2), BootOffset(2_000_000, UTC_NS, None)),
+        (intervals_message(4, 6), BootOffset(4_000_000, UTC_NS, None)), (intervals_message(4, 6, utc_ns=0), None),
         (event_message(1, 5), None),
         (
             intervals_message(4, 6, utc_ns=CLOCK_SET_NS - 4_000_000),
             BootOffset(4_000_000, CLOCK_SET_NS - 4_000_000, None),
         ),
     ],
-)
+)  # fmt: skip
 def test_clock_offset_of_a_message(message: FleetMessage, expected: BootOffset | None) -> None:
     assert offset_of(message) == expected
 

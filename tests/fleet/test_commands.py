@@ -135,18 +135,15 @@ def test_commands_that_are_not_allowed_are_denied() -> None:
 @pytest.mark.parametrize(
     ("actions", "arguments", "allowed"),
     [
-        (["set"], {"mode": "9-axis", "output.hi91": 200, "save": True}, True),
-        (["set"], {"save": True}, True),
-        (["bow/set"], {"mode": "9-axis"}, True),
-        (["mast/set", "save"], {"mode": "9-axis"}, False),
+        (["set"], {"mode": "9-axis", "output.hi91": 200, "save": True}, True), (["set"], {"save": True}, True),
+        (["bow/set"], {"mode": "9-axis"}, True), (["mast/set", "save"], {"mode": "9-axis"}, False),
         (["set.mode"], {"mode": "9-axis", "save": True}, True),
         (["set.mode", "bow/set.output"], {"mode": "9-axis", "output.hi91": 200}, True),
         (["set.mode"], {"mode": "9-axis", "output.hi91": 200}, False),
-        (["set.mode", "mast/set.output"], {"output": {"hi91": 200}}, False),
-        (["set.mode"], {"save": True}, False),
+        (["set.mode", "mast/set.output"], {"output": {"hi91": 200}}, False), (["set.mode"], {"save": True}, False),
         (["set.mode"], {}, False),
     ],
-)
+)  # fmt: skip
 def test_settings_are_set_if_the_configuration_allows_each(
     actions: list[str], arguments: dict[str, Any], allowed: bool
 ) -> None:

@@ -235,10 +235,8 @@ def test_without_the_extra_only_this_output_does_not_start(tmp_path: Path, monke
     [
         ({"brokers": []}, "brokers: expected a list of 1 to 16"),
         ({"brokers": ["http://a"]}, "expected a URL such as mqtts://"),
-        ({"brokers": ["mqtt://user:secret@a"]}, "no user"),
-        ({"brokers": ["mqtt://a:99999"]}, "expected a URL"),
-        ({"brokers": ["mqtt://a/path"]}, "expected a URL"),
-        ({"site": "a/b"}, "site: expected letters, digits"),
+        ({"brokers": ["mqtt://user:secret@a"]}, "no user"), ({"brokers": ["mqtt://a:99999"]}, "expected a URL"),
+        ({"brokers": ["mqtt://a/path"]}, "expected a URL"), ({"site": "a/b"}, "site: expected letters, digits"),
         ({"key_file": "/k"}, "key_file: expected cert_file as well"),
         ({"password_file": "/p"}, "password_file: expected user as well"),
         ({"devices": {"a b": {}}}, "devices: expected names of devices"),
@@ -250,7 +248,7 @@ def test_without_the_extra_only_this_output_does_not_start(tmp_path: Path, monke
         ({"devices": {"*": {"wole": "json"}}}, "wole"),
         ({"version": "3.1"}, "version: expected"),
     ],
-)
+)  # fmt: skip
 def test_bad_settings_are_named(given: Mapping[str, Any], words: str) -> None:
     (wrong,) = wrong_values(MqttOptions, given)
     assert words in str(wrong)

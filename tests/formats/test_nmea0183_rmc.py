@@ -43,17 +43,11 @@ def test_examples(data: bytes, expected: Rmc) -> None:
 @pytest.mark.parametrize(
     ("data", "fault"),
     [
-        (UBLOX.replace(b"083559", b"083558"), RmcFault.CHECKSUM),
-        (UBLOX.replace(b"*57", b"*58"), RmcFault.CHECKSUM),
-        (b"", RmcFault.FORM),
-        (b"$GPRMC", RmcFault.FORM),
-        (b"$GPGGA,083559.00,A,,,,,,,091202,,,A*00", RmcFault.FORM),
-        (b"\x00" + UBLOX, RmcFault.FORM),
-        (UBLOX + b"\r\n", RmcFault.FORM),
-        (UBLOX[:-2] + b"\n\r", RmcFault.FORM),
+        (UBLOX.replace(b"083559", b"083558"), RmcFault.CHECKSUM), (UBLOX.replace(b"*57", b"*58"), RmcFault.CHECKSUM),
+        (b"", RmcFault.FORM), (b"$GPRMC", RmcFault.FORM), (b"$GPGGA,083559.00,A,,,,,,,091202,,,A*00", RmcFault.FORM),
+        (b"\x00" + UBLOX, RmcFault.FORM), (UBLOX + b"\r\n", RmcFault.FORM), (UBLOX[:-2] + b"\n\r", RmcFault.FORM),
         (b"$GPRMC," + b"," * RMC_BYTES_MAX + b"*00", RmcFault.LENGTH),
-        (sentence("GPRMC,120000,A,,,,,,010125"), RmcFault.FORM),
-        (sentence("GPRMC,,V,,,,,,,,,,N"), RmcFault.CONTENT),
+        (sentence("GPRMC,120000,A,,,,,,010125"), RmcFault.FORM), (sentence("GPRMC,,V,,,,,,,,,,N"), RmcFault.CONTENT),
         (sentence("GPRMC,120000,V,,,,,,,,,,N"), RmcFault.CONTENT),
         (sentence("GPRMC,240000,A,,,,,,,010125,,,A"), RmcFault.CONTENT),
         (sentence("GPRMC,126000,A,,,,,,,010125,,,A"), RmcFault.CONTENT),
@@ -63,7 +57,7 @@ def test_examples(data: bytes, expected: Rmc) -> None:
         (sentence("GPRMC,120000,A,,,,,,,011325,,,A"), RmcFault.CONTENT),
         (sentence("GPRMC,120000,A,,,,,,,010025,,,A"), RmcFault.CONTENT),
     ],
-)
+)  # fmt: skip
 def test_faults_are_named(data: bytes, fault: RmcFault) -> None:
     assert parse(data) == fault
 

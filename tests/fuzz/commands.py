@@ -111,17 +111,14 @@ def seeds() -> list[bytes]:
     every += [_message(f"set-{n}", "set", given) for n, given in enumerate(settings)]
     twice = _message("a", "save", {})
     odd = [
-        b"",
-        SEPARATOR.join((TOPIC.encode(), b"", b"{}")),
-        SEPARATOR.join((TOPIC.encode(), b"", b"[" * 2000)),
+        b"", SEPARATOR.join((TOPIC.encode(), b"", b"{}")), SEPARATOR.join((TOPIC.encode(), b"", b"[" * 2000)),
         SEPARATOR.join((TOPIC.encode(), b"", b'"\xff"')),
         _message("b", "save", {"a": [1e300, None, "\U0001f600", {"b": 2**63}]}),
         _message("c", "save", {}, topic="imud/site/other/bow/command"),
-        _message("d", "save", {}, topic="imud/site/gw/stern/command"),
-        _message("e", "save", {}, wanted=f"{OWN}/mine"),
+        _message("d", "save", {}, topic="imud/site/gw/stern/command"), _message("e", "save", {}, wanted=f"{OWN}/mine"),
         _message("f", "save", {}, wanted="imud/site/other/bow/state"),
         _message("g", "save", {}).replace(str(UTC_NS + AGE_NS).encode(), str(2**70).encode()),
-    ]
+    ]  # fmt: skip
     return [
         *every[:6], b"\n".join(every), twice + b"\n" + twice, *odd, b"\n".join(odd),
         b"\n".join(_message(f"n{n}", "save", {}) for n in range(16)),

@@ -177,13 +177,11 @@ def seeds() -> list[bytes]:
     arguments = {"rate_hz": 100}
     params: list[tuple[str, dict[str, Any]]] = [
         ("watch", {"devices": ["imu0"], "fields": ["seq", "accel_m_s2"], "rate_hz": 10}),
-        ("watch", {"encoding": "binary"}),
-        ("poll", {"devices": ["imu1"], "fields": ["t_ns"]}),
-        ("events", {"devices": ["imu0"], "enable": False}),
-        ("notify", {"device": "imu0"}),
+        ("watch", {"encoding": "binary"}), ("poll", {"devices": ["imu1"], "fields": ["t_ns"]}),
+        ("events", {"devices": ["imu0"], "enable": False}), ("notify", {"device": "imu0"}),
         ("actions", {"device": "imu0"}),
         *(("command", {"device": "imu0", "name": name, "arguments": arguments}) for name in VERBS),
-    ]
+    ]  # fmt: skip
     requests += [{"jsonrpc": "2.0", "id": "a", "method": method, "params": given} for method, given in params]
     lines = [json.dumps(request).encode() + b"\n" for request in requests]
     odd = [

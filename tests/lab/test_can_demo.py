@@ -13,12 +13,10 @@ from tests.lab.demo import demo
 
 LIMIT_S = 90.0
 EVERY_PROTOCOL = {
-    ("hipnuc-canopen", "node 8"): "hipnuc-canopen:8",
-    ("hipnuc-canopen", "node 9"): "hipnuc-canopen:9",
-    ("hipnuc-j1939", "address 10"): "hipnuc-j1939:10",
-    ("hipnuc-nmea2000", "source 35"): "hipnuc-nmea2000:35",
+    ("hipnuc-canopen", "node 8"): "hipnuc-canopen:8", ("hipnuc-canopen", "node 9"): "hipnuc-canopen:9",
+    ("hipnuc-j1939", "address 10"): "hipnuc-j1939:10", ("hipnuc-nmea2000", "source 35"): "hipnuc-nmea2000:35",
     ("imu61x-can", "base_id 101"): "imu61x-can:101",
-}
+}  # fmt: skip
 
 
 @contextmanager

@@ -26,21 +26,15 @@ def angles(x_deg: float, y_deg: float) -> Vector3:
 @pytest.mark.parametrize(
     ("ranges", "euler_rad", "level", "verdict"),
     [
-        (BOTH, angles(0, 0), False, AlarmVerdict.RIGHT),
-        (BOTH, angles(0, 0), True, AlarmVerdict.STUCK_HIGH),
-        (BOTH, angles(0, -6), True, AlarmVerdict.RIGHT),
-        (BOTH, angles(12, 12), False, AlarmVerdict.STUCK_LOW),
-        (BOTH, angles(-12, 0), False, AlarmVerdict.STUCK_LOW),
-        (BOTH, angles(7, 0), True, AlarmVerdict.STUCK_HIGH),
-        (ONLY_Y, angles(20, 0), False, AlarmVerdict.RIGHT),
-        (ONLY_Y, angles(20, 0), True, AlarmVerdict.STUCK_HIGH),
-        (BOTH, angles(9.6, 0), False, AlarmVerdict.UNKNOWN),
-        (BOTH, angles(9.6, 7), False, AlarmVerdict.STUCK_LOW),
-        (BOTH, angles(10.4, 0), True, AlarmVerdict.UNKNOWN),
-        (BOTH, None, True, AlarmVerdict.UNKNOWN),
+        (BOTH, angles(0, 0), False, AlarmVerdict.RIGHT), (BOTH, angles(0, 0), True, AlarmVerdict.STUCK_HIGH),
+        (BOTH, angles(0, -6), True, AlarmVerdict.RIGHT), (BOTH, angles(12, 12), False, AlarmVerdict.STUCK_LOW),
+        (BOTH, angles(-12, 0), False, AlarmVerdict.STUCK_LOW), (BOTH, angles(7, 0), True, AlarmVerdict.STUCK_HIGH),
+        (ONLY_Y, angles(20, 0), False, AlarmVerdict.RIGHT), (ONLY_Y, angles(20, 0), True, AlarmVerdict.STUCK_HIGH),
+        (BOTH, angles(9.6, 0), False, AlarmVerdict.UNKNOWN), (BOTH, angles(9.6, 7), False, AlarmVerdict.STUCK_LOW),
+        (BOTH, angles(10.4, 0), True, AlarmVerdict.UNKNOWN), (BOTH, None, True, AlarmVerdict.UNKNOWN),
         ({}, angles(0, 0), True, AlarmVerdict.UNKNOWN),
     ],
-)
+)  # fmt: skip
 @pytest.mark.manual("B 2.2.4 alarm level")
 def test_verdicts(ranges: dict[str, AlarmRange], euler_rad: Vector3 | None, level: bool, verdict: AlarmVerdict) -> None:
     assert judge(ranges, euler_rad, level) is verdict

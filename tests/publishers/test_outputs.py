@@ -80,12 +80,10 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> Rig:
 BATCH = cast("Batch", object())
 EVENT = Event(0, "bow", EventKind.UP, "found")
 CALLS: dict[str, Callable[[Rig], None]] = {
-    "publish": lambda rig: rig.outputs.publish(BATCH),
-    "event": lambda rig: rig.outputs.send_event(EVENT),
-    "tick": lambda rig: rig.run(0),
-    "add_device": lambda rig: rig.outputs.add_device("mast", 1),
+    "publish": lambda rig: rig.outputs.publish(BATCH), "event": lambda rig: rig.outputs.send_event(EVENT),
+    "tick": lambda rig: rig.run(0), "add_device": lambda rig: rig.outputs.add_device("mast", 1),
     "remove_device": lambda rig: rig.outputs.remove_device("bow"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("method", CALLS)

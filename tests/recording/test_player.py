@@ -49,14 +49,10 @@ def bench(tmp_path: Path, recorded: pytest.MonkeyPatch) -> PolledBusBench:
 @pytest.mark.parametrize(
     "run",
     [
-        lambda: signals.test_every_sample_has_its_edge(settings=None),
-        signals.test_frames_answer_the_triggers_on_sin,
-        signals.test_an_alarm_is_an_event_and_shown_in_the_samples,
-        waiting.test_a_link_without_pause_has_no_hold,
-        can.test_lost_samples_are_counted_by_cause,
-        can.test_frames_from_before_a_loss_are_not_mixed_with_those_after,
-        can.test_bus_down_and_up,
-        can.test_a_suspend_of_the_host_is_a_gap_of_unknown_size,
+        lambda: signals.test_every_sample_has_its_edge(settings=None), signals.test_frames_answer_the_triggers_on_sin,
+        signals.test_an_alarm_is_an_event_and_shown_in_the_samples, waiting.test_a_link_without_pause_has_no_hold,
+        can.test_lost_samples_are_counted_by_cause, can.test_frames_from_before_a_loss_are_not_mixed_with_those_after,
+        can.test_bus_down_and_up, can.test_a_suspend_of_the_host_is_a_gap_of_unknown_size,
         watches.test_coordinates_are_described_and_an_unknown_value_is_reported,
     ],
     ids=[

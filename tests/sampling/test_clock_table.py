@@ -29,15 +29,13 @@ STALLS = Stalls(20 * NS_PER_S, 2 * NS_PER_S, 12 * NS_PER_S)
 UNTOLD = Link("usb, told 1 ms", timer_ns=16 * NS_PER_MS, told_hold_ns=NS_PER_MS)
 
 CELLS = [
-    (Cell("100 Hz to 400 to 50", FAST, CHANGED), 700.0),
-    (Cell("loaded host", USB_1, wake=LOADED), 600.0),
-    (Cell("loaded host", USB_16, wake=LOADED), 1200.0),
-    (Cell("wrong timer", UNTOLD), 2500.0),
+    (Cell("100 Hz to 400 to 50", FAST, CHANGED), 700.0), (Cell("loaded host", USB_1, wake=LOADED), 600.0),
+    (Cell("loaded host", USB_16, wake=LOADED), 1200.0), (Cell("wrong timer", UNTOLD), 2500.0),
     (Cell("TPDO, loaded host", CAN, TIMELESS, LOADED), 1500.0),
     (Cell("numbered, loaded host", CAN, Device(says="number"), LOADED), 800.0),
     (Cell("TPDO, stalls of 2 s", CAN, TIMELESS, stalls=STALLS), 300.0),
     (Cell("stalls of 2 s", UART, stalls=STALLS), 150.0),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.thorough)])

@@ -40,14 +40,12 @@ def _reseal(slot: bytes, seq: int) -> bytes:
 
 WHOLE = encode_slot(make_sample(2), 3)
 TORN = {
-    "number invalid": struct.pack("<Q", SEQ_INVALID) + WHOLE[8:],
-    "number not there yet": bytes(8) + WHOLE[8:],
+    "number invalid": struct.pack("<Q", SEQ_INVALID) + WHOLE[8:], "number not there yet": bytes(8) + WHOLE[8:],
     "payload of another sample": WHOLE[:8] + encode_slot(make_sample(66), 3)[8:],
     "payload half old": WHOLE[:128] + encode_slot(make_sample(66), 3)[128:],
-    "crc wrong": WHOLE[:-1] + bytes([WHOLE[-1] ^ 1]),
-    "whole, but of another round": _reseal(WHOLE, 2 + SLOTS),
+    "crc wrong": WHOLE[:-1] + bytes([WHOLE[-1] ^ 1]), "whole, but of another round": _reseal(WHOLE, 2 + SLOTS),
     "never written": bytes(SLOT_BYTES),
-}
+}  # fmt: skip
 """Damaged slots of sample 2 that a reader must reject, by the kind of damage."""
 
 

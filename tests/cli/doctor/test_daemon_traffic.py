@@ -85,14 +85,12 @@ def one_way(**changes: object) -> DeviceStatus:
 @pytest.mark.parametrize(
     ("status", "severities"),
     [
-        (one_way(), ["ok", "warning"]),
-        (one_way(identity={"product": "HI14"}), ["ok"]),
+        (one_way(), ["ok", "warning"]), (one_way(identity={"product": "HI14"}), ["ok"]),
         (one_way(ledger=one_way().ledger | {"frames_in_replies": 1}), ["ok"]),
-        (one_way(ledger=one_way().ledger | {"samples": 6000}), ["ok"]),
-        (one_way(state=DeviceState.SILENT), ["ok"]),
+        (one_way(ledger=one_way().ledger | {"samples": 6000}), ["ok"]), (one_way(state=DeviceState.SILENT), ["ok"]),
         (one_way(expected_rate_hz=0.0, rate_hz=0.0), ["ok"]),
     ],
-)
+)  # fmt: skip
 def test_a_device_that_never_answers_does_not_hear_imud(
     machine: Machine, status: DeviceStatus, severities: list[str]
 ) -> None:

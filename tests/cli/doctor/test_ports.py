@@ -92,15 +92,13 @@ def test_root_may_an_unknown_user_is_not_judged_and_a_unit_can_have_no_rules(bow
 @pytest.mark.parametrize(
     ("line", "severity", "words"),
     [
-        ("DeviceAllow=char-ttyUSB rw", "ok", "allows"),
-        ("DeviceAllow=char-tty* rw", "ok", "allows"),
-        ("DeviceAllow=/dev/ttyUSB0 rw", "ok", "allows"),
-        ("DeviceAllow=char-ttyACM rw", "error", "EPERM"),
+        ("DeviceAllow=char-ttyUSB rw", "ok", "allows"), ("DeviceAllow=char-tty* rw", "ok", "allows"),
+        ("DeviceAllow=/dev/ttyUSB0 rw", "ok", "allows"), ("DeviceAllow=char-ttyACM rw", "error", "EPERM"),
         ("DeviceAllow=/dev/ttyUSB1 rw", "error", "EPERM"),
         ("DeviceAllow=char-ttyUSB r", "error", "`DeviceAllow=char-ttyUSB rw`"),
         ("DevicePolicy=closed", "error", "EPERM"),
     ],
-)
+)  # fmt: skip
 def test_rules_of_the_unit(bow: Machine, line: str, severity: str, words: str) -> None:
     bow.write("/proc/devices", "Character devices:\n  4 ttyS\n188 ttyUSB\n\nBlock devices:\n  8 sd\n")
     bow.unit(line)

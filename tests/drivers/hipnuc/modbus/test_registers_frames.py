@@ -34,22 +34,14 @@ from imud.formats.modbus import framed
 from imud.model.errors import BadArgument, DeviceRefused
 
 PRINTED = [  # sections 4.3.1 to 4.5, in their order
-    ("50 06 00 00 00 00 84 4B", save()),
-    ("50 06 00 00 00 01 45 8B", send_control(FACTORY_RESET)),
-    ("50 06 00 00 00 FF C4 0B", send_control(RESTART)),
-    ("50 06 00 04 00 00 C5 8A", set_baud(4800)),
-    ("50 06 00 04 00 01 04 4A", set_baud(9600)),
-    ("50 06 00 04 00 02 44 4B", set_baud(19200)),
-    ("50 06 00 04 00 03 85 8B", set_baud(38400)),
-    ("50 06 00 04 00 04 C4 49", set_baud(57600)),
-    ("50 06 00 04 00 05 05 89", set_baud(115200)),
-    ("50 06 00 04 00 06 45 88", set_baud(230400)),
-    ("50 06 00 04 00 07 84 48", set_baud(460800)),
-    ("50 06 00 04 00 08 C4 4C", set_baud(921600)),
-    ("50 06 00 05 00 50 94 76", set_id(0x50)),
-    ("50 06 00 05 00 51 55 B6", set_id(0x51)),
-    ("50 06 00 05 00 52 15 B7", set_id(0x52)),
-    ("50 06 00 05 00 53 D4 77", set_id(0x53)),
+    ("50 06 00 00 00 00 84 4B", save()), ("50 06 00 00 00 01 45 8B", send_control(FACTORY_RESET)),
+    ("50 06 00 00 00 FF C4 0B", send_control(RESTART)), ("50 06 00 04 00 00 C5 8A", set_baud(4800)),
+    ("50 06 00 04 00 01 04 4A", set_baud(9600)), ("50 06 00 04 00 02 44 4B", set_baud(19200)),
+    ("50 06 00 04 00 03 85 8B", set_baud(38400)), ("50 06 00 04 00 04 C4 49", set_baud(57600)),
+    ("50 06 00 04 00 05 05 89", set_baud(115200)), ("50 06 00 04 00 06 45 88", set_baud(230400)),
+    ("50 06 00 04 00 07 84 48", set_baud(460800)), ("50 06 00 04 00 08 C4 4C", set_baud(921600)),
+    ("50 06 00 05 00 50 94 76", set_id(0x50)), ("50 06 00 05 00 51 55 B6", set_id(0x51)),
+    ("50 06 00 05 00 52 15 B7", set_id(0x52)), ("50 06 00 05 00 53 D4 77", set_id(0x53)),
     ("50 06 00 A6 00 00 64 68", set_mounting(LineMounting.LEVEL)),
     ("50 06 00 A6 00 01 A5 A8", set_mounting(LineMounting.Y_DOWN)),
     ("50 06 00 A6 00 02 E5 A9", set_mounting(LineMounting.Y_UP)),
@@ -59,9 +51,8 @@ PRINTED = [  # sections 4.3.1 to 4.5, in their order
     ("50 06 00 A5 00 05 54 6B", auto_level(LevelReset.CANCEL)),
     ("50 06 00 06 00 00 64 4A", set_heading_mode(AttitudeMode.SIX_AXIS)),
     ("50 06 00 06 00 01 A5 8A", set_heading_mode(AttitudeMode.NINE_AXIS)),
-    ("50 03 00 70 00 14 49 9F", read_registers(0x70, 0x14)),
-    ("50 03 00 34 00 18 09 8F", read_registers(0x34, 0x18)),
-]
+    ("50 03 00 70 00 14 49 9F", read_registers(0x70, 0x14)), ("50 03 00 34 00 18 09 8F", read_registers(0x34, 0x18)),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("printed", "asked"), PRINTED, ids=[row[0] for row in PRINTED])
@@ -104,16 +95,12 @@ def test_requests_to_all() -> None:
         (lambda: serial_bytes("what is this one"), "16 hexadecimal digits"),
         (lambda: set_id_by_serial("047D955F8D2A1708", 0), "1 … 247"),
         (lambda: set_id_by_serial("047D955F8D2A1708", 248), "1 … 247"),
-        (lambda: randomise_ids(9, 9), "below the highest"),
-        (lambda: randomise_ids(0, 9), "1 … 247"),
-        (lambda: randomise_ids(True, 9), "1 … 247"),
-        (lambda: next(set_id(129)), "1 … 128"),
-        (lambda: next(set_id(0)), "1 … 128"),
-        (lambda: read_registers(0, 126), "1 … 125"),
-        (lambda: read_registers(0xFFFF, 2), "0xFFFF"),
-        (lambda: write_register(0, 0x10000), "0xFFFF"),
+        (lambda: randomise_ids(9, 9), "below the highest"), (lambda: randomise_ids(0, 9), "1 … 247"),
+        (lambda: randomise_ids(True, 9), "1 … 247"), (lambda: next(set_id(129)), "1 … 128"),
+        (lambda: next(set_id(0)), "1 … 128"), (lambda: read_registers(0, 126), "1 … 125"),
+        (lambda: read_registers(0xFFFF, 2), "0xFFFF"), (lambda: write_register(0, 0x10000), "0xFFFF"),
     ],
-)
+)  # fmt: skip
 def test_invalid_requests(begin: object, names: str) -> None:
     assert callable(begin)
     with pytest.raises(BadArgument) as refused:

@@ -142,25 +142,19 @@ def test_a_fixed_rate_in_the_configuration_is_to_be_changed() -> None:
 @pytest.mark.parametrize(
     ("name", "arguments", "named"),
     [
-        ("baud", {"baud": 9600}, "one of 115200, 230400, 460800, 921600, 1500000"),
-        ("baud", {"baud": True}, "baud"),
-        ("rate", {"rate_hz": 0}, "one of 1, 10, 50, 100, 200, 400"),
-        ("rate", {"rate_hz": 100.5}, "output_rate_hz"),
-        ("bus", {"bus": 1}, '"spi"'),
-        ("i2c_address", {"address": 0x1C}, "address"),
-        ("i2c_address", {"address": "0x1c"}, "address"),
-        ("i2c_address", {"address": "18"}, "address"),
+        ("baud", {"baud": 9600}, "one of 115200, 230400, 460800, 921600, 1500000"), ("baud", {"baud": True}, "baud"),
+        ("rate", {"rate_hz": 0}, "one of 1, 10, 50, 100, 200, 400"), ("rate", {"rate_hz": 100.5}, "output_rate_hz"),
+        ("bus", {"bus": 1}, '"spi"'), ("i2c_address", {"address": 0x1C}, "address"),
+        ("i2c_address", {"address": "0x1c"}, "address"), ("i2c_address", {"address": "18"}, "address"),
         ("filter", {"accel_filter": 16, "gyro_filter": 0}, "accel_filter"),
         ("filter", {"accel_filter": "9 Hz", "gyro_filter": 0}, '"0.2 Hz", "1 Hz", "2 Hz", "5 Hz", "10 Hz", "15 Hz"'),
         ("filter", {"accel_filter": -1, "gyro_filter": 0}, "accel_filter"),
         ("filter", {"accel_filter": 0, "gyro_filter": True}, "gyro_filter"),
-        ("heading", {"heading_deg": -0.1}, "from 0 to 360"),
-        ("heading", {"heading_deg": 360.1}, "from 0 to 360"),
-        ("heading", {"heading_deg": nan}, "from 0 to 360"),
-        ("heading", {"heading_deg": True}, "from 0 to 360"),
+        ("heading", {"heading_deg": -0.1}, "from 0 to 360"), ("heading", {"heading_deg": 360.1}, "from 0 to 360"),
+        ("heading", {"heading_deg": nan}, "from 0 to 360"), ("heading", {"heading_deg": True}, "from 0 to 360"),
         ("heading", {"heading_deg": "90"}, "from 0 to 360"),
     ],
-)
+)  # fmt: skip
 @pytest.mark.manual("A 1.6 other values")
 def test_unsupported_values_are_rejected(name: str, arguments: dict[str, Any], named: str) -> None:
     far = imu61x_bench()
