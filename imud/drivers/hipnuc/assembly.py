@@ -319,16 +319,21 @@ class _Kind:
         """Return whether an anchor at `t_ns` waits for the kind. `is_even`: one period after the previous anchor."""
         if not self.is_near or not self.every or self.seen_ns is None or self.missed >= AWAY_PERIODS:
             return False
+        if self.every == 1:
+            return True
         since = round((t_ns - self.seen_ns) / period_ns)
         # after a loss, the time shows the number of periods; if frames arrive together, the number of anchors
         by_count = not is_even and self.anchors - self.leads == self.every
-        return self.every == 1 or by_count or (since > 0 and since % self.every == 0)
+        return by_count or (since > 0 and since % self.every == 0)
 
     def arrive(self, t_ns: int, anchor_ns: int, period_ns: int) -> None:
         """Add the arrival of a frame. `anchor_ns`: arrival of the newest anchor."""
         offset_ns = (t_ns - anchor_ns) % period_ns
-        is_near = min(offset_ns, period_ns - offset_ns) <= NEAR_SHARE * period_ns
-        self.near = min(self.near + 1, NEAR_FRAMES_MAX) if is_near else max(self.near - FAR_WEIGHT, 0)
+        if 4 * offset_ns <= period_ns or 4 * offset_ns >= 3 * period_ns:  # NEAR_SHARE
+            if self.near < NEAR_FRAMES_MAX:
+                self.near += 1
+        else:
+            self.near = max(self.near - FAR_WEIGHT, 0)
         if self.seen_ns is not None:
             self.step_ns = t_ns - self.seen_ns
             late_ns = self.behind_ns + self.step_ns - self.every * period_ns
@@ -338,7 +343,8 @@ class _Kind:
             self._learn(round(self.step_ns / period_ns))
         self.seen_ns, self.missed, self.anchors = t_ns, 0, 0
         step_ns, previous_ns = self.step_ns, self.alternation.newest[1]
-        self.alternation.add(step_ns, differs=min(step_ns, previous_ns) > PHASE_LEAST * (step_ns + previous_ns))
+        least_ns = PHASE_LEAST * (step_ns + previous_ns)
+        self.alternation.add(step_ns, differs=step_ns > least_ns and previous_ns > least_ns)
 
     def _learn(self, step: int) -> None:
         self.run = self.run + 1 if step == self.step else 1
@@ -448,9 +454,10 @@ class Assembly:
 
     def _is_copy(self, kind: int, data: bytes, t_rx_ns: int) -> bool:
         """Return whether the bus repeated the newest frame."""
-        if self._newest is None or (kind, data) != self._newest[:2]:
+        newest = self._newest
+        if newest is None or newest[0] != kind or newest[1] != data:
             return False
-        known, after_ns = self._kinds.get(kind), t_rx_ns - self._newest[2]
+        known, after_ns = self._kinds.get(kind), t_rx_ns - newest[2]
         if known is None or not known.every or self._anchor is None:
             return after_ns < COPY_NS
         period_ns = known.every * self._cadence.period_ns
@@ -462,8 +469,12 @@ class Assembly:
         kinds, parts, period_ns = self._kinds, self._parts, self._cadence.period_ns
         known = kinds.get(kind)
         anchor = parts.get(self._anchor) if self._anchor is not None else None
-        near_ns = [part.t_ns for number, part in parts.items() if kinds[number].is_near]
-        age_ns = t_rx_ns - near_ns[0] if near_ns and known is not None and known.is_near else 0
+        age_ns = 0
+        if known is not None and known.near >= NEAR_FRAMES:
+            for number, part in parts.items():
+                if kinds[number].near >= NEAR_FRAMES:
+                    age_ns = t_rx_ns - part.t_ns
+                    break
         if known is not None and sid is not None and known.has_shared_sid:
             for number, part in parts.items():
                 if part.sid is not None and kinds[number].has_shared_sid:
@@ -511,7 +522,9 @@ class Assembly:
             first_ns = anchor.t_ns
             self._strays = max(self._strays - 1, 0)
             self._compare_sids(anchor)
-            shares = any(one.has_shared_sid for number, one in kinds.items() if number != self._anchor)
+            shares = anchor.sid is not None and any(
+                one.has_shared_sid for number, one in kinds.items() if number != self._anchor
+            )
             self._count_losses(first_ns, anchor.sid, is_instant=shares)
         elif self._anchor is not None:
             burst_ns = [part.t_ns for kind, part in parts.items() if kinds[kind].is_near and kinds[kind].every]

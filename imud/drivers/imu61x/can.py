@@ -47,7 +47,13 @@ from imud.drivers.imu61x.common import (
     SHEET,
     relative_heading,
 )
-from imud.drivers.value_limits import is_possible, possible_temperature_c, scaled
+from imud.drivers.value_limits import (
+    TEMPERATURE_LIMITS_C,
+    VALUE_HIGH_BYTES,
+    is_possible,
+    possible_temperature_c,
+    scaled,
+)
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame
 from imud.model.ledger import Ledger
 from imud.model.options import Options
@@ -68,6 +74,8 @@ SURE_SETS: Final = 8  # number of sets before the learned times count: a late se
 _NEVER_NS: Final = 1 << 63
 ALTERNATIONS: Final = 32  # number of alternating INDEX values after which two devices have the same identifiers
 
+TEMPERATURE_COUNTS: Final = tuple(round(limit_c / C_PER_COUNT) for limit_c in TEMPERATURE_LIMITS_C)
+_HIGH_BYTES: Final = slice(3, 36, 4)  # high bytes of the nine floats of a set
 _CLOSING: Final = SET_FRAMES - 1
 _FLOATS: Final = tuple(struct.Struct(layout) for layout in ("<2f", "<2f", "<2f", "<2f", "<f4x"))
 _IN_ORDER: Final = (0, 1, 2, 3)
@@ -197,7 +205,8 @@ class Imu61xCanCodec:
         ledger.frames_pending -= _CLOSING
         ledger.frames_in_samples += SET_FRAMES
         *values, temperature, _ = SET.unpack(raw)
-        if is_possible(values) and possible_temperature_c(temperature * C_PER_COUNT) is not None:
+        low, high = TEMPERATURE_COUNTS
+        if low < temperature < high and not raw[_HIGH_BYTES].strip(VALUE_HIGH_BYTES):
             return (_measurement(values, temperature, index, first_ns),)
         return (*self._not_finite(raw), _measurement(values, temperature, index, first_ns))
 

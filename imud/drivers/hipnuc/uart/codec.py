@@ -42,7 +42,7 @@ from imud.drivers.hipnuc.common import (
     temperature_beside,
 )
 from imud.drivers.hipnuc.uart.replies import LINE_CHARACTERS_MAX, LineFinder
-from imud.drivers.value_limits import is_possible, values_possible
+from imud.drivers.value_limits import VALUE_HIGH_BYTES, is_possible, values_possible
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Quaternion, Vector3
@@ -122,6 +122,16 @@ def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int
         )  # fmt: skip
         trailing -= size
     return made
+
+
+def _run_possible(hi91s: bytes) -> bool:
+    """Return whether all floats of adjacent sub-packets are possible."""
+    high_bytes = bytearray(hi91s[_RUN_HIGH_BYTES])
+    if values_possible(high_bytes):
+        return True
+    # a large system_time and a negative temperature have other high bytes
+    del high_bytes[_RUN_TEMPERATURES], high_bytes[_RUN_TIMES]
+    return values_possible(high_bytes)
 
 
 def _decode_hi91(data: bytes, at: int, word_is_status: bool, size: int, trailing: int) -> tuple[Measurement, bool]:
@@ -320,7 +330,7 @@ class HipnucCodec:
                 crc16_xmodem(payload, _RUN_SEED) == data[4] | data[5] << 8
                 and payload[0] == TAG_HI91
                 and payload[_PRESSURE_HIGH_BYTE] not in _NOT_FINITE_BYTES
-                and values_possible(payload[_HIGH_BYTES])
+                and not payload[_HIGH_BYTES].strip(VALUE_HIGH_BYTES)
             ):
                 ledger = self.ledger
                 ledger.bytes_in_good_frames += _HI91_FRAME_BYTES
@@ -397,9 +407,7 @@ class HipnucCodec:
         count = len(payloads)
         end = at + count * size
         hi91s = b"".join(payloads)
-        high_bytes = bytearray(hi91s[_RUN_HIGH_BYTES])
-        del high_bytes[_RUN_TEMPERATURES], high_bytes[_RUN_TIMES]
-        if not values_possible(high_bytes):  # `_decode_payload` checks each value at three times the cost
+        if not _run_possible(hi91s):  # `_decode_payload` checks each value at three times the cost
             for begin in range(at, end, size):
                 self._decode_payload(data, begin, begin + size, events)
             return end

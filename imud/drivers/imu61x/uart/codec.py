@@ -27,7 +27,14 @@ from imud.attitude.rotation import quat_from_euler_zyx
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
 from imud.contracts.script import Message, ReplyFrame
 from imud.drivers.imu61x.common import CRC_INVERSION, CRC_START, M_S2_PER_G, RAD_S_PER_DEG_S, crc32
-from imud.drivers.value_limits import possible_temperature_c, scaled, temperatures_possible, values_possible
+from imud.drivers.value_limits import (
+    TEMPERATURE_HIGH_BYTES,
+    VALUE_HIGH_BYTES,
+    possible_temperature_c,
+    scaled,
+    temperatures_possible,
+    values_possible,
+)
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
@@ -328,7 +335,7 @@ _ONLY: Final = struct.Struct(
     f"<{HEADER.size}xI10f{CRC_BYTES}x"
 )  # timer and 10 floats of one frame; skips header and CRC
 # high bytes of the temperature and of the other floats in a frame
-_ONLY_TEMPERATURE: Final = slice(AHRS_FRAME_BYTES - CRC_BYTES - 1, AHRS_FRAME_BYTES - CRC_BYTES)
+_ONLY_TEMPERATURE: Final = AHRS_FRAME_BYTES - CRC_BYTES - 1
 _ONLY_HIGH_BYTES: Final = slice(HEADER.size + 7, AHRS_FRAME_BYTES - CRC_BYTES - 4, 4)
 # pattern of adjacent AHRS frames by their headers
 _RUN: Final = re.compile(rb"(?s:%b.{%d})+" % (re.escape(_HEAD), AHRS_FRAME_BYTES - HEADER.size))
@@ -365,8 +372,8 @@ class Imu61xCodec:
             and self._finder.idle
             and inverted_crc32(data, CRC_START) == CRC_INVERSION
             and data.startswith(_HEAD)
-            and values_possible(data[_ONLY_HIGH_BYTES])
-            and temperatures_possible(data[_ONLY_TEMPERATURE])
+            and not data[_ONLY_HIGH_BYTES].strip(VALUE_HIGH_BYTES)
+            and data[_ONLY_TEMPERATURE] in TEMPERATURE_HIGH_BYTES
         ):
             ledger = self.ledger
             ledger.bytes_in += AHRS_FRAME_BYTES
