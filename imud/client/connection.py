@@ -250,6 +250,7 @@ class Client:
         self._fds: list[int] = []
         self._framed = False
         self._id = 0
+        self._binary_ids: set[int] = set()  # requests whose reply starts binary frames, also if the reply is late
         self._sock = _connect(self.path, timeout_s)
         with ExitStack() as undo:
             undo.callback(self.close)
@@ -297,7 +298,11 @@ class Client:
     def call(self, method: str, **params: object) -> Any:
         """Call a method and return its result as JSON values. Leave out the parameters that are None."""
         self._id += 1
+        while self._fds:  # descriptors of late replies
+            os.close(self._fds.pop())
         chosen = {name: value for name, value in params.items() if value is not None}
+        if method == "watch" and chosen.get("encoding") == "binary":
+            self._binary_ids.add(self._id)
         self._send(line_of(encode_request(method, chosen, self._id)))
         deadline_s = monotonic() + self.timeout_s
         while True:
@@ -332,12 +337,14 @@ class Client:
         - `timeout_s`: the iterator raises TimeoutError if no sample arrives in this time.
         """
         wanted = None if fields is None else sorted({*fields, "t_err_ns", "sync", "t_rx_ns", "utc_ns"})
-        reply = self._request(
-            "watch", WatchReply, devices=_listed(devices), fields=wanted, rate_hz=_finite(rate_hz), encoding=encoding,
-            convention=convention, latency_ms=_finite(latency_ms),
-        )  # fmt: skip
-        if encoding == "binary":
-            self._framed = True
+        try:
+            reply = self._request(
+                "watch", WatchReply, devices=_listed(devices), fields=wanted, rate_hz=_finite(rate_hz),
+                encoding=encoding, convention=convention, latency_ms=_finite(latency_ms),
+            )  # fmt: skip
+        except TimeoutError:
+            self._end_watch()  # the daemon may already send the samples of the new subscription
+            raise
         _check_convention(reply.convention, convention)
         self._end_watch()
         while self.kept_message(Watch.NAMES) is not None:
@@ -453,7 +460,10 @@ class Client:
             self._sock.settimeout(self.timeout_s)
             self._sock.sendall(data)
         except TimeoutError:
-            raise TimeoutError(f"{self.path}: the daemon did not read the request for {self.timeout_s} s") from None
+            self.close()  # the daemon may have a part of the request, so it cannot decode another one
+            raise TimeoutError(
+                f"{self.path}: the daemon did not read the request for {self.timeout_s} s; the connection is closed"
+            ) from None
         except OSError as error:
             raise _lost(self.path, error) from error
 
@@ -485,7 +495,10 @@ class Client:
                 return None
             line = bytes(buffer[:end])
             del buffer[: end + 1]
-            return self._object(line)
+            message = self._object(line)
+            number = message.get("id")
+            self._framed = "result" in message and isinstance(number, int) and number in self._binary_ids
+            return message
         if len(buffer) < FRAME_HEADER.size:
             return None
         (length,) = FRAME_HEADER.unpack_from(buffer)

@@ -13,6 +13,7 @@ import pytest
 from msgspec.structs import replace
 
 from imud.client.connection import Client, EventStream, default_path, event_of
+from imud.client import connection
 from imud.contracts.publisher import Batch
 from imud.formats.jsonrpc import RpcError
 from imud.model.errors import LinkDenied, LinkMissing, ServerError
@@ -330,3 +331,24 @@ def test_a_reply_without_its_descriptor_is_an_error(tmp_path: Path) -> None:
     missing = pytest.raises(ServerError, match=r"expected a descriptor in the reply to record\.snapshot, got a reply")
     with answering(tmp_path / "s", HELLO + reply), Client(tmp_path / "s", timeout_s=60) as client, missing:
         client.snapshot()
+
+
+def test_a_late_reply_to_watch_leaves_a_usable_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, peer = socket.socketpair()
+    monkeypatch.setattr(connection, "_connect", lambda path, timeout_s: ours)
+    peer.sendall(HELLO)
+    with peer, Client("/daemon") as client:
+        client.timeout_s = 0.0
+        with pytest.raises(TimeoutError, match="no watch within"):
+            client.watch()
+        client.timeout_s = 60.0
+        status = b'{"id":2,"result":{"now_ns":5}}'
+        late = b'{"id":1,"result":{"devices":{"a":0}}}\n'
+        peer.sendall(late + len(status).to_bytes(4, "little") + status)
+        assert client.status() == {"now_ns": 5}
+        peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
+        client.timeout_s = 0.001
+        with pytest.raises(TimeoutError, match="the connection is closed"):
+            client.call("status", filler="x" * 1_000_000)
+        with pytest.raises(LinkMissing):
+            client.status()
