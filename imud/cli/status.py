@@ -14,6 +14,7 @@ from imud.contracts.status import (
     DeviceStatus,
     FrameStatus,
     LinesStatus,
+    MqttStatus,
     PollingStatus,
     SerialLineCounters,
     UtcStatus,
@@ -38,13 +39,18 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(msgspec.json.encode(answer).decode())
     else:
-        print(page(devices))
+        print(page(devices, msgspec.convert(answer.get("mqtt", []), list[MqttStatus])))
     return 0 if all(d.state in WELL and closes(d.ledger) for d in devices) else 1
 
 
-def page(devices: Sequence[DeviceStatus]) -> str:
-    """Format the blocks of all devices. If a device does not run, add the next step."""
+def page(devices: Sequence[DeviceStatus], mqtts: Sequence[MqttStatus] = ()) -> str:
+    """Format the blocks of all devices and the problems of the output `mqtt`. If a device does not run, add the next
+    step."""
     parts = [block(device) for device in devices]
+    for mqtt in mqtts:
+        problems = [one for one in (mqtt.problem, mqtt.spool_problem) if one]
+        problems += [f"the broker refuses messages of {topic}: {reason}" for topic, reason in mqtt.refused.items()]
+        parts += ["\n".join(paragraph("mqtt: ", problem)) for problem in problems]
     if any(device.state not in WELL for device in devices):
         parts.append("to find the cause and the next step, run `sudo imud doctor`")
     return "\n\n".join(parts)

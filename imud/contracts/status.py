@@ -262,6 +262,7 @@ class MqttStatus(msgspec.Struct, frozen=True):
     reconnects: int  # number of connections after the first connection
     commands: int = 0  # number of requested commands that imud ran or tried to run
     commands_refused: int = 0  # number of rejected requests
+    refused: dict[str, str] = {}  # reason for each topic that the broker refuses; imud sends all other messages
 
 
 class ClientStatus(msgspec.Struct, frozen=True):

@@ -32,6 +32,7 @@ UNANSWERED: Final = (
     "or a client certificate"
 )
 REFUSED: Final = 0x80  # lowest reason code of a refusal (MQTT 5.0, section 2.4)
+QUOTA: Final = 0x97  # reason code "Quota exceeded" (MQTT 5.0, section 2.4)
 # Maximum length of a file of certificates, bytes. The file with all authorities of Debian has 0.2 MB.
 PEM_BYTES: Final = 4 << 20
 MQTT_5: Final = 5  # value of `MQTTv5` in paho-mqtt: protocol version in CONNECT (MQTT 5.0, section 3.1.2.2)
@@ -40,6 +41,10 @@ PASSWORD_BYTES: Final = 65_535  # maximum length of a password, bytes (MQTT 5.0,
 
 class BrokerError(Exception):
     """Cannot connect to a broker, or the broker ended the connection. Example: connection refused."""
+
+
+class MessageRefused(Exception):
+    """The broker does not accept a message. The connection continues."""
 
 
 class ReaderAccess(msgspec.Struct, frozen=True):
@@ -220,6 +225,7 @@ class BrokerConnection(Protocol):
     acknowledged: list[int]  # Packet identifiers of acknowledged messages. The reader clears the list.
     in_flight_max: int  # maximum number of messages without an acknowledgement
     received: list[Received]  # Messages received from subscriptions. The reader clears the list.
+    refused: list[tuple[int, str]]  # packet identifiers of refused messages with the reason; the reader clears the list
 
     def subscribe(self, topic: str) -> None:
         """Subscribe to a topic. Raises BrokerError."""
@@ -228,12 +234,13 @@ class BrokerConnection(Protocol):
     def publish(
         self, topic: str, payload: bytes, content_type: str, *, retain: bool, correlation: bytes | None = None
     ) -> int:
-        """Send a message with QoS 1. Return its packet identifier. Raises BrokerError."""
+        """Send a message with QoS 1. Return its packet identifier. Raises BrokerError, and MessageRefused if the
+        message is longer than the broker accepts."""
         ...
 
     def wait(self, seconds: float) -> None:
         """Read and write pending data. Return after `seconds`, after data arrived, or after `ring`. Raises BrokerError
-        if the connection is lost or if the broker refused a message."""
+        if the connection is lost."""
         ...
 
     def ring(self) -> None:
@@ -269,6 +276,7 @@ class PahoConnection:
         self.acknowledged: list[int] = []
         self.in_flight_max = IN_FLIGHT_MAX
         self.received: list[Received] = []
+        self.refused: list[tuple[int, str]] = []
         self._broker = broker
         self._is_v5 = settings.version == "5"
         self._answered = self._closed = self._woke = False
@@ -323,13 +331,13 @@ class PahoConnection:
     def publish(
         self, topic: str, payload: bytes, content_type: str, *, retain: bool, correlation: bytes | None = None
     ) -> int:
-        """Send a message with QoS 1. Return its packet identifier. Raises BrokerError."""
+        """Send a message with QoS 1. Return its packet identifier. Raises BrokerError or MessageRefused."""
         properties = None
         if self._is_v5:
             given = {"ContentType": content_type or None, "CorrelationData": correlation}
             properties = properties_of("PUBLISH", **{name: one for name, one in given.items() if one is not None})
         if len(topic) + len(payload) + OVERHEAD_BYTES > self._packet_bytes:
-            self._fail(
+            raise MessageRefused(
                 f"the broker accepts messages of at most {self._packet_bytes} bytes, got a message of {topic} with "
                 f"{len(payload)}: raise the limit of the broker"
             )
@@ -412,7 +420,10 @@ class PahoConnection:
     def _on_publish(self, _client: Any, _data: Any, mid: int, reason: Any, _properties: Any) -> None:
         topic = self._topics.pop(mid, "")
         if reason is not None and reason.value >= REFUSED:
-            self._problem = self._problem or f"the broker refuses messages of {topic}: {reason}"
+            if reason.value == QUOTA:  # the broker can accept the same message later
+                self._problem = self._problem or f"the broker refuses messages of {topic}: {reason}"
+            else:
+                self.refused.append((mid, str(reason)))
             return
         self.acknowledged.append(mid)
 

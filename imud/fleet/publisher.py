@@ -155,6 +155,7 @@ class MqttPublisher:
         self._state_ns = self._all_ns = 0
         self._is_changed = True  # True after an event of STATE_KINDS
         self._spool_problem = self._problem = ""
+        self._refused: Mapping[str, str] = {}  # reported topics that the broker refuses
         self._lock = -1
 
     # --- publisher ----------------------------------------------------------------------------------------------------
@@ -268,6 +269,7 @@ class MqttPublisher:
             sender.broker, sender.problem, writer.problem, self._queue.queued, spool.spooled, sender.sent,
             sender.acknowledged, spool.messages, spool.used_bytes, spool.thinned, dropped, sender.reconnects,
             commands.run if commands is not None else 0, commands.refused if commands is not None else 0,
+            dict(sender.refused),
         )  # fmt: skip
 
     # --- states ------------------------------------------------------------------------------------------------------
@@ -342,6 +344,14 @@ class MqttPublisher:
                 now_ns, f"the spool was damaged; imud created a new spool and renamed the old one to {spool.set_aside}"
             )
             spool.set_aside = ""
+        before_refused, self._refused = self._refused, sender.refused
+        for topic in sender.refused.keys() - before_refused.keys():
+            self._raise(
+                now_ns, f"the broker refuses messages of {topic}: {sender.refused[topic]}; imud sends all other "
+                f"messages and tries this topic again later; check the access rights of the gateway",
+            )  # fmt: skip
+        for topic in before_refused.keys() - sender.refused.keys():
+            self._raise(now_ns, f"the broker accepts messages of {topic} again")
         if sender.problem != self._problem:
             self._problem = sender.problem
             if sender.problem:

@@ -8,18 +8,22 @@ next session the writer gives messages without an acknowledgement again. The sen
 sessions.
 """
 
+import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
-from typing import Final
+from collections.abc import Callable, Collection, Iterator, Mapping
+from itertools import chain
+from typing import Final, NamedTuple
 
-from imud.fleet.broker import BrokerConnection, BrokerError, BrokerTurn, Connect, Will
+from imud.fleet.broker import BrokerConnection, BrokerError, BrokerTurn, Connect, MessageRefused, Will
 from imud.fleet.commands import CommandChannel, CommandReply
 from imud.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
 from imud.fleet.settings import MqttOptions
 from imud.fleet.spool import SpoolRow
 from imud.host.threads import WakeEvent
 from imud.model.units import NS_PER_S
+
+log = logging.getLogger(__name__)
 
 REPLIES_MAX: Final = 32  # Maximum number of replies that wait for a connection. The sender drops the oldest.
 OUTBOX_MAX: Final = 60  # maximum number of messages in memory, 6 MB at most: three times IN_FLIGHT_MAX
@@ -30,6 +34,105 @@ CLOSE_S: Final = 0.5
 # connection if another client connects with the same client ID. Most brokers do not report this reason.
 SHORT_RUNS: Final = 3
 FAREWELL_S: Final = 0.3  # part of CLOSE_S for the acknowledgement of the farewell, s
+# Maximum time without any acknowledgement while messages are in flight, s. A message of 130 kB takes 52 s at 20 kbit/s.
+UNANSWERED_S: Final = 60.0
+
+
+# Number of lost connections in sequence with only one topic in flight, after which imud skips the topic
+LOSSES_MAX: Final = 3
+# Time for which imud skips a refused topic, ns. It doubles with each further refusal: a test can cost a connection.
+SKIP_NS: Final = 600 * NS_PER_S
+SKIP_MOST_NS: Final = 24 * 3600 * NS_PER_S
+# Maximum number of refused topics, and of suspected topics. imud forgets the oldest.
+TOPICS_MAX: Final = 500
+
+
+class _Refusal(NamedTuple):
+    """Refusal of a topic."""
+
+    problem: str  # reason of the refusal, one sentence
+    skip_ns: int  # time for which imud skips the topic
+    end_ns: int  # CLOCK_MONOTONIC of the next test
+
+
+class TopicRefusals:
+    """Topics that the broker refuses, and suspected topics. Synchronization: the caller holds its lock.
+
+    A broker refuses a message with a reason code (MQTT 5), or it closes the connection. In the second case several
+    messages can be in flight. The sender then sends the next message of each of these topics alone. A topic is refused
+    if the connection was lost LOSSES_MAX times while only messages of this topic were in flight.
+    """
+
+    def __init__(self) -> None:
+        self._suspects: dict[str, int] = {}  # number of connections that were lost while only this topic was in flight
+        self._refused: dict[str, _Refusal] = {}
+        self._skipped: dict[str, None] = {}  # refused topics whose time has not ended
+
+    @property
+    def skipped(self) -> Collection[str]:
+        """Return the topics that imud must not send now."""
+        return self._skipped.keys()
+
+    @property
+    def problems(self) -> Mapping[str, str]:
+        """Return the reason for each refused topic. The broker has not accepted a message of the topic since then."""
+        return {topic: refusal.problem for topic, refusal in self._refused.items()}
+
+    def is_suspect(self, topic: str) -> bool:
+        """Return whether a message of the topic must be the only message in flight."""
+        return topic in self._suspects
+
+    def losses(self, topic: str) -> int:
+        return self._suspects.get(topic, 0)
+
+    def refuse(self, topic: str, problem: str, now_ns: int) -> None:
+        """Skip a topic, because the broker refused a message. Do nothing for a skipped topic."""
+        if topic in self._skipped:
+            return
+        known = self._refused.pop(topic, None)
+        skip_ns = SKIP_NS if known is None else min(2 * known.skip_ns, SKIP_MOST_NS)
+        self._suspects.pop(topic, None)
+        self._refused[topic] = _Refusal(problem, skip_ns, now_ns + skip_ns)
+        self._skipped[topic] = None
+        while len(self._refused) > TOPICS_MAX:
+            oldest = next(iter(self._refused))
+            del self._refused[oldest]
+            self._skipped.pop(oldest, None)
+
+    def accept(self, topic: str) -> None:
+        """Forget a refusal, because the broker acknowledged a message of the topic."""
+        self._suspects.pop(topic, None)
+        self._refused.pop(topic, None)
+        self._skipped.pop(topic, None)
+
+    def lose(self, in_flight: Collection[str], problem: str, now_ns: int) -> None:
+        """Suspect the topics of all messages in flight, because the connection was lost."""
+        topics = dict.fromkeys(topic for topic in in_flight if topic not in self._skipped)
+        for topic in topics:
+            losses = self._suspects.setdefault(topic, 0) + (len(topics) == 1)
+            self._suspects[topic] = losses
+            if losses >= LOSSES_MAX:
+                self.refuse(topic, f"{problem}, {losses} times after a message of this topic", now_ns)
+        while len(self._suspects) > TOPICS_MAX:
+            del self._suspects[next(iter(self._suspects))]
+
+    def take_ended(self, now_ns: int) -> list[str]:
+        """Return the topics whose time has ended. One further loss refuses them again."""
+        ended = [topic for topic in self._skipped if self._refused[topic].end_ns <= now_ns]
+        for topic in ended:
+            del self._skipped[topic]
+            self._suspects[topic] = LOSSES_MAX - 1
+        return ended
+
+
+class _Message(NamedTuple):
+    """Message that the sender sends next, or that is in flight."""
+
+    topic: str
+    payload: bytes
+    row: int = 0  # ID of a row of the spool; 0 for other messages
+    reply: CommandReply | None = None  # reply to a request
+    is_retained: bool = False
 
 
 class MqttSender:
@@ -48,16 +151,19 @@ class MqttSender:
         self.acknowledged = 0  # number of acknowledged messages of the spool
         self.reconnects = 0  # number of connections after the first
         self.failure: BaseException | None = None  # internal error that ended the thread
+        self.refused: Mapping[str, str] = {}  # reason for each topic that the broker refuses
+        self.skipped: frozenset[str] = frozenset()  # topics that imud does not send now
         # Called by the thread if messages are wanted or acknowledgements wait. The writer sets it.
         self.wanting: Callable[[], None] = lambda: None
         self.commands: CommandChannel | None = None  # receiver of requests; set before `start`
         self._settings, self._client_id, self._will = settings, client_id, will
         self._turn, self._connect, self._now_ns = turn, connect, now_ns
         self._replies: deque[CommandReply] = deque(maxlen=REPLIES_MAX)
-        self._sent_replies: dict[int, CommandReply] = {}  # replies without an acknowledgement, by packet identifier
         self._lock = threading.Lock()
         self._outbox: deque[SpoolRow] = deque()  # rows of the spool
-        self._in_flight: dict[int, int] = {}  # row ID by packet identifier, 0 for other messages
+        self._in_flight: dict[int, _Message] = {}  # messages without an acknowledgement, by packet identifier
+        self._answered_ns = 0  # time of the newest acknowledgement, or of the first message in flight
+        self._refusals = TopicRefusals()
         self._answers: list[tuple[int, int]] = []
         self._retained: dict[str, bytes] = {}  # newest payload by topic
         self._due: dict[str, None] = {}  # topics of retained messages to send, in order
@@ -102,7 +208,7 @@ class MqttSender:
         with self._lock:
             if session != self.session:
                 return
-            self._outbox.extend(rows)
+            self._outbox.extend(row for row in rows if row.topic not in self.skipped)
         self._ring()
 
     def retain(self, messages: Mapping[str, bytes]) -> None:
@@ -111,14 +217,24 @@ class MqttSender:
             for topic, payload in messages.items():
                 if self._retained.get(topic) != payload:
                     self._retained[topic] = payload
-                    self._due[topic] = None
+                    if topic not in self.skipped:
+                        self._due[topic] = None
         self._ring()
 
     def reply(self, reply: CommandReply) -> None:
         """Send a reply before all other messages, and again after a lost connection. Any thread may call it."""
         with self._lock:
+            if reply.topic in self.skipped:
+                log.warning("mqtt: discarding a reply, because the broker refuses messages of %s", reply.topic)
+                return
             self._replies.append(reply)
         self._ring()
+
+    def held(self) -> set[int]:
+        """Return the IDs of the rows that the sender has, acknowledged rows included."""
+        with self._lock:
+            rows = [row.id for row in self._outbox] + [one.row for one in self._in_flight.values()]
+            return {*rows, *[number for _, number in self._answers]}
 
     def take_acknowledged(self) -> list[tuple[int, int]]:
         """Return session and row ID of each acknowledgement since the last call."""
@@ -157,10 +273,12 @@ class MqttSender:
             if connection is None:
                 self._open()
             else:
+                self._end_refusals()
                 self._send(connection)
                 connection.wait(WAIT_S)
                 self._take_acknowledgements(connection)
                 self._take_requests(connection)
+                self._check_answers()
         except BrokerError as error:
             pause_s, problem = self._turn.failed(self._now_ns()), str(error)
             if self._turn.short_runs >= SHORT_RUNS:
@@ -182,7 +300,7 @@ class MqttSender:
         self._was_connected = True
         with self._lock:
             self._connection = connection
-            self._due = dict.fromkeys(self._retained)
+            self._due = dict.fromkeys(topic for topic in self._retained if topic not in self.skipped)
             self.session += 1
             self.connected, self.broker, self.problem = True, broker.name, ""
         self.wanting()
@@ -190,54 +308,113 @@ class MqttSender:
     def _send(self, connection: BrokerConnection) -> None:
         """Send messages up to the window of the broker: replies first, then retained messages, then the spool."""
         while len(self._in_flight) < connection.in_flight_max:
-            if self._send_reply(connection):
-                continue
             with self._lock:
-                topic = next(iter(self._due), None)
-                if topic is not None:
-                    del self._due[topic]
-                    payload = self._retained[topic]
-                    if not payload:
-                        del self._retained[topic]
-                row = self._outbox.popleft() if topic is None and self._outbox else None
-            if topic is not None:
-                self._in_flight[connection.publish(topic, payload, JSON_TYPE, retain=True)] = 0
-            elif row is not None:
-                kind = SLOTS_TYPE if row.payload.startswith(MAGIC) else JSON_TYPE
-                self._in_flight[connection.publish(row.topic, row.payload, kind, retain=False)] = row.id
-                self.sent += 1
-            else:
+                message = self._next_message()
+            if message is None:
                 return
+            self._publish(connection, message)
 
-    def _send_reply(self, connection: BrokerConnection) -> bool:
-        """Send the oldest reply. Return whether there was one."""
+    def _publish(self, connection: BrokerConnection, message: _Message) -> None:
+        kind = SLOTS_TYPE if message.payload.startswith(MAGIC) else JSON_TYPE
+        correlation = message.reply.correlation if message.reply is not None else None
+        try:
+            number = connection.publish(
+                message.topic, message.payload, kind, retain=message.is_retained, correlation=correlation
+            )
+        except MessageRefused as error:
+            self._refuse(message.topic, str(error))
+            return
+        self.sent += bool(message.row)
         with self._lock:
-            if not self._replies:
-                return False
-            reply = self._replies[0]
-        number = connection.publish(reply.topic, reply.payload, JSON_TYPE, retain=False, correlation=reply.correlation)
-        with self._lock:
-            if self._replies and self._replies[0] is reply:  # newer replies can have removed it from the full queue
-                self._replies.popleft()
-            self._sent_replies[number] = reply
-            self._in_flight[number] = 0
-        return True
+            if not self._in_flight:
+                self._answered_ns = self._now_ns()
+            self._in_flight[number] = message
+
+    def _next_message(self) -> _Message | None:
+        """Remove and return the next message; None if there is none. A message of a suspected topic follows all other
+        messages, and it is the only message in flight. The caller holds the lock."""
+        refusals = self._refusals
+        if any(refusals.is_suspect(one.topic) for one in self._in_flight.values()):
+            return None
+        found = next((one for one in self._waiting() if not refusals.is_suspect(one.topic)), None)
+        if found is None and not self._in_flight:
+            found = min(self._waiting(), key=lambda one: refusals.losses(one.topic), default=None)
+        if found is None:
+            return None
+        if found.reply is not None:
+            self._replies.remove(found.reply)
+        elif found.is_retained:
+            del self._due[found.topic]
+        else:
+            self._outbox.remove(next(row for row in self._outbox if row.id == found.row))
+        return found
+
+    def _waiting(self) -> Iterator[_Message]:
+        """Yield all waiting messages in their order."""
+        replies = (_Message(one.topic, one.payload, reply=one) for one in self._replies)
+        due = (_Message(topic, self._retained[topic], is_retained=True) for topic in self._due)
+        rows = (_Message(row.topic, row.payload, row.id) for row in self._outbox)
+        return chain(replies, due, rows)
 
     def _take_acknowledgements(self, connection: BrokerConnection) -> None:
-        """Pass the acknowledgements to the writer."""
+        """Pass the acknowledgements to the writer, and skip the topics of refused messages."""
+        refused, connection.refused = connection.refused, []
+        for number, problem in refused:
+            if (message := self._in_flight.pop(number, None)) is not None:
+                self._refuse(message.topic, problem)
         if not connection.acknowledged:
             return
         numbers = connection.acknowledged[:]
         connection.acknowledged.clear()
         with self._lock:
-            ids = [self._in_flight.pop(number, 0) for number in numbers]
-            for number in numbers:
-                self._sent_replies.pop(number, None)
-            self._answers += [(self.session, one) for one in ids if one]
-            self.acknowledged += sum(map(bool, ids))
+            self._answered_ns = self._now_ns()
+            messages = [self._in_flight.pop(number) for number in numbers if number in self._in_flight]
+            for one in messages:
+                self._refusals.accept(one.topic)
+                if one.is_retained and not one.payload and not self._retained.get(one.topic, b"-"):
+                    del self._retained[one.topic]  # the broker removed the message
+            ids = [one.row for one in messages if one.row]
+            self._answers += [(self.session, one) for one in ids]
+            self.acknowledged += len(ids)
             is_low = 2 * (len(self._outbox) + len(self._in_flight)) <= OUTBOX_MAX
+        self._update_refusals()
         if is_low:
             self.wanting()
+
+    def _check_answers(self) -> None:
+        """Raise BrokerError if the broker acknowledges nothing, although messages are in flight."""
+        if self._in_flight and self._now_ns() - self._answered_ns > UNANSWERED_S * NS_PER_S:
+            raise BrokerError(
+                f"{self.broker}: no acknowledgement of {len(self._in_flight)} messages within {UNANSWERED_S:g} s"
+            )
+
+    # --- refused topics -----------------------------------------------------------------------------------------------
+
+    def _refuse(self, topic: str, problem: str) -> None:
+        """Skip a topic. Its rows stay in the spool; the newest retained message stays in memory."""
+        with self._lock:
+            self._refusals.refuse(topic, problem, self._now_ns())
+        self._update_refusals()
+
+    def _end_refusals(self) -> None:
+        """Send messages of a refused topic again after its time."""
+        with self._lock:
+            ended = self._refusals.take_ended(self._now_ns())
+            self._due |= dict.fromkeys(topic for topic in ended if topic in self._retained)
+        if ended:
+            self._update_refusals()
+
+    def _update_refusals(self) -> None:
+        """Publish the refused topics for other threads, and remove the waiting messages of skipped topics."""
+        problems = self._refusals.problems
+        if self.skipped == self._refusals.skipped and self.refused == problems:
+            return
+        with self._lock:
+            self.skipped, self.refused = frozenset(self._refusals.skipped), problems
+            self._replies = deque((one for one in self._replies if one.topic not in self.skipped), REPLIES_MAX)
+            self._due = {topic: None for topic in self._due if topic not in self.skipped}
+            self._outbox = deque(row for row in self._outbox if row.topic not in self.skipped)
+        self.wanting()
 
     def _take_requests(self, connection: BrokerConnection) -> None:
         """Check received requests. The event loop runs them."""
@@ -256,9 +433,11 @@ class MqttSender:
             self.session += 1
             self.connected, self.broker, self.problem = False, "", problem
             self._outbox.clear()
-            self._in_flight.clear()
-            self._replies = deque([*self._sent_replies.values(), *self._replies], REPLIES_MAX)
-            self._sent_replies.clear()
+            messages, self._in_flight = list(self._in_flight.values()), {}
+            self._refusals.lose([one.topic for one in messages], problem, self._now_ns())
+            replies = [one.reply for one in messages if one.reply is not None]
+            self._replies = deque([*replies, *self._replies], REPLIES_MAX)
+        self._update_refusals()
         self.wanting()
 
     def _say_farewell(self) -> None:
@@ -270,7 +449,7 @@ class MqttSender:
             end_ns = self._now_ns() + round(FAREWELL_S * NS_PER_S)
             while number not in connection.acknowledged and (rest_ns := end_ns - self._now_ns()) > 0:
                 connection.wait(rest_ns / NS_PER_S)
-        except BrokerError:
+        except (BrokerError, MessageRefused):
             pass  # the broker publishes the last will
         self._take_acknowledgements(connection)
         connection.close()

@@ -347,34 +347,36 @@ class Spool:
         finally:
             self._reserve()
 
-    def after(self, limit: int) -> list[SpoolRow]:
-        """Return the next messages for the sender, oldest first. Raises SpoolError."""
+    def after(self, limit: int, skipped: Collection[str] = ()) -> list[SpoolRow]:
+        """Return the next messages for the sender, oldest first, without the topics in `skipped`. Raises SpoolError."""
         found: list[SpoolRow] = []
         if self._ahead_from:
-            found = self._between(self._ahead, _ID_MAX, limit)
+            found = self._between(self._ahead, _ID_MAX, limit, skipped)
             self._ahead = found[-1].id if found else self._ahead
-            waited = self._between(self._given, self._ahead_from, limit - len(found))
+            waited = self._between(self._given, self._ahead_from, limit - len(found), skipped)
             self._given = waited[-1].id if waited else self._given
             if not waited and len(found) < limit:  # the sender received all older messages
                 self._given, self._ahead_from, self._ahead = self._ahead, 0, 0
             return found + waited
-        found = self._between(self._given, _ID_MAX, limit)
+        found = self._between(self._given, _ID_MAX, limit, skipped)
         self._given = found[-1].id if found else self._given
         return found
 
-    def _between(self, after_id: int, last_id: int, limit: int) -> list[SpoolRow]:
+    def _between(self, after_id: int, last_id: int, limit: int, skipped: Collection[str]) -> list[SpoolRow]:
         """Return the messages after one ID up to another ID, oldest first. Raises SpoolError."""
         if limit <= 0:
             return []
         base = self._connection()
         try:
-            return self._undamaged(base, "id > ? AND id <= ? ORDER BY id LIMIT ?", (after_id, last_id, limit))
+            topics = f"AND topic NOT IN ({', '.join('?' * len(skipped))})" if skipped else ""
+            where = f"id > ? AND id <= ? {topics} ORDER BY id LIMIT ?"
+            return self._undamaged(base, where, (after_id, last_id, *skipped, limit))
         except sqlite3.Error as error:
             self._rename_if_damaged(error)
             raise SpoolError(f"{self._path}: {reason_of(error)}") from error
 
     def rewind(self) -> None:
-        """Give all messages again, because the connection was lost."""
+        """Give all messages again, because the connection was lost or a topic is no longer skipped."""
         self._given = 0
         self._ahead_from = self._ahead = self._next_id - 1 if self._newest_first else 0
 

@@ -171,6 +171,7 @@ class SpoolWriter:
         self._rows: list[SpoolRow] = []
         self._acknowledged: set[int] = set()
         self._session = 0
+        self._skipped: frozenset[str] = frozenset()  # topics that the sender did not want at the last call
         self._due_ns = 0
         # number of messages that `messages_per_s` allows now, and the time of this number
         self._allowed, self._allowed_ns = 1.0, clock.now_ns()
@@ -363,11 +364,15 @@ class SpoolWriter:
             self._allowed, self._allowed_ns = min(self._allowed, max(rate_hz, 1.0)), now_ns
             room = min(room, int(self._allowed))
         try:
+            skipped, held = self._sender.skipped, self._sender.held()
+            if not self._skipped <= skipped:
+                self._spool.rewind()
+            self._skipped = skipped
             while room > 0:
-                rows = self._spool.after(room)
+                rows = self._spool.after(room, skipped)
                 if not rows:
                     return COMMIT_NS
-                fresh = [row for row in rows if row.id not in self._acknowledged]
+                fresh = [row for row in rows if row.id not in self._acknowledged and row.id not in held]
                 self._sender.give(self._session, fresh)
                 room -= len(fresh)
                 self._allowed -= len(fresh) if rate_hz is not None else 0

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from imud.attitude.conventions import Heading
 from imud.cli.status import axes, block, driven, page, parts, utc, watched
 from imud.client.connection import Client
-from imud.contracts.status import DeviceState, FrameStatus, LinesStatus, UtcStatus
+from imud.contracts.status import DeviceState, FrameStatus, LinesStatus, MqttStatus, UtcStatus
 from tests.cli.conftest import Cli
 from tests.support.metrics import LINES, POLLING, UTC, device, equipped
 from tests.support.socket_rig import daemon
@@ -65,7 +65,7 @@ def test_json_is_all_that_the_socket_sends(tmp_path: Path, cli: Cli, monkeypatch
         with Client(served.path) as client:
             said = client.status()
         shown = json.loads(cli("status", "--socket", served.path, "--json").out)
-        assert shown.keys() == said.keys() == {"now_ns", "devices", "socket", "configuration"}
+        assert shown.keys() == said.keys() == {"now_ns", "devices", "socket", "configuration", "mqtt"}
         assert shown["devices"] == said["devices"]
 
 
@@ -74,6 +74,13 @@ def test_a_device_that_does_not_run_has_its_reason_and_the_next_step() -> None:
     text = page([device("bow"), device("mast", state=DeviceState.MISSING, problem="/dev/x is not there: the cable?")])
     assert "mast: missing\n  /dev/x is not there: the cable?\n" in text
     assert text.endswith("\n\nto find the cause and the next step, run `sudo imud doctor`")
+
+
+def test_problems_of_mqtt_are_shown() -> None:
+    mqtt = MqttStatus("", "no route", "", 0, 0, 0, 0, 0, 0, 0, {}, 0, refused={"a/b": "Not authorized"})
+    assert page([], [mqtt]).splitlines() == [
+        "mqtt: no route", "", "mqtt: the broker refuses messages of a/b: Not authorized",
+    ]  # fmt: skip
 
 
 def test_lines_and_utc_say_only_what_is_known() -> None:

@@ -13,7 +13,6 @@ import pytest
 from msgspec.structs import replace
 
 from imud.client.connection import Client, EventStream, default_path, event_of
-from imud.client import connection
 from imud.contracts.publisher import Batch
 from imud.formats.jsonrpc import RpcError
 from imud.model.errors import LinkDenied, LinkMissing, ServerError
@@ -333,11 +332,21 @@ def test_a_reply_without_its_descriptor_is_an_error(tmp_path: Path) -> None:
         client.snapshot()
 
 
-def test_a_late_reply_to_watch_leaves_a_usable_connection(monkeypatch: pytest.MonkeyPatch) -> None:
-    ours, peer = socket.socketpair()
-    monkeypatch.setattr(connection, "_connect", lambda path, timeout_s: ours)
-    peer.sendall(HELLO)
-    with peer, Client("/daemon") as client:
+def test_a_late_reply_to_watch_leaves_a_usable_connection(tmp_path: Path) -> None:
+    path, peers = tmp_path / "s", list[socket.socket]()
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+
+        def greet() -> None:
+            peers.append(listener.accept()[0])
+            peers[0].sendall(HELLO)
+
+        thread = threading.Thread(target=greet)
+        thread.start()
+        client = Client(path)
+        thread.join()
+    with peers[0] as peer, client:
         client.timeout_s = 0.0
         with pytest.raises(TimeoutError, match="no watch within"):
             client.watch()

@@ -15,6 +15,7 @@ class FakeConnection:
         self.acknowledged: list[int] = []
         self.in_flight_max = broker.window
         self.received: list[Received] = []
+        self.refused: list[tuple[int, str]] = []
         self.subscribed: list[str] = []
         self.correlations: list[bytes | None] = []
         self.sent: list[tuple[str, bytes, bool]] = []
@@ -45,7 +46,13 @@ class FakeConnection:
         while self._answered < len(self.sent) and self._broker.answers > 0:
             self._broker.answers -= 1
             self._answered += 1
-            self.acknowledged.append(self._answered)
+            topic = self.sent[self._answered - 1][0]
+            if topic in self._broker.closes_on:
+                raise BrokerError("the connection was lost")
+            if topic in self._broker.refuses:
+                self.refused.append((self._answered, "Not authorized"))
+            else:
+                self.acknowledged.append(self._answered)
         if self._broker.blocks and not self.acknowledged:
             self._bell.wait(seconds)
             self._bell.clear()
@@ -69,6 +76,8 @@ class FakeBroker:
         self.problem = ""  # problem of every connection; empty if the broker works
         self.answers = 1_000_000  # number of remaining acknowledgements
         self.window = 4
+        self.closes_on: set[str] = set()  # topics for which the broker closes the connection
+        self.refuses: set[str] = set()  # topics that the broker refuses with a reason
         self.will: Will | None = None
         self.connecting, self.accepts = threading.Event(), threading.Event()
         self.accepts.set()

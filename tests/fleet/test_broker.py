@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from imud.fleet.broker import BrokerError, PahoConnection, Will
+from imud.fleet.broker import BrokerError, MessageRefused, PahoConnection, Will
 from imud.fleet.settings import MqttOptions, broker_of
 from tests.fleet.authority import Authority
 from tests.fleet.mosquitto import NO_MOSQUITTO, Collector, running_broker
@@ -101,13 +101,12 @@ def test_refused_messages_are_named(tmp_path: Path) -> None:
     with running_broker(tmp_path / "broker", *lines) as broker:
         connection = connect(f"mqtt://127.0.0.1:{broker.port}")
         send(connection, bytes(1700))
-        with pytest.raises(BrokerError, match=r"at most 2000 bytes, .* imud/s/g/state with 2000: raise"):
+        with pytest.raises(MessageRefused, match=r"at most 2000 bytes, .* imud/s/g/state with 2000: raise"):
             send(connection, bytes(2000))
-        connection.close()
-        connection = connect(f"mqtt://127.0.0.1:{broker.port}")
-        send(connection)
-        with pytest.raises(BrokerError, match=r"refuses messages of imud/s/g/events: Not authorized"):
-            send(connection, topic="imud/s/g/events")
+        number = connection.publish("imud/s/g/events", b"{}", "application/json", retain=False)
+        while not connection.refused:
+            connection.wait(1.0)
+        assert connection.refused == [(number, "Not authorized")]
         connection.close()
 
 

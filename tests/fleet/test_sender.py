@@ -7,16 +7,17 @@ import pytest
 from imud.fleet.broker import STABLE_NS, BrokerTurn, Will
 from imud.fleet.commands import CommandReply
 from imud.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
-from imud.fleet.sender import OUTBOX_MAX, REPLIES_MAX, MqttSender
+from imud.fleet.sender import LOSSES_MAX, OUTBOX_MAX, REPLIES_MAX, SKIP_NS, MqttSender
 from imud.fleet.settings import Broker, MqttOptions
 from imud.fleet.spool import SpoolRow
+from imud.model.units import NS_PER_S
 from tests.fleet.fake_broker import FakeBroker
 from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import VirtualClock
 
 
-def row(number: int, payload: bytes = b"{}") -> SpoolRow:
-    return SpoolRow(number, "1", "bow", "samples", "samples", "topic", number, number, 1, 0, payload)
+def row(number: int, payload: bytes = b"{}", topic: str = "topic") -> SpoolRow:
+    return SpoolRow(number, "1", "bow", "samples", "samples", topic, number, number, 1, 0, payload)
 
 
 class SenderBench:
@@ -25,11 +26,21 @@ class SenderBench:
         turn = BrokerTurn([Broker(host, 1, False, False, "") for host in hosts or ("a",)], 60.0, lambda: 0.5)
         will = Will("state", b"gone")
         self.sender = MqttSender(MqttOptions(), "me", will, turn, self.broker.connect, self.clock.now_ns)
-        self.wanted = 0
+        self.wanted, self.done = 0, set[int]()
         self.sender.wanting = self._want
 
     def _want(self) -> None:
         self.wanted += 1
+
+    def drive(self, turns: int, rows: list[SpoolRow] | None = None) -> None:
+        """Let the sender work. Give it all rows without an acknowledgement at each new session, as the writer does."""
+        session = 0
+        for _ in range(turns):
+            self.clock.advance(round((self.sender.work() + 0.1) * NS_PER_S))
+            self.done |= {number for _, number in self.sender.take_acknowledged()}
+            if rows and self.sender.session != session and self.sender.connected:
+                session = self.sender.session
+                self.sender.give(session, [one for one in rows if one.id not in self.done])
 
     def sent(self) -> list[bytes]:
         return [payload for _, payload, _ in self.broker.connections[-1].sent]
@@ -112,9 +123,15 @@ def test_retained_messages_are_sent_first_at_each_connection() -> None:
     bench.sender.retain({"status": b"1"})
     bench.sender.work()
     assert len(bench.sent()) == 3, "what is the same is not sent again"
+    bench.broker.answers = 0
     bench.sender.retain({"status": b""})
     bench.sender.work()
     assert bench.sent()[3:] == [b""]
+    bench.broker.problem = "gone"
+    bench.sender.work()
+    bench.broker.problem, bench.broker.answers = "", 9
+    bench.drive(4)
+    assert bench.sent() == [b"born", b""], "the broker did not acknowledge the removal"
     bench.broker.problem = "gone"
     bench.sender.work()
     bench.broker.problem = ""
@@ -166,8 +183,7 @@ def test_a_reply_without_acknowledgement_is_sent_again() -> None:
     bench.sender.work()
     bench.sender.reply(CommandReply("answer", b"3", None))
     bench.broker.problem, bench.broker.answers = "", 100
-    bench.sender.work()
-    bench.sender.work()
+    bench.drive(5)
     assert bench.sent() == [b"1", b"2", b"3"]
     assert bench.broker.connections[-1].correlations == [b"c", b"c", None]
     assert not any(retained for _, _, retained in bench.broker.connections[-1].sent)
@@ -184,7 +200,66 @@ def test_the_number_of_waiting_replies_is_limited() -> None:
     for number in range(10, REPLIES_MAX + 5):
         bench.sender.reply(CommandReply("answer", b"%d" % number, None))
     bench.sender.work()
-    bench.broker.problem = ""
-    bench.sender.work()
-    bench.sender.work()
+    bench.broker.problem, bench.broker.answers = "", 100
+    bench.drive(REPLIES_MAX + 2)
     assert bench.sent() == [b"%d" % number for number in range(5, REPLIES_MAX + 5)]
+
+
+FORBIDDEN = {"ha/a", "ha/b", "data/x", "answer/x"}
+
+
+@pytest.mark.parametrize("way", ["closes_on", "refuses"])
+def test_forbidden_topics_do_not_block_other_messages(way: str) -> None:
+    bench = SenderBench()
+    setattr(bench.broker, way, set(FORBIDDEN))
+    rows = [row(n, b"%d" % n, "data/x" if n % 3 == 0 else f"data/{n % 3}") for n in range(1, 31)]
+    bench.sender.retain({"ha/a": b"1", "state": b"2", "ha/b": b"3", "status": b"4"})
+    bench.drive(1)
+    bench.sender.reply(CommandReply("answer/x", b"", None))
+    bench.sender.reply(CommandReply("answer/y", b"", None))
+    bench.drive(100, rows)
+    assert bench.done == {one.id for one in rows if one.topic != "data/x"}
+    sent = [topic for one in bench.broker.connections for topic, _, _ in one.sent]
+    assert {"state", "status", "answer/y"} <= set(sent)
+    assert bench.sender.skipped == set(bench.sender.refused) == FORBIDDEN
+    assert all("lost" in one or one == "Not authorized" for one in bench.sender.refused.values())
+    losses = len(bench.broker.connections) - 1
+    assert losses <= (0 if way == "refuses" else 2 + LOSSES_MAX * len(FORBIDDEN))
+    assert bench.sender.connected
+    bench.sender.retain({"ha/a": b"5"})
+    bench.sender.reply(CommandReply("answer/x", b"", None))
+    bench.drive(5)
+    assert len(bench.broker.connections) - 1 == losses, "imud does not send skipped topics"
+    setattr(bench.broker, way, {"ha/b"})
+    bench.clock.advance(SKIP_NS)
+    bench.drive(50, rows)
+    assert bench.sender.skipped == set(bench.sender.refused) - {"answer/x"} == {"ha/b"}
+    assert bench.done == {one.id for one in rows}
+    assert ("ha/a", b"5", True) in [one for made in bench.broker.connections for one in made.sent]
+
+
+def test_an_innocent_topic_is_not_refused_after_lost_connections() -> None:
+    bench = SenderBench()
+    for number in range(1, 20):
+        bench.broker.problem, bench.broker.answers = "", 0
+        bench.sender.work()
+        bench.sender.give(bench.sender.session, [row(2 * number), row(2 * number + 1, topic="other")])
+        bench.sender.work()
+        bench.broker.answers = 9
+        bench.drive(3)
+        bench.broker.answers = 0
+        bench.sender.give(bench.sender.session, [row(99)])
+        bench.sender.work()
+        bench.broker.problem = "the cable was pulled"
+        bench.sender.work()
+    assert bench.sender.refused == {}
+
+
+def test_a_silent_broker_is_left() -> None:
+    bench = SenderBench()
+    bench.broker.answers = 0
+    bench.drive(1)
+    bench.sender.give(1, [row(1), row(2, topic="other")])
+    bench.drive(650)
+    assert not bench.sender.connected or len(bench.broker.connections) > 1
+    assert bench.broker.connections[0].closed

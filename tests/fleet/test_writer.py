@@ -13,7 +13,7 @@ from imud.contracts.publisher import Batch, PublisherClock
 from imud.fleet.accounts import FleetLedger, StreamCounts
 from imud.fleet.broker import BrokerTurn, Will
 from imud.fleet.messages import Stream, decode_message
-from imud.fleet.sender import MqttSender
+from imud.fleet.sender import SKIP_NS, MqttSender
 from imud.fleet.settings import Broker, MqttOptions
 from imud.fleet.spool import Spool, SpoolError
 from imud.fleet.streams import Gateway
@@ -112,6 +112,24 @@ def test_everything_is_spooled_sent_and_removed(tmp_path: Path) -> None:
     bench.work(3)
     assert len(bench.arrived()) == 10, "what is not stored is not sent"
     assert bench.writer.problem == "No space left on device"
+
+
+def test_samples_of_a_refused_topic_wait_in_the_spool(tmp_path: Path) -> None:
+    bench = WriterBench(tmp_path)
+    bench.broker.refuses = {"imud/site/gw/bow/samples"}
+    for number in range(3):
+        bench.put(1000)
+        bench.queue.put_event(Event(number, "bow", EventKind.UP, ""))
+        bench.work(2)
+    sent = [topic for topic, _, _ in bench.broker.connections[0].sent]
+    assert sent.count("imud/site/gw/bow/events") == 3
+    assert sent.count("imud/site/gw/bow/samples") <= 2
+    assert (bench.spool.messages, bench.sender.acknowledged) == (6, 3)
+    bench.broker.refuses = set()
+    bench.clock.advance(SKIP_NS)
+    bench.work(4)
+    assert (bench.spool.messages, bench.sender.acknowledged) == (0, 9)
+    assert (len(bench.broker.connections), bench.sender.refused) == (1, {})
 
 
 def test_waiting_messages_are_sent_in_order_with_the_allowed_rate(tmp_path: Path) -> None:

@@ -544,6 +544,10 @@ MQTT_FAMILIES: Final = (
     _counter_of("sent_messages", "Sent messages, including repeated messages.", lambda status: status.sent),
     _counter_of("acknowledged_messages", "Messages that the broker acknowledged.", lambda status: status.acknowledged),
     _gauge_of("waiting_messages", NO_UNIT, "Messages in the spool.", lambda status: status.waiting),
+    _gauge_of(
+        "refused_topics", NO_UNIT, "Topics that the broker refuses; imud sends all other messages.",
+        lambda status: len(status.refused),
+    ),
     _gauge_of("spool_bytes", BYTES, "Size of the spool.", lambda status: status.spool_bytes),
     _counter_of(
         "thinned", "Samples that imud replaced by statistics because the spool was full.",

@@ -10,7 +10,7 @@ import msgspec
 
 from imud.attitude.conventions import Convention, Heading
 from imud.attitude.published import FrameWords
-from imud.contracts.status import DeviceState, DeviceStatus, SocketStatus
+from imud.contracts.status import DeviceState, DeviceStatus, MqttStatus, SocketStatus
 from imud.model.event import Event
 from imud.model.sample import FieldInfo, Sample, Sync
 from imud.publishers.socket.subscription import Form
@@ -130,6 +130,7 @@ class StatusResult(msgspec.Struct):
     devices: list[DeviceStatus]
     socket: SocketStatus
     configuration: str  # absolute path of the daemon's configuration file; empty without a file
+    mqtt: list[MqttStatus]  # the output `mqtt`; empty if it does not run
 
 
 class DeviceFrame(msgspec.Struct, omit_defaults=True):

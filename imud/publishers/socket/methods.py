@@ -226,7 +226,7 @@ def _status(hub: Hub, connection: ClientConnection, _params: NoParams) -> Pieces
     socket = msgspec.structs.asdict(hub.status(())) | {"clients": clients}
     result = {
         "now_ns": str(now_ns) if texts else now_ns, "devices": made, "socket": socket,
-        "configuration": hub.context.configuration,
+        "configuration": hub.context.configuration, "mqtt": [status() for status in hub.context.outputs.mqtts],
     }  # fmt: skip
     return MethodReply(result, big_numbers=False)
 
