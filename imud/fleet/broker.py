@@ -11,6 +11,7 @@ import select
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from random import random
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
@@ -63,11 +64,78 @@ BrokerAccess = MqttOptions | ReaderAccess
 CALLBACKS: Final = ("on_connect", "on_disconnect", "on_message", "on_publish", "on_subscribe")
 
 
+# Maximum number of packets from a broker that does not read the replies
+UNREAD_MAX: Final = 10_000
+# Maximum length of an incomplete WebSocket frame, bytes. paho-mqtt keeps the whole frame in memory.
+WEBSOCKET_BYTES: Final = 16 << 20
+PUBLISH: Final = 0x30  # type of a PUBLISH packet in the first byte (MQTT 5.0, section 2.1.2)
+
+
+class PacketGuard:
+    """Check of the packets from a broker before paho-mqtt stores them. A hostile broker must not fill the memory."""
+
+    def __init__(self, packet_bytes: int) -> None:
+        """`packet_bytes` is the maximum length of a packet after its fixed header."""
+        self._packet_bytes = packet_bytes
+        self._left = 0  # bytes of the packet that have not arrived
+        self._shift = -1  # position of the next 7 bits of the length; -1 before the first byte of a packet
+        self._length = 0
+        self._unread = 0  # number of packets since all replies were written
+
+    def take(self, data: bytes, *, is_writing: bool) -> None:
+        """Check received bytes. `is_writing`: replies wait, because the broker does not read. Raises ValueError."""
+        at = 0
+        self._unread = self._unread if is_writing else 0
+        while at < len(data):
+            if self._left:
+                step = min(self._left, len(data) - at)
+                at, self._left = at + step, self._left - step
+                continue
+            byte, at = data[at], at + 1
+            if self._shift < 0:
+                if byte & 0xF0 == PUBLISH and byte >> 1 & 3 > 1:
+                    raise ValueError("the broker sent a message with QoS 2; imud requests at most QoS 1")
+                self._shift = self._length = 0
+                continue
+            self._length |= (byte & 0x7F) << self._shift
+            self._shift += 7
+            if self._length > self._packet_bytes:
+                raise ValueError(
+                    f"expected a packet of at most {self._packet_bytes} bytes from the broker, got a longer packet"
+                )
+            if byte < 0x80:
+                self._left, self._shift = self._length, -1
+                self._unread += 1
+        if self._unread > UNREAD_MAX:
+            raise ValueError(f"the broker sent {UNREAD_MAX} packets and does not read the replies")
+
+
+@lru_cache(1)
+def _client_type() -> Any:
+    """Return the class of the clients. Its import needs paho-mqtt."""
+    from paho.mqtt import client as paho
+
+    class GuardedClient(paho.Client):
+        """Client of paho-mqtt that checks all received bytes."""
+
+        guard: PacketGuard
+
+        def _sock_recv(self, bufsize: int) -> bytes:
+            data = super()._sock_recv(bufsize)
+            self.guard.take(data, is_writing=self.want_write())
+            if len(getattr(self.socket(), "_readbuffer", b"")) > WEBSOCKET_BYTES:
+                raise ValueError(f"expected a WebSocket frame of at most {WEBSOCKET_BYTES} bytes, got a longer frame")
+            return data
+
+    return GuardedClient
+
+
 def paho_client(
-    broker: Broker, access: BrokerAccess, client_id: str, owner: object = None, *, is_v5: bool, session_s: int = 0,
-    manual_ack: bool = False,
+    broker: Broker, access: BrokerAccess, client_id: str, owner: object = None, *, is_v5: bool, packet_bytes: int,
+    session_s: int = 0, manual_ack: bool = False,
 ) -> Any:  # fmt: skip
-    """Return an unconnected client of paho-mqtt. The client calls the methods of `owner` that CALLBACKS lists.
+    """Return an unconnected client of paho-mqtt. The client calls the methods of `owner` that CALLBACKS lists. It
+    raises ValueError for a packet longer than `packet_bytes`, and for a message with QoS 2.
 
     The broker keeps the session for `session_s` after the end of the connection. With MQTT 3.1.1 the broker decides the
     time. Raises ValueError with the key and the path if a file of `access` is invalid.
@@ -75,7 +143,7 @@ def paho_client(
     from paho.mqtt import client as paho
     from paho.mqtt.enums import CallbackAPIVersion
 
-    client = paho.Client(
+    client = _client_type()(
         CallbackAPIVersion.VERSION2,
         client_id,
         clean_session=None if is_v5 else not session_s,
@@ -84,6 +152,7 @@ def paho_client(
         reconnect_on_failure=False,
         manual_ack=manual_ack,
     )
+    client.guard = PacketGuard(packet_bytes)
     client.connect_timeout = CONNECT_S
     if broker.websockets:
         client.ws_set_options(path=broker.path)
@@ -196,6 +265,7 @@ LOOK_S: Final = 0.1
 PACKET_BYTES: Final = 16_384  # maximum length of a packet from the broker, bytes: four times the longest request
 # Maximum length of an MQTT packet, bytes (MQTT 5.0, section 2.1.4), if the broker does not set a lower limit
 PACKET_BYTES_MOST: Final = 268_435_460
+RECEIVED_MAX: Final = 100  # Maximum number of received messages in memory. imud takes them in each turn.
 # Bytes of a packet without topic and payload: type, lengths, packet identifier, content type, and correlation data of
 # 128 bytes
 OVERHEAD_BYTES: Final = 200
@@ -288,7 +358,9 @@ class PahoConnection:
         # another thread closes the descriptor, and its number may then belong to another file
         self._bell_lock = threading.Lock()
         try:
-            self._client = paho_client(broker, settings, client_id, self, is_v5=self._is_v5)
+            self._client = paho_client(
+                broker, settings, client_id, self, is_v5=self._is_v5, packet_bytes=PACKET_BYTES
+            )  # fmt: skip
             self._client.will_set(will.topic, will.payload, qos=1, retain=True)
             self._client.on_socket_open = lambda *_: self._check_wanted(is_wanted)
             open_client(self._client, broker, settings.keep_alive_s, IN_FLIGHT_MAX, PACKET_BYTES)
@@ -428,6 +500,9 @@ class PahoConnection:
         self.acknowledged.append(mid)
 
     def _on_message(self, _client: Any, _data: Any, message: Any) -> None:
+        if not self._answered or len(self.received) >= RECEIVED_MAX:
+            self._problem = self._problem or "the broker sent a message that imud did not request"
+            return
         properties = message.properties
         self.received.append(
             Received(

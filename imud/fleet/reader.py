@@ -128,7 +128,10 @@ class ReaderConnection:
         return self
 
     async def _connect(self, access: BrokerAccess, client_id: str, session_s: int, *, is_v5: bool) -> None:
-        client = paho_client(self._broker, access, client_id, self, is_v5=is_v5, session_s=session_s, manual_ack=True)
+        client = paho_client(
+            self._broker, access, client_id, self, is_v5=is_v5, packet_bytes=PACKET_BYTES, session_s=session_s,
+            manual_ack=True,
+        )  # fmt: skip
         client.max_inflight_messages_set(RECEIVE_MAX)
         self._client = client
         await asyncio.to_thread(open_client, client, self._broker, KEEP_ALIVE_S, RECEIVE_MAX, PACKET_BYTES, session_s)
