@@ -7,12 +7,14 @@ The numbers of a stream arrive in order. A gateway can send a message again, alo
 """
 
 from collections.abc import Mapping, Sequence
+from itertools import islice
 from typing import Final, NamedTuple
 
 import msgspec
 
 from imud.fleet.messages import (
     CLOCK_SET_NS,
+    NUMBER_MOST,
     FleetMessage,
     GatewayClock,
     MessageKind,
@@ -25,7 +27,7 @@ from imud.fleet.messages import (
 from imud.model.units import NS_PER_MS
 
 RANGES_MAX: Final = 1000  # Maximum number of stored gaps per stream. Numbers of older gaps stay missing.
-# Maximum number of streams of all gateways and boots. A reader with more streams raises an error.
+# Maximum number of streams of all gateways and boots: 1,000 gateways with 3 streams and 33 boots
 STREAMS_MAX: Final = 100_000
 
 
@@ -52,7 +54,7 @@ class StreamCounts(msgspec.Struct):
     # Numbers that the gateway dropped, by cause
     dropped: dict[str, int] = {}  # msgspec copies a mutable default
     missing: int = 0  # numbers that no message covers
-    duplicates: int = 0  # numbers that arrived again
+    duplicates: int = 0  # numbers that arrived again; at most NUMBER_MOST
 
     @property
     def balance(self) -> int:
@@ -68,7 +70,7 @@ class StoredAccount(msgspec.Struct, frozen=True):
     gaps: list[tuple[int, int]]  # first and last number of each gap that a later message can fill
 
 
-Accounts = Mapping[StreamKey, StoredAccount]  # stored ledgers by stream
+Accounts = Mapping[StreamKey, StoredAccount | None]  # ledgers by stream; None: the stream left the ledger
 
 
 class _Account:
@@ -97,7 +99,7 @@ class _Account:
             counts.newest = message.last
         number = sum([last - first + 1 for first, last in fresh])
         # the part that is not new
-        counts.duplicates += message.last - message.first + 1 - number
+        counts.duplicates = min(counts.duplicates + message.last - message.first + 1 - number, NUMBER_MOST)
         if message.kind is MessageKind.DROPPED:
             cause = message.cause.value if message.cause is not None else "unknown"
             counts.dropped[cause] = counts.dropped.get(cause, 0) + number
@@ -122,6 +124,38 @@ class _Account:
         return found
 
 
+class RecentStreams:
+    """Streams in the order of their use, with a maximum number. Synchronization: one thread.
+
+    A sender of many streams must not remove the streams of other gateways. If there are too many streams, the gateway
+    with the most streams loses its oldest ones. These are the streams of old boots.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._count = 0
+        self._by_gateway: dict[str, dict[StreamKey, None]] = {}  # oldest first, both gateways and streams
+
+    def use(self, key: StreamKey) -> list[StreamKey]:
+        """Make a stream the newest. Return the streams that are removed because there are too many."""
+        own = self._by_gateway.pop(key.gateway, {})
+        self._count += key not in own
+        own.pop(key, None)
+        own[key] = None
+        self._by_gateway[key.gateway] = own
+        if self._count <= self._most:
+            return []
+        largest = max(self._by_gateway.values(), key=len)
+        # several at a time: the search for the largest takes 3 ms for 100,000 gateways
+        removed = list(islice(largest, 1 + len(largest) // 20))
+        for one in removed:
+            del largest[one]
+        self._count -= len(removed)
+        if not largest:
+            del self._by_gateway[removed[0].gateway]
+        return removed
+
+
 class FleetLedger:
     """Ledgers of all streams of a reader. Synchronization: one thread."""
 
@@ -129,30 +163,41 @@ class FleetLedger:
         """Create an empty ledger. With `from_begin`, numbers before the first received message count as missing."""
         self._from_begin = from_begin
         self._accounts: dict[StreamKey, _Account] = {}
+        self._recent = RecentStreams(STREAMS_MAX)
 
     @property
     def counts(self) -> Mapping[StreamKey, StreamCounts]:
         """Return the counters of each stream."""
         return {key: account.counts for key, account in self._accounts.items()}
 
-    def stored(self, key: StreamKey) -> StoredAccount:
-        """Return the ledger of a stream for a store. Raises KeyError if no message of the stream arrived."""
-        return self._accounts[key].stored()
+    def stored(self, key: StreamKey) -> StoredAccount | None:
+        """Return the ledger of a stream for a store; None if the ledger does not contain the stream."""
+        account = self._accounts.get(key)
+        return account.stored() if account is not None else None
 
     def restore(self, key: StreamKey, account: StoredAccount) -> None:
-        """Continue with a stored ledger. Raises OverflowError if there are more than STREAMS_MAX streams."""
-        if key not in self._accounts and len(self._accounts) >= STREAMS_MAX:
-            raise OverflowError(f"expected at most {STREAMS_MAX} streams, got one more: {key}")
+        """Continue with a stored ledger."""
         self._accounts[key] = _Account(account.counts, account.gaps)
+        self._use(key)
 
-    def take(self, message: FleetMessage, stream: Stream) -> FleetMessage | None:
-        """Add a message. Return its new part, None for a duplicate. Raises OverflowError at STREAMS_MAX streams. If
-        only a part of a message with statistics is new, return the complete message."""
+    def _use(self, key: StreamKey) -> list[StreamKey]:
+        """Make a stream the newest. Return the streams that left the ledger."""
+        removed = self._recent.use(key)
+        for one in removed:
+            self._accounts.pop(one, None)
+        return removed
+
+    def take(
+        self, message: FleetMessage, stream: Stream, changed: set[StreamKey] | None = None
+    ) -> FleetMessage | None:  # fmt: skip
+        """Add a message. Return its new part, None for a duplicate. Add the changed and the removed streams to
+        `changed`. If only a part of a message with statistics is new, return the complete message."""
         key = key_of(message, stream)
+        removed = self._use(key)
+        if changed is not None:
+            changed.update((key, *removed))
         account = self._accounts.get(key)
         if account is None:
-            if len(self._accounts) >= STREAMS_MAX:
-                raise OverflowError(f"expected at most {STREAMS_MAX} streams, got one more: {key}")
             begin = message.begin if self._from_begin else message.first
             account = self._accounts[key] = _Account(StreamCounts(begin, begin - 1))
         fresh = account.take(message, stream)
@@ -164,7 +209,7 @@ class FleetLedger:
         return msgspec.structs.replace(message, samples=samples)
 
 
-# Maximum number of streams in the states of all gateways. A reader with more streams raises an error.
+# Maximum number of streams in the states of all gateways
 POSITIONS_MAX: Final = 100_000
 
 
@@ -218,15 +263,17 @@ class SpoolPositions:
         """With `from_begin`, numbers before the first state of a stream count as not yet received."""
         self._from_begin = from_begin
         self._positions: dict[StreamKey, StreamPosition] = {}
+        self._recent = RecentStreams(POSITIONS_MAX)
         self._begins: dict[StreamKey, int] = {}  # first number of the ledger of each stream without a message
 
     def take(self, gateway: str, state: GatewayState) -> None:
-        """Store the positions of a state. Raises OverflowError if there are more than POSITIONS_MAX streams."""
+        """Store the positions of a state."""
         for one in state.positions:
             key = StreamKey(gateway, one.boot, one.device, one.stream)
             known = self._positions.get(key)
-            if known is None and len(self._positions) >= POSITIONS_MAX:
-                raise OverflowError(f"expected at most {POSITIONS_MAX} streams in states, got one more: {key}")
+            for old in self._recent.use(key):
+                self._positions.pop(old, None)
+                self._begins.pop(old, None)
             if known is None:
                 self._begins[key] = one.begin if self._from_begin else one.last + 1
             if known is None or one.last > known.last:
@@ -311,7 +358,8 @@ def offset_of(message: FleetMessage) -> BootOffset | None:
     pairs = [(one.t_ns, one.utc_ns) for one in message.samples[-1:]]
     pairs += [(one.begin_t_ns, one.begin_utc_ns) for one in message.intervals[-1:]]
     for t_ns, utc_ns in pairs:
-        if utc_ns >= CLOCK_SET_NS:
+        # the sum with a time of another message must fit into 64 bits
+        if utc_ns >= CLOCK_SET_NS and abs(utc_ns - t_ns) < NUMBER_MOST:
             return BootOffset(t_ns, utc_ns - t_ns, None)
     return None
 

@@ -39,8 +39,8 @@ class FleetStore(Protocol):
         ...
 
     def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
-        """Store batches, changed ledgers and clock offsets in one transaction. Raises ServerError or OSError. Records
-        without UTC time of a boot in `offsets` get their UTC time."""
+        """Store batches, changed ledgers and clock offsets in one transaction. Remove the ledgers that are None. Raises
+        ServerError or OSError. Records without UTC time of a boot in `offsets` get their UTC time."""
         ...
 
     def close(self) -> None:

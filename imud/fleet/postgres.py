@@ -11,6 +11,7 @@ false, until a message or a state of the same boot contains a synchronized clock
 rows of the boot to their UTC time. It uses DELETE and INSERT, because TimescaleDB partitions tables by time.
 """
 
+import logging
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from datetime import datetime, timedelta
@@ -151,6 +152,10 @@ def _placed(batch: FleetBatch, one: Interval, begin: PlacedTime) -> Interval:
     return msgspec.structs.replace(one, begin_utc_ns=begin.utc_ns, end_utc_ns=end.utc_ns)
 
 
+log = logging.getLogger(__name__)
+
+# Classes of SQLSTATE that the values of a row can cause: data exception, program limit exceeded
+OF_VALUES: Final = ("22", "54")
 LOCK: Final = 0x696D7564  # Number of the advisory lock, "imud". One collector at a time writes to a database.
 LOCK_S: Final = 20  # Maximum wait for the lock, s. The lock of a killed collector ends with its last statement.
 EXTRA_MISSING: Final = "--to postgresql needs the extra fleet: pip install 'imud[fleet]'"
@@ -178,6 +183,7 @@ class PostgresStore:
             raise ServerError(EXTRA_MISSING) from error
         self._error: type[Exception] = psycopg.Error
         self._conflict: type[Exception] = psycopg.errors.UniqueViolation
+        self.refused = 0  # number of messages, ledgers and offsets that the database could not store
         self._offsets: dict[BootKey, BootOffset] = {}  # clock offsets in the table `imud_boots`
         try:
             self._connection: Any = psycopg.connect(url, connect_timeout=10, application_name="imud fleet collect")
@@ -213,11 +219,12 @@ class PostgresStore:
                     ledger.restore(StreamKey(*key), msgspec.json.decode(account, type=StoredAccount))
                 cursor.execute("SELECT gateway, boot, t_ns, utc_offset_ns, utc_err_ns FROM imud_boots")
                 self._offsets = {BootKey(*row[:2]): BootOffset(*row[2:]) for row in cursor}
-        except (self._error, OverflowError, msgspec.DecodeError) as error:
+        except (self._error, msgspec.DecodeError) as error:
             raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
 
     def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
-        """Store batches, changed ledgers and clock offsets in one transaction. Raises ServerError."""
+        """Store batches, changed ledgers and clock offsets in one transaction. Raises ServerError. If the database
+        cannot store a message, store each part in its own transaction and ignore the parts that fail."""
         known = [batch._replace(offset=batch.offset or self._offsets.get(boot_of(batch.message))) for batch in batches]
         fresh = {key: offset for key, offset in offsets.items() if key not in self._offsets}
         try:
@@ -225,9 +232,30 @@ class PostgresStore:
                 self._transact(self._copy, known, accounts, fresh)
             except self._conflict:
                 self._transact(self._insert, known, accounts, fresh)
-        except self._error as error:
+            self._offsets |= fresh
+        except (self._error, ValueError, OverflowError) as error:
+            self._check_cause(error)
+            self._write_parts(known, accounts, fresh)
+
+    def _write_parts(self, batches: Sequence[FleetBatch], accounts: Accounts, fresh: Offsets) -> None:
+        """Store each message, ledger and offset in its own transaction. Raises ServerError."""
+        parts: list[tuple[str, list[FleetBatch], Accounts, Offsets]] = []
+        parts += [(f"a message of {'/'.join(map(str, _head(batch)))}", [batch], {}, {}) for batch in batches]
+        parts += [(f"the ledger of {'/'.join(key)}", [], {key: one}, {}) for key, one in accounts.items()]
+        parts += [(f"the clock offset of {'/'.join(key)}", [], {}, {key: one}) for key, one in fresh.items()]
+        for name, some_batches, some_accounts, some_offsets in parts:
+            try:
+                self._transact(self._insert, some_batches, some_accounts, some_offsets)
+                self._offsets |= some_offsets
+            except (self._error, ValueError, OverflowError) as error:
+                self._check_cause(error)
+                self.refused += 1
+                log.warning("PostgreSQL: cannot store %s: %s; ignoring it", name, _sentence(error))
+
+    def _check_cause(self, error: Exception) -> None:
+        """Raise ServerError if the values of a message are not the cause of an error."""
+        if isinstance(error, self._error) and not (getattr(error, "sqlstate", None) or "").startswith(OF_VALUES):
             raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
-        self._offsets |= fresh
 
     def close(self) -> None:
         """Close the connection. A second call does nothing."""
@@ -247,10 +275,15 @@ class PostgresStore:
             insert(cursor, SAMPLES, (row for batch in batches for row in sample_rows(batch)))
             insert(cursor, RECORDS, (row for batch in batches for row in record_rows(batch)))
             if accounts:
-                _copy_rows(cursor, f"new_{LEDGER}", ((*key, json_of(one)) for key, one in accounts.items()))
+                kept = ((*key, json_of(one)) for key, one in accounts.items() if one is not None)
+                _copy_rows(cursor, f"new_{LEDGER}", kept)
                 cursor.execute(
                     f"INSERT INTO {LEDGER} SELECT * FROM new_{LEDGER} "
                     "ON CONFLICT (gateway, boot, device, stream) DO UPDATE SET account = EXCLUDED.account"
+                )
+                cursor.executemany(
+                    f"DELETE FROM {LEDGER} WHERE gateway = %s AND boot = %s AND device = %s AND stream = %s",
+                    [key for key, one in accounts.items() if one is None],
                 )
             self._place(cursor, fresh)
 

@@ -29,7 +29,6 @@ from imud.fleet.accounts import (
     StreamAccount,
     StreamKey,
     decode_state,
-    key_of,
     placed,
 )
 from imud.fleet.broker import (
@@ -49,7 +48,7 @@ from imud.fleet.broker import (
 )
 from imud.fleet.messages import ROOT, STATE, FleetMessage, Stream, TopicParts, decode_message, is_name, parse_topic
 from imud.fleet.settings import Broker, broker_of
-from imud.model.errors import BadArgument, ServerError
+from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_S
 
 # Maximum number of messages without an acknowledgement. 1,000 gateways with two devices send this number per second.
@@ -59,6 +58,8 @@ WAITING_BYTES: Final = 16 << 20
 # Maximum length of a message, bytes. A message of a gateway has at most 130 kB; the state of a hundred devices is
 # shorter.
 PACKET_BYTES: Final = 1_000_000
+# Maximum length of the stored states of all gateways, bytes: 10,000 gateways with 3 kB
+STATES_BYTES: Final = 32 << 20
 KEEP_ALIVE_S: Final = 30
 # Pause after received messages, s. Reading several messages together costs less than half of the CPU time per message.
 GATHER_S: Final = 0.01
@@ -374,6 +375,8 @@ class Fleet:
         self.retry_max_s, self.now_ns = retry_max_s, now_ns
         self.ledger = FleetLedger(from_begin=from_begin)
         self.states: dict[tuple[str, str], GatewayState] = {}  # newest state of each gateway, by site and gateway
+        self._states_bytes = 0
+        self._state_bytes: dict[tuple[str, str], int] = {}  # length of each state, in the order of their arrival
         self.ignored = 0  # number of messages that no gateway of a supported version sent
         self.connections = 0  # number of accepted connections
         self.problem = ""  # cause of a missing connection, one sentence; empty while the reader is connected
@@ -396,7 +399,7 @@ class Fleet:
         """Yield batches. Acknowledge each batch when the caller requests the next. None selects all.
 
         The reader tries again after connection problems and stores them in `problem`. Raises BadArgument if a name is
-        invalid, and ServerError if there are too many streams for the ledger.
+        invalid.
         """
         async with FleetSession(self, site=site, gateway=gateway, device=device) as session:
             while True:
@@ -409,14 +412,14 @@ class Fleet:
                 session.acknowledge(delivery)
 
     def take(self, delivery: FleetDelivery, changed: set[StreamKey] | None = None) -> FleetBatch | None:
-        """Add a message to the ledger. Return its new part. Raises ServerError if there are too many streams. This
-        method adds the key of a changed ledger to `changed`, also after a duplicate."""
+        """Add a message to the ledger. Return its new part. This method adds the keys of changed and removed ledgers to
+        `changed`, also after a duplicate."""
         parts = parse_topic(delivery.topic)
         assert parts is not None  # FleetSession.next checks the topic
         try:
             if parts.leaf == STATE:
                 state = decode_state(delivery.payload)
-                self.states[parts.site, parts.gateway] = state
+                self._keep_state((parts.site, parts.gateway), state, len(delivery.payload))
                 self._positions.take(parts.gateway, state)
                 self.clocks.take_state(parts.gateway, state)
                 return None
@@ -425,17 +428,23 @@ class Fleet:
                 raise ValueError(
                     f"expected a message of {parts.gateway}/{parts.device}, got a message of another device"
                 )
-            fresh = self.ledger.take(message, stream)
-            if changed is not None:
-                changed.add(key_of(message, stream))
+            fresh = self.ledger.take(message, stream, changed)
             offset = self.clocks.take(message)
             return FleetBatch(parts.site, stream, fresh, offset) if fresh is not None else None
         except ValueError as error:
             self.ignored += 1
             log.warning("%s: %s", delivery.topic, error)
             return None
-        except OverflowError as error:
-            raise ServerError(str(error)) from error
+
+    def _keep_state(self, key: tuple[str, str], state: GatewayState, size: int) -> None:
+        """Store the newest state of a gateway. Forget the oldest states if all states are too large."""
+        self.states.pop(key, None)
+        self._states_bytes += size - self._state_bytes.pop(key, 0)
+        self.states[key], self._state_bytes[key] = state, size
+        while self._states_bytes > STATES_BYTES:
+            oldest = next(iter(self._state_bytes))
+            self._states_bytes -= self._state_bytes.pop(oldest)
+            del self.states[oldest]
 
 
 class FleetSession:

@@ -1,11 +1,12 @@
 """Ledger of a reader: it balances after each message, for any order and any repetition."""
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imud.fleet.accounts import FleetLedger, StreamCounts
-from imud.fleet.messages import VERSION, DropCause, FleetMessage, Interval, MessageKind, Stream
+from imud.fleet.accounts import FleetLedger, StreamCounts, StreamKey, key_of
+from imud.fleet.messages import NUMBER_MOST, VERSION, DropCause, FleetMessage, Interval, MessageKind, Stream
 from imud.model.sample import Sample, Sync
 
 
@@ -91,3 +92,30 @@ def test_the_ledger_balances_for_any_sequence_of_messages(taken: list[tuple[tupl
         (counts,) = ledger.counts.values()
         assert counts.balance == 0
         assert counts.missing == max(seen) - len(seen)
+
+
+def test_old_boots_leave_the_ledger_of_the_gateway_with_the_most_streams(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("imud.fleet.accounts.STREAMS_MAX", 60)
+    ledger, changed = FleetLedger(), set[StreamKey]()
+    good = [msgspec.structs.replace(message(1, 1), gateway=f"good{n}") for n in range(20)]
+    for one in good:
+        ledger.take(one, Stream.SAMPLES, changed)
+    for boot in range(1000):
+        ledger.take(message(1, 1, boot=f"{boot:x}"), Stream.SAMPLES, changed)
+    keys = list(ledger.counts)
+    assert [key.gateway for key in keys[:20]] == [one.gateway for one in good]
+    own = [int(key.boot, 16) for key in keys[20:]]
+    assert own == list(range(1000 - len(own), 1000)), "the newest boots stay"
+    assert 35 <= len(own) <= 40
+    assert len(changed) == 1020
+    assert {key for key in changed if ledger.stored(key) is not None} == set(keys)
+    assert ledger.take(good[0], Stream.SAMPLES) is None, "the ledger still recognizes duplicates"
+
+
+def test_the_sum_of_duplicates_is_limited() -> None:
+    ledger, long = FleetLedger(), message(1, 1, MessageKind.DROPPED)
+    long = msgspec.structs.replace(long, last=NUMBER_MOST - 1)
+    for _ in range(9):
+        ledger.take(long, Stream.SAMPLES)
+    assert ledger.counts[key_of(long, Stream.SAMPLES)].duplicates == NUMBER_MOST
+    assert msgspec.json.encode(ledger.stored(key_of(long, Stream.SAMPLES)))

@@ -16,6 +16,7 @@ from imud.fleet.accounts import (
     decode_state,
 )
 from imud.fleet.messages import GatewayClock, MessageKind, Stream
+from imud.fleet.reader import Fleet, FleetDelivery, ReaderConnection
 from tests.fleet.test_accounts import message
 
 KEY = StreamKey("gw", "1", "bow", "samples")
@@ -137,11 +138,9 @@ def test_the_ledger_balances_for_any_sequence_and_any_number_of_restarts(steps: 
 def test_the_number_of_positions_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("imud.fleet.accounts.POSITIONS_MAX", 2)
     positions = SpoolPositions(from_begin=True)
-    for boot in ("1", "2", "1"):
+    for boot in ("1", "2", "1", "3"):
         positions.take("gw", state(5, boot))
-    with pytest.raises(OverflowError, match="at most 2 streams"):
-        positions.take("gw", state(5, "3"))
-    assert [key.boot for key in positions.accounts(FleetLedger())] == ["1", "2"]
+    assert [key.boot for key in positions.accounts(FleetLedger())] == ["1", "3"]
 
 
 def test_a_stored_ledger_does_not_change() -> None:
@@ -150,3 +149,12 @@ def test_a_stored_ledger_does_not_change() -> None:
     stored = ledger.stored(KEY)
     ledger.take(message(5, 9, MessageKind.DROPPED), Stream.SAMPLES)
     assert stored == StoredAccount(StreamCounts(1, 4, dropped={"space": 4}), [])
+
+
+def test_the_size_of_the_stored_states_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("imud.fleet.reader.STATES_BYTES", 100)
+    fleet = Fleet("mqtt://broker")
+    payload = b'{"v":1,"online":true,"boot":"1"}'  # 32 bytes
+    for name in ("a", "b", "a", "c", "d", "b"):
+        fleet.take(FleetDelivery(f"imud/site/{name}/state", payload, True, 0, ReaderConnection(fleet.brokers[0])))
+    assert [gateway for _, gateway in fleet.states] == ["c", "d", "b"]

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from imud.fleet.accounts import BootClocks, BootKey, BootOffset, FleetLedger, StoredAccount, key_of
+from imud.fleet.accounts import BootClocks, BootKey, BootOffset, FleetLedger, StoredAccount, StreamKey
 from imud.fleet.collector import Offsets
 from imud.fleet.messages import (
     NUMBER_MOST,
@@ -71,11 +71,10 @@ def write(url: str, *messages: FleetMessage, offsets: Offsets = NO_OFFSETS) -> F
 
     store, ledger, clocks = PostgresStore(url), FleetLedger(), BootClocks()
     store.restore(ledger)
-    batches, changed = [], set()
+    batches, changed = [], set[StreamKey]()
     for message in messages:
         stream = STREAMS.get(message.kind, Stream.SAMPLES)
-        fresh, offset = ledger.take(message, stream), clocks.take(message)
-        changed.add(key_of(message, stream))
+        fresh, offset = ledger.take(message, stream, changed), clocks.take(message)
         if fresh is not None:
             batches.append(FleetBatch("mill", stream, fresh, offset))
     try:
@@ -203,6 +202,28 @@ def test_the_largest_numbers_that_are_decoded_are_rows(database: str, t_ns: int,
     assert [row[1] for row in placed(database) if row[0] == MOST] == [t_ns + offset_ns] * 2
     ((content,),) = query(database, "SELECT content FROM imud_records WHERE kind = 'event'")
     assert content["message"] == text.message
+
+
+def test_a_bad_message_affects_only_itself(database: str, caplog: pytest.LogCaptureFixture) -> None:
+    sample = Sample("bow", 1, -MOST, 0, Sync.EDGE, 0, MOST)
+    first = msgspec.structs.replace(samples_message(1, 1, boot="a"), samples=[sample], clock=None)
+    set_at_0 = GatewayClock(0, 0, synchronised=False, error_ns=None)
+    second = msgspec.structs.replace(samples_message(2, 2, boot="a", utc_ns=0), clock=set_at_0)
+    write(database, *(decode_message(encode_message(one)) for one in (first, second)))
+    assert query(database, "SELECT count(*) FROM imud_samples") == [(2,)]
+    too_large = Sample("bow", 1 << 63, 1, 0, Sync.EDGE, 0, UTC_NS)
+    bad = msgspec.structs.replace(samples_message(3, 3, boot="b"), samples=[too_large])
+    write(database, samples_message(1, 5), bad, samples_message(6, 9))
+    assert query(database, "SELECT count(*) FROM imud_samples WHERE boot = '1'") == [(9,)]
+    assert "cannot store a message of mill/gw/b/bow" in caplog.text
+    assert query(database, "SELECT count(*) FROM imud_ledger") == [(3,)]
+
+
+def test_ledgers_of_old_boots_are_removed(database: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("imud.fleet.accounts.STREAMS_MAX", 3)
+    for boot in "12345":
+        write(database, samples_message(1, 5, boot=boot))
+    assert query(database, "SELECT boot FROM imud_ledger ORDER BY boot") == [("3",), ("4",), ("5",)]
 
 
 def test_a_transaction_that_fails_leaves_nothing(database: str) -> None:
