@@ -13,7 +13,7 @@ from imud.model.errors import BadArgument, LinkError, reason_of
 from imud.web.guard import WebGuard, is_loopback, read_token
 
 if TYPE_CHECKING:
-    from aiohttp import web
+    from imud.web.server import WebServer
 
 ADDRESS: Final = "127.0.0.1"
 PORT: Final = 9322  # Default port. The metrics use port 9321.
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
         from imud.web.server import WebServer
     except ModuleNotFoundError as error:
         raise BadArgument(f"cannot import {error.name}; install the extra: pip install 'imud[web]'") from None
-    asyncio.run(_serve(WebServer(args.socket, guard).make_app(), args))
+    asyncio.run(_serve(WebServer(args.socket, guard), args))
     return 0
 
 
@@ -74,17 +74,19 @@ def guard_of(args: argparse.Namespace) -> WebGuard:
     return WebGuard(token, time, reading_needs_token=reading == "token", names=args.host)
 
 
-async def _serve(app: "web.Application", args: argparse.Namespace) -> None:
+async def _serve(server: "WebServer", args: argparse.Namespace) -> None:
     from aiohttp import web
+
+    from imud.web.server import LimitedSite, server_log
 
     stopped = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     # no log line per request
-    runner = web.AppRunner(app, access_log=None, shutdown_timeout=STOP_S)
+    runner = web.AppRunner(server.make_app(), access_log=None, logger=server_log(), shutdown_timeout=STOP_S)
     await runner.setup()
     try:
-        site = web.TCPSite(runner, args.address, args.port)
+        site = LimitedSite(runner, args.address, args.port, server.connections)
         try:
             await site.start()
         except (OSError, socket.gaierror) as error:

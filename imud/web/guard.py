@@ -67,9 +67,16 @@ class WebGuard:
         return "expected a request of a page of this server, got a request of another site"
 
     def rights(self, authorization: str | None, cookie: str | None) -> WebRights:
-        by_header = (authorization or "").startswith(BEARER) and self.is_token((authorization or "")[len(BEARER) :])
+        token = self.bearer(authorization)
+        by_header = token is not None and self.is_token(token)
         by_cookie = not by_header and self.is_session(cookie or "")
         return WebRights(not self._reading_needs_token or by_header or by_cookie, by_header or by_cookie, by_cookie)
+
+    def bearer(self, authorization: str | None) -> str | None:
+        """Return the token in the header Authorization; None if it contains no token, or the server has no token."""
+        if not self._token or authorization is None or not authorization.startswith(BEARER):
+            return None
+        return authorization[len(BEARER) :]
 
     def is_token(self, words: str) -> bool:
         """Return whether `words` is the token, in constant time."""

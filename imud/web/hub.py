@@ -225,9 +225,13 @@ class BrowserHub:
         self._want()
         if is_other_view and wanted.look != "nothing":
             self._send_known(browser)
-        if wanted.look == "device" and wanted.device not in self._watched:
+        if wanted.look == "device" and wanted.device not in self._watched and self._exists(wanted.device):
             words = f"pages of {DEVICES_MAX} other devices are open, the maximum; close one of them"
             browser.mailbox.put(_text(messages.ProblemMessage(words)))
+
+    def _exists(self, device: str) -> bool:
+        """Return whether a device exists, or its existence is unknown before the first status."""
+        return not self._statuses or device in self._statuses
 
     def _send_known(self, browser: Browser) -> None:
         """Send the state and the kept events, so that the page is not empty until the next status."""
@@ -238,7 +242,7 @@ class BrowserHub:
     def _want(self) -> None:
         """Request the data that all pages need from the feed."""
         looks = [one.look for one in self.browsers if one.look.look != "nothing"]
-        named = {look.device for look in looks if look.look == "device"}
+        named = {look.device for look in looks if look.look == "device" and self._exists(look.device)}
         stay = [name for name in self._watched if name in named]
         devices = self._watched = tuple([*stay, *sorted(named.difference(stay))][:DEVICES_MAX])
         rates = [look.rate_hz for look in looks if look.look == "device"]
@@ -269,7 +273,9 @@ class BrowserHub:
         """Send the data in `news` to the pages that show it."""
         self._spread_state(news)
         if news.statuses is not None:
-            self._statuses = {status.name: status for status in news.statuses}
+            before, self._statuses = self._statuses, {status.name: status for status in news.statuses}
+            if before.keys() != self._statuses.keys():
+                self._want()  # a page can show a device that did not exist
             self._clients = news.clients
             self._spread_statuses(news.now_ns)
         if news.newest is not None:

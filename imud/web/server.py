@@ -8,13 +8,17 @@ POST /api/call         {"method": …, "params": {…}}: a method of docs/socket
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
-from contextlib import suppress
+import logging
+from collections import Counter
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from time import monotonic
 from typing import Any, Final
 
 import msgspec
 from aiohttp import WSMsgType, web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from imud import __version__
 from imud.client.connection import params_of, rpc_error
@@ -115,6 +119,115 @@ HEARTBEAT_S: Final = 20.0
 FAILURES_MAX: Final = 8
 FAILURE_S: Final = 2.0
 """Delay of the reply to a wrong token, s. With at most FAILURES_MAX at a time, four guesses per second are possible."""
+GUESSING: Final = "too many wrong tokens; try again in a few seconds"
+
+FAILURES_TOTAL_MAX: Final = 64
+"""Maximum number of delayed replies to wrong tokens of all addresses. FAILURES_MAX limits one address."""
+BODY_S: Final = 10.0
+"""Maximum time to receive the body of a POST, s."""
+CONNECTIONS_MAX: Final = 200
+"""Maximum number of connections, with open pages. A new connection then closes the connection that is idle longest."""
+IDLE_S: Final = 60.0
+"""Maximum time of a connection without a complete request, or to send a reply, s."""
+CHECK_S: Final = 1.0
+"""Time between two checks for idle connections, s."""
+BAD_INPUT: Final = (HttpProcessingError, web.RequestPayloadError)
+"""Errors of aiohttp about malformed requests."""
+
+
+class WebConnections:
+    """TCP connections of the server. Synchronization: one event loop.
+
+    aiohttp limits neither their number nor the time to send a request.
+    """
+
+    def __init__(self, now_s: Callable[[], float]) -> None:
+        """`now_s` returns the time of a monotonic clock, s."""
+        self._now_s = now_s
+        # start of the connection, or end of its last request, oldest first
+        self._since_s: dict[web.RequestHandler, float] = {}
+        self._busy: set[web.RequestHandler] = set()
+
+    def accept(self, connection: web.RequestHandler) -> web.RequestHandler:
+        """Add a new connection and return it. Close the oldest idle connection if there are too many."""
+        self._close(lambda idle_s: len(self._since_s) >= CONNECTIONS_MAX)
+        self._since_s[connection] = self._now_s()
+        return connection
+
+    def close_idle(self) -> None:
+        """Close the connections that are idle for IDLE_S."""
+        self._close(lambda idle_s: idle_s >= IDLE_S)
+
+    def _close(self, is_wanted: Callable[[float], bool]) -> None:
+        now_s = self._now_s()
+        for connection, since_s in list(self._since_s.items()):
+            idle_s = now_s - since_s
+            transport = connection.transport
+            if transport is None and idle_s > CHECK_S:  # already closed; a new connection gets its transport soon
+                del self._since_s[connection]
+            elif transport is not None and connection not in self._busy and is_wanted(idle_s):
+                del self._since_s[connection]
+                transport.abort()
+
+    @contextmanager
+    def in_use(self, request: web.Request) -> Iterator[None]:
+        """Keep the connection of a request during a long reply."""
+        connection = request.protocol
+        self._busy.add(connection)
+        try:
+            yield
+        finally:
+            self._busy.discard(connection)
+
+    def end_request(self, request: web.Request) -> None:
+        """Restart the idle time of a connection."""
+        if self._since_s.pop(request.protocol, None) is not None:
+            self._since_s[request.protocol] = self._now_s()
+
+    async def run(self, _app: web.Application) -> Any:
+        """Close idle connections while the application runs."""
+
+        async def check() -> None:
+            while True:
+                await asyncio.sleep(CHECK_S)
+                self.close_idle()
+
+        checking = asyncio.create_task(check())
+        yield
+        checking.cancel()
+
+
+class LimitedSite(web.TCPSite):
+    """Listening socket whose connections are in a `WebConnections`."""
+
+    def __init__(self, runner: web.AppRunner, host: str, port: int, connections: WebConnections) -> None:
+        super().__init__(runner, host, port)
+        self._address, self._connections = (host, port), connections
+
+    async def start(self) -> None:
+        await web.BaseSite.start(self)
+        make = self._runner.server
+        assert make is not None
+        host, port = self._address
+        self._server = await asyncio.get_running_loop().create_server(
+            lambda: self._connections.accept(make()), host, port, backlog=self._backlog
+        )
+
+
+class _OfPrograms(logging.Filter):
+    """Filter that keeps errors of imud, and discards errors about malformed requests."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        return not (record.exc_info and isinstance(record.exc_info[1], BAD_INPUT))
+
+
+def server_log() -> logging.Logger:
+    """Return the log of aiohttp without malformed requests: a client must not be able to fill the log."""
+    log = logging.getLogger("imud.web.aiohttp")
+    if not log.filters:
+        log.addFilter(_OfPrograms())
+    return log
+
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -126,7 +239,8 @@ class WebServer:
         self._guard = guard
         self._calls = Calls(path)
         self._path = path
-        self._failures = 0
+        self._failures: Counter[str] = Counter()  # delayed replies to wrong tokens by address
+        self.connections = WebConnections(monotonic)
         self.hub: BrowserHub | None = None  # the hub; None before the application runs
 
     def make_app(self) -> web.Application:
@@ -140,6 +254,7 @@ class WebServer:
         app.router.add_static("/static", STATIC)
         app.on_response_prepare.append(_add_headers)
         app.cleanup_ctx.append(self._reading)
+        app.cleanup_ctx.append(self.connections.run)
         return app
 
     async def _reading(self, _app: web.Application) -> Any:
@@ -155,10 +270,23 @@ class WebServer:
 
     @web.middleware
     async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse requests that another site could have sent."""
+        """Refuse malformed requests, and requests that another site could have sent."""
+        try:
+            return await self._checked(request, handler)
+        except BAD_INPUT:
+            return _refusal(400, "expected a valid HTTP request")
+        finally:
+            self.connections.end_request(request)
+
+    async def _checked(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         headers = request.headers
         if problem := self._guard.host_problem(headers.get("Host")):
             return _refusal(421, problem)
+        if (token := self._guard.bearer(headers.get("Authorization"))) is not None:
+            if self._is_guessing(request):
+                return _refusal(429, GUESSING)
+            if not self._guard.is_token(token):
+                return await self._wrong_token(request)
         rights = self._rights_of(request)
         if request.method != "GET" or request.path == "/api/stream":
             with_token = rights.control and not rights.by_cookie
@@ -177,25 +305,32 @@ class WebServer:
 
     async def _login(self, request: web.Request) -> web.StreamResponse:
         try:
-            token = messages.decode_body(await request.read(), messages.LoginRequest).token
+            token = messages.decode_body(await _body(request), messages.LoginRequest).token
         except ValueError:
             return _refusal(400, 'expected a token, as {"token": "…"}')
         if not self._guard.has_token:
             return _refusal(403, "this server has no token, so no login is possible; start imud web with --token-file")
+        if self._is_guessing(request):
+            return _refusal(429, GUESSING)
         if not self._guard.is_token(token):
-            return await self._wrong_token()
+            return await self._wrong_token(request)
         response = _reply({"control": True})
         response.set_cookie(COOKIE, self._guard.new_session(), max_age=SESSION_S, httponly=True, samesite="Strict")
         return response
 
-    async def _wrong_token(self) -> web.Response:
-        if self._failures >= FAILURES_MAX:
-            return _refusal(429, "too many wrong tokens; try again in a few seconds")
-        self._failures += 1
+    def _is_guessing(self, request: web.Request) -> bool:
+        """Return whether imud must not check a token, because too many wrong tokens were received."""
+        failures = self._failures
+        return failures[request.remote or ""] >= FAILURES_MAX or failures.total() >= FAILURES_TOTAL_MAX
+
+    async def _wrong_token(self, request: web.Request) -> web.Response:
+        address = request.remote or ""
+        self._failures[address] += 1
         try:
             await asyncio.sleep(FAILURE_S)
         finally:
-            self._failures -= 1
+            self._failures[address] -= 1
+            self._failures += Counter()  # removes addresses without failures
         return _refusal(401, "wrong token")
 
     async def _logout(self, _request: web.Request) -> web.StreamResponse:
@@ -220,9 +355,10 @@ class WebServer:
         self.hub.add(browser)
         sending = asyncio.create_task(_send_all(browser, socket))
         try:
-            async for message in socket:
-                if message.type is WSMsgType.TEXT:
-                    self._look(browser, message.data)
+            with self.connections.in_use(request):
+                async for message in socket:
+                    if message.type is WSMsgType.TEXT:
+                        self._look(browser, message.data)
         finally:
             self.hub.remove(browser)
             sending.cancel()
@@ -240,7 +376,7 @@ class WebServer:
 
     async def _call(self, request: web.Request) -> web.StreamResponse:
         try:
-            asked = messages.decode_body(await request.read(), messages.CallRequest)
+            asked = messages.decode_body(await _body(request), messages.CallRequest)
         except ValueError:
             return _refusal(400, 'expected a method and its parameters, as {"method": "status", "params": {}}')
         rights = self._rights_of(request)
@@ -249,7 +385,8 @@ class WebServer:
         is_control = asked.method in CONTROLLING or asked.params.get("fresh") not in (None, False)
         if not (rights.control if is_control else rights.read):
             return _refusal(401, "no permission; log in with the token")
-        return await self._forwarded(asked)
+        with self.connections.in_use(request):
+            return await self._forwarded(asked)
 
     async def _forwarded(self, asked: messages.CallRequest) -> web.Response:
         try:
@@ -260,6 +397,15 @@ class WebServer:
             return _refusal(503, str(error))
         except (ImudError, TimeoutError) as error:
             return _refusal(502, str(error))
+
+
+async def _body(request: web.Request) -> bytes:
+    """Return the body of a POST. Raises HTTPRequestTimeout if it does not arrive in BODY_S."""
+    try:
+        async with asyncio.timeout(BODY_S):
+            return await request.read()
+    except TimeoutError:
+        raise web.HTTPRequestTimeout from None
 
 
 async def _send_all(browser: Browser, socket: web.WebSocketResponse) -> None:

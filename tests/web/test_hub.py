@@ -206,6 +206,19 @@ def test_the_feed_waits_for_a_late_event_loop() -> None:
     assert len(waiting) == WAITING_MAX
 
 
+def test_unknown_devices_take_no_places() -> None:
+    hub, feed = make()
+    opened(hub, look="device", device="later")
+    hub.spread(News(statuses=(device("bow"),), now_ns=1))
+    for number in range(DEVICES_MAX):
+        opened(hub, look="device", device=f"x{number}")
+    opened(hub, look="device", device="bow")
+    assert [one.devices for one in feed.wanted if one] == [("later",), *[()] * (DEVICES_MAX + 1), ("bow",)]
+    hub.spread(News(statuses=(device("bow"), device("later")), now_ns=2))
+    assert feed.wanted[-1] is not None
+    assert feed.wanted[-1].devices == ("bow", "later")
+
+
 async def test_devices_above_the_maximum_are_reported() -> None:
     hub, feed = make()
     for number in range(DEVICES_MAX):

@@ -9,18 +9,28 @@ import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from aiohttp import ClientWebSocketResponse, WSMsgType, WSServerHandshakeError
 from aiohttp.test_utils import TestClient, TestServer, get_port_socket
+from aiohttp.web import AppRunner
 
 from imud.model.event import Event, EventKind
 from imud.publishers.socket.server import SocketServer
 from imud.web import hub as mailbox
 from imud.web import server as web_app
 from imud.web.guard import COOKIE, WebGuard
-from imud.web.server import STATIC, WebServer
+from imud.web.server import (
+    CONNECTIONS_MAX,
+    IDLE_S,
+    STATIC,
+    LimitedSite,
+    WebConnections,
+    WebServer,
+    server_log,
+)
 from tests.support.socket_rig import batch, serving, until
 
 TOKEN = "correct-horse-battery-staple"
@@ -196,16 +206,25 @@ async def test_reading_can_need_the_token_too(tmp_path: Path) -> None:
         await socket.close()
 
 
+async def login(site: Site) -> tuple[int, dict[str, str]]:
+    """Log in. Return the status, and the header with the cookie."""
+    async with site.client.post("/api/login", json={"token": TOKEN}, headers=site.origin) as response:
+        return response.status, {"Cookie": f"{COOKIE}={response.cookies[COOKIE].value}"}
+
+
 async def test_replies_to_wrong_tokens_are_delayed_and_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(web_app, "FAILURE_S", 3600.0)
     async with running(tmp_path) as site:
-        guesses = [
-            asyncio.create_task(site.post("/api/login", {"token": "wrong"})) for _ in range(web_app.FAILURES_MAX + 1)
-        ]
+        _, session = await login(site)
+        wrong = {"Authorization": "Bearer wrong"}
+        half = web_app.FAILURES_MAX // 2
+        guesses = [asyncio.create_task(site.post("/api/login", {"token": "wrong"})) for _ in range(half)]
+        guesses += [asyncio.create_task(site.get("/api/session", **wrong)) for _ in range(half + 1)]
         done, waiting = await asyncio.wait(guesses, return_when=asyncio.FIRST_COMPLETED)
         assert [one.result()[0] for one in done] == [429]
-        status, _ = await site.post("/api/login", {"token": TOKEN})
-        assert status == 200, "the right one is not held up"
+        assert (await site.post("/api/login", {"token": TOKEN}))[0] == 429, "imud checks no token"
+        assert (await site.get("/api/session", **BEARER))[0] == 429, "imud checks no token"
+        assert (await site.get("/api/session", **session))[1]["control"], "a session continues"
         for one in waiting:
             one.cancel()
     monkeypatch.setattr(web_app, "FAILURE_S", 0.0)
@@ -332,3 +351,70 @@ async def test_pages_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         hub = site.web.hub
         await until(lambda: not hub.browsers)
         await (await site.stream(look="overview")).close()
+
+
+class FakeTransport(asyncio.Transport):
+    aborted = False
+
+    def abort(self) -> None:
+        self.aborted = True
+
+
+class FakeHandler:
+    def __init__(self) -> None:
+        self.transport = FakeTransport()
+
+
+def connected(connections: WebConnections) -> tuple[FakeHandler, FakeTransport]:
+    one = FakeHandler()
+    connections.accept(one)  # type: ignore[arg-type]  # only its transport is used
+    return one, one.transport
+
+
+def test_idle_connections_are_closed_and_a_new_connection_replaces_the_oldest() -> None:
+    now = [0.0]
+    connections = WebConnections(lambda: now[0])
+    (page, page_transport), *others = [connected(connections) for _ in range(CONNECTIONS_MAX)]
+    with connections.in_use(SimpleNamespace(protocol=page)):  # type: ignore[arg-type]
+        _, newest = connected(connections)
+        assert [transport.aborted for _, transport in others[:3]] == [True, False, False]
+        now[0] = IDLE_S - 1
+        used = others[1][0]
+        connections.end_request(SimpleNamespace(protocol=used))  # type: ignore[arg-type]
+        connections.close_idle()
+        assert not newest.aborted
+        now[0] = IDLE_S
+        connections.close_idle()
+        assert newest.aborted
+        assert [transport.aborted for one, transport in others if one is used] == [False]
+        assert not page_transport.aborted
+    connections.close_idle()
+    assert page_transport.aborted
+
+
+MALFORMED = (
+    b"\x00\x01\x02\r\n\r\n", b"GET / HTTP/9.9\r\n\r\n", b"GET /" + b"a" * 9000 + b" HTTP/1.1\r\n\r\n",
+    b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"a" * 9000 + b"\r\n\r\n",
+    b"POST /api/call HTTP/1.1\r\nHost: HOST\r\nOrigin: http://HOST\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n",
+    b"POST /api/call HTTP/1.1\r\nHost: HOST\r\nOrigin: http://HOST\r\nContent-Length: 3\r\n"
+    b"Content-Encoding: gzip\r\n\r\nabc",
+    b"POST /api/login HTTP/1.1\r\nHost: HOST\r\nOrigin: http://HOST\r\nContent-Length: -3\r\n\r\nabc",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("request_bytes", MALFORMED)
+async def test_malformed_requests_cause_no_log_line(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, request_bytes: bytes
+) -> None:
+    web = WebServer(str(tmp_path / "none"), WebGuard(b"", lambda: 1e9, reading_needs_token=False))
+    runner = AppRunner(web.make_app(), access_log=None, logger=server_log())
+    await runner.setup()
+    site = LimitedSite(runner, "127.0.0.1", 0, web.connections)
+    await site.start()
+    host, port = runner.addresses[0][:2]
+    reader, writer = await asyncio.open_connection(host, port)
+    writer.write(request_bytes.replace(b"HOST", f"{host}:{port}".encode()))
+    assert (await reader.readline()).split()[1] in (b"400", b"431", b"505")
+    writer.close()
+    await runner.cleanup()
+    assert not caplog.records
