@@ -41,8 +41,8 @@ UNANSWERED_S: Final = 60.0
 # Number of lost connections in sequence with only one topic in flight, after which imud skips the topic
 LOSSES_MAX: Final = 3
 # Time for which imud skips a refused topic, ns. It doubles with each further refusal: a test can cost a connection.
-SKIP_NS: Final = 600 * NS_PER_S
-SKIP_MOST_NS: Final = 24 * 3600 * NS_PER_S
+SKIP_NS: Final = 60 * NS_PER_S
+SKIP_MOST_NS: Final = 3600 * NS_PER_S
 # Maximum number of refused topics, and of suspected topics. imud forgets the oldest.
 TOPICS_MAX: Final = 500
 

@@ -57,19 +57,6 @@ def test_a_duplicate_fills_no_gap() -> None:
     assert counts == StreamCounts(1, 9, whole=7, missing=2, duplicates=5)
 
 
-def test_the_number_of_streams_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("imud.fleet.accounts.STREAMS_MAX", 2)
-    ledger = FleetLedger()
-    for boot in ("1", "2"):
-        ledger.take(message(1, 2, boot=boot), Stream.SAMPLES)
-    with pytest.raises(OverflowError, match="at most 2 streams"):
-        ledger.take(message(1, 2, boot="3"), Stream.SAMPLES)
-    first, second = ledger.counts
-    ledger.restore(first, ledger.stored(second))
-    with pytest.raises(OverflowError, match="at most 2 streams"):
-        ledger.restore(first._replace(boot="3"), ledger.stored(second))
-
-
 RANGES = st.tuples(st.integers(1, 40), st.integers(0, 12)).map(lambda pair: (pair[0], pair[0] + pair[1]))
 
 

@@ -9,7 +9,7 @@ from contextlib import closing, contextmanager, suppress
 import msgspec
 import pytest
 
-from imud.fleet.broker import BrokerError, PahoConnection, ReaderAccess, Will
+from imud.fleet.broker import BrokerError, MessageRefused, PahoConnection, ReaderAccess, Will
 from imud.fleet.reader import ReaderConnection
 from imud.fleet.settings import Broker, MqttOptions, broker_of
 from tests.support.daemon_process import LIMIT_S
@@ -121,6 +121,6 @@ def test_a_gateway_keeps_the_limits_of_the_broker() -> None:
         assert connection.in_flight_max == 2
         with pytest.raises(BrokerError, match="the output ends"):
             PahoConnection(broker, msgspec.convert({}, MqttOptions), "gateway", Will("t", b""), lambda: False)
-    too_long = pytest.raises(BrokerError, match="at most 100 bytes, got a message of t with 100")
+    too_long = pytest.raises(MessageRefused, match="at most 100 bytes, got a message of t with 100")
     with scripted(AT_MOST_100_BYTES) as broker, too_long, closing(gateway(broker)) as connection:
         connection.publish("t", bytes(100), "", retain=False)

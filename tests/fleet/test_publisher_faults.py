@@ -76,7 +76,8 @@ def test_a_frozen_broker_is_replaced_without_loss(tmp_path: Path, broker: Mosqui
     assert counts.newest >= 6900
 
 
-def test_refused_messages_are_not_lost(tmp_path: Path) -> None:
+def test_refused_messages_are_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("imud.fleet.sender.SKIP_NS", 1)
     rights = tmp_path / "rights"
     rights.write_text("topic read #\ntopic write imud/default/gw/state\n")
     port = free_port()
@@ -84,7 +85,7 @@ def test_refused_messages_are_not_lost(tmp_path: Path) -> None:
         collector = Collector(port)
         gateway = LiveGateway(tmp_path / "spool", port)
         gateway.publish(3000)
-        gateway.wait_for(lambda: "refuses messages of imud/default/gw/bow/" in gateway.output.status().problem)
+        gateway.wait_for(lambda: "imud/default/gw/bow/samples" in gateway.output.status().refused)
         rights.write_text("topic readwrite #\n")
         broker.reload()
         finish(gateway, collector)
