@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from time import monotonic
 from typing import Any, Final
 
 import msgspec
@@ -141,9 +140,8 @@ class WebConnections:
     aiohttp limits neither their number nor the time to send a request.
     """
 
-    def __init__(self, now_s: Callable[[], float]) -> None:
-        """`now_s` returns the time of a monotonic clock, s."""
-        self._now_s = now_s
+    def __init__(self) -> None:
+        self._now_s = 0.0  # time of the newest check, s
         # start of the connection, or end of its last request, oldest first
         self._since_s: dict[web.RequestHandler, float] = {}
         self._busy: set[web.RequestHandler] = set()
@@ -151,17 +149,17 @@ class WebConnections:
     def accept(self, connection: web.RequestHandler) -> web.RequestHandler:
         """Add a new connection and return it. Close the oldest idle connection if there are too many."""
         self._close(lambda idle_s: len(self._since_s) >= CONNECTIONS_MAX)
-        self._since_s[connection] = self._now_s()
+        self._since_s[connection] = self._now_s
         return connection
 
     def close_idle(self) -> None:
-        """Close the connections that are idle for IDLE_S."""
+        """Close the connections that are idle for IDLE_S. Call this method every CHECK_S."""
+        self._now_s += CHECK_S
         self._close(lambda idle_s: idle_s >= IDLE_S)
 
     def _close(self, is_wanted: Callable[[float], bool]) -> None:
-        now_s = self._now_s()
         for connection, since_s in list(self._since_s.items()):
-            idle_s = now_s - since_s
+            idle_s = self._now_s - since_s
             transport = connection.transport
             if transport is None and idle_s > CHECK_S:  # already closed; a new connection gets its transport soon
                 del self._since_s[connection]
@@ -182,7 +180,7 @@ class WebConnections:
     def end_request(self, request: web.Request) -> None:
         """Restart the idle time of a connection."""
         if self._since_s.pop(request.protocol, None) is not None:
-            self._since_s[request.protocol] = self._now_s()
+            self._since_s[request.protocol] = self._now_s
 
     async def run(self, _app: web.Application) -> Any:
         """Close idle connections while the application runs."""
@@ -240,7 +238,7 @@ class WebServer:
         self._calls = Calls(path)
         self._path = path
         self._failures: Counter[str] = Counter()  # delayed replies to wrong tokens by address
-        self.connections = WebConnections(monotonic)
+        self.connections = WebConnections()
         self.hub: BrowserHub | None = None  # the hub; None before the application runs
 
     def make_app(self) -> web.Application:

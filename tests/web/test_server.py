@@ -23,6 +23,7 @@ from imud.web import hub as mailbox
 from imud.web import server as web_app
 from imud.web.guard import COOKIE, WebGuard
 from imud.web.server import (
+    CHECK_S,
     CONNECTIONS_MAX,
     IDLE_S,
     STATIC,
@@ -372,18 +373,16 @@ def connected(connections: WebConnections) -> tuple[FakeHandler, FakeTransport]:
 
 
 def test_idle_connections_are_closed_and_a_new_connection_replaces_the_oldest() -> None:
-    now = [0.0]
-    connections = WebConnections(lambda: now[0])
+    connections = WebConnections()
     (page, page_transport), *others = [connected(connections) for _ in range(CONNECTIONS_MAX)]
     with connections.in_use(SimpleNamespace(protocol=page)):  # type: ignore[arg-type]
         _, newest = connected(connections)
         assert [transport.aborted for _, transport in others[:3]] == [True, False, False]
-        now[0] = IDLE_S - 1
+        for _ in range(round(IDLE_S / CHECK_S) - 1):
+            connections.close_idle()
         used = others[1][0]
         connections.end_request(SimpleNamespace(protocol=used))  # type: ignore[arg-type]
-        connections.close_idle()
         assert not newest.aborted
-        now[0] = IDLE_S
         connections.close_idle()
         assert newest.aborted
         assert [transport.aborted for one, transport in others if one is used] == [False]
