@@ -51,7 +51,7 @@ class MemoryStore:
         if self.fails:
             raise ServerError("the store is full")
         self.rows += [sample.seq for batch in batches for sample in batch.message.samples]
-        self.accounts |= accounts
+        self.accounts |= {key: account for key, account in accounts.items() if account is not None}
         self.offsets |= offsets
         if len(self.rows) >= self.most and self.collector is not None:
             self.collector.stop()
