@@ -183,8 +183,9 @@ def close_client(client: Any) -> None:
     """Send DISCONNECT and close the socket. Do nothing if the connection is already lost."""
     with suppress(OSError, ValueError):
         client.disconnect()
-        # paho-mqtt keeps the socket open if DISCONNECT waits behind unsent data
-        if (sock := client.socket()) is not None:
+    # paho-mqtt keeps the socket open if DISCONNECT waits behind unsent data
+    if (sock := client.socket()) is not None:
+        with suppress(OSError):
             sock.close()
 
 
