@@ -50,7 +50,7 @@ READ_ADDRESS: Final = read_registers(BY_NAME["MD_ID"].address, 1)
 SAVE: Final = 0x0000
 FACTORY_RESET: Final = 0x0001
 RESTART: Final = 0x00FF
-FLASH_MS: Final = 2500  # maximum time to the confirmation of a save, ms; 2 s were observed
+WRITE_MS: Final = 2500  # maximum time to the confirmation of a write, ms; 2 s were observed for a save
 # Number of requests without reply before an address counts as unused or a device as absent: noise can destroy one
 TRIES: Final = 3
 # together 3 s for a restart; the manual states no time
@@ -114,7 +114,7 @@ def read_settings() -> TransferScript[Reports]:
 
 def save() -> TransferScript[None]:
     """Write all settings to flash. Raises DeviceRefused, TransferError."""
-    return _write_only(BY_NAME["CTRL"], SAVE, FLASH_MS)
+    return _write_only(BY_NAME["CTRL"], SAVE)
 
 
 def restart(places: tuple[int, ...], line_baud: int) -> TransferScript[str]:
@@ -253,8 +253,9 @@ def _write(register: Register, value: int) -> TransferScript[Written]:
     return Written.VERIFIED
 
 
-def _write_only(register: Register, value: int, reply_ms: int = 0) -> TransferScript[None]:
-    request = replace(write_register(register.address, value), reply_ms=reply_ms)
+def _write_only(register: Register, value: int) -> TransferScript[None]:
+    # the reads of the samples do not show how long a write takes
+    request = replace(write_register(register.address, value), reply_ms=WRITE_MS)
     check_written((yield request), request)
 
 

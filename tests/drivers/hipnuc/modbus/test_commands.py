@@ -61,6 +61,12 @@ def test_settings_are_read_back_and_saved_only_on_request(bench: ModbusBench) ->
         ModbusBench(module(7, variant=SlaveVariant(flash_ms=2600))).run(save())
 
 
+def test_each_write_has_as_much_time_as_a_save() -> None:
+    slow = ModbusBench(module(7, processing_ns=2_000_000_000))
+    assert slow.run(set_heading_mode(NINE)) is Written.UNVERIFIED  # the bench gives the read less time
+    assert slow.slave.settings.heading_mode == 1
+
+
 @pytest.mark.manual("B 4.3.3 address")
 def test_a_module_is_followed_to_another_address(bench: ModbusBench) -> None:
     written = bench.run(change_address(7, 9))
