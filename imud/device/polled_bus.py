@@ -20,7 +20,7 @@ from imud.contracts.script import Transfer, TransferScript
 from imud.host.clock import HostClock
 from imud.host.threads import BusThread, StartWatchingWorker
 from imud.model.errors import ImudError, LinkError, TransferError
-from imud.model.units import NS_PER_S
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.path import QUIET_NS
 
 LATE_SHARE: Final = 4  # a read counts as late if its delay exceeds the period divided by this number
@@ -200,7 +200,9 @@ T = TypeVar("T")
 
 IDLE_NS = 60 * NS_PER_S  # maximum sleep of a thread without a due read, ns
 FAR_NS = 1 << 63  # time of the next read if there is none: after all other times
-POLLS_IN_ROW = 8  # number of reads before a script gets one transfer on a bus that is never idle
+# Reads before a script gets one transfer on a bus that is never idle: maximum number, and time after which none starts
+POLLS_IN_ROW = 8
+ROW_NS = 100 * NS_PER_MS
 READINGS_MAX = 10_000
 """Maximum number of readings that wait for a blocked loop. imud drops further readings and counts missed deadlines."""
 
@@ -436,6 +438,7 @@ class PolledBus:
         self._commands: deque[Callback] = deque()
         self._callbacks: list[Callback] = []  # functions that the loop's thread runs at the next wake-up
         self._in_row = 0  # number of reads since the last transfer of a script
+        self._row_ns = 0  # CLOCK_MONOTONIC of the first of these reads
         # Claimed targets of a shared bus. Only the loop's thread uses them.
         self._owners: dict[int, BusMember] = {}
         self._failure: BaseException | None = None
@@ -494,7 +497,11 @@ class PolledBus:
         while commands:
             commands.popleft()()
         polling, schedule = self._next()
-        if schedule is not None and schedule.due_ns <= self.host.now_ns() and self._in_row < POLLS_IN_ROW:
+        now_ns = self.host.now_ns()
+        if not self._in_row:
+            self._row_ns = now_ns
+        is_row_full = self._in_row >= POLLS_IN_ROW or now_ns - self._row_ns > ROW_NS
+        if schedule is not None and schedule.due_ns <= now_ns and not is_row_full:
             assert polling is not None
             self._in_row += 1
             polling.poll(schedule)

@@ -185,6 +185,26 @@ def test_readings_are_delivered_in_order_with_their_times() -> None:
     run_virtually(clock, body())
 
 
+@pytest.mark.parametrize(("read_ns", "most"), [(2_000_000, 40), (300_000_000, 5)])
+def test_a_script_waits_for_few_reads_of_a_slow_device(read_ns: int, most: int) -> None:
+    """Virtual time: a read is always due. Reads precede each of the three transfers, and the result."""
+    clock = VirtualClock()
+    buses = virtual_buses(clock)
+
+    async def body() -> None:
+        wire, sink = Wire(), Sink()
+        wire.takes_time = lambda: clock.advance(read_ns)
+        member = joined(buses, wire, sink)
+        member.start((Poll(ASK),))
+        await sink.enough.wait()
+        before = wire.count
+        await member.run(three(), 5)
+        assert wire.count - before <= 3 + most
+        buses.end()
+
+    run_virtually(clock, body())
+
+
 @pytest.mark.parametrize(("latency_ns", "together"), [(0, 1), (460_000, 1), (5_000_000, 11), (5_100_000, 11)])
 def test_a_hold_does_not_delay_reads(latency_ns: int, together: int) -> None:
     """Virtual time, 2 kHz: imud delivers the oldest reading before the end of its latency."""
