@@ -73,6 +73,7 @@ UP: Final = 16  # Divisors: part of a difference by which the learned times decr
 SURE_SETS: Final = 8  # number of sets before the learned times count: a late set would have too much weight
 _NEVER_NS: Final = 1 << 63
 ALTERNATIONS: Final = 32  # number of alternating INDEX values after which two devices have the same identifiers
+STEADY: Final = 256  # number of consecutive INDEX values after which there is one device again
 
 TEMPERATURE_COUNTS: Final = tuple(round(limit_c / C_PER_COUNT) for limit_c in TEMPERATURE_LIMITS_C)
 _HIGH_BYTES: Final = slice(3, 36, 4)  # high bytes of the nine floats of a set
@@ -129,8 +130,10 @@ class Imu61xCanCodec:
         self._index: int | None = None  # INDEX of the newest 105
         self._closed_ns = 0  # arrival of the newest 105, ns
         self._pace = _Pace()
-        self._before: int | None = None  # INDEX of the 105 before the newest 105
-        self._alternations = 0  # number of consecutive 105 that continue `_before` and not the newest 105
+        self._closing = b""  # data of the newest 105
+        self._other: int | None = None  # newest INDEX of the series before the newest jump
+        self._steady = 0  # number of 105 since the newest one that did not follow its predecessor
+        self._alternations = 0  # number of 105 of the other series since a jump to a third series
 
     @property
     def problem(self) -> str:
@@ -187,9 +190,13 @@ class Imu61xCanCodec:
         before_ns, self._closed_ns = self._closed_ns, t_rx_ns
         span_ns = t_rx_ns - self._first_ns
         follows = before is not None and (index - before) % INDEX_MODULUS == 1
-        alternates = self._before is not None and not follows and (index - self._before) % INDEX_MODULUS == 1
-        self._alternations = self._alternations + 1 if alternates else 0
-        self._before = before
+        if before is not None and not follows and data != self._closing:
+            self._note_series(index, before)
+        elif follows:
+            self._steady += 1
+            if self._steady >= STEADY:
+                self._alternations = 0
+        self._closing = data
         places = tuple(held)
         in_time = places == _IN_ORDER and span_ns <= pace.longest_ns
         is_whole = in_time or (follows and len(places) == _CLOSING)
@@ -209,6 +216,13 @@ class Imu61xCanCodec:
         if low < temperature < high and not raw[_HIGH_BYTES].strip(VALUE_HIGH_BYTES):
             return (_measurement(values, temperature, index, first_ns),)
         return (*self._not_finite(raw), _measurement(values, temperature, index, first_ns))
+
+    def _note_series(self, index: int, before: int) -> None:
+        """Note an INDEX that does not follow `before`. Two devices continue two series, which can have equal INDEX."""
+        is_other = self._other is not None and (index - self._other) % INDEX_MODULUS == 1
+        is_equal = index == before and self._steady > 0  # 0: an INDEX that stands still
+        self._alternations = self._alternations + 1 if is_other or is_equal else 0
+        self._other, self._steady = before, 0
 
     def _not_finite(self, raw: bytes) -> list[CodecEvent]:
         """Return a `BadFrame` for every frame with a value that is not possible."""

@@ -47,6 +47,24 @@ def indices(events: list[CodecEvent]) -> list[int | None]:
     return [event.dev_ticks for event in events if isinstance(event, Measurement)]
 
 
+@pytest.mark.parametrize(
+    ("pairs", "is_found"),
+    [([(n, 5000 + n) for n in range(40)], True), ([(n, n) for n in range(40)], True),  # both switched on at once
+     ([(n, n + 1) for n in range(40)], True), ([(2 * n, 2 * n + 1, 500 + n) for n in range(40)], True),  # half the rate
+     ([(7, 7)] * 40, False), ([(n * n,) for n in range(90)], False), ([(n,) for n in range(90)], False)],
+)  # fmt: skip
+def test_two_devices_with_one_base_id_are_found(pairs: list[tuple[int, ...]], *, is_found: bool) -> None:
+    codec = make()
+    for pair in pairs:
+        for device, index in enumerate(pair):
+            feed(codec, sample(index, 0.5 * device + index / 1000))
+    assert bool(codec.problem) is is_found
+    newest = pairs[-1][0] + 1
+    for index in range(newest, newest + 300):  # one device was removed
+        feed(codec, sample(index))
+    assert not codec.problem
+
+
 @pytest.mark.manual(
     "A 4.2 frame 101", "A 4.2 frame 102", "A 4.2 frame 103", "A 4.2 frame 104", "A 4.2 frame 105", "A 4.1 frames"
 )
