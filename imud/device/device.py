@@ -109,7 +109,8 @@ class VerbRun:
                     if verified is None and (changes := _changes(before, settings.values)):
                         verified, evidence = True, f"the device has lost settings that its flash lacks: {changes}"
                 case Proof.SETTINGS:
-                    verified, evidence = _reset(_changes(before, settings.values), was_unsaved)
+                    after = settings.values if settings.is_current else {}
+                    verified, evidence = _reset(before, after, was_unsaved)
                 case Proof.SAMPLES:
                     verified, evidence = await self._agrees(verb, arguments)
                 case Proof.ONE_SAMPLE if not is_quiet:
@@ -173,8 +174,11 @@ def _changes(before: Values, after: Values) -> str:
     )
 
 
-def _reset(changes: str, was_unsaved: bool) -> tuple[bool, str]:
+def _reset(before: Values, after: Values, was_unsaved: bool) -> tuple[bool, str]:
     """Return whether a reset changed the settings. A restart alone changes only settings that were not saved."""
+    changes = _changes(before, after)
+    if not after:
+        return False, "the device reports no settings after it"
     if not changes:
         return False, "the device reports the same settings before and after it"
     if was_unsaved:

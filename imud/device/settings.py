@@ -231,7 +231,7 @@ class DeviceSettings:
         self._host = host
         self._files = files
         self._reports: Reports = {}
-        self._is_current = False  # whether the device still has the settings of `_reports`
+        self.is_current = False  # whether the device still has the settings of `_reports`
         self._read_ns: int | None = None
         # resets of the device counter at the newest read of all reports if no other script followed; None otherwise
         self._read_resets: int | None = None
@@ -253,7 +253,7 @@ class DeviceSettings:
     def start(self, clock: SampleClock) -> None:
         """Note that the settings may differ: imud has found the device again, or another device."""
         self._clock, self._resets = clock, clock.status().resets
-        self._is_current = False
+        self.is_current = False
         self._after_start(BEGIN_NS)
 
     def tick(self, now_ns: int, _newest: Sample | None) -> None:
@@ -268,7 +268,7 @@ class DeviceSettings:
 
     def forget(self) -> None:
         """Note that the settings of the device may differ from the last values."""
-        self._is_current = False
+        self.is_current = False
 
     @property
     def is_polled(self) -> bool:
@@ -277,7 +277,7 @@ class DeviceSettings:
 
     def stop(self) -> None:
         """Note that the settings may differ: the link ended. A second call does nothing."""
-        self._is_current = False
+        self.is_current = False
         self.comparison.cancel()
 
     close = stop
@@ -330,7 +330,7 @@ class DeviceSettings:
     def update(self, reports: Reports) -> None:
         """Store all reports. Raise an event if a known setting has another value, and compare the GPIO lines."""
         driver, known = self._transport.driver, self.shown
-        self._reports, self._is_current, self._read_ns = reports, True, self._host.now_ns()
+        self._reports, self.is_current, self._read_ns = reports, True, self._host.now_ns()
         text = printable_words(words_of(reports))
         self.shown = printable_words(driver.shown_settings(text)) if driver is not None else text
         changed = {name: value for name, value in self.shown.items() if known.get(name, value) != value}
@@ -360,7 +360,7 @@ class DeviceSettings:
 
     async def read_again(self, *, identity: bool) -> None:
         """Read all reports after a command, and the identity if the device may have restarted."""
-        self._is_current = False
+        self.is_current = False
         if not self._transport.may_ask:
             return
         try:
@@ -375,7 +375,7 @@ class DeviceSettings:
 
         They are valid for PLAN_NS if no other script and no restart followed. Raises as `report`.
         """
-        is_valid = self._is_current and self._read_ns is not None and self._read_resets == self.counter_resets
+        is_valid = self.is_current and self._read_ns is not None and self._read_resets == self.counter_resets
         if is_valid and self._host.now_ns() - (self._read_ns or 0) <= PLAN_NS:
             return self.values
         return await self.read()
@@ -393,13 +393,13 @@ class DeviceSettings:
             return None
         found = self.differences()
         state = SettingsState.DIFFER if found else SettingsState.AGREE
-        state = state if self._is_current else SettingsState.UNKNOWN
+        state = state if self.is_current else SettingsState.UNKNOWN
         return SettingsStatus(
             state if self.declared else SettingsState.UNDECLARED,
             self._config.on_difference,
             self.comparison.problem,
             found,
-            unverified(table, self.declared, self.values) if self._is_current else (),
+            unverified(table, self.declared, self.values) if self.is_current else (),
             self._read_ns, self.comparison.repairs,
             self._files.flash.writes(self.module), self._files.flash.writes_day(self.module),
             self._unsaved and table.save is not None,
@@ -416,7 +416,7 @@ class DeviceSettings:
                 await self.read()
         status = self.status()
         assert status is not None
-        found = described_settings(table, self.declared, self.values if self._is_current else None)
+        found = described_settings(table, self.declared, self.values if self.is_current else None)
         return SettingsReport(self._config.name, self._driver_name, identity_words(self.identity), status, found)
 
     async def plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
@@ -455,7 +455,7 @@ class DeviceSettings:
     def changed(self, *, unsaved: bool) -> None:
         """Note that a command can have changed any setting, and whether the flash may not contain the change."""
         if unsaved:
-            self._mark_unsaved(self.values if self._is_current else None)
+            self._mark_unsaved(self.values if self.is_current else None)
         self._read_resets = None
         self.comparison.schedule(0)
 
@@ -509,7 +509,7 @@ class DeviceSettings:
             if applying.changed:
                 self._mark_unsaved(actual)
             self.update(applying.reports)
-            self._is_current = applying.heard
+            self.is_current = applying.heard
             if applying.saved:
                 self._unsaved = False
                 unreadable = {name: as_json(value) for name, value in self._all_written(table).items()}
@@ -577,7 +577,7 @@ class DeviceSettings:
     def differences(self) -> dict[str, SettingDifference]:
         """Return the differences of the present settings from the declared settings."""
         table = self.table
-        if table is None or not self._is_current:
+        if table is None or not self.is_current:
             return {}
         return differences(table, self.declared, self.values, self._all_written(table))
 

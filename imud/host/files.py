@@ -120,9 +120,10 @@ def can_replace(status: os.stat_result, path: str | os.PathLike[str], content: s
     """Return why other users can replace the files of a directory; empty if only root and this user can. `content`
     names the files. In a directory with the sticky bit, other users can create files, but not replace them."""
     if status.st_uid not in (0, os.geteuid()):
+        wanted = " or ".join(dict.fromkeys(("root", user_name())))
         return (
-            f"{os.fspath(path)} belongs to user {status.st_uid}, who can replace {content}: expected root or "
-            f"{user_name()} as its owner"
+            f"{os.fspath(path)} belongs to user {status.st_uid}, who can replace {content}: expected {wanted} as its "
+            "owner"
         )
     if status.st_mode & _OTHERS_WRITE and not status.st_mode & stat.S_ISVTX:
         mode = f"{stat.S_IMODE(status.st_mode):04o}"

@@ -63,6 +63,14 @@ async def test_a_reset_is_verified_by_changed_settings(
     assert not bench.status.unsaved
 
 
+@played(ModuleBench)
+async def test_a_reset_of_a_device_without_reports_is_not_verified(bench: ModuleBench) -> None:
+    bench.module.silent = {"GET"}
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    found = await result_of(bench, "factory_reset")
+    assert (found.verified, found.evidence) == (False, "the device reports no settings after it")
+
+
 @pytest.mark.parametrize("sends", [False, True])
 @played(ModuleBench)
 async def test_samples_are_evidence_only_if_none_arrived_before(bench: ModuleBench, sends: bool) -> None:

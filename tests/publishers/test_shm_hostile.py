@@ -166,7 +166,7 @@ def test_daemon_starts_reloads_and_stops(tmp_path: Path, shared: Path, kind: str
 @pytest.mark.parametrize(
     ("uid", "mode", "message"),
     [
-        (HOSTILE_UID, 0o755, f"belongs to user {HOSTILE_UID}, who can replace the rings"),
+        (HOSTILE_UID, 0o755, f"belongs to user {HOSTILE_UID}, who can replace the rings: expected root as its owner"),
         (HOSTILE_UID, 0o1777, f"belongs to user {HOSTILE_UID}, who can replace the rings"),
         (0, 0o777, "has mode 0777: other users can replace the rings; chmod go-w"),
         (0, 0o775, "has mode 0775: other users can replace"),
