@@ -13,6 +13,7 @@ magic bytes is a raw capture. The last record may be incomplete (power loss). A 
 decreasing time means damage: the reader stops and reports it in `problem`.
 """
 
+import re
 import struct
 from collections.abc import Iterator, Mapping
 from typing import BinaryIO, Final, NamedTuple
@@ -25,6 +26,8 @@ VERSION: Final = "1"
 HEADER_BYTES_MAX: Final = 4096
 RECORD_BYTES_MAX: Final = 1 << 20  # Maximum size of one read of any link. A larger length means damage.
 RAW_CHUNK_BYTES: Final = 4096  # size of the pieces of a raw capture, the maximum of one tty read
+
+_HEXADECIMAL: Final = re.compile(rb"(?:[0-9A-Fa-f]{2}[ ,:\t]?){4,}[0-9A-Fa-f]?")
 
 RECORD: Final = struct.Struct("<qI")  # head of a record: `t_ns`, length
 
@@ -41,13 +44,15 @@ class CaptureReader:
     file decide between raw and stamped."""
 
     def __init__(self, file: BinaryIO) -> None:
-        """Raises ImudError for a stamped capture of another version or with an invalid first line."""
+        """Raises ImudError for a stamped capture of another version or with an invalid first line, and for text."""
         self._file = file
         self._offset = 0
         self.problem = ""  # error of the file after the iteration, one sentence; empty if the file is complete
         self.is_damaged = False  # after the iteration: whether the file is damaged, not only incomplete
         self._head = _read_fully(file, len(MAGIC))
         self.stamped = self._head == MAGIC
+        if _HEXADECIMAL.fullmatch(self._head):
+            raise ImudError("expected the bytes of a device, got them as hexadecimal text; convert it with `xxd -r -p`")
         # Decoded keys and values of the first line
         self.details: Mapping[str, str] = self._read_details() if self.stamped else {}
 

@@ -98,6 +98,12 @@ def test_other_versions_and_broken_first_lines_are_refused(line: bytes) -> None:
         CaptureReader(io.BytesIO(MAGIC + line))
 
 
+@pytest.mark.parametrize("text", [b"5A A5 4C 00 02 9D 91", b"aa5502002c00f8ff", b"5a,a5,4c,00,02,9d"])
+def test_hexadecimal_text_is_refused(text: bytes) -> None:
+    with pytest.raises(ImudError, match="got them as hexadecimal text"):
+        CaptureReader(io.BytesIO(text))
+
+
 @pytest.mark.parametrize("baud", ["", "fast", "-1", "²", "9" * 30])
 def test_an_invalid_baud_rate_is_unknown(baud: str) -> None:
     file = io.BytesIO()
