@@ -132,7 +132,7 @@ class Imu61xCanCodec:
         self._pace = _Pace()
         self._closing = b""  # data of the newest 105
         self._other: int | None = None  # newest INDEX of the series before the newest jump
-        self._steady = 0  # number of 105 since the newest one that did not follow its predecessor
+        self._steady = 0  # number of consecutive 105 that follow their predecessor
         self._alternations = 0  # number of 105 of the other series since a jump to a third series
 
     @property
@@ -220,7 +220,7 @@ class Imu61xCanCodec:
     def _note_series(self, index: int, before: int) -> None:
         """Note an INDEX that does not follow `before`. Two devices continue two series, which can have equal INDEX."""
         is_other = self._other is not None and (index - self._other) % INDEX_MODULUS == 1
-        is_equal = index == before and self._steady > 0  # 0: an INDEX that stands still
+        is_equal = index == before and self._steady > 0  # 0: the device repeats its INDEX
         self._alternations = self._alternations + 1 if is_other or is_equal else 0
         self._other, self._steady = before, 0
 
