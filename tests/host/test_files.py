@@ -4,13 +4,23 @@ import errno
 import grp
 import os
 import socket
+import stat
 from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from imud.host.files import NotRegularFile, StateFile, group_of, open_regular, open_stream, read_regular, replace_file
+from imud.host.files import (
+    NotRegularFile,
+    StateFile,
+    can_replace,
+    group_of,
+    open_regular,
+    open_stream,
+    read_regular,
+    replace_file,
+)
 
 
 def fifo(path: Path) -> None:
@@ -166,3 +176,21 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+@pytest.mark.parametrize(
+    ("mode", "is_safe"),
+    [(0o755, True), (0o700, True), (0o1777, True), (0o1775, True), (0o775, False), (0o757, False), (0o777, False)],
+)
+def test_others_can_replace_files_if_they_can_write_without_the_sticky_bit(mode: int, is_safe: bool) -> None:
+    status = os.stat_result((stat.S_IFDIR | mode, 0, 0, 1, os.geteuid(), 0, 0, 0, 0, 0))
+    problem = can_replace(status, "/a", "recordings")
+    expected = f"/a has mode {mode:04o}: other users can replace recordings; chmod go-w /a"
+    assert problem == ("" if is_safe else expected)
+
+
+def test_the_owner_of_a_directory_can_replace_its_files() -> None:
+    foreign = os.stat_result((stat.S_IFDIR | 0o700, 0, 0, 1, os.geteuid() + 12345, 0, 0, 0, 0, 0))
+    assert f"/a belongs to user {os.geteuid() + 12345}, who can replace it" in can_replace(foreign, "/a", "it")
+    root = os.stat_result((stat.S_IFDIR | 0o700, 0, 0, 1, 0, 0, 0, 0, 0, 0))
+    assert can_replace(root, "/a", "it") == ""

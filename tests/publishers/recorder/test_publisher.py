@@ -32,6 +32,8 @@ def test_both_write_to_one_directory_and_one_alone_does_not_start_the_other(tmp_
         settings = RecorderOptions(enabled=enabled, directory=str(tmp_path / str(enabled)), flight=flight)
         made = PUBLISHER.make(settings, bench.context)
         made.start()
+        outputs = bench.context.outputs
+        assert (len(outputs.recorders), len(outputs.flights)) == (enabled, 1)
         made.add_device("imu0", 0)
         made.tick(bench.advance(0.1))
         assert made.publish is not None
