@@ -182,6 +182,7 @@ class Daemon:
         self._timer: asyncio.TimerHandle | None = None
         self._failure: BaseException | None = None
         self._manager = ServiceManager()
+        self._signals: list[int] = []  # signals with a handler of this daemon
 
     # --- life ------------------------------------------------------------------------------------------------------
 
@@ -207,6 +208,7 @@ class Daemon:
         finally:
             self._manager.stopping()
             await self._close()
+            self._ignore_signals()
             log.info("imud has stopped")
         if self._failure is not None:
             raise self._failure
@@ -218,9 +220,15 @@ class Daemon:
     def install_signals(self) -> None:
         """Install signal handlers: SIGTERM and SIGINT stop, SIGHUP reloads. Needs a running loop in the main thread."""
         loop = asyncio.get_running_loop()
-        for number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(number, self.stop)
-        loop.add_signal_handler(signal.SIGHUP, self.reload)
+        for number, action in ((signal.SIGTERM, self.stop), (signal.SIGINT, self.stop), (signal.SIGHUP, self.reload)):
+            loop.add_signal_handler(number, action)
+            self._signals.append(number)
+
+    def _ignore_signals(self) -> None:
+        """Ignore further signals: the default action would replace the exit status of a regular end."""
+        for number in self._signals:
+            asyncio.get_running_loop().remove_signal_handler(number)
+            signal.signal(number, signal.SIG_IGN)
 
     @property
     def finished(self) -> bool:

@@ -226,3 +226,24 @@ ctypes.CDLL(None).prctl(15, bytes.fromhex(sys.argv[2]), 0, 0, 0)
 print("held", flush=True)
 sys.stdin.read()
 """
+
+
+def test_a_second_signal_at_the_end_does_not_change_the_exit_status() -> None:
+    numbers = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+    before = [signal.getsignal(number) for number in numbers]
+
+    @in_loop
+    async def run() -> None:
+        daemon = Daemon(Config("info", "", {}, ()))
+        daemon.install_signals()
+        running = asyncio.create_task(daemon.run())
+        await asyncio.sleep(0)
+        signal.raise_signal(signal.SIGTERM)
+        await running
+
+    try:
+        run()
+        assert [signal.getsignal(number) for number in numbers] == [signal.SIG_IGN] * 3
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
