@@ -1,4 +1,4 @@
-"""Measures the time stamp errors of held samples: `python -m tests.bench.clock_hold` (docs/measurements.md).
+"""Measures the time stamp errors of held samples: `python -m tests.bench.clock_hold`.
 
 The same simulated arrivals are read in three ways, at intervals of the latency:
 
