@@ -107,7 +107,7 @@ def _text(name: bytes) -> str:
 
 
 def _listed(names: Iterable[str], word: str) -> str:
-    *rest, last = list(names)[:INTERFACES_MAX]
+    *rest, last = [name if name.isprintable() else ascii(name) for name in list(names)[:INTERFACES_MAX]]
     return f"{', '.join(rest)} {word} {last}" if rest else last
 
 

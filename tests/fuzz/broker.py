@@ -1,4 +1,4 @@
-"""Data from an MQTT broker: for any data, the connection continues or ends with a BrokerError."""
+"""Data from an MQTT broker: for any data, the connection continues, refuses a message, or ends with a BrokerError."""
 
 import socket
 from collections.abc import Sequence
@@ -6,7 +6,7 @@ from contextlib import closing, suppress
 from threading import Thread
 from typing import Final
 
-from imud.fleet.broker import BrokerError, PahoConnection, Will, check_extra
+from imud.fleet.broker import BrokerError, MessageRefused, PahoConnection, Will, check_extra
 from imud.fleet.settings import MqttOptions, broker_of
 from tests.fuzz.target import Target, check_printable
 
@@ -42,7 +42,7 @@ def run(data: bytes) -> None:
                 for _ in range(WAITS):
                     connection.wait(LIMIT_S)
                     assert all(1 <= number <= 0xFFFF for number in connection.acknowledged)
-        except BrokerError as error:
+        except (BrokerError, MessageRefused) as error:
             check_printable(str(error))
         finally:
             thread.join(LIMIT_S)
