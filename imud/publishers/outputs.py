@@ -94,7 +94,7 @@ class Outputs:
     @property
     def options(self) -> Mapping[str, Options]:
         """Present options of all outputs."""
-        return self._options
+        return dict(self._options)
 
     def summary(self) -> str:
         """Return the outputs for the log."""

@@ -32,7 +32,9 @@ from imud.contracts.command import (
     Expectation,
     Handling,
     Kept,
+    Proof,
     Target,
+    Verb,
     Verbs,
 )
 from imud.contracts.driver import DataSheet, StatusBit
@@ -101,7 +103,16 @@ FLOATS: Final = DataSheet(document=DOCUMENT)  # data sheet of the UART protocol
 REGISTERS: Final = DataSheet(document=DOCUMENT, gyro_step_rad_s=GYRO_RAD_S_PER_LSB, accel_step_m_s2=ACCEL_M_S2_PER_LSB)
 
 
-SAVED: Final = "the device confirmed it, and imud cannot read the flash"
+def save_verb(begin: Callable[[Target], Any]) -> Verb:
+    """Return the verb `save` with the script of a protocol."""
+    return Verb(
+        "write all settings to flash",
+        begin,
+        saves=True,
+        changes=False,
+        proof=Proof.NONE,
+        evidence="the device confirmed it, and imud cannot read the flash",
+    )
 
 
 def levelled(given: Any) -> Sequence[Expectation]:

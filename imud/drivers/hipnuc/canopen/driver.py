@@ -1,7 +1,6 @@
 """Row `DRIVER` of HiPNUC devices on CANopen: settings and verbs."""
 
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
+from collections.abc import Collection, Mapping
 from random import Random
 from typing import Annotated, Any, Final, Literal, get_args
 
@@ -48,7 +47,7 @@ from imud.drivers.hipnuc.canopen.commands import (
     Transmission,
     identify,
 )
-from imud.drivers.hipnuc.common import DOCUMENT, SAVED, inclinometer_zero, refuse_all, zeroed
+from imud.drivers.hipnuc.common import DOCUMENT, inclinometer_zero, refuse_all, save_verb, zeroed
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
 from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_S, NS_PER_US
@@ -231,10 +230,6 @@ SETTINGS: Final = SettingsTable(
 _ZEROS: Final = {"here": InclinometerZero.SET, "cancel": InclinometerZero.CANCEL}
 
 
-def _simple(words: str, begin: Callable[[int], RequestScript[None]], risk: Risk = Risk.NONE) -> Verb:
-    return Verb(words, lambda target: begin(target.settings.node), risk)
-
-
 def _zero(
     target: Target, *, zero: Annotated[Literal["here", "cancel"], Meta(extra={"section": "5.4.1"})]
 ) -> RequestScript[None]:
@@ -259,13 +254,7 @@ def _nmt(
 
 
 VERBS: Final[Verbs] = {
-    "save": replace(
-        _simple("write all settings to flash", commands.save),
-        saves=True,
-        changes=False,
-        proof=Proof.NONE,
-        evidence=SAVED,
-    ),
+    "save": save_verb(lambda target: commands.save(target.settings.node)),
     "restart": Verb(
         "restart the device and wait for its frames, also from a new node number; unsaved settings are lost",
         lambda target: commands.restart(target.settings, target.baud),

@@ -1,7 +1,6 @@
 """Row `DRIVER` of HiPNUC devices on SAE J1939: settings and verbs."""
 
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
+from collections.abc import Collection, Mapping
 from random import Random
 from typing import Annotated, Any, Final, Literal
 
@@ -13,14 +12,13 @@ from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, random_vector
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import DeviceReport, Effect, Reports, Setting, SettingsTable
 from imud.drivers.hipnuc.bus_load import RATE_NOTE, CyclicMessage, refuse_other_rate, refuse_overload
-from imud.drivers.hipnuc.common import REGISTERS, SAVED, inclinometer_zero, random_quaternion, refuse_all, zeroed
+from imud.drivers.hipnuc.common import REGISTERS, inclinometer_zero, random_quaternion, refuse_all, save_verb, zeroed
 from imud.drivers.hipnuc.j1939 import codec, commands
 from imud.drivers.hipnuc.j1939.codec import (
     CONFIGURE,
     HOST_ADDRESS,
     HipnucJ1939Codec,
     HipnucJ1939Options,
-    J1939Node,
     PgnName,
     encode,
 )
@@ -174,10 +172,6 @@ SETTINGS: Final = SettingsTable(
 Pgn = Annotated[PgnName, Meta(description="last four digits of the PGN", extra={"section": "6.1"})]
 
 
-def _simple(words: str, begin: Callable[[J1939Node], RequestScript[None]], risk: Risk = Risk.NONE) -> Verb:
-    return Verb(words, lambda target: begin(target.settings.peer), risk)
-
-
 def _send_once(target: Target, *, pgn: Pgn) -> RequestScript[None]:
     return commands.send_once(target.settings.peer, int(pgn, 16))
 
@@ -189,13 +183,7 @@ def _zero(
 
 
 VERBS: Final[Verbs] = {
-    "save": replace(
-        _simple("write all settings to flash", commands.save),
-        saves=True,
-        changes=False,
-        proof=Proof.NONE,
-        evidence=SAVED,
-    ),
+    "save": save_verb(lambda target: commands.save(target.settings.peer)),
     "restart": Verb(
         "restart the device and wait for its frames, also from a new address; unsaved settings are lost",
         lambda target: commands.restart(target.settings, target.baud),

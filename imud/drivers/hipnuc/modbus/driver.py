@@ -1,7 +1,6 @@
 """Row `DRIVER` of HiPNUC devices on RS-485: verbs, calibrations and settings."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from random import Random
 from typing import Annotated, Any, Final, Literal
 
@@ -16,7 +15,6 @@ from imud.drivers.hipnuc.common import (
     MAIN_STATUS,
     NINE_AXES_NEEDED,
     REGISTERS,
-    SAVED,
     AttitudeMode,
     LevelReset,
     heading_by_mode,
@@ -24,6 +22,7 @@ from imud.drivers.hipnuc.common import (
     levels,
     magnetometer,
     random_quaternion,
+    save_verb,
 )
 from imud.drivers.hipnuc.modbus import commands
 from imud.drivers.hipnuc.modbus.codec import HipnucModbusCodec, HipnucModbusOptions, pack_block, update_ns
@@ -39,10 +38,6 @@ from imud.drivers.hipnuc.modbus.registers import (
 from imud.formats.modbus import SLAVES, framed
 from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_MS
-
-
-def _simple(words: str, begin: Callable[[], TransferScript[None]], risk: Risk = Risk.NONE) -> Verb:
-    return Verb(words, lambda _target: begin(), risk)
 
 
 def _restart(target: Target) -> TransferScript[str]:
@@ -72,13 +67,7 @@ def _read(
 
 
 VERBS: Final[Verbs] = {
-    "save": replace(
-        _simple("write all settings to flash", commands.save),
-        saves=True,
-        changes=False,
-        proof=Proof.NONE,
-        evidence=SAVED,
-    ),
+    "save": save_verb(lambda _target: commands.save()),
     "restart": Verb(
         "restart the device and wait until it replies; unsaved settings are lost",
         _restart,

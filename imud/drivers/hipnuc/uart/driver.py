@@ -1,6 +1,6 @@
 """Row `DRIVER` of HiPNUC devices on a UART: verbs and calibrations."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from random import Random
 from typing import Annotated, Any, Final, Literal
@@ -24,18 +24,18 @@ from imud.contracts.command import (
     yaw_at,
 )
 from imud.contracts.driver import Identity, StreamDriver, random_vector
-from imud.contracts.script import Request, RequestScript, Silence
+from imud.contracts.script import RequestScript, Silence
 from imud.drivers.hipnuc.common import (
     FLOATS,
     MAIN_STATUS,
     NINE_AXES_NEEDED,
-    SAVED,
     LevelReset,
     heading_by_mode,
     levelled,
     levels,
     magnetometer,
     random_quaternion,
+    save_verb,
 )
 from imud.drivers.hipnuc.uart import commands
 from imud.drivers.hipnuc.uart.codec import (
@@ -76,10 +76,6 @@ from imud.model.units import NS_PER_MS
 
 Message = Annotated[OutputMessage, Meta(extra={"section": "2.2.5"})]
 Degrees = Annotated[float, Meta(ge=-180, le=180, extra={"unit": "°", "section": "2.2.4"})]
-
-
-def _simple(words: str, make: Callable[[], Request], risk: Risk = Risk.NONE) -> Verb:
-    return Verb(words, lambda _target: send(make()), risk)
 
 
 def _restart(target: Target) -> RequestScript[Identity]:
@@ -125,13 +121,7 @@ def _yaw(
 
 
 VERBS: Final[Verbs] = {
-    "save": replace(
-        _simple("write all settings to flash", commands.save_config),
-        saves=True,
-        changes=False,
-        proof=Proof.NONE,
-        evidence=SAVED,
-    ),
+    "save": save_verb(lambda _target: send(commands.save_config())),
     "restart": Verb(
         "restart the device and wait until it replies; unsaved settings are lost",
         _restart,

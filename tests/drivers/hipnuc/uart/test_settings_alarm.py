@@ -35,7 +35,7 @@ def test_the_modules_own_lines_are_read() -> None:
      ("COORDS=4", None), ("", None)],
 )  # fmt: skip
 def test_coordinates_select_axes_and_the_angles_of_the_alarm(line: str, value: str | None) -> None:
-    """With COORD 4, the alarm of X watches roll about the x axis."""
+    """COORD 4 makes roll the angle about the x axis, which the alarm of X watches."""
     settings = ModuleSettings(alarm_x=AlarmSetting(-5, 5.5, False), alarm_y=AlarmSetting(-30.25, 12, True))
     report = parse_report([*settings.user_lines(), line])
     raw = {**report.values, **{f"USRCONFIG {n}": other for n, other in enumerate(filter(None, report.other), 1)}}
