@@ -1,17 +1,16 @@
 # make demo   one simulated sensor through the real daemon          make test   everything that needs no lab, in 5 minutes
 # make test-thorough   every test and the long forms of fuzz, attack, lab, chaos, soak      make mutants   quality of the tests
 # make lab    tests on a booted kernel          make chaos  random faults on a booted kernel (ARGS="--seed N --seconds S")
-# make soak   100 devices, 20 clients, all recorded, an hour (ARGS="--seconds 120"; ARGS=--single: one device at 1 kHz)
+# make soak   100 devices, 20 clients, all recorded, an hour (ARGS="--seconds 120")
 # make test-pythons   the tests on every supported Python that is here; those that are missing are named
 # make check  ruff, mypy --strict, then the tests                   make bench  measurements, into build/bench.json
-#                                                                   (14 minutes; ARGS=--short: at most 5)
+#                                                                   (ARGS=--short: at most 5 minutes)
 # make alerts every alert provoked, by a real Prometheus that scrapes a daemon: fires and clears, with a table of times
 # make monitoring-deps   installs Prometheus and Alertmanager, for the tests of rules, examples and dashboard
 # make fleet-deps  installs PostgreSQL, for the tests of the collector, and what make mqtt-deps installs
 # make mqtt-deps   installs mosquitto and nats-server, for the tests of the output mqtt and these:
 # make fleet-demo    a broker, three gateways with a simulated sensor each, and `imud fleet top` on them
 # make fleet-faults  a gateway, a broker and what can happen between them (ARGS="--seconds 120"), as a table
-# make fleet-day     a spool with what 24 hours without a network make, replayed
 # make fleet-load    1,000 simulated gateways, one broker, one collector   make fleet-cluster  three NATS servers, one is killed
 # make bench-instructions   instructions per sample, beside those kept in the tree; make bench-deps   what it needs
 # make web-deps   installs chromium and its driver, for the tests of the page of `imud web`
@@ -116,7 +115,7 @@ audit: $(VENV)/made
 attack: $(VENV)/made
 	$(BIN)/python -m tests.attack $(ARGS)
 
-.PHONY: fleet-demo fleet-faults fleet-load fleet-cluster fleet-day
+.PHONY: fleet-demo fleet-faults fleet-load fleet-cluster
 fleet-demo: $(VENV)/made
 	$(BIN)/python -m tests.fleet.demo $(ARGS)
 
@@ -128,9 +127,6 @@ fleet-load: $(VENV)/made
 
 fleet-cluster: $(VENV)/made
 	$(BIN)/python -m tests.bench.fleet_cluster $(ARGS)
-
-fleet-day: $(VENV)/made
-	$(BIN)/python -m tests.bench.fleet_day $(ARGS)
 
 soak: $(VENV)/made
 	$(BIN)/python -m tests.bench.soak $(ARGS)

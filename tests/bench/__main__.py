@@ -1,7 +1,7 @@
 """`make bench`: run all measurements, print one table, and write the same rows to build/bench.json.
 
-`make bench ARGS="clock socket"` runs only these parts. `make bench ARGS=--short` runs all parts with fewer and shorter
-rounds. The short form takes at most SHORT_LIMIT_S on an idle host. It omits the parts that may boot the lab's kernel.
+`make bench ARGS="clock latency"` runs only these parts. `make bench ARGS=--short` runs all parts with fewer and shorter
+rounds. The short form takes at most SHORT_LIMIT_S on an idle host.
 """
 
 import argparse
@@ -17,13 +17,9 @@ import msgspec
 from tests.bench.rows import Row
 
 PARTS = (
-    "clock", "clock_table", "clock_lines", "lines", "polling", "modbus", "can", "can_devices", "detect",
-    "shm", "socket", "metrics", "end_to_end", "latency", "clock_hold", "gpsd", "sout", "recording", "mqtt", "web",
-    "start",
+    "clock", "clock_table", "clock_lines", "can_devices", "end_to_end", "latency", "gpsd", "recording", "mqtt",
 )  # fmt: skip
 SHORT_LIMIT_S: Final = 300.0  # goal on an idle host
-LAB_PARTS: Final = ("can",)
-"""Parts that may boot the lab's kernel. The short form runs them only if the command line names them."""
 OUTPUT = Path("build/bench.json")
 
 
@@ -40,10 +36,6 @@ def measure(parts: Iterable[str], quick: bool) -> list[Row]:
     return rows
 
 
-def parts_of(*, short: bool) -> tuple[str, ...]:
-    return tuple(part for part in PARTS if not (short and part in LAB_PARTS))
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(prog="make bench")
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"one of {', '.join(PARTS)}")
@@ -52,8 +44,7 @@ def main() -> int:
     )
     args = parser.parse_args()
     begun_s = monotonic()
-    parts = args.parts or parts_of(short=args.short)
-    rows = measure(parts, args.short)
+    rows = measure(args.parts or PARTS, args.short)
     took_s = monotonic() - begun_s
     OUTPUT.parent.mkdir(exist_ok=True)
     # compare.py reads this file and matches rows by name

@@ -1,8 +1,8 @@
 """Process with N socket clients. It prints `ready`, reads until the server or standard input closes, and prints JSON.
 
-The first client checks each sample and measures its latency. The other clients only receive. With `--stuck`, a further
-client subscribes and never reads. With `--devices`, every client checks its samples, each client watches every fifth
-device, and every second client uses JSON. The result is one line of JSON.
+The first client checks each sample and measures its latency. The other clients only receive. With
+`--devices`, every client checks its samples, each client watches every fifth device, and every second client uses JSON.
+The result is one line of JSON.
 """
 
 import argparse
@@ -170,7 +170,6 @@ def main() -> None:
     parser.add_argument("--clients", type=int, default=1)
     parser.add_argument("--encoding", choices=list(TAKES), default="binary")
     parser.add_argument("--bare", action="store_true")
-    parser.add_argument("--stuck", action="store_true")
     parser.add_argument("--watch", type=json.loads, default={}, help="further parameters of `watch`, JSON")
     parser.add_argument("--times")
     parser.add_argument("--frames", type=int, default=0)
@@ -183,7 +182,6 @@ def main() -> None:
         with open(args.times, "rb") as file:
             times = mmap.mmap(file.fileno(), 8 * args.frames, access=mmap.ACCESS_READ)
     ask = partial(subscribe, args.socket, bare=args.bare)
-    stuck = ask(args.encoding, wanted=args.watch) if args.stuck else None
     takes: list[tuple[Take, Seen]] = [(TAKES[args.encoding], Seen(times, args.skip))]
     if args.gpsd:
         clients = [subscribe_to_gpsd(args.gpsd) for _ in range(args.clients)]
@@ -198,8 +196,6 @@ def main() -> None:
     print("ready", flush=True)
     receive(clients, takes, args.seconds)
     print(json.dumps(figures([seen for _, seen in takes])), flush=True)
-    if stuck is not None:
-        stuck.socket.close()
 
 
 if __name__ == "__main__":

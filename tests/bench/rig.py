@@ -41,12 +41,10 @@ class Load:
     """Latency that clients and shared memory request, ms; None for their defaults."""
     client_hz: float | None = None
     """Sample rate that a client requests, Hz; None for all samples."""
-    stuck: bool = False
     phases: int = 1
     apart: int = 0
     """Number of frames between the starts of two devices; 0 starts all devices at the same time."""
     shm: bool = True
-    sout: bool = False
     record_to: str = ""
     """Directory of the recording; empty for no recording."""
     mqtt: Mapping[str, object] = field(default_factory=dict)
@@ -137,9 +135,6 @@ def configuration(folder: Path, ports: Sequence[str], load: Load) -> Path:
         f"d{i}": {"driver": "hipnuc-uart", "identify": False, "uart": {"port": port, "baud": 921600}}
         for i, port in enumerate(ports)
     }
-    if load.sout:
-        # the name of a line has at most 31 bytes
-        devices["d0"]["lines"] = {"sout": {"line": str(folder / "edges")[-31:]}}
     tree = {
         "log_level": "error", "state_dir": str(folder), "socket": {"path": str(folder / "s")},
         "shm": {"enabled": load.shm, "directory": str(folder)}
@@ -170,8 +165,7 @@ def start_server(stack: ExitStack, folder: Path, ports: Sequence[str], load: Loa
         server.line()
         return server
     file = configuration(folder, ports, load)
-    how = ["tests.bench.sout_daemon"] if load.sout else ["imud", "run", "-c"]
-    server = stack.enter_context(Process(SERVER_CORE, "-m", *how, str(file)))
+    server = stack.enter_context(Process(SERVER_CORE, "-m", "imud", "run", "-c", str(file)))
     wait_for(path)
     end = monotonic() + START_LIMIT_S
     with Client(str(path)) as client:
@@ -195,7 +189,7 @@ def start_readers(stack: ExitStack, folder: Path, load: Load, cores: set[int] = 
     args += ["--skip", str(int(load.warm_s * load.rate_hz))]
     wanted = {"rate_hz": load.client_hz, "latency_ms": load.latency_ms}
     args += ["--watch", json.dumps({name: value for name, value in wanted.items() if value is not None})]
-    args += ["--bare"] * load.bare + ["--stuck"] * load.stuck
+    args += ["--bare"] * load.bare
     readers = stack.enter_context(Process(cores, "-m", "tests.bench.readers", *args))
     readers.line()
     return readers
@@ -225,9 +219,7 @@ def measure_cpu(load: Load, writer: Process, pid: int) -> Used:
 def run(load: Load) -> Outcome:
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="imud-bench-") as name, ExitStack() as stack:
         folder = Path(name)
-        if load.sout:
-            os.mkfifo(folder / "edges")
-        writer = start_writer(stack, folder, load, *(["--edges", str(folder / "edges")] if load.sout else []))
+        writer = start_writer(stack, folder, load)
         ports = writer.line().split()
         server = start_server(stack, folder, ports, load)
         readers = start_readers(stack, folder, load)

@@ -26,6 +26,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from signal import SIGCONT, SIGSTOP
+from statistics import linear_regression
 from time import monotonic, sleep
 from typing import Any, Final
 from urllib.request import urlopen
@@ -39,7 +40,6 @@ from tests.bench import soak_recordings
 from tests.bench.fleet_writer import hi91_frames
 from tests.bench.rig import REST_CORES, SERVER_CORE, START_LIMIT_S, Process, cpu_ns, wait_for
 from tests.bench.soak_recordings import Recordings
-from tests.bench.soak_single import run_single, slope_mb_per_h
 from tests.support.files import CaptureWriter
 from tests.support.surroundings import free_port
 
@@ -245,7 +245,7 @@ def judge_memory(points: list[tuple[float, float]], seconds: float) -> tuple[str
     """Return the memory growth as text, and whether it is within its limit."""
     settled = [(t, mb) for t, mb in points if t > SETTLE_S]
     if seconds >= SETTLE_S + SLOPE_MIN_S:
-        slope = slope_mb_per_h(settled)
+        slope = 3600 * linear_regression(*zip(*settled, strict=True)).slope
         return (
             f"RSS {slope:+.3f} MB/h after {SETTLE_S:g} s (limit {SLOPE_LIMIT_MB_PER_H:g})",
             slope < SLOPE_LIMIT_MB_PER_H,
@@ -346,12 +346,8 @@ def wait_open(path: Path, fleet: Fleet) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="make soak")
-    parser.add_argument("--seconds", type=float, help="duration, s (default: 3600; with --single 600)")
-    parser.add_argument("--single", action="store_true", help="use one device at 1 kHz with ten clients")
-    args = parser.parse_args()
-    if args.single:
-        return run_single(args.seconds or 600.0)
-    return run_fleet(args.seconds or 3600.0, free_port())
+    parser.add_argument("--seconds", type=float, default=3600.0, help="duration, s")
+    return run_fleet(parser.parse_args().seconds, free_port())
 
 
 if __name__ == "__main__":

@@ -22,8 +22,6 @@ from functools import reduce
 from operator import xor
 
 from imud.drivers.hipnuc.uart.codec import encode_hi91
-from imud.lines.gpio import EVENT, RISING
-from imud.model.units import uart_byte_ns
 
 LATE_LIMIT_NS = 50_000_000
 """Maximum delay of the writer, ns. With a larger delay, the writer has lost its deadlines and shifts all later ones."""
@@ -32,9 +30,6 @@ MakeFrame = Callable[[int], bytes | bytearray]
 
 FIRST_PA = 2000
 """Pressure of frame 0, Pa. imud ignores a pressure below 1000 Pa or above 120 kPa."""
-
-PULSE_NS = 82 * uart_byte_ns(921_600) + 80_000
-"""Time from the rising edge of SOUT to the last byte of a frame, ns. The edge is set back by it: a pty has no wire."""
 
 
 def open_ptys(count: int) -> list[tuple[int, int]]:
@@ -79,14 +74,13 @@ def sentence(i: int) -> bytes:
 
 
 def play(
-    masters: list[int], rate_hz: float, frames: int, phases: int, times: mmap.mmap, make: MakeFrame, edges: int = -1,
+    masters: list[int], rate_hz: float, frames: int, phases: int, times: mmap.mmap, make: MakeFrame,
     count: mmap.mmap | None = None, apart: int = 0,
 ) -> int:  # fmt: skip
     """Write `frames` frames to every master, in `phases` groups over each period. Return the number of rejected frames.
 
     A pty rejects a frame if it accepts only a part of it. `count` contains the number of rejected frames so far. Each
-    master skips `apart` more first frames than the previous master. If `edges` is a descriptor, the event of a SOUT
-    pulse is written to it before each frame.
+    master skips `apart` more first frames than the previous master.
     """
     pack = struct.pack_into
     period_ns = int(1e9 / rate_hz)
@@ -105,8 +99,6 @@ def play(
                 start_ns -= wait_ns
             if phase == 0:
                 pack("<q", times, 8 * i, time.monotonic_ns())
-                if edges >= 0:
-                    os.write(edges, EVENT.pack(time.monotonic_ns() - PULSE_NS, RISING, 0, i + 1, i + 1))
             for master, first in group:
                 if i >= first and not _takes(master, frame):
                     refused += 1
@@ -139,7 +131,6 @@ def main() -> None:
     parser.add_argument("--times", required=True)
     parser.add_argument("--refused", metavar="FILE")
     parser.add_argument("--udp", type=int, metavar="PORT")
-    parser.add_argument("--edges", help="FIFO for the events of SOUT")
     args = parser.parse_args()
     times, count = mapped(args.times, 8 * args.frames), mapped(args.refused, 8) if args.refused else None
     if args.udp:
@@ -153,9 +144,8 @@ def main() -> None:
     pairs = open_ptys(args.devices)
     print(*(os.ttyname(slave) for _, slave in pairs), flush=True)
     sys.stdin.readline()
-    edges = os.open(args.edges, os.O_WRONLY) if args.edges else -1
     masters, make = [master for master, _ in pairs], hi91_frames(args.rate)
-    print(play(masters, args.rate, args.frames, args.phases, times, make, edges, count, args.apart), flush=True)
+    print(play(masters, args.rate, args.frames, args.phases, times, make, count, args.apart), flush=True)
     sys.stdin.readline()
 
 

@@ -68,7 +68,7 @@ CALLS: dict[str, tuple[list[str], set[str]]] = {
 @pytest.mark.live
 @pytest.mark.parametrize(("words", "foreign"), CALLS.values(), ids=CALLS)
 def test_a_command_that_is_called_often_imports_little(words: list[str], foreign: set[str]) -> None:
-    """Other imports would take as long as the command (`python -m tests.bench.start`)."""
+    """Other imports would take as long as the command."""
     program = (
         "import sys\nbefore = set(sys.modules)\nfrom imud.cli import main\ntry:\n"
         f"    main({words!r})\nexcept SystemExit:\n    pass\nprint()\nprint(*sys.modules.keys() - before)"
