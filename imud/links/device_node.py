@@ -100,11 +100,9 @@ def directories_of(path: Path) -> list[Path]:
         directory = _nearest_directory(path.parent)
         if directory not in directories:
             directories.append(directory)
-        if not path.is_symlink():
-            break
         try:
             path = path.parent / path.readlink()
-        except OSError:  # the link was removed in the meantime
+        except OSError:  # not a link, or removed in the meantime
             break
     return directories
 
@@ -132,7 +130,6 @@ ACCESS_WAIT_S: Final = 1.0
 SERIAL_GROUP: Final = "dialout"
 PROC: Final = Path("/proc")
 OWN_PROCESS: Final = "this imud"
-COMMAND_BYTES: Final = 1024  # maximum number of bytes to read of a command line
 CABLE: Final = "is the cable plugged in, and is the path right?"  # hint for a user whose serial port does not exist
 
 
@@ -154,8 +151,6 @@ class DeviceNode:
         Raises LinkError if inotify is not available, LinkDenied if the user may not read the directory.
         """
         await wait_until(self._path, self._path.exists)
-        if self._accessible():
-            return
         try:
             async with asyncio.timeout(ACCESS_WAIT_S):
                 await wait_until(self._path, self._accessible)
@@ -236,7 +231,7 @@ def holders_of(path: str, proc: Path = PROC) -> str:
 def _words(process: Path) -> list[str]:
     """Return the first words of the command line of a process; empty if it cannot be read."""
     try:
-        return (process / "cmdline").read_bytes()[:COMMAND_BYTES].decode("utf-8", "replace").split("\0")
+        return (process / "cmdline").read_text("utf-8", "replace").split("\0")
     except OSError:
         return []
 

@@ -139,11 +139,10 @@ class PythonCanLink:
         try:
             while not stop.is_set():
                 frames = _batch(bus)
-                if frames and not stop.is_set():
+                if frames:
                     loop.call_soon_threadsafe(deliver, frames)
         except (can.CanError, OSError) as error:
-            if not stop.is_set():
-                loop.call_soon_threadsafe(end, LinkError(f"{self.title} ended: {reason_of(error)}"))
+            loop.call_soon_threadsafe(end, LinkError(f"{self.title} ended: {reason_of(error)}"))
 
 
 def _as_python_can(filters: Sequence[CanFilter]) -> CanFilters:

@@ -143,7 +143,7 @@ def _inside(value: object, place: str) -> str:
     for key, index in _STEP.findall(place):
         if isinstance(value, Mapping) and key in value:
             value = value[key]
-        elif isinstance(value, Sequence) and index and int(index) < len(value):
+        elif isinstance(value, Sequence) and index:
             value = value[int(index)]
         else:
             return ""

@@ -39,6 +39,10 @@ def test_the_length_of_windows() -> None:
     assert window_size([run], 100.0) == 1024
     assert window_size([np.zeros((10**6, 3))], 100.0) == 4096
     assert window_size([run], 100.0, 0.1) == 1000
+    assert [window_size([np.zeros((16, 3))], 16.0, *given) for given in ([], [1.0])] == [16, 16]
+    assert window_size([np.zeros((1 << 17, 3))], 1.0, 2.0**-16) == 1 << 16
+    with pytest.raises(BadArgument, match=r"expected from 1.53e-05 Hz"):
+        window_size([np.zeros((1 << 17, 3))], 1.0, 2.0**-17)
     with pytest.raises(BadArgument, match=r"resolution 0.001 Hz: expected from 0.01 Hz"):
         window_size([run], 100.0, 0.001)
     with pytest.raises(BadArgument, match="more than 0 Hz"):

@@ -317,6 +317,10 @@ def test_the_quaternion_has_priority_unless_it_is_zero() -> None:
     made = turned(sample(euler_deg=(0, 0, 30), quat=(0, 0, 0, 0)), frame(convention=ENU))
     assert degrees_of(made.euler_rad) == pytest.approx((0, 0, 30))
     assert turned(sample(quat=(0, 0, 0, 0)), frame(convention=ENU)).quat_wxyz is None
+    for_client = frame(convention=NED).rotation_to(ENU)
+    assert for_client is not None
+    made = for_client.sample(sample(euler_deg=(0, 0, 30), quat=(HALF, 0, 0, HALF)))
+    assert made.quat_wxyz == for_client.sample(sample(quat=(HALF, 0, 0, HALF))).quat_wxyz
 
 
 def test_an_element_that_is_nan_stays_one_element_in_quarter_turns() -> None:

@@ -4,9 +4,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic_ns, time_ns
+from unittest.mock import create_autospec
 
 import pytest
 
+from imud.client.connection import Client
 from imud.client.feed import Feed, Wish, clock_ahead_ns, utc_offset_ns
 from imud.model.event import Event, EventKind
 from imud.model.units import NS_PER_S
@@ -40,7 +42,11 @@ def until(condition: Callable[[], object], heard: Listener) -> None:
         heard.wait_for(lambda news: True)
 
 
-def test_the_first_news_have_the_greeting_and_every_sample_comes(tmp_path: Path) -> None:
+def test_the_first_news_have_the_greeting_and_every_sample_comes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watch = create_autospec(Client.watch, side_effect=Client.watch)
+    monkeypatch.setattr(Client, "watch", watch)
     with daemon(tmp_path) as served, feeding(str(served.path), Wish(("imu0",), news_s=0.02)) as (_, heard):
         first = heard.wait_for(lambda news: news.statuses)
         assert first.hello is not None
@@ -54,6 +60,7 @@ def test_the_first_news_have_the_greeting_and_every_sample_comes(tmp_path: Path)
             assert news.hello is None
             found += [sample.seq for sample in news.samples]
         assert found == [*range(1, 51)]
+    assert watch.call_count == 1, "the feed repeated its request"
 
 
 def test_the_feed_is_disconnected_without_a_wish(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from msgspec import Meta
 
-from imud.contracts.command import Risk, Target, Verb, described, parameters_of
+from imud.contracts.command import Risk, Target, Verb, described, infos, parameters_of
 from imud.drivers import DRIVERS
 from imud.model.errors import BadArgument
 
@@ -31,6 +31,7 @@ def test_every_action_is_described_and_says_what_it_saves_and_risks(driver: str)
         assert action.saves == (name == "save" or (driver, name) in SAVING), name
         assert info.risk is RISKS.get(name, info.risk), name
         assert info.risk is not Risk.RESET or name == "factory_reset", name
+    assert [info.kind for info in infos(DRIVERS[driver].calibrations)] == [*DRIVERS[driver].calibrations]
 
 
 def _turn(target: Target, *, angle_deg: Annotated[float, Meta(ge=-180, le=180)], relative: bool = False) -> str:

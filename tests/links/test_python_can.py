@@ -3,6 +3,7 @@
 import asyncio
 import threading
 from collections.abc import Sequence
+from unittest.mock import Mock
 
 import can
 import msgspec
@@ -120,6 +121,24 @@ async def test_only_data_frames_are_delivered_and_nothing_after_close(monkeypatc
     await asyncio.sleep(0.01)  # the loop would deliver the frame now
     assert got == [0, 4]
     assert bus.is_shut_down
+
+
+@in_loop
+@pytest.mark.parametrize("closed", [False, True])
+async def test_a_failed_bus_ends_an_open_link(monkeypatch: pytest.MonkeyPatch, closed: bool) -> None:
+    bus, ends = FakeBus(), list[str]()
+    monkeypatch.setattr(bus, "recv", Mock(side_effect=can.CanOperationError("gone")))
+    monkeypatch.setattr(can, "Bus", lambda *_, **__: bus)
+    link = make("fake")
+    link.open()
+    link.start(lambda frames: None, lambda news, problem: None, lambda error: ends.append(str(error)))
+    for thread in [one for one in threading.enumerate() if one.name == link.title]:
+        thread.join()
+    if closed:
+        link.close()
+    await asyncio.sleep(0)
+    assert ends == ([] if closed else [f"{link.title} ended: gone"])
+    link.close()
 
 
 @in_loop

@@ -157,6 +157,7 @@ def test_unplugging_takes_the_node_away_and_brings_it_back(rig: PluggedPort) -> 
     assert rig.path.is_symlink()
     rig.port.unplug(rig.now_ns, 300 * NS_PER_MS)
     assert not rig.path.is_symlink()
+    rig.path.with_name(f".{rig.path.name}.{os.getpid()}").symlink_to("left by a killed process with this number")
     with pytest.raises(OSError, match="Input/output error"):
         os.write(rig.fd, b"anybody there?")
     rig.run(299)

@@ -51,13 +51,21 @@ def test_result_is_judged_by_the_option() -> None:
     assert contact.result_of(Reply(("text",))) is None
 
 
-def test_a_device_without_replies_raises_no_reply() -> None:
-    script = contact.settled()
-    request = next(script)
-    asked = 1
-    with pytest.raises(NoReply, match="status: expected a reply, got none"):  # noqa: PT012  # driven by hand
+@pytest.mark.parametrize(
+    ("script", "requests", "unheard"),
+    [
+        (contact.settled(), 10, "status"),
+        (_baud(), 5, "read parameter BAUD"),
+        (contact.resume_streaming(), 5, ""),
+        (contact.in_command_mode(_baud), 7, "status"),
+        (contact.acknowledged(commands.reset_heading(0), 0), 11, "status"),
+    ],
+)
+def test_a_device_without_replies_raises_no_reply(script: RequestScript[object], requests: int, unheard: str) -> None:
+    asked = [next(script)]
+    with pytest.raises((NoReply, StopIteration)) as caught:  # noqa: PT012  # driven by hand
         while True:
-            request = script.send(Silence(()))
-            asked += 1
-    assert asked == contact.SETTLE_TRIES
-    assert request.name == "status"
+            asked.append(script.send(Silence(())))
+    assert len(asked) == requests
+    assert str(caught.value).startswith(f"{unheard}: expected a reply, got none" if unheard else "False")
+    assert {one.timeout_ns for one in asked} == {300_000_000}
