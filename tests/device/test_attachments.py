@@ -70,6 +70,10 @@ class Scene:
         self.device.restart()
         self.device.faults.line = None
 
+    async def search(self, times: int) -> None:
+        due = self.device.transactions + times
+        await self.rig.until(lambda: self.device.transactions >= due, "the search")
+
     @property
     def pulses(self) -> int:
         return sum(active for _, active in self.line.history)
@@ -105,6 +109,18 @@ async def test_a_device_that_hangs_is_reset_and_set_up_again(bench: PolledBusBen
         assert it.rig.kinds.count(EventKind.UP) == 2
         assert (it.device.extended, it.device.filter & 0x0F) == (1, 2)
         assert bench.clock.now_ns() - up_ns < 4e9
+
+
+@in_bench
+async def test_search_rounds_before_the_newest_sample_cause_no_reset(bench: PolledBusBench) -> None:
+    async with polled(bench) as it:
+        for _ in range(3):
+            await it.rig.until_samples(5, 20)
+            it.hang()
+            await it.rig.until(lambda: it.rig.state is DeviceState.SEARCHING, "left")
+            await it.search(4)
+            it.boot()
+        assert it.pulses == 0
 
 
 @in_bench

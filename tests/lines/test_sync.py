@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import pytest
 
 from imud.contracts.lines import (
+    TRIGGER_VERB,
     DeviceLines,
     DividedOptions,
     Edge,
@@ -14,7 +15,7 @@ from imud.contracts.lines import (
     SoutOptions,
     TriggerOptions,
 )
-from imud.lines.sync import ALARM_STATUS, SyncSignals
+from imud.lines.sync import ALARM_STATUS, LineVerbs, SyncSignals
 from imud.model.errors import CommandError, LinkBusy, LinkError
 from imud.model.event import EventKind
 from imud.model.sample import Measurement
@@ -113,6 +114,7 @@ async def test_the_alarm_is_in_the_samples_of_each_clock() -> None:
 async def test_one_edge_by_command_where_there_is_sin() -> None:
     bench = SyncBench()
     assert bench.signals.can_trigger
+    assert [*LineVerbs(None, bench.signals).rows] == [TRIGGER_VERB]
     with pytest.raises(CommandError, match="trigger: bow sin is not driven"):
         bench.signals.trigger_once()
     bench.start()
@@ -133,6 +135,8 @@ async def test_one_edge_by_command_where_there_is_sin() -> None:
     assert not bench.output("sin").is_open
     bench = SyncBench(DeviceLines(sout=SoutOptions(line="A")))
     assert not bench.signals.can_trigger
+    assert not LineVerbs(None, bench.signals).rows
+    assert not LineVerbs(None, None).rows
     with pytest.raises(CommandError, match=r"expected the key lines\.sin"):
         bench.signals.trigger_once()
     assert bench.signals.status().sin is False

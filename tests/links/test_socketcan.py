@@ -111,6 +111,19 @@ def ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ends]:
         yield receiver, sender, tmp_path
 
 
+def test_a_link_waits_for_its_interface(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    found: list[bool] = []
+
+    async def wait_until(holds: Callable[[], bool]) -> None:
+        found.append(holds())
+
+    monkeypatch.setattr(netlink, "wait_until", wait_until)
+    for flags in (netlink.IFF_UP, 0):
+        (ends[2] / "class/net/lo/flags").write_text(f"{flags:#x}\n")
+        asyncio.run(Bus(ends, 0).link.wait_present())
+    assert found == [True, False]
+
+
 def test_frames_gather(ends: Ends) -> None:
 
     async def story(bus: Bus) -> None:

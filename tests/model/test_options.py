@@ -57,6 +57,8 @@ class Trip(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
             raise ValueError("names: expected one or many, got both")
         if self.names == ("none",):
             raise ValueError("this cannot be")
+        if self.names == ("rate",):
+            raise ValueError("rate: this cannot be")
 
 
 @pytest.mark.parametrize(
@@ -83,6 +85,7 @@ class Trip(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
         ),
         ({"rate_hz": 1, "names": ["both"]}, [("names", "expected one or many, got both")]),
         ({"rate_hz": 1, "names": ["none"]}, [("", "this cannot be")]),
+        ({"rate_hz": 1, "names": ["rate"]}, [("", "rate: this cannot be")]),
     ],
 )  # fmt: skip
 def test_wrong_values(given: dict[str, Any], expected: list[tuple[str, str]]) -> None:

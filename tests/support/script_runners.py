@@ -1,9 +1,25 @@
 """Script runners without a device: tests give them the messages and the time."""
 
-from imud.contracts.script import Request, never, of_text
+from collections.abc import Iterator
+from typing import Any
+
+from imud.contracts.script import Request, Silence, never, of_text
 from imud.device.scripts import RequestPort, ScriptRunner
 from imud.host.clock import HostClock
+from imud.model.errors import NoReply
 from imud.model.ledger import Ledger
+from imud.model.units import NS_PER_MS
+
+
+def unanswered_ms(script: Any) -> Iterator[float]:
+    """Yield the timeouts of all requests of a script to a device that does not reply, ms."""
+    try:
+        request = next(script)
+        while True:
+            yield request.timeout_ns / NS_PER_MS
+            request = script.send(Silence(()))
+    except (StopIteration, NoReply):
+        return
 
 
 class ListPort(RequestPort):

@@ -15,6 +15,7 @@ from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.drivers.hipnuc.canopen.driver import SETTINGS
 from imud.model.errors import BadArgument, DeviceRefused, NoReply
 from imud.sim.hipnuc.canopen import NodeSettings, NodeVariant
+from tests.support.script_runners import unanswered_ms
 from tests.support.simulated_modules import QUIET, CanopenBench, run_script, unpack
 
 TPDO_OBJECTS = {1: "00", 2: "01", 3: "02", 4: "03", 6: "04", 7: "05"}
@@ -38,6 +39,11 @@ def test_a_restart_a_slow_save_and_a_refused_write() -> None:
         bench = CanopenBench()
         bench.run_script(session.set_inclinometer_sign(8, "y", invert=invert))
         assert (0x608, bytes([0x23, 0x9F, 0x20, 0, invert, 0, 0, 0])) in bench.sent
+
+
+def test_timeouts_without_replies() -> None:
+    for make, timeout_ms in ((session.identify, 500), (session.save, 2000), (session.factory_reset, 2000)):
+        assert [*unanswered_ms(make(8))] == [timeout_ms]
 
 
 @pytest.mark.parametrize("tpdo", TPDO_OBJECTS)

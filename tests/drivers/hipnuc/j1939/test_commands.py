@@ -17,7 +17,7 @@ from imud.model.errors import BadArgument, NoReply, Rejected
 from imud.model.ledger import Ledger
 from imud.sim.hipnuc.j1939 import J1939_VARIANTS, J1939Settings, J1939Variant
 from tests.support.old_spellings import script_of
-from tests.support.script_runners import offline_runner
+from tests.support.script_runners import offline_runner, unanswered_ms
 from tests.support.simulated_modules import J1939Bench, run_script
 
 PEER = J1939Node(8)
@@ -88,6 +88,21 @@ def test_every_row_of_the_manual(name: str, arguments: dict[str, object], data: 
     writes = [frame for frame in bench.sent if frame[0] == 0x0CEF0855 and frame[1][2] == 6]
     assert writes[0] == (0x0CEF0855, bytes.fromhex(data))
     assert (result in (Written.VERIFIED, Written.PENDING)) == (name in READABLE)
+
+
+@pytest.mark.parametrize(
+    ("script", "timeouts_ms"),
+    [
+        (session.identify(PEER), [500]),
+        (session.save(PEER), [2500]),
+        (session.factory_reset(PEER), [2500]),
+        (session.read_values(PEER, [1, 2, 3]), [250, 250]),
+        (session.change_address(HipnucJ1939Options(), 9), [1100, 500, 500, 500, 500]),
+        (session.restart(HipnucJ1939Options(), 500_000), [250, 250, 3000, 1100]),
+    ],
+)
+def test_timeouts_without_replies(script: RequestScript[object], timeouts_ms: list[float]) -> None:
+    assert [*unanswered_ms(script)] == timeouts_ms
 
 
 def test_missing_replies_and_unchanged_values_are_reported() -> None:

@@ -6,10 +6,11 @@ from typing import Any
 
 import pytest
 
-from imud.contracts.script import Request
+from imud.contracts.script import Request, RequestScript
 from imud.drivers.hipnuc.common import AttitudeMode, LevelReset
 from imud.drivers.hipnuc.uart import commands as c
 from imud.model.errors import BadArgument
+from tests.support.script_runners import unanswered_ms
 
 H91, H92 = c.OutputMessage.HI91, c.OutputMessage.HI92
 
@@ -51,6 +52,19 @@ PRINTED = [
 )
 def test_commands_are_as_printed(request_: Request, text: str) -> None:
     assert (request_.payload, request_.name) == (text.encode() + b"\r\n", text)
+
+
+@pytest.mark.parametrize(
+    ("script", "timeouts_ms"),
+    [
+        (c.restart(115200), [500, 1000, 0] + [500] * 5 + [0, 500, 500] * 5 + [0]),
+        (c.change_baud(9600, 115200), [500, 500, 0, 500, 500, 0, 500, 500, 0]),
+        (c.reset_to_factory(115200), [5000, 0, 500, 500, 0]),
+        (c.send(c.save_config()), [5000]),
+    ],
+)
+def test_timeouts_without_replies(script: RequestScript[object], timeouts_ms: list[float]) -> None:
+    assert [*unanswered_ms(script)] == timeouts_ms
 
 
 IDENTITY = ((1, 0, 0), (0, 1, 0), (0, 0, 1))

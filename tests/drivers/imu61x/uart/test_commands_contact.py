@@ -3,13 +3,14 @@
 import pytest
 
 from imud.contracts.script import Reply, RequestScript, Silence
-from imud.drivers.imu61x.uart import commands
+from imud.drivers.imu61x.uart import commands, settings
 from imud.drivers.imu61x.uart import commands as contact
 from imud.drivers.imu61x.uart.codec import Parameter
 from imud.drivers.imu61x.uart.commands import Imu61xUartOptions, OutputMode
 from imud.model.errors import NoReply, Rejected
 from imud.sim.imu61x.uart import Imu61xSettings
-from tests.support.simulated_modules import every_variant, imu61x_bench, variant_bench
+from tests.support.script_runners import unanswered_ms
+from tests.support.simulated_modules import every_variant, imu61x_bench, run_script, variant_bench
 
 
 def _baud() -> RequestScript[float]:
@@ -52,20 +53,26 @@ def test_result_is_judged_by_the_option() -> None:
 
 
 @pytest.mark.parametrize(
-    ("script", "requests", "unheard"),
+    ("script", "timeouts_ms"),
     [
-        (contact.settled(), 10, "status"),
-        (_baud(), 5, "read parameter BAUD"),
-        (contact.resume_streaming(), 5, ""),
-        (contact.in_command_mode(_baud), 7, "status"),
-        (contact.acknowledged(commands.reset_heading(0), 0), 11, "status"),
+        (contact.settled(), [300] * 10),
+        (_baud(), [300] * 5),
+        (contact.resume_streaming(), [300] * 5),
+        (contact.in_command_mode(_baud), [300] * 7),
+        (settings.save(), [300] * 11),
+        (settings.change_baud(921600, 115200), [300] * 11),
+        (settings.start_streaming(), [300] * 5 + [3000]),
+        (contact.acknowledged(commands.calibrate_gyro(), 0), [10_000] + [300] * 10),
+        (contact.acknowledged(commands.start_installation_calibration(), 0), [10_000] + [300] * 10),
+        (contact.acknowledged(commands.save(), 0), [5000] + [300] * 10),
+        (contact.acknowledged(commands.factory_reset(), 0), [5000] + [300] * 10),
     ],
 )
-def test_a_device_without_replies_raises_no_reply(script: RequestScript[object], requests: int, unheard: str) -> None:
-    asked = [next(script)]
-    with pytest.raises((NoReply, StopIteration)) as caught:  # noqa: PT012  # driven by hand
-        while True:
-            asked.append(script.send(Silence(())))
-    assert len(asked) == requests
-    assert str(caught.value).startswith(f"{unheard}: expected a reply, got none" if unheard else "False")
-    assert {one.timeout_ns for one in asked} == {300_000_000}
+def test_requests_to_a_device_without_replies(script: RequestScript[object], timeouts_ms: list[float]) -> None:
+    assert [*unanswered_ms(script)] == timeouts_ms
+
+
+def test_a_device_without_replies_raises_no_reply() -> None:
+    for script in (contact.settled(), contact.acknowledged(commands.reset_heading(0), 0)):
+        with pytest.raises(NoReply, match="status: expected a reply, got none"):
+            run_script(script, lambda _request: Silence(()))
