@@ -47,6 +47,13 @@ def test_runs_are_taken_together_without_a_difference_across_the_gap() -> None:
     assert both == pytest.approx((alone[0] * counts[0] + alone[1] * counts[1]) / (counts[0] + counts[1]))
 
 
+def test_runs_that_are_too_short_have_no_degrees_of_freedom() -> None:
+    run = white(np.random.default_rng(4), 500, 1.0, 1.0)[:, None]
+    curve = allan_curve([run, run[:20], run[:19]], 1.0, np.array([10]))
+    noise = NoiseType(int(curve.types[0, 0]))
+    assert curve.freedom[0, 0] == sum(degrees_of_freedom(noise, 10, n) for n in (501, 21))
+
+
 @pytest.mark.parametrize("noise", list(NoiseType))
 @pytest.mark.parametrize(("m", "n"), [(1, 1001), (4, 1001), (100, 1001), (7, 50)])
 def test_degrees_of_freedom_are_those_of_allantools(noise: NoiseType, m: int, n: int) -> None:

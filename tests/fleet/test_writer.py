@@ -164,6 +164,11 @@ def test_a_rate_below_one_message_per_second_works(tmp_path: Path) -> None:
         bench.put(100)
         bench.workers[0].work()
     assert len(commits) in (9, 10), "there is one transaction a second"
+    bench.clock.advance(3 * NS_PER_S)
+    for _ in range(2):
+        bench.workers[0].work()
+        bench.clock.advance(NS_PER_S)
+    assert 0 not in commits, "a gateway without messages does not write to the disk"
 
 
 def test_messages_without_acknowledgement_are_sent_again_in_order(tmp_path: Path) -> None:

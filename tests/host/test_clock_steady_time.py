@@ -90,6 +90,8 @@ def test_less_exact_pairs_do_not_shorten_the_constant_time() -> None:
     for i in range(100):
         steady.add_pair(BEGIN_NS + i * NS_PER_S + (i % 2) * 3 * NS_PER_US, RAW_NS + i * NS_PER_S, 0, NS_PER_US)
     assert steady.even_from_ns == BEGIN_NS
+    steady.add_pair(BEGIN_NS + 100 * NS_PER_S + 4 * NS_PER_US, RAW_NS + 100 * NS_PER_S, 0, NS_PER_US)
+    assert steady.even_from_ns == BEGIN_NS + NS_PER_S  # 4 µs after the first pair, 1 µs after the second pair
 
 
 def test_a_change_of_the_rate_between_two_pairs_is_in_the_error() -> None:

@@ -15,6 +15,7 @@ from imud.drivers.hipnuc.modbus.commands import (
     change_address,
     factory_reset,
     read,
+    read_settings,
     restart,
     save,
     set_baud,
@@ -118,6 +119,7 @@ def test_addresses_that_are_taken_not_accepted_or_lost() -> None:
     def transfer(transfer: Transfer) -> bytes:
         answer = bench.transfer(transfer)
         if transfer.sends[0][0] == 6:
+            assert transfer.holds, "no other transfer before the next address"
             bench.slave.mute = 6  # three tries at each address against noise
         return answer
 
@@ -167,10 +169,17 @@ def test_devices_with_unexpected_replies() -> None:
         return framed(7, request if request[0] == 6 else b"\x83\x02")
 
     assert run_transfer_script(set_heading_mode(NINE), answer) is Written.UNVERIFIED
+    (report,) = run_transfer_script(
+        read_settings(), lambda _transfer: framed(7, bytes((3, 6, 0, 10, 0, 7, 0, 2)))
+    ).values()
+    assert report.words == {"baud": "code 10", "id": "7", "heading_mode": "code 2"}
+    assert report.values == {"address": 7}
 
     bench = ModbusBench(module(7, variant=SlaveVariant(boot_ms=60_000)))
     with pytest.raises(NoReply, match="does not reply at address 7 after its restart"):
         restarted(bench)
+    written = [request[0] for _, request in bench.sent].index(6)
+    assert len(bench.sent) - written == 1 + 30
 
     made = module(7)
     made.settings = made.flash = replace(made.settings, baud=9600)
