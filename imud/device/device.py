@@ -386,6 +386,8 @@ class Device:
                 return result
             finally:
                 saved = result is not None and (result.saved or result.kept is not Kept.BY_SAVE)
+                if result is not None and result.saved:  # the save writes all settings
+                    self._settings.flash_is_current()
                 self._settings.changed(unsaved=not saved)
 
     def stop_calibration(self) -> bool:

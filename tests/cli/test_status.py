@@ -9,6 +9,7 @@ from msgspec.structs import replace
 from imud.attitude.conventions import Heading
 from imud.cli.status import axes, block, driven, page, parts, utc, watched
 from imud.client.connection import Client
+from imud.contracts.setting import OnDifference, SettingsState, SettingsStatus
 from imud.contracts.status import DeviceState, FrameStatus, LinesStatus, MqttStatus, UtcStatus
 from tests.cli.conftest import Cli
 from tests.support.metrics import LINES, POLLING, UTC, device, equipped
@@ -89,6 +90,8 @@ def test_lines_and_utc_say_only_what_is_known() -> None:
         assert watched(replace(LINES, alarm=alarm), "alarm", 2).startswith(f"{words}, raised")
     assert driven(lines).endswith("(GPIO4 is in use by another program)")
     assert [name for name, _ in parts(device("bow", lines=LinesStatus({}, {}, {}, sin=True)))] == ["sin"]
+    unsaved = SettingsStatus(SettingsState.UNDECLARED, OnDifference.REPORT, unsaved=True)
+    assert dict(parts(device("bow", declared=unsaved)))["unsaved"].endswith("run `imud command bow save`")
     lines = LinesStatus({"reset": "GPIO5 is in use by another program"}, {}, {})
     assert list(parts(device("bow", lines=lines))) == [("reset", "GPIO5 is in use by another program")]
     assert utc(UtcStatus("", "")) == "no pulse and no sentence yet"

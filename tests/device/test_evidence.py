@@ -7,10 +7,12 @@ from typing import Any
 import pytest
 
 from imud.contracts.command import VerbResult
+from imud.contracts.driver import SAMPLE_COUNTER
 from imud.contracts.status import DeviceState
 from imud.device import stream_transport
 from imud.drivers import DRIVERS
 from imud.model.sample import Measurement, Vector3
+from imud.model.units import NS_PER_MS
 from tests.device.test_settings import ModuleBench
 from tests.support.fake_drivers import FAKE_MODULE_DRIVER, LinesCodec
 from tests.support.stories import played
@@ -39,6 +41,28 @@ async def test_a_restart_is_verified_by_the_device_counter(bench: ModuleBench, i
     assert (found.verified, found.evidence) == ((False, seen) if ignores else (True, "the device counter restarted"))
     applied = await bench.doing(bench.device.settings_apply({"mounting": "x_up"}, save=True))
     assert (applied.restarted, applied.problem) == ((False, f"restart: {seen}") if ignores else (True, ""))
+
+
+@pytest.mark.parametrize("pause_ms", [0, 200, 500])
+def test_without_a_counter_a_pause_of_the_samples_shows_a_restart(
+    pause_ms: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on Modbus, CANopen and J1939, also if the device aborts the request."""
+    driver = replace(FAKE_MODULE_DRIVER, tick_ns=SAMPLE_COUNTER)
+    monkeypatch.setattr(stream_transport, "DRIVERS", {**dict(DRIVERS), "fake-module": driver})
+    bench = ModuleBench()
+    sample = bench.module.sample
+    bench.module.sample = lambda: (  # type: ignore[method-assign]
+        sample() if bench.clock.now_ns() - bench.module._boot_ns >= pause_ms * NS_PER_MS else None
+    )
+
+    async def story() -> None:
+        await bench.pass_s(3)
+        found = await result_of(bench, "restart")
+        assert found.verified is (pause_ms == 500)
+        assert found.evidence.startswith("the samples paused for" if pause_ms == 500 else "the samples did not pause")
+
+    bench.play(story)
 
 
 @pytest.mark.parametrize(

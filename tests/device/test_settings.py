@@ -607,7 +607,10 @@ def test_a_new_rate_is_followed_if_the_device_replies() -> None:
 async def test_commands_that_save_count_and_are_limited(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
     await bench.pass_s(2)
+    assert (await bench.doing(bench.device.calibrate("zero", save=False))).verified
+    assert bench.status.unsaved
     assert (await bench.doing(bench.device.calibrate("zero", save=True))).saved
+    assert not bench.status.unsaved
     for _ in range(LIMIT_ASKED - 2):
         await bench.doing(bench.device.act("save", {}))
     applied = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))

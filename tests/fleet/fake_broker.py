@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable
 
-from imud.fleet.broker import BrokerError, Received, Will
+from imud.fleet.broker import BrokerError, MessageRefused, Received, Will
 from imud.fleet.settings import Broker, MqttOptions
 from tests.support.daemon_process import LIMIT_S
 
@@ -32,6 +32,8 @@ class FakeConnection:
     def publish(
         self, topic: str, payload: bytes, content_type: str, *, retain: bool, correlation: bytes | None = None
     ) -> int:
+        if topic in self._broker.rejects:
+            raise MessageRefused("Not authorized")
         self.correlations.append(correlation)
         self.sent.append((topic, payload, retain))
         self.types.append(content_type)
@@ -78,6 +80,7 @@ class FakeBroker:
         self.window = 4
         self.closes_on: set[str] = set()  # topics for which the broker closes the connection
         self.refuses: set[str] = set()  # topics that the broker refuses with a reason
+        self.rejects: set[str] = set()  # topics whose messages are too long for the broker
         self.will: Will | None = None
         self.connecting, self.accepts = threading.Event(), threading.Event()
         self.accepts.set()

@@ -166,7 +166,7 @@ def test_only_configured_devices_are_queued(tmp_path: Path) -> None:
     assert bench.context.outputs.mqtts == []
 
 
-def test_a_failed_spool_causes_an_event_and_the_output_continues(tmp_path: Path) -> None:
+def test_a_failed_spool_or_a_refused_topic_causes_an_event_and_the_output_continues(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path / "spool")
     bench.start()
     database = tmp_path / "spool" / "spool.db"
@@ -183,6 +183,12 @@ def test_a_failed_spool_causes_an_event_and_the_output_continues(tmp_path: Path)
     assert sum("the spool was damaged" in one for one in messages) == 1, messages
     assert all(event.kind is EventKind.MQTT and not event.device for event in bench.events)
     assert database.exists()
+    bench.broker.refuses = {"imud/default/gw/imu0/events"}
+    while len(bench.output.status().refused) != 1:
+        bench.output.event(Event(0, "imu0", EventKind.LOSS, "x"))
+        bench.tick()
+    bench.tick()
+    assert bench.events[-1].message.startswith("the broker refuses messages of imud/default/gw/imu0/events: Not auth")
     bench.close()
 
 

@@ -114,7 +114,7 @@ def test_everything_is_spooled_sent_and_removed(tmp_path: Path) -> None:
     assert bench.writer.problem == "No space left on device"
 
 
-def test_samples_of_a_refused_topic_wait_in_the_spool(tmp_path: Path) -> None:
+def test_samples_of_a_refused_topic_wait_in_the_spool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = WriterBench(tmp_path)
     bench.broker.refuses = {"imud/site/gw/bow/samples"}
     for number in range(3):
@@ -125,10 +125,18 @@ def test_samples_of_a_refused_topic_wait_in_the_spool(tmp_path: Path) -> None:
     assert sent.count("imud/site/gw/bow/events") == 3
     assert sent.count("imud/site/gw/bow/samples") <= 2
     assert (bench.spool.messages, bench.sender.acknowledged) == (6, 3)
+    monkeypatch.setattr("imud.fleet.sender.OUTBOX_MAX", 8)
+    for _ in range(10):
+        bench.put(1000)
+        bench.work()
+    bench.spool.rewind()
+    bench.queue.put_event(Event(9, "bow", EventKind.UP, ""))
+    bench.work()
+    assert bench.sender.acknowledged == 4, "waiting samples do not delay an event"
     bench.broker.refuses = set()
     bench.clock.advance(SKIP_NS)
-    bench.work(4)
-    assert (bench.spool.messages, bench.sender.acknowledged) == (0, 9)
+    bench.work(20)
+    assert (bench.spool.messages, bench.sender.acknowledged) == (0, bench.spool.spooled)
     assert (len(bench.broker.connections), bench.sender.refused) == (1, {})
 
 

@@ -124,3 +124,7 @@ def test_the_document_has_every_place_section_and_command() -> None:
     assert "--allow-downgrades" in back
     guest = (ROOT / "tests/lab_debian/guest/removal.py").read_text()
     assert '"--allow-downgrades"' in guest, "the rig runs it"
+    recording = (ROOT / "docs" / "recording.md").read_text()
+    assert re.search(r"^```ini\n\[Unit\]\nRequiresMountsFor=", recording, re.MULTILINE), (
+        "recordings on an external disk"
+    )

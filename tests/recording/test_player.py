@@ -12,6 +12,7 @@ from random import Random
 import msgspec
 import pytest
 
+from imud.attitude.conventions import Convention
 from imud.drivers import DRIVERS
 from imud.formats import records
 from imud.formats.records import CallRecord, CheckRecord, Kind, PathRecord, Record, records_of
@@ -53,7 +54,7 @@ def bench(tmp_path: Path, recorded: pytest.MonkeyPatch) -> PolledBusBench:
         signals.test_an_alarm_is_an_event_and_shown_in_the_samples, waiting.test_a_link_without_pause_has_no_hold,
         can.test_lost_samples_are_counted_by_cause, can.test_frames_from_before_a_loss_are_not_mixed_with_those_after,
         can.test_bus_down_and_up, can.test_a_suspend_of_the_host_is_a_gap_of_unknown_size,
-        watches.test_coordinates_are_described_and_an_unknown_value_is_reported,
+        lambda: watches.test_both_coordinates_of_a_device_give_the_same_published_samples(Convention.NED_FRD, {}),
     ],
     ids=[
         "edges", "triggers", "alarm", "held samples", "losses on CAN", "loss within a sample", "bus down", "suspended",
