@@ -11,6 +11,7 @@ import pytest
 from imud.cli import build_parser
 from imud.cli.web import _say, guard_of
 from imud.model.errors import BadArgument
+from imud.web.server import CONNECTIONS_MAX
 from tests.cli.conftest import Cli, imud_process
 from tests.support.daemon_process import LIMIT_S
 
@@ -64,7 +65,14 @@ def test_it_serves_until_a_signal_and_says_where_it_is_open(
     more = ("--port", 0, "--token-file", token, *words, "--socket", tmp_path / "none")
     with imud_process("web", *more, python=("-X", "dev", "-W", "error")) as web:
         line = web.out.readline().strip()
-        asked = HTTPConnection("127.0.0.1", int(line.rstrip("/").rpartition(":")[2]), timeout=LIMIT_S)
+        port = int(line.rstrip("/").rpartition(":")[2])
+        idle = [socket.create_connection(("127.0.0.1", port), LIMIT_S) for _ in range(CONNECTIONS_MAX + 1)]
+        assert idle[0].recv(1) == b"", "a new connection replaces the oldest idle connection"
+        idle[-1].sendall(b"GET / HTTP/9.9\r\n\r\n")
+        assert b" 400 " in idle[-1].recv(100)
+        for one in idle:
+            one.close()
+        asked = HTTPConnection("127.0.0.1", port, timeout=LIMIT_S)
         asked.request("GET", "/")
         assert b"<title>imud</title>" in asked.getresponse().read()
         asked.close()

@@ -47,7 +47,7 @@ async def test_a_restart_is_verified_by_the_device_counter(bench: ModuleBench, i
 def test_without_a_counter_a_pause_of_the_samples_shows_a_restart(
     pause_ms: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As on Modbus, CANopen and J1939, also if the device aborts the request."""
+    """Modbus, CANopen and J1939 have no counter. A rejected request causes no pause."""
     driver = replace(FAKE_MODULE_DRIVER, tick_ns=SAMPLE_COUNTER)
     monkeypatch.setattr(stream_transport, "DRIVERS", {**dict(DRIVERS), "fake-module": driver})
     bench = ModuleBench()

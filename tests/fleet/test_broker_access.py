@@ -8,14 +8,17 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
+from paho.mqtt.client import Client
 
 from imud.fleet.broker import (
     PACKET_BYTES,
     RECEIVED_MAX,
     UNREAD_MAX,
+    WEBSOCKET_BYTES,
     BrokerError,
     PacketGuard,
     PahoConnection,
@@ -143,6 +146,14 @@ def test_messages_that_imud_did_not_request_end_the_connection(head: bytes) -> N
     data = head + message * (RECEIVED_MAX + 1)
     with hostile_broker(data) as broker, pytest.raises(BrokerError, match="message that imud did not request"):
         use_gateway(broker)
+
+
+def test_a_long_websocket_frame_ends_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    client = paho_client(BROKER, MqttOptions(), "one", is_v5=True, packet_bytes=99)
+    monkeypatch.setattr(Client, "_sock_recv", lambda *_arguments: b"")
+    monkeypatch.setattr(client, "socket", lambda: SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES + 1)))
+    with pytest.raises(ValueError, match="WebSocket frame of at most"):
+        client._sock_recv(1)
 
 
 def test_the_guard_finds_packets_in_any_pieces() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from aiohttp import ClientWebSocketResponse, WSMsgType, WSServerHandshakeError
 from aiohttp.test_utils import TestClient, TestServer, get_port_socket
-from aiohttp.web import AppRunner
+from aiohttp.web import AppRunner, HTTPRequestTimeout
 
 from imud.model.event import Event, EventKind
 from imud.publishers.socket.server import SocketServer
@@ -231,6 +231,8 @@ async def test_replies_to_wrong_tokens_are_delayed_and_limited(tmp_path: Path, m
     monkeypatch.setattr(web_app, "FAILURE_S", 0.0)
     async with running(tmp_path) as site:
         assert await site.post("/api/login", {"token": "wrong"}) == (401, {"error": "wrong token"})
+        monkeypatch.setattr(web_app, "FAILURES_TOTAL_MAX", 0)
+        assert (await site.post("/api/login", {"token": TOKEN}))[0] == 429, "too many from all addresses"
     async with running(tmp_path, token="") as site:
         assert (await site.post("/api/login", {"token": ""}))[0] == 403
 
@@ -391,6 +393,17 @@ def test_idle_connections_are_closed_and_a_new_connection_replaces_the_oldest() 
     assert page_transport.aborted
 
 
+@asynccontextmanager
+async def listening(tmp_path: Path) -> AsyncIterator[tuple[str, int]]:
+    """Run the server as the command does. Yield its address."""
+    web = WebServer(str(tmp_path / "none"), WebGuard(b"", lambda: 1e9, reading_needs_token=False))
+    runner = AppRunner(web.make_app(), access_log=None, logger=server_log())
+    await runner.setup()
+    await LimitedSite(runner, "127.0.0.1", 0, web.connections).start()
+    yield runner.addresses[0][:2]
+    await runner.cleanup()
+
+
 MALFORMED = (
     b"\x00\x01\x02\r\n\r\n", b"GET / HTTP/9.9\r\n\r\n", b"GET /" + b"a" * 9000 + b" HTTP/1.1\r\n\r\n",
     b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"a" * 9000 + b"\r\n\r\n",
@@ -405,15 +418,20 @@ MALFORMED = (
 async def test_malformed_requests_cause_no_log_line(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, request_bytes: bytes
 ) -> None:
-    web = WebServer(str(tmp_path / "none"), WebGuard(b"", lambda: 1e9, reading_needs_token=False))
-    runner = AppRunner(web.make_app(), access_log=None, logger=server_log())
-    await runner.setup()
-    site = LimitedSite(runner, "127.0.0.1", 0, web.connections)
-    await site.start()
-    host, port = runner.addresses[0][:2]
-    reader, writer = await asyncio.open_connection(host, port)
-    writer.write(request_bytes.replace(b"HOST", f"{host}:{port}".encode()))
-    assert (await reader.readline()).split()[1] in (b"400", b"431", b"505")
-    writer.close()
-    await runner.cleanup()
+    async with listening(tmp_path) as (host, port):
+        reader, writer = await asyncio.open_connection(host, port)
+        writer.write(request_bytes.replace(b"HOST", f"{host}:{port}".encode()))
+        assert (await reader.readline()).split()[1] in (b"400", b"431", b"505")
+        writer.close()
     assert not caplog.records
+
+
+async def test_connections_without_a_complete_request_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("IDLE_S", "CHECK_S", "BODY_S"):
+        monkeypatch.setattr(web_app, name, 0.01)
+    async with listening(tmp_path) as (host, port):
+        reader, writer = await asyncio.open_connection(host, port)
+        assert await reader.read() == b""
+        writer.close()
+    with pytest.raises(HTTPRequestTimeout):
+        await web_app._body(SimpleNamespace(read=asyncio.Event().wait))  # type: ignore[arg-type]
