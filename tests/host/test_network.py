@@ -13,6 +13,7 @@ from imud.model.errors import ServerError
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 from imud.publishers.nmea0183 import TcpOutput, UdpOutput
 from imud.utc.receivers import GpsdSource, RmcOptions
+from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import VirtualClock, in_loop
 
 
@@ -47,7 +48,7 @@ async def test_a_silent_name_server_does_not_occupy_the_executor(monkeypatch: py
 
     def silent(*_arguments: Any, **_names: Any) -> Any:
         threads.append(threading.current_thread())
-        release.wait()
+        release.wait(LIMIT_S)  # a failed assertion must not wait for ever
         raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
 
     monkeypatch.setattr(socket, "getaddrinfo", silent)
