@@ -1,8 +1,10 @@
 """ROS 2 messages, read by rosbags with its own definitions, as a ROS 2 node would read them."""
 
 import math
+import struct
 from typing import Any
 
+import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from imud.bridges.channel import (
@@ -14,7 +16,7 @@ from imud.bridges.channel import (
     MessageFrames,
     StampedEvent,
 )
-from imud.bridges.ros2 import FIELDS, Ros2Dialect, schema, time_of
+from imud.bridges.ros2 import ENCAPSULATION, FIELDS, CdrWriter, Layout, Ros2Dialect, schema, time_of
 from imud.contracts.status import Deviations
 from imud.model.sample import Sample
 from tests.bridges.samples import BARE, EVENT, FULL, UTC_NS
@@ -136,3 +138,29 @@ def test_definitions_are_those_of_ros_2_and_times_are_clipped() -> None:
     assert time_of(1_500_000_000) == (1, 500_000_000)
     assert time_of(-1) == (-1, 999_999_999)
     assert time_of(1 << 62) == (0x7FFF_FFFF, (1 << 62) % 1_000_000_000)
+
+
+def test_numbers_and_texts_are_aligned() -> None:
+    layout = Layout("B", "I", "B", "d", "H")
+    assert layout.pack(ENCAPSULATION, 1, 2, 3, 1.0, 4) == bytes.fromhex(
+        "00010000"  # CDR_LE
+        "01 000000"  # u8, padding to 4
+        "02000000"
+        "03 00000000000000"  # u8 at 8, padding to 16
+        "000000000000f03f"
+        "0400"
+    )
+    layout = Layout("B", '"bow', "I")
+    assert layout.texts == (bytes.fromhex("04000000 626f7700"),)
+    assert layout.pack(ENCAPSULATION, 7, *layout.texts, 5) == bytes.fromhex(
+        "00010000 07000000 04000000 626f7700 05000000"
+    )
+    layout = Layout('"ab', "2d")
+    packed = layout.pack(ENCAPSULATION, *layout.texts, 1.0, 2.0)
+    assert packed == bytes.fromhex("00010000 03000000 616200 00") + struct.pack("<2d", 1.0, 2.0)
+    layout = Layout("B", '"boé', "q", "H")
+    written = CdrWriter().number("B", 9).text("boé").number("q", -1).number("H", 3).done()
+    assert written == layout.pack(ENCAPSULATION, 9, *layout.texts, -1, 3)
+    assert CdrWriter().text("a\0b").done() == bytes.fromhex("00010000 03000000 616200")
+    with pytest.raises(struct.error):
+        CdrWriter().number("B", 256)

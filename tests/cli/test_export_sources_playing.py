@@ -3,7 +3,7 @@
 import subprocess
 import sys
 from fcntl import F_GETPIPE_SZ, fcntl
-from io import BytesIO
+from io import BytesIO, StringIO
 from pathlib import Path
 
 import pytest
@@ -11,11 +11,22 @@ import pytest
 from imud.attitude.conventions import Convention
 from imud.bridges.channel import LossCounts, StampedEvent
 from imud.cli import export_sources as playing
-from imud.cli.export_sources import EVENT, HEAD, SAMPLES, PipeSink, play_beside, play_here
+from imud.cli.export_sources import (
+    CLEAR,
+    EVENT,
+    EVERY_S,
+    HEAD,
+    LOOK_SAMPLES,
+    SAMPLES,
+    PipeSink,
+    Progress,
+    play_beside,
+    play_here,
+)
 from imud.contracts.publisher import Batch
 from imud.model.errors import ImudError
 from imud.model.sample import Sample
-from tests.cli.conftest import Cli
+from tests.cli.conftest import Cli, Terminal
 from tests.cli.recorded_daemon import FRAMES, run_recorded
 from tests.support.socket_rig import batch
 
@@ -153,3 +164,45 @@ def test_the_command_writes_the_same_file(
     cli.refuses(
         "expected a device of the recording: bow, mast", "export", "--to", "csv", "--device", "stern", str(file)
     )
+
+
+def pictures(terminal: Terminal) -> list[str]:
+    return [one for one in terminal.getvalue().split(CLEAR) if one]
+
+
+def test_a_bar_with_share_samples_and_time() -> None:
+    terminal, now_s = Terminal(), [100.0]
+    progress = Progress(1000, terminal, lambda: now_s[0])
+    now_s[0] = 110.0
+    progress.add(LOOK_SAMPLES, lambda: 250)
+    progress.close()
+    progress.close()
+    assert pictures(terminal) == [f"[######..................]  25 %  {LOOK_SAMPLES} samples, 30 s left"]
+    assert terminal.getvalue().endswith(CLEAR)
+    assert progress.spent_s == 10.0
+
+
+def test_it_is_drawn_immediately_and_after_each_fifth_of_a_second() -> None:
+    terminal, now_s = Terminal(), [100.0]
+    progress = Progress(1000, terminal, lambda: now_s[0])
+    for samples, second, expected in [(1999, 100.0, 0), (1, 100.0, 1), (2000, 100.19, 1), (2000, 100.2, 2)]:
+        now_s[0] = second
+        progress.add(samples, lambda: 20)
+        assert len(pictures(terminal)) == expected
+    assert pictures(terminal)[-1] == "[........................]   2 %  6000 samples"  # no estimate up to 2 %
+
+
+def test_it_is_not_drawn_more_often_than_it_can_be_read_or_without_a_terminal() -> None:
+    terminal, now_s = Terminal(), [0.0]
+    progress = Progress(1000, terminal, lambda: now_s[0])
+    for step in range(100):
+        now_s[0] = step * EVERY_S / 10
+        progress.add(LOOK_SAMPLES, lambda: 0)
+    assert 9 <= len(pictures(terminal)) <= 11
+    assert progress.samples == 100 * LOOK_SAMPLES
+    out = StringIO()
+    progress = Progress(1000, out, lambda: 0.0)
+    progress.add(10 * LOOK_SAMPLES, lambda: 500)
+    progress.close()
+    assert out.getvalue() == ""
+    assert progress.samples == 10 * LOOK_SAMPLES

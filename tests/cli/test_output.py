@@ -1,10 +1,23 @@
 """Histograms: bars, edges, lengths. Tables and times."""
 
+import io
+import os
+import subprocess
+import sys
 import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 
-from imud.cli.output import BARS, WIDTH, bar_width, fitted, histogram, local_time, paragraph, table
+from imud.cli import main
+from imud.cli.output import BARS, WIDTH, bar_width, fitted, histogram, local_time, paragraph, raise_if_unread, table
+from tests.cli.conftest import Cli
+from tests.cli.recorded_daemon import run_recorded
+from tests.support.daemon_process import LIMIT_S, running_daemon
+from tests.support.files import hi91
+from tests.support.surroundings import pipe
 
 
 def test_a_histogram_has_bars_with_shares() -> None:
@@ -61,3 +74,154 @@ def test_local_time_has_its_offset_then(monkeypatch: pytest.MonkeyPatch) -> None
     finally:
         monkeypatch.undo()
         time.tzset()
+
+
+BUFFERED = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+ASCII = {**BUFFERED, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii"}
+
+
+def imud(*words: str | bytes | Path, **options: Any) -> "subprocess.CompletedProcess[bytes]":
+    argv = [sys.executable, "-m", "imud", *words]
+    return subprocess.run(argv, timeout=LIMIT_S, check=False, **{"stderr": subprocess.PIPE, "env": BUFFERED, **options})
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("streams")
+    (made / "imud.yaml").write_text("devices: {}\n")
+    (made / "capture").write_bytes(b"".join(hi91(10 * n) for n in range(100)))
+    run_recorded(made)[2][0].rename(made / "recording")
+    return made
+
+
+COMMANDS: dict[str, Callable[[Path], list[str]]] = {
+    "check": lambda folder: ["check", f"{folder}/imud.yaml"],
+    "schema": lambda _: ["schema", "--json"],
+    "decode": lambda folder: ["decode", "--driver", "hipnuc-uart", f"{folder}/capture"],
+    "replay": lambda folder: ["replay", "--json", f"{folder}/capture"],
+    "replay-recording": lambda folder: ["replay", "--json", f"{folder}/recording"],
+    "export-csv": lambda folder: ["export", "--to", "csv", f"{folder}/recording"],
+    "export-mcap": lambda folder: ["export", "--to", "mcap", f"{folder}/recording"],
+    "help": lambda _: ["run", "--help"],
+    "version": lambda _: ["--version"],
+}
+
+
+def ended(words: list[str], output: int, monkeypatch: pytest.MonkeyPatch) -> object:
+    """Run a command with this descriptor as standard output. Return the exit status."""
+    with open(os.dup(output), "w", encoding="utf-8") as out, monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", out)
+        try:
+            return main(words)
+        except SystemExit as end:
+            return end.code
+
+
+@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
+def test_a_full_disk_is_an_error_and_a_reader_that_has_gone_is_none(
+    command: Callable[[Path], list[str]], folder: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    words = command(folder)
+    with open("/dev/full", "wb") as full:
+        assert ended(words, full.fileno(), monkeypatch) == 2
+    error = capsys.readouterr().err
+    assert "standard output: No space left on device" in error.splitlines()[-1]
+    assert "Traceback" not in error
+    with pipe() as (reader, writer):
+        os.close(reader)
+        assert ended(words, writer, monkeypatch) == 0
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    assert "Broken pipe" not in error
+
+
+@pytest.mark.live
+def test_processes_with_a_full_disk_or_without_a_reader(folder: Path, tmp_path: Path) -> None:
+    """The interpreter writes its buffer at exit, which fails too."""
+    good = folder / "imud.yaml"
+    with open("/dev/full", "wb") as full:
+        done = imud("check", good, stdout=full)
+        assert (done.returncode, done.stderr) == (2, b"imud check: standard output: No space left on device\n")
+        assert imud("check", tmp_path / "none", stdout=full, stderr=full).returncode == 2
+    capture = tmp_path / "noise"
+    capture.write_bytes(b"A\r\n" * 100_000)
+    script = '"$0" -m imud decode --driver hipnuc-uart "$1" | head -n 1; echo ${PIPESTATUS[0]}'
+    argv = ["bash", "-c", script, sys.executable, str(capture)]
+    done = subprocess.run(argv, capture_output=True, timeout=LIMIT_S, check=True)
+    assert (done.stdout, done.stderr) == (b'{"text":"A"}\n0\n', b"")
+    with pipe(full=True) as (_, writer):  # the command ends even if no program reads its standard error
+        assert imud("run", "--config", tmp_path / "none", stderr=writer).returncode == 78
+
+
+def test_a_reader_that_has_gone_is_seen_without_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pipe() as (reader, writer), open(writer, "w", closefd=False) as output:
+        monkeypatch.setattr(sys, "stdout", output)
+        raise_if_unread()
+        os.close(reader)
+        with pytest.raises(BrokenPipeError):
+            raise_if_unread()
+    with (tmp_path / "file").open("w") as file:
+        for stream in (file, io.StringIO()):
+            monkeypatch.setattr(sys, "stdout", stream)
+            raise_if_unread()
+    assert (tmp_path / "file").read_bytes() == b""
+
+
+@pytest.mark.live
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_closed_descriptors(closed: str, folder: Path) -> None:
+    script = f'''"$0" -m imud check "$1" {closed}; echo "status $?"
+        "$0" -m imud decode --driver hipnuc-uart - {closed}; echo "status $?"'''
+    argv = ["bash", "-c", script, sys.executable, str(folder / "imud.yaml")]
+    done = subprocess.run(argv, stdin=subprocess.DEVNULL, capture_output=True, timeout=LIMIT_S, check=True, text=True)
+    assert [line for line in done.stdout.splitlines() if line.startswith("status")] == ["status 0", "status 1"]
+    assert [line for line in done.stderr.splitlines() if not line.startswith("{")] == []
+
+
+@pytest.mark.live
+def test_ascii_locale(folder: Path, tmp_path: Path) -> None:
+    file = tmp_path / "Größe.yaml"
+    file.write_text("devices: {}\n")
+    done = imud("check", file, env=ASCII, stdout=subprocess.PIPE)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert rb"Gr\udcc3\udcb6\udcc3\udc9fe.yaml: valid" in done.stdout
+    file.write_text("devices: {größe: 1}\n", encoding="utf-8")
+    done = imud("check", file, env=ASCII, stdout=subprocess.PIPE)
+    assert done.returncode == 2
+    assert rb"gr\xf6\xdfe" in done.stderr
+    assert b"Traceback" not in done.stderr
+    done = imud("schema", env=ASCII, stdout=subprocess.PIPE)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert done.stdout.isascii()
+
+
+def test_names_of_files_are_escaped_in_errors(tmp_path: Path, cli: Cli) -> None:
+    error = cli("check", os.fsdecode(os.fsencode(tmp_path) + b"/\xff\x1b[31m\nimud: fine"), status=2).err
+    assert "\x1b" not in error
+    assert "\\udcff\\x1b[31m" in error
+
+
+def test_a_configuration_from_standard_input(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    def given(text: bytes) -> None:
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(text)))
+
+    given(b"devices: {}\n")
+    assert cli("check", "-") == ("-: valid; devices: none\n", "")
+    given(b"devices: {a: 1}\n")
+    cli.refuses("standard input:1:", "check", "-")
+
+
+@pytest.mark.parametrize("special", ["fifo", "/dev/zero", "/dev/tty", "."])
+def test_check_of_what_is_no_file(special: str, tmp_path: Path, cli: Cli) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    cli.refuses("cannot read", "check", tmp_path / special)
+
+
+@pytest.mark.live
+def test_a_full_disk_is_an_error_of_commands_that_ask_the_daemon(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with running_daemon(tmp_path, {}) as daemon, open("/dev/full", "wb") as full:
+        for words in (["status"], ["status", "--json"], ["devices"], ["clock"]):
+            assert ended([*words, "--socket", str(daemon.socket)], full.fileno(), monkeypatch) == 2, words

@@ -2,14 +2,26 @@
 
 import itertools
 import json
+from io import BytesIO
+from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
+from random import Random
 
+import msgspec
 import pytest
 
+from imud import drivers
+from imud.cli.replay import play_to_end
+from imud.contracts.driver import CanDriver, of_kind
+from imud.drivers.imu61x.can import encode_set
+from imud.formats.can import CanFrame
 from imud.formats.capture import RECORD
 from imud.model.units import NS_PER_MS
+from imud.recording.player import Player
 from tests.cli.conftest import Cli
-from tests.support.files import hi91, imu61x_log
+from tests.cli.recorded_daemon import FRAMES, run_recorded
+from tests.support.files import BEGIN_NS, FRAME_NS, PERIOD_NS, candump_line, hi91, imu61x_log
 
 
 def capture(file: Path, count: int) -> Path:
@@ -79,3 +91,197 @@ def test_log_of_a_can_bus(tmp_path: Path, cli: Cli) -> None:
 def test_file_that_is_no_can_log_is_an_error(content: bytes, tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "x").write_bytes(content)
     cli.refuses("candump -L", "replay", "--driver", "imu61x-can", str(tmp_path / "x"))
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str], dict[str, dict[str, int]]]:
+    daemon, collector, (file,) = run_recorded(tmp_path_factory.mktemp("recorded"))
+    lines = [msgspec.json.encode(sample).decode() for sample in collector.samples]
+    return file, lines, {status.name: status.ledger for status in daemon.status()}
+
+
+Recorded = tuple[Path, list[str], dict[str, dict[str, int]]]
+
+
+def test_the_samples_are_those_that_the_daemon_published(recorded: Recorded, cli: Cli) -> None:
+    file, lines, ledgers = recorded
+    printed = cli("replay", "--json", file)
+    assert len(lines) > FRAMES
+    assert printed.out.splitlines() == lines
+    for name, ledger in ledgers.items():
+        assert f"{name}: replayed" in printed.err
+        assert f"samples   {ledger['samples']}; lost 0" in printed.err
+        assert f"bytes     {ledger['bytes_in']}: balanced" in printed.err
+    assert printed.err.count("equal to the live run") == 2
+    assert "the file" not in printed.err
+
+
+def test_records_that_were_dropped_are_an_answer_of_no(recorded: Recorded) -> None:
+    for lost, status in ((0, 0), (3, 1)):
+        player = Player(lambda _batch: None)
+        player.lost = lost
+        with recorded[0].open("rb") as file:
+            report, got = play_to_end(file, "a", player)
+        assert (got, "the recorder dropped 3 records" in report) == (status, lost == 3)
+
+
+def test_options_of_captures_are_refused(recorded: Recorded, cli: Cli) -> None:
+    for words in (["--driver", "hipnuc-uart"], ["--baud", "9600"], ["--speed", "real"], ["--option", "a=1"]):
+        cli.refuses(f"{words[0]} applies to captures only", "replay", *words, str(recorded[0]))
+
+
+def test_a_fresh_clock_gives_other_numbers_and_says_why(recorded: Recorded, cli: Cli) -> None:
+    printed = cli("replay", "--json", "--fresh", recorded[0])
+    assert len(printed.out.splitlines()) == len(recorded[1])
+    assert printed.err.count("a new clock was requested") == 2
+    assert cli("replay", recorded[0]).out == "", "samples need --json"
+
+
+def test_a_cut_file_is_replayed_as_far_as_it_goes(recorded: Recorded) -> None:
+    """A slow host writes several blocks, so the blocks before the cut can contain samples."""
+    file, lines, _ = recorded
+    printed: list[str] = []
+    player = Player(lambda batch: printed.extend(msgspec.json.encode(sample).decode() for sample in batch.samples))
+    report, status = play_to_end(BytesIO(file.read_bytes()[:-7]), "cut", player)
+    assert printed == lines[: len(printed)]
+    assert status == (0 if printed else 1)
+    assert "no regular end" in report
+    assert "incomplete" in report
+
+
+def test_a_damaged_file_is_an_answer_of_no(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
+    file = recorded[0]
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "damaged").write_bytes(data)
+    assert "damaged" in cli("replay", tmp_path / "damaged", status=1).err
+
+
+def test_a_recording_whose_first_bytes_are_damaged_is_no_capture(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
+    file = tmp_path / "damaged.imudrec"
+    file.write_bytes(bytes(8) + recorded[0].read_bytes()[8:])
+    for command in (["replay"], ["export", "--to", "csv"]):
+        printed = cli(*command, file, status=1).err
+        assert "bytes from byte 0 are damaged" in printed
+        assert "the capture" not in printed
+
+
+def test_a_file_that_only_begins_as_a_recording_is_an_error(tmp_path: Path, cli: Cli) -> None:
+    (tmp_path / "a").write_bytes(b"\x89imudREC" + bytes(100))
+    cli.refuses("at least one complete block", "replay", tmp_path / "a")
+
+
+def test_a_raw_capture_says_what_it_cannot_know(tmp_path: Path, cli: Cli) -> None:
+    (tmp_path / "c.raw").write_bytes(b"".join(hi91(10 * i) for i in range(300)))
+    printed = " ".join(cli("replay", tmp_path / "c.raw").err.split())
+    assert "times unknown: a raw capture does not contain arrival times" in printed
+    assert "ppm" not in printed
+    assert "Hz" not in printed
+    assert "samples 300; lost 0" in printed
+
+
+DRIVERS = {driver.name: driver for driver in of_kind(drivers.DRIVERS.values(), CanDriver)}
+COMMANDS = ("decode", "replay", "export", "noise", "spectrum")
+SETS = 300
+HOUR_NS = 3600 * 10**9
+every_driver = pytest.mark.parametrize("driver", DRIVERS)
+every_command = pytest.mark.parametrize("command", COMMANDS)
+
+
+def sets(driver: str, phase_ns: int = 0, first_index: int = 0) -> list[list[CanFrame]]:
+    """Return the frames of SETS samples, each sample as a burst."""
+    made = []
+    for number in range(SETS):
+        if driver == "imu61x-can":
+            pairs = encode_set(index=first_index + number, accel_m_s2=(0, 0, 9.8), gyro_rad_s=(0, 0, 0),
+                               euler_rad=(0, 0, 0), temperature_c=20)  # fmt: skip
+            frames = [CanFrame(can_id, False, data, 0) for can_id, data in pairs]
+        else:
+            frames = list(DRIVERS[driver].example_frames(Random(first_index)))
+        begin_ns = BEGIN_NS + number * PERIOD_NS + phase_ns
+        made.append([frame._replace(t_rx_ns=begin_ns + n * FRAME_NS) for n, frame in enumerate(frames)])
+    return made
+
+
+def status_of(command: str, driver: str) -> int:
+    """Return the exit status of a command. Noise and vibration need three axes, and noise a sensor at rest."""
+    if driver == "hipnuc-nmea2000" and command in ("noise", "spectrum"):
+        return 2
+    return int(command == "noise" and driver != "imu61x-can")
+
+
+def run(cli: Cli, command: str, driver: str, log: Path, *options: str, status: int = 0) -> str:
+    """Return the standard error, and the standard output without samples."""
+    extra = {"export": ["--to", "csv"], "replay": ["--json"]}.get(command, [])
+    printed = cli(command, *extra, "--driver", driver, *options, log, status=status)
+    shown = "" if command in ("decode", "export", "replay") else printed.out
+    return " ".join((shown + printed.err).split())
+
+
+@every_command
+@every_driver
+@pytest.mark.parametrize("step_ns", [-HOUR_NS, -50_000_000, 28 * HOUR_NS])
+def test_a_step_of_the_clock_is_reported_and_removed(
+    driver: str, command: str, step_ns: int, tmp_path: Path, cli: Cli, caplog: pytest.LogCaptureFixture
+) -> None:
+    frames = sets(driver)
+    stepped = [f._replace(t_rx_ns=f.t_rx_ns + step_ns) for one in frames[SETS // 2 :] for f in one]
+    kept = [frame for one in frames[: SETS // 2] for frame in one]
+    (tmp_path / "x.log").write_text("".join(map(candump_line, kept + stepped)))
+    report = run(cli, command, driver, tmp_path / "x.log", status=status_of(command, driver))
+    if status_of(command, driver) == 2:
+        return
+    rise_ns = stepped[0].t_rx_ns - kept[-1].t_rx_ns
+    assert (
+        f"line {len(kept) + 1}: the time changes by {rise_ns / 1e9:+.3f} s (a step of the clock" in report + caplog.text
+    )
+    if command == "export":
+        out = cli("export", "--to", "csv", "--driver", driver, tmp_path / "x.log").out.splitlines()[1:]
+        times = [int(row.split(",")[2]) for row in out]
+        assert len(times) == SETS
+        assert max(b - a for a, b in pairwise(times)) < 2 * PERIOD_NS
+        assert abs(times[-1] - times[0] - (SETS - 1) * PERIOD_NS) < 2 * PERIOD_NS
+
+
+@every_command
+@every_driver
+def test_a_log_of_two_interfaces_needs_a_choice(driver: str, command: str, tmp_path: Path, cli: Cli) -> None:
+    lines = [candump_line(f, bus) for one in sets(driver) for bus in ("can0", "vcan1") for f in one]
+    (tmp_path / "x.log").write_text("".join(lines))
+    assert "interfaces can0 and vcan1: select one" in run(cli, command, driver, tmp_path / "x.log", status=2)
+    wrong = run(cli, command, driver, tmp_path / "x.log", "--interface", "can7", status=2)
+    assert "interface can7: expected can0 or vcan1" in wrong
+    if driver == "hipnuc-canopen":
+        status = status_of(command, driver)
+        report = run(cli, command, driver, tmp_path / "x.log", "--interface", "vcan1", status=status)
+        assert f"{SETS} samples" in report or f"samples {SETS};" in report or '"frames_good":1200' in report
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_interface_is_for_logs_of_a_can_bus(command: str, tmp_path: Path, cli: Cli) -> None:
+    (tmp_path / "x.raw").write_bytes(bytes(100))
+    report = run(cli, command, "hipnuc-uart", tmp_path / "x.raw", "--interface", "can0", status=2)
+    assert "--interface applies to logs of a CAN bus" in report
+
+
+@pytest.mark.parametrize("second_ns", [3_300_000, 5_000_000])
+@every_command
+@every_driver
+def test_two_devices_with_one_address_are_reported(
+    driver: str, command: str, second_ns: int, tmp_path: Path, cli: Cli
+) -> None:
+    """The second device at opposite phases is visible only in the values or in INDEX."""
+    both = [frame for phase_ns, index in ((0, 0), (second_ns, 5000)) for one in sets(driver, phase_ns, index)
+            for frame in one]  # fmt: skip
+    (tmp_path / "x.log").write_text("".join(map(candump_line, sorted(both, key=attrgetter("t_rx_ns")))))
+    status = status_of(command, driver)
+    report = run(cli, command, driver, tmp_path / "x.log", status=status)
+    assert status == 2 or "do two devices on the bus have this" in report
+
+
+def test_one_device_is_not_a_conflict_and_json_lines_are_complete(tmp_path: Path, cli: Cli) -> None:
+    for driver in DRIVERS:
+        (tmp_path / "x.log").write_text("".join(candump_line(f) for one in sets(driver) for f in one))
+        printed = cli("decode", "--driver", driver, tmp_path / "x.log")
+        assert len([json.loads(line) for line in printed.out.splitlines()]) == SETS
+        assert "two devices" not in printed.err

@@ -1,8 +1,24 @@
 """Length of frames on the wire, and frames as bytes."""
 
+import io
+from collections.abc import Sequence
+from random import Random
+
 import pytest
 
-from imud.formats.can import EXTENDED_FLAG, RAW_FRAME, CanFilter, frame_bits, pack_frame
+from imud.formats.can import (
+    EXTENDED_FLAG,
+    EXTENDED_ID_MAX,
+    RAW_FRAME,
+    STANDARD_ID_MAX,
+    CandumpReader,
+    CanFilter,
+    CanFrame,
+    frame_bits,
+    pack_frame,
+)
+from imud.model.errors import BadArgument
+from tests.support.files import candump_line
 
 
 @pytest.mark.parametrize(
@@ -38,3 +54,100 @@ def test_filters_overlap_if_one_frame_passes_both(one: CanFilter, other: CanFilt
         can_id = (one.can_id & one.mask) | (other.can_id & other.mask)
         assert one.matches(can_id, one.extended)
         assert other.matches(can_id, other.extended)
+
+
+US = 1000
+LOG = b"""\
+(1436509052.249713) can1 044#2A366C2B
+(1436509053.6507) can1 18FEE9AA#0102030405060708 R
+(1436509053.650700) can1 7FF# T
+
+(1436509053.700000) can1 123#R8
+(1436509053.700001) can1 123##1001122
+(1436509053.700002) can1 20000040#0000000000000000
+(1436509053.700003) can1 1A2#1122334455667788_9
+"""
+
+
+def read(data: bytes) -> tuple[list[CanFrame], CandumpReader]:
+    reader = CandumpReader(io.BytesIO(data))
+    return list(reader), reader
+
+
+def test_lines_of_candump() -> None:
+    frames, reader = read(LOG)
+    assert frames == [
+        CanFrame(0x44, False, b"\x2a\x36\x6c\x2b", 1436509052_249713_000),
+        CanFrame(0x18FEE9AA, True, bytes(range(1, 9)), 1436509053_650700_000),
+        CanFrame(0x7FF, False, b"", 1436509053_650700_000),
+        CanFrame(0x1A2, False, bytes.fromhex("1122334455667788"), 1436509053_700003_000),
+    ]
+    assert (reader.passed_over, reader.problem) == (3, "")
+
+
+@pytest.mark.parametrize(
+    ("times_s", "expected_s", "words"),
+    [
+        ((5, 4.9995, 6), (5, 5, 6), ""),  # two lines in another order
+        ((5, 5.01, 4, 4.01), (5, 5.01, 5.02, 5.03), "line 3: the time changes by -1.010 s (a step of"),
+        ((5, 5.01, 9000, 9000.1), (5, 5.01, 5.02, 5.12), "line 3: the time changes by +8994.990 s (a step of"),
+        ((5, 5.01, 35.01), (5, 5.01, 35.01), "line 3: the time changes by +30.000 s (a pause or a step"),
+        ((9, 8, 7, 6, 5, 4, 3, 2), (9,) * 8, "s (a step of the clock, removed by imud); 2 more steps"),
+    ],
+)  # fmt: skip
+def test_steps_of_the_clock(times_s: Sequence[float], expected_s: Sequence[float], words: str) -> None:
+    frames, reader = read("".join(f"({t_s:.6f}) a 001#\n" for t_s in times_s).encode())
+    assert [frame.t_rx_ns for frame in frames] == [round(t_s * 1e9) for t_s in expected_s]
+    assert words in reader.problem
+    assert bool(words) == bool(reader.problem)
+    assert sum(frame.after_loss for frame in frames) == reader.problem.count("removed") + 2 * ("2 more" in words)
+
+
+def test_interfaces() -> None:
+    log = b"(1.0) can1 001#\n(2.0) can0 002#\n(3.0) can1 003#\n"
+    for name, ids in (("can0", [2]), ("can1", [1, 3])):
+        assert [frame.can_id for frame in CandumpReader(io.BytesIO(log), name)] == ids
+    with pytest.raises(BadArgument, match="interfaces can1 and can0: select one"):
+        read(log)
+    with pytest.raises(BadArgument, match="interface x: expected can1 or can0"):
+        list(CandumpReader(io.BytesIO(log), "x"))
+    piped = io.BytesIO(log)
+    piped.seekable = lambda: False  # type: ignore[method-assign]
+    with pytest.raises(BadArgument, match="interfaces can1 and can0: select one"):
+        list(CandumpReader(piped))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"no log at all", b"(1.0) can0 900#00", b"(1.0) can0 123#0", b"(1.0) can0 123#001122334455667788",
+        b"(1.0) can0 1234#00", b"can0  123  [2]  11 22", b"\x00\xff" * 400,
+    ],
+)  # fmt: skip  # 0x900 is above 11 bits
+def test_other_lines_are_reported(line: bytes) -> None:
+    frames, reader = read(b"(1.0) can0 001#00\n" + line + b"\n(2.0) can0 002#00\n")
+    assert [frame.can_id for frame in frames] == [1, 2]
+    assert reader.bad_lines >= 1
+    assert "line 2" in reader.problem
+
+
+def test_what_is_written_is_read() -> None:
+    random = Random(3)
+    frames = []
+    for number in range(50):
+        extended = random.random() < 0.5
+        can_id = random.randrange((EXTENDED_ID_MAX if extended else STANDARD_ID_MAX) + 1)
+        frames.append(CanFrame(can_id, extended, random.randbytes(random.randint(0, 8)), number * US))
+    again, reader = read("".join(candump_line(frame, "can3") for frame in frames).encode("ascii"))
+    expected = [frame for frame in frames if not (frame.extended and frame.can_id >> 29)]
+    assert again == expected
+    assert reader.problem == ""
+    assert candump_line(CanFrame(0x65, False, b"\xab", 1_500_000_000)) == "(0000000001.500000) can0 065#AB\n"
+    with pytest.raises(ValueError, match="no classical CAN frame"):
+        candump_line(CanFrame(0x800, False, b"", 0))
+
+
+def test_a_name_of_an_interface_is_printed_with_escapes() -> None:
+    log = io.BytesIO(b"(1.0) can0 123#\n(2.0) v\x1b[2J 123#\n")
+    with pytest.raises(BadArgument, match=r"frames of the interfaces can0 and 'v\\x1b\[2J': select one"):
+        list(CandumpReader(log))

@@ -1,15 +1,40 @@
 """Checks of the configuration, the unit, the socket and the device states."""
 
+import asyncio
 import os
+from typing import Any
 
 import msgspec
 import pytest
 
-from imud.cli.doctor.daemon import configuration, device_states, service, socket, stale_configuration
-from imud.cli.doctor.surroundings import DoctorCheck
-from imud.contracts.status import DeviceState
+from imud.cli.doctor.command import examine, exit_status
+from imud.cli.doctor.daemon import (
+    configuration,
+    device_states,
+    half_duplex,
+    heard,
+    lines,
+    prometheus,
+    restarts,
+    service,
+    shared_memory,
+    socket,
+    stale_configuration,
+)
+from imud.cli.doctor.surroundings import DoctorCheck, fetch_over_http
+from imud.contracts.status import (
+    ClockStatus,
+    DeviceState,
+    DeviceStatus,
+    KernelCounters,
+    LinesStatus,
+    SerialLineCounters,
+)
 from imud.model.errors import LinkDenied, LinkMissing, ServerError
-from tests.support.metrics import device
+from imud.model.sample import Sync
+from imud.publishers.metrics.publisher import MetricsOptions, MetricsPublisher
+from tests.support.metrics import POLLING, ask, device
+from tests.support.publisher_context import publisher_context
 from tests.support.surroundings import Machine
 
 CONFIGURATION, SERVICE, SOCKET = DoctorCheck("c", configuration), DoctorCheck("s", service), DoctorCheck("o", socket)
@@ -104,3 +129,233 @@ def test_states_come_with_the_reason_of_the_daemon(machine: Machine) -> None:
     found = machine.told(STATES)
     assert [severity for severity, _ in found] == ["ok", "error", "warning"]
     assert "b is missing: /dev/ttyUSB1 is not there" in found[1][1]
+
+
+PROMETHEUS, SHARED = DoctorCheck("p", prometheus), DoctorCheck("s", shared_memory)
+AT = ("127.0.0.1", 9321, "/scrapes")
+
+
+@pytest.fixture
+def running(machine: Machine) -> Machine:
+    machine.configure()
+    machine.status = []
+    return machine
+
+
+def test_scrapes(running: Machine) -> None:
+    for page, severity, words in [
+        ('{"scrapes":0,"age_s":9.0}', "note", "no scrape of 127.0.0.1 port 9321 since imud opened it 9 s ago"),
+        ('{"scrapes":0,"age_s":3000.0}', "note", "opened it 50 minutes ago"),
+        ('{"scrapes":7,"age_s":9.0}', "ok", "7 scrapes, the last 9 s ago"),
+        ('{"scrapes":7,"age_s":301.0}', "warning", "for 5 minutes, after 7 scrapes"),
+        ("<html>", "error", "is not imud"),
+    ]:
+        running.pages[AT] = page
+        running.tells(PROMETHEUS, severity, words)
+    for age_s, severity in [(300.0, "note"), (301.0, "warning")]:
+        running.configure(more="metrics: {port: 9321}\n")
+        running.pages[AT] = f'{{"scrapes":0,"age_s":{age_s}}}'
+        examined = examine([PROMETHEUS], running.surroundings())
+        assert [finding.severity for finding in examined[0].findings] == [severity]
+        assert exit_status(examined) == (severity == "warning")
+
+
+def test_no_answer_another_address_and_switched_off(running: Machine) -> None:
+    running.tells(PROMETHEUS, "error", "do not reply at 127.0.0.1 port 9321: Connection refused")
+    running.configure(more="metrics: {enabled: false}\n")
+    assert running.find(PROMETHEUS)[0].severity == "note"
+    running.configure(more="metrics: {port: 0}\n")
+    assert running.find(PROMETHEUS)[0].severity == "not checked"
+    running.configure(more="metrics: {address: 0.0.0.0}\n")
+    running.pages[AT] = '{"scrapes":7,"age_s":9.0}'
+    assert running.find(PROMETHEUS)[0].severity == "ok"
+
+
+def test_without_daemon_or_configuration(machine: Machine) -> None:
+    assert machine.find(PROMETHEUS)[0].severity == "not checked"
+    machine.configure()
+    assert "no daemon runs" in machine.told(PROMETHEUS)[0][1]
+
+
+def test_the_endpoint_itself_is_understood(running: Machine) -> None:
+    async def serve() -> list[str]:
+        made = MetricsPublisher(MetricsOptions(port=0), publisher_context(lambda: (), 1, lambda: 5_000_000_000))
+        made.start()
+        pages = []
+        try:
+            pages.append(await asyncio.to_thread(fetch_over_http, "127.0.0.1", made.port, "/scrapes"))
+            await ask(made.port)
+            pages.append(await asyncio.to_thread(fetch_over_http, "127.0.0.1", made.port, "/scrapes"))
+            with pytest.raises(OSError, match="got 404"):
+                await asyncio.to_thread(fetch_over_http, "127.0.0.1", made.port, "/other")
+        finally:
+            made.close()
+        return pages
+
+    severities = []
+    for page in asyncio.run(serve()):
+        running.pages[AT] = page
+        severities.append(str(running.find(PROMETHEUS)[0].severity))
+    assert severities == ["note", "ok"]
+
+
+RINGS, FLIGHT = "shm: {directory: /dev/shm}\n", "recorder: {flight: {enabled: true, directory: /dev/shm/imud-flight}}\n"
+
+
+@pytest.mark.parametrize(
+    ("more", "removes", "severities"),
+    [
+        (RINGS + FLIGHT, "yes", ["warning", "warning"]), (RINGS + FLIGHT, "no", ["ok", "ok"]),
+        (FLIGHT, "yes", ["warning"]), (FLIGHT.replace("true", "false"), "yes", []),
+        ("shm: {directory: /dev/shmem}\n", "yes", []), ("", "yes", []),
+    ],
+)  # fmt: skip
+def test_files_in_shared_memory_that_systemd_removes(
+    machine: Machine, more: str, removes: str, severities: list[str]
+) -> None:
+    machine.configure(more=more)
+    assert machine.find(SHARED) == [], "without a service nothing removes them"
+    machine.unit(f"RemoveIPC={removes}")
+    told = machine.told(SHARED)
+    assert [severity for severity, _ in told] == severities
+    assert all("RemoveIPC=no" in text for severity, text in told if severity == "warning")
+
+
+HEARD, HALF, RESTARTS, LINES = (
+    DoctorCheck("h", heard), DoctorCheck("d", half_duplex), DoctorCheck("r", restarts), DoctorCheck("l", lines),
+)  # fmt: skip
+UART = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}}"
+WIRED = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}, lines: {sout: {line: GPIO17}}}"
+RS485 = "bow: {driver: hipnuc-modbus, rs485: {line: /dev/ttyUSB0, address: 80}}"
+
+GOOD: dict[str, Any] = {"frames_good": 5000, "samples": 5000}
+
+
+def counted(state: DeviceState = DeviceState.SEARCHING, **counts: int) -> DeviceStatus:
+    """Return the status of a device with these counters. Other counters and kernel errors are 0."""
+    made = device("bow", state=state, kernel=KernelCounters())
+    return msgspec.structs.replace(made, ledger=dict.fromkeys(made.ledger, 0) | counts)
+
+
+def test_without_the_daemon_a_port_or_samples(machine: Machine) -> None:
+    machine.configure(WIRED)
+    for check in (HEARD, RESTARTS, LINES):
+        assert [finding.severity for finding in machine.find(check)] == ["not checked"]
+    assert machine.find(HALF) == []  # this line is not configured
+    machine.configure(UART)
+    machine.status = [counted(DeviceState.MISSING)]
+    assert machine.find(HEARD) == []
+    machine.status = [counted()]
+    assert machine.find(RESTARTS) == []
+
+
+@pytest.mark.parametrize(
+    ("status", "severity", "words"),
+    [
+        (counted(), "error", "are TX and RX swapped"),
+        (counted(bytes_in=40), "error", "echoes of imud's requests"),
+        (counted(bytes_in=5000), "error", "the baud rate, the driver or the device is wrong"),
+        (
+            msgspec.structs.replace(counted(bytes_in=5000), kernel=KernelCounters(framing=9)),
+            "error",
+            "9 framing errors",
+        ),
+        (counted(bytes_in=5000, frames_good=7, frames_in_replies=7), "error", "but no sample in 7 frames"),
+        (
+            counted(bytes_in=5000, frames_good=7, frames_ignored=7),
+            "error",
+            "valid frames of unknown types, but no sample",
+        ),
+        (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=5), "ok", "5 damaged"),
+        (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=6), "warning", "6 damaged and"),
+        (msgspec.structs.replace(counted(**GOOD), kernel=KernelCounters(overrun=2)), "warning", "overrun"),
+    ],
+)
+def test_serial_data(machine: Machine, status: DeviceStatus, severity: str, words: str) -> None:
+    machine.configure(UART)
+    machine.status = [status]
+    machine.tells(HEARD, severity, words)
+
+
+def one_way(**changes: object) -> DeviceStatus:
+    """Return a device that sent samples at 100 Hz for 70 s and never replied."""
+    made = counted(DeviceState.RUNNING, frames_good=7000, samples=7000)
+    made = msgspec.structs.replace(made, identity={}, expected_rate_hz=100.0)
+    return msgspec.structs.replace(made, **changes)
+
+
+@pytest.mark.parametrize(
+    ("status", "severities"),
+    [
+        (one_way(), ["ok", "warning"]), (one_way(identity={"product": "HI14"}), ["ok"]),
+        (one_way(ledger=one_way().ledger | {"frames_in_replies": 1}), ["ok"]),
+        (one_way(ledger=one_way().ledger | {"samples": 6000}), ["ok"]), (one_way(state=DeviceState.SILENT), ["ok"]),
+        (one_way(expected_rate_hz=0.0, rate_hz=0.0), ["ok"]),
+    ],
+)  # fmt: skip
+def test_a_device_that_never_answers_does_not_hear_imud(
+    machine: Machine, status: DeviceStatus, severities: list[str]
+) -> None:
+    machine.configure(UART)
+    machine.status = [status]
+    told = machine.told(HEARD)
+    assert [severity for severity, _ in told] == severities
+    assert all("RX of the device is not connected" in text for severity, text in told if severity == "warning")
+    machine.configure(UART.replace("bow: {", "bow: {identify: false, "))
+    assert [finding.severity for finding in machine.find(HEARD)] == ["ok"]
+
+
+@pytest.mark.parametrize(
+    ("state", "line", "severity", "words"),
+    [
+        (DeviceState.RUNNING, SerialLineCounters(timeouts=10, echoes=1000), "ok", "ignores the echoes"),
+        (DeviceState.RUNNING, SerialLineCounters(timeouts=10, strange_bytes=10), "ok", "bus works"),
+        (DeviceState.RUNNING, SerialLineCounters(strange_bytes=1), "ok", "bus works"),
+        (DeviceState.RUNNING, SerialLineCounters(timeouts=11), "warning", "11 requests without a reply"),
+        (DeviceState.RUNNING, SerialLineCounters(strange_bytes=5), "warning", "5 invalid bytes"),
+        (DeviceState.SEARCHING, SerialLineCounters(timeouts=9, echoes=9), "error", "only 9 echoes"),
+        (DeviceState.SEARCHING, SerialLineCounters(timeouts=9), "error", "no byte arrived"),
+    ],
+)
+def test_rs485(machine: Machine, state: DeviceState, line: SerialLineCounters, severity: str, words: str) -> None:
+    machine.configure(RS485)
+    machine.status = [device("bow", state=state, serial_line=line, polling=POLLING)]  # 1000 reads
+    machine.tells(HALF, severity, words)
+
+
+@pytest.mark.parametrize(
+    ("resets", "requested", "samples", "severity"),
+    [
+        (0, 0, 1000, "ok"), (9, 9, 1000, "ok"), (2, 0, 1000, "note"), (3, 0, 360_000, "warning"),
+        (9, 6, 360_000, "warning"), (9, 7, 360_000, "note"), (3, 0, 2 * 360_000, "warning"),
+        (3, 0, 3 * 360_000, "note"),
+    ],
+)  # fmt: skip
+def test_restarts_without_a_request_count_by_the_hour(
+    machine: Machine, resets: int, requested: int, samples: int, severity: str
+) -> None:
+    clock = ClockStatus(Sync.REGRESSION, resets=resets)
+    running = counted(DeviceState.RUNNING, samples=samples)
+    running = msgspec.structs.replace(running, clock=clock, resets_requested=requested)
+    machine.status = [msgspec.structs.replace(running, expected_rate_hz=100.0)]  # 360,000 samples per hour
+    assert [finding.severity for finding in machine.find(RESTARTS)] == [severity]
+
+
+@pytest.mark.parametrize(
+    ("samples", "found", "severity", "words"),
+    [
+        (5000, LinesStatus({}, {"sout": 4999}, {"sout": 0}), "ok", "4999 edges"),
+        (5000, LinesStatus({}, {"sout": 4990}, {"sout": 9}), "warning", "the kernel lost 9 of 4999 edges"),
+        (101, LinesStatus({}, {"sout": 0}, {}), "warning", "no edge in 101 samples"),
+        (100, LinesStatus({}, {"sout": 0}, {}), "not checked", "too few samples"),
+        (5000, LinesStatus({}, {"alarm": 0}, {}), "note", "no edge so far"),
+        (1000, LinesStatus({}, {"pps": 0}, {}), "not checked", "too few samples"),
+        (1001, LinesStatus({}, {"pps": 0}, {}), "warning", "does the receiver have a fix"),
+        (5000, LinesStatus({"sout": "GPIO17 is in use"}, {"sout": 0}, {}), "error", "GPIO17 is in use"),
+    ],
+)
+def test_edges_of_lines(machine: Machine, samples: int, found: LinesStatus, severity: str, words: str) -> None:
+    machine.configure(WIRED)
+    running = counted(DeviceState.RUNNING, samples=samples)
+    machine.status = [msgspec.structs.replace(running, lines=found, expected_rate_hz=100.0)]
+    machine.tells(LINES, severity, words)

@@ -1,10 +1,33 @@
 """Attached devices, and the configured devices among them."""
 
+import os
+import threading
+from pathlib import Path
+from random import Random
+from types import SimpleNamespace
+
 import pytest
 
-from imud.cli.setup.hardware import Attached, Wanted, look
+from imud.cli.setup import hardware as finders
+from imud.cli.setup.changes import CommandChange, FileChange
+from imud.cli.setup.hardware import (
+    FINDERS,
+    Attached,
+    Wanted,
+    free_console,
+    look,
+    network_file,
+    raise_can,
+    without_console,
+)
+from imud.contracts.driver import StreamDriver
+from imud.drivers import DRIVERS
+from imud.links.i2c import I2cLink, I2cOptions
+from imud.sim.imu61x.registers import Imu61xRegisters
+from imud.sim.ports.in_process_bus import InProcessI2c
 from tests.cli.setup.conftest import Attachments, LivingMachine
 from tests.support.metrics import device
+from tests.support.pty_port import BAUD, PtyPort, slave, wired
 
 USB0, USB1 = "/dev/serial/by-id/usb-A", "/dev/serial/by-id/usb-B"
 
@@ -126,3 +149,169 @@ def test_what_is_named_and_not_there_is_said_to_be(gateway: LivingMachine, attac
         USB0: "nothing is heard", "ttyUSB1": missing, "can7": missing, "/dev/ttyUSB9": missing,
         "/etc/passwd": "this is not a serial port of a hardware device",
     }  # fmt: skip
+
+
+def test_a_port_is_listened_to() -> None:
+    driver = DRIVERS["hipnuc-uart"]
+    assert isinstance(driver, StreamDriver)
+    port = PtyPort()
+    frame = driver.example_frame(Random(1))
+    stop = threading.Event()
+
+    def feed() -> None:
+        while not stop.wait(0.01):
+            os.write(port.master, frame)
+
+    feeder = threading.Thread(target=feed)
+    feeder.start()
+    try:
+        (report,) = FINDERS.listen([port.path], set())
+    finally:
+        stop.set()
+        feeder.join()
+    os.close(port.master)
+    os.close(port.slave)
+    assert (report.port, report.driver, report.problem) == (port.path, "hipnuc-uart", "")
+
+
+def test_a_line_is_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(finders, "SLAVES", range(2, 4))
+    monkeypatch.setattr(finders, "FACTORY_ID", 2)
+    monkeypatch.setattr(finders, "REPLY_MS", 400)
+    with wired(tmp_path, slave(2)) as (path, _):
+        (found,) = FINDERS.scan_rs485(str(path), BAUD)
+    assert found.keys == {"driver": "hipnuc-modbus", "rs485": {"line": str(path), "baud": BAUD, "address": 2}}
+    assert found.title == "HI14R2N-485-000"
+    (absent,) = FINDERS.scan_rs485(str(tmp_path / "none"), 0)
+    assert "does not exist" in absent.problem
+
+
+def on_bus(monkeypatch: pytest.MonkeyPatch, bus: InProcessI2c) -> None:
+    row = SimpleNamespace(
+        settings=I2cOptions, make_polled=lambda settings: I2cLink(settings, open_bus=bus.open, ioctl=bus.ioctl)
+    )
+    monkeypatch.setattr(finders, "LINKS", {"i2c": row})
+
+
+def test_a_bus_is_asked_at_every_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    on_bus(monkeypatch, InProcessI2c({0x19: Imu61xRegisters(lambda: 0, product="IMU612")}))
+    (found,) = FINDERS.ask_bus("i2c", "1")
+    assert found.keys == {"driver": "imu61x-i2c", "i2c": {"bus": 1, "address": 0x19}}
+    assert (found.node, found.title, found.device) == ("/dev/i2c-1", "IMU612", "address 0x19")
+
+
+def test_a_bus_without_a_sensor_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    on_bus(monkeypatch, InProcessI2c({}))
+    (found,) = FINDERS.ask_bus("i2c", "1")
+    assert (found.driver, "no acknowledgement at address 0x18" in found.problem) == ("", True)
+
+
+def test_a_bus_that_is_not_there_and_a_number_that_no_bus_has() -> None:
+    for kind, bus in [("i2c", "250"), ("i2c", "900"), ("spi", "/dev/spidev250.0")]:
+        (found,) = FINDERS.ask_bus(kind, bus)
+        assert found.problem
+    (found,) = FINDERS.ask_bus("i2c", "256")
+    assert found.problem == "bus: expected a whole number from 0 to 255, got 256"
+
+
+NETWORK = "/etc/systemd/network/80-imud-can0.network"
+
+
+@pytest.fixture
+def bus(machine: LivingMachine) -> LivingMachine:
+    machine.can("can0")
+    machine.units["systemd-networkd.service"] = ["enabled", "active"]
+    return machine
+
+
+def commands(changes: object) -> list[str]:
+    assert isinstance(changes, list)
+    return [" ".join(one.words) for one in changes if isinstance(one, CommandChange)]
+
+
+def test_only_the_consoles_of_the_port_leave_the_command_line(machine: LivingMachine) -> None:
+    for before, after in [
+        ("console=serial0,115200 console=tty1 root=/dev/x\n", "console=tty1 root=/dev/x\n"),
+        ("root=/dev/x console=ttyAMA0\n", "root=/dev/x\n"),
+        ("console=tty1 root=/dev/x console=ttyAMA1,9600\n", "console=tty1 root=/dev/x console=ttyAMA1,9600\n"),
+        ("root=/dev/x  quiet", "root=/dev/x  quiet"),
+    ]:
+        assert without_console(before, {"ttyAMA0", "serial0"}) == after
+    machine.uart("ttyAMA0", console=True)
+    machine.write("/boot/cmdline.txt", "console=ttyAMA0,115200 root=/dev/x\n")
+    changes, notes = free_console(machine.surroundings(), "/dev/ttyAMA0")
+    assert [one.path for one in changes if isinstance(one, FileChange)] == ["/boot/cmdline.txt"]
+    assert "reboot the host" in notes[0]
+
+
+def test_an_alias_of_another_port_keeps_its_console(machine: LivingMachine) -> None:
+    machine.uart("ttyAMA0")
+    machine.uart("ttyS0")
+    (machine.root / "dev/serial0").symlink_to("ttyS0")
+    machine.write("/boot/cmdline.txt", "console=serial0,115200 root=/dev/x\n")
+    assert free_console(machine.surroundings(), "/dev/ttyAMA0") == ([], [])
+
+
+def test_elsewhere_the_boot_loader_is_left_alone_and_the_login_ends(machine: LivingMachine) -> None:
+    machine.uart("ttyS0", console=True)
+    changes, notes = free_console(machine.surroundings(), "/dev/ttyS0")
+    assert commands(changes) == ["systemctl mask --now serial-getty@ttyS0.service"]
+    assert "remove `console=ttyS0` from the kernel command line" in notes[0]
+    machine.units["serial-getty@ttyS0.service"] = ["masked", "inactive"]
+    assert free_console(machine.surroundings(), "/dev/ttyS0")[0] == []
+
+
+def test_a_can_interface_comes_up_by_networkd(bus: LivingMachine) -> None:
+    changes, notes = raise_can(bus.surroundings(), "can0", 250_000)
+    assert isinstance(changes[0], FileChange)
+    assert (changes[0].path, changes[0].then) == (NETWORK, (("networkctl", "reload"),))
+    assert b"BitRate=250000\nRestartSec=100ms\n" in changes[0].content
+    assert commands(changes) == ["networkctl reconfigure can0"]
+    assert notes == []
+    bus.write(NETWORK, changes[0].content.decode())
+    assert raise_can(bus.surroundings(), "can0", 250_000) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("unit", "name"), [("NetworkManager.service", "NetworkManager"), ("networking.service", "ifupdown")]
+)
+def test_networkd_is_enabled_beside_others_and_that_is_said(bus: LivingMachine, unit: str, name: str) -> None:
+    bus.units |= {"systemd-networkd.service": ["disabled", "inactive"], unit: ["enabled", "active"]}
+    changes, notes = raise_can(bus.surroundings(), "can0", 500_000)
+    assert commands(changes)[0] == "systemctl enable --now systemd-networkd.service"
+    assert commands(changes)[1] == "systemctl disable systemd-networkd-wait-online.service"
+    assert [one.optional for one in changes if isinstance(one, CommandChange)] == [False, True, False]
+    assert notes[0].startswith(f"{name} manages the network")
+
+
+def test_networkd_is_not_enabled_where_it_would_use_more(bus: LivingMachine) -> None:
+    bus.units["systemd-networkd.service"] = ["disabled", "inactive"]
+    bus.write("/etc/systemd/network/10-eth.network", "[Match]\nName=eth*\n")
+    changes, notes = raise_can(bus.surroundings(), "can0", 500_000)
+    assert [type(one) for one in changes] == [FileChange]
+    assert "would also use /etc/systemd/network/10-eth.network" in notes[0]
+
+
+def test_a_file_of_the_administrator_is_left(bus: LivingMachine) -> None:
+    bus.write("/etc/systemd/network/can.network", "[Match]\nName=vcan* can*\n")
+    changes, notes = raise_can(bus.surroundings(), "can0", 500_000)
+    assert changes == []
+    assert "/etc/systemd/network/can.network configures" in notes[0]
+
+
+def test_without_networkd_or_interface_nothing_is_changed(bus: LivingMachine) -> None:
+    assert raise_can(bus.surroundings(), "can1", 500_000)[1] == [
+        "can1 does not exist; CAN interfaces of this host: can0"
+    ]
+    del bus.units["systemd-networkd.service"]
+    changes, notes = raise_can(bus.surroundings(), "can0", 500_000)
+    assert (changes, "not installed" in notes[0]) == ([], True)
+
+
+def test_a_virtual_interface_has_no_bit_rate(bus: LivingMachine) -> None:
+    bus.can("vcan0")
+    (bus.root / "sys/devices/virtual/net/vcan0").mkdir(parents=True)
+    changes, _ = raise_can(bus.surroundings(), "vcan0", 500_000)
+    assert isinstance(changes[0], FileChange)
+    assert changes[0].content == network_file("vcan0", 0)
+    assert b"[CAN]" not in changes[0].content

@@ -1,12 +1,20 @@
 """Values as counts of a signed field, valid air pressures, and the load of a bus."""
 
+from dataclasses import dataclass
 from math import inf, nan
 
 import pytest
 
+from imud.attitude.conventions import Heading
+from imud.contracts.command import RestMeans, Target, Verb
+from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.bus_load import CyclicMessage, refuse_overload
-from imud.drivers.hipnuc.common import counts_of, pressure_of, temperature_beside
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
+from imud.drivers.hipnuc.common import counts_of, heading_by_mode, inclinometer_zero, pressure_of, temperature_beside
+from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
+from imud.drivers.hipnuc.nmea2000 import HipnucNmea2000Options
 from imud.model.errors import BadArgument
+from tests.support.simulated_modules import CanopenBench
 
 
 @pytest.mark.parametrize(
@@ -52,3 +60,59 @@ def test_bits_of_a_message_and_the_limit_of_the_bus() -> None:
         refuse_overload(messages, 0, 25_000)
     with pytest.raises(BadArgument, match=r"got 100 % of it: A every 5 ms 26.2 %; other devices 73.8 %"):
         refuse_overload(messages, 73_801, 100_000)
+
+
+@pytest.mark.parametrize(
+    ("values", "heading"),
+    [({"mode": "6-axis"}, Heading.RELATIVE), ({"mode": "9-axis"}, Heading.MAGNETIC), ({}, Heading.UNKNOWN)],
+)
+def test_by_mode(values: dict[str, str], heading: Heading) -> None:
+    assert heading_by_mode(None, values) is heading
+
+
+def test_drivers_that_read_it_back_and_that_know_it_beforehand() -> None:
+    for name in ("hipnuc-uart", "hipnuc-modbus"):
+        assert DRIVERS[name].heading(None, {"mode": "9-axis"}) is Heading.MAGNETIC
+    for name in ("imu61x-uart", "imu61x-can", "imu61x-i2c", "imu61x-spi"):
+        assert DRIVERS[name].heading(None, {}) is Heading.RELATIVE
+    nmea = DRIVERS["hipnuc-nmea2000"].heading
+    assert nmea(HipnucNmea2000Options(heading="true"), {}) is Heading.TRUE
+    assert nmea(HipnucNmea2000Options(heading="magnetic"), {}) is Heading.MAGNETIC
+    assert nmea(HipnucNmea2000Options(), {}) is Heading.UNKNOWN
+    assert nmea(None, {}) is Heading.UNKNOWN
+    assert DRIVERS["hipnuc-canopen"].heading(None, {}) is Heading.UNKNOWN
+
+
+@dataclass(frozen=True)
+class Began:
+    name: str
+    zero: str = ""
+
+
+VERBS = {
+    "zero": Verb("zero", lambda _target, *, zero: Began("zero", zero)),
+    "save": Verb("save", lambda _target: Began("save")),
+}
+
+
+def test_it_is_made_of_actions() -> None:
+    zero = inclinometer_zero("5.4.1", VERBS)["zero"]
+    target = Target(None, 0)
+    assert zero.begin(target) == Began("zero", "here")
+    assert zero.save is not None
+    assert zero.save(target) == Began("save")
+    (expectation,) = zero.expected
+    assert expectation.value(RestMeans(None, None, None, (0.001, -0.02))) == 0.02
+    assert expectation.value(RestMeans(None, None, (0.0, 0.0, 0.0))) is None
+
+
+def test_on_both_buses() -> None:
+    bench = CanopenBench()
+    zero = DRIVERS["hipnuc-canopen"].calibrations["zero"]
+    bench.run_script(zero.begin(Target(HipnucCanopenOptions(node=bench.module.node), 500_000)))
+    assert len(bench.sent) >= 1
+    assert zero.section[0] == "5"
+    zero = DRIVERS["hipnuc-j1939"].calibrations["zero"]
+    request = next(zero.begin(Target(HipnucJ1939Options(), 250_000)))
+    assert request.payload
+    assert zero.section[0] == "6"

@@ -11,6 +11,7 @@ from prometheus_client.parser import text_string_to_metric_families as parse_tex
 
 import imud
 from imud.contracts import status as states
+from imud.contracts.status import FlightStatus, MqttStatus, OutputStatus, RecorderStatus
 from imud.model.event import EventKind
 from imud.model.ledger import LEDGER_FIELDS
 from imud.model.sample import Sync
@@ -41,7 +42,7 @@ from imud.publishers.metrics.publisher import ClientTotals, Renderer
 from imud.publishers.metrics.rings import RingView
 from imud.utc.rmc_feed import Refusal
 from tests.support.files import ROOT
-from tests.support.metrics import FRAME, LINES, UTC, client, device, equipped, views
+from tests.support.metrics import FRAME, LINES, UTC, client, device, equipped, shown, views
 
 SAMPLES_PER_TURN = 64
 
@@ -413,3 +414,60 @@ def test_alerts_use_metrics_that_exist() -> None:
         assert used or "up{" in alert["expr"]
         assert {"summary", "description"} <= set(alert["annotations"])
         assert alert["labels"]["severity"] in ("warning", "critical")
+
+
+def test_each_metric_is_a_value_of_a_port() -> None:
+    tcp, serial = "tcp 127.0.0.1:10110", "serial /dev/ttyUSB0"
+    outputs = (OutputStatus(tcp, 1, 2, 3, ""), OutputStatus(serial, 4, 5, 0, "No such file or directory"))
+    assert shown("imud_nmea0183_", Snapshot(outputs=outputs)) == {
+        f"sentences_total {tcp}": 1, f"sentences_dropped_total {tcp}": 2, f"readers {tcp}": 3,
+        f"sentences_total {serial}": 4, f"sentences_dropped_total {serial}": 5, f"readers {serial}": 0,
+    }  # fmt: skip
+    assert shown("imud_nmea0183_", Snapshot()) == {}
+
+
+def test_each_metric_is_a_value_of_the_output() -> None:
+    status = MqttStatus("mqtt://a:1883", "", "", 1, 2, 3, 4, 5, 6, 7, {"age": 8, "space": 9}, 10, 11, 12, {"a": "no"})
+    assert shown("imud_mqtt_", Snapshot(mqtts=(status,))) == {
+        "connected": 1, "spooling": 1, "queued_total": 1, "spooled_messages_total": 2, "sent_messages_total": 3,
+        "acknowledged_messages_total": 4, "waiting_messages": 5, "refused_topics": 1, "spool_bytes": 6,
+        "thinned_total": 7, "dropped_total age": 8, "dropped_total space": 9, "reconnects_total": 10,
+        "commands_total": 11, "commands_refused_total": 12,
+    }  # fmt: skip
+    assert shown("imud_mqtt_", Snapshot()) == {}
+
+
+def test_a_failure_is_zero() -> None:
+    status = MqttStatus("", "refused", "full", 0, 0, 0, 0, 0, 0, 0, {}, 0)
+    values = shown("imud_mqtt_", Snapshot(mqtts=(status,)))
+    assert (values["connected"], values["spooling"]) == (0, 0)
+
+
+RECORDER = RecorderStatus("a", "", 1, 2, 3, 4, 5, 6)
+FULL = "No space left on device"
+
+
+def test_each_metric_is_a_value_of_the_status() -> None:
+    recorders = Snapshot(recorders=(RECORDER,))
+    assert shown("imud_recorder_", recorders) == {
+        "active": 1, "written_bytes_total": 1, "records_total": 2, "records_dropped_total": 3, "waiting_bytes": 4,
+        "files_removed_total": 5,
+    }  # fmt: skip
+    assert shown("imud_recordings_", recorders) == {"bytes": 6}
+    full = Snapshot(recorders=(RecorderStatus("", FULL, 1, 2, 3, 4, 5, 6),))
+    assert shown("imud_recorder_", full)["active"] == 0
+    for prefix in ("imud_recorder_", "imud_recordings_", "imud_flight_"):
+        assert shown(prefix, Snapshot()) == {}
+
+
+def test_each_metric_is_a_value_of_the_flight_recorder() -> None:
+    flights = Snapshot(flights=(FlightStatus("", 90_500_000_000, 2, 3, 4, 5, 6, 7, 8),))
+    assert shown("imud_flight_recorder_", flights) == {
+        "active": 1, "kept_seconds": 90.5, "kept_bytes": 2, "records_dropped_total": 3, "snapshots_total saved": 4,
+        "snapshots_total failed": 5, "snapshots_total left_out": 6, "snapshots_sent_total": 7,
+    }  # fmt: skip
+    assert shown("imud_recordings_", flights) == {"bytes": 8}
+    both = Snapshot(recorders=(RECORDER,), flights=(FlightStatus("", 1, 2, 3, 4, 5, 6, 7, 5),))
+    assert shown("imud_recordings_", both) == {"bytes": 6}  # including the open file
+    full = Snapshot(flights=(FlightStatus(FULL, 0, 0, 0, 0, 0, 0, 0, 0),))
+    assert shown("imud_flight_recorder_", full)["active"] == 0

@@ -6,10 +6,32 @@ from typing import Any
 import msgspec
 import pytest
 
+from imud import config
+from imud.config.schema import TABLES
 from imud.contracts.command import Target
+from imud.contracts.lines import (
+    AlarmRange,
+    AlarmRanges,
+    DeviceLines,
+    DividedOptions,
+    InputOptions,
+    PpsOptions,
+    SoutOptions,
+    TriggerOptions,
+)
 from imud.contracts.setting import Effect, values_of, words_of
-from imud.drivers.hipnuc.uart.settings import SETTINGS, report_values, shown
-from imud.model.errors import BadArgument
+from imud.drivers.hipnuc.uart.driver import DRIVER
+from imud.drivers.hipnuc.uart.replies import parse_report
+from imud.drivers.hipnuc.uart.settings import (
+    SETTINGS,
+    alarm_ranges,
+    declared_line_differences,
+    line_differences,
+    message_limits,
+    report_values,
+    shown,
+)
+from imud.model.errors import BadArgument, ConfigError
 from imud.sim.hipnuc.uart_settings import VARIANTS, AlarmSetting, Behaviour, ModuleSettings, Output
 from tests.support.simulated_modules import HipnucLine, hardware_of
 
@@ -171,3 +193,149 @@ def test_possible_combinations_are_accepted() -> None:
 def test_a_declaration_is_checked_by_its_types(given: dict[str, Any]) -> None:
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert(given, SETTINGS.declarable)
+
+
+def x(low_deg: float, high_deg: float, enabled: bool = True) -> dict[str, AlarmRange]:
+    """X is pitch."""
+    return {"X": AlarmRange(1, low_deg, high_deg, enabled)}
+
+
+def y(low_deg: float, high_deg: float, enabled: bool = True) -> dict[str, AlarmRange]:
+    """Y is roll."""
+    return {"Y": AlarmRange(0, low_deg, high_deg, enabled)}
+
+
+@pytest.mark.manual("B 2.2.4 alarm range")
+def test_the_modules_own_lines_are_read() -> None:
+    settings = ModuleSettings(alarm_x=AlarmSetting(-5, 5.5, False), alarm_y=AlarmSetting(-30.25, 12, True))
+    report = parse_report([*settings.user_lines(), "OK"]).values
+    assert DRIVER.alarm_ranges is not None
+    assert DRIVER.alarm_ranges(report_values(report)) == AlarmRanges(
+        {**x(-5, 5.5, False), **y(-30.25, 12)}, "PMUX5", "URFR"
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "value"),
+    [("COORD 4", "4"), ("COORD=4", "4"), ("IMU_COORD: 04", "4"), ("CONFIG IMU COORD 2", "2"), ("COORD: 0", "0"),
+     ("COORDS=4", None), ("", None)],
+)  # fmt: skip
+def test_coordinates_select_axes_and_the_angles_of_the_alarm(line: str, value: str | None) -> None:
+    """COORD 4 makes roll the angle about the x axis, which the alarm of X watches."""
+    settings = ModuleSettings(alarm_x=AlarmSetting(-5, 5.5, False), alarm_y=AlarmSetting(-30.25, 12, True))
+    report = parse_report([*settings.user_lines(), line])
+    raw = {**report.values, **{f"USRCONFIG {n}": other for n, other in enumerate(filter(None, report.other), 1)}}
+    assert report_values(raw).get("coordinates") == value
+    sent = DRIVER.sent_axes(shown(raw))
+    assert (sent.navigation_frame == "NWU") == (value == "4")
+    assert bool(sent.problem) == (value == "2")
+    by_axis = alarm_ranges(report_values(raw)).by_axis
+    assert (by_axis["X"].euler_index, by_axis["Y"].euler_index) == ((0, 1) if value == "4" else (1, 0))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("PMUX5", "Y,-5,5,0,1", y(-5, 5)), ("ALARM X", " +1.5 , 2 , 0 , 0 ", x(1.5, 2, False)),
+        ("pmux5_y", "-5,5,0,1", y(-5, 5)), ("IO_ALARM", "x,-5,5,0,1", x(-5, 5)), ("PMUX5", "IO9", {}),
+        ("PMUX5", "-5,5,0,1", {}),  # the axis is missing
+        ("ALARM_X", "-5,5,0,2", {}), ("ALARM_X", "-5,5,1", {}), ("URFR", "1,0,0,0,1,0,0,0,1", {}),
+    ],
+)  # fmt: skip
+def test_other_forms(name: str, value: str, expected: dict[str, AlarmRange]) -> None:
+    assert alarm_ranges(report_values({name: value})).by_axis == expected
+
+
+SOUT = DeviceLines(sout=SoutOptions(line="A"))
+DIVIDED = DeviceLines(sout_div=DividedOptions(line="B", divisor=4))
+SIN = DeviceLines(sin=TriggerOptions(line="C", rate_hz=200))
+PPS = DeviceLines(pps=PpsOptions(line="D"))
+ALARM = DeviceLines(alarm=InputOptions(line="E"))
+MARKED = Output(on_mark=True)
+
+
+@pytest.mark.parametrize(
+    ("lines", "settings", "found"),
+    [
+        (SOUT, ModuleSettings(), {}),
+        (SOUT, ModuleSettings(pins=(1, 2, 2, 6, 9)), {"sout": "the device has sout and led on IO2: move one"}),
+        (DIVIDED, ModuleSettings(sout_div=4), {}),
+        (DIVIDED, ModuleSettings(), {"sout_div": "expected divisor 4 from the configuration, got 8 from the device"}),
+        (SIN, ModuleSettings(baud=921600, hi91=MARKED), {}),
+        (SIN, ModuleSettings(), {"sin": "no message of the device is on mark"}),
+        (
+            SIN,
+            ModuleSettings(hi91=MARKED),
+            {"sin": "expected triggers of at most 100 Hz for HI91 at 115200 baud, got 200 Hz"},
+        ),
+        (SIN, ModuleSettings(hi91=Output(), hi92=MARKED), {"sin": "HI92 on mark has no device time"}),
+        (PPS, ModuleSettings(), {}),
+        (PPS, ModuleSettings(hi91=MARKED), {"pps": "HI91 on mark: each pulse per second makes a sample"}),
+        (ALARM, ModuleSettings(alarm_y=AlarmSetting(-5, 5, True)), {}),
+        (ALARM, ModuleSettings(), {"alarm": "the device watches no angle"}),
+    ],
+)
+def test_contradictions_of_the_device_are_found(
+    lines: DeviceLines, settings: ModuleSettings, found: dict[str, str]
+) -> None:
+    differences = line_differences(values_of(HipnucLine(settings).run(SETTINGS.read(Target(None, 0), None))), lines)
+    assert differences.keys() == found.keys()
+    for key, words in found.items():
+        assert words in differences[key]
+
+
+@pytest.mark.parametrize("lines", [SOUT, DIVIDED, SIN, PPS, ALARM])
+def test_unreported_settings_are_not_compared(lines: DeviceLines) -> None:
+    assert line_differences({"mode": "6-axis"}, lines) == {}
+
+
+@pytest.mark.parametrize(
+    ("lines", "declared", "found"),
+    [
+        (SIN, {"output": {"hi91": 0, "hi92": "on_mark"}}, {"sin": "HI92 on mark has no device time"}),
+        (SIN, {"output": {"hi91": 100, "hi92": 0}}, {"sin": "no message of the device is on mark"}),
+        (SIN, {"output": {"hi91": "on_mark", "hi92": 0}}, {}),
+        (SIN, {"output": {"hi92": "on_mark"}}, {}),  # the device may have HI91 on mark
+        (DIVIDED, {"sout_divisor": 8}, {"sout_div": "expected divisor 4 from the configuration"}),
+        (SOUT, {"pins": {"sout": 2, "led": 2}}, {"sout": "sout and led on IO2"}),
+        (ALARM, {"alarm": {"x": {"min_deg": -5, "max_deg": 5, "enabled": False}}}, {}),  # the device may watch Y
+    ],
+)
+def test_contradictions_of_declared_settings_are_found(
+    lines: DeviceLines, declared: dict[str, object], found: dict[str, str]
+) -> None:
+    differences = declared_line_differences(declared, lines)
+    assert differences.keys() == found.keys()
+    for key, words in found.items():
+        assert words in differences[key]
+
+
+def test_check_refuses_a_line_that_declared_settings_contradict() -> None:
+    text = (
+        "devices:\n  bow:\n    driver: hipnuc-uart\n    uart: {port: /dev/ttyUSB0, baud: 921600}\n"
+        "    lines: {sin: {line: GPIO1, rate_hz: 10}}\n    settings: {output: {hi91: 0, hi92: on_mark}}\n"
+    )
+    with pytest.raises(ConfigError, match=r"f:5:\d+: devices\.bow\.lines\.sin: .*HI92 on mark has no device time"):
+        config.parse(text, "f", TABLES)
+
+
+@pytest.mark.parametrize(
+    ("declared", "lines", "fed", "found"),
+    [
+        ({}, DeviceLines(), True, []),
+        ({"output": {"hi91": 100, "hi92": 0}}, DeviceLines(), True, []),
+        ({"output": {"hi92": 100}}, DeviceLines(), False, []),
+        ({"output": {"hi92": 100}}, DeviceLines(), True, ["HI92 has no UTC"]),
+        ({"output": {"hi92": 100}}, DeviceLines(pps=PpsOptions(line="GPIO1")), False, ["HI92 has no UTC"]),
+        (
+            {"output": {"hi91": 50, "hi92": 50}}, DeviceLines(), False,
+            ["HI92 next to HI91 is time-stamped by its arrival"],
+        ),
+    ],
+)  # fmt: skip
+def test_limits_of_hi92_are_reported(
+    declared: dict[str, object], lines: DeviceLines, fed: bool, found: list[str]
+) -> None:
+    limits = message_limits(declared, lines, fed)
+    assert len(limits) == len(found)
+    assert all(limit.startswith(words) for limit, words in zip(limits, found, strict=True))
