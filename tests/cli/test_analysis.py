@@ -157,7 +157,8 @@ def test_a_damaged_capture_is_named_and_a_raw_one_dated_by_the_device(tmp_path: 
 # --- what is wrong ----------------------------------------------------------------------------------------------------
 
 
-def test_what_cannot_be_done_is_said(resting_file: Path, cli: Cli) -> None:
+def test_what_cannot_be_done_is_said(tmp_path: Path, cli: Cli) -> None:
+    file = write_capture(tmp_path / "short.capture", *resting(500, 100.0), rate_hz=100.0)
     for words, message in [
         (["noise", "-o", "a.pdf"], "ends in .html, .svg, .png"),
         (["spectrum", "-o", "a.html"], "ends in .svg or .png"),
@@ -167,7 +168,7 @@ def test_what_cannot_be_done_is_said(resting_file: Path, cli: Cli) -> None:
         (["noise", "--sheet", "/nowhere"], "--sheet /nowhere"),
         (["noise", "-o", "/nowhere/a.svg"], "/nowhere/a.svg"),
     ]:
-        cli.refuses(message, *words, str(resting_file))
+        cli.refuses(message, *words, file)
 
 
 def test_what_is_neither_file_nor_device(tmp_path: Path, cli: Cli) -> None:

@@ -417,7 +417,7 @@ class BusInProcess:
         link.feed([CanFrame(f.can_id, f.extended, f.data, f.due_ns) for f in self.modules.advance(now_ns)])
 
     async def until(self, condition: Callable[[], object], what: str) -> None:
-        await self.rig.until(condition, what, 120.0, step=self.step)
+        await self.rig.until(condition, what, 120.0, step=self.step, step_s=0.01)
 
     async def done(self, work: Coroutine[Any, Any, Any]) -> Any:
         """Return the result of `work`, while the modules run."""

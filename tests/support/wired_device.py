@@ -224,7 +224,7 @@ class LinkedModule(MemoryLink, Generic[SimulatedModule]):
 
 
 class Imu61xLine(LinkedModule[Imu61xModule]):
-    step_s = 0.001
+    step_s = 0.005
 
 
 class LinkedDevice:
