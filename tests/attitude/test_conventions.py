@@ -23,9 +23,13 @@ from imud.model.sample import Vector3
 FRONT_LEFT_UP: tuple[Vector3, Vector3, Vector3] = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 
-def test_body_axes() -> None:
+def test_axes_of_conventions_and_of_frames_with_z_down() -> None:
     assert [matrix_times(body_axes(Convention.ENU_FLU), v) for v in FRONT_LEFT_UP] == list(FRONT_LEFT_UP)
     assert matrix_times(body_axes(Convention.NED_FRD), (1, 2, 3)) == (1, -2, -3), "front, right, down"
+    # At yaw 0, the x axis (ZYX) or the y axis (ZXY) of the sensor is parallel to the same axis of the frame.
+    assert matrix_times(DeviceAxes(order=EulerOrder.ZYX, z_down=True).to_z_up, (1, 2, 3)) == (1, -2, -3)
+    assert matrix_times(DeviceAxes(order=EulerOrder.ZXY, z_down=True).to_z_up, (1, 2, 3)) == (-1, 2, -3)
+    assert matrix_times(RFU_ENU.to_z_up, (1, 2, 3)) == (1, 2, 3)
 
 
 def test_navigation_axes() -> None:
@@ -52,13 +56,6 @@ def test_front_left_and_up_in_the_axes_of_a_device(
 ) -> None:
     assert [matrix_times(axes.to_body, v) for v in (front, left, up)] == list(FRONT_LEFT_UP)
     assert is_rotation(axes.to_body)
-
-
-def test_a_frame_with_z_down_keeps_the_direction_that_yaw_is_counted_from() -> None:
-    """At yaw 0, the x axis (ZYX) or the y axis (ZXY) of the sensor is parallel to the same axis of the frame."""
-    assert matrix_times(DeviceAxes(order=EulerOrder.ZYX, z_down=True).to_z_up, (1, 2, 3)) == (1, -2, -3)
-    assert matrix_times(DeviceAxes(order=EulerOrder.ZXY, z_down=True).to_z_up, (1, 2, 3)) == (-1, 2, -3)
-    assert matrix_times(RFU_ENU.to_z_up, (1, 2, 3)) == (1, 2, 3)
 
 
 def test_the_navigation_frame_nwu() -> None:

@@ -195,12 +195,9 @@ def test_motion_is_not_judged() -> None:
     assert judged(swinging) == 0, "slow for moments only"
 
 
-def test_a_bias_of_gyroscope_and_accelerometer_is_rest() -> None:
+def test_only_samples_at_rest_count() -> None:
     biased = (replace(one, gyro_rad_s=(0.02, -0.02, 0.01), accel_m_s2=(0.1, 0.1, -9.7)) for one in ticks(WRONG))
     assert judged(biased) == 1
-
-
-def test_a_sample_in_motion_and_a_pause_restart_the_window() -> None:
     samples = list(ticks(WRONG, 9.9))
     samples[49] = replace(samples[49], gyro_rad_s=(1.0, 0, 0))
     assert judged(iter(samples)) == 0, "4.9 s before it and 5 s after it"

@@ -63,13 +63,10 @@ def same_rotation(a: Quaternion | None, b: Quaternion) -> bool:
 # --- no rotation ------------------------------------------------------------------------------------------------------
 
 
-def test_without_frame_and_convention_samples_are_unchanged() -> None:
+def test_without_rotation_values_are_unchanged() -> None:
     assert frame(device=RFU_ENU).rotation is None
     assert as_sent(FLU_LEVEL).rotation is None
     assert frame(convention=NED).rotation_to(NED) is None
-
-
-def test_values_without_a_direction_are_unchanged() -> None:
     after = turned(sample((1, 2, 3), (10, 20, 30)), frame(convention=NED))
     before = sample()
     for name in Sample.__struct_fields__:

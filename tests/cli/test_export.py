@@ -428,22 +428,24 @@ def test_a_file_that_is_there_is_kept_without_force(tmp_path: Path) -> None:
     assert file.read_bytes() == b"new"
 
 
-def test_what_is_exported_is_never_replaced(tmp_path: Path) -> None:
+def test_outputs_that_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "source").write_bytes(b"a recording")
     (tmp_path / "link").symlink_to(tmp_path / "source")
     for name in ("source", "link"):
         with pytest.raises(BadArgument, match="name another file"):
             output(tmp_path / name, tmp_path, force=True)
     assert (tmp_path / "source").read_bytes() == b"a recording"
-
-
-def test_a_missing_folder_and_a_full_disk_are_errors_with_the_name(tmp_path: Path) -> None:
     with pytest.raises(ImudError, match="none/a: No such file or directory"):
         output(tmp_path / "none" / "a", tmp_path)
     out = output(Path("/dev/full"), tmp_path)
     with pytest.raises(ImudError, match="/dev/full: No space left on device"), out:
         out.write(b"x")
     assert Path("/dev/full").is_char_device()
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    with pytest.raises(BadArgument, match="cannot write MCAP to a terminal"):
+        output(None, tmp_path, binary=True)
+    with output(None, tmp_path):
+        pass
 
 
 def test_a_fifo_is_written_in_place(tmp_path: Path) -> None:
@@ -457,11 +459,3 @@ def test_a_fifo_is_written_in_place(tmp_path: Path) -> None:
     reader.join(10)
     assert got == [b"through"]
     assert fifo.is_fifo()
-
-
-def test_a_terminal_gets_no_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
-    with pytest.raises(BadArgument, match="cannot write MCAP to a terminal"):
-        output(None, tmp_path, binary=True)
-    with output(None, tmp_path):
-        pass

@@ -149,24 +149,18 @@ def test_a_cut_file_is_replayed_as_far_as_it_goes(recorded: Recorded) -> None:
     assert "incomplete" in report
 
 
-def test_a_damaged_file_is_an_answer_of_no(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
+def test_damaged_recordings(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
     file = recorded[0]
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 1
     (tmp_path / "damaged").write_bytes(data)
     assert "damaged" in cli("replay", tmp_path / "damaged", status=1).err
-
-
-def test_a_recording_whose_first_bytes_are_damaged_is_no_capture(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
     file = tmp_path / "damaged.imudrec"
     file.write_bytes(bytes(8) + recorded[0].read_bytes()[8:])
     for command in (["replay"], ["export", "--to", "csv"]):
         printed = cli(*command, file, status=1).err
         assert "bytes from byte 0 are damaged" in printed
         assert "the capture" not in printed
-
-
-def test_a_file_that_only_begins_as_a_recording_is_an_error(tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "a").write_bytes(b"\x89imudREC" + bytes(100))
     cli.refuses("at least one complete block", "replay", tmp_path / "a")
 

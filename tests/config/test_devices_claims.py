@@ -208,12 +208,18 @@ def parse(*lines: str, driver: str = "fake-module", baud: str = "115200") -> Con
     return config.parse(text, "f", TABLES)
 
 
-def test_declared_values_have_the_types_of_the_table() -> None:
+def test_declared_values_and_their_changes() -> None:
     (device,) = parse(
         "settings: {mode: 9-axis, output: {a: 10}, offset_deg: 5}", "on_difference: apply_and_save"
     ).devices
     assert declared_values(device.declared) == {"mode": "9-axis", "output": {"a": 10}, "offset_deg": 5.0}
     assert device.on_difference is OnDifference.APPLY_AND_SAVE
+    for values, baud in (("baud: 921600", "auto"), ("baud: 115200", "115200"), ("output: {a: 1000, b: 500}", "auto")):
+        assert parse(f"settings: {{{values}}}", baud=baud).devices[0].declared is not None
+    old = parse("settings: {mode: 9-axis}")
+    assert differences(old, parse("settings: {mode: 6-axis}")).devices_changed == ("bow",)
+    assert differences(old, parse("settings: {mode: 9-axis}", "on_difference: apply")).devices_changed == ("bow",)
+    assert str(differences(old, parse("settings: {mode: 9-axis}"))) == "nothing differs"
 
 
 @pytest.mark.parametrize("lines", [[], ["settings:"], ["settings: {}"], ["settings: {mode: null}"]])
@@ -242,15 +248,3 @@ def test_errors_with_their_place(given: dict[str, Any], error: str) -> None:
     with pytest.raises(ConfigError) as caught:
         parse(*given.pop("lines"), **given)
     assert str(caught.value).splitlines() == ["f:" + error]
-
-
-def test_what_may_be_declared_where_imud_searches() -> None:
-    for values, baud in (("baud: 921600", "auto"), ("baud: 115200", "115200"), ("output: {a: 1000, b: 500}", "auto")):
-        assert parse(f"settings: {{{values}}}", baud=baud).devices[0].declared is not None
-
-
-def test_a_change_of_settings_is_a_change_of_the_device() -> None:
-    old = parse("settings: {mode: 9-axis}")
-    assert differences(old, parse("settings: {mode: 6-axis}")).devices_changed == ("bow",)
-    assert differences(old, parse("settings: {mode: 9-axis}", "on_difference: apply")).devices_changed == ("bow",)
-    assert str(differences(old, parse("settings: {mode: 9-axis}"))) == "nothing differs"

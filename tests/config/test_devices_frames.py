@@ -31,10 +31,12 @@ def problem(keys: str, driver: str = "hipnuc-uart") -> str:
     return line
 
 
-def test_without_the_keys_nothing_is_turned() -> None:
+def test_the_keys_of_a_frame_are_part_of_the_device() -> None:
     plain = device("")
     assert (plain.frame, plain.convention, plain.declination_deg, plain.noise) == (None, None, None, None)
     assert device("    noise: {gyro_rad_s: 0.001, mag_t: 2.0e-7}\n").noise == Deviations(gyro_rad_s=0.001, mag_t=2e-7)
+    before, after = (config.parse(HEAD.format(driver="auto") + keys, "f.yaml") for keys in ("", "    frame: {}\n"))
+    assert config.differences(before, after).devices_changed == ("bow",)
 
 
 def test_every_way() -> None:
@@ -89,11 +91,6 @@ def test_a_declination_needs_a_magnetic_heading() -> None:
     assert config.parse(nmea, "f.yaml").devices[0].declination_deg == 1
     with pytest.raises(ConfigError, match="whose heading is already true"):
         config.parse(nmea + "    options: {heading: 'true'}\n", "f.yaml")
-
-
-def test_a_change_of_the_frame_is_a_change_of_the_device() -> None:
-    before, after = (config.parse(HEAD.format(driver="auto") + keys, "f.yaml") for keys in ("", "    frame: {}\n"))
-    assert config.differences(before, after).devices_changed == ("bow",)
 
 
 def test_the_shipped_examples_show_the_defaults() -> None:

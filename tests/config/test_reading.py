@@ -255,14 +255,12 @@ def test_all_errors_are_reported_in_the_order_of_the_file() -> None:
     ]  # fmt: skip
 
 
-def test_device_names() -> None:
+def test_names_and_number_of_devices() -> None:
     for name in ("0", "a-b_c", "a" * 32):
         assert [d.name for d in parse(f"devices: {{'{name}': {{file: {{path: x}}}}}}").devices] == [name]
     for name in ("a" * 33, "-a", "_a", "é", "a.b", "a b", "a/b", "../a", "", "a\\n"):
         assert "device name" in errors(f'devices: {{"{name}": {{file: {{path: x}}}}}}')[0]
 
-
-def test_number_of_devices() -> None:
     def text(count: int) -> str:
         return "devices:\n" + "".join(f"  d{n}: {{file: {{path: x}}}}\n" for n in range(count))
 

@@ -23,13 +23,10 @@ def test_rows_lead_to_objects_that_know_their_name(table: Registry[Any], kind: t
         assert row.name == name  # type: ignore[attr-defined]  # every kind of row has one
 
 
-def test_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(KeyError, match=r"no driver named 'bno055'; expected one of: .*hipnuc-uart"):
-        DRIVERS["bno055"]
-
-
-def test_row_is_imported_on_first_use_only() -> None:
+def test_rows_are_imported_on_first_use_and_unknown_names_list_the_known_ones() -> None:
     table: Registry[object] = Registry("thing", {"bad": "imud.no_such_module:X", "good": "imud.model.units:NS_PER_S"})
     assert table["good"] == 1_000_000_000
     with pytest.raises(ModuleNotFoundError):
         table["bad"]
+    with pytest.raises(KeyError, match=r"no driver named 'bno055'; expected one of: .*hipnuc-uart"):
+        DRIVERS["bno055"]

@@ -116,22 +116,16 @@ def is_from(can_id: int) -> Callable[[object], bool]:
 # --- another place ----------------------------------------------------------------------------------------------------
 
 
-def test_a_place_in_use_is_refused_without_a_write() -> None:
+def test_a_device_stays_is_followed_or_the_place_is_refused() -> None:
     bench = Bench(FakeDevice(), FakeDevice(place=12))
     with pytest.raises(BadArgument, match="node 12 is in use: received its 0x58c; try another number"):
         bench.change(12)
     assert bench.sent == [(12, QUERY, 0)]
-
-
-def test_a_device_is_followed_to_its_new_place() -> None:
     bench = Bench(FakeDevice(immediate=True))
     assert bench.change(9) is Written.VERIFIED
     assert bench.options == FakeOptions(9)
     # the device confirms the first write at 5 and then uses 9
     assert bench.sent == [(9, QUERY, 0), (5, WRITE, 9), (5, WRITE, 9), (9, WRITE, 9), (9, QUERY, 0)]
-
-
-def test_a_device_that_still_replies_at_its_old_place_stays_there() -> None:
     bench = Bench(FakeDevice())
     assert bench.change(9) is Written.PENDING
     assert bench.options == FakeOptions(5)
@@ -180,39 +174,30 @@ def test_a_restarted_device_is_found_at_its_saved_or_present_place(
     assert bench.options == FakeOptions(place)
 
 
-def test_the_factory_place_is_accepted_by_its_boot_frame_only() -> None:
+def test_boot_frames_of_this_device_only() -> None:
     bench = Bench(FakeDevice(saved={"place": 9}, booted=FACTORY))
     assert bench.restart() == "found as node 8"
     bench = Bench(FakeDevice(saved={"place": 9}, booted=FACTORY, boots=False))
     with pytest.raises(NoReply, match="no frame of node 5 or 9 after the restart"):
         bench.restart()
     assert bench.options == FakeOptions(5)
-
-
-def test_frames_of_other_devices_are_ignored() -> None:
     bench = Bench(FakeDevice(saved={"place": 9}, booted=5))
     bench.beside = [ReplyFrame(BOOTS + 12, b"\0"), ReplyFrame(BOOTS + 9, b"\5"), ReplyFrame(REPLIES + 12, b"\0")]
     assert bench.restart() == "found as node 5"
-
-
-def test_any_boot_frame_is_accepted_if_the_device_reports_no_settings() -> None:
     bench = Bench(FakeDevice(booted=33))
     assert bench.restart() == "found as node 33"
     assert bench.options == FakeOptions(33)
 
 
-def test_a_lost_device_is_reported_with_its_saved_bit_rate() -> None:
+def test_a_rejected_restart_and_a_lost_device_are_reported() -> None:
+    with pytest.raises(Rejected, match="restart: the device rejected the request"):
+        Bench(FakeDevice(), rejects=True).restart()
     bench = Bench(FakeDevice(saved={"place": 9, "rate": 0}))
     assert bench.restart() == ("the device now uses 250000 bit/s and the bus does not; set the bus to 250000 bit/s")
     assert bench.sent == [(5, RESTART, 0), (5, QUERY, 0), (9, QUERY, 0)]
     for saved, bus_bit_s in (({"rate": 1}, BUS_BIT_S), ({"rate": 7}, BUS_BIT_S), ({}, BUS_BIT_S), ({"rate": 0}, 0)):
         with pytest.raises(NoReply, match="no frame of node 5 after the restart; does it use another bit rate now"):
             Bench(FakeDevice(saved=saved)).restart(bus_bit_s)
-
-
-def test_a_rejected_restart_is_reported() -> None:
-    with pytest.raises(Rejected, match="restart: the device rejected the request"):
-        Bench(FakeDevice(), rejects=True).restart()
 
 
 def test_the_factory_place_is_checked_before_a_reset() -> None:

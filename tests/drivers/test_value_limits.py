@@ -33,11 +33,8 @@ def test_the_smallest_impossible_value_is_131072(value: float) -> None:
     assert not values_possible(high_byte(-value) + high_byte(0.0))
 
 
-def test_the_largest_possible_value_is_scaled() -> None:
+def test_limits_of_values_and_temperatures() -> None:
     assert scaled((0.0, 131071.5, -131071.5), 2.0) == (0.0, 262143.0, -262143.0)
-
-
-def test_a_temperature_is_between_128_below_zero_and_512() -> None:
     for impossible in (-128.0, 512.0):
         assert possible_temperature_c(impossible) is None
         inside = nextafter(impossible, 0.0)

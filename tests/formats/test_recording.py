@@ -132,10 +132,16 @@ def test_a_block_with_a_valid_crc_and_damaged_content_costs_only_itself(block: b
     assert (found, reader.bytes_bad + reader.bytes_cut) == ([], len(block))
 
 
-def test_the_largest_content_is_read_and_a_larger_one_refused() -> None:
+def test_limits_of_a_block() -> None:
     assert blocks_of(BlockEncoder().encode(bytes(PLAIN_MAX)))[0] == [bytes(PLAIN_MAX)]
     with pytest.raises(ValueError, match="at most"):
         BlockEncoder().encode(b"\0" * (PLAIN_MAX + 1))
+    zeros = bytes(100_000)
+    assert blocks_of(BlockEncoder().encode(zeros))[0] == [zeros]
+    bomb = zstandard.ZstdCompressor().compress(zeros)
+    found, reader = blocks_of(valid_crc(bomb, len(zeros)))
+    assert not found
+    assert reader.bytes_bad == HEAD.size + len(bomb)
 
 
 def test_a_block_with_another_number_is_whole() -> None:
@@ -162,15 +168,6 @@ def test_false_heads_cost_a_limited_number_of_bytes(monkeypatch: pytest.MonkeyPa
     assert found == [b"abc" * 100] * 2
     assert reader.bytes_bad == 300_000 // len(head) * len(head)
     assert checked < 70 << 20
-
-
-def test_a_block_that_grows_too_much_is_no_block_and_zeros_are_stored_without_compression() -> None:
-    zeros = bytes(100_000)
-    assert blocks_of(BlockEncoder().encode(zeros))[0] == [zeros]
-    bomb = zstandard.ZstdCompressor().compress(zeros)
-    found, reader = blocks_of(valid_crc(bomb, len(zeros)))
-    assert not found
-    assert reader.bytes_bad == HEAD.size + len(bomb)
 
 
 def test_blocks_inside_a_cut_block_are_read_and_the_first_bad_byte_is_known() -> None:

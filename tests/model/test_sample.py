@@ -17,12 +17,9 @@ def test_every_member_has_its_row_in_its_place() -> None:
     assert [name for name, field in BY_NAME.items() if not field.always] == list(optional)
 
 
-def test_the_bit_of_the_alarm_line_is_documented() -> None:
+def test_meanings_of_fields() -> None:
     assert ALARM_STATUS == 1 << 31
     assert "bit 31" in BY_NAME["status"].meaning
-
-
-def test_the_meaning_of_edge_seq() -> None:
     meaning = BY_NAME["edge_seq"].meaning
     assert "rising edge on SOUT" in meaning
     assert "trigger on SIN" in meaning

@@ -297,13 +297,19 @@ def other_daemon(folder: Path) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
-def test_second_daemon_is_refused(tmp_path: Path) -> None:
+def test_locks_of_other_processes(tmp_path: Path) -> None:
     with other_daemon(tmp_path) as other:
         with pytest.raises(ServerError, match=f"another imud writes this ring, process {other.pid}: stop it first"):
             Board(tmp_path, now_ns=START_NS + 60_000_000_000)  # the age of its heartbeat has no effect
         other.kill()
         other.wait()
         Board(tmp_path).publisher.close()  # the ring can be created immediately
+    first = Board(tmp_path)
+    first.die()
+    with first.path.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        Board(tmp_path, epoch=78).publisher.close()
+    first.publisher.close()
 
 
 def test_ring_of_another_daemon_is_not_replaced(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -324,15 +330,6 @@ def test_ring_of_another_daemon_is_not_replaced(tmp_path: Path, caplog: pytest.L
         board.tick(1_000_000_000)
     assert (board.path.stat().st_ino == inode, board.word("newest_seq"), board.word("first_seq")) == (False, 1, 2)
     board.publisher.close()
-
-
-def test_lock_of_a_reader_is_not_the_lock_of_a_daemon(tmp_path: Path) -> None:
-    first = Board(tmp_path)
-    first.die()
-    with first.path.open("rb") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        Board(tmp_path, epoch=78).publisher.close()
-    first.publisher.close()
 
 
 def dead_pid() -> int:

@@ -40,22 +40,16 @@ def test_all_samples_of_a_device_with_the_same_rate_are_selected(device_hz: floa
     assert len(taken(Pace(100.0), times_ns)) >= len(times_ns) - 5
 
 
-def test_the_selection_does_not_drift_in_a_day() -> None:
+def test_the_selection_does_not_drift_and_has_no_burst() -> None:
     pace, instants = Pace(3.0), 259_200
     times_ns = [START_NS + ceil(k * 1e9 / 3.0) for k in range(instants)]
     assert sum(pace.is_due(t_ns, 333_333_333) for t_ns in times_ns) == instants
     # half a sample period before due time number 259,200
     assert pace.due_ns == START_NS + 86_400 * 1_000_000_000 - 166_666_667 + 1
-
-
-def test_a_rate_above_the_sample_rate_selects_all_samples() -> None:
     for step_ns, rates_hz in ((1_000_000, (1000.0, 1001.0, 1e6)), (1, (1e9, 5e9, 1e300))):
         times_ns = [START_NS + k * step_ns for k in range(100)]
         for rate_hz in rates_hz:
             assert taken(Pace(rate_hz), times_ns) == times_ns
-
-
-def test_after_a_pause_there_is_no_burst() -> None:
     times_ns = [START_NS, *(START_NS + 5_000_000_000 + k * 10_000_000 for k in range(10))]
     assert taken(Pace(10.0), times_ns) == times_ns[:2]
 

@@ -38,10 +38,21 @@ def test_the_fit_follows_the_frames_without_delay(slope: float) -> None:
     assert fit.error_ns < 20_000
 
 
-def test_a_young_fit_stays_within_its_bounds() -> None:
+def test_the_window_is_bounded() -> None:
     fit, off_ns = fitted(1.0, 1_000_000, 1)
     assert abs(off_ns) < 1_000_000
     assert fit.slope_error > 1e-5
+    # Each change opens a bin: the number of bins in a window is limited.
+    fit, _ = fitted(1.0, 1_000_000, 200)
+    assert 30 * NS_PER_S < fit.span_ns < (BINS + 2) * NS_PER_S
+    later = range(200 * NS_PER_S, 200 * NS_PER_S + fit.span_ns, 10 * NS_PER_MS)
+    assert sum(add(fit, device_ns, device_ns + 1_000_000) for device_ns in later) <= BINS
+    # One arrival that is too early affects the fit for at most one window.
+    fit, device_ns = ArrivalFit(0, -5_000_000), 0
+    for i in range(1, 100 * 100):
+        device_ns = i * 10 * NS_PER_MS
+        add(fit, device_ns, device_ns)
+    assert abs(at(fit, device_ns) - device_ns) < 10
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -73,23 +84,6 @@ def test_the_fit_is_over_the_bins_that_are_left() -> None:
         if add(fit, device_ns, arrival_ns):
             kept = [(x, y) for x, y in points if x >= device_ns - fit.span_ns]
             assert min(y - at(fit, x) for x, y in kept) > -10_000  # lowest point above an earlier fit
-
-
-def test_the_window_is_bounded() -> None:
-    """Each change opens a bin: the number of bins in a window is limited."""
-    fit, _ = fitted(1.0, 1_000_000, 200)
-    assert 30 * NS_PER_S < fit.span_ns < (BINS + 2) * NS_PER_S
-    later = range(200 * NS_PER_S, 200 * NS_PER_S + fit.span_ns, 10 * NS_PER_MS)
-    assert sum(add(fit, device_ns, device_ns + 1_000_000) for device_ns in later) <= BINS
-
-
-def test_an_old_minimum_leaves_the_window() -> None:
-    """One arrival that is too early affects the fit for at most one window."""
-    fit, device_ns = ArrivalFit(0, -5_000_000), 0
-    for i in range(1, 100 * 100):
-        device_ns = i * 10 * NS_PER_MS
-        add(fit, device_ns, device_ns)
-    assert abs(at(fit, device_ns) - device_ns) < 10
 
 
 # --- latency timers -------------------------------------------------------------------------------------------------
@@ -166,14 +160,11 @@ def test_a_timer_that_is_longer_than_reported_is_measured(reported_ms: int, true
 # --- feasible lines ---------------------------------------------------------------------------------------------------
 
 
-def test_level_bounds() -> None:
+def test_feasible_lines_have_bounds_or_do_not_exist() -> None:
     found = feasible_lines([(0.0, 10.0), (10.0, 10.0)], [(0.0, 0.0), (10.0, 0.0)], 10.0)
     assert found is not None
     assert (found.lowest_ns, found.highest_ns) == (0.0, 10.0)
     assert (found.slope_lowest, found.slope_highest) == (-1.0, 1.0)
-
-
-def test_no_line_fits() -> None:
     assert feasible_lines([(0.0, 0.0), (10.0, 0.0)], [(5.0, 1.0)], 10.0) is None
     assert feasible_lines([(5.0, 0.0)], [(5.0, 1.0)], 10.0) is None
 

@@ -52,15 +52,12 @@ def test_a_number_counts_what_is_missing() -> None:
     assert times.missed == 2
 
 
-def test_a_timer_hides_no_more_than_the_pause() -> None:
+def test_hold_of_a_timer_and_receive_timeout_of_a_uart() -> None:
     delay = LinkDelay(byte_ns=10_850, hold_ns=16 * NS_PER_MS)
     assert delay.held_ns(0.0, 82) == 16 * NS_PER_MS
     assert delay.held_ns(1e6, 82) == 1e6 - 82 * 10_850
     assert delay.held_ns(1e9, 82) == 16 * NS_PER_MS
     assert delay.held_ns(1e5, 82) == 0.0
-
-
-def test_a_uart_has_a_receive_timeout() -> None:
     assert LinkDelay(86_805, 0).floor_ns - LinkDelay(0, 0).floor_ns == 4 * 86_805
 
 
@@ -83,11 +80,19 @@ def settled(even: EvenArrivals, count: int = 300) -> int:
     return BEGIN_NS + count * PERIOD_NS
 
 
-def test_it_is_not_used_before_its_pace_is_known() -> None:
+def test_arrivals_need_a_known_pace() -> None:
     even = EvenArrivals()
     used = [even.add_arrival(DELAY, BEGIN_NS + i * PERIOD_NS, 0, triggered=False) for i in range(60)]
     assert not any(used[:40])
     assert used[-1]
+    random, even, t_ns, used_count = Random(2), EvenArrivals(), BEGIN_NS, 0
+    for _ in range(3000):
+        t_ns += int(random.expovariate(1 / PERIOD_NS))
+        used_count += even.add_arrival(DELAY, t_ns, 0, triggered=False)
+    assert used_count < 300
+    even = EvenArrivals()
+    delay = LinkDelay(0, 16 * NS_PER_MS)
+    assert not any(even.add_arrival(delay, BEGIN_NS + i * PERIOD_NS, 0, triggered=False) for i in range(200))
 
 
 def test_delayed_frames_are_time_stamped_by_the_fit() -> None:
@@ -140,17 +145,3 @@ def test_another_rate_restarts_the_fit(period_ns: int) -> None:
     assert not all(used)
     assert used[-1]
     assert abs(even.t_ns - (due_ns + 399 * period_ns)) < 200 * NS_PER_US
-
-
-def test_arrivals_without_a_pace_keep_the_arrival_time() -> None:
-    random, even, t_ns, used = Random(2), EvenArrivals(), BEGIN_NS, 0
-    for _ in range(3000):
-        t_ns += int(random.expovariate(1 / PERIOD_NS))
-        used += even.add_arrival(DELAY, t_ns, 0, triggered=False)
-    assert used < 300
-
-
-def test_an_adapter_that_holds_frames_hides_losses() -> None:
-    even = EvenArrivals()
-    delay = LinkDelay(0, 16 * NS_PER_MS)
-    assert not any(even.add_arrival(delay, BEGIN_NS + i * PERIOD_NS, 0, triggered=False) for i in range(200))

@@ -230,12 +230,9 @@ def test_a_fit_beside_the_intervals_is_moved_and_doubted_by_that() -> None:
     assert error == pytest.approx(MS, rel=0.01)
 
 
-def test_the_width_grows_with_time() -> None:
+def test_the_width_grows_with_time_and_arrivals_bound_it() -> None:
     intervals, x = filled(50.0, 5)
     assert intervals.width_ns(x + NS_PER_S) > intervals.width_ns(x) + 10_000
-
-
-def test_arrivals_bound_from_above() -> None:
     intervals = IntervalFit()
     for x in range(0, 5 * NS_PER_S, NS_PER_S):
         intervals.add_interval(x, x, x + MS, x + 100_000, 1.0)

@@ -51,29 +51,23 @@ def running(count: int = 100) -> EdgePairing:
     return pairing
 
 
-def test_events_that_come_together_are_distinguished() -> None:
+def test_each_event_is_paired_with_its_sample() -> None:
     pairing = running()
     pairing.add_events([(i * PERIOD_NS, i) for i in range(100, 116)])
     assert [(pair(pairing, i), pairing.number) for i in range(100, 116)] == [(True, i) for i in range(100, 116)]
-
-
-def test_either_side_may_lose() -> None:
     pairing = running()
     pairing.add_events([(i * PERIOD_NS, i) for i in (100, 102, 103)])
     assert [(pair(pairing, i), pairing.number) for i in (100, 101, 103)] == [(True, 100), (False, 100), (True, 103)]
     assert (pairing.events_unpaired, pairing.samples_unpaired) == (1, 1)
 
 
-def test_the_nearest_is_taken_and_a_distant_one_is_not() -> None:
+def test_distant_events_are_unpaired() -> None:
     pairing = running()
     at = 100 * PERIOD_NS
     pairing.add_events([(at - 3 * NS_PER_MS, 1), (at - 20_000, 2), (at + 5_000, 3), (at + 3 * NS_PER_MS, 4)])
     assert pair(pairing, 100)
     assert (pairing.stamp_ns, pairing.number) == (at + 5_000, 3)
     assert not pair(pairing, 101)
-
-
-def test_a_distant_event_counts_as_unpaired_on_both_sides() -> None:
     pairing = running()
     pairing.add_events([(100 * PERIOD_NS + NS_PER_MS, 100)])
     assert not pair(pairing, 100)
@@ -90,14 +84,11 @@ def test_it_begins_only_when_most_agree_and_the_fit_is_sure(apart_ns: int, error
     assert not pairing.running
 
 
-def test_a_line_without_events_is_dropped() -> None:
+def test_lines_without_events_or_off_by_a_period_are_dropped() -> None:
     pairing = running()
     assert not any(pair(pairing, 100 + i) for i in range(MISSES_MOST))
     assert not pairing.running
     assert pairing.learned
-
-
-def test_a_line_off_by_a_period_is_found_by_the_fit() -> None:
     pairing = running()
     for i in range(100, 100 + WRONG_MOST + 200):
         pairing.add_events([(i * PERIOD_NS, i)])

@@ -24,9 +24,13 @@ needs_jsonschema = pytest.mark.skipif(not CHECKER.able, reason="the package json
 UTC_NS = 1_790_000_000_000_000_000 + 1_000_000
 
 
-def test_the_file_in_docs_is_of_these_types() -> None:
+def test_the_file_in_docs_and_the_types_of_methods() -> None:
     current = (ROOT / "docs" / "socket.schema.json").read_text()
     assert current == socket_schema(), "run python -m docs.generate.references"
+    free = {name for name, method in METHODS.items() if method.result is Any}
+    assert free <= {"command"}  # the result of an action can have any type
+    fields = [(name, one) for name, method in METHODS.items() for one in msgspec.structs.fields(method.params)]
+    assert [(name, one.name) for name, one in fields if not one.required and NoneType not in get_args(one.type)] == []
 
 
 @needs_jsonschema
@@ -41,11 +45,6 @@ def test_the_schema_is_valid_and_finds_invalid_messages() -> None:
     for params in ({"device": "a"}, {"device": 1, "device_id": 1}, {"device": "a", "device_id": 1, "more": 2}):
         with pytest.raises(AssertionError, match=r"notification\.device"):
             CHECKER.check("notification.device", {**good, "params": params})
-
-
-def test_every_method_has_a_described_result() -> None:
-    free = {name for name, method in METHODS.items() if method.result is Any}
-    assert free <= {"command"}  # the result of an action can have any type
 
 
 def test_every_notification_of_the_server_is_described() -> None:
@@ -75,11 +74,6 @@ async def test_optional_parameters_may_be_null(server: SocketServer) -> None:
     assert (await peer.result("poll", **nothing))["samples"] == []
     assert await peer.result("events", devices=None, enable=None) == {"enable": True}
     assert (await peer.result("options", big_numbers=None))["big_numbers"] == "number"
-
-
-def test_every_parameter_with_a_default_may_be_null() -> None:
-    fields = [(name, one) for name, method in METHODS.items() for one in msgspec.structs.fields(method.params)]
-    assert [(name, one.name) for name, one in fields if not one.required and NoneType not in get_args(one.type)] == []
 
 
 @in_server()

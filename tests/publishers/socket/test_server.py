@@ -574,12 +574,17 @@ def test_the_file_appears_with_its_final_rights(tmp_path: Path, monkeypatch: pyt
     assert not list(tmp_path.iterdir())
 
 
-def test_a_path_of_the_greatest_length(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paths_of_the_socket_are_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / ("x" * (PATH_MAX_BYTES - len(str(tmp_path)) - 1))
     as_process(monkeypatch, 4_194_303, lambda: Listener(path, GROUP)).close()
     longer = path.with_name(path.name + "x")
     with pytest.raises(ServerError, match=f"at most {PATH_MAX_BYTES} bytes, got {PATH_MAX_BYTES + 1}"):
         Listener(longer, GROUP)
+    file = tmp_path / f"imud.sock.{os.getpid()}"
+    file.touch()
+    with pytest.raises(ServerError, match=f"{file.name} exists; remove it"):
+        Listener(tmp_path / "imud.sock", GROUP)
+    assert list(tmp_path.iterdir()) == [file]
 
 
 def test_two_daemons_start_at_the_same_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -636,14 +641,6 @@ def test_leftovers_of_dead_daemons_go_and_nothing_else(tmp_path: Path) -> None:
         f"imud.sock.{other.pid}", f"imud.sock.{ended.pid}.x", "imud.sock.x", f"other.{ended.pid}",
         f"imud.sock.0{ended.pid}", f"imud.sock.00{ended.pid}",
     }  # fmt: skip
-
-
-def test_a_file_in_the_way_of_the_first_name(tmp_path: Path) -> None:
-    file = tmp_path / f"imud.sock.{os.getpid()}"
-    file.touch()
-    with pytest.raises(ServerError, match=f"{file.name} exists; remove it"):
-        Listener(tmp_path / "imud.sock", GROUP)
-    assert list(tmp_path.iterdir()) == [file]
 
 
 def failing(error: OSError) -> Callable[..., NoReturn]:
