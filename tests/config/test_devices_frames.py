@@ -91,16 +91,3 @@ def test_a_declination_needs_a_magnetic_heading() -> None:
     assert config.parse(nmea, "f.yaml").devices[0].declination_deg == 1
     with pytest.raises(ConfigError, match="whose heading is already true"):
         config.parse(nmea + "    options: {heading: 'true'}\n", "f.yaml")
-
-
-def test_the_shipped_examples_show_the_defaults() -> None:
-    from tests.config.test_reading import SHIPPED, uncommented
-
-    devices = config.parse(uncommented(SHIPPED.read_text()), "etc/imud.yaml").devices
-    frames = {device.name: device.frame for device in devices if device.frame is not None}
-    assert frames == {
-        "crane": FrameOptions(axes=MountingAxes(x="y", y="-x", z="z")),
-        "pole": FrameOptions(euler=MountingAngles()),
-        "mirror": FrameOptions(quat_wxyz=[1.0, 0.0, 0.0, 0.0]),
-    }
-    assert {(device.convention, device.declination_deg) for device in devices} == {(None, None)}

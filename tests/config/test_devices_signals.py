@@ -150,17 +150,6 @@ def test_drivers_have_lines_that_there_are() -> None:
     assert DRIVERS["imu61x-i2c"].lines == {"reset", "data_ready"}
 
 
-def test_the_shipped_examples_show_the_defaults() -> None:
-    from tests.config.test_reading import SHIPPED, uncommented
-
-    devices = config.parse(uncommented(SHIPPED.read_text()), "etc/imud.yaml").devices
-    lines = [device.lines for device in devices if device.lines]
-    shown = {name: made for one in lines for name in LINE_SCHEMAS if (made := getattr(one, name)) is not None}
-    assert set(shown) == set(LINE_SCHEMAS)
-    for name, made in shown.items():
-        assert made == LINE_SCHEMAS[name](line=made.line, chip=made.chip)
-
-
 # --- the source of RMC sentences --------------------------------------------------------------------------------------
 
 

@@ -18,13 +18,14 @@ from msgspec import Meta
 from docs.generate import references
 from imud import config
 from imud.attitude.conventions import Heading
+from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes
 from imud.config.devices import DEVICES_MAX
 from imud.config.model import Config, DeviceConfig
 from imud.config.reading import PROBLEMS_SHOWN
 from imud.config.schema import TABLES, Tables
 from imud.config.yaml import EVENTS_PER_TURN
 from imud.contracts.driver import KeyProblem
-from imud.contracts.lines import DeviceLines
+from imud.contracts.lines import LINE_SCHEMAS, DeviceLines
 from imud.contracts.link import Claim
 from imud.contracts.setting import SettingsTable
 from imud.drivers import DRIVERS
@@ -385,6 +386,16 @@ def test_shipped_file_shows_the_defaults() -> None:
     for name, link in (("keel", "i2c"), ("nothing", "memory")):
         assert named[name].link_settings == LINKS[link].settings()
     assert {device.link for device in full.devices} == set(LINKS)
+    frames = {device.name: device.frame for device in full.devices if device.frame is not None}
+    assert frames == {
+        "crane": FrameOptions(axes=MountingAxes(x="y", y="-x", z="z")), "pole": FrameOptions(euler=MountingAngles()),
+        "mirror": FrameOptions(quat_wxyz=[1.0, 0.0, 0.0, 0.0]),
+    }  # fmt: skip
+    assert {(device.convention, device.declination_deg) for device in full.devices} == {(None, None)}
+    lines = [device.lines for device in full.devices if device.lines]
+    shown = {name: made for one in lines for name in LINE_SCHEMAS if (made := getattr(one, name)) is not None}
+    assert shown == {name: LINE_SCHEMAS[name](line=made.line, chip=made.chip) for name, made in shown.items()}
+    assert set(shown) == set(LINE_SCHEMAS)
 
 
 def test_shipped_file_has_every_key() -> None:

@@ -22,6 +22,7 @@ from tests.support.metrics import device
 BY_ID = "/dev/serial/by-id/usb-FTDI_FT232R_USB_UART_A1-if00-port0"
 EXAMPLE = (ROOT / "etc/imud.yaml").read_text()
 PORT = Wanted()
+RULES = "/etc/udev/rules.d/61-imud-setup.rules"
 
 
 @pytest.fixture
@@ -180,10 +181,22 @@ def test_without_systemd_the_configuration_is_written(gateway: LivingMachine, se
     assert gateway.ran == []
 
 
-def test_a_configuration_with_a_mistake_is_not_touched(gateway: LivingMachine, setup: Setup) -> None:
-    gateway.write("/etc/imud.yaml", "devices: {bow: {}}\n")
-    with pytest.raises(ConfigError, match=r"imud.yaml:1:\d+: devices.bow"):
-        setup.steps().set_up(PORT, ())
+@pytest.mark.parametrize(
+    ("prepare", "error", "words"),
+    [
+        (lambda at: at.write("/etc/imud.yaml", "devices: {bow: {}}\n"), ConfigError, r"imud.yaml:1:\d+: devices.bow"),
+        (lambda at: at.write(RULES, "#" * (1 << 20) + "\n"), ImudError, "expected at most 1048576 bytes, got more"),
+        (lambda at: (at.root / RULES[1:]).symlink_to("/dev/null"), ImudError, "symbolic link to /dev/null"),
+        (lambda at: None, BadArgument, "--yes"),  # questions need a terminal
+    ],
+    ids=["configuration with a mistake", "large file", "link in place of the rules", "no terminal"],
+)
+def test_nothing_is_changed_after_a_refusal(
+    gateway: LivingMachine, setup: Setup, prepare: Callable[[LivingMachine], object], error: type[ImudError], words: str
+) -> None:
+    prepare(gateway)
+    with pytest.raises(error, match=words):
+        setup.steps(ask=error is BadArgument).set_up(PORT, ())
     assert gateway.ran == []
 
 
@@ -250,13 +263,6 @@ def test_control_and_wait_have_an_effect(gateway: LivingMachine, setup: Setup) -
     said = setup.said()
     assert "imu: nothing is heard" in said
     assert "the next step with `sudo imud doctor`" in said
-
-
-def test_a_file_that_is_too_large_is_not_changed(gateway: LivingMachine, setup: Setup) -> None:
-    gateway.write("/etc/udev/rules.d/61-imud-setup.rules", "#" * (1 << 20) + "\n")
-    with pytest.raises(ImudError, match="expected at most 1048576 bytes, got more"):
-        setup.steps().set_up(PORT, ())
-    assert gateway.ran == []
 
 
 def test_undo_leaves_what_is_already_as_before(gateway: LivingMachine, setup: Setup) -> None:
@@ -362,12 +368,6 @@ def test_a_no_changes_nothing(gateway: LivingMachine, setup: Setup, answers: dic
     assert setup.steps(dry_run=True).undo() == 0
     assert "Undo, newest change first:" in setup.said()
     assert gateway.files() == after
-
-
-def test_without_a_terminal_questions_are_an_error(gateway: LivingMachine, setup: Setup) -> None:
-    with pytest.raises(BadArgument, match="--yes"):
-        setup.steps(ask=True).set_up(PORT, ())
-    assert gateway.ran == []
 
 
 # --- ports in use, consoles, CAN --------------------------------------------------------------------------------------
@@ -554,13 +554,6 @@ def test_a_link_in_place_of_the_configuration_is_followed(gateway: LivingMachine
     assert BY_ID in (gateway.root / "etc/kept/imud.yaml").read_text()
     assert setup.steps().undo() == 0
     assert (gateway.root / "etc/kept/imud.yaml").read_text() == EXAMPLE
-
-
-def test_a_link_in_place_of_the_rules_is_refused(gateway: LivingMachine, setup: Setup) -> None:
-    (gateway.root / "etc/udev/rules.d/61-imud-setup.rules").symlink_to("/dev/null")
-    with pytest.raises(ImudError, match="symbolic link to /dev/null"):
-        setup.steps().set_up(PORT, ())
-    assert gateway.ran == []
 
 
 def test_a_command_that_fails_ends_it_and_what_was_done_is_told(gateway: LivingMachine, setup: Setup) -> None:

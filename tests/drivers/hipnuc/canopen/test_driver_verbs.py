@@ -83,7 +83,6 @@ def test_arguments_that_cannot_be_send_nothing(name: str, given: dict[str, objec
         next(begun(name, **given))
 
 
-@pytest.mark.manual("B 5.4.1 node number")
 def test_the_module_obeys() -> None:
     bench = CanopenBench(NodeSettings(periods_ms=QUIET.periods_ms))
     bench.run_script(begun("direction", x_reversed=False, y_reversed=True))
@@ -94,12 +93,6 @@ def test_the_module_obeys() -> None:
     assert not bench.module.objects.settings.invert_x
     assert bench.run_script(begun("nmt", command="reset_node")) == "found as node 8"
     assert not bench.module.objects.settings.invert_y  # nothing was saved
-    bench = CanopenBench()
-    bench.run_script(begun("node", node=9))
-    assert bench.module.node == 8
-    bench.run_script(begun("save"))
-    assert bench.run_script(begun("restart")) == "found as node 9"
-    assert bench.module.node == bench.settings.node == 9
 
 
 def test_an_interval_above_the_bus_load_is_rejected_with_numbers() -> None:

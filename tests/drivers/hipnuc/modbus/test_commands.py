@@ -142,13 +142,6 @@ def test_a_rate_is_in_force_after_saving_and_restarting(bench: ModbusBench) -> N
     assert bench.slave.baud == 9600
 
 
-@pytest.mark.manual("B 4.3.2 baud rate")
-def test_code_nine_is_256000(bench: ModbusBench) -> None:
-    if not bench.slave.variant.rate_at_once:
-        bench.run(set_baud(256000))
-        assert (bench.sent[0], bench.slave.settings.baud) == ((7, bytes.fromhex("0600040009")), 256000)
-
-
 @pytest.mark.manual("B 4.3.1 factory settings")
 def test_mounting_level_and_factory_settings(bench: ModbusBench) -> None:
     assert bench.run(set_mounting(LineMounting.X_UP)) is Written.UNVERIFIED

@@ -35,7 +35,7 @@ def act(bench: ModbusBench, name: str, **given: object) -> object:
         ("mounting", {"mounting": "y_down"}, "0600a60001"), ("mounting", {"mounting": "x_up"}, "0600a60003"),
     ],
 )  # fmt: skip
-@pytest.mark.manual("B 4.3.1 save", "B 4.3.4 mounting", "B 4.3.5 level", "B 4.3.6 axes")
+@pytest.mark.manual("B 4.3.1 save", "B 4.3.2 baud rate", "B 4.3.4 mounting", "B 4.3.5 level", "B 4.3.6 axes")
 def test_requests_as_sent(name: str, given: dict[str, object], sent: str) -> None:
     bench = ModbusBench()
     act(bench, name, **given)
