@@ -31,16 +31,13 @@ def test_without_pairs_and_with_one_the_two_are_the_same() -> None:
             assert one.steady_ns(at_ns) == one.monotonic_ns(at_ns) == at_ns
 
 
-def test_times_between_pairs_are_interpolated_both_ways() -> None:
+def test_offsets_between_before_and_after_pairs() -> None:
     """By hand: 83,333 ppm for a second, pairs every 10 ms; half a step is 5 ms, or 5.416665 ms."""
     steady = slewed(FAST, 101)
     assert steady.monotonic_ns(BEGIN_NS + 5 * NS_PER_MS) == BEGIN_NS + 5_416_665
     assert steady.steady_ns(BEGIN_NS + 5_416_665) == BEGIN_NS + 5 * NS_PER_MS
     assert steady.monotonic_ns(BEGIN_NS + NS_PER_S) == BEGIN_NS + 1_083_333_000
     assert steady.rate == pytest.approx(FAST, rel=1e-6)
-
-
-def test_times_before_all_pairs_and_after_them_have_the_nearest_offset() -> None:
     steady = slewed(FAST, 11)
     assert steady.monotonic_ns(BEGIN_NS - 7) == BEGIN_NS - 7
     last_ns = BEGIN_NS + 100 * NS_PER_MS
