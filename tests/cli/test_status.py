@@ -70,11 +70,14 @@ def test_json_is_all_that_the_socket_sends(tmp_path: Path, cli: Cli, monkeypatch
         assert shown["devices"] == said["devices"]
 
 
-def test_problems_of_devices_and_of_mqtt_are_shown() -> None:
+def test_a_device_that_does_not_run_has_its_reason_and_the_next_step() -> None:
     assert "doctor" not in page([device("bow"), device("mast", state=DeviceState.FINISHED)])
     text = page([device("bow"), device("mast", state=DeviceState.MISSING, problem="/dev/x is not there: the cable?")])
     assert "mast: missing\n  /dev/x is not there: the cable?\n" in text
     assert text.endswith("\n\nto find the cause and the next step, run `sudo imud doctor`")
+
+
+def test_problems_of_mqtt_are_shown() -> None:
     mqtt = MqttStatus("", "no route", "", 0, 0, 0, 0, 0, 0, 0, {}, 0, refused={"a/b": "Not authorized"})
     assert page([], [mqtt]).splitlines() == [
         "mqtt: no route", "", "mqtt: the broker refuses messages of a/b: Not authorized",

@@ -29,17 +29,12 @@ def parsed(*words: str) -> object:
     return guard_of(build_parser(("web",)).parse_args(["web", *words]))
 
 
-def test_addresses_and_ports_are_checked(cli: Cli) -> None:
+def test_another_address_needs_a_token() -> None:
     for address in ("0.0.0.0", "::", "192.168.1.5", "gateway"):
         with pytest.raises(BadArgument, match="add --token-file FILE, or omit --address and use a tunnel: ssh -L"):
             parsed("--address", address)
     with pytest.raises(BadArgument, match="--reading token: add --token-file"):
         parsed("--reading", "token")
-    for port in ("-1", "65536", "99999999999999999999"):
-        assert cli("web", "--port", port, status=2).err == f"imud web: --port: expected 0 to 65535, got {port}\n"
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        cli.refuses(f"cannot listen on 127.0.0.1 port {port}: ", "web", "--port", port)
 
 
 def test_who_may_look(token: str) -> None:
@@ -85,6 +80,14 @@ def test_it_serves_until_a_signal_and_says_where_it_is_open(
     assert ("OPEN: other hosts can reach 0.0.0.0 port" in errors) == is_open
     assert "Traceback" not in errors
     assert TOKEN not in line + errors
+
+
+def test_a_port_that_cannot_be_had_is_refused(cli: Cli) -> None:
+    for port in ("-1", "65536", "99999999999999999999"):
+        assert cli("web", "--port", port, status=2).err == f"imud web: --port: expected 0 to 65535, got {port}\n"
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        cli.refuses(f"cannot listen on 127.0.0.1 port {port}: ", "web", "--port", port)
 
 
 def test_addresses_and_who_may_look_and_change_are_said(capsys: pytest.CaptureFixture[str]) -> None:

@@ -67,16 +67,22 @@ def play(path: Path, enough: int = 1 << 30, **keys: Any) -> tuple[list[CanFrame]
     return frames, ends, clock.now_ns() - begin_ns
 
 
-def test_speeds_of_a_replay(tmp_path: Path) -> None:
+def test_maximum_speed_ends_now_and_keeps_the_recorded_steps(tmp_path: Path) -> None:
     frames, ends, took_ns = play(write(tmp_path / "a.log", 1600), speed="maximum")
     assert (ends, took_ns) == ([None], 0)
     assert len(frames) == sum(n % 3 != 0 for n in range(1600))
     assert {frame.can_id for frame in frames} == {101, 102}
     assert frames[1].t_rx_ns - frames[0].t_rx_ns == 10 * MS
     assert VirtualClock().now_ns() - frames[-1].t_rx_ns == 10 * MS, "the last frame does not pass the filters"
+
+
+def test_recorded_speed_takes_its_time(tmp_path: Path) -> None:
     frames, _, took_ns = play(write(tmp_path / "a.log", 9, step_ms=5))
     assert took_ns == pytest.approx(40 * MS, abs=100)
     assert [b.t_rx_ns - a.t_rx_ns for a, b in itertools.pairwise(frames)] == [5 * MS, 10 * MS] * 2 + [5 * MS]
+
+
+def test_it_can_repeat_and_be_closed_by_the_receiver(tmp_path: Path) -> None:
     frames, ends, _ = play(write(tmp_path / "a.log", 3, step_ms=1), enough=7, repeat=True)
     assert [frame.can_id for frame in frames[:6]] == [101, 102] * 3
     assert ends == []

@@ -2,41 +2,24 @@
 
 from collections.abc import Callable, Sequence
 from math import sqrt
-from random import Random
 from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import pytest
 
-from imud.attitude.published import published_frame
 from imud.contracts.codec import BadFrame, BadReason, PolledEvent, Reading, Vanished
-from imud.contracts.driver import CanDriver, Driver, PolledDriver, StreamDriver
 from imud.contracts.lines import Edge, ReadyOptions, TriggerStamp
 from imud.contracts.publisher import Batch
 from imud.contracts.script import Message, ReplyFrame, TextLine
-from imud.contracts.status import LATENCY_BOUNDS_NS
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucOptions
 from imud.formats.can import CanFrame
-from imud.host.clock import HostClock
 from imud.model.errors import TransferError, Trouble
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Sample, Sync
 from imud.model.units import NS_PER_MS
-from imud.sampling.path import (
-    CanPath,
-    LatencyMeter,
-    LossMeter,
-    PathContext,
-    PolledPath,
-    PollTiming,
-    RateMeter,
-    ReadyEdges,
-    SamplePath,
-    StreamPath,
-    make_clock,
-)
+from imud.sampling.path import CanPath, PathContext, PolledPath, PollTiming, ReadyEdges, StreamPath, make_clock
 from tests.support.event_loops import UTC_AHEAD_NS, VirtualClock
 from tests.support.files import hi91
 
@@ -388,128 +371,3 @@ def test_edges_of_a_data_ready_line_time_stamp_the_reads() -> None:
     assert rig.noted.named()[-3:] == [("call", "edges", "restart"), ("edges",), ("readings",)]
     path.observe(None)
     assert edges.observer is None
-
-
-S = 1_000_000_000
-
-
-def test_rate_over_the_window_falls_to_zero_when_samples_stop() -> None:
-    meter = RateMeter()
-    assert meter.rate_hz() == 0.0
-    for tenth in range(31):  # 3 s at 100 Hz
-        meter.mark(tenth * S // 10, tenth * 10)
-    assert meter.rate_hz() == 100.0
-    meter = RateMeter()
-    for tenth in range(50):
-        meter.mark(tenth * S // 10, min(tenth, 10) * 10)
-    assert meter.rate_hz() == 0.0
-    meter = RateMeter()
-    for tenth in range(21):  # 1 s at 100 Hz, 1 s at 50 Hz
-        meter.mark(tenth * S // 10, min(tenth, 10) * 10 + max(tenth - 10, 0) * 5)
-    assert meter.rate_hz() == 75.0
-
-
-def test_latencies_go_into_the_buckets_whose_bounds_they_do_not_exceed() -> None:
-    meter = LatencyMeter()
-    for latency_ns in (50_000, 50_001, 10**12):
-        meter.add(2 * 10**12, published_after(latency_ns))
-    assert (meter.buckets[0], meter.buckets[1]) == (1, 1)
-    assert meter.buckets[len(LATENCY_BOUNDS_NS)] == 1
-    assert meter.sum_ns == 100_001 + 10**12
-    latencies = [10**12, 50_000_001, 50_000_000, 20_000_000, 20_000_000, 5_000_001, 49_999, 7]
-    together, alone = LatencyMeter(), LatencyMeter()
-    together.add(2 * 10**12, published_after(*latencies))
-    for latency_ns in latencies:
-        alone.add(2 * 10**12, published_after(latency_ns))
-    assert (together.buckets, together.buckets[-1], together.buckets[0]) == (alone.buckets, 2, 2)
-    assert together.sum_ns == alone.sum_ns == sum(latencies)
-
-
-def published_after(*latencies_ns: int) -> list[Sample]:
-    """Samples that are published at 2000 s, oldest first."""
-    return [
-        Sample("bow", seq, 2 * 10**12 - latency_ns, 1, Sync.ARRIVAL, 0, 0)
-        for seq, latency_ns in enumerate(latencies_ns, start=1)
-    ]
-
-
-def test_loss_is_explained_by_damage_first_then_overruns_then_the_device() -> None:
-    ledger = Ledger()
-    loss = LossMeter(ledger)
-    loss.bad_frames = 2
-    loss.missed(3, overruns=0)
-    assert (ledger.lost_crc, ledger.lost_overrun, ledger.lost_gap_device) == (2, 0, 1)
-    loss.bad_frames = 0
-    loss.missed(4, overruns=7)
-    assert (ledger.lost_crc, ledger.lost_overrun, ledger.lost_gap_device) == (2, 4, 1)
-    loss.missed(1, overruns=7)  # no new overrun
-    assert (ledger.lost_crc, ledger.lost_overrun, ledger.lost_gap_device) == (2, 4, 2)
-    loss.link_opened()
-    loss.missed(1, overruns=1)
-    assert ledger.lost_overrun == 5
-    assert ledger.lost() == 9
-
-
-class Order:
-    """Order of the reports to the observer and of the batches."""
-
-    def __init__(self) -> None:
-        self.seen: list[str] = []
-
-    def __getattr__(self, name: str) -> Any:
-        return lambda *arguments, **_: self.seen.append(str(arguments[1]) if name == "call" else name)
-
-
-def path_of(driver: Driver, order: Order) -> SamplePath:
-    ledger, options = Ledger(), driver.settings()
-    clock = make_clock("bow", None, driver, None)
-    context = PathContext(
-        "bow", 0, ledger, lambda _batch: order.seen.append("publish"), lambda *_: None, lambda _bad: None, lambda: 0,
-        HostClock(), published_frame(None, None, None, driver.axes),
-    )  # fmt: skip
-    if isinstance(driver, StreamDriver):
-        return StreamPath(driver.make_codec(ledger, options), clock, context)
-    if isinstance(driver, CanDriver):
-        return CanPath(driver.make_codec(ledger, options), clock, context)
-    assert isinstance(driver, PolledDriver)
-    return PolledPath(driver.make_codec(ledger, options), PollTiming(NS_PER_MS, 0, None), clock, context)
-
-
-@pytest.mark.parametrize("name", DRIVERS)
-def test_a_read_is_reported_before_its_samples_are_published(name: str) -> None:
-    driver, order, random = DRIVERS[name], Order(), Random(1)
-    path = path_of(driver, order)
-    path.observe(order)
-    if isinstance(path, StreamPath):
-        assert isinstance(driver, StreamDriver)
-        path.on_data(driver.example_frame(random), NS_PER_MS)
-        assert order.seen == ["data", "publish"]
-        path.gather(driver.example_frame(random), 2 * NS_PER_MS)
-        path.publish_gathered()
-        assert order.seen[2:] == ["data", "publish_gathered", "publish"]
-    elif isinstance(path, CanPath):
-        assert isinstance(driver, CanDriver)
-        frames = [
-            frame._replace(t_rx_ns=(10 * number + place) * NS_PER_MS)
-            for number in range(1, 30)
-            for place, frame in enumerate(driver.example_frames(random))
-        ]
-        path.on_frames(frames)
-        path.flush(1000 * NS_PER_MS)
-        assert order.seen in (["frames", "publish", "flush"], ["frames", "flush", "publish"])
-    else:
-        assert isinstance(path, PolledPath)
-        assert isinstance(driver, PolledDriver)
-        path.on_readings([Reading(0, driver.example_reading(random), None, NS_PER_MS, 2 * NS_PER_MS)])
-        assert order.seen == ["readings", "publish"]
-
-
-def test_an_incomplete_frame_is_reported_before_the_frames_in_it_are_published() -> None:
-    driver, order = DRIVERS["hipnuc-uart"], Order()
-    assert isinstance(driver, StreamDriver)
-    path = path_of(driver, order)
-    path.observe(order)
-    assert isinstance(path, StreamPath)
-    path.on_data(b"\x5a\xa5\x00\x01" + driver.example_frame(Random(1)), NS_PER_MS)  # 256 bytes by its length
-    path.flush(50 * NS_PER_MS)
-    assert order.seen == ["data", "flush", "publish"]

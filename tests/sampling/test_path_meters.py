@@ -1,0 +1,65 @@
+"""Rate, latency, and causes of loss, computed by hand."""
+
+from imud.contracts.status import LATENCY_BOUNDS_NS
+from imud.model.ledger import Ledger
+from imud.model.sample import Sample, Sync
+from imud.sampling.path import LatencyMeter, LossMeter, RateMeter
+
+S = 1_000_000_000
+
+
+def test_rate_over_the_window_falls_to_zero_when_samples_stop() -> None:
+    meter = RateMeter()
+    assert meter.rate_hz() == 0.0
+    for tenth in range(31):  # 3 s at 100 Hz
+        meter.mark(tenth * S // 10, tenth * 10)
+    assert meter.rate_hz() == 100.0
+    meter = RateMeter()
+    for tenth in range(50):
+        meter.mark(tenth * S // 10, min(tenth, 10) * 10)
+    assert meter.rate_hz() == 0.0
+    meter = RateMeter()
+    for tenth in range(21):  # 1 s at 100 Hz, 1 s at 50 Hz
+        meter.mark(tenth * S // 10, min(tenth, 10) * 10 + max(tenth - 10, 0) * 5)
+    assert meter.rate_hz() == 75.0
+
+
+def test_latencies_go_into_the_buckets_whose_bounds_they_do_not_exceed() -> None:
+    meter = LatencyMeter()
+    for latency_ns in (50_000, 50_001, 10**12):
+        meter.add(2 * 10**12, published_after(latency_ns))
+    assert (meter.buckets[0], meter.buckets[1]) == (1, 1)
+    assert meter.buckets[len(LATENCY_BOUNDS_NS)] == 1
+    assert meter.sum_ns == 100_001 + 10**12
+    latencies = [10**12, 50_000_001, 50_000_000, 20_000_000, 20_000_000, 5_000_001, 49_999, 7]
+    together, alone = LatencyMeter(), LatencyMeter()
+    together.add(2 * 10**12, published_after(*latencies))
+    for latency_ns in latencies:
+        alone.add(2 * 10**12, published_after(latency_ns))
+    assert (together.buckets, together.buckets[-1], together.buckets[0]) == (alone.buckets, 2, 2)
+    assert together.sum_ns == alone.sum_ns == sum(latencies)
+
+
+def published_after(*latencies_ns: int) -> list[Sample]:
+    """Samples that are published at 2000 s, oldest first."""
+    return [
+        Sample("bow", seq, 2 * 10**12 - latency_ns, 1, Sync.ARRIVAL, 0, 0)
+        for seq, latency_ns in enumerate(latencies_ns, start=1)
+    ]
+
+
+def test_loss_is_explained_by_damage_first_then_overruns_then_the_device() -> None:
+    ledger = Ledger()
+    loss = LossMeter(ledger)
+    loss.bad_frames = 2
+    loss.missed(3, overruns=0)
+    assert (ledger.lost_crc, ledger.lost_overrun, ledger.lost_gap_device) == (2, 0, 1)
+    loss.bad_frames = 0
+    loss.missed(4, overruns=7)
+    assert (ledger.lost_crc, ledger.lost_overrun, ledger.lost_gap_device) == (2, 4, 1)
+    loss.missed(1, overruns=7)  # no new overrun
+    assert (ledger.lost_crc, ledger.lost_overrun, ledger.lost_gap_device) == (2, 4, 2)
+    loss.link_opened()
+    loss.missed(1, overruns=1)
+    assert ledger.lost_overrun == 5
+    assert ledger.lost() == 9
