@@ -110,6 +110,12 @@ class PacketGuard:
             raise ValueError(f"the broker sent {UNREAD_MAX} packets and does not read the replies")
 
 
+def check_websocket_buffer(connection: object) -> None:
+    """Raise ValueError if paho-mqtt's buffer of an incomplete WebSocket frame exceeds WEBSOCKET_BYTES."""
+    if len(getattr(connection, "_readbuffer", b"")) > WEBSOCKET_BYTES:
+        raise ValueError(f"expected a WebSocket frame of at most {WEBSOCKET_BYTES} bytes, got a longer frame")
+
+
 @lru_cache(1)
 def _client_type() -> Any:
     """Return the class of the clients. Its import needs paho-mqtt."""
@@ -123,8 +129,7 @@ def _client_type() -> Any:
         def _sock_recv(self, bufsize: int) -> bytes:
             data = super()._sock_recv(bufsize)
             self.guard.take(data, is_writing=self.want_write())
-            if len(getattr(self.socket(), "_readbuffer", b"")) > WEBSOCKET_BYTES:
-                raise ValueError(f"expected a WebSocket frame of at most {WEBSOCKET_BYTES} bytes, got a longer frame")
+            check_websocket_buffer(self.socket())
             return data
 
     return GuardedClient

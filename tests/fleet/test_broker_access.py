@@ -12,7 +12,6 @@ from types import SimpleNamespace
 
 import msgspec
 import pytest
-from paho.mqtt.client import Client
 
 from imud.fleet.broker import (
     PACKET_BYTES,
@@ -23,6 +22,7 @@ from imud.fleet.broker import (
     PacketGuard,
     PahoConnection,
     Will,
+    check_websocket_buffer,
     connection_problem,
     paho_client,
     properties_of,
@@ -148,12 +148,11 @@ def test_messages_that_imud_did_not_request_end_the_connection(head: bytes) -> N
         use_gateway(broker)
 
 
-def test_a_long_websocket_frame_ends_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
-    client = paho_client(BROKER, MqttOptions(), "one", is_v5=True, packet_bytes=99)
-    monkeypatch.setattr(Client, "_sock_recv", lambda *_arguments: b"")
-    monkeypatch.setattr(client, "socket", lambda: SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES + 1)))
+def test_a_long_websocket_frame_ends_the_connection() -> None:
+    check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES)))
+    check_websocket_buffer(SimpleNamespace())  # a connection without WebSocket
     with pytest.raises(ValueError, match="WebSocket frame of at most"):
-        client._sock_recv(1)
+        check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES + 1)))
 
 
 def test_the_guard_finds_packets_in_any_pieces() -> None:

@@ -20,8 +20,7 @@ from tests.lab_debian.host.release import PYTHONS, Release
 
 NAME = "unit-tests"
 CLOCK = (
-    "arrival_fit", "arrival_time", "arrival_time_even_arrivals", "arrival_time_link_delay", "clock_even_run",
-    "device_time_stamp_time", "device_utc", "device_utc_intervals", "edge_pairing",
+    "arrival_fit", "arrival_time", "clock_even_run", "device_time_stamp_time", "device_utc", "edge_pairing",
 )  # fmt: skip
 """Tests of the clock without tests that simulate hours of arrivals, which take several minutes each in emulation."""
 PARTS = {
