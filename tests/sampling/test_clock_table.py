@@ -1,10 +1,14 @@
 """Time stamp error in short cells of `tests.bench.clock_table`, and regressions that its cells showed."""
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from statistics import fmean
 
 import pytest
 
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US, uart_byte_ns
+from imud.sim.ports.arrival import LOADED as LOADED_HOST
+from imud.sim.ports.arrival import USB_16MS, USB_16MS_PACKET, ArrivalModel, ArrivalProfile, Crystal
 from tests.bench.adversity import (
     CAN,
     FRAMES,
@@ -20,7 +24,10 @@ from tests.bench.adversity import (
     machine_of,
     messages,
 )
+from tests.bench.clock import BAUD_OF_RATE
 from tests.bench.clock_table import HOST_CLOCKS, RATIO_LEAST, RATIO_MOST, SLOW_RATE, clock_of, dated, figures_of
+from tests.bench.line_model import LineFaults
+from tests.bench.line_runs import DatedSample, run_pps, run_sout, run_triggers, run_utc
 
 FAST = replace(UART, baud=921_600)
 CHANGED = Device(rates_hz=((0.0, 100.0), (32.0, 400.0), (37.0, 50.0)))
@@ -45,6 +52,53 @@ def test_the_time_stamp_error_covers_the_truth(cell: Cell, most_us: float, seed:
     assert got.settling >= 0.95
     assert got.settled >= 0.97
     assert got.sigma_us <= most_us
+
+
+def _cell(number: int) -> Iterable[tuple[int, int]]:
+    return [one[:2] for one in dated(CELLS[number][0], 5, 20)]
+
+
+def _lines(found: Iterable[DatedSample]) -> Iterable[tuple[int, int]]:
+    return [(one.off_ns, one.sample.t_err_ns) for one in found]
+
+
+def _model(profile: ArrivalProfile, rate_hz: int = 100, ppm: float = 50.0) -> ArrivalModel:
+    return ArrivalModel(profile, rate_hz, 1, Crystal(ppm), BAUD_OF_RATE.get(rate_hz, 115_200))
+
+
+FIGURES: list[tuple[Callable[[], Iterable[tuple[int, int]]], tuple[int, int, int, int]]] = [
+    (lambda: _cell(0), (5200, 45084, 69075, 378272)),
+    (lambda: _cell(1), (2000, -36471, 469376, 1100457)),
+    (lambda: _cell(2), (2000, 292068, 1433446, 6204555)),
+    (lambda: _cell(3), (2000, 372716, 1182511, 5529449)),
+    (lambda: _cell(4), (2000, 48749, 256402, 781038)),
+    (lambda: _cell(5), (2000, 57036, 78614, 14848550)),
+    (lambda: _cell(6), (2000, 38440, 50084203, 204278)),
+    (lambda: _cell(7), (2000, 124773, 7505813, 164300)),
+    (
+        lambda: _lines(run_sout(_model(USB_16MS), 20, LineFaults(0.02, 0.02, 0.02, 0.05))),
+        (1965, 16154, 133717, 6027129),
+    ),
+    (lambda: _lines(run_sout(_model(LOADED_HOST, 400), 10, LineFaults(loaded=True))), (4000, 10938, 51347, 1152518)),
+    (lambda: _lines(run_pps(_model(USB_16MS), 40, silent_s=range(15, 20))), (4000, 111047, 441277, 6107129)),
+    (lambda: _lines(run_utc(_model(USB_16MS, ppm=-50_000.0), 30, turn_ms=1 << 32)[0]), (3000, 23601, 674168, 7687576)),
+    (
+        lambda: _lines(run_utc(_model(USB_16MS_PACKET), 30, turn_ms=86_400_000, back_at=0.7)[0]),
+        (3000, -372586, 940435, 5296665),
+    ),
+    (lambda: _lines(run_triggers(_model(LOADED_HOST), 20, 0.9)[0]), (1803, 5907, 87869, 1519111)),
+]
+"""Number of samples, mean error, mean stated error, and largest error of a run, ns."""
+
+
+@pytest.mark.parametrize(("run", "figures"), FIGURES)
+def test_the_figures_of_a_run_change_only_on_purpose(
+    run: Callable[[], Iterable[tuple[int, int]]], figures: tuple[int, int, int, int]
+) -> None:
+    """After a change of the clock, compare it with `python -m tests.bench.clock_table --base COMMIT`, and update."""
+    off_ns, t_err_ns = zip(*run(), strict=True)
+    got = (len(off_ns), fmean(off_ns), fmean(t_err_ns), max(map(abs, off_ns)))
+    assert got == pytest.approx(figures, rel=1e-6, abs=2)
 
 
 @pytest.mark.thorough
