@@ -77,6 +77,8 @@ class Reader:
     made: int = 0
     delivered: int = 0
     missed: int = 0
+    late_ns: int = 0
+    stated_ns: int = 0
     now_ns: int = BEGIN_NS
     waiting: list[int] = field(default_factory=list)
 
@@ -127,6 +129,8 @@ class Reader:
             assert sample.t_ns <= sample.t_rx_ns
             self.delivered += 1
             self.missed += self.clock.missed
+            self.late_ns += sample.t_ns - self.device.time_ns(index)
+            self.stated_ns += sample.t_err_ns
 
 
 def reader(device: Device, kept_bytes: int, seed: int) -> tuple[Reader, list[int]]:
@@ -165,6 +169,36 @@ def test_losses_over_stalls_are_those_of_the_device(device: Device, kept_bytes: 
     assert one.finish() == one.missed
     assert not unknown
     assert not device.stamp_modulus or one.clock.status().resets == 0
+
+
+FIGURES = [
+    (HI91_400, (20526, 15853, 0, 0, 6881662, 42150625)),
+    (IMU61X, (9026, 3453, 0, 2, 39514998, 43423370)),
+    (IMU61X_WRAPS, (9026, 3453, 0, 2, 39514998, 43423370)),
+    (NUMBERED_SHORT, (9026, 3453, 0, 0, 100238019, 6608218)),
+    (UNCOUNTED, (4928, 118, 1, 0, -54582426, 83666802)),
+    (UNCOUNTED_FAST, (20526, 15848, 0, 0, -141908012, 118447326)),
+    (HI92, (4928, 180, 0, 1, 5267146, 23445785)),
+    (HI92_400, (20526, 15897, 0, 0, -199349940, 154431348)),
+    (replace(HI92_400, pulses=True), (20526, 15849, 0, 2, -318281337, 207161284)),
+]
+
+
+@pytest.mark.parametrize(("device", "figures"), FIGURES)
+def test_the_figures_of_a_run_change_only_on_purpose(device: Device, figures: tuple[int, ...]) -> None:
+    """Delivered and missed samples, gaps of unknown size, resets, mean error and mean stated error, ns."""
+    one, unknown = reader(device, N_TTY, 9)
+    for _ in range(4):
+        one.starve(int(one.random.uniform(1, 12) * NS_PER_S), int(one.random.uniform(0.05, 0.7) * NS_PER_S))
+        one.run(2 * NS_PER_S)
+        one.stall(int(one.random.choice([0.05, 0.7, 5, 12]) * NS_PER_S))
+        one.made += 3  # lost in the device
+        one.run(int(one.random.choice([0.01, 0.3, 5]) * NS_PER_S))
+        device = one.device = replace(one.device, first=one.device.first + 40 * (device.tick_ns or 1) // NS_PER_MS)
+    one.finish()
+    means = (one.late_ns // one.delivered, one.stated_ns // one.delivered)
+    got = (one.delivered, one.missed, len(unknown), one.clock.status().resets, *means)
+    assert got == pytest.approx(figures, rel=1e-6, abs=2)
 
 
 @pytest.mark.parametrize("device", [HI92, replace(HI92_400, pulses=True)])
