@@ -69,5 +69,6 @@ def test_spectrograms() -> None:
     whole = power_spectrum(runs, RATE_HZ, 64)
     assert np.nanmean(found.density, axis=0) == pytest.approx(whole.density[:, 0], rel=0.02)
     assert (np.diff(found.time_s) > 0).all()
+    assert len(spectrogram([runs[0][:64], runs[0][:63]], [0.0, 9.0], RATE_HZ, 64).time_s) == 1
     with pytest.raises(BadArgument, match="a run of at least 64"):
         spectrogram([np.zeros((10, 3))], [0.0], RATE_HZ, 64)

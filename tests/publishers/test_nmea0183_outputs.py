@@ -155,11 +155,12 @@ async def test_a_port_in_use_is_reported(made: Server) -> None:
         TcpOutput("127.0.0.1", made.port, VirtualClock().now_ns).open()
 
 
-def test_datagrams() -> None:
+@pytest.mark.parametrize("address", ["127.0.0.1", "127.255.255.255"])
+def test_datagrams_to_a_host_and_to_all(address: str) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind(("127.0.0.1", 0))
+        receiver.bind((address, 0))
         receiver.settimeout(LIMIT_S)
-        made = UdpOutput("127.0.0.1", receiver.getsockname()[1])
+        made = UdpOutput(address, receiver.getsockname()[1])
         made.put(ONE * 3)
         assert receiver.recv(1000) == ONE * 3
         assert (made.status().sent, made.status().dropped, made.status().readers) == (3, 0, 1)

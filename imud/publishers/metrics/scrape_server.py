@@ -123,11 +123,7 @@ class ScrapeServer:
         loop.add_reader(listener, self._accept, loop, listener)
         ready.set()
         await self._stop.wait()
-        loop.remove_reader(listener)
-        connections = list(self._connections)
-        for connection in connections:
-            connection.cancel()
-        await asyncio.gather(*connections, return_exceptions=True)
+        loop.remove_reader(listener)  # `asyncio.run` cancels the tasks of all connections
 
     def _accept(self, loop: asyncio.AbstractEventLoop, listener: socket.socket) -> None:
         """Accept one client. `asyncio.start_server` may neither report nor close a client accepted at the end."""
