@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic_ns, sleep, time_ns
 from typing import Any, cast
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -192,6 +193,21 @@ async def test_whatever_an_output_raises_at_the_end_all_others_are_closed(caplog
     for output in outputs.values():
         assert output.did[-2:] == ["tick", "close"]
     assert "b: the end failed" in caplog.text
+
+
+@in_loop
+async def test_the_first_part_that_fails_to_close_is_the_reason(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon = Daemon(Config("info", "", {}, ()))
+    running = asyncio.create_task(daemon.run())
+    await asyncio.sleep(0)
+    for name in ("bow", "stern"):
+        monkeypatch.setitem(daemon._devices, name, Mock(close=Mock(side_effect=RuntimeError(name))))
+    daemon.stop()
+    with pytest.raises(RuntimeError, match="bow"):
+        await running
+    assert "stern: the end failed" in caplog.text
 
 
 def reload(daemon: RunningDaemon, devices: dict[str, Any], **more: Any) -> None:
