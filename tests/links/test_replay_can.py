@@ -34,10 +34,21 @@ def make(path: Path, **keys: object) -> CanLink:
     return row.make_can(msgspec.convert({"path": str(path), **keys}, row.settings))
 
 
-def play(path: Path, enough: int = 1 << 30, **keys: Any) -> tuple[list[CanFrame], list[LinkError | None], int]:
-    """Replay in simulated time to the end, or until `enough` frames. Return frames, ends and duration."""
+def play(
+    path: Path, enough: int = 1 << 30, looks: list[int] | None = None, **keys: Any
+) -> tuple[list[CanFrame], list[LinkError | None], int]:
+    """Replay in simulated time to the end, or until `enough` frames. Return frames, ends and duration.
+
+    `looks` gets the times at which the link reads the clock.
+    """
     clock = VirtualClock()
-    link = CanReplayLink(ReplayOptions(path=str(path), **keys), clock.now_ns)
+
+    def now_ns() -> int:
+        if looks is not None:
+            looks.append(clock.now_ns())
+        return clock.now_ns()
+
+    link = CanReplayLink(ReplayOptions(path=str(path), **keys), now_ns)
     link.filters = [CanFilter(101, 0x7FF, False), CanFilter(102, 0x7FF, False)]
     frames: list[CanFrame] = []
     ends: list[LinkError | None] = []
@@ -77,7 +88,9 @@ def test_maximum_speed_ends_now_and_keeps_the_recorded_steps(tmp_path: Path) -> 
 
 
 def test_recorded_speed_takes_its_time(tmp_path: Path) -> None:
-    frames, _, took_ns = play(write(tmp_path / "a.log", 9, step_ms=5))
+    looks: list[int] = []
+    frames, _, took_ns = play(write(tmp_path / "a.log", 9, step_ms=5), looks=looks)
+    assert len(looks) <= 2 * 9, "one wait for each frame"
     assert took_ns == pytest.approx(40 * MS, abs=100)
     assert [b.t_rx_ns - a.t_rx_ns for a, b in itertools.pairwise(frames)] == [5 * MS, 10 * MS] * 2 + [5 * MS]
 
