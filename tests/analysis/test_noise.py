@@ -85,7 +85,7 @@ def test_drift_with_temperature() -> None:
 
 
 def test_the_figures_of_a_filtered_walking_and_drifting_sensor() -> None:
-    """The figures are those of the commit that added this test: a change of the analysis must be on purpose."""
+    """The test fails after each change of the analysis: update the figures if the change is on purpose."""
     temperature = np.linspace(20.0, 40.0, COUNT)
     values = lfilter(*butter(1, 20.0, fs=RATE_HZ), noise_of_three(11), axis=0)
     values += 3e-4 * three(random_walk(np.random.default_rng(12), COUNT, RATE_HZ, 1.0))

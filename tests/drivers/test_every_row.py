@@ -44,6 +44,25 @@ def test_rows_are_complete(name: str) -> None:
     assert sheet.figures_of("HI14") is None
 
 
+@every_driver
+def test_verbs_that_restart_change_or_save(name: str) -> None:
+    verbs = DRIVERS[name].verbs
+    restarting = {"restart", "factory_reset", "nmt"}
+    assert {verb for verb, one in verbs.items() if one.restarts} == restarting & set(verbs)
+    saving = {"save", "factory_reset"} if name == "imu61x-uart" else {"save"}
+    assert {verb for verb, one in verbs.items() if one.saves} == saving & set(verbs)
+    changing = {
+        "wake",
+        "level",
+        "zero",
+        "start_streaming",
+        "stop_streaming",
+        "calibrate_gyro",
+        "calibrate_installation",
+    }
+    assert {verb for verb, one in verbs.items() if one.changes and not one.restarts} == changing & set(verbs)
+
+
 EVERY = [
     pytest.param(driver.name, kind, one, id=f"{driver.name} {kind}")
     for driver in DRIVERS.values()

@@ -43,6 +43,23 @@ def test_the_same_seed_gives_the_same(profile: ArrivalProfile) -> None:
     assert arrivals(profile, count=200) != arrivals(profile, count=200, seed=2)
 
 
+@pytest.mark.parametrize(
+    ("profile", "late_ns", "trailing_bytes"),
+    [
+        *zip(
+            PROFILES,
+            (889_700, 999_911, 1_430_841, 9_142_774, 2_918_942, 2_405_092),
+            (0, 82, 4, 359_578, 44_994, 52_455),
+            strict=True,
+        )
+    ],
+)
+def test_the_mean_delay_of_a_profile(profile: ArrivalProfile, late_ns: int, trailing_bytes: int) -> None:
+    found = list(ArrivalModel(profile, 400, 3, Crystal(20.0, 0.1), 921_600).run(1500))
+    assert sum(a.t_rx_ns - a.t_ns for a in found) / len(found) == pytest.approx(late_ns, abs=2)
+    assert sum(a.trailing_bytes for a in found) == trailing_bytes
+
+
 def test_wires_timers_and_packets() -> None:
     """At 115200 baud 82 bytes take 7.1 ms, so that at 200 Hz each frame waits for the previous frames."""
     assert {one_way(a) // 2 for a in arrivals(PERFECT)} <= {-1, 0}
