@@ -213,7 +213,7 @@ def restart_request(peer: J1939Node) -> Request:
     return exchange(peer, CONTROL, WRITE, RESTART, "restart")
 
 
-def verify(peer: J1939Node, register: int, value: int, name: str, *, pending: bool = False) -> RequestScript[Written]:
+def verify(peer: J1939Node, register: int, value: int, name: str, *, pending: bool) -> RequestScript[Written]:
     """Read back a written value. Raises Rejected if it differs."""
     try:
         now = yield from read(peer, register)

@@ -52,6 +52,7 @@ PRINTED = [
 )
 def test_commands_are_as_printed(request_: Request, text: str) -> None:
     assert (request_.payload, request_.name) == (text.encode() + b"\r\n", text)
+    assert request_.repeatable is text.endswith(("VERSION", "USRCONFIG", "COMCONFIG", "MAGCONFIG"))
 
 
 @pytest.mark.parametrize(
