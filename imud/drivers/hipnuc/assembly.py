@@ -175,18 +175,24 @@ LATE_BURSTS: Final = 4  # number of bursts that can arrive together
 class SidSeries:
     """Series of the SIDs of one kind. Synchronization: one thread."""
 
-    __slots__ = ("_modulus", "_newest", "_run", "_step")
+    __slots__ = ("_modulus", "_newest", "_others", "_run", "_step")
 
     def __init__(self) -> None:
         self._newest: int | None = None
         self._modulus = 0  # 0: unknown
         self._step = 0  # newest difference of two SIDs
         self._run = 0  # number of consecutive differences of this size
+        self._others = 0  # number of consecutive differences of other sizes, since the step is known
 
     @property
     def is_known(self) -> bool:
-        """Whether the SIDs rise by equal steps: they are from one device."""
+        """Whether the SIDs have risen by equal steps."""
         return self._run >= SID_RUN
+
+    @property
+    def is_of_one(self) -> bool:
+        """Whether the newest SIDs rise by equal steps: they are from one device."""
+        return self.is_known and self._others < SID_RUN
 
     def add(self, sid: int | None, *, is_next: bool) -> int | None:
         """Add a SID. Return the number of missing SIDs before it; None if the SIDs do not show this number.
@@ -205,6 +211,7 @@ class SidSeries:
                 self._modulus = modulus
             return None
         if self.is_known and rise > 0 and rise % self._step == 0:
+            self._others = 0 if rise == self._step else self._others + 1
             return rise // self._step - 1
         self._run = self._run + 1 if rise == self._step and rise > 0 else 0
         self._step = rise
@@ -401,7 +408,7 @@ class Assembly:
     @property
     def problem(self) -> str:
         """Address conflict that the frames show, one sentence; empty without a conflict."""
-        if self._anchor is None or self._sids.is_known:
+        if self._anchor is None or self._sids.is_of_one:
             return ""
         own = self._kinds[self._anchor].alternation
         often = [kind.alternation for kind in self._kinds.values() if kind.every == 1]

@@ -393,8 +393,9 @@ def test_sids_without_a_loss_and_sids_that_no_longer_agree() -> None:
 
 @pytest.mark.parametrize("phase", [0.15, 0.33, 0.45, 0.7, 0.85])
 @pytest.mark.parametrize("kinds", [{1: 1}, EQUAL])
-def test_two_devices_with_one_address_are_reported(phase: float, kinds: dict[int, int]) -> None:
-    """The second device has a crystal of its own, 100 ppm slower."""
+@pytest.mark.parametrize("has_sids", [False, True])
+def test_two_devices_with_one_address_are_reported(phase: float, kinds: dict[int, int], has_sids: bool) -> None:
+    """The second device starts later. It has a crystal of its own, 100 ppm slower, and its own SIDs."""
 
     def frames(bursts: range) -> list[Frame]:
         first = stream(kinds, bursts)
@@ -406,10 +407,15 @@ def test_two_devices_with_one_address_are_reported(phase: float, kinds: dict[int
         ]
         return sorted(first + second, key=lambda frame: frame.t_ns)
 
+    def add(sent: list[Frame]) -> None:
+        for frame in sent:
+            sid = (frame.burst + 77 * len(frame.data)) % 253 if has_sids else None
+            assembly.add_frame(frame.kind, frame.data, frame.t_ns, sid)
+
     assembly = Assembly(Ledger())
-    for frame in frames(range(150)):
-        assembly.add_frame(frame.kind, frame.data, frame.t_ns)
+    add(stream(kinds, range(30)))
+    assert assembly.problem == ""
+    add(frames(range(30, 180)))
     assert "each frame arrives twice per period of 5.0 ms, " in assembly.problem
-    for frame in stream(kinds, range(160, 500)):
-        assembly.add_frame(frame.kind, frame.data, frame.t_ns)
+    add(stream(kinds, range(190, 530)))
     assert assembly.problem == ""
