@@ -9,9 +9,11 @@ POST /api/call         {"method": …, "params": {…}}: a method of docs/socket
 
 import asyncio
 import logging
+import os
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from errno import EAFNOSUPPORT
 from pathlib import Path
 from typing import Any, Final
 
@@ -210,6 +212,8 @@ class LimitedSite(web.TCPSite):
         self._server = await asyncio.get_running_loop().create_server(
             lambda: self._connections.accept(make()), host, port, backlog=self._backlog
         )
+        if not self._server.sockets:  # asyncio ignores a family that the kernel lacks
+            raise OSError(EAFNOSUPPORT, os.strerror(EAFNOSUPPORT))
 
 
 class _OfPrograms(logging.Filter):

@@ -1,10 +1,12 @@
 """`imud web`: invalid arguments and messages. The tests of the server are in tests/web."""
 
+import errno
 import signal
 import socket
 import sys
 from http.client import HTTPConnection
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -82,12 +84,21 @@ def test_it_serves_until_a_signal_and_says_where_it_is_open(
     assert TOKEN not in line + errors
 
 
-def test_a_port_that_cannot_be_had_is_refused(cli: Cli) -> None:
+def test_a_port_that_cannot_be_had_is_refused(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     for port in ("-1", "65536", "99999999999999999999"):
         assert cli("web", "--port", port, status=2).err == f"imud web: --port: expected 0 to 65535, got {port}\n"
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         cli.refuses(f"cannot listen on 127.0.0.1 port {port}: ", "web", "--port", port)
+
+    class WithoutIpv6(socket.socket):
+        def __init__(self, family: int = -1, *arguments: int, **names: Any) -> None:
+            if family == socket.AF_INET6:
+                raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
+            super().__init__(family, *arguments, **names)
+
+    monkeypatch.setattr(socket, "socket", WithoutIpv6)
+    cli.refuses("cannot listen on ::1 port 9322: Address family not supported by protocol", "web", "--address", "::1")
 
 
 def test_addresses_and_who_may_look_and_change_are_said(capsys: pytest.CaptureFixture[str]) -> None:
