@@ -1,7 +1,7 @@
 """`imud status`: state, rate, clock, losses and ledger of each device."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 import msgspec
@@ -39,18 +39,19 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(msgspec.json.encode(answer).decode())
     else:
-        print(page(devices, msgspec.convert(answer.get("mqtt", []), list[MqttStatus])))
+        mqtts = msgspec.convert(answer.get("mqtt", []), list[MqttStatus])
+        print(page(devices, mqtts, msgspec.convert(answer.get("outputs", {}), dict[str, str])))
     return 0 if all(d.state in WELL and closes(d.ledger) for d in devices) else 1
 
 
-def page(devices: Sequence[DeviceStatus], mqtts: Sequence[MqttStatus] = ()) -> str:
-    """Format the blocks of all devices and the problems of the output `mqtt`. If a device does not run, add the next
-    step."""
+def page(devices: Sequence[DeviceStatus], mqtts: Sequence[MqttStatus] = (), outputs: Mapping[str, str] = {}) -> str:
+    """Format the blocks of all devices and the problems of the outputs. If a device does not run, add the next step."""
     parts = [block(device) for device in devices]
     for mqtt in mqtts:
         problems = [one for one in (mqtt.problem, mqtt.spool_problem) if one]
         problems += [f"the broker refuses messages of {topic}: {reason}" for topic, reason in mqtt.refused.items()]
         parts += ["\n".join(paragraph("mqtt: ", problem)) for problem in problems]
+    parts += ["\n".join(paragraph(f"{name}: ", problem)) for name, problem in outputs.items()]
     if any(device.state not in WELL for device in devices):
         parts.append("to find the cause and the next step, run `sudo imud doctor`")
     return "\n\n".join(parts)

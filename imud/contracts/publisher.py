@@ -231,6 +231,13 @@ class OutputFacts:
     rings: dict[str, str] = field(default_factory=dict)  # path of the ring file of each device in shared memory
     # Devices that have no ring file because imud cannot create it now
     without_ring: set[str] = field(default_factory=set)
+    # Reason for each output that does not run and that imud starts again
+    failed: dict[str, str] = field(default_factory=dict)
+
+    def problems(self) -> dict[str, str]:
+        """Return the problem of each output, or port of an output, that does not work."""
+        ports = (port for status in self.sentences for port in status())
+        return self.failed | {f"nmea0183 {port.name}": port.problem for port in ports if port.problem}
 
 
 @dataclass(frozen=True, slots=True)

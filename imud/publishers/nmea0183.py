@@ -109,7 +109,7 @@ class TcpOutput:
         except OSError as error:
             raise ServerError(
                 f"cannot open the NMEA 0183 server at {self._address} port {self.port}: {reason_of(error)}; "
-                f"set nmea0183.tcp_port to another port, or to null"
+                f"set nmea0183.tcp_address to an address of the host, or nmea0183.tcp_port to another port or null"
             ) from error
         self.port = listener.getsockname()[1]
         self._listener = listener

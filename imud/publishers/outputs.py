@@ -157,6 +157,7 @@ class Outputs:
         pause_ns = RETRY_FIRST_NS if before is None else min(2 * before.pause_ns, RETRY_MOST_NS)
         self._failures[name] = _Failure(now_ns + pause_ns, pause_ns)
         words = str(error) if isinstance(error, ServerError) else f"internal error {type(error).__name__}: {error}"
+        self._context.outputs.failed[name] = words
         if name in self._running or before is None:
             log.error(
                 "%s: %s; imud continues without this output and tries again",
@@ -189,6 +190,7 @@ class Outputs:
 
     def _start(self, name: str) -> None:
         options = self._options[name]
+        self._context.outputs.failed.pop(name, None)
         if PUBLISHERS[name].wanted(options):
             self._run(name, PUBLISHERS[name].make(options, self._context))
 

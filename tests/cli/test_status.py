@@ -66,7 +66,7 @@ def test_json_is_all_that_the_socket_sends(tmp_path: Path, cli: Cli, monkeypatch
         with Client(served.path) as client:
             said = client.status()
         shown = json.loads(cli("status", "--socket", served.path, "--json").out)
-        assert shown.keys() == said.keys() == {"now_ns", "devices", "socket", "configuration", "mqtt"}
+        assert shown.keys() == said.keys() == {"now_ns", "devices", "socket", "configuration", "mqtt", "outputs"}
         assert shown["devices"] == said["devices"]
 
 
@@ -79,8 +79,8 @@ def test_a_device_that_does_not_run_has_its_reason_and_the_next_step() -> None:
 
 def test_problems_of_mqtt_are_shown() -> None:
     mqtt = MqttStatus("", "no route", "", 0, 0, 0, 0, 0, 0, 0, {}, 0, refused={"a/b": "Not authorized"})
-    assert page([], [mqtt]).splitlines() == [
-        "mqtt: no route", "", "mqtt: the broker refuses messages of a/b: Not authorized",
+    assert page([], [mqtt], {"metrics": "no IPv6"}).splitlines() == [
+        "mqtt: no route", "", "mqtt: the broker refuses messages of a/b: Not authorized", "", "metrics: no IPv6",
     ]  # fmt: skip
 
 

@@ -47,7 +47,8 @@ class Rig:
         self.clock = VirtualClock()
         rows = {name: self._row(name, at) for name, at in modules.items()}
         monkeypatch.setattr(module, "PUBLISHERS", rows)
-        self.outputs = Outputs(publisher_context(now_ns=self.clock.now_ns), {})
+        self.context = publisher_context(now_ns=self.clock.now_ns)
+        self.outputs = Outputs(self.context, {})
         self.options = dict.fromkeys(rows, Switch())
 
     def _row(self, name: str, module_name: str) -> PublisherType:
@@ -137,12 +138,15 @@ def test_an_optional_output_that_cannot_start_is_tried_again(
     rig.failing[("two", "start")] = error
     rig.start()
     assert rig.outputs.summary() == "one, must (not yet: two)"
+    assert list(rig.context.outputs.problems()) == ["two"]
+    assert str(error) in rig.context.outputs.problems()["two"]
     assert ("Traceback" in caplog.text) == isinstance(error, OSError)
     rig.run(1)
     rig.failing.clear()
     rig.run(2)
     assert rig.done("start") == [("two", "start"), ("two", "start")]
     assert rig.outputs.summary() == "one, must, two"
+    assert rig.context.outputs.problems() == {}
 
 
 def test_a_required_output_that_cannot_start_stops_imud_only_at_the_start(rig: Rig) -> None:

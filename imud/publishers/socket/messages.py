@@ -131,6 +131,7 @@ class StatusResult(msgspec.Struct):
     socket: SocketStatus
     configuration: str  # absolute path of the daemon's configuration file; empty without a file
     mqtt: list[MqttStatus]  # the output `mqtt`; empty if it does not run
+    outputs: dict[str, str]  # problem of each output, or port of an output, that does not work
 
 
 class DeviceFrame(msgspec.Struct, omit_defaults=True):
