@@ -47,7 +47,6 @@ while True:
         for _ in range(64): file.write(data)
         os.fsync(file.fileno())
 """
-LOCK = "import ctypes; ctypes.CDLL(None).mlockall(3)"
 DAEMON = "import os, runpy; os.setsid(); runpy.run_module('imud', run_name='__main__')"
 FIFO_OF_OTHERS = 40  # real-time priority of writer and reader, above imud's 10
 ROUNDS = 3
@@ -59,22 +58,13 @@ class Setting:
     nice: int = 0
     policy: int = os.SCHED_OTHER
     priority: int = 0
-    core: bool = False
-    """CPUAffinity= with one core. The other programs use the same core."""
-    lock: bool = False
-    """Lock the memory with mlockall. systemd has no directive for this."""
     weight: bool = False
     """CPUWeight=: share of the processors relative to other services; simulated with the nice value of the session."""
 
 
 SETTINGS = (
     Setting("default"), Setting("Nice=-15", nice=-15), Setting("CPUWeight=10000", weight=True),
-    Setting("Nice=-15, CPUWeight=10000", nice=-15, weight=True),
     Setting("CPUSchedulingPolicy=rr, 10", policy=os.SCHED_RR, priority=10),
-    Setting("CPUSchedulingPolicy=fifo, 10", policy=os.SCHED_FIFO, priority=10),
-    Setting("fifo, 10 and one core", policy=os.SCHED_FIFO, priority=10, core=True),
-    Setting("fifo, 10 and mlockall", policy=os.SCHED_FIFO, priority=10, lock=True),
-    Setting("default and mlockall", lock=True),
 )  # fmt: skip
 
 
@@ -114,8 +104,7 @@ def run(setting: Setting, load: Load) -> Seen:
         writer = start_writer(stack, folder, load, cores=set(CORES))
         ports = writer.line().split()
         file = configuration(folder, ports, replace(load, shm=True))
-        command = f"{LOCK}; {DAEMON}" if setting.lock else DAEMON
-        server = stack.enter_context(Process(set(CORES), "-c", command, "run", "-c", str(file)))
+        server = stack.enter_context(Process(set(CORES), "-c", DAEMON, "run", "-c", str(file)))
         wait_for(folder / "s")
         sleep(1.0)
         reader = start_readers(stack, folder, load, set(CORES))
@@ -137,7 +126,6 @@ def apply(setting: Setting, pid: int) -> None:
     for task in map(int, os.listdir(f"/proc/{pid}/task")):
         os.setpriority(os.PRIO_PROCESS, task, setting.nice)
         os.sched_setscheduler(task, setting.policy, os.sched_param(setting.priority))
-        os.sched_setaffinity(task, {CORES[-1]} if setting.core else set(CORES))
     autogroup = Path(f"/proc/{pid}/autogroup")
     if setting.weight and autogroup.exists():
         # autogroup is the nice value of a session, -19 the largest weight

@@ -1,10 +1,9 @@
-"""Accuracy of the clock on hosts with a slewed CLOCK_MONOTONIC: `python -m tests.bench.host_clocks` prints the table.
+"""Accuracy of the clock on hosts with a slewed CLOCK_MONOTONIC.
 
 The arrival models use steady time, which is the truth. CLOCK_MONOTONIC follows from steady time and changing rates. A
-real `HostClock` reads it at each read of the device. With `--unseen`, the clock does not know the steering of the host.
+real `HostClock` reads it at each read of the device. With `unseen`, the clock does not know the steering of the host.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,8 +13,8 @@ from imud.host.clock import UNSTEERED, HostClock
 from imud.model.sample import Measurement, Sample
 from imud.model.units import NS_PER_S, NS_PER_US
 from imud.sampling.clock import SampleClock
-from imud.sim.ports.arrival import BARE_UART, LOADED, USB_16MS, Arrival, ArrivalModel, ArrivalProfile, Crystal
-from tests.bench.clock import BAUD_OF_RATE, TICK_MODULUS, TICK_NS, Accuracy, Point, accuracy
+from imud.sim.ports.arrival import Arrival, ArrivalModel
+from tests.bench.clock import TICK_MODULUS, TICK_NS, Point
 
 UTC_AHEAD_NS: Final = 1_795_000_000 * NS_PER_S  # CLOCK_REALTIME minus CLOCK_MONOTONIC
 DECODE_NS: Final = 20 * NS_PER_US  # time from the arrival to the clock read
@@ -37,16 +36,6 @@ class Steering:
                 break
             moved_ns += slewed_ns * round(ppm) // 1_000_000
         return steady_ns + moved_ns
-
-
-STEERINGS: Final = (
-    Steering("not steered"),
-    Steering("20 ppm, constant", ((-1000, 20),)),
-    Steering("500 ppm for 40 s, twice", ((30, 500), (70, -500), (110, 0))),
-    Steering("83,333 ppm for 5 s after start", ((2, 83_333), (7, 0))),
-    Steering("-83,333 ppm for 5 s", ((80, -83_333), (85, 0))),
-    Steering("400 ppm, alternating each second", tuple((s, 400 * (-1) ** s) for s in range(1, 120))),
-)
 
 
 class SteeredHost:
@@ -103,29 +92,3 @@ def rises(dated: Sequence[DatedArrival]) -> bool:
     return all(a.sample.t_ns < b.sample.t_ns for a, b in pairwise(dated)) and all(
         d.sample.t_ns <= d.sample.t_rx_ns for d in dated
     )
-
-
-def figures(profile: ArrivalProfile, rate_hz: int, steering: Steering, seconds: int, *, unseen: bool) -> Accuracy:
-    model = ArrivalModel(profile, rate_hz, 1, Crystal(50.0), BAUD_OF_RATE[rate_hz])
-    dated = run(model, steering, rate_hz * seconds, unseen=unseen)
-    assert rises(dated)
-    return accuracy([d.point for d in dated])
-
-
-def print_table(*, unseen: bool) -> None:
-    print(
-        "| host's clock | arrival | rate, Hz | σ, µs | rms, µs | p99.9, µs | mean t_err, µs | in 2 t_err | settling |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|")
-    for steering in STEERINGS:
-        for profile, rate_hz in ((BARE_UART, 100), (USB_16MS, 100), (LOADED, 100), (BARE_UART, 1000)):
-            a = figures(profile, rate_hz, steering, 130 if rate_hz == 1000 else 150, unseen=unseen)
-            micro = " | ".join(f"{ns / 1000:.0f}" for ns in (a.sigma_ns, a.rms_ns, a.p999_ns, a.mean_t_err_ns))
-            print(
-                f"| {steering.name} | {profile.name} | {rate_hz} | {micro} | {a.share:.3f} | {a.share_settling:.3f} |",
-                flush=True,
-            )
-
-
-if __name__ == "__main__":
-    print_table(unseen="--unseen" in sys.argv)

@@ -1,80 +1,35 @@
-"""Cost of a recording: CPU time of the daemon with and without it, and bytes per sample. Also checks the replay.
+"""Cost of a recording: CPU time of the daemon with and without it. Also checks the replay.
 
-`python -m tests.bench.recording [--quick] [size] [cpu] [replay]`; without a name, all three run.
-
-`cpu` alternates between the load with and without a recording. The rows show the best round. Other programs must be
-idle. The CPU time of the daemon includes the threads of the recorder. `size` records simulated devices in motion,
-because a recording of a device at rest compresses better. `replay` records ten minutes of such a device at 1 kHz as
-fast as possible. All members of all samples must be equal in the replay. Together with the other parts, `replay`
-records half a minute.
+The load with and without a recording alternates, and the rows show the best round. Other programs must be idle. The CPU
+time of the daemon includes the threads of the recorder. Then a daemon records ten minutes of a simulated device in
+motion at 1 kHz as fast as possible. All members of all samples must be equal in the replay.
 """
 
 import hashlib
-import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from random import Random
-from time import thread_time_ns
 
 import msgspec
 
 from imud.contracts.publisher import Batch
-from imud.formats import records
-from imud.formats.recording import BlockGatherer, RecordingReader
+from imud.formats.recording import RecordingReader
 from imud.model.event import Event
-from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.recording.player import Player
-from tests.bench.captures import BEGIN_NS, Source, hi91_module, record
+from tests.bench.captures import Source, hi91_module, record
 from tests.bench.rig import Load, run
 from tests.bench.rows import Row, at_most
 
 RATIO_LIMIT = 1.15  # goal: CPU with / without a recording
-SIZE_SECONDS = 60
 REPLAY_SECONDS = 600
 REPLAY_QUICK_SECONDS = 30
 HI91_1_KHZ = Source("hipnuc-uart", 1000, lambda: hi91_module(1000))
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
-    yield from size_rows()
     yield from cpu_rows(rounds=1 if quick else 3, seconds=2.0 if quick else 6.0)
-    yield from replay_rows(REPLAY_QUICK_SECONDS)
-
-
-def chosen_rows(words: list[str]) -> Iterator[Row]:
-    quick = "--quick" in words
-    if not {"size", "cpu", "replay"} & set(words):
-        yield from rows(quick=quick)
-    if "size" in words:
-        yield from size_rows()
-    if "cpu" in words:
-        yield from cpu_rows(rounds=1 if quick else 3, seconds=2.0 if quick else 6.0)
-    if "replay" in words:
-        yield from replay_rows(REPLAY_QUICK_SECONDS if quick else REPLAY_SECONDS)
-
-
-def size_rows() -> Iterator[Row]:
-    """Yield the bytes per sample of a device in motion. The daemon writes one block per second."""
-    for rate_hz in (100, 1000):
-        random, module = Random(1), hi91_module(rate_hz)
-        gatherer, stored, plain, samples, spent_ns = BlockGatherer(), 0, 0, 0, 0
-        for second in range(SIZE_SECONDS):
-            made: list[bytes] = []
-            for burst in module.advance(BEGIN_NS + (second + 1) * NS_PER_S):
-                if burst.data:
-                    late_ns = random.randrange(NS_PER_MS // 4)
-                    made.append(records.encode_data(0, burst.data, BEGIN_NS + len(made) * NS_PER_MS + late_ns, -1))
-            begin_ns = thread_time_ns()
-            # finish the block after each second, like the daemon
-            stored += sum(len(gatherer.add(one)) for one in made) + len(gatherer.finish())
-            spent_ns += thread_time_ns() - begin_ns
-            plain += sum(map(len, made))
-            samples += len(made)
-        yield Row(f"HI91 at {rate_hz} Hz: bytes on the disk per sample", stored / samples, "bytes")
-        yield Row(f"HI91 at {rate_hz} Hz: bytes of records per sample", plain / samples, "bytes")
-        yield Row(f"HI91 at {rate_hz} Hz: CPU of blocks per sample", spent_ns / samples / 1000, "us")
+    yield from replay_rows(REPLAY_QUICK_SECONDS if quick else REPLAY_SECONDS)
 
 
 def cpu_rows(rounds: int, seconds: float) -> Iterator[Row]:
@@ -126,8 +81,3 @@ def replay_rows(seconds: int) -> Iterator[Row]:
         yield at_most(f"{seconds} s at 1 kHz: checks that differ", float(len(device.differences)), "checks", 0)
         yield at_most(f"{seconds} s at 1 kHz: 0 if every member of every sample is equal", float(not same), "", 0)
         yield Row(f"{seconds} s at 1 kHz: bytes on the disk per sample", file.stat().st_size / live.count, "bytes")
-
-
-if __name__ == "__main__":
-    for row in chosen_rows(sys.argv[1:]):
-        print(row, flush=True)
