@@ -7,42 +7,32 @@ message older than three seconds is in the spool. Then SIGKILL ends the gateway.
 number in the spool's file has arrived or is still in the spool. The exit status is 1 if a sequence number is missing or
 a ledger does not balance.
 
-With `--tls`, gateway and broker use TLS with certificates on both sides. With `--postgres`, `imud fleet collect` also
-writes rows. The number of rows must be equal to the number of received whole samples.
+With `--tls`, gateway and broker use TLS with certificates on both sides.
 """
 
 import argparse
-import signal
 import sys
 import tempfile
-import threading
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from pathlib import Path
 from time import monotonic
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from imud.fleet.messages import Stream
-from tests.bench.fleet_rows import RowCollector
 from tests.fleet.authority import Authority
 from tests.fleet.gateways import KilledGateway, closes, in_spool
 from tests.fleet.mosquitto import NO_MOSQUITTO, Collector, Mosquitto
-from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
 from tests.fleet.proxy import Proxy
 from tests.support.surroundings import free_port
 
 CAUGHT_UP: Final = 30
 """Maximum number of messages in the spool of an up-to-date gateway: three transactions of ten messages."""
 LIMIT_S: Final = 300.0  # time to catch up, or to fill the spool
-UP_S: Final = 3.0
-"""Time between two restarts, s. mosquitto ignores SIGTERM during its start."""
 SMALL_MB: Final = 1.0  # spool of kill-full
 
 
 class Scene:
-    def __init__(
-        self, folder: Path, *lines: str, spool_mb: float = 256.0, tls: bool = False, database: str = ""
-    ) -> None:
+    def __init__(self, folder: Path, *lines: str, spool_mb: float = 256.0, tls: bool = False) -> None:
         self.folder, self.spool_mb = folder, spool_mb
         (folder / "broker").mkdir(parents=True)
         self.authority: Authority | None = None
@@ -54,27 +44,12 @@ class Scene:
         self.broker = Mosquitto(folder / "broker", lines, free_port())
         self.broker.start()
         self.proxy = Proxy(port if tls else self.broker.port)
-        self.rows: RowCollector | None = None
-        if database:
-            self.rows = RowCollector(f"mqtt://127.0.0.1:{self.broker.port}", database, folder / "collector.log")
-        self.held = threading.Event()
-        self.collector = Collector(self.broker.port, prepare=self._prepare)
+        self.collector = Collector(self.broker.port)
         self.spool = folder / "spool"
         self.epoch = 0
         self.high_water = 0
         self.gateway: KilledGateway
         self.start_gateway()
-
-    def _prepare(self, client: Any) -> None:
-        take = client.on_message
-
-        # 0.2 s per message: 5 messages/s
-        def slowly(*args: object) -> None:
-            if self.held.is_set():
-                threading.Event().wait(0.2)
-            take(*args)
-
-        client.on_message = slowly
 
     def start_gateway(self) -> None:
         self.epoch += 1
@@ -102,8 +77,6 @@ class Scene:
     def close(self) -> None:
         self.gateway.kill()
         self.collector.close()
-        if self.rows is not None:
-            self.rows.end(signal.SIGKILL)
         self.proxy.close()
         self.broker.stop()
 
@@ -123,12 +96,6 @@ def during(begin: Callable[[Scene], object], end: Callable[[Scene], object]) -> 
 
 
 restart = during(lambda scene: scene.broker.stop(), lambda scene: scene.broker.start())
-
-
-def kill_broker(scene: Scene, seconds: float) -> None:
-    for _ in range(3):
-        restart(scene, seconds / 3)
-        scene.watch(UP_S)
 
 
 def give_rights(scene: Scene, rights: str) -> None:
@@ -160,21 +127,10 @@ def kill_full(scene: Scene, seconds: float) -> None:
     kill_gateway(scene, seconds, round(SMALL_MB * 950_000))
 
 
-def kill_collector(scene: Scene, seconds: float) -> None:
-    for _ in range(3):
-        scene.watch(seconds / 6)
-        if scene.rows is not None:
-            scene.rows.end(signal.SIGKILL)
-        scene.watch(seconds / 6)
-        if scene.rows is not None:
-            scene.rows.start()
-
-
 # by name: function and description in the table
 FAULTS: Final[Mapping[str, tuple[Fault, str]]] = {
     "none": (lambda scene, seconds: scene.watch(seconds), "none"),
     "restart": (restart, "the broker restarts"),
-    "restarts": (kill_broker, "the broker restarts three times"),
     "freeze": (
         during(lambda scene: scene.broker.freeze(), lambda scene: scene.broker.thaw()),
         "the broker's process is stopped (SIGSTOP)",
@@ -192,13 +148,8 @@ FAULTS: Final[Mapping[str, tuple[Fault, str]]] = {
         during(lambda scene: limit_network(scene, 20_000.0), lambda scene: limit_network(scene, None)),
         "the network is limited to 20 kB/s",
     ),
-    "slow-collector": (
-        during(lambda scene: scene.held.set(), lambda scene: scene.held.clear()),
-        "the collector reads 5 messages per second",
-    ),
     "kill": (kill_gateway, "SIGKILL of the gateway, three times, while the network is cut"),
     "kill-full": (kill_full, "SIGKILL of the gateway, three times, with a full spool of 1 MB"),
-    "kill-collector": (kill_collector, "SIGKILL of the collector with rows, three times"),
 }
 
 
@@ -212,23 +163,21 @@ class Result(NamedTuple):
     missing: int
     high_water: int
     catch_up_s: float
-    rows: int | None
-    """Number of rows in the database; None without a database."""
 
     @property
     def closes(self) -> bool:
         came = self.whole + self.thinned + self.dropped + self.waiting
-        return not self.missing and self.numbered == came and self.rows in (None, self.whole)
+        return not self.missing and self.numbered == came
 
 
-def play(name: str, folder: Path, seconds: float, *, tls: bool, database: str) -> Result:
+def play(name: str, folder: Path, seconds: float, *, tls: bool) -> Result:
     fault, _ = FAULTS[name]
     rights = folder / "rights"
     rights.write_text("topic readwrite #\n")
     # with an ACL, mosquitto 2.0.11 stores no messages for readers that are offline since its restart (docs/fleet.md)
     lines = ("allow_anonymous true", *((f"acl_file {rights}",) if name == "refuse" else ()))
     spool_mb = SMALL_MB if name == "kill-full" else 256.0
-    scene = Scene(folder, *lines, spool_mb=spool_mb, tls=tls, database=database)
+    scene = Scene(folder, *lines, spool_mb=spool_mb, tls=tls)
     try:
         scene.collector.wait_for(lambda: len(scene.collector.fresh) > 5, 60.0)
         fault(scene, seconds)
@@ -237,9 +186,6 @@ def play(name: str, folder: Path, seconds: float, *, tls: bool, database: str) -
         scene.watch(2.0)
         scene.gateway.kill()
         counts = [one for (_, stream), one in closes(scene.collector, scene.spool).items() if stream == Stream.SAMPLES]
-        rows = None if scene.rows is None else scene.rows.rows_after(sum(one.whole for one in counts))
-        if scene.rows is not None and (missing := scene.rows.missing()):
-            raise AssertionError(f"expected no missing samples in the ledger of the database, got {missing}")
     finally:
         scene.close()
     numbered = last_numbers(scene.spool)
@@ -247,7 +193,7 @@ def play(name: str, folder: Path, seconds: float, *, tls: bool, database: str) -
     return Result(
         numbered, sum(one.whole for one in counts), sum(one.thinned for one in counts),
         sum(sum(one.dropped.values()) for one in counts), numbered - came, sum(one.duplicates for one in counts),
-        sum(one.missing for one in counts), scene.high_water, catch_up_s, rows,
+        sum(one.missing for one in counts), scene.high_water, catch_up_s,
     )  # fmt: skip
 
 
@@ -262,20 +208,17 @@ def main() -> int:
     parser.add_argument("faults", nargs="*", choices=[[], *FAULTS], metavar="FAULT", help=", ".join(FAULTS))
     parser.add_argument("--seconds", type=float, default=20.0, help="duration of each fault, s (default: %(default)g)")
     parser.add_argument("--tls", action="store_true", help="use TLS between gateway and broker")
-    parser.add_argument("--postgres", action="store_true", help="also count the rows of `imud fleet collect`")
     args = parser.parse_args()
-    if missing := NO_MOSQUITTO or (NO_POSTGRES if args.postgres else ""):
-        print(missing)
+    if NO_MOSQUITTO:
+        print(NO_MOSQUITTO)
         return 1
     failed = False
     head = "| fault | numbered | whole | thinned | dropped | waiting | duplicate | lost | spool, kB | catching up, s |"
-    print(f"{head} rows |\n{'|---' * 11}|")
+    print(f"{head}\n{'|---' * 10}|")
     for name in args.faults or FAULTS:
-        with ExitStack() as stack:
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-faults-"))
-            database = stack.enter_context(running_postgres()) if args.postgres else ""
+        with tempfile.TemporaryDirectory(prefix="imud-faults-") as folder:
             try:
-                one = play(name, Path(folder), args.seconds, tls=args.tls, database=database)
+                one = play(name, Path(folder), args.seconds, tls=args.tls)
             except (AssertionError, TimeoutError) as error:
                 failed = True
                 print(f"| {name} | FAILED: {error} |", flush=True)
@@ -283,8 +226,7 @@ def main() -> int:
         failed |= not one.closes
         print(
             f"| {FAULTS[name][1]} | {one.numbered} | {one.whole} | {one.thinned} | {one.dropped} |"
-            f" {one.waiting} | {one.duplicates} | {one.missing} | {one.high_water / 1000:.0f} | {one.catch_up_s:.1f} |"
-            f" {'-' if one.rows is None else one.rows} |",
+            f" {one.waiting} | {one.duplicates} | {one.missing} | {one.high_water / 1000:.0f} | {one.catch_up_s:.1f} |",
             flush=True,
         )
     return int(failed)

@@ -94,6 +94,7 @@ def test_defaults() -> None:
         (hipnuc("sin: {line: A, rate_hz: .nan}"), "expected a finite number, got .nan"),
         (hipnuc("sin: {line: A, bias: pull-up}"), 'got "bias"; did you mean bias_us? known: active_low, bias_us, chip, line, offset_us, open_drain, pulse_ms, rate_hz'),
         (hipnuc("alarm: {line: A, bias: up}"), 'expected one of "as-is", "disabled", "pull-down", "pull-up", got "up"'),
+        (hipnuc('sout: {line: "A\\0"}'), "devices.a.lines.sout.line: expected text without control characters, got"),
         (spi("reset: {line: A, hold_ms: 0}"), "devices.a.lines.reset.hold_ms: expected a number from 0.01 to 10000, got 0"),
         (spi("data_ready: {line: A, edge: both}"), 'expected one of "falling", "rising", got "both"'),
         (hipnuc("")[:-2] + "5", "devices.a.lines: expected keys and values, got 5"),

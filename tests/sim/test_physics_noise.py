@@ -21,15 +21,6 @@ def test_white_noise_has_the_stated_spread() -> None:
     assert pstdev(r.pressure_pa for r in read) == pytest.approx(4.0, rel=0.06)
 
 
-def test_noise_is_white() -> None:
-    noise = Noise(8, NoiseLevels(accel_m_s2=1.0))
-    read = [noise.add(TRUTH, 0.0).accel_m_s2 for _ in range(2000)]
-    mean_x, mean_y = fmean(r[0] for r in read), fmean(r[1] for r in read)
-    x, y = [r[0] - mean_x for r in read], [r[1] - mean_y for r in read]
-    for a, b in ((x[1:], x[:-1]), (x, y), (x[1:], y[:-1])):
-        assert abs(fmean(i * j for i, j in zip(a, b, strict=True))) < 0.09  # 4 sigma of 2000 samples
-
-
 def test_bias_wanders_slowly_within_its_bounds() -> None:
     levels = NoiseLevels()
     noise = Noise(3, levels)
@@ -40,15 +31,6 @@ def test_bias_wanders_slowly_within_its_bounds() -> None:
             assert 0.9 * bound < max(map(abs, values)) <= bound
     near, far = noise.bias(100.0)[0][0], noise.bias(100.01)[0][0]
     assert 0 < abs(near - far) < 1e-5
-
-
-def test_mean_reading_is_truth_plus_bias() -> None:
-    noise = Noise(5)
-    read = [noise.add(TRUTH, 42.0) for _ in range(2000)]
-    bias = noise.bias(42.0)[1]
-    for axis in range(3):
-        mean = fmean(r.gyro_rad_s[axis] for r in read)
-        assert mean == pytest.approx(TRUTH.gyro_rad_s[axis] + bias[axis], abs=5e-5)
 
 
 def test_the_seed_decides_and_the_attitude_stays_true() -> None:

@@ -6,20 +6,15 @@ from typing import TypeVar
 
 import pytest
 
-from imud.contracts.command import Target
-from imud.contracts.script import Outcome, Request, RequestScript, TextLine
-from imud.contracts.setting import words_of
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_MS, NS_PER_S
-from imud.sim import SIMULATORS
 from imud.sim.hipnuc.uart import HipnucModule, make
 from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings, Output
 from imud.sim.physics import Noise, Still, swing
 from imud.sim.sensor import SimulatorOptions
-from tests.support.script_runners import offline_runner
-from tests.support.simulated_modules import BEGIN_NS, FAST, HIPNUC_STILL, HipnucUartBench, run_script, unpack_hi91
+from tests.support.simulated_modules import BEGIN_NS, FAST, HIPNUC_STILL, HipnucUartBench, unpack_hi91
 
 T = TypeVar("T")
 
@@ -150,35 +145,6 @@ def test_main_status_noise_the_end_of_32_bits_and_pulses() -> None:
     kinds = [burst.sample_ns is None for burst in bench.wait(30.0)]
     assert sorted(kinds) == [False, True]
     assert bench.wait(1000.0) == []
-
-
-def converse(bench: HipnucUartBench, script: RequestScript[T]) -> T:
-    ledger = Ledger()
-    codec, session = DRIVER.make_codec(ledger, DRIVER.settings()), offline_runner(ledger)
-
-    def ask(request: Request) -> Outcome:
-        bench.module.receive(session.start(request, bench.now_ns), bench.now_ns)
-        while True:
-            events = [event for burst in bench.wait(1.0) for event in codec.feed(burst.data)]
-            outcomes = [session.on_message(e.text, bench.now_ns) for e in events if isinstance(e, TextLine)]
-            for outcome in (*outcomes, session.on_time(bench.now_ns)):
-                if outcome is not None:
-                    return outcome
-
-    value = run_script(script, ask)
-    assert ledger.closes()
-    return value
-
-
-def test_identity_and_settings_are_read_amid_frames() -> None:
-    identity = converse(HipnucUartBench(FAST), DRIVER.identify())
-    assert (identity.product, identity.serial_number, identity.firmware) == ("HI14R3", "043995698D6E1708", "1.5.6")
-    assert DRIVER.device_settings is not None
-    settings = words_of(converse(HipnucUartBench(FAST), DRIVER.device_settings.read(Target(None, 0), None)))
-    assert (settings["ATT_MODE"], settings["BAUD"]) == ("0", "921600")
-    module = SIMULATORS["hipnuc-uart"].make(SimulatorOptions(), BEGIN_NS)
-    assert (module.baud, module.epoch_ns) == (115_200, BEGIN_NS)
-    assert SIMULATORS["hipnuc-uart"].name in SIMULATORS
 
 
 @pytest.mark.parametrize("message", ["HI91", "HI92"])

@@ -1,13 +1,16 @@
 """Pins change lines at the due time and lose the edges of a fault. The same seed gives the same edges."""
 
+import asyncio
 from itertools import pairwise
 
 import pytest
 
+from imud.contracts.lines import Edge
 from imud.model.units import NS_PER_MS
 from imud.sim.ports.faults import FaultKind, FaultRates, Faults
-from imud.sim.ports.pins import MemoryInput, PinFaultRates, PinFaults, Pins
+from imud.sim.ports.pins import MemoryInput, MemoryOutput, PinFaultRates, PinFaults, Pins
 from imud.sim.sensor import Pin
+from tests.support.event_loops import in_loop
 from tests.support.simulated_modules import FAST, HipnucUartBench
 
 
@@ -103,3 +106,20 @@ def test_single_edges_lost_extra_pulses_and_lost_frames() -> None:
 def test_probabilities_are_probabilities(value: float) -> None:
     with pytest.raises(ValueError, match="expected a probability"):
         PinFaultRates(lose_pulse=value)
+
+
+@in_loop
+async def test_a_line_in_memory_counts_lost_edges_and_ends_inactive() -> None:
+    line, found, output = MemoryInput(), list[Edge](), MemoryOutput()
+    line.open()
+    line.edge(10, True)
+    line.start(found.extend, lambda _error: None)
+    await asyncio.sleep(0)
+    line.lose(2)
+    line.edge(20, False)
+    line.drain()
+    assert found == [Edge(10, True, 1), Edge(20, False, 4)]
+    output.open()
+    output.set(True)
+    output.close()
+    assert [active for _, active in output.history] == [True, False]
