@@ -1,11 +1,15 @@
 """Several simulated devices as one object, and their transfer to the kernel."""
 
 import socket
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Final
 
 import pytest
 
+from imud.attitude.rotation import euler_zyx_from_quat
 from imud.contracts.codec import CodecEvent
+from imud.contracts.driver import CanDriver
+from imud.drivers import DRIVERS
 from imud.drivers.imu61x.can import DRIVER
 from imud.formats.can import RAW_FRAME
 from imud.model.ledger import Ledger
@@ -131,3 +135,62 @@ def test_a_device_sends_at_the_time_of_its_next_frame(driver: str) -> None:
         assert due_ns >= now_ns
         now_ns = due_ns
         assert module.advance(now_ns)
+
+
+BEGIN_NS: Final = 5_000_000_000
+SECONDS: Final = 5
+TOLERANCES: Final[Mapping[str, Mapping[str, float]]] = {
+    "hipnuc-canopen": {
+        "accel_m_s2": 0.0050, "gyro_rad_s": 0.00088, "quat_wxyz": 0.000051, "euler_rad": 0.000088,
+        "incli_rad": 0.000088, "pressure_pa": 0.51,
+    },
+    "hipnuc-j1939": {
+        "accel_m_s2": 0.0024, "gyro_rad_s": 0.00054, "mag_t": 1.6e-8, "euler_rad": 9e-6, "quat_wxyz": 5.1e-5,
+        "temperature_c": 0.0051,
+    },
+    "hipnuc-nmea2000": {"euler_rad": 5.1e-5, "gyro_rad_s": 1.6e-8},
+    "imu61x-can": {"gyro_rad_s": 1e-6, "accel_m_s2": 1e-5, "euler_rad": 1e-6, "temperature_c": 0.005001},
+}  # fmt: skip
+"""Resolution of each value on the wire. A driver that is not here has no test of its values."""
+
+
+@pytest.mark.parametrize("name", CAN_SIMULATORS)
+def test_values_are_the_truth_of_the_sample_instant(name: str) -> None:
+    driver, rate_hz = DRIVERS[name], 20.0 if name == "hipnuc-nmea2000" else 100.0
+    assert isinstance(driver, CanDriver)
+    message = "all" if name == "hipnuc-j1939" else ""
+    options = SimulatorOptions(rate_hz=rate_hz, noise="none", boot_ms=0, message=message)
+    module: Any = CAN_SIMULATORS[name].make(options, BEGIN_NS)
+    frames = module.advance(BEGIN_NS + SECONDS * 1000 * MS)
+    codec = driver.make_codec(Ledger(), driver.settings())
+    instants = {frame.due_ns: frame.sample_ns for frame in frames}
+    seen = list[str]()
+    for frame in frames:
+        for event in codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.due_ns):
+            if not isinstance(event, Measurement):
+                continue
+            sample_ns = instants[event.t_first_ns or frame.due_ns]
+            assert sample_ns is not None
+            truth = module.hardware.motion.at((sample_ns - module.epoch_ns) / 1e9)
+            expected = {**truth._asdict(), "incli_rad": (truth.euler_rad[1], truth.euler_rad[0])}
+            if name == "imu61x-can":
+                expected["euler_rad"] = euler_zyx_from_quat(truth.quat_wxyz)
+            elif name == "hipnuc-nmea2000":  # rate of turn only
+                expected["gyro_rad_s"] = (float("nan"), float("nan"), truth.gyro_rad_s[2])
+            for field, tolerance in TOLERANCES[name].items():
+                if (value := getattr(event, field)) is not None:
+                    seen.append(field)
+                    assert value == pytest.approx(expected[field], abs=tolerance, nan_ok=True), field
+    assert set(seen) == TOLERANCES[name].keys()
+    assert seen.count("euler_rad") == pytest.approx(SECONDS * rate_hz, abs=2)
+    assert codec.ledger.closes()
+    assert codec.ledger.lost() == 0
+
+
+@pytest.mark.parametrize("name", CAN_SIMULATORS)
+def test_frames_of_a_sample_take_their_time_at_the_bit_rate(name: str) -> None:
+    module = CAN_SIMULATORS[name].make(SimulatorOptions(rate_hz=20.0, baud=250_000, boot_ms=0, noise="none"), BEGIN_NS)
+    frames = [frame for frame in module.advance(BEGIN_NS + 1000 * MS) if frame.sample_ns is not None]
+    first, second = (frame.due_ns for frame in frames[:2])
+    assert frames[0].sample_ns == frames[1].sample_ns
+    assert second - first == (140 if frames[0].extended else 120) * 4000
