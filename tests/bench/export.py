@@ -1,12 +1,12 @@
 """Duration of `imud export` for one hour of samples at 400 Hz, in each format.
 
-`python -m tests.bench.export [--quick] [--keep FOLDER]`; `--quick` exports two minutes and checks no goal.
+`make bench ARGS=export`; the short form exports two minutes and checks no goal.
 
 The recordings are from a simulated IMU61x at 400 Hz and a simulated HI91 device at 500 Hz. Both have the same number of
 samples; HI91 samples have more fields. A daemon replays and records them as fast as possible, with the time stamps of
 one hour. The part runs the command itself. CPU is the sum of the user and system time of all its processes. Other
 programs on the host affect this sum less than the duration. If both cores are idle, the duration is the relevant
-figure. `--keep` stores the recordings in FOLDER and uses existing recordings there.
+figure.
 """
 
 import os
@@ -32,8 +32,6 @@ FORMATS: Final = {
     "MCAP, ROS 2": ("--to", "mcap", "--schema", "ros2"),
 }
 
-
-IMU61X: Final = Imu61xSettings(baud=BAUD, rate_hz=RATE_HZ)
 SOURCES: Final = {
     "IMU61X": Source(
         "imu61x-uart", RATE_HZ, lambda: Imu61xModule(BEGIN_NS, Imu61xSettings(baud=BAUD, rate_hz=RATE_HZ))
@@ -42,15 +40,11 @@ SOURCES: Final = {
 }
 
 
-def rows(*, quick: bool = False, folder: Path | None = None) -> Iterator[Row]:
+def rows(*, quick: bool = False) -> Iterator[Row]:
     samples = (QUICK_SECONDS if quick else SECONDS) * RATE_HZ
     with tempfile.TemporaryDirectory() as scratch:
-        kept = folder or Path(scratch)
-        kept.mkdir(exist_ok=True)
         for name, source in SOURCES.items():
-            recording = kept / f"{source.driver}-{samples}.imudrec"
-            if not recording.exists():
-                record(source, samples // source.rate_hz, Path(scratch)).rename(recording)
+            recording = record(source, samples // source.rate_hz, Path(scratch))
             yield from export_rows(name, recording, samples, Path(scratch), None if quick else LIMIT_S)
 
 
@@ -77,15 +71,3 @@ def export_rows(name: str, recording: Path, samples: int, folder: Path, limit_s:
         yield Row(f"{name}, {words}: CPU", used.ru_utime + used.ru_stime, "s")
         yield Row(f"{name}, {words}: file", out.stat().st_size / 1e6, "MB")
         out.unlink()
-
-
-def main(words: list[str]) -> None:
-    folder = Path(words[words.index("--keep") + 1]) if "--keep" in words else None
-    for row in rows(quick="--quick" in words, folder=folder):
-        load = f"load {os.getloadavg()[0]:.1f}"
-        reached = "" if row.reached is None else row.reached
-        print(f"{row.name:52} {row.value:9.2f} {row.unit:3} {row.reach:8} {reached!s:6} {load}", flush=True)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

@@ -11,7 +11,7 @@ from imud.formats.modbus import framed, is_exception, is_whole
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_S
-from imud.sim.hipnuc.modbus import ModbusLine, Slave, SlaveVariant, incli_counts, make
+from imud.sim.hipnuc.modbus import ModbusLine, Slave, incli_counts, make
 from imud.sim.physics import swing
 from imud.sim.sensor import Burst, SimulatorOptions
 from tests.support.pty_port import serial_of, slave
@@ -146,14 +146,6 @@ def test_ids_exceptions_and_common_options() -> None:
             make(SimulatorOptions(**wrong), BEGIN_NS)
 
 
-def test_an_ignored_write_is_confirmed_and_changes_nothing() -> None:
-    request = write_register(6, 1).sends[0]
-    for ignores, mode in ((frozenset({"HEADING_MODE"}), 0), (frozenset({"MD_ID"}), 1)):
-        rig = ModbusMaster(here(1, variant=SlaveVariant(ignores=ignores)))
-        assert rig.ask(1, request) == framed(1, request)
-        assert rig.line.slaves[0].settings.heading_mode == mode
-
-
 @pytest.mark.parametrize(
     ("kind", "roll_deg", "pitch_deg", "counts"),
     [
@@ -165,12 +157,3 @@ def test_counts_of_an_inclinometer(kind: str, roll_deg: float, pitch_deg: float,
     """One count of 360°/32768 for X from 0 to 360°, of 180°/32768 for ±180°. Y is 67.8° at pitch 60° and roll -45°."""
     truth = STILL._replace(euler_rad=(radians(roll_deg), radians(pitch_deg), 0.3))
     assert incli_counts(truth, kind) == pytest.approx(counts, abs=1)
-
-
-def test_a_slave_is_silent_while_it_boots() -> None:
-    rig = ModbusMaster(here(1, variant=SlaveVariant(boot_ms=500)))
-    rig.ask(1, write_register(0, 0xFF).sends[0])
-    begin_ns = rig.now_ns
-    for after_ms, answers in ((450, False), (510, True)):
-        rig.now_ns = begin_ns + after_ms * 1_000_000
-        assert bool(rig.ask(1, READ_BLOCK)) == answers
