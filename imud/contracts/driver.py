@@ -200,6 +200,8 @@ class StreamDriver(Driver):
     # nothing. Its result: whether the device acknowledged, or None if the device settings disable the output (then the
     # script changes nothing). Raises NoReply if the device does not reply.
     wake: Callable[[], RequestScript[bool | None]] | None = None
+    # Request that starts the output, if scripts other than `wake` also send it: they cannot know whether it was on
+    output_on: bytes = b""
     # Returns why a device with these values of its settings replies and sends no samples, one clause
     why_silent: Callable[[Mapping[str, Any]], str] = lambda _settings: "its output is off"
     # Returns one valid frame with random values, for property tests and fault injection

@@ -143,13 +143,14 @@ class StreamTransport(ReceivingTransport):
         self._hold: StreamHold | None = None  # holds the samples; None if the path receives each read on arrival
         self._fixed_baud = 0 if link.auto_baud else link.baud
         self._samples_before = 0  # number of samples before the link was opened
+        self._started = False  # whether a script has started the output of a device that replied and sent no samples
         self._ignored = 0  # number of valid frames without samples at the last check
         self._ignored_ns = -UNHEARD_NS  # CLOCK_MONOTONIC of the last change of this number
 
     # --- the link ----------------------------------------------------------------------------------------------------
 
     def start(self, on_end: OnEnd) -> None:
-        self._samples_before = self._ledger.samples
+        self._samples_before, self._started = self._ledger.samples, False
         self.link.start(self._on_data, on_end)
         self._search.start()
 
@@ -249,6 +250,8 @@ class StreamTransport(ReceivingTransport):
             await asyncio.sleep(UNHEARD_NS / NS_PER_S)
             samples_arrived = self._ledger.samples != self._samples_before
             if samples_arrived or self._search.requested or self._hears_unknown(self._host.now_ns()):
+                if samples_arrived and self._started and not reported:
+                    self._report_started()
                 return
             try:
                 acknowledged = await self.scripts.run(driver.wake())
@@ -259,10 +262,12 @@ class StreamTransport(ReceivingTransport):
                 return
             if not reported:
                 reported = True
-                message = "it replied but sent no samples: imud started its output and did not save this"
-                self._context.events.raise_event(
-                    self._host.now_ns(), EventKind.CONFIGURATION, message, acknowledged=acknowledged
-                )
+                self._report_started(acknowledged=acknowledged)
+
+    def _report_started(self, **detail: bool) -> None:
+        self._started = False
+        message = "it replied but sent no samples: imud started its output and did not save this"
+        self._context.events.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, message, **detail)
 
     def _apply(self, identity: Identity) -> None:
         if self.driver is not None and self.path is not None:
@@ -273,6 +278,9 @@ class StreamTransport(ReceivingTransport):
         """Send a request at the baud rate of the device. Raises CommandError during a search, and LinkError."""
         self._require_device()
         self.link.write(data)
+        driver = self.driver
+        if driver is not None and data == driver.output_on and self._ledger.samples == self._samples_before:
+            self._started = self._started or self.hears_replies
 
     def _require_device(self) -> None:
         if not self.receiving:

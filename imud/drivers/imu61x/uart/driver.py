@@ -42,6 +42,7 @@ from imud.drivers.imu61x.uart.codec import (
 )
 from imud.drivers.imu61x.uart.commands import (
     BAUD_RATES,
+    STREAM,
     Imu61xUartOptions,
     Parameters3,
     answered,
@@ -330,6 +331,7 @@ DRIVER: Final = StreamDriver(
     device_settings=SETTINGS,
     identify=identify,
     wake=wake,
+    output_on=STREAM,
     example_frame=_example_frame,
     unknown_name=frame_name,
     decoded="imud decodes the AHRS frame (identifier 0x0002): select this output with the program of the vendor",
