@@ -55,6 +55,9 @@ class Request:
     # The reply to an equal earlier request also answers this request, if imud sent no other request between them: the
     # request reads a value.
     repeatable: bool = False
+    # Request with a reply that no other request of the driver has. imud sends it before this request if a late reply
+    # could count as the reply to this request. None for the probe itself, and for requests that must be sent first.
+    probe: "Request | None" = None
     # New baud rate of the link for this and all following requests, bit/s; 0: unchanged. Serial ports only.
     baud: int = 0
     # New driver options for this and all following requests, after the node number changed; None: unchanged. CAN only.

@@ -5,6 +5,8 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
+from itertools import dropwhile
 from typing import TypeVar
 
 from imud.contracts.script import Message, Outcome, Rejection, Reply, Request, RequestScript, Silence
@@ -16,13 +18,13 @@ from imud.model.sample import Measurement
 from imud.model.units import NS_PER_MS, NS_PER_S
 
 REPLY_MESSAGES_MAX = 256  # maximum number of messages in a reply. The longest reply of any manual has some dozens.
-LATE_WINDOW_NS = 5 * NS_PER_S  # time after a timeout in which a matching message counts as part of the late reply, ns
 PATIENCE_MAX_NS = 3 * NS_PER_S  # maximum timeout by the observed replies, ns
 PATIENCE_FACTOR = 2  # timeout as a multiple of the slowest reply
 # Requests with a longer timeout do not change the timeout of other requests: the device writes flash or calibrates.
 ORDINARY_TIMEOUT_NS = NS_PER_S // 2
-OWED_NS = 5 * NS_PER_S // 2  # time after a timeout in which no request with a similar reply is sent, ns
-OWED_MAX = 16  # maximum number of requests whose late replies imud recognizes
+PROBES = 3  # maximum number of probes before a request; each has twice the timeout of the previous probe
+# Maximum number of requests whose late replies imud recognizes: 16 requests without a reply, with their probes
+OWED_MAX = 64
 
 T = TypeVar("T")
 
@@ -53,26 +55,30 @@ class RequestPort(ABC):
 class _Owed:
     """A request without a reply: its late reply can still arrive."""
 
-    __slots__ = ("ended_ns", "partial", "request", "sent_ns")
+    __slots__ = ("partial", "request", "sent_ns")
 
-    def __init__(self, request: Request, sent_ns: int, ended_ns: int, partial: bool) -> None:
+    def __init__(self, request: Request, sent_ns: int, partial: bool) -> None:
         self.request = request
         self.sent_ns = sent_ns  # CLOCK_MONOTONIC when imud sent the request
-        self.ended_ns = ended_ns  # CLOCK_MONOTONIC of the timeout or of the cancellation
-        self.partial = partial  # whether a part of the reply arrived before the timeout
+        self.partial = partial  # whether a part of the reply arrived before the timeout: its end can look like any end
 
     def resembles(self, request: Request) -> bool:
-        """Return whether a late reply could count as the reply to `request`."""
+        """Return whether the complete replies to both requests look alike."""
         mine = self.request
-        return self.partial or (mine.kind, mine.kind or mine.payload) == (request.kind, request.kind or request.payload)
+        return (mine.kind, mine.kind or mine.payload) == (request.kind, request.kind or request.payload)
+
+    def reads_like(self, request: Request) -> bool:
+        """Return whether this request changes no value, and its reply also answers `request` if it looks like it."""
+        return self.request.repeatable and (not self.resembles(request) or self.request.payload == request.payload)
 
 
 class ScriptRunner:
     """Runner of one request script at a time. Synchronization: one thread.
 
     Devices reply in the order of the requests. A message is late if it can belong to a request that timed out and not
-    to the outstanding request, or if it ends a reply with late messages. The runner sends a request whose reply looks
-    like a late reply only when the late reply has arrived, or OWED_NS after the timeout.
+    to the outstanding request, or if it ends a reply with late messages. Before a request whose reply looks like a late
+    reply, the runner sends the `probe` of the request. The reply to the probe shows that no earlier reply can follow.
+    If no reply to a probe arrives, the next matching reply counts for the oldest request without a reply.
 
     The timeout of a request is at least PATIENCE_FACTOR times the slowest reply of the device, at most
     PATIENCE_MAX_NS. Before the first reply, each timeout doubles the next timeout.
@@ -94,7 +100,6 @@ class ScriptRunner:
         self._slowest_ns = 0
         self._replied = False  # whether the time of a reply is known
         self._owed: deque[_Owed] = deque(maxlen=OWED_MAX)  # requests without a reply, oldest first
-        self._arrived: asyncio.Future[None] | None = None  # completed by the next late reply
         self._baud = 0  # baud rate that a script has set; 0: unchanged
         self._late_messages = 0  # number of messages of the late reply that is arriving
         self.deadline_ns: int | None = None
@@ -137,8 +142,15 @@ class ScriptRunner:
                 self._port.on_busy(False)
 
     async def _ask(self, request: Request) -> Outcome:
+        """Send a request, after the probe if a late reply could count as its reply."""
+        for factor in range(PROBES):
+            if request.probe is None or not self.is_owed(request):
+                break
+            await self._exchange(replace(request.probe, timeout_ns=request.probe.timeout_ns << factor))
+        return await self._exchange(request)
+
+    async def _exchange(self, request: Request) -> Outcome:
         port = self._port
-        await self._late_reply_arrived(request)
         if request.baud:
             port.change_rate(request)
             if request.baud != self._baud:
@@ -164,23 +176,12 @@ class ScriptRunner:
             if request.also:
                 port.listen(request, ())
 
-    async def _late_reply_arrived(self, request: Request) -> None:
-        """Return when no late reply can count as the reply to `request`."""
-        while (wait_ns := self.owed_ns(request, self._host.now_ns())) > 0:
-            self._arrived = asyncio.get_running_loop().create_future()
-            with suppress(TimeoutError):
-                async with asyncio.timeout(wait_ns / NS_PER_S):
-                    await self._arrived
-            self._arrived = None
-
-    def owed_ns(self, request: Request, now_ns: int) -> int:
-        """Return the time for which `request` must wait for a late reply that looks like its reply, ns."""
-        if not request.payload or (request.baud and request.baud != self._baud):
-            return 0
-        if request.repeatable and all(owed.request.payload == request.payload for owed in self._owed):
-            return 0
-        similar = (owed.ended_ns + OWED_NS - now_ns for owed in self._owed if owed.resembles(request))
-        return max(0, *similar, 0)
+    def is_owed(self, request: Request) -> bool:
+        """Return whether a late reply could count as the reply to `request`."""
+        if request.silent or not request.payload or (request.baud and request.baud != self._baud):
+            return False
+        similar = list(dropwhile(lambda owed: not (owed.partial or owed.resembles(request)), self._owed))
+        return bool(similar) and not (request.repeatable and all(owed.reads_like(request) for owed in similar))
 
     def _timeout_ns(self, request: Request) -> int:
         """Return the timeout of a request by the slowest reply. A pause keeps its time."""
@@ -215,7 +216,7 @@ class ScriptRunner:
     def on_message(self, message: Message, now_ns: int) -> Outcome | None:
         """Process a text line or a reply frame. Return the outcome if it ends the outstanding request."""
         request = self._request
-        if request is None or not _belongs(request, message) or self._ends_late(request, message, now_ns):
+        if request is None or not _belongs(request, message) or self._ends_late(request, message):
             self._count_stray(message, now_ns)
             return None
         self._late_messages = 0
@@ -259,12 +260,13 @@ class ScriptRunner:
     # --- late replies ------------------------------------------------------------------------------------------------
 
     def _learn(self, request: Request, now_ns: int) -> None:
-        """Process the end of a reply. Devices reply in order: no earlier reply of another kind can follow."""
+        """Process the end of a reply. It can be the reply to the oldest similar request, and no earlier one follows."""
         if request.timeout_ns <= ORDINARY_TIMEOUT_NS and not self._owed:
             self._note_reply_time(now_ns - self._sent_ns)
-        similar = [owed for owed in self._owed if owed.resembles(request)]
-        if not similar:
-            self._owed.clear()
+        while request.kind and self._owed and not self._owed[0].resembles(request):
+            self._owed.popleft()
+        if request.kind and self._owed:
+            self._owed[0].partial = False  # a complete reply of this kind can follow
 
     def _note_reply_time(self, duration_ns: int) -> None:
         """Follow the slowest reply, also with the timeout of the outstanding request."""
@@ -277,25 +279,26 @@ class ScriptRunner:
         """Expect the late reply to the outstanding request. No late reply can follow a pause."""
         request = self._request
         if request is not None and (request.payload or request.kind):
-            self._owed.append(_Owed(request, self._sent_ns, now_ns, bool(self._messages)))
+            self._owed.append(_Owed(request, self._sent_ns, bool(self._messages)))
             if not self._replied:
                 self._slowest_ns = max(self._slowest_ns, now_ns - self._sent_ns)
             self._late_messages = len(self._messages)
 
-    def _ends_late(self, request: Request, message: Message, now_ns: int) -> bool:
+    def _ends_late(self, request: Request, message: Message) -> bool:
         """Return whether `message` ends a late reply: no message of the outstanding reply has arrived yet."""
         if not _ends(request, message) or self._messages:
             return False
-        late_is_arriving = self._late_messages > 0 and bool(self._expected(now_ns))
-        return late_is_arriving or (request.is_end(message) and request.messages_min > 1)
+        late_is_arriving = self._late_messages > 0 and bool(self._owed)
+        is_too_short = request.is_end(message) and request.messages_min > 1
+        return late_is_arriving or is_too_short or (self.is_owed(request) and self._owing(message) is not None)
 
-    def _expected(self, now_ns: int) -> list[_Owed]:
-        """Return the requests whose late replies can still arrive, oldest first."""
-        return [owed for owed in self._owed if now_ns - owed.ended_ns <= LATE_WINDOW_NS]
+    def _owing(self, message: Message) -> _Owed | None:
+        """Return the oldest request without a reply that `message` can belong to; None if there is none."""
+        return next((owed for owed in self._owed if _belongs(owed.request, message)), None)
 
     def _count_stray(self, message: Message, now_ns: int) -> None:
         """Count a message that belongs to no outstanding request: part of a late reply, or unsolicited."""
-        late = next((owed for owed in self._expected(now_ns) if _belongs(owed.request, message)), None)
+        late = self._owing(message)
         if late is None:
             self._ledger.replies_unsolicited += 1
             return
@@ -304,10 +307,9 @@ class ScriptRunner:
             self._ledger.replies_late += 1
             if late.request.timeout_ns <= ORDINARY_TIMEOUT_NS:
                 self._note_reply_time(now_ns - late.sent_ns)
-            self._owed.remove(late)
+            while self._owed.popleft() is not late:
+                pass  # the device replies in order
             self._late_messages = 0
-            if self._arrived is not None and not self._arrived.done():
-                self._arrived.set_result(None)
 
 
 def _belongs(request: Request, message: Message) -> bool:

@@ -8,9 +8,25 @@ from typing import Any
 import pytest
 
 from imud.contracts.driver import StreamDriver
-from imud.contracts.script import Outcome, Reply, ReplyFrame, Request, RequestScript, Silence, of_text, pause, with_undo
+from imud.contracts.script import (
+    Outcome,
+    Reply,
+    ReplyFrame,
+    Request,
+    RequestScript,
+    Silence,
+    never,
+    of_text,
+    pause,
+    with_undo,
+)
 from imud.device.scripts import RequestPort, ScriptRunner
 from imud.drivers import DRIVERS
+from imud.drivers.hipnuc.canopen import cia301
+from imud.drivers.hipnuc.j1939.codec import J1939Node
+from imud.drivers.hipnuc.j1939.commands import WRITE, exchange
+from imud.drivers.hipnuc.uart import commands
+from imud.drivers.imu61x.uart import commands as imu61x
 from imud.host.clock import HostClock
 from imud.model.errors import CommandError, LinkMissing, NoReply
 from imud.model.ledger import Ledger
@@ -221,22 +237,25 @@ MS = 1_000_000
 
 
 def on_slow_device(delays_ms: Sequence[float | None], *requests: Request) -> tuple[list[str], list[int]]:
-    """Send requests to a device that replies OK in order, after each delay or not at all (None).
+    """Send requests to a device that replies OK in order, after each delay or not at all (None). Later delays are 1 ms.
 
-    Return the end of each outcome, and the times in ms at which imud sent the requests.
+    The device replies to a probe, also a late one. Return the end of each outcome, and the times in ms of the requests.
     """
     clock, sent_ms, texts = VirtualClock(), list[int](), list[str]()
     begin_ns, due_ms = clock.now_ns(), [0.0]
 
     async def body() -> None:
-        def write(_data: bytes) -> None:
-            delay_ms = delays_ms[len(sent_ms)]
-            sent_ms.append((clock.now_ns() - begin_ns) // MS)
+        def write(data: bytes) -> None:
+            delay_ms = 1 if data == PROBE.payload else delays_ms[len(sent_ms)]
+            now_ms = (clock.now_ns() - begin_ns) // MS
+            if data == PROBE.payload:
+                text = "probe"
+            else:
+                sent_ms.append(now_ms)
+                text = f"{len(sent_ms)} OK"
             if delay_ms is not None:
-                number = len(sent_ms)
-                due_ms.append(max(due_ms[-1], sent_ms[-1] + delay_ms))
-                wait_s = (due_ms[-1] - sent_ms[-1]) / 1000
-                later(wait_s, lambda: runner.on_message(f"{number} OK", clock.now_ns()))
+                due_ms.append(max(due_ms[-1], now_ms + delay_ms))
+                later((due_ms[-1] - now_ms) / 1000, lambda: runner.on_message(text, clock.now_ns()))
 
         later = asyncio.get_running_loop().call_later
         runner = runner_of(write, clock)
@@ -246,9 +265,12 @@ def on_slow_device(delays_ms: Sequence[float | None], *requests: Request) -> tup
     return texts, sent_ms
 
 
+PROBE = Request(b"?", "probe", of_text(lambda text: text == "probe"), never, never, kind="probe", repeatable=True)
+
+
 def ok(name: str, *, kind: str = "OK", repeatable: bool = False) -> Request:
     numbered = of_text(lambda text: text.endswith("OK"))
-    return Request(name.encode(), name, numbered, of_text(lambda _: False), numbered, kind=kind, repeatable=repeatable)
+    return Request(name.encode(), name, numbered, never, numbered, kind=kind, repeatable=repeatable, probe=PROBE)
 
 
 def test_the_timeout_follows_the_slowest_reply() -> None:
@@ -271,20 +293,26 @@ def test_the_first_contact_is_patient(delay_ms: int | None, outcomes: list[str])
 
 
 @pytest.mark.parametrize(
-    ("late_ms", "next_ms"), [(700, 800), (2900, 3000), (None, 3100)], ids=["late", "very late", "never"]
-)
-def test_a_late_reply_never_answers_the_next_similar_request(late_ms: int | None, next_ms: int) -> None:
-    """The next request waits for the late reply, or until no late reply can arrive. The timeout then follows it."""
+    ("late_ms", "next_ms", "outcomes"),
+    [
+        (700, 800, ["3 OK", "4 OK"]), (2900, 3000, ["3 OK", "4 OK"]), (3900, 4000, ["3 OK", "4 OK"]),
+        (9000, 4100, ["", ""]), (None, 601, ["3 OK", ""]),
+    ],
+)  # fmt: skip
+def test_a_late_reply_never_answers_the_next_similar_request(
+    late_ms: int | None, next_ms: int, outcomes: list[str]
+) -> None:
+    """The reply to a probe shows that the late reply has arrived or is lost. Three probes follow within 3.5 s."""
     texts, sent_ms = on_slow_device([100, late_ms, 50, 900], ok("A"), ok("B"), ok("C"), ok("D"))
-    assert texts == ["1 OK", "", "3 OK", "4 OK" if late_ms else ""]
+    assert texts == ["1 OK", "", *outcomes]
     assert sent_ms[:3] == [0, 100, next_ms]
 
 
 def test_a_wait_for_a_further_reply_follows_the_slowest_reply_and_its_late_reply_counts_for_no_request() -> None:
     further = replace(ok("A"), payload=b"", name="A, further reply")
     texts, sent_ms = on_slow_device([400, 700], ok("A"), further, ok("B"))
-    # no reply within twice 400 ms, and no late reply within 2.5 s
-    assert (texts, sent_ms) == (["1 OK", "", "2 OK"], [0, 400 + 800 + 2500])
+    # no reply within twice 400 ms, then the reply to a probe
+    assert (texts, sent_ms) == (["1 OK", "", "2 OK"], [0, 400 + 800 + 1])
 
 
 def test_a_request_with_another_reply_or_the_same_read_is_sent_immediately() -> None:
@@ -294,3 +322,26 @@ def test_a_request_with_another_reply_or_the_same_read_is_sent_immediately() -> 
     # a write between two equal reads: the late reply has the old value
     texts, sent_ms = on_slow_device([1, 2000, 1, 1], ok("A"), read, ok("write"), read)
     assert (texts, sent_ms) == (["1 OK", "", "", "4 OK"], [0, 1, 501, 2001])
+
+
+@pytest.mark.parametrize(
+    "request_of",
+    [
+        commands.log_enable,
+        lambda: next(cia301.write_object(8, 0x1800, 5, 10, 2)),
+        lambda: exchange(J1939Node(128, 85), 0x9E, WRITE, 1, "sign"),
+        lambda: imu61x.set_rate(100),
+    ],
+    ids=["hipnuc-uart", "canopen", "j1939", "imu61x-uart"],
+)
+def test_a_request_after_an_equal_request_without_reply_follows_a_probe(request_of: Callable[[], Request]) -> None:
+    """The reply to the probe has another kind. The simulated device does not reply: three probes."""
+    one, clock, port = request_of(), VirtualClock(), ListPort()
+    assert one.probe is not None
+    assert one.probe.kind != one.kind
+
+    async def body() -> None:
+        await ScriptRunner(port, Ledger(), clock.host).run(ask(one, one))
+
+    run_virtually(clock, body())
+    assert port.written == [one.payload, *[one.probe.payload] * 3, one.payload]

@@ -17,6 +17,7 @@ from enum import Enum, auto
 from typing import Final, Literal, NamedTuple
 
 from imud.attitude.rotation import euler312_from_quat
+from imud.drivers.hipnuc.canopen import cia301
 from imud.drivers.hipnuc.canopen import commands as objects
 from imud.drivers.hipnuc.canopen.cia301 import (
     ABORT,
@@ -217,7 +218,7 @@ def _tpdo_entries(number: int, index: int) -> dict[tuple[int, int], _Entry]:
 
 def _entries() -> dict[tuple[int, int], _Entry]:
     entries = {
-        (objects.DEVICE_TYPE, 0): _Entry(4, lambda _: DEVICE_TYPE),
+        (cia301.DEVICE_TYPE, 0): _Entry(4, lambda _: DEVICE_TYPE),
         (objects.DEVICE_NAME, 0): _Entry(4, lambda _: int.from_bytes(NAME, "little")),
         (objects.IDENTITY, 0): _Entry(1, lambda _: len(IDENTITY_SUBS)),
         (objects.HEARTBEAT_TIME, 0): _Entry(

@@ -75,6 +75,7 @@ def state_name(code: int) -> str:
 
 
 SDO_BYTES: Final = 8
+DEVICE_TYPE: Final = 0x1000  # index of the object that every node has
 READ: Final = 0x40
 WRITE: Final = {1: 0x2F, 2: 0x2B, 3: 0x27, 4: 0x23}
 WRITTEN: Final = 0x60
@@ -159,9 +160,9 @@ def value_of(data: bytes) -> bytes | None:
 
 def read_object(node: int, index: int, sub: int) -> RequestScript[bytes | None]:
     """Read an object. Return its bytes, or None if it has more than four bytes. Raises Aborted, NoReply."""
-    name = f"node {node}, read 0x{index:04X}.{sub}"
-    ends = _answers(node, index, sub, (*READ_SIZES, *READ_SEGMENTED))
-    data = _reply(name, (yield _request(node, name, read_frame(index, sub), ends, index, sub)))
+    request = _read_request(node, index, sub)
+    name = request.name
+    data = _reply(name, (yield request))
     value = value_of(data)
     if value is None:
         payload = pack_frame(SDO_REQUEST + node, False, abort_frame(index, sub, ABORT_UNSUPPORTED))
@@ -192,7 +193,13 @@ def _request(node: int, name: str, frame: bytes, ends: Callable[[Message], bool]
     reads = frame[0] == READ
     kind = f"node {node}, 0x{index:04X}.{sub}"  # an abort does not contain the direction of the transfer
     payload = pack_frame(SDO_REQUEST + node, False, frame)
-    return Request(payload, name, ends, refuses, never, TIMEOUT_NS, kind=kind, repeatable=reads)
+    probe = None if (index, sub) == (DEVICE_TYPE, 0) else _read_request(node, DEVICE_TYPE, 0)
+    return Request(payload, name, ends, refuses, never, TIMEOUT_NS, kind=kind, repeatable=reads, probe=probe)
+
+
+def _read_request(node: int, index: int, sub: int) -> Request:
+    ends = _answers(node, index, sub, (*READ_SIZES, *READ_SEGMENTED))
+    return _request(node, f"node {node}, read 0x{index:04X}.{sub}", read_frame(index, sub), ends, index, sub)
 
 
 def _reply(name: str, outcome: Outcome) -> bytes:

@@ -17,6 +17,7 @@ from imud.contracts.driver import Identity
 from imud.contracts.script import Message, Reply, ReplyFrame, Request, RequestScript, never
 from imud.contracts.setting import Written
 from imud.drivers.hipnuc.canopen.cia301 import (
+    DEVICE_TYPE,
     EMERGENCY,
     FLASH_TIMEOUT_NS,
     FUNCTION_MASK,
@@ -45,7 +46,6 @@ from imud.formats.can import STANDARD_ID_MAX, CanFilter, pack_frame
 from imud.model.errors import BadArgument, DeviceRefused, NoReply
 from imud.model.units import NS_PER_MS, NS_PER_S
 
-DEVICE_TYPE: Final = 0x1000
 DEVICE_NAME: Final = 0x1008
 HEARTBEAT_TIME: Final = 0x1017
 IDENTITY: Final = 0x1018

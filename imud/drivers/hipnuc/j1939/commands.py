@@ -113,9 +113,12 @@ def exchange(
     can_id = join(J1939Id(PRIORITY, CONFIGURE, peer.host, peer.address))
     frame = pack_frame(can_id, True, LAYOUT.pack(register, command, 0, value))
     kind = f"register {register} of {peer.address}, command {command}"
+    is_probe = (register, command) == (ADDRESS, READ)
+    probe = None if is_probe else exchange(peer, ADDRESS, READ, READ_VALUE, "read the address")
     return Request(
-        frame, name, accepts, refuses, is_reply, timeout_ns, kind=kind, repeatable=command == READ, also=also
-    )
+        frame, name, accepts, refuses, is_reply, timeout_ns,
+        kind=kind, repeatable=command == READ, probe=probe, also=also,
+    )  # fmt: skip
 
 
 def read(peer: J1939Node, register: int) -> RequestScript[int]:

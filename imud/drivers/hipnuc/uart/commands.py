@@ -276,7 +276,7 @@ def _command(
     payload = (text + LINE_END).encode("ascii")
     return Request(
         payload, text, of_text(is_end), of_text(is_rejection), of_text(is_part), timeout_ns, silent, messages_min,
-        kind, repeatable,
+        kind, repeatable, probe=None if kind == "version" else ask(Query.VERSION),
     )  # fmt: skip
 
 

@@ -130,6 +130,7 @@ def ask_installation_status() -> Request:
         command,
         "installation calibration status",
         is_end=lambda message: acknowledged(message) or parse_status(message) is not None,
+        repeatable=True,
     )
 
 
@@ -248,9 +249,11 @@ def _command(
     ends = is_end or acknowledged
     # the acknowledgement contains the command and not the parameter
     kind = f"{command.name} {param3 if is_end else ''}"
+    # outside of command mode, the device may reply to no probe
+    probe = None if command in (Command.STATUS, Command.OUTPUT_MODE) else ask_status()
     return Request(
         payload, name, ends, never, acknowledged, timeout_ns,
-        kind=kind, repeatable=repeatable, baud=baud, is_sample=is_sample,
+        kind=kind, repeatable=repeatable, probe=probe, baud=baud, is_sample=is_sample,
     )  # fmt: skip
 
 
