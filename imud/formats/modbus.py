@@ -7,6 +7,7 @@ Source: "MODBUS over Serial Line" V1.02, chapter 2.5, and "MODBUS Application Pr
 frame has no sync word and no end mark. Its meaning follows from the request and from the silence before and after it.
 """
 
+from collections.abc import Collection
 from typing import Final
 
 from imud.model.units import NS_PER_US, uart_byte_ns
@@ -83,6 +84,16 @@ def exception_text(code: int) -> str:
 def frame_gap_ns(baud: int) -> int:
     """Return the silence that ends a frame, ns ("MODBUS over Serial Line" V1.02, 2.5.1.1)."""
     return FAST_GAP_NS if baud > FAST_BAUD else round(FRAME_GAP_CHARACTERS * uart_byte_ns(baud))
+
+
+def late_sender(data: bytes, owing: Collection[int]) -> int | None:
+    """Return the address of the first complete reply to a read in `data` from one of the addresses `owing`."""
+    for at in range(len(data) - READ_OVERHEAD_BYTES):
+        if data[at] in owing and data[at + 1] == READ_HOLDING:
+            size = READ_OVERHEAD_BYTES + data[at + 2]
+            if len(data) - at >= size and is_whole(data[at : at + size]):
+                return data[at]
+    return None
 
 
 class ReplyFinder:

@@ -39,6 +39,7 @@ from imud.formats.modbus import (
     ReplyFinder,
     frame_gap_ns,
     framed,
+    late_sender,
 )
 from imud.links.device_node import CABLE, PROC, DeviceNode
 from imud.links.serial_port import TtyCounters, hold_ns, open_port, port_problem, request_low_latency
@@ -100,31 +101,51 @@ PATIENCE_FACTOR: Final = 2  # this time as a multiple of the slowest reply
 DECAY: Final = 8  # each faster reply reduces the slowest reply by this share of it, so that a stall has a short effect
 
 
-class ReplyTimes:
-    """Times of the replies of one bus. Before the first reply, the first device on the bus gets PATIENCE_NS.
+# Rounds of a search in which each address gets SEARCH_NS once. A round over all addresses lasts about 8 s longer.
+SEARCH_ROUNDS: Final = 16
+SEARCH_NS: Final = NS_PER_S // 2
 
-    Other devices do not get this time: a search over all addresses would take minutes. After a reply, all devices get
-    a multiple of the slowest reply.
+
+class ReplyTimes:
+    """Times of the replies on one bus.
+
+    Before the first reply on the bus, the first device gets PATIENCE_NS. Other addresses do not get this time: a search
+    over all addresses would take minutes. From the second request on, an address gets SEARCH_NS in one of SEARCH_ROUNDS
+    requests. An address with a late reply gets PATIENCE_NS until it replies in time. After its first reply, a device
+    gets a multiple of its slowest reply. The other devices get a multiple of the slowest reply on the bus.
     """
 
-    __slots__ = ("_first", "_slowest_ns")
+    __slots__ = ("_asked", "_first", "_late", "_slowest_ns")
 
     def __init__(self) -> None:
         self._first: int | None = None  # address of the first request on the bus
-        self._slowest_ns = 0  # time of the slowest reply, ns; 0 before the first reply
+        self._asked: dict[int, int] = {}  # number of requests by address, before the first reply on the bus
+        self._late: set[int] = set()  # addresses with a late reply
+        self._slowest_ns: dict[int, int] = {}  # time of the slowest reply by address, ns
 
     def wait_ns(self, target: int, reply_ns: int) -> int:
         """Return the maximum time until a device starts its reply, at least `reply_ns`."""
         if self._first is None:
             self._first = target
-        if not self._slowest_ns and target != self._first:
-            return reply_ns
-        patience_ns = PATIENCE_FACTOR * self._slowest_ns if self._slowest_ns else PATIENCE_NS
+        slowest = self._slowest_ns
+        if target in self._late or (not slowest and target == self._first):
+            patience_ns = PATIENCE_NS
+        elif slowest:
+            patience_ns = PATIENCE_FACTOR * slowest.get(target, max(slowest.values()))
+        else:
+            asked = self._asked[target] = self._asked.get(target, -1) + 1
+            patience_ns = SEARCH_NS if asked and (target + asked) % SEARCH_ROUNDS == 0 else 0
         return max(reply_ns, min(patience_ns, PATIENCE_NS))
 
-    def add(self, duration_ns: int) -> None:
+    def add(self, target: int, duration_ns: int) -> None:
         """Note the time of a reply."""
-        self._slowest_ns = max(duration_ns, self._slowest_ns - self._slowest_ns // DECAY, 1)
+        self._late.discard(target)
+        slowest_ns = self._slowest_ns.get(target, 0)
+        self._slowest_ns[target] = max(duration_ns, slowest_ns - slowest_ns // DECAY, 1)
+
+    def add_late(self, target: int) -> None:
+        """Note a reply after its timeout."""
+        self._late.add(target)
 
 
 class PortSetup(NamedTuple):
@@ -176,6 +197,7 @@ class Rs485Line:
         self._quiet_ns = now_ns()
         self._owing: dict[int, bytes] = {}
         self._times = ReplyTimes()
+        self._stray = b""  # newest bytes outside of replies, which can contain a late reply
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
         try:
@@ -242,9 +264,10 @@ class Rs485Line:
             self._owing[target] = owed or request
             self.counters.timeouts += 1
             self.counters.strange += len(finder.rest())
+            self._note_stray(finder.rest())
             raise self._no_reply(target, finder)
         self._owing.pop(target, None)
-        self._times.add(self._now_ns() - sent_ns - overhead_ns)
+        self._times.add(target, self._now_ns() - sent_ns - overhead_ns)
         return reply
 
     def _wait(self, finder: ReplyFinder, deadline_ns: int) -> bytes | None:
@@ -258,6 +281,16 @@ class Rs485Line:
             if finder.missing > 1:
                 time.sleep(finder.missing * self._byte_ns * ASLEEP_SHARE / NS_PER_S)
         return finder.feed(self._read())  # this thread may be late: read once more
+
+    def _note_stray(self, data: bytes) -> None:
+        """Look for the late reply of a device in bytes outside of replies."""
+        if not data or not self._owing:
+            return
+        self._stray = (self._stray + data)[-ADU_BYTES_MAX:]
+        sender = late_sender(self._stray, self._owing)
+        if sender is not None:
+            self._times.add_late(sender)
+            self._stray = b""
 
     def _note_echo(self, finder: ReplyFinder, reply: bytes | None) -> None:
         """Store whether the port echoes."""
@@ -295,10 +328,11 @@ class Rs485Line:
         """Return after a silence of one frame gap. Count the bytes received before it as late."""
         limit_ns = self._now_ns() + 2 * ADU_BYTES_MAX * self._byte_ns + self._gap_ns
         while True:
-            late = len(self._read())
-            self.counters.late += late
+            data = self._read()
+            self.counters.late += len(data)
+            self._note_stray(data)
             now_ns = self._now_ns()
-            if not late and now_ns >= self._quiet_ns + self._gap_ns:
+            if not data and now_ns >= self._quiet_ns + self._gap_ns:
                 return
             if now_ns > limit_ns:
                 raise TransferError(Trouble.STUCK, f"{self._path} is never silent: is there another master on the bus?")

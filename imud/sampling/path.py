@@ -469,6 +469,8 @@ def make_clock(
 
 # Time without edges after which the line counts as stopped, ns. It is shorter than the time until a device is silent.
 QUIET_NS: Final = 500 * NS_PER_MS
+# Maximum interval of the reads of a slow device that the period follows, ns: three devices with replies of 3 s on a bus
+READ_INTERVAL_MAX_NS: Final = 9 * NS_PER_S
 KEPT: Final = 1024  # number of buffered edges without a read: the capacity of the kernel's event buffer
 # Maximum time from an edge to a second read of its values, in intervals. After that, an edge may have been lost.
 AGE_LIMIT: Final = 1.5
@@ -559,6 +561,7 @@ class PolledPath(SamplePath):
         self.failed = 0  # number of failed transfers
         self.edges = timing.edges  # edges of the data-ready line; None without a line
         self._period_ns = timing.period_ns
+        self._interval_ns = 0  # time between the two newest successful reads, or duration of the first read, ns
         self._update_ns = timing.update_ns
         self._before_ns = 0  # start of the previous successful read
         self._faults = 0  # consecutive damaged or disturbed reads
@@ -569,7 +572,8 @@ class PolledPath(SamplePath):
 
     @property
     def period_ns(self) -> int:
-        return self._period_ns
+        """Expected time between two reads, ns. It follows the reads of slow devices, up to READ_INTERVAL_MAX_NS."""
+        return max(self._period_ns, min(self._interval_ns, READ_INTERVAL_MAX_NS))
 
     def set_frame(self, frame: PublishedAxes) -> None:
         """Publish the following samples in other axes."""
@@ -650,6 +654,8 @@ class PolledPath(SamplePath):
                     self._ledger.lost_crc += 1
                     gone = gone or self._fault(f"{FAULTS_MAX} damaged frames in a row, the last by {event.reason}")
         if reading.poll == 0:
+            first_ns = self._before_ns or reading.start_ns
+            self._interval_ns = max(reading.start_ns - first_ns, reading.end_ns - reading.start_ns)
             self._before_ns = reading.start_ns
             if not vanished:
                 self._read_ns = reading.start_ns

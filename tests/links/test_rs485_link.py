@@ -8,7 +8,7 @@ import select
 import struct
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -210,17 +210,41 @@ def test_slow_devices_of_a_bus_reply_in_time(tmp_path: Path) -> None:
         assert link.heard.timeouts == 0
 
 
-def test_the_time_for_a_reply_follows_the_slowest_reply() -> None:
+def test_the_time_for_a_reply_follows_the_slowest_reply_of_a_device() -> None:
     times, ms = ReplyTimes(), 1_000_000
     assert [times.wait_ns(target, 20 * ms) for target in (80, 1, 80, 2)] == [3000 * ms, 20 * ms, 3000 * ms, 20 * ms]
-    times.add(700 * ms)
-    assert [times.wait_ns(target, 20 * ms) for target in (80, 1)] == [1400 * ms] * 2
-    times.add(2000 * ms)
-    assert times.wait_ns(1, 20 * ms) == 3000 * ms
+    times.add_late(2)
+    assert [times.wait_ns(target, 20 * ms) for target in (80, 1, 2)] == [3000 * ms, 20 * ms, 3000 * ms]
+    times.add(80, 700 * ms)
+    assert [times.wait_ns(target, 20 * ms) for target in (80, 1, 2)] == [1400 * ms, 1400 * ms, 3000 * ms]
+    times.add(2, 2000 * ms)
+    assert [times.wait_ns(target, 20 * ms) for target in (80, 1, 2)] == [1400 * ms, 3000 * ms, 3000 * ms]
     assert times.wait_ns(1, 5000 * ms) == 5000 * ms  # a request that writes the flash
     for _ in range(60):  # a stall of the host has a short effect
-        times.add(-ms)
-    assert times.wait_ns(80, 20 * ms) == 20 * ms
+        times.add(80, -ms)
+    assert [times.wait_ns(target, 20 * ms) for target in (80, 2)] == [20 * ms, 3000 * ms]
+
+
+def test_a_search_asks_each_address_with_a_long_timeout() -> None:
+    """The first round is fast. In each of 16 further rounds, one of 16 addresses gets 0.5 s."""
+    times, ms = ReplyTimes(), 1_000_000
+    rounds = [[times.wait_ns(target, 20 * ms) for target in (80, *range(1, 80))][1:] for _ in range(17)]
+    assert set(rounds[0]) == {20 * ms}
+    assert [sorted({one[at] for one in rounds}) for at in range(79)] == [[20 * ms, 500 * ms]] * 79
+    assert max(sum(one) for one in rounds) <= 79 * 20 * ms + 5 * 480 * ms
+
+
+def test_a_search_finds_a_device_by_its_late_reply(tmp_path: Path) -> None:
+    """The device needs 0.7 s. The search asks the other addresses in the meantime."""
+    with wired(tmp_path, slave(7, processing_ns=700_000_000)) as (path, _), opened(path, reply_ms=20) as link:
+        found = []
+        link.select(247)
+        for target in (*range(1, 60), 7):
+            link.select(target)
+            with suppress(TransferError):
+                found.append((target, link.transfer(SERIAL)[3:11]))
+        assert found == [(7, serial_of(7))]
+        assert link.heard.late + link.heard.strange >= SERIAL.read_bytes
 
 
 def test_after_a_time_out_one_register_is_read_first_and_then_no_more(pty: PtyPort) -> None:

@@ -307,6 +307,18 @@ def test_readings_of_one_turn_are_one_batch_and_end_at_a_vanished_device() -> No
     assert rig.noted.reports[-2:] == [("readings", [*readings, gone, *later]), ("call", "path", "skip", 8)]
 
 
+@pytest.mark.parametrize(
+    ("starts_ms", "period_ms"), [([0], 10), ([0, 5], 10), ([0, 700], 700), ([0, 700, 1400], 700), ([0, 60_000], 9000)]
+)
+def test_the_period_follows_the_reads_of_a_slow_device(starts_ms: list[int], period_ms: int) -> None:
+    """The time without a sample that makes a device silent is a multiple of the period."""
+    rig = PathRig("imu61x-i2c")
+    path = rig.polled()
+    path.begin(rig.now)
+    path.on_readings([rig.reading(at, [VALUES]) for at in starts_ms])
+    assert path.period_ns == period_ms * MS
+
+
 @pytest.mark.parametrize("kind", ["damaged", "disturbed"])
 def test_three_faults_in_a_row_identify_the_device_again(kind: str) -> None:
     rig = PathRig("imu61x-i2c")
