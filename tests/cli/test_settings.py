@@ -85,7 +85,7 @@ def test_values_in_place_of_the_declared_ones(daemon: RunningDaemon, words: tupl
     found = actual(daemon)
     assert (found["output"]["hi91"], found["alarm"]["x"]["min_deg"], found["alarm"]["x"]["max_deg"]) == (50, -5, 10)
     assert (found["pins"]["led"], found["pins"]["sin"]) == (7, 1)
-    cli.refuses("pins: expected an unused pin for led, got IO1; sin uses it", *words, "--set", "pins.led=1")
+    cli.refuses("pins: expected another pin for each function, got IO1 for sin and led", *words, "--set", "pins.led=1")
     out = cli(*words, "--set", "mounting=x_up", status=1).out
     assert "not set: mounting needs a save and a restart" in out
 

@@ -132,8 +132,8 @@ def test_a_present_contradiction_does_not_prevent_another_change() -> None:
 
     assert names(plan(mode="9-axis")) == ["mode"]
     assert names(plan(pins={"led": 5})) == ["pins"]
-    for pins, problem in ({"sout": 1}, "sout, got IO1; sin"), ({"alarm": 2}, "alarm, got IO2; sout"):
-        with pytest.raises(BadArgument, match=f"pins: expected an unused pin for {problem} uses it"):
+    for pins, problem in ({"sout": 1}, "IO1 for sin and sout"), ({"alarm": 2}, "IO2 for sout and alarm"):
+        with pytest.raises(BadArgument, match=f"pins: expected another pin for each function, got {problem}"):
             plan(pins=pins)
 
 

@@ -318,7 +318,7 @@ def _contradictions(target: Target, values: Mapping[str, Any]) -> Iterator[str]:
     taken: dict[int, str] = {}
     for function, pin in values.get("pins", {}).items():
         if pin in taken:
-            yield f"pins: expected an unused pin for {function}, got IO{pin}; {taken[pin]} uses it"
+            yield f"pins: expected another pin for each function, got IO{pin} for {taken[pin]} and {function}"
         taken[pin] = function
     for axis, one in msgspec.to_builtins(values.get("alarm", {})).items():
         if not one["min_deg"] < one["max_deg"]:
