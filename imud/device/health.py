@@ -37,10 +37,21 @@ class DeviceEvents:
         self, now_ns: int, kind: EventKind, message: str, /, **detail: str | int | float | bool | None
     ) -> None:
         """Log and send an event. Replace unprintable characters, because a device can send any text."""
+        self._report(LEVELS.get(kind, logging.WARNING), now_ns, kind, message, detail)
+
+    def note_own(
+        self, now_ns: int, kind: EventKind, message: str, /, **detail: str | int | float | bool | None
+    ) -> None:
+        """Log and send an event about a requested change: it is no warning."""
+        self._report(logging.INFO, now_ns, kind, message, detail)
+
+    def _report(
+        self, level: int, now_ns: int, kind: EventKind, message: str, detail: dict[str, str | int | float | bool | None]
+    ) -> None:
         message = printable(message, MESSAGE_CHARACTERS_MAX)
         detail = {name: printable(one) if isinstance(one, str) else one for name, one in detail.items()}
         alike = same_as(kind if kind is EventKind.BAD_FRAME else message)  # the bytes of each damaged frame differ
-        log.log(LEVELS.get(kind, logging.WARNING), "%s: %s", self.device, message, extra=alike)
+        log.log(level, "%s: %s", self.device, message, extra=alike)
         self._send(Event(now_ns, self.device, kind, message, detail))
 
     def bad_frame(self, frame: BadFrame) -> None:

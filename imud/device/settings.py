@@ -327,8 +327,11 @@ class DeviceSettings:
             message = f"another device: serial number {identity.serial_number}, was {before.serial_number}"
             self.raise_event(message, serial_number=identity.serial_number)
 
-    def update(self, reports: Reports) -> None:
-        """Store all reports. Raise an event if a known setting has another value, and compare the GPIO lines."""
+    def update(self, reports: Reports, *, own: bool = False) -> None:
+        """Store all reports. Raise an event if a known setting has another value, and compare the GPIO lines.
+
+        `own`: a command of imud has just run, so the change is no warning.
+        """
         driver, known = self._transport.driver, self.shown
         self._reports, self.is_current, self._read_ns = reports, True, self._host.now_ns()
         text = printable_words(words_of(reports))
@@ -336,23 +339,27 @@ class DeviceSettings:
         changed = {name: value for name, value in self.shown.items() if known.get(name, value) != value}
         if changed:
             now = ", ".join(f"{name} is {value}, was {known[name]}" for name, value in changed.items())
-            self.raise_event(f"settings of the device changed: {now}", **changed)
+            now_ns, kind = self._host.now_ns(), EventKind.CONFIGURATION
+            if own:
+                self._events.note_own(now_ns, kind, f"a command changed settings of the device: {now}", **changed)
+            else:
+                self._events.raise_event(now_ns, kind, f"settings of the device changed: {now}", **changed)
         self._observer.described(self._transport.where, identity_words(self.identity), self.shown)
         self._transport.attachments.compare_settings(self.values, driver)
         self._transport.use_axes(self.shown)
 
-    async def read(self) -> Values:
-        """Read all reports; no report if the driver has no table of settings. Raises as `report`."""
+    async def read(self, *, own: bool = False) -> Values:
+        """Read all reports; no report if the driver has no table of settings. Raises as `report`. `own` as `update`."""
         table = self.table
         if table is None:
-            self.update({})
+            self.update({}, own=own)
             return {}
 
         def script(target: Target) -> Any:
             self._target = target
             return table.read(target, None)
 
-        self.update(await self._transport.run_script(script))
+        self.update(await self._transport.run_script(script), own=own)
         self._read_resets = self.counter_resets
         if self.comparison.is_scheduled and self._transport.can_be_asked:
             self.comparison.start_if_due(None)
@@ -366,7 +373,7 @@ class DeviceSettings:
         try:
             if identity:
                 await self._transport.read_identity()
-            await self.read()
+            await self.read(own=True)
         except DEVICE_ERRORS as error:
             log.info("%s: settings not read back: %s", self._config.name, error)
 
@@ -508,7 +515,7 @@ class DeviceSettings:
             self._written |= applying.written
             if applying.changed:
                 self._mark_unsaved(actual)
-            self.update(applying.reports)
+            self.update(applying.reports, own=True)
             self.is_current = applying.heard
             if applying.saved:
                 self._unsaved = False

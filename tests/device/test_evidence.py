@@ -95,6 +95,17 @@ async def test_a_reset_of_a_device_without_reports_is_not_verified(bench: Module
     assert (found.verified, found.evidence) == (False, "the device reports no settings after it")
 
 
+@played(ModuleBench)
+async def test_the_log_has_no_warning_about_a_requested_change(
+    bench: ModuleBench, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "imud")
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=False))
+    records = [(r.levelname, r.getMessage()) for r in caplog.records if "settings of the device" in r.getMessage()]
+    assert [level for level, _ in records] == ["INFO"], records
+
+
 @pytest.mark.parametrize("sends", [False, True])
 @played(ModuleBench)
 async def test_samples_are_evidence_only_if_none_arrived_before(bench: ModuleBench, sends: bool) -> None:

@@ -183,7 +183,7 @@ async def test_settings_are_read_again_after_each_action(device: LinkedDevice) -
     settings = device.device.status().settings
     assert (settings["pins.led"], settings["mounting"]) == ("IO7", "y_up")
     assert settings["output.hi91"] == "25 Hz"
-    assert "settings of the device changed: pins.led is IO7, was IO5" in device.messages
+    assert "a command changed settings of the device: pins.led is IO7, was IO5" in device.messages
 
 
 @played(lambda: LinkedDevice(hardware=hardware_of(Behaviour(refuses=("CONFIG ATT RST",)))))
