@@ -58,6 +58,10 @@ class VerbResult(msgspec.Struct, frozen=True):
     not_saved: str = ""  # that the flash lacks a change, and the next step; empty if the flash contains all settings
 
 
+def _always(_arguments: Any) -> bool:
+    return True
+
+
 def _nothing_expected(_arguments: Any) -> "Sequence[Expectation]":
     return ()
 
@@ -82,6 +86,8 @@ class Verb:
     changes: bool = True  # Whether the verb can change a setting. imud reads all settings again after such a verb.
     # Whether the device has the settings of its flash afterwards. imud also reads the identity again.
     restarts: bool = False
+    # Returns the same from the arguments, for a verb that restarts the device with some arguments only
+    restarts_with: "Callable[[Any], bool]" = _always
     proof: Proof = Proof.VALUE
     evidence: str = ""  # evidence of `Proof.SCRIPT`, or the reason of `Proof.NONE`, one clause
     # Returns the expected means of the samples after the verb, from its arguments; empty if no sample shows the effect
@@ -98,6 +104,11 @@ class Verb:
             known = ", ".join(str(parameter) for parameter in parameters_of(self)) or "none"
             raise BadArgument(f"{'; '.join(map(str, wrong))}; arguments: {known}")
         return msgspec.convert(dict(given), self.parameters)
+
+    def effect_on_flash(self, arguments: Options) -> tuple[bool, bool]:
+        """Return whether the device restarts, and whether the flash may lack a change afterwards."""
+        restarts = self.restarts and self.restarts_with(arguments)
+        return restarts, self.changes and not (self.saves or self.restarts)
 
     def script(self, target: Target, arguments: Options) -> Any:
         """Return the script of the verb for `arguments`, a result of the method `arguments`."""

@@ -94,7 +94,8 @@ class VerbRun:
             before, was_unsaved = settings.values, settings.is_unsaved
             is_quiet = await self._samples.is_quiet() if verb.proof is Proof.ONE_SAMPLE else True
             self._samples.mark()
-            answer = await self._changed(verb, arguments)
+            restarts, unsaved = verb.effect_on_flash(arguments)
+            answer = await self._changed(verb, arguments, restarts=restarts, unsaved=unsaved)
             verified: bool | None = True
             evidence = verb.evidence
             match verb.proof:
@@ -105,7 +106,7 @@ class VerbRun:
                 case Proof.NONE:
                     verified = False
                 case Proof.RESTART:
-                    verified, evidence = await self._samples.restarted()
+                    verified, evidence = await self._samples.evidence(verb.proof, is_quiet)
                     if verified is None and (changes := _changes(before, settings.values)):
                         verified, evidence = True, f"the device has lost settings that its flash lacks: {changes}"
                 case Proof.SETTINGS:
@@ -113,15 +114,20 @@ class VerbRun:
                     verified, evidence = _reset(before, after, was_unsaved)
                 case Proof.SAMPLES:
                     verified, evidence = await self._agrees(verb, arguments)
-                case Proof.ONE_SAMPLE if not is_quiet:
-                    verified, evidence = False, "the device sends other samples too"
                 case Proof.STREAM | Proof.ONE_SAMPLE:
-                    verified = await self._samples.arrived()
-                    evidence = "a sample arrived" if verified else "no sample arrived; check the output of the device"
-            not_saved = settings.not_saved if verb.changes and not (verb.saves or verb.restarts) else ""
-            return VerbResult(bool(verified), evidence, answer, not_saved)
+                    verified, evidence = await self._samples.evidence(verb.proof, is_quiet)
+            return VerbResult(bool(verified), evidence, answer, settings.not_saved if unsaved else "")
 
-    async def _changed(self, verb: Verb, arguments: Options) -> object:
+    async def run_line(self, name: str, given: Mapping[str, Any], attachments: Attachments) -> VerbResult:
+        """Run a verb of the GPIO lines and return its evidence. Raises BadArgument, CommandError."""
+        proof = attachments.verbs[name].proof
+        is_quiet = await self._samples.is_quiet() if proof is Proof.ONE_SAMPLE else True
+        self._samples.mark()
+        await attachments.run_verb(name, given)
+        verified, evidence = await self._samples.evidence(proof, is_quiet)
+        return VerbResult(bool(verified), evidence)
+
+    async def _changed(self, verb: Verb, arguments: Options, *, restarts: bool, unsaved: bool) -> object:
         """Run the script, and read the values that it can change."""
         settings = self._settings
         settings.script_follows(changes=verb.changes)
@@ -130,15 +136,15 @@ class VerbRun:
         except BadArgument:  # a script checks its arguments before it changes anything
             raise
         except BaseException as error:  # the state of the device is unknown
-            settings.changed(unsaved=verb.changes and not verb.restarts)
+            settings.changed(unsaved=unsaved or verb.saves)
             if isinstance(error, ImudError):
                 await settings.read_again(identity=True)
             raise
-        if verb.saves or verb.restarts:
+        if verb.saves or restarts:
             settings.flash_is_current()
         if verb.changes:
-            settings.changed(unsaved=not (verb.saves or verb.restarts))
-            await settings.read_again(identity=verb.restarts)
+            settings.changed(unsaved=unsaved)
+            await settings.read_again(identity=restarts)
         return answer
 
     # --- evidence ----------------------------------------------------------------------------------------------------
@@ -359,7 +365,7 @@ class Device:
                 raise instead
             raise BadArgument(f"{self.config.name}: unknown command {name[:64]!r}; expected: {self._known_verbs()}")
         if name in self._attachments.verbs:
-            return await self._attachments.run_verb(name, arguments)
+            return await self._verb_run.run_line(name, arguments, self._attachments)
         self._require_replies()
         return await self._verb_run.run(name, verb, arguments)
 

@@ -4,6 +4,7 @@ import asyncio
 from abc import ABC
 from typing import Final
 
+from imud.contracts.command import Proof
 from imud.contracts.driver import SAMPLE_COUNTER, Driver
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_MS
@@ -85,6 +86,19 @@ class SampleWatch:
         """Return whether a sample has arrived since `mark`."""
         return await self.next(self._before) is not None
 
+    async def evidence(self, proof: Proof, is_quiet: bool) -> tuple[bool | None, str]:
+        """Return whether the samples show the effect of a verb since `mark`, None: unknown, and the observation.
+
+        `is_quiet`: whether no sample arrived before the verb.
+        """
+        if proof is Proof.RESTART:
+            return await self.restarted()
+        if proof is Proof.ONE_SAMPLE and not is_quiet:
+            return False, "the device sends other samples too"
+        if await self.arrived():
+            return True, "a sample arrived"
+        return False, "no sample arrived; check the output of the device"
+
     async def restarted(self) -> tuple[bool | None, str]:
         """Return whether the device has restarted since `mark`, None: unknown, and the observation.
 
@@ -92,8 +106,10 @@ class SampleWatch:
         """
         source, before = self._source, self._before
         path, driver = source.path, source.driver
-        if before is None or path is None or driver is None or not await self.arrived():
-            return None, "the device replies, but sends no samples that show a restart"
+        if not await self.arrived() or path is None or driver is None:
+            return None, "the device sends no samples that show a restart"
+        if before is None:
+            return True, "a sample arrived, and none arrived before"
         has_counter = driver.tick_ns != SAMPLE_COUNTER and before.t_dev_ns is not None
         pause_ns = max(PAUSE_NS, PAUSE_PERIODS * path.period_ns)
         for _ in range(STEPS // 2):

@@ -7,7 +7,7 @@ data of a read. A failed line affects only its own function. imud opens it again
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, Final
 
-from imud.contracts.command import Verb
+from imud.contracts.command import Proof, Verb
 from imud.contracts.lines import (
     RESET_VERB,
     TRIGGER_VERB,
@@ -190,8 +190,8 @@ def _no_script(_target: object) -> None:
     raise AssertionError("a line is driven by `LineVerbs.run`")
 
 
-RESET: Final = Verb("pulse the reset line, and wait until the device works again", _no_script)
-TRIGGER: Final = Verb("make one additional edge on SIN", _no_script)
+RESET: Final = Verb("pulse the reset line, and wait until the device works again", _no_script, proof=Proof.RESTART)
+TRIGGER: Final = Verb("make one additional edge on SIN", _no_script, proof=Proof.ONE_SAMPLE)
 
 
 class LineVerbs:

@@ -236,6 +236,9 @@ def _zero(
     return commands.set_inclinometer_zero(target.settings.node, _ZEROS[zero])
 
 
+RESETS: Final = frozenset({"reset_node", "reset_communication"})  # NMT commands after which unsaved settings are lost
+
+
 def _nmt(
     target: Target,
     *,
@@ -248,7 +251,7 @@ def _nmt(
     ],
 ) -> RequestScript[str | None]:
     made = NmtCommand[command.upper()]
-    if made in (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION):
+    if command in RESETS:
         return commands.reset(target.settings, target.baud, made)
     return commands.nmt(target.settings.node, made)
 
@@ -279,6 +282,7 @@ VERBS: Final[Verbs] = {
         "start or stop the TPDOs, or reset the node and follow it",
         _nmt,
         restarts=True,
+        restarts_with=lambda given: given.command in RESETS,
         proof=Proof.NONE,
         evidence="no node confirms an NMT command; watch the samples",
     ),

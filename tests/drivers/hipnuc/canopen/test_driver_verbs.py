@@ -66,6 +66,9 @@ def test_network_management(command: str, code: int) -> None:
     bench = CanopenBench(NodeSettings(node=5))
     bench.run_script(begun("nmt", 5, command=command))
     assert (0, bytes([code, 5])) in bench.sent
+    # only a reset returns to the settings of the flash
+    verb = DRIVER.verbs["nmt"]
+    assert verb.effect_on_flash(verb.arguments({"command": command})) == (code > 0x80, False)
     assert {name for name, _, _ in ROWS} | {"nmt"} == {*DRIVER.verbs, *DRIVER.renamed}
 
 
