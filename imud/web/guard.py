@@ -91,11 +91,19 @@ class WebGuard:
 
     def is_session(self, cookie: str) -> bool:
         """Return whether a cookie is valid and has not expired."""
+        return self._has_not_expired(cookie) and self._is_signed(cookie)
+
+    def is_forged(self, cookie: str) -> bool:
+        """Return whether a cookie has a wrong signature and has not expired: a guess, or a cookie for another token."""
+        return self._has_not_expired(cookie) and not self._is_signed(cookie)
+
+    def _has_not_expired(self, cookie: str) -> bool:
+        end = cookie.partition(".")[0]
+        return bool(self._token) and end.isascii() and end.isdecimal() and len(end) <= 12 and self._now_s() < int(end)
+
+    def _is_signed(self, cookie: str) -> bool:
         end, _, signature = cookie.partition(".")
-        if not self._token or not (end.isascii() and end.isdecimal() and len(end) <= 12):
-            return False
-        known = hmac.compare_digest(signature.encode("utf-8", "replace"), self._signature(end).encode())
-        return known and self._now_s() < int(end)
+        return hmac.compare_digest(signature.encode("utf-8", "replace"), self._signature(end).encode())
 
     def _signature(self, end: str) -> str:
         return hmac.new(self._token, f"imud web session until {end}".encode(), hashlib.sha256).hexdigest()

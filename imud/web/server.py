@@ -122,8 +122,10 @@ FAILURE_S: Final = 2.0
 """Delay of the reply to a wrong token, s. With at most FAILURES_MAX at a time, four guesses per second are possible."""
 GUESSING: Final = "too many wrong tokens; try again in a few seconds"
 
-FAILURES_TOTAL_MAX: Final = 64
-"""Maximum number of delayed replies to wrong tokens of all addresses. FAILURES_MAX limits one address."""
+CHECKS_MAX: Final = 32
+"""Maximum number of tokens and cookies of one address that wait for a check. A right one then waits for at most 8 s."""
+CHECKS_TOTAL_MAX: Final = 64
+"""Maximum number of tokens and cookies of all addresses that wait for a check."""
 BODY_S: Final = 10.0
 """Maximum time to receive the body of a POST, s."""
 CONNECTIONS_MAX: Final = 200
@@ -231,6 +233,39 @@ def server_log() -> logging.Logger:
     return log
 
 
+class SecretChecks:
+    """Checks of tokens and cookies, at most FAILURES_MAX at a time for each address. Synchronization: one event loop.
+
+    A wrong secret occupies its place for FAILURE_S.
+    """
+
+    def __init__(self) -> None:
+        self._places: dict[str, asyncio.Semaphore] = {}  # by address
+        self._count: Counter[str] = Counter()  # checks that wait or last, by address
+
+    @property
+    def total(self) -> int:
+        """Number of checks that wait or last."""
+        return self._count.total()
+
+    async def check(self, request: web.Request, is_right: Callable[[], bool]) -> web.Response | None:
+        """Return the refusal of a wrong secret, or None for a right one."""
+        address = request.remote or ""
+        if self._count[address] >= CHECKS_MAX or self.total >= CHECKS_TOTAL_MAX:
+            return _refusal(429, GUESSING)
+        self._count[address] += 1
+        try:
+            async with self._places.setdefault(address, asyncio.Semaphore(FAILURES_MAX)):
+                if is_right():
+                    return None
+                await asyncio.sleep(FAILURE_S)
+        finally:
+            self._count[address] -= 1
+            if not self._count[address]:
+                del self._count[address], self._places[address]
+        return _refusal(401, "wrong token")
+
+
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
@@ -241,7 +276,7 @@ class WebServer:
         self._guard = guard
         self._calls = Calls(path)
         self._path = path
-        self._failures: Counter[str] = Counter()  # delayed replies to wrong tokens by address
+        self.checks = SecretChecks()
         self.connections = WebConnections()
         self.hub: BrowserHub | None = None  # the hub; None before the application runs
 
@@ -284,11 +319,14 @@ class WebServer:
         headers = request.headers
         if problem := self._guard.host_problem(headers.get("Host")):
             return _refusal(421, problem)
-        if (token := self._guard.bearer(headers.get("Authorization"))) is not None:
-            if self._is_guessing(request):
-                return _refusal(429, GUESSING)
-            if not self._guard.is_token(token):
-                return await self._wrong_token(request)
+        token = self._guard.bearer(headers.get("Authorization"))
+        if token is not None and (refusal := await self.checks.check(request, lambda: self._guard.is_token(token))):
+            return refusal
+        if request.path.startswith("/api/") and self._is_forged(request):
+            refusal = await self.checks.check(request, lambda: False)
+            assert refusal is not None
+            refusal.del_cookie(COOKIE, httponly=True, samesite="Strict")
+            return refusal
         rights = self._rights_of(request)
         if request.method != "GET" or request.path == "/api/stream":
             with_token = rights.control and not rights.by_cookie
@@ -312,28 +350,15 @@ class WebServer:
             return _refusal(400, 'expected a token, as {"token": "…"}')
         if not self._guard.has_token:
             return _refusal(403, "this server has no token, so no login is possible; start imud web with --token-file")
-        if self._is_guessing(request):
-            return _refusal(429, GUESSING)
-        if not self._guard.is_token(token):
-            return await self._wrong_token(request)
+        if refusal := await self.checks.check(request, lambda: self._guard.is_token(token)):
+            return refusal
         response = _reply({"control": True})
         response.set_cookie(COOKIE, self._guard.new_session(), max_age=SESSION_S, httponly=True, samesite="Strict")
         return response
 
-    def _is_guessing(self, request: web.Request) -> bool:
-        """Return whether imud must not check a token, because too many wrong tokens were received."""
-        failures = self._failures
-        return failures[request.remote or ""] >= FAILURES_MAX or failures.total() >= FAILURES_TOTAL_MAX
-
-    async def _wrong_token(self, request: web.Request) -> web.Response:
-        address = request.remote or ""
-        self._failures[address] += 1
-        try:
-            await asyncio.sleep(FAILURE_S)
-        finally:
-            self._failures[address] -= 1
-            self._failures += Counter()  # removes addresses without failures
-        return _refusal(401, "wrong token")
+    def _is_forged(self, request: web.Request) -> bool:
+        """Return whether the cookie has a wrong signature: a guess, or a cookie for another token."""
+        return self._guard.is_forged(request.cookies.get(COOKIE, ""))
 
     async def _logout(self, _request: web.Request) -> web.StreamResponse:
         response = _reply({"control": False})
@@ -342,8 +367,11 @@ class WebServer:
 
     # --- the page ---------------------------------------------------------------------------------------------------
 
-    async def _page(self, _request: web.Request) -> web.StreamResponse:
-        return web.FileResponse(STATIC / "index.html")
+    async def _page(self, request: web.Request) -> web.StreamResponse:
+        response = web.FileResponse(STATIC / "index.html")
+        if self._is_forged(request):  # a browser with a cookie for a former token can log in again
+            response.del_cookie(COOKIE, httponly=True, samesite="Strict")
+        return response
 
     async def _stream(self, request: web.Request) -> web.StreamResponse:
         assert self.hub is not None

@@ -217,17 +217,24 @@ async def test_replies_to_wrong_tokens_are_delayed_and_limited(tmp_path: Path, m
     monkeypatch.setattr(web_app, "FAILURE_S", 3600.0)
     async with running(tmp_path) as site:
         _, session = await login(site)
+        site.client.session.cookie_jar.clear()
         wrong = {"Authorization": "Bearer wrong"}
-        half = web_app.FAILURES_MAX // 2
-        guesses = [asyncio.create_task(site.post("/api/login", {"token": "wrong"})) for _ in range(half)]
-        guesses += [asyncio.create_task(site.get("/api/session", **wrong)) for _ in range(half + 1)]
-        done, waiting = await asyncio.wait(guesses, return_when=asyncio.FIRST_COMPLETED)
-        assert [one.result()[0] for one in done] == [429]
-        assert (await site.post("/api/login", {"token": TOKEN}))[0] == 429, "imud checks no token"
-        assert (await site.get("/api/session", **BEARER))[0] == 429, "imud checks no token"
+        forged = {"Cookie": f"{COOKIE}=9999999999.0"}  # a cookie with a wrong signature
+        third = web_app.FAILURES_MAX // 3
+        guesses = [asyncio.create_task(site.post("/api/login", {"token": "wrong"})) for _ in range(third)]
+        guesses += [asyncio.create_task(site.get("/api/session", **wrong)) for _ in range(third)]
+        many = web_app.CHECKS_MAX - 2 * third - 1
+        guesses += [asyncio.create_task(site.get("/api/session", **forged)) for _ in range(many)]
+        right = asyncio.create_task(site.get("/api/session", **BEARER))
+        await until(lambda: site.web.checks.total == web_app.CHECKS_MAX)
+        assert not any(one.done() for one in (right, *guesses))
+        assert (await site.get("/api/session", **forged))[0] == 429, "imud checks no further token"
         assert (await site.get("/api/session", **session))[1]["control"], "a session continues"
-        for one in waiting:
+        for one in guesses:
             one.cancel()
+        assert (await right)[1]["control"], "a right token waits and is accepted"
+        async with site.client.get("/", headers=forged) as page:
+            assert (page.status, page.cookies[COOKIE].value) == (200, "")
     monkeypatch.setattr(web_app, "FAILURE_S", 0.0)
     async with running(tmp_path) as site:
         assert await site.post("/api/login", {"token": "wrong"}) == (401, {"error": "wrong token"})
