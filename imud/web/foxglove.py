@@ -287,6 +287,8 @@ HEAD_S: Final = 10.0
 """Time limit for the request head, s."""
 CONNECTIONS_MAX: Final = 32
 """Maximum number of viewers. The server has a queue of 1024 messages for each."""
+WAITING_MAX: Final = 64
+"""Maximum number of connections without a complete request head. A new connection then closes the oldest of them."""
 READ_BYTES: Final = 65536
 GATHER_S: Final = 0.005
 """Pause after each read of messages, s. The server writes each message separately. A viewer draws every 16 ms."""
@@ -314,6 +316,9 @@ class ViewerGate:
         self._origins = origins
         self._note = note
         self._noted: set[str] = set()
+        self._viewers = 0  # number of connections with an accepted head
+        # connections without a complete request head, oldest first
+        self._waiting: dict[asyncio.Task[None], StreamWriter] = {}
         self._connections: set[asyncio.Task[None]] = set()
         self._socket = _listening(host, port)
         self.port: Final = int(self._socket.getsockname()[1])
@@ -341,8 +346,13 @@ class ViewerGate:
         listening.close()
 
     def _accept(self, reader: StreamReader, writer: StreamWriter) -> None:
+        if len(self._waiting) >= WAITING_MAX:
+            oldest = next(iter(self._waiting))
+            self._waiting.pop(oldest).transport.abort()
         task = self._loop.create_task(self._take(reader, writer))
         self._connections.add(task)
+        self._waiting[task] = writer
+        task.add_done_callback(lambda _: self._waiting.pop(task, None))
         task.add_done_callback(self._connections.discard)
         task.add_done_callback(lambda _: writer.close())  # also if the gate closes before the task starts
 
@@ -351,17 +361,24 @@ class ViewerGate:
             async with asyncio.timeout(HEAD_S):
                 head = await reader.readuntil(b"\r\n\r\n")
             status, problem = self._judge(head)
+            task = asyncio.current_task()
+            assert task is not None
             if problem:
                 writer.write(_refusal(status, problem))
                 await writer.drain()
             else:
-                await self._join(head, reader, writer)
+                self._waiting.pop(task, None)
+                self._viewers += 1
+                try:
+                    await self._join(head, reader, writer)
+                finally:
+                    self._viewers -= 1
         except (OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
             pass  # the client has left, or it is not a viewer
 
     def _judge(self, head: bytes) -> tuple[str, str]:
         """Return HTTP status and reason of a refusal. The reason is empty if the gate accepts the request."""
-        if len(self._connections) > CONNECTIONS_MAX:
+        if self._viewers >= CONNECTIONS_MAX:
             return "503 Service Unavailable", f"{CONNECTIONS_MAX} viewers are connected, the maximum; close one"
         request, _, rest = head.partition(b"\r\n")
         try:

@@ -3,14 +3,14 @@
 import gc
 import socket
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from threading import Thread
 
 import pytest
 
 from imud.model.errors import ServerError
 from imud.web import foxglove as module
-from imud.web.foxglove import CONNECTIONS_MAX, HEAD_BYTES_MAX, ViewerGate, ViewerOrigins
+from imud.web.foxglove import CONNECTIONS_MAX, HEAD_BYTES_MAX, WAITING_MAX, ViewerGate, ViewerOrigins
 from tests.support.daemon_process import LIMIT_S, wait_until
 
 pytestmark = pytest.mark.live
@@ -155,6 +155,18 @@ def test_the_number_of_viewers_is_limited(echo: Echo) -> None:
         wait_until(lambda: not answer_starts(gate).startswith(b"HTTP/1.1 503"), "there is room again")
         for viewer in viewers:
             viewer.close()
+
+
+def test_connections_without_a_head_are_limited_and_occupy_no_place_of_a_viewer(echo: Echo) -> None:
+    with gated(echo) as gate, ExitStack() as opened:
+        silent = [opened.enter_context(connect(gate)) for _ in range(WAITING_MAX + 1)]
+        assert is_closed(silent[0])
+        viewer = opened.enter_context(connect(gate))
+        viewer.sendall(head())
+        assert received(viewer, len(head())) == head()
+        assert is_closed(silent[1])
+        silent[-1].sendall(head())
+        assert received(silent[-1], len(head())) == head()
 
 
 def answer_starts(gate: ViewerGate) -> bytes:
