@@ -434,7 +434,8 @@ class CanPath(SamplePath):
         self.codec.reset()
 
     def _take_incomplete(self, samples: list[Sample]) -> None:
-        self._sort(self.codec.flush(), self.last_data_ns, self._utc_offset_ns(), samples)
+        if events := self.codec.flush():
+            self._sort(events, self.last_data_ns, self._utc_offset_ns(), samples)
 
 
 def make_clock(

@@ -254,7 +254,10 @@ def test_a_sample_was_measured_before_its_first_frame() -> None:
 
 def test_lost_frames_and_a_closed_link_end_a_sample_and_an_idle_bus_publishes_it() -> None:
     rig = PathRig("imu61x-can")
-    path, now = rig.can(), rig.now
+    path, now, clock_reads = rig.can(), rig.now, list[int]()
+    rig.context.host.on_measured = lambda *_: clock_reads.append(1)
+    path.flush(now)  # no frame yet: a recording gets no clock reading
+    assert not clock_reads
     rig.codec.results = [((), 1), ((), 1), ((since(now + MS),), 0)]
     path.on_frames([frame(now), frame(now + MS, after_loss=True), frame(now + 2 * MS)])
     assert rig.codec.resets == 1
