@@ -4,6 +4,7 @@ The replay makes the samples, time stamps, errors and ledger counters of the liv
 values of the live run. The player compares them with its own values and counts the differences.
 """
 
+import logging
 from bisect import bisect_right
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -43,6 +44,8 @@ from imud.sampling.path import (
     StreamPath,
     make_clock,
 )
+
+log = logging.getLogger(__name__)
 
 # Ledger counters that do not depend on codec and clock. The player copies them from each check record.
 FROM_OUTSIDE: Final = ("lost_queue", "replies_late", "replies_unsolicited")
@@ -310,9 +313,13 @@ def _frame_of(config: DeviceConfig, driver: Driver, described: DeviceRecord) -> 
 def _config_of(described: DeviceRecord, driver: Driver, made: PathRecord) -> DeviceConfig:
     """Return the recorded configuration of a device. Raises ImudError if it is invalid."""
     tree = described.configuration
+    # another version of imud can have recorded an option that this version does not have
+    options = {name: value for name, value in made.options.items() if name in driver.settings.__struct_fields__}
+    if unknown := sorted(made.options.keys() - options.keys()):
+        log.warning("%s: this imud ignores recorded options: %s", described.name, printable(", ".join(unknown)))
     try:
         return DeviceConfig(
-            described.name, made.driver, msgspec.convert(made.options, driver.settings), False, described.link,
+            described.name, made.driver, msgspec.convert(options, driver.settings), False, described.link,
             NoOptions(), lines=msgspec.convert(tree.get("lines"), DeviceLines | None),
             frame=msgspec.convert(tree.get("frame"), FrameOptions | None),
             convention=msgspec.convert(tree.get("convention"), Convention | None),

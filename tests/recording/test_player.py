@@ -129,7 +129,9 @@ def test_a_recording_that_begins_in_the_middle_has_the_stamps_and_numbers_of_the
     assert rig.samples[0].seq > 1 or middle == 1
 
 
-def test_without_the_state_a_new_clock_starts_and_is_reported(recorded: pytest.MonkeyPatch) -> None:
+def test_without_the_state_a_new_clock_starts_and_a_removed_option_is_ignored(
+    recorded: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     rig = run_of("hipnuc-uart", 30)
     samples: list[Sample] = []
     player = Player(lambda batch: samples.extend(batch.samples))
@@ -139,12 +141,15 @@ def test_without_the_state_a_new_clock_starts_and_is_reported(recorded: pytest.M
     assert len(samples) == len(rig.samples)
     assert played.ledger.closes()
     assert played.differences
+    assert "this imud ignores recorded options: calibration_done" in caplog.text
 
 
 def without_state(record: Record) -> Record:
     if record.kind != Kind.PATH:
         return record
-    made = msgspec.structs.replace(records.decode_object(record, PathRecord), state=b"")
+    made = msgspec.structs.replace(
+        records.decode_object(record, PathRecord), state=b"", options={"calibration_done": 0}
+    )
     return record._replace(body=msgspec.msgpack.encode(made))
 
 
