@@ -66,8 +66,8 @@ CANOPEN = Protocol(
     make=lambda number=8, **more: CanopenBench(NodeSettings(node=number), **more), variants=NODE_VARIANTS,
     variant=NodeVariant, register=0x20A0,
     values={
-        **{f"tpdo{tpdo}_interval_ms": (5, 1000, 0) for tpdo in TPDOS},
-        **{f"tpdo{tpdo}_by": ("sync", "timer") for tpdo in TPDOS},
+        **{f"tpdo{tpdo}_interval_ms": (5, 1000, 0) if tpdo == 1 else (1000,) for tpdo in TPDOS},
+        **{f"tpdo{tpdo}_by": ("sync", "timer") if tpdo == 1 else ("sync",) for tpdo in TPDOS},
         **dict.fromkeys(("incli_x_reversed", "incli_y_reversed"), (True, False)), "heartbeat_ms": (500, 0),
         "bit_rate": (500_000,), "node": (127, 1),
     },
@@ -87,7 +87,7 @@ J1939 = Protocol(
     make=lambda number=8, **more: J1939Bench(J1939Settings(address=number), **more), variants=J1939_VARIANTS,
     variant=J1939Variant, register=j1939.ADDRESS,
     values={
-        **{f"{pgn}_interval_ms": (5, 1000) for pgn in PGNS},
+        **{f"{pgn}_interval_ms": (5, 1000) if pgn == "ff34" else (1000,) for pgn in PGNS},
         **dict.fromkeys(("x_reversed", "y_reversed"), (True, False)), "bit_rate": (500_000,), "address": (128, 1),
     },
     of_each_form=("ff34_interval_ms", "x_reversed", "bit_rate", "address"),
