@@ -23,6 +23,7 @@ from typing import Final
 from imud import __version__
 from imud import config as configuration
 from imud.config.model import Config, DeviceConfig
+from imud.contracts.condition import summary
 from imud.contracts.lines import LineFactory
 from imud.contracts.publisher import (
     Batch,
@@ -378,11 +379,11 @@ class Daemon:
         for device in self._devices.values():
             device.tick(now_ns)
         self._outputs.tick(now_ns)
-        self._manager.tick(now_ns, self._states)
+        self._manager.tick(now_ns, self._status_line)
         self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
 
-    def _states(self) -> dict[str, str]:
-        return {name: device.state for name, device in self._devices.items()}
+    def _status_line(self) -> str:
+        return summary({name: device.condition for name, device in self._devices.items()})
 
     async def _close(self) -> None:
         if self._reloader is not None:

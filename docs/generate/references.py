@@ -25,6 +25,7 @@ from docs.generate.socket_schema import socket_schema
 from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes
 from imud.config.schema import TABLES, DeviceGeneral, General
 from imud.contracts.command import Handling, Verb, Verbs, parameters_of
+from imud.contracts.condition import ConditionLimits
 from imud.contracts.driver import Driver
 from imud.contracts.lines import LINE_SCHEMAS, DeviceLines
 from imud.contracts.status import Deviations
@@ -149,6 +150,7 @@ def settings_parts() -> Iterator[tuple[str, str, type[Options]]]:
     yield "Mounting by axes", "devices.NAME.frame.axes.", MountingAxes
     yield "Mounting by angles", "devices.NAME.frame.euler.", MountingAngles
     yield "Noise of a device, for covariances (`docs/export.md`)", "devices.NAME.noise.", Deviations
+    yield "Limits of the condition of a device (`docs/views.md`)", "devices.NAME.condition.", ConditionLimits
     yield "RMC sentences for a device (`docs/time.md`)", "devices.NAME.rmc.", RmcOptions
 
 

@@ -5,12 +5,13 @@ They do not depend on the message format. Axes and coordinate frames follow REP-
 """
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, Generic, NamedTuple, Protocol, TypeVar
 
 from imud.attitude.conventions import Convention
+from imud.contracts.condition import Condition
 from imud.contracts.status import Deviations, DeviceState, DeviceStatus
 from imud.model.event import LEVELS, Event, EventKind
 from imud.model.ledger import LOST_FIELDS
@@ -202,9 +203,14 @@ PERIOD_NS: Final = NS_PER_S  # time between two diagnoses in a file, ns, as in d
 LOSS_SHOWN_NS: Final = 10 * NS_PER_S  # duration of the warning after a loss, ns
 # Time without samples after which a recorded device is stale, s. Viewers also wait 5 s for diagnoses.
 STALE_S: Final = 5
-RATE_LEAST: Final = 0.95  # Minimum rate as a share of the expected rate. The alert ImudRateLow uses the same limit.
 
-
+CONDITION_LEVEL: Final = {
+    Condition.OK: DiagnosisLevel.OK,
+    Condition.DEGRADED: DiagnosisLevel.WARN,
+    Condition.ATTENTION: DiagnosisLevel.WARN,
+    Condition.MISSING: DiagnosisLevel.ERROR,
+}
+# Levels of the states in the events of a recording
 LEVEL_OF: Final = {
     DeviceState.RUNNING: DiagnosisLevel.OK,
     DeviceState.FINISHED: DiagnosisLevel.OK,
@@ -219,7 +225,6 @@ class LiveDiagnosis:
     """Diagnoses of the devices of a running daemon. Synchronization: one thread."""
 
     def __init__(self) -> None:
-        self._losses: dict[str, _LossWarning] = {}
         self._newest: dict[str, Diagnosis] = {}
 
     def of(self, statuses: Iterable[DeviceStatus], utc_ns: int) -> Diagnoses:
@@ -233,14 +238,10 @@ class LiveDiagnosis:
         return Diagnoses(utc_ns, tuple(stale))
 
     def _one(self, status: DeviceStatus, utc_ns: int) -> Diagnosis:
-        level, words = LEVEL_OF[status.state], [f"{status.state}: {status.problem}".removesuffix(": ")]
-        counts = [status.ledger.get(name, 0) for name in LOST_FIELDS]
-        losing = self._losses.setdefault(status.name, _LossWarning()).is_on(counts, utc_ns)
-        warnings = list(_warnings(status, losing=losing))
-        if level is DiagnosisLevel.OK and warnings:
-            level = DiagnosisLevel.WARN
+        known = status.condition
+        level = CONDITION_LEVEL[known.condition] if known is not None else LEVEL_OF[status.state]
         hardware = status.identity.get("serial_number") or status.identity.get("product", "")
-        return Diagnosis(status.name, level, "; ".join(words + warnings), hardware, _values(status))
+        return Diagnosis(status.name, level, str(known or status.state), hardware, _values(status))
 
 
 class RecordedDiagnosis:
@@ -369,20 +370,6 @@ class _RecordedDevice:
 
 
 _LOSING: Final = f"samples were lost within the last {LOSS_SHOWN_NS // NS_PER_S} s"
-
-
-def _warnings(status: DeviceStatus, *, losing: bool) -> Iterator[str]:
-    """Yield the problems of a device that runs."""
-    if losing:
-        yield _LOSING
-    if status.state is DeviceState.RUNNING and status.rate_hz < RATE_LEAST * status.expected_rate_hz:
-        yield f"rate {status.rate_hz:.1f} Hz, expected {status.expected_rate_hz:.1f} Hz"
-    if status.frame is not None and status.frame.problem:
-        yield status.frame.problem
-    if status.lines is not None:
-        yield from (f"{line}: {problem}" for line, problem in status.lines.problems.items() if problem)
-        if status.lines.alarm:
-            yield "the ALARM line is active"
 
 
 def _values(status: DeviceStatus) -> dict[str, str]:

@@ -9,8 +9,9 @@ from imud.cli.arguments import CliCommand, add_socket, confirmed, connect, named
 from imud.cli.output import table
 from imud.client.connection import Client
 from imud.contracts.command import VerbInfo
+from imud.contracts.condition import Condition
 
-HEAD: Final = ("DEVICE", "STATE", "RATE HZ", "DRIVER", "PRODUCT", "SERIAL NUMBER", "LINK")
+HEAD: Final = ("DEVICE", "CONDITION", "RATE HZ", "DRIVER", "PRODUCT", "SERIAL NUMBER", "LINK")
 LIMIT_S: Final = 180.0  # Time limit of a command, s. The longest command, a calibration, ends within two minutes.
 
 
@@ -19,13 +20,13 @@ def devices_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def devices(args: argparse.Namespace) -> int:
-    """Print one line per device. Return 1 if no device is running, otherwise 0."""
+    """Print one line per device. Return 1 if all devices are missing, otherwise 0."""
     with connect(args) as client:
         found = statuses(client)
     rows = [
         (
             d.name,
-            d.state,
+            d.word,
             d.rate_hz,
             d.driver,
             d.identity.get("product", "-"),
@@ -35,7 +36,7 @@ def devices(args: argparse.Namespace) -> int:
         for d in found
     ]
     print(table(HEAD, rows))
-    return 0 if any(d.state == "running" for d in found) else 1
+    return 0 if any(d.word != Condition.MISSING for d in found) else 1
 
 
 def command_arguments(parser: argparse.ArgumentParser) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 import msgspec
+from msgspec.structs import replace
 
 from imud import config
 from imud.cli.arguments import CliCommand, add_interface, add_option, chosen_interface, driver_settings, given_options
@@ -213,6 +214,7 @@ def run(args: argparse.Namespace) -> int:
         args.baud = args.baud or (0 if names_rate(args) else BAUD)
         without_times = "" if has_times(args) else NO_TIMES
         status = play(args)
+    status = replace(status, condition=None)  # the condition uses the time of this host
     print(block(status, without_times, virtual=args.speed == "maximum"), file=sys.stderr)
     is_damaged = not isinstance(DRIVERS[args.driver], CanDriver) and problem_of(args)[1]
     return 0 if status.ledger["samples"] and not is_damaged else 1

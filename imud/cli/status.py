@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Final
 
 import msgspec
 
@@ -10,7 +9,6 @@ from imud.cli.arguments import CliCommand, add_socket, connect
 from imud.cli.output import paragraph, times
 from imud.contracts.setting import SettingsState, SettingsStatus
 from imud.contracts.status import (
-    DeviceState,
     DeviceStatus,
     FrameStatus,
     LinesStatus,
@@ -23,8 +21,6 @@ from imud.model.ledger import bytes_open, frames_open, lost
 from imud.model.options import shown
 from imud.model.units import NS_PER_MS, NS_PER_US
 
-WELL: Final = (DeviceState.RUNNING, DeviceState.FINISHED)  # states without a problem
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_socket(parser)
@@ -32,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print one block per device. Return 1 if a ledger does not balance or a device does not run, otherwise 0."""
+    """Print one block per device. Return 1 if the condition of a device is not ok, otherwise 0."""
     with connect(args) as client:
         answer = client.status()
     devices = msgspec.convert(answer["devices"], list[DeviceStatus])
@@ -41,19 +37,17 @@ def run(args: argparse.Namespace) -> int:
     else:
         mqtts = msgspec.convert(answer.get("mqtt", []), list[MqttStatus])
         print(page(devices, mqtts, msgspec.convert(answer.get("outputs", {}), dict[str, str])))
-    return 0 if all(d.state in WELL and closes(d.ledger) for d in devices) else 1
+    return 1 if any(device.has_problem for device in devices) else 0
 
 
 def page(devices: Sequence[DeviceStatus], mqtts: Sequence[MqttStatus] = (), outputs: Mapping[str, str] = {}) -> str:
-    """Format the blocks of all devices and the problems of the outputs. If a device does not run, add the next step."""
+    """Format the blocks of all devices and the problems of the outputs."""
     parts = [block(device) for device in devices]
     for mqtt in mqtts:
         problems = [one for one in (mqtt.problem, mqtt.spool_problem) if one]
         problems += [f"the broker refuses messages of {topic}: {reason}" for topic, reason in mqtt.refused.items()]
         parts += ["\n".join(paragraph("mqtt: ", problem)) for problem in problems]
     parts += ["\n".join(paragraph(f"{name}: ", problem)) for name, problem in outputs.items()]
-    if any(device.state not in WELL for device in devices):
-        parts.append("to find the cause and the next step, run `sudo imud doctor`")
     return "\n\n".join(parts)
 
 
@@ -66,7 +60,7 @@ def block(status: DeviceStatus, without_times: str = "", *, virtual: bool = Fals
     clock, ledger = status.clock, status.ledger
     words = ", ".join(f"{name} {value}" for name, value in status.identity.items()) or "not known"
     rows = [
-        ("link", f"{status.link}, driver {status.driver}, opened {times(status.connects)}"),
+        ("link", f"{status.state}; {status.link}, driver {status.driver}, opened {times(status.connects)}"),
         ("identity", words),
         ("rate", f"{status.rate_hz:.1f} Hz measured, {status.expected_rate_hz:.1f} Hz by the device's clock"),
         (
@@ -99,8 +93,10 @@ def block(status: DeviceStatus, without_times: str = "", *, virtual: bool = Fals
         rows = [("times", without_times), *(row for row in rows if row[0] not in ("rate", "clock", "latency"))]
     if status.frame is not None:
         rows.insert(2, ("axes", axes(status.frame)))
-    lines = paragraph(f"{status.name}: ", str(status.state))
-    if status.problem:
+    lines = paragraph(f"{status.name}: ", status.word)
+    for reason in status.reasons:
+        lines += paragraph("  ", f"{reason.message} {reason.next}".rstrip())
+    if status.problem and status.condition is None:
         lines += paragraph("  ", status.problem)
     for name, text in (*rows, *parts(status)):
         lines += paragraph(f"  {name:<10}", text)
@@ -108,12 +104,12 @@ def block(status: DeviceStatus, without_times: str = "", *, virtual: bool = Fals
 
 
 def axes(frame: FrameStatus) -> str:
-    """Format axes and heading, and a problem with them."""
+    """Format axes and heading."""
     own = frame.convention == "device"
     words = f"{frame.frame if own else f'{frame.convention}, {frame.frame}'}; heading {frame.heading}"
     if frame.declination_deg is not None:
         words += f" with a declination of {frame.declination_deg:g}°"
-    return words + (f" ({frame.problem})" if frame.problem else "")
+    return words
 
 
 def parts(status: DeviceStatus) -> Iterator[tuple[str, str]]:

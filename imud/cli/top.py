@@ -19,9 +19,10 @@ from textual.widgets.option_list import Option
 from imud.cli.arguments import CliCommand, add_socket
 from imud.cli.events import as_text, printed
 from imud.cli.output import fitted, shortened
-from imud.cli.status import WELL, block
+from imud.cli.status import block
 from imud.client.feed import Feed, News, Wish, utc_offset_ns
-from imud.contracts.status import DeviceState, DeviceStatus
+from imud.contracts.condition import Condition, summary
+from imud.contracts.status import DeviceStatus
 from imud.host.log import printable
 from imud.model.errors import BadArgument
 from imud.model.event import Event
@@ -72,6 +73,12 @@ class DeviceHistory:
     def __init__(self, status: DeviceStatus) -> None:
         self.status = status
         self._samples: deque[Sample] = deque(maxlen=POINTS_MAX)
+
+    @property
+    def condition(self) -> Condition:
+        """Condition of the device."""
+        known = self.status.condition
+        return known.condition if known is not None else Condition.OK
 
     @property
     def newest(self) -> Sample | None:
@@ -217,12 +224,6 @@ def _hundredths(value: float) -> str:
     return f"{value:.2f}"
 
 
-# Device states in the sort order, problems first
-STATE_ORDER: Final = (
-    DeviceState.FAILED, DeviceState.MISSING, DeviceState.SILENT, DeviceState.SEARCHING, DeviceState.RUNNING,
-    DeviceState.FINISHED,
-)  # fmt: skip
-
 NAME: Final = Column(
     "DEVICE",
     NAME_WIDTH,
@@ -230,11 +231,11 @@ NAME: Final = Column(
     lambda device, now_ns: device.status.name,
     is_number=False,
 )
-STATE: Final = Column(
-    "STATE",
+CONDITION: Final = Column(
+    "CONDITION",
     9,
-    lambda device, now_ns: str(device.status.state),
-    lambda device, now_ns: f"{STATE_ORDER.index(device.status.state)}",
+    lambda device, now_ns: device.status.word,
+    lambda device, now_ns: f"{list(Condition).index(device.condition)}",
     is_number=False,
 )
 RATE: Final = _number("HZ", 6, lambda device, now_ns: device.status.rate_hz, _tenths)
@@ -257,7 +258,7 @@ SYNC: Final = Column(
 # Sets of columns by name. Each set has at most WIDTH characters, with one space between two columns.
 VIEWS: Final[dict[str, tuple[Column, ...]]] = {
     "motion": (
-        NAME, STATE, RATE, AGE, LOST, ERROR,
+        NAME, CONDITION, RATE, AGE, LOST, ERROR,
         _number("ROLL°", 6, _angle(0), _tenths),
         _number("PITCH°", 6, _angle(1), _tenths),
         _number("YAW°", 6, _angle(2), _tenths),
@@ -289,7 +290,7 @@ VIEWS: Final[dict[str, tuple[Column, ...]]] = {
     ),
 }  # fmt: skip
 
-SORTS: Final = (NAME, STATE, RATE, AGE, LOST, ERROR)  # Sort columns. The key `s` selects the next one.
+SORTS: Final = (NAME, CONDITION, RATE, AGE, LOST, ERROR)  # Sort columns. The key `s` selects the next one.
 
 
 def head(columns: Iterable[Column]) -> str:
@@ -315,7 +316,7 @@ def chosen(
 ) -> list[DeviceHistory]:
     """Return the devices that contain all `words`, sorted; the largest number first.
 
-    The search uses name, state, driver, link, problem and identity, and ignores the case.
+    The search uses name, condition, reasons, driver, link and identity, and ignores the case.
     """
     wanted = words.casefold().split()
     found = [device for device in devices if all(word in _searched(device) for word in wanted)]
@@ -326,7 +327,7 @@ def chosen(
 
 def _searched(device: DeviceHistory) -> str:
     status = device.status
-    parts = (status.name, status.state, status.driver, status.link, status.problem, *status.identity.values())
+    parts = (status.name, str(status.condition), status.driver, status.link, *status.identity.values())
     return " ".join(parts).casefold()
 
 
@@ -437,10 +438,8 @@ class TopApp(App[None]):
         """Format the problem of the connection, or the state of the daemon."""
         if self.problem:
             return printable(self.problem, TEXT_MAX)
-        devices = self.fleet.devices.values()
-        well = sum(device.status.state in WELL for device in devices)
-        words = f"imud: {well} of {len(devices)} devices ok, {self.fleet.clients} client"
-        words += "" if self.fleet.clients == 1 else "s"
+        words = summary({name: device.condition for name, device in self.fleet.devices.items()})
+        words += f" {self.fleet.clients} client" + "s" * (self.fleet.clients != 1)
         return words + ("  PAUSED" if self.paused else "")
 
     def _post(self, news: News) -> None:
@@ -495,7 +494,7 @@ class Overview(TopScreen):
         yield Static(id="state", markup=False)
         yield Static(id="head", markup=False)
         yield OptionList(id="rows", markup=False)
-        yield Input(placeholder="words in name, state, driver, link, problem", id="filter")
+        yield Input(placeholder="words in name, condition, driver, link", id="filter")
         yield Footer()
 
     def on_mount(self) -> None:

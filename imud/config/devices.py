@@ -16,6 +16,7 @@ from imud.config.schema import DeviceGeneral, Keys, Tables
 from imud.config.yaml import Path as KeyPath
 from imud.config.yaml import no_pause
 from imud.contracts.command import Target
+from imud.contracts.condition import ConditionLimits
 from imud.contracts.driver import CanDriver, Driver, PolledDriver
 from imud.contracts.lines import LINE_SCHEMAS, DeviceLines, LineOptions
 from imud.contracts.link import CanUse, Claim, LinkType, conflict_of
@@ -368,6 +369,7 @@ def _lines_of_driver(drivers: Mapping[str, Driver], driver: object) -> frozenset
 # Maximum number of devices, more than one process can serve. A longer file is a mistake of a generator.
 DEVICES_MAX: Final = 256
 NOISE: Final = "noise"
+CONDITION: Final = "condition"
 DEVICE_NAME: Final = pattern(DEVICE_NAME_PATTERN)
 
 
@@ -414,7 +416,7 @@ class DeviceReader:
             return None
         own = DeviceGeneral.__struct_fields__
         self._keys.unknown_keys(
-            path, keys, [*own, "options", "settings", "lines", "rmc", "frame", NOISE, *self._tables.links]
+            path, keys, [*own, "options", "settings", "lines", "rmc", "frame", NOISE, CONDITION, *self._tables.links]
         )
         general = self._keys.settings(DeviceGeneral, path, {key: keys[key] for key in own if key in keys})
         options = self._options(path, keys)
@@ -424,7 +426,8 @@ class DeviceReader:
         rmc = read_rmc(self._keys, (*path, "rmc"), keys, self._tables.drivers)
         frame = read_frame(self._keys, (*path, "frame"), keys)
         noise = self._keys.part(Deviations, keys[NOISE], (*path, NOISE)) if NOISE in keys else None
-        if general is None or link is None:
+        limits = self._keys.part(ConditionLimits, keys.get(CONDITION), (*path, CONDITION))
+        if general is None or link is None or limits is None:
             return None
         link_name, link_settings = link
         known = general.driver == "auto" or options is not None
@@ -439,7 +442,7 @@ class DeviceReader:
         line = self._keys.tree.key_mark(path).line
         own_keys = general.driver, options, general.identify, link_name, link_settings
         frames = frame, general.convention, general.declination_deg
-        made = DeviceConfig(name, *own_keys, line, lines, rmc, declared, general.on_difference, *frames, noise)
+        made = DeviceConfig(name, *own_keys, line, lines, rmc, declared, general.on_difference, *frames, noise, limits)
         return made, general.enabled
 
     def _options(self, path: KeyPath, keys: Mapping[str, Any]) -> Options | None:

@@ -1,10 +1,11 @@
 """A checked configuration, and the differences between two configurations."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 from imud.attitude.conventions import Convention
 from imud.attitude.published import FrameOptions
+from imud.contracts.condition import ConditionLimits
 from imud.contracts.lines import DeviceLines
 from imud.contracts.setting import OnDifference
 from imud.contracts.status import Deviations
@@ -32,6 +33,7 @@ class DeviceConfig:
     # True heading minus magnetic heading, degrees; None: the heading stays unchanged.
     declination_deg: float | None = None
     noise: Deviations | None = None  # standard deviations of the samples; None if they are unknown
+    condition: ConditionLimits = field(default_factory=ConditionLimits)
 
 
 @dataclass(frozen=True, slots=True)

@@ -182,6 +182,13 @@ class SettingsStatus(msgspec.Struct, frozen=True):
     flash_writes_day: int = 0  # number of these writes in the last 24 hours
     # Whether the device would lose a change at power-off: imud changed a setting, and no save followed
     unsaved: bool = False
+    # Present value of each setting that the device would lose at power-off, as far as imud knows the value in flash
+    lost_at_power_off: dict[str, Any] = {}  # msgspec copies a mutable default
+
+
+def title_of(name: str) -> str:
+    """Return the title of a setting for people, for example `Low pass hz`."""
+    return name.replace("_", " ").replace("-", " ").capitalize()
 
 
 class SettingInfo(msgspec.Struct, frozen=True):

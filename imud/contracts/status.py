@@ -8,6 +8,7 @@ from msgspec import Meta
 
 from imud.attitude.conventions import Heading
 from imud.attitude.published import FrameWords
+from imud.contracts.condition import Condition, DeviceCondition, Reason
 from imud.contracts.setting import SettingsStatus
 from imud.model.options import Options
 from imud.model.sample import Sync
@@ -136,6 +137,32 @@ class UtcStatus(msgspec.Struct, frozen=True):
     chrony_refused: int = 0
 
 
+class FrameProblem(StrEnum):
+    """Kind of a contradiction in axes, angles or heading."""
+
+    GRAVITY = "gravity"  # gravity at rest contradicts the attitude or the mounting
+    DECLINATION = "declination"  # the heading of the device does not permit the declination of the configuration
+    AXES = "axes"  # the device settings select axes that imud does not know
+
+
+class RecentStatus(msgspec.Struct, frozen=True):
+    """Counts of the last minute, made once per second."""
+
+    begun_ns: int  # CLOCK_MONOTONIC at the start of all counters of the device
+    rate_hz: float | None  # rate of sent samples, received or lost, over 10 s; null if it is not known
+    samples: int = 0
+    lost: dict[str, int] = {}  # number of lost samples by cause, without causes with no loss
+    gaps: int = 0  # number of gaps of unknown size
+    bytes_in: int = 0
+    restarts: int = 0  # number of restarts of the device in the last hour that imud did not request
+    last_sample_ns: int = 0  # CLOCK_MONOTONIC of the newest sample; 0 before the first sample
+    loss_ns: int = 0  # CLOCK_MONOTONIC of the last loss; 0 before the first loss
+    loss_samples: int = (
+        0  # number of lost samples in the last loss; losses with less than one minute between them are one
+    )
+    loss_cause: str = ""  # largest cause of the last loss
+
+
 class FrameStatus(msgspec.Struct, frozen=True):
     """Axes, angles and heading of the samples of one device."""
 
@@ -150,6 +177,7 @@ class FrameStatus(msgspec.Struct, frozen=True):
     # Contradiction between gravity and attitude or mounting, or between the heading and the configuration; empty if
     # there is no contradiction
     problem: str = ""
+    problem_kind: FrameProblem | None = None  # kind of the contradiction; null if there is none
 
 
 # Upper bounds of the latency histogram, ns. One more bucket without a bound follows.
@@ -212,6 +240,26 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     # Noise of the samples from the configuration; None if the configuration does not give it
     noise: Deviations | None = None
     resets_requested: int = 0  # restarts of the device counter (`clock.resets`) that commands or settings caused
+    # Condition with reasons, for all views; null for a device of a recording
+    condition: DeviceCondition | None = None
+    recent: RecentStatus | None = None  # counts of the last minute; null for a device of a recording
+    # Worst condition in each of the last 60 minutes, the oldest first; null for a minute before the start of imud
+    history: tuple[Condition | None, ...] = ()
+
+    @property
+    def has_problem(self) -> bool:
+        """Whether the condition is not `ok`."""
+        return self.condition is not None and not self.condition.is_ok
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """Reasons of the condition; empty for a device of a recording."""
+        return self.condition.reasons if self.condition is not None else ()
+
+    @property
+    def word(self) -> str:
+        """Condition; for a device of a recording its state."""
+        return str(self.state if self.condition is None else self.condition.condition)
 
 
 class RecorderStatus(msgspec.Struct, frozen=True):

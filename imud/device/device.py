@@ -17,6 +17,7 @@ from typing import Any, Final
 from imud.config.devices import owner_of
 from imud.config.model import DeviceConfig
 from imud.contracts.command import CalibrationResult, Calibrations, Kept, Proof, Risk, Verb, VerbResult, Verbs
+from imud.contracts.condition import Condition
 from imud.contracts.driver import status_words
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link
@@ -25,9 +26,10 @@ from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
 from imud.device.attachments import Attachments
 from imud.device.calibration import CalibrationRun, RestWindow, check
+from imud.device.condition import ConditionJudge
 from imud.device.evidence import STEP_S
 from imud.device.flash import SettingsFiles
-from imud.device.health import DeviceEvents, Health
+from imud.device.health import NO_SAMPLE, DeviceEvents, Health
 from imud.device.latency import Need
 from imud.device.settings import DeviceSettings, identity_words
 from imud.device.settings_plan import Values, as_json, setting_instead
@@ -222,6 +224,7 @@ class Device:
         self._attitude = AttitudeWatch(config, self._events)
         self._status = StatusWatch(self._events)
         self._rate = RateMeter()
+        self._judge = ConditionJudge(config, transport.link.title, self.ledger, self._events, host.now_ns())
         self._connects = 0
         self._need = Need(0, "")
         self._ended: asyncio.Future[LinkError | None] | None = None
@@ -251,6 +254,7 @@ class Device:
             self._attachments.tick(self._host.now_ns(), None)
             await self._serve_until_finished()
             self._health.finished()
+            self._judge.tick(self._host.now_ns(), self.state, self.status)
         finally:
             self._attachments.close()
             self._transport.close()
@@ -262,8 +266,12 @@ class Device:
         path = transport.path
         self._attachments.tick(now_ns, path.newest if path is not None else None)
         transport.tick(now_ns)
-        if path is None:
-            return
+        if path is not None:
+            self._tick_path(path, now_ns)
+        self._judge.tick(now_ns, self.state, self.status)
+
+    def _tick_path(self, path: SamplePath, now_ns: int) -> None:
+        transport = self._transport
         if self._suspends != self._host.suspends:
             self._suspends = self._host.suspends
             if path.fresh:  # CLOCK_MONOTONIC does not count the suspend, during which samples were lost
@@ -275,6 +283,10 @@ class Device:
         self._attitude.tick(now_ns, path)
         self._status.tick(now_ns, transport.driver, path)
         self._events.tick(now_ns, path.newest.sync if path.newest else None)
+
+    @property
+    def condition(self) -> Condition:
+        return self._judge.condition.condition
 
     def close(self) -> None:
         """Release the link. A second call does nothing."""
@@ -439,9 +451,7 @@ class Device:
             self._up(now_ns)
         elif state is DeviceState.RUNNING and quiet_ns > max(SILENCE_NS, SILENCE_PERIODS * path.period_ns):
             seconds = f"{quiet_ns / NS_PER_S:.1f} s"
-            words = (
-                f"no sample for {seconds}, but the link is open; check the power supply of the device and its output"
-            )
+            words = f"{NO_SAMPLE} {seconds}, but the link is open; check the power supply of the device and its output"
             self._health.down(now_ns, DeviceState.SILENT, words)
         elif quiet_ns > UNHEARD_NS:
             self._transport.on_no_samples(path, now_ns)
@@ -494,6 +504,9 @@ class Device:
             declared=self._settings.status(),
             noise=self.config.noise,
             resets_requested=self._settings.resets_requested,
+            condition=self._judge.condition,
+            recent=self._judge.recent(path.last_sample_ns if path else 0),
+            history=self._judge.history,
         )
         return transport.add_status(status)
 

@@ -102,6 +102,8 @@ def _counted(number: int, what: str) -> str:
     return f"{number} {what}{'s' * (number != 1)}"
 
 
+NO_SAMPLE = "no sample for"
+"""Start of the problem of a device that stopped sending."""
 SEARCH_BEGUN = "no sample has arrived yet; wait for the search"
 """Problem of a device right after imud has opened its link."""
 STREAMING = (DeviceState.RUNNING, DeviceState.SILENT)

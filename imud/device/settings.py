@@ -409,8 +409,16 @@ class DeviceSettings:
             unverified(table, self.declared, self.values) if self.is_current else (),
             self._read_ns, self.comparison.repairs,
             self._files.flash.writes(self.module), self._files.flash.writes_day(self.module),
-            self._unsaved and table.save is not None,
+            self._unsaved and table.save is not None, self._lost_at_power_off(),
         )  # fmt: skip
+
+    def _lost_at_power_off(self) -> dict[str, Any]:
+        """Return the present values that differ from the values in flash, as far as both are known."""
+        if not (self._unsaved and self.is_current and self._saved is not None):
+            return {}
+        return {
+            name: as_json(one) for name, one in self.values.items() if as_json(self._saved.get(name)) != as_json(one)
+        }
 
     async def report(self, *, fresh: bool) -> SettingsReport:
         """Return all settings: read now if `fresh`, otherwise the last values.

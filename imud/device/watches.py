@@ -12,7 +12,7 @@ from imud.attitude.gravity import Contradiction, GravityCheck
 from imud.attitude.published import PublishedAxes
 from imud.config.model import DeviceConfig
 from imud.contracts.driver import Driver, StatusBit
-from imud.contracts.status import FrameStatus
+from imud.contracts.status import FrameProblem, FrameStatus
 from imud.device.health import DeviceEvents
 from imud.model.event import EventKind
 from imud.model.units import NS_PER_S
@@ -61,17 +61,18 @@ class AttitudeWatch:
         if driver is None or path is None:
             return None
         frame, config, sent = path.frame, self._config, driver.sent_axes(shown)
-        device_heading = driver.heading(config.options, settings)
+        kind, problem = self._problem(driver.heading(config.options, settings), sent.problem)
         words = frame.words(sent.euler_convention, sent.navigation_frame)
         return FrameStatus(
             frame=words.frame,
             convention=AS_DEVICE if frame.convention is None else str(frame.convention),
             euler_convention=words.euler_convention,
             navigation_frame=words.navigation_frame,
-            heading=frame.heading(device_heading),
+            heading=frame.heading(driver.heading(config.options, settings)),
             declination_deg=frame.declination_deg,
             conventions={str(one): frame.words_of(one) for one in Convention},
-            problem=self._problem(device_heading) or sent.problem,
+            problem=problem,
+            problem_kind=kind,
         )
 
     def _new_check(self, path: SamplePath) -> GravityCheck:
@@ -79,14 +80,19 @@ class AttitudeWatch:
         is_level = configured is not None and configured.level_at_rest
         return GravityCheck(frame.device, frame.mounting if is_level else None)
 
-    def _problem(self, heading: Heading) -> str:
+    def _problem(self, heading: Heading, axes: str) -> tuple[FrameProblem | None, str]:
+        """Return the kind of the present contradiction and its text. `axes`: the problem of the driver."""
         finding = self._check.finding if self._check is not None else None
         if finding is not None:
-            return finding.message
+            return FrameProblem.GRAVITY, finding.message
         if self._config.declination_deg is not None and heading in (Heading.RELATIVE, Heading.TRUE):
-            why = "counts from power-on" if heading is Heading.RELATIVE else "is true already"
-            return f"declination_deg is configured, but the heading of the device {why}"
-        return ""
+            why = (
+                "yaw is measured from the direction at power-on"
+                if heading is Heading.RELATIVE
+                else "yaw is true already"
+            )
+            return FrameProblem.DECLINATION, f"declination_deg is configured, but {why}"
+        return (FrameProblem.AXES, axes) if axes else (None, "")
 
 
 CLEAR_NS: Final = NS_PER_S  # time without a status bit after which the bit is cleared, ns

@@ -17,8 +17,9 @@ from zlib import crc32
 import msgspec
 
 from imud import __version__
+from imud.contracts.condition import Condition, signature
 from imud.contracts.publisher import Batch, PublisherContext, PublisherType
-from imud.contracts.status import DeviceState, DeviceStatus, MqttStatus
+from imud.contracts.status import DeviceStatus, MqttStatus
 from imud.fleet.broker import BrokerTurn, Connect, PahoConnection, Will, check_extra
 from imud.fleet.commands import CommandChannel
 from imud.fleet.messages import (
@@ -88,9 +89,14 @@ def _status_parts(topic: str) -> dict[str, dict[str, object]]:
     """Return the entities of the retained state."""
     diagnostic = {"state_topic": topic, "entity_category": "diagnostic"}
     return {
-        "running": {
-            "platform": "binary_sensor", "name": "Running", "device_class": "running", **diagnostic,
-            "value_template": f"{{{{ 'ON' if value_json.state == '{DeviceState.RUNNING.value}' else 'OFF' }}}}",
+        "condition": {
+            "platform": "sensor", "name": "Condition", "device_class": "enum", "options": list(Condition),
+            **diagnostic, "value_template": "{{ value_json.condition.condition }}",
+            "json_attributes_topic": topic, "json_attributes_template": "{{ value_json.condition | tojson }}",
+        },
+        "problem": {
+            "platform": "binary_sensor", "name": "Problem", "device_class": "problem", **diagnostic,
+            "value_template": f"{{{{ 'OFF' if value_json.condition.condition == '{Condition.OK}' else 'ON' }}}}",
         },
         "rate": {
             "platform": "sensor", "name": "Sample rate", "device_class": "frequency", "state_class": "measurement",
@@ -128,7 +134,15 @@ LOCK: Final = "lock"
 STATE_NS: Final = NS_PER_S
 # Events that change the state of a device
 STATE_KINDS: Final = frozenset(
-    (EventKind.UP, EventKind.DOWN, EventKind.SYNC, EventKind.CONFIGURATION, EventKind.ALARM, EventKind.ATTITUDE)
+    (
+        EventKind.UP,
+        EventKind.DOWN,
+        EventKind.CONDITION,
+        EventKind.SYNC,
+        EventKind.CONFIGURATION,
+        EventKind.ALARM,
+        EventKind.ATTITUDE,
+    )
 )
 
 
@@ -150,7 +164,7 @@ class MqttPublisher:
         self._commands: CommandChannel | None = None
         self._names: set[str] = set()
         self._sent: set[str] = set()  # devices with messages
-        self._known: dict[str, tuple[str, str, str]] = {}  # published state, problem and axes of each device
+        self._known: dict[str, object] = {}  # published state, problem and axes of each device
         self._settings_known: dict[str, dict[str, object]] = {}  # published settings of each device
         self._state_ns = self._all_ns = 0
         self._is_changed = True  # True after an event of STATE_KINDS
@@ -291,7 +305,7 @@ class MqttPublisher:
             if not sending.status:
                 continue
             frame = status.frame
-            known = (status.state.value, status.problem, repr(frame))
+            known = (status.state.value, status.problem, repr(frame), signature(status.condition))
             if is_due or self._known.get(status.name) != known:
                 statuses[self._topic(status.name, STATUS)] = status
                 other[self._topic(status.name, SCHEMA)] = schema_of(status)

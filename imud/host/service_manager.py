@@ -3,7 +3,7 @@
 import logging
 import os
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Final
 
 from imud.model.units import NS_PER_S
@@ -11,8 +11,6 @@ from imud.model.units import NS_PER_S
 log = logging.getLogger(__name__)
 
 STATUS_NS: Final = NS_PER_S  # minimum time between two changes of the status line, ns
-NAMES_SHOWN: Final = 5  # maximum number of device names in the status line
-FINE: Final = ("running", "finished")  # device states (`DeviceState`) that need no action of the user
 
 
 def notify(state: str) -> None:
@@ -46,32 +44,19 @@ class ServiceManager:
         """Report the end of the daemon."""
         notify("STOPPING=1")
 
-    def tick(self, now_ns: int, states: Callable[[], Mapping[str, str]]) -> None:
-        """Feed the watchdog. Report the device states if they changed. Call this method ten times per second. `states`
-        returns the state of each device by its name. It is called at most once per second."""
+    def tick(self, now_ns: int, status_line: Callable[[], str]) -> None:
+        """Feed the watchdog. Report the status line if it changed. Call this method ten times per second. `status_line`
+        is called at most once per second."""
         if self._watchdog_s is not None and now_ns >= self._watchdog_due_ns:
             notify("WATCHDOG=1")
             self._watchdog_due_ns = now_ns + int(self._watchdog_s * NS_PER_S)
         if now_ns < self._status_due_ns:
             return
         self._status_due_ns = now_ns + STATUS_NS
-        status = status_line(states())
+        status = status_line()
         if status != self._status:
             self._status = status
             notify(f"STATUS={status}")
-
-
-def status_line(states: Mapping[str, str]) -> str:
-    """Return the number of running devices and the names of the other devices, for `systemctl status`."""
-    if not states:
-        return "The configuration has no devices."
-    other = [f"{name} ({state})" for name, state in states.items() if state not in FINE]
-    running = len(states) - len(other)
-    counted = f"{running} of {len(states)} devices running" if len(states) > 1 else f"{running} of 1 device running"
-    if not other:
-        return f"{counted}."
-    more = f" and {len(other) - NAMES_SHOWN} more" if len(other) > NAMES_SHOWN else ""
-    return f"{counted}; not running: {', '.join(other[:NAMES_SHOWN])}{more}."
 
 
 def watchdog_interval_s() -> float | None:

@@ -12,6 +12,8 @@ class EventKind(StrEnum):
 
     UP = "up"  # imud found and identified the device; samples follow
     DOWN = "down"  # the device or its link is absent; `detail` contains the reason
+    # The condition of the device or its reasons changed. `detail` contains the condition and the codes of the reasons.
+    CONDITION = "condition"
     SYNC = "sync"  # the source of time stamps changed
     # Samples were lost; `detail` contains their number and the cause. At most once per second and device.
     LOSS = "loss"
@@ -41,6 +43,7 @@ def kind_of(name: str) -> EventKind:
 LEVELS: Final = {
     EventKind.UP: logging.INFO,
     EventKind.SYNC: logging.INFO,
+    EventKind.CONDITION: logging.INFO,  # the causes have events of their own
     EventKind.MARK: logging.DEBUG,  # as frequent as camera triggers
     EventKind.CALIBRATION: logging.DEBUG,  # twice per second during a calibration
 }

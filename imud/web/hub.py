@@ -15,7 +15,7 @@ import msgspec
 
 from imud.client.feed import Feed, News, Wish
 from imud.contracts.setting import SettingsState
-from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus
+from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceStatus
 from imud.model.event import Event, EventKind
 from imud.model.ledger import LEDGER_FIELDS, bytes_open, frames_open, lost
 from imud.model.sample import Sample
@@ -361,9 +361,9 @@ def row_of(status: DeviceStatus, newest: Sample | None, now_ns: int) -> messages
     ledger = _counts(status)
     return messages.DeviceRow(
         name=status.name,
-        state=str(status.state),
-        problem=status.problem,
-        is_well=status.state in (DeviceState.RUNNING, DeviceState.FINISHED),
+        state=status.word,
+        problem=" ".join(one.message for one in status.reasons if status.has_problem),
+        is_well=not status.has_problem,
         driver=status.driver,
         link=status.link,
         identity=status.identity,

@@ -58,8 +58,8 @@ class DeviceRow(msgspec.Struct, frozen=True):
     """One device in the overview."""
 
     name: str
-    state: str
-    problem: str
+    state: str  # condition
+    problem: str  # reasons of the condition; empty if it is ok
     is_well: bool
     driver: str
     link: str

@@ -6,7 +6,6 @@ from typing import Any
 import msgspec
 
 from imud.bridges.channel import (
-    LOSS_SHOWN_NS,
     STALE_S,
     Diagnosis,
     DiagnosisLevel,
@@ -15,7 +14,8 @@ from imud.bridges.channel import (
     RecordedDiagnosis,
     StampedEvent,
 )
-from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, LinesStatus
+from imud.contracts.condition import Condition, DeviceCondition, Reason, ReasonCode
+from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_S
@@ -38,42 +38,20 @@ def one(found: DeviceStatus) -> Diagnosis:
 
 
 def test_levels_and_messages_of_a_running_daemon() -> None:
-    for state, level in [
-        (DeviceState.RUNNING, OK), (DeviceState.FINISHED, OK), (DeviceState.SEARCHING, WARN),
-        (DeviceState.MISSING, ERROR), (DeviceState.FAILED, ERROR), (DeviceState.SILENT, STALE),
-    ]:  # fmt: skip
-        found = one(status(state=state, problem="the adapter was pulled out"))
-        assert (found.level, found.message) == (level, f"{state}: the adapter was pulled out")
-        assert found.values["state"] == state
+    for word, level in (("ok", OK), ("degraded", WARN), ("attention", WARN), ("missing", ERROR)):
+        reason = Reason(ReasonCode.LOST, "The adapter was pulled out.")
+        found = one(status(condition=DeviceCondition(Condition(word), 0, (reason,))))
+        assert (found.level, found.message) == (level, f"{word}: The adapter was pulled out.")
+    assert one(status(state=DeviceState.SILENT, condition=None))[1:3] == (STALE, "silent")
     clock = ClockStatus(sync=Sync.REGRESSION, t_err_ns=12_000, skew_ppm=-40.5, residual_ns=900)
     found = one(status(clock=clock, identity={"product": "HI13", "serial_number": "17"}))
-    assert found[:4] == ("bow", OK, "running", "17")
+    assert found[:4] == ("bow", OK, "ok", "17")
     expected = {
         "t_err_ns": "12000", "skew_ppm": "-40.5", "residual_ns": "900", "sync": "regression", "rate_hz": "1000",
         "lost_crc": "0", "link": "/dev/ttyUSB0 at 115200 baud",
     }  # fmt: skip
     assert found.values.items() >= expected.items()
     assert one(status()).hardware == "HI13"
-    taken, raised = LinesStatus({"sout": "line 5 is taken"}, {}, {}), LinesStatus({}, {}, {}, alarm=True)
-    for found, words in (
-        (one(status(rate_hz=940.0)), "running; rate 940.0 Hz, expected 1000.0 Hz"),
-        (one(status(lines=taken)), "running; sout: line 5 is taken"),
-        (one(status(lines=raised)), "running; the ALARM line is active"),
-    ):
-        assert (found.level, found.message) == (WARN, words)
-    frame = device_status("bow", 0).frame
-    assert frame is not None
-    found = one(status(frame=msgspec.structs.replace(frame, problem="z points down")))
-    assert (found.level, found.message) == (WARN, "running; z points down")
-
-
-def test_losses_are_a_warning_for_a_while_when_they_grow() -> None:
-    diagnosis, levels = LiveDiagnosis(), []
-    for at_s, lost in ((0, 5), (1, 5), (2, 8), (3, 8), (2 + LOSS_SHOWN_NS // NS_PER_S, 8), (20, 0), (21, 1)):
-        (found,) = diagnosis.of([status(ledger={"lost_crc": lost})], UTC_NS + at_s * NS_PER_S).devices
-        levels.append(found.level)
-        assert found.values["lost_crc"] == str(lost)
-    assert levels == [OK, OK, WARN, WARN, OK, OK, WARN], "before the first look; grown; over; a new daemon; grown"
 
 
 def test_without_a_daemon_all_are_stale_and_keep_their_values() -> None:

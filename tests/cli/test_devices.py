@@ -20,8 +20,8 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
 @live
 def test_devices_and_verbs_are_listed_and_a_module_obeys(daemon: RunningDaemon, cli: Cli) -> None:
     head, bow = cli("devices", "--socket", daemon.socket).out.splitlines()
-    assert head.split() == ["DEVICE", "STATE", "RATE", "HZ", "DRIVER", "PRODUCT", "SERIAL", "NUMBER", "LINK"]
-    assert bow.split()[:2] == ["bow", "running"]
+    assert head.split() == ["DEVICE", "CONDITION", "RATE", "HZ", "DRIVER", "PRODUCT", "SERIAL", "NUMBER", "LINK"]
+    assert bow.split()[:2] == ["bow", "ok"]
     assert f"{daemon.folder}/port at 115200 baud" in bow
     out = cli("command", "--socket", daemon.socket, "bow").out
     assert [line.split()[0] for line in out.splitlines() if not line.startswith(" ")] == [

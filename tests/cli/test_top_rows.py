@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from imud.cli.top import AGE, LOST, NAME, RATE, STATE, VIEWS, WIDTH, DeviceHistory, chosen, duration, head, row
+from imud.cli.top import AGE, CONDITION, LOST, NAME, RATE, VIEWS, WIDTH, DeviceHistory, chosen, duration, head, row
 from imud.contracts.status import DeviceState
 from imud.model.sample import Sync
 from imud.model.units import NS_PER_S
@@ -21,9 +21,9 @@ def history(name: str = "imu0", number: int = 0, **changes: object) -> DeviceHis
 
 def test_a_row_has_its_values_below_their_titles() -> None:
     columns = VIEWS["motion"]
-    assert head(columns) == "DEVICE     STATE         HZ   AGE  LOST   ±µs  ROLL° PITCH°   YAW°   |a|  |ω|°"
+    assert head(columns) == "DEVICE     CONDITION     HZ   AGE  LOST   ±µs  ROLL° PITCH°   YAW°   |a|  |ω|°"
     assert row(history(), columns, NOW_NS) == (
-        "imu0       running    999.5 0.25s  4066    12   28.6  -14.3  171.9  9.76  53.6"
+        "imu0       ok         999.5 0.25s  4066    12   28.6  -14.3  171.9  9.76  53.6"
     )
     words = row(DeviceHistory(device("imu0", state=DeviceState.MISSING)), VIEWS["motion"], NOW_NS).split()
     assert words == ["imu0", "missing", "999.5", "-", "4066", "-", "-", "-", "-", "-", "-"]
@@ -62,12 +62,12 @@ def test_ages_order_and_filter() -> None:
     assert names(chosen(devices, NAME, NOW_NS, backwards=True)) == ["c", "b", "a"]
     assert names(chosen(devices, RATE, NOW_NS)) == ["a", "b", "c"]
     assert names(chosen(devices, LOST, NOW_NS, backwards=True)) == ["c", "b", "a"]
-    assert names(chosen(devices, STATE, NOW_NS)) == ["c", "a", "b"]
+    assert names(chosen(devices, CONDITION, NOW_NS)) == ["c", "a", "b"]
     devices = [history("a"), DeviceHistory(device("b"))]
     assert names(chosen(devices, AGE, NOW_NS)) == ["b", "a"], "a device without samples is the oldest"
     devices = [history("bow", 0), history("stern", 1, problem="has no power")]
     for words, found in {
-        "": ["bow", "stern"], "BOW": ["bow"], "ttyusb1": ["stern"], "hi13 running": ["bow", "stern"], "bow stern": [],
-        "power": ["stern"],
+        "": ["bow", "stern"], "BOW": ["bow"], "ttyusb1": ["stern"], "hi13 ok": ["bow"], "bow stern": [],
+        "hi13 /dev": ["bow", "stern"], "power": ["stern"],
     }.items():  # fmt: skip
         assert names(chosen(devices, NAME, NOW_NS, words=words)) == found

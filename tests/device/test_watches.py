@@ -178,7 +178,7 @@ def test_declination_and_heading_reference() -> None:
     relative = played("imu61x-uart", motion, 2.0, declination_deg=7.0)
     assert relative.status.heading is Heading.RELATIVE
     assert (
-        relative.status.problem == "declination_deg is configured, but the heading of the device counts from power-on"
+        relative.status.problem == "declination_deg is configured, but yaw is measured from the direction at power-on"
     )
 
 

@@ -2,12 +2,11 @@
 
 import os
 import socket
-from functools import partial
 from pathlib import Path
 
 import pytest
 
-from imud.host.service_manager import STATUS_NS, ServiceManager, notify, status_line, watchdog_interval_s
+from imud.host.service_manager import STATUS_NS, ServiceManager, notify, watchdog_interval_s
 
 NO_PROCESS = str(1 << 30)
 """Number above the largest process id (proc(5), pid_max)."""
@@ -45,24 +44,6 @@ def test_watchdog_interval(usec: str, pid: str, expected: float | None, monkeypa
     assert watchdog_interval_s() == expected
 
 
-@pytest.mark.parametrize(
-    ("states", "line"),
-    [
-        ({}, "The configuration has no devices."),
-        ({"bow": "running"}, "1 of 1 device running."),
-        ({"bow": "missing"}, "0 of 1 device running; not running: bow (missing)."),
-        ({"a": "running", "b": "silent", "c": "finished"}, "2 of 3 devices running; not running: b (silent)."),
-        (
-            {f"d{n}": "missing" for n in range(8)},
-            "0 of 8 devices running; not running: "
-            "d0 (missing), d1 (missing), d2 (missing), d3 (missing), d4 (missing) and 3 more.",
-        ),
-    ],
-)
-def test_status_line(states: dict[str, str], line: str) -> None:
-    assert status_line(states) == line
-
-
 def test_status_is_sent_when_it_changes_and_the_watchdog_is_fed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -75,11 +56,10 @@ def test_status_is_sent_when_it_changes_and_the_watchdog_is_fed(
         manager = ServiceManager()
         manager.ready()
         for tenth in range(31):
-            states = {"bow": "running" if tenth > 12 else "searching"}
-            manager.tick(tenth * STATUS_NS // 10, partial(dict, states))
+            manager.tick(tenth * STATUS_NS // 10, lambda: "OK." if tenth > 12 else "missing.")  # noqa: B023
         manager.stopping()
         sent = [receiver.recv(100).decode() for _ in range(6)]
     assert sent == [
-        "READY=1", "WATCHDOG=1", "STATUS=0 of 1 device running; not running: bow (searching).", "WATCHDOG=1",
-        "STATUS=1 of 1 device running.", "STOPPING=1",
+        "READY=1", "WATCHDOG=1", "STATUS=missing.", "WATCHDOG=1",
+        "STATUS=OK.", "STOPPING=1",
     ]  # fmt: skip

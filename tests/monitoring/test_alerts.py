@@ -39,13 +39,13 @@ from tests.support.daemon_process import wait_until, write_config
 from tests.support.surroundings import free_port
 
 DEVICE_OF: Final = {
-    "ImudDeviceDown": "gone", "ImudReconnects": "flapping", "ImudRateLow": "lossy", "ImudSamplesLost": "lossy",
+    "ImudDeviceDown": "gone", "ImudReconnects": "flapping", "ImudDeviceDegraded": "lossy", "ImudSamplesLost": "lossy",
     "ImudLossHigh": "lossy", "ImudGapsUnknown": "lossy", "ImudFramesDamaged": "noisy", "ImudBusErrors": "quiet",
-    "ImudBusOff": "mute", "ImudTransfersFail": "boom", "ImudTemperature": "hot", "ImudAlarm": "lines",
-    "ImudFrameProblem": "tilted", "ImudSettingsDiffer": "module", "ImudSettingsProblem": "mute",
+    "ImudBusOff": "mute", "ImudTransfersFail": "boom", "ImudTemperature": "hot",
+    "ImudDeviceAttention": "tilted",
     "ImudClockErrorLarge": "late", "ImudLatencyHigh": "late", "ImudSyncLost": "jumping",
-    "ImudClockResets": "jumping", "ImudLineProblem": "late", "ImudEdgesLost": "lines", "ImudUtcProblem": "quiet",
-    "ImudPulsesMissing": "lines", "ImudRingStopped": "quiet", "ImudLedgerOpen": "tilted",
+    "ImudClockResets": "jumping", "ImudLineProblem": "late", "ImudEdgesLost": "lines",
+    "ImudPulsesMissing": "lines", "ImudRingStopped": "quiet",
 }  # fmt: skip
 SITE_ALERTS: Final = (
     "ImudLoopLate", "ImudLogMessagesDropped", "ImudClientsTooSlow", "ImudRecordingStopped", "ImudRecordsLost",

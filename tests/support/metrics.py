@@ -7,6 +7,7 @@ import msgspec
 from prometheus_client.parser import text_string_to_metric_families
 
 from imud.attitude.conventions import Heading
+from imud.contracts.condition import Condition, DeviceCondition, Reason, ReasonCode
 from imud.contracts.status import (
     LATENCY_BOUNDS_NS,
     ClientStatus,
@@ -44,7 +45,17 @@ def device(name: str, number: int = 0, **changes: object) -> DeviceStatus:
         kernel=KernelCounters(7, 8, 9, 10), latency_buckets=tuple(range(1, len(LATENCY_BOUNDS_NS) + 2)),
         latency_sum_ns=2_500_000_000, temperature_c=36.5, status_bits=4, connects=3,
     )  # fmt: skip
-    return msgspec.structs.replace(status, **changes)
+    return judged(msgspec.structs.replace(status, **changes))
+
+
+def judged(status: DeviceStatus) -> DeviceStatus:
+    """Return a status with a simple condition, unless it has one."""
+    if status.condition is not None:
+        return status
+    is_ok = status.state in (DeviceState.RUNNING, DeviceState.FINISHED) and not status.problem
+    reason = Reason(ReasonCode.NONE_LOST if is_ok else ReasonCode.FAILED, status.problem or "No sample was lost.")
+    known = DeviceCondition(Condition.OK if is_ok else Condition.MISSING, 0, (reason,))
+    return msgspec.structs.replace(status, condition=known)
 
 
 POLLING = PollingStatus(

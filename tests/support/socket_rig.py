@@ -27,6 +27,7 @@ from imud.contracts.command import (
     Verb,
     Verbs,
 )
+from imud.contracts.condition import Condition, DeviceCondition
 from imud.contracts.publisher import AS_SENT, Batch, Latencies, PublisherContext, RecordingSource
 from imud.contracts.setting import (
     AppliedSettings,
@@ -91,7 +92,7 @@ def device_status(name: str, device_id: int) -> DeviceStatus:
             navigation_frame="ENU", heading=Heading.MAGNETIC, declination_deg=None,
             conventions={str(one): AS_SENT.words_of(one) for one in Convention},
         ),
-        noise=Deviations(accel_m_s2=0.01),
+        noise=Deviations(accel_m_s2=0.01), condition=DeviceCondition(Condition.OK, NOW_NS - 5_000_000_000),
     )  # fmt: skip
 
 

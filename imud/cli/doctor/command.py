@@ -139,7 +139,6 @@ CHECKS: Final = (
     DoctorCheck("latency timer", ports.latency_timer),
     DoctorCheck("serial data", daemon.heard),
     DoctorCheck("RS-485", daemon.half_duplex),
-    DoctorCheck("restarts", daemon.restarts),
     DoctorCheck("CAN interfaces", buses.can_up),
     DoctorCheck("CAN state", buses.can_state),
     DoctorCheck("CAN bit rate", buses.can_bitrate),

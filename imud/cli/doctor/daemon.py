@@ -8,6 +8,7 @@ from typing import Final
 import msgspec
 
 from imud.cli.doctor.surroundings import DoctorFinding, Findings, Surroundings, error, not_checked, note, ok, warning
+from imud.contracts.condition import DOCTOR, Condition
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.model.errors import LinkDenied, reason_of
 from imud.model.units import NS_PER_S, NS_PER_US
@@ -149,7 +150,7 @@ def stale_configuration(at: Surroundings) -> Findings:
 
 
 def device_states(at: Surroundings) -> Findings:
-    """Report each device that does not run, with the reason of the daemon."""
+    """Report the condition of each device, with the reasons and next steps of the daemon."""
     if at.status is None:
         yield not_checked(
             "the device states are unknown, because the daemon does not reply",
@@ -157,17 +158,13 @@ def device_states(at: Surroundings) -> Findings:
         )
         return
     for one in at.status:
-        if one.state in ("running", "finished"):
-            yield (
-                warning(f"{one.name}: {one.problem}", f"details of {one.name}: `imud status`")
-                if one.problem
-                else ok(f"{one.name} is {one.state}, {one.rate_hz:.1f} samples/s")
-            )
-        else:
-            yield error(
-                f"{one.name} is {one.state}: {one.problem or 'no reason reported'}",
-                "see the findings about its port or bus; counters: `imud status`",
-            )
+        for reason in one.reasons:
+            words = f"{one.name}: {reason.message}"
+            step = "see the findings about its port, bus and lines" if reason.next == DOCTOR else reason.next
+            if one.has_problem:
+                yield (error if one.word == Condition.MISSING else warning)(words, step)
+            else:
+                yield ok(words)
 
 
 def _names(names: set[str]) -> str:
@@ -265,12 +262,9 @@ HEARD_BYTES: Final = 200
 DAMAGED_SHARE: Final = 0.001  # Maximum share of damaged frames. A good link has no damaged frame in days.
 # Time without a reply that causes a warning, s. imud requests the identity at detection, and 5 s and 35 s later.
 ANSWERED_AFTER_S: Final = 60.0
-RESETS: Final = 3
-RESETS_PER_H: Final = 1.0  # Maximum number of restarts of a device per hour. A user restarts a device less often.
 # Number of samples without an edge on SOUT after which the pin is not connected, or disabled in the device
 EDGES_AFTER_SAMPLES: Final = 100
 PPS_AFTER_S: Final = 10.0
-S_PER_H: Final = 3600
 DOWN: Final = "the received data is unknown, because the daemon does not reply"
 
 
@@ -384,30 +378,6 @@ def half_duplex(at: Surroundings) -> Findings:
             )
         else:
             yield ok(f"{one.name}: the RS-485 bus works" + ("; imud ignores the echoes" if line.echoes else ""))
-
-
-def restarts(at: Surroundings) -> Findings:
-    """Look for devices that restart without a request."""
-    for one in _status(at):
-        if isinstance(one, DoctorFinding):
-            yield one
-            return
-        if not one.ledger["samples"]:
-            continue
-        resets = one.clock.resets - one.resets_requested
-        rate_hz = one.expected_rate_hz or one.rate_hz
-        # the number of samples is a clock of the running time
-        hours = one.ledger["samples"] / rate_hz / S_PER_H if rate_hz else 0.0
-        if resets >= RESETS and resets > RESETS_PER_H * hours:
-            yield warning(
-                f"the device counter of {one.name} restarted {resets} times in {hours:.1f} h of samples",
-                "is the supply voltage too low? Measure it at the device: the cable can be too thin, or the USB port "
-                "or regulator too weak; then look for commands that restart the device",
-            )
-        elif resets:
-            yield note(f"the device counter of {one.name} restarted {resets} times since the daemon started")
-        else:
-            yield ok(f"{one.name} has not restarted since the daemon started")
 
 
 def lines(at: Surroundings) -> Findings:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 import imud
+from imud.contracts.condition import Condition
 from imud.contracts.setting import SettingsState, SettingsStatus
 from imud.contracts.status import (
     LATENCY_BOUNDS_NS,
@@ -104,6 +105,7 @@ def _compared(device: DeviceStatus) -> SettingsStatus | None:
 
 
 DEVICE: Final = status_part(lambda device: device)
+CONDITION: Final = status_part(lambda device: device.condition)
 CLOCK: Final = status_part(lambda device: device.clock)
 FRAME: Final = status_part(lambda device: device.frame)
 LEDGER: Final = status_part(lambda device: device.ledger)
@@ -185,6 +187,14 @@ DEVICE_FAMILIES: Final = (
     _gauge(
         "imud_device_state", "1 for the present device state, 0 for the others.",
         DEVICE.by("state", lambda d: {state.value: d.state is state for state in DeviceState}),
+    ),
+    _gauge(
+        "imud_device_condition", "1 for the present condition of the device, 0 for the others.",
+        CONDITION.by("condition", lambda c: {one.value: c.condition is one for one in Condition}),
+    ),
+    _gauge(
+        "imud_device_reason", "1 for each reason of a condition other than ok; absent for the other reasons.",
+        CONDITION.by("code", lambda c: {reason.code.value: 1 for reason in c.reasons if not c.is_ok}),
     ),
     _counter("imud_device_connects_total", "Number of connections to the link.", DEVICE.one(lambda d: d.connects)),
     _counter("imud_bytes_in_total", "Bytes received from the link.", _ledger("bytes_in")),

@@ -10,6 +10,7 @@ import msgspec
 
 from imud.attitude.conventions import Convention, Heading
 from imud.attitude.published import FrameWords
+from imud.contracts.condition import DeviceCondition
 from imud.contracts.status import DeviceState, DeviceStatus, MqttStatus, SocketStatus
 from imud.model.event import Event
 from imud.model.sample import FieldInfo, Sample, Sync
@@ -119,6 +120,7 @@ class DeviceSummary(msgspec.Struct):
     link: str
     state: DeviceState
     problem: str
+    condition: DeviceCondition | None
     identity: dict[str, str]
     rate_hz: float
     sync: Sync

@@ -208,8 +208,8 @@ def _devices(hub: Hub, connection: ClientConnection, _params: NoParams) -> Piece
     rings = hub.context.outputs.rings
     summaries = (
         DeviceSummary(
-            one.name, one.device_id, one.driver, one.link, one.state, one.problem, one.identity, one.rate_hz,
-            one.clock.sync, rings.get(one.name),
+            one.name, one.device_id, one.driver, one.link, one.state, one.problem, one.condition, one.identity,
+            one.rate_hz, one.clock.sync, rings.get(one.name),
         )
         for one in hub.context.devices.each_status()
     )  # fmt: skip

@@ -124,9 +124,11 @@ export class DevicePage {
   showStatus(message) {
     const { status } = message;
     this.status = message;
-    setText(this.state, status ? status.state : "removed");
-    this.state.className = `pill ${["running", "finished"].includes(status?.state) ? "good" : "bad"}`;
-    const trouble = status ? status.problem : `the configuration of the daemon does not contain ${this.name}`;
+    const condition = status?.condition?.condition;
+    setText(this.state, condition ?? "removed");
+    this.state.className = `pill ${condition === "ok" ? "good" : "bad"}`;
+    const reasons = condition === "ok" ? [] : (status?.condition?.reasons ?? []);
+    const trouble = status ? reasons.map((one) => `${one.message} ${one.next}`).join(" ") : `the configuration of the daemon does not contain ${this.name}`;
     setText(this.trouble, trouble);
     this.trouble.hidden = !trouble;
     this.setOffset(Date.now() / 1000 - message.now_s);

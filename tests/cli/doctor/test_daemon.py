@@ -2,7 +2,6 @@
 
 import os
 
-import msgspec
 import pytest
 
 from imud.cli.doctor.daemon import configuration, device_states, service, socket, stale_configuration
@@ -99,8 +98,8 @@ def test_a_daemon_with_other_devices(machine: Machine) -> None:
 
 def test_states_come_with_the_reason_of_the_daemon(machine: Machine) -> None:
     assert machine.find(STATES)[0].severity == "not checked"
-    down = msgspec.structs.replace(device("b"), state=DeviceState.MISSING, problem="/dev/ttyUSB1 is not there")
+    down = device("b", state=DeviceState.MISSING, problem="/dev/ttyUSB1 is not there")
     machine.status = [device("a"), down, device("c", problem="can0 is error-passive")]
     found = machine.told(STATES)
-    assert [severity for severity, _ in found] == ["ok", "error", "warning"]
-    assert "b is missing: /dev/ttyUSB1 is not there" in found[1][1]
+    assert [severity for severity, _ in found] == ["ok", "error", "error"]
+    assert "b: /dev/ttyUSB1 is not there" in found[1][1]

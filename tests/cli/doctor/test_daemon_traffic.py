@@ -5,22 +5,20 @@ from typing import Any
 import msgspec
 import pytest
 
-from imud.cli.doctor.daemon import half_duplex, heard, lines, restarts
+from imud.cli.doctor.daemon import half_duplex, heard, lines
 from imud.cli.doctor.surroundings import DoctorCheck
 from imud.contracts.status import (
-    ClockStatus,
     DeviceState,
     DeviceStatus,
     KernelCounters,
     LinesStatus,
     SerialLineCounters,
 )
-from imud.model.sample import Sync
 from tests.support.metrics import POLLING, device
 from tests.support.surroundings import Machine
 
-HEARD, HALF, RESTARTS, LINES = (
-    DoctorCheck("h", heard), DoctorCheck("d", half_duplex), DoctorCheck("r", restarts), DoctorCheck("l", lines),
+HEARD, HALF, LINES = (
+    DoctorCheck("h", heard), DoctorCheck("d", half_duplex), DoctorCheck("l", lines),
 )  # fmt: skip
 UART = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}}"
 WIRED = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}, lines: {sout: {line: GPIO17}}}"
@@ -37,14 +35,12 @@ def counted(state: DeviceState = DeviceState.SEARCHING, **counts: int) -> Device
 
 def test_without_the_daemon_a_port_or_samples(machine: Machine) -> None:
     machine.configure(WIRED)
-    for check in (HEARD, RESTARTS, LINES):
+    for check in (HEARD, LINES):
         assert [finding.severity for finding in machine.find(check)] == ["not checked"]
     assert machine.find(HALF) == []  # this line is not configured
     machine.configure(UART)
     machine.status = [counted(DeviceState.MISSING)]
     assert machine.find(HEARD) == []
-    machine.status = [counted()]
-    assert machine.find(RESTARTS) == []
 
 
 @pytest.mark.parametrize(
@@ -119,24 +115,6 @@ def test_rs485(machine: Machine, state: DeviceState, line: SerialLineCounters, s
     machine.configure(RS485)
     machine.status = [device("bow", state=state, serial_line=line, polling=POLLING)]  # 1000 reads
     machine.tells(HALF, severity, words)
-
-
-@pytest.mark.parametrize(
-    ("resets", "requested", "samples", "severity"),
-    [
-        (0, 0, 1000, "ok"), (9, 9, 1000, "ok"), (2, 0, 1000, "note"), (3, 0, 360_000, "warning"),
-        (9, 6, 360_000, "warning"), (9, 7, 360_000, "note"), (3, 0, 2 * 360_000, "warning"),
-        (3, 0, 3 * 360_000, "note"),
-    ],
-)  # fmt: skip
-def test_restarts_without_a_request_count_by_the_hour(
-    machine: Machine, resets: int, requested: int, samples: int, severity: str
-) -> None:
-    clock = ClockStatus(Sync.REGRESSION, resets=resets)
-    running = counted(DeviceState.RUNNING, samples=samples)
-    running = msgspec.structs.replace(running, clock=clock, resets_requested=requested)
-    machine.status = [msgspec.structs.replace(running, expected_rate_hz=100.0)]  # 360,000 samples per hour
-    assert [finding.severity for finding in machine.find(RESTARTS)] == [severity]
 
 
 @pytest.mark.parametrize(

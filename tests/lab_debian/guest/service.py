@@ -162,7 +162,7 @@ def check_streaming(checks: Checks, _host: Host) -> None:
         wait_streaming("can")
         wait_until(lambda: (device("usb") or usb)["identity"].get("product"), "the product of the device on USB")
     with checks("systemctl status shows the number of running devices"):
-        wait_until(lambda: shown("StatusText") == "2 of 2 devices running.", f"two: {shown('StatusText')}")
+        wait_until(lambda: shown("StatusText") == "All 2 devices are OK.", f"two: {shown('StatusText')}")
     with checks("rings, socket and metrics contain the samples"):
         must(PYTHON, "-c", "from imud.client import Ring\nwith Ring('usb') as ring: assert ring.latest() is not None")
         must("sh", "-c", "imud devices | grep --quiet 'usb.*running'")

@@ -1,0 +1,349 @@
+"""Each sentence of the condition table, its limits, the hysteresis, and the counts of the last minute."""
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from imud.attitude.conventions import Heading
+from imud.contracts.condition import Condition, ConditionLimits, DeviceCondition, Reason, ReasonCode, condition_of
+from imud.contracts.setting import OnDifference, SettingDifference, SettingsState, SettingsStatus
+from imud.contracts.status import (
+    ClockStatus,
+    DeviceState,
+    DeviceStatus,
+    FrameProblem,
+    FrameStatus,
+    LinesStatus,
+    RecentStatus,
+    UtcStatus,
+)
+from imud.device.condition import ConditionWatch, ConfiguredPort, RecentCounts, no_loss, reasons_of
+from imud.device.health import SEARCH_BEGUN, DeviceEvents
+from imud.model.event import Event, EventKind
+from imud.model.ledger import Ledger
+from imud.model.sample import Sync
+from tests.support.metrics import device
+
+S = 1_000_000_000
+NOW_NS = 1000 * S
+PORT = ConfiguredPort("/dev/ttyUSB0", "uart.port", True, lambda: ["/dev/ttyUSB1", "/dev/ttyS0"])
+THERE = "Ports on this host: /dev/ttyUSB1, /dev/ttyS0."
+BUS = ConfiguredPort("can0", "can.interface", False, list)
+APPLY = "Apply the declared value, or change the configuration."
+SAVE = "Save the settings to the device's flash."
+DOCTOR = "Run `sudo imud doctor`."
+
+
+def recent(rate_hz: float | None = None, **changes: Any) -> RecentStatus:
+    known = {"samples": 3000, "last_sample_ns": NOW_NS - 12 * S, **changes}
+    return RecentStatus(NOW_NS - 840 * S, rate_hz, **known)
+
+
+def absent(state: DeviceState, problem: str, **changes: Any) -> DeviceStatus:
+    return device("bow", state=state, problem=problem, recent=recent(**changes), expected_rate_hz=0.0)
+
+
+def running(**changes: Any) -> DeviceStatus:
+    known: dict[str, Any] = {"recent": recent(), "expected_rate_hz": 50.0, **changes}
+    return device("bow", **known)
+
+
+def declared(state: SettingsState = SettingsState.AGREE, **changes: Any) -> DeviceStatus:
+    return running(declared=SettingsStatus(state, OnDifference.REPORT, **changes))
+
+
+def frame(kind: FrameProblem, problem: str) -> DeviceStatus:
+    return running(frame=FrameStatus("", "", "", "", Heading.RELATIVE, 3.0, {}, problem, kind))
+
+
+LATE = running(clock=ClockStatus(Sync.REGRESSION, t_err_ns=2_100_000))
+OPEN_LEDGER = running()
+OPEN_LEDGER.ledger["bytes_in"] += 3
+
+
+@pytest.mark.parametrize(
+    ("status", "condition", "message", "step"),
+    [
+        (
+            absent(DeviceState.MISSING, "the port is missing"), "missing", "The port /dev/ttyUSB0 does not exist.",
+            f"Plug in the cable, or correct uart.port in the configuration. {THERE}",
+        ),
+        (
+            absent(DeviceState.SEARCHING, "no byte arrives"), "missing", "No data arrives at /dev/ttyUSB0.",
+            "Check the power supply, and check that TX and RX are not swapped.",
+        ),
+        (
+            absent(DeviceState.SILENT, "no sample for 1.0 s, but the link is open"), "missing",
+            "The device stopped sending 12 s ago. Its port still exists.", "Check the power supply and the connector.",
+        ),
+        (absent(DeviceState.FAILED, "port is in use by gpsd"), "missing", "Port is in use by gpsd.", DOCTOR),
+        (
+            absent(DeviceState.SEARCHING, SEARCH_BEGUN), "missing",
+            "imud searches for the device at /dev/ttyUSB0.", "Wait for the search.",
+        ),
+        (
+            absent(DeviceState.SEARCHING, "bytes arrive, but no valid frame", bytes_in=9), "missing",
+            "Bytes arrive, but no valid frame.", DOCTOR,
+        ),
+        (absent(DeviceState.SILENT, "it replies but sends none"), "missing", "It replies but sends none.", DOCTOR),
+        (
+            declared(SettingsState.DIFFER, differences={"mounting": SettingDifference("x up", "level")}), "attention",
+            "Mounting is “level” on the device, but “x up” in the configuration.", APPLY,
+        ),
+        (
+            declared(SettingsState.DIFFER, differences={"low_pass_hz": SettingDifference(20)}), "attention",
+            "Low pass hz is not known on the device, but “20” in the configuration.", APPLY,
+        ),
+        (
+            declared(unsaved=True, lost_at_power_off={"mode": "9 axes"}), "attention",
+            "Mode “9 axes” is lost at power-off because it is not saved.", SAVE,
+        ),
+        (declared(unsaved=True), "attention", "A change is lost at power-off because it is not saved.", SAVE),
+        (
+            declared(problem="cannot read the settings: no reply"), "attention", "Cannot read the settings: no reply.",
+            "Run `imud settings` with the name of the device.",
+        ),
+        (
+            frame(
+                FrameProblem.DECLINATION,
+                "declination_deg is configured, but yaw is measured from the direction at power-on",
+            ),
+            "attention", "declination_deg is configured, but yaw is measured from the direction at power-on.",
+            "Calibrate the magnetometer, or remove declination_deg from the configuration.",
+        ),
+        (
+            frame(FrameProblem.GRAVITY, "at rest, up is +x: set frame"), "attention",
+            "The measured gravity does not match the attitude.", "At rest, up is +x: set frame.",
+        ),
+        (frame(FrameProblem.AXES, "imud does not know urfr 9"), "attention", "imud does not know urfr 9.", DOCTOR),
+        (
+            running(lines=LinesStatus({}, {}, {}, alarm=True)), "attention", "The ALARM pin is active.",
+            "Compare the measured values with the limits of the device (docs/lines.md).",
+        ),
+        (running(lines=LinesStatus({"sout": "no chip"}, {}, {})), "attention", "Line sout: no chip.", DOCTOR),
+        (running(utc=UtcStatus("gpsd", "gpsd is down")), "attention", "gpsd is down.".capitalize(), DOCTOR),
+        (
+            OPEN_LEDGER, "attention", "The ledger does not balance: 3 bytes.",
+            "Report this fault of imud with the output of `imud status --json`.",
+        ),
+        (
+            running(recent=recent(restarts=3)), "attention", "The device restarted 3 times in the last hour.",
+            "Measure the supply voltage at the device.",
+        ),
+        (
+            running(recent=recent(samples=961, lost={"crc": 38, "queue": 1})), "degraded",
+            "3.9 % of the samples are lost because frames are damaged.",
+            "Check the cable, its length and its ground. If they are correct, use a lower bit rate.",
+        ),
+        (
+            running(recent=recent(samples=998, lost={"overrun": 2})), "degraded",
+            "0.20 % of the samples are lost in kernel buffer overruns.",
+            "Reduce the load of this host, or use a lower rate.",
+        ),
+        (
+            running(recent=recent(gaps=2)), "degraded",
+            "Samples are lost in 2 gaps of unknown size in the last minute.", DOCTOR,
+        ),
+        (
+            running(recent=recent(45.9)), "degraded", "The device sends 45.9 samples per second instead of 50.",
+            "Compare the output rate in the settings of the device with its bit rate.",
+        ),
+        (
+            LATE, "degraded", "The time stamp error is ±2.1 ms.", "Connect SOUT, or reduce the latency timer.",
+        ),
+        (running(problem="can0 is error-passive"), "degraded", "can0 is error-passive.", DOCTOR),
+        (absent(DeviceState.FINISHED, ""), "ok", "The replay is at its end.", ""),
+    ],
+)  # fmt: skip
+def test_each_sentence(status: DeviceStatus, condition: str, message: str, step: str) -> None:
+    limits = ConditionLimits(t_err_ms=2.0)
+    (reason,) = reasons_of(status, limits, PORT, NOW_NS)
+    assert (reason.message, reason.next, condition_of(reason.code)) == (message, step, condition)
+
+
+@pytest.mark.parametrize(
+    "status",
+    [
+        running(recent=recent(samples=999, lost={"crc": 1})),
+        running(recent=recent(49.01)),
+        running(recent=recent(50.99)),
+        running(recent=recent(30.0), expected_rate_hz=0.0),
+        running(recent=recent(restarts=2)),
+        LATE,
+        declared(SettingsState.UNKNOWN),
+    ],
+)
+def test_no_reason_within_the_limits(status: DeviceStatus) -> None:
+    assert reasons_of(status, ConditionLimits(), PORT, NOW_NS) == []
+
+
+def test_ports_of_other_links() -> None:
+    gone, quiet = absent(DeviceState.MISSING, "can0 is down: imud waits"), absent(DeviceState.SEARCHING, "nothing came")
+    (missing,), (silent,) = (reasons_of(one, ConditionLimits(), BUS, NOW_NS) for one in (gone, quiet))
+    assert missing.message == "can0 is down: imud waits."
+    assert (silent.message, "bit rate" in silent.next) == ("No data arrives at can0.", True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({}, "No sample was lost since imud started 14 min ago."),
+        (
+            {"loss_ns": NOW_NS - 600 * S, "loss_samples": 19, "loss_cause": "overrun"},
+            "19 samples were lost 10 min ago in a kernel buffer overrun. No sample was lost after that.",
+        ),
+        (
+            {"loss_ns": NOW_NS - S, "loss_samples": 1, "loss_cause": "crc"},
+            "1 sample was lost 1 s ago because frames were damaged. No sample was lost after that.",
+        ),
+        ({"loss_ns": NOW_NS - S}, "Samples were lost 1 s ago. No sample was lost after that."),
+    ],
+)
+def test_sentence_without_a_problem(changes: dict[str, Any], message: str) -> None:
+    assert no_loss(recent(**changes), NOW_NS).message == message
+
+
+# --- hysteresis -------------------------------------------------------------------------------------------------------
+
+LOST = Reason(ReasonCode.LOST, "lost")
+ALARM = Reason(ReasonCode.ALARM, "alarm")
+SETTING = Reason(ReasonCode.SETTING, "differs", setting="mode")
+GONE = Reason(ReasonCode.STOPPED, "stopped")
+
+
+class Watched:
+    """Watch of one device whose time advances by one second per update."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+        self.now_s = 0
+        self.watch = ConditionWatch(ConditionLimits(), DeviceEvents("bow", Ledger(), self.events.append), 0)
+
+    def after(self, seconds: int, *reasons: Reason) -> Condition:
+        for _ in range(seconds):
+            self.watch.update(self.now_s * S, reasons, recent())
+            self.now_s += 1
+        return self.watch.condition.condition
+
+
+def test_a_reason_counts_after_5_s_and_ends_60_s_after_its_cause() -> None:
+    watched = Watched()
+    assert watched.after(1) == "ok"
+    assert watched.after(5, LOST) == "ok"
+    assert watched.after(1, LOST) == "degraded"
+    assert watched.after(60, ALARM) == "attention"
+    assert [reason.code for reason in watched.watch.condition.reasons] == ["alarm", "lost"]
+    assert watched.after(1, ALARM) == "attention"
+    assert [reason.code for reason in watched.watch.condition.reasons] == ["alarm"]
+    assert watched.after(60) == "attention"
+    assert watched.after(1) == "ok"
+    assert watched.watch.condition.since_ns == (watched.now_s - 1) * S
+    assert [event.detail["reasons"] for event in watched.events] == ["lost", "alarm, lost", "alarm", "none-lost"]
+    assert {event.kind for event in watched.events} == {EventKind.CONDITION}
+
+
+def test_a_short_cause_does_not_count() -> None:
+    watched = Watched()
+    assert watched.after(1) == watched.after(4, LOST) == watched.after(100) == "ok"
+    assert watched.events == []
+
+
+def test_a_repaired_setting_ends_at_once() -> None:
+    watched = Watched()
+    watched.after(1)
+    assert watched.after(6, SETTING) == "attention"
+    assert watched.after(1) == "ok"
+
+
+def test_a_missing_device() -> None:
+    watched = Watched()
+    assert watched.after(1, GONE) == "missing"  # before the first sample without a delay
+    assert watched.after(1) == "ok"
+    assert watched.after(6, LOST) == "degraded"
+    assert watched.after(5, GONE) == "degraded"
+    assert watched.after(1, GONE) == "missing"
+    assert watched.watch.condition.reasons == (GONE,)
+    assert watched.after(1) == "ok"
+
+
+def test_history_contains_the_worst_condition_of_each_minute() -> None:
+    watched = Watched()
+    watched.after(60)
+    watched.after(10, LOST)
+    watched.after(120)
+    assert watched.watch.history[-4:] == ("ok", "degraded", "degraded", "ok")
+    assert set(watched.watch.history[:-4]) == {None}
+    watched.now_s += 130
+    watched.after(1)
+    assert watched.watch.history[-3:] == ("ok", None, "ok")
+    watched.now_s += 100_000
+    watched.after(1)
+    assert watched.watch.history[-2:] == (None, "ok")
+    assert len(watched.watch.history) == 60
+
+
+def test_text_of_a_condition() -> None:
+    assert str(DeviceCondition(Condition.DEGRADED, 0, (LOST, ALARM))) == "degraded: lost alarm"
+    assert str(DeviceCondition(Condition.MISSING, 0)) == "missing"
+
+
+# --- counts -----------------------------------------------------------------------------------------------------------
+
+
+class Counted:
+    """Counts of a device that sends 50 samples per second."""
+
+    def __init__(self, *, timed: bool = True) -> None:
+        self.ledger, self.now_s, self.resets, self.expected_hz = Ledger(), 0, 0, 50.0
+        self.counts = RecentCounts(self.ledger, 0, timed=timed)
+
+    def pass_seconds(self, seconds: int, samples: int = 50, **lost: int) -> RecentStatus:
+        for _ in range(seconds):
+            self.now_s += 1
+            self.ledger.samples += samples
+            for name, count in lost.items():
+                setattr(self.ledger, name, getattr(self.ledger, name) + count)
+            self.counts.add(self.now_s * S, self.expected_hz, self.resets)
+        return self.counts.status(self.now_s * S)
+
+
+def test_losses_of_the_last_minute_by_cause() -> None:
+    counted = Counted()
+    counted.pass_seconds(30, lost_crc=2, lost_queue=1)
+    found = counted.pass_seconds(29, lost_unknown=1)
+    assert (found.samples, found.lost, found.gaps) == (59 * 50, {"crc": 60, "queue": 30}, 29)
+    assert (found.loss_ns, found.loss_samples, found.loss_cause) == (59 * S, 90, "crc")
+    later = counted.pass_seconds(61)
+    assert (later.samples, later.lost, later.gaps) == (60 * 50, {}, 0)
+    assert (later.loss_ns, later.loss_samples) == (59 * S, 90)
+    again = counted.pass_seconds(1, lost_overrun=1)
+    assert (again.loss_samples, again.loss_cause) == (1, "overrun")
+
+
+def test_the_rate_contains_lost_samples_and_needs_a_steady_device() -> None:
+    counted = Counted()
+    assert counted.pass_seconds(9).rate_hz is None
+    counted.pass_seconds(5, samples=45, lost_crc=5)
+    assert counted.pass_seconds(11, samples=45).rate_hz == 45.0
+    assert counted.pass_seconds(1, lost_unknown=1).rate_hz is None
+    counted.pass_seconds(12)
+    counted.expected_hz = 25.0
+    assert counted.pass_seconds(10, samples=25).rate_hz is None  # the device changed its rate
+    assert counted.pass_seconds(2, samples=25).rate_hz == 25.0
+    assert Counted(timed=False).pass_seconds(30).rate_hz is None
+
+
+def test_restarts_of_the_last_hour() -> None:
+    counted = Counted()
+    counted.resets = 2
+    assert counted.pass_seconds(1).restarts == 2
+    counted.now_s += 3599
+    assert counted.pass_seconds(1).restarts == 0
+    counted.resets = 1000
+    assert counted.pass_seconds(1).restarts == 60
+
+
+def test_a_status_of_another_version_has_no_condition() -> None:
+    status = msgspec.convert(msgspec.to_builtins(msgspec.structs.replace(device("bow"), condition=None)), DeviceStatus)
+    assert (status.has_problem, status.word, status.reasons) == (False, "running", ())
