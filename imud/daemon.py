@@ -328,6 +328,8 @@ class Daemon:
         self._tasks.pop(name).cancel()
         self._latencies.remove_device(name)
         self._devices.pop(name).close()
+        if all(device.name != name for device in self.config.devices):
+            self._context.past_events.remove(name)
         self._outputs.remove_device(name)
 
     def _on_done(self, task: asyncio.Task[None]) -> None:
@@ -358,7 +360,8 @@ class Daemon:
         self._outputs.publish(batch)
 
     def send_event(self, event: Event) -> None:
-        """Pass an event to the outputs."""
+        """Store an event, and pass it to the outputs."""
+        self._context.past_events.add(event)
         self._outputs.send_event(event)
 
     # --- time -------------------------------------------------------------------------------------------------------

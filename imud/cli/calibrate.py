@@ -9,14 +9,14 @@ from typing import Final, TextIO
 import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket
-from imud.cli.output import table
+from imud.cli.output import local_time, table
 from imud.client.connection import Client
-from imud.contracts.command import CalibrationInfo, CalibrationResult, Handling, Kept
+from imud.contracts.command import CalibrationInfo, CalibrationResult, Handling, Kept, LastCalibration
 from imud.model.errors import BadArgument
 from imud.model.event import Event, EventKind
 from imud.model.units import RAD_PER_DEG
 
-HEAD: Final = ("CALIBRATION", "HANDLING", "RESULT LASTS", "EFFECT")
+HEAD: Final = ("CALIBRATION", "HANDLING", "RESULT LASTS", "LAST", "EFFECT")
 LIMIT_S: Final = 600.0  # Time limit of the request, s. The daemon stops every calibration earlier.
 LOOK_S: Final = 0.5  # Maximum wait for the next event, s. After that, imud checks for the reply.
 BAR: Final = 30  # length of the progress bar, characters
@@ -29,16 +29,23 @@ def calibrate_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("device", metavar="DEVICE", help="name of the device")
     parser.add_argument("kind", nargs="?", metavar="KIND", help="calibration to run (default: list all calibrations)")
     parser.add_argument("--save", action="store_true", help="save the result in the device after verification")
+    parser.add_argument("--stop", action="store_true", help="stop the running calibration of the device")
     parser.add_argument("--yes", action="store_true", help="start without a question, for scripts")
     parser.add_argument("--json", action="store_true", help="print the events and the result as JSON lines")
 
 
 def calibrate(args: argparse.Namespace) -> int:
     """Run a calibration. Return 0 if imud verified the result, otherwise 1. Requires the right to control devices."""
+    if args.stop and args.kind is not None:
+        raise BadArgument(f"expected --stop without a calibration, got {args.kind!r}")
     with Client(args.socket) as watching:
+        if args.stop:
+            stopped = msgspec.convert(watching.call("stop_calibration", device=args.device), dict[str, bool])["stopped"]
+            print("stopped; the device can still finish it" if stopped else f"{args.device} has no running calibration")
+            return 0 if stopped else 1
         found = msgspec.convert(watching.call("calibrations", device=args.device), list[CalibrationInfo])
         if args.kind is None:
-            print(table(HEAD, [(one.kind, one.handling, one.kept, one.help) for one in found]))
+            print(table(HEAD, [(one.kind, one.handling, one.kept, _last(one.last), one.help) for one in found]))
             return 0
         known = {one.kind: one for one in found}
         if args.kind not in known:
@@ -51,6 +58,14 @@ def calibrate(args: argparse.Namespace) -> int:
         result = _follow(args, watching)
     print(msgspec.json.encode(result).decode() if args.json else _account(result, asked_to_save=args.save))
     return 0 if result.verified else 1
+
+
+def _last(last: LastCalibration | None) -> str:
+    """Format the result of the last calibration."""
+    if last is None:
+        return "not done yet"
+    result = "NOT verified" if not last.verified else "saved" if last.saved else "verified"
+    return f"{local_time(last.utc_ns):%Y-%m-%d}, {result}"
 
 
 def _instruct(calibration: CalibrationInfo) -> None:

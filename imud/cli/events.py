@@ -1,9 +1,9 @@
-"""`imud events`: print new events with local time and priority.
+"""`imud events`: print new or past events with local time and priority.
 
     2026-11-23T14:05:09.123+01:00 warning bow: down: the adapter was pulled out
 
 The priority is the log level of this kind of event in the daemon (`imud.model.event.LEVELS`), a name of syslog(3).
-The daemon does not send events from before the start of the command. The journal contains these events.
+The daemon keeps the newest 1,000 events of each device since its start. Repeated events are one line with a count.
 """
 
 import argparse
@@ -15,14 +15,16 @@ from typing import Any, Final, Protocol
 
 import msgspec
 
-from imud.cli.arguments import CliCommand, add_socket
+from imud.cli.arguments import CliCommand, add_socket, duration_s
 from imud.cli.output import complain, local_time, raise_if_unread
 from imud.client.connection import Client
 from imud.client.feed import clock_ahead_ns, utc_offset_ns
+from imud.contracts.condition import duration as in_words
 from imud.contracts.status import DeviceState
 from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
 from imud.model.errors import LinkMissing, ServerError
-from imud.model.event import LEVELS, Event
+from imud.model.event import LEVELS, Event, StoredEvent
+from imud.model.units import NS_PER_S
 
 RETRY_S: Final = 1.0  # Time between two attempts to connect, s. A restart of the service takes about 2 s.
 LOOK_S: Final = 2.0  # time between two checks of the device states, and maximum wait for the next sample or event, s
@@ -124,6 +126,8 @@ class PrintedEvent(msgspec.Struct, frozen=True, omit_defaults=True):
     kind: str
     message: str
     detail: dict[str, str | int | float | bool | None] = {}
+    count: int = 1  # number of equal events; `t_ns` and `message` are those of the last one
+    first_ns: int = 0  # CLOCK_MONOTONIC of the first of them, ns; 0 for a single new event
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -135,6 +139,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--priority", choices=list(PRIORITIES), default="debug",
         help="lowest printed priority (default: %(default)s, which prints all events)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--since", type=duration_s, default=None, metavar="TIME",
+        help="print the events of this time, for example 30min or 2d, then stop; --follow: then new events",
     )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print one JSON object per line")
     parser.add_argument("--count", type=int, default=None, metavar="N", help="stop after N events")
@@ -158,20 +166,34 @@ class _Printer:
     def work(self, client: Client) -> None:
         """Print the events of one connection."""
         ahead_ns = clock_ahead_ns(client.status()["now_ns"])
+        if self._args.since is not None:
+            self._print_past(client, ahead_ns)
+            if not self._args.follow:
+                return
         events = client.events(self._args.device or None, timeout_s=LOOK_S)
-        show = as_json if self._args.json else as_text
         while self._left is None or self._left > 0:
             try:
                 event = next(events)
             except TimeoutError:  # no event for LOOK_S: without a write, only this check finds a closed pipe
                 raise_if_unread()
                 continue
-            if level_of(event) < self._least:
-                continue
-            sys.stdout.write(show(printed(event, utc_offset_ns(ahead_ns))) + "\n")
-            sys.stdout.flush()
-            if self._left is not None:
-                self._left -= 1
+            self._print(event, ahead_ns)
+
+    def _print_past(self, client: Client, ahead_ns: int) -> None:
+        """Print the stored events of the requested time."""
+        since_ns = time.monotonic_ns() + ahead_ns - int(self._args.since * NS_PER_S)
+        for event in client.past_events(since_ns, self._args.device or None):
+            if self._left != 0:
+                self._print(event, ahead_ns)
+
+    def _print(self, event: Event, ahead_ns: int) -> None:
+        if level_of(event) < self._least:
+            return
+        show = as_json if self._args.json else as_text
+        sys.stdout.write(show(printed(event, utc_offset_ns(ahead_ns))) + "\n")
+        sys.stdout.flush()
+        if self._left is not None:
+            self._left -= 1
 
 
 def level_of(event: Event) -> int:
@@ -184,12 +206,16 @@ def printed(event: Event, utc_offset_ns: int) -> PrintedEvent:
     level = level_of(event)
     priority = next(name for name, least in PRIORITIES.items() if level >= least)
     when = local_time(event.t_ns + utc_offset_ns).isoformat(timespec="milliseconds")
-    return PrintedEvent(when, priority, event.t_ns, event.device, str(event.kind), event.message, event.detail)
+    made = PrintedEvent(when, priority, event.t_ns, event.device, str(event.kind), event.message, event.detail)
+    if isinstance(event, StoredEvent) and event.count > 1:
+        return msgspec.structs.replace(made, count=event.count, first_ns=event.first_ns)
+    return made
 
 
 def as_text(event: PrintedEvent) -> str:
     """Format an event as one line of printable characters."""
-    line = f"{event.time} {event.priority:7} {event.device or DAEMON}: {event.kind}: {event.message}"
+    repeated = f" (×{event.count} in {in_words(event.t_ns - event.first_ns)})" if event.count > 1 else ""
+    line = f"{event.time} {event.priority:7} {event.device or DAEMON}: {event.kind}: {event.message}{repeated}"
     return printable(line, MESSAGE_CHARACTERS_MAX)
 
 

@@ -33,7 +33,7 @@ from imud.formats.jsonrpc import (
 )
 from imud.formats.slot import SLOT_BYTES, SLOT_FIELDS, decode_slot
 from imud.model.errors import LinkDenied, LinkError, LinkMissing, ServerError, reason_of
-from imud.model.event import Event, kind_of
+from imud.model.event import Event, StoredEvent, kind_of
 from imud.model.options import wrong_values
 from imud.model.sample import Sample
 
@@ -361,6 +361,16 @@ class Client:
         """Return an endless iterator over events. It raises TimeoutError if no event arrives in `timeout_s`."""
         self.call("events", devices=_listed(devices))
         return EventStream(self, timeout_s)
+
+    def past_events(
+        self, since_ns: int, devices: Iterable[str] | None = None, *, limit: int | None = None
+    ) -> list[StoredEvent]:
+        """Return the stored events since `since_ns` (CLOCK_MONOTONIC of the daemon), at most 1000, the oldest first.
+
+        The method ends a subscription of `events` on this connection.
+        """
+        reply = self.call("events", devices=_listed(devices), enable=False, since_ns=since_ns, limit=limit)
+        return msgspec.convert(reply.get("events", []), list[StoredEvent])
 
     def notify(self, device: str, latency_ms: float | None = None) -> int:
         """Return a descriptor for `Ring.wait`, readable after each batch of samples of `device`. The caller closes it.

@@ -1,6 +1,7 @@
 """Contract of a verb: an operation that a device executes once on request, for example save, restart, level."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
@@ -264,6 +265,18 @@ class Calibration:
 Calibrations = Mapping[str, Calibration]
 
 
+class CalibrationStatus(msgspec.Struct, frozen=True):
+    """Running calibration of a device."""
+
+    kind: str
+    phase: str  # phase of the newest progress event; empty before the first event
+    begun_ns: int  # CLOCK_MONOTONIC of the start, ns
+    limit_ns: int | None  # maximum time for the turns, ns; null for a device at rest
+    by: str  # who requested it, for example `uid 1000`; empty if unknown
+    message: str = ""  # newest progress, one sentence
+    progress: dict[str, str | int | float | bool | None] = {}  # `detail` of the newest progress event
+
+
 class CalibrationInfo(msgspec.Struct, frozen=True):
     """Description of one calibration."""
 
@@ -273,6 +286,7 @@ class CalibrationInfo(msgspec.Struct, frozen=True):
     handling: Handling
     instructions: tuple[str, ...]
     kept: Kept
+    last: "LastCalibration | None" = None  # result of the last calibration of this kind; null if there is none
 
 
 class Check(msgspec.Struct, frozen=True):
@@ -295,9 +309,23 @@ class CalibrationResult(msgspec.Struct, frozen=True):
     kept: Kept
 
 
-def infos(calibrations: Calibrations) -> list[CalibrationInfo]:
+class LastCalibration(msgspec.Struct, frozen=True):
+    """Result of a calibration, kept in the state directory."""
+
+    utc_ns: int  # time of the end, UTC
+    verified: bool
+    saved: bool
+    problem: str = ""
+    checks: tuple[Check, ...] = ()
+
+
+REQUESTED_BY: ContextVar[str] = ContextVar("REQUESTED_BY", default="")
+"""Who requested the running work, for example `uid 1000`. Outputs set it in the task of a request."""
+
+
+def infos(calibrations: Calibrations, last: Mapping[str, LastCalibration] | None = None) -> list[CalibrationInfo]:
     """Return the descriptions of calibrations in the same order."""
     return [
-        CalibrationInfo(kind, one.help, one.section, one.handling, one.instructions, one.kept)
+        CalibrationInfo(kind, one.help, one.section, one.handling, one.instructions, one.kept, (last or {}).get(kind))
         for kind, one in calibrations.items()
     ]

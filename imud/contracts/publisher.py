@@ -8,14 +8,14 @@ from typing import Any, Final, Protocol
 
 from imud.attitude.conventions import Convention
 from imud.attitude.published import PublishedAxes, as_sent
-from imud.contracts.command import CalibrationResult, Calibrations, Verbs
+from imud.contracts.command import CalibrationResult, Calibrations, LastCalibration, Verbs
 from imud.contracts.driver import Driver
 from imud.contracts.lines import UtcReference, WatchLine
 from imud.contracts.link import Claim
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import ClientStatus, DeviceStatus, FlightStatus, MqttStatus, OutputStatus, RecorderStatus
 from imud.formats.slot import encode_slots
-from imud.model.event import Event
+from imud.model.event import Event, EventLog
 from imud.model.options import Options
 from imud.model.sample import Sample
 
@@ -143,6 +143,11 @@ class DeviceControl(Protocol):
         """Present guided calibrations of the device, by kind."""
         ...
 
+    @property
+    def last_calibrations(self) -> Mapping[str, LastCalibration]:
+        """Result of the last calibration of each kind, of this run of imud or an earlier one."""
+        ...
+
     async def calibrate(self, kind: str, *, save: bool) -> CalibrationResult:
         """Run a guided calibration to its end. Raises ImudError."""
         ...
@@ -252,6 +257,7 @@ class PublisherContext:
     watch_line: WatchLine  # watches a GPIO line that belongs to no device
     raise_event: Callable[[Event], None]  # sends an event of the daemon to all outputs
     configuration: str = ""  # absolute path of the configuration file; empty without a file
+    past_events: EventLog = field(default_factory=EventLog)
 
 
 def _claims_nothing(_settings: Options) -> Sequence[Claim]:

@@ -8,6 +8,7 @@ from msgspec import Meta
 
 from imud.attitude.conventions import Heading
 from imud.attitude.published import FrameWords
+from imud.contracts.command import CalibrationStatus
 from imud.contracts.condition import Condition, DeviceCondition, Reason
 from imud.contracts.setting import SettingsStatus
 from imud.model.options import Options
@@ -243,6 +244,7 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     # Condition with reasons, for all views; null for a device of a recording
     condition: DeviceCondition | None = None
     recent: RecentStatus | None = None  # counts of the last minute; null for a device of a recording
+    calibration: CalibrationStatus | None = None  # running calibration; null if none is running
     # Worst condition in each of the last 60 minutes, the oldest first; null for a minute before the start of imud
     history: tuple[Condition | None, ...] = ()
 

@@ -15,9 +15,13 @@ from itertools import permutations
 from math import atan2, cos, dist, hypot, pi, sin, sqrt
 from typing import Any, Final
 
+from msgspec.structs import replace
+
 from imud.contracts.command import (
+    REQUESTED_BY,
     Calibration,
     CalibrationResult,
+    CalibrationStatus,
     Check,
     Expectation,
     Handling,
@@ -297,6 +301,7 @@ class CalibrationRun:
         self._transport = transport
         self._events = events
         self._running: asyncio.Task[CalibrationResult] | None = None
+        self.status: CalibrationStatus | None = None  # running calibration; None if none is running
         self._tick_future: asyncio.Future[tuple[int, Sample | None]] | None = None
         self._now_ns = 0
         self._seen_seq = 0
@@ -328,6 +333,8 @@ class CalibrationRun:
             raise CommandError("another calibration of this device is running")
         if save and calibration.kept is not Kept.BY_SAVE:
             raise CommandError(f"{kind}: cannot save: the result lasts {calibration.kept}")
+        limit_ns = TURN_LIMIT_NS if calibration.handling is Handling.TURN else None
+        self.status = CalibrationStatus(kind, "", self._now_ns, limit_ns, REQUESTED_BY.get())
         task = self._running = asyncio.ensure_future(self._run(kind, calibration, save))
         try:
             return await task
@@ -337,7 +344,7 @@ class CalibrationRun:
             task.cancel()
             raise
         finally:
-            self._running = None
+            self._running = self.status = None
 
     def cancel(self) -> bool:
         return self._running is not None and self._running.cancel()
@@ -475,6 +482,8 @@ class CalibrationRun:
 
     def _report(self, kind: str, phase: str, words: str, **detail: str | int | float | bool | None) -> None:
         message = f"calibration {kind}: {words}"
+        if self.status is not None:
+            self.status = replace(self.status, phase=phase, message=words, progress=detail)
         self._events.raise_event(self._now_ns, EventKind.CALIBRATION, message, kind=kind, phase=phase, **detail)
 
     def _report_turning(self, kind: str, turning: Turning, verdict: Verdict) -> None:

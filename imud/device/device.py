@@ -16,7 +16,17 @@ from typing import Any, Final
 
 from imud.config.devices import owner_of
 from imud.config.model import DeviceConfig
-from imud.contracts.command import CalibrationResult, Calibrations, Kept, Proof, Risk, Verb, VerbResult, Verbs
+from imud.contracts.command import (
+    CalibrationResult,
+    Calibrations,
+    Kept,
+    LastCalibration,
+    Proof,
+    Risk,
+    Verb,
+    VerbResult,
+    Verbs,
+)
 from imud.contracts.condition import Condition
 from imud.contracts.driver import status_words
 from imud.contracts.lines import LineFactory
@@ -88,7 +98,7 @@ class VerbRun:
         Raises CommandError, TransferError, DeviceRefused, LinkError.
         """
         settings, arguments = self._settings, verb.arguments(given)
-        async with settings.exclusive():
+        async with settings.exclusive(f"the command {name}"):
             if verb.saves:
                 settings.spend_flash()
             if verb.risk is Risk.RESET:
@@ -387,6 +397,11 @@ class Device:
         driver = self._transport.driver
         return driver.calibrations if driver is not None else {}
 
+    @property
+    def last_calibrations(self) -> Mapping[str, LastCalibration]:
+        """Result of the last calibration of each kind."""
+        return self._shared.files.flash.calibrations(self._settings.module)
+
     async def calibrate(self, kind: str, *, save: bool) -> CalibrationResult:
         """Guide a calibration. Raises CommandError, TransferError, DeviceRefused, LinkError."""
         calibration = self.calibrations.get(kind)
@@ -395,12 +410,14 @@ class Device:
             raise BadArgument(f"{self.config.name}: unknown calibration {kind[:64]!r}; expected: {known}")
         log.info("%s: calibrate %s%s", self.config.name, kind, ", save" if save else "")
         self._require_replies()
-        async with self._settings.exclusive():
+        stop = f"stop it with imud calibrate {self.config.name} --stop"
+        async with self._settings.exclusive(f"the calibration {kind}", stop):
             if save:
                 self._settings.spend_flash()
             result = None
             try:
                 result = await self._calibration.run(kind, calibration, save=save)
+                self._shared.files.flash.keep_calibration(self._settings.module, result)
                 return result
             finally:
                 saved = result is not None and (result.saved or result.kept is not Kept.BY_SAVE)
@@ -507,6 +524,7 @@ class Device:
             condition=self._judge.condition,
             recent=self._judge.recent(path.last_sample_ns if path else 0),
             history=self._judge.history,
+            calibration=self._calibration.status,
         )
         return transport.add_status(status)
 

@@ -1,4 +1,4 @@
-"""Flash writes of each device, counted over all runs of imud and limited per day, and backups of the settings.
+"""State of each device over all runs of imud: flash writes, limited per day, last calibrations, and backups.
 
 The flash of such devices endures about 10,000 writes. imud by itself makes at most LIMIT_ITSELF writes in 24 hours: at
 this rate the flash lasts about seven years. Users and programs may make LIMIT_ASKED writes in 24 hours.
@@ -14,6 +14,7 @@ from typing import Any, Final
 import msgspec
 
 from imud.config.yaml import yaml_block, yaml_comment
+from imud.contracts.command import CalibrationResult, LastCalibration
 from imud.host.clock import HostClock
 from imud.host.files import StateFile, replace_file
 from imud.model.units import NS_PER_S
@@ -27,17 +28,18 @@ MODULES_MAX: Final = 1024
 
 
 class ModuleRecord(msgspec.Struct):
-    """Flash writes of one device."""
+    """Flash writes and calibrations of one device."""
 
     writes: int = 0  # number of writes by imud
     times_s: list[int] = []  # msgspec copies a mutable default
     """UTC of the newest LIMIT_ASKED writes, s, oldest first."""
     unreadable: dict[str, Any] = msgspec.field(name="told", default_factory=dict)
     """Saved values of settings that the device does not report, as JSON."""
+    calibrations: dict[str, LastCalibration] = {}  # last result of each kind
 
 
 class FlashWrites:
-    """Flash writes of all devices. Synchronization: the loop's thread only."""
+    """Flash writes and calibrations of all devices. Synchronization: the loop's thread only."""
 
     def __init__(self, folder: Path | None, host: HostClock) -> None:
         """`folder` contains the file; None: imud keeps the counts in memory."""
@@ -82,6 +84,17 @@ class FlashWrites:
             record = self._modules.pop(module, None) or ModuleRecord()
             record.unreadable = dict(values)
             self._keep(module, record)
+
+    def calibrations(self, module: str) -> Mapping[str, LastCalibration]:
+        """Return the result of the last calibration of each kind."""
+        return self._record(module).calibrations
+
+    def keep_calibration(self, module: str, result: CalibrationResult) -> None:
+        """Store the result of a calibration."""
+        record = self._modules.pop(module, None) or ModuleRecord()
+        last = LastCalibration(self._host.utc_ns(), result.verified, result.saved, result.problem, result.checks)
+        record.calibrations = record.calibrations | {result.kind: last}
+        self._keep(module, record)
 
     def close(self) -> None:
         """Wait for the end of the last write, for a limited time. A second call does nothing."""

@@ -13,12 +13,13 @@ import logging
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from itertools import islice
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import msgspec
 
 from imud.config.model import DeviceConfig
-from imud.contracts.command import Target
+from imud.contracts.command import REQUESTED_BY, Target
+from imud.contracts.condition import duration
 from imud.contracts.driver import Identity, PolledDriver
 from imud.contracts.setting import (
     AppliedSettings,
@@ -146,7 +147,7 @@ class SettingsComparison:
             await self._wanted.wait()
             self._wanted.clear()
             with suppress(CommandError):  # another command is running: imud compares after it
-                async with settings.exclusive():
+                async with settings.exclusive("the comparison of the settings"):
                     self._due_ns = None
                     if settings.table is not None:
                         await self._compare(settings.table)
@@ -212,6 +213,20 @@ class SettingsComparison:
         self.problem = problem
 
 
+class Work(NamedTuple):
+    """Work that uses the device alone."""
+
+    name: str  # for example `the command save`
+    begun_ns: int  # CLOCK_MONOTONIC of the start, ns
+    by: str  # who requested it
+    stop: str  # how a user can stop it; empty if there is no way
+
+    def words(self, now_ns: int) -> str:
+        """Describe the work for a user who waits for it."""
+        started = f"{self.name} is running, started {duration(now_ns - self.begun_ns)} ago by {self.by}"
+        return f"{started}; {self.stop}" if self.stop else started
+
+
 class DeviceSettings:
     """Identity and settings of one device; an attachment. Synchronization: the loop's thread only."""
 
@@ -241,6 +256,7 @@ class DeviceSettings:
         self._own_until_ns = self._resets = 0
         self.resets_requested = 0  # number of restarts of the device counter that a script of imud caused
         self._lock = asyncio.Lock()
+        self._work: Work | None = None  # work that holds the lock
         # values that imud wrote since the last restart, of settings that the device does not report
         self._written: dict[str, Any] = {}
         self._unsaved = False  # whether a write since the last restart may be missing in flash
@@ -294,21 +310,22 @@ class DeviceSettings:
         return self._lock.locked()
 
     @asynccontextmanager
-    async def exclusive(self) -> AsyncIterator[None]:
-        """Lock the settings for a command.
+    async def exclusive(self, work: str, stop: str = "") -> AsyncIterator[None]:
+        """Lock the settings for `work`, for example `the command save`. `stop`: how a user can stop it.
 
-        Raises CommandError if another command, for example a calibration, does not end within WAIT_S.
+        Raises CommandError if other work, for example a calibration, does not end within WAIT_S. The error names it.
         """
         try:
             async with asyncio.timeout(WAIT_S):
                 await self._lock.acquire()
         except TimeoutError:
-            raise CommandError(
-                f"{self._config.name}: another command or a calibration is still running; try again later"
-            ) from None
+            words = self._work.words(self._host.now_ns()) if self._work is not None else "other work has just ended"
+            raise CommandError(f"{self._config.name}: {words}; try again later") from None
+        self._work = Work(work, self._host.now_ns(), REQUESTED_BY.get() or "imud", stop)
         try:
             yield
         finally:
+            self._work = None
             self._own_until_ns = self._host.now_ns() + OWN_NS
             self._lock.release()
 
@@ -427,7 +444,7 @@ class DeviceSettings:
         """
         table = self._table()
         if fresh:
-            async with self.exclusive():
+            async with self.exclusive("a read of the settings"):
                 await self.read()
         status = self.status()
         assert status is not None
@@ -438,7 +455,7 @@ class DeviceSettings:
         """Return the plan to set the values `given` (None: the declared settings). Raises as `report`."""
         table = self._table()
         wanted = self._wanted_values(table, given)
-        async with self.exclusive():
+        async with self.exclusive("a plan of settings"):
             actual = await self.read()
             wanted = completed(table, wanted, actual)
             return self._make_plan(table, wanted, actual, save=save, unsaved=self._unsaved, by_name=given is not None)
@@ -447,7 +464,7 @@ class DeviceSettings:
         """Set the values `given` (None: the declared settings). Raises as `report`, before the first write."""
         table = self._table()
         wanted = self._wanted_values(table, given)
-        async with self.exclusive():
+        async with self.exclusive("a change of settings"):
             actual = await self.valid_values()
             wanted = completed(table, wanted, actual)
             return await self.carry_out(table, wanted, actual, save=save, asked=True, by_name=given is not None)

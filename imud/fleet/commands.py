@@ -20,6 +20,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
+from imud.contracts.command import REQUESTED_BY
 from imud.contracts.publisher import DeviceControl
 from imud.fleet.broker import Received
 from imud.fleet.messages import (
@@ -227,6 +228,7 @@ class CommandChannel:
             if request.action == SET:
                 await self._set(asked, control)
                 return
+            REQUESTED_BY.set("mqtt")
             result = await control.act(request.action, request.arguments)
         except ImudError as error:
             log.warning("mqtt: %s: request %s failed: %s", asked.device, request.id, error, extra=_own_log_line(asked))

@@ -1,10 +1,15 @@
 """Events of a device other than samples, for subscribers and the log."""
 
 import logging
+from collections.abc import Collection, Iterator
 from enum import StrEnum
+from heapq import merge
+from itertools import islice, takewhile
 from typing import Final, Protocol, cast
 
 import msgspec
+
+from imud.model.units import NS_PER_S
 
 
 class EventKind(StrEnum):
@@ -57,6 +62,72 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     kind: EventKind
     message: str  # Description, one sentence
     detail: dict[str, str | int | float | bool | None] = {}  # msgspec copies a mutable default
+
+
+class StoredEvent(Event, frozen=True, omit_defaults=True):
+    """Group of equal events of one device. `t_ns`, `message` and `detail` are those of the newest event."""
+
+    count: int = 1
+    first_ns: int = 0  # CLOCK_MONOTONIC of the first event of the group
+
+
+EVENTS_MAX: Final = 1000  # maximum number of stored groups of a device
+GROUP_NS: Final = 60 * NS_PER_S  # maximum time between two events of a group, ns
+# Kinds whose messages contain counts: all events of the kind are equal
+COUNTED: Final = frozenset((EventKind.LOSS, EventKind.BAD_FRAME, EventKind.MARK))
+
+_Key = tuple[str, ...]
+
+
+class EventLog:
+    """Newest events of all devices and of the daemon, repeated events as groups. Synchronization: one thread."""
+
+    def __init__(self) -> None:
+        # Groups of each device by number, in the order of their newest events
+        self._devices: dict[str, dict[int, StoredEvent]] = {}
+        self._newest: dict[str, dict[_Key, int]] = {}  # by device: number of the newest group with each key
+        self._made = 0  # number of groups since start
+
+    def add(self, event: Event) -> None:
+        """Store an event, and remove the oldest groups of its device above EVENTS_MAX."""
+        groups, newest = self._devices.setdefault(event.device, {}), self._newest.setdefault(event.device, {})
+        key, self._made = _group_key(event), self._made + 1
+        number = newest.get(key, 0)
+        before = groups.get(number)
+        count, first_ns = 1, event.t_ns
+        if before is not None and event.t_ns - before.t_ns <= GROUP_NS:
+            del groups[number]
+            count, first_ns = before.count + 1, before.first_ns
+        newest[key] = self._made
+        groups[self._made] = StoredEvent(
+            event.t_ns, event.device, event.kind, event.message, event.detail, count=count, first_ns=first_ns
+        )
+        if len(groups) > EVENTS_MAX:
+            number, oldest = next(iter(groups.items()))
+            del groups[number]
+            if newest.get(_group_key(oldest)) == number:
+                del newest[_group_key(oldest)]
+
+    def remove(self, device: str) -> None:
+        """Remove the events of a device that left the configuration."""
+        self._devices.pop(device, None)
+        self._newest.pop(device, None)
+
+    def newest(self, since_ns: int, limit: int, devices: Collection[str] | None = None) -> list[StoredEvent]:
+        """Return the newest groups since `since_ns`, at most `limit`, the oldest first. None: of all devices."""
+
+        def of(device: str) -> Iterator[StoredEvent]:
+            return takewhile(lambda one: one.t_ns >= since_ns, reversed(self._devices[device].values()))
+
+        chosen = [of(device) for device in self._devices if devices is None or not device or device in devices]
+        return list(islice(merge(*chosen, key=lambda one: -one.t_ns), limit))[::-1]
+
+
+def _group_key(event: Event) -> _Key:
+    """Return the key of the group of an event: equal events have equal keys."""
+    if event.kind is EventKind.CALIBRATION:
+        return event.kind, str(event.detail.get("kind")), str(event.detail.get("phase"))
+    return (event.kind,) if event.kind in COUNTED else (event.kind, event.message)
 
 
 class RaiseEvent(Protocol):

@@ -29,11 +29,20 @@ def test_calibrations_are_listed_verified_and_saved(daemon: RunningDaemon, cli: 
     words = ("calibrate", "--socket", daemon.socket, "bow")
     out = cli(*words).out
     assert "magnetometer_once" in out
+    assert "not done yet" in out
     assert "until power-off; it cannot be saved" in out
     out = cli(*words, "level", "--yes", "--save").out
     assert "  1. Put the device down in the attitude that must be level, and do not touch it.\n" in out
     assert "\nverified\n  roll: " in out
     assert "°, limit 0.5°: passed\n  saved\n" in out
+    (level,) = [line for line in cli(*words).out.splitlines() if line.startswith("level ")]
+    assert ", saved " in level
+    past = cli("events", "--since", "1h", "--socket", daemon.socket).out.splitlines()
+    assert [line for line in past if " bow: up: " in line]
+    assert "calibration: calibration level: verified" in past[-1]
+    assert cli("events", "--since", "1h", "--count", "1", "--socket", daemon.socket).out.count("\n") == 1
+    assert cli(*words, "--stop", status=1).out == "bow has no running calibration\n"
+    cli.refuses("expected --stop without a calibration, got 'level'", *words, "level", "--stop")
     *events, result = map(json.loads, cli(*words, "heading", "--yes", "--json").out.splitlines())
     assert {event["kind"] for event in events} == {"calibration"}
     assert [event["detail"]["phase"] for event in events] == ["begin", "end"]

@@ -109,7 +109,12 @@ def magnetometer(rig: GuideRig, verdicts: Callable[[], Verdict], **changes: Any)
 
 @played(GuideRig)
 async def test_calibration_at_rest_is_verified_and_saved(rig: GuideRig) -> None:
-    result = await rig.guide.run("gyro", gyro(rig), save=True)
+    running = asyncio.ensure_future(rig.guide.run("gyro", gyro(rig), save=True))
+    await asyncio.sleep(1.0)
+    assert rig.guide.status is not None
+    assert (rig.guide.status.phase, rig.guide.status.limit_ns) == ("begin", None)
+    result = await running
+    assert rig.guide.status is None
     (check,) = result.checks
     assert check.name == "mean angular rate"
     assert check.passed

@@ -637,7 +637,7 @@ async def test_a_command_waits_for_another_command_for_a_limited_time(bench: Mod
     waiting = asyncio.ensure_future(bench.device.act("wait", {}))
     await bench.pass_s(1)
     begin_ns = bench.clock.now_ns()
-    with pytest.raises(CommandError, match="another command or a calibration is still running"):
+    with pytest.raises(CommandError, match="the command wait is running, started 11 s ago by imud; try again later"):
         await bench.doing(bench.device.settings_report(fresh=True))
     assert bench.clock.now_ns() - begin_ns == pytest.approx(10e9, rel=0.1)
     waiting.cancel()

@@ -23,6 +23,7 @@ from imud.contracts.command import (
     Check,
     Handling,
     Kept,
+    LastCalibration,
     Target,
     Verb,
     Verbs,
@@ -125,6 +126,7 @@ done_late = asyncio.Event()
 class FakeControl:
     verbs: Verbs = VERBS
     calibrations: Calibrations = CALIBRATIONS
+    last_calibrations: Mapping[str, LastCalibration] = {"heading": LastCalibration(NOW_NS, verified=True, saved=False)}
 
     def __init__(self, device: str) -> None:
         self._device = device

@@ -12,7 +12,7 @@ from imud.attitude.conventions import Convention, Heading
 from imud.attitude.published import FrameWords
 from imud.contracts.condition import DeviceCondition
 from imud.contracts.status import DeviceState, DeviceStatus, MqttStatus, SocketStatus
-from imud.model.event import Event
+from imud.model.event import Event, StoredEvent
 from imud.model.sample import FieldInfo, Sample, Sync
 from imud.publishers.socket.subscription import Form
 
@@ -57,6 +57,8 @@ class PollParams(msgspec.Struct):
 class EventsParams(msgspec.Struct):
     devices: list[str] | None = None
     enable: bool | None = None
+    since_ns: int | None = None  # CLOCK_MONOTONIC, ns: reply with the stored events since then; default: none
+    limit: int | None = None  # maximum number of stored events; default and maximum: 1000
 
 
 class DeviceParams(msgspec.Struct):
@@ -190,8 +192,9 @@ class PollResult(msgspec.Struct, omit_defaults=True):
     convention: Convention | None = None
 
 
-class EventsResult(msgspec.Struct):
+class EventsResult(msgspec.Struct, omit_defaults=True):
     enable: bool
+    events: list[StoredEvent] = []  # stored events, the oldest first; absent without `since_ns`
 
 
 class NotifyResult(msgspec.Struct):

@@ -8,7 +8,7 @@ import msgspec
 
 from imud import __version__
 from imud.attitude.conventions import Convention
-from imud.contracts.command import CalibrationInfo, CalibrationResult, VerbInfo, described, infos
+from imud.contracts.command import REQUESTED_BY, CalibrationInfo, CalibrationResult, VerbInfo, described, infos
 from imud.contracts.publisher import Batch, DeviceControl
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus
@@ -26,6 +26,7 @@ from imud.formats.jsonrpc import (
 )
 from imud.formats.slot import PRESENT_BITS, SLOT_BYTES, SLOT_FIELDS, SLOT_LAYOUT_VERSION, SYNC_CODES
 from imud.model.errors import ImudError
+from imud.model.event import EVENTS_MAX
 from imud.model.options import wrong_values
 from imud.model.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA, Sample
 from imud.model.units import NS_PER_MS
@@ -185,6 +186,7 @@ def _reply_in_pieces(connection: ClientConnection, request: RpcRequest, pieces: 
 
 
 async def _reply_later(connection: ClientConnection, request: RpcRequest, later: Later) -> None:
+    REQUESTED_BY.set(f"uid {connection.peer.uid}")
     try:
         try:
             result = await later
@@ -322,11 +324,15 @@ def _newest_of(batch: Batch, convention: Convention | None) -> Sample:
 def _events(hub: Hub, connection: ClientConnection, params: EventsParams) -> MethodReply:
     devices = _known_devices(hub, params.devices)
     enable = params.enable is not False
+    limit = EVENTS_MAX if params.limit is None else params.limit
+    if not 1 <= limit <= EVENTS_MAX:
+        raise RpcError(Code.INVALID_PARAMS, f"limit: expected 1 to {EVENTS_MAX}, got {limit}")
+    past = [] if params.since_ns is None else hub.context.past_events.newest(params.since_ns, limit, devices)
     if enable:
         hub.subscribe_events(connection, devices)
     else:
         hub.unsubscribe_events(connection)
-    return MethodReply(EventsResult(enable))
+    return MethodReply(EventsResult(enable, past))
 
 
 def _notify(hub: Hub, connection: ClientConnection, params: NotifyParams) -> MethodReply:
@@ -357,7 +363,8 @@ def _command(hub: Hub, connection: ClientConnection, params: CommandParams) -> L
 
 
 def _calibrations(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> MethodReply:
-    return MethodReply(infos(_control(hub, params.device).calibrations))
+    control = _control(hub, params.device)
+    return MethodReply(infos(control.calibrations, control.last_calibrations))
 
 
 def _calibrate(hub: Hub, connection: ClientConnection, params: CalibrateParams) -> Later:

@@ -86,6 +86,7 @@ async def test_bad_lines(server: SocketServer, line: bytes, code: int, request_i
         ("watch", {"fields": ["accel"]}, "no field named 'accel'; there are: device, seq, t_ns"),
         ("watch", {"encoding": "xml"}, "xml"),
         ("poll", {"devices": ["imu7"]}, "there are: imu0, imu1"),
+        ("events", {"limit": 1001}, "limit: expected 1 to 1000, got 1001"),
         ("events", {"enable": "yes"}, 'enable: expected true or false, or null, got "yes"'),
         ("notify", {}, "notify: expected the parameter device (text), got none"),
         ("notify", {"device": "imu7"}, "there are: imu0, imu1"),

@@ -1,0 +1,55 @@
+"""Stored events: groups, order, limits."""
+
+from imud.model.event import EVENTS_MAX, Event, EventKind, EventLog
+
+S = 1_000_000_000
+
+
+def event(t_s: int, kind: EventKind = EventKind.LOSS, message: str = "", device: str = "bow") -> Event:
+    return Event(t_s * S, device, kind, message)
+
+
+def seen(log: EventLog, since_s: int = 0, limit: int = 10, *devices: str) -> list[tuple[int, int, int]]:
+    found = log.newest(since_s * S, limit, devices or None)
+    return [(one.first_ns // S, one.t_ns // S, one.count) for one in found]
+
+
+def test_repeated_events_are_one_group_while_they_continue() -> None:
+    log = EventLog()
+    for t_s in (0, 1, 61, 122):
+        log.add(event(t_s, message=f"{t_s} samples lost"))
+    assert seen(log) == [(0, 61, 3), (122, 122, 1)]
+    assert [one.message for one in log.newest(0, 10)] == ["61 samples lost", "122 samples lost"]
+    log.add(event(123, EventKind.ALARM, "active"))
+    log.add(event(124, EventKind.ALARM, "inactive"))
+    log.add(event(125, EventKind.ALARM, "active"))
+    assert seen(log, 123) == [(124, 124, 1), (123, 125, 2)]
+
+
+def test_progress_of_a_calibration_is_one_group_per_phase() -> None:
+    log = EventLog()
+    for t_s, phase in enumerate(("begin", "turn", "turn", "end")):
+        log.add(Event(t_s * S, "bow", EventKind.CALIBRATION, str(t_s), {"kind": "magnetometer", "phase": phase}))
+    assert seen(log) == [(0, 0, 1), (1, 2, 2), (3, 3, 1)]
+
+
+def test_devices_are_merged_by_time_and_events_of_the_daemon_always_included() -> None:
+    log = EventLog()
+    for t_s, device in ((1, "bow"), (2, "mast"), (3, ""), (4, "bow")):
+        log.add(event(t_s, EventKind.UP, str(t_s), device))
+    assert [one[1] for one in seen(log)] == [1, 2, 3, 4]
+    assert [one[1] for one in seen(log, 0, 2)] == [3, 4]
+    assert [one[1] for one in seen(log, 0, 10, "mast")] == [2, 3]
+    assert [one[1] for one in seen(log, 3)] == [3, 4]
+    log.remove("bow")
+    assert [one[1] for one in seen(log)] == [2, 3]
+
+
+def test_the_oldest_groups_are_removed() -> None:
+    log = EventLog()
+    for t_s in range(EVENTS_MAX + 5):
+        log.add(event(t_s, EventKind.UP, str(t_s)))
+    found = log.newest(0, 2 * EVENTS_MAX)
+    assert (len(found), found[0].t_ns) == (EVENTS_MAX, 5 * S)
+    log.add(event(6, EventKind.UP, "0"))
+    assert log.newest(0, 2 * EVENTS_MAX)[-1].count == 1
