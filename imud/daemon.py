@@ -39,6 +39,7 @@ from imud.device.device import Device, RecordableDevices
 from imud.device.factory import DeviceFactory
 from imud.device.latency import LatencyBudget
 from imud.host.clock import HostClock
+from imud.host.event_loop import Alarm
 from imud.host.log import printable
 from imud.host.service_manager import ServiceManager, notify
 from imud.lines.gpio import GPIO_LINES
@@ -127,7 +128,8 @@ def _give(answer: "asyncio.Future[Config]", config: Config | None, error: Config
         answer.set_exception(error or ConfigError("not read"))
 
 
-TICK_S = 0.1  # interval of ticks, s
+TICK_S: Final = 0.1  # interval of ticks while a part needs them (`tick_soon`), s
+QUIET_TICK_S: Final = 0.5  # interval of ticks in a quiet state, s; half of the maximum age of a heartbeat
 
 
 class Daemon:
@@ -173,6 +175,7 @@ class Daemon:
             latencies=self._latencies,
             watch_line=watching(lines, host),
             raise_event=self.send_event,
+            tick_soon=self.tick_soon,
             configuration="" if file is None else str(file.absolute()),
         )
         self._outputs = Outputs(self._context, extra or {})
@@ -180,7 +183,8 @@ class Daemon:
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._ids: dict[str, int] = {}
         self._stop = asyncio.Event()
-        self._timer: asyncio.TimerHandle | None = None
+        self._alarm: Alarm | None = None
+        self._is_soon = False  # whether the next tick follows after TICK_S
         self._failure: BaseException | None = None
         self._manager = ServiceManager()
         self._signals: list[int] = []  # signals with a handler of this daemon
@@ -302,7 +306,7 @@ class Daemon:
 
     def ledgers(self) -> list[DeviceLedger]:
         """Return the ledgers of all devices."""
-        return [(name, device.driver_name, device.ledger.snapshot()) for name, device in self._devices.items()]
+        return [(name, device.driver_name, device.ledger.values()) for name, device in self._devices.items()]
 
     def configured_devices(self) -> Sequence[DeviceConfig]:
         """Return all devices of the present configuration."""
@@ -323,6 +327,7 @@ class Daemon:
         task = asyncio.create_task(device.run(), name=config.name)
         task.add_done_callback(self._on_done)
         self._tasks[config.name] = task
+        self.tick_soon()
 
     def _stop_device(self, name: str) -> None:
         self._tasks.pop(name).cancel()
@@ -367,23 +372,31 @@ class Daemon:
     # --- time -------------------------------------------------------------------------------------------------------
 
     async def _tick_until_stopped(self) -> None:
-        # A wait with a timeout would add four iterations of the event loop per tick.
-        self._tick()
+        self._alarm = Alarm(self)
+        self.on_alarm()
         try:
             await self._stop.wait()
         finally:
-            if self._timer is not None:
-                self._timer.cancel()
+            self._alarm.cancel()
 
-    def _tick(self) -> None:
+    def tick_soon(self) -> None:
+        """Tick within TICK_S. A part that needs ten ticks per second calls this method in each tick."""
+        if not self._is_soon:
+            self._is_soon = True
+            if self._alarm is not None and self._alarm.is_set:
+                self._alarm.set(TICK_S)
+
+    def on_alarm(self) -> None:
         """Call `tick` of all devices and outputs. An error stops the daemon (`_on_loop_error`)."""
+        assert self._alarm is not None
+        self._is_soon = False
         now_ns = self._host.now_ns()
         self._host.utc_offset_ns()  # without samples too: the rate of the clock is a mean between two reads
         for device in self._devices.values():
             device.tick(now_ns)
         self._outputs.tick(now_ns)
         self._manager.tick(now_ns, self._status_line)
-        self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
+        self._alarm.set(TICK_S if self._is_soon else QUIET_TICK_S)
 
     def _status_line(self) -> str:
         return summary({name: device.condition for name, device in self._devices.items()})

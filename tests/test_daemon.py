@@ -136,6 +136,22 @@ def test_outputs_do_not_read_the_clocks_that_stamp_samples(monkeypatch: pytest.M
     assert clock.utc_reference() is not None
 
 
+@in_loop
+async def test_the_daemon_ticks_twice_per_second_until_a_part_needs_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    alarm, daemon = Mock(is_set=True), Daemon(Config("info", "", {}, ()))
+    monkeypatch.setattr("imud.daemon.Alarm", lambda _owner: alarm)
+    running = asyncio.create_task(daemon.run())
+    await asyncio.sleep(0)
+    daemon.tick_soon()
+    daemon.tick_soon()  # the first request is enough
+    monkeypatch.setattr("imud.publishers.outputs.Outputs.tick", lambda *_: daemon.tick_soon())
+    alarm.is_set = False  # as during a tick
+    daemon.on_alarm()
+    assert [call.args for call in alarm.set.call_args_list] == [(0.5,), (0.1,), (0.1,)]
+    daemon.stop()
+    await running
+
+
 def test_a_device_that_there_is_not_is_an_error_of_who_asks() -> None:
     with pytest.raises(CommandError, match=r"^nobody: no such device$"):
         Daemon(Config("info", "", {}, ())).control("nobody")

@@ -12,13 +12,13 @@ in sensor axes.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from math import acos, asin, atan2, cos, degrees, hypot, inf, isfinite
+from math import acos, asin, atan2, cos, degrees, hypot, inf, isfinite, sin
 from typing import Final
 
 from imud.attitude.conventions import DeviceAxes, EulerOrder
-from imud.attitude.published import AXES, TO_QUAT
-from imud.attitude.rotation import Matrix3, dot, matrix_from_quat, matrix_times
-from imud.model.sample import Quaternion, Sample, Vector3
+from imud.attitude.published import AXES
+from imud.attitude.rotation import Matrix3, dot, matrix_times, quat_normalized
+from imud.model.sample import Sample, Vector3
 from imud.model.units import NS_PER_S, STANDARD_GRAVITY_M_S2
 
 WINDOW_NS: Final = 5 * NS_PER_S  # duration of rest before an evaluation, ns
@@ -112,15 +112,24 @@ def _directions(device: DeviceAxes, sample: Sample) -> Iterator[tuple[str, Vecto
     """Yield the direction of up in sensor axes for each attitude member of the sample."""
     quat, euler = sample.quat_wxyz, sample.euler_rad
     if quat is not None and 0.0 < hypot(*quat) < inf:
-        yield "quat_wxyz", _up_of(device, quat)
+        w, x, y, z = quat_normalized(quat)
+        # third row of the matrix sensor → navigation frame: its z axis in sensor axes
+        yield "quat_wxyz", _signed(device, (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z))
     if euler is not None and isfinite(euler[0] + euler[1]):
-        yield "euler_rad", _up_of(device, TO_QUAT[device.order]((euler[0], euler[1], 0.0)))
+        yield "euler_rad", _up_by_angles(device, euler[0], euler[1])
 
 
-def _up_of(device: DeviceAxes, quat: Quaternion) -> Vector3:
-    # third row of the matrix sensor → navigation frame: its z axis in sensor axes
-    x, y, z = matrix_from_quat(quat)[2]
-    return (-x, -y, -z) if device.z_down else (x, y, z)
+def _up_by_angles(device: DeviceAxes, roll: float, pitch: float) -> Vector3:
+    """Return the direction of up of a device with these angles. `_angles` is the inverse function."""
+    if device.order is EulerOrder.ZXY:
+        return _signed(device, (-sin(roll) * cos(pitch), sin(pitch), cos(roll) * cos(pitch)))
+    return _signed(device, (-sin(pitch), sin(roll) * cos(pitch), cos(roll) * cos(pitch)))
+
+
+def _signed(device: DeviceAxes, z_axis: Vector3) -> Vector3:
+    """Return the direction of up from the direction of the navigation frame's z axis."""
+    x, y, z = z_axis
+    return (-x, -y, -z) if device.z_down else z_axis
 
 
 # --- causes -----------------------------------------------------------------------------------------------------------
@@ -151,7 +160,7 @@ def _causes(device: DeviceAxes, up: Vector3) -> Iterator[tuple[Contradiction, Ve
     other = DeviceAxes(order=order, z_down=device.z_down)
     yield (
         Contradiction.ORDER,
-        _up_of(other, TO_QUAT[order]((roll, pitch, 0.0))),
+        _up_by_angles(other, roll, pitch),
         f"the axes of roll and pitch are exchanged; set frame: {{euler_order: {order}}}",
     )
     by_roll, by_pitch = ((-x, y, z), (x, -y, z)) if zxy else ((x, -y, z), (-x, y, z))
@@ -161,7 +170,7 @@ def _causes(device: DeviceAxes, up: Vector3) -> Iterator[tuple[Contradiction, Ve
     yield Contradiction.SIGN, (-x, -y, z), f"roll and pitch have the opposite sign; {about}"
     yield Contradiction.SIGN, (x, -y, -z), f"y and z of the acceleration have the opposite sign; {about}"
     yield Contradiction.SIGN, (-x, y, -z), f"x and z of the acceleration have the opposite sign; {about}"
-    swapped = _up_of(device, TO_QUAT[device.order]((pitch, roll, 0.0)))
+    swapped = _up_by_angles(device, pitch, roll)
     yield Contradiction.ORDER, swapped, f"roll and pitch are exchanged; {about}"
 
 

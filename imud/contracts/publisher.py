@@ -54,7 +54,7 @@ class RecordingSource(Protocol):
 
 AS_SENT: Final = as_sent()  # axes and angles of HiPNUC devices: default of a batch
 # Name of a device, its driver as in `DeviceStatus.driver`, and its present ledger
-DeviceLedger = tuple[str, str, Mapping[str, int]]
+DeviceLedger = tuple[str, str, Sequence[int]]
 
 
 class Batch:
@@ -117,7 +117,8 @@ class Publisher(Protocol):
         ...
 
     def tick(self, now_ns: int) -> None:
-        """Send heartbeats and ledgers and check timeouts. Called ten times per second."""
+        """Send heartbeats and ledgers and check timeouts. Called twice per second, and ten times per second after
+        calls of `PublisherContext.tick_soon`."""
         ...
 
     def close(self) -> None:
@@ -200,7 +201,7 @@ class Devices(Protocol):
         ...
 
     def ledgers(self) -> Sequence[DeviceLedger]:
-        """Return the ledger of every device. The complete state costs five times as much CPU time."""
+        """Return name, driver and counters (in the order of LEDGER_FIELDS) of every device."""
         ...
 
     def control(self, name: str) -> DeviceControl:
@@ -245,6 +246,9 @@ class OutputFacts:
         return self.failed | {f"nmea0183 {port.name}": port.problem for port in ports if port.problem}
 
 
+def _do_nothing() -> None: ...
+
+
 @dataclass(frozen=True, slots=True)
 class PublisherContext:
     """The parts of the daemon that outputs may use."""
@@ -256,6 +260,7 @@ class PublisherContext:
     latencies: Latencies  # register of the latencies that readers need
     watch_line: WatchLine  # watches a GPIO line that belongs to no device
     raise_event: Callable[[Event], None]  # sends an event of the daemon to all outputs
+    tick_soon: Callable[[], None] = _do_nothing  # requests the next tick within 0.1 s
     configuration: str = ""  # absolute path of the configuration file; empty without a file
     past_events: EventLog = field(default_factory=EventLog)
 

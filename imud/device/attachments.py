@@ -32,7 +32,7 @@ class Attachment(Protocol):
         ...
 
     def tick(self, now_ns: int, newest: Sample | None) -> None:
-        """Do periodic work, ten times per second. `now_ns` is CLOCK_MONOTONIC."""
+        """Do periodic work at each tick of the device. `now_ns` is CLOCK_MONOTONIC."""
         ...
 
     def stop(self) -> None:
@@ -71,6 +71,11 @@ class Attachments:
 
     def add(self, attachment: Attachment) -> None:
         self._present.append(attachment)
+
+    @property
+    def needs_ticks(self) -> bool:
+        """Whether GPIO lines or a source of UTC need ten ticks per second."""
+        return self._signals is not None or self._reset is not None or self._utc is not None
 
     # --- all attachments ---------------------------------------------------------------------------------------------
 

@@ -65,6 +65,7 @@ if the device node exists but imud cannot open it."""
 IDLE_FLUSH_NS = 50 * NS_PER_MS
 """Idle time of the link after which the codec discards a pending frame, ns. Latency timers take up to 16 ms."""
 SILENCE_NS = 1 * NS_PER_S  # minimum time without a sample that makes a device silent, ns
+WATCHED: Final = (DeviceState.SEARCHING, DeviceState.SILENT)  # states that end with the first sample
 SILENCE_PERIODS = 5  # minimum number of sample periods without a sample that makes a device silent
 
 CHANGES_MAX: Final = 5  # maximum number of changed settings in the evidence of a reset
@@ -270,8 +271,11 @@ class Device:
             self._transport.close()
 
     def tick(self, now_ns: int) -> None:
-        """Update the state, detect an idle link, and send collected events. Called ten times per second."""
+        """Update the state, detect an idle link, and send collected events. Called twice per second, and ten times per
+        second while `_needs_ticks`."""
         transport = self._transport
+        if self._needs_ticks():
+            self._shared.owner.tick_soon()
         self._rate.mark(now_ns, self.ledger.samples)
         path = transport.path
         self._attachments.tick(now_ns, path.newest if path is not None else None)
@@ -297,6 +301,15 @@ class Device:
     @property
     def condition(self) -> Condition:
         return self._judge.condition.condition
+
+    def _needs_ticks(self) -> bool:
+        """Return whether the device needs ten ticks per second."""
+        state, path = self._health.state, self._transport.path
+        if self._attachments.needs_ticks or self._transport.busy or self._settings.busy:
+            return True
+        if state is not DeviceState.RUNNING or path is None:
+            return state in WATCHED
+        return not 0 < path.period_ns <= IDLE_FLUSH_NS  # `flush` must complete the samples of a slow device
 
     def close(self) -> None:
         """Release the link. A second call does nothing."""
@@ -324,6 +337,7 @@ class Device:
         transport.link.open()
         self._connects += 1
         self._health.link_opened()
+        self._shared.owner.tick_soon()
         ended = self._ended = asyncio.get_running_loop().create_future()
         tasks: list[asyncio.Task[None]] = []
         try:
@@ -451,6 +465,7 @@ class Device:
         return await self._settings.apply(given, save=save)
 
     def _require_replies(self) -> None:
+        self._shared.owner.tick_soon()  # a command watches the samples
         if not self._transport.accepts_scripts:
             problem = self._health.problem or "it cannot reply to commands now"
             raise CommandError(f"{self.config.name} is {self._health.state}: {problem}")
@@ -466,7 +481,7 @@ class Device:
             state is DeviceState.SILENT and now_ns - path.last_sample_ns < SILENCE_NS
         ):
             self._up(now_ns)
-        elif state is DeviceState.RUNNING and quiet_ns > max(SILENCE_NS, SILENCE_PERIODS * path.period_ns):
+        elif state is DeviceState.RUNNING and quiet_ns > SILENCE_NS and quiet_ns > SILENCE_PERIODS * path.period_ns:
             seconds = f"{quiet_ns / NS_PER_S:.1f} s"
             words = f"{NO_SAMPLE} {seconds}, but the link is open; check the power supply of the device and its output"
             self._health.down(now_ns, DeviceState.SILENT, words)

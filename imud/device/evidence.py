@@ -57,6 +57,7 @@ class SampleWatch:
     def mark(self) -> None:
         """Start the watch, before the command."""
         self._pause_ns, self._before, self._resets = 0, self.newest, self.counter_resets
+        self._seen = self._before  # the last tick can be half a second old
 
     @property
     def newest(self) -> Sample | None:
@@ -66,7 +67,7 @@ class SampleWatch:
     @property
     def counter_resets(self) -> int:
         """Number of resets of the device counter."""
-        return self._source.path.clock.status().resets if self._source.path is not None else 0
+        return self._source.path.clock.resets if self._source.path is not None else 0
 
     async def next(self, after: Sample | None) -> Sample | None:
         """Return a sample other than `after`; None if no sample arrives."""

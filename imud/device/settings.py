@@ -268,7 +268,7 @@ class DeviceSettings:
 
     def start(self, clock: SampleClock) -> None:
         """Note that the settings may differ: imud has found the device again, or another device."""
-        self._clock, self._resets = clock, clock.status().resets
+        self._clock, self._resets = clock, clock.resets
         self.is_current = False
         self._after_start(BEGIN_NS)
 
@@ -406,7 +406,7 @@ class DeviceSettings:
 
     @property
     def counter_resets(self) -> int:
-        return self._clock.status().resets if self._clock is not None else 0
+        return self._clock.resets if self._clock is not None else 0
 
     # --- requests -----------------------------------------------------------------------------------------------------
 

@@ -24,6 +24,7 @@ from imud.device.transport import (
 )
 from imud.drivers import DRIVERS
 from imud.host.clock import HostClock
+from imud.host.event_loop import Alarm
 from imud.model.errors import CommandError
 from imud.model.event import EventKind
 from imud.model.ledger import Ledger
@@ -56,8 +57,7 @@ class StreamHold:
         self._path = path
         self._scripts = scripts
         self._host = host
-        self._loop = asyncio.get_running_loop()
-        self._timer: asyncio.TimerHandle | None = None
+        self._alarm = Alarm(self)
         self._paused_ns = 0  # CLOCK_MONOTONIC of the start of the hold
         self._watch_ns = 0  # CLOCK_MONOTONIC of the next frame that is read on arrival
         # maximum hold in which the bytes fit into the kernel buffer, from the number of bytes of the last hold, ns
@@ -82,9 +82,9 @@ class StreamHold:
     def release(self) -> None:
         """Read and publish the held bytes now. Do nothing without held bytes."""
         self._watch_ns = 0  # publishing can call this method: no new hold follows
-        if self._timer is not None:
-            self._timer.cancel()
-            self._end_hold()
+        if self._alarm.is_set:
+            self._alarm.cancel()
+            self.on_alarm()
 
     def _allowed_ns(self) -> int:
         latency_ns, path = min(self.latency_ns, self._most_ns), self._path
@@ -95,10 +95,10 @@ class StreamHold:
     def _begin_hold(self, now_ns: int, hold_ns: int) -> None:
         self._paused_ns = now_ns
         wait_ns = hold_ns - (now_ns + hold_ns) % GRID_NS
-        self._timer = self._loop.call_later(wait_ns / NS_PER_S, self._end_hold)
+        self._alarm.set(wait_ns / NS_PER_S)
 
-    def _end_hold(self) -> None:
-        self._timer = None
+    def on_alarm(self) -> None:
+        """End the hold: read and publish the held bytes. Start the next hold, or read on arrival."""
         link, path = self._link, self._path
         data = link.take()
         now_ns = self._host.now_ns()

@@ -63,6 +63,10 @@ class DeviceOwner(Protocol):
         """Return all devices of the present configuration."""
         ...
 
+    def tick_soon(self) -> None:
+        """Tick the devices within 0.1 s."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class DeviceContext:
@@ -182,7 +186,7 @@ class Transport(SettingsPort):
         """Report the received data, or search again. Called after UNHEARD_NS without a sample."""
 
     def tick(self, now_ns: int) -> None:  # only a polled bus counts deadlines
-        """Do periodic work, ten times per second, before the device checks its samples."""
+        """Do periodic work before the device checks its samples."""
 
     def on_reset(self) -> None:  # a stream or CAN device sends again without a request
         """Prepare for a reset of the device by its line."""

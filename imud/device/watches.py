@@ -1,6 +1,6 @@
 """Checks of the samples of one device: the attitude against gravity at rest, and the status bits.
 
-The checks use the newest sample ten times per second. Each kind of contradiction between attitude and gravity raises
+The check of the attitude uses one sample per second. Each kind of contradiction between attitude and gravity raises
 one event per path. The status shows the contradiction until a later rest without contradiction.
 """
 
@@ -15,9 +15,11 @@ from imud.contracts.driver import Driver, StatusBit
 from imud.contracts.status import FrameProblem, FrameStatus
 from imud.device.health import DeviceEvents
 from imud.model.event import EventKind
-from imud.model.units import NS_PER_S
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.path import SamplePath
 
+# Minimum time between two checked samples, ns. A window of `GravityCheck` needs five samples in 5 s.
+CHECK_NS: Final = NS_PER_S - 50 * NS_PER_MS
 AS_DEVICE = "device"  # name of the convention if none is configured
 
 
@@ -31,12 +33,17 @@ class AttitudeWatch:
         self._path: SamplePath | None = None
         self._check: GravityCheck | None = None
         self._raised: set[Contradiction] = set()
+        self._due_ns = 0
 
     def tick(self, now_ns: int, path: SamplePath) -> None:
         """Check the newest sample. Raise an event for the first contradiction of each kind."""
         if path is not self._path or path.frame is not self._frame:
             self._path, self._frame, self._check = path, path.frame, self._new_check(path)
             self._raised.clear()
+            self._due_ns = 0
+        if now_ns < self._due_ns:
+            return
+        self._due_ns = now_ns + CHECK_NS
         check, sample = self._check, path.newest
         if check is None or sample is None or not check.add(sample) or check.finding is None:
             return
@@ -111,7 +118,7 @@ class StatusWatch:
         self._due_ns = 0
 
     def tick(self, now_ns: int, driver: Driver | None, path: SamplePath | None) -> None:
-        """Check the samples since the last call. Raise an event for changed bits. Called at 10 Hz."""
+        """Check the samples since the last call. Raise an event for changed bits."""
         if driver is None or path is None:
             return
         if path is not self._path:
@@ -119,6 +126,8 @@ class StatusWatch:
         if not self._bits:
             return
         seen = path.take_status()
+        if not seen and not self._set and not self._seen_ns:
+            return
         for number in self._bits:
             if seen >> number & 1:
                 self._seen_ns[number] = now_ns

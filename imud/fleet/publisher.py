@@ -251,6 +251,7 @@ class MqttPublisher:
         self._report_problems(now_ns, writer, sender)
         if self._commands is not None:
             self._commands.run_next()
+            self._context.tick_soon()  # a request can arrive at any time
         if now_ns - self._state_ns >= STATE_NS:
             self._state_ns = now_ns
             self._send_states(now_ns)

@@ -25,7 +25,7 @@ Rules for a reader, because the writer has no memory fence:
 import os
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -95,6 +95,7 @@ _CONSTANT = struct.Struct("<8s6IQ3I12x64s64x")  # magic … reserved1
 _LIVELY = struct.Struct("<QQq")  # newest_seq, first_seq, heartbeat_ns
 _BLOCK = struct.Struct(f"<Q32s{LEDGER_ROOM}Q")
 _CRC = struct.Struct("<I")
+_NO_COUNTERS = (0,) * LEDGER_ROOM
 _U64_MASK = 0xFFFF_FFFF_FFFF_FFFF
 
 
@@ -173,10 +174,9 @@ def decode_header(raw: bytes, where: str) -> RingHeader:
     )  # fmt: skip
 
 
-def encode_ledger_block(update: int, driver: str, ledger: Mapping[str, int]) -> bytes:
-    """Return LEDGER_BLOCK_BYTES bytes. Counters missing in `ledger` are 0. A driver name is cut to 31 bytes."""
-    values = [ledger.get(name, 0) & _U64_MASK for name in LEDGER_FIELDS]
-    body = _BLOCK.pack(update, driver.encode()[:31], *values, *[0] * (LEDGER_ROOM - len(values)))
+def encode_ledger_block(update: int, driver: str, counters: Sequence[int]) -> bytes:
+    """Return LEDGER_BLOCK_BYTES bytes. `counters` is in the order of LEDGER_FIELDS. A name is cut to 31 bytes."""
+    body = _BLOCK.pack(update, driver.encode()[:31], *counters, *_NO_COUNTERS[len(counters) :])
     return body + _CRC.pack(zlib.crc32(body))
 
 

@@ -45,7 +45,7 @@ class ServiceManager:
         notify("STOPPING=1")
 
     def tick(self, now_ns: int, status_line: Callable[[], str]) -> None:
-        """Feed the watchdog. Report the status line if it changed. Call this method ten times per second. `status_line`
+        """Feed the watchdog. Report the status line if it changed. Call this method twice per second. `status_line`
         is called at most once per second."""
         if self._watchdog_s is not None and now_ns >= self._watchdog_due_ns:
             notify("WATCHDOG=1")

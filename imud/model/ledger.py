@@ -88,7 +88,7 @@ class Ledger:
 
     def lost(self) -> int:
         """Return the number of lost samples, within one per gap, without `lost_unknown`."""
-        return lost(self.snapshot())
+        return self.lost_gap_device + self.lost_crc + self.lost_overrun + self.lost_queue
 
     def add_unknown_gap(self) -> None:
         """Count a gap with an unknown number of lost samples."""

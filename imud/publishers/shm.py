@@ -302,7 +302,7 @@ class ShmRing:
         self._mask = header.slot_count - 1
         self._newest = header.newest_seq
         self._update = 0
-        self._known: tuple[str, Mapping[str, int]] | None = None
+        self._known: tuple[str, Sequence[int]] | None = None
         # minimum size of the file for a write; larger than any file after the file was truncated
         self._least_bytes = self._size_bytes
         self._closed = False
@@ -355,13 +355,13 @@ class ShmRing:
         if self._is_whole():
             self._words[HEARTBEAT_WORD] = now_ns
 
-    def set_ledger(self, driver: str, ledger: Mapping[str, int]) -> None:
-        """Write the ledger and the driver if they changed."""
-        if self._known == (driver, ledger) or not self._is_whole():
+    def set_ledger(self, driver: str, counters: Sequence[int]) -> None:
+        """Write the driver, and the ledger as counters in the order of LEDGER_FIELDS, if they changed."""
+        if self._known == (driver, counters) or not self._is_whole():
             return
-        self._known = (driver, dict(ledger))
+        self._known = (driver, counters)
         self._update += 1
-        block = encode_ledger_block(self._update, driver, ledger)
+        block = encode_ledger_block(self._update, driver, counters)
         self._words[LEDGER_UPDATE_WORD] = SEQ_INVALID
         self._memory[_LEDGER_PAYLOAD] = block[8:]
         self._words[LEDGER_UPDATE_WORD] = self._update

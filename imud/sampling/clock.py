@@ -337,6 +337,11 @@ class SampleClock:
             period_ns *= self._line.slope / self._fit.slope  # the slope of the fit is inaccurate if frames wait
         return NS_PER_S / period_ns if period_ns else 0.0
 
+    @property
+    def resets(self) -> int:
+        """Number of resets of the device counter."""
+        return self._resets + self._arrivals.resets
+
     def status(self) -> ClockStatus:
         fit = self._fit if self._fit_sync is not Sync.ARRIVAL else None
         status = ClockStatus(
@@ -346,7 +351,7 @@ class SampleClock:
             steering_ppm=self._host.rate * 1e6,
             residual_ns=int(fit.residual_ns if fit else self._arrivals.spread.sigma_ns),
             t_err_ns=self._t_err_ns,
-            resets=self._resets + self._arrivals.resets,
+            resets=self.resets,
             hold_ns=self._delay.hold_ns,
         )
         return self._aiding.add_status(status) if self._aiding else status

@@ -10,6 +10,7 @@ import pytest
 
 from imud.config.model import DeviceConfig
 from imud.contracts.script import Request, RequestScript, never, of_text
+from imud.contracts.status import DeviceState
 from imud.device.latency import Need
 from imud.links.memory import MemoryLink, MemoryOptions
 from imud.model.sample import Sample, Sync
@@ -116,6 +117,20 @@ async def test_one_frame_per_50_ms_is_read_on_arrival(bench: HoldBench, latency_
     assert len(bench.link.resumed) - resumed == pytest.approx(10, abs=1)
     assert len(bench.link.taken) - taken == pytest.approx(10 * rounds, abs=rounds)
     assert max(bench.waits_ns(-20)) <= latency_ms * NS_PER_MS
+
+
+@pytest.mark.parametrize(("period_ms", "needed"), [(1, False), (100, True)])
+@played(lambda period_ms: HoldBench(10, period_ms=period_ms))
+async def test_a_device_needs_ten_ticks_per_second_if_it_is_slow_or_busy(
+    bench: HoldBench, period_ms: int, needed: bool
+) -> None:
+    device = bench.device
+    bench.rig.tick()
+    assert device._needs_ticks() is needed, period_ms
+    async with device._settings.exclusive():
+        assert device._needs_ticks()
+    device._health.state = DeviceState.SILENT
+    assert device._needs_ticks()
 
 
 @played(lambda: HoldBench(10, hold_ns=NS_PER_MS))

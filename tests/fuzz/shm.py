@@ -98,7 +98,7 @@ def base() -> bytes:
     """Return a ring in use: eight slots, twenty samples."""
     header = encode_header(RingHeader(77, PID, 1, DEVICE, 3, SLOTS, NEWEST, 1, START_NS))
     image = bytearray(header + bytes(SLOTS * SLOT_BYTES))
-    block = encode_ledger_block(5, "hipnuc-uart", dict.fromkeys(LEDGER_FIELDS, 7))
+    block = encode_ledger_block(5, "hipnuc-uart", [7] * len(LEDGER_FIELDS))
     image[LEDGER_BLOCK_OFFSET : LEDGER_BLOCK_OFFSET + LEDGER_BLOCK_BYTES] = block
     for seq in range(NEWEST - SLOTS + 1, NEWEST + 1):
         at = _slot_at(seq)

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from imud.host.event_loop import ReaderSelector, SampleLoop, run
+from imud.host.event_loop import Alarm, ReaderSelector, SampleLoop, run
 from tests.support.event_loops import in_loop
 
 TURNS = 3
@@ -379,3 +379,39 @@ async def test_a_descriptor_of_the_same_number_is_watched_from_the_next_wait_of_
     loop.call_later(0.05, first_far.send, b"a")
     await done
     assert seen == [b"new"]
+
+
+@in_loop
+async def test_an_alarm_rings_at_its_last_time_without_a_turn_of_asyncio(pair: Pair) -> None:
+    loop, (ours, theirs) = loop_in_use(), pair
+    errors, done, begin_s = list[dict[str, Any]](), loop.create_future(), loop.time()
+
+    class Owner:
+        def __init__(self) -> None:
+            self.alarm = Alarm(self)
+            self.rung_s: list[float] = []
+
+        def on_alarm(self) -> None:
+            self.rung_s.append(loop.time() - begin_s)
+            self.alarm.set(0.01 if len(self.rung_s) < 3 else 60)
+            theirs.send(b"end" if len(self.rung_s) == 3 else b"x")
+            if len(self.rung_s) == 1:
+                raise ValueError
+
+    def end() -> None:
+        if ours.recv(9).endswith(b"end"):
+            done.set_result(None)
+
+    again, never = Owner(), Owner()
+    loop.set_exception_handler(lambda _loop, context: errors.append(context))
+    loop.add_reader(ours, end)
+    again.alarm.set(0.0)
+    again.alarm.set(0.02)
+    never.alarm.set(0.001)
+    never.alarm.cancel()
+    await done
+    assert (again.alarm.is_set, never.alarm.is_set, len(again.rung_s), never.rung_s) == (True, False, 3, [])
+    again.alarm.cancel()
+    loop.remove_reader(ours)
+    assert [again.rung_s[0] >= 0.02, again.rung_s[2] >= 0.04] == [True, True]
+    assert [type(context["exception"]) for context in errors] == [ValueError]

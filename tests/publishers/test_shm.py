@@ -216,7 +216,9 @@ def test_a_tick_reads_ledgers_without_the_complete_state(tmp_path: Path) -> None
         raise AssertionError("the state of every device was made for its ledger")
 
     counts = dict.fromkeys(LEDGER_FIELDS, 7)
-    context = publisher_context(whole_state, 1, lambda: START_NS, ledgers=lambda: [(DEVICE, "imu61x-uart", counts)])
+    context = publisher_context(
+        whole_state, 1, lambda: START_NS, ledgers=lambda: [(DEVICE, "imu61x-uart", tuple(counts.values()))]
+    )
     publisher = ShmPublisher(ShmOptions(directory=str(tmp_path), slots=SLOTS), context)
     publisher.add_device(DEVICE, 3)
     publisher.tick(START_NS)

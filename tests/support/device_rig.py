@@ -131,6 +131,8 @@ class DeviceOutput:
     def configured_devices(self) -> Sequence[DeviceConfig]:
         return ()
 
+    def tick_soon(self) -> None: ...
+
 
 class DeviceRigs:
     """Creates devices with common time, buses and lines, and keeps their outputs separate."""
@@ -195,6 +197,8 @@ class DeviceRigs:
 
     def configured_devices(self) -> Sequence[DeviceConfig]:
         return self._configured
+
+    def tick_soon(self) -> None: ...
 
     def publish(self, batch: Batch) -> None:
         rig = self.rigs[batch.device]

@@ -41,7 +41,8 @@ async def _without_readers_left(body: Coroutine[Any, Any, None]) -> None:
 def timers_left(loop: Any) -> list[str]:
     """Return the timers of imud that are neither cancelled nor due. A closed object must not be called again."""
     pending = (timer for timer in loop._scheduled if not timer.cancelled())
-    return [repr(timer) for timer in pending if str(getattr(timer._callback, "__module__", "")).startswith("imud.")]
+    found = [repr(timer) for timer in pending if str(getattr(timer._callback, "__module__", "")).startswith("imud.")]
+    return found + [repr(alarm) for alarm in getattr(getattr(loop, "_reader_selector", None), "alarms", ())]
 
 
 DESCRIPTOR_LIMIT_S = 60.0

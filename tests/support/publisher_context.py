@@ -80,7 +80,7 @@ def publisher_context(
 ) -> PublisherContext:  # fmt: skip
     devices = FakeDevices(
         status, control, recording or NothingRecorded(), each_status or (lambda: iter(status())),
-        ledgers or (lambda: [(one.name, one.driver, one.ledger) for one in status()]),
+        ledgers or (lambda: [(one.name, one.driver, tuple(one.ledger.values())) for one in status()]),
     )  # fmt: skip
     return PublisherContext(
         epoch, PublisherClock(now_ns, utc_offset_ns, utc_reference, cpu_ns), devices, outputs or OutputFacts(),

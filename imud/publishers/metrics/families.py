@@ -167,7 +167,7 @@ DAEMON_FAMILIES: Final = (
     ),
     _gauge(
         "imud_heartbeat_age_seconds",
-        "Time since the last tick of the event loop, which ticks ten times per second.",
+        "Time since the last tick of the event loop, which ticks at least twice per second.",
         daemon(lambda snapshot: snapshot.heartbeat_age_ns), SECONDS,
     ),
     _counter(

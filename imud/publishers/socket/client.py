@@ -257,15 +257,16 @@ class ClientConnection(Outbox, ScheduledClient):
         if not self.waiting:
             self.close()
 
-    def tick(self) -> None:
+    def tick(self) -> bool:
         """Close the connection LINGER_TICKS after `finish`. Finish it after the last reply to a client that has shut
-        down its sending direction. The server calls this method every 100 ms."""
+        down its sending direction. Return whether the connection needs the next tick within 100 ms."""
         if self._input_ended:
             self._finish_if_done()
         if self._linger_ticks is not None:
             self._linger_ticks -= 1
             if self._linger_ticks <= 0:
                 self.close()
+        return self._input_ended or self._linger_ticks is not None
 
     def close(self) -> None:
         """Close the connection immediately. A second call does nothing."""

@@ -123,8 +123,8 @@ class ClientRecordings:
         for made in self.running.values():
             made.event(event)
 
-    def tick(self, now_ns: int) -> None:
-        """Check all recordings, and close the finished ones."""
+    def tick(self, now_ns: int) -> bool:
+        """Check all recordings, and close the finished ones. Return whether one needs the next tick within 100 ms."""
         for number, made in list(self.running.items()):
             made.tick(now_ns)
             if made.ended:
@@ -135,6 +135,7 @@ class ClientRecordings:
             if made.ended:
                 self._ending.remove(made)
                 made.close()
+        return bool(self.running or self._ending)
 
     def close(self) -> None:
         """Stop all recordings regularly. A second call does nothing."""
@@ -376,14 +377,16 @@ class Hub(Clients):
             clients = self.clients()
         return SocketStatus(self.path, clients, self.accepted, self.refused, self.evicted, self._failed)
 
-    def tick(self, now_ns: int) -> None:
-        """Close clients whose time to read their queue is over, and check the recordings. Called every 100 ms."""
+    def tick(self, now_ns: int) -> bool:
+        """Close clients whose time to read their queue is over, and check the recordings. Return whether a client needs
+        the next tick within 100 ms."""
+        needs_ticks = self.recordings.tick(now_ns)
         for connection in list(self.connections.values()):
             try:
-                connection.tick()
+                needs_ticks = connection.tick() or needs_ticks
             except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
                 connection.on_failure(error)
-        self.recordings.tick(now_ns)
+        return needs_ticks
 
     def close(self) -> None:
         """Close every client and cancel running requests. A second call does nothing."""

@@ -229,13 +229,17 @@ class Scheduler:
             if events:
                 self._epoll.modify(client.fd, events | select.EPOLLONESHOT)
 
-    def tick(self) -> None:
-        """Fill the allowances. Queue parked clients with a new allowance. Evict clients that exceed theirs for 10 s."""
+    def tick(self) -> bool:
+        """Fill the allowances. Queue parked clients with a new allowance. Evict clients that exceed theirs for 10 s.
+        Return whether a client needs the next tick within 100 ms."""
         now_ns = self.now_ns()
+        needs_ticks = False
         for client in list(self._clients.values()):
             client.fill(now_ns)
             is_parked = client.state is _State.PARKED
-            client.over_ticks = client.over_ticks + 1 if is_parked else max(0, client.over_ticks - 1)
+            if is_parked or client.over_ticks:
+                client.over_ticks += 1 if is_parked else -1
+                needs_ticks = True
         for client in list(self._parked):
             if client.over_ticks > OVER_TICKS_MAX:
                 try:
@@ -246,6 +250,7 @@ class Scheduler:
                 del self._parked[client]
                 client.state = _State.IDLE
                 self.enqueue(client)
+        return needs_ticks
 
     def close(self) -> None:
         """Stop serving. A second call does nothing."""

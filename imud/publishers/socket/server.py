@@ -351,11 +351,14 @@ class SocketServer:
             log.warning("group %r (socket.control_group) does not exist: only root can change things; %s", group, hint)
 
     def tick(self, now_ns: int) -> None:
-        """Close lingering clients, fill allowances, and accept clients again after a pause. Called every 100 ms."""
-        self.hub.tick(now_ns)
+        """Close lingering clients, fill allowances, and accept clients again after a pause. The limits of clients count
+        ticks of 100 ms: request them while a client lingers or waits for its allowance."""
+        needs_ticks = self.hub.tick(now_ns)
         if self._scheduler is not None:
-            self._scheduler.tick()
+            needs_ticks = self._scheduler.tick() or needs_ticks
             self.hub.pool.trim()
+        if needs_ticks:
+            self._context.tick_soon()
         self._quota.tick()
         if self._listener is not None and now_ns >= self._retry_ns and not self._listener.has_file:
             self._replace_file(self._listener, now_ns)
@@ -400,6 +403,7 @@ class SocketServer:
             log.warning("cannot accept a client: %s (%d times since the last report)", error.strerror, count)
         asyncio.get_running_loop().remove_reader(self._listener.sock)
         self._paused = True
+        self._context.tick_soon()
 
     def _greet(self, sock: socket.socket) -> None:
         connection: ClientConnection | None = None

@@ -15,10 +15,13 @@ from typing import Final
 import msgspec
 
 from imud import config
-from imud.daemon import Daemon
+from imud.daemon import QUIET_TICK_S, Daemon
+from imud.device.device import Device
 from imud.formats.jsonrpc import encode_request, line_of
 from imud.host.event_loop import ReaderSelector, SampleLoop
-from imud.model.units import NS_PER_MS
+from imud.model.sample import Sample
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sampling.path import SamplePath
 from tests.bench.instructions import virtual_time
 from tests.bench.instructions.module import BAUD, SETTLE_READS, Module, Read
 
@@ -75,7 +78,8 @@ class VirtualDaemon:
         self._feeder = _Feeder(self._master, slave)
         self._loop = SampleLoop(ReaderSelector(self._feeder))
         self._feeder.loop = self._loop
-        self._running = self._loop.create_task(Daemon(_settings(directory, os.ttyname(slave))).run())
+        self._daemon = Daemon(_settings(directory, os.ttyname(slave)))
+        self._running = self._loop.create_task(self._daemon.run())
         self._pass_time(START_MS)
         self.process(self._module.first_minute())
 
@@ -97,6 +101,32 @@ class VirtualDaemon:
 
     def process(self, reads: list[Read]) -> None:
         self._run(iter(reads))
+
+    def newest_samples(self, count: int) -> list[Sample]:
+        """Process reads with one frame each, and return their samples."""
+        found = []
+        for read in self.prepare(count, 1):
+            self.process([read])
+            found.append(self._path.newest)
+        return [sample for sample in found if sample is not None]
+
+    def tick(self, newest: Sample) -> None:
+        """Tick after another sample: the newest sample and the ledger differ from the last tick."""
+        path = self._path
+        path.newest, path.last_sample_ns = newest, virtual_time.now_ns()
+        self._device.ledger.samples += 1
+        virtual_time.set_now(virtual_time.now_ns() + round(QUIET_TICK_S * NS_PER_S))
+        self._daemon.on_alarm()
+
+    @property
+    def _device(self) -> Device:
+        return self._daemon._devices["d0"]
+
+    @property
+    def _path(self) -> SamplePath:
+        path = self._device._transport.path
+        assert path is not None
+        return path
 
     def _run(self, reads: Iterator[Read]) -> None:
         self._feeder.reads = reads

@@ -338,6 +338,13 @@ def _daemon(clients: int, encoding: str, frames: int, total: int, directory: str
     return lambda count: daemon.process(list(islice(reads, count)))
 
 
+def _tick(total: int, directory: str) -> Run:
+    """Tick a daemon with one device and one client in a quiet state."""
+    daemon = VirtualDaemon(directory)
+    daemon.connect(1, "binary")
+    return _taking([partial(daemon.tick, sample) for sample in daemon.newest_samples(total)])
+
+
 STAGES: Final = (
     CountedStage(INTERPRETER, _interpreter, 10, 100),
     CountedStage("decode HI91, reads of 4096 bytes", _hi91_bulk, 4, HI91_BLOCK),
@@ -363,5 +370,6 @@ STAGES: Final = (
     CountedStage("daemon, 1 client, a sample per wake-up", partial(_daemon, 1, "binary", 1), 1000),
     CountedStage("daemon, 10 binary clients, a sample per wake-up", partial(_daemon, 10, "binary", 1), 200),
     CountedStage("daemon, 10 JSON clients, a sample per wake-up", partial(_daemon, 10, "json", 1), 200),
+    CountedStage("tick, 1 device, 1 client", _tick, 40, 1),
     CountedStage("daemon, 1 client, 20 samples per wake-up", partial(_daemon, 1, "binary", 20), 50, 20),
 )
