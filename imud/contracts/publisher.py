@@ -14,7 +14,7 @@ from imud.contracts.lines import UtcReference, WatchLine
 from imud.contracts.link import Claim
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import ClientStatus, DeviceStatus, FlightStatus, MqttStatus, OutputStatus, RecorderStatus
-from imud.formats.slot import encode_slots
+from imud.formats.slot import SLOT_BYTES, decode_slots, encode_slots, slot_seqs, slot_times_ns
 from imud.model.event import Event, EventLog
 from imud.model.options import Options
 from imud.model.sample import Sample
@@ -58,24 +58,61 @@ DeviceLedger = tuple[str, str, Sequence[int]]
 
 
 class Batch:
-    """Samples from one read of one device, oldest first, at least one. All publishers share the object. Immutable."""
+    """Samples from one read of one device, oldest first, at least one. All publishers share the object. Immutable.
 
-    __slots__ = ("_converted", "_slots", "device", "device_id", "frame", "samples")
+    A batch contains sample objects, packed slots, or both: the first use of the other form makes it. An output that
+    needs only slots thus creates no sample objects.
+    """
 
-    def __init__(self, device: str, device_id: int, samples: Sequence[Sample], frame: PublishedAxes = AS_SENT) -> None:
+    __slots__ = ("_converted", "_packed", "_samples", "device", "device_id", "frame")
+
+    def __init__(
+        self, device: str, device_id: int, samples: Sequence[Sample] | bytes, frame: PublishedAxes = AS_SENT
+    ) -> None:
+        """`samples` are sample objects, or valid slots back to back."""
         self.device = device
         self.device_id = device_id  # number of the device in slots
-        self.samples = samples
         self.frame = frame  # axes and angles of the samples
-        self._slots: list[bytes] | None = None
+        self._samples: Sequence[Sample] | None = None
+        self._packed = b""
+        if isinstance(samples, bytes):
+            self._packed = samples
+        else:
+            self._samples = samples
         self._converted: dict[Convention, Batch] | None = None
 
-    def slots(self) -> list[bytes]:
-        """Return the samples as slots (`imud.formats.slot`). The first call encodes them."""
-        slots = self._slots
-        if slots is None:
-            slots = self._slots = encode_slots(self.samples, self.device_id)
-        return slots
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return len(self._packed) // SLOT_BYTES if self._samples is None else len(self._samples)
+
+    @property
+    def samples(self) -> Sequence[Sample]:
+        """Sample objects. The first use decodes them from the slots."""
+        samples = self._samples
+        if samples is None:
+            samples = self._samples = decode_slots(self._packed, self.device)
+        return samples
+
+    @property
+    def packed(self) -> bytes:
+        """Samples as slots (`imud.formats.slot`) back to back. The first use encodes them."""
+        packed = self._packed
+        if not packed:
+            slots = encode_slots(self.samples, self.device_id)
+            packed = self._packed = slots[0] if len(slots) == 1 else b"".join(slots)
+        return packed
+
+    @property
+    def seqs(self) -> tuple[int, int]:
+        """Sequence numbers of the first and the last sample."""
+        samples = self._samples
+        return slot_seqs(self._packed) if samples is None else (samples[0].seq, samples[-1].seq)
+
+    @property
+    def times_ns(self) -> Sequence[int]:
+        """Time stamps of the samples (`t_ns`)."""
+        samples = self._samples
+        return slot_times_ns(self._packed) if samples is None else [sample.t_ns for sample in samples]
 
     def converted(self, convention: Convention | None) -> "Batch":
         """Return the samples in a convention; None: as published. The first call rotates them."""

@@ -83,7 +83,7 @@ class WriterQueue:
 
     def put_batch(self, batch: Batch) -> None:
         """Add samples, or drop and count them."""
-        count = len(batch.samples)
+        count = len(batch)
         self.queued += count
         if self._put - self._taken + count > self._samples_max:
             self.dropped += count

@@ -16,7 +16,7 @@ import struct
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 from zlib import crc32
 
 import msgspec
@@ -106,6 +106,10 @@ _HEAD = struct.Struct(_NATIVE + "".join(f"{f.count}{f.code}" for f in SLOT_FIELD
 _VALUES = struct.Struct(_NATIVE + "".join(f"{f.count}{f.code}" for f in SLOT_FIELDS[_HEAD_FIELDS:-2]) + "24x")
 _BODY = struct.Struct(_NATIVE + "".join(f"{f.count}{f.code}" for f in SLOT_FIELDS[:-2]) + "24x")
 _CRC = struct.Struct("<I")
+_SEQ = struct.Struct("<Q")
+_T_NS = struct.Struct("<8xq240x")
+_STATUS = struct.Struct("<56xI196x")
+_SYNC_OFFSET: Final = next(field.offset for field in SLOT_FIELDS if field.name == "sync")
 _U16_MAX: Final = 0xFFFF
 _U32_MAX: Final = 0xFFFF_FFFF
 _U64_MAX: Final = 0xFFFF_FFFF_FFFF_FFFF
@@ -230,6 +234,24 @@ def _clipped(value: int, low: int, high: int) -> int:
     return min(max(value, low), high)
 
 
+def slot_seqs(packed: bytes) -> tuple[int, int]:
+    """Return the sequence numbers of the first and the last of packed slots."""
+    return _SEQ.unpack_from(packed)[0], _SEQ.unpack_from(packed, len(packed) - SLOT_BYTES)[0]
+
+
+def slot_times_ns(packed: bytes) -> list[int]:
+    """Return the time stamps `t_ns` of packed slots."""
+    return [t_ns for (t_ns,) in _T_NS.iter_unpack(packed)]
+
+
+def slot_status_bits(packed: bytes) -> int:
+    """Return all status bits that are set in packed slots. A slot without status has zeros."""
+    bits = 0
+    for (status,) in _STATUS.iter_unpack(packed):
+        bits |= status
+    return bits
+
+
 def slot_is_whole(slot: bytes) -> bool:
     """Return whether the CRC of a slot is correct."""
     return len(slot) == SLOT_BYTES and crc32(slot[:CRC_OFFSET]) == _CRC.unpack_from(slot, CRC_OFFSET)[0]
@@ -242,10 +264,20 @@ def decode_slot(slot: bytes, device: str) -> Sample:
             f"slot of {len(slot)} bytes: expected {SLOT_BYTES} bytes with a matching CRC-32; "
             "was it written during the copy?"
         )
-    v = _BODY.unpack_from(slot)
+    sync = slot[_SYNC_OFFSET]
+    if sync >= len(SYNC_BY_CODE):
+        raise ValueError(f"slot with sync {sync}: expected 0 to {len(SYNC_BY_CODE) - 1}; did a newer imud write it?")
+    return _sample(_BODY.unpack_from(slot), device)
+
+
+def decode_slots(packed: bytes, device: str) -> list[Sample]:
+    """Return the samples of valid slots back to back, without a check of their CRC."""
+    return [_sample(_BODY.unpack_from(packed, at), device) for at in range(0, len(packed), SLOT_BYTES)]
+
+
+def _sample(v: tuple[Any, ...], device: str) -> Sample:
+    """Return the sample with the values of `_BODY`."""
     has = v[7]
-    if v[10] >= len(SYNC_BY_CODE):
-        raise ValueError(f"slot with sync {v[10]}: expected 0 to {len(SYNC_BY_CODE) - 1}; did a newer imud write it?")
     return Sample(
         device, v[0], v[1], v[6], SYNC_BY_CODE[v[10]], v[2], v[3],
         t_dev_ns=v[4] if has & HAS_T_DEV else None,

@@ -45,12 +45,11 @@ from imud.formats.ring import (
     encode_ledger_block,
     ring_path,
 )
-from imud.formats.slot import SEQ_INVALID, SLOT_BYTES
+from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, slot_seqs
 from imud.host.files import can_replace, user_name
 from imud.model.errors import ServerError
 from imud.model.event import Event
 from imud.model.options import Options
-from imud.model.sample import Sample
 from imud.model.units import NS_PER_MS
 
 log = logging.getLogger(__name__)
@@ -312,17 +311,17 @@ class ShmRing:
         """Return the sequence number of the newest sample; 0 before the first."""
         return self._newest
 
-    def write(self, samples: Sequence[Sample], slots: Sequence[bytes]) -> None:
-        """Write `samples`, oldest first, as `slots`. Do nothing if the file was truncated."""
+    def write(self, first: int, last: int, packed: bytes) -> None:
+        """Write slots with the numbers `first` to `last`, oldest first. Do nothing if the file was truncated."""
         if _lseek(self._fd, 0, _END) < self._least_bytes:
             self._restore_size()
-            self._newest = samples[-1].seq
-            return
-        if len(slots) == 1:
-            self._write_one(samples[0].seq, slots[0])
-        elif slots and not self._write_run(samples[0].seq, samples[-1].seq, slots):
-            for sample, slot in zip(samples, slots, strict=True):
-                self._write_one(sample.seq, slot)
+            self._newest = last
+        elif len(packed) == SLOT_BYTES:
+            self._write_one(first, packed)
+        elif not self._write_run(first, last, packed):
+            for at in range(0, len(packed), SLOT_BYTES):
+                slot = packed[at : at + SLOT_BYTES]
+                self._write_one(slot_seqs(slot)[0], slot)
 
     def _write_one(self, seq: int, slot: bytes) -> None:
         words, at = self._words, HEADER_BYTES + (seq & self._mask) * SLOT_BYTES
@@ -334,19 +333,21 @@ class ShmRing:
             words[FIRST_WORD] = seq
         self._newest = seq
 
-    def _write_run(self, first: int, last: int, slots: Sequence[bytes]) -> bool:
+    def _write_run(self, first: int, last: int, packed: bytes) -> bool:
         """Write consecutive slots. All slots are invalid from before the first payload until after the last payload.
         Return False without a write if a number is missing, or if the run reaches the end of the ring."""
-        count, begin = len(slots), first & self._mask
+        count, begin = len(packed) // SLOT_BYTES, first & self._mask
         if first != self._newest + 1 or last != self._newest + count or begin + count > self._mask + 1:
             return False
         at = HEADER_BYTES + begin * SLOT_BYTES
-        words, numbers = self._words, range(at >> 3, (at + count * SLOT_BYTES) >> 3, SLOT_BYTES >> 3)
-        for word in numbers:
-            words[word] = SEQ_INVALID
-        self._memory[at + 8 : at + count * SLOT_BYTES] = _INVALID.join([slot[_PAYLOAD] for slot in slots])
-        for seq, word in enumerate(numbers, first):
-            words[word] = seq
+        words, numbers = self._words, slice(at >> 3, (at + count * SLOT_BYTES) >> 3, SLOT_BYTES >> 3)
+        words[numbers] = invalid = memoryview(_INVALID * count).cast("Q")
+        payload = bytearray(packed)
+        with memoryview(payload).cast("Q") as view:
+            view[:: SLOT_BYTES >> 3] = invalid
+        self._memory[at + 8 : at + count * SLOT_BYTES] = memoryview(payload)[8:]
+        with memoryview(packed).cast("Q") as view:
+            words[numbers] = view[:: SLOT_BYTES >> 3]
         self._newest = words[NEWEST_WORD] = last
         return True
 
@@ -503,9 +504,9 @@ class ShmPublisher:
         """Write samples over the oldest samples of the ring."""
         ring = self._rings.get(batch.device)
         if ring is not None:
-            ring.write(batch.samples, batch.slots())
+            ring.write(*batch.seqs, batch.packed)
         elif batch.device in self._places:
-            self._places[batch.device].newest = batch.samples[-1].seq
+            self._places[batch.device].newest = batch.seqs[1]
 
     def event(self, event: Event) -> None:
         """Do nothing: rings contain only samples."""

@@ -77,17 +77,16 @@ class RateThinner:
         if not self._users[rate_hz]:
             del self._users[rate_hz], self._paces[rate_hz]
 
-    def choose(self, samples: Sequence[Sample]) -> Mapping[float, tuple[int, ...]]:
-        """Return the indices of the selected samples by rate. Call it once with each sample."""
+    def choose(self, times_ns: Sequence[int]) -> Mapping[float, tuple[int, ...]]:
+        """Return the indices of the selected samples by rate. Call it once with the time stamp of each sample."""
         paces = self._paces
         if not paces:
             return NOTHING
-        before_ns, newest_ns = self._newest_ns, samples[-1].t_ns
+        before_ns, newest_ns = self._newest_ns, times_ns[-1]
         self._newest_ns = newest_ns
         due = [(rate_hz, pace) for rate_hz, pace in paces.items() if newest_ns >= pace.due_ns]
         if not due:
             return NOTHING
-        times_ns = [sample.t_ns for sample in samples]
         steps_ns = [t_ns - last_ns for t_ns, last_ns in zip(times_ns, (before_ns, *times_ns), strict=False)]
         found = {}
         for rate_hz, pace in due:

@@ -1,5 +1,7 @@
 import struct
 import zlib
+from functools import reduce
+from operator import or_
 from typing import Any
 
 import msgspec
@@ -14,9 +16,13 @@ from imud.formats.slot import (
     SLOT_FIELDS,
     SYNC_CODES,
     decode_slot,
+    decode_slots,
     encode_slot,
     encode_slots,
     slot_is_whole,
+    slot_seqs,
+    slot_status_bits,
+    slot_times_ns,
 )
 from imud.model.sample import Sample, Sync
 from tests.support.rings import check_layout
@@ -148,7 +154,12 @@ def test_a_batch_is_its_samples_one_by_one_also_where_one_does_not_fit() -> None
     for batch in ([FULL, BARE, FULL], [BARE, unfit, FULL], [unfit]):
         slots = encode_slots(batch, 9)
         assert slots == [encode_slot(sample, 9) for sample in batch]
-        assert [decode_slot(slot, "imu0").seq for slot in slots] == [sample.seq for sample in batch]
+        decoded, packed = [decode_slot(slot, "imu0") for slot in slots], b"".join(slots)
+        assert [one.seq for one in decoded] == [sample.seq for sample in batch]
+        assert decode_slots(packed, "imu0") == decoded
+        assert slot_seqs(packed) == (decoded[0].seq, decoded[-1].seq)
+        assert slot_times_ns(packed) == [one.t_ns for one in decoded]
+        assert slot_status_bits(packed) == reduce(or_, [one.status or 0 for one in decoded])
 
 
 HI91: dict[str, Any] = {

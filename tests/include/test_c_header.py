@@ -423,7 +423,7 @@ def stress_batches() -> list[Batch]:
     while done < STRESS_SAMPLES:
         end = min(done + random.choice((1, 1, 1, 5, 20, 100)), STRESS_SAMPLES)
         batch = Batch(DEVICE, 3, [make_sample(seq) for seq in range(done + 1, end + 1)])
-        batch.slots()
+        assert batch.packed
         batches.append(batch)
         done = end
     return batches

@@ -133,9 +133,10 @@ class Spy:
     def cast(self, code: Any) -> "Spy":
         return Spy(self.target.cast(code), self.notes)
 
-    def __setitem__(self, at: int, value: Any) -> None:
-        width = self.target.itemsize
-        self.notes.append((at * width, width, value))
+    def __setitem__(self, at: Any, value: Any) -> None:
+        width, is_run = self.target.itemsize, isinstance(at, slice)
+        places, values = (range(*at.indices(len(self.target))), value.tolist()) if is_run else ([at], [value])
+        self.notes += [(place * width, width, one) for place, one in zip(places, values, strict=True)]
         self.target[at] = value
 
     def release(self) -> None:

@@ -54,24 +54,20 @@ def test_the_selection_does_not_drift_and_has_no_burst() -> None:
     assert taken(Pace(10.0), times_ns) == times_ns[:2]
 
 
-def samples(*times_ns: int) -> list[Sample]:
-    return [Sample("bow", number, t_ns, 0, Sync.ARRIVAL, t_ns, 0) for number, t_ns in enumerate(times_ns)]
-
-
 def test_a_thinner_chooses_for_each_rate_across_batches() -> None:
     thinner, ms = RateThinner(), 1_000_000
-    assert not thinner.choose(samples(0))
+    assert not thinner.choose([0])
     for rate_hz in (100.0, 250.0, 100.0):
         thinner.add(rate_hz)
-    assert thinner.choose(samples(*(k * ms for k in range(1, 11)))) == {100.0: (0,), 250.0: (0, 4, 8)}
-    assert not thinner.choose(samples(11 * ms - 600_000))  # 0.6 ms before the due time of the lower rate
-    assert thinner.choose(samples(11 * ms, 12 * ms)) == {100.0: (0,)}
+    assert thinner.choose([*(k * ms for k in range(1, 11))]) == {100.0: (0,), 250.0: (0, 4, 8)}
+    assert not thinner.choose([11 * ms - 600_000])  # 0.6 ms before the due time of the lower rate
+    assert thinner.choose([11 * ms, 12 * ms]) == {100.0: (0,)}
     thinner.discard(100.0)
     thinner.discard(250.0)
-    assert not thinner.choose(samples(21 * ms - 300_001))  # the step before the selected sample was 0.6 ms
-    assert thinner.choose(samples(21 * ms - 300_000)) == {100.0: (0,)}
+    assert not thinner.choose([21 * ms - 300_001])  # the step before the selected sample was 0.6 ms
+    assert thinner.choose([21 * ms - 300_000]) == {100.0: (0,)}
     thinner.discard(100.0)
-    assert not thinner.choose(samples(31 * ms))
+    assert not thinner.choose([31 * ms])
 
 
 def test_the_mean_ignores_samples_without_angular_rate() -> None:

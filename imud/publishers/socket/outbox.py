@@ -45,7 +45,7 @@ class Encoding(ABC):
         self._convention = convention
 
     @abstractmethod
-    def encode(self, batch: Batch) -> list[bytes]:
+    def encode(self, batch: Batch) -> Sequence[bytes]:
         """Return a message for each sample of the batch."""
 
     @abstractmethod
@@ -102,18 +102,18 @@ class BinaryEncoding(Encoding):
 
     message_bytes = FRAME_HEADER.size + SLOT_BYTES
 
-    def encode(self, batch: Batch) -> list[bytes]:
+    def encode(self, batch: Batch) -> Sequence[bytes]:
         if self._convention is not None:
             batch = batch.converted(self._convention)
-        slots = batch.slots()
-        if len(slots) == 1:  # the usual case: faster than a list comprehension
-            return [_SLOT_HEADER + slots[0]]
-        return [_SLOT_HEADER + slot for slot in slots]
+        packed = batch.packed
+        if len(packed) == SLOT_BYTES:  # the usual case: faster than a list comprehension
+            return [_SLOT_HEADER + packed]
+        return [_SLOT_HEADER + packed[at : at + SLOT_BYTES] for at in range(0, len(packed), SLOT_BYTES)]
 
     def encode_one(self, batch: Batch, index: int) -> bytes:
         if self._convention is not None:
             batch = batch.converted(self._convention)
-        return _SLOT_HEADER + batch.slots()[index]
+        return _SLOT_HEADER + batch.packed[index * SLOT_BYTES : (index + 1) * SLOT_BYTES]
 
     def with_dropped(self, message: bytes, device: str, dropped: Mapping[str, int]) -> bytes:
         return b"".join((*(_dropped_notice(name, count, frame_of) for name, count in dropped.items()), message))
@@ -177,7 +177,7 @@ class Delivery:
         self.encoding = encoding
         self._batch = batch if messages is None else None
         self._chosen = chosen
-        self.count = len(batch.samples) if chosen is None else len(chosen)
+        self.count = len(batch) if chosen is None else len(chosen)
         self._messages = messages
         # memory of a sample with its message; with the size of the last message before encoding
         self.each_bytes = SAMPLE_BYTES + (encoding.message_bytes if messages is None else len(messages[0]))

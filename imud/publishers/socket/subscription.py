@@ -219,7 +219,7 @@ class DeliveryPlan:
         groups = self._in_order
         if not groups:
             return
-        chosen = self._thinner.choose(batch.samples) if self._thins else NOTHING
+        chosen = self._thinner.choose(batch.times_ns) if self._thins else NOTHING
         if self._only is not None:
             self._only.send(batch, chosen, now_ns, NEVER_NS)
             return

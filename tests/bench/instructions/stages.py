@@ -238,7 +238,7 @@ def _ring(frames: int, total: int, directory: str) -> Run:
     batches = [Batch("d0", 0, samples[at : at + frames]) for at in range(0, len(samples), frames)]
     # encode the slots before the count: the outputs share the encoded slots of a batch
     for batch in batches:
-        batch.slots()
+        assert batch.packed
     return _taking([partial(publisher.publish, batch) for batch in batches])
 
 
@@ -272,7 +272,7 @@ def _socket(clients: int, encoding: str, frames: int, total: int, directory: str
     made = [Batch("d0", 0, samples[at : at + frames]) for at in range(0, len(samples), frames)]
     if encoding == "binary":
         for batch in made:
-            batch.slots()
+            assert batch.packed
     batches = iter(made)
 
     async def publish(count: int) -> None:

@@ -13,7 +13,7 @@ from imud.attitude.published import FrameOptions, MountingAxes, PublishedAxes, a
 from imud.contracts.publisher import Batch
 from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.model.sample import Sample
-from imud.publishers.socket.outbox import BinaryEncoding, JsonEncoding
+from imud.publishers.socket.outbox import BinaryEncoding, Encoding, JsonEncoding
 from imud.publishers.socket.server import SocketServer
 from tests.support.socket_rig import Peer, in_server, sample
 
@@ -152,9 +152,18 @@ def test_a_batch_is_turned_once_for_all_clients() -> None:
     turned = batch.converted(Convention.NED_FRD)
     assert turned is batch.converted(Convention.NED_FRD)
     assert turned is not batch.converted(Convention.ENU_FLU)
-    assert turned.slots() is batch.converted(Convention.NED_FRD).slots()
+    assert turned.packed is batch.converted(Convention.NED_FRD).packed
     down = published([SENT], published_frame(None, Convention.NED_FRD, None, RFU_ENU))
     assert down.converted(Convention.NED_FRD) is down, "published so already"
+
+
+@pytest.mark.parametrize("encoding", [BinaryEncoding(), BinaryEncoding(Convention.NED_FRD), JsonEncoding(None, False)])
+def test_a_batch_of_slots_is_the_batch_of_its_samples(encoding: Encoding) -> None:
+    whole = published([SENT, replace(SENT, seq=2)])
+    packed = Batch("imu0", 0, whole.packed, whole.frame)
+    assert (len(packed), packed.seqs, list(packed.times_ns)) == (2, whole.seqs, list(whole.times_ns))
+    assert list(encoding.encode(packed)) == list(encoding.encode(whole))
+    assert packed.samples == whole.samples
 
 
 def test_losses_are_reported_with_converted_samples() -> None:
