@@ -67,18 +67,19 @@ class Batch:
     __slots__ = ("_converted", "_packed", "_samples", "device", "device_id", "frame")
 
     def __init__(
-        self, device: str, device_id: int, samples: Sequence[Sample] | bytes, frame: PublishedAxes = AS_SENT
+        self,
+        device: str,
+        device_id: int,
+        samples: Sequence[Sample] | None,
+        frame: PublishedAxes = AS_SENT,
+        packed: bytes = b"",
     ) -> None:
-        """`samples` are sample objects, or valid slots back to back."""
+        """`packed` contains the samples as valid slots back to back, and `samples` can be None."""
         self.device = device
         self.device_id = device_id  # number of the device in slots
         self.frame = frame  # axes and angles of the samples
-        self._samples: Sequence[Sample] | None = None
-        self._packed = b""
-        if isinstance(samples, bytes):
-            self._packed = samples
-        else:
-            self._samples = samples
+        self._samples = samples
+        self._packed = packed
         self._converted: dict[Convention, Batch] | None = None
 
     def __len__(self) -> int:
@@ -98,7 +99,8 @@ class Batch:
         """Samples as slots (`imud.formats.slot`) back to back. The first use encodes them."""
         packed = self._packed
         if not packed:
-            slots = encode_slots(self.samples, self.device_id)
+            assert self._samples is not None
+            slots = encode_slots(self._samples, self.device_id)
             packed = self._packed = slots[0] if len(slots) == 1 else b"".join(slots)
         return packed
 

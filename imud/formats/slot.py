@@ -14,7 +14,7 @@ The CRC-32 (IEEE 802.3, as zlib.crc32) covers bytes 0…251 with the sequence nu
 
 import struct
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 from zlib import crc32
@@ -106,6 +106,7 @@ _HEAD = struct.Struct(_NATIVE + "".join(f"{f.count}{f.code}" for f in SLOT_FIELD
 _VALUES = struct.Struct(_NATIVE + "".join(f"{f.count}{f.code}" for f in SLOT_FIELDS[_HEAD_FIELDS:-2]) + "24x")
 _BODY = struct.Struct(_NATIVE + "".join(f"{f.count}{f.code}" for f in SLOT_FIELDS[:-2]) + "24x")
 _CRC = struct.Struct("<I")
+_SLOT = struct.Struct(f"{SLOT_BYTES}s")
 _SEQ = struct.Struct("<Q")
 _T_NS = struct.Struct("<8xq240x")
 _STATUS = struct.Struct("<56xI196x")
@@ -232,6 +233,11 @@ def _fitted(sample: Sample) -> Sample:
 
 def _clipped(value: int, low: int, high: int) -> int:
     return min(max(value, low), high)
+
+
+def slots_in(packed: bytes) -> Iterator[tuple[bytes]]:
+    """Return an iterator over packed slots."""
+    return _SLOT.iter_unpack(packed)
 
 
 def slot_seqs(packed: bytes) -> tuple[int, int]:

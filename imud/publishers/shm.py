@@ -45,7 +45,7 @@ from imud.formats.ring import (
     encode_ledger_block,
     ring_path,
 )
-from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, slot_seqs
+from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, slot_seqs, slots_in
 from imud.host.files import can_replace, user_name
 from imud.model.errors import ServerError
 from imud.model.event import Event
@@ -280,6 +280,7 @@ def _process(descriptor: int) -> str:
 _lseek, _END = os.lseek, os.SEEK_END  # looked up once, because `write` uses them for each batch
 _CLOSED = struct.pack("<I", STATE_CLOSED)
 _INVALID = struct.pack("<Q", SEQ_INVALID)
+_SEQ = struct.Struct("<Q")
 _PAYLOAD = slice(8, SLOT_BYTES)
 _LEDGER_PAYLOAD = slice(LEDGER_BLOCK_OFFSET + 8, LEDGER_BLOCK_OFFSET + LEDGER_BLOCK_BYTES)
 
@@ -311,19 +312,19 @@ class ShmRing:
         """Return the sequence number of the newest sample; 0 before the first."""
         return self._newest
 
-    def write(self, first: int, last: int, packed: bytes) -> None:
-        """Write slots with the numbers `first` to `last`, oldest first. Do nothing if the file was truncated."""
+    def write(self, packed: bytes) -> None:
+        """Write slots that are back to back, oldest first. Do nothing if the file was truncated."""
         if _lseek(self._fd, 0, _END) < self._least_bytes:
             self._restore_size()
-            self._newest = last
+            self._newest = slot_seqs(packed)[1]
         elif len(packed) == SLOT_BYTES:
-            self._write_one(first, packed)
-        elif not self._write_run(first, last, packed):
-            for at in range(0, len(packed), SLOT_BYTES):
-                slot = packed[at : at + SLOT_BYTES]
-                self._write_one(slot_seqs(slot)[0], slot)
+            self._write_one(packed)
+        elif not self._write_run(packed):
+            for (slot,) in slots_in(packed):
+                self._write_one(slot)
 
-    def _write_one(self, seq: int, slot: bytes) -> None:
+    def _write_one(self, slot: bytes) -> None:
+        (seq,) = _SEQ.unpack_from(slot)
         words, at = self._words, HEADER_BYTES + (seq & self._mask) * SLOT_BYTES
         word = at >> 3
         words[word] = SEQ_INVALID
@@ -333,9 +334,10 @@ class ShmRing:
             words[FIRST_WORD] = seq
         self._newest = seq
 
-    def _write_run(self, first: int, last: int, packed: bytes) -> bool:
+    def _write_run(self, packed: bytes) -> bool:
         """Write consecutive slots. All slots are invalid from before the first payload until after the last payload.
         Return False without a write if a number is missing, or if the run reaches the end of the ring."""
+        first, last = slot_seqs(packed)
         count, begin = len(packed) // SLOT_BYTES, first & self._mask
         if first != self._newest + 1 or last != self._newest + count or begin + count > self._mask + 1:
             return False
@@ -504,7 +506,7 @@ class ShmPublisher:
         """Write samples over the oldest samples of the ring."""
         ring = self._rings.get(batch.device)
         if ring is not None:
-            ring.write(*batch.seqs, batch.packed)
+            ring.write(batch.packed)
         elif batch.device in self._places:
             self._places[batch.device].newest = batch.seqs[1]
 

@@ -64,13 +64,13 @@ class LatencyMeter:
         self.buckets = [0] * (len(LATENCY_BOUNDS_NS) + 1)
         self.sum_ns = 0
 
+    def add_one(self, latency_ns: int) -> None:
+        """Count a sample."""
+        self.buckets[bisect_left(LATENCY_BOUNDS_NS, latency_ns)] += 1
+        self.sum_ns += latency_ns
+
     def add(self, now_ns: int, times_ns: Sequence[int]) -> None:
         """Count samples with these time stamps that imud publishes at `now_ns`. The time stamps rise."""
-        if len(times_ns) == 1:
-            latency_ns = now_ns - times_ns[0]
-            self.buckets[bisect_left(LATENCY_BOUNDS_NS, latency_ns)] += 1
-            self.sum_ns += latency_ns
-            return
         latencies = [now_ns - t_ns for t_ns in reversed(times_ns)]  # reversed: ascending latencies
         self.sum_ns += sum(latencies)
         buckets, begin = self.buckets, 0
@@ -293,7 +293,10 @@ class SamplePath(ABC):
             for sample in samples:
                 if sample.status is not None:
                     self._status_seen |= sample.status & mask
-        self.latency.add(self._now_ns(), [sample.t_ns for sample in samples])
+        if len(samples) == 1:  # the usual case, without a list of the time stamps
+            self.latency.add_one(self._now_ns() - samples[0].t_ns)
+        else:
+            self.latency.add(self._now_ns(), [sample.t_ns for sample in samples])
 
 
 class SampleListener(Protocol):

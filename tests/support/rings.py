@@ -75,7 +75,8 @@ class Board:
         self.publish_samples([make_sample(seq) for seq in numbers])
 
     def publish_samples(self, samples: Sequence[Sample]) -> None:
-        self.publisher.publish(Batch(DEVICE, 3, samples))
+        if samples:  # a batch has at least one sample
+            self.publisher.publish(Batch(DEVICE, 3, samples))
 
     def tick(self, later_ns: int = 100_000_000) -> None:
         self.now_ns += later_ns

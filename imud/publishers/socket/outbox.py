@@ -22,7 +22,7 @@ from typing import Final
 from imud.attitude.conventions import Convention
 from imud.contracts.publisher import Batch
 from imud.formats.jsonrpc import FRAME_HEADER, encode, encode_notification, frame_of, line_of, with_texts
-from imud.formats.slot import SLOT_BYTES
+from imud.formats.slot import SLOT_BYTES, slots_in
 from imud.model.errors import reason_of
 from imud.model.sample import Sample
 
@@ -108,7 +108,7 @@ class BinaryEncoding(Encoding):
         packed = batch.packed
         if len(packed) == SLOT_BYTES:  # the usual case: faster than a list comprehension
             return [_SLOT_HEADER + packed]
-        return [_SLOT_HEADER + packed[at : at + SLOT_BYTES] for at in range(0, len(packed), SLOT_BYTES)]
+        return [_SLOT_HEADER + slot for (slot,) in slots_in(packed)]
 
     def encode_one(self, batch: Batch, index: int) -> bytes:
         if self._convention is not None:
