@@ -227,6 +227,33 @@ class Work(NamedTuple):
         return f"{started}; {self.stop}" if self.stop else started
 
 
+class WorkLock:
+    """Lock of one device: one command, calibration or comparison at a time."""
+
+    def __init__(self, device: str, host: HostClock) -> None:
+        self._device, self._host = device, host
+        self._lock = asyncio.Lock()
+        self._work: Work | None = None  # work that holds the lock
+
+    @property
+    def busy(self) -> bool:
+        return self._lock.locked()
+
+    async def begin(self, name: str, stop: str) -> None:
+        """Wait at most WAIT_S for the end of other work. Raises CommandError with the name of the other work."""
+        try:
+            async with asyncio.timeout(WAIT_S):
+                await self._lock.acquire()
+        except TimeoutError:
+            words = self._work.words(self._host.now_ns()) if self._work is not None else "other work has just ended"
+            raise CommandError(f"{self._device}: {words}; try again later") from None
+        self._work = Work(name, self._host.now_ns(), REQUESTED_BY.get() or "imud", stop)
+
+    def end(self) -> None:
+        self._work = None
+        self._lock.release()
+
+
 class DeviceSettings:
     """Identity and settings of one device; an attachment. Synchronization: the loop's thread only."""
 
@@ -255,8 +282,7 @@ class DeviceSettings:
         # CLOCK_MONOTONIC until which a restart of the device counter is a result of a script of imud
         self._own_until_ns = self._resets = 0
         self.resets_requested = 0  # number of restarts of the device counter that a script of imud caused
-        self._lock = asyncio.Lock()
-        self._work: Work | None = None  # work that holds the lock
+        self._work = WorkLock(config.name, host)
         # values that imud wrote since the last restart, of settings that the device does not report
         self._written: dict[str, Any] = {}
         self._unsaved = False  # whether a write since the last restart may be missing in flash
@@ -307,7 +333,7 @@ class DeviceSettings:
     @property
     def busy(self) -> bool:
         """Whether imud reads or writes settings, or executes a command."""
-        return self._lock.locked()
+        return self._work.busy
 
     @asynccontextmanager
     async def exclusive(self, work: str, stop: str = "") -> AsyncIterator[None]:
@@ -315,19 +341,12 @@ class DeviceSettings:
 
         Raises CommandError if other work, for example a calibration, does not end within WAIT_S. The error names it.
         """
-        try:
-            async with asyncio.timeout(WAIT_S):
-                await self._lock.acquire()
-        except TimeoutError:
-            words = self._work.words(self._host.now_ns()) if self._work is not None else "other work has just ended"
-            raise CommandError(f"{self._config.name}: {words}; try again later") from None
-        self._work = Work(work, self._host.now_ns(), REQUESTED_BY.get() or "imud", stop)
+        await self._work.begin(work, stop)
         try:
             yield
         finally:
-            self._work = None
             self._own_until_ns = self._host.now_ns() + OWN_NS
-            self._lock.release()
+            self._work.end()
 
     # --- reports of the device ----------------------------------------------------------------------------------------
 
