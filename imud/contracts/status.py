@@ -313,6 +313,7 @@ class MqttStatus(msgspec.Struct, frozen=True):
     commands: int = 0  # number of requested commands that imud ran or tried to run
     commands_refused: int = 0  # number of rejected requests
     refused: dict[str, str] = {}  # reason for each topic that the broker refuses; imud sends all other messages
+    replies_lost: int = 0  # number of discarded replies to requests: the broker refuses the topic, or too many wait
 
 
 class ClientStatus(msgspec.Struct, frozen=True):

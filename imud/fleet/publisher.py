@@ -284,7 +284,7 @@ class MqttPublisher:
             sender.broker, sender.problem, writer.problem, self._queue.queued, spool.spooled, sender.sent,
             sender.acknowledged, spool.messages, spool.used_bytes, spool.thinned, dropped, sender.reconnects,
             commands.run if commands is not None else 0, commands.refused if commands is not None else 0,
-            dict(sender.refused),
+            dict(sender.refused), sender.replies_lost,
         )  # fmt: skip
 
     # --- states ------------------------------------------------------------------------------------------------------

@@ -149,6 +149,7 @@ class MqttSender:
         self.problem = ""
         self.sent = 0  # number of sent messages of the spool, including repeated messages
         self.acknowledged = 0  # number of acknowledged messages of the spool
+        self.replies_lost = 0  # number of discarded replies: the broker refuses the topic, or too many wait
         self.reconnects = 0  # number of connections after the first
         self.failure: BaseException | None = None  # internal error that ended the thread
         self.refused: Mapping[str, str] = {}  # reason for each topic that the broker refuses
@@ -221,12 +222,19 @@ class MqttSender:
                         self._due[topic] = None
         self._ring()
 
+    def removals(self) -> frozenset[str]:
+        """Return the topics whose removal the broker has not acknowledged."""
+        with self._lock:
+            return frozenset(topic for topic, payload in self._retained.items() if not payload)
+
     def reply(self, reply: CommandReply) -> None:
         """Send a reply before all other messages, and again after a lost connection. Any thread may call it."""
         with self._lock:
             if reply.topic in self.skipped:
+                self.replies_lost += 1
                 log.warning("mqtt: discarding a reply, because the broker refuses messages of %s", reply.topic)
                 return
+            self.replies_lost += len(self._replies) == REPLIES_MAX
             self._replies.append(reply)
         self._ring()
 
@@ -322,6 +330,7 @@ class MqttSender:
                 message.topic, message.payload, kind, retain=message.is_retained, correlation=correlation
             )
         except MessageRefused as error:
+            self.replies_lost += message.reply is not None
             self._refuse(message.topic, str(error))
             return
         self.sent += bool(message.row)
@@ -361,6 +370,7 @@ class MqttSender:
         refused, connection.refused = connection.refused, []
         for number, problem in refused:
             if (message := self._in_flight.pop(number, None)) is not None:
+                self.replies_lost += message.reply is not None
                 self._refuse(message.topic, problem)
         if not connection.acknowledged:
             return
@@ -411,7 +421,9 @@ class MqttSender:
             return
         with self._lock:
             self.skipped, self.refused = frozenset(self._refusals.skipped), problems
-            self._replies = deque((one for one in self._replies if one.topic not in self.skipped), REPLIES_MAX)
+            kept = [one for one in self._replies if one.topic not in self.skipped]
+            self.replies_lost += len(self._replies) - len(kept)
+            self._replies = deque(kept, REPLIES_MAX)
             self._due = {topic: None for topic in self._due if topic not in self.skipped}
             self._outbox = deque(row for row in self._outbox if row.topic not in self.skipped)
         self.wanting()
@@ -436,7 +448,9 @@ class MqttSender:
             messages, self._in_flight = list(self._in_flight.values()), {}
             self._refusals.lose([one.topic for one in messages], problem, self._now_ns())
             replies = [one.reply for one in messages if one.reply is not None]
-            self._replies = deque([*replies, *self._replies], REPLIES_MAX)
+            replies = [*replies, *self._replies]
+            self.replies_lost += max(0, len(replies) - REPLIES_MAX)
+            self._replies = deque(replies, REPLIES_MAX)
         self._update_refusals()
         self.wanting()
 

@@ -203,6 +203,12 @@ def test_the_number_of_waiting_replies_is_limited() -> None:
     bench.broker.problem, bench.broker.answers = "", 100
     bench.drive(REPLIES_MAX + 2)
     assert bench.sent() == [b"%d" % number for number in range(5, REPLIES_MAX + 5)]
+    assert bench.sender.replies_lost == 5
+    bench.broker.refuses = {"answer"}
+    for number in range(3):  # refused, and discarded before the end of the refusal
+        bench.sender.reply(CommandReply("answer", b"%d" % number, None))
+        bench.drive(3)
+    assert bench.sender.replies_lost == 8
 
 
 LONG_NS = 600 * NS_PER_S  # longer than the pauses of this test

@@ -140,6 +140,19 @@ def test_samples_of_a_refused_topic_wait_in_the_spool(tmp_path: Path, monkeypatc
     assert (len(bench.broker.connections), bench.sender.refused) == (1, {})
 
 
+def test_a_removal_survives_a_restart_until_the_broker_acknowledges_it(tmp_path: Path) -> None:
+    sent: list[list[str]] = []
+    for answers in (0, 0, 9, 9):
+        bench = WriterBench(tmp_path)
+        bench.broker.answers = answers
+        if not sent:
+            bench.queue.put_state(SentState({}, {"gw/old/status": None}))
+        bench.work(3)
+        sent.append([topic for topic, payload, _ in bench.broker.connections[0].sent if not payload])
+        bench.writer.close()
+    assert sent == [["gw/old/status"]] * 3 + [[]]
+
+
 def test_waiting_messages_are_sent_in_order_with_the_allowed_rate(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path, messages_per_s=3)
     bench.broker.problem = "no route"

@@ -570,6 +570,7 @@ MQTT_FAMILIES: Final = (
     _counter_of("reconnects", "Connections to a broker after the first.", lambda status: status.reconnects),
     _counter_of("commands", "Requests for commands that imud ran.", lambda status: status.commands),
     _counter_of("commands_refused", "Rejected requests for commands.", lambda status: status.commands_refused),
+    _counter_of("replies_lost", "Discarded replies to requests for commands.", lambda status: status.replies_lost),
 )  # fmt: skip
 
 
