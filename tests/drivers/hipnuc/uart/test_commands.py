@@ -6,11 +6,12 @@ from typing import Any
 
 import pytest
 
-from imud.contracts.script import Request, RequestScript
+from imud.contracts.script import Rejection, Reply, Request, RequestScript
 from imud.drivers.hipnuc.common import AttitudeMode, LevelReset
 from imud.drivers.hipnuc.uart import commands as c
 from imud.model.errors import BadArgument
-from tests.support.script_runners import unanswered_ms
+from imud.model.ledger import Ledger
+from tests.support.script_runners import offline_runner, unanswered_ms
 
 H91, H92 = c.OutputMessage.HI91, c.OutputMessage.HI92
 
@@ -66,6 +67,20 @@ def test_commands_are_as_printed(request_: Request, text: str) -> None:
 )
 def test_timeouts_without_replies(script: RequestScript[object], timeouts_ms: list[float]) -> None:
     assert [*unanswered_ms(script)] == timeouts_ms
+
+
+@pytest.mark.parametrize("request_", [one for one, _ in PRINTED if not one.silent], ids=lambda one: one.name)
+def test_replies_in_lower_case_and_between_nmea_lines_count(request_: Request) -> None:
+    """Newer firmware sends NMEA sentences between the lines of a reply."""
+    part = {"version": ["PNAME=HI14"], "report": ["ATT_MODE=0"]}.get(request_.kind, [])
+    for end, outcome in (("ok", Reply), ("Ok ", Reply), ("err 3", Rejection)):
+        ledger = Ledger()
+        runner = offline_runner(ledger)
+        runner.start(request_, 5)
+        for line in ("$GPHDT,1.0,T*00", *part, "$PASHR,1,2*00"):
+            assert runner.on_message(line, 6) is None
+        assert runner.on_message(end, 7) == outcome((*part, end))
+        assert ledger.replies_unsolicited == 2
 
 
 IDENTITY = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
