@@ -20,6 +20,7 @@ import msgspec
 
 from imud.formats.can import CanFrame
 from imud.model.errors import ImudError, reason_of
+from imud.model.ledger import LOST_FIELDS
 from imud.model.sample import DEVICE_NAME_PATTERN
 
 VERSION: Final = 1  # Version of the layout of records. A reader rejects other versions.
@@ -161,6 +162,11 @@ class CheckRecord(msgspec.Struct, frozen=True):
     sample_t_ns: int
     sample_t_err_ns: int  # error of the newest sample; 0 without a sample
     ledger: dict[str, int]
+
+    def __post_init__(self) -> None:
+        """Raise ValueError if the ledger lacks a counter of lost samples."""
+        if missing := [name for name in LOST_FIELDS if name not in self.ledger]:
+            raise ValueError(f"expected a ledger with {missing[0]}")
 
 
 class LostRecord(NamedTuple):

@@ -7,6 +7,7 @@ import pytest
 
 from imud.cli.record import Contents
 from imud.formats.records import CheckRecord, Kind, PathRecord, encode_object, records_of
+from imud.model.errors import ImudError
 from imud.model.ledger import LEDGER_FIELDS
 from imud.model.units import NS_PER_S
 from tests.cli.conftest import Cli
@@ -71,6 +72,9 @@ def test_a_device_that_was_removed_and_added_counts_from_the_begin_again() -> No
     add(Kind.PATH, PathRecord("hipnuc-uart", {}, 0, {"samples": 0}, b""))  # a second reload
     check(30, 200, 0)
     check(32, 400, 5)
+    without = {"t_ns": 0, "seq": 0, "sample_t_ns": 0, "sample_t_err_ns": 0, "ledger": {"lost_crc": 0}}
+    with pytest.raises(ImudError, match="record of kind 10: expected a ledger with lost_gap_device"):
+        add(Kind.CHECK, without)
     device = contents.devices[0]
     assert (device.samples, device.lost) == (400 + 100 + 200, 2 + 3 + 5)
     assert device.rate_hz == pytest.approx(700 / (4 + 1 + 2))
