@@ -238,6 +238,8 @@ async def test_replies_to_wrong_tokens_are_delayed_and_limited(tmp_path: Path, m
     monkeypatch.setattr(web_app, "FAILURE_S", 0.0)
     async with running(tmp_path) as site:
         assert await site.post("/api/login", {"token": "wrong"}) == (401, {"error": "wrong token"})
+        monkeypatch.setattr(web_app, "CHECKS_TOTAL_MAX", 0)
+        assert (await site.post("/api/login", {"token": TOKEN}))[0] == 429, "too many from all addresses"
     async with running(tmp_path, token="") as site:
         assert (await site.post("/api/login", {"token": ""}))[0] == 403
 

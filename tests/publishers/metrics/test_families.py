@@ -421,7 +421,9 @@ def test_each_metric_is_a_value_of_a_port() -> None:
 
 
 def test_each_metric_is_a_value_of_the_output() -> None:
-    status = MqttStatus("mqtt://a:1883", "", "", 1, 2, 3, 4, 5, 6, 7, {"age": 8, "space": 9}, 10, 11, 12, {"a": "no"}, 13)
+    status = MqttStatus(
+        "mqtt://a:1883", "", "", 1, 2, 3, 4, 5, 6, 7, {"age": 8, "space": 9}, 10, 11, 12, {"a": "no"}, 13
+    )
     assert shown("imud_mqtt_", Snapshot(mqtts=(status,))) == {
         "connected": 1, "spooling": 1, "queued_total": 1, "spooled_messages_total": 2, "sent_messages_total": 3,
         "acknowledged_messages_total": 4, "waiting_messages": 5, "refused_topics": 1, "spool_bytes": 6,
