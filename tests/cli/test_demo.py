@@ -64,7 +64,7 @@ def test_the_commands_it_prints_reach_it_from_another_directory() -> None:
         assert clock.endswith("imud clock")
         printed = pasted(export, f"{watch} --count 3", status, f"{clock} --duration 0.1", ring)
         assert len(re.findall(r"^\d\d:\d\d:\d\d\.\d{3} ", printed, re.MULTILINE)) == 3
-        for words in ("demo: running", "verdict", "accel_m_s2="):
+        for words in ("demo: ok", "running; ", "verdict", "accel_m_s2="):
             assert words in printed
         with urlopen(scrape.removeprefix("curl ")) as answer:
             assert b'imud_samples_total{device="demo"}' in answer.read()
