@@ -1,7 +1,7 @@
 """Noise has the declared strength, depends on its seed, and does not change the attitude."""
 
 from math import hypot
-from statistics import fmean, pstdev
+from statistics import correlation, fmean, pstdev
 
 import pytest
 
@@ -19,6 +19,18 @@ def test_white_noise_has_the_stated_spread() -> None:
         assert pstdev(r.gyro_rad_s[axis] for r in read) == pytest.approx(0.2, rel=0.06)
         assert pstdev(r.mag_t[axis] for r in read) == pytest.approx(0.3, rel=0.06)
     assert pstdev(r.pressure_pa for r in read) == pytest.approx(4.0, rel=0.06)
+
+
+def test_noise_is_white_around_truth_plus_bias() -> None:
+    noise = Noise(5)
+    read = [noise.add(TRUTH, 42.0) for _ in range(2000)]
+    bias = noise.bias(42.0)[1]
+    for axis in range(3):
+        mean = fmean(r.gyro_rad_s[axis] for r in read)
+        assert mean == pytest.approx(TRUTH.gyro_rad_s[axis] + bias[axis], abs=5e-5)
+    x, y, *_ = ([r.accel_m_s2[axis] for r in read] for axis in range(3))
+    for a, b in ((x[1:], x[:-1]), (x, y), (x[1:], y[:-1])):
+        assert abs(correlation(a, b)) < 0.09  # 4 sigma of 2000 samples
 
 
 def test_bias_wanders_slowly_within_its_bounds() -> None:
