@@ -17,7 +17,7 @@ import msgspec
 from tests.bench.rows import Row
 
 PARTS = (
-    "clock", "clock_table", "clock_lines", "can_devices", "end_to_end", "latency", "gpsd", "recording", "mqtt",
+    "clock", "clock_table", "clock_lines", "can_devices", "end_to_end", "latency", "gpsd", "recording",
 )  # fmt: skip
 SHORT_LIMIT_S: Final = 300.0  # goal on an idle host
 OUTPUT = Path("build/bench.json")

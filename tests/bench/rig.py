@@ -5,9 +5,9 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, sleep
 from typing import NamedTuple
@@ -47,8 +47,6 @@ class Load:
     shm: bool = True
     record_to: str = ""
     """Directory of the recording; empty for no recording."""
-    mqtt: Mapping[str, object] = field(default_factory=dict)
-    """Configuration of the output `mqtt`; empty for no output."""
 
     @property
     def frames(self) -> int:
@@ -58,8 +56,6 @@ class Load:
 @dataclass(frozen=True)
 class Outcome:
     cpu_us_per_sample: float
-    loop_us_per_sample: float
-    written_bytes_s: float
     cpu_share: float
     p50_us: float
     p99_us: float
@@ -116,16 +112,6 @@ def cpu_ns(pid: int) -> int:
     return total
 
 
-def loop_ns(pid: int) -> int:
-    return int(Path(f"/proc/{pid}/task/{pid}/schedstat").read_text().split()[0])
-
-
-def written_bytes(pid: int) -> int:
-    """Return the number of bytes that a process has written to the disk (proc(5), /proc/PID/io)."""
-    lines = Path(f"/proc/{pid}/io").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("write_bytes:"))
-
-
 def rss_mb(pid: int) -> float:
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6
 
@@ -141,7 +127,6 @@ def configuration(folder: Path, ports: Sequence[str], load: Load) -> Path:
         | ({} if load.latency_ms is None else {"latency_ms": load.latency_ms}),
         "metrics": {"port": 0},
         "recorder": {"enabled": bool(load.record_to), "directory": load.record_to or str(folder)},
-        **({"mqtt": load.mqtt} if load.mqtt else {}),
         "devices": devices,
     }  # fmt: skip
     file = folder / "imud.yaml"
@@ -176,29 +161,27 @@ def start_server(stack: ExitStack, folder: Path, ports: Sequence[str], load: Loa
     return server
 
 
-def start_writer(stack: ExitStack, folder: Path, load: Load, *options: str, cores: set[int] = REST_CORES) -> Process:
+def start_writer(stack: ExitStack, folder: Path, load: Load, *options: str) -> Process:
     (folder / "times").write_bytes(bytes(8 * load.frames))
     args = ["--devices", str(load.devices), "--rate", str(load.rate_hz), "--frames", str(load.frames)]
     args += ["--phases", str(load.phases), "--apart", str(load.apart), "--times", str(folder / "times"), *options]
-    return stack.enter_context(Process(cores, "-m", "tests.bench.writer", *args))
+    return stack.enter_context(Process(REST_CORES, "-m", "tests.bench.writer", *args))
 
 
-def start_readers(stack: ExitStack, folder: Path, load: Load, cores: set[int] = REST_CORES) -> Process:
+def start_readers(stack: ExitStack, folder: Path, load: Load) -> Process:
     args = ["--socket", str(folder / "s"), "--clients", str(load.clients), "--encoding", load.encoding]
     args += ["--times", str(folder / "times"), "--frames", str(load.frames)]
     args += ["--skip", str(int(load.warm_s * load.rate_hz))]
     wanted = {"rate_hz": load.client_hz, "latency_ms": load.latency_ms}
     args += ["--watch", json.dumps({name: value for name, value in wanted.items() if value is not None})]
     args += ["--bare"] * load.bare
-    readers = stack.enter_context(Process(cores, "-m", "tests.bench.readers", *args))
+    readers = stack.enter_context(Process(REST_CORES, "-m", "tests.bench.readers", *args))
     readers.line()
     return readers
 
 
 class Used(NamedTuple):
     cpu_ns: int
-    loop_ns: int
-    written_bytes: int
     elapsed_s: float
     refused: int
 
@@ -207,13 +190,12 @@ def measure_cpu(load: Load, writer: Process, pid: int) -> Used:
     """Start the writer. Return the cost of process `pid` during the measurement."""
     writer.say("go")
     sleep(load.warm_s)
-    before_ns, before_loop_ns, before_bytes, begun = cpu_ns(pid), loop_ns(pid), written_bytes(pid), monotonic()
+    before_ns, begun = cpu_ns(pid), monotonic()
     sleep(load.seconds - END_S)
-    used_ns, used_loop_ns, elapsed = cpu_ns(pid) - before_ns, loop_ns(pid) - before_loop_ns, monotonic() - begun
-    used_bytes = written_bytes(pid) - before_bytes
+    used_ns, elapsed = cpu_ns(pid) - before_ns, monotonic() - begun
     refused = int(writer.line())
     sleep(0.05)  # wait for the last samples
-    return Used(used_ns, used_loop_ns, used_bytes, elapsed, refused)
+    return Used(used_ns, elapsed, refused)
 
 
 def run(load: Load) -> Outcome:
@@ -233,8 +215,7 @@ def run(load: Load) -> Outcome:
     total = load.frames * load.devices - load.apart * sum(range(load.devices))
     counted = used.elapsed_s * load.rate_hz * load.devices
     return Outcome(
-        cpu_us_per_sample=used.cpu_ns / 1e3 / counted, loop_us_per_sample=used.loop_ns / 1e3 / counted,
-        written_bytes_s=used.written_bytes / used.elapsed_s, cpu_share=used.cpu_ns / 1e9 / used.elapsed_s,
+        cpu_us_per_sample=used.cpu_ns / 1e3 / counted, cpu_share=used.cpu_ns / 1e9 / used.elapsed_s,
         p50_us=figures["p50_us"], p99_us=figures["p99_us"], max_us=figures["max_us"], received=figures["samples"],
         # a client with `rate_hz` receives only a part of the samples
         gaps=figures["gaps"] + total - figures["samples"] if load.clients and load.client_hz is None else 0,
