@@ -1,13 +1,43 @@
-"""Ledger of a reader: it balances after each message, for any order and any repetition."""
+"""Ledger of a reader, across the network and restarts, for any order and repetition; UTC time of records."""
 
 import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imud.fleet.accounts import FleetLedger, StreamCounts, StreamKey, key_of
-from imud.fleet.messages import NUMBER_MOST, VERSION, DropCause, FleetMessage, Interval, MessageKind, Stream
+from imud.fleet.accounts import (
+    BOOTS_MAX,
+    BootClocks,
+    BootKey,
+    BootOffset,
+    FleetLedger,
+    GatewayState,
+    PlacedTime,
+    SpoolPositions,
+    StoredAccount,
+    StreamCounts,
+    StreamKey,
+    StreamPosition,
+    boot_of,
+    decode_state,
+    key_of,
+    offset_of,
+    placed,
+)
+from imud.fleet.messages import (
+    CLOCK_SET_NS,
+    NUMBER_MOST,
+    VERSION,
+    DropCause,
+    FleetMessage,
+    GatewayClock,
+    Interval,
+    MessageKind,
+    Stream,
+)
+from imud.fleet.reader import Fleet, FleetDelivery, ReaderConnection
 from imud.model.sample import Sample, Sync
+from tests.fleet.fleet_gateway import UTC_NS, event_message, intervals_message, not_set, samples_message, synchronised
 
 
 def message(first: int, last: int, kind: MessageKind = MessageKind.SAMPLES, *, boot: str = "1") -> FleetMessage:
@@ -60,27 +90,6 @@ def test_a_duplicate_fills_no_gap() -> None:
 RANGES = st.tuples(st.integers(1, 40), st.integers(0, 12)).map(lambda pair: (pair[0], pair[0] + pair[1]))
 
 
-@given(
-    st.lists(
-        st.tuples(RANGES, st.sampled_from([MessageKind.SAMPLES, MessageKind.DROPPED, MessageKind.INTERVALS])),
-        min_size=1,
-    )
-)
-def test_the_ledger_balances_for_any_sequence_of_messages(taken: list[tuple[tuple[int, int], MessageKind]]) -> None:
-    ledger = FleetLedger(from_begin=True)
-    seen: set[int] = set()
-    for (first, last), kind in taken:
-        fresh = ledger.take(message(first, last, kind), Stream.SAMPLES)
-        new = set(range(first, last + 1)) - seen
-        assert (fresh is None) == (not new)
-        if fresh is not None and kind is MessageKind.SAMPLES:
-            assert {one.seq for one in fresh.samples} == new
-        seen |= new
-        (counts,) = ledger.counts.values()
-        assert counts.balance == 0
-        assert counts.missing == max(seen) - len(seen)
-
-
 def test_old_boots_leave_the_ledger_of_the_gateway_with_the_most_streams(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("imud.fleet.accounts.STREAMS_MAX", 60)
     ledger, changed = FleetLedger(), set[StreamKey]()
@@ -106,3 +115,220 @@ def test_the_sum_of_duplicates_is_limited() -> None:
         ledger.take(long, Stream.SAMPLES)
     assert ledger.counts[key_of(long, Stream.SAMPLES)].duplicates == NUMBER_MOST
     assert msgspec.json.encode(ledger.stored(key_of(long, Stream.SAMPLES)))
+
+
+SET = GatewayClock(0, UTC_NS, synchronised=True, error_ns=40)
+NOT_SET = GatewayClock(0, 123, synchronised=False)
+KNOWN = BootOffset(1_000_000, UTC_NS, 40)
+
+
+@pytest.mark.parametrize(
+    ("utc_ns", "t_ns", "clock", "known", "expected"),
+    [
+        (UTC_NS + 5, 5, SET, None, PlacedTime(UTC_NS + 5, True, 40)),
+        # the time and the offset were read microseconds apart
+        (UTC_NS + 9_000, 5, SET, None, PlacedTime(UTC_NS + 9_000, True, 40)),
+        (77, 5, SET, None, PlacedTime(UTC_NS + 5, True, 40)),  # the clock stepped after the sample, within one message
+        (77, 5, NOT_SET, None, PlacedTime(77, False, None)),
+        # systemd set the clock to a wrong time after 2020
+        (CLOCK_SET_NS + 5, 5, NOT_SET, None, PlacedTime(CLOCK_SET_NS + 5, False, None)),
+        (77, 5_000_000, NOT_SET, KNOWN, PlacedTime(UTC_NS + 5_000_000, True, 40 + 2_000)),  # 4 ms at 500 ppm: 2 us
+        (77, None, NOT_SET, KNOWN, PlacedTime(77, False, None)),
+        (CLOCK_SET_NS, 5, None, None, PlacedTime(CLOCK_SET_NS, True, None)),  # a gateway with an earlier version
+        (CLOCK_SET_NS - 1, 5, None, None, PlacedTime(CLOCK_SET_NS - 1, False, None)),
+        (0, 5, None, BootOffset(0, UTC_NS, None), PlacedTime(UTC_NS + 5, True, None)),
+    ],
+)
+def test_utc_time_of_a_record(
+    utc_ns: int, t_ns: int | None, clock: GatewayClock | None, known: BootOffset | None, expected: PlacedTime
+) -> None:
+    assert placed(utc_ns, t_ns, clock, known) == expected
+
+
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        (synchronised(event_message(1, 5), t_ns=3, error_ns=40), BootOffset(3, UTC_NS, 40)),
+        (not_set(samples_message(1, 2)), None), (samples_message(1, 2), BootOffset(2_000_000, UTC_NS, None)),
+        (intervals_message(4, 6), BootOffset(4_000_000, UTC_NS, None)), (intervals_message(4, 6, utc_ns=0), None),
+        (event_message(1, 5), None),
+        (
+            intervals_message(4, 6, utc_ns=CLOCK_SET_NS - 4_000_000),
+            BootOffset(4_000_000, CLOCK_SET_NS - 4_000_000, None),
+        ),
+    ],
+)  # fmt: skip
+def test_clock_offset_of_a_message(message: FleetMessage, expected: BootOffset | None) -> None:
+    assert offset_of(message) == expected
+
+
+def test_a_boot_is_fresh_once_and_the_newest_offset_is_used() -> None:
+    clocks = BootClocks()
+    assert clocks.take(not_set(samples_message(1, 2))) is None
+    assert clocks.take_fresh() == {}
+    first = BootOffset(2, UTC_NS, 9)
+    assert clocks.take(synchronised(samples_message(3, 4, boot="1-2"), t_ns=2, error_ns=9)) == first
+    assert clocks.take_fresh() == {BootKey("gw", "1"): first}
+    later = BootOffset(5, UTC_NS, 3)
+    assert clocks.take(synchronised(samples_message(5, 6), t_ns=5, error_ns=3)) == later
+    assert clocks.take(not_set(samples_message(7, 8))) == later
+    assert clocks.take_fresh() == {}
+    assert clocks.take(samples_message(1, 2, boot="2", utc_ns=0)) is None
+    assert boot_of(samples_message(1, 1, boot="00ff-3")) == BootKey("gw", "00ff"), (
+        "a device with a restarted count belongs to the boot"
+    )
+
+
+def test_a_state_contains_the_clock_offset() -> None:
+    clocks, state = BootClocks(), GatewayState(v=1, online=True, boot="1", clock=SET)
+    clocks.take_state("gw", msgspec.structs.replace(state, clock=NOT_SET))
+    clocks.take_state("gw", msgspec.structs.replace(state, clock=None))
+    assert clocks.offsets == {}
+    clocks.take_state("gw", state)
+    assert clocks.take_fresh() == clocks.offsets == {BootKey("gw", "1"): BootOffset(0, UTC_NS, 40)}
+    clocks = BootClocks()
+    for number in range(BOOTS_MAX + 1):
+        clocks.take_state(f"gw-{number}", state)
+    assert len(clocks.offsets) == BOOTS_MAX
+    assert BootKey("gw-0", "1") not in clocks.offsets
+    assert BootKey(f"gw-{BOOTS_MAX}", "1") in clocks.offsets
+    assert len(clocks.take_fresh()) == BOOTS_MAX, "a reader may never take the offsets"
+
+
+KEY = StreamKey("gw", "1", "bow", "samples")
+
+
+def state(last: int, boot: str = "1") -> GatewayState:
+    return GatewayState(v=1, online=True, boot=boot, positions=[StreamPosition(boot, "bow", "samples", 1, last)])
+
+
+def account_of(positions: SpoolPositions, ledger: FleetLedger) -> tuple[int, int, int]:
+    """Return the numbers that the gateway sent, the reader received, and the spool contains."""
+    account = positions.accounts(ledger)[KEY]
+    assert account.balance == 0
+    return account.sent, account.received, account.in_spool
+
+
+def test_numbers_spooled_before_the_first_state_count_only_with_from_begin() -> None:
+    positions, ledger = SpoolPositions(), FleetLedger()
+    positions.take("gw", state(40))
+    assert account_of(positions, ledger) == (0, 0, 0)
+    positions.take("gw", state(50))
+    assert account_of(positions, ledger) == (10, 0, 10)
+    ledger.take(message(31, 40), Stream.SAMPLES)
+    assert account_of(positions, ledger) == (20, 10, 10)
+    positions = SpoolPositions(from_begin=True)
+    positions.take("gw", state(40))
+    assert account_of(positions, FleetLedger()) == (40, 0, 40)
+
+
+def test_an_old_state_does_not_reduce_the_positions() -> None:
+    positions, ledger = SpoolPositions(), FleetLedger()
+    ledger.take(message(1, 30), Stream.SAMPLES)
+    positions.take("gw", state(50))
+    positions.take("gw", state(20))
+    assert account_of(positions, ledger) == (50, 30, 20)
+    positions.take("gw", state(7, "2"))
+    account = positions.accounts(ledger)[KEY._replace(boot="2")]
+    assert (account.sent, account.in_spool) == (0, 0), "a reboot has its own account"
+
+
+DEEP = b'{"v":1,"online":true,"boot":"1","mqtt":{"deep":' + b"[" * 100_000
+
+
+@pytest.mark.parametrize("payload", [b"", b"[]", b'{"v":1}', b'{"v":1,"online":1,"boot":"1"}', b"\xff", DEEP])
+def test_invalid_payloads_are_rejected(payload: bytes) -> None:
+    with pytest.raises(ValueError, match="expected the state of a gateway"):
+        decode_state(payload)
+    assert decode_state(b'{"v":1,"online":false,"boot":"ab","reason":"lost"}').reason == "lost", "a will is a state"
+
+
+TOO_MUCH = 1 << 62
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        msgspec.structs.replace(state(3), boot="x" * 65),
+        msgspec.structs.replace(state(3), reason="\0"),
+        msgspec.structs.replace(state(3), clock=GatewayClock(TOO_MUCH, 0, synchronised=True)),
+        msgspec.structs.replace(state(3), clock=GatewayClock(0, -TOO_MUCH, synchronised=True)),
+        msgspec.structs.replace(state(3), clock=GatewayClock(0, 0, synchronised=True, error_ns=TOO_MUCH)),
+        msgspec.structs.replace(state(3), positions=[StreamPosition("", "bow", "samples", 1, 2)]),
+        state(TOO_MUCH),
+    ],
+)
+def test_values_that_no_database_can_store_are_rejected(bad: GatewayState) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        decode_state(msgspec.json.encode(bad))
+    assert decode_state(msgspec.json.encode(state(TOO_MUCH - 1)))
+
+
+KINDS = st.sampled_from([MessageKind.SAMPLES, MessageKind.DROPPED, MessageKind.INTERVALS])
+MESSAGES = st.tuples(st.sampled_from(["1", "2"]), RANGES, KINDS)
+STATES = st.tuples(st.sampled_from(["1", "2"]), st.integers(1, 60))
+
+
+@given(st.lists(st.one_of(MESSAGES, STATES, st.just("restart"), st.just("killed"))))
+def test_the_ledger_balances_for_any_sequence_and_any_number_of_restarts(steps: list[object]) -> None:
+    ledger, positions = FleetLedger(from_begin=True), SpoolPositions(from_begin=True)
+    seen: dict[str, set[int]] = {"1": set(), "2": set()}
+    stored: dict[StreamKey, bytes] = {}
+    newest: dict[str, int] = {}
+    last: tuple[str, tuple[int, int], MessageKind] | None = None
+
+    def take(boot: str, span: tuple[int, int], kind: MessageKind) -> None:
+        fresh = ledger.take(message(*span, kind, boot=boot), Stream.SAMPLES)
+        new = set(range(span[0], span[1] + 1)) - seen[boot]
+        assert (fresh is None) == (not new)
+        if fresh is not None and kind is MessageKind.SAMPLES:
+            assert [one.seq for one in fresh.samples] == sorted(new)
+        seen[boot] |= new
+        stored[KEY._replace(boot=boot)] = msgspec.json.encode(ledger.stored(KEY._replace(boot=boot)))
+
+    for step in steps:
+        if step in ("restart", "killed"):
+            ledger, positions = FleetLedger(from_begin=True), SpoolPositions(from_begin=True)
+            newest.clear()
+            for key, account in stored.items():
+                ledger.restore(key, msgspec.json.decode(account, type=StoredAccount))
+            if step == "killed" and last is not None:
+                take(*last)
+        elif isinstance(step, tuple) and len(step) == 3:
+            last = step
+            take(*step)
+        else:
+            assert isinstance(step, tuple)
+            boot, position = step
+            positions.take("gw", state(position, boot))
+            newest[boot] = max(position, newest.get(boot, 0))
+        for key, told in positions.accounts(ledger).items():
+            numbers = seen[key.boot]
+            assert (told.balance, told.sent) == (0, max(numbers | {newest.get(key.boot, 0)}))
+            assert told.counts.missing == max(numbers, default=0) - len(numbers)
+            assert told.in_spool == max(0, newest.get(key.boot, 0) - max(numbers, default=0))
+
+
+def test_the_number_of_positions_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("imud.fleet.accounts.POSITIONS_MAX", 2)
+    positions = SpoolPositions(from_begin=True)
+    for boot in ("1", "2", "1", "3"):
+        positions.take("gw", state(5, boot))
+    assert [key.boot for key in positions.accounts(FleetLedger())] == ["1", "3"]
+
+
+def test_a_stored_ledger_does_not_change() -> None:
+    ledger = FleetLedger()
+    ledger.take(message(1, 4, MessageKind.DROPPED), Stream.SAMPLES)
+    stored = ledger.stored(KEY)
+    ledger.take(message(5, 9, MessageKind.DROPPED), Stream.SAMPLES)
+    assert stored == StoredAccount(StreamCounts(1, 4, dropped={"space": 4}), [])
+
+
+def test_the_size_of_the_stored_states_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("imud.fleet.reader.STATES_BYTES", 100)
+    fleet = Fleet("mqtt://broker")
+    payload = b'{"v":1,"online":true,"boot":"1"}'  # 32 bytes
+    for name in ("a", "b", "a", "c", "d", "b"):
+        fleet.take(FleetDelivery(f"imud/site/{name}/state", payload, True, 0, ReaderConnection(fleet.brokers[0])))
+    assert [gateway for _, gateway in fleet.states] == ["c", "d", "b"]

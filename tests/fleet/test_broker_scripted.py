@@ -1,20 +1,42 @@
-"""Packets that a real broker sends rarely, from a scripted broker: refusals, DISCONNECT, limits, silence."""
+"""Clients of paho-mqtt with a scripted broker: refusals, limits, hostile packets; errors of files; pauses."""
 
 import asyncio
+import random
 import socket
+import ssl
+import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
 
-from imud.fleet.broker import BrokerError, MessageRefused, PahoConnection, ReaderAccess, Will
+from imud.fleet.broker import (
+    FIRST_S,
+    PACKET_BYTES,
+    RECEIVED_MAX,
+    STABLE_NS,
+    UNREAD_MAX,
+    WEBSOCKET_BYTES,
+    BrokerError,
+    BrokerTurn,
+    MessageRefused,
+    PacketGuard,
+    PahoConnection,
+    ReaderAccess,
+    Will,
+    check_websocket_buffer,
+    connection_problem,
+    paho_client,
+    properties_of,
+)
 from imud.fleet.reader import ReaderConnection
 from imud.fleet.settings import Broker, MqttOptions, broker_of
+from tests.fleet.authority import Authority
 from tests.support.daemon_process import LIMIT_S
-
-pytestmark = pytest.mark.live
 
 # MQTT 5.0, sections 3.2 CONNACK, 3.9 SUBACK, 3.14 DISCONNECT, 3.3 PUBLISH with QoS 0
 CONNACK = bytes.fromhex("20 03 00 00 00")
@@ -124,3 +146,168 @@ def test_a_gateway_keeps_the_limits_of_the_broker() -> None:
     too_long = pytest.raises(MessageRefused, match="at most 100 bytes, got a message of t with 100")
     with scripted(AT_MOST_100_BYTES) as broker, too_long, closing(gateway(broker)) as connection:
         connection.publish("t", bytes(100), "", retain=False)
+
+
+BROKER = Broker("127.0.0.1", 1883, tls=False, websockets=False, path="/mqtt")
+TLS_BROKER = BROKER._replace(tls=True)
+
+
+def of_tls(authority: Authority) -> MqttOptions:
+    return MqttOptions(
+        user="reader", ca_file=authority["ca.pem"], cert_file=authority["gateway.pem"],
+        key_file=authority["gateway.key"],
+    )  # fmt: skip
+
+
+def test_a_password_file_has_the_password_in_its_first_line(tmp_path: Path) -> None:
+    secret = tmp_path / "password"
+    secret.write_text("first line\r\nsecond\n")
+    settings = MqttOptions(user="reader", password_file=str(secret))
+    client = paho_client(BROKER, settings, "one", is_v5=True, packet_bytes=99, manual_ack=True)
+    assert (client.username, client.password) == ("reader", "first line")
+    secret.write_bytes(b"\xff\n")
+    with pytest.raises(ValueError, match=f"^password_file {secret}: expected text in UTF-8"):
+        paho_client(BROKER, settings, "one", is_v5=True, packet_bytes=99)
+
+
+@pytest.mark.parametrize("name", ["password_file", "ca_file", "cert_file", "key_file"])
+def test_a_file_that_cannot_be_read_is_named_with_its_key(tmp_path: Path, authority: Authority, name: str) -> None:
+    path = tmp_path / "absent"
+    settings = msgspec.structs.replace(of_tls(authority), **{name: str(path)})
+    with pytest.raises(ValueError, match=f"^{name} {path}: No such file or directory$"):
+        paho_client(TLS_BROKER, settings, "one", is_v5=True, packet_bytes=99)
+    path.mkdir()
+    with pytest.raises(ValueError, match=f"^{name} {path}: Is a directory$"):
+        paho_client(TLS_BROKER, settings, "one", is_v5=True, packet_bytes=99)
+
+
+@pytest.mark.parametrize("name", ["ca_file", "cert_file", "key_file"])
+def test_an_invalid_certificate_or_key_file_is_named(tmp_path: Path, authority: Authority, name: str) -> None:
+    path = tmp_path / "garbage"
+    path.write_text("no certificate\n")
+    settings = msgspec.structs.replace(of_tls(authority), **{name: str(path)})
+    with pytest.raises(ValueError, match=rf"{name} {path}.*: expected .* \(PEM\)"):
+        paho_client(TLS_BROKER, settings, "one", is_v5=True, packet_bytes=99)
+
+
+def test_a_key_with_a_passphrase_is_rejected_without_a_prompt(tmp_path: Path, authority: Authority) -> None:
+    locked = tmp_path / "locked.key"
+    words = ["openssl", "rsa", "-aes256", "-passout", "pass:x", "-in", authority["gateway.key"], "-out", str(locked)]
+    subprocess.run(words, check=True, capture_output=True)
+    settings = msgspec.structs.replace(of_tls(authority), key_file=str(locked))
+    with pytest.raises(ValueError, match=r"^key_file: expected a key without a passphrase"):
+        paho_client(TLS_BROKER, settings, "one", is_v5=True, packet_bytes=99)
+
+
+def test_problems_and_properties() -> None:
+    error = ssl.SSLCertVerificationError("certificate verify failed")
+    error.verify_message = "self-signed certificate"
+    assert connection_problem(error) == "self-signed certificate"
+    assert properties_of("CONNECT", ReceiveMaximum=7).ReceiveMaximum == 7
+
+
+TOPIC = b"\x00\x01t"
+
+
+def use_gateway(broker: Broker) -> None:
+    """Connect as a gateway and wait for the end of the connection."""
+    with closing(PahoConnection(broker, MqttOptions(), "me", Will("t", b""))) as connection:
+        while True:
+            connection.wait(60.0)
+
+
+def use_reader(broker: Broker) -> None:
+    async def read() -> None:
+        with closing(await ReaderConnection.open(broker, MqttOptions(), "me", ["t"], 0)) as connection:
+            await connection.next()
+
+    asyncio.run(read())
+
+
+HOSTILE = {
+    "message with QoS 2": CONNACK + b"\x34\x07" + TOPIC + b"\x00\x01\x00x",
+    "at most": CONNACK + b"\x30\xff\xff\xff\x7f" + TOPIC + bytes(1000),
+    "a longer packet": b"\x20\xff\xff\xff\x7f\x00\x00" + bytes(1000),
+}
+
+
+@pytest.mark.parametrize("use", [use_gateway, use_reader])
+@pytest.mark.parametrize("words", HOSTILE)
+def test_packets_that_could_fill_the_memory_end_the_connection(words: str, use: Callable[[Broker], None]) -> None:
+    with scripted(HOSTILE[words]) as broker, pytest.raises(BrokerError, match=words):
+        use(broker)
+
+
+@pytest.mark.parametrize("head", [b"", CONNACK])
+def test_messages_that_imud_did_not_request_end_the_connection(head: bytes) -> None:
+    message = b"\x30\x05" + TOPIC + b"\x00x"
+    data = head + message * (RECEIVED_MAX + 1)
+    with scripted(data) as broker, pytest.raises(BrokerError, match="message that imud did not request"):
+        use_gateway(broker)
+
+
+def test_a_long_websocket_frame_ends_the_connection() -> None:
+    check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES)))
+    check_websocket_buffer(SimpleNamespace())  # a connection without WebSocket
+    with pytest.raises(ValueError, match="WebSocket frame of at most"):
+        check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES + 1)))
+
+
+def test_the_guard_finds_packets_in_any_pieces() -> None:
+    guard = PacketGuard(PACKET_BYTES)
+    data = b"\x32\x80\x01" + b"\x34" * 128 + b"\xd0\x00"
+    for at in range(len(data)):
+        guard.take(data[at : at + 1], is_writing=False)
+    for _ in range(3):
+        guard.take(data * 1000, is_writing=False)
+    with pytest.raises(ValueError, match="does not read"):
+        guard.take(b"\xc0\x00" * (UNREAD_MAX + 1), is_writing=True)
+    with pytest.raises(ValueError, match="at most 10 bytes"):
+        PacketGuard(10).take(b"\x30\x0b", is_writing=False)
+    PacketGuard(10).take(b"\x30\x0a", is_writing=False)
+
+
+A, B = (Broker(name, 1883, False, False, "") for name in "ab")
+
+
+def longest(_low: float = 0.0) -> float:
+    return 1.0
+
+
+def test_pauses_double_up_to_the_maximum() -> None:
+    turn = BrokerTurn([A], 60.0, longest)
+    assert [turn.failed(0) for _ in range(6)] == [4.0, 8.0, 16.0, 32.0, 60.0, 60.0]
+    for _ in range(1100):  # 2.0 to the power of this number exceeds a float
+        assert turn.failed(0) == 60.0
+    draw = random.Random(25).random
+    pauses = [BrokerTurn([A], 60.0, draw).failed(0) for _ in range(500)]
+    in_second = [sum(second <= pause < second + 1 for pause in pauses) for second in range(4)]
+    assert sum(in_second) == 500
+    assert max(in_second) < 170
+
+
+def test_brokers_take_turns() -> None:
+    turn = BrokerTurn([A, B], 60.0, longest)
+    seen, pauses = [], []
+    for _ in range(4):
+        seen.append(turn.broker)
+        pauses.append(turn.failed(0))
+    assert seen == [A, B, A, B]
+    assert pauses == [4.0, 4.0, 8.0, 8.0]
+    turn = BrokerTurn([A, B], 60.0, longest)
+    turn.failed(0)
+    assert turn.broker == B
+    turn.connected(0)
+    turn.failed(STABLE_NS)
+    assert turn.broker == B
+    turn.failed(STABLE_NS)
+    assert turn.broker == A
+
+
+@pytest.mark.parametrize(("held_ns", "pause_s"), [(STABLE_NS, FIRST_S), (STABLE_NS - 1, 32.0)])
+def test_only_a_stable_connection_resets_the_pause(held_ns: int, pause_s: float) -> None:
+    turn = BrokerTurn([A], 60.0, longest)
+    for _ in range(3):
+        turn.failed(0)
+    turn.connected(0)
+    assert turn.failed(held_ns) == pause_s

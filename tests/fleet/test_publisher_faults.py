@@ -6,7 +6,6 @@ number in a stream.
 """
 
 import os
-from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
 from random import Random
@@ -23,12 +22,6 @@ from tests.support.daemon_process import LIMIT_S
 from tests.support.surroundings import free_port
 
 pytestmark = [pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO), pytest.mark.live]
-
-
-@pytest.fixture
-def broker(tmp_path: Path) -> Iterator[Mosquitto]:
-    with running_broker(tmp_path / "broker") as made:
-        yield made
 
 
 BOOT = f"{7:016x}"
