@@ -1,8 +1,8 @@
 """A device of the daemon on a CAN interface of the kernel, with simulated modules on the same bus."""
 
 import asyncio
-from collections.abc import Callable, Coroutine
-from contextlib import closing, nullcontext
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import asynccontextmanager, closing, nullcontext
 from time import monotonic, monotonic_ns
 from typing import Any
 
@@ -46,24 +46,22 @@ class BusRig:
         await self.until(task.done, "its end")
         return task.result()
 
-    def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Run the device during the story. The story starts with the first samples of the modules, if there are any."""
+    @asynccontextmanager
+    async def played(self) -> AsyncIterator[None]:
+        """Run the device during the block, from the first samples of the modules, if there are any."""
 
         def is_ready() -> bool:
             state = self.device.state
             return state is not DeviceState.MISSING if self.port is None else state is DeviceState.RUNNING
 
-        async def both() -> None:
+        with closing(self.port) if self.port is not None else nullcontext():
             task = asyncio.create_task(self.device.run())
             try:
                 await self.until(is_ready, "samples or an open bus")
-                await story()
+                yield
             finally:
                 task.cancel()
                 await asyncio.gather(task, return_exceptions=True)
                 self.device.close()
                 self.factory.close()
-
-        with closing(self.port) if self.port is not None else nullcontext():
-            asyncio.run(both())
         assert self.device.ledger.closes(), self.device.ledger.snapshot()

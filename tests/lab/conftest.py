@@ -1,5 +1,7 @@
 """Fixtures of the lab. pytest collects these tests only in the guest of the lab: `make lab` runs it."""
 
+import asyncio
+import inspect
 import os
 import threading
 from collections.abc import Iterator
@@ -31,6 +33,16 @@ def pytest_runtest_logstart() -> None:
         mark = Path(SHARE) / "first-test"
         if not mark.exists():
             mark.touch()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run an `async` test in a new event loop."""
+    if not inspect.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    names = inspect.signature(pyfuncitem.obj).parameters
+    asyncio.run(pyfuncitem.obj(**{name: pyfuncitem.funcargs[name] for name in names}))
+    return True
 
 
 @pytest.fixture(autouse=True)

@@ -34,10 +34,9 @@ def j1939(interface: str, motion: Motion) -> BusRig:
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("make", [canopen, j1939])
-def test_the_zero_of_an_inclinometer(vcan: CanInterface, make: Callable[[str, Motion], BusRig]) -> None:
+async def test_the_zero_of_an_inclinometer(vcan: CanInterface, make: Callable[[str, Motion], BusRig]) -> None:
     rig = make(vcan.name, TILTED)
-
-    async def story() -> None:
+    async with rig.played():
         await rig.until(lambda: any(sample.incli_rad is not None for sample in rig.samples), "inclinations")
         before = next(sample.incli_rad for sample in reversed(rig.samples) if sample.incli_rad is not None)
         assert max(map(abs, before)) > 0.05
@@ -45,18 +44,13 @@ def test_the_zero_of_an_inclinometer(vcan: CanInterface, make: Callable[[str, Mo
         assert result.verified, result
         assert result.saved
         assert [check.name for check in result.checks] == ["inclination"]
-
-    rig.play(story)
     assert any(event.kind is EventKind.CALIBRATION for event in rig.events)
 
 
 @pytest.mark.thorough
 @pytest.mark.timeout(300)
-def test_a_node_that_moves_gets_no_zero(vcan: CanInterface) -> None:
+async def test_a_node_that_moves_gets_no_zero(vcan: CanInterface) -> None:
     rig = canopen(vcan.name, swing())
-
-    async def story() -> None:
+    async with rig.played():
         with pytest.raises(CommandError, match="expected the device at rest"):
             await rig.done(rig.device.calibrate("zero", save=True))
-
-    rig.play(story)

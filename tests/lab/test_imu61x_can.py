@@ -3,7 +3,8 @@
 import asyncio
 import socket
 import struct
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from time import monotonic, monotonic_ns
 from typing import Any
 
@@ -69,28 +70,23 @@ class Rig:
     async def running(self) -> None:
         await self.until(lambda: self.runner.state is not DeviceState.MISSING, "the bus is open")
 
-    def play(self, story: Callable[["Rig"], Awaitable[None]]) -> None:
-        async def both() -> None:
-            task = asyncio.create_task(self.runner.run())
-            try:
-                await story(self)
-            finally:
-                task.cancel()
-                await asyncio.gather(task, return_exceptions=True)
-                self.runner.close()
-
+    @asynccontextmanager
+    async def played(self) -> AsyncIterator["Rig"]:
+        task = asyncio.create_task(self.runner.run())
         try:
-            asyncio.run(both())
+            yield self
         finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+            self.runner.close()
             self.far.close()
         assert self.runner.ledger.closes(), self.runner.ledger.snapshot()
         assert self.runner.ledger.frames_pending == 0
 
 
-def test_stream_of_the_simulator_with_its_truth(vcan: CanInterface) -> None:
+async def test_stream_of_the_simulator_with_its_truth(vcan: CanInterface) -> None:
     rig = Rig(vcan.name, vcan.name)
-
-    async def story(rig: Rig) -> None:
+    async with rig.played():
         await rig.running()
         hardware = Imu61xCanHardware(rate_hz=50, boot_ms=0, index=65500)
         module = Imu61xCanModule(monotonic_ns(), hardware)
@@ -110,16 +106,13 @@ def test_stream_of_the_simulator_with_its_truth(vcan: CanInterface) -> None:
         assert status.state is DeviceState.RUNNING
         assert status.ledger["lost_gap_device"] == 0
         assert status.expected_rate_hz == pytest.approx(50, rel=0.05)
-
-    rig.play(story)
     assert [s.seq for s in rig.samples] == list(range(1, len(rig.samples) + 1))
     assert rig.events[0].kind is EventKind.UP
 
 
-def test_two_devices_share_a_bus_and_see_only_their_own(vcan: CanInterface) -> None:
+async def test_two_devices_share_a_bus_and_see_only_their_own(vcan: CanInterface) -> None:
     first, second = Rig(vcan.name, vcan.name), Rig(vcan.name, vcan.name, base_id=200)
-
-    async def other(rig: Rig) -> None:
+    async with first.played() as rig:
         task = asyncio.create_task(second.runner.run())
         await rig.running()
         await second.running()
@@ -131,17 +124,14 @@ def test_two_devices_share_a_bus_and_see_only_their_own(vcan: CanInterface) -> N
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
         second.runner.close()
-
-    first.play(other)
     second.far.close()
     for rig, frames in ((first, 15), (second, 10)):
         assert (rig.runner.ledger.bytes_in, rig.runner.ledger.bytes_skipped) == (8 * frames, 0)
 
 
-def test_frames_dropped_by_a_small_buffer_are_overruns(vcan: CanInterface) -> None:
+async def test_frames_dropped_by_a_small_buffer_are_overruns(vcan: CanInterface) -> None:
     rig = Rig(vcan.name, vcan.name, receive_buffer_bytes=4096)
-
-    async def story(rig: Rig) -> None:
+    async with rig.played():
         await rig.running()
         rig.send(*range(10))  # no program reads: the buffer overflows
         await rig.until(lambda: rig.runner.ledger.bytes_in, "the first frames")
@@ -149,30 +139,24 @@ def test_frames_dropped_by_a_small_buffer_are_overruns(vcan: CanInterface) -> No
         await rig.until(lambda: rig.samples and rig.samples[-1].seq, "a sample")
         await rig.until(lambda: rig.runner.ledger.lost_overrun, "loss is counted")
         rig.runner.tick(monotonic_ns())
-
-    rig.play(story)
     ledger = rig.runner.ledger
     assert ledger.samples + ledger.lost_overrun == 11
     assert ledger.lost_gap_device == 0
     assert EventKind.LOSS in [event.kind for event in rig.events]
 
 
-def test_a_jump_of_index_without_drops_is_the_devices(vcan: CanInterface) -> None:
+async def test_a_jump_of_index_without_drops_is_the_devices(vcan: CanInterface) -> None:
     rig = Rig(vcan.name, vcan.name)
-
-    async def story(rig: Rig) -> None:
+    async with rig.played():
         await rig.running()
         rig.send(65534, 65535, 65536 + 2)
         await rig.until(lambda: len(rig.samples) == 3, "three samples")
-
-    rig.play(story)
     assert (rig.runner.ledger.lost_gap_device, rig.runner.ledger.lost_overrun) == (2, 0)
 
 
-def test_interface_down_and_up_again(vcan: CanInterface) -> None:
+async def test_interface_down_and_up_again(vcan: CanInterface) -> None:
     rig = Rig(vcan.name, vcan.name)
-
-    async def story(rig: Rig) -> None:
+    async with rig.played():
         await rig.running()
         rig.send(1, 2)
         await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running")
@@ -185,21 +169,18 @@ def test_interface_down_and_up_again(vcan: CanInterface) -> None:
         rig.send(500, 501)
         await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running again")
         await rig.until(lambda: len(rig.samples) == 4, "both")  # the kernel may deliver the second sample later
-
-    rig.play(story)
     assert len(rig.samples) == 4
     assert rig.runner.ledger.lost() == 0
     assert [e.kind for e in rig.events] == [EventKind.UP, EventKind.DOWN, EventKind.UP]
     assert rig.runner.status().connects == 2
 
 
-def test_interface_that_is_missing_is_waited_for() -> None:
+async def test_interface_that_is_missing_is_waited_for() -> None:
     config = SocketCanOptions(interface="vcan7")
     tool("ip", "link", "add", "dev", "vcan7", "type", "vcan")
     rig = Rig("vcan7", "vcan7")
     tool("ip", "link", "delete", "vcan7")
-
-    async def story(rig: Rig) -> None:
+    async with rig.played():
         await rig.until(lambda: "does not exist" in rig.runner.status().problem, "the problem in the status")
         tool("ip", "link", "add", "dev", config.interface, "type", "vcan")
         tool("ip", "link", "set", config.interface, "up")
@@ -207,13 +188,10 @@ def test_interface_that_is_missing_is_waited_for() -> None:
         tool("ip", "link", "delete", config.interface)
         await rig.until(lambda: rig.runner.state is DeviceState.MISSING, "gone")
 
-    rig.play(story)
 
-
-def test_error_states_are_counted_and_shown(vcan: CanInterface) -> None:
+async def test_error_states_are_counted_and_shown(vcan: CanInterface) -> None:
     rig = Rig(vcan.name, vcan.name)
-
-    async def story(rig: Rig) -> None:
+    async with rig.played():
         await rig.running()
         rig.send(1)
         await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running")
@@ -232,8 +210,6 @@ def test_error_states_are_counted_and_shown(vcan: CanInterface) -> None:
         rig.send_error(CONTROLLER, 0x01)  # overflow of the controller's receive buffer
         rig.send(5)
         await rig.until(lambda: len(rig.samples) == 4, "four samples")
-
-    rig.play(story)
     kernel = rig.runner.status().kernel
     news = [event.message for event in rig.events if event.kind is EventKind.LINK]
     assert [message.partition(":")[0] for message in news] == [
@@ -244,11 +220,10 @@ def test_error_states_are_counted_and_shown(vcan: CanInterface) -> None:
 
 
 @pytest.mark.manual("A 4.1 rate")
-def test_real_controllers_carry_the_stream(can_pair: tuple[CanInterface, CanInterface]) -> None:
+async def test_real_controllers_carry_the_stream(can_pair: tuple[CanInterface, CanInterface]) -> None:
     near, far = can_pair
     rig = Rig(near.name, far.name)
-
-    async def story(rig: Rig) -> None:
+    async with rig.played():
         await rig.running()
         for index in range(20):
             rig.send(index)
@@ -261,16 +236,13 @@ def test_real_controllers_carry_the_stream(can_pair: tuple[CanInterface, CanInte
         await rig.until(lambda: rig.runner.state is DeviceState.SEARCHING, "open again")
         rig.send(90, 91)  # the interface at the far end is still up
         await rig.until(lambda: len(rig.samples) == 22, "two more")
-
-    rig.play(story)
     assert rig.runner.ledger.lost() == 0
 
 
-def test_error_passive_of_a_real_controller(can_pair: tuple[CanInterface, CanInterface]) -> None:
+async def test_error_passive_of_a_real_controller(can_pair: tuple[CanInterface, CanInterface]) -> None:
     near, far = can_pair
     rig = Rig(near.name, far.name)
-
-    async def story(rig: Rig) -> None:
+    async with rig.played():
         await rig.running()
         rig.send(1, 2)
         await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running")
@@ -281,8 +253,6 @@ def test_error_passive_of_a_real_controller(can_pair: tuple[CanInterface, CanInt
         assert rig.runner.state is DeviceState.RUNNING
         near.enter("error-active")
         await rig.until(lambda: rig.runner.status().problem == "", "over")
-
-    rig.play(story)
     assert rig.runner.status().kernel.error_passive == 1
     assert rig.runner.ledger.lost() == 0
     news = [event.message.partition(":")[0] for event in rig.events if event.kind is EventKind.LINK]
@@ -290,15 +260,14 @@ def test_error_passive_of_a_real_controller(can_pair: tuple[CanInterface, CanInt
 
 
 @pytest.mark.parametrize("restart_ms", [0, 300])
-def test_bus_off_of_a_real_controller_and_its_restart(
+async def test_bus_off_of_a_real_controller_and_its_restart(
     can_pair: tuple[CanInterface, CanInterface], restart_ms: int
 ) -> None:
     """Restart by an administrator, or by the kernel after `restart-ms`. Frames in between are lost and counted."""
     near, far = can_pair
     near.restart_by_itself(restart_ms)
     rig = Rig(near.name, far.name)
-
-    async def story(rig: Rig) -> None:
+    async with rig.played():
         await rig.running()
         rig.send(1, 2)
         await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running")
@@ -316,8 +285,6 @@ def test_bus_off_of_a_real_controller_and_its_restart(
         rig.send(6, 7)
         await rig.until(lambda: len(rig.samples) == 4 and rig.runner.state is DeviceState.RUNNING, "back")
         assert rig.runner.status().problem == ""
-
-    rig.play(story)
     ledger = rig.runner.ledger
     assert rig.runner.status().kernel.bus_off == 1
     assert rig.runner.status().connects == 1

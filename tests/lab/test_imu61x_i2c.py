@@ -1,6 +1,5 @@
 """The IMU61x on i2c-dev of the kernel: detection by id, setup, stream, faults, recovery."""
 
-import asyncio
 import errno
 
 import pytest
@@ -22,24 +21,20 @@ ADDRESS = 0x1A
 
 
 @pytest.mark.manual("A 3.1 rate")
-def test_found_by_its_id_and_streams_the_truth(i2c: Bus[I2cTransfer]) -> None:
+async def test_found_by_its_id_and_streams_the_truth(i2c: Bus[I2cTransfer]) -> None:
     """Another sensor replies at the first address. The device is at the third address."""
     other = RegisterDevice({0x6A: 0x12})
     device = registers(product="IMU6132B")
     i2c.attach(0x18, other)
     i2c.attach(ADDRESS, on_i2c(device))
     config = device_config("imu", "imu61x-i2c", "i2c", {"bus": 0, "rate_hz": 20}, accel_filter=2)
-
-    async def body() -> None:
-        async with running(config) as (rig,):
-            await rig.until_samples(20, LIMIT_S)
-            status = rig.device.status()
-            assert (status.identity, status.link) == ({"product": "IMU6132B"}, "/dev/i2c-0, address 0x1a")
-            assert status.settings == {"accel_filter": "2 Hz", "gyro_filter": "47 Hz"}
-            assert device.filter == 0x2B
-            physics_holds(rig, device, RESOLUTION_M_S2)
-
-    asyncio.run(body())
+    async with running(config) as (rig,):
+        await rig.until_samples(20, LIMIT_S)
+        status = rig.device.status()
+        assert (status.identity, status.link) == ({"product": "IMU6132B"}, "/dev/i2c-0, address 0x1a")
+        assert status.settings == {"accel_filter": "2 Hz", "gyro_filter": "47 Hz"}
+        assert device.filter == 0x2B
+        physics_holds(rig, device, RESOLUTION_M_S2)
     assert not any(other.registers[register] for register in range(0x20)), "nothing is written to another device"
     bursts = [t for t in i2c.transfers if t.segments[0].data == b"\x12"]
     assert len(bursts) >= 20
@@ -59,7 +54,7 @@ FAULTS: dict[str, tuple[dict[str, object], str]] = {
 
 
 @pytest.mark.parametrize("fault", cases(FAULTS, "bus stuck", "line high", "wrong id"))
-def test_vanishes_and_is_identified_before_it_is_believed(
+async def test_vanishes_and_is_identified_before_it_is_believed(
     i2c: Bus[I2cTransfer], fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     polls = (Poll(device_i2c.READ_BURST), Poll(READ_ID, 10**8))
@@ -69,70 +64,54 @@ def test_vanishes_and_is_identified_before_it_is_believed(
     i2c.attach(ADDRESS, on_i2c(device))
     config = device_config("imu", "imu61x-i2c", "i2c", {"bus": 0, "address": ADDRESS, "rate_hz": 20})
     values, why = FAULTS[fault]
-
-    async def body() -> None:
-        async with running(config) as (rig,):
-            await rig.until_samples(3, LIMIT_S)
-            for name, value in values.items():
-                setattr(device.faults, name, value)
-            await vanishes(rig, why)
-            device.faults = type(device.faults)()
-            await comes_back(rig)
-
-    asyncio.run(body())
+    async with running(config) as (rig,):
+        await rig.until_samples(3, LIMIT_S)
+        for name, value in values.items():
+            setattr(device.faults, name, value)
+        await vanishes(rig, why)
+        device.faults = type(device.faults)()
+        await comes_back(rig)
 
 
-def test_unplugged_and_plugged(i2c: Bus[I2cTransfer]) -> None:
+async def test_unplugged_and_plugged(i2c: Bus[I2cTransfer]) -> None:
     device = registers()
     i2c.attach(0x18, on_i2c(device))
     config = device_config("imu", "auto", "i2c", {"bus": 0, "rate_hz": 20})
-
-    async def body() -> None:
-        async with running(config) as (rig,):
-            await rig.until_samples(3, LIMIT_S)
-            i2c.detach(0x18)
-            await vanishes(rig, "no acknowledgement")
-            i2c.attach(0x1B, on_i2c(device))  # the address of the device changes
-            await comes_back(rig)
-            assert rig.device.status().link == "/dev/i2c-0, address 0x1b"
-
-    asyncio.run(body())
+    async with running(config) as (rig,):
+        await rig.until_samples(3, LIMIT_S)
+        i2c.detach(0x18)
+        await vanishes(rig, "no acknowledgement")
+        i2c.attach(0x1B, on_i2c(device))  # the address of the device changes
+        await comes_back(rig)
+        assert rig.device.status().link == "/dev/i2c-0, address 0x1b"
 
 
-def test_repeated_bytes_are_counted_and_no_samples(i2c: Bus[I2cTransfer]) -> None:
+async def test_repeated_bytes_are_counted_and_no_samples(i2c: Bus[I2cTransfer]) -> None:
     device = registers()
     i2c.attach(0x18, on_i2c(device))
     config = device_config("imu", "imu61x-i2c", "i2c", {"bus": 0, "rate_hz": 20})
-
-    async def body() -> None:
-        async with running(config) as (rig,):
-            await rig.until_samples(3, LIMIT_S)
-            device.faults.frozen = True
-            await rig.until(lambda: rig.state is DeviceState.SILENT, "silent", LIMIT_S)
-            polling = rig.device.status().polling
-            assert polling is not None
-            assert polling.stale > 5
-            assert rig.device.ledger.frames_ignored == polling.stale
-            device.faults.frozen = False
-            await comes_back(rig)
-
-    asyncio.run(body())
+    async with running(config) as (rig,):
+        await rig.until_samples(3, LIMIT_S)
+        device.faults.frozen = True
+        await rig.until(lambda: rig.state is DeviceState.SILENT, "silent", LIMIT_S)
+        polling = rig.device.status().polling
+        assert polling is not None
+        assert polling.stale > 5
+        assert rig.device.ledger.frames_ignored == polling.stale
+        device.faults.frozen = False
+        await comes_back(rig)
 
 
-def test_two_devices_on_one_bus_are_found_by_themselves(i2c: Bus[I2cTransfer]) -> None:
+async def test_two_devices_on_one_bus_are_found_by_themselves(i2c: Bus[I2cTransfer]) -> None:
     first, second = registers(product="IMU612"), registers(product="IMU618")
     i2c.attach(0x18, on_i2c(first))
     i2c.attach(0x19, on_i2c(second))
     configs = [device_config(name, "imu61x-i2c", "i2c", {"bus": 0, "rate_hz": 20}) for name in ("a", "b")]
-
-    async def body() -> None:
-        async with running(*configs) as (a, b):
-            await a.until_samples(5, LIMIT_S)
-            await b.until_samples(5, LIMIT_S)
-            links = {rig.device.status().link for rig in (a, b)}
-            assert links == {"/dev/i2c-0, address 0x18", "/dev/i2c-0, address 0x19"}
-
-    asyncio.run(body())
+    async with running(*configs) as (a, b):
+        await a.until_samples(5, LIMIT_S)
+        await b.until_samples(5, LIMIT_S)
+        links = {rig.device.status().link for rig in (a, b)}
+        assert links == {"/dev/i2c-0, address 0x18", "/dev/i2c-0, address 0x19"}
 
 
 @pytest.mark.timeout(240)

@@ -49,7 +49,7 @@ class WiredReset(GpioOutput):
             self._boot()
 
 
-def test_a_device_that_hangs_is_reset_by_its_line(i2c: Bus[I2cTransfer], gpio_chip: GpioChip) -> None:
+async def test_a_device_that_hangs_is_reset_by_its_line(i2c: Bus[I2cTransfer], gpio_chip: GpioChip) -> None:
     device = registers()
     i2c.attach(0x18, on_i2c(device))
     config = device_config("imu", "imu61x-i2c", "i2c", {"bus": 0, "rate_hz": 20}, gyro_filter=3)
@@ -62,7 +62,13 @@ def test_a_device_that_hangs_is_reset_by_its_line(i2c: Bus[I2cTransfer], gpio_ch
 
     maker = LineFactory(GpioInput, partial(WiredReset, gpio_chip, boot))
 
-    async def body(seen: Any) -> None:
+    command = (
+        "gpiomon", "--line-buffered", "--format=%e %s %n", gpio_chip.path.name, str(gpio_chip.names.index("PPS")),
+    )  # fmt: skip
+    with tool_running(*command) as monitor:
+        assert monitor.stdout is not None
+        wait_until(lambda: "gpiomon" in INTERRUPTS.read_text(encoding="ascii"), "gpiomon has its interrupt")
+        seen = ((kind == "1", int(s) * 10**9 + int(n)) for kind, s, n in map(str.split, monitor.stdout))
         async with running(replace(config, lines=DeviceLines(reset=settings)), lines=maker) as (rig,):
             await rig.until_samples(3, LIMIT_S)
             assert gpio_chip.level("RESET"), "held inactive, which is high"
@@ -78,15 +84,6 @@ def test_a_device_that_hangs_is_reset_by_its_line(i2c: Bus[I2cTransfer], gpio_ch
             back_ns = next(event.t_ns for event in reversed(rig.events) if event.kind is EventKind.UP)
             assert back_ns - rise_ns > WAIT_S * 1e9
             assert len(told) == 1
-
-    command = (
-        "gpiomon", "--line-buffered", "--format=%e %s %n", gpio_chip.path.name, str(gpio_chip.names.index("PPS")),
-    )  # fmt: skip
-    with tool_running(*command) as monitor:
-        assert monitor.stdout is not None
-        wait_until(lambda: "gpiomon" in INTERRUPTS.read_text(encoding="ascii"), "gpiomon has its interrupt")
-        edges = ((kind == "1", int(s) * 10**9 + int(n)) for kind, s, n in map(str.split, monitor.stdout))
-        asyncio.run(body(edges))
 
 
 class Stepped:
@@ -149,77 +146,65 @@ async def first(rig: DeviceRig) -> None:
     assert rig.samples[0].sync is Sync.ARRIVAL
 
 
-def test_every_edge_is_one_sample(stepped: tuple[Stepped, DeviceConfig]) -> None:
+async def test_every_edge_is_one_sample(stepped: tuple[Stepped, DeviceConfig]) -> None:
     it, config = stepped
-
-    async def body() -> None:
-        async with running(config) as (rig,):
-            await first(rig)
-            for number in range(1, EDGES + 1):
-                it.renew()
-                await rig.until(lambda number=number: len(rig.samples) > number, "its sample", LIMIT_S)  # type: ignore[misc]  # binds it
-            assert [sample.edge_seq for sample in rig.samples[1:]] == list(range(1, EDGES + 1))
-            for sample in rig.samples[1:]:
-                it.has(sample)
-            assert rig.device.ledger.lost_queue == 0
-            polling = rig.device.status().polling
-            assert polling is not None
-            mean_us, worst_us = polling.late_mean_ns / 1e3, polling.late_worst_ns / 1e3
-            print(f"edge to read: {mean_us:.0f} us on average, {worst_us:.0f} us at worst")
-
-    asyncio.run(body())
+    async with running(config) as (rig,):
+        await first(rig)
+        for number in range(1, EDGES + 1):
+            it.renew()
+            await rig.until(lambda number=number: len(rig.samples) > number, "its sample", LIMIT_S)  # type: ignore[misc]  # binds it
+        assert [sample.edge_seq for sample in rig.samples[1:]] == list(range(1, EDGES + 1))
+        for sample in rig.samples[1:]:
+            it.has(sample)
+        assert rig.device.ledger.lost_queue == 0
+        polling = rig.device.status().polling
+        assert polling is not None
+        mean_us, worst_us = polling.late_mean_ns / 1e3, polling.late_worst_ns / 1e3
+        print(f"edge to read: {mean_us:.0f} us on average, {worst_us:.0f} us at worst")
 
 
-def test_edges_that_come_faster_than_reads_are_missed_and_counted(stepped: tuple[Stepped, DeviceConfig]) -> None:
+async def test_edges_that_come_faster_than_reads_are_missed_and_counted(stepped: tuple[Stepped, DeviceConfig]) -> None:
     """Ten updates without a pause: a read is active during some updates, and other updates have no read."""
     it, config = stepped
-
-    async def body() -> None:
-        async with running(config) as (rig,):
-            await first(rig)
-            it.renew()
-            await rig.until(lambda: len(rig.samples) == 2, "the first edge", LIMIT_S)
-            seen = rig.device.status().lines
-            assert seen is not None
-            for _ in range(5):
-                for _ in range(10):
-                    it.renew()
-                count = len(rig.samples)
-                await rig.until(lambda count=count: len(rig.samples) > count, "its sample", LIMIT_S)  # type: ignore[misc]  # binds it
-            numbers = [sample.edge_seq or 0 for sample in rig.samples[1:]]
-            for sample in rig.samples[1:]:
-                it.has_within_error(sample)
-            missed = sum(b - a - 1 for a, b in pairwise(numbers))
-            assert missed > 0
-            rig.device.tick(monotonic_ns())
-            polling = rig.device.status().polling
-            assert polling is not None
-            # a read before the edge makes the value stale at its edge
-            lost, stale = rig.device.ledger.lost_queue, polling.stale
-            assert 0 < lost <= missed <= lost + stale
-            assert numbers[-1] <= len(it.stamps_ns) <= numbers[-1] + stale
-
-    asyncio.run(body())
-
-
-def test_edges_stop_and_come_back(stepped: tuple[Stepped, DeviceConfig]) -> None:
-    it, config = stepped
-
-    async def body() -> None:
-        async with running(config) as (rig,):
-            await first(rig)
-            await rig.until(lambda: any("no edges" in event.message for event in rig.events), "told", LIMIT_S)
-            it.t_ns += STEP_NS
-            await rig.until(lambda: len(rig.samples) == 2, "by a deadline", LIMIT_S)
-            assert rig.samples[1].sync is Sync.ARRIVAL
-            it.t_ns -= STEP_NS
-            end_ns = monotonic_ns() + round(TASK_LIMIT_S * 1e9)
-            while not any("edges have returned" in event.message for event in rig.events):
-                assert monotonic_ns() < end_ns
+    async with running(config) as (rig,):
+        await first(rig)
+        it.renew()
+        await rig.until(lambda: len(rig.samples) == 2, "the first edge", LIMIT_S)
+        seen = rig.device.status().lines
+        assert seen is not None
+        for _ in range(5):
+            for _ in range(10):
                 it.renew()
-                await asyncio.sleep(0.05)
-                rig.device.tick(monotonic_ns())
-            await rig.until(lambda: rig.samples[-1].edge_seq == len(it.stamps_ns), "the newest", LIMIT_S)
-            it.has(rig.samples[-1])
+            count = len(rig.samples)
+            await rig.until(lambda count=count: len(rig.samples) > count, "its sample", LIMIT_S)  # type: ignore[misc]  # binds it
+        numbers = [sample.edge_seq or 0 for sample in rig.samples[1:]]
+        for sample in rig.samples[1:]:
+            it.has_within_error(sample)
+        missed = sum(b - a - 1 for a, b in pairwise(numbers))
+        assert missed > 0
+        rig.device.tick(monotonic_ns())
+        polling = rig.device.status().polling
+        assert polling is not None
+        # a read before the edge makes the value stale at its edge
+        lost, stale = rig.device.ledger.lost_queue, polling.stale
+        assert 0 < lost <= missed <= lost + stale
+        assert numbers[-1] <= len(it.stamps_ns) <= numbers[-1] + stale
 
-    asyncio.run(body())
+
+async def test_edges_stop_and_come_back(stepped: tuple[Stepped, DeviceConfig]) -> None:
+    it, config = stepped
+    async with running(config) as (rig,):
+        await first(rig)
+        await rig.until(lambda: any("no edges" in event.message for event in rig.events), "told", LIMIT_S)
+        it.t_ns += STEP_NS
+        await rig.until(lambda: len(rig.samples) == 2, "by a deadline", LIMIT_S)
+        assert rig.samples[1].sync is Sync.ARRIVAL
+        it.t_ns -= STEP_NS
+        end_ns = monotonic_ns() + round(TASK_LIMIT_S * 1e9)
+        while not any("edges have returned" in event.message for event in rig.events):
+            assert monotonic_ns() < end_ns
+            it.renew()
+            await asyncio.sleep(0.05)
+            rig.device.tick(monotonic_ns())
+        await rig.until(lambda: rig.samples[-1].edge_seq == len(it.stamps_ns), "the newest", LIMIT_S)
+        it.has(rig.samples[-1])

@@ -55,7 +55,7 @@ def rolls(samples: list[Sample]) -> list[int]:
     return [round(s.euler_rad[0] / RAD_PER_COUNT) for s in samples if s.euler_rad is not None]
 
 
-def test_a_node_of_the_kernel_under_our_driver(vcan: CanInterface) -> None:
+async def test_a_node_of_the_kernel_under_our_driver(vcan: CanInterface) -> None:
     """The node sends samples and replies to requests. Samples of another node are on the same bus."""
     rig = BusRig(vcan.name, "hipnuc-j1939", HipnucJ1939Options())
     requests: list[tuple[int, bytes]] = []
@@ -72,7 +72,7 @@ def test_a_node_of_the_kernel_under_our_driver(vcan: CanInterface) -> None:
             reply = commands.LAYOUT.pack(register, command, 0, intervals[register])
             say(end, vcan.name, codec.CONFIGURE, reply, 0x55)
 
-    async def story() -> None:
+    async with rig.played():
         loop = asyncio.get_running_loop()
         with node(vcan.name, 8) as end, node(vcan.name, 9) as other:
             loop.add_reader(end, answer, end)
@@ -90,8 +90,6 @@ def test_a_node_of_the_kernel_under_our_driver(vcan: CanInterface) -> None:
                     await rig.device.act("zero", {"zero": "here"})
             finally:
                 loop.remove_reader(end)
-
-    rig.play(story)
     found = rolls(rig.samples)
     assert found == list(range(40 - len(found), 40))
     assert len(found) >= 30
@@ -141,7 +139,7 @@ def test_our_simulator_heard_and_set_by_a_node_of_the_kernel(vcan: CanInterface)
     assert 1700 < sum(counts * counts for counts in accel[:3]) ** 0.5 < 2400  # 1 G and the motion
 
 
-def test_driver_and_simulator_with_every_message_and_changes(vcan: CanInterface) -> None:
+async def test_driver_and_simulator_with_every_message_and_changes(vcan: CanInterface) -> None:
     """Two devices on the bus. The test changes settings of one device while both send, and restarts it."""
     fast = dict.fromkeys(codec.PGNS, 100)
     quiet = J1939Hardware(bitrate=0, boot_ms=0)
@@ -155,7 +153,7 @@ def test_driver_and_simulator_with_every_message_and_changes(vcan: CanInterface)
         assert isinstance(answer, VerbResult)
         results[name] = answer
 
-    async def story() -> None:
+    async with rig.played():
         await rig.until(lambda: len(rig.samples) >= 20, "twenty samples")
         assert rig.samples[-1].temperature_c is not None
         assert rig.samples[-1].incli_rad is not None
@@ -172,22 +170,17 @@ def test_driver_and_simulator_with_every_message_and_changes(vcan: CanInterface)
         assert (module.flash.x_reversed, module.settings) == (1, module.flash)
         count = len(rig.samples)
         await rig.until(lambda: len(rig.samples) >= count + 30, "faster samples")
-
-    rig.play(story)
     assert other.requests == 0
     last = rig.samples[-20:]
     assert {sample.accel_m_s2 is not None for sample in last} == {True}
     assert {sample.mag_t is not None for sample in last} == {True, False}
 
 
-def test_nmea_2000_from_the_simulator(vcan: CanInterface) -> None:
+async def test_nmea_2000_from_the_simulator(vcan: CanInterface) -> None:
     module = HipnucNmea2000Module(monotonic_ns(), Nmea2000Hardware(rate_hz=20, bitrate=0, boot_ms=0))
     rig = BusRig(vcan.name, "hipnuc-nmea2000", HipnucNmea2000Options(), module)
-
-    async def story() -> None:
+    async with rig.played():
         await rig.until(lambda: len(rig.samples) >= 40, "forty samples")
-
-    rig.play(story)
     assert rig.device.ledger.lost() == 0
     for sample in rig.samples:
         assert sample.euler_rad is not None

@@ -5,7 +5,6 @@ on gpio-sim, IMU61x devices on a 16550A, vcan, an SJA1000 pair, i2c-dev and spid
 from the socket, and from shared memory before its connection. It does not use the recording.
 """
 
-import asyncio
 import errno
 import os
 import subprocess
@@ -155,28 +154,24 @@ def differing(found: list[Sample], live: list[Sample]) -> str:
 # --- a data-ready line ------------------------------------------------------------------------------------------------
 
 
-def test_samples_of_a_data_ready_line_are_replayed(i2c: Bus[I2cTransfer], gpio_chip: GpioChip) -> None:
+async def test_samples_of_a_data_ready_line_are_replayed(i2c: Bus[I2cTransfer], gpio_chip: GpioChip) -> None:
     """First single edges, then many edges together, so that reads miss some. The rigs compare at the end."""
     it = Stepped(gpio_chip)
     i2c.attach(0x18, on_i2c(it.device))
     config = device_config("imu", "imu61x-i2c", "i2c", {"bus": 0, "rate_hz": FALLBACK_HZ})
     rigs = DeviceRigs()
     rigs.recording = True
-
-    async def body() -> None:
-        lines = DeviceLines(data_ready=ReadyOptions(line="SOUT"))
-        async with running(replace(config, lines=lines), rigs=rigs) as (rig,):
-            await first(rig)
-            for number in range(1, EDGES + 1):
-                it.renew()
-                await rig.until(lambda number=number: len(rig.samples) > number, "its sample", LIMIT_S)  # type: ignore[misc]  # binds it
-            for _ in range(EDGES):
-                it.renew()
-            await rig.until(lambda: len(rig.samples) > EDGES + 1, "a sample of many edges", LIMIT_S)
-            assert rig.samples[EDGES].edge_seq == EDGES
-            assert rig.recorded
-
-    asyncio.run(body())
+    lines = DeviceLines(data_ready=ReadyOptions(line="SOUT"))
+    async with running(replace(config, lines=lines), rigs=rigs) as (rig,):
+        await first(rig)
+        for number in range(1, EDGES + 1):
+            it.renew()
+            await rig.until(lambda number=number: len(rig.samples) > number, "its sample", LIMIT_S)  # type: ignore[misc]  # binds it
+        for _ in range(EDGES):
+            it.renew()
+        await rig.until(lambda: len(rig.samples) > EDGES + 1, "a sample of many edges", LIMIT_S)
+        assert rig.samples[EDGES].edge_seq == EDGES
+        assert rig.recorded
 
 
 # --- the flight recorder, and a full disk -----------------------------------------------------------------------------

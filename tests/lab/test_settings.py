@@ -33,22 +33,19 @@ async def made_so(rig: BusRig, wanted: Mapping[str, object], *, verified: bool) 
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("variant", cases(NODE_VARIANTS, "manual"))
-def test_a_canopen_node_is_made_as_declared(vcan: CanInterface, variant: str) -> None:
+async def test_a_canopen_node_is_made_as_declared(vcan: CanInterface, variant: str) -> None:
     now_ns, kind = monotonic_ns(), NODE_VARIANTS[variant]
     slow = NodeSettings(bit_rate=0, periods_ms={1: 100, 2: 100, 3: 100, 4: 100, 6: 0, 7: 0})
     rare = NodeSettings(node=12, bit_rate=0, periods_ms={1: 500, 2: 0, 3: 0, 4: 0, 6: 0, 7: 0})
     module = HipnucCanopenModule(now_ns, HipnucCanopenHardware(factory=slow, boot_ms=200, variant=kind))
     beside = HipnucCanopenModule(now_ns, HipnucCanopenHardware(factory=rare, boot_ms=0))
     rig = BusRig(vcan.name, "hipnuc-canopen", HipnucCanopenOptions(), module, beside)
-
-    async def story() -> None:
+    async with rig.played():
         taken = await rig.done(rig.device.settings_apply({"node": 12}, save=True))
         assert "node 12 is in use" in taken.problem
         assert module.objects.writes_to_flash == 0
         wanted = {"tpdo2_interval_ms": 200, "incli_x_reversed": True, "node": 9}
         await made_so(rig, wanted, verified=kind.reads == "answered")
-
-    rig.play(story)
     saved = module.objects.saved
     assert (saved.periods_ms[2], saved.invert_x, saved.node, module.node) == (200, 1, 9, 9)
     assert module.objects.writes_to_flash == 1
@@ -57,20 +54,17 @@ def test_a_canopen_node_is_made_as_declared(vcan: CanInterface, variant: str) ->
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("variant", cases(J1939_VARIANTS, "real"))
-def test_a_j1939_module_is_made_as_declared(vcan: CanInterface, variant: str) -> None:
+async def test_a_j1939_module_is_made_as_declared(vcan: CanInterface, variant: str) -> None:
     now_ns, kind = monotonic_ns(), J1939_VARIANTS[variant]
     module = HipnucJ1939Module(now_ns, J1939Settings(), J1939Hardware(bitrate=0, boot_ms=200, variant=kind))
     beside = HipnucJ1939Module(now_ns, J1939Settings(address=12), J1939Hardware(bitrate=0, boot_ms=0))
     rig = BusRig(vcan.name, "hipnuc-j1939", HipnucJ1939Options(), module, beside)
-
-    async def story() -> None:
+    async with rig.played():
         taken = await rig.done(rig.device.settings_apply({"address": 12}, save=True))
         assert "address 12 is in use" in taken.problem
         assert module.writes_to_flash == 0
         wanted = {"ff37_interval_ms": 50, "y_reversed": True, "address": 9}
         await made_so(rig, wanted, verified=kind.reads != "ignored")
-
-    rig.play(story)
     saved = module.flash
     assert (saved.intervals_ms[0xFF37], saved.y_reversed, saved.address) == (50, 1, 9)
     assert module.writes_to_flash == 1

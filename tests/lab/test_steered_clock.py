@@ -90,7 +90,7 @@ class Device:
 
 
 @pytest.mark.thorough
-def test_stamps_stay_right_while_the_kernel_steers(pty: PseudoTerminal) -> None:
+async def test_stamps_stay_right_while_the_kernel_steers(pty: PseudoTerminal) -> None:
     output, host = DeviceOutput(), HostClock()
     samples, factory = output.samples, DeviceFactory(output, host)
     settings = UartOptions(port=str(pty.path), baud=115_200)
@@ -98,8 +98,7 @@ def test_stamps_stay_right_while_the_kernel_steers(pty: PseudoTerminal) -> None:
     module = Device(pty)
     rates: list[float] = []
     ends = [monotonic_ns()]
-
-    async def story() -> None:
+    with steering():
         task = asyncio.create_task(runner.run())
         for seconds, ppm, tick_us in STEPS:
             steer(ppm, tick_us)
@@ -114,9 +113,6 @@ def test_stamps_stay_right_while_the_kernel_steers(pty: PseudoTerminal) -> None:
         runner.close()
         factory.close()
         module.pairs.append(tight_pair())
-
-    with steering():
-        asyncio.run(story())
     expected = [ppm * 1e-6 + tick_us / 10_000 - 1 for _, ppm, tick_us in STEPS]
     assert rates == pytest.approx(expected, abs=20e-6), (rates, expected)
     dated = [(s, module.truth_ns(s.t_dev_ns)) for s in samples if s.t_dev_ns is not None]
