@@ -1,14 +1,16 @@
-"""The dashboard: its file matches its description, and a real Prometheus has data for every query."""
+"""The dashboard: file and picture match its description, and a real Prometheus has data for every query."""
 
 import json
 import re
 import subprocess
 import time
+from html import unescape
 from pathlib import Path
 
 import pytest
 
 from docs.generate import dashboard
+from docs.generate import dashboard_picture as picture
 from tests.monitoring.faults import Site, site
 from tests.monitoring.prometheus import LIMIT_S, Pace, RealPrometheus, needs, real_prometheus
 from tests.support.files import ROOT
@@ -89,3 +91,10 @@ def assert_devices_are_told_apart(prometheus: RealPrometheus, one: Site) -> None
                 assert series["metric"].get("device", "quiet") == "quiet", title
     devices = prometheus.query("count(max_over_time(imud_device_up[5m]))")  # also if the last scrape was late
     assert devices[0]["value"][1] == str(len(one.wires) + 2)
+
+
+def test_the_picture_is_of_the_dashboard_as_it_is() -> None:
+    drawn = {unescape(words) for words in re.findall(r">([^<]+)</text>", picture.FILE.read_text())}
+    titles = {panel["title"].replace("$device", picture.CHOSEN) for panel in dashboard.dashboard()["panels"]}
+    assert titles <= drawn, "run python -m docs.generate.dashboard_picture"
+    assert f"]({picture.FILE.relative_to(ROOT / 'docs')})" in (ROOT / "docs/monitoring.md").read_text()

@@ -1,7 +1,9 @@
-"""Messages to the pages, and the requests to the daemon."""
+"""Messages to the pages with their queue and buckets, and the requests to the daemon."""
 
+import asyncio
 import json
 from collections.abc import Callable
+from math import inf, nan
 from typing import Any
 
 import msgspec
@@ -10,7 +12,22 @@ from imud.client.connection import Hello
 from imud.client.feed import Feed, News, Wish
 from imud.contracts.status import DeviceState
 from imud.model.event import Event, EventKind
-from imud.web.hub import DEVICES_MAX, EVENTS_KEPT, WAITING_MAX, Browser, BrowserHub, row_of, status_message
+from imud.model.sample import Sample
+from imud.web.hub import (
+    DEVICES_MAX,
+    EVENTS_KEPT,
+    FRAMES_MAX,
+    WAITING_MAX,
+    WINDOW_MAX,
+    Browser,
+    BrowserHub,
+    Bucketing,
+    Mailbox,
+    bucket_of,
+    raw_of,
+    row_of,
+    status_message,
+)
 from imud.web.messages import Look
 from tests.support.metrics import device
 from tests.support.socket_rig import sample
@@ -236,3 +253,93 @@ def test_missing_counters_of_another_version_are_zero() -> None:
     status = msgspec.structs.replace(device("bow"), ledger={"bytes_in": 5, "bytes_pending": 5})
     assert status_message("bow", status, 0).lost == 0
     assert row_of(status, None, 0).closes
+
+
+MS = 1_000_000
+
+
+def at(ms: float, seq: int = 1, z: float = 9.75) -> Sample:
+    made = sample("bow", seq)
+    t_ns = 80_000_000_000_000 + round(ms * MS)
+    return msgspec.structs.replace(made, t_ns=t_ns, t_rx_ns=t_ns + 300_000, accel_m_s2=(0.5, -0.5, z))
+
+
+def test_buckets() -> None:
+    bucketing = Bucketing(20)
+    early = [at(ms, seq) for seq, ms in enumerate((0, 10, 49.999), start=1)]
+    assert bucketing.add(early, early[-1].t_ns) == []
+    (bucket,) = bucketing.add([at(50, 4)], at(50).t_ns)
+    assert (bucket.count, bucket.seq, bucket.first_s, bucket.last_s) == (3, 3, 80000.0, 80000.049999)
+    (second,) = bucketing.add([], at(200).t_ns)
+    assert (second.count, second.seq) == (1, 4), "it ends two periods after its interval without another sample"
+    assert bucketing.add([], at(500).t_ns) == []
+    samples = [at(ms, ms + 1) for ms in range(1000)]
+    bucketing = Bucketing(50)
+    buckets = bucketing.add(samples, samples[-1].t_ns) + bucketing.add([], samples[-1].t_ns + 60 * MS)
+    assert [bucket.count for bucket in buckets] == [20] * 50
+    assert [bucket.seq for bucket in buckets] == [*range(20, 1001, 20)]
+    samples = [at(0, 1, 9.0), at(1, 2, 60.0), at(2, 3, -40.0), at(3, 4, 9.5)]
+    bucket = bucket_of(samples)
+    assert bucket.accel_m_s2 == ((0.5, -0.5, -40.0), (0.5, -0.5, 60.0))
+    assert (bucket.t_err_s, bucket.latency_s) == (12e-6, 300e-6)
+    bucket = bucket_of([at(0, 1, nan), at(1, 2, 9.0), at(2, 3, inf)])
+    assert bucket.accel_m_s2 == ((0.5, -0.5, 9.0), (0.5, -0.5, 9.0))
+    assert bucket_of([at(0, 1, nan)]).accel_m_s2 is None
+    assert bucket.mag_t is None
+    assert bucket.quat_wxyz is None
+    assert "mag_t" not in msgspec.to_builtins(bucket)
+    good = msgspec.structs.replace(at(0), quat_wxyz=(0.5, 0.5, 0.5, 0.5))
+    bad = msgspec.structs.replace(at(1, 2), quat_wxyz=(nan, 0.0, 0.0, 0.0))
+    assert bucket_of([good, bad, at(2, 3)]).quat_wxyz == (0.5, 0.5, 0.5, 0.5)
+
+
+def test_raw_values_keep_their_sequence_numbers() -> None:
+    raw = raw_of("bow", "accel_m_s2", [at(0, 1, 1.0), at(1, 2, nan), at(2, 5, 3.0)])
+    assert raw is not None
+    assert (raw.seq, raw.t_s) == ((1, 5), (80000.0, 80000.002))
+    assert raw.axes == ((0.5, 0.5), (-0.5, -0.5), (1.0, 3.0))
+    assert raw_of("bow", "mag_t", [at(0)]) is None
+
+
+async def taken(mailbox: Mailbox, count: int) -> list[str]:
+    return [await mailbox.take() for _ in range(count)]
+
+
+async def test_messages_wait_in_order_and_are_dropped_or_forgotten() -> None:
+    mailbox = Mailbox()
+    mailbox.put("a")
+    mailbox.put_newest("status", "old")
+    mailbox.put_newest("status", "new")
+    mailbox.put("b")
+    assert await taken(mailbox, 3) == ["new", "a", "b"]
+    assert mailbox.waiting == 0
+    mailbox = Mailbox()
+    for number in range(FRAMES_MAX + 7):
+        mailbox.put(str(number))
+    assert mailbox.dropped == 7
+    assert await taken(mailbox, 2) == ["7", "8"]
+    mailbox = Mailbox()
+    mailbox.put("a")
+    mailbox.put_newest("status", "b")
+    mailbox.forget()
+    assert mailbox.waiting == 0
+    assert mailbox.dropped == 0, "nobody misses it"
+
+
+async def test_a_page_that_does_not_acknowledge_gets_no_more() -> None:
+    mailbox = Mailbox()
+    for _ in range(2):
+        for number in range(WINDOW_MAX // 2):
+            mailbox.put(str(number))
+        await taken(mailbox, WINDOW_MAX // 2)
+    mailbox.put("one more")
+    waiting = asyncio.ensure_future(mailbox.take())
+    for _ in range(5):
+        await asyncio.sleep(0)
+    assert not waiting.done()
+    mailbox.acknowledge(1)
+    assert await waiting == "one more"
+    mailbox.acknowledge(10**9)  # more messages than sent
+    mailbox.acknowledge(-5)
+    mailbox.put("and one")
+    assert await mailbox.take() == "and one"
