@@ -32,9 +32,8 @@ from tests.lab.imu_process import running_imu, tell, tty
 from tests.lab.serial_port import PseudoTerminal, pseudo_terminal
 from tests.lab.test_gpio_lines import INTERRUPTS
 from tests.lab.tool import running, tool
-from tests.lab.waiting import wait_until
 from tests.lab.wire import I2cTransfer, Refuse, SpiTransfer
-from tests.support.daemon_process import RunningDaemon, running_daemon, write_config
+from tests.support.daemon_process import RunningDaemon, running_daemon, wait_until, write_config
 from tests.support.files import ROOT, hi91
 
 pytestmark = pytest.mark.timeout(600)

@@ -23,9 +23,9 @@ from tests.lab.bus import Bus
 from tests.lab.gpio_chip import GpioChip
 from tests.lab.imu61x_bus import LIMIT_S, on_i2c, on_spi, registers
 from tests.lab.tool import running as tool_running
-from tests.lab.waiting import wait_until
 from tests.lab.wire import I2cTransfer
 from tests.support.daemon_process import LIMIT_S as TASK_LIMIT_S
+from tests.support.daemon_process import wait_until
 from tests.support.device_rig import DeviceRig, device_config, running
 
 INTERRUPTS = Path("/proc/interrupts")

@@ -33,9 +33,8 @@ from tests.lab.imu61x_bus import LIMIT_S, on_i2c
 from tests.lab.imu_process import running_imu, tty
 from tests.lab.test_imu61x_lines import FALLBACK_HZ, Stepped, first
 from tests.lab.tool import tool
-from tests.lab.waiting import wait_until
 from tests.lab.wire import I2cTransfer
-from tests.support.daemon_process import RunningDaemon, running_daemon, write_config
+from tests.support.daemon_process import RunningDaemon, running_daemon, wait_until, write_config
 from tests.support.device_rig import DeviceRigs, device_config, running
 
 pytestmark = pytest.mark.timeout(900)

@@ -29,8 +29,7 @@ from tests.lab.chaos.far_side import FarSide
 from tests.lab.chaos.faults import Fault, Planned, all_faults, plan, plan_short, play
 from tests.lab.chaos.polls import Answer
 from tests.lab.tool import tool
-from tests.lab.waiting import wait_until
-from tests.support.daemon_process import write_config
+from tests.support.daemon_process import wait_until, write_config
 
 CI_SECONDS: Final = 45.0  # three rounds
 STATE_SIZE: Final = "64k"  # size of the file system of the state directory

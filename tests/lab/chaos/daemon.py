@@ -19,7 +19,7 @@ from imud.contracts.status import DeviceState, DeviceStatus
 from imud.formats.slot import SLOT_BYTES, SLOT_FIELDS, decode_slot
 from imud.model.errors import ImudError
 from imud.model.sample import Sample
-from tests.lab.waiting import wait_until
+from tests.support.daemon_process import wait_until
 
 START_LIMIT_S: Final = 60.0  # start of the daemon under emulation
 BACK_LIMIT_S: Final = 120.0

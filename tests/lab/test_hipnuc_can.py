@@ -1,27 +1,36 @@
-"""The J1939 driver and its simulator with the J1939 sockets of the kernel, in both directions, on a virtual bus."""
+"""The J1939 driver and its simulator with the J1939 sockets of the kernel, in both directions, on a virtual bus.
+
+Declared settings and guided calibrations of devices on CAN: imud writes each setting, reads it back and saves it. Then
+the device restarts, and imud continues at its new node number.
+"""
 
 import asyncio
 import math
 import socket
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from time import monotonic, monotonic_ns
 
 import pytest
 
-from imud.contracts.command import VerbResult
+from imud.contracts.command import CalibrationResult, VerbResult
 from imud.contracts.status import DeviceState
+from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.drivers.hipnuc.j1939 import codec, commands
 from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
 from imud.drivers.hipnuc.nmea2000 import HipnucNmea2000Options
-from imud.model.errors import NoReply
+from imud.model.errors import CommandError, NoReply
+from imud.model.event import EventKind
 from imud.model.sample import Sample
+from imud.sim.hipnuc.canopen import NODE_VARIANTS, HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
 from imud.sim.hipnuc.j1939 import J1939_VARIANTS, HipnucJ1939Module, J1939Hardware, J1939Settings
 from imud.sim.hipnuc.nmea2000 import HipnucNmea2000Module, Nmea2000Hardware
+from imud.sim.physics import Motion, Still, swing
 from imud.sim.ports.can_port import CanPort
 from tests.lab.can_device import BusRig
 from tests.lab.can_interface import CanInterface
+from tests.lab.short_form import cases
 
 LIMIT_S = 30.0
 LEVEL = 100 + socket.CAN_J1939
@@ -186,3 +195,96 @@ async def test_nmea_2000_from_the_simulator(vcan: CanInterface) -> None:
         assert sample.euler_rad is not None
         truth = module.hardware.motion.at((sample.t_ns - module.epoch_ns) / 1e9)
         assert sample.euler_rad == pytest.approx(truth.euler_rad, abs=0.1)
+
+
+async def made_so(rig: BusRig, wanted: Mapping[str, object], *, verified: bool) -> None:
+    applied = await rig.done(rig.device.settings_apply(wanted, save=True))
+    assert applied.problem == "", applied
+    assert {step.name for step in applied.steps} == set(wanted)
+    outcomes = {str(step.outcome) for step in applied.steps}
+    assert ("not verified" in " ".join(outcomes)) is not verified, applied
+    assert applied.saved
+    count = len(rig.samples)
+    await rig.until(lambda: len(rig.samples) > count + 5, "samples afterwards")
+    messages = " ".join(event.message for event in rig.events)
+    assert "in the configuration" in messages  # the message names the node number to change in the configuration
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("variant", cases(NODE_VARIANTS, "manual"))
+async def test_a_canopen_node_is_made_as_declared(vcan: CanInterface, variant: str) -> None:
+    now_ns, kind = monotonic_ns(), NODE_VARIANTS[variant]
+    slow = NodeSettings(bit_rate=0, periods_ms={1: 100, 2: 100, 3: 100, 4: 100, 6: 0, 7: 0})
+    rare = NodeSettings(node=12, bit_rate=0, periods_ms={1: 500, 2: 0, 3: 0, 4: 0, 6: 0, 7: 0})
+    module = HipnucCanopenModule(now_ns, HipnucCanopenHardware(factory=slow, boot_ms=200, variant=kind))
+    beside = HipnucCanopenModule(now_ns, HipnucCanopenHardware(factory=rare, boot_ms=0))
+    rig = BusRig(vcan.name, "hipnuc-canopen", HipnucCanopenOptions(), module, beside)
+    async with rig.played():
+        taken = await rig.done(rig.device.settings_apply({"node": 12}, save=True))
+        assert "node 12 is in use" in taken.problem
+        assert module.objects.writes_to_flash == 0
+        wanted = {"tpdo2_interval_ms": 200, "incli_x_reversed": True, "node": 9}
+        await made_so(rig, wanted, verified=kind.reads == "answered")
+    saved = module.objects.saved
+    assert (saved.periods_ms[2], saved.invert_x, saved.node, module.node) == (200, 1, 9, 9)
+    assert module.objects.writes_to_flash == 1
+    assert beside.objects.settings == rare
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("variant", cases(J1939_VARIANTS, "real"))
+async def test_a_j1939_module_is_made_as_declared(vcan: CanInterface, variant: str) -> None:
+    now_ns, kind = monotonic_ns(), J1939_VARIANTS[variant]
+    module = HipnucJ1939Module(now_ns, J1939Settings(), J1939Hardware(bitrate=0, boot_ms=200, variant=kind))
+    beside = HipnucJ1939Module(now_ns, J1939Settings(address=12), J1939Hardware(bitrate=0, boot_ms=0))
+    rig = BusRig(vcan.name, "hipnuc-j1939", HipnucJ1939Options(), module, beside)
+    async with rig.played():
+        taken = await rig.done(rig.device.settings_apply({"address": 12}, save=True))
+        assert "address 12 is in use" in taken.problem
+        assert module.writes_to_flash == 0
+        wanted = {"ff37_interval_ms": 50, "y_reversed": True, "address": 9}
+        await made_so(rig, wanted, verified=kind.reads != "ignored")
+    saved = module.flash
+    assert (saved.intervals_ms[0xFF37], saved.y_reversed, saved.address) == (50, 1, 9)
+    assert module.writes_to_flash == 1
+    assert beside.settings == J1939Settings(address=12)
+
+
+TILTED = Still(0.2, -0.1, 0.5)
+SLOW = NodeSettings(bit_rate=0, periods_ms={1: 50, 2: 50, 3: 50, 4: 0, 6: 0, 7: 50})
+
+
+def canopen(interface: str, motion: Motion) -> BusRig:
+    hardware = HipnucCanopenHardware(factory=SLOW, boot_ms=0, motion=motion)
+    return BusRig(interface, "hipnuc-canopen", HipnucCanopenOptions(), HipnucCanopenModule(monotonic_ns(), hardware))
+
+
+def j1939(interface: str, motion: Motion) -> BusRig:
+    hardware = J1939Hardware(bitrate=0, boot_ms=0, motion=motion)
+    settings = J1939Settings(intervals_ms={**J1939Settings().intervals_ms, 0xFF4A: 100})
+    module = HipnucJ1939Module(monotonic_ns(), settings, hardware)
+    return BusRig(interface, "hipnuc-j1939", HipnucJ1939Options(), module)
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("make", [canopen, j1939])
+async def test_the_zero_of_an_inclinometer(vcan: CanInterface, make: Callable[[str, Motion], BusRig]) -> None:
+    rig = make(vcan.name, TILTED)
+    async with rig.played():
+        await rig.until(lambda: any(sample.incli_rad is not None for sample in rig.samples), "inclinations")
+        before = next(sample.incli_rad for sample in reversed(rig.samples) if sample.incli_rad is not None)
+        assert max(map(abs, before)) > 0.05
+        result: CalibrationResult = await rig.done(rig.device.calibrate("zero", save=True))
+        assert result.verified, result
+        assert result.saved
+        assert [check.name for check in result.checks] == ["inclination"]
+    assert any(event.kind is EventKind.CALIBRATION for event in rig.events)
+
+
+@pytest.mark.thorough
+@pytest.mark.timeout(300)
+async def test_a_node_that_moves_gets_no_zero(vcan: CanInterface) -> None:
+    rig = canopen(vcan.name, swing())
+    async with rig.played():
+        with pytest.raises(CommandError, match="expected the device at rest"):
+            await rig.done(rig.device.calibrate("zero", save=True))
