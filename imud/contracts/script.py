@@ -79,11 +79,6 @@ def never(_message: Message) -> bool:
     return False
 
 
-def of_text(holds: Callable[[str], bool]) -> Callable[[Message], bool]:
-    """Return a predicate that is true for lines of text that match `holds`."""
-    return lambda message: isinstance(message, str) and holds(message)
-
-
 def pause(duration_ns: int, *, baud: int = 0) -> Request:
     """Return a request that waits, at another baud rate if `baud` is given. Its outcome is `Silence`."""
     return Request(b"", "pause", never, never, never, duration_ns, baud=baud)

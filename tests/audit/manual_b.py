@@ -51,7 +51,7 @@ MANUAL_B: Final = (
     Item("B 2.2.5 LOG ENABLE", "frames out", "drivers.hipnuc.uart.commands:log_enable"),
     Item("B 2.2.5 LOG DISABLE", "no frames", "drivers.hipnuc.uart.commands:log_disable"),
     Item("B 2.2.5 VERSION", "product, serial number, firmware", "drivers.hipnuc.uart.replies:parse_version"),
-    Item("B 2.2.5 USRCONFIG", "settings of the user", "drivers.hipnuc.uart.replies:parse_usrconfig"),
+    Item("B 2.2.5 USRCONFIG", "settings of the user", "drivers.hipnuc.uart.settings:report_values"),
     Item("B 2.2.5 COMCONFIG", "port and outputs", "drivers.hipnuc.uart.replies:parse_comconfig"),
     Item("B 2.2.5 ONTIME", "periods of 1 s to 2 ms, and so on", "drivers.hipnuc.uart.commands:log_ontime"),
     Item("B 2.2.5 output off", "period 0", "drivers.hipnuc.uart.commands:log_ontime"),
@@ -167,7 +167,7 @@ MANUAL_B: Final = (
     Item("B 6.2.2 source address", "any", "drivers.hipnuc.j1939.codec:HOST_ADDRESS"),
     Item("B 7 NMEA 2000", "heading, rate of turn, attitude by the standard", "drivers.hipnuc.nmea2000:measurement_of"),
     Item("B 8.1.1 procedure", "steps and conditions", "drivers.hipnuc.common:TURNING"),
-    Item("B 8.1.1 result", "bias of MAGCONFIG, zero before", "drivers.hipnuc.uart.replies:parse_magconfig"),
+    Item("B 8.1.1 result", "bias of MAGCONFIG, zero before", "drivers.hipnuc.uart.settings:report_values"),
     Item("B 8.1.2 disturbance", "a field that does not turn with the module", "device.calibration:RESIDUAL_MAX"),
     Item(
         "B 8.1.3 in the background", "collects, calibrates, saves by itself", "sim.hipnuc.uart_settings:SelfCalibration"

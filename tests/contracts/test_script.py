@@ -14,7 +14,6 @@ from imud.contracts.script import (
     RequestScript,
     Silence,
     never,
-    of_text,
     pause,
     with_undo,
 )
@@ -22,7 +21,7 @@ from imud.device.scripts import REPLY_MESSAGES_MAX, ScriptRunner
 from imud.model.errors import CommandError
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
-from tests.support.script_runners import offline_runner
+from tests.support.script_runners import of_text, offline_runner
 
 TIMEOUT_NS = 100
 
@@ -185,11 +184,6 @@ def test_a_late_frame_is_told_from_the_next_reply(session: ScriptRunner, ledger:
     assert session.on_message(ReplyFrame(6, b""), TIMEOUT_NS + 1) is None
     assert strays(ledger) == (1, 0)
     assert session.on_message(ReplyFrame(7, b""), TIMEOUT_NS + 2) == Reply((ReplyFrame(7, b""),))
-
-
-def test_text_predicates_hold_for_no_frame() -> None:
-    assert of_text(lambda line: True)("x")
-    assert not of_text(lambda line: True)(ReplyFrame(1, b""))
 
 
 def test_a_pause_sends_nothing_and_late_replies_stay_late(session: ScriptRunner, ledger: Ledger) -> None:

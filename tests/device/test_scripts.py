@@ -16,7 +16,6 @@ from imud.contracts.script import (
     RequestScript,
     Silence,
     never,
-    of_text,
     pause,
     with_undo,
 )
@@ -32,7 +31,7 @@ from imud.model.errors import CommandError, LinkMissing, NoReply
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from tests.support.event_loops import VirtualClock, in_loop, run_virtually
-from tests.support.script_runners import ListPort, of_fast_device, offline_runner
+from tests.support.script_runners import ListPort, of_fast_device, of_text, offline_runner
 
 
 def request(name: str, timeout_ns: int = 10**10, *, silent: bool = False) -> Request:

@@ -27,7 +27,6 @@ from imud.contracts.script import (
     Silence,
     TextLine,
     never,
-    of_text,
     pause,
     says_nothing,
 )
@@ -38,6 +37,7 @@ from imud.model.errors import BadArgument, NoReply, Rejected
 from imud.model.ledger import Ledger
 from imud.model.options import NoOptions, Options
 from imud.model.sample import Measurement
+from tests.support.script_runners import of_text
 
 SYNC: Final = b"\x5a\xa5"
 PAYLOAD_MAX: Final = 512

@@ -1,14 +1,19 @@
 """Script runners without a device: tests give them the messages and the time."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
-from imud.contracts.script import Request, Silence, never, of_text
+from imud.contracts.script import Message, Request, Silence, never
 from imud.device.scripts import RequestPort, ScriptRunner
 from imud.host.clock import HostClock
 from imud.model.errors import NoReply
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS
+
+
+def of_text(holds: Callable[[str], bool]) -> Callable[[Message], bool]:
+    """Return a predicate that is true for lines of text that match `holds`."""
+    return lambda message: isinstance(message, str) and holds(message)
 
 
 def unanswered_ms(script: Any) -> Iterator[float]:

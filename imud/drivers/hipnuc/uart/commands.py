@@ -17,10 +17,20 @@ from typing import Final, Literal, get_args
 
 from imud.attitude.rotation import Matrix3, is_rotation
 from imud.contracts.driver import Identity
-from imud.contracts.script import Outcome, Rejection, Reply, Request, RequestScript, Silence, of_text, pause
+from imud.contracts.script import (
+    Message,
+    Outcome,
+    Rejection,
+    Reply,
+    Request,
+    RequestScript,
+    Silence,
+    never,
+    pause,
+)
 from imud.drivers.hipnuc.common import AttitudeMode, LevelReset
 from imud.drivers.hipnuc.uart.replies import (
-    ComConfig,
+    Outputs,
     is_end,
     is_rejection,
     is_setting_line,
@@ -259,24 +269,20 @@ def require_room(rates_hz: Mapping[OutputMessage, float], baud: int) -> None:
         )
 
 
-def _never(_line: str) -> bool:
-    return False
-
-
 def _command(
     text: str,
     *,
     timeout_ns: int = REPLY_TIMEOUT_NS,
     silent: bool = False,
-    is_part: Callable[[str], bool] = _never,
+    is_part: Callable[[Message], bool] = never,
     messages_min: int = 1,
     kind: str = "OK",
     repeatable: bool = False,
 ) -> Request:
     payload = (text + LINE_END).encode("ascii")
     return Request(
-        payload, text, of_text(is_end), of_text(is_rejection), of_text(is_part), timeout_ns, silent, messages_min,
-        kind, repeatable, probe=None if kind == "version" else ask(Query.VERSION),
+        payload, text, is_end, is_rejection, is_part, timeout_ns, silent, messages_min, kind, repeatable,
+        probe=None if kind == "version" else ask(Query.VERSION),
     )  # fmt: skip
 
 
@@ -362,7 +368,7 @@ def send_once(message: OutputMessage) -> RequestScript[None]:
     raise_if_rejected(request.name, outcome)
 
 
-def ask_outputs() -> RequestScript[ComConfig | None]:
+def ask_outputs() -> RequestScript[Outputs | None]:
     """Read which messages the device sends at which rate (LOG COMCONFIG); None if the device does not report it."""
     outcome = yield ask(Query.COMCONFIG)
     if not isinstance(outcome, Reply):
@@ -371,7 +377,7 @@ def ask_outputs() -> RequestScript[ComConfig | None]:
     return config if config.periods_s or config.on_mark else None
 
 
-def rates_hz(config: ComConfig | None) -> dict[OutputMessage, float]:
+def rates_hz(config: Outputs | None) -> dict[OutputMessage, float]:
     """Return the output rates of all timed messages."""
     periods_s = config.periods_s if config is not None else {}
     return {OutputMessage(name): 1 / period_s for name, period_s in periods_s.items() if period_s > 0}

@@ -59,7 +59,7 @@ from imud.drivers.hipnuc.uart.commands import (
     send,
     wake,
 )
-from imud.drivers.hipnuc.uart.replies import parse_magconfig
+from imud.drivers.hipnuc.uart.replies import numbers_of, parse_report
 from imud.drivers.hipnuc.uart.settings import (
     RFU_312,
     SETTINGS,
@@ -191,7 +191,7 @@ def _magnetometer_verdict(_target: Target) -> RequestScript[Verdict]:
     if isinstance(outcome, Silence):
         raise NoReply("LOG MAGCONFIG: expected lines up to OK, got no reply; does the device have a magnetometer?")
     commands.raise_if_rejected("LOG MAGCONFIG", outcome)
-    bias = parse_magconfig(outcome.lines).bias_ut
+    bias = numbers_of(parse_report(outcome.lines).values.get("MB", ""), 3)
     if bias is None:
         return Verdict(done=False, words="the device does not report its bias")
     words = "bias " + ", ".join(f"{value:g}" for value in bias) + " µT"

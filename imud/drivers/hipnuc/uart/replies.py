@@ -1,4 +1,4 @@
-"""Replies of HiPNUC devices to ASCII commands: kinds of lines, and the four reports of LOG as records.
+"""Replies of HiPNUC devices to ASCII commands: kinds of messages, and the lines of the reports of LOG.
 
 Manual "IMU配置手冊" V1.5.9, sections 2.2.5 and 8.1.1, which show one line of USRCONFIG and one line of MAGCONFIG; LOG
 VERSION as sent by firmware 1.5.6:
@@ -12,49 +12,43 @@ unchanged.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
-from typing import Final
+from typing import Final, NamedTuple
 
-from imud.attitude.rotation import Matrix3
-from imud.contracts.script import TextLine
+from imud.contracts.script import Message, TextLine
 from imud.model.ledger import Ledger
-from imud.model.sample import Vector3
 
 _VERSION_NAMES: Final = ("PNAME", "BUILD", "UUID", "APP_VER", "BL_VER")
 _VALUE_LINE: Final = re.compile(r"\s*([A-Za-z][A-Za-z0-9_.\-]*)\s*[=:]\s*(.*?)\s*")
 _COMMENT: Final = re.compile(r"\s*/\*.*?(\*/|$)")
 _OUTPUT: Final = re.compile(r"\b(?:IMU|HI)(91|92)\s+(?:COM\d+\s+)?ONTIME\s+(\d+(?:\.\d*)?|\.\d+)")
 _MARKED: Final = re.compile(r"\b(?:IMU|HI)(91|92)\s+(?:COM\d+\s+)?ONMARK\s+1\b")
-# `COORD 4`, `COORD=4` or `COORD: 4`; no document of the vendor shows the line
-_COORD: Final = re.compile(r"(?<![A-Za-z])COORD(?![A-Za-z])\s*[=:]?\s*0*(\w+)")
-_PIN: Final = re.compile(r"IO([1-9])\b")
-_DIVISOR: Final = re.compile(r"(?:.*\bDIV)?\s*(\d{1,2})\b")
 
 
-def is_end(line: str) -> bool:
-    """Return whether `line` ends a positive reply: OK in any case."""
-    return line.strip().upper() == "OK"
+def is_end(message: Message) -> bool:
+    """Return whether a message ends a positive reply: the line OK in any case."""
+    return isinstance(message, str) and message.strip().upper() == "OK"
 
 
-def is_rejection(line: str) -> bool:
-    """Return whether `line` is a rejection: ERR with any text, but not a setting with a name that starts with ERR."""
-    return line.lstrip().upper().startswith("ERR") and "=" not in line
+def is_rejection(message: Message) -> bool:
+    """Return whether a message is a rejection: ERR with any text, but not a setting whose name starts with ERR."""
+    return isinstance(message, str) and message.lstrip().upper().startswith("ERR") and "=" not in message
 
 
-def is_version_line(line: str) -> bool:
-    """Return whether `line` can be part of the reply to LOG VERSION."""
-    match = _VALUE_LINE.fullmatch(line)
+def is_version_line(message: Message) -> bool:
+    """Return whether a message can be part of the reply to LOG VERSION."""
+    match = _VALUE_LINE.fullmatch(message) if isinstance(message, str) else None
     return match is not None and match[1] in _VERSION_NAMES
 
 
-def is_setting_line(line: str) -> bool:
-    """Return whether `line` can be part of another report (not documented).
+def is_setting_line(message: Message) -> bool:
+    """Return whether a message can be part of another report (not documented).
 
     A version line and an NMEA sentence of newer firmware, which can arrive between the lines, are not part of it.
     """
-    return not is_version_line(line) and not line.startswith("$")
+    return isinstance(message, str) and not is_version_line(message) and not message.startswith("$")
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,35 +71,11 @@ class Version:
     report: Report
 
 
-@dataclass(frozen=True, slots=True)
-class UserConfig:
-    """Reply to LOG USRCONFIG."""
-
-    att_mode: int | None  # 0: 6-axis, 1: 9-axis
-    urfr: Matrix3 | None  # rotation from new sensor axes to the old axes
-    magnetic_calibration: bool | None  # whether the background calibration is enabled (EN_MCAL)
-    pins: Mapping[int, int]  # pin (1 for IO1) by the number of its function (1 for PMUX1)
-    sout_divisor: int | None
-    coordinates: str  # value of COORD (newer firmware); empty if the device does not report it
-    report: Report
-
-
-@dataclass(frozen=True, slots=True)
-class ComConfig:
-    """Reply to LOG COMCONFIG. Its form is not documented: imud looks for output periods in the form of the command."""
+class Outputs(NamedTuple):
+    """Outputs in a reply to LOG COMCONFIG. Its form is not documented: imud looks for the form of the command."""
 
     periods_s: Mapping[str, float]  # output periods by message (`HI91`, `HI92`); 0 is off
     on_mark: frozenset[str]  # messages for each pulse on SIN
-    baud: int | None
-    report: Report
-
-
-@dataclass(frozen=True, slots=True)
-class MagConfig:
-    """Reply to LOG MAGCONFIG."""
-
-    bias_ut: Vector3 | None  # offset of the calibration (`MB`), µT; all zero: not calibrated
-    report: Report
 
 
 def parse_report(lines: Sequence[str]) -> Report:
@@ -123,75 +93,38 @@ def parse_report(lines: Sequence[str]) -> Report:
     return Report(values, tuple(other))
 
 
-def lines_of(values: Mapping[str, str]) -> list[str]:
-    """Return settings from `read_settings` as lines, for the functions below."""
-    return [text if name.startswith("COMCONFIG ") else f"{name}: {text}" for name, text in values.items()]
-
-
 def parse_version(lines: Sequence[str]) -> Version:
     """Return the values of a reply to LOG VERSION."""
     report = parse_report(lines)
     get = report.values.get
     return Version(
-        get("PNAME", ""), get("BUILD", ""), get("UUID", ""), _whole(get("APP_VER")), _whole(get("BL_VER")), report
+        get("PNAME", ""), get("BUILD", ""), get("UUID", ""), whole(get("APP_VER")), whole(get("BL_VER")), report
     )
 
 
-def parse_usrconfig(lines: Sequence[str]) -> UserConfig:
-    """Return the values of a reply to LOG USRCONFIG."""
-    report = parse_report(lines)
-    get = report.values.get
-    pins = {number: _PIN.match(get(f"PMUX{number}", "")) for number in range(1, 6)}
-    divisor = _DIVISOR.match(get("SOUT_DIV", ""))
-    calibrates = _whole(get("EN_MCAL"))
-    return UserConfig(
-        _whole(get("ATT_MODE")),
-        _matrix(get("URFR", "")),
-        None if calibrates is None else calibrates != 0,
-        {number: int(pin[1]) for number, pin in pins.items() if pin},
-        int(divisor[1]) if divisor else None,
-        next((match[1] for line in lines if (match := _COORD.search(line))), ""),
-        report,
-    )
+def parse_comconfig(lines: Iterable[str]) -> Outputs:
+    """Return the outputs in a reply to LOG COMCONFIG."""
+    periods_s, on_mark = {}, set()
+    for line in lines:
+        for message, period in _OUTPUT.findall(line):
+            periods_s[f"HI{message}"] = float(period)
+        for message in _MARKED.findall(line):
+            on_mark.add(f"HI{message}")
+    return Outputs(periods_s, frozenset(on_mark))
 
 
-def parse_comconfig(lines: Sequence[str]) -> ComConfig:
-    """Return the values of a reply to LOG COMCONFIG."""
-    periods_s = {f"HI{message}": float(period) for line in lines for message, period in _OUTPUT.findall(line)}
-    on_mark = frozenset(f"HI{message}" for line in lines for message in _MARKED.findall(line))
-    report = parse_report(lines)
-    return ComConfig(periods_s, on_mark, _whole(report.values.get("BAUD")), report)
-
-
-def parse_magconfig(lines: Sequence[str]) -> MagConfig:
-    """Return the values of a reply to LOG MAGCONFIG."""
-    report = parse_report(lines)
-    return MagConfig(_vector(report.values.get("MB", "")), report)
-
-
-def _whole(text: str | None) -> int | None:
+def whole(text: str | None) -> int | None:
+    """Return the number in a value; None for another text."""
     return int(text) if text is not None and text.isdecimal() else None
 
 
-def _numbers(text: str, count: int) -> tuple[float, ...] | None:
+def numbers_of(text: str, count: int) -> list[float] | None:
+    """Return the numbers of a vector or matrix; None for another text."""
     try:
-        numbers = tuple(map(float, text.split(",")))
+        numbers = list(map(float, text.split(",")))
     except ValueError:
         return None
     return numbers if len(numbers) == count and all(map(isfinite, numbers)) else None
-
-
-def _vector(text: str) -> Vector3 | None:
-    numbers = _numbers(text, 3)
-    return None if numbers is None else (numbers[0], numbers[1], numbers[2])
-
-
-def _matrix(text: str) -> Matrix3 | None:
-    numbers = _numbers(text, 9)
-    if numbers is None:
-        return None
-    a, b, c, d, e, f, g, h, i = numbers
-    return ((a, b, c), (d, e, f), (g, h, i))
 
 
 # Maximum length of a line without its end. Replies in the manual are below 80; more means a lost line end.

@@ -5,8 +5,11 @@ imud ignores values of an unknown form. `report_values` returns the known values
 """
 
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
+from itertools import chain
+from math import isclose
 from typing import Annotated, Any, Final, Literal, get_args
 
 import msgspec
@@ -38,7 +41,7 @@ from imud.drivers.hipnuc.uart.commands import (
     Query,
     send,
 )
-from imud.drivers.hipnuc.uart.replies import lines_of, parse_comconfig, parse_magconfig, parse_usrconfig
+from imud.drivers.hipnuc.uart.replies import numbers_of, parse_comconfig, whole
 from imud.model.errors import BadArgument
 from imud.model.options import Options
 
@@ -79,6 +82,10 @@ _NAME: Final = re.compile(rf"(?:{PIN_SETTING}|.*ALARM)(?:[_ ]?([XY]))?", re.IGNO
 _VALUES: Final = re.compile(
     rf"(?:([XY])\s*,\s*)?({_NUMBER})\s*,\s*({_NUMBER})\s*,\s*{_NUMBER}\s*,\s*([01])", re.IGNORECASE
 )
+# `COORD 4`, `COORD=4` or `COORD: 4`; no document of the vendor shows the line
+_COORD: Final = re.compile(r"(?<![A-Za-z])COORD(?![A-Za-z])\s*[=:]?\s*0*(\w+)")
+_PIN: Final = re.compile(r"IO([1-9])\b")
+_DIVISOR: Final = re.compile(r"(?:.*\bDIV)?\s*(\d{1,2})\b")
 
 
 def alarm_ranges(settings: Mapping[str, Any]) -> AlarmRanges:
@@ -95,6 +102,7 @@ ON_MARK: Final = "on_mark"
 MessageName = Literal["hi91", "hi92"]
 Output = dict[MessageName, OutputRate | Literal["on_mark"]]
 Modes = Literal["6-axis", "9-axis"]
+MODES: Final[Mapping[int | None, Modes]] = {0: "6-axis", 1: "9-axis"}  # by the value of ATT_MODE
 Axis = Literal["x", "y"]
 Pin = Annotated[int, Meta(ge=1, le=PIN_MAX)]
 Angle = Annotated[float, Meta(ge=-180, le=180, extra={"unit": "°"})]
@@ -113,33 +121,40 @@ class AngleAlarm(Options, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 def report_values(raw: Mapping[str, str]) -> dict[str, Any]:
     """Return the settings in reports (`commands.read_report`) by name."""
-    lines = lines_of(raw)
-    user, com, mag = parse_usrconfig(lines), parse_comconfig(lines), parse_magconfig(lines)
-    rates = {name.lower(): _whole_rate(period_s) for name, period_s in com.periods_s.items()}
-    reported: dict[str, Any] = {
-        "output": {**rates, **{name.lower(): ON_MARK for name in com.on_mark}} or None,
-        "mode": {0: "6-axis", 1: "9-axis"}.get(-1 if user.att_mode is None else user.att_mode),
-        "mounting": None if user.urfr is None else _mounting_name(user.urfr),
-        "magnetic_calibration": user.magnetic_calibration,
-        "pins": {PinFunction(number).name.lower(): pin for number, pin in user.pins.items()} or None,
-        "sout_divisor": user.sout_divisor,
-        "alarm": _alarms(raw) or None,
-        "coordinates": user.coordinates or None,
-        "magnetometer_bias": None if mag.bias_ut is None else list(mag.bias_ut),
-        "baud": com.baud if com.baud in BAUD_RATES else None,
-    }
-    return {name: value for name, value in reported.items() if value is not None}
-
-
-def _alarms(raw: Mapping[str, str]) -> dict[str, AngleAlarm]:
-    """Return the alarm ranges by axis, without axes that the device does not report."""
-    found = {}
+    outputs = parse_comconfig(raw.values())
+    output: dict[str, Any] = {}
+    for message, period_s in outputs.periods_s.items():
+        rate_hz = round(1 / period_s, 3) if period_s else 0
+        output[message.lower()] = int(rate_hz) if rate_hz == int(rate_hz) else rate_hz
+    for message in outputs.on_mark:
+        output[message.lower()] = ON_MARK
+    alarms, coordinates = {}, None
     for name, text in raw.items():
         named, values = _NAME.fullmatch(name.strip()), _VALUES.fullmatch(text.strip())
         if named and values and (axis := (values[1] or named[1] or "").lower()):
             low, high = float(values[2]), float(values[3])
-            found[axis] = AngleAlarm(min_deg=low, max_deg=high, enabled=values[4] == "1")
-    return found
+            alarms[axis] = AngleAlarm(min_deg=low, max_deg=high, enabled=values[4] == "1")
+        if coordinates is None and (found := _COORD.search(f"{name}: {text}")):
+            coordinates = found[1]
+    pins = {}
+    for function in PinFunction:
+        if found := _PIN.match(raw.get(f"PMUX{function.value}", "")):
+            pins[function.name.lower()] = int(found[1])
+    calibrates, baud = whole(raw.get("EN_MCAL")), whole(raw.get("BAUD"))
+    divisor = _DIVISOR.match(raw.get("SOUT_DIV", ""))
+    reported: dict[str, Any] = {
+        "output": output or None,
+        "mode": MODES.get(whole(raw.get("ATT_MODE"))),
+        "mounting": _mounting_name(numbers_of(raw.get("URFR", ""), 9)),
+        "magnetic_calibration": None if calibrates is None else calibrates != 0,
+        "pins": pins or None,
+        "sout_divisor": int(divisor[1]) if divisor else None,
+        "alarm": alarms or None,
+        "coordinates": coordinates,
+        "magnetometer_bias": numbers_of(raw.get("MB", ""), 3),
+        "baud": baud if baud in BAUD_RATES else None,
+    }
+    return {name: value for name, value in reported.items() if value is not None}
 
 
 def why_silent(settings: Mapping[str, Any]) -> str:
@@ -156,62 +171,43 @@ def why_silent(settings: Mapping[str, Any]) -> str:
 
 def shown(raw: Mapping[str, str]) -> dict[str, str]:
     """Return the settings by name, as text with units. Unknown settings keep the name and text of the device."""
-    return {name: text for name, text in _words(raw) if text} | _unknown(raw)
-
-
-def _words(raw: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    for name, value in report_values(raw).items():
+    found, known = {}, report_values(raw)
+    for name, value in known.items():
         match name, value:
             case "output", dict():
-                yield from ((f"output.{message}", _rate_words(rate)) for message, rate in sorted(value.items()))
+                for message, rate in sorted(value.items()):
+                    found[f"output.{message}"] = "on mark" if rate == ON_MARK else f"{rate:g} Hz" if rate else "off"
             case "pins", dict():
-                yield from ((f"pins.{function}", f"IO{pin}") for function, pin in value.items())
+                for function, pin in value.items():
+                    found[f"pins.{function}"] = f"IO{pin}"
             case "alarm", dict():
-                yield from ((f"alarm.{axis}", _alarm_words(alarm)) for axis, alarm in value.items())
+                for axis, alarm in value.items():
+                    state = "on" if alarm.enabled else "off"
+                    found[f"alarm.{axis}"] = f"{alarm.min_deg:g}° … {alarm.max_deg:g}°, {state}"
             case "magnetometer_bias", [x, y, z]:
-                yield name, f"{x:g}, {y:g}, {z:g} µT" if any(value) else "0, 0, 0 µT: not calibrated"
+                found[name] = f"{x:g}, {y:g}, {z:g} µT" if any(value) else "0, 0, 0 µT: not calibrated"
             case "baud", int():
-                yield name, f"{value} bit/s"
+                found[name] = f"{value} bit/s"
             case "mounting", list():
-                yield name, ", ".join(f"{number:g}" for number in value)
+                found[name] = ", ".join(f"{number:g}" for number in value)
             case _:
-                yield name, {True: "on", False: "off"}.get(value, str(value)) if isinstance(value, bool) else str(value)
+                found[name] = {True: "on", False: "off"}[value] if isinstance(value, bool) else str(value)
+    # a line contains no known setting if the known settings are the same without its text
+    return found | {name: text for name, text in raw.items() if report_values({**raw, name: ""}) == known}
 
 
-def _unknown(raw: Mapping[str, str]) -> dict[str, str]:
-    """Return the lines of the device that contain no known setting."""
-    known = report_values(raw)
-    return {
-        name: text for name, text in raw.items() if report_values({k: v for k, v in raw.items() if k != name}) == known
-    }
+def _mounting_name(urfr: list[float] | None) -> str | list[float] | None:
+    """Return the name of a mounting by its nine numbers, rows first; the numbers if it has no name."""
+    if urfr is not None:
+        for mounting in Mounting:
+            if _near(chain(*mounting.value), urfr):
+                return mounting.name.lower()
+    return urfr
 
 
-def _rate_words(rate: object) -> str:
-    return "on mark" if rate == ON_MARK else f"{rate:g} Hz" if rate else "off"
-
-
-def _alarm_words(alarm: AngleAlarm) -> str:
-    return f"{alarm.min_deg:g}° … {alarm.max_deg:g}°, {'on' if alarm.enabled else 'off'}"
-
-
-def _whole_rate(period_s: float) -> float:
-    """Return the rate of a period, as an integer if possible."""
-    rate_hz = round(1 / period_s, 3) if period_s else 0
-    return int(rate_hz) if rate_hz == int(rate_hz) else rate_hz
-
-
-def _mounting_name(urfr: Matrix3) -> str | list[float]:
-    """Return the name of a mounting; its nine numbers if it has no name."""
-    numbers = [value for row in urfr for value in row]
-    return next((one.name.lower() for one in Mounting if _near(_numbers(one), numbers)), numbers)
-
-
-def _numbers(mounting: Mounting) -> list[float]:
-    return [float(value) for row in mounting.value for value in row]
-
-
-def _near(one: list[float], other: list[float]) -> bool:
-    return len(one) == len(other) and all(abs(a - b) <= ROTATION_TOLERANCE for a, b in zip(one, other, strict=True))
+def _near(one: Iterable[float], other: Iterable[float]) -> bool:
+    """Return whether two mountings agree, each given by its nine numbers."""
+    return all(map(partial(isclose, rel_tol=0, abs_tol=ROTATION_TOLERANCE), one, other))
 
 
 def _read(_target: Target, names: Collection[str] | None) -> RequestScript[Reports]:
@@ -252,7 +248,9 @@ def _mounting(_target: Target, value: MountingName | list[float]) -> RequestScri
 
 def matrix_of(value: MountingName | list[float]) -> Matrix3:
     """Return the URFR matrix of a mounting by name or by its nine numbers, rows first."""
-    a, b, c, d, e, f, g, h, i = value if isinstance(value, list) else _numbers(Mounting[value.upper()])
+    if isinstance(value, str):
+        return Mounting[value.upper()].value
+    a, b, c, d, e, f, g, h, i = value
     return ((a, b, c), (d, e, f), (g, h, i))
 
 
@@ -296,8 +294,7 @@ def _has_all(declared: Mapping[str, Any], actual: Mapping[str, Any]) -> bool:
 
 
 def _same_mounting(declared: MountingName | list[float], actual: MountingName | list[float]) -> bool:
-    one, other = ([value for row in matrix_of(mounting) for value in row] for mounting in (declared, actual))
-    return _near(one, other)
+    return _near(chain(*matrix_of(declared)), chain(*matrix_of(actual)))
 
 
 def _check(target: Target, values: Mapping[str, Any]) -> None:

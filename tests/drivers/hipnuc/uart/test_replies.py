@@ -18,10 +18,8 @@ def test_reports_of_the_module() -> None:
     assert version.report.values == {"PNAME": "CH0", "APP_VER": "beta", "COLOUR": "red"}
     assert version.report.other == ("* boot ok *", "PNAME=again")
 
-    config = r.parse_usrconfig(("ATT_MODE: 1 /* 0:6, 1:9 */", "URFR=1,0,0", "OK"))
-    assert config.att_mode == 1
-    assert config.report.values == {"ATT_MODE": "1", "URFR": "1,0,0"}
-    assert r.parse_usrconfig(("OK",)).att_mode is None
+    config = r.parse_report(("ATT_MODE: 1 /* 0:6, 1:9 */", "URFR=1,0,0", "OK"))
+    assert config.values == {"ATT_MODE": "1", "URFR": "1,0,0"}
     assert r.is_end("OK")
     assert not r.is_end("OKAY")
     assert r.is_rejection("ERR")
@@ -32,15 +30,14 @@ def test_reports_of_the_module() -> None:
     assert r.is_setting_line("ATT_MODE: 0")
     assert not r.is_version_line("ATT_MODE: 0")
 
-    port = r.parse_comconfig(("BAUD=115200", "LOG IMU91 ONTIME 0.01", "LOG HI92 COM1 ONTIME 0", "OK"))
-    assert (port.periods_s, port.report.values) == ({"HI91": 0.01, "HI92": 0.0}, {"BAUD": "115200"})
-    assert port.report.other == ("LOG IMU91 ONTIME 0.01", "LOG HI92 COM1 ONTIME 0")
+    lines = ("BAUD=115200", "LOG IMU91 ONTIME 0.01", "LOG HI92 COM1 ONTIME 0", "OK")
+    assert r.parse_comconfig(lines) == ({"HI91": 0.01, "HI92": 0.0}, frozenset())
+    assert r.parse_report(lines) == r.Report({"BAUD": "115200"}, lines[1:3])
 
 
 @pytest.mark.parametrize(
-    ("line", "bias_ut"),
-    [("MB=14.14, -2.08, -8.75", (14.14, -2.08, -8.75)), ("MB=1,2", None), ("MB=1,nan,2", None), ("X=1", None)],
+    ("text", "bias_ut"), [("14.14, -2.08, -8.75", [14.14, -2.08, -8.75]), ("1,2", None), ("1,nan,2", None), ("", None)]
 )
 @pytest.mark.manual("B 8.1.1 result")
-def test_magconfig(line: str, bias_ut: tuple[float, float, float] | None) -> None:
-    assert r.parse_magconfig((line, "OK")).bias_ut == bias_ut
+def test_numbers(text: str, bias_ut: list[float] | None) -> None:
+    assert r.numbers_of(text, 3) == bias_ut
