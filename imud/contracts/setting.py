@@ -7,6 +7,7 @@ transfer scripts on a polled bus. The second half of this module describes decla
 settings.
 """
 
+import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -186,9 +187,38 @@ class SettingsStatus(msgspec.Struct, frozen=True):
     lost_at_power_off: dict[str, Any] = {}  # msgspec copies a mutable default
 
 
+_UNIT = re.compile(r"_(hz|ms|deg_s|deg)$")
+_SHORT_NAME = re.compile(r"sout|sin|ff[0-9a-f]{2}|\w*\d\w*")
+
+
 def title_of(name: str) -> str:
-    """Return the title of a setting for people, for example `Low pass hz`."""
-    return name.replace("_", " ").replace("-", " ").capitalize()
+    """Return the title of a setting for people, for example `TPDO1 interval` for `tpdo1_interval_ms`."""
+    words = _UNIT.sub("", name).split("_")
+    title = " ".join(word.upper() if _SHORT_NAME.fullmatch(word) else word for word in words)
+    return title[:1].upper() + title[1:]
+
+
+def group_of(name: str, setting: Setting) -> str:
+    """Return the group of a setting in a form: `connection`, `output`, `pins` or `measurement`."""
+    if setting.connection or name in ("heartbeat_ms", "second_bus", "i2c_address"):
+        return "connection"
+    if name.startswith(("output", "tpdo", "ff", "burst")):
+        return "output"
+    return "pins" if name in ("pins", "sout_divisor", "alarm") else "measurement"
+
+
+@cache
+def schemas_of(table: SettingsTable) -> Mapping[str, dict[str, Any]]:
+    """Return the JSON Schema of the values of each setting."""
+    return {name: msgspec.json.schema(setting.type) for name, setting in table.table.items()}
+
+
+class SavedState(StrEnum):
+    """Comparison of the present value of a setting with the flash of the device."""
+
+    SAME = "same"
+    DIFFERS = "differs"  # the device loses the present value at power-off
+    UNKNOWN = "unknown"  # imud has not observed a start of the device, and has not saved its settings
 
 
 class SettingInfo(msgspec.Struct, frozen=True):
@@ -206,6 +236,12 @@ class SettingInfo(msgspec.Struct, frozen=True):
     declared: Any = None
     actual: Any = None  # null if the device did not report the setting
     differs: bool = False
+    title: str = ""
+    help: str = ""  # first sentence of `description`
+    group: str = ""  # `connection`, `output`, `pins` or `measurement`
+    schema: dict[str, Any] = {}  # JSON Schema of the value
+    saved: Any = None  # value in flash; null if it is not known
+    saved_state: SavedState = SavedState.UNKNOWN
 
 
 class SettingsReport(msgspec.Struct, frozen=True):

@@ -154,7 +154,7 @@ class VerbRun:
                 await settings.read_again(identity=True)
             raise
         if verb.saves or restarts:
-            settings.flash_is_current()
+            settings.flash_is_current(changed=restarts or verb.changes)
         if verb.changes:
             settings.changed(unsaved=unsaved)
             await settings.read_again(identity=restarts)
@@ -436,7 +436,7 @@ class Device:
             finally:
                 saved = result is not None and (result.saved or result.kept is not Kept.BY_SAVE)
                 if result is not None and result.saved:  # the save writes all settings
-                    self._settings.flash_is_current()
+                    self._settings.flash_is_current(changed=False)
                 self._settings.changed(unsaved=not saved)
 
     def stop_calibration(self) -> bool:

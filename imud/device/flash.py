@@ -15,6 +15,7 @@ import msgspec
 
 from imud.config.yaml import yaml_block, yaml_comment
 from imud.contracts.command import CalibrationResult, LastCalibration
+from imud.contracts.setting import SavedState
 from imud.host.clock import HostClock
 from imud.host.files import StateFile, replace_file
 from imud.model.units import NS_PER_S
@@ -124,6 +125,46 @@ class ModuleFlash:
 
     def count(self) -> None:
         self._writes.count(self._module)
+
+
+class FlashValues:
+    """Values of the settings in the flash of one device, as far as imud knows them.
+
+    imud cannot read the flash. After a start of the device that imud observed, the first values that it reads are those
+    of the flash. After a save, the present values are.
+    """
+
+    def __init__(self) -> None:
+        self._values: Mapping[str, Any] | None = None
+        self._follow = False  # whether the next read values are those of the flash
+
+    def found(self) -> None:
+        """Note that imud found a device. It can have unsaved changes of another program."""
+        self._values, self._follow = None, False
+
+    def started(self) -> None:
+        """Note that the device started and now has the values of its flash, or that it saved unknown values."""
+        self._values, self._follow = None, True
+
+    def wrote(self) -> None:
+        """Note a write that may be missing in flash."""
+        self._follow = False
+
+    def read(self, values: Mapping[str, Any]) -> None:
+        """Take the values that the device reports into account."""
+        if self._follow:
+            self.saved(values)
+
+    def saved(self, values: Mapping[str, Any]) -> None:
+        """Note that the device saved these values."""
+        self._values, self._follow = dict(values), False
+
+    def state(self, name: str, actual: object) -> tuple[SavedState, object]:
+        """Compare a present value with the flash. Return the state and the value in flash; None if it is unknown."""
+        if self._values is None or name not in self._values or actual is None:
+            return SavedState.UNKNOWN, None
+        saved = self._values[name]
+        return SavedState.SAME if saved == actual else SavedState.DIFFERS, saved
 
 
 FOLDER: Final = "backups"

@@ -36,7 +36,7 @@ from imud.contracts.setting import (
     values_of,
     words_of,
 )
-from imud.device.flash import ModuleFlash, SettingsFiles, backup_text
+from imud.device.flash import FlashValues, ModuleFlash, SettingsFiles, backup_text
 from imud.device.health import DeviceEvents
 from imud.device.settings_plan import (
     DEVICE_ERRORS,
@@ -228,10 +228,11 @@ class Work(NamedTuple):
 
 
 class WorkLock:
-    """Lock of one device: one command, calibration or comparison at a time."""
+    """Lock of a device for one command, calibration or change of settings at a time."""
 
     def __init__(self, device: str, host: HostClock) -> None:
-        self._device, self._host = device, host
+        self._device = device
+        self._host = host
         self._lock = asyncio.Lock()
         self._work: Work | None = None  # work that holds the lock
 
@@ -239,19 +240,24 @@ class WorkLock:
     def busy(self) -> bool:
         return self._lock.locked()
 
-    async def begin(self, name: str, stop: str) -> None:
-        """Wait at most WAIT_S for the end of other work. Raises CommandError with the name of the other work."""
+    @asynccontextmanager
+    async def hold(self, work: str, stop: str) -> AsyncIterator[None]:
+        """Hold the lock for `work`, for example `the command save`. `stop`: how a user can stop it.
+
+        Raises CommandError if other work, for example a calibration, does not end within WAIT_S. The error names it.
+        """
         try:
             async with asyncio.timeout(WAIT_S):
                 await self._lock.acquire()
         except TimeoutError:
             words = self._work.words(self._host.now_ns()) if self._work is not None else "other work has just ended"
             raise CommandError(f"{self._device}: {words}; try again later") from None
-        self._work = Work(name, self._host.now_ns(), REQUESTED_BY.get() or "imud", stop)
-
-    def end(self) -> None:
-        self._work = None
-        self._lock.release()
+        self._work = Work(work, self._host.now_ns(), REQUESTED_BY.get() or "imud", stop)
+        try:
+            yield
+        finally:
+            self._work = None
+            self._lock.release()
 
 
 class DeviceSettings:
@@ -282,11 +288,12 @@ class DeviceSettings:
         # CLOCK_MONOTONIC until which a restart of the device counter is a result of a script of imud
         self._own_until_ns = self._resets = 0
         self.resets_requested = 0  # number of restarts of the device counter that a script of imud caused
-        self._work = WorkLock(config.name, host)
+        self._lock = WorkLock(config.name, host)
         # values that imud wrote since the last restart, of settings that the device does not report
         self._written: dict[str, Any] = {}
         self._unsaved = False  # whether a write since the last restart may be missing in flash
         self._saved: Values | None = None  # while `_unsaved`: the values before the write; None if they are unknown
+        self._in_flash = FlashValues()
         self._differing: Mapping[str, SettingDifference] = {}
         self.comparison = SettingsComparison(self, config, host)
 
@@ -297,12 +304,15 @@ class DeviceSettings:
         self._clock, self._resets = clock, clock.resets
         self.is_current = False
         self._after_start(BEGIN_NS)
+        self._in_flash.found()
 
     def tick(self, now_ns: int, _newest: Sample | None) -> None:
         """Detect a restart of the device counter. Start a comparison if one is due and the device can reply."""
         if (resets := self.counter_resets) != self._resets:
             is_own = self.busy or now_ns < self._own_until_ns + BOOT_NS
             self.resets_requested, self._resets = self.resets_requested + is_own * (resets - self._resets), resets
+            if not is_own:
+                self._in_flash.started()
             if (self.declared or self._unsaved) and not self.busy and now_ns >= self._own_until_ns:
                 self._after_start(SETTLE_NS)
         if self.declared and not self.busy and self._transport.can_be_asked:
@@ -333,20 +343,16 @@ class DeviceSettings:
     @property
     def busy(self) -> bool:
         """Whether imud reads or writes settings, or executes a command."""
-        return self._work.busy
+        return self._lock.busy
 
     @asynccontextmanager
     async def exclusive(self, work: str, stop: str = "") -> AsyncIterator[None]:
-        """Lock the settings for `work`, for example `the command save`. `stop`: how a user can stop it.
-
-        Raises CommandError if other work, for example a calibration, does not end within WAIT_S. The error names it.
-        """
-        await self._work.begin(work, stop)
-        try:
-            yield
-        finally:
-            self._own_until_ns = self._host.now_ns() + OWN_NS
-            self._work.end()
+        """Use the device alone for `work` (`WorkLock.hold`). Raises CommandError if other work does not end."""
+        async with self._lock.hold(work, stop):
+            try:
+                yield
+            finally:
+                self._own_until_ns = self._host.now_ns() + OWN_NS
 
     # --- reports of the device ----------------------------------------------------------------------------------------
 
@@ -370,6 +376,7 @@ class DeviceSettings:
         """
         driver, known = self._transport.driver, self.shown
         self._reports, self.is_current, self._read_ns = reports, True, self._host.now_ns()
+        self._in_flash.read(self.values)
         text = printable_words(words_of(reports))
         self.shown = printable_words(driver.shown_settings(text)) if driver is not None else text
         changed = {name: value for name, value in self.shown.items() if known.get(name, value) != value}
@@ -445,16 +452,9 @@ class DeviceSettings:
             unverified(table, self.declared, self.values) if self.is_current else (),
             self._read_ns, self.comparison.repairs,
             self._files.flash.writes(self.module), self._files.flash.writes_day(self.module),
-            self._unsaved and table.save is not None, self._lost_at_power_off(),
+            self._unsaved and table.save is not None,
+            lost_values(self._saved, self.values if self._unsaved and self.is_current else {}),
         )  # fmt: skip
-
-    def _lost_at_power_off(self) -> dict[str, Any]:
-        """Return the present values that differ from the values in flash, as far as both are known."""
-        if not (self._unsaved and self.is_current and self._saved is not None):
-            return {}
-        return {
-            name: as_json(one) for name, one in self.values.items() if as_json(self._saved.get(name)) != as_json(one)
-        }
 
     async def report(self, *, fresh: bool) -> SettingsReport:
         """Return all settings: read now if `fresh`, otherwise the last values.
@@ -467,13 +467,14 @@ class DeviceSettings:
                 await self.read()
         status = self.status()
         assert status is not None
-        found = described_settings(table, self.declared, self.values if self.is_current else None)
+        actual = self.values if self.is_current else None
+        found = described_settings(table, self.declared, actual, self._in_flash)
         return SettingsReport(self._config.name, self._driver_name, identity_words(self.identity), status, found)
 
     async def plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
         """Return the plan to set the values `given` (None: the declared settings). Raises as `report`."""
         table = self._table()
-        wanted = self._wanted_values(table, given)
+        wanted = _wanted(self._config.name, table, given, self.declared)
         async with self.exclusive("a plan of settings"):
             actual = await self.read()
             wanted = completed(table, wanted, actual)
@@ -482,7 +483,7 @@ class DeviceSettings:
     async def apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
         """Set the values `given` (None: the declared settings). Raises as `report`, before the first write."""
         table = self._table()
-        wanted = self._wanted_values(table, given)
+        wanted = _wanted(self._config.name, table, given, self.declared)
         async with self.exclusive("a change of settings"):
             actual = await self.valid_values()
             wanted = completed(table, wanted, actual)
@@ -494,9 +495,16 @@ class DeviceSettings:
         if changes:
             self._transport.attachments.set_alarm_ranges(None)  # the script can change the ranges
 
-    def flash_is_current(self) -> None:
-        """Note that the device has the settings of its flash: after a save or a restart."""
+    def flash_is_current(self, *, changed: bool) -> None:
+        """Note that the device has the settings of its flash: after a save or a restart.
+
+        `changed`: the settings can differ from the last values.
+        """
         self._unsaved = False
+        if changed or not self.is_current:
+            self._in_flash.started()
+        else:
+            self._in_flash.saved(self.values)
 
     @property
     def is_unsaved(self) -> bool:
@@ -514,6 +522,7 @@ class DeviceSettings:
         """Note that the flash does not contain the present settings. `before`: the values before the write."""
         if not self._unsaved:
             self._unsaved, self._saved, self._resets = True, before, self.counter_resets
+        self._in_flash.wrote()
 
     def spend_flash(self) -> None:
         """Count a write to flash before a command makes it. Raises CommandError if the limit is reached."""
@@ -563,6 +572,7 @@ class DeviceSettings:
             self.is_current = applying.heard
             if applying.saved:
                 self._unsaved = False
+                self._in_flash.saved(self.values)
                 unreadable = {name: as_json(value) for name, value in self._all_written(table).items()}
                 self._files.flash.keep_unreadable(self.module, unreadable)
         if asked:  # a repair raises an event, which the log contains
@@ -644,12 +654,20 @@ class DeviceSettings:
             raise CommandError(f"{self._config.name}: {self._driver_name} cannot read or write device settings")
         return table
 
-    def _wanted_values(self, table: SettingsTable, given: Mapping[str, Any] | None) -> Values:
-        if given is not None:
-            return wanted_values(table, given)
-        if not self.declared:
-            raise BadArgument(f"{self._config.name}: expected values, or `settings` in the configuration, got neither")
-        return self.declared
+
+def _wanted(device: str, table: SettingsTable, given: Mapping[str, Any] | None, declared: Values) -> Values:
+    """Return the values `given` (None: the declared values). Raises BadArgument."""
+    if given is not None:
+        return wanted_values(table, given)
+    if not declared:
+        raise BadArgument(f"{device}: expected values, or `settings` in the configuration, got neither")
+    return declared
+
+
+def lost_values(saved: Values | None, present: Values) -> dict[str, Any]:
+    """Return the present values that differ from the values in flash; empty if those are unknown."""
+    values = {name: as_json(one) for name, one in present.items()} if saved is not None else {}
+    return {name: one for name, one in values.items() if as_json((saved or {}).get(name)) != one}
 
 
 def _summary(applied: AppliedSettings) -> str:

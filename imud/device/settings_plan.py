@@ -32,11 +32,14 @@ from imud.contracts.setting import (
     SettingsTable,
     StepOutcome,
     Written,
+    group_of,
+    schemas_of,
+    title_of,
     values_of,
 )
 from imud.device.attachments import Attachments
 from imud.device.evidence import SampleSource, SampleWatch
-from imud.device.flash import ModuleFlash
+from imud.device.flash import FlashValues, ModuleFlash
 from imud.host.log import printable
 from imud.model.errors import BadArgument, CommandError, DeviceRefused, IsSetting, LinkError, Rejected, TransferError
 from imud.model.options import expected, json_or_text, shown, unknown_name, value_problem
@@ -179,13 +182,19 @@ def valid_values(table: SettingsTable, saved: Mapping[str, Any]) -> dict[str, An
     return found
 
 
-def described_settings(table: SettingsTable, declared: Values, actual: Values | None) -> tuple[SettingInfo, ...]:
+def described_settings(
+    table: SettingsTable, declared: Values, actual: Values | None, in_flash: FlashValues | None = None
+) -> tuple[SettingInfo, ...]:
     """Describe all settings of a table. `actual` is None if imud has not read them."""
     found = differences(table, declared, actual, {}) if actual is not None else {}
+    schemas = schemas_of(table)
+    meanings = {name: description_of(setting.type) for name, setting in table.table.items()}
+    flash = in_flash or FlashValues()
+    saved = {name: flash.state(name, (actual or {}).get(name)) for name in table.table}
     return tuple(
         SettingInfo(
             name,
-            *description_of(setting.type),
+            *meanings[name],
             setting.effect,
             setting.connection,
             setting.readable,
@@ -193,9 +202,20 @@ def described_settings(table: SettingsTable, declared: Values, actual: Values | 
             as_json(declared.get(name)),
             as_json((actual or {}).get(name)),
             name in found,
+            title_of(name),
+            first_sentence(meanings[name][1]),
+            group_of(name, setting),
+            schemas[name],
+            as_json(saved[name][1]),
+            saved[name][0],
         )
         for name, setting in table.table.items()
     )
+
+
+def first_sentence(text: str) -> str:
+    """Return the first sentence of a description."""
+    return re.split(r"[.;] ", text, maxsplit=1)[0]
 
 
 def description_of(value_type: Any) -> tuple[str, str, str, str]:

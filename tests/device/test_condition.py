@@ -93,7 +93,7 @@ OPEN_LEDGER.ledger["bytes_in"] += 3
         ),
         (
             declared(SettingsState.DIFFER, differences={"low_pass_hz": SettingDifference(20)}), "attention",
-            "Low pass hz is not known on the device, but “20” in the configuration.", APPLY,
+            "Low pass is not known on the device, but “20” in the configuration.", APPLY,
         ),
         (
             declared(unsaved=True, lost_at_power_off={"mode": "9 axes"}), "attention",

@@ -161,6 +161,32 @@ async def test_apply_uses_the_values_of_a_recent_plan(
     assert not bench.status.unsaved
 
 
+@played(ModuleBench)
+async def test_the_value_in_flash_is_inferred_from_starts_and_saves(bench: ModuleBench) -> None:
+    async def mode(*, fresh: bool = False) -> tuple[str, object, object]:
+        report = await bench.doing(bench.device.settings_report(fresh=fresh))
+        one = next(one for one in report.settings if one.name == "mode")
+        return str(one.saved_state), one.saved, one.actual
+
+    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    await bench.pass_s(2)
+    assert await mode() == ("unknown", None, "6-axis")  # read once after detection, without declared settings
+    await bench.doing(bench.device.act("save", {}))
+    assert await mode() == ("same", "6-axis", "6-axis")
+    await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=False))
+    assert await mode() == ("differs", "6-axis", "9-axis")
+    reasons = bench.device.status().declared
+    assert reasons is not None
+    assert reasons.lost_at_power_off == {"mode": "9-axis"}
+    await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
+    assert await mode() == ("same", "9-axis", "9-axis")
+    await bench.pass_s(12)
+    bench.module.restart()
+    await bench.pass_s(2)
+    assert await mode() == ("unknown", None, "9-axis")
+    assert await mode(fresh=True) == ("same", "9-axis", "9-axis")
+
+
 @played(lambda: ModuleBench(declared={"mode": "6-axis"}))
 async def test_a_save_makes_one_request(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.is_in(SettingsState.AGREE))

@@ -7,7 +7,7 @@ import msgspec
 import pytest
 
 from imud.contracts.command import Risk, Target
-from imud.contracts.setting import PlannedStep, SettingDifference, SettingsPlan
+from imud.contracts.setting import PlannedStep, SettingDifference, SettingsPlan, title_of
 from imud.device.settings_plan import (
     CANNOT_SAVE,
     NEEDS_SAVE,
@@ -15,6 +15,7 @@ from imud.device.settings_plan import (
     completed,
     described_settings,
     differences,
+    first_sentence,
     make_plan,
     merged,
     unverified,
@@ -203,6 +204,13 @@ def test_every_setting_is_described() -> None:
     assert (hours.actual, hours.declarable) == (7, False)
     assert (offset.unit, offset.section, offset.description) == ("°", "2.3", "added to the heading")
     assert all(one.actual is None for one in described_settings(FAKE_SETTINGS, {}, None))
+    assert (offset.title, offset.help, offset.group) == ("Offset", "added to the heading", "measurement")
+    assert mode.schema["enum"] == ["6-axis", "9-axis"]
+    names = ("tpdo1_interval_ms", "sout_divisor", "ff2f_interval_ms", "gyro_offset_deg_s", "second_bus")
+    assert [title_of(name) for name in names] == [
+        "TPDO1 interval", "SOUT divisor", "FF2F interval", "Gyro offset", "Second bus",
+    ]  # fmt: skip
+    assert first_sentence("off; other functions. More") == "off"
 
 
 HIPNUC = DRIVERS["hipnuc-uart"].device_settings
