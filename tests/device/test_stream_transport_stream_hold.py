@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from imud.config.model import DeviceConfig
-from imud.contracts.script import Request, RequestScript, never, of_text
+from imud.contracts.script import Request, RequestScript, never
 from imud.contracts.status import DeviceState
 from imud.device.latency import Need
 from imud.links.memory import MemoryLink, MemoryOptions
@@ -18,6 +18,7 @@ from imud.model.units import NS_PER_MS, NS_PER_US
 from tests.support.device_rig import DeviceRigs
 from tests.support.event_loops import VirtualClock, run_virtually
 from tests.support.files import hi91
+from tests.support.script_runners import of_text
 from tests.support.stories import played
 
 MOST_NS = 50 * 10**6
