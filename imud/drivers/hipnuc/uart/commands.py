@@ -30,7 +30,7 @@ from imud.contracts.script import (
 )
 from imud.drivers.hipnuc.common import AttitudeMode, LevelReset
 from imud.drivers.hipnuc.uart.replies import (
-    Outputs,
+    PeriodicOutputs,
     is_end,
     is_rejection,
     is_setting_line,
@@ -368,7 +368,7 @@ def send_once(message: OutputMessage) -> RequestScript[None]:
     raise_if_rejected(request.name, outcome)
 
 
-def ask_outputs() -> RequestScript[Outputs | None]:
+def ask_outputs() -> RequestScript[PeriodicOutputs | None]:
     """Read which messages the device sends at which rate (LOG COMCONFIG); None if the device does not report it."""
     outcome = yield ask(Query.COMCONFIG)
     if not isinstance(outcome, Reply):
@@ -377,7 +377,7 @@ def ask_outputs() -> RequestScript[Outputs | None]:
     return config if config.periods_s or config.on_mark else None
 
 
-def rates_hz(config: Outputs | None) -> dict[OutputMessage, float]:
+def rates_hz(config: PeriodicOutputs | None) -> dict[OutputMessage, float]:
     """Return the output rates of all timed messages."""
     periods_s = config.periods_s if config is not None else {}
     return {OutputMessage(name): 1 / period_s for name, period_s in periods_s.items() if period_s > 0}

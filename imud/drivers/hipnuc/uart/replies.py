@@ -71,7 +71,7 @@ class Version:
     report: Report
 
 
-class Outputs(NamedTuple):
+class PeriodicOutputs(NamedTuple):
     """Outputs in a reply to LOG COMCONFIG. Its form is not documented: imud looks for the form of the command."""
 
     periods_s: Mapping[str, float]  # output periods by message (`HI91`, `HI92`); 0 is off
@@ -102,7 +102,7 @@ def parse_version(lines: Sequence[str]) -> Version:
     )
 
 
-def parse_comconfig(lines: Iterable[str]) -> Outputs:
+def parse_comconfig(lines: Iterable[str]) -> PeriodicOutputs:
     """Return the outputs in a reply to LOG COMCONFIG."""
     periods_s, on_mark = {}, set()
     for line in lines:
@@ -110,7 +110,7 @@ def parse_comconfig(lines: Iterable[str]) -> Outputs:
             periods_s[f"HI{message}"] = float(period)
         for message in _MARKED.findall(line):
             on_mark.add(f"HI{message}")
-    return Outputs(periods_s, frozenset(on_mark))
+    return PeriodicOutputs(periods_s, frozenset(on_mark))
 
 
 def whole(text: str | None) -> int | None:
