@@ -4,7 +4,6 @@ A test of logic receives the time as an argument. A `live` test runs a real daem
 condition with `wait_until`.
 """
 
-import os
 import threading
 import time
 from collections.abc import Iterator
@@ -12,6 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import pytest
+
+from tests.support.leaks import open_descriptors
 
 if TYPE_CHECKING:
     from tests.support.rings import Board
@@ -75,17 +76,6 @@ def board(tmp_path: Path) -> "Iterator[Board]":
     made = Board(tmp_path)
     yield made
     made.publisher.close()
-
-
-def open_descriptors() -> dict[int, str]:
-    """Return the files of the open descriptors of this process."""
-    found = {}
-    for name in os.listdir("/proc/self/fd"):
-        try:
-            found[int(name)] = os.readlink(f"/proc/self/fd/{name}")
-        except FileNotFoundError:  # the listing itself
-            continue
-    return found
 
 
 @pytest.fixture(autouse=True)

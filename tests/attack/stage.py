@@ -88,8 +88,6 @@ def before_others(pid: int) -> bool:
 
 
 class IdlePort:
-    """A port with a device that can be unplugged: a link to a pseudo-terminal."""
-
     def __init__(self, path: Path) -> None:
         self.path = path
         self._fds: tuple[int, int] = (-1, -1)
@@ -124,7 +122,6 @@ class LogPipe:
         return int.from_bytes(size, sys.byteorder)
 
     def stop_reading(self) -> None:
-        """Stop reading and fill the socket, so that no later data fits into it."""
         self._reads.clear()
         # the daemon's descriptor is blocking
         writer = os.open(f"/proc/self/fd/{self.writer}", os.O_WRONLY | os.O_NONBLOCK)

@@ -85,8 +85,6 @@ Fault = Callable[[Scene, float], object]
 
 
 def during(begin: Callable[[Scene], object], end: Callable[[Scene], object]) -> Fault:
-    """Return a fault that lasts from `begin` to `end`."""
-
     def fault(scene: Scene, seconds: float) -> None:
         begin(scene)
         scene.watch(seconds)

@@ -172,7 +172,6 @@ class Clients:
 
 
 def text(value: str) -> bytes:
-    """Return a string with its length (section 1.5.3)."""
     data = value.encode()
     return struct.pack(">H", len(data)) + data
 

@@ -89,15 +89,12 @@ TAKES: dict[str, Take] = {"binary": take_binary, "json": take_json}
 
 
 class Client(NamedTuple):
-    """A client with a subscription."""
-
     socket: socket.socket
     buffer: bytearray
     """Received bytes that were not processed yet."""
 
 
 def subscribe(path: str, encoding: str, bare: bool, wanted: dict[str, object]) -> Client:
-    """Connect and subscribe with the parameters `wanted`."""
     sock = socket.socket(socket.AF_UNIX)
     sock.connect(path)
     if bare:
@@ -113,7 +110,6 @@ def subscribe(path: str, encoding: str, bare: bool, wanted: dict[str, object]) -
 
 
 def subscribe_to_gpsd(port: int) -> Client:
-    """Connect to gpsd and subscribe to all reports."""
     sock = socket.create_connection(("127.0.0.1", port))
     sock.sendall(b'?WATCH={"enable":true,"json":true};\n')
     got = b""

@@ -6,8 +6,6 @@ from pathlib import Path
 
 
 class Authority:
-    """Certificate authority of one test."""
-
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._run("req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", "ca.key", "-out", "ca.pem", "-days", "2",

@@ -24,7 +24,6 @@ LIMIT_S: Final = 60.0
 
 @contextmanager
 def ended_with(words: Sequence[str], log: Path) -> Iterator[None]:
-    """Run a program during the block."""
     with (
         log.open("w") as out,
         # the simulator ends when its standard input closes
@@ -41,7 +40,6 @@ def ended_with(words: Sequence[str], log: Path) -> Iterator[None]:
 
 
 def configuration(folder: Path, gateway: str, port: int) -> Path:
-    """Return the configuration of a daemon with all files in `folder`."""
     tree = {
         "state_dir": str(folder), "socket": {"path": str(folder / "imud.sock")}, "shm": {"enabled": False},
         "metrics": {"enabled": False},

@@ -9,8 +9,6 @@ from tests.support.daemon_process import LIMIT_S
 
 
 class FakeConnection:
-    """Connection to a `FakeBroker`."""
-
     def __init__(self, broker: "FakeBroker") -> None:
         self.acknowledged: list[int] = []
         self.in_flight_max = broker.window

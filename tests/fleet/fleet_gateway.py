@@ -45,7 +45,6 @@ def samples_message(
 
 
 def intervals_message(first: int, last: int, *, boot: str = "1", utc_ns: int = UTC_NS) -> FleetMessage:
-    """Return one interval of such samples."""
     begin, end = first * NS_PER_MS, last * NS_PER_MS
     one = Interval(
         first, last, last - first + 1, begin, end, utc_ns + begin, utc_ns + end, 500, Sync.EDGE,
@@ -56,7 +55,6 @@ def intervals_message(first: int, last: int, *, boot: str = "1", utc_ns: int = U
 
 
 def event_message(number: int, t_ns: int, *, boot: str = "1", utc_ns: int = UTC_NS) -> FleetMessage:
-    """Return an event at `t_ns`."""
     made = samples_message(number, number, boot=boot)
     events = [Event(t_ns, "bow", EventKind.UP, "it is up")]
     return msgspec.structs.replace(made, kind=MessageKind.EVENTS, samples=[], events=events, utc_ns=utc_ns + t_ns)
@@ -68,12 +66,10 @@ def not_set(message: FleetMessage, utc_ns: int = 0) -> FleetMessage:
 
 
 def synchronised(message: FleetMessage, utc_ns: int = UTC_NS, *, t_ns: int = 0, error_ns: int = 1000) -> FleetMessage:
-    """Return the message with a synchronized clock."""
     return msgspec.structs.replace(message, clock=GatewayClock(t_ns, utc_ns, synchronised=True, error_ns=error_ns))
 
 
 def dropped_message(first: int, last: int, *, gateway: str = "gw", boot: str = "1") -> FleetMessage:
-    """Return the message about dropped numbers."""
     return msgspec.structs.replace(
         samples_message(first, last, gateway=gateway, boot=boot), kind=MessageKind.DROPPED, cause=DropCause.SPACE,
         samples=[],

@@ -29,8 +29,6 @@ from tests.support.publisher_context import publisher_context
 
 
 class LiveGateway:
-    """Real output in this process with samples from the test."""
-
     def __init__(self, folder: Path, port: int, **settings: object) -> None:
         self.host = HostClock()
         self.folder = folder
@@ -55,7 +53,6 @@ class LiveGateway:
         self.output.publish(Batch("bow", 0, samples))
 
     def wait_for(self, true: Callable[[], bool], limit_s: float = LIMIT_S) -> None:
-        """Wait for the threads of the output."""
         end_ns, pause = self.host.now_ns() + round(limit_s * NS_PER_S), threading.Event()
         while not true():
             assert self.host.now_ns() < end_ns, self.output.status()
@@ -127,7 +124,6 @@ class KilledGateway:
         )
 
     def wait_until(self, waiting: int) -> None:
-        """Wait until this number of messages waits in the spool."""
         while (state := self.state(LIMIT_S)) is None or state.waiting < waiting:
             pass
 

@@ -35,7 +35,6 @@ class Mosquitto:
         self._reader: threading.Thread | None = None
 
     def start(self) -> None:
-        """Start the broker and wait until it listens."""
         assert PROGRAM is not None
         own = os.geteuid() == 0
         config = self.folder / "mosquitto.conf"
@@ -56,7 +55,6 @@ class Mosquitto:
 
     @property
     def pid(self) -> int:
-        """Return the process ID."""
         assert self._process is not None
         return self._process.pid
 
@@ -81,7 +79,6 @@ class Mosquitto:
             process.stdout.close()
 
     def reload(self) -> None:
-        """Let the broker read its password and ACL files again."""
         assert self._process is not None
         self._process.send_signal(signal.SIGHUP)
 
@@ -91,7 +88,6 @@ class Mosquitto:
         self._process.send_signal(signal.SIGSTOP)
 
     def thaw(self) -> None:
-        """Continue the process."""
         assert self._process is not None
         self._process.send_signal(signal.SIGCONT)
 

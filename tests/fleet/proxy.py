@@ -19,7 +19,6 @@ class Proxy:
     """Proxy. Synchronization: any thread may call the methods."""
 
     def __init__(self, port: int) -> None:
-        """`port` is the port of the broker on loopback."""
         self.bytes_s: float | None = None  # maximum rate from gateway to broker, bytes/s; None: no limit
         self.connections = 0  # number of accepted connections
         self._to = port
@@ -38,7 +37,6 @@ class Proxy:
         self._stalled = True
 
     def cut(self) -> None:
-        """Close all connections and refuse new connections."""
         self._cut = True
 
     def reset(self) -> None:
@@ -52,7 +50,6 @@ class Proxy:
             self._drop_all()
 
     def restore(self) -> None:
-        """Forward all data again."""
         self._stalled = self._cut = False
 
     def close(self) -> None:

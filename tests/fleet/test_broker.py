@@ -26,7 +26,6 @@ def connect(url: str, **settings: object) -> PahoConnection:
 
 
 def send(connection: PahoConnection, payload: bytes = b"{}", topic: str = "imud/s/g/state") -> None:
-    """Send a message and wait for its acknowledgement."""
     number = connection.publish(topic, payload, "application/json", retain=False)
     for _ in range(1000):
         if number in connection.acknowledged:

@@ -210,7 +210,6 @@ TOPIC = b"\x00\x01t"
 
 
 def use_gateway(broker: Broker) -> None:
-    """Connect as a gateway and wait for the end of the connection."""
     with closing(PahoConnection(broker, MqttOptions(), "me", Will("t", b""))) as connection:
         while True:
             connection.wait(60.0)

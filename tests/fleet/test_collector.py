@@ -61,7 +61,6 @@ class MemoryStore:
 
 
 def collect(broker: Mosquitto | Proxy, store: MemoryStore, most: int) -> Fleet:
-    """Run the collector until the store has `most` rows."""
     fleet = Fleet(f"mqtt://127.0.0.1:{broker.port}", name="archive", retry_max_s=1.0)
     store.most = most
     store.collector = FleetCollector(fleet, store)
@@ -141,8 +140,6 @@ def test_a_reset_during_the_acknowledgements_loses_only_the_connection(
 
 
 class SlowStore(MemoryStore):
-    """Store whose first transaction ends when the test allows it."""
-
     def __init__(self, *, is_slow: bool) -> None:
         super().__init__()
         self.goes_on = threading.Event()

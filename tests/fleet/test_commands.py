@@ -304,7 +304,6 @@ def test_errors_and_internal_errors_have_a_reply() -> None:
 
 @pytest.fixture
 def log_of_daemon(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]:
-    """Return the log without the repeated messages that the daemon suppresses."""
     repeats = RepeatFilter()
     caplog.handler.addFilter(repeats)
     yield caplog

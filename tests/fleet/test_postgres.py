@@ -296,7 +296,6 @@ class Collecting:
         self.process = subprocess.Popen(words, stderr=subprocess.DEVNULL)
 
     def until(self, text: str, least: int) -> None:
-        """Wait until a query returns at least this number."""
         wait_until(lambda: (query(self.database, text)[0][0] or 0) >= least, f"{text} gives {least}", 2 * LIMIT_S)
 
     def until_rows(self, number: int) -> None:

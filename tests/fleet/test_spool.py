@@ -78,7 +78,6 @@ class SpoolBench:
         return found
 
     def counts(self) -> StreamCounts:
-        """Return the counts of a reader of the stream `samples`."""
         ledger = FleetLedger(from_begin=True)
         for row in self.all():
             ledger.take(decode_message(row.payload), Stream(row.stream))
@@ -352,7 +351,6 @@ DAMAGE = {
 
 
 def damage(folder: Path, change: str, where: str = "id = 2", table: str = "message") -> None:
-    """Change rows of the spool file, by default the second message."""
     base = sqlite3.connect(folder / FILE, isolation_level=None)
     base.execute(f"UPDATE {table} SET {change} WHERE {where}")
     base.close()

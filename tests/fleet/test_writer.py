@@ -250,8 +250,6 @@ def test_a_short_failure_of_the_disk_loses_nothing(tmp_path: Path, caplog: pytes
 
 
 class TightSpool(Spool):
-    """Spool on a disk that has no room for two messages at a time."""
-
     def commit(self, new: Any, acknowledged: Any, now_ns: int, utc_ns: int) -> None:
         if len(new) > 1:
             raise SpoolError("database or disk is full")

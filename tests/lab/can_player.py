@@ -41,8 +41,6 @@ INDEX_AT = 8 + 6
 
 @dataclass
 class Played:
-    """Frames that are sent together."""
-
     offset_ns: int
     frames: bytearray
     indices: list[int] = field(default_factory=list)

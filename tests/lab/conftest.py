@@ -14,6 +14,7 @@ from tests.lab.can_interface import CanInterface, controller_pair, virtual_can
 from tests.lab.gpio_chip import GpioChip, simulated_chip
 from tests.lab.serial_port import PseudoTerminal, pseudo_terminal, uart_pair
 from tests.lab.wire import I2cTransfer, SpiTransfer
+from tests.support.leaks import open_descriptors
 
 SHARE = os.environ.get("IMUD_LAB")
 
@@ -23,7 +24,6 @@ collect_ignore_glob = [] if SHARE else ["*"]
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print the reason why pytest collected no tests here."""
     if not SHARE:
         terminalreporter.write_line("tests/lab skipped: it needs the lab's kernel; try make lab")
 
@@ -48,20 +48,10 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 @pytest.fixture(autouse=True)
 def nothing_left_behind() -> Iterator[None]:
     """Check that each test closes its descriptors and ends its threads."""
-    before = _open_descriptors()
+    before = open_descriptors()
     yield
-    assert _open_descriptors() == before, "open descriptors"
+    assert open_descriptors() == before, "open descriptors"
     assert threading.enumerate() == [threading.main_thread()], "running threads"
-
-
-def _open_descriptors() -> dict[str, str]:
-    found = {}
-    for name in os.listdir("/proc/self/fd"):
-        try:
-            found[name] = os.readlink(f"/proc/self/fd/{name}")
-        except FileNotFoundError:
-            continue  # the descriptor of this listing
-    return found
 
 
 @pytest.fixture

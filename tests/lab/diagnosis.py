@@ -35,7 +35,6 @@ class Diagnosis(msgspec.Struct, frozen=True):
     checks: list[CheckOutcome]
 
     def of(self, severity: str) -> list[tuple[str, str]]:
-        """Return check and text of every finding of a severity."""
         return [
             (check.name, found.seen) for check in self.checks for found in check.findings if found.severity == severity
         ]

@@ -56,7 +56,6 @@ def test_i2c_has_repeated_starts_and_refuses_an_absent_address(i2c: Bus[I2cTrans
 
 @pytest.fixture
 def word_of_16_bits() -> Iterator[None]:
-    """Set the second SPI bus to words of 16 bits."""
     tool("spi-config", "-d", "/dev/spidev1.0", "-b", "16")
     yield
     tool("spi-config", "-d", "/dev/spidev1.0", "-b", "8")

@@ -39,7 +39,6 @@ def steer(ppm: float, tick_us: int) -> None:
 
 @contextmanager
 def steering() -> Iterator[None]:
-    """Restore the clock at the end."""
     try:
         yield
     finally:

@@ -40,14 +40,11 @@ class I2cSegment:
 
     @property
     def reads(self) -> bool:
-        """Return whether the host reads this segment."""
         return bool(self.flags & I2C_M_RD)
 
 
 @dataclass(frozen=True, slots=True)
 class I2cTransfer:
-    """All segments between start and stop."""
-
     id: int
     segments: tuple[I2cSegment, ...]
 
@@ -66,8 +63,6 @@ class I2cTransfer:
 
 @dataclass(frozen=True, slots=True)
 class SpiSegment:
-    """One spi_ioc_transfer."""
-
     mosi: bytes
     speed_hz: int
     bits_per_word: int
@@ -77,8 +72,6 @@ class SpiSegment:
 
 @dataclass(frozen=True, slots=True)
 class SpiTransfer:
-    """One SPI_IOC_MESSAGE with all its transfers."""
-
     id: int
     mode: int
     chip_select: int
@@ -129,7 +122,6 @@ def swapped(data: bytes, bits_per_word: int) -> bytes:
 
 
 def parse(request: bytes) -> Transfer:
-    """Parse the result of one read() of the kernel module's device."""
     identifier, size, kind, count, mode, chip_select = REQUEST.unpack_from(request)
     assert size == len(request), f"request says {size} bytes, has {len(request)}"
     assert kind in (KIND_I2C, KIND_SPI), f"unknown kind {kind}"

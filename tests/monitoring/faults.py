@@ -75,7 +75,6 @@ class Wire(Cable):
         self._count = 0
 
     def step(self, ms: int) -> None:
-        """Send the frame of this time."""
         self._count += 1
         if self.silent or (self.lose_every and self._count % self.lose_every == 0):
             return
@@ -102,7 +101,6 @@ class Wire(Cable):
         )  # fmt: skip
 
     def swap(self) -> None:
-        """Unplug the device, or plug it in."""
         if self.plugged:
             self.plugged = False
             self.unplug()
@@ -112,18 +110,15 @@ class Wire(Cable):
 
 
 def unpaid(status: DeviceStatus) -> DeviceStatus:
-    """Return the status with a ledger that does not balance."""
     return msgspec.structs.replace(status, ledger={**status.ledger, "bytes_in": status.ledger["bytes_in"] + 1})
 
 
 def kernel_errors(name: str) -> Callable[[DeviceStatus], DeviceStatus]:
-    """Return a change that adds three errors of a port with every look."""
     looks = count(3, 3)
     return lambda status: msgspec.structs.replace(status, kernel=KernelCounters(**{name: next(looks)}))
 
 
 def gaps_of_unknown_size() -> Callable[[DeviceStatus], DeviceStatus]:
-    """Return a change that adds a gap with every look."""
     looks = count(1)
     return lambda status: msgspec.structs.replace(status, ledger={**status.ledger, "lost_unknown": next(looks)})
 
@@ -159,7 +154,6 @@ class Site:
         self._looping: asyncio.AbstractEventLoop | None = None
 
     def start(self) -> None:
-        """Start all parts without a fault."""
         stack, folder = self._stack, self.folder
         (folder / "shm").mkdir()
         self.wires = {}
@@ -210,7 +204,6 @@ class Site:
     # --- faults ----------------------------------------------------------------------------------------------------
 
     def break_everything(self) -> None:
-        """Switch every fault on."""
         wires = self.wires
         wires["gone"].silent = True
         wires["lossy"].lose_every = 5
@@ -238,7 +231,6 @@ class Site:
         self.faulty = True
 
     def mend_everything(self) -> None:
-        """Switch every fault off."""
         self.faulty = False
         resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         self._broker.start()
@@ -275,11 +267,9 @@ class Site:
         return put_or_drop
 
     def block_loop(self, seconds: float) -> None:
-        """Block the event loop of the daemon."""
         self.in_loop(lambda: time.sleep(seconds))
 
     def in_loop(self, call: Callable[[], object]) -> None:
-        """Run a function in the event loop of the daemon."""
         assert self._looping is not None
         self._looping.call_soon_threadsafe(call)
 
@@ -361,7 +351,6 @@ class Site:
 
 @contextmanager
 def _log_without_reader() -> Iterator[LogWriter]:
-    """Yield a log with a full pipe that no program reads."""
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     with suppress(BlockingIOError):

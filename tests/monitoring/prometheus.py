@@ -27,19 +27,15 @@ UNIT_MS: Final = {"s": 1000, "m": 60_000, "h": 3_600_000}
 
 
 def needs(*programs: str) -> pytest.MarkDecorator:
-    """Skip a test with the reason if a program is not installed."""
     missing = [program for program in programs if shutil.which(program) is None]
     return pytest.mark.skipif(bool(missing), reason=f"cannot find {', '.join(missing)}; try make monitoring-deps")
 
 
 def alerts_of(text: str) -> list[dict[str, Any]]:
-    """Return the alerts of a file of rules."""
     return [rule for group in yaml.safe_load(text)["groups"] for rule in group["rules"]]
 
 
 def shortened(text: str, divisor: int) -> str:
-    """Return the rules with each `for` and each range divided by `divisor`."""
-
     def shorter(found: re.Match[str]) -> str:
         return f"{int(found[1]) * UNIT_MS[found[2]] // divisor}ms"
 
@@ -68,8 +64,6 @@ class Pace(NamedTuple):
 
 
 class Alert(NamedTuple):
-    """An alert that is pending or fires."""
-
     name: str
     device: str
     instance: str
@@ -86,13 +80,11 @@ class RealPrometheus:
         self._url = f"http://127.0.0.1:{port}"
 
     def scrape(self, *ports: int) -> None:
-        """Scrape these ports of this host and no other ports."""
         fresh = self._targets.with_suffix(".new")
         fresh.write_text(json.dumps([{"targets": [f"127.0.0.1:{port}" for port in ports]}]))
         fresh.rename(self._targets)
 
     def get(self, path: str, **parameters: str) -> Any:
-        """Return the data of a reply of the API."""
         query = f"?{urllib.parse.urlencode(parameters)}" if parameters else ""
         with urllib.request.urlopen(f"{self._url}/api/v1/{path}{query}", timeout=LIMIT_S) as answer:
             found = json.load(answer)
@@ -100,7 +92,6 @@ class RealPrometheus:
         return found["data"]
 
     def ready(self) -> bool:
-        """Return whether Prometheus replies."""
         try:
             with urllib.request.urlopen(f"{self._url}/-/ready", timeout=LIMIT_S) as answer:
                 return bool(answer.status == 200)
@@ -108,7 +99,6 @@ class RealPrometheus:
             return False
 
     def alerts(self) -> list[Alert]:
-        """Return all pending and active alerts."""
         found = []
         for alert in self.get("alerts")["alerts"]:
             labels = alert["labels"]
@@ -117,12 +107,10 @@ class RealPrometheus:
         return found
 
     def query(self, expression: str) -> list[dict[str, Any]]:
-        """Return the present vector of an expression."""
         result: list[dict[str, Any]] = self.get("query", query=expression)["result"]
         return result
 
     def query_range(self, expression: str, start_s: float, end_s: float, step_s: float) -> list[dict[str, Any]]:
-        """Return the matrix of an expression."""
         times = {"start": f"{start_s:.3f}", "end": f"{end_s:.3f}", "step": f"{step_s:.3f}"}
         result: list[dict[str, Any]] = self.get("query_range", query=expression, **times)["result"]
         return result

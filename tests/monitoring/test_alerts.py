@@ -89,7 +89,6 @@ class Spare:
             self.process.stdin.flush()
 
     def kill(self) -> None:
-        """Kill the daemon, as the kernel does if memory is short."""
         assert self.process is not None
         _end(self.process)
         self.process = None
@@ -159,7 +158,6 @@ class Watcher:
 
 
 def wait_scraped(prometheus: RealPrometheus, watcher: Watcher, spare: Spare) -> None:
-    """Wait until Prometheus scrapes only the newly started daemon."""
     port = spare.port
     before = prometheus.query(f'max_over_time(process_start_time_seconds{{instance="127.0.0.1:{port}"}}[10m])')
 
@@ -250,7 +248,6 @@ def test_every_alert_fires_and_clears(tmp_path: Path) -> None:
 
 
 def wait_calm(prometheus: RealPrometheus) -> None:
-    """Wait until every device runs and no alert is active."""
     end = time.monotonic() + 2 * LIMIT_S
     while wrong := unrest(prometheus):
         assert time.monotonic() < end, wrong

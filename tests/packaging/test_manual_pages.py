@@ -22,7 +22,6 @@ PAGES = pages()
 
 
 def plain(text: str) -> str:
-    """Return the visible text of a page as one line."""
     words = re.sub(r"\\f[BIR]|\\&", "", text).replace("\\-", "-").replace("\\(ha", "^").replace("\\(ti", "~")
     return " ".join(words.replace("\\e", "\\").split())
 

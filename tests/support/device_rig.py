@@ -116,8 +116,6 @@ class DeviceRig:
 
 
 class DeviceOutput:
-    """Owner of devices that keeps their samples and events."""
-
     def __init__(self) -> None:
         self.samples: list[Sample] = []
         self.events: list[Event] = []

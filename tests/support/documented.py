@@ -47,7 +47,6 @@ def rows(page: str, heading: str) -> list[Row]:
 
 
 def default_of(cell: str) -> Any:
-    """Return the value of a default cell."""
     text = cell.strip("`")
     return int(text, 8) if re.fullmatch(r"0o\d+", text) else json.loads(text)
 

@@ -19,7 +19,6 @@ class MessageChecker:
 
     @property
     def able(self) -> bool:
-        """Whether the package jsonschema is installed."""
         return find_spec("jsonschema") is not None
 
     def check(self, name: str, message: object) -> None:
@@ -47,7 +46,6 @@ class MessageChecker:
 
 
 def _close(schema: Any) -> None:
-    """Allow only described members."""
     if isinstance(schema, dict):
         if "properties" in schema:
             schema.setdefault("additionalProperties", False)

@@ -109,7 +109,6 @@ async def ask(port: int, path: str = "/metrics", method: str = "GET", headers: s
 
 
 def read_all(connection: socket.socket) -> bytes:
-    """Read until the far end closes or resets the connection."""
     parts = []
     try:
         while part := connection.recv(65536):

@@ -79,8 +79,6 @@ class PolledBusBench:
 
 
 class _ReadyI2c(I2cLink):
-    """An I2C link whose node exists immediately."""
-
     def absence(self) -> str:
         return ""
 

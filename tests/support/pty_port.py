@@ -107,7 +107,6 @@ def slave(address: int, *, baud: int = BAUD, serial: int = 0, **more: object) ->
 
 @contextmanager
 def wired(folder: Path, *slaves: Slave, echo: bool = False, chunk_bytes: int = 0) -> Iterator[tuple[Path, ModbusLine]]:
-    """Yield the path of a port with these devices on its bus."""
     line = ModbusLine(time.monotonic_ns(), slaves, echo=echo, chunk_bytes=chunk_bytes)
     with plugged(folder / "line", line) as path:
         yield path, line
@@ -115,7 +114,6 @@ def wired(folder: Path, *slaves: Slave, echo: bool = False, chunk_bytes: int = 0
 
 @contextmanager
 def plugged(path: Path, module: StreamModule) -> Iterator[Path]:
-    """Yield the path of a port with this device behind it, in real time."""
     now_ns = time.monotonic_ns()
     node = PtyNode(path)
     port = SimulatedPort(module, node, Adapter(BARE_UART, now_ns))

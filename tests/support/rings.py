@@ -20,7 +20,6 @@ START_NS = 5_000_000_000
 
 
 def slot_at(seq: int) -> int:
-    """Return the offset of the slot of a sequence number."""
     return HEADER_BYTES + seq % SLOTS * SLOT_BYTES
 
 

@@ -28,8 +28,6 @@ def unanswered_ms(script: Any) -> Iterator[float]:
 
 
 class ListPort(RequestPort):
-    """A link that keeps the requests in a list."""
-
     def __init__(self) -> None:
         self.written: list[bytes] = []
 

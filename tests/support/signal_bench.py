@@ -122,8 +122,6 @@ class FakeGpiod:
 
 
 class FakeChip:
-    """An open chip."""
-
     def __init__(self, label: str, names: tuple[str, ...], holder: str) -> None:
         self._label, self._names, self._holder = label, names, holder
 

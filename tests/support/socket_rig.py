@@ -158,7 +158,6 @@ class FakeControl:
         return False
 
     async def settings_report(self, *, fresh: bool) -> SettingsReport:
-        """Return one setting that differs."""
         differences = {"mode": SettingDifference("9-axis", "6-axis")}
         status = SettingsStatus(
             SettingsState.DIFFER, OnDifference.REPORT, differences=differences, flash_writes=3,

@@ -76,7 +76,6 @@ def pipe(*, full: bool = False) -> Iterator[tuple[int, int]]:
 
 
 def read_until(descriptor: int, end: bytes) -> bytes:
-    """Read until the text `end`."""
     data = b""
     while end not in data:
         assert select.select([descriptor], [], [], 60)[0], data[-200:]

@@ -153,7 +153,6 @@ def upright(value_of: Callable[[int], float]) -> Callable[[int], bytes]:
 
 @contextmanager
 def sent_by(folder: Path, port: Cable) -> Iterator[RunningDaemon]:
-    """A daemon that reads the device at the virtual port as `bow`."""
     with running_daemon(folder, {"bow": device(port.name)}, python=()) as daemon:
         yield daemon
 

@@ -32,7 +32,6 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
 @pytest.fixture(scope="session")
 def window(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """The browser of all tests without another window size."""
     with browser(tmp_path_factory.mktemp("browser")) as one:
         yield one
 

@@ -79,7 +79,6 @@ async def running(
 
 
 def small_socket(host: str, port: int, family: socket.AddressFamily) -> socket.socket:
-    """Return a listening socket with the minimum send buffer."""
     listening = get_port_socket(host, port, family)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, StalledPage.BUFFER_BYTES)
     return listening

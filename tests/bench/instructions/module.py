@@ -62,7 +62,6 @@ class Module:
         self._time_ms += duration_ms
 
     def reads(self, count: int, frames: int = 1) -> list[Read]:
-        """Return `count` reads with `frames` frames each, at 1 kHz."""
         found = []
         for number in range(count):
             times = range(self._time_ms + 1, self._time_ms + frames + 1)

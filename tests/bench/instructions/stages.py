@@ -246,7 +246,6 @@ def _ring(frames: int, total: int, directory: str) -> Run:
 
 
 async def _serve(directory: str, clients: int, encoding: str) -> tuple[SocketServer, list[socket.socket]]:
-    """Start a server with clients that watch `d0` over real sockets."""
     path = f"{directory}/s"
     server = SocketServer(SocketOptions(path=path, group=own_group()), _context())
     server.start()
@@ -339,7 +338,6 @@ def _daemon(clients: int, encoding: str, frames: int, total: int, directory: str
 
 
 def _tick(total: int, directory: str) -> Run:
-    """Tick a daemon with one device and one client in a quiet state."""
     daemon = VirtualDaemon(directory)
     daemon.connect(1, "binary")
     return _taking([partial(daemon.tick, sample) for sample in daemon.newest_samples(total)])

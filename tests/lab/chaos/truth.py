@@ -75,7 +75,6 @@ def time_key(sample: Sample) -> int:
 
 
 def encoded(number: int) -> Vector3:
-    """Return an acceleration that identifies its sample."""
     return (number % BASE * STEP_M_S2, number // BASE % BASE * STEP_M_S2, 9.80665)
 
 

@@ -29,8 +29,6 @@ STEADY_SILENCE_S = 300.0
 
 @dataclass(frozen=True)
 class Limits:
-    """Time limits of the runner."""
-
     total_s: float = 1200.0
     boot_s: float = 300.0
     """Maximum time from the start to the first sign of life, s; about 5 s on an idle host."""

@@ -36,7 +36,6 @@ def installed_versions(names: list[str]) -> dict[str, str]:
 
 
 def missing() -> list[str]:
-    """Return the names of the missing packages in the order of the table."""
     present = installed_versions(list(PACKAGES))
     return [name for name in PACKAGES if name not in present]
 
@@ -54,7 +53,6 @@ def kernel_source_version() -> str:
 
 
 def without_candidate(names: list[str]) -> list[str]:
-    """Return the packages in `names` without a version in apt."""
     policy = subprocess.run(
         ["apt-cache", "policy", *names], capture_output=True, text=True, check=False, env={**os.environ, "LC_ALL": "C"}
     ).stdout

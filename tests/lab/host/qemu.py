@@ -18,8 +18,6 @@ STEADY = ("-icount", "shift=0")
 
 @dataclass(frozen=True)
 class Machine:
-    """Options of a run."""
-
     image: Path
     share: Path
     """Folder that the guest may write, its /run/lab."""

@@ -112,7 +112,6 @@ def further_device(text: str) -> Iterator[str]:
 
 
 def check_i2c(checks: Checks) -> None:
-    """Check a bus without a device."""
     if not is_there(checks, "i2c-0", "the daemon opens an I2C bus"):
         return
     with (

@@ -87,12 +87,10 @@ def wait_until(found: Callable[[], T | None], what: str, limit_s: float = LIMIT_
 
 
 def expect(what: str, got: object, wanted: object) -> None:
-    """Raise Failed unless `got` is equal to `wanted`."""
     if got != wanted:
         raise Failed(f"{what}: expected {wanted!r}, got {got!r}")
 
 
 def expect_in(part: str, whole: str, what: str) -> None:
-    """Raise Failed unless `part` is in `whole`."""
     if part not in whole:
         raise Failed(f"{what}: expected {part!r} in: {whole.strip()[-1500:]}")

@@ -45,8 +45,6 @@ LATENCY_MS = 1
 
 
 class AdapterNow(NamedTuple):
-    """State of the USB adapter under the udev rules."""
-
     latency_ms: int
     """Latency timer, ms (`latency_timer` of ftdi_sio)."""
     ignored: bool
@@ -131,7 +129,6 @@ def drop_in() -> Iterator[None]:
 
 
 def allow(*entries: str) -> None:
-    """Restart the service with only these DeviceAllow= entries."""
     DROP_IN.parent.mkdir(parents=True, exist_ok=True)
     DROP_IN.write_text("[Service]\nDeviceAllow=\n" + "".join(f"DeviceAllow={entry}\n" for entry in entries))
     must("systemctl", "daemon-reload")
@@ -237,7 +234,6 @@ def adapter() -> AdapterNow:
 
 
 def properties(text: str) -> list[str]:
-    """Return the properties of a device in the output of `udevadm info`."""
     return [line.removeprefix("E: ") for line in text.splitlines() if line.startswith("E: ")]
 
 

@@ -53,7 +53,6 @@ def check(checks: Checks, host: Host) -> None:
 
 
 def check_reload(checks: Checks) -> None:
-    """Check `systemctl reload` with a valid file and with an invalid file."""
     with checks("systemctl waits for a reload if systemd supports it"):
         waits = int(must("systemctl", "--version").split()[1]) >= NOTIFY_RELOAD_SINCE
         expect("type", shown("Type"), "notify-reload" if waits else "notify")

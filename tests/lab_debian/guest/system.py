@@ -124,8 +124,6 @@ def ensure_running(text: str) -> None:
 
 
 class Host:
-    """The program on the host that plugs and unplugs the adapter."""
-
     def __init__(self) -> None:
         self._port: IO[bytes] = open(REQUESTS, "r+b", buffering=0)  # noqa: SIM115 - open as long as the run
 

@@ -139,7 +139,6 @@ def check_token(checks: Checks) -> None:
 
 
 def check_no_broker(checks: Checks) -> None:
-    """Check the enabled output without a broker."""
     with checks("a daemon without its MQTT broker continues, keeps its messages, and does not restart"):
         since = mark()
         configure(NO_BROKER + USB + CAN)

@@ -45,7 +45,6 @@ def obstacle(release: Release) -> str:
 
 
 def deps_target(release: Release) -> str:
-    """Return the target of make that installs the missing packages."""
     return "lab-debian-deps" if release.architecture == "amd64" else "lab-arm64-deps"
 
 

@@ -55,7 +55,6 @@ class Tally:
 
     @property
     def good(self) -> bool:
-        """Return whether tests ran and none failed."""
         return self.passed > 0 and not self.failures
 
 
