@@ -23,11 +23,12 @@ LIMIT_S = 60.0
 class BusRig:
     """A device of the daemon on an interface, with the simulated modules of the bus; the first module is the device."""
 
-    def __init__(self, interface: str, driver: str, options: Options, *modules: CanModule) -> None:
+    def __init__(self, interface: str, driver: str, options: Options, *modules: CanModule, **link: Any) -> None:
         self.port = CanPort(CanModules(modules), interface) if modules else None
         self.output = DeviceOutput()
         self.samples, self.events = self.output.samples, self.output.events
-        config = DeviceConfig("bow", driver, options, True, "socketcan", SocketCanOptions(interface=interface))
+        settings = SocketCanOptions(interface=interface, **link)
+        config = DeviceConfig("bow", driver, options, True, "socketcan", settings)
         self.factory = DeviceFactory(self.output, HostClock())
         self.device: Device = self.factory.make(config, 1)
 
@@ -47,8 +48,8 @@ class BusRig:
         return task.result()
 
     @asynccontextmanager
-    async def played(self) -> AsyncIterator[None]:
-        """Run the device during the block, from the first samples of the modules, if there are any."""
+    async def played(self, *, waits: bool = True) -> AsyncIterator[None]:
+        """Run the device during the block, from its first samples or, without modules, from an open bus."""
 
         def is_ready() -> bool:
             state = self.device.state
@@ -57,7 +58,8 @@ class BusRig:
         with closing(self.port) if self.port is not None else nullcontext():
             task = asyncio.create_task(self.device.run())
             try:
-                await self.until(is_ready, "samples or an open bus")
+                if waits:
+                    await self.until(is_ready, "samples or an open bus")
                 yield
             finally:
                 task.cancel()

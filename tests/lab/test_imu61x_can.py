@@ -3,38 +3,30 @@
 import asyncio
 import socket
 import struct
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from time import monotonic, monotonic_ns
+from time import monotonic_ns
 from typing import Any
 
 import pytest
 
-from imud.config.model import DeviceConfig
 from imud.contracts.status import DeviceState
-from imud.device.factory import DeviceFactory
 from imud.drivers.imu61x.can import Imu61xCanOptions, encode_set
 from imud.formats.can import pack_frame
-from imud.host.clock import HostClock
 from imud.links.socketcan import SocketCanOptions
 from imud.model.event import EventKind
 from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
 from imud.sim.ports.can_port import CanPort
+from tests.lab.can_device import BusRig
 from tests.lab.can_interface import CanInterface
 from tests.lab.tool import tool
-from tests.support.device_rig import DeviceOutput
 
-LIMIT_S = 20.0
 BUS_OFF, CONTROLLER = 0x2000_0040, 0x2000_0004
 
 
-class Rig:
+class Rig(BusRig):
     def __init__(self, near: str, far: str, *, base_id: int = 101, **link: Any) -> None:
-        settings = SocketCanOptions(interface=near, **link)
-        config = DeviceConfig("mast", "imu61x-can", Imu61xCanOptions(base_id=base_id), True, "socketcan", settings)
-        output = DeviceOutput()
-        self.samples, self.events = output.samples, output.events
-        self.runner = DeviceFactory(output, HostClock()).make(config, 1)
+        super().__init__(near, "imu61x-can", Imu61xCanOptions(base_id=base_id), **link)
         self.far = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         self.far.bind((far,))
 
@@ -60,34 +52,17 @@ class Rig:
         its class."""
         self.far.send(struct.pack("=IB3x8s", classes, 8, bytes([0, status])))
 
-    async def until(self, condition: Callable[[], object], what: str) -> None:
-        end = monotonic() + LIMIT_S
-        while not condition():
-            assert monotonic() < end, f"not within {LIMIT_S} s: {what}; {self.runner.status()}"
-            self.runner.tick(monotonic_ns())
-            await asyncio.sleep(0.01)
-
-    async def running(self) -> None:
-        await self.until(lambda: self.runner.state is not DeviceState.MISSING, "the bus is open")
-
     @asynccontextmanager
-    async def played(self) -> AsyncIterator["Rig"]:
-        task = asyncio.create_task(self.runner.run())
-        try:
-            yield self
-        finally:
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
-            self.runner.close()
-            self.far.close()
-        assert self.runner.ledger.closes(), self.runner.ledger.snapshot()
-        assert self.runner.ledger.frames_pending == 0
+    async def played(self, *, waits: bool = True) -> AsyncIterator[None]:
+        with self.far:
+            async with super().played(waits=waits):
+                yield
+        assert self.device.ledger.frames_pending == 0
 
 
 async def test_stream_of_the_simulator_with_its_truth(vcan: CanInterface) -> None:
     rig = Rig(vcan.name, vcan.name)
     async with rig.played():
-        await rig.running()
         hardware = Imu61xCanHardware(rate_hz=50, boot_ms=0, index=65500)
         module = Imu61xCanModule(monotonic_ns(), hardware)
         port = CanPort(module, vcan.name)
@@ -101,8 +76,8 @@ async def test_stream_of_the_simulator_with_its_truth(vcan: CanInterface) -> Non
             truth = hardware.motion.at((instant_ns - module.epoch_ns) / 1e9)
             assert sample.gyro_rad_s == pytest.approx(truth.gyro_rad_s, abs=1e-6)
             assert instant_ns - 3 * sample.t_err_ns <= sample.t_ns <= sample.t_rx_ns
-        rig.runner.tick(monotonic_ns())
-        status = rig.runner.status()
+        rig.device.tick(monotonic_ns())
+        status = rig.device.status()
         assert status.state is DeviceState.RUNNING
         assert status.ledger["lost_gap_device"] == 0
         assert status.expected_rate_hz == pytest.approx(50, rel=0.05)
@@ -112,34 +87,26 @@ async def test_stream_of_the_simulator_with_its_truth(vcan: CanInterface) -> Non
 
 async def test_two_devices_share_a_bus_and_see_only_their_own(vcan: CanInterface) -> None:
     first, second = Rig(vcan.name, vcan.name), Rig(vcan.name, vcan.name, base_id=200)
-    async with first.played() as rig:
-        task = asyncio.create_task(second.runner.run())
-        await rig.running()
-        await second.running()
+    async with first.played(), second.played():
         tool("cansend", vcan.name, "12345678#DEADBEEF")
-        rig.send(1, 2, 3)
+        first.send(1, 2, 3)
         second.send(1, 2, base_id=200)
-        await rig.until(lambda: len(rig.samples) == 3, "three of the first")
+        await first.until(lambda: len(first.samples) == 3, "three of the first")
         await second.until(lambda: len(second.samples) == 2, "two of the second")
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-        second.runner.close()
-    second.far.close()
     for rig, frames in ((first, 15), (second, 10)):
-        assert (rig.runner.ledger.bytes_in, rig.runner.ledger.bytes_skipped) == (8 * frames, 0)
+        assert (rig.device.ledger.bytes_in, rig.device.ledger.bytes_skipped) == (8 * frames, 0)
 
 
 async def test_frames_dropped_by_a_small_buffer_are_overruns(vcan: CanInterface) -> None:
     rig = Rig(vcan.name, vcan.name, receive_buffer_bytes=4096)
     async with rig.played():
-        await rig.running()
         rig.send(*range(10))  # no program reads: the buffer overflows
-        await rig.until(lambda: rig.runner.ledger.bytes_in, "the first frames")
+        await rig.until(lambda: rig.device.ledger.bytes_in, "the first frames")
         rig.send(10)
         await rig.until(lambda: rig.samples and rig.samples[-1].seq, "a sample")
-        await rig.until(lambda: rig.runner.ledger.lost_overrun, "loss is counted")
-        rig.runner.tick(monotonic_ns())
-    ledger = rig.runner.ledger
+        await rig.until(lambda: rig.device.ledger.lost_overrun, "loss is counted")
+        rig.device.tick(monotonic_ns())
+    ledger = rig.device.ledger
     assert ledger.samples + ledger.lost_overrun == 11
     assert ledger.lost_gap_device == 0
     assert EventKind.LOSS in [event.kind for event in rig.events]
@@ -148,31 +115,29 @@ async def test_frames_dropped_by_a_small_buffer_are_overruns(vcan: CanInterface)
 async def test_a_jump_of_index_without_drops_is_the_devices(vcan: CanInterface) -> None:
     rig = Rig(vcan.name, vcan.name)
     async with rig.played():
-        await rig.running()
         rig.send(65534, 65535, 65536 + 2)
         await rig.until(lambda: len(rig.samples) == 3, "three samples")
-    assert (rig.runner.ledger.lost_gap_device, rig.runner.ledger.lost_overrun) == (2, 0)
+    assert (rig.device.ledger.lost_gap_device, rig.device.ledger.lost_overrun) == (2, 0)
 
 
 async def test_interface_down_and_up_again(vcan: CanInterface) -> None:
     rig = Rig(vcan.name, vcan.name)
     async with rig.played():
-        await rig.running()
         rig.send(1, 2)
-        await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running")
+        await rig.until(lambda: rig.device.state is DeviceState.RUNNING, "running")
         vcan.down()
-        await rig.until(lambda: rig.runner.state is DeviceState.MISSING, "missing")
-        await rig.until(lambda: "is down" in rig.runner.status().problem, "the problem in the status")
+        await rig.until(lambda: rig.device.state is DeviceState.MISSING, "missing")
+        await rig.until(lambda: "is down" in rig.device.status().problem, "the problem in the status")
         vcan.up()
-        await rig.until(lambda: rig.runner.state is DeviceState.SEARCHING, "open again")
+        await rig.until(lambda: rig.device.state is DeviceState.SEARCHING, "open again")
         rig.back()
         rig.send(500, 501)
-        await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running again")
+        await rig.until(lambda: rig.device.state is DeviceState.RUNNING, "running again")
         await rig.until(lambda: len(rig.samples) == 4, "both")  # the kernel may deliver the second sample later
     assert len(rig.samples) == 4
-    assert rig.runner.ledger.lost() == 0
+    assert rig.device.ledger.lost() == 0
     assert [e.kind for e in rig.events] == [EventKind.UP, EventKind.DOWN, EventKind.UP]
-    assert rig.runner.status().connects == 2
+    assert rig.device.status().connects == 2
 
 
 async def test_interface_that_is_missing_is_waited_for() -> None:
@@ -180,42 +145,41 @@ async def test_interface_that_is_missing_is_waited_for() -> None:
     tool("ip", "link", "add", "dev", "vcan7", "type", "vcan")
     rig = Rig("vcan7", "vcan7")
     tool("ip", "link", "delete", "vcan7")
-    async with rig.played():
-        await rig.until(lambda: "does not exist" in rig.runner.status().problem, "the problem in the status")
+    async with rig.played(waits=False):
+        await rig.until(lambda: "does not exist" in rig.device.status().problem, "the problem in the status")
         tool("ip", "link", "add", "dev", config.interface, "type", "vcan")
         tool("ip", "link", "set", config.interface, "up")
-        await rig.until(lambda: rig.runner.state is DeviceState.SEARCHING, "open")
+        await rig.until(lambda: rig.device.state is DeviceState.SEARCHING, "open")
         tool("ip", "link", "delete", config.interface)
-        await rig.until(lambda: rig.runner.state is DeviceState.MISSING, "gone")
+        await rig.until(lambda: rig.device.state is DeviceState.MISSING, "gone")
 
 
 async def test_error_states_are_counted_and_shown(vcan: CanInterface) -> None:
     rig = Rig(vcan.name, vcan.name)
     async with rig.played():
-        await rig.running()
         rig.send(1)
-        await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running")
+        await rig.until(lambda: rig.device.state is DeviceState.RUNNING, "running")
         rig.send_error(CONTROLLER, 0x10)
-        await rig.until(lambda: "error-passive" in rig.runner.status().problem, "error-passive is shown")
-        assert rig.runner.state is DeviceState.RUNNING
+        await rig.until(lambda: "error-passive" in rig.device.status().problem, "error-passive is shown")
+        assert rig.device.state is DeviceState.RUNNING
         rig.send_error(BUS_OFF, 0)
-        await rig.until(lambda: "bus-off" in rig.runner.status().problem, "bus-off is shown")
-        await rig.until(lambda: rig.runner.state is DeviceState.SILENT, "silent")
-        assert "bus-off" in rig.runner.status().problem
+        await rig.until(lambda: "bus-off" in rig.device.status().problem, "bus-off is shown")
+        await rig.until(lambda: rig.device.state is DeviceState.SILENT, "silent")
+        assert "bus-off" in rig.device.status().problem
         rig.send_error(0x2000_0100, 0)
         rig.send(2)
-        await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running again")
-        assert rig.runner.status().problem == ""
+        await rig.until(lambda: rig.device.state is DeviceState.RUNNING, "running again")
+        assert rig.device.status().problem == ""
         rig.send(3)
         rig.send_error(CONTROLLER, 0x01)  # overflow of the controller's receive buffer
         rig.send(5)
         await rig.until(lambda: len(rig.samples) == 4, "four samples")
-    kernel = rig.runner.status().kernel
+    kernel = rig.device.status().kernel
     news = [event.message for event in rig.events if event.kind is EventKind.LINK]
     assert [message.partition(":")[0] for message in news] == [
         "vcan0 is error-passive", "vcan0 is bus-off", "vcan0 is error-active again",
     ]  # fmt: skip
-    assert rig.runner.ledger.lost_overrun == 1
+    assert rig.device.ledger.lost_overrun == 1
     assert (kernel.error_passive, kernel.bus_off) == (1, 1)
 
 
@@ -224,37 +188,35 @@ async def test_real_controllers_carry_the_stream(can_pair: tuple[CanInterface, C
     near, far = can_pair
     rig = Rig(near.name, far.name)
     async with rig.played():
-        await rig.running()
         for index in range(20):
             rig.send(index)
             await asyncio.sleep(0.01)
         await rig.until(lambda: len(rig.samples) == 20, "twenty samples")
-        assert rig.runner.status().link == "can0 at 500 kbit/s"
+        assert rig.device.status().link == "can0 at 500 kbit/s"
         near.down()
-        await rig.until(lambda: rig.runner.state is DeviceState.MISSING, "missing")
+        await rig.until(lambda: rig.device.state is DeviceState.MISSING, "missing")
         near.up()
-        await rig.until(lambda: rig.runner.state is DeviceState.SEARCHING, "open again")
+        await rig.until(lambda: rig.device.state is DeviceState.SEARCHING, "open again")
         rig.send(90, 91)  # the interface at the far end is still up
         await rig.until(lambda: len(rig.samples) == 22, "two more")
-    assert rig.runner.ledger.lost() == 0
+    assert rig.device.ledger.lost() == 0
 
 
 async def test_error_passive_of_a_real_controller(can_pair: tuple[CanInterface, CanInterface]) -> None:
     near, far = can_pair
     rig = Rig(near.name, far.name)
     async with rig.played():
-        await rig.running()
         rig.send(1, 2)
-        await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running")
+        await rig.until(lambda: rig.device.state is DeviceState.RUNNING, "running")
         near.enter("error-passive")
-        await rig.until(lambda: "error-passive" in rig.runner.status().problem, "error-passive is shown")
+        await rig.until(lambda: "error-passive" in rig.device.status().problem, "error-passive is shown")
         rig.send(3, 4)
         await rig.until(lambda: len(rig.samples) == 4, "it still receives")
-        assert rig.runner.state is DeviceState.RUNNING
+        assert rig.device.state is DeviceState.RUNNING
         near.enter("error-active")
-        await rig.until(lambda: rig.runner.status().problem == "", "over")
-    assert rig.runner.status().kernel.error_passive == 1
-    assert rig.runner.ledger.lost() == 0
+        await rig.until(lambda: rig.device.status().problem == "", "over")
+    assert rig.device.status().kernel.error_passive == 1
+    assert rig.device.ledger.lost() == 0
     news = [event.message.partition(":")[0] for event in rig.events if event.kind is EventKind.LINK]
     assert news == ["can0 is error-passive", "can0 is error-active again"]
 
@@ -268,26 +230,25 @@ async def test_bus_off_of_a_real_controller_and_its_restart(
     near.restart_by_itself(restart_ms)
     rig = Rig(near.name, far.name)
     async with rig.played():
-        await rig.running()
         rig.send(1, 2)
-        await rig.until(lambda: rig.runner.state is DeviceState.RUNNING, "running")
+        await rig.until(lambda: rig.device.state is DeviceState.RUNNING, "running")
         rig.send_part(3)
-        await rig.until(lambda: rig.runner.ledger.frames_pending == 3, "in the middle of a sample")
+        await rig.until(lambda: rig.device.ledger.frames_pending == 3, "in the middle of a sample")
         near.enter("bus-off")
         rig.send(4, 5)  # the controller is off the bus
         await rig.until(lambda: EventKind.LINK in [event.kind for event in rig.events], "told")
         if not restart_ms:
-            assert "bus-off" in rig.runner.status().problem
-            await rig.until(lambda: rig.runner.state is DeviceState.SILENT, "silent")
-            assert "bus-off" in rig.runner.status().problem
+            assert "bus-off" in rig.device.status().problem
+            await rig.until(lambda: rig.device.state is DeviceState.SILENT, "silent")
+            assert "bus-off" in rig.device.status().problem
             near.restart()
         await rig.until(lambda: "again" in rig.events[-1].message, "restarted")
         rig.send(6, 7)
-        await rig.until(lambda: len(rig.samples) == 4 and rig.runner.state is DeviceState.RUNNING, "back")
-        assert rig.runner.status().problem == ""
-    ledger = rig.runner.ledger
-    assert rig.runner.status().kernel.bus_off == 1
-    assert rig.runner.status().connects == 1
+        await rig.until(lambda: len(rig.samples) == 4 and rig.device.state is DeviceState.RUNNING, "back")
+        assert rig.device.status().problem == ""
+    ledger = rig.device.ledger
+    assert rig.device.status().kernel.bus_off == 1
+    assert rig.device.status().connects == 1
     assert ledger.lost() == 3  # frame 3 was incomplete, frames 4 and 5 were not received
     assert ledger.frames_ignored == 3
     news = [event.message.partition(":")[0] for event in rig.events if event.kind is EventKind.LINK]
