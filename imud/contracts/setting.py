@@ -61,12 +61,18 @@ Reports = Mapping[str, DeviceReport]  # reports of a device by name, without rep
 
 def words_of(reports: Reports) -> dict[str, str]:
     """Return the text of all settings in the reports, by the names that the device uses."""
-    return {name: text for report in reports.values() for name, text in report.words.items()}
+    words: dict[str, str] = {}
+    for report in reports.values():
+        words |= report.words
+    return words
 
 
 def values_of(reports: Reports) -> dict[str, Any]:
     """Return the values of all settings in the reports."""
-    return {name: value for report in reports.values() for name, value in report.values.items()}
+    values: dict[str, Any] = {}
+    for report in reports.values():
+        values |= report.values
+    return values
 
 
 def nothing_wrong(_target: Target, _values: Mapping[str, Any]) -> None:

@@ -278,10 +278,10 @@ class CanTransport(ReceivingTransport):
         if self.driver is not None and self._round is None:
             self.link.filters = (*self.driver.filters(self._options), *filters)
 
-    async def run_script(self, make: Callable[[Target], Any]) -> Any:
+    async def run_script(self, make: Callable[..., Any], *arguments: Any) -> Any:
         """Run a request script. Follow the device if the script changes its number."""
         others = self._buses.bits_per_s(self._config.name, self.link.bus)
-        return await self.scripts.run(make(Target(self._options, self.bit_rate, other_bits_per_s=others)))
+        return await self.scripts.run(make(Target(self._options, self.bit_rate, other_bits_per_s=others), *arguments))
 
     # --- the samples -------------------------------------------------------------------------------------------------
 

@@ -145,7 +145,7 @@ class VerbRun:
         settings = self._settings
         settings.script_follows(changes=verb.changes)
         try:
-            answer: object = await self._transport.run_script(lambda target: verb.script(target, arguments))
+            answer: object = await self._transport.run_script(verb.script, arguments)
         except BadArgument:  # a script checks its arguments before it changes anything
             raise
         except BaseException as error:  # the state of the device is unknown
@@ -414,7 +414,7 @@ class Device:
     @property
     def last_calibrations(self) -> Mapping[str, LastCalibration]:
         """Result of the last calibration of each kind."""
-        return self._shared.files.flash.calibrations(self._settings.module)
+        return self._shared.files.flash.record(self._settings.module).calibrations
 
     async def calibrate(self, kind: str, *, save: bool) -> CalibrationResult:
         """Guide a calibration. Raises CommandError, TransferError, DeviceRefused, LinkError."""

@@ -7,6 +7,7 @@ this rate the flash lasts about seven years. Users and programs may make LIMIT_A
 import asyncio
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +19,7 @@ from imud.contracts.command import CalibrationResult, LastCalibration
 from imud.contracts.setting import SavedState
 from imud.host.clock import HostClock
 from imud.host.files import StateFile, replace_file
+from imud.model.errors import CommandError
 from imud.model.units import NS_PER_S
 
 FILE_NAME: Final = "settings.json"
@@ -50,13 +52,13 @@ class FlashWrites:
         self._modules = self._file.read(dict[str, ModuleRecord])
         self._host = host
 
-    def writes(self, module: str) -> int:
-        """Return the number of writes in all runs."""
-        return self._record(module).writes
+    def record(self, module: str) -> ModuleRecord:
+        """Return the record of a device; an empty record if imud has none."""
+        return self._modules.get(module) or ModuleRecord()
 
     def writes_day(self, module: str) -> int:
         """Return the number of writes in the last 24 hours. A write in the future (a wrong clock) counts as of now."""
-        now_s, record = self._host.utc_ns() // NS_PER_S, self._record(module)
+        now_s, record = self._host.utc_ns() // NS_PER_S, self.record(module)
         record.times_s = [min(time_s, now_s) for time_s in record.times_s]
         return sum(time_s > now_s - DAY_S for time_s in record.times_s)
 
@@ -75,20 +77,12 @@ class FlashWrites:
         record.times_s = [*record.times_s, self._host.utc_ns() // NS_PER_S][-LIMIT_ASKED:]
         self._keep(module, record)
 
-    def unreadable(self, module: str) -> Mapping[str, Any]:
-        """Return the saved values of settings that the device does not report, as JSON."""
-        return self._record(module).unreadable
-
     def keep_unreadable(self, module: str, values: Mapping[str, Any]) -> None:
         """Store the saved values of settings that the device does not report."""
-        if self.unreadable(module) != values:
+        if self.record(module).unreadable != values:
             record = self._modules.pop(module, None) or ModuleRecord()
             record.unreadable = dict(values)
             self._keep(module, record)
-
-    def calibrations(self, module: str) -> Mapping[str, LastCalibration]:
-        """Return the result of the last calibration of each kind."""
-        return self._record(module).calibrations
 
     def keep_calibration(self, module: str, result: CalibrationResult) -> None:
         """Store the result of a calibration."""
@@ -101,9 +95,6 @@ class FlashWrites:
         """Wait for the end of the last write, for a limited time. A second call does nothing."""
         self._file.close()
 
-    def _record(self, module: str) -> ModuleRecord:
-        return self._modules.get(module) or ModuleRecord()
-
     def _keep(self, module: str, record: ModuleRecord) -> None:
         """Store the record as the newest, and remove the oldest records above MODULES_MAX."""
         self._modules[module] = record
@@ -112,19 +103,19 @@ class FlashWrites:
         self._file.write(self._modules)
 
 
+@dataclass
 class ModuleFlash:
     """Flash of one device, for writes of a user or program (`asked`) or of imud itself."""
 
-    def __init__(self, writes: FlashWrites, module: str, *, asked: bool) -> None:
-        self._writes = writes
-        self._module = module
-        self._asked = asked
+    writes: FlashWrites
+    module: str
+    asked: bool
 
-    def refusal(self) -> str:
-        return self._writes.refusal(self._module, asked=self._asked)
-
-    def count(self) -> None:
-        self._writes.count(self._module)
+    def spend(self) -> None:
+        """Count a write before imud makes it. Raises CommandError if the limit is reached."""
+        if refusal := self.writes.refusal(self.module, asked=self.asked):
+            raise CommandError(refusal)
+        self.writes.count(self.module)
 
 
 class FlashValues:

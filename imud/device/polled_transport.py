@@ -337,13 +337,13 @@ class PolledTransport(Transport):
 
     # --- requests ----------------------------------------------------------------------------------------------------
 
-    async def run_script(self, make: Callable[[Target], Any]) -> Any:
+    async def run_script(self, make: Callable[..., Any], *arguments: Any) -> Any:
         """Run a transfer script between two reads. Follow the device if the script changes its address."""
         member, device = self._member, self._device
         if member is None or device is None:
             raise CommandError(f"{self._config.name}: the device is missing")
         options = self._config.options or device.driver.settings()
-        script = make(Target(options, self.bit_rate, places=self._places(device)))
+        script = make(Target(options, self.bit_rate, places=self._places(device)), *arguments)
         return await member.run(script, device.target, self._follow)
 
     def _places(self, device: IdentifiedDevice) -> tuple[int, ...]:

@@ -379,9 +379,13 @@ class DeviceSettings:
         self._in_flash.read(self.values)
         text = printable_words(words_of(reports))
         self.shown = printable_words(driver.shown_settings(text)) if driver is not None else text
-        changed = {name: value for name, value in self.shown.items() if known.get(name, value) != value}
+        changed, texts = {}, []
+        for name, value in self.shown.items():
+            if known.get(name, value) != value:
+                changed[name] = value
+                texts.append(f"{name} is {value}, was {known[name]}")
         if changed:
-            now = ", ".join(f"{name} is {value}, was {known[name]}" for name, value in changed.items())
+            now = ", ".join(texts)
             now_ns, kind = self._host.now_ns(), EventKind.CONFIGURATION
             if own:
                 self._events.note_own(now_ns, kind, f"a command changed settings of the device: {now}", **changed)
@@ -451,7 +455,7 @@ class DeviceSettings:
             found,
             unverified(table, self.declared, self.values) if self.is_current else (),
             self._read_ns, self.comparison.repairs,
-            self._files.flash.writes(self.module), self._files.flash.writes_day(self.module),
+            self._files.flash.record(self.module).writes, self._files.flash.writes_day(self.module),
             self._unsaved and table.save is not None,
             lost_values(self._saved, self.values if self._unsaved and self.is_current else {}),
         )  # fmt: skip
@@ -526,10 +530,10 @@ class DeviceSettings:
 
     def spend_flash(self) -> None:
         """Count a write to flash before a command makes it. Raises CommandError if the limit is reached."""
-        flash = ModuleFlash(self._files.flash, self.module, asked=True)
-        if refusal := flash.refusal():
+        flash, module = self._files.flash, self.module
+        if refusal := flash.refusal(module, asked=True):
             raise CommandError(f"{self._config.name}: {refusal}")
-        flash.count()
+        flash.count(module)
 
     async def back_up(self, verb: str) -> None:
         """Write a backup before a verb that resets all settings, and report its file.
@@ -605,7 +609,7 @@ class DeviceSettings:
 
     def _all_written(self, table: SettingsTable) -> dict[str, Any]:
         """Return the written values of settings that the device does not report: saved, or since its restart."""
-        return valid_values(table, self._files.flash.unreadable(self.module)) | self._written
+        return valid_values(table, self._files.flash.record(self.module).unreadable) | self._written
 
     # --- events -------------------------------------------------------------------------------------------------------
 

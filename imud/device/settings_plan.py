@@ -10,7 +10,8 @@ from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import takewhile
+from functools import partial
+from operator import attrgetter
 from shlex import quote
 from typing import Annotated, Any, Final, get_args, get_origin
 
@@ -45,6 +46,7 @@ from imud.model.errors import BadArgument, CommandError, DeviceRefused, IsSettin
 from imud.model.options import expected, json_or_text, shown, unknown_name, value_problem
 
 Values = Mapping[str, Any]  # values of settings by name, in the types of the table
+as_json: Final = msgspec.to_builtins  # returns the JSON value of a setting
 
 
 def has(table: SettingsTable, name: str, wanted: Values, actual: Values, unreadable: Values) -> bool:
@@ -81,33 +83,36 @@ def words(found: Mapping[str, SettingDifference]) -> str:
     )
 
 
-def as_json(value: Any) -> Any:
-    """Return the JSON value of a setting."""
-    return msgspec.to_builtins(value)
-
-
 def wanted_values(table: SettingsTable, given: Mapping[str, Any]) -> dict[str, Any]:
     """Convert values of JSON or YAML to the types of the table, in its order.
 
     A name with dots selects a part of a setting, for example `output.hi91`. Then the value is a `Parts` object, which
     `completed` converts. Raises BadArgument if a setting is unknown or read-only, or if a value is invalid.
     """
-    settable = [name for name, setting in table.table.items() if setting.write is not None]
     parts: dict[str, dict[Path, Any]] = {}
     for given_name, value in given.items():
         name, *path = given_name.split(".")
-        if name not in settable:
-            only_read = f"{name}: it is read-only" if name in table.table else ""
+        setting = table.table.get(name)
+        if setting is None or setting.write is None:
+            settable = [name for name, setting in table.table.items() if setting.write is not None]
+            only_read = f"{name}: it is read-only" if setting is not None else ""
             raise BadArgument(only_read or unknown_name("a setting", name, settable))
-        if path and (problem := value_problem(value, _part_type(name, table.table[name].type, path))):
+        if path and (problem := value_problem(value, _part_type(name, setting.type, path))):
             raise BadArgument(f"{given_name}: {problem}")
         _refuse_overlap(name, parts.setdefault(name, {}), tuple(path))
         parts[name][tuple(path)] = value
-    return {
-        name: _converted(name, parts[name][()], table.table[name].type) if () in parts[name] else Parts(parts[name])
-        for name in settable
-        if name in parts
-    }
+    wanted: dict[str, Any] = {}
+    for name in filter(parts.__contains__, table.table):
+        values, value_type = parts[name], table.table[name].type
+        if () not in values:
+            wanted[name] = Parts(values)
+            continue
+        try:
+            wanted[name] = msgspec.convert(values[()], value_type)
+        except msgspec.ValidationError:
+            got = shown(values[()])[:60]
+            raise BadArgument(f"{name}: expected {expected(value_type)}, got {got}") from None
+    return wanted
 
 
 Path = tuple[str, ...]  # names of the parts that select a value in a setting, from the outside to the inside
@@ -125,10 +130,11 @@ def completed(table: SettingsTable, wanted: Values, actual: Values) -> dict[str,
 
     Raises BadArgument if an entry lacks a part that the device does not report.
     """
-    return {
-        name: _joined(name, value, actual.get(name), table.table[name].type) if isinstance(value, Parts) else value
-        for name, value in wanted.items()
-    }
+    values = dict(wanted)
+    for name, value in wanted.items():
+        if isinstance(value, Parts):
+            values[name] = _joined(name, value, actual.get(name), table.table[name].type)
+    return values
 
 
 def _joined(name: str, parts: Parts, actual: Any, value_type: Any) -> Any:
@@ -229,13 +235,6 @@ def description_of(value_type: Any) -> tuple[str, str, str, str]:
     return expected(value_type), str(meaning), str(unit), str(section)
 
 
-def _converted(name: str, value: Any, value_type: Any) -> Any:
-    try:
-        return msgspec.convert(value, value_type)
-    except msgspec.ValidationError:
-        raise BadArgument(f"{name}: expected {expected(value_type)}, got {shown(value)[:60]}") from None
-
-
 _ARGUMENT: Final = re.compile(r"\{(\w+)(?:\|(\w+))?\}")  # argument of a removed command, with its default
 SHOWN_MAX: Final = 400  # maximum length of the arguments in an error message, characters
 TEXT_MAX: Final = 1000  # maximum length of the command in an error message, with escapes, characters
@@ -304,31 +303,45 @@ def make_plan(
     """
     if by_name:  # write again: a command or another program may have changed a value that imud cannot read
         unreadable = {}
-    differing = [name for name in table.table if name in wanted and not has(table, name, wanted, actual, unreadable)]
-    left_out = {name: why for name in differing if (why := _why_left_out(table, table.table[name], save))}
-    written = [name for name in differing if name not in left_out]
-    values = merged(actual, {name: wanted[name] for name in written})
-    rate = next((name for name, setting in table.table.items() if setting.bus_rate and name in values), "")
+    left_out: dict[str, str] = {}
+    written: dict[str, Any] = {}
+    rate = ""
+    for name, setting in table.table.items():
+        if name in wanted and not has(table, name, wanted, actual, unreadable):
+            if why := _why_left_out(table, setting, save):
+                left_out[name] = why
+            else:
+                written[name] = wanted[name]
+        if setting.bus_rate and (name in actual or name in written):
+            rate = name
+    values = merged(actual, written)
     is_moved = by_name and rate in written  # the user moves the whole bus to another rate
     if written:
         _require_agreement(table, replace(target, baud=values[rate]) if is_moved else target, actual, values)
     # at another rate than the bus, a device is lost after its restart and disturbs the bus
     is_other_rate = bool(rate) and values[rate] != target.baud and (is_moved or target.baud != 0)
-    notes = [name for name in written if table.table[name].note and (name != rate or is_other_rate)]
-    names = list(table.table)
-    written.sort(key=lambda name: (table.table[name].connection, table.table[name].saves, names.index(name)))
-    steps = tuple(_step(name, table.table[name], wanted, actual) for name in written)
-    by_itself = any(step.saves for step in steps)
+    steps, notes = [], []
+    for name in written:
+        setting, before = table.table[name], as_json(actual.get(name))
+        value = as_json(wanted[name])
+        steps.append(PlannedStep(name, value, before, setting.effect, setting.connection, setting.saves))
+        if setting.note and (name != rate or is_other_rate):
+            notes.append(f"{name}: {setting.note}")
+    steps.sort(key=attrgetter("connection", "saves"))
+    by_itself, needs_restart = any(map(attrgetter("saves"), steps)), is_after_restart(steps)
     return SettingsPlan(
-        steps,
+        tuple(steps),
         save=save and table.save is not None and (bool(steps) or unsaved) and not by_itself,
-        restart=any(step.effect is Effect.AFTER_RESTART for step in steps)
-        and not (by_itself or is_other_rate)
-        and table.restart is not None,
+        restart=needs_restart and not (by_itself or is_other_rate) and table.restart is not None,
         left_out=left_out,
-        risk=Risk.CONNECTION if any(step.connection for step in steps) else Risk.NONE,
-        advice="; ".join(f"{name}: {table.table[name].note}" for name in notes),
+        risk=Risk.CONNECTION if any(map(attrgetter("connection"), steps)) else Risk.NONE,
+        advice="; ".join(notes),
     )
+
+
+def is_after_restart(steps: Iterable[PlannedStep]) -> bool:
+    """Return whether one of the settings takes effect after a restart."""
+    return Effect.AFTER_RESTART in map(attrgetter("effect"), steps)
 
 
 def _require_agreement(table: SettingsTable, target: Target, actual: Values, values: Values) -> None:
@@ -367,11 +380,6 @@ def _why_left_out(table: SettingsTable, setting: Setting, save: bool) -> str:
     return "" if table.save is not None else CANNOT_SAVE
 
 
-def _step(name: str, setting: Setting, wanted: Values, actual: Values) -> PlannedStep:
-    before = as_json(actual.get(name))
-    return PlannedStep(name, as_json(wanted[name]), before, setting.effect, setting.connection, setting.saves)
-
-
 DEVICE_ERRORS: Final = (CommandError, DeviceRefused, LinkError, TransferError)
 """Errors of a device that does not reply, rejects a value, or is missing."""
 
@@ -402,8 +410,8 @@ class SettingsPort(SampleSource):
         return True
 
     @abstractmethod
-    async def run_script(self, make: Callable[[Target], Any]) -> Any:
-        """Run the script that `make` returns, and return its result.
+    async def run_script(self, make: Callable[..., Any], *arguments: Any) -> Any:
+        """Run the script that `make(target, *arguments)` returns, and return its result.
 
         Raises LinkError and the errors of the script and of `make`: CommandError, TransferError, DeviceRefused.
         """
@@ -438,53 +446,52 @@ class Applying:
         """Execute the plan up to the first failure. Raises no error of the device or its link."""
         done: list[AppliedStep] = []
         while len(done) < len(plan.steps) and not self.problem:
-            done += await self._write(_next_group(plan.steps[len(done) :]))
-        done += [_applied(step, StepOutcome.NOT_DONE) for step in plan.steps[len(done) :]]
+            done += await self._write(plan.steps[len(done) :])
+        for step in plan.steps[len(done) :]:
+            done.append(_applied(step, StepOutcome.NOT_DONE))
         if not self.problem and plan.save:
             await self._save()
-        if not self.problem and self._restarts(plan):
+        # a plan with such a setting and without a restart keeps the device at the present rate of its bus
+        needs_restart = bool(self.pending) and self.saved and not is_after_restart(plan.steps)
+        if not self.problem and (plan.restart or (needs_restart and self.table.restart is not None)):
             done = await self._restart(done)
         found = differences(self.table, self.wanted, values_of(self.reports) if self.heard else {}, self.written)
-        return AppliedSettings(
-            tuple(done), self.saved, self.restarted, self.problem + self._present(), plan.left_out, found
-        )
+        problem = self.problem and self.problem + self._present()
+        return AppliedSettings(tuple(done), self.saved, self.restarted, problem, plan.left_out, found)
 
-    def _restarts(self, plan: SettingsPlan) -> bool:
-        # a plan with such a setting and without a restart keeps the device at the present rate of its bus
-        is_planned = any(step.effect is Effect.AFTER_RESTART for step in plan.steps)
-        return plan.restart or (bool(self.pending) and self.saved and self.table.restart is not None and not is_planned)
+    async def _write(self, steps: Sequence[PlannedStep]) -> list[AppliedStep]:
+        """Write settings up to the first error, read back their reports once, and compare each setting.
 
-    async def _write(self, group: Sequence[PlannedStep]) -> list[AppliedStep]:
-        """Write settings up to the first error, read back their reports once, and compare each setting."""
+        imud checks a setting of the connection by itself.
+        """
         sent: list[PlannedStep] = []
+        names: set[str] = set()
         failure: Exception | None = None
-        for step in group:
+        for step in steps:
+            by_itself, setting = step.connection or step.saves, self.table.table[step.name]
+            assert setting.write is not None
+            if sent and by_itself:
+                break
             sent.append(step)
+            if setting.readable:
+                names.add(setting.report)
             try:
-                result = await self._send(step)
+                if step.saves:
+                    self.flash.spend()
+                result = await self.transport.run_script(setting.write, self.wanted[step.name])
+                self.saved |= step.saves
             except DEVICE_ERRORS as error:
                 failure = error
                 break
             self.changed = True
             if result in PENDING:
                 self.pending.add(step.name)
-        settings = [self.table.table[step.name] for step in sent]
-        names = {setting.report for setting in settings if setting.readable}
+            if by_itself:
+                break
         # an error can be the sign of a restart, which loses unsaved values
         why = await self._read(None if failure or sent[-1].saves else names) if names else ""
-        last = self._judged(sent[-1], failure, why)
-        return [*(self._judged(step, None, why) for step in sent[:-1]), last]
-
-    async def _send(self, step: PlannedStep) -> Any:
-        write, value = self.table.table[step.name].write, self.wanted[step.name]
-        assert write is not None
-        if step.saves:
-            if refusal := self.flash.refusal():
-                raise CommandError(refusal)
-            self.flash.count()
-        result = await self.transport.run_script(lambda target: write(target, value))
-        self.saved |= step.saves
-        return result
+        last = self._judged(sent.pop(), failure, why)  # first: a failed write is the problem that imud reports
+        return [*map(partial(self._judged, error=None, why_unread=why), sent), last]
 
     def _judged(self, step: PlannedStep, error: Exception | None, why_unread: str) -> AppliedStep:
         """Return the result of a write: `error` of its script, and the reason if imud could not read the report."""
@@ -521,11 +528,8 @@ class Applying:
     async def _save(self) -> None:
         save = self.table.save
         assert save is not None
-        if refusal := self.flash.refusal():
-            self.problem = f"not saved: {refusal}"
-            return
-        self.flash.count()
         try:
+            self.flash.spend()
             await self.transport.run_script(save)
             self.saved = True
         except DEVICE_ERRORS as error:
@@ -552,34 +556,23 @@ class Applying:
     async def _read(self, names: Collection[str] | None) -> str:
         """Read reports, None: all. Return an empty text, or the reason if the device did not reply."""
         try:
-            read = await self.transport.run_script(lambda target: self.table.read(target, names))
+            read = await self.transport.run_script(self.table.read, names)
         except DEVICE_ERRORS as error:
             self.heard = False
             return str(error)
-        self.reports, self.heard = joined(self.reports, read, names), True
+        kept = {} if names is None else dict(self.reports)
+        for name in set(names or ()) - read.keys():  # the device does not send these reports any longer
+            kept.pop(name, None)
+        self.reports, self.heard = kept | {**read}, True
         return ""
 
     def _present(self) -> str:
         """Describe the state of the device after a failure, for the end of the message."""
-        if not self.problem:
-            return ""
         if not self.heard:
             return "; its present settings are unknown"
         if not self.changed:
             return "; no other setting was written"
         return "" if self.saved else "; the previous writes last until the device restarts"
-
-
-def joined(reports: Reports, read: Reports, names: Collection[str] | None) -> Reports:
-    """Return `reports` with the newer reports `read` in place of the reports `names`, None: of all reports."""
-    if names is None:
-        return read
-    return {name: report for name, report in reports.items() if name in read or name not in names} | {**read}
-
-
-def _next_group(steps: Sequence[PlannedStep]) -> Sequence[PlannedStep]:
-    """Return the next settings to write before a read-back. imud checks a setting of the connection by itself."""
-    return list(takewhile(lambda step: not (step.connection or step.saves), steps)) or steps[:1]
 
 
 def advice(config: DeviceConfig, plan: SettingsPlan, done: AppliedSettings) -> str:
@@ -593,7 +586,7 @@ def advice(config: DeviceConfig, plan: SettingsPlan, done: AppliedSettings) -> s
             if place not in (None, "auto", step.value) and type(place) is type(step.value) and step.name in PLACES:
                 found.append(f"change `{key}.{step.name}: {place}` in the configuration to {step.value}")
     changes = "; ".join(found) + (": imud uses this value at its next start" if found else "")
-    return "; ".join(text for text in (changes, "" if done.problem else plan.advice) if text)
+    return "; ".join(filter(None, (changes, "" if done.problem else plan.advice)))
 
 
 def _applied(step: PlannedStep | AppliedStep, outcome: StepOutcome, message: str = "") -> AppliedStep:

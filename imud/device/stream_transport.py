@@ -302,11 +302,11 @@ class StreamTransport(ReceivingTransport):
         """Release held samples when a script starts or ends: the reply must not wait."""
         self._release()
 
-    async def run_script(self, make: Callable[[Target], Any]) -> Any:
+    async def run_script(self, make: Callable[..., Any], *arguments: Any) -> Any:
         """Run a request script. Follow the device if the script changes the baud rate."""
         self._require_device()
         options = self._config.options or (self.driver.settings() if self.driver is not None else None)
-        return await self.scripts.run(make(Target(options, self.bit_rate, self._fixed_baud)))
+        return await self.scripts.run(make(Target(options, self.bit_rate, self._fixed_baud), *arguments))
 
     # --- the samples -------------------------------------------------------------------------------------------------
 

@@ -42,7 +42,7 @@ class GuideRig:
         self.silent = False
         self._begin_ns = self.clock.now_ns()
 
-    async def run_script(self, make: Callable[[Target], Any]) -> Any:
+    async def run_script(self, make: Callable[..., Any], *arguments: Any) -> Any:
         made = make(Target(None, 115200))
         return await made if isinstance(made, Awaitable) else made
 

@@ -1,6 +1,7 @@
 """Flash writes: counted over all runs, limited per day, with any wall clock."""
 
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -32,20 +33,20 @@ class Days:
 def test_the_limit_of_imud_itself_is_lower_than_the_limit_of_users() -> None:
     days = Days()
     writes = FlashWrites(None, days.host)
-    itself, asked = ModuleFlash(writes, "A", asked=False), ModuleFlash(writes, "A", asked=True)
+    itself, asked = (partial(writes.refusal, "A", asked=asked) for asked in (False, True))
     for number in range(LIMIT_ASKED):
-        assert bool(itself.refusal()) == (number >= LIMIT_ITSELF)
-        assert not asked.refusal()
-        asked.count()
+        assert bool(itself()) == (number >= LIMIT_ITSELF)
+        assert not asked()
+        ModuleFlash(writes, "A", asked=True).spend()
         days.now_s += 1
-    assert "written 40 times in 24 hours, the limit is 40" in asked.refusal()
-    assert "the limit of imud itself" in itself.refusal()
-    assert not ModuleFlash(writes, "B", asked=False).refusal()
+    assert "written 40 times in 24 hours, the limit is 40" in asked()
+    assert "the limit of imud itself" in itself()
+    assert not writes.refusal("B", asked=False)
     days.now_s = BEGIN_S + DAY_S + LIMIT_ASKED - LIMIT_ITSELF - 1
-    assert itself.refusal()
+    assert itself()
     days.now_s += 1
-    assert not itself.refusal()
-    assert writes.writes("A") == LIMIT_ASKED
+    assert not itself()
+    assert writes.record("A").writes == LIMIT_ASKED
 
 
 def test_counts_survive_a_restart_of_imud(tmp_path: Path) -> None:
@@ -55,8 +56,9 @@ def test_counts_survive_a_restart_of_imud(tmp_path: Path) -> None:
         writes.count("A")
         writes.keep_unreadable("A", {"secret": 5})
     with closing(FlashWrites(tmp_path, days.host)) as writes:
-        assert (writes.writes("A"), writes.writes_day("A"), writes.unreadable("A")) == (2, 2, {"secret": 5})
-        assert (writes.writes("B"), writes.unreadable("B")) == (0, {})
+        assert writes.record("A").unreadable == {"secret": 5}
+        assert (writes.record("A").writes, writes.writes_day("A")) == (2, 2)
+        assert (writes.record("B").writes, writes.record("B").unreadable) == (0, {})
 
 
 def test_a_wrong_clock_does_not_forbid_writes_and_the_modules_written_last_are_remembered() -> None:
@@ -74,7 +76,7 @@ def test_a_wrong_clock_does_not_forbid_writes_and_the_modules_written_last_are_r
         writes.count(str(number))
     writes.count("0")
     writes.count("one more")
-    assert [writes.writes(name) for name in ("0", "1", "2", "one more")] == [2, 0, 1, 1]
+    assert [writes.record(name).writes for name in ("0", "1", "2", "one more")] == [2, 0, 1, 1]
 
 
 @pytest.mark.parametrize("content", [b"{", b'{"A": {"writes": "x"}}', b"[]"])
@@ -83,11 +85,11 @@ def test_an_invalid_file_only_loses_the_counts(
 ) -> None:
     (tmp_path / FILE_NAME).write_bytes(content)
     with closing(FlashWrites(tmp_path, Days().host)) as writes:
-        assert writes.writes("A") == 0
+        assert writes.record("A").writes == 0
         writes.count("A")
     assert "counts the writes to flash from 0" in caplog.text
     with closing(FlashWrites(tmp_path, Days().host)) as writes:
-        assert writes.writes("A") == 1
+        assert writes.record("A").writes == 1
 
 
 BACKUPS_MAX = 10

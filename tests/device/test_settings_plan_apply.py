@@ -69,20 +69,19 @@ class OnePort(SettingsPort):
     def __init__(self) -> None:
         self.samples = SampleWatch(self)
 
-    async def run_script(self, make: Callable[[Target], Any]) -> Any:
-        return make(TARGET)
+    async def run_script(self, make: Callable[..., Any], *arguments: Any) -> Any:
+        return make(TARGET, *arguments)
 
 
 class CountedFlash(ModuleFlash):
     """Flash that may be written, and the number of writes."""
 
     def __init__(self) -> None:
-        self._counts = FlashWrites(None, HostClock())
-        super().__init__(self._counts, "module", asked=True)
+        super().__init__(FlashWrites(None, HostClock()), "module", asked=True)
 
     @property
     def counted(self) -> int:
-        return self._counts.writes("module")
+        return self.writes.record("module").writes
 
 
 def applied(

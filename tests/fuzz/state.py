@@ -49,10 +49,10 @@ def run(data: bytes) -> None:
     assert again["new"] == devices.get("new")
     (folder / flash.FILE_NAME).write_bytes(data)
     writes = FlashWrites(folder, HostClock(lambda: 0, lambda: UTC_NS, lambda: 0))
-    before = writes.writes(MODULE)
+    before = writes.record(MODULE).writes
     assert bool(writes.refusal(MODULE, asked=True)) == (writes.writes_day(MODULE) >= LIMIT_ASKED)
     writes.count(MODULE)
-    assert writes.writes(MODULE) == before + 1
+    assert writes.record(MODULE).writes == before + 1
     assert 1 <= writes.writes_day(MODULE) <= LIMIT_ASKED
     writes.keep_unreadable(MODULE, {"a": 1})
     writes.close()
