@@ -1,6 +1,6 @@
 """`make bench`: run all measurements, print one table, and write the same rows to build/bench.json.
 
-`make bench ARGS="clock latency"` runs only these parts. The part `export` takes minutes and runs only if it is named.
+`make bench ARGS="clock latency"` runs only these parts.
 `make bench ARGS=--short` runs all parts with fewer and shorter rounds. It takes at most SHORT_LIMIT_S on an idle host.
 """
 

@@ -10,21 +10,62 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from random import Random
+from typing import Any, Final
 
 import msgspec
 
+from imud import config
 from imud.contracts.publisher import Batch
+from imud.daemon import Daemon
 from imud.formats.recording import RecordingReader
+from imud.host import event_loop
 from imud.model.event import Event
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.recording.player import Player
-from tests.bench.captures import Source, hi91_module, record
+from imud.sim.hipnuc.uart import HipnucModule
+from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings, Output
 from tests.bench.rig import Load, run
 from tests.bench.rows import Row, at_most
+from tests.support.files import CaptureWriter
 
 RATIO_LIMIT = 1.15  # goal: CPU with / without a recording
 REPLAY_SECONDS = 600
 REPLAY_QUICK_SECONDS = 30
-HI91_1_KHZ = Source("hipnuc-uart", 1000, lambda: hi91_module(1000))
+
+BEGIN_NS: Final = 86_400 * NS_PER_S  # a device that runs for a day
+BAUD: Final = 921_600
+
+
+def write_capture(seconds: int, path: Path) -> None:
+    """Write a capture of the simulated device. The simulated port delivers each burst up to 0.25 ms late."""
+    random = Random(1)
+    module = HipnucModule(BEGIN_NS, ModuleSettings(baud=BAUD, hi91=Output(period_ms=1)), HipnucHardware())
+    with path.open("wb") as out:
+        writer = CaptureWriter(out, driver="hipnuc-uart", baud=BAUD)
+        for second in range(seconds):
+            for burst in module.advance(BEGIN_NS + (second + 1) * NS_PER_S):
+                if burst.data:
+                    writer.write(burst.data, burst.due_ns + random.randrange(NS_PER_MS // 4))
+
+
+def record(seconds: int, folder: Path, **more: Any) -> Path:
+    """Record the device with a daemon. Return the path of the recording. `more`: further arguments of the daemon."""
+    capture, recordings = folder / "capture", folder / "recordings"
+    write_capture(seconds, capture)
+    text = f"""
+recorder: {{enabled: true, directory: {recordings}, file_mb: 1000}}
+socket: {{enabled: false}}
+shm: {{enabled: false}}
+metrics: {{enabled: false}}
+devices:
+  bow: {{driver: hipnuc-uart, replay: {{path: {capture}, speed: maximum}}}}
+"""
+    # speed `maximum`: the daemon reads the capture without pauses
+    event_loop.run(Daemon(config.parse(text, "imud.yaml"), until_finished=True, **more).run())
+    capture.unlink()
+    (made,) = recordings.glob("*.imudrec")
+    return made
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
@@ -68,7 +109,7 @@ class Digest:
 def replay_rows(seconds: int) -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as name:
         live, again = Digest(), Digest()
-        file = record(HI91_1_KHZ, seconds, Path(name), extra={"live": live})
+        file = record(seconds, Path(name), extra={"live": live})
         player = Player(again.publish)
         with file.open("rb") as opened:
             reader = RecordingReader(opened, file.name)

@@ -190,11 +190,12 @@ async def test_the_next_broker_of_the_cluster_is_tried(broker: Mosquitto, gatewa
 
 @in_loop
 async def test_a_timeout_before_the_next_attempt_returns_none() -> None:
-    fleet = Fleet(f"mqtt://127.0.0.1:{free_port()}", retry_max_s=60.0)
+    url = f"mqtt://127.0.0.1:{free_port()}"
+    fleet = Fleet(url, retry_max_s=60.0)
     async with FleetSession(fleet, site=None, gateway=None, device=None) as session:
         for _ in range(3):
             assert await session.next(0.001) is None
-            assert "refused" in fleet.problem
+            assert re.match(f"{url}: .*refused", fleet.problem)
 
 
 @pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)
@@ -231,22 +232,6 @@ def test_the_example_of_the_document(broker: Mosquitto, gateway: SendingGateway)
         line = process.stdout.readline()
         process.kill()
     assert line == "samples 1 3 3\n"
-
-
-@pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)
-def test_a_refusal_is_reported_and_tried_again(tmp_path: Path) -> None:
-    with running_broker(tmp_path / "closed", "allow_anonymous false") as closed:
-        fleet = fleet_at(closed)
-
-        async def play() -> None:
-            batches = fleet.watch()
-            waiting = asyncio.ensure_future(anext(batches))
-            await until(lambda: bool(fleet.problem))
-            waiting.cancel()
-            await asyncio.gather(waiting, return_exceptions=True)
-
-        asyncio.run(play())
-        assert "refuses the connection: Not authorized" in fleet.problem
 
 
 def test_names_are_checked() -> None:
@@ -371,17 +356,6 @@ async def test_large_messages_wait_at_the_broker(broker: Mosquitto, gateway: Sen
     most, found = await waiting_and_taken(connection, count)
     assert most * size <= WAITING_BYTES + 2 * size, "a read takes two messages at most beyond the bound"
     assert found == list(range(count))
-
-
-@in_loop
-async def test_a_stopped_broker_is_detected(broker: Mosquitto) -> None:
-    connection = await opened(broker.port)
-    await asyncio.to_thread(broker.stop)
-    with pytest.raises(BrokerError, match=f"mqtt://127.0.0.1:{broker.port}: "):
-        await connection.next(LIMIT_S)
-    connection.close()
-    with pytest.raises(BrokerError, match=f"mqtt://127.0.0.1:{broker.port}: .*refused"):
-        await opened(broker.port)
 
 
 @BOTH
