@@ -42,6 +42,7 @@ class Subcommand(NamedTuple):
 COMMANDS = {
     "run": Subcommand("imud.cli.run:RUN", "run the daemon in the foreground"),
     "demo": Subcommand("imud.cli.demo:DEMO", "run the daemon with a simulated device and print samples"),
+    "sim": Subcommand("imud.cli.sim:SIM", "simulate a device on a pseudo-terminal or a CAN interface"),
     "check": Subcommand("imud.cli.run:CHECK", "check a configuration file; do not open any port"),
     "probe": Subcommand("imud.cli.probe:PROBE", "list attached devices"),
     "setup": Subcommand(

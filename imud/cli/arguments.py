@@ -12,6 +12,7 @@ import msgspec
 
 from imud.client.connection import Client, default_path
 from imud.contracts.status import Deviations, DeviceStatus
+from imud.formats.jsonrpc import DEFAULT_PATH
 from imud.host.files import read_regular
 from imud.model.errors import BadArgument, ImudError, reason_of
 from imud.model.options import Options, json_or_text, shown, unknown_name, value_problem, wrong_values
@@ -95,7 +96,7 @@ def add_socket(parser: argparse.ArgumentParser) -> None:
         "--socket",
         default=default_path(),
         metavar="PATH",
-        help="socket of the daemon (default: $IMUD_SOCKET or %(default)s)",
+        help=f"socket of the daemon (default: $IMUD_SOCKET or {DEFAULT_PATH})",
     )
 
 

@@ -20,6 +20,7 @@ from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 KEPT: Final = 2000  # number of newest samples in the histogram of a device
 REFRESH_S: Final = 1.0
+ONCE_S: Final = 2.0  # time to collect samples for one report without a terminal, s
 CLEAR: Final = "\x1b[H\x1b[2J"
 ENOUGH: Final = 20  # minimum number of arrivals for a verdict about their spread
 # Minimum spread of the arrivals, as a share of the latency timer, that the latency timer explains
@@ -37,13 +38,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_socket(parser)
     parser.add_argument("device", nargs="*", metavar="DEVICE", help="devices to show (default: all)")
     parser.add_argument(
-        "--duration", type=finite, metavar="S", help="collect samples for S seconds, then print one report"
+        "--duration",
+        type=finite,
+        metavar="S",
+        help="print one report after S seconds (default without a terminal: 2)",
     )
     parser.add_argument("--json", action="store_true", help="print the clocks once, as the socket reports them")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the report every second until Ctrl-C, or once after `--duration`. Return 1 if no sample arrived, else 0."""
+    """Print the report every second until Ctrl-C, or once after `--duration` or without a terminal.
+
+    Return 1 if no sample arrived, otherwise 0.
+    """
+    if args.duration is None and not sys.stdout.isatty():
+        args.duration = ONCE_S
     with connect(args) as asking:
         chosen = args.device or [status.name for status in statuses(asking)]
         if not chosen and not args.json:

@@ -155,7 +155,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "file", type=Path, metavar="FILE",
         help="recording of imud, raw or time-stamped capture, or for CAN a log of candump -L",
     )  # fmt: skip
-    parser.add_argument("--to", choices=FORMATS, required=True, help="output format")
+    parser.add_argument("--to", choices=FORMATS, help="output format (default: from the name of OUT)")
     parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="output file (default: standard output)")
     parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
     parser.add_argument(
@@ -199,7 +199,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def check(args: argparse.Namespace) -> None:
-    """Raise BadArgument for options that exclude each other."""
+    """Find the output format. Raise BadArgument if it is unknown, and for options that exclude each other."""
+    if args.to is None:
+        args.to = args.output.suffix.removeprefix(".").lower() if args.output is not None else ""
+        if args.to not in FORMATS:
+            wanted = " or ".join(f".{name}" for name in FORMATS)
+            got = args.output or "standard output"
+            raise BadArgument(f"expected --to, or an output file with the suffix {wanted}, got {got}")
     for option, to in (("table", "csv"), ("schema", "mcap")):
         if getattr(args, option) is not None and args.to != to:
             raise BadArgument(f"--{option} applies to --to {to} only, got --to {args.to}")

@@ -12,7 +12,7 @@ from contextlib import suppress
 import msgspec
 
 from imud.cli.arguments import CliCommand
-from imud.cli.output import table
+from imud.cli.output import paragraph
 from imud.config.model import DeviceConfig
 from imud.contracts.codec import message_of
 from imud.contracts.driver import CanDriver, Identity, of_kind
@@ -32,8 +32,6 @@ from imud.links.socketcan import ControllerState
 from imud.model.errors import CommandError, ImudError, NothingHeard
 from imud.model.ledger import Ledger
 
-HEAD = ("PORT", "DRIVER", "RATE", "PRODUCT", "SERIAL NUMBER", "")
-
 
 class ProbeReport(msgspec.Struct, frozen=True, omit_defaults=True):
     """Result for one port, or for one device of a bus."""
@@ -47,17 +45,13 @@ class ProbeReport(msgspec.Struct, frozen=True, omit_defaults=True):
     problem: str = ""
 
 
-def row(report: ProbeReport) -> tuple[object, ...]:
-    """Format a report as a row of the table."""
-    identity = report.identity
-    return (
-        report.port,
-        f"{report.driver} {report.device}".strip() or "-",
-        report.baud or "-",
-        identity.get("product", "-"),
-        identity.get("serial_number", "-"),
-        report.problem or report.title,
-    )
+def block(report: ProbeReport) -> str:
+    """Format a report in 80 columns: the port, then the device or the reason why there is none."""
+    identity = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in report.identity.items())
+    driver = f"{report.driver} {report.device}".strip()
+    rate = f"{report.baud} {'bit/s' if report.device else 'baud'}" if report.baud else ""
+    parts = [" at ".join(filter(None, (driver, rate))), identity, report.problem, report.title]
+    return "\n".join([*paragraph("", report.port), *(line for part in parts if part for line in paragraph("  ", part))])
 
 
 class LinkRequestPort(RequestPort):
@@ -164,7 +158,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print one line per port, or per device of a CAN bus. Return 1 if no device was found."""
+    """Print a few lines per port, or per device of a CAN bus. Return 1 if no device was found."""
     titles = {port.path: port.title for port in list_ports()}
     chosen = [*args.port, *args.active] or [*titles, *can_interfaces(down=True)]
     reports = asyncio.run(examine_all(list(dict.fromkeys(chosen)), set(args.active), titles))
@@ -172,7 +166,7 @@ def run(args: argparse.Namespace) -> int:
         for report in reports:
             print(msgspec.json.encode(report).decode())
     elif reports:
-        print(table(HEAD, [row(report) for report in reports]))
+        print("\n".join(map(block, reports)))
     else:
         print("found no serial port and no CAN interface: is the adapter plugged in, is the UART enabled?")
     return 0 if any(report.driver for report in reports) else 1

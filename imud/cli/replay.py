@@ -90,7 +90,8 @@ def play_to_end(file: BinaryIO, name: str, player: Player) -> tuple[str, int]:
 
 def device_block(device: PlayedDevice, without: Collection[str] = ()) -> list[str]:
     """Format the result of a device in 80 columns, without the rows in `without`."""
-    counts = device.ledger.snapshot()
+    counts, before = device.ledger.snapshot(), device.before or {}
+    own = {name: count - before.get(name, 0) for name, count in counts.items()}  # without the run before the recording
     path = device.path
     newest = path.newest if path is not None else None
     clock = f"{newest.sync}, error {newest.t_err_ns / NS_PER_MS:.3f} ms" if newest is not None else "no sample"
@@ -100,8 +101,8 @@ def device_block(device: PlayedDevice, without: Collection[str] = ()) -> list[st
     rows = [
         ("link", f"{device.described.where}, driver {device.driver.name if device.driver else 'unknown'}"),
         ("clock", clock),
-        ("samples", f"{counts['samples']}; lost {lost(counts)}, {counts['lost_unknown']} gaps of unknown size"),
-        ("bytes", f"{counts['bytes_in']}: {'balanced' if closes else 'NOT BALANCED'}"),
+        ("samples", f"{own['samples']}; lost {lost(own)}, {own['lost_unknown']} gaps of unknown size"),
+        ("bytes", f"{own['bytes_in']}: {'all accounted for' if closes else 'NOT ALL ACCOUNTED FOR'}"),
         ("compared", comparison(device)),
     ]
     lines = paragraph(f"{device.described.name}: ", "replayed")

@@ -37,7 +37,7 @@ def settings_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         action="extend",
         metavar="NAME=VALUE",
-        help="set these settings; NAME.PART=VALUE sets one part, for example output.hi91=200",
+        help="set these settings; NAME.PART=VALUE sets one part, for example output.hi91=200 or 'output={hi91: 200}'",
     )
     operation.add_argument(
         "--yaml", action="store_true", help="print the device settings as YAML for the configuration"
@@ -60,7 +60,7 @@ def settings(args: argparse.Namespace) -> int:
         if args.restore is not None:
             return _restore(client, args)
         if args.apply or args.set or (args.save and not args.yaml and args.backup is None):
-            return _change(client, args, None if args.apply else named_values(args.set or ()))
+            return _change(client, args, None if args.apply else given_values(args.set or ()))
         report = _report(client, args.device, needed=args.yaml or args.backup is not None)
     if args.yaml:
         print(_yaml(report))
@@ -69,6 +69,22 @@ def settings(args: argparse.Namespace) -> int:
         return _back_up(report, args)
     print(msgspec.json.encode(report).decode() if args.json else _shown(report, verbose=args.verbose))
     return 1 if report.status.state in (SettingsState.DIFFER, SettingsState.UNKNOWN) else 0
+
+
+def given_values(words: Sequence[str]) -> dict[str, object]:
+    """Return the values of NAME=VALUE by name. A value can also be in the notation of `--yaml`. Raises BadArgument."""
+    return {name: _yaml_value(name, value) for name, value in named_values(words).items()}
+
+
+def _yaml_value(name: str, value: object) -> object:
+    """Return the value of a mapping or a list in YAML; other values unchanged. Raises BadArgument."""
+    if not isinstance(value, str) or not value.startswith(("{", "[")):
+        return value
+    tree = read_yaml(f"value: {value}\n".encode(), no_pause)
+    if tree.problems or not isinstance(tree.data, dict) or not tree.complete:
+        reason = tree.problems[0].message if tree.problems else "incomplete text"
+        raise BadArgument(f"{name}: expected YAML, for example {{hi91: 50}}, got {value!r}: {reason}")
+    return tree.data["value"]
 
 
 # --- report -----------------------------------------------------------------------------------------------------------

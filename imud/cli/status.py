@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import msgspec
 
+from imud.attitude.conventions import Heading
 from imud.cli.arguments import CliCommand, add_socket, connect
 from imud.cli.output import paragraph, times
 from imud.contracts.setting import SettingsState, SettingsStatus
@@ -17,13 +18,15 @@ from imud.contracts.status import (
     SerialLineCounters,
     UtcStatus,
 )
+from imud.model.errors import BadArgument
 from imud.model.ledger import bytes_open, frames_open, lost
-from imud.model.options import shown
+from imud.model.options import shown, unknown_name
 from imud.model.units import NS_PER_MS, NS_PER_US
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_socket(parser)
+    parser.add_argument("device", nargs="*", metavar="DEVICE", help="devices to print (default: all)")
     parser.add_argument("--json", action="store_true", help="print the complete status, as the socket sends it")
 
 
@@ -31,6 +34,11 @@ def run(args: argparse.Namespace) -> int:
     """Print one block per device. Return 1 if the condition of a device is not ok, otherwise 0."""
     with connect(args) as client:
         answer = client.status()
+    if args.device:
+        known = [str(one["name"]) for one in answer["devices"]]
+        if unknown := [name for name in args.device if name not in known]:
+            raise BadArgument(unknown_name("a device", unknown[0], known))
+        answer = {**answer, "devices": [one for one in answer["devices"] if one["name"] in args.device]}
     devices = msgspec.convert(answer["devices"], list[DeviceStatus])
     if args.json:
         print(msgspec.json.encode(answer).decode())
@@ -58,6 +66,7 @@ def block(status: DeviceStatus, without_times: str = "", *, virtual: bool = Fals
     replay at maximum speed; the block then contains no measured rate and no latency.
     """
     clock, ledger = status.clock, status.ledger
+    accounted = "all accounted for" if closes(ledger) else "NOT ALL ACCOUNTED FOR"
     words = ", ".join(f"{name} {value}" for name, value in status.identity.items()) or "not known"
     rows = [
         ("link", f"{status.state}; {status.link}, driver {status.driver}, opened {times(status.connects)}"),
@@ -79,7 +88,7 @@ def block(status: DeviceStatus, without_times: str = "", *, virtual: bool = Fals
             "bytes",
             f"{ledger['bytes_in']} = {ledger['bytes_in_good_frames']} in good frames"
             f" + {ledger['bytes_in_bad_frames']} in bad frames + {ledger['bytes_skipped']} skipped"
-            f" + {ledger['bytes_pending']} pending: {'balanced' if closes(ledger) else 'NOT BALANCED'}",
+            f" + {ledger['bytes_pending']} pending: {accounted}",
         ),
         (
             "kernel",
@@ -107,7 +116,9 @@ def axes(frame: FrameStatus) -> str:
     """Format axes and heading."""
     own = frame.convention == "device"
     words = f"{frame.frame if own else f'{frame.convention}, {frame.frame}'}; heading {frame.heading}"
-    if frame.declination_deg is not None:
+    if frame.heading is Heading.RELATIVE:
+        words += " to power-on" + ("; declination_deg is ignored" if frame.declination_deg is not None else "")
+    elif frame.declination_deg is not None:
         words += f" with a declination of {frame.declination_deg:g}°"
     return words
 
@@ -220,8 +231,8 @@ def latency(status: DeviceStatus) -> str:
 
 def held(status: DeviceStatus) -> str:
     """Format the hold of the samples, and the client or output that limits it."""
-    limit = f"limit {status.hold_wanted_ns / NS_PER_MS:g} ms" + (f" by {status.hold_by}" if status.hold_by else "")
-    return f"samples held for {status.hold_ns / NS_PER_MS:g} ms ({limit})"
+    limit = f"limit {status.hold_wanted_ns / NS_PER_MS:g} ms" + (f", {status.hold_by}" if status.hold_by else "")
+    return f"batching {status.hold_ns / NS_PER_MS:g} ms ({limit})"
 
 
 STATUS = CliCommand(add_arguments, run)

@@ -190,9 +190,9 @@ class RingDirectory:
 
 def open_directory(configured: str, environment: Mapping[str, str]) -> RingDirectory:
     """Open the configured directory. If the default directory cannot be used, open the directory of the user. This
-    function creates missing default directories. Raises ServerError."""
+    function creates missing default directories, and a configured directory in an existing one. Raises ServerError."""
     if configured != DIRECTORY:
-        return RingDirectory(configured)
+        return _made(configured, parents=False)
     first, *others = default_directories(environment)
     try:
         return _made(first)
@@ -210,16 +210,17 @@ def directory_problem(configured: str, environment: Mapping[str, str]) -> str:
     paths = default_directories(environment) if is_default else [configured]
     for path in paths:
         level = Path(path)
-        while is_default and not os.path.exists(level):  # imud creates the default directories
+        # imud creates the default directories, and a configured directory in an existing one
+        while not os.path.exists(level) and (is_default or level == Path(path)):
             level = level.parent
         if os.path.isdir(level) and os.access(level, os.W_OK | os.X_OK, effective_ids=True):
             return ""
-    hint = "set shm.directory, or XDG_RUNTIME_DIR" if is_default else "create it, or set shm.directory"
+    hint = "set shm.directory, or XDG_RUNTIME_DIR" if is_default else "create its parent, or set shm.directory"
     return f"user {user_name()} cannot create shared memory in {' or '.join(paths)}; {hint}"
 
 
-def _made(path: str) -> RingDirectory:
-    for level in (Path(path).parent, Path(path)):
+def _made(path: str, *, parents: bool = True) -> RingDirectory:
+    for level in (Path(path).parent, Path(path))[not parents :]:
         with suppress(OSError):  # it exists, or opening it reports the problem
             level.mkdir(_DIRECTORY_MODE)
             level.chmod(_DIRECTORY_MODE)  # the umask may have removed permissions

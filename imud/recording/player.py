@@ -64,6 +64,7 @@ class PlayedDevice:
     config: DeviceConfig | None = None
     # overruns that the kernel counted in the live run
     overruns: int = 0
+    before: dict[str, int] | None = None  # counters of the live run at the start of the recording; None if unknown
     checks: int = 0  # number of check records
     # Differences between replay and live run, one sentence for each check record that differs.
     differences: list[str] = field(default_factory=list)
@@ -254,6 +255,8 @@ class Player:
         before = device.path
         device.path = self._path(device, driver, config, made, before=None)
         _set_ledger(device.ledger, made.ledger)
+        if device.before is None:
+            device.before = device.ledger.snapshot()
         try:
             self._restore(device, made.state)
         except StateError as error:

@@ -1,7 +1,8 @@
-"""`python -m imud.sim`: a process that simulates a device on a pseudo-terminal, or several devices on a CAN interface.
+"""`imud sim`, `python -m imud.sim`: simulate a device on a pseudo-terminal, or several devices on a CAN interface.
 
-The first line on stdout is the path of the port or the name of the interface. The process runs until stdin ends, or
-until SIGTERM or SIGINT. Its last line contains the counters as JSON. stdin accepts these lines:
+The first line on stdout is the path of the port or the name of the interface. The process runs until SIGTERM or SIGINT;
+`python -m imud.sim` also ends with stdin, so that it ends with the program that started it. Its last line contains the
+counters as JSON. stdin accepts these lines:
 
     unplug SECONDS    remove the port for this time and cut the power of the device
     reboot            restart the device, keep the port
@@ -31,13 +32,17 @@ from imud.sim.sensor import StreamModule
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run. Return the exit status."""
-    options = make_parser().parse_args(arguments)
+    """Run `python -m imud.sim`. Return the exit status."""
+    return run_simulator(make_parser().parse_args(arguments), stays=False)
+
+
+def run_simulator(options: argparse.Namespace, *, stays: bool) -> int:
+    """Simulate the devices of the options. Return the exit status. `stays`: the end of stdin does not end it."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # both signals end as KeyboardInterrupt
     now_ns = time.monotonic_ns()
     devices: list[tuple[str, int]] = options.device or [(DEVICE, 0)]
     if all(name in CAN_SIMULATORS for name, _ in devices):
-        return _run_on_can(options, devices, now_ns)
+        return _run_on_can(options, devices, now_ns, stays=stays)
     if len(devices) > 1:
         print("imud.sim: expected one device on a terminal, or one or more devices on a CAN bus", file=sys.stderr)
         return 2
@@ -58,12 +63,12 @@ def main(arguments: list[str] | None = None) -> int:
         stack.callback(port.close)
         with suppress(KeyboardInterrupt):
             print(path, flush=True)
-            StandardInputControl(port, time.monotonic_ns, lines).run()
+            StandardInputControl(port, time.monotonic_ns, lines, stays=stays).run()
         print(json.dumps(port.summary() | lines.summary()), flush=True)
     return 0
 
 
-def _run_on_can(options: argparse.Namespace, devices: list[tuple[str, int]], now_ns: int) -> int:
+def _run_on_can(options: argparse.Namespace, devices: list[tuple[str, int]], now_ns: int, *, stays: bool) -> int:
     try:
         modules = [CAN_SIMULATORS[name].make(module_options(options, node), now_ns) for name, node in devices]
         port = CanPort(
@@ -76,7 +81,7 @@ def _run_on_can(options: argparse.Namespace, devices: list[tuple[str, int]], now
     with closing(port):
         with suppress(KeyboardInterrupt):
             print(port.interface, flush=True)
-            StandardInputControl(port, time.monotonic_ns).run()
+            StandardInputControl(port, time.monotonic_ns, stays=stays).run()
         print(json.dumps(port.summary()), flush=True)
     return 0
 

@@ -33,16 +33,19 @@ class StandardInputControl:
         port: SimulatedPort | CanPort,
         now_ns: Callable[[], int],
         lines: SimulatedLines | None = None,
+        *,
+        stays: bool = False,
     ) -> None:
-        """`now_ns` is CLOCK_MONOTONIC."""
+        """`now_ns` is CLOCK_MONOTONIC. `stays`: the end of stdin does not end the simulator."""
+        self._stays = stays
         self._port = port
         self._lines = lines
         self._now_ns = now_ns
         self._text = b""
-        self._running = True
+        self._running = self._listens = True
 
     def run(self) -> None:
-        """Run until the command `quit` or the end of stdin."""
+        """Run until the command `quit` or the end of stdin (unless `stays`)."""
         port, node, commands = self._port, self._port.node, sys.stdin.fileno()
         readable = True
         while self._running:
@@ -55,7 +58,7 @@ class StandardInputControl:
             is_open = node.is_open
             wait_ns = min(port.next_ns(now_ns), next_ns) - self._now_ns()
             # select, because epoll and poll round up to milliseconds
-            watched = [commands, node.fileno()] if is_open else [commands]
+            watched = [commands] * self._listens + [node.fileno()] * is_open
             ready = select.select(watched, [], [], max(wait_ns, 0) / NS_PER_S)[0]
             readable = not is_open or node.fileno() in ready  # a program can write and close the port
             if commands in ready:
@@ -63,7 +66,7 @@ class StandardInputControl:
 
     def _on_input(self, data: bytes) -> None:
         if not data:
-            self._running = False
+            self._running, self._listens = self._stays, False
         *lines, self._text = (self._text + data).split(b"\n")
         for line in lines:
             try:
@@ -102,9 +105,15 @@ DEVICE: Final = "hipnuc-uart"  # driver of the device that is simulated by defau
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    default = SimulatorOptions()
+    """Return the parser of `python -m imud.sim`."""
     parser = argparse.ArgumentParser("python -m imud.sim", description="A simulated sensor on a pseudo-terminal.")
+    add_arguments(parser)
+    return parser
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of a simulator."""
+    default = SimulatorOptions()
     add = parser.add_argument
     add(
         "--device",
@@ -150,7 +159,8 @@ def make_parser() -> argparse.ArgumentParser:
     add("--interface", default="", metavar="NAME", help="interface of CAN devices (default: the first that is up)")
     add("--path", type=Path, help="device node to create (default: a temporary node)")
     add("--truth", type=Path, metavar="FILE", help="write true sample times, CSV: sample_ns,device_ms,written_ns")
-    return parser
+    add("--rest", action="store_const", const="still", dest="motion", help="a device at rest, as --motion still")
+    add("--variant", default="", metavar="NAME", help="behavior where the manual is unclear (unknown NAME: a list)")
 
 
 def simulated(text: str) -> tuple[str, int]:
@@ -178,4 +188,5 @@ def module_options(options: argparse.Namespace, node: int) -> SimulatorOptions:
         seed=options.seed,
         node=node or options.node,
         at_once=options.at_once,
+        variant=options.variant,
     )

@@ -1,11 +1,13 @@
 """Sensor of a simulated device: its motion, its noise and its crystal, from the options."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Literal, NamedTuple, Protocol, TypedDict
+from typing import Literal, NamedTuple, Protocol, TypedDict, TypeVar
 
 from imud.sim.physics import GRAVITY_M_S2, MOTIONS, Motion, Noise, Truth, swing
+
+V = TypeVar("V")
 
 
 class Burst(NamedTuple):
@@ -94,8 +96,17 @@ class SimulatorOptions:
     seed: int = 1
     node: int = 0
     """Node, address or first identifier of the device on its bus; 0: the default of the factory."""
+    variant: str = ""
+    """Name of a behavior where the manual is not clear; empty: the default of the device."""
     at_once: bool = False
     """True: the frames of a CAN device take no time on the wire, as on a virtual bus."""
+
+    def chosen(self, variants: Mapping[str, V]) -> V:
+        """Return the chosen variant, the first without a choice. Raises ValueError for an unknown name."""
+        name = self.variant or next(iter(variants))
+        if name not in variants:
+            raise ValueError(f"variant {name!r}: expected one of {', '.join(variants)}")
+        return variants[name]
 
     def bitrate(self, common: int) -> int:
         """Return the bit rate of a CAN device, bit/s: `baud` or `common`; 0 for frames that take no time."""

@@ -91,7 +91,10 @@ def test_csv_has_every_sample_with_all_its_digits(recorded: Recorded, cli: Cli) 
 
 
 def test_csv_is_that_of_rfc_4180_and_has_chosen_fields(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
-    cli("export", "--to", "csv", "-o", tmp_path / "a.csv", recorded.file)
+    cli("export", "-o", tmp_path / "a.csv", recorded.file)
+    for words in (["-o", tmp_path / "a.txt"], []):
+        problem = "expected --to, or an output file with the suffix .csv or .mcap, got "
+        cli.refuses(problem, "export", recorded.file, *words)
     data = (tmp_path / "a.csv").read_bytes()
     lines = data.split(b"\r\n")
     assert lines[-1] == b""

@@ -9,7 +9,7 @@ import pytest
 
 from imud.cli import probe
 from imud.cli import probe as probe_can
-from imud.cli.probe import ProbeReport, row
+from imud.cli.probe import ProbeReport, block
 from imud.contracts.driver import Driver
 from imud.contracts.link import LinkType, OnBusNews, OnEnd, OnFrames
 from imud.device import can_search as detection
@@ -100,10 +100,11 @@ def test_a_port_is_listened_to_and_only_asked_with_active(ports: Ports, cli: Cli
     assert asked.identity["product"].startswith("HI14R3")
     assert asked.identity["serial_number"]
     assert port.written
-    head, row = cli("probe", "--active", PORT, PORT).out.splitlines()
-    assert head.split() == ["PORT", "DRIVER", "RATE", "PRODUCT", "SERIAL", "NUMBER"]
-    assert row.split()[:4] == [PORT, "hipnuc-uart", "460800", asked.identity["product"]]
-    assert row.endswith("FT232R")
+    lines = cli("probe", "--active", PORT, PORT).out.splitlines()
+    assert lines[:2] == [PORT, "  hipnuc-uart at 460800 baud"]
+    assert lines[2].startswith(f"  product {asked.identity['product']}, serial number ")
+    assert lines[-1] == "  FT232R"
+    assert max(map(len, lines)) <= 80
     assert port.opened == 3, "a port that is named twice is opened once"
 
 
@@ -190,7 +191,7 @@ def test_every_device_of_the_bus_is_listed(bus: type[Bus]) -> None:
         ("can0", "fake-can", "node 8", 500_000, "error-active", {}),
         ("can0", "fake-can", "node 9", 500_000, "error-active", {}),
     ]
-    assert row(reports[0])[:3] == ("can0", "fake-can node 8", 500_000)
+    assert block(reports[0]) == "can0\n  fake-can node 8 at 500000 bit/s\n  error-active"
     assert bus.made[0].written == []
     assert not bus.made[0].is_open
 

@@ -38,7 +38,7 @@ def test_every_sample_is_printed_and_the_account_is_given(tmp_path: Path, cli: C
     times = [s["t_ns"] for s in samples]
     assert times == sorted(set(times))
     assert "samples   50; lost 0" in printed.err
-    assert "balanced" in printed.err
+    assert "all accounted for" in printed.err
 
 
 def test_a_stamped_capture_has_its_own_rate_and_no_figures_of_how_fast_it_was_read(tmp_path: Path, cli: Cli) -> None:
@@ -84,7 +84,7 @@ def test_log_of_a_can_bus(tmp_path: Path, cli: Cli) -> None:
     steps = [b["t_ns"] - a["t_ns"] for a, b in itertools.pairwise(samples)]
     assert sum(abs(step - 10_000_000) < 100_000 for step in steps[5:]) == len(steps[5:]) - 1
     assert "samples   97; lost 3 (device 3," in printed.err
-    assert "balanced" in printed.err
+    assert "all accounted for" in printed.err
 
 
 @pytest.mark.parametrize("content", [b"", b"Z\xa5 no log", b"(1.0) can0 123##1001122\n"])
@@ -111,7 +111,7 @@ def test_the_samples_are_those_that_the_daemon_published(recorded: Recorded, cli
     for name, ledger in ledgers.items():
         assert f"{name}: replayed" in printed.err
         assert f"samples   {ledger['samples']}; lost 0" in printed.err
-        assert f"bytes     {ledger['bytes_in']}: balanced" in printed.err
+        assert f"bytes     {ledger['bytes_in']}: all accounted for" in printed.err
     assert printed.err.count("equal to the live run") == 2
     assert "the file" not in printed.err
 

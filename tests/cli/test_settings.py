@@ -9,8 +9,10 @@ from typing import Any
 import pytest
 
 from imud import config
+from imud.cli.settings import given_values
 from imud.client.connection import Client
 from imud.contracts.setting import declared_values
+from imud.model.errors import BadArgument
 from tests.cli.conftest import Cli, Terminal
 from tests.support.daemon_process import LIMIT_S, RunningDaemon, daemon_with_module
 
@@ -157,3 +159,20 @@ def test_a_factory_reset_is_asked_for_and_backed_up(daemon: RunningDaemon, cli: 
     assert not backups.exists()
     cli(*command, "--yes")
     assert len(list(backups.iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    ("word", "value"),
+    [
+        ("output={hi91: 50}", {"hi91": 50}), ('output={"hi91": 50}', {"hi91": 50}), ("mounting=[1, 0]", [1, 0]),
+        ("mode=9-axis", "9-axis"), ("mode=a{b", "a{b"),
+    ],
+)  # fmt: skip
+def test_values_in_the_notation_of_yaml(word: str, value: object) -> None:
+    assert list(given_values([word]).values()) == [value]
+
+
+@pytest.mark.parametrize("word", ["output={hi91: ", "output={hi91: 50} {}", "output={a: 1, a: 2}"])
+def test_broken_yaml_is_explained(word: str) -> None:
+    with pytest.raises(BadArgument, match=r"output: expected YAML, for example \{hi91: 50\}, got "):
+        given_values([word])

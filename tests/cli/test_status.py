@@ -27,6 +27,8 @@ def test_each_part_of_a_device_has_its_row() -> None:
     frame = FrameStatus("body: x forward", "ned-frd", "ZYX", "NED", Heading.TRUE, -3.5, {}, "its z axis points down")
     lines = block(replace(device("bow"), frame=frame)).splitlines()
     at = lines.index("  axes      ned-frd, body: x forward; heading true with a declination of -3.5°")
+    ignored = replace(frame, heading=Heading.RELATIVE)
+    assert axes(ignored) == "ned-frd, body: x forward; heading relative to power-on; declination_deg is ignored"
     own = replace(frame, frame="sensor: x right", convention="device", declination_deg=None, problem="")
     assert axes(own) == "sensor: x right; heading true"
     assert block(device("front", polling=POLLING)).splitlines()[-2:] == [
@@ -66,6 +68,9 @@ def test_json_is_all_that_the_socket_sends(tmp_path: Path, cli: Cli) -> None:
         shown = json.loads(cli("status", "--socket", served.path, "--json").out)
         assert shown.keys() == said.keys() == {"now_ns", "devices", "socket", "configuration", "mqtt", "outputs"}
         assert shown["devices"] == said["devices"]
+        one = json.loads(cli("status", "--socket", served.path, "--json", "imu1").out)
+        assert [device["name"] for device in one["devices"]] == ["imu1"]
+        cli.refuses("expected a device, got imu9", "status", "--socket", served.path, "imu1", "imu9")
 
 
 def test_a_device_shows_its_condition_with_reasons_and_next_steps() -> None:

@@ -403,7 +403,12 @@ def test_full_memory_delays_the_ring(
 
 def test_missing_or_read_only_directory_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ServerError, match="expected a directory for shared memory"):
-        make(tmp_path / "none").start()
+        make(tmp_path / "none" / "shm").start()
+    assert not (tmp_path / "none").exists()
+    made = make(tmp_path / "made")
+    made.start()
+    assert (tmp_path / "made").is_dir()
+    made.close()
     monkeypatch.setattr(os, "access", lambda *_, **__: False)
     with pytest.raises(ServerError, match="cannot create files in"):
         make(tmp_path).start()

@@ -236,12 +236,14 @@ def test_a_user_without_a_directory_is_told_before_the_start(
             assert directory_problem(str(system), environment).endswith(expected)
             assert bool(directory_problem(str(system), environment)) == bool(expected)
         assert directory_problem(str(own), {}) == ""
-        assert "create it, or set shm.directory" in directory_problem(str(own / "none"), {})
+        assert directory_problem(str(own / "none"), {}) == ""
+        assert "create its parent, or set" in directory_problem(str(own / "none" / "shm"), {})
     assert directory_problem(str(system), {}) == ""  # root
     with unprivileged(), pytest.raises(ServerError, match="; or set XDG_RUNTIME_DIR"):
         open_directory(str(system), {})
-    file.write_text(f"shm: {{directory: {own}/none}}\ndevices: {{}}\n")
-    note = f"{file}: note: shm: user root cannot create shared memory in {own}/none; create it, or set shm.directory"
+    file.write_text(f"shm: {{directory: {own}/none/shm}}\ndevices: {{}}\n")
+    note = f"{file}: note: shm: user root cannot create shared memory in {own}/none/shm; create its parent, or set "
+    note += "shm.directory"
     note += "; ignore this note if another user runs the daemon"
     assert main(["check", str(file)]) == 0
     assert note in capsys.readouterr().out.splitlines()
@@ -368,19 +370,20 @@ def test_ring_replaced_by_another_file(board: Board) -> None:
 
 
 def test_directory_removed_and_created_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    folder = tmp_path / "shm"
-    folder.mkdir()
+    folder = tmp_path / "parent" / "shm"
+    folder.mkdir(parents=True)
     board = Board(folder)
     caplog.clear()
     with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
         board.path.unlink()
         folder.rmdir()
+        folder.parent.rmdir()
         for seq in range(1, 16):
             board.publish([seq])
             board.tick()
         assert ring.read() == ([make_sample(seq) for seq in range(1, 16)], 0)
         assert len([record for record in caplog.records if record.levelno == logging.ERROR]) == 2  # one per problem
-        folder.mkdir()
+        folder.mkdir(parents=True)
         board.tick(1_000_000_000)
         board.publish([16])
         assert ring.read() == ([make_sample(16)], 0)

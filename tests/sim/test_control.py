@@ -11,7 +11,7 @@ from imud.sim.sensor import SimulatorOptions
 
 GIVEN = SimulatorOptions(
     rate_hz=50.0, baud=921600, message="HI92", motion="still", gravity_m_s2=9.7, noise="none", skew_ppm=-3.0,
-    firmware=169, boot_ms=250, processing_ns=12_500, seed=5, node=9, at_once=True,
+    firmware=169, boot_ms=250, processing_ns=12_500, seed=5, node=9, at_once=True, variant="slow flash",
 )  # fmt: skip
 ARGUMENTS = (
     "--rate 50 --baud 921600 --message HI92 --motion still --gravity 9.7 --no-noise --skew-ppm -3 --firmware 169 "
@@ -20,7 +20,8 @@ ARGUMENTS = (
 
 
 def test_options_arrive_in_their_units() -> None:
-    options = make_parser().parse_args(ARGUMENTS.split())
+    options = make_parser().parse_args([*ARGUMENTS.split(), "--variant", "slow flash"])
+    assert make_parser().parse_args(["--rest"]).motion == "still"
     assert module_options(options, 0) == GIVEN
     assert module_options(options, 12) == replace(GIVEN, node=12)
     assert module_options(make_parser().parse_args([]), 0) == SimulatorOptions()

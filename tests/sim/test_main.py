@@ -7,7 +7,7 @@ import select
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -29,8 +29,8 @@ Start = Callable[..., "subprocess.Popen[str]"]
 def start() -> Iterator[Start]:
     started: list[subprocess.Popen[str]] = []
 
-    def begin(*arguments: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "imud.sim", "--boot", "0", *arguments]
+    def begin(*arguments: str, program: Sequence[str] = ("imud.sim",)) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", *program, "--boot", "0", *arguments]
         pipe = subprocess.PIPE
         process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
         started.append(process)
@@ -125,6 +125,21 @@ def test_unplug_closes_the_port_and_a_new_one_appears(start: Start) -> None:
     assert pin_rates("lose_pulse=0.1,extra=0.02") == PinFaultRates(lose_pulse=0.1, extra=0.02)
 
 
+def test_the_command_survives_the_end_of_its_input(start: Start) -> None:
+    process = start("--rest", program=("imud", "sim"))
+    path = path_of(process)
+    assert process.stdin is not None
+    process.stdin.close()
+    process.stdin = None
+    fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    read(fd, 20)
+    os.close(fd)
+    assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 0
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_signals_end_it_well(start: Start, number: signal.Signals) -> None:
     process = start()
@@ -141,6 +156,7 @@ def test_signals_end_it_well(start: Start, number: signal.Signals) -> None:
     [
         (["--rate", "300"], "rate 300"),
         (["--faults", "flop=1"], "flop"),
+        (["--variant", "odd"], "variant 'odd': expected one of as in the manual, "),
         (["--baud", "1200"], "baud 1200"),
         (["--device", "imu61x-can:101", "--device", "hipnuc-uart"], "one device on a terminal"),
         (["--device", "imu61x-can:x"], "with or without :NODE"),

@@ -435,6 +435,7 @@ def make(options: SimulatorOptions, now_ns: int) -> HipnucCanopenModule:
     hardware = HipnucCanopenHardware(
         factory=factory,
         **sensor_of(options),
+        variant=options.chosen(NODE_VARIANTS),
     )
     return HipnucCanopenModule(now_ns, hardware)
 

@@ -337,6 +337,7 @@ def make(options: SimulatorOptions, now_ns: int) -> HipnucJ1939Module:
     hardware = J1939Hardware(
         bitrate=options.bitrate(BITRATE),
         **sensor_of(options),
+        variant=options.chosen(J1939_VARIANTS),
     )
     return HipnucJ1939Module(now_ns, settings, hardware)
 

@@ -411,6 +411,7 @@ def slaves_at(addresses: Iterable[int], options: SimulatorOptions) -> list[Slave
             motion=motion_of(options),
             noise=noise_of(options, number),
             skew_ppm=options.skew_ppm,
+            variant=options.chosen(SLAVE_VARIANTS),
         )
         for number, address in enumerate(addresses, 1)
     ]

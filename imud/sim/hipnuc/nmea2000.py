@@ -53,6 +53,7 @@ def _frames(hardware: Nmea2000Hardware, number: int, reading: Truth) -> list[tup
 
 def make(options: SimulatorOptions, now_ns: int) -> HipnucNmea2000Module:
     """Return a sensor for the options. Raises ValueError for an unsupported option."""
+    options.chosen({"as in the manual": None})
     if not 1 <= options.rate_hz <= RATE_MAX_HZ:
         raise ValueError(f"rate {options.rate_hz:g} Hz: expected 1 … {RATE_MAX_HZ:g}")
     if options.message not in MESSAGES:

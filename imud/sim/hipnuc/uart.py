@@ -32,6 +32,7 @@ from imud.model.sample import Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US, T_PER_UT
 from imud.sim.hipnuc.uart_settings import (
     NWU,
+    VARIANTS,
     CommandRefused,
     HipnucHardware,
     ModuleSettings,
@@ -498,6 +499,7 @@ def make(options: SimulatorOptions, now_ns: int) -> HipnucModule:
         firmware=options.firmware or HipnucHardware().firmware,
         **sensor_of(options),
         mark_seed=options.seed,
+        behaviour=options.chosen(VARIANTS),
     )
     return HipnucModule(now_ns, ModuleSettings(baud=baud, hi91=hi91, hi92=hi92), hardware)
 

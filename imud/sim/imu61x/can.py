@@ -49,6 +49,7 @@ def _frames(base_id: int, index: int, reading: Truth) -> list[tuple[int, bytes]]
 
 def make(options: SimulatorOptions, now_ns: int) -> Imu61xCanModule:
     """Return a device for the options. Raises ValueError for an unsupported option."""
+    options.chosen({"as in the manual": None})
     if not 1 <= options.rate_hz <= RATE_MAX_HZ:
         raise ValueError(f"rate {options.rate_hz:g} Hz: expected 1 … {RATE_MAX_HZ:g}")
     if options.message:

@@ -473,6 +473,7 @@ def make(options: SimulatorOptions, now_ns: int) -> Imu61xModule:
     hardware = Imu61xHardware(
         status=replace(STATUS, software_version=options.firmware or STATUS.software_version),
         **sensor_of(options),
+        behaviour=options.chosen(VARIANTS),
     )
     return Imu61xModule(now_ns, Imu61xSettings(baud=baud, rate_hz=rate_hz), hardware)
 

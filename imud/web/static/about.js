@@ -18,7 +18,7 @@ export function aboutRows({ status, lost, bytes_open, frames_open }) {
     ["latency", latency(status)],
     ["samples", `${number(ledger.samples)}; lost ${number(lost)} (device ${number(ledger.lost_gap_device)}, damaged ${number(ledger.lost_crc)}, ` +
       `overrun ${number(ledger.lost_overrun)}, queue ${number(ledger.lost_queue)}), ${number(ledger.lost_unknown)} gaps of unknown size`],
-    ["bytes", `${number(ledger.bytes_in)}: ${bytes_open || frames_open ? "NOT BALANCED" : "balanced"}`],
+    ["bytes", `${number(ledger.bytes_in)}: ${bytes_open || frames_open ? "NOT ALL ACCOUNTED FOR" : "all accounted for"}`],
     ["kernel", `${number(kernel.overrun)} overruns, ${number(kernel.framing)} framing, ${number(kernel.parity)} parity`],
   ];
   if (status.temperature_c !== null) rows.splice(3, 0, ["temperature", `${number(status.temperature_c, 1)} °C`]);
@@ -44,12 +44,14 @@ function parts(status) {
 function latency(status) {
   const count = status.latency_buckets.reduce((a, b) => a + b, 0);
   const mean = count ? `${seconds(status.latency_sum_ns / count)} mean over ${number(count)} samples` : "no samples";
-  return `${mean}; imud holds samples for ${seconds(status.hold_ns)}, ${seconds(status.hold_wanted_ns)} allowed by ${status.hold_by || "all clients"}`;
+  return `${mean}; batching ${seconds(status.hold_ns)} (limit ${seconds(status.hold_wanted_ns)}, ${status.hold_by || "all clients"})`;
 }
 
 function axes(frame) {
   const words = frame.convention === "device" ? frame.frame : `${frame.convention}, ${frame.frame}`;
-  const declination = frame.declination_deg === null ? "" : ` with a declination of ${shown(frame.declination_deg)}°`;
+  const isRelative = frame.heading === "relative";
+  const ignored = frame.declination_deg === null ? "" : "; declination_deg is ignored";
+  const declination = isRelative ? ` to power-on${ignored}` : frame.declination_deg === null ? "" : ` with a declination of ${shown(frame.declination_deg)}°`;
   return `${words}; heading ${frame.heading}${declination}${inBrackets(frame.problem)}`;
 }
 
