@@ -126,7 +126,7 @@ class PrintedEvent(msgspec.Struct, frozen=True, omit_defaults=True):
     kind: str
     message: str
     detail: dict[str, str | int | float | bool | None] = {}
-    count: int = 1  # number of equal events; `t_ns` and `message` are those of the last one
+    count: int = 1  # number of equal events; `t_ns` and `message` belong to the last event
     first_ns: int = 0  # CLOCK_MONOTONIC of the first of them, ns; 0 for a single new event
 
 

@@ -53,7 +53,7 @@ class FlashWrites:
         self._host = host
 
     def record(self, module: str) -> ModuleRecord:
-        """Return the record of a device; an empty record if imud has none."""
+        """Return the record of a device; an empty record if no record exists."""
         return self._modules.get(module) or ModuleRecord()
 
     def writes_day(self, module: str) -> int:
@@ -121,13 +121,13 @@ class ModuleFlash:
 class FlashValues:
     """Values of the settings in the flash of one device, as far as imud knows them.
 
-    imud cannot read the flash. After a start of the device that imud observed, the first values that it reads are those
-    of the flash. After a save, the present values are.
+    imud cannot read the flash. After a start of the device that imud observed, the first values that it reads are equal
+    to the values of the flash. After a save, the flash contains the present values.
     """
 
     def __init__(self) -> None:
         self._values: Mapping[str, Any] | None = None
-        self._follow = False  # whether the next read values are those of the flash
+        self._follow = False  # whether the next read values are equal to the flash
 
     def found(self) -> None:
         """Note that imud found a device. It can have unsaved changes of another program."""

@@ -42,7 +42,7 @@ class DeviceEvents:
     def note_own(
         self, now_ns: int, kind: EventKind, message: str, /, **detail: str | int | float | bool | None
     ) -> None:
-        """Log and send an event about a requested change: it is no warning."""
+        """Log and send an event about a requested change, at the level INFO."""
         self._report(logging.INFO, now_ns, kind, message, detail)
 
     def _report(

@@ -372,7 +372,7 @@ class DeviceSettings:
     def update(self, reports: Reports, *, own: bool = False) -> None:
         """Store all reports. Raise an event if a known setting has another value, and compare the GPIO lines.
 
-        `own`: a command of imud has just run, so the change is no warning.
+        `own`: a command of imud has just run, so the change is expected.
         """
         driver, known = self._transport.driver, self.shown
         self._reports, self.is_current, self._read_ns = reports, True, self._host.now_ns()

@@ -65,7 +65,7 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class StoredEvent(Event, frozen=True, omit_defaults=True):
-    """Group of equal events of one device. `t_ns`, `message` and `detail` are those of the newest event."""
+    """Group of equal events of one device. `t_ns`, `message` and `detail` belong to the newest event."""
 
     count: int = 1
     first_ns: int = 0  # CLOCK_MONOTONIC of the first event of the group

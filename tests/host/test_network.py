@@ -48,7 +48,7 @@ async def test_a_silent_name_server_does_not_occupy_the_executor(monkeypatch: py
 
     def silent(*_arguments: Any, **_names: Any) -> Any:
         threads.append(threading.current_thread())
-        release.wait(LIMIT_S)  # a failed assertion must not wait for ever
+        release.wait(LIMIT_S)  # a failed assertion must not wait without a limit
         raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
 
     monkeypatch.setattr(socket, "getaddrinfo", silent)
