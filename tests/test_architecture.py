@@ -494,7 +494,8 @@ CROSS_CUTTING = {
 """Test modules without a single module, and their subjects."""
 
 TESTED_IN = {
-    "imud.cli.setup.changes": "cli/setup/test_steps.py", "imud.config.model": "config/test_reading.py",
+    "imud.cli.setup.changes": "cli/setup/test_steps.py", "imud.cli.sim": "sim/test_main.py",
+    "imud.config.model": "config/test_reading.py",
     "imud.config.schema": "config/test_reading.py", "imud.device.device": "device/test_can_transport.py",
     "imud.device.factory": "device/test_search.py", "imud.device.transport": "device/test_stream_transport.py",
     "imud.drivers.hipnuc.bus_load": "drivers/hipnuc/test_common.py",

@@ -159,19 +159,20 @@ def test_a_device_that_there_is_not_is_an_error_of_who_asks() -> None:
 
 @in_loop
 async def test_a_reload_without_any_usable_directory_keeps_the_daemon(tmp_path: Path) -> None:
-    """Both the old and the new directory of shared memory are missing."""
-    old, new = tmp_path / "old", tmp_path / "new"
-    old.mkdir()
+    """Both the old and the new directory of shared memory are missing, and imud cannot create them."""
+    old, new = tmp_path / "a" / "old", tmp_path / "b" / "new"
+    old.mkdir(parents=True)
     daemon = Daemon(Config("info", "", {"shm": ShmOptions(directory=str(old))}, ()))
     running = asyncio.create_task(daemon.run())
     await asyncio.sleep(0)
     old.rmdir()
+    old.parent.rmdir()
     await daemon.change_to(Config("info", "", {"shm": ShmOptions(directory=str(new))}, ()))
     assert daemon.config.publishers["shm"] == ShmOptions(directory=str(old))
     assert "not yet: shm" in daemon._summary()
     daemon._outputs.tick(monotonic_ns() + 100 * NS_PER_S)  # a later attempt
     assert not running.done()
-    old.mkdir()
+    old.parent.mkdir()
     daemon._outputs.tick(monotonic_ns() + 1000 * NS_PER_S)
     assert "outputs: shm" in daemon._summary()
     daemon.stop()

@@ -70,7 +70,7 @@ def test_json_is_all_that_the_socket_sends(tmp_path: Path, cli: Cli) -> None:
         assert shown["devices"] == said["devices"]
         one = json.loads(cli("status", "--socket", served.path, "--json", "imu1").out)
         assert [device["name"] for device in one["devices"]] == ["imu1"]
-        cli.refuses("expected a device, got imu9", "status", "--socket", served.path, "imu1", "imu9")
+        cli.refuses('that imud knows, got "imu9"', "status", "--socket", served.path, "imu1", "imu9")
 
 
 def test_a_device_shows_its_condition_with_reasons_and_next_steps() -> None:

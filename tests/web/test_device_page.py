@@ -147,7 +147,7 @@ WORDS = {
     "settings": ("mode is 6-axis, declared 9-axis", "not reported by the device: baud"),
     "status": ("gyroscope-saturated",),
     "present": ("mode 6-axis",),
-    "latency": ("imud holds samples for 5.0 ms", "allowed by shared memory"),
+    "latency": ("batching 5.0 ms", "shared memory"),
 }  # fmt: skip
 
 
