@@ -46,7 +46,7 @@ class ProbeReport(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def block(report: ProbeReport) -> str:
-    """Format a report in 80 columns: the port, then the device or the reason why there is none."""
+    """Format a report in 80 columns: the port, then the device, or why no device was found."""
     identity = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in report.identity.items())
     driver = f"{report.driver} {report.device}".strip()
     rate = f"{report.baud} {'bit/s' if report.device else 'baud'}" if report.baud else ""

@@ -160,7 +160,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--path", type=Path, help="device node to create (default: a temporary node)")
     add("--truth", type=Path, metavar="FILE", help="write true sample times, CSV: sample_ns,device_ms,written_ns")
     add("--rest", action="store_const", const="still", dest="motion", help="a device at rest, as --motion still")
-    add("--variant", default="", metavar="NAME", help="behavior where the manual is unclear (unknown NAME: a list)")
+    add("--variant", default="", metavar="NAME", help="behavior that the manual does not define (unknown NAME: a list)")
 
 
 def simulated(text: str) -> tuple[str, int]:

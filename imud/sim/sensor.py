@@ -97,7 +97,7 @@ class SimulatorOptions:
     node: int = 0
     """Node, address or first identifier of the device on its bus; 0: the default of the factory."""
     variant: str = ""
-    """Name of a behavior where the manual is not clear; empty: the default of the device."""
+    """Name of a behavior that the manual does not define; empty: the default of the device."""
     at_once: bool = False
     """True: the frames of a CAN device take no time on the wire, as on a virtual bus."""
 
