@@ -128,7 +128,12 @@ class ScriptRunner:
                 request = next(script)
                 while True:
                     undo = request.undo
-                    outcome = await self._ask(request)
+                    for factor in range(PROBES):  # before a request whose reply could be a late reply
+                        if request.probe is None or not self.is_owed(request):
+                            break
+                        timeout_ns = request.probe.timeout_ns << factor
+                        await self._exchange(replace(request.probe, timeout_ns=timeout_ns))
+                    outcome = await self._exchange(request)
                     undo = b""
                     request = script.send(outcome)
             except StopIteration as end:
@@ -140,14 +145,6 @@ class ScriptRunner:
                     with suppress(LinkError, CommandError):  # the link is missing: nothing to undo
                         self._port.write(undo)
                 self._port.on_busy(False)
-
-    async def _ask(self, request: Request) -> Outcome:
-        """Send a request, after the probe if a late reply could count as its reply."""
-        for factor in range(PROBES):
-            if request.probe is None or not self.is_owed(request):
-                break
-            await self._exchange(replace(request.probe, timeout_ns=request.probe.timeout_ns << factor))
-        return await self._exchange(request)
 
     async def _exchange(self, request: Request) -> Outcome:
         port = self._port
@@ -172,7 +169,8 @@ class ScriptRunner:
         finally:
             self._timer.cancel()
             self._outcome = None
-            self.cancel()
+            if self._request is not None:
+                self.cancel()
             if request.also:
                 port.listen(request, ())
 
@@ -216,14 +214,25 @@ class ScriptRunner:
     def on_message(self, message: Message, now_ns: int) -> Outcome | None:
         """Process a text line or a reply frame. Return the outcome if it ends the outstanding request."""
         request = self._request
-        if request is None or not _belongs(request, message) or self._ends_late(request, message):
+        ends = request is not None and _ends(request, message)
+        if (
+            request is None
+            or not (ends or request.is_part(message))
+            or (ends and not self._messages and self._ends_late(request, message))
+        ):
             self._count_stray(message, now_ns)
             return None
         self._late_messages = 0
         self._messages.append(message)
-        if not _ends(request, message):
+        if not ends:
             return None
-        self._learn(request, now_ns)
+        # it can be the reply to the oldest similar request, and no earlier one follows
+        if request.timeout_ns <= ORDINARY_TIMEOUT_NS and not self._owed:
+            self._note_reply_time(now_ns - self._sent_ns)
+        while request.kind and self._owed and not self._owed[0].resembles(request):
+            self._owed.popleft()
+        if request.kind and self._owed:
+            self._owed[0].partial = False  # a complete reply of this kind can follow
         made = Rejection if request.is_rejection(message) else Reply
         return self._finish(made(tuple(self._messages)))
 
@@ -259,15 +268,6 @@ class ScriptRunner:
 
     # --- late replies ------------------------------------------------------------------------------------------------
 
-    def _learn(self, request: Request, now_ns: int) -> None:
-        """Process the end of a reply. It can be the reply to the oldest similar request, and no earlier one follows."""
-        if request.timeout_ns <= ORDINARY_TIMEOUT_NS and not self._owed:
-            self._note_reply_time(now_ns - self._sent_ns)
-        while request.kind and self._owed and not self._owed[0].resembles(request):
-            self._owed.popleft()
-        if request.kind and self._owed:
-            self._owed[0].partial = False  # a complete reply of this kind can follow
-
     def _note_reply_time(self, duration_ns: int) -> None:
         """Follow the slowest reply, also with the timeout of the outstanding request."""
         self._slowest_ns = max(self._slowest_ns, duration_ns) if self._replied else duration_ns
@@ -285,16 +285,16 @@ class ScriptRunner:
             self._late_messages = len(self._messages)
 
     def _ends_late(self, request: Request, message: Message) -> bool:
-        """Return whether `message` ends a late reply: no message of the outstanding reply has arrived yet."""
-        if not _ends(request, message) or self._messages:
-            return False
+        """Return whether `message`, the end of a reply, ends a late reply."""
         late_is_arriving = self._late_messages > 0 and bool(self._owed)
         is_too_short = request.is_end(message) and request.messages_min > 1
         return late_is_arriving or is_too_short or (self.is_owed(request) and self._owing(message) is not None)
 
     def _owing(self, message: Message) -> _Owed | None:
         """Return the oldest request without a reply that `message` can belong to; None if there is none."""
-        return next((owed for owed in self._owed if _belongs(owed.request, message)), None)
+        return next(
+            (owed for owed in self._owed if _ends(owed.request, message) or owed.request.is_part(message)), None
+        )
 
     def _count_stray(self, message: Message, now_ns: int) -> None:
         """Count a message that belongs to no outstanding request: part of a late reply, or unsolicited."""
@@ -310,10 +310,6 @@ class ScriptRunner:
             while self._owed.popleft() is not late:
                 pass  # the device replies in order
             self._late_messages = 0
-
-
-def _belongs(request: Request, message: Message) -> bool:
-    return _ends(request, message) or request.is_part(message)
 
 
 def _ends(request: Request, message: Message) -> bool:
