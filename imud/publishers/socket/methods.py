@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Coroutine, Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final, Generic, TypeVar
 
 import msgspec
@@ -345,9 +346,15 @@ def _notify(hub: Hub, connection: ClientConnection, params: NotifyParams) -> Met
 # --- commands, calibrations, settings -------------------------------------------------------------------------------
 
 
-def _control(hub: Hub, device: str) -> DeviceControl:
-    """Return the control of a device. Raises RpcError if the device is unknown."""
-    _known_devices(hub, [device])
+def _control(hub: Hub, device: str, connection: ClientConnection | None = None, method: str = "") -> DeviceControl:
+    """Return the control of a device, for a `method` that takes time if given.
+
+    Raises RpcError if the device is unknown, or if the previous request of the connection is not finished.
+    """
+    _known("device", [device], hub.devices)
+    if connection is not None and hub.busy(connection):
+        message = f"{method}: the previous request of this connection is not finished; wait for its reply"
+        raise RpcError(Code.UNAVAILABLE, message)
     return hub.context.devices.control(device)
 
 
@@ -356,8 +363,7 @@ def _actions(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> M
 
 
 def _command(hub: Hub, connection: ClientConnection, params: CommandParams) -> Later:
-    control = _control(hub, params.device)
-    _refuse_second(hub, connection, "command")
+    control = _control(hub, params.device, connection, "command")
     _check_name("command", params.name)
     return control.act(params.name, params.arguments or {})
 
@@ -368,8 +374,7 @@ def _calibrations(hub: Hub, _connection: ClientConnection, params: DeviceParams)
 
 
 def _calibrate(hub: Hub, connection: ClientConnection, params: CalibrateParams) -> Later:
-    control = _control(hub, params.device)
-    _refuse_second(hub, connection, "calibrate")
+    control = _control(hub, params.device, connection, "calibrate")
     _check_name("calibrate", params.kind)
     return control.calibrate(params.kind, save=bool(params.save))
 
@@ -385,26 +390,14 @@ def _settings(hub: Hub, connection: ClientConnection, params: SettingsParams) ->
         if Rights.CONTROL not in connection.rights:
             message = f"settings.get: for fresh, expected root or a member of {hub.control_group}"
             raise RpcError(Code.DENIED, message)
-        _refuse_second(hub, connection, "settings.get")
+        _control(hub, params.device, connection, "settings.get")
     return control.settings_report(fresh=bool(params.fresh))
 
 
-def _settings_plan(hub: Hub, connection: ClientConnection, params: SettingsChangeParams) -> Later:
-    control = _control(hub, params.device)
-    _refuse_second(hub, connection, "settings.plan")
-    return control.settings_plan(params.settings, save=bool(params.save))
-
-
-def _settings_apply(hub: Hub, connection: ClientConnection, params: SettingsChangeParams) -> Later:
-    control = _control(hub, params.device)
-    _refuse_second(hub, connection, "settings.apply")
-    return control.settings_apply(params.settings, save=bool(params.save))
-
-
-def _refuse_second(hub: Hub, connection: ClientConnection, method: str) -> None:
-    if hub.busy(connection):
-        message = f"{method}: the previous request of this connection is not finished; wait for its reply"
-        raise RpcError(Code.UNAVAILABLE, message)
+def _settings_change(method: str, hub: Hub, connection: ClientConnection, params: SettingsChangeParams) -> Later:
+    control = _control(hub, params.device, connection, method)
+    change = control.settings_plan if method == "settings.plan" else control.settings_apply
+    return change(params.settings, save=bool(params.save))
 
 
 def _check_name(method: str, name: str) -> None:
@@ -445,8 +438,16 @@ METHODS: Final[Mapping[str, Method[Any]]] = {
     "calibrations": Method(DeviceParams, _calibrations, result=list[CalibrationInfo]),
     "calibrate": Method(CalibrateParams, _calibrate, Rights.CONTROL, acts=True, result=CalibrationResult),
     "settings.get": Method(SettingsParams, _settings, result=SettingsReport),
-    "settings.plan": Method(SettingsChangeParams, _settings_plan, Rights.CONTROL, result=SettingsPlan),
-    "settings.apply": Method(SettingsChangeParams, _settings_apply, Rights.CONTROL, acts=True, result=AppliedSettings),
+    "settings.plan": Method(
+        SettingsChangeParams, partial(_settings_change, "settings.plan"), Rights.CONTROL, result=SettingsPlan
+    ),
+    "settings.apply": Method(
+        SettingsChangeParams,
+        partial(_settings_change, "settings.apply"),
+        Rights.CONTROL,
+        acts=True,
+        result=AppliedSettings,
+    ),
     "stop_calibration": Method(DeviceParams, _stop_calibration, Rights.CONTROL, acts=True, result=StopResult),
     "record.start": Method(RecordParams, _record_start, Rights.CONTROL, result=RecordResult),
     "record.stop": Method(NoParams, _record_stop, Rights.CONTROL, acts=True, result=RecordStopResult),
