@@ -254,13 +254,16 @@ def max_rate_hz(message: OutputMessage, baud: int) -> int:
 
 def require_room(rates_hz: Mapping[OutputMessage, float], baud: int) -> None:
     """Raise BadArgument if the serial port cannot carry all messages, or if one message exceeds table 3.7."""
+    frame_bytes_s = 0.0
     for message, rate_hz in rates_hz.items():
-        if rate_hz > max_rate_hz(message, baud):
+        frame_bytes_s += rate_hz * FRAME_BYTES[message]
+        most_hz = max_rate_hz(message, baud)
+        if rate_hz > most_hz:
             raise BadArgument(
-                f"{message}: expected at most {max_rate_hz(message, baud)} Hz at {baud} baud, got {rate_hz:g} Hz; "
+                f"{message}: expected at most {most_hz} Hz at {baud} baud, got {rate_hz:g} Hz; "
                 f"set a lower rate or a higher baud rate first"
             )
-    bits = sum(rate_hz * FRAME_BYTES[message] for message, rate_hz in rates_hz.items()) * BITS_PER_UART_BYTE
+    bits = frame_bytes_s * BITS_PER_UART_BYTE
     if bits > LINE_SHARE_MAX * baud:
         all_rates = " and ".join(f"{message} at {rate_hz:g} Hz" for message, rate_hz in rates_hz.items() if rate_hz)
         raise BadArgument(

@@ -299,11 +299,7 @@ def _same_mounting(declared: MountingName | list[float], actual: MountingName | 
 
 def _check(target: Target, values: Mapping[str, Any]) -> None:
     """Raise BadArgument for too much output, two functions on one pin, and an empty range of an alarm."""
-    if problems := list(_contradictions(target, values)):
-        raise BadArgument("; ".join(problems))
-
-
-def _contradictions(target: Target, values: Mapping[str, Any]) -> Iterator[str]:
+    problems = []
     baud = values.get("baud", target.baud)
     output = values.get("output", {})
     if baud in BAUD_RATES:
@@ -311,16 +307,19 @@ def _contradictions(target: Target, values: Mapping[str, Any]) -> Iterator[str]:
         try:
             commands.require_room(rates, baud)
         except BadArgument as error:
-            yield str(error)
+            problems.append(str(error))
     taken: dict[int, str] = {}
     for function, pin in values.get("pins", {}).items():
         if pin in taken:
-            yield f"pins: expected another pin for each function, got IO{pin} for {taken[pin]} and {function}"
+            both = f"{taken[pin]} and {function}"
+            problems.append(f"pins: expected another pin for each function, got IO{pin} for {both}")
         taken[pin] = function
     for axis, one in msgspec.to_builtins(values.get("alarm", {})).items():
         if not one["min_deg"] < one["max_deg"]:
-            low, high = one["min_deg"], one["max_deg"]
-            yield f"alarm.{axis}: expected the minimum below the maximum, got {low:g}° and {high:g}°"
+            got = f"{one['min_deg']:g}° and {one['max_deg']:g}°"
+            problems.append(f"alarm.{axis}: expected the minimum below the maximum, got {got}")
+    if problems:
+        raise BadArgument("; ".join(problems))
 
 
 def _described(value_type: Any, description: str, section: str, unit: str = "") -> Any:
