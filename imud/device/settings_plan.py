@@ -99,8 +99,12 @@ def wanted_values(table: SettingsTable, given: Mapping[str, Any]) -> dict[str, A
             raise BadArgument(only_read or unknown_name("a setting", name, settable))
         if path and (problem := value_problem(value, _part_type(name, setting.type, path))):
             raise BadArgument(f"{given_name}: {problem}")
-        _refuse_overlap(name, parts.setdefault(name, {}), tuple(path))
-        parts[name][tuple(path)] = value
+        mine = tuple(path)
+        for other in parts.setdefault(name, {}):  # a part and its whole, or another part of the part
+            if other[: len(mine)] == mine or mine[: len(other)] == other:
+                both = " and ".join(".".join((name, *one)) for one in (other, mine))
+                raise BadArgument(f"{name}: expected one value for each part, got {both}")
+        parts[name][mine] = value
     wanted: dict[str, Any] = {}
     for name in filter(parts.__contains__, table.table):
         values, value_type = parts[name], table.table[name].type
@@ -169,14 +173,6 @@ def _part_type(name: str, value_type: Any, path: Sequence[str]) -> Any:
             raise BadArgument(unknown_name(f"a part of {name}", key, list(types)))
         name, value_type = f"{name}.{key}", types[key]
     return value_type
-
-
-def _refuse_overlap(name: str, others: Iterable[Path], path: Path) -> None:
-    """Raise BadArgument if a value is given for a part and also for its whole."""
-    for other in others:
-        if other[: len(path)] == path or path[: len(other)] == other:
-            both = " and ".join(".".join((name, *one)) for one in (other, path))
-            raise BadArgument(f"{name}: expected one value for each part, got {both}")
 
 
 def valid_values(table: SettingsTable, saved: Mapping[str, Any]) -> dict[str, Any]:

@@ -68,6 +68,8 @@ def got(value: object) -> str:
 def shown(value: object) -> str:
     """Return `value` as one line of YAML with printable characters only."""
     text = msgspec.json.encode(value).decode()
+    if text.isprintable():
+        return text
     return "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text)
 
 
