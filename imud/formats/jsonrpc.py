@@ -84,7 +84,7 @@ def parse_object(line: bytes | bytearray) -> dict[str, Any]:
         value = _decode(line)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise RpcError(Code.PARSE, f"not JSON: {error}") from None
-    except RecursionError:  # only for replies of a server; _check_bounds limits requests
+    except RecursionError:  # only for replies of a server; `parse_request` limits requests
         raise RpcError(Code.PARSE, "cannot read the JSON: nested too deeply") from None
     if not isinstance(value, dict):
         raise RpcError(Code.INVALID_REQUEST, f"expected one JSON object per line, got {_kind(value)}")
@@ -93,7 +93,11 @@ def parse_object(line: bytes | bytearray) -> dict[str, Any]:
 
 def parse_request(line: bytes | bytearray) -> RpcRequest:
     """Return the request in `line`. Raises RpcError (PARSE, INVALID_REQUEST, INVALID_PARAMS)."""
-    _check_bounds(line)
+    # limits of the work to parse the line; brackets and commas in strings count too
+    if line.count(b"[") + line.count(b"{") > NESTED_MAX:
+        raise RpcError(Code.PARSE, f"nested too deeply: expected at most {NESTED_MAX} arrays and objects")
+    if line.count(b",") > ITEMS_MAX:
+        raise RpcError(Code.PARSE, f"too many values: expected at most {ITEMS_MAX} members and elements")
     value = parse_object(line)
     request_id = value.get("id")
     if isinstance(request_id, bool) or not isinstance(request_id, int | float | str | None):
@@ -108,15 +112,6 @@ def parse_request(line: bytes | bytearray) -> RpcRequest:
     if not isinstance(params, dict):
         raise RpcError(Code.INVALID_REQUEST, f"params: expected an object, got {_kind(params)}", request_id)
     return RpcRequest(method, params, request_id, "id" in value)
-
-
-def _check_bounds(line: bytes | bytearray) -> None:
-    """Reject a line that is expensive to parse or nested too deeply, without parsing."""
-    # brackets and commas in strings count too
-    if line.count(b"[") + line.count(b"{") > NESTED_MAX:
-        raise RpcError(Code.PARSE, f"nested too deeply: expected at most {NESTED_MAX} arrays and objects")
-    if line.count(b",") > ITEMS_MAX:
-        raise RpcError(Code.PARSE, f"too many values: expected at most {ITEMS_MAX} members and elements")
 
 
 def encode_request(method: str, params: Mapping[str, Any], request_id: int) -> bytes:

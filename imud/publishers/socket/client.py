@@ -298,7 +298,13 @@ class ClientConnection(Outbox, ScheduledClient):
                 self._serve_line()
         if not self.closed:
             self.set_request_bytes(self.unread_bytes)
-        return self._has_work()
+        if self.closed:
+            return False
+        if self._writable and self.waiting:
+            return True
+        return not self.finishing and (
+            self._work is not None or self._readable or self._input.find(b"\n", self._searched) >= 0
+        )
 
     def wanted_events(self) -> int:
         # a client that has shut down its sending direction stays readable: EPOLLHUP reports that it closes the socket
@@ -323,15 +329,6 @@ class ClientConnection(Outbox, ScheduledClient):
         if not self.closed:
             self._clients.evicted += 1
             self.on_broken(reason)
-
-    def _has_work(self) -> bool:
-        if self.closed:
-            return False
-        if self._writable and self.waiting:
-            return True
-        return not self.finishing and (
-            self._work is not None or self._readable or self._input.find(b"\n", self._searched) >= 0
-        )
 
     def _step(self) -> None:
         assert self._work is not None
