@@ -4,6 +4,7 @@ A test of logic receives the time as an argument. A `live` test runs a real daem
 condition with `wait_until`.
 """
 
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -66,6 +67,16 @@ def _no_waiting(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch)
     """Let `time.sleep` fail in a test of logic if it waits for a fixed duration."""
     if not is_live(request.node):
         monkeypatch.setattr(time, "sleep", _refuse_to_wait)
+
+
+@pytest.fixture(autouse=True)
+def _signals() -> Iterator[None]:
+    """Restore the signal handlers: a daemon that ended in this process leaves them ignored, also for children."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    yield
+    for number, handler in before.items():
+        if signal.getsignal(number) is not handler:
+            signal.signal(number, handler)
 
 
 @pytest.fixture

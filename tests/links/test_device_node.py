@@ -66,6 +66,7 @@ async def test_access_is_waited_for_quietly(tmp_path: Path, monkeypatch: pytest.
         return granted
 
     monkeypatch.setattr("imud.links.device_node.os.access", access)
+    monkeypatch.setattr("imud.links.device_node.ACCESS_WAIT_S", LIMIT_S)
     node = DeviceNode(str(path), "is it plugged in?")
     assert node.absence() == f"{path} does not exist: is it plugged in?"
     waiting = asyncio.create_task(node.wait_present())
