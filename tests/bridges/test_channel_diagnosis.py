@@ -52,6 +52,8 @@ def test_levels_and_messages_of_a_running_daemon() -> None:
     }  # fmt: skip
     assert found.values.items() >= expected.items()
     assert one(status()).hardware == "HI13"
+    assert "status" not in one(status()).values
+    assert one(status(status_words=["overrange", "hot"])).values["status"] == "overrange, hot"
 
 
 def test_without_a_daemon_all_are_stale_and_keep_their_values() -> None:
