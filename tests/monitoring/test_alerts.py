@@ -216,8 +216,9 @@ def test_every_alert_fires_and_clears(tmp_path: Path) -> None:
         watcher.begin(firing=True)
         begin = time.monotonic()
         while "ImudLoopLate" not in watcher.after_s:  # only this alert: scrapes fail while the loop is blocked
-            one.block_loop(max(STUCK_S, 1.5 * pace.interval_ms / 1000))
-            time.sleep(2.17 * STUCK_S)  # out of step with the scrapes: one scrape must be in time
+            block_s = max(STUCK_S, 1.5 * pace.interval_ms / 1000)
+            one.block_loop(block_s)
+            time.sleep(2.17 * block_s)  # out of step with the scrapes: one scrape must be in time
             watcher.look()
             assert time.monotonic() < begin + LIMIT_S
         fired["ImudLoopLate"] = watcher.after_s["ImudLoopLate"]
