@@ -57,7 +57,7 @@ SPARE_ALERTS: Final = ("ImudDown", "ImudRestarts", "ImudNoDevices", "ImudFilesNe
 STARTS: Final = 4
 WHEN_TOLD: Final = "import sys, imud.cli, imud.daemon; sys.stdin.readline(); sys.exit(imud.cli.main())"
 """Program that imports imud and waits for a line on standard input, so that a start is fast on a slow host."""
-STUCK_S: Final = 1.5  # blocked event loop
+STUCK_S: Final = 2.5  # blocked event loop
 
 
 class Spare:
