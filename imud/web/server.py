@@ -9,11 +9,10 @@ POST /api/call         {"method": …, "params": {…}}: a method of docs/socket
 
 import asyncio
 import logging
-import os
+import socket
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from errno import EAFNOSUPPORT
 from pathlib import Path
 from typing import Any, Final
 
@@ -211,11 +210,11 @@ class LimitedSite(web.TCPSite):
         make = self._runner.server
         assert make is not None
         host, port = self._address
+        # asyncio does not report a family that the kernel lacks
+        socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET).close()
         self._server = await asyncio.get_running_loop().create_server(
             lambda: self._connections.accept(make()), host, port, backlog=self._backlog
         )
-        if not self._server.sockets:  # asyncio ignores a family that the kernel lacks
-            raise OSError(EAFNOSUPPORT, os.strerror(EAFNOSUPPORT))
 
 
 class _OfPrograms(logging.Filter):

@@ -98,8 +98,7 @@ def test_a_port_that_cannot_be_had_is_refused(cli: Cli, monkeypatch: pytest.Monk
             super().__init__(family, *arguments, **names)
 
     monkeypatch.setattr(socket, "socket", WithoutIpv6)
-    # asyncio of Python 3.13 reports that it could not bind, without the error number
-    cli.refuses("cannot listen on ::1 port 9322: ", "web", "--address", "::1")
+    cli.refuses("cannot listen on ::1 port 9322: Address family not supported by protocol", "web", "--address", "::1")
 
 
 def test_addresses_and_who_may_look_and_change_are_said(capsys: pytest.CaptureFixture[str]) -> None:

@@ -168,7 +168,7 @@ def test_demo_of_three_protocols_to_its_end(vcan: CanInterface) -> None:
     devices = ("--device", "hipnuc-canopen:8", "--device", "hipnuc-j1939:9", "--device", "imu61x-can")
     printed = demo(*devices, "--rate", "10", "--duration", "5")
     for driver in ("hipnuc-canopen", "hipnuc-j1939", "imu61x-can"):
-        assert f"{vcan.name}, driver {driver}" in printed
+        assert f"link      running; {vcan.name}, driver {driver}" in printed
     assert printed.count("lost 0 (device 0, damaged 0, overrun 0, queue 0)") == 3, printed
     assert printed.rstrip().endswith("the ledger balances"), printed
 

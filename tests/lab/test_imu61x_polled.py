@@ -121,7 +121,7 @@ async def test_two_devices_on_one_bus_are_found_by_themselves(i2c: Bus[I2cTransf
 def test_demo_on_a_bus_that_exists(i2c: Bus[I2cTransfer]) -> None:
     i2c.attach(ADDRESS, on_i2c(registers()))
     printed = demo("--device", "imu61x-i2c", "--bus", "0", "--rate", "20", "--duration", "5")
-    assert "/dev/i2c-0, address 0x1a, driver imu61x-i2c" in printed
+    assert "link      running; /dev/i2c-0, address 0x1a, driver imu61x-i2c" in printed
     assert "reads, " in printed
     assert printed.rstrip().endswith("the ledger balances")
 
@@ -258,6 +258,6 @@ async def test_bus_that_goes_is_noticed(spi8: Bus[SpiTransfer]) -> None:
 def test_demo_on_spi(spi8: Bus[SpiTransfer]) -> None:
     spi8.attach(0, on_spi(registers()))
     printed = demo("--device", "imu61x-spi", "--port", "/dev/spidev0.0", "--rate", "20", "--duration", "5")
-    assert "/dev/spidev0.0, mode 0, driver imu61x-spi" in printed
+    assert "link      running; /dev/spidev0.0, mode 0, driver imu61x-spi" in printed
     assert "reads, " in printed
     assert printed.rstrip().endswith("the ledger balances")

@@ -336,6 +336,8 @@ class Site:
         }  # fmt: skip
         if faulty:
             devices["mute"] |= {"identify": True, "settings": {"mode": "9-axis"}}
+            # the repaired configuration differs, so that the device starts again and its restarts of the last hour end
+            devices["jumping"]["condition"] = {"restarts": 60}
             devices["quiet"]["rmc"] = {"source": "gpsd", "tcp_port": 9}
         recorder = {"enabled": True, "directory": str(self.folder / "recordings")}
         mqtt = {

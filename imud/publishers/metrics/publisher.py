@@ -276,13 +276,14 @@ class MetricsPublisher:
         answer: Future[Snapshot] = Future()
         if self._loop is None or self._loop.is_closed():
             raise TimeoutError
-        self._loop.call_soon_threadsafe(self._begin_snapshot, answer)
+        # the last tick before the request: a late loop ticks before it calls `_begin_snapshot`
+        self._loop.call_soon_threadsafe(self._begin_snapshot, answer, self._tick_ns)
         async with asyncio.timeout(self._snapshot_s):
             return await asyncio.wrap_future(answer)
 
-    def _begin_snapshot(self, answer: "Future[Snapshot]") -> None:
-        """Start a snapshot. Measure the delay of the loop first, because the loop ticks before its next turn."""
-        self._gather(answer, self._context.clock.now_ns() - self._tick_ns, self._context.devices.each_status(), [])
+    def _begin_snapshot(self, answer: "Future[Snapshot]", tick_ns: int) -> None:
+        """Start a snapshot. `tick_ns` is the time of the last tick before the request."""
+        self._gather(answer, self._context.clock.now_ns() - tick_ns, self._context.devices.each_status(), [])
 
     def _gather(
         self, answer: "Future[Snapshot]", late_ns: int, rest: Iterator[DeviceStatus], found: list[DeviceStatus]
