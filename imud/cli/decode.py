@@ -88,8 +88,7 @@ def events_in(
             yield from codec.feed(data)
         # complete frames at the end of the capture
         yield from codec.flush()
-        if codec.unknown and not ledger.frames_in_samples:
-            print(f"found {driver.unknown_words(codec.unknown)}", file=sys.stderr)
+        unknown = codec.unknown
     elif isinstance(driver, CanDriver):
         frame_codec = driver.make_codec(ledger, settings)
         log = CandumpReader(file, interface)
@@ -101,8 +100,11 @@ def events_in(
         yield from frame_codec.flush()
         for problem in filter(None, (log.problem, frame_codec.problem)):
             print(problem, file=sys.stderr)
+        unknown = frame_codec.unknown
     else:
         raise ImudError(f"cannot decode a capture of {driver.name}: its devices reply only to requests on a polled bus")
+    if unknown and not ledger.frames_in_samples:
+        print(f"found {driver.unknown_words(unknown, counted=True)}", file=sys.stderr)
 
 
 def as_object(event: CodecEvent, times: "UnwrappedTime") -> dict[str, object]:

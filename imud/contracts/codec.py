@@ -77,6 +77,7 @@ class CanCodec(Protocol):
     data bytes. Data bytes of other devices count as skipped. Synchronization: one thread."""
 
     ledger: Ledger
+    unknown: dict[int, int]  # number of frames of each unknown type that the device may have sent, by identifier or PGN
 
     @property
     def problem(self) -> str:

@@ -172,6 +172,18 @@ class Driver:
     limits: Callable[[Mapping[str, Any], DeviceLines, bool], Sequence[str]] = lambda _declared, _lines, _fed: ()
     # Finds problems of driver options together with link options. Both are valid on their own.
     check: Callable[[Any, Any], Sequence[KeyProblem]] = no_problems
+    # Returns the name of an unknown frame type (`unknown` of the codec), for example `HI83 (tag 0x83)`
+    unknown_name: Callable[[int], str] = str
+    # Decoded frame types, and how to select one of them, one clause. `NAME` stands for the name of the device.
+    decoded: str = "select another frame type on the device"
+
+    def unknown_words(self, unknown: Mapping[int, int], device: str = "NAME", *, counted: bool = False) -> str:
+        """Describe valid frames that the codec cannot decode, with the next step, one sentence without its start.
+
+        `counted`: with the number of frames of each type.
+        """
+        types = ", ".join(self.unknown_name(one) + f": {count}" * counted for one, count in unknown.items())
+        return f"valid frames of unknown types ({types}), but no sample; {self.decoded.replace('NAME', device)}"
 
     def sent_axes(self, settings: Mapping[str, str]) -> SentAxes:
         """Return axes and angles of a device with these readable settings (empty: not read yet)."""
@@ -206,15 +218,6 @@ class StreamDriver(Driver):
     why_silent: Callable[[Mapping[str, Any]], str] = lambda _settings: "its output is off"
     # Returns one valid frame with random values, for property tests and fault injection
     example_frame: Callable[[Random], bytes]
-    # Returns the name of an unknown frame type (`StreamCodec.unknown`), for example `HI83 (tag 0x83)`
-    unknown_name: Callable[[int], str] = str
-    # Decoded frame types, and how to select one of them, one clause. `NAME` stands for the name of the device.
-    decoded: str = "select another frame type on the device"
-
-    def unknown_words(self, unknown: Mapping[int, int], device: str = "NAME") -> str:
-        """Describe valid frames that the codec cannot decode, with the next step, one sentence without its start."""
-        types = ", ".join(self.unknown_name(one) for one in unknown)
-        return f"valid frames of unknown types ({types}), but no sample; {self.decoded.replace('NAME', device)}"
 
     def problems(self, options: Any, link: Any) -> Sequence[KeyProblem]:
         """Return the problems of the driver options, and an unsupported baud rate."""
@@ -252,6 +255,9 @@ class CanDriver(Driver):
     make_codec: Callable[[Ledger, Any], CanCodec]
     # Returns the filters for all frames of the device, replies included, from the driver options
     filters: Callable[[Any], Sequence[CanFilter]]
+    # Returns the filters for all frames that the device can send, frames of unknown types included. imud uses them
+    # while no sample arrives.
+    sent_by: Callable[[Any], Sequence[CanFilter]]
     node_of: Callable[[int, bool, bytes], int | None]
     """Returns the node number of the device that sends this frame (identifier, whether it has 29 bits, data), or None.
 

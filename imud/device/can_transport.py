@@ -111,6 +111,7 @@ class CanTransport(ReceivingTransport):
         self._node: int | None = None
         self._joined = False
         self._bus_problem = ""  # present problem of the bus; empty if there is none
+        self._is_wide = False  # whether the link passes all frames that the device can send
         self._conflict = ""  # present conflict of two devices with one address; empty without a conflict
         if not self._searchable:
             driver = DRIVERS[self._config.driver]
@@ -200,7 +201,8 @@ class CanTransport(ReceivingTransport):
         assert driver is not None
         assert path is not None
         self._round = None
-        link.filters = driver.filters(self._options)
+        self._is_wide = False
+        self._set_filters(wide=True)
         link.gather_ns = self._latency_ns
         path.clock.restart()
         first = driver.example_frames(Random(0))[0]
@@ -275,8 +277,19 @@ class CanTransport(ReceivingTransport):
     def listen(self, request: Request, filters: Sequence[CanFilter]) -> None:
         """Receive frames of other senders too, while they can answer the request."""
         self._also = filters
-        if self.driver is not None and self._round is None:
-            self.link.filters = (*self.driver.filters(self._options), *filters)
+        if self._round is None:
+            self._set_filters(wide=self._is_wide)
+
+    def _set_filters(self, *, wide: bool) -> None:
+        """Receive the frames of the device. `wide`: also frames of unknown types, to name them."""
+        driver, codec = self.driver, self._codec
+        if driver is None or codec is None:
+            return
+        if wide and not self._is_wide:
+            codec.unknown.clear()
+        self._is_wide = wide
+        passed = driver.sent_by(self._options) if wide else driver.filters(self._options)
+        self.link.filters = (*passed, *self._also)
 
     async def run_script(self, make: Callable[..., Any], *arguments: Any) -> Any:
         """Run a request script. Follow the device if the script changes its number."""
@@ -301,9 +314,15 @@ class CanTransport(ReceivingTransport):
         if self._round is not None:
             self._round.on_frames(frames)
         elif self.path is not None:
-            self.path.on_frames(frames)
+            self.path.on_frames([one for one in frames if not self._is_foreign(one)] if self._is_wide else frames)
         if self._also:
             self._answer(frames)
+
+    def _is_foreign(self, frame: CanFrame) -> bool:
+        """Return whether only another configured device receives a frame."""
+        at, driver = (frame.can_id, frame.extended), self.driver
+        is_own = driver is not None and any(one.matches(*at) for one in driver.filters(self._options))
+        return not is_own and self._buses.claimed(self._config.name, self.link.bus)(*at)
 
     def _answer(self, frames: Sequence[CanFrame]) -> None:
         for frame in frames:
@@ -311,6 +330,8 @@ class CanTransport(ReceivingTransport):
                 self.scripts.on_message(ReplyFrame(frame.can_id, frame.data), frame.t_rx_ns)
 
     def tick(self, now_ns: int) -> None:
+        if self._is_wide and self._round is None and self._health.state is DeviceState.RUNNING:
+            self._set_filters(wide=False)
         self._report_conflict()
 
     def _report_conflict(self) -> None:
@@ -332,9 +353,15 @@ class CanTransport(ReceivingTransport):
         since_ns = health.silent_since_ns if health.state is DeviceState.SILENT else path.begun_ns
         if self._searchable and now_ns - since_ns > SILENT_SEARCH_NS:
             self._search.search_again()
-        if health.state is not DeviceState.SEARCHING or driver is None or now_ns - path.begun_ns <= UNHEARD_NS:
+        if driver is None or self._round is not None or now_ns - since_ns <= UNHEARD_NS:
             return
-        if path.last_data_ns > path.begun_ns:
+        if not self._is_wide:
+            self._set_filters(wide=True)
+        if words := self.unknown_words():
+            health.report(f"on {self.where}: {words}")
+        elif health.state is not DeviceState.SEARCHING:
+            return
+        elif path.last_data_ns > path.begun_ns:
             health.report(f"frames of {driver.name} arrive on {self.where}, but no complete sample")
         else:
             health.report(f"no frame of {driver.name} arrives on {self.where}; check its identifier")

@@ -264,7 +264,7 @@ class Device:
         try:
             self._attachments.tick(self._host.now_ns(), None)
             await self._serve_until_finished()
-            self._health.finished()
+            self._health.finished("" if self.ledger.samples else self._transport.unknown_words())
             self._judge.tick(self._host.now_ns(), self.state, self.status)
         finally:
             self._attachments.close()

@@ -133,9 +133,9 @@ class Health:
         self.state = DeviceState.SEARCHING
         self.problem = self.problem or SEARCH_BEGUN
 
-    def finished(self) -> None:
-        """Enter FINISHED after the end of a replay. A problem of the link stays in the status."""
-        self.state, self.problem = DeviceState.FINISHED, self.link_problem
+    def finished(self, problem: str) -> None:
+        """Enter FINISHED after the end of a replay. `problem`: reason for no sample, after a link problem."""
+        self.state, self.problem = DeviceState.FINISHED, self.link_problem or problem
 
     def up(self, now_ns: int, driver: str, where: str, bit_rate: int) -> None:
         """Enter RUNNING: samples of `driver` arrive on the link `where`."""

@@ -343,9 +343,7 @@ class StreamTransport(ReceivingTransport):
         """Report the received bytes or replies, and search again if a search can find the device."""
         health = self._health
         if self._hears_unknown(now_ns):
-            assert self.driver is not None
-            assert self.path is not None
-            problem = f"on {self.where}: {self.driver.unknown_words(self.path.codec.unknown, self._config.name)}"
+            problem = f"on {self.where}: {self.unknown_words()}"
             self._report_silence(problem, now_ns, ended=health.state is not DeviceState.SILENT)
             return  # the baud rate and the driver are right: no search can find samples
         unheard = self._is_unheard(path)

@@ -238,6 +238,12 @@ class Transport(SettingsPort):
         """Return `status` with the fields of this kind of transport."""
         return status
 
+    def unknown_words(self) -> str:
+        """Describe the received frames of unknown types; empty without such frames."""
+        driver = self.driver
+        unknown = getattr(getattr(self.path, "codec", None), "unknown", {})
+        return driver.unknown_words(unknown, self._config.name) if driver is not None and unknown else ""
+
 
 class ReceivingTransport(Transport, RequestPort):
     """Transport of a device that sends samples without a request, on a serial port or a CAN bus."""

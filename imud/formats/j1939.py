@@ -61,6 +61,16 @@ def sender_of(can_id: int, extended: bool, data: bytes, pgns: Container[int]) ->
     return parts.source if is_one and parts.source <= ADDRESS_MAX else None
 
 
+def all_of(source: int | None) -> CanFilter:
+    """Return the filter for all frames of one node; None: of all nodes."""
+    return CanFilter(source or 0, 0 if source is None else 0xFF, True)
+
+
+def pgn_name(pgn: int) -> str:
+    """Return the readable name of a PGN."""
+    return f"PGN {pgn} (0x{pgn:04X})"
+
+
 def filter_of(pgn: int, source: int | None, destination: int = GLOBAL) -> CanFilter:
     """Return the filter for one PGN with any priority from one node; None: from any node."""
     can_id = join(J1939Id(0, pgn, source or 0, destination))

@@ -64,7 +64,7 @@ def test_a_file_without_a_message_and_none(tmp_path: Path, cli: Cli) -> None:
         (
             encode_frame(b"\x83" + bytes(55)) * 3,
             1,
-            "found valid frames of unknown types (HI83 (tag 0x83)), but no sample; ",
+            "found valid frames of unknown types (HI83 (tag 0x83): 3), but no sample; ",
         ),
         (encode_frame(b"\x83" + bytes(55)) + b"OK\r\n", 1, "`imud settings NAME --set output.hi91=100`"),
         (encode_frame(b"\x83" + bytes(55)) + MANUAL_FRAME, 0, ""),
@@ -78,6 +78,18 @@ def test_a_capture_without_samples_names_its_frames(
     err = cli(*DECODE, tmp_path / "capture", status=status).err
     assert words in err
     assert ("unknown types" in err) == bool(words)
+    if status:
+        assert "types (HI83" in cli("replay", "--driver", DECODE[2], tmp_path / "capture", status=1).err
+
+
+def test_a_log_without_samples_names_its_frames(tmp_path: Path, cli: Cli) -> None:
+    """The number of named types has a limit."""
+    log = tmp_path / "drive.log"
+    log.write_text("".join(f"({one}.0) can0 0CFF{0x60 + one % 12:02X}08#00\n" for one in range(24)))
+    err = cli("decode", "--driver", "hipnuc-j1939", log, status=1).err
+    assert "found valid frames of unknown types (PGN 65376 (0xFF60): 2, " in err
+    assert err.count("PGN 65") == 8
+    assert "types (PGN 65376" in " ".join(cli("replay", "--driver", "hipnuc-j1939", log, status=1).err.split())
 
 
 def test_log_of_a_can_bus(tmp_path: Path, cli: Cli) -> None:

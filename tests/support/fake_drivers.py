@@ -153,6 +153,7 @@ class FakeCanCodec:
 
     def __init__(self, ledger: Ledger, settings: FakeCanSettings) -> None:
         self.ledger = ledger
+        self.unknown: dict[int, int] = {}
         self._can_id = BASE + settings.node
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
@@ -188,6 +189,7 @@ def fake_can_driver(name: str = "fake-can", base: int = BASE) -> CanDriver:
     return CanDriver(
         name=name, title="a fake", settings=FakeCanSettings, make_codec=FakeCanCodec,
         filters=lambda settings: [CanFilter(BASE + settings.node, STANDARD_ID_MAX, False)], tick_ns=SAMPLE_COUNTER,
+        sent_by=lambda settings: [CanFilter(BASE + settings.node, STANDARD_ID_MAX, False)],
         tick_modulus=0xFF, euler_convention="", navigation_frame="",
         node_of=lambda can_id, extended, data: (
             can_id - base if base < can_id <= base + 127 and not extended and len(data) == 8 else None

@@ -24,13 +24,23 @@ from msgspec import Meta
 
 from imud.attitude.conventions import Heading
 from imud.attitude.rotation import euler312_from_quat, quat_from_euler312
-from imud.contracts.codec import BadFrame, BadReason, CodecEvent
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Identity
 from imud.contracts.script import says_nothing
 from imud.drivers.hipnuc.assembly import Assembled, Assembly
 from imud.drivers.hipnuc.common import FLOATS, random_quaternion
 from imud.formats.can import CanFilter, CanFrame
-from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, filter_of, join, sender_of
+from imud.formats.j1939 import (
+    ADDRESS_MAX,
+    WITHOUT_PRIORITY,
+    J1939Id,
+    all_of,
+    filter_of,
+    join,
+    pgn_name,
+    sender_of,
+    split,
+)
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
@@ -168,6 +178,7 @@ class HipnucNmea2000Codec:
         self._wanted_reference = _REFERENCES[settings.heading]
         self._set_sender(self._fixed)
         self._heard_ns = 0
+        self.unknown: dict[int, int] = {}  # number of frames by unknown PGN
 
     @property
     def problem(self) -> str:
@@ -181,6 +192,8 @@ class HipnucNmea2000Codec:
         pgn = _PGNS.get(can_id & WITHOUT_PRIORITY & ~0xFF) if extended else None
         if pgn is None or not self._is_sender(can_id & 0xFF, t_rx_ns):
             ledger.bytes_skipped += size
+            if pgn is None and extended and self._source in (None, can_id & 0xFF):
+                count_unknown(self.unknown, split(can_id).pgn)
             return ()
         if size != MESSAGE_BYTES:
             ledger.bytes_in_bad_frames += size
@@ -261,6 +274,10 @@ def _filters(settings: HipnucNmea2000Options) -> list[CanFilter]:
     return [filter_of(pgn, source) for pgn in PGNS]
 
 
+def _sent_by(settings: HipnucNmea2000Options) -> list[CanFilter]:
+    return [all_of(None if settings.source == "auto" else settings.source)]
+
+
 def _node_of(can_id: int, extended: bool, data: bytes) -> int | None:
     return sender_of(can_id, extended, data, PGNS)
 
@@ -277,6 +294,7 @@ DRIVER: Final = CanDriver(
     settings=HipnucNmea2000Options,
     make_codec=HipnucNmea2000Codec,
     filters=_filters,
+    sent_by=_sent_by,
     tick_ns=SAMPLE_COUNTER,
     tick_modulus=2,
     euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above, "
@@ -290,4 +308,7 @@ DRIVER: Final = CanDriver(
     identify=lambda _settings: says_nothing(Identity()),
     sample_frames=len(PGNS),
     example_frames=_example_frames,
+    unknown_name=pgn_name,
+    decoded=f"imud decodes {', '.join(map(pgn_name, PGNS))}: configure options.source, or enable one of them in the "
+    "device",
 )

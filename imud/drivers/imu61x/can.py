@@ -36,7 +36,7 @@ from msgspec import Meta
 
 from imud.attitude.conventions import FLU_LEVEL
 from imud.attitude.rotation import quat_from_euler_zyx
-from imud.contracts.codec import BadFrame, BadReason, CodecEvent
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Identity, random_vector
 from imud.contracts.script import says_nothing
 from imud.drivers.imu61x.common import (
@@ -123,6 +123,7 @@ class Imu61xCanCodec:
 
     def __init__(self, ledger: Ledger, settings: Imu61xCanOptions) -> None:
         self.ledger = ledger
+        self.unknown: dict[int, int] = {}  # number of frames by standard identifier outside base_id … base_id + 4
         self._slots = {settings.base_id + slot: slot for slot in range(SET_FRAMES)}
         self._held: dict[int, bytes] = {}  # data of 101 … 104 by index, in the order of arrival
         self._newest = -1  # index of the newest held frame
@@ -149,6 +150,8 @@ class Imu61xCanCodec:
         slot = self._slots.get(can_id)
         if slot is None or extended:
             ledger.bytes_skipped += size
+            if not extended:
+                count_unknown(self.unknown, can_id)
             return ()
         if size != FRAME_BYTES:
             ledger.bytes_in_bad_frames += size
@@ -306,6 +309,7 @@ DRIVER: Final = CanDriver(
     settings=Imu61xCanOptions,
     make_codec=Imu61xCanCodec,
     filters=_filters,
+    sent_by=lambda _settings: [CanFilter(0, 0, False)],  # each identifier is a setting of the device
     tick_ns=SAMPLE_COUNTER,
     tick_modulus=INDEX_MODULUS,
     euler_convention=EULER_CONVENTION,
@@ -319,4 +323,6 @@ DRIVER: Final = CanDriver(
     identify=lambda _settings: says_nothing(Identity()),
     sample_frames=SET_FRAMES,
     example_frames=_example_frames,
+    unknown_name=lambda can_id: f"identifier {can_id}",
+    decoded="imud decodes the identifiers base_id to base_id + 4: configure options.base_id of the device",
 )

@@ -25,16 +25,19 @@ from typing import Annotated, Final, Literal
 from msgspec import Meta
 
 from imud.attitude.rotation import quat_from_euler312
-from imud.contracts.codec import BadFrame, BadReason, CodecEvent
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
 from imud.contracts.script import ReplyFrame
 from imud.drivers.hipnuc.assembly import Assembled, Assembly
 from imud.drivers.hipnuc.canopen.cia301 import (
     EMERGENCY,
     HEARTBEAT,
+    NMT,
     NODE_DEFAULT,
+    NODE_MASK,
     NODE_MAX,
     SDO_BYTES,
     SDO_REPLY,
+    SDO_REQUEST,
     TPDO_FUNCTIONS,
     NmtState,
     TpdoNumber,
@@ -58,6 +61,7 @@ EULER_RAD_PER_LSB: Final = 0.01 * RAD_PER_DEG
 INCLI_RAD_PER_LSB: Final = 0.01 * RAD_PER_DEG
 
 SYNC_HZ_MIN, SYNC_HZ_MAX = 0.01, 200.0
+NOT_OF_NODE: Final = (NMT, SDO_REQUEST)  # functions of frames that a node does not send
 
 
 class HipnucCanopenOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -87,6 +91,8 @@ class HipnucCanopenCodec:
         self._sdo_id, self._heartbeat_id, self._emergency_id = SDO_REPLY + node, HEARTBEAT + node, EMERGENCY + node
         self._assembly = Assembly(ledger, None if wanted == "auto" else frozenset(wanted))
         self._state = NmtState.OPERATIONAL.value
+        self._node = node
+        self.unknown: dict[int, int] = {}  # number of frames by unknown identifier of this node
 
     @property
     def problem(self) -> str:
@@ -121,6 +127,8 @@ class HipnucCanopenCodec:
         ledger, size = self.ledger, len(data)
         if extended or can_id not in (self._sdo_id, self._heartbeat_id, self._emergency_id):
             ledger.bytes_skipped += size
+            if not extended and can_id & NODE_MASK == self._node and can_id - self._node not in NOT_OF_NODE:
+                count_unknown(self.unknown, can_id)
             return ()
         if size != (1 if can_id == self._heartbeat_id else SDO_BYTES):
             return self._bad_length(data)

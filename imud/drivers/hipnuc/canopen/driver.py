@@ -342,6 +342,7 @@ DRIVER: Final = CanDriver(
     renamed=RENAMED,
     calibrations=inclinometer_zero("5.4.1", VERBS),
     device_settings=SETTINGS,
+    sent_by=lambda settings: [CanFilter(settings.node, NODE_MASK, False)],
     node_of=_node_of,
     node_settings=lambda node: HipnucCanopenOptions(node=node),
     node_title=lambda node: f"node {node}",
@@ -349,4 +350,8 @@ DRIVER: Final = CanDriver(
     sample_frames=4,
     example_frames=_example_frames,
     cyclic=_cyclic,
+    unknown_name=lambda can_id: f"COB-ID 0x{can_id:03X}",
+    decoded="imud decodes TPDO "
+    + ", ".join(f"{number} (0x{function:03X} + node)" for number, function in TPDO_FUNCTIONS.items())
+    + ": enable one of them in the device",
 )

@@ -19,7 +19,7 @@ from typing import Annotated, Final, Literal
 from msgspec import Meta
 
 from imud.attitude.rotation import quat_from_euler312
-from imud.contracts.codec import BadFrame, BadReason, CodecEvent
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
 from imud.contracts.script import ReplyFrame
 from imud.drivers.hipnuc.assembly import Assembly
 from imud.drivers.hipnuc.common import (
@@ -31,7 +31,7 @@ from imud.drivers.hipnuc.common import (
     TEMPERATURE_C_PER_LSB,
     counts_of,
 )
-from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, join
+from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, join, split
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Quaternion, Vector3
@@ -270,7 +270,9 @@ class HipnucJ1939Codec:
         taken = (UTC, *settings.measured())
         self._pgns = {join(J1939Id(0, pgn, settings.address)): pgn for pgn in taken}
         self._reply_ids = settings.peer.reply_ids()
+        self._address = settings.address
         self._assembly = Assembly(ledger)
+        self.unknown: dict[int, int] = {}  # number of frames by unknown PGN
 
     @property
     def problem(self) -> str:
@@ -285,6 +287,8 @@ class HipnucJ1939Codec:
         pgn = self._pgns.get(key)
         if not extended or (pgn is None and key not in self._reply_ids):
             ledger.bytes_skipped += size
+            if extended and can_id & 0xFF == self._address:
+                count_unknown(self.unknown, split(can_id).pgn)
             return ()
         if size != MESSAGE_BYTES:
             ledger.bytes_in_bad_frames += size

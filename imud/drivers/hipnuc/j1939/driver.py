@@ -33,7 +33,7 @@ from imud.drivers.hipnuc.j1939.commands import (
     Zero,
 )
 from imud.formats.can import CanFilter, CanFrame
-from imud.formats.j1939 import filter_of, sender_of
+from imud.formats.j1939 import all_of, filter_of, pgn_name, sender_of
 
 CONTENT: Final = {
     codec.UTC: "UTC", codec.ACCEL: "acceleration", codec.GYRO: "angular rate", codec.MAG: "magnetic field",
@@ -248,6 +248,7 @@ DRIVER: Final = CanDriver(
     settings=HipnucJ1939Options,
     make_codec=HipnucJ1939Codec,
     filters=_filters,
+    sent_by=lambda settings: [all_of(settings.address)],
     tick_ns=SAMPLE_COUNTER,
     tick_modulus=2,
     euler_convention="312: yaw about Z, then pitch about X, then roll about Y; yaw counter-clockwise from above; "
@@ -264,4 +265,7 @@ DRIVER: Final = CanDriver(
     identify=lambda settings: commands.identify(settings.peer),
     sample_frames=4,
     example_frames=_example_frames,
+    unknown_name=pgn_name,
+    decoded=f"imud decodes {', '.join(f'{pgn:04X}' for pgn in codec.MEASURED)}: enable one of these PGNs in "
+    "the device, or check options.pgns",
 )
