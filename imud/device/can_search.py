@@ -20,6 +20,7 @@ from imud.contracts.codec import CodecEvent
 from imud.contracts.driver import CanDriver
 from imud.device.search import GaveUp, Listen, SearchRound
 from imud.formats.can import CanFilter, CanFrame
+from imud.formats.j1939 import pgn_name, split
 from imud.host.clock import HostClock
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
@@ -102,9 +103,9 @@ class CanSurvey:
         ]
 
     def others(self, claimed: Claimed = none_claimed) -> list[str]:
-        """Return the identifiers without candidate and without configured device, as three or eight digits."""
+        """Return the names of the frames without candidate and without configured device."""
         free = (i for i, trials in self._listeners.items() if not trials and not claimed(*i))
-        return [f"0x{can_id:08X}" if extended else f"0x{can_id:03X}" for can_id, extended in sorted(free)]
+        return [_frame_name(*identifier) for identifier in sorted(free)]
 
     def _look_for_devices(self, frame: CanFrame) -> None:
         for driver in self._drivers:
@@ -190,7 +191,7 @@ class CanSearch:
         if others := survey.others(self._claimed):
             more = f" and {len(others) - SHOWN_MAX} more" if len(others) > SHOWN_MAX else ""
             names = ", ".join(others[:SHOWN_MAX])
-            return f"unknown frames arrive on {where} ({names}{more}); configure driver and options"
+            return f"frames of unknown types arrive on {where} ({names}{more}); configure driver and options"
         if survey.others() or survey.devices() or survey.doubtful():
             return f"only frames of other configured devices arrive on {where}; check the power supply of the device"
         return f"no frame arrives on {where}; check the bit rate, the termination and the power supply of the device"
@@ -229,6 +230,11 @@ class _Trial:
     def has_any(self, claimed: Claimed) -> bool:
         """Return whether a configured device uses a frame of the candidate."""
         return any(claimed(*identifier) for identifier in self.identifiers)
+
+
+def _frame_name(can_id: int, extended: bool) -> str:
+    """Return the PGN and the source of a frame with 29 bits, and the identifier of a frame with 11 bits."""
+    return f"{pgn_name(split(can_id).pgn)} from source {can_id & 0xFF}" if extended else f"0x{can_id:03X}"
 
 
 def _listed(devices: Sequence[CanDevice]) -> str:

@@ -216,7 +216,7 @@ class SamplePath(ABC):
             if self.observer is not None:
                 self.observer.call("path", "flush", now_ns)
         if samples:
-            self._finish(samples, now_ns)
+            self._finish(samples, self.last_data_ns)
 
     def reset(self) -> None:
         """Discard an incomplete frame, and publish an incomplete sample: the link was closed."""

@@ -204,7 +204,7 @@ def test_a_query_where_it_is_allowed(bus: type[Bus]) -> None:
 def test_why_nobody_is_listed(bus: type[Bus]) -> None:
     assert "no frame arrives on can0" in examined()[0].problem
     bus.frames = [CanFrame(0x123, False, b"", 0)]
-    assert "unknown frames arrive on can0 (0x123)" in examined()[0].problem
+    assert "frames of unknown types arrive on can0 (0x123)" in examined()[0].problem
     bus.problem = "can0 is bus-off: x"
     assert examined()[0].problem == "can0 is bus-off: x"
     bus.down = True

@@ -91,7 +91,8 @@ def test_incomplete_samples_extend_the_round_and_are_reported() -> None:
 def test_unknown_frames_and_silence_are_reported() -> None:
     frames = [CanFrame(0x18FEE9AA, True, bytes(8), 0), CanFrame(0x65, True, bytes(8), 0), CanFrame(0x7, False, b"", 0)]
     assert Round().hear(*frames).complaint() == (
-        "unknown frames arrive on can0 (0x007, 0x00000065, 0x18FEE9AA); configure driver and options"
+        "frames of unknown types arrive on can0 (0x007, PGN 0 (0x0000) from source 101, "
+        "PGN 65257 (0xFEE9) from source 170); configure driver and options"
     )
     many = [CanFrame(number, False, b"", 0) for number in range(12)]
     assert "0x007 and 4 more" in Round().hear(*many).complaint()

@@ -292,17 +292,34 @@ async def test_a_silent_device_reports_the_received_frames(bench: CanDeviceBench
     [
         ("hipnuc-j1939", 0x0CFF6008, True, "(PGN 65376 (0xFF60)), but no sample; imud decodes FF34, "),
         ("hipnuc-canopen", 0x508, False, "(COB-ID 0x508), but no sample; imud decodes TPDO 1 "),
-        ("hipnuc-nmea2000", 0x0DF80108, True, "(PGN 129025 (0x1F801)), but no sample; imud decodes PGN 127250 "),
+        ("hipnuc-nmea2000", 0x0DF80123, True, "(PGN 129025 (0x1F801)), but no sample; imud decodes PGN 127250 "),
         ("imu61x-can", 201, False, "(identifier 201), but no sample; imud decodes the identifiers base_id "),
     ],
 )
-def test_frames_of_unknown_types_are_named(driver: str, can_id: int, extended: bool, words: str) -> None:
+@pytest.mark.parametrize("ran", [False, True])
+def test_frames_of_unknown_types_are_named(driver: str, can_id: int, extended: bool, words: str, ran: bool) -> None:
+    """Also if the device has sent samples before. The last incomplete sample does not end the silence."""
     row = DRIVERS[driver]
+    assert isinstance(row, CanDriver)
 
     async def story(bench: CanDeviceBench) -> None:
-        bench.link.feed([CanFrame(can_id, extended, bytes(8), bench.rig.now_ns())])
-        bench.rig.tick(ahead_ns=3000 * MS)
-        assert f"on can0: valid frames of unknown types {words}" in bench.rig.problem
+        rig, begun_ns = bench.rig, bench.rig.now_ns()
+        known = [
+            frame._replace(t_rx_ns=begun_ns + (10 * number + place) * MS)
+            for number in range(20)
+            for place, frame in enumerate(row.example_frames(Random(number)))
+        ]
+        if ran:
+            bench.link.feed(known)
+            rig.tick()
+            rig.tick()
+            assert rig.is_in(DeviceState.RUNNING)
+            assert bench.link.filters == tuple(row.filters(row.settings()))
+        rig.tick(ahead_ns=3000 * MS)
+        rig.tick(ahead_ns=6000 * MS)
+        bench.link.feed([CanFrame(can_id, extended, bytes(8), begun_ns + 3000 * MS)])
+        rig.tick(ahead_ns=6000 * MS)
+        assert f"on can0: valid frames of unknown types {words}" in rig.problem
 
     play(story, configured(driver, row.settings()))
 
