@@ -16,7 +16,8 @@ one instant back to back (a burst), some devices send each kind by its own timer
 - imud counts a lost sample only if the SID or the period of the anchor proves the loss (`SidSeries`, `Cadence`).
 - If many samples lack the anchor, imud selects another anchor.
 
-If each kind arrives twice per period at fixed phases, or if the values alternate, two devices have the same address.
+If each kind arrives twice per period at fixed phases, if the values alternate, or if extra frames of the anchor arrive
+at a period of their own, two devices have the same address.
 """
 
 from collections import deque
@@ -276,6 +277,61 @@ def _add_value(found: Alternation, value: float, least: float) -> None:
         found.add(value, differs=abs(value - found.newest[1]) >= least)
 
 
+EXTRAS: Final = 32  # number of regular extra frames after which two devices have the same address
+# Number of distances that show the usual distance, and maximum number of longer distances, across lost frames
+USUAL_OF, LONGER = 64, 5
+EVEN, REGULAR = 1 / 16, 1 / 8  # maximum deviations of an extra frame from the other device and from its own period
+EXTRAS_END: Final = 4  # number of its periods without an extra frame after which the conflict has ended
+
+
+class ExtraFrames:
+    """Frames of a slower device with the same address, between the frames of a device. Synchronization: one thread."""
+
+    __slots__ = ("_newest", "_previous", "_steps_ns", "_times_ns", "kind", "usual_ns")
+
+    def __init__(self, kind: int | None) -> None:
+        self.kind = kind  # kind of the frames; None: unknown
+        self.usual_ns = 0  # time between two frames of the faster device, ns; 0 if unknown
+        # arrival time and SID of the two newest frames
+        self._previous: tuple[int, int | None] = (0, None)
+        self._newest: tuple[int, int | None] = (0, None)
+        self._steps_ns: list[int] = []
+        self._times_ns: deque[int] = deque(maxlen=EXTRAS)
+
+    @property
+    def period_ns(self) -> int:
+        """Time between two extra frames, ns; 0 if they do not show two devices."""
+        times_ns = self._times_ns
+        if len(times_ns) < EXTRAS:
+            return 0
+        steps_ns = [after - before for before, after in pairwise(times_ns)]
+        counts = [max(round(step_ns / median(steps_ns)), 1) for step_ns in steps_ns]  # an extra frame can be lost
+        period_ns, limit_ns = sum(steps_ns) // sum(counts), REGULAR * self.usual_ns
+        off_ns = max(abs(step_ns - count * period_ns) for step_ns, count in zip(steps_ns, counts, strict=True))
+        has_ended = self._newest[0] - times_ns[-1] > EXTRAS_END * period_ns
+        return 0 if off_ns > limit_ns or has_ended else period_ns
+
+    def add(self, t_ns: int, sid: int | None) -> None:
+        """Add a frame."""
+        (first_ns, first_sid), (middle_ns, middle_sid) = self._previous, self._newest
+        self._previous, self._newest = self._newest, (t_ns, sid)
+        self._steps_ns.append(t_ns - middle_ns)
+        if len(self._steps_ns) == USUAL_OF:
+            self.usual_ns = sorted(self._steps_ns)[-1 - LONGER]
+            self._steps_ns.clear()
+        usual_ns = self.usual_ns
+        if abs(t_ns - first_ns - usual_ns) > EVEN * usual_ns:
+            return
+        is_of_one = (
+            sid is not None
+            and middle_sid is not None
+            and first_sid is not None
+            and (sid - middle_sid == middle_sid - first_sid != 0)
+        )
+        if not is_of_one and min(middle_ns - first_ns, t_ns - middle_ns) > PHASE_LEAST * usual_ns:
+            self._times_ns.append(middle_ns)
+
+
 COPY_NS: Final = 2 * NS_PER_MS  # maximum time from a frame to its copy, ns: a repetition by the bus
 # Number of frames near the anchor, less FAR_WEIGHT for each other frame, from which a kind is near
 NEAR_FRAMES: Final = 4
@@ -398,6 +454,7 @@ class Assembly:
         self._sids = SidSeries()
         self._strays = 0
         self._values = ValueAlternation()
+        self._extras = ExtraFrames(None)  # extra frames of the anchor
         self._incomplete = 0  # number of bursts without the anchor since the newest anchor
 
     @property
@@ -408,7 +465,14 @@ class Assembly:
     @property
     def problem(self) -> str:
         """Address conflict that the frames show, one sentence; empty without a conflict."""
-        if self._anchor is None or self._sids.is_of_one:
+        if self._anchor is None:
+            return ""
+        if extra_ns := self._extras.period_ns:
+            return (
+                f"an extra frame arrives every {extra_ns / NS_PER_MS:.1f} ms between the frames of a device with a "
+                f"period of {self._extras.usual_ns / NS_PER_MS:.1f} ms; do two devices on the bus have this address?"
+            )
+        if self._sids.is_of_one:
             return ""
         own = self._kinds[self._anchor].alternation
         often = [kind.alternation for kind in self._kinds.values() if kind.every == 1]
@@ -509,6 +573,8 @@ class Assembly:
         is_even = 3 * period_ns <= 4 * (t_rx_ns - self._anchor_ns) <= 5 * period_ns
         known.arrive(t_rx_ns, t_rx_ns, period_ns)
         known.every = 1
+        part = self._parts.get(kind)
+        self._extras.add(t_rx_ns, part.sid if part is not None else None)
         self._anchor_ns = t_rx_ns
         for number, one in kinds.items():
             one.anchors += 1
@@ -618,6 +684,8 @@ class Assembly:
         self._anchor = learned.anchor
         self._cadence = Cadence(learned.period_ns, frames[-1][1])
         self._sids = SidSeries()
+        if self._extras.kind != learned.anchor:
+            self._extras = ExtraFrames(learned.anchor)
         self._kinds = {kind: _Kind() for kind, _ in frames}
         self._kinds[learned.anchor].near = NEAR_FRAMES_MAX
         begin = next(place for place, (kind, _) in enumerate(frames) if kind == learned.anchor)

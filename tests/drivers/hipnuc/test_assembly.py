@@ -419,3 +419,31 @@ def test_two_devices_with_one_address_are_reported(phase: float, kinds: dict[int
     assert "each frame arrives twice per period of 5.0 ms, " in assembly.problem
     add(stream(kinds, range(190, 530)))
     assert assembly.problem == ""
+
+
+@pytest.mark.parametrize("every", [1.3, 2, 3.3, 5, 10])
+@pytest.mark.parametrize("phase", [0.15, 0.5, 0.8])
+@pytest.mark.parametrize("kinds", [{1: 1}, EQUAL])
+@pytest.mark.parametrize("sids", [0, 1])
+@pytest.mark.parametrize("begin", [0, 100])
+def test_two_devices_with_one_address_at_different_rates_are_reported(
+    every: float, phase: float, kinds: dict[int, int], sids: int, begin: int
+) -> None:
+    """The SIDs of each device rise by one. The arrival times have a jitter of 0.1 ms."""
+    random = Random(1)
+
+    def add(*sent: list[Frame]) -> None:
+        for frame in sorted((f for one in sent for f in one), key=lambda frame: frame.t_ns):
+            sid = (frame.burst + 77 * len(frame.data)) % 253 if sids else None
+            assembly.add_frame(frame.kind, frame.data, frame.t_ns + random.randrange(100_000), sid)
+
+    def slow(bursts: int) -> list[Frame]:
+        delay_ns = round((begin + phase) * PERIOD_NS)
+        made = stream(kinds, range(bursts), round(every * PERIOD_NS * 1.0001))
+        return [f._replace(t_ns=f.t_ns + delay_ns, data=b"\0\0\0\1" + f.data) for f in made]
+
+    assembly = Assembly(Ledger())
+    add(stream(kinds, range(700)), slow(int((699 - begin) / every)))
+    assert f"an extra frame arrives every {every * 5:.1f} ms between " in assembly.problem
+    add(stream(kinds, range(710, 1100)))
+    assert assembly.problem == ""
