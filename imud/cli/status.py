@@ -82,7 +82,8 @@ def block(status: DeviceStatus, without_times: str = "", *, virtual: bool = Fals
             "samples",
             f"{ledger['samples']}; lost {lost(ledger)} (device {ledger['lost_gap_device']}, damaged "
             f"{ledger['lost_crc']}, overrun {ledger['lost_overrun']}, queue {ledger['lost_queue']}), "
-            f"{ledger['lost_unknown']} gaps of unknown size",
+            f"{ledger['lost_unknown']} gaps of unknown size"
+            + (f"; {frames} lost CAN frames" if (frames := ledger.get("frames_lost", 0)) else ""),
         ),
         (
             "bytes",

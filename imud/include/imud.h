@@ -115,7 +115,8 @@ enum {
     IMUD_LEDGER_REPLIES_LATE,
     IMUD_LEDGER_REPLIES_UNSOLICITED,
     IMUD_LEDGER_FRAMES_NOT_FINITE,
-    IMUD_LEDGER_LOST_UNKNOWN
+    IMUD_LEDGER_LOST_UNKNOWN,
+    IMUD_LEDGER_FRAMES_LOST
 };
 
 /* One sample: a slot of the ring, and a record of the socket's binary encoding. */

@@ -34,6 +34,7 @@ LEDGER_FIELDS: Final = (
     "replies_unsolicited",  # text without a request
     "frames_not_finite",  # valid frames from which imud removed NaN, infinite or physically impossible values
     "lost_unknown",  # gaps with an unknown number of lost samples
+    "frames_lost",  # CAN frames that did not arrive, according to the SID or the period of their kind
 )
 
 
@@ -65,6 +66,7 @@ class Ledger:
     replies_unsolicited: int
     frames_not_finite: int
     lost_unknown: int
+    frames_lost: int
 
     def __init__(self) -> None:
         for name in LEDGER_FIELDS:

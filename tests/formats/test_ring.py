@@ -26,7 +26,7 @@ LEDGER = {name: 100 + i for i, name in enumerate(LEDGER_FIELDS)}
 
 GOLDEN = (
     b"imudshm\0"
-    + bytes.fromhex("01000000 01000000 00100000 00010000 00100000 17000000")  # 1, 1, 4096, 256, 4096, 23 counters
+    + bytes.fromhex("01000000 01000000 00100000 00010000 00100000 18000000")  # 1, 1, 4096, 256, 4096, 24 counters
     + bytes.fromhex("0807060504030201 67120000 01000000 03000000")
     + bytes(12)
     + b"front-imu".ljust(64, b"\0")

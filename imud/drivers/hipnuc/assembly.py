@@ -14,6 +14,7 @@ one instant back to back (a burst), some devices send each kind by its own timer
 - If the SIDs of two kinds agree, the SID decides in place of the time.
 - Until the anchor is known (LEARNING_STEPS periods), a sample ends when a kind arrives again, before the longest pause.
 - imud counts a lost sample only if the SID or the period of the anchor proves the loss (`SidSeries`, `Cadence`).
+- imud counts a lost frame of any kind only if the SID or the period of this kind proves the loss (`KindLosses`).
 - If many samples lack the anchor, imud selects another anchor.
 
 If each kind arrives twice per period at fixed phases, if the values alternate, or if extra frames of the anchor arrive
@@ -219,6 +220,50 @@ class SidSeries:
         return None
 
 
+def fits_time(missing: int, steps: int, *, is_instant: bool) -> bool:
+    """Return whether this number of SIDs can be missing in `steps` periods.
+
+    `is_instant`: the SID numbers the bursts, not the frames.
+    """
+    if not missing:
+        return True
+    # SIDs of a counter that other messages share rise without a gap in time, as the SIDs of late bursts
+    return missing <= steps + LATE_BURSTS if is_instant else abs(steps - 1 - missing) <= missing // 8
+
+
+class KindLosses:
+    """Lost frames of one kind, according to its own SID and period. Synchronization: one thread."""
+
+    __slots__ = ("_cadence", "_learning", "_sids")
+
+    def __init__(self) -> None:
+        self._learning: list[tuple[int, int]] = []
+        self._cadence: Cadence | None = None  # None: the period is unknown
+        self._sids = SidSeries()
+
+    def add(self, t_ns: int, sid: int | None) -> int:
+        """Add a frame. Return the number of lost frames that are now proven."""
+        cadence = self._cadence
+        if cadence is None:
+            self._sids.add(sid, is_next=False)
+            self._learning.append((0, t_ns))
+            learned = learned_from(self._learning)
+            if learned is not None:
+                self._cadence = Cadence(learned.period_ns, t_ns)
+                self._learning.clear()
+            return 0
+        steps = cadence.steps_to(t_ns)
+        missing = self._sids.add(sid, is_next=steps == 1)
+        # after a longer time, whole turns can be missing
+        if missing is None or steps >= SID_MODULUS_LEAST // 2 or not fits_time(missing, steps, is_instant=False):
+            return cadence.begin(t_ns)[0]
+        if missing or steps != 1:
+            cadence.rebase(t_ns)
+        else:
+            cadence.begin(t_ns)
+        return missing
+
+
 # Number of alternating distances, and of alternating values, after which two devices have the same address
 DISTANCES, VALUES = 64, 256
 PHASE_LEAST: Final = 0.1  # Minimum phase of the second device, in periods. A gateway can send two frames back to back.
@@ -352,8 +397,8 @@ class _Kind:
     """State of one kind of frame."""
 
     __slots__ = (
-        "agree", "alternation", "anchors", "behind_ns", "every", "leads", "missed", "near", "run", "seen_ns", "step",
-        "step_ns",
+        "agree", "alternation", "anchors", "behind_ns", "every", "leads", "losses", "missed", "near", "run", "seen_ns",
+        "step", "step_ns",
     )  # fmt: skip
 
     def __init__(self) -> None:
@@ -369,6 +414,7 @@ class _Kind:
         self.missed = 0  # number of samples that waited for this kind in vain since its newest frame
         self.behind_ns = 0  # delay that short distances may still make up for, ns
         self.alternation = Alternation(DISTANCES)
+        self.losses = KindLosses()
 
     @property
     def is_near(self) -> bool:
@@ -566,6 +612,9 @@ class Assembly:
         known = kinds.get(kind)
         if known is None:
             known = kinds[kind] = _Kind()
+        part = self._parts.get(kind)
+        sid = part.sid if part is not None else None
+        self._ledger.frames_lost += known.losses.add(t_rx_ns, sid)
         if kind != self._anchor:
             known.arrive(t_rx_ns, self._anchor_ns, period_ns)
             self._due.discard(kind)
@@ -573,8 +622,7 @@ class Assembly:
         is_even = 3 * period_ns <= 4 * (t_rx_ns - self._anchor_ns) <= 5 * period_ns
         known.arrive(t_rx_ns, t_rx_ns, period_ns)
         known.every = 1
-        part = self._parts.get(kind)
-        self._extras.add(t_rx_ns, part.sid if part is not None else None)
+        self._extras.add(t_rx_ns, sid)
         self._anchor_ns = t_rx_ns
         for number, one in kinds.items():
             one.anchors += 1
@@ -632,19 +680,12 @@ class Assembly:
             missing = max(missing - self._incomplete, 0)
         self._incomplete = 0
         # after a longer time, whole turns can be missing
-        if missing is not None and steps < SID_MODULUS_LEAST // 2 and self._fits_time(missing, steps, is_instant):
+        if missing is not None and steps < SID_MODULUS_LEAST // 2 and fits_time(missing, steps, is_instant=is_instant):
             self._ledger.lost_gap_device += missing
             if missing or steps != 1:
                 cadence.rebase(t_ns)
                 return
         self._count_by_period(t_ns)
-
-    def _fits_time(self, missing: int, steps: int, is_instant: bool) -> bool:
-        """Return whether this number of SIDs can be missing in `steps` periods."""
-        if not missing:
-            return True
-        # SIDs of a counter that other messages share rise without a gap in time, as the SIDs of late bursts
-        return missing <= steps + LATE_BURSTS if is_instant else abs(steps - 1 - missing) <= missing // 8
 
     def _count_by_period(self, t_ns: int) -> None:
         before_ns = self._cadence.period_ns

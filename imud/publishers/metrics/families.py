@@ -216,6 +216,10 @@ DEVICE_FAMILIES: Final = (
                    not_finite="frames_not_finite"),
     ),
     _counter("imud_unknown_tags_total", "Sub-packets of good frames with an unknown tag.", _ledger("unknown_tags")),
+    _counter(
+        "imud_frames_lost_total", "CAN frames that did not arrive, by the SID or the period of their kind.",
+        _ledger("frames_lost"),
+    ),
     _gauge(
         "imud_ledger_unaccounted_bytes", "Received bytes minus the bytes in the ledger; 0 unless imud has a bug.",
         LEDGER.one(bytes_open), BYTES,

@@ -91,6 +91,7 @@ LEDGER_LINES = {
     "frames_bad_length": ("imud_frames_bad_total", {"reason": "length"}),
     "frames_bad_content": ("imud_frames_bad_total", {"reason": "content"}),
     "frames_not_finite": ("imud_frames_bad_total", {"reason": "not_finite"}),
+    "frames_lost": ("imud_frames_lost_total", {}),
     "unknown_tags": ("imud_unknown_tags_total", {}),
     "samples": ("imud_samples_total", {}),
     "lost_gap_device": ("imud_samples_lost_total", {"cause": "gap_device"}),
