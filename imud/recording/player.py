@@ -368,7 +368,9 @@ def _check(device: PlayedDevice, live: CheckRecord) -> None:
         theirs = (live.seq, live.sample_t_ns, live.sample_t_err_ns)
         found = {name: (a, b) for name, a, b in zip(names, theirs, own, strict=True) if a != b}
     found |= {
-        name: (live.ledger[name], here) for name, here in ledger.snapshot().items() if live.ledger.get(name) != here
+        name: (live.ledger[name], here)
+        for name, here in ledger.snapshot().items()
+        if live.ledger.get(name, here) != here  # an older imud did not have the counter
     }
     if found:
         words = ", ".join(f"{name} recorded {a}, replayed {b}" for name, (a, b) in found.items())

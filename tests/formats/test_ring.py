@@ -71,7 +71,7 @@ def test_another_version_and_impossible_counts_are_refused(name: str, value: int
 
 def test_ledger_block_also_of_a_writer_with_other_counters() -> None:
     body = struct.pack("<Q", 6) + b"hipnuc-uart".ljust(32, b"\0")
-    body += b"".join(struct.pack("<Q", 100 + i) for i in range(23)) + bytes(8 * (LEDGER_ROOM - 23))
+    body += b"".join(struct.pack("<Q", 100 + i) for i in range(24)) + bytes(8 * (LEDGER_ROOM - 24))
     expected = body + zlib.crc32(body).to_bytes(4, "little")
     assert encode_ledger_block(6, "hipnuc-uart", tuple(LEDGER.values())) == expected
     assert len(expected) == LEDGER_BLOCK_BYTES
