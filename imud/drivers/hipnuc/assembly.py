@@ -354,7 +354,9 @@ class ExtraFrames:
         period_ns, limit_ns = sum(steps_ns) // sum(counts), REGULAR * self.usual_ns
         off_ns = max(abs(step_ns - count * period_ns) for step_ns, count in zip(steps_ns, counts, strict=True))
         has_ended = self._newest[0] - times_ns[-1] > EXTRAS_END * period_ns
-        return 0 if off_ns > limit_ns or has_ended else period_ns
+        # after many lost frames, the usual distance is several periods of one device
+        is_faster = period_ns < (1 - REGULAR) * self.usual_ns
+        return 0 if off_ns > limit_ns or has_ended or is_faster else period_ns
 
     def add(self, t_ns: int, sid: int | None) -> None:
         """Add a frame."""
@@ -362,8 +364,10 @@ class ExtraFrames:
         self._previous, self._newest = self._newest, (t_ns, sid)
         self._steps_ns.append(t_ns - middle_ns)
         if len(self._steps_ns) == USUAL_OF:
-            self.usual_ns = sorted(self._steps_ns)[-1 - LONGER]
+            before_ns, self.usual_ns = self.usual_ns, sorted(self._steps_ns)[-1 - LONGER]
             self._steps_ns.clear()
+            if abs(self.usual_ns - before_ns) > EVEN * before_ns:
+                self._times_ns.clear()
         usual_ns = self.usual_ns
         if abs(t_ns - first_ns - usual_ns) > EVEN * usual_ns:
             return

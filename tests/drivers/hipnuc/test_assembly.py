@@ -345,6 +345,16 @@ def test_frames_reach_one_sample_each_under_any_loss(seed: int, kinds: dict[int,
     assert rig.ledger.lost() <= 1.25 * lost + 3 * (rate > 0)
 
 
+@pytest.mark.parametrize("kinds", [{1: 1}, EQUAL, MIXED])
+@pytest.mark.parametrize("rate", [0.05, 0.1, 0.2, 0.4])
+def test_lost_frames_are_not_a_second_device(kinds: dict[int, int], rate: float) -> None:
+    random, assembly = Random(3), Assembly(Ledger())
+    for frame in stream(kinds, range(2000)):
+        if random.random() > rate:
+            assembly.add_frame(frame.kind, frame.data, frame.t_ns + random.randrange(100_000))
+            assert assembly.problem == ""
+
+
 @given(seed=st.integers(0, 2**32))
 def test_any_frames_at_any_time_keep_the_ledger_closed(seed: int) -> None:
     random = Random(seed)
