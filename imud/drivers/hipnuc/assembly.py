@@ -709,7 +709,7 @@ class Assembly:
         while kind in self._parts:
             times = [*(one.t_ns for one in self._parts.values()), part.t_ns]
             pauses = [after - before for before, after in pairwise(times)]
-            cut = 1 + next(place for place, pause_ns in enumerate(pauses) if 4 * pause_ns >= 3 * max(pauses))
+            cut = 1 + next((place for place, pause_ns in enumerate(pauses) if 4 * pause_ns >= 3 * max(pauses)), 0)
             parts = list(self._parts.items())
             self._parts = dict(parts[:cut])
             done.append(self._take())

@@ -362,7 +362,7 @@ def test_any_frames_at_any_time_keep_the_ledger_closed(seed: int) -> None:
     assembly = Assembly(ledger)
     t_ns = 0
     for _ in range(600):
-        t_ns += random.choice((0, 1000, FRAME_NS, PERIOD_NS, 10**9))
+        t_ns += random.choice((-1, 0, 1000, FRAME_NS, PERIOD_NS, 10**9))
         ledger.frames_good += 1
         sid = random.choice((None, 0, 1, 2, 250))
         assembly.add_frame(random.choice((1, 2, 2, 3, 6)), random.choice((b"a", b"b")), t_ns, sid)
