@@ -104,7 +104,8 @@ class Cadence:
         step_ns, period_ns = t_ns - self._newest_ns, self.period_ns
         late_ns = t_ns - self._due_ns - period_ns
         self._newest_ns = t_ns
-        if self._add_odd(step_ns, late_ns):
+        is_punctual = 3 * period_ns <= 4 * step_ns <= 5 * period_ns
+        if (self._odd_ns or not is_punctual) and self._add_odd(step_ns, late_ns):
             self.rebase(t_ns)
             return 0, False
         if 2 * late_ns < -period_ns:  # another burst of the same period
@@ -112,7 +113,8 @@ class Cadence:
         self._due_ns += period_ns
         least_ns = min(self._usual_ns, default=0)
         if 2 * (late_ns - least_ns) < period_ns:
-            self._close_gap()
+            if self._room or self._late_ns:
+                self._close_gap()
             self._usual_ns.append(late_ns)
             self._due_ns += late_ns // PHASE_SHARE
             self.period_ns = max(period_ns + late_ns // PERIOD_SHARE, PERIOD_LEAST_NS)
@@ -247,11 +249,13 @@ class KindLosses:
         if cadence is None:
             self._sids.add(sid, is_next=False)
             self._learning.append((0, t_ns))
-            learned = learned_from(self._learning)
+            learned = learned_from(self._learning) if len(self._learning) > LEARNING_STEPS else None
             if learned is not None:
                 self._cadence = Cadence(learned.period_ns, t_ns)
                 self._learning.clear()
             return 0
+        if sid is None:
+            return cadence.begin(t_ns)[0]
         steps = cadence.steps_to(t_ns)
         missing = self._sids.add(sid, is_next=steps == 1)
         # after a longer time, whole turns can be missing
