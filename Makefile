@@ -52,11 +52,16 @@ $(VENV)/made: $(VENV)/made-runtime
 	$(PIP) install --editable '.[dev]'
 	@touch $@
 
+# The optional kernel in C. Without a compiler, the tests use only the Python code.
+KERNEL := imud/_kernel.abi3.so
+$(KERNEL): imud/_kernel.c hatch_build.py $(VENV)/made-runtime
+	-$(BIN)/python hatch_build.py
+
 demo: $(VENV)/made-runtime
 	$(BIN)/imud demo $(ARGS)
 
 # Most `live` tests wait for a process, so that four processes use two cores. One folder: ARGS=tests/links PROCESSES=0
-test: $(VENV)/made
+test: $(VENV)/made $(KERNEL)
 	$(BIN)/pytest -n $(PROCESSES) --dist worksteal -m "not thorough" $(ARGS)
 
 # Every test in the repository and the long form of every check, about four hours. As root, with the packages of all `-deps`.

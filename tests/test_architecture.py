@@ -502,6 +502,7 @@ TESTED_IN = {
     "imud.drivers.hipnuc.j1939.driver": "drivers/test_every_can_driver.py",
     "imud.drivers.polled_frames": "drivers/test_every_polled_driver.py",
     "imud.fleet.settings": "fleet/test_publisher.py", "imud.formats.jsonrpc": "publishers/socket/test_methods.py",
+    "imud.formats.kernel": "sampling/test_path_kernel.py",
     "imud.publishers.metrics.metric": "publishers/metrics/test_families.py",
     "imud.sim.ports.in_process_bus": "links/test_spi.py", "imud.web.messages": "web/test_hub.py",
 }  # fmt: skip

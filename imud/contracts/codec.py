@@ -1,9 +1,9 @@
 """Contract of a codec: bytes to events, without I/O. Invalid bytes become `BadFrame`, never an exception."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import msgspec
 
@@ -50,6 +50,29 @@ def count_unknown(counts: dict[int, int], frame_type: int) -> None:
     """Count a valid frame of an unknown type. Ignore further types above UNKNOWN_TYPES_MAX."""
     if frame_type in counts or len(counts) < UNKNOWN_TYPES_MAX:
         counts[frame_type] = counts.get(frame_type, 0) + 1
+
+
+class UsualFrames(NamedTuple):
+    """Complete frames that the kernel can decode, at the start of the bytes of a stream."""
+
+    data: bytes  # the frames and all received bytes after them
+    frames: int  # number of frames
+    word_is_status: bool  # as in the codec
+    stamp: Callable[..., Any]  # function of the kernel that makes slots of the frames (`stamp_hi91`)
+
+
+@runtime_checkable
+class KernelCodec(Protocol):
+    """Codec of frames that the kernel decodes. `imud.drivers` implements it, and the sample path may not import it."""
+
+    def usual_frames(self, data: bytes) -> UsualFrames | None:
+        """Return the frames at the start of the next bytes `data` of the stream; None if the first event needs `feed`.
+        This method changes nothing."""
+        ...
+
+    def take(self, frames: UsualFrames, count: int, data: bytes) -> bytes:
+        """Count `count` of the frames, at least one, as samples. Return the end of `data` that `feed` must decode."""
+        ...
 
 
 class StreamCodec(Protocol):

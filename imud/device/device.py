@@ -54,7 +54,8 @@ from imud.model.options import Options
 from imud.model.options import shown as json_words
 from imud.model.units import NS_PER_MS, NS_PER_S, RAD_PER_DEG
 from imud.recording.observer import ClockObserver, PathObserver
-from imud.sampling.path import LatencyMeter, RateMeter, SamplePath
+from imud.sampling.meters import LatencyMeter, RateMeter
+from imud.sampling.path import SamplePath
 
 log = logging.getLogger(__name__)
 

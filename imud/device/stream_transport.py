@@ -28,7 +28,6 @@ from imud.host.event_loop import Alarm
 from imud.model.errors import CommandError
 from imud.model.event import EventKind
 from imud.model.ledger import Ledger
-from imud.model.sample import Sync
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 from imud.sampling.path import SamplePath, StreamPath
 
@@ -71,7 +70,7 @@ class StreamHold:
             path.on_data(data, t_rx_ns)
         elif not path.gather(data, t_rx_ns):
             return
-        elif path.gathered[-1].sync is not Sync.REGRESSION:
+        elif not path.held_by_fit:
             self.hold_ns = 0
             path.publish_gathered()
         else:
@@ -108,7 +107,7 @@ class StreamHold:
             path.gather(data, now_ns, waited_ns)
             most_ns = min(most_ns, link.waiting_bytes * waited_ns // len(data))
         self._most_ns = min(max(most_ns, 1), MOST_NS)
-        by_fit = bool(path.gathered) and path.gathered[-1].sync is Sync.REGRESSION
+        by_fit = path.held_by_fit
         path.publish_gathered()
         hold_ns = self._allowed_ns()
         if data and by_fit and hold_ns and now_ns + hold_ns <= self._watch_ns:

@@ -111,7 +111,7 @@ _SEQ = struct.Struct("<Q")
 _T_NS = struct.Struct("<8xq240x")
 _STATUS = struct.Struct("<56xI196x")
 _SYNC_OFFSET: Final = next(field.offset for field in SLOT_FIELDS if field.name == "sync")
-_U16_MAX: Final = 0xFFFF
+DEVICE_ID_MOST: Final = 0xFFFF  # maximum number of a device in a slot
 _U32_MAX: Final = 0xFFFF_FFFF
 _U64_MAX: Final = 0xFFFF_FFFF_FFFF_FFFF
 _I64_MIN: Final = -(1 << 63)
@@ -138,7 +138,7 @@ def encode_slot(sample: Sample, device_id: int) -> bytes:
     try:
         return _encode(sample, device_id)
     except struct.error:
-        return _encode(_fitted(sample), device_id & _U16_MAX)
+        return _encode(_fitted(sample), device_id & DEVICE_ID_MOST)
 
 
 def _encode(sample: Sample, device_id: int) -> bytes:

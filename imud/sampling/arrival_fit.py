@@ -104,9 +104,10 @@ class ArrivalFit:
 
     __slots__ = (
         "_begin_ns", "_bins", "_hull", "_hull_bins", "_open", "_pause_count", "_pause_ns", "_slope_known",
-        "_slope_known_error", "_wait_most", "_width_ns", "count", "error_ns", "fitted_ns", "hidden_ns", "hold_ns",
+        "_slope_known_error", "_width_ns", "count", "error_ns", "fitted_ns", "hidden_ns", "hold_ns",
         "measured_hold_ns", "recent_ns", "ref_arrival_ns", "ref_device_ns", "residual_ns", "shift_ns", "slope",
         "slope_error", "until_ns",
+        "wait_most",
     )  # fmt: skip
 
     def __init__(
@@ -131,7 +132,7 @@ class ArrivalFit:
         self.shift_ns = hold_ns / 2  # distance from the fit down to the middle of the feasible lines, ns
         # measured period of the timer, ns, if most frames wait for longer than `hold_ns`; else 0
         self.measured_hold_ns = 0
-        self._wait_most = float(hold_ns + LATENCIES_NS[0])
+        self.wait_most = float(hold_ns + LATENCIES_NS[0])
         self._pause_ns = float(hold_ns)
         self._pause_count = 1
         self._width_ns = 0
@@ -162,9 +163,9 @@ class ArrivalFit:
         self.count += 1
         wait = above_ns + trailing_ns
         late_ns = 0.0
-        if wait > self._wait_most:
-            late_ns = wait - self._wait_most
-            wait = self._wait_most  # the truth is below the fit: the timer alone cannot cause this wait
+        if wait > self.wait_most:
+            late_ns = wait - self.wait_most
+            wait = self.wait_most  # the truth is below the fit: the timer alone cannot cause this wait
         if device_ns >= self.until_ns:
             bin_ = _Bin(device_ns, arrival_ns, above_ns, wait)
             self._bins.append(bin_)
@@ -191,6 +192,19 @@ class ArrivalFit:
             bin_.device_ns = device_ns
             bin_.arrival_ns = arrival_ns
         return False
+
+    def open_bin(self) -> tuple[int, int, float, float, float, float, int, int, float]:
+        """Return the state of the newest bin, which the kernel changes."""
+        b = self._open
+        return (
+            b.device_ns, b.arrival_ns, b.lowest, b.wait, b.wait_least, b.wait_most, b.count, b.late, b.late_ns,
+        )  # fmt: skip
+
+    def set_open_bin(self, state: tuple[int, int, float, float, float, float, int, int, float], added: int) -> None:
+        """Set the state of the newest bin after `added` arrivals, none of which changes the fit."""
+        b = self._open
+        b.device_ns, b.arrival_ns, b.lowest, b.wait, b.wait_least, b.wait_most, b.count, b.late, b.late_ns = state
+        self.count += added
 
     def _make_room(self) -> None:
         """Drop the oldest bin. If the bins are short, merge pairs of bins instead."""
@@ -268,7 +282,7 @@ class ArrivalFit:
             longest = b.longest_wait() - held if b.late_ns <= hold * b.count else none
             least = b.lowest - pause if b.count - b.late >= enough else none
             floor = max(longest, least)
-            floors.append(floor if floor <= self._wait_most else none)
+            floors.append(floor if floor <= self.wait_most else none)
         # a bin above its two neighbors on both sides was stalled: use the bound of the neighbors
         padded = [-inf, -inf, *floors, -inf, -inf]
         return [min(f, max(padded[i : i + 2] + padded[i + 3 : i + 5])) for i, f in enumerate(floors)]

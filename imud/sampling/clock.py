@@ -22,6 +22,7 @@ from functools import partial
 from math import hypot
 from typing import Final, NamedTuple
 
+from imud.contracts.codec import UsualFrames
 from imud.contracts.lines import (
     NO_TIME_BITS,
     Edge,
@@ -34,6 +35,7 @@ from imud.contracts.lines import (
 )
 from imud.contracts.observer import InputObserver
 from imud.contracts.status import ClockStatus
+from imud.formats.slot import SLOT_BYTES, SYNC_CODES
 from imud.host.clock import UNSTEERED, SteadyTime
 from imud.model.sample import T_ERR_MOST, Measurement, Sample, Sync
 from imud.model.units import NS_PER_S
@@ -128,6 +130,7 @@ YOUNG_NS: Final = 32 * NS_PER_S
 # Factor for the error of a fit that is shorter than YOUNG_NS. The beat of the latency timer is not visible yet.
 YOUNG_FACTOR: Final = 1.2
 _ARRIVAL: Final = Sync.ARRIVAL
+_KERNEL_MODULUS: Final = 1 << 32  # the kernel supports only this modulus of the device counter
 
 
 class SampleClock:
@@ -257,6 +260,54 @@ class SampleClock:
             self._seq, self._t_ns, self._t_rx_ns = newest.seq, newest.t_ns, newest.t_rx_ns
             self._t_err_ns, self._error_ns, self.missed = newest.t_err_ns, error_ns, 0
         return at + len(samples) - before
+
+    @property
+    def t_rx_ns(self) -> int:
+        """CLOCK_MONOTONIC at the read of the newest sample."""
+        return self._t_rx_ns
+
+    @property
+    def is_even(self) -> bool:
+        """Return whether the kernel can time-stamp the next frames: the fit is in use, and nothing changes it."""
+        time = self._time
+        return (
+            self._fit_sync is not _ARRIVAL and self._aiding is None and not time.watched and not time.rephased
+            and not self._jump.late_reads and not self._slew.left_ns and time.modulus == _KERNEL_MODULUS
+        )  # fmt: skip
+
+    def stamp_frames(self, frames: UsualFrames, device_id: int, t_rx_ns: int, utc_offset_ns: int) -> bytes:
+        """Return the slots of frames while `is_even`, as `add_run`; empty if the first frame needs `sample`."""
+        time, fit, host = self._time, self._fit, self._host
+        assert fit is not None
+        t_rx_ns = max(t_rx_ns, self._t_rx_ns)
+        own = -1 if self._own_status is None else self._own_status
+        try:
+            made = frames.stamp(
+                frames.data, frames.frames, frames.word_is_status, device_id,
+                (
+                    SYNC_CODES[self._fit_sync], own, self._seq, self._t_ns, t_rx_ns, self._delay.byte_ns or 1,
+                    self.waited_ns, self._fit_bias_ns, self._fit_error_ns, utc_offset_ns, host.offset_ns,
+                    host.even_from_ns,
+                ),
+                (
+                    time.ticks, time.even_ns, time.raw_ns, time.tick_ns, time.period.period_ticks, time.doubt_ns,
+                    fit.ref_arrival_ns, fit.ref_device_ns, fit.fitted_ns, fit.until_ns, fit.slope, fit.slope_error,
+                    fit.wait_most,
+                ),
+                fit.open_bin(),
+            )  # fmt: skip
+        except OverflowError:  # a value with more than 64 bits, for example after many jumps of the counter
+            return b""
+        if made is None:
+            return b""
+        slots: bytes
+        slots, ticks, self._t_ns, error_ns, open_bin, added = made
+        count = len(slots) // SLOT_BYTES
+        time.advance_evenly(ticks, count)
+        fit.set_open_bin(open_bin, added)
+        self._seq, self._t_rx_ns, self._error_ns, self.missed = self._seq + count, t_rx_ns, error_ns, 0
+        self._t_err_ns = int(error_ns) + 1 if error_ns < _T_ERR_MOST else T_ERR_MOST
+        return slots
 
     def sample_polled(
         self, m: Measurement, t_ns: int, t_err_ns: int, t_rx_ns: int, utc_offset_ns: int, edge_seq: int | None = None

@@ -5,7 +5,6 @@ call of the clock and one record. Counters are plain integers. Synchronization: 
 """
 
 from abc import ABC, abstractmethod
-from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,104 +12,33 @@ from math import hypot, sqrt
 from typing import ClassVar, Final, NamedTuple, Protocol
 
 from imud.attitude.published import PublishedAxes
-from imud.contracts.codec import BadFrame, BadReason, CanCodec, CodecEvent, PolledCodec, Reading, StreamCodec, Vanished
+from imud.contracts.codec import (
+    BadFrame,
+    BadReason,
+    CanCodec,
+    CodecEvent,
+    KernelCodec,
+    PolledCodec,
+    Reading,
+    StreamCodec,
+    Vanished,
+)
 from imud.contracts.driver import Driver
 from imud.contracts.lines import DeviceLines, Edge, ReadyOptions
 from imud.contracts.observer import InputObserver
 from imud.contracts.publisher import AS_SENT, Batch
 from imud.contracts.script import Message, ReplyFrame, TextLine
-from imud.contracts.status import LATENCY_BOUNDS_NS
 from imud.formats.can import CanFrame
+from imud.formats.slot import DEVICE_ID_MOST, SLOT_BYTES, decode_slots, slot_status_bits, slot_times_ns
 from imud.host.clock import UNSTEERED, HostClock, SteadyTime
 from imud.model.errors import Trouble
 from imud.model.ledger import Ledger
-from imud.model.sample import Measurement, Sample
+from imud.model.sample import Measurement, Sample, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from imud.sampling.clock import SampleClock
 from imud.sampling.gaps import GAP_PERIODS
+from imud.sampling.meters import LatencyMeter, LossMeter
 from imud.sampling.steering import STAMP_FLOOR_NS
-
-# window of the sample rate, ns: long enough for devices with 1 Hz, short enough to show a stall
-RATE_WINDOW_NS = 2 * NS_PER_S
-
-
-class RateMeter:
-    """Sample rate over the last `RATE_WINDOW_NS`. The device adds the sample count at each tick."""
-
-    def __init__(self) -> None:
-        self._marks: deque[tuple[int, int]] = deque()
-
-    def mark(self, now_ns: int, count: int) -> None:
-        """Add the sample count at `now_ns`."""
-        marks = self._marks
-        marks.append((now_ns, count))
-        while len(marks) > 2 and marks[1][0] <= now_ns - RATE_WINDOW_NS:  # keep one mark before the window
-            marks.popleft()
-
-    def rate_hz(self) -> float:
-        """Return the samples per second between the oldest and the newest count; 0.0 without two counts."""
-        if len(self._marks) < 2:
-            return 0.0
-        (t0_ns, n0), (t1_ns, n1) = self._marks[0], self._marks[-1]
-        return (n1 - n0) * NS_PER_S / (t1_ns - t0_ns) if t1_ns > t0_ns else 0.0
-
-
-class LatencyMeter:
-    """Histogram of the time from a measurement to its publication."""
-
-    __slots__ = ("buckets", "sum_ns")
-
-    def __init__(self) -> None:
-        self.buckets = [0] * (len(LATENCY_BOUNDS_NS) + 1)
-        self.sum_ns = 0
-
-    def add_one(self, latency_ns: int) -> None:
-        """Count a sample."""
-        self.buckets[bisect_left(LATENCY_BOUNDS_NS, latency_ns)] += 1
-        self.sum_ns += latency_ns
-
-    def add(self, now_ns: int, times_ns: Sequence[int]) -> None:
-        """Count samples with these time stamps that imud publishes at `now_ns`. The time stamps rise."""
-        latencies = [now_ns - t_ns for t_ns in reversed(times_ns)]  # reversed: ascending latencies
-        self.sum_ns += sum(latencies)
-        buckets, begin = self.buckets, 0
-        # one step for each bucket, not for each sample
-        for bucket in range(bisect_left(LATENCY_BOUNDS_NS, latencies[0]), len(LATENCY_BOUNDS_NS)):
-            end = bisect_right(latencies, LATENCY_BOUNDS_NS[bucket], begin)
-            buckets[bucket] += end - begin
-            if end == len(latencies):
-                return
-            begin = end
-        buckets[-1] += len(latencies) - begin
-
-
-class LossMeter:
-    """Attribution of lost samples to causes: first damaged frames, then kernel overruns, then the device.
-
-    The device counter shows the number of lost samples. Each damaged frame since the last sample explains one of them.
-    An overrun explains the rest. Without an overrun, the device did not send the rest.
-    """
-
-    def __init__(self, ledger: Ledger) -> None:
-        # Number of damaged frames since the last sample. The path counts them and resets the number after each sample.
-        self.bad_frames = 0
-        self._ledger = ledger
-        self._overruns_seen = 0
-
-    def missed(self, count: int, overruns: int) -> None:
-        """Attribute `count` lost samples. `overruns` is the kernel's count since the link was opened."""
-        ledger = self._ledger
-        by_crc = min(count, self.bad_frames)
-        left = count - by_crc
-        by_overrun = left if overruns > self._overruns_seen else 0
-        ledger.lost_crc += by_crc
-        ledger.lost_overrun += by_overrun
-        ledger.lost_gap_device += left - by_overrun
-        self._overruns_seen = overruns
-
-    def link_opened(self) -> None:
-        """Reset the overruns: the kernel counts from the opening of the link."""
-        self._overruns_seen = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +63,9 @@ class SamplePath(ABC):
     # Attributes that a recorded state does not contain: parts of the daemon, and statistics.
     NOT_STATE: ClassVar = frozenset({
         "_device", "_device_id", "_drain_edges", "_ledger", "_listener", "_now_ns", "_on_bad_frame", "_on_message",
-        "_overruns", "_publish", "_rotation", "_status_mask", "_status_seen", "_utc_offset_ns", "frame", "latency",
+        "_overruns", "_publish", "_rotation", "_status_mask", "_status_seen", "_kernel_codec", "_utc_offset_ns",
+        "frame",
+        "latency",
     })  # fmt: skip
 
     def __init__(self, clock: SampleClock, context: PathContext) -> None:
@@ -144,7 +74,7 @@ class SamplePath(ABC):
         self.loss = LossMeter(context.ledger)
         # Observer of the input; None if no recording runs. Set by `observe`.
         self.observer: InputObserver | None = None
-        self.newest: Sample | None = None  # newest sample, in the axes of the sensor
+        self._newest: Sample | bytes | None = None  # sample object, or slot of the kernel
         self.frame = context.frame
         self.begun_ns = 0  # CLOCK_MONOTONIC at the last `begin`, ns
         self.last_data_ns = 0
@@ -180,6 +110,19 @@ class SamplePath(ABC):
         """Return the collected status bits of all samples since the previous call."""
         seen, self._status_seen = self._status_seen, 0
         return seen
+
+    @property
+    def newest(self) -> Sample | None:
+        """Newest sample, in the axes of the sensor."""
+        newest = self._newest
+        if isinstance(newest, bytes):
+            (newest,) = decode_slots(newest, self._device)
+            self._newest = newest
+        return newest
+
+    @newest.setter
+    def newest(self, sample: Sample | None) -> None:
+        self._newest = sample
 
     @property
     def fresh(self) -> bool:
@@ -298,6 +241,22 @@ class SamplePath(ABC):
         else:
             self.latency.add(self._now_ns(), [sample.t_ns for sample in samples])
 
+    def _finish_slots(self, packed: bytes, t_rx_ns: int) -> None:
+        """Publish slots of the kernel as one batch, as `_finish`."""
+        if self._rotation is not None:
+            self._finish(decode_slots(packed, self._device), t_rx_ns)
+            return
+        self._ledger.samples += len(packed) // SLOT_BYTES
+        self._newest = packed[-SLOT_BYTES:]
+        self.last_sample_ns = t_rx_ns
+        self._publish(Batch(self._device, self._device_id, None, self.frame, packed))
+        if mask := self._status_mask:
+            self._status_seen |= slot_status_bits(packed) & mask
+        self.latency.add(self._now_ns(), slot_times_ns(packed))
+
+
+KERNEL_BYTES: Final = 160  # minimum size of a read for the kernel, bytes: with a single frame it saves no CPU time
+
 
 class SampleListener(Protocol):
     """Listener to the measurements of a codec, for a command that waits for one. `imud.device` implements it, and this
@@ -326,24 +285,35 @@ class StreamPath(SamplePath):
         self.codec = codec
         self._listener = listener
         self._drain_edges = drain_edges
-        self.gathered: list[Sample] = []  # samples that `publish_gathered` will publish, oldest first
+        self._kernel_codec = codec if isinstance(codec, KernelCodec) and context.device_id <= DEVICE_ID_MOST else None
+        # samples that `publish_gathered` will publish, oldest first: packed slots of the kernel, then sample objects.
+        # Not two lists: an object with more than 30 attributes is slower.
+        self.gathered: list[Sample | bytes] = []
 
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
         """Process the bytes of one read. `t_rx_ns` is CLOCK_MONOTONIC right after the read."""
         self.last_data_ns = t_rx_ns
         samples: list[Sample] = []
+        packed, rest, utc_offset_ns = b"", data, None
+        listener = self._listener
+        wants_samples = listener is not None and listener.wants_samples
         try:
             if self._drain_edges is not None:
                 self._drain_edges()
-            events = self.codec.feed(data)
+            if len(data) >= KERNEL_BYTES and not wants_samples:
+                packed, rest, utc_offset_ns = self._stamp(data, t_rx_ns)
+            events = self.codec.feed(rest) if rest else ()
             if events:
-                self._sort(events, t_rx_ns, self._utc_offset_ns(), samples)
+                if packed:
+                    samples, packed = decode_slots(packed, self._device), b""
+                self._sort(events, t_rx_ns, self._utc_offset_ns() if utc_offset_ns is None else utc_offset_ns, samples)
         finally:  # a recording must contain the data that caused an exception
             if self.observer is not None:
                 self.observer.data(data, t_rx_ns, -1)
-        if samples:
+        if packed:
+            self._finish_slots(packed, t_rx_ns)
+        elif samples:
             self._finish(samples, t_rx_ns)
-        listener = self._listener
         if listener is not None and listener.wants_samples:
             for event in events:
                 if type(event) is Measurement:
@@ -354,25 +324,53 @@ class StreamPath(SamplePath):
         `waited_ns` is the maximum time of the bytes in the kernel's buffer; 0 if imud read them on arrival."""
         self.last_data_ns = t_rx_ns
         try:
-            events = self.codec.feed(data)
-            if not events:
-                return False
-            before = len(self.gathered)
             self.clock.waited_ns = waited_ns
-            self._sort(events, t_rx_ns, self._utc_offset_ns(), self.gathered)
+            packed, rest, utc_offset_ns = b"", data, None
+            if len(data) >= KERNEL_BYTES and (not self.gathered or isinstance(self.gathered[-1], bytes)):
+                packed, rest, utc_offset_ns = self._stamp(data, t_rx_ns)
+                if packed:
+                    self.gathered.append(packed)
+            events = self.codec.feed(rest) if rest else ()
+            samples: list[Sample] = []
+            if events:
+                self._sort(events, t_rx_ns, self._utc_offset_ns() if utc_offset_ns is None else utc_offset_ns, samples)
+            self.gathered += samples
             self.clock.waited_ns = 0
-            return len(self.gathered) > before
+            return bool(packed or samples)
         finally:
             if self.observer is not None:
                 self.observer.data(data, t_rx_ns, waited_ns)
 
     def publish_gathered(self) -> None:
         """Publish the held samples as one batch."""
-        samples, self.gathered = self.gathered, []
+        held, self.gathered = self.gathered, []
         if self.observer is not None:
             self.observer.call("path", "publish_gathered")
-        if samples:
-            self._finish(samples, samples[-1].t_rx_ns)
+        packed = b"".join([one for one in held if isinstance(one, bytes)])
+        samples = [one for one in held if not isinstance(one, bytes)]
+        if packed and not samples:
+            self._finish_slots(packed, self.clock.t_rx_ns)
+        elif samples:
+            self._finish([*decode_slots(packed, self._device), *samples], samples[-1].t_rx_ns)
+
+    @property
+    def held_by_fit(self) -> bool:
+        """Whether the fit has time-stamped the newest held sample."""
+        newest = self.gathered[-1] if self.gathered else None
+        return isinstance(newest, bytes) or (newest is not None and newest.sync is Sync.REGRESSION)
+
+    def _stamp(self, data: bytes, t_rx_ns: int) -> tuple[bytes, bytes, int | None]:
+        """Process usual frames at the start of `data` with the kernel. Return their slots, the rest of the data, and
+        the offset of UTC if imud has read it."""
+        codec, clock = self._kernel_codec, self.clock
+        if codec is None or not clock.is_even or (frames := codec.usual_frames(data)) is None:
+            return b"", data, None
+        utc_offset_ns = self._utc_offset_ns()
+        packed = clock.stamp_frames(frames, self._device_id, t_rx_ns, utc_offset_ns)
+        if packed:
+            self.loss.bad_frames = 0
+            data = codec.take(frames, len(packed) // SLOT_BYTES, data)
+        return packed, data, utc_offset_ns
 
     def _flush(self, now_ns: int, samples: list[Sample]) -> None:
         """Process complete frames inside an incomplete longer frame."""

@@ -16,7 +16,7 @@ from imud.model.sample import Sync
 from imud.recording.state import StateError, StateReader, StateWriter, attributes
 from imud.sampling.clock import SampleClock
 from imud.sampling.device_time import JumpDetector
-from imud.sampling.path import LossMeter
+from imud.sampling.meters import LossMeter
 
 
 class Holder:

@@ -29,7 +29,7 @@ from typing import Any, Final, Literal, ParamSpec
 
 import msgspec
 
-from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent, UsualFrames, count_unknown
 from imud.contracts.lines import TimeBits
 from imud.drivers.hipnuc.common import (
     EULER_RAD_PER_LSB,
@@ -43,6 +43,7 @@ from imud.drivers.hipnuc.common import (
 )
 from imud.drivers.hipnuc.uart.replies import LINE_CHARACTERS_MAX, LineFinder
 from imud.drivers.value_limits import VALUE_HIGH_BYTES, is_possible, values_possible
+from imud.formats import kernel
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Quaternion, Vector3
@@ -83,6 +84,7 @@ def decode_hi91(values: Sequence[Any], word_is_status: bool, size: int, trailing
     low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz = values
     # a global name costs twice as much as a local name, and a frame uses thirty of them
     g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
+    temperature += 0.0  # a float, as in a slot
     if (
         not PRESSURE_MIN_PA <= pressure <= PRESSURE_MAX_PA
     ):  # `pressure_of` without a call, which costs a tenth of a frame
@@ -108,6 +110,7 @@ def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int
     for (
         low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
     ) in HI91_VALUES.iter_unpack(hi91s):  # fmt: skip
+        temperature += 0.0  # noqa: PLW2901
         if not low_pa <= pressure <= high_pa:
             temperature, pressure = temperature_beside(temperature, pressure), None  # noqa: PLW2901
         word = low + 256 * high
@@ -338,6 +341,30 @@ class HipnucCodec:
                 ledger.frames_in_samples += 1
                 return (decode_hi91(HI91_VALUES.unpack(payload), self.word_is_status, _HI91_FRAME_BYTES, 0),)
         return self._scan(self._tail + data if self._tail else data, 0)
+
+    # --- frames for the kernel --------------------------------------------------------------------------------------
+
+    def usual_frames(self, data: bytes) -> UsualFrames | None:
+        module, tail = kernel.present.module, self._tail
+        if module is None or self._bad_ahead or self._barred_ahead or self._lines.pending_bytes:
+            return None
+        stream = tail + data if tail else data
+        count = module.count_hi91(stream)
+        return UsualFrames(stream, count, self.word_is_status, module.stamp_hi91) if count else None
+
+    def take(self, frames: UsualFrames, count: int, data: bytes) -> bytes:
+        ledger, size = self.ledger, count * _HI91_FRAME_BYTES
+        rest = frames.data[size:]
+        is_start = len(rest) < _HI91_FRAME_BYTES and rest[: len(_HI91_HEAD)] == _HI91_HEAD[: len(rest)]
+        self._tail = rest if is_start else b""
+        ledger.bytes_in += len(data) if is_start else len(data) - len(rest)
+        ledger.bytes_in_good_frames += size
+        ledger.bytes_pending = len(self._tail)
+        ledger.frames_good += count
+        ledger.frames_in_samples += count
+        return b"" if is_start else rest
+
+    # --- end of the stream ------------------------------------------------------------------------------------------
 
     def flush(self) -> Sequence[CodecEvent]:
         """Drop an incomplete frame that contains a complete frame or line. imud calls it when the link is idle."""

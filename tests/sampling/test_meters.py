@@ -2,7 +2,7 @@
 
 from imud.contracts.status import LATENCY_BOUNDS_NS
 from imud.model.ledger import Ledger
-from imud.sampling.path import LatencyMeter, LossMeter, RateMeter
+from imud.sampling.meters import LatencyMeter, LossMeter, RateMeter
 
 S = 1_000_000_000
 

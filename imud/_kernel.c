@@ -1,0 +1,342 @@
+/* Fast path of HI91 samples: check the frames of a read, decode them, time-stamp them, and pack them as slots.
+ *
+ * Every function is a pure function of its arguments. It does the same as the Python code and stops before the first
+ * frame that is not usual. Python then continues with this frame. The names are the names of the Python code:
+ *
+ *   count_hi91 ─▶ HipnucCodec (imud/drivers/hipnuc/uart/codec.py)
+ *   stamp_hi91 ─▶ add_even_run (imud/sampling/clock.py), ArrivalFit.add_arrival (imud/sampling/arrival_fit.py),
+ *                 encode_slots (imud/formats/slot.py)
+ *
+ * The result must be equal to the result of Python in every bit. Therefore the compiler must not join a product and a
+ * sum to one operation (-ffp-contract=off), and each expression has the order of the Python expression.
+ */
+#define PY_SSIZE_T_CLEAN
+#define Py_LIMITED_API 0x030B0000
+#include <Python.h>
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#if __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
+#error "frames and slots are little-endian: use the Python code on this host"
+#endif
+
+#define SYNC_AND_LENGTH "\x5a\xa5\x4c\x00" /* start of an HI91 frame: the payload has 76 bytes */
+#define HEAD_BYTES 6
+#define PAYLOAD_BYTES 76
+#define FRAME_BYTES (HEAD_BYTES + PAYLOAD_BYTES)
+#define TAG_HI91 0x91
+#define FLOATS 16                /* accel, gyro, mag, euler, quaternion */
+#define VALUE_HIGH_BYTE 0x48     /* a float of 131,072 or more has this high byte or a larger one, also NaN */
+#define PRESSURE_MIN_PA 1000.0
+#define PRESSURE_MAX_PA 120000.0
+#define PPS_STAMP_MODULUS_MS 8192
+#define M_S2_PER_G 9.8
+#define RAD_PER_DEG (3.141592653589793 / 180)
+#define T_PER_UT 1e-6
+#define EARLY_NS (-5e6)          /* an earlier frame can be a jump of the device counter */
+#define JUMP_LATE_NS 5e8         /* a later frame can be a jump of the device counter */
+#define T_ERR_MOST 4294967295.0
+/* Maximum magnitude of times, ns: 36 years of CLOCK_MONOTONIC. Sums of some of them thus fit into 64 bits. Python has
+ * no limit. The offset of UTC may be four times as large. */
+#define TIME_MOST_NS (INT64_C(1) << 60)
+
+enum { HAS_T_DEV = 1 << 0, HAS_ACCEL = 1 << 1, HAS_GYRO = 1 << 2, HAS_MAG = 1 << 3, HAS_QUAT = 1 << 4,
+       HAS_EULER = 1 << 5, HAS_TEMPERATURE = 1 << 6, HAS_PRESSURE = 1 << 7, HAS_STATUS = 1 << 9, HAS_PPS_AGE = 1 << 10 };
+
+typedef struct {
+    uint64_t seq;
+    int64_t t_ns, t_rx_ns, utc_ns, t_dev_ns;
+    uint64_t edge_seq;
+    uint32_t t_err_ns, present, status;
+    uint16_t device_id;
+    uint8_t sync, reserved0;
+    double accel_m_s2[3], gyro_rad_s[3], mag_t[3], quat_wxyz[4], euler_rad[3], temperature_c, pressure_pa, incli_rad[2];
+    uint32_t pps_age_ms;
+    uint8_t reserved1[24];
+    uint32_t crc32;
+} Slot;
+
+_Static_assert(sizeof(Slot) == 256, "a slot has 256 bytes without padding");
+
+/* Open bin of the fit (`_Bin`), and the number of arrivals that were added to it. */
+typedef struct {
+    int64_t device_ns, arrival_ns, count, late, added;
+    double lowest, wait, wait_least, wait_most, late_ns;
+} Bin;
+
+/* State of codec, clock, host and fit at the start of a run. */
+typedef struct {
+    int word_is_status, device_id, sync;
+    int64_t own_status; /* -1: none */
+    int64_t seq, t_ns, t_rx_ns, utc_offset_ns, byte_ns, waited_ns;
+    double bias_ns, fit_error_ns;
+    int64_t offset_ns, even_from_ns;
+    int64_t ticks, device_ns, raw_ns, tick_ns;
+    double period_ticks, doubt_ns;
+    int64_t ref_arrival_ns, ref_device_ns, fitted_ns, until_ns;
+    double slope, slope_error, wait_most;
+    Bin bin;
+} Run;
+
+static uint16_t crc16_table[256];
+static uint32_t crc32_table[8][256]; /* table k: effect of a byte that k bytes follow */
+
+static void make_tables(void)
+{
+    for (int byte = 0; byte < 256; byte++) {
+        uint16_t crc16 = (uint16_t)(byte << 8);
+        uint32_t crc32 = (uint32_t)byte;
+        for (int bit = 0; bit < 8; bit++) {
+            crc16 = (uint16_t)((crc16 << 1) ^ (crc16 & 0x8000 ? 0x1021 : 0));
+            crc32 = (crc32 >> 1) ^ (crc32 & 1 ? 0xEDB88320u : 0);
+        }
+        crc16_table[byte] = crc16;
+        crc32_table[0][byte] = crc32;
+    }
+    for (int k = 1; k < 8; k++)
+        for (int byte = 0; byte < 256; byte++) {
+            uint32_t before = crc32_table[k - 1][byte];
+            crc32_table[k][byte] = (before >> 8) ^ crc32_table[0][before & 0xFF];
+        }
+}
+
+static uint16_t crc16_xmodem(const uint8_t *data, size_t size, uint16_t crc)
+{
+    for (size_t i = 0; i < size; i++)
+        crc = (uint16_t)((crc << 8) ^ crc16_table[(crc >> 8) ^ data[i]]);
+    return crc;
+}
+
+/* Return the CRC-32 of `size` bytes, as zlib.crc32. Eight bytes per step. */
+static uint32_t crc32_of(const uint8_t *data, size_t size)
+{
+    uint32_t crc = 0xFFFFFFFFu;
+    for (; size >= 8; data += 8, size -= 8) {
+        uint32_t low, high;
+        memcpy(&low, data, 4);
+        memcpy(&high, data + 4, 4);
+        low ^= crc;
+        crc = crc32_table[7][low & 0xFF] ^ crc32_table[6][low >> 8 & 0xFF] ^ crc32_table[5][low >> 16 & 0xFF] ^
+              crc32_table[4][low >> 24] ^ crc32_table[3][high & 0xFF] ^ crc32_table[2][high >> 8 & 0xFF] ^
+              crc32_table[1][high >> 16 & 0xFF] ^ crc32_table[0][high >> 24];
+    }
+    for (; size; data++, size--)
+        crc = (crc >> 8) ^ crc32_table[0][(crc ^ *data) & 0xFF];
+    return ~crc;
+}
+
+/* Return whether a usual HI91 frame starts at `frame`: correct check value, possible values, and a known pressure. */
+static int is_usual(const uint8_t *frame)
+{
+    const uint8_t *payload = frame + HEAD_BYTES;
+    float pressure_pa;
+    if (memcmp(frame, SYNC_AND_LENGTH, 4) || payload[0] != TAG_HI91)
+        return 0;
+    if (crc16_xmodem(payload, PAYLOAD_BYTES, crc16_xmodem(frame, 4, 0)) != (uint16_t)(frame[4] | frame[5] << 8))
+        return 0;
+    for (int i = 0; i < FLOATS; i++)
+        if ((payload[15 + 4 * i] & 0x7F) >= VALUE_HIGH_BYTE)
+            return 0;
+    memcpy(&pressure_pa, payload + 4, 4);
+    return PRESSURE_MIN_PA <= pressure_pa && pressure_pa <= PRESSURE_MAX_PA; /* false for NaN */
+}
+
+/* count_hi91(data) -> number of usual HI91 frames at the start of `data` */
+static PyObject *count_hi91(PyObject *self, PyObject *args)
+{
+    const char *data;
+    Py_ssize_t size, count = 0;
+    if (!PyArg_ParseTuple(args, "y#:count_hi91", &data, &size))
+        return NULL;
+    while ((count + 1) * FRAME_BYTES <= size && is_usual((const uint8_t *)data + count * FRAME_BYTES))
+        count++;
+    return PyLong_FromSsize_t(count);
+}
+
+/* Write the values of a usual frame into a slot, which contains zeros. */
+static void decode(Slot *slot, const uint8_t *payload, const Run *run)
+{
+    float pressure_pa, floats[FLOATS];
+    unsigned word = payload[1] + 256u * payload[2];
+    uint32_t present = HAS_T_DEV | HAS_ACCEL | HAS_GYRO | HAS_EULER | HAS_TEMPERATURE | HAS_PRESSURE;
+    memcpy(&pressure_pa, payload + 4, 4);
+    memcpy(floats, payload + 12, sizeof floats);
+    for (int i = 0; i < 3; i++) {
+        slot->accel_m_s2[i] = floats[i] * M_S2_PER_G;
+        slot->gyro_rad_s[i] = floats[3 + i] * RAD_PER_DEG;
+        slot->euler_rad[i] = floats[9 + i] * RAD_PER_DEG;
+    }
+    /* a device without magnetometer sends zeros, and no rotation has a quaternion of zeros */
+    if (floats[6] || floats[7] || floats[8]) {
+        present |= HAS_MAG;
+        for (int i = 0; i < 3; i++)
+            slot->mag_t[i] = floats[6 + i] * T_PER_UT;
+    }
+    if (floats[12] || floats[13] || floats[14] || floats[15]) {
+        present |= HAS_QUAT;
+        for (int i = 0; i < 4; i++)
+            slot->quat_wxyz[i] = floats[12 + i];
+    }
+    slot->temperature_c = (int8_t)payload[3];
+    slot->pressure_pa = pressure_pa;
+    if (run->word_is_status) {
+        present |= HAS_STATUS;
+        slot->status = word;
+    } else if (word <= PPS_STAMP_MODULUS_MS) {
+        present |= HAS_PPS_AGE;
+        slot->pps_age_ms = word;
+    }
+    if (run->own_status >= 0) {
+        present |= HAS_STATUS;
+        slot->status |= (uint32_t)run->own_status;
+    }
+    slot->present = present;
+    slot->device_id = (uint16_t)run->device_id;
+    slot->sync = (uint8_t)run->sync;
+}
+
+/* Add an arrival to the open bin of the fit. */
+static void add_arrival(Bin *bin, int64_t device_ns, int64_t arrival_ns, int64_t trailing_ns, double above_ns,
+                        double wait_most)
+{
+    double wait = above_ns + trailing_ns;
+    bin->added++;
+    bin->count++;
+    if (wait > wait_most) {
+        bin->late++;
+        bin->late_ns += wait - wait_most;
+        wait = wait_most;
+    }
+    bin->wait += wait;
+    if (wait < bin->wait_least)
+        bin->wait_least = wait;
+    else if (wait > bin->wait_most)
+        bin->wait_most = wait;
+    if (above_ns < bin->lowest) {
+        bin->lowest = above_ns;
+        bin->device_ns = device_ns;
+        bin->arrival_ns = arrival_ns;
+    }
+}
+
+/* Time-stamp and decode one frame. `trailing_bytes` follow it. Return 0 without a change if the frame is not usual. */
+static int stamp(Run *run, double *error_ns, Slot *slot, const uint8_t *frame, int64_t trailing_bytes)
+{
+    const uint8_t *payload = frame + HEAD_BYTES;
+    uint32_t ticks, step;
+    memcpy(&ticks, payload + 8, 4);
+    step = ticks - (uint32_t)run->ticks;
+    int64_t trailing_ns = trailing_bytes * run->byte_ns;
+    int64_t arrival_ns = run->t_rx_ns - (FRAME_BYTES * run->byte_ns + trailing_ns + run->offset_ns);
+    /* a gap, a repeated counter value, or a change of the host's rate */
+    if (step != run->period_ticks || !step || arrival_ns < run->even_from_ns)
+        return 0;
+    int64_t step_ns = step * run->tick_ns, next_ns = run->device_ns + step_ns;
+    double fit_ns = run->ref_arrival_ns + run->slope * (double)(next_ns - run->ref_device_ns);
+    double above_ns = arrival_ns - fit_ns, wanted_ns = fit_ns - run->bias_ns;
+    int is_new = !run->waited_ns || above_ns <= 0.0; /* a held frame above the fit contains no new information */
+    if (!is_new)
+        above_ns = fmax(above_ns - run->waited_ns, 0.0);
+    if (!(fabs(wanted_ns) < TIME_MOST_NS))
+        return 0;
+    int64_t steady_ns = (int64_t)wanted_ns, t_ns = steady_ns + run->offset_ns;
+    *error_ns = run->fit_error_ns + run->slope_error * (double)(next_ns - run->fitted_ns) + run->doubt_ns;
+    /* an early or late frame, a fit that is due, or a time stamp that needs a correction */
+    if (!(above_ns >= EARLY_NS && above_ns < JUMP_LATE_NS) || (is_new && next_ns >= run->until_ns) ||
+        steady_ns < run->even_from_ns || steady_ns > arrival_ns || t_ns <= run->t_ns || t_ns > run->t_rx_ns ||
+        !(*error_ns >= 0.0))
+        return 0;
+    if (is_new)
+        add_arrival(&run->bin, next_ns, arrival_ns, trailing_ns, above_ns, run->wait_most);
+    run->ticks = ticks;
+    run->device_ns = next_ns;
+    run->raw_ns += step_ns;
+    run->t_ns = t_ns;
+    run->seq++;
+    memset(slot, 0, sizeof *slot);
+    slot->seq = (uint64_t)run->seq;
+    slot->t_ns = t_ns;
+    slot->t_rx_ns = run->t_rx_ns;
+    slot->utc_ns = t_ns + run->utc_offset_ns;
+    slot->t_dev_ns = run->raw_ns;
+    slot->t_err_ns = *error_ns < T_ERR_MOST ? (uint32_t)((int64_t)*error_ns + 1) : UINT32_MAX;
+    decode(slot, payload, run);
+    slot->crc32 = crc32_of((const uint8_t *)slot, sizeof *slot - 4);
+    return 1;
+}
+
+static int is_in_range(const Run *run)
+{
+    const int64_t times_ns[] = {
+        run->seq, run->t_ns, run->t_rx_ns, run->utc_offset_ns / 4, run->waited_ns, run->offset_ns, run->device_ns,
+        run->raw_ns, run->ref_arrival_ns, run->ref_device_ns, run->fitted_ns,
+    };
+    for (size_t i = 0; i < sizeof times_ns / sizeof *times_ns; i++)
+        if (times_ns[i] > TIME_MOST_NS || times_ns[i] < -TIME_MOST_NS)
+            return 0;
+    /* limits of the products: 1e9 ns per byte, and 1e6 ns per tick of a step below 2³² */
+    return run->seq >= 0 && run->byte_ns >= 0 && run->byte_ns <= 1000000000 && run->tick_ns > 0 &&
+           run->tick_ns <= 1000000 && run->own_status <= UINT32_MAX && run->device_id >= 0 &&
+           run->device_id <= UINT16_MAX;
+}
+
+/* stamp_hi91(data, count, …state…) -> None if the first frame needs Python, or a tuple: slots, ticks, t_ns,
+ * error_ns, bin. `data` starts with `count` usual frames. */
+static PyObject *stamp_hi91(PyObject *self, PyObject *args)
+{
+    Run run;
+    Bin *bin = &run.bin;
+    const char *data;
+    Py_ssize_t size, count, done = 0;
+    memset(&run, 0, sizeof run);
+    if (!PyArg_ParseTuple(
+            args, "y#nii(iLLLLLLddLLL)(LLLLddLLLLddd)(LLddddLLd):stamp_hi91", &data, &size, &count, &run.word_is_status,
+            &run.device_id, &run.sync, &run.own_status, &run.seq, &run.t_ns, &run.t_rx_ns, &run.byte_ns, &run.waited_ns,
+            &run.bias_ns, &run.fit_error_ns, &run.utc_offset_ns, &run.offset_ns, &run.even_from_ns, &run.ticks, &run.device_ns,
+            &run.raw_ns, &run.tick_ns, &run.period_ticks, &run.doubt_ns, &run.ref_arrival_ns, &run.ref_device_ns,
+            &run.fitted_ns, &run.until_ns, &run.slope, &run.slope_error, &run.wait_most, &bin->device_ns,
+            &bin->arrival_ns, &bin->lowest, &bin->wait, &bin->wait_least, &bin->wait_most, &bin->count, &bin->late,
+            &bin->late_ns))
+        return NULL;
+    if (count < 0 || count > size / FRAME_BYTES || !is_in_range(&run))
+        Py_RETURN_NONE;
+    PyObject *slots = PyBytes_FromStringAndSize(NULL, count * (Py_ssize_t)sizeof(Slot));
+    if (slots == NULL)
+        return NULL;
+    Slot *slot = (Slot *)PyBytes_AsString(slots);
+    double error_ns = 0.0, newest_error_ns = 0.0;
+    while (done < count && stamp(&run, &error_ns, slot + done, (const uint8_t *)data + done * FRAME_BYTES,
+                                 size - (done + 1) * FRAME_BYTES)) {
+        newest_error_ns = error_ns;
+        done++;
+    }
+    if (!done) {
+        Py_DECREF(slots);
+        Py_RETURN_NONE;
+    }
+    if (done < count) { /* the limited API cannot shorten bytes */
+        PyObject *some = PyBytes_FromStringAndSize((const char *)slot, done * (Py_ssize_t)sizeof(Slot));
+        Py_DECREF(slots);
+        if (some == NULL)
+            return NULL;
+        slots = some;
+    }
+    return Py_BuildValue("NLLd(LLddddLLd)L", slots, run.ticks, run.t_ns, newest_error_ns, bin->device_ns,
+                         bin->arrival_ns, bin->lowest, bin->wait, bin->wait_least, bin->wait_most, bin->count, bin->late,
+                         bin->late_ns, bin->added);
+}
+
+static PyMethodDef methods[] = {
+    {"count_hi91", count_hi91, METH_VARARGS, "Return the number of usual HI91 frames at the start of bytes."},
+    {"stamp_hi91", stamp_hi91, METH_VARARGS, "Return slots of usual HI91 frames, and the changed state; or None."},
+    {NULL, NULL, 0, NULL},
+};
+
+static struct PyModuleDef module = {PyModuleDef_HEAD_INIT, "imud._kernel", NULL, 0, methods, NULL, NULL, NULL, NULL};
+
+PyMODINIT_FUNC PyInit__kernel(void)
+{
+    make_tables();
+    return PyModule_Create(&module);
+}

@@ -1,0 +1,91 @@
+"""Counters of a sample path: sample rate, latency, and the causes of lost samples."""
+
+from bisect import bisect_left, bisect_right
+from collections import deque
+from collections.abc import Sequence
+
+from imud.contracts.status import LATENCY_BOUNDS_NS
+from imud.model.ledger import Ledger
+from imud.model.units import NS_PER_S
+
+# window of the sample rate, ns: long enough for devices with 1 Hz, short enough to show a stall
+RATE_WINDOW_NS = 2 * NS_PER_S
+
+
+class RateMeter:
+    """Sample rate over the last `RATE_WINDOW_NS`. The device adds the sample count at each tick."""
+
+    def __init__(self) -> None:
+        self._marks: deque[tuple[int, int]] = deque()
+
+    def mark(self, now_ns: int, count: int) -> None:
+        """Add the sample count at `now_ns`."""
+        marks = self._marks
+        marks.append((now_ns, count))
+        while len(marks) > 2 and marks[1][0] <= now_ns - RATE_WINDOW_NS:  # keep one mark before the window
+            marks.popleft()
+
+    def rate_hz(self) -> float:
+        """Return the samples per second between the oldest and the newest count; 0.0 without two counts."""
+        if len(self._marks) < 2:
+            return 0.0
+        (t0_ns, n0), (t1_ns, n1) = self._marks[0], self._marks[-1]
+        return (n1 - n0) * NS_PER_S / (t1_ns - t0_ns) if t1_ns > t0_ns else 0.0
+
+
+class LatencyMeter:
+    """Histogram of the time from a measurement to its publication."""
+
+    __slots__ = ("buckets", "sum_ns")
+
+    def __init__(self) -> None:
+        self.buckets = [0] * (len(LATENCY_BOUNDS_NS) + 1)
+        self.sum_ns = 0
+
+    def add_one(self, latency_ns: int) -> None:
+        """Count a sample."""
+        self.buckets[bisect_left(LATENCY_BOUNDS_NS, latency_ns)] += 1
+        self.sum_ns += latency_ns
+
+    def add(self, now_ns: int, times_ns: Sequence[int]) -> None:
+        """Count samples with these time stamps that imud publishes at `now_ns`. The time stamps rise."""
+        latencies = [now_ns - t_ns for t_ns in reversed(times_ns)]  # reversed: ascending latencies
+        self.sum_ns += sum(latencies)
+        buckets, begin = self.buckets, 0
+        # one step for each bucket, not for each sample
+        for bucket in range(bisect_left(LATENCY_BOUNDS_NS, latencies[0]), len(LATENCY_BOUNDS_NS)):
+            end = bisect_right(latencies, LATENCY_BOUNDS_NS[bucket], begin)
+            buckets[bucket] += end - begin
+            if end == len(latencies):
+                return
+            begin = end
+        buckets[-1] += len(latencies) - begin
+
+
+class LossMeter:
+    """Attribution of lost samples to causes: first damaged frames, then kernel overruns, then the device.
+
+    The device counter shows the number of lost samples. Each damaged frame since the last sample explains one of them.
+    An overrun explains the rest. Without an overrun, the device did not send the rest.
+    """
+
+    def __init__(self, ledger: Ledger) -> None:
+        # Number of damaged frames since the last sample. The path counts them and resets the number after each sample.
+        self.bad_frames = 0
+        self._ledger = ledger
+        self._overruns_seen = 0
+
+    def missed(self, count: int, overruns: int) -> None:
+        """Attribute `count` lost samples. `overruns` is the kernel's count since the link was opened."""
+        ledger = self._ledger
+        by_crc = min(count, self.bad_frames)
+        left = count - by_crc
+        by_overrun = left if overruns > self._overruns_seen else 0
+        ledger.lost_crc += by_crc
+        ledger.lost_overrun += by_overrun
+        ledger.lost_gap_device += left - by_overrun
+        self._overruns_seen = overruns
+
+    def link_opened(self) -> None:
+        """Reset the overruns: the kernel counts from the opening of the link."""
+        self._overruns_seen = 0

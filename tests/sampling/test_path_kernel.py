@@ -1,0 +1,181 @@
+"""The kernel and the Python code make the same samples of the same bytes: slots, ledger, latencies, losses, state."""
+
+import struct
+import sys
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+from unittest.mock import Mock
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from imud.attitude.conventions import Convention
+from imud.attitude.published import published_frame
+from imud.contracts.publisher import AS_SENT, Batch
+from imud.drivers import DRIVERS
+from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucOptions, encode_frame, encode_hi92
+from imud.formats import kernel
+from imud.host.clock import HostClock
+from imud.model.ledger import Ledger
+from imud.model.units import NS_PER_MS, NS_PER_US
+from imud.recording.state import StateWriter
+from imud.sampling.clock import SampleClock
+from imud.sampling.path import PathContext, StreamPath, make_clock
+from tests.support.event_loops import UTC_AHEAD_NS
+from tests.support.files import hi91
+
+BYTE_NS = 10_851
+SETTLE = 400  # frames of 1 ms until imud uses the fit and does not watch the counter
+BEGIN_NS = 1000 * 10**9
+
+if kernel.present.module is None:
+    pytest.skip(f"no kernel: {kernel.present.problem}", allow_module_level=True)
+
+
+class Step(NamedTuple):
+    """One read. Without changes it contains `frames` usual frames that arrive evenly."""
+
+    frames: int
+    cut: int = 0  # bytes at the end that arrive with the next read
+    damage: int | None = None  # position of an inverted byte
+    kind: str = "usual"
+    jump_ms: int = 0  # change of the device counter
+    late_us: int = 0
+    waited_ms: int = -1  # -1: read on arrival; otherwise the hold
+    publish: bool = True
+    slew_ns: int = 0  # change of CLOCK_MONOTONIC against the steady time
+    own_status: int | None = None
+
+
+STEPS = st.builds(
+    Step, st.integers(0, 12), st.sampled_from([0, 0, 0, 1, 2, 5, 40, 81]),
+    st.none() | st.none() | st.integers(0, 900),
+    st.sampled_from(["usual", "usual", "usual", "nan", "text", "hi92", "zeros", "word", "hot", "pressure", "reset"]),
+    st.sampled_from([0, 0, 0, 1, 7, -3, 10**6, 2**31]), st.sampled_from([0, 0, 30, 900, 20_000, 700_000]),
+    st.sampled_from([-1, -1, 0, 5, 30]), st.booleans(), st.sampled_from([0, 0, 0, 400, 20_000, -90_000]),
+    st.sampled_from([None, None, 0, 1 << 31]),
+)  # fmt: skip
+
+
+def changed(frame: bytes, at: int, data: bytes) -> bytes:
+    """Return the frame with other bytes in its payload and a correct check value."""
+    payload = bytearray(frame[6:])
+    payload[at : at + len(data)] = data
+    return encode_frame(bytes(payload))
+
+
+KINDS: dict[str, Any] = {
+    "nan": lambda frame: changed(frame, 12, struct.pack("<f", float("nan"))),
+    "text": lambda frame: b"OK\r\n" + frame,
+    "hi92": lambda frame: frame + encode_hi92(
+        pps_stamp_ms=3, accel_m_s2=(1, 2, 3), gyro_rad_s=(0, 0, 0), mag_t=(0, 0, 0), euler_rad=(0, 0, 0),
+        quat_wxyz=(1, 0, 0, 0), temperature_c=3, pressure_pa=100_000,
+    ),
+    "zeros": lambda frame: changed(frame, 36, bytes(12) + frame[54:66] + bytes(16)),
+    "word": lambda frame: changed(frame, 1, b"\xff\xff\x80"),
+    "hot": lambda frame: changed(frame, 24, struct.pack("<f", 140_000.0)),
+    "pressure": lambda frame: changed(frame, 4, struct.pack("<f", 12.5)),
+}  # fmt: skip
+
+
+class Run:
+    """A path that processes steps, with or without the kernel."""
+
+    def __init__(self, options: HipnucOptions, turned: bool) -> None:
+        self.slots = b""
+        self.now_ns, self.slewed_ns, self.ms, self.number = BEGIN_NS, 0, 0, 0
+        self.kernel_batches = 0
+        self.late_bytes = b""
+        self.ledger = Ledger()
+        self.seen = Mock()
+        host = HostClock(lambda: self.now_ns, lambda: self.now_ns + UTC_AHEAD_NS, lambda: self.now_ns - self.slewed_ns)
+        self.steady = host.steady
+        frame = published_frame(None, Convention.NED_FRD, None, AS_SENT.device) if turned else AS_SENT
+        context = PathContext(
+            "bow", 3, self.ledger, self.publish, self.seen.message, self.seen.bad_frame, lambda: 0, host, frame
+        )
+        clock: SampleClock = make_clock(
+            "bow", None, DRIVERS["hipnuc-uart"], None, host=host.steady, byte_ns=BYTE_NS,
+            on_unknown_gap=self.ledger.add_unknown_gap,
+        )  # fmt: skip
+        self.path = StreamPath(HipnucCodec(self.ledger, options), clock, context)
+        self.path.watch_status(0xFFFF_FFFF)
+        self.path.observe(self.seen.observer)
+
+    def publish(self, batch: Batch) -> None:
+        self.kernel_batches += batch._samples is None
+        self.slots += batch.packed
+
+    def do(self, step: Step) -> None:
+        path = self.path
+        if step.kind == "reset":
+            path.clock.restart()
+        self.slewed_ns += step.slew_ns
+        path.clock.set_own_status(step.own_status)
+        self.ms += step.jump_ms
+        stream = self.late_bytes
+        for number in range(step.frames):
+            self.ms += 1
+            self.now_ns += NS_PER_MS + 40
+            frame = hi91(self.ms % 2**32)
+            stream += KINDS.get(step.kind, bytes)(frame) if number == step.frames // 2 else frame
+        self.number += 1
+        self.now_ns += self.number * 7919 % 97 * 1000
+        data = bytearray(stream[: len(stream) - step.cut])
+        self.late_bytes = stream[len(data) :]
+        if step.damage is not None and step.damage < len(data):
+            data[step.damage] ^= 0xFF
+        t_rx_ns = self.now_ns + step.late_us * NS_PER_US
+        if step.waited_ms < 0:
+            path.publish_gathered()
+            path.on_data(bytes(data), t_rx_ns)
+        else:
+            path.gather(bytes(data), t_rx_ns, step.waited_ms * NS_PER_MS)
+            if step.publish:
+                path.publish_gathered()
+
+    def result(self) -> tuple[Any, ...]:
+        path = self.path
+        path.publish_gathered()
+        external = {"ledger": self.ledger, "steady": self.steady, "observer": self.seen.observer}
+        newest, taken = path.newest, path.take_status()
+        state = StateWriter(external, path.NOT_STATE).write({"path": path})
+        return (
+            self.slots, self.ledger.snapshot(), path.latency.buckets, path.latency.sum_ns, newest, taken,
+            self.seen.mock_calls, path.clock.status(), state,
+        )  # fmt: skip
+
+
+def play(steps: Sequence[Step], options: HipnucOptions, turned: bool, found: kernel.Kernel) -> Run:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernel, "present", found)
+        run = Run(options, turned)
+        for _ in range(SETTLE // 4):
+            run.do(Step(4))
+        for step in steps:
+            run.do(step)
+    return run
+
+
+def test_a_variable_of_the_environment_switches_the_kernel_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert kernel.load("0") == kernel.Kernel(None, "IMUD_KERNEL=0 switches it off")
+    assert kernel.load("1").module is kernel.load(None).module is not None
+    monkeypatch.setitem(sys.modules, "imud._kernel", None)
+    assert kernel.load(None).problem.startswith("it is not installed: ")
+
+
+@given(
+    st.lists(STEPS, max_size=30), st.sampled_from([HipnucOptions(), HipnucOptions(hi91_word="status")]), st.booleans()
+)
+def test_kernel_and_python_are_equal(steps: list[Step], options: HipnucOptions, turned: bool) -> None:
+    by_kernel, by_python = (play(steps, options, turned, one) for one in (kernel.present, kernel.Kernel(None)))
+    for one, other in zip(by_kernel.result(), by_python.result(), strict=True):
+        assert one == other
+
+
+@pytest.mark.parametrize("cut", [0, 40])
+def test_the_kernel_makes_the_samples_of_usual_reads(cut: int) -> None:
+    run = play([Step(10, cut)] * 50, HipnucOptions(), False, kernel.present)
+    assert run.kernel_batches > 20  # a young fit changes often, and Python makes the samples of such a read
+    assert run.ledger.closes()
