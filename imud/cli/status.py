@@ -10,6 +10,7 @@ from imud.cli.arguments import CliCommand, add_socket, connect
 from imud.cli.output import paragraph, times
 from imud.contracts.setting import SettingsState, SettingsStatus
 from imud.contracts.status import (
+    CKernelStatus,
     DeviceStatus,
     FrameStatus,
     LinesStatus,
@@ -44,18 +45,28 @@ def run(args: argparse.Namespace) -> int:
         print(msgspec.json.encode(answer).decode())
     else:
         mqtts = msgspec.convert(answer.get("mqtt", []), list[MqttStatus])
-        print(page(devices, mqtts, msgspec.convert(answer.get("outputs", {}), dict[str, str])))
+        # a daemon of an older version does not send `c_kernel`
+        found = msgspec.convert(answer.get("c_kernel"), CKernelStatus | None)
+        print(page(devices, mqtts, msgspec.convert(answer.get("outputs", {}), dict[str, str]), found))
     return 1 if any(device.has_problem for device in devices) else 0
 
 
-def page(devices: Sequence[DeviceStatus], mqtts: Sequence[MqttStatus] = (), outputs: Mapping[str, str] = {}) -> str:
-    """Format the blocks of all devices and the problems of the outputs."""
+def page(
+    devices: Sequence[DeviceStatus],
+    mqtts: Sequence[MqttStatus] = (),
+    outputs: Mapping[str, str] = {},
+    c_kernel: CKernelStatus | None = None,
+) -> str:
+    """Format the blocks of all devices, the problems of the outputs, and the use of the C kernel."""
     parts = [block(device) for device in devices]
     for mqtt in mqtts:
         problems = [one for one in (mqtt.problem, mqtt.spool_problem) if one]
         problems += [f"the broker refuses messages of {topic}: {reason}" for topic, reason in mqtt.refused.items()]
         parts += ["\n".join(paragraph("mqtt: ", problem)) for problem in problems]
     parts += ["\n".join(paragraph(f"{name}: ", problem)) for name, problem in outputs.items()]
+    if c_kernel is not None:
+        use = "active" if c_kernel.active else f"not active: {c_kernel.problem}"
+        parts.append("\n".join(paragraph("C kernel: ", use)))
     return "\n\n".join(parts)
 
 

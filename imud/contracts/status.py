@@ -264,6 +264,13 @@ class DeviceStatus(msgspec.Struct, frozen=True):
         return str(self.state if self.condition is None else self.condition.condition)
 
 
+class CKernelStatus(msgspec.Struct, frozen=True):
+    """Use of the optional kernel in C (`imud/_kernel.c`) by the daemon."""
+
+    active: bool  # whether the daemon has loaded the kernel
+    problem: str = ""  # reason why it is not active; empty if it is active
+
+
 class RecorderStatus(msgspec.Struct, frozen=True):
     file: str  # name of the present file; empty if the recorder is not recording
     problem: str  # reason why the recorder is not recording, one sentence; empty while it is recording

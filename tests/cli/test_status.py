@@ -10,7 +10,8 @@ from imud.cli.status import axes, block, driven, page, parts, utc, watched
 from imud.client.connection import Client
 from imud.contracts.condition import Condition, DeviceCondition, Reason, ReasonCode
 from imud.contracts.setting import OnDifference, SettingsState, SettingsStatus
-from imud.contracts.status import DeviceState, FrameStatus, LinesStatus, MqttStatus, UtcStatus
+from imud.contracts.status import CKernelStatus, DeviceState, FrameStatus, LinesStatus, MqttStatus, UtcStatus
+from imud.formats import kernel
 from tests.cli.conftest import Cli
 from tests.support.metrics import LINES, POLLING, UTC, device, equipped
 from tests.support.socket_rig import daemon
@@ -66,7 +67,12 @@ def test_json_is_all_that_the_socket_sends(tmp_path: Path, cli: Cli) -> None:
         with Client(served.path) as client:
             said = client.status()
         shown = json.loads(cli("status", "--socket", served.path, "--json").out)
-        assert shown.keys() == said.keys() == {"now_ns", "devices", "socket", "configuration", "mqtt", "outputs"}
+        assert said["c_kernel"] == {"active": kernel.present.module is not None, "problem": kernel.present.problem}
+        assert (
+            shown.keys()
+            == said.keys()
+            == {"now_ns", "devices", "socket", "configuration", "mqtt", "outputs", "c_kernel"}
+        )
         assert shown["devices"] == said["devices"]
         one = json.loads(cli("status", "--socket", served.path, "--json", "imu1").out)
         assert [device["name"] for device in one["devices"]] == ["imu1"]
@@ -82,10 +88,12 @@ def test_a_device_shows_its_condition_with_reasons_and_next_steps() -> None:
     assert block(old).startswith("mast: running\n  an old daemon\n")
 
 
-def test_problems_of_mqtt_are_shown() -> None:
+def test_problems_of_mqtt_and_the_kernel_in_c_are_shown() -> None:
     mqtt = MqttStatus("", "no route", "", 0, 0, 0, 0, 0, 0, 0, {}, 0, refused={"a/b": "Not authorized"})
-    assert page([], [mqtt], {"metrics": "no IPv6"}).splitlines() == [
+    assert page([], c_kernel=CKernelStatus(True)) == "C kernel: active"
+    assert page([], [mqtt], {"metrics": "no IPv6"}, CKernelStatus(False, "no file")).splitlines() == [
         "mqtt: no route", "", "mqtt: the broker refuses messages of a/b: Not authorized", "", "metrics: no IPv6",
+        "", "C kernel: not active: no file",
     ]  # fmt: skip
 
 

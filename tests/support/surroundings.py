@@ -17,8 +17,8 @@ from typing import Final
 
 import pytest
 
-from imud.cli.doctor.surroundings import CommandOutput, DoctorCheck, DoctorFinding, Surroundings
-from imud.contracts.status import DeviceStatus
+from imud.cli.doctor.surroundings import CommandOutput, DaemonReply, DoctorCheck, DoctorFinding, Surroundings
+from imud.contracts.status import CKernelStatus, DeviceStatus
 from imud.model.errors import LinkMissing
 from imud.utc.system_clock import KernelClock
 from tests.support.files import ROOT
@@ -113,6 +113,7 @@ class Machine:
         self.outputs: dict[str, CommandOutput | OSError] = {}
         self.status: list[DeviceStatus] | Exception = LinkMissing("no daemon at /run/imud/imud.sock")
         self.pages: dict[tuple[str, int, str], str] = {}
+        self.c_kernel: CKernelStatus | None = CKernelStatus(True)
         self.clock = KernelClock(True, 50, 1000)
         self.sync_s: list[float] = []
         """Times of the next writes."""
@@ -160,10 +161,10 @@ class Machine:
             raise ConnectionRefusedError(111, "Connection refused")
         return self.pages[address, port, path]
 
-    def ask(self) -> list[DeviceStatus]:
+    def ask(self) -> DaemonReply:
         if isinstance(self.status, Exception):
             raise self.status
-        return self.status
+        return DaemonReply(self.status, self.c_kernel)
 
     def pause(self, _seconds: float) -> None:
         self.on_pause()

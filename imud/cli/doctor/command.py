@@ -150,6 +150,7 @@ CHECKS: Final = (
     DoctorCheck("storage", machine.storage),
     DoctorCheck("power", machine.power),
     DoctorCheck("processor", machine.processor),
+    DoctorCheck("C kernel", daemon.c_kernel),
     DoctorCheck("kernel log", machine.kernel_log),
     DoctorCheck("shared memory", daemon.shared_memory),
     DoctorCheck("Prometheus", daemon.prometheus),

@@ -118,6 +118,19 @@ def socket(at: Surroundings) -> Findings:
         )
 
 
+def c_kernel(at: Surroundings) -> Findings:
+    """Check that the daemon uses the kernel in C."""
+    if at.c_kernel is None:
+        return  # the check `socket` reports a daemon that does not reply
+    if at.c_kernel.active:
+        yield ok("the daemon uses its C kernel")
+    else:
+        yield note(
+            f"the daemon does not use its C kernel, so it needs more CPU time: {at.c_kernel.problem}",
+            "if the CPU load is too high, install imud with a C compiler (docs/install.md)",
+        )
+
+
 def stale_configuration(at: Surroundings) -> Findings:
     """Compare the configuration file with the configuration of the running daemon."""
     if at.config is None:

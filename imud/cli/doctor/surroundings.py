@@ -18,10 +18,9 @@ from typing import Final, NamedTuple
 import msgspec
 
 from imud import config
-from imud.cli.arguments import statuses
 from imud.client.connection import Client
 from imud.config.model import Config, DeviceConfig
-from imud.contracts.status import DeviceStatus
+from imud.contracts.status import CKernelStatus, DeviceStatus
 from imud.model.errors import ConfigError, ImudError, LinkMissing
 from imud.model.units import NS_PER_S
 from imud.utc.system_clock import KernelClock, kernel_clock
@@ -51,13 +50,20 @@ Run = Callable[[Sequence[str]], CommandOutput]
 Fetch = Callable[[str, int, str], str]
 
 
+class DaemonReply(NamedTuple):
+    """Part of the reply to `status` that the checks use."""
+
+    devices: list[DeviceStatus]
+    c_kernel: CKernelStatus | None = None  # None: the daemon is of an older version
+
+
 class Surroundings:
     """The host, or a simulated host of a test. Slow requests run once. Synchronization: one thread."""
 
     def __init__(
         self,
         config_file: Path,
-        ask: Callable[[], list[DeviceStatus]],
+        ask: Callable[[], DaemonReply],
         *,
         root: Path = Path("/"),
         run: Run | None = None,
@@ -69,7 +75,7 @@ class Surroundings:
         boot_utc_ns: Callable[[], int] = lambda: time.time_ns() - time.monotonic_ns(),
         pause: Callable[[float], None] = time.sleep,
     ) -> None:
-        """`ask` returns the status of all devices; it raises ImudError or TimeoutError if the daemon does not reply.
+        """`ask` returns the reply of the daemon; it raises ImudError or TimeoutError if the daemon does not reply.
 
         `sync_s` measures the time of a write to a folder, s. `boot_utc_ns` returns UTC when CLOCK_MONOTONIC was 0.
         `pause` waits for a time in seconds.
@@ -131,7 +137,7 @@ class Surroundings:
     # --- the daemon ---------------------------------------------------------------------------------------------------
 
     @cached_property
-    def _answer(self) -> tuple[list[DeviceStatus] | None, Exception | None]:
+    def _answer(self) -> tuple[DaemonReply | None, Exception | None]:
         try:
             return self._ask(), None
         except (ImudError, TimeoutError, msgspec.ValidationError) as error:
@@ -139,12 +145,19 @@ class Surroundings:
 
     def status_now(self) -> list[DeviceStatus]:
         """Request the status of all devices again. Raises ImudError, TimeoutError, msgspec.ValidationError."""
-        return self._ask()
+        return self._ask().devices
 
     @property
     def status(self) -> list[DeviceStatus] | None:
         """Status of all devices; None if the daemon does not reply."""
-        return self._answer[0]
+        reply = self._answer[0]
+        return None if reply is None else reply.devices
+
+    @property
+    def c_kernel(self) -> CKernelStatus | None:
+        """Use of the kernel in C by the daemon; None if it is unknown."""
+        reply = self._answer[0]
+        return None if reply is None else reply.c_kernel
 
     @property
     def status_error(self) -> Exception | None:
@@ -231,10 +244,11 @@ def measure_sync_s(folder: Path) -> float:
         return (time.monotonic_ns() - begin_ns) / NS_PER_S
 
 
-def ask_daemon(socket: str) -> list[DeviceStatus]:
-    """Request the status of all devices. Raises ImudError, TimeoutError, msgspec.ValidationError."""
+def ask_daemon(socket: str) -> DaemonReply:
+    """Request the status of the daemon. Raises ImudError, TimeoutError, msgspec.ValidationError."""
     with Client(socket) as client:
-        return statuses(client)
+        reply = client.status()
+    return msgspec.convert((reply["devices"], reply.get("c_kernel")), DaemonReply)
 
 
 def file_of_daemon(socket: str) -> Path | None:

@@ -11,7 +11,7 @@ import msgspec
 from imud.attitude.conventions import Convention, Heading
 from imud.attitude.published import FrameWords
 from imud.contracts.condition import DeviceCondition
-from imud.contracts.status import DeviceState, DeviceStatus, MqttStatus, SocketStatus
+from imud.contracts.status import CKernelStatus, DeviceState, DeviceStatus, MqttStatus, SocketStatus
 from imud.model.event import Event, StoredEvent
 from imud.model.sample import FieldInfo, Sample, Sync
 from imud.publishers.socket.subscription import Form
@@ -136,6 +136,7 @@ class StatusResult(msgspec.Struct):
     configuration: str  # absolute path of the daemon's configuration file; empty without a file
     mqtt: list[MqttStatus]  # the output `mqtt`; empty if it does not run
     outputs: dict[str, str]  # problem of each output, or port of an output, that does not work
+    c_kernel: CKernelStatus
 
 
 class DeviceFrame(msgspec.Struct, omit_defaults=True):

@@ -12,7 +12,8 @@ from imud.attitude.conventions import Convention
 from imud.contracts.command import REQUESTED_BY, CalibrationInfo, CalibrationResult, VerbInfo, described, infos
 from imud.contracts.publisher import Batch, DeviceControl
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
-from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus
+from imud.contracts.status import LATENCY_BOUNDS_NS, CKernelStatus, DeviceState, DeviceStatus
+from imud.formats import kernel
 from imud.formats.jsonrpc import (
     PROTOCOL,
     Code,
@@ -231,6 +232,7 @@ def _status(hub: Hub, connection: ClientConnection, _params: NoParams) -> Pieces
         "now_ns": str(now_ns) if texts else now_ns, "devices": made, "socket": socket,
         "configuration": hub.context.configuration, "mqtt": [status() for status in hub.context.outputs.mqtts],
         "outputs": hub.context.outputs.problems(),
+        "c_kernel": CKernelStatus(kernel.present.module is not None, kernel.present.problem),
     }  # fmt: skip
     return MethodReply(result, big_numbers=False)
 

@@ -4,9 +4,9 @@ import os
 
 import pytest
 
-from imud.cli.doctor.daemon import configuration, device_states, service, socket, stale_configuration
+from imud.cli.doctor.daemon import c_kernel, configuration, device_states, service, socket, stale_configuration
 from imud.cli.doctor.surroundings import DoctorCheck
-from imud.contracts.status import DeviceState
+from imud.contracts.status import CKernelStatus, DeviceState
 from imud.model.errors import LinkDenied, LinkMissing, ServerError
 from tests.support.metrics import device
 from tests.support.surroundings import Machine
@@ -70,6 +70,17 @@ def test_no_systemd_and_no_unit(machine: Machine) -> None:
 def test_answers_of_the_socket(machine: Machine, answer: Exception, severity: str) -> None:
     machine.status = answer
     assert [finding.severity for finding in machine.find(SOCKET)] == [severity]
+
+
+def test_use_of_the_kernel_in_c(machine: Machine) -> None:
+    kernel = DoctorCheck("k", c_kernel)
+    assert machine.find(kernel) == []  # no daemon
+    machine.status = []
+    machine.tells(kernel, "ok", "uses its C kernel")
+    machine.c_kernel = CKernelStatus(False, "IMUD_KERNEL=0 switches it off")
+    machine.tells(kernel, "note", "IMUD_KERNEL=0", "C compiler")
+    machine.c_kernel = None  # a daemon of an older version
+    assert machine.find(kernel) == []
 
 
 def test_a_file_newer_than_the_last_reload(machine: Machine) -> None:

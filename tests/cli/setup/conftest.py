@@ -6,11 +6,10 @@ from typing import Final
 
 import pytest
 
-from imud.cli.doctor.surroundings import CommandOutput
+from imud.cli.doctor.surroundings import CommandOutput, DaemonReply
 from imud.cli.probe import ProbeReport
 from imud.cli.setup.hardware import Attached, Finders
 from imud.cli.setup.steps import Conversation, SetupSteps
-from imud.contracts.status import DeviceStatus
 from imud.model.errors import LinkMissing
 from tests.support.surroundings import Machine
 
@@ -30,7 +29,7 @@ class LivingMachine(Machine):
             (self.root / folder[1:]).mkdir(parents=True)
         self.write("/etc/group", GROUPS)
 
-    def ask(self) -> list[DeviceStatus]:
+    def ask(self) -> DaemonReply:
         if self.units.get("imud.service", ["", ""])[1] != "active":
             raise LinkMissing("no daemon at /run/imud/imud.sock")
         return super().ask()
