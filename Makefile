@@ -100,10 +100,10 @@ lint: $(VENV)/made
 
 check: lint test
 
-bench: $(VENV)/made
+bench: $(VENV)/made $(KERNEL)
 	$(BIN)/python -m tests.bench $(ARGS)
 
-bench-instructions: $(VENV)/made
+bench-instructions: $(VENV)/made $(KERNEL)
 	$(BIN)/python -m tests.bench.instructions $(ARGS)
 
 # BASE=COMMIT ARGS="clock socket": both checkouts in turns

@@ -120,10 +120,6 @@ class SamplePath(ABC):
             self._newest = newest
         return newest
 
-    @newest.setter
-    def newest(self, sample: Sample | None) -> None:
-        self._newest = sample
-
     @property
     def fresh(self) -> bool:
         """Return whether a sample arrived since the last `begin`."""
@@ -226,7 +222,7 @@ class SamplePath(ABC):
         """Publish samples as one batch. Their data arrived at `t_rx_ns`, and the path has reported it to its observer:
         an output may read the host clocks, and this reading must follow the data in a recording."""
         self._ledger.samples += len(samples)
-        self.newest = samples[-1]
+        self._newest = samples[-1]
         self.last_sample_ns = t_rx_ns
         if self._rotation is not None:
             samples = self._rotation.samples(samples)
@@ -294,26 +290,24 @@ class StreamPath(SamplePath):
         """Process the bytes of one read. `t_rx_ns` is CLOCK_MONOTONIC right after the read."""
         self.last_data_ns = t_rx_ns
         samples: list[Sample] = []
-        packed, rest, utc_offset_ns = b"", data, None
+        packed = None
         listener = self._listener
-        wants_samples = listener is not None and listener.wants_samples
         try:
             if self._drain_edges is not None:
                 self._drain_edges()
-            if len(data) >= KERNEL_BYTES and not wants_samples:
-                packed, rest, utc_offset_ns = self._stamp(data, t_rx_ns)
-            events = self.codec.feed(rest) if rest else ()
-            if events:
-                if packed:
-                    samples, packed = decode_slots(packed, self._device), b""
-                self._sort(events, t_rx_ns, self._utc_offset_ns() if utc_offset_ns is None else utc_offset_ns, samples)
+            if len(data) >= KERNEL_BYTES and (listener is None or not listener.wants_samples):
+                packed, events = self._stamp(data, t_rx_ns, samples)
+            else:
+                events = self.codec.feed(data)
+                if events:
+                    self._sort(events, t_rx_ns, self._utc_offset_ns(), samples)
         finally:  # a recording must contain the data that caused an exception
             if self.observer is not None:
                 self.observer.data(data, t_rx_ns, -1)
-        if packed:
+        if samples:
+            self._finish([*decode_slots(packed, self._device), *samples] if packed else samples, t_rx_ns)
+        elif packed:
             self._finish_slots(packed, t_rx_ns)
-        elif samples:
-            self._finish(samples, t_rx_ns)
         if listener is not None and listener.wants_samples:
             for event in events:
                 if type(event) is Measurement:
@@ -325,15 +319,14 @@ class StreamPath(SamplePath):
         self.last_data_ns = t_rx_ns
         try:
             self.clock.waited_ns = waited_ns
-            packed, rest, utc_offset_ns = b"", data, None
+            samples: list[Sample] = []
+            packed = b""
             if len(data) >= KERNEL_BYTES and (not self.gathered or isinstance(self.gathered[-1], bytes)):
-                packed, rest, utc_offset_ns = self._stamp(data, t_rx_ns)
+                packed, _ = self._stamp(data, t_rx_ns, samples)
                 if packed:
                     self.gathered.append(packed)
-            events = self.codec.feed(rest) if rest else ()
-            samples: list[Sample] = []
-            if events:
-                self._sort(events, t_rx_ns, self._utc_offset_ns() if utc_offset_ns is None else utc_offset_ns, samples)
+            elif events := self.codec.feed(data):
+                self._sort(events, t_rx_ns, self._utc_offset_ns(), samples)
             self.gathered += samples
             self.clock.waited_ns = 0
             return bool(packed or samples)
@@ -359,18 +352,21 @@ class StreamPath(SamplePath):
         newest = self.gathered[-1] if self.gathered else None
         return isinstance(newest, bytes) or (newest is not None and newest.sync is Sync.REGRESSION)
 
-    def _stamp(self, data: bytes, t_rx_ns: int) -> tuple[bytes, bytes, int | None]:
-        """Process usual frames at the start of `data` with the kernel. Return their slots, the rest of the data, and
-        the offset of UTC if imud has read it."""
+    def _stamp(self, data: bytes, t_rx_ns: int, samples: list[Sample]) -> tuple[bytes, Sequence[CodecEvent]]:
+        """Process usual frames at the start of `data` with the kernel, then the rest as `_sort`. Return the slots of
+        the frames and the events of the rest."""
         codec, clock = self._kernel_codec, self.clock
-        if codec is None or not clock.is_even or (frames := codec.usual_frames(data)) is None:
-            return b"", data, None
-        utc_offset_ns = self._utc_offset_ns()
-        packed = clock.stamp_frames(frames, self._device_id, t_rx_ns, utc_offset_ns)
-        if packed:
-            self.loss.bad_frames = 0
-            data = codec.take(frames, len(packed) // SLOT_BYTES, data)
-        return packed, data, utc_offset_ns
+        packed, utc_offset_ns = b"", None
+        if codec is not None and clock.is_even and (frames := codec.usual_frames(data)) is not None:
+            utc_offset_ns = self._utc_offset_ns()
+            packed = clock.stamp_frames(frames, self._device_id, t_rx_ns, utc_offset_ns)
+            if packed:
+                self.loss.bad_frames = 0
+                data = codec.take(frames, len(packed) // SLOT_BYTES, data)
+        events = self.codec.feed(data) if data else ()
+        if events:
+            self._sort(events, t_rx_ns, self._utc_offset_ns() if utc_offset_ns is None else utc_offset_ns, samples)
+        return packed, events
 
     def _flush(self, now_ns: int, samples: list[Sample]) -> None:
         """Process complete frames inside an incomplete longer frame."""
