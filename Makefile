@@ -17,6 +17,7 @@
 # make pictures   the pictures of README.md and docs/, into docs/pictures
 # make web-pictures   the pictures of `imud web`, in a real browser, into docs/pictures
 # make fuzz   every decoder of foreign bytes, 60 s each, with a table
+# make sanitize   tests of the C kernel with AddressSanitizer and UndefinedBehaviorSanitizer
 # make audit  items of both manuals: code and tests of each
 # make deb    the Debian package of this release and architecture, into build/deb (RELEASE=trixie ARCH=arm64: of others)
 # make deb-try   installs, upgrades, removes and purges it in a Debian in a folder (as root)
@@ -150,7 +151,12 @@ $(VENV)/made-fuzz: $(VENV)/made
 fuzz: $(VENV)/made-fuzz
 	$(BIN)/python -m tests.fuzz $(ARGS)
 
-# the compiler for the fuzzer of imud.h
+# tests of the kernel in C with AddressSanitizer and UndefinedBehaviorSanitizer
+.PHONY: sanitize
+sanitize: $(VENV)/made
+	$(BIN)/python -m tests.fuzz.kernel $(ARGS)
+
+# the compiler for the fuzzer of imud.h and for the sanitizers
 fuzz-deps:
 	apt-get install --yes --no-install-recommends clang libclang-rt-14-dev
 

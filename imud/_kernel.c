@@ -238,7 +238,7 @@ static int stamp(Run *run, double *error_ns, Slot *slot, const uint8_t *frame, i
     int is_new = !run->waited_ns || above_ns <= 0.0; /* a held frame above the fit contains no new information */
     if (!is_new)
         above_ns = fmax(above_ns - run->waited_ns, 0.0);
-    if (!(fabs(wanted_ns) < TIME_MOST_NS))
+    if (!(fabs(wanted_ns) < TIME_MOST_NS) || next_ns > TIME_MOST_NS || run->raw_ns > TIME_MOST_NS)
         return 0;
     int64_t steady_ns = (int64_t)wanted_ns, t_ns = steady_ns + run->offset_ns;
     *error_ns = run->fit_error_ns + run->slope_error * (double)(next_ns - run->fitted_ns) + run->doubt_ns;
@@ -270,7 +270,7 @@ static int is_in_range(const Run *run)
 {
     const int64_t times_ns[] = {
         run->seq, run->t_ns, run->t_rx_ns, run->utc_offset_ns / 4, run->waited_ns, run->offset_ns, run->device_ns,
-        run->raw_ns, run->ref_arrival_ns, run->ref_device_ns, run->fitted_ns,
+        run->raw_ns, run->ref_arrival_ns, run->ref_device_ns, run->fitted_ns, run->bin.count, run->bin.late,
     };
     for (size_t i = 0; i < sizeof times_ns / sizeof *times_ns; i++)
         if (times_ns[i] > TIME_MOST_NS || times_ns[i] < -TIME_MOST_NS)
@@ -299,7 +299,7 @@ static PyObject *stamp_hi91(PyObject *self, PyObject *args)
             &bin->arrival_ns, &bin->lowest, &bin->wait, &bin->wait_least, &bin->wait_most, &bin->count, &bin->late,
             &bin->late_ns))
         return NULL;
-    if (count < 0 || count > size / FRAME_BYTES || !is_in_range(&run))
+    if (count < 0 || count > size / FRAME_BYTES || size > INT32_MAX || !is_in_range(&run))
         Py_RETURN_NONE;
     PyObject *slots = PyBytes_FromStringAndSize(NULL, count * (Py_ssize_t)sizeof(Slot));
     if (slots == NULL)

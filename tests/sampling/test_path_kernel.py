@@ -1,8 +1,11 @@
 """The kernel and the Python code make the same samples of the same bytes: slots, ledger, latencies, losses, state."""
 
+import contextlib
+import math
 import struct
 import sys
 from collections.abc import Sequence
+from random import Random
 from typing import Any, NamedTuple
 from unittest.mock import Mock
 
@@ -172,6 +175,40 @@ def test_kernel_and_python_are_equal(steps: list[Step], options: HipnucOptions, 
     by_kernel, by_python = (play(steps, options, turned, one) for one in (kernel.present, kernel.Kernel(None)))
     for one, other in zip(by_kernel.result(), by_python.result(), strict=True):
         assert one == other
+
+
+EXTREMES: list[Any] = [
+    0, -1, 1, 2**31, 2**32 - 1, 2**60, -(2**60), 2**62, 2**63 - 1, -(2**63), 2**64, 0.0, -1.0, 1e18, -1e300, math.inf,
+    math.nan,
+]  # fmt: skip
+
+
+def test_the_kernel_accepts_any_bytes_and_numbers() -> None:
+    module = kernel.present.module
+    assert module is not None
+    calls = Mock(wraps=module)
+    play([Step(10)] * 10, HipnucOptions(), False, kernel.Kernel(calls))
+    data, _, *values = calls.stamp_hi91.call_args.args
+    random, made_slots = Random(25), 0
+    for _ in range(3000):
+        stream = bytearray(data[: random.choice([len(data), random.randrange(len(data) + 1)])])
+        if stream and random.random() < 0.3:
+            stream[random.randrange(len(stream))] ^= random.randrange(1, 256)
+        frames = module.count_hi91(bytes(stream))
+        assert 0 <= frames <= len(stream) // len(hi91(0))
+        numbers = [list(one) if isinstance(one, tuple) else [one] for one in values]
+        for _ in range(random.randrange(4)):
+            group = random.choice(numbers)
+            group[random.randrange(len(group))] = random.choice(EXTREMES)
+        arguments = [
+            tuple(group) if isinstance(one, tuple) else group[0] for one, group in zip(values, numbers, strict=True)
+        ]
+        with contextlib.suppress(OverflowError, TypeError):  # 2⁶⁴, and a float in place of an integer
+            made = module.stamp_hi91(
+                bytes(stream), random.choice([frames, frames, len(stream) // 82, -1, 2**31]), *arguments
+            )
+            made_slots += made is not None
+    assert made_slots > 300
 
 
 @pytest.mark.parametrize("cut", [0, 40])
