@@ -70,6 +70,14 @@ def members(sdist: Path) -> dict[str, bytes]:
         return {name: file.read() for name, file in read.items() if file is not None}
 
 
+def test_a_wheel_without_a_compiler_has_only_python_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", str(tmp_path / "none"))
+    wheel = build(ROOT, tmp_path, "wheel")
+    assert wheel.name.endswith("-py3-none-any.whl")
+    with zipfile.ZipFile(wheel) as file:
+        assert KERNEL not in file.namelist()
+
+
 def test_the_wheel_has_every_file_of_the_package_as_it_is_and_no_other(distributions: tuple[Path, Path]) -> None:
     wanted = {path for path in repository() if path.startswith("imud/")}
     with zipfile.ZipFile(distributions[0]) as wheel:
