@@ -293,8 +293,8 @@ static PyObject *stamp_hi91(PyObject *self, PyObject *args)
     if (!PyArg_ParseTuple(
             args, "y#nii(iLLLLLLddLLL)(LLLLddLLLLddd)(LLddddLLd):stamp_hi91", &data, &size, &count, &run.word_is_status,
             &run.device_id, &run.sync, &run.own_status, &run.seq, &run.t_ns, &run.t_rx_ns, &run.byte_ns, &run.waited_ns,
-            &run.bias_ns, &run.fit_error_ns, &run.utc_offset_ns, &run.offset_ns, &run.even_from_ns, &run.ticks, &run.device_ns,
-            &run.raw_ns, &run.tick_ns, &run.period_ticks, &run.doubt_ns, &run.ref_arrival_ns, &run.ref_device_ns,
+            &run.bias_ns, &run.fit_error_ns, &run.utc_offset_ns, &run.offset_ns, &run.even_from_ns, &run.ticks,
+            &run.device_ns, &run.raw_ns, &run.tick_ns, &run.period_ticks, &run.doubt_ns, &run.ref_arrival_ns, &run.ref_device_ns,
             &run.fitted_ns, &run.until_ns, &run.slope, &run.slope_error, &run.wait_most, &bin->device_ns,
             &bin->arrival_ns, &bin->lowest, &bin->wait, &bin->wait_least, &bin->wait_most, &bin->count, &bin->late,
             &bin->late_ns))
