@@ -113,7 +113,7 @@ class VirtualDaemon:
     def tick(self, newest: Sample) -> None:
         """Tick after another sample: the newest sample and the ledger differ from the last tick."""
         path = self._path
-        path.newest, path.last_sample_ns = newest, virtual_time.now_ns()
+        path._newest, path.last_sample_ns = newest, virtual_time.now_ns()
         self._device.ledger.samples += 1
         virtual_time.set_now(virtual_time.now_ns() + round(QUIET_TICK_S * NS_PER_S))
         self._daemon.on_alarm()
