@@ -53,12 +53,12 @@ $(VENV)/made: $(VENV)/made-runtime
 	$(PIP) install --editable '.[dev]'
 	@touch $@
 
-# The optional kernel in C. Without a compiler, the tests use only the Python code.
+# The optional kernel in C. Without a compiler, imud uses only its Python code.
 KERNEL := imud/_kernel.abi3.so
 $(KERNEL): imud/_kernel.c hatch_build.py $(VENV)/made-runtime
 	-$(BIN)/python hatch_build.py
 
-demo: $(VENV)/made-runtime
+demo: $(VENV)/made-runtime $(KERNEL)
 	$(BIN)/imud demo $(ARGS)
 
 # Most `live` tests wait for a process, so that four processes use two cores. One folder: ARGS=tests/links PROCESSES=0

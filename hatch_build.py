@@ -11,6 +11,7 @@ import sys
 import sysconfig
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 try:
     from hatchling.builders.hooks.plugin.interface import BuildHookInterface
@@ -29,9 +30,12 @@ def compile_kernel(root: Path, compiler: str = "", options: tuple[str, ...] = ()
     include = sysconfig.get_paths()["include"]
     target = root / LIBRARY
     made = target.with_suffix(f".{os.getpid()}")  # a running imud keeps the old file
+    source = root / SOURCE
+    # imud does not use a library of another source
+    version = f"-DSOURCE_CRC={crc32(source.read_bytes())}u"
     try:
         subprocess.run(
-            [*command, *OPTIONS, *options, f"-I{include}", str(root / SOURCE), "-o", str(made), "-lm"],
+            [*command, *OPTIONS, *options, version, f"-I{include}", str(source), "-o", str(made), "-lm"],
             check=True, capture_output=True, text=True,
         )  # fmt: skip
         made.replace(target)

@@ -17,6 +17,10 @@
 #include <stdint.h>
 #include <string.h>
 
+#ifndef SOURCE_CRC
+#error "compile the kernel with hatch_build.py, which defines the CRC-32 of this file"
+#endif
+
 #if __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
 #error "frames and slots are little-endian: use the Python code on this host"
 #endif
@@ -338,5 +342,10 @@ static struct PyModuleDef module = {PyModuleDef_HEAD_INIT, "imud._kernel", NULL,
 PyMODINIT_FUNC PyInit__kernel(void)
 {
     make_tables();
-    return PyModule_Create(&module);
+    PyObject *made = PyModule_Create(&module);
+    PyObject *source_crc = PyLong_FromUnsignedLong(SOURCE_CRC);
+    if (made == NULL || PyModule_AddObjectRef(made, "source_crc", source_crc) < 0)
+        Py_CLEAR(made);
+    Py_XDECREF(source_crc);
+    return made;
 }

@@ -5,12 +5,16 @@ The value 0 of the environment variable IMUD_KERNEL switches the kernel off.
 
 import os
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import Final, NamedTuple
+from zlib import crc32
+
+SOURCE: Final = Path(__file__).parent.parent / "_kernel.c"
 
 
 class Kernel(NamedTuple):
-    """The loaded kernel, or the reason why there is none."""
+    """The loaded kernel, or the reason why imud does not use it."""
 
     module: ModuleType | None
     problem: str = ""  # one sentence; empty if the kernel is loaded
@@ -21,9 +25,13 @@ def load(setting: str | None) -> Kernel:
     if setting == "0":
         return Kernel(None, "IMUD_KERNEL=0 switches it off")
     try:
-        return Kernel(import_module("imud._kernel"))
-    except ImportError as error:
+        module = import_module("imud._kernel")
+        source_crc = crc32(SOURCE.read_bytes())
+    except (ImportError, OSError) as error:
         return Kernel(None, f"it is not installed: {error}")
+    if getattr(module, "source_crc", None) != source_crc:  # a checkout with an older library
+        return Kernel(None, "it was compiled from another version of imud/_kernel.c; compile it again")
+    return Kernel(module)
 
 
 # Kernel of this process. Users read it at each call, so that a test can replace it.

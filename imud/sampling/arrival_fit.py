@@ -201,7 +201,7 @@ class ArrivalFit:
         )  # fmt: skip
 
     def set_open_bin(self, state: tuple[int, int, float, float, float, float, int, int, float], added: int) -> None:
-        """Set the state of the newest bin after `added` arrivals, none of which changes the fit."""
+        """Set the state of the newest bin after `added` arrivals. They do not change the fit."""
         b = self._open
         b.device_ns, b.arrival_ns, b.lowest, b.wait, b.wait_least, b.wait_most, b.count, b.late, b.late_ns = state
         self.count += added

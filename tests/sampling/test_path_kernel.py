@@ -26,7 +26,7 @@ from imud.recording.state import StateWriter
 from imud.sampling.clock import SampleClock
 from imud.sampling.path import PathContext, StreamPath, make_clock
 from tests.support.event_loops import UTC_AHEAD_NS
-from tests.support.files import hi91
+from tests.support.files import ROOT, hi91
 
 BYTE_NS = 10_851
 SETTLE = 400  # frames of 1 ms until imud uses the fit and does not watch the counter
@@ -164,6 +164,8 @@ def play(steps: Sequence[Step], options: HipnucOptions, turned: bool, found: ker
 def test_a_variable_of_the_environment_switches_the_kernel_off(monkeypatch: pytest.MonkeyPatch) -> None:
     assert kernel.load("0") == kernel.Kernel(None, "IMUD_KERNEL=0 switches it off")
     assert kernel.load("1").module is kernel.load(None).module is not None
+    monkeypatch.setattr(kernel, "SOURCE", ROOT / "hatch_build.py")
+    assert kernel.load(None).problem.startswith("it was compiled from another version")
     monkeypatch.setitem(sys.modules, "imud._kernel", None)
     assert kernel.load(None).problem.startswith("it is not installed: ")
 
