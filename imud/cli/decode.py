@@ -3,7 +3,7 @@
 A capture contains bytes, raw or time-stamped. For CAN drivers, the capture is a log of `candump -L`. The objects are:
 a measurement with the field names of a sample (`t_dev_ns` unwrapped, or `index` if the device numbers its samples; no
 host time), `{"text": …}` for a line of text, `{"reply": kind, "payload": hex}` for a binary reply,
-`{"bad_frame": reason, "raw": hex}` for a damaged frame.
+`{"bad_frame": reason, "raw": hex}` for a damaged frame, with `can_id` for a CAN frame of a wrong length.
 """
 
 import argparse
@@ -114,7 +114,8 @@ def as_object(event: CodecEvent, times: "UnwrappedTime") -> dict[str, object]:
     if isinstance(event, ReplyFrame):
         return {"reply": event.frame_id, "payload": event.payload.hex()}
     if isinstance(event, BadFrame):
-        return {"bad_frame": str(event.reason), "raw": event.raw.hex()}
+        shown_bad: dict[str, object] = {"bad_frame": str(event.reason), "raw": event.raw.hex()}
+        return shown_bad if event.can_id is None else shown_bad | {"can_id": f"{event.can_id:03X}"}
     shown: dict[str, object] = {}
     if event.dev_ticks is not None:
         shown[times.key] = times.unwrap(event.dev_ticks)

@@ -31,6 +31,14 @@ class BadFrame(msgspec.Struct, frozen=True, gc=False):
     reason: BadReason
     # Received bytes from the sync word to the end of the frame by its length field; fewer bytes if the rest is missing
     raw: bytes
+    can_id: int | None = None  # identifier of a CAN frame
+
+
+def wrong_length(ledger: Ledger, can_id: int, data: bytes) -> tuple[BadFrame]:
+    """Count a CAN frame of a known identifier with another length than the manual's. Return its event."""
+    ledger.bytes_in_bad_frames += len(data)
+    ledger.frames_bad_length += 1
+    return (BadFrame(BadReason.LENGTH, data, can_id),)
 
 
 CodecEvent = Measurement | TextLine | ReplyFrame | BadFrame

@@ -72,10 +72,11 @@ class DeviceEvents:
         if bad and self._last_bad is not None:
             frame = self._last_bad
             shown = frame.raw[:RAW_SHOWN_BYTES].hex(" ")
+            of = "" if frame.can_id is None else f" of CAN identifier {frame.can_id:03X}"
             self.raise_event(
                 now_ns,
                 EventKind.BAD_FRAME,
-                f"{_counted(bad, 'bad frame')}, the last by {frame.reason}: {shown}",
+                f"{_counted(bad, 'bad frame')}, the last by {frame.reason}{of}: {shown}",
                 count=bad,
             )
         self._lost, self._bad = ledger.lost(), troubled

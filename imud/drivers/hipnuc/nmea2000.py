@@ -24,7 +24,7 @@ from msgspec import Meta
 
 from imud.attitude.conventions import Heading
 from imud.attitude.rotation import euler312_from_quat, quat_from_euler312
-from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
+from imud.contracts.codec import CodecEvent, count_unknown, wrong_length
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Identity
 from imud.contracts.script import says_nothing
 from imud.drivers.hipnuc.assembly import Assembled, Assembly
@@ -196,9 +196,7 @@ class HipnucNmea2000Codec:
                 count_unknown(self.unknown, split(can_id).pgn)
             return ()
         if size != MESSAGE_BYTES:
-            ledger.bytes_in_bad_frames += size
-            ledger.frames_bad_length += 1
-            return (BadFrame(BadReason.LENGTH, data),)
+            return wrong_length(ledger, can_id, data)
         ledger.bytes_in_good_frames += size
         ledger.frames_good += 1
         sid, reference = head_of(pgn, data)

@@ -36,7 +36,7 @@ from msgspec import Meta
 
 from imud.attitude.conventions import FLU_LEVEL
 from imud.attitude.rotation import quat_from_euler_zyx
-from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown, wrong_length
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Identity, random_vector
 from imud.contracts.script import says_nothing
 from imud.drivers.imu61x.common import (
@@ -154,9 +154,7 @@ class Imu61xCanCodec:
                 count_unknown(self.unknown, can_id)
             return ()
         if size != FRAME_BYTES:
-            ledger.bytes_in_bad_frames += size
-            ledger.frames_bad_length += 1
-            return (BadFrame(BadReason.LENGTH, data),)
+            return wrong_length(ledger, can_id, data)
         ledger.bytes_in_good_frames += size
         ledger.frames_good += 1
         if slot == _CLOSING:
@@ -175,7 +173,8 @@ class Imu61xCanCodec:
         return ()
 
     def flush(self) -> Sequence[CodecEvent]:
-        """Return no event: only a 105 completes a set."""
+        """Return no event, because only a 105 completes a set. Count the held frames."""
+        self.reset()
         return ()
 
     def reset(self) -> None:

@@ -202,7 +202,7 @@ def test_a_burst_makes_a_sample_and_other_frames_do_not() -> None:
     assert feed(learned(), burst(42), 1000 * MS) == [42]
     assert [can_id for can_id, _ in burst(0)] == [0x09F11223, 0x09F11323, 0x0DF11923]
     codec = make()
-    assert codec.feed_frame(0x09F11223, True, b"\1", 0) == (BadFrame(BadReason.LENGTH, b"\1"),)
+    assert codec.feed_frame(0x09F11223, True, b"\1", 0) == (BadFrame(BadReason.LENGTH, b"\1", 0x09F11223),)
     skipped = [(0x09F11423, True), (0x11223, False), (0x09F112FE, True), (0x08F11223, True)]
     for can_id, extended in skipped:
         assert not codec.feed_frame(can_id, extended, bytes(8), 0)

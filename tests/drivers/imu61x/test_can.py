@@ -214,7 +214,8 @@ def test_time_separates_complete_and_mixed_sets() -> None:
 def test_wrong_length_is_a_bad_frame() -> None:
     codec = make()
     events = feed(codec, [*sample(1)[:2], (103, b"\1\2\3")])
-    assert events == [BadFrame(BadReason.LENGTH, b"\1\2\3")]
+    assert events == [BadFrame(BadReason.LENGTH, b"\1\2\3", 103)]
+    assert (codec.flush(), codec.ledger.frames_ignored, codec.ledger.frames_pending) == ((), 2, 0)
     assert (codec.ledger.frames_bad_length, codec.ledger.bytes_in_bad_frames) == (1, 3)
 
     frames = sample(1)

@@ -25,7 +25,7 @@ from typing import Annotated, Final, Literal
 from msgspec import Meta
 
 from imud.attitude.rotation import quat_from_euler312
-from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
+from imud.contracts.codec import CodecEvent, count_unknown, wrong_length
 from imud.contracts.script import ReplyFrame
 from imud.drivers.hipnuc.assembly import Assembled, Assembly
 from imud.drivers.hipnuc.canopen.cia301 import (
@@ -108,7 +108,7 @@ class HipnucCanopenCodec:
             return self._other(can_id, extended, data)
         number, expected = tpdo
         if size != expected:
-            return self._bad_length(data)
+            return wrong_length(ledger, can_id, data)
         ledger.bytes_in_good_frames += size
         ledger.frames_good += 1
         made = self._assembly.add_frame(number, data, t_rx_ns)
@@ -131,7 +131,7 @@ class HipnucCanopenCodec:
                 count_unknown(self.unknown, can_id)
             return ()
         if size != (1 if can_id == self._heartbeat_id else SDO_BYTES):
-            return self._bad_length(data)
+            return wrong_length(ledger, can_id, data)
         ledger.bytes_in_good_frames += size
         ledger.frames_good += 1
         if can_id == self._sdo_id or (can_id == self._heartbeat_id and self._is_news(data[0])):
@@ -147,11 +147,6 @@ class HipnucCanopenCodec:
         if state == NmtState.BOOT_UP.value:
             self._assembly.reset()
         return changed or state != NmtState.OPERATIONAL.value
-
-    def _bad_length(self, data: bytes) -> Sequence[CodecEvent]:
-        self.ledger.bytes_in_bad_frames += len(data)
-        self.ledger.frames_bad_length += 1
-        return (BadFrame(BadReason.LENGTH, data),)
 
 
 def _measurement(assembled: Assembled) -> Measurement:

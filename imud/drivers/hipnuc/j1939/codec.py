@@ -19,7 +19,7 @@ from typing import Annotated, Final, Literal
 from msgspec import Meta
 
 from imud.attitude.rotation import quat_from_euler312
-from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
+from imud.contracts.codec import CodecEvent, count_unknown, wrong_length
 from imud.contracts.script import ReplyFrame
 from imud.drivers.hipnuc.assembly import Assembly
 from imud.drivers.hipnuc.common import (
@@ -291,9 +291,7 @@ class HipnucJ1939Codec:
                 count_unknown(self.unknown, split(can_id).pgn)
             return ()
         if size != MESSAGE_BYTES:
-            ledger.bytes_in_bad_frames += size
-            ledger.frames_bad_length += 1
-            return (BadFrame(BadReason.LENGTH, data),)
+            return wrong_length(ledger, can_id, data)
         ledger.bytes_in_good_frames += size
         ledger.frames_good += 1
         if pgn is None:

@@ -93,7 +93,9 @@ def test_a_node_without_barometer_has_no_pressure(sent: int, pressure_pa: float 
 def test_which_frames_count() -> None:
     for number, text in GOLDEN.items():
         codec, data = make(), bytes.fromhex(text)[:-1]
-        assert codec.feed_frame(FUNCTIONS[number] + 8, False, data, 0) == (BadFrame(BadReason.LENGTH, data),)
+        assert codec.feed_frame(FUNCTIONS[number] + 8, False, data, 0) == (
+            BadFrame(BadReason.LENGTH, data, FUNCTIONS[number] + 8),
+        )
         assert (codec.ledger.frames_bad_length, codec.ledger.bytes_in_bad_frames) == (1, len(data))
         assert codec.ledger.closes()
     codec = make()
@@ -107,7 +109,7 @@ def test_which_frames_count() -> None:
     codec = make()
     data = bytes.fromhex("60 00 20 00 00 00 00 00")
     assert codec.feed_frame(0x588, False, data, 0) == (ReplyFrame(0x588, data),)
-    assert codec.feed_frame(0x588, False, data[:7], 0) == (BadFrame(BadReason.LENGTH, data[:7]),)
+    assert codec.feed_frame(0x588, False, data[:7], 0) == (BadFrame(BadReason.LENGTH, data[:7], 0x588),)
     assert codec.feed_frame(0x608, False, data, 0) == ()  # from another master
     assert codec.ledger.frames_in_replies == 1
     assert codec.ledger.closes()
@@ -127,7 +129,7 @@ def test_heartbeats_are_news_when_the_state_changes_or_is_not_operational() -> N
     told = [state for state in states if codec.feed_frame(0x708, False, bytes([state]), 0)]
     assert told == [0x7F, 0x7F, 5, 4, 0, 5]
     assert codec.ledger.frames_ignored == 3
-    assert codec.feed_frame(0x708, False, b"", 0) == (BadFrame(BadReason.LENGTH, b""),)
+    assert codec.feed_frame(0x708, False, b"", 0) == (BadFrame(BadReason.LENGTH, b"", 0x708),)
     assert codec.ledger.closes()
     codec = make()
     feed_bursts(codec, [1, 2, 3])

@@ -265,7 +265,7 @@ def test_samples_of_several_modules_slow_messages_and_loss() -> None:
 
 def test_which_frames_count() -> None:
     codec = make()
-    assert codec.feed_frame(0x0CFF3408, True, b"\1\2\3", 0) == (BadFrame(BadReason.LENGTH, b"\1\2\3"),)
+    assert codec.feed_frame(0x0CFF3408, True, b"\1\2\3", 0) == (BadFrame(BadReason.LENGTH, b"\1\2\3", 0x0CFF3408),)
     skipped = [(0x0CFF3508, True), (0x0CFF3409, True), (0x0CEF0855, True), (0x0DFF3408, True), (0x0CFF3408, False)]
     for can_id, extended in skipped:
         assert not codec.feed_frame(can_id, extended, bytes(8), 0)
