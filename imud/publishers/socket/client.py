@@ -154,18 +154,18 @@ class ClientWakers:
 class Clients(ABC):
     """Base class of the hub: all clients, their common memory, and the counters of `status`."""
 
-    def __init__(self, pool: Pool, now_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, pool: Pool, now_ns: Callable[[], int], handle_line: Callable[["ClientConnection", bytes], None]
+    ) -> None:
+        """`handle_line` carries out the request in a line."""
         self.pool = pool
+        self.handle_line = handle_line
         self.connections: dict[int, ClientConnection] = {}  # the clients by number
         self.accepted = 0  # connections accepted since start; the number of the newest
         self.refused = 0
         self.evicted = 0  # clients disconnected because they exceeded a limit
         self._failed = 0
         self._failures = RateLimitedLog(now_ns)
-
-    @abstractmethod
-    def handle_line(self, connection: "ClientConnection", line: bytes) -> None:
-        """Carry out the request in `line`."""
 
     @abstractmethod
     def remove(self, connection: "ClientConnection") -> None:
@@ -206,7 +206,8 @@ class ClientConnection(Outbox, ScheduledClient):
         self._work: Iterator[int] | None = None  # an unfinished reply
         self._work_bytes = 0
         self._readable = self._writable = False
-        self._linger_ticks: int | None = None
+        self.finishing = False  # whether the connection only sends its queue and then ends
+        self._linger_ticks = LINGER_TICKS
         self._input_ended = False  # whether the client has shut down its sending direction
 
     def post(self, body: bytes, fd: int = NO_FD) -> None:
@@ -215,16 +216,6 @@ class ClientConnection(Outbox, ScheduledClient):
             self.put_reply(frame_of(body) if self.framed else line_of(body), fd)
             if not self.waiting:
                 self.wakers.close_copies()
-
-    @property
-    def unread_bytes(self) -> int:
-        """Bytes of the requests that are not carried out yet, and of the unfinished reply."""
-        return len(self._input) + self._work_bytes
-
-    @property
-    def finishing(self) -> bool:
-        """Whether the connection only sends its queue and then ends."""
-        return self._linger_ticks is not None
 
     def status(self, encoding: str) -> ClientStatus:
         """Return the state of this client; `encoding` is the encoding of its subscription, empty without one."""
@@ -253,7 +244,7 @@ class ClientConnection(Outbox, ScheduledClient):
         if self.closed or self.finishing:
             return
         self._drop_requests()
-        self._linger_ticks = LINGER_TICKS
+        self.finishing = True
         if not self.waiting:
             self.close()
 
@@ -262,11 +253,11 @@ class ClientConnection(Outbox, ScheduledClient):
         down its sending direction. Return whether the connection needs the next tick within 100 ms."""
         if self._input_ended:
             self._finish_if_done()
-        if self._linger_ticks is not None:
+        if self.finishing:
             self._linger_ticks -= 1
             if self._linger_ticks <= 0:
                 self.close()
-        return self._input_ended or self._linger_ticks is not None
+        return self._input_ended or self.finishing
 
     def close(self) -> None:
         """Close the connection immediately. A second call does nothing."""
@@ -295,9 +286,15 @@ class ClientConnection(Outbox, ScheduledClient):
             if self._work is not None:
                 self._step()
             else:
-                self._serve_line()
-        if not self.closed:
-            self.set_request_bytes(self.unread_bytes)
+                line = self._next_line()
+                if line is None and self._readable and not self.finishing:
+                    self._read()
+                    line = self._next_line()
+                if line is not None:
+                    self._clients.handle_line(self, line)
+        if self.closed:
+            return False
+        self.set_request_bytes(len(self._input) + self._work_bytes)
         if self.closed:
             return False
         if self._writable and self.waiting:
@@ -344,14 +341,6 @@ class ClientConnection(Outbox, ScheduledClient):
 
     # --- input --------------------------------------------------------------------------------------------------------
 
-    def _serve_line(self) -> None:
-        line = self._next_line()
-        if line is None and self._readable and not self.finishing:
-            self._read()
-            line = self._next_line()
-        if line is not None:
-            self._clients.handle_line(self, line)
-
     def _read(self) -> None:
         try:
             data = self._sock.recv(RECV_BYTES)
@@ -369,7 +358,7 @@ class ClientConnection(Outbox, ScheduledClient):
             self._finish_if_done()
             return
         self._readable = len(data) == RECV_BYTES
-        self.count_bytes(len(data))
+        self.data.use(len(data))
         self._input += data if self._input else data.lstrip(BLANK)
 
     def _finish_if_done(self) -> None:

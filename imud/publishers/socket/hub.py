@@ -3,8 +3,9 @@
 import asyncio
 import logging
 import socket
-from collections.abc import Callable, Collection, Coroutine, Iterable, Iterator, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from functools import partial
+from typing import Final
 
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.contracts.status import ClientStatus, SocketStatus
@@ -168,7 +169,7 @@ class Hub(Clients):
         pool: Pool,
         handle_line: Callable[["Hub", ClientConnection, bytes], None],
     ) -> None:
-        super().__init__(pool, context.clock.now_ns)
+        super().__init__(pool, context.clock.now_ns, partial(handle_line, self))
         self.path = path
         self.context = context
         self.control_group = "the control group"  # name of the group that may control, for error messages
@@ -177,12 +178,11 @@ class Hub(Clients):
         self.recordings = ClientRecordings(context, quota.check_fds)
         self._quota = quota
         self._time = time
-        self._handle_line = handle_line
         self._subscriptions: dict[int, Subscription] = {}
         # devices with events for a client, None for all. A client without events is absent.
         self._events: dict[int, Collection[str] | None] = {}
         self._plans: dict[str, DeliveryPlan] = {}
-        self._work: dict[int, asyncio.Future[None]] = {}  # running request of a client, by client number
+        self.running: dict[int, asyncio.Task[None]] = {}  # running request of a client, by client number
         self._wanting_wake: dict[str, dict[ClientConnection, None]] = {}  # clients with a waker, by device
         # clients that imud has not woken yet for the newest batch of a device
         self._to_wake: dict[str, list[ClientConnection]] = {}
@@ -222,6 +222,8 @@ class Hub(Clients):
     def event(self, event: Event) -> None:
         """Send an event to the clients that asked for it. Events of the daemon (device "") go to all of them."""
         self.recordings.event(event)
+        if not self._events:
+            return
         device = event.device
         wanting = [
             self.connections[number]
@@ -279,9 +281,6 @@ class Hub(Clients):
 
     # --- requests of a client -----------------------------------------------------------------------------------------
 
-    def handle_line(self, connection: ClientConnection, line: bytes) -> None:
-        self._handle_line(self, connection, line)
-
     def subscribe(self, connection: ClientConnection, subscription: Subscription) -> None:
         """Send samples to a client, in place of its previous subscription.
 
@@ -335,20 +334,10 @@ class Hub(Clients):
         """Return whether a client has a waker for `device`."""
         return device in self._wanting_wake
 
-    def busy(self, connection: ClientConnection) -> bool:
-        """Return whether a request of the client still runs."""
-        return connection.number in self._work
-
     def has_news_for(self, connection: ClientConnection) -> bool:
         number = connection.number
-        sources = (self._subscriptions, self._events, self._work, self.recordings.running)
-        return bool(connection.wakers) or any(number in source for source in sources)
-
-    def do_later(self, connection: ClientConnection, work: Coroutine[Any, Any, None]) -> None:
-        """Run a request that takes time. It continues if the client leaves."""
-        number = connection.number
-        task = self._work[number] = asyncio.ensure_future(work)
-        task.add_done_callback(lambda _done: self._work.pop(number, None))
+        is_asked = number in self._subscriptions or number in self._events or number in self.running
+        return is_asked or number in self.recordings.running or bool(connection.wakers)
 
     # --- clients ------------------------------------------------------------------------------------------------------
 
@@ -393,7 +382,7 @@ class Hub(Clients):
         self.recordings.close()
         for connection in list(self.connections.values()):
             connection.close()
-        for task in list(self._work.values()):
+        for task in list(self.running.values()):
             task.cancel()
 
 

@@ -1,5 +1,6 @@
 """Methods of the UNIX socket: the table METHODS, and the path from a line to its reply."""
 
+import asyncio
 from collections.abc import Callable, Collection, Coroutine, Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -141,37 +142,30 @@ def handle_line(hub: Hub, connection: ClientConnection, line: bytes) -> None:
         connection.post(encode_error(error))
         return
     try:
-        reply = _call(hub, connection, request)
+        method = METHODS.get(request.method)
+        if method is None:
+            message = f"no method {request.method[:64]!r}; there are: {', '.join(METHODS)}"
+            raise RpcError(Code.METHOD_NOT_FOUND, message)
+        if method.right not in connection.rights:
+            raise RpcError(Code.DENIED, f"{request.method}: expected root or a member of {hub.control_group}")
+        if not request.wants_reply and not method.acts:
+            return
+        try:
+            params = msgspec.convert(request.params, method.params)
+        except msgspec.ValidationError:
+            wrong = "; ".join(map(str, wrong_values(method.params, request.params, "parameter")))
+            raise RpcError(Code.INVALID_PARAMS, f"{request.method}: {wrong}") from None
+        reply = method.run(hub, connection, params)
     except RpcError as error:
         if request.wants_reply:
             connection.post(encode_error(RpcError(error.code, str(error), request.request_id)))
-        return
-    if reply is None:
         return
     if isinstance(reply, Generator):
         connection.work_on(_reply_in_pieces(connection, request, reply))
     elif isinstance(reply, MethodReply):
         _send(connection, request, reply)
-    else:
-        hub.do_later(connection, _reply_later(connection, request, reply))
-
-
-def _call(hub: Hub, connection: ClientConnection, request: RpcRequest) -> MethodReply | Pieces | Later | None:
-    """Check the request, and run its method. Raises RpcError."""
-    method = METHODS.get(request.method)
-    if method is None:
-        message = f"no method {request.method[:64]!r}; there are: {', '.join(METHODS)}"
-        raise RpcError(Code.METHOD_NOT_FOUND, message)
-    if method.right not in connection.rights:
-        raise RpcError(Code.DENIED, f"{request.method}: expected root or a member of {hub.control_group}")
-    if not request.wants_reply and not method.acts:
-        return None
-    try:
-        params = msgspec.convert(request.params, method.params)
-    except msgspec.ValidationError:
-        wrong = "; ".join(map(str, wrong_values(method.params, request.params, "parameter")))
-        raise RpcError(Code.INVALID_PARAMS, f"{request.method}: {wrong}") from None
-    return method.run(hub, connection, params)
+    else:  # the request continues if the client leaves
+        hub.running[connection.number] = asyncio.create_task(_reply_later(hub, connection, request, reply))
 
 
 def _send(connection: ClientConnection, request: RpcRequest, reply: MethodReply) -> None:
@@ -187,7 +181,7 @@ def _reply_in_pieces(connection: ClientConnection, request: RpcRequest, pieces: 
     _send(connection, request, reply)
 
 
-async def _reply_later(connection: ClientConnection, request: RpcRequest, later: Later) -> None:
+async def _reply_later(hub: Hub, connection: ClientConnection, request: RpcRequest, later: Later) -> None:
     REQUESTED_BY.set(f"uid {connection.peer.uid}")
     try:
         try:
@@ -199,6 +193,8 @@ async def _reply_later(connection: ClientConnection, request: RpcRequest, later:
             connection.post(body)
     except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
         connection.on_failure(error)
+    finally:
+        hub.running.pop(connection.number, None)
 
 
 # --- devices, status, schema ----------------------------------------------------------------------------------------
@@ -354,7 +350,7 @@ def _control(hub: Hub, device: str, connection: ClientConnection | None = None, 
     Raises RpcError if the device is unknown, or if the previous request of the connection is not finished.
     """
     _known("device", [device], hub.devices)
-    if connection is not None and hub.busy(connection):
+    if connection is not None and connection.number in hub.running:
         message = f"{method}: the previous request of this connection is not finished; wait for its reply"
         raise RpcError(Code.UNAVAILABLE, message)
     return hub.context.devices.control(device)

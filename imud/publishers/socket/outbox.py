@@ -515,7 +515,12 @@ class Outbox(ABC):
         try:
             if not self._partial and not self._next():
                 return self._emptied()
-            count = self._send_partial()
+            if self._partial_fd == NO_FD:
+                count = self._send(self._fd, self._partial)
+            else:
+                rights = (socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", [self._partial_fd]))
+                count = self._sock.sendmsg([self._partial], [rights])
+                self._partial_fd = NO_FD  # sent with the first byte
         except BlockingIOError:
             self._keep(self.on_full)
             return False
@@ -543,14 +548,6 @@ class Outbox(ABC):
             self._count_held()
             self.on_emptied()
         return False
-
-    def _send_partial(self) -> int:
-        if self._partial_fd == NO_FD:
-            return self._send(self._fd, self._partial)
-        rights = (socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", [self._partial_fd]))
-        count = self._sock.sendmsg([self._partial], [rights])
-        self._partial_fd = NO_FD  # sent with the first byte
-        return count
 
     def _next(self) -> bool:
         """Move the next messages to `_partial`, or one reply with its descriptor. Return False if there is none."""

@@ -113,32 +113,23 @@ class ScheduledClient(ABC):
         self.number = number
         self.state = _State.IDLE
         self.over_ticks = 0
-        self._cpu = TokenBucket(CPU_PER_S_NS, CPU_BURST_NS, now_ns, CPU_NEW_NS)
-        self._data = TokenBucket(BYTES_PER_S, BYTES_BURST, now_ns)
+        self.cpu = TokenBucket(CPU_PER_S_NS, CPU_BURST_NS, now_ns, CPU_NEW_NS)
+        self.data = TokenBucket(BYTES_PER_S, BYTES_BURST, now_ns)
         self.user = scheduler.add(self, uid)
         self.run_ns = self.user.served_ns
 
-    def count_bytes(self, count: int) -> None:
-        self._data.use(count)
-
-    def charge(self, cpu_ns: int) -> None:
-        """Count CPU time that serving the client took."""
-        self.run_ns += cpu_ns
-        self.user.run_ns += cpu_ns
-        self._cpu.use(cpu_ns)
-
     @property
     def is_over(self) -> bool:
-        return self._cpu.level < 0 or self._data.level < 0
+        return self.cpu.level < 0 or self.data.level < 0
 
     @property
     def is_light(self) -> bool:
         """Whether the client has recently used little of its allowance."""
-        return self._cpu.level >= CPU_LIGHT_NS and self._data.level >= 0
+        return self.cpu.level >= CPU_LIGHT_NS and self.data.level >= 0
 
     def fill(self, now_ns: int) -> None:
-        self._cpu.fill(now_ns)
-        self._data.fill(now_ns)
+        self.cpu.fill(now_ns)
+        self.data.fill(now_ns)
 
     @abstractmethod
     def on_ready(self, events: int) -> None:
@@ -174,7 +165,7 @@ class Scheduler:
         self._served_all_ns = 0  # time of the last turn that served every client
         self._loop = asyncio.get_running_loop()
         self._epoll = select.epoll()
-        self._loop.add_reader(self._epoll.fileno(), self._on_events)
+        self._loop.add_reader(self._epoll.fileno(), self._schedule)
         self._next_turn: asyncio.Handle | None = None
         self._pausing = False  # whether the next turn begins after a pause
         self._clients: dict[int, ScheduledClient] = {}  # all clients by descriptor
@@ -220,7 +211,7 @@ class Scheduler:
             self._queued[user] = None
         heappush(user.queue, (not client.is_light, client.run_ns, client.number, client))
         if self._next_turn is None:
-            self._schedule(pause=False)
+            self._schedule()
 
     def arm(self, client: ScheduledClient) -> None:
         """Wait for the events that a client wants. Do nothing unless the client is idle: `_serve` arms it later."""
@@ -263,14 +254,12 @@ class Scheduler:
 
     # --- a turn -----------------------------------------------------------------------------------------------------
 
-    def _on_events(self) -> None:
-        # serve in the next turn of the event loop, so that the loop reads samples before and after
-        if self._next_turn is None or self._pausing:
-            self._schedule(pause=False)
-
-    def _schedule(self, *, pause: bool) -> None:
-        """Run `_turn` in the next turn of the event loop, or after a pause."""
+    def _schedule(self, *, pause: bool = False) -> None:
+        """Run `_turn` in the next turn of the event loop, or after a pause. An event of a client ends the pause."""
+        # not now: the loop reads samples before and after a turn
         if self._next_turn is not None:
+            if not (pause or self._pausing):
+                return
             self._next_turn.cancel()
         self._next_turn = self._loop.call_later(PAUSE_S, self._turn) if pause else self._loop.call_soon(self._turn)
         self._pausing = pause
@@ -342,7 +331,10 @@ class Scheduler:
         except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
             self._fail(client, error)
             has_more = True
-        client.charge(self._cpu_ns() - begun_ns + PIECE_NS)
+        used_ns = self._cpu_ns() - begun_ns + PIECE_NS
+        client.run_ns += used_ns
+        client.user.run_ns += used_ns
+        client.cpu.use(used_ns)
         if client.state is not _State.SERVED:  # the client has left
             return
         if has_more and client.is_over:

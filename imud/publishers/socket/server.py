@@ -393,7 +393,7 @@ class SocketServer:
                 self._pause(error)
                 return
             sock.setblocking(False)
-            self._greet(sock)
+            self._let_in(sock)
 
     def _pause(self, error: OSError) -> None:
         """Accept no client until the next tick. Without a pause, a lack of descriptors would cause a busy loop."""
@@ -405,42 +405,35 @@ class SocketServer:
         self._paused = True
         self._context.tick_soon()
 
-    def _greet(self, sock: socket.socket) -> None:
+    def _let_in(self, sock: socket.socket) -> None:
+        """Greet a new client, or refuse it. Do nothing if it has already left."""
+        hub = self.hub
         connection: ClientConnection | None = None
         try:
-            connection = self._let_in(sock)
-            if connection is not None:
-                connection.post(hello(self.hub, connection))
-        except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
-            if connection is not None:
-                connection.on_failure(error)
-            else:
-                self.hub.count_failed(error)
+            try:
+                peer = peer_of(sock)
+            except OSError:  # the client has left
                 sock.close()
-
-    def _let_in(self, sock: socket.socket) -> ClientConnection | None:
-        """Return a new client; None if it is refused or has already left."""
-        try:
-            peer = peer_of(sock)
-        except OSError:  # the client has left
-            sock.close()
-            return None
-        rights = self._guard.rights_of(peer)
-        hub = self.hub
-        try:
+                return
+            rights = self._guard.rights_of(peer)
             if Rights.READ not in rights:
                 message = f"uid {peer.uid} may not read: expected root or a member of group {self._settings.group!r}"
                 raise RpcError(Code.DENIED, message)
             places = [connection.place for connection in hub.connections.values()]
             place = self._quota.admit(peer, rights, sock.fileno(), places)
+            assert self._scheduler is not None
+            connection = ClientConnection(sock, peer, rights, place, hub, self._scheduler)
+            hub.connections[connection.number] = connection
+            connection.post(hello(hub, connection))
         except RpcError as refusal:
             hub.refused += 1
             _refuse(sock, refusal)
-            return None
-        assert self._scheduler is not None
-        connection = ClientConnection(sock, peer, rights, place, hub, self._scheduler)
-        hub.connections[connection.number] = connection
-        return connection
+        except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
+            if connection is not None:
+                connection.on_failure(error)
+            else:
+                hub.count_failed(error)
+                sock.close()
 
 
 def _refuse(sock: socket.socket, error: RpcError) -> None:

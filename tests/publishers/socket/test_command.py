@@ -56,7 +56,7 @@ async def test_a_failed_command_gives_a_reason(
     error = (await peer.message())["error"]
     assert error["code"] == -32005
     assert words in error["message"]
-    assert not server.hub.busy(next(iter(server.hub.connections.values())))
+    assert not server.hub.running
 
 
 @in_server()
@@ -104,12 +104,12 @@ def test_a_command_continues_without_its_client_and_ends_with_the_server(tmp_pat
         async with serving(tmp_path) as server:
             peer = await Peer.greeted(server)
             await peer.send(request(1, "wait"))
-            await until(lambda: any(map(server.hub.busy, server.hub.connections.values())))
+            await until(lambda: bool(server.hub.running))
             (connection,) = server.hub.connections.values()
             peer.close()
             await until(lambda: not server.hub.connections)
-            assert server.hub.busy(connection)
-        await until(lambda: not server.hub.busy(connection))
+            assert connection.number in server.hub.running
+        await until(lambda: connection.number not in server.hub.running)
 
     run(body)
 

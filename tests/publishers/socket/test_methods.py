@@ -368,12 +368,10 @@ async def test_samples_and_other_clients_come_between_and_requests_keep_their_or
     await asking.send("\n".join([*lines, ""]).encode())
     await until(lambda: 0 < fleet.taken < DEVICES)
     fleet.server.publish(batch("imu0", 1))
-    connection, _ = fleet.server.hub.connections.values()
     assert fleet.server.hub.pool.held_bytes > 1000  # the unfinished reply counts
     assert (await watching.message())["params"]["seq"] == 1
     assert fleet.taken < DEVICES
     assert [(await asking.message())["id"] for _ in range(2)] == [1, 2]
-    assert connection.unread_bytes == 0
     assert fleet.server.hub.pool.held_bytes == 0
     # if a client leaves, imud discards its unfinished reply
     fleet.taken = 0

@@ -149,19 +149,19 @@ async def test_a_client_has_an_allowance_of_cpu_time_and_of_bytes(rig: Scheduler
     assert not client.is_light
     client.fill(now_ns + 500 * MS)  # 100 ms for a new client, and 100 ms per second
     assert client.is_light
-    client.count_bytes(1 << 20)
+    client.data.use(1 << 20)
     assert (client.is_over, client.is_light) == (False, True)
-    client.count_bytes(262_144)
+    client.data.use(262_144)
     assert (client.is_over, client.is_light) == (True, False)
     client.fill(now_ns + 1499 * MS)
     assert client.is_over
     client.fill(now_ns + 1501 * MS)
     assert not client.is_over
-    client.charge(200 * MS)  # the maximum allowance
+    client.cpu.use(200 * MS)  # the maximum allowance
     assert not client.is_over
-    client.charge(1)
+    client.cpu.use(1)
     assert client.is_over
-    client.charge(1000 * MS)  # the debt is at most the maximum allowance
+    client.cpu.use(1000 * MS)  # the debt is at most the maximum allowance
     client.fill(now_ns + 3500 * MS)
     assert client.is_over
     client.fill(now_ns + 3502 * MS)
