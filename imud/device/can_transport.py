@@ -294,7 +294,8 @@ class CanTransport(ReceivingTransport):
     async def run_script(self, make: Callable[..., Any], *arguments: Any) -> Any:
         """Run a request script. Follow the device if the script changes its number."""
         others = self._buses.bits_per_s(self._config.name, self.link.bus)
-        return await self.scripts.run(make(Target(self._options, self.bit_rate, other_bits_per_s=others), *arguments))
+        self.target = Target(self._options, self.bit_rate, other_bits_per_s=others)
+        return await self.scripts.run(make(self.target, *arguments))
 
     # --- the samples -------------------------------------------------------------------------------------------------
 

@@ -100,7 +100,7 @@ class VerbRun:
         Raises CommandError, TransferError, DeviceRefused, LinkError.
         """
         settings, arguments = self._settings, verb.arguments(given)
-        async with settings.exclusive(f"the command {name}"):
+        async with settings.lock.hold(f"the command {name}"):
             if verb.saves:
                 settings.spend_flash()
             if verb.risk is Risk.RESET:
@@ -306,7 +306,7 @@ class Device:
     def _needs_ticks(self) -> bool:
         """Return whether the device needs ten ticks per second."""
         state, path = self._health.state, self._transport.path
-        if self._attachments.needs_ticks or self._transport.busy or self._settings.busy:
+        if self._attachments.needs_ticks or self._transport.busy or self._settings.lock.busy:
             return True
         if state is not DeviceState.RUNNING or path is None:
             return state in WATCHED
@@ -426,7 +426,7 @@ class Device:
         log.info("%s: calibrate %s%s", self.config.name, kind, ", save" if save else "")
         self._require_replies()
         stop = f"stop it with imud calibrate {self.config.name} --stop"
-        async with self._settings.exclusive(f"the calibration {kind}", stop):
+        async with self._settings.lock.hold(f"the calibration {kind}", stop):
             if save:
                 self._settings.spend_flash()
             result = None

@@ -4,7 +4,7 @@ A lasting problem of the link (for example an error-passive CAN bus) stays in th
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from imud.contracts.codec import BadFrame
 from imud.contracts.status import DeviceState
@@ -37,22 +37,18 @@ class DeviceEvents:
         self, now_ns: int, kind: EventKind, message: str, /, **detail: str | int | float | bool | None
     ) -> None:
         """Log and send an event. Replace unprintable characters, because a device can send any text."""
-        self._report(LEVELS.get(kind, logging.WARNING), now_ns, kind, message, detail)
+        self.report(LEVELS.get(kind, logging.WARNING), now_ns, kind, message, detail)
 
-    def note_own(
-        self, now_ns: int, kind: EventKind, message: str, /, **detail: str | int | float | bool | None
-    ) -> None:
-        """Log and send an event about a requested change, at the level INFO."""
-        self._report(logging.INFO, now_ns, kind, message, detail)
-
-    def _report(
-        self, level: int, now_ns: int, kind: EventKind, message: str, detail: dict[str, str | int | float | bool | None]
-    ) -> None:
+    def report(
+        self, level: int, now_ns: int, kind: EventKind, message: str,
+        detail: Mapping[str, str | int | float | bool | None],
+    ) -> None:  # fmt: skip
+        """Log and send an event as `raise_event`, at `level`: INFO for a change that a user requested."""
         message = printable(message, MESSAGE_CHARACTERS_MAX)
-        detail = {name: printable(one) if isinstance(one, str) else one for name, one in detail.items()}
+        texts = {name: printable(one) if isinstance(one, str) else one for name, one in detail.items()}
         alike = same_as(kind if kind is EventKind.BAD_FRAME else message)  # the bytes of each damaged frame differ
         log.log(level, "%s: %s", self.device, message, extra=alike)
-        self._send(Event(now_ns, self.device, kind, message, detail))
+        self._send(Event(now_ns, self.device, kind, message, texts))
 
     def bad_frame(self, frame: BadFrame) -> None:
         """Note a damaged frame. The next event shows the newest frame."""

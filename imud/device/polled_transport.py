@@ -343,8 +343,8 @@ class PolledTransport(Transport):
         if member is None or device is None:
             raise CommandError(f"{self._config.name}: the device is missing")
         options = self._config.options or device.driver.settings()
-        script = make(Target(options, self.bit_rate, places=self._places(device)), *arguments)
-        return await member.run(script, device.target, self._follow)
+        self.target = Target(options, self.bit_rate, places=self._places(device))
+        return await member.run(make(self.target, *arguments), device.target, self._follow)
 
     def _places(self, device: IdentifiedDevice) -> tuple[int, ...]:
         given = () if self.link.target is None else (self.link.target,)

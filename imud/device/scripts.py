@@ -129,7 +129,7 @@ class ScriptRunner:
                 while True:
                     undo = request.undo
                     for factor in range(PROBES):  # before a request whose reply could be a late reply
-                        if request.probe is None or not self.is_owed(request):
+                        if request.probe is None or not self._owed or not self.is_owed(request):
                             break
                         timeout_ns = request.probe.timeout_ns << factor
                         await self._exchange(replace(request.probe, timeout_ns=timeout_ns))
@@ -218,7 +218,8 @@ class ScriptRunner:
         if (
             request is None
             or not (ends or request.is_part(message))
-            or (ends and not self._messages and self._ends_late(request, message))
+            or (ends and not self._messages and request.messages_min > 1 and request.is_end(message))  # too short
+            or (ends and not self._messages and bool(self._owed) and self._ends_late(request, message))
         ):
             self._count_stray(message, now_ns)
             return None
@@ -285,10 +286,8 @@ class ScriptRunner:
             self._late_messages = len(self._messages)
 
     def _ends_late(self, request: Request, message: Message) -> bool:
-        """Return whether `message`, the end of a reply, ends a late reply."""
-        late_is_arriving = self._late_messages > 0 and bool(self._owed)
-        is_too_short = request.is_end(message) and request.messages_min > 1
-        return late_is_arriving or is_too_short or (self.is_owed(request) and self._owing(message) is not None)
+        """Return whether `message`, the end of a reply, ends a late reply. Requires a request without a reply."""
+        return self._late_messages > 0 or (self.is_owed(request) and self._owing(message) is not None)
 
     def _owing(self, message: Message) -> _Owed | None:
         """Return the oldest request without a reply that `message` can belong to; None if there is none."""

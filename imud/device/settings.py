@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 import msgspec
 
 from imud.config.model import DeviceConfig
-from imud.contracts.command import REQUESTED_BY, Target
+from imud.contracts.command import REQUESTED_BY
 from imud.contracts.condition import duration
 from imud.contracts.driver import Identity, PolledDriver
 from imud.contracts.setting import (
@@ -119,25 +119,21 @@ class SettingsComparison:
         self._on_difference = config.on_difference
         self._host = host
         self._wanted = asyncio.Event()
-        self._due_ns: int | None = None  # CLOCK_MONOTONIC of the next comparison; None: after the next event
+        self.due_ns: int | None = None  # CLOCK_MONOTONIC of the next comparison; None: after the next event
         self._tries = 0
         self._pauses = RepairPauses()
 
     def schedule(self, after_ns: int) -> None:
         """Compare after this time, because the settings can have changed."""
-        self._tries, self._due_ns = 0, self._host.now_ns() + after_ns
-
-    @property
-    def is_scheduled(self) -> bool:
-        return self._due_ns is not None
+        self._tries, self.due_ns = 0, self._host.now_ns() + after_ns
 
     def start_if_due(self, now_ns: int | None) -> None:
         """Start the scheduled comparison if its time has passed; None: in any case."""
-        if self._due_ns is not None and (now_ns is None or now_ns >= self._due_ns):
+        if self.due_ns is not None and (now_ns is None or now_ns >= self.due_ns):
             self._wanted.set()
 
     def cancel(self) -> None:
-        self._due_ns = None
+        self.due_ns = None
         self._wanted.clear()
 
     async def run(self) -> None:
@@ -147,8 +143,8 @@ class SettingsComparison:
             await self._wanted.wait()
             self._wanted.clear()
             with suppress(CommandError):  # another command is running: imud compares after it
-                async with settings.exclusive("the comparison of the settings"):
-                    self._due_ns = None
+                async with settings.lock.hold("the comparison of the settings"):
+                    self.due_ns = None
                     if settings.table is not None:
                         await self._compare(settings.table)
 
@@ -163,7 +159,7 @@ class SettingsComparison:
         self._tries, self.problem = 0, ""
         settings.report_differences()
         if settings.is_polled:
-            self._due_ns = self._host.now_ns() + AGAIN_NS
+            self.due_ns = self._host.now_ns() + AGAIN_NS
         if self._on_difference is not OnDifference.REPORT:
             await self._repair(table, actual)
 
@@ -181,7 +177,7 @@ class SettingsComparison:
         now_ns = self._host.now_ns()
         wait_ns = self._pauses.remaining_ns(settings.module, now_ns)
         if wait_ns > 0:
-            self._due_ns = now_ns + wait_ns
+            self.due_ns = now_ns + wait_ns
             self.problem = f"the device loses its settings; imud sets them again in {wait_ns / NS_PER_S:.0f} s"
             return
         self._pauses.add(now_ns)
@@ -193,7 +189,7 @@ class SettingsComparison:
         if applied.problem:
             self.problem = applied.problem
             now_ns = self._host.now_ns()
-            self._due_ns = now_ns + max(self._pauses.remaining_ns(self._settings.module, now_ns), NS_PER_S)
+            self.due_ns = now_ns + max(self._pauses.remaining_ns(self._settings.module, now_ns), NS_PER_S)
         detail = {step.name: str(step.outcome) for step in applied.steps}
         self._settings.raise_event(_summary(applied), saved=applied.saved, **detail)
 
@@ -203,7 +199,7 @@ class SettingsComparison:
         self._settings.forget()
         if self._tries < READ_TRIES:
             self.problem = f"cannot read the settings: {error}"
-            self._due_ns = self._host.now_ns() + READ_AGAIN_NS
+            self.due_ns = self._host.now_ns() + READ_AGAIN_NS
         else:
             self._complain(f"cannot read the settings after {self._tries} tries: {error}")
 
@@ -235,13 +231,14 @@ class WorkLock:
         self._host = host
         self._lock = asyncio.Lock()
         self._work: Work | None = None  # work that holds the lock
+        self.ended_ns = -OWN_NS  # CLOCK_MONOTONIC of the end of the last work, ns
 
     @property
     def busy(self) -> bool:
         return self._lock.locked()
 
     @asynccontextmanager
-    async def hold(self, work: str, stop: str) -> AsyncIterator[None]:
+    async def hold(self, work: str, stop: str = "") -> AsyncIterator[None]:
         """Hold the lock for `work`, for example `the command save`. `stop`: how a user can stop it.
 
         Raises CommandError if other work, for example a calibration, does not end within WAIT_S. The error names it.
@@ -257,6 +254,7 @@ class WorkLock:
             yield
         finally:
             self._work = None
+            self.ended_ns = self._host.now_ns()
             self._lock.release()
 
 
@@ -279,16 +277,15 @@ class DeviceSettings:
         self._host = host
         self._files = files
         self._reports: Reports = {}
+        self.values: Values = {}  # values of the settings that the device reported last
         self.is_current = False  # whether the device still has the settings of `_reports`
         self._read_ns: int | None = None
         # resets of the device counter at the newest read of all reports if no other script followed; None otherwise
         self._read_resets: int | None = None
-        self._target: Target | None = None
         self._clock: SampleClock | None = None
-        # CLOCK_MONOTONIC until which a restart of the device counter is a result of a script of imud
-        self._own_until_ns = self._resets = 0
+        self._resets = 0  # resets of the device counter at the last tick
         self.resets_requested = 0  # number of restarts of the device counter that a script of imud caused
-        self._lock = WorkLock(config.name, host)
+        self.lock = WorkLock(config.name, host)
         # values that imud wrote since the last restart, of settings that the device does not report
         self._written: dict[str, Any] = {}
         self._unsaved = False  # whether a write since the last restart may be missing in flash
@@ -308,14 +305,16 @@ class DeviceSettings:
 
     def tick(self, now_ns: int, _newest: Sample | None) -> None:
         """Detect a restart of the device counter. Start a comparison if one is due and the device can reply."""
+        busy = self.lock.busy
         if (resets := self.counter_resets) != self._resets:
-            is_own = self.busy or now_ns < self._own_until_ns + BOOT_NS
+            own_until_ns = self.lock.ended_ns + OWN_NS
+            is_own = busy or now_ns < own_until_ns + BOOT_NS
             self.resets_requested, self._resets = self.resets_requested + is_own * (resets - self._resets), resets
             if not is_own:
                 self._in_flash.started()
-            if (self.declared or self._unsaved) and not self.busy and now_ns >= self._own_until_ns:
+            if (self.declared or self._unsaved) and not busy and now_ns >= own_until_ns:
                 self._after_start(SETTLE_NS)
-        if self.declared and not self.busy and self._transport.can_be_asked:
+        if self.declared and not busy and self._transport.can_be_asked:
             self.comparison.start_if_due(now_ns)
 
     def forget(self) -> None:
@@ -340,26 +339,7 @@ class DeviceSettings:
         self._read_resets = None
         self.comparison.schedule(after_ns)
 
-    @property
-    def busy(self) -> bool:
-        """Whether imud reads or writes settings, or executes a command."""
-        return self._lock.busy
-
-    @asynccontextmanager
-    async def exclusive(self, work: str, stop: str = "") -> AsyncIterator[None]:
-        """Use the device alone for `work` (`WorkLock.hold`). Raises CommandError if other work does not end."""
-        async with self._lock.hold(work, stop):
-            try:
-                yield
-            finally:
-                self._own_until_ns = self._host.now_ns() + OWN_NS
-
     # --- reports of the device ----------------------------------------------------------------------------------------
-
-    @property
-    def values(self) -> Values:
-        """Values of the settings that the device reported last."""
-        return values_of(self._reports)
 
     def update_identity(self, identity: Identity) -> None:
         """Store a new identity. Raise an event if another device has replied."""
@@ -375,7 +355,8 @@ class DeviceSettings:
         `own`: a command of imud has just run, so the change is expected.
         """
         driver, known = self._transport.driver, self.shown
-        self._reports, self.is_current, self._read_ns = reports, True, self._host.now_ns()
+        self._reports, self.values, self.is_current = reports, values_of(reports), True
+        self._read_ns = now_ns = self._host.now_ns()
         self._in_flash.read(self.values)
         text = printable_words(words_of(reports))
         self.shown = printable_words(driver.shown_settings(text)) if driver is not None else text
@@ -385,12 +366,9 @@ class DeviceSettings:
                 changed[name] = value
                 texts.append(f"{name} is {value}, was {known[name]}")
         if changed:
-            now = ", ".join(texts)
-            now_ns, kind = self._host.now_ns(), EventKind.CONFIGURATION
-            if own:
-                self._events.note_own(now_ns, kind, f"a command changed settings of the device: {now}", **changed)
-            else:
-                self._events.raise_event(now_ns, kind, f"settings of the device changed: {now}", **changed)
+            what = "a command changed settings of the device" if own else "settings of the device changed"
+            level = logging.INFO if own else logging.WARNING
+            self._events.report(level, now_ns, EventKind.CONFIGURATION, f"{what}: {', '.join(texts)}", changed)
         self._observer.described(self._transport.where, identity_words(self.identity), self.shown)
         self._transport.attachments.compare_settings(self.values, driver)
         self._transport.use_axes(self.shown)
@@ -401,14 +379,9 @@ class DeviceSettings:
         if table is None:
             self.update({}, own=own)
             return {}
-
-        def script(target: Target) -> Any:
-            self._target = target
-            return table.read(target, None)
-
-        self.update(await self._transport.run_script(script), own=own)
+        self.update(await self._transport.run_script(table.read, None), own=own)
         self._read_resets = self.counter_resets
-        if self.comparison.is_scheduled and self._transport.can_be_asked:
+        if self.comparison.due_ns is not None and self._transport.can_be_asked:
             self.comparison.start_if_due(None)
         return self.values
 
@@ -467,7 +440,7 @@ class DeviceSettings:
         """
         table = self._table()
         if fresh:
-            async with self.exclusive("a read of the settings"):
+            async with self.lock.hold("a read of the settings"):
                 await self.read()
         status = self.status()
         assert status is not None
@@ -479,16 +452,18 @@ class DeviceSettings:
         """Return the plan to set the values `given` (None: the declared settings). Raises as `report`."""
         table = self._table()
         wanted = _wanted(self._config.name, table, given, self.declared)
-        async with self.exclusive("a plan of settings"):
+        async with self.lock.hold("a plan of settings"):
             actual = await self.read()
             wanted = completed(table, wanted, actual)
-            return self._make_plan(table, wanted, actual, save=save, unsaved=self._unsaved, by_name=given is not None)
+            target, written = self._transport.target, self._all_written(table)
+            by_name, unsaved = given is not None, self._unsaved
+            return make_plan(table, target, wanted, actual, written, save=save, unsaved=unsaved, by_name=by_name)
 
     async def apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
         """Set the values `given` (None: the declared settings). Raises as `report`, before the first write."""
         table = self._table()
         wanted = _wanted(self._config.name, table, given, self.declared)
-        async with self.exclusive("a change of settings"):
+        async with self.lock.hold("a change of settings"):
             actual = await self.valid_values()
             wanted = completed(table, wanted, actual)
             return await self.carry_out(table, wanted, actual, save=save, asked=True, by_name=given is not None)
@@ -561,7 +536,8 @@ class DeviceSettings:
         self, table: SettingsTable, wanted: Values, actual: Values, *, save: bool, asked: bool, by_name: bool = False
     ) -> AppliedSettings:
         """Set the values `wanted`. `asked`: a user or program requested it. The caller holds `exclusive`."""
-        plan = self._make_plan(table, wanted, actual, save=save, unsaved=self._unsaved, by_name=by_name)
+        target, written, unsaved = self._transport.target, self._all_written(table), self._unsaved
+        plan = make_plan(table, target, wanted, actual, written, save=save, unsaved=unsaved, by_name=by_name)
         flash = ModuleFlash(self._files.flash, self.module, asked=asked)
         applying = Applying(table, self._transport, flash, wanted, self._reports)
         self._transport.attachments.set_alarm_ranges(None)  # the new settings can change the ranges
@@ -598,14 +574,8 @@ class DeviceSettings:
         """Return the plan to set the declared settings. Raises BadArgument."""
         # flash contains the declared settings if commands changed no value
         saved = actual == self._saved and all(name in actual for name in self.declared)
-        return self._make_plan(table, self.declared, actual, save=save, unsaved=self._unsaved and not saved)
-
-    def _make_plan(
-        self, table: SettingsTable, wanted: Values, actual: Values, *, save: bool, unsaved: bool, by_name: bool = False
-    ) -> SettingsPlan:
-        assert self._target is not None
-        written = self._all_written(table)
-        return make_plan(table, self._target, wanted, actual, written, save=save, unsaved=unsaved, by_name=by_name)
+        target, written, unsaved = self._transport.target, self._all_written(table), self._unsaved and not saved
+        return make_plan(table, target, self.declared, actual, written, save=save, unsaved=unsaved)
 
     def _all_written(self, table: SettingsTable) -> dict[str, Any]:
         """Return the written values of settings that the device does not report: saved, or since its restart."""

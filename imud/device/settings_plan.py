@@ -7,7 +7,7 @@ imud leaves out the settings that need a restart, because the restart loses unsa
 
 import re
 from abc import abstractmethod
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -324,7 +324,8 @@ def make_plan(
         if setting.note and (name != rate or is_other_rate):
             notes.append(f"{name}: {setting.note}")
     steps.sort(key=attrgetter("connection", "saves"))
-    by_itself, needs_restart = any(map(attrgetter("saves"), steps)), is_after_restart(steps)
+    by_itself = any(map(attrgetter("saves"), steps))
+    needs_restart = Effect.AFTER_RESTART in map(attrgetter("effect"), steps)
     return SettingsPlan(
         tuple(steps),
         save=save and table.save is not None and (bool(steps) or unsaved) and not by_itself,
@@ -333,11 +334,6 @@ def make_plan(
         risk=Risk.CONNECTION if any(map(attrgetter("connection"), steps)) else Risk.NONE,
         advice="; ".join(notes),
     )
-
-
-def is_after_restart(steps: Iterable[PlannedStep]) -> bool:
-    """Return whether one of the settings takes effect after a restart."""
-    return Effect.AFTER_RESTART in map(attrgetter("effect"), steps)
 
 
 def _require_agreement(table: SettingsTable, target: Target, actual: Values, values: Values) -> None:
@@ -389,6 +385,7 @@ class SettingsPort(SampleSource):
 
     attachments: Attachments
     samples: SampleWatch
+    target: Target  # target of the newest script; set by `run_script`
 
     @property
     @abstractmethod
@@ -444,11 +441,12 @@ class Applying:
         while len(done) < len(plan.steps) and not self.problem:
             done += await self._write(plan.steps[len(done) :])
         for step in plan.steps[len(done) :]:
-            done.append(_applied(step, StepOutcome.NOT_DONE))
+            done.append(AppliedStep(step.name, step.value, step.before, StepOutcome.NOT_DONE))
         if not self.problem and plan.save:
             await self._save()
         # a plan with such a setting and without a restart keeps the device at the present rate of its bus
-        needs_restart = bool(self.pending) and self.saved and not is_after_restart(plan.steps)
+        is_planned = Effect.AFTER_RESTART in map(attrgetter("effect"), plan.steps)
+        needs_restart = bool(self.pending) and self.saved and not is_planned
         if not self.problem and (plan.restart or (needs_restart and self.table.restart is not None)):
             done = await self._restart(done)
         found = differences(self.table, self.wanted, values_of(self.reports) if self.heard else {}, self.written)
@@ -486,40 +484,39 @@ class Applying:
                 break
         # an error can be the sign of a restart, which loses unsaved values
         why = await self._read(None if failure or sent[-1].saves else names) if names else ""
-        last = self._judged(sent.pop(), failure, why)  # first: a failed write is the problem that imud reports
-        return [*map(partial(self._judged, error=None, why_unread=why), sent), last]
+        last = self._compared(sent.pop(), failure, why)  # first: a failed write is the problem that imud reports
+        return [*map(partial(self._compared, why_unread=why), sent), last]
 
-    def _judged(self, step: PlannedStep, error: Exception | None, why_unread: str) -> AppliedStep:
-        """Return the result of a write: `error` of its script, and the reason if imud could not read the report."""
-        setting, actual = self.table.table[step.name], values_of(self.reports)
-        is_read = setting.readable and not why_unread and step.name in actual
-        agrees = is_read and setting.agrees(self.wanted[step.name], actual[step.name])
-        if error is not None and not agrees:
-            is_known = is_read or isinstance(error, Rejected | BadArgument | DeviceRefused)
-            return self._failed(step, str(error), StepOutcome.NOT_APPLIED if is_known else StepOutcome.NOT_VERIFIED)
-        self.changed = True  # also if only the reply was lost
-        if why_unread and setting.readable:
-            words = f"the device has not reported its settings after the write: {why_unread}"
-            return self._failed(step, words, StepOutcome.NOT_VERIFIED)
-        if is_read and (step.name in self.pending or (step.effect is Effect.AFTER_RESTART and not step.saves)):
-            return _applied(step, StepOutcome.WRITTEN)
-        return self._compared(step)
-
-    def _compared(self, step: PlannedStep | AppliedStep) -> AppliedStep:
-        """Compare the written value with the value that imud read back."""
-        setting, actual, wanted = self.table.table[step.name], values_of(self.reports), self.wanted[step.name]
-        if not setting.readable or step.name not in actual:
-            self.written[step.name] = wanted
-            return _applied(step, StepOutcome.NOT_VERIFIED, NOT_REPORTED)
-        if setting.agrees(wanted, actual[step.name]):
-            return _applied(step, StepOutcome.VERIFIED)
-        return self._failed(step, f"wrote {shown(as_json(wanted))}, read back {shown(as_json(actual[step.name]))}")
-
-    def _failed(
-        self, step: PlannedStep | AppliedStep, message: str, outcome: StepOutcome = StepOutcome.NOT_APPLIED
+    def _compared(
+        self, step: PlannedStep | AppliedStep, error: Exception | None = None, why_unread: str = ""
     ) -> AppliedStep:
-        self.problem = self.problem or f"{step.name}: {message}"
-        return _applied(step, outcome, message)
+        """Compare the written value with the value that imud read back. `error`: error of the script that wrote it.
+
+        `why_unread`: reason why imud could not read the report; empty if imud read it.
+        """
+        name, setting, actual = step.name, self.table.table[step.name], values_of(self.reports)
+        is_read = setting.readable and not why_unread and name in actual
+        agrees = is_read and setting.agrees(self.wanted[name], actual[name])
+        has_failed = error is not None and not agrees  # it has not failed if only the reply was lost
+        is_pending = name in self.pending or (setting.effect is Effect.AFTER_RESTART and not setting.saves)
+        outcome, failure, message = StepOutcome.VERIFIED, "", ""
+        if has_failed:
+            is_known = is_read or isinstance(error, Rejected | BadArgument | DeviceRefused)
+            outcome, failure = StepOutcome.NOT_APPLIED if is_known else StepOutcome.NOT_VERIFIED, str(error)
+        elif why_unread and setting.readable:
+            outcome = StepOutcome.NOT_VERIFIED
+            failure = f"the device has not reported its settings after the write: {why_unread}"
+        elif not is_read:
+            self.written[name] = self.wanted[name]
+            outcome, message = StepOutcome.NOT_VERIFIED, NOT_REPORTED
+        elif is_pending and not self.restarted:
+            outcome = StepOutcome.WRITTEN
+        elif not agrees:
+            outcome = StepOutcome.NOT_APPLIED
+            failure = f"wrote {shown(as_json(self.wanted[name]))}, read back {shown(as_json(actual[name]))}"
+        self.changed = self.changed or not has_failed
+        self.problem = self.problem or (failure and f"{name}: {failure}")
+        return AppliedStep(name, step.value, step.before, outcome, failure or message)
 
     async def _save(self) -> None:
         save = self.table.save
@@ -583,7 +580,3 @@ def advice(config: DeviceConfig, plan: SettingsPlan, done: AppliedSettings) -> s
                 found.append(f"change `{key}.{step.name}: {place}` in the configuration to {step.value}")
     changes = "; ".join(found) + (": imud uses this value at its next start" if found else "")
     return "; ".join(filter(None, (changes, "" if done.problem else plan.advice)))
-
-
-def _applied(step: PlannedStep | AppliedStep, outcome: StepOutcome, message: str = "") -> AppliedStep:
-    return AppliedStep(step.name, step.value, step.before, outcome, message)

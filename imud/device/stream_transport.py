@@ -305,7 +305,8 @@ class StreamTransport(ReceivingTransport):
         """Run a request script. Follow the device if the script changes the baud rate."""
         self._require_device()
         options = self._config.options or (self.driver.settings() if self.driver is not None else None)
-        return await self.scripts.run(make(Target(options, self.link.baud, self._fixed_baud), *arguments))
+        self.target = Target(options, self.link.baud, self._fixed_baud)
+        return await self.scripts.run(make(self.target, *arguments))
 
     # --- the samples -------------------------------------------------------------------------------------------------
 
