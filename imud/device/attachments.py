@@ -104,10 +104,12 @@ class Attachments:
 
     def compare_settings(self, settings: Mapping[str, Any], driver: Driver | None) -> None:
         """Compare the GPIO lines with the values of the device settings. Raise an event for each new difference."""
+        lines = self._config.lines
+        if lines is None:
+            return
         read_ranges = driver.alarm_ranges if driver is not None else None
         self.set_alarm_ranges(read_ranges(settings) if read_ranges is not None else None)
-        lines = self._config.lines
-        found = driver.line_differences(settings, lines) if driver is not None and lines is not None else {}
+        found = driver.line_differences(settings, lines) if driver is not None else {}
         for key, words in found.items():
             if self._differences.get(key) != words:
                 message = f"line {key}: {words}"
