@@ -59,8 +59,7 @@ class McapChannel:
 
     def add(self, t_ns: int, data: bytes) -> None:
         """Append a message. `t_ns`: ns since 1970; an earlier time becomes 0. Raises OSError."""
-        if not 0 <= t_ns <= TIME_MAX:
-            t_ns = min(max(t_ns, 0), TIME_MAX)
+        t_ns = min(max(t_ns, 0), TIME_MAX)
         head = _MESSAGE.pack(
             Opcode.MESSAGE, _MESSAGE_REST + len(data), self.id, self.count & _SEQUENCE_MASK, t_ns, t_ns
         )

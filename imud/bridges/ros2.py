@@ -248,7 +248,7 @@ _STAMP: Final = {
 def time_of(utc_ns: int) -> tuple[int, int]:
     """Return `sec` and `nanosec` of a time, limited to the range of `builtin_interfaces/Time`."""
     sec, nanosec = divmod(utc_ns, NS_PER_S)
-    return (sec, nanosec) if -SEC_MAX <= sec <= SEC_MAX else (SEC_MAX if sec > 0 else -SEC_MAX, nanosec)
+    return max(-SEC_MAX, min(sec, SEC_MAX)), nanosec
 
 
 def _imu(frames: MessageFrames, *, with_attitude: bool) -> Encoder:

@@ -1,8 +1,9 @@
 """Names of topics and coordinate frames, covariances of sensor_msgs/Imu, and the filter of steady values."""
 
 from imud.attitude.conventions import Convention
-from imud.bridges.channel import STEADY_NS, MessageFrames, StampedEvent, Steady, covariance, topic
+from imud.bridges.channel import MessageFrames, StampedEvent, Steady, covariance, topic
 from imud.model.event import Event, EventKind
+from imud.model.units import NS_PER_S
 
 
 def test_topics_frames_covariances_and_steady_values() -> None:
@@ -21,11 +22,11 @@ def test_topics_frames_covariances_and_steady_values() -> None:
     assert StampedEvent(Event(1, "bow", EventKind.DOWN, "gone"), 2).is_warning
     assert not StampedEvent(Event(1, "bow", EventKind.UP, "there"), 2).is_warning
     steady = Steady()
-    passed = [steady.passes(20.0 if t < 5 else 21.0, t * STEADY_NS // 4) for t in range(13)]
+    passed = [steady.passes(20.0 if t < 5 else 21.0, t * NS_PER_S // 4) for t in range(13)]
     assert [t for t, one in enumerate(passed) if one] == [0, 4, 5, 9]
     steady = Steady()
-    assert steady.passes(20.0, 100 * STEADY_NS)
-    assert steady.passes(20.0, 50 * STEADY_NS)
-    assert not steady.passes(20.0, 50 * STEADY_NS + 1)
-    assert not steady.passes(20.0, 49 * STEADY_NS + 1)
-    assert steady.passes(20.0, 49 * STEADY_NS)  # a step back by the period
+    assert steady.passes(20.0, 100 * NS_PER_S)
+    assert steady.passes(20.0, 50 * NS_PER_S)
+    assert not steady.passes(20.0, 50 * NS_PER_S + 1)
+    assert not steady.passes(20.0, 49 * NS_PER_S + 1)
+    assert steady.passes(20.0, 49 * NS_PER_S)  # a step back by the period

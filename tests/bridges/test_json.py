@@ -16,6 +16,7 @@ from imud.bridges.channel import (
 )
 from imud.bridges.json import JsonDialect, status_channel
 from imud.contracts.status import Deviations
+from imud.model.event import Event, EventKind
 from imud.model.sample import Sample
 from tests.bridges.samples import BARE, EVENT, FULL, UTC_NS
 from tests.support.socket_rig import device_status
@@ -87,6 +88,8 @@ def test_messages_and_schemas() -> None:
     assert message == {
         "timestamp": STAMP, "level": 3, "message": 'loss: lost 3, "damaged"', "name": "bow", "file": "", "line": 0
     }  # fmt: skip
+    long = StampedEvent(Event(1, "bow", EventKind.UP, "x" * 5000), UTC_NS)
+    assert read(DIALECT.events(), long).items() >= {"level": 2, "message": f"up: {4091 * 'x'}…"}.items()
     losses = read(DIALECT.losses("bow"), LossCounts(1, UTC_NS, "bow", 100, 1, 2, 3, 4, 5))
     assert losses == {
         "timestamp": STAMP, "samples": 100, "lost_gap_device": 1, "lost_crc": 2, "lost_overrun": 3, "lost_queue": 4,
@@ -106,3 +109,19 @@ def test_messages_and_schemas() -> None:
     }  # fmt: skip
     for name in ["imu/data", "imu/mag", "temperature", "pressure", "attitude", "stamp"]:
         Draft202012Validator.check_schema(json.loads(channels()[f"/bow/{name}"].schema.data))
+    schema = json.loads(channels()["/bow/imu/data"].schema.data)
+    number = {"type": "number"}
+    assert schema["required"] == ["timestamp"]
+    assert schema["properties"]["timestamp"]["required"] == ["sec", "nsec"]
+    assert schema["properties"]["angular_velocity"] == {
+        "type": "object", "properties": {"x": number, "y": number, "z": number}, "description": "rad/s"
+    }  # fmt: skip
+    assert schema["properties"]["angular_velocity_covariance"] == {
+        "type": "array", "items": number, "minItems": 9, "maxItems": 9, "description": "rad²/s²"
+    }  # fmt: skip
+    fields = json.loads(channels()["/bow/stamp"].schema.data)["properties"]
+    assert fields["t_err_ns"]["type"] == "integer"
+    assert fields["incli_rad"]["items"] == number
+    assert [name for name, field in fields.items() if not field.get("description") and name != "timestamp"] == []
+    diagnoses = json.loads(DIALECT.diagnostics().schema.data)["properties"]["status"]["items"]["properties"]
+    assert diagnoses["values"]["items"]["properties"] == {"key": {"type": "string"}, "value": {"type": "string"}}

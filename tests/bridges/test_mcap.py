@@ -2,15 +2,18 @@
 
 import struct
 import threading
+import zlib
 from collections.abc import Sequence
 from io import BytesIO
 from random import Random
 from typing import Any
 
 import pytest
+import zstandard
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, SeekingReader
-from mcap.records import Chunk, Message
+from mcap.records import Chunk, Message, SummaryOffset
 from mcap.stream_reader import StreamReader
 
 from imud.bridges.channel import MessageChannel, MessageSchema
@@ -79,7 +82,7 @@ def test_a_file_is_read_back_by_order_index_and_summary(whole: Whole) -> None:
     assert statistics.channel_message_counts == {1: 20_000, 2: 1000}
     assert (statistics.message_start_time, statistics.message_end_time) == (1000, 20_999)
     assert statistics.chunk_count == len(summary.chunk_indexes) > 3
-    assert {schema.name for schema in summary.schemas.values()} == {"a.B", "c.D"}
+    assert [(number, one.id, one.name) for number, one in summary.schemas.items()] == [(1, 1, "a.B"), (2, 2, "c.D")]
     assert reader.get_header().profile == "ros2"
     assert [(one.name, one.metadata) for one in reader.iter_metadata()] == [("imud", {"source": "a.imudrec"})]
     out, _ = whole
@@ -117,7 +120,7 @@ def test_times_out_of_range_and_no_messages() -> None:
     summary = SeekingReader(out, validate_crcs=True).get_summary()
     assert summary is not None
     assert summary.statistics is not None
-    assert summary.statistics.message_count == 0
+    assert (summary.statistics.message_count, summary.statistics.chunk_count) == (0, 0)
 
 
 def test_an_error_of_the_disk_comes_out_and_closing_ends_the_thread() -> None:
@@ -134,6 +137,27 @@ def test_an_error_of_the_disk_comes_out_and_closing_ends_the_thread() -> None:
     file.close()
     file.close()
     assert threading.enumerate() == before
+    written(BytesIO(), 1)
+    assert threading.enumerate() == before
+
+
+def test_the_records_of_a_file_and_their_places() -> None:
+    out = BytesIO()
+    messages, data = written(out, 20), out.getvalue()
+    records = list(StreamReader(BytesIO(data), emit_chunks=True).records)
+    assert [type(record).__name__ for record in records] == [
+        "Header", "Metadata", "Chunk", "MessageIndex", "MessageIndex", "DataEnd", "Schema", "Schema", "Channel",
+        "Channel", "Statistics", "ChunkIndex", "MetadataIndex", *5 * ["SummaryOffset"], "Footer",
+    ]  # fmt: skip
+    chunk, *indexes = records[2:5]
+    content = zstandard.decompress(chunk.data)
+    places = {at: t_ns for index in indexes for t_ns, at in index.records}
+    assert [places[at] for at in sorted(places)] == [t_ns for _, t_ns, _ in messages]
+    assert {content[at] for at in places} == {Opcode.MESSAGE}
+    footer, offsets = records[-1], [record for record in records if isinstance(record, SummaryOffset)]
+    assert [data[one.group_start] for one in offsets] == [one.group_opcode for one in offsets]
+    assert data[footer.summary_offset_start] == Opcode.SUMMARY_OFFSET
+    assert footer.summary_crc == zlib.crc32(data[footer.summary_start : -12])
 
 
 def in_runs(sizes: Sequence[int], times_ns: Sequence[int], length: int) -> tuple[bytes, bytes]:

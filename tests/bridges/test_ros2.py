@@ -18,6 +18,7 @@ from imud.bridges.channel import (
 )
 from imud.bridges.ros2 import ENCAPSULATION, FIELDS, CdrWriter, Layout, Ros2Dialect, schema, time_of
 from imud.contracts.status import Deviations
+from imud.model.event import Event, EventKind
 from imud.model.sample import Sample
 from tests.bridges.samples import BARE, EVENT, FULL, UTC_NS
 
@@ -111,6 +112,7 @@ def test_losses_events_and_diagnoses() -> None:
     log = read(DIALECT.events(), StampedEvent(EVENT, UTC_NS))
     assert (log.level, log.name, log.msg) == (30, "bow", 'loss: lost 3, "damaged"')
     assert log.stamp.sec == 1_790_000_000
+    assert read(DIALECT.events(), StampedEvent(Event(1, "bow", EventKind.UP, "there"), UTC_NS)).level == 20
     values = {"t_err_ns": "12000", "state": "running"}
     bow = Diagnosis("bow", DiagnosisLevel.OK, "running", "17", values)
     mast = Diagnosis("mast", DiagnosisLevel.STALE, "silent: nothing comes", "", {})
