@@ -113,7 +113,7 @@ class TcpOutput:
             ) from error
         self.port = listener.getsockname()[1]
         self._listener = listener
-        asyncio.get_running_loop().add_reader(listener, self._accept)
+        asyncio.get_running_loop().add_reader(listener, self._accept, listener)
 
     def put(self, sentences: bytes) -> None:
         """Send sentences to each client with room in its socket buffer."""
@@ -147,10 +147,7 @@ class TcpOutput:
             asyncio.get_running_loop().remove_reader(listener)
             listener.close()
 
-    def _accept(self) -> None:
-        listener = self._listener
-        if listener is None:
-            return
+    def _accept(self, listener: socket.socket) -> None:
         try:
             sock, address = listener.accept()
         except (BlockingIOError, ConnectionError):
@@ -176,7 +173,7 @@ class TcpOutput:
 
     def _listen_again(self) -> None:
         if self._listener is not None:
-            asyncio.get_running_loop().add_reader(self._listener, self._accept)
+            asyncio.get_running_loop().add_reader(self._listener, self._accept, self._listener)
 
     def _read(self, number: int) -> None:
         client = self._clients.get(number)

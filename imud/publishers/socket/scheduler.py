@@ -244,9 +244,7 @@ class Scheduler:
         return needs_ticks
 
     def close(self) -> None:
-        """Stop serving. A second call does nothing."""
-        if self._epoll.closed:
-            return
+        """Stop serving."""
         if self._next_turn is not None:
             self._next_turn.cancel()
         self._loop.remove_reader(self._epoll.fileno())
