@@ -25,7 +25,6 @@ NONE: Final = "-"
 INDENT: Final = "    "  # indent of the second and later lines of a sample
 ROWS: Final = 24  # number of rows of a terminal with unknown size
 ROWS_LEAST: Final = 10  # minimum number of samples between two headers
-NAME_MAX: Final = 256
 
 Text = Callable[[Any], str]
 
@@ -76,7 +75,7 @@ _SECONDS: Final = _scaled(NS_PER_S, 6)
 
 _LAYOUT: Final = (
     _one("utc_ns", "TIME", 12, _clock_time, is_number=False),
-    _one("device", "DEVICE", 10, lambda name: shortened(printable(name, NAME_MAX), 10), is_number=False),
+    _one("device", "DEVICE", 10, lambda name: shortened(printable(name), 10), is_number=False),
     _one("seq", "SEQ", 9, str),
     _one("t_ns", "T s", 14, _SECONDS),
     _one("t_err_ns", "±ms", 4, _scaled(NS_PER_MS, 2)),

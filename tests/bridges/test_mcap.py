@@ -144,7 +144,7 @@ def test_an_error_of_the_disk_comes_out_and_closing_ends_the_thread() -> None:
 def test_the_records_of_a_file_and_their_places() -> None:
     out = BytesIO()
     messages, data = written(out, 20), out.getvalue()
-    records = list(StreamReader(BytesIO(data), emit_chunks=True).records)
+    records: list[Any] = list(StreamReader(BytesIO(data), emit_chunks=True).records)
     assert [type(record).__name__ for record in records] == [
         "Header", "Metadata", "Chunk", "MessageIndex", "MessageIndex", "DataEnd", "Schema", "Schema", "Channel",
         "Channel", "Statistics", "ChunkIndex", "MetadataIndex", *5 * ["SummaryOffset"], "Footer",

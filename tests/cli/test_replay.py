@@ -248,6 +248,9 @@ def test_a_log_of_two_interfaces_needs_a_choice(driver: str, command: str, tmp_p
     if driver == "hipnuc-canopen":
         status = status_of(command, driver)
         report = run(cli, command, driver, tmp_path / "x.log", "--interface", "vcan1", status=status)
+        options = ("--interface", "vcan1", "--option", "sync_hz=0.001")
+        few = run(cli, command, driver, tmp_path / "x.log", *options, status=2)
+        assert "--option sync_hz: expected 0, or" in few
         assert f"{SETS} samples" in report or f"samples {SETS};" in report or '"frames_good":1200' in report
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from imud.client.connection import Client, EventStream, default_path, event_of
+from imud.client.connection import Client, EventStream, default_path, event_of, rpc_error
 from imud.contracts.publisher import Batch
 from imud.formats.jsonrpc import RpcError
 from imud.model.errors import LinkDenied, LinkMissing, ServerError
@@ -171,6 +171,7 @@ def test_events(served: Daemon) -> None:
 
 
 def test_an_event_of_a_kind_to_come_is_accepted() -> None:
+    assert [rpc_error({"code": 7, "message": "m", "data": data}).data for data in ({"a": 1}, [1])] == [{"a": 1}, None]
     event = event_of({"t_ns": 1, "device": "imu0", "kind": "earthquake", "message": "m", "later": 1})
     assert event.kind == "earthquake"
     with pytest.raises(ServerError, match="cannot decode the notification 'event'"):
@@ -192,9 +193,13 @@ def test_notify_gives_a_descriptor_that_wakes(served: Daemon) -> None:
         publish(served, batch("imu0", 6))
         assert len(client.devices()) == 2
         assert os.read(another, 64)
-        os.close(fd)
-        os.close(another)
         assert next(watch).seq == 1
+        client._fds.append(fd)  # as after a late reply
+        client.devices()
+        client._fds.append(another)
+    for closed in (fd, another):
+        with pytest.raises(OSError, match="Bad file descriptor"):
+            os.fstat(closed)
 
 
 def test_path_of_the_environment(served: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -133,3 +133,5 @@ def test_a_small_difference_of_clocks_counts_as_one_clock(monkeypatch: pytest.Mo
     monkeypatch.setattr("imud.client.feed.monotonic_ns", lambda: NOW_NS)
     assert clock_ahead_ns(NOW_NS + sign * SAME_CLOCK_NS) == 0  # the reply may be late
     assert clock_ahead_ns(NOW_NS + sign * (SAME_CLOCK_NS + 1)) == sign * (SAME_CLOCK_NS + 1)
+    monkeypatch.setattr("imud.client.feed.time_ns", lambda: NOW_NS + 7)
+    assert utc_offset_ns(5) == 2

@@ -15,9 +15,9 @@ import pytest
 from imud.contracts.setting import AppliedSettings, SettingDifference
 from imud.fleet.broker import Received
 from imud.fleet.commands import ANSWERS_KEPT, WAITING_MAX, CommandChannel, CommandReply
-from imud.fleet.messages import REQUEST_BYTES, CommandAnswer, Outcome, answer_topic
+from imud.fleet.messages import CommandAnswer, Outcome, answer_topic
 from imud.fleet.publisher import MqttPublisher
-from imud.fleet.settings import CommandOptions, MqttOptions
+from imud.fleet.settings import CommandOptions, MqttOptions, check_commands
 from imud.fleet.streams import Gateway
 from imud.host.clock import HostClock
 from imud.host.log import RepeatFilter
@@ -128,6 +128,8 @@ def test_commands_that_are_not_allowed_are_denied() -> None:
     (wrong,) = wrong_values(CommandOptions, {"actions": ["a b"]})
     assert "expected names of commands, set.SETTING, or DEVICE/COMMAND" in str(wrong)
     assert wrong_values(CommandOptions, {"actions": ["a", "bow/a", "set", "set.mode", "bow/set.mode"]}) == []
+    (problem,) = check_commands(MqttOptions(commands=CommandOptions(actions=["set", "bow/set", "save"])), {}).values()
+    assert problem.startswith('expected a command that imud knows, got "save"')
     for entry in ("set.", "set.output.hi91", "get.mode"):
         assert wrong_values(CommandOptions, {"actions": [entry]})
 
@@ -180,14 +182,14 @@ def test_the_reply_of_set_reports_what_the_device_lacks() -> None:
 
 
 @pytest.mark.parametrize(
-    ("age_s", "taken"), [(29.9, False), (30.1, False), (-29.9, True), (-30.1, False), (0.9, True), (1.1, False)]
+    ("age_s", "taken"), [(30.0, False), (30.1, False), (-30.0, True), (-30.1, False), (1.0, True), (1.1, False)]
 )
 def test_old_and_future_requests_are_rejected(age_s: float, taken: bool) -> None:
     bench = ChannelBench()  # the output started 1 s ago, so an older request was not for it
     assert (bench.ask(age_s=age_s) is None) is taken
     bench = ChannelBench()
     bench.clock.advance(100 * NS_PER_S)
-    assert (bench.ask(age_s=age_s) is None) is (abs(age_s) < 30)
+    assert (bench.ask(age_s=age_s) is None) is (abs(age_s) <= 30)
 
 
 def test_a_request_that_becomes_too_old_in_the_queue_does_not_run() -> None:
@@ -262,10 +264,13 @@ def test_requests_above_the_rate_or_the_queue_are_rejected_as_busy() -> None:
     assert len(bench.device.done) == WAITING_MAX
 
 
+VALID = b'{"v": 1, "id": "a", "action": "identity", "issued_utc_ns": 1}'
+
+
 @pytest.mark.parametrize(
     "payload",
     [
-        b"", b"{}", b"[]", b"\xff", b'{"v": 1}', b"[" * 3000, b" " * (REQUEST_BYTES + 1),
+        b"", b"{}", b"[]", b"\xff", b'{"v": 1}', b"[" * 3000, VALID.ljust(4097),
         b'{"v": 2, "id": "a", "action": "identity", "issued_utc_ns": 1}',
         b'{"v": 1, "id": "a/b", "action": "identity", "issued_utc_ns": 1}',
         b'{"v": 1, "id": "a", "action": "identity", "issued_utc_ns": 1, "more": 1}',
@@ -276,6 +281,8 @@ def test_invalid_requests_are_counted_without_a_reply(payload: bytes) -> None:
     bench = ChannelBench()
     bench.take(payload)
     assert (bench.channel.refused, bench.replies) == (1, [])
+    bench.take(VALID.ljust(4096))
+    assert bench.answers()[-1].outcome is Outcome.STALE
 
 
 def test_retained_requests_and_foreign_reply_topics_are_ignored() -> None:

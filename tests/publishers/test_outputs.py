@@ -135,6 +135,7 @@ def test_the_pause_doubles_and_is_short_again_after_a_long_run(rig: Rig) -> None
 def test_an_optional_output_that_cannot_start_is_tried_again(
     rig: Rig, caplog: pytest.LogCaptureFixture, error: Exception
 ) -> None:
+    caplog.set_level("INFO")
     rig.failing[("two", "start")] = error
     rig.start()
     assert rig.outputs.summary() == "one, must (not yet: two)"
@@ -147,6 +148,7 @@ def test_an_optional_output_that_cannot_start_is_tried_again(
     assert rig.done("start") == [("two", "start"), ("two", "start")]
     assert rig.outputs.summary() == "one, must, two"
     assert rig.context.outputs.problems() == {}
+    assert [text for text in caplog.messages if "started" in text] == ["two: started"]
 
 
 def test_a_required_output_that_cannot_start_stops_imud_only_at_the_start(rig: Rig) -> None:
