@@ -23,11 +23,17 @@ BEGIN_NS = 5000 * NS_PER_S
 class Played:
     def __init__(self, driver: str) -> None:
         self.samples: list[Sample] = []
+        self.batches: list[int] = []  # number of samples in each batch
         row = DRIVERS[driver]
         self.player = CapturePlayer(self.publish, row, row.settings(), "file")
 
     def publish(self, batch: Batch) -> None:
         self.samples += batch.samples
+        self.batches.append(len(batch.samples))
+
+    @property
+    def counted(self) -> dict[str, int]:
+        return {name: count for name, count in self.player.device.ledger.snapshot().items() if count}
 
 
 def stamped(count: int = 300, details: dict[str, str | int] | None = None) -> BytesIO:
@@ -35,6 +41,7 @@ def stamped(count: int = 300, details: dict[str, str | int] | None = None) -> By
     writer = CaptureWriter(out, driver="hipnuc-uart", baud=115200, details=details)
     for number in range(count):
         writer.write(hi91(10 * number), BEGIN_NS + number * 10 * NS_PER_MS + 8 * NS_PER_MS)
+    writer.write(hi91(0)[:30], BEGIN_NS + count * 10 * NS_PER_MS)  # a frame that the end of the capture cuts
     out.seek(0)
     return out
 
@@ -50,6 +57,10 @@ def test_a_stamped_capture_has_the_times_of_its_reads_and_utc_if_it_says_when_it
     assert 0 < read_ns - last.t_ns < 8 * NS_PER_MS  # 82 bytes at 115200 baud are 7.1 ms
     assert last.utc_ns - last.t_ns == -(BEGIN_NS + 8 * NS_PER_MS)
     assert played.player.device.ledger.closes()
+    assert played.counted == {
+        "bytes_in": 24630, "bytes_in_good_frames": 24600, "bytes_skipped": 30, "frames_good": 300,
+        "frames_in_samples": 300, "samples": 300,
+    }  # fmt: skip
     played = Played("hipnuc-uart")
     played.player.play_bytes(CaptureReader(stamped(details={"start_utc_ns": 1_763_717_507 * NS_PER_S})), 0)
     assert played.player.times is KnownTimes.HOST
@@ -92,7 +103,11 @@ def test_a_log_of_a_can_bus_has_the_wall_clock_and_frames_of_others_are_left_out
     assert len(played.samples) == 600
     assert played.samples[-1].utc_ns == played.samples[-1].t_ns
     assert abs(played.samples[-1].t_ns - (LOG_NS + 599 * 10 * NS_PER_MS)) < NS_PER_MS
-    assert played.player.device.ledger.bytes_skipped == 0
+    assert played.counted == {
+        "bytes_in": 24000, "bytes_in_good_frames": 24000, "frames_good": 3000, "frames_in_samples": 3000,
+        "samples": 600,
+    }  # fmt: skip
+    assert played.batches == [51, 51, 51, 51, 52] * 2 + [51, 37]
 
 
 def test_a_polled_device_cannot_be_captured(tmp_path: Path) -> None:

@@ -13,6 +13,8 @@ import msgspec
 import pytest
 
 from imud.attitude.conventions import Convention
+from imud.attitude.published import published_frame
+from imud.contracts.publisher import Batch
 from imud.drivers import DRIVERS
 from imud.formats import records
 from imud.formats.records import CallRecord, CheckRecord, Kind, PathRecord, Record, records_of
@@ -21,7 +23,7 @@ from imud.links.memory import MemoryLink
 from imud.model.errors import ImudError
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_S
-from imud.recording.player import Player, _reading
+from imud.recording.player import STEP_NS, Player, RecordedClock, _reading
 from tests.device import test_can_transport as can
 from tests.device import test_polled_transport as polled
 from tests.device import test_polled_transport_data_ready as data_ready
@@ -30,7 +32,9 @@ from tests.device import test_watches as watches
 from tests.lines import test_end_to_end as signals
 from tests.support.device_rig import DeviceRig, DeviceRigs, device_config, play
 from tests.support.event_loops import LoopWorker, VirtualClock
+from tests.support.fake_drivers import FAKE_DRIVER
 from tests.support.polled_bus_bench import PolledBusBench
+from tests.support.rings import make_sample
 
 SAMPLES = 60
 
@@ -127,6 +131,27 @@ def test_a_recording_that_begins_in_the_middle_has_the_stamps_and_numbers_of_the
     rig = run_of(driver, middle)
     assert rig.samples
     assert rig.samples[0].seq > 1 or middle == 1
+    player = Player(lambda _batch: None)
+    player.play(record for one in rig.recorded for record in records_of(one))
+    (played,) = player.devices.values()
+    assert (played.before or {})["samples"] == rig.samples[0].seq - 1
+    assert (played.ledger.snapshot(), played.fresh_starts, played.differences) == (rig.ledger.snapshot(), [], [])
+
+
+def test_a_wall_clock_that_steps_moves_the_samples_before_the_step() -> None:
+    """The first clock steps by 2 s; a suspend starts a new offset; a reading that differs by 1 ms is no step."""
+    clock, sample = RecordedClock(), make_sample(1)
+    frame = published_frame(None, None, None, FAKE_DRIVER.axes)
+    samples = [msgspec.structs.replace(sample, t_ns=t_ns, utc_ns=t_ns + 1000) for t_ns in (50, 99, 100, 101)]
+    batch = Batch("a", 1, samples, frame)
+    assert clock.placed(batch) is batch
+    for monotonic_ns, offset_ns, suspends in ((10, 1000, 0), (20, 1000 + STEP_NS, 0)):
+        clock.add(monotonic_ns, offset_ns, suspends)
+        assert clock.placed(batch) is batch
+    clock.add(100, 1000 + 2 * STEP_NS, 1)
+    placed = clock.placed(batch)
+    assert (placed.device, placed.device_id, placed.frame) == ("a", 1, frame)
+    assert [one.utc_ns - one.t_ns - 1000 for one in placed.samples] == [0, 0, 2 * STEP_NS, 2 * STEP_NS]
 
 
 def test_without_the_state_a_new_clock_starts_and_a_removed_option_is_ignored(

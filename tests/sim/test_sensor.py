@@ -1,11 +1,18 @@
 """The sensor inside every simulated device follows the options."""
 
+import re
+import struct
 from typing import Any
+from zlib import crc32
 
 import pytest
 
+from imud.drivers.imu61x.uart.codec import HOST_SYNC, encode_frame, pack_parameters
+from imud.formats.modbus import framed
 from imud.model.units import NS_PER_S
 from imud.sim import CAN_SIMULATORS, SIMULATORS
+from imud.sim.hipnuc import canopen, j1939, modbus, uart_settings
+from imud.sim.imu61x import uart
 from imud.sim.physics import Noise, swing
 from imud.sim.sensor import SensorHardware, SimulatorOptions, sensor_of
 
@@ -62,3 +69,115 @@ def test_the_crystal_and_the_boot_time_decide_the_times_of_frames(name: str) -> 
         assert BEGIN_NS + 300_000_000 < times_ns[0] < BEGIN_NS + 500_000_000
         spans_ns.append(times_ns[1000] - times_ns[0])
     assert spans_ns[0] / spans_ns[1] == pytest.approx(1.01, rel=1e-3)
+
+
+def register(number: int, value: int = 1, command: int = 6, size: int = 8) -> tuple[int, bool, bytes]:
+    return 0x0CEF0855, True, struct.pack("<HBBI", number, command, 0, value)[:size]
+
+
+def order(command: int, param1: float = 0.0, param3: int = 0) -> tuple[bytes]:
+    return (encode_frame(HOST_SYNC, command, pack_parameters(param1, param3)),)
+
+
+REQUESTS: dict[str, list[tuple[Any, ...]]] = {
+    "hipnuc-uart": [
+        (line.encode() + b"\r\n",)
+        for line in (
+            "LOG VERSION|CONFIG ATT MODE 1|CONFIG YAW 1 30|CONFIG YAW 2 30|CONFIG ATT RST 3|CONFIG ATT RST 2|"
+            "CONFIG IMU URFR 0,1,0,-1,0,0,0,0,1|CONFIG PMUX4 DIV2|CONFIG PMUX5 X,-1,1,0,1|LOG HI92 ONTIME 0.5|"
+            "LOG HI91 ONMARK 1|LOG HI91 ONMARK ONCE|UNLOGALL|LOG USRCONFIG|LOG COMCONFIG|LOG MAGCONFIG|LOG DISABLE|"
+            "LOG ENABLE|SERIALCONFIG 460800|SERIALCONFIG 1|SAVECONFIG|REBOOT|CONFIG YAW 0 -20|CONFIG ATT RST 5|FRESET|"
+            "LOG COMCONFIG|REBOOT|LOG COMCONFIG|" + "x" * 129
+        ).split("|")
+    ],
+    "hipnuc-modbus": [
+        (framed(int(row[:2], 16), bytes.fromhex(row[2:])),)
+        for row in re.split(
+            r"\|",
+            "08 03 0004 0008|08 03 0034 001A|08 03 0034 0018|08 03 0070 0014|08 03 0034 007E|08 06 0006 0001|"
+            "08 06 0004 0006|08 06 0000 0000|08 06 0005 0009|09 03 0005 0001|08 03 0005 0001|09 06 0000 0000|"
+            "08 06 0000 0000|09 06 0000 00FF|09 03 0004 0003|08 06 00A5 0004|09 06 00A5 0005|09 06 0000 0001|"
+            "50 03 0004 0003|00 06 0005 000A|0A 50 0031 0000 047D955F8D2A1701 000B|0B 03 0005 0001|0B 04 0000 0001|"
+            "0B 03",
+        )
+    ],
+    "hipnuc-canopen": [
+        (int(row[:3], 16), False, bytes.fromhex(row[3:]))
+        for row in re.split(
+            r"\|",
+            "608 40 18 10 01|608 40 18 10 01 00000000|608 40 18 10 07 00000000|608 2B 01 18 05 05000000|"
+            "608 2F 02 18 02 01000000|080|608 2B 17 10 00 F4010000|000 80 08|000 02 08|000 01 08|"
+            "608 23 A5 20 00 02000000|608 23 A5 20 00 05000000|608 23 9E 20 00 01000000|608 40 9E 20 00 00000000|"
+            "608 23 00 20 00 00000000|608 23 A0 20 00 09000000|608 40 00 10 00 00000000|609 40 00 10 00 00000000|"
+            "608 23 00 20 00 FF000000|608 40 A0 20 00 00000000|609 23 00 20 00 00000000|608 23 00 20 00 01000000|"
+            "000 81 00|608 40 17 10 00 00000000",
+        )
+    ],
+    "hipnuc-j1939": [
+        *((0x18EA08FE, True, b"\0\xee\0"), register(0x78, 1, 3), register(0x78, 0, 3), register(0x71, 1, 3)),
+        *(register(0x100 | pgn, value) for pgn, value in ((0x34, 400), (0x37, 1001), (0x3D, 1000), (0x4A, 4))),
+        *(register(0x100, 1, 3), register(0x96, 0xFF34), register(0x9E), register(0x9F), register(0x9F, 2)),
+        *(register(0xA5, 1), register(0xA5, 2), register(0xA5, 0), register(0x9A, 2), register(0x9A, 9)),
+        *(register(0, 0), register(0x9C, 9), register(0x9C, 3, 3), register(0, 0xFF), register(0x9C, 1, 3)),
+        *(register(0, 1), register(0, 0xFF), register(0x34, 1, 3), register(0, 2), register(0, 0, 6, 7)),
+    ],
+    "hipnuc-nmea2000": [(0x18EAFF01, True, b"\0\xee\0")],
+    "imu61x-uart": [
+        *(order(1), order(2), order(14, 50, 21), order(6, 0, 21), order(3, 100), order(1), order(3, 2), order(2)),
+        *(order(4, 90), order(4, 361), order(2), order(14, 2, 27), order(14, 25, 30), order(14, 24, 30)),
+        *(order(6, 0, 99), order(14, 255, 31), order(14, 256, 31), order(7), order(8), order(10), order(8)),
+        *(order(6, 0, 11), order(5), order(14, 460800, 3), order(1), order(5), order(9), order(6, 0, 3)),
+        *(order(3, 1), order(15), order(9), order(77)),
+    ],
+    "imu61x-can": [(0x65, False, b"")],
+}  # fmt: skip
+VARIANTS_OF: dict[str, Any] = {
+    "hipnuc-uart": uart_settings.VARIANTS, "hipnuc-modbus": modbus.SLAVE_VARIANTS,
+    "hipnuc-canopen": canopen.NODE_VARIANTS, "hipnuc-j1939": j1939.J1939_VARIANTS, "imu61x-uart": uart.VARIANTS,
+}  # fmt: skip
+REPLIES = {
+    "hipnuc-uart": [
+        0xF39C41CC, 0x56A541BD, 0x1461DE9D, 0xFFC43E47, 0xAAB0CE06, 0x2A9E3D5D, 0x3A7963EF, 0xCFFDE83C,
+        0x0A0800EC, 0xB396DAE6,
+    ],
+    "hipnuc-modbus": [
+        0x6AB493CA, 0x016FD270, 0x853FD1AC, 0x300192EA, 0x04FAFEA3, 0xE13ECC07, 0x9FE2A1DA, 0x4F083F16,
+        0x78AF0169, 0x218227F7, 0x6FDDF100,
+    ],
+    "hipnuc-canopen": [
+        0x43DB518E, 0x0F9BDE56, 0x4281D91F, 0x554317A1, 0xEACEBD1C, 0xCE0A3CEB, 0x7D532B2E, 0x625DB5CC,
+        0x9C0478DF,
+    ],
+    "hipnuc-j1939": [
+        0xD81DABA1, 0x0B48C519, 0xA918A6A0, 0x1EA92E85, 0x6B60A236, 0x588E0DBE, 0x159C9680, 0x0DA4B95F,
+        0x936AF8B8,
+    ],
+    "hipnuc-nmea2000": [0x337F03C7],
+    "imu61x-uart": [
+        0xCFD14F67, 0x4CB81042, 0x737D0520, 0x7044A7FE, 0xB4237883, 0x28A39AC2, 0xF4F5C643, 0xEDB0DDED,
+        0xF693DD91, 0x5FECEC42, 0x3ACA42E4,
+    ],
+    "imu61x-can": [0x3C445451],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REQUESTS)
+def test_each_variant_replies_as_before(name: str) -> None:
+    simulator: Any = SIMULATORS[name] if name in SIMULATORS else CAN_SIMULATORS[name]
+    found = {}
+    for variant in VARIANTS_OF.get(name, [""]):
+        message = {"hipnuc-modbus": "8", "hipnuc-j1939": "all"}.get(name, "")
+        options = SimulatorOptions(1.0, message=message, variant=variant, firmware=169 if name[0] == "h" else 0, node=0)
+        module, now_ns, log = simulator.make(options, BEGIN_NS), BEGIN_NS, list[object]()
+        for number, request in enumerate(REQUESTS[name]):
+            now_ns += 2_500_000_000 if number % 3 else 100_000_000
+            log.append((module.next_ns(), getattr(module, "baud", 0), *module.advance(now_ns)))
+            log.append((module.counters(), *(module.pins(now_ns) if name == "hipnuc-uart" else ())))
+            module.receive(*request, now_ns)
+            if number % 5 == 0:
+                module.mark(now_ns + 1000)
+        log += module.advance(now_ns + 200_000_000)
+        module.reboot(now_ns + 500_000_000)
+        log += module.advance(now_ns + 2_500_000_000)
+        found[variant] = crc32(repr(log).encode())
+    assert list(found.values()) == REPLIES[name], found

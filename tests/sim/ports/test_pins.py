@@ -1,14 +1,17 @@
 """Pins change lines at the due time and lose the edges of a fault. The same seed gives the same edges."""
 
 import asyncio
+from io import StringIO
 from itertools import pairwise
+from zlib import crc32
 
 import pytest
 
-from imud.contracts.lines import Edge
+from imud.contracts.lines import Edge, InputOptions, OutputOptions
+from imud.model.errors import LinkError
 from imud.model.units import NS_PER_MS
 from imud.sim.ports.faults import FaultKind, FaultRates, Faults
-from imud.sim.ports.pins import MemoryInput, MemoryOutput, PinFaultRates, PinFaults, Pins
+from imud.sim.ports.pins import MemoryInput, MemoryLines, PinFaultRates, PinFaults, Pins
 from imud.sim.sensor import Pin
 from tests.support.event_loops import in_loop
 from tests.support.simulated_modules import FAST, HipnucUartBench
@@ -40,12 +43,14 @@ def test_every_edge_comes_once_in_order() -> None:
     assert pins.summary() == {"pin_edges": pins.edges}
     memory_line = MemoryInput()
     memory_line.open()
-    bench = HipnucUartBench(FAST)
-    pins = Pins(bench.module, {Pin.SOUT: memory_line.edge})
+    bench, truth = HipnucUartBench(FAST), StringIO()
+    pins = Pins(bench.module, {Pin.SOUT: memory_line.edge}, truth=truth)
     for _ in range(100):
         bench.now_ns += NS_PER_MS
         pins.step(bench.now_ns)
-    assert pins.edges == pytest.approx(200, abs=2)
+    text = truth.getvalue()
+    assert text.startswith("pin,level,due_ns,sample_ns,step_ns\nsout,1,1235068925104,1235068880104,1235069890123\n")
+    assert (pins.edges, text.count("\n"), crc32(text.encode())) == (198, 199, 3932825069)
     assert not memory_line.level()
 
 
@@ -110,16 +115,44 @@ def test_probabilities_are_probabilities(value: float) -> None:
 
 @in_loop
 async def test_a_line_in_memory_counts_lost_edges_and_ends_inactive() -> None:
-    line, found, output = MemoryInput(), list[Edge](), MemoryOutput()
+    line, found = MemoryInput(), list[Edge]()
     line.open()
     line.edge(10, True)
-    line.start(found.extend, lambda _error: None)
+    ends = list[LinkError]()
+    line.start(found.extend, ends.append)
+    assert (line.is_open, line.level(), line.fileno(), found) == (True, True, -1, [])
     await asyncio.sleep(0)
+    assert found == [Edge(10, True, 1)]
     line.lose(2)
     line.edge(20, False)
     line.drain()
-    assert found == [Edge(10, True, 1), Edge(20, False, 4)]
+    line.pulse(30, 5)
+    await asyncio.sleep(0)
+    assert found[1:] == [Edge(20, False, 4), Edge(30, True, 5), Edge(35, False, 6)]
+    assert line.edges_lost == 2
+    line.vanish(gone := LinkError("gone"))
+    line.edge(40, True)
+    assert (ends, line.is_open, found[4:]) == ([gone], False, [])
+    rising = MemoryLines(lambda: 7).input(InputOptions(chip="/dev/gpiochip0", line=1), "ready", True)
+    rising.open_error = gone
+    with pytest.raises(LinkError, match="gone"):
+        rising.open()
+    with pytest.raises(LinkError, match="ready is not open"):
+        rising.level()
+    rising.open_error = None
+    rising.open()
+    rising.pulse(50, 5)
+    rising.start(found.extend, ends.append, watch=False)
+    rising.edge(60, True)
+    await asyncio.sleep(0)
+    assert found[4:] == []
+    rising.drain()
+    assert found[4:] == [Edge(50, True, 1), Edge(60, True, 2)]
+    output = MemoryLines(lambda: 7).output(OutputOptions(chip="/dev/gpiochip0", line=1), "reset")
+    with pytest.raises(LinkError, match="reset is not open"):
+        output.set(True)
     output.open()
     output.set(True)
     output.close()
-    assert [active for _, active in output.history] == [True, False]
+    output.close()
+    assert (output.history, output.is_open) == ([(7, True), (7, False)], False)
