@@ -357,7 +357,7 @@ class ConditionWatch:
         self._causes: dict[_Key, tuple[int, int, Reason]] = {}  # first and last time of each cause, newest reason
         self._missing_ns: int | None = None  # CLOCK_MONOTONIC since which no samples arrive; None while they arrive
         self._found = False  # whether the device was running since start
-        self._minute = now_ns // MINUTE_NS
+        self._minute = 0
         self._history: deque[Condition | None] = deque([None] * HISTORY_MINUTES, maxlen=HISTORY_MINUTES)
         self.condition = DeviceCondition(Condition.MISSING, now_ns)
 

@@ -69,7 +69,7 @@ def test_an_event_of_another_kind_is_logged_immediately(caplog: pytest.LogCaptur
     for t, lost in enumerate((2, 3)):
         ledger.lost_crc += lost
         ledger.frames_bad_crc += 1
-        device_events.bad_frame(BadFrame(BadReason.CRC, bytes((0x5A, 0xA5, t))))
+        device_events.bad_frame(BadFrame(BadReason.CRC, bytes((0x5A, 0xA5, 0xAB + t))))
         device_events.tick(t * S, None)
     device_events.raise_event(2 * S, EventKind.CONFIGURATION, "settings differ from the declared settings")
     for record in caplog.records:
@@ -77,6 +77,6 @@ def test_an_event_of_another_kind_is_logged_immediately(caplog: pytest.LogCaptur
     told = [record.getMessage() for record in caplog.records if repeats.filter(record)]
     assert told == [
         "bow: 2 samples lost",
-        "bow: 1 bad frame, the last by crc: 5a a5 00",
+        "bow: 1 bad frame, the last by crc: 5a a5 ab",
         "bow: settings differ from the declared settings",
     ]

@@ -18,6 +18,7 @@ from imud.device.settings_plan import (
     first_sentence,
     make_plan,
     merged,
+    setting_instead,
     unverified,
     wanted_values,
     words,
@@ -255,3 +256,22 @@ def test_an_error_names_the_wrong_part(given: dict[str, Any], message: str) -> N
     with pytest.raises(BadArgument) as caught:
         completed(HIPNUC, wanted_values(HIPNUC, given), {"alarm": msgspec.convert(ALARM, dict[str, AngleAlarm])})
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "command", "settings"),
+    [
+        ("baud", {}, "--set baud=BAUD --save", {}),
+        ("baud", {"baud": 460800}, "--set baud=460800 --save", {"baud": 460800}),
+        ("baud", {"baud": "x" * 395}, f"--set baud={'x' * 395} --save", {"baud": "x" * 395}),
+        ("baud", {"baud": "x" * 396}, "--set baud=BAUD --save", {}),
+        ("output_none", {}, "--set output.hi91=0 output.hi92=0", {"output.hi91": 0, "output.hi92": 0}),
+    ],
+)
+def test_a_command_that_a_setting_replaces(
+    name: str, given: dict[str, Any], command: str, settings: dict[str, Any]
+) -> None:
+    found = setting_instead("bow", name, DRIVERS["hipnuc-uart"], given)
+    assert found is not None
+    assert str(found) == f"{name} is a setting: imud settings bow {command}"
+    assert found.data == {"settings": settings, "save": command.endswith("--save")}

@@ -60,7 +60,11 @@ async def test_the_output_of_a_device_in_command_mode_is_started(bench: WakeBenc
     assert bench.woken == [WOKEN]
     assert bench.device.status().identity["serial_number"] == "003200473133510D33383736"
     assert bench.module.flash.mode is OutputMode.COMMAND
-    assert [e.kind for e in bench.events if "started its output" in e.message] == [EventKind.CONFIGURATION]
+    events = [event for event in bench.events if event.message == WOKEN]
+    assert [(event.kind, event.device, event.detail) for event in events] == [
+        (EventKind.CONFIGURATION, "bow", {"acknowledged": True})
+    ]
+    assert bench.device.stop_calibration() is False
 
 
 @pytest.mark.parametrize(

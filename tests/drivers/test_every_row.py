@@ -6,8 +6,9 @@ from random import Random
 import msgspec
 import pytest
 
-from imud.contracts.command import Calibration, CalibrationInfo, Handling, Kept, infos
+from imud.contracts.command import Calibration, CalibrationInfo, Handling, Kept, Risk, infos
 from imud.contracts.driver import CanDriver, DataSheet, Driver, ModelFigures, PolledDriver, SensorFigures, StreamDriver
+from imud.contracts.setting import Effect
 from imud.drivers import DRIVERS
 from imud.model.units import RAD_PER_DEG
 
@@ -61,6 +62,29 @@ def test_verbs_that_restart_change_or_save(name: str) -> None:
         "calibrate_installation",
     }
     assert {verb for verb, one in verbs.items() if one.changes and not one.restarts} == changing & set(verbs)
+    assert {verb for verb, one in verbs.items() if one.risk is Risk.RESET} == {"factory_reset"} & set(verbs)
+
+
+FLAGS = ("connection", "saves", "bus_rate", "unreadable", "after restart", "read only")
+FLAGGED = {
+    "hipnuc-uart": ("baud", "baud", "", "output_enabled", "mounting", "coordinates magnetometer_bias"),
+    "hipnuc-modbus": ("baud address", "", "baud", "mounting", "mounting baud", ""),
+    "hipnuc-canopen": ("bit_rate node", "", "bit_rate", "", "bit_rate node", ""),
+    "hipnuc-j1939": ("bit_rate address", "", "bit_rate", "", "bit_rate address", ""),
+    "imu61x-uart": ("baud", "", "", "", "", "gyro_offset_deg_s installation_angles_deg"),
+}
+
+
+@pytest.mark.parametrize("name", FLAGGED)
+def test_settings_that_need_more_than_a_write(name: str) -> None:
+    device_settings = DRIVERS[name].device_settings
+    assert device_settings is not None
+    found: dict[str, list[str]] = {flag: [] for flag in FLAGS}
+    for setting, one in device_settings.table.items():
+        has = one.connection, one.saves, one.bus_rate, not one.readable, one.effect is Effect.AFTER_RESTART
+        for flag, is_set in zip(FLAGS, (*has, one.write is None), strict=True):
+            found[flag] += [setting] * is_set
+    assert tuple(map(" ".join, found.values())) == FLAGGED[name]
 
 
 EVERY = [

@@ -7,8 +7,9 @@ import pytest
 
 from imud.contracts.link import StreamLink
 from imud.contracts.status import KernelCounters
+from imud.formats.can import CanFilter, CanFrame
 from imud.links import LINKS
-from imud.links.memory import MemoryLink, MemoryOptions
+from imud.links.memory import MemoryCanLink, MemoryLink, MemoryOptions
 from imud.model.errors import LinkBusy, LinkError, LinkMissing
 from tests.support.event_loops import in_loop
 
@@ -50,6 +51,19 @@ def test_what_is_fed_arrives_with_its_time() -> None:
     link.end(LinkError("late"))
     assert listener.ends == [None]
     assert not link.listening
+
+
+def test_a_can_link_delivers_the_frames_that_pass_its_filters() -> None:
+    link, passed, news = MemoryCanLink(MemoryOptions()), list[list[CanFrame]](), list[tuple[str, str]]()
+    one, two = CanFrame(1, False, b"", 5), CanFrame(2, False, b"", 6)
+    assert not link.feed([one])
+    link.filters = [CanFilter(1, 0x7FF, False)]
+    link.open()
+    link.start(lambda frames: passed.append(list(frames)), lambda *told: news.append(told), lambda _error: None)
+    assert link.feed([two, one])
+    assert link.feed([two])
+    link.news("bus off", "bus off")
+    assert (passed, news, link.listening) == ([[one]], [("bus off", "bus off")], True)
 
 
 @in_loop

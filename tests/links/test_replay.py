@@ -12,6 +12,7 @@ import msgspec
 import pytest
 
 from imud.contracts.link import StreamLink
+from imud.contracts.status import KernelCounters
 from imud.links import LINKS
 from imud.links.replay import PIECE_BYTES_MAX, PIECE_NS, CanReplayLink, ReplayLink, ReplayOptions
 from imud.model.errors import LinkDenied, LinkError, LinkMissing
@@ -238,3 +239,4 @@ def test_a_replay_has_settings_and_refuses_commands(stamped: Path) -> None:
         link.write(b"x")
     with pytest.raises(LinkError, match="fixed baud rate"):
         link.set_baud(9600)
+    assert link.kernel_counters() == KernelCounters()

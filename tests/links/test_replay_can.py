@@ -12,7 +12,7 @@ import pytest
 from imud.contracts.link import CanLink
 from imud.formats.can import CanFilter, CanFrame
 from imud.links import LINKS
-from imud.links.replay import TURN_FRAMES, CanReplayLink, ReplayOptions
+from imud.links.replay import TURN_FRAMES, CanReplayLink, ReplayOptions, _problem
 from imud.model.errors import LinkError, LinkMissing
 from tests.support.event_loops import VirtualClock, run_virtually
 from tests.support.files import candump_line
@@ -114,3 +114,14 @@ def test_what_cannot_be_played(tmp_path: Path) -> None:
         missing.open()
     with pytest.raises(LinkError, match="replay"):
         missing.write(b"")
+    log = write(tmp_path / "a.log", 3)
+    for path, frames, interface, expected in (
+        (bad, True, "can0", "is not a CAN log: expected frames in the format of `candump -L`, got none"),
+        (bad, False, "", "is a raw capture without times: use speed real with the key baud, or speed maximum"),
+        (log, True, "can0", ""), (log, True, "", ""), (tmp_path / "missing", True, "", ""),
+        (tmp_path, False, "", "is not a regular file: expected a capture file"),
+    ):  # fmt: skip
+        settings = ReplayOptions(path=str(path), interface=interface)
+        assert _problem(settings, frames) == (f"{path} {expected}" if expected else "")
+    words = f"interface: expected a log of a CAN bus, got {log} for a driver of bytes"
+    assert _problem(ReplayOptions(path=str(log), interface="can0"), frames=False) == words

@@ -74,6 +74,18 @@ def test_distant_events_are_unpaired() -> None:
     assert (pairing.events_unpaired, pairing.samples_unpaired) == (1, 1)
 
 
+def test_a_line_begins_with_the_eighth_pair_after_a_restart() -> None:
+    pairing, begins = EdgePairing(LEAD_NS), list[int]()
+    for i in range(40):
+        if i in (3, 20):
+            pairing.restart()
+        pairing.add_events([(i * PERIOD_NS, i)])
+        before = pairing.running
+        pair(pairing, i)
+        begins += [i] if pairing.running and not before else []
+    assert begins == [10, 27]
+
+
 @pytest.mark.parametrize(("apart_ns", "error_ns"), [(NS_PER_MS, ERROR_NS), (0, 0.5 * PERIOD_NS)])
 def test_it_begins_only_when_most_agree_and_the_fit_is_sure(apart_ns: int, error_ns: float) -> None:
     pairing = EdgePairing(LEAD_NS)

@@ -136,29 +136,14 @@ VARIANTS_OF: dict[str, Any] = {
     "hipnuc-canopen": canopen.NODE_VARIANTS, "hipnuc-j1939": j1939.J1939_VARIANTS, "imu61x-uart": uart.VARIANTS,
 }  # fmt: skip
 REPLIES = {
-    "hipnuc-uart": [
-        0xF39C41CC, 0x56A541BD, 0x1461DE9D, 0xFFC43E47, 0xAAB0CE06, 0x2A9E3D5D, 0x3A7963EF, 0xCFFDE83C,
-        0x0A0800EC, 0xB396DAE6,
-    ],
-    "hipnuc-modbus": [
-        0x6AB493CA, 0x016FD270, 0x853FD1AC, 0x300192EA, 0x04FAFEA3, 0xE13ECC07, 0x9FE2A1DA, 0x4F083F16,
-        0x78AF0169, 0x218227F7, 0x6FDDF100,
-    ],
-    "hipnuc-canopen": [
-        0x43DB518E, 0x0F9BDE56, 0x4281D91F, 0x554317A1, 0xEACEBD1C, 0xCE0A3CEB, 0x7D532B2E, 0x625DB5CC,
-        0x9C0478DF,
-    ],
-    "hipnuc-j1939": [
-        0xD81DABA1, 0x0B48C519, 0xA918A6A0, 0x1EA92E85, 0x6B60A236, 0x588E0DBE, 0x159C9680, 0x0DA4B95F,
-        0x936AF8B8,
-    ],
-    "hipnuc-nmea2000": [0x337F03C7],
-    "imu61x-uart": [
-        0xCFD14F67, 0x4CB81042, 0x737D0520, 0x7044A7FE, 0xB4237883, 0x28A39AC2, 0xF4F5C643, 0xEDB0DDED,
-        0xF693DD91, 0x5FECEC42, 0x3ACA42E4,
-    ],
-    "imu61x-can": [0x3C445451],
-}  # fmt: skip
+    "hipnuc-uart": 0xB875FD98,
+    "hipnuc-modbus": 0xC5960473,
+    "hipnuc-canopen": 0x2945F911,
+    "hipnuc-j1939": 0x9EA7991F,
+    "hipnuc-nmea2000": 0x56276182,
+    "imu61x-uart": 0x1D54A669,
+    "imu61x-can": 0x1A1332E7,
+}
 
 
 @pytest.mark.parametrize("name", REQUESTS)
@@ -180,4 +165,4 @@ def test_each_variant_replies_as_before(name: str) -> None:
         module.reboot(now_ns + 500_000_000)
         log += module.advance(now_ns + 2_500_000_000)
         found[variant] = crc32(repr(log).encode())
-    assert list(found.values()) == REPLIES[name], found
+    assert crc32(repr(found).encode()) == REPLIES[name], found

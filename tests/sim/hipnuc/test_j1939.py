@@ -19,7 +19,7 @@ from imud.formats.j1939 import split
 from imud.model.errors import NoReply, Rejected
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
-from imud.sim.can_module import CanModules, SentFrame
+from imud.sim.can_module import SentFrame
 from imud.sim.hipnuc.j1939 import SIMULATOR, HipnucJ1939Module, J1939Hardware, J1939Settings, J1939Variant
 from imud.sim.physics import Still
 from imud.sim.sensor import SimulatorOptions
@@ -82,18 +82,6 @@ class J1939Host:
 
 def restarted(peer: J1939Node) -> RequestScript[None]:
     yield commands.restart_request(peer)
-
-
-def test_four_modules_crystal_wire_and_the_next_frame() -> None:
-    modules = [made(node=node, rate_hz=100.0) for node in (1, 8, 9, 128)]
-    frames = CanModules(modules).advance(BEGIN_NS + SECOND_NS)
-    for module in modules:
-        assert samples_of(frames, module.settings.address) >= 94
-
-    module = made(skew_ppm=1000.0)
-    frames = [f for f in module.advance(BEGIN_NS + SECOND_NS) if split(f.can_id).pgn != commands.CLAIMED]
-    assert [split(frame.can_id).pgn for frame in frames[:4]] == [0xFF34, 0xFF37, 0xFF3D, 0xFF41]
-    assert module.counters() == {"samples_sent": 101, "frames_sent": 405, "requests": 0}
 
 
 @pytest.mark.manual("B 6.2.2 intervals", "B 6.2.2 bit rate", "B 6.2.2 address")
@@ -175,21 +163,6 @@ def test_a_restart_is_answered_before_it_happens_or_not_at_all(confirms: bool) -
     replies = [f for f in module.advance(BEGIN_NS + 60 * MS) if split(f.can_id).pgn == 0xEF00]
     expected = [(0x0CEF5508, bytes.fromhex("00000600FF000000"))] if confirms else []
     assert [(f.can_id, f.data) for f in replies] == expected
-
-
-def test_an_address_is_claimed_after_power_on_and_when_asked() -> None:
-    """The request for PGN 0xEE00 has the format of J1939-21, low byte first, to the device and to all nodes."""
-    module = HipnucJ1939Module(BEGIN_NS, hardware=J1939Hardware(boot_ms=0))
-    claims = [f for f in module.advance(BEGIN_NS + 10 * MS) if f.can_id == 0x18EEFF08]
-    assert len(claims) == 1
-    for number, can_id in enumerate((0x18EA0855, 0x18EAFF55), 1):
-        now_ns = BEGIN_NS + number * 20 * MS
-        module.advance(now_ns)
-        module.receive(can_id, True, bytes.fromhex("00EE000000000000"), now_ns)
-        (claim,) = [f for f in module.advance(now_ns + 10 * MS) if f.can_id == 0x18EEFF08]
-        assert claim.data == claims[0].data
-    module.receive(0x18EA0955, True, bytes.fromhex("00EE000000000000"), BEGIN_NS + 70 * MS)
-    assert not [f for f in module.advance(BEGIN_NS + 80 * MS) if f.can_id == 0x18EEFF08]
 
 
 def test_registers_replies_and_a_single_message() -> None:

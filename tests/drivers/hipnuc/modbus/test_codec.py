@@ -1,6 +1,8 @@
 """Replies of the manual with values by hand, and the scales that the codec decides."""
 
+import struct
 from math import radians
+from typing import Any
 
 import pytest
 
@@ -91,6 +93,10 @@ def test_identity_sensors_and_the_block_of_newer_firmware() -> None:
     assert m.temperature_c is None
     assert m.pressure_pa is None
 
+    values: dict[str, Any] = {name: getattr(m, name) for name in ("accel_m_s2", "gyro_rad_s", "mag_t", "euler_rad")}
+    values |= {"quat_wxyz": m.quat_wxyz, "quat_per_lsb": QUAT_OLD_PER_LSB, "temperature_c": 0, "pressure_pa": 0}
+    incli = struct.unpack(">2h", SENSORS[-6:-2])
+    assert pack_block(uptime_ms=None, incli_counts=incli, **values) == SENSORS[3:-2]
     words = "0000 0000 0800 0000 0000 0000 0000 0000 0000" + "0000 0000" * 3 + "09D0 009A9C14" + "2710 0000 0000 0000"
     m = measured(codec(), framed(1, registers_reply(bytes.fromhex(words + "0000 0000 0001 2345"))))
     assert (m.size_bytes, m.dev_ticks) == (57, 74_565)
