@@ -504,7 +504,7 @@ TESTED_IN = {
     "imud.fleet.settings": "fleet/test_publisher.py", "imud.formats.jsonrpc": "publishers/socket/test_methods.py",
     "imud.formats.kernel": "sampling/test_path_kernel.py",
     "imud.publishers.metrics.metric": "publishers/metrics/test_families.py",
-    "imud.sim.ports.in_process_bus": "links/test_spi.py", "imud.web.messages": "web/test_hub.py",
+    "imud.web.messages": "web/test_hub.py",
 }  # fmt: skip
 """Modules without a test module of their own, and the test module that covers them."""
 

@@ -380,7 +380,7 @@ class ModbusLine:
         slave.answered += 1
         if slave.bad_crc:
             slave.bad_crc -= 1
-            return reply[:-1] + bytes([reply[-1] ^ 0x10])
+            return reply[:-1] + bytes([reply[-1] ^ 1])
         return reply
 
     def _send(self, data: bytes, ready_ns: int, sample_ns: int | None) -> None:

@@ -67,6 +67,7 @@ def test_windows_bursts_modes_and_a_restart() -> None:
     assert cut[:8] == whole[:8] or cut[4:8] == whole[4:8]
     assert cut[12:] == bytes(len(cut) - 12)
 
+    assert State(b"".join(device()[0].spi(READ_STATE.sends, 3))).product_id == b"\x00\x00IMU614"
     one, _ = device(modes=frozenset({3}))
     right = b"".join(one.spi(READ_STATE.sends, 3))
     wrong = b"".join(one.spi(READ_STATE.sends, 0))
