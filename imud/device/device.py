@@ -36,7 +36,7 @@ from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
 from imud.device.attachments import Attachments
 from imud.device.calibration import CalibrationRun, RestWindow, check
-from imud.device.condition import ConditionJudge
+from imud.device.condition import ConditionJudge, Facts
 from imud.device.evidence import STEP_S
 from imud.device.flash import SettingsFiles
 from imud.device.health import NO_SAMPLE, DeviceEvents, Health
@@ -266,7 +266,7 @@ class Device:
             self._attachments.tick(self._host.now_ns(), None)
             await self._serve_until_finished()
             self._health.finished("" if self.ledger.samples else self._transport.unknown_words())
-            self._judge.tick(self._host.now_ns(), self.state, self.status)
+            self._judge_condition(self._host.now_ns())
         finally:
             self._attachments.close()
             self._transport.close()
@@ -283,7 +283,25 @@ class Device:
         transport.tick(now_ns)
         if path is not None:
             self._tick_path(path, now_ns)
-        self._judge.tick(now_ns, self.state, self.status)
+        if self._judge.is_due(now_ns, self._health.state):
+            self._judge_condition(now_ns)
+
+    def _judge_condition(self, now_ns: int) -> None:
+        """Update the condition from the facts that it depends on."""
+        judge, transport, settings, ledger = self._judge, self._transport, self._settings, self.ledger
+        state, path, rate_hz = self._health.state, transport.path, transport.expected_rate_hz
+        resets = settings.counter_resets - settings.resets_requested
+        judge.counts.add(now_ns, rate_hz if state is DeviceState.RUNNING else 0.0, resets)
+        has_settings = bool(settings.declared or settings.is_unsaved or settings.comparison.problem)
+        axes, axes_problem = self._attitude.problem(transport.driver, settings, transport.axes_problem)
+        judge.judge(Facts(
+            now_ns=now_ns, state=state, problem=self._health.problem, place=judge.place,
+            recent=judge.counts.status(path.last_sample_ns if path is not None else 0), is_polled=transport.is_polled,
+            declared=settings.status() if has_settings else None, axes=axes, axes_problem=axes_problem,
+            lines=transport.add_lines(self._attachments.lines_status()), utc_problem=self._attachments.utc_problem,
+            open_bytes=ledger.bytes_open(), open_frames=ledger.frames_open(), expected_rate_hz=rate_hz,
+            t_err_ns=path.newest.t_err_ns if path and path.newest else 0,
+        ))  # fmt: skip
 
     def _tick_path(self, path: SamplePath, now_ns: int) -> None:
         transport = self._transport
@@ -301,7 +319,7 @@ class Device:
 
     @property
     def condition(self) -> Condition:
-        return self._judge.condition.condition
+        return self._judge.watch.level
 
     def _needs_ticks(self) -> bool:
         """Return whether the device needs ten ticks per second."""
@@ -503,7 +521,7 @@ class Device:
         path, driver = transport.path, transport.driver
         newest = path.newest if path is not None else None
         latency = path.latency if path is not None else LatencyMeter()
-        frame = self._attitude.status(driver, path, self._settings.values, self._settings.shown)
+        frame = self._attitude.status(driver, path, self._settings)
         status = DeviceStatus(
             name=self.config.name,
             device_id=self.device_id,
@@ -517,7 +535,7 @@ class Device:
             identity=identity_words(self._settings.identity),
             settings=dict(self._settings.shown),
             rate_hz=self._rate.rate_hz(),
-            expected_rate_hz=path.clock.expected_rate_hz if path else 0.0,
+            expected_rate_hz=transport.expected_rate_hz,
             newest_seq=newest.seq if newest else 0,
             clock=path.clock.status() if path else ClockStatus(),
             ledger=self.ledger.snapshot(),
@@ -532,14 +550,14 @@ class Device:
             status_words=status_words(driver.status_bits, newest.status) if driver and newest else (),
             status_bit_names={str(number): bit.name for number, bit in driver.status_bits.items()} if driver else {},
             connects=self._connects,
-            lines=self._attachments.lines_status(),
+            lines=transport.add_lines(self._attachments.lines_status()),
             utc=self._attachments.utc_status(),
             declared=self._settings.status(),
             noise=self.config.noise,
             resets_requested=self._settings.resets_requested,
-            condition=self._judge.condition,
-            recent=self._judge.recent(path.last_sample_ns if path else 0),
-            history=self._judge.history,
+            condition=self._judge.watch.condition,
+            recent=self._judge.counts.status(path.last_sample_ns if path else 0),
+            history=self._judge.watch.history,
             calibration=self._calibration.status,
         )
         return transport.add_status(status)

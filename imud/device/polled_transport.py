@@ -188,6 +188,7 @@ class PolledTransport(Transport):
     """Transport of one device on a polled bus. Synchronization: the loop's thread only."""
 
     link: PolledLink
+    is_polled = True
     driver: PolledDriver | None
     path: PolledPath | None
 
@@ -448,14 +449,16 @@ class PolledTransport(Transport):
 
     def add_status(self, status: DeviceStatus) -> DeviceStatus:
         """Return `status` with the state of the reads."""
-        ready, lines = self._ready, status.lines
-        return msgspec.structs.replace(
-            status,
-            expected_rate_hz=ready.expected_rate_hz if ready is not None else self.link.rate_hz,
-            polling=self._polling_status(),
-            serial_line=self.link.serial_line(),
-            lines=ready.add_status(lines) if ready is not None and lines is not None else lines,
-        )
+        return msgspec.structs.replace(status, polling=self._polling_status(), serial_line=self.link.serial_line())
+
+    def add_lines(self, status: LinesStatus | None) -> LinesStatus | None:
+        """Return the status of the lines with the data-ready line."""
+        return self._ready.add_status(status) if self._ready is not None and status is not None else status
+
+    @property
+    def expected_rate_hz(self) -> float:
+        """Present rate of the reads, Hz."""
+        return self._ready.expected_rate_hz if self._ready is not None else self.link.rate_hz
 
     @property
     def _missed(self) -> int:

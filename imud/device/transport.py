@@ -20,7 +20,7 @@ from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link, OnEnd
 from imud.contracts.publisher import Batch
 from imud.contracts.script import Message, RequestScript
-from imud.contracts.status import DeviceState, DeviceStatus
+from imud.contracts.status import DeviceState, DeviceStatus, LinesStatus
 from imud.device.attachments import Attachments
 from imud.device.evidence import SampleWatch
 from imud.device.health import DeviceEvents, Health
@@ -119,6 +119,7 @@ class Transport(SettingsPort):
 
     link: Link
     settings: DeviceSettings
+    is_polled = False  # whether imud requests each sample
 
     def __init__(self, context: DeviceContext) -> None:
         self.samples = SampleWatch(self)
@@ -127,7 +128,7 @@ class Transport(SettingsPort):
         self._health = context.health
         self._host = context.host
         self._latency_ns = 0
-        self._axes_problem = ""  # reason for which the axes of the device are uncertain
+        self.axes_problem = ""  # reason for which the axes of the device are uncertain
 
     def serve(self, attachments: Attachments, settings: DeviceSettings) -> None:
         """Set the other parts of the device, before the first use of the link."""
@@ -170,8 +171,8 @@ class Transport(SettingsPort):
             return
         if (frame := self._context.published(driver, settings)) != path.frame:
             path.set_frame(frame)
-        problem, before = driver.sent_axes(settings).problem, self._axes_problem
-        self._axes_problem = problem
+        problem, before = driver.sent_axes(settings).problem, self.axes_problem
+        self.axes_problem = problem
         if problem and problem != before:
             self._context.events.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, problem)
 
@@ -237,6 +238,15 @@ class Transport(SettingsPort):
     def add_status(self, status: DeviceStatus) -> DeviceStatus:
         """Return `status` with the fields of this kind of transport."""
         return status
+
+    def add_lines(self, status: LinesStatus | None) -> LinesStatus | None:
+        """Return `status` with the lines of this kind of transport."""
+        return status
+
+    @property
+    def expected_rate_hz(self) -> float:
+        """Sample rate that the device must have, Hz; 0 if it is not known."""
+        return self.path.clock.expected_rate_hz if self.path is not None else 0.0
 
     def unknown_words(self) -> str:
         """Describe the received frames of unknown types; empty without such frames."""

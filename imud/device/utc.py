@@ -102,22 +102,18 @@ class UtcFeed:
                 if self._feed is not None:
                     self._feed.on_pulse(edge.t_ns)
 
+    @property
+    def problem(self) -> str:
+        """Present fault of the source or of the connection to chronyd; empty if there is no fault."""
+        source, chrony = self._source, self._chrony
+        faults = (source.problem if source is not None else "", *self._doubts.values())
+        return next((one for one in faults if one), chrony.problem if chrony is not None else "")
+
     def status(self) -> UtcStatus:
         source, feed, chrony = self._source, self._feed, self._chrony
         return UtcStatus(
             source=source.title if source is not None else "",
-            problem=next(
-                (
-                    one
-                    for one in (
-                        source.problem if source is not None else "",
-                        *self._doubts.values(),
-                        chrony.problem if chrony is not None else "",
-                    )
-                    if one
-                ),
-                "",
-            ),
+            problem=self.problem,
             sentences=source.sentences if source is not None else 0,
             sent=feed.sent if feed is not None else 0,
             refused=dict(feed.refused) if feed is not None else {},

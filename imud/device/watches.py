@@ -5,7 +5,7 @@ one event per path. The status shows the contradiction until a later rest withou
 """
 
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 from imud.attitude.conventions import Convention, Heading
 from imud.attitude.gravity import Contradiction, GravityCheck
@@ -14,6 +14,7 @@ from imud.config.model import DeviceConfig
 from imud.contracts.driver import Driver, StatusBit
 from imud.contracts.status import FrameProblem, FrameStatus
 from imud.device.health import DeviceEvents
+from imud.device.settings import DeviceSettings
 from imud.model.event import EventKind
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.path import SamplePath
@@ -58,24 +59,19 @@ class AttitudeWatch:
                 angle_deg=round(finding.angle_deg, 1),
             )
 
-    def status(
-        self, driver: Driver | None, path: SamplePath | None, settings: Mapping[str, Any], shown: Mapping[str, str]
-    ) -> FrameStatus | None:
-        """Return axes and angles of the published samples; None before imud has found the device.
-
-        `settings` contains the values of the settings, `shown` their readable text.
-        """
+    def status(self, driver: Driver | None, path: SamplePath | None, settings: DeviceSettings) -> FrameStatus | None:
+        """Return axes and angles of the published samples; None before imud has found the device."""
         if driver is None or path is None:
             return None
-        frame, config, sent = path.frame, self._config, driver.sent_axes(shown)
-        kind, problem = self._problem(driver.heading(config.options, settings), sent.problem)
+        frame, config, sent = path.frame, self._config, driver.sent_axes(settings.shown)
+        kind, problem = self.problem(driver, settings, sent.problem)
         words = frame.words(sent.euler_convention, sent.navigation_frame)
         return FrameStatus(
             frame=words.frame,
             convention=AS_DEVICE if frame.convention is None else str(frame.convention),
             euler_convention=words.euler_convention,
             navigation_frame=words.navigation_frame,
-            heading=frame.heading(driver.heading(config.options, settings)),
+            heading=frame.heading(driver.heading(config.options, settings.values)),
             declination_deg=frame.declination_deg,
             conventions={str(one): frame.words_of(one) for one in Convention},
             problem=problem,
@@ -87,12 +83,18 @@ class AttitudeWatch:
         is_level = configured is not None and configured.level_at_rest
         return GravityCheck(frame.device, frame.mounting if is_level else None)
 
-    def _problem(self, heading: Heading, axes: str) -> tuple[FrameProblem | None, str]:
+    def problem(self, driver: Driver | None, settings: DeviceSettings, axes: str) -> tuple[FrameProblem | None, str]:
         """Return the kind of the present contradiction and its text. `axes`: the problem of the driver."""
         finding = self._check.finding if self._check is not None else None
+        if driver is None:
+            return None, ""
         if finding is not None:
             return FrameProblem.GRAVITY, finding.message
-        if self._config.declination_deg is not None and heading in (Heading.RELATIVE, Heading.TRUE):
+        config = self._config
+        if config.declination_deg is not None and (heading := driver.heading(config.options, settings.values)) in (
+            Heading.RELATIVE,
+            Heading.TRUE,
+        ):
             why = (
                 "yaw is measured from the direction at power-on"
                 if heading is Heading.RELATIVE

@@ -5,24 +5,22 @@ from typing import Any
 import msgspec
 import pytest
 
-from imud.attitude.conventions import Heading
-from imud.contracts.condition import Condition, ConditionLimits, DeviceCondition, Reason, ReasonCode, condition_of
-from imud.contracts.setting import OnDifference, SettingDifference, SettingsState, SettingsStatus
-from imud.contracts.status import (
-    ClockStatus,
-    DeviceState,
-    DeviceStatus,
-    FrameProblem,
-    FrameStatus,
-    LinesStatus,
-    RecentStatus,
-    UtcStatus,
+from imud.contracts.condition import (
+    OK,
+    Condition,
+    ConditionLimits,
+    DeviceCondition,
+    Reason,
+    ReasonCode,
+    Section,
+    condition_of,
 )
-from imud.device.condition import ConditionWatch, ConfiguredPort, RecentCounts, no_loss, reasons_of
+from imud.contracts.setting import OnDifference, SettingDifference, SettingsState, SettingsStatus
+from imud.contracts.status import DeviceState, DeviceStatus, FrameProblem, LinesStatus, RecentStatus
+from imud.device.condition import Cause, ConditionWatch, ConfiguredPort, Facts, RecentCounts, Rule, causes_of
 from imud.device.health import SEARCH_BEGUN, DeviceEvents
 from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
-from imud.model.sample import Sync
 from tests.support.metrics import device
 
 S = 1_000_000_000
@@ -40,53 +38,52 @@ def recent(rate_hz: float | None = None, **changes: Any) -> RecentStatus:
     return RecentStatus(NOW_NS - 840 * S, rate_hz, **known)
 
 
-def absent(state: DeviceState, problem: str, **changes: Any) -> DeviceStatus:
-    return device("bow", state=state, problem=problem, recent=recent(**changes), expected_rate_hz=0.0)
+def facts(state: DeviceState = DeviceState.RUNNING, problem: str = "", **changes: Any) -> Facts:
+    known = {"now_ns": NOW_NS, "place": PORT, "recent": recent(), "expected_rate_hz": 50.0, **changes}
+    return Facts(state=state, problem=problem, **known)
 
 
-def running(**changes: Any) -> DeviceStatus:
-    known: dict[str, Any] = {"recent": recent(), "expected_rate_hz": 50.0, **changes}
-    return device("bow", **known)
+def declared(state: SettingsState = SettingsState.AGREE, **changes: Any) -> Facts:
+    return facts(declared=SettingsStatus(state, OnDifference.REPORT, **changes))
 
 
-def declared(state: SettingsState = SettingsState.AGREE, **changes: Any) -> DeviceStatus:
-    return running(declared=SettingsStatus(state, OnDifference.REPORT, **changes))
+def axes(kind: FrameProblem, problem: str) -> Facts:
+    return facts(axes=kind, axes_problem=problem)
 
 
-def frame(kind: FrameProblem, problem: str) -> DeviceStatus:
-    return running(frame=FrameStatus("", "", "", "", Heading.RELATIVE, 3.0, {}, problem, kind))
+def reasons_of(known: Facts, limits: ConditionLimits) -> list[Reason]:
+    """Return the reasons that are not ok."""
+    return [cause.reason() for cause in causes_of(known, limits) if cause.code not in OK]
 
 
-LATE = running(clock=ClockStatus(Sync.REGRESSION, t_err_ns=2_100_000))
-OPEN_LEDGER = running()
-OPEN_LEDGER.ledger["bytes_in"] += 3
+LATE = facts(t_err_ns=2_100_000)
 
 
 @pytest.mark.parametrize(
-    ("status", "condition", "message", "step"),
+    ("known", "condition", "message", "step"),
     [
         (
-            absent(DeviceState.MISSING, "the port is missing"), "missing", "The port /dev/ttyUSB0 does not exist.",
+            facts(DeviceState.MISSING, "the port is missing"), "missing", "The port /dev/ttyUSB0 does not exist.",
             f"Plug in the cable, or correct uart.port in the configuration. {THERE}",
         ),
         (
-            absent(DeviceState.SEARCHING, "no byte arrives"), "missing", "No data arrives at /dev/ttyUSB0.",
+            facts(DeviceState.SEARCHING, "no byte arrives"), "missing", "No data arrives at /dev/ttyUSB0.",
             "Check the power supply, and check that TX and RX are not swapped.",
         ),
         (
-            absent(DeviceState.SILENT, "no sample for 1.0 s, but the link is open"), "missing",
+            facts(DeviceState.SILENT, "no sample for 1.0 s, but the link is open"), "missing",
             "The device stopped sending 12 s ago. Its port still exists.", "Check the power supply and the connector.",
         ),
-        (absent(DeviceState.FAILED, "port is in use by gpsd"), "missing", "Port is in use by gpsd.", DOCTOR),
+        (facts(DeviceState.FAILED, "port is in use by gpsd"), "missing", "Port is in use by gpsd.", DOCTOR),
         (
-            absent(DeviceState.SEARCHING, SEARCH_BEGUN), "missing",
+            facts(DeviceState.SEARCHING, SEARCH_BEGUN), "missing",
             "imud searches for the device at /dev/ttyUSB0.", "Wait for the search.",
         ),
         (
-            absent(DeviceState.SEARCHING, "bytes arrive, but no valid frame", bytes_in=9), "missing",
+            facts(DeviceState.SEARCHING, "bytes arrive, but no valid frame", recent=recent(bytes_in=9)), "missing",
             "Bytes arrive, but no valid frame.", DOCTOR,
         ),
-        (absent(DeviceState.SILENT, "it replies but sends none"), "missing", "It replies but sends none.", DOCTOR),
+        (facts(DeviceState.SILENT, "it replies but sends none"), "missing", "It replies but sends none.", DOCTOR),
         (
             declared(SettingsState.DIFFER, differences={"mounting": SettingDifference("x up", "level")}), "attention",
             "Mounting is “level” on the device, but “x up” in the configuration.", APPLY,
@@ -105,7 +102,7 @@ OPEN_LEDGER.ledger["bytes_in"] += 3
             "Run `imud settings` with the name of the device.",
         ),
         (
-            frame(
+            axes(
                 FrameProblem.DECLINATION,
                 "declination_deg is configured, but yaw is measured from the direction at power-on",
             ),
@@ -113,74 +110,75 @@ OPEN_LEDGER.ledger["bytes_in"] += 3
             "Calibrate the magnetometer, or remove declination_deg from the configuration.",
         ),
         (
-            frame(FrameProblem.GRAVITY, "at rest, up is +x: set frame"), "attention",
+            axes(FrameProblem.GRAVITY, "at rest, up is +x: set frame"), "attention",
             "The measured gravity does not match the attitude.", "At rest, up is +x: set frame.",
         ),
-        (frame(FrameProblem.AXES, "imud does not know urfr 9"), "attention", "imud does not know urfr 9.", DOCTOR),
+        (axes(FrameProblem.AXES, "imud does not know urfr 9"), "attention", "imud does not know urfr 9.", DOCTOR),
         (
-            running(lines=LinesStatus({}, {}, {}, alarm=True)), "attention", "The ALARM pin is active.",
+            facts(lines=LinesStatus({}, {}, {}, alarm=True)), "attention", "The ALARM pin is active.",
             "Compare the measured values with the limits of the device (docs/lines.md).",
         ),
-        (running(lines=LinesStatus({"sout": "no chip"}, {}, {})), "attention", "Line sout: no chip.", DOCTOR),
-        (running(utc=UtcStatus("gpsd", "gpsd is down")), "attention", "gpsd is down.".capitalize(), DOCTOR),
+        (facts(lines=LinesStatus({"sout": "no chip"}, {}, {})), "attention", "Line sout: no chip.", DOCTOR),
+        (facts(utc_problem="gpsd is down"), "attention", "gpsd is down.".capitalize(), DOCTOR),
         (
-            OPEN_LEDGER, "attention", "The ledger does not balance: 3 bytes.",
+            facts(open_bytes=3), "attention", "The ledger does not balance: 3 bytes.",
             "Report this fault of imud with the output of `imud status --json`.",
         ),
         (
-            running(recent=recent(restarts=3)), "attention", "The device restarted 3 times in the last hour.",
+            facts(recent=recent(restarts=3)), "attention", "The device restarted 3 times in the last hour.",
             "Measure the supply voltage at the device.",
         ),
         (
-            running(recent=recent(samples=961, lost={"crc": 38, "queue": 1})), "degraded",
+            facts(recent=recent(samples=961, lost={"crc": 38, "queue": 1})), "degraded",
             "3.9 % of the samples are lost because frames are damaged.",
             "Check the cable, its length and its ground. If they are correct, use a lower bit rate.",
         ),
         (
-            running(recent=recent(samples=998, lost={"overrun": 2})), "degraded",
+            facts(recent=recent(samples=998, lost={"overrun": 2})), "degraded",
             "0.20 % of the samples are lost in kernel buffer overruns.",
             "Reduce the load of this host, or use a lower rate.",
         ),
         (
-            running(recent=recent(gaps=2)), "degraded",
+            facts(recent=recent(gaps=2)), "degraded",
             "Samples are lost in 2 gaps of unknown size in the last minute.", DOCTOR,
         ),
         (
-            running(recent=recent(45.9)), "degraded", "The device sends 45.9 samples per second instead of 50.",
+            facts(recent=recent(45.9)), "degraded", "The device sends 45.9 samples per second instead of 50.",
             "Compare the output rate in the settings of the device with its bit rate.",
         ),
         (
             LATE, "degraded", "The time stamp error is ±2.1 ms.", "Connect SOUT, or reduce the latency timer.",
         ),
-        (running(problem="can0 is error-passive"), "degraded", "can0 is error-passive.", DOCTOR),
-        (absent(DeviceState.FINISHED, ""), "ok", "The replay is at its end.", ""),
+        (facts(problem="can0 is error-passive"), "degraded", "can0 is error-passive.", DOCTOR),
+        (facts(DeviceState.FINISHED, ""), "ok", "The replay is at its end.", ""),
     ],
 )  # fmt: skip
-def test_each_sentence(status: DeviceStatus, condition: str, message: str, step: str) -> None:
+def test_each_sentence(known: Facts, condition: str, message: str, step: str) -> None:
     limits = ConditionLimits(t_err_ms=2.0)
-    (reason,) = reasons_of(status, limits, PORT, NOW_NS)
+    reason = causes_of(known, limits)[0].reason()
     assert (reason.message, reason.next, condition_of(reason.code)) == (message, step, condition)
 
 
 @pytest.mark.parametrize(
-    "status",
+    "known",
     [
-        running(recent=recent(samples=999, lost={"crc": 1})),
-        running(recent=recent(49.01)),
-        running(recent=recent(50.99)),
-        running(recent=recent(30.0), expected_rate_hz=0.0),
-        running(recent=recent(restarts=2)),
+        facts(recent=recent(samples=999, lost={"crc": 1})),
+        facts(recent=recent(49.01)),
+        facts(recent=recent(50.99)),
+        facts(recent=recent(30.0), expected_rate_hz=0.0),
+        facts(recent=recent(restarts=2)),
         LATE,
         declared(SettingsState.UNKNOWN),
     ],
 )
-def test_no_reason_within_the_limits(status: DeviceStatus) -> None:
-    assert reasons_of(status, ConditionLimits(), PORT, NOW_NS) == []
+def test_no_reason_within_the_limits(known: Facts) -> None:
+    assert reasons_of(known, ConditionLimits()) == []
 
 
 def test_ports_of_other_links() -> None:
-    gone, quiet = absent(DeviceState.MISSING, "can0 is down: imud waits"), absent(DeviceState.SEARCHING, "nothing came")
-    (missing,), (silent,) = (reasons_of(one, ConditionLimits(), BUS, NOW_NS) for one in (gone, quiet))
+    gone = facts(DeviceState.MISSING, "can0 is down: imud waits", place=BUS)
+    quiet = facts(DeviceState.SEARCHING, "nothing came", place=BUS)
+    (missing,), (silent,) = (reasons_of(one, ConditionLimits()) for one in (gone, quiet))
     assert missing.message == "can0 is down: imud waits."
     assert (silent.message, "bit rate" in silent.next) == ("No data arrives at can0.", True)
 
@@ -201,15 +199,22 @@ def test_ports_of_other_links() -> None:
     ],
 )
 def test_sentence_without_a_problem(changes: dict[str, Any], message: str) -> None:
-    assert no_loss(recent(**changes), NOW_NS).message == message
+    (cause,) = causes_of(facts(recent=recent(**changes)), ConditionLimits())
+    assert (cause.reason().message, cause.code in OK) == (message, True)
 
 
 # --- hysteresis -------------------------------------------------------------------------------------------------------
 
-LOST = Reason(ReasonCode.LOST, "lost")
-ALARM = Reason(ReasonCode.ALARM, "alarm")
-SETTING = Reason(ReasonCode.SETTING, "differs", setting="mode")
-GONE = Reason(ReasonCode.STOPPED, "stopped")
+
+def cause(code: ReasonCode, message: str, setting: str = "") -> Cause:
+    return Cause(Rule(code, Section.LIVE, lambda _facts, _limits: True, message), facts(), setting)
+
+
+LOST = cause(ReasonCode.LOST, "lost")
+ALARM = cause(ReasonCode.ALARM, "alarm")
+SETTING = cause(ReasonCode.SETTING, "differs", "mode")
+GONE = cause(ReasonCode.STOPPED, "stopped")
+NONE = cause(ReasonCode.NONE_LOST, "none")
 
 
 class Watched:
@@ -220,9 +225,9 @@ class Watched:
         self.now_s = 0
         self.watch = ConditionWatch(ConditionLimits(), DeviceEvents("bow", Ledger(), self.events.append), 0)
 
-    def after(self, seconds: int, *reasons: Reason) -> Condition:
+    def after(self, seconds: int, *causes: Cause) -> Condition:
         for _ in range(seconds):
-            self.watch.update(self.now_s * S, reasons, recent())
+            self.watch.update(self.now_s * S, causes if GONE in causes else (*causes, NONE))
             self.now_s += 1
         return self.watch.condition.condition
 
@@ -263,7 +268,7 @@ def test_a_missing_device() -> None:
     assert watched.after(6, LOST) == "degraded"
     assert watched.after(5, GONE) == "degraded"
     assert watched.after(1, GONE) == "missing"
-    assert watched.watch.condition.reasons == (GONE,)
+    assert watched.watch.condition.reasons == (GONE.reason(),)
     assert watched.after(1) == "ok"
 
 
@@ -284,7 +289,7 @@ def test_history_contains_the_worst_condition_of_each_minute() -> None:
 
 
 def test_text_of_a_condition() -> None:
-    assert str(DeviceCondition(Condition.DEGRADED, 0, (LOST, ALARM))) == "degraded: lost alarm"
+    assert str(DeviceCondition(Condition.DEGRADED, 0, (LOST.reason(), ALARM.reason()))) == "degraded: lost alarm"
     assert str(DeviceCondition(Condition.MISSING, 0)) == "missing"
 
 

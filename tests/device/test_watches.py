@@ -250,10 +250,11 @@ def test_a_replaced_device_is_checked_again() -> None:
             watch.tick(number * 10**8, path)
 
     driver = DRIVERS["hipnuc-uart"]
+    settings: Any = SimpleNamespace(values={}, shown={})
     for number, path in enumerate(paths, 1):
         path.newest = None
         watch.tick(0, path)
-        status = watch.status(driver, path, {}, {})
+        status = watch.status(driver, path, settings)
         assert status is not None
         assert status.problem == "", "nothing is known of this device yet"
         rest(path)
