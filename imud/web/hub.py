@@ -14,9 +14,8 @@ from typing import Final
 import msgspec
 
 from imud.client.feed import Feed, News, Wish
-from imud.contracts.setting import SettingsState
-from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceStatus
-from imud.model.event import Event, EventKind
+from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceStatus, RecentStatus
+from imud.model.event import Event
 from imud.model.ledger import LEDGER_FIELDS, bytes_open, frames_open, lost
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_S
@@ -160,7 +159,6 @@ class Mailbox:
         return self._frames.popleft()
 
 
-EVENTS_KEPT: Final = 200
 NEWEST_S: Final = 0.5
 """Time between two updates of the overview, s."""
 OVERVIEW_NEWS_S: Final = 0.25
@@ -194,7 +192,6 @@ class BrowserHub:
         self._state = messages.StateMessage("connecting to the daemon", "", "")
         self._statuses: dict[str, DeviceStatus] = {}
         self._clients = 0
-        self._events: deque[messages.NewEvent] = deque(maxlen=EVENTS_KEPT)
         self._buckets: dict[tuple[str, int], Bucketing] = {}
         self._newest: dict[str, Sample] = {}
         self._watched: tuple[str, ...] = ()  # devices with samples for a page
@@ -224,7 +221,7 @@ class BrowserHub:
             browser.mailbox.forget()
         self._want()
         if is_other_view and wanted.look != "nothing":
-            self._send_known(browser)
+            browser.mailbox.put_newest("state", _text(self._state))
         if wanted.look == "device" and wanted.device not in self._watched and self._exists(wanted.device):
             words = f"pages of {DEVICES_MAX} other devices are open, the maximum; close one of them"
             browser.mailbox.put(_text(messages.ProblemMessage(words)))
@@ -232,12 +229,6 @@ class BrowserHub:
     def _exists(self, device: str) -> bool:
         """Return whether a device exists, or its existence is unknown before the first status."""
         return not self._statuses or device in self._statuses
-
-    def _send_known(self, browser: Browser) -> None:
-        """Send the state and the kept events, so that the page is not empty until the next status."""
-        browser.mailbox.put_newest("state", _text(self._state))
-        if self._events:
-            browser.mailbox.put(_text(messages.EventsMessage(tuple(self._events))))
 
     def _want(self) -> None:
         """Request the data that all pages need from the feed."""
@@ -280,7 +271,8 @@ class BrowserHub:
             self._spread_statuses(news.now_ns)
         if news.newest is not None:
             self._newest = {sample.device: sample for sample in news.newest}
-            self._spread_overview(news.newest_ns)
+        if news.statuses is not None or news.newest is not None:
+            self._spread_overview(news.now_ns if news.newest is None else news.newest_ns)
         if news.events:
             self._spread_events(news.events)
         if news.dropped:
@@ -303,14 +295,14 @@ class BrowserHub:
 
     def _spread_overview(self, now_ns: int) -> None:
         rows = tuple(row_of(one, self._newest.get(name), now_ns) for name, one in self._statuses.items())
-        self._to(lambda look: look.look == "overview", messages.OverviewMessage(self._clients, rows), "overview")
+        message = messages.OverviewMessage(self._clients, now_ns / NS_PER_S, rows)
+        self._to(lambda look: look.look != "nothing", message, "overview")
 
     def _spread_events(self, events: Iterable[Event]) -> None:
         fresh = tuple(
             messages.NewEvent(one.t_ns / NS_PER_S, one.device, str(one.kind), one.message, dict(one.detail))
             for one in events
         )
-        self._events.extend(one for one in fresh if not _is_progress(one))
         self._to(lambda look: look.look != "nothing", messages.EventsMessage(fresh))
 
     def _spread_samples(self, news: News) -> None:
@@ -358,34 +350,36 @@ def status_message(name: str, status: DeviceStatus | None, now_ns: int) -> messa
 
 
 def row_of(status: DeviceStatus, newest: Sample | None, now_ns: int) -> messages.DeviceRow:
-    ledger = _counts(status)
+    condition, calibration, frame = status.condition, status.calibration, status.frame
     return messages.DeviceRow(
         name=status.name,
         state=status.word,
-        problem=" ".join(one.message for one in status.reasons if status.has_problem),
         is_well=not status.has_problem,
+        since_s=None if condition is None else condition.since_ns / NS_PER_S,
+        reasons=status.reasons,
+        history=status.history,
+        calibration="" if calibration is None else calibration.kind,
         driver=status.driver,
         link=status.link,
         identity=status.identity,
+        heading="" if frame is None else str(frame.heading),
         rate_hz=status.rate_hz,
         expected_rate_hz=status.expected_rate_hz,
-        lost=lost(ledger),
-        closes=bytes_open(ledger) == 0 and frames_open(ledger) == 0,
-        differs=status.declared is not None and status.declared.state is SettingsState.DIFFER,
-        alarm=status.lines is not None and status.lines.alarm is True,
+        lost=lost(_counts(status)),
+        lost_percent=_lost_percent(status.recent),
         temperature_c=status.temperature_c,
         age_s=None if newest is None else max(now_ns - newest.t_ns, 0) / NS_PER_S,
         t_err_s=None if newest is None else newest.t_err_ns / NS_PER_S,
         sync="" if newest is None else str(newest.sync),
         euler_rad=None if newest is None else newest.euler_rad,
-        accel_m_s2=None if newest is None else newest.accel_m_s2,
-        gyro_rad_s=None if newest is None else newest.gyro_rad_s,
     )
 
 
-def _is_progress(event: messages.NewEvent) -> bool:
-    """Return whether an event reports progress of a calibration. The hub does not keep it for new pages."""
-    return event.event == EventKind.CALIBRATION and event.detail.get("phase") not in ("begin", "end")
+def _lost_percent(recent: RecentStatus | None) -> float | None:
+    """Return the share of lost samples in the last minute; None without samples."""
+    lost_samples = 0 if recent is None else sum(recent.lost.values())
+    measured = 0 if recent is None else recent.samples + lost_samples
+    return 100 * lost_samples / measured if measured else None
 
 
 def _counts(status: DeviceStatus) -> dict[str, int]:

@@ -8,6 +8,8 @@ from typing import Any, Final, Literal, TypeVar
 
 import msgspec
 
+from imud.contracts.condition import Reason
+
 T = TypeVar("T")
 
 RATES_HZ: Final = (10, 20, 50)
@@ -59,30 +61,31 @@ class DeviceRow(msgspec.Struct, frozen=True):
 
     name: str
     state: str  # condition
-    problem: str  # reasons of the condition; empty if it is ok
     is_well: bool
+    since_s: float | None  # time of the last change of the condition, CLOCK_MONOTONIC
+    reasons: tuple[Reason, ...]
+    history: tuple[str | None, ...]  # worst condition in each of the last 60 minutes, the newest last
+    calibration: str  # kind of the running calibration; empty if none is running
     driver: str
     link: str
     identity: dict[str, str]
+    heading: str  # reference of yaw; empty while it is not known
     rate_hz: float
     expected_rate_hz: float
     lost: int
-    closes: bool  # whether the ledger balances
-    differs: bool  # whether its settings differ from the declared ones
-    alarm: bool
+    lost_percent: float | None  # share of lost samples in the last minute; null without samples
     temperature_c: float | None
     age_s: float | None  # age of the newest sample; null before the first sample
     t_err_s: float | None
     sync: str
     euler_rad: tuple[float, ...] | None
-    accel_m_s2: tuple[float, ...] | None
-    gyro_rad_s: tuple[float, ...] | None
 
 
 class OverviewMessage(ToPage, frozen=True, tag="overview"):
-    """All devices."""
+    """All devices. Each visible page gets it, for its list of devices."""
 
     clients: int  # number of clients of the daemon's socket
+    now_s: float  # CLOCK_MONOTONIC of the daemon's host
     devices: tuple[DeviceRow, ...]
 
 
@@ -128,7 +131,7 @@ class NewEvent(msgspec.Struct, frozen=True):
 
 
 class EventsMessage(ToPage, frozen=True, tag="events"):
-    """New events; for a new page, the kept events."""
+    """New events. A page reads the stored events with the method `events`."""
 
     events: tuple[NewEvent, ...]
 

@@ -1,6 +1,8 @@
 // Status of a device as rows of name and text, as `imud status` prints it (imud/cli/status.py).
 
-import { duration, number, shown } from "./util.js";
+import { session } from "./state.js";
+import { button, section, toast } from "./ui.js";
+import { call, copy, duration, el, facts, number, shown } from "./util.js";
 
 const seconds = (ns) => duration(ns / 1e9);
 const times = (count) => (count === 1 ? "once" : `${number(count)} times`);
@@ -105,4 +107,65 @@ function utc(status) {
   if (status.chrony_sent || status.chrony_refused)
     words.push(`chronyd accepted ${number(status.chrony_sent)}, refused ${number(status.chrony_refused)}`);
   return (words.join("; ") || "no pulse and no sentence yet") + inBrackets(status.problem);
+}
+
+const MAINTENANCE = {
+  restart: ["Restart", "Settings that are not saved are lost. The samples pause."], save: ["Save", "imud writes all settings to the flash of the device."],
+  wake: ["Wake", "Starts the output again if the device sends no frames."], factory_reset: ["Reset to factory settings", "The device loses all its settings."],
+};
+
+/** The section About: identity, axes, link; maintenance of the device. */
+export class AboutSection {
+  constructor(device) {
+    this.device = device;
+    this.facts = el("div");
+    this.actions = el("div");
+    this.result = el("p", { class: "help", role: "status" });
+    const copyAll = button("Copy as text", async () => { await copy(this.rows.map(([name, value]) => `${name}: ${value}`).join("\n")); toast("Copied."); }, { kind: "small", glyph: "copy" });
+    this.rows = [];
+    this.node = section("about", "About", el("div", { class: "two" }, el("div", { class: "panel" }, this.facts, copyAll), el("div", { class: "panel" }, el("h3", { text: "Maintenance" }), this.actions, this.result)));
+    this.load();
+  }
+
+  async load() {
+    try {
+      this.verbs = await call("actions", { device: this.device });
+      this.onSession();
+    } catch (error) {
+      this.result.textContent = error.message;
+    }
+  }
+
+  onSession() {
+    const found = (this.verbs ?? []).filter((one) => one.name in MAINTENANCE);
+    const [risky, calm] = [found.filter((one) => one.name === "factory_reset"), found.filter((one) => one.name !== "factory_reset")];
+    const words = !found.length ? "This device has no commands for maintenance." : session.control ? "" : "Log in to use these commands.";
+    this.actions.replaceChildren(...[words && el("p", { class: "help", text: words }), ...calm.map((one) => this.entry(one)),
+      risky.length && el("details", {}, el("summary", { text: "Factory settings" }), risky.map((one) => this.entry(one)))].filter(Boolean));
+  }
+
+  entry({ name, risk }) {
+    const [title, about] = MAINTENANCE[name];
+    const run = button(title.split(" ")[0], () => this.run(name, title, risk), { kind: risk ? "danger small" : "small", disabled: !session.control, label: title });
+    return el("div", { class: "action", "data-action": name }, el("div", {}, el("b", { text: title }), el("p", { class: "help", text: about })), run);
+  }
+
+  async run(name, title, risk) {
+    if (risk && !confirm(`${risk}\n${title}?`)) return;
+    this.result.textContent = `${title}…`;
+    try {
+      const answer = await call("command", { device: this.device, name, arguments: {} });
+      const evidence = answer?.evidence ? `${answer.verified ? "verified" : "sent, not verified"}: ${answer.evidence}` : "sent, not verified";
+      this.result.textContent = [`${title}: ${evidence}`, answer?.not_saved].filter(Boolean).join(". ");
+    } catch (error) {
+      this.result.textContent = error.message;
+    }
+  }
+
+  draw(message) {
+    this.rows = aboutRows(message);
+    const drawn = JSON.stringify(this.rows);
+    if (drawn !== this.drawn) this.facts.replaceChildren(facts(this.rows));
+    this.drawn = drawn;
+  }
 }

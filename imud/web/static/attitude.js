@@ -7,6 +7,8 @@ const BODY = [1.0, 0.7, 0.18]; // half edges along x, y, z of the device
 const CAMERA = { azimuth: -2.3, elevation: 0.5 }; // view from the south-west, from above
 const GROUND = -1.6; // height of the compass
 const QUARTERS = [["E", 1, 0], ["N", 0, 1], ["W", -1, 0], ["S", 0, -1]];
+const DEGREES = { E: "0°", N: "90°", W: "180°", S: "−90°" }; // names without a compass heading
+const GRAVITY_M_S2 = 9.80665;
 const FACES = [[0, 1], [0, -1], [1, 1], [1, -1], [2, 1], [2, -1]];
 
 /** Rotate a vector by a quaternion [w, x, y, z]. */
@@ -15,10 +17,16 @@ export function rotate([w, x, y, z], [a, b, c]) {
   return [a + w * u + y * t - z * v, b + w * v + z * u - x * t, c + w * t + x * v - y * u];
 }
 
+/** Return what an accelerometer at rest measures with this attitude, in the axes of the device. */
+export function gravityOf([w, x, y, z], frame) {
+  return rotate([w, -x, -y, -z], [0, 0, frame.startsWith("NED") ? -GRAVITY_M_S2 : GRAVITY_M_S2]);
+}
+
 export class AttitudeView {
   constructor() {
-    this.canvas = el("canvas", { role: "img", "aria-label": "attitude of the device" });
+    this.canvas = el("canvas", { class: "block", role: "img", "aria-label": "attitude of the device" });
     this.frame = "ENU";
+    this.isCompass = false; // whether yaw is a compass heading
     this.quaternion = null;
   }
 
@@ -65,8 +73,8 @@ export class AttitudeView {
 
   /** Draw the names of directions and axes in front of the block, with a border in the color of the panel. */
   drawNames(context, style) {
-    const quiet = style.getPropertyValue("--quiet");
-    const names = QUARTERS.map(([name, e, n]) => [name, quiet, [1.85 * e, 1.85 * n, GROUND]]);
+    const quiet = style.getPropertyValue("--mute");
+    const names = QUARTERS.map(([name, e, n]) => [this.isCompass ? name : DEGREES[name], quiet, [1.85 * e, 1.85 * n, GROUND]]);
     if (this.quaternion) names.push(...this.axes().map(({ colour, name, end }) => [name, colour, end.map((one) => one * 1.12)]));
     context.strokeStyle = style.getPropertyValue("--card");
     context.lineWidth = 4;

@@ -1,92 +1,91 @@
-// The ledger as bars with parts that add up, and the histogram of latencies.
+// The section Ledger: three bars with parts that add up, and the lost samples by cause.
 
-import { duration, el, number, setText } from "./util.js";
+import { section } from "./ui.js";
+import { el, number, setText } from "./util.js";
 
 const BARS = [
   ["bytes", "Bytes", (one) => one.bytes_in, [
-    ["in good frames", "bytes_in_good_frames", "good"], ["in bad frames", "bytes_in_bad_frames", "bad"],
-    ["skipped", "bytes_skipped", "warn"], ["pending", "bytes_pending", "wait"],
+    ["in valid frames", "bytes_in_good_frames", "good"], ["in damaged frames", "bytes_in_bad_frames", "bad"],
+    ["skipped", "bytes_skipped", "warn"], ["not processed yet", "bytes_pending", "wait"],
   ]],
-  ["frames", "Good frames", (one) => one.frames_good, [
+  ["frames", "Valid frames", (one) => one.frames_good, [
     ["in samples", "frames_in_samples", "good"], ["in replies", "frames_in_replies", "other"],
-    ["ignored", "frames_ignored", "warn"], ["pending", "frames_pending", "wait"],
+    ["ignored", "frames_ignored", "warn"], ["not processed yet", "frames_pending", "wait"],
   ]],
-  ["samples", "Samples measured", null, [
-    ["published", "samples", "good"], ["lost (device)", "lost_gap_device", "warn"], ["lost (CRC)", "lost_crc", "bad"],
-    ["lost (overrun)", "lost_overrun", "bad2"], ["dropped (queue)", "lost_queue", "bad3"],
+  ["samples", "Samples", null, [
+    ["published", "samples", "good"], ["not sent by the device", "lost_gap_device", "warn"], ["lost in damaged frames", "lost_crc", "bad"],
+    ["lost in kernel buffer overruns", "lost_overrun", "bad2"], ["lost in full queues", "lost_queue", "bad3"],
   ]],
 ];
+const LOSSES = [
+  ["lost_crc", "In damaged frames", "Check the cable and its ground"],
+  ["lost_gap_device", "Not sent by the device", "Use a lower output rate or a higher bit rate"],
+  ["lost_overrun", "Kernel buffer overruns", "Reduce the load of this host"],
+  ["lost_queue", "Full queues in imud", "Reduce the load of this host, or use a lower output rate"],
+];
 
-export class LedgerView {
+export class LedgerSection {
   constructor() {
-    this.node = el("div", { class: "ledger" });
-    this.bars = BARS.map(([id, title, whole, parts]) => {
-      const sum = el("p", { class: "sum" });
-      const bar = el("div", { class: "bar", id: `bar-${id}` });
-      const legend = el("ul", { class: "legend" });
-      const made = parts.map(([name, field, kind]) => {
-        const piece = el("span", { class: `part ${kind}`, title: name });
-        const count = el("b");
-        const item = el("li", {}, el("i", { class: `mark ${kind}` }), `${name} `, count);
-        bar.append(piece);
-        legend.append(item);
-        return { field, piece, count, item };
-      });
-      this.node.append(el("h3", { text: title }), bar, legend, sum);
-      return { title, whole, made, sum, bar };
+    this.bars = BARS.map(makeBar);
+    this.lead = el("p", { class: "lead" });
+    this.losses = LOSSES.map(([cause, name, next]) => {
+      const cells = ["recent", "all", "next"].map(() => el("td"));
+      return { cause, next, cells, node: el("tr", { "data-cause": cause }, el("th", { scope: "row", text: name }), cells) };
     });
+    const head = ["Lost samples", "last minute", "since start", "next step"].map((text) => el("th", { text, scope: "col" }));
+    const table = el("table", { class: "plain" }, el("thead", {}, el("tr", {}, head)), el("tbody", {}, this.losses.map((one) => one.node)));
+    this.gaps = el("p", { class: "help" });
+    this.node = section("ledger", "Ledger", this.lead, el("div", { class: "two" }, el("div", { class: "panel ledger" }, this.bars.map((one) => one.node)), el("div", { class: "panel" }, table, this.gaps)));
   }
 
   draw({ status, bytes_open, frames_open }) {
-    const ledger = status.ledger;
-    for (const { whole, made, sum, bar } of this.bars) {
-      const parts = made.map(({ field }) => ledger[field]);
-      const all = parts.reduce((a, b) => a + b, 0);
-      const total = whole ? whole(ledger) : all;
-      made.forEach(({ piece, count, item }, index) => {
-        piece.style.flexGrow = String(parts[index]);
-        piece.hidden = parts[index] === 0;
-        piece.dataset.count = parts[index];
-        setText(count, number(parts[index]));
-        item.classList.toggle("none", parts[index] === 0);
-      });
-      bar.dataset.total = total;
-      const open = total - all;
-      setText(sum, whole ? `${number(total)} received; ${open ? `${number(open)} unaccounted for` : "the parts add up"}` : `${number(total)} in total`);
-      sum.classList.toggle("problem", open !== 0);
+    for (const bar of this.bars) drawBar(bar, status.ledger);
+    const closes = bytes_open === 0 && frames_open === 0;
+    this.node.dataset.closes = String(closes);
+    setText(this.lead, `imud counts every byte, frame and sample. ${closes ? "All bytes and frames are accounted for." : `The ledger does not balance: ${number(bytes_open)} bytes, ${number(frames_open)} frames.`}`);
+    this.lead.classList.toggle("wrong", !closes);
+    const recent = status.recent?.lost ?? {};
+    for (const { cause, next, cells, node } of this.losses) {
+      const all = status.ledger[cause] ?? 0;
+      setText(cells[0], number(recent[cause] ?? 0));
+      setText(cells[1], number(all));
+      setText(cells[2], all ? next : "");
+      node.classList.toggle("none", !all);
     }
-    this.node.dataset.closes = String(bytes_open === 0 && frames_open === 0);
+    const unknown = status.ledger.lost_unknown ?? 0;
+    setText(this.gaps, unknown ? `${number(unknown)} gaps of unknown size since start.` : "");
   }
 }
 
-export class LatencyView {
-  constructor() {
-    this.list = el("ol", { class: "histogram" });
-    this.note = el("p", { class: "quiet" });
-    this.node = el("div", {}, this.list, this.note);
-    this.bars = [];
-  }
+function makeBar([id, title, whole, parts]) {
+  const sum = el("span", { class: "help sum" });
+  const bar = el("div", { class: "bar", id: `bar-${id}`, role: "img" });
+  const legend = el("ul", { class: "legend" });
+  const made = parts.map(([name, field, kind]) => {
+    const [piece, count, share] = [el("i", { class: `part p-${kind}`, title: name }), el("b"), el("span", { class: "help" })];
+    const item = el("li", {}, el("i", { class: `p-${kind}` }), name, count, share);
+    bar.append(piece);
+    legend.append(item);
+    return { name, field, piece, count, share, item, isGood: kind === "good" };
+  });
+  return { whole, made, sum, bar, node: el("div", { class: "ledger-bar" }, el("div", { class: "ledger-head" }, el("b", { text: title }), sum), bar, legend) };
+}
 
-  draw({ status, latency_bounds_s }) {
-    const counts = status.latency_buckets;
-    const all = counts.reduce((a, b) => a + b, 0);
-    const most = Math.max(...counts, 1);
-    if (this.bars.length !== counts.length) {
-      this.bars = counts.map((_, index) => {
-        const bound = latency_bounds_s[index];
-        const name = bound === undefined ? `> ${duration(latency_bounds_s.at(-1))}` : `≤ ${duration(bound)}`;
-        const bar = el("span", { class: "part good" });
-        const share = el("span", { class: "share" });
-        return { bar, share, node: el("li", {}, el("span", { class: "name", text: name }), el("span", { class: "room" }, bar), share) };
-      });
-      this.list.replaceChildren(...this.bars.map((one) => one.node));
-    }
-    counts.forEach((count, index) => {
-      this.bars[index].bar.style.width = `${(100 * count) / most}%`;
-      this.bars[index].node.dataset.count = count;
-      setText(this.bars[index].share, all ? `${number((100 * count) / all, 1)} %` : "–");
-    });
-    const mean = all ? duration(status.latency_sum_ns / 1e9 / all) : "–";
-    setText(this.note, `${number(all)} samples since start, mean ${mean} from measurement to publication`);
-  }
+function drawBar({ whole, made, sum, bar }, ledger) {
+  const parts = made.map(({ field }) => ledger[field] ?? 0);
+  const all = parts.reduce((a, b) => a + b, 0);
+  const total = whole ? whole(ledger) : all;
+  made.forEach(({ piece, count, share, item, isGood }, index) => {
+    piece.style.flexGrow = String(parts[index]);
+    piece.hidden = parts[index] === 0;
+    piece.dataset.count = parts[index];
+    item.hidden = parts[index] === 0 && !isGood;
+    setText(count, number(parts[index]));
+    setText(share, total && parts[index] < total ? `${number((100 * parts[index]) / total, 1)} %` : "");
+  });
+  bar.dataset.total = total;
+  bar.setAttribute("aria-label", made.map(({ name }, index) => `${name} ${parts[index]}`).join(", "));
+  const open = total - all;
+  setText(sum, `total ${number(total)}${open ? `; ${number(open)} unaccounted for` : ""}`);
+  sum.classList.toggle("wrong", open !== 0);
 }

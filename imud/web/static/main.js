@@ -1,21 +1,25 @@
 // The page: selects the view, shows the state of the daemon, and logs in.
 
+import { Compare } from "./compare.js";
 import { DevicePage } from "./device.js";
-import { Overview } from "./overview.js";
+import { Overview, Wall } from "./overview.js";
+import { routeOf, Shell } from "./shell.js";
+import { session, world } from "./state.js";
 import { Stream } from "./stream.js";
-import { el, setText } from "./util.js";
+import { icon } from "./ui.js";
+import { clock, el, setText, timeOf } from "./util.js";
 
 const byId = (id) => document.getElementById(id);
-const session = { read: false, control: false, has_token: false, version: "" };
+const shell = new Shell();
 let view = null;
+let shownKey = null;
 let isLinked = false;
 let state = { problem: "connecting to the daemon", version: "" };
 
 const stream = new Stream(onMessage, (linked) => {
   isLinked = linked;
   showState();
-  if (linked) refreshSession();
-  else refreshSession().catch(() => {});
+  refreshSession().catch(() => {});
 }, () => session.read);
 
 function onMessage(message) {
@@ -33,17 +37,22 @@ function onMessage(message) {
   } else if (message.kind === "problem") {
     showProblem(message.message);
   } else {
+    if (message.kind === "overview") {
+      Object.assign(world, message, { isKnown: true });
+      clock.offset_s = Date.now() / 1000 - message.now_s;
+      shell.draw();
+    }
     view?.onMessage(message);
   }
 }
 
 function showState() {
-  const pill = byId("daemon");
   const problem = isLinked ? state.problem : "no connection to imud web; the page tries again";
-  setText(pill, problem ? "not connected" : `imud ${state.version}`);
-  pill.className = `pill ${problem ? "bad" : "good"}`;
+  setText(byId("daemon"), problem ? "not connected" : `imud ${state.version}`);
+  byId("daemon").classList.toggle("bad", Boolean(problem));
   document.body.classList.toggle("stale", Boolean(problem));
-  showProblem(session.read || !isLinked ? problem : "");
+  const last = problem && world.isKnown ? ` The last values are from ${timeOf(world.now_s)}.` : "";
+  showProblem(session.read || !isLinked ? problem && `No connection to imud: ${problem}.${last}` : "");
 }
 
 function showProblem(words) {
@@ -56,7 +65,7 @@ async function refreshSession() {
   const before = session.control;
   Object.assign(session, answer);
   byId("login").hidden = !session.has_token;
-  setText(byId("login"), session.control ? "Log out" : "Log in");
+  byId("login").replaceChildren(icon(session.control ? "unlock" : "lock"), el("span", { text: session.control ? "Log out" : "Log in" }));
   if (before !== session.control) view?.onSession?.();
   if (!session.read && !byId("login-dialog").open) byId("login-dialog").showModal();
 }
@@ -79,19 +88,36 @@ byId("login-form").addEventListener("submit", async (event) => {
   await refreshSession();
 });
 
+const VIEWS = {
+  overview: (main) => new Overview(main, stream),
+  wall: (main) => new Wall(main, stream),
+  compare: (main, route) => new Compare(main, stream, route.name, route.other),
+  device: (main, route) => new DevicePage(main, route.name, stream, shell),
+};
+
 function show() {
-  const [, what, name] = location.hash.split("/");
-  view?.close();
-  const main = byId("main");
-  main.replaceChildren();
-  showProblem(state.problem);
-  if (what === "device" && name) view = new DevicePage(main, decodeURIComponent(name), stream, session);
-  else view = new Overview(main, stream);
-  document.title = what === "device" ? `${decodeURIComponent(name)} – imud` : "imud";
-  window.imud = { view, stream, session }; // for tests and the browser's console
+  const route = routeOf();
+  shell.draw();
+  const key = JSON.stringify([route.what, route.name, route.other]);
+  if (key !== shownKey) {
+    shownKey = key;
+    view?.close();
+    const main = byId("main");
+    main.replaceChildren();
+    byId("bar").hidden = true;
+    showState();
+    view = VIEWS[route.what](main, route);
+    scrollTo(0, 0);
+    document.title = route.name ? `${route.name} – imud` : "imud";
+    window.imud = { view, stream, session }; // for tests and the browser's console
+    if (world.isKnown) view.onMessage({ kind: "overview", ...world });
+  }
+  view.go?.(route.section, route.item);
 }
 
-window.addEventListener("hashchange", show);
+shell.onTheme = () => view?.onTheme?.();
+shell.onPause = () => view?.onPause?.();
+addEventListener("hashchange", show);
 try {
   await refreshSession();
 } catch (error) {

@@ -1,64 +1,169 @@
-// Overview of all devices.
+// All devices: the summary, then the devices with a problem, then the devices that are OK. The wall display.
 
-import { DEGREE, duration, el, length, number, setText } from "./util.js";
+import { deviceLink, known, reasonList, sinceWords, sorted } from "./condition.js";
+import { eventWords, pastEvents } from "./events.js";
+import { CONDITION_WORDS, icon } from "./ui.js";
+import { DEGREE, duration, el, number, setText, timeOf } from "./util.js";
 
-const FACTS = [
-  ["rate", (row) => `${number(row.rate_hz, 1)} Hz`],
-  ["attitude", (row) => (row.euler_rad ? row.euler_rad.map((one) => number(one / DEGREE, 1)).join(" / ") + "°" : "–")],
-  ["|a|", (row) => (row.accel_m_s2 ? `${number(length(row.accel_m_s2), 2)} m/s²` : "–")],
-  ["|ω|", (row) => (row.gyro_rad_s ? `${number(length(row.gyro_rad_s) / DEGREE, 1)} °/s` : "–")],
-  ["time stamp", (row) => (row.sync ? `±${duration(row.t_err_s)}, ${row.sync}` : "–")],
-  ["lost", (row) => number(row.lost)],
-  ["age", (row) => duration(row.age_s)],
-  ["temperature", (row) => (row.temperature_c === null ? "–" : `${number(row.temperature_c, 1)} °C`)],
-];
+const COUNTED = { missing: (n) => `${n} missing`, attention: (n) => `${n} need${n === 1 ? "s" : ""} attention`, degraded: (n) => `${n} degraded`, ok: (n) => `${n} OK` };
+const FILTER_FROM = 9; // number of devices from which a field filters by name
+const EVENTS_SHOWN = 5;
+const LOST_PERCENT = 0.1;
+const RATE_SHARE = 0.02;
+
+/** Return the sentence about all devices, the worst condition, and the number of devices by condition. */
+export function verdict(rows) {
+  const counts = Object.fromEntries(Object.keys(COUNTED).map((one) => [one, rows.filter((row) => known(row.state) === one).length]));
+  const bad = rows.length - counts.ok;
+  const worst = Object.keys(COUNTED).find((one) => counts[one]) ?? "ok";
+  const all = rows.length === 1 ? "The device is OK" : `All ${rows.length} devices are OK`;
+  const words = bad ? `${bad} of ${rows.length} device${rows.length === 1 ? "" : "s"} ${bad === 1 ? "has" : "have"} a problem` : all;
+  return { counts, worst, words: rows.length ? words : "The configuration contains no devices" };
+}
+
+/** Return one mark for each of the last 60 minutes. */
+function strip(history) {
+  const said = history.filter(Boolean);
+  const ok = said.filter((one) => one === "ok").length;
+  return el("div", { class: "strip", role: "img", "aria-label": `last hour: OK in ${ok} of ${said.length} minutes` }, history.map((one) => el("i", { class: `h-${one ?? "none"}` })));
+}
+
+function figures(row) {
+  const [error, unit] = duration(row.t_err_s).split(" ");
+  const isSlow = row.expected_rate_hz > 0 && Math.abs(row.rate_hz / row.expected_rate_hz - 1) > RATE_SHARE;
+  const shown = [
+    ["rate", number(row.rate_hz, 1), row.expected_rate_hz ? `of ${number(row.expected_rate_hz, 0)} Hz` : "Hz", isSlow],
+    ["lost, 1 min", row.lost_percent ? number(row.lost_percent, 1) : "0", "%", row.lost_percent > LOST_PERCENT],
+    row.t_err_s !== null && ["time error", `±${error}`, unit ?? "", false],
+    row.temperature_c !== null && ["temp.", number(row.temperature_c, 0), "°C", false],
+  ];
+  return el("dl", { class: "figures" }, shown.filter(Boolean).map(([name, value, unit_, isBad]) =>
+    el("div", { class: isBad ? "bad" : "" }, el("dt", { text: name }), el("dd", {}, el("b", { text: value }), el("span", { text: ` ${unit_}` })))));
+}
+
+const about = (row) => [row.identity.product, row.driver, row.link].filter(Boolean).join(" · ");
+const activity = (row) => (row.calibration ? `Calibration: ${row.calibration}` : "");
+
+function card(row, now_s) {
+  const since = el("span", { text: ` ${sinceWords(row.since_s, now_s)}` });
+  const head = el("div", { class: "card-head" }, icon(row.state), el("div", {}, el("h3", { text: row.name }), el("p", { class: "cond", text: CONDITION_WORDS[row.state] }, since)));
+  const foot = row.state === "missing" ? el("p", { class: "help", text: about(row) }) : figures(row);
+  return el("a", { class: `card k-${row.state}`, href: deviceLink(row.name), "data-device": row.name }, head, reasonList(row.reasons, 3), activity(row) && el("p", { class: "help", text: activity(row) }),
+    el("div", { class: "card-foot" }, foot, strip(row.history), el("p", { class: "strip-label" }, el("span", { text: "1 h ago" }), el("span", { text: "now" }))));
+}
+
+function line(row) {
+  const turn = row.heading === "relative" ? "yaw" : "heading";
+  const angles = row.euler_rad ? row.euler_rad.map((one) => `${number(one / DEGREE, 1)}°`).join("  ") : "";
+  return el("a", { class: "row k-ok", href: deviceLink(row.name), "data-device": row.name }, icon("ok", row.state), el("div", { class: "row-name" }, el("h3", { text: row.name }), el("p", { class: "help", text: activity(row) || about(row) })),
+    el("div", { class: "row-angles" }, angles && el("span", { class: "help", text: `roll, pitch, ${turn}` }), el("output", { class: "angles", text: angles })), figures(row), el("div", { class: "row-strip" }, strip(row.history)));
+}
 
 export class Overview {
   constructor(main, stream) {
-    this.summary = el("p", { id: "summary", class: "quiet" });
-    this.grid = el("div", { class: "cards" });
-    this.none = el("p", { class: "quiet", hidden: true, text: "The configuration contains no devices. Add one with: imud setup" });
-    main.append(el("h1", { text: "Devices" }), this.summary, this.none, this.grid);
-    this.cards = new Map();
+    this.stream = stream;
+    this.title = el("h1");
+    this.tally = el("div", { class: "tally" });
+    this.verdict = el("section", { id: "summary", class: "verdict", role: "status" }, this.title, this.tally);
+    this.filter = el("input", { type: "search", id: "filter", "aria-label": "filter by name", placeholder: "Filter by name", hidden: true, oninput: () => this.draw() });
+    this.none = el("p", { class: "help", hidden: true, text: "Add a device with: imud setup" });
+    this.cards = el("div", { class: "cards" });
+    this.group = el("h2", { class: "group", text: "OK" });
+    this.rows = el("div", { class: "rows" });
+    this.happened = el("ol", { class: "happened", id: "recent-events" });
+    main.append(this.verdict, this.filter, this.none, this.cards, this.group, this.rows, el("h2", { class: "group", text: "Recent events" }), this.happened);
     stream.look({ look: "overview" });
+    this.loadEvents();
+  }
+
+  async loadEvents() {
+    try {
+      this.events = await pastEvents(undefined, EVENTS_SHOWN);
+      this.drawEvents();
+    } catch {
+      this.happened.replaceChildren();
+    }
+  }
+
+  drawEvents() {
+    const shown = (this.events ?? []).slice(-EVENTS_SHOWN).reverse();
+    this.happened.replaceChildren(...shown.map((one) => el("li", {}, el("time", { text: timeOf(one.t_ns / 1e9) }), el("b", { text: one.device || "imud" }),
+      el("span", {}, eventWords(one.kind), one.count > 1 && el("em", { text: ` ×${number(one.count)}` }), el("span", { class: "help", text: ` ${one.message}` })))));
+  }
+
+  onRestart() {
+    this.loadEvents();
   }
 
   onMessage(message) {
+    if (message.kind === "events" && message.events.some((one) => one.event !== "calibration" && one.event !== "mark")) this.loadEvents();
     if (message.kind !== "overview") return;
-    const well = message.devices.filter((row) => row.is_well).length;
-    setText(this.summary, `${well} of ${message.devices.length} devices run without a problem; the daemon has ${message.clients} ${message.clients === 1 ? "client" : "clients"}`);
-    this.none.hidden = message.devices.length > 0;
-    const names = message.devices.map((row) => row.name);
-    if (names.join("\n") !== [...this.cards.keys()].join("\n")) {
-      this.cards = new Map(message.devices.map((row) => [row.name, makeCard(row.name)]));
-      this.grid.replaceChildren(...[...this.cards.values()].map((card) => card.node));
-    }
-    for (const row of message.devices) draw(this.cards.get(row.name), row);
+    this.world = message;
+    this.draw();
+    if (this.isTimed !== true) this.drawEvents(); // the first message gives the offset of the clock
+    this.isTimed = true;
+  }
+
+  draw() {
+    const { devices, now_s } = this.world;
+    const { counts, words, worst } = verdict(devices);
+    setText(this.title, words);
+    this.verdict.className = `verdict v-${worst}`;
+    const tally = JSON.stringify(counts);
+    if (tally !== this.counted) this.tally.replaceChildren(...Object.entries(COUNTED).filter(([key]) => counts[key]).map(([key, say]) => el("span", {}, icon(key), say(counts[key]))));
+    this.counted = tally;
+    this.none.hidden = devices.length > 0;
+    this.filter.hidden = devices.length < FILTER_FROM;
+    const wanted = this.filter.hidden ? "" : this.filter.value.trim().toLowerCase();
+    const rows = sorted(devices).filter((one) => one.name.toLowerCase().includes(wanted));
+    const [bad, good] = [rows.filter((one) => known(one.state) !== "ok"), rows.filter((one) => known(one.state) === "ok")];
+    replaceKeepingFocus(this.cards, bad.map((one) => card(one, now_s)));
+    replaceKeepingFocus(this.rows, good.map(line));
+    this.group.hidden = !good.length;
   }
 
   close() {}
 }
 
-function makeCard(name) {
-  const state = el("span", { class: "pill" });
-  const notes = el("p", { class: "notes" });
-  const values = new Map(FACTS.map(([fact]) => [fact, el("dd")]));
-  const list = el("dl", { class: "facts" });
-  for (const [fact, value] of values) list.append(el("dt", { text: fact }), value);
-  const about = el("p", { class: "quiet" });
-  const head = el("div", { class: "card-head" }, el("strong", { text: name }), state);
-  const node = el("a", { class: "card", href: `#/device/${encodeURIComponent(name)}` }, head, about, notes, list);
-  return { node, state, notes, values, about };
+/** Replace the links, and keep the focus on the link of the same device. */
+function replaceKeepingFocus(box, nodes) {
+  const name = box.contains(document.activeElement) ? document.activeElement.dataset.device : null;
+  const before = [...box.children];
+  if (before.length === nodes.length && before.every((one, index) => one.dataset.device === nodes[index].dataset.device && one.className === nodes[index].className))
+    nodes.forEach((one, index) => before[index].textContent !== one.textContent && before[index].replaceChildren(...one.childNodes));
+  else box.replaceChildren(...nodes);
+  if (name) [...box.children].find((one) => one.dataset.device === name)?.focus();
 }
 
-function draw(card, row) {
-  setText(card.state, row.state);
-  card.state.className = `pill ${row.is_well ? "good" : "bad"}`;
-  setText(card.about, [row.identity.product, row.driver, row.link].filter(Boolean).join(" · "));
-  const notes = [row.problem];
-  if (!row.closes) notes.push("the ledger does not balance");
-  if (row.differs) notes.push("settings differ from the declared settings");
-  if (row.alarm) notes.push("ALARM is active");
-  setText(card.notes, notes.filter(Boolean).join("; "));
-  for (const [fact, text] of FACTS) setText(card.values.get(fact), text(row));
+/** Page for a wall display: name and condition of each device, as large as possible. */
+export class Wall {
+  constructor(main, stream) {
+    this.title = el("h1");
+    this.verdict = el("section", { id: "summary", class: "verdict" }, this.title, el("a", { class: "button", href: "#/", text: "Close" }));
+    this.bad = el("div", { class: "wall" });
+    this.good = el("div", { class: "wall wall-ok" });
+    main.append(this.verdict, this.bad, this.good);
+    stream.look({ look: "overview" });
+  }
+
+  onMessage({ kind, devices }) {
+    if (kind !== "overview") return;
+    const { words, worst } = verdict(devices);
+    setText(this.title, words);
+    this.verdict.className = `verdict v-${worst}`;
+    const rows = sorted(devices);
+    for (const [box, isOk] of [[this.bad, false], [this.good, true]]) {
+      const shown = rows.filter((one) => (known(one.state) === "ok") === isOk);
+      box.hidden = !shown.length;
+      box.replaceChildren(...shown.map(tile));
+    }
+  }
+
+  close() {}
+}
+
+function tile(row) {
+  const state = known(row.state);
+  return el("a", { class: `tile k-${state}`, href: deviceLink(row.name), "data-device": row.name }, icon(state), el("h2", { text: row.name }), el("p", { class: "cond", text: CONDITION_WORDS[state] }),
+    el("p", { class: "why", text: row.reasons[0]?.message ?? `${number(row.rate_hz, 0)} Hz` }));
 }

@@ -1,16 +1,45 @@
 // Rolling plots (uPlot). Each axis has a line through the minimum and a line through the maximum of each bucket, and the
 // area between them. Thus peaks are visible at any rate.
 
+import { segmented } from "./ui.js";
 import { el, number, setText } from "./util.js";
 
 export const COLOURS = ["#d1495b", "#2e8b57", "#3a7bd5"];
 const AREA = "40"; // opacity, in hexadecimal
 const DRAW_MS = 66;
 const HOLE_BUCKETS = 3; // number of periods without buckets that breaks the line
+const KEPT_S = 600; // time span of the data that a plot keeps
+const SPLICE_MIN = 64; // number of old points that a plot removes together
+const LANE_MARGIN = 0.12; // free share of the height of a lane, above and below its curve
+const STEP = 0.2; // share of the time range by which a key moves the cursor or zooms
 
-const dark = matchMedia("(prefers-color-scheme: dark)");
-export const ink = () => (dark.matches ? "#a9b4c4" : "#5b6675");
-export const grid = () => (dark.matches ? "#2b3443" : "#e4e8ee");
+const color = (name) => () => getComputedStyle(document.documentElement).getPropertyValue(name).trim() || "#888";
+export const ink = color("--mute");
+export const grid = color("--line");
+const lostColor = color("--missing");
+
+/** Time range of several plots: the newest `span_s`, or a zoomed range. */
+export class PlotGroup {
+  constructor(span_s, onZoom) {
+    Object.assign(this, { span_s, onZoom, zoomed: null, plots: [] });
+  }
+
+  setSpan(span_s) {
+    this.span_s = span_s;
+    this.zoom(null);
+  }
+
+  /** range: first and last time in s; null for the newest `span_s`. */
+  zoom(range) {
+    this.zoomed = range;
+    this.onZoom?.();
+    for (const plot of this.plots) plot.draw();
+  }
+
+  range(newest) {
+    return this.zoomed ?? [newest - this.span_s, newest];
+  }
+}
 
 /** Return the labels of a linear axis. */
 export function labels(_, splits) {
@@ -22,24 +51,29 @@ export function powers(_, splits) {
   return splits.map((at) => (at && Math.abs(Math.log10(at) - Math.round(Math.log10(at))) < 1e-9 ? String(Number(at.toPrecision(1))) : ""));
 }
 
+/** Return two or three round values between least and most. */
+function splitsOf(least, most) {
+  const rough = (most - least) / 3;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = [1, 2, 5, 10].map((one) => one * power).find((one) => one >= rough);
+  const first = Math.ceil(least / step + 0.05);
+  return Array.from({ length: 4 }, (_, index) => (first + index) * step).filter((one) => one < most - 0.05 * step);
+}
+
 export class RollingPlot {
   /** axes: names of the lines; scale: what values are multiplied by; isAngle: a step over a half turn breaks the line;
-   *  isLog: the axis is logarithmic. */
-  constructor(id, title, unit, axes, { scale = 1, isAngle = false, isLog = false, decimals = 2 } = {}) {
-    this.axes = axes;
-    this.scale = scale;
-    this.isAngle = isAngle;
-    this.isLog = isLog;
-    this.decimals = decimals;
+   *  isLog: the axis is logarithmic; lanes: each line has a lane with a scale of its own; group: common time range. */
+  constructor(id, title, unit, axes, { scale = 1, isAngle = false, isLog = false, decimals = 2, lanes = null } = {}, group = new PlotGroup(30)) {
+    Object.assign(this, { axes, title, scale, isAngle, isLog, decimals, group, lanes: lanes ?? false });
+    group.plots.push(this);
     this.offset_s = null; // from the daemon's clock to UTC, constant after the first bucket
-    this.values = axes.map((name, index) => {
-      const value = el("output");
-      const mark = el("i", { class: `mark axis${index}` });
-      return { value, node: el("span", { class: "key" }, mark, el("b", { text: name }), value) };
-    });
-    const keys = el("div", { class: "keys" }, ...this.values.map((one) => one.node));
-    this.box = el("div", { class: "plot" });
-    this.node = el("section", { id, class: "panel" }, el("h2", {}, title, el("span", { class: "unit", text: ` ${unit}` })), keys, this.box);
+    this.losses = []; // times of lost samples
+    this.hidden = new Set(); // indexes of hidden lines
+    this.values = axes.map((name, index) => this.key(name, index));
+    const keys = el("div", { class: "keys" }, this.values.map((one) => one.node));
+    const scales = isLog ? null : segmented(`scale of ${title}`, [["together", "Combined"], ["lanes", "Separate"]], this.lanes ? "lanes" : "together", (value) => this.setLanes(value === "lanes"));
+    this.box = el("div", { class: "plot", tabindex: "0", role: "img", "aria-label": `plot of ${title}`, onkeydown: (event) => this.onKey(event) });
+    this.node = el("figure", { id, class: "chart" }, el("figcaption", {}, el("b", { text: title }), el("span", { class: "unit", text: unit }), keys, el("div", { class: "chart-tools" }, scales)), this.box);
     this.data = [[], ...axes.flatMap(() => [[], []])];
     this.drawn = 0;
     this.isDue = false;
@@ -52,33 +86,116 @@ export class RollingPlot {
     new ResizeObserver(() => this.plot && this.box.clientWidth && this.plot.setSize(this.size())).observe(this.box);
   }
 
+  /** Return the name and value of a line. A click hides the line. */
+  key(name, index) {
+    const value = el("output");
+    const node = el("button", { type: "button", class: "key", "aria-pressed": "true", onclick: () => {
+      const isShown = this.hidden.delete(index);
+      if (!isShown) this.hidden.add(index);
+      node.setAttribute("aria-pressed", String(isShown));
+      for (const line of [1, 2]) this.plot?.setSeries(2 * index + line, { show: isShown });
+    } }, el("i", { class: `axis${index}` }), el("b", { text: name }), value);
+    return { value, node };
+  }
+
+  setLanes(is) {
+    this.lanes = is;
+    this.plot?.destroy();
+    this.plot = null;
+    this.draw();
+  }
+
   size() {
-    return { width: Math.max(this.box.clientWidth, 120), height: Math.max(this.box.clientHeight, 220) };
+    return { width: Math.max(this.box.clientWidth, 120), height: Math.max(this.box.clientHeight, 120) };
+  }
+
+  /** Return the name of the scale of a line. */
+  scaleOf(index) {
+    return this.lanes ? `y${index}` : "y";
   }
 
   begin() {
     const axis = (more) => ({ stroke: ink, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1 }, ...more });
     const series = this.axes.flatMap((name, index) => {
-      const line = { stroke: COLOURS[index], width: 1.25, points: { show: false }, spanGaps: false };
+      const line = { stroke: COLOURS[index], width: 1.25, points: { show: false }, spanGaps: false, scale: this.scaleOf(index), show: !this.hidden.has(index) };
       return [{ ...line, label: `${name} maximum` }, { ...line, label: `${name} minimum` }];
     });
     const bands = this.axes.map((_, index) => ({ series: [1 + 2 * index, 2 + 2 * index], fill: COLOURS[index] + AREA }));
     const seconds = (_, splits) => splits.map((at) => new Date(at * 1000).toTimeString().slice(0, 8));
+    const lanes = Object.fromEntries(this.axes.map((_, index) => [`y${index}`, { range: (_plot, least, most) => this.laneRange(index, least, most) }]));
+    const upright = this.lanes ? { scale: "y0", size: 52, values: (_, splits) => splits.map(() => ""), grid: { show: false }, ticks: { show: false } } : { scale: "y", size: 52, values: this.isLog ? powers : labels };
     this.plot = new uPlot(
       {
         ...this.size(), series: [{}, ...series], bands, legend: { show: false },
-        cursor: { sync: { key: "time" }, drag: { x: false, y: false }, points: { show: false } },
-        axes: [axis({ values: seconds, space: 80, size: 30 }), axis({ size: 52, values: this.isLog ? powers : labels })],
-        scales: { y: this.isLog ? { distr: 3 } : {}, x: { time: true, range: () => [this.newest - this.span_s, this.newest] } },
-        hooks: { setCursor: [() => this.showValues()] },
+        cursor: { sync: { key: "time" }, drag: { x: true, y: false, setScale: false }, points: { show: false } },
+        axes: [axis({ values: seconds, space: 80, size: 30 }), axis(upright)],
+        scales: { ...(this.lanes ? lanes : { y: this.isLog ? { distr: 3 } : {} }), x: { time: true, range: () => this.group.range(this.newest) } },
+        hooks: { setCursor: [() => this.showValues()], setSelect: [(plot) => this.onSelect(plot)], draw: [(plot) => this.drawMore(plot)] },
       },
       this.data, this.box,
     );
   }
 
+  /** Return a range that places the curve in its lane: one share of the height for each line, the first at the top. */
+  laneRange(index, least, most) {
+    if (least === null || most === null) return [0, 1];
+    const height = Math.max(most - least, 10 ** -this.decimals, 1e-9) * (1 + 2 * LANE_MARGIN);
+    const bottom = (least + most - height) / 2;
+    const below = this.axes.length - 1 - index;
+    return [bottom - below * height, bottom + (this.axes.length - below) * height];
+  }
+
+  /** Draw the labels and borders of the lanes, and a mark for each lost sample. */
+  drawMore({ ctx, bbox, valToPos, scales }) {
+    const pixels = devicePixelRatio || 1;
+    ctx.save();
+    ctx.font = `${11 * pixels}px system-ui, sans-serif`;
+    ctx.textAlign = "right";
+    ctx.textBaseline = "middle";
+    const count = this.axes.length;
+    for (let index = 0; this.lanes && index < count; index += 1) {
+      const { min, max } = scales[`y${index}`];
+      if (min === null || min === undefined) continue;
+      const bottom = min + ((count - 1 - index) * (max - min)) / count;
+      const top = bottom + (max - min) / count;
+      ctx.fillStyle = ink();
+      for (const at of splitsOf(bottom, top)) ctx.fillText(labels(null, [at])[0], bbox.left - 6 * pixels, valToPos(at, `y${index}`, true));
+      ctx.fillStyle = grid();
+      if (index) ctx.fillRect(bbox.left, valToPos(top, `y${index}`, true), bbox.width, pixels);
+    }
+    ctx.fillStyle = lostColor();
+    for (const at of this.losses) {
+      const x = valToPos(at, "x", true);
+      if (x >= bbox.left && x <= bbox.left + bbox.width) ctx.fillRect(x - pixels, bbox.top + bbox.height - 7 * pixels, 2 * pixels, 7 * pixels);
+    }
+    ctx.restore();
+  }
+
+  onSelect(plot) {
+    const { left, width } = plot.select;
+    if (width < 5) return;
+    const [from, to] = [plot.posToVal(left, "x"), plot.posToVal(left + width, "x")];
+    plot.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
+    this.group.zoom([from, to]);
+  }
+
+  onKey(event) {
+    if (!this.plot) return;
+    const [from, to] = this.group.range(this.newest);
+    const width = this.plot.over.clientWidth;
+    const at = this.plot.cursor.left >= 0 ? this.plot.cursor.left : width;
+    if (event.key === "0") this.group.zoom(null);
+    else if (event.key === "+" || event.key === "-") {
+      const half = ((to - from) / 2) * (event.key === "+" ? 1 - STEP : 1 / (1 - STEP));
+      this.group.zoom([(from + to) / 2 - half, (from + to) / 2 + half]);
+    } else if (event.key === "ArrowLeft" || event.key === "ArrowRight")
+      this.plot.setCursor({ left: Math.min(width - 1, Math.max(0, at + (event.key === "ArrowLeft" ? -1 : 1) * Math.max(1, width / 200))), top: 10 });
+    else return;
+    event.preventDefault();
+  }
+
   /** Add a bucket with its first and last time, and minimum and maximum per axis (null without values). */
-  add(bucket, range, period_s, span_s) {
-    this.span_s = span_s;
+  add(bucket, range, period_s) {
     this.offset_s ??= bucket.utc_s - bucket.last_s;
     const x = (bucket.first_s + bucket.last_s) / 2 + this.offset_s;
     const xs = this.data[0];
@@ -88,11 +205,16 @@ export class RollingPlot {
       this.push(before + period_s, null);
       this.step_s = undefined;
     } else if (before !== undefined) this.step_s = x - before;
+    if (this.seq !== undefined && bucket.seq - this.seq > bucket.count) this.losses.push(x);
+    this.seq = bucket.seq;
     this.push(x, range);
     this.newest = x;
     let old = 0;
-    while (xs[old] < x - span_s) old += 1;
-    if (old) this.data.forEach((one) => one.splice(0, old));
+    while (xs[old] < x - KEPT_S) old += 1;
+    if (old > SPLICE_MIN) {
+      this.data.forEach((one) => one.splice(0, old));
+      this.losses = this.losses.filter((one) => one >= xs[0]);
+    }
     this.draw();
   }
 
@@ -116,6 +238,8 @@ export class RollingPlot {
   clear() {
     this.data.forEach((one) => (one.length = 0));
     this.offset_s = null;
+    this.losses = [];
+    this.seq = undefined;
   }
 
   draw() {

@@ -1,108 +1,301 @@
-// Settings of a device: declared, actual, difference. After a login also new values: a plan first, then the change.
+// Settings: a control for each type, with the declared value, the value on the device and the value in flash.
+// Edits stay in the browser until the user applies them.
 
-import { call, el, shown } from "./util.js";
+import { agrees, changed, control, said, same, words } from "./fields.js";
+import { closeDialog, showDialog } from "./shell.js";
+import { editsOf, keepEdits, session } from "./state.js";
+import { button, icon, section, segmented, toast, toggle } from "./ui.js";
+import { call, copy, el, timeOf } from "./util.js";
 
-export class SettingsView {
-  constructor(device, session) {
+const GROUPS = { measurement: "Measurement", output: "Output", pins: "Pins and alarm", connection: "Connection" };
+const AFTER_RESTART = "after save and restart";
+
+export class SettingsSection {
+  constructor(device) {
     this.device = device;
-    this.session = session;
-    this.inputs = new Map();
+    this.edits = editsOf(device);
+    this.wrong = new Set(); // settings with an invalid value in a field
+    this.rows = new Map();
+    this.all = [];
     this.known = "";
-    this.state = el("p", { class: "quiet" });
-    this.table = el("tbody");
-    this.result = el("div", { class: "result" });
-    this.save = el("input", { type: "checkbox", id: "settings-save" });
-    this.tools = el("div", { class: "buttons" },
-      el("button", { type: "button", text: "Plan changes", onclick: () => this.plan(this.given()) }),
-      el("button", { type: "button", text: "Plan declared", onclick: () => this.plan(null) }),
-      el("label", {}, this.save, " save to the device's flash"));
-    const names = ["setting", "declared", "actual", "new value"].map((name) => el("th", { text: name }));
-    this.head = names.at(-1);
-    const table = el("table", {}, el("thead", {}, el("tr", {}, ...names)), this.table);
-    const again = el("button", { type: "button", text: "Read again", onclick: () => this.load(this.session.control) });
-    this.node = el("div", {}, this.state, el("div", { class: "scroll" }, table), el("div", { class: "buttons" }, again), this.tools, this.result);
+    this.only = "all";
+    this.lead = el("p", { class: "lead" });
+    this.locked = el("p", { class: "locked" }, icon("lock"), el("span", { text: "Read only. Log in to change settings." }));
+    this.groups = el("div");
+    this.again = button("Read again", () => this.load(true), { kind: "quiet", glyph: "undo" });
+    const filter = segmented("filter of the settings", [["all", "All"], ["look", "Changed or different"]], "all", (value) => { this.only = value; this.filter(); });
+    this.node = section("settings", "Settings", this.lead, el("div", { class: "timebar" }, filter, el("span", { class: "push" }), this.again), this.locked, this.groups);
     this.load();
   }
 
-  /** Load the settings again if their status changed, for example after a replug. The input fields keep their text. */
+  onSession() {
+    this.draw();
+  }
+
+  /** Load the settings again if their status changed, for example after a replug. */
   onStatus(status) {
     const known = JSON.stringify([status.state, status.declared, status.settings]);
-    if (known === this.known) return;
+    if (known !== this.known && this.known) this.load();
     this.known = known;
-    this.load(false, new Map([...this.inputs].map(([name, input]) => [name, input.value])));
   }
 
-  /** Load the settings. fresh: read them from the device, which needs a login. texts: texts of the input fields, by name. */
-  async load(fresh = false, texts = new Map()) {
+  /** fresh: read the settings from the device, which needs a login. */
+  async load(fresh = false) {
     try {
-      this.show(await call("settings.get", fresh ? { device: this.device, fresh } : { device: this.device }), texts);
+      this.report = await call("settings.get", fresh ? { device: this.device, fresh } : { device: this.device });
+      if (fresh) toast("imud read the settings again.");
+      this.draw();
     } catch (error) {
-      this.state.textContent = String(error.message);
+      if (fresh) toast(error.message);
+      else this.lead.textContent = error.message;
     }
   }
 
-  show(report, texts) {
-    const { status, settings } = report;
-    const words = [`declared and actual: ${status.state}`, status.problem, `${status.flash_writes} writes to flash by imud`];
-    this.state.textContent = words.filter(Boolean).join("; ");
-    const control = this.session.control;
-    this.tools.hidden = this.head.hidden = !control;
-    this.inputs = new Map();
-    this.table.replaceChildren(...settings.map((one) => {
-      const unit = one.unit ? ` ${one.unit}` : "";
-      const name = el("td", {}, el("b", { text: one.name }), el("p", { class: "quiet", text: `${one.description} (${one.values}; ${one.effect})` }));
-      const cells = [name, el("td", { text: shown(one.declared) }), el("td", { text: shown(one.actual) + (one.actual === null ? "" : unit) })];
-      if (control) {
-        const input = el("input", { type: "text", "aria-label": `new value of ${one.name}`, size: 10, value: texts.get(one.name) ?? "" });
-        if (one.declarable) this.inputs.set(one.name, input);
-        cells.push(el("td", {}, one.declarable ? input : null));
-      }
-      return el("tr", { class: one.differs ? "differs" : null, "data-setting": one.name }, ...cells);
+  draw() {
+    this.locked.hidden = this.again.disabled = false;
+    this.locked.hidden = session.control;
+    this.again.disabled = !session.control;
+    if (!this.report) return;
+    this.all = this.report.settings;
+    for (const name of [...this.edits.keys()]) if (!this.all.some((one) => one.name === name)) this.edits.delete(name);
+    this.drawLead();
+    const focused = document.activeElement?.closest?.(".setting")?.id;
+    this.groups.replaceChildren(...Object.entries(GROUPS).map(([group, title]) => {
+      const found = this.all.filter((one) => one.group === group);
+      return found.length ? el("div", { class: "panel setting-group" }, el("h3", { text: title }), found.map((one) => this.row(one))) : "";
     }));
+    if (focused) document.querySelector(`#${focused} :is(input, select, button)`)?.focus();
+    this.filter();
+    this.drawBar();
   }
 
-  /** Return the values of the input fields: JSON (numbers, true, false, lists), or text. */
+  drawLead() {
+    const { status } = this.report;
+    const off = this.all.filter((one) => one.differs).length;
+    const unsaved = this.all.filter((one) => !one.differs && this.isUnsaved(one)).length;
+    const found = [off && `${off} setting${off === 1 ? " differs" : "s differ"} from the configuration`, unsaved && `${unsaved} setting${unsaved === 1 ? " is" : "s are"} not saved`].filter(Boolean).join(", ");
+    const read = status.read_ns ? `Read from the device at ${timeOf(status.read_ns / 1e9)}. ` : "Not read from the device yet. ";
+    this.lead.textContent = `${read}${found ? `${found}. ` : ""}${status.problem}`;
+  }
+
+  filter() {
+    for (const one of this.all) this.rows.get(one.name).node.hidden = this.only === "look" && !(one.differs || this.isUnsaved(one) || this.edits.has(one.name));
+    for (const group of this.groups.children) group.hidden = !group.querySelector(".setting:not([hidden])");
+  }
+
+  isUnsaved(setting) { return setting.saved_state === "differs"; }
+
+  row(setting) {
+    const box = el("div", { class: "control" });
+    const state = el("div", { class: "states" });
+    const id = `more-${setting.name}`;
+    const details = [setting.description && `${setting.description}.`, `The change takes effect ${setting.effect}.`, `Key in the configuration: ${setting.name}.`, setting.section && `Manual: section ${setting.section}.`];
+    const text = el("p", { class: "help more", id, hidden: true, text: details.filter(Boolean).join(" ") });
+    const more = el("button", { type: "button", class: "quiet bare ask", "aria-label": `more about ${setting.title}`, "aria-expanded": "false", "aria-controls": id, onclick: () => {
+      text.hidden = !text.hidden;
+      more.setAttribute("aria-expanded", String(!text.hidden));
+    } }, icon("about"));
+    const node = el("div", { class: "setting", id: `setting-${setting.name}`, "data-setting": setting.name },
+      el("div", { class: "what" }, el("div", { class: "title-line" }, el("b", { text: setting.title }), more), setting.help && el("p", { class: "help", text: setting.help }), text), box, state);
+    this.rows.set(setting.name, { node, box, state });
+    this.fill(setting);
+    return node;
+  }
+
+  value(setting) { return this.edits.has(setting.name) ? this.edits.get(setting.name) : setting.actual; }
+
+  set(setting, value, isRedrawn = false) {
+    this.wrong.delete(setting.name);
+    if (same(value, setting.actual)) this.edits.delete(setting.name);
+    else this.edits.set(setting.name, value);
+    if (isRedrawn) this.fill(setting);
+    else this.fillState(setting);
+    this.changed();
+  }
+
+  changed() {
+    keepEdits();
+    this.drawBar();
+  }
+
+  fill(setting) {
+    const { box } = this.rows.get(setting.name);
+    const value = this.value(setting);
+    const hadFocus = box.contains(document.activeElement);
+    if (!setting.declarable) box.replaceChildren(el("output", { class: "read", text: said(value, setting.unit) }));
+    else box.replaceChildren(control(setting, value, {
+      disabled: !session.control,
+      onChange: (next, isRedrawn) => this.set(setting, next, isRedrawn),
+      onInvalid: () => {
+        this.wrong.add(setting.name);
+        this.fillState(setting);
+        this.drawBar();
+      },
+    }));
+    if (hadFocus) box.querySelector("input, select, button")?.focus();
+    this.fillState(setting);
+  }
+
+  /** Show the edit, or the declared value, the value on the device and the value in flash if they differ. */
+  fillState(setting) {
+    const { node, state } = this.rows.get(setting.name);
+    const isEdited = this.edits.has(setting.name);
+    const [isOff, isUnsaved] = [setting.differs, this.isUnsaved(setting)];
+    node.classList.toggle("edited", isEdited);
+    node.classList.toggle("off", !isEdited && (isOff || isUnsaved));
+    if (this.wrong.has(setting.name)) state.replaceChildren(el("p", { class: "help wrong", text: "invalid value" }), this.undo(setting));
+    else if (isEdited) state.replaceChildren(...this.editParts(setting));
+    else if (isOff || isUnsaved) state.replaceChildren(...this.differenceParts(setting, isOff, isUnsaved));
+    else state.replaceChildren(this.fine(setting));
+  }
+
+  undo(setting) {
+    return button("", () => this.set(setting, setting.actual, true), { kind: "quiet bare", glyph: "undo", label: `undo the change of ${setting.title}` });
+  }
+
+  editParts(setting) {
+    const { actual, unit, effect, connection } = setting;
+    const value = this.edits.get(setting.name);
+    return [
+      el("div", { class: "change" }, el("s", { text: said(changed(value, actual), unit) }), icon("arrow"), el("b", { text: said(changed(actual, value), unit) }), this.undo(setting)),
+      ...(effect === AFTER_RESTART ? [el("p", { class: "help", text: "takes effect after save and restart" })] : []),
+      ...(connection ? [el("p", { class: "help", text: "imud may not find the device after this change." })] : []),
+    ];
+  }
+
+  differenceParts(setting, isOff, isUnsaved) {
+    const line = (name, value, isBad) => el("div", { class: `state ${isBad ? "bad" : ""}` }, el("dt", { text: name }), el("dd", { text: value }));
+    const { declared, actual, saved, saved_state, unit } = setting;
+    const flash = saved_state === "unknown" ? "unknown" : said(saved, unit);
+    const parts = [el("dl", { class: "three" }, declared !== null && line("declared", said(declared, unit), isOff), line("on device", said(actual, unit), isOff), line("in flash", flash, isUnsaved))];
+    if (isUnsaved) parts.push(el("p", { class: "lost", text: "Lost at power-off." }));
+    if (isOff && session.control) parts.push(button("Use the declared value", () => this.set(setting, isPartial(declared) ? { ...actual, ...declared } : declared, true), { kind: "small" }));
+    if (!isOff && isUnsaved && session.control) parts.push(button("Save to flash", () => this.saveAll(), { kind: "small", glyph: "save" }));
+    return parts;
+  }
+
+  fine(setting) {
+    if (!setting.readable) return el("p", { class: "fine" }, el("span", { text: "the device does not report it" }));
+    if (setting.declared === null) return el("p", { class: "fine plain" }, el("span", { text: setting.declarable ? "not declared" : "" }));
+    return el("p", { class: "fine" }, icon("ok"), el("span", { text: "as declared" }));
+  }
+
+  /** Show a setting that the address names. */
+  goTo(name) {
+    const node = name && document.getElementById(`setting-${name}`);
+    this.wanted = node ? "" : name;
+    if (!node) return;
+    node.scrollIntoView({ block: "center" });
+    node.classList.remove("flash");
+    void node.offsetWidth; // starts the animation again
+    node.classList.add("flash");
+  }
+
+  drawBar() {
+    if (this.wanted) this.goTo(this.wanted);
+    const bar = document.getElementById("bar");
+    const count = new Set([...this.edits.keys(), ...this.wrong]).size;
+    bar.hidden = !count;
+    if (!count) return;
+    const restarts = this.all.some((one) => this.edits.has(one.name) && one.effect === AFTER_RESTART);
+    const [wrong] = this.wrong;
+    const note = wrong ? `${words(wrong)}: invalid value` : `${this.device}: stored only in this browser${restarts ? ", restart needed" : ""}`;
+    bar.replaceChildren(el("div", {}, el("b", { text: `${count} ${count === 1 ? "change" : "changes"} not applied` }), el("span", { class: "help", text: note })),
+      button("Discard", () => this.discard(), { kind: "quiet" }), button("Review", () => this.review(), { kind: "primary", disabled: this.wrong.size > 0 || !session.control }));
+  }
+
+  discard() {
+    this.edits.clear();
+    this.wrong.clear();
+    for (const one of this.all) this.fill(one);
+    this.changed();
+  }
+
+  // --- review and apply --------------------------------------------------------------------------------------------------
+
   given() {
-    const found = {};
-    for (const [name, input] of this.inputs) {
-      if (!input.value.trim()) continue;
-      try {
-        found[name] = JSON.parse(input.value);
-      } catch {
-        found[name] = input.value.trim();
-      }
-    }
-    return found;
+    return Object.fromEntries(this.all.filter((one) => this.edits.has(one.name)).map((one) => [one.name, changed(one.actual, this.edits.get(one.name))]));
   }
 
-  async plan(settings) {
-    const asked = { device: this.device, save: this.save.checked };
-    if (settings) asked.settings = settings;
+  async review(save = true) {
+    const asked = { device: this.device, settings: this.given(), save };
+    const body = el("div", { class: "review-body" }, el("p", { text: "imud plans the changes…" }));
+    const buttons = el("div", { class: "buttons" }, button("Back", closeDialog));
+    const count = Object.keys(asked.settings).length;
+    showDialog("review", el("h2", { text: `${count === 1 ? "1 change" : `${count} changes`} for ${this.device}` }), body, buttons);
     try {
       const plan = await call("settings.plan", asked);
-      const steps = plan.steps.map((step) => el("li", { text: `${step.name}: ${shown(step.before)} → ${shown(step.value)}` }));
-      const left = Object.entries(plan.left_out).map(([name, why]) => el("li", { text: `${name} is not written: ${why}` }));
-      const words = plan.steps.length ? "Planned changes:" : "No change is necessary.";
-      const apply = el("button", { type: "button", text: "Apply", onclick: () => this.apply(asked) });
-      this.result.replaceChildren(el("p", { text: words }), el("ul", {}, ...steps, ...left),
-        ...(plan.advice ? [el("p", { text: plan.advice })] : []),
-        ...(plan.risk ? [el("p", { class: "problem", text: plan.risk })] : []), ...(plan.steps.length ? [apply] : []));
+      body.replaceChildren(...this.planParts(plan, save));
+      if (plan.steps.length) buttons.append(button(plan.restart ? "Apply and restart" : "Apply", () => this.apply(asked, body, buttons), { kind: "primary" }));
     } catch (error) {
-      this.result.replaceChildren(el("p", { class: "problem", text: error.message }));
+      body.replaceChildren(el("p", { class: "wrong", role: "alert", text: error.message }));
     }
   }
 
-  async apply(asked) {
-    this.result.replaceChildren(el("p", { text: "Writing…" }));
+  planParts(plan, save) {
+    const rows = plan.steps.map((step) => {
+      const setting = this.all.find((one) => one.name === step.name);
+      const differs = setting && !agrees(setting.declared, step.value);
+      return el("tr", {}, el("th", { scope: "row", text: setting?.title ?? words(step.name) }), el("td", {}, el("s", { text: said(step.before, setting?.unit) })), el("td", {}, icon("arrow", "to")),
+        el("td", {}, el("b", { text: said(step.value, setting?.unit) }), el("p", { class: "help", text: step.effect === "at once" ? "takes effect immediately" : `takes effect ${step.effect}` }), differs && el("p", { class: "lost", text: `configuration: ${said(setting.declared, setting.unit)}` })));
+    });
+    const left = Object.entries(plan.left_out).map(([name, why]) => el("li", { text: `${words(name)} is not written: ${why}` }));
+    const { flash_writes, flash_writes_day } = this.report.status;
+    const note = save ? `This uses 1 write to the flash of the device (${flash_writes} by imud, ${flash_writes_day} in the last 24 hours).` : "The device loses these changes at power-off. This page shows that they are not saved.";
+    return [
+      rows.length ? el("table", { class: "plain" }, el("tbody", {}, rows)) : el("p", { text: "No change is necessary." }), left.length ? el("ul", {}, left) : "",
+      toggle("Keep after power-off", save, (is) => this.review(is)), el("p", { class: "help", text: note }),
+      ...[plan.risk, plan.advice].filter(Boolean).map((text) => el("p", { class: "warnbox" }, icon("attention"), el("span", { text }))),
+    ];
+  }
+
+  async apply(asked, body, buttons) {
+    body.replaceChildren(el("p", { role: "status", text: "imud writes the settings…" }));
+    buttons.replaceChildren();
+    let parts;
     try {
       const done = await call("settings.apply", asked);
-      const steps = done.steps.map((step) => el("li", { text: `${step.name} = ${shown(step.value)}: ${step.outcome}${step.message ? ` (${step.message})` : ""}` }));
-      const words = done.problem || `Done${done.saved ? ", and saved" : ""}.`;
-      this.result.replaceChildren(el("p", { class: done.problem ? "problem" : "good", text: words }), el("ul", {}, ...steps),
-        ...[done.not_saved, done.advice].filter(Boolean).map((text) => el("p", { text })));
+      parts = this.outcomeParts(done);
+      for (const step of done.steps) if (!["not applied", "not done"].includes(step.outcome)) this.edits.delete(step.name);
     } catch (error) {
-      this.result.replaceChildren(el("p", { class: "problem", text: error.message }));
+      parts = [el("p", { class: "wrong", role: "alert", text: error.message })];
+    }
+    body.replaceChildren(...parts);
+    buttons.replaceChildren(button("Close", closeDialog, { kind: "primary" }));
+    await this.load();
+    this.changed();
+  }
+
+  outcomeParts(done) {
+    const isGood = (one) => !["not applied", "not done"].includes(one.outcome);
+    const titles = Object.fromEntries(this.all.map((one) => [one.name, one.title]));
+    const steps = done.steps.map((one) => el("li", {}, icon(isGood(one) ? "ok" : "missing", isGood(one) ? "done" : "not done"), `${titles[one.name] ?? one.name}: ${one.outcome}${one.message ? ` (${one.message})` : ""}`));
+    const others = Object.fromEntries(done.steps.filter((one) => isGood(one) && !agrees(this.all.find((each) => each.name === one.name)?.declared, one.value)).map((one) => [one.name, one.value]));
+    const lost = done.steps.filter(isGood).map((one) => `“${titles[one.name] ?? one.name}”`).join(", ");
+    const result = done.problem || (done.saved ? "Applied and saved to flash." : `Applied. The device loses ${lost} at power-off.`);
+    return [
+      el("ol", { class: "outcome" }, steps), el("p", { class: done.problem ? "wrong" : "", role: "status", id: "outcome" }, el("b", { text: result })),
+      ...(!done.saved && !done.problem ? [button("Save to flash", () => this.saveAll(), { glyph: "save" })] : []),
+      ...[done.advice, done.not_saved].filter(Boolean).map((text) => el("p", { class: "help", text })),
+      ...(Object.keys(others).length ? [el("p", { text: "Update the configuration:" }), button("Copy as YAML", async () => { await copy(yaml(others)); toast("Copied."); }, { glyph: "copy" })] : []),
+    ];
+  }
+
+  async saveAll() {
+    closeDialog();
+    try {
+      const answer = await call("command", { device: this.device, name: "save", arguments: {} });
+      toast(answer?.evidence ? `Save: ${answer.verified ? "verified" : "sent, not verified"}: ${answer.evidence}` : "Save: sent, not verified");
+    } catch (error) {
+      toast(error.message);
     }
     this.load();
   }
+}
+
+const isPartial = (value) => value !== null && typeof value === "object" && !Array.isArray(value);
+
+/** Return settings in the notation of the configuration. JSON values are YAML. */
+function yaml(values) {
+  return `settings:\n${Object.entries(values).map(([name, value]) => `  ${name}: ${JSON.stringify(value)}`).join("\n")}\n`;
 }

@@ -28,7 +28,7 @@ export class SpectrumPlot {
       setText(this.note, this.member ? "collecting samples" : OFF);
       onChoice(this.member);
     });
-    this.note = el("p", { class: "quiet", text: OFF });
+    this.note = el("p", { class: "help", text: OFF });
     this.box = el("div", { class: "plot" });
     this.node = el("div", { class: "fill" }, el("div", { class: "buttons" }, this.choice), this.box, this.note);
     this.box.hidden = true;

@@ -92,8 +92,8 @@ export class CoverageSphere {
     const style = getComputedStyle(this.canvas);
     const colour = (name) => style.getPropertyValue(name) || "#888";
     if (this.map?.pixels !== this.canvas.width) this.map = cellMap(this.canvas.width);
-    context.putImageData(this.filled(context, covered, colour("--good")), 0, 0);
-    context.strokeStyle = colour("--wait");
+    context.putImageData(this.filled(context, covered, colour("--ok")), 0, 0);
+    context.strokeStyle = colour("--faint");
     context.lineWidth = 1;
     context.beginPath();
     for (const circle of this.edges) {

@@ -1,14 +1,16 @@
 // Elements of the page, and numbers as text. The page never inserts texts of devices as HTML.
 
+/** Return a new element. `text` is its text, `css` are styles (CSSOM), `on…` are handlers; other names are attributes. */
 export function el(tag, attributes = {}, ...children) {
   const node = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
+    if (value === null || value === undefined || value === false) continue;
     if (name === "text") node.textContent = value;
+    else if (name === "css") for (const [property, one] of Object.entries(value)) node.style.setProperty(property, one);
     else if (name.startsWith("on")) node.addEventListener(name.slice(2), value);
-    else if (name === "hidden" || name === "disabled" || name === "checked" || name === "selected") node[name] = value;
-    else if (value !== null && value !== undefined) node.setAttribute(name, value);
+    else node.setAttribute(name, value === true ? "" : value);
   }
-  node.append(...children.filter((child) => child !== null));
+  node.append(...children.flat().filter((child) => child !== null && child !== undefined && child !== false));
   return node;
 }
 
@@ -72,11 +74,6 @@ export function marked(text) {
   return text.split("`").map((part, index) => (index % 2 ? el("code", { text: part }) : part));
 }
 
-/** Return a panel with a title. */
-export function panel(id, title, ...children) {
-  return el("section", { id, class: "panel" }, el("h2", { text: title }), ...children);
-}
-
 /** Return a list of rows with name and value. */
 export function facts(rows) {
   const list = el("dl", { class: "facts" });
@@ -97,4 +94,37 @@ export async function call(method, params) {
   const answer = await response.json();
   if (answer.error) throw new Error(answer.error);
   return answer.result;
+}
+
+/** Return a span of time as `imud status` prints it: 40 s, 14 min, 3 h, 2 days. */
+export function span(seconds) {
+  const whole = Math.max(0, Math.floor(seconds));
+  if (whole < 120) return `${whole} s`;
+  if (whole < 7200) return `${Math.floor(whole / 60)} min`;
+  return whole < 172800 ? `${Math.floor(whole / 3600)} h` : `${Math.floor(whole / 86400)} days`;
+}
+
+/** Difference of wall-clock time and the clock of the daemon, s; null before the first message. */
+export const clock = { offset_s: null };
+
+/** Return the local time of day of a time of the daemon's clock. */
+export function timeOf(t_s, { date = false } = {}) {
+  if (clock.offset_s === null) return "";
+  const at = new Date((t_s + clock.offset_s) * 1000);
+  const day = at.toDateString() === new Date().toDateString() && !date ? "" : `${at.getDate()} ${at.toLocaleString("en", { month: "short" })} `;
+  return day + at.toTimeString().slice(0, 8);
+}
+
+/** Copy a text. Browsers permit it only on HTTPS and localhost, so there is a second way. */
+export async function copy(text) {
+  try {
+    await navigator.clipboard.writeText(text);
+  } catch {
+    const area = el("textarea", { "aria-hidden": "true" });
+    area.value = text;
+    (document.querySelector("dialog[open]") ?? document.body).append(area);
+    area.select();
+    document.execCommand("copy");
+    area.remove();
+  }
 }

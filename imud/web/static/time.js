@@ -1,0 +1,78 @@
+// The section Time: the causes of the time stamp error as a chain, a plot of error and latency, a histogram.
+
+import { PlotGroup, RollingPlot } from "./plots.js";
+import { section } from "./ui.js";
+import { duration, el, number, setText } from "./util.js";
+
+const SYNC = {
+  arrival: "the arrival of the bytes", device: "the clock of the device and the arrival of the bytes", utc: "UTC from the device",
+  sout: "pulses on SOUT", sin: "triggers on SIN",
+};
+const seconds = (ns) => duration(ns / 1e9);
+
+export class TimeSection {
+  constructor() {
+    this.group = new PlotGroup(600);
+    this.stamps = new RollingPlot("stamps", "Time stamp error and latency", "ms", ["time stamp error", "latency"], { scale: 1e3, decimals: 3, isLog: true }, this.group);
+    this.lead = el("p", { class: "lead" });
+    this.chain = el("ol", { class: "chain" });
+    this.list = el("ol", { class: "histogram" });
+    this.note = el("p", { class: "help" });
+    this.bars = [];
+    this.node = section("time", "Time", this.lead, this.chain, el("div", { class: "two" }, el("div", { class: "panel" }, this.stamps.node),
+      el("div", { class: "panel", id: "latency" }, el("h3", { text: "Delay from measurement to publication" }), this.list, this.note)));
+  }
+
+  add(bucket, period_s) {
+    const stamp = [bucket.t_err_s, bucket.latency_s];
+    this.stamps.add(bucket, [stamp, stamp], period_s);
+  }
+
+  draw({ status, latency_bounds_s }) {
+    const { clock } = status;
+    const source = SYNC[clock.sync] ?? clock.sync;
+    setText(this.lead, `The time stamp error is ±${seconds(clock.t_err_ns)} (one sigma). The time stamps come from ${source}.`);
+    const rate = status.expected_rate_hz ? `device clock, ${number(status.expected_rate_hz, 0)} Hz` : "device clock, rate not known";
+    const parts = [
+      ["Device", rate, `${number(clock.skew_ppm, 2)} ppm`],
+      ["Adapter", clock.hold_ns ? "latency timer of the USB adapter" : "no latency timer", clock.hold_ns ? seconds(clock.hold_ns) : "0 ms"],
+      ["Fit", "spread of the arrival times", `±${seconds(clock.residual_ns)}`],
+      ["Host", "batching in imud", seconds(status.hold_ns)],
+      ["UTC", clock.reference_error_ns ? "the host's estimate" : "no estimate of the host", clock.reference_error_ns ? `±${seconds(clock.reference_error_ns)}` : "–"],
+    ];
+    const drawn = JSON.stringify(parts);
+    if (drawn !== this.drawn) this.chain.replaceChildren(...parts.map(([name, words, value]) => el("li", {}, el("b", { text: name }), el("span", { class: "help", text: words }), el("output", { text: value }))));
+    this.drawn = drawn;
+    this.drawHistogram(status, latency_bounds_s);
+  }
+
+  drawHistogram(status, bounds_s) {
+    const counts = status.latency_buckets;
+    const all = counts.reduce((a, b) => a + b, 0);
+    const most = Math.max(...counts, 1);
+    if (this.bars.length !== counts.length) {
+      this.bars = counts.map((_, index) => {
+        const bound = bounds_s[index];
+        const name = bound === undefined ? `> ${duration(bounds_s.at(-1))}` : `≤ ${duration(bound)}`;
+        const [bar, share] = [el("b"), el("output")];
+        return { bar, share, node: el("li", {}, el("span", { text: name }), el("i", {}, bar), share) };
+      });
+      this.list.replaceChildren(...this.bars.map((one) => one.node));
+    }
+    counts.forEach((count, index) => {
+      this.bars[index].bar.style.width = `${(100 * count) / most}%`;
+      this.bars[index].node.dataset.count = count;
+      setText(this.bars[index].share, all ? `${number((100 * count) / all, 1)} %` : "–");
+    });
+    const mean = all ? duration(status.latency_sum_ns / 1e9 / all) : "–";
+    setText(this.note, `${number(all)} samples since start, mean ${mean} from measurement to publication`);
+  }
+
+  redraw() {
+    this.stamps.draw();
+  }
+
+  close() {
+    this.stamps.close();
+  }
+}
