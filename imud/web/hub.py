@@ -215,14 +215,14 @@ class BrowserHub:
         wanted = msgspec.structs.replace(look, acknowledged=0)
         if wanted == browser.look:
             return
-        is_other_view = (wanted.look, wanted.device) != (browser.look.look, browser.look.device)
+        is_other_view = (wanted.look, wanted.devices) != (browser.look.look, browser.look.devices)
         browser.look = wanted
         if is_other_view:
             browser.mailbox.forget()
         self._want()
         if is_other_view and wanted.look != "nothing":
             browser.mailbox.put_newest("state", _text(self._state))
-        if wanted.look == "device" and wanted.device not in self._watched and self._exists(wanted.device):
+        if any(name not in self._watched and self._exists(name) for name in wanted.devices):
             words = f"pages of {DEVICES_MAX} other devices are open, the maximum; close one of them"
             browser.mailbox.put(_text(messages.ProblemMessage(words)))
 
@@ -233,11 +233,11 @@ class BrowserHub:
     def _want(self) -> None:
         """Request the data that all pages need from the feed."""
         looks = [one.look for one in self.browsers if one.look.look != "nothing"]
-        named = {look.device for look in looks if look.look == "device" and self._exists(look.device)}
+        named = {name for look in looks for name in look.devices if self._exists(name)}
         stay = [name for name in self._watched if name in named]
         devices = self._watched = tuple([*stay, *sorted(named.difference(stay))][:DEVICES_MAX])
         rates = [look.rate_hz for look in looks if look.look == "device"]
-        used = {(look.device, look.rate_hz) for look in looks if look.look == "device"}
+        used = {(name, look.rate_hz) for look in looks for name in look.devices}
         self._buckets = {key: self._buckets.get(key) or Bucketing(key[1]) for key in used}
         if not looks:
             self._newest.clear()
@@ -289,9 +289,9 @@ class BrowserHub:
             self._to(lambda look: look.look != "nothing", self._state, "state")
 
     def _spread_statuses(self, now_ns: int) -> None:
-        for name in {one.look.device for one in self.browsers if one.look.look == "device"}:
+        for name in {name for one in self.browsers for name in one.look.devices}:
             message = status_message(name, self._statuses.get(name), now_ns)
-            self._to(lambda look, name=name: look.device == name, message, "status")  # type: ignore[misc]  # bound now
+            self._to(lambda look, name=name: name in look.devices, message, f"status {name}")  # type: ignore[misc]  # bound now
 
     def _spread_overview(self, now_ns: int) -> None:
         rows = tuple(row_of(one, self._newest.get(name), now_ns) for name, one in self._statuses.items())
@@ -312,7 +312,7 @@ class BrowserHub:
         for (name, rate_hz), bucketing in self._buckets.items():
             if buckets := bucketing.add(by_device.get(name, ()), news.now_ns):
                 self._to(
-                    lambda look, key=(name, rate_hz): (look.device, look.rate_hz) == key,  # type: ignore[misc]
+                    lambda look, key=(name, rate_hz): key[0] in look.devices and look.rate_hz == key[1],  # type: ignore[misc]
                     messages.SamplesMessage(name, rate_hz, tuple(buckets)),
                 )
         for name, member in {(one.look.device, one.look.spectrum) for one in self.browsers if one.look.spectrum}:

@@ -154,11 +154,21 @@ class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     look: Literal["overview", "device", "nothing"] = "nothing"
     device: str = ""
+    other: str = ""  # second device of a comparison
     rate_hz: Literal[10, 20, 50] = 20
     spectrum: Literal["", "accel_m_s2", "gyro_rad_s", "mag_t"] = ""
     acknowledged: int = 0
     """Number of messages that the page has processed since its last message. A page that only acknowledges repeats its
     view."""
+
+    @property
+    def devices(self) -> tuple[str, ...]:
+        """Names of the shown devices."""
+        return (
+            (self.device, self.other)
+            if self.look == "device" and self.other
+            else (self.device,) * (self.look == "device")
+        )
 
 
 class LoginRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -5,8 +5,8 @@ import { section } from "./ui.js";
 import { duration, el, number, setText } from "./util.js";
 
 const SYNC = {
-  arrival: "the arrival of the bytes", device: "the clock of the device and the arrival of the bytes", utc: "UTC from the device",
-  sout: "pulses on SOUT", sin: "triggers on SIN",
+  arrival: "the arrival times of the bytes", regression: "the device time, fitted to the arrival times", edge: "the device time, fitted to pulses",
+  utc: "the device time, which the device synchronizes to UTC",
 };
 const seconds = (ns) => duration(ns / 1e9);
 
