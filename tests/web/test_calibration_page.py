@@ -50,14 +50,14 @@ def test_a_magnetometer_is_calibrated_with_the_token(page: Page, tmp_path: Path,
         assert page.js("return document.querySelector(arguments[0]).disabled", BEGIN.format("level"))
         first = page.until(COVERED)
         page.until(f"{COVERED} > arguments[0]", first)
-        page.until_text("#calibration .facts", "turned about x")
+        page.until_text("#calibration .turns", "around x")
         page.until_text("#calibration-result", "magnetometer is verified and saved")
         result = page.text("#calibration-result")
         assert "field strength 45.1 µT, at most 67 µT: passed" in result
         assert "residual of the field" in result
         assert f"The device reports: {BIAS}" in result
         page.until(f"{COVERED} >= arguments[0]", COVERAGE_WANTED * 48)  # the events may arrive after the reply
-        assert "field\n45.1 µT" in page.text("#calibration .facts")
+        assert "45.1 µT" in page.text("#calibration .measures")
         assert not page.js("return document.querySelector('#calibration-stop').getClientRects().length")
         assert not page.js("return document.querySelector(arguments[0]).disabled", BEGIN.format("level"))
         page.until(f"{CALIBRATION_EVENTS} >= 2")
@@ -74,7 +74,7 @@ def test_a_calibration_is_seen_without_the_token_and_stopped_with_it(page: Page,
     ):
         open_page(page, url, "bow")
         page.until("return document.querySelector('#calibration').textContent.includes('Log in to start it.')")
-        assert not page.js("return document.querySelector('#calibration button')")
+        assert not page.js("return document.querySelector('#calibration details button')")
         ask = """const { call } = await import('/static/util.js');
             return call(args[0], { device: 'bow', kind: 'level' }).catch((error) => error.message)"""
         for method in ("calibrate", "stop_calibration"):
@@ -82,7 +82,7 @@ def test_a_calibration_is_seen_without_the_token_and_stopped_with_it(page: Page,
         running: Future[Any] = pool.submit(client.call, "calibrate", device="bow", kind="magnetometer")
         page.until(COVERED)
         page.until_text("#calibration-progress", "of the directions and turns")
-        assert not page.js("return document.querySelector('#calibration-stop')")
+        assert not page.js("return document.querySelector('#calibration-stop').getClientRects().length")
         with daemon.client() as other:
             other.call("stop_calibration", device="bow")
         with pytest.raises(RpcError, match="was cancelled"):

@@ -29,7 +29,7 @@ export class DevicePage {
     this.aboutSection = new AboutSection(name);
     this.settings = new SettingsSection(name);
     this.calibration = new CalibrationSection(name);
-    this.plots = this.live.plots;
+    Object.assign(this, { plots: this.live.plots, spectrum: this.live.spectrum });
     const parts = [this.live, this.time, this.ledger, this.settings, this.calibration, this.events, this.aboutSection];
     this.sections = el("div", { class: "sections" }, parts.map((one) => one.node));
     const head = el("div", { class: "device-head" }, el("div", {}, el("h1", { text: name }), this.about), el("div", { class: "chips" }, this.activity));

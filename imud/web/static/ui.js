@@ -69,9 +69,9 @@ export function section(id, title, ...children) {
 
 export function segmented(label, options, chosen, onChange) {
   const group = el("div", { class: "segmented", role: "radiogroup", "aria-label": label });
-  const draw = (value) => group.replaceChildren(...options.map(([key, words]) => el("button", {
-    type: "button", role: "radio", "aria-checked": String(key === value), tabindex: key === value ? "0" : "-1", text: words,
-    onclick: () => { draw(key); onChange(key); },
+  const draw = (value) => group.replaceChildren(...options.map(([key, words], index) => el("button", {
+    type: "button", role: "radio", "aria-checked": String(key === value), tabindex: key === value || (index === 0 && !options.some(([one]) => one === value)) ? "0" : "-1", text: words,
+    onclick: () => { draw(key); onChange(key); group.querySelector("[aria-checked=true]")?.focus(); },
     onkeydown: (event) => {
       const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
       if (!step) return;
