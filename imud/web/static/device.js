@@ -90,7 +90,9 @@ export class DevicePage {
     if (!status) return this.condition.draw(null, now_s);
     setText(this.about, [status.identity.product ?? "unknown product", status.driver, status.link].filter(Boolean).join(" · "));
     this.condition.draw(status.condition, now_s);
-    this.missing.hidden = status.condition?.condition !== "missing";
+    const isMissing = status.condition?.condition === "missing";
+    this.missing.hidden = !isMissing;
+    this.live.node.hidden = this.time.node.hidden = isMissing; // a missing device has no figures
     this.activity.hidden = !status.calibration;
     if (status.calibration) this.activity.replaceChildren(icon("calibration"), `Calibration: ${status.calibration.kind}`);
     for (const part of [this.live, this.time, this.ledger, this.aboutSection]) part.draw(message);
