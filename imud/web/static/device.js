@@ -45,7 +45,8 @@ export class DevicePage {
   onSession() {
     this.settings.onSession();
     this.calibration.onSession();
-    this.aboutSection.onSession();
+    this.aboutSection.load();
+    this.onRestart(); // before a login, imud web may refuse the reads
   }
 
   onRestart() {

@@ -95,6 +95,10 @@ export class Overview {
     this.loadEvents();
   }
 
+  onSession() {
+    this.loadEvents();
+  }
+
   onMessage(message) {
     if (message.kind === "events" && message.events.some((one) => one.event !== "calibration" && one.event !== "mark")) this.loadEvents();
     if (message.kind !== "overview") return;
