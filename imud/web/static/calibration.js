@@ -32,7 +32,7 @@ export function instruction(detail) {
 }
 
 const dayOf = (utc_ns) => new Date(utc_ns / 1e6).toLocaleDateString("en-GB", { day: "numeric", month: "short" });
-const title = (kind) => kind[0].toUpperCase() + kind.slice(1).replaceAll("_", " ");
+const title = (kind) => kind.charAt(0).toUpperCase() + kind.slice(1).replaceAll("_", " ");
 
 export class CalibrationSection {
   constructor(device) {
