@@ -183,7 +183,7 @@ export class CalibrationSection {
     const at = { turn: 1, check: 2, save: 3 }[detail.phase] ?? 0;
     this.steps.replaceChildren(...STEPS.map((words, index) =>
       el("li", { class: index < at ? "done" : index === at ? "now" : "", "aria-current": index === at ? "step" : null }, el("i", {}, index < at && icon("ok")), words)));
-    if (detail.phase !== undefined) setText(this.progress, instruction(detail));
+    if (detail.phase !== undefined || detail.cells !== undefined) setText(this.progress, instruction(detail));
     this.turning.hidden = detail.cells === undefined;
     if (detail.cells === undefined) return;
     this.showTurning(detail);
