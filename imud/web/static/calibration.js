@@ -193,7 +193,7 @@ export class CalibrationSection {
     if (detail.cells !== this.cells) {
       this.cells = detail.cells;
       this.sphere.draw(detail.cells);
-      navigator.vibrate?.(60);
+      if (navigator.userActivation?.hasBeenActive) navigator.vibrate?.(60);
     }
     this.bar.value = detail.progress ?? 0;
     setText(this.percent, number(100 * (detail.progress ?? 0)));
