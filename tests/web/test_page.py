@@ -43,7 +43,8 @@ def test_the_plot_contains_every_sent_peak(page: Page, tmp_path: Path) -> None:
             page.until(POINTS, 80, what="four seconds are plotted")
             page.click("#pause")
             page.until("return !window.imud.view.plots.get('accel_m_s2').isDue")
-            times, least, greatest = page.js(PLOTTED)
+            drawn = [row for row in zip(*page.js(PLOTTED), strict=True) if None not in row]  # a late host breaks the line
+            times, least, greatest = map(list, zip(*drawn, strict=True))
             measured = sender.measured
             assert page.problems() == []
     assert len(times) == len(least) == len(greatest) >= 80

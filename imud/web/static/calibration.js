@@ -40,6 +40,7 @@ export class CalibrationSection {
     this.infos = [];
     this.status = null; // member `calibration` of the status
     this.isOwn = false;
+    this.isReplied = false; // whether the reply to this page has shown the result, before the event of the end
     this.now_s = 0;
     this.progress = el("p", { class: "instruction", id: "calibration-instruction", role: "status" });
     this.message = el("p", { class: "help", id: "calibration-progress" });
@@ -104,6 +105,7 @@ export class CalibrationSection {
 
   async begin(kind, save) {
     this.isOwn = true;
+    this.isReplied = false;
     this.kind = kind;
     this.result.replaceChildren();
     this.showRunning(true);
@@ -118,6 +120,7 @@ export class CalibrationSection {
       this.result.replaceChildren(el("p", { class: "wrong", text: error.message }));
     }
     this.isOwn = false;
+    this.isReplied = true;
     this.showRunning(false);
     this.load();
   }
@@ -134,8 +137,9 @@ export class CalibrationSection {
   onEvent({ message, detail }) {
     setText(this.message, message);
     if (detail.kind) this.kind = detail.kind;
+    if (detail.phase === "begin") this.isReplied = false;
     if (detail.phase === "end") {
-      if (!this.isOwn) {
+      if (!this.isOwn && !this.isReplied) {
         this.result.replaceChildren(el("p", { class: detail.verified ? "fine-result" : "wrong", text: message + (detail.saved ? " and saved" : "") }));
         this.load();
       }
