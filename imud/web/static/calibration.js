@@ -135,11 +135,13 @@ export class CalibrationSection {
 
   /** Show an event of the kind `calibration`, also if another client started it. */
   onEvent({ message, detail }) {
-    setText(this.message, message);
     if (detail.kind) this.kind = detail.kind;
     if (detail.phase === "begin") this.isReplied = false;
+    if (this.isReplied && detail.cells !== undefined) this.showTurning(detail);
+    if (this.isReplied) return; // an event from the time before the reply
+    setText(this.message, message);
     if (detail.phase === "end") {
-      if (!this.isOwn && !this.isReplied) {
+      if (!this.isOwn) {
         this.result.replaceChildren(el("p", { class: detail.verified ? "fine-result" : "wrong", text: message + (detail.saved ? " and saved" : "") }));
         this.load();
       }
