@@ -32,7 +32,7 @@ MODULES: Final = {
 }
 DECLARED: Final = {"bow": {"mode": "9-axis", "magnetic_calibration": True, "output": {"hi91": 200}, "sout_divisor": 8}}
 ABSENT: Final = "stern"
-STATES: Final = {"bow": "running", "mast": "running", "crane": "silent", ABSENT: "missing"}
+CONDITIONS: Final = {"bow": "attention", "mast": "degraded", "crane": "missing", ABSENT: "missing"}
 COLOURS_MAX: Final = 256
 """Number of colors of a picture. The file is a third as large and looks the same."""
 FULL = "return window.imud.view.plots.get('accel_m_s2').data[0].length >= 580"
@@ -113,16 +113,14 @@ def fit(page: Page, width: int) -> None:
     metrics = {"width": width, "height": height + 10, "deviceScaleFactor": 1, "mobile": False}
     page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
     page.until("return window.innerHeight >= arguments[0]", height)
-    page.until("return [...document.querySelectorAll('.plot canvas')].every((one) => one.width > 0)")
+    page.until("return [...document.querySelectorAll('main .plot:not([hidden] *) canvas')].every((one) => one.width > 0)")
 
 
 def desktop(folder: Path, url: str, bow: Module, daemon: RunningDaemon) -> None:
     with browser(folder / "desktop", (1320, 900)) as page:
         page.driver.get(url)
-        page.until("return document.querySelectorAll('.card').length === arguments[0]", len(STATES))
-        for place, state in enumerate(STATES.values(), 1):
-            page.until_text(f".card:nth-child({place}) .pill", state)
-        page.until_text(".card", "regression")
+        for name, condition in CONDITIONS.items():
+            page.until("return document.querySelector(arguments[0])", f".k-{condition}[data-device={name}]")
         fit(page, 1320)
         shot(page, "overview")
         log_in(page, TOKEN)
@@ -130,14 +128,11 @@ def desktop(folder: Path, url: str, bow: Module, daemon: RunningDaemon) -> None:
         bow.unplug(1.5)
         daemon.wait_for("bow", "missing")
         daemon.wait_for("bow", "running")
-        page.until_text("#event-list", "up")
+        page.until_text("#event-list", "Device found")
         page.until_text("#about", "mode is 6-axis, declared 9-axis")
-        page.click("#settings .buttons button")  # reads the settings again: the device was missing before
-        page.until("return document.querySelector('[data-setting=mode].differs')")
-        page.js("window.imud.view.clear()")  # otherwise the plots show the pause
-        choose(page, "#spectrum-of", "accel_m_s2")
+        page.until("return document.querySelector('[data-setting=mode].off')")
+        choose(page, "#rate", "20")  # clears the plots, which otherwise show the pause
         page.until(FULL)
-        page.until("return window.imud.view.spectrum.spectrum.segments.length >= 8")
         fit(page, 1320)
         shot(page, "device")
 
@@ -162,7 +157,7 @@ def calibration(folder: Path) -> None:
         open_page(page, url, "bow")
         log_in(page, TOKEN)
         page.until("return document.querySelector('#calibration [data-kind=magnetometer] button')")
-        page.js("document.querySelector('header').hidden = true")  # it would cover the panel
+        page.js("document.querySelector('#top').hidden = true")  # it would cover the section
         page.click("#calibration [data-kind=magnetometer] button")
         page.until("return Number(document.querySelector('#calibration canvas').dataset.covered) > 12")
         (panel,) = page.driver.find_elements("css selector", "#calibration")
