@@ -113,7 +113,9 @@ def fit(page: Page, width: int) -> None:
     metrics = {"width": width, "height": height + 10, "deviceScaleFactor": 1, "mobile": False}
     page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
     page.until("return window.innerHeight >= arguments[0]", height)
-    page.until("return [...document.querySelectorAll('main .plot:not([hidden] *) canvas')].every((one) => one.width > 0)")
+    page.until(
+        "return [...document.querySelectorAll('main .plot:not([hidden] *) canvas')].every((one) => one.width > 0)"
+    )
 
 
 def desktop(folder: Path, url: str, bow: Module, daemon: RunningDaemon) -> None:

@@ -16,6 +16,14 @@ pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.liv
 
 Site = tuple[RunningDaemon, str]
 TOKEN = "correct-horse-battery-staple"
+SECTIONS = ("time", "ledger", "settings", "calibration", "events", "about", "live")
+CONDITIONS = ("ok", "degraded", "attention", "missing")
+TEXT_ON = [
+    *((text, ground) for text in ("ink", "mute", "faint") for ground in ("bg", "card", "well")),
+    *((text, ground) for text in CONDITIONS for ground in (f"{text}-soft", "card")),
+    ("accent", "card"), ("accent", "accent-soft"), ("accent-ink", "accent"),
+]  # fmt: skip
+"""Colors of text and of the ground behind it."""
 PEAK_EVERY = 40
 POINTS = "return window.imud.view.plots?.get('accel_m_s2').data[0].length >= arguments[0]"
 PLOTTED = """const plot = window.imud.view.plots.get('accel_m_s2');
@@ -43,7 +51,9 @@ def test_the_plot_contains_every_sent_peak(page: Page, tmp_path: Path) -> None:
             page.until(POINTS, 80, what="four seconds are plotted")
             page.click("#pause")
             page.until("return !window.imud.view.plots.get('accel_m_s2').isDue")
-            drawn = [row for row in zip(*page.js(PLOTTED), strict=True) if None not in row]  # a late host breaks the line
+            drawn = [
+                row for row in zip(*page.js(PLOTTED), strict=True) if None not in row
+            ]  # a late host breaks the line
             times, least, greatest = map(list, zip(*drawn, strict=True))
             measured = sender.measured
             assert page.problems() == []
@@ -185,7 +195,7 @@ def test_both_views_fit_a_telephone(phone: Page, site: Site) -> None:
     phone.click("[data-device]")
     phone.until(POINTS, 5)
     phone.until("return document.querySelectorAll('[data-setting]').length > 3")
-    for section in ("time", "ledger", "settings", "calibration", "events", "about", "live"):
+    for section in SECTIONS:
         phone.js("location.hash = `#/device/bow/${arguments[0]}`", section)
         phone.until("return document.getElementById(arguments[0]).getClientRects().length", section)
         assert phone.js(wide) == [PHONE[0], PHONE[0]], section
@@ -196,6 +206,52 @@ def test_both_views_fit_a_telephone(phone: Page, site: Site) -> None:
         }).map((one) => one.outerHTML.slice(0, 80))"""
     )
     assert cut == []
+
+
+def test_no_section_overflows_at_any_width_in_both_color_schemes(page: Page, site: Site) -> None:
+    _, url = site
+    page.driver.get(f"{url}#/device/bow")
+    page.until("return document.querySelectorAll('[data-setting]').length > 3")
+    addresses = [f"#/device/bow/{one}" for one in SECTIONS] + ["#/", "#/wall", "#/compare"]
+    found = []
+    for width in (360, 390, 1024, 1400):
+        metrics = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+        page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+        for theme in ("light", "dark"):
+            page.js("document.documentElement.dataset.theme = arguments[0]", theme)
+            for address in addresses:
+                page.js("location.hash = arguments[0]", address)
+                page.until("return document.body.dataset.view && document.querySelector('main').children.length")
+                if page.js("return document.documentElement.scrollWidth > innerWidth"):
+                    found.append((width, theme, address))
+    page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert found == []
+    assert page.problems() == []
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_each_color_of_text_has_contrast(scripts: Page, theme: str) -> None:
+    tokens = scripts.js(
+        """document.documentElement.dataset.theme = arguments[0];
+        const style = getComputedStyle(document.documentElement);
+        return Object.fromEntries(arguments[1].map((one) => [one, style.getPropertyValue(`--${one}`).trim()]))""",
+        theme, sorted({name for pair in TEXT_ON for name in pair}),
+    )  # fmt: skip
+    low = {pair: ratio for pair in TEXT_ON if (ratio := contrast(tokens[pair[0]], tokens[pair[1]])) < 4.5}
+    assert low == {}
+
+
+def contrast(one: str, other: str) -> float:
+    """Return the contrast of two colors as defined by WCAG 2."""
+    low, high = sorted(luminance(color.lstrip("#")) for color in (one, other))
+    return (high + 0.05) / (low + 0.05)
+
+
+def luminance(color: str) -> float:
+    digits = color if len(color) == 6 else "".join(2 * one for one in color)
+    parts = [int(digits[at : at + 2], 16) / 255 for at in (0, 2, 4)]
+    red, green, blue = (one / 12.92 if one <= 0.04045 else ((one + 0.055) / 1.055) ** 2.4 for one in parts)
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
 def test_a_hidden_page_reads_nothing(page: Page, site: Site) -> None:
