@@ -82,6 +82,9 @@ def test_a_calibration_is_seen_without_the_token_and_stopped_with_it(page: Page,
         running: Future[Any] = pool.submit(client.call, "calibrate", device="bow", kind="magnetometer")
         page.until(COVERED)
         page.until_text("#calibration-progress", "of the directions and turns")
+        page.driver.refresh()
+        page.until_text("#calibration .running", "Magnetometer calibration is running")
+        page.until(COVERED)
         assert not page.js("return document.querySelector('#calibration-stop').getClientRects().length")
         with daemon.client() as other:
             other.call("stop_calibration", device="bow")
