@@ -274,11 +274,10 @@ class Device:
     def tick(self, now_ns: int) -> None:
         """Update the state, detect an idle link, and send collected events. Called twice per second, and ten times per
         second while `_needs_ticks`."""
-        transport = self._transport
+        transport, path = self._transport, self._transport.path
         if self._needs_ticks():
             self._shared.owner.tick_soon()
         self._rate.mark(now_ns, self.ledger.samples)
-        path = transport.path
         self._attachments.tick(now_ns, path.newest if path is not None else None)
         transport.tick(now_ns)
         if path is not None:
@@ -291,7 +290,7 @@ class Device:
         judge, transport, settings, ledger = self._judge, self._transport, self._settings, self.ledger
         state, path, rate_hz = self._health.state, transport.path, transport.expected_rate_hz
         resets = settings.counter_resets - settings.resets_requested
-        judge.counts.add(now_ns, rate_hz if state is DeviceState.RUNNING else 0.0, resets)
+        judge.counts.add(now_ns, rate_hz * (state is DeviceState.RUNNING), resets)
         has_settings = bool(settings.declared or settings.is_unsaved or settings.comparison.problem)
         axes, axes_problem = self._attitude.problem(transport.driver, settings, transport.axes_problem)
         judge.judge(Facts(

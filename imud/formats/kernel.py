@@ -10,6 +10,8 @@ from types import ModuleType
 from typing import Final, NamedTuple
 from zlib import crc32
 
+from imud.model.errors import reason_of
+
 SOURCE: Final = Path(__file__).parent.parent / "_kernel.c"
 
 
@@ -28,7 +30,7 @@ def load(setting: str | None) -> Kernel:
         module = import_module("imud._kernel")
         source_crc = crc32(SOURCE.read_bytes())
     except (ImportError, OSError) as error:
-        return Kernel(None, f"it is not installed: {error}")
+        return Kernel(None, f"it is not installed: {reason_of(error)}")
     if getattr(module, "source_crc", None) != source_crc:  # a checkout with an older library
         return Kernel(None, "it was compiled from another version of imud/_kernel.c; compile it again")
     return Kernel(module)
