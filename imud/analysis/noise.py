@@ -275,6 +275,7 @@ KNOWN_PARTS: Final = 10  # duration divided by the largest τ with an error of t
 STILL_S: Final = 1.0  # length of the blocks that imud checks for motion, s
 STILL_FACTOR: Final = 4.0  # minimum standard deviation of a disturbed block, as a multiple of the median block
 MOVED_SHARE: Final = 0.01  # maximum share of blocks with motion in a measurement at rest
+RAISED: Final = 1.1  # maximum ratio of two standard deviations: with these blocks, and without them
 BLOCKS_MOST: Final = 2000  # maximum number of means for the fit of the drift
 SPAN_LEAST_C: Final = 2.0  # Minimum range of the temperature for a drift, °C. Many devices send whole degrees.
 BLOCKS_LEAST: Final = 8
@@ -443,8 +444,12 @@ def _motion(t_ns: IntArray, values: FloatArray, limits: RestLimits) -> str:
         ("standard deviation", blocks.std(axis=1).max(axis=1), limits.scatter),
         ("change of the mean", np.abs(mean - np.median(mean, axis=0)).max(axis=1), limits.change),
     ):
-        count = int((found > limit).sum())
-        if count > MOVED_SHARE * len(found):
+        at_rest = found <= limit
+        count = int((~at_rest).sum())
+        # a short strong motion also determines the standard deviation of a long measurement
+        if count > MOVED_SHARE * len(found) or (
+            count and float(blocks.std(axis=(0, 1)).max()) > RAISED * float(blocks[at_rest].std(axis=(0, 1)).max())
+        ):
             return (
                 f"{limits.quantity}: expected a {words} of at most {limit:.3g} {limits.unit} in each second, got up to "
                 f"{found.max():.3g} {limits.unit} in {count} of {len(found)} seconds"
