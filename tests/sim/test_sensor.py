@@ -119,7 +119,8 @@ REQUESTS: dict[str, list[tuple[Any, ...]]] = {
         *(register(0x100, 1, 3), register(0x96, 0xFF34), register(0x9E), register(0x9F), register(0x9F, 2)),
         *(register(0xA5, 1), register(0xA5, 2), register(0xA5, 0), register(0x9A, 2), register(0x9A, 9)),
         *(register(0, 0), register(0x9C, 9), register(0x9C, 3, 3), register(0, 0xFF), register(0x9C, 1, 3)),
-        *(register(0, 1), register(0, 0xFF), register(0x34, 1, 3), register(0, 2), register(0, 0, 6, 7)),
+        *(register(0, 1), register(0, 0xFF), register(0x34, 1, 3), register(0, 2), register(0, 0, 6, 7),
+          (0x0CEF0955, *register(0x134, 100)[1:]), register(0x134, 4), register(0x42, 1, 3)),
     ],
     "hipnuc-nmea2000": [(0x18EAFF01, True, b"\0\xee\0")],
     "imu61x-uart": [
@@ -139,7 +140,7 @@ REPLIES = {
     "hipnuc-uart": 0xB875FD98,
     "hipnuc-modbus": 0xC5960473,
     "hipnuc-canopen": 0x2945F911,
-    "hipnuc-j1939": 0x9EA7991F,
+    "hipnuc-j1939": 0x7AF3B39B,
     "hipnuc-nmea2000": 0x56276182,
     "imu61x-uart": 0x1D54A669,
     "imu61x-can": 0x1A1332E7,
