@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import pytest
@@ -15,9 +16,10 @@ from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Options
 from imud.drivers.hipnuc.j1939.driver import SETTINGS
 from imud.formats.can import EXTENDED_ID_MAX, RAW_FRAME
 from imud.formats.j1939 import split
+from imud.model.errors import NoReply, Rejected
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
-from imud.sim.can_module import SentFrame
+from imud.sim.can_module import CanModules, SentFrame
 from imud.sim.hipnuc.j1939 import SIMULATOR, HipnucJ1939Module, J1939Hardware, J1939Settings, J1939Variant
 from imud.sim.physics import Still
 from imud.sim.sensor import SimulatorOptions
@@ -82,6 +84,18 @@ def restarted(peer: J1939Node) -> RequestScript[None]:
     yield commands.restart_request(peer)
 
 
+def test_four_modules_crystal_wire_and_the_next_frame() -> None:
+    modules = [made(node=node, rate_hz=100.0) for node in (1, 8, 9, 128)]
+    frames = CanModules(modules).advance(BEGIN_NS + SECOND_NS)
+    for module in modules:
+        assert samples_of(frames, module.settings.address) >= 94
+
+    module = made(skew_ppm=1000.0)
+    frames = [f for f in module.advance(BEGIN_NS + SECOND_NS) if split(f.can_id).pgn != commands.CLAIMED]
+    assert [split(frame.can_id).pgn for frame in frames[:4]] == [0xFF34, 0xFF37, 0xFF3D, 0xFF41]
+    assert module.counters() == {"samples_sent": 101, "frames_sent": 405, "requests": 0}
+
+
 @pytest.mark.manual("B 6.2.2 intervals", "B 6.2.2 bit rate", "B 6.2.2 address")
 def test_what_is_set_read_back_saved_and_lost_at_a_restart() -> None:
     bench = J1939Host(made())
@@ -124,6 +138,33 @@ def test_what_is_set_read_back_saved_and_lost_at_a_restart() -> None:
     assert bench.talk(commands.identify, address=20) is not None
 
 
+def written_and_read(peer: J1939Node, register: int, value: int) -> RequestScript[int]:
+    """Write a register, wait for the acknowledgement, and read the register."""
+    acknowledged = yield commands.exchange(peer, register, commands.WRITE, value, "write")
+    assert isinstance(acknowledged, Reply)
+    return (yield from commands.read(peer, register))
+
+
+def test_values_out_of_range_do_not_take() -> None:
+    bench = J1939Host(made())
+    for register, value in ((0x0134, 4), (0x009A, 5), (0x009C, 129), (0x009E, 2)):
+        assert bench.talk(partial(written_and_read, register=register, value=value)) != value
+    with pytest.raises(Rejected):
+        bench.talk(lambda peer: commands.set_interval(peer, 0xFF34, 4))
+    with pytest.raises(Rejected):
+        bench.talk(lambda peer: commands.set_address(peer, 129))
+    assert bench.module.settings == bench.module.flash
+    with pytest.raises(NoReply):
+        bench.talk(lambda peer: commands.read(peer, 0x0042))
+    with pytest.raises(NoReply):
+        bench.talk(lambda peer: commands.read(peer, 0x009C), address=9)
+    before = bench.module.requests
+    bench.module.receive(0x0CEF0955, True, bytes.fromhex("3401060064000000"), bench.now_ns)
+    bench.module.receive(0x0CEF0855, True, bytes.fromhex("34010600640000"), bench.now_ns)
+    bench.module.receive(0x0CFF3408, True, bytes.fromhex("3401060064000000"), bench.now_ns)
+    assert bench.module.requests == before
+
+
 @pytest.mark.manual("B 6.2.2 restart")
 @pytest.mark.parametrize("confirms", [False, True])
 def test_a_restart_is_answered_before_it_happens_or_not_at_all(confirms: bool) -> None:
@@ -134,6 +175,21 @@ def test_a_restart_is_answered_before_it_happens_or_not_at_all(confirms: bool) -
     replies = [f for f in module.advance(BEGIN_NS + 60 * MS) if split(f.can_id).pgn == 0xEF00]
     expected = [(0x0CEF5508, bytes.fromhex("00000600FF000000"))] if confirms else []
     assert [(f.can_id, f.data) for f in replies] == expected
+
+
+def test_an_address_is_claimed_after_power_on_and_when_asked() -> None:
+    """The request for PGN 0xEE00 has the format of J1939-21, low byte first, to the device and to all nodes."""
+    module = HipnucJ1939Module(BEGIN_NS, hardware=J1939Hardware(boot_ms=0))
+    claims = [f for f in module.advance(BEGIN_NS + 10 * MS) if f.can_id == 0x18EEFF08]
+    assert len(claims) == 1
+    for number, can_id in enumerate((0x18EA0855, 0x18EAFF55), 1):
+        now_ns = BEGIN_NS + number * 20 * MS
+        module.advance(now_ns)
+        module.receive(can_id, True, bytes.fromhex("00EE000000000000"), now_ns)
+        (claim,) = [f for f in module.advance(now_ns + 10 * MS) if f.can_id == 0x18EEFF08]
+        assert claim.data == claims[0].data
+    module.receive(0x18EA0955, True, bytes.fromhex("00EE000000000000"), BEGIN_NS + 70 * MS)
+    assert not [f for f in module.advance(BEGIN_NS + 80 * MS) if f.can_id == 0x18EEFF08]
 
 
 def test_registers_replies_and_a_single_message() -> None:

@@ -18,6 +18,7 @@ from imud.drivers.imu61x.uart.codec import (
     parse_parameter,
     parse_status,
 )
+from imud.model.sample import Measurement
 from imud.model.units import NS_PER_S
 from imud.sim import SIMULATORS
 from imud.sim.imu61x.uart import RESULT_BUSY, Imu61xModule, Imu61xSettings, ParameterRefused, changed, make
@@ -212,7 +213,27 @@ def heard(far: Imu61xBench, request: Request, duration_ms: float) -> list[tuple[
     return found
 
 
-def test_results_of_refused_and_ignored_commands() -> None:
+def test_behaviour_of_the_variants() -> None:
+    far = imu61x_bench(flash_ms=2000)
+    far.send(c.save().payload)
+    assert len(far.samples(1990)) <= 1  # the frame that the device already sent
+    ((at_ms, result),) = heard(far, c.ask_status(), 100)
+    assert (at_ms < 30, result) == (True, 0)  # the device did not receive the status request
+    assert len(far.samples(500)) >= 48
+
+    far = imu61x_bench(quiet_ms=700)
+    ((at_ms, _),) = heard(far, c.reset_heading(0), 20)
+    assert at_ms < 10
+    far.send(c.ask_status().payload)
+    assert [event for event in far.wait(650) if not isinstance(event, Measurement)] == []
+    assert far.samples(200)
+
+    for at_end, expected_ms in ((False, 0), (True, 3000)):
+        far = imu61x_bench(acknowledges_at_end=at_end)
+        ((at_ms, result),) = heard(far, c.calibrate_gyro(), 3500)
+        assert at_ms == pytest.approx(expected_ms, abs=20)
+        assert result == 0
+
     far = imu61x_bench(result_done=1, result_refused=0, refuses=frozenset({c.Command.SAVE}))
     assert [result for _, result in heard(far, c.reset_heading(0), 20)] == [1]
     assert [result for _, result in heard(far, c.save(), 20)] == [0]
@@ -249,6 +270,15 @@ def test_power_off_cuts_the_frame_on_the_wire() -> None:
     cut = b"".join(burst.data for burst in module.advance(now_ns))
     assert 0 < len(cut) < 54
     assert cut == bytes.fromhex("AA5502002C00")[: len(cut)] or cut.startswith(bytes.fromhex("AA5502002C00"))
+    module = Imu61xModule(BEGIN_NS, hardware=IMU61X_STILL)
+    now_ns = BEGIN_NS
+    for _ in range(20):
+        next_ns = module.next_ns()
+        assert next_ns is not None
+        assert module.advance(next_ns - 1) == []
+        assert len(module.advance(next_ns)) == 1
+        assert next_ns > now_ns
+        now_ns = next_ns
 
 
 def test_the_row_makes_it_from_common_options() -> None:
