@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from imud.analysis.series import even_runs, grid_of
+from tests.support.daemon_process import wait_until
 from tests.test_daemon import cable
 from tests.web.browser import MISSING, Page, Sender, choose, open_page, sent_by, serving_web, upright
 
@@ -57,9 +58,9 @@ def test_lost_samples_are_counted_and_a_vibration_keeps_its_frequency_and_size(p
         open_page(page, url, "bow")
         choose(page, "#spectrum-of", "accel_m_s2")
         with Sender(port, with_losses(upright(wave))) as sender:
+            wait_until(lambda: sender.measured > PAUSE.stop + 768, "two segments of 512 after the pause")
             page.until("return window.imud.view.spectrum.spectrum.gaps >= 1", what="the long gap is seen")
             page.until(SEGMENTS, 2)
-            assert sender.measured > PAUSE.stop + 768, "two segments of 512 after the pause"
             page.click("#pause")
             frequencies, _, _, density = page.js("return window.imud.view.spectrum.data")
             rate_hz, missing, segments, gaps = page.js(
