@@ -1,10 +1,11 @@
 /* Fast path of HI91 samples: check the frames of a read, decode them, time-stamp them, and pack them as slots.
  *
- * Every function is a pure function of its arguments. It does the same as the Python code and stops before the first
- * frame that is not usual. Python then continues with this frame. The names are the names of the Python code:
+ * A Run contains a copy of the state of clock and fit. `Run.stamp` does the same as the Python code and stops before the
+ * first frame that is not usual. Python then copies the state back (`SampleClock.settle`) and continues with this frame.
+ * The names are the names of the Python code:
  *
- *   count_hi91 ─▶ HipnucCodec (imud/drivers/hipnuc/uart/codec.py)
- *   stamp_hi91 ─▶ add_even_run (imud/sampling/clock.py), ArrivalFit.add_arrival (imud/sampling/arrival_fit.py),
+ *   is_usual, decode ─▶ HipnucCodec (imud/drivers/hipnuc/uart/codec.py)
+ *   stamp ─▶ add_even_run (imud/sampling/clock.py), ArrivalFit.add_arrival (imud/sampling/arrival_fit.py),
  *                 encode_slots (imud/formats/slot.py)
  *
  * The result must be equal to the result of Python in every bit. Therefore the compiler must not join a product and a
@@ -13,7 +14,9 @@
 #define PY_SSIZE_T_CLEAN
 #define Py_LIMITED_API 0x030B0000
 #include <Python.h>
+#include <structmember.h>
 #include <math.h>
+#include <stddef.h>
 #include <stdint.h>
 #include <string.h>
 
@@ -146,18 +149,6 @@ static int is_usual(const uint8_t *frame)
     return PRESSURE_MIN_PA <= pressure_pa && pressure_pa <= PRESSURE_MAX_PA; /* false for NaN */
 }
 
-/* count_hi91(data) -> number of usual HI91 frames at the start of `data` */
-static PyObject *count_hi91(PyObject *self, PyObject *args)
-{
-    const char *data;
-    Py_ssize_t size, count = 0;
-    if (!PyArg_ParseTuple(args, "y#:count_hi91", &data, &size))
-        return NULL;
-    while ((count + 1) * FRAME_BYTES <= size && is_usual((const uint8_t *)data + count * FRAME_BYTES))
-        count++;
-    return PyLong_FromSsize_t(count);
-}
-
 /* Write the values of a usual frame into a slot, which contains zeros. */
 static void decode(Slot *slot, const uint8_t *payload, const Run *run)
 {
@@ -285,55 +276,121 @@ static int is_in_range(const Run *run)
            run->device_id <= UINT16_MAX;
 }
 
-/* stamp_hi91(data, count, …state…) -> None if the first frame needs Python, or a tuple: slots, ticks, t_ns,
- * error_ns, bin. `data` starts with `count` usual frames. */
-static PyObject *stamp_hi91(PyObject *self, PyObject *args)
+/* A sequence of usual frames that Python did not interrupt. Python copies the changed state back with `state`. */
+typedef struct {
+    PyObject_HEAD
+    Run run;
+    int64_t frames; /* number of time-stamped frames */
+    double error_ns; /* error of the newest time stamp */
+} RunObject;
+
+static PyObject *run_type;
+
+/* start_hi91(…state…) -> Run, or None if a value is out of range */
+static PyObject *start_hi91(PyObject *self, PyObject *args)
 {
     Run run;
     Bin *bin = &run.bin;
-    const char *data;
-    Py_ssize_t size, count, done = 0;
     memset(&run, 0, sizeof run);
     if (!PyArg_ParseTuple(
-            args, "y#nii(iLLLLLLddLLL)(LLLLddLLLLddd)(LLddddLLd):stamp_hi91", &data, &size, &count, &run.word_is_status,
-            &run.device_id, &run.sync, &run.own_status, &run.seq, &run.t_ns, &run.t_rx_ns, &run.byte_ns, &run.waited_ns,
-            &run.bias_ns, &run.fit_error_ns, &run.utc_offset_ns, &run.offset_ns, &run.even_from_ns, &run.ticks,
-            &run.device_ns, &run.raw_ns, &run.tick_ns, &run.period_ticks, &run.doubt_ns, &run.ref_arrival_ns, &run.ref_device_ns,
-            &run.fitted_ns, &run.until_ns, &run.slope, &run.slope_error, &run.wait_most, &bin->device_ns,
-            &bin->arrival_ns, &bin->lowest, &bin->wait, &bin->wait_least, &bin->wait_most, &bin->count, &bin->late,
-            &bin->late_ns))
+            args, "i(iLLLLLdd)(LLLLddLLLLddd)(LLddddLLd):start_hi91", &run.device_id, &run.sync, &run.own_status,
+            &run.seq, &run.t_ns, &run.t_rx_ns, &run.byte_ns, &run.bias_ns, &run.fit_error_ns, &run.ticks,
+            &run.device_ns, &run.raw_ns, &run.tick_ns, &run.period_ticks, &run.doubt_ns, &run.ref_arrival_ns,
+            &run.ref_device_ns, &run.fitted_ns, &run.until_ns, &run.slope, &run.slope_error, &run.wait_most,
+            &bin->device_ns, &bin->arrival_ns, &bin->lowest, &bin->wait, &bin->wait_least, &bin->wait_most,
+            &bin->count, &bin->late, &bin->late_ns))
         return NULL;
-    if (count < 0 || count > size / FRAME_BYTES || size > INT32_MAX || !is_in_range(&run))
+    if (!is_in_range(&run))
         Py_RETURN_NONE;
-    PyObject *slots = PyBytes_FromStringAndSize(NULL, count * (Py_ssize_t)sizeof(Slot));
-    if (slots == NULL)
+    RunObject *made = PyObject_New(RunObject, (PyTypeObject *)run_type);
+    if (made == NULL)
         return NULL;
-    Slot *slot = (Slot *)PyBytes_AsString(slots);
-    double error_ns = 0.0, newest_error_ns = 0.0;
-    while (done < count && stamp(&run, &error_ns, slot + done, (const uint8_t *)data + done * FRAME_BYTES,
-                                 size - (done + 1) * FRAME_BYTES)) {
-        newest_error_ns = error_ns;
-        done++;
-    }
-    if (!done) {
-        Py_DECREF(slots);
-        Py_RETURN_NONE;
-    }
-    if (done < count) { /* the limited API cannot shorten bytes */
-        PyObject *some = PyBytes_FromStringAndSize((const char *)slot, done * (Py_ssize_t)sizeof(Slot));
-        Py_DECREF(slots);
-        if (some == NULL)
-            return NULL;
-        slots = some;
-    }
-    return Py_BuildValue("NLLd(LLddddLLd)L", slots, run.ticks, run.t_ns, newest_error_ns, bin->device_ns,
-                         bin->arrival_ns, bin->lowest, bin->wait, bin->wait_least, bin->wait_most, bin->count, bin->late,
-                         bin->late_ns, bin->added);
+    made->run = run;
+    made->frames = 0;
+    made->error_ns = 0.0;
+    return (PyObject *)made;
 }
 
+/* Run.stamp(data, word_is_status, t_rx_ns, utc_offset_ns, waited_ns, offset_ns, even_from_ns) -> slots of the usual
+ * frames at the start of `data`; empty if the first frame needs Python */
+static PyObject *stamp_frames(RunObject *self, PyObject *args)
+{
+    Run *run = &self->run;
+    const char *data;
+    Py_ssize_t size, done = 0;
+    long long t_rx_ns, t_rx_before_ns = run->t_rx_ns;
+    if (!PyArg_ParseTuple(args, "y#iLLLLL:stamp", &data, &size, &run->word_is_status, &t_rx_ns, &run->utc_offset_ns,
+                          &run->waited_ns, &run->offset_ns, &run->even_from_ns))
+        return NULL;
+    if (t_rx_ns > run->t_rx_ns)
+        run->t_rx_ns = t_rx_ns;
+    Py_ssize_t most = size <= INT32_MAX && is_in_range(run) ? size / FRAME_BYTES : 0;
+    while (done < most && is_usual((const uint8_t *)data + done * FRAME_BYTES))
+        done++;
+    PyObject *slots = PyBytes_FromStringAndSize(NULL, done * (Py_ssize_t)sizeof(Slot));
+    if (slots == NULL) {
+        run->t_rx_ns = t_rx_before_ns;
+        return NULL;
+    }
+    Slot *slot = (Slot *)PyBytes_AsString(slots);
+    most = done;
+    for (done = 0; done < most; done++) {
+        double error_ns;
+        if (!stamp(run, &error_ns, slot + done, (const uint8_t *)data + done * FRAME_BYTES,
+                   size - (done + 1) * FRAME_BYTES))
+            break;
+        self->error_ns = error_ns;
+    }
+    self->frames += done;
+    if (!done)
+        run->t_rx_ns = t_rx_before_ns;
+    if (done < most) { /* the limited API cannot shorten bytes */
+        PyObject *some = PyBytes_FromStringAndSize((const char *)slot, done * (Py_ssize_t)sizeof(Slot));
+        Py_DECREF(slots);
+        slots = some;
+    }
+    return slots;
+}
+
+/* Run.state() -> frames, ticks, seq, t_ns, t_rx_ns, error_ns, bin, number of arrivals that were added to the bin */
+static PyObject *state_of(RunObject *self, PyObject *unused)
+{
+    const Run *run = &self->run;
+    const Bin *bin = &run->bin;
+    return Py_BuildValue("LLLLLd(LLddddLLd)L", self->frames, run->ticks, run->seq, run->t_ns, run->t_rx_ns,
+                         self->error_ns, bin->device_ns, bin->arrival_ns, bin->lowest, bin->wait, bin->wait_least,
+                         bin->wait_most, bin->count, bin->late, bin->late_ns, bin->added);
+}
+
+static void free_run(PyObject *self)
+{
+    PyTypeObject *type = Py_TYPE(self);
+    PyObject_Free(self);
+    Py_DECREF(type);
+}
+
+static PyMethodDef run_methods[] = {
+    {"stamp", (PyCFunction)stamp_frames, METH_VARARGS, "Return slots of the usual frames at the start of bytes."},
+    {"state", (PyCFunction)state_of, METH_NOARGS, "Return the state after the newest frame."},
+    {NULL, NULL, 0, NULL},
+};
+
+static PyMemberDef run_members[] = {
+    {"t_ns", T_LONGLONG, offsetof(RunObject, run.t_ns), READONLY, "time stamp of the newest sample, ns"},
+    {"t_rx_ns", T_LONGLONG, offsetof(RunObject, run.t_rx_ns), READONLY, "CLOCK_MONOTONIC of its read, ns"},
+    {NULL, 0, 0, 0, NULL},
+};
+
+static PyType_Slot run_slots[] = {
+    {Py_tp_methods, run_methods}, {Py_tp_members, run_members}, {Py_tp_dealloc, (void *)free_run}, {0, NULL},
+};
+
+static PyType_Spec run_spec = {
+    "imud._kernel.Run", sizeof(RunObject), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_DISALLOW_INSTANTIATION, run_slots,
+};
+
 static PyMethodDef methods[] = {
-    {"count_hi91", count_hi91, METH_VARARGS, "Return the number of usual HI91 frames at the start of bytes."},
-    {"stamp_hi91", stamp_hi91, METH_VARARGS, "Return slots of usual HI91 frames, and the changed state; or None."},
+    {"start_hi91", start_hi91, METH_VARARGS, "Return a Run for HI91 frames that starts with a state; or None."},
     {NULL, NULL, 0, NULL},
 };
 
@@ -342,6 +399,8 @@ static struct PyModuleDef module = {PyModuleDef_HEAD_INIT, "imud._kernel", NULL,
 PyMODINIT_FUNC PyInit__kernel(void)
 {
     make_tables();
+    if (run_type == NULL && (run_type = PyType_FromSpec(&run_spec)) == NULL)
+        return NULL;
     PyObject *made = PyModule_Create(&module);
     PyObject *source_crc = PyLong_FromUnsignedLong(SOURCE_CRC);
     if (made == NULL || PyModule_AddObjectRef(made, "source_crc", source_crc) < 0)

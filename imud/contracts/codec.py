@@ -61,12 +61,11 @@ def count_unknown(counts: dict[int, int], frame_type: int) -> None:
 
 
 class UsualFrames(NamedTuple):
-    """Complete frames that the kernel can decode, at the start of the bytes of a stream."""
+    """Bytes that can start with frames for the kernel."""
 
-    data: bytes  # the frames and all received bytes after them
-    frames: int  # number of frames
+    data: bytes  # all bytes that the codec has not decoded
     word_is_status: bool  # as in the codec
-    stamp: Callable[..., Any]  # function of the kernel that makes slots of the frames (`stamp_hi91`)
+    start: Callable[..., Any]  # function of the kernel that starts a run (`start_hi91`)
 
 
 @runtime_checkable
@@ -74,8 +73,8 @@ class KernelCodec(Protocol):
     """Codec of frames that the kernel decodes. `imud.drivers` implements it, and the sample path may not import it."""
 
     def usual_frames(self, data: bytes) -> UsualFrames | None:
-        """Return the frames at the start of the next bytes `data` of the stream; None if the first event needs `feed`.
-        This method changes nothing."""
+        """Return the next bytes `data` of the stream for the kernel; None if the first event needs `feed`. This method
+        changes nothing."""
         ...
 
     def take(self, frames: UsualFrames, count: int, data: bytes) -> bytes:

@@ -119,6 +119,7 @@ class PathObserver:
 
     def _state(self, path: SamplePath) -> bytes:
         external = {"ledger": self._ledger, "steady": self._host.steady, "observer": self}
+        path.clock.settle()
         try:
             return StateWriter(external, path.NOT_STATE).write({"path": path})
         except StateError as error:

@@ -20,7 +20,7 @@ counter starts a new fit and does not move the time stamps. Synchronization: non
 from collections.abc import Callable, Sequence
 from functools import partial
 from math import hypot
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from imud.contracts.codec import UsualFrames
 from imud.contracts.lines import (
@@ -35,7 +35,7 @@ from imud.contracts.lines import (
 )
 from imud.contracts.observer import InputObserver
 from imud.contracts.status import ClockStatus
-from imud.formats.slot import SLOT_BYTES, SYNC_CODES
+from imud.formats.slot import SYNC_CODES
 from imud.host.clock import UNSTEERED, SteadyTime
 from imud.model.sample import T_ERR_MOST, Measurement, Sample, Sync
 from imud.model.units import NS_PER_S
@@ -149,7 +149,7 @@ class SampleClock:
     __slots__ = (
         "_aiding", "_arrivals", "_delay", "_device", "_error_ns", "_fit", "_fit_begin_ns", "_fit_bias_ns",
         "_fit_error_ns", "_fit_sync", "_holdover", "_host", "_jump", "_known", "_line", "_make_aiding",
-        "_on_unknown_gap", "_own_status", "_resets", "_seq", "_slew", "_stamps", "_sync", "_t_err_ns", "_t_ns",
+        "_on_unknown_gap", "_own_status", "_resets", "_run", "_seq", "_slew", "_stamps", "_sync", "_t_err_ns", "_t_ns",
         "_t_rx_ns", "_time", "missed", "observer", "waited_ns",
     )  # fmt: skip
 
@@ -181,12 +181,15 @@ class SampleClock:
         self._seq = self._t_ns = self._t_rx_ns = self._t_err_ns = 0
         self._error_ns = 0.0  # one-sigma error of the newest time stamp before its correction
         self._own_status: int | None = None
+        self._run: Any = None  # `Run` of the kernel, which has the state of the newest samples; None without a run
         self.missed = 0  # number of lost samples directly before the newest sample, without gaps of unknown size
         # Observer of the input; None if no recording runs. Set by `SamplePath.observe`.
         self.observer: InputObserver | None = None
         self.waited_ns = 0  # set by the path: maximum time of the next frames in the kernel's buffer
 
-    def sample(self, m: Measurement, t_rx_ns: int, utc_offset_ns: int, t_begin_ns: int | None = None) -> Sample:
+    def sample(  # noqa: PLR0912 - each function call costs time on the sample path
+        self, m: Measurement, t_rx_ns: int, utc_offset_ns: int, t_begin_ns: int | None = None
+    ) -> Sample:
         """Return the next sample of the device.
 
         `t_rx_ns` is CLOCK_MONOTONIC right after the read of the last byte. It must not fall. If it is constant for more
@@ -194,6 +197,8 @@ class SampleClock:
         is CLOCK_REALTIME minus CLOCK_MONOTONIC. `t_begin_ns` is CLOCK_MONOTONIC at the start of the frame on the wire;
         None: computed from its size.
         """
+        if self._run is not None:
+            self.settle()
         if t_rx_ns < self._t_rx_ns:  # noqa: PLR1730 - a call of max() costs 60 ns on the sample path
             t_rx_ns = self._t_rx_ns
         size_bytes, ticks, byte_ns = m.size_bytes, m.dev_ticks, self._delay.byte_ns or 1
@@ -245,6 +250,8 @@ class SampleClock:
         self, samples: list[Sample], events: Sequence[object], at: int, t_rx_ns: int, utc_offset_ns: int
     ) -> int:
         """Append samples of `events` from index `at` on. Return the index of the first event that needs `sample`."""
+        if self._run is not None:
+            self.settle()
         time, fit, sync = self._time, self._fit, self._fit_sync
         unusual = time.watched or time.rephased or self._jump.late_reads or self._slew.left_ns
         if sync is _ARRIVAL or fit is None or unusual or self._aiding is not None:
@@ -262,32 +269,48 @@ class SampleClock:
         return at + len(samples) - before
 
     @property
-    def t_rx_ns(self) -> int:
-        """CLOCK_MONOTONIC at the read of the newest sample."""
-        return self._t_rx_ns
+    def t_ns(self) -> int:
+        """Time stamp of the newest sample."""
+        return self._t_ns if self._run is None else int(self._run.t_ns)
 
     @property
-    def is_even(self) -> bool:
-        """Return whether the kernel can time-stamp the next frames: the fit is in use, and nothing changes it."""
-        time = self._time
-        return (
-            self._fit_sync is not _ARRIVAL and self._aiding is None and not time.watched and not time.rephased
-            and not self._jump.late_reads and not self._slew.left_ns and time.modulus == _KERNEL_MODULUS
-        )  # fmt: skip
+    def t_rx_ns(self) -> int:
+        """CLOCK_MONOTONIC at the read of the newest sample."""
+        return self._t_rx_ns if self._run is None else int(self._run.t_rx_ns)
 
     def stamp_frames(self, frames: UsualFrames, device_id: int, t_rx_ns: int, utc_offset_ns: int) -> bytes:
-        """Return the slots of frames while `is_even`, as `add_run`; empty if the first frame needs `sample`."""
-        time, fit, host = self._time, self._fit, self._host
-        assert fit is not None
-        t_rx_ns = max(t_rx_ns, self._t_rx_ns)
-        own = -1 if self._own_status is None else self._own_status
+        """Return the slots of the usual frames at the start of the bytes, as `add_run`; empty if `sample` or `add_run`
+        must process the first frame. The kernel then keeps the state until `settle`."""
+        run, host = self._run, self._host
+        if run is None:
+            run = self._start_run(frames, device_id)
+            if run is None:
+                return b""
         try:
-            made = frames.stamp(
-                frames.data, frames.frames, frames.word_is_status, device_id,
+            slots: bytes = run.stamp(
+                frames.data, frames.word_is_status, t_rx_ns, utc_offset_ns, self.waited_ns, host.offset_ns,
+                host.even_from_ns,
+            )  # fmt: skip
+        except OverflowError:  # a value with more than 64 bits
+            return b""
+        if slots:
+            self._run, self.missed = run, 0
+        return slots
+
+    def _start_run(self, frames: UsualFrames, device_id: int) -> Any:
+        """Return a run of the kernel with the present state; None if the next frames need Python."""
+        time, fit = self._time, self._fit
+        if (
+            self._fit_sync is _ARRIVAL or fit is None or self._aiding is not None or time.watched or time.rephased
+            or self._jump.late_reads or self._slew.left_ns or time.modulus != _KERNEL_MODULUS
+        ):  # fmt: skip
+            return None
+        try:
+            return frames.start(
+                device_id,
                 (
-                    SYNC_CODES[self._fit_sync], own, self._seq, self._t_ns, t_rx_ns, self._delay.byte_ns or 1,
-                    self.waited_ns, self._fit_bias_ns, self._fit_error_ns, utc_offset_ns, host.offset_ns,
-                    host.even_from_ns,
+                    SYNC_CODES[self._fit_sync], -1 if self._own_status is None else self._own_status, self._seq,
+                    self._t_ns, self._t_rx_ns, self._delay.byte_ns or 1, self._fit_bias_ns, self._fit_error_ns,
                 ),
                 (
                     time.ticks, time.even_ns, time.raw_ns, time.tick_ns, time.period.period_ticks, time.doubt_ns,
@@ -297,17 +320,20 @@ class SampleClock:
                 fit.open_bin(),
             )  # fmt: skip
         except OverflowError:  # a value with more than 64 bits, for example after many jumps of the counter
-            return b""
-        if made is None:
-            return b""
-        slots: bytes
-        slots, ticks, self._t_ns, error_ns, open_bin, added = made
-        count = len(slots) // SLOT_BYTES
-        time.advance_evenly(ticks, count)
+            return None
+
+    def settle(self) -> None:
+        """Copy the state of the kernel back, and end its run. Do nothing without a run."""
+        run, self._run = self._run, None
+        if run is None:
+            return
+        fit = self._fit
+        assert fit is not None
+        frames, ticks, self._seq, self._t_ns, self._t_rx_ns, error_ns, open_bin, added = run.state()
+        self._time.advance_evenly(ticks, frames)
         fit.set_open_bin(open_bin, added)
-        self._seq, self._t_rx_ns, self._error_ns, self.missed = self._seq + count, t_rx_ns, error_ns, 0
+        self._error_ns = error_ns
         self._t_err_ns = int(error_ns) + 1 if error_ns < _T_ERR_MOST else T_ERR_MOST
-        return slots
 
     def sample_polled(
         self, m: Measurement, t_ns: int, t_err_ns: int, t_rx_ns: int, utc_offset_ns: int, edge_seq: int | None = None
@@ -334,6 +360,7 @@ class SampleClock:
 
     def _sources(self) -> AidingSources:
         """Return the aiding sources. Create them at the first use, because the clock is faster without them."""
+        self.settle()
         if self._aiding is None:
             self._aiding = self._make_aiding()
         return self._aiding
@@ -369,6 +396,7 @@ class SampleClock:
 
     def set_own_status(self, bits: int | None) -> None:
         """Set status bits of imud, which `sample` adds to the status of the next samples. None removes them."""
+        self.settle()
         self._own_status = bits
         if self.observer is not None:
             self.observer.call("clock", "set_own_status", bits)
@@ -394,6 +422,7 @@ class SampleClock:
         return self._resets + self._arrivals.resets
 
     def status(self) -> ClockStatus:
+        self.settle()
         fit = self._fit if self._fit_sync is not Sync.ARRIVAL else None
         status = ClockStatus(
             sync=self._sync if self._aiding else self._fit_sync,
@@ -409,6 +438,7 @@ class SampleClock:
 
     def link_changed(self, *, byte_ns: int, hold_ns: int) -> None:
         """Start a new fit, for another baud rate or port."""
+        self.settle()
         self._delay = LinkDelay(byte_ns, hold_ns)
         self._arrivals.change_link(self._delay)
         self._drop_fit()
@@ -418,6 +448,7 @@ class SampleClock:
     def restart(self) -> None:
         """Start again after the device or the link was missing. This does not count as a reset. If the device counter
         continued, the clock counts the lost samples. Otherwise the gap has an unknown size."""
+        self.settle()
         self._known = False
         self._time.period.restart()
         self._arrivals.restart()
@@ -430,6 +461,7 @@ class SampleClock:
 
     def continue_from(self, other: "SampleClock") -> None:
         """Continue the sequence numbers and time stamps of another clock of the same device."""
+        other.settle()
         self._seq, self._t_ns, self._t_rx_ns = other._seq, other._t_ns, other._t_rx_ns
         self.set_utc_reference(other.utc_reference)
 

@@ -248,10 +248,13 @@ class SamplePath(ABC):
         self._publish(Batch(self._device, self._device_id, None, self.frame, packed))
         if mask := self._status_mask:
             self._status_seen |= slot_status_bits(packed) & mask
-        self.latency.add(self._now_ns(), slot_times_ns(packed))
+        if len(packed) == SLOT_BYTES:
+            self.latency.add_one(self._now_ns() - self.clock.t_ns)
+        else:
+            self.latency.add(self._now_ns(), slot_times_ns(packed))
 
 
-KERNEL_BYTES: Final = 160  # minimum size of a read for the kernel, bytes: with a single frame it saves no CPU time
+KERNEL_BYTES: Final = 82  # minimum size of a read for the kernel, bytes: one HI91 frame
 
 
 class SampleListener(Protocol):
@@ -357,7 +360,7 @@ class StreamPath(SamplePath):
         the frames and the events of the rest."""
         codec, clock = self._kernel_codec, self.clock
         packed, utc_offset_ns = b"", None
-        if codec is not None and clock.is_even and (frames := codec.usual_frames(data)) is not None:
+        if codec is not None and (frames := codec.usual_frames(data)) is not None:
             utc_offset_ns = self._utc_offset_ns()
             packed = clock.stamp_frames(frames, self._device_id, t_rx_ns, utc_offset_ns)
             if packed:

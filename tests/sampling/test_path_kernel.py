@@ -19,6 +19,7 @@ from imud.contracts.publisher import AS_SENT, Batch
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucOptions, encode_frame, encode_hi92
 from imud.formats import kernel
+from imud.formats.slot import SLOT_BYTES
 from imud.host.clock import HostClock
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, NS_PER_US
@@ -143,6 +144,7 @@ class Run:
         path.publish_gathered()
         external = {"ledger": self.ledger, "steady": self.steady, "observer": self.seen.observer}
         newest, taken = path.newest, path.take_status()
+        path.clock.settle()
         state = StateWriter(external, path.NOT_STATE).write({"path": path})
         return (
             self.slots, self.ledger.snapshot(), path.latency.buckets, path.latency.sum_ns, newest, taken,
@@ -189,27 +191,26 @@ def test_the_kernel_accepts_any_bytes_and_numbers() -> None:
     module = kernel.present.module
     assert module is not None
     calls = Mock(wraps=module)
-    play([Step(10)] * 10, HipnucOptions(), False, kernel.Kernel(calls))
-    data, _, *values = calls.stamp_hi91.call_args.args
+    run = play([Step(10)] * 10, HipnucOptions(), False, kernel.Kernel(calls))
+    values, t_rx_ns = calls.start_hi91.call_args.args, run.path.clock.t_rx_ns
+    data = b"".join(hi91(values[2][0] + number) for number in range(1, 11))
     random, made_slots = Random(25), 0
     for _ in range(3000):
         stream = bytearray(data[: random.choice([len(data), random.randrange(len(data) + 1)])])
         if stream and random.random() < 0.3:
             stream[random.randrange(len(stream))] ^= random.randrange(1, 256)
-        frames = module.count_hi91(bytes(stream))
-        assert 0 <= frames <= len(stream) // len(hi91(0))
-        numbers = [list(one) if isinstance(one, tuple) else [one] for one in values]
+        groups = [[values[0]], *map(list, values[1:]), [1, t_rx_ns + 10 * NS_PER_MS, UTC_AHEAD_NS, 0, 0, 0]]
         for _ in range(random.randrange(4)):
-            group = random.choice(numbers)
+            group = random.choice(groups)
             group[random.randrange(len(group))] = random.choice(EXTREMES)
-        arguments = [
-            tuple(group) if isinstance(one, tuple) else group[0] for one, group in zip(values, numbers, strict=True)
-        ]
+        (device_id,), *state, arguments = groups
         with contextlib.suppress(OverflowError, TypeError):  # 2⁶⁴, and a float in place of an integer
-            made = module.stamp_hi91(
-                bytes(stream), random.choice([frames, frames, len(stream) // 82, -1, 2**31]), *arguments
-            )
-            made_slots += made is not None
+            made = module.start_hi91(device_id, *map(tuple, state))
+            for _ in range(2):
+                slots = b"" if made is None else made.stamp(bytes(stream), *arguments)
+                assert len(slots) <= len(stream) // len(hi91(0)) * SLOT_BYTES
+                assert made is None or len(made.state()) == 8
+                made_slots += bool(slots)
     assert made_slots > 300
 
 

@@ -348,9 +348,7 @@ class HipnucCodec:
         module, tail = kernel.present.module, self._tail
         if module is None or self._bad_ahead or self._barred_ahead or self._lines.pending_bytes:
             return None
-        stream = tail + data if tail else data
-        count = module.count_hi91(stream)
-        return UsualFrames(stream, count, self.word_is_status, module.stamp_hi91) if count else None
+        return UsualFrames(tail + data if tail else data, self.word_is_status, module.start_hi91)
 
     def take(self, frames: UsualFrames, count: int, data: bytes) -> bytes:
         ledger, size = self.ledger, count * _HI91_FRAME_BYTES
