@@ -13,16 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from imud.attitude.rotation import (
-    Matrix3,
-    euler312_from_quat,
-    matrix_from_quat,
-    matrix_product,
-    matrix_times,
-    quat_from_euler_zyx,
-    quat_from_matrix,
-    transposed,
-)
+from imud.attitude import rotation
 from imud.client.ring import Ring
 from imud.drivers.hipnuc.uart.codec import encode_hi91
 from imud.model.sample import Sample
@@ -131,7 +122,7 @@ BODY = (radians(5.0), radians(-10.0), radians(30.0))
 """Roll, pitch, yaw of the body in enu-flu: left side up by 5°, nose up by 10°, its front 30° to the left of east."""
 IN_NED = (radians(5.0), radians(10.0), radians(60.0))
 """Attitude of BODY in ned-frd, computed by hand: right side down by 5°, nose up by 10°, 60° clockwise from north."""
-MOUNTINGS: dict[str, tuple[dict[str, object], Matrix3]] = {
+MOUNTINGS: dict[str, tuple[dict[str, object], rotation.Matrix3]] = {
     # lines of the configuration; rows: the axis of the sensor that points forward, left, up
     "side": ({"axes": {"x": "y", "y": "z", "z": "x"}}, ((0, 1, 0), (0, 0, 1), (1, 0, 0))),
     "upside_down": ({"quat_wxyz": [0, 1, 0, 0]}, ((1, 0, 0), (0, -1, 0), (0, 0, -1))),
@@ -142,9 +133,9 @@ MOUNTINGS: dict[str, tuple[dict[str, object], Matrix3]] = {
 @pytest.mark.live
 def test_simulated_modules_in_bodies_of_known_attitude(tmp_path: Path) -> None:
     """The ring and a normal client receive enu-flu; a binary client and `poll` request ned-frd."""
-    body = matrix_from_quat(quat_from_euler_zyx(BODY))
+    body = rotation.matrix_from_quat(rotation.quat_from_euler_zyx(BODY))
     up_m_s2 = (body[2][0] * G, body[2][1] * G, body[2][2] * G)
-    field_t = matrix_times(transposed(body), FIELD_ENU_T)
+    field_t = rotation.matrix_times(rotation.transposed(body), FIELD_ENU_T)
     with raw_ports(len(MOUNTINGS)) as ports:
         devices = {
             name: device(path, frame=keys)
@@ -153,8 +144,10 @@ def test_simulated_modules_in_bodies_of_known_attitude(tmp_path: Path) -> None:
         with running_daemon(tmp_path, devices) as daemon, daemon.client() as plain, daemon.client() as other:
             for (name, (_, mounting)), (master, _) in zip(MOUNTINGS.items(), ports, strict=True):
                 daemon.wait_for(name, "searching")
-                sensor = quat_from_matrix(matrix_product(body, mounting))
-                module = HipnucModule(0, None, HipnucHardware(motion=Still(*euler312_from_quat(sensor)), skew_ppm=0))
+                sensor = rotation.quat_from_matrix(rotation.matrix_product(body, mounting))
+                module = HipnucModule(
+                    0, None, HipnucHardware(motion=Still(*rotation.euler312_from_quat(sensor)), skew_ppm=0)
+                )
                 as_configured = plain.watch([name], timeout_s=LIMIT_S, encoding="json")
                 asked = other.watch([name], timeout_s=LIMIT_S, convention="ned-frd")
                 os.write(master, b"".join(burst.data for burst in module.advance(int(1.5e9))))

@@ -1,14 +1,34 @@
-"""Noise of a sensor at rest: density, corner frequency, temperature drift, disturbances, resolution."""
+"""Noise of a sensor at rest: density, corner frequency, temperature drift, disturbances, resolution.
+Allan deviation compared with allantools and with values by hand, and the coverage of the intervals.
+Noise coefficients: synthetic noise within 5 %, and no value for a coefficient that the series does not resolve."""
 
+import allantools
 import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
 
-from imud.analysis.noise import corner_of, motion_words, sensor_noise, step_of, temperature_drift
+from imud.analysis.noise import (
+    BIAS_FACTOR,
+    NoiseTerms,
+    NoiseType,
+    allan_curve,
+    averaging_factors,
+    basis,
+    corner_of,
+    degrees_of_freedom,
+    interval,
+    motion_words,
+    noise_terms,
+    noise_types,
+    sensor_noise,
+    step_of,
+    temperature_drift,
+)
 from imud.analysis.series import FloatArray, Readings
 from imud.analysis.spectrum import power_spectrum
+from imud.model.errors import BadArgument
 from imud.model.units import STANDARD_GRAVITY_M_S2
-from tests.analysis.synthetic import random_walk, stamps_ns, three, white
+from tests.analysis.synthetic import flicker, quantisation, ramp, random_walk, stamps_ns, three, white
 
 RATE_HZ = 200.0
 COUNT = 60_000
@@ -163,3 +183,167 @@ def test_one_weakly_disturbed_second_in_a_hundred_seconds_is_no_motion() -> None
     gyro[:40] -= 1.0
     gyro[200:400] += 0.03
     assert "in 2 of 100 seconds" in motion_words(readings_of(gyro))
+
+
+ALPHAS = {
+    NoiseType.QUANTISATION: 2, NoiseType.FLICKER_PHASE: 1, NoiseType.WHITE: 0, NoiseType.FLICKER: -1,
+    NoiseType.RATE_RANDOM_WALK: -2,
+}  # fmt: skip
+
+
+def test_a_deviation_and_an_interval_by_hand() -> None:
+    rate = np.array([[1.0], [2.0], [4.0], [3.0]])  # differences of neighbours 1, 2, -1: 6 / (2 · 3) = 1
+    curve = allan_curve([rate], 1.0, np.array([1]))
+    assert curve.deviation[0, 0] == pytest.approx(1.0)
+    means = [1.5, 3.0, 3.5]  # averages of two samples, overlapping: the first and the last average differ by 2
+    curve = allan_curve([rate], 1.0, np.array([2]))
+    assert curve.deviation[0, 0] == pytest.approx((means[2] - means[0]) / np.sqrt(2))
+    # χ² of 10 degrees of freedom at 5 and 95 %: 3.940 and 18.307 (any table)
+    low, high = interval(np.array([1.0]), np.array([10.0]), confidence=0.9)
+    assert low[0] == pytest.approx(np.sqrt(10 / 18.307), rel=1e-4)
+    assert high[0] == pytest.approx(np.sqrt(10 / 3.940), rel=1e-4)
+
+
+def test_it_is_that_of_allantools() -> None:
+    random = np.random.default_rng(1)
+    rate_hz = 50.0
+    one = white(random, 20_000, rate_hz, 0.1) + random_walk(random, 20_000, rate_hz, 0.02) + 9.81
+    curve = allan_curve([three(one)], rate_hz)
+    tau_s, deviation, _, _ = allantools.oadev(one, rate=rate_hz, data_type="freq", taus=curve.tau_s)
+    assert tau_s == pytest.approx(curve.tau_s)
+    assert curve.deviation[:, 0] == pytest.approx(deviation, rel=1e-9)
+
+
+def test_runs_are_taken_together_without_a_difference_across_the_gap() -> None:
+    random = np.random.default_rng(3)
+    first, second = white(random, 500, 1.0, 1.0)[:, None], white(random, 300, 1.0, 1.0)[:, None] + 1000.0
+    factors = np.array([1, 10])
+    both = allan_curve([first, second], 1.0, factors).deviation[:, 0] ** 2
+    alone = [allan_curve([run], 1.0, factors).deviation[:, 0] ** 2 for run in (first, second)]
+    counts = [np.array([len(run) + 1 - 2 * m for m in factors]) for run in (first, second)]
+    assert both == pytest.approx((alone[0] * counts[0] + alone[1] * counts[1]) / (counts[0] + counts[1]))
+
+
+def test_runs_that_are_too_short_have_no_degrees_of_freedom() -> None:
+    run = white(np.random.default_rng(4), 500, 1.0, 1.0)[:, None]
+    curve = allan_curve([run, run[:20], run[:19]], 1.0, np.array([10]))
+    noise = NoiseType(int(curve.types[0, 0]))
+    assert curve.freedom[0, 0] == sum(degrees_of_freedom(noise, 10, n) for n in (501, 21))
+
+
+@pytest.mark.parametrize("noise", list(NoiseType))
+@pytest.mark.parametrize(("m", "n"), [(1, 1001), (4, 1001), (100, 1001), (7, 50)])
+def test_degrees_of_freedom_are_those_of_allantools(noise: NoiseType, m: int, n: int) -> None:
+    if noise is NoiseType.FLICKER and m == 1:
+        theirs = 2 * (n - 2) ** 2 / (2.3 * n - 4.9)  # SP 1065, table 5; allantools 2024.6 returns 0.87
+    else:
+        theirs = allantools.edf_simple(n, m, ALPHAS[noise])
+    assert degrees_of_freedom(noise, m, n) == pytest.approx(max(theirs, 1.0), rel=1e-9)
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
+    random = np.random.default_rng(4)
+    factors, truth = np.array([1, 8, 40]), 1.0 / np.sqrt([1, 8, 40])
+    held = np.zeros(3)
+    rounds = 300
+    for _ in range(rounds):
+        curve = allan_curve([white(random, 400, 1.0, 1.0)[:, None]], 1.0, factors)
+        held += (curve.low[:, 0] <= truth) & (truth <= curve.high[:, 0])
+    assert held / rounds == pytest.approx([0.683] * 3, abs=0.08)
+
+
+def test_types_of_noise_factors_and_short_runs() -> None:
+    for made, expected in [
+        (quantisation(np.random.default_rng(5), 4000, 1.0, 1.0), NoiseType.QUANTISATION),
+        (white(np.random.default_rng(5), 4000, 1.0, 1.0), NoiseType.WHITE),
+        (flicker(np.random.default_rng(5), 4000, 1.0), NoiseType.FLICKER),
+        (random_walk(np.random.default_rng(5), 4000, 1.0, 1.0), NoiseType.RATE_RANDOM_WALK),
+    ]:
+        types = noise_types(made[:, None], np.array([1, 4, 1000]))
+        assert types[0, 0] == expected
+        assert types[2, 0] == types[1, 0], "too few averages: as at the τ before"
+    factors = averaging_factors(3000)
+    assert (factors[0], factors[-1]) == (1, 1000)
+    assert len(factors) > 24
+    with pytest.raises(BadArgument, match="at least 3 samples"):
+        averaging_factors(2)
+    curve = allan_curve([np.full((200, 3), 9.81)], 100.0)
+    assert curve.deviation == pytest.approx(0.0, abs=1e-9)
+    with pytest.raises(BadArgument, match="at least 200 samples"):
+        allan_curve([np.zeros((50, 1))], 1.0, np.array([100]))
+
+
+TERM_HZ = 100.0
+TERMS_COUNT = 1 << 18
+WITHIN = 0.05
+
+
+def terms_of(series: FloatArray, rate_hz: float = TERM_HZ) -> NoiseTerms:
+    return noise_terms(allan_curve([series[:, None]], rate_hz), 0)
+
+
+def test_basis_factor_and_a_constant() -> None:
+    assert pytest.approx(0.664, abs=5e-4) == BIAS_FACTOR
+    assert basis(np.array([2.0]))[0] == pytest.approx([3 / 4, 1 / 2, 2 * np.log(2) / np.pi, 2 / 3, 2.0])
+    found = terms_of(np.zeros(500))
+    assert all(term.value is None for term in found)
+
+
+def test_each_term_over_white_noise() -> None:
+    random = np.random.default_rng(11)
+    found = terms_of(white(random, TERMS_COUNT, TERM_HZ, 2e-4))
+    assert found.random_walk.value == pytest.approx(2e-4, rel=WITHIN)
+    assert found.rate_random_walk.value is None
+    assert found.rate_ramp.value is None
+    found = terms_of(white(random, TERMS_COUNT, TERM_HZ, 1e-4) + flicker(random, TERMS_COUNT, 3e-3))
+    assert found.bias_instability.value == pytest.approx(3e-3, rel=WITHIN)
+    noise = white(random, TERMS_COUNT, TERM_HZ, 1e-3)
+    found = terms_of(noise + random_walk(random, TERMS_COUNT, TERM_HZ, 1e-2))
+    assert found.random_walk.value == pytest.approx(1e-3, rel=WITHIN)
+    assert found.rate_random_walk.value == pytest.approx(1e-2, rel=WITHIN)
+    found = terms_of(noise + quantisation(random, TERMS_COUNT, TERM_HZ, 1e-3))
+    assert found.random_walk.value == pytest.approx(1e-3, rel=WITHIN)
+    assert found.quantisation.value == pytest.approx(1e-3, rel=WITHIN)
+    found = terms_of(noise + ramp(TERMS_COUNT, TERM_HZ, 1e-5))
+    assert found.random_walk.value == pytest.approx(1e-3, rel=WITHIN)
+    assert found.rate_ramp.value == pytest.approx(1e-5, rel=WITHIN)
+
+
+def test_all_of_a_gyroscope_together() -> None:
+    random, count = np.random.default_rng(21), 1 << 20
+    series = (
+        white(random, count, TERM_HZ, 1e-3) + flicker(random, count, 8e-3) + random_walk(random, count, TERM_HZ, 8e-3)
+    )
+    found = terms_of(series)
+    assert found.random_walk.value == pytest.approx(1e-3, rel=WITHIN)
+    assert found.bias_instability.value == pytest.approx(8e-3, rel=WITHIN)
+    assert found.rate_random_walk.value == pytest.approx(8e-3, rel=WITHIN)
+
+
+def test_the_fit_makes_the_curve_again() -> None:
+    random = np.random.default_rng(31)
+    curve = allan_curve([white(random, TERMS_COUNT, TERM_HZ, 1e-3)[:, None]], TERM_HZ)
+    fitted = noise_terms(curve, 0).deviation(curve.tau_s)
+    near = curve.freedom[:, 0] > 100
+    assert fitted[near] == pytest.approx(curve.deviation[near, 0], rel=0.15)
+
+
+def test_spreads_and_bounds_are_those_of_many_series() -> None:
+    random = np.random.default_rng(41)
+    found = [terms_of(white(random, 4096, 1.0, 1.0), 1.0).random_walk for _ in range(60)]
+    values = np.array([one.value for one in found], dtype=float)
+    stated = float(np.median([one.sigma for one in found]))
+    assert 0.5 < stated / values.std() < 3.0
+    random = np.random.default_rng(51)
+    unresolved = terms_of(white(random, 4096, TERM_HZ, 1e-3)).rate_ramp
+    assert unresolved.value is None
+    assert unresolved.below > 0
+
+
+def test_short_filtered_points_are_left_out() -> None:
+    random = np.random.default_rng(61)
+    smooth = np.convolve(white(random, TERMS_COUNT, TERM_HZ, 1e-3), np.ones(8) / 8, mode="same")
+    curve = allan_curve([smooth[:, None]], TERM_HZ)
+    assert noise_terms(curve, 0, tau_least_s=0.8).random_walk.value == pytest.approx(1e-3, rel=WITHIN)
+    with pytest.raises(BadArgument, match="record a longer series"):
+        noise_terms(curve, 0, tau_least_s=curve.tau_s[-3])

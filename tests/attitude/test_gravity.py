@@ -9,17 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from imud.attitude import rotation
 from imud.attitude.conventions import FLU_LEVEL, RFU_ENU, DeviceAxes, EulerOrder
 from imud.attitude.gravity import SAMPLES_MIN, WINDOW_NS, Contradiction, Finding, GravityCheck, nearest_axis
 from imud.attitude.published import matrix_from_axes
-from imud.attitude.rotation import (
-    Matrix3,
-    matrix_from_quat,
-    matrix_times,
-    quat_from_euler312,
-    quat_from_euler_zyx,
-    transposed,
-)
 from imud.model.sample import Quaternion, Sample, Sync, Vector3
 from imud.model.units import NS_PER_S
 from tests.support.files import SHARED
@@ -35,8 +28,8 @@ FRD = DeviceAxes(order=EulerOrder.ZYX, has_north=False, z_down=True)
 def zyx(roll_deg: float, pitch_deg: float, yaw_deg: float = 40.0, z_down: bool = False) -> Sample:
     """Return a sample at rest of a device with ZYX and correct attitude."""
     euler = (radians(roll_deg), radians(pitch_deg), radians(yaw_deg))
-    quat = quat_from_euler_zyx(euler)
-    x, y, z = matrix_times(transposed(matrix_from_quat(quat)), (0, 0, -G if z_down else G))
+    quat = rotation.quat_from_euler_zyx(euler)
+    x, y, z = rotation.matrix_times(rotation.transposed(rotation.matrix_from_quat(quat)), (0, 0, -G if z_down else G))
     return Sample(
         "bow", 1, 0, 1, Sync.ARRIVAL, 0, 0, accel_m_s2=(x, y, z), gyro_rad_s=(0, 0, 0), quat_wxyz=quat, euler_rad=euler
     )
@@ -45,8 +38,8 @@ def zyx(roll_deg: float, pitch_deg: float, yaw_deg: float = 40.0, z_down: bool =
 def zxy(roll_deg: float, pitch_deg: float, yaw_deg: float = 40.0) -> Sample:
     """Return a sample at rest of a device with ZXY (312) and correct attitude."""
     euler = (radians(roll_deg), radians(pitch_deg), radians(yaw_deg))
-    quat = quat_from_euler312(euler)
-    accel = matrix_times(transposed(matrix_from_quat(quat)), (0, 0, G))
+    quat = rotation.quat_from_euler312(euler)
+    accel = rotation.matrix_times(rotation.transposed(rotation.matrix_from_quat(quat)), (0, 0, G))
     return replace(zyx(0, 0), accel_m_s2=accel, quat_wxyz=quat, euler_rad=euler)
 
 
@@ -56,7 +49,7 @@ def ticks(sample: Sample, seconds: float = 5.2, start: int = 1) -> Iterator[Samp
         yield replace(sample, seq=number, t_ns=number * TICK_NS)
 
 
-def found(device: DeviceAxes, sample: Sample, mounting: Matrix3 | None = None) -> Finding | None:
+def found(device: DeviceAxes, sample: Sample, mounting: rotation.Matrix3 | None = None) -> Finding | None:
     """Return the finding of one window at rest."""
     check = GravityCheck(device, mounting)
     assert sum(check.add(one) for one in ticks(sample)) == 1
@@ -64,7 +57,7 @@ def found(device: DeviceAxes, sample: Sample, mounting: Matrix3 | None = None) -
 
 
 def contradiction(
-    device: DeviceAxes, sample: Sample, kind: Contradiction, words: str, mounting: Matrix3 | None = None
+    device: DeviceAxes, sample: Sample, kind: Contradiction, words: str, mounting: rotation.Matrix3 | None = None
 ) -> Finding:
     """Return the finding of one window at rest. Check its kind and its text."""
     finding = found(device, sample, mounting)
@@ -116,8 +109,8 @@ ORDER, SIGN = Contradiction.ORDER, Contradiction.SIGN
             "in the opposite direction; set frame: {z_down: true} (docs/frames.md)",
         ),
         # a device with ZXY that is configured as ZYX, and the reverse
-        *((FLU_LEVEL, turned(zxy(*at), quat_from_euler_zyx), ORDER, "{euler_order: zxy}") for at in LEANING),
-        *((RFU_ENU, turned(zyx(*at), quat_from_euler312), ORDER, "{euler_order: zyx}") for at in LEANING),
+        *((FLU_LEVEL, turned(zxy(*at), rotation.quat_from_euler_zyx), ORDER, "{euler_order: zxy}") for at in LEANING),
+        *((RFU_ENU, turned(zyx(*at), rotation.quat_from_euler312), ORDER, "{euler_order: zyx}") for at in LEANING),
         *(
             (device, seen_as(make(30 * roll, 40 * pitch), make(30, 40)), SIGN, f"{angles} the opposite sign")
             for device, make in ((FLU_LEVEL, zyx), (RFU_ENU, zxy))

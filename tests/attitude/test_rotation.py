@@ -8,21 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imud.attitude.rotation import (
-    Matrix3,
-    euler312_from_quat,
-    euler_zyx_from_matrix,
-    euler_zyx_from_quat,
-    is_rotation,
-    matrix_from_euler312,
-    matrix_from_quat,
-    matrix_product,
-    matrix_times,
-    quat_from_euler312,
-    quat_from_euler_zyx,
-    quat_from_matrix,
-    quat_normalized,
-)
+from imud.attitude import rotation
 from imud.model.sample import Quaternion, Vector3
 from tests.support.files import SHARED
 
@@ -31,7 +17,9 @@ HALF = math.sqrt(0.5)
 
 component = st.floats(-1, 1)
 quats = (
-    st.tuples(component, component, component, component).filter(lambda q: math.hypot(*q) > 1e-3).map(quat_normalized)
+    st.tuples(component, component, component, component)
+    .filter(lambda q: math.hypot(*q) > 1e-3)
+    .map(rotation.quat_normalized)
 )
 steep = st.one_of(st.floats(-math.pi / 2, math.pi / 2), st.sampled_from([math.pi / 2, -math.pi / 2]))
 angles = st.floats(-math.pi, math.pi)
@@ -52,7 +40,7 @@ def angle_between(a: Quaternion, b: Quaternion) -> float:
 @pytest.mark.manual("B 9.1 angles of a quaternion")
 def test_manual_example() -> None:
     """Section 3.5: the quaternion gives 13.0519° / 12.1885° / -122.477°."""
-    euler = degrees(euler312_from_quat((-0.485922, -0.14982, 0.0380868, 0.860223)))
+    euler = degrees(rotation.euler312_from_quat((-0.485922, -0.14982, 0.0380868, 0.860223)))
     assert euler == pytest.approx((13.0519, 12.1885, -122.4771), abs=2e-4)
 
 
@@ -68,33 +56,37 @@ def test_manual_example() -> None:
     ],
 )
 def test_turns_about_one_axis(quat: Quaternion, euler_deg: Vector3) -> None:
-    assert degrees(euler312_from_quat(quat)) == pytest.approx(euler_deg, abs=1e-6)
+    assert degrees(rotation.euler312_from_quat(quat)) == pytest.approx(euler_deg, abs=1e-6)
 
 
 @pytest.mark.manual("B 9.2 matrix of a quaternion")
 def test_the_matrix_turns_body_to_navigation() -> None:
     """A body that is rotated left by 90° has its x axis (before: east) pointing north."""
-    assert matrix_times(matrix_from_quat((HALF, 0.0, 0.0, HALF)), (1, 0, 0)) == pytest.approx((0, 1, 0), abs=1e-15)
-    assert matrix_times(matrix_from_euler312((0, math.pi / 2, 0)), (0, 1, 0)) == pytest.approx((0, 0, 1), abs=1e-15)
+    assert rotation.matrix_times(rotation.matrix_from_quat((HALF, 0.0, 0.0, HALF)), (1, 0, 0)) == pytest.approx(
+        (0, 1, 0), abs=1e-15
+    )
+    assert rotation.matrix_times(rotation.matrix_from_euler312((0, math.pi / 2, 0)), (0, 1, 0)) == pytest.approx(
+        (0, 0, 1), abs=1e-15
+    )
 
 
 @given(quats)
 def test_quaternion_to_matrix_or_euler_and_back(quat: Quaternion) -> None:
-    matrix = matrix_from_quat(quat)
-    assert is_rotation(matrix, 1e-12)
-    back = quat_from_matrix(matrix)
+    matrix = rotation.matrix_from_quat(quat)
+    assert rotation.is_rotation(matrix, 1e-12)
+    back = rotation.quat_from_matrix(matrix)
     assert back[0] >= 0
     assert angle_between(quat, back) < 1e-7
-    assert angle_between(quat, quat_from_euler312(euler312_from_quat(quat))) < 1e-7
+    assert angle_between(quat, rotation.quat_from_euler312(rotation.euler312_from_quat(quat))) < 1e-7
 
 
 @given(angles, steep, angles)
 def test_euler_to_quaternion_and_back_is_the_same_rotation(roll: float, pitch: float, yaw: float) -> None:
     """At pitch ±90°, the angles are not unique; the rotation is."""
-    quat = quat_from_euler312((roll, pitch, yaw))
+    quat = rotation.quat_from_euler312((roll, pitch, yaw))
     assert math.hypot(*quat) == pytest.approx(1)
-    euler = euler312_from_quat(quat)
-    assert angle_between(quat, quat_from_euler312(euler)) < 1e-7
+    euler = rotation.euler312_from_quat(quat)
+    assert angle_between(quat, rotation.quat_from_euler312(euler)) < 1e-7
     if abs(pitch) < 1.5:
         assert euler == pytest.approx((roll, pitch, yaw), abs=1e-9) or abs(abs(roll) - math.pi) < 1e-9 or abs(
             abs(yaw) - math.pi
@@ -105,28 +97,28 @@ def test_euler_to_quaternion_and_back_is_the_same_rotation(roll: float, pitch: f
 @pytest.mark.manual("B 9.1 angles of a quaternion")
 def test_the_manual_formula_gives_the_same(roll: float, pitch: float, yaw: float) -> None:
     """Section 9.1 as printed, away from its singularities."""
-    q0, q1, q2, q3 = quat_from_euler312((roll, pitch, yaw))
+    q0, q1, q2, q3 = rotation.quat_from_euler312((roll, pitch, yaw))
     printed = (
         -math.atan2(2 * (q1 * q3 - q0 * q2), q0**2 - q1**2 - q2**2 + q3**2),
         math.asin(2 * (q0 * q1 + q2 * q3)),
         -math.atan2(2 * (q1 * q2 - q0 * q3), q0**2 - q1**2 + q2**2 - q3**2),
     )
     assert printed == pytest.approx((roll, pitch, yaw), abs=1e-9)
-    assert euler312_from_quat((q0, q1, q2, q3)) == pytest.approx(printed, abs=1e-9)
+    assert rotation.euler312_from_quat((q0, q1, q2, q3)) == pytest.approx(printed, abs=1e-9)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_straight_up_and_down_all_of_the_turn_is_yaw(sign: int) -> None:
     up = sign * math.pi / 2
     for found, yaw in (
-        (euler312_from_quat(quat_from_euler312((0.3, up, 0.5))), 0.5 + sign * 0.3),
-        (euler_zyx_from_quat(quat_from_euler_zyx((0.3, up, 1.0))), 1.0 - sign * 0.3),
+        (rotation.euler312_from_quat(rotation.quat_from_euler312((0.3, up, 0.5))), 0.5 + sign * 0.3),
+        (rotation.euler_zyx_from_quat(rotation.quat_from_euler_zyx((0.3, up, 1.0))), 1.0 - sign * 0.3),
     ):
         assert found[0] == 0
         assert found[1:] == pytest.approx((up, yaw), abs=1e-7)
 
 
-@pytest.mark.parametrize("convert", [euler312_from_quat, euler_zyx_from_quat])
+@pytest.mark.parametrize("convert", [rotation.euler312_from_quat, rotation.euler_zyx_from_quat])
 @pytest.mark.parametrize("quat", [(0.0,) * 4, (math.nan, 0.0, 0.0, 1.0), (math.inf, 0.0, 0.0, 0.0)])
 def test_quaternions_without_direction_are_refused(quat: Quaternion, convert: Callable[[Quaternion], Vector3]) -> None:
     with pytest.raises(ValueError, match="expected a length above zero"):
@@ -140,10 +132,10 @@ def test_quaternions_without_direction_are_refused(quat: Quaternion, convert: Ca
         ((math.nan, 0, 0), (0, 1, 0), (0, 0, 1)),
     ],
 )  # fmt: skip
-def test_other_matrices_are_rejected(matrix: Matrix3) -> None:
-    assert not is_rotation(matrix)
+def test_other_matrices_are_rejected(matrix: rotation.Matrix3) -> None:
+    assert not rotation.is_rotation(matrix)
     with pytest.raises(ValueError, match="orthonormal"):
-        quat_from_matrix(matrix)
+        rotation.quat_from_matrix(matrix)
 
 
 @pytest.mark.skipif(not RECORDING.exists(), reason=f"the recording is not at {RECORDING}; set IMUD_SHARED")
@@ -155,7 +147,7 @@ def test_recording_of_a_module_at_rest() -> None:
     worst_deg = 0.0
     for row in rows:
         quat = (float(row["quat_w"]), float(row["quat_x"]), float(row["quat_y"]), float(row["quat_z"]))
-        euler = degrees(euler312_from_quat(quat))
+        euler = degrees(rotation.euler312_from_quat(quat))
         sent = (float(row["roll"]), float(row["pitch"]), float(row["yaw"]))
         worst_deg = max(worst_deg, *(abs(a - b) for a, b in zip(euler, sent, strict=True)))
     assert worst_deg < 1.2e-4
@@ -175,21 +167,25 @@ def test_recording_of_a_module_at_rest() -> None:
 )
 def test_zyx_turns_about_the_axes(euler_deg: Vector3, quat: Quaternion) -> None:
     roll, pitch, yaw = map(math.radians, euler_deg)
-    assert quat_from_euler_zyx((roll, pitch, yaw)) == pytest.approx(quat, abs=1e-15)
+    assert rotation.quat_from_euler_zyx((roll, pitch, yaw)) == pytest.approx(quat, abs=1e-15)
 
 
 @given(roll=angles, pitch=st.floats(-1.57, 1.57), yaw=angles)
 def test_zyx_is_the_product_of_its_turns(roll: float, pitch: float, yaw: float) -> None:
     """Compare with the same rotations as 312 rotations about one axis each, multiplied as matrices."""
-    about_z, about_y, about_x = (matrix_from_euler312(one) for one in ((0, 0, yaw), (pitch, 0, 0), (0, roll, 0)))
-    wanted = matrix_product(matrix_product(about_z, about_y), about_x)
-    for row, other in zip(matrix_from_quat(quat_from_euler_zyx((roll, pitch, yaw))), wanted, strict=True):
+    about_z, about_y, about_x = (
+        rotation.matrix_from_euler312(one) for one in ((0, 0, yaw), (pitch, 0, 0), (0, roll, 0))
+    )
+    wanted = rotation.matrix_product(rotation.matrix_product(about_z, about_y), about_x)
+    for row, other in zip(
+        rotation.matrix_from_quat(rotation.quat_from_euler_zyx((roll, pitch, yaw))), wanted, strict=True
+    ):
         assert row == pytest.approx(other, abs=1e-12)
 
 
 @given(roll=angles, pitch=st.floats(-1.5, 1.5), yaw=angles)
 def test_round_trip_of_zyx_angles(roll: float, pitch: float, yaw: float) -> None:
-    found = euler_zyx_from_matrix(matrix_from_quat(quat_from_euler_zyx((roll, pitch, yaw))))
+    found = rotation.euler_zyx_from_matrix(rotation.matrix_from_quat(rotation.quat_from_euler_zyx((roll, pitch, yaw))))
     for value, wanted in zip(found, (roll, pitch, yaw), strict=True):
         assert math.remainder(value - wanted, 2 * math.pi) == pytest.approx(0, abs=1e-9)
 
@@ -199,10 +195,10 @@ def test_zyx_angles_of_a_quaternion_of_any_length_equal_the_angles_of_its_matrix
     roll: float, pitch: float, yaw: float, length: float
 ) -> None:
     """The square can overflow or underflow."""
-    w, x, y, z = quat_from_euler_zyx((roll, pitch, yaw))
+    w, x, y, z = rotation.quat_from_euler_zyx((roll, pitch, yaw))
     quat = (w * length, x * length, y * length, z * length)
-    found, wanted = euler_zyx_from_quat(quat), euler_zyx_from_matrix(matrix_from_quat(quat))
+    found, wanted = rotation.euler_zyx_from_quat(quat), rotation.euler_zyx_from_matrix(rotation.matrix_from_quat(quat))
     assert found[1] == pytest.approx(wanted[1], abs=1e-12)
     for euler in (found, wanted):
-        pairs = zip(quat_from_euler_zyx(euler), (w, x, y, z), strict=True)
+        pairs = zip(rotation.quat_from_euler_zyx(euler), (w, x, y, z), strict=True)
         assert abs(sum(a * b for a, b in pairs)) == pytest.approx(1, abs=1e-12)

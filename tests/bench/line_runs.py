@@ -9,16 +9,8 @@ from imud.model.sample import Measurement, Sample, Sync
 from imud.model.units import NS_PER_S
 from imud.sampling.clock import SampleClock
 from imud.sim.ports.arrival import Arrival, ArrivalModel
+from tests.bench import line_model
 from tests.bench.clock import TICK_MODULUS, TICK_NS, clock_for
-from tests.bench.line_model import (
-    LineFaults,
-    LineRead,
-    measured_ns,
-    pps_age_ms,
-    pulses_per_second,
-    simulate_reads,
-    triggered,
-)  # fmt: skip
 
 UTC_OFFSET_NS = 1_790_000_000_123_456_789  # CLOCK_REALTIME minus CLOCK_MONOTONIC
 REFERENCE = UtcReference(UTC_OFFSET_NS, 20_000)  # with an error of 20 us
@@ -52,20 +44,22 @@ def sout_clock(model: ArrivalModel, timing: SoutTiming | None = None) -> SampleC
     )  # fmt: skip
 
 
-def with_sout(clock: SampleClock, reads: Sequence[LineRead], *, silent: range = range(0)) -> list[DatedSample]:
+def with_sout(
+    clock: SampleClock, reads: Sequence[line_model.LineRead], *, silent: range = range(0)
+) -> list[DatedSample]:
     dated = []
     for i, read in enumerate(reads):
         if i not in silent:
             clock.add_edges("sout", read.edges)
         for a, number in zip(read.arrivals, read.numbers, strict=True):
-            dated.append(DatedSample(clock.sample(measurement(a), a.t_rx_ns, 0), measured_ns(a), number))
+            dated.append(DatedSample(clock.sample(measurement(a), a.t_rx_ns, 0), line_model.measured_ns(a), number))
     return dated
 
 
 def run_sout(
-    model: ArrivalModel, seconds: int, faults: LineFaults, timing: SoutTiming | None = None
+    model: ArrivalModel, seconds: int, faults: line_model.LineFaults, timing: SoutTiming | None = None
 ) -> list[DatedSample]:
-    reads = simulate_reads(model.run(int(model.rate_hz) * seconds), model.seed, faults)
+    reads = line_model.simulate_reads(model.run(int(model.rate_hz) * seconds), model.seed, faults)
     return with_sout(sout_clock(model, timing), reads)
 
 
@@ -74,7 +68,9 @@ def run_pps(model: ArrivalModel, seconds: int, *, silent_s: range = range(0)) ->
     clock, dated = clock_for(model), []
     arrivals = list(model.run(int(model.rate_hz) * seconds))
     first_s = arrivals[0].t_ns // NS_PER_S
-    pulses = [p for p in pulses_per_second(arrivals, model.seed) if p.t_ns // NS_PER_S - first_s not in silent_s]
+    pulses = [
+        p for p in line_model.pulses_per_second(arrivals, model.seed) if p.t_ns // NS_PER_S - first_s not in silent_s
+    ]
     given = 0
     for a in arrivals:
         due: list[Edge] = [p for p in pulses[given : given + 3] if p.t_ns <= a.t_rx_ns]
@@ -82,7 +78,7 @@ def run_pps(model: ArrivalModel, seconds: int, *, silent_s: range = range(0)) ->
         clock.add_edges("pps", due)
         # without a new pulse, the time since the last pulse continues to rise
         newest = max((p.t_ns // NS_PER_S for p in pulses[:given] if p.t_ns <= a.t_ns), default=a.t_ns // NS_PER_S)
-        age = pps_age_ms(a, model.crystal.skew_ppm) + 1000 * (a.t_ns // NS_PER_S - newest)
+        age = line_model.pps_age_ms(a, model.crystal.skew_ppm) + 1000 * (a.t_ns // NS_PER_S - newest)
         dated.append(
             DatedSample(clock.sample(measurement(a, pps_age=age % 8192), a.t_rx_ns, 0), a.t_ns, 0, begun_ns(model, a))
         )
@@ -107,7 +103,7 @@ def run_utc(
 def run_triggers(model: ArrivalModel, seconds: int, answered: float) -> tuple[list[DatedSample], SampleClock, int]:
     """Run a device that answers most triggers. Also return the number of triggers without a reply."""
     clock, dated, missed = clock_for(model), [], 0
-    for stamp, a in triggered(model, int(model.rate_hz) * seconds, answered):
+    for stamp, a in line_model.triggered(model, int(model.rate_hz) * seconds, answered):
         clock.add_triggers([stamp])
         if a is None:
             missed += 1

@@ -11,18 +11,6 @@ import pytest
 from imud.attitude.conventions import Convention
 from imud.bridges.channel import LossCounts, StampedEvent
 from imud.cli import export_sources as playing
-from imud.cli.export_sources import (
-    CLEAR,
-    EVENT,
-    EVERY_S,
-    HEAD,
-    LOOK_SAMPLES,
-    SAMPLES,
-    PipeSink,
-    Progress,
-    play_beside,
-    play_here,
-)
 from imud.contracts.publisher import Batch
 from imud.model.errors import ImudError
 from imud.model.sample import Sample
@@ -60,8 +48,8 @@ def test_both_ways_give_the_same_in_the_same_order(file: Path) -> None:
     for devices in [[], ["bow"]]:
         here, beside, positions = KeepingSink(), KeepingSink(), list[int]()
         with file.open("rb") as stream:
-            first = play_here(stream, str(file), here, devices)
-        second = play_beside(file, beside, devices, positions.append)
+            first = playing.play_here(stream, str(file), here, devices)
+        second = playing.play_beside(file, beside, devices, positions.append)
         assert second == first
         assert first[2] == ["bow", "mast"]
         assert beside.taken == here.taken
@@ -73,10 +61,10 @@ def test_both_ways_give_the_same_in_the_same_order(file: Path) -> None:
 
 def test_a_full_message_is_written_at_once() -> None:
     pipe = BytesIO()
-    sink = PipeSink(pipe, lambda: 0)
-    sink.samples(batch(count=SAMPLES - 1))
+    sink = playing.PipeSink(pipe, lambda: 0)
+    sink.samples(batch(count=playing.SAMPLES - 1))
     head_only = pipe.tell()
-    sink.samples(batch(first=SAMPLES))
+    sink.samples(batch(first=playing.SAMPLES))
     assert pipe.tell() > head_only
     written = pipe.tell()
     sink.finish()
@@ -91,7 +79,7 @@ def test_the_pipe_is_as_large_as_the_kernel_allows(file: Path, monkeypatch: pyte
         sizes.append(fcntl(pipe, F_GETPIPE_SZ))
 
     monkeypatch.setattr(playing, "fcntl", kept)
-    play_beside(file, KeepingSink(), [], lambda _at: None)
+    playing.play_beside(file, KeepingSink(), [], lambda _at: None)
     assert sizes == [playing.PIPE_BYTES]
 
     def refuse(*_arguments: int) -> None:
@@ -99,17 +87,17 @@ def test_the_pipe_is_as_large_as_the_kernel_allows(file: Path, monkeypatch: pyte
 
     monkeypatch.setattr(playing, "fcntl", refuse)
     sink = KeepingSink()
-    play_beside(file, sink, [], lambda _at: None)
+    playing.play_beside(file, sink, [], lambda _at: None)
     assert len(sink.taken) > FRAMES
 
 
 def test_an_error_of_the_player_comes_out(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"\x89imudREC" + bytes(100))
     with pytest.raises(ImudError, match="at least one complete block"):
-        play_beside(tmp_path / "a", KeepingSink(), [], lambda _at: None)
+        playing.play_beside(tmp_path / "a", KeepingSink(), [], lambda _at: None)
 
 
-WHOLE = HEAD.pack(EVENT, 4, 0)  # header of a message with four bytes of data
+WHOLE = playing.HEAD.pack(playing.EVENT, 4, 0)  # header of a message with four bytes of data
 
 
 @pytest.mark.parametrize(
@@ -124,16 +112,16 @@ def test_a_player_that_ends_early_is_an_error(
     player.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(player))
     with pytest.raises(ImudError, match="player process ended early"):
-        play_beside(file, KeepingSink(), [], lambda _at: None)
+        playing.play_beside(file, KeepingSink(), [], lambda _at: None)
 
 
 def test_the_player_uses_the_tree_of_this_process(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "imud.py").write_text("raise SystemExit('another tree')")
     monkeypatch.chdir(tmp_path)
-    play_beside(file, KeepingSink(), [], lambda _at: None)  # not of the current directory
+    playing.play_beside(file, KeepingSink(), [], lambda _at: None)  # not of the current directory
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     with pytest.raises(ImudError, match="player process ended early"):
-        play_beside(file, KeepingSink(), [], lambda _at: None)
+        playing.play_beside(file, KeepingSink(), [], lambda _at: None)
 
 
 def test_an_error_of_the_sink_ends_the_player(file: Path) -> None:
@@ -142,7 +130,7 @@ def test_an_error_of_the_sink_ends_the_player(file: Path) -> None:
             raise ImudError("full")
 
     with pytest.raises(ImudError, match="full"):
-        play_beside(file, Full(), [], lambda _at: None)
+        playing.play_beside(file, Full(), [], lambda _at: None)
 
 
 def test_the_player_ends_quietly_when_nobody_reads(file: Path) -> None:
@@ -167,24 +155,24 @@ def test_the_command_writes_the_same_file(
 
 
 def pictures(terminal: Terminal) -> list[str]:
-    return [one for one in terminal.getvalue().split(CLEAR) if one]
+    return [one for one in terminal.getvalue().split(playing.CLEAR) if one]
 
 
 def test_a_bar_with_share_samples_and_time() -> None:
     terminal, now_s = Terminal(), [100.0]
-    progress = Progress(1000, terminal, lambda: now_s[0])
+    progress = playing.Progress(1000, terminal, lambda: now_s[0])
     now_s[0] = 110.0
-    progress.add(LOOK_SAMPLES, lambda: 250)
+    progress.add(playing.LOOK_SAMPLES, lambda: 250)
     progress.close()
     progress.close()
-    assert pictures(terminal) == [f"[######..................]  25 %  {LOOK_SAMPLES} samples, 30 s left"]
-    assert terminal.getvalue().endswith(CLEAR)
+    assert pictures(terminal) == [f"[######..................]  25 %  {playing.LOOK_SAMPLES} samples, 30 s left"]
+    assert terminal.getvalue().endswith(playing.CLEAR)
     assert progress.spent_s == 10.0
 
 
 def test_it_is_drawn_immediately_and_after_each_fifth_of_a_second() -> None:
     terminal, now_s = Terminal(), [100.0]
-    progress = Progress(1000, terminal, lambda: now_s[0])
+    progress = playing.Progress(1000, terminal, lambda: now_s[0])
     for samples, second, expected in [(1999, 100.0, 0), (1, 100.0, 1), (2000, 100.19, 1), (2000, 100.2, 2)]:
         now_s[0] = second
         progress.add(samples, lambda: 20)
@@ -194,15 +182,15 @@ def test_it_is_drawn_immediately_and_after_each_fifth_of_a_second() -> None:
 
 def test_it_is_not_drawn_more_often_than_it_can_be_read_or_without_a_terminal() -> None:
     terminal, now_s = Terminal(), [0.0]
-    progress = Progress(1000, terminal, lambda: now_s[0])
+    progress = playing.Progress(1000, terminal, lambda: now_s[0])
     for step in range(100):
-        now_s[0] = step * EVERY_S / 10
-        progress.add(LOOK_SAMPLES, lambda: 0)
+        now_s[0] = step * playing.EVERY_S / 10
+        progress.add(playing.LOOK_SAMPLES, lambda: 0)
     assert 9 <= len(pictures(terminal)) <= 11
-    assert progress.samples == 100 * LOOK_SAMPLES
+    assert progress.samples == 100 * playing.LOOK_SAMPLES
     out = StringIO()
-    progress = Progress(1000, out, lambda: 0.0)
-    progress.add(10 * LOOK_SAMPLES, lambda: 500)
+    progress = playing.Progress(1000, out, lambda: 0.0)
+    progress.add(10 * playing.LOOK_SAMPLES, lambda: 500)
     progress.close()
     assert out.getvalue() == ""
-    assert progress.samples == 10 * LOOK_SAMPLES
+    assert progress.samples == 10 * playing.LOOK_SAMPLES

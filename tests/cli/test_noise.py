@@ -8,17 +8,8 @@ import pytest
 from imud.analysis.noise import Coefficient
 from imud.analysis.quantities import ShownUnit
 from imud.analysis.series import FloatArray, Readings
-from imud.cli.noise import (
-    SHEET_BYTES_MOST,
-    cell,
-    comparisons,
-    duration_words,
-    figures_for,
-    limits,
-    noise_report,
-    read_sheet,
-    text,
-)
+from imud.cli import noise
+from imud.cli.noise import text
 from imud.cli.sample_set import SampleSet
 from imud.contracts.driver import DataSheet, ModelFigures, SensorFigures
 from imud.model.errors import BadArgument, ImudError
@@ -48,50 +39,50 @@ def test_cells_and_durations() -> None:
         (Coefficient(None, 0.0, 0.005), "< 5"),
         (Coefficient(3.26e3, 3e2, 0.0), "3.26e6 ±3e5"),
     ]:
-        assert cell(figure, MILLI) == words
+        assert noise.cell(figure, MILLI) == words
     for seconds, words in [(12.34, "12.3 s"), (150.0, "2 min 30 s"), (7260.0, "2 h 1 min")]:
-        assert duration_words(seconds) == words
+        assert noise.duration_words(seconds) == words
 
 
 def test_figures_hold_or_not_and_open_ones_have_no_verdict() -> None:
     sheet = ModelFigures(gyro=SensorFigures(random_walk=1.2e-3, noise_density=1e-3), source="a sheet")
-    report = noise_report(sample_set_of(noise_of_three()), sheet)
-    walk, density = comparisons(report, "gyro")
+    report = noise.noise_report(sample_set_of(noise_of_three()), sheet)
+    walk, density = noise.comparisons(report, "gyro")
     assert (walk.quantity.key, walk.verdict) == ("random_walk", "within")
     assert walk.ratio == pytest.approx(1 / 1.2, rel=0.05)
     assert (density.quantity.key, density.verdict) == ("noise_density", "ABOVE")
     assert density.ratio == pytest.approx(np.sqrt(2), rel=0.05)
-    report = noise_report(
+    report = noise.noise_report(
         sample_set_of(noise_of_three()),
         ModelFigures(gyro=SensorFigures(bias_instability=1e-6, rate_random_walk=10.0), source="a sheet"),
     )
-    bias, walk = comparisons(report, "gyro")
+    bias, walk = noise.comparisons(report, "gyro")
     assert (bias.measured, bias.verdict) == (None, "not resolved")
     assert walk.verdict == "within"
 
 
 def test_what_limits_the_figures() -> None:
     values = np.round(noise_of_three() / 1.7453293e-3) * 1.7453293e-3
-    report = noise_report(sample_set_of(values), None)
-    words = " ".join(limits(report, "gyro"))
+    report = noise.noise_report(sample_set_of(values), None)
+    words = " ".join(noise.limits(report, "gyro"))
     assert "multiples of 0.001745 rad/s (in the manual)" in words
     moved = noise_of_three()
     moved[2000:4000] += np.sin(np.arange(2000) / 10)[:, None]
-    words = " ".join(limits(noise_report(sample_set_of(moved, "imu61x-can"), None), "gyro"))
+    words = " ".join(noise.limits(noise.noise_report(sample_set_of(moved, "imu61x-can"), None), "gyro"))
     assert "DISTURBED: in 20 of 100 seconds" in words
     assert "filter of the device: low-pass 47 Hz (factory setting" in words
 
 
 def test_the_text_names_what_is_not_compared_and_a_device_without_sensors_is_refused() -> None:
-    words = text(noise_report(sample_set_of(noise_of_three()), None))
+    words = text(noise.noise_report(sample_set_of(noise_of_three()), None))
     assert "bow: noise" in words
     assert "product HI14" in words
     assert "No comparison with a data sheet: HiPNUC" in words
     empty = Readings(stamps_ns(COUNT, RATE_HZ), None, None, None)
     with pytest.raises(ImudError, match="bow sends neither angular rate nor acceleration"):
-        noise_report(SampleSet("a file", "bow", readings=empty), None)
+        noise.noise_report(SampleSet("a file", "bow", readings=empty), None)
     with pytest.raises(ImudError, match="found no samples"):
-        noise_report(SampleSet("a file", "bow"), None)
+        noise.noise_report(SampleSet("a file", "bow"), None)
 
 
 def test_figures_become_si_and_those_of_the_user_come_first(tmp_path: Path) -> None:
@@ -101,7 +92,7 @@ def test_figures_become_si_and_those_of_the_user_come_first(tmp_path: Path) -> N
         "gyro: {random_walk_deg_sqrt_h: 0.3, bias_instability_deg_h: 2.5}\n"
         "accel: {noise_density_ug_sqrt_hz: 60, bias_instability_mg: 0.03}\n"
     )
-    found = read_sheet(file)
+    found = noise.read_sheet(file)
     assert found.source == "data sheet, table 2"
     assert found.gyro.random_walk == pytest.approx(0.3 * 2.9088821e-4)
     assert found.gyro.bias_instability == pytest.approx(2.5 * 4.8481368e-6)
@@ -110,17 +101,17 @@ def test_figures_become_si_and_those_of_the_user_come_first(tmp_path: Path) -> N
     assert found.accel.random_walk is None
     page = (ROOT / "docs/analysis.md").read_text()
     (tmp_path / "sheet.yaml").write_text(page.partition("```yaml\n")[2].partition("```")[0])
-    found = read_sheet(tmp_path / "sheet.yaml")
+    found = noise.read_sheet(tmp_path / "sheet.yaml")
     for sensor in (found.gyro, found.accel):
         assert all(getattr(sensor, name) is not None for name in sensor.__struct_fields__)
     assert found.accel.temperature_slope == pytest.approx(0.05 * 9.80665e-3)
     with pytest.raises(BadArgument, match=r"--sheet .*none\.yaml"):
-        read_sheet(tmp_path / "none.yaml")
+        noise.read_sheet(tmp_path / "none.yaml")
     given, stated = ModelFigures(source="given"), ModelFigures(source="stated")
     sheet = DataSheet(models={"HI14": stated})
-    assert figures_for(sheet, "HI14R2", given) is given
-    assert figures_for(sheet, "HI14R2", None) is stated
-    assert figures_for(sheet, "CH100", None) is None
+    assert noise.figures_for(sheet, "HI14R2", given) is given
+    assert noise.figures_for(sheet, "HI14R2", None) is stated
+    assert noise.figures_for(sheet, "CH100", None) is None
 
 
 @pytest.mark.parametrize(
@@ -128,7 +119,7 @@ def test_figures_become_si_and_those_of_the_user_come_first(tmp_path: Path) -> N
     [
         ("gyro: {random_walk: 0.3}", "random_walk"), ("gyro: {random_walk_deg_sqrt_h: -1}", "gyro"),
         ("gyro: {random_walk_deg_sqrt_h: .nan}", "gyro"), ("gyroscope: {}", "gyroscope"), ("- 1", "mapping"),
-        ("a: [", "YAML"), ("x" * (SHEET_BYTES_MOST + 1), "at most"),
+        ("a: [", "YAML"), ("x" * (noise.SHEET_BYTES_MOST + 1), "at most"),
     ],
     ids=["unknown figure", "negative", "not a number", "unknown sensor", "a list", "no YAML", "too long"],
 )  # fmt: skip
@@ -136,5 +127,5 @@ def test_what_is_wrong_is_named(tmp_path: Path, text: str, words: str) -> None:
     file = tmp_path / "sheet.yaml"
     file.write_text(text)
     with pytest.raises(BadArgument, match=words) as caught:
-        read_sheet(file)
+        noise.read_sheet(file)
     assert str(file) in str(caught.value)

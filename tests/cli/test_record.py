@@ -1,4 +1,6 @@
-"""`imud record`: the recording replays like the live run, and errors during the recording."""
+"""`imud record`: the recording replays like the live run, and errors during the recording.
+`imud info`: start, size, devices, rates, losses and integrity of a recording.
+Snapshots of the flight recorder replay like the live run, from the middle of the run."""
 
 import json
 import os
@@ -10,10 +12,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
+from imud.cli.record import Contents
+from imud.formats.records import CheckRecord, Kind, PathRecord, encode_object, records_of
+from imud.model.errors import ImudError
+from imud.model.ledger import LEDGER_FIELDS
+from imud.model.units import NS_PER_S
+from imud.publishers.recorder import flight
 from tests.cli.conftest import Cli, imud_process
-from tests.cli.recorded_daemon import stamped_capture
+from tests.cli.recorded_daemon import FRAMES, run_recorded, stamped_capture
 from tests.support.daemon_process import LIMIT_S, RunningDaemon, running_daemon, wait_until
 from tests.support.files import ROOT
 from tests.support.surroundings import pipe
@@ -143,3 +152,105 @@ def test_the_examples_of_the_document(
     assert reads
     assert [int(t_ns) for _, t_ns, _ in reads] == sorted(int(t_ns) for _, t_ns, _ in reads)
     assert b"\x5a\xa5\x4c\x00" in bytes.fromhex("".join(data for *_, data in reads)), "HI91 has 76 bytes"
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    _, _, (made,) = run_recorded(tmp_path_factory.mktemp("info"))
+    return made
+
+
+def test_whole_damaged_cut_and_foreign_files(file: Path, cli: Cli, tmp_path: Path) -> None:
+    page = cli("info", file).out
+    assert "integrity  complete" in page
+    assert "dropped    0 records" in page
+    assert "bow: " in page
+    assert "driver imu61x-can" in page
+    assert "bytes per sample" in page
+    assert all(len(line) <= 80 for line in page.splitlines())
+    told = json.loads(cli("info", "--json", file).out)
+    assert [device["name"] for device in told["devices"]] == ["bow", "mast"]
+    bow, mast = told["devices"]
+    assert (bow["samples"], bow["reads"], bow["lost"]) == (300, 300, 0)
+    assert bow["input_bytes"] == 300 * (82 + 17)
+    assert mast["samples"] > 190
+    assert (told["stored_bytes"], told["problems"], told["file_number"]) == (file.stat().st_size, [], 0)
+    data = bytearray(file.read_bytes())
+    (tmp_path / "cut").write_bytes(data[:-3])
+    assert "no regular end" in " ".join(cli("info", tmp_path / "cut").out.split())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "damaged").write_bytes(data + file.read_bytes())
+    assert "are damaged" in cli("info", tmp_path / "damaged", status=1).out
+    data = bytearray(file.read_bytes())
+    data[100] ^= 1
+    (tmp_path / "damaged").write_bytes(data)
+    page = " ".join(cli("info", tmp_path / "damaged", status=1).out.split())
+    assert "start unknown: the block with the start time and the device names is damaged or missing" in page
+    assert "duration unknown" in page
+    assert "missing blocks according to their numbers: 1" in page
+    (tmp_path / "a.csv").write_text("t_ns,accel\n" * 50)
+    cli.refuses("not a recording of imud", "info", str(tmp_path / "a.csv"))
+    cli.refuses("No such file", "info", str(tmp_path / "none"))
+
+
+def test_a_device_that_was_removed_and_added_counts_from_the_begin_again() -> None:
+    contents = Contents()
+
+    def add(kind: Kind, value: object) -> None:
+        contents.add(next(records_of(encode_object(kind, 0, value))))
+
+    def check(t_s: int, seq: int, lost: int) -> None:
+        ledger = dict.fromkeys(LEDGER_FIELDS, 0) | {"samples": seq, "lost_crc": lost}
+        add(Kind.CHECK, CheckRecord(t_s * NS_PER_S, seq, 0, 0, ledger))
+
+    check(10, 5000, 7)
+    check(12, 5200, 9)
+    add(Kind.PATH, PathRecord("hipnuc-uart", {}, 0, {"samples": 5250}, b""))  # the port opens again
+    check(14, 5400, 9)
+    check(20, 50, 1)  # a reload adds the device again
+    check(21, 150, 4)
+    add(Kind.PATH, PathRecord("hipnuc-uart", {}, 0, {"samples": 0}, b""))  # a second reload
+    check(30, 200, 0)
+    check(32, 400, 5)
+    without = {"t_ns": 0, "seq": 0, "sample_t_ns": 0, "sample_t_err_ns": 0, "ledger": {"lost_crc": 0}}
+    with pytest.raises(ImudError, match="record of kind 10: expected a ledger with lost_gap_device"):
+        add(Kind.CHECK, without)
+    device = contents.devices[0]
+    assert (device.samples, device.lost) == (400 + 100 + 200, 2 + 3 + 5)
+    assert device.rate_hz == pytest.approx(700 / (4 + 1 + 2))
+
+
+@pytest.mark.live
+@pytest.mark.parametrize("place", ["memory", "directory"])
+def test_a_snapshot_whose_begin_is_gone_replays_as_the_daemon_ran(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli, place: str
+) -> None:
+    monkeypatch.setattr(flight, "SEGMENT_NS_MIN", 300_000_000)
+    monkeypatch.setattr(flight, "MEGABYTE", 28_000)  # the run makes 39,000: the recorder removes the oldest segments
+    directory = f"directory: {tmp_path / 'flight'}, " if place == "directory" else ""
+    recorder = f"flight: {{enabled: true, {directory}memory_mb: 1, minutes: 0.1, acceleration_m_s2: 5}}"
+    _, collector, (file,) = run_recorded(tmp_path, recorder=recorder, speed="recorded", can_frames=FRAMES)
+    printed = cli("replay", "--json", file)
+    assert printed.err.count("equal to the live run") == 2
+    assert "0 of 0 checks" not in printed.err
+    for name in ("bow", "mast"):
+        live = [msgspec.json.encode(one).decode() for one in collector.samples if one.device == name]
+        again = [line for line in printed.out.splitlines() if f'"device":"{name}"' in line]
+        assert 20 < len(again) < len(live)
+        assert again == live[len(live) - len(again) :]
+    assert "integrity  complete" in cli("info", file).out
+
+
+@pytest.mark.live
+def test_a_client_saves_the_last_minutes(tmp_path: Path, cli: Cli) -> None:
+    capture = str(stamped_capture(tmp_path / "capture"))
+    played = {"driver": "hipnuc-uart", "replay": {"path": capture, "speed": "recorded", "repeat": True}}
+    recorder = {"directory": str(tmp_path / "recordings"), "flight": {"enabled": True}}
+    file = tmp_path / "snapshot.imudrec"
+    with running_daemon(tmp_path, {"bow": played}, recorder=recorder) as daemon:
+        wait_until(lambda: daemon.wait_for("bow", "running").newest_seq > 150, "150 samples")
+        assert "samples of 1 device" in cli("record", "--socket", daemon.socket, "--snapshot", file).err
+    printed = cli("replay", "--json", file)
+    assert len(printed.out.splitlines()) > 150
+    assert "equal to the live run" in printed.err
+    assert list((tmp_path / "recordings").glob("*.imudrec")) == []

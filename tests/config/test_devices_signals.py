@@ -6,17 +6,7 @@ import pytest
 
 from imud import config
 from imud.config.model import DeviceConfig
-from imud.contracts.lines import (
-    LINE_SCHEMAS,
-    DeviceLines,
-    DividedOptions,
-    InputOptions,
-    PpsOptions,
-    ReadyOptions,
-    ResetOptions,
-    SoutOptions,
-    TriggerOptions,
-)
+from imud.contracts import lines as contracts_lines
 from imud.contracts.status import Deviations
 from imud.drivers import DRIVERS
 from imud.model.errors import ConfigError
@@ -53,21 +43,22 @@ def test_every_line() -> None:
         ),
         spi("reset: {line: R, hold_ms: 5, open_drain: true}, data_ready: {line: Y, edge: falling}"),
     )
-    assert bow.lines == DeviceLines(
-        sout=SoutOptions(line=17, chip="gpiochip0", bias="pull-down"), sout_div=DividedOptions(line="D", divisor=64),
-        sin=TriggerOptions(line="S", rate_hz=0.0), alarm=InputOptions(line="A", active_low=True),
-        pps=PpsOptions(line="P", chrony="/run/chrony.imud.sock"),
+    assert bow.lines == contracts_lines.DeviceLines(
+        sout=contracts_lines.SoutOptions(line=17, chip="gpiochip0", bias="pull-down"), sout_div=contracts_lines.DividedOptions(line="D", divisor=64),
+        sin=contracts_lines.TriggerOptions(line="S", rate_hz=0.0), alarm=contracts_lines.InputOptions(line="A", active_low=True),
+        pps=contracts_lines.PpsOptions(line="P", chrony="/run/chrony.imud.sock"),
     )  # fmt: skip
-    assert gimbal.lines == DeviceLines(
-        reset=ResetOptions(line="R", hold_ms=5.0, open_drain=True), data_ready=ReadyOptions(line="Y", edge="falling")
+    assert gimbal.lines == contracts_lines.DeviceLines(
+        reset=contracts_lines.ResetOptions(line="R", hold_ms=5.0, open_drain=True),
+        data_ready=contracts_lines.ReadyOptions(line="Y", edge="falling"),
     )
 
 
 def test_defaults() -> None:
-    reset = ResetOptions(line="R")
+    reset = contracts_lines.ResetOptions(line="R")
     assert (reset.active_low, reset.hold_ms, reset.wait_s, reset.open_drain) == (True, 10.0, 3.0, False)
-    assert DividedOptions(line="D").divisor == 8
-    assert not TriggerOptions(line="S").active_low
+    assert contracts_lines.DividedOptions(line="D").divisor == 8
+    assert not contracts_lines.TriggerOptions(line="S").active_low
     for keys in ("driver: hipnuc-uart, uart: {port: x}", hipnuc("")):
         assert parse(keys)[0].lines is None
 
@@ -146,7 +137,7 @@ def test_a_changed_line_is_a_changed_device() -> None:
 
 def test_drivers_have_lines_that_there_are() -> None:
     for name, driver in DRIVERS.items():
-        assert driver.lines <= set(LINE_SCHEMAS), name
+        assert driver.lines <= set(contracts_lines.LINE_SCHEMAS), name
     assert DRIVERS["hipnuc-uart"].lines == {"sout", "sout_div", "sin", "alarm", "pps"}
     assert DRIVERS["imu61x-i2c"].lines == {"reset", "data_ready"}
 
@@ -206,9 +197,9 @@ def test_every_source_has_its_row() -> None:
     assert all(callable(RMC_SOURCES[name]) for name in RMC_SOURCES)
 
 
-@pytest.mark.parametrize("name", LINE_SCHEMAS)
+@pytest.mark.parametrize("name", contracts_lines.LINE_SCHEMAS)
 def test_keys_of_a_line_accept_the_documented_values(name: str) -> None:
-    check_schema(f"Line `{name}`", LINE_SCHEMAS[name])
+    check_schema(f"Line `{name}`", contracts_lines.LINE_SCHEMAS[name])
 
 
 def test_deviations_are_above_zero() -> None:

@@ -1,4 +1,5 @@
-"""YAML with positions: errors with their place, and the values of plain data."""
+"""YAML with positions: errors with their place, and the values of plain data.
+imud, and a reader of YAML 1.1, read written settings with the same values."""
 
 import math
 from typing import Any
@@ -9,7 +10,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imud.config.yaml import DEPTH_MAX, FILE_BYTES_MAX, SourcePosition, path_text, plain, read_yaml
+from imud.config import yaml as config_yaml
 
 
 @pytest.fixture(params=["C", "Python"], autouse=True)
@@ -20,23 +21,23 @@ def parser(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def only_problem(content: bytes | str) -> tuple[int, int, str, str]:
-    tree = read_yaml(content.encode() if isinstance(content, str) else content)
+    tree = config_yaml.read_yaml(content.encode() if isinstance(content, str) else content)
     assert len(tree.problems) == 1, tree.problems
     (problem,) = tree.problems
-    return problem.mark.line, problem.mark.column, path_text(problem.path), problem.message
+    return problem.mark.line, problem.mark.column, config_yaml.path_text(problem.path), problem.message
 
 
 def test_data_and_marks() -> None:
     text = "# first\na: 1\nb:\n  c: [x, 2.5]\n  d: 'no'\n  e:\n"
-    tree = read_yaml(text.encode())
+    tree = config_yaml.read_yaml(text.encode())
     assert tree.problems == []
     assert tree.data == {"a": 1, "b": {"c": ["x", 2.5], "d": "no", "e": None}}
-    assert tree.mark(("a",)) == SourcePosition(2, 4)
-    assert tree.mark(("b", "c", 1)) == SourcePosition(4, 10)
-    assert tree.key_mark(("b", "c")) == SourcePosition(4, 3)
-    assert tree.key_mark(("b", "c", 1)) == SourcePosition(4, 10)
+    assert tree.mark(("a",)) == config_yaml.SourcePosition(2, 4)
+    assert tree.mark(("b", "c", 1)) == config_yaml.SourcePosition(4, 10)
+    assert tree.key_mark(("b", "c")) == config_yaml.SourcePosition(4, 3)
+    assert tree.key_mark(("b", "c", 1)) == config_yaml.SourcePosition(4, 10)
     assert tree.mark(("b", "c", 7, "x")) == tree.mark(("b", "c"))
-    assert tree.mark(("z",)) == SourcePosition(2, 1)
+    assert tree.mark(("z",)) == config_yaml.SourcePosition(2, 1)
 
 
 @pytest.mark.parametrize(
@@ -49,14 +50,14 @@ def test_data_and_marks() -> None:
     ],
 )  # fmt: skip
 def test_plain_words(word: str, value: object) -> None:
-    assert plain(word) == value
-    assert type(plain(word)) is type(value)
+    assert config_yaml.plain(word) == value
+    assert type(config_yaml.plain(word)) is type(value)
 
 
 def test_the_length_of_numbers_is_limited() -> None:
-    assert plain("9" * 40) == int("9" * 40)
+    assert config_yaml.plain("9" * 40) == int("9" * 40)
     with pytest.raises(ValueError, match="at most 40 characters, got 41"):
-        plain("9" * 41)
+        config_yaml.plain("9" * 41)
 
 
 @pytest.mark.parametrize(
@@ -75,7 +76,7 @@ def test_traps_are_refused(word: str, says: str) -> None:
     assert (line, column, path) == (2, 6, "a.b")
     assert says in message
     assert len(message) < 200
-    assert read_yaml(f"a: '{word}'".encode()).data == {"a": word}
+    assert config_yaml.read_yaml(f"a: '{word}'".encode()).data == {"a": word}
 
 
 @pytest.mark.parametrize(
@@ -115,35 +116,35 @@ def test_refused_with_its_place(text: str, line: int, column: int, path: str, sa
 def test_columns_count_characters_and_a_byte_order_mark_is_no_text() -> None:
     assert only_problem(b"a: 1\nb: caf\xe9\n") == (2, 7, "", "expected UTF-8 text, got byte 0xe9")
     assert only_problem(b"\xef\xbb\xbf\xe9")[:2] == (1, 1)
-    tree = read_yaml("\ufeffñandú: [é, no]\n".encode())
+    tree = config_yaml.read_yaml("\ufeffñandú: [é, no]\n".encode())
     assert [(p.mark.line, p.mark.column) for p in tree.problems] == [(1, 12)]
     assert "ñandú" in (tree.data if isinstance(tree.data, dict) else {})
 
 
 def test_all_problems_are_found_and_the_second_of_two_equal_keys_has_no_data() -> None:
-    tree = read_yaml(b"a: no\nb: .nan\nc: 1:20\nc: 2\n")
+    tree = config_yaml.read_yaml(b"a: no\nb: .nan\nc: 1:20\nc: 2\n")
     assert [p.mark.line for p in tree.problems] == [1, 2, 3, 4]
     assert tree.complete
-    tree = read_yaml(b"a: {x: 1, y: 1}\na: {x: 2, z: no}\n")
-    assert [path_text(p.path) for p in tree.problems] == ["a", "a.(again).z"]
+    tree = config_yaml.read_yaml(b"a: {x: 1, y: 1}\na: {x: 2, z: no}\n")
+    assert [config_yaml.path_text(p.path) for p in tree.problems] == ["a", "a.(again).z"]
     assert tree.data == {"a": {"x": 1, "y": 1}}
 
 
 @pytest.mark.parametrize("opening", ["[", "{a: ", "- ", "? "])
 def test_deep_nesting_is_refused_and_does_not_overflow(opening: str) -> None:
     """`yaml.compose` with libyaml ends the process with a segmentation fault on this file."""
-    tree = read_yaml((opening * 200_000).encode())
+    tree = config_yaml.read_yaml((opening * 200_000).encode())
     assert not tree.complete
     assert len(tree.problems) == 1
 
 
 def test_limits_of_nesting_and_size() -> None:
-    at_limit = "[" * DEPTH_MAX + "]" * DEPTH_MAX
-    assert read_yaml(at_limit.encode()).problems == []
+    at_limit = "[" * config_yaml.DEPTH_MAX + "]" * config_yaml.DEPTH_MAX
+    assert config_yaml.read_yaml(at_limit.encode()).problems == []
     assert "levels of nesting" in only_problem(f"[{at_limit}]")[3]
-    filler = b"#" + b"x" * (FILE_BYTES_MAX - len(b"#\na: 1\n")) + b"\na: 1\n"
-    assert len(filler) == FILE_BYTES_MAX
-    assert read_yaml(filler).data == {"a": 1}
+    filler = b"#" + b"x" * (config_yaml.FILE_BYTES_MAX - len(b"#\na: 1\n")) + b"\na: 1\n"
+    assert len(filler) == config_yaml.FILE_BYTES_MAX
+    assert config_yaml.read_yaml(filler).data == {"a": 1}
     assert "at most 1048576 bytes" in only_problem(filler + b"\n")[3]
 
 
@@ -158,18 +159,18 @@ PLAIN_DATA = st.recursive(
 @given(data=PLAIN_DATA)
 def test_json_reads_as_itself(data: Any) -> None:
     """The command line creates configurations with msgspec. The YAML parser must read this JSON unchanged."""
-    tree = read_yaml(msgspec.json.encode(data))
+    tree = config_yaml.read_yaml(msgspec.json.encode(data))
     assert (tree.problems, tree.data) == ([], data)
 
 
 @given(content=st.binary(max_size=200) | st.text(alphabet="ab:- \n\t[]{},&*!'\"#|>?%@1.~", max_size=80).map(str.encode))
 def test_whatever_comes_there_is_data_or_a_problem(content: bytes) -> None:
-    tree = read_yaml(content)
+    tree = config_yaml.read_yaml(content)
     assert tree.complete or tree.problems
     for number in leaves(tree.data):
         assert math.isfinite(number)
     for problem in tree.problems:
-        assert problem.mark >= SourcePosition(1, 1)
+        assert problem.mark >= config_yaml.SourcePosition(1, 1)
 
 
 def leaves(data: object) -> list[float]:
@@ -177,3 +178,47 @@ def leaves(data: object) -> list[float]:
         return [data]
     inner = data.values() if isinstance(data, dict) else data if isinstance(data, list) else ()
     return [number for value in inner for number in leaves(value)]
+
+
+TEXTS = [
+    "6-axis", "yes", "on", "1e5", "0x10", "12:30", "1_000", "~", "", "a: b # c", "- x", "é\u2028\x7f\U0001f600", "\\",
+]  # fmt: skip
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(max_size=8) | st.sampled_from(TEXTS),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(min_size=1, max_size=5), inner, max_size=3),
+    max_leaves=8,
+)  # fmt: skip
+
+
+def read_back(text: str) -> Any:
+    tree = config_yaml.read_yaml(text.encode(), config_yaml.no_pause)
+    assert not tree.problems, (text, tree.problems)
+    return tree.data
+
+
+def test_blocks_outside_and_flow_inside() -> None:
+    values = {"settings": {"mode": "6-axis", "output": {"hi91": 100}, "matrix": [1, 0.5]}, "time": "now", "none": {}}
+    assert config_yaml.yaml_block(values) == (
+        'settings:\n  mode: "6-axis"\n  output: {hi91: 100}\n  matrix: [1, 0.5]\ntime: "now"\nnone: {}'
+    )
+    assert config_yaml.yaml_comment("a\n\nb") == "# a\n#\n# b"
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_texts_stay_texts(text: str) -> None:
+    assert read_back(f"a: {config_yaml.yaml_flow(text)}") == {"a": text}
+    assert yaml.safe_load(f"a: {config_yaml.yaml_flow(text)}") == {"a": text}
+
+
+@pytest.mark.parametrize("key", ["mode", "yes", "ON", "null", "y", "a-b", "1", "", "a b", ":"])
+def test_keys_stay_texts(key: str) -> None:
+    for read in (read_back, yaml.safe_load):
+        assert read(config_yaml.yaml_block({key: 1})) == {key: 1}
+
+
+@given(st.dictionaries(st.text(min_size=1, max_size=5).filter(lambda key: key != "<<"), VALUES, min_size=1, max_size=3))
+def test_everything_is_read_back(values: dict[str, Any]) -> None:
+    text = config_yaml.yaml_block(values)
+    if "<<" not in text:
+        assert read_back(text) == values

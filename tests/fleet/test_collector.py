@@ -1,30 +1,34 @@
-"""Collector with a real broker: it acknowledges stored messages and continues with the stored ledger."""
+"""Collector with a real broker: it acknowledges stored messages and continues with the stored ledger.
+Lines of the collector: each record once, with its source."""
 
 import asyncio
 import gc
+import io
+import json
+import math
 import threading
 from collections.abc import Sequence
 
 import msgspec
 import pytest
 
-from imud.fleet.accounts import (
-    Accounts,
-    BootKey,
-    BootOffset,
-    FleetLedger,
-    GatewayState,
-    StoredAccount,
-    StreamKey,
-    StreamPosition,
-)
-from imud.fleet.collector import BATCHES_MAX, GC_ALLOCATIONS, TURN_BYTES, FleetCollector, Offsets
-from imud.fleet.messages import GatewayClock, decode_message, encode_message
+from imud.fleet import accounts as fleet_accounts
+from imud.fleet.collector import BATCHES_MAX, GC_ALLOCATIONS, TURN_BYTES, FleetCollector, JsonLines, Offsets, lines_of
+from imud.fleet.messages import FleetMessage, GatewayClock, Stream, decode_message, encode_message
 from imud.fleet.reader import RECEIVE_MAX, Fleet, FleetBatch
 from imud.host.threads import rare_garbage_collection
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
-from tests.fleet.fleet_gateway import UTC_NS, SendingGateway, intervals_message, samples_message, synchronised
+from tests.fleet.fleet_gateway import (
+    UTC_NS,
+    SendingGateway,
+    dropped_message,
+    event_message,
+    intervals_message,
+    not_set,
+    samples_message,
+    synchronised,
+)
 from tests.fleet.mosquitto import Mosquitto
 from tests.fleet.proxy import Proxy
 from tests.support.daemon_process import LIMIT_S
@@ -37,17 +41,17 @@ class MemoryStore:
 
     def __init__(self) -> None:
         self.rows: list[int] = []
-        self.accounts: dict[StreamKey, StoredAccount] = {}
-        self.offsets: dict[BootKey, BootOffset] = {}
+        self.accounts: dict[fleet_accounts.StreamKey, fleet_accounts.StoredAccount] = {}
+        self.offsets: dict[fleet_accounts.BootKey, fleet_accounts.BootOffset] = {}
         self.fails = False
         self.collector: FleetCollector | None = None
         self.most = 1 << 30
 
-    def restore(self, ledger: FleetLedger) -> None:
+    def restore(self, ledger: fleet_accounts.FleetLedger) -> None:
         for key, account in self.accounts.items():
             ledger.restore(key, account)
 
-    def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
+    def write(self, batches: Sequence[FleetBatch], accounts: fleet_accounts.Accounts, offsets: Offsets) -> None:
         if self.fails:
             raise ServerError("the store is full")
         self.rows += [sample.seq for batch in batches for sample in batch.message.samples]
@@ -107,7 +111,9 @@ def test_messages_that_a_store_refused_are_delivered_to_the_next_collector(
     assert store.rows == list(range(1, 13))
     (account,) = fleet.accounts.values()
     assert (account.received, account.counts.duplicates, account.balance) == (12, 5, 0)
-    assert store.accounts == {StreamKey("gw", "1", "bow", "samples"): StoredAccount(account.counts, [])}
+    assert store.accounts == {
+        fleet_accounts.StreamKey("gw", "1", "bow", "samples"): fleet_accounts.StoredAccount(account.counts, [])
+    }
 
 
 class ResettingStore(MemoryStore):
@@ -117,7 +123,7 @@ class ResettingStore(MemoryStore):
         super().__init__()
         self.proxy, self.resets = proxy, resets
 
-    def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
+    def write(self, batches: Sequence[FleetBatch], accounts: fleet_accounts.Accounts, offsets: Offsets) -> None:
         super().write(batches, accounts, offsets)
         if self.resets:
             self.resets -= 1
@@ -147,7 +153,7 @@ class SlowStore(MemoryStore):
         if not is_slow:
             self.goes_on.set()
 
-    def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
+    def write(self, batches: Sequence[FleetBatch], accounts: fleet_accounts.Accounts, offsets: Offsets) -> None:
         self.sizes.append(len(batches))
         assert self.goes_on.wait(LIMIT_S)
         super().write(batches, accounts, offsets)
@@ -170,7 +176,9 @@ def test_a_slow_store_receives_larger_transactions_and_its_ledger_balances(
     sending = threading.Thread(target=send)
     sending.start()
     gateway.send_state(
-        GatewayState(v=1, online=True, boot="1", positions=[StreamPosition("1", "bow", "samples", 1, number)])
+        fleet_accounts.GatewayState(
+            v=1, online=True, boot="1", positions=[fleet_accounts.StreamPosition("1", "bow", "samples", 1, number)]
+        )
     )
     fleet = collect(broker, store, number)
     sending.join()
@@ -194,10 +202,10 @@ def test_the_size_of_waiting_messages_is_limited(broker: Mosquitto, gateway: Sen
 
 def test_a_state_with_a_clock_gives_the_store_its_offset(broker: Mosquitto, gateway: SendingGateway) -> None:
     clock = GatewayClock(9, UTC_NS, synchronised=True, error_ns=700)
-    gateway.send_state(GatewayState(v=1, online=True, boot="1", clock=clock))
+    gateway.send_state(fleet_accounts.GatewayState(v=1, online=True, boot="1", clock=clock))
     store = MemoryStore()
     collect(broker, store, 0)
-    assert store.offsets == {BootKey("gw", "1"): BootOffset(9, UTC_NS, 700)}
+    assert store.offsets == {fleet_accounts.BootKey("gw", "1"): fleet_accounts.BootOffset(9, UTC_NS, 700)}
 
 
 def test_the_garbage_collector_does_not_track_stored_objects() -> None:
@@ -211,3 +219,60 @@ def test_the_garbage_collector_does_not_track_stored_objects() -> None:
         assert gc.get_threshold()[0] == GC_ALLOCATIONS > before[0]
     assert gc.get_threshold() == before
     assert not gc.get_freeze_count()
+
+
+HEAD = {"site": "mill", "gateway": "gw", "boot": "1", "device": "bow", "stream": "samples"}
+
+
+def test_the_line_of_a_sample_contains_its_values() -> None:
+    (line,) = lines_of(FleetBatch("mill", Stream.SAMPLES, samples_message(3, 3)))
+    assert json.loads(line) == HEAD | {
+        "kind": "sample", "seq": 3, "t_ns": 3_000_000, "t_err_ns": 500, "sync": "edge", "t_rx_ns": 3_000_010,
+        "utc_ns": 1_790_000_000_003_000_000, "accel_m_s2": [0.375, 0.0, 9.75], "temperature_c": 21.5,
+    }  # fmt: skip
+    message = samples_message(1, 1)
+    sample = msgspec.structs.replace(message.samples[0], accel_m_s2=(math.nan, 0.0, math.inf))
+    (line,) = lines_of(FleetBatch("mill", Stream.SAMPLES, msgspec.structs.replace(message, samples=[sample])))
+    assert json.loads(line)["accel_m_s2"] == [None, 0.0, None]
+
+
+def test_lines_of_dropped_records_intervals_and_events_have_kinds() -> None:
+    out = io.TextIOWrapper(io.BytesIO())
+    batches = [
+        FleetBatch("mill", Stream.SAMPLES, dropped_message(1, 4)),
+        FleetBatch("mill", Stream.SAMPLES, intervals_message(1, 2)),
+        FleetBatch("mill", Stream.EVENTS, event_message(1, 5)),
+    ]
+    JsonLines(out).write(batches, {}, {})
+    dropped, found, up = map(json.loads, out.buffer.getvalue().splitlines())
+    assert dropped == HEAD | {
+        "kind": "dropped", "first": 1, "last": 4, "cause": "space", "utc_ns": UTC_NS + 4_000_000,
+    }  # fmt: skip
+    assert (found["kind"], found["values"]["accel_m_s2"]["mean"]) == ("interval", [1.0, 2.0, 3.0])
+    assert (up["stream"], up["kind"], up["event"], up["message"]) == ("events", "event", "up", "it is up")
+
+
+def test_lines_report_an_unset_clock_and_a_later_line_contains_its_offset() -> None:
+    messages = [
+        samples_message(1, 1, utc_ns=0), intervals_message(2, 3, utc_ns=0), event_message(4, 4_000_000, utc_ns=0),
+        dropped_message(5, 6),
+    ]  # fmt: skip
+    out, clocks = io.StringIO(), fleet_accounts.BootClocks()
+
+    def write(message: FleetMessage) -> None:
+        offset = clocks.take(message)
+        JsonLines(out).write([FleetBatch("mill", Stream.SAMPLES, message, offset)], {}, clocks.take_fresh())
+
+    for one in messages:
+        write(not_set(one))
+    write(synchronised(samples_message(7, 7), t_ns=7_000_000, error_ns=900))
+    write(not_set(samples_message(8, 8, utc_ns=0)))
+    lines = [json.loads(line) for line in out.getvalue().splitlines()]
+    assert [line.get("utc") for line in lines] == ["not set"] * 4 + [None] * 3
+    assert [line["kind"] for line in lines] == ["sample", "interval", "event", "dropped", "sample", "clock", "sample"]
+    assert lines[5] == {
+        "kind": "clock", "gateway": "gw", "boot": "1", "t_ns": 7_000_000, "utc_offset_ns": UTC_NS, "utc_err_ns": 900,
+    }  # fmt: skip
+    assert lines[0]["t_ns"] + lines[5]["utc_offset_ns"] == UTC_NS + 1_000_000
+    assert (lines[4]["utc_ns"], lines[4]["utc_err_ns"]) == (UTC_NS + 7_000_000, 900)
+    assert (lines[6]["utc_ns"], lines[6]["utc_err_ns"]) == (UTC_NS + 8_000_000, 900 + 1_000_000 // 2000)

@@ -11,6 +11,7 @@ from random import Random
 import msgspec
 import pytest
 
+from imud.fleet import spool
 from imud.fleet.accounts import FleetLedger, StreamCounts
 from imud.fleet.messages import (
     CLOCK_SET_NS,
@@ -24,18 +25,6 @@ from imud.fleet.messages import (
     encode_slots_message,
     topic_of,
 )
-from imud.fleet.spool import (
-    FILE,
-    RESERVE_FILE,
-    STEP,
-    Spool,
-    SpoolError,
-    SpoolRow,
-    is_position,
-    repaired_row,
-    row_of,
-    undamaged_row,
-)
 from imud.formats.slot import encode_slots
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_S
@@ -44,7 +33,7 @@ HOUR_NS = 3600 * NS_PER_S
 UTC_NS = CLOCK_SET_NS + 10_000 * HOUR_NS
 
 
-def batch(first: int, count: int = 100, device: str = "bow", *, whole: bool = True) -> SpoolRow:
+def batch(first: int, count: int = 100, device: str = "bow", *, whole: bool = True) -> spool.SpoolRow:
     stream = Stream.SAMPLES if whole else Stream.EVENTS
     last = first + count - 1
     samples = [
@@ -56,22 +45,22 @@ def batch(first: int, count: int = 100, device: str = "bow", *, whole: bool = Tr
         kind=MessageKind.SLOTS if whole else MessageKind.EVENTS, first=first, last=last, count=count, utc_ns=last,
     )  # fmt: skip
     payload = encode_slots_message(message, encode_slots(samples, 0)) if whole else encode_message(message)
-    return row_of(topic_of("site", "gw", device, stream), stream, message, payload, 0)
+    return spool.row_of(topic_of("site", "gw", device, stream), stream, message, payload, 0)
 
 
 class SpoolBench:
     def __init__(
         self, path: Path, kilobytes: int = 100_000, hours: float = 100.0, *, newest_first: bool = False
     ) -> None:
-        self.spool = Spool(path, kilobytes * 1000, round(hours * HOUR_NS), newest_first=newest_first)
+        self.spool = spool.Spool(path, kilobytes * 1000, round(hours * HOUR_NS), newest_first=newest_first)
         self.spool.open()
         self.now_ns = 0
 
-    def commit(self, *rows: SpoolRow, done: tuple[int, ...] = (), utc_ns: int = UTC_NS) -> None:
+    def commit(self, *rows: spool.SpoolRow, done: tuple[int, ...] = (), utc_ns: int = UTC_NS) -> None:
         self.now_ns += NS_PER_S
         self.spool.commit(rows, done, self.now_ns, utc_ns)
 
-    def all(self) -> list[SpoolRow]:
+    def all(self) -> list[spool.SpoolRow]:
         self.spool.rewind()
         found = self.spool.after(1_000_000)
         self.spool.rewind()
@@ -183,7 +172,7 @@ def test_messages_in_the_sender_are_not_changed(tmp_path: Path, newest_first: bo
 def test_everything_is_given_once_and_never_changed_afterwards(tmp_path: Path, seed: int, newest_first: bool) -> None:
     random = Random(seed)
     bench = SpoolBench(tmp_path, kilobytes=random.choice([120, 250, 100_000]), newest_first=newest_first)
-    ledger, first, given = FleetLedger(from_begin=True), 1, dict[int, SpoolRow]()
+    ledger, first, given = FleetLedger(from_begin=True), 1, dict[int, spool.SpoolRow]()
     for _ in range(150):
         match random.randrange(8):
             case 0:
@@ -254,7 +243,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_full_disk_does_not_change_the_spool_until_messages_are_acknowledged(small_disk: Path) -> None:
     bench = SpoolBench(small_disk)
     number = 0
-    with pytest.raises(SpoolError, match="full"):  # noqa: PT012
+    with pytest.raises(spool.SpoolError, match="full"):  # noqa: PT012
         while True:
             bench.commit(batch(100 * number + 1))
             number += 1
@@ -275,7 +264,7 @@ def test_a_full_disk_does_not_change_the_spool_until_messages_are_acknowledged(s
 
 
 def test_the_reserve_is_created_again_when_the_disk_has_room(small_disk: Path) -> None:
-    reserve, other = small_disk / RESERVE_FILE, small_disk / "other"
+    reserve, other = small_disk / spool.RESERVE_FILE, small_disk / "other"
     bench = SpoolBench(small_disk)
     assert reserve.stat().st_size > 100_000
     bench.commit(batch(1))
@@ -295,22 +284,22 @@ def test_the_reserve_is_created_again_when_the_disk_has_room(small_disk: Path) -
 
 
 def test_a_damaged_file_is_renamed(tmp_path: Path) -> None:
-    (tmp_path / FILE).write_bytes(b"This is no database at all, and it is long enough to be seen as none." * 100)
+    (tmp_path / spool.FILE).write_bytes(b"This is no database at all, and it is long enough to be seen as none." * 100)
     bench = SpoolBench(tmp_path)
     assert bench.spool.set_aside == str(tmp_path / "spool.db.damaged")
     bench.commit(batch(1))
     assert bench.counts() == StreamCounts(1, 100, whole=100)
     (tmp_path / "file").write_text("")
-    with pytest.raises(SpoolError, match="file"):
-        Spool(tmp_path / "file" / "spool", 1_000_000, HOUR_NS).open()
+    with pytest.raises(spool.SpoolError, match="file"):
+        spool.Spool(tmp_path / "file" / "spool", 1_000_000, HOUR_NS).open()
 
 
 def test_a_file_that_is_damaged_later_is_renamed_at_the_next_attempt(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path)
-    for number in range(STEP):
+    for number in range(spool.STEP):
         bench.commit(batch(100 * number + 1))
     bench.spool.close()
-    path = tmp_path / FILE
+    path = tmp_path / spool.FILE
     content = bytearray(path.read_bytes())
     content[1024:] = b"\xa5" * (len(content) - 1024)
     path.write_bytes(content)
@@ -318,7 +307,7 @@ def test_a_file_that_is_damaged_later_is_renamed_at_the_next_attempt(tmp_path: P
     for _ in range(2):
         try:
             bench.commit(batch(1))
-        except SpoolError:
+        except spool.SpoolError:
             continue
     assert bench.spool.set_aside
     assert bench.counts().whole == 100
@@ -351,7 +340,7 @@ DAMAGE = {
 
 
 def damage(folder: Path, change: str, where: str = "id = 2", table: str = "message") -> None:
-    base = sqlite3.connect(folder / FILE, isolation_level=None)
+    base = sqlite3.connect(folder / spool.FILE, isolation_level=None)
     base.execute(f"UPDATE {table} SET {change} WHERE {where}")
     base.close()
 
@@ -411,11 +400,11 @@ def test_a_file_with_the_maximum_row_id_is_renamed(tmp_path: Path) -> None:
 
 
 def test_positions_belong_to_one_name_of_the_gateway(tmp_path: Path) -> None:
-    old = Spool(tmp_path, 1 << 30, HOUR_NS, gateway="gw")
+    old = spool.Spool(tmp_path, 1 << 30, HOUR_NS, gateway="gw")
     old.open()
     old.commit([batch(1)], (), 1, UTC_NS)
     old.close()
-    new = Spool(tmp_path, 1 << 30, HOUR_NS, gateway="other")
+    new = spool.Spool(tmp_path, 1 << 30, HOUR_NS, gateway="other")
     new.open()
     assert new.positions() == []
     row = batch(101)
@@ -449,50 +438,50 @@ FOREIGN = (None, 1.5, "text", b"\xff", -1, 1 << 63)  # values that SQLite can re
 
 
 def test_a_row_survives_storing() -> None:
-    assert undamaged_row(tuple(batch(1))) == batch(1)
-    assert undamaged_row(tuple(batch(7, 1, whole=False))) == batch(7, 1, whole=False)
+    assert spool.undamaged_row(tuple(batch(1))) == batch(1)
+    assert spool.undamaged_row(tuple(batch(7, 1, whole=False))) == batch(7, 1, whole=False)
 
 
-@pytest.mark.parametrize("column", SpoolRow._fields[1:])
+@pytest.mark.parametrize("column", spool.SpoolRow._fields[1:])
 def test_a_column_of_another_type_is_detected_or_harmless(column: str) -> None:
     """Any number is a valid time. No sent message contains `items`."""
     for value in FOREIGN:
-        row = undamaged_row(tuple(value if name == column else one for name, one in batch(1)._asdict().items()))
+        row = spool.undamaged_row(tuple(value if name == column else one for name, one in batch(1)._asdict().items()))
         assert row is None or column in ("stored_utc_ns", "items"), value
 
 
 @pytest.mark.parametrize("column", ["kind", "payload"])
 def test_a_row_with_known_numbers_becomes_a_dropped_message(column: str) -> None:
-    row = repaired_row([17 if name == column else one for name, one in batch(101)._asdict().items()])
+    row = spool.repaired_row([17 if name == column else one for name, one in batch(101)._asdict().items()])
     assert row is not None
     note = decode_message(row.payload)
     assert (note.kind, note.cause, note.first, note.last, note.count) == (
         MessageKind.DROPPED, DropCause.DAMAGED, 101, 200, 100,
     )  # fmt: skip
     assert (note.gateway, note.boot, note.device) == ("gw", "1", "bow")
-    assert undamaged_row(tuple(row)) == row
+    assert spool.undamaged_row(tuple(row)) == row
 
 
 @pytest.mark.parametrize("change", [{"last": 900}, {"items": 3}, {"topic": "imud/x"}, {"boot": ""}, {"first": 0}])
 def test_a_row_with_inconsistent_numbers_does_not_become_a_dropped_message(change: dict[str, object]) -> None:
     """A `dropped` message with wrong numbers would make other messages duplicates."""
-    assert repaired_row([change.get(name, one) for name, one in batch(101)._asdict().items()]) is None
+    assert spool.repaired_row([change.get(name, one) for name, one in batch(101)._asdict().items()]) is None
 
 
 def test_the_numbers_of_the_payload_are_checked() -> None:
     message = decode_message(batch(1).payload)
     for name, value in (("first", 2), ("last", 99), ("boot", "2"), ("device", "stern"), ("gateway", "other")):
         other = msgspec.structs.replace(message, kind=MessageKind.EVENTS, samples=[], **{name: value})
-        row = row_of(batch(1).topic, Stream.SAMPLES, message, msgspec.json.encode(other), 0)
-        assert undamaged_row(tuple(row)) is None, name
+        row = spool.row_of(batch(1).topic, Stream.SAMPLES, message, msgspec.json.encode(other), 0)
+        assert spool.undamaged_row(tuple(row)) is None, name
 
 
 def test_positions() -> None:
-    assert is_position(("1", "bow", "samples", 1, 9))
-    assert is_position(("1", "", "events", 9, 9))
+    assert spool.is_position(("1", "bow", "samples", 1, 9))
+    assert spool.is_position(("1", "", "events", 9, 9))
     for values in (
         ("1", "bow", "samples", 0, 9), ("1", "bow", "samples", 9, 1), ("1", "bow", "other", 1, 9),
         ("\ufffd", "bow", "samples", 1, 9), ("1", "bow", "samples", 1, "9"), ("1", None, "samples", 1, 9),
         ("1", "bow", "samples", 1, 1 << 62),
     ):  # fmt: skip
-        assert not is_position(values), values
+        assert not spool.is_position(values), values

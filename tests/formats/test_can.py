@@ -6,17 +6,7 @@ from random import Random
 
 import pytest
 
-from imud.formats.can import (
-    EXTENDED_FLAG,
-    EXTENDED_ID_MAX,
-    RAW_FRAME,
-    STANDARD_ID_MAX,
-    CandumpReader,
-    CanFilter,
-    CanFrame,
-    frame_bits,
-    pack_frame,
-)
+from imud.formats import can
 from imud.model.errors import BadArgument
 from tests.support.files import candump_line
 
@@ -27,28 +17,32 @@ from tests.support.files import candump_line
     [(False, 8, 111), (False, 6, 95), (False, 0, 47), (True, 8, 131), (True, 0, 67)],
 )
 def test_length_of_a_frame(extended: bool, data_bytes: int, bits: int) -> None:
-    assert frame_bits(extended, data_bytes) == bits
+    assert can.frame_bits(extended, data_bytes) == bits
 
 
 def test_frames_in_the_layout_of_the_kernel() -> None:
-    assert RAW_FRAME.unpack(pack_frame(0x7FF, False, b"ab")) == (0x7FF, 2, b"ab" + bytes(6))
-    assert RAW_FRAME.unpack(pack_frame(0x1FFF_FFFF, True, b"")) == (0x1FFF_FFFF | EXTENDED_FLAG, 0, bytes(8))
+    assert can.RAW_FRAME.unpack(can.pack_frame(0x7FF, False, b"ab")) == (0x7FF, 2, b"ab" + bytes(6))
+    assert can.RAW_FRAME.unpack(can.pack_frame(0x1FFF_FFFF, True, b"")) == (
+        0x1FFF_FFFF | can.EXTENDED_FLAG,
+        0,
+        bytes(8),
+    )
     wrong = [(0x800, False, b""), (-1, False, b""), (0x2000_0000, True, b""), (1, True, bytes(9))]
     for can_id, extended, data in wrong:
         with pytest.raises(ValueError, match="invalid CAN frame"):
-            pack_frame(can_id, extended, data)
+            can.pack_frame(can_id, extended, data)
 
 
 @pytest.mark.parametrize(
     ("one", "other", "expected"),
     [
-        (CanFilter(0x180, 0x7F0, False), CanFilter(0x185, 0x7FF, False), True),
-        (CanFilter(0x180, 0x7FF, False), CanFilter(0x185, 0x7FF, False), False),
-        (CanFilter(0x180, 0x7F0, False), CanFilter(0x185, 0x7FF, True), False),
-        (CanFilter(0, 0, True), CanFilter(0x1FFF_FFFF, 0x1FFF_FFFF, True), True),
+        (can.CanFilter(0x180, 0x7F0, False), can.CanFilter(0x185, 0x7FF, False), True),
+        (can.CanFilter(0x180, 0x7FF, False), can.CanFilter(0x185, 0x7FF, False), False),
+        (can.CanFilter(0x180, 0x7F0, False), can.CanFilter(0x185, 0x7FF, True), False),
+        (can.CanFilter(0, 0, True), can.CanFilter(0x1FFF_FFFF, 0x1FFF_FFFF, True), True),
     ],
 )
-def test_filters_overlap_if_one_frame_passes_both(one: CanFilter, other: CanFilter, expected: bool) -> None:
+def test_filters_overlap_if_one_frame_passes_both(one: can.CanFilter, other: can.CanFilter, expected: bool) -> None:
     assert one.overlaps(other) == other.overlaps(one) == expected
     if expected:  # the identifier with all bits of both masks
         can_id = (one.can_id & one.mask) | (other.can_id & other.mask)
@@ -69,18 +63,18 @@ LOG = b"""\
 """
 
 
-def read(data: bytes) -> tuple[list[CanFrame], CandumpReader]:
-    reader = CandumpReader(io.BytesIO(data))
+def read(data: bytes) -> tuple[list[can.CanFrame], can.CandumpReader]:
+    reader = can.CandumpReader(io.BytesIO(data))
     return list(reader), reader
 
 
 def test_lines_of_candump() -> None:
     frames, reader = read(LOG)
     assert frames == [
-        CanFrame(0x44, False, b"\x2a\x36\x6c\x2b", 1436509052_249713_000),
-        CanFrame(0x18FEE9AA, True, bytes(range(1, 9)), 1436509053_650700_000),
-        CanFrame(0x7FF, False, b"", 1436509053_650700_000),
-        CanFrame(0x1A2, False, bytes.fromhex("1122334455667788"), 1436509053_700003_000),
+        can.CanFrame(0x44, False, b"\x2a\x36\x6c\x2b", 1436509052_249713_000),
+        can.CanFrame(0x18FEE9AA, True, bytes(range(1, 9)), 1436509053_650700_000),
+        can.CanFrame(0x7FF, False, b"", 1436509053_650700_000),
+        can.CanFrame(0x1A2, False, bytes.fromhex("1122334455667788"), 1436509053_700003_000),
     ]
     assert (reader.passed_over, reader.problem) == (3, "")
 
@@ -106,15 +100,15 @@ def test_steps_of_the_clock(times_s: Sequence[float], expected_s: Sequence[float
 def test_interfaces() -> None:
     log = b"(1.0) can1 001#\n(2.0) can0 002#\n(3.0) can1 003#\n"
     for name, ids in (("can0", [2]), ("can1", [1, 3])):
-        assert [frame.can_id for frame in CandumpReader(io.BytesIO(log), name)] == ids
+        assert [frame.can_id for frame in can.CandumpReader(io.BytesIO(log), name)] == ids
     with pytest.raises(BadArgument, match="interfaces can1 and can0: select one"):
         read(log)
     with pytest.raises(BadArgument, match="interface x: expected can1 or can0"):
-        list(CandumpReader(io.BytesIO(log), "x"))
+        list(can.CandumpReader(io.BytesIO(log), "x"))
     piped = io.BytesIO(log)
     piped.seekable = lambda: False  # type: ignore[method-assign]
     with pytest.raises(BadArgument, match="interfaces can1 and can0: select one"):
-        list(CandumpReader(piped))
+        list(can.CandumpReader(piped))
 
 
 @pytest.mark.parametrize(
@@ -136,18 +130,18 @@ def test_what_is_written_is_read() -> None:
     frames = []
     for number in range(50):
         extended = random.random() < 0.5
-        can_id = random.randrange((EXTENDED_ID_MAX if extended else STANDARD_ID_MAX) + 1)
-        frames.append(CanFrame(can_id, extended, random.randbytes(random.randint(0, 8)), number * US))
+        can_id = random.randrange((can.EXTENDED_ID_MAX if extended else can.STANDARD_ID_MAX) + 1)
+        frames.append(can.CanFrame(can_id, extended, random.randbytes(random.randint(0, 8)), number * US))
     again, reader = read("".join(candump_line(frame, "can3") for frame in frames).encode("ascii"))
     expected = [frame for frame in frames if not (frame.extended and frame.can_id >> 29)]
     assert again == expected
     assert reader.problem == ""
-    assert candump_line(CanFrame(0x65, False, b"\xab", 1_500_000_000)) == "(0000000001.500000) can0 065#AB\n"
+    assert candump_line(can.CanFrame(0x65, False, b"\xab", 1_500_000_000)) == "(0000000001.500000) can0 065#AB\n"
     with pytest.raises(ValueError, match="no classical CAN frame"):
-        candump_line(CanFrame(0x800, False, b"", 0))
+        candump_line(can.CanFrame(0x800, False, b"", 0))
 
 
 def test_a_name_of_an_interface_is_printed_with_escapes() -> None:
     log = io.BytesIO(b"(1.0) can0 123#\n(2.0) v\x1b[2J 123#\n")
     with pytest.raises(BadArgument, match=r"frames of the interfaces can0 and 'v\\x1b\[2J': select one"):
-        list(CandumpReader(log))
+        list(can.CandumpReader(log))

@@ -6,46 +6,37 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imud.formats.modbus import (
-    SLAVES,
-    ReplyFinder,
-    crc16_modbus,
-    exception_text,
-    frame_gap_ns,
-    framed,
-    is_exception,
-    is_whole,
-)
+from imud.formats import modbus
 
-REQUEST = framed(5, bytes.fromhex("03 0034 0002"))
-REPLY = framed(5, bytes.fromhex("03 04 11 22 33 44"))
-OTHER = framed(6, bytes.fromhex("03 04 55 66 77 88"))
-EXCEPTION = framed(5, b"\x83\x02")
+REQUEST = modbus.framed(5, bytes.fromhex("03 0034 0002"))
+REPLY = modbus.framed(5, bytes.fromhex("03 04 11 22 33 44"))
+OTHER = modbus.framed(6, bytes.fromhex("03 04 55 66 77 88"))
+EXCEPTION = modbus.framed(5, b"\x83\x02")
 
 
-def finder(echoes: bool | None = False, request: bytes = REQUEST, size: int = len(REPLY)) -> ReplyFinder:
-    return ReplyFinder(request, size, echoes=echoes)
+def finder(echoes: bool | None = False, request: bytes = REQUEST, size: int = len(REPLY)) -> modbus.ReplyFinder:
+    return modbus.ReplyFinder(request, size, echoes=echoes)
 
 
 @pytest.mark.manual("B 4.1.3 CRC")
 def test_check_value_and_frames() -> None:
-    assert crc16_modbus(b"123456789") == 0x4B37
-    assert crc16_modbus(b"123456789\x37\x4b") == 0
-    assert framed(0x50, bytes.fromhex("03 0034 0018")).hex() == "50030034001809" + "8f"
-    assert is_whole(REPLY)
-    assert not is_whole(REPLY[:-1])
-    assert not is_whole(b"")
-    assert is_exception(EXCEPTION)
-    assert not is_exception(EXCEPTION[:-1] + b"\x00")
-    assert not is_exception(framed(5, b"\x03\x02"))
-    assert exception_text(2) == "exception 2: the register does not exist"
-    assert exception_text(77) == "exception 77: unknown code"
+    assert modbus.crc16_modbus(b"123456789") == 0x4B37
+    assert modbus.crc16_modbus(b"123456789\x37\x4b") == 0
+    assert modbus.framed(0x50, bytes.fromhex("03 0034 0018")).hex() == "50030034001809" + "8f"
+    assert modbus.is_whole(REPLY)
+    assert not modbus.is_whole(REPLY[:-1])
+    assert not modbus.is_whole(b"")
+    assert modbus.is_exception(EXCEPTION)
+    assert not modbus.is_exception(EXCEPTION[:-1] + b"\x00")
+    assert not modbus.is_exception(modbus.framed(5, b"\x03\x02"))
+    assert modbus.exception_text(2) == "exception 2: the register does not exist"
+    assert modbus.exception_text(77) == "exception 77: unknown code"
 
 
 @pytest.mark.parametrize(("baud", "gap_ns"), [(9600, 3_645_831), (19200, 1_822_915), (38400, 1_750_000)])
 def test_silence_between_frames(baud: int, gap_ns: int) -> None:
     """3.5 characters of 10 bits up to 19200 baud, 1.75 ms above."""
-    assert frame_gap_ns(baud) == pytest.approx(gap_ns, abs=2)
+    assert modbus.frame_gap_ns(baud) == pytest.approx(gap_ns, abs=2)
 
 
 @given(seed=st.integers(0, 2**32), echo=st.booleans(), known=st.booleans(), exception=st.booleans())
@@ -69,7 +60,7 @@ def test_bytes_that_are_not_the_reply_are_skipped_and_counted() -> None:
     assert found.feed(REPLY[4:]) == REPLY
     assert found.strange == len(OTHER) + 2
     # late reply to a previous request: imud now requests another number of registers
-    old = framed(5, bytes.fromhex("03 06 11 22 33 44 55 66"))
+    old = modbus.framed(5, bytes.fromhex("03 06 11 22 33 44 55 66"))
     found = finder()
     assert found.feed(old) is None
     assert found.feed(REPLY) == REPLY
@@ -93,7 +84,7 @@ def test_a_damaged_reply_is_returned_only_in_its_place() -> None:
 
 
 def test_confirmation_is_distinguished_from_the_echo() -> None:
-    write = framed(5, bytes.fromhex("06 0006 0001"))
+    write = modbus.framed(5, bytes.fromhex("06 0006 0001"))
     found = finder(True, write, len(write))
     assert found.feed(write) is None
     assert found.feed(write) == write
@@ -107,4 +98,4 @@ def test_confirmation_is_distinguished_from_the_echo() -> None:
 
 def test_addresses_of_slaves() -> None:
     """0 is the broadcast, 248 to 255 are reserved (Modbus over serial line V1.02, section 2.2)."""
-    assert [address for address in range(256) if address not in SLAVES] == [0, *range(248, 256)]
+    assert [address for address in range(256) if address not in modbus.SLAVES] == [0, *range(248, 256)]

@@ -3,25 +3,12 @@ import zlib
 
 import pytest
 
-from imud.formats.ring import (
-    HEADER_BYTES,
-    HEADER_FIELDS,
-    LEDGER_BLOCK_BYTES,
-    LEDGER_ROOM,
-    OFFSETS,
-    STATE_LIVE,
-    RingHeader,
-    decode_header,
-    decode_ledger_block,
-    encode_header,
-    encode_ledger_block,
-    ring_path,
-)
+from imud.formats import ring
 from imud.model.errors import ServerError
 from imud.model.ledger import LEDGER_FIELDS
 from tests.support.rings import check_layout
 
-HEADER = RingHeader(0x0102_0304_0506_0708, 4711, STATE_LIVE, "front-imu", 3, 4096, 10, 2, -5)
+HEADER = ring.RingHeader(0x0102_0304_0506_0708, 4711, ring.STATE_LIVE, "front-imu", 3, 4096, 10, 2, -5)
 LEDGER = {name: 100 + i for i, name in enumerate(LEDGER_FIELDS)}
 
 GOLDEN = (
@@ -36,70 +23,72 @@ GOLDEN = (
 
 
 def test_header() -> None:
-    check_layout(HEADER_FIELDS, HEADER_BYTES)
+    check_layout(ring.HEADER_FIELDS, ring.HEADER_BYTES)
     lively = {"newest_seq", "first_seq", "heartbeat_ns"}
-    lines = {OFFSETS[name] // 64 for name in lively}
-    others = {f.offset // 64 for f in HEADER_FIELDS if f.name not in lively and not f.name.startswith("reserved")}
+    lines = {ring.OFFSETS[name] // 64 for name in lively}
+    others = {f.offset // 64 for f in ring.HEADER_FIELDS if f.name not in lively and not f.name.startswith("reserved")}
     assert len(lines) == 1
     assert not lines & others
-    raw = encode_header(HEADER)
-    assert len(raw) == HEADER_BYTES
+    raw = ring.encode_header(HEADER)
+    assert len(raw) == ring.HEADER_BYTES
     assert raw[: len(GOLDEN)].hex(" ", 8) == GOLDEN.hex(" ", 8)
     assert not any(raw[len(GOLDEN) :])
-    assert decode_header(GOLDEN.ljust(HEADER_BYTES, b"\0"), "x") == HEADER
+    assert ring.decode_header(GOLDEN.ljust(ring.HEADER_BYTES, b"\0"), "x") == HEADER
 
 
-@pytest.mark.parametrize("raw", [b"", bytes(HEADER_BYTES), encode_header(HEADER)[:-1], b"x" * HEADER_BYTES])
+@pytest.mark.parametrize(
+    "raw", [b"", bytes(ring.HEADER_BYTES), ring.encode_header(HEADER)[:-1], b"x" * ring.HEADER_BYTES]
+)
 def test_no_ring_at_all(raw: bytes) -> None:
     with pytest.raises(ServerError, match=r"/x is not a ring"):
-        decode_header(raw, "/x")
+        ring.decode_header(raw, "/x")
 
 
 VERSIONS = [("layout_version", 3), ("slot_layout_version", 3), ("header_bytes", 4098), ("slot_bytes", 258)]
-COUNTS = [("slot_count", 0), ("slot_count", 4095), ("ledger_count", LEDGER_ROOM + 1)]
+COUNTS = [("slot_count", 0), ("slot_count", 4095), ("ledger_count", ring.LEDGER_ROOM + 1)]
 
 
 @pytest.mark.parametrize(
     ("name", "value", "words"), [(*one, "the same version") for one in VERSIONS] + [(*one, "damaged") for one in COUNTS]
 )
 def test_another_version_and_impossible_counts_are_refused(name: str, value: int, words: str) -> None:
-    raw = bytearray(encode_header(HEADER))
-    struct.pack_into("<I", raw, OFFSETS[name], value)
+    raw = bytearray(ring.encode_header(HEADER))
+    struct.pack_into("<I", raw, ring.OFFSETS[name], value)
     with pytest.raises(ServerError, match=words):
-        decode_header(bytes(raw), "/x")
+        ring.decode_header(bytes(raw), "/x")
 
 
 def test_ledger_block_also_of_a_writer_with_other_counters() -> None:
     body = struct.pack("<Q", 6) + b"hipnuc-uart".ljust(32, b"\0")
-    body += b"".join(struct.pack("<Q", 100 + i) for i in range(24)) + bytes(8 * (LEDGER_ROOM - 24))
+    body += b"".join(struct.pack("<Q", 100 + i) for i in range(24)) + bytes(8 * (ring.LEDGER_ROOM - 24))
     expected = body + zlib.crc32(body).to_bytes(4, "little")
-    assert encode_ledger_block(6, "hipnuc-uart", tuple(LEDGER.values())) == expected
-    assert len(expected) == LEDGER_BLOCK_BYTES
-    block = decode_ledger_block(expected, len(LEDGER_FIELDS))
+    assert ring.encode_ledger_block(6, "hipnuc-uart", tuple(LEDGER.values())) == expected
+    assert len(expected) == ring.LEDGER_BLOCK_BYTES
+    block = ring.decode_ledger_block(expected, len(LEDGER_FIELDS))
     assert block is not None
     assert (block.update, block.driver, block.ledger) == (6, "hipnuc-uart", LEDGER)
-    block = decode_ledger_block(encode_ledger_block(1, "", tuple(LEDGER.values())), 2)
+    block = ring.decode_ledger_block(ring.encode_ledger_block(1, "", tuple(LEDGER.values())), 2)
     assert block is not None
     assert block.ledger == {"bytes_in": 100, "bytes_in_good_frames": 101}
-    block = decode_ledger_block(encode_ledger_block(1, "", tuple(LEDGER.values())), LEDGER_ROOM)
+    block = ring.decode_ledger_block(ring.encode_ledger_block(1, "", tuple(LEDGER.values())), ring.LEDGER_ROOM)
     assert block is not None
     assert block.ledger == LEDGER
-    block = decode_ledger_block(encode_ledger_block(1, "d" * 40, [5]), 1)
+    block = ring.decode_ledger_block(ring.encode_ledger_block(1, "d" * 40, [5]), 1)
     assert block is not None
     assert (block.driver, block.ledger) == ("d" * 31, {"bytes_in": 5})
 
 
-@pytest.mark.parametrize("at", [0, 8, 40, 300, LEDGER_BLOCK_BYTES - 1])
+@pytest.mark.parametrize("at", [0, 8, 40, 300, ring.LEDGER_BLOCK_BYTES - 1])
 def test_torn_ledger_block_is_refused(at: int) -> None:
-    raw = bytearray(encode_ledger_block(6, "hipnuc-uart", tuple(LEDGER.values())))
+    raw = bytearray(ring.encode_ledger_block(6, "hipnuc-uart", tuple(LEDGER.values())))
     raw[at] ^= 1
-    assert decode_ledger_block(bytes(raw), len(LEDGER_FIELDS)) is None
+    assert ring.decode_ledger_block(bytes(raw), len(LEDGER_FIELDS)) is None
     raw[at] ^= 1
-    assert decode_ledger_block(bytes(raw[:-1]), len(LEDGER_FIELDS)) is None
+    assert ring.decode_ledger_block(bytes(raw[:-1]), len(LEDGER_FIELDS)) is None
 
 
 @pytest.mark.parametrize("device", ["", "a/b", "../x", "a\0b", "x" * 64, "ü" * 32])
 def test_names_that_cannot_be_files(device: str) -> None:
-    assert str(ring_path("/run/imud/shm", "imu0")) == "/run/imud/shm/imud.imu0"
+    assert str(ring.ring_path("/run/imud/shm", "imu0")) == "/run/imud/shm/imud.imu0"
     with pytest.raises(ServerError, match="expected a name"):
-        ring_path("/dev/shm", device)
+        ring.ring_path("/dev/shm", device)

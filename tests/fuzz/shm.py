@@ -24,16 +24,7 @@ from random import Random
 from typing import Final
 
 from imud.client.ring import Ring
-from imud.formats.ring import (
-    HEADER_BYTES,
-    LEDGER_BLOCK_BYTES,
-    LEDGER_BLOCK_OFFSET,
-    LEDGER_CRC_OFFSET,
-    OFFSETS,
-    RingHeader,
-    encode_header,
-    encode_ledger_block,
-)
+from imud.formats import ring as formats_ring
 from imud.formats.slot import CRC_OFFSET, SLOT_BYTES, SYNC_CODES, decode_slot, encode_slot
 from imud.model.errors import ServerError
 from imud.model.ledger import LEDGER_FIELDS
@@ -44,7 +35,7 @@ from tests.support.rings import DEVICE, START_NS, make_sample
 SLOTS: Final = 8  # slots of the ring
 NEWEST: Final = 20  # newest sequence number
 PID: Final = 4242
-BYTES: Final = HEADER_BYTES + SLOTS * SLOT_BYTES
+BYTES: Final = formats_ring.HEADER_BYTES + SLOTS * SLOT_BYTES
 CUT_BYTES: Final = 64
 WRITE_BYTES_MAX: Final = 31
 READ, LATEST, LEDGER, HEALTH, WRITE, MEND_SLOT, MEND_LEDGER, REPLACE = range(8)
@@ -96,10 +87,10 @@ def slot_seeds() -> list[bytes]:
 @cache
 def base() -> bytes:
     """Return a ring in use: eight slots, twenty samples."""
-    header = encode_header(RingHeader(77, PID, 1, DEVICE, 3, SLOTS, NEWEST, 1, START_NS))
+    header = formats_ring.encode_header(formats_ring.RingHeader(77, PID, 1, DEVICE, 3, SLOTS, NEWEST, 1, START_NS))
     image = bytearray(header + bytes(SLOTS * SLOT_BYTES))
-    block = encode_ledger_block(5, "hipnuc-uart", [7] * len(LEDGER_FIELDS))
-    image[LEDGER_BLOCK_OFFSET : LEDGER_BLOCK_OFFSET + LEDGER_BLOCK_BYTES] = block
+    block = formats_ring.encode_ledger_block(5, "hipnuc-uart", [7] * len(LEDGER_FIELDS))
+    image[formats_ring.LEDGER_BLOCK_OFFSET : formats_ring.LEDGER_BLOCK_OFFSET + formats_ring.LEDGER_BLOCK_BYTES] = block
     for seq in range(NEWEST - SLOTS + 1, NEWEST + 1):
         at = _slot_at(seq)
         image[at : at + SLOT_BYTES] = encode_slot(make_sample(seq), 3)
@@ -107,7 +98,7 @@ def base() -> bytes:
 
 
 def _slot_at(number: int) -> int:
-    return HEADER_BYTES + number % SLOTS * SLOT_BYTES
+    return formats_ring.HEADER_BYTES + number % SLOTS * SLOT_BYTES
 
 
 class RingFile:
@@ -127,8 +118,8 @@ class RingFile:
         self.write(at + CRC_OFFSET, zlib.crc32(self.image[at : at + CRC_OFFSET]).to_bytes(4, "little"))
 
     def mend_ledger(self) -> None:
-        block = self.image[LEDGER_BLOCK_OFFSET:LEDGER_CRC_OFFSET]
-        self.write(LEDGER_CRC_OFFSET, zlib.crc32(block).to_bytes(4, "little"))
+        block = self.image[formats_ring.LEDGER_BLOCK_OFFSET : formats_ring.LEDGER_CRC_OFFSET]
+        self.write(formats_ring.LEDGER_CRC_OFFSET, zlib.crc32(block).to_bytes(4, "little"))
 
     def replace(self) -> None:
         other = self.path.with_suffix(".new")
@@ -218,15 +209,17 @@ def ring_seeds() -> list[bytes]:
     fields = {"slot_count": 4, "ledger_count": 4, "state": 4, "newest_seq": 8, "first_seq": 8, "heartbeat_ns": 8}
     for name, size in fields.items():
         for value in (0, 1, 0x80 << (8 * size - 8), (1 << (8 * size)) - 1):
-            write = written(OFFSETS[name], value.to_bytes(size, "little"))
+            write = written(formats_ring.OFFSETS[name], value.to_bytes(size, "little"))
             found.append(bytes([1, 0]) + write + readings + readings)
             found.append(bytes([0, 0]) + bytes([READ]) + write + readings + bytes([READ]))
     newer = written(_slot_at(NEWEST + 1), encode_slot(make_sample(NEWEST + 1), 3)[:WRITE_BYTES_MAX])
-    newest = written(OFFSETS["newest_seq"], (NEWEST + 1).to_bytes(8, "little"))
+    newest = written(formats_ring.OFFSETS["newest_seq"], (NEWEST + 1).to_bytes(8, "little"))
     mended = bytes([MEND_SLOT, (NEWEST + 1) % SLOTS])
     found.append(bytes([0, 0, READ]) + newer + newest + bytes([READ]) + mended + readings)
     found.append(bytes([0, 0, READ]) + newer + mended + newest + readings)
-    found.append(bytes([1, 0]) + written(OFFSETS["device"], b"\xff\x1b[31m\n") + bytes([MEND_LEDGER]) + readings)
+    found.append(
+        bytes([1, 0]) + written(formats_ring.OFFSETS["device"], b"\xff\x1b[31m\n") + bytes([MEND_LEDGER]) + readings
+    )
     return found
 
 

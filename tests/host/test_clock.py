@@ -1,11 +1,13 @@
-"""Host clocks: exact under preemption, updated after a step, correct while slewed, cheap in between."""
+"""Host clocks: exact under preemption, updated after a step, correct while slewed, cheap in between.
+Conversion between CLOCK_MONOTONIC and steady time: exact at pairs, linear between them, with a correct error."""
 
 import time
 from itertools import pairwise
+from random import Random
 
 import pytest
 
-from imud.host.clock import KEPT_NS, READINGS, TOLERANCE_NS, HostClock
+from imud.host import clock as host_clock
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 AHEAD_NS = 1_795_000_000 * NS_PER_S
@@ -24,7 +26,7 @@ class Host:
         self.calls = 0
         self.preempted: dict[int, int] = {}
         """Duration of the preemption before each call, ns."""
-        self.clock = HostClock(self.monotonic_ns, self.realtime_ns, self.raw_ns)
+        self.clock = host_clock.HostClock(self.monotonic_ns, self.realtime_ns, self.raw_ns)
 
     def sleep(self, ns: int) -> None:
         self.raw += ns
@@ -62,7 +64,7 @@ def test_the_first_reading_measures_and_later_readings_cost_two_calls() -> None:
 
 
 def test_preemption_at_any_call_shifts_neither_difference() -> None:
-    for call in range(1, 4 * READINGS):
+    for call in range(1, 4 * host_clock.READINGS):
         for away_ns in (5 * NS_PER_US, NS_PER_MS, 3 * NS_PER_S):
             host = Host()
             host.preempted = {call: away_ns}
@@ -76,7 +78,7 @@ def test_a_host_that_is_never_undisturbed_gives_the_tightest_of_some_readings() 
     host.preempted = {call: 10 * NS_PER_US + call * NS_PER_US for call in range(1, 1000)}
     calls = host.calls
     offset_ns = host.offset_ns()
-    assert host.calls <= calls + 2 + 4 * READINGS + 2
+    assert host.calls <= calls + 2 + 4 * host_clock.READINGS + 2
     assert abs(offset_ns - AHEAD_NS) <= host.clock.error_ns
     host = Host()
     host.preempted = dict.fromkeys(range(1, 10_000), 10 * NS_PER_US)
@@ -100,10 +102,10 @@ def test_a_step_of_the_wall_clock_or_a_leap_second_is_seen_by_the_next_reading(s
 def test_a_step_below_the_tolerance_is_seen_within_a_second() -> None:
     host = Host()
     before = host.offset_ns()
-    host.ahead_ns += 3 * TOLERANCE_NS // 4
+    host.ahead_ns += 3 * host_clock.TOLERANCE_NS // 4
     assert host.offset_ns() == before
-    host.sleep(KEPT_NS)
-    assert abs(host.offset_ns() - before - 3 * TOLERANCE_NS // 4) <= 2 * CALL_NS
+    host.sleep(host_clock.KEPT_NS)
+    assert abs(host.offset_ns() - before - 3 * host_clock.TOLERANCE_NS // 4) <= 2 * CALL_NS
 
 
 @pytest.mark.parametrize("rate", [20e-6, -500e-6, 500e-6, 83_333e-6, -83_333e-6])
@@ -115,7 +117,7 @@ def test_while_the_clocks_are_slewed_utc_stays_and_steering_is_followed(rate: fl
         host.sleep(10 * NS_PER_MS)
         assert abs(host.offset_ns() - first) <= 2 * CALL_NS
         now_ns = host.truth_ns()
-        assert abs(host.clock.steady.steady_ns(now_ns) - host.raw) <= TOLERANCE_NS + 4 * CALL_NS
+        assert abs(host.clock.steady.steady_ns(now_ns) - host.raw) <= host_clock.TOLERANCE_NS + 4 * CALL_NS
     assert host.clock.steady.rate == pytest.approx(rate, abs=1e-6)
 
 
@@ -144,7 +146,9 @@ def test_after_a_suspend_and_a_stopped_machine_nothing_moves() -> None:
 
 def test_a_suspend_differs_from_a_step_and_from_a_preemption() -> None:
     host, asleep_ns = Host(), 0
-    clock = HostClock(host.monotonic_ns, host.realtime_ns, host.raw_ns, lambda: host.monotonic_ns() + asleep_ns)
+    clock = host_clock.HostClock(
+        host.monotonic_ns, host.realtime_ns, host.raw_ns, lambda: host.monotonic_ns() + asleep_ns
+    )
     for number in range(1, 30):
         host.preempted = {host.calls + number: 3 * NS_PER_S}
         clock.utc_offset_ns()
@@ -161,7 +165,7 @@ def test_a_suspend_differs_from_a_step_and_from_a_preemption() -> None:
 
 def test_a_coarse_clock_is_supported() -> None:
     now = [1000 * NS_PER_S]
-    clock = HostClock(lambda: now[0], lambda: now[0] + AHEAD_NS, lambda: now[0])
+    clock = host_clock.HostClock(lambda: now[0], lambda: now[0] + AHEAD_NS, lambda: now[0])
     for _ in range(10):
         assert [clock.utc_offset_ns() for _ in range(3)] == [AHEAD_NS] * 3
         assert clock.steady.steady_ns(now[0]) == now[0]
@@ -172,16 +176,16 @@ def test_without_the_raw_clock_the_monotonic_clock_is_used(monkeypatch: pytest.M
     def refuse(_clock: int) -> int:
         raise OSError(22, "Invalid argument")
 
-    assert HostClock().is_steering_seen
+    assert host_clock.HostClock().is_steering_seen
     monkeypatch.setattr(time, "clock_gettime_ns", refuse)
-    clock = HostClock()
+    clock = host_clock.HostClock()
     assert not clock.is_steering_seen
     assert abs(clock.utc_offset_ns() - (time.time_ns() - time.monotonic_ns())) < 60 * NS_PER_S
     assert abs(clock.steady.steady_ns(time.monotonic_ns()) - time.monotonic_ns()) < 60 * NS_PER_S
 
 
 def test_the_real_clocks() -> None:
-    clock = HostClock()
+    clock = host_clock.HostClock()
     before_ns = time.time_ns()
     utc_ns = clock.now_ns() + clock.utc_offset_ns()
     assert before_ns - NS_PER_MS < utc_ns < time.time_ns() + 60 * NS_PER_S
@@ -190,3 +194,140 @@ def test_the_real_clocks() -> None:
         clock.utc_offset_ns()
         steady.append(clock.steady.steady_ns(clock.now_ns()))
     assert all(a < b for a, b in pairwise(steady))
+
+
+BEGIN_NS = 700 * NS_PER_S
+RAW_NS = 699 * NS_PER_S
+"""CLOCK_MONOTONIC_RAW at the start: 1 s behind because of an earlier slew."""
+FAST = 83_333e-6
+
+
+def slewed(rate: float, pairs: int, step_ns: int = 10 * NS_PER_MS) -> host_clock.SteadyTime:
+    """Return a clock that runs `rate` fast from the start, with a pair per step."""
+    steady = host_clock.SteadyTime()
+    for i in range(pairs):
+        steady.add_pair(BEGIN_NS + int(i * step_ns * (1 + rate)), RAW_NS + i * step_ns)
+    return steady
+
+
+def test_without_pairs_and_with_one_the_two_are_the_same() -> None:
+    assert (host_clock.UNSTEERED.offset_ns, host_clock.UNSTEERED.rate, host_clock.UNSTEERED.error_ns(BEGIN_NS)) == (
+        0,
+        0.0,
+        0.0,
+    )
+    assert host_clock.UNSTEERED.even_from_ns < 0
+    steady = host_clock.SteadyTime()
+    steady.add_pair(BEGIN_NS, RAW_NS)
+    for at_ns in (BEGIN_NS - NS_PER_S, BEGIN_NS, BEGIN_NS + NS_PER_S):
+        for one in (host_clock.UNSTEERED, steady):
+            assert one.steady_ns(at_ns) == one.monotonic_ns(at_ns) == at_ns
+
+
+def test_offsets_between_before_and_after_pairs() -> None:
+    """By hand: 83,333 ppm for a second, pairs every 10 ms; half a step is 5 ms, or 5.416665 ms."""
+    steady = slewed(FAST, 101)
+    assert steady.monotonic_ns(BEGIN_NS + 5 * NS_PER_MS) == BEGIN_NS + 5_416_665
+    assert steady.steady_ns(BEGIN_NS + 5_416_665) == BEGIN_NS + 5 * NS_PER_MS
+    assert steady.monotonic_ns(BEGIN_NS + NS_PER_S) == BEGIN_NS + 1_083_333_000
+    assert steady.rate == pytest.approx(FAST, rel=1e-6)
+    steady = slewed(FAST, 11)
+    assert steady.monotonic_ns(BEGIN_NS - 7) == BEGIN_NS - 7
+    last_ns = BEGIN_NS + 100 * NS_PER_MS
+    assert steady.monotonic_ns(last_ns + 7) == last_ns + 8_333_300 + 7
+    assert steady.steady_ns(last_ns + 8_333_300 + 7) == last_ns + 7
+
+
+def test_both_conversions_are_each_other_s_reverse_and_rise() -> None:
+    random, steady = Random(1), host_clock.SteadyTime()
+    monotonic, raw, rate = float(BEGIN_NS), RAW_NS, 0.0
+    for _ in range(500):
+        rate = random.choice((rate, rate, 0.0, FAST, -FAST, 500e-6))
+        step_ns = random.randrange(1000, 20 * NS_PER_MS)
+        monotonic, raw = monotonic + step_ns * (1 + rate), raw + step_ns
+        steady.add_pair(int(monotonic), raw)
+    before = 0
+    for at_ns in range(BEGIN_NS, int(monotonic), 777_777):
+        there_ns = steady.steady_ns(at_ns)
+        assert abs(steady.monotonic_ns(there_ns) - at_ns) <= 2
+        assert there_ns > before
+        before = there_ns
+
+
+def test_a_time_at_which_the_offset_was_still_the_old_one_is_a_pair() -> None:
+    """The slew started between 0.9 and 1 s, not at 0: it does not change times before 0.9 s."""
+    steady = host_clock.SteadyTime()
+    steady.add_pair(BEGIN_NS, RAW_NS)
+    steady.add_pair(BEGIN_NS + 1_008_333_300, RAW_NS + NS_PER_S, RAW_NS + 900 * NS_PER_MS)
+    assert steady.monotonic_ns(BEGIN_NS + 900 * NS_PER_MS) == BEGIN_NS + 900 * NS_PER_MS
+    assert steady.monotonic_ns(BEGIN_NS + 950 * NS_PER_MS) == BEGIN_NS + 950 * NS_PER_MS + 4_166_650
+    assert steady.rate == pytest.approx(8_333_300 / NS_PER_S)
+
+
+def test_the_newest_offset_holds_while_it_was_constant() -> None:
+    steady = slewed(20e-6, 101)  # 200 ns per step
+    assert abs(steady.monotonic_ns(steady.even_from_ns) - steady.even_from_ns - steady.offset_ns) <= host_clock.EVEN_NS
+    last_ns = BEGIN_NS + NS_PER_S
+    assert steady.even_from_ns == last_ns - 5 * 10 * NS_PER_MS
+    steady = slewed(FAST, 101)
+    assert steady.even_from_ns == last_ns
+    steady.add_pair(BEGIN_NS + 2 * NS_PER_S + 83_333_000, RAW_NS + 2 * NS_PER_S)
+    assert steady.even_from_ns == last_ns  # the slew has ended
+
+
+def test_less_exact_pairs_do_not_shorten_the_constant_time() -> None:
+    steady = host_clock.SteadyTime()
+    for i in range(100):
+        steady.add_pair(BEGIN_NS + i * NS_PER_S + (i % 2) * 3 * NS_PER_US, RAW_NS + i * NS_PER_S, 0, NS_PER_US)
+    assert steady.even_from_ns == BEGIN_NS
+    steady.add_pair(BEGIN_NS + 100 * NS_PER_S + 4 * NS_PER_US, RAW_NS + 100 * NS_PER_S, 0, NS_PER_US)
+    assert steady.even_from_ns == BEGIN_NS + NS_PER_S  # 4 µs after the first pair, 1 µs after the second pair
+
+
+def test_a_change_of_the_rate_between_two_pairs_is_in_the_error() -> None:
+    """The true time is in a triangle above the chord: at most a quarter of the step times the change."""
+    steady = slewed(0.0, 5)
+    now_ns, raw = BEGIN_NS + 40 * NS_PER_MS, RAW_NS + 40 * NS_PER_MS
+    for _ in range(4):
+        now_ns, raw = now_ns + int(10 * NS_PER_MS * (1 + FAST)), raw + 10 * NS_PER_MS
+        steady.add_pair(now_ns, raw)
+    onset_ns = BEGIN_NS + 45 * NS_PER_MS
+    assert 100_000 < steady.error_ns(onset_ns) < 300_000
+    assert steady.error_ns(BEGIN_NS + 15 * NS_PER_MS) == 0.0
+    assert steady.error_ns(BEGIN_NS + 75 * NS_PER_MS) < 10
+    assert steady.error_ns(BEGIN_NS - NS_PER_S) == steady.error_ns(BEGIN_NS + NS_PER_S) == 0.0
+
+
+def test_memory_is_bounded_and_the_rest_stays_correct() -> None:
+    steady = slewed(FAST, 2 * host_clock.PAIRS_MOST + 10, NS_PER_MS)
+    last_ns = BEGIN_NS + (2 * host_clock.PAIRS_MOST + 9) * NS_PER_MS
+    for back_ns in (0, 3 * NS_PER_MS // 2, NS_PER_S, host_clock.RATE_NS):
+        steady_ns = last_ns - back_ns
+        assert steady.monotonic_ns(steady_ns) == pytest.approx(BEGIN_NS + (steady_ns - BEGIN_NS) * (1 + FAST), abs=2)
+    assert steady.monotonic_ns(BEGIN_NS) > BEGIN_NS  # the pair is no longer known
+    steady = slewed(FAST, host_clock.PAIRS_MOST + 1, NS_PER_MS)  # half of the pairs were removed
+    oldest_ns = BEGIN_NS + (host_clock.PAIRS_MOST // 2) * NS_PER_MS
+    assert steady.monotonic_ns(oldest_ns) == pytest.approx(BEGIN_NS + (oldest_ns - BEGIN_NS) * (1 + FAST), abs=2)
+
+
+def test_the_rate_is_that_of_the_last_two_seconds() -> None:
+    assert slewed(FAST, 2).rate == pytest.approx(FAST, rel=1e-6)
+    steady = slewed(0.0, 3001, NS_PER_MS)
+    for ms in range(1, 2001):
+        steady.add_pair(
+            BEGIN_NS + 3 * NS_PER_S + int(ms * NS_PER_MS * (1 + FAST)), RAW_NS + 3 * NS_PER_S + ms * NS_PER_MS
+        )
+    assert steady.rate == pytest.approx(FAST, rel=1e-6)
+    steady.add_pair(
+        BEGIN_NS + 5 * NS_PER_S + int(2 * NS_PER_S * FAST) + 400 * NS_PER_MS, RAW_NS + 5 * NS_PER_S + 400 * NS_PER_MS
+    )
+    assert steady.rate == pytest.approx(FAST * 0.8, rel=1e-3)
+
+
+def test_a_clock_that_is_read_faster_than_it_ticks() -> None:
+    steady = host_clock.SteadyTime()
+    for i in range(10):
+        steady.add_pair(BEGIN_NS, RAW_NS)
+        steady.add_pair(BEGIN_NS + i, RAW_NS)
+    assert abs(steady.steady_ns(BEGIN_NS) - BEGIN_NS) < 50
+    assert abs(steady.offset_ns) < 50

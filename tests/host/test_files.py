@@ -11,16 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from imud.host.files import (
-    NotRegularFile,
-    StateFile,
-    can_replace,
-    group_of,
-    open_regular,
-    open_stream,
-    read_regular,
-    replace_file,
-)
+from imud.host import files
 
 
 def fifo(path: Path) -> None:
@@ -47,12 +38,12 @@ def link_to(target: str) -> Callable[[Path], None]:
 def test_other_file_types_are_rejected_immediately(make: Callable[[Path], None], words: str, tmp_path: Path) -> None:
     make(tmp_path / "it")
     with pytest.raises(OSError, match=words):
-        open_regular(tmp_path / "it")
+        files.open_regular(tmp_path / "it")
 
 
 def test_a_path_with_a_null_character() -> None:
     with pytest.raises(OSError, match="null"):
-        open_regular("a\0b")
+        files.open_regular("a\0b")
 
 
 def test_a_file_replaced_between_check_and_opening(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -67,8 +58,8 @@ def test_a_file_replaced_between_check_and_opening(tmp_path: Path, monkeypatch: 
 
     descriptors: list[int] = []
     monkeypatch.setattr("imud.host.files.os.open", exchange)
-    with pytest.raises(NotRegularFile, match="FIFO"):
-        open_regular(path)
+    with pytest.raises(files.NotRegularFile, match="FIFO"):
+        files.open_regular(path)
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(descriptors[0])
 
@@ -77,9 +68,9 @@ def test_no_more_is_read_than_wanted(tmp_path: Path) -> None:
     path = tmp_path / "sparse"
     with path.open("wb") as file:
         file.truncate(1 << 40)
-    assert len(read_regular(path, 1000)) == 1000
-    replace_file(path, b"short")
-    assert read_regular(path, 1000) == b"short"
+    assert len(files.read_regular(path, 1000)) == 1000
+    files.replace_file(path, b"short")
+    assert files.read_regular(path, 1000) == b"short"
     assert path.stat().st_mode & 0o777 == 0o640 & ~_umask()
 
 
@@ -95,7 +86,7 @@ def test_a_failed_replacement_keeps_the_old_file(failing: str, tmp_path: Path, m
     with monkeypatch.context() as patch:
         patch.setattr(f"imud.host.files.{failing}", fail)
         with pytest.raises(OSError, match="failed"):
-            replace_file(path, b"new", owner=(os.getuid() + 1, 0))
+            files.replace_file(path, b"new", owner=(os.getuid() + 1, 0))
     assert [one.name for one in tmp_path.iterdir()] == ["file"]
     assert path.read_bytes() == b"old"
 
@@ -105,29 +96,29 @@ def test_owner_and_mode_change_only_if_they_differ(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr("imud.host.files.os.fchown", lambda _, *owner: calls.append(owner))
     monkeypatch.setattr("imud.host.files.os.fchmod", lambda _, mode: calls.append((mode,)))
     own = os.getuid(), os.getgid()
-    replace_file(tmp_path / "file", b"", mode=0o600, owner=own)
+    files.replace_file(tmp_path / "file", b"", mode=0o600, owner=own)
     assert calls == []
-    replace_file(tmp_path / "file", b"", mode=0o4600, owner=(own[0], own[1] + 1))
-    replace_file(tmp_path / "file", b"", mode=0o600, owner=(own[0] + 1, own[1]))
+    files.replace_file(tmp_path / "file", b"", mode=0o4600, owner=(own[0], own[1] + 1))
+    files.replace_file(tmp_path / "file", b"", mode=0o600, owner=(own[0] + 1, own[1]))
     assert (calls[0], calls[-1]) == ((own[0], own[1] + 1), (own[0] + 1, own[1]))
 
 
 def test_a_fifo_is_opened_only_with_data(tmp_path: Path) -> None:
     path = tmp_path / "fifo"
     os.mkfifo(path)
-    with pytest.raises(NotRegularFile, match="no program writes"):
-        open_stream(path, 1)
+    with pytest.raises(files.NotRegularFile, match="no program writes"):
+        files.open_stream(path, 1)
     writer = os.open(path, os.O_RDWR)
     os.write(writer, b"data")
-    with open_stream(path, 1) as file:
+    with files.open_stream(path, 1) as file:
         assert os.get_blocking(file.fileno())
         assert file.read(4) == b"data"
     os.close(writer)
     (tmp_path / "file").write_bytes(b"regular")
-    with open_stream(tmp_path / "file", 1) as file:
+    with files.open_stream(tmp_path / "file", 1) as file:
         assert file.read() == b"regular"
-    with pytest.raises(NotRegularFile, match="directory"):
-        open_stream(tmp_path, 1)
+    with pytest.raises(files.NotRegularFile, match="directory"):
+        files.open_stream(tmp_path, 1)
 
 
 def test_group_of_a_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,15 +127,15 @@ def test_group_of_a_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     for found, expected in ((gid, name), (0, "other"), (4_000_000_000, "other")):
         status[5] = found
         monkeypatch.setattr("imud.host.files.os.stat", lambda _: os.stat_result(status))
-        assert group_of("/dev/ttyUSB0", "other") == expected
+        assert files.group_of("/dev/ttyUSB0", "other") == expected
     monkeypatch.undo()
-    assert group_of(str(tmp_path / "absent"), "other") == "other"
+    assert files.group_of(str(tmp_path / "absent"), "other") == "other"
 
 
 def test_a_state_file_keeps_the_newest_content(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "state" / "file"
     for content in ({"a": 1}, {"b": 2}):
-        state = StateFile(path, "saving", "is empty")
+        state = files.StateFile(path, "saving", "is empty")
         state.read(dict[str, int])
         state.write({"old": 0})
         state.write(content)
@@ -152,9 +143,9 @@ def test_a_state_file_keeps_the_newest_content(tmp_path: Path, caplog: pytest.Lo
         state.close()
         state.write({"after": 1})  # ignored: the thread has ended
         assert path.read_bytes() == msgspec.json.encode(content)
-        assert StateFile(None, "", "").read(dict[str, int]) == {}
+        assert files.StateFile(None, "", "").read(dict[str, int]) == {}
     assert path.parent.stat().st_mode & 0o777 == 0o750 & ~_umask()
-    state = StateFile(path, "saving", "is empty")
+    state = files.StateFile(path, "saving", "is empty")
     assert (state.read(dict[str, int]), caplog.messages) == ({"b": 2}, [])
     path.unlink()
     assert (state.read(dict[str, int]), caplog.messages) == ({}, [])
@@ -169,7 +160,7 @@ def test_a_state_file_keeps_the_newest_content(tmp_path: Path, caplog: pytest.Lo
     state.write({})
     state.close()
     assert f"cannot write {path}: Is a directory; after the next start is empty" in caplog.messages[-1]
-    assert StateFile(None, "", "").read(dict[str, int]) == {}
+    assert files.StateFile(None, "", "").read(dict[str, int]) == {}
 
 
 def _umask() -> int:
@@ -184,13 +175,13 @@ def _umask() -> int:
 )
 def test_others_can_replace_files_if_they_can_write_without_the_sticky_bit(mode: int, is_safe: bool) -> None:
     status = os.stat_result((stat.S_IFDIR | mode, 0, 0, 1, os.geteuid(), 0, 0, 0, 0, 0))
-    problem = can_replace(status, "/a", "recordings")
+    problem = files.can_replace(status, "/a", "recordings")
     expected = f"/a has mode {mode:04o}: other users can replace recordings; chmod go-w /a"
     assert problem == ("" if is_safe else expected)
 
 
 def test_the_owner_of_a_directory_can_replace_its_files() -> None:
     foreign = os.stat_result((stat.S_IFDIR | 0o700, 0, 0, 1, os.geteuid() + 12345, 0, 0, 0, 0, 0))
-    assert f"/a belongs to user {os.geteuid() + 12345}, who can replace it" in can_replace(foreign, "/a", "it")
+    assert f"/a belongs to user {os.geteuid() + 12345}, who can replace it" in files.can_replace(foreign, "/a", "it")
     root = os.stat_result((stat.S_IFDIR | 0o700, 0, 0, 1, 0, 0, 0, 0, 0, 0))
-    assert can_replace(root, "/a", "it") == ""
+    assert files.can_replace(root, "/a", "it") == ""

@@ -11,21 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from imud.host.log import (
-    KNOWN_MOST,
-    MESSAGE_CHARACTERS_MAX,
-    TRACEBACK_LINES_MAX,
-    VALUE_CHARACTERS_MAX,
-    LineFormatter,
-    LogWriter,
-    RepeatFilter,
-    is_journal,
-    log_to,
-    messages_dropped,
-    printable,
-    same_as,
-    shown,
-)
+from imud.host import log as host_log
 from tests.support.daemon_process import wait_until
 from tests.support.surroundings import pipe, read_until
 
@@ -58,7 +44,7 @@ def formatted(message: str, *values: object, **more: object) -> str:
     """Return the line of one message."""
     record = logging.LogRecord("imud", logging.WARNING, __file__, 1, message, values, None)
     record.__dict__.update(more)
-    return LineFormatter(journal=True).format(record)
+    return host_log.LineFormatter(journal=True).format(record)
 
 
 # --- journal, repeated messages ---------------------------------------------------------------------------------------
@@ -70,20 +56,22 @@ def formatted(message: str, *values: object, **more: object) -> str:
 )
 def test_lines_for_the_journal_begin_with_their_priority(level: int, priority: int) -> None:
     record = logging.LogRecord("imud", level, __file__, 1, "bow is %s", ("up",), None)
-    assert LineFormatter(journal=True).format(record) == f"<{priority}>bow is up"
+    assert host_log.LineFormatter(journal=True).format(record) == f"<{priority}>bow is up"
     elsewhere = rf"\d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d,\d{{3}} {logging.getLevelName(level)} bow is up"
-    assert re.fullmatch(elsewhere, LineFormatter(journal=False).format(record))
+    assert re.fullmatch(elsewhere, host_log.LineFormatter(journal=False).format(record))
 
 
-def passed(repeats: RepeatFilter, t_s: float, message: str, *values: object, level: int = logging.WARNING) -> str:
+def passed(
+    repeats: host_log.RepeatFilter, t_s: float, message: str, *values: object, level: int = logging.WARNING
+) -> str:
     """Return the line that passes the filter at a time; empty if none passes."""
     record = logging.LogRecord("imud", level, __file__, 1, message, values, None)
     record.created = t_s
-    return LineFormatter(journal=True).format(record) if repeats.filter(record) else ""
+    return host_log.LineFormatter(journal=True).format(record) if repeats.filter(record) else ""
 
 
 def test_repeated_messages_pass_less_and_less_often() -> None:
-    repeats = RepeatFilter()
+    repeats = host_log.RepeatFilter()
     told = {t: line for t in range(200) if (line := passed(repeats, 1000 + t, "%s: %d lost", "bow", t))}
     assert (list(told), told[1]) == ([0, 1, 3, 7, 15, 31, 63, 123, 183], "<4>bow: 1 lost")
     assert told[7] == "<4>bow: 7 lost, 3 similar messages in 4 s"
@@ -92,7 +80,7 @@ def test_repeated_messages_pass_less_and_less_often() -> None:
 
 
 def test_other_messages_pass_immediately() -> None:
-    repeats = RepeatFilter()
+    repeats = host_log.RepeatFilter()
     assert passed(repeats, 0, "%s: %d lost", "bow", 1)
     assert not passed(repeats, 0, "%s: %d lost", "bow", 2)
     assert passed(repeats, 0, "%s: %d lost", "stern", 2)
@@ -105,19 +93,19 @@ def test_other_messages_pass_immediately() -> None:
 
 
 def test_texts_differ_except_for_numbers() -> None:
-    repeats, told = RepeatFilter(), []
+    repeats, told = host_log.RepeatFilter(), []
     for text in ("3 samples lost", "5 samples lost", "the adapter is gone"):
         values = {"msg": "%s: %s", "args": ("bow", text), "levelno": logging.WARNING, "created": 0.0}
-        told.append(repeats.filter(logging.makeLogRecord(values | same_as(text))))
+        told.append(repeats.filter(logging.makeLogRecord(values | host_log.same_as(text))))
     assert told == [True, False, True]
 
 
 def test_remembered_messages_are_bounded() -> None:
-    repeats = RepeatFilter()
-    for number in range(KNOWN_MOST + 1):
+    repeats = host_log.RepeatFilter()
+    for number in range(host_log.KNOWN_MOST + 1):
         assert passed(repeats, 0, f"message {number}")
     assert passed(repeats, 0, "message 0")  # forgotten
-    assert not passed(repeats, 0, f"message {KNOWN_MOST}")
+    assert not passed(repeats, 0, f"message {host_log.KNOWN_MOST}")
 
 
 # --- texts and values -------------------------------------------------------------------------------------------------
@@ -125,17 +113,17 @@ def test_remembered_messages_are_bounded() -> None:
 
 @pytest.mark.parametrize("text", HOSTILE)
 def test_printable_is_one_bounded_line_for_every_encoding(text: str) -> None:
-    line = printable(text)
+    line = host_log.printable(text)
     assert line.isprintable()
-    assert len(line) <= VALUE_CHARACTERS_MAX
+    assert len(line) <= host_log.VALUE_CHARACTERS_MAX
     line.encode("utf-8")
 
 
 def test_printable_marks_a_cut() -> None:
-    assert printable("Überseeschiff 3 °C") == "Überseeschiff 3 °C"
-    assert printable("a\nb\x1b\udc80\u202e") == r"a\nb\x1b\udc80\u202e"
-    assert printable("x" * 300, 10) == "x" * 9 + "…"
-    assert printable("\n" * 6, 10) == r"\n\n\n\n\n"[:9] + "…"
+    assert host_log.printable("Überseeschiff 3 °C") == "Überseeschiff 3 °C"
+    assert host_log.printable("a\nb\x1b\udc80\u202e") == r"a\nb\x1b\udc80\u202e"
+    assert host_log.printable("x" * 300, 10) == "x" * 9 + "…"
+    assert host_log.printable("\n" * 6, 10) == r"\n\n\n\n\n"[:9] + "…"
 
 
 class Unshowable:
@@ -150,15 +138,15 @@ class Unshowable:
     ids=lambda value: type(value).__name__,
 )  # fmt: skip
 def test_shown_is_one_bounded_line_of_any_value(value: object) -> None:
-    line = shown(value)
+    line = host_log.shown(value)
     assert line.isprintable()
-    assert len(line) <= VALUE_CHARACTERS_MAX
+    assert len(line) <= host_log.VALUE_CHARACTERS_MAX
 
 
 def test_shown_is_a_literal_where_it_fits_and_has_the_outer_levels_of_a_deep_value() -> None:
-    assert shown({"rate_hz": 100, "name": "a'b"}) == """{'name': "a'b", 'rate_hz': 100}"""
-    assert shown(b"\x01") == r"b'\x01'"
-    assert shown(nested(100_001)) == "{'a': [{'a': [{...}]}]}"
+    assert host_log.shown({"rate_hz": 100, "name": "a'b"}) == """{'name': "a'b", 'rate_hz': 100}"""
+    assert host_log.shown(b"\x01") == r"b'\x01'"
+    assert host_log.shown(nested(100_001)) == "{'a': [{'a': [{...}]}]}"
 
 
 # --- messages ---------------------------------------------------------------------------------------------------------
@@ -169,12 +157,12 @@ def test_a_message_is_one_line_and_each_line_of_a_traceback_is_escaped(text: str
     for line in (formatted("%s: gone", text), formatted(text)):
         assert line.isprintable()
         assert line.startswith("<4>")
-        assert len(line) <= MESSAGE_CHARACTERS_MAX + len("<4>")
+        assert len(line) <= host_log.MESSAGE_CHARACTERS_MAX + len("<4>")
     try:
         raise ValueError(text)
     except ValueError:
         lines = formatted("it failed", exc_info=sys.exc_info()).split("\n")
-    assert all(line.isprintable() and len(line) <= MESSAGE_CHARACTERS_MAX + len("<4>    ") for line in lines)
+    assert all(line.isprintable() and len(line) <= host_log.MESSAGE_CHARACTERS_MAX + len("<4>    ") for line in lines)
     assert all(line.startswith("<4>    ") for line in lines[1:]), "no line of a traceback looks like a message"
 
 
@@ -193,7 +181,7 @@ def test_a_long_traceback_is_cut_and_its_end_is_kept() -> None:
     except ValueError:
         lines = formatted("it failed", exc_info=sys.exc_info()).split("\n")
     assert lines[0] == "<4>it failed"
-    assert len(lines) == TRACEBACK_LINES_MAX + 1
+    assert len(lines) == host_log.TRACEBACK_LINES_MAX + 1
     assert lines[-1] == "<4>    line 9999"
 
 
@@ -202,7 +190,7 @@ def test_a_long_traceback_is_cut_and_its_end_is_kept() -> None:
 
 def test_messages_arrive_in_order_and_whole_at_the_end() -> None:
     with pipe() as (reader, descriptor):
-        with log_to(descriptor, "info"):
+        with host_log.log_to(descriptor, "info"):
             for number in range(100):
                 log.info("message %d", number)
             log.debug("not this one")
@@ -213,12 +201,12 @@ def test_messages_arrive_in_order_and_whole_at_the_end() -> None:
 
 @pytest.mark.live
 def test_a_log_without_a_reader_never_blocks_and_reports_dropped_messages() -> None:
-    with pipe(full=True) as (reader, descriptor), log_to(descriptor, "info") as writer:
+    with pipe(full=True) as (reader, descriptor), host_log.log_to(descriptor, "info") as writer:
         for number in range(5000):
             log.info("message %d", number)
         dropped = writer.dropped
         assert 3900 < dropped <= 4000  # messages outside the queue and the thread
-        assert messages_dropped() == dropped
+        assert host_log.messages_dropped() == dropped
         text = read_until(reader, b"messages dropped").decode()
         lines = text.splitlines()
         assert f"WARNING {dropped} messages dropped: the log was not read in time" in lines
@@ -236,16 +224,16 @@ def test_the_end_does_not_wait_for_a_reader_that_reads_nothing(monkeypatch: pyte
     waits: list[float | None] = []
     monkeypatch.setattr(threading.Thread, "join", lambda _thread, wait_s=None: waits.append(wait_s))
     with pipe(full=True) as (reader, descriptor):
-        with log_to(descriptor, "info"):
+        with host_log.log_to(descriptor, "info"):
             log.warning("lost")
-        writer = LogWriter(descriptor)
+        writer = host_log.LogWriter(descriptor)
         writer.close()
         writer.close()
         assert waits == [WRITE_S] * 2, "the second time it returns at once"
         no_thread_is_left()
         # a pipe with one free page is writable; a longer write would block
         assert len(os.read(reader, select.PIPE_BUF)) == select.PIPE_BUF
-        with log_to(descriptor, "info"):
+        with host_log.log_to(descriptor, "info"):
             try:
                 raise ValueError("\n".join("x" * 200 for _ in range(50)))
             except ValueError:
@@ -258,7 +246,7 @@ def test_a_message_that_cannot_be_formatted_is_counted_and_nothing_else(capfd: p
         def format(self, record: logging.LogRecord) -> str:
             raise ValueError(record.msg)
 
-    with pipe() as (_, descriptor), log_to(descriptor, "info") as writer:
+    with pipe() as (_, descriptor), host_log.log_to(descriptor, "info") as writer:
         writer.setFormatter(Broken())
         log.warning("one")
         assert writer.dropped == 1
@@ -269,14 +257,14 @@ def test_a_message_that_cannot_be_formatted_is_counted_and_nothing_else(capfd: p
 def test_the_journal_adds_the_time_itself(journal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("JOURNAL_STREAM", raising=False)
     with pipe() as (reader, descriptor):
-        assert not is_journal(descriptor)
+        assert not host_log.is_journal(descriptor)
         status = os.fstat(descriptor)
         monkeypatch.setenv("JOURNAL_STREAM", f"{status.st_dev}:{status.st_ino + (not journal)}")  # else redirected
-        with log_to(descriptor, "info"):
+        with host_log.log_to(descriptor, "info"):
             log.info("begun")
         line = os.read(reader, 1 << 16).decode()
     assert line == "<6>begun\n" if journal else line.endswith(" INFO begun\n")
-    assert not is_journal(-1)
+    assert not host_log.is_journal(-1)
 
 
 @pytest.mark.parametrize("kind", ["no reader", "full disk", "closed"])
@@ -288,7 +276,7 @@ def test_messages_that_cannot_be_written_are_counted(kind: str) -> None:
         descriptor = os.open("/dev/full", os.O_WRONLY)
     elif kind == "closed":
         os.close(descriptor)
-    with log_to(descriptor, "info") as writer:
+    with host_log.log_to(descriptor, "info") as writer:
         log.warning("one")
         log.warning("two")
         wait_until(lambda: writer.dropped == 2, "both are counted")
@@ -305,7 +293,7 @@ def test_a_file_receives_messages_and_reports_of_python(tmp_path: Path, monkeypa
     hooks = print, repr
     monkeypatch.setattr(sys, "unraisablehook", hooks[0])
     monkeypatch.setattr(threading, "excepthook", hooks[1])
-    with (tmp_path / "log").open("wb") as file, log_to(file.fileno(), "info"):
+    with (tmp_path / "log").open("wb") as file, host_log.log_to(file.fileno(), "info"):
         thread = threading.Thread(target=lambda: {}["missing"], name="worker")  # type: ignore[index]
         thread.start()
         thread.join()

@@ -13,19 +13,7 @@ from gpiod.line import Bias, Clock, Direction, Drive, Value
 from gpiod.line import Edge as Detection
 
 from imud.contracts.lines import Edge, InputOptions, LineOptions, OutputOptions, ResetOptions
-from imud.lines.gpio import (
-    EVENT,
-    GPIO_LINES,
-    KERNEL_EVENTS,
-    READ_EVENTS,
-    GpioInput,
-    GpioOutput,
-    LineEventDecoder,
-    LineLocation,
-    find_line,
-    load_gpiod,
-    request_error,
-)
+from imud.lines import gpio
 from imud.model.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
 from tests.support.event_loops import in_loop
 from tests.support.signal_bench import FakeGpiod
@@ -57,13 +45,13 @@ class Sink:
 
 
 def test_an_input_asks_for_both_edges_and_a_large_buffer(gpiod: FakeGpiod, tmp_path: Path) -> None:
-    line = GpioInput(
+    line = gpio.GpioInput(
         InputOptions(line="SOUT", active_low=True, bias="pull-down"), "bow sout " + "x" * 40, devices=tmp_path
     )
     line.open()
     assert line.title == "gpiochip0 line 0 (SOUT)"
     ((chip, offset, consumer, events),) = gpiod.asked
-    assert (chip, offset, events) == ("gpiochip0", 0, KERNEL_EVENTS)
+    assert (chip, offset, events) == ("gpiochip0", 0, gpio.KERNEL_EVENTS)
     assert consumer == "imud bow sout " + "x" * 17
     asked = gpiod.requests[0].settings
     assert (asked.direction, asked.edge_detection, asked.event_clock) == (
@@ -77,7 +65,7 @@ def test_an_input_asks_for_both_edges_and_a_large_buffer(gpiod: FakeGpiod, tmp_p
 
 @in_loop
 async def test_edges_come_by_the_loop_and_by_drain_and_lost_ones_are_counted(gpiod: FakeGpiod, tmp_path: Path) -> None:
-    line, sink = GpioInput(SOUT, devices=tmp_path), Sink()
+    line, sink = gpio.GpioInput(SOUT, devices=tmp_path), Sink()
     line.open()
     (request,) = gpiod.requests
     request.feed((100, 1, 1))
@@ -92,7 +80,7 @@ async def test_edges_come_by_the_loop_and_by_drain_and_lost_ones_are_counted(gpi
     assert sink.edges[1:] == [Edge(200, False, 2), Edge(300, True, 3)]
     assert line.edges_lost == 0
     line.close()
-    line, sink = GpioInput(SOUT, devices=tmp_path), Sink()
+    line, sink = gpio.GpioInput(SOUT, devices=tmp_path), Sink()
     for seqnos in ((3, 4), (1, 7)):
         line.open()
         line.start(sink.on_edges, sink.on_end)
@@ -105,14 +93,14 @@ async def test_edges_come_by_the_loop_and_by_drain_and_lost_ones_are_counted(gpi
 
 @in_loop
 async def test_many_edges_are_read_in_batches_but_not_for_ever(gpiod: FakeGpiod, tmp_path: Path) -> None:
-    line, sink = GpioInput(SOUT, devices=tmp_path), Sink()
+    line, sink = gpio.GpioInput(SOUT, devices=tmp_path), Sink()
     line.open()
     line.start(sink.on_edges, sink.on_end)
-    count = KERNEL_EVENTS + READ_EVENTS
+    count = gpio.KERNEL_EVENTS + gpio.READ_EVENTS
     gpiod.requests[0].feed(*((n, 1, n) for n in range(1, count + 1)))
     line.drain()
-    assert len(sink.edges) == KERNEL_EVENTS
-    assert sink.calls == KERNEL_EVENTS // READ_EVENTS
+    assert len(sink.edges) == gpio.KERNEL_EVENTS
+    assert sink.calls == gpio.KERNEL_EVENTS // gpio.READ_EVENTS
     async with asyncio.timeout(LIMIT_S):
         while len(sink.edges) < count:
             await asyncio.sleep(0)
@@ -121,7 +109,7 @@ async def test_many_edges_are_read_in_batches_but_not_for_ever(gpiod: FakeGpiod,
 
 @in_loop
 async def test_a_line_closed_by_the_handler_of_its_edges(gpiod: FakeGpiod, tmp_path: Path) -> None:
-    line, sink = GpioInput(SOUT, devices=tmp_path), Sink()
+    line, sink = gpio.GpioInput(SOUT, devices=tmp_path), Sink()
     line.open()
 
     def on_edges(edges: Sequence[Edge]) -> None:
@@ -129,16 +117,16 @@ async def test_a_line_closed_by_the_handler_of_its_edges(gpiod: FakeGpiod, tmp_p
         line.close()
 
     line.start(on_edges, sink.on_end)
-    gpiod.requests[0].feed(*((n, 1, n) for n in range(1, READ_EVENTS * 3)))
+    gpiod.requests[0].feed(*((n, 1, n) for n in range(1, gpio.READ_EVENTS * 3)))
     await sink.wait()
-    assert (len(sink.edges), sink.end) == (READ_EVENTS, None)
+    assert (len(sink.edges), sink.end) == (gpio.READ_EVENTS, None)
 
 
 @in_loop
 async def test_a_chip_that_vanishes_ends_the_line(
     gpiod: FakeGpiod, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    line, sink = GpioInput(SOUT, devices=tmp_path), Sink()
+    line, sink = gpio.GpioInput(SOUT, devices=tmp_path), Sink()
     line.open()
     line.start(sink.on_edges, sink.on_end)
 
@@ -158,7 +146,7 @@ async def test_a_chip_that_vanishes_ends_the_line(
 
 
 def test_level(gpiod: FakeGpiod, tmp_path: Path) -> None:
-    line = GpioInput(SOUT, devices=tmp_path)
+    line = gpio.GpioInput(SOUT, devices=tmp_path)
     with pytest.raises(LinkError, match="not open"):
         line.level()
     line.open()
@@ -176,7 +164,7 @@ def test_level(gpiod: FakeGpiod, tmp_path: Path) -> None:
 
 def test_a_busy_line(gpiod: FakeGpiod, tmp_path: Path) -> None:
     gpiod.refusal, gpiod.holder = errno.EBUSY, "spi0 CS0"
-    for line in (GpioInput(SOUT, devices=tmp_path), GpioOutput(OutputOptions(line="SOUT"), devices=tmp_path)):
+    for line in (gpio.GpioInput(SOUT, devices=tmp_path), gpio.GpioOutput(OutputOptions(line="SOUT"), devices=tmp_path)):
         with pytest.raises(LinkBusy, match="in use by spi0 CS0"):
             line.open()
         line.close()
@@ -184,7 +172,7 @@ def test_a_busy_line(gpiod: FakeGpiod, tmp_path: Path) -> None:
 
 def test_an_output_is_inactive_from_its_first_moment_to_its_last(gpiod: FakeGpiod, tmp_path: Path) -> None:
     done: list[tuple[int, bool, bool]] = []
-    line = GpioOutput(
+    line = gpio.GpioOutput(
         ResetOptions(line="RESET", open_drain=True), "bow reset", devices=tmp_path,
         drive=lambda fd, active: done.append((fd, active, gpiod.requests[0].released)),
     )  # fmt: skip
@@ -206,7 +194,7 @@ def test_an_output_whose_chip_vanishes_or_that_is_no_line(gpiod: FakeGpiod, tmp_
     def gone(_fd: int, _active: bool) -> None:
         raise OSError(errno.ENODEV, "by the test")
 
-    line = GpioOutput(OutputOptions(line="RESET"), devices=tmp_path, drive=gone)
+    line = gpio.GpioOutput(OutputOptions(line="RESET"), devices=tmp_path, drive=gone)
     line.open()
     with pytest.raises(LinkMissing, match="gpiochip10 line 0"):
         line.set(True)
@@ -214,8 +202,8 @@ def test_an_output_whose_chip_vanishes_or_that_is_no_line(gpiod: FakeGpiod, tmp_
     assert gpiod.requests[0].released
     assert gpiod.requests[0].settings.drive is Drive.PUSH_PULL
     # The kernel's own reply to the ioctl on a pipe
-    assert isinstance(GPIO_LINES.make_output(OutputOptions(line="RESET"), "x"), GpioOutput)
-    line = GpioOutput(OutputOptions(line="RESET"), devices=tmp_path)
+    assert isinstance(gpio.GPIO_LINES.make_output(OutputOptions(line="RESET"), "x"), gpio.GpioOutput)
+    line = gpio.GpioOutput(OutputOptions(line="RESET"), devices=tmp_path)
     line.open()
     with pytest.raises(LinkError, match="cannot be used: Inappropriate ioctl"):
         line.set(True)
@@ -223,7 +211,7 @@ def test_an_output_whose_chip_vanishes_or_that_is_no_line(gpiod: FakeGpiod, tmp_
 
 
 def test_size_of_the_kernel_struct() -> None:
-    assert EVENT.size == 48
+    assert gpio.EVENT.size == 48
 
 
 def event(t_ns: int, kind: int, seqno: int) -> bytes:
@@ -233,22 +221,22 @@ def event(t_ns: int, kind: int, seqno: int) -> bytes:
 
 
 def test_edges_with_jumps_of_the_count_which_are_losses() -> None:
-    events = LineEventDecoder()
+    events = gpio.LineEventDecoder()
     data = event(0x0102030405060708, 1, 1) + event(2**63 - 1, 2, 2)
     assert events.decode(data) == [Edge(0x0102030405060708, True, 1), Edge(2**63 - 1, False, 2)]
     assert events.decode(b"") == []
     assert events.lost == 0
-    events = LineEventDecoder()
+    events = gpio.LineEventDecoder()
     assert [edge.number for edge in events.decode(event(1, 1, 2) + event(2, 2, 10) + event(3, 1, 11))] == [2, 10, 11]
     assert events.lost == 1 + 7
 
 
 def test_numbers_go_on_when_the_count_wraps_and_after_a_restart() -> None:
-    events = LineEventDecoder()
+    events = gpio.LineEventDecoder()
     events.decode(event(1, 1, 2**32 - 1))
     assert [edge.number for edge in events.decode(event(2, 2, 0) + event(3, 1, 1))] == [2**32, 2**32 + 1]
     assert events.lost == 2**32 - 2
-    events = LineEventDecoder()
+    events = gpio.LineEventDecoder()
     events.decode(event(1, 1, 1) + event(2, 2, 2))
     events.restart()
     assert [edge.number for edge in events.decode(event(3, 1, 1))] == [3]
@@ -261,16 +249,16 @@ def test_numbers_go_on_when_the_count_wraps_and_after_a_restart() -> None:
 @pytest.mark.parametrize("chip", ["gpiochip0", "pinctrl-bcm2711"])
 @pytest.mark.parametrize(("line", "offset", "name"), [(0, 0, "SOUT"), (1, 1, ""), ("SOUT", 0, "SOUT")])
 def test_by_chip(gpiod: FakeGpiod, tmp_path: Path, chip: str, line: int | str, offset: int, name: str) -> None:
-    place = find_line(gpiod, LineOptions(line=line, chip=chip), tmp_path)
-    assert place == LineLocation(str(tmp_path / "gpiochip0"), offset, name)
+    place = gpio.find_line(gpiod, LineOptions(line=line, chip=chip), tmp_path)
+    assert place == gpio.LineLocation(str(tmp_path / "gpiochip0"), offset, name)
 
 
 def test_by_path_or_by_name_alone_whatever_other_names_a_chip_has(gpiod: FakeGpiod, tmp_path: Path) -> None:
-    place = find_line(gpiod, LineOptions(line="TWIN", chip=str(tmp_path / "gpiochip10")))
+    place = gpio.find_line(gpiod, LineOptions(line="TWIN", chip=str(tmp_path / "gpiochip10")))
     assert str(place) == "gpiochip10 line 1 (TWIN)"
-    assert str(find_line(gpiod, LineOptions(line="RESET"), tmp_path)) == "gpiochip10 line 0 (RESET)"
+    assert str(gpio.find_line(gpiod, LineOptions(line="RESET"), tmp_path)) == "gpiochip10 line 0 (RESET)"
     (tmp_path / "gpiochip4").symlink_to(tmp_path / "gpiochip0")
-    assert find_line(gpiod, LineOptions(line="SOUT"), tmp_path).path == str(tmp_path / "gpiochip0")
+    assert gpio.find_line(gpiod, LineOptions(line="SOUT"), tmp_path).path == str(tmp_path / "gpiochip0")
 
 
 @pytest.mark.parametrize(
@@ -287,7 +275,7 @@ def test_errors_of_missing_lines(
     gpiod: FakeGpiod, tmp_path: Path, line: int | str, chip: str, kind: type[LinkError], message: str
 ) -> None:
     with pytest.raises(LinkError) as caught:
-        find_line(gpiod, LineOptions(line=line, chip=chip), tmp_path)
+        gpio.find_line(gpiod, LineOptions(line=line, chip=chip), tmp_path)
     assert type(caught.value) is kind
     assert message in str(caught.value)
 
@@ -296,32 +284,32 @@ def test_no_chip_at_all_or_two_of_a_label(tmp_path: Path, gpiod: FakeGpiod) -> N
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(LinkMissing, match="on any chip: no chip exists"):
-        find_line(gpiod, LineOptions(line="SOUT"), empty)
+        gpio.find_line(gpiod, LineOptions(line="SOUT"), empty)
     with pytest.raises(LinkMissing, match="existing chips: none"):
-        find_line(gpiod, LineOptions(line=0, chip="gpiochip0"), empty)
+        gpio.find_line(gpiod, LineOptions(line=0, chip="gpiochip0"), empty)
     gpiod.chips["gpiochip10"] = gpiod.chips["gpiochip0"]
     with pytest.raises(LinkError, match=r"on one GPIO chip, got it on gpiochip0 \(.*\) and gpiochip10 \("):
-        find_line(gpiod, LineOptions(line=0, chip="pinctrl-bcm2711"), tmp_path)
+        gpio.find_line(gpiod, LineOptions(line=0, chip="pinctrl-bcm2711"), tmp_path)
 
 
 def test_a_denied_chip_matters_only_if_no_other_chip_has_the_line(gpiod: FakeGpiod, tmp_path: Path) -> None:
     gpiod.errors["gpiochip0"] = errno.EACCES
-    assert find_line(gpiod, LineOptions(line="RESET"), tmp_path).offset == 0
+    assert gpio.find_line(gpiod, LineOptions(line="RESET"), tmp_path).offset == 0
     for settings in (LineOptions(line="SOUT"), LineOptions(line=0, chip="gpiochip0"), LineOptions(line=0, chip="x")):
         with pytest.raises(
             LinkDenied, match=r"cannot open .*gpiochip0: user .* lacks the permission; the node must belong to group"
         ):
-            find_line(gpiod, settings, tmp_path)
+            gpio.find_line(gpiod, settings, tmp_path)
 
 
 def test_a_missing_chip_matters_only_if_no_other_chip_has_the_line(gpiod: FakeGpiod, tmp_path: Path) -> None:
     gpiod.errors["gpiochip0"] = errno.ENODEV
-    assert find_line(gpiod, LineOptions(line="RESET"), tmp_path).offset == 0
+    assert gpio.find_line(gpiod, LineOptions(line="RESET"), tmp_path).offset == 0
     with pytest.raises(LinkMissing, match="gpiochip0 is missing, or is not a GPIO chip: No such device"):
-        find_line(gpiod, LineOptions(line=0, chip="gpiochip0"), tmp_path)
+        gpio.find_line(gpiod, LineOptions(line=0, chip="gpiochip0"), tmp_path)
     (tmp_path / "ttyS0").touch()
     with pytest.raises(LinkError, match=r"cannot use .*ttyS0 as a GPIO chip"):
-        find_line(gpiod, LineOptions(line=0, chip="ttyS0"), tmp_path)
+        gpio.find_line(gpiod, LineOptions(line=0, chip="ttyS0"), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -338,28 +326,30 @@ def test_a_line_request_that_the_kernel_refuses(
     gpiod: FakeGpiod, tmp_path: Path, number: int, kind: type[LinkError], message: str
 ) -> None:
     gpiod.holder = "gpiomon"
-    error = request_error(gpiod, OSError(number, "by the test"), LineLocation(str(tmp_path / "gpiochip0"), 0, "SOUT"))
+    error = gpio.request_error(
+        gpiod, OSError(number, "by the test"), gpio.LineLocation(str(tmp_path / "gpiochip0"), 0, "SOUT")
+    )
     assert type(error) is kind
     assert message in str(error)
 
 
 def test_a_holder_without_a_name(gpiod: FakeGpiod, tmp_path: Path) -> None:
-    place = LineLocation(str(tmp_path / "gpiochip0"), 0, "SOUT")
-    assert "in use by an unknown program" in str(request_error(gpiod, OSError(errno.EBUSY, ""), place))
+    place = gpio.LineLocation(str(tmp_path / "gpiochip0"), 0, "SOUT")
+    assert "in use by an unknown program" in str(gpio.request_error(gpiod, OSError(errno.EBUSY, ""), place))
     gpiod.errors["gpiochip0"] = errno.ENODEV
-    assert isinstance(request_error(gpiod, OSError(errno.EBUSY, ""), place), LinkBusy)
+    assert isinstance(gpio.request_error(gpiod, OSError(errno.EBUSY, ""), place), LinkBusy)
 
 
 def test_gpiod_is_missing_or_that_of_libgpiod_1(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gpiod", None)
     with pytest.raises(LinkError, match="need the Python package gpiod, got none; run `pip install"):
-        load_gpiod()
+        gpio.load_gpiod()
     old = ModuleType("gpiod")
     old.__file__ = "/usr/lib/python3/dist-packages/gpiod.so"
     monkeypatch.setitem(sys.modules, "gpiod", old)
     with pytest.raises(LinkError, match=r"2\.3 or later, got the module of libgpiod 1 \(/usr/lib.*Debian 12"):
-        load_gpiod()
+        gpio.load_gpiod()
 
 
 def test_gpiod_of_the_environment() -> None:
-    assert hasattr(load_gpiod(), "request_lines")
+    assert hasattr(gpio.load_gpiod(), "request_lines")

@@ -1,4 +1,8 @@
-"""An RS-485 bus on a real pty: a shared port, echoes, silence, late and foreign replies, and an unplugged cable."""
+"""An RS-485 bus on a real pty: a shared port, echoes, silence, late and foreign replies, and an unplugged cable.
+The Modbus code with pymodbus: pymodbus as devices for imud's driver, and as master of imud's simulator.
+
+A pymodbus server has its own pseudo-terminal. A thread moves bytes between this terminal and the terminal of imud.
+"""
 
 import asyncio
 import errno
@@ -7,7 +11,7 @@ import os
 import select
 import struct
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -15,25 +19,26 @@ from typing import Any
 
 import msgspec
 import pytest
+from pymodbus.client import ModbusSerialClient
+from pymodbus.server import ModbusSerialServer
+from pymodbus.simulator import DataType, SimData, SimDevice
 
-from imud.contracts.script import Transfer
+from imud.contracts.codec import Vanished
+from imud.contracts.script import Transfer, run_transfer_script
+from imud.contracts.setting import words_of
 from imud.contracts.status import KernelCounters, SerialLineCounters
-from imud.drivers.hipnuc.modbus.registers import read_registers, set_id_by_serial, write_register
+from imud.drivers.hipnuc.common import AttitudeMode
+from imud.drivers.hipnuc.modbus.codec import READ_BLOCK, READ_SHORT_BLOCK, HipnucModbusCodec, HipnucModbusOptions
+from imud.drivers.hipnuc.modbus.commands import LineMounting, set_heading_mode, set_mounting
+from imud.drivers.hipnuc.modbus.driver import DRIVER
+from imud.drivers.hipnuc.modbus.registers import pack_identity, read_registers, set_id_by_serial, write_register
 from imud.formats.modbus import framed, is_exception, is_whole
-from imud.links.rs485 import (
-    ENABLED,
-    RTS_ON_SEND,
-    TIOCGRS485,
-    TIOCSRS485,
-    Direction,
-    ReplyTimes,
-    Rs485Line,
-    Rs485Link,
-    Rs485Options,
-    SharedPorts,
-)
+from imud.links import rs485
 from imud.links.serial_port import TtyCounters, open_port
 from imud.model.errors import LinkBusy, LinkError, LinkMissing, TransferError, Trouble
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
+from tests.drivers.hipnuc.modbus.test_codec import SENSORS
 from tests.support.daemon_process import LIMIT_S, wait_until
 from tests.support.pty_port import BAUD, PtyPort, serial_of, slave, waiting_bytes, wired
 
@@ -46,9 +51,11 @@ pytestmark = pytest.mark.live
 
 
 @contextmanager
-def opened(path: Path | str, ports: SharedPorts | None = None, address: int = 1, **more: Any) -> Iterator[Rs485Link]:
+def opened(
+    path: Path | str, ports: rs485.SharedPorts | None = None, address: int = 1, **more: Any
+) -> Iterator[rs485.Rs485Link]:
     settings = {"line": str(path), "baud": BAUD, "reply_ms": 1000, **more}
-    link = Rs485Link(msgspec.convert(settings, Rs485Options), ports=ports or SharedPorts())
+    link = rs485.Rs485Link(msgspec.convert(settings, rs485.Rs485Options), ports=ports or rs485.SharedPorts())
     link.open()
     link.select(address)
     try:
@@ -58,7 +65,7 @@ def opened(path: Path | str, ports: SharedPorts | None = None, address: int = 1,
         link.close()
 
 
-def sure(link: Rs485Link, transfer: Transfer) -> bytes:
+def sure(link: rs485.Rs485Link, transfer: Transfer) -> bytes:
     for _ in range(TRIES):
         try:
             return link.transfer(transfer)
@@ -67,7 +74,7 @@ def sure(link: Rs485Link, transfer: Transfer) -> bytes:
     raise AssertionError(f"no reply in {TRIES} tries")
 
 
-def time_out(link: Rs485Link, transfer: Transfer) -> None:
+def time_out(link: rs485.Rs485Link, transfer: Transfer) -> None:
     """Send requests until a reply arrives after its timeout. This thread may also be late."""
     for _ in range(TRIES):
         try:
@@ -86,7 +93,7 @@ def pty() -> Iterator[PtyPort]:
 
 @pytest.mark.parametrize("chunk_bytes", [0, 1])
 def test_modules_of_a_line_share_its_port(tmp_path: Path, chunk_bytes: int) -> None:
-    ports = SharedPorts()
+    ports = rs485.SharedPorts()
     with (
         wired(tmp_path, slave(1), slave(2), chunk_bytes=chunk_bytes) as (path, _),
         opened(path, ports, 1) as one,
@@ -152,7 +159,7 @@ def test_noise_before_the_first_echo_does_not_hide_that_there_are_echoes(pty: Pt
 
 @pytest.mark.parametrize("more", [{"echo": True}, {"direction": "none"}])
 def test_devices_of_a_line_agree_on_it(pty: PtyPort, more: dict[str, object]) -> None:
-    ports = SharedPorts()
+    ports = rs485.SharedPorts()
     with opened(pty.path, ports):
         with (
             pytest.raises(LinkError, match=r"expected the same (direction|echo) for all its devices"),
@@ -211,7 +218,7 @@ def test_slow_devices_of_a_bus_reply_in_time(tmp_path: Path) -> None:
 
 
 def test_the_time_for_a_reply_follows_the_slowest_reply_of_a_device() -> None:
-    times, ms = ReplyTimes(), 1_000_000
+    times, ms = rs485.ReplyTimes(), 1_000_000
     assert [times.wait_ns(target, 20 * ms) for target in (80, 1, 80, 2)] == [3000 * ms, 20 * ms, 3000 * ms, 20 * ms]
     times.add_late(2)
     assert [times.wait_ns(target, 20 * ms) for target in (80, 1, 2)] == [3000 * ms, 20 * ms, 3000 * ms]
@@ -227,7 +234,7 @@ def test_the_time_for_a_reply_follows_the_slowest_reply_of_a_device() -> None:
 
 def test_a_search_asks_each_address_with_a_long_timeout() -> None:
     """The first round is fast. In each of 16 further rounds, one of 16 addresses gets 0.5 s."""
-    times, ms = ReplyTimes(), 1_000_000
+    times, ms = rs485.ReplyTimes(), 1_000_000
     rounds = [[times.wait_ns(target, 20 * ms) for target in (80, *range(1, 80))][1:] for _ in range(17)]
     assert set(rounds[0]) == {20 * ms}
     assert [sorted({one[at] for one in rounds}) for at in range(79)] == [[20 * ms, 500 * ms]] * 79
@@ -321,9 +328,9 @@ def test_request_to_all_expects_no_reply(tmp_path: Path) -> None:
 
 
 def test_cable_pulled_and_back(pty: PtyPort) -> None:
-    ports = SharedPorts()
-    link_a = Rs485Link(Rs485Options(line=pty.path, baud=BAUD, reply_ms=1), ports=ports)
-    link_b = Rs485Link(Rs485Options(line=pty.path, baud=BAUD, reply_ms=1), ports=ports)
+    ports = rs485.SharedPorts()
+    link_a = rs485.Rs485Link(rs485.Rs485Options(line=pty.path, baud=BAUD, reply_ms=1), ports=ports)
+    link_b = rs485.Rs485Link(rs485.Rs485Options(line=pty.path, baud=BAUD, reply_ms=1), ports=ports)
     link_a.open()
     link_b.open()
     pty.unplug()
@@ -338,7 +345,7 @@ def test_cable_pulled_and_back(pty: PtyPort) -> None:
 
 
 def test_missing_port_and_what_a_link_cannot_do(tmp_path: Path) -> None:
-    link = Rs485Link(Rs485Options(line=str(tmp_path / "none")))
+    link = rs485.Rs485Link(rs485.Rs485Options(line=str(tmp_path / "none")))
     with pytest.raises(LinkMissing):
         link.open()
     with pytest.raises(LinkError):
@@ -356,7 +363,7 @@ def test_the_line_gets_the_longer_time_for_a_reply_and_has_the_counters_of_the_k
     pty: PtyPort, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waits: list[int] = []
-    monkeypatch.setattr(Rs485Line, "transfer", lambda *args: waits.append(args[-1]) or b"")  # type: ignore[func-returns-value]
+    monkeypatch.setattr(rs485.Rs485Line, "transfer", lambda *args: waits.append(args[-1]) or b"")  # type: ignore[func-returns-value]
     monkeypatch.setattr(TtyCounters, "read", lambda _counters: KernelCounters(overrun=3))
     with opened(pty.path, reply_ms=30) as link:
         for reply_ms in (29, 31):
@@ -375,29 +382,29 @@ class Driver:
     def ioctl(self, _fd: int, request: int, data: bytes) -> bytes:
         if self.error:
             raise OSError(self.error, os.strerror(self.error))
-        if request == TIOCSRS485:
+        if request == rs485.TIOCSRS485:
             self.flags = struct.unpack("8I", data)[0]
             self.set.append(self.flags)
         else:
-            assert request == TIOCGRS485
+            assert request == rs485.TIOCGRS485
         return struct.pack("8I", self.flags, *[0] * 7)
 
 
 def test_direction_by_the_kernel(monkeypatch: pytest.MonkeyPatch, pty: PtyPort) -> None:
-    driver, real, requests = Driver(0), fcntl.ioctl, (TIOCGRS485, TIOCSRS485)
+    driver, real, requests = Driver(0), fcntl.ioctl, (rs485.TIOCGRS485, rs485.TIOCSRS485)
     monkeypatch.setattr(fcntl, "ioctl", driver.ioctl)
-    direction = Direction(3, "x", required=True)
+    direction = rs485.Direction(3, "x", required=True)
     assert direction.by_kernel
     direction.restore()
     direction.restore()
-    assert driver.set == [ENABLED | RTS_ON_SEND, 0]
+    assert driver.set == [rs485.ENABLED | rs485.RTS_ON_SEND, 0]
     monkeypatch.setattr(fcntl, "ioctl", lambda *a: driver.ioctl(*a) if a[1] in requests else real(*a))
     with opened(pty.path):
-        assert driver.set[2:] == [ENABLED | RTS_ON_SEND]
+        assert driver.set[2:] == [rs485.ENABLED | rs485.RTS_ON_SEND]
     assert driver.set[3:] == [0], "the link leaves the port as it was"
-    driver = Driver(ENABLED)
+    driver = Driver(rs485.ENABLED)
     monkeypatch.setattr(fcntl, "ioctl", driver.ioctl)
-    direction = Direction(3, "x", required=False)
+    direction = rs485.Direction(3, "x", required=False)
     direction.restore()
     assert direction.by_kernel
     assert driver.set == []
@@ -406,17 +413,155 @@ def test_direction_by_the_kernel(monkeypatch: pytest.MonkeyPatch, pty: PtyPort) 
 def test_direction_that_the_kernel_cannot_switch(monkeypatch: pytest.MonkeyPatch, pty: PtyPort) -> None:
     for number in (errno.ENOTTY, errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP):
         monkeypatch.setattr(fcntl, "ioctl", Driver(0, number).ioctl)
-        assert not Direction(3, "x", required=False).by_kernel
+        assert not rs485.Direction(3, "x", required=False).by_kernel
         with pytest.raises(LinkError, match="direction: none"):
-            Direction(3, "x", required=True)
+            rs485.Direction(3, "x", required=True)
     monkeypatch.setattr(fcntl, "ioctl", Driver(0, errno.EIO).ioctl)
     with pytest.raises(LinkError):
-        Direction(3, "x", required=False)
+        rs485.Direction(3, "x", required=False)
     monkeypatch.undo()
-    before, ports = len(os.listdir("/proc/self/fd")), SharedPorts()
-    link = Rs485Link(Rs485Options(line=pty.path, baud=BAUD, direction="kernel"), ports=ports)
+    before, ports = len(os.listdir("/proc/self/fd")), rs485.SharedPorts()
+    link = rs485.Rs485Link(rs485.Rs485Options(line=pty.path, baud=BAUD, direction="kernel"), ports=ports)
     with pytest.raises(LinkError, match="direction: none") as caught:
         link.open()
     assert len(os.listdir("/proc/self/fd")) == before, f"{caught} keeps the port object: only close() releases it"
     with opened(pty.path, ports, direction="none"):
         pass
+
+
+UPTIME = (0x0001, 0x2345)
+
+
+def words(data: bytes) -> list[int]:
+    return [int.from_bytes(data[at : at + 2], "big") for at in range(0, len(data), 2)]
+
+
+def registers(start: int, values: Sequence[int], *, readonly: bool = False) -> SimData:
+    return SimData(start, values=list(values), datatype=DataType.REGISTERS, readonly=readonly)
+
+
+def device(address: int, *, new: bool) -> SimDevice:
+    block = [*words(SENSORS[3:-2]), *(UPTIME if new else ())]
+    identity = words(pack_identity("HI14R2N-485-000", 169 if new else 152, 107, serial_of(address)))
+    return SimDevice(
+        address,
+        [
+            registers(0, [0, 0, 0, 0, 8, address, 0]), registers(0x34, block, readonly=True),
+            registers(0x70, identity, readonly=True), registers(0xA5, [0, 0]),
+        ],
+    )  # fmt: skip
+
+
+@contextmanager
+def carried(one: PtyPort, other: PtyPort) -> Iterator[None]:
+    ended = threading.Event()
+
+    def carry() -> None:
+        while not ended.is_set():
+            for fd in select.select([one.master, other.master], [], [], 0.02)[0]:
+                with suppress(OSError):
+                    os.write(other.master if fd == one.master else one.master, os.read(fd, 4096))
+
+    thread = threading.Thread(target=carry)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join(LIMIT_S)
+
+
+@contextmanager
+def served(*devices: SimDevice) -> Iterator[str]:
+    """Yield the path of a bus. A pymodbus server simulates these devices on it."""
+    ours, theirs = PtyPort(), PtyPort()
+    ready, loop = threading.Event(), asyncio.new_event_loop()
+    servers: list[Any] = []
+
+    async def serve() -> None:
+        server = ModbusSerialServer(
+            list(devices), port=theirs.path, baudrate=BAUD, timeout=1, ignore_missing_devices=True
+        )
+        servers.append(server)
+        await server.serve_forever(background=True)
+        ready.set()
+        await server.serving
+
+    def run() -> None:
+        with suppress(asyncio.CancelledError):
+            loop.run_until_complete(serve())
+        loop.run_until_complete(loop.shutdown_asyncgens())
+        loop.close()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        assert ready.wait(LIMIT_S)
+        with carried(ours, theirs):
+            yield ours.path
+    finally:
+        asyncio.run_coroutine_threadsafe(servers[0].shutdown(), loop)
+        thread.join(LIMIT_S)
+        ours.unplug()
+        theirs.unplug()
+
+
+@contextmanager
+def linked(path: str) -> Iterator[rs485.Rs485Link]:
+    link = rs485.Rs485Link(rs485.Rs485Options(line=path, baud=BAUD, reply_ms=1000), ports=rs485.SharedPorts())
+    link.open()
+    try:
+        yield link
+    finally:
+        link.close()
+
+
+def test_pymodbus_server_as_modules_under_our_driver() -> None:
+    settings = HipnucModbusOptions()
+    with served(device(1, new=False), device(80, new=True)) as path, linked(path) as link:
+        for address, firmware in ((80, "1.6.9"), (1, "1.5.2")):
+            link.select(address)
+            identity = run_transfer_script(DRIVER.probe(settings), link.transfer)
+            assert (identity.product, identity.firmware) == ("HI14R2N-485-000", firmware)
+            assert identity.serial_number == serial_of(address).hex().upper()
+            found = words_of(run_transfer_script(DRIVER.set_up(settings), link.transfer))
+            assert found == {"baud": "921600", "id": str(address), "heading_mode": "six axes"}
+            codec = HipnucModbusCodec(Ledger(), settings)
+            if address == 1:
+                (event,) = codec.decode(0, link.transfer(codec.polls[0].transfer))
+                assert isinstance(event, Vanished)
+            assert codec.polls[0].transfer == (READ_SHORT_BLOCK if address == 1 else READ_BLOCK)
+            (event,) = codec.decode(0, link.transfer(codec.polls[0].transfer))
+            assert isinstance(event, Measurement)
+            assert event.euler_rad == pytest.approx((0.151896, 0.571735, -2.913600), abs=1e-6)
+            assert event.dev_ticks == (None if address == 1 else 74_565)
+            assert codec.decode(1, link.transfer(codec.polls[1].transfer)) == ()
+            run_transfer_script(set_heading_mode(AttitudeMode.NINE_AXIS), link.transfer)
+            run_transfer_script(set_mounting(LineMounting.Y_UP), link.transfer)
+            assert words_of(run_transfer_script(DRIVER.set_up(settings), link.transfer))["heading_mode"] == "nine axes"
+            assert link.heard.strange == link.heard.late == link.heard.timeouts == 0
+
+
+def test_pymodbus_client_on_our_simulator(tmp_path: Path) -> None:
+    with wired(tmp_path, slave(1), slave(2, firmware=152)) as (path, line):
+        client = ModbusSerialClient(str(path), baudrate=BAUD, timeout=LIMIT_S, retries=0)
+        assert client.connect()
+        try:
+            block = client.read_holding_registers(0x34, count=26, device_id=1)
+            assert not block.isError()
+            assert len(block.registers) == 26
+            assert 700 < block.registers[2] < 2700  # about 1 G on the upward axis, 2048 counts
+            refused = client.read_holding_registers(0x34, count=26, device_id=2)
+            assert refused.isError()
+            assert refused.exception_code == 2
+            assert len(client.read_holding_registers(0x34, count=24, device_id=2).registers) == 24
+            name = client.read_holding_registers(0x70, count=8, device_id=2).registers
+            assert b"".join(word.to_bytes(2, "big") for word in name).rstrip(b"\0") == b"HI14R2N-485-000"
+            assert not client.write_register(6, 1, device_id=1).isError()
+            assert client.read_holding_registers(6, device_id=1).registers == [1]
+            assert client.write_register(6, 7, device_id=1).exception_code == 3
+            assert not client.write_register(5, 9, device_id=1).isError()
+            assert client.read_holding_registers(5, device_id=9).registers == [9]
+            assert line.slaves[0].settings.slave == 9
+        finally:
+            client.close()  # type: ignore[no-untyped-call]  # of pymodbus

@@ -9,17 +9,8 @@ from pathlib import Path
 import pytest
 
 from imud.contracts.status import KernelCounters
+from imud.links import serial_port
 from imud.links.device_node import PROC
-from imud.links.serial_port import (
-    SerialPort,
-    TtyCounters,
-    hold_ns,
-    list_ports,
-    open_port,
-    port_problem,
-    read_latency_timer_ms,
-    relative,
-)
 from imud.model.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
 from imud.model.units import NS_PER_MS
 from tests.support.leaks import open_descriptors
@@ -40,24 +31,26 @@ LATER = (0, 0, 0, 0, 2000, 0, 6, 9, 14, 17, 22, *[0] * 9)
 )  # fmt: skip
 def test_each_number_has_its_error_which_names_the_port(number: int, kind: type[LinkError], tmp_path: Path) -> None:
     for error in (OSError(number, "text"), termios.error(number, "text")):
-        explained = port_problem(error, "/dev/ttyS9", tmp_path)
+        explained = serial_port.port_problem(error, "/dev/ttyS9", tmp_path)
         assert type(explained) is kind
         assert "/dev/ttyS9" in str(explained)
-    assert "in use by another program" in str(port_problem(OSError(errno.EBUSY, ""), "/dev/ttyS9", tmp_path))
-    assert "no such thing" in str(port_problem(ValueError("no such thing"), "/dev/ttyS9", tmp_path))
+    assert "in use by another program" in str(
+        serial_port.port_problem(OSError(errno.EBUSY, ""), "/dev/ttyS9", tmp_path)
+    )
+    assert "no such thing" in str(serial_port.port_problem(ValueError("no such thing"), "/dev/ttyS9", tmp_path))
 
 
 def test_an_open_port_has_one_descriptor_and_leaves_none() -> None:
     pty = PtyPort()
     before = len(open_descriptors())
-    port = open_port(str(pty.path), 115200, PROC)
+    port = serial_port.open_port(str(pty.path), 115200, PROC)
     assert len(open_descriptors()) == before + 1
     port.close()
     port.close()
     assert len(open_descriptors()) == before
     os.chmod(pty.path, 0o666)
     with unprivileged():  # no lock and no exclusive mode remain; root can open a port in exclusive mode
-        again = open_port(str(pty.path), 115200, PROC)
+        again = serial_port.open_port(str(pty.path), 115200, PROC)
         again.baudrate = 9600
         again.close()
         killed = os.open(pty.path, os.O_RDWR | os.O_NOCTTY)
@@ -66,7 +59,7 @@ def test_an_open_port_has_one_descriptor_and_leaves_none() -> None:
         with pytest.raises(
             LinkBusy, match=r"; stop it first, or start the program again that made the pseudo-terminal"
         ):
-            open_port(str(pty.path), 115200, PROC)
+            serial_port.open_port(str(pty.path), 115200, PROC)
     pty.unplug()
 
 
@@ -78,7 +71,7 @@ def timer_of(sys: Path, node: str) -> Path:
 
 @pytest.mark.parametrize(("node", "hold_ms"), [("ttyUSB0", 16), ("ttyACM3", 1), ("ttyS0", 0), ("ttyAMA0", 0), ("7", 0)])
 def test_without_a_timer_the_kind_of_port_decides(tmp_path: Path, node: str, hold_ms: int) -> None:
-    assert hold_ns(f"/dev/{node}", tmp_path) == hold_ms * NS_PER_MS
+    assert serial_port.hold_ns(f"/dev/{node}", tmp_path) == hold_ms * NS_PER_MS
 
 
 def test_the_timer_is_found_through_a_link(tmp_path: Path) -> None:
@@ -86,24 +79,24 @@ def test_the_timer_is_found_through_a_link(tmp_path: Path) -> None:
     node, link = tmp_path / "ttyUSB4", tmp_path / "by-id"
     node.touch()
     link.symlink_to(node)
-    assert hold_ns(str(link), tmp_path) == 4 * NS_PER_MS
+    assert serial_port.hold_ns(str(link), tmp_path) == 4 * NS_PER_MS
     (tmp_path / "class/tty/ttyUSB4/device/latency_timer").write_text("?\n")
-    assert read_latency_timer_ms("/dev/ttyUSB4", tmp_path) is None
+    assert serial_port.read_latency_timer_ms("/dev/ttyUSB4", tmp_path) is None
 
 
 def test_only_what_was_counted_since_the_start_is_reported() -> None:
-    assert relative(START, START) == KernelCounters()
+    assert serial_port.relative(START, START) == KernelCounters()
     # one value contains overruns of the UART's FIFO (9 - 7) and of the tty's buffer (22 - 17)
-    assert relative(START, LATER) == KernelCounters(overrun=7, framing=1, parity=3, break_=4)
+    assert serial_port.relative(START, LATER) == KernelCounters(overrun=7, framing=1, parity=3, break_=4)
     before = (*[0] * 6, 0x7FFF_FFFF, *[0] * 13)
     after = (*[0] * 6, -0x8000_0000, *[0] * 13)
-    assert relative(before, after).framing == 1
+    assert serial_port.relative(before, after).framing == 1
     port = PtyPort()
-    assert TtyCounters(port.master).read() == KernelCounters()
+    assert serial_port.TtyCounters(port.master).read() == KernelCounters()
     port.unplug()
     answers = iter([START, LATER, None])
-    counters = TtyCounters(0, lambda _fd: next(answers))
-    assert counters.read() == counters.read() == relative(START, LATER)
+    counters = serial_port.TtyCounters(0, lambda _fd: next(answers))
+    assert counters.read() == counters.read() == serial_port.relative(START, LATER)
 
 
 @pytest.fixture
@@ -141,17 +134,17 @@ def test_an_adapter_is_listed_by_its_lasting_name(dev: Path, sys: Path) -> None:
     usb(dev, sys, "ttyUSB0", manufacturer="FTDI", product="FT232R USB UART", serial="A1")
     (dev / "serial" / "by-id" / "usb-FTDI").symlink_to("../../ttyUSB0")
     (dev / "serial" / "by-path" / "pci-0").symlink_to("../../ttyUSB0")
-    expected = SerialPort(f"{dev}/serial/by-id/usb-FTDI", f"{dev}/ttyUSB0", "FTDI FT232R USB UART A1")
-    assert list_ports(dev, sys) == [expected]
+    expected = serial_port.SerialPort(f"{dev}/serial/by-id/usb-FTDI", f"{dev}/ttyUSB0", "FTDI FT232R USB UART A1")
+    assert serial_port.list_ports(dev, sys) == [expected]
 
 
 def test_without_by_id_the_path_and_then_the_node_is_the_name(dev: Path, sys: Path) -> None:
     usb(dev, sys, "ttyUSB0", product="adapter")
     usb(dev, sys, "ttyUSB1")
     (dev / "serial" / "by-path" / "pci-0").symlink_to("../../ttyUSB0")
-    assert list_ports(dev, sys) == [
-        SerialPort(f"{dev}/serial/by-path/pci-0", f"{dev}/ttyUSB0", "adapter"),
-        SerialPort(f"{dev}/ttyUSB1", f"{dev}/ttyUSB1", ""),
+    assert serial_port.list_ports(dev, sys) == [
+        serial_port.SerialPort(f"{dev}/serial/by-path/pci-0", f"{dev}/ttyUSB0", "adapter"),
+        serial_port.SerialPort(f"{dev}/ttyUSB1", f"{dev}/ttyUSB1", ""),
     ]
 
 
@@ -161,7 +154,7 @@ def test_equal_adapters_without_serial_numbers_are_named_by_their_sockets(dev: P
         usb(dev, sys, name, product="CH340")
         (dev / "serial" / "by-path" / f"pci-{name[-1]}").symlink_to(f"../../{name}")
     (dev / "serial" / "by-id" / "usb-1a86_CH340").symlink_to("../../ttyUSB1")
-    assert [port.path for port in list_ports(dev, sys)] == [f"{dev}/serial/by-path/pci-{n}" for n in (0, 1)]
+    assert [port.path for port in serial_port.list_ports(dev, sys)] == [f"{dev}/serial/by-path/pci-{n}" for n in (0, 1)]
 
 
 def test_ports_of_one_adapter_keep_their_names(dev: Path, sys: Path) -> None:
@@ -169,7 +162,9 @@ def test_ports_of_one_adapter_keep_their_names(dev: Path, sys: Path) -> None:
         usb(dev, sys, f"ttyUSB{number}", product="FT2232H", serial="A1")
         (dev / "serial" / "by-id" / f"usb-FT2232H-if0{number}").symlink_to(f"../../ttyUSB{number}")
         (dev / "serial" / "by-path" / f"pci-{number}").symlink_to(f"../../ttyUSB{number}")
-    assert [port.path for port in list_ports(dev, sys)] == [f"{dev}/serial/by-id/usb-FT2232H-if0{n}" for n in (0, 1)]
+    assert [port.path for port in serial_port.list_ports(dev, sys)] == [
+        f"{dev}/serial/by-id/usb-FT2232H-if0{n}" for n in (0, 1)
+    ]
 
 
 def test_ports_without_hardware_and_other_terminals_are_left_out(dev: Path, sys: Path) -> None:
@@ -178,18 +173,18 @@ def test_ports_without_hardware_and_other_terminals_are_left_out(dev: Path, sys:
     native(dev, sys, "ttyAMA0", "32")
     for name in ("tty0", "tty63", "ttyprintk"):
         native(dev, sys, name, "4")
-    assert [port.node for port in list_ports(dev, sys)] == [f"{dev}/ttyAMA0", f"{dev}/ttyS0"]
+    assert [port.node for port in serial_port.list_ports(dev, sys)] == [f"{dev}/ttyAMA0", f"{dev}/ttyS0"]
     usb(dev, sys, "ttyUSB0")
     (dev / "ttyUSB0").unlink()
-    assert [port.node for port in list_ports(dev, sys)] == [f"{dev}/ttyAMA0", f"{dev}/ttyS0"]
+    assert [port.node for port in serial_port.list_ports(dev, sys)] == [f"{dev}/ttyAMA0", f"{dev}/ttyS0"]
 
 
 def test_the_order_is_the_natural_one(dev: Path, sys: Path) -> None:
     for number in (10, 2, 1):
         usb(dev, sys, f"ttyUSB{number}")
-    assert [port.node[-2:] for port in list_ports(dev, sys)] == ["B1", "B2", "10"]
+    assert [port.node[-2:] for port in serial_port.list_ports(dev, sys)] == ["B1", "B2", "10"]
 
 
 def test_this_machine_and_one_without_ports_can_be_listed(tmp_path: Path) -> None:
-    assert list_ports(tmp_path / "dev", tmp_path / "sys") == []
-    assert all(Path(port.node).exists() for port in list_ports())
+    assert serial_port.list_ports(tmp_path / "dev", tmp_path / "sys") == []
+    assert all(Path(port.node).exists() for port in serial_port.list_ports())

@@ -23,18 +23,8 @@ from typing import Final
 import pytest
 
 from tests.fleet.mosquitto import NO_MOSQUITTO
+from tests.monitoring import prometheus as monitoring_prometheus
 from tests.monitoring.faults import WIRES, Wire, site
-from tests.monitoring.prometheus import (
-    LIMIT_S,
-    RULES,
-    Alert,
-    Pace,
-    RealPrometheus,
-    alerts_of,
-    needs,
-    real_prometheus,
-    shortened,
-)
 from tests.support.daemon_process import wait_until, write_config
 from tests.support.surroundings import free_port
 
@@ -107,7 +97,7 @@ class Spare:
 
 def _end(process: subprocess.Popen[bytes]) -> None:
     process.kill()
-    process.wait(LIMIT_S)
+    process.wait(monitoring_prometheus.LIMIT_S)
     if process.stdin is not None:
         process.stdin.close()
 
@@ -124,11 +114,11 @@ def spare_daemon(folder: Path, port: int) -> Iterator[Spare]:
 
 
 class Watcher:
-    def __init__(self, prometheus: RealPrometheus, expected: dict[str, tuple[str, str]]) -> None:
+    def __init__(self, prometheus: monitoring_prometheus.RealPrometheus, expected: dict[str, tuple[str, str]]) -> None:
         self._prometheus = prometheus
         self._expected = expected
         """Device and instance by alert."""
-        self.texts: dict[str, Alert] = {}
+        self.texts: dict[str, monitoring_prometheus.Alert] = {}
         """The newest active alert of each kind."""
         self.begin(firing=True)
 
@@ -152,12 +142,12 @@ class Watcher:
         """Wait until all alerts in `names` have fired, or cleared, in this phase."""
         while missing := set(names) - self.after_s.keys():
             late = f"not yet {'fired' if self._firing else 'cleared'}: {sorted(missing)}; {self.after_s}"
-            assert time.monotonic() < self._begin + 2 * LIMIT_S, late
+            assert time.monotonic() < self._begin + 2 * monitoring_prometheus.LIMIT_S, late
             time.sleep(0.1)
             self.look()
 
 
-def wait_scraped(prometheus: RealPrometheus, watcher: Watcher, spare: Spare) -> None:
+def wait_scraped(prometheus: monitoring_prometheus.RealPrometheus, watcher: Watcher, spare: Spare) -> None:
     port = spare.port
     before = prometheus.query(f'max_over_time(process_start_time_seconds{{instance="127.0.0.1:{port}"}}[10m])')
 
@@ -166,10 +156,10 @@ def wait_scraped(prometheus: RealPrometheus, watcher: Watcher, spare: Spare) -> 
         now = prometheus.query(f'process_start_time_seconds{{instance="127.0.0.1:{port}"}}')
         return bool(now) and float(now[0]["value"][1]) > float(before[0]["value"][1])
 
-    wait_until(seen, "a scrape of the new daemon", LIMIT_S)
+    wait_until(seen, "a scrape of the new daemon", monitoring_prometheus.LIMIT_S)
 
 
-def break_spare(prometheus: RealPrometheus, watcher: Watcher, spare: Spare) -> None:
+def break_spare(prometheus: monitoring_prometheus.RealPrometheus, watcher: Watcher, spare: Spare) -> None:
     spare.kill()
     watcher.wait("ImudDown")
     for devices in (True, True, False):
@@ -185,25 +175,27 @@ def mend_spare(spare: Spare) -> None:
     spare.start()
 
 
-@needs("prometheus")
+@monitoring_prometheus.needs("prometheus")
 @pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO)
 @pytest.mark.skipif("IMUD_ALERTS" not in os.environ, reason="takes more than a minute of real time: make alerts")
 @pytest.mark.live
 @pytest.mark.timeout(1500)
 def test_every_alert_fires_and_clears(tmp_path: Path) -> None:
     site_port, spare_port = free_port(), free_port()
-    text = RULES.read_text()
+    text = monitoring_prometheus.RULES.read_text()
     at_site, at_spare = (f"127.0.0.1:{port}" for port in (site_port, spare_port))
     expected = {name: (device, at_site) for name, device in DEVICE_OF.items()}
     expected |= dict.fromkeys(SITE_ALERTS, ("", at_site)) | dict.fromkeys(SPARE_ALERTS, ("", at_spare))
     expected["ImudNotScraped"] = ("", "")
-    assert set(expected) == {alert["alert"] for alert in alerts_of(text)}
+    assert set(expected) == {alert["alert"] for alert in monitoring_prometheus.alerts_of(text)}
     with ExitStack() as stack:
         (tmp_path / "site").mkdir()
         spare = stack.enter_context(spare_daemon(tmp_path / "spare", spare_port))
         one = stack.enter_context(site(tmp_path / "site", site_port, beside=[spare.wire]))
-        pace = Pace.of(one.scrape_s())
-        prometheus = stack.enter_context(real_prometheus(tmp_path, shortened(text, pace.divisor), pace))
+        pace = monitoring_prometheus.Pace.of(one.scrape_s())
+        prometheus = stack.enter_context(
+            monitoring_prometheus.real_prometheus(tmp_path, monitoring_prometheus.shortened(text, pace.divisor), pace)
+        )
         watcher = Watcher(prometheus, expected)
         watcher.wait("ImudNotScraped")
         fired = dict(watcher.after_s)
@@ -220,7 +212,7 @@ def test_every_alert_fires_and_clears(tmp_path: Path) -> None:
             one.block_loop(block_s)
             time.sleep(2.17 * block_s)  # out of step with the scrapes: one scrape must be in time
             watcher.look()
-            assert time.monotonic() < begin + LIMIT_S
+            assert time.monotonic() < begin + monitoring_prometheus.LIMIT_S
         fired["ImudLoopLate"] = watcher.after_s["ImudLoopLate"]
 
         watcher.begin(firing=True)
@@ -248,20 +240,22 @@ def test_every_alert_fires_and_clears(tmp_path: Path) -> None:
             assert "<" not in text, text
 
 
-def wait_calm(prometheus: RealPrometheus) -> None:
-    end = time.monotonic() + 2 * LIMIT_S
+def wait_calm(prometheus: monitoring_prometheus.RealPrometheus) -> None:
+    end = time.monotonic() + 2 * monitoring_prometheus.LIMIT_S
     while wrong := unrest(prometheus):
         assert time.monotonic() < end, wrong
         time.sleep(0.2)
 
 
-def unrest(prometheus: RealPrometheus) -> list[str]:
+def unrest(prometheus: monitoring_prometheus.RealPrometheus) -> list[str]:
     firing = [f"{alert.name} {alert.device}" for alert in prometheus.alerts() if alert.state == "firing"]
     up = {one["metric"]["device"]: one["value"][1] == "1" for one in prometheus.query("imud_device_up")}
     return firing + [f"expected {name} to be up" for name in (*WIRES, "boom", "module", "spare") if not up.get(name)]
 
 
-def table(fired: dict[str, float], cleared: dict[str, float], watcher: Watcher, pace: Pace) -> str:
+def table(
+    fired: dict[str, float], cleared: dict[str, float], watcher: Watcher, pace: monitoring_prometheus.Pace
+) -> str:
     rows = [f"\n{'alert':24} {'fires after':>12} {'clears after':>13}  ({pace})"]
     for name in sorted(fired):
         summary = watcher.texts[name].annotations["summary"]

@@ -1,14 +1,18 @@
-"""Complete output: choice of the device, times of sentences, axes, and a real gpsd as reader."""
+"""Complete output: choice of the device, times of sentences, axes, and a real gpsd as reader.
+Ports: accepted sentences arrive complete, other sentences are dropped and counted, and no port waits."""
 
 import asyncio
 import json
 import math
+import os
 import shutil
 import socket
 import subprocess
+import tty
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, contextmanager, suppress
 from math import nan, radians
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -19,21 +23,13 @@ from pynmea2.types.proprietary.ash import ASHRATT
 from imud.attitude.conventions import Convention, Heading
 from imud.attitude.published import PublishedAxes, published_frame
 from imud.contracts.publisher import AS_SENT, Batch
-from imud.contracts.status import FrameStatus
+from imud.contracts.status import FrameStatus, OutputStatus
+from imud.model.errors import ServerError
 from imud.model.options import wrong_values
 from imud.model.sample import Sample, Sync, Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S
-from imud.publishers.nmea0183 import (
-    USUAL_BYTES,
-    WHO,
-    Formatter,
-    HeadingReference,
-    Nmea0183,
-    Nmea0183Options,
-    address_of,
-    make,
-    turn_rate_rad_s,
-)
+from imud.publishers import nmea0183
+from imud.publishers.nmea0183 import open_serial as open_real_port
 from tests.support.event_loops import VirtualClock, in_loop
 from tests.support.publisher_context import publisher_context
 from tests.support.socket_rig import device_status, in_context
@@ -69,8 +65,8 @@ class OutputBench:
             msgspec.structs.replace(device_status(name, n), frame=frame) for n, name in enumerate(("bow", "mast"))
         ]
         self.context = publisher_context(lambda: statuses, 1, self.clock.now_ns, latencies=self.asked)
-        made = msgspec.convert({"tcp_port": 0, **settings}, Nmea0183Options)
-        self.output = Nmea0183(made, self.context)
+        made = msgspec.convert({"tcp_port": 0, **settings}, nmea0183.Nmea0183Options)
+        self.output = nmea0183.Nmea0183(made, self.context)
         self.output.start()
         self.output.add_device("bow", 0)
         self.seq = 0
@@ -218,12 +214,12 @@ async def test_the_heading_reference_is_read_again(bench: OutputBench) -> None:
 @in_loop
 async def test_the_only_device_or_the_configured_device_is_used(caplog: pytest.LogCaptureFixture) -> None:
     bench = OutputBench(sentences={"HDT": 100.0})
-    assert bench.asked.of == {WHO: (10 * NS_PER_MS, ("bow",))}
+    assert bench.asked.of == {nmea0183.WHO: (10 * NS_PER_MS, ("bow",))}
     bench.output.add_device("mast", 1)
     assert bench.asked.of == {}
     assert "nmea0183.device: expected the name of one device (bow, mast), got none" in caplog.text
     bench.output.remove_device("bow")
-    assert bench.asked.of == {WHO: (10 * NS_PER_MS, ("mast",))}
+    assert bench.asked.of == {nmea0183.WHO: (10 * NS_PER_MS, ("mast",))}
     bench.output.close()
     assert (bench.asked.of, bench.context.outputs.sentences) == ({}, [])
 
@@ -259,23 +255,23 @@ async def test_the_only_device_or_the_configured_device_is_used(caplog: pytest.L
     ],
 )
 def test_invalid_options_are_rejected(given: dict[str, object], words: str) -> None:
-    assert words in "; ".join(map(str, wrong_values(Nmea0183Options, given)))
+    assert words in "; ".join(map(str, wrong_values(nmea0183.Nmea0183Options, given)))
 
 
 def test_addresses() -> None:
-    assert address_of("192.168.1.255:65535") == ("192.168.1.255", 65535)
-    assert address_of("[fe80::1]:2000") == ("fe80::1", 2000)
+    assert nmea0183.address_of("192.168.1.255:65535") == ("192.168.1.255", 65535)
+    assert nmea0183.address_of("[fe80::1]:2000") == ("fe80::1", 2000)
 
 
-@pytest.mark.parametrize("kind", Formatter)
-def test_usual_bytes_covers_complete_sentences(kind: Formatter) -> None:
+@pytest.mark.parametrize("kind", nmea0183.Formatter)
+def test_usual_bytes_covers_complete_sentences(kind: nmea0183.Formatter) -> None:
     full = Sample(
         "bow", 1, 0, 0, Sync.ARRIVAL, 0, NS_PER_S, euler_rad=(radians(-80), radians(-80), radians(211.5)),
         gyro_rad_s=(0.0, 0.0, radians(-0.3)), temperature_c=23.4, pressure_pa=101_325.0,
     )  # fmt: skip
-    made = make(kind, full, HeadingReference(Heading.TRUE, 12.6))
+    made = nmea0183.make(kind, full, nmea0183.HeadingReference(Heading.TRUE, 12.6))
     assert made is not None
-    assert len(made) <= USUAL_BYTES[kind]
+    assert len(made) <= nmea0183.USUAL_BYTES[kind]
 
 
 # --- independent reader -----------------------------------------------------------------------------------------------
@@ -342,9 +338,9 @@ async def test_gpsd_accepts_all_sentences_and_reports_their_values() -> None:
         assert {name for report in found for name in report} == {"class", "device", "heading"}
 
 
-MAGNETIC = HeadingReference(Heading.MAGNETIC)
-CORRECTED = HeadingReference(Heading.TRUE, 3.0)
-TRUE = HeadingReference(Heading.TRUE)
+MAGNETIC = nmea0183.HeadingReference(Heading.MAGNETIC)
+CORRECTED = nmea0183.HeadingReference(Heading.TRUE, 3.0)
+TRUE = nmea0183.HeadingReference(Heading.TRUE)
 
 
 def sample(
@@ -359,9 +355,9 @@ def sample(
     )  # fmt: skip
 
 
-def body(kind: Formatter, one: Sample, reference: HeadingReference, talker: str = "") -> str | None:
+def body(kind: nmea0183.Formatter, one: Sample, reference: nmea0183.HeadingReference, talker: str = "") -> str | None:
     """Return the text between `$` and `*`."""
-    made = make(kind, one, reference, talker)
+    made = nmea0183.make(kind, one, reference, talker)
     return None if made is None else made.decode().removeprefix("$").partition("*")[0]
 
 
@@ -371,46 +367,325 @@ def body(kind: Formatter, one: Sample, reference: HeadingReference, talker: str 
         (MAGNETIC, (None, "HCHDG,45.0,,,,", "HCHDM,45.0,M")),
         (CORRECTED, ("HCHDT,45.0,T", "HCHDG,42.0,,,3.0,E", "HCHDM,42.0,M")),
         (TRUE, ("HCHDT,45.0,T", None, None)),  # a true heading from the device has no magnetic heading
-        (HeadingReference(Heading.RELATIVE), (None, None, None)),  # relative to the direction at power-on
-        (HeadingReference(Heading.UNKNOWN), (None, None, None)),
+        (nmea0183.HeadingReference(Heading.RELATIVE), (None, None, None)),  # relative to the direction at power-on
+        (nmea0183.HeadingReference(Heading.UNKNOWN), (None, None, None)),
     ],
 )
-def test_a_heading_is_sent_with_its_reference(reference: HeadingReference, sentences: tuple[str | None, ...]) -> None:
-    kinds = (Formatter.HDT, Formatter.HDG, Formatter.HDM)
+def test_a_heading_is_sent_with_its_reference(
+    reference: nmea0183.HeadingReference, sentences: tuple[str | None, ...]
+) -> None:
+    kinds = (nmea0183.Formatter.HDT, nmea0183.Formatter.HDG, nmea0183.Formatter.HDM)
     assert tuple(body(kind, sample(), reference) for kind in kinds) == sentences
     if sentences == (None, None, None):
-        assert body(Formatter.PASHR, sample(), reference) == "PASHR,000000.000,,T,+1.00,-2.00,,,,,0,0"
+        assert body(nmea0183.Formatter.PASHR, sample(), reference) == "PASHR,000000.000,,T,+1.00,-2.00,,,,,0,0"
 
 
 def test_roll_pitch_temperature_pressure() -> None:
     one = sample(temperature_c=23.44, pressure_pa=101_325.0)
-    assert body(Formatter.XDR, one, MAGNETIC) == "YXXDR,A,-2.00,D,PTCH,A,1.00,D,ROLL,C,23.4,C,TEMP,P,1.01325,B,BARO"
-    assert body(Formatter.XDR, sample(euler_deg=(nan, 1, 2), temperature_c=nan), MAGNETIC) is None
-    assert body(Formatter.XDR, sample(euler_deg=None), MAGNETIC) is None
+    assert (
+        body(nmea0183.Formatter.XDR, one, MAGNETIC)
+        == "YXXDR,A,-2.00,D,PTCH,A,1.00,D,ROLL,C,23.4,C,TEMP,P,1.01325,B,BARO"
+    )
+    assert body(nmea0183.Formatter.XDR, sample(euler_deg=(nan, 1, 2), temperature_c=nan), MAGNETIC) is None
+    assert body(nmea0183.Formatter.XDR, sample(euler_deg=None), MAGNETIC) is None
 
 
 def test_the_configured_talker_is_used_for_all_sentences() -> None:
-    assert body(Formatter.HDT, sample(), TRUE, "II") == "IIHDT,45.0,T"
-    assert str(body(Formatter.PASHR, sample(), TRUE, "II")).startswith("PASHR,")
+    assert body(nmea0183.Formatter.HDT, sample(), TRUE, "II") == "IIHDT,45.0,T"
+    assert str(body(nmea0183.Formatter.PASHR, sample(), TRUE, "II")).startswith("PASHR,")
 
 
 def test_the_rate_of_turn_is_the_rate_of_the_heading() -> None:
     level = sample((0, 0, 0), (5, 5, 2))
-    assert turn_rate_rad_s(level) == pytest.approx(radians(2))
+    assert nmea0183.turn_rate_rad_s(level) == pytest.approx(radians(2))
     # right side down by 90°: a rotation about y changes the heading
-    assert turn_rate_rad_s(sample((90, 0, 0), (0, 3, 0))) == pytest.approx(radians(3))
+    assert nmea0183.turn_rate_rad_s(sample((90, 0, 0), (0, 3, 0))) == pytest.approx(radians(3))
     # bow up by 60°: the heading turns twice as fast as the body about its z axis
-    assert turn_rate_rad_s(sample((0, 60, 0), (0, 0, 1))) == pytest.approx(radians(2))
-    assert turn_rate_rad_s(sample(None, (0, 0, 1))) == pytest.approx(radians(1))
+    assert nmea0183.turn_rate_rad_s(sample((0, 60, 0), (0, 0, 1))) == pytest.approx(radians(2))
+    assert nmea0183.turn_rate_rad_s(sample(None, (0, 0, 1))) == pytest.approx(radians(1))
 
 
 def test_there_is_no_rate_of_turn_with_the_bow_straight_up_or_without_rates() -> None:
-    assert turn_rate_rad_s(sample((0, 85, 0), (0, 0, 1))) is None
-    assert turn_rate_rad_s(sample((0, 0, 0))) is None
-    assert turn_rate_rad_s(sample((0, 0, 0), (0, 0, math.inf))) is None
-    assert body(Formatter.ROT, sample((0, 0, 0), (0, 0, 1.5)), MAGNETIC) == "TIROT,90.0,A"
+    assert nmea0183.turn_rate_rad_s(sample((0, 85, 0), (0, 0, 1))) is None
+    assert nmea0183.turn_rate_rad_s(sample((0, 0, 0))) is None
+    assert nmea0183.turn_rate_rad_s(sample((0, 0, 0), (0, 0, math.inf))) is None
+    assert body(nmea0183.Formatter.ROT, sample((0, 0, 0), (0, 0, 1.5)), MAGNETIC) == "TIROT,90.0,A"
 
 
-@pytest.mark.parametrize("kind", Formatter)
-def test_a_sample_without_values_makes_no_sentence(kind: Formatter) -> None:
-    assert make(kind, sample(euler_deg=None), CORRECTED) is None
+@pytest.mark.parametrize("kind", nmea0183.Formatter)
+def test_a_sample_without_values_makes_no_sentence(kind: nmea0183.Formatter) -> None:
+    assert nmea0183.make(kind, sample(euler_deg=None), CORRECTED) is None
+
+
+CLIENTS_MAX, RETRY_FIRST_NS, STUCK_NS = 32, NS_PER_S, 30 * NS_PER_S
+
+ONE = b"$HEHDT,98.3,T*2F\r\n"
+BUSY = b"$" + b"x" * 60_000 + b"\r\n"
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(LIMIT_S):
+        while not condition():
+            await asyncio.sleep(0)
+
+
+class Server(nmea0183.TcpOutput):
+    def __init__(self) -> None:
+        self.clock, self.clients = VirtualClock(), list[socket.socket]()
+        super().__init__("127.0.0.1", 0, self.clock.now_ns)
+        self.open()
+
+    def connect(self) -> socket.socket:
+        self.clients.append(socket.create_connection(("127.0.0.1", self.port), timeout=LIMIT_S))
+        return self.clients[-1]
+
+    async def connected(self) -> socket.socket:
+        before, sock = self.status().readers, self.connect()
+        await until(lambda: self.status().readers == before + 1)
+        return sock
+
+
+@asynccontextmanager
+async def serving(_folder: Path) -> AsyncIterator[Server]:
+    made = Server()
+    yield made
+    for client in made.clients:
+        client.close()
+    made.close()
+    made.close()
+
+
+@in_context("made", serving)
+async def test_every_client_gets_every_sentence(made: Server) -> None:
+    first, second = await made.connected(), await made.connected()
+    made.put(ONE * 2)
+    assert first.recv(100) == second.recv(100) == ONE * 2
+    assert made.status().sent == 4
+    assert made.status().dropped == 0
+    first.shutdown(socket.SHUT_WR)  # kplex direction=in, ncat </dev/null
+    second.close()
+
+    def is_alone() -> bool:
+        made.put(ONE)
+        return made.status().readers == 1
+
+    await until(is_alone)
+    first.recv(10_000)
+    for _ in range(5):
+        made.put(ONE)
+        assert first.recv(100) == ONE
+    assert made.status().readers == 1
+
+
+@in_context("made", serving)
+async def test_data_from_a_client_is_ignored_and_an_idle_client_stays_connected(made: Server) -> None:
+    client = await made.connected()
+    client.sendall(b"?WATCH={}\r\n" * 1000)
+    for _ in range(20):
+        await asyncio.sleep(0)
+    made.put(ONE)
+    assert client.recv(100) == ONE
+    made.clock.advance(100 * STUCK_NS)  # a missing device, or a sentence with 0.01 Hz
+    made.tick(made.clock.now_ns())
+    assert made.status().readers == 1
+    made.put(ONE)
+    assert client.recv(100) == ONE
+
+
+@in_context("made", serving)
+async def test_a_client_that_does_not_read_loses_complete_sentences_and_is_disconnected(made: Server) -> None:
+    client = await made.connected()
+    for _ in range(200):
+        made.put(BUSY)
+    status = made.status()
+    assert status.dropped > 100
+    assert status.sent + status.dropped == 200
+    got = bytearray()
+    client.settimeout(0)
+    while len(got) < status.sent * len(BUSY):  # the rest of a partly sent sentence precedes the next sentence
+        made.put(b"")
+        try:
+            got += client.recv(1 << 20)
+        except BlockingIOError:
+            await asyncio.sleep(0)
+    assert bytes(got) == BUSY * status.sent
+    for _ in range(200):
+        made.put(BUSY)
+    made.clock.advance(STUCK_NS)
+    made.tick(made.clock.now_ns())
+    assert made.status().readers == 1
+    made.clock.advance(1)
+    made.tick(made.clock.now_ns())
+    assert made.status().readers == 0
+
+
+@in_context("made", serving)
+async def test_clients_above_the_limit_are_rejected(made: Server) -> None:
+    for _ in range(CLIENTS_MAX):
+        await made.connected()
+    one_more = made.connect()
+    one_more.setblocking(False)
+    closed: list[bytes] = []
+
+    def is_closed() -> bool:
+        try:
+            closed.append(one_more.recv(1))
+        except BlockingIOError:
+            return False
+        return True
+
+    await until(is_closed)
+    assert closed == [b""]
+    assert made.status().readers == CLIENTS_MAX
+    made.clients[3].shutdown(socket.SHUT_WR)
+    for _ in range(10):
+        await asyncio.sleep(0)
+    made.connect()  # in place of the client that can be closed
+    made.clients[3].setblocking(False)
+    one_more = made.clients[3]
+    await until(is_closed)
+    assert made.status().readers == CLIENTS_MAX
+
+
+@in_context("made", serving)
+async def test_a_port_in_use_is_reported(made: Server) -> None:
+    with pytest.raises(ServerError, match=r"nmea0183\.tcp_port"):
+        nmea0183.TcpOutput("127.0.0.1", made.port, VirtualClock().now_ns).open()
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1", "127.255.255.255"])
+def test_datagrams_to_a_host_and_to_all(address: str) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind((address, 0))
+        receiver.settimeout(LIMIT_S)
+        made = nmea0183.UdpOutput(address, receiver.getsockname()[1])
+        made.put(ONE * 3)
+        assert receiver.recv(1000) == ONE * 3
+        assert (made.status().sent, made.status().dropped, made.status().readers) == (3, 0, 1)
+        made.close()
+
+
+def test_datagrams_without_a_route_are_counted_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    made = nmea0183.UdpOutput("127.0.0.1", 9)
+    made.put(ONE + b"x" * 70_000)  # longer than the maximum of a datagram
+    made.put(ONE + b"x" * 70_000)
+    assert (made.status().dropped, made.status().readers) == (2, 0)
+    assert "too long" in made.status().problem
+    assert len(caplog.records) == 1
+    made.close()
+
+
+class Port:
+    def __init__(self) -> None:
+        self.master, self.slave = os.openpty()
+        tty.setraw(self.slave)
+        self.path = os.ttyname(self.slave)
+
+    def close(self) -> None:
+        os.close(self.master)
+        os.close(self.slave)
+
+
+@in_loop
+async def test_a_lost_serial_port_is_opened_again() -> None:
+    clock, ports = VirtualClock(), [Port(), Port()]
+    tried: list[int] = []
+
+    def open_port(_port: str, baud: int) -> int:
+        tried.append(baud)
+        if len(tried) == 1:
+            raise FileNotFoundError(2, "No such file or directory")
+        return open_real_port(ports[0].path, baud)
+
+    made = nmea0183.SerialOutput("/dev/ttyUSB9", 38400, clock.now_ns, open_port)
+    made.put(ONE)
+    made.tick(clock.now_ns())
+    await until(lambda: made.status().problem == "No such file or directory")
+    made.tick(clock.now_ns())
+    assert len(tried) == 1  # the attempt is not due
+    clock.advance(RETRY_FIRST_NS)
+    made.tick(clock.now_ns())
+    await until(lambda: made.status().readers == 1)
+    made.put(ONE)
+    assert os.read(ports[0].master, 100) == ONE
+    ports[0].close()
+    made.put(ONE)
+    assert made.status().readers == 0
+    ports.pop(0)
+    clock.advance(2 * RETRY_FIRST_NS)
+    made.tick(clock.now_ns())
+    await until(lambda: made.status().readers == 1)
+    made.put(ONE)
+    assert os.read(ports[0].master, 100) == ONE
+    assert made.status() == OutputStatus("serial /dev/ttyUSB9", 2, 2, 1, "")
+    assert tried == [38400] * 3
+    made.close()
+    made.close()
+    ports[0].close()
+
+
+@in_loop
+async def test_a_serial_port_finishes_a_sentence_before_the_next() -> None:
+    clock, (reader, writer) = VirtualClock(), os.pipe2(os.O_NONBLOCK)
+    made = nmea0183.SerialOutput("/dev/ttyUSB9", 4800, clock.now_ns, lambda *_: writer)
+    made.tick(clock.now_ns())
+    await until(lambda: made.status().readers == 1)
+    made.put(2 * BUSY)  # a pipe has room for 65,536 bytes
+    data, written, puts = b"", 2, 0
+    while len(data) < len(2 * BUSY):
+        data += os.read(reader, 4096)
+        made.put(ONE)
+        puts += 1
+    with suppress(BlockingIOError):
+        data += os.read(reader, 65_536)
+    written += data.count(ONE)
+    assert data == 2 * BUSY + data.count(ONE) * ONE
+    assert (made.status().sent, made.status().dropped) == (written, puts - data.count(ONE))
+    made.close()
+    os.close(reader)
+
+
+@in_loop
+async def test_a_full_serial_port_drops_complete_sentences() -> None:
+    clock, port = VirtualClock(), Port()
+    made = nmea0183.SerialOutput(port.path, 4800, clock.now_ns)
+    made.tick(clock.now_ns())
+    await until(lambda: made.status().readers == 1)
+    sentence = b"$" + b"y" * 60 + b"\r\n"
+    for _ in range(5000):
+        made.put(sentence)
+    status = made.status()
+    assert status.dropped > 0
+    got = bytearray()
+    while len(got) < status.sent * len(sentence):
+        got += os.read(port.master, 1 << 16)
+        made.put(b"")
+    assert bytes(got) == sentence * status.sent
+    made.close()
+    port.close()
+
+
+@in_loop
+async def test_a_port_opened_after_the_end_is_closed() -> None:
+    clock, port = VirtualClock(), Port()
+    fds: list[int] = []
+
+    def open_port(path: str, baud: int) -> int:
+        fds.append(open_real_port(path, baud))
+        return fds[0]
+
+    made = nmea0183.SerialOutput(port.path, 4800, clock.now_ns, open_port)
+    made.tick(clock.now_ns())
+    made.close()
+
+    def is_closed() -> bool:
+        if not fds:
+            return False
+        try:
+            os.fstat(fds[0])
+        except OSError:
+            return True
+        return False
+
+    await until(is_closed)
+    port.close()

@@ -16,20 +16,10 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 from msgspec import Meta
 
+from imud.contracts import script
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, StreamCodec
 from imud.contracts.command import Calibration, Expectation, Handling, Kept, Proof, Risk, Target, Verb, yaw_at
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Identity, StreamDriver
-from imud.contracts.script import (
-    Outcome,
-    Rejection,
-    Request,
-    RequestScript,
-    Silence,
-    TextLine,
-    never,
-    pause,
-    says_nothing,
-)
 from imud.contracts.setting import DeviceReport, Effect, Reports, Setting, SettingsTable
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
 from imud.links.memory import MemoryLink, MemoryOptions
@@ -106,19 +96,19 @@ class FakeCodec:
         for line in _LINE.finditer(data):
             self.ledger.frames_good += 1
             self.ledger.frames_in_replies += 1
-            events.append(TextLine(line[0].decode("ascii").strip()))
+            events.append(script.TextLine(line[0].decode("ascii").strip()))
             end = line.end()
         return end
 
 
-def _query(payload: bytes, name: str) -> Request:
+def _query(payload: bytes, name: str) -> script.Request:
     is_end, is_error, is_part = (
         of_text(holds) for holds in (lambda line: line == "OK", lambda line: line == "ERR", lambda line: "=" in line)
     )
-    return Request(payload, name, is_end, is_error, is_part, messages_min=2)
+    return script.Request(payload, name, is_end, is_error, is_part, messages_min=2)
 
 
-def _identify() -> Generator[Request, Outcome, Identity]:
+def _identify() -> Generator[script.Request, script.Outcome, Identity]:
     yield _query(QUERY, "WHO")
     return Identity("FAKE")
 
@@ -179,9 +169,11 @@ def _cyclic(settings: FakeCanSettings) -> Sequence[CyclicFrame]:
     return [CyclicFrame(SYNC_ID, False, b"", settings.sync_ms * 1_000_000)] if settings.sync_ms else []
 
 
-def _renumber(target: Target, *, node: int) -> RequestScript[None]:
+def _renumber(target: Target, *, node: int) -> script.RequestScript[None]:
     settings = msgspec.structs.replace(target.settings, node=node)
-    yield Request(bytes([node]), "renumber", never, never, never, silent=True, settings=settings)
+    yield script.Request(
+        bytes([node]), "renumber", script.never, script.never, script.never, silent=True, settings=settings
+    )
 
 
 def fake_can_driver(name: str = "fake-can", base: int = BASE) -> CanDriver:
@@ -195,10 +187,10 @@ def fake_can_driver(name: str = "fake-can", base: int = BASE) -> CanDriver:
             can_id - base if base < can_id <= base + 127 and not extended and len(data) == 8 else None
         ),
         node_settings=lambda node: FakeCanSettings(node=node), node_title=lambda node: f"node {node}",
-        identify=lambda _settings: says_nothing(Identity("FAKE")), apply_identity=lambda _codec, _identity: None,
+        identify=lambda _settings: script.says_nothing(Identity("FAKE")), apply_identity=lambda _codec, _identity: None,
         sample_frames=1, example_frames=lambda _random: [CanFrame(BASE + 1, False, bytes(8), 0)], cyclic=_cyclic,
         verbs={
-            "node": Verb("its number", lambda target: says_nothing(target.settings.node)),
+            "node": Verb("its number", lambda target: script.says_nothing(target.settings.node)),
             "renumber": Verb("give it another number", _renumber),
         },
     )  # fmt: skip
@@ -241,7 +233,7 @@ class LinesCodec:
             self.ledger.frames_in_samples += 1
             return Measurement(len(line) + 2, 0, int(line[2:]), temperature_c=20.0)
         self.ledger.frames_in_replies += 1
-        return TextLine(line)
+        return script.TextLine(line)
 
     def flush(self) -> Sequence[CodecEvent]:
         return ()
@@ -338,50 +330,50 @@ class FakeModule(MemoryLink):
             self.feed(line.encode() + b"\r\n", self._now_ns())
 
 
-def _send_command(line: str) -> RequestScript[Mapping[str, str]]:
+def _send_command(line: str) -> script.RequestScript[Mapping[str, str]]:
     outcome = yield replace(_query(line.encode() + b"\r\n", line.partition(" ")[0]), messages_min=1)
-    if isinstance(outcome, Silence):
+    if isinstance(outcome, script.Silence):
         raise NoReply(f"{line}: expected OK, got nothing")
-    if isinstance(outcome, Rejection):
+    if isinstance(outcome, script.Rejection):
         raise Rejected(f"{line}: the module refused")
     return dict(text.split("=", 1) for text in outcome.lines if "=" in text)
 
 
-def _who() -> RequestScript[Identity]:
+def _who() -> script.RequestScript[Identity]:
     found = yield from _send_command("WHO")
     return Identity(found["NAME"], found["SN"], "1.0")
 
 
-def _get(_target: Target, _names: Collection[str] | None) -> RequestScript[Reports]:
+def _get(_target: Target, _names: Collection[str] | None) -> script.RequestScript[Reports]:
     found = yield from _send_command("GET")
     return {"": DeviceReport(found, {name: msgspec.json.decode(text) for name, text in found.items()})}
 
 
-def _setter(name: str) -> Callable[[Target, Any], RequestScript[None]]:
-    def write(_target: Target, value: Any) -> RequestScript[None]:
+def _setter(name: str) -> Callable[[Target, Any], script.RequestScript[None]]:
+    def write(_target: Target, value: Any) -> script.RequestScript[None]:
         yield from _send_command(f"SET {name}={msgspec.json.encode(value).decode()}")
 
     return write
 
 
-def _save_all(_target: Target) -> RequestScript[None]:
+def _save_all(_target: Target) -> script.RequestScript[None]:
     yield from _send_command("SAVE")
 
 
-def _restart(_target: Target) -> RequestScript[None]:
-    yield Request(b"RESTART\r\n", "RESTART", never, never, never, silent=True)
-    yield pause(1_000_000_000)
+def _restart(_target: Target) -> script.RequestScript[None]:
+    yield script.Request(b"RESTART\r\n", "RESTART", script.never, script.never, script.never, silent=True)
+    yield script.pause(1_000_000_000)
 
 
-def _write_baud(target: Target, baud: int) -> RequestScript[None]:
+def _write_baud(target: Target, baud: int) -> script.RequestScript[None]:
     yield from _send_command(f"SET baud={baud}")
     yield from _send_command("SAVE")
     yield from _restart(target)
-    yield pause(1_000_000, baud=baud)
+    yield script.pause(1_000_000, baud=baud)
     try:
         yield from _who()
     except NoReply:
-        yield pause(1_000_000, baud=target.baud)
+        yield script.pause(1_000_000, baud=target.baud)
         raise Rejected(f"the device does not reply at {baud} baud; the bus has {target.baud} baud again") from None
 
 
@@ -438,11 +430,11 @@ ZERO: Final = Calibration(
 )  # fmt: skip
 
 
-def _who_again(_target: Target) -> RequestScript[None]:
+def _who_again(_target: Target) -> script.RequestScript[None]:
     yield from _who()
 
 
-def _turned(_target: Target, *, angle_deg: float) -> RequestScript[None]:
+def _turned(_target: Target, *, angle_deg: float) -> script.RequestScript[None]:
     yield from _who()
 
 
@@ -450,7 +442,7 @@ def _heading_expected(given: Any) -> Sequence[Expectation]:
     return () if given.angle_deg > 180 else (yaw_at(given.angle_deg),)
 
 
-def _set_mode(target: Target, *, mode: str) -> RequestScript[None]:
+def _set_mode(target: Target, *, mode: str) -> script.RequestScript[None]:
     return _setter("mode")(target, mode)
 
 
@@ -459,7 +451,7 @@ FAKE_MODULE_DRIVER: Final = replace(
     device_settings=FAKE_SETTINGS, calibrations={"zero": ZERO},
     verbs={
         "set_mode": Verb("set it", _set_mode),
-        "wait": Verb("take an hour", lambda _target: (pause(3600 * 1_000_000_000) for _ in range(1))),
+        "wait": Verb("take an hour", lambda _target: (script.pause(3600 * 1_000_000_000) for _ in range(1))),
         "save": Verb("save all", _save_all, saves=True, changes=False),
         "restart": Verb("restart it", _restart, restarts=True, proof=Proof.RESTART),
         "factory_reset": Verb("forget all", _restart, Risk.RESET, restarts=True, proof=Proof.SETTINGS),

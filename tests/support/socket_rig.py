@@ -16,34 +16,9 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from imud.attitude.conventions import Convention, Heading
-from imud.contracts.command import (
-    Calibration,
-    CalibrationResult,
-    Calibrations,
-    Check,
-    Handling,
-    Kept,
-    LastCalibration,
-    Target,
-    Verb,
-    Verbs,
-)
+from imud.contracts import command, setting
 from imud.contracts.condition import Condition, DeviceCondition
 from imud.contracts.publisher import AS_SENT, Batch, Latencies, PublisherContext, RecordingSource
-from imud.contracts.setting import (
-    AppliedSettings,
-    AppliedStep,
-    Effect,
-    OnDifference,
-    PlannedStep,
-    SettingDifference,
-    SettingInfo,
-    SettingsPlan,
-    SettingsReport,
-    SettingsState,
-    SettingsStatus,
-    StepOutcome,
-)
 from imud.contracts.status import ClockStatus, Deviations, DeviceState, DeviceStatus, FrameStatus, KernelCounters
 from imud.host import event_loop
 from imud.model.errors import IsSetting, Rejected
@@ -108,15 +83,15 @@ def context(
     )  # fmt: skip
 
 
-def turn(_target: Target, *, angle_deg: float, relative: bool = False) -> None:
+def turn(_target: command.Target, *, angle_deg: float, relative: bool = False) -> None:
     """Verb `yaw`."""
 
 
-VERBS = {"yaw": Verb("set the heading", turn)}
+VERBS = {"yaw": command.Verb("set the heading", turn)}
 CALIBRATIONS = {
-    "heading": Calibration(
-        help="make the present heading zero", section="2.2.4", handling=Handling.REST,
-        instructions=("Do not touch it.",), begin=lambda _target: None, kept=Kept.BY_SAVE,
+    "heading": command.Calibration(
+        help="make the present heading zero", section="2.2.4", handling=command.Handling.REST,
+        instructions=("Do not touch it.",), begin=lambda _target: None, kept=command.Kept.BY_SAVE,
     )
 }  # fmt: skip
 done_late = asyncio.Event()
@@ -124,9 +99,11 @@ done_late = asyncio.Event()
 
 
 class FakeControl:
-    verbs: Verbs = VERBS
-    calibrations: Calibrations = CALIBRATIONS
-    last_calibrations: Mapping[str, LastCalibration] = {"heading": LastCalibration(NOW_NS, verified=True, saved=False)}
+    verbs: command.Verbs = VERBS
+    calibrations: command.Calibrations = CALIBRATIONS
+    last_calibrations: Mapping[str, command.LastCalibration] = {
+        "heading": command.LastCalibration(NOW_NS, verified=True, saved=False)
+    }
 
     def __init__(self, device: str) -> None:
         self._device = device
@@ -146,38 +123,44 @@ class FakeControl:
         VERBS[name].arguments(arguments)
         return None
 
-    async def calibrate(self, kind: str, *, save: bool) -> CalibrationResult:
+    async def calibrate(self, kind: str, *, save: bool) -> command.CalibrationResult:
         if kind == "wait":
             await done_late.wait()
         if kind not in CALIBRATIONS:
             raise Rejected(f"{self._device} refuses {kind}")
-        check = Check("yaw", 0.001, 0.017, "rad", passed=True)
-        return CalibrationResult(kind, True, "", "", (check,), save, Kept.BY_SAVE)
+        check = command.Check("yaw", 0.001, 0.017, "rad", passed=True)
+        return command.CalibrationResult(kind, True, "", "", (check,), save, command.Kept.BY_SAVE)
 
     def stop_calibration(self) -> bool:
         return False
 
-    async def settings_report(self, *, fresh: bool) -> SettingsReport:
-        differences = {"mode": SettingDifference("9-axis", "6-axis")}
-        status = SettingsStatus(
-            SettingsState.DIFFER, OnDifference.REPORT, differences=differences, flash_writes=3,
+    async def settings_report(self, *, fresh: bool) -> setting.SettingsReport:
+        differences = {"mode": setting.SettingDifference("9-axis", "6-axis")}
+        status = setting.SettingsStatus(
+            setting.SettingsState.DIFFER, setting.OnDifference.REPORT, differences=differences, flash_writes=3,
             read_ns=NOW_NS if fresh else 80_000_000_000_000,
         )  # fmt: skip
         texts = 'one of "6-axis", "9-axis"', "axes that make the attitude", "", "2.2.4"
-        mode = SettingInfo("mode", *texts, Effect.AT_ONCE, False, True, True, "9-axis", "6-axis", differs=True)
-        return SettingsReport(self._device, "hipnuc-uart", {"product": "HI13"}, status, (mode,))
+        mode = setting.SettingInfo(
+            "mode", *texts, setting.Effect.AT_ONCE, False, True, True, "9-axis", "6-axis", differs=True
+        )
+        return setting.SettingsReport(self._device, "hipnuc-uart", {"product": "HI13"}, status, (mode,))
 
-    async def settings_plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
+    async def settings_plan(self, given: Mapping[str, Any] | None, *, save: bool) -> setting.SettingsPlan:
         """Make one step of a plan: for the given settings or for the declared settings."""
         mode = {"mode": "9-axis"} if given is None else given
-        return SettingsPlan(tuple(PlannedStep(name, value, "6-axis") for name, value in mode.items()), save=save)
+        return setting.SettingsPlan(
+            tuple(setting.PlannedStep(name, value, "6-axis") for name, value in mode.items()), save=save
+        )
 
-    async def settings_apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
+    async def settings_apply(self, given: Mapping[str, Any] | None, *, save: bool) -> setting.AppliedSettings:
         if given and "wait" in given:
             await done_late.wait()
         plan = await self.settings_plan(given, save=save)
-        steps = [AppliedStep(one.name, one.value, one.before, StepOutcome.VERIFIED) for one in plan.steps]
-        return AppliedSettings(tuple(steps), saved=save, not_saved="" if save else NOT_SAVED)
+        steps = [
+            setting.AppliedStep(one.name, one.value, one.before, setting.StepOutcome.VERIFIED) for one in plan.steps
+        ]
+        return setting.AppliedSettings(tuple(steps), saved=save, not_saved="" if save else NOT_SAVED)
 
 
 def run(body: Callable[[], Awaitable[T]]) -> T:

@@ -15,19 +15,7 @@ from imud.contracts.status import KernelCounters
 from imud.formats.nmea0183 import build
 from imud.model.errors import LinkError, LinkMissing
 from imud.model.units import NS_PER_S
-from imud.utc import RMC_SOURCES
-from imud.utc.receivers import (
-    FIRST_PAUSE_S,
-    LINE_BYTES_MAX,
-    LONGEST_PAUSE_S,
-    GpsdSource,
-    NmeaPortSource,
-    Retry,
-    RmcOptions,
-    SentenceSplitter,
-    SourceContext,
-    make_nmea,
-)
+from imud.utc import RMC_SOURCES, receivers
 from imud.utc.system_clock import SystemClockSource
 from tests.support.documented import check_schema
 from tests.support.event_loops import in_loop
@@ -36,10 +24,10 @@ from tests.support.rmc_sources import LIMIT_S, Sentences, soon
 SENTENCES = [build((1_795_000_000 + n) * NS_PER_S) for n in range(5)]
 VERSION = b'{"class":"VERSION","release":"3.22","rev":"3.22","proto_major":3,"proto_minor":14}\r\n'
 Serve = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
-Scene = Callable[[GpsdSource, Sentences], Awaitable[None]]
+Scene = Callable[[receivers.GpsdSource, Sentences], Awaitable[None]]
 
 
-def play(serve: Serve, scene: Scene, gps: str = "", retry: Retry | None = None) -> Sentences:
+def play(serve: Serve, scene: Scene, gps: str = "", retry: receivers.Retry | None = None) -> Sentences:
     async def whole() -> Sentences:
         async def one(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             try:
@@ -50,7 +38,11 @@ def play(serve: Serve, scene: Scene, gps: str = "", retry: Retry | None = None) 
         server = await asyncio.start_server(one, "127.0.0.1", 0)
         port = server.sockets[0].getsockname()[1]
         sentences = Sentences()
-        source = GpsdSource(RmcOptions(source="gpsd", tcp_port=port, gps=gps), time.monotonic_ns, retry or Retry(soon))
+        source = receivers.GpsdSource(
+            receivers.RmcOptions(source="gpsd", tcp_port=port, gps=gps),
+            time.monotonic_ns,
+            retry or receivers.Retry(soon),
+        )
         async with server:
             source.start(sentences)
             try:
@@ -76,7 +68,7 @@ def test_it_asks_for_nmea_and_gives_rmc_with_its_time() -> None:
         assert await reader.read() == b""
         ended.set()
 
-    async def scene(source: GpsdSource, sentences: Sentences) -> None:
+    async def scene(source: receivers.GpsdSource, sentences: Sentences) -> None:
         await sentences.until(lambda: len(sentences.got) == 2)
         assert (source.problem, source.sentences) == ("", 2)
         source.close()
@@ -102,7 +94,7 @@ def test_a_server_that_closes_is_connected_to_again() -> None:
         writer.write(SENTENCES[connections] + SENTENCES[0][:20])
         await writer.drain()
 
-    async def scene(_source: GpsdSource, sentences: Sentences) -> None:
+    async def scene(_source: receivers.GpsdSource, sentences: Sentences) -> None:
         await sentences.until(lambda: len(sentences.got) >= 3)
 
     pauses: list[float] = []
@@ -110,8 +102,8 @@ def test_a_server_that_closes_is_connected_to_again() -> None:
     async def sleep(seconds: float) -> None:
         pauses.append(seconds)
 
-    assert play(serve, scene, retry=Retry(sleep)).data[:3] == SENTENCES[1:4]
-    assert set(pauses) == {FIRST_PAUSE_S}  # after a success, the next pause is short again
+    assert play(serve, scene, retry=receivers.Retry(sleep)).data[:3] == SENTENCES[1:4]
+    assert set(pauses) == {receivers.FIRST_PAUSE_S}  # after a success, the next pause is short again
 
 
 @in_loop
@@ -126,7 +118,9 @@ async def test_an_unreachable_server_is_reported_and_retried() -> None:
         paused.set()
         await asyncio.sleep(0)
 
-    source = GpsdSource(RmcOptions(source="gpsd", tcp_port=port), time.monotonic_ns, Retry(sleep))
+    source = receivers.GpsdSource(
+        receivers.RmcOptions(source="gpsd", tcp_port=port), time.monotonic_ns, receivers.Retry(sleep)
+    )
     source.start(Sentences())
     async with asyncio.timeout(LIMIT_S):
         await paused.wait()
@@ -141,7 +135,7 @@ def test_a_line_that_is_too_long_is_skipped() -> None:
         writer.write(b"x" * 100_000 + b"\n" + SENTENCES[0])
         await reader.read()
 
-    async def scene(source: GpsdSource, sentences: Sentences) -> None:
+    async def scene(source: receivers.GpsdSource, sentences: Sentences) -> None:
         await sentences.until(lambda: bool(sentences.got))
         assert source.problem == ""
 
@@ -205,7 +199,7 @@ class Port:
 @in_loop
 async def test_sentences_come_with_the_time_of_their_last_byte() -> None:
     port, sentences = Port(), Sentences()
-    source = NmeaPortSource(port, Retry(soon))
+    source = receivers.NmeaPortSource(port, receivers.Retry(soon))
     source.start(sentences)
     async with asyncio.timeout(LIMIT_S):
         await port.started.wait()
@@ -223,7 +217,7 @@ async def test_sentences_come_with_the_time_of_their_last_byte() -> None:
 @in_loop
 async def test_a_port_that_goes_away_or_is_held_is_opened_again() -> None:
     port, sentences = Port(refusals=3), Sentences()
-    source = NmeaPortSource(port, Retry(soon))
+    source = receivers.NmeaPortSource(port, receivers.Retry(soon))
     source.start(sentences)
     async with asyncio.timeout(LIMIT_S):
         await port.started.wait()
@@ -250,24 +244,26 @@ async def test_make_nmea_uses_the_configured_port() -> None:
         asked.append((path, baud))
         return Port()
 
-    context = SourceContext(make_port, time.monotonic_ns, lambda: 0)
-    source = make_nmea(RmcOptions(source="nmea", port="/dev/ttyGNSS", baud=38400), context)
+    context = receivers.SourceContext(make_port, time.monotonic_ns, lambda: 0)
+    source = receivers.make_nmea(receivers.RmcOptions(source="nmea", port="/dev/ttyGNSS", baud=38400), context)
     assert source.title == "NMEA receiver on /dev/ttyGNSS"
     assert asked == [("/dev/ttyGNSS", 38400)]
 
 
 def test_keys_of_rmc_accept_the_documented_values() -> None:
-    assert check_schema("RMC sentences", RmcOptions) == 8
+    assert check_schema("RMC sentences", receivers.RmcOptions) == 8
 
 
 def test_sources_by_their_name() -> None:
     """`nmea` needs a port, the others read gpsd or the clock of the host."""
-    context = SourceContext(lambda *_where: Port(), time.monotonic_ns, lambda: 0)
+    context = receivers.SourceContext(lambda *_where: Port(), time.monotonic_ns, lambda: 0)
     kinds = {
-        name: type(RMC_SOURCES[name](msgspec.convert({"source": name, "port": "/dev/a"}, RmcOptions), context))
+        name: type(
+            RMC_SOURCES[name](msgspec.convert({"source": name, "port": "/dev/a"}, receivers.RmcOptions), context)
+        )
         for name in RMC_SOURCES
     }
-    assert kinds == {"gpsd": GpsdSource, "nmea": NmeaPortSource, "system": SystemClockSource}
+    assert kinds == {"gpsd": receivers.GpsdSource, "nmea": receivers.NmeaPortSource, "system": SystemClockSource}
 
 
 GGA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
@@ -277,15 +273,15 @@ JSON = b'{"class":"TPV","device":"/dev/ttyS0","mode":3}\r\n'
 @pytest.mark.parametrize("size", [1, 2, 7, 64, 10_000])
 def test_any_split_gives_the_same(size: int) -> None:
     data = JSON + b"".join(sentence + GGA for sentence in SENTENCES)
-    splitter = SentenceSplitter()
+    splitter = receivers.SentenceSplitter()
     found = [s for at in range(0, len(data), size) for s in splitter.feed(data[at : at + size])]
     assert found == SENTENCES
 
 
 def test_broken_and_too_long_sentences_are_skipped() -> None:
     broken = SENTENCES[0][:30] + SENTENCES[1]
-    assert SentenceSplitter().feed(broken + b"noise\xff$" + SENTENCES[2]) == SENTENCES[1:3]
-    splitter = SentenceSplitter()
+    assert receivers.SentenceSplitter().feed(broken + b"noise\xff$" + SENTENCES[2]) == SENTENCES[1:3]
+    splitter = receivers.SentenceSplitter()
     splitter.feed(SENTENCES[0][:20])
     splitter.clear()
     assert splitter.feed(SENTENCES[0][20:] + SENTENCES[1]) == [SENTENCES[1]]
@@ -296,12 +292,12 @@ def test_broken_and_too_long_sentences_are_skipped() -> None:
 
 
 def test_a_line_without_end_is_skipped_and_not_buffered() -> None:
-    splitter = SentenceSplitter()
+    splitter = receivers.SentenceSplitter()
     tracemalloc.start()
     try:
         for _ in range(100):
             assert splitter.feed(b"$" + b"x" * 1000) == []
-            assert tracemalloc.get_traced_memory()[0] <= LINE_BYTES_MAX + 4000
+            assert tracemalloc.get_traced_memory()[0] <= receivers.LINE_BYTES_MAX + 4000
     finally:
         tracemalloc.stop()
     assert splitter.feed(SENTENCES[0] + SENTENCES[1]) == [SENTENCES[1]]  # the first sentence ends the skipped line
@@ -314,10 +310,10 @@ async def test_pauses() -> None:
     async def sleep(seconds: float) -> None:
         pauses.append(seconds)
 
-    retry = Retry(sleep)
+    retry = receivers.Retry(sleep)
     for _ in range(10):
         await retry.pause()
     retry.reset()
     await retry.pause()
-    assert pauses[:3] == [FIRST_PAUSE_S, 2 * FIRST_PAUSE_S, 4 * FIRST_PAUSE_S]
-    assert pauses[-2:] == [LONGEST_PAUSE_S, FIRST_PAUSE_S]
+    assert pauses[:3] == [receivers.FIRST_PAUSE_S, 2 * receivers.FIRST_PAUSE_S, 4 * receivers.FIRST_PAUSE_S]
+    assert pauses[-2:] == [receivers.LONGEST_PAUSE_S, receivers.FIRST_PAUSE_S]

@@ -8,25 +8,17 @@ import pytest
 from imud.formats.nmea0183 import Rmc, parse
 from imud.host.clock import HostClock
 from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.utc import system_clock
 from imud.utc.receivers import RmcOptions
-from imud.utc.system_clock import (
-    AFTER_NS,
-    LATEST_NS,
-    KernelClock,
-    SystemClockSource,
-    Timex,
-    kernel_clock,
-    system_reference,
-)
 from tests.support.event_loops import VirtualClock, in_loop, run_virtually
 from tests.support.rmc_sources import Sentences
 
-GOOD = KernelClock(True, 500, 1000)
+GOOD = system_clock.KernelClock(True, 500, 1000)
 OFFSET_NS = 1_795_000_000 * NS_PER_S + 123_456_789
 
 
 def test_the_kernel_answers_sensibly() -> None:
-    clock = kernel_clock()
+    clock = system_clock.kernel_clock()
     assert 0 <= clock.most_error_us <= 16_000_000  # NTP_PHASE_LIMIT
     assert 0 <= clock.estimated_error_us <= 16_000_000
     assert clock.synchronised or clock.most_error_us > 0
@@ -39,33 +31,33 @@ def test_the_kernel_answers_sensibly() -> None:
     [(0, 0x0001, True), (1, 0x2011, True), (5, 0x0040, False), (5, 0x0001, False), (0, 0x0040, False)],
 )
 def test_states_that_count_as_synchronized(state: int, status: int, synchronised: bool) -> None:
-    def ask(timex: Timex) -> int:
+    def ask(timex: system_clock.Timex) -> int:
         assert timex.modes == 0  # adjtimex must not change the clock
         timex.status, timex.esterror, timex.maxerror = status, 7, 99
         return state
 
-    assert kernel_clock(ask) == KernelClock(synchronised, 7, 99)
+    assert system_clock.kernel_clock(ask) == system_clock.KernelClock(synchronised, 7, 99)
 
 
 def test_a_refused_call_means_not_synchronized() -> None:
-    def ask(_timex: Timex) -> int:
+    def ask(_timex: system_clock.Timex) -> int:
         raise PermissionError(1, "Operation not permitted")
 
-    assert not kernel_clock(ask).synchronised
-    assert system_reference(kernel_clock(ask), 42) is None
-    assert system_reference(KernelClock(False, 1, NS_PER_MS), 42) is None
+    assert not system_clock.kernel_clock(ask).synchronised
+    assert system_clock.system_reference(system_clock.kernel_clock(ask), 42) is None
+    assert system_clock.system_reference(system_clock.KernelClock(False, 1, NS_PER_MS), 42) is None
 
 
 @pytest.mark.parametrize(
     ("clock", "error_ns"),
     [
-        (KernelClock(True, 250, 300), 250_000),
-        (KernelClock(True, 0, 1732), 999_971),  # uniform within ±1732 µs: 1732 / √3
-        (KernelClock(True, 5, 17_320), 9_999_707),
+        (system_clock.KernelClock(True, 250, 300), 250_000),
+        (system_clock.KernelClock(True, 0, 1732), 999_971),  # uniform within ±1732 µs: 1732 / √3
+        (system_clock.KernelClock(True, 5, 17_320), 9_999_707),
     ],
 )
-def test_the_error_is_the_greater_of_both(clock: KernelClock, error_ns: int) -> None:
-    reference = system_reference(clock, 42)
+def test_the_error_is_the_greater_of_both(clock: system_clock.KernelClock, error_ns: int) -> None:
+    reference = system_clock.system_reference(clock, 42)
     assert reference
     assert reference.offset_ns == 42
     assert reference.error_ns == pytest.approx(error_ns, abs=1)
@@ -77,11 +69,11 @@ def test_the_error_is_the_greater_of_both(clock: KernelClock, error_ns: int) -> 
 class SystemClockBench:
     """A source with a clock of the test. Its timer does not run, because the tests do not wait."""
 
-    def __init__(self, rate_hz: int = 1, clock: KernelClock = GOOD) -> None:
+    def __init__(self, rate_hz: int = 1, clock: system_clock.KernelClock = GOOD) -> None:
         self.now_ns = 5 * NS_PER_S
         self.clock = clock
         self.got: list[tuple[bytes, int]] = []
-        self.source = SystemClockSource(
+        self.source = system_clock.SystemClockSource(
             RmcOptions(source="system", rate_hz=rate_hz), lambda: self.now_ns, lambda: OFFSET_NS, lambda: self.clock
         )
         self.source.start(lambda sentence, t_rx_ns: self.got.append((sentence, t_rx_ns)))
@@ -103,8 +95,8 @@ async def test_each_names_its_instant_after_it_was_and_within_its_second(rate_hz
         assert isinstance(rmc, Rmc)
         assert rmc.valid
         assert rmc.unix_s == utc_ns // NS_PER_S
-        assert AFTER_NS <= utc_ns - rmc.utc_ns < AFTER_NS + 60 * NS_PER_MS
-        assert utc_ns % NS_PER_S < LATEST_NS
+        assert system_clock.AFTER_NS <= utc_ns - rmc.utc_ns < system_clock.AFTER_NS + 60 * NS_PER_MS
+        assert utc_ns % NS_PER_S < system_clock.LATEST_NS
     names = [rmc.utc_ns for s, _ in bench.got if isinstance(rmc := parse(s), Rmc)]
     assert len(set(names)) == len(names)
     assert sum(name % NS_PER_S == 0 for name in names) >= 18
@@ -126,13 +118,15 @@ async def test_an_early_wakeup_waits_and_a_late_wakeup_skips_edges() -> None:
 @pytest.mark.parametrize(
     ("clock", "problem"),
     [
-        (KernelClock(False, 0, 0), "not synchronized"),
-        (KernelClock(True, 51_000, 60_000), "may be wrong by 51.0 ms, the maximum is 50 ms"),
-        (KernelClock(True, 0, 100_000), "may be wrong by 57.7 ms"),
+        (system_clock.KernelClock(False, 0, 0), "not synchronized"),
+        (system_clock.KernelClock(True, 51_000, 60_000), "may be wrong by 51.0 ms, the maximum is 50 ms"),
+        (system_clock.KernelClock(True, 0, 100_000), "may be wrong by 57.7 ms"),
     ],
 )
 @in_loop
-async def test_an_inaccurate_clock_gives_no_sentence_and_reports_the_reason(clock: KernelClock, problem: str) -> None:
+async def test_an_inaccurate_clock_gives_no_sentence_and_reports_the_reason(
+    clock: system_clock.KernelClock, problem: str
+) -> None:
     bench = SystemClockBench(clock=clock)
     bench.go(3)
     assert bench.got == []
@@ -147,7 +141,7 @@ async def test_an_inaccurate_clock_gives_no_sentence_and_reports_the_reason(cloc
 def test_the_timer_runs_in_the_event_loop_and_stops() -> None:
     clock, sentences = VirtualClock(), Sentences()
     settings = RmcOptions(source="system", rate_hz=10)
-    source = SystemClockSource(settings, clock.now_ns, clock.host.utc_offset_ns, lambda: GOOD)
+    source = system_clock.SystemClockSource(settings, clock.now_ns, clock.host.utc_offset_ns, lambda: GOOD)
 
     async def scene() -> None:
         source.start(sentences)

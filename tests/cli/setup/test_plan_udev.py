@@ -5,16 +5,7 @@ from typing import NoReturn
 import pytest
 
 from imud import config
-from imud.cli.setup.plan import (
-    RULES,
-    UsbAdapter,
-    device_names,
-    is_example,
-    modem_manager_runs,
-    rules,
-    usb_adapter,
-    with_devices,
-)
+from imud.cli.setup import plan
 from imud.config.yaml import read_yaml
 from imud.model.errors import ImudError
 from tests.cli.setup.conftest import LivingMachine
@@ -23,12 +14,12 @@ from tests.support.files import ROOT
 WHICH = 'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6001", ATTRS{serial}=="A1"'
 LATENCY = f'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", {WHICH}, ATTR{{latency_timer}}="1"'
 MODEM = f'ACTION!="remove", SUBSYSTEM=="tty", {WHICH}, ENV{{ID_MM_DEVICE_IGNORE}}="1", ENV{{ID_MM_PORT_IGNORE}}="1"'
-FTDI = UsbAdapter("ttyUSB0", "ftdi_sio", "0403", "6001", "A1")
-OTHER = UsbAdapter("ttyUSB1", "cp210x", "10c4", "ea60", "")
+FTDI = plan.UsbAdapter("ttyUSB0", "ftdi_sio", "0403", "6001", "A1")
+OTHER = plan.UsbAdapter("ttyUSB1", "cp210x", "10c4", "ea60", "")
 
 
-def lines(machine: LivingMachine, *adapters: UsbAdapter) -> list[str]:
-    change = rules(machine.surroundings(), adapters)
+def lines(machine: LivingMachine, *adapters: plan.UsbAdapter) -> list[str]:
+    change = plan.rules(machine.surroundings(), adapters)
     return [] if change is None else change.content.decode().splitlines()[1:]
 
 
@@ -36,8 +27,8 @@ def test_an_adapter_is_found_and_gets_a_latency_timer(machine: LivingMachine) ->
     machine.usb_port("ttyUSB0")
     machine.uart("ttyAMA0")
     at = machine.surroundings()
-    assert usb_adapter(at, "/dev/ttyUSB0") == FTDI
-    assert usb_adapter(at, "/dev/ttyAMA0") is None
+    assert plan.usb_adapter(at, "/dev/ttyUSB0") == FTDI
+    assert plan.usb_adapter(at, "/dev/ttyAMA0") is None
     assert lines(machine, FTDI, OTHER) == [LATENCY]
 
 
@@ -58,14 +49,14 @@ def test_a_host_without_systemctl_has_no_modem_manager(machine: LivingMachine) -
 
     at = machine.surroundings()
     at.run = missing
-    assert not modem_manager_runs(at)
+    assert not plan.modem_manager_runs(at)
 
 
 def test_lines_that_are_there_stay_and_are_not_proposed_again(machine: LivingMachine) -> None:
-    machine.write(RULES, f"# mine\n{LATENCY}\n")
+    machine.write(plan.RULES, f"# mine\n{LATENCY}\n")
     assert lines(machine, FTDI) == []
     second = FTDI._replace(serial="A2", node="ttyUSB3")
-    change = rules(machine.surroundings(), [FTDI, second])
+    change = plan.rules(machine.surroundings(), [FTDI, second])
     assert change is not None
     assert change.content.decode().splitlines() == ["# mine", LATENCY, LATENCY.replace('"A1"', '"A2"')]
     assert "--sysname-match=ttyUSB3" in change.then[1]
@@ -82,11 +73,11 @@ EXAMPLE = (ROOT / "etc/imud.yaml").read_bytes()
 
 
 def test_without_a_file_one_is_made_and_disabled_devices_have_names() -> None:
-    text = with_devices(None, NEW).decode()
+    text = plan.with_devices(None, NEW).decode()
     assert text.endswith("devices:\n" + BLOCK)
     assert [one.name for one in config.parse(text, "new").devices] == ["imu"]
-    assert device_names(b"devices:\n  bow: {enabled: false, uart: {port: /dev/ttyS0}}\n") == ["bow"]
-    assert device_names(None) == []
+    assert plan.device_names(b"devices:\n  bow: {enabled: false, uart: {port: /dev/ttyS0}}\n") == ["bow"]
+    assert plan.device_names(None) == []
 
 
 def test_a_block_goes_behind_the_key_or_is_left_to_the_person() -> None:
@@ -106,7 +97,7 @@ def test_a_block_goes_behind_the_key_or_is_left_to_the_person() -> None:
         ("devices:\r\n  bow: {uart: {port: /dev/ttyS0}}\r\n", None),
         ("\ufeffdevices: {}", "devices:\n" + BLOCK),
     ]:
-        made = with_devices(before.encode(), NEW).decode()
+        made = plan.with_devices(before.encode(), NEW).decode()
         assert after is None or made == after
         assert made.count("\r\n") in (0, made.count("\n"))
         old, new = read_yaml(before.encode()).data, read_yaml(made.encode()).data
@@ -114,15 +105,17 @@ def test_a_block_goes_behind_the_key_or_is_left_to_the_person() -> None:
         assert new == {**old, "devices": {**(old.get("devices") or {}), **NEW}}
     for before in ["devices: {bow: {uart: {port: /dev/ttyS0}}}\n", "{devices: {}}\n", "- a\n"]:
         with pytest.raises(ImudError, match="cannot add the devices") as refused:
-            with_devices(before.encode(), NEW)
+            plan.with_devices(before.encode(), NEW)
         assert BLOCK.rstrip() in str(refused.value)
 
 
 def test_the_example_of_the_package_is_known_and_only_its_device_is_replaced() -> None:
-    assert is_example(EXAMPLE)
-    assert not is_example(EXAMPLE + b"  bow: {uart: {port: /dev/ttyS9}}\n")
-    made = with_devices(EXAMPLE, {"mast": {"driver": "imu61x-can", "socketcan": {"interface": "can0"}}}, replace="imu")
-    assert device_names(made) == ["mast"]
+    assert plan.is_example(EXAMPLE)
+    assert not plan.is_example(EXAMPLE + b"  bow: {uart: {port: /dev/ttyS9}}\n")
+    made = plan.with_devices(
+        EXAMPLE, {"mast": {"driver": "imu61x-can", "socketcan": {"interface": "can0"}}}, replace="imu"
+    )
+    assert plan.device_names(made) == ["mast"]
     kept = made.decode().splitlines()
     lost = [line for line in EXAMPLE.decode().splitlines() if line not in kept]
     assert lost[0] == "  imu:"
@@ -139,6 +132,6 @@ def test_names_of_ports_stay_what_they_are() -> None:
         ("12", '"12"'),
         ("a: b", '"a: b"'),
     ]:  # fmt: skip
-        made = with_devices(None, {"imu": {"uart": {"port": text}}}).decode()
+        made = plan.with_devices(None, {"imu": {"uart": {"port": text}}}).decode()
         assert f"port: {written}\n" in made
         assert read_yaml(made.encode()).data == {"devices": {"imu": {"uart": {"port": text}}}}

@@ -9,23 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from tests.lab_debian.guest import system
 from tests.lab_debian.guest.checks import Checks, Failed, expect, wait_until
-from tests.lab_debian.guest.system import (
-    CONFIG,
-    PYTHON,
-    UNIT,
-    Host,
-    configure,
-    confined,
-    confinement,
-    device,
-    journal,
-    mark,
-    must,
-    run,
-    start_service,
-    wait_streaming,
-)
 
 NODES = {
     "x86_64": ("ttyUSB0", "ttyS1", "i2c-0", "spidev*", "gpiochip0"),
@@ -61,15 +46,15 @@ print(feed.sent, feed.refused, feed.problem)
 
 def make_nodes() -> None:
     """Create a node for each kind of bus for which Debian's kernel has a driver of QEMU's machine (machine.py)."""
-    must("modprobe", "i2c-dev")
-    run("modprobe", "i2c-stub", "chip_addr=0x18")
+    system.must("modprobe", "i2c-dev")
+    system.run("modprobe", "i2c-stub", "chip_addr=0x18")
     for module in ("pcengines-apuv2", "parport_pc", "spi-butterfly"):
-        run("modprobe", module)
+        system.run("modprobe", module)
     for found in SPI.glob("devices/*"):
         if not (found / "driver").exists():
             (found / "driver_override").write_text("spidev")
             (SPI / "drivers/spidev/bind").write_text(found.name)
-    must("udevadm", "settle")
+    system.must("udevadm", "settle")
 
 
 def is_there(checks: Checks, pattern: str, what: str) -> bool:
@@ -84,7 +69,7 @@ def is_there(checks: Checks, pattern: str, what: str) -> bool:
     return False
 
 
-def check(checks: Checks, _host: Host) -> None:
+def check(checks: Checks, _host: system.Host) -> None:
     make_nodes()
     check_i2c(checks)
     check_gpio(checks)
@@ -95,20 +80,20 @@ def check(checks: Checks, _host: Host) -> None:
 @contextmanager
 def further_device(text: str) -> Iterator[str]:
     """Add a device to the configuration during the block. Yield the problem that the daemon reports for it."""
-    before = CONFIG.read_text()
-    since = mark()
-    configure(before + text)
-    start_service()
-    wait_until(lambda: (device("keel") or {}).get("problem"), "a problem of the device")
-    problem: str = (device("keel") or {})["problem"]
+    before = system.CONFIG.read_text()
+    since = system.mark()
+    system.configure(before + text)
+    system.start_service()
+    wait_until(lambda: (system.device("keel") or {}).get("problem"), "a problem of the device")
+    problem: str = (system.device("keel") or {})["problem"]
     try:
-        if "cannot open" in problem or "cannot open" in journal(since):
+        if "cannot open" in problem or "cannot open" in system.journal(since):
             raise Failed(problem)
         yield problem
     finally:
-        configure(before)
-        must("systemctl", "reload", UNIT)
-        wait_streaming("usb")
+        system.configure(before)
+        system.must("systemctl", "reload", system.UNIT)
+        system.wait_streaming("usb")
 
 
 def check_i2c(checks: Checks) -> None:
@@ -128,12 +113,12 @@ def check_gpio(checks: Checks) -> None:
     with checks("a GPIO chip belongs to its group"):
         expect("group and mode", (CHIP.group(), CHIP.stat().st_mode & 0o777), ("gpio", 0o660))
     with checks("the daemon drives a GPIO line, and names the line without interrupts"):
-        line = int(must(PYTHON, "-c", FREE_LINE))
+        line = int(system.must(system.PYTHON, "-c", FREE_LINE))
         lines = f"lines: {{reset: {{line: {line}, chip: gpiochip0}}}}"
         with further_device(f"  keel:\n    driver: imu61x-uart\n    uart: {{port: /dev/ttyS7}}\n    {lines}\n"):
-            wait_until(lambda: (device("keel") or {}).get("lines"), "the lines of the device")
-            expect("problems of lines", (device("keel") or {})["lines"]["problems"], {})
-            held = [text for text in must("gpioinfo").splitlines() if "imud" in text]
+            wait_until(lambda: (system.device("keel") or {}).get("lines"), "the lines of the device")
+            expect("problems of lines", (system.device("keel") or {})["lines"]["problems"], {})
+            held = [text for text in system.must("gpioinfo").splitlines() if "imud" in text]
             expect("lines that imud holds", len(held), 1)
             checks.note(held[0])
 
@@ -155,9 +140,13 @@ def check_spi(checks: Checks) -> None:
 def check_chrony(checks: Checks) -> None:
     """Check that Debian's chronyd, with its own unit, accepts the samples of the confined user."""
     with checks("chronyd accepts pulses of a program that is confined like the unit"), configured_chronyd():
-        code = FEED.format(path=must(PYTHON, "-c", "import imud, os; print(os.path.dirname(imud.__path__[0]))").strip())
-        expect("sent, refused", confined(code, *confinement()).strip(), f"{PULSES} 0")
-        wait_until(lambda: "IMUD" in reached(), f"expected pulses at chronyd, got {run('chronyc', 'sources').stdout}")
+        code = FEED.format(
+            path=system.must(system.PYTHON, "-c", "import imud, os; print(os.path.dirname(imud.__path__[0]))").strip()
+        )
+        expect("sent, refused", system.confined(code, *system.confinement()).strip(), f"{PULSES} 0")
+        wait_until(
+            lambda: "IMUD" in reached(), f"expected pulses at chronyd, got {system.run('chronyc', 'sources').stdout}"
+        )
 
 
 @contextmanager
@@ -167,20 +156,20 @@ def configured_chronyd() -> Iterator[None]:
     for name, text in CHRONY_FILES.items():
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).write_text(text)
-    must("systemctl", "daemon-reload")
+    system.must("systemctl", "daemon-reload")
     try:
-        must("systemctl", "start", "chrony.service")
+        system.must("systemctl", "start", "chrony.service")
         yield
     finally:
-        run("systemctl", "stop", "chrony.service")
+        system.run("systemctl", "stop", "chrony.service")
         Path(CHRONY_SOCKET).unlink(missing_ok=True)  # chronyd 4.3 does not remove its socket
         for name in CHRONY_FILES:
             Path(name).unlink()
         Path(CHRONY_SOCKET).unlink(missing_ok=True)  # chronyd has dropped root and cannot remove its socket
-        must("systemctl", "daemon-reload")
+        system.must("systemctl", "daemon-reload")
 
 
 def reached() -> list[str]:
     """Return the sources of chronyd with received samples: their reach is not zero."""
-    rows = [row.split(",") for row in run("chronyc", "-c", "sources").stdout.splitlines()]
+    rows = [row.split(",") for row in system.run("chronyc", "-c", "sources").stdout.splitlines()]
     return [row[2] for row in rows if len(row) > 5 and int(row[5], 8)]

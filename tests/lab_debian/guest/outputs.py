@@ -3,20 +3,10 @@
 import os
 from pathlib import Path
 
+from tests.lab_debian.guest import system
 from tests.lab_debian.guest.checks import Checks, expect, expect_in, wait_until
 from tests.lab_debian.guest.sandbox import PRIVATE, PUBLIC
 from tests.lab_debian.guest.service import CAN, USB, metrics
-from tests.lab_debian.guest.system import (
-    Host,
-    background,
-    configure,
-    device,
-    must,
-    pid,
-    run,
-    start_service,
-    wait_streaming,
-)
 
 METRICS_PORT = 9400
 GPSD_PORT = 2947
@@ -24,37 +14,37 @@ NOTHING_YET = "has no sentences yet"
 REALTIME = "[Service]\nCPUSchedulingPolicy=rr\nCPUSchedulingPriority=10\n"
 
 
-def check(checks: Checks, _host: Host) -> None:
+def check(checks: Checks, _host: system.Host) -> None:
     with checks("metrics on all addresses and another port"):
-        configure(f"metrics: {{address: 0.0.0.0, port: {METRICS_PORT}}}\n{USB}{CAN}")
-        start_service()
-        wait_streaming("usb")
+        system.configure(f"metrics: {{address: 0.0.0.0, port: {METRICS_PORT}}}\n{USB}{CAN}")
+        system.start_service()
+        system.wait_streaming("usb")
         for address in (PUBLIC, PRIVATE):
-            must("ip", "address", "replace", f"{address}/32", "dev", "lo")
+            system.must("ip", "address", "replace", f"{address}/32", "dev", "lo")
         wait_until(lambda: metrics(f"http://{PRIVATE}:{METRICS_PORT}"), "metrics on another address")
     with checks("metrics are not served to a public address"):
         assert not metrics(f"http://{PUBLIC}:{METRICS_PORT}"), "they are"
     with checks("the daemon reaches a real gpsd over TCP"):
         # without a receiver; bookworm's gpsd ends if it has neither a receiver nor a control socket
-        background("labgpsd", "/usr/sbin/gpsd", "-N", "-n", "-S", str(GPSD_PORT), "-F", "/run/labgpsd.sock")
-        configure(USB.replace("115200}", "115200}\n    rmc: {source: gpsd}") + CAN)
-        start_service()
-        wait_streaming("usb")
-        wait_until(lambda: NOTHING_YET in str((device("usb") or {}).get("utc")), "gpsd without a receiver")
-        must("systemctl", "stop", "labgpsd")
-        wait_until(lambda: NOTHING_YET not in str((device("usb") or {}).get("utc")), "the loss of gpsd")
+        system.background("labgpsd", "/usr/sbin/gpsd", "-N", "-n", "-S", str(GPSD_PORT), "-F", "/run/labgpsd.sock")
+        system.configure(USB.replace("115200}", "115200}\n    rmc: {source: gpsd}") + CAN)
+        system.start_service()
+        system.wait_streaming("usb")
+        wait_until(lambda: NOTHING_YET in str((system.device("usb") or {}).get("utc")), "gpsd without a receiver")
+        system.must("systemctl", "stop", "labgpsd")
+        wait_until(lambda: NOTHING_YET not in str((system.device("usb") or {}).get("utc")), "the loss of gpsd")
     with checks("real-time scheduling with the drop-in of docs/operate.md"):
         folder = Path("/etc/systemd/system/imud.service.d")
         folder.mkdir()
         (folder / "realtime.conf").write_text(REALTIME)
-        must("systemctl", "daemon-reload")
-        configure(USB + CAN)
-        start_service()
-        wait_streaming("usb")
-        expect("policy", os.sched_getscheduler(pid()), os.SCHED_RR)
+        system.must("systemctl", "daemon-reload")
+        system.configure(USB + CAN)
+        system.start_service()
+        system.wait_streaming("usb")
+        expect("policy", os.sched_getscheduler(system.pid()), os.SCHED_RR)
         (folder / "realtime.conf").unlink()
         folder.rmdir()
-        must("systemctl", "daemon-reload")
-    start_service()
-    wait_streaming("usb")
-    expect_in("active", run("systemctl", "is-active", "imud").stdout, "service")
+        system.must("systemctl", "daemon-reload")
+    system.start_service()
+    system.wait_streaming("usb")
+    expect_in("active", system.run("systemctl", "is-active", "imud").stdout, "service")

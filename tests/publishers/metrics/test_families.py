@@ -15,17 +15,7 @@ from imud.contracts.status import FlightStatus, MqttStatus, OutputStatus, Record
 from imud.model.event import EventKind
 from imud.model.ledger import LEDGER_FIELDS
 from imud.model.sample import Sync
-from imud.publishers.metrics.families import (
-    FAMILIES,
-    FLIGHT_FAMILIES,
-    LINE_FAMILIES,
-    MQTT_FAMILIES,
-    OUTPUT_FAMILIES,
-    POLLING_FAMILIES,
-    RECORDER_FAMILIES,
-    RECORDINGS_FAMILIES,
-    TIME_FAMILIES,
-)
+from imud.publishers.metrics import families
 from imud.publishers.metrics.metric import (
     ACCELERATION,
     BYTES,
@@ -176,7 +166,7 @@ PARTS: dict[tuple[str, tuple[tuple[str, str], ...]], float] = {
 
 
 def parts_of(name: str, shown: dict[Key, float]) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
-    names = {family.name for family in (*POLLING_FAMILIES, *TIME_FAMILIES, *LINE_FAMILIES)}
+    names = {family.name for family in (*families.POLLING_FAMILIES, *families.TIME_FAMILIES, *families.LINE_FAMILIES)}
     return {
         (metric, tuple(pair for pair in labels if pair[0] != "device")): value
         for (metric, labels), value in shown.items()
@@ -382,8 +372,14 @@ def test_every_metric_and_label_value_is_documented() -> None:
 
 
 def test_names_contain_type_and_unit() -> None:
-    more = (*MQTT_FAMILIES, *OUTPUT_FAMILIES, *RECORDER_FAMILIES, *FLIGHT_FAMILIES, *RECORDINGS_FAMILIES)
-    for family in (*FAMILIES, *more):
+    more = (
+        *families.MQTT_FAMILIES,
+        *families.OUTPUT_FAMILIES,
+        *families.RECORDER_FAMILIES,
+        *families.FLIGHT_FAMILIES,
+        *families.RECORDINGS_FAMILIES,
+    )
+    for family in (*families.FAMILIES, *more):
         assert family.name.startswith("imud_")
         if isinstance(family, Family):
             assert family.help.endswith(".")

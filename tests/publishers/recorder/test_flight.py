@@ -1,8 +1,9 @@
-"""Flight recorder: kept data, saved alerts, and reports."""
+"""Flight recorder: kept data, saved alerts, and reports.
+Thread of the flight recorder: snapshots to files and clients, with failing disks and clients."""
 
 import errno
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -17,18 +18,11 @@ from imud.formats.records import NO_DEVICE, EndRecord, Kind, SessionRecord, deco
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.model.units import NS_PER_S
+from imud.publishers.recorder import flight as recorder_flight
 from imud.publishers.recorder.client_stream import stream_pair
 from imud.publishers.recorder.directory import FlightOptions, RecorderOptions, RecordingDirectory
-from imud.publishers.recorder.flight import (
-    Alert,
-    AlertGate,
-    FlightRecorder,
-    SegmentBegin,
-    SegmentReader,
-    SegmentRing,
-    left_behind,
-)
-from tests.publishers.recorder.recording_bench import RecordingBench, records_in
+from imud.publishers.recorder.writer import RecordQueue
+from tests.publishers.recorder.recording_bench import RecordingBench, kinds_in, records_in
 from tests.support.publisher_context import NoLine
 from tests.support.socket_rig import sample
 from tests.support.surroundings import HOSTILE_UID, needs_root
@@ -48,7 +42,7 @@ class FlightBench(RecordingBench):
         )  # fmt: skip
         object.__setattr__(self.context, "watch_line", self._watch)
         directory = RecordingDirectory(self.folder, settings.keep_bytes)
-        self.flight = FlightRecorder(settings, self.context, directory, self.workers.start)
+        self.flight = recorder_flight.FlightRecorder(settings, self.context, directory, self.workers.start)
         self.flight.start()
         self.tick()
 
@@ -325,12 +319,12 @@ HOUR_NS = 3600 * NS_PER_S
 AFTER_NS = 30 * NS_PER_S
 
 
-def alert(t_ns: int, reason: str = "a blow") -> Alert:
-    return Alert(t_ns, "bow", reason)
+def alert(t_ns: int, reason: str = "a blow") -> recorder_flight.Alert:
+    return recorder_flight.Alert(t_ns, "bow", reason)
 
 
 def test_an_alert_is_due_once_with_all_later_alerts() -> None:
-    gate = AlertGate(AFTER_NS, 6)
+    gate = recorder_flight.AlertGate(AFTER_NS, 6)
     assert gate.take_due(0) is None
     assert gate.add(alert(5))
     assert gate.add(alert(6, "another"))
@@ -343,7 +337,7 @@ def test_an_alert_is_due_once_with_all_later_alerts() -> None:
 
 
 def test_alerts_per_hour_are_limited_and_the_first_ignored_alert_is_reported() -> None:
-    gate = AlertGate(0, 2)
+    gate = recorder_flight.AlertGate(0, 2)
     for t_ns in (0, 10):
         assert gate.add(alert(t_ns))
         assert gate.take_due(t_ns) is not None
@@ -368,13 +362,13 @@ class RingBench:
     """Ring with one data block per segment, in addition to the session record."""
 
     def __init__(self, bytes_max: int = 1 << 20, folder: Path | None = None) -> None:
-        self.ring = SegmentRing(bytes_max)
+        self.ring = recorder_flight.SegmentRing(bytes_max)
         self.folder = folder
         self.count = 0
 
     def add(self, size: int = 50, drop_before_ns: int = -1) -> None:
         path = self.folder / f"{self.count:03d}" if self.folder is not None else None
-        self.ring.begin(SegmentBegin(self.count, session(self.count), path, drop_before_ns))
+        self.ring.begin(recorder_flight.SegmentBegin(self.count, session(self.count), path, drop_before_ns))
         encoder = BlockEncoder()
         self.ring.append(encoder.encode(session(self.count)))
         self.ring.append(encoder.encode(records.encode_data(self.count, os.urandom(size), 1, -1)))
@@ -384,7 +378,7 @@ class RingBench:
         self.ring.clear()
 
 
-def read(reader: SegmentReader) -> list[records.Record]:
+def read(reader: recorder_flight.SegmentReader) -> list[records.Record]:
     data = b""
     while block := reader.next_block():
         data += block
@@ -435,9 +429,9 @@ def test_the_oldest_segments_are_dropped_but_never_the_newest() -> None:
         small.add(10)
     assert devices(read(small.ring.reader(END))) == list(range(2, SEGMENTS_MAX + 2))
     small.close()
-    ring = SegmentRing(200)
+    ring = recorder_flight.SegmentRing(200)
     for t_ns, size, kept in ((1, 100, 100), (2, 100, 200), (3, 1, 101)):
-        ring.begin(SegmentBegin(t_ns, b"", None, -1))
+        ring.begin(recorder_flight.SegmentBegin(t_ns, b"", None, -1))
         ring.append(bytes(size))
         assert ring.bytes == kept
     ring.clear()
@@ -448,7 +442,7 @@ def test_a_failed_reader_closes_its_descriptors(tmp_path: Path, monkeypatch: pyt
     for _ in range(2):
         bench.add()
     with pytest.raises(FileNotFoundError):
-        left_behind([*tmp_path.iterdir(), tmp_path / "none"])
+        recorder_flight.left_behind([*tmp_path.iterdir(), tmp_path / "none"])
     made, dup = list[int](), os.dup
 
     def dup_once(descriptor: int) -> int:
@@ -500,10 +494,10 @@ def test_complete_blocks_of_a_killed_process_are_read(tmp_path: Path) -> None:
     files = sorted(tmp_path.iterdir())
     with files[2].open("r+b") as file:
         file.truncate(files[2].stat().st_size - 1)
-    found = read(left_behind(files))
+    found = read(recorder_flight.left_behind(files))
     assert [one.kind for one in found] == [Kind.SESSION, Kind.DATA, Kind.DATA]
     files[1].write_bytes(b"something else" * 10)
-    assert devices(read(left_behind(files))) == [0]
+    assert devices(read(recorder_flight.left_behind(files))) == [0]
     bench.close()
 
 
@@ -528,3 +522,199 @@ def test_a_full_file_system_drops_the_oldest_segments_and_then_fails(
         bench.add()
     assert raised.value.errno == errno.ENOSPC
     bench.close()
+
+
+LINGER_NS = 10_000_000_000
+
+SESSION = records.encode_object(Kind.SESSION, NO_DEVICE, SessionRecord(1, "", "", "", 7, 0, 1, 1))
+
+
+class FlightWriterBench(RecordingBench):
+    def __init__(self, folder: Path, keep_bytes: int = 1 << 30) -> None:
+        super().__init__()
+        self.folder = folder / "recordings"
+        self.queue = RecordQueue[recorder_flight.Mark]()
+        self.ring = recorder_flight.SegmentRing(1 << 30)
+        directory = RecordingDirectory(self.folder, keep_bytes)
+        self.writer = recorder_flight.FlightWriter(
+            self.queue, self.ring, directory, self.clock.now_ns, self.workers.start
+        )
+
+    def begin(self, path: Path | None = None) -> None:
+        self.queue.mark(recorder_flight.SegmentBegin(self.advance(1), SESSION, path, 0))
+
+    def put(self, number: int, size: int = 50) -> None:
+        self.queue.put(records.encode_data(number, os.urandom(size), 1, -1))
+
+    def work(self) -> int:
+        return self.workers[0].work()
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[FlightWriterBench]:
+    made = FlightWriterBench(tmp_path)
+    yield made
+    made.writer.close()
+
+
+def test_a_snapshot_contains_all_earlier_records_and_no_later_record(
+    bench: FlightWriterBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, synced = bench.folder / "a", list[int]()
+    monkeypatch.setattr(os, "fdatasync", synced.append)
+    bench.begin()
+    bench.put(0)
+    bench.begin()
+    bench.put(1)
+    bench.queue.mark(recorder_flight.Save(path, END))
+    bench.put(2)
+    bench.work()
+    (saved,) = bench.writer.saved
+    assert (saved.path, saved.bytes, saved.problem) == (path, path.stat().st_size, "")
+    assert len(synced) == 1  # the file is on the disk before the report
+    assert [(one.kind, one.device) for one in records_in(path)] == [
+        (Kind.SESSION, NO_DEVICE), (Kind.DATA, 0), (Kind.DATA, 1), (Kind.END, NO_DEVICE)
+    ]  # fmt: skip
+    bench.queue.mark(recorder_flight.Save(bench.folder / "b", END))
+    bench.work()
+    assert [one.device for one in records_in(bench.folder / "b") if one.kind == Kind.DATA] == [0, 1, 2]
+
+
+def test_a_slow_client_does_not_delay_other_clients(bench: FlightWriterBench, tmp_path: Path) -> None:
+    ours, theirs = stream_pair()
+    bench.begin()
+    for number in range(40):
+        bench.put(number, 200_000)
+    bench.queue.mark(recorder_flight.Send(ours, END))
+    assert bench.work() < LINGER_NS
+    assert bench.writer.sends_ended == 0
+    bench.queue.mark(recorder_flight.Save(bench.folder / "a", END))
+    bench.begin()
+    got, theirs_file = tmp_path / "got", theirs.makefile("rb")
+    theirs.setblocking(False)
+    with got.open("wb") as out:
+        while not bench.writer.sends_ended:
+            bench.work()
+            while piece := theirs_file.read(1 << 20):
+                out.write(piece)
+        while piece := theirs_file.read(1 << 20):
+            out.write(piece)
+    assert got.read_bytes() == (bench.folder / "a").read_bytes()
+    assert kinds_in(got).count(Kind.DATA) == 40
+    theirs_file.close()
+    theirs.close()
+
+
+def test_clients_without_progress_are_disconnected(bench: FlightWriterBench) -> None:
+    bench.begin()
+    for number in range(40):
+        bench.put(number, 200_000)
+    gone, silent = stream_pair(), stream_pair()
+    gone[1].close()
+    bench.queue.mark(recorder_flight.Send(gone[0], END))
+    bench.queue.mark(recorder_flight.Send(silent[0], END))
+    bench.work()
+    assert bench.writer.sends_ended == 1
+    bench.advance(LINGER_NS / 1e9)
+    bench.work()
+    assert bench.writer.sends_ended == 2
+    silent[1].close()
+
+
+def test_a_client_reads_end_of_file_without_descriptors_and_when_imud_stops(
+    bench: FlightWriterBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.begin()
+    for number in range(40):
+        bench.put(number, 200_000)
+    stopped, refused = stream_pair(), stream_pair()
+    for _, theirs in (stopped, refused):
+        theirs.setblocking(False)
+    bench.queue.mark(recorder_flight.Send(stopped[0], END))
+    bench.work()
+    monkeypatch.setattr(bench.ring, "reader", lambda _ending: os.open("/none", os.O_RDONLY))
+    bench.queue.mark(recorder_flight.Send(refused[0], END))
+    bench.work()
+    assert refused[1].recv(1) == b""
+    assert bench.writer.sends_ended == 1
+    bench.writer.close()
+    while stopped[1].recv(1 << 20):
+        pass
+    stopped[1].close()
+    refused[1].close()
+
+
+def test_a_full_disk_leaves_no_incomplete_snapshot(bench: FlightWriterBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.begin()
+    bench.put(0)
+    bench.work()
+    write = os.write
+
+    def full(descriptor: int, data: bytes) -> int:
+        if "recordings" in os.readlink(f"/proc/self/fd/{descriptor}"):
+            raise OSError(28, "No space left on device")
+        return write(descriptor, data)
+
+    monkeypatch.setattr(os, "write", full)
+    bench.queue.mark(recorder_flight.Save(bench.folder / "a", END))
+    bench.work()
+    assert [saved.problem for saved in bench.writer.saved] == ["No space left on device"]
+    assert list(bench.folder.glob("*.imudrec")) == []
+    assert bench.writer.problem == ""
+    monkeypatch.undo()
+    bench.queue.mark(recorder_flight.Save(bench.folder / "b", END))
+    bench.work()
+    assert bench.writer.saved[1].problem == ""
+
+
+def test_after_a_failed_segment_nothing_is_saved_until_the_next_segment(
+    bench: FlightWriterBench, tmp_path: Path
+) -> None:
+    bench.begin(tmp_path / "no" / "folder")
+    bench.put(0)
+    bench.queue.mark(recorder_flight.Save(bench.folder / "a", END))
+    bench.work()
+    assert bench.writer.problem == "No such file or directory"
+    assert [saved.problem for saved in bench.writer.saved] == ["nothing was kept"]
+    assert list(bench.folder.glob("*.imudrec")) == []
+    bench.begin()
+    bench.put(1)
+    bench.queue.mark(recorder_flight.Save(bench.folder / "b", END))
+    bench.work()
+    assert bench.writer.problem == ""
+    assert kinds_in(bench.folder / "b") == [Kind.SESSION, Kind.DATA, Kind.END]
+
+
+def test_snapshots_stay_below_the_limit(tmp_path: Path) -> None:
+    bench = FlightWriterBench(tmp_path, keep_bytes=100_000)
+    for number in range(5):
+        bench.begin()
+        bench.put(number, 30_000)
+        path = bench.folder / f"20251121T09314{number}Z-000000ab-00000{number}-snapshot.imudrec"
+        bench.ring.clear()
+        bench.queue.mark(recorder_flight.Save(path, END))
+        bench.work()
+        assert sum(file.stat().st_size for file in bench.folder.glob("*.imudrec")) <= 100_000
+    assert len(list(bench.folder.glob("*.imudrec"))) == 3 - 1 + 1
+    bench.writer.close()
+
+
+def test_data_of_a_killed_process_is_saved_and_removed_or_kept(
+    bench: FlightWriterBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = [tmp_path / "000", tmp_path / "001"]
+    for number, file in enumerate(files):
+        bench.begin(file)
+        bench.put(number)
+    bench.work()
+    bench.folder.mkdir()
+    (bench.folder / "a").write_bytes(b"taken")
+    bench.queue.mark(recorder_flight.Rescue(bench.folder / "a", files))
+    bench.work()
+    assert bench.writer.saved[0].problem == "File exists"
+    assert all(file.exists() for file in files)
+    bench.queue.mark(recorder_flight.Rescue(bench.folder / "b", files))
+    bench.work()
+    assert bench.writer.saved[1].problem == ""
+    assert not any(file.exists() for file in files)
+    assert (bench.folder / "b").stat().st_size > 100

@@ -1,15 +1,26 @@
-"""Admission: no user locks out another, root and the control group always connect, devices keep their descriptors."""
+"""Admission: no user locks out another, root and the control group always connect, devices keep their descriptors.
+Rights of clients by the credentials of the kernel."""
 
+import asyncio
+import os
 import resource
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import pytest
 
 from imud.formats.jsonrpc import Code, RpcError
 from imud.publishers.socket import admission as quota
-from imud.publishers.socket.admission import Peer, Place, Quota, RateLimitedLog, Rights, raise_fd_limit
 from imud.publishers.socket.scheduler import TokenBucket
+from tests.support.socket_rig import run, serving
+from tests.support.surroundings import needs_root
 
-READ, ALL = Rights.READ, Rights.READ | Rights.CONTROL
+READ, ALL = quota.Rights.READ, quota.Rights.READ | quota.Rights.CONTROL
 OWN_UID = 500
 MS = 1_000_000
 
@@ -17,18 +28,18 @@ MS = 1_000_000
 class House:
     def __init__(self, clients: int = 64, per_user: int = 20, fd_limit: int = 1024) -> None:
         self.now_ns = 0
-        self.quota = Quota(clients, per_user, OWN_UID, fd_limit, lambda: self.now_ns)
-        self.clients: list[Place] = []
+        self.quota = quota.Quota(clients, per_user, OWN_UID, fd_limit, lambda: self.now_ns)
+        self.clients: list[quota.Place] = []
 
-    def connect(self, uid: int, rights: Rights = READ, fd: int = 50) -> str:
-        peer = Peer(1, uid, frozenset())
+    def connect(self, uid: int, rights: quota.Rights = READ, fd: int = 50) -> str:
+        peer = quota.Peer(1, uid, frozenset())
         try:
             self.clients.append(self.quota.admit(peer, rights, fd, self.clients))
         except RpcError as refusal:
             return str(refusal) if refusal.code == Code.TOO_MANY_CLIENTS else pytest.fail(str(refusal))
         return ""
 
-    def fill(self, uids: tuple[int, ...], rights: Rights = READ) -> int:
+    def fill(self, uids: tuple[int, ...], rights: quota.Rights = READ) -> int:
         """Connect clients of these users in turns until all are refused. Return the number of new clients."""
         before = len(self.clients)
         while [uid for uid in uids if not self.connect(uid, rights)]:
@@ -204,7 +215,7 @@ def test_selections_of_fields_are_limited() -> None:
 
 def test_a_frequent_message_is_logged_once_a_minute_with_its_count() -> None:
     now_ns = 0
-    limited = RateLimitedLog(lambda: now_ns)
+    limited = quota.RateLimitedLog(lambda: now_ns)
     assert [limited.count() for _ in range(5)] == [1, 0, 0, 0, 0]
     now_ns = 60_000 * MS - 1
     assert limited.count() == 0
@@ -216,8 +227,89 @@ def test_the_limit_of_descriptors_is_raised(monkeypatch: pytest.MonkeyPatch) -> 
     limits = [(1024, 524_288)]
     monkeypatch.setattr(resource, "getrlimit", lambda _which: limits[-1])
     monkeypatch.setattr(resource, "setrlimit", lambda _which, pair: limits.append(pair))
-    assert raise_fd_limit() == 16_384
+    assert quota.raise_fd_limit() == 16_384
     assert limits[-1] == (16_384, 524_288)
-    assert raise_fd_limit() == 16_384
+    assert quota.raise_fd_limit() == 16_384
     limits[:] = [(1024, 4096)]
-    assert raise_fd_limit() == 4096
+    assert quota.raise_fd_limit() == 4096
+
+
+NONE, READ_RIGHT, ALL_RIGHTS = quota.Rights.NONE, quota.Rights.READ, quota.Rights.READ | quota.Rights.CONTROL
+
+
+@pytest.mark.parametrize(
+    ("uid", "groups", "expected"),
+    [
+        (0, (), ALL_RIGHTS),
+        (500, (), READ_RIGHT),  # the user of the daemon
+        (1000, (), NONE), (1000, (7, 80), READ_RIGHT), (1000, (7, 90), ALL_RIGHTS), (500, (90,), ALL_RIGHTS),
+    ],
+)  # fmt: skip
+def test_rules(uid: int, groups: tuple[int, ...], expected: quota.Rights) -> None:
+    assert quota.Guard(500, 80, 90).rights_of(quota.Peer(1, uid, frozenset(groups))) == expected
+
+
+def test_a_group_that_does_not_exist_gives_nothing() -> None:
+    assert quota.gid_of("no-such-group-here") is None
+    assert quota.Guard(500, None, None).rights_of(quota.Peer(1, 1000, frozenset((7, 80)))) == NONE
+
+
+def test_the_peer_of_a_socket_is_this_process() -> None:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        peer = quota.peer_of(ours)
+    assert (peer.pid, peer.uid) == (os.getpid(), os.geteuid())
+    assert peer.groups == {os.getegid(), *os.getgroups()}
+
+
+CLIENT = """
+import os, socket, sys
+os.setgroups([int(word) for word in sys.argv[2:]])
+os.setgid(65534)
+os.setuid(65534)
+sock = socket.socket(socket.AF_UNIX)
+try:
+    sock.connect(sys.argv[1])
+    print(sock.makefile().readline())
+except PermissionError:
+    print("PermissionError")
+"""
+
+
+@pytest.fixture
+def open_directory() -> Iterator[Path]:
+    path = Path(tempfile.mkdtemp(prefix="imud-"))
+    path.chmod(0o755)
+    yield path
+    shutil.rmtree(path)
+
+
+MANY_GROUPS = [*map(str, range(70_000, 70_300)), "daemon", "bin"]
+"""More than 256 groups, the maximum of Python's getsockopt."""
+
+
+@needs_root
+@pytest.mark.parametrize(
+    ("groups", "mode", "expected"),
+    [
+        ([], 0o660, "PermissionError"), ([], 0o666, '"code":-32001'), (["daemon"], 0o660, '"rights":["read"]'),
+        (["bin"], 0o666, '"rights":["read","control"]'), (MANY_GROUPS, None, '"rights":["read","control"]'),
+    ],
+)  # fmt: skip
+def test_other_users(open_directory: Path, groups: list[str], mode: int | None, expected: str) -> None:
+    async def body() -> str:
+        async with serving(open_directory, group="daemon", control_group="bin") as server:
+            if mode is not None:
+                os.chmod(server.hub.path, mode)
+            numbers = [int(name) if name.isdigit() else quota.gid_of(name) for name in groups]
+            return await asyncio.to_thread(ask, server.hub.path, numbers)
+
+    assert expected in run(body)
+
+
+def ask(path: str, groups: Sequence[int | None]) -> str:
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", "-c", CLIENT, path, *map(str, groups)], capture_output=True, text=True,
+        timeout=60, check=True,
+    )  # fmt: skip
+    return done.stdout

@@ -11,13 +11,7 @@ from imud.drivers.hipnuc.canopen.cia301 import NmtCommand
 from imud.drivers.hipnuc.canopen.commands import InclinometerZero, Transmission
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.can_module import SentFrame
-from imud.sim.hipnuc.canopen import (
-    SIMULATOR,
-    HipnucCanopenHardware,
-    HipnucCanopenModule,
-    NodeSettings,
-    ObjectDictionary,
-)
+from imud.sim.hipnuc import canopen
 from imud.sim.sensor import SimulatorOptions
 from tests.support.simulated_modules import BEGIN_NS, QUIET, CanopenBench
 
@@ -31,8 +25,10 @@ def times_of(frames: list[SentFrame], can_id: int) -> list[int]:
 
 @pytest.mark.manual("B 5.1 defaults")
 def test_timers_and_wire() -> None:
-    settings = NodeSettings(periods_ms={1: 5, 2: 20, 3: 0, 4: 0, 6: 100, 7: 0}, bit_rate=250_000)
-    module = HipnucCanopenModule(BEGIN_NS, HipnucCanopenHardware(factory=settings, boot_ms=0, skew_ppm=1000))
+    settings = canopen.NodeSettings(periods_ms={1: 5, 2: 20, 3: 0, 4: 0, 6: 100, 7: 0}, bit_rate=250_000)
+    module = canopen.HipnucCanopenModule(
+        BEGIN_NS, canopen.HipnucCanopenHardware(factory=settings, boot_ms=0, skew_ppm=1000)
+    )
     frames = module.advance(BEGIN_NS + SECOND_NS + 2 * MS)
     counts = [len(times_of(frames, can_id)) for can_id in (0x188, 0x288, 0x388, 0x488, 0x688, 0x788)]
     assert counts == [200, 50, 0, 0, 10, 0]
@@ -40,18 +36,18 @@ def test_timers_and_wire() -> None:
     assert [b - a for a, b in itertools.pairwise(first)] == pytest.approx([4_995_005] * 2, abs=2)
     together = [frame for frame in frames if frame.sample_ns == frames[-1].sample_ns]
     assert [b.due_ns - a.due_ns for a, b in itertools.pairwise(together)] == [480_000] * (len(together) - 1)
-    silent = HipnucCanopenModule(BEGIN_NS, HipnucCanopenHardware(factory=QUIET, boot_ms=0))
+    silent = canopen.HipnucCanopenModule(BEGIN_NS, canopen.HipnucCanopenHardware(factory=QUIET, boot_ms=0))
     silent.advance(BEGIN_NS + SECOND_NS)
     assert silent.next_ns() is None
 
-    bench = CanopenBench(NodeSettings(periods_ms=QUIET.periods_ms, heartbeat_ms=100), boot_ms=50)
+    bench = CanopenBench(canopen.NodeSettings(periods_ms=QUIET.periods_ms, heartbeat_ms=100), boot_ms=50)
     bench.run(400 * MS)
     assert bench.heard == [(0x708, b"\0"), *[(0x708, b"\5")] * 3]
 
 
 @pytest.mark.manual("B 5.4.2 transmission type")
 def test_sync_sends_what_is_of_type_1() -> None:
-    bench = CanopenBench(NodeSettings(periods_ms={1: 10, 2: 10, 3: 0, 4: 0, 6: 0, 7: 0}))
+    bench = CanopenBench(canopen.NodeSettings(periods_ms={1: 10, 2: 10, 3: 0, 4: 0, 6: 0, 7: 0}))
     bench.run_script(session.set_tpdo_type(8, 1, Transmission.SYNC))
     bench.run_script(session.set_tpdo_type(8, 3, Transmission.SYNC))
     bench.heard.clear()
@@ -66,7 +62,7 @@ def test_sync_sends_what_is_of_type_1() -> None:
     bench.run(35 * MS)
     assert sum(can_id == 0x188 for can_id, _ in bench.heard) >= 3
 
-    bench = CanopenBench(NodeSettings())
+    bench = CanopenBench(canopen.NodeSettings())
     bench.run_script(session.nmt(8, NmtCommand.PRE_OPERATIONAL))
     bench.run(20 * MS)
     bench.heard.clear()
@@ -116,7 +112,7 @@ def test_inclinometer_signs_and_zero() -> None:
         assert angles is not None
         return angles
 
-    bench = CanopenBench(NodeSettings(periods_ms={**QUIET.periods_ms, 7: 5}))
+    bench = CanopenBench(canopen.NodeSettings(periods_ms={**QUIET.periods_ms, 7: 5}))
     bench.run(700 * MS)
     x, y = incli()
     bench.run_script(session.set_inclinometer_sign(8, "x", invert=True))
@@ -141,14 +137,14 @@ def test_inclinometer_signs_and_zero() -> None:
 )  # fmt: skip
 def test_abort_codes(request_hex: str, code: int) -> None:
     request = bytes.fromhex(request_hex)
-    reply, _ = ObjectDictionary(NodeSettings()).serve(request)
+    reply, _ = canopen.ObjectDictionary(canopen.NodeSettings()).serve(request)
     assert reply == b"\x80" + request[1:4] + code.to_bytes(4, "little")
 
 
 @pytest.mark.parametrize("rate_hz", [1, 125, 200])
 def test_options_make_rates_that_divide(rate_hz: float) -> None:
-    module = SIMULATOR.make(SimulatorOptions(rate_hz=rate_hz, node=5, at_once=True), BEGIN_NS)
-    assert isinstance(module, HipnucCanopenModule)
+    module = canopen.SIMULATOR.make(SimulatorOptions(rate_hz=rate_hz, node=5, at_once=True), BEGIN_NS)
+    assert isinstance(module, canopen.HipnucCanopenModule)
     assert module.node == 5
     periods = module.objects.settings.periods_ms
     assert periods[1] == 1000 / rate_hz

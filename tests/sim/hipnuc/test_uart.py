@@ -1,19 +1,24 @@
-"""The simulated device follows chapter 3 of the manual, and the codec decodes its frames."""
+"""The simulated device follows chapter 3 of the manual, and the codec decodes its frames.
+The simulated device replies, saves and resets settings, and rotates its axes as in the manual (chapters 2, 8).
+Pins of the simulated device follow the manual, sections 1.2 and 2.2.4, in step with its frames."""
 
 from itertools import pairwise
-from math import degrees, hypot
+from math import degrees, hypot, radians
 from typing import TypeVar
 
 import pytest
 
+from imud.attitude.rotation import matrix_from_quat
+from imud.drivers.hipnuc.uart import commands
+from imud.drivers.hipnuc.uart.commands import AlarmAxis, alarm, sout_divider
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.hipnuc.uart import HipnucModule, make
-from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings, Output
+from imud.sim.hipnuc.uart_settings import AlarmSetting, HipnucHardware, ModuleSettings, Output
 from imud.sim.physics import Noise, Still, swing
-from imud.sim.sensor import SimulatorOptions
+from imud.sim.sensor import Burst, Pin, PinEdge, SimulatorOptions
 from tests.support.simulated_modules import BEGIN_NS, FAST, HIPNUC_STILL, HipnucUartBench, unpack_hi91
 
 T = TypeVar("T")
@@ -182,3 +187,364 @@ def test_baud_follows_from_the_rate(rate_hz: float, message: str, baud: int) -> 
 def test_impossible_options_are_refused(options: SimulatorOptions) -> None:
     with pytest.raises(ValueError, match="expected"):
         make(options, 0)
+
+
+VERSION = ["PNAME=HI14R3", "BUILD=Oct 15 2024", "UUID=043995698D6E1708", "APP_VER=156", "BL_VER=109", "OK"]
+
+
+def test_the_vendors_probe_split_long_and_early_commands() -> None:
+    bench = HipnucUartBench()
+    for _ in range(3):
+        assert bench.ask("LOG DISABLE") == ["OK"]
+    assert bench.wait(100.0) == []
+    assert bench.ask("LOG VERSION") == VERSION
+    assert bench.ask("LOG ENABLE") == ["OK"]
+    assert len(bench.frames(100.0)) == 10
+
+    bench = HipnucUartBench()
+    for byte in b"LOG VERSION\r\n":
+        bench.module.receive(bytes([byte]), bench.now_ns)
+    assert bench.text(30.0) == VERSION
+
+    identity = [1, 0, 0, 0, 1, 0, 0, 0, 1]
+    fits, too_long = ("CONFIG IMU URFR " + ",".join(f"{n:.{digits}f}" for n in identity) for digits in (9, 10))
+    assert len(fits) <= 128 < len(too_long)
+    assert HipnucUartBench().ask(fits) == ["OK"]
+    assert HipnucUartBench().ask(too_long) == []
+
+    bench = HipnucUartBench()
+    bench.module.receive(b"REBOOT\r\nLOG VERSION\r\n", bench.now_ns)
+    assert bench.ask("LOG VERSION", 800.0) == []
+    bench.reboot()
+    assert bench.ask("LOG VERSION") == VERSION
+
+
+def test_replies_stand_between_whole_frames() -> None:
+    bench = HipnucUartBench(FAST)
+    for _ in range(20):
+        bench.module.receive(b"LOG VERSION\r\n", bench.now_ns)
+        bench.now_ns += 3 * NS_PER_MS
+    bursts = bench.wait(40.0)
+    text = [burst.data for burst in bursts if burst.sample_ns is None]
+    assert text == ["".join(f"{line}\r\n" for line in VERSION).encode()] * 20
+    ends = [burst.due_ns - len(burst.data) * 10 * NS_PER_S // 921_600 for burst in bursts]
+    assert all(start >= before.due_ns - 1 for start, before in zip(ends[1:], bursts, strict=False))
+
+    bench = HipnucUartBench(hardware=HipnucHardware(mag_bias_t=(14.14e-6, -2.08e-6, -8.75e-6)))
+    assert bench.ask("LOG MAGCONFIG") == ["MB=14.14, -2.08, -8.75", "OK"]
+    assert bench.ask("LOG USRCONFIG")[0] == "ATT_MODE: 0"
+    assert bench.ask("CONFIG ATT MODE 1") == ["OK"]
+    assert bench.ask("LOG USRCONFIG")[0] == "ATT_MODE: 1"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "LOG VERSION\n", "LOG VERSION\r\n", "\xff\x80\x01LOG VERSION\r\n", "\r\n\r\nLOG VERSION\n",
+        "LOG D\xffLOG VERSION\n",
+    ],
+)  # fmt: skip
+@pytest.mark.manual("B 2 line end")
+def test_line_ends_and_garbage_before_a_command(line: str) -> None:
+    bench = HipnucUartBench()
+    bench.module.receive(line.encode("latin-1"), bench.now_ns)
+    assert bench.text(30.0) == VERSION
+
+
+@pytest.mark.parametrize(
+    "line", ["", "HELLO", "log version", "LOG", "LOG VERSIONS", "LOG HI93 ONTIME 1", "CONFIG ATT", "AT+RST", "X" * 5000]
+)
+def test_unknown_commands_get_no_reply(line: str) -> None:
+    bench = HipnucUartBench()
+    assert bench.ask(line) == []
+    assert bench.ask("LOG VERSION") == VERSION
+    assert bench.module.settings == ModuleSettings()
+
+
+def test_reboot_baud_rate_and_factory_reset() -> None:
+    bench = HipnucUartBench()
+    assert bench.ask("LOG HI91 ONTIME 0.02") == ["OK"]
+    assert bench.ask("SAVECONFIG") == ["OK"]
+    assert bench.ask("LOG HI91 ONTIME 0.1") == ["OK"]
+    assert bench.ask("LOG DISABLE") == ["OK"]
+    assert bench.ask("REBOOT", 500.0) == []
+    frames = bench.frames(1000.0)
+    assert len(frames) == pytest.approx(50, abs=1)
+    assert frames[0].system_time_ms == 520
+
+    bench = HipnucUartBench(ModuleSettings(baud=9600, hi91=Output(100)), HipnucHardware(skew_ppm=0, processing_ns=0))
+    bench.wait(100.0 + 41.5 * 10 / 9.6)
+    bench.module.receive(b"REBOOT\r\n", bench.now_ns)
+    (burst,) = bench.wait(300.0)
+    assert len(burst.data) == 41
+    assert burst.sample_ns is None
+
+    bench = HipnucUartBench()
+    assert bench.ask("SERIALCONFIG 921600") == ["OK"]
+    assert bench.module.baud == 115_200
+    assert "BAUD: 921600" in bench.ask("LOG COMCONFIG")
+    bench.reboot()
+    assert bench.module.baud == 115_200
+    assert bench.ask("SERIALCONFIG 921600") == ["OK"]
+    assert bench.ask("SAVECONFIG") == ["OK"]
+    assert bench.module.baud == 115_200
+    bench.reboot()
+    assert bench.module.baud == 921_600
+
+    bench = HipnucUartBench(FAST)
+    assert bench.ask("CONFIG ATT MODE 1") == ["OK"]
+    assert bench.ask("FRESET") == ["OK"]
+    assert bench.module.baud == 921_600
+    bench.reboot()
+    assert (bench.module.settings, bench.module.baud) == (ModuleSettings(), 115_200)
+    assert len(bench.frames(1000.0)) == pytest.approx(100, abs=1)
+
+
+@pytest.mark.parametrize("mounting", commands.Mounting)
+@pytest.mark.manual("B 2.2.4 URFR")
+def test_urfr_turns_vectors_and_attitude_after_save_and_reboot(mounting: commands.Mounting) -> None:
+    bench = HipnucUartBench(hardware=HIPNUC_STILL)
+    before = bench.frames(20.0)[-1]
+    assert bench.ask(commands.mounting(mounting).name) == ["OK"]
+    assert bench.frames(20.0)[-1].accel_g == before.accel_g
+    bench.ask("SAVECONFIG")
+    bench.reboot()
+    after = bench.frames(20.0)[-1]
+    for old, new in ((before.accel_g, after.accel_g), (before.mag_ut, after.mag_ut)):
+        back = [sum(c * value for c, value in zip(row, new, strict=True)) for row in mounting.value]  # B = C · U
+        assert back == pytest.approx(old, abs=1e-5)
+    up = matrix_from_quat((after.quat_wxyz[0], *after.quat_wxyz[1:]))[2]  # type: ignore[arg-type]  # four floats
+    assert after.accel_g == pytest.approx(up, abs=1e-5)  # the attitude rotates with the axes: the force still points up
+
+
+@pytest.mark.manual("B 2.2.4 ATT RST 2", "B 2.2.4 ATT RST 5", "B 2.2.4 ATT RST 3", "B 2.2.4 YAW 1", "B 2.2.4 YAW 0")
+def test_levels_and_yaw() -> None:
+    bench = HipnucUartBench(hardware=HIPNUC_STILL)
+    assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, 40.0), abs=1e-4)
+    assert bench.ask("CONFIG ATT RST 2") == ["OK"]
+    levelled = bench.frames(20.0)[-1]
+    assert levelled.euler_deg == pytest.approx((0.0, 0.0, 40.0), abs=1e-4)
+    assert abs(levelled.accel_g[0]) > 0.01
+    assert bench.ask("CONFIG ATT RST 5") == ["OK"]
+    assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, 40.0), abs=1e-4)
+
+    bench = HipnucUartBench(hardware=HIPNUC_STILL)
+    assert bench.ask("CONFIG ATT RST 3") == ["OK"]
+    frame = bench.frames(20.0)[-1]
+    assert frame.euler_deg == pytest.approx((0.0, 0.0, 40.0), abs=1e-4)
+    assert frame.accel_g == pytest.approx((0.0, 0.0, 1.0), abs=1e-5)
+
+    steep = HipnucUartBench(hardware=HipnucHardware(motion=Still(radians(2), radians(6), 0.0)))
+    assert steep.ask("CONFIG ATT RST 3") == ["ERR"]
+    assert steep.frames(20.0)[-1].euler_deg[1] == pytest.approx(6.0, abs=1e-4)
+    turned = HipnucUartBench(hardware=HipnucHardware(motion=Still(radians(-177), radians(1), 0.0)))
+    assert turned.ask("CONFIG ATT RST 3") == ["OK"]
+    roll, pitch, _ = turned.frames(20.0)[-1].euler_deg
+    assert abs(roll) == pytest.approx(180.0, abs=1e-4)
+    assert pitch == pytest.approx(0.0, abs=1e-4)
+
+    bench = HipnucUartBench(hardware=HIPNUC_STILL)
+    bench.ask("CONFIG ATT RST 2")
+    bench.ask("SAVECONFIG")
+    bench.reboot()
+    assert bench.frames(20.0)[-1].euler_deg == pytest.approx((0.0, 0.0, 40.0), abs=1e-4)
+
+    bench = HipnucUartBench(hardware=HIPNUC_STILL)
+    for command, yaw_deg in (("CONFIG YAW 1 16", 16.0), ("CONFIG YAW 0 1.5", 17.5), ("CONFIG YAW 1 -170", -170.0)):
+        assert bench.ask(command) == ["OK"]
+        assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, yaw_deg), abs=1e-4)
+    bench.ask("SAVECONFIG")
+    bench.reboot()
+    assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, 40.0), abs=1e-4)
+
+
+@pytest.mark.parametrize("line", ["CONFIG ATT RST 4", "CONFIG YAW 2 0", "CONFIG YAW 1 181", "CONFIG YAW 1 nan"])
+def test_bad_values_are_refused(line: str) -> None:
+    assert HipnucUartBench().ask(line) == ["ERR"]
+
+
+HIGH_NS = 80_000  # SOUT pulse, 80 us
+
+
+def pulses(edges: list[PinEdge], pin: Pin) -> list[tuple[PinEdge, PinEdge]]:
+    mine = [edge for edge in edges if edge.pin is pin]
+    mine = mine[not mine[0].rising : len(mine) - mine[-1].rising]  # without incomplete pulses at both ends
+    assert [edge.rising for edge in mine] == [True, False] * (len(mine) // 2)
+    return list(zip(mine[::2], mine[1::2], strict=True))
+
+
+def run(bench: HipnucUartBench, duration_ms: float) -> tuple[list[Burst], list[PinEdge]]:
+    bursts = bench.wait(duration_ms)
+    return bursts, bench.module.pins(bench.now_ns)
+
+
+@pytest.mark.parametrize("settings", [ModuleSettings(), FAST, ModuleSettings(baud=115_200, hi91=Output(1))])
+@pytest.mark.manual("B 1.2.2 SOUT", "B 2.2.4 PMUX2 SOUT")
+def test_each_frame_has_its_pulse_right_before_it(settings: ModuleSettings) -> None:
+    bench = HipnucUartBench(settings)
+    bursts, edges = run(bench, 1000.0)
+    wire_ns = 82 * 10 * NS_PER_S // settings.baud
+    found = pulses(edges, Pin.SOUT)[: len(bursts)]
+    assert len(bursts) > 90
+    for burst, (rise, fall) in zip(bursts, found, strict=True):
+        assert fall.due_ns == burst.due_ns - wire_ns
+        assert fall.due_ns - rise.due_ns == HIGH_NS
+        assert rise.sample_ns == fall.sample_ns == burst.sample_ns
+        assert rise.due_ns >= (burst.sample_ns or 0)
+
+
+def test_which_frames_have_a_pulse_and_how_long_it_is() -> None:
+    bench = HipnucUartBench(ModuleSettings(baud=115_200, hi91=Output(1)))
+    _, edges = run(bench, 1000.0)
+    assert bench.module.frames_dropped > 800
+    assert len(pulses(edges, Pin.SOUT)) == pytest.approx(bench.module.frames_sent, abs=6)  # frames in the buffer
+
+    bench = HipnucUartBench(ModuleSettings(baud=921_600, hi91=Output(10), hi92=Output(10)))
+    bursts, edges = run(bench, 1000.0)
+    assert len(bursts) == pytest.approx(200, abs=2)
+    for burst, (_, fall) in zip(bursts, pulses(edges, Pin.SOUT), strict=True):
+        assert fall.due_ns == burst.due_ns - len(burst.data) * 10 * NS_PER_S // 921_600
+
+    bench = HipnucUartBench()
+    bench.ask("UNLOGALL")
+    bench.module.pins(bench.now_ns)
+    assert bench.ask("LOG VERSION")[-1] == "OK"
+    assert bench.module.pins(bench.now_ns) == []
+
+    _, edges = run(HipnucUartBench(hardware=HipnucHardware(processing_ns=30_000, skew_ppm=0)), 100.0)
+    for rise, fall in pulses(edges, Pin.SOUT):
+        assert fall.due_ns - rise.due_ns == 30_000
+        assert rise.due_ns == rise.sample_ns
+
+
+def test_edges_come_in_order_whatever_the_steps() -> None:
+    settings = ModuleSettings(hi91=Output(5), hi92=Output(7), baud=921_600, alarm_x=AlarmSetting(-1, 1, True))
+    whole = run(HipnucUartBench(settings), 500.0)[1]
+    bench = HipnucUartBench(settings)
+    steps = [edge for _ in range(2500) for edge in run(bench, 0.2)[1]]
+    assert steps == whole
+    assert all(after.due_ns >= before.due_ns for before, after in pairwise(whole))
+    assert {edge.pin for edge in whole} == set(Pin)
+    bench = HipnucUartBench(ModuleSettings(alarm_y=AlarmSetting(-3, 3, True)))
+    edges: list[PinEdge] = []
+    while bench.now_ns < BEGIN_NS + 1500 * NS_PER_MS:
+        next_ns = bench.module.next_pin_ns()
+        assert next_ns is not None
+        assert next_ns > bench.now_ns
+        bench.now_ns = next_ns
+        found = bench.module.pins(next_ns)
+        assert all(edge.due_ns == next_ns for edge in found)
+        edges += found
+    assert len(edges) > 200
+
+
+@pytest.mark.parametrize("divider", [1, 8, 64])
+@pytest.mark.manual("B 2.2.4 divider")
+def test_every_nth_pulse_is_repeated(divider: int) -> None:
+    bench = HipnucUartBench()
+    assert bench.ask(sout_divider(divider).payload.decode().strip()) == ["OK"]
+    bench.module.pins(bench.now_ns)
+    _, edges = run(bench, 2000.0)
+    sout = [rise.due_ns for rise, _ in pulses(edges, Pin.SOUT)]
+    divided = [rise.due_ns for rise, _ in pulses(edges, Pin.SOUT_DIV)]
+    assert len(divided) == pytest.approx(200 / divider, abs=1)
+    assert set(divided) <= set(sout)
+    assert {sout.index(after) - sout.index(before) for before, after in pairwise(divided)} == {divider}
+
+
+@pytest.mark.manual("B 2.2.4 PMUX4 SOUT_DIV")
+def test_dividers_and_pins_that_nobody_watches() -> None:
+    bench = HipnucUartBench(hardware=HIPNUC_STILL)
+    bench.wait(45.0)  # within eight pulses
+    bench.module.pins(bench.now_ns)
+    assert bench.ask("CONFIG PMUX4 DIV20", 0.5) == []
+    rises = [rise.due_ns for rise, _ in pulses(run(bench, 1000.0)[1], Pin.SOUT_DIV)]
+    assert rises[0] - bench.now_ns + 1000 * NS_PER_MS == pytest.approx(20 * 10 * NS_PER_MS, abs=10 * NS_PER_MS)
+
+    _, edges = run(HipnucUartBench(), 1000.0)
+    periods = [(b.due_ns - a.due_ns) / NS_PER_MS for (a, _), (b, _) in pairwise(pulses(edges, Pin.SOUT_DIV))]
+    assert periods == pytest.approx([80.0] * len(periods), rel=1e-4)  # manual, PMUX4
+    assert len(periods) >= 11
+
+    bench = HipnucUartBench(FAST)
+    bench.wait(10_000.0)
+    assert len(bench.module.pins(bench.now_ns)) <= 8192
+
+
+@pytest.mark.manual("B 2.2.4 alarm level")
+def test_alarm_follows_the_angles() -> None:
+    motion = swing()
+    bench = HipnucUartBench(hardware=HipnucHardware(motion=motion, skew_ppm=0))
+    assert bench.ask(alarm(AlarmAxis.Y, -5, 5, enabled=True).payload.decode().strip()) == ["OK"]
+    edges = [edge for edge in run(bench, 20_000.0)[1] if edge.pin is Pin.ALARM]
+    assert len(edges) > 4
+    level = edges.pop(0).rising  # the angle was out of range before the alarm was set
+    assert level
+    for edge in edges:
+        assert edge.rising is not level
+        level = edge.rising
+        t_s = (edge.due_ns - BEGIN_NS) / NS_PER_S
+        rolls = [degrees(motion.at(t_s - back_s).euler_rad[0]) for back_s in (0.0, 0.0101)]
+        assert (abs(rolls[0]) > 5) is edge.rising
+        assert (abs(rolls[1]) > 5) is not edge.rising  # the device checks the angle every 10 ms
+
+    bench = HipnucUartBench(ModuleSettings(alarm_y=AlarmSetting(-1, 1, True)), HIPNUC_STILL)
+    run(bench, 100.0)
+    assert bench.ask("CONFIG PMUX5 Y,-1,1,0,0") == ["OK"]
+    assert [edge.rising for edge in bench.module.pins(bench.now_ns) if edge.pin is Pin.ALARM] == [False]
+    bench = HipnucUartBench(ModuleSettings(alarm_y=AlarmSetting(-1, 1, True)), HIPNUC_STILL)
+    edges = run(bench, 105.0)[1]
+    rise_ns = edges[-1].due_ns + 10 * NS_PER_MS  # without skew, SOUT falls every 10 ms: here it is high or rises soon
+    bench.now_ns = rise_ns - 40_000
+    bench.module.reboot(bench.now_ns)
+    edges += bench.module.pins(bench.now_ns)
+    for pin in Pin:
+        levels = [edge.rising for edge in edges if edge.pin is pin]
+        assert not levels or levels[-1] is False
+    assert [edge.pin for edge in edges[-2:]] == [Pin.SOUT, Pin.ALARM]
+    assert edges[-1].due_ns == edges[-2].due_ns == bench.now_ns
+    assert all(edge.pin is not Pin.SOUT for edge in run(bench, 499.0)[1])  # still booting
+
+
+@pytest.mark.parametrize(
+    ("alarm_x", "alarm_y", "expected"),
+    [
+        (AlarmSetting(-5, 5, True), AlarmSetting(), True),  # X is pitch: 7°
+        (AlarmSetting(-5, 5, False), AlarmSetting(), False),
+        (AlarmSetting(-8, 8, True), AlarmSetting(-3, 3, True), False),  # Y is roll: 2°
+        (AlarmSetting(-8, 8, True), AlarmSetting(2.5, 5, True), True),
+        (AlarmSetting(8, 9, True), AlarmSetting(), True),  # below the range
+    ],
+)
+def test_which_angle_alarms(alarm_x: AlarmSetting, alarm_y: AlarmSetting, expected: bool) -> None:
+    hardware = HipnucHardware(motion=Still(radians(2), radians(7), 0.0))
+    _, edges = run(HipnucUartBench(ModuleSettings(alarm_x=alarm_x, alarm_y=alarm_y), hardware), 100.0)
+    assert [edge.rising for edge in edges if edge.pin is Pin.ALARM] == [True] * expected
+
+
+@pytest.mark.manual("B 1.2.1 delay of the answer", "B 2.2.4 PMUX1 SIN")
+def test_a_trigger_is_answered_125_us_later_on_average() -> None:
+    bench = HipnucUartBench(ModuleSettings(baud=921_600, hi91=Output(on_mark=True)))
+    delays, wire_ns = [], 82 * 10 * NS_PER_S // 921_600
+    for _ in range(300):
+        marked_ns = bench.now_ns
+        bench.module.mark(marked_ns)
+        (burst,), edges = run(bench, 10.0)
+        (pulse,) = pulses(edges, Pin.SOUT)
+        assert burst.sample_ns == pulse[0].sample_ns == marked_ns
+        assert burst.due_ns - wire_ns == pulse[1].due_ns == pulse[0].due_ns + HIGH_NS
+        delays.append(pulse[1].due_ns - marked_ns)
+    assert sum(delays) / len(delays) == pytest.approx(125_000, abs=2000)
+    assert 20_000 < max(delays) - min(delays) <= 30_000
+
+    bench = HipnucUartBench(FAST, HIPNUC_STILL)
+    bench.wait(0.7)
+    bench.module.mark(bench.now_ns)
+    frame = bench.frames(3.0)[-1]
+    assert frame.word_1_2 == 1  # the sample is 2 ms later; minus 0.7: 0.3, 1.3, 2.3 …
+    bench = HipnucUartBench(FAST, HIPNUC_STILL)
+    bench.module.reboot(bench.now_ns)
+    bench.wait(100.0)
+    bench.module.mark(bench.now_ns)
+    (frame, *_) = bench.frames(405.0)
+    assert frame.word_1_2 == frame.system_time_ms

@@ -3,16 +3,7 @@
 import pytest
 
 from imud.contracts.script import Rejection, Reply, ReplyFrame, Silence
-from imud.drivers.hipnuc.canopen.cia301 import (
-    ABORT_TEXTS,
-    Aborted,
-    abort_frame,
-    abort_text,
-    read_frame,
-    read_object,
-    value_of,
-    write_object,
-)
+from imud.drivers.hipnuc.canopen import cia301
 from imud.model.errors import NoReply
 from tests.support.simulated_modules import unpack
 
@@ -23,7 +14,7 @@ def frame(text: str, can_id: int = 0x588) -> ReplyFrame:
 
 @pytest.mark.manual("B 5.4.1 SDO")
 def test_write_and_its_confirmation() -> None:
-    conversation = write_object(8, 0x20A0, 0, 9, 4)
+    conversation = cia301.write_object(8, 0x20A0, 0, 9, 4)
     request = next(conversation)
     assert unpack(request.payload) == (0x608, bytes.fromhex("23 A0 20 00 09 00 00 00"))
     done = frame("60 A0 20 00 00 00 00 00")
@@ -32,11 +23,11 @@ def test_write_and_its_confirmation() -> None:
     with pytest.raises(StopIteration):
         conversation.send(Reply((done,)))
 
-    assert read_frame(0x1018, 4) == bytes.fromhex("40 18 10 04 00 00 00 00")
+    assert cia301.read_frame(0x1018, 4) == bytes.fromhex("40 18 10 04 00 00 00 00")
     values = {"4F": b"\1", "4B": b"\1\2", "47": b"\1\2\3", "43": b"\1\2\3\4", "42": b"\1\2\3\4", "41": None, "40": None}
-    assert {cs: value_of(bytes.fromhex(cs) + bytes(3) + b"\1\2\3\4") for cs in values} == values
+    assert {cs: cia301.value_of(bytes.fromhex(cs) + bytes(3) + b"\1\2\3\4") for cs in values} == values
     for size, command in ((1, 0x2F), (2, 0x2B), (3, 0x27), (4, 0x23)):
-        _, data = unpack(next(write_object(8, 0x1800, 5, 10, size)).payload)
+        _, data = unpack(next(cia301.write_object(8, 0x1800, 5, 10, size)).payload)
         assert data == bytes([command, 0x00, 0x18, 5, 10, 0, 0, 0])
 
 
@@ -48,32 +39,32 @@ def test_write_and_its_confirmation() -> None:
     ],
 )  # fmt: skip
 def test_invalid_confirmations(other: ReplyFrame | str) -> None:
-    request = next(write_object(8, 0x20A0, 0, 9, 4))
+    request = next(cia301.write_object(8, 0x20A0, 0, 9, 4))
     assert not request.is_end(other)
     assert not request.is_rejection(other)
     assert not request.is_part(other)
 
 
 def test_aborts_silence_and_values_in_segments() -> None:
-    conversation = read_object(8, 0x2345, 1)
+    conversation = cia301.read_object(8, 0x2345, 1)
     request = next(conversation)
     refused = frame("80 45 23 01 00 00 02 06")
     assert request.is_rejection(refused)
-    with pytest.raises(Aborted, match=r"node 8, read 0x2345.1: .*object does not exist.*0x06020000") as caught:
+    with pytest.raises(cia301.Aborted, match=r"node 8, read 0x2345.1: .*object does not exist.*0x06020000") as caught:
         conversation.send(Rejection((refused,)))
     assert caught.value.code == 0x0602_0000
-    assert abort_text(0x1234) == "unknown abort code"
-    assert len(ABORT_TEXTS) == 31
-    conversation = read_object(8, 0x1000, 0)
+    assert cia301.abort_text(0x1234) == "unknown abort code"
+    assert len(cia301.ABORT_TEXTS) == 31
+    conversation = cia301.read_object(8, 0x1000, 0)
     next(conversation)
     with pytest.raises(NoReply, match=r"node 8, read 0x1000\.0"):
         conversation.send(Silence(()))
-    conversation = read_object(8, 0x1008, 0)
+    conversation = cia301.read_object(8, 0x1008, 0)
     request = next(conversation)
     announced = frame("41 08 10 00 0A 00 00 00")
     assert request.is_end(announced)
     abort = conversation.send(Reply((announced,)))
-    assert unpack(abort.payload) == (0x608, abort_frame(0x1008, 0, 0x0504_0001))
+    assert unpack(abort.payload) == (0x608, cia301.abort_frame(0x1008, 0, 0x0504_0001))
     assert abort.silent
     with pytest.raises(StopIteration) as end:
         conversation.send(Reply(()))

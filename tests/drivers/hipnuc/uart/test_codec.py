@@ -15,17 +15,7 @@ from imud.attitude.rotation import euler312_from_quat
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
 from imud.contracts.driver import Identity
 from imud.contracts.script import TextLine
-from imud.drivers.hipnuc.uart.codec import (
-    HEADER,
-    HI91,
-    HI92,
-    PPS_STAMP_MODULUS_MS,
-    HipnucCodec,
-    HipnucOptions,
-    encode_frame,
-    encode_hi91,
-    encode_hi92,
-)
+from imud.drivers.hipnuc.uart import codec as uart_codec
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
@@ -68,8 +58,8 @@ def framed(payload: bytes, length: int | None = None) -> bytes:
     return head + struct.pack("<H", crc_bit_by_bit(head + payload)) + payload
 
 
-def make(**settings: Any) -> HipnucCodec:
-    return HipnucCodec(Ledger(), HipnucOptions(**settings))
+def make(**settings: Any) -> uart_codec.HipnucCodec:
+    return uart_codec.HipnucCodec(Ledger(), uart_codec.HipnucOptions(**settings))
 
 
 def one(events: Sequence[CodecEvent]) -> Measurement:
@@ -83,7 +73,7 @@ def reasons(events: Sequence[CodecEvent]) -> list[BadReason]:
 
 
 def hi91(system_time_ms: int = 0, **values: Any) -> bytes:
-    return encode_hi91(system_time_ms=system_time_ms, **(LEVEL | values))
+    return uart_codec.encode_hi91(system_time_ms=system_time_ms, **(LEVEL | values))
 
 
 def check_manual_values(m: Measurement) -> None:
@@ -119,10 +109,10 @@ def test_manual_hi91() -> None:
     check_manual_values(msgspec.structs.replace(m, size_bytes=m.size_bytes - 1))
     assert codec.ledger.unknown_tags == 1
     assert crc_bit_by_bit(MANUAL_HI91[:4] + MANUAL_HI91[6:]) == 0xBB14
-    assert encode_frame(MANUAL_HI91[6:]) == MANUAL_HI91
+    assert uart_codec.encode_frame(MANUAL_HI91[6:]) == MANUAL_HI91
     m = one(make().feed(MANUAL_HI91))
     values = {name: getattr(m, name) for name in LEVEL}
-    assert encode_hi91(system_time_ms=1840392, word_1_2=5384, **values) == MANUAL_HI91
+    assert uart_codec.encode_hi91(system_time_ms=1840392, word_1_2=5384, **values) == MANUAL_HI91
 
 
 @pytest.mark.parametrize("word", ["pps", "status"])
@@ -131,7 +121,9 @@ def test_frames_back_to_back_are_decoded_like_one(word: str) -> None:
     check_manual_values(alone)
     run = make(hi91_word=word).feed(3 * MANUAL_HI91)
     assert run == [msgspec.structs.replace(alone, trailing_bytes=frames * len(MANUAL_HI91)) for frames in (2, 1, 0)]
-    general = make(hi91_word=word).feed(framed(MANUAL_HI91[HEADER.size :] + b"\x00"))  # an unknown tag after it
+    general = make(hi91_word=word).feed(
+        framed(MANUAL_HI91[uart_codec.HEADER.size :] + b"\x00")
+    )  # an unknown tag after it
     assert general == [msgspec.structs.replace(alone, size_bytes=len(MANUAL_HI91) + 1)]
 
 
@@ -151,7 +143,7 @@ def test_hand_made_hi92() -> None:
     assert m.quat_wxyz == pytest.approx((1.0, 0.0, -0.5, 0.0001), rel=1e-12)
     assert m.size_bytes == 54
     values = {name: getattr(m, name) for name in LEVEL}
-    assert encode_hi92(pps_stamp_ms=1000, status=0x1234, **values) == framed(HI92_PAYLOAD)
+    assert uart_codec.encode_hi92(pps_stamp_ms=1000, status=0x1234, **values) == framed(HI92_PAYLOAD)
 
 
 @pytest.mark.manual("B 3.1 sub-packets")
@@ -195,7 +187,7 @@ def test_a_configured_word_stays(word: str, version: str) -> None:
 @pytest.mark.manual("B 3.1 length")
 def test_an_impossible_length_costs_the_sync_word_only(length: int) -> None:
     codec = make()
-    header = HEADER.pack(b"\x5a\xa5", length, 0)
+    header = uart_codec.HEADER.pack(b"\x5a\xa5", length, 0)
     events = codec.feed(header[:4] + MANUAL_HI91)
     assert events[0] == BadFrame(BadReason.LENGTH, header[:4])
     assert isinstance(events[1], Measurement)
@@ -211,7 +203,7 @@ def test_lengths_of_payloads_and_every_single_bit_error() -> None:
         assert codec.ledger.closes()
     for payload in (b"", bytes(513)):
         with pytest.raises(ValueError, match=r"expected 1 … 512"):
-            encode_frame(payload)
+            uart_codec.encode_frame(payload)
     for length in (1, 512):
         codec = make()
         assert codec.feed(framed(b"\x77" * length)) == []
@@ -234,7 +226,7 @@ def test_bytes_of_damaged_frames_count_as_bad() -> None:
     assert (ledger.bytes_in_bad_frames, ledger.bytes_skipped, ledger.bytes_in_good_frames) == (82, 3, 82)
 
     codec = make()
-    false = HEADER.pack(b"\x5a\xa5", 200, 0x1234)
+    false = uart_codec.HEADER.pack(b"\x5a\xa5", 200, 0x1234)
     assert codec.feed(false + MANUAL_HI91) == []
     assert codec.ledger.bytes_pending == 88
     events = codec.feed(bytes(117) + b"\x01\x02")
@@ -245,7 +237,7 @@ def test_bytes_of_damaged_frames_count_as_bad() -> None:
     assert (ledger.bytes_in_bad_frames, ledger.bytes_in_good_frames, ledger.bytes_skipped) == (124, 82, 1)
 
     codec = make()
-    assert codec.feed(HEADER.pack(b"\x5a\xa5", 200, 0x1234) + b"\x00APP_VER=156\r\nOK\r\n") == []
+    assert codec.feed(uart_codec.HEADER.pack(b"\x5a\xa5", 200, 0x1234) + b"\x00APP_VER=156\r\nOK\r\n") == []
     events = codec.flush()
     assert reasons(events) == [BadReason.CRC]
     assert events[1:] == [TextLine("APP_VER=156"), TextLine("OK")]
@@ -253,26 +245,26 @@ def test_bytes_of_damaged_frames_count_as_bad() -> None:
     assert codec.flush() == []
 
     codec = make()
-    codec.feed(HEADER.pack(b"\x5a\xa5", 200, 0x1234) + b"\x00APP_VER=156\r\nOK\r\n")
+    codec.feed(uart_codec.HEADER.pack(b"\x5a\xa5", 200, 0x1234) + b"\x00APP_VER=156\r\nOK\r\n")
     codec.flush()
     assert codec.feed(b"ATT_MODE: 0\r\nOK\r\n") == [TextLine("ATT_MODE: 0"), TextLine("OK")]
     assert codec.ledger.closes()
 
     codec = make()
-    inner = HEADER.pack(b"\x5a\xa5", 30, 0x1234)
-    events = codec.feed(HEADER.pack(b"\x5a\xa5", 20, 0x1234) + inner + bytes(14))
+    inner = uart_codec.HEADER.pack(b"\x5a\xa5", 30, 0x1234)
+    events = codec.feed(uart_codec.HEADER.pack(b"\x5a\xa5", 20, 0x1234) + inner + bytes(14))
     assert reasons(events) == [BadReason.CRC]
     codec.feed(bytes(16) + b"\x01\x02\x03")
     ledger = codec.ledger
     assert (ledger.bytes_in_bad_frames, ledger.bytes_skipped, ledger.bytes_pending) == (6 + 36, 3, 0)
 
     codec = make()
-    codec.feed(HEADER.pack(b"\x5a\xa5", 100, 0x1234) + MANUAL_HI91)
+    codec.feed(uart_codec.HEADER.pack(b"\x5a\xa5", 100, 0x1234) + MANUAL_HI91)
     assert isinstance(codec.flush()[-1], Measurement)
     codec.feed(bytes(20))  # 106 bytes claimed: these 18 bytes belong to them
     assert (codec.ledger.bytes_in_bad_frames, codec.ledger.bytes_skipped) == (6 + 18, 2)
     codec = make()
-    codec.feed(HEADER.pack(b"\x5a\xa5", 3, 0x1234) + b"\x00\x00Z")
+    codec.feed(uart_codec.HEADER.pack(b"\x5a\xa5", 3, 0x1234) + b"\x00\x00Z")
     assert codec.ledger.bytes_pending == 1
     codec.feed(b"\x00")
     assert (codec.ledger.bytes_in_bad_frames, codec.ledger.bytes_skipped) == (9, 1)
@@ -377,11 +369,13 @@ def test_clipping_the_check_value_and_a_driver_of_other_settings() -> None:
     far: dict[str, Any] = LEVEL | {
         "accel_m_s2": (1e9, -1e9, 0.0), "gyro_rad_s": (1e3, -1e3, 0.0), "temperature_c": 300.0, "pressure_pa": 1e6,
     }  # fmt: skip
-    m = one(make().feed(encode_hi92(pps_stamp_ms=-1, **far)))
+    m = one(make().feed(uart_codec.encode_hi92(pps_stamp_ms=-1, **far)))
     assert m.accel_m_s2 == pytest.approx((159.994, -159.9996, 0.0), abs=1e-2)
     assert m.gyro_rad_s == pytest.approx((32.767, -32.768, 0.0))
     assert (m.temperature_c, m.pressure_pa, m.pps_age_ms) == (127, None, 0)  # 132767 Pa is not an air pressure
-    bad, last = make().feed(encode_hi91(system_time_ms=2**32 + 7, **(far | {"accel_m_s2": (1e300, 0.0, 0.0)})))
+    bad, last = make().feed(
+        uart_codec.encode_hi91(system_time_ms=2**32 + 7, **(far | {"accel_m_s2": (1e300, 0.0, 0.0)}))
+    )
     assert isinstance(bad, BadFrame)
     assert isinstance(last, Measurement)
     assert last.dev_ticks == 7
@@ -389,7 +383,7 @@ def test_clipping_the_check_value_and_a_driver_of_other_settings() -> None:
     assert struct.unpack_from("<f", bad.raw, 6 + 12)[0] == pytest.approx(3.4028e38, rel=1e-4)
     assert crc_hqx(b"123456789", 0) == 0x31C3
     assert crc_hqx(b"6789", crc_hqx(b"12345", 0)) == 0x31C3
-    codec = replace(DRIVER, name="other").make_codec(Ledger(), HipnucOptions(hi91_word="status"))
+    codec = replace(DRIVER, name="other").make_codec(Ledger(), uart_codec.HipnucOptions(hi91_word="status"))
     assert one(codec.feed(hi91(word_1_2=3))).status == 3
     assert DRIVER.example_frame(Random(0))
 
@@ -409,7 +403,7 @@ def test_filler_bytes_are_no_values(
 ) -> None:
     """Alone (fast path), in a run, and in a frame with NaN. The values next to the filler bytes stay."""
     floats = hi91(**hi91_values)
-    integers = encode_hi92(**({"pps_stamp_ms": 8192, "status": 0x2323} | LEVEL | hi92_values))
+    integers = uart_codec.encode_hi92(**({"pps_stamp_ms": 8192, "status": 0x2323} | LEVEL | hi92_values))
     with_nan = hi91(**({"gyro_rad_s": (0.0, math.nan, 0.0)} | hi91_values))
     for data in (floats * count, integers * count, with_nan * count):
         events = [event for event in make().feed(data) if isinstance(event, Measurement)]
@@ -422,7 +416,7 @@ def test_filler_bytes_are_no_values(
 
 
 def test_the_limit_of_the_time_since_a_pulse_is_a_value() -> None:
-    for data in (hi91(word_1_2=8192) * 2, encode_hi92(pps_stamp_ms=8192, **LEVEL)):
+    for data in (hi91(word_1_2=8192) * 2, uart_codec.encode_hi92(pps_stamp_ms=8192, **LEVEL)):
         assert [m.pps_age_ms for m in make().feed(data) if isinstance(m, Measurement)] == [8192] * data.count(
             b"\x5a\xa5"
         )
@@ -430,21 +424,21 @@ def test_the_limit_of_the_time_since_a_pulse_is_a_value() -> None:
 
 def test_damaged_frames_among_lines() -> None:
     codec = make()
-    damaged = HEADER.pack(b"\x5a\xa5", 2, 0x1234)
+    damaged = uart_codec.HEADER.pack(b"\x5a\xa5", 2, 0x1234)
     events = codec.feed(b"APP_" + damaged + b"\n\x00VER\n")
     assert [event.text for event in events if isinstance(event, TextLine)] == ["VER"]
     codec = make()
     assert codec.feed(b"ab\x5a\xa5\x20\x20cd\nef\n")[1:] == [TextLine("ef")]
     assert codec.ledger.closes()
 
-    damaged = HEADER.pack(b"\x5a\xa5", 10, 0x1234) + bytes(6) + b"KERR"
+    damaged = uart_codec.HEADER.pack(b"\x5a\xa5", 10, 0x1234) + bytes(6) + b"KERR"
     codec = make()
     events = codec.feed(damaged + b"OR\r\nOK\r\n")
     assert events[1:] == [TextLine("OK")]
     assert codec.ledger.closes()
 
-    codec = HipnucCodec(Ledger(), HipnucOptions())
-    frame = encode_frame(b"\x91" + b'\x01"Cs\n' + bytes(70))
+    codec = uart_codec.HipnucCodec(Ledger(), uart_codec.HipnucOptions())
+    frame = uart_codec.encode_frame(b"\x91" + b'\x01"Cs\n' + bytes(70))
     cut = frame.index(b"\n") + 1
     assert codec.feed(frame[:cut]) == []
     assert codec.flush() == []
@@ -458,7 +452,7 @@ def test_text_inside_a_damaged_frame_is_not_a_line(text: bytes, step: int) -> No
     """The first characters may be bytes of the frame: `AOK` is a byte of a sample and a reply, or four bytes of a
     sample.
     """
-    damaged = HEADER.pack(b"\x5a\xa5", 76, 0x1234) + b"\x91" + bytes(20) + text + bytes(55 - len(text))
+    damaged = uart_codec.HEADER.pack(b"\x5a\xa5", 76, 0x1234) + b"\x91" + bytes(20) + text + bytes(55 - len(text))
     data = damaged + b"OK\r\n" + MANUAL_HI91
     codec = make()
     events = [event for at in range(0, len(data), step) for event in codec.feed(data[at : at + step])]
@@ -472,5 +466,5 @@ def test_text_inside_a_damaged_frame_is_not_a_line(text: bytes, step: int) -> No
 
 @pytest.mark.manual("B 3.3.1 size", "B 3.3.2 size", "B 3.3.1 pps_sync_stamp")
 def test_sizes_and_the_pps_stamp_that_runs_free() -> None:
-    assert (HI91.size, HI92.size) == (76, 48)
-    assert (8190 + 10) % PPS_STAMP_MODULUS_MS == 8
+    assert (uart_codec.HI91.size, uart_codec.HI92.size) == (76, 48)
+    assert (8190 + 10) % uart_codec.PPS_STAMP_MODULUS_MS == 8

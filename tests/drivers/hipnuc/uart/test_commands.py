@@ -1,17 +1,27 @@
-"""HiPNUC commands: bytes as printed in the manual, and arguments that imud rejects before it sends them."""
+"""HiPNUC commands: bytes as printed in the manual, and arguments that imud rejects before it sends them.
+Scripts with a HiPNUC device: identity, settings, missing replies, rejections and late replies."""
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 
-from imud.contracts.script import Rejection, Reply, Request, RequestScript
+from imud.contracts.command import Target
+from imud.contracts.script import Outcome, Rejection, Reply, Request, RequestScript, Silence
+from imud.contracts.setting import words_of
 from imud.drivers.hipnuc.common import AttitudeMode, LevelReset
 from imud.drivers.hipnuc.uart import commands as c
-from imud.model.errors import BadArgument
+from imud.drivers.hipnuc.uart.commands import OutputMessage, Query, advice, ask, identify, log_ontime, send_once, wake
+from imud.drivers.hipnuc.uart.driver import DRIVER
+from imud.drivers.hipnuc.uart.settings import SETTINGS, report_values, why_silent
+from imud.model.errors import BadArgument, NoReply, Rejected
 from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
+from imud.sim.hipnuc.uart_settings import VARIANTS, Behaviour, ModuleSettings, Output, RateChange
+from tests.support.old_spellings import script_of
 from tests.support.script_runners import offline_runner, unanswered_ms
+from tests.support.simulated_modules import HipnucLine, hardware_of, run_script
 
 H91, H92 = c.OutputMessage.HI91, c.OutputMessage.HI92
 
@@ -114,3 +124,291 @@ def test_table_3_7_and_the_silent_command() -> None:
         assert rate * frame_bytes * 10 <= baud
     assert (c.max_rate_hz(H91, 115200), c.max_rate_hz(H92, 115200)) == (100, 200)
     assert [text for request, text in PRINTED if request.silent] == ["REBOOT"]
+
+
+T = TypeVar("T")
+VERSION = ("PNAME=HI14R3", "BUILD=Oct 15 2024", "UUID=043995698D6E1708", "APP_VER=156", "BL_VER=109", "OK")
+REPLIES = {
+    "LOG USRCONFIG": ("ATT_MODE: 0", "OK"),
+    "LOG COMCONFIG": ("BAUD=115200", "LOG HI91 ONTIME 0.01", "OK"),
+    "LOG MAGCONFIG": ("MB=14.14, -2.08, -8.75", "OK"),
+}
+
+
+def hold(script: RequestScript[T], answer: Callable[[str], Outcome]) -> T:
+    return run_script(script, lambda request: answer(request.name))
+
+
+@pytest.mark.manual("B 2.2.5 VERSION")
+def test_identity_refusal_and_flat_settings() -> None:
+    asked: list[str] = []
+
+    def answer(name: str) -> Outcome:
+        asked.append(name)
+        return Reply(VERSION)
+
+    identity = hold(identify(), answer)
+    assert asked == ["LOG VERSION"]
+    assert (identity.product, identity.serial_number, identity.firmware) == ("HI14R3", "043995698D6E1708", "1.5.6")
+    assert identity.details is not None
+    assert identity.details["APP_VER"] == "156"
+    assert hold(identify(), lambda _: Reply(("PNAME=CH0", "OK"))).firmware == ""
+    with pytest.raises(Rejected, match="ERR 3"):
+        hold(identify(), lambda _: Rejection(("ERR 3",)))
+
+    assert words_of(hold(SETTINGS.read(Target(None, 0), None), lambda name: Reply(REPLIES[name]))) == {
+        "ATT_MODE": "0", "BAUD": "115200", "COMCONFIG 1": "LOG HI91 ONTIME 0.01", "MB": "14.14, -2.08, -8.75",
+    }  # fmt: skip
+    without = hold(
+        SETTINGS.read(Target(None, 0), None), lambda n: Silence(()) if n == "LOG MAGCONFIG" else Reply(REPLIES[n])
+    )
+    settings = words_of(without)
+    assert "ATT_MODE" in settings
+    assert "MB" not in settings
+    for silent in ("LOG USRCONFIG", "LOG COMCONFIG"):
+        script = SETTINGS.read(Target(None, 0), None)
+        with pytest.raises(NoReply, match=silent):
+            hold(script, lambda n, silent=silent: Silence(()) if n == silent else Reply(REPLIES[n]))  # type: ignore[misc]  # bound now
+
+    def user_report(name: str) -> Outcome:
+        assert name == "LOG USRCONFIG"
+        return Reply(REPLIES[name])
+
+    assert set(hold(SETTINGS.read(Target(None, 0), {SETTINGS.table["mode"].report}), user_report)) == {"USRCONFIG"}
+
+
+@pytest.mark.parametrize(
+    ("outcome", "words"),
+    [
+        (Silence(()), "LOG VERSION: expected lines up to OK"),
+        (Silence(("PNAME=HI14R3",)), "LOG VERSION: expected lines up to OK"),
+        (Reply(("OK",)), "LOG VERSION: expected PNAME=.* bytes were lost"),
+        (Reply(("NAME=HI14R3", "UUID=043995698D6E1708", "OK")), "LOG VERSION: expected PNAME=.* bytes were lost"),
+    ],
+)
+def test_no_reply_and_one_that_lost_its_product(outcome: Outcome, words: str) -> None:
+    with pytest.raises(NoReply, match=words):
+        hold(identify(), lambda _: outcome)
+
+
+def test_a_late_version_is_not_taken_for_the_settings() -> None:
+    """LOG VERSION times out, imud sends LOG USRCONFIG, and then the late reply to LOG VERSION arrives with its OK."""
+    ledger = Ledger()
+    session = offline_runner(ledger)
+    session.start(ask(Query.VERSION), 0)
+    assert isinstance(session.on_time(10**9), Silence)
+    session.start(ask(Query.USRCONFIG), 10**9)
+    assert [session.on_message(line, 10**9 + 1) for line in VERSION] == [None] * len(VERSION)
+    assert (ledger.replies_late, ledger.replies_unsolicited) == (1, 0)
+    assert session.on_message("ATT_MODE: 0", 10**9 + 2) is None
+    assert session.on_message("OK", 10**9 + 2) == Reply(("ATT_MODE: 0", "OK"))
+    ledger = Ledger()
+    session = offline_runner(ledger)
+    session.start(log_ontime(OutputMessage.HI91, 100), 0)
+    session.on_time(10**9)
+    session.start(ask(Query.VERSION), 10**9)
+    outcomes = [session.on_message(line, 10**9 + 1) for line in ("OK", *VERSION)]
+    assert outcomes == [None] * 6 + [Reply(VERSION)]
+    assert ledger.replies_late == 1
+
+
+every_variant = pytest.mark.parametrize("behaviour", VARIANTS.values(), ids=VARIANTS)
+
+
+@every_variant
+@pytest.mark.parametrize("baud", [9600, 921600])
+@pytest.mark.manual("B 2.2.3 SERIALCONFIG")
+def test_another_baud_rate_is_followed_and_saved(behaviour: Behaviour, baud: int) -> None:
+    line = HipnucLine(ModuleSettings(hi91=Output(200)), hardware_of(behaviour))
+    assert line.act("baud", baud=baud) == baud
+    assert line.baud == line.module.baud == line.module.flash.baud == baud
+    line.module.reboot(line.now_ns)
+    line.wait(line.module.hardware.boot_ms)
+    assert line.run(identify()).product == "HI14R3"
+
+
+@pytest.mark.manual("B 2.2.3 a wrong rate")
+def test_a_module_that_refuses_or_does_not_know_another_rate_stays_reachable() -> None:
+    line = HipnucLine(hardware=hardware_of(Behaviour(refuses=("SERIALCONFIG",))))
+    with pytest.raises(Rejected, match="SERIALCONFIG 921600: the device rejected the request: ERR"):
+        line.act("baud", baud=921600)
+    assert line.run(identify()).product == "HI14R3"
+    line = HipnucLine(hardware=hardware_of(Behaviour(ignores=("SERIALCONFIG",))))
+    with pytest.raises(NoReply, match="keeps 115200 baud"):
+        line.act("baud", baud=921600)
+    assert "SAVECONFIG" not in line.asked
+    assert line.run(identify()).product == "HI14R3"
+
+
+class Forgetful(HipnucLine):
+    """Device that replies OK to SAVECONFIG and saves nothing."""
+
+    def ask(self, request: Request) -> Outcome:
+        outcome = super().ask(request)
+        self.module.flash = ModuleSettings()
+        return outcome
+
+
+def test_a_rate_that_was_not_saved_after_all_is_reported_after_the_restart() -> None:
+    line = Forgetful()
+    with pytest.raises(Rejected, match="keeps 115200 baud"):
+        line.act("baud", baud=921600)
+    assert line.baud == 115200
+    assert line.run(identify()).product == "HI14R3"
+
+
+@pytest.mark.parametrize(
+    ("settings", "baud", "words"),
+    [
+        (ModuleSettings(hi91=Output(10)), 9600, "HI91: expected at most 10 Hz at 9600 baud, got 100 Hz"),
+        (ModuleSettings(baud=921600, hi91=Output(1)), 460800, "at most 500 Hz at 460800 baud, got 1000 Hz"),
+        (ModuleSettings(hi91=Output(100), hi92=Output(200)), 9600, r"9120 bit/s of frames at 9600 baud, got 10900"),
+    ],
+)
+def test_a_baud_rate_that_does_not_carry_the_present_output_is_refused(
+    settings: ModuleSettings, baud: int, words: str
+) -> None:
+    """10 Hz of HI91 need 8200 bit/s, 5 Hz of HI92 2700 bit/s."""
+    line = HipnucLine(settings)
+    with pytest.raises(BadArgument, match=words):
+        line.act("baud", baud=baud)
+    assert line.asked == ["LOG COMCONFIG"]
+
+
+@pytest.mark.manual("B 2.2.5 output and line", "B 2.2.5 ONTIME")
+def test_the_sum_of_all_messages_is_refused_and_a_sum_that_fits_is_not() -> None:
+    """100 Hz of HI91 need 82000 of 115200 bit/s. HI92 needs 540 bits per frame: 95 % leave 50 Hz and not 100."""
+    line, actual = HipnucLine(), {"output": {"hi91": 100, "hi92": 0}}
+
+    def output(message: str, rate_hz: int) -> None:
+        given = {"message": message, "rate_hz": rate_hz}
+        line.run(script_of(DRIVER, Target(None, 115200), "output", given, **actual))
+
+    with pytest.raises(BadArgument, match="got 136000 bit/s by HI91 at 100 Hz and HI92 at 100 Hz"):
+        output("HI92", 100)
+    assert "LOG HI92 ONTIME 0.01" not in line.asked
+    output("HI92", 50)
+    assert line.module.settings.hi92 == Output(20)
+    output("HI91", 25)
+    assert line.module.settings.hi91 == Output(40)
+
+
+@every_variant
+@pytest.mark.parametrize("baud", [9600, 115200])
+@pytest.mark.manual("B 2.2.7 FRESET")
+def test_a_factory_reset_is_in_force_and_followed(behaviour: Behaviour, baud: int) -> None:
+    line = HipnucLine(ModuleSettings(baud=baud, att_mode=1, hi91=Output(1000)), hardware_of(behaviour))
+    answer = line.act("factory_reset", fixed_baud=baud)
+    assert answer["baud"] == line.baud == line.module.baud == 115200
+    assert ("configuration" in answer) is (baud != 115200)
+    assert line.module.settings == line.module.flash == ModuleSettings()
+
+
+def test_a_factory_reset_that_is_refused_or_unknown_changes_nothing() -> None:
+    before = ModuleSettings(baud=921600, att_mode=1)
+    with pytest.raises(Rejected, match="FRESET: the device rejected the request: ERR"):
+        HipnucLine(before, hardware_of(Behaviour(refuses=("FRESET",)))).act("factory_reset")
+    line = HipnucLine(before, hardware_of(Behaviour(ignores=("FRESET",))))
+    with pytest.raises(NoReply, match="FRESET: expected OK, got no reply"):
+        line.act("factory_reset")
+    assert (line.baud, line.module.settings) == (921600, before)
+
+    assert advice(921600, 0) == advice(921600, 921600) == ""
+    assert advice(921600, 115200).startswith("change `baud: 115200` in the configuration to 921600 or auto")
+    line = HipnucLine(hardware=hardware_of(Behaviour(rate_change=RateChange.AFTER_ANSWER)))
+    line.run(_send(line, "SERIALCONFIG 460800"))
+    line.baud = 460800
+    assert line.act("restart").product == "HI14R3"
+    assert line.baud == line.module.baud == 115200
+
+
+def _send(line: HipnucLine, command: str) -> RequestScript[None]:
+    line.module.receive(command.encode() + b"\r\n", line.now_ns)
+    line.wait(20)
+    return None
+    yield  # makes it a generator
+
+
+@pytest.mark.parametrize(
+    ("settings", "done", "hi91"),
+    [
+        (ModuleSettings(), "LOG ENABLE", Output(10)),
+        (ModuleSettings(hi91=Output()), "LOG ENABLE; HI91 at 100 Hz, not saved", Output(10)),
+        (ModuleSettings(baud=9600, hi91=Output()), "LOG ENABLE; HI91 at 10 Hz, not saved", Output(100)),
+        (ModuleSettings(hi91=Output(on_mark=True)), "LOG ENABLE; HI91 at 100 Hz, not saved", Output(10)),
+    ],
+)
+def test_a_silent_module_is_woken_by_an_action(settings: ModuleSettings, done: str, hi91: Output) -> None:
+    line = HipnucLine(settings)
+    line.module.receive(b"LOG DISABLE\r\n", line.now_ns)
+    line.wait(300)
+    assert line.act("wake") == done
+    assert (line.module.settings.hi91, line.module.flash) == (hi91, settings)
+    line.wait(300)
+    assert line.ledger.frames_in_samples > 1
+
+
+@pytest.mark.parametrize(
+    ("settings", "woken"),
+    [
+        (ModuleSettings(), True),
+        (ModuleSettings(hi91=Output()), None),
+        (ModuleSettings(hi91=Output(on_mark=True)), None),
+        (ModuleSettings(hi91=Output(on_mark=True), hi92=Output(100)), None),
+    ],
+)
+@pytest.mark.manual("B 2.2.5 LOG ENABLE")
+def test_by_itself_only_frames_that_have_a_rate_are_let_out(settings: ModuleSettings, woken: bool | None) -> None:
+    line = HipnucLine(settings)
+    line.module.receive(b"LOG DISABLE\r\n", line.now_ns)
+    line.wait(300)
+    assert line.run(wake()) is woken
+    assert ("LOG ENABLE" in line.asked) is (woken is True)
+    assert line.module.settings == settings
+
+
+@pytest.mark.parametrize(
+    ("report", "words"),
+    [
+        (("LOG HI91 ONTIME 0.01", "LOG HI92 ONTIME 0.005"), "LOG DISABLE); HI92 has the rate 200 Hz"),
+        (("LOG HI92 ONMARK 1", "LOG HI91 ONMARK 1"), "HI91 and HI92 on mark"),
+        (("LOG HI91 ONTIME 0",), "no message has a rate"),
+        ((), "its output is off, or on mark"),
+    ],
+)
+def test_the_reason_of_a_silent_device(report: tuple[str, ...], words: str) -> None:
+    lines = {f"COMCONFIG {number}": line for number, line in enumerate(report)}
+    assert words in why_silent(report_values({"BAUD": "115200", **lines}))
+
+
+FRAME = Reply((), Measurement(82, 0, 5))
+OK = Reply(("OK",))
+ERR = Rejection(("ERR",))
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "error"),
+    [
+        ([OK], ""),  # the frame follows
+        ([FRAME, OK], ""),  # the frame first, or a frame of the timed output
+        ([FRAME, Silence(())], ""),  # newer firmware: the frame is the reply
+        ([FRAME, ERR], "the device rejected the request: ERR"),
+        ([ERR], "the device rejected the request: ERR"),
+        ([Silence(())], "expected OK or a frame, got no reply"),
+    ],
+)
+@pytest.mark.manual("B 2.2.5 ONMARK ONCE")
+def test_a_frame_without_ok_answers_a_request_for_one_frame(outcomes: list[Outcome], error: str) -> None:
+    asked: list[Request] = []
+
+    def answer(request: Request) -> Outcome:
+        asked.append(request)
+        return outcomes[len(asked) - 1]
+
+    if error:
+        with pytest.raises((NoReply, Rejected), match=error):
+            run_script(send_once(OutputMessage.HI91), answer)
+    else:
+        run_script(send_once(OutputMessage.HI91), answer)
+    assert [one.payload for one in asked] == [b"LOG HI91 ONMARK ONCE\r\n", b""][: len(outcomes)]
+    assert all(one.kind == "OK" and one.is_end("OK") for one in asked)

@@ -11,30 +11,7 @@ from imud.attitude.rotation import matrix_from_quat, quat_from_euler_zyx
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
 from imud.contracts.script import ReplyFrame
 from imud.drivers.imu61x.common import crc32
-from imud.drivers.imu61x.uart.codec import (
-    AHRS_FRAME,
-    DEVICE_SYNC,
-    FRAME_BYTES_MAX,
-    PAYLOAD_BYTES_MAX,
-    STATUS_BYTES_MIN,
-    Acknowledgement,
-    Imu61xCodec,
-    Parameter,
-    ParameterValue,
-    Status,
-    encode_acknowledgement,
-    encode_ahrs,
-    encode_frame,
-    encode_parameter,
-    encode_status,
-    is_reply,
-    pack_acknowledgement,
-    pack_parameters,
-    pack_status,
-    parse_acknowledgement,
-    parse_parameter,
-    parse_status,
-)
+from imud.drivers.imu61x.uart import codec as uart_codec
 from imud.drivers.imu61x.uart.driver import DRIVER
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
@@ -57,8 +34,8 @@ def with_crc(text: str) -> bytes:
 GOLDEN = with_crc(AHRS_HEX)
 
 
-def codec() -> Imu61xCodec:
-    return Imu61xCodec(Ledger())
+def codec() -> uart_codec.Imu61xCodec:
+    return uart_codec.Imu61xCodec(Ledger())
 
 
 def only(events: object) -> Measurement:
@@ -86,7 +63,7 @@ def test_golden_ahrs_frame() -> None:
     assert (DRIVER.tick_ns, DRIVER.tick_modulus) == (1000, 2**32)
     assert "assumed" in DRIVER.euler_convention
     assert (
-        encode_ahrs(
+        uart_codec.encode_ahrs(
             timer_us=0x12345678 + 2**32, accel_m_s2=(9.80665, -4.903325, 19.6133), gyro_rad_s=(pi, -pi / 2, pi / 180),
             euler_rad=(-pi / 4, pi / 6, pi / 2), temperature_c=36.5,
         )
@@ -158,7 +135,7 @@ def test_values_near_infinity_and_quaternions_to_the_last_bit() -> None:
 
     random = Random(5)
     frames = [
-        encode_ahrs(
+        uart_codec.encode_ahrs(
             timer_us=number, accel_m_s2=(0, 0, 9.8), gyro_rad_s=(0, 0, 0), temperature_c=20,
             euler_rad=(random.uniform(-pi, pi), random.uniform(-pi / 2, pi / 2), random.uniform(-pi, pi)),
         )
@@ -169,7 +146,9 @@ def test_values_near_infinity_and_quaternions_to_the_last_bit() -> None:
         assert event.euler_rad is not None
         assert event.quat_wxyz == quat_from_euler_zyx(event.euler_rad)
 
-    broken = encode_frame(DEVICE_SYNC, AHRS_FRAME, GOLDEN[6:46] + struct.pack("<f", nan))
+    broken = uart_codec.encode_frame(
+        uart_codec.DEVICE_SYNC, uart_codec.AHRS_FRAME, GOLDEN[6:46] + struct.pack("<f", nan)
+    )
     _, measurement = codec().feed(broken)
     whole = only(codec().feed(GOLDEN))
     assert isinstance(measurement, Measurement)
@@ -190,7 +169,7 @@ def test_values_near_infinity_and_quaternions_to_the_last_bit() -> None:
 def test_groups_that_are_not_finite_are_removed_and_reported(place: int, missing: set[str], value: float) -> None:
     values = [1.0] * 10
     values[place] = value
-    frame = encode_frame(DEVICE_SYNC, AHRS_FRAME, struct.pack("<I10f", 5, *values))
+    frame = uart_codec.encode_frame(uart_codec.DEVICE_SYNC, uart_codec.AHRS_FRAME, struct.pack("<I10f", 5, *values))
     tested = codec()
     bad, measurement = tested.feed(frame)
     assert bad == BadFrame(BadReason.NOT_FINITE, frame)
@@ -205,24 +184,29 @@ def test_groups_that_are_not_finite_are_removed_and_reported(place: int, missing
 @pytest.mark.manual("A 1.2 ID and length", "A 1.2 headers")
 def test_frames_of_other_kinds_and_lengths() -> None:
     tested = codec()
-    status = encode_status(Status(1, 2, 3, (4, 5, 6)))
-    stream = GOLDEN + status + encode_parameter(21, 100.0) + encode_acknowledgement(14, 0, frame_id=0x4242)
+    status = uart_codec.encode_status(uart_codec.Status(1, 2, 3, (4, 5, 6)))
+    stream = (
+        GOLDEN
+        + status
+        + uart_codec.encode_parameter(21, 100.0)
+        + uart_codec.encode_acknowledgement(14, 0, frame_id=0x4242)
+    )
     kinds = [type(event) for event in tested.feed(stream)]
     assert kinds == [Measurement, ReplyFrame, ReplyFrame, ReplyFrame]
     assert (tested.ledger.frames_in_samples, tested.ledger.frames_in_replies) == (1, 3)
     assert tested.ledger.bytes_in_good_frames == len(stream)
 
     for frame_id in (2, 6, 14, 0xFF, 0xFFFF):
-        (event,) = codec().feed(encode_acknowledgement(3, 0, frame_id=frame_id))
+        (event,) = codec().feed(uart_codec.encode_acknowledgement(3, 0, frame_id=frame_id))
         assert event == ReplyFrame(frame_id, b"\x03\x00\x00\x00")
 
     tested = codec()
-    assert tested.feed(encode_frame(DEVICE_SYNC, 0x0123, bytes(30))) == []
+    assert tested.feed(uart_codec.encode_frame(uart_codec.DEVICE_SYNC, 0x0123, bytes(30))) == []
     assert (tested.ledger.frames_ignored, tested.ledger.frames_good) == (1, 1)
     assert tested.ledger.bytes_in_good_frames == 40
     assert tested.ledger.closes()
 
-    longer = encode_frame(DEVICE_SYNC, AHRS_FRAME, GOLDEN[6:-4] + bytes(8))
+    longer = uart_codec.encode_frame(uart_codec.DEVICE_SYNC, uart_codec.AHRS_FRAME, GOLDEN[6:-4] + bytes(8))
     measurement = only(codec().feed(longer))
     assert (measurement.temperature_c, measurement.size_bytes) == (36.5, 62)
 
@@ -231,12 +215,12 @@ def test_frames_of_other_kinds_and_lengths() -> None:
     assert tested.feed(command) == []
     assert tested.ledger.bytes_skipped == len(command)
 
-    for size in (0, PAYLOAD_BYTES_MAX + 1):
+    for size in (0, uart_codec.PAYLOAD_BYTES_MAX + 1):
         with pytest.raises(ValueError, match="payload"):
-            encode_frame(DEVICE_SYNC, 1, bytes(size))
+            uart_codec.encode_frame(uart_codec.DEVICE_SYNC, 1, bytes(size))
 
 
-@pytest.mark.parametrize("length", [0, PAYLOAD_BYTES_MAX + 1, 0xFFFF])
+@pytest.mark.parametrize("length", [0, uart_codec.PAYLOAD_BYTES_MAX + 1, 0xFFFF])
 @pytest.mark.manual("A 1.2 ID and length")
 def test_a_length_above_the_maximum_is_rejected_immediately(length: int) -> None:
     lie = b"\xaa\x55\x02\x00" + length.to_bytes(2, "little")
@@ -258,7 +242,7 @@ def test_frames_inside_damaged_ones_and_false_lengths() -> None:
     ledger = tested.ledger
     assert (ledger.bytes_in_bad_frames, ledger.bytes_in_good_frames, ledger.bytes_skipped) == (20, 54, 0)
 
-    lie = b"\xaa\x55\x02\x00" + PAYLOAD_BYTES_MAX.to_bytes(2, "little")
+    lie = b"\xaa\x55\x02\x00" + uart_codec.PAYLOAD_BYTES_MAX.to_bytes(2, "little")
     tested = codec()
     assert [*tested.feed(lie + GOLDEN[:30]), *tested.flush(), *tested.feed(GOLDEN[30:])] == []
     bad, measurement = tested.flush()
@@ -269,11 +253,11 @@ def test_frames_inside_damaged_ones_and_false_lengths() -> None:
     assert (ledger.bytes_in_bad_frames, ledger.bytes_in_good_frames, ledger.bytes_pending) == (6, 54, 0)
     assert ledger.closes()
 
-    lie = b"\xaa\x55\x02\x00" + PAYLOAD_BYTES_MAX.to_bytes(2, "little")
+    lie = b"\xaa\x55\x02\x00" + uart_codec.PAYLOAD_BYTES_MAX.to_bytes(2, "little")
     tested = codec()
     events: list[CodecEvent] = [*tested.feed(lie)]
     while not events:
-        assert tested.ledger.bytes_pending < FRAME_BYTES_MAX
+        assert tested.ledger.bytes_pending < uart_codec.FRAME_BYTES_MAX
         events += tested.feed(GOLDEN)
     sent = (tested.ledger.bytes_in - len(lie)) // len(GOLDEN)
     assert sent == 5
@@ -301,7 +285,7 @@ def test_bytes_where_a_damaged_frame_claimed_to_be_are_its_in_any_split(end: byt
 @pytest.mark.manual("A 1.2 CRC")
 def test_short_frames_are_bad_and_every_single_bit_matters() -> None:
     for frame_id, size in ((2, 43), (0xFF, 21), (6, 23), (2, 5)):
-        frame, tested = encode_frame(DEVICE_SYNC, frame_id, bytes(size)), codec()
+        frame, tested = uart_codec.encode_frame(uart_codec.DEVICE_SYNC, frame_id, bytes(size)), codec()
         assert tested.feed(frame) == [BadFrame(BadReason.CONTENT, frame)]
         assert (tested.ledger.frames_bad_content, tested.ledger.bytes_in_bad_frames) == (1, len(frame))
         assert tested.ledger.closes()
@@ -310,7 +294,7 @@ def test_short_frames_are_bad_and_every_single_bit_matters() -> None:
             flipped = bytearray(GOLDEN)
             flipped[place] ^= 1 << bit
             tested = codec()
-            events = [*tested.feed(bytes(flipped)), *tested.feed(bytes(FRAME_BYTES_MAX))]
+            events = [*tested.feed(bytes(flipped)), *tested.feed(bytes(uart_codec.FRAME_BYTES_MAX))]
             assert not any(isinstance(event, Measurement) for event in events), (place, bit)
             assert tested.ledger.closes()
 
@@ -324,7 +308,7 @@ S1 = bytes.fromhex(
     "7800 0300"  # CPU load 120, drop rate 3
     "01 32 02 04"  # I2C master, voltage 50, user configuration 2, calibration 4
 ) + bytes(range(32))
-FULL = Status(
+FULL = uart_codec.Status(
     0x01020304, 2, 614, (0x00320047, 0x3133510D, 0x33383736), 1, 120, 3, 1, 50, 2, 4, bytes(range(32))
 )  # fmt: skip
 
@@ -332,52 +316,52 @@ FULL = Status(
 @pytest.mark.manual("A 1.4 software version", "A 1.4 hardware version", "A 1.4 status members", "A 1.4 frame")
 def test_s1() -> None:
     assert len(S1) == 0x42
-    assert parse_status(ReplyFrame(0xFF, S1)) == FULL
-    assert pack_status(FULL) == S1
-    frame = encode_status(FULL)
+    assert uart_codec.parse_status(ReplyFrame(0xFF, S1)) == FULL
+    assert uart_codec.pack_status(FULL) == S1
+    frame = uart_codec.encode_status(FULL)
     assert frame[:6] == bytes.fromhex("AA55FF004200")
     assert len(frame) == 76
-    (event,) = Imu61xCodec(Ledger()).feed(frame)
+    (event,) = uart_codec.Imu61xCodec(Ledger()).feed(frame)
     assert isinstance(event, ReplyFrame)
-    assert parse_status(event) == FULL
+    assert uart_codec.parse_status(event) == FULL
 
 
-@pytest.mark.parametrize("size", [STATUS_BYTES_MIN, 25, 26, 28, 30, 31, 32, 33, 34, 65, 66, 89])
+@pytest.mark.parametrize("size", [uart_codec.STATUS_BYTES_MIN, 25, 26, 28, 30, 31, 32, 33, 34, 65, 66, 89])
 @pytest.mark.manual("A 1.4 frame")
 def test_s1_of_any_length_contains_its_complete_members(size: int) -> None:
     ends = {
         "system_status": 26, "cpu_load": 28, "drop_rate": 30, "i2c_master": 31, "voltage": 32,
         "user_config_fault": 33, "calibration_fault": 34, "imu_health": 66,
     }  # fmt: skip
-    status = parse_status(ReplyFrame(0xFF, S1.ljust(90, b"\x77")[:size]))
+    status = uart_codec.parse_status(ReplyFrame(0xFF, S1.ljust(90, b"\x77")[:size]))
     assert status is not None
     assert status.serial_number == FULL.serial_number
     for name, end in ends.items():
         assert getattr(status, name) == (getattr(FULL, name) if size >= end else None)
     if size in {22, *ends.values()}:
-        assert pack_status(status) == S1[:size]
+        assert uart_codec.pack_status(status) == S1[:size]
 
 
 @pytest.mark.parametrize("message", [ReplyFrame(0xFF, S1[:21]), ReplyFrame(0xFE, S1), "S1", ReplyFrame(6, bytes(24))])
 def test_messages_other_than_s1(message: ReplyFrame | str) -> None:
-    assert parse_status(message) is None
+    assert uart_codec.parse_status(message) is None
 
 
 @pytest.mark.manual("A 1.5 frame", "A 1.5 parameter 3", "A 1.7 K1")
 def test_p1_and_k1() -> None:
     """Parameter 3 = 921600 bit/s: 0x49610000 as a float."""
     payload = bytes.fromhex("00006149 00000000 03000000 00000000 00000000 00000000")
-    assert parse_parameter(ReplyFrame(6, payload)) == ParameterValue(3, 921600.0)
-    assert pack_parameters(921600, 3) == payload
-    assert parse_parameter(ReplyFrame(6, payload[:23])) is None
-    assert parse_parameter(ReplyFrame(7, payload)) is None
-    assert parse_parameter("P1") is None
-    assert [parameter.value for parameter in Parameter] == [3, 8, 9, 10, 16, 17, 18, 21, 27, 30, 31]
+    assert uart_codec.parse_parameter(ReplyFrame(6, payload)) == uart_codec.ParameterValue(3, 921600.0)
+    assert uart_codec.pack_parameters(921600, 3) == payload
+    assert uart_codec.parse_parameter(ReplyFrame(6, payload[:23])) is None
+    assert uart_codec.parse_parameter(ReplyFrame(7, payload)) is None
+    assert uart_codec.parse_parameter("P1") is None
+    assert [parameter.value for parameter in uart_codec.Parameter] == [3, 8, 9, 10, 16, 17, 18, 21, 27, 30, 31]
     payload = bytes.fromhex("0E00 0500")
-    assert parse_acknowledgement(ReplyFrame(0x1234, payload)) == Acknowledgement(14, 5)
-    assert pack_acknowledgement(14, 5) == payload
-    assert parse_acknowledgement(ReplyFrame(0x1234, payload + b"\x00")) is None
-    assert parse_acknowledgement("K1") is None
+    assert uart_codec.parse_acknowledgement(ReplyFrame(0x1234, payload)) == uart_codec.Acknowledgement(14, 5)
+    assert uart_codec.pack_acknowledgement(14, 5) == payload
+    assert uart_codec.parse_acknowledgement(ReplyFrame(0x1234, payload + b"\x00")) is None
+    assert uart_codec.parse_acknowledgement("K1") is None
 
 
 @pytest.mark.parametrize(
@@ -385,4 +369,4 @@ def test_p1_and_k1() -> None:
     [(0xFF, 22, True), (0xFF, 21, False), (6, 24, True), (6, 23, False), (9, 4, True), (2, 44, False), (9, 24, False)],
 )
 def test_replies_by_id_and_length(frame_id: int, size: int, wanted: bool) -> None:
-    assert is_reply(frame_id, bytes(size)) is wanted
+    assert uart_codec.is_reply(frame_id, bytes(size)) is wanted
