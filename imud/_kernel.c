@@ -11,7 +11,6 @@
  * The result must be equal to the result of Python in every bit. Therefore the compiler must not join a product and a
  * sum to one operation (-ffp-contract=off), and each expression has the order of the Python expression.
  */
-#define PY_SSIZE_T_CLEAN
 #define Py_LIMITED_API 0x030B0000
 #include <Python.h>
 #include <structmember.h>
@@ -316,11 +315,13 @@ static PyObject *start_hi91(PyObject *self, PyObject *args)
 static PyObject *stamp_frames(RunObject *self, PyObject *args)
 {
     Run *run = &self->run;
-    const char *data;
+    PyObject *bytes; /* the headers of Python 3.13 compile the format y# for Python 3.13 and later only */
+    char *data;
     Py_ssize_t size, done = 0;
     long long t_rx_ns, t_rx_before_ns = run->t_rx_ns;
-    if (!PyArg_ParseTuple(args, "y#iLLLLL:stamp", &data, &size, &run->word_is_status, &t_rx_ns, &run->utc_offset_ns,
-                          &run->waited_ns, &run->offset_ns, &run->even_from_ns))
+    if (!PyArg_ParseTuple(args, "SiLLLLL:stamp", &bytes, &run->word_is_status, &t_rx_ns, &run->utc_offset_ns,
+                          &run->waited_ns, &run->offset_ns, &run->even_from_ns) ||
+        PyBytes_AsStringAndSize(bytes, &data, &size) < 0)
         return NULL;
     if (t_rx_ns > run->t_rx_ns)
         run->t_rx_ns = t_rx_ns;
