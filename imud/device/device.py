@@ -290,7 +290,7 @@ class Device:
         judge, transport, settings, ledger = self._judge, self._transport, self._settings, self.ledger
         state, path, rate_hz = self._health.state, transport.path, transport.expected_rate_hz
         resets = settings.counter_resets - settings.resets_requested
-        judge.counts.add(now_ns, rate_hz * (state is DeviceState.RUNNING), resets)
+        judge.counts.add(now_ns, rate_hz if state is DeviceState.RUNNING else 0.0, resets)
         has_settings = bool(settings.declared or settings.is_unsaved or settings.comparison.problem)
         axes, axes_problem = self._attitude.problem(transport.driver, settings, transport.axes_problem)
         judge.judge(Facts(

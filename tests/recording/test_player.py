@@ -139,7 +139,7 @@ def test_a_recording_that_begins_in_the_middle_has_the_stamps_and_numbers_of_the
 
 
 def test_a_wall_clock_that_steps_moves_the_samples_before_the_step() -> None:
-    """The first clock steps by 2 s; a suspend starts a new offset; a reading that differs by 1 ms is no step."""
+    """The first clock steps by 2 s. A suspend starts a new offset. A difference of 1 ms does not count as a step."""
     clock, sample = RecordedClock(), make_sample(1)
     frame = published_frame(None, None, None, FAKE_DRIVER.axes)
     samples = [msgspec.structs.replace(sample, t_ns=t_ns, utc_ns=t_ns + 1000) for t_ns in (50, 99, 100, 101)]
