@@ -225,9 +225,10 @@ class Site:
         client = Client(self.folder / "imud.sock")
         client.watch(encoding="json")  # a client that never reads
         self._clients.append(client)
+        # first the limit: without it, a tick could create the moved directory and its rings again
+        resource.setrlimit(resource.RLIMIT_FSIZE, (DISK_BYTES, resource.RLIM_INFINITY))
         shutil.move(self.folder / "shm", self.folder / "away")
         self._broker.stop()
-        resource.setrlimit(resource.RLIMIT_FSIZE, (DISK_BYTES, resource.RLIM_INFINITY))
         self.faulty = True
 
     def mend_everything(self) -> None:
