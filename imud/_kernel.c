@@ -33,6 +33,8 @@
 #define FRAME_BYTES (HEAD_BYTES + PAYLOAD_BYTES)
 #define TAG_HI91 0x91
 #define FLOATS 16                /* accel, gyro, mag, euler, quaternion */
+#define QUAT_SQUARE_MIN 0.9604   /* limits of the squared length of a rotation, see value_limits.py */
+#define QUAT_SQUARE_MAX 1.0404
 #define VALUE_HIGH_BYTE 0x48     /* a float of 131,072 or more has this high byte or a larger one, also NaN */
 #define PRESSURE_MIN_PA 1000.0
 #define PRESSURE_MAX_PA 120000.0
@@ -161,13 +163,15 @@ static void decode(Slot *slot, const uint8_t *payload, const Run *run)
         slot->gyro_rad_s[i] = floats[3 + i] * RAD_PER_DEG;
         slot->euler_rad[i] = floats[9 + i] * RAD_PER_DEG;
     }
-    /* a device without magnetometer sends zeros, and no rotation has a quaternion of zeros */
+    /* a device without magnetometer sends zeros */
     if (floats[6] || floats[7] || floats[8]) {
         present |= HAS_MAG;
         for (int i = 0; i < 3; i++)
             slot->mag_t[i] = floats[6 + i] * T_PER_UT;
     }
-    if (floats[12] || floats[13] || floats[14] || floats[15]) {
+    double w = floats[12], x = floats[13], y = floats[14], z = floats[15];
+    double square = w * w + x * x + y * y + z * z;
+    if (QUAT_SQUARE_MIN < square && square < QUAT_SQUARE_MAX) {
         present |= HAS_QUAT;
         for (int i = 0; i < 4; i++)
             slot->quat_wxyz[i] = floats[12 + i];

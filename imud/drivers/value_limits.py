@@ -1,17 +1,20 @@
-"""Limits of values that a device sends as 32-bit floats. A value outside is not a measurement.
+"""Limits of the values that a device sends. A value outside is not a measurement.
 
 A damaged device or a hostile frame with a correct check value can send any 32-bit float. No inertial sensor measures
 131,072 g, °/s, µT or °, or a temperature outside -128 … 512 °C. The limits are powers of two: the high byte of a float
-shows whether the value is inside, so that one call checks all values of many frames.
+shows whether the value is inside, so that one call checks all values of many frames. A quaternion is a rotation only if
+its length is 1.
 """
 
 from collections.abc import Sequence
 from typing import Final
 
-from imud.model.sample import Vector3
+from imud.model.sample import Quaternion, Vector3
 
-VALUE_LIMIT: Final = 131_072.0  # magnitude that no value reaches, in g, °/s, µT, ° or as part of a quaternion
+VALUE_LIMIT: Final = 131_072.0  # magnitude that no value reaches, in g, °/s, µT or °
 TEMPERATURE_LIMITS_C: Final = (-128.0, 512.0)  # a measured temperature is between these values, °C
+# Limits of the squared length of a rotation: 0.98² and 1.02². Rounding to 16 bits changes the length by 1e-4.
+QUAT_SQUARE_MIN, QUAT_SQUARE_MAX = 0.9604, 1.0404
 
 # High bytes of little-endian 32-bit floats inside the limits. The high byte is the sign and the
 # upper seven bits of the exponent: 131,072 is 0x48000000, -128 is 0xC3000000, 512 is 0x44000000.
@@ -49,3 +52,8 @@ def possible_temperature_c(temperature_c: float) -> float | None:
     """Return a temperature, °C; None if it is not possible."""
     low_c, high_c = TEMPERATURE_LIMITS_C
     return temperature_c if low_c < temperature_c < high_c else None
+
+
+def possible_quaternion(w: float, x: float, y: float, z: float) -> Quaternion | None:
+    """Return a quaternion; None if its length shows that it is not a rotation."""
+    return (w, x, y, z) if QUAT_SQUARE_MIN < w * w + x * x + y * y + z * z < QUAT_SQUARE_MAX else None

@@ -55,7 +55,7 @@ class Step(NamedTuple):
 STEPS = st.builds(
     Step, st.integers(0, 12), st.sampled_from([0, 0, 0, 1, 2, 5, 40, 81]),
     st.none() | st.none() | st.integers(0, 900),
-    st.sampled_from(["usual", "usual", "usual", "nan", "text", "hi92", "zeros", "word", "hot", "pressure", "reset"]),
+    st.sampled_from(["usual"] * 3 + ["nan", "text", "hi92", "zeros", "word", "hot", "pressure", "reset", "long"]),
     st.sampled_from([0, 0, 0, 1, 7, -3, 10**6, 2**31]), st.sampled_from([0, 0, 30, 900, 20_000, 700_000]),
     st.sampled_from([-1, -1, 0, 5, 30]), st.booleans(), st.sampled_from([0, 0, 0, 400, 20_000, -90_000]),
     st.sampled_from([None, None, 0, 1 << 31]),
@@ -77,6 +77,7 @@ KINDS: dict[str, Any] = {
         quat_wxyz=(1, 0, 0, 0), temperature_c=3, pressure_pa=100_000,
     ),
     "zeros": lambda frame: changed(frame, 36, bytes(12) + frame[54:66] + bytes(16)),
+    "long": lambda frame: changed(frame, 60, struct.pack("<4f", 3.28, 0, 0, 0)),
     "word": lambda frame: changed(frame, 1, b"\xff\xff\x80"),
     "hot": lambda frame: changed(frame, 24, struct.pack("<f", 140_000.0)),
     "pressure": lambda frame: changed(frame, 4, struct.pack("<f", 12.5)),

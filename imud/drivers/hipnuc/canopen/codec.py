@@ -43,6 +43,7 @@ from imud.drivers.hipnuc.canopen.cia301 import (
     TpdoNumber,
 )
 from imud.drivers.hipnuc.common import M_S2_PER_G, QUAT_PER_LSB, pressure_of
+from imud.drivers.value_limits import possible_quaternion
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Pair, Quaternion, Vector3
@@ -154,10 +155,9 @@ def _measurement(assembled: Assembled) -> Measurement:
     frames = dict(assembled.frames)
     euler = _vector(frames.get(3), EULER_RAD_PER_LSB)
     quat: Quaternion | None = None
-    if any(frames.get(4, b"")):  # four zeros are not a rotation
-        w, x, y, z = FOUR.unpack(frames[4])
-        quat = (w * QUAT_PER_LSB, x * QUAT_PER_LSB, y * QUAT_PER_LSB, z * QUAT_PER_LSB)
-    elif euler is not None:
+    if 4 in frames:
+        quat = possible_quaternion(*(part * QUAT_PER_LSB for part in FOUR.unpack(frames[4])))
+    if quat is None and euler is not None:
         quat = quat_from_euler312(euler)
     incli: Pair | None = None
     if 7 in frames:

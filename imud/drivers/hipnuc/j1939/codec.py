@@ -13,7 +13,7 @@ has its own interval, and no document states its instant.
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import hypot, isfinite, nan
+from math import isfinite, nan
 from typing import Annotated, Final, Literal
 
 from msgspec import Meta
@@ -31,6 +31,7 @@ from imud.drivers.hipnuc.common import (
     TEMPERATURE_C_PER_LSB,
     counts_of,
 )
+from imud.drivers.value_limits import possible_quaternion
 from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, join, split
 from imud.model.ledger import Ledger
 from imud.model.options import Options
@@ -58,7 +59,6 @@ TURN: Final = 360_000  # counts of a full turn
 HALF_TURN: Final = TURN // 2
 PLACEHOLDER: Final = 999  # reserved bytes 4-7 of FF43 as devices without barometer send them
 TEMPERATURE_MOST_C: Final = 150.0  # maximum valid temperature, °C: above the operating range of all devices
-UNIT_TOLERANCE: Final = 0.02
 # year 0 in FF2F (assumed)
 YEAR_ZERO: Final = 2000
 
@@ -136,8 +136,7 @@ class _Parts:
     def decode_quaternion(self, data: bytes) -> None:
         w, x, y, z = QUATERNION_LAYOUT.unpack(data)
         k = QUAT_PER_LSB
-        if abs(hypot(w, x, y, z) * k - 1) <= UNIT_TOLERANCE:
-            self.quat = w * k, x * k, y * k, z * k
+        self.quat = possible_quaternion(w * k, x * k, y * k, z * k)
 
 
 _DECODE: Final[dict[int, Callable[[_Parts, bytes], None]]] = {

@@ -21,7 +21,7 @@ that the product lacks the sensor. `pressure_of` decides which pressures are val
 
 import struct
 from collections.abc import Sequence
-from math import atan2, cos, hypot, radians, sin
+from math import atan2, cos, radians, sin
 from typing import Annotated, Final, Literal
 
 from msgspec import Meta
@@ -49,7 +49,7 @@ from imud.drivers.hipnuc.modbus.registers import (
     read_registers,
 )
 from imud.drivers.polled_frames import Measured, PolledFrameDecoder, absence
-from imud.drivers.value_limits import possible_temperature_c
+from imud.drivers.value_limits import possible_quaternion, possible_temperature_c
 from imud.formats.modbus import (
     CRC_BYTES,
     ILLEGAL_ADDRESS,
@@ -72,8 +72,6 @@ DATA_AT: Final = 3
 CHECK_NS: Final = 10 * NS_PER_S
 # Number of missing replies in a row before imud tries the shorter block. After three, the device counts as missing.
 SILENT_MAX: Final = 2
-# Maximum length error of a quaternion. The two scales differ by a factor of 3.3; rounding changes the length by 1e-4.
-UNIT_TOLERANCE: Final = 0.02
 PITCHED_RAD: Final = radians(1.0)  # minimum pitch for a decision: a dual-axis inclinometer then shows 182 counts
 
 READ_BLOCK: Final = read_registers(BLOCK_FIRST, BLOCK_REGISTERS)
@@ -219,13 +217,10 @@ class HipnucModbusCodec:
 
     def _quaternion(self, w: int, x: int, y: int, z: int) -> Quaternion | None:
         if not self._quat_scale:
-            length = hypot(w, x, y, z)
-            fitting = [k for k in (QUAT_OLD_PER_LSB, QUAT_PER_LSB) if abs(length * k - 1) < UNIT_TOLERANCE]
-            if not fitting:
-                return None
-            self._quat_scale = fitting[0]
+            scales = (QUAT_OLD_PER_LSB, QUAT_PER_LSB)
+            self._quat_scale = next((k for k in scales if possible_quaternion(w * k, x * k, y * k, z * k)), 0.0)
         k = self._quat_scale
-        return (w * k, x * k, y * k, z * k) if w or x or y or z else None
+        return possible_quaternion(w * k, x * k, y * k, z * k)
 
     def _inclination(self, x: int, y: int, roll_rad: float, pitch_rad: float) -> Pair | None:
         if not self._incli_scale:

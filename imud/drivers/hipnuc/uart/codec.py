@@ -42,7 +42,14 @@ from imud.drivers.hipnuc.common import (
     temperature_beside,
 )
 from imud.drivers.hipnuc.uart.replies import LINE_CHARACTERS_MAX, LineFinder
-from imud.drivers.value_limits import VALUE_HIGH_BYTES, is_possible, values_possible
+from imud.drivers.value_limits import (
+    QUAT_SQUARE_MAX,
+    QUAT_SQUARE_MIN,
+    VALUE_HIGH_BYTES,
+    is_possible,
+    possible_quaternion,
+    values_possible,
+)
 from imud.formats import kernel
 from imud.model.ledger import Ledger
 from imud.model.options import Options
@@ -90,12 +97,11 @@ def decode_hi91(values: Sequence[Any], word_is_status: bool, size: int, trailing
     ):  # `pressure_of` without a call, which costs a tenth of a frame
         temperature, pressure = temperature_beside(temperature, pressure), None
     word = low + 256 * high
-    # a device without magnetometer sends zeros, and no rotation has a quaternion of zeros
+    # a device without magnetometer sends zeros
     return Measurement(
         size, trailing, ms, (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad),
         (mx * tesla, my * tesla, mz * tesla) if mx or my or mz else None,
-        (qw, qx, qy, qz) if qw or qx or qy or qz else None,
-        (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
+        possible_quaternion(qw, qx, qy, qz), (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
         word if word_is_status else None, None if word_is_status or word > PPS_STAMP_MODULUS_MS else word,
     )  # fmt: skip
 
@@ -104,6 +110,7 @@ def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int
     """Return `decode_hi91` of adjacent sub-packets, one per frame. `trailing` bytes follow the first frame."""
     g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
     low_pa, high_pa, most_ms = PRESSURE_MIN_PA, PRESSURE_MAX_PA, PPS_STAMP_MODULUS_MS
+    least, most = QUAT_SQUARE_MIN, QUAT_SQUARE_MAX
     made: list[Measurement] = []
     make, keep = Measurement, made.append
     # decode_hi91 inline: the call costs a twentieth of the time
@@ -118,7 +125,7 @@ def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int
             make(
                 size, trailing, ms, (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad),
                 (mx * tesla, my * tesla, mz * tesla) if mx or my or mz else None,
-                (qw, qx, qy, qz) if qw or qx or qy or qz else None,
+                (qw, qx, qy, qz) if least < qw * qw + qx * qx + qy * qy + qz * qz < most else None,
                 (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
                 word if word_is_status else None, None if word_is_status or word > most_ms else word,
             )
@@ -148,7 +155,6 @@ def _decode_hi91(data: bytes, at: int, word_is_status: bool, size: int, trailing
 # values of each group in HI91_VALUES
 _GROUPS: Final = {
     "accel_m_s2": slice(5, 8), "gyro_rad_s": slice(8, 11), "mag_t": slice(11, 14), "euler_rad": slice(14, 17),
-    "quat_wxyz": slice(17, 21),
 }  # fmt: skip
 
 
@@ -166,7 +172,7 @@ def _decode_hi92(data: bytes, at: int, _word_is_status: bool, size: int, trailin
     return Measurement(
         size, trailing, None, (ax * a, ay * a, az * a), (gx * w, gy * w, gz * w),
         (mx * b, my * b, mz * b) if mx or my or mz else None,
-        (qw * q, qx * q, qy * q, qz * q) if qw or qx or qy or qz else None,
+        possible_quaternion(qw * q, qx * q, qy * q, qz * q),
         (roll * angle, pitch * angle, yaw * angle), temperature, pressure_of(pressure + PRESSURE_OFFSET_PA), None, None,
         pps_ms if pps_ms <= PPS_STAMP_MODULUS_MS else None,
     ), True  # fmt: skip

@@ -1,6 +1,7 @@
 """TPDOs of the manual with SI values computed by hand, and the handling of all other frames."""
 
 import math
+import struct
 from math import pi
 from random import Random
 
@@ -12,6 +13,7 @@ from imud.contracts.codec import BadFrame, BadReason, CodecEvent
 from imud.contracts.script import ReplyFrame
 from imud.drivers.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenOptions, encode_tpdos
 from imud.drivers.hipnuc.canopen.driver import DRIVER
+from imud.drivers.hipnuc.common import random_quaternion
 from imud.formats.can import CyclicFrame
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
@@ -22,7 +24,7 @@ GOLDEN = {
     1: "4A 00 1F 00 C8 03",  # manual 5.2: 74, 31 (printed 731, ERRATA B17), 968 mG
     2: "15 00 14 01 34 00",  # manual 5.2: 2.1, 27.6, 5.2 °/s
     3: "94 11 78 EC B0 B9",  # 0x1194 = 4500, 0xEC78 = -5000, 0xB9B0 = -18000: 45°, -50°, -180°
-    4: "10 27 F0 D8 88 13 00 00",  # 10000, -10000, 5000, 0
+    4: "88 13 78 EC 88 13 88 13",  # 5000, -5000, 5000, 5000
     6: "CD 8B 01 00",  # 0x18BCD = 101325 Pa
     7: "2E FB FF FF A0 8C 00 00",  # -1234 = -12.34°, 36000 = 360°
 }
@@ -57,7 +59,7 @@ def test_all_tpdos_in_si_units() -> None:
     # 2.1 · π/180 and so on
     assert event.gyro_rad_s == pytest.approx((0.0366519143, 0.4817108736, 0.0907571211), abs=1e-9)
     assert event.euler_rad == pytest.approx((pi / 4, -0.8726646260, -pi), abs=1e-9)
-    assert event.quat_wxyz == pytest.approx((1.0, -1.0, 0.5, 0.0), abs=1e-12)
+    assert event.quat_wxyz == pytest.approx((0.5, -0.5, 0.5, 0.5), abs=1e-12)
     assert event.pressure_pa == 101325
     assert event.incli_rad == pytest.approx((-0.2153736296, 2 * pi), abs=1e-9)
     assert event.size_bytes == 38
@@ -77,16 +79,27 @@ def test_all_tpdos_in_si_units() -> None:
 
 
 @pytest.mark.parametrize(
-    ("sent", "pressure_pa"), [(0, None), (999, None), (1000, 1000), (120_000, 120_000), (-5, None)]
+    ("can_id", "data", "values"),
+    [
+        (0x688, struct.pack("<i", sent), (pressure_pa, None))
+        for sent, pressure_pa in ((0, None), (999, None), (1000, 1000), (120_000, 120_000), (-5, None))
+    ]
+    + [
+        (0x488, struct.pack("<4h", *sent), (None, quat))
+        for sent, quat in (((0,) * 4, None), ((32767, 0, 0, 0), None), ((-10_000, 0, 0, 0), (-1.0, 0.0, 0.0, 0.0)))
+    ],
 )
-@pytest.mark.manual("B 5.2 TPDO6")
-def test_a_node_without_barometer_has_no_pressure(sent: int, pressure_pa: float | None) -> None:
+@pytest.mark.manual("B 5.2 TPDO6", "B 5.2 TPDO4")
+def test_impossible_values_are_omitted(
+    can_id: int, data: bytes, values: tuple[float | None, tuple[float, ...] | None]
+) -> None:
+    """A node without barometer sends any pressure."""
     codec = make()
     for burst in range(10):
-        events = codec.feed_frame(0x688, False, sent.to_bytes(4, "little", signed=True), burst * 50 * MS)
+        events = codec.feed_frame(can_id, False, data, burst * 50 * MS)
     (event,) = events
     assert isinstance(event, Measurement)
-    assert event.pressure_pa == pressure_pa
+    assert (event.pressure_pa, event.quat_wxyz) == values
 
 
 @pytest.mark.manual("B 5 frames")
@@ -191,6 +204,8 @@ def test_random_payloads_decode_alike() -> None:
         values: dict[str, float] = {}
         for place, (can_id, size) in enumerate(SIZES.items()):
             data = random.randbytes(size)
+            if can_id == 0x488:
+                data = struct.pack("<4h", *(round(10_000 * part) for part in random_quaternion(random)))
             decoded = database.decode_message(can_id, data)
             assert isinstance(decoded, dict)
             for name, value in decoded.items():

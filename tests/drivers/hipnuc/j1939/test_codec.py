@@ -138,6 +138,7 @@ def test_packing_gives_the_golden_messages_and_clips_them() -> None:
         (0xFF43, NONE, "temperature_c"), (0xFF43, NONE, "pressure_pa"), (0xFF43, bytes(8), "temperature_c"),
         (0xFF43, bytes(8), "pressure_pa"), (0xFF43, bytes.fromhex("ff7f000000000000"), "temperature_c"),
         (0xFF46, NONE, "quat_wxyz"), (0xFF46, bytes(8), "quat_wxyz"),
+        (0xFF46, bytes.fromhex("ff7f000000000000"), "quat_wxyz"),
     ],
 )  # fmt: skip
 def test_absent_is_not_zero(pgn: int, data: bytes, field: str) -> None:

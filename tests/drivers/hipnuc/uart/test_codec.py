@@ -33,7 +33,7 @@ HI92_PAYLOAD = bytes.fromhex(
     "00 08  00 F8  D0 07"  # accel 2048, -2048, 2000
     "E8 03  18 FC  00 00"  # mag 1000, -1000, 0
     "90 5F 01 00  38 50 FF FF  20 BF 02 00"  # roll 90°, pitch -45°, yaw 180°
-    "10 27  00 00  78 EC  01 00"  # quaternion 10000, 0, -5000, 1
+    "C1 21  00 00  78 EC  01 00"  # quaternion 8641, 0, -5000, 1
 )
 # SI value of one unit of the device: 1 g (manual B: 9.8 m/s²), 1 °/s, 1 µT, 1 °
 SI_PER_UNIT = {"accel_m_s2": 9.8, "gyro_rad_s": math.pi / 180, "mag_t": 1e-6, "euler_rad": math.pi / 180}
@@ -140,7 +140,7 @@ def test_hand_made_hi92() -> None:
     assert m.accel_m_s2 == pytest.approx((9.9999744, -9.9999744, 9.7656), rel=1e-12)
     assert m.mag_t == pytest.approx((30.517e-6, -30.517e-6, 0.0), rel=1e-12)
     assert m.euler_rad == pytest.approx((math.pi / 2, -math.pi / 4, math.pi), rel=1e-12)
-    assert m.quat_wxyz == pytest.approx((1.0, 0.0, -0.5, 0.0001), rel=1e-12)
+    assert m.quat_wxyz == pytest.approx((0.8641, 0.0, -0.5, 0.0001), rel=1e-12)
     assert m.size_bytes == 54
     values = {name: getattr(m, name) for name in LEVEL}
     assert uart_codec.encode_hi92(pps_stamp_ms=1000, status=0x1234, **values) == framed(HI92_PAYLOAD)
@@ -287,7 +287,7 @@ def test_impossible_values_are_removed_and_reported() -> None:
             assert (codec.ledger.frames_good, codec.ledger.frames_not_finite, codec.ledger.frames_bad()) == (3, 1, 0)
             assert codec.ledger.closes()
             assert make().feed(frame)[1] == msgspec.structs.replace(m, trailing_bytes=0)
-        if name != "pressure_pa":
+        if name not in ("pressure_pa", "quat_wxyz"):
             most = {name: (*good[:-1], -limit * (1 - 1e-6))}
             for event in make().feed(hi91(5, **most) * 2):
                 assert getattr(event, name) == pytest.approx(most[name])
@@ -392,7 +392,10 @@ FILLER = [
     ("pps_age_ms", {"word_1_2": 8193}, {"pps_stamp_ms": 8193}),
     ("pps_age_ms", {"word_1_2": 0x2323}, {"pps_stamp_ms": 0x2323}),
     ("mag_t", {"mag_t": (0.0, 0.0, 0.0)}, {"mag_t": (0.0, 0.0, 0.0)}),
-    ("quat_wxyz", {"quat_wxyz": (0.0, 0.0, 0.0, 0.0)}, {"quat_wxyz": (0.0, 0.0, 0.0, 0.0)}),
+    *(
+        ("quat_wxyz", {"quat_wxyz": quat}, {"quat_wxyz": quat})
+        for quat in ((0, 0, 0, 0), (0.5, 0.5, 0.5, 0), (3.2767,) * 4)
+    ),
 ]
 
 
