@@ -158,7 +158,7 @@ class SettingsComparison:
             return
         self._tries, self.problem = 0, ""
         settings.report_differences()
-        if settings.is_polled:
+        if settings.is_polled and settings.declared:
             self.due_ns = self._host.now_ns() + AGAIN_NS
         if self._on_difference is not OnDifference.REPORT:
             await self._repair(table, actual)
@@ -301,6 +301,8 @@ class DeviceSettings:
         self._clock, self._resets = clock, clock.resets
         self.is_current = False
         self._after_start(BEGIN_NS)
+        if not self.declared:
+            self.comparison.cancel()  # the query of the identity reads the settings
         self._in_flash.found()
 
     def tick(self, now_ns: int, _newest: Sample | None) -> None:
@@ -312,9 +314,11 @@ class DeviceSettings:
             self.resets_requested, self._resets = self.resets_requested + is_own * (resets - self._resets), resets
             if not is_own:
                 self._in_flash.started()
-            if (self.declared or self._unsaved) and not busy and now_ns >= own_until_ns:
+            if not busy and now_ns >= own_until_ns:
                 self._after_start(SETTLE_NS)
-        if self.declared and not busy and self._transport.can_be_asked:
+                if not self.declared and (self._read_ns is None or not self._transport.may_ask):
+                    self.comparison.cancel()  # imud has not read the settings, or must not
+        if not busy and self._transport.can_be_asked:
             self.comparison.start_if_due(now_ns)
 
     def forget(self) -> None:
@@ -495,7 +499,8 @@ class DeviceSettings:
         if unsaved:
             self._mark_unsaved(self.values if self.is_current else None)
         self._read_resets = None
-        self.comparison.schedule(0)
+        if self.declared:
+            self.comparison.schedule(0)
 
     def _mark_unsaved(self, before: Values | None) -> None:
         """Note that the flash does not contain the present settings. `before`: the values before the write."""
