@@ -4,7 +4,7 @@ All attachments have the same methods, so that the device calls them in one loop
 """
 
 from collections.abc import Awaitable, Callable, Mapping
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import msgspec
 
@@ -65,17 +65,14 @@ class Attachments:
         self._differences: Mapping[str, str] = {}
         made: tuple[Attachment | None, ...] = (self._signals, self._reset, self._utc)
         self._present = [one for one in made if one is not None]
+        self.needs_ticks: Final = bool(self._present)
+        """Whether GPIO lines or a source of UTC need ten ticks per second."""
         self.drain_edges: Callable[[], None] | None = self._signals.drain if self._signals is not None else None
         """Passes all edges in the kernel's buffer to the clock. Call it before the codec decodes bytes. None if the
         device has no GPIO lines."""
 
     def add(self, attachment: Attachment) -> None:
         self._present.append(attachment)
-
-    @property
-    def needs_ticks(self) -> bool:
-        """Whether GPIO lines or a source of UTC need ten ticks per second."""
-        return self._signals is not None or self._reset is not None or self._utc is not None
 
     # --- all attachments ---------------------------------------------------------------------------------------------
 

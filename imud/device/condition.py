@@ -90,6 +90,7 @@ class Facts(msgspec.Struct, kw_only=True):
     utc_problem: str = ""
     open_bytes: int = 0  # bytes and frames that the ledger does not account for
     open_frames: int = 0
+    rate_hz: float | None = None  # as in `RecentStatus`
     expected_rate_hz: float = 0.0
     t_err_ns: int = 0  # 0 if the time stamp error has no limit
 
@@ -237,11 +238,12 @@ def _lost(facts: Facts, _name: str, _value: Any) -> str:
 
 
 RATE_WINDOW_NS: Final = 10 * NS_PER_S  # time over which imud measures the rate, ns
+SHORT_NS: Final = 2 * NS_PER_S  # time of the rate in the status, ns: two samples of a device at 1 Hz
 RATE_SAMPLES: Final = 2  # deviation that the start and the end of the window can cause, samples
 
 
 def _has_other_rate(facts: Facts, limits: ConditionLimits) -> bool:
-    rate_hz, expected_hz = facts.recent.rate_hz, facts.expected_rate_hz
+    rate_hz, expected_hz = facts.rate_hz, facts.expected_rate_hz
     if rate_hz is None or not expected_hz:
         return False
     tolerance_hz = max(limits.rate_percent / 100 * expected_hz, RATE_SAMPLES * NS_PER_S / RATE_WINDOW_NS)
@@ -249,7 +251,7 @@ def _has_other_rate(facts: Facts, limits: ConditionLimits) -> bool:
 
 
 def _rate(facts: Facts, _name: str, _value: Any) -> str:
-    rates = (f"{one:.1f}".removesuffix(".0") for one in (facts.recent.rate_hz or 0.0, facts.expected_rate_hz))
+    rates = (f"{one:.1f}".removesuffix(".0") for one in (facts.rate_hz or 0.0, facts.expected_rate_hz))
     return "The device sends {} samples per second instead of {}.".format(*rates)
 
 
@@ -340,6 +342,10 @@ RULES: Final = (
 )  # fmt: skip
 
 
+NUMBER_RULES: Final = tuple(rule for rule in RULES if rule.code in (ReasonCode.RATE, ReasonCode.TIME_ERROR))
+"""Rules for facts that change in each second."""
+
+
 # --- counts of the last minute ----------------------------------------------------------------------------------------
 
 _LOST: Final = attrgetter(*LOST_FIELDS)
@@ -412,8 +418,8 @@ class RecentCounts:
         causes = _by_cause(first.lost, last.lost)
         gaps = causes.pop("unknown", 0)
         status = RecentStatus(
-            self._begun_ns, self._rate_hz(), last.samples - first.samples, causes, gaps, last.bytes_in - first.bytes_in,
-            len(self._restarts), last_sample_ns, self._loss_ns,
+            self._begun_ns, self.steady_rate_hz(), last.samples - first.samples, causes, gaps,
+            last.bytes_in - first.bytes_in, len(self._restarts), last_sample_ns, self._loss_ns,
         )  # fmt: skip
         if not self._loss:
             return status
@@ -421,7 +427,19 @@ class RecentCounts:
         cause = max(known, key=lambda name: known[name], default="")
         return msgspec.structs.replace(status, loss_samples=sum(known.values()), loss_cause=cause)
 
-    def _rate_hz(self) -> float | None:
+    @property
+    def has_losses(self) -> bool:
+        """Whether samples were lost in the last minute."""
+        return self._seconds[0].lost != self._seconds[-1].lost
+
+    def rate_hz(self) -> float:
+        """Return the rate of received samples over the last SHORT_NS; 0.0 without two counts."""
+        last = self._seconds[-1]
+        first = next((one for one in reversed(self._seconds) if one.t_ns <= last.t_ns - SHORT_NS), self._seconds[0])
+        span_ns = last.t_ns - first.t_ns
+        return (last.samples - first.samples) * NS_PER_S / span_ns if span_ns > 0 else 0.0
+
+    def steady_rate_hz(self) -> float | None:
         """Return the rate of received and lost samples; None without a steady rate or after a gap of unknown size."""
         steady = self._steady
         if not steady or (span_ns := steady[-1].t_ns - steady[0].t_ns) < RATE_WINDOW_NS:
@@ -465,6 +483,11 @@ class ConditionWatch:
         return DeviceCondition(self.level, self._since_ns, tuple(cause.reason() for cause in self._counted))
 
     @property
+    def is_ok(self) -> bool:
+        """Whether no reason counts, and no cause of a reason exists or ended a short time ago."""
+        return self.level is Condition.OK and not self._causes
+
+    @property
     def history(self) -> tuple[Condition | None, ...]:
         """Worst condition of each of the last 60 minutes, the oldest first."""
         return tuple(self._history)
@@ -481,7 +504,7 @@ class ConditionWatch:
         self._counted, level = counted, condition_of(counted[0].code)
         if level is not self.level:
             self._since_ns, self.level = now_ns, level
-        self._remember(now_ns, level)
+        self.remember(now_ns)
         if before and _keys(before) != _keys(counted):
             condition = self.condition
             codes = ", ".join(dict.fromkeys(cause.code for cause in counted))
@@ -508,8 +531,9 @@ class ConditionWatch:
                 counted.append(cause)
         return counted
 
-    def _remember(self, now_ns: int, level: Condition) -> None:
-        minute, history = now_ns // MINUTE_NS, self._history
+    def remember(self, now_ns: int) -> None:
+        """Add the present level to the history."""
+        minute, history, level = now_ns // MINUTE_NS, self._history, self.level
         if minute != self._minute:
             history.extend([None] * min(minute - self._minute, HISTORY_MINUTES))
             self._minute = minute
@@ -538,17 +562,38 @@ class ConditionJudge:
         )
         self.counts = RecentCounts(ledger, now_ns, timed=config.link != "replay")
         self.watch = ConditionWatch(config.condition, events, now_ns)
-        self._due_ns = now_ns
-        self._state: DeviceState | None = None
+        self.due_ns = now_ns  # CLOCK_MONOTONIC of the next update: once per second
+        self.state: DeviceState | None = None  # state of the device at the last update
+        self._facts: Facts | None = None
+        self._seen: tuple[int, Mapping[str, Any]] = 0, {}  # arguments `resets` and `known` of the last `judge`
 
-    def is_due(self, now_ns: int, state: DeviceState) -> bool:
-        """Return whether the condition is due: once per second, and when the state changed."""
-        return now_ns >= self._due_ns or state is not self._state
+    def judge(
+        self, now_ns: int, rate_hz: float, t_err_ns: int, last_sample_ns: int, resets: int, known: Mapping[str, Any]
+    ) -> bool:
+        """Update the counts and the condition. Return whether the rules ran: they give the same result for the same
+        facts. `rate_hz`: expected rate; `resets`: own restarts; `known`: fields of `Facts` that are not numbers."""
+        self.due_ns, self.state, counts = now_ns + JUDGE_NS, known["state"], self.counts
+        counts.add(now_ns, rate_hz if self.state is DeviceState.RUNNING else 0.0, resets)
+        is_same, self._seen = self._seen == (resets, known), (resets, known)
+        if is_same and not counts.has_losses and self.watch.is_ok and self._has_good_numbers(now_ns, rate_hz, t_err_ns):
+            self.watch.remember(now_ns)
+            return False
+        recent = counts.status(last_sample_ns)
+        self._facts = facts = Facts(
+            now_ns=now_ns, place=self.place, recent=recent, rate_hz=recent.rate_hz, expected_rate_hz=rate_hz,
+            t_err_ns=t_err_ns, **known,
+        )  # fmt: skip
+        self.watch.update(now_ns, causes_of(facts, self._limits))
+        return True
 
-    def judge(self, facts: Facts) -> None:
-        """Update the condition."""
-        self._due_ns, self._state = facts.now_ns + JUDGE_NS, facts.state
-        self.watch.update(facts.now_ns, causes_of(facts, self._limits))
+    def _has_good_numbers(self, now_ns: int, rate_hz: float, t_err_ns: int) -> bool:
+        """Update the numbers and the time of the facts. Return whether no rule for numbers holds."""
+        facts = self._facts
+        if facts is None:
+            return False
+        facts.now_ns, facts.rate_hz = now_ns, self.counts.steady_rate_hz()
+        facts.expected_rate_hz, facts.t_err_ns = rate_hz, t_err_ns
+        return not any(rule.holds(facts, self._limits) for rule in NUMBER_RULES)
 
 
 def _serial_ports() -> Sequence[str]:

@@ -36,7 +36,7 @@ from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
 from imud.device.attachments import Attachments
 from imud.device.calibration import CalibrationRun, RestWindow, check
-from imud.device.condition import ConditionJudge, Facts
+from imud.device.condition import ConditionJudge
 from imud.device.evidence import STEP_S
 from imud.device.flash import SettingsFiles
 from imud.device.health import NO_SAMPLE, DeviceEvents, Health
@@ -54,7 +54,7 @@ from imud.model.options import Options
 from imud.model.options import shown as json_words
 from imud.model.units import NS_PER_MS, NS_PER_S, RAD_PER_DEG
 from imud.recording.observer import ClockObserver, PathObserver
-from imud.sampling.meters import LatencyMeter, RateMeter
+from imud.sampling.meters import LatencyMeter
 from imud.sampling.path import SamplePath
 
 log = logging.getLogger(__name__)
@@ -235,8 +235,8 @@ class Device:
         self._verb_run = VerbRun(self._settings, transport)
         self._attitude = AttitudeWatch(config, self._events)
         self._status = StatusWatch(self._events)
-        self._rate = RateMeter()
         self._judge = ConditionJudge(config, transport.link.title, self.ledger, self._events, host.now_ns())
+        self._is_slow = True  # whether the sample period is longer than IDLE_FLUSH_NS, or not known
         self._connects = 0
         self._need = Need(0, "")
         self._ended: asyncio.Future[LinkError | None] | None = None
@@ -273,34 +273,35 @@ class Device:
 
     def tick(self, now_ns: int) -> None:
         """Update the state, detect an idle link, and send collected events. Called twice per second, and ten times per
-        second while `_needs_ticks`."""
+        second while `_needs_ticks`. The other work is due once per second."""
         transport, path = self._transport, self._transport.path
-        if self._needs_ticks():
+        needs_ticks, is_due = self._needs_ticks(), now_ns >= self._judge.due_ns
+        if needs_ticks:
             self._shared.owner.tick_soon()
-        self._rate.mark(now_ns, self.ledger.samples)
-        self._attachments.tick(now_ns, path.newest if path is not None else None)
+        if needs_ticks or is_due:  # only watches of a command and of GPIO lines use the sample
+            self._attachments.tick(now_ns, path.newest if needs_ticks and path is not None else None)
         transport.tick(now_ns)
         if path is not None:
             self._tick_path(path, now_ns)
-        if self._judge.is_due(now_ns, self._health.state):
+            if is_due:
+                self._attitude.tick(now_ns, path)
+        if is_due or self._health.state is not self._judge.state:
             self._judge_condition(now_ns)
 
     def _judge_condition(self, now_ns: int) -> None:
         """Update the condition from the facts that it depends on."""
-        judge, transport, settings, ledger = self._judge, self._transport, self._settings, self.ledger
-        state, path, rate_hz = self._health.state, transport.path, transport.expected_rate_hz
-        resets = settings.counter_resets - settings.resets_requested
-        judge.counts.add(now_ns, rate_hz if state is DeviceState.RUNNING else 0.0, resets)
+        transport, settings, path = self._transport, self._settings, self._transport.path
+        self._is_slow = path is None or not 0 < path.period_ns <= IDLE_FLUSH_NS
         has_settings = bool(settings.declared or settings.is_unsaved or settings.comparison.problem)
         axes, axes_problem = self._attitude.problem(transport.driver, settings, transport.axes_problem)
-        judge.judge(Facts(
-            now_ns=now_ns, state=state, problem=self._health.problem, place=judge.place,
-            recent=judge.counts.status(path.last_sample_ns if path is not None else 0), is_polled=transport.is_polled,
-            declared=settings.status() if has_settings else None, axes=axes, axes_problem=axes_problem,
-            lines=transport.add_lines(self._attachments.lines_status()), utc_problem=self._attachments.utc_problem,
-            open_bytes=ledger.bytes_open(), open_frames=ledger.frames_open(), expected_rate_hz=rate_hz,
-            t_err_ns=path.newest.t_err_ns if path and path.newest else 0,
-        ))  # fmt: skip
+        t_err_ns, last_ns = (path.quality[1], path.last_sample_ns) if path is not None else (0, 0)
+        resets = settings.counter_resets - settings.resets_requested
+        self._judge.judge(now_ns, transport.expected_rate_hz, t_err_ns, last_ns, resets, {
+            "state": self._health.state, "problem": self._health.problem, "is_polled": transport.is_polled,
+            "declared": settings.status() if has_settings else None, "axes": axes, "axes_problem": axes_problem,
+            "lines": transport.add_lines(self._attachments.lines_status()), "open_bytes": self.ledger.bytes_open(),
+            "utc_problem": self._attachments.utc_problem, "open_frames": self.ledger.frames_open(),
+        })  # fmt: skip
 
     def _tick_path(self, path: SamplePath, now_ns: int) -> None:
         transport = self._transport
@@ -312,9 +313,8 @@ class Device:
             path.flush(now_ns)
         if transport.receiving:
             self._watch_flow(path, now_ns)
-        self._attitude.tick(now_ns, path)
         self._status.tick(now_ns, transport.driver, path)
-        self._events.tick(now_ns, path.newest.sync if path.newest else None)
+        self._events.tick(now_ns, path.quality[0])
 
     @property
     def condition(self) -> Condition:
@@ -327,7 +327,7 @@ class Device:
             return True
         if state is not DeviceState.RUNNING or path is None:
             return state in WATCHED
-        return not 0 < path.period_ns <= IDLE_FLUSH_NS  # `flush` must complete the samples of a slow device
+        return self._is_slow  # `flush` must complete the samples of a slow device
 
     def close(self) -> None:
         """Release the link. A second call does nothing."""
@@ -533,7 +533,7 @@ class Device:
             problem=health.problem,
             identity=identity_words(self._settings.identity),
             settings=dict(self._settings.shown),
-            rate_hz=self._rate.rate_hz(),
+            rate_hz=self._judge.counts.rate_hz(),
             expected_rate_hz=transport.expected_rate_hz,
             newest_seq=newest.seq if newest else 0,
             clock=path.clock.status() if path else ClockStatus(),

@@ -5,18 +5,21 @@ A lasting problem of the link (for example an error-passive CAN bus) stays in th
 
 import logging
 from collections.abc import Callable, Mapping
+from operator import attrgetter
 
 from imud.contracts.codec import BadFrame
 from imud.contracts.status import DeviceState
 from imud.host.log import MESSAGE_CHARACTERS_MAX, printable, same_as
 from imud.model.event import LEVELS, Event, EventKind
-from imud.model.ledger import Ledger
+from imud.model.ledger import LOST_FIELDS, Ledger
 from imud.model.sample import Sync
 from imud.model.units import NS_PER_S
 
 log = logging.getLogger(__name__)
 
 INTERVAL_NS = NS_PER_S  # minimum interval of loss events and of bad-frame events, ns
+# Counters that cause events: `Ledger.lost`, `Ledger.frames_bad`, and `frames_not_finite`
+_TROUBLES = attrgetter(*LOST_FIELDS, "frames_bad_crc", "frames_bad_length", "frames_bad_content", "frames_not_finite")
 RAW_SHOWN_BYTES = 32  # maximum number of bytes of a bad frame in an event
 
 
@@ -28,6 +31,7 @@ class DeviceEvents:
         self._ledger = ledger
         self._send = send
         self._due_ns = 0
+        self._counts: tuple[int, ...] = ()  # counters of the last report
         self._lost = 0
         self._bad = 0
         self._last_bad: BadFrame | None = None
@@ -58,9 +62,10 @@ class DeviceEvents:
         """Send the events of the counters since the previous interval."""
         if sync is not None and sync is not self._sync:
             self._report_sync(now_ns, sync)
-        if now_ns < self._due_ns:
-            return
         ledger = self._ledger
+        if (counts := _TROUBLES(ledger)) == self._counts or now_ns < self._due_ns:
+            return
+        self._counts = counts
         troubled = ledger.frames_bad() + ledger.frames_not_finite
         lost, bad = ledger.lost() - self._lost, troubled - self._bad
         if lost:

@@ -1,7 +1,8 @@
 """Checks of the samples of one device: the attitude against gravity at rest, and the status bits.
 
-The check of the attitude uses one sample per second. Each kind of contradiction between attitude and gravity raises
-one event per path. The status shows the contradiction until a later rest without contradiction.
+The check of the attitude uses one sample per second, and pauses after a rest without contradiction. Each kind of
+contradiction between attitude and gravity raises one event per path. The status shows the contradiction until a later
+rest without contradiction.
 """
 
 from collections.abc import Mapping
@@ -21,6 +22,7 @@ from imud.sampling.path import SamplePath
 
 # Minimum time between two checked samples, ns. A window of `GravityCheck` needs five samples in 5 s.
 CHECK_NS: Final = NS_PER_S - 50 * NS_PER_MS
+AGAIN_NS: Final = 30 * NS_PER_S  # time between two windows at rest without contradiction, ns
 AS_DEVICE = "device"  # name of the convention if none is configured
 
 
@@ -46,9 +48,12 @@ class AttitudeWatch:
             return
         self._due_ns = now_ns + CHECK_NS
         check, sample = self._check, path.newest
-        if check is None or sample is None or not check.add(sample) or check.finding is None:
+        if check is None or sample is None or not check.add(sample):
             return
         finding = check.finding
+        if finding is None:
+            self._due_ns = now_ns + AGAIN_NS
+            return
         if finding.kind not in self._raised:
             self._raised.add(finding.kind)
             self._events.raise_event(

@@ -2,7 +2,7 @@
 
 The file is `/run/imud/shm/imud.<device>`. `HEADER_FIELDS` is the only table of the header. The writer, the Python
 reader and the check of the C header use it. Three cache lines contain the constant fields and `state`, one cache line
-the fields that change with every sample, bytes 256 to 771 the fields that change at most ten times per second.
+the fields that change with every sample, bytes 256 to 771 the fields that change once per second.
 
        0         8       12       16     20     24     28       32      40    44     48                  64       128
     +---------+-------+--------+------+------+------+--------+-------+-----+-------+-----------+------+----------+

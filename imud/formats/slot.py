@@ -110,6 +110,7 @@ _SLOT = struct.Struct(f"{SLOT_BYTES}s")
 _SEQ = struct.Struct("<Q")
 _T_NS = struct.Struct("<8xq240x")
 _STATUS = struct.Struct("<56xI196x")
+_QUALITY = struct.Struct("<48xI10xB193x")
 _SYNC_OFFSET: Final = next(field.offset for field in SLOT_FIELDS if field.name == "sync")
 DEVICE_ID_MOST: Final = 0xFFFF  # maximum number of a device in a slot
 _U32_MAX: Final = 0xFFFF_FFFF
@@ -121,6 +122,12 @@ _HI91_PRESENT: Final = _ALL_PRESENT - HAS_INCLI - HAS_EDGE
 _ZERO3: Vector3 = (0.0, 0.0, 0.0)
 _ZERO4: Quaternion = (0.0, 0.0, 0.0, 0.0)
 _ZERO2: Pair = (0.0, 0.0)
+
+
+def slot_quality(slot: bytes) -> tuple[Sync, int]:
+    """Return the fields `sync` and `t_err_ns` of one slot of this daemon."""
+    t_err_ns, code = _QUALITY.unpack(slot)
+    return SYNC_BY_CODE[code], t_err_ns
 
 
 def encode_slots(samples: Sequence[Sample], device_id: int) -> list[bytes]:

@@ -6,7 +6,7 @@ does not balance.
 """
 
 from collections.abc import Mapping
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from typing import Final
 
 # Names in the order of shared memory. Append new names at the end.
@@ -74,11 +74,11 @@ class Ledger:
 
     def bytes_open(self) -> int:
         """Return the number of uncounted bytes; 0 if the ledger balances."""
-        return bytes_open(self.snapshot())
+        return _open(*_BYTES(self))
 
     def frames_open(self) -> int:
         """Return the number of uncounted good frames; 0 if the ledger balances."""
-        return frames_open(self.snapshot())
+        return _open(*_FRAMES(self))
 
     def closes(self) -> bool:
         """Return whether the ledger balances."""
@@ -106,7 +106,10 @@ class Ledger:
         return dict(zip(LEDGER_FIELDS, self.values(), strict=True))
 
 
-_ALL = attrgetter(*LEDGER_FIELDS)
+# The first counter of each balance is the sum of the others.
+BYTE_FIELDS: Final = ("bytes_in", "bytes_in_good_frames", "bytes_in_bad_frames", "bytes_skipped", "bytes_pending")
+FRAME_FIELDS: Final = ("frames_good", "frames_in_samples", "frames_in_replies", "frames_ignored", "frames_pending")
+_ALL, _BYTES, _FRAMES = attrgetter(*LEDGER_FIELDS), attrgetter(*BYTE_FIELDS), attrgetter(*FRAME_FIELDS)
 LOST_FIELDS: Final = tuple(name for name in LEDGER_FIELDS if name.startswith("lost_"))  # counters of losses by cause
 
 
@@ -117,11 +120,13 @@ def lost(counts: Mapping[str, int]) -> int:
 
 def bytes_open(counts: Mapping[str, int]) -> int:
     """Return the number of uncounted bytes in a snapshot; 0 if the ledger balances."""
-    accounted = counts["bytes_in_good_frames"] + counts["bytes_in_bad_frames"] + counts["bytes_skipped"]
-    return counts["bytes_in"] - accounted - counts["bytes_pending"]
+    return _open(*itemgetter(*BYTE_FIELDS)(counts))
 
 
 def frames_open(counts: Mapping[str, int]) -> int:
     """Return the number of uncounted good frames in a snapshot; 0 if the ledger balances."""
-    accounted = counts["frames_in_samples"] + counts["frames_in_replies"] + counts["frames_ignored"]
-    return counts["frames_good"] - accounted - counts["frames_pending"]
+    return _open(*itemgetter(*FRAME_FIELDS)(counts))
+
+
+def _open(count: int, *accounted: int) -> int:
+    return count - sum(accounted)

@@ -45,6 +45,7 @@ class Outputs:
         self._running: dict[str, Publisher] = {}
         # name and `publish` of all outputs that process samples
         self._with_samples: tuple[tuple[str, Callable[[Batch], None]], ...] = ()
+        self._ticked: tuple[tuple[str, Publisher], ...] = ()  # running outputs
         self._devices: dict[str, int] = {}  # numbers of the present devices
         self._failures: dict[str, _Failure] = {}
 
@@ -129,11 +130,16 @@ class Outputs:
 
     def tick(self, now_ns: int) -> None:
         """Call `tick` of the outputs. Start failed outputs after their pause."""
-        for name in list(self._running):
-            self._guard(name, lambda publisher: publisher.tick(now_ns))
-        for name, failure in list(self._failures.items()):
-            if name not in self._running and now_ns >= failure.due_ns:
-                self._start_or_fail(name)
+        for name, publisher in self._ticked:
+            if self._running.get(name) is publisher:  # the failure of another output can end this output
+                try:
+                    publisher.tick(now_ns)
+                except Exception as error:  # noqa: BLE001 - an internal error of one output
+                    self._fail(name, error)
+        if self._failures:
+            for name, failure in list(self._failures.items()):
+                if name not in self._running and now_ns >= failure.due_ns:
+                    self._start_or_fail(name)
 
     # --- failures ----------------------------------------------------------------------------------------------------
 
@@ -204,12 +210,12 @@ class Outputs:
                 publisher.close()
             raise
         self._running[name] = publisher
-        self._note_samples()
+        self._note_running()
 
     def _end(self, name: str) -> BaseException | None:
         """Close an output. Return the exception that it raised."""
         publisher = self._running.pop(name, None)
-        self._note_samples()
+        self._note_running()
         if publisher is None:
             return None
         try:
@@ -219,9 +225,10 @@ class Outputs:
             return error
         return None
 
-    def _note_samples(self) -> None:
+    def _note_running(self) -> None:
         found = [(name, publisher.publish) for name, publisher in self._running.items()]
         self._with_samples = tuple((name, publish) for name, publish in found if publish is not None)
+        self._ticked = tuple(self._running.items())
 
 
 def _unexpected(error: BaseException) -> BaseException | None:

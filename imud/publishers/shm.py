@@ -415,8 +415,8 @@ class ShmRing:
 
 
 ASKER: Final = "shared memory"  # name of this output in latency requests
-# Time between two attempts to create a ring, ns. A full memory is not filled faster than that.
-RETRY_NS: Final = 1_000_000_000
+# Minimum time between two checks of the files, and between two ledgers, ns: each second tick in a quiet state
+CHECK_NS: Final = 950_000_000
 OTHERS_WRITE: Final = 0o022
 SLOTS_MIN, SLOTS_MAX = 64, 1 << 20  # limits of `slots`: a ring of 64 slots has 16 kB, a ring of 2²⁰ slots 256 MB
 
@@ -455,7 +455,6 @@ class _Place:
     device_id: int
     newest: int = 0  # sequence number of the newest sample while there was no ring
     problem: str = ""
-    retry_ns: int = 0
 
 
 class ShmPublisher:
@@ -470,6 +469,7 @@ class ShmPublisher:
         self._group_id: int | None = None
         self._started = False
         self._directory_problem = ""
+        self._check_ns = 0  # CLOCK_MONOTONIC of the next check of the files
 
     def start(self) -> None:
         """Open the directory and find the group. Raises ServerError if imud cannot create files in the directory."""
@@ -515,30 +515,36 @@ class ShmPublisher:
         """Do nothing: rings contain only samples."""
 
     def tick(self, now_ns: int) -> None:
-        """Create missing or truncated rings again. Write ledgers and heartbeats."""
-        directory = self._current_directory()
-        for name, place in self._places.items():
-            ring = self._rings.get(name)
-            if (ring is None or not ring.is_intact(directory)) and now_ns >= place.retry_ns:
-                self._replace(name, directory, now_ns)
-        self._show(now_ns)
+        """Write heartbeats. Once per second, create missing or truncated rings again, and write ledgers."""
+        if now_ns >= self._check_ns:
+            self._check_ns = now_ns + CHECK_NS
+            directory = self._current_directory()
+            for name in self._places:
+                ring = self._rings.get(name)
+                if ring is None or not ring.is_intact(directory):
+                    self._replace(name, directory, now_ns)
+            self._show_ledgers()
+        self._beat(now_ns)
 
     def close(self) -> None:
         """Write the final ledgers and close all rings. A second call does nothing."""
         self._context.latencies.release(ASKER)
         if self._rings:
-            self._show(self._context.clock.now_ns())
+            self._show_ledgers()
+            self._beat(self._context.clock.now_ns())
         for name in list(self._places):
             self.remove_device(name)
         if self._directory is not None:
             self._directory.close()
             self._directory = None
 
-    def _show(self, now_ns: int) -> None:
+    def _show_ledgers(self) -> None:
         for name, driver, ledger in self._context.devices.ledgers():
             ring = self._rings.get(name)
             if ring is not None:
                 ring.set_ledger(driver, ledger)
+
+    def _beat(self, now_ns: int) -> None:
         for ring in self._rings.values():
             ring.beat(now_ns)
 
@@ -570,7 +576,7 @@ class ShmPublisher:
             try:
                 directory.refuse_second_writer(ring_path(directory.path, name).name)
             except ServerError as error:
-                self._put_off(name, error, now_ns)
+                self._put_off(name, error)
                 return
         if self._make(name, directory, now_ns):
             log.warning("shm: the ring file of %s was missing or truncated; created it again", name)
@@ -587,7 +593,7 @@ class ShmPublisher:
         try:
             ring = self._rings[name] = ShmRing(directory, header, settings.mode, self._group_id)
         except ServerError as error:
-            self._put_off(name, error, now_ns)
+            self._put_off(name, error)
             return False
         place.problem = ""
         context.outputs.rings[name] = str(ring_path(directory.path, name))
@@ -596,11 +602,11 @@ class ShmPublisher:
             self._warn_of_group(f"does not contain user {os.geteuid()}, so imud cannot give it files")
         return True
 
-    def _put_off(self, name: str, error: ServerError, now_ns: int) -> None:
+    def _put_off(self, name: str, error: ServerError) -> None:
         place = self._places[name]
         if str(error) != place.problem:
             log.error("shm: no ring for %s: %s; trying again every second", name, error)
-        place.problem, place.retry_ns = str(error), now_ns + RETRY_NS
+        place.problem = str(error)
         self._context.outputs.without_ring.add(name)
 
     def _find_group(self) -> int | None:

@@ -1,36 +1,10 @@
-"""Counters of a sample path: sample rate, latency, and the causes of lost samples."""
+"""Counters of a sample path: latency, and the causes of lost samples."""
 
 from bisect import bisect_left, bisect_right
-from collections import deque
 from collections.abc import Sequence
 
 from imud.contracts.status import LATENCY_BOUNDS_NS
 from imud.model.ledger import Ledger
-from imud.model.units import NS_PER_S
-
-# window of the sample rate, ns: long enough for devices with 1 Hz, short enough to show a stall
-RATE_WINDOW_NS = 2 * NS_PER_S
-
-
-class RateMeter:
-    """Sample rate over the last `RATE_WINDOW_NS`. The device adds the sample count at each tick."""
-
-    def __init__(self) -> None:
-        self._marks: deque[tuple[int, int]] = deque()
-
-    def mark(self, now_ns: int, count: int) -> None:
-        """Add the sample count at `now_ns`."""
-        marks = self._marks
-        marks.append((now_ns, count))
-        while len(marks) > 2 and marks[1][0] <= now_ns - RATE_WINDOW_NS:  # keep one mark before the window
-            marks.popleft()
-
-    def rate_hz(self) -> float:
-        """Return the samples per second between the oldest and the newest count; 0.0 without two counts."""
-        if len(self._marks) < 2:
-            return 0.0
-        (t0_ns, n0), (t1_ns, n1) = self._marks[0], self._marks[-1]
-        return (n1 - n0) * NS_PER_S / (t1_ns - t0_ns) if t1_ns > t0_ns else 0.0
 
 
 class LatencyMeter:

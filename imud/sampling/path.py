@@ -29,7 +29,7 @@ from imud.contracts.observer import InputObserver
 from imud.contracts.publisher import AS_SENT, Batch
 from imud.contracts.script import Message, ReplyFrame, TextLine
 from imud.formats.can import CanFrame
-from imud.formats.slot import DEVICE_ID_MOST, SLOT_BYTES, decode_slots, slot_status_bits, slot_times_ns
+from imud.formats.slot import DEVICE_ID_MOST, SLOT_BYTES, decode_slots, slot_quality, slot_status_bits, slot_times_ns
 from imud.host.clock import UNSTEERED, HostClock, SteadyTime
 from imud.model.errors import Trouble
 from imud.model.ledger import Ledger
@@ -119,6 +119,14 @@ class SamplePath(ABC):
             (newest,) = decode_slots(newest, self._device)
             self._newest = newest
         return newest
+
+    @property
+    def quality(self) -> tuple[Sync | None, int]:
+        """Return `sync` and `t_err_ns` of the newest sample; (None, 0) without a sample. Cheaper than `newest`."""
+        newest = self._newest
+        if isinstance(newest, bytes):
+            return slot_quality(newest)
+        return (newest.sync, newest.t_err_ns) if newest is not None else (None, 0)
 
     @property
     def fresh(self) -> bool:

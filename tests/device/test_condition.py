@@ -5,6 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from imud import config
 from imud.contracts.condition import (
     OK,
     Condition,
@@ -17,7 +18,16 @@ from imud.contracts.condition import (
 )
 from imud.contracts.setting import OnDifference, SettingDifference, SettingsState, SettingsStatus
 from imud.contracts.status import DeviceState, DeviceStatus, FrameProblem, LinesStatus, RecentStatus
-from imud.device.condition import Cause, ConditionWatch, ConfiguredPort, Facts, RecentCounts, Rule, causes_of
+from imud.device.condition import (
+    Cause,
+    ConditionJudge,
+    ConditionWatch,
+    ConfiguredPort,
+    Facts,
+    RecentCounts,
+    Rule,
+    causes_of,
+)
 from imud.device.health import SEARCH_BEGUN, DeviceEvents
 from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
@@ -40,7 +50,7 @@ def recent(rate_hz: float | None = None, **changes: Any) -> RecentStatus:
 
 def facts(state: DeviceState = DeviceState.RUNNING, problem: str = "", **changes: Any) -> Facts:
     known = {"now_ns": NOW_NS, "place": PORT, "recent": recent(), "expected_rate_hz": 50.0, **changes}
-    return Facts(state=state, problem=problem, **known)
+    return Facts(state=state, problem=problem, rate_hz=known["recent"].rate_hz, **known)
 
 
 def declared(state: SettingsState = SettingsState.AGREE, **changes: Any) -> Facts:
@@ -337,6 +347,53 @@ def test_the_rate_contains_lost_samples_and_needs_a_steady_device() -> None:
     assert counted.pass_seconds(10, samples=25).rate_hz is None  # the device changed its rate
     assert counted.pass_seconds(2, samples=25).rate_hz == 25.0
     assert Counted(timed=False).pass_seconds(30).rate_hz is None
+
+
+def test_the_short_rate_falls_to_zero_when_samples_stop() -> None:
+    counted = Counted()
+    assert counted.counts.rate_hz() == 0.0
+    counted.pass_seconds(4)
+    assert counted.counts.rate_hz() == 50.0
+    counted.pass_seconds(1, samples=25)
+    assert counted.counts.rate_hz() == 37.5
+    counted.pass_seconds(2, samples=0)
+    assert counted.counts.rate_hz() == 0.0
+
+
+class Judged:
+    """Judge of a device that sends 50 samples per second."""
+
+    def __init__(self) -> None:
+        tree = {"devices": {"imu0": {"driver": "hipnuc-uart", "uart": {"port": "/dev/ttyUSB0", "baud": 921600}}}}
+        (device_config,) = config.parse(msgspec.json.encode(tree), "test").devices
+        self.ledger, self.now_ns = Ledger(), 0
+        events = DeviceEvents("imu0", self.ledger, lambda _event: None)
+        self.judge = ConditionJudge(device_config, PORT.port, self.ledger, events, 0)
+
+    def is_steady(self, seconds: int = 1, samples: int = 50, problem: str = "") -> bool:
+        """Pass seconds. Return whether no rule ran in the last second."""
+        for _ in range(seconds):
+            self.now_ns += S
+            self.ledger.samples += samples
+            known = {"state": DeviceState.RUNNING, "problem": problem}
+            has_run = self.judge.judge(self.now_ns, 50.0, 0, self.now_ns, 0, known)
+        return not has_run
+
+
+def test_the_rules_run_again_after_a_change_of_a_fact() -> None:
+    judged = Judged()
+    assert not judged.is_steady()
+    assert judged.is_steady(20)
+    assert judged.judge.watch.condition.reasons[0].message.endswith("since imud started 21 s ago.")
+    judged.ledger.lost_crc += 1
+    assert not judged.is_steady(60)  # the loss is in the last minute
+    assert judged.is_steady(2)
+    assert judged.judge.watch.condition.reasons[0].message.startswith("1 sample was lost 61 s ago")
+    assert not judged.is_steady(problem="the bus is error-passive")
+    assert not judged.is_steady(60)  # the reason ends 60 s after its cause
+    assert judged.is_steady(2)
+    assert not judged.is_steady(10, samples=40)
+    assert judged.judge.watch.condition.condition is Condition.DEGRADED
 
 
 def test_restarts_of_the_last_hour() -> None:

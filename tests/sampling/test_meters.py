@@ -1,26 +1,10 @@
-"""Rate, latency, and causes of loss, computed by hand."""
+"""Latency, and causes of loss, computed by hand."""
 
 from imud.contracts.status import LATENCY_BOUNDS_NS
 from imud.model.ledger import Ledger
-from imud.sampling.meters import LatencyMeter, LossMeter, RateMeter
+from imud.sampling.meters import LatencyMeter, LossMeter
 
 S = 1_000_000_000
-
-
-def test_rate_over_the_window_falls_to_zero_when_samples_stop() -> None:
-    meter = RateMeter()
-    assert meter.rate_hz() == 0.0
-    for tenth in range(31):  # 3 s at 100 Hz
-        meter.mark(tenth * S // 10, tenth * 10)
-    assert meter.rate_hz() == 100.0
-    meter = RateMeter()
-    for tenth in range(50):
-        meter.mark(tenth * S // 10, min(tenth, 10) * 10)
-    assert meter.rate_hz() == 0.0
-    meter = RateMeter()
-    for tenth in range(21):  # 1 s at 100 Hz, 1 s at 50 Hz
-        meter.mark(tenth * S // 10, min(tenth, 10) * 10 + max(tenth - 10, 0) * 5)
-    assert meter.rate_hz() == 75.0
 
 
 def test_latencies_go_into_the_buckets_whose_bounds_they_do_not_exceed() -> None:

@@ -240,6 +240,8 @@ class Quota:
 
     def tick(self) -> None:
         """Forget the users with a full allowance of connections."""
+        if not self._connects:
+            return
         now_ns = self._now_ns()
         for uid, bucket in list(self._connects.items()):
             bucket.fill(now_ns)

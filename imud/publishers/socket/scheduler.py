@@ -123,6 +123,10 @@ class ScheduledClient(ABC):
         return self.cpu.level < 0 or self.data.level < 0
 
     @property
+    def is_full(self) -> bool:
+        return self.cpu.level >= CPU_BURST_NS and self.data.level >= BYTES_BURST
+
+    @property
     def is_light(self) -> bool:
         """Whether the client has recently used little of its allowance."""
         return self.cpu.level >= CPU_LIGHT_NS and self.data.level >= 0
@@ -173,6 +177,7 @@ class Scheduler:
         self._queued: dict[_User, None] = {}  # users with queued clients
         self._served_ns = 0  # run time of the user that was served last
         self._parked: dict[ScheduledClient, None] = {}
+        self._charged: dict[ScheduledClient, None] = {}  # clients whose allowances are not full
 
     def add(self, client: ScheduledClient, uid: int) -> _User:
         """Wait for input of a new client. Return the user `uid`, who may have other clients."""
@@ -182,6 +187,7 @@ class Scheduler:
             user = self._users[uid] = _User(uid, self._served_ns)
         user.clients += 1
         self._clients[client.fd] = client
+        self._charged[client] = None
         return user
 
     def remove(self, client: ScheduledClient) -> None:
@@ -191,6 +197,7 @@ class Scheduler:
         client.state = _State.GONE
         self._clients.pop(client.fd, None)
         self._parked.pop(client, None)
+        self._charged.pop(client, None)
         if not self._epoll.closed:
             self._epoll.unregister(client.fd)
         user = client.user
@@ -223,14 +230,18 @@ class Scheduler:
     def tick(self) -> bool:
         """Fill the allowances. Queue parked clients with a new allowance. Evict clients that exceed theirs for 10 s.
         Return whether a client needs the next tick within 100 ms."""
+        if not self._charged:
+            return False
         now_ns = self.now_ns()
         needs_ticks = False
-        for client in list(self._clients.values()):
+        for client in list(self._charged):
             client.fill(now_ns)
             is_parked = client.state is _State.PARKED
             if is_parked or client.over_ticks:
                 client.over_ticks += 1 if is_parked else -1
                 needs_ticks = True
+            elif client.is_full:
+                del self._charged[client]
         for client in list(self._parked):
             if client.over_ticks > OVER_TICKS_MAX:
                 try:
@@ -323,6 +334,9 @@ class Scheduler:
     def _serve(self, client: ScheduledClient) -> None:
         """Serve one piece, then queue, park or arm the client."""
         client.state = _State.SERVED
+        if client not in self._charged:
+            client.fill(self.now_ns())
+            self._charged[client] = None
         begun_ns = self._cpu_ns()
         try:
             has_more = client.serve()

@@ -24,7 +24,7 @@ from imud.contracts.publisher import PublisherContext, PublisherType
 from imud.formats.jsonrpc import DEFAULT_PATH, Code, RpcError, encode_error, line_of
 from imud.model.errors import ServerError, reason_of
 from imud.model.options import Options, shown
-from imud.model.units import NS_PER_S
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.publishers.socket.admission import (
     Guard,
     Quota,
@@ -252,8 +252,8 @@ ACCEPTS_PER_TURN: Final = 16
 ACCEPT_NS: Final = 300_000
 """Maximum time of accepting clients in one turn of the event loop, ns: three clients with their greetings."""
 MIB: Final = 1 << 20
-RETRY_NS: Final = NS_PER_S
-"""Time between two attempts to create a removed socket file again, ns."""
+CHECK_NS: Final = NS_PER_S - 50 * NS_PER_MS
+"""Minimum time between two checks of the socket file, ns: each second tick in a quiet state."""
 
 
 class SocketOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -310,7 +310,7 @@ class SocketServer:
         self._paused = False  # whether imud accepts no client until the next tick
         self._pauses = RateLimitedLog(context.clock.now_ns)
         self._file_problem = ""  # why imud cannot create the removed socket file again
-        self._retry_ns = 0
+        self._check_ns = 0  # CLOCK_MONOTONIC of the next check of the socket file
 
     def start(self) -> None:
         """Listen. Raises ServerError, and leaves no file behind, if that is not possible."""
@@ -325,14 +325,14 @@ class SocketServer:
     def _listen(self) -> Listener:
         return Listener(Path(self._settings.path), self._settings.group, self._settings.control_group)
 
-    def _replace_file(self, listener: Listener, now_ns: int) -> None:
+    def _replace_file(self, listener: Listener) -> None:
         """Create a removed socket file again. Connected clients are not affected."""
         try:
             new = self._listen()
         except ServerError as error:
             if str(error) != self._file_problem:
                 log.error("socket: the file %s was removed or replaced: %s; trying again", listener.path, error)
-            self._file_problem, self._retry_ns = str(error), now_ns + RETRY_NS
+            self._file_problem = str(error)
             return
         self._accept()  # clients that connected before the removal
         loop = asyncio.get_running_loop()
@@ -360,8 +360,10 @@ class SocketServer:
         if needs_ticks:
             self._context.tick_soon()
         self._quota.tick()
-        if self._listener is not None and now_ns >= self._retry_ns and not self._listener.has_file:
-            self._replace_file(self._listener, now_ns)
+        if now_ns >= self._check_ns and self._listener is not None:
+            self._check_ns = now_ns + CHECK_NS
+            if not self._listener.has_file:
+                self._replace_file(self._listener)
         if self._paused and self._listener is not None:
             self._paused = False
             asyncio.get_running_loop().add_reader(self._listener.sock, self._accept)

@@ -9,27 +9,36 @@ import grp
 import os
 import select
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Final
 
 import msgspec
 
 from imud import config
+from imud.contracts.condition import Condition
 from imud.daemon import QUIET_TICK_S, Daemon
+from imud.device.condition import MINUTE_NS
 from imud.device.device import Device
 from imud.formats.jsonrpc import encode_request, line_of
+from imud.formats.slot import encode_slot
 from imud.host.event_loop import ReaderSelector, SampleLoop
-from imud.model.sample import Sample
+from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.path import SamplePath
 from tests.bench.instructions import virtual_time
-from tests.bench.instructions.module import BAUD, SETTLE_READS, Module, Read
+from tests.bench.instructions.module import BAUD, HI91, SETTLE_READS, Module, Read
 
 DRAIN_EVERY: Final = 16
 """Number of wake-ups between two reads of the clients. The socket buffers do not fill up in this time."""
 START_MS: Final = 1000  # until the daemon has opened the port
 CONNECT_MS: Final = 10  # until the clients are subscribed
 BUFFER: Final = bytearray(1 << 20)
+TICK_NS: Final = round(QUIET_TICK_S * NS_PER_S)
+TICK_SAMPLES: Final = TICK_NS // NS_PER_MS  # samples of the device between two ticks
+TICK_BYTES: Final = TICK_SAMPLES * len(HI91)
+END_NS: Final = 1 << 62  # after each time of a measurement
+SETTLE_TICKS: Final = 3 * MINUTE_NS // TICK_NS  # after the losses of the first minute and the end of their reason
 
 
 class _Feeder:
@@ -102,20 +111,36 @@ class VirtualDaemon:
     def process(self, reads: list[Read]) -> None:
         self._run(iter(reads))
 
-    def newest_samples(self, count: int) -> list[Sample]:
-        """Process reads with one frame each, and return their samples."""
-        found = []
-        for read in self.prepare(count, 1):
-            self.process([read])
-            found.append(self._path.newest)
-        return [sample for sample in found if sample is not None]
+    def quiet_ticks(self, count: int) -> list[Callable[[], None]]:
+        """Return ticks of a quiet state: all samples arrive in time, and the device is at rest. The last minute had no
+        loss, so no reason holds."""
+        self.process(self.prepare(1, 1))
+        newest, begin_ns = self._path.newest, virtual_time.now_ns()
+        assert newest is not None
+        host = self._daemon._host
+        host._held_ns, host._due_ns = begin_ns, END_NS  # the reads of the device measure the clock, not the tick
+        ticks: list[Callable[[], None]] = []
+        for number in range(1, SETTLE_TICKS + count + 1):
+            later_ns, later = number * TICK_NS, number * TICK_SAMPLES
+            sample = msgspec.structs.replace(
+                newest, seq=newest.seq + later, t_ns=newest.t_ns + later_ns, t_rx_ns=newest.t_rx_ns + later_ns
+            )
+            slot = encode_slot(sample, self._device.device_id)
+            ticks.append(partial(self._tick, self._path, self._device.ledger, begin_ns + later_ns, slot))
+        for tick in ticks[:SETTLE_TICKS]:
+            tick()
+        assert self._device.condition is Condition.OK
+        return ticks[SETTLE_TICKS:]
 
-    def tick(self, newest: Sample) -> None:
-        """Tick after another sample: the newest sample and the ledger differ from the last tick."""
-        path = self._path
-        path._newest, path.last_sample_ns = newest, virtual_time.now_ns()
-        self._device.ledger.samples += 1
-        virtual_time.set_now(virtual_time.now_ns() + round(QUIET_TICK_S * NS_PER_S))
+    def _tick(self, path: SamplePath, ledger: Ledger, now_ns: int, newest: bytes) -> None:
+        """Tick right after the last of TICK_SAMPLES samples. These samples changed the ledger."""
+        path._newest, path.last_sample_ns, path.last_data_ns = newest, now_ns, now_ns
+        ledger.bytes_in += TICK_BYTES
+        ledger.bytes_in_good_frames += TICK_BYTES
+        ledger.frames_good += TICK_SAMPLES
+        ledger.frames_in_samples += TICK_SAMPLES
+        ledger.samples += TICK_SAMPLES
+        virtual_time.set_now(now_ns)
         self._daemon.on_alarm()
 
     @property

@@ -340,7 +340,7 @@ def _daemon(clients: int, encoding: str, frames: int, total: int, directory: str
 def _tick(total: int, directory: str) -> Run:
     daemon = VirtualDaemon(directory)
     daemon.connect(1, "binary")
-    return _taking([partial(daemon.tick, sample) for sample in daemon.newest_samples(total)])
+    return _taking(daemon.quiet_ticks(total))
 
 
 STAGES: Final = (
