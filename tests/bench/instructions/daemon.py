@@ -16,10 +16,12 @@ from typing import Final
 import msgspec
 
 from imud import config
+from imud.attitude.gravity import WINDOW_NS
 from imud.contracts.condition import Condition
 from imud.daemon import QUIET_TICK_S, Daemon
 from imud.device.condition import MINUTE_NS
 from imud.device.device import Device
+from imud.device.watches import AGAIN_NS
 from imud.formats.jsonrpc import encode_request, line_of
 from imud.formats.slot import encode_slot
 from imud.host.event_loop import ReaderSelector, SampleLoop
@@ -37,6 +39,7 @@ BUFFER: Final = bytearray(1 << 20)
 TICK_NS: Final = round(QUIET_TICK_S * NS_PER_S)
 TICK_SAMPLES: Final = TICK_NS // NS_PER_MS  # samples of the device between two ticks
 TICK_BYTES: Final = TICK_SAMPLES * len(HI91)
+QUIET_PERIOD_TICKS: Final = (WINDOW_NS + AGAIN_NS) // TICK_NS  # from one check against gravity to the next
 END_NS: Final = 1 << 62  # after each time of a measurement
 SETTLE_TICKS: Final = 3 * MINUTE_NS // TICK_NS  # after the losses of the first minute and the end of their reason
 

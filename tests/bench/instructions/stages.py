@@ -33,7 +33,7 @@ from imud.publishers.socket.server import SocketOptions, SocketServer
 from imud.sampling.clock import SampleClock
 from imud.sampling.path import PathContext, StreamPath
 from tests.bench.instructions import virtual_time
-from tests.bench.instructions.daemon import BUFFER, DRAIN_EVERY, VirtualDaemon, own_group
+from tests.bench.instructions.daemon import BUFFER, DRAIN_EVERY, QUIET_PERIOD_TICKS, VirtualDaemon, own_group
 from tests.bench.instructions.figures import INTERPRETER
 from tests.bench.instructions.module import BAUD, SETTLE_READS, Module, Read
 from tests.support.publisher_context import publisher_context
@@ -368,6 +368,6 @@ STAGES: Final = (
     CountedStage("daemon, 1 client, a sample per wake-up", partial(_daemon, 1, "binary", 1), 1000),
     CountedStage("daemon, 10 binary clients, a sample per wake-up", partial(_daemon, 10, "binary", 1), 200),
     CountedStage("daemon, 10 JSON clients, a sample per wake-up", partial(_daemon, 10, "json", 1), 200),
-    CountedStage("tick, 1 device, 1 client", _tick, 40, 1),
+    CountedStage("tick, 1 device, 1 client", _tick, QUIET_PERIOD_TICKS, 1),
     CountedStage("daemon, 1 client, 20 samples per wake-up", partial(_daemon, 1, "binary", 20), 50, 20),
 )
