@@ -7,6 +7,7 @@
  *   is_usual, decode ─▶ HipnucCodec (imud/drivers/hipnuc/uart/codec.py)
  *   stamp ─▶ add_even_run (imud/sampling/clock.py), ArrivalFit.add_arrival (imud/sampling/arrival_fit.py),
  *                 encode_slots (imud/formats/slot.py)
+ *   add_slots ─▶ add_slots (imud/publishers/socket/history.py)
  *
  * The result must be equal to the result of Python in every bit. Therefore the compiler must not join a product and a
  * sum to one operation (-ffp-contract=off), and each expression has the order of the Python expression.
@@ -14,6 +15,7 @@
 #define Py_LIMITED_API 0x030B0000
 #include <Python.h>
 #include <structmember.h>
+#include <float.h>
 #include <math.h>
 #include <stddef.h>
 #include <stdint.h>
@@ -394,7 +396,123 @@ static PyType_Spec run_spec = {
     "imud._kernel.Run", sizeof(RunObject), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_DISALLOW_INSTANTIATION, run_slots,
 };
 
+/* Samples of one second (`SECOND` of imud/publishers/socket/history.py). */
+typedef struct {
+    int64_t first_ns, last_ns, utc_ns, latency_ns;
+    uint64_t seq;
+    uint32_t count, t_err_ns, present;
+    uint8_t sync, reserved[3];
+    float low[12], high[12]; /* accel, gyro, mag, euler */
+    float quat_wxyz[4], temperature_c, pressure_pa;
+} Second;
+
+_Static_assert(sizeof(Second) == 176, "a second has 176 bytes without padding");
+
+/* Return whether each value is finite and fits into a float. */
+static int fit_float(const double *values, int count)
+{
+    for (int i = 0; i < count; i++)
+        if (!(fabs(values[i]) <= FLT_MAX))
+            return 0;
+    return 1;
+}
+
+static void add_range(Second *second, uint32_t bit, int first, const double *vector)
+{
+    float *low = second->low + first, *high = second->high + first;
+    if (!fit_float(vector, 3))
+        return;
+    if (!(second->present & bit)) {
+        second->present |= bit;
+        for (int i = 0; i < 3; i++)
+            low[i] = high[i] = (float)vector[i];
+    }
+    for (int i = 0; i < 3; i++) {
+        float value = (float)vector[i];
+        low[i] = value < low[i] ? value : low[i];
+        high[i] = value > high[i] ? value : high[i];
+    }
+}
+
+static void add_slot(Second *second, const Slot *slot)
+{
+    int64_t latency_ns;
+    int is_first = !second->count;
+    if (__builtin_sub_overflow(slot->t_rx_ns, slot->t_ns, &latency_ns))
+        latency_ns = slot->t_ns < 0 ? INT64_MAX : INT64_MIN;
+    if (is_first)
+        second->first_ns = slot->t_ns;
+    if (is_first || latency_ns > second->latency_ns)
+        second->latency_ns = latency_ns;
+    if (slot->t_err_ns > second->t_err_ns)
+        second->t_err_ns = slot->t_err_ns;
+    second->last_ns = slot->t_ns;
+    second->utc_ns = slot->utc_ns;
+    second->seq = slot->seq;
+    second->sync = slot->sync;
+    second->count++;
+    if (slot->present & HAS_ACCEL)
+        add_range(second, HAS_ACCEL, 0, slot->accel_m_s2);
+    if (slot->present & HAS_GYRO)
+        add_range(second, HAS_GYRO, 3, slot->gyro_rad_s);
+    if (slot->present & HAS_MAG)
+        add_range(second, HAS_MAG, 6, slot->mag_t);
+    if (slot->present & HAS_EULER)
+        add_range(second, HAS_EULER, 9, slot->euler_rad);
+    if (slot->present & HAS_QUAT && fit_float(slot->quat_wxyz, 4)) {
+        second->present |= HAS_QUAT;
+        for (int i = 0; i < 4; i++)
+            second->quat_wxyz[i] = (float)slot->quat_wxyz[i];
+    }
+    if (slot->present & HAS_TEMPERATURE && fit_float(&slot->temperature_c, 1)) {
+        second->present |= HAS_TEMPERATURE;
+        second->temperature_c = (float)slot->temperature_c;
+    }
+    if (slot->present & HAS_PRESSURE && fit_float(&slot->pressure_pa, 1)) {
+        second->present |= HAS_PRESSURE;
+        second->pressure_pa = (float)slot->pressure_pa;
+    }
+}
+
+static int64_t second_of(int64_t t_ns)
+{
+    int64_t second = t_ns / 1000000000;
+    return t_ns % 1000000000 < 0 ? second - 1 : second;
+}
+
+/* add_slots(second, slots, offset) -> offset of the first slot that is in another second, or the size of `slots` */
+static PyObject *add_slots(PyObject *self, PyObject *args)
+{
+    Py_buffer open, slots;
+    Py_ssize_t offset;
+    if (!PyArg_ParseTuple(args, "w*y*n:add_slots", &open, &slots, &offset))
+        return NULL;
+    if (open.len != (Py_ssize_t)sizeof(Second) || offset < 0) {
+        PyErr_SetString(PyExc_ValueError, "expected 176 bytes of a second and an offset of 0 or more");
+    } else {
+        Second second;
+        Slot slot;
+        int64_t number = 0;
+        memcpy(&second, open.buf, sizeof second);
+        if (second.count)
+            number = second_of(second.first_ns);
+        for (; slots.len - offset >= (Py_ssize_t)sizeof slot; offset += (Py_ssize_t)sizeof slot) {
+            memcpy(&slot, (const char *)slots.buf + offset, offsetof(Slot, incli_rad));
+            if (!second.count)
+                number = second_of(slot.t_ns);
+            else if (second_of(slot.t_ns) != number)
+                break;
+            add_slot(&second, &slot);
+        }
+        memcpy(open.buf, &second, sizeof second);
+    }
+    PyBuffer_Release(&open);
+    PyBuffer_Release(&slots);
+    return PyErr_Occurred() ? NULL : PyLong_FromSsize_t(offset);
+}
+
 static PyMethodDef methods[] = {
+    {"add_slots", add_slots, METH_VARARGS, "Add slots to the minimum and maximum of a second."},
     {"start_hi91", start_hi91, METH_VARARGS, "Return a Run for HI91 frames that starts with a state; or None."},
     {NULL, NULL, 0, NULL},
 };

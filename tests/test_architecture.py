@@ -503,6 +503,7 @@ TESTED_IN = {
     "imud.drivers.polled_frames": "drivers/test_every_polled_driver.py",
     "imud.fleet.settings": "fleet/test_publisher.py", "imud.formats.jsonrpc": "publishers/socket/test_methods.py",
     "imud.formats.kernel": "sampling/test_path_kernel.py",
+    "imud.model.bucket": "publishers/socket/test_history.py",
     "imud.publishers.metrics.metric": "publishers/metrics/test_families.py",
     "imud.web.messages": "web/test_hub.py",
 }  # fmt: skip

@@ -32,6 +32,7 @@ from imud.formats.jsonrpc import (
     parse_object,
 )
 from imud.formats.slot import SLOT_BYTES, SLOT_FIELDS, decode_slot
+from imud.model.bucket import Bucket
 from imud.model.errors import LinkDenied, LinkError, LinkMissing, ServerError, reason_of
 from imud.model.event import Event, StoredEvent, kind_of
 from imud.model.options import wrong_values
@@ -372,6 +373,13 @@ class Client:
         reply = self.call("events", devices=_listed(devices), enable=False, since_ns=since_ns, limit=limit)
         return msgspec.convert(reply.get("events", []), list[StoredEvent])
 
+    def history(self, devices: Iterable[str], **params: int | str | None) -> dict[str, list[Bucket]]:
+        """Return minimum and maximum of the samples of the last hour by device. `params` are the other parameters of
+        the method: `from_ns`, `to_ns`, `points`, `convention`."""
+        reply = self.call("history", devices=_listed(devices), **params)
+        _check_convention(reply.get("convention"), params.get("convention"))
+        return msgspec.convert(reply["devices"], dict[str, list[Bucket]])
+
     def notify(self, device: str, latency_ms: float | None = None) -> int:
         """Return a descriptor for `Ring.wait`, readable after each batch of samples of `device`. The caller closes it.
 
@@ -549,7 +557,7 @@ def _is_one_of(message: Message, names: frozenset[str]) -> bool:
     return "sample" in names if isinstance(message, bytes) else message.get("method") in names
 
 
-def _check_convention(given: str | None, convention: str | None) -> None:
+def _check_convention(given: object, convention: object) -> None:
     """Raise ServerError if the daemon ignored the convention."""
     if convention is not None and given != convention:
         raise ServerError(f"the daemon does not know the convention {convention}; update the daemon")

@@ -15,12 +15,13 @@ import msgspec
 
 from imud.client.feed import Feed, News, Wish
 from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceStatus, RecentStatus
+from imud.model.bucket import VECTORS, Bucket, Range
 from imud.model.event import Event
 from imud.model.ledger import LEDGER_FIELDS, bytes_open, frames_open, lost
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_S
 from imud.web import messages
-from imud.web.messages import VECTORS, Bucket, Look, Range, RawMessage
+from imud.web.messages import Look, RawMessage
 
 LATE_PERIODS: Final = 2
 """Number of periods after its interval at which a bucket ends if no later sample arrives."""

@@ -9,39 +9,14 @@ from typing import Any, Final, Literal, TypeVar
 import msgspec
 
 from imud.contracts.condition import Reason
+from imud.model.bucket import Bucket
 
 T = TypeVar("T")
 
 RATES_HZ: Final = (10, 20, 50)
 """Possible numbers of buckets per second."""
-VECTORS: Final = ("accel_m_s2", "gyro_rad_s", "mag_t", "euler_rad")
-"""Members of a sample with minimum and maximum in a bucket."""
 SPECTRA: Final = ("accel_m_s2", "gyro_rad_s", "mag_t")
 """Members of a sample that a page can request completely."""
-
-Range = tuple[tuple[float, ...], tuple[float, ...]]
-"""Minimum and maximum of each axis."""
-
-
-class Bucket(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The samples of one device in one interval. A member is absent if no sample contains it."""
-
-    first_s: float  # time of the first sample, CLOCK_MONOTONIC
-    last_s: float  # time of the last sample, CLOCK_MONOTONIC
-    utc_s: float  # time of the last sample since 1970-01-01 UTC
-    count: int
-    seq: int  # sequence number of the last sample
-    sync: str  # source of the time stamp of the last sample
-    t_err_s: float  # maximum time stamp error, one sigma
-    latency_s: float  # maximum time from the measurement to the arrival of the last byte
-    accel_m_s2: Range | None = None
-    gyro_rad_s: Range | None = None
-    mag_t: Range | None = None
-    euler_rad: Range | None = None
-    # the last value in the interval
-    quat_wxyz: tuple[float, ...] | None = None
-    temperature_c: float | None = None
-    pressure_pa: float | None = None
 
 
 class ToPage(msgspec.Struct, frozen=True, tag_field="kind"):

@@ -29,7 +29,7 @@ from imud.web import messages
 from imud.web.guard import COOKIE, SESSION_S, WebGuard, WebRights, safety_headers
 from imud.web.hub import Browser, BrowserHub
 
-READING: Final = frozenset(("settings.get", "actions", "calibrations", "events", "schema"))
+READING: Final = frozenset(("settings.get", "actions", "calibrations", "events", "history", "schema"))
 """Methods that need the right to read."""
 CONTROLLING: Final = frozenset(("settings.plan", "settings.apply", "command", "calibrate", "stop_calibration"))
 """Methods that need the right to control, here and at the daemon."""

@@ -48,6 +48,8 @@ def test_requests(served: Daemon) -> None:
         publish(served, batch("imu0", 4), batch("imu1", 5))
         assert client.poll() == [sample("imu0", 4), sample("imu1", 5)]
         assert client.poll(["imu1"]) == [sample("imu1", 5)]
+        (bucket,) = client.history(["imu1"], convention="enu-flu")["imu1"]
+        assert (bucket.seq, bucket.accel_m_s2) == (5, ((-0.5, -0.125, 9.75),) * 2)
 
 
 def test_a_convention_is_asked_for(served: Daemon) -> None:

@@ -16,7 +16,7 @@ OPTIONS: Final = (
     "-g", "-O1", "-Wall", "-Wextra", "-Wno-unused-parameter", "-Werror", "-shared-libasan", "-fno-sanitize-recover=all",
     "-fsanitize=address,undefined,float-cast-overflow",
 )  # fmt: skip
-TESTS: Final = "tests/sampling/test_path_kernel.py"
+TESTS: Final = ("tests/sampling/test_path_kernel.py", "tests/publishers/socket/test_history.py")
 # The tests import `imud._kernel`, and find the module that is already loaded.
 PROGRAM: Final = """
 import sys
@@ -52,7 +52,7 @@ def main() -> int:
         **os.environ, "LD_PRELOAD": found.stdout.strip(), "PYTHONMALLOC": "malloc", "IMUD_KERNEL": "1",
         "ASAN_OPTIONS": "detect_leaks=0", "UBSAN_OPTIONS": "print_stacktrace=1",
     }  # fmt: skip
-    command = [sys.executable, "-c", PROGRAM, str(FOLDER / LIBRARY), TESTS, *sys.argv[1:]]
+    command = [sys.executable, "-c", PROGRAM, str(FOLDER / LIBRARY), *TESTS, *sys.argv[1:]]
     return subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
 
 

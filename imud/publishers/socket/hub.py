@@ -15,6 +15,7 @@ from imud.model.event import Event
 from imud.publishers.recorder.client_stream import ClientRecording, stream_pair
 from imud.publishers.socket.admission import Quota
 from imud.publishers.socket.client import ClientConnection, Clients
+from imud.publishers.socket.history import History
 from imud.publishers.socket.messages import DeviceNotice
 from imud.publishers.socket.outbox import Pool
 from imud.publishers.socket.scheduler import TokenBucket
@@ -179,6 +180,7 @@ class Hub(Clients):
         self.control_group = "the control group"  # name of the group that may control, for error messages
         self.devices: dict[str, int] = {}  # the `device_id` of each device
         self.newest: dict[str, Batch] = {}  # the newest batch of each device
+        self.history: History | None = None  # None if `socket.history` switches it off
         self.recordings = ClientRecordings(context, quota.check_fds)
         self._quota = quota
         self._time = time
@@ -210,11 +212,15 @@ class Hub(Clients):
             post_all([self.connections[number] for number in matching], notice)
         self.recordings.remove_device(name)
         self.newest.pop(name, None)
+        if self.history is not None:
+            self.history.remove(name)
         self._plans.pop(name, None)
 
     def publish(self, batch: Batch) -> None:
         device = batch.device
         self.newest[device] = batch
+        if self.history is not None:
+            self.history.add(batch)
         plan = self._plans.get(device)
         if plan is None:
             plan = self._plans[device] = self._new_plan(device)

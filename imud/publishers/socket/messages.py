@@ -12,6 +12,7 @@ from imud.attitude.conventions import Convention, Heading
 from imud.attitude.published import FrameWords
 from imud.contracts.condition import DeviceCondition
 from imud.contracts.status import CKernelStatus, DeviceState, DeviceStatus, MqttStatus, SocketStatus
+from imud.model.bucket import Bucket
 from imud.model.event import Event, StoredEvent
 from imud.model.sample import FieldInfo, Sample, Sync
 from imud.publishers.socket.subscription import Form
@@ -59,6 +60,14 @@ class EventsParams(msgspec.Struct):
     enable: bool | None = None
     since_ns: int | None = None  # CLOCK_MONOTONIC, ns: reply with the stored events since then; default: none
     limit: int | None = None  # maximum number of stored events; default and maximum: 1000
+
+
+class HistoryParams(msgspec.Struct):
+    devices: list[str]  # at most 4
+    from_ns: int | None = None  # time stamp of a sample (`t_ns`); default: one hour before `to_ns`
+    to_ns: int | None = None  # default: newest sample of each device
+    points: int | None = None  # maximum number of buckets of each device, 1 to 1000; default 600
+    convention: Convention | None = None
 
 
 class DeviceParams(msgspec.Struct):
@@ -196,6 +205,12 @@ class PollResult(msgspec.Struct, omit_defaults=True):
 class EventsResult(msgspec.Struct, omit_defaults=True):
     enable: bool
     events: list[StoredEvent] = []  # stored events, the oldest first; absent without `since_ns`
+
+
+class HistoryResult(msgspec.Struct, omit_defaults=True):
+    kept_s: int  # maximum number of seconds that imud keeps of each device
+    devices: dict[str, list[Bucket]]  # the oldest bucket first
+    convention: Convention | None = None
 
 
 class NotifyResult(msgspec.Struct):

@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Callable, Collection, Coroutine, Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from math import ceil
 from typing import Any, Final, Generic, TypeVar
 
 import msgspec
@@ -32,9 +33,10 @@ from imud.model.errors import ImudError
 from imud.model.event import EVENTS_MAX
 from imud.model.options import wrong_values
 from imud.model.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA, Sample
-from imud.model.units import NS_PER_MS
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.publishers.socket.admission import Rights
 from imud.publishers.socket.client import ClientConnection
+from imud.publishers.socket.history import KEPT_S, History, buckets, end_ns
 from imud.publishers.socket.hub import Hub
 from imud.publishers.socket.messages import (
     BigNumbers,
@@ -46,6 +48,8 @@ from imud.publishers.socket.messages import (
     EventsParams,
     EventsResult,
     Greeting,
+    HistoryParams,
+    HistoryResult,
     NoParams,
     NothingMore,
     NotifyParams,
@@ -75,6 +79,13 @@ DEVICES_PER_PIECE: Final = 8
 """Number of devices in one piece of a reply: about 0.3 ms; 0.5 ms with big numbers as strings."""
 CLIENTS_PER_PIECE: Final = 64
 """Number of clients in one piece of a reply: about 0.3 ms."""
+BUCKETS_PER_PIECE: Final = 8
+"""Number of buckets in one piece of a reply: about 0.3 ms."""
+HISTORY_DEVICES_MAX: Final = 4
+"""Maximum number of devices of one request of `history`."""
+POINTS_MAX: Final = 1000
+"""Maximum number of buckets of each device in a reply: 0.8 MB."""
+POINTS_DEFAULT: Final = 600
 RATE_MIN_HZ: Final = 0.001
 """Minimum `rate_hz`. A lower rate is probably a wrong unit, and `poll` can replace it."""
 RATE_MAX_HZ: Final = 1_000_000
@@ -334,6 +345,40 @@ def _events(hub: Hub, connection: ClientConnection, params: EventsParams) -> Met
     return MethodReply(EventsResult(enable, past))
 
 
+def _history(hub: Hub, _connection: ClientConnection, params: HistoryParams) -> Pieces:
+    names = _known("device", params.devices, hub.devices)
+    points = POINTS_DEFAULT if params.points is None else params.points
+    if len(names) > HISTORY_DEVICES_MAX:
+        raise RpcError(Code.INVALID_PARAMS, f"devices: expected at most {HISTORY_DEVICES_MAX} names, got {len(names)}")
+    if not 1 <= points <= POINTS_MAX:
+        raise RpcError(Code.INVALID_PARAMS, f"points: expected 1 to {POINTS_MAX}, got {points}")
+    if params.from_ns is not None and params.to_ns is not None and params.from_ns > params.to_ns:
+        message = f"from_ns: expected at most to_ns ({params.to_ns}), got {params.from_ns}"
+        raise RpcError(Code.INVALID_PARAMS, message)
+    if hub.history is None:
+        message = "history: the history is off; set `socket: {history: true}` in the configuration"
+        raise RpcError(Code.UNAVAILABLE, message)
+    return _history_of(hub.history, names, points, params)
+
+
+def _history_of(history: History, names: Iterable[str], points: int, params: HistoryParams) -> Pieces:
+    found: dict[str, list[msgspec.Raw]] = {}
+    held_bytes = 0
+    for name in names:
+        records, frame = history.seconds(name), history.frame(name)
+        newest_ns = end_ns(records) or 0
+        to_ns = newest_ns if params.to_ns is None else min(params.to_ns, newest_ns)
+        oldest_ns = to_ns - KEPT_S * NS_PER_S + 1
+        from_ns = oldest_ns if params.from_ns is None else max(params.from_ns, oldest_ns)
+        period_s = max(1, ceil((to_ns // NS_PER_S - from_ns // NS_PER_S + 1) / points))
+        rotation = None if frame is None or params.convention is None else frame.rotation_to(params.convention)
+        made = buckets(records, from_ns, to_ns, period_s, rotation)
+        found[name] = yield from _encoded(made, BUCKETS_PER_PIECE, texts=False, held_bytes=held_bytes + len(records))
+        held_bytes += sum(map(len, found[name]))
+    result = HistoryResult(history.kept_s, {}, params.convention)
+    return MethodReply(msgspec.structs.asdict(result) | {"devices": found}, big_numbers=False)
+
+
 def _notify(hub: Hub, connection: ClientConnection, params: NotifyParams) -> MethodReply:
     _known_devices(hub, [params.device])
     latency_ms = _latency_ms(params.latency_ms, 0.0)
@@ -430,6 +475,7 @@ METHODS: Final[Mapping[str, Method[Any]]] = {
     "unwatch": Method(NoParams, _unwatch, acts=True, result=NothingMore),
     "poll": Method(PollParams, _poll, result=PollResult),
     "events": Method(EventsParams, _events, acts=True, result=EventsResult),
+    "history": Method(HistoryParams, _history, result=HistoryResult),
     "notify": Method(NotifyParams, _notify, result=NotifyResult),
     "actions": Method(DeviceParams, _actions, result=list[VerbInfo]),
     "command": Method(CommandParams, _command, Rights.CONTROL, acts=True),

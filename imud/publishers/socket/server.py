@@ -35,6 +35,7 @@ from imud.publishers.socket.admission import (
     raise_fd_limit,
 )
 from imud.publishers.socket.client import ClientConnection
+from imud.publishers.socket.history import History
 from imud.publishers.socket.hub import Hub
 from imud.publishers.socket.methods import handle_line, hello
 from imud.publishers.socket.outbox import Limits, Pool
@@ -277,6 +278,9 @@ class SocketOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Maximum queue of a client that does not read, samples: 4096 are 4 s at 1 kHz. imud drops the oldest samples."""
     queue_bytes: Annotated[int, msgspec.Meta(ge=4096, le=1 << 30)] = 4 << 20
     """Maximum queue of a client that does not read, bytes."""
+    history: bool = True
+    """Whether imud keeps minimum and maximum of each second of the last hour for the plots of `imud web`: 0.7 MB for
+    each device, at most 64 MB."""
 
     def __post_init__(self) -> None:
         """Raise ValueError if the path is too long for a socket."""
@@ -299,6 +303,7 @@ class SocketServer:
         limits = Limits(settings.queue_samples, settings.queue_bytes)
         pool = Pool(settings.memory_mb * MIB, limits)
         self.hub = Hub(settings.path, context, self._quota, self._time, pool, handle_line)
+        self.hub.history = History() if settings.history else None
         # direct references: a method of this class would cost one more call per batch
         self.publish: Final = self.hub.publish
         self.event: Final = self.hub.event
