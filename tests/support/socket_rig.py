@@ -204,7 +204,8 @@ async def serving(
     path = directory / "imud.sock"
     own_group = grp.getgrgid(os.getgid()).gr_name
     server = SocketServer(
-        SocketOptions(**{"path": str(path), "group": own_group, **settings}), context(now_ns, latencies, recording)
+        SocketOptions(**{"path": str(path), "group": own_group, "history": True, **settings}),
+        context(now_ns, latencies, recording),
     )
     server.start()
     for name, number in DEVICES.items():
