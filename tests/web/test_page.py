@@ -27,7 +27,8 @@ TEXT_ON = [
 PEAK_EVERY = 40
 POINTS = "return window.imud.view.plots?.get('accel_m_s2').data[0].length >= arguments[0]"
 PLOTTED = """const plot = window.imud.view.plots.get('accel_m_s2');
-    return [plot.plot.data[0].map((x) => x - plot.offset_s), plot.plot.data[6], plot.plot.data[5]]"""
+    const lines = [plot.plot.data[0].map((x) => x - plot.offset_s), plot.plot.data[6], plot.plot.data[5]];
+    return lines.map((one) => one.slice(plot.stored))"""
 
 
 DIRECTIONS = [(x, y, z) for x in (-0.9, 0.1, 0.5) for y in (-0.2, 0.3) for z in (-0.6, 0.4, 1.0)]
@@ -118,7 +119,7 @@ def test_the_page_continues_after_a_restart_of_the_daemon_and_of_imud_web(page: 
             with sent_by(tmp_path, port):
                 page.until_text("#daemon", "imud 0.")
                 page.until("return window.imud.view.plots.get('accel_m_s2').newest > arguments[0] + 1", before)
-                greatest = page.js(PLOTTED)[2]
+                greatest = page.js("return window.imud.view.plots.get('accel_m_s2').data[5]")
                 assert None in greatest, "the line is broken while nothing came"
 
 
@@ -255,6 +256,36 @@ def luminance(color: str) -> float:
     parts = [int(digits[at : at + 2], 16) / 255 for at in (0, 2, 4)]
     red, green, blue = (one / 12.92 if one <= 0.04045 else ((one + 0.055) / 1.055) ** 2.4 for one in parts)
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+def test_the_plots_continue_after_a_reload(page: Page, site: Site) -> None:
+    _, url = site
+    page.driver.get(f"{url}#/device/bow")
+    page.until(POINTS, 80)
+    begin = page.js("return window.imud.view.plots.get('accel_m_s2').data[0].at(-1)")
+    page.driver.refresh()
+    page.until("return window.imud.view.plots?.get('accel_m_s2').stored && window.imud.view.time.stamps.stored")
+    times, greatest, least = page.js("return window.imud.view.plots.get('accel_m_s2').data.slice(0, 3)")
+    assert times[0] < begin
+    assert times == sorted(times)
+    assert greatest[0] >= least[0]
+    assert page.problems() == []
+
+
+def test_a_plot_merges_old_points_without_loss_of_a_peak(scripts: Page) -> None:
+    stored, xs, most, least = scripts.module(
+        """const { RollingPlot } = await import('/static/plots.js');
+        const plot = new RollingPlot('t', 't', 'm', ['x']);
+        for (let t = 0; t < 8000; t += 1) {
+          const range = t === 7003 ? [[-7], [9]] : [[1], [2]];
+          if (t < 6000 || t > 6100) plot.add({ first_s: t, last_s: t, utc_s: t, seq: t, count: 1 }, range, 1);
+        }
+        return [plot.stored, ...plot.data]"""
+    )
+    assert 8000 - 3600 - 60 <= xs[0] < 8000 - 3500
+    assert xs == sorted(xs)
+    assert len(xs) - stored <= 662
+    assert (most.index(9), most.count(9), most.count(None)) == (least.index(-7), 1, 1), "one peak and one gap"
 
 
 def test_a_hidden_page_reads_nothing(page: Page, site: Site) -> None:

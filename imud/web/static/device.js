@@ -10,9 +10,12 @@ import { SettingsSection } from "./settings.js";
 import { SECTIONS } from "./shell.js";
 import { TimeSection } from "./time.js";
 import { button, icon, toast } from "./ui.js";
-import { clock, copy, el, setText } from "./util.js";
+import { call, clock, copy, el, setText } from "./util.js";
 
 const PHONE = matchMedia("(max-width: 820px)");
+const HOUR = { points: 600, period_s: 6 };
+const RECENT_S = 599; // the newest part of the history has a point per second
+const GAP_S = 5; // time without buckets after which the page requests the history
 
 export class DevicePage {
   constructor(main, name, stream, shell) {
@@ -36,6 +39,7 @@ export class DevicePage {
     main.append(head, this.condition.node, this.trouble, this.missing, this.sections);
     this.spy();
     this.look();
+    this.restore();
   }
 
   look() {
@@ -53,6 +57,27 @@ export class DevicePage {
     this.events.load();
     this.settings.load();
     this.calibration.load();
+    this.restore();
+  }
+
+  /** Show the history of the daemon in the plots. */
+  async restore() {
+    if (this.isRestoring) return;
+    this.isRestoring = true;
+    const get = async (more) => (await call("history", { devices: [this.name], points: HOUR.points, ...more })).devices[this.name];
+    try {
+      const hour = await get({});
+      const from_s = (hour.at(-1)?.last_s ?? 0) - RECENT_S;
+      const recent = hour.length ? await get({ from_ns: Math.round(from_s * 1e9) }) : [];
+      const end_s = (recent.at(-1)?.last_s ?? 0) - 1; // the newest second is not complete
+      const older = hour.filter((one) => one.last_s < Math.floor(from_s)).map((one) => [one, HOUR.period_s]);
+      const buckets = [...older, ...recent.filter((one) => one.last_s < end_s).map((one) => [one, 1])];
+      for (const part of [this.live, this.time]) part.restore(buckets);
+    } catch {
+      // without the history, the plots begin with the page
+    } finally {
+      this.isRestoring = false;
+    }
   }
 
   onPause() {
@@ -76,6 +101,8 @@ export class DevicePage {
     if (message.kind === "raw") this.live.addRaw(message);
     if (message.kind === "samples" && message.rate_hz === this.live.rate_hz && !this.live.isPaused) {
       for (const bucket of message.buckets) {
+        if (bucket.first_s - this.last_s > GAP_S) this.restore(); // this page was hidden or not connected
+        this.last_s = bucket.last_s;
         this.live.add(bucket);
         this.time.add(bucket, 1 / message.rate_hz);
       }

@@ -7,7 +7,7 @@ import { button, icon, section, segmented, toggle } from "./ui.js";
 import { AXES, DEGREE, duration, el, number, setText } from "./util.js";
 
 const RATES_HZ = [10, 20, 50];
-const SPANS = [["10", "10 s"], ["30", "30 s"], ["60", "1 min"], ["600", "10 min"]];
+const SPANS = [["10", "10 s"], ["30", "30 s"], ["600", "10 min"], ["3600", "1 h"]];
 const ANGLES = ["roll", "pitch", "yaw"];
 const PLOTS = [
   ["accel_m_s2", "Acceleration", "m/s²", AXES, { decimals: 2, lanes: true }],
@@ -79,7 +79,6 @@ export class LiveSection {
 
   setRate(rate_hz) {
     this.rate_hz = rate_hz;
-    for (const plot of [...this.plots.values(), this.free]) plot.clear();
     this.onLook();
   }
 
@@ -121,6 +120,15 @@ export class LiveSection {
     const gravity = quat_wxyz && accel_m_s2 ? gravityOf(quat_wxyz, this.frame) : null;
     this.free.add(bucket, gravity && accel_m_s2.map((one) => one.map((value, axis) => value - gravity[axis])), period_s);
     if (euler_rad) euler_rad[1].forEach((one, axis) => setText(this.angles[axis].value, `${number(one / DEGREE, 1)}°`));
+  }
+
+  /** Show buckets of the history. Gravity needs the attitude of each sample, so its plot begins with the page. */
+  restore(buckets) {
+    for (const [member, plot] of this.plots) {
+      if (!buckets.some(([bucket]) => bucket[member])) continue;
+      if (!(member === "accel_m_s2" && this.isFree)) plot.node.hidden = false;
+      plot.restore(buckets, (bucket) => bucket[member] ?? null);
+    }
   }
 
   addRaw(message) {

@@ -8,8 +8,10 @@ export const COLOURS = ["#d1495b", "#2e8b57", "#3a7bd5"];
 const AREA = "40"; // opacity, in hexadecimal
 const DRAW_MS = 66;
 const HOLE_BUCKETS = 3; // number of periods without buckets that breaks the line
-const KEPT_S = 600; // time span of the data that a plot keeps
-const SPLICE_MIN = 64; // number of old points that a plot removes together
+const KEPT_S = 3600; // time span of the data that a plot keeps
+const FINE_S = 600; // age at which a plot merges points
+const MERGED_S = 6; // time span of a merged point
+const MERGE_S = 60; // time span of the points that a plot merges together
 const LANE_MARGIN = 0.12; // free share of the height of a lane, above and below its curve
 const STEP = 0.2; // share of the time range by which a key moves the cursor or zooms
 
@@ -68,6 +70,7 @@ export class RollingPlot {
     group.plots.push(this);
     this.offset_s = null; // from the daemon's clock to UTC, constant after the first bucket
     this.losses = []; // times of lost samples
+    this.stored = 0; // number of the first points that are merged or from the history of the daemon
     this.hidden = new Set(); // indexes of hidden lines
     this.values = axes.map((name, index) => this.key(name, index));
     const keys = el("div", { class: "keys" }, this.values.map((one) => one.node));
@@ -200,7 +203,7 @@ export class RollingPlot {
     const x = (bucket.first_s + bucket.last_s) / 2 + this.offset_s;
     const xs = this.data[0];
     const before = xs.at(-1);
-    if (before !== undefined && x <= before) this.data.forEach((one) => (one.length = 0)); // the host has restarted
+    if (before !== undefined && x <= before) this.data.forEach((one) => (one.length = this.stored = 0)); // the host has restarted
     else if (before !== undefined && x - before > HOLE_BUCKETS * Math.max(period_s, this.step_s ?? 0)) {
       this.push(before + period_s, null);
       this.step_s = undefined;
@@ -209,12 +212,63 @@ export class RollingPlot {
     this.seq = bucket.seq;
     this.push(x, range);
     this.newest = x;
-    let old = 0;
-    while (xs[old] < x - KEPT_S) old += 1;
-    if (old > SPLICE_MIN) {
-      this.data.forEach((one) => one.splice(0, old));
-      this.losses = this.losses.filter((one) => one >= xs[0]);
+    if (xs[this.stored] < x - FINE_S - MERGE_S) this.merge();
+    this.draw();
+  }
+
+  /** Merge the points that are older than FINE_S, and remove the points that are older than KEPT_S. */
+  merge() {
+    const xs = this.data[0];
+    const isGap = (at) => this.data.every((one, line) => !line || one[at] === null);
+    const merged = this.data.map(() => []);
+    const slot = (at) => Math.floor(xs[at] / MERGED_S);
+    let end = this.stored;
+    while (xs[end] < this.newest - FINE_S) {
+      const first = end;
+      while (xs[end] < this.newest - FINE_S && slot(end) === slot(first) && isGap(end) === isGap(first)) end += 1;
+      const part = this.data.map((one) => one.slice(first, end).filter((value) => value !== null));
+      merged[0].push((part[0][0] + part[0].at(-1)) / 2);
+      this.axes.forEach((_, index) => {
+        const [most, least] = [Math.max(...part[1 + 2 * index]), Math.min(...part[2 + 2 * index])];
+        const isKept = part[1 + 2 * index].length && !(this.isAngle && most - least > Math.PI * this.scale);
+        merged[1 + 2 * index].push(isKept ? most : null);
+        merged[2 + 2 * index].push(isKept ? least : null);
+      });
     }
+    this.data.forEach((one, line) => one.splice(this.stored, end - this.stored, ...merged[line]));
+    this.stored += merged[0].length;
+    let old = 0;
+    while (xs[old] < this.newest - KEPT_S) old += 1;
+    this.data.forEach((one) => one.splice(0, old));
+    this.stored -= old;
+    this.losses = this.losses.filter((one) => one >= xs[0]);
+  }
+
+  /** Insert buckets of the history, [bucket, length in s] each, in place of the points of this time. rangeOf(bucket)
+   *  returns minimum and maximum per axis. */
+  restore(buckets, rangeOf) {
+    if (!buckets.length) return;
+    const live = this.data;
+    const { utc_s, last_s } = buckets.at(-1)[0];
+    this.offset_s ??= utc_s - last_s;
+    const xOf = (bucket) => (bucket.first_s + bucket.last_s) / 2 + this.offset_s;
+    const [first, last] = [xOf(buckets[0][0]), xOf(buckets.at(-1)[0])];
+    const [begin, end] = [first, last].map((x, index) => live[0].filter((one) => (index ? one <= x : one < x)).length);
+    this.data = live.map((one) => one.slice(0, begin));
+    this.losses = this.losses.filter((one) => one < first || one > last);
+    if (begin && first - live[0][begin - 1] > HOLE_BUCKETS * buckets[0][1]) this.push((live[0][begin - 1] + first) / 2, null);
+    let before = null;
+    for (const [bucket, period_s] of buckets) {
+      const x = xOf(bucket);
+      if (before && bucket.first_s - before.last_s > period_s) this.push(before.last_s + this.offset_s, null);
+      if (before && bucket.seq - before.seq > bucket.count) this.losses.push(x);
+      this.push(x, rangeOf(bucket));
+      before = bucket;
+    }
+    this.stored = this.data[0].length;
+    this.data = this.data.map((one, line) => one.concat(live[line].slice(end)));
+    this.newest = Math.max(this.newest ?? last, last);
+    if (this.stored === this.data[0].length) this.step_s = 1; // the incomplete second is no gap
     this.draw();
   }
 
@@ -239,6 +293,7 @@ export class RollingPlot {
     this.data.forEach((one) => (one.length = 0));
     this.offset_s = null;
     this.losses = [];
+    this.stored = 0;
     this.seq = undefined;
   }
 

@@ -28,6 +28,10 @@ export class TimeSection {
     this.stamps.add(bucket, [stamp, stamp], period_s);
   }
 
+  restore(buckets) {
+    this.stamps.restore(buckets, ({ t_err_s, latency_s }) => [[t_err_s, latency_s], [t_err_s, latency_s]]);
+  }
+
   draw({ status, latency_bounds_s }) {
     const { clock } = status;
     const source = SYNC[clock.sync] ?? clock.sync;
