@@ -334,7 +334,7 @@ def test_ring_of_another_daemon_is_not_replaced(tmp_path: Path, caplog: pytest.L
         ]
         other.kill()
         other.wait()
-        board.tick(1_000_000_000)
+        board.tick()
     assert (board.path.stat().st_ino == inode, board.word("newest_seq"), board.word("first_seq")) == (False, 1, 2)
     board.publisher.close()
 
@@ -383,7 +383,7 @@ def test_full_memory_delays_the_ring(
         patch.setattr(os, "posix_fallocate", refuse)
         board = Board(tmp_path)
         for _ in range(30):
-            board.tick()
+            board.tick(100_000_000)
         board.publish([1, 2, 3])
     assert [(at - START_NS) // 1_000_000 for at in tries] == [0, 100, 1100, 2100]
     assert len(os.listdir("/proc/self/fd")) == descriptors + 1  # the descriptor of the directory
@@ -391,7 +391,7 @@ def test_full_memory_delays_the_ring(
     [record] = (record for record in caplog.records if record.levelno == logging.ERROR)
     assert re.search(r"imud.imu0 with 20480 bytes: No space left .* reduce shm.slots", record.getMessage())
     assert not list(tmp_path.iterdir())
-    board.tick(1_000_000_000)
+    board.tick()
     with Ring(board.path, now_ns=lambda: board.now_ns) as reader:
         board.publish([4])
         assert [s.seq for s in reader.read().samples] == [4]
@@ -399,7 +399,7 @@ def test_full_memory_delays_the_ring(
     assert (board.context.outputs.rings, board.context.outputs.without_ring) == ({DEVICE: str(board.path)}, set())
     monkeypatch.setattr(os, "posix_fallocate", refuse)
     board.path.unlink()
-    board.tick(1_000_000_000)
+    board.tick()
     assert board.context.outputs.without_ring == {DEVICE}
     board.publisher.close()
     assert not board.context.outputs.without_ring

@@ -77,7 +77,7 @@ class Board:
         if samples:  # a batch has at least one sample
             self.publisher.publish(Batch(DEVICE, 3, samples))
 
-    def tick(self, later_ns: int = 100_000_000) -> None:
+    def tick(self, later_ns: int = 1_000_000_000) -> None:
         self.now_ns += later_ns
         self.publisher.tick(self.now_ns)
 
