@@ -484,8 +484,8 @@ class ConditionWatch:
 
     @property
     def is_ok(self) -> bool:
-        """Whether no reason counts, and no cause of a reason exists or ended a short time ago."""
-        return self.level is Condition.OK and not self._causes
+        """Whether no reason counts, no cause of a reason exists or ended a short time ago, and samples arrive."""
+        return self.level is Condition.OK and not self._causes and self._missing_ns is None
 
     @property
     def history(self) -> tuple[Condition | None, ...]:

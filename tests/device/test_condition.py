@@ -370,12 +370,14 @@ class Judged:
         events = DeviceEvents("imu0", self.ledger, lambda _event: None)
         self.judge = ConditionJudge(device_config, PORT.port, self.ledger, events, 0)
 
-    def is_steady(self, seconds: int = 1, samples: int = 50, problem: str = "") -> bool:
+    def is_steady(
+        self, seconds: int = 1, samples: int = 50, problem: str = "", state: DeviceState = DeviceState.RUNNING
+    ) -> bool:
         """Pass seconds. Return whether no rule ran in the last second."""
         for _ in range(seconds):
             self.now_ns += S
             self.ledger.samples += samples
-            known = {"state": DeviceState.RUNNING, "problem": problem}
+            known = {"state": state, "problem": problem}
             has_run = self.judge.judge(self.now_ns, 50.0, 0, self.now_ns, 0, known)
         return not has_run
 
@@ -394,6 +396,16 @@ def test_the_rules_run_again_after_a_change_of_a_fact() -> None:
     assert judged.is_steady(2)
     assert not judged.is_steady(10, samples=40)
     assert judged.judge.watch.condition.condition is Condition.DEGRADED
+
+
+def test_a_device_without_samples_is_missing_after_5_s_without_another_change() -> None:
+    judged = Judged()
+    judged.is_steady(20)
+    levels = []
+    for seconds in (5, 1):
+        judged.is_steady(seconds, samples=0, state=DeviceState.SILENT)
+        levels.append(judged.judge.watch.level)
+    assert levels == [Condition.OK, Condition.MISSING]
 
 
 def test_restarts_of_the_last_hour() -> None:
