@@ -51,7 +51,7 @@ def test_an_input_asks_for_both_edges_and_a_large_buffer(gpiod: FakeGpiod, tmp_p
     line.open()
     assert line.title == "gpiochip0 line 0 (SOUT)"
     ((chip, offset, consumer, events),) = gpiod.asked
-    assert (chip, offset, events) == ("gpiochip0", 0, gpio.KERNEL_EVENTS)
+    assert (chip, offset, events) == ("gpiochip0", 0, 1024)
     assert consumer == "imud bow sout " + "x" * 17
     asked = gpiod.requests[0].settings
     assert (asked.direction, asked.edge_detection, asked.event_clock) == (
@@ -96,11 +96,10 @@ async def test_many_edges_are_read_in_batches_but_not_for_ever(gpiod: FakeGpiod,
     line, sink = gpio.GpioInput(SOUT, devices=tmp_path), Sink()
     line.open()
     line.start(sink.on_edges, sink.on_end)
-    count = gpio.KERNEL_EVENTS + gpio.READ_EVENTS
+    count = 1024 + 64
     gpiod.requests[0].feed(*((n, 1, n) for n in range(1, count + 1)))
     line.drain()
-    assert len(sink.edges) == gpio.KERNEL_EVENTS
-    assert sink.calls == gpio.KERNEL_EVENTS // gpio.READ_EVENTS
+    assert (len(sink.edges), sink.calls) == (1024, 1024 // 64)
     async with asyncio.timeout(LIMIT_S):
         while len(sink.edges) < count:
             await asyncio.sleep(0)
@@ -117,9 +116,9 @@ async def test_a_line_closed_by_the_handler_of_its_edges(gpiod: FakeGpiod, tmp_p
         line.close()
 
     line.start(on_edges, sink.on_end)
-    gpiod.requests[0].feed(*((n, 1, n) for n in range(1, gpio.READ_EVENTS * 3)))
+    gpiod.requests[0].feed(*((n, 1, n) for n in range(1, 64 * 3)))
     await sink.wait()
-    assert (len(sink.edges), sink.end) == (gpio.READ_EVENTS, None)
+    assert (len(sink.edges), sink.end) == (64, None)
 
 
 @in_loop
@@ -190,7 +189,9 @@ def test_an_output_is_inactive_from_its_first_moment_to_its_last(gpiod: FakeGpio
     assert request.released
 
 
-def test_an_output_whose_chip_vanishes_or_that_is_no_line(gpiod: FakeGpiod, tmp_path: Path) -> None:
+def test_an_output_whose_chip_vanishes_or_that_is_no_line(
+    gpiod: FakeGpiod, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def gone(_fd: int, _active: bool) -> None:
         raise OSError(errno.ENODEV, "by the test")
 
@@ -208,6 +209,13 @@ def test_an_output_whose_chip_vanishes_or_that_is_no_line(gpiod: FakeGpiod, tmp_
     with pytest.raises(LinkError, match="cannot be used: Inappropriate ioctl"):
         line.set(True)
     line.close()
+    calls: list[tuple[int, int, list[int]]] = []
+    monkeypatch.setattr(gpio, "_ioctl", lambda fd, request, levels: calls.append((fd, request, [*levels])) or 0)
+    for active in (True, False):
+        gpio.set_line(9, active)
+    # _IOWR(0xB4, 0x0F, two u64): direction 3, size 16
+    request = 3 << 30 | 16 << 16 | 0xB4 << 8 | 0x0F
+    assert calls == [(9, request, [1, 1]), (9, request, [0, 1])]
 
 
 def test_size_of_the_kernel_struct() -> None:

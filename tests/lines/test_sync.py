@@ -15,7 +15,7 @@ from imud.contracts.lines import (
     SoutOptions,
     TriggerOptions,
 )
-from imud.lines.sync import ALARM_STATUS, LineVerbs, SyncSignals
+from imud.lines.sync import LineVerbs, SyncSignals
 from imud.model.errors import CommandError, LinkBusy, LinkError
 from imud.model.event import EventKind
 from imud.model.sample import Measurement
@@ -25,6 +25,7 @@ from tests.support.event_loops import in_loop
 from tests.support.signal_bench import DEVICE, SignalBench
 
 RETRY_NS = 5 * 10**9
+ALARM_STATUS = 1 << 31  # docs/lines.md
 
 ALL = DeviceLines(
     sout=SoutOptions(line="A"), sout_div=DividedOptions(line="B"), pps=PpsOptions(line="C"),

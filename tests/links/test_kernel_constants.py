@@ -4,7 +4,7 @@ import socket
 
 import pytest
 
-from imud.links import cyclic_sender, device_node, netlink, serial_port, socketcan, spi
+from imud.links import cyclic_sender, device_node, i2c, netlink, rs485, serial_port, socketcan, spi
 
 
 def write_ioctl(letter: str, number: int, size: int) -> int:
@@ -40,7 +40,11 @@ EXPECTED = {
         "WR_MODE": write_ioctl("k", 1, 1), "WR_BITS_PER_WORD": write_ioctl("k", 3, 1),
         "WR_MAX_SPEED_HZ": write_ioctl("k", 4, 4),
     },
-    serial_port: {"TIOCGICOUNT": 0x545D},  # asm-generic/ioctls.h
+    # linux/i2c-dev.h
+    i2c: {"I2C_TIMEOUT": 0x0702},
+    # asm-generic/ioctls.h; linux/serial.h: flags, and the number of counters; asm-generic/termbits.h: 44 bytes
+    rs485: {"TIOCGRS485": 0x542E, "TIOCSRS485": 0x542F, "ENABLED": 1, "RTS_ON_SEND": 2},
+    serial_port: {"TIOCGICOUNT": 0x545D, "ICOUNTER_INTS": 20, "TERMIOS2_INTS": 44 // 4},
 }  # fmt: skip
 
 

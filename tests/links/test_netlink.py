@@ -1,6 +1,7 @@
 """Network interfaces: existence from a file tree, details from prepared netlink replies, and waits for changes."""
 
 import asyncio
+import socket
 import struct
 from pathlib import Path
 
@@ -40,7 +41,9 @@ def answer(info: bytes) -> bytes:
     return struct.pack("=IHHII", 16 + len(body), 16, 0, 1, 0) + body
 
 
-def test_details_of_an_interface() -> None:
+def test_details_of_an_interface(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits_s: list[float] = []
+    monkeypatch.setattr(socket.socket, "settimeout", lambda _socket, limit_s: limits_s.append(limit_s))
     timing = struct.pack("=8I", 250_000, 875, 0, 0, 0, 0, 0, 0)
     data = attribute(1, timing) + attribute(4, struct.pack("=I", 3))
     info = attribute(1, b"can\0") + attribute(2, data)
@@ -49,7 +52,7 @@ def test_details_of_an_interface() -> None:
     assert parse_details(answer(b"")) == CanDetails(None, None)
     assert parse_details(struct.pack("=IHHIIi", 20, 2, 0, 1, 0, -19)) == CanDetails(None, None)
     assert parse_details(answer(attribute(2, b"\1\0\1\0"))[:-1]) == CanDetails(None, None)
-    assert can_details("lo") == CanDetails(None, None)
+    assert (can_details("lo"), limits_s) == (CanDetails(None, None), [1])
     with pytest.raises(LinkError, match="nosuch0"):
         can_details("nosuch0")
 

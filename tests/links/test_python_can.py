@@ -86,9 +86,11 @@ class FakeBus:
     def __init__(self, *messages: can.Message) -> None:
         self.messages = list(messages)
         self.sent: list[can.Message] = []
+        self.timeouts_s: set[float] = set()
         self.is_shut_down = False
 
-    def recv(self, _timeout: float) -> can.Message | None:
+    def recv(self, timeout_s: float) -> can.Message | None:
+        self.timeouts_s.add(timeout_s)
         return self.messages.pop(0) if self.messages else None
 
     def send(self, message: can.Message, timeout: float) -> None:
@@ -101,17 +103,18 @@ class FakeBus:
 
 @in_loop
 async def test_only_data_frames_are_delivered_and_nothing_after_close(monkeypatch: pytest.MonkeyPatch) -> None:
-    kinds: list[dict[str, bool]] = [{}, {"is_error_frame": True}, {"is_remote_frame": True}, {"is_fd": True}, {}]
+    kinds = [{}, {"is_error_frame": True}, {"is_remote_frame": True}, {"is_fd": True}, *[dict[str, bool]()] * 64]
     bus = FakeBus(*(can.Message(arbitration_id=n, is_extended_id=False, **kind) for n, kind in enumerate(kinds)))
     monkeypatch.setattr(can, "Bus", lambda *_, **__: bus)
-    got: list[int] = []
+    got: list[list[int]] = []
     link = make("fake")
     link.open()
     first = asyncio.Event()
 
     def on_frames(frames: Sequence[CanFrame]) -> None:
-        got.extend(frame.can_id for frame in frames)
-        first.set()
+        got.append([frame.can_id for frame in frames])
+        if len(got) == 2:
+            first.set()
 
     link.start(on_frames, lambda news, problem: None, lambda error: None)
     await asyncio.wait_for(first.wait(), LIMIT_S)
@@ -119,8 +122,8 @@ async def test_only_data_frames_are_delivered_and_nothing_after_close(monkeypatc
     wait_until(lambda: not bus.messages, "the thread has read the frame")
     link.close()
     await asyncio.sleep(0.01)  # the loop would deliver the frame now
-    assert got == [0, 4]
-    assert bus.is_shut_down
+    assert got == [[0, *range(4, 67)], [67]]
+    assert (bus.is_shut_down, bus.timeouts_s) == (True, {0, 0.05})
 
 
 @in_loop

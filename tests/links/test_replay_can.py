@@ -12,7 +12,7 @@ import pytest
 from imud.contracts.link import CanLink
 from imud.formats.can import CanFilter, CanFrame
 from imud.links import LINKS
-from imud.links.replay import TURN_FRAMES, CanReplayLink, ReplayOptions, _problem
+from imud.links.replay import CanReplayLink, ReplayOptions, _problem
 from imud.model.errors import LinkError, LinkMissing
 from tests.support.event_loops import VirtualClock, run_virtually
 from tests.support.files import candump_line
@@ -57,7 +57,7 @@ def play(
         done = asyncio.Event()
 
         def on_frames(some: Sequence[CanFrame]) -> None:
-            assert len(some) <= TURN_FRAMES, "others get their turn"
+            assert len(some) <= 512, "others get their turn"
             frames.extend(some)
             if len(frames) >= enough:
                 link.close()
@@ -114,11 +114,13 @@ def test_what_cannot_be_played(tmp_path: Path) -> None:
         missing.open()
     with pytest.raises(LinkError, match="replay"):
         missing.write(b"")
-    log = write(tmp_path / "a.log", 3)
+    log, long = write(tmp_path / "a.log", 3), tmp_path / "long"
+    long.write_bytes(b"#" * 65536)
     for path, frames, interface, expected in (
         (bad, True, "can0", "is not a CAN log: expected frames in the format of `candump -L`, got none"),
         (bad, False, "", "is a raw capture without times: use speed real with the key baud, or speed maximum"),
         (log, True, "can0", ""), (log, True, "", ""), (tmp_path / "missing", True, "", ""),
+        (long, True, "", ""), (long, True, "can0", ""),  # frames can follow
         (tmp_path, False, "", "is not a regular file: expected a capture file"),
     ):  # fmt: skip
         settings = ReplayOptions(path=str(path), interface=interface)
