@@ -99,7 +99,7 @@ def test_every_link_says_that_its_port_is_not_there_and_what_to_look_at(link: st
 def test_access_that_is_not_granted_is_waited_for_no_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("imud.links.device_node.os.access", lambda *_arguments, **_more: False)
     limits_s, timeout = list[float](), asyncio.timeout
-    monkeypatch.setattr(asyncio, "timeout", lambda limit_s: limits_s.append(limit_s) or timeout(0))
+    monkeypatch.setattr(asyncio, "timeout", lambda limit_s: limits_s.append(limit_s) or timeout(0))  # type: ignore[func-returns-value]
     asyncio.run(DeviceNode(str(tmp_path), "").wait_present())
     assert limits_s == [1]
 

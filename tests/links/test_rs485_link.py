@@ -11,6 +11,7 @@ import os
 import select
 import struct
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
@@ -38,6 +39,7 @@ from imud.links.serial_port import TtyCounters, open_port
 from imud.model.errors import LinkBusy, LinkError, LinkMissing, TransferError, Trouble
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
+from imud.model.units import uart_byte_ns
 from tests.drivers.hipnuc.modbus.test_codec import SENSORS
 from tests.support.daemon_process import LIMIT_S, wait_until
 from tests.support.pty_port import BAUD, PtyPort, serial_of, slave, waiting_bytes, wired
@@ -318,10 +320,20 @@ def test_garbage_instead_of_a_reply_is_reported(pty: PtyPort) -> None:
         speaker.join(LIMIT_S)
 
 
-def test_request_to_all_expects_no_reply(tmp_path: Path) -> None:
+def test_request_to_all_expects_no_reply(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After it, imud waits for 100 ms ("MODBUS over Serial Line" 2.4.1) and the time of the request."""
+    sleep, pauses_ns = rs485.Rs485Line._sleep_until, list[int]()
+
+    def sleep_until(line: rs485.Rs485Line, deadline_ns: int) -> None:
+        pauses_ns.append(deadline_ns - time.monotonic_ns())
+        sleep(line, deadline_ns)
+
+    monkeypatch.setattr(rs485.Rs485Line, "_sleep_until", sleep_until)
     with wired(tmp_path, slave(1), slave(2), echo=True) as (path, line), opened(path) as link:
         link.select(0)
-        assert link.transfer(set_id_by_serial(serial_of(2).hex(), 33)) == b""
+        request = set_id_by_serial(serial_of(2).hex(), 33)
+        assert link.transfer(request) == b""
+        assert max(pauses_ns) <= 100_000_000 + (len(request.sends[0]) + 3) * uart_byte_ns(BAUD)
         wait_until(lambda: line.slaves[1].settings.slave == 33, "the module has its address")
         link.select(33)
         assert link.transfer(SERIAL)[3:11] == serial_of(2)

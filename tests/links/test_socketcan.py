@@ -15,7 +15,14 @@ import pytest
 
 from imud.formats.can import RAW_FRAME, CanFrame, pack_frame
 from imud.links import netlink
-from imud.links.socketcan import BusState, ControllerState, FrameReader, SocketCanLink, SocketCanOptions
+from imud.links.socketcan import (
+    SO_TIMESTAMPNS_NEW,
+    BusState,
+    ControllerState,
+    FrameReader,
+    SocketCanLink,
+    SocketCanOptions,
+)
 from imud.model.errors import LinkError, LinkMissing
 from tests.support.daemon_process import LIMIT_S
 
@@ -240,6 +247,20 @@ def test_what_gathers_is_read_when_nothing_may_wait_any_more(ends: Ends) -> None
     assert len(bus.delays_s) == 1
 
 
+def test_a_full_bus_leaves_the_loop_time_for_others(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    class FullBus(FrameReader):
+        def read(self) -> list[CanFrame]:
+            return [CanFrame(1, False, b"", 0)] * 64
+
+    async def story(bus: Bus) -> None:
+        bus.send(1)
+        await bus.until(lambda: bus.looks)
+        assert len(bus.batches) == 1 + bus.looks * 1024 // 64
+
+    monkeypatch.setattr("imud.links.socketcan.FrameReader", FullBus)
+    Bus(ends, GATHER_MS).run(story)
+
+
 def test_no_more_gathers_than_half_the_buffer_holds(ends: Ends) -> None:
     async def story(bus: Bus) -> None:
         room = ends[0].getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 960
@@ -462,6 +483,19 @@ def test_a_frame_is_no_older_than_the_read_that_emptied_the_queue(wire: Wire) ->
     wire.wall_ahead_ns += HOUR_NS
     (frame,) = wire.read()
     assert begun_ns <= frame.t_rx_ns <= wire.now_ns
+
+
+def test_limits_of_a_step_and_of_a_backlog(wire: Wire) -> None:
+    """An offset changes by a step from 100 us. A frame waited in a queue if its stamp is over 5 ms too old."""
+
+    def stamps(offset_ns: int, now_ns: int, *times_ns: int) -> list[int]:
+        reader = FrameReader(wire.receiver, BusState("can0"), lambda: 0, lambda: 0)
+        rows = [((1, 0, bytes(8)), (SO_TIMESTAMPNS_NEW, 0, t_ns, 0, 0)) for t_ns in (20_000_000 + offset_ns, *times_ns)]
+        return [frame.t_rx_ns for frame in reader._decoded(rows, offset_ns, now_ns)][1:]
+
+    assert stamps(99_999, 21_000_000, 20_050_000) == [20_000_000]
+    assert stamps(100_000, 21_000_000, 20_050_000) == [20_050_000]
+    assert stamps(0, 21_000_000, 15_000_000, 14_999_999) == [20_000_000, 21_000_000]
 
 
 def test_clocks_that_are_always_read_apart_give_the_closest_of_some_readings(wire: Wire) -> None:

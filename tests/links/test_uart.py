@@ -17,7 +17,7 @@ from imud.contracts.link import StreamLink
 from imud.contracts.status import KernelCounters
 from imud.links import LINKS
 from imud.links.serial_port import baud_of
-from imud.links.uart import FULL_READ_BYTES, WRITE_QUEUE_BYTES, UartLink, UartOptions
+from imud.links.uart import UartLink, UartOptions
 from imud.model.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
 from imud.model.units import NS_PER_MS
 from tests.support.daemon_process import LIMIT_S, wait_until
@@ -118,7 +118,7 @@ def test_what_the_port_does_not_take_is_queued_in_order_and_bounded(pty: PtyPort
             for block in blocks:
                 link.write(block)
                 accepted += 1
-        assert accepted * 1000 > WRITE_QUEUE_BYTES
+        assert accepted * 1000 > 4096
         assert await drained(pty, accepted * 1000) == b"".join(blocks[:accepted])
 
     play(link, scene)
@@ -141,9 +141,9 @@ def test_what_is_sent_later_waits_behind_the_queue(pty: PtyPort) -> None:
 def test_the_queue_has_a_largest_size_and_ends_with_the_link(pty: PtyPort) -> None:
     async def scene(_receiver: Receiver) -> None:
         with pytest.raises(LinkError, match="0 bytes wait"):
-            link.write(bytes(WRITE_QUEUE_BYTES + 1))
+            link.write(bytes(4096 + 1))
         sent = pty.fill()
-        link.write(bytes(WRITE_QUEUE_BYTES))
+        link.write(bytes(4096))
         with pytest.raises(LinkError, match="bytes wait"):
             link.write(b"x")
         numbers = [int(name) for name in os.listdir("/proc/self/fd")]
@@ -401,8 +401,8 @@ def test_a_paused_port_keeps_what_comes_until_it_is_taken(pty: PtyPort) -> None:
         link.pause()
         sent = bytes(range(256)) * 32  # more than the limit of one read
         taken = b""
-        for at in range(0, len(sent), FULL_READ_BYTES):
-            pty.send(sent[at : at + FULL_READ_BYTES])
+        for at in range(0, len(sent), 2048):
+            pty.send(sent[at : at + 2048])
         while len(taken) < len(sent):
             taken += link.take()
         assert taken == sent
@@ -414,10 +414,10 @@ def test_a_paused_port_keeps_what_comes_until_it_is_taken(pty: PtyPort) -> None:
 def test_a_full_read_is_followed_by_another(pty: PtyPort, monkeypatch: pytest.MonkeyPatch) -> None:
     async def scene(_receiver: Receiver) -> None:
         link.pause()
-        pieces = iter([bytes(FULL_READ_BYTES), b"last"])
+        pieces = iter([bytes(2048), b"last"])
         with monkeypatch.context() as patch:
             patch.setattr(os, "read", lambda _fd, _size: next(pieces))
-            assert link.take() == bytes(FULL_READ_BYTES) + b"last"
+            assert link.take() == bytes(2048) + b"last"
 
     link = UartLink(UartOptions(port=pty.path))
     play(link, scene)
@@ -463,6 +463,7 @@ def test_the_row_and_its_settings() -> None:
     settings = msgspec.convert({"port": "/dev/ttyUSB0", "baud": "auto"}, row.settings)
     link: StreamLink = row.make(settings)
     assert (link.title, link.auto_baud, link.baud, link.writable) == ("/dev/ttyUSB0", True, 115200, True)
+    assert link.waiting_bytes == 2048, "half of the buffer of n_tty"
     assert not row.make(msgspec.convert({"port": "a", "baud": 9600}, row.settings)).auto_baud
     for wrong in ({}, {"port": ""}, {"baud": 0}, {"baud": "fast"}, {"speed": 9600}):
         with pytest.raises(msgspec.ValidationError):
