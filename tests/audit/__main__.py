@@ -6,13 +6,12 @@ Exits with 1 when an item has no code or no test.
 import sys
 from collections.abc import Iterator
 
+from tests.audit import manuals
 from tests.audit.descriptions import described
 from tests.audit.item import Item, faults, marks
-from tests.audit.manual_a import MANUAL_A
-from tests.audit.manual_b import MANUAL_B
 
 TITLES = {"A": "Forsense IMU61x", "B": "HiPNUC CH0x0, CH10x, HI14"}
-ITEMS = {item.key: item for item in (*MANUAL_A, *MANUAL_B)}
+ITEMS = {item.key: item for item in manuals.ITEMS}
 
 
 def report(marked: dict[str, list[str]]) -> Iterator[str]:
