@@ -16,7 +16,7 @@ from imud.contracts.lines import (
     TriggerOptions,
 )
 from imud.lines.sync import LineVerbs, SyncSignals
-from imud.model.errors import CommandError, LinkBusy, LinkError
+from imud.model.errors import BadArgument, CommandError, LinkBusy, LinkError
 from imud.model.event import EventKind
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_MS, NS_PER_S
@@ -115,11 +115,14 @@ async def test_the_alarm_is_in_the_samples_of_each_clock() -> None:
 async def test_one_edge_by_command_where_there_is_sin() -> None:
     bench = SyncBench()
     assert bench.signals.can_trigger
-    assert [*LineVerbs(None, bench.signals).rows] == [TRIGGER_VERB]
+    verbs = LineVerbs(None, bench.signals)
+    assert [*verbs.rows] == [TRIGGER_VERB]
     with pytest.raises(CommandError, match="trigger: bow sin is not driven"):
-        bench.signals.trigger_once()
+        await verbs.run(TRIGGER_VERB, {})
     bench.start()
-    bench.signals.trigger_once()
+    with pytest.raises(BadArgument, match="pulse_ms"):
+        await verbs.run(TRIGGER_VERB, {"pulse_ms": 1})
+    await verbs.run(TRIGGER_VERB, {})
     (worker,) = bench.workers
     worker.work()
     for _ in range(2):
