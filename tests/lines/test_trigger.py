@@ -83,7 +83,7 @@ def test_stamps_are_numbered_and_each_is_the_middle_of_the_call() -> None:
         def set(self, active: bool) -> None:
             bench.time.t_ns += 30_000
             super().set(active)
-            bench.time.t_ns += 70_000
+            bench.time.t_ns += 70_001
 
     line = Slow(now_ns=lambda: bench.time.t_ns)
     line.open()
@@ -91,9 +91,9 @@ def test_stamps_are_numbered_and_each_is_the_middle_of_the_call() -> None:
     wave.work()
     (stamp,) = wave.stamps
     ((edge_ns, _),) = line.history
-    assert (stamp.number, stamp.err_ns) == (1, (100_000 + CALL_NS) // 2)
-    assert stamp.t_ns - stamp.err_ns == edge_ns - 30_000
-    assert stamp.t_ns + stamp.err_ns == edge_ns + 70_000 + CALL_NS
+    assert (stamp.number, stamp.err_ns) == (1, 51_001)
+    assert stamp.t_ns - stamp.err_ns == edge_ns - 30_001
+    assert stamp.t_ns + stamp.err_ns == edge_ns + 70_001 + CALL_NS
     bench = SquareWaveBench(100.0)
     bench.run(NS_PER_S)
     assert [stamp.number for stamp in bench.wave.stamps] == list(range(1, len(bench.rises_ns) + 1))
