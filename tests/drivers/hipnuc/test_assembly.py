@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imud.drivers.hipnuc.assembly import Assembly, Cadence
+from imud.drivers.hipnuc.assembly import Assembly, Cadence, Learned, learned_from
 from imud.model.ledger import Ledger
 
 MS = 1_000_000
@@ -474,12 +474,39 @@ def lost(*times_ms: float, period_ms: int = 5) -> int:
         ((5, 10), 0),
         ((9.4, 13.2, 15), 0),  # the second burst is delayed less, but still late
         ((12, 12.1, 15), 0), ((38, 38.1, 38.2, 38.3, 38.4, 38.5, 38.6, 40), 0), ((5, 11.2, 15, 19, 25), 0), ((10,), 1),
+        ((11.25,), 1), ((11.3,), 0), ((8.76,), 1), ((8.7,), 0),  # a quarter of a period is another phase
         ((5, 20), 2), ((10, 20), 2), ((20, 20.1, 25), 2), ((1000,), 199), ((1004,), 0),
         ((10, 30, 40, 60, 70, 90, 100, 120), 16),
     ],
 )  # fmt: skip
 def test_a_remaining_delay_is_a_loss(times_ms: tuple[float, ...], expected: int) -> None:
     assert lost(*times_ms) == expected
+
+
+@pytest.mark.parametrize(("jitter_ns", "bursts"), [(400_000, 3), (500_000, 16)])
+def test_an_unsteady_device_needs_more_bursts_for_a_loss(jitter_ns: int, bursts: int) -> None:
+    cadence, numbers = Cadence(5 * MS, 0), (*range(1, 21), *range(22, 60))
+    found = [cadence.begin(5 * MS * n + n % 2 * jitter_ns)[0] for n in numbers]
+    assert (sum(found), numbers[found.index(1)]) == (1, 21 + bursts)
+
+
+@pytest.mark.parametrize(
+    ("times_ms", "others_ms", "expected"),
+    [
+        (range(0, 80, 10), (), None), (range(0, 90, 10), (), Learned(0, 10 * MS)),
+        # a distance from 1.5 to 4.5 medians is a gap, which does not count in the mean
+        ((*range(0, 80, 10), 84.9), (), Learned(0, 10_612_500)), ((*range(0, 80, 10), 85.1), (), Learned(0, 10 * MS)),
+        ((*range(0, 80, 10), 114.9), (), Learned(0, 10 * MS)), ((*range(0, 80, 10), 115.1), (), Learned(0, 14_387_500)),
+        # kind 1 arrives after the longest pause: it is the anchor if its mean period is at most 10 % longer
+        (range(0, 90, 10), (9, 19, 29, 39, 52.6), Learned(1, 10_900_000)),
+        (range(0, 90, 10), (9, 19, 29, 39, 53.4), Learned(0, 10 * MS)),
+    ],
+)  # fmt: skip
+def test_anchor_and_period_after_eight_periods(
+    times_ms: Iterable[float], others_ms: Iterable[float], expected: Learned | None
+) -> None:
+    frames = [(kind, round(t * MS)) for kind, times in enumerate((times_ms, others_ms)) for t in times]
+    assert learned_from(sorted(frames, key=lambda frame: frame[1])) == expected
 
 
 def test_a_silence_has_more_than_four_periods() -> None:
