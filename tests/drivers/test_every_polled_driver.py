@@ -144,6 +144,8 @@ READ_NS: list[tuple[str, object, object, int]] = [
     # 16 words of 16 bits at 1 µs: the burst command, two cycles of the pipeline and 13 values
     ("imu61x-spi", {}, {"port": "x", "speed_hz": 1_000_000}, 256_000),
     ("imu61x-spi", {}, {"port": "x", "speed_hz": 2_000_000}, 128_000),
+    # 35 bytes of 9 bits at 400 kHz (two addresses, the register, 32 bytes of data), start, repeated start and stop
+    ("imu61x-i2c", {}, {}, (35 * 9 + 3) * 2_500),
 ]
 
 
