@@ -1,21 +1,23 @@
-"""SPI frames of the IMU61x: words by hand, every burst, every invalid reply."""
+"""SPI frames of the IMU61x: words by hand, every burst, every invalid reply; scripts with the simulated device."""
 
 import struct
 from collections.abc import Sequence
 from math import nan
+from typing import Literal
 
 import pytest
 
 from imud.contracts.codec import BadFrame, BadReason, PolledEvent, Vanished
+from imud.contracts.script import Transfer, run_transfer_script
+from imud.contracts.setting import words_of
 from imud.drivers.imu61x import spi
-from imud.drivers.imu61x import spi as bursts
-from imud.drivers.imu61x import spi as words
 from imud.drivers.imu61x.registers import temperature_c
-from imud.drivers.imu61x.spi import READ_STATE, BurstKind, SpiDeviceOptions, burst_problem
+from imud.drivers.imu61x.spi import READ_STATE, BurstKind, SpiDeviceOptions, burst_problem, probe, set_up
+from imud.model.errors import DeviceRefused, TransferError, Trouble
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.sim.imu61x.registers import Imu61xRegisters
-from imud.sim.imu61x.uart import RegisterBehaviour
+from imud.sim.imu61x.uart import REGISTER_VARIANTS, RegisterBehaviour
 from tests.support.simulated_modules import over_spi
 
 PIPELINE = b"\xde\xad\xbe\xef"
@@ -32,12 +34,12 @@ def codec(burst: str = "standard", **more: object) -> spi.Imu61xSpiCodec:
     return spi.Imu61xSpiCodec(Ledger(), SpiDeviceOptions(burst=burst, **more))  # type: ignore[arg-type]  # passed on as given
 
 
-def words_of(data: bytes) -> tuple[int, ...]:
+def u16_words(data: bytes) -> tuple[int, ...]:
     return struct.unpack(f">{len(data) // 2}H", data)
 
 
 def with_sum(values: bytes, total: int | None = None) -> bytes:
-    total = sum(words_of(values)) if total is None else total
+    total = sum(u16_words(values)) if total is None else total
     return values + struct.pack(">HH", total & 0xFFFF, total >> 16)
 
 
@@ -97,7 +99,7 @@ def extended(*values: float, status: int = 0x01020304) -> bytes:
 @pytest.mark.manual("A 2.4.1 extended burst")
 def test_extended_burst_in_si() -> None:
     data = extended(1, 0, -1, 0, 0.5, 1, 25, 90, 0, -45)
-    assert words_of(data)[:6] == (0x0000, 0x3F80, 0, 0, 0x0000, 0xBF80)  # 1.0 = 0x3F800000, low word first
+    assert u16_words(data)[:6] == (0x0000, 0x3F80, 0, 0, 0x0000, 0xBF80)  # 1.0 = 0x3F800000, low word first
     m = one(codec("extended").decode(0, PIPELINE + data))
     assert m.gyro_rad_s == pytest.approx((RAD_S, 0, -RAD_S))
     assert m.accel_m_s2 == pytest.approx((0, G / 2, G))
@@ -182,26 +184,26 @@ def test_state_that_changed_by_itself_is_noticed() -> None:
 
 def test_words_of_the_manual_and_their_answers() -> None:
     """2.4.4: 0xFE01 opens window 1. 2.4.2: 0x8644 sets both filters to 10 Hz, 0x0600 reads them back."""
-    assert words.OPEN == 0xFE01
-    assert words.write(0x06, 0x44) == 0x8644
-    assert words.read(0x06) == 0x0600
-    assert [one.hex() for one in words.READ_STATE.sends] == [
+    assert spi.OPEN == 0xFE01
+    assert spi.write(0x06, 0x44) == 0x8644
+    assert spi.read(0x06) == 0x0600
+    assert [one.hex() for one in spi.READ_STATE.sends] == [
         "fe01", "6a00", "6c00", "6e00", "7000", "0600", "0c00", "0d00", "fe00", "7e00", "7e00", "7e00"
     ]  # fmt: skip
-    assert words.answers(bytes.fromhex("aaaa bbbb 0001 fffe")) == (1, 0xFFFE)
-    assert words.answers(b"\x01\x02\x03\x04\x05") == ()
+    assert spi.answers(bytes.fromhex("aaaa bbbb 0001 fffe")) == (1, 0xFFFE)
+    assert spi.answers(b"\x01\x02\x03\x04\x05") == ()
 
 
 @pytest.mark.manual("A 2.3 read and write", "A 2.4.1 reading", "A 2.4.2 write and read")
 def test_transfers_on_the_wire() -> None:
-    assert bursts.READ_STANDARD.sends == (b"\x80\x00" + bytes(30),)
-    assert bursts.READ_EXTENDED.sends == (b"\x80\x00" + bytes(50),)
-    assert [one.hex() for one in bursts.READ_TEMPERATURE.sends] == ["0e00", "1000", "7e00", "7e00"]
-    assert [bursts.READ_REGISTERS.sends[n].hex() for n in (0, 13)] == ["0e00", "2800"]
+    assert spi.READ_STANDARD.sends == (b"\x80\x00" + bytes(30),)
+    assert spi.READ_EXTENDED.sends == (b"\x80\x00" + bytes(50),)
+    assert [one.hex() for one in spi.READ_TEMPERATURE.sends] == ["0e00", "1000", "7e00", "7e00"]
+    assert [spi.READ_REGISTERS.sends[n].hex() for n in (0, 13)] == ["0e00", "2800"]
 
 
-STANDARD = bursts.encode_standard(accel_m_s2=(0.1, -0.2, 9.8), gyro_rad_s=(0.1, 0.2, 0.3))
-EXTENDED = bursts.encode_extended(
+STANDARD = spi.encode_standard(accel_m_s2=(0.1, -0.2, 9.8), gyro_rad_s=(0.1, 0.2, 0.3))
+EXTENDED = spi.encode_extended(
     accel_m_s2=(0.1, -0.2, 9.8), gyro_rad_s=(0.1, 0.2, 0.3), temperature_c=25.0, euler_rad=(0.1, 0.2, 0.3)
 )
 
@@ -219,3 +221,104 @@ def test_which_bytes_are_a_burst_of_a_kind(kind: BurstKind, frame: bytes, why: s
     found = burst_problem(kind, PIPELINE + frame, 32)
     assert found.startswith(why)
     assert bool(found) is bool(why)
+
+
+class Wire:
+    """Simulated device with a failure at one of its transfers."""
+
+    def __init__(self, *, fail_at: int = -1, deaf: bool = False, behaviour: RegisterBehaviour | None = None) -> None:
+        self.device = Imu61xRegisters(lambda: 0, behaviour=behaviour)
+        self.sent: list[str] = []
+        self._fail_at = fail_at
+        self._deaf = deaf
+
+    def transfer(self, transfer: Transfer) -> bytes:
+        number = len(self.sent)
+        self.sent.append(" ".join(item.hex() for item in transfer.sends))
+        if number == self._fail_at:
+            self.device.spi(transfer.sends[:3])  # the transfer fails in window 1
+            raise TransferError(Trouble.DISTURBED, "by the test")
+        data = over_spi(self.device, transfer)
+        if self._deaf:
+            self.device.filter, self.device.extended = 0xBB, 0
+        return data
+
+
+@pytest.mark.manual(
+    "A 2.4 PROD_ID", "A 2.4.3 reading", "A 2.4 BURST_CTRL", "A 2.4 FILTER_CTRL", "A 2.4.2 write and read"
+)
+def test_probe_and_set_up() -> None:
+    wire = Wire()
+    assert run_transfer_script(probe(SpiDeviceOptions()), wire.transfer).product == "IMU614"
+    assert wire.device.window == 0
+    assert len(wire.sent) == 1
+
+    wire = Wire()
+    words = words_of(run_transfer_script(set_up(SpiDeviceOptions()), wire.transfer))
+    assert words == {"accel_filter": "47 Hz", "gyro_filter": "47 Hz", "burst": "standard"}
+    assert len(wire.sent) == 2  # the state and a burst
+    settings = SpiDeviceOptions(accel_filter=4, gyro_filter=4, burst="extended")
+    words = words_of(run_transfer_script(set_up(settings), wire.transfer))
+    assert words == {"accel_filter": "10 Hz", "gyro_filter": "10 Hz", "burst": "extended"}
+    assert wire.sent[3] == "fe01 8644 fe00 7e00 7e00"  # 10 Hz in the manual's example: 0x8644
+    assert wire.sent[5] == "fe01 8d01 fe00 7e00 7e00"
+    assert len(wire.sent) == 7
+    assert (wire.device.filter, wire.device.extended, wire.device.window) == (0x44, 1, 0)
+
+    wire = Wire()
+    wire.device.extended = 1
+    flips = iter([0, 0, 1, 0, 0])  # the first burst after the selection
+
+    def transfer(one: Transfer) -> bytes:
+        wire.device.faults.flips = next(flips)
+        return wire.transfer(one)
+
+    assert words_of(run_transfer_script(set_up(SpiDeviceOptions()), transfer))["burst"] == "standard"
+    assert wire.device.extended == 0
+
+
+@pytest.mark.parametrize("fail_at", [0, 1, 2])
+@pytest.mark.manual("A 2.4.4 windows")
+def test_window_is_closed_after_a_failure(fail_at: int) -> None:
+    wire = Wire(fail_at=fail_at)
+    with pytest.raises(TransferError):
+        run_transfer_script(set_up(SpiDeviceOptions(gyro_filter=1)), wire.transfer)
+    assert (wire.sent[-1], wire.device.window) == ("fe00 7e00 7e00", 0)
+    wire = Wire(fail_at=3)  # the burst that shows its kind
+    with pytest.raises(TransferError):
+        run_transfer_script(set_up(SpiDeviceOptions(gyro_filter=1)), wire.transfer)
+    assert len(wire.sent) == 4
+
+
+def test_setting_that_does_not_take_is_refused() -> None:
+    with pytest.raises(DeviceRefused, match="FILTER_CTRL: expected 0xb1 after the write, got 0xbb"):
+        run_transfer_script(set_up(SpiDeviceOptions(gyro_filter=1)), Wire(deaf=True).transfer)
+    words = "expected a burst of the selected kind extended: wrong check value: .* is 0x0000 at 0x0C and 0x0000 at 0x0D"
+    with pytest.raises(DeviceRefused, match=words):
+        run_transfer_script(set_up(SpiDeviceOptions(burst="extended")), Wire(deaf=True).transfer)
+
+
+@pytest.mark.parametrize("variant", REGISTER_VARIANTS)
+@pytest.mark.parametrize("before", [0, 1])
+@pytest.mark.parametrize("burst", ["standard", "extended", "registers"])
+def test_kind_of_burst_wherever_it_reads_back(
+    variant: str, before: int, burst: Literal["standard", "extended", "registers"]
+) -> None:
+    wire = Wire(behaviour=REGISTER_VARIANTS[variant])
+    wire.device.extended = before
+    words = words_of(run_transfer_script(set_up(SpiDeviceOptions(burst=burst)), wire.transfer))
+    if burst != "registers":
+        assert words["burst"] == burst
+        assert wire.device.extended == (burst == "extended")
+    assert wire.device.window == 0
+
+
+@pytest.mark.parametrize(
+    ("product_id", "why"),
+    [(b"\xff" * 8, "received only 0xFF"), (b"\x00" * 8, "received only 0x00"), (b"\x00\x00IMU61C", "SPI mode")],
+)
+def test_another_id_is_refused(product_id: bytes, why: str) -> None:
+    wire = Wire()
+    wire.device.faults.product_id = product_id
+    with pytest.raises(DeviceRefused, match=why):
+        run_transfer_script(probe(SpiDeviceOptions()), wire.transfer)

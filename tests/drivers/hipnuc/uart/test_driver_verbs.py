@@ -1,23 +1,24 @@
-"""Verbs of a HiPNUC device: bytes on the wire, and their effect on the simulated device."""
+"""Verbs and calibrations of a HiPNUC device: bytes on the wire, and their effect on the simulated device."""
 
 import math
 from typing import Any
 
 import pytest
 
-from imud.contracts.command import Target
-from imud.contracts.script import Outcome, Rejection, Reply, Request, Silence
-from imud.drivers.hipnuc.uart.driver import DRIVER
+from imud.contracts.command import Calibration, Kept, Target, Verdict
+from imud.contracts.script import Outcome, Rejection, Reply, Request, RequestScript, Silence
+from imud.drivers.hipnuc.uart.driver import CALIBRATIONS, DRIVER
 from imud.model.errors import BadArgument, NoReply, Rejected
 from tests.support.old_spellings import script_of
 from tests.support.simulated_modules import run_script
 
 OK = Reply(("OK",))
+TARGET = Target(None, 115200)
 VERSION = Reply(("PNAME=HI14R3", "OK"))
 
 
-def sent(name: str, answers: list[Outcome] | None = None, **arguments: Any) -> tuple[list[Request], object]:
-    """Return the requests of a verb or a setting, with one reply each (default: OK), and its result."""
+def asked(script: RequestScript[object], answers: list[Outcome] | None = None) -> tuple[list[Request], object]:
+    """Return the requests of a script, with one reply each (default: OK), and its result."""
     left = list(answers or [])
     requests: list[Request] = []
 
@@ -25,9 +26,19 @@ def sent(name: str, answers: list[Outcome] | None = None, **arguments: Any) -> t
         requests.append(request)
         return OK if answers is None else left.pop(0)
 
-    value = run_script(script_of(DRIVER, Target(None, 115200), name, arguments), answer)
+    value = run_script(script, answer)
     assert not left
     return requests, value
+
+
+def sent(name: str, answers: list[Outcome] | None = None, **arguments: Any) -> tuple[list[Request], object]:
+    """Return the requests of a verb or a setting, and its result."""
+    return asked(script_of(DRIVER, TARGET, name, arguments), answers)
+
+
+def texts(script: RequestScript[object]) -> list[str]:
+    """Return the requests of a script whose replies are OK."""
+    return [request.payload.decode("ascii").rstrip() for request in asked(script)[0]]
 
 
 @pytest.mark.parametrize(
@@ -63,10 +74,6 @@ def test_one_command(name: str, arguments: dict[str, Any], command: str) -> None
     requests, value = sent(name, **arguments)
     assert [request.payload for request in requests] == [f"{one}\r\n".encode() for one in command.split("; ")]
     assert value is None
-
-
-def test_the_actions_that_write_to_flash_say_so() -> None:
-    assert [name for name, verb in DRIVER.verbs.items() if verb.saves] == ["save"]
 
 
 RATES = r"output.hi91: expected one of 0, 1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 100, 125, 200, 250, 500, 1000, or"
@@ -119,3 +126,52 @@ def test_refusal_silence_output_and_restart() -> None:
     requests, value = sent("restart", [Reply(()), Silence(()), Silence(()), Silence(()), VERSION])
     assert requests[0].silent
     assert getattr(value, "product", "") == "HI14R3"
+
+
+@pytest.mark.parametrize(
+    ("kind", "begun", "saved"),
+    [
+        ("magnetometer", ["CONFIG IMU EN_MCAL 1"], []),
+        ("magnetometer_once", ["CONFIG IMU EN_MCAL 1"], ["CONFIG IMU EN_MCAL 0", "SAVECONFIG"]),
+        ("level", ["CONFIG ATT RST 2"], ["SAVECONFIG"]),
+        ("accelerometer_level", ["CONFIG ATT RST 3"], ["SAVECONFIG"]),
+        ("heading", ["CONFIG YAW 1 0"], []),
+    ],
+)
+@pytest.mark.manual("B 2.2.4 ATT RST 2", "B 2.2.4 ATT RST 3", "B 8.2 once")
+def test_requests_of_a_calibration(kind: str, begun: list[str], saved: list[str]) -> None:
+    calibration = CALIBRATIONS[kind]
+    assert texts(calibration.begin(TARGET)) == begun
+    assert (calibration.kept is Kept.BY_SAVE) == bool(saved)
+    if calibration.save is not None:
+        assert texts(calibration.save(TARGET)) == saved
+
+
+@pytest.mark.parametrize(
+    ("lines", "verdict"),
+    [
+        (("MB=14.14, -2.08, -8.75", "OK"), Verdict(True, "bias 14.14, -2.08, -8.75 µT")),
+        (("MB=0.00, 0.00, 0.00", "OK"), Verdict(False, "bias 0, 0, 0 µT")),
+        (("MC=1", "OK"), Verdict(False, "the device does not report its bias")),
+    ],
+)
+@pytest.mark.manual("B 8.1.1 result")
+def test_verdict_of_the_magnetometer(lines: tuple[str, ...], verdict: Verdict) -> None:
+    ask = CALIBRATIONS["magnetometer"].verdict
+    assert ask is not None
+    (request,), found = asked(ask(TARGET), [Reply(lines)])
+    assert (request.payload, found) == (b"LOG MAGCONFIG\r\n", verdict)
+    with pytest.raises(NoReply, match="does the device have a magnetometer"):
+        asked(ask(TARGET), [Silence(())])
+    with pytest.raises(Rejected, match="LOG MAGCONFIG: the device rejected the request: ERR"):
+        asked(ask(TARGET), [Rejection(("ERR",))])
+
+
+@pytest.mark.parametrize(("mode", "ready"), [("0", False), ("1", True)])
+@pytest.mark.parametrize("kind", ["magnetometer", "magnetometer_once"])
+@pytest.mark.manual("B 1.1 9-axis mode")
+def test_nine_axes_are_needed(kind: str, mode: str, ready: bool) -> None:
+    calibration: Calibration = CALIBRATIONS[kind]
+    assert calibration.unready is not None
+    words = asked(calibration.unready(TARGET), [Reply((f"ATT_MODE: {mode}", "OK"))])[1]
+    assert (words == "") == ready
