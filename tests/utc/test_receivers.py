@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import socket
 import time
 import tracemalloc
 from collections.abc import Awaitable, Callable
@@ -18,7 +19,7 @@ from imud.model.units import NS_PER_S
 from imud.utc import RMC_SOURCES, receivers
 from imud.utc.system_clock import SystemClockSource
 from tests.support.documented import check_schema
-from tests.support.event_loops import in_loop
+from tests.support.event_loops import VirtualClock, in_loop, run_virtually
 from tests.support.rmc_sources import LIMIT_S, Sentences, soon
 
 SENTENCES = [build((1_795_000_000 + n) * NS_PER_S) for n in range(5)]
@@ -71,6 +72,11 @@ def test_it_asks_for_nmea_and_gives_rmc_with_its_time() -> None:
     async def scene(source: receivers.GpsdSource, sentences: Sentences) -> None:
         await sentences.until(lambda: len(sentences.got) == 2)
         assert (source.problem, source.sentences) == ("", 2)
+        assert source._writer is not None
+        sock = source._writer.get_extra_info("socket")
+        assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+        probes = (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
+        assert [sock.getsockopt(socket.IPPROTO_TCP, option) for option in probes] == [10, 5, 3]  # a loss shows in 25 s
         source.close()
         await ended.wait()
 
@@ -103,7 +109,7 @@ def test_a_server_that_closes_is_connected_to_again() -> None:
         pauses.append(seconds)
 
     assert play(serve, scene, retry=receivers.Retry(sleep)).data[:3] == SENTENCES[1:4]
-    assert set(pauses) == {receivers.FIRST_PAUSE_S}  # after a success, the next pause is short again
+    assert set(pauses) == {0.5}  # after a success, the next pause is short again
 
 
 @in_loop
@@ -127,6 +133,29 @@ async def test_an_unreachable_server_is_reported_and_retried() -> None:
     assert "cannot connect to gpsd" in source.problem
     assert "is gpsd running?" in source.problem
     source.close()
+
+
+def test_a_server_that_does_not_answer_is_retried_after_5_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, paused_s = VirtualClock(), list[float]()
+
+    async def connect(_host: str, _port: int) -> None:
+        await asyncio.sleep(60)
+
+    async def sleep(_seconds: float) -> None:
+        paused_s.append((clock.now_ns() - begin_ns) / NS_PER_S)
+        await asyncio.sleep(60)
+
+    async def scene() -> None:
+        source.start(Sentences())
+        await asyncio.sleep(20)
+        source.close()
+
+    monkeypatch.setattr(receivers, "_connect", connect)
+    begin_ns = clock.now_ns()
+    source = receivers.GpsdSource(receivers.RmcOptions(source="gpsd"), clock.now_ns, receivers.Retry(sleep))
+    run_virtually(clock, scene())
+    assert paused_s == [pytest.approx(5, abs=0.1)]
+    assert source.problem == "cannot connect to gpsd at 127.0.0.1:2947: no answer; is gpsd running?"
 
 
 def test_a_line_that_is_too_long_is_skipped() -> None:
@@ -252,6 +281,8 @@ async def test_make_nmea_uses_the_configured_port() -> None:
 
 def test_keys_of_rmc_accept_the_documented_values() -> None:
     assert check_schema("RMC sentences", receivers.RmcOptions) == 8
+    defaults = receivers.RmcOptions(source="gpsd")
+    assert (defaults.rate_hz, defaults.tcp_port, defaults.baud, defaults.error_ms) == (1, 2947, 9600, 50)
 
 
 def test_sources_by_their_name() -> None:
@@ -297,7 +328,7 @@ def test_a_line_without_end_is_skipped_and_not_buffered() -> None:
     try:
         for _ in range(100):
             assert splitter.feed(b"$" + b"x" * 1000) == []
-            assert tracemalloc.get_traced_memory()[0] <= receivers.LINE_BYTES_MAX + 4000
+            assert tracemalloc.get_traced_memory()[0] <= 16_384 + 4000
     finally:
         tracemalloc.stop()
     assert splitter.feed(SENTENCES[0] + SENTENCES[1]) == [SENTENCES[1]]  # the first sentence ends the skipped line
@@ -315,5 +346,4 @@ async def test_pauses() -> None:
         await retry.pause()
     retry.reset()
     await retry.pause()
-    assert pauses[:3] == [receivers.FIRST_PAUSE_S, 2 * receivers.FIRST_PAUSE_S, 4 * receivers.FIRST_PAUSE_S]
-    assert pauses[-2:] == [receivers.LONGEST_PAUSE_S, receivers.FIRST_PAUSE_S]
+    assert pauses == [0.5, 1, 2, 4, 8, 16, 30, 30, 30, 30, 0.5]

@@ -106,10 +106,11 @@ def test_another_second_a_slow_port_a_late_sending_and_an_old_pulse() -> None:
     assert FeedBench().give(0, 0.1, waited_s=0.8) == ""
     assert FeedBench().give(0, 0.1, waited_s=0.9) == Refusal.STALE
     assert FeedBench(reference=None).give(0, 0.1, waited_s=1.0) == Refusal.STALE
-    assert FeedBench(reference=UtcReference(OFFSET_NS, 90 * NS_PER_MS)).give(0, 1.5) == ""
+    for error_ms, refusal in ((81, Refusal.STALE), (82, "")):  # three times the error and 5 ms: at most 250 ms
+        assert FeedBench(reference=UtcReference(OFFSET_NS, error_ms * NS_PER_MS)).give(0, 1.5) == refusal
     bench = FeedBench(reference=None)
     bench.feed.on_pulse(BEGIN_NS)
-    assert bench.give(1, 1.99) == ""
+    assert [bench.give(1, at_s) for at_s in (1.0999, 1.1)] == [Refusal.STALE, ""]  # a pulse is valid for 1.1 s
 
 
 @pytest.mark.parametrize(("reference", "doubt_ms"), [(UtcReference(OFFSET_NS, 0), 5), (None, 0)])

@@ -1,6 +1,7 @@
 """System clock: the state in the kernel, its meaning, and sentences at the right time or not at all."""
 
 import asyncio
+import ctypes
 import time
 
 import pytest
@@ -22,6 +23,7 @@ def test_the_kernel_answers_sensibly() -> None:
     assert 0 <= clock.most_error_us <= 16_000_000  # NTP_PHASE_LIMIT
     assert 0 <= clock.estimated_error_us <= 16_000_000
     assert clock.synchronised or clock.most_error_us > 0
+    assert ctypes.sizeof(system_clock.Timex) == 26 * ctypes.sizeof(ctypes.c_long)  # <linux/timex.h>
     offset_ns = HostClock().utc_offset_ns()
     assert abs(time.monotonic_ns() + offset_ns - time.time_ns()) < 5 * NS_PER_S  # the host may stall in between
 
@@ -95,8 +97,8 @@ async def test_each_names_its_instant_after_it_was_and_within_its_second(rate_hz
         assert isinstance(rmc, Rmc)
         assert rmc.valid
         assert rmc.unix_s == utc_ns // NS_PER_S
-        assert system_clock.AFTER_NS <= utc_ns - rmc.utc_ns < system_clock.AFTER_NS + 60 * NS_PER_MS
-        assert utc_ns % NS_PER_S < system_clock.LATEST_NS
+        assert 200 * NS_PER_MS <= utc_ns - rmc.utc_ns < 260 * NS_PER_MS
+        assert utc_ns % NS_PER_S < 800 * NS_PER_MS
     names = [rmc.utc_ns for s, _ in bench.got if isinstance(rmc := parse(s), Rmc)]
     assert len(set(names)) == len(names)
     assert sum(name % NS_PER_S == 0 for name in names) >= 18
