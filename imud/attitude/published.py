@@ -387,11 +387,6 @@ class FrameOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     level_at_rest: bool = True
     """Whether the body is level within 45° at rest. Then imud reports a mounting that contradicts gravity."""
 
-    @property
-    def has_mounting(self) -> bool:
-        """Whether the configuration gives a rotation in addition to `z_down`."""
-        return self.axes is not None or self.euler is not None or self.quat_wxyz is not None
-
 
 NO_FRAME: Final = FrameOptions()
 
