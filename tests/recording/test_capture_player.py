@@ -108,6 +108,11 @@ def test_a_log_of_a_can_bus_has_the_wall_clock_and_frames_of_others_are_left_out
         "samples": 600,
     }  # fmt: skip
     assert played.batches == [51, 51, 51, 51, 52] * 2 + [51, 37]
+    # a frame of another device after a step of the clock, within a sample
+    before = candump_line(CanFrame(0x7AA, False, b"\1", LOG_NS + 9 * NS_PER_S))
+    stepped = Played("imu61x-can")
+    stepped.player.play_frames(CandumpReader(BytesIO("".join([*lines[:2], before, *lines[2:]]).encode())))
+    assert len(stepped.samples) == 599
 
 
 def test_a_polled_device_cannot_be_captured(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from imud.config.model import DeviceConfig
 from imud.contracts.lines import Edge
 from imud.device.device import Device, RecordableDevices
 from imud.drivers.hipnuc.uart.driver import DRIVER
-from imud.formats.records import CheckRecord, Kind, decode_object, records_of
+from imud.formats.records import CheckRecord, Kind, PathRecord, decode_object, records_of
 from imud.model.ledger import Ledger
 from imud.model.options import NoOptions
 from imud.recording.observer import ClockObserver, PathObserver
@@ -52,10 +52,13 @@ def test_a_recording_contains_the_inputs_in_order() -> None:
     assert one.observers == {None}
     one.begin()
     assert one.observers == {one.observer}
+    (path,) = [decode_object(record, PathRecord) for record in records_of(one.records[-1])]
+    assert (path.driver, path.options) == ("hipnuc-uart", {"hi91_word": "auto"})
+    one.observer.codec_changed()
     one.observer.end(one.records.append)
     assert one.observers == {None}
     one.path.on_data(hi91(0), 1)
-    assert one.kinds() == [Kind.DEVICE, Kind.PATH]
+    assert one.kinds() == [Kind.DEVICE, Kind.PATH, Kind.PATH]
     one = ObservedPath()
     one.begin()
     one.path.clock.link_changed(byte_ns=86_806, hold_ns=0)

@@ -12,18 +12,19 @@ from random import Random
 import msgspec
 import pytest
 
+from imud import __version__
 from imud.attitude.conventions import Convention
 from imud.attitude.published import published_frame
 from imud.contracts.publisher import Batch
 from imud.drivers import DRIVERS
 from imud.formats import records
-from imud.formats.records import CallRecord, CheckRecord, Kind, PathRecord, Record, records_of
+from imud.formats.records import CallRecord, CheckRecord, Kind, PathRecord, Record, SessionRecord, records_of
 from imud.host.clock import HostClock
 from imud.links.memory import MemoryLink
 from imud.model.errors import ImudError
 from imud.model.sample import Sample
-from imud.model.units import NS_PER_S
-from imud.recording.player import STEP_NS, Player, RecordedClock, _reading
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.recording.player import Player, RecordedClock, _reading
 from tests.device import test_can_transport as can
 from tests.device import test_polled_transport as polled
 from tests.device import test_polled_transport_data_ready as data_ready
@@ -145,13 +146,13 @@ def test_a_wall_clock_that_steps_moves_the_samples_before_the_step() -> None:
     samples = [msgspec.structs.replace(sample, t_ns=t_ns, utc_ns=t_ns + 1000) for t_ns in (50, 99, 100, 101)]
     batch = Batch("a", 1, samples, frame)
     assert clock.placed(batch) is batch
-    for monotonic_ns, offset_ns, suspends in ((10, 1000, 0), (20, 1000 + STEP_NS, 0)):
+    for monotonic_ns, offset_ns, suspends in ((10, 1000, 0), (20, 1000 + NS_PER_MS, 0)):
         clock.add(monotonic_ns, offset_ns, suspends)
         assert clock.placed(batch) is batch
-    clock.add(100, 1000 + 2 * STEP_NS, 1)
+    clock.add(100, 1000 + 2 * NS_PER_MS, 1)
     placed = clock.placed(batch)
     assert (placed.device, placed.device_id, placed.frame) == ("a", 1, frame)
-    assert [one.utc_ns - one.t_ns - 1000 for one in placed.samples] == [0, 0, 2 * STEP_NS, 2 * STEP_NS]
+    assert [one.utc_ns - one.t_ns - 1000 for one in placed.samples] == [0, 0, 2 * NS_PER_MS, 2 * NS_PER_MS]
 
 
 def test_without_the_state_a_new_clock_starts_and_a_removed_option_is_ignored(
@@ -167,6 +168,12 @@ def test_without_the_state_a_new_clock_starts_and_a_removed_option_is_ignored(
     assert played.ledger.closes()
     assert played.differences
     assert "this imud ignores recorded options: calibration_done" in caplog.text
+    session, player = SessionRecord(1, "0.1", "3.11", "host", 1, 0, 1, 2), Player(lambda _batch: None)
+    data = [records.encode_object(Kind.SESSION, records.NO_DEVICE, session), *rig.recorded]
+    player.play(record for one in data for record in records_of(one))
+    assert player.devices[played.device_id].fresh_starts == [
+        f"imud 0.1 wrote the recording, this is imud {__version__}"
+    ]
 
 
 def without_state(record: Record) -> Record:
@@ -187,14 +194,14 @@ def recorded_run() -> list[Record]:
 
 
 def test_a_check_finds_a_stamp_a_number_and_a_count_that_differ(recorded: pytest.MonkeyPatch) -> None:
-    """A counter that an older imud did not have is not a difference."""
+    """A counter that an older imud did not have is not a difference, and bytes that a search skipped are not one."""
     found = recorded_run()
-    for name in ("seq", "sample_t_ns", "sample_t_err_ns", "ledger", "older"):
+    for name in ("seq", "sample_t_ns", "sample_t_err_ns", "ledger", "older", "searched"):
         player = Player(lambda _batch: None)
         player.play(_changed(record, name) for record in found)
         (played,) = player.devices.values()
         assert played.checks > 0
-        assert len(played.differences) == played.checks * (name != "older")
+        assert len(played.differences) == played.checks * (name not in ("older", "searched"))
 
 
 def _changed(record: Record, name: str) -> Record:
@@ -203,6 +210,8 @@ def _changed(record: Record, name: str) -> Record:
     check = records.decode_object(record, CheckRecord)
     if name == "older":
         name, value = "ledger", {key: count for key, count in check.ledger.items() if key != "frames_lost"}
+    elif name == "searched":
+        name, value = "ledger", check.ledger | {key: check.ledger[key] + 7 for key in ("bytes_in", "bytes_skipped")}
     else:
         value = {**check.ledger, "frames_good": 1} if name == "ledger" else getattr(check, name) + 1
     return record._replace(body=msgspec.msgpack.encode(msgspec.structs.replace(check, **{name: value})))
