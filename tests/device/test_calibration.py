@@ -12,7 +12,7 @@ import pytest
 
 from imud.contracts.command import GYRO_ZERO, Calibration, CalibrationResult, Handling, Kept, Target, Verdict
 from imud.contracts.lines import DeviceLines
-from imud.device.calibration import CELLS, CalibrationRun, RestWindow, Turning, _words, cell_of, coverage
+from imud.device.calibration import CalibrationRun, RestWindow, Turning, _words, cell_of, coverage
 from imud.device.health import DeviceEvents
 from imud.device.transport import Transport
 from imud.model.errors import BadArgument, CommandError, Rejected
@@ -511,7 +511,7 @@ def test_each_cell_has_one_direction_of_each_order_and_sign() -> None:
         for values in permutations((1.0, 2.0, 3.0))
     ]
     cells = {cell_of((x, y, z)) for x, y, z in directions}
-    assert cells == set(range(CELLS))
+    assert cells == set(range(48))
     assert cell_of((3.0, 2.0, 1.0)) == 0
     assert coverage(0b1011) == 3 / 48
 

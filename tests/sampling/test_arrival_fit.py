@@ -8,7 +8,7 @@ from random import Random
 import pytest
 
 from imud.model.units import NS_PER_MS, NS_PER_S
-from imud.sampling.arrival_fit import BINS, ArrivalFit, extend_lower_hull, feasible_lines, lower_hull
+from imud.sampling.arrival_fit import ArrivalFit, extend_lower_hull, feasible_lines, lower_hull
 
 
 def at(fit: ArrivalFit, device_ns: int) -> float:
@@ -44,9 +44,9 @@ def test_the_window_is_bounded() -> None:
     assert fit.slope_error > 1e-5
     # Each change opens a bin: the number of bins in a window is limited.
     fit, _ = fitted(1.0, 1_000_000, 200)
-    assert 30 * NS_PER_S < fit.span_ns < (BINS + 2) * NS_PER_S
+    assert 30 * NS_PER_S < fit.span_ns < (64 + 2) * NS_PER_S
     later = range(200 * NS_PER_S, 200 * NS_PER_S + fit.span_ns, 10 * NS_PER_MS)
-    assert sum(add(fit, device_ns, device_ns + 1_000_000) for device_ns in later) <= BINS
+    assert sum(add(fit, device_ns, device_ns + 1_000_000) for device_ns in later) <= 64
     # One arrival that is too early affects the fit for at most one window.
     fit, device_ns = ArrivalFit(0, -5_000_000), 0
     for i in range(1, 100 * 100):

@@ -5,7 +5,9 @@ from random import Random
 import pytest
 
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
-from imud.sampling.arrival_time import FIRST_SPREAD_NS, ArrivalSpread, ArrivalTime, EvenArrivals, LinkDelay
+from imud.sampling.arrival_time import ArrivalSpread, ArrivalTime, EvenArrivals, LinkDelay
+
+FIRST_SPREAD_NS = 2 * NS_PER_MS
 
 DELAY = LinkDelay(0, 0)
 BEGIN_NS = 1000 * NS_PER_S

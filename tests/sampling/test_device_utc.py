@@ -6,7 +6,7 @@ from imud.contracts.lines import TimeBits, UtcReference
 from imud.model.sample import Measurement, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.clock import SampleClock
-from imud.sampling.device_utc import DAY_NS, IntervalFit
+from imud.sampling.device_utc import IntervalFit
 from imud.sim.ports.arrival import BARE_UART, LOADED, USB_16MS, USB_16MS_PACKET, ArrivalModel, ArrivalProfile, Crystal
 from tests.bench.clock import BAUD_OF_RATE, clock_for
 from tests.bench.line_runs import (
@@ -23,7 +23,7 @@ from tests.bench.line_runs import (
 from tests.support.clock_feed import BEGIN_NS, rises
 
 UNIX = 1 << 32
-DAY = DAY_NS // NS_PER_MS
+DAY = 86_400_000
 SLEW = 550e-6
 """500 ppm, and a margin for inexact crystals and lines."""
 

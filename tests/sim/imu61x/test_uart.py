@@ -21,7 +21,7 @@ from imud.drivers.imu61x.uart.codec import (
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_S
 from imud.sim import SIMULATORS
-from imud.sim.imu61x.uart import RESULT_BUSY, Imu61xModule, Imu61xSettings, ParameterRefused, changed, make
+from imud.sim.imu61x.uart import Imu61xModule, Imu61xSettings, ParameterRefused, changed, make
 from imud.sim.physics import Noise, swing
 from imud.sim.sensor import SimulatorOptions
 from tests.support.simulated_modules import BEGIN_NS, IMU61X_STILL, Imu61xBench, imu61x_bench
@@ -245,7 +245,7 @@ def test_installation_calibration_takes_its_time() -> None:
     far = imu61x_bench()
     assert acknowledged(far, c.ask_installation_status()) == 0
     assert acknowledged(far, c.start_installation_calibration()) == 0
-    assert acknowledged(far, c.ask_installation_status()) == RESULT_BUSY
+    assert acknowledged(far, c.ask_installation_status()) == 9
     assert parameter(far, Parameter.INSTALL_X_OFF) == 0
     far.wait(3000)
     assert acknowledged(far, c.ask_installation_status()) == 0
