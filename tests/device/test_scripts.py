@@ -8,17 +8,7 @@ from typing import Any
 import pytest
 
 from imud.contracts.driver import StreamDriver
-from imud.contracts.script import (
-    Outcome,
-    Reply,
-    ReplyFrame,
-    Request,
-    RequestScript,
-    Silence,
-    never,
-    pause,
-    with_undo,
-)
+from imud.contracts.script import Outcome, Reply, ReplyFrame, Request, RequestScript, Silence, never, pause, with_undo
 from imud.device.scripts import RequestPort, ScriptRunner
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.canopen import cia301
