@@ -26,6 +26,25 @@ def device(baud: int, rate_hz: float, phase_ns: int = 0, poll_ns: int = NS_PER_M
     return FakeDevice(FAKE_DRIVER, baud, rate_hz, phase_ns, poll_ns, REPLY, QUERY, random=Random(baud + phase_ns))
 
 
+def found_by(search: Search, far: FakeDevice, start_ns: int = NS_PER_S) -> tuple[StreamFound, int, list[Listen]]:
+    """Return the found device, the time of the search, and its visits."""
+    found, took_ns, listens = run_search(search, far, start_ns=start_ns)
+    assert isinstance(found, StreamFound), found
+    return found, took_ns, listens
+
+
+def given_up(search: Search, far: FakeDevice) -> tuple[GaveUp, int, list[Listen]]:
+    result, took_ns, listens = run_search(search, far)
+    assert isinstance(result, GaveUp), result
+    return result, took_ns, listens
+
+
+def first_visit(search: Search) -> Listen:
+    step = search.start(0)
+    assert isinstance(step, Listen)
+    return step
+
+
 def test_the_line_model_changes_bytes_at_a_wrong_rate() -> None:
     data = bytes(range(256))
     assert bytes(value for _, value in received(data, 115200, 115200)) == data
@@ -37,38 +56,26 @@ def test_the_line_model_changes_bytes_at_a_wrong_rate() -> None:
 
 def test_a_wrong_remembered_rate_costs_little_time() -> None:
     search = Search([FAKE_DRIVER], remembered=("fake-uart", 9600))
-    found, took_ns, listens = run_search(search, device(921600, 100, 777), start_ns=NS_PER_S)
-    assert isinstance(found, StreamFound)
+    found, took_ns, listens = found_by(search, device(921600, 100, 777))
     assert found.baud == 921600
     assert listens[0].baud == 9600
     assert found.wasted_bytes > 0
     assert took_ns < 0.8 * NS_PER_S  # invalid bytes end the long wait
-    assert first_baud(Search([FAKE_DRIVER], remembered=("gone-uart", 9600))) == BAUD_RATES[0]
-    assert first_baud(Search([FAKE_DRIVER], remembered=("fake-uart", 57600))) == BAUD_RATES[0]
-    assert first_baud(Search([FAKE_DRIVER], bauds=(9600,), remembered=("fake-uart", 115200))) == 9600
+    assert first_visit(Search([FAKE_DRIVER], remembered=("gone-uart", 9600))).baud == BAUD_RATES[0]
+    assert first_visit(Search([FAKE_DRIVER], remembered=("fake-uart", 57600))).baud == BAUD_RATES[0]
+    assert first_visit(Search([FAKE_DRIVER], bauds=(9600,), remembered=("fake-uart", 115200))).baud == 9600
 
 
 def test_a_latency_timer_extends_the_visits() -> None:
-    until_ns = []
-    for hold_ns in (0, 16 * NS_PER_MS):
-        step = Search([FAKE_DRIVER], hold_ns=hold_ns).start(0)
-        assert isinstance(step, Listen)
-        until_ns.append(step.until_ns)
-    assert until_ns[1] - until_ns[0] == 16 * NS_PER_MS
-
-
-def first_baud(search: Search) -> int:
-    step = search.start(0)
-    assert isinstance(step, Listen)
-    return step.baud
+    first, longer = (first_visit(Search([FAKE_DRIVER], hold_ns=hold_ns)).until_ns for hold_ns in (0, 16 * NS_PER_MS))
+    assert longer - first == 16 * NS_PER_MS
 
 
 @pytest.mark.parametrize(("baud", "rate_hz"), [(9600, 1.0), (115200, 1.0), (921600, 1.0), (230400, 5.0), (256000, 20)])
 def test_a_slow_device_is_found_in_a_later_pass(baud: int, rate_hz: float) -> None:
     for phase_ns in range(0, NS_PER_S, NS_PER_S // 7):
         far = device(baud, rate_hz, phase_ns)
-        found, took_ns, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far, start_ns=9 * NS_PER_S)
-        assert isinstance(found, StreamFound), found
+        found, took_ns, _ = found_by(Search([FAKE_DRIVER], may_ask=True), far, 9 * NS_PER_S)
         assert found.baud == baud
         assert took_ns < 15 * NS_PER_S
         assert far.sent_to == []
@@ -77,8 +84,7 @@ def test_a_slow_device_is_found_in_a_later_pass(baud: int, rate_hz: float) -> No
 @pytest.mark.parametrize("baud", BAUD_RATES)
 def test_a_silent_device_is_queried_only_after_the_quiet_time(baud: int) -> None:
     far = device(baud, 0)
-    found, took_ns, listens = run_search(Search([FAKE_DRIVER], may_ask=True), far, start_ns=NS_PER_S)
-    assert isinstance(found, StreamFound)
+    found, took_ns, listens = found_by(Search([FAKE_DRIVER], may_ask=True), far)
     assert found.baud == baud
     first_question = next(index for index, listen in enumerate(listens) if listen.send)
     assert listens[first_question - 1].until_ns - NS_PER_S >= QUIET_NS
@@ -88,22 +94,19 @@ def test_a_silent_device_is_queried_only_after_the_quiet_time(baud: int) -> None
 
 def test_no_query_without_permission_or_to_another_device() -> None:
     far = device(115200, 0)
-    result, _, listens = run_search(Search([FAKE_DRIVER]), far)
-    assert isinstance(result, GaveUp)
+    result, _, listens = given_up(Search([FAKE_DRIVER]), far)
     assert far.sent_to == []
     assert {listen.baud for listen in listens} == set(BAUD_RATES)
     assert "got no byte at 115200" in result.summary
     assert "query" not in result.summary
     far = replace(device(115200, 10), noise=b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n")
-    result, _, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far)
-    assert isinstance(result, GaveUp)
+    result, _, _ = given_up(Search([FAKE_DRIVER], may_ask=True), far)
     assert far.sent_to == []
     assert "115200: " in result.summary
     assert "0 valid frames" in result.summary
     assert result.wasted_bytes > 0
     far = replace(device(115200, 0), reply=b"OK\r\n")
-    result, _, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far)
-    assert isinstance(result, GaveUp)
+    given_up(Search([FAKE_DRIVER], may_ask=True), far)
 
 
 def test_noise_stops_the_queries() -> None:
@@ -143,12 +146,10 @@ def test_two_good_frames_are_enough_with_few_bad_frames() -> None:
 
 def test_a_device_on_a_noisy_line_is_found() -> None:
     far = replace(device(460800, 100, 4_000_000), damage=0.4)
-    found, took_ns, _ = run_search(Search([FAKE_DRIVER]), far, start_ns=NS_PER_S)
-    assert isinstance(found, StreamFound)
+    _, took_ns, _ = found_by(Search([FAKE_DRIVER]), far)
     assert took_ns < 2 * NS_PER_S
     search = Search([FAKE_DRIVER], bauds=(115200,))
-    step = search.start(0)
-    assert isinstance(step, Listen)
+    step = first_visit(search)
     lie = b"\x5a\xa5\x00\x02\x00\x00"  # its length field is 512
     assert search.on_data(lie + fake_frame(b"a" * 76) + fake_frame(b"b" * 76), 1) is None
     assert isinstance(search.on_time(step.until_ns), StreamFound)
@@ -166,8 +167,7 @@ def test_each_byte_is_in_the_result_or_counted_as_wasted() -> None:
         return take(data, t_rx_ns)
 
     search.on_data = counting  # type: ignore[method-assign, assignment]  # a spy
-    found, _, _ = run_search(search, far, start_ns=NS_PER_S)
-    assert isinstance(found, StreamFound)
+    found, _, _ = found_by(search, far)
     assert found.wasted_bytes > 0
     assert sum(len(data) for data, _ in found.chunks) + found.wasted_bytes == heard
 
@@ -199,26 +199,18 @@ def test_an_unsupported_rate_is_skipped_and_reported() -> None:
 
 def test_a_visit_ends_at_its_deadline_or_byte_limit() -> None:
     search = Search([FAKE_DRIVER])
-    step = search.start(0)
-    assert isinstance(step, Listen)
+    step = first_visit(search)
     assert search.on_time(step.until_ns - 1) is None
-    search = Search([FAKE_DRIVER])
-    step = search.start(0)
-    assert isinstance(step, Listen)
-    change = None
-    for number in range(100):
-        change = search.on_data(bytes(4096), number)
-        if change is not None:
-            break
-    assert isinstance(change, Listen)
-    assert change.baud != step.baud
+    changes = [search.on_data(bytes(4096), number) for number in range(65)]
+    assert changes[:-1] == [None] * 64, "256 KiB are within the limit"
+    assert isinstance(changes[-1], Listen)
+    assert changes[-1].baud != step.baud
 
 
 def test_the_frames_determine_the_driver() -> None:
     other = replace(FAKE_DRIVER, name="other-uart", make_codec=lambda ledger, options: DeafCodec(ledger))
     for drivers in ([other, FAKE_DRIVER], [FAKE_DRIVER, other]):
-        found, _, _ = run_search(Search(drivers), device(115200, 100), start_ns=NS_PER_S)
-        assert isinstance(found, StreamFound)
+        found, _, _ = found_by(Search(drivers), device(115200, 100))
         assert found.driver is FAKE_DRIVER
 
 
@@ -240,8 +232,7 @@ def test_cut_frames_and_random_bytes_are_not_a_device() -> None:
     random = Random(7)
     for noise in (fake_frame(b"x" * 76)[:60], fake_frame(b"x" * 76)[:60] + SYNC, random.randbytes(82), SYNC * 40):
         far = replace(device(115200, 100, 3_000_000), noise=noise)
-        result, _, _ = run_search(Search([FAKE_DRIVER], may_ask=True), far, start_ns=NS_PER_S)
-        assert isinstance(result, GaveUp)
+        given_up(Search([FAKE_DRIVER], may_ask=True), far)
         assert far.sent_to == []
 
 
@@ -276,8 +267,7 @@ def test_a_reply_behind_other_frames_and_frames_of_several_visits_count() -> Non
 def test_only_received_bytes_make_longer_visits_of_several_rates(bauds: tuple[int, ...]) -> None:
     """Foreign bytes: three passes with longer visits, one rate: one visit. No bytes: only the quiet time."""
     foreign = replace(device(115200, 10), noise=b"$GPGGA,123519,4807.038,N,01131.000,E*47\r\n")
-    result, _, listens = run_search(Search([FAKE_DRIVER], bauds=bauds), foreign)
-    assert isinstance(result, GaveUp)
+    _, _, listens = given_up(Search([FAKE_DRIVER], bauds=bauds), foreign)
     assert [listen.baud for listen in listens] == [*bauds] * (3 if len(bauds) > 1 else 1)
     _, took_ns, _ = run_search(Search([FAKE_DRIVER], bauds=bauds), device(115200, 0))
     assert QUIET_NS <= took_ns < QUIET_NS + 100 * NS_PER_MS
@@ -312,8 +302,7 @@ def test_a_streaming_device_is_found_without_a_remembered_rate(
     for _ in range(3):
         far = replace(family_device(driver, baud, 100, random.randrange(NS_PER_S)), poll_ns=max(hold_ms, 1) * NS_PER_MS)
         search = Search(FAMILIES[::order], may_ask=True, hold_ns=hold_ms * NS_PER_MS)
-        found, took_ns, _ = run_search(search, far, start_ns=5 * NS_PER_S)
-        assert isinstance(found, StreamFound), found
+        found, took_ns, _ = found_by(search, far, 5 * NS_PER_S)
         assert (found.driver.name, found.baud) == (driver.name, baud)
         assert took_ns < 2 * NS_PER_S
         assert far.sent_to == []
@@ -327,8 +316,7 @@ def test_a_streaming_device_is_found_without_a_remembered_rate(
 @every_rate
 def test_a_remembered_device_is_found_immediately(driver: StreamDriver, baud: int) -> None:
     search = Search(FAMILIES, remembered=(driver.name, baud))
-    found, took_ns, listens = run_search(search, family_device(driver, baud, 100, 1_234_567), start_ns=NS_PER_S)
-    assert isinstance(found, StreamFound)
+    found, took_ns, listens = found_by(search, family_device(driver, baud, 100, 1_234_567))
     assert found.driver is driver
     assert {listen.baud for listen in listens} == {baud}
     assert found.wasted_bytes == 0
@@ -339,8 +327,7 @@ def test_a_remembered_device_is_found_immediately(driver: StreamDriver, baud: in
 def test_a_replaced_device_of_another_family_is_found(before: StreamDriver, now: StreamDriver) -> None:
     """Another device at the same rate: the search starts at the remembered rate with both codecs."""
     search = Search(FAMILIES, remembered=(before.name, 115200))
-    found, took_ns, _ = run_search(search, family_device(now, 115200, 100, 4_000_000), start_ns=NS_PER_S)
-    assert isinstance(found, StreamFound)
+    found, took_ns, _ = found_by(search, family_device(now, 115200, 100, 4_000_000))
     assert found.driver is now
     assert took_ns < 0.3 * NS_PER_S
 
@@ -348,16 +335,14 @@ def test_a_replaced_device_of_another_family_is_found(before: StreamDriver, now:
 @every_rate
 def test_a_silent_device_is_found_by_its_reply(driver: StreamDriver, baud: int) -> None:
     far = family_device(driver, baud, 0)
-    found, took_ns, _ = run_search(Search(FAMILIES, may_ask=True), far, start_ns=NS_PER_S)
-    assert isinstance(found, StreamFound)
+    found, took_ns, _ = found_by(Search(FAMILIES, may_ask=True), far)
     assert (found.driver.name, found.baud) == (driver.name, baud)
     assert took_ns < 8 * NS_PER_S
 
 
 def test_each_driver_is_queried_equally_often() -> None:
     far = family_device(HIPNUC, 57600, 0)
-    result, _, _ = run_search(Search(FAMILIES, may_ask=True), far)
-    assert isinstance(result, GaveUp)
+    result, _, _ = given_up(Search(FAMILIES, may_ask=True), far)
     assert "no reply to a query" in result.summary
     bauds = {baud for driver in FAMILIES for baud in driver.baud_rates}
     for query, _ in ANSWERS.values():
@@ -368,5 +353,4 @@ def test_each_driver_is_queried_equally_often() -> None:
 
 def test_an_acknowledgement_is_not_a_reply() -> None:
     far = replace(family_device(IMU61X, 115200, 0), reply=encode_acknowledgement(1))
-    result, _, _ = run_search(Search(FAMILIES, may_ask=True), far, start_ns=NS_PER_S)
-    assert isinstance(result, GaveUp)
+    given_up(Search(FAMILIES, may_ask=True), far)
