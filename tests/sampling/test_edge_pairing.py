@@ -1,10 +1,12 @@
 """Pairing of edges with samples by device time, with losses on both sides; decoding of pulses from edges."""
 
+from collections.abc import Sequence
+
 import pytest
 
 from imud.contracts.lines import Edge
 from imud.model.units import NS_PER_MS
-from imud.sampling.edge_pairing import EdgePairing, PulseDecoder, rising_edges
+from imud.sampling.edge_pairing import EdgePairing, MarkPairing, PulseDecoder, rising_edges
 
 # --- pulses -----------------------------------------------------------------------------------------------------------
 
@@ -86,20 +88,33 @@ def test_a_line_begins_with_the_eighth_pair_after_a_restart() -> None:
     assert begins == [10, 27]
 
 
-@pytest.mark.parametrize(("apart_ns", "error_ns"), [(NS_PER_MS, ERROR_NS), (0, 0.5 * PERIOD_NS)])
-def test_it_begins_only_when_most_agree_and_the_fit_is_sure(apart_ns: int, error_ns: float) -> None:
+@pytest.mark.parametrize(
+    ("off_ns", "moved", "period_ns", "error_ns", "begins"),
+    [
+        # 0.45 periods
+        (4_500_000, range(8), PERIOD_NS, ERROR_NS, True), (4_500_001, range(8), PERIOD_NS, ERROR_NS, False),
+        # 1.4 times the error of the fit is below 0.45 periods
+        (0, (), PERIOD_NS, 3_214_000, True), (0, (), PERIOD_NS, 3_215_000, False),
+        # six of eight events agree: within 0.1 periods, at least 150 us
+        (2_000_000, (2, 5), PERIOD_NS, ERROR_NS, True), (2_000_000, (2, 4, 6), PERIOD_NS, ERROR_NS, False),
+        (1_000_000, (2, 4, 6), PERIOD_NS, ERROR_NS, True), (1_000_001, (2, 4, 6), PERIOD_NS, ERROR_NS, False),
+        (150_000, (2, 4, 6), NS_PER_MS, ERROR_NS, True), (150_001, (2, 4, 6), NS_PER_MS, ERROR_NS, False),
+    ],
+)  # fmt: skip
+def test_it_begins_only_when_most_agree_and_the_fit_is_sure(
+    off_ns: int, moved: Sequence[int], period_ns: int, error_ns: float, begins: bool
+) -> None:
     pairing = EdgePairing(LEAD_NS)
-    for i in range(30):
-        at = i * PERIOD_NS
-        pairing.add_events([(at + (i % 4) * apart_ns, i)])
-        assert not pairing.pair(at, at + NS_PER_MS, at + LEAD_NS, error_ns, float(PERIOD_NS), 1.0)
-    assert not pairing.running
+    for i in range(8):
+        at = i * period_ns
+        pairing.add_events([(at + off_ns * (i in moved), i)])
+        assert not pairing.pair(at, at + NS_PER_MS, at + LEAD_NS, error_ns, float(period_ns), 1.0)
+    assert pairing.running is begins
 
 
 def test_lines_without_events_or_off_by_a_period_are_dropped() -> None:
     pairing = running()
-    assert not any(pair(pairing, 100 + i) for i in range(8))
-    assert not pairing.running
+    assert [(pair(pairing, 100 + i), pairing.running) for i in range(8)] == [(False, i < 7) for i in range(8)]
     assert pairing.learned
     pairing = running()
     for i in range(100, 364):
@@ -107,6 +122,48 @@ def test_lines_without_events_or_off_by_a_period_are_dropped() -> None:
         pair(pairing, i, PERIOD_NS + LEAD_NS)
     assert pairing.number < 364
     assert not pairing.learned or abs(pairing.delay_ns) < PERIOD_NS / 2
+    pairing, found = running(), list[bool]()
+    for at in range(100 * PERIOD_NS, 164 * PERIOD_NS, PERIOD_NS):  # each event is later than its frame
+        pairing.add_events([(at, 1)])
+        found.append(pairing.pair(at, at - 1, at + LEAD_NS, ERROR_NS, float(PERIOD_NS), 1.0))
+    assert (found, pairing.learned) == ([True] * 63 + [False], False)
+    for slope, is_paired in ((1.1199, True), (1.1201, False)):
+        pairing, at = running(), 100 * PERIOD_NS
+        pairing.add_events([(at, 1)])
+        assert pairing.pair(at, at + NS_PER_MS, at + LEAD_NS, ERROR_NS, float(PERIOD_NS), slope) is is_paired
+
+
+def test_the_line_follows_32_events_and_its_window_their_spread() -> None:
+    """The window is 30 us and eight spreads. The spread starts at 10 us and has a memory of 32 events."""
+    assert [running(count).learned for count in (23, 24)] == [False, True], "16 pairs after the eighth event"
+    assert running(8).spread_ns == 10_000
+    for count in (40, 500):
+        for beyond in (0, 1):
+            pairing, at = running(count), count * PERIOD_NS
+            off_ns = int(30_000 + 8 * 10_000 * (31 / 32) ** (count - 8)) + beyond
+            pairing.add_events([(at + off_ns, 1)])
+            assert pair(pairing, count) == (not beyond)
+    pairing = running(500)
+    pairing.add_events([(500 * PERIOD_NS + 20_000, 500)])
+    assert pair(pairing, 500)
+    assert pairing.spread_ns == pytest.approx(20_000 / 32, abs=0.01)
+    pair(pairing, 501)
+    # gains of the 32nd of equally weighted points: 2 * 63 / (32 * 33) of the level, 6 / (32 * 33) of the slope
+    assert pairing.due_ns - 501 * PERIOD_NS == pytest.approx(20_000 * (126 + 6) / (32 * 33), abs=1)
+
+
+def test_a_pulse_belongs_to_the_sample_within_half_a_period() -> None:
+    marks, half_ns = MarkPairing(), PERIOD_NS // 2
+    marks.add_pulses([(PERIOD_NS - half_ns - 1, 1), (PERIOD_NS - half_ns, 2), (PERIOD_NS + half_ns, 3)])
+    marks.add_sample(PERIOD_NS, 7, 0)
+    marks.add_sample(PERIOD_NS, 7, PERIOD_NS)
+    assert marks.take_marks() == [(PERIOD_NS - half_ns - 1, 1, None), (PERIOD_NS - half_ns, 2, 7)]
+    marks.add_pulses([(PERIOD_NS + half_ns + number, 3 + number) for number in range(1, 1024)])
+    marks.add_sample(2 * PERIOD_NS, 8, PERIOD_NS)
+    assert [(mark.number, mark.seq) for mark in marks.take_marks()] == [(number, 8) for number in range(3, 1027)]
+    marks.add_pulses([(3 * PERIOD_NS, number) for number in range(1025)])
+    marks.add_sample(3 * PERIOD_NS, 9, PERIOD_NS)
+    assert [mark.number for mark in marks.take_marks()] == [*range(1, 1025)]
 
 
 def test_events_without_samples_are_bounded() -> None:
