@@ -1,6 +1,6 @@
 """Fit below the arrivals, and the feasible lines of a latency timer, compared with a brute-force search."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 from math import ceil
 from random import Random
@@ -143,18 +143,72 @@ def test_a_fit_is_known_after_8_points_and_100_ms_or_20_periods_of_the_timer(hol
     assert not fit.is_known(span_ms * NS_PER_MS + 1)
 
 
-@pytest.mark.parametrize(("reported_ms", "true_ms"), [(1, 16), (1, 4), (4, 16)])
+@pytest.mark.parametrize(("reported_ms", "true_ms"), [(1, 16), (1, 4), (4, 16), (1, 20)])
 def test_a_timer_that_is_longer_than_reported_is_measured(reported_ms: int, true_ms: int) -> None:
     random, fit = Random(1), ArrivalFit(0, 0, reported_ms * NS_PER_MS)
     for number in range(1, 2000):
         sent_ns = number * 10 * NS_PER_MS
         add(fit, sent_ns, sent_ns + int(random.uniform(0, 0.9 * true_ms * NS_PER_MS)))
-    assert fit.measured_hold_ns == true_ms * NS_PER_MS
+    assert fit.measured_hold_ns == min(true_ms, 16) * NS_PER_MS
     fit = ArrivalFit(0, 0, reported_ms * NS_PER_MS)
     for number in range(1, 2000):
         sent_ns = number * 10 * NS_PER_MS
         add(fit, sent_ns, sent_ns + int(random.uniform(0, 0.9 * reported_ms * NS_PER_MS)))
     assert fit.measured_hold_ns == 0
+
+
+def followed(fit: ArrivalFit, seconds: int, slope: float, delays_ns: Callable[[float], float]) -> ArrivalFit:
+    """Add a frame every 20 ms. `delays_ns` is the delay of a frame by its time, s."""
+    for number in range(1, 50 * seconds):
+        sent_ns = number * 20 * NS_PER_MS
+        add(fit, sent_ns, int(slope * sent_ns + delays_ns(number / 50)))
+    return fit
+
+
+def noise(mean_ns: float) -> Callable[[float], float]:
+    random = Random(2)
+    return lambda _t_s: random.expovariate(1 / mean_ns)
+
+
+def held(random: Random) -> Callable[[float], float]:
+    """Return waits in a timer of 16 ms. In each second half of a second, the host adds 5 ms."""
+    return lambda t_s: 5e6 * (int(t_s * 2) % 2) + random.random() * 14.4e6
+
+
+FITS: dict[str, Callable[[], ArrivalFit]] = {
+    "three points": lambda: followed(ArrivalFit(0, 0), 1, 1.0001, lambda t_s: 1000 * (t_s > 0.03)),
+    "too slow": lambda: followed(ArrivalFit(0, 0), 20, 1 / 1.08, noise(1e5)),
+    "too fast": lambda: followed(ArrivalFit(0, 0), 20, 1 / 0.92, noise(1e5)),
+    "known slope": lambda: followed(ArrivalFit(0, 0, 0, 1.0, 1e-6), 20, 1.0001, noise(1e5)),
+    "clock stopped": lambda: followed(ArrivalFit(0, 0), 150, 1.0, lambda t_s: 3e8 * (t_s > 130)),
+    "short timer": lambda: followed(ArrivalFit(0, 0, NS_PER_MS), 20, 1.00002, noise(4e5)),
+    "timer and late host": lambda: followed(ArrivalFit(0, 0, 16 * NS_PER_MS), 20, 1.00002, held(Random(5))),
+    "timer and stalls": lambda: behind_timer(
+        40, [(at_ms * NS_PER_MS, (at_ms + 90) * NS_PER_MS) for at_ms in range(0, 40_000, 350)], 16 * NS_PER_MS,
+        3 * NS_PER_MS,
+    ),
+}  # fmt: skip
+FIGURES: dict[str, tuple[float, ...]] = {
+    "three points": (99000, 101041.667, 2460.81633, 112.9, 556.84659, 0, 0, 0),
+    "too slow": (-1.46944004e+09, -65420560.7, 3246481.56, 15849292.4, 97217435, 0, 0, 0),
+    "too fast": (1.49333333e+09, 75268817.2, 45952455.9, 227914261, 134486262, 205813684, 0, 0),
+    "known slope": (472985.6, 23840, 5960, 1495045.86, 894474.868, 1347572.4, 0, 0),
+    "clock stopped": (300000000, 15000000, 3160705.36, 49749609.4, 324154052, 3.81469727e-06, 0, 0),
+    "short timer": (329241.914, 16594.8545, 17052.7379, 5180.79118, 106344.792, 0, 617066.586, 222003.103),
+    "timer and late host": (417593.346, 21048.0517, 261989.757, 540287.147, 3723227.27, 0, 6942595.18, 2522798.8),
+    "timer and stalls": (409842.83, 10328.7004, 46476.1538, 96461.7138, 619397.552, 0, 3205560.35, 1155153.68),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FITS)
+def test_the_figures_of_a_fit_change_only_on_purpose(name: str) -> None:
+    """Value, slope and its error in 1e-9, errors and hidden part in ns."""
+    fit = FITS[name]()
+    got = (
+        at(fit, fit.fitted_ns) - fit.fitted_ns, (fit.slope - 1) * 1e9, fit.slope_error * 1e9, fit.error_ns,
+        fit.residual_ns, fit.recent_ns, fit.hidden_ns, fit.shift_ns,
+    )  # fmt: skip
+    assert got == pytest.approx(FIGURES[name], rel=1e-6, abs=1)
 
 
 # --- feasible lines ---------------------------------------------------------------------------------------------------
