@@ -34,7 +34,7 @@ from imud.device.transport import Transport
 from imud.model.errors import CommandError, ImudError
 from imud.model.event import EventKind
 from imud.model.sample import Pair, Sample, Vector3
-from imud.model.units import NS_PER_S, RAD_PER_DEG
+from imud.model.units import NS_PER_S, RAD_PER_DEG, STANDARD_GRAVITY_M_S2
 from imud.sampling.clock import SampleClock
 
 WINDOW_SAMPLES: Final = 20  # number of samples of a rest: 2 s at ten samples per second
@@ -43,7 +43,6 @@ RATE_BAND_RAD_S: Final = 1.0 * RAD_PER_DEG
 RATE_MEAN_RAD_S: Final = 5.0 * RAD_PER_DEG
 """Maximum mean at rest, rad/s: above the bias of an uncalibrated gyroscope, below a slow turn."""
 ACCEL_BAND_M_S2: Final = 0.5  # maximum deviation from the mean at rest, m/s²
-STANDARD_GRAVITY_M_S2: Final = 9.80665
 GRAVITY_TOLERANCE: Final = 0.05
 """Maximum relative difference to standard gravity. Scale errors and local gravity are below 1 %."""
 
