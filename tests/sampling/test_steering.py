@@ -11,7 +11,7 @@ from imud.contracts.lines import Edge, SoutTiming, TimeBits, TriggerStamp, UtcRe
 from imud.model.sample import Measurement, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.clock import SampleClock
-from imud.sampling.steering import Slew
+from imud.sampling.steering import Holdover, Slew
 from imud.sim.ports.arrival import (
     BARE_UART,
     LOADED,
@@ -51,6 +51,12 @@ def test_the_rate_of_a_slew_is_limited_and_it_ends_at_zero(sign: int, age_ns: in
     assert before - slew.advance(10 * NS_PER_MS, age_ns) == pytest.approx(sign * rate * 10 * NS_PER_MS)
     slew.set(sign * 3.0)
     assert slew.advance(NS_PER_S, age_ns) == slew.left_ns == 0.0
+
+
+def test_a_holdover_has_the_rate_of_utc_within_50_ppm() -> None:
+    line = Holdover(5 * NS_PER_S, 7 * NS_PER_S, 30.0, 80)
+    assert (line.at(6 * NS_PER_S), line.least_ns) == (8 * NS_PER_S, 16 * NS_PER_S)
+    assert (line.error_ns(5 * NS_PER_S), line.error_ns(6 * NS_PER_S)) == (50, 50_050)  # with half a tick: 40 ns
 
 
 # --- edges ------------------------------------------------------------------------------------------------------------
