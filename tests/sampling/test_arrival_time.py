@@ -98,9 +98,10 @@ def test_arrivals_need_a_known_pace() -> None:
             late_ns = 45 * PERIOD_NS // 100 * (i % 4 < late_of_four)
             found = even.add_arrival(DELAY, BEGIN_NS + i * PERIOD_NS + late_ns, 0, triggered=False)
         assert found is is_used
-    even = EvenArrivals()
-    delay = LinkDelay(0, 16 * NS_PER_MS)
-    assert not any(even.add_arrival(delay, BEGIN_NS + i * PERIOD_NS, 0, triggered=False) for i in range(200))
+    for hold_ns, is_used in ((PERIOD_NS // 4, True), (PERIOD_NS // 4 + 100, False)):
+        even, delay = EvenArrivals(), LinkDelay(0, hold_ns)
+        used = [even.add_arrival(delay, BEGIN_NS + i * PERIOD_NS, 0, triggered=False) for i in range(200)]
+        assert any(used) is is_used
 
 
 def test_delayed_frames_are_time_stamped_by_the_fit() -> None:
