@@ -19,7 +19,7 @@ from imud.host.clock import HostClock
 from imud.model.errors import DeviceRefused, LinkError, TransferError, Trouble
 from imud.model.units import NS_PER_S
 from tests.support.event_loops import VirtualClock, in_loop, run_virtually, virtual_buses
-from tests.support.stories import told
+from tests.support.stories import played
 
 ASK = Transfer((b"\x01",), 1)
 
@@ -110,18 +110,24 @@ def refusing() -> TransferScript[None]:
     raise DeviceRefused("no")
 
 
-def run(body: Callable[[PolledBuses], Coroutine[Any, Any, None]]) -> None:
-    clock = VirtualClock()
+class BusBench:
+    """A bus with one device, in virtual time. A transfer takes `takes_ns`."""
 
-    async def whole() -> None:
-        buses = virtual_buses(clock)
-        try:
-            await body(buses)
-        finally:
-            buses.end()
-            buses.end()
+    def __init__(self, takes_ns: int = 0) -> None:
+        self.clock, self.wire, self.sink = VirtualClock(), Wire(), Sink()
+        self.wire.takes_time = lambda: self.clock.advance(takes_ns)
 
-    run_virtually(clock, whole())
+    def play(self, story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        async def whole() -> None:
+            self.buses = virtual_buses(self.clock)
+            self.member = joined(self.buses, self.wire, self.sink)
+            try:
+                await story()
+            finally:
+                self.buses.end()
+                self.buses.end()
+
+        run_virtually(self.clock, whole())
 
 
 def moving() -> TransferScript[None]:
@@ -131,178 +137,144 @@ def moving() -> TransferScript[None]:
     raise DeviceRefused("no")
 
 
-@told(run)
-async def test_a_script_changes_the_target_and_reads_other_targets(buses: PolledBuses) -> None:
-    wire, ended_at = Wire(), list[int]()
-    member = joined(buses, wire, Sink())
+@played(BusBench)
+async def test_a_script_changes_the_target_and_reads_other_targets(it: BusBench) -> None:
+    ended_at = list[int]()
     with pytest.raises(DeviceRefused):
-        await member.run(moving(), 5, ended_at.append)
-    assert (wire.targets, wire.selected, ended_at) == ([7, 5, 9], 9, [9])
-    await member.run(three(), 5, ended_at.append)
+        await it.member.run(moving(), 5, ended_at.append)
+    assert (it.wire.targets, it.wire.selected, ended_at) == ([7, 5, 9], 9, [9])
+    await it.member.run(three(), 5, ended_at.append)
     assert ended_at == [9, 5]
-    wire.fail = TransferError(Trouble.ABSENT, "no")
+    it.wire.fail = TransferError(Trouble.ABSENT, "no")
     with pytest.raises(TransferError):
-        await member.run(moving(), 5)
-    assert (wire.targets[-1], wire.selected) == (7, 5)  # the next read is on the device
+        await it.member.run(moving(), 5)
+    assert (it.wire.targets[-1], it.wire.selected) == (7, 5)  # the next read is on the device
 
 
-@told(run)
-async def test_scripts_return_raise_and_catch(buses: PolledBuses) -> None:
-    wire = Wire()
-    member = joined(buses, wire, Sink())
-    assert await member.run(three(), 1) == 1 + 2 + 3
+@played(BusBench)
+async def test_scripts_return_raise_and_catch(it: BusBench) -> None:
+    assert await it.member.run(three(), 1) == 1 + 2 + 3
     with pytest.raises(DeviceRefused):
-        await member.run(refusing(), 1)
-    wire.fail = TransferError(Trouble.ABSENT, "no")
-    assert await member.run(stubborn(), 1) == "after absent"
+        await it.member.run(refusing(), 1)
+    it.wire.fail = TransferError(Trouble.ABSENT, "no")
+    assert await it.member.run(stubborn(), 1) == "after absent"
     with pytest.raises(TransferError):
-        await member.run(three(), 1)
-    wire.fail = LinkError("gone")
+        await it.member.run(three(), 1)
+    it.wire.fail = LinkError("gone")
     with pytest.raises(LinkError):
-        await member.run(stubborn(), 1)
+        await it.member.run(stubborn(), 1)
 
 
-def test_readings_are_delivered_in_order_with_their_times() -> None:
-    """Virtual time: reads at 2 kHz, 30 µs each; every sixth deadline has two reads."""
-    clock = VirtualClock()
-    buses = virtual_buses(clock)
-
-    async def body() -> None:
-        wire, sink = Wire(), Sink()
-        wire.takes_time = lambda: clock.advance(30_000)
-        member = joined(buses, wire, sink)
-        member.start((Poll(ASK), Poll(Transfer((b"\x02",), 2), 3_000_000)))
-        await sink.enough.wait()
-        buses.end()
-        readings = sink.readings
-        firsts = [reading.start_ns for reading in readings if reading.poll == 0]
-        steps = [after - before for before, after in pairwise(firsts)]
-        assert steps == pytest.approx([500_000] * len(steps), abs=2)
-        assert [r.poll for r in readings[:15]] == [0, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0]
-        assert all(reading.end_ns - reading.start_ns == 30_000 for reading in readings)
-        assert all(before.end_ns <= after.start_ns for before, after in pairwise(readings))
-
-    run_virtually(clock, body())
+@played(lambda: BusBench(30_000))
+async def test_readings_are_delivered_in_order_with_their_times(it: BusBench) -> None:
+    """Reads at 2 kHz, 30 µs each; every sixth deadline has two reads."""
+    it.member.start((Poll(ASK), Poll(Transfer((b"\x02",), 2), 3_000_000)))
+    await it.sink.enough.wait()
+    it.buses.end()
+    readings = it.sink.readings
+    firsts = [reading.start_ns for reading in readings if reading.poll == 0]
+    steps = [after - before for before, after in pairwise(firsts)]
+    assert steps == pytest.approx([500_000] * len(steps), abs=2)
+    assert [r.poll for r in readings[:15]] == [0, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0]
+    assert all(reading.end_ns - reading.start_ns == 30_000 for reading in readings)
+    assert all(before.end_ns <= after.start_ns for before, after in pairwise(readings))
 
 
-@pytest.mark.parametrize(("read_ns", "most"), [(2_000_000, 40), (300_000_000, 5)])
-def test_a_script_waits_for_few_reads_of_a_slow_device(read_ns: int, most: int) -> None:
-    """Virtual time: a read is always due. Reads precede each of the three transfers, and the result."""
-    clock = VirtualClock()
-    buses = virtual_buses(clock)
-
-    async def body() -> None:
-        wire, sink = Wire(), Sink()
-        wire.takes_time = lambda: clock.advance(read_ns)
-        member = joined(buses, wire, sink)
-        member.start((Poll(ASK),))
-        await sink.enough.wait()
-        before = wire.count
-        await member.run(three(), 5)
-        assert wire.count - before <= 3 + most
-        buses.end()
-
-    run_virtually(clock, body())
+@pytest.mark.parametrize(("takes_ns", "most"), [(2_000_000, 40), (300_000_000, 5)])
+@played(BusBench)
+async def test_a_script_waits_for_few_reads_of_a_slow_device(it: BusBench, takes_ns: int, most: int) -> None:
+    """A read is always due. Reads precede each of the three transfers, and the result."""
+    it.member.start((Poll(ASK),))
+    await it.sink.enough.wait()
+    before = it.wire.count
+    await it.member.run(three(), 5)
+    assert it.wire.count - before <= 3 + most
 
 
 @pytest.mark.parametrize(("latency_ns", "together"), [(0, 1), (460_000, 1), (5_000_000, 11), (5_100_000, 11)])
-def test_a_hold_does_not_delay_reads(latency_ns: int, together: int) -> None:
-    """Virtual time, 2 kHz: imud delivers the oldest reading before the end of its latency."""
-    clock = VirtualClock()
-    buses = virtual_buses(clock)
+@played(lambda: BusBench(30_000))
+async def test_a_hold_does_not_delay_reads(it: BusBench, latency_ns: int, together: int) -> None:
+    """2 kHz: imud delivers the oldest reading before the end of its latency."""
     delivered: list[tuple[int, list[Reading]]] = []
-
-    async def body() -> None:
-        wire = Wire()
-        wire.takes_time = lambda: clock.advance(30_000)
-        bus = buses.get(wire.bus)
-        member = bus.join(wire, Deadlines(), lambda some, _problem: delivered.append((clock.now_ns(), list(some))))
-        member.set_latency(latency_ns)
-        member.start((Poll(ASK),))
-        await asyncio.sleep(0.1)
-        member.set_latency(0)
-        count = len(delivered)
-        await asyncio.sleep(0.002)
-        assert len(delivered) >= count + 4  # the held readings, then each reading immediately
-        buses.end()
-
-    run_virtually(clock, body())
+    bus = it.buses.get(it.wire.bus)
+    member = bus.join(it.wire, Deadlines(), lambda some, _problem: delivered.append((it.clock.now_ns(), list(some))))
+    member.set_latency(latency_ns)
+    member.start((Poll(ASK),))
+    await asyncio.sleep(0.1)
+    member.set_latency(0)
+    count = len(delivered)
+    await asyncio.sleep(0.002)
+    assert len(delivered) >= count + 4  # the held readings, then each reading immediately
+    it.buses.end()
     assert {len(some) for at_ns, some in delivered[:-6]} == {together}
     assert all(at_ns <= some[0].end_ns + latency_ns + 30_000 for at_ns, some in delivered)
     starts = [reading.start_ns for _, some in delivered for reading in some]
     assert [after - before for before, after in pairwise(starts)] == pytest.approx([500_000] * (len(starts) - 1), abs=2)
 
 
-@told(run)
-async def test_a_failed_reading_ends_the_hold(buses: PolledBuses) -> None:
-    wire, delivered = Wire(), list[list[Reading]]()
-    member = buses.get(wire.bus).join(wire, Deadlines(), lambda some, _problem: delivered.append(list(some)))
-    member.set_latency(40_000_000)
-    member.start((Poll(ASK),))
+@played(BusBench)
+async def test_a_failed_reading_ends_the_hold(it: BusBench) -> None:
+    it.member.set_latency(40_000_000)
+    it.member.start((Poll(ASK),))
     await asyncio.sleep(0.0024)
-    assert delivered == []
-    wire.fail = TransferError(Trouble.ABSENT, "no")
+    assert it.sink.calls == 0
+    it.wire.fail = TransferError(Trouble.ABSENT, "no")
     await asyncio.sleep(0.0005)
-    (some,) = delivered
-    assert [reading.error is not None for reading in some] == [False] * 5 + [True]
+    assert it.sink.calls == 1
+    assert [reading.error is not None for reading in it.sink.readings] == [False] * 5 + [True]
 
 
-@told(run)
-async def test_a_script_gets_a_turn_on_a_busy_bus(buses: PolledBuses) -> None:
-    wire, sink = Wire(), Sink()
-    wire.rate_hz = 1e6
-    member = joined(buses, wire, sink)
-    member.start((Poll(ASK),))
-    await sink.enough.wait()
-    assert await member.run(three(), 1) > 0
+@played(BusBench)
+async def test_a_script_gets_a_turn_on_a_busy_bus(it: BusBench) -> None:
+    it.wire.rate_hz = 1e6
+    it.member.start((Poll(ASK),))
+    await it.sink.enough.wait()
+    assert await it.member.run(three(), 1) > 0
 
 
-@told(run)
-async def test_the_end_of_the_bus_is_reported_once_and_stops_reads(buses: PolledBuses) -> None:
-    wire, sink = Wire(), Sink()
-    member = joined(buses, wire, sink)
-    wire.fail = LinkError("gone")
-    member.start((Poll(ASK),))
-    await sink.enough.wait()
-    wire.fail = None
-    count = wire.count
-    assert await member.run(three(), 1) == 3 * count + 6  # no other transfer in the meantime
-    assert (str(sink.problem), sink.calls) == ("gone", 1)
+@played(BusBench)
+async def test_the_end_of_the_bus_is_reported_once_and_stops_reads(it: BusBench) -> None:
+    it.wire.fail = LinkError("gone")
+    it.member.start((Poll(ASK),))
+    await it.sink.enough.wait()
+    it.wire.fail = None
+    count = it.wire.count
+    assert await it.member.run(three(), 1) == 3 * count + 6  # no other transfer in the meantime
+    assert (str(it.sink.problem), it.sink.calls) == ("gone", 1)
 
 
-@told(run)
-async def test_the_thread_closes_the_link_of_a_device_that_has_left(buses: PolledBuses) -> None:
-    wire, sink, other = Wire(), Sink(), Wire()
-    member, stays = joined(buses, wire, sink), joined(buses, other, Sink())
-    member.start((Poll(ASK),))
-    await sink.enough.wait()
-    member.leave()
-    member.leave()
-    calls = sink.calls
+@played(BusBench)
+async def test_the_thread_closes_the_link_of_a_device_that_has_left(it: BusBench) -> None:
+    other = Wire()
+    stays = joined(it.buses, other, Sink())
+    it.member.start((Poll(ASK),))
+    await it.sink.enough.wait()
+    it.member.leave()
+    it.member.leave()
+    calls = it.sink.calls
     await stays.run(three(), 1)
-    assert sink.calls == calls
-    assert wire.closed == 1
+    assert it.sink.calls == calls
+    assert it.wire.closed == 1
     assert other.closed == 0
 
 
-@told(run)
-async def test_a_cancelled_script_has_no_result(buses: PolledBuses) -> None:
-    failed, wire = list[object](), Wire()
+@played(BusBench)
+async def test_a_cancelled_script_has_no_result(it: BusBench) -> None:
+    failed = list[object]()
     asyncio.get_running_loop().set_exception_handler(lambda _loop, context: failed.append(context))
-    member = joined(buses, wire, Sink())
     for script in (three(), refusing()):
-        running = asyncio.create_task(member.run(script, 1))
+        running = asyncio.create_task(it.member.run(script, 1))
         await asyncio.sleep(0)
         running.cancel()
         with pytest.raises(asyncio.CancelledError):
             await running
-    assert await member.run(three(), 1) == 5 + 6 + 7  # after the transfers
+    assert await it.member.run(three(), 1) == 5 + 6 + 7  # after the transfers
     assert failed == []
 
 
-@told(run)
-async def test_a_target_is_claimed_once(buses: PolledBuses) -> None:
-    a, b = joined(buses, Wire(), Sink()), joined(buses, Wire(), Sink())
+@played(BusBench)
+async def test_a_target_is_claimed_once(it: BusBench) -> None:
+    a, b = it.member, joined(it.buses, Wire(), Sink())
     assert a.claim(0x18)
     assert a.claim(0x18)
     assert not b.claim(0x18)
@@ -320,20 +292,19 @@ def holding(log: list[int], wire: Wire) -> TransferScript[None]:
     yield ASK
 
 
-@told(run)
-async def test_a_script_can_prevent_reads_of_its_device(buses: PolledBuses) -> None:
-    wire, log = Wire(), list[int]()
-    wire.rate_hz = 0.0  # a read is always due
-    member = joined(buses, wire, Sink())
-    member.start([Poll(ASK)])
-    while wire.count < 20:
+@played(BusBench)
+async def test_a_script_can_prevent_reads_of_its_device(it: BusBench) -> None:
+    log = list[int]()
+    it.wire.rate_hz = 0.0  # a read is always due
+    it.member.start([Poll(ASK)])
+    while it.wire.count < 20:
         await asyncio.sleep(0)
-    await member.run(holding(log, wire), 5)
+    await it.member.run(holding(log, it.wire), 5)
     assert log == [1]  # the error of the script
-    read = wire.count
-    while wire.count < read + 20:
+    read = it.wire.count
+    while it.wire.count < read + 20:
         await asyncio.sleep(0)
-    member.leave()
+    it.member.leave()
 
 
 @pytest.mark.live

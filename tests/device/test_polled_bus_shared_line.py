@@ -118,12 +118,11 @@ async def test_several_modules_alternate(bench: LineBench) -> None:
             status = rig.device.status()
             assert status.identity["serial_number"] == module.serial.hex().upper()
             assert status.settings["id"] == str(module.settings.slave)
-            assert status.polling is not None
-            assert status.polling.missed == status.polling.late == 0
+            assert rig.polling.missed == rig.polling.late == 0
             assert status.expected_rate_hz == 0
-        counts = [rig.device.status().polling.polls for rig in rigs]  # type: ignore[union-attr]  # seen above
+        counts = [rig.polling.polls for rig in rigs]
         await rigs[0].until_samples(30)
-        more = [rig.device.status().polling.polls - n for rig, n in zip(rigs, counts, strict=True)]  # type: ignore[union-attr]  # seen above
+        more = [rig.polling.polls - n for rig, n in zip(rigs, counts, strict=True)]
         assert max(more) - min(more) <= 1
         for rig, module in zip(rigs, modules, strict=True):
             for sample in rig.samples[-10:]:
@@ -169,9 +168,7 @@ async def test_noise_loses_one_sample(bench: LineBench) -> None:
             await rig.until(
                 partial(lambda count: rig.device.ledger.lost_gap_device == count, silences), "silence counted"
             )
-            polling = rig.device.status().polling
-            assert polling is not None
-            assert polling.failed == silences
+            assert rig.polling.failed == silences
         await rig.until_samples(10)
         assert rig.kinds.count(EventKind.DOWN) == 0
 

@@ -212,7 +212,7 @@ async def test_restarted_device_is_set_up_again(bench: PolledBusBench) -> None:
         device.restart()
         await rig.until(lambda: device.filter == 0xB2, "set up again", 11)
         await rig.until_samples(3)
-        assert rig.device.status().polling.vanished == 1  # type: ignore[union-attr]  # a polled device has it
+        assert rig.polling.vanished == 1
         assert rig.device.ledger.frames_in_replies > 2
 
 
@@ -290,9 +290,7 @@ async def test_a_missing_device_does_not_delay_other_devices(bench: PolledBusBen
     gone.faults.error = errno.ENXIO
     async with bench.running(on_i2c("there", address=0x18), on_i2c("gone", address=0x19)) as (good, bad):
         await good.until_samples(100)
-        polling = good.device.status().polling
-        assert polling is not None
-        assert (polling.missed, polling.late) == (0, 0)
+        assert (good.polling.missed, good.polling.late) == (0, 0)
         assert bad.state is DeviceState.SEARCHING
         assert "no acknowledgement at address 0x19" in bad.device.status().problem
         gone.faults.error = 0
@@ -307,8 +305,7 @@ async def test_repeated_values_are_stale_and_make_the_device_silent(bench: Polle
         await rig.until_samples(3)
         device.faults.frozen = True
         await rig.until(lambda: rig.state is DeviceState.SILENT, "silent")
-        polling, ledger = rig.device.status().polling, rig.device.ledger
-        assert polling is not None
+        polling, ledger = rig.polling, rig.device.ledger
         assert polling.stale == ledger.frames_ignored > 10
         assert ledger.lost() == 0
         device.faults.frozen = False
@@ -323,9 +320,7 @@ async def test_device_slower_than_its_polls_gives_each_value_once(bench: PolledB
         await rig.until_samples(20)
     values = [sample.accel_m_s2 for sample in rig.samples]
     assert len(set(values)) == len(values)
-    polling = rig.device.status().polling
-    assert polling is not None
-    assert polling.stale > 2 * len(values)
+    assert rig.polling.stale > 2 * len(values)
     steps = [b.t_ns - a.t_ns for a, b in zip(rig.samples[5:], rig.samples[6:], strict=False)]
     assert sum(steps) / len(steps) == pytest.approx(1e7, rel=0.1)
 
@@ -373,8 +368,7 @@ async def test_slow_transfers_miss_deadlines_which_are_lost_samples(
     async with bench.running(bench.on_spi(rate_hz=1000)) as (rig,):
         await rig.until_samples(10)
         await rig.until(lambda: EventKind.LOSS in rig.kinds, "told")
-        polling = rig.device.status().polling
-        assert polling is not None
+        polling = rig.polling
         # a transfer takes 5.16 ms, the first read has three; each ms is one deadline, kept or missed
         assert polling.polls + polling.missed == pytest.approx(5.16 * (polling.polls + 2), abs=1.5)
         assert polling.late > 0.5 * polling.polls
@@ -419,10 +413,9 @@ async def test_the_kind_of_burst_is_detected_in_every_variant(
     bench.spi.device = device.spi
     async with bench.running(bench.on_spi(burst=burst)) as (rig,):
         await rig.until_samples(int(RATE_HZ))
-        polling = rig.device.status().polling
-        assert polling is not None
+        polling = rig.polling
         assert (polling.vanished, rig.device.ledger.frames_bad_crc) == (0, 0)
         device.restart()
         await rig.until_samples(5)
-        assert rig.device.status().polling.vanished == (burst == "extended")  # type: ignore[union-attr]  # it has it
+        assert rig.polling.vanished == (burst == "extended")
         assert device.extended == (burst == "extended")

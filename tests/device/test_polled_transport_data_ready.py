@@ -80,9 +80,7 @@ class Scene:
 
     @property
     def missed(self) -> int:
-        polling = self.rig.device.status().polling
-        assert polling is not None
-        return polling.missed
+        return self.rig.polling.missed
 
     def dated(self, sample: Sample) -> int:
         """Check time stamp and values of a sample. Return the index of its edge."""
@@ -192,7 +190,7 @@ async def test_an_edge_in_the_kernel_time_stamps_its_read(bench: PolledBusBench)
         await it.rig.until_samples(20)
         it.signal.quiet = True
         await asyncio.sleep(0.01)
-        before = it.rig.device.status().polling
+        before = it.rig.polling
         stamp_ns = it.signal.newest_ns
 
         def at_the_beginning_of_the_read() -> None:
@@ -203,9 +201,7 @@ async def test_an_edge_in_the_kernel_time_stamps_its_read(bench: PolledBusBench)
         bench.before_next_time = at_the_beginning_of_the_read
         await asyncio.sleep(0.01)
         assert bench.before_next_time is None
-        after = it.rig.device.status().polling
-        assert before is not None
-        assert after is not None
+        after = it.rig.polling
         assert it.dated(it.rig.samples[-1]) == len(it.signal.stamps)
         assert (after.polls - before.polls, after.missed - before.missed) == (1, 1)
         assert after.stale == before.stale

@@ -16,7 +16,7 @@ import msgspec
 from imud.config.model import DeviceConfig
 from imud.contracts.lines import LineFactory
 from imud.contracts.publisher import Batch
-from imud.contracts.status import DeviceState
+from imud.contracts.status import DeviceState, PollingStatus
 from imud.device.device import Device
 from imud.device.factory import DeviceFactory
 from imud.drivers import DRIVERS
@@ -72,6 +72,12 @@ class DeviceRig:
     @property
     def problem(self) -> str:
         return self.device.status().problem
+
+    @property
+    def polling(self) -> PollingStatus:
+        polling = self.device.status().polling
+        assert polling is not None
+        return polling
 
     @property
     def link(self) -> MemoryLink:
