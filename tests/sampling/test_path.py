@@ -79,6 +79,8 @@ class PathRig:
         self.noted: Any = Noted()
         self.codec: Any = Scripted(self.ledger)
         self.batches: list[list[Sample]] = []
+        self.reported: list[int] = []
+        """Number of reports to the observer before each batch."""
         self.messages: list[tuple[Message, int]] = []
         self.bad: list[BadReason] = []
         self.overruns = 0
@@ -90,6 +92,7 @@ class PathRig:
 
     def _publish(self, batch: Batch) -> None:
         self.batches.append(list(batch.samples))
+        self.reported.append(len(self.noted.reports))
 
     @property
     def sizes(self) -> list[int]:
@@ -269,6 +272,34 @@ def test_lost_frames_and_a_closed_link_end_a_sample_and_an_idle_bus_publishes_it
     assert rig.sizes == [1]
     path.flush(now + 6 * MS)  # no frame since the previous call
     assert (rig.sizes, rig.batches[1][0].t_rx_ns) == ([1, 1], now + 2 * MS)
+
+
+def test_each_input_is_reported_before_its_samples_are_published() -> None:
+    """An output can read the host clocks when it receives samples. A recording has this reading after the input."""
+    rig = PathRig("hipnuc-uart")
+    stream, now = rig.stream(), rig.now
+    stream.observe(rig.noted)
+    stream.on_data(hi91(0), now)
+    stream.gather(hi91(10), now + 10 * MS)
+    stream.publish_gathered()
+    stream.on_data(b"\x5a\xa5\x00\x01" + hi91(20), now + 20 * MS)  # 256 bytes by its length
+    stream.flush(now + 70 * MS)
+    assert [name for name, *_ in rig.noted.reports] == ["data", "data", "call", "data", "call"]
+    assert rig.reported == [1, 3, 5]
+    rig = PathRig("imu61x-can")
+    can = rig.can()
+    can.observe(rig.noted)
+    rig.codec.results, rig.codec.flush = [((since(now),), 0)], lambda: [since(now)]
+    can.on_frames([frame(now)])
+    can.flush(now + 5 * MS)
+    can.flush(now + 50 * MS)
+    assert [report[0] for report in rig.noted.reports] == ["frames", "call", "call"]
+    assert rig.reported == [1, 3]
+    rig = PathRig("imu61x-i2c")
+    polled = rig.polled()
+    polled.observe(rig.noted)
+    polled.on_readings([rig.reading(0, [VALUES])])
+    assert (rig.noted.reports[0][0], rig.reported) == ("readings", [1])
 
 
 # --- polled devices ---------------------------------------------------------------------------------------------------
