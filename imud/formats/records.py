@@ -33,7 +33,6 @@ _CLOCKS: Final = struct.Struct("<qqqqqI")
 _LOST: Final = struct.Struct("<QQq")
 _EXTENDED: Final = 1
 _AFTER_LOSS: Final = 2
-_FAILED: Final = 1
 NO_DEVICE: Final = 0xFFFF  # device number of records about all devices
 
 

@@ -96,7 +96,6 @@ _LIVELY = struct.Struct("<QQq")  # newest_seq, first_seq, heartbeat_ns
 _BLOCK = struct.Struct(f"<Q32s{LEDGER_ROOM}Q")
 _CRC = struct.Struct("<I")
 _NO_COUNTERS = (0,) * LEDGER_ROOM
-_U64_MASK = 0xFFFF_FFFF_FFFF_FFFF
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +142,7 @@ def encode_header(header: RingHeader) -> bytes:
     """Return the first HEADER_BYTES of a ring, with an empty ledger block."""
     constant = _CONSTANT.pack(
         MAGIC, RING_LAYOUT_VERSION, SLOT_LAYOUT_VERSION, HEADER_BYTES, SLOT_BYTES, header.slot_count,
-        header.ledger_count, header.epoch & _U64_MASK, header.pid, header.state, header.device_id,
+        header.ledger_count, header.epoch, header.pid, header.state, header.device_id,
         header.device.encode(),
     )  # fmt: skip
     lively = _LIVELY.pack(header.newest_seq, header.first_seq, header.heartbeat_ns)

@@ -122,6 +122,7 @@ def test_losses_events_and_diagnoses() -> None:
     assert (array.header.stamp.sec, array.header.stamp.nanosec) == (1_790_000_000, 123_456_789)
     first, second = array.status
     assert (first.level, first.name, first.message, first.hardware_id) == (first.OK, "imud: bow", "running", "17")
+    assert list(DiagnosisLevel) == [first.OK, first.WARN, first.ERROR, first.STALE]
     assert {one.key: one.value for one in first.values} == values
     assert (second.level, second.name, second.values) == (second.STALE, "imud: mast", [])
     assert bytes(ROS.serialize_cdr(array, channel.schema.name)) == channel.encode(Diagnoses(UTC_NS, (bow, mast)))

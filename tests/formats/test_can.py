@@ -22,11 +22,8 @@ def test_length_of_a_frame(extended: bool, data_bytes: int, bits: int) -> None:
 
 def test_frames_in_the_layout_of_the_kernel() -> None:
     assert can.RAW_FRAME.unpack(can.pack_frame(0x7FF, False, b"ab")) == (0x7FF, 2, b"ab" + bytes(6))
-    assert can.RAW_FRAME.unpack(can.pack_frame(0x1FFF_FFFF, True, b"")) == (
-        0x1FFF_FFFF | can.EXTENDED_FLAG,
-        0,
-        bytes(8),
-    )
+    assert can.RAW_FRAME.unpack(can.pack_frame(0x1FFF_FFFF, True, b"")) == (0x9FFF_FFFF, 0, bytes(8))
+    assert (can.EXTENDED_FLAG, can.REMOTE_FLAG, can.ERROR_FLAG) == (1 << 31, 1 << 30, 1 << 29)  # linux/can.h
     wrong = [(0x800, False, b""), (-1, False, b""), (0x2000_0000, True, b""), (1, True, bytes(9))]
     for can_id, extended, data in wrong:
         with pytest.raises(ValueError, match="invalid CAN frame"):
@@ -84,8 +81,10 @@ def test_lines_of_candump() -> None:
     [
         ((5, 4.9995, 6), (5, 5, 6), ""),  # two lines in another order
         ((5, 5.01, 4, 4.01), (5, 5.01, 5.02, 5.03), "line 3: the time changes by -1.010 s (a step of"),
-        ((5, 5.01, 9000, 9000.1), (5, 5.01, 5.02, 5.12), "line 3: the time changes by +8994.990 s (a step of"),
-        ((5, 5.01, 35.01), (5, 5.01, 35.01), "line 3: the time changes by +30.000 s (a pause or a step"),
+        ((5, 5.01, 3605.01, 3605.11), (5, 5.01, 5.02, 5.12), "line 3: the time changes by +3600.000 s (a step of"),
+        ((5, 14.999, 24.999), (5, 14.999, 24.999), "line 3: the time changes by +10.000 s (a pause or a step"),
+        ((5, 3604), (5, 3604), "line 2: the time changes by +3599.000 s (a pause or a step"),
+        ((0, 2, *range(3, 19), 0), (0, *range(2, 20)), "line 19: the time changes by -18.000 s (a step of"),
         ((9, 8, 7, 6, 5, 4, 3, 2), (9,) * 8, "s (a step of the clock, removed by imud); 2 more steps"),
     ],
 )  # fmt: skip
@@ -109,13 +108,15 @@ def test_interfaces() -> None:
     piped.seekable = lambda: False  # type: ignore[method-assign]
     with pytest.raises(BadArgument, match="interfaces can1 and can0: select one"):
         list(can.CandumpReader(piped))
+    with pytest.raises(BadArgument, match=r"interfaces can0, .*can14 and can15: select one"):
+        read(b"".join(b"(1.0) can%d 001#\n" % number for number in range(20)))
 
 
 @pytest.mark.parametrize(
     "line",
     [
         b"no log at all", b"(1.0) can0 900#00", b"(1.0) can0 123#0", b"(1.0) can0 123#001122334455667788",
-        b"(1.0) can0 1234#00", b"can0  123  [2]  11 22", b"\x00\xff" * 400,
+        b"(1.0) can0 1234#00", b"can0  123  [2]  11 22", b"\x00\xff" * 400, b"(1.0) %s 123#00" % (b"c" * 500),
     ],
 )  # fmt: skip  # 0x900 is above 11 bits
 def test_other_lines_are_reported(line: bytes) -> None:

@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import BinaryIO, cast
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
-from imud.formats.capture import MAGIC, RAW_CHUNK_BYTES, RECORD_BYTES_MAX, CaptureReader
+from imud.formats.capture import MAGIC, CaptureReader
 from imud.model.errors import ImudError
 from tests.support.files import ROOT, CaptureWriter
 
+RECORD_BYTES_MAX = 1_048_576
 GOLDEN = (
     b"#imud-capture 1 driver=hipnuc-uart baud=115200\n"
     b"\x02\x01\x00\x00\x00\x00\x00\x00\x03\x00\x00\x00abc"
@@ -60,13 +61,15 @@ def test_the_golden_capture_is_read_and_written() -> None:
     assert list(reader) == [(258, b"abc"), (259, b"d")]
 
 
-@given(st.binary(max_size=3 * RAW_CHUNK_BYTES).filter(lambda data: not data.startswith(MAGIC)))
+@example(bytes(8193))
+@given(st.binary(max_size=100).filter(lambda data: not data.startswith(MAGIC)))
 def test_everything_else_is_raw(data: bytes) -> None:
     reader = CaptureReader(io.BytesIO(data))
     pieces = list(reader)
     assert not reader.stamped
     assert b"".join(piece for _, piece in pieces) == data
-    assert all(t_ns is None and 0 < len(piece) <= RAW_CHUNK_BYTES for t_ns, piece in pieces)
+    sizes = [4096] * (len(data) // 4096) + [len(data) % 4096] * (len(data) % 4096 > 0)
+    assert [(t_ns, len(piece)) for t_ns, piece in pieces] == [(None, size) for size in sizes]
 
 
 @pytest.mark.parametrize("data", [GOLDEN, b"#imud", b"", b"#imud-capture", bytes(100)])
@@ -92,7 +95,7 @@ def test_damage_is_named_with_its_place() -> None:
         assert reader.problem.startswith(f"damaged at byte {len(GOLDEN)}:")
 
 
-@pytest.mark.parametrize("line", [b"2 driver=x\n", b"1 driver=x", b"\n", b"\xff\xff\n"])
+@pytest.mark.parametrize("line", [b"2 driver=x\n", b"1 driver=x", b"\n", b"\xff\xff\n", b"1 note=%s\n" % (b"x" * 4089)])
 def test_other_versions_and_broken_first_lines_are_refused(line: bytes) -> None:
     with pytest.raises(ImudError, match="expected version 1, got"):
         CaptureReader(io.BytesIO(MAGIC + line))

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imud.formats.can import EXTENDED_ID_MAX
-from imud.formats.j1939 import GLOBAL, J1939Id, filter_of, join, sender_of, split
+from imud.formats.j1939 import GLOBAL, J1939Id, all_of, filter_of, join, sender_of, split
 
 KNOWN = [
     (0x0CFF3408, J1939Id(3, 0xFF34, 0x08)), (0x0CEF0855, J1939Id(3, 0xEF00, 0x55, 0x08)),
@@ -52,6 +52,9 @@ def test_filters_and_senders() -> None:
     any_source = filter_of(127250, None)
     assert any_source.matches(0x09F11200, True)
     assert any_source.matches(0x1DF112FD, True)
+    assert all_of(8).matches(0x1DF11208, True)
+    assert not all_of(8).matches(0x1DF11209, True)
+    assert all_of(None).matches(0x1DF11209, True)
     assert not any_source.matches(0x09F11300, True)
     reply = filter_of(0xEF00, 8, 0x55)
     assert reply.matches(0x18EF5508, True)

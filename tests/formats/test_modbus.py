@@ -22,6 +22,7 @@ def finder(echoes: bool | None = False, request: bytes = REQUEST, size: int = le
 def test_check_value_and_frames() -> None:
     assert modbus.crc16_modbus(b"123456789") == 0x4B37
     assert modbus.crc16_modbus(b"123456789\x37\x4b") == 0
+    assert (modbus.READ_HOLDING, modbus.WRITE_SINGLE, modbus.REGISTERS_MAX) == (0x03, 0x06, 125)
     assert modbus.framed(0x50, bytes.fromhex("03 0034 0018")).hex() == "50030034001809" + "8f"
     assert modbus.is_whole(REPLY)
     assert not modbus.is_whole(REPLY[:-1])
@@ -70,6 +71,7 @@ def test_bytes_that_are_not_the_reply_are_skipped_and_counted() -> None:
 def test_a_damaged_reply_is_returned_only_in_its_place() -> None:
     damaged = REPLY[:-1] + bytes([REPLY[-1] ^ 1])
     assert finder().feed(damaged) == damaged
+    assert finder().feed(REPLY[:3] + EXCEPTION) is None  # registers with the bytes of an exception
     late = finder()
     assert late.feed(OTHER + damaged) is None  # after unknown bytes, only a frame with a correct CRC is a reply
     assert late.feed(REPLY) == REPLY
@@ -89,6 +91,10 @@ def test_confirmation_is_distinguished_from_the_echo() -> None:
     assert found.feed(write) is None
     assert found.feed(write) == write
     assert finder(False, write, len(write)).feed(write) == write
+    request, reply = modbus.framed(5, bytes.fromhex("03 0234 0001")), modbus.framed(5, bytes.fromhex("03 02 11 22"))
+    found = finder(None, request, len(reply))
+    assert found.feed(request[: len(reply)]) is None  # the register 0x02… looks like the length of the reply
+    assert found.feed(request[len(reply) :] + reply) == reply
     found = finder()
     for _ in range(100):
         assert found.feed(b"\xee" * 100) is None
@@ -98,4 +104,9 @@ def test_confirmation_is_distinguished_from_the_echo() -> None:
 
 def test_addresses_of_slaves() -> None:
     """0 is the broadcast, 248 to 255 are reserved (Modbus over serial line V1.02, section 2.2)."""
-    assert [address for address in range(256) if address not in modbus.SLAVES] == [0, *range(248, 256)]
+    assert list(modbus.SLAVES) == list(range(1, 248))
+
+
+def test_a_late_reply_names_its_sender() -> None:
+    for data, sender in ((b"\x06" + OTHER + REPLY, 6), (REPLY + OTHER[:-1], None), (REPLY, None), (EXCEPTION, None)):
+        assert modbus.late_sender(data, {6, 7}) == sender

@@ -13,7 +13,16 @@ from hypothesis import strategies as st
 
 from imud.formats import records
 from imud.formats.can import CanFrame
-from imud.formats.records import CallRecord, ClocksRecord, EdgeRecord, Kind, LostRecord, ReadingRecord, Record
+from imud.formats.records import (
+    CallRecord,
+    CheckRecord,
+    ClocksRecord,
+    EdgeRecord,
+    Kind,
+    LostRecord,
+    ReadingRecord,
+    Record,
+)
 from imud.model.errors import ImudError
 from tests.support.documented import DOCS
 
@@ -39,6 +48,8 @@ def test_a_data_record_by_hand_and_round_trip_of_objects() -> None:
     assert records.decode_object(record, CallRecord) == call
     with pytest.raises(ImudError, match="cannot read a record of kind 9"):
         records.decode_object(record._replace(body=b"\xc1"), CallRecord)
+    with pytest.raises(ImudError, match="expected a ledger with "):
+        records.decode_object(only(records.encode_object(Kind.CHECK, 1, CHECK)), CheckRecord)
 
 
 FRAMES = [
@@ -47,6 +58,7 @@ FRAMES = [
 ]  # fmt: skip
 READINGS = [ReadingRecord(0, 5, 9, 0, b"\1" * 300), ReadingRecord(1, 10, 12, 2, "bus é".encode())]
 CLOCKS, LOST = ClocksRecord(1, -2, 3, 4, 5, 6), LostRecord(1, 2, -3)
+CHECK = {"t_ns": 1, "seq": 2, "sample_t_ns": 3, "sample_t_err_ns": 4, "ledger": {}}
 
 
 @pytest.mark.parametrize(

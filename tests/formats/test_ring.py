@@ -1,5 +1,6 @@
 import struct
 import zlib
+from dataclasses import replace
 
 import pytest
 
@@ -8,7 +9,7 @@ from imud.model.errors import ServerError
 from imud.model.ledger import LEDGER_FIELDS
 from tests.support.rings import check_layout
 
-HEADER = ring.RingHeader(0x0102_0304_0506_0708, 4711, ring.STATE_LIVE, "front-imu", 3, 4096, 10, 2, -5)
+HEADER = ring.RingHeader(0x0102_0304_0506_0708, 4711, 1, "front-imu", 3, 4096, 10, 2, -5)
 LEDGER = {name: 100 + i for i, name in enumerate(LEDGER_FIELDS)}
 
 GOLDEN = (
@@ -34,6 +35,13 @@ def test_header() -> None:
     assert raw[: len(GOLDEN)].hex(" ", 8) == GOLDEN.hex(" ", 8)
     assert not any(raw[len(GOLDEN) :])
     assert ring.decode_header(GOLDEN.ljust(ring.HEADER_BYTES, b"\0"), "x") == HEADER
+    full = replace(HEADER, ledger_count=59)
+    assert ring.decode_header(ring.encode_header(full), "x") == full
+    words, half_words = memoryview(raw).cast("Q"), memoryview(raw).cast("I")
+    places = ring.NEWEST_WORD, ring.FIRST_WORD, ring.HEARTBEAT_WORD
+    assert [words[place] for place in places] == [10, 2, (1 << 64) - 5]
+    assert half_words[ring.STATE_HALF_WORD] == 1
+    assert (ring.LEDGER_UPDATE_WORD, ring.STATE_CLOSED, ring.HEARTBEAT_LIMIT_NS) == (32, 2, 1_000_000_000)
 
 
 @pytest.mark.parametrize(
@@ -45,7 +53,7 @@ def test_no_ring_at_all(raw: bytes) -> None:
 
 
 VERSIONS = [("layout_version", 3), ("slot_layout_version", 3), ("header_bytes", 4098), ("slot_bytes", 258)]
-COUNTS = [("slot_count", 0), ("slot_count", 4095), ("ledger_count", ring.LEDGER_ROOM + 1)]
+COUNTS = [("slot_count", 0), ("slot_count", 4095), ("ledger_count", 60)]
 
 
 @pytest.mark.parametrize(
@@ -92,3 +100,10 @@ def test_names_that_cannot_be_files(device: str) -> None:
     assert str(ring.ring_path("/run/imud/shm", "imu0")) == "/run/imud/shm/imud.imu0"
     with pytest.raises(ServerError, match="expected a name"):
         ring.ring_path("/dev/shm", device)
+
+
+def test_default_directories() -> None:
+    assert ring.default_directories({"XDG_RUNTIME_DIR": "/run/user/9"}) == ["/run/imud/shm", "/run/user/9/imud/shm"]
+    assert (
+        ring.default_directories({"XDG_RUNTIME_DIR": "relative"}) == ring.default_directories({}) == ["/run/imud/shm"]
+    )

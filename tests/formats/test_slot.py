@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from imud.formats.slot import (
     CRC_OFFSET,
     PRESENT_BITS,
+    SEQ_INVALID,
     SLOT_BYTES,
     SLOT_FIELDS,
     SYNC_CODES,
@@ -20,9 +21,11 @@ from imud.formats.slot import (
     encode_slot,
     encode_slots,
     slot_is_whole,
+    slot_quality,
     slot_seqs,
     slot_status_bits,
     slot_times_ns,
+    slots_in,
 )
 from imud.model.sample import Sample, Sync
 from tests.support.rings import check_layout
@@ -118,6 +121,7 @@ def test_any_flipped_bit_and_the_sync_of_a_newer_layout_are_found() -> None:
 @pytest.mark.parametrize("slot", [b"", bytes(SLOT_BYTES), encode_slot(FULL, 1)[:-1], b"\xff" * SLOT_BYTES])
 def test_bytes_that_are_not_a_slot(slot: bytes) -> None:
     assert not slot_is_whole(slot)
+    assert SEQ_INVALID == 0xFFFF_FFFF_FFFF_FFFF
 
 
 @pytest.mark.parametrize(
@@ -125,7 +129,8 @@ def test_bytes_that_are_not_a_slot(slot: bytes) -> None:
     [
         ("t_err_ns", 1 << 32, 0xFFFF_FFFF),  # 4.3 s is clipped to the maximum
         ("t_err_ns", -1, 0), ("status", 0x1_8000_0001, 0x8000_0001), ("status", -1, 0xFFFF_FFFF),
-        ("pps_age_ms", 1 << 32, 0xFFFF_FFFF), ("pps_age_ms", -5, 0), ("edge_seq", -1, 0), ("t_dev_ns", -5, -5),
+        ("pps_age_ms", 1 << 32, 0xFFFF_FFFF), ("pps_age_ms", -5, 0), ("edge_seq", -1, 0),
+        ("edge_seq", 1 << 64, (1 << 64) - 1), ("seq", -1, 0), ("t_dev_ns", -5, -5),
         ("t_dev_ns", 1 << 63, (1 << 63) - 1), ("t_dev_ns", -(1 << 63) - 1, -(1 << 63)),
         ("t_ns", 1 << 63, (1 << 63) - 1), ("t_rx_ns", 1 << 63, (1 << 63) - 1), ("utc_ns", 1 << 63, (1 << 63) - 1),
     ],
@@ -159,6 +164,8 @@ def test_a_batch_is_its_samples_one_by_one_also_where_one_does_not_fit() -> None
         assert decode_slots(packed, "imu0") == decoded
         assert slot_seqs(packed) == (decoded[0].seq, decoded[-1].seq)
         assert slot_times_ns(packed) == [one.t_ns for one in decoded]
+        assert [slot for (slot,) in slots_in(packed)] == slots
+        assert [slot_quality(slot) for slot in slots] == [(one.sync, one.t_err_ns) for one in decoded]
         assert slot_status_bits(packed) == reduce(or_, [one.status or 0 for one in decoded])
 
 
