@@ -17,7 +17,9 @@ from mcap.records import Chunk, Message, SummaryOffset
 from mcap.stream_reader import StreamReader
 
 from imud.bridges.channel import MessageChannel, MessageSchema
-from imud.bridges.mcap import CHUNK_BYTES, McapFile
+from imud.bridges.mcap import McapFile
+
+CHUNK_BYTES = 1 << 20
 
 SCHEMA = MessageSchema("a.B", "jsonschema", b'{"type":"object"}')
 FIRST: MessageChannel[bytes] = MessageChannel("/first", SCHEMA, "json", bytes)

@@ -15,6 +15,7 @@ from msgspec.structs import replace
 from imud.client.connection import Client, EventStream, default_path, event_of, rpc_error
 from imud.contracts.publisher import Batch
 from imud.formats.jsonrpc import RpcError
+from imud.formats.recording import is_recording
 from imud.model.errors import LinkDenied, LinkMissing, ServerError
 from imud.model.event import Event, EventKind
 from imud.publishers.socket.server import SocketServer
@@ -135,7 +136,7 @@ def test_dropped_samples_are_reported(served: Daemon, encoding: str) -> None:
         assert min(watch.dropped.values()) > 1000
 
 
-def test_a_snapshot_is_a_descriptor_and_its_length(served: Daemon) -> None:
+def test_recordings_and_snapshots_are_descriptors(served: Daemon) -> None:
     def take(sock: socket.socket) -> float:
         with sock:
             sock.send(b"a snapshot")
@@ -147,6 +148,9 @@ def test_a_snapshot_is_a_descriptor_and_its_length(served: Daemon) -> None:
         assert seconds == 299.5
         with open(fd, "rb") as file:
             assert file.read() == b"a snapshot"
+        with open(client.record(["imu0"]), "rb") as file:
+            assert client.stop_recording() == 0
+            assert is_recording(file.read())
 
 
 def test_null_is_nan(served: Daemon) -> None:
@@ -167,6 +171,10 @@ def test_events(served: Daemon) -> None:
         served.do(lambda server: server.event(replace(down, device="imu0")))
         served.do(lambda server: server.event(down))
         assert next(iter(events)) == down
+        served.do(lambda server: server.hub.context.past_events.add(down))
+        (stored,) = client.past_events(7, ["imu1"])
+        assert (stored.t_ns, stored.message) == (7, down.message)
+        assert client.past_events(8) == []
         short = client.events(timeout_s=0.01)
         with pytest.raises(TimeoutError, match="no event within"):
             next(short)
@@ -290,14 +298,13 @@ def test_invalid_servers_raise_errors(tmp_path: Path, answer: bytes, error: type
         next(client.watch(timeout_s=limit_s))
 
 
-@pytest.mark.parametrize("method", ["watch", "poll"])
+@pytest.mark.parametrize("method", ["watch", "poll", "history"])
 def test_a_daemon_without_conventions_raises_an_error(tmp_path: Path, method: str) -> None:
     """An older daemon ignores the parameter and sends the axes of the device."""
     path = tmp_path / "s"
     with answering(path, HELLO + b'{"id":1,"result":{"devices":{},"samples":[]}}\n'), Client(path) as client:
-        ask = client.watch if method == "watch" else client.poll
         with pytest.raises(ServerError, match="does not know the convention ned-frd"):
-            ask(convention="ned-frd")
+            getattr(client, method)([], convention="ned-frd")
 
 
 WATCHING = HELLO + b'{"id":1,"result":{"devices":{}}}\n'

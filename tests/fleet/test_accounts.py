@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imud.fleet.accounts import (
-    BOOTS_MAX,
     BootClocks,
     BootKey,
     BootOffset,
@@ -24,20 +23,12 @@ from imud.fleet.accounts import (
     offset_of,
     placed,
 )
-from imud.fleet.messages import (
-    CLOCK_SET_NS,
-    NUMBER_MOST,
-    VERSION,
-    DropCause,
-    FleetMessage,
-    GatewayClock,
-    Interval,
-    MessageKind,
-    Stream,
-)
+from imud.fleet.messages import VERSION, DropCause, FleetMessage, GatewayClock, Interval, MessageKind, Stream
 from imud.fleet.reader import Fleet, FleetDelivery, ReaderConnection
 from imud.model.sample import Sample, Sync
 from tests.fleet.fleet_gateway import UTC_NS, event_message, intervals_message, not_set, samples_message, synchronised
+
+BOOTS_MAX, CLOCK_SET_NS, NUMBER_MOST = 100_000, 1_577_836_800_000_000_000, 1 << 62
 
 
 def message(first: int, last: int, kind: MessageKind = MessageKind.SAMPLES, *, boot: str = "1") -> FleetMessage:

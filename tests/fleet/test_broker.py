@@ -25,6 +25,9 @@ from tests.fleet.mosquitto import NO_MOSQUITTO, Collector, running_broker
 from tests.support.daemon_process import LIMIT_S
 from tests.support.surroundings import free_port
 
+FIRST_S, PACKET_BYTES, RECEIVED_MAX = 4.0, 16_384, 100
+STABLE_NS, UNREAD_MAX, WEBSOCKET_BYTES = 30_000_000_000, 10_000, 1 << 24
+
 pytestmark = [pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO), pytest.mark.live]
 WILL = fleet_broker.Will("imud/s/g/state", b'{"online":false}')
 
@@ -396,27 +399,27 @@ def test_packets_that_could_fill_the_memory_end_the_connection(words: str, use: 
 @pytest.mark.parametrize("head", [b"", CONNACK])
 def test_messages_that_imud_did_not_request_end_the_connection(head: bytes) -> None:
     message = b"\x30\x05" + TOPIC + b"\x00x"
-    data = head + message * (fleet_broker.RECEIVED_MAX + 1)
+    data = head + message * (RECEIVED_MAX + 1)
     with scripted(data) as broker, pytest.raises(fleet_broker.BrokerError, match="message that imud did not request"):
         use_gateway(broker)
 
 
 def test_a_long_websocket_frame_ends_the_connection() -> None:
-    fleet_broker.check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(fleet_broker.WEBSOCKET_BYTES)))
+    fleet_broker.check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES)))
     fleet_broker.check_websocket_buffer(SimpleNamespace())  # a connection without WebSocket
     with pytest.raises(ValueError, match="WebSocket frame of at most"):
-        fleet_broker.check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(fleet_broker.WEBSOCKET_BYTES + 1)))
+        fleet_broker.check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES + 1)))
 
 
 def test_the_guard_finds_packets_in_any_pieces() -> None:
-    guard = fleet_broker.PacketGuard(fleet_broker.PACKET_BYTES)
+    guard = fleet_broker.PacketGuard(PACKET_BYTES)
     data = b"\x32\x80\x01" + b"\x34" * 128 + b"\xd0\x00"
     for at in range(len(data)):
         guard.take(data[at : at + 1], is_writing=False)
     for _ in range(3):
         guard.take(data * 1000, is_writing=False)
     with pytest.raises(ValueError, match="does not read"):
-        guard.take(b"\xc0\x00" * (fleet_broker.UNREAD_MAX + 1), is_writing=True)
+        guard.take(b"\xc0\x00" * (UNREAD_MAX + 1), is_writing=True)
     with pytest.raises(ValueError, match="at most 10 bytes"):
         fleet_broker.PacketGuard(10).take(b"\x30\x0b", is_writing=False)
     fleet_broker.PacketGuard(10).take(b"\x30\x0a", is_writing=False)
@@ -453,15 +456,13 @@ def test_brokers_take_turns() -> None:
     turn.failed(0)
     assert turn.broker == B
     turn.connected(0)
-    turn.failed(fleet_broker.STABLE_NS)
+    turn.failed(STABLE_NS)
     assert turn.broker == B
-    turn.failed(fleet_broker.STABLE_NS)
+    turn.failed(STABLE_NS)
     assert turn.broker == A
 
 
-@pytest.mark.parametrize(
-    ("held_ns", "pause_s"), [(fleet_broker.STABLE_NS, fleet_broker.FIRST_S), (fleet_broker.STABLE_NS - 1, 32.0)]
-)
+@pytest.mark.parametrize(("held_ns", "pause_s"), [(STABLE_NS, FIRST_S), (STABLE_NS - 1, 32.0)])
 def test_only_a_stable_connection_resets_the_pause(held_ns: int, pause_s: float) -> None:
     turn = fleet_broker.BrokerTurn([A], 60.0, longest)
     for _ in range(3):

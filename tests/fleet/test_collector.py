@@ -13,9 +13,9 @@ import msgspec
 import pytest
 
 from imud.fleet import accounts as fleet_accounts
-from imud.fleet.collector import BATCHES_MAX, GC_ALLOCATIONS, TURN_BYTES, FleetCollector, JsonLines, Offsets, lines_of
+from imud.fleet.collector import FleetCollector, JsonLines, Offsets, lines_of
 from imud.fleet.messages import FleetMessage, GatewayClock, Stream, decode_message, encode_message
-from imud.fleet.reader import RECEIVE_MAX, Fleet, FleetBatch
+from imud.fleet.reader import Fleet, FleetBatch
 from imud.host.threads import rare_garbage_collection
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
@@ -32,6 +32,8 @@ from tests.fleet.fleet_gateway import (
 from tests.fleet.mosquitto import Mosquitto
 from tests.fleet.proxy import Proxy
 from tests.support.daemon_process import LIMIT_S
+
+BATCHES_MAX, GC_ALLOCATIONS, TURN_BYTES, RECEIVE_MAX = 1000, 100_000, 1 << 23, 2000
 
 pytestmark = pytest.mark.live
 

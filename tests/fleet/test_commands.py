@@ -14,7 +14,7 @@ import pytest
 
 from imud.contracts.setting import AppliedSettings, SettingDifference
 from imud.fleet.broker import Received
-from imud.fleet.commands import ANSWERS_KEPT, WAITING_MAX, CommandChannel, CommandReply
+from imud.fleet.commands import CommandChannel, CommandReply
 from imud.fleet.messages import CommandAnswer, Outcome, answer_topic
 from imud.fleet.publisher import MqttPublisher
 from imud.fleet.settings import CommandOptions, MqttOptions, check_commands
@@ -28,6 +28,8 @@ from tests.fleet.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
 from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import VirtualClock, in_loop
 from tests.support.publisher_context import publisher_context
+
+ANSWERS_KEPT, WAITING_MAX = 32, 8
 
 UTC_NS = 1_800_000_000 * NS_PER_S
 DOCS = Path(__file__).parents[2] / "docs" / "fleet.md"

@@ -17,9 +17,7 @@ from hypothesis import strategies as st
 
 from imud.fleet.messages import (
     MAGIC,
-    NUMBER_MOST,
     SCHEMA,
-    SLOTS_MAX,
     STATE,
     STATUS,
     VERSION,
@@ -40,6 +38,8 @@ from imud.fleet.messages import (
 from imud.formats.slot import encode_slots
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample, Sync
+
+NUMBER_MOST, SLOTS_MAX = 1 << 62, 500
 
 
 def made(seq: int) -> Sample:

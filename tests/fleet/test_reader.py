@@ -15,7 +15,7 @@ import pytest
 from imud.fleet.accounts import GatewayState, StreamKey, StreamPosition
 from imud.fleet.broker import BrokerError, ReaderAccess
 from imud.fleet.messages import topic_of
-from imud.fleet.reader import RECEIVE_MAX, VERSIONS, WAITING_BYTES, Fleet, FleetBatch, FleetSession, ReaderConnection
+from imud.fleet.reader import VERSIONS, Fleet, FleetBatch, FleetSession, ReaderConnection
 from imud.fleet.settings import broker_of
 from imud.model.errors import BadArgument
 from tests.fleet.authority import Authority
@@ -26,6 +26,8 @@ from tests.support.daemon_process import LIMIT_S, wait_until
 from tests.support.event_loops import in_loop
 from tests.support.files import ROOT
 from tests.support.surroundings import free_port
+
+RECEIVE_MAX, WAITING_BYTES = 2000, 1 << 24
 
 pytestmark = pytest.mark.live
 

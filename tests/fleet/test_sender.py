@@ -4,16 +4,18 @@ import threading
 
 import pytest
 
-from imud.fleet.broker import STABLE_NS, BrokerTurn, Will
+from imud.fleet.broker import BrokerTurn, Will
 from imud.fleet.commands import CommandReply
 from imud.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
-from imud.fleet.sender import LOSSES_MAX, OUTBOX_MAX, REPLIES_MAX, MqttSender
+from imud.fleet.sender import MqttSender
 from imud.fleet.settings import Broker, MqttOptions
 from imud.fleet.spool import SpoolRow
 from imud.model.units import NS_PER_S
 from tests.fleet.fake_broker import FakeBroker
 from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import VirtualClock
+
+STABLE_NS, LOSSES_MAX, OUTBOX_MAX, REPLIES_MAX = 30 * NS_PER_S, 3, 60, 32
 
 
 def row(number: int, payload: bytes = b"{}", topic: str = "topic") -> SpoolRow:

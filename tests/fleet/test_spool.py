@@ -14,7 +14,6 @@ import pytest
 from imud.fleet import spool
 from imud.fleet.accounts import FleetLedger, StreamCounts
 from imud.fleet.messages import (
-    CLOCK_SET_NS,
     VERSION,
     DropCause,
     FleetMessage,
@@ -28,6 +27,8 @@ from imud.fleet.messages import (
 from imud.formats.slot import encode_slots
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_S
+
+CLOCK_SET_NS, STEP = 1_577_836_800 * NS_PER_S, 32
 
 HOUR_NS = 3600 * NS_PER_S
 UTC_NS = CLOCK_SET_NS + 10_000 * HOUR_NS
@@ -296,7 +297,7 @@ def test_a_damaged_file_is_renamed(tmp_path: Path) -> None:
 
 def test_a_file_that_is_damaged_later_is_renamed_at_the_next_attempt(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path)
-    for number in range(spool.STEP):
+    for number in range(STEP):
         bench.commit(batch(100 * number + 1))
     bench.spool.close()
     path = tmp_path / spool.FILE

@@ -4,13 +4,15 @@ import msgspec
 import pytest
 
 from imud.fleet.accounts import FleetLedger, StreamCounts, StreamPosition
-from imud.fleet.messages import SAMPLES_MAX, SLOTS_MAX, DropCause, FleetMessage, MessageKind, Stream, decode_message
+from imud.fleet.messages import DropCause, FleetMessage, MessageKind, Stream, decode_message
 from imud.fleet.settings import DeviceSending, Whole
 from imud.fleet.spool import SpoolRow
-from imud.fleet.streams import LATE_NS, DeviceStreams, Gateway, notes_of
+from imud.fleet.streams import DeviceStreams, Gateway, notes_of
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S
+
+SAMPLES_MAX, SLOTS_MAX, LATE_NS = 200, 500, 1 * NS_PER_S
 
 GATEWAY = Gateway("site", "gw", "0000000000000001")
 

@@ -13,11 +13,11 @@ from imud.contracts.publisher import Batch, PublisherClock
 from imud.fleet.accounts import FleetLedger, StreamCounts
 from imud.fleet.broker import BrokerTurn, Will
 from imud.fleet.messages import Stream, decode_message
-from imud.fleet.sender import SKIP_NS, MqttSender
+from imud.fleet.sender import MqttSender
 from imud.fleet.settings import Broker, MqttOptions
 from imud.fleet.spool import Spool, SpoolError
 from imud.fleet.streams import Gateway
-from imud.fleet.writer import COMMIT_NS, DISK_RETRY_NS, MissedEvents, SentState, SpoolWriter, WriterQueue
+from imud.fleet.writer import MissedEvents, SentState, SpoolWriter, WriterQueue
 from imud.host.threads import BusThread, StartWorker
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample, Sync
@@ -27,6 +27,8 @@ from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import VirtualClock
 from tests.support.signal_bench import HandWorkers
 from tests.support.socket_rig import device_status
+
+SKIP_NS, COMMIT_NS, DISK_RETRY_NS = 60 * NS_PER_S, 1 * NS_PER_S, 10 * NS_PER_S
 
 HOUR_NS = 3600 * NS_PER_S
 

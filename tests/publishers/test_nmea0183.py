@@ -567,11 +567,11 @@ def test_datagrams_to_a_host_and_to_all(address: str) -> None:
 
 def test_datagrams_without_a_route_are_counted_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     made = nmea0183.UdpOutput("127.0.0.1", 9)
-    made.put(ONE + b"x" * 70_000)  # longer than the maximum of a datagram
-    made.put(ONE + b"x" * 70_000)
-    assert (made.status().dropped, made.status().readers) == (2, 0)
-    assert "too long" in made.status().problem
-    assert len(caplog.records) == 1
+    for dropped in (1, 2):
+        made.put(ONE + b"x" * 70_000)  # longer than the maximum of a datagram
+        assert (made.status().dropped, made.status().readers) == (dropped, 0)
+        assert "too long" in made.status().problem
+        assert len(caplog.records) == 1
     made.close()
 
 
@@ -584,6 +584,23 @@ class Port:
     def close(self) -> None:
         os.close(self.master)
         os.close(self.slave)
+
+
+@in_loop
+async def test_the_pause_between_attempts_to_open_a_port_grows_to_30_s() -> None:
+    clock, tried_s = VirtualClock(), list[float]()
+
+    def fail(_port: str, _baud: int) -> int:
+        tried_s.append(clock.now_ns() / NS_PER_S)
+        raise FileNotFoundError(2, "No such file or directory")
+
+    made = nmea0183.SerialOutput("/dev/ttyUSB9", 38400, clock.now_ns, fail)
+    begin_s = clock.now_ns() / NS_PER_S
+    for _ in range(100):
+        made.tick(clock.now_ns())
+        await until(lambda: made._opening is None)
+        clock.advance(NS_PER_S)
+    assert [t_s - begin_s for t_s in tried_s] == [0, 1, 3, 7, 15, 31, 61, 91]
 
 
 @in_loop

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, cast
 
+import msgspec
 import pytest
 
 from imud.contracts.publisher import Batch, Publisher, PublisherType
@@ -10,10 +11,58 @@ from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.model.options import Options
 from imud.model.units import NS_PER_S
+from imud.publishers import PUBLISHERS
 from imud.publishers import outputs as module
-from imud.publishers.outputs import FORGOTTEN_NS, RETRY_MOST_NS, Outputs
+from imud.publishers.outputs import Outputs
 from tests.support.event_loops import VirtualClock
 from tests.support.publisher_context import publisher_context
+
+FORGOTTEN_NS, RETRY_MOST_NS = 600 * NS_PER_S, 60 * NS_PER_S
+
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "socket": {
+        "enabled": True, "path": "/run/imud/imud.sock", "group": "imud", "control_group": "imud-control",
+        "clients_max": 256, "clients_per_user": 128, "memory_mb": 64, "queue_samples": 4096, "queue_bytes": 4_194_304,
+        "history": None,
+    },
+    "shm": {
+        "enabled": True, "directory": "/run/imud/shm", "slots": 4096, "latency_ms": 5, "group": "imud", "mode": 0o640,
+    },
+    "metrics": {"enabled": True, "address": "127.0.0.1", "port": 9321, "motion": True},
+    "recorder": {
+        "enabled": False, "directory": "/var/lib/imud/recordings", "devices": None, "keep_gb": 10, "file_mb": 100,
+        "file_minutes": 60,
+        "flight": {
+            "enabled": False, "minutes": 5, "after_s": 30, "memory_mb": 64, "directory": "", "acceleration_m_s2": None,
+            "device_lost": True, "line": None, "per_hour": 6,
+        },
+    },
+    "nmea0183": {
+        "enabled": False, "device": None, "sentences": {"HDT": 10, "HDG": 10, "ROT": 10, "XDR": 2}, "talker": "",
+        "tcp_address": "127.0.0.1", "tcp_port": 10110, "udp": [], "serial_port": None, "serial_baud": 38400,
+    },
+    "mqtt": {
+        "enabled": False, "brokers": ["mqtt://127.0.0.1:1883"], "version": "5", "site": "default", "gateway": "",
+        "user": "", "password_file": None, "ca_file": None, "cert_file": None, "key_file": None, "keep_alive_s": 30,
+        "retry_max_s": 60, "messages_per_s": None, "newest_first": False, "spool_directory": "/var/lib/imud/mqtt",
+        "spool_mb": 256, "spool_hours": 168, "status_s": 60, "home_assistant": False,
+        "commands": {"enabled": False, "actions": [], "max_age_s": 30, "per_minute": 30},
+        "devices": {
+            "*": {
+                "rate_hz": 1, "values": ["mean", "min", "max", "rms"], "whole": "none", "batch_s": 1, "events": True,
+                "status": True, "settings": True,
+            },
+        },
+    },
+}  # fmt: skip
+"""Defaults of docs/configuration.md."""
+
+
+def test_rows_and_defaults() -> None:
+    rows = {name: PUBLISHERS[name] for name in PUBLISHERS}
+    assert {name: msgspec.to_builtins(row.settings()) for name, row in rows.items()} == DEFAULTS
+    assert [name for name, row in rows.items() if row.required] == ["socket", "shm"]
+    assert all(name == row.name for name, row in rows.items())
 
 
 class Switch(Options, frozen=True):

@@ -26,9 +26,8 @@ from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.model.ledger import LEDGER_FIELDS
 from imud.model.units import NS_PER_S
-from imud.publishers import PUBLISHERS
 from imud.publishers import shm as ring
-from imud.publishers.shm import PUBLISHER, ShmOptions, ShmPublisher
+from imud.publishers.shm import ShmOptions, ShmPublisher
 from tests.support.files import ROOT
 from tests.support.publisher_context import publisher_context
 from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample, slot_at
@@ -37,14 +36,6 @@ from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample, slo
 def make(folder: Path, **settings: Any) -> ShmPublisher:
     context = publisher_context(list, 1, lambda: START_NS)
     return ShmPublisher(ShmOptions(directory=str(folder), slots=SLOTS, **settings), context)
-
-
-def test_row_and_defaults() -> None:
-    assert PUBLISHERS["shm"] is PUBLISHER
-    assert PUBLISHER.name == "shm"
-    settings = PUBLISHER.settings()
-    assert isinstance(PUBLISHER.make(settings, publisher_context(list, 1, lambda: 0)), ShmPublisher)
-    assert settings == ShmOptions(enabled=True, directory="/run/imud/shm", slots=4096, group="imud", mode=0o640)
 
 
 @pytest.mark.parametrize(

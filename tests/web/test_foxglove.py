@@ -21,10 +21,12 @@ from imud.contracts.status import Deviations
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.publishers.socket.server import SocketServer
-from imud.web.foxglove import CONNECTIONS_MAX, HEAD_BYTES_MAX, WAITING_MAX, Relay, ViewerGate, ViewerOrigins
+from imud.web.foxglove import Relay, ViewerGate, ViewerOrigins
 from tests.support import socket_rig
 from tests.support.daemon_process import LIMIT_S, wait_until
 from tests.support.socket_rig import NOW_NS, batch, daemon
+
+CONNECTIONS_MAX, HEAD_BYTES_MAX, WAITING_MAX = 32, 16_384, 64
 
 pytestmark = pytest.mark.live
 

@@ -5,7 +5,9 @@ from pathlib import Path
 import pytest
 
 from imud.model.errors import BadArgument
-from imud.web.guard import SESSION_S, WebGuard, WebRights, host_name, is_loopback, read_token, safety_headers
+from imud.web.guard import WebGuard, WebRights, host_name, is_loopback, read_token, safety_headers
+
+SESSION_S = 43_200
 
 TOKEN = "correct-horse-battery-staple"
 

@@ -13,23 +13,12 @@ from imud.client.feed import Feed, News, Wish
 from imud.contracts.status import DeviceState
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample
-from imud.web.hub import (
-    DEVICES_MAX,
-    FRAMES_MAX,
-    WAITING_MAX,
-    WINDOW_MAX,
-    Browser,
-    BrowserHub,
-    Bucketing,
-    Mailbox,
-    bucket_of,
-    raw_of,
-    row_of,
-    status_message,
-)
+from imud.web.hub import Browser, BrowserHub, Bucketing, Mailbox, bucket_of, raw_of, row_of, status_message
 from imud.web.messages import Look
 from tests.support.metrics import device
 from tests.support.socket_rig import sample
+
+DEVICES_MAX, FRAMES_MAX, WAITING_MAX, WINDOW_MAX = 32, 100, 8, 100
 
 HELLO = Hello(1, "0.1.0", 2**62 + 1, ("read",))
 

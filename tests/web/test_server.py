@@ -24,21 +24,11 @@ from imud.publishers.socket.server import SocketServer
 from imud.web import hub as mailbox
 from imud.web import server as web_app
 from imud.web.guard import COOKIE, WebGuard
-from imud.web.server import (
-    AT_A_TIME_MAX,
-    CHECK_S,
-    CONNECTIONS_MAX,
-    IDLE_S,
-    STATIC,
-    Busy,
-    Calls,
-    LimitedSite,
-    WebConnections,
-    WebServer,
-    server_log,
-)
+from imud.web.server import STATIC, Busy, Calls, LimitedSite, WebConnections, WebServer, server_log
 from tests.support import socket_rig
 from tests.support.socket_rig import batch, serving, until
+
+AT_A_TIME_MAX, CHECKS_MAX, CHECK_S, CONNECTIONS_MAX, FAILURES_MAX, IDLE_S = 16, 32, 1.0, 200, 8, 60.0
 
 TOKEN = "correct-horse-battery-staple"
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
@@ -225,13 +215,13 @@ async def test_replies_to_wrong_tokens_are_delayed_and_limited(tmp_path: Path, m
         site.client.session.cookie_jar.clear()
         wrong = {"Authorization": "Bearer wrong"}
         forged = {"Cookie": f"{COOKIE}=9999999999.0"}  # a cookie with a wrong signature
-        third = web_app.FAILURES_MAX // 3
+        third = FAILURES_MAX // 3
         guesses = [asyncio.create_task(site.post("/api/login", {"token": "wrong"})) for _ in range(third)]
         guesses += [asyncio.create_task(site.get("/api/session", **wrong)) for _ in range(third)]
-        many = web_app.CHECKS_MAX - 2 * third - 1
+        many = CHECKS_MAX - 2 * third - 1
         guesses += [asyncio.create_task(site.get("/api/session", **forged)) for _ in range(many)]
         right = asyncio.create_task(site.get("/api/session", **BEARER))
-        await until(lambda: site.web.checks.total == web_app.CHECKS_MAX)
+        await until(lambda: site.web.checks.total == CHECKS_MAX)
         assert not any(one.done() for one in (right, *guesses))
         assert (await site.get("/api/session", **forged))[0] == 429, "imud checks no further token"
         assert (await site.get("/api/session", **session))[1]["control"], "a session continues"

@@ -11,6 +11,7 @@ from prometheus_client.parser import text_string_to_metric_families as parse_tex
 
 import imud
 from imud.contracts import status as states
+from imud.contracts.setting import OnDifference, SettingsState, SettingsStatus
 from imud.contracts.status import FlightStatus, MqttStatus, OutputStatus, RecorderStatus
 from imud.model.event import EventKind
 from imud.model.ledger import LEDGER_FIELDS
@@ -202,6 +203,14 @@ def test_missing_parts_of_a_device_are_absent() -> None:
     assert ("imud_line_problem", (("line", "sin"),)) not in found
 
 
+def test_settings_are_absent_without_a_declaration_or_a_report() -> None:
+    for state, number in ((SettingsState.UNDECLARED, 0), (SettingsState.UNKNOWN, 2), (SettingsState.AGREE, 3)):
+        settings = SettingsStatus(state, OnDifference.REPORT)
+        shown = rendered(Snapshot((device("bow", declared=settings),)))
+        names = "differ", "problem", "repairs_total"
+        assert sum(key(f"imud_settings_{name}", device="bow") in shown for name in names) == number
+
+
 def test_problems_of_lines_and_of_gravity_are_shown() -> None:
     lines = msgspec.structs.replace(LINES, problems={"reset": "in use", "sin": "in use"}, edges={"sout": 1})
     found = parts_of("bow", rendered(Snapshot((equipped("bow", lines=lines),))))
@@ -309,6 +318,11 @@ def test_clients_are_summed_and_totals_never_fall() -> None:
     assert {e: shown[key("imud_clients", encoding=e)] for e in ("json", "binary", "none")} == {
         "json": 2, "binary": 1, "none": 1,
     }  # fmt: skip
+    renderer = Renderer(pause=lambda: None)
+    for sent in (4, 9):
+        body = renderer.render(Snapshot(clients=[client(1, sent=sent, dropped=sent - 3)]), "").body
+        assert b"imud_client_samples_sent_total %d.0\n" % sent in body
+        assert b"imud_client_samples_dropped_total %d.0\n" % (sent - 3) in body
     assert (shown[key("imud_client_queue_samples")], shown[key("imud_client_queue_samples_max")]) == (9, 7)
     assert shown[key("imud_client_queue_bytes")] == 9 * 256
 

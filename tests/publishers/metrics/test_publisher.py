@@ -18,7 +18,6 @@ from imud.contracts.publisher import PublisherContext
 from imud.contracts.status import DeviceStatus
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
-from imud.publishers import PUBLISHERS
 from imud.publishers.metrics.publisher import MetricsOptions, MetricsPublisher
 from tests.support.event_loops import in_loop
 from tests.support.metrics import LIMIT_S, ask, device, read_all
@@ -190,6 +189,8 @@ async def test_paths_and_methods() -> None:
     async with publisher(context()) as served:
         assert "/metrics" in (await ask(served.port, "/"))[2]
         assert (await ask(served.port, "/metrics?x=1"))[0] == "HTTP/1.1 200 OK"
+        invalid = "Accept: application/openmetrics-text; version=x\r\n"
+        assert "Content-Type: text/plain; version=0.0.4" in (await ask(served.port, headers=invalid))[1]
         assert (await ask(served.port, "/other"))[0] == "HTTP/1.1 404 Not Found"
         assert (await ask(served.port, method="POST"))[0] == "HTTP/1.1 405 Method Not Allowed"
         line, head, body = await ask(served.port, method="HEAD")
@@ -241,8 +242,7 @@ async def test_port_is_free_after_close() -> None:
         assert second.port == port
 
 
-def test_row() -> None:
-    row = PUBLISHERS["metrics"]
-    assert row.name == "metrics"
-    assert row.settings is MetricsOptions
-    assert MetricsOptions().port == 9321
+def test_the_address_is_checked() -> None:
+    assert MetricsOptions(address="localhost").address == "localhost"
+    with pytest.raises(ValueError, match=r'expected an IP address such as 127\.0\.0\.1 or ::1, got "front\.example"'):
+        MetricsOptions(address="front.example")

@@ -14,6 +14,8 @@ from imud.publishers.recorder.client_stream import ClientRecording, stream_pair
 from imud.publishers.recorder.writer import RecordQueue
 from tests.publishers.recorder.recording_bench import RecordingBench
 
+FULL_NS = 20_000_000
+
 LINGER_NS = 10_000_000_000
 
 
@@ -89,7 +91,7 @@ def test_the_recording_contains_the_number_of_records_lost_by_a_slow_client(monk
         bench.tick()
     assert not bench.read()
     bench.tick()
-    while bench.workers[0].work() == module.FULL_NS:
+    while bench.workers[0].work() == FULL_NS:
         bench.read()
     bench.tick()  # the queue has room again
     bench.source.deliver(77)
@@ -128,7 +130,7 @@ def test_a_client_without_progress_is_disconnected_after_the_end() -> None:
     for _ in range(100):
         bench.source.deliver(100_000)
     bench.recording.stop("")
-    assert bench.workers[0].work() == module.FULL_NS
+    assert bench.workers[0].work() == FULL_NS
     bench.clock.advance(LINGER_NS - 1)
     bench.workers[0].work()
     assert not bench.recording.ended

@@ -13,7 +13,6 @@ from msgspec.structs import replace
 from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceStatus
 from imud.formats.jsonrpc import (
-    LINE_MAX_BYTES,
     Code,
     RpcError,
     encode_error,
@@ -26,11 +25,12 @@ from imud.formats.jsonrpc import (
 )
 from imud.formats.slot import SLOT_BYTES
 from imud.publishers.socket.admission import Rights
-from imud.publishers.socket.methods import DEVICES_PER_PIECE, METHODS
-from imud.publishers.socket.scheduler import BYTES_BURST
+from imud.publishers.socket.methods import METHODS
 from imud.publishers.socket.server import SocketOptions, SocketServer
 from tests.support.publisher_context import publisher_context
 from tests.support.socket_rig import NOW_NS, Peer, batch, device_status, in_context, in_server, run, serving, until
+
+LINE_MAX_BYTES, DEVICES_PER_PIECE, BYTES_BURST = 65_536, 8, 1 << 20
 
 
 @pytest.mark.parametrize(

@@ -17,19 +17,11 @@ from imud.formats.jsonrpc import encode_notification
 from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.model.event import Event, EventKind
 from imud.publishers.socket.client import BYTE, ClientConnection
-from imud.publishers.socket.outbox import (
-    NO_FD,
-    REPLY_BYTES,
-    SAMPLE_BYTES,
-    BinaryEncoding,
-    Delivery,
-    JsonEncoding,
-    Limits,
-    Outbox,
-    Pool,
-)
+from imud.publishers.socket.outbox import NO_FD, BinaryEncoding, Delivery, JsonEncoding, Limits, Outbox, Pool
 from imud.publishers.socket.server import SocketServer
 from tests.support.socket_rig import Peer, batch, done_late, in_server, run, until
+
+REPLY_BYTES, SAMPLE_BYTES = 200, 300
 
 
 async def read_samples(peer: Peer, last: dict[str, int]) -> list[tuple[str, int, dict[str, int]]]:

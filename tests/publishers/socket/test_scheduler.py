@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from imud.publishers.socket import scheduler as serving
 from imud.publishers.socket.scheduler import ScheduledClient, Scheduler, TokenBucket
 from tests.support.socket_rig import in_context, until
+
+CPU_NEW_NS, CPU_PER_S_NS, OVER_TICKS_MAX = 100_000_000, 100_000_000, 100
 
 MS = 1_000_000
 
@@ -127,7 +128,7 @@ async def test_a_client_above_its_allowance_is_parked_and_evicted(rig: Scheduler
     for _ in range(200):
         await asyncio.sleep(0)
     used = len(rig.log)
-    assert used * 5 * MS <= serving.CPU_NEW_NS + serving.CPU_PER_S_NS  # then it is parked
+    assert used * 5 * MS <= CPU_NEW_NS + CPU_PER_S_NS  # then it is parked
     rig.clock.ns += 500 * MS
     rig.scheduler.tick()
     await until(lambda: len(rig.log) > used)
@@ -262,7 +263,7 @@ async def test_an_error_outside_of_a_piece_ends_only_its_client(
         rig.socks[1].send(b"x")
     else:
         bad.enqueue()
-    for _ in range(serving.OVER_TICKS_MAX + 10):
+    for _ in range(OVER_TICKS_MAX + 10):
         for _ in range(30):
             await asyncio.sleep(0)
         rig.clock.ns += 2 * MS

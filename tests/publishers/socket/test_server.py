@@ -20,25 +20,12 @@ from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.model.sample import SAMPLE_FIELDS
-from imud.publishers import PUBLISHERS
-from imud.publishers.socket.server import (
-    CHECK_NS,
-    PATH_MAX_BYTES,
-    PUBLISHER,
-    SOCKET_MODE,
-    Listener,
-    SocketOptions,
-    SocketServer,
-)
+from imud.publishers.socket.server import Listener, SocketOptions, SocketServer
 from tests.support import socket_rig
 
+CHECK_NS, PATH_MAX_BYTES, SOCKET_MODE = 950_000_000, 99, 0o660
+
 FORMS_PER_USER = 16
-
-
-def test_row_is_the_table_s() -> None:
-    assert PUBLISHERS["socket"] is PUBLISHER
-    assert PUBLISHER.name == "socket"
-    assert PUBLISHER.settings() == SocketOptions()
 
 
 @socket_rig.in_server()
