@@ -205,10 +205,14 @@ async def test_the_heading_reference_is_read_again(bench: OutputBench) -> None:
     statuses = bench.context.devices.status()
     known = FrameStatus("", "device", "", "", Heading.TRUE, None, {})
     statuses[0] = msgspec.structs.replace(statuses[0], frame=known)  # type: ignore[index]  # it is a list
+    bench.output.tick(bench.clock.now_ns())  # the next read is not due
     bench.publish(20)
     bench.tick()
     bench.publish(20)
-    assert bench.received() == ["HCHDT,45.0,T"]
+    statuses[0] = msgspec.structs.replace(statuses[0], frame=None)  # type: ignore[index]
+    bench.tick()
+    bench.publish(20)
+    assert bench.received() == ["HCHDT,45.0,T"] * 2
 
 
 @in_loop
@@ -228,7 +232,7 @@ async def test_the_only_device_or_the_configured_device_is_used(caplog: pytest.L
     named.output.add_device("mast", 1)
     named.tick()
     await named.connect()
-    named.publish()
+    named.publish(euler=(0.0, 0.0, 0.0))
     named.publish(device="mast")
     assert named.received() == ["HCHDT,45.0,T"]
     named.reader.close()
@@ -256,6 +260,11 @@ async def test_the_only_device_or_the_configured_device_is_used(caplog: pytest.L
 )
 def test_invalid_options_are_rejected(given: dict[str, object], words: str) -> None:
     assert words in "; ".join(map(str, wrong_values(nmea0183.Nmea0183Options, given)))
+
+
+def test_a_serial_port_can_be_filled() -> None:
+    full = {"serial_port": "/dev/ttyS0", "serial_baud": 4800, "sentences": {"HDT": 21, "HDG": 3}}  # 19 and 27 bytes
+    assert not wrong_values(nmea0183.Nmea0183Options, full)
 
 
 def test_addresses() -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from typing import Any, cast
+from unittest.mock import Mock, call
 
 import msgspec
 import pytest
@@ -16,8 +17,6 @@ from imud.publishers import outputs as module
 from imud.publishers.outputs import Outputs
 from tests.support.event_loops import VirtualClock
 from tests.support.publisher_context import publisher_context
-
-FORGOTTEN_NS, RETRY_MOST_NS = 600 * NS_PER_S, 60 * NS_PER_S
 
 DEFAULTS: dict[str, dict[str, Any]] = {
     "socket": {
@@ -173,8 +172,7 @@ def test_the_pause_doubles_and_is_short_again_after_a_long_run(rig: Rig) -> None
         assert rig.done("start") == []
         rig.run(0.1)
         assert rig.done("start") == [("one", "start")]
-    assert RETRY_MOST_NS == 60 * NS_PER_S
-    rig.run(FORGOTTEN_NS / NS_PER_S + 1)
+    rig.run(600.1)
     rig.outputs.publish(BATCH)
     rig.run(1)
     assert rig.done("start") == [("one", "start")]
@@ -194,7 +192,7 @@ def test_an_optional_output_that_cannot_start_is_tried_again(
     rig.run(1)
     rig.failing.clear()
     rig.run(2)
-    assert rig.done("start") == [("two", "start"), ("two", "start")]
+    assert rig.done("start", "close") == [("two", "start"), ("two", "close"), ("two", "start")]
     assert rig.outputs.summary() == "one, must, two"
     assert rig.context.outputs.problems() == {}
     assert [text for text in caplog.messages if "started" in text] == ["two: started"]
@@ -225,6 +223,16 @@ def test_changed_options_that_fail_keep_the_old_options(rig: Rig) -> None:
     assert rig.outputs.summary() == "one, two, must"
     assert rig.outputs.change_to("one", Switch(enabled=False)) == ""
     assert rig.outputs.summary() == "two, must"
+
+
+@pytest.mark.parametrize("method", ["tick", "close", ""])
+def test_the_end_closes_all_outputs_and_returns_the_first_error(rig: Rig, method: str) -> None:
+    rig.start()
+    error = ValueError(method) if method else None
+    if error is not None:
+        rig.failing = {("one", method): error, ("two", "close"): OSError()}
+    assert rig.outputs.close() is error
+    assert rig.done("tick", "close") == [(name, step) for name in ("one", "two", "must") for step in ("tick", "close")]
 
 
 def error_through(*modules: str) -> Exception:
@@ -264,8 +272,10 @@ def test_an_error_in_a_callback_restarts_the_output_whose_code_it_passed(
 
 
 def test_an_exception_in_an_output_of_the_program_reaches_the_program(rig: Rig) -> None:
-    outputs = Outputs(publisher_context(), {"mine": cast("Publisher", FakeOutput(rig, "mine"))})
+    asked = Mock()
+    outputs = Outputs(publisher_context(latencies=asked), {"mine": cast("Publisher", FakeOutput(rig, "mine"))})
     outputs.start({})
+    assert asked.mock_calls == [call.ask("mine", 0)]
     rig.failing[("mine", "publish")] = ValueError("mine")
     with pytest.raises(ValueError, match="mine"):
         outputs.publish(BATCH)
