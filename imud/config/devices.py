@@ -153,9 +153,8 @@ class DeclaredReader:
 
     def check(self, path: KeyPath, driver: str, declared: Options, options: Options | None, link: Options) -> None:
         """Report settings that exclude each other or contradict the address of the device."""
-        table = self._table(driver)
-        if table is None:
-            return
+        table = self._drivers[driver].device_settings
+        assert table is not None  # `read` has accepted the settings
         key, values = (*path, "settings"), declared_values(declared)
         for name, value in values.items():
             place = _fixed(name, options, link) if table.table[name].connection else None
@@ -171,10 +170,9 @@ class DeclaredReader:
 
     def check_lines(self, path: KeyPath, driver: str, declared: Options, lines: DeviceLines) -> None:
         """Report lines that have no function with the declared settings."""
-        if self._table(driver) is not None:
-            found = self._drivers[driver].declared_line_differences(declared_values(declared), lines)
-            for key, words in found.items():
-                self._keys.problem((*path, "lines", key), f"with the declared settings, {words}", at_key=True)
+        found = self._drivers[driver].declared_line_differences(declared_values(declared), lines)
+        for key, words in found.items():
+            self._keys.problem((*path, "lines", key), f"with the declared settings, {words}", at_key=True)
 
     def _table(self, driver: str) -> SettingsTable | None:
         try:
@@ -213,9 +211,11 @@ def read_frame(keys: Keys, path: KeyPath, device: Mapping[str, Any]) -> FrameOpt
     if len(given) > 1:
         message = f"expected one key for the rotation ({', '.join(WAYS)}), got {' and '.join(given)}"
         keys.problem((*path, given[1]), message, at_key=True)
-    nested = _nested(keys, path, found)
-    if nested is None:
-        return None
+    nested = {
+        name: keys.part(schema, found[name], (*path, name))
+        for name, schema in NESTED.items()
+        if found.get(name) is not None
+    }
     settings = keys.part(FrameOptions, {name: value for name, value in found.items() if name not in NESTED}, path)
     if settings is None:
         return None
@@ -227,18 +227,6 @@ def read_frame(keys: Keys, path: KeyPath, device: Mapping[str, Any]) -> FrameOpt
             keys.problem((*path, given[0]), str(error))
             return None
     return frame
-
-
-def _nested(keys: Keys, path: KeyPath, found: Mapping[str, Any]) -> dict[str, Options] | None:
-    """Read the keys that contain keys; None if a key is invalid."""
-    made: dict[str, Options] = {}
-    for name, schema in NESTED.items():
-        if found.get(name) is not None:
-            part = keys.part(schema, found[name], (*path, name))
-            if part is None:
-                return None
-            made[name] = part
-    return made
 
 
 def check_declination(

@@ -83,14 +83,13 @@ class EventLog:
     """Newest events of all devices and of the daemon, repeated events as groups. Synchronization: one thread."""
 
     def __init__(self) -> None:
-        # Groups of each device by number, in the order of their newest events
-        self._devices: dict[str, dict[int, StoredEvent]] = {}
-        self._newest: dict[str, dict[_Key, int]] = {}  # by device: number of the newest group with each key
+        # By device: groups by number in the order of their newest events, and number of the newest group of each key
+        self._devices: dict[str, tuple[dict[int, StoredEvent], dict[_Key, int]]] = {}
         self._made = 0  # number of groups since start
 
     def add(self, event: Event) -> None:
         """Store an event, and remove the oldest groups of its device above EVENTS_MAX."""
-        groups, newest = self._devices.setdefault(event.device, {}), self._newest.setdefault(event.device, {})
+        groups, newest = self._devices.setdefault(event.device, ({}, {}))
         key, self._made = _group_key(event), self._made + 1
         number = newest.get(key, 0)
         before = groups.get(number)
@@ -111,13 +110,12 @@ class EventLog:
     def remove(self, device: str) -> None:
         """Remove the events of a device that left the configuration."""
         self._devices.pop(device, None)
-        self._newest.pop(device, None)
 
     def newest(self, since_ns: int, limit: int, devices: Collection[str] | None = None) -> list[StoredEvent]:
         """Return the newest groups since `since_ns`, at most `limit`, the oldest first. None: of all devices."""
 
         def of(device: str) -> Iterator[StoredEvent]:
-            return takewhile(lambda one: one.t_ns >= since_ns, reversed(self._devices[device].values()))
+            return takewhile(lambda one: one.t_ns >= since_ns, reversed(self._devices[device][0].values()))
 
         chosen = [of(device) for device in self._devices if devices is None or not device or device in devices]
         return list(islice(merge(*chosen, key=lambda one: -one.t_ns), limit))[::-1]

@@ -68,8 +68,6 @@ def got(value: object) -> str:
 def shown(value: object) -> str:
     """Return `value` as one line of YAML with printable characters only."""
     text = msgspec.json.encode(value).decode()
-    if text.isprintable():
-        return text
     return "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text)
 
 
@@ -154,7 +152,7 @@ def _inside(value: object, place: str) -> str:
 
 def unknown_name(what: str, name: str, known: Sequence[str]) -> str:
     """Return the error for a name that is not in `known`, with the most similar name. `what`: `a driver`, …."""
-    near = get_close_matches(name, known, n=1, cutoff=0.5)
+    near = get_close_matches(name, known, cutoff=0.5)
     hint = f"did you mean {near[0]}? " if near else ""
     return f"expected {what} that imud knows, got {got(name)}; {hint}known: {', '.join(sorted(known)) or 'none'}"
 

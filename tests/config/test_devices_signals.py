@@ -88,6 +88,13 @@ def test_defaults() -> None:
         (hipnuc('sout: {line: "A\\0"}'), "devices.a.lines.sout.line: expected text without control characters, got"),
         (spi("reset: {line: A, hold_ms: 0}"), "devices.a.lines.reset.hold_ms: expected a number from 0.01 to 10000, got 0"),
         (spi("data_ready: {line: A, edge: both}"), 'expected one of "falling", "rising", got "both"'),
+        (hipnuc("sout_div: {line: D, divisor: 4}") + ", settings: {sout_divisor: 8}", "2:53: devices.a.lines.sout_div: with the declared settings, expected divisor 4 from the configuration, got 8"),
+        ("driver: imu61x-uart, uart: {port: x}, rmc: {source: gpsd}", '2:45: devices.a.rmc: expected rmc only with the link uart and a device with SIN/PPS, got driver "imu61x-uart"'),
+        ("driver: hipnuc-uart, replay: {path: x}, rmc: {source: gpsd}", "2:47: devices.a.rmc: expected rmc only with the link uart"),
+        ("uart: {port: x}, rmc: {source: gpsd}", "2:24: devices.a.rmc: expected the name of a driver next to rmc, got auto"),
+        ("driver: nobody, uart: {port: x}, rmc: {source: gpsd}, settings: {mode: 6-axis}", '2:15: devices.a.driver: expected a driver that imud knows, got "nobody"'),
+        # a device that imud triggers has no pulse per second
+        (hipnuc("sin: {line: GPIO17}") + ", rmc: {source: gpsd}", "2:75: devices.a.rmc: expected the pulse per second of a receiver on SIN with rmc, got lines.sin, with which imud drives SIN (line 2); remove one of the keys"),
         (hipnuc("")[:-2] + "5", "devices.a.lines: expected keys and values, got 5"),
     ],
 )  # fmt: skip
@@ -179,11 +186,6 @@ def test_each_rmc_source(keys: str, rmc: RmcOptions | None) -> None:
         (HIPNUC + ", rmc: {source: gpsd, tcp_port: 0}", "tcp_port"),
         (HIPNUC + ", rmc: {source: gpsd, error_ms: .nan}", "error_ms"),
         (HIPNUC + ", rmc: {source: gpsd, speed: 1}", "speed"),
-        ("driver: imu61x-uart, uart: {port: x}, rmc: {source: gpsd}", "expected rmc only with"),
-        ("driver: hipnuc-uart, replay: {path: x}, rmc: {source: gpsd}", "expected rmc only with"),
-        ("uart: {port: x}, rmc: {source: gpsd}", "expected the name of a driver next to rmc, got auto"),
-        # a device that imud triggers has no pulse per second
-        (hipnuc("sin: {line: GPIO17}") + ", rmc: {source: gpsd}", "drives SIN (line 2); remove one of the keys"),
     ],
 )
 def test_what_is_wrong_with_an_rmc_source(keys: str, said: str) -> None:

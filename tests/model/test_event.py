@@ -1,6 +1,6 @@
 """Stored events: groups, order, limits."""
 
-from imud.model.event import EVENTS_MAX, Event, EventKind, EventLog
+from imud.model.event import Event, EventKind, EventLog
 
 S = 1_000_000_000
 
@@ -47,9 +47,10 @@ def test_devices_are_merged_by_time_and_events_of_the_daemon_always_included() -
 
 def test_the_oldest_groups_are_removed() -> None:
     log = EventLog()
-    for t_s in range(EVENTS_MAX + 5):
-        log.add(event(t_s, EventKind.UP, str(t_s)))
-    found = log.newest(0, 2 * EVENTS_MAX)
-    assert (len(found), found[0].t_ns) == (EVENTS_MAX, 5 * S)
-    log.add(event(6, EventKind.UP, "0"))
-    assert log.newest(0, 2 * EVENTS_MAX)[-1].count == 1
+    for number in range(1003):
+        log.add(event(61 + number // 1000, EventKind.UP, str(number)) if number else event(0, EventKind.UP, "1"))
+    found = log.newest(0, 2000)
+    assert (len(found), found[0].message) == (1000, "3")
+    for message, count in (("0", 1), ("1002", 2)):
+        log.add(event(62, EventKind.UP, message))
+        assert log.newest(0, 2000)[-1].count == count

@@ -1,6 +1,6 @@
 """The two sums of the ledger."""
 
-from imud.model.ledger import LEDGER_FIELDS, Ledger
+from imud.model.ledger import LEDGER_FIELDS, Ledger, bytes_open, frames_open, lost
 
 
 def test_new_ledger_is_zero_and_closes_and_a_snapshot_is_a_copy() -> None:
@@ -16,12 +16,12 @@ def test_new_ledger_is_zero_and_closes_and_a_snapshot_is_a_copy() -> None:
 def test_every_byte_and_every_good_frame_must_be_somewhere() -> None:
     ledger = Ledger()
     ledger.bytes_in = 100
-    assert ledger.bytes_open() == 100
+    assert ledger.bytes_open() == bytes_open(ledger.snapshot()) == 100
     assert not ledger.closes()
     ledger.bytes_in_good_frames, ledger.bytes_in_bad_frames, ledger.bytes_skipped, ledger.bytes_pending = 70, 10, 15, 5
     assert ledger.closes()
     ledger.frames_good = 10
-    assert ledger.frames_open() == 10
+    assert ledger.frames_open() == frames_open(ledger.snapshot()) == 10
     assert not ledger.closes()
     ledger.frames_in_samples, ledger.frames_in_replies, ledger.frames_ignored, ledger.frames_pending = 4, 3, 2, 1
     assert ledger.closes()
@@ -34,3 +34,4 @@ def test_sums_by_reason_and_cause() -> None:
     ledger.lost_gap_device, ledger.lost_crc, ledger.lost_overrun, ledger.lost_queue = 1, 2, 4, 8
     ledger.add_unknown_gap()
     assert (ledger.lost(), ledger.lost_unknown) == (15, 1), "gaps of unknown size are not among them"
+    assert lost(ledger.snapshot()) == 15

@@ -11,7 +11,7 @@ from msgspec import Meta
 from docs.generate import references
 from imud.contracts.lines import LINE_SCHEMAS
 from imud.drivers import DRIVERS
-from imud.model.options import Options, WrongValue, expected, got, is_host, value_problem, wrong_values
+from imud.model.options import Options, WrongValue, expected, got, is_host, json_or_text, value_problem, wrong_values
 from imud.publishers.socket.methods import METHODS
 
 LEAKS = re.compile(r"`|\$|Object|missing required|ValidationError|<class|Expected|NoneType|\bstr\b|\bint\b|\bfloat\b")
@@ -103,7 +103,7 @@ def test_wrong_values(given: dict[str, Any], expected: list[tuple[str, str]]) ->
             "list, each item a whole number)",
         ),
         (Annotated[int, Meta(ge=0, le=3)] | None, "a whole number from 0 to 3, or null"),
-        (Annotated[int, Meta(ge=-4)], "a whole number from -4"),
+        (Annotated[int, Meta(ge=-4_000_000)], "a whole number from -4000000"),
         (list[bool], "a list, each item true or false"),
         (Annotated[list[int], Meta(min_length=2, max_length=2)], "a list of 2, each item a whole number"),
         (Annotated[list[int], Meta(min_length=2)], "a list of at least 2, each item a whole number"),
@@ -123,16 +123,24 @@ def test_types_in_words(field_type: Any, words: str) -> None:
 
 @pytest.mark.parametrize(
     ("value", "field_type", "place"),
-    [([1, "x"], list[int], ' with "x" at [1]'), ({"rate_hz": 1, "names": ["a", 2]}, Trip, " with 2 at names[1]")],
+    [
+        ([1, "x"], list[int], ' with "x" at [1]'),
+        (["", 1], list[int], ' with "" at [0]'),
+        ({"rate_hz": 1, "names": ["a", 2]}, Trip, " with 2 at names[1]"),
+    ],
 )
 def test_the_place_of_a_wrong_part(value: object, field_type: Any, place: str) -> None:
     assert value_problem(value, field_type).endswith(place)
 
 
-def test_texts_in_errors_are_short() -> None:
-    assert got("a" * 60) == '"' + "a" * 60 + '"'
-    assert len(got("a" * 61)) < len(got("a" * 60)) + 2
-    assert "a" * 61 not in got("a" * 61)
+def test_texts_in_errors_are_short_and_printable() -> None:
+    assert got("a" * 60) == got("a" * 61) == '"' + "a" * 60 + '"'
+    assert got("é\u2028\x9f") == '"é\\u2028\\u009f"'
+
+
+def test_text_of_the_command_line_is_json_or_text() -> None:
+    texts = ("1", "true", "[1]", '"1"', "6-axis", "")
+    assert [json_or_text(text) for text in texts] == [1, True, [1], "1", "6-axis", ""]
 
 
 @pytest.mark.parametrize(

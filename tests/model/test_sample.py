@@ -5,10 +5,18 @@ import struct
 import pytest
 
 from imud.lines.sync import ALARM_STATUS
+from imud.model import units
 from imud.model.event import EventKind, kind_of
 from imud.model.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA, T_ERR_MOST, Sample
 
 BY_NAME = {field.name: field for field in SAMPLE_SCHEMA}
+
+
+def test_units_by_their_definitions() -> None:
+    assert pytest.approx(57.295779513, rel=1e-9) == 1 / units.RAD_PER_DEG
+    assert (units.STANDARD_GRAVITY_M_S2, units.T_PER_UT, units.PPM_PER_ONE) == (9.80665, 1e-6, 1e6)
+    assert (units.NS_PER_S, units.NS_PER_MS, units.NS_PER_US) == (1e9, 1e6, 1e3)
+    assert [units.uart_byte_ns(baud) for baud in (0, 9600, 1_000_000)] == [0, 1_041_666, 10_000], "10 bits per byte"
 
 
 def test_every_member_has_its_row_in_its_place() -> None:
