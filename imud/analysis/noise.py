@@ -26,7 +26,6 @@ PER_DECADE: Final = 12  # number of τ per decade
 PARTS_LEAST: Final = 3
 # Minimum number of averages to find the noise type. With 30 (SP 1065, 5.5.6), the error of the power is 0.4.
 CLUSTERS_LEAST: Final = 60
-DIFFERENCES_MOST: Final = 2
 
 
 class NoiseType(IntEnum):
@@ -152,16 +151,16 @@ def noise_types(run: FloatArray, factors: IntArray) -> IntArray:
 
 def _type_of(averages: FloatArray) -> NoiseType:
     """Return the noise type of averages, shape (n,), from the autocorrelation at lag 1 (SP 1065, 5.5.6)."""
-    for differences in range(DIFFERENCES_MOST + 1):
+    for differences in (0, 1):
         centred = averages - averages.mean()
         power = float(centred @ centred)
         correlation = float(centred[1:] @ centred[:-1]) / power if power > 0 else 0.0
         delta = correlation / (1 + correlation)
-        # stationary enough: no further differencing
-        if delta < 0.25 or differences == DIFFERENCES_MOST:
+        alpha = round(-2 * delta - 2 * differences)
+        # stationary enough: no differencing. A second difference would only find α < -2.
+        if delta < 0.25:
             break
         averages = np.diff(averages)
-    alpha = round(-2 * delta - 2 * differences)
     return NoiseType(min(max(alpha, -2), 2))
 
 

@@ -101,7 +101,10 @@ def grid_of(t_ns: IntArray) -> Grid:
     scatter_s = _scatter(steps_s - steps * period_s)
     located = scatter_s <= SCATTER_MOST * period_s
     if not located:
-        steps = np.where(steps_s > PAUSE_S, np.maximum(np.rint(steps_s / period_s), 1), 1).astype(np.int64)
+        pauses = steps_s > PAUSE_S
+        # without the rounded distances of scattered time stamps, which make the period too short
+        period_s = float(np.mean(steps_s[~pauses]))
+        steps = np.where(pauses, np.maximum(np.rint(steps_s / period_s), 1), 1).astype(np.int64)
     place = np.concatenate(([0], np.cumsum(steps))).astype(np.int64)
     period_s = _slope(place, t_s, steps)
     most = FILL_MOST + 1

@@ -238,9 +238,9 @@ def _shift(power: FloatArray, place: int) -> float:
     """Return the distance from the largest bin of a line to the line, -0.5 to 0.5 bins."""
     above, below = power[place + 1], power[place - 1]
     side = 1 if above >= below else -1
-    # ratio of the two largest bins of a Hann window
+    # ratio of the two largest bins of a Hann window, at most 1
     ratio = float(np.sqrt(max(above, below) / power[place]))
-    return side * min(max((2 * ratio - 1) / (ratio + 1), 0.0), 0.5)
+    return side * max((2 * ratio - 1) / (ratio + 1), 0.0)
 
 
 def _named(line: Peak, lines: Sequence[Peak], bin_hz: float) -> Peak:

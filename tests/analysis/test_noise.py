@@ -53,7 +53,10 @@ def test_white_noise_of_three_axes() -> None:
         assert axis.spread == pytest.approx(1e-3 * np.sqrt(RATE_HZ), rel=0.02)
         assert axis.drift is None
         assert axis.bias_instability_most == pytest.approx(axis.least_deviation / 0.6643, rel=1e-3)
+        assert axis.least_at_end
+        assert 25 < axis.least_tau_s <= 30, "a tenth of the duration"
     assert found.corner_hz is None
+    assert found.flat_hz == pytest.approx((5.0, 60.0))
     assert (found.disturbed_s, found.still_s) == (0, 300)
     assert found.step is None
 
@@ -94,8 +97,14 @@ def test_drift_with_temperature() -> None:
     assert abs(slopes[1].slope) < 4 * slopes[1].sigma
     assert slopes[1].r2 < 0.1
     assert slopes[2].slope == pytest.approx(-2e-3, rel=0.02)
-    temperature = np.linspace(20.0, 21.5, COUNT)
-    assert temperature_drift(temperature, noise_of_three(7)[:, 0], RATE_HZ) is None
+    noise = noise_of_three(7)[:, 0]
+    for span_c, samples in ((1.9, COUNT), (20.0, 1599)):  # at least 2 K and 8 s
+        assert temperature_drift(np.linspace(20, 20 + span_c, samples), noise[:samples], RATE_HZ) is None
+    for span_c, samples in ((2.1, COUNT), (20.0, 1600)):
+        assert temperature_drift(np.linspace(20, 20 + span_c, samples), noise[:samples], RATE_HZ) is not None
+    halves = temperature_drift(np.linspace(20, 40, 4000), np.tile([0.0, 1.0], 2000), 1.0)
+    assert halves is not None
+    assert halves.sigma == pytest.approx(0.0, abs=1e-12), "at most 2000 means: each of two samples"
     temperature = np.full(COUNT, np.nan)
     temperature[:: int(RATE_HZ)] = np.linspace(20.0, 40.0, COUNT // int(RATE_HZ))
     values = noise_of_three(8, 1e-4) + np.outer(np.linspace(-10, 10, COUNT), [1e-3] * 3)
@@ -120,6 +129,7 @@ def test_the_figures_of_a_filtered_walking_and_drifting_sensor() -> None:
     assert (axis.least_deviation, axis.least_tau_s, axis.density) == pytest.approx(
         (0.00066820761, 3.925, 0.00133997352), rel=1e-4
     )
+    assert not axis.least_at_end
     assert (axis.drift.slope, axis.drift.sigma, axis.drift.r2) == pytest.approx(
         (0.00122897744, 1.98019364e-5, 0.9281906555), rel=1e-4
     )
@@ -136,7 +146,9 @@ def test_disturbances_and_counts() -> None:
     values = noise_of_three(9)
     values[2000:2010] += 1.0
     values[30_000:30_400] += np.sin(np.arange(400))[:, None]
-    assert sensor_noise(readings_of(values), values).disturbed_s == 3
+    values[40_000:40_200] *= 5
+    values[50_000:50_200] *= 3
+    assert sensor_noise(readings_of(values), values).disturbed_s == 4
     values = np.round(noise_of_three(10) / 1.065e-3) * 1.065e-3
     assert step_of(values) == pytest.approx(1.065e-3)
     assert step_of(noise_of_three(10)) is None
@@ -178,9 +190,9 @@ def test_one_weakly_disturbed_second_in_a_hundred_seconds_is_no_motion() -> None
     gyro = noise_of_three(8, count=20_000)
     gyro[:200] += 0.03
     assert not motion_words(readings_of(gyro))
-    gyro[:40] += 1.0  # a strong bump changes the standard deviation of all samples
+    gyro[:40] += 0.35  # a strong bump increases the standard deviation of all samples by more than 10 %
     assert "in 1 of 100 seconds" in motion_words(readings_of(gyro))
-    gyro[:40] -= 1.0
+    gyro[:40] -= 0.35
     gyro[200:400] += 0.03
     assert "in 2 of 100 seconds" in motion_words(readings_of(gyro))
 
@@ -262,6 +274,7 @@ def test_types_of_noise_factors_and_short_runs() -> None:
         types = noise_types(made[:, None], np.array([1, 4, 1000]))
         assert types[0, 0] == expected
         assert types[2, 0] == types[1, 0], "too few averages: as at the τ before"
+    assert [noise_types(made[:n, None], np.array([1]))[0, 0] for n in (59, 60)] == [NoiseType.WHITE, expected]
     factors = averaging_factors(3000)
     assert (factors[0], factors[-1]) == (1, 1000)
     assert len(factors) > 24
@@ -345,5 +358,6 @@ def test_short_filtered_points_are_left_out() -> None:
     smooth = np.convolve(white(random, TERMS_COUNT, TERM_HZ, 1e-3), np.ones(8) / 8, mode="same")
     curve = allan_curve([smooth[:, None]], TERM_HZ)
     assert noise_terms(curve, 0, tau_least_s=0.8).random_walk.value == pytest.approx(1e-3, rel=WITHIN)
-    with pytest.raises(BadArgument, match="record a longer series"):
-        noise_terms(curve, 0, tau_least_s=curve.tau_s[-3])
+    assert noise_terms(curve, 0, tau_least_s=curve.tau_s[-6])
+    with pytest.raises(BadArgument, match=r"at least 6 points .*, got 5; record a longer series"):
+        noise_terms(curve, 0, tau_least_s=curve.tau_s[-5])

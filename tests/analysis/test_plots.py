@@ -1,9 +1,11 @@
 """Plots show the values of the analysis on axes with units."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from imud.analysis.noise import SensorNoise, sensor_noise
+from imud.analysis.noise import AllanCurve, SensorNoise, sensor_noise
 from imud.analysis.plots import SensorVibration, density_figure, deviation_figure, page_figure, spectrum_figure, thinned
 from imud.analysis.quantities import DEG_PER_RAD, S_PER_H
 from imud.analysis.series import Readings, grid_of
@@ -28,18 +30,24 @@ def test_plots_are_drawn_in_units_of_data_sheets(sensor: SensorNoise) -> None:
     assert drawn == pytest.approx(sensor.curve.deviation[:, 1] * DEG_PER_RAD * S_PER_H)
     assert axes.get_xscale() == axes.get_yscale() == "log"
     assert "deg/h" in axes.get_ylabel()
-    assert len(axes.collections) == 3, "an interval for each axis"
+    assert (len(axes.collections), len(axes.get_lines())) == (3, 6), "an interval and a fit for each axis"
+    low, high = axes.get_ylim()
+    assert high > 20 * low
+    part = replace(sensor, curve=AllanCurve._make(values[20:24] for values in sensor.curve))
+    low, high = deviation_figure("gyro", part).axes[0].get_ylim()
+    assert high == pytest.approx(10 * low), "the axis has at least one decade"
     (axes,) = density_figure("accel", sensor).axes
     assert "µg/√Hz" in axes.get_ylabel()
     middle = np.asarray(axes.get_lines()[0].get_ydata())[-10:].mean()
     assert middle == pytest.approx(np.sqrt(2) * 1e-3 / 9.80665e-6, rel=0.05)
     figure = page_figure({"gyro": sensor, "accel": sensor}, ["first line", "second line"])
-    assert len(figure.axes) == 4
+    assert [axes.get_xlabel() for axes in figure.axes] == ["τ, s", "τ, s", "f, Hz", "f, Hz"]
+    assert figure.get_size_inches() == pytest.approx((8.27, 11.69 * 0.0105 * 2 + 0.5 + 6.4)), "A4 is 8.27 in wide"
     assert "first line\nsecond line" in [text.get_text() for text in figure.texts]
     frequency = np.arange(1.0, 1001.0)
     density = np.stack([frequency, np.ones(1000)], axis=1)
     few, power = thinned(frequency, density)
-    assert len(few) < 200
+    assert len(few) == 121, "60 bands per decade, without the empty bands"
     assert power[:, 0] == pytest.approx(few)
     assert power[:, 1] == pytest.approx(1.0)
 
@@ -54,6 +62,9 @@ def test_peaks_are_named_in_the_picture() -> None:
         grid_of(stamps_ns(COUNT, RATE_HZ)), spectrum, gram, tuple(peaks(spectrum)), tuple(bands_of(spectrum))
     )
     figure = spectrum_figure({"accel": vibration}, "title", ["line"])
-    assert len(figure.axes) == 3, "density, spectrogram, its scale"
+    assert [(axes.get_title(), axes.get_xlabel()) for axes in figure.axes] == [
+        ("Power spectral density of the accelerometer", "f, Hz"),
+        ("Spectrogram of the accelerometer, sum of all axes", "time, s"), ("", ""),
+    ]  # fmt: skip
     assert [text.get_text() for text in figure.axes[0].texts] == ["P1 12.50 Hz"]
     assert figure.axes[0].get_xlim() == (0.0, 50.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from imud.analysis.series import FILL_MOST, Readings, even_runs, grid_of, with_values
+from imud.analysis.series import Readings, even_runs, grid_of, with_values
 from imud.model.errors import BadArgument
 from tests.analysis.synthetic import stamps_ns
 
@@ -14,13 +14,11 @@ def test_rate_missing_samples_and_runs() -> None:
     assert (grid.missing, grid.runs) == (0, ((0, 1000),))
     assert grid.duration_s == pytest.approx(1000 / 408)
     assert "no sample is lost" in grid.words()
-    t_ns = np.delete(stamps_ns(1000, 100.0), [10, 500, 501])
-    grid = grid_of(t_ns)
-    assert (grid.missing, grid.filled, grid.runs) == (3, 3, ((0, 997),))
+    grid = grid_of(np.delete(stamps_ns(100, 100.0), [10, 50, 51, 70, 71, 72, 73]))
+    assert (grid.missing, grid.filled, grid.runs) == (7, 7, ((0, 93),))
     assert (grid.place[9], grid.place[10]) == (9, 11)
-    assert "3 samples are lost (0.30 %)" in grid.words()
-    gone = list(range(300, 300 + FILL_MOST + 1))
-    grid = grid_of(np.delete(stamps_ns(1000, 100.0), gone))
+    assert "7 samples are lost (7.00 %)" in grid.words()
+    grid = grid_of(np.delete(stamps_ns(1000, 100.0), range(300, 305)))
     assert grid.runs == ((0, 300), (300, 995))
     assert (grid.missing, grid.filled) == (5, 0)
     assert "2 runs" in grid.words()
@@ -37,12 +35,16 @@ def test_rate_missing_samples_and_runs() -> None:
 
 def test_scattered_stamps_are_said_to_hide_gaps() -> None:
     random = np.random.default_rng(1)
-    t_ns = stamps_ns(5000, 200.0) + random.normal(0, 2e6, 5000).astype(np.int64)
-    t_ns = np.maximum.accumulate(t_ns) + np.arange(5000)
-    grid = grid_of(t_ns)
-    assert not grid.located
-    assert grid.missing == 0
-    assert grid.rate_hz == pytest.approx(200.0, rel=1e-4)
+    noise_ns = random.normal(0, 1, 5000)
+    grid = grid_of(stamps_ns(5000, 200.0) + (0.9e6 * noise_ns).astype(np.int64))
+    assert grid.located
+    assert grid.scatter_s == pytest.approx(0.9e-3, rel=0.05)
+    t_ns = np.maximum.accumulate(stamps_ns(5000, 200.0) + (2e6 * noise_ns).astype(np.int64)) + np.arange(5000)
+    for pause_ns, runs, missing in ((0, 1, 0), (900_000_000, 1, 0), (1_100_000_000, 2, 220)):
+        grid = grid_of(t_ns + pause_ns * (np.arange(5000) >= 2000))
+        assert (grid.located, len(grid.runs)) == (False, runs)
+        assert grid.missing == pytest.approx(missing, abs=1)
+        assert grid.rate_hz == pytest.approx(200.0, rel=1e-4 if runs > 1 or not pause_ns else 0.1)
     assert "cannot find and interpolate single lost samples" in grid.words()
 
 

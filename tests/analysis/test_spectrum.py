@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.signal import welch
+from scipy.stats import chi2
 
 from imud.analysis.series import FloatArray, even_runs, grid_of
 from imud.analysis.spectrum import (
@@ -50,6 +51,7 @@ def test_density_bandwidth_and_windows() -> None:
 def test_the_length_of_windows() -> None:
     run = np.zeros((10_000, 3))
     assert window_size([run], 100.0) == 1024
+    assert [window_size([np.zeros((n, 3))], 100.0) for n in (8703, 8704)] == [512, 1024], "17 half windows"
     assert window_size([np.zeros((10**6, 3))], 100.0) == 4096
     assert window_size([run], 100.0, 0.1) == 1000
     assert [window_size([np.zeros((16, 3))], 16.0, *given) for given in ([], [1.0])] == [16, 16]
@@ -77,7 +79,7 @@ def test_spectrograms() -> None:
     random = np.random.default_rng(5)
     runs = [white(random, 100_000, RATE_HZ, 1.0)[:, None], white(random, 50_000, RATE_HZ, 1.0)[:, None]]
     found = spectrogram(runs, [0.0, 300.0], RATE_HZ, 64)
-    assert len(found.time_s) <= 602
+    assert len(found.density) == len(found.time_s) <= 602
     assert np.isnan(found.density).all(axis=1).sum() == 1
     whole = power_spectrum(runs, RATE_HZ, 64)
     assert np.nanmean(found.density, axis=0) == pytest.approx(whole.density[:, 0], rel=0.02)
@@ -118,7 +120,9 @@ def test_lines_noise_and_harmonics() -> None:
     assert peaks(power_spectrum([values], LINE_HZ, SIZE))[0].axis == 1
     noise = white(np.random.default_rng(10), 100 * SIZE, LINE_HZ, 1.0)[:, None]
     few, many = (power_spectrum([noise[: k * SIZE]], LINE_HZ, SIZE) for k in (2, 100))
-    assert threshold(few) > threshold(many) == 4.0
+    assert threshold(many) == 4.0
+    false_peaks = len(few.density) * chi2.sf(threshold(few) * chi2.median(2 * few.averages), 2 * few.averages)
+    assert false_peaks == pytest.approx(0.001)
     assert images_hz(30.0, 400.0) == (370.0, 430.0)
     aliased = line(20_000, 370.0, 1.0)
     assert peaks(power_spectrum([three(aliased)], LINE_HZ, SIZE))[0].frequency_hz == pytest.approx(30.0, abs=1e-2)

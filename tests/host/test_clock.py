@@ -52,10 +52,12 @@ class Host:
 
 
 def test_the_first_reading_measures_and_later_readings_cost_two_calls() -> None:
-    host = Host()
-    begun = host.calls
-    first, calls = host.offset_ns(), host.calls
-    assert calls - begun == 2 + 4 + 2, "one reading is tight enough; two calls look for a suspend"
+    for away_ns, readings in ((700, 1), (701, 2)):
+        host = Host()
+        begun = host.calls
+        host.preempted = {begun + 4: away_ns}  # with three calls of 100 ns: 1 µs is tight enough
+        first, calls = host.offset_ns(), host.calls
+        assert calls - begun == 2 + 4 * readings + 2, "two calls look for a suspend"
     assert abs(first - AHEAD_NS) <= host.clock.error_ns <= 2 * CALL_NS
     for number in range(1, 100):
         host.sleep(NS_PER_MS)
@@ -64,7 +66,7 @@ def test_the_first_reading_measures_and_later_readings_cost_two_calls() -> None:
 
 
 def test_preemption_at_any_call_shifts_neither_difference() -> None:
-    for call in range(1, 4 * host_clock.READINGS):
+    for call in range(1, 20):
         for away_ns in (5 * NS_PER_US, NS_PER_MS, 3 * NS_PER_S):
             host = Host()
             host.preempted = {call: away_ns}
@@ -78,7 +80,7 @@ def test_a_host_that_is_never_undisturbed_gives_the_tightest_of_some_readings() 
     host.preempted = {call: 10 * NS_PER_US + call * NS_PER_US for call in range(1, 1000)}
     calls = host.calls
     offset_ns = host.offset_ns()
-    assert host.calls <= calls + 2 + 4 * host_clock.READINGS + 2
+    assert host.calls <= calls + 2 + 20 + 2
     assert abs(offset_ns - AHEAD_NS) <= host.clock.error_ns
     host = Host()
     host.preempted = dict.fromkeys(range(1, 10_000), 10 * NS_PER_US)
@@ -102,10 +104,10 @@ def test_a_step_of_the_wall_clock_or_a_leap_second_is_seen_by_the_next_reading(s
 def test_a_step_below_the_tolerance_is_seen_within_a_second() -> None:
     host = Host()
     before = host.offset_ns()
-    host.ahead_ns += 3 * host_clock.TOLERANCE_NS // 4
+    host.ahead_ns += 750
     assert host.offset_ns() == before
-    host.sleep(host_clock.KEPT_NS)
-    assert abs(host.offset_ns() - before - 3 * host_clock.TOLERANCE_NS // 4) <= 2 * CALL_NS
+    host.sleep(NS_PER_S)
+    assert abs(host.offset_ns() - before - 750) <= 2 * CALL_NS
 
 
 @pytest.mark.parametrize("rate", [20e-6, -500e-6, 500e-6, 83_333e-6, -83_333e-6])
@@ -117,7 +119,7 @@ def test_while_the_clocks_are_slewed_utc_stays_and_steering_is_followed(rate: fl
         host.sleep(10 * NS_PER_MS)
         assert abs(host.offset_ns() - first) <= 2 * CALL_NS
         now_ns = host.truth_ns()
-        assert abs(host.clock.steady.steady_ns(now_ns) - host.raw) <= host_clock.TOLERANCE_NS + 4 * CALL_NS
+        assert abs(host.clock.steady.steady_ns(now_ns) - host.raw) <= NS_PER_US + 4 * CALL_NS
     assert host.clock.steady.rate == pytest.approx(rate, abs=1e-6)
 
 
@@ -155,9 +157,9 @@ def test_a_suspend_differs_from_a_step_and_from_a_preemption() -> None:
         host.ahead_ns += 3600 * NS_PER_S
         clock.utc_offset_ns()
     assert clock.suspends == 0
-    for count in (1, 2):
-        asleep_ns += 2 * NS_PER_S
-        host.ahead_ns += 2 * NS_PER_S
+    for count, slept_ns in ((0, 99 * NS_PER_MS), (1, 101 * NS_PER_MS), (2, 2 * NS_PER_S)):
+        asleep_ns += slept_ns
+        host.ahead_ns += slept_ns
         clock.utc_offset_ns()
         clock.utc_offset_ns()
         assert clock.suspends == count
@@ -211,12 +213,9 @@ def slewed(rate: float, pairs: int, step_ns: int = 10 * NS_PER_MS) -> host_clock
 
 
 def test_without_pairs_and_with_one_the_two_are_the_same() -> None:
-    assert (host_clock.UNSTEERED.offset_ns, host_clock.UNSTEERED.rate, host_clock.UNSTEERED.error_ns(BEGIN_NS)) == (
-        0,
-        0.0,
-        0.0,
-    )
-    assert host_clock.UNSTEERED.even_from_ns < 0
+    unsteered = host_clock.UNSTEERED
+    assert (unsteered.offset_ns, unsteered.rate, unsteered.error_ns(BEGIN_NS)) == (0, 0.0, 0.0)
+    assert unsteered.even_from_ns < 0
     steady = host_clock.SteadyTime()
     steady.add_pair(BEGIN_NS, RAW_NS)
     for at_ns in (BEGIN_NS - NS_PER_S, BEGIN_NS, BEGIN_NS + NS_PER_S):
@@ -266,7 +265,7 @@ def test_a_time_at_which_the_offset_was_still_the_old_one_is_a_pair() -> None:
 
 def test_the_newest_offset_holds_while_it_was_constant() -> None:
     steady = slewed(20e-6, 101)  # 200 ns per step
-    assert abs(steady.monotonic_ns(steady.even_from_ns) - steady.even_from_ns - steady.offset_ns) <= host_clock.EVEN_NS
+    assert abs(steady.monotonic_ns(steady.even_from_ns) - steady.even_from_ns - steady.offset_ns) <= NS_PER_US
     last_ns = BEGIN_NS + NS_PER_S
     assert steady.even_from_ns == last_ns - 5 * 10 * NS_PER_MS
     steady = slewed(FAST, 101)
@@ -292,21 +291,22 @@ def test_a_change_of_the_rate_between_two_pairs_is_in_the_error() -> None:
         now_ns, raw = now_ns + int(10 * NS_PER_MS * (1 + FAST)), raw + 10 * NS_PER_MS
         steady.add_pair(now_ns, raw)
     onset_ns = BEGIN_NS + 45 * NS_PER_MS
-    assert 100_000 < steady.error_ns(onset_ns) < 300_000
+    assert steady.error_ns(onset_ns) == pytest.approx(10e6 * FAST / 12**0.5, rel=1e-3), "uniform in the triangle"
     assert steady.error_ns(BEGIN_NS + 15 * NS_PER_MS) == 0.0
     assert steady.error_ns(BEGIN_NS + 75 * NS_PER_MS) < 10
     assert steady.error_ns(BEGIN_NS - NS_PER_S) == steady.error_ns(BEGIN_NS + NS_PER_S) == 0.0
 
 
 def test_memory_is_bounded_and_the_rest_stays_correct() -> None:
-    steady = slewed(FAST, 2 * host_clock.PAIRS_MOST + 10, NS_PER_MS)
-    last_ns = BEGIN_NS + (2 * host_clock.PAIRS_MOST + 9) * NS_PER_MS
-    for back_ns in (0, 3 * NS_PER_MS // 2, NS_PER_S, host_clock.RATE_NS):
+    steady = slewed(FAST, 2 * 4096 + 10, NS_PER_MS)
+    last_ns = BEGIN_NS + (2 * 4096 + 9) * NS_PER_MS
+    for back_ns in (0, 3 * NS_PER_MS // 2, NS_PER_S, 2 * NS_PER_S):
         steady_ns = last_ns - back_ns
         assert steady.monotonic_ns(steady_ns) == pytest.approx(BEGIN_NS + (steady_ns - BEGIN_NS) * (1 + FAST), abs=2)
+    assert slewed(FAST, 4096, NS_PER_MS).monotonic_ns(BEGIN_NS) == BEGIN_NS
+    steady = slewed(FAST, 4097, NS_PER_MS)  # half of the pairs were removed
     assert steady.monotonic_ns(BEGIN_NS) > BEGIN_NS  # the pair is no longer known
-    steady = slewed(FAST, host_clock.PAIRS_MOST + 1, NS_PER_MS)  # half of the pairs were removed
-    oldest_ns = BEGIN_NS + (host_clock.PAIRS_MOST // 2) * NS_PER_MS
+    oldest_ns = BEGIN_NS + 2048 * NS_PER_MS
     assert steady.monotonic_ns(oldest_ns) == pytest.approx(BEGIN_NS + (oldest_ns - BEGIN_NS) * (1 + FAST), abs=2)
 
 
