@@ -11,7 +11,6 @@ import pytest
 from imud.cli import main, sample_set
 from imud.cli import spectrum as spectrum_live
 from imud.cli.analysis import bands_hz
-from imud.cli.output import COLUMNS
 from imud.model.units import NS_PER_MS
 from tests.cli.captures import frame, resting, shaken, write_capture
 from tests.cli.conftest import Cli
@@ -57,7 +56,7 @@ def test_a_spectrum_in_words(shaken_file: Path, tmp_path: Path, cli: Cli) -> Non
     picture = tmp_path / "vibration.png"
     words = ["spectrum", "--sensor", "accel", "--bands", "5-60,60-70", "-o", str(picture), str(shaken_file)]
     out = cli(*words, "--resolution", "0.5").out
-    assert max(map(len, out.splitlines())) <= COLUMNS
+    assert max(map(len, out.splitlines())) <= 80
     assert "P1" in out
     assert "60 to 70" in out
     assert "gyroscope" not in out
@@ -85,7 +84,7 @@ def test_a_report_for_a_supplier(resting_file: Path, tmp_path: Path, cli: Cli, e
     sheet, file = tmp_path / "sheet.yaml", tmp_path / f"report{end}"
     sheet.write_text(SHEET)
     out = cli("noise", "--sheet", sheet, "--for", "60s", "-o", file, resting_file).out
-    assert max(map(len, out.splitlines())) <= COLUMNS
+    assert max(map(len, out.splitlines())) <= 80
     for words in ("angle random walk N", "µg/√Hz", "of 0.5 deg/√h = 0.6", "times: within", "times: ABOVE", "a sheet"):
         assert words in out, words
     content = file.read_bytes()
@@ -207,7 +206,7 @@ def test_spectrum_and_noise_of_a_live_device(tmp_path: Path, cli: Cli) -> None:
         assert measurement["duration_s"] == pytest.approx(1.5, abs=0.1)
         assert measurement["begun_utc_ns"] > 0
         text, error = cli("noise", "--skip", "0.2s", "--for", "1.5s", *live, status=1)
-        assert max(map(len, text.splitlines())) <= COLUMNS
+        assert max(map(len, text.splitlines())) <= 80
         assert text.splitlines()[1].startswith("  NOT AT REST: a")
         assert error.startswith("imud noise: the device was not at rest: a")
         for word in ("live from", "angle random walk N", "bow, driver hipnuc-uart"):

@@ -119,7 +119,7 @@ def test_figures_become_si_and_those_of_the_user_come_first(tmp_path: Path) -> N
     [
         ("gyro: {random_walk: 0.3}", "random_walk"), ("gyro: {random_walk_deg_sqrt_h: -1}", "gyro"),
         ("gyro: {random_walk_deg_sqrt_h: .nan}", "gyro"), ("gyroscope: {}", "gyroscope"), ("- 1", "mapping"),
-        ("a: [", "YAML"), ("x" * (noise.SHEET_BYTES_MOST + 1), "at most"),
+        ("a: [", "YAML"), ("x" * 65537, "at most"),
     ],
     ids=["unknown figure", "negative", "not a number", "unknown sensor", "a list", "no YAML", "too long"],
 )  # fmt: skip

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from imud.analysis.spectrum import power_spectrum
-from imud.cli.output import COLUMNS
 from imud.cli.sample_set import Collector
-from imud.cli.spectrum import CLEAR, HEIGHT, SHADES, LiveView, SpectrumOptions, axis_line, curve_rows, in_columns
+from imud.cli.spectrum import CLEAR, SHADES, LiveView, SpectrumOptions, axis_line, curve_rows, in_columns
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_S
 from tests.cli.captures import frame, shaken
@@ -39,13 +38,13 @@ def test_the_page() -> None:
     view = LiveView("bow", "accel")
     pages = [view.page(collected(hz), SpectrumOptions(("accel",))).splitlines() for hz in (25.0, 75.0)]
     for page in pages:
-        assert max(map(len, page)) <= COLUMNS
+        assert max(map(len, page)) <= 80
         assert page[0] == "bow accelerometer: 200.000 Hz, 0 lost, bins of 1.56 Hz"
     first, second = pages
     for page, hz in ((first, 25), (second, 75)):
         top = next(row for row in page[2:] if row.strip())
-        assert len(top) - 1 == pytest.approx(COLUMNS * hz / 100, abs=2), "the highest bar"
-    past = second[2 + HEIGHT + 2 :][:2]
+        assert len(top) - 1 == pytest.approx(80 * hz / 100, abs=2), "the highest bar"
+    past = second[12:][:2]
     darkest = [max(range(len(row)), key=lambda at, row=row: SHADES.index(row[at])) for row in past]  # type: ignore[misc]
     assert darkest == [pytest.approx(60, abs=2), pytest.approx(20, abs=2)], "newest row first"
     assert any(line.startswith("  P1") and " 75.0" in line for line in second)
@@ -63,16 +62,16 @@ def test_columns_bars_and_axis() -> None:
     accel, _ = shaken(20_000, RATE_HZ, 30.0)
     spectrum = power_spectrum([accel], RATE_HZ, 2048)
     columns = in_columns(spectrum)
-    assert len(columns) == COLUMNS
+    assert len(columns) == 80
     assert columns.max() == spectrum.density[1:].sum(axis=1).max()
     few = in_columns(power_spectrum([accel], RATE_HZ, 64))
-    assert len(few) == COLUMNS
+    assert len(few) == 80
     assert (few > 0).all()
-    rows = curve_rows(np.concatenate(([1.0, 0.5, 1 / (8 * HEIGHT)], np.zeros(COLUMNS - 3))))
-    assert len(rows) == HEIGHT
-    assert (rows[0], rows[HEIGHT // 2], rows[-1]) == ("█", "██", "██▁")
+    rows = curve_rows(np.concatenate(([1.0, 0.5, 1 / 64], np.zeros(77))))
+    assert len(rows) == 8
+    assert (rows[0], rows[4], rows[-1]) == ("█", "██", "██▁")
     line = axis_line(200.0)
-    assert len(line) == COLUMNS
+    assert len(line) == 80
     assert line.startswith("0")
     assert line.endswith("200 Hz")
     assert line.split() == ["0", "50", "100", "150", "200", "Hz"]
@@ -103,6 +102,6 @@ def test_it_is_redrawn_until_ctrl_c(tmp_path: Path) -> None:
     pages = [page for page in text.decode(errors="replace").split(CLEAR)[:-1] if "newest row first" in page]
     assert pages
     for page in pages:
-        assert max(map(len, page.splitlines())) <= COLUMNS
+        assert max(map(len, page.splitlines())) <= 80
         assert re.match(r"bow accelerometer: [0-9.]+ Hz, \d+ lost", page), page
         assert re.search(r"last \d+ s, newest row first", page), page

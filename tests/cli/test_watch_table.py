@@ -6,7 +6,7 @@ import sys
 import msgspec
 import pytest
 
-from imud.cli.watch import FIELDS, ROWS_LEAST, SampleTable, lines_of, usual_fields
+from imud.cli.watch import FIELDS, SampleTable, lines_of, usual_fields
 from imud.model.sample import SAMPLE_FIELDS, Sample, Sync
 
 UTC_NS = 1_790_000_000_123_999_999  # 2026-09-21 14:13:20 UTC
@@ -102,8 +102,8 @@ def test_headers(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [n for n, head in enumerate(heads) if head] == [0, 20, 40]
     Terminal(monkeypatch, 80, 5)
     low = SampleTable()
-    heads = [low.text(WHOLE).count("TIME") for _ in range(ROWS_LEAST + 1)]
-    assert [n for n, head in enumerate(heads) if head] == [0, ROWS_LEAST]
+    heads = [low.text(WHOLE).count("TIME") for _ in range(11)]
+    assert [n for n, head in enumerate(heads) if head] == [0, 10]
     Terminal(monkeypatch, 80, 23)
     table = SampleTable()
     before = [table.text(WHOLE) for _ in range(20)]
