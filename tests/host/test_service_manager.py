@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from imud.host.service_manager import STATUS_NS, ServiceManager, notify, watchdog_interval_s
+from imud.host.service_manager import ServiceManager, notify, watchdog_interval_s
+from imud.model.units import NS_PER_S
 
 NO_PROCESS = str(1 << 30)
 """Number above the largest process id (proc(5), pid_max)."""
@@ -56,7 +57,7 @@ def test_status_is_sent_when_it_changes_and_the_watchdog_is_fed(
         manager = ServiceManager()
         manager.ready()
         for tenth in range(31):
-            manager.tick(tenth * STATUS_NS // 10, lambda: "OK." if tenth > 12 else "missing.")  # noqa: B023
+            manager.tick(tenth * NS_PER_S // 10, lambda: "OK." if tenth > 12 else "missing.")  # noqa: B023
         manager.stopping()
         sent = [receiver.recv(100).decode() for _ in range(6)]
     assert sent == [

@@ -47,8 +47,8 @@ def test_without_the_daemon_a_port_or_samples(machine: Machine) -> None:
     ("status", "severity", "words"),
     [
         (counted(), "error", "are TX and RX swapped"),
-        (counted(bytes_in=40), "error", "echoes of imud's requests"),
-        (counted(bytes_in=5000), "error", "the baud rate, the driver or the device is wrong"),
+        (counted(bytes_in=199), "error", "echoes of imud's requests"),
+        (counted(bytes_in=200), "error", "the baud rate, the driver or the device is wrong"),
         (
             msgspec.structs.replace(counted(bytes_in=5000), kernel=KernelCounters(framing=9)),
             "error",
