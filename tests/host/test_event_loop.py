@@ -7,6 +7,7 @@ import signal
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -415,3 +416,33 @@ async def test_an_alarm_rings_at_its_last_time_without_a_turn_of_asyncio(pair: P
     loop.remove_reader(ours)
     assert [again.rung_s[0] >= 0.02, again.rung_s[2] >= 0.04] == [True, True]
     assert [type(context["exception"]) for context in errors] == [ValueError]
+
+
+def test_an_alarm_in_a_loop_of_asyncio_rings_at_its_last_time() -> None:
+    async def main() -> None:
+        rung = list[str]()
+        alarm = Alarm(SimpleNamespace(on_alarm=lambda: rung.append("rung")))
+        for delays_s, is_cancelled, count in (((0, 60), False, 0), ((60, 0), False, 1), ((0,), True, 1)):
+            for delay_s in delays_s:
+                alarm.set(delay_s)
+            if is_cancelled:
+                alarm.cancel()
+            await turns()
+            assert (len(rung), alarm.is_set) == (count, count == 0)
+
+    asyncio.run(main())
+
+
+@in_loop
+async def test_a_turn_has_at_most_256_readers() -> None:
+    loop, seen = loop_in_use(), list[int]()
+    events = [os.eventfd(1) for _ in range(257)]
+    for event in events:
+        loop.add_reader(event, seen.append, event)
+    await turns(1)
+    assert len(seen) == 256
+    await turns(1)
+    assert set(seen) == set(events)
+    for event in events:
+        loop.remove_reader(event)
+        os.close(event)

@@ -7,13 +7,7 @@ import pytest
 
 from imud.cli.doctor.daemon import half_duplex, heard, lines
 from imud.cli.doctor.surroundings import DoctorCheck
-from imud.contracts.status import (
-    DeviceState,
-    DeviceStatus,
-    KernelCounters,
-    LinesStatus,
-    SerialLineCounters,
-)
+from imud.contracts.status import DeviceState, DeviceStatus, KernelCounters, LinesStatus, SerialLineCounters
 from tests.support.metrics import POLLING, device
 from tests.support.surroundings import Machine
 
