@@ -1,12 +1,14 @@
 """Verbs: check and description of arguments, and the actions in the rows of all drivers."""
 
-from typing import Annotated
+from math import pi, radians
+from typing import Annotated, Any
 
 import msgspec
 import pytest
 from msgspec import Meta
 
-from imud.contracts.command import Risk, Target, Verb, described, infos, parameters_of
+from imud.contracts import command
+from imud.contracts.command import RestMeans, Risk, Target, Verb, described, infos, parameters_of, yaw_at
 from imud.drivers import DRIVERS
 from imud.model.errors import BadArgument
 
@@ -66,3 +68,27 @@ def test_description_for_people() -> None:
         ],
         "risk": "",
     }
+
+
+@pytest.mark.parametrize(
+    ("options", "effect"),
+    [({}, (False, True)), ({"restarts": True}, (True, False)), ({"saves": True}, (False, False)),
+     ({"restarts": True, "restarts_with": lambda _: False}, (False, False)), ({"changes": False}, (False, False))],
+)  # fmt: skip
+def test_effect_on_the_flash(options: dict[str, Any], effect: tuple[bool, bool]) -> None:
+    verb = Verb("turn it", _turn, **options)
+    arguments = verb.arguments({"angle_deg": 5})
+    assert verb.effect_on_flash(arguments) == effect
+    assert verb.expected(arguments) == ()
+
+
+def test_expected_means_at_rest() -> None:
+    means = RestMeans((0.06, -0.08, 9.8), (0.002, 0.003, 0.006), (-0.1, -0.2, -3.0), (0.3, -0.4))
+    for expectation, value, limit in (
+        (command.GYRO_ZERO, 0.007, radians(0.1)), (command.ROLL_ZERO, 0.1, radians(0.5)),
+        (command.PITCH_ZERO, 0.2, radians(0.5)), (command.YAW_ZERO, 3.0, radians(1.0)),
+        (command.INCLINATION_ZERO, 0.4, radians(0.5)), (command.ACCEL_LEVEL, 0.1, 0.1),
+        (yaw_at(180.0), pi - 3.0, radians(1.0)), (yaw_at(-90.0), 3.0 - pi / 2, radians(1.0)),
+    ):  # fmt: skip
+        assert (expectation.value(means), expectation.limit) == pytest.approx((value, limit)), expectation.name
+        assert expectation.value(RestMeans(None, None, None)) is None

@@ -2,7 +2,21 @@
 
 import pytest
 
-from imud.contracts.condition import Condition, duration, summary
+from imud.contracts.condition import (
+    DEGRADED,
+    MISSING,
+    OK,
+    Condition,
+    ConditionLimits,
+    DeviceCondition,
+    Reason,
+    ReasonCode,
+    condition_of,
+    duration,
+    signature,
+    summary,
+)
+from tests.support.documented import check_schema
 
 
 @pytest.mark.parametrize(
@@ -30,3 +44,19 @@ def test_summary(words: dict[str, str], line: str) -> None:
 )
 def test_duration(seconds: float, text: str) -> None:
     assert duration(int(seconds * 1e9)) == text
+
+
+def test_limits_have_the_documented_values() -> None:
+    assert check_schema("Limits of the condition", ConditionLimits) == 6
+
+
+def test_each_reason_has_one_condition_and_ok_reasons_are_no_signature() -> None:
+    names = {"ok": OK, "degraded": DEGRADED, "missing": MISSING}
+    found = {code: next((name for name, codes in names.items() if code in codes), "attention") for code in ReasonCode}
+    assert {code: condition_of(code) for code in ReasonCode} == found
+    reasons = (Reason(ReasonCode.LOST, "Lost."), Reason(ReasonCode.NONE_LOST, "None lost."))
+    for condition, is_ok, text in ((Condition.OK, True, "ok"), (Condition.DEGRADED, False, "degraded")):
+        made = DeviceCondition(condition, 0, reasons)
+        assert (made.is_ok, str(made)) == (is_ok, f"{text}: Lost. None lost.")
+        assert signature(made) == {("lost", "")}
+    assert signature(None) == frozenset()

@@ -13,12 +13,16 @@ from imud.contracts.script import (
     Request,
     RequestScript,
     Silence,
+    Transfer,
+    TransferScript,
     never,
     pause,
+    run_transfer_script,
+    says_nothing,
     with_undo,
 )
 from imud.device.scripts import REPLY_MESSAGES_MAX, ScriptRunner
-from imud.model.errors import CommandError
+from imud.model.errors import CommandError, TransferError, Trouble
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from tests.support.script_runners import of_text, offline_runner
@@ -212,6 +216,29 @@ def test_a_script_with_undo_passes_requests_on_and_is_closed_with_it() -> None:
 
 def asking() -> RequestScript[Outcome]:
     return (yield command("ask"))
+
+
+def test_a_request_has_half_a_second_for_one_message() -> None:
+    request = Request(payload=b"", name="ask", is_end=never, is_rejection=never, is_part=never)
+    assert (request.timeout_ns, request.messages_min) == (500_000_000, 1)
+
+
+def test_a_transfer_script_can_continue_after_a_failed_transfer() -> None:
+    def script() -> TransferScript[bytes]:
+        try:
+            return (yield Transfer((b"fails",)))
+        except TransferError:
+            return (yield Transfer((b"works",)))
+
+    def transfer(wanted: Transfer) -> bytes:
+        if wanted.sends == (b"fails",):
+            raise TransferError(Trouble.ABSENT, "no acknowledgement")
+        return wanted.sends[0]
+
+    assert run_transfer_script(script(), transfer) == b"works"
+    with pytest.raises(StopIteration) as end:
+        next(says_nothing(5))
+    assert end.value.value == 5
 
 
 # --- measurements -----------------------------------------------------------------------------------------------------
