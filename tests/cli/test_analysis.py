@@ -3,14 +3,15 @@
 import json
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from imud.cli import main, sample_set
+from imud.cli import Subcommand, main, sample_set
 from imud.cli import spectrum as spectrum_live
-from imud.cli.analysis import bands_hz
+from imud.cli.analysis import bands_hz, loaded
 from imud.model.units import NS_PER_MS
 from tests.cli.captures import frame, resting, shaken, write_capture
 from tests.cli.conftest import Cli
@@ -184,6 +185,12 @@ def test_the_extra_is_named_if_it_is_missing_and_the_daemon_does_not_load_it(res
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=LIMIT_S, check=True)
     assert done.stdout == "set()\n"
     assert "imud noise: cannot import scipy; install the extra: pip install 'imud[analysis]'" in done.stderr
+
+
+def test_a_missing_module_of_imud_is_not_a_missing_extra() -> None:
+    for load in (partial(loaded, "none"), Subcommand("imud.cli.none:NONE", "", "analysis").load):
+        with pytest.raises(ModuleNotFoundError, match=r"imud\.cli\.none"):
+            load()
 
 
 def test_bands(capsys: pytest.CaptureFixture[str]) -> None:

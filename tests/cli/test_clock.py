@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from imud.cli.clock import EDGES_ENOUGH, ENOUGH, aids, block, verdict
+from imud.cli.clock import aids, block, page, verdict
 from imud.contracts.status import ClockStatus
 from imud.model.sample import Sync
 from imud.model.units import NS_PER_MS
@@ -51,9 +51,15 @@ def test_aids_of_the_clock_have_rows() -> None:
         ("PPS", "59 pulses, 1 ignored because of their interval"),
         ("UTC", "error of the host clock 250.0 µs (one sigma)"),
     ]
-    page = block(equipped("bow"), deque([9_000_000] * 100))
-    assert "\n  SOUT      4998 pulses" in page
-    assert "  verdict   the kernel's time stamps of the GPIO line" in page
+    text = block(equipped("bow"), deque([9_000_000] * 100))
+    for words in (
+        "\n  SOUT      4998 pulses",
+        " 9000 µs 100.0 % ##",
+        "  verdict   the kernel's time stamps of the GPIO line",
+    ):
+        assert words in text
+    both = page([equipped("bow"), device("stern")], {"bow": deque([9_000_000] * 100), "mast": deque()})
+    assert both == f"{text}\n\nmast: no longer in the configuration"
     lines = msgspec.structs.replace(LINES, edges={})
     assert [name for name, _ in aids(equipped("bow", lines=lines, utc=None))] == ["SIN", "UTC"]
 
@@ -71,8 +77,8 @@ def test_the_cause_is_named_and_wires_that_do_not_fit_first() -> None:
         (ClockStatus(Sync.EDGE, t_err_ns=4_000), TIMER, "limit the time stamps: 4.0 µs"),
         (ClockStatus(Sync.ARRIVAL, t_err_ns=4_000), WIRE, "imud uses arrival times only"),
         (ClockStatus(Sync.ARRIVAL), [], "too few"),
-        (ClockStatus(Sync.REGRESSION), WIRE[: ENOUGH - 1], "too few"),
-        (ClockStatus(Sync.REGRESSION), WIRE[:ENOUGH], "arrivals spread over 0.0 ms; without SOUT"),
+        (ClockStatus(Sync.REGRESSION), WIRE[:19], "too few"),
+        (ClockStatus(Sync.REGRESSION), WIRE[:20], "arrivals spread over 0.0 ms; without SOUT"),
         (ClockStatus(Sync.REGRESSION, hold_ns=16 * MS), TIMER, "latency timer of the USB adapter, 16 ms"),
         (ClockStatus(Sync.REGRESSION, hold_ns=16 * MS), WIRE, "the constant delay"),
         (ClockStatus(Sync.REGRESSION, hold_ns=16 * MS), [0] * 10 + [8 * MS] * 10, "latency timer of the USB adapter"),
@@ -90,6 +96,7 @@ def test_the_cause_is_named_and_wires_that_do_not_fit_first() -> None:
         (ClockStatus(Sync.UTC, edges=1000, edges_unpaired=500), "pulses have no sample"),
         (ClockStatus(Sync.UTC, edges=1000), "the device sends UTC"),
         (ClockStatus(Sync.REGRESSION, edges=1000), "1000 edges in total, but imud cannot match them"),
-        (ClockStatus(Sync.REGRESSION, edges=EDGES_ENOUGH - 1, edges_unpaired=99), "the constant delay"),
+        (ClockStatus(Sync.REGRESSION, edges=99, edges_unpaired=99), "the constant delay"),
+        (ClockStatus(Sync.REGRESSION, edges=100, edges_unpaired=100), "100 of 100 pulses have no sample"),
     ]:
         assert expected in verdict(clock, WIRE)

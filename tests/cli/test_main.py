@@ -30,6 +30,10 @@ def test_the_table_has_every_command_of_every_module() -> None:
     assert written == set(loaded)
 
 
+def test_without_a_command_the_usage_is_printed(cli: Cli) -> None:
+    cli.refuses("usage: imud ")
+
+
 def test_version(cli: Cli) -> None:
     assert cli("--version").out == f"imud {__version__}\n"
 
