@@ -11,10 +11,11 @@ from functools import partial
 from pathlib import Path
 from threading import Event as Flag
 from threading import Thread
+from unittest.mock import Mock
 
 import pytest
 
-from imud.cli.events import RETRY_S, DeviceNotes, as_json, as_text, keep_connected, printed
+from imud.cli.events import DeviceNotes, as_json, as_text, keep_connected, printed
 from imud.client.connection import Client
 from imud.formats.jsonrpc import RpcError
 from imud.model.errors import LinkMissing, ServerError
@@ -142,7 +143,7 @@ def test_follow_waits_for_the_daemon_and_says_so_once(tmp_path: Path, capsys: py
 
     with pytest.raises(KeyboardInterrupt):
         attempt()
-    assert waits == [RETRY_S] * 3
+    assert waits == [1.0] * 3
     assert len(versions) == 1
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
@@ -150,36 +151,21 @@ def test_follow_waits_for_the_daemon_and_says_so_once(tmp_path: Path, capsys: py
     assert lines[0].endswith("; waiting for the daemon")
 
 
-def test_follow_goes_on_after_the_connection_is_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    epochs: list[int] = []
-
-    def work(client: Client) -> None:
-        epochs.append(client.hello.epoch)
-        if len(epochs) == 1:
-            raise LinkMissing("the daemon closed the connection")
-
-    with daemon(tmp_path) as served:
-        keep_connected("imud events", str(served.path), work, follow=True, wait=lambda _s: None)
-    assert len(epochs) == 2
-    assert capsys.readouterr().err.splitlines() == [
-        "imud events: the daemon closed the connection; waiting for the daemon",
-        "imud events: connected again",
-    ]
-
-
-def test_a_daemon_that_does_not_answer(tmp_path: Path) -> None:
-    tries: list[Client] = []
-
-    def work(client: Client) -> None:
-        tries.append(client)
-        if len(tries) < 3:
-            raise TimeoutError("waited in vain for devices")
-
+def test_only_follow_goes_on_after_a_lost_connection_and_a_timeout(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    silent, lost = TimeoutError("waited in vain for devices"), LinkMissing("the daemon closed the connection")
+    work = Mock(side_effect=[silent, lost, silent, None])
     with daemon(tmp_path) as served:
         with pytest.raises(ServerError, match="in vain"):
-            keep_connected("imud watch", str(served.path), work, follow=False)
-        keep_connected("imud watch", str(served.path), work, follow=True, wait=lambda _s: None)
-    assert len(tries) == 3
+            keep_connected("imud events", str(served.path), work, follow=False)
+        keep_connected("imud events", str(served.path), work, follow=True, wait=lambda _s: None)
+    assert work.call_count == 4
+    assert capsys.readouterr().err.splitlines() == [
+        f"imud events: {words}"
+        for words in ("the daemon closed the connection; waiting for the daemon", "connected again",
+                      "waited in vain for devices; waiting for the daemon", "connected again")
+    ]  # fmt: skip
 
 
 def test_waiting_ends_when_nobody_reads_the_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,34 +38,20 @@ CANOPEN = "{{driver: hipnuc-canopen, options: {{{}}}, socketcan: {{interface: {}
 @pytest.mark.parametrize(
     ("devices", "expected"),
     [
-        (
-            ["a {uart: {port: /dev/x}}", "b {uart: {port: /dev/x}}"],
-            "3: devices.b.uart.port: expected an unused port, got /dev/x; a (line 2) uses it",
-        ),
-        (
-            ["a {uart: {port: /dev/x}}", "b " + MODBUS.format("/dev/x", 80, 9600)],
-            "3: devices.b.rs485.line: expected an unused line, got /dev/x; a (line 2) uses it",
-        ),
-        (
-            ["a " + MODBUS.format("/dev/x", 80, 9600), "b " + MODBUS.format("/dev/x", 80, 9600)],
-            "3: devices.b.rs485.address: expected an unused address on /dev/x, got 80; a (line 2) uses it",
-        ),
-        (
-            ["a " + MODBUS.format("/dev/x", 80, 9600), "b " + MODBUS.format("/dev/x", 81, 115200)],
-            "3: devices.b.rs485.baud: expected the same baud for all devices of /dev/x, got 115200; a (line 2) has 9600",
-        ),
-        (
-            ["a {driver: imu61x-i2c, i2c: {address: 0x18}}", "b {driver: imu61x-i2c, i2c: {address: 24}}"],
-            "3: devices.b.i2c.address: expected an unused address on /dev/i2c-1, got 24; a (line 2) uses it",
-        ),
-        (
-            ["a {spi: {port: /dev/spidev0.0}}", "b {spi: {port: /dev/../dev/spidev0.0}}"],
-            "3: devices.b.spi.port: expected an unused port, got /dev/../dev/spidev0.0; a (line 2) uses it",
-        ),
-        (
-            ["a " + CANOPEN.format("node: 8", "can0"), "b " + CANOPEN.format("", "can0")],
-            "3: devices.b.options: expected no device on can0 with the frame 0x188 of a (line 2), got this device",
-        ),
+        (["a {uart: {port: /dev/x}}", "b {uart: {port: /dev/x}}"],
+         "3: devices.b.uart.port: expected an unused port, got /dev/x; a (line 2) uses it"),
+        (["a {uart: {port: /dev/x}}", "b " + MODBUS.format("/dev/x", 80, 9600)],
+         "3: devices.b.rs485.line: expected an unused line, got /dev/x; a (line 2) uses it"),
+        (["a " + MODBUS.format("/dev/x", 80, 9600), "b " + MODBUS.format("/dev/x", 80, 9600)],
+         "3: devices.b.rs485.address: expected an unused address on /dev/x, got 80; a (line 2) uses it"),
+        (["a " + MODBUS.format("/dev/x", 80, 9600), "b " + MODBUS.format("/dev/x", 81, 115200)],
+         "3: devices.b.rs485.baud: expected the same baud for all devices of /dev/x, got 115200; a (line 2) has 9600"),
+        (["a {driver: imu61x-i2c, i2c: {address: 0x18}}", "b {driver: imu61x-i2c, i2c: {address: 24}}"],
+         "3: devices.b.i2c.address: expected an unused address on /dev/i2c-1, got 24; a (line 2) uses it"),
+        (["a {spi: {port: /dev/spidev0.0}}", "b {spi: {port: /dev/../dev/spidev0.0}}"],
+         "3: devices.b.spi.port: expected an unused port, got /dev/../dev/spidev0.0; a (line 2) uses it"),
+        (["a " + CANOPEN.format("node: 8", "can0"), "b " + CANOPEN.format("", "can0")],
+         "3: devices.b.options: expected no device on can0 with the frame 0x188 of a (line 2), got this device"),
         (
             ["a " + CANOPEN.format("node: 8, sync_hz: 100", "can0"), "b " + CANOPEN.format("node: 9, sync_hz: 50", "can0")],
             "3: devices.b.options: expected one device on can0 for which imud sends 0x080, got this device "
@@ -87,14 +73,10 @@ CANOPEN = "{{driver: hipnuc-canopen, options: {{{}}}, socketcan: {{interface: {}
             "3: devices.b.socketcan.bitrate: expected the same bitrate for all devices of c (virtual), got 500000; "
             "a (line 2) has 0",
         ),
-        (
-            ["a {driver: imu61x-can, socketcan: {interface: /dev/ttyACM0, backend: slcan}}", "b {uart: {port: /dev/ttyACM0}}"],
-            "3: devices.b.uart.port: expected an unused port, got /dev/ttyACM0; a (line 2) uses it",
-        ),
-        (
-            ["a {driver: hipnuc-uart, uart: {port: /dev/x}, rmc: {source: nmea, port: /dev/x}}"],
-            "2: devices.a.rmc.port: expected an unused port, got /dev/x; a (line 2) uses it",
-        ),
+        (["a {driver: imu61x-can, socketcan: {interface: /dev/ttyACM0, backend: slcan}}", "b {uart: {port: /dev/ttyACM0}}"],
+         "3: devices.b.uart.port: expected an unused port, got /dev/ttyACM0; a (line 2) uses it"),
+        (["a {driver: hipnuc-uart, uart: {port: /dev/x}, rmc: {source: nmea, port: /dev/x}}"],
+         "2: devices.a.rmc.port: expected an unused port, got /dev/x; a (line 2) uses it"),
     ],
 )  # fmt: skip
 def test_what_two_devices_cannot_have_together(devices: list[str], expected: str) -> None:

@@ -160,17 +160,13 @@ HIPNUC = "driver: hipnuc-uart, uart: {port: x}"
     [
         (HIPNUC, None),
         (HIPNUC + ", rmc: {source: gpsd}", RmcOptions(source="gpsd")),
-        (
-            HIPNUC + ", rmc: {source: system, rate_hz: 5, error_ms: 10}",
-            RmcOptions(source="system", rate_hz=5, error_ms=10.0),
-        ),
-        (
-            HIPNUC + ", rmc: {source: nmea, port: /dev/ttyUSB1, baud: 38400}",
-            RmcOptions(source="nmea", port="/dev/ttyUSB1", baud=38400),
-        ),
+        (HIPNUC + ", rmc: {source: system, rate_hz: 5, error_ms: 10}",
+         RmcOptions(source="system", rate_hz=5, error_ms=10.0)),
+        (HIPNUC + ", rmc: {source: nmea, port: /dev/ttyUSB1, baud: 38400}",
+         RmcOptions(source="nmea", port="/dev/ttyUSB1", baud=38400)),
         (hipnuc("pps: {line: GPIO17}") + ", rmc: {source: gpsd}", RmcOptions(source="gpsd")),
     ],
-)
+)  # fmt: skip
 def test_each_rmc_source(keys: str, rmc: RmcOptions | None) -> None:
     assert parse(keys)[0].rmc == rmc
 

@@ -68,20 +68,14 @@ class Trip(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
         ({}, [("", "expected the word rate_hz (a number above 0), got none")]),
         ({"rate_hz": "x"}, [("rate_hz", 'expected a number above 0, got "x"')]),
         ({"rate_hz": 1, "names": ["a", 2]}, [("names", "expected a list, each item text, got a list with 2 at [1]")]),
-        (
-            {"rate_hz": 1, "groups": {"a": 5}},
-            [("groups", "expected keys, each with a list, each item a whole number, got keys and values")],
-        ),
-        (
-            {"rate_hz": 1, "rate": 2},
-            [("", 'expected a word that imud knows, got "rate"; did you mean rate_hz? known: groups, names, rate_hz')],
-        ),
+        ({"rate_hz": 1, "groups": {"a": 5}},
+         [("groups", "expected keys, each with a list, each item a whole number, got keys and values")]),
+        ({"rate_hz": 1, "rate": 2},
+         [("", 'expected a word that imud knows, got "rate"; did you mean rate_hz? known: groups, names, rate_hz')]),
         (
             {"rate_hz": None, "names": None},
-            [
-                ("rate_hz", "expected a number above 0, got nothing"),
-                ("names", "expected a list, each item text, got nothing"),
-            ],
+            [("rate_hz", "expected a number above 0, got nothing"),
+             ("names", "expected a list, each item text, got nothing")],
         ),
         ({"rate_hz": 1, "names": ["both"]}, [("names", "expected one or many, got both")]),
         ({"rate_hz": 1, "names": ["none"]}, [("", "this cannot be")]),

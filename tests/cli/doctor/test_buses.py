@@ -218,18 +218,12 @@ def test_errors_on_a_bus_that_carried_frames_before(mast: Machine) -> None:
     ("state", "severities", "words"),
     [
         ("error-active", ["ok", "note"], "can0 is ERROR-ACTIVE, error counters tx 0, rx 0, 2 frames received → "),
-        (
-            "bus-off",
-            ["error", "note"],
-            "the controller left the bus → restart it: `sudo ip link set can0 down`, then `sudo ip",
-        ),
-        (
-            "error-passive",
-            ["error", "warning", "note"],
-            "2 frames received, no frame arrives now → no other node acknowledges",
-        ),
+        ("bus-off", ["error", "note"],
+         "the controller left the bus → restart it: `sudo ip link set can0 down`, then `sudo ip"),
+        ("error-passive", ["error", "warning", "note"],
+         "2 frames received, no frame arrives now → no other node acknowledges"),
     ],
-)
+)  # fmt: skip
 def test_states_as_they_were_recorded(mast: Machine, state: str, severities: list[str], words: str) -> None:
     up(mast)
     mast.prints(COMMAND, json.dumps(RECORDED[state]))

@@ -43,22 +43,16 @@ def test_without_the_daemon_a_port_or_samples(machine: Machine) -> None:
         (counted(), "error", "are TX and RX swapped"),
         (counted(bytes_in=199), "error", "echoes of imud's requests"),
         (counted(bytes_in=200), "error", "the baud rate, the driver or the device is wrong"),
-        (
-            msgspec.structs.replace(counted(bytes_in=5000), kernel=KernelCounters(framing=9)),
-            "error",
-            "9 framing errors",
-        ),
+        (msgspec.structs.replace(counted(bytes_in=5000), kernel=KernelCounters(framing=9)), "error",
+         "9 framing errors"),
         (counted(bytes_in=5000, frames_good=7, frames_in_replies=7), "error", "but no sample in 7 frames"),
-        (
-            counted(bytes_in=5000, frames_good=7, frames_ignored=7),
-            "error",
-            "valid frames of unknown types, but no sample",
-        ),
+        (counted(bytes_in=5000, frames_good=7, frames_ignored=7), "error",
+         "valid frames of unknown types, but no sample"),
         (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=5), "ok", "5 damaged"),
         (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=6), "warning", "6 damaged and"),
         (msgspec.structs.replace(counted(**GOOD), kernel=KernelCounters(overrun=2)), "warning", "overrun"),
     ],
-)
+)  # fmt: skip
 def test_serial_data(machine: Machine, status: DeviceStatus, severity: str, words: str) -> None:
     machine.configure(UART)
     machine.status = [status]
