@@ -125,8 +125,12 @@ class Outputs:
 
     def send_event(self, event: Event) -> None:
         """Pass an event to the outputs."""
-        for name in list(self._running):
-            self._guard(name, lambda publisher: publisher.event(event))
+        for name, publisher in self._ticked:
+            if self._running.get(name) is publisher:  # the failure of another output can end this output
+                try:
+                    publisher.event(event)
+                except Exception as error:  # noqa: BLE001 - an internal error of one output
+                    self._fail(name, error)
 
     def tick(self, now_ns: int) -> None:
         """Call `tick` of the outputs. Start failed outputs after their pause."""

@@ -40,7 +40,6 @@ from imud.publishers.socket.scheduler import TokenBucket
 SO_PEERGROUPS: Final = 59
 """Socket option (asm-generic/socket.h, Linux ≥ 4.13). Python's socket module does not define it."""
 _UCRED: Final = struct.Struct("iII")
-_GID: Final = struct.Struct("I")
 _GETSOCKOPT_MAX_BYTES: Final = 1024
 """Maximum buffer of Python's getsockopt: 256 groups."""
 _GROUPS_MAX: Final = 65536
@@ -137,7 +136,7 @@ def _supplementary(sock: socket.socket, uid: int, gid: int) -> list[int]:
             return os.getgrouplist(pwd.getpwuid(uid).pw_name, gid)
         except KeyError:
             return []
-    return [number for (number,) in _GID.iter_unpack(raw)]
+    return memoryview(raw).cast("I").tolist()
 
 
 def _long_list(sock: socket.socket) -> list[int]:
@@ -146,7 +145,7 @@ def _long_list(sock: socket.socket) -> list[int]:
     if _libc.getsockopt(sock.fileno(), socket.SOL_SOCKET, SO_PEERGROUPS, groups, ctypes.byref(size_bytes)) != 0:
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))
-    return list(groups[: size_bytes.value // _GID.size])
+    return list(groups[: size_bytes.value // ctypes.sizeof(ctypes.c_uint32)])
 
 
 class Quota:

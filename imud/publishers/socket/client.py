@@ -86,11 +86,8 @@ class ClientWakers:
     """
 
     def __init__(self) -> None:
-        self._wakers: dict[str, Waker] = {}
+        self.by_device: dict[str, Waker] = {}  # the wakers by device
         self._lent: socket.socket | None = None
-
-    def __len__(self) -> int:
-        return len(self._wakers)
 
     def lend(self, sock: socket.socket) -> int:
         """Take a socket, and close it when its descriptor is sent. Return the descriptor for the next reply.
@@ -109,7 +106,7 @@ class ClientWakers:
         `check` receives both descriptors, and raises RpcError if clients may not use them. Raises RpcError also if no
         socket pair can be made, or if the previous descriptor is not sent yet.
         """
-        old = self._wakers.get(device)
+        old = self.by_device.get(device)
         if old is not None and old.client_end != NO_FD:
             message = "notify: the previous reply for this device is not sent yet; read it, then ask again"
             raise RpcError(Code.UNAVAILABLE, message)
@@ -124,20 +121,20 @@ class ClientWakers:
             raise
         if old is not None:
             old.close()
-        self._wakers[device] = waker
+        self.by_device[device] = waker
         return waker.client_end
 
     def wake(self, device: str) -> bool:
         """Wake the client if it has a waker for `device`. Return False, once, if the client has closed the waker."""
-        waker = self._wakers.get(device)
+        waker = self.by_device.get(device)
         if waker is None or waker.wake():
             return True
-        self._wakers.pop(device).close()
+        self.by_device.pop(device).close()
         return False
 
     def close_copies(self) -> None:
         """Close the daemon's copies of descriptors, because all replies are sent."""
-        for waker in self._wakers.values():
+        for waker in self.by_device.values():
             waker.close_copy()
         if self._lent is not None:
             self._lent.close()
@@ -146,9 +143,9 @@ class ClientWakers:
     def close(self) -> None:
         """Close all descriptors. A second call does nothing."""
         self.close_copies()
-        for waker in self._wakers.values():
+        for waker in self.by_device.values():
             waker.close()
-        self._wakers.clear()
+        self.by_device.clear()
 
 
 class Clients(ABC):

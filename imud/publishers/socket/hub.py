@@ -87,11 +87,9 @@ class ClientRecordings:
             raise RpcError(Code.UNAVAILABLE, f"record.snapshot: {error}") from None
 
     def remove(self, connection: ClientConnection) -> None:
-        """Abort the recording, if any, of a client that has ended."""
-        made = self.running.pop(connection.number, None)
-        if made is not None:
-            made.close()
-            log.info("client %d stopped recording: its connection has ended", connection.number)
+        """Abort the recording of a client that has ended."""
+        self.running.pop(connection.number).close()
+        log.info("client %d stopped recording: its connection has ended", connection.number)
 
     def _make_pair(self, connection: ClientConnection, method: str) -> tuple[socket.socket, int]:
         """Make a pair of sockets. Return the daemon's socket and the client's descriptor. Raises RpcError."""
@@ -334,7 +332,9 @@ class Hub(Clients):
         Raises RpcError as `ClientWakers.make`, or if the user has too many wakers.
         """
         uid = connection.uid
-        self._quota.check_waker(uid, sum(len(one.wakers) for one in self.connections.values() if one.uid == uid))
+        self._quota.check_waker(
+            uid, sum(len(one.wakers.by_device) for one in self.connections.values() if one.uid == uid)
+        )
         fd = connection.wakers.make(device, self._quota.check_fds)
         self._wanting_wake.setdefault(device, {})[connection] = None
         self.context.latencies.ask(_requester(connection, device), latency_ns, (device,))
@@ -347,7 +347,7 @@ class Hub(Clients):
     def has_news_for(self, connection: ClientConnection) -> bool:
         number = connection.number
         is_asked = number in self._subscriptions or number in self._events or number in self.running
-        return is_asked or number in self.recordings.running or bool(connection.wakers)
+        return is_asked or number in self.recordings.running or bool(connection.wakers.by_device)
 
     # --- clients ------------------------------------------------------------------------------------------------------
 
@@ -355,9 +355,11 @@ class Hub(Clients):
         """Remove a client and its subscriptions. Do nothing if it is unknown."""
         number = connection.number
         self.connections.pop(number, None)
-        self.unsubscribe(connection)
+        if number in self._subscriptions:
+            self.unsubscribe(connection)
         self._events.pop(number, None)
-        self.recordings.remove(connection)
+        if number in self.recordings.running:
+            self.recordings.remove(connection)
         for device in list(self._wanting_wake):
             self._forget_waker(connection, device)
 

@@ -436,16 +436,18 @@ class Outbox(ABC):
 
     def discard(self) -> None:
         """Discard the queue, because the connection ends."""
-        self.waiting = False
+        was_waiting, self.waiting = self.waiting, False
         self._fd = -1
         self._samples.clear()
         self._replies.clear()
         self._partial = b""
         self.reply_bytes = self._request_bytes = 0
-        self._pool.remove(self)
-        self._pool.count_samples(-self._sample_bytes)
-        self._sample_bytes = self._sample_count = 0
-        self._count_held()
+        if was_waiting:
+            self._pool.remove(self)
+            self._pool.count_samples(-self._sample_bytes)
+            self._sample_bytes = self._sample_count = 0
+        if self.held_bytes:
+            self._count_held()
 
     # --- queueing ---------------------------------------------------------------------------------------------------
 
@@ -514,7 +516,8 @@ class Outbox(ABC):
         """Send one piece of the queue. Return whether the queue contains more and the socket may have room."""
         try:
             if not self._partial and not self._next():
-                return self._emptied()
+                self._emptied()
+                return False
             if self._partial_fd == NO_FD:
                 count = self._send(self._fd, self._partial)
             else:
@@ -532,7 +535,9 @@ class Outbox(ABC):
             self.progress = self._pool.next_progress()
             self._keep(self.on_deferred)
             return self.waiting
-        return self._emptied()
+        if self.waiting:
+            self._emptied()
+        return False
 
     def _keep(self, report: Callable[[], None]) -> None:
         """Keep the unsent rest, call `report`, and evict clients if their memory exceeds the limit."""
@@ -541,13 +546,11 @@ class Outbox(ABC):
         report()
         self._pool.evict()
 
-    def _emptied(self) -> bool:
-        if self.waiting:
-            self.waiting = False
-            self._pool.remove(self)
-            self._count_held()
-            self.on_emptied()
-        return False
+    def _emptied(self) -> None:
+        self.waiting = False
+        self._pool.remove(self)
+        self._count_held()
+        self.on_emptied()
 
     def _next(self) -> bool:
         """Move the next messages to `_partial`, or one reply with its descriptor. Return False if there is none."""

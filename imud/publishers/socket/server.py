@@ -15,6 +15,7 @@ import socket
 import stat
 import struct
 from contextlib import suppress
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -428,7 +429,7 @@ class SocketServer:
             if Rights.READ not in rights:
                 message = f"uid {peer.uid} may not read: expected root or a member of group {self._settings.group!r}"
                 raise RpcError(Code.DENIED, message)
-            places = [connection.place for connection in hub.connections.values()]
+            places = list(map(attrgetter("place"), hub.connections.values()))
             place = self._quota.admit(peer, rights, sock.fileno(), places)
             assert self._scheduler is not None
             connection = ClientConnection(sock, peer, rights, place, hub, self._scheduler)

@@ -104,7 +104,7 @@ async def test_bad_parameters(server: SocketServer, method: str, params: dict[st
     assert words in message
     (connection,) = server.hub.connections.values()
     assert connection.number not in watching(server)
-    assert not connection.wakers
+    assert not connection.wakers.by_device
 
 
 def watching(server: SocketServer) -> set[int]:
@@ -142,7 +142,7 @@ async def test_notifications_act_without_a_reply(server: SocketServer) -> None:
     assert (await peer.message())["id"] == 9
     (connection,) = server.hub.connections.values()
     assert connection.number in watching(server)
-    assert not connection.wakers
+    assert not connection.wakers.by_device
 
 
 @in_server()
