@@ -373,7 +373,8 @@ class DeviceSettings:
             what = "a command changed settings of the device" if own else "settings of the device changed"
             level = logging.INFO if own else logging.WARNING
             self._events.report(level, now_ns, EventKind.CONFIGURATION, f"{what}: {', '.join(texts)}", changed)
-        self._observer.described(self._transport.where, identity_words(self.identity), self.shown)
+        if self._observer.listeners:
+            self._observer.described(self._transport.where, identity_words(self.identity), self.shown)
         self._transport.attachments.compare_settings(self.values, driver)
         self._transport.use_axes(self.shown)
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from itertools import chain, repeat
 from typing import Any, Protocol
 
+from imud.attitude.conventions import DeviceAxes
 from imud.attitude.published import PublishedAxes, published_frame
 from imud.config.model import DeviceConfig
 from imud.contracts.driver import Driver, Identity
@@ -82,10 +83,9 @@ class DeviceContext:
     health: Health
     observer: PathObserver
 
-    def published(self, driver: Driver, settings: Mapping[str, str]) -> PublishedAxes:
-        """Return the published axes of a device with these readable settings (empty: not read yet)."""
+    def published(self, axes: DeviceAxes) -> PublishedAxes:
+        """Return the published axes of a device that sends `axes`."""
         config = self.config
-        axes = driver.sent_axes(settings).axes
         return published_frame(config.frame, config.convention, config.declination_deg, axes)
 
     def path_context(
@@ -98,7 +98,7 @@ class DeviceContext:
 
         return PathContext(
             self.config.name, self.device_id, self.ledger, self.owner.publish, on_message, self.events.bad_frame,
-            overruns, self.host, self.published(driver, settings),
+            overruns, self.host, self.published(driver.sent_axes(settings).axes),
         )  # fmt: skip
 
     def new_clock(self, driver: Driver, path: SamplePath | None) -> SampleClock:
@@ -129,6 +129,7 @@ class Transport(SettingsPort):
         self._host = context.host
         self._latency_ns = 0
         self.axes_problem = ""  # reason for which the axes of the device are uncertain
+        self._compared: tuple[SamplePath, DeviceAxes] | None = None  # path, and the sent axes that it publishes
 
     def serve(self, attachments: Attachments, settings: DeviceSettings) -> None:
         """Set the other parts of the device, before the first use of the link."""
@@ -169,12 +170,14 @@ class Transport(SettingsPort):
         driver, path = self.driver, self.path
         if driver is None or path is None:
             return
-        if (frame := self._context.published(driver, settings)) != path.frame:
-            path.set_frame(frame)
-        problem, before = driver.sent_axes(settings).problem, self.axes_problem
-        self.axes_problem = problem
-        if problem and problem != before:
-            self._context.events.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, problem)
+        sent, before = driver.sent_axes(settings), self.axes_problem
+        if self._compared != (path, sent.axes):
+            self._compared = path, sent.axes
+            if (frame := self._context.published(sent.axes)) != path.frame:
+                path.set_frame(frame)
+        self.axes_problem = sent.problem
+        if sent.problem and sent.problem != before:
+            self._context.events.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, sent.problem)
 
     # --- the samples -------------------------------------------------------------------------------------------------
 

@@ -37,7 +37,7 @@ class PathObserver:
         self._id = device_id
         self._ledger = ledger
         self._host = host
-        self._listeners: list[PutRecord] = []
+        self.listeners: list[PutRecord] = []
         self._path: SamplePath | None = None
         self._driver = ""
         self._options: Options | None = None
@@ -51,19 +51,18 @@ class PathObserver:
         if self._path is not None:
             self._path.observe(None)
         self._path, self._driver, self._options = path, driver, options
-        if self._listeners:
+        if self.listeners:
             self._put(self._path_record(path))
             path.observe(self)
 
     def codec_changed(self) -> None:
         """Record the path again: the codec changed its options because the device reported its identity."""
-        if self._listeners and self._path is not None:
+        if self.listeners and self._path is not None:
             self._put(self._path_record(self._path))
 
     def described(self, where: str, identity: Mapping[str, str], settings: Mapping[str, str]) -> None:
         """Record the identity and the settings that the device reported."""
-        if self._listeners:
-            self._put(self._device_record(where, identity, settings))
+        self._put(self._device_record(where, identity, settings))
 
     # --- the recorder's side -----------------------------------------------------------------------------------------
 
@@ -73,17 +72,17 @@ class PathObserver:
         A second call sends the description and the state again.
         """
         put(self._device_record(where, identity, settings))
-        if put not in self._listeners:
-            self._listeners.append(put)
+        if put not in self.listeners:
+            self.listeners.append(put)
         if self._path is not None:
             put(self._path_record(self._path))
             self._path.observe(self)
 
     def end(self, put: PutRecord) -> None:
         """Send no more records to `put`. Do nothing if `put` receives no records."""
-        if put in self._listeners:
-            self._listeners.remove(put)
-        if not self._listeners and self._path is not None:
+        if put in self.listeners:
+            self.listeners.remove(put)
+        if not self.listeners and self._path is not None:
             self._path.observe(None)
 
     def check(self, put: PutRecord) -> None:
@@ -101,7 +100,7 @@ class PathObserver:
     # --- records -----------------------------------------------------------------------------------------------------
 
     def _put(self, record: bytes) -> None:
-        for put in self._listeners:
+        for put in self.listeners:
             put(record)
 
     def _device_record(self, where: str, identity: Mapping[str, str], settings: Mapping[str, str]) -> bytes:
@@ -160,7 +159,7 @@ class ClockObserver:
 
     def __init__(self, host: HostClock) -> None:
         self._host = host
-        self._listeners: list[PutRecord] = []
+        self.listeners: list[PutRecord] = []
 
     def begin(self, put: PutRecord) -> None:
         """Send the present state of the clocks to `put`, then each reading."""
@@ -169,15 +168,15 @@ class ClockObserver:
         steady = StateWriter({}).write({"steady": host.steady})
         call = CallRecord("host", "restore", [steady, *host.kept()])
         put(records.encode_object(Kind.CALL, records.NO_DEVICE, call))
-        if put not in self._listeners:
-            self._listeners.append(put)
+        if put not in self.listeners:
+            self.listeners.append(put)
         host.on_measured = self._measured
 
     def end(self, put: PutRecord) -> None:
         """Send no more readings to `put`. Do nothing if `put` receives no readings."""
-        if put in self._listeners:
-            self._listeners.remove(put)
-        if not self._listeners:
+        if put in self.listeners:
+            self.listeners.remove(put)
+        if not self.listeners:
             self._host.on_measured = None
 
     def _measured(self, monotonic_ns: int, raw_ns: int, held_raw_ns: int) -> None:
@@ -185,7 +184,7 @@ class ClockObserver:
         utc_offset_ns, suspends = host.kept()
         clocks = ClocksRecord(monotonic_ns, raw_ns, held_raw_ns, host.error_ns, utc_offset_ns, suspends)
         record = records.encode_clocks(clocks)
-        for put in self._listeners:
+        for put in self.listeners:
             put(record)
 
 

@@ -13,6 +13,7 @@ raise BadArgument here. Settings are lost at power-off unless `save_config` foll
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from enum import Enum, StrEnum
+from functools import cache
 from typing import Final, Literal, get_args
 
 from imud.attitude.rotation import Matrix3, is_rotation
@@ -236,6 +237,7 @@ def log_once(message: OutputMessage) -> Request:
     return _command(f"LOG {message} ONMARK ONCE")
 
 
+@cache
 def ask(query: Query) -> Request:
     """Request one of the four reports."""
     is_part = is_version_line if query is Query.VERSION else is_setting_line
@@ -309,8 +311,8 @@ def identify() -> RequestScript[Identity]:
     `details` contains every value by the name of the device; `firmware` is "1.5.6" for APP_VER=156. Raises NoReply,
     Rejected. A reply without a product has lost bytes, which happens to the first reply after a replug.
     """
-    outcome = yield ask(Query.VERSION)
-    lines = _lines(outcome, Query.VERSION)
+    request = ask(Query.VERSION)
+    lines = require_reply(request, (yield request))
     version = parse_version(lines)
     if not version.product:
         raise NoReply(f"LOG VERSION: expected PNAME=... and other lines, got {' / '.join(lines)}; bytes were lost")
@@ -324,35 +326,30 @@ def read_report(query: Query) -> RequestScript[Mapping[str, str] | None]:
     A line without a name gets the name "COMCONFIG 1", "COMCONFIG 2" and so on. Raises NoReply, Rejected. Returns None
     for MAGCONFIG in these cases, because a device without magnetometer may not know it (assumption).
     """
-    outcome = yield ask(query)
-    if query is Query.MAGCONFIG and isinstance(outcome, Silence | Rejection):
+    request = ask(query)
+    outcome = yield request
+    if query is Query.MAGCONFIG and not isinstance(outcome, Reply):
         return None
-    report = parse_report(_lines(outcome, query))
+    report = parse_report(require_reply(request, outcome))
     return {**report.values, **{f"{query} {number}": line for number, line in enumerate(report.other, 1)}}
 
 
-def _lines(outcome: Outcome, query: Query) -> tuple[str, ...]:
-    """Return the lines of a positive reply. Raises NoReply or Rejected for another outcome."""
-    if isinstance(outcome, Silence):
-        heard = f"got {len(outcome.lines)} lines without OK" if outcome.lines else "got no reply"
-        raise NoReply(
-            f"LOG {query}: expected lines up to OK, {heard}; check the transmit wire of the host and the baud rate"
-        )
-    raise_if_rejected(f"LOG {query}", outcome)
-    return outcome.lines
-
-
-def raise_if_rejected(name: str, outcome: Outcome) -> None:
+def require_reply(request: Request, outcome: Outcome, expected: str = "") -> tuple[str, ...]:
+    """Return the lines of a positive reply. Raises NoReply, with the `expected` reply, or Rejected."""
     if isinstance(outcome, Rejection):
-        raise Rejected(f"{name}: the device rejected the request: {' / '.join(outcome.lines)}")
+        raise Rejected(f"{request.name}: the device rejected the request: {' / '.join(outcome.lines)}")
+    if isinstance(outcome, Silence):
+        is_report = request.messages_min > 1
+        expected = expected or ("lines up to OK" if is_report else "OK")
+        heard = f"{len(outcome.lines)} lines without OK" if outcome.lines else "no reply"
+        check = "check the transmit wire of the host" + " and the baud rate" * is_report
+        raise NoReply(f"{request.name}: expected {expected}, got {heard}; {check}")
+    return outcome.lines
 
 
 def send(request: Request) -> RequestScript[None]:
     """Send one command. Raises NoReply (also for a command that the firmware does not know) and Rejected."""
-    outcome = yield request
-    if isinstance(outcome, Silence):
-        raise NoReply(f"{request.name}: expected OK, got no reply; check the transmit wire of the host")
-    raise_if_rejected(request.name, outcome)
+    require_reply(request, (yield request))
 
 
 # --- output -----------------------------------------------------------------------------------------------------------
@@ -363,12 +360,10 @@ def send_once(message: OutputMessage) -> RequestScript[None]:
     request = replace(log_once(message), is_sample=lambda _sample: True)
     outcome = yield request
     if isinstance(outcome, Reply) and outcome.sample is not None:
-        outcome = yield replace(request, payload=b"", is_sample=None)  # OK can follow the frame
-        raise_if_rejected(request.name, outcome)
-        return
-    if isinstance(outcome, Silence):
-        raise NoReply(f"{request.name}: expected OK or a frame, got no reply; check the transmit wire of the host")
-    raise_if_rejected(request.name, outcome)
+        outcome = yield replace(request, payload=b"", is_sample=None)
+        if isinstance(outcome, Silence):  # OK can follow the frame
+            return
+    require_reply(request, outcome, "OK or a frame")
 
 
 def ask_outputs() -> RequestScript[PeriodicOutputs | None]:
@@ -433,8 +428,7 @@ def change_baud(baud: BaudRate, present_baud: int) -> RequestScript[int]:
     keeps.
     """
     require_room(rates_hz((yield from ask_outputs())), baud)
-    outcome = yield serial_config(baud)
-    answered = _is_answer(outcome, f"SERIALCONFIG {baud}")
+    answered = yield from _acknowledged(serial_config(baud))
     heard = yield from _find((present_baud, baud) if answered else (baud, present_baud))
     if heard == present_baud != baud and not answered:
         raise NoReply(f"SERIALCONFIG {baud}: expected OK, got no reply; the device keeps {present_baud} baud")
@@ -448,8 +442,7 @@ def change_baud(baud: BaudRate, present_baud: int) -> RequestScript[int]:
 
 def reset_to_factory(present_baud: int) -> RequestScript[int]:
     """Restore the factory settings, restart and follow the device. Return the baud rate. Raises NoReply, Rejected."""
-    outcome = yield factory_reset()
-    answered = _is_answer(outcome, "FRESET")
+    answered = yield from _acknowledged(factory_reset())
     heard = yield from _find((present_baud, FACTORY_BAUD) if answered else (FACTORY_BAUD, present_baud))
     if not answered and heard == present_baud:
         raise NoReply("FRESET: expected OK, got no reply; read the settings to check the result")
@@ -465,9 +458,11 @@ def advice(baud: int, fixed_baud: int) -> str:
     return f"change `baud: {fixed_baud}` in the configuration to {baud} or auto: imud uses it at its next start"
 
 
-def _is_answer(outcome: Outcome, name: str) -> bool:
-    """Return whether the device acknowledged. Raises Rejected."""
-    raise_if_rejected(name, outcome)
+def _acknowledged(request: Request) -> RequestScript[bool]:
+    """Send a command. Return whether the device acknowledged it. Raises Rejected."""
+    outcome = yield request
+    if not isinstance(outcome, Silence):
+        require_reply(request, outcome)
     return isinstance(outcome, Reply)
 
 

@@ -187,11 +187,11 @@ def _start_magnetometer(_target: Target) -> RequestScript[None]:
 
 def _magnetometer_verdict(_target: Target) -> RequestScript[Verdict]:
     """Read the bias of the magnetometer. Raises NoReply, Rejected."""
-    outcome = yield ask(Query.MAGCONFIG)
+    request = ask(Query.MAGCONFIG)
+    outcome = yield request
     if isinstance(outcome, Silence):
         raise NoReply("LOG MAGCONFIG: expected lines up to OK, got no reply; does the device have a magnetometer?")
-    commands.raise_if_rejected("LOG MAGCONFIG", outcome)
-    bias = numbers_of(parse_report(outcome.lines).values.get("MB", ""), 3)
+    bias = numbers_of(parse_report(commands.require_reply(request, outcome)).values.get("MB", ""), 3)
     if bias is None:
         return Verdict(done=False, words="the device does not report its bias")
     words = "bias " + ", ".join(f"{value:g}" for value in bias) + " µT"

@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 from imud.contracts.script import Message, TextLine
 from imud.model.ledger import Ledger
 
-_VERSION_NAMES: Final = ("PNAME", "BUILD", "UUID", "APP_VER", "BL_VER")
+_VERSION_LINE: Final = re.compile(r"\s*(?:PNAME|BUILD|UUID|APP_VER|BL_VER)\s*[=:].*")
 _VALUE_LINE: Final = re.compile(r"\s*([A-Za-z][A-Za-z0-9_.\-]*)\s*[=:]\s*(.*?)\s*")
 _COMMENT: Final = re.compile(r"\s*/\*.*?(\*/|$)")
 _OUTPUT: Final = re.compile(r"\b(?:IMU|HI)(91|92)\s+(?:COM\d+\s+)?ONTIME\s+(\d+(?:\.\d*)?|\.\d+)")
@@ -39,8 +39,7 @@ def is_rejection(message: Message) -> bool:
 
 def is_version_line(message: Message) -> bool:
     """Return whether a message can be part of the reply to LOG VERSION."""
-    match = _VALUE_LINE.fullmatch(message) if isinstance(message, str) else None
-    return match is not None and match[1] in _VERSION_NAMES
+    return isinstance(message, str) and _VERSION_LINE.fullmatch(message) is not None
 
 
 def is_setting_line(message: Message) -> bool:
@@ -48,7 +47,7 @@ def is_setting_line(message: Message) -> bool:
 
     A version line and an NMEA sentence of newer firmware, which can arrive between the lines, are not part of it.
     """
-    return isinstance(message, str) and not is_version_line(message) and not message.startswith("$")
+    return isinstance(message, str) and not _VERSION_LINE.fullmatch(message) and not message.startswith("$")
 
 
 @dataclass(frozen=True, slots=True)
