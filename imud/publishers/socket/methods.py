@@ -141,7 +141,7 @@ class Method(Generic[P]):
 
 def hello(hub: Hub, connection: ClientConnection) -> bytes:
     """Return the notification that greets a client."""
-    rights = [right.name.lower() for right in Rights if right in connection.rights and right.name]
+    rights = str(connection.rights.name).lower().split("|")  # the name of two rights is READ|CONTROL
     return encode_notification("hello", Greeting(PROTOCOL, __version__, hub.context.epoch, rights))
 
 

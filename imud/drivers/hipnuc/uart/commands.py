@@ -245,21 +245,15 @@ def ask(query: Query) -> Request:
     return _command(f"LOG {query}", is_part=is_part, messages_min=2, kind=kind, repeatable=True)
 
 
-def max_rate_hz(message: OutputMessage, baud: int) -> int:
-    """Return the maximum output rate of `message` at `baud` (table 3.7). Raises BadArgument for other baud rates."""
-    rates = MAX_RATE_HZ[message]
-    if baud not in rates:
-        known = ", ".join(map(str, sorted(rates)))
-        raise BadArgument(f"baud rate: expected one of {known}, got {baud!r}")
-    return rates[baud]
-
-
 def require_room(rates_hz: Mapping[OutputMessage, float], baud: int) -> None:
-    """Raise BadArgument if the serial port cannot carry all messages, or if one message exceeds table 3.7."""
+    """Raise BadArgument if the serial port cannot carry all messages, or if one message exceeds table 3.7.
+
+    `baud` is one of BAUD_RATES.
+    """
     frame_bytes_s = 0.0
     for message, rate_hz in rates_hz.items():
         frame_bytes_s += rate_hz * FRAME_BYTES[message]
-        most_hz = max_rate_hz(message, baud)
+        most_hz = MAX_RATE_HZ[message][baud]
         if rate_hz > most_hz:
             raise BadArgument(
                 f"{message}: expected at most {most_hz} Hz at {baud} baud, got {rate_hz:g} Hz; "
@@ -331,7 +325,10 @@ def read_report(query: Query) -> RequestScript[Mapping[str, str] | None]:
     if query is Query.MAGCONFIG and not isinstance(outcome, Reply):
         return None
     report = parse_report(require_reply(request, outcome))
-    return {**report.values, **{f"{query} {number}": line for number, line in enumerate(report.other, 1)}}
+    words = dict(report.values)
+    for number, line in enumerate(report.other, 1):
+        words[f"{query} {number}"] = line
+    return words
 
 
 def require_reply(request: Request, outcome: Outcome, expected: str = "") -> tuple[str, ...]:
