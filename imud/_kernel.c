@@ -37,7 +37,8 @@
 #define FLOATS 16                /* accel, gyro, mag, euler, quaternion */
 #define QUAT_SQUARE_MIN 0.9604   /* limits of the squared length of a rotation, see value_limits.py */
 #define QUAT_SQUARE_MAX 1.0404
-#define VALUE_HIGH_BYTE 0x48     /* a float of 131,072 or more has this high byte or a larger one, also NaN */
+#define VALUE_HIGH_BYTE 0x46     /* a float of 8,192 or more has this high byte or a larger one, also NaN */
+#define TURN_DEG 360.0f          /* maximum magnitude of an angle */
 #define PRESSURE_MIN_PA 1000.0
 #define PRESSURE_MAX_PA 120000.0
 #define PPS_STAMP_MODULUS_MS 8192
@@ -140,13 +141,17 @@ static uint32_t crc32_of(const uint8_t *data, size_t size)
 static int is_usual(const uint8_t *frame)
 {
     const uint8_t *payload = frame + HEAD_BYTES;
-    float pressure_pa;
+    float pressure_pa, angles_deg[3];
     if (memcmp(frame, SYNC_AND_LENGTH, 4) || payload[0] != TAG_HI91)
         return 0;
     if (crc16_xmodem(payload, PAYLOAD_BYTES, crc16_xmodem(frame, 4, 0)) != (uint16_t)(frame[4] | frame[5] << 8))
         return 0;
     for (int i = 0; i < FLOATS; i++)
         if ((payload[15 + 4 * i] & 0x7F) >= VALUE_HIGH_BYTE)
+            return 0;
+    memcpy(angles_deg, payload + 48, sizeof angles_deg);
+    for (int i = 0; i < 3; i++)
+        if (!(fabsf(angles_deg[i]) <= TURN_DEG))
             return 0;
     memcpy(&pressure_pa, payload + 4, 4);
     return PRESSURE_MIN_PA <= pressure_pa && pressure_pa <= PRESSURE_MAX_PA; /* false for NaN */

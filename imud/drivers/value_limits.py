@@ -1,25 +1,28 @@
 """Limits of the values that a device sends. A value outside is not a measurement.
 
 A damaged device or a hostile frame with a correct check value can send any 32-bit float. No inertial sensor measures
-131,072 g, °/s, µT or °, or a temperature outside -128 … 512 °C. The limits are powers of two: the high byte of a float
-shows whether the value is inside, so that one call checks all values of many frames. A quaternion is a rotation only if
-its length is 1.
+8,192 g, °/s, µT or °, or a temperature outside -128 … 150 °C. VALUE_LIMIT is a power of two: the high byte of a float
+shows whether the value is inside, so that one call checks all values of many frames. An angle beyond a full turn is not
+an angle. A quaternion is a rotation only if its length is 1.
 """
 
 from collections.abc import Sequence
-from typing import Final
+from math import tau
+from typing import Final, TypeVar
 
 from imud.model.sample import Quaternion, Vector3
 
-VALUE_LIMIT: Final = 131_072.0  # magnitude that no value reaches, in g, °/s, µT or °
-TEMPERATURE_LIMITS_C: Final = (-128.0, 512.0)  # a measured temperature is between these values, °C
+VALUE_LIMIT: Final = 8_192.0  # magnitude that no value reaches, in g, °/s, µT or °
+TEMPERATURE_LIMITS_C: Final = (-128.0, 150.0)  # a measured temperature is above the first value, up to the second, °C
+TURN_DEG: Final = 360.0  # maximum magnitude of an angle
+TURN_RAD: Final = tau * (1 + 1e-9)  # the same in rad, with the rounding of the scales
 # Limits of the squared length of a rotation: 0.98² and 1.02². Rounding to 16 bits changes the length by 1e-4.
 QUAT_SQUARE_MIN, QUAT_SQUARE_MAX = 0.9604, 1.0404
 
 # High bytes of little-endian 32-bit floats inside the limits. The high byte is the sign and the
-# upper seven bits of the exponent: 131,072 is 0x48000000, -128 is 0xC3000000, 512 is 0x44000000.
-VALUE_HIGH_BYTES: Final = bytes(byte for byte in range(256) if byte & 0x7F < 0x48)
-TEMPERATURE_HIGH_BYTES: Final = bytes([*range(0x44), *range(0x80, 0xC3)])
+# upper seven bits of the exponent: 8,192 is 0x46000000, ±128 is 0x43000000 and 0xC3000000.
+VALUE_HIGH_BYTES: Final = bytes(byte for byte in range(256) if byte & 0x7F < 0x46)
+TEMPERATURE_HIGH_BYTES: Final = bytes([*range(0x43), *range(0x80, 0xC3)])
 
 
 def values_possible(high_bytes: bytes | bytearray) -> bool:
@@ -29,7 +32,8 @@ def values_possible(high_bytes: bytes | bytearray) -> bool:
 
 
 def temperatures_possible(high_bytes: bytes | bytearray) -> bool:
-    """Return whether all temperatures with these high bytes are inside TEMPERATURE_LIMITS_C."""
+    """Return whether all temperatures with these high bytes are inside ±128 °C. `possible_temperature_c` decides the
+    other temperatures."""
     return not high_bytes.translate(None, TEMPERATURE_HIGH_BYTES)
 
 
@@ -51,7 +55,15 @@ def scaled(values: Sequence[float], factor: float) -> Vector3 | None:
 def possible_temperature_c(temperature_c: float) -> float | None:
     """Return a temperature, °C; None if it is not possible."""
     low_c, high_c = TEMPERATURE_LIMITS_C
-    return temperature_c if low_c < temperature_c < high_c else None
+    return temperature_c if low_c < temperature_c <= high_c else None
+
+
+_Angles = TypeVar("_Angles", bound=tuple[float, ...])
+
+
+def possible_angles(angles_rad: _Angles | None) -> _Angles | None:
+    """Return finite angles, rad; None if one is beyond a full turn."""
+    return None if angles_rad is None or max(map(abs, angles_rad)) > TURN_RAD else angles_rad
 
 
 def possible_quaternion(w: float, x: float, y: float, z: float) -> Quaternion | None:

@@ -57,7 +57,8 @@ ATTITUDE_LAYOUT: Final = struct.Struct("<BhhhB")
 RAD_PER_LSB: Final = 1e-4
 RATE_RAD_S_PER_LSB: Final = 1e-6 / 32
 
-I16_MOST, U16_MOST, I32_MOST, SID_MOST = 0x7FFC, 0xFFFC, 0x7FFF_FFFC, 252  # maximum counts that are values
+I16_MOST, I32_MOST, SID_MOST = 0x7FFC, 0x7FFF_FFFC, 252  # maximum counts that are values
+HEADING_MOST: Final = 62_832  # maximum heading in counts: a full turn
 
 
 class Reference(IntEnum):
@@ -96,7 +97,7 @@ def measurement_of(
         if pgn == HEADING:
             _, heading, _, _, reference = HEADING_LAYOUT.unpack(data)
             has_heading = True
-            is_good = heading <= U16_MOST and reference & 3 != Reference.ERROR
+            is_good = heading <= HEADING_MOST and reference & 3 != Reference.ERROR
             yaw = _counter_clockwise(heading) if is_good else nan
         elif pgn == RATE_OF_TURN:
             _, counts = RATE_LAYOUT.unpack(data)

@@ -51,6 +51,7 @@ from imud.drivers.value_limits import (
     TEMPERATURE_LIMITS_C,
     VALUE_HIGH_BYTES,
     is_possible,
+    possible_angles,
     possible_temperature_c,
     scaled,
 )
@@ -215,7 +216,7 @@ class Imu61xCanCodec:
         ledger.frames_in_samples += SET_FRAMES
         *values, temperature, _ = SET.unpack(raw)
         low, high = TEMPERATURE_COUNTS
-        if low < temperature < high and not raw[_HIGH_BYTES].strip(VALUE_HIGH_BYTES):
+        if low < temperature <= high and not raw[_HIGH_BYTES].strip(VALUE_HIGH_BYTES):
             return (_measurement(values, temperature, index, first_ns),)
         return (*self._not_finite(raw), _measurement(values, temperature, index, first_ns))
 
@@ -242,7 +243,7 @@ class Imu61xCanCodec:
 
 def _measurement(values: Sequence[float], temperature: int, index: int, first_ns: int) -> Measurement:
     """Return the measurement of a complete set, without groups with a value that is not possible."""
-    euler = scaled(values[:3], RAD_PER_DEG)
+    euler = possible_angles(scaled(values[:3], RAD_PER_DEG))
     return Measurement(
         SET.size, 0, index,
         accel_m_s2=scaled(values[6:9], M_S2_PER_G),

@@ -40,7 +40,7 @@ from imud.drivers.imu61x.registers import (
     wanted_filter,
 )
 from imud.drivers.polled_frames import Measured, PolledFrameDecoder, absence
-from imud.drivers.value_limits import possible_temperature_c, scaled
+from imud.drivers.value_limits import possible_angles, possible_temperature_c, scaled
 from imud.model.errors import DeviceRefused, TransferError
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Vector3
@@ -337,7 +337,8 @@ class Imu61xSpiCodec:
     def _on_temperature(self, data: bytes) -> Sequence[PolledEvent]:
         words = answers(data)
         good = len(words) >= 2 and any(words[:2]) and words[:2] != (0xFFFF, 0xFFFF)
-        self._temperature_c = temperature_c(_signed(words[0] << 16 | words[1])) if good else None
+        found = temperature_c(_signed(words[0] << 16 | words[1]))
+        self._temperature_c = possible_temperature_c(found) if good else None
         self._frames.add_reply(data[PIPELINE_BYTES:], good=good)
         return ()
 
@@ -370,10 +371,11 @@ def _in_si(counts: Sequence[int], factor: float) -> Vector3:
 
 
 def _registers(frame: bytes) -> Measured:
-    (temperature,) = struct.unpack_from(">i", frame)
+    temperature = possible_temperature_c(temperature_c(*struct.unpack_from(">i", frame)))
     gyro = _in_si(_THREE.unpack_from(frame, 4), RAD_S_PER_COUNT)
     accel = _in_si(_THREE.unpack_from(frame, 16), M_S2_PER_COUNT_REGISTER)
-    return Measurement(len(frame), 0, None, accel, gyro, temperature_c=temperature_c(temperature)), True
+    measurement = Measurement(len(frame), 0, None, accel, gyro, temperature_c=temperature)
+    return measurement, temperature is not None
 
 
 def _never_bad(_frame: bytes) -> BadReason | None:
@@ -392,7 +394,7 @@ def _extended(frame: bytes) -> Measured:
             (values[0:3], RAD_S_PER_DEG_S), (values[3:6], M_S2_PER_G), (values[7:10], RAD_PER_DEG),
         )
     )  # fmt: skip
-    temperature = possible_temperature_c(values[6])
+    euler, temperature = possible_angles(euler), possible_temperature_c(values[6])
     measurement = Measurement(
         len(frame), 0, None, accel, gyro,
         quat_wxyz=None if euler is None else quat_from_euler_zyx(euler),

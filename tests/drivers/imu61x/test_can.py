@@ -104,11 +104,11 @@ def test_golden_set_in_si_units_and_back() -> None:
 
 @pytest.mark.manual("A 4.2 temperature")
 def test_temperature_is_in_hundredths() -> None:
-    for raw, expected in (("0000", 0.0), ("9cff", -1.0), ("ff7f", 327.67), ("01ce", -127.99)):
+    for raw, expected in (("0000", 0.0), ("9cff", -1.0), ("983a", 150.0), ("01ce", -127.99)):
         (measured,) = feed(make(), [*GOLDEN[:4], (105, F_M1 + bytes.fromhex(raw) + b"\0\0")])
         assert isinstance(measured, Measurement)
         assert measured.temperature_c == pytest.approx(expected)
-    for raw in ("00ce", "0080"):  # -128 °C and -327.68 °C
+    for raw in ("00ce", "0080", "993a"):  # -128 °C, -327.68 °C, 150.01 °C
         bad, measured = feed(make(), [*GOLDEN[:4], (105, F_M1 + bytes.fromhex(raw) + b"\0\0")])
         assert isinstance(bad, BadFrame)
         assert isinstance(measured, Measurement)

@@ -43,7 +43,7 @@ from imud.drivers.hipnuc.canopen.cia301 import (
     TpdoNumber,
 )
 from imud.drivers.hipnuc.common import M_S2_PER_G, QUAT_PER_LSB, pressure_of
-from imud.drivers.value_limits import possible_quaternion
+from imud.drivers.value_limits import possible_angles, possible_quaternion
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Pair, Quaternion, Vector3
@@ -162,7 +162,7 @@ def _measurement(assembled: Assembled) -> Measurement:
     incli: Pair | None = None
     if 7 in frames:
         x, y = TWO_LONG.unpack(frames[7])
-        incli = (x * INCLI_RAD_PER_LSB, y * INCLI_RAD_PER_LSB)
+        incli = possible_angles((x * INCLI_RAD_PER_LSB, y * INCLI_RAD_PER_LSB))
     return Measurement(
         sum(map(len, frames.values())), 0, None,
         accel_m_s2=_vector(frames.get(1), ACCEL_M_S2_PER_LSB),

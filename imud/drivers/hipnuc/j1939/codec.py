@@ -31,7 +31,7 @@ from imud.drivers.hipnuc.common import (
     TEMPERATURE_C_PER_LSB,
     counts_of,
 )
-from imud.drivers.value_limits import possible_quaternion
+from imud.drivers.value_limits import possible_quaternion, possible_temperature_c
 from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, join, split
 from imud.model.ledger import Ledger
 from imud.model.options import Options
@@ -58,7 +58,6 @@ UTC_LAYOUT: Final = struct.Struct("<6BH")
 TURN: Final = 360_000  # counts of a full turn
 HALF_TURN: Final = TURN // 2
 PLACEHOLDER: Final = 999  # reserved bytes 4-7 of FF43 as devices without barometer send them
-TEMPERATURE_MOST_C: Final = 150.0  # maximum valid temperature, °C: above the operating range of all devices
 # year 0 in FF2F (assumed)
 YEAR_ZERO: Final = 2000
 
@@ -129,9 +128,8 @@ class _Parts:
 
     def decode_temperature(self, data: bytes) -> None:
         celsius, _, reserved = TEMPERATURE_LAYOUT.unpack(data)
-        celsius *= TEMPERATURE_C_PER_LSB
-        if abs(celsius) <= TEMPERATURE_MOST_C and (celsius or reserved) and data != _NOTHING:
-            self.temperature_c = celsius
+        if (celsius or reserved) and data != _NOTHING:
+            self.temperature_c = possible_temperature_c(celsius * TEMPERATURE_C_PER_LSB)
 
     def decode_quaternion(self, data: bytes) -> None:
         w, x, y, z = QUATERNION_LAYOUT.unpack(data)

@@ -49,7 +49,7 @@ from imud.drivers.hipnuc.modbus.registers import (
     read_registers,
 )
 from imud.drivers.polled_frames import Measured, PolledFrameDecoder, absence
-from imud.drivers.value_limits import possible_quaternion, possible_temperature_c
+from imud.drivers.value_limits import possible_angles, possible_quaternion, possible_temperature_c
 from imud.formats.modbus import (
     CRC_BYTES,
     ILLEGAL_ADDRESS,
@@ -206,14 +206,14 @@ class HipnucModbusCodec:
         has_time = len(data) == READ_BLOCK.read_bytes
         self._answered = True
         a, w, b, angle = ACCEL_M_S2_PER_LSB, GYRO_RAD_S_PER_LSB, MAG_T_PER_LSB, EULER_RAD_PER_LSB
+        euler = possible_angles((roll * angle, pitch * angle, yaw * angle))
+        temperature = possible_temperature_c(celsius * TEMPERATURE_C_PER_LSB)
         return Measurement(
             len(data), 0, UPTIME.unpack_from(data, DATA_AT + BLOCK.size)[0] if has_time else None,
             (ax * a, ay * a, az * a), (gx * w, gy * w, gz * w), (mx * b, my * b, mz * b) if mx or my or mz else None,
-            self._quaternion(qw, qx, qy, qz), (roll * angle, pitch * angle, yaw * angle),
-            possible_temperature_c(celsius * TEMPERATURE_C_PER_LSB) if celsius or pressure else None,
-            pressure_of(pressure * PRESSURE_PA_PER_LSB),
-            self._inclination(ix, iy, roll * angle, pitch * angle), self._status,
-        ), True  # fmt: skip
+            self._quaternion(qw, qx, qy, qz), euler, temperature if celsius or pressure else None,
+            pressure_of(pressure * PRESSURE_PA_PER_LSB), self._inclination(ix, iy, euler), self._status,
+        ), euler is not None and temperature is not None  # fmt: skip
 
     def _quaternion(self, w: int, x: int, y: int, z: int) -> Quaternion | None:
         if not self._quat_scale:
@@ -222,13 +222,13 @@ class HipnucModbusCodec:
         k = self._quat_scale
         return possible_quaternion(w * k, x * k, y * k, z * k)
 
-    def _inclination(self, x: int, y: int, roll_rad: float, pitch_rad: float) -> Pair | None:
+    def _inclination(self, x: int, y: int, euler_rad: Vector3 | None) -> Pair | None:
         if not self._incli_scale:
             if not x and not y:
                 return None
             if y or x < 0:
                 self._incli_scale = INCLI_DUAL_RAD_PER_LSB
-            elif abs(_dual_y_rad(roll_rad, pitch_rad)) > PITCHED_RAD:
+            elif euler_rad is not None and abs(_dual_y_rad(euler_rad[0], euler_rad[1])) > PITCHED_RAD:
                 self._incli_scale = INCLI_SINGLE_RAD_PER_LSB
             else:
                 return None

@@ -45,8 +45,10 @@ from imud.drivers.hipnuc.uart.replies import LINE_CHARACTERS_MAX, LineFinder
 from imud.drivers.value_limits import (
     QUAT_SQUARE_MAX,
     QUAT_SQUARE_MIN,
+    TURN_DEG,
     VALUE_HIGH_BYTES,
     is_possible,
+    possible_angles,
     possible_quaternion,
     values_possible,
 )
@@ -71,7 +73,7 @@ PPS_STAMP_MODULUS_MS: Final = 8192
 
 ACCEL_M_S2_PER_LSB: Final = 0.0048828  # scale of HI92 as printed; 160 / 32768 would be 2.6e-6 larger
 GYRO_RAD_S_PER_LSB: Final = 0.001  # scale of HI92
-PRESSURE_OFFSET_PA: Final = 100_000
+PRESSURE_OFFSET_PA: Final = 100_000.0
 
 
 # HI91 after its tag, the word as two bytes. In the native layout, `struct` reads a float in half the time.
@@ -106,17 +108,20 @@ def decode_hi91(values: Sequence[Any], word_is_status: bool, size: int, trailing
     )  # fmt: skip
 
 
-def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int) -> list[Measurement]:
-    """Return `decode_hi91` of adjacent sub-packets, one per frame. `trailing` bytes follow the first frame."""
+def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int) -> list[Measurement] | None:
+    """Return `decode_hi91` of adjacent sub-packets, one per frame; None if an angle is beyond a full turn. `trailing`
+    bytes follow the first frame."""
     g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
     low_pa, high_pa, most_ms = PRESSURE_MIN_PA, PRESSURE_MAX_PA, PPS_STAMP_MODULUS_MS
-    least, most = QUAT_SQUARE_MIN, QUAT_SQUARE_MAX
+    least, most, turn = QUAT_SQUARE_MIN, QUAT_SQUARE_MAX, TURN_DEG
     made: list[Measurement] = []
     make, keep = Measurement, made.append
     # decode_hi91 inline: the call costs a twentieth of the time
     for (
         low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
     ) in HI91_VALUES.iter_unpack(hi91s):  # fmt: skip
+        if not (-turn <= roll <= turn and -turn <= pitch <= turn and -turn <= yaw <= turn):
+            return None
         temperature += 0.0  # noqa: PLW2901
         if not low_pa <= pressure <= high_pa:
             temperature, pressure = temperature_beside(temperature, pressure), None  # noqa: PLW2901
@@ -147,7 +152,7 @@ def _run_possible(hi91s: bytes) -> bool:
 def _decode_hi91(data: bytes, at: int, word_is_status: bool, size: int, trailing: int) -> tuple[Measurement, bool]:
     values = HI91_VALUES.unpack_from(data, at)
     measurement = decode_hi91(values, word_is_status, size, trailing)
-    if isfinite(values[3]) and is_possible(values[5:]):
+    if isfinite(values[3]) and is_possible(values[5:]) and max(map(abs, values[_GROUPS["euler_rad"]])) <= TURN_DEG:
         return measurement, True
     return _possible_groups(measurement, values), False
 
@@ -160,7 +165,10 @@ _GROUPS: Final = {
 
 def _possible_groups(m: Measurement, values: Sequence[Any]) -> Measurement:
     """Return the measurement without groups with a value that is not possible."""
-    return msgspec.structs.replace(m, **{name: None for name, at in _GROUPS.items() if not is_possible(values[at])})
+    without = {name: None for name, at in _GROUPS.items() if not is_possible(values[at])}
+    if "euler_rad" not in without and possible_angles(m.euler_rad) is None:
+        without["euler_rad"] = None
+    return msgspec.structs.replace(m, **without)
 
 
 def _decode_hi92(data: bytes, at: int, _word_is_status: bool, size: int, trailing: int) -> tuple[Measurement, bool]:
@@ -168,14 +176,15 @@ def _decode_hi92(data: bytes, at: int, _word_is_status: bool, size: int, trailin
         _, _, temperature, pps_ms, pressure, gx, gy, gz, ax, ay, az, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
     ) = HI92.unpack_from(data, at)  # fmt: skip
     a, w, b, angle, q = ACCEL_M_S2_PER_LSB, GYRO_RAD_S_PER_LSB, MAG_T_PER_LSB, EULER_RAD_PER_LSB, QUAT_PER_LSB
+    euler = possible_angles((roll * angle, pitch * angle, yaw * angle))
     # no device time: `dev_ticks` is None; the manual reserves the status
     return Measurement(
         size, trailing, None, (ax * a, ay * a, az * a), (gx * w, gy * w, gz * w),
         (mx * b, my * b, mz * b) if mx or my or mz else None,
         possible_quaternion(qw * q, qx * q, qy * q, qz * q),
-        (roll * angle, pitch * angle, yaw * angle), temperature, pressure_of(pressure + PRESSURE_OFFSET_PA), None, None,
+        euler, temperature + 0.0, pressure_of(pressure + PRESSURE_OFFSET_PA), None, None,
         pps_ms if pps_ms <= PPS_STAMP_MODULUS_MS else None,
-    ), True  # fmt: skip
+    ), euler is not None  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -438,11 +447,14 @@ class HipnucCodec:
         count = len(payloads)
         end = at + count * size
         hi91s = b"".join(payloads)
-        if not _run_possible(hi91s):  # `_decode_payload` checks each value at three times the cost
+        made = (
+            decode_hi91_run(hi91s, self.word_is_status, size, len(data) - at - size) if _run_possible(hi91s) else None
+        )
+        if made is None:  # `_decode_payload` checks each value at three times the cost
             for begin in range(at, end, size):
                 self._decode_payload(data, begin, begin + size, events)
             return end
-        events += decode_hi91_run(hi91s, self.word_is_status, size, len(data) - at - size)
+        events += made
         ledger = self.ledger
         ledger.bytes_in_good_frames += end - at
         ledger.frames_good += count

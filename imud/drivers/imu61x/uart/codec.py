@@ -29,7 +29,9 @@ from imud.contracts.script import Message, ReplyFrame
 from imud.drivers.imu61x.common import CRC_INVERSION, CRC_START, M_S2_PER_G, RAD_S_PER_DEG_S, crc32
 from imud.drivers.value_limits import (
     TEMPERATURE_HIGH_BYTES,
+    TURN_DEG,
     VALUE_HIGH_BYTES,
+    possible_angles,
     possible_temperature_c,
     scaled,
     temperatures_possible,
@@ -349,7 +351,6 @@ _RUN_HIGH_BYTES: Final = slice(3, None, 4)
 _RUN_TEMPERATURES: Final = slice(10, None, 11)
 _RUN_TIMERS: Final = slice(0, None, 10)
 _HIGH_BYTES: Final = slice(7, AHRS.size - 4, 4)  # in a payload: high bytes of the floats without the temperature
-_TEMPERATURE: Final = slice(AHRS.size - 1, AHRS.size)  # in a payload: high byte of the temperature
 
 
 class Imu61xCodec:
@@ -374,13 +375,14 @@ class Imu61xCodec:
             and data.startswith(_HEAD)
             and not data[_ONLY_HIGH_BYTES].strip(VALUE_HIGH_BYTES)
             and data[_ONLY_TEMPERATURE] in TEMPERATURE_HIGH_BYTES
+            and (made := _measurements((_ONLY.unpack(data),), AHRS_FRAME_BYTES, 0))
         ):
             ledger = self.ledger
             ledger.bytes_in += AHRS_FRAME_BYTES
             ledger.bytes_in_good_frames += AHRS_FRAME_BYTES
             ledger.frames_good += 1
             ledger.frames_in_samples += 1
-            return _measurements((_ONLY.unpack(data),), AHRS_FRAME_BYTES, 0)
+            return made
         return self._decode(data)
 
     def flush(self) -> Sequence[CodecEvent]:
@@ -417,8 +419,9 @@ class Imu61xCodec:
         if not (values_possible(high_bytes) and temperatures_possible(temperatures)):
             possible: list[bytes] = list(takewhile(_is_possible, payloads))
             joined = b"".join(possible)
-        count = len(joined) // AHRS.size
-        events += _measurements(_RUN_VALUES.iter_unpack(joined), size, len(data) - size)
+        made = _measurements(_RUN_VALUES.iter_unpack(joined), size, len(data) - size)
+        events += made
+        count = len(made)
         ledger = self.ledger
         ledger.bytes_in_good_frames += count * size
         ledger.frames_good += count
@@ -457,8 +460,8 @@ class Imu61xCodec:
     def _measure(self, frame: Frame, events: list[CodecEvent]) -> None:
         values = AHRS.unpack_from(frame.payload)
         size, trailing = len(frame.raw), frame.trailing_bytes
-        if _is_possible(frame.payload):
-            events += _measurements((values,), size, trailing)
+        if _is_possible(frame.payload) and (made := _measurements((values,), size, trailing)):
+            events += made
             return
         self.ledger.frames_not_finite += 1
         events.append(BadFrame(BadReason.NOT_FINITE, frame.raw))
@@ -478,15 +481,20 @@ _REPLY_FRAMES: Final = (STATUS_FRAME, PARAMETER_FRAME)
 
 
 def _is_possible(payload: bytes) -> bool:
-    return values_possible(payload[_HIGH_BYTES]) and temperatures_possible(payload[_TEMPERATURE])
+    *_, temperature_c = AHRS.unpack_from(payload)
+    return values_possible(payload[_HIGH_BYTES]) and possible_temperature_c(temperature_c) is not None
 
 
 def _measurements(frames: Iterable[Sequence[Any]], size: int, trailing: int) -> list[Measurement]:
-    """Return the measurements of adjacent AHRS frames with possible values; `trailing` bytes follow the first frame."""
+    """Return the measurements of adjacent AHRS frames with possible values, up to an angle beyond a full turn;
+    `trailing` bytes follow the first frame."""
     made: list[Measurement] = []
     keep, make, g, rad, cosine, sine = made.append, Measurement, M_S2_PER_G, RAD_PER_DEG, cos, sin
+    turn = TURN_DEG
     # quat_from_euler_zyx inline: a call costs a twentieth of a frame
     for us, pitch_deg, roll_deg, yaw_deg, ax, ay, az, gx, gy, gz, temperature_c in frames:
+        if not (-turn <= roll_deg <= turn and -turn <= pitch_deg <= turn and -turn <= yaw_deg <= turn):
+            break
         roll, pitch, yaw = roll_deg * rad, pitch_deg * rad, yaw_deg * rad
         half_roll, half_pitch, half_yaw = roll * 0.5, pitch * 0.5, yaw * 0.5
         cr, sr, cp, sp = cosine(half_roll), sine(half_roll), cosine(half_pitch), sine(half_pitch)
@@ -507,7 +515,7 @@ def _measurements(frames: Iterable[Sequence[Any]], size: int, trailing: int) -> 
 def _partial_measurement(values: Sequence[Any], size: int, trailing: int) -> Measurement:
     """Return the measurement without groups with a value that is not possible."""
     us, pitch, roll, yaw = values[:4]
-    euler = scaled((roll, pitch, yaw), RAD_PER_DEG)
+    euler = possible_angles(scaled((roll, pitch, yaw), RAD_PER_DEG))
     return Measurement(
         size, trailing, us,
         accel_m_s2=scaled(values[4:7], M_S2_PER_G),
