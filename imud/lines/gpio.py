@@ -166,8 +166,8 @@ RISING: Final = 1  # `id` of an edge from inactive to active (GPIO_V2_LINE_EVENT
 SET_VALUES: Final = 0xC010B40F
 _SEQNO_MODULUS: Final = 2**32
 
-_ioctl = ctypes.PyDLL(None, use_errno=True).ioctl  # PyDLL keeps the GIL
-_ioctl.argtypes = (ctypes.c_int, ctypes.c_ulong, ctypes.c_void_p)
+ioctl = ctypes.PyDLL(None, use_errno=True).ioctl  # PyDLL keeps the GIL
+ioctl.argtypes = (ctypes.c_int, ctypes.c_ulong, ctypes.c_void_p)
 _LEVELS = {active: (ctypes.c_uint64 * 2)(active, 1) for active in (False, True)}
 
 
@@ -200,7 +200,7 @@ class LineEventDecoder:
 
 def set_line(fd: int, active: bool) -> None:
     """Set the level of the only line of the request `fd`. Raises OSError."""
-    if _ioctl(fd, SET_VALUES, _LEVELS[active]) < 0:
+    if ioctl(fd, SET_VALUES, _LEVELS[active]) < 0:
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))
 

@@ -302,9 +302,9 @@ def test_invalid_servers_raise_errors(tmp_path: Path, answer: bytes, error: type
 def test_a_daemon_without_conventions_raises_an_error(tmp_path: Path, method: str) -> None:
     """An older daemon ignores the parameter and sends the axes of the device."""
     path = tmp_path / "s"
-    with answering(path, HELLO + b'{"id":1,"result":{"devices":{},"samples":[]}}\n'), Client(path) as client:
-        with pytest.raises(ServerError, match="does not know the convention ned-frd"):
-            getattr(client, method)([], convention="ned-frd")
+    answer, error = HELLO + b'{"id":1,"result":{"devices":{},"samples":[]}}\n', "does not know the convention ned-frd"
+    with answering(path, answer), Client(path) as client, pytest.raises(ServerError, match=error):
+        getattr(client, method)([], convention="ned-frd")
 
 
 WATCHING = HELLO + b'{"id":1,"result":{"devices":{}}}\n'

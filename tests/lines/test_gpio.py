@@ -210,7 +210,7 @@ def test_an_output_whose_chip_vanishes_or_that_is_no_line(
         line.set(True)
     line.close()
     calls: list[tuple[int, int, list[int]]] = []
-    monkeypatch.setattr(gpio, "_ioctl", lambda *call: calls.append((*call[:2], [*call[2]])) or 0)  # type: ignore[func-returns-value]
+    monkeypatch.setattr(gpio, "ioctl", lambda *call: calls.append((*call[:2], [*call[2]])) or 0)  # type: ignore[func-returns-value]
     for active in (True, False):
         gpio.set_line(9, active)
     # _IOWR(0xB4, 0x0F, two u64): direction 3, size 16

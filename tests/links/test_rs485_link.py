@@ -322,18 +322,18 @@ def test_garbage_instead_of_a_reply_is_reported(pty: PtyPort) -> None:
 
 def test_request_to_all_expects_no_reply(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After it, imud waits for 100 ms ("MODBUS over Serial Line" 2.4.1) and the time of the request."""
-    sleep, pauses_ns = rs485.Rs485Line._sleep_until, list[int]()
+    sleep, pauses_s = time.sleep, list[float]()
 
-    def sleep_until(line: rs485.Rs485Line, deadline_ns: int) -> None:
-        pauses_ns.append(deadline_ns - time.monotonic_ns())
-        sleep(line, deadline_ns)
+    def noted_sleep(seconds: float) -> None:
+        pauses_s.append(seconds)
+        sleep(seconds)
 
-    monkeypatch.setattr(rs485.Rs485Line, "_sleep_until", sleep_until)
+    monkeypatch.setattr(time, "sleep", noted_sleep)
     with wired(tmp_path, slave(1), slave(2), echo=True) as (path, line), opened(path) as link:
         link.select(0)
         request = set_id_by_serial(serial_of(2).hex(), 33)
         assert link.transfer(request) == b""
-        assert max(pauses_ns) <= 100_000_000 + (len(request.sends[0]) + 3) * uart_byte_ns(BAUD)
+        assert max(pauses_s) <= 0.1 + (len(request.sends[0]) + 3) * uart_byte_ns(BAUD) / 1e9
         wait_until(lambda: line.slaves[1].settings.slave == 33, "the module has its address")
         link.select(33)
         assert link.transfer(SERIAL)[3:11] == serial_of(2)

@@ -138,7 +138,7 @@ async def test_an_unreachable_server_is_reported_and_retried() -> None:
 def test_a_server_that_does_not_answer_is_retried_after_5_s(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, paused_s = VirtualClock(), list[float]()
 
-    async def connect(_host: str, _port: int) -> None:
+    async def connect(*_address: object) -> None:
         await asyncio.sleep(60)
 
     async def sleep(_seconds: float) -> None:
@@ -150,7 +150,7 @@ def test_a_server_that_does_not_answer_is_retried_after_5_s(monkeypatch: pytest.
         await asyncio.sleep(20)
         source.close()
 
-    monkeypatch.setattr(receivers, "_connect", connect)
+    monkeypatch.setattr(asyncio, "open_connection", connect)
     begin_ns = clock.now_ns()
     source = receivers.GpsdSource(receivers.RmcOptions(source="gpsd"), clock.now_ns, receivers.Retry(sleep))
     run_virtually(clock, scene())
