@@ -337,8 +337,9 @@ class Imu61xSpiCodec:
     def _on_temperature(self, data: bytes) -> Sequence[PolledEvent]:
         words = answers(data)
         good = len(words) >= 2 and any(words[:2]) and words[:2] != (0xFFFF, 0xFFFF)
-        found = temperature_c(_signed(words[0] << 16 | words[1]))
-        self._temperature_c = possible_temperature_c(found) if good else None
+        self._temperature_c = (
+            possible_temperature_c(temperature_c(_signed(words[0] << 16 | words[1]))) if good else None
+        )
         self._frames.add_reply(data[PIPELINE_BYTES:], good=good)
         return ()
 
