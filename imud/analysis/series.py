@@ -103,7 +103,7 @@ def grid_of(t_ns: IntArray) -> Grid:
     if not located:
         pauses = steps_s > PAUSE_S
         # without the rounded distances of scattered time stamps, which make the period too short
-        period_s = float(np.mean(steps_s[~pauses]))
+        period_s = period_s if pauses.all() else float(np.mean(steps_s[~pauses]))
         steps = np.where(pauses, np.maximum(np.rint(steps_s / period_s), 1), 1).astype(np.int64)
     place = np.concatenate(([0], np.cumsum(steps))).astype(np.int64)
     period_s = _slope(place, t_s, steps)

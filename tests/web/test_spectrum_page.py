@@ -93,6 +93,7 @@ STAMPS: dict[str, Callable[[np.random.Generator], NDArray[np.float64]]] = {
     "in whole ms": lambda rng: np.round(100.0 + np.arange(400) / 300, 3),
     "that scatter": lambda rng: even(rng, 0.4),
     "that scatter, with a pause": lambda rng: even(rng, 0.4) + np.where(np.arange(400) < 200, 0.0, 1.7),
+    "that scatter, with pauses only": lambda rng: 4001 * even(rng, 0.4),
 }
 
 

@@ -57,6 +57,8 @@ export function gridOf(times, numbers) {
   if (!isLocated) {
     const jumps = differences(numbers);
     const usual = median(jumps); // 4 for a vector in every fourth sample
+    const short_s = steps_s.filter((step_s) => step_s <= PAUSE_S);
+    if (short_s.length) period_s = short_s.reduce((sum, step_s) => sum + step_s, 0) / short_s.length;
     steps = steps_s.map((step_s, index) => (step_s > PAUSE_S ? whole(step_s / period_s) : whole(jumps[index] / usual)));
   }
   return { rate_hz: 1 / slope(times, steps), steps, scatter_s, isLocated };
