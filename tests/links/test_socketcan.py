@@ -41,6 +41,7 @@ class Bus:
         self.link.gather_ns = gather_ms * 1_000_000
         self.batches: list[list[CanFrame]] = []
         self.ends: list[LinkError | None] = []
+        self.news: list[tuple[str, str]] = []
         self.delays_s: list[float] = []
         """Delays of the started timers, s."""
         self.looks = 0
@@ -83,7 +84,7 @@ class Bus:
             loop.set_exception_handler(lambda _loop, context: self._failures.append(context))
             loop.call_later = noted  # type: ignore[assignment]
             self.link.open()
-            self.link.start(self._on_frames, lambda news, problem: None, self.ends.append)
+            self.link.start(self._on_frames, lambda *news: self.news.append(news), self.ends.append)
             await story(self)
             self.link.close()
 
@@ -145,7 +146,15 @@ def test_frames_gather(ends: Ends) -> None:
     bus = Bus(ends, GATHER_MS)
     bus.run(story)
     assert [[frame.can_id for frame in batch] for batch in bus.batches] == [[1], [2, 3, 4]]
-    assert (bus.delays_s, bus.by_timer) == ([GATHER_MS / 1000] * 2, [False, True])
+    assert (bus.delays_s, bus.by_timer, bus.news) == ([GATHER_MS / 1000] * 2, [False, True], [])
+
+
+def test_a_controller_that_is_off_at_the_start_is_news(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(bus: Bus) -> None:
+        assert [news == problem and news.startswith("lo is bus-off: ") for news, problem in bus.news] == [True]
+
+    monkeypatch.setattr(netlink, "can_details", lambda name: netlink.CanDetails(None, 3))
+    Bus(ends, 0).run(story)
 
 
 def test_what_is_more_than_a_batch_is_read_at_once(ends: Ends) -> None:

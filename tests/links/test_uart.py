@@ -133,6 +133,8 @@ def test_what_is_sent_later_waits_behind_the_queue(pty: PtyPort) -> None:
             received += pty.received()
         link.write(b"last")
         assert await drained(pty, sent + 1004, received) == bytes(sent + 1000) + b"last"
+        numbers = [int(name) for name in os.listdir("/proc/self/fd")]
+        assert not any(asyncio.get_running_loop().remove_writer(number) for number in numbers)
 
     link = UartLink(UartOptions(port=pty.path))
     play(link, scene)
