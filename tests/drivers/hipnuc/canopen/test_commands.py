@@ -5,7 +5,7 @@ from typing import Literal
 import pytest
 
 from imud.contracts.command import Target
-from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request
+from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request, Silence
 from imud.contracts.setting import Written, words_of
 from imud.drivers.hipnuc.canopen import cia301
 from imud.drivers.hipnuc.canopen import commands as moves
@@ -27,7 +27,12 @@ def test_a_restart_a_slow_save_and_a_refused_write() -> None:
     for period_ms in (1, 4):
         with pytest.raises(BadArgument, match="expected 0 or 5 … 1000"):
             next(session.set_tpdo_period(8, 1, period_ms))
-    assert unpack(session.restart_request(8).payload) == (0x608, bytes.fromhex("23 00 20 00 FF 00 00 00"))
+    restart = 0x608, bytes.fromhex("23 00 20 00 FF 00 00 00")
+    assert unpack(session.restart_request(8).payload) == restart
+    script = session.restart(HipnucCanopenOptions(), 500_000)
+    next(script)
+    script.send(Reply((ReplyFrame(0x588, bytes.fromhex("43 A0 20 00 08 00 00 00")),)))
+    assert unpack(script.send(Silence(())).payload) == restart, "the bit rate is unreadable"
     bench = CanopenBench(variant=NodeVariant(flash_ms=1900))
     bench.run_script(session.save(8))
     assert bench.module.objects.writes_to_flash == 1
