@@ -190,6 +190,10 @@ def test_frames_name_their_node_and_its_options(name: str) -> None:
     assert node is not None
     assert str(node) in driver.node_title(node)
     filters = driver.filters(driver.node_settings(node))
+    for number in (node, node + 1):  # each identifier of an IMU61x is a setting: its frames can be from any device
+        sent = driver.sent_by(driver.node_settings(number))
+        found = {any(one.matches(frame.can_id, frame.extended) for one in sent) for frame in frames}
+        assert found == {number == node or name == "imu61x-can"}
     for frame in frames:
         assert any(wanted.matches(frame.can_id, frame.extended) for wanted in filters)
         assert driver.node_of(frame.can_id, not frame.extended, frame.data) is None

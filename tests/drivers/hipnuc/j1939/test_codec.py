@@ -150,6 +150,8 @@ def test_one_negative_count_is_a_value() -> None:
     assert measured(0xFF34, "ffffffffffff0000").accel_m_s2 == pytest.approx((-0.00478514,) * 3, abs=1e-8)
     assert measured(0xFF3D, "ffffffff00000000").euler_rad == pytest.approx((-1.74532925e-5, 0, math.nan), nan_ok=True)
     assert measured(0xFF43, "00000000e7030000").temperature_c == 0.0  # with the placeholder it is 0 °C
+    # counts of 0.01 °C up to 150 °C
+    assert [measured(0xFF43, f"{counts}000000000000").temperature_c for counts in ("983a", "993a")] == [150.0, None]
 
 
 SIGNALS = {

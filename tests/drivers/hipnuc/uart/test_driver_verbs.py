@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from imud.contracts.command import Calibration, Kept, Target, Verdict
+from imud.contracts.command import Calibration, Kept, RestMeans, Target, Verdict
 from imud.contracts.script import Outcome, Rejection, Reply, Request, RequestScript, Silence
 from imud.drivers.hipnuc.uart.driver import CALIBRATIONS, DRIVER
 from imud.model.errors import BadArgument, NoReply, Rejected
@@ -58,7 +58,7 @@ def texts(script: RequestScript[object]) -> list[str]:
         ("yaw", {"angle_deg": 1.5, "relative": True}, "CONFIG YAW 0 1.5"),
         ("mounting", {"turned": "y_down"}, "CONFIG IMU URFR 1,0,0,0,0,1,0,-1,0"),
         ("mounting", {"turned": "x_up"}, "CONFIG IMU URFR 0,0,-1,0,1,0,1,0,0"),
-        ("mounting", {"turned": [0, -1, 0, 1, 0, 0, 0, 0, 1]}, "CONFIG IMU URFR 0,-1,0,1,0,0,0,0,1"),
+        ("mounting", {"turned": [0, -1, 0, 1, 0, 0.0009, 0, 0, 1]}, "CONFIG IMU URFR 0,-1,0,1,0,0.0009,0,0,1"),
         ("magnetic_calibration", {"enabled": True}, "CONFIG IMU EN_MCAL 1"),
         ("pin", {"function": "sout_div", "pin": 9}, "CONFIG PMUX4 IO9"),
         ("alarm", {"axis": "Y", "min_deg": -5, "max_deg": 5}, "CONFIG PMUX5 Y,-5,5,0,1"),
@@ -91,7 +91,7 @@ HALF_TURN = "a number from -180 to 180"
         ("mode", {"axes": 7}, 'one of "6-axis", "9-axis"'),
         ("level", {"level": None}, '"automatic", "cancel", "relative"'),
         ("mounting", {"turned": [1.0] * 8}, "or a list of 9, each item a number"),
-        ("mounting", {"turned": [2, 0, 0, 0, 1, 0, 0, 0, 1]}, "expected a rotation"),
+        ("mounting", {"turned": [1, 0, 0.0011, 0, 1, 0, 0, 0, 1]}, "expected a rotation .* orthonormal within 0.001, "),
         ("magnetic_calibration", {"enabled": 2}, "true or false"),
         ("yaw", {"angle_deg": 180.1}, HALF_TURN),
         ("yaw", {"angle_deg": math.nan}, HALF_TURN),
@@ -111,6 +111,15 @@ HALF_TURN = "a number from -180 to 180"
 def test_bad_arguments_send_nothing(name: str, arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(BadArgument, match=message):
         sent(name, [], **arguments)
+
+
+@pytest.mark.parametrize(("relative", "expected"), [(False, [pytest.approx(math.pi / 6)]), (True, [])])
+def test_a_relative_heading_has_no_expected_value(relative: bool, expected: list[float]) -> None:
+    """The samples contain the heading 15°; the verb set 45°."""
+    verb = DRIVER.verbs["yaw"]
+    found = verb.expected(verb.arguments({"angle_deg": 45, "relative": relative}))
+    means = RestMeans(None, None, (0, 0, math.pi / 12))
+    assert [one.value(means) for one in found] == expected
 
 
 @pytest.mark.manual("B 2.2.1 REBOOT")
