@@ -229,3 +229,9 @@ def test_wrong_length_is_a_bad_frame() -> None:
     assert (measured.euler_rad, measured.quat_wxyz, measured.accel_m_s2) == (None, None, None)
     assert measured.gyro_rad_s is not None
     assert (codec.ledger.frames_not_finite, codec.ledger.frames_in_samples) == (2, 5)
+    for place in range(9):
+        values = [1.0] * place + [math.inf] + [1.0] * (8 - place)
+        data = struct.pack("<9fhH", *values, 2500, 1)
+        bad, measured = feed(make(), [(101 + slot, data[8 * slot : 8 * slot + 8]) for slot in range(5)])
+        assert isinstance(bad, BadFrame)
+        assert bad.raw == data[place // 2 * 8 :][:8]

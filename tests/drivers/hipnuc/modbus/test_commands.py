@@ -156,8 +156,10 @@ def test_devices_with_unexpected_replies() -> None:
     assert report.values == {"address": 7}
 
     bench = ModbusBench(module(7, variant=SlaveVariant(boot_ms=60_000)))
+    before_ns = bench.now_ns
     with pytest.raises(NoReply, match="does not reply at address 7 after its restart"):
         restarted(bench)
+    assert (bench.now_ns - before_ns) // 10**9 == 3
     written = [request[0] for _, request in bench.sent].index(6)
     assert len(bench.sent) - written == 1 + 30
 
