@@ -33,6 +33,11 @@ def pty() -> Iterator[PtyPort]:
     port.unplug()
 
 
+@pytest.fixture
+def link(pty: PtyPort) -> UartLink:
+    return UartLink(UartOptions(port=pty.path))
+
+
 class Receiver:
     def __init__(self) -> None:
         self.chunks: list[tuple[bytes, int]] = []
@@ -73,7 +78,7 @@ def play(link: UartLink, scene: Callable[[Receiver], Awaitable[None]]) -> Receiv
     return asyncio.run(whole())
 
 
-def test_bytes_pass_as_they_are(pty: PtyPort) -> None:
+def test_bytes_pass_as_they_are(pty: PtyPort, link: UartLink) -> None:
     everything = bytes(range(256))
 
     async def scene(receiver: Receiver) -> None:
@@ -85,7 +90,6 @@ def test_bytes_pass_as_they_are(pty: PtyPort) -> None:
     assert receiver.data == everything
     assert all(before_ns < t_rx_ns <= time.monotonic_ns() for _, t_rx_ns in receiver.chunks)
     assert receiver.ends == []
-    link = UartLink(UartOptions(port=pty.path))
     link.open()
     link.write(everything)
     assert pty.received() == everything
@@ -108,8 +112,7 @@ async def drained(pty: PtyPort, count: int, received: bytes = b"") -> bytes:
     return received
 
 
-def test_what_the_port_does_not_take_is_queued_in_order_and_bounded(pty: PtyPort) -> None:
-    link = UartLink(UartOptions(port=pty.path))
+def test_what_the_port_does_not_take_is_queued_in_order_and_bounded(pty: PtyPort, link: UartLink) -> None:
     blocks = [bytes([number % 251]) * 1000 for number in range(200)]
 
     async def scene(_receiver: Receiver) -> None:
@@ -124,7 +127,7 @@ def test_what_the_port_does_not_take_is_queued_in_order_and_bounded(pty: PtyPort
     play(link, scene)
 
 
-def test_what_is_sent_later_waits_behind_the_queue(pty: PtyPort) -> None:
+def test_what_is_sent_later_waits_behind_the_queue(pty: PtyPort, link: UartLink) -> None:
     async def scene(_receiver: Receiver) -> None:
         sent = pty.fill()
         link.write(bytes(1000))  # all bytes are queued
@@ -136,11 +139,10 @@ def test_what_is_sent_later_waits_behind_the_queue(pty: PtyPort) -> None:
         numbers = [int(name) for name in os.listdir("/proc/self/fd")]
         assert not any(asyncio.get_running_loop().remove_writer(number) for number in numbers)
 
-    link = UartLink(UartOptions(port=pty.path))
     play(link, scene)
 
 
-def test_the_queue_has_a_largest_size_and_ends_with_the_link(pty: PtyPort) -> None:
+def test_the_queue_has_a_largest_size_and_ends_with_the_link(pty: PtyPort, link: UartLink) -> None:
     async def scene(_receiver: Receiver) -> None:
         with pytest.raises(LinkError, match="0 bytes wait"):
             link.write(bytes(4096 + 1))
@@ -156,18 +158,16 @@ def test_the_queue_has_a_largest_size_and_ends_with_the_link(pty: PtyPort) -> No
         link.write(b"new")
         assert await drained(pty, 3) == b"new"
 
-    link = UartLink(UartOptions(port=pty.path))
     play(link, scene)
 
 
-def test_unplugging_ends_the_link_once(pty: PtyPort) -> None:
+def test_unplugging_ends_the_link_once(pty: PtyPort, link: UartLink) -> None:
     async def scene(receiver: Receiver) -> None:
         pty.unplug()
         await receiver.until(lambda: bool(receiver.ends))
         for _ in range(20):
             await asyncio.sleep(0)
 
-    link = UartLink(UartOptions(port=pty.path))
     receiver = play(link, scene)
     assert len(receiver.ends) == 1
     assert isinstance(receiver.ends[0], LinkMissing)
@@ -191,9 +191,8 @@ def test_a_spurious_wake_up_is_no_end(pty: PtyPort) -> None:
     assert (receiver.data, receiver.ends, failures) == (b"", [], [])
 
 
-def test_closing_releases_everything_and_may_be_repeated(pty: PtyPort) -> None:
+def test_closing_releases_everything_and_may_be_repeated(pty: PtyPort, link: UartLink) -> None:
     before = open_descriptors()
-    link = UartLink(UartOptions(port=pty.path))
     for _ in range(3):
         link.open()
         link.close()
@@ -205,8 +204,7 @@ def test_closing_releases_everything_and_may_be_repeated(pty: PtyPort) -> None:
         link.set_baud(9600)
 
 
-def test_closing_inside_the_receiver_is_allowed(pty: PtyPort) -> None:
-    link = UartLink(UartOptions(port=pty.path))
+def test_closing_inside_the_receiver_is_allowed(pty: PtyPort, link: UartLink) -> None:
 
     async def scene(receiver: Receiver) -> None:
         got = asyncio.Event()
@@ -278,7 +276,7 @@ def test_a_rate_that_the_driver_changes_is_refused(pty: PtyPort, monkeypatch: py
 
 
 @pytest.mark.manual("A 1.8 one program")
-def test_a_second_open_is_refused_and_names_the_holder(pty: PtyPort) -> None:
+def test_a_second_open_is_refused_and_names_the_holder(pty: PtyPort, link: UartLink) -> None:
     first, second = (UartLink(UartOptions(port=pty.path)) for _ in range(2))
     first.open()
     with pytest.raises(LinkBusy, match=rf"\(pid {os.getpid()}\)"):
@@ -287,7 +285,6 @@ def test_a_second_open_is_refused_and_names_the_holder(pty: PtyPort) -> None:
     second.open()
     second.close()
     os.chmod(pty.path, 0o666)
-    link = UartLink(UartOptions(port=pty.path))
     link.open()
     with unprivileged(), pytest.raises(OSError, match="busy"):
         os.open(pty.path, os.O_RDWR | os.O_NOCTTY)
@@ -297,13 +294,12 @@ def test_a_second_open_is_refused_and_names_the_holder(pty: PtyPort) -> None:
 @pytest.mark.parametrize("step", ["fcntl.ioctl", "_finish_raw", "_check_rate", "baud_of"])
 @pytest.mark.parametrize("kind", [OSError, termios.error])
 def test_a_step_after_open_that_fails_releases_the_port(
-    pty: PtyPort, monkeypatch: pytest.MonkeyPatch, step: str, kind: type[Exception]
+    pty: PtyPort, link: UartLink, monkeypatch: pytest.MonkeyPatch, step: str, kind: type[Exception]
 ) -> None:
     def refuse(*_arguments: object) -> None:
         raise kind(errno.EIO, "by the test")
 
     before = open_descriptors()
-    link = UartLink(UartOptions(port=pty.path))
     with monkeypatch.context() as patch:
         if step == "fcntl.ioctl":  # TIOCEXCL fails; the library needs the other calls
             real = fcntl.ioctl
@@ -320,9 +316,8 @@ def test_a_step_after_open_that_fails_releases_the_port(
     link.close()
 
 
-def test_ports_that_cannot_be_opened(pty: PtyPort, tmp_path: Path) -> None:
+def test_ports_that_cannot_be_opened(pty: PtyPort, link: UartLink, tmp_path: Path) -> None:
     os.chmod(pty.path, 0)
-    link = UartLink(UartOptions(port=pty.path))
     with (
         unprivileged(),
         pytest.raises(
@@ -368,9 +363,8 @@ async def test_a_port_that_is_unplugged_and_comes_back_is_noticed(tmp_path: Path
 
 
 @in_loop
-async def test_after_a_refusal_access_is_waited_for(pty: PtyPort) -> None:
+async def test_after_a_refusal_access_is_waited_for(pty: PtyPort, link: UartLink) -> None:
     os.chmod(pty.path, 0)
-    link = UartLink(UartOptions(port=pty.path))
     with unprivileged():
         with pytest.raises(LinkDenied):
             link.open()
@@ -388,7 +382,7 @@ async def test_after_a_refusal_access_is_waited_for(pty: PtyPort) -> None:
         link.close()
 
 
-def test_a_paused_port_keeps_what_comes_until_it_is_taken(pty: PtyPort) -> None:
+def test_a_paused_port_keeps_what_comes_until_it_is_taken(pty: PtyPort, link: UartLink) -> None:
     async def scene(receiver: Receiver) -> None:
         link.pause()
         pty.send(b"abc")
@@ -409,11 +403,10 @@ def test_a_paused_port_keeps_what_comes_until_it_is_taken(pty: PtyPort) -> None:
             taken += link.take()
         assert taken == sent
 
-    link = UartLink(UartOptions(port=pty.path))
     assert play(link, scene).ends == []
 
 
-def test_a_full_read_is_followed_by_another(pty: PtyPort, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_read_is_followed_by_another(pty: PtyPort, link: UartLink, monkeypatch: pytest.MonkeyPatch) -> None:
     async def scene(_receiver: Receiver) -> None:
         link.pause()
         pieces = iter([bytes(2048), b"last"])
@@ -421,12 +414,11 @@ def test_a_full_read_is_followed_by_another(pty: PtyPort, monkeypatch: pytest.Mo
             patch.setattr(os, "read", lambda _fd, _size: next(pieces))
             assert link.take() == bytes(2048) + b"last"
 
-    link = UartLink(UartOptions(port=pty.path))
     play(link, scene)
 
 
 @pytest.mark.parametrize("resumed", [False, True])
-def test_the_end_of_a_paused_port_is_reported_once(pty: PtyPort, resumed: bool) -> None:
+def test_the_end_of_a_paused_port_is_reported_once(pty: PtyPort, link: UartLink, resumed: bool) -> None:
     async def scene(receiver: Receiver) -> None:
         link.pause()
         pty.unplug()
@@ -438,7 +430,6 @@ def test_the_end_of_a_paused_port_is_reported_once(pty: PtyPort, resumed: bool) 
             link.resume()
         assert link.take() == b""
 
-    link = UartLink(UartOptions(port=pty.path))
     assert len(play(link, scene).ends) == 1
 
 
