@@ -88,6 +88,8 @@ EVERY = [
 
 
 def test_calibrations_filters_and_figures_by_the_longest_begin_of_a_name() -> None:
+    for name, limit_deg in (("hipnuc-modbus", 15), ("hipnuc-uart", 5)):  # sections 4.3.5 and 2.2.4
+        assert f"within {limit_deg}° of level" in DRIVERS[name].calibrations["accelerometer_level"].help
     assert {name for name, driver in DRIVERS.items() if driver.calibrations} == {
         "hipnuc-uart", "hipnuc-modbus", "hipnuc-canopen", "hipnuc-j1939", "imu61x-uart",
     }  # fmt: skip

@@ -28,6 +28,12 @@ def test_nearest_count_in_the_range(value: float, bits: int, counts: int) -> Non
     assert counts_of(value, bits) == counts
 
 
+def test_status_bits_with_an_event() -> None:
+    """A range, a disturbance, or a state before convergence. The other bits describe the present state."""
+    for name in ("hipnuc-uart", "hipnuc-modbus"):
+        assert [bit for bit, one in DRIVERS[name].status_bits.items() if one.notable] == [3, 4, 5, 6, 7]
+
+
 def test_nan_has_no_count() -> None:
     with pytest.raises(ValueError, match="NaN"):
         counts_of(nan, 16)

@@ -229,7 +229,8 @@ def test_all_that_can_be_read() -> None:
 
     def answer(request: Request) -> Outcome:
         data = sent(request)[1]
-        if sent(request)[0] != 0x0CEF0855:
+        if sent(request)[0] != 0x0CEF0855:  # J1939-21: PGN EA00 requests the address claim, PGN EE00
+            assert (*sent(request), request.timeout_ns) == (0x18EA0855, b"\0\xee" + bytes(6), 250_000_000)
             return Silence(())
         value = 8 if data[0] == 0x9C else 0x0102
         return Reply((ReplyFrame(0x0CEF5508, data[:4] + value.to_bytes(4, "little")),))
@@ -251,4 +252,5 @@ def test_identity(variant: str) -> None:
     claims = {"J1939 NAME": "80000000002A1708"} if J1939_VARIANTS[variant].claims_address else {}
     assert identity.details == {"address": "8", **claims}
     assert HOST_ADDRESS == 0x55
+    assert {data[0] for _, data in bench.sent} == {0x9C, 0, 0x78, *range(0x70, 0x78)}, "section 6.2.2"
     assert {name for name, _, _ in ROWS} == {*DRIVER.verbs, *DRIVER.renamed}
