@@ -193,6 +193,39 @@ def test_random_losses_are_not_a_slower_rate() -> None:
     assert learner.period_ticks == 1
 
 
+def learned(loss: float, *rates_hz: float) -> tuple[float, int, int, int, int]:
+    """Feed steps in ms of a device that changes its rate. Return (period in ms, changes of the step, lost samples, gaps of
+    unknown size, new rates)."""
+    noted, missed, new = list[int](), 0, 0
+    random, learner, time_ms, ticks = Random(5), PeriodLearner(lambda: noted.append(1)), 7.3, 7
+    for rate_hz in rates_hz:
+        for _ in range(3000):
+            time_ms += 1000 / rate_hz * (1 + (random.random() < loss) * random.randrange(1, 9))
+            ticks, before = int(time_ms), ticks
+            missed += learner.add_step(ticks - before)
+            if random.random() < 0.01:  # the device sends a sample again
+                learner.add_step(0)
+            new += learner.is_new
+            learner.is_new = False
+    return learner.period_ticks, learner.changes, missed, len(noted), new
+
+
+@pytest.mark.parametrize(
+    ("loss", "rates_hz", "figures"),
+    [
+        (0.02, (400.0, 363.0), (2.7551632245169886, 1432, 493, 0, 0)),
+        (0.02, (1000.0, 500.0, 1000.0), (0.9871116986120291, 78, 776, 0, 1)),
+        (0.0, (100.05, 100.0, 99.9), (9.999336518046709, 30, 0, 0, 0)),
+        (0.02, (640.0,), (1.562251655629139, 2554, 246, 0, 0)),
+        (0.4, (123.4,), (8.10462130937099, 366, 5604, 0, 0)),
+    ],
+)
+def test_the_figures_of_a_period_change_only_on_purpose(
+    loss: float, rates_hz: tuple[float, ...], figures: tuple[float, int, int, int, int]
+) -> None:
+    assert learned(loss, *rates_hz) == pytest.approx(figures, rel=1e-9)
+
+
 # --- corrections ------------------------------------------------------------------------------------------------------
 
 
