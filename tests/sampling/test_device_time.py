@@ -194,8 +194,10 @@ def test_random_losses_are_not_a_slower_rate() -> None:
 
 
 def learned(loss: float, *rates_hz: float) -> tuple[float, int, int, int, int]:
-    """Feed steps in ms of a device that changes its rate. Return (period in ms, changes of the step, lost samples, gaps of
-    unknown size, new rates)."""
+    """Feed steps in ms of a device that changes its rate.
+
+    Return (period in ms, changes of the step, lost samples, gaps of unknown size, new rates).
+    """
     noted, missed, new = list[int](), 0, 0
     random, learner, time_ms, ticks = Random(5), PeriodLearner(lambda: noted.append(1)), 7.3, 7
     for rate_hz in rates_hz:

@@ -20,7 +20,7 @@ from imud.model.errors import NoReply, Rejected
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.sim.can_module import CanModules, SentFrame
-from imud.sim.hipnuc.j1939 import SIMULATOR, HipnucJ1939Module, J1939Hardware, J1939Settings, J1939Variant
+from imud.sim.hipnuc.j1939 import SIMULATOR, HipnucJ1939Module, J1939Hardware, J1939Settings, J1939Variant, _within_pi
 from imud.sim.physics import Still
 from imud.sim.sensor import SimulatorOptions
 from tests.support.simulated_modules import run_script
@@ -229,6 +229,7 @@ def test_zero_and_directions_of_the_inclinometer() -> None:
     assert shown() == (0.0, 0.0)
     bench.talk(lambda peer: commands.zero(peer, commands.Zero.CANCEL))
     assert shown() == (-10.0, -20.28)
+    assert [math.degrees(_within_pi(math.radians(angle))) for angle in (350, -190)] == pytest.approx([-10, 170])
 
 
 def test_the_time_of_day_starts_again_after_a_day() -> None:

@@ -70,6 +70,13 @@ def test_time_of_bytes_pieces_and_echo() -> None:
     assert is_whole(reply.data)
 
 
+def test_a_request_after_a_silence_is_another_request() -> None:
+    line = ModbusMaster(here(1)).line
+    for later_ns in (0, NS_PER_S):
+        line.receive(framed(1, READ_BLOCK), BEGIN_NS + later_ns)
+    assert [is_whole(burst.data) for burst in line.advance(BEGIN_NS + 2 * NS_PER_S)] == [True, True]
+
+
 def test_values_are_the_truth_of_that_instant() -> None:
     for firmware, resolution in ((152, 2**-15), (169, 1e-4)):
         rig = ModbusMaster(here(1, firmware=firmware, inclinometer="dual"))
@@ -108,7 +115,8 @@ def test_who_answers_and_which_replies_are_whole() -> None:
 
     rig = ModbusMaster(here(1, bad_crc=1, mute=1))
     assert rig.ask(1, READ_BLOCK) == b""
-    assert not is_whole(rig.ask(1, READ_BLOCK))
+    damaged = rig.ask(1, READ_BLOCK)
+    assert (len(damaged), is_whole(damaged)) == (57, False)
     assert is_whole(rig.ask(1, READ_BLOCK))
 
     rig = ModbusMaster(here(1), slave(2, baud=9600))
