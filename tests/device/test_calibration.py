@@ -416,6 +416,11 @@ async def test_a_module_that_moves_is_not_levelled(it: WiredDevice) -> None:
         await it.device.calibrate("level", save=True)
     assert it.module.settings.level == before
     assert not it.device.stop_calibration()
+    running = asyncio.ensure_future(it.device.calibrate("level", save=True))
+    await it.wait(1)
+    it.link.disappear()
+    with pytest.raises(CommandError, match="link ended during the calibration"):
+        await running
 
 
 @pytest.mark.parametrize(
