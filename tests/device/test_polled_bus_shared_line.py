@@ -238,6 +238,9 @@ async def test_unknown_address_and_fixed_rate(bench: LineBench) -> None:
         assert (status.link, status.expected_rate_hz) == (f"{bench.path}, address 4", 20)
         steps = [after.t_ns - before.t_ns for before, after in pairwise(rig.samples)]
         assert steps == pytest.approx([50 * NS_PER_MS] * len(steps), abs=NS_PER_MS)
+        await act(rig.device, "address", {"address": 9})
+        assert rig.device.status().link == f"{bench.path}, address 9"
+        assert "in the configuration" not in told(rig)
 
 
 @pytest.mark.parametrize("variant", ["manual", "address after restart", "confirms from the new address"])
