@@ -7,10 +7,14 @@ import pytest
 from imud.config.model import DeviceConfig
 from imud.contracts.lines import DeviceLines, Edge, PpsOptions, UtcReference
 from imud.device import utc as utc_module
+from imud.device.attachments import Attachments
+from imud.device.health import DeviceEvents
 from imud.device.utc import UtcFeed, make_utc_feed
 from imud.formats.nmea0183 import build
 from imud.host.clock import HostClock
+from imud.lines.gpio import GPIO_LINES
 from imud.links.memory import MemoryOptions
+from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.clock import SampleClock
 from imud.utc.pps import ChronyFeed
@@ -261,6 +265,10 @@ def test_the_feed_follows_the_configuration(
     assert bool(real.status().source) == (rmc is not None)
     real.close()
     monkeypatch.setattr(utc_module, "RMC_SOURCES", {"gpsd": lambda _settings, _context: source})
+    host = HostClock(lambda: BEGIN_NS, lambda: BEGIN_NS, lambda: BEGIN_NS)
+    device = Attachments(configured(rmc, None), GPIO_LINES, port, DeviceEvents("bow", Ledger(), print), host)
+    status = device.utc_status()
+    assert (status and status.source) == ("test" if rmc else None)
     keeper = make()
     assert keeper is not None
     keeper.tick(BEGIN_NS, None)
