@@ -474,8 +474,12 @@ class BusInProcess:
         play_rigs(self.rigs, told, self.clock)
 
 
-async def made_so(bus: BusInProcess, wanted: Mapping[str, object], *, verified: bool) -> None:
-    """Apply and save settings, and check the result of each setting."""
+async def made_so(bus: BusInProcess, wanted: Mapping[str, object], saves: Callable[[], int], *, verified: bool) -> None:
+    """Apply and save settings with a number that is in use, then with number 9. Check the result of each setting."""
+    number = "node" if "node" in wanted else "address"
+    taken = await bus.done(bus.rig.device.settings_apply({number: 12}, save=True))
+    assert f"{number} 12 is in use" in taken.problem
+    assert saves() == 0
     applied = await bus.done(bus.rig.device.settings_apply(wanted, save=True))
     assert applied.problem == "", applied
     assert {step.name for step in applied.steps} == set(wanted)
@@ -484,6 +488,7 @@ async def made_so(bus: BusInProcess, wanted: Mapping[str, object], *, verified: 
     count = len(bus.rig.samples)
     await bus.until(lambda: len(bus.rig.samples) > count + 20, "samples afterwards")
     assert any("9 in the configuration" in event.message for event in bus.rig.events)
+    assert saves() == 1
 
 
 @pytest.mark.parametrize("variant", NODE_VARIANTS)
@@ -493,18 +498,10 @@ def test_declared_settings_are_applied_to_a_canopen_node(variant: str) -> None:
     other = NodeSettings(node=12)
     beside = HipnucCanopenModule(clock.now_ns(), HipnucCanopenHardware(factory=other, boot_ms=0))
     bus = BusInProcess(clock, "hipnuc-canopen", HipnucCanopenOptions(), module, beside)
-
-    async def story() -> None:
-        taken = await bus.done(bus.rig.device.settings_apply({"node": 12}, save=True))
-        assert "node 12 is in use" in taken.problem
-        assert module.objects.writes_to_flash == 0
-        wanted = {"tpdo2_interval_ms": 100, "incli_x_reversed": True, "node": 9}
-        await made_so(bus, wanted, verified=kind.reads == "answered")
-
-    bus.play(story)
+    wanted = {"tpdo2_interval_ms": 100, "incli_x_reversed": True, "node": 9}
+    bus.play(lambda: made_so(bus, wanted, lambda: module.objects.writes_to_flash, verified=kind.reads == "answered"))
     saved = module.objects.saved
     assert (saved.periods_ms[2], saved.invert_x, saved.node, module.node) == (100, 1, 9, 9)
-    assert module.objects.writes_to_flash == 1
     assert beside.objects.settings == other
 
 
@@ -514,17 +511,9 @@ def test_declared_settings_are_applied_to_a_j1939_module(variant: str) -> None:
     module = HipnucJ1939Module(clock.now_ns(), J1939Settings(), J1939Hardware(boot_ms=200, variant=kind))
     beside = HipnucJ1939Module(clock.now_ns(), J1939Settings(address=12), J1939Hardware(boot_ms=0))
     bus = BusInProcess(clock, "hipnuc-j1939", HipnucJ1939Options(), module, beside)
-
-    async def story() -> None:
-        taken = await bus.done(bus.rig.device.settings_apply({"address": 12}, save=True))
-        assert "address 12 is in use" in taken.problem
-        assert module.writes_to_flash == 0
-        wanted = {"ff37_interval_ms": 50, "y_reversed": True, "address": 9}
-        await made_so(bus, wanted, verified=kind.reads != "ignored")
-
-    bus.play(story)
+    wanted = {"ff37_interval_ms": 50, "y_reversed": True, "address": 9}
+    bus.play(lambda: made_so(bus, wanted, lambda: module.writes_to_flash, verified=kind.reads != "ignored"))
     assert (module.flash.intervals_ms[0xFF37], module.flash.y_reversed, module.flash.address) == (50, 1, 9)
-    assert module.writes_to_flash == 1
     assert beside.settings == J1939Settings(address=12)
 
 
