@@ -106,6 +106,9 @@ def test_claimed_devices_are_not_found() -> None:
     assert heard.found() == "fake-can node 9"
     claimed.add(BASE + 9)  # another search has found it in the meantime
     assert "only frames of other configured devices" in heard.complaint()
+    heard = Round(claimed=lambda can_id, _: can_id == 0x7AA)
+    heard.hear(*(CanFrame(can_id, False, bytes(8), 0) for can_id in (0x7AA, 0x7AB)))
+    assert "unknown types arrive on can0 (0x7AB);" in heard.complaint()
 
 
 def test_the_remembered_device_is_found_immediately_if_it_is_free() -> None:
