@@ -4,17 +4,19 @@ from random import Random
 
 import pytest
 
+from imud.contracts.driver import CanDriver, of_kind
 from imud.device.can_search import CanFound, CanSearch, CanStep, CanSurvey
 from imud.device.search import GaveUp, Listen
+from imud.drivers import DRIVERS as TABLE
 from imud.drivers.imu61x.can import DRIVER as IMU61X
 from imud.drivers.imu61x.can import encode_set
 from imud.formats.can import CanFrame
-from imud.model.units import NS_PER_S
+from imud.model.units import NS_PER_MS, NS_PER_S
 from tests.support.fake_drivers import BASE, fake_can_driver, fake_can_frame
 
 DEVICES_MAX = 128
 IDENTIFIERS_MAX = 4096
-LISTEN_NS = 1500 * 10**6
+LISTEN_NS = 1500 * NS_PER_MS
 
 FAKE = fake_can_driver()
 DRIVERS = (FAKE, IMU61X)
@@ -121,6 +123,17 @@ def test_the_remembered_device_is_found_immediately_if_it_is_free() -> None:
     heard = Round(remembered=("fake-can", 9), claimed=lambda can_id, _: can_id == BASE + 9)
     heard.hear(*(fake_can_frame(9, n) for n in range(5)))
     assert heard.early is None
+
+
+@pytest.mark.parametrize("driver", of_kind(TABLE.values(), CanDriver), ids=lambda driver: driver.name)
+def test_two_samples_are_enough(driver: CanDriver) -> None:
+    """The frames of the second sample end with the round."""
+    search = CanSearch([driver], "can0")
+    search.start(0)
+    for number in range(2):
+        frames = enumerate(driver.example_frames(Random(number)))
+        search.on_frames([f._replace(t_rx_ns=(10 * number + place) * NS_PER_MS) for place, f in frames])
+    assert isinstance(search.on_time(LISTEN_NS), CanFound)
 
 
 def test_frames_before_the_naming_frame_do_not_prevent_the_search() -> None:
