@@ -125,18 +125,6 @@ def test_impossible_options_are_refused(name: str) -> None:
             CAN_SIMULATORS[name].make(SimulatorOptions(**options), 0)
 
 
-@pytest.mark.parametrize("driver", CAN_SIMULATORS)
-def test_a_device_sends_at_the_time_of_its_next_frame(driver: str) -> None:
-    module = CAN_SIMULATORS[driver].make(SimulatorOptions(rate_hz=100.0), 0)
-    now_ns = 0
-    for _ in range(60):
-        due_ns = module.next_ns()
-        assert due_ns is not None
-        assert due_ns >= now_ns
-        now_ns = due_ns
-        assert module.advance(now_ns)
-
-
 BEGIN_NS: Final = 5_000_000_000
 SECONDS: Final = 5
 TOLERANCES: Final[Mapping[str, Mapping[str, float]]] = {

@@ -270,15 +270,6 @@ def test_power_off_cuts_the_frame_on_the_wire() -> None:
     cut = b"".join(burst.data for burst in module.advance(now_ns))
     assert 0 < len(cut) < 54
     assert cut == bytes.fromhex("AA5502002C00")[: len(cut)] or cut.startswith(bytes.fromhex("AA5502002C00"))
-    module = Imu61xModule(BEGIN_NS, hardware=IMU61X_STILL)
-    now_ns = BEGIN_NS
-    for _ in range(20):
-        next_ns = module.next_ns()
-        assert next_ns is not None
-        assert module.advance(next_ns - 1) == []
-        assert len(module.advance(next_ns)) == 1
-        assert next_ns > now_ns
-        now_ns = next_ns
 
 
 def test_the_row_makes_it_from_common_options() -> None:
