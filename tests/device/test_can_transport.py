@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import count
 from random import Random
 from typing import Any
@@ -384,8 +385,10 @@ def filters(*can_ids: int) -> list[CanFilter]:
 
 def test_frames_of_others_on_the_same_bus_are_claimed() -> None:
     buses = CanBuses()
-    buses.join("front", "can0", filters(0x181), ())
-    buses.join("rear", "can1", filters(0x182), ())
+    for name, bus, can_id, load in (("front", "can0", 0x181, 100.0), ("rear", "can1", 0x182, 20.0)):
+        buses.join(name, bus, filters(can_id), (), partial(float, load))
+    buses.join("top", "can0", (), (), partial(float, 3.0))
+    assert [buses.bits_per_s(name, "can0") for name in ("front", "rear", "top")] == [3, 103, 100]
     claimed = buses.claimed("mast", "can0")
     assert claimed(0x181, False)
     assert not claimed(0x181, True)
