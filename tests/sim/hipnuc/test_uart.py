@@ -310,6 +310,15 @@ def test_urfr_turns_vectors_and_attitude_after_save_and_reboot(mounting: command
     assert after.accel_g == pytest.approx(up, abs=1e-5)  # the attitude rotates with the axes: the force still points up
 
 
+def test_coordinates_4_have_x_forward_and_nwu() -> None:
+    plain, nwu = (HipnucUartBench(ModuleSettings(coord=coord), HIPNUC_STILL).frames(20.0)[-1] for coord in (0, 4))
+    right, forward, up = plain.accel_g
+    assert nwu.accel_g == pytest.approx((forward, -right, up), abs=1e-6)
+    w, x, y, z = nwu.quat_wxyz
+    assert matrix_from_quat((w, x, y, z))[2] == pytest.approx(nwu.accel_g, abs=1e-5)
+    assert nwu.euler_deg[2] == pytest.approx(plain.euler_deg[2], abs=0.2)  # both count from north
+
+
 @pytest.mark.manual("B 2.2.4 ATT RST 2", "B 2.2.4 ATT RST 5", "B 2.2.4 ATT RST 3", "B 2.2.4 YAW 1", "B 2.2.4 YAW 0")
 def test_levels_and_yaw() -> None:
     bench = HipnucUartBench(hardware=HIPNUC_STILL)

@@ -79,7 +79,7 @@ def test_rates_pins_unlogall_and_reports() -> None:
         "CONFIG IMU URFR 1,0,0,1,0,0,0,0,1", "CONFIG IMU EN_MCAL 2", "CONFIG PMUX1 IO0", "CONFIG PMUX4 DIV0",
         "CONFIG PMUX4 DIV65", "CONFIG PMUX5 X,5,-5,0,1", "CONFIG PMUX5 X,-5,5,1,1", "CONFIG PMUX5 X,-5,5,0,2",
         "CONFIG PMUX5 X,-5,inf,0,1", "LOG HI91 ONTIME 2", "LOG HI91 ONTIME -0.01", "LOG HI91 ONTIME 0.0005",
-        "LOG HI91 ONMARK 2",
+        "LOG HI91 ONMARK 2", "CONFIG PMUX3 IO10",
     ],
 )  # fmt: skip
 def test_bad_values_are_refused(line: str) -> None:

@@ -6,8 +6,12 @@ import pytest
 
 from imud.drivers.imu61x import spi
 from imud.drivers.imu61x.spi import READ_STATE, State
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
+from imud.model.units import STANDARD_GRAVITY_M_S2
 from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.imu61x.uart import RegisterBehaviour
+from imud.sim.physics import swing
 
 MS = 1_000_000
 
@@ -49,6 +53,21 @@ def test_answer_comes_with_the_second_word_after_it_even_in_another_transaction(
     clock.now = 90 * MS
     one.i2c([b"\x12", 32])
     assert one.latched_ns == 20 * MS
+
+
+@pytest.mark.parametrize("burst", spi.POLLS)
+def test_values_are_the_truth_of_the_update(burst: str) -> None:
+    one, clock = device()
+    spoken(one, 0xFE01, 0x8D00 | (burst == "extended"), 0xFE00)
+    clock.now, transactions = 1_234 * MS, one.transactions
+    codec = spi.DRIVER.make_codec(Ledger(), spi.DRIVER.settings(burst=burst))
+    (found,) = codec.decode(0, b"".join(one.spi(spi.POLLS[burst][0].transfer.sends, 3)))
+    assert isinstance(found, Measurement)
+    truth = swing(STANDARD_GRAVITY_M_S2).at(1.234)
+    assert found.accel_m_s2 == pytest.approx(truth.accel_m_s2, abs=4e-5)
+    assert found.gyro_rad_s == pytest.approx(truth.gyro_rad_s, abs=1e-6)
+    assert found.temperature_c is None or found.temperature_c == pytest.approx(truth.temperature_c, abs=2e-3)
+    assert one.transactions == transactions + 1
 
 
 @pytest.mark.manual("A 2.4 WIN_CTRL", "A 2.4.1 reading", "A 2.1 mode")
