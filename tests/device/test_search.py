@@ -56,6 +56,10 @@ class Bus:
         config = DeviceConfig(name, driver, options, True, "memory", settings)
         return OnBus(self, self.rigs.add(config, MemoryCanLink(settings)))
 
+    def claimed(self, node: int) -> bool:
+        """Return whether a device receives the frames of a node."""
+        return self.rigs.factory._can_buses.claimed("other", "can0")(BASE + node, False)
+
     async def start(self) -> None:
         """Start the devices. A second call does nothing."""
         if not self._started:
@@ -207,8 +211,10 @@ async def test_the_search_continues_after_the_bus_was_down(bus: Bus) -> None:
     path = bench.device._transport.path
     bench.link.disappear()
     await bench.until(lambda: bench.rig.is_in(DeviceState.MISSING))
+    assert not bus.claimed(8), "another search can find this device"
     bench.link.appear()
     await bench.until(lambda: bench.rig.is_in(DeviceState.RUNNING), 8)
+    assert bus.claimed(8)
     assert bench.device._transport.path is path  # the same device
 
 
@@ -229,12 +235,14 @@ def syncing(bus: Bus, name: str, node: int, *, writable: bool = True) -> OnBus:
 
 @played(Bus)
 async def test_cyclic_frames_are_sent_while_the_link_is_open(bus: Bus) -> None:
+    """A configured device keeps its identifiers."""
     bench = syncing(bus, "mast", 8)
     await bench.until(lambda: bench.link.cyclic)
     assert list(bench.link.cyclic) == [CyclicFrame(SYNC_ID, False, b"", 10_000_000)]
     bench.link.disappear()
     await bench.until(lambda: bench.device.state is DeviceState.MISSING)
     assert not bench.link.cyclic
+    assert bus.claimed(8)
     bench.link.appear()
     await bench.until(lambda: bench.link.cyclic)
 
