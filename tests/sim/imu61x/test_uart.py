@@ -267,6 +267,7 @@ def test_power_off_cuts_the_frame_on_the_wire() -> None:
     now_ns = BEGIN_NS + 512_000_000
     assert module.advance(now_ns) == []
     module.reboot(now_ns)
+    assert module.next_ns() == now_ns
     cut = b"".join(burst.data for burst in module.advance(now_ns))
     assert 0 < len(cut) < 54
     assert cut == bytes.fromhex("AA5502002C00")[: len(cut)] or cut.startswith(bytes.fromhex("AA5502002C00"))
