@@ -5,14 +5,7 @@ from typing import Any
 
 import msgspec
 
-from imud.bridges.channel import (
-    Diagnosis,
-    DiagnosisLevel,
-    LiveDiagnosis,
-    LossCounts,
-    RecordedDiagnosis,
-    StampedEvent,
-)
+from imud.bridges.channel import Diagnosis, DiagnosisLevel, LiveDiagnosis, LossCounts, RecordedDiagnosis, StampedEvent
 from imud.contracts.condition import Condition, DeviceCondition, Reason, ReasonCode
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
 from imud.model.event import Event, EventKind

@@ -16,7 +16,7 @@ from imud.client.connection import Client, EventStream, default_path, event_of, 
 from imud.contracts.publisher import Batch
 from imud.formats.jsonrpc import RpcError
 from imud.formats.recording import is_recording
-from imud.model.errors import LinkDenied, LinkMissing, ServerError
+from imud.model.errors import LinkDenied, LinkError, LinkMissing, ServerError
 from imud.model.event import Event, EventKind
 from imud.publishers.socket.server import SocketServer
 from tests.support.socket_rig import DEVICES, EPOCH, NOW_NS, Daemon, batch, daemon, sample
@@ -233,6 +233,14 @@ def test_no_daemon_there_and_no_permission(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(LinkMissing, match="is imud running"):
         Client(path)
 
+    path.unlink()
+    with socket.socket(socket.AF_UNIX) as busy, socket.socket(socket.AF_UNIX) as waiting:
+        busy.bind(str(path))
+        busy.listen(0)
+        waiting.connect(str(path))
+        with pytest.raises(LinkError, match=r"cannot connect to .*: Resource temporarily unavailable"):
+            Client(path, timeout_s=0.01)
+
     def deny(_sock: socket.socket, _path: str) -> None:
         raise PermissionError(13, "Permission denied")
 
@@ -363,7 +371,7 @@ def test_a_late_reply_to_watch_leaves_a_usable_connection(tmp_path: Path) -> Non
         client.timeout_s = 0.0
         with pytest.raises(TimeoutError, match="no watch within"):
             client.watch()
-        client.timeout_s = 60.0
+        client.timeout_s = 3600.0  # the last request has a limit of its own
         status = b'{"id":2,"result":{"now_ns":5}}'
         late = b'{"id":1,"result":{"devices":{"a":0}}}\n'
         peer.sendall(late + len(status).to_bytes(4, "little") + status)

@@ -11,15 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imud.formats import nmea0183
-from imud.formats.nmea0183 import (
-    Rmc,
-    RmcFault,
-    Transducer,
-    as_gprmc,
-    build,
-    checksum,
-    parse,
-)
+from imud.formats.nmea0183 import Rmc, RmcFault, Transducer, as_gprmc, build, checksum, parse
 from imud.model.units import NS_PER_S
 
 ANGLES = st.floats(-4 * math.pi, 4 * math.pi)

@@ -256,13 +256,15 @@ def test_events_and_unknown_devices_are_ignored(board: Board) -> None:
     assert not board.path.exists()
     board.publish([1])  # a batch that arrives late
     board.tick()
+    assert not board.path.exists()
     board.publisher.remove_device(DEVICE)
 
 
 def test_temporary_files_of_a_dead_daemon_are_removed(tmp_path: Path) -> None:
-    (tmp_path / f".imud.{DEVICE}.new").write_bytes(b"half")
+    for name in (f".imud.{DEVICE}.new", ".imud.x", "x.new"):
+        (tmp_path / name).write_bytes(b"half")
     board = Board(tmp_path)
-    assert [file.name for file in tmp_path.iterdir()] == [f"imud.{DEVICE}"]
+    assert {file.name for file in tmp_path.iterdir()} == {f"imud.{DEVICE}", ".imud.x", "x.new"}
     board.publisher.close()
 
 

@@ -17,20 +17,8 @@ from imud.publishers.recorder import publisher as module
 from imud.publishers.recorder.directory import FlightOptions, RecorderOptions, RecordingDirectory
 from imud.publishers.recorder.publisher import PUBLISHER, Recorder
 from imud.publishers.recorder.writer import RecordQueue
-from tests.publishers.recorder.recording_bench import RecordingBench, kinds_in
+from tests.publishers.recorder.recording_bench import RecordingBench, records_in
 from tests.support.socket_rig import batch
-
-
-def test_files_are_written(tmp_path: Path) -> None:
-    bench = RecordingBench()
-    made = PUBLISHER.make(RecorderOptions(enabled=True, directory=str(tmp_path / "a")), bench.context)
-    made.start()
-    made.add_device("bow", 0)
-    made.tick(bench.advance(0.1))
-    made.event(Event(1, "bow", EventKind.UP, "up"))
-    made.close()
-    (file,) = (tmp_path / "a").glob("*.imudrec")
-    assert {Kind.SESSION, Kind.DEVICE, Kind.EVENT, Kind.END} <= set(kinds_in(file))
 
 
 def test_both_write_to_one_directory_and_one_alone_does_not_start_the_other(tmp_path: Path) -> None:
@@ -42,16 +30,22 @@ def test_both_write_to_one_directory_and_one_alone_does_not_start_the_other(tmp_
         made.start()
         outputs = bench.context.outputs
         assert (len(outputs.recorders), len(outputs.flights)) == (enabled, 1)
-        made.add_device("imu0", 0)
+        made.add_device("bow", 7)
         made.tick(bench.advance(0.1))
+        made.event(Event(1, "bow", EventKind.UP, "up"))
+        made.remove_device("bow")
+        made.tick(bench.advance(0.1))  # the device exists again, with another description
         assert made.publish is not None
-        made.publish(batch("imu0"))
-        made.remove_device("imu0")
+        made.publish(batch("bow"))
         made.close()
         made.close()
     ends = [
         sorted(file.name.split("-", 2)[2] for file in (tmp_path / str(one)).glob("*.imudrec")) for one in (True, False)
     ]
+    for file in tmp_path.rglob("*.imudrec"):
+        kinds = [(record.kind, record.device) for record in records_in(file)]
+        assert [device for kind, device in kinds if kind == Kind.EVENT] == [7]
+        assert kinds.count((Kind.DEVICE, 0)) == 2
     assert ends == [["000000-snapshot.imudrec", "000000.imudrec"], ["000000-snapshot.imudrec"]]
 
 

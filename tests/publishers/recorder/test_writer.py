@@ -65,6 +65,10 @@ def test_a_full_block_wakes_the_thread() -> None:
     for number in range(RING_BYTES // size + 1):
         bench.queue.put(record(number, 1000))
     assert bench.workers[0].rung == 1
+    queue = RecordQueue[Path]()
+    for _ in range(17):
+        queue.put(bytes(1 << 20))
+    assert (queue.dropped, queue.waiting_bytes) == (1, 16 << 20)
 
 
 def test_records_without_room_are_dropped_and_counted(tmp_path: Path) -> None:
