@@ -57,11 +57,8 @@ async def test_devices_status_and_schema(server: SocketServer) -> None:
 async def test_json_samples_have_the_names_of_the_design_and_only_the_selected_members(server: SocketServer) -> None:
     peer = await socket_rig.Peer.greeted(server)
     assert await peer.result("watch") == {
-        "encoding": "json",
-        "devices": socket_rig.DEVICES,
-        "rate_hz": 0.0,
-        "latency_ms": 0.0,
-    }
+        "encoding": "json", "devices": socket_rig.DEVICES, "rate_hz": 0.0, "latency_ms": 0.0,
+    }  # fmt: skip
     server.publish(socket_rig.batch("imu0", 7, 2))
     server.publish(socket_rig.batch("imu1", 1))
     first, second, other = await peer.messages(3)
