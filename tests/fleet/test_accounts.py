@@ -95,6 +95,14 @@ def test_old_boots_leave_the_ledger_of_the_gateway_with_the_most_streams(monkeyp
     assert own == list(range(1000 - len(own), 1000)), "the newest boots stay"
     assert 35 <= len(own) <= 40
     assert len(changed) == 1020
+    again = FleetLedger()
+    for key in keys:
+        account = ledger.stored(key)
+        assert account is not None
+        again.restore(key, account)
+    for boot in range(2000, 2100):
+        again.take(message(1, 1, boot=f"{boot:x}"), Stream.SAMPLES)
+    assert len(again.counts) <= 60, "restored streams leave the ledger too"
     assert {key for key in changed if ledger.stored(key) is not None} == set(keys)
     assert ledger.take(good[0], Stream.SAMPLES) is None, "the ledger still recognizes duplicates"
 

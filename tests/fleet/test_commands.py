@@ -40,6 +40,7 @@ class FakeDevice:
         self.done: list[tuple[object, ...]] = []
         self.applied = AppliedSettings()
         self.go_on: asyncio.Event | None = None
+        self.result: object = {"serial": 7}
 
     async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
         if name == "turn" and "angle" not in arguments:
@@ -49,7 +50,7 @@ class FakeDevice:
         self.done.append((name, arguments))
         if self.go_on is not None:
             await self.go_on.wait()
-        return {"serial": 7}
+        return self.result
 
     async def settings_apply(self, given: Mapping[str, Any], *, save: bool) -> AppliedSettings:
         self.done.append(("set", given, save))
@@ -249,6 +250,14 @@ def test_the_number_of_stored_replies_is_limited() -> None:
     assert bench.ask(0) is Outcome.DUPLICATE
     assert bench.ask(1) is Outcome.DONE
     assert len(bench.device.done) == ANSWERS_KEPT + 1
+    overhead_bytes = len(bench.replies[0].payload) - len(b'{"serial":7}') + len(b'""')
+    for size, outcome in ((65_536, Outcome.DONE), (65_537, Outcome.DUPLICATE)):
+        bench = ChannelBench()
+        bench.device.result = "x" * (size - overhead_bytes)
+        bench.ask(0)
+        bench.run()
+        assert len(bench.replies[0].payload) == size
+        assert bench.ask(0) is outcome
 
 
 def test_requests_above_the_rate_or_the_queue_are_rejected_as_busy() -> None:
@@ -342,6 +351,7 @@ async def test_one_request_runs_at_a_time_and_close_stops_it() -> None:
     assert len(bench.device.done) == 1
     bench.channel.close()
     bench.channel.close()
+    bench.device.go_on.set()
     for _ in range(5):
         await asyncio.sleep(0)
     bench.channel.run_next()

@@ -85,15 +85,19 @@ def test_values_that_json_cannot_represent_are_omitted() -> None:
     assert finite(made(5)) == made(5)
 
 
-def bomb() -> bytes:
-    head = msgspec.json.encode(message(MessageKind.SLOTS))
-    return struct.pack("<4sBBH", MAGIC, 1, 0, len(head)) + head + zstandard.compress(bytes(256 * (SLOTS_MAX + 1)))
+def forged(slots: bytes, version: int = 1, padding: int = 0) -> bytes:
+    head = msgspec.json.encode(message(MessageKind.SLOTS)) + b" " * padding
+    return struct.pack("<4sBBH", MAGIC, version, 0, len(head)) + head + zstandard.compress(slots)
+
+
+SLOT = encode_slots([made(5)], 0)[0]
 
 
 @pytest.mark.parametrize(
     "payload",
     [
-        b"", b"{}", b"IMUB", b"null", bomb(), b'{"deep":' + b"[" * 100_000,
+        b"", b"{}", b"IMUB", b"null", forged(bytes(256 * (SLOTS_MAX + 1))), forged(SLOT, version=2),
+        forged(SLOT, padding=4096), b'{"deep":' + b"[" * 100_000,
         encode_message(message(MessageKind.SAMPLES)).replace(b'"v":1', b'"v":2'),
         encode_message(message(MessageKind.SAMPLES, 8, 7)),
         encode_message(message(MessageKind.SAMPLES)).replace(b'"begin":1', b'"begin":0'),
