@@ -14,14 +14,13 @@ from imud.client.connection import Client
 from imud.contracts.command import CalibrationInfo, CalibrationResult, Handling, Kept, LastCalibration
 from imud.model.errors import BadArgument
 from imud.model.event import Event, EventKind
-from imud.model.units import RAD_PER_DEG
+from imud.model.units import RAD_PER_DEG, T_PER_UT
 
 HEAD: Final = ("CALIBRATION", "HANDLING", "RESULT LASTS", "LAST", "EFFECT")
 LIMIT_S: Final = 600.0  # Time limit of the request, s. The daemon stops every calibration earlier.
 LOOK_S: Final = 0.5  # Maximum wait for the next event, s. After that, imud checks for the reply.
 BAR: Final = 30  # length of the progress bar, characters
 CLEAR_LINE: Final = "\r\x1b[2K"
-T_PER_UT: Final = 1e-6
 
 
 def calibrate_arguments(parser: argparse.ArgumentParser) -> None:

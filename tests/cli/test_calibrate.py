@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Event as ThreadingEvent
+from unittest.mock import Mock
 
 import pytest
 
@@ -119,11 +120,15 @@ def test_exit_statuses_and_an_interrupt(verified: bool, status: int, cli: Cli, m
         pass
 
     Made.verified = verified
-    monkeypatch.setattr("imud.cli.calibrate.Client", lambda *_arguments, **_options: Made())
+    client = Mock(side_effect=lambda *_arguments, **_options: Made())
+    monkeypatch.setattr("imud.cli.calibrate.Client", client)
     words = ("calibrate", "bow", "level", "--yes", "--save")
     ENDED.clear()
     assert ("NOT verified: it moved" in cli(*words, status=status).out) is not verified
     assert not Made.stopped
+    assert [call.kwargs for call in client.call_args_list] == [{}, {"timeout_s": 600.0}], (
+        "the daemon stops each calibration earlier"
+    )
     Made.interrupts = True
     ENDED.clear()
     cli(*words, status=130)

@@ -57,6 +57,7 @@ class FileSettings(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 class OutSettings(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     path: str = "/run/x"
     ids: tuple[int, ...] = ()
+    names: tuple[str, ...] = ()
 
 
 class DriverSettings(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -207,6 +208,7 @@ def test_defaults() -> None:
         ("", "1:1: expected keys and values, got an empty file"),
         ("divices: {}\ndevices: {}", '1:1: divices: expected a key that imud knows, got "divices"; did you mean devices? known: devices, log_level, none, out, state_dir'),
         ("out: {ids: [1, x]}\ndevices: {}", "1:12: out.ids: expected a list, each item a whole number, got a list with \"x\" at [1]"),
+        ('out: {names: [a, "b\\0"]}\ndevices: {}', '1:14: out.names: expected text without control characters, got "b\\u0000"'),
         ("logg: 1\nb: c: d\n", "2:5: expected YAML: mapping values are not allowed in this context"),
         ("out: 5\ndevices: {}", "1:6: out: expected keys and values, got 5"),
     ],
@@ -471,7 +473,7 @@ def test_what_a_device_or_a_bus_cannot_do_is_refused(devices: list[str], message
         (["{driver: imu61x-uart, uart: {port: x, baud: 1500000}}"], "imu61x-uart"),
         (["{driver: imu61x-i2c, i2c: {address: 0x1B}}"], "imu61x-i2c"),
         (["{driver: imu61x-i2c, i2c: {rate_hz: 1200}}", "{driver: imu61x-i2c, i2c: {bus: 2, rate_hz: 1200}}"], "imu61x-i2c"),
-        (["{driver: imu61x-spi, spi: {port: /dev/spidev0.0, rate_hz: 3900}}",
+        (["{driver: imu61x-spi, spi: {port: /dev/spidev0.0, rate_hz: 3906.25}}",
           "{driver: imu61x-spi, spi: {port: /dev/spidev1.0, rate_hz: 3900}}"], "imu61x-spi"),
         (["{socketcan: {interface: can0}}"], "auto"),  # imud searches for a device that sends
         (["{driver: imu61x-can, socketcan: {interface: can0}}"], "imu61x-can"),
