@@ -121,6 +121,7 @@ class Machine:
         self.gids: frozenset[int] = frozenset({1000})
         self.boot_utc_ns = 0
         self.on_pause: Callable[[], None] = lambda: None
+        self.paused_s = 0.0
 
     def write(self, path: str, text: str = "") -> Path:
         file = self.root / path.lstrip("/")
@@ -166,7 +167,8 @@ class Machine:
             raise self.status
         return DaemonReply(self.status, self.c_kernel)
 
-    def pause(self, _seconds: float) -> None:
+    def pause(self, seconds: float) -> None:
+        self.paused_s += seconds
         self.on_pause()
 
     def surroundings(self) -> Surroundings:

@@ -124,6 +124,7 @@ def unusable(**refuse: int) -> str:
         (refused("0000000000000000"), "→ if all bytes are 00"),
         (f"{refused('ffffffffffffffff')}; {refused('00004d4936553431')}", "→ word size"),
         (unusable(request=WR_BITS_PER_WORD), "→ the controller refuses words of 16 and 8 bits"),
+        (unusable(request=WR_BITS_PER_WORD).replace("Invalid argument", "Permission denied"), "→ if all bytes are 00"),
         (unusable(request=WR_MODE, least=3), "→ the controller does not support this mode"),
     ],
 )
@@ -175,6 +176,9 @@ def controller(state: str = "ERROR-ACTIVE", tx: int = 0, rx: int = 0, **more: ob
 
 def test_an_interface_that_is_absent_down_up_or_virtual(mast: Machine) -> None:
     assert mast.told(UP)[0][1].startswith("can0 does not exist; CAN interfaces of this host: none →")
+    mast.write("/sys/class/net/can1/type", "280\n")
+    mast.write("/sys/class/net/can1/flags", "0x40080\n")
+    assert mast.told(UP)[0][1].startswith("can0 does not exist; CAN interfaces of this host: can1 →")
     up(mast, "0x40080")
     mast.prints(COMMAND, json.dumps(RECORDED["down"]))
     mast.tells(UP, "error", "can0 is down", "up type can bitrate")
@@ -210,6 +214,7 @@ def test_errors_on_a_bus_that_carried_frames_before(mast: Machine) -> None:
     """The kernel also counts frames from before a change of the bit rate, or from before the device was unplugged."""
     interface(mast, packets=100, data=controller("ERROR-PASSIVE", 128, 0))
     mast.tells(STATE, "error", "100 frames received, no frame arrives now → no other node acknowledges")
+    assert mast.paused_s == 2.0
     mast.status = [device("mast", state=DeviceState.RUNNING)]  # a device that sends only after a request
     assert mast.find(STATE)[0].severity == "warning"
 
