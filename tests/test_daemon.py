@@ -196,35 +196,25 @@ class EndingOutput:
             raise RuntimeError(name)
 
 
+@pytest.mark.parametrize("is_ticking", [True, False])
 @in_loop
-async def test_whatever_an_output_raises_at_the_end_all_others_are_closed(caplog: pytest.LogCaptureFixture) -> None:
+async def test_whatever_a_part_raises_at_the_end_all_others_are_closed(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, is_ticking: bool
+) -> None:
     outputs = {"a": EndingOutput("tick", "close"), "b": EndingOutput("close"), "c": EndingOutput()}
-    daemon = Daemon(Config("info", "", {}, ()), extra=cast("dict[str, Publisher]", outputs))
+    extra = cast("dict[str, Publisher]", outputs if is_ticking else {})
+    daemon = Daemon(Config("info", "", {}, ()), extra=extra)
     running = asyncio.create_task(daemon.run())
     await asyncio.sleep(0)
+    for name in () if is_ticking else ("bow", "stern"):
+        monkeypatch.setitem(daemon._devices, name, Mock(close=Mock(side_effect=RuntimeError(name))))
     for output in outputs.values():
         output.ends = True
     daemon.stop()
-    with pytest.raises(RuntimeError, match="tick"):  # the first exception is the reason
+    with pytest.raises(RuntimeError, match="tick" if is_ticking else "bow"):  # the first exception is the reason
         await running
-    for output in outputs.values():
-        assert output.did[-2:] == ["tick", "close"]
-    assert "b: the end failed" in caplog.text
-
-
-@in_loop
-async def test_the_first_part_that_fails_to_close_is_the_reason(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    daemon = Daemon(Config("info", "", {}, ()))
-    running = asyncio.create_task(daemon.run())
-    await asyncio.sleep(0)
-    for name in ("bow", "stern"):
-        monkeypatch.setitem(daemon._devices, name, Mock(close=Mock(side_effect=RuntimeError(name))))
-    daemon.stop()
-    with pytest.raises(RuntimeError, match="bow"):
-        await running
-    assert "stern: the end failed" in caplog.text
+    assert f"{'b' if is_ticking else 'stern'}: the end failed" in caplog.text
+    assert not is_ticking or [output.did[-2:] for output in outputs.values()] == [["tick", "close"]] * 3
 
 
 def reload(daemon: RunningDaemon, devices: dict[str, Any], **more: Any) -> None:

@@ -114,23 +114,15 @@ def test_children_that_end_too_early_are_named(
 def test_devices_that_cannot_be_shown(cli: Cli) -> None:
     for words, said in [
         (["--device", "imu61x-i2c"], "cannot simulate imu61x-i2c; name the bus of a real device, for example --bus 1"),
-        (
-            ["--device", "imu61x-spi", "--bus", "1"],
-            "cannot simulate imu61x-spi; name the bus of a real device, for example --port /dev/spidev0.0",
-        ),
-        (
-            ["--device", "imu61x-i2c", "--device", "imu61x-uart"],
-            "expected imu61x-i2c as the only device, got 2 devices",
-        ),
-        (
-            ["--device", "hipnuc-uart", "--device", "imu61x-can"],
-            "several devices: expected CAN devices only; simulate one device of another kind at a time",
-        ),
-        (
-            ["--device", "imu61x-can", "--device", "imu61x-can"],
-            "expected different devices, for example --device imu61x-can:101 --device imu61x-can:201",
-        ),
-    ]:
+        (["--device", "imu61x-spi", "--bus", "1"],
+         "cannot simulate imu61x-spi; name the bus of a real device, for example --port /dev/spidev0.0"),
+        (["--device", "imu61x-i2c", "--device", "imu61x-uart"],
+         "expected imu61x-i2c as the only device, got 2 devices"),
+        (["--device", "hipnuc-uart", "--device", "imu61x-can"],
+         "several devices: expected CAN devices only; simulate one device of another kind at a time"),
+        (["--device", "imu61x-can", "--device", "imu61x-can"],
+         "expected different devices, for example --device imu61x-can:101 --device imu61x-can:201"),
+    ]:  # fmt: skip
         assert cli("demo", *words, status=2).err == f"imud demo: {said}\n"
 
 

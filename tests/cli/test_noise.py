@@ -33,12 +33,10 @@ def noise_of_three(n: float = 1e-3) -> FloatArray:
 
 def test_cells_and_durations() -> None:
     for figure, words in [
-        (None, "-"),
-        (Coefficient(0.00123456, 0.0, 0.0), "1.23"),
-        (Coefficient(0.00123456, 0.0000412, 0.0), "1.23 ±0.04"),
-        (Coefficient(None, 0.0, 0.005), "< 5"),
+        (None, "-"), (Coefficient(0.00123456, 0.0, 0.0), "1.23"),
+        (Coefficient(0.00123456, 0.0000412, 0.0), "1.23 ±0.04"), (Coefficient(None, 0.0, 0.005), "< 5"),
         (Coefficient(3.26e3, 3e2, 0.0), "3.26e6 ±3e5"),
-    ]:
+    ]:  # fmt: skip
         assert noise.cell(figure, MILLI) == words
     for seconds, words in [(12.34, "12.3 s"), (150.0, "2 min 30 s"), (7260.0, "2 h 1 min")]:
         assert noise.duration_words(seconds) == words

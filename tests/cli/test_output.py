@@ -53,13 +53,9 @@ def test_a_table_aligns_numbers_and_cannot_write_to_the_terminal() -> None:
         "node     -               -",
     ]  # fmt: skip
     for value, width, text in [
-        (12.34, 5, "12.34"),
-        (12345.6, 5, "12346"),
-        (123456.0, 5, "1.2e5"),
-        (1234567.0, 4, "1e6"),
-        (-1e300, 3, "###"),
+        (12.34, 5, "12.34"), (12345.6, 5, "12346"), (123456.0, 5, "1.2e5"), (1234567.0, 4, "1e6"), (-1e300, 3, "###"),
         (-12.34, 5, "-12.3"),
-    ]:
+    ]:  # fmt: skip
         assert fitted(value, width, lambda number: f"{number:.2f}") == text
 
 

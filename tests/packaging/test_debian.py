@@ -174,13 +174,11 @@ def test_the_unit_of_a_release_reloads_as_its_systemd_can() -> None:
     assert len(lines) == len(text.splitlines()) - 1, "all but ExecReload="
     assert set(text.splitlines()) - set(lines) == {"Type=notify", "ExecReload=/bin/kill -HUP $MAINPID"}
     for release, text in [
-        ("trixie", "[Service]\nType = notify\nExecReload=/bin/kill\n"),
-        ("trixie", "[Service]\nType=notify \n"),
-        ("trixie", "[Service]\nType=simple\n"),
-        ("trixie", "[Service]\nType=notify\nExecReload=\nType=notify\n"),
+        ("trixie", "[Service]\nType = notify\nExecReload=/bin/kill\n"), ("trixie", "[Service]\nType=notify \n"),
+        ("trixie", "[Service]\nType=simple\n"), ("trixie", "[Service]\nType=notify\nExecReload=\nType=notify\n"),
         ("bookworm", "[Service]\nType=notify\n"),
         ("bookworm", "[Service]\nType=notify-reload\nExecReload=/bin/kill\n"),
-    ]:
+    ]:  # fmt: skip
         done = unit_for(release, text)
         assert (done.returncode, done.stdout) == (1, "")
         assert "expected one Type=" in done.stderr

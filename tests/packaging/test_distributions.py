@@ -87,11 +87,8 @@ def test_the_wheel_has_every_file_of_the_package_as_it_is_and_no_other(distribut
     assert (KERNEL in content) is (is_on and shutil.which(os.environ.get("CC", "cc")) is not None)
     assert all(data == (ROOT / path).read_bytes() for path, data in content.items())
     for pattern in (
-        "imud/py.typed",
-        "imud/include/imud.h",
-        "imud/web/static/*.html",
-        "imud/web/static/uplot/*LICENSE*",
-    ):
+        "imud/py.typed", "imud/include/imud.h", "imud/web/static/*.html", "imud/web/static/uplot/*LICENSE*",
+    ):  # fmt: skip
         assert any(fnmatch(path, pattern) for path in content), pattern
 
 

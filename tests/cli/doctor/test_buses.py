@@ -261,12 +261,10 @@ def test_documents_set_restart_ms_while_the_interface_is_down(file: str) -> None
 
 def test_bit_rates(mast: Machine) -> None:
     for bitrate, packets, state, severity in [
-        (500_000, 0, DeviceState.SEARCHING, "error"),
-        (500_000, 9, DeviceState.SEARCHING, "error"),
-        (500_000, 9, DeviceState.SILENT, "error"),
-        (500_000, 0, DeviceState.RUNNING, "ok"),
+        (500_000, 0, DeviceState.SEARCHING, "error"), (500_000, 9, DeviceState.SEARCHING, "error"),
+        (500_000, 9, DeviceState.SILENT, "error"), (500_000, 0, DeviceState.RUNNING, "ok"),
         (100_000, 9, DeviceState.RUNNING, "warning"),
-    ]:
+    ]:  # fmt: skip
         interface(mast, packets=packets, data=controller(bittiming={"bitrate": bitrate}))
         mast.status = [device("mast", state=state)]
         ((got, text),) = mast.told(RATE)
