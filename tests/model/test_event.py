@@ -1,5 +1,7 @@
 """Stored events: groups, order, limits."""
 
+import msgspec
+
 from imud.model.event import Event, EventKind, EventLog
 
 S = 1_000_000_000
@@ -20,6 +22,7 @@ def test_repeated_events_are_one_group_while_they_continue() -> None:
         log.add(event(t_s, message=f"{t_s} samples lost"))
     assert seen(log) == [(0, 61, 3), (122, 122, 1)]
     assert [one.message for one in log.newest(0, 10)] == ["61 samples lost", "122 samples lost"]
+    assert [b'"count"' in msgspec.json.encode(one) for one in log.newest(0, 10)] == [True, False]
     log.add(event(123, EventKind.ALARM, "active"))
     log.add(event(124, EventKind.ALARM, "inactive"))
     log.add(event(125, EventKind.ALARM, "active"))
