@@ -98,10 +98,9 @@ def device_block(device: PlayedDevice, without: Collection[str] = ()) -> list[st
     if path is not None and path.clock.expected_rate_hz:
         clock += f", {path.clock.expected_rate_hz:.1f} Hz by the device's clock"
     closes = not bytes_open(counts) and not frames_open(counts)
-    unknown = getattr(getattr(path, "codec", None), "unknown", {})
     words = ""
-    if device.driver is not None and unknown and not counts["samples"]:
-        words = device.driver.unknown_words(unknown, device.described.name, counted=True)
+    if device.driver is not None and path is not None and path.unknown and not counts["samples"]:
+        words = device.driver.unknown_words(path.unknown, device.described.name, counted=True)
     rows = [
         ("link", f"{device.described.where}, driver {device.driver.name if device.driver else 'unknown'}"),
         *([("problem", words)] if words else []),

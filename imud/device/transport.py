@@ -253,9 +253,10 @@ class Transport(SettingsPort):
 
     def unknown_words(self) -> str:
         """Describe the received frames of unknown types; empty without such frames."""
-        driver = self.driver
-        unknown = getattr(getattr(self.path, "codec", None), "unknown", {})
-        return driver.unknown_words(unknown, self._config.name) if driver is not None and unknown else ""
+        driver, path = self.driver, self.path
+        if driver is None or path is None or not path.unknown:
+            return ""
+        return driver.unknown_words(path.unknown, self._config.name)
 
 
 class ReceivingTransport(Transport, RequestPort):

@@ -230,15 +230,14 @@ class CommandChannel:
                 return
             REQUESTED_BY.set("mqtt")
             result = await control.act(request.action, request.arguments)
+            log.info("mqtt: %s: request %s is done: %s", asked.device, request.id, shown(result))
+            self._end(asked, Outcome.DONE, result=result)
         except ImudError as error:
             log.warning("mqtt: %s: request %s failed: %s", asked.device, request.id, error, extra=_own_log_line(asked))
             self._end(asked, Outcome.FAILED, error=str(error))
         except Exception:
             log.exception("mqtt: %s: request %s failed because of an internal error", asked.device, request.id)
             self._end(asked, Outcome.FAILED, error="internal error; see the traceback in the log of imud")
-        else:
-            log.info("mqtt: %s: request %s is done: %s", asked.device, request.id, shown(result))
-            self._end(asked, Outcome.DONE, result=result)
 
     async def _set(self, asked: _Request, control: DeviceControl) -> None:
         """Set settings and send the reply. Raises ImudError if imud did not begin."""

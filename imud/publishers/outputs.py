@@ -6,7 +6,6 @@ again after a pause, which doubles with each failure.
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from typing import Final, NamedTuple
 
 from imud.contracts.publisher import Batch, Publisher, PublisherContext
@@ -29,6 +28,7 @@ class _Failure(NamedTuple):
 
     due_ns: int  # CLOCK_MONOTONIC of the next start
     pause_ns: int
+    words: str  # reason for the log, the status and the event
 
 
 class Outputs:
@@ -73,10 +73,11 @@ class Outputs:
         try:
             self._start(name)
         except Exception as error:
-            log.error("%s keeps its old options: %s", name, error, exc_info=_unexpected(error))
+            problem = f"{name} keeps its old options: {_words(error)}"
+            log.error("%s", problem, exc_info=_unexpected(error))
             self._options[name] = old
             self._start_or_fail(name)
-            return f"{name} keeps its old options: {error}"
+            return problem
         return ""
 
     def close(self) -> BaseException | None:
@@ -165,10 +166,10 @@ class Outputs:
         if before is not None and now_ns - before.due_ns > FORGOTTEN_NS:
             before = None
         pause_ns = RETRY_FIRST_NS if before is None else min(2 * before.pause_ns, RETRY_MOST_NS)
-        self._failures[name] = _Failure(now_ns + pause_ns, pause_ns)
-        words = str(error) if isinstance(error, ServerError) else f"internal error {type(error).__name__}: {error}"
+        words = _words(error)
+        self._failures[name] = _Failure(now_ns + pause_ns, pause_ns, words)
         self._context.outputs.failed[name] = words
-        if name in self._running or before is None:
+        if name in self._running or before is None or words != before.words:
             log.error(
                 "%s: %s; imud continues without this output and tries again",
                 name, words, exc_info=_unexpected(error),
@@ -210,18 +211,20 @@ class Outputs:
                 publisher.add_device(device, device_id)
             publisher.start()
         except Exception:
-            with suppress(Exception):  # the first exception is the reason
-                publisher.close()
+            self._close(name, publisher)  # the first exception is the reason
             raise
         self._running[name] = publisher
         self._note_running()
 
     def _end(self, name: str) -> BaseException | None:
-        """Close an output. Return the exception that it raised."""
+        """End a running output. Return the exception that it raised."""
         publisher = self._running.pop(name, None)
         self._note_running()
-        if publisher is None:
-            return None
+        return self._close(name, publisher) if publisher is not None else None
+
+    @staticmethod
+    def _close(name: str, publisher: Publisher) -> BaseException | None:
+        """Close an output. Log and return the exception that it raised."""
         try:
             publisher.close()
         except Exception as error:
@@ -233,6 +236,11 @@ class Outputs:
         found = [(name, publisher.publish) for name, publisher in self._running.items()]
         self._with_samples = tuple((name, publish) for name, publish in found if publish is not None)
         self._ticked = tuple(self._running.items())
+
+
+def _words(error: BaseException) -> str:
+    """Return the reason of a failure for users."""
+    return str(error) if isinstance(error, ServerError) else f"internal error {type(error).__name__}: {error}"
 
 
 def _unexpected(error: BaseException) -> BaseException | None:

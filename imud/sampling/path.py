@@ -6,7 +6,7 @@ call of the clock and one record. Counters are plain integers. Synchronization: 
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import hypot, sqrt
 from typing import ClassVar, Final, NamedTuple, Protocol
@@ -92,6 +92,11 @@ class SamplePath(ABC):
         self._now_ns = context.host.now_ns
         self._utc_offset_ns = context.host.utc_offset_ns
         self._frame_ns = 0  # shortest time of a CAN frame on the wire
+
+    @property
+    def unknown(self) -> Mapping[int, int]:
+        """Number of valid frames of each unknown type. Empty for a polled device, which sends only requested frames."""
+        return {}
 
     def set_frame(self, frame: PublishedAxes) -> None:
         """Publish the following samples in other axes."""
@@ -297,6 +302,10 @@ class StreamPath(SamplePath):
         # Not two lists: an object with more than 30 attributes is slower.
         self.gathered: list[Sample | bytes] = []
 
+    @property
+    def unknown(self) -> Mapping[int, int]:
+        return self.codec.unknown
+
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
         """Process the bytes of one read. `t_rx_ns` is CLOCK_MONOTONIC right after the read."""
         self.last_data_ns = t_rx_ns
@@ -400,6 +409,10 @@ class CanPath(SamplePath):
         super().__init__(clock, context)
         self.codec = codec
         self._idle_ns = 0  # arrival of the newest frame at the previous `flush`, ns
+
+    @property
+    def unknown(self) -> Mapping[int, int]:
+        return self.codec.unknown
 
     def set_frame_time(self, frame_ns: int) -> None:
         """Set the shortest time of a frame on the wire, ns; 0 if the bit rate is unknown."""

@@ -47,6 +47,8 @@ class FakeDevice:
             raise BadArgument("angle: expected a number, got nothing")
         if name == "break":
             raise ZeroDivisionError
+        if name == "confuse":
+            return object()  # a result without JSON
         self.done.append((name, arguments))
         if self.go_on is not None:
             await self.go_on.wait()
@@ -308,15 +310,16 @@ def test_retained_requests_and_foreign_reply_topics_are_ignored() -> None:
 
 
 def test_errors_and_internal_errors_have_a_reply() -> None:
-    bench = ChannelBench(actions=["identity", "turn", "break"])
+    bench = ChannelBench(actions=["identity", "turn", "break", "confuse"])
     bench.ask(1, "turn")
     bench.ask(2, "identity", device="mast")
     bench.ask(3, "break")
-    bench.run(rounds=5)
+    bench.ask(4, "confuse")
+    bench.run(rounds=6)
     assert [(one.outcome, one.error) for one in bench.answers()] == [
         (Outcome.FAILED, "angle: expected a number, got nothing"),
         (Outcome.FAILED, "mast: no such device"),
-        (Outcome.FAILED, "internal error; see the traceback in the log of imud"),
+        *[(Outcome.FAILED, "internal error; see the traceback in the log of imud")] * 2,
     ]
 
 

@@ -189,7 +189,13 @@ def test_an_optional_output_that_cannot_start_is_tried_again(
     assert list(rig.context.outputs.problems()) == ["two"]
     assert str(error) in rig.context.outputs.problems()["two"]
     assert ("Traceback" in caplog.text) == isinstance(error, OSError)
+    caplog.clear()
+    rig.failing |= {("two", "start"): KeyError("mode"), ("two", "close"): KeyError("thread")}
     rig.run(1)
+    new = ["two: internal error KeyError: 'mode'; imud continues without this output and tries again"]
+    assert caplog.messages == ["two: the end failed", *new], (
+        "another reason, and an error of the clean-up, are reported"
+    )
     rig.failing.clear()
     rig.run(2)
     assert rig.done("start", "close") == [("two", "start"), ("two", "close"), ("two", "start")]
@@ -214,9 +220,9 @@ def test_a_required_output_that_cannot_start_stops_imud_only_at_the_start(rig: R
 
 def test_changed_options_that_fail_keep_the_old_options(rig: Rig) -> None:
     rig.start()
-    rig.failing[("must", "start")] = OSError("no such directory")
+    rig.failing[("must", "start")] = KeyError("mode")
     problem = rig.outputs.change_to("must", Switch())
-    assert problem == "must keeps its old options: no such directory"
+    assert problem == "must keeps its old options: internal error KeyError: 'mode'"
     assert rig.outputs.options == rig.options
     rig.failing.clear()
     rig.run(1)
