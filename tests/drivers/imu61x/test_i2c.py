@@ -28,6 +28,7 @@ def codec(**settings: int) -> Imu61xI2cCodec:
 @pytest.mark.manual("A 3.3.1 reading", "A 3.3.1 order")
 def test_burst_in_si() -> None:
     made = codec()
+    assert (made.polls[0].transfer.sends, made.polls[0].transfer.read_bytes) == ((b"\x12",), 32)
     (m,) = made.decode(0, GOLDEN)
     assert isinstance(m, Measurement)
     assert m.accel_m_s2 == pytest.approx((0, G / 2, G))

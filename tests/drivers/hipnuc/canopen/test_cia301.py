@@ -64,7 +64,7 @@ def test_aborts_silence_and_values_in_segments() -> None:
     announced = frame("41 08 10 00 0A 00 00 00")
     assert request.is_end(announced)
     abort = conversation.send(Reply((announced,)))
-    assert unpack(abort.payload) == (0x608, cia301.abort_frame(0x1008, 0, 0x0504_0001))
+    assert unpack(abort.payload) == (0x608, bytes.fromhex("80 08 10 00 01 00 04 05"))
     assert abort.silent
     with pytest.raises(StopIteration) as end:
         conversation.send(Reply(()))
