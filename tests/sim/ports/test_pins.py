@@ -11,7 +11,7 @@ from imud.contracts.lines import Edge, InputOptions, OutputOptions
 from imud.model.errors import LinkError
 from imud.model.units import NS_PER_MS
 from imud.sim.ports.faults import FaultKind, FaultRates, Faults
-from imud.sim.ports.pins import MemoryInput, MemoryLines, PinFaultRates, PinFaults, Pins
+from imud.sim.ports.pins import MemoryInput, MemoryLines, MemoryOutput, PinFaultRates, PinFaults, Pins
 from imud.sim.sensor import Pin
 from tests.support.event_loops import in_loop
 from tests.support.simulated_modules import FAST, HipnucUartBench
@@ -156,3 +156,12 @@ async def test_a_line_in_memory_counts_lost_edges_and_ends_inactive() -> None:
     output.close()
     output.close()
     assert (output.history, output.is_open) == ([(7, True), (7, False)], False)
+
+
+def test_an_output_line_is_inactive_when_it_is_opened_or_closed() -> None:
+    line = MemoryOutput(now_ns=lambda: 7)
+    line.open()
+    line.set(True)
+    line.close()
+    line.close()
+    assert line.history == [(7, True), (7, False)]
