@@ -72,6 +72,7 @@ def test_a_damaged_reply_is_returned_only_in_its_place() -> None:
     damaged = REPLY[:-1] + bytes([REPLY[-1] ^ 1])
     assert finder().feed(damaged) == damaged
     assert finder().feed(REPLY[:3] + EXCEPTION) is None  # registers with the bytes of an exception
+    assert finder().feed(modbus.framed(6, b"\x83\x02")) is None
     late = finder()
     assert late.feed(OTHER + damaged) is None  # after unknown bytes, only a frame with a correct CRC is a reply
     assert late.feed(REPLY) == REPLY
