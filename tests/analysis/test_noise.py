@@ -25,7 +25,7 @@ from imud.analysis.noise import (
     temperature_drift,
 )
 from imud.analysis.series import FloatArray, Readings
-from imud.analysis.spectrum import power_spectrum
+from imud.analysis.spectrum import Spectrum, power_spectrum
 from imud.model.errors import BadArgument
 from imud.model.units import STANDARD_GRAVITY_M_S2
 from tests.analysis.synthetic import flicker, quantisation, ramp, random_walk, stamps_ns, three, white
@@ -82,6 +82,17 @@ def test_missing_samples_and_filters_do_not_change_the_coefficients() -> None:
     for seed in [4, 5]:
         walk = three(random_walk(np.random.default_rng(seed), COUNT, RATE_HZ, 1.0))
         assert corner_of(power_spectrum([walk], RATE_HZ)) is None
+
+
+@pytest.mark.parametrize(("rise_hz", "drop_hz", "corner_hz"), [(0, 5, 5.0), (0, 4, None), (3, 33, 33.0), (3, 24, None)])
+def test_a_corner_needs_four_flat_bands_below_and_uses_eight(
+    rise_hz: int, drop_hz: int, corner_hz: float | None
+) -> None:
+    """The lowest bands contain 1, 2, 3 and 4 Hz. The eight bands below 33 Hz begin at 4 Hz, below 24 Hz at 3 Hz."""
+    frequency_hz = np.arange(1025.0)
+    density = np.where(frequency_hz < drop_hz, 1.0, 0.1)
+    density[: rise_hz + 1] = 100.0
+    assert corner_of(Spectrum(2048.0, frequency_hz, density[:, None], "hann", 2048, 1.5, 1, 0)) == corner_hz
 
 
 def test_drift_with_temperature() -> None:
