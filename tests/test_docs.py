@@ -178,7 +178,7 @@ def test_layout_tables_have_their_fields() -> None:
 
 def test_tables_of_actions_are_those_of_the_drivers() -> None:
     text = references.current("docs/commands.md")
-    assert text.count("\n### `") == len(DRIVERS)
     for driver in DRIVERS.values():
+        assert f"\n### `{driver.name}`: " in text if driver.verbs else f"`{driver.name}`" in text
         for action in driver.verbs:
             assert f"\n| `{action}` | " in text, action

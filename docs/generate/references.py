@@ -6,7 +6,6 @@
 | docs/commands.md, docs/calibration.md, docs/settings.md | commands, calibrations and device settings of the drivers |
 | docs/shm.md | layout of shared memory |
 | docs/monitoring.md | rules for Prometheus |
-| docs/measurements.md | measured figures (tests/bench/clock_figures.py) |
 | docs/socket.schema.json | messages of the socket (docs/generate/socket_schema.py) |
 """
 
@@ -15,7 +14,7 @@ import inspect
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import groupby
+from itertools import chain, groupby
 from typing import Final, NamedTuple
 
 import msgspec
@@ -47,7 +46,6 @@ from imud.lines.sync import RESET, TRIGGER
 from imud.model.ledger import LEDGER_FIELDS
 from imud.model.options import Options, expected, shown
 from imud.utc.receivers import RmcOptions
-from tests.bench import clock_figures
 from tests.support.files import ROOT
 
 # --- values in cells --------------------------------------------------------------------------------------------------
@@ -238,45 +236,33 @@ def actions_table(actions: Verbs, lists: LongLists) -> Iterator[str]:
 
 def actions_part(driver: Driver, lists: LongLists, first_of: dict[str, str]) -> list[str]:
     """Return title and table of the commands of a driver; a table that an earlier driver has becomes a reference."""
-    table = "\n".join(actions_table(driver.verbs, lists)) if driver.verbs else "No commands."
+    table = "\n".join(actions_table(driver.verbs, lists))
     first = first_of.setdefault(table, driver.name)
-    same = bool(driver.verbs) and first != driver.name
-    return [f"### `{driver.name}`: {driver.title}", "", f"As `{first}`." if same else table, ""]
-
-
-def removed_part(driver: Driver) -> Iterator[str]:
-    """Yield the removed commands of a driver with the settings in their place."""
-    if driver.renamed:
-        yield f"| removed command of `{driver.name}` | arguments of `imud settings DEVICE` |"
-        yield "|---|---|"
-        for name, words in driver.renamed.items():
-            shown = re.sub(r"\{(\w+)(\|\w+)?\}", lambda found: found[1].upper(), words)
-            yield f"| `{name}` | {f'`--set {shown}`' if words else 'none'} |"
-        yield ""
+    return [f"### `{driver.name}`: {driver.title}", "", f"As `{first}`." if first != driver.name else table, ""]
 
 
 def actions_tables() -> str:
     lists, first_of = LongLists(), dict[str, str]()
-    lines = [line for driver in DRIVERS.values() for line in actions_part(driver, lists, first_of)]
+    lines = [line for driver in DRIVERS.values() if driver.verbs for line in actions_part(driver, lists, first_of)]
+    without = ", ".join(f"`{driver.name}`" for driver in DRIVERS.values() if not driver.verbs)
     by_lines = [
         "### Any device with the line `reset` or `sin`",
         "",
         *actions_table({"reset": RESET, "trigger": TRIGGER}, lists),
         "",
     ]
-    removed = [line for driver in DRIVERS.values() for line in removed_part(driver)]
-    return "\n".join([*lines, *by_lines, "## Removed commands", "", *removed])
+    return "\n".join([*lines, *by_lines, f"{without}: no commands."])
 
 
 # --- docs/calibration.md ----------------------------------------------------------------------------------------------
 
 
 def calibrations_table() -> str:
-    rows = ["| driver | kind | effect | manual | device | result lasts |", "|---|---|---|---|---|---|"]
+    rows = ["| driver | kind | effect | device | result lasts |", "|---|---|---|---|---|"]
     for driver in DRIVERS.values():
         for kind, one in driver.calibrations.items():
             hold = {Handling.REST: "at rest", Handling.TURN: "turned"}[one.handling]
-            rows.append(f"| `{driver.name}` | `{kind}` | {cell(one.help)} | {one.section} | {hold} | {one.kept} |")
+            rows.append(f"| `{driver.name}` | `{kind}` | {cell(one.help)} | {hold} | {one.kept} |")
     return "\n".join(rows)
 
 
@@ -288,7 +274,7 @@ class SettingRow(NamedTuple):
 
     name: str
     cells: tuple[str, ...]
-    """Values with unit, section of the manual, effect."""
+    """Values with unit, effect."""
     meaning: str
 
     @property
@@ -307,7 +293,7 @@ def setting_rows(driver: Driver, lists: LongLists) -> Iterator[SettingRow]:
         if not one.readable:
             force += ", not readable"
         values = lists.cell(one.values, f"`{one.name}`") + (f" ({one.unit})" if one.unit else "")
-        yield SettingRow(one.name, (values, one.section, force), cell(one.description))
+        yield SettingRow(one.name, (values, force), cell(one.description))
 
 
 def common_words(texts: Sequence[list[str]]) -> int:
@@ -330,18 +316,28 @@ def merged(rows: Sequence[SettingRow]) -> Iterator[SettingRow]:
         yield from (row._replace(name=f"`{row.name}`") for row in group)
 
 
-def device_settings_part(driver: Driver, lists: LongLists) -> list[str]:
-    """Return title and table of the device settings of a driver."""
+def device_settings_part(driver: Driver, lists: LongLists, first_of: dict[tuple[str, str, str], str]) -> list[str]:
+    """Return title and table of the device settings of a driver, without the rows of an earlier driver."""
     title = [f"### `{driver.name}`: {driver.title}", ""]
-    if driver.device_settings is None:
-        return [*title, "This driver has no device settings.", ""]
-    rows = merged(list(setting_rows(driver, lists)))
-    return [*title, "| setting | values | manual | in force | meaning |", "|---|---|---|---|---|", *map(str, rows), ""]
+    found, repeated = [], dict[str, list[str]]()
+    for row in setting_rows(driver, lists):
+        first = first_of.setdefault((row.name, row.cells[-1], row.meaning), driver.name)
+        if first == driver.name or not row.cells[0].startswith("as "):
+            found.append(row)
+        else:
+            repeated.setdefault(first, []).append(f"`{row.name}`")
+    references = [f"{', '.join(names)}: as in `{first}`." for first, names in repeated.items()]
+    if not found:
+        return [*title, *references, ""]
+    rows = [*merged(found), *(["", *references] if references else [])]
+    return [*title, "| setting | values | in force | meaning |", "|---|---|---|---|", *map(str, rows), ""]
 
 
 def device_settings_tables() -> str:
-    lists = LongLists()
-    return "\n".join(line for driver in DRIVERS.values() for line in device_settings_part(driver, lists))
+    lists, first_of = LongLists(), dict[tuple[str, str, str], str]()
+    parts = (device_settings_part(driver, lists, first_of) for driver in DRIVERS.values() if driver.device_settings)
+    without = ", ".join(f"`{driver.name}`" for driver in DRIVERS.values() if not driver.device_settings)
+    return "\n".join([*chain.from_iterable(parts), f"{without}: no device settings."])
 
 
 # --- docs/shm.md ------------------------------------------------------------------------------------------------------
@@ -395,7 +391,6 @@ PAGES: Final[Mapping[str, Callable[[], Mapping[str, str]]]] = {
     "docs/settings.md": lambda: {"settings": "\n" + device_settings_tables()},
     "docs/shm.md": layout_tables,
     "docs/monitoring.md": lambda: {"alerts": alert_table()},
-    "docs/measurements.md": clock_figures.tables,
 }
 
 

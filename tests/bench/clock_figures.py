@@ -1,7 +1,7 @@
-"""Measured figures of docs/measurements.md, stored in `clock_figures.json`: two tables and two plots.
+"""Measured figures of docs/measurements.md, stored in `clock_figures.json`.
 
 `python -m tests.bench.clock --keep` and `python -m tests.bench.clock_lines --keep` measure and store the figures.
-`python -m docs.generate.references` creates the tables, and `python -m docs.generate.clock_pictures` the plots.
+`python -m docs.generate.clock_pictures` draws the plots.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,16 +19,6 @@ LINE_HEAD: Final = (
     + "---|" * 10
 )
 WHOLE_FROM_US: Final = 10.0  # larger values have no decimals
-ARRIVAL_COLUMNS: Final = (0, 1, 3, 5, 7)
-"""Columns of docs/measurements.md: arrival, rate, rms, mean t_err, settling."""
-LINE_COLUMNS: Final = (0, 1, 2, 3, 4, 6)
-"""Columns of docs/measurements.md: source, over, rate, σ, mean, mean t_err."""
-SAME_WITH_SOUT: Final = {
-    "usb-1ms", "usb-16ms, crystal +5 %", "usb-16ms, crystal -5 %", "usb-16ms, crystal drift",
-    "usb-16ms, 1 % of edges lost", "usb-16ms, 5 % extra edges",
-}  # fmt: skip
-"""Rows that docs/measurements.md omits: SOUT has the same error on each link."""
-SHOWN_RATES_HZ: Final = (1, 100, 1000)  # rates in the table of docs/measurements.md; the plot has all rates
 
 Spread = tuple[float, float]
 """Minimum and maximum over all crystals, µs."""
@@ -78,7 +68,7 @@ def kept() -> ClockFigures:
 
 
 def keep(*, arrivals: Sequence[ArrivalFigures] | None = None, lines: Sequence[LineFigures] | None = None) -> None:
-    # keep the other table if only one was measured
+    # keep the other figures if only one was measured
     old = kept() if FILE.exists() else ClockFigures()
     new = ClockFigures(
         old.arrivals if arrivals is None else tuple(arrivals), old.lines if lines is None else tuple(lines)
@@ -100,24 +90,3 @@ def markdown(head: str, found: Iterable[ArrivalFigures | LineFigures]) -> Iterat
     yield head
     for one in found:
         yield one.row()
-
-
-def tables() -> dict[str, str]:
-    """Return the tables of docs/measurements.md by their markers, with the most important columns and rows."""
-    figures = kept()
-    return {
-        "arrivals": _table(
-            ARRIVAL_HEAD, (one for one in figures.arrivals if one.rate_hz in SHOWN_RATES_HZ), ARRIVAL_COLUMNS
-        ),
-        "lines": _table(LINE_HEAD, (one for one in figures.lines if _is_shown(one)), LINE_COLUMNS),
-    }
-
-
-def _is_shown(figures: LineFigures) -> bool:
-    return figures.over not in SAME_WITH_SOUT and (figures.source != "SOUT" or figures.rate_hz == 100)
-
-
-def _table(head: str, found: Iterable[ArrivalFigures | LineFigures], columns: Sequence[int]) -> str:
-    """Return a table with some columns, with blank lines around it: <details> requires them."""
-    rows = [line.split("|") for line in "\n".join(markdown(head, found)).splitlines()]
-    return "\n" + "\n".join("|" + "|".join(row[1 + column] for column in columns) + "|" for row in rows) + "\n"

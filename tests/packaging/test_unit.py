@@ -86,18 +86,12 @@ def directives() -> set[str]:
     return set(re.findall(r"^(\w+)=", UNIT.read_text(), re.MULTILINE))
 
 
-def reasons() -> dict[str, str]:
-    text = PAGE.partition("\n## Directives of the unit\n")[2].partition("\n## ")[0]
-    rows = re.findall(r"^\| ((?:`\w+=`(?:, )?)+) \| (.*) \|$", text, re.MULTILINE)
-    found = [(name, reason) for names, reason in rows for name in re.findall(r"`(\w+)=`", names)]
-    assert len(dict(found)) == len(found), "a directive has two rows"
-    return dict(found)
-
-
-def test_every_directive_of_the_unit_has_its_reason_in_the_document_and_nothing_else_has() -> None:
+def test_every_block_of_directives_has_its_reason_above_it() -> None:
     assert len(directives()) > 50
-    assert reasons().keys() == directives()
-    assert all(len(reason.split()) >= REASON_WORDS for reason in reasons().values())
+    blocks = re.findall(r"^((?:#.*\n)*)((?:\w+=.*\n)+)", UNIT.read_text(), re.MULTILINE)
+    assert {name for _, block in blocks for name in re.findall(r"^(\w+)=", block, re.MULTILINE)} == directives()
+    for reason, block in blocks:
+        assert len(reason.split()) >= REASON_WORDS, block
 
 
 def test_the_rings_are_where_removing_ipc_does_not_reach_unless_the_configuration_says_so() -> None:
@@ -166,8 +160,8 @@ def test_clock_calls_networks_and_the_documents() -> None:
         assert not network.is_global, network
     text = PAGE
     assert f"`systemd-analyze security imud` gives {EXPOSURE_MAX} " in text
-    left_open = re.findall(r"^\| `(\w+)=(\w*)` \|", text.partition("\n## Directives of the unit\n")[0], re.MULTILINE)
-    assert left_open
+    left_open = re.findall(r"Not (\w+)=(\w*):", UNIT.read_text())
+    assert len(left_open) == 3
     for name, value in left_open:
         assert value not in values(name) if value else not values(name), name
 
