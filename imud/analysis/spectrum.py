@@ -129,7 +129,7 @@ def _powers(rows: FloatArray, window: FloatArray, rate_hz: float) -> FloatArray:
     size = len(window)
     transformed = np.fft.rfft((rows - rows.mean(axis=2, keepdims=True)) * window, axis=2)
     power = np.abs(transformed) ** 2 / (rate_hz * (window**2).sum())
-    power[:, :, 1 : (size + 1) // 2] *= 2  # negative frequencies; the bins at 0 and at half of the rate have none
+    power[:, :, 1 : (size + 1) // 2] *= 2  # add the negative frequencies, except at 0 and at half of the rate
     return np.asarray(np.moveaxis(power, 2, 1))
 
 
@@ -244,7 +244,7 @@ def _shift(power: FloatArray, place: int) -> float:
 
 
 def _named(line: Peak, lines: Sequence[Peak], bin_hz: float) -> Peak:
-    """Return the line with the first stronger line of which it is a multiple."""
+    """Return the line, with its multiple of the first stronger line if its frequency is such a multiple."""
     for number, other in enumerate(lines):
         multiple = round(line.frequency_hz / other.frequency_hz)
         near = abs(line.frequency_hz - multiple * other.frequency_hz) <= HARMONIC_BINS * bin_hz

@@ -29,7 +29,7 @@ REST_RAD_S: Final = 0.05  # maximum angular rate at rest, rad/s: 2.9 °/s, above
 # sideways acceleration within the limit rotates the direction by up to 14°.
 REST_M_S2: Final = 0.03 * STANDARD_GRAVITY_M_S2
 CONTRADICTION_DEG: Final = 20.0
-LEVEL_DEG: Final = 45.0  # maximum tilt of a level body, degrees: a ship heels, a vehicle stands on a slope
+LEVEL_DEG: Final = 45.0  # maximum tilt of a level body, degrees: a ship heels, a vehicle is on a slope
 EXPLAINED_DEG: Final = 10.0  # maximum remaining angle of a possible cause, degrees
 
 

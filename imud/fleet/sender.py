@@ -269,7 +269,7 @@ class MqttSender:
             self.failure = error
 
     def _wake_after(self, seconds: float) -> None:
-        """Sleep between two attempts. Only the end wakes the thread earlier."""
+        """Sleep between two attempts. Only the end of the sender wakes the thread earlier."""
         due_ns = self._now_ns() + round(seconds * NS_PER_S)
         while not self._ended and (rest_ns := due_ns - self._now_ns()) > 0:
             self._wake.wait(min(rest_ns / NS_PER_S, WAIT_S))

@@ -203,9 +203,9 @@ SETTLED_CHANGES: Final = 64
 UNSETTLED_MOST: Final = 512
 # number of even samples after which an uneven step is a correction of the counter, not an uneven sample
 EVEN_FOR: Final = 64
-# maximum distance of a sample from its tick, ns, that is an error of the learned period
+# Maximum distance of a sample from its tick, ns, that an error of the learned period can cause
 FOLLOWED_NS: Final = 15 * NS_PER_US
-# maximum difference of a step, ns, or one tick, that is not a correction of the counter
+# Maximum difference of a step, ns, or one tick. A larger difference is a correction of the counter.
 UNEVEN_NS: Final = 200 * NS_PER_US
 UNEVEN_SHARE: Final = 0.25
 # number of samples after an uneven step or a gap whose device time the clock compares with the arrivals

@@ -163,7 +163,7 @@ def test_signals_end_it_well(start: Start, number: signal.Signals) -> None:
         (["--device", "imu61x-can:9999", "--interface", "vcan0"], "node 9999"),
         (["--pins", "tx=/tmp/x"], "expected NAME=PATH with one of sout, sout_div, alarm"),
         (["--pins", "sout=/nowhere/pull"], "/nowhere/pull"),
-        (["--device", "imu61x-uart", "--pins", "sout=/dev/null"], "got one without pins"),
+        (["--device", "imu61x-uart", "--pins", "sout=/dev/null"], "got a device without pins"),
         (["--pins", "sout=/dev/null", "--pin-faults", "lose=1"], "expected one of lose_pulse, lose_edge, extra"),
         (["--pins", "sout=/dev/null", "--pin-faults", "extra=x"], "expected a number, got 'x'"),
         (["--pins", "sout=/dev/null", "--pin-faults", "extra=2"], "expected a probability"),

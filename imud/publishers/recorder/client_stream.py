@@ -106,7 +106,7 @@ class StreamWriter:
         return self._sender.ended
 
     def close(self, *, flush: bool) -> None:
-        """End the thread. With `flush`, wait shortly for the client. A second call does nothing."""
+        """End the thread. With `flush`, give the client a short time to read. A second call does nothing."""
         self._queue.ring = lambda: None
         self._hurry = True
         self._worker.end()
@@ -205,7 +205,7 @@ class ClientRecording:
         self._writer.is_ending = True
 
     def close(self, *, flush: bool = False) -> None:
-        """Close the recording. With `flush`, wait shortly for the client. A second call does nothing."""
+        """Close the recording. With `flush`, give the client a short time to read. A second call does nothing."""
         self._stopped = True
         self._feed.stop()
         self._writer.close(flush=flush)

@@ -298,7 +298,7 @@ class Outbox(ABC):
     Synchronization: the event loop's thread.
     """
 
-    # a client has more attributes than the interpreter keeps in its fast form
+    # an object with more than 30 attributes is slower without slots
     __slots__ = (
         "_fd", "_limits", "_partial", "_partial_fd", "_pool", "_replies", "_request_bytes", "_sample_bytes",
         "_sample_count", "_samples", "_send", "_skip", "_sock", "_unreported", "dropped", "held_bytes", "progress",

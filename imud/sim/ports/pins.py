@@ -348,7 +348,7 @@ class SimulatedLines:
         self._pins: Pins | None = None
         if files:
             if not isinstance(module, HipnucModule):
-                raise ValueError("pins: expected a device with simulated pins, got one without pins")
+                raise ValueError("pins: expected a device with simulated pins, got a device without pins")
             self._pins = Pins(module, files, faults, truth)
         self._sin = SinFile(sin, module) if sin else None
 

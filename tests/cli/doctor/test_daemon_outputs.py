@@ -1,4 +1,4 @@
-"""Checks of shared memory and of the scrapes of the metrics."""
+"""Checks of shared memory and of metrics scrapes."""
 
 import asyncio
 

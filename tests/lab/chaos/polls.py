@@ -68,7 +68,7 @@ class PollLog:
         return " ".join(words)
 
     def strange(self, samples: Sequence[Sample]) -> list[int]:
-        """Return `seq` of the samples in whose read the device gave no valid reply."""
+        """Return `seq` of each sample from a read without a valid reply of the device."""
         with self._lock:
             times = [asked.t_ns for asked in self._asked if asked.is_sample and asked.answer is Answer.GOOD]
         return [s.seq for s in samples if bisect_left(times, s.t_ns) == bisect_right(times, s.t_rx_ns)]

@@ -120,8 +120,8 @@ def save() -> TransferScript[None]:
 def restart(places: tuple[int, ...], line_baud: int) -> TransferScript[str]:
     """Restart the device, as after power-on, wait until it replies, and return a report.
 
-    The script tries `places`, of which the first is the present address, and the address in its register. `line_baud`
-    is the baud rate of the bus; 0 if it is not known. Raises DeviceRefused, TransferError, NoReply.
+    The script tries `places`, the present address first, and the address in its register. `line_baud` is the baud rate
+    of the bus; 0 if it is not known. Raises DeviceRefused, TransferError, NoReply.
     """
     serial = yield from _own_serial()
     baud, address, _ = yield from read_present()

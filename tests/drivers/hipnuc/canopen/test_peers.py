@@ -283,7 +283,7 @@ def test_their_node_executes_our_nmt_and_sends_its_heartbeat(local: canopen.Loca
 
 
 def test_their_tpdos_are_our_samples(network: canopen.Network, local: canopen.LocalNode, host: Host) -> None:
-    """Their node maps, packs and sends two TPDOs per period. All frames are on the bus before the first read."""
+    """python-canopen maps, packs and sends two TPDOs per period. All frames are on the bus before the first read."""
     for number, index in ((1, ACCEL), (2, GYRO)):
         tpdo = local.tpdo[number]
         tpdo.cob_id = 0x080 + 0x100 * number + NODE
