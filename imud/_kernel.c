@@ -37,8 +37,8 @@
 #define FLOATS 16                /* accel, gyro, mag, euler, quaternion */
 #define QUAT_SQUARE_MIN 0.9604   /* limits of the squared length of a rotation, see value_limits.py */
 #define QUAT_SQUARE_MAX 1.0404
-#define VALUE_HIGH_BYTE 0x46     /* a float of 8,192 or more has this high byte or a larger one, also NaN */
-#define TURN_DEG 360.0f          /* maximum magnitude of an angle */
+#define VALUE_HIGH_BYTE 0x48     /* a float of 131,072 or more has this high byte or a larger one, also NaN */
+#define TURN_DEG 360.0f          /* maximum magnitude of a usual angle */
 #define PRESSURE_MIN_PA 1000.0
 #define PRESSURE_MAX_PA 120000.0
 #define PPS_STAMP_MODULUS_MS 8192

@@ -48,15 +48,15 @@ def test_both_rules_agree(value: float) -> None:
     assert (value_limits.possible_temperature_c(value) is not None) == (-128 < value <= 150)
 
 
-@pytest.mark.parametrize("value", [8192.0, 3e38, inf, nan])
-def test_the_smallest_impossible_value_is_8192(value: float) -> None:
+@pytest.mark.parametrize("value", [131072.0, 3e38, inf, nan])
+def test_the_smallest_impossible_value_is_131072(value: float) -> None:
     assert not value_limits.is_possible([value])
     assert value_limits.scaled((0.0, value, 0.0), 2.0) is None
     assert not value_limits.values_possible(high_byte(-value) + high_byte(0.0))
 
 
 def test_limits_of_values_and_temperatures() -> None:
-    assert value_limits.scaled((0.0, 8191.5, -8191.5), 2.0) == (0.0, 16383.0, -16383.0)
+    assert value_limits.scaled((0.0, 131071.5, -131071.5), 2.0) == (0.0, 262143.0, -262143.0)
     assert value_limits.possible_angles((-tau, 0.0, tau)) == (-tau, 0.0, tau)
     assert value_limits.possible_angles((0.0, tau * 1.00001)) is None
     for impossible in (-128.0, nextafter(150.0, 151.0)):
@@ -65,10 +65,10 @@ def test_limits_of_values_and_temperatures() -> None:
         assert value_limits.possible_temperature_c(inside) == inside
 
 
-FLOATS = (nan, inf, -inf, 3e38, -3e38, 1e-45, 1e5, -9e3, 400.0, -361.0, 151.0, 1.0, 0.0)
+FLOATS = (nan, inf, -inf, 3e38, -3e38, 1e-45, 2e5, -9e8, 400.0, -361.0, 151.0, 1.0, 0.0)
 COUNTS = (0x7FFF_FFFF, 0x8000_0000, 0xFFFF_FFFF, 0x7FFF_8000, 0x8000_7FFF, 0x7FFE_FFFD, 0)
 PREFIX = bytes([spi.PIPELINE_BYTES]) * spi.PIPELINE_BYTES
-MOST = {"accel_m_s2": 8192 * 9.80665, "gyro_rad_s": radians(8192), "mag_t": 8192e-6, "euler_rad": 6.2832,
+MOST = {"accel_m_s2": 131072 * 9.80665, "gyro_rad_s": radians(131072), "mag_t": 131072e-6, "euler_rad": 6.2832,
         "incli_rad": 6.2832, "quat_wxyz": 1.02, "pressure_pa": 120_000, "temperature_c": 150}  # fmt: skip
 
 

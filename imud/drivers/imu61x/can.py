@@ -49,9 +49,9 @@ from imud.drivers.imu61x.common import (
 )
 from imud.drivers.value_limits import (
     TEMPERATURE_LIMITS_C,
+    TURN_DEG,
     VALUE_HIGH_BYTES,
     is_possible,
-    possible_angles,
     possible_temperature_c,
     scaled,
 )
@@ -243,7 +243,7 @@ class Imu61xCanCodec:
 
 def _measurement(values: Sequence[float], temperature: int, index: int, first_ns: int) -> Measurement:
     """Return the measurement of a complete set, without groups with a value that is not possible."""
-    euler = possible_angles(scaled(values[:3], RAD_PER_DEG))
+    euler = scaled(values[:3], RAD_PER_DEG, TURN_DEG)
     return Measurement(
         SET.size, 0, index,
         accel_m_s2=scaled(values[6:9], M_S2_PER_G),

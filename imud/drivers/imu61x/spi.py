@@ -40,7 +40,7 @@ from imud.drivers.imu61x.registers import (
     wanted_filter,
 )
 from imud.drivers.polled_frames import Measured, PolledFrameDecoder, absence
-from imud.drivers.value_limits import possible_angles, possible_temperature_c, scaled
+from imud.drivers.value_limits import TURN_DEG, VALUE_LIMIT, possible_temperature_c, scaled
 from imud.model.errors import DeviceRefused, TransferError
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Vector3
@@ -390,12 +390,13 @@ def _bad_crc(frame: bytes) -> BadReason | None:
 def _extended(frame: bytes) -> Measured:
     values = EXTENDED.unpack(little_endian(frame))
     gyro, accel, euler = (
-        scaled(part, factor)
-        for part, factor in (
-            (values[0:3], RAD_S_PER_DEG_S), (values[3:6], M_S2_PER_G), (values[7:10], RAD_PER_DEG),
+        scaled(part, factor, limit)
+        for part, factor, limit in (
+            (values[0:3], RAD_S_PER_DEG_S, VALUE_LIMIT), (values[3:6], M_S2_PER_G, VALUE_LIMIT),
+            (values[7:10], RAD_PER_DEG, TURN_DEG),
         )
     )  # fmt: skip
-    euler, temperature = possible_angles(euler), possible_temperature_c(values[6])
+    temperature = possible_temperature_c(values[6])
     measurement = Measurement(
         len(frame), 0, None, accel, gyro,
         quat_wxyz=None if euler is None else quat_from_euler_zyx(euler),

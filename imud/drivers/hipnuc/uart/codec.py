@@ -46,10 +46,12 @@ from imud.drivers.value_limits import (
     QUAT_SQUARE_MAX,
     QUAT_SQUARE_MIN,
     TURN_DEG,
+    TURN_SQUARE,
     VALUE_HIGH_BYTES,
     is_possible,
     possible_angles,
     possible_quaternion,
+    scaled,
     values_possible,
 )
 from imud.formats import kernel
@@ -109,18 +111,20 @@ def decode_hi91(values: Sequence[Any], word_is_status: bool, size: int, trailing
 
 
 def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int) -> list[Measurement] | None:
-    """Return `decode_hi91` of adjacent sub-packets, one per frame; None if an angle is beyond a full turn. `trailing`
-    bytes follow the first frame."""
+    """Return `decode_hi91` of adjacent sub-packets, one per frame; None if an angle may be beyond a full turn.
+
+    `trailing` bytes follow the first frame.
+    """
     g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
     low_pa, high_pa, most_ms = PRESSURE_MIN_PA, PRESSURE_MAX_PA, PPS_STAMP_MODULUS_MS
-    least, most, turn = QUAT_SQUARE_MIN, QUAT_SQUARE_MAX, TURN_DEG
+    least, most, turn = QUAT_SQUARE_MIN, QUAT_SQUARE_MAX, TURN_SQUARE
     made: list[Measurement] = []
     make, keep = Measurement, made.append
     # decode_hi91 inline: the call costs a twentieth of the time
     for (
         low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
     ) in HI91_VALUES.iter_unpack(hi91s):  # fmt: skip
-        if not (-turn <= roll <= turn and -turn <= pitch <= turn and -turn <= yaw <= turn):
+        if roll * roll + pitch * pitch + yaw * yaw > turn:
             return None
         temperature += 0.0  # noqa: PLW2901
         if not low_pa <= pressure <= high_pa:
@@ -152,21 +156,20 @@ def _run_possible(hi91s: bytes) -> bool:
 def _decode_hi91(data: bytes, at: int, word_is_status: bool, size: int, trailing: int) -> tuple[Measurement, bool]:
     values = HI91_VALUES.unpack_from(data, at)
     measurement = decode_hi91(values, word_is_status, size, trailing)
-    if isfinite(values[3]) and is_possible(values[5:]) and max(map(abs, values[_GROUPS["euler_rad"]])) <= TURN_DEG:
+    if isfinite(values[3]) and is_possible(values[5:]) and scaled(values[_ANGLES], 1.0, TURN_DEG):
         return measurement, True
     return _possible_groups(measurement, values), False
 
 
-# values of each group in HI91_VALUES
-_GROUPS: Final = {
-    "accel_m_s2": slice(5, 8), "gyro_rad_s": slice(8, 11), "mag_t": slice(11, 14), "euler_rad": slice(14, 17),
-}  # fmt: skip
+_ANGLES: Final = slice(14, 17)  # angles in HI91_VALUES
+# other groups in HI91_VALUES
+_GROUPS: Final = {"accel_m_s2": slice(5, 8), "gyro_rad_s": slice(8, 11), "mag_t": slice(11, 14)}
 
 
 def _possible_groups(m: Measurement, values: Sequence[Any]) -> Measurement:
     """Return the measurement without groups with a value that is not possible."""
     without = {name: None for name, at in _GROUPS.items() if not is_possible(values[at])}
-    if "euler_rad" not in without and possible_angles(m.euler_rad) is None:
+    if scaled(values[_ANGLES], 1.0, TURN_DEG) is None:
         without["euler_rad"] = None
     return msgspec.structs.replace(m, **without)
 

@@ -30,8 +30,8 @@ from imud.drivers.imu61x.common import CRC_INVERSION, CRC_START, M_S2_PER_G, RAD
 from imud.drivers.value_limits import (
     TEMPERATURE_HIGH_BYTES,
     TURN_DEG,
+    TURN_SQUARE,
     VALUE_HIGH_BYTES,
-    possible_angles,
     possible_temperature_c,
     scaled,
     temperatures_possible,
@@ -460,11 +460,9 @@ class Imu61xCodec:
     def _measure(self, frame: Frame, events: list[CodecEvent]) -> None:
         values = AHRS.unpack_from(frame.payload)
         size, trailing = len(frame.raw), frame.trailing_bytes
-        if _is_possible(frame.payload) and (made := _measurements((values,), size, trailing)):
-            events += made
-            return
-        self.ledger.frames_not_finite += 1
-        events.append(BadFrame(BadReason.NOT_FINITE, frame.raw))
+        if not (_is_possible(frame.payload) and max(map(abs, values[1:4])) < TURN_DEG):
+            self.ledger.frames_not_finite += 1
+            events.append(BadFrame(BadReason.NOT_FINITE, frame.raw))
         events.append(_partial_measurement(values, size, trailing))
 
 
@@ -486,14 +484,16 @@ def _is_possible(payload: bytes) -> bool:
 
 
 def _measurements(frames: Iterable[Sequence[Any]], size: int, trailing: int) -> list[Measurement]:
-    """Return the measurements of adjacent AHRS frames with possible values, up to an angle beyond a full turn;
-    `trailing` bytes follow the first frame."""
+    """Return the measurements of adjacent AHRS frames with possible values; `trailing` bytes follow the first frame.
+
+    The list ends before a frame with an angle that may be beyond a full turn.
+    """
     made: list[Measurement] = []
     keep, make, g, rad, cosine, sine = made.append, Measurement, M_S2_PER_G, RAD_PER_DEG, cos, sin
-    turn = TURN_DEG
+    turn = TURN_SQUARE
     # quat_from_euler_zyx inline: a call costs a twentieth of a frame
     for us, pitch_deg, roll_deg, yaw_deg, ax, ay, az, gx, gy, gz, temperature_c in frames:
-        if not (-turn <= roll_deg <= turn and -turn <= pitch_deg <= turn and -turn <= yaw_deg <= turn):
+        if roll_deg * roll_deg + pitch_deg * pitch_deg + yaw_deg * yaw_deg > turn:
             break
         roll, pitch, yaw = roll_deg * rad, pitch_deg * rad, yaw_deg * rad
         half_roll, half_pitch, half_yaw = roll * 0.5, pitch * 0.5, yaw * 0.5
@@ -515,7 +515,7 @@ def _measurements(frames: Iterable[Sequence[Any]], size: int, trailing: int) -> 
 def _partial_measurement(values: Sequence[Any], size: int, trailing: int) -> Measurement:
     """Return the measurement without groups with a value that is not possible."""
     us, pitch, roll, yaw = values[:4]
-    euler = possible_angles(scaled((roll, pitch, yaw), RAD_PER_DEG))
+    euler = scaled((roll, pitch, yaw), RAD_PER_DEG, TURN_DEG)
     return Measurement(
         size, trailing, us,
         accel_m_s2=scaled(values[4:7], M_S2_PER_G),
