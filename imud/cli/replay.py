@@ -14,6 +14,7 @@ from imud import config
 from imud.cli.arguments import CliCommand, add_interface, add_option, chosen_interface, driver_settings, given_options
 from imud.cli.output import paragraph
 from imud.cli.status import block
+from imud.contracts.codec import wrong_length_words
 from imud.contracts.driver import CanDriver
 from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceStatus
@@ -101,9 +102,10 @@ def device_block(device: PlayedDevice, without: Collection[str] = ()) -> list[st
     words = ""
     if device.driver is not None and path is not None and path.unknown and not counts["samples"]:
         words = device.driver.unknown_words(path.unknown, device.described.name, counted=True)
+    odd = wrong_length_words(device.ledger, device.last_bad)
     rows = [
         ("link", f"{device.described.where}, driver {device.driver.name if device.driver else 'unknown'}"),
-        *([("problem", words)] if words else []),
+        *(("problem", one) for one in (words, odd) if one),
         ("clock", clock),
         ("samples", f"{own['samples']}; lost {lost(own)}, {own['lost_unknown']} gaps of unknown size"),
         ("bytes", f"{own['bytes_in']}: {'all accounted for' if closes else 'NOT ALL ACCOUNTED FOR'}"),

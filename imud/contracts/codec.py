@@ -34,6 +34,14 @@ class BadFrame(msgspec.Struct, frozen=True, gc=False):
     can_id: int | None = None  # identifier of a CAN frame
 
 
+def wrong_length_words(ledger: Ledger, frame: BadFrame | None) -> str:
+    """Describe the CAN frames of a wrong length by the newest one, one clause; empty without such a frame."""
+    if frame is None or frame.can_id is None:
+        return ""
+    count = ledger.frames_bad_length
+    return f"{count} frame{'s' * (count != 1)} of a wrong length, the last of CAN identifier {frame.can_id:03X}"
+
+
 def wrong_length(ledger: Ledger, can_id: int, data: bytes) -> tuple[BadFrame]:
     """Count a CAN frame of a known identifier with another length than the manual's. Return its event."""
     ledger.bytes_in_bad_frames += len(data)

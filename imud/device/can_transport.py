@@ -363,7 +363,9 @@ class CanTransport(ReceivingTransport):
         elif health.state is not DeviceState.SEARCHING:
             return
         elif path.last_data_ns > path.begun_ns:
-            health.report(f"frames of {driver.name} arrive on {self.where}, but no complete sample")
+            words = self._context.events.wrong_length_words()
+            what = f"; {words}" if words else ""
+            health.report(f"frames of {driver.name} arrive on {self.where}, but no complete sample{what}")
         else:
             health.report(f"no frame of {driver.name} arrives on {self.where}; check its identifier")
 

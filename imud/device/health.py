@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Mapping
 from operator import attrgetter
 
-from imud.contracts.codec import BadFrame
+from imud.contracts.codec import BadFrame, wrong_length_words
 from imud.contracts.status import DeviceState
 from imud.host.log import MESSAGE_CHARACTERS_MAX, printable, same_as
 from imud.model.event import LEVELS, Event, EventKind
@@ -57,6 +57,10 @@ class DeviceEvents:
     def bad_frame(self, frame: BadFrame) -> None:
         """Note a damaged frame. The next event shows the newest frame."""
         self._last_bad = frame
+
+    def wrong_length_words(self) -> str:
+        """Describe the CAN frames of a wrong length; empty without such a frame."""
+        return wrong_length_words(self._ledger, self._last_bad)
 
     def tick(self, now_ns: int, sync: Sync | None) -> None:
         """Send the events of the counters since the previous interval."""

@@ -20,7 +20,7 @@ from imud.model.errors import BadArgument
 from imud.model.options import Options
 from imud.model.sample import T_ERR_MOST, Sample, Sync
 from imud.model.units import uart_byte_ns
-from imud.recording.player import PlayedClock, PlayedDevice, ignore_frame, ignore_message
+from imud.recording.player import PlayedClock, PlayedDevice, ignore_message
 from imud.sampling.clock import SampleClock
 from imud.sampling.path import CanPath, PathContext, SamplePath, StreamPath, make_clock
 
@@ -137,7 +137,15 @@ class CapturePlayer:
     def _context(self, publish: Callable[[Batch], None]) -> PathContext:
         frame = published_frame(None, None, None, self._driver.axes)
         return PathContext(
-            NAME, DEVICE_ID, self.device.ledger, publish, ignore_message, ignore_frame, lambda: 0, self._host, frame
+            NAME,
+            DEVICE_ID,
+            self.device.ledger,
+            publish,
+            ignore_message,
+            self.device.note_frame,
+            lambda: 0,
+            self._host,
+            frame,
         )
 
     def _publish_without_times(self, batch: Batch) -> None:

@@ -62,6 +62,7 @@ class PlayedDevice:
     path: SamplePath | None = None
     driver: Driver | None = None
     config: DeviceConfig | None = None
+    last_bad: BadFrame | None = None  # newest damaged frame
     # overruns that the kernel counted in the live run
     overruns: int = 0
     before: dict[str, int] | None = None  # counters of the live run at the start of the recording; None if unknown
@@ -70,6 +71,10 @@ class PlayedDevice:
     differences: list[str] = field(default_factory=list)
     # Reasons for each new clock that replaced the clock of the live run.
     fresh_starts: list[str] = field(default_factory=list)
+
+    def note_frame(self, frame: BadFrame) -> None:
+        """Note a damaged frame. The codec counts it in the ledger."""
+        self.last_bad = frame
 
 
 class RecordedEvent(msgspec.Struct, frozen=True):
@@ -285,7 +290,7 @@ class Player:
             on_unknown_gap=ledger.add_unknown_gap,
         )  # fmt: skip
         context = PathContext(
-            config.name, device.device_id, ledger, self._publish, ignore_message, ignore_frame,
+            config.name, device.device_id, ledger, self._publish, ignore_message, device.note_frame,
             lambda: device.overruns, self._host,
             _frame_of(config, driver, device.described),
         )  # fmt: skip
@@ -412,7 +417,3 @@ def _repeat(device: PlayedDevice, path: Any, call: CallRecord) -> None:
 
 def ignore_message(_message: Message, _t_rx_ns: int) -> None:
     """Ignore a text line or reply: a replay sends no requests."""
-
-
-def ignore_frame(_frame: BadFrame) -> None:
-    """Ignore a bad frame: the codec counts it in the ledger."""

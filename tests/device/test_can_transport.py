@@ -286,6 +286,10 @@ async def test_a_silent_device_reports_the_received_frames(bench: CanDeviceBench
         bench.link.feed(bench.frames(1, lost=lost))
     bench.rig.tick(ahead_ns=3000 * MS)
     assert words in bench.rig.problem
+    if lost:
+        bench.link.feed([bench.frames(2)[0]._replace(data=b"short")])
+        bench.rig.tick(ahead_ns=3000 * MS)
+        assert bench.rig.problem.endswith("; 1 frame of a wrong length, the last of CAN identifier 065")
 
 
 @pytest.mark.parametrize(
