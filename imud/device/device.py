@@ -121,8 +121,6 @@ class VerbRun:
                     verified = False
                 case Proof.RESTART:
                     verified, evidence = await self._samples.evidence(verb.proof, is_quiet)
-                    if verified is None and (changes := _changes(before, settings.values)):
-                        verified, evidence = True, f"the device has lost settings that its flash lacks: {changes}"
                 case Proof.SETTINGS:
                     after = settings.values if settings.is_current else {}
                     verified, evidence = _reset(before, after, was_unsaved)
@@ -130,6 +128,8 @@ class VerbRun:
                     verified, evidence = await self._agrees(verb, arguments)
                 case Proof.STREAM | Proof.ONE_SAMPLE:
                     verified, evidence = await self._samples.evidence(verb.proof, is_quiet)
+            if restarts and before and verb.proof is not Proof.SETTINGS and (lost := _changes(before, settings.values)):
+                verified, evidence = verified is not False, f"{evidence}; the restart changed settings: {lost}"
             return VerbResult(bool(verified), evidence, answer, settings.not_saved if unsaved else "")
 
     async def run_line(self, name: str, given: Mapping[str, Any], attachments: Attachments) -> VerbResult:

@@ -136,16 +136,9 @@ class CapturePlayer:
 
     def _context(self, publish: Callable[[Batch], None]) -> PathContext:
         frame = published_frame(None, None, None, self._driver.axes)
+        device, host = self.device, self._host
         return PathContext(
-            NAME,
-            DEVICE_ID,
-            self.device.ledger,
-            publish,
-            ignore_message,
-            self.device.note_frame,
-            lambda: 0,
-            self._host,
-            frame,
+            NAME, DEVICE_ID, device.ledger, publish, ignore_message, device.note_frame, lambda: 0, host, frame
         )
 
     def _publish_without_times(self, batch: Batch) -> None:

@@ -39,6 +39,10 @@ async def test_a_restart_is_verified_by_the_device_counter(bench: ModuleBench, i
     found = await result_of(bench, "restart")
     seen = "the device counter continued, so the device has ignored the command"
     assert (found.verified, found.evidence) == ((False, seen) if ignores else (True, "the device counter restarted"))
+    if not ignores:  # the device loses a setting that it has not saved
+        await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=False))
+        lost = '; the restart changed settings: mode is "6-axis", was "9-axis"'
+        assert (await result_of(bench, "restart")).evidence == "the device counter restarted" + lost
     applied = await bench.doing(bench.device.settings_apply({"mounting": "x_up"}, save=True))
     assert (applied.restarted, applied.problem) == ((False, f"restart: {seen}") if ignores else (True, ""))
 
