@@ -7,6 +7,8 @@
  *   is_usual, decode ─▶ HipnucCodec (imud/drivers/hipnuc/uart/codec.py)
  *   stamp ─▶ add_even_run (imud/sampling/clock.py), ArrivalFit.add_arrival (imud/sampling/arrival_fit.py),
  *                 encode_slots (imud/formats/slot.py)
+ *   write_slots ─▶ ShmRing (imud/publishers/shm.py)
+ *   frame_slots ─▶ BinaryEncoding (imud/publishers/socket/outbox.py)
  *   add_slots ─▶ add_slots (imud/publishers/socket/history.py)
  *
  * The result must be equal to the result of Python in every bit. Therefore the compiler must not join a product and a
@@ -90,8 +92,9 @@ typedef struct {
     Bin bin;
 } Run;
 
-static uint16_t crc16_table[256];
-static uint32_t crc32_table[8][256]; /* table k: effect of a byte that k bytes follow */
+/* table k: effect of a byte that k bytes follow */
+static uint16_t crc16_table[8][256];
+static uint32_t crc32_table[8][256];
 
 static void make_tables(void)
 {
@@ -102,20 +105,27 @@ static void make_tables(void)
             crc16 = (uint16_t)((crc16 << 1) ^ (crc16 & 0x8000 ? 0x1021 : 0));
             crc32 = (crc32 >> 1) ^ (crc32 & 1 ? 0xEDB88320u : 0);
         }
-        crc16_table[byte] = crc16;
+        crc16_table[0][byte] = crc16;
         crc32_table[0][byte] = crc32;
     }
     for (int k = 1; k < 8; k++)
         for (int byte = 0; byte < 256; byte++) {
             uint32_t before = crc32_table[k - 1][byte];
+            uint16_t before16 = crc16_table[k - 1][byte];
             crc32_table[k][byte] = (before >> 8) ^ crc32_table[0][before & 0xFF];
+            crc16_table[k][byte] = (uint16_t)((before16 << 8) ^ crc16_table[0][before16 >> 8]);
         }
 }
 
+/* Return the CRC-16 of `size` bytes after bytes with the value `crc`, as binascii.crc_hqx. Eight bytes per step. */
 static uint16_t crc16_xmodem(const uint8_t *data, size_t size, uint16_t crc)
 {
-    for (size_t i = 0; i < size; i++)
-        crc = (uint16_t)((crc << 8) ^ crc16_table[(crc >> 8) ^ data[i]]);
+    for (; size >= 8; data += 8, size -= 8)
+        crc = crc16_table[7][data[0] ^ crc >> 8] ^ crc16_table[6][data[1] ^ (crc & 0xFF)] ^ crc16_table[5][data[2]] ^
+              crc16_table[4][data[3]] ^ crc16_table[3][data[4]] ^ crc16_table[2][data[5]] ^ crc16_table[1][data[6]] ^
+              crc16_table[0][data[7]];
+    for (; size; data++, size--)
+        crc = (uint16_t)((crc << 8) ^ crc16_table[0][(crc >> 8) ^ *data]);
     return crc;
 }
 
@@ -286,12 +296,15 @@ static int is_in_range(const Run *run)
            run->device_id <= UINT16_MAX;
 }
 
+enum { DATA, WORD_IS_STATUS, T_RX_NS, UTC_OFFSET_NS, WAITED_NS, OFFSET_NS, EVEN_FROM_NS, ARGUMENTS };
+
 /* A sequence of usual frames that Python did not interrupt. Python copies the changed state back with `state`. */
 typedef struct {
     PyObject_HEAD
     Run run;
     int64_t frames; /* number of time-stamped frames */
     double error_ns; /* error of the newest time stamp */
+    PyObject *known[ARGUMENTS]; /* arguments of the last `stamp`: most of them are the same objects in each call */
 } RunObject;
 
 static PyObject *run_type;
@@ -318,21 +331,62 @@ static PyObject *start_hi91(PyObject *self, PyObject *args)
     made->run = run;
     made->frames = 0;
     made->error_ns = 0.0;
+    memset(made->known, 0, sizeof made->known);
     return (PyObject *)made;
+}
+
+/* Read an integer of Python. Return 0 with an exception if it is not an integer of 64 bits. */
+static int integer(PyObject *object, int64_t *value)
+{
+    *value = PyLong_AsLongLong(object);
+    return *value != -1 || !PyErr_Occurred();
+}
+
+static void know(RunObject *self, int index, PyObject *const *args)
+{
+    PyObject *before = self->known[index];
+    Py_INCREF(args[index]);
+    self->known[index] = args[index];
+    Py_XDECREF(before);
+}
+
+/* Read an argument of `stamp`, unless it is the object of the last call. */
+static int learn(RunObject *self, int index, PyObject *const *args, int64_t *value)
+{
+    int64_t read;
+    if (args[index] == self->known[index])
+        return 1;
+    if (!integer(args[index], &read))
+        return 0;
+    *value = read;
+    know(self, index, args);
+    return 1;
 }
 
 /* Run.stamp(data, word_is_status, t_rx_ns, utc_offset_ns, waited_ns, offset_ns, even_from_ns) -> slots of the usual
  * frames at the start of `data`; empty if the first frame needs Python */
-static PyObject *stamp_frames(RunObject *self, PyObject *args)
+static PyObject *stamp_frames(RunObject *self, PyObject *const *args, Py_ssize_t count)
 {
     Run *run = &self->run;
-    PyObject *bytes; /* the headers of Python 3.13 compile the format y# for Python 3.13 and later only */
     char *data;
     Py_ssize_t size, done = 0;
-    long long t_rx_ns, t_rx_before_ns = run->t_rx_ns;
-    if (!PyArg_ParseTuple(args, "SiLLLLL:stamp", &bytes, &run->word_is_status, &t_rx_ns, &run->utc_offset_ns,
-                          &run->waited_ns, &run->offset_ns, &run->even_from_ns) ||
-        PyBytes_AsStringAndSize(bytes, &data, &size) < 0)
+    int64_t t_rx_ns, t_rx_before_ns = run->t_rx_ns;
+    if (count != ARGUMENTS) {
+        PyErr_Format(PyExc_TypeError, "stamp: expected %d arguments, got %zd", ARGUMENTS, count);
+        return NULL;
+    }
+    if (PyBytes_AsStringAndSize(args[DATA], &data, &size) < 0)
+        return NULL;
+    if (args[WORD_IS_STATUS] != self->known[WORD_IS_STATUS]) {
+        int is_true = PyObject_IsTrue(args[WORD_IS_STATUS]);
+        if (is_true < 0)
+            return NULL;
+        run->word_is_status = is_true;
+        know(self, WORD_IS_STATUS, args);
+    }
+    if (!integer(args[T_RX_NS], &t_rx_ns) || !learn(self, UTC_OFFSET_NS, args, &run->utc_offset_ns) ||
+        !learn(self, WAITED_NS, args, &run->waited_ns) || !learn(self, OFFSET_NS, args, &run->offset_ns) ||
+        !learn(self, EVEN_FROM_NS, args, &run->even_from_ns))
         return NULL;
     if (t_rx_ns > run->t_rx_ns)
         run->t_rx_ns = t_rx_ns;
@@ -377,12 +431,14 @@ static PyObject *state_of(RunObject *self, PyObject *unused)
 static void free_run(PyObject *self)
 {
     PyTypeObject *type = Py_TYPE(self);
+    for (int i = 0; i < ARGUMENTS; i++)
+        Py_XDECREF(((RunObject *)self)->known[i]);
     PyObject_Free(self);
     Py_DECREF(type);
 }
 
 static PyMethodDef run_methods[] = {
-    {"stamp", (PyCFunction)stamp_frames, METH_VARARGS, "Return slots of the usual frames at the start of bytes."},
+    {"stamp", (PyCFunction)(void (*)(void))stamp_frames, METH_FASTCALL, "Return slots of the usual frames at the start of bytes."},
     {"state", (PyCFunction)state_of, METH_NOARGS, "Return the state after the newest frame."},
     {NULL, NULL, 0, NULL},
 };
@@ -400,6 +456,74 @@ static PyType_Slot run_slots[] = {
 static PyType_Spec run_spec = {
     "imud._kernel.Run", sizeof(RunObject), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_DISALLOW_INSTANTIATION, run_slots,
 };
+
+#define RING_HEADER_BYTES 4096 /* `HEADER_BYTES` of imud/formats/ring.py */
+#define RING_NEWEST_OFFSET 192
+#define RING_FIRST_OFFSET 200
+
+static void put_word(uint8_t *memory, uint64_t value)
+{
+    __atomic_store_n((uint64_t *)memory, value, __ATOMIC_RELEASE);
+}
+
+/* write_slots(memory, mask, newest_seq, slots): write slots one after the other into a ring of mask + 1 slots */
+static PyObject *write_slots(PyObject *self, PyObject *const *args, Py_ssize_t count)
+{
+    Py_buffer ring;
+    char *slots;
+    Py_ssize_t size;
+    int64_t mask, newest;
+    if (count != 4) {
+        PyErr_Format(PyExc_TypeError, "write_slots: expected 4 arguments, got %zd", count);
+        return NULL;
+    }
+    if (!integer(args[1], &mask) || !integer(args[2], &newest) || PyBytes_AsStringAndSize(args[3], &slots, &size) < 0 ||
+        PyObject_GetBuffer(args[0], &ring, PyBUF_WRITABLE) < 0)
+        return NULL;
+    uint8_t *memory = ring.buf;
+    if (mask < 0 || mask > (INT64_C(1) << 32) || ring.len < RING_HEADER_BYTES + (mask + 1) * (int64_t)sizeof(Slot)) {
+        PyBuffer_Release(&ring);
+        PyErr_SetString(PyExc_ValueError, "expected the memory of a ring of mask + 1 slots");
+        return NULL;
+    }
+    for (; size >= (Py_ssize_t)sizeof(Slot); size -= (Py_ssize_t)sizeof(Slot), slots += sizeof(Slot)) {
+        uint64_t seq;
+        memcpy(&seq, slots, sizeof seq);
+        uint8_t *slot = memory + RING_HEADER_BYTES + (seq & (uint64_t)mask) * sizeof(Slot);
+        put_word(slot, UINT64_MAX); /* invalid while it changes */
+        __atomic_thread_fence(__ATOMIC_SEQ_CST);
+        memcpy(slot + sizeof seq, slots + sizeof seq, sizeof(Slot) - sizeof seq);
+        put_word(slot, seq);
+        put_word(memory + RING_NEWEST_OFFSET, seq);
+        if (seq != (uint64_t)newest + 1) /* the ring does not contain the samples between */
+            put_word(memory + RING_FIRST_OFFSET, seq);
+        newest = (int64_t)seq;
+    }
+    PyBuffer_Release(&ring);
+    Py_RETURN_NONE;
+}
+
+#define FRAME_HEADER_BYTES 4 /* size of the message, little-endian (`FRAME_HEADER` of imud/formats/jsonrpc.py) */
+
+/* frame_slots(slots) -> the slots as messages of the socket, back to back */
+static PyObject *frame_slots(PyObject *self, PyObject *packed)
+{
+    char *slots;
+    Py_ssize_t size;
+    const uint32_t slot_bytes = sizeof(Slot);
+    if (PyBytes_AsStringAndSize(packed, &slots, &size) < 0)
+        return NULL;
+    Py_ssize_t count = size / (Py_ssize_t)sizeof(Slot);
+    PyObject *framed = PyBytes_FromStringAndSize(NULL, count * (Py_ssize_t)(FRAME_HEADER_BYTES + sizeof(Slot)));
+    if (framed == NULL)
+        return NULL;
+    char *to = PyBytes_AsString(framed);
+    for (; count; count--, slots += sizeof(Slot), to += FRAME_HEADER_BYTES + sizeof(Slot)) {
+        memcpy(to, &slot_bytes, FRAME_HEADER_BYTES);
+        memcpy(to + FRAME_HEADER_BYTES, slots, sizeof(Slot));
+    }
+    return framed;
+}
 
 /* Samples of one second (`SECOND` of imud/publishers/socket/history.py). */
 typedef struct {
@@ -518,6 +642,8 @@ static PyObject *add_slots(PyObject *self, PyObject *args)
 
 static PyMethodDef methods[] = {
     {"add_slots", add_slots, METH_VARARGS, "Add slots to the minimum and maximum of a second."},
+    {"frame_slots", frame_slots, METH_O, "Return slots as messages of the socket, back to back."},
+    {"write_slots", (PyCFunction)(void (*)(void))write_slots, METH_FASTCALL, "Write slots into a ring."},
     {"start_hi91", start_hi91, METH_VARARGS, "Return a Run for HI91 frames that starts with a state; or None."},
     {NULL, NULL, 0, NULL},
 };

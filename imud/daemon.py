@@ -26,7 +26,6 @@ from imud.config.model import Config, DeviceConfig
 from imud.contracts.condition import summary
 from imud.contracts.lines import LineFactory
 from imud.contracts.publisher import (
-    Batch,
     DeviceControl,
     DeviceLedger,
     OutputFacts,
@@ -179,6 +178,8 @@ class Daemon:
             configuration="" if file is None else str(file.absolute()),
         )
         self._outputs = Outputs(self._context, extra or {})
+        # a direct reference: a method of this class would cost one more call per batch
+        self.publish: Final = self._outputs.publish
         self._until_finished = until_finished
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._ids: dict[str, int] = {}
@@ -359,10 +360,6 @@ class Daemon:
         log.error("%s", context.get("message"), exc_info=error if isinstance(error, BaseException) else None)
         self._failure = error if isinstance(error, BaseException) else RuntimeError(str(context.get("message")))
         self._stop.set()
-
-    def publish(self, batch: Batch) -> None:
-        """Pass samples of a device to the outputs."""
-        self._outputs.publish(batch)
 
     def send_event(self, event: Event) -> None:
         """Store an event, and pass it to the outputs."""

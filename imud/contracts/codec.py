@@ -1,9 +1,9 @@
 """Contract of a codec: bytes to events, without I/O. Invalid bytes become `BadFrame`, never an exception."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import msgspec
 
@@ -68,25 +68,21 @@ def count_unknown(counts: dict[int, int], frame_type: int) -> None:
         counts[frame_type] = counts.get(frame_type, 0) + 1
 
 
-class UsualFrames(NamedTuple):
-    """Bytes that can start with frames for the kernel."""
-
-    data: bytes  # all bytes that the codec has not decoded
-    word_is_status: bool  # as in the codec
-    start: Callable[..., Any]  # function of the kernel that starts a run (`start_hi91`)
-
-
 @runtime_checkable
 class KernelCodec(Protocol):
     """Codec of frames that the kernel decodes. `imud.drivers` implements it, and the sample path may not import it."""
 
-    def usual_frames(self, data: bytes) -> UsualFrames | None:
-        """Return the next bytes `data` of the stream for the kernel; None if the first event needs `feed`. This method
-        changes nothing."""
+    kernel_start: ClassVar[str]  # name of the function of the kernel that starts a run
+    word_is_status: bool  # whether a word of the frame contains status bits
+
+    def usual_frames(self, data: bytes) -> bytes:
+        """Return all bytes that the codec has not decoded, with the next bytes `data` of the stream; empty if the first
+        event needs `feed`. This method changes nothing."""
         ...
 
-    def take(self, frames: UsualFrames, count: int, data: bytes) -> bytes:
-        """Count `count` of the frames, at least one, as samples. Return the end of `data` that `feed` must decode."""
+    def take(self, frames: bytes, count: int, data: bytes) -> bytes:
+        """Count the first `count` frames of `usual_frames`, at least one, as samples. Return the end of `data` that
+        `feed` must decode."""
         ...
 
 

@@ -64,7 +64,10 @@ class Batch:
     needs only slots thus creates no sample objects.
     """
 
-    __slots__ = ("_converted", "_packed", "_samples", "device", "device_id", "frame")
+    __slots__ = ("_converted", "device", "device_id", "frame", "is_packed", "packed", "samples")
+
+    samples: Sequence[Sample]  # sample objects
+    packed: bytes  # slots (`imud.formats.slot`) back to back
 
     def __init__(
         self,
@@ -78,43 +81,37 @@ class Batch:
         self.device = device
         self.device_id = device_id  # number of the device in slots
         self.frame = frame  # axes and angles of the samples
-        self._samples = samples
-        self._packed = packed
+        self.is_packed = samples is None  # whether the path made slots without sample objects
+        if samples is not None:
+            self.samples = samples
+        if packed or samples is None:
+            self.packed = packed
         self._converted: dict[Convention, Batch] | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        """Make the missing form. Python calls this method for an empty slot only, so that each later use is fast."""
+        if name == "samples":
+            self.samples = decode_slots(self.packed, self.device)
+            return self.samples
+        if name == "packed":
+            slots = encode_slots(self.samples, self.device_id)
+            self.packed = slots[0] if len(slots) == 1 else b"".join(slots)
+            return self.packed
+        raise AttributeError(name)
 
     def __len__(self) -> int:
         """Return the number of samples."""
-        return len(self._packed) // SLOT_BYTES if self._samples is None else len(self._samples)
-
-    @property
-    def samples(self) -> Sequence[Sample]:
-        """Sample objects. The first use decodes them from the slots."""
-        samples = self._samples
-        if samples is None:
-            samples = self._samples = decode_slots(self._packed, self.device)
-        return samples
-
-    @property
-    def packed(self) -> bytes:
-        """Samples as slots (`imud.formats.slot`) back to back. The first use encodes them."""
-        packed = self._packed
-        if not packed:
-            assert self._samples is not None
-            slots = encode_slots(self._samples, self.device_id)
-            packed = self._packed = slots[0] if len(slots) == 1 else b"".join(slots)
-        return packed
+        return len(self.packed) // SLOT_BYTES if self.is_packed else len(self.samples)
 
     @property
     def seqs(self) -> tuple[int, int]:
         """Sequence numbers of the first and the last sample."""
-        samples = self._samples
-        return slot_seqs(self._packed) if samples is None else (samples[0].seq, samples[-1].seq)
+        return slot_seqs(self.packed) if self.is_packed else (self.samples[0].seq, self.samples[-1].seq)
 
     @property
     def times_ns(self) -> Sequence[int]:
         """Time stamps of the samples (`t_ns`)."""
-        samples = self._samples
-        return slot_times_ns(self._packed) if samples is None else [sample.t_ns for sample in samples]
+        return slot_times_ns(self.packed) if self.is_packed else [sample.t_ns for sample in self.samples]
 
     def converted(self, convention: Convention | None) -> "Batch":
         """Return the samples in a convention; None: as published. The first call rotates them."""

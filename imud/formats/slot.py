@@ -109,6 +109,7 @@ _CRC = struct.Struct("<I")
 _SLOT = struct.Struct(f"{SLOT_BYTES}s")
 _SEQ = struct.Struct("<Q")
 _T_NS = struct.Struct("<8xq240x")
+slot_time_ns: Final = _T_NS.unpack  # returns a tuple with the field `t_ns` of one slot
 _STATUS = struct.Struct("<56xI196x")
 _QUALITY = struct.Struct("<48xI10xB193x")
 _SYNC_OFFSET: Final = next(field.offset for field in SLOT_FIELDS if field.name == "sync")
@@ -242,6 +243,23 @@ def _clipped(value: int, low: int, high: int) -> int:
     return min(max(value, low), high)
 
 
+class EqualPieces(Sequence[bytes]):
+    """Pieces of equal size, back to back in `whole`. The use of one piece cuts it out."""
+
+    def __init__(self, whole: bytes, size: int) -> None:
+        self.whole = whole
+        self._size = size
+
+    def __len__(self) -> int:
+        return len(self.whole) // self._size
+
+    def __getitem__(self, index: Any) -> Any:
+        """Return one piece, or a list of pieces for a slice."""
+        whole, size = self.whole, self._size
+        at = range(0, len(whole), size)[index]
+        return whole[at : at + size] if isinstance(at, int) else [whole[one : one + size] for one in at]
+
+
 def slots_in(packed: bytes) -> Iterator[tuple[bytes]]:
     """Return an iterator over packed slots."""
     return _SLOT.iter_unpack(packed)
@@ -250,6 +268,12 @@ def slots_in(packed: bytes) -> Iterator[tuple[bytes]]:
 def slot_seqs(packed: bytes) -> tuple[int, int]:
     """Return the sequence numbers of the first and the last of packed slots."""
     return _SEQ.unpack_from(packed)[0], _SEQ.unpack_from(packed, len(packed) - SLOT_BYTES)[0]
+
+
+def newest_seq(packed: bytes) -> int:
+    """Return the sequence number of the last of packed slots."""
+    seq: int = _SEQ.unpack_from(packed, len(packed) - SLOT_BYTES)[0]
+    return seq
 
 
 def slot_times_ns(packed: bytes) -> list[int]:

@@ -231,7 +231,7 @@ class SampleLoop(asyncio.SelectorEventLoop):
 
     def add_reader(self, fd: Any, callback: Callable[[*Arguments], Any], *args: *Arguments) -> None:
         """Call `callback` with `args` in each turn in which `fd`, a descriptor or a file, is readable or at its end."""
-        self._reader_selector.add(_number_of(fd), partial(callback, *args))
+        self._reader_selector.add(_number_of(fd), partial(callback, *args) if args else callback)
 
     def remove_reader(self, fd: Any) -> bool:
         """Remove the reader of a descriptor, also of asyncio itself (`sock_recv`, …). Return whether it existed."""

@@ -14,7 +14,7 @@ import secrets
 import stat
 import struct
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
@@ -24,6 +24,7 @@ from typing import Annotated, Final
 import msgspec
 
 from imud.contracts.publisher import Batch, PublisherContext, PublisherType
+from imud.formats import kernel
 from imud.formats.ring import (
     DIRECTORY,
     FIRST_WORD,
@@ -45,7 +46,7 @@ from imud.formats.ring import (
     encode_ledger_block,
     ring_path,
 )
-from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, slot_seqs, slots_in
+from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, newest_seq, slot_seqs, slots_in
 from imud.host.files import can_replace, user_name
 from imud.model.errors import ServerError
 from imud.model.event import Event
@@ -301,6 +302,8 @@ class ShmRing:
         with memoryview(self._memory) as view:
             self._words, self._halves = view.cast("Q"), view.cast("I")
         self._mask = header.slot_count - 1
+        # function of the kernel in C, if it is installed
+        self._write_slots: Callable[..., None] | None = getattr(kernel.present.module, "write_slots", None)
         self._newest = header.newest_seq
         self._update = 0
         self._known: tuple[str, Sequence[int]] | None = None
@@ -318,6 +321,9 @@ class ShmRing:
         if _lseek(self._fd, 0, _END) < self._least_bytes:
             self._restore_size()
             self._newest = slot_seqs(packed)[1]
+        elif self._write_slots is not None:
+            self._write_slots(self._memory, self._mask, self._newest, packed)
+            self._newest = newest_seq(packed)
         elif len(packed) == SLOT_BYTES:
             self._write_one(packed)
         elif not self._write_run(packed):

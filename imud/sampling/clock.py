@@ -22,7 +22,6 @@ from functools import partial
 from math import hypot
 from typing import Any, Final, NamedTuple
 
-from imud.contracts.codec import UsualFrames
 from imud.contracts.lines import (
     NO_TIME_BITS,
     Edge,
@@ -44,6 +43,8 @@ from imud.sampling.arrival_time import FIRST_SPREAD_NS, ArrivalTime, LinkDelay
 from imud.sampling.device_time import FIRST_EARLY_NS, JUMP_EARLY_NS, JUMP_LATE_NS, DeviceTime, JumpDetector, StampTime
 from imud.sampling.gaps import GAP_PERIODS, CounterLine
 from imud.sampling.steering import SETTLED_AFTER_NS, AidingSources, Holdover, Slew
+
+StartRun = Callable[..., Any]  # function of the kernel that starts a run, with its first argument
 
 _EARLY_NS: Final = -JUMP_EARLY_NS
 _T_ERR_MOST: Final = float(T_ERR_MOST)
@@ -278,26 +279,25 @@ class SampleClock:
         """CLOCK_MONOTONIC at the read of the newest sample."""
         return self._t_rx_ns if self._run is None else int(self._run.t_rx_ns)
 
-    def stamp_frames(self, frames: UsualFrames, device_id: int, t_rx_ns: int, utc_offset_ns: int) -> bytes:
+    def stamp_frames(
+        self, start: StartRun, frames: bytes, word_is_status: bool, t_rx_ns: int, utc_offset_ns: int
+    ) -> bytes:
         """Return the slots of the usual frames at the start of the bytes, as `add_run`; empty if `sample` or `add_run`
         must process the first frame. The kernel then keeps the state until `settle`."""
         run, host = self._run, self._host
-        if run is None:
-            run = self._start_run(frames, device_id)
-            if run is None:
-                return b""
+        if run is None and (run := self._start_run(start)) is None:
+            return b""
         try:
             slots: bytes = run.stamp(
-                frames.data, frames.word_is_status, t_rx_ns, utc_offset_ns, self.waited_ns, host.offset_ns,
-                host.even_from_ns,
-            )  # fmt: skip
+                frames, word_is_status, t_rx_ns, utc_offset_ns, self.waited_ns, host.offset_ns, host.even_from_ns
+            )
         except OverflowError:  # a value with more than 64 bits
             return b""
         if slots:
             self._run, self.missed = run, 0
         return slots
 
-    def _start_run(self, frames: UsualFrames, device_id: int) -> Any:
+    def _start_run(self, start: StartRun) -> Any:
         """Return a run of the kernel with the present state; None if the next frames need Python."""
         time, fit = self._time, self._fit
         if (
@@ -306,8 +306,7 @@ class SampleClock:
         ):  # fmt: skip
             return None
         try:
-            return frames.start(
-                device_id,
+            return start(
                 (
                     SYNC_CODES[self._fit_sync], -1 if self._own_status is None else self._own_status, self._seq,
                     self._t_ns, self._t_rx_ns, self._delay.byte_ns or 1, self._fit_bias_ns, self._fit_error_ns,

@@ -8,8 +8,9 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import hypot, sqrt
-from typing import ClassVar, Final, NamedTuple, Protocol
+from typing import Any, ClassVar, Final, NamedTuple, Protocol
 
 from imud.attitude.published import PublishedAxes
 from imud.contracts.codec import (
@@ -28,14 +29,23 @@ from imud.contracts.lines import DeviceLines, Edge, ReadyOptions
 from imud.contracts.observer import InputObserver
 from imud.contracts.publisher import AS_SENT, Batch
 from imud.contracts.script import Message, ReplyFrame, TextLine
+from imud.formats import kernel
 from imud.formats.can import CanFrame
-from imud.formats.slot import DEVICE_ID_MOST, SLOT_BYTES, decode_slots, slot_quality, slot_status_bits, slot_times_ns
+from imud.formats.slot import (
+    DEVICE_ID_MOST,
+    SLOT_BYTES,
+    decode_slots,
+    slot_quality,
+    slot_status_bits,
+    slot_time_ns,
+    slot_times_ns,
+)
 from imud.host.clock import UNSTEERED, HostClock, SteadyTime
 from imud.model.errors import Trouble
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Sample, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
-from imud.sampling.clock import SampleClock
+from imud.sampling.clock import SampleClock, StartRun
 from imud.sampling.gaps import GAP_PERIODS
 from imud.sampling.meters import LatencyMeter, LossMeter
 from imud.sampling.steering import STAMP_FLOOR_NS
@@ -63,7 +73,7 @@ class SamplePath(ABC):
     # Attributes that a recorded state does not contain: parts of the daemon, and statistics.
     NOT_STATE: ClassVar = frozenset({
         "_device", "_device_id", "_drain_edges", "_ledger", "_listener", "_now_ns", "_on_bad_frame", "_on_message",
-        "_overruns", "_publish", "_rotation", "_status_mask", "_status_seen", "_kernel_codec", "_utc_offset_ns",
+        "_overruns", "_publish", "_rotation", "_start_run", "_status_mask", "_status_seen", "_utc_offset_ns",
         "frame",
         "latency",
     })  # fmt: skip
@@ -256,13 +266,14 @@ class SamplePath(ABC):
             self._finish(decode_slots(packed, self._device), t_rx_ns)
             return
         self._ledger.samples += len(packed) // SLOT_BYTES
-        self._newest = packed[-SLOT_BYTES:]
+        self._newest = packed if len(packed) == SLOT_BYTES else packed[-SLOT_BYTES:]
         self.last_sample_ns = t_rx_ns
         self._publish(Batch(self._device, self._device_id, None, self.frame, packed))
         if mask := self._status_mask:
             self._status_seen |= slot_status_bits(packed) & mask
         if len(packed) == SLOT_BYTES:
-            self.latency.add_one(self._now_ns() - self.clock.t_ns)
+            (t_ns,) = slot_time_ns(packed)
+            self.latency.add_one(self._now_ns() - t_ns)
         else:
             self.latency.add(self._now_ns(), slot_times_ns(packed))
 
@@ -297,7 +308,9 @@ class StreamPath(SamplePath):
         self.codec = codec
         self._listener = listener
         self._drain_edges = drain_edges
-        self._kernel_codec = codec if isinstance(codec, KernelCodec) and context.device_id <= DEVICE_ID_MOST else None
+        self._start_run: StartRun | None = None  # None if Python decodes all frames
+        if isinstance(codec, KernelCodec) and context.device_id <= DEVICE_ID_MOST and kernel.present.module is not None:
+            self._start_run = partial(getattr(kernel.present.module, codec.kernel_start), context.device_id)
         # samples that `publish_gathered` will publish, oldest first: packed slots of the kernel, then sample objects.
         # Not two lists: an object with more than 30 attributes is slower.
         self.gathered: list[Sample | bytes] = []
@@ -375,15 +388,17 @@ class StreamPath(SamplePath):
     def _stamp(self, data: bytes, t_rx_ns: int, samples: list[Sample]) -> tuple[bytes, Sequence[CodecEvent]]:
         """Process usual frames at the start of `data` with the kernel, then the rest as `_sort`. Return the slots of
         the frames and the events of the rest."""
-        codec, clock = self._kernel_codec, self.clock
+        codec: Any = self.codec  # a KernelCodec if `_start_run` is not None
         packed, utc_offset_ns = b"", None
-        if codec is not None and (frames := codec.usual_frames(data)) is not None:
+        if self._start_run is not None and (frames := codec.usual_frames(data)):
             utc_offset_ns = self._utc_offset_ns()
-            packed = clock.stamp_frames(frames, self._device_id, t_rx_ns, utc_offset_ns)
+            packed = self.clock.stamp_frames(self._start_run, frames, codec.word_is_status, t_rx_ns, utc_offset_ns)
             if packed:
                 self.loss.bad_frames = 0
                 data = codec.take(frames, len(packed) // SLOT_BYTES, data)
-        events = self.codec.feed(data) if data else ()
+                if not data:
+                    return packed, ()
+        events = codec.feed(data)
         if events:
             self._sort(events, t_rx_ns, self._utc_offset_ns() if utc_offset_ns is None else utc_offset_ns, samples)
         return packed, events

@@ -20,6 +20,7 @@ import pytest
 from imud.client.ring import Ring
 from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceStatus
+from imud.formats import kernel
 from imud.formats import ring as layout
 from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, encode_slot
 from imud.model.errors import ServerError
@@ -93,11 +94,17 @@ def test_slots_are_at_the_position_of_their_number_and_the_ring_wraps(board: Boa
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_batches_and_single_samples_write_the_same_bytes(tmp_path: Path, seed: int) -> None:
+@pytest.mark.parametrize("found", [kernel.present, kernel.Kernel(None)], ids=["kernel", "python"])
+def test_batches_and_single_samples_write_the_same_bytes(
+    tmp_path: Path, seed: int, found: kernel.Kernel, monkeypatch: pytest.MonkeyPatch
+) -> None:
     random = Random(seed)
     for name in ("one", "many"):
         (tmp_path / name).mkdir()
-    one, many = Board(tmp_path / "one"), Board(tmp_path / "many")
+    monkeypatch.setattr(kernel, "present", found)
+    many = Board(tmp_path / "many")
+    monkeypatch.setattr(kernel, "present", kernel.Kernel(None))
+    one = Board(tmp_path / "one")
     seq = 0
     for _ in range(40):
         numbers = []
@@ -156,6 +163,7 @@ def test_order_of_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         patch.setattr(ring, "memoryview", lambda memory: Spy(memoryview(memory), notes), raising=False)
         patch.setattr(SpyMap, "notes", notes)
         patch.setattr(mmap, "mmap", SpyMap)
+        patch.setattr(kernel, "present", kernel.Kernel(None))
         board = Board(tmp_path)
     monkeypatch.setattr(SpyMap, "notes", notes)
     board.publish([1])

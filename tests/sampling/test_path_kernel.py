@@ -109,7 +109,7 @@ class Run:
         self.path.observe(self.seen.observer)
 
     def publish(self, batch: Batch) -> None:
-        self.kernel_batches += batch._samples is None
+        self.kernel_batches += batch.is_packed
         self.slots += batch.packed
 
     def do(self, step: Step) -> None:

@@ -21,8 +21,9 @@ from typing import Final
 
 from imud.attitude.conventions import Convention
 from imud.contracts.publisher import Batch
+from imud.formats import kernel
 from imud.formats.jsonrpc import FRAME_HEADER, encode, encode_notification, frame_of, line_of, with_texts
-from imud.formats.slot import SLOT_BYTES, slots_in
+from imud.formats.slot import SLOT_BYTES, EqualPieces, slots_in
 from imud.model.errors import reason_of
 from imud.model.sample import Sample
 
@@ -33,6 +34,7 @@ MESSAGE_GUESS_BYTES: Final = 700
 _HEAD: Final = b'{"jsonrpc":"2.0","method":"sample","params":'
 _TAIL: Final = b"}"
 _SLOT_HEADER: Final = FRAME_HEADER.pack(SLOT_BYTES)
+_FRAMED_BYTES: Final = FRAME_HEADER.size + SLOT_BYTES
 
 
 class Encoding(ABC):
@@ -100,7 +102,7 @@ class JsonEncoding(Encoding):
 class BinaryEncoding(Encoding):
     """Frames with one slot each."""
 
-    message_bytes = FRAME_HEADER.size + SLOT_BYTES
+    message_bytes = _FRAMED_BYTES
 
     def encode(self, batch: Batch) -> Sequence[bytes]:
         if self._convention is not None:
@@ -108,6 +110,8 @@ class BinaryEncoding(Encoding):
         packed = batch.packed
         if len(packed) == SLOT_BYTES:  # the usual case: faster than a list comprehension
             return [_SLOT_HEADER + packed]
+        if kernel.present.module is not None:
+            return EqualPieces(kernel.present.module.frame_slots(packed), _FRAMED_BYTES)
         return [_SLOT_HEADER + slot for (slot,) in slots_in(packed)]
 
     def encode_one(self, batch: Batch, index: int) -> bytes:
@@ -366,7 +370,10 @@ class Outbox(ABC):
     ) -> None:  # fmt: skip
         """Send samples of one device to several clients: the same bytes, one `send` each."""
         # one loop here: a method call per client would cost as much as all other code around `send`
-        whole = messages[0] if len(messages) == 1 else b"".join(messages)
+        if type(messages) is EqualPieces:
+            whole = messages.whole
+        else:
+            whole = messages[0] if len(messages) == 1 else b"".join(messages)
         size, samples = len(whole), len(messages)
         delivery: Delivery | None = None
         for outbox in outboxes:

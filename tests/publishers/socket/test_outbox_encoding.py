@@ -177,7 +177,7 @@ def test_losses_are_reported_with_converted_samples() -> None:
     assert turned.message_bytes == len(second)
     binary = BinaryEncoding(Convention.NED_FRD)
     assert binary.message_bytes == BinaryEncoding.message_bytes
-    assert binary.encode(batch) == BinaryEncoding().encode(batch.converted(Convention.NED_FRD))
+    assert list(binary.encode(batch)) == list(BinaryEncoding().encode(batch.converted(Convention.NED_FRD)))
 
 
 @in_server()

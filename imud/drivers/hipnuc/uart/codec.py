@@ -25,11 +25,11 @@ from binascii import crc_hqx as crc16_xmodem
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isfinite
-from typing import Any, Final, Literal, ParamSpec
+from typing import Any, ClassVar, Final, Literal, ParamSpec
 
 import msgspec
 
-from imud.contracts.codec import BadFrame, BadReason, CodecEvent, UsualFrames, count_unknown
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
 from imud.contracts.lines import TimeBits
 from imud.drivers.hipnuc.common import (
     EULER_RAD_PER_LSB,
@@ -54,7 +54,6 @@ from imud.drivers.value_limits import (
     scaled,
     values_possible,
 )
-from imud.formats import kernel
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Quaternion, Vector3
@@ -362,22 +361,26 @@ class HipnucCodec:
 
     # --- frames for the kernel --------------------------------------------------------------------------------------
 
-    def usual_frames(self, data: bytes) -> UsualFrames | None:
-        module, tail = kernel.present.module, self._tail
-        if module is None or self._bad_ahead or self._barred_ahead or self._lines.pending_bytes:
-            return None
-        return UsualFrames(tail + data if tail else data, self.word_is_status, module.start_hi91)
+    kernel_start: ClassVar = "start_hi91"
 
-    def take(self, frames: UsualFrames, count: int, data: bytes) -> bytes:
+    def usual_frames(self, data: bytes) -> bytes:
+        if self._bad_ahead or self._barred_ahead or self._lines.pending_bytes:
+            return b""
+        return self._tail + data if self._tail else data
+
+    def take(self, frames: bytes, count: int, data: bytes) -> bytes:
         ledger, size = self.ledger, count * _HI91_FRAME_BYTES
-        rest = frames.data[size:]
-        is_start = len(rest) < _HI91_FRAME_BYTES and rest[: len(_HI91_HEAD)] == _HI91_HEAD[: len(rest)]
-        self._tail = rest if is_start else b""
-        ledger.bytes_in += len(data) if is_start else len(data) - len(rest)
         ledger.bytes_in_good_frames += size
-        ledger.bytes_pending = len(self._tail)
         ledger.frames_good += count
         ledger.frames_in_samples += count
+        if size == len(frames):  # the usual case, without a slice
+            self._tail, rest, is_start = b"", b"", True
+        else:
+            rest = frames[size:]
+            is_start = len(rest) < _HI91_FRAME_BYTES and rest[: len(_HI91_HEAD)] == _HI91_HEAD[: len(rest)]
+            self._tail = rest if is_start else b""
+        ledger.bytes_in += len(data) if is_start else len(data) - len(rest)
+        ledger.bytes_pending = len(self._tail)
         return b"" if is_start else rest
 
     # --- end of the stream ------------------------------------------------------------------------------------------
