@@ -481,7 +481,8 @@ static PyObject *write_slots(PyObject *self, PyObject *const *args, Py_ssize_t c
         PyObject_GetBuffer(args[0], &ring, PyBUF_WRITABLE) < 0)
         return NULL;
     uint8_t *memory = ring.buf;
-    if (mask < 0 || mask > (INT64_C(1) << 32) || ring.len < RING_HEADER_BYTES + (mask + 1) * (int64_t)sizeof(Slot)) {
+    if (mask < 0 || mask > (INT64_C(1) << 32) || ring.len < RING_HEADER_BYTES + (mask + 1) * (int64_t)sizeof(Slot) ||
+        (uintptr_t)memory % sizeof(uint64_t)) {
         PyBuffer_Release(&ring);
         PyErr_SetString(PyExc_ValueError, "expected the memory of a ring of mask + 1 slots");
         return NULL;

@@ -210,6 +210,10 @@ def test_the_kernel_accepts_any_bytes_and_numbers() -> None:
             for _ in range(2):
                 slots = b"" if made is None else made.stamp(bytes(stream), *arguments)
                 assert len(slots) <= len(stream) // len(hi91(0)) * SLOT_BYTES
+                assert len(module.frame_slots(slots)) == len(slots) + 4 * (len(slots) // SLOT_BYTES)
+                with contextlib.suppress(ValueError):  # a memory that is too small for the ring
+                    memory = bytearray(random.choice([4096 + SLOT_BYTES, 4096 + 8 * SLOT_BYTES]))
+                    module.write_slots(memory, random.choice([0, 7, *EXTREMES]), random.choice(EXTREMES), slots)
                 assert made is None or len(made.state()) == 8
                 made_slots += bool(slots)
     assert made_slots > 300
