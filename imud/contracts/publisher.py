@@ -299,6 +299,7 @@ class PublisherContext:
     tick_soon: Callable[[], None] = _do_nothing  # requests the next tick within 0.1 s
     configuration: str = ""  # absolute path of the configuration file; empty without a file
     past_events: EventLog = field(default_factory=EventLog)
+    kept: dict[str, Any] = field(default_factory=dict)  # data that a restarted output continues with, by name
 
 
 def _claims_nothing(_settings: Options) -> Sequence[Claim]:

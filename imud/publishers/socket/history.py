@@ -5,7 +5,7 @@ object is made. The kernel in C does this work if it is installed.
 """
 
 from bisect import bisect_left
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from itertools import groupby, takewhile
@@ -162,6 +162,11 @@ class History:
     def remove(self, device: str) -> None:
         """Forget a device. Do nothing if it is unknown."""
         self._devices.pop(device, None)
+
+    def retain(self, devices: Collection[str]) -> None:
+        """Forget all other devices."""
+        for name in [one for one in self._devices if one not in devices]:
+            del self._devices[name]
 
     def frame(self, device: str) -> PublishedAxes | None:
         """Return the axes of the samples of a device; None without samples."""

@@ -306,7 +306,10 @@ class SocketServer:
         pool = Pool(settings.memory_mb * MIB, limits)
         self.hub = Hub(settings.path, context, self._quota, self._time, pool, handle_line)
         has_history = kernel.present.module is not None if settings.history is None else settings.history
-        self.hub.history = History() if has_history else None
+        if has_history:  # a reload of the section `socket` makes a new server, which continues the history
+            self.hub.history = context.kept.setdefault("history", History())
+        else:
+            context.kept.pop("history", None)
         # direct references: a method of this class would cost one more call per batch
         self.publish: Final = self.hub.publish
         self.event: Final = self.hub.event
@@ -325,6 +328,8 @@ class SocketServer:
         settings = self._settings
         self._guard = Guard(os.geteuid(), gid_of(settings.group), gid_of(settings.control_group))
         self._name_control_group(settings.control_group)
+        if self.hub.history is not None:
+            self.hub.history.retain(self.hub.devices)
         self._listener = self._listen()
         self._scheduler = Scheduler(self._context.clock.now_ns, self._context.clock.cpu_ns, self._time)
         asyncio.get_running_loop().add_reader(self._listener.sock, self._accept)

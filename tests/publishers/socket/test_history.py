@@ -15,7 +15,8 @@ from imud.model.bucket import VECTORS, Bucket
 from imud.model.sample import Sample
 from imud.publishers.socket import history
 from imud.publishers.socket.history import SECOND, History, buckets
-from imud.publishers.socket.server import SocketServer
+from imud.publishers.socket.server import SocketOptions, SocketServer
+from tests.support.publisher_context import publisher_context
 from tests.support.socket_rig import Peer, batch, in_server, sample
 
 S = 1_000_000_000
@@ -121,6 +122,20 @@ def test_the_history_ends_after_an_hour_or_at_the_limit_of_memory(monkeypatch: p
     assert [one.first_s for one in found(of)] == [3.0, 4.0]
     of.remove("imu0")
     assert found(of) == []
+
+
+def test_a_new_server_after_a_reload_continues_the_history() -> None:
+    context = publisher_context()
+    for has_history, continues in ((True, False), (True, True), (False, False), (True, False)):
+        server = SocketServer(SocketOptions(history=has_history), context)
+        server.add_device("imu0", 0)
+        history = server.hub.history
+        assert (history is not None) is has_history
+        assert bool(history and history.seconds("imu0")) is continues
+        server.publish(batch("imu0", 1, 100, 20_000_000))
+    assert history is not None
+    history.retain(["imu1"])
+    assert history.seconds("imu0") == b""
 
 
 @in_server()
