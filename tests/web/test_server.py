@@ -125,6 +125,14 @@ async def test_the_page_has_safe_headers_and_other_names_and_sites_are_refused(t
             answer = await site.client.get(path)
             assert answer.status == 200, path
             assert "Content-Security-Policy" in answer.headers
+            assert (answer.headers["Content-Encoding"], answer.charset) == ("gzip", "utf-8")
+            file = (STATIC / path.removeprefix("/static/")).read_bytes()
+            assert await answer.read() == file
+            assert int(answer.headers["Content-Length"]) < 0.8 * len(file)
+            plain = await site.client.get(path, headers={"Accept-Encoding": "identity"})
+            assert (await plain.read(), plain.headers.get("Content-Encoding")) == (file, None)
+            known = await site.client.get(path, headers={"If-None-Match": plain.headers["ETag"]})
+            assert (known.status, await known.read()) == (304, b"")
         assert (await site.client.get("/static/../app.py")).status == 404
         assert (await site.client.get("/static/")).status in (403, 404)
         missing = await site.client.get("/none")
