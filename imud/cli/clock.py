@@ -11,9 +11,9 @@ from typing import Final
 import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket, connect, finite, statuses
-from imud.cli.output import histogram
+from imud.cli.output import histogram, paragraph
 from imud.client.connection import Client
-from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
+from imud.contracts.status import ClockStatus, DeviceStatus
 from imud.model.errors import ImudError
 from imud.model.sample import Sync
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
@@ -101,7 +101,7 @@ def page(devices: list[DeviceStatus], behind: dict[str, deque[int]]) -> str:
 
 def block(status: DeviceStatus, behind_ns: deque[int]) -> str:
     clock = status.clock
-    lines = [] if status.state is DeviceState.RUNNING else [f"{status.name} is {status.state}: {status.problem}"]
+    lines = paragraph(f"{status.name}: ", str(status.condition)) if status.has_problem else []
     lines += [
         f"{status.name}: time stamps by {clock.sync}, error {clock.t_err_ns / NS_PER_US:.1f} µs (one sigma)",
         f"  offset    {clock.offset_ns / NS_PER_S:+.9f} s (host - device), skew {clock.skew_ppm:+.3f} ppm, "

@@ -19,8 +19,8 @@ from imud.cli.arguments import CliCommand, add_socket, duration_s
 from imud.cli.output import complain, local_time, raise_if_unread
 from imud.client.connection import Client
 from imud.client.feed import clock_ahead_ns, utc_offset_ns
+from imud.contracts.condition import DeviceCondition, signature
 from imud.contracts.condition import duration as in_words
-from imud.contracts.status import DeviceState
 from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
 from imud.model.errors import LinkMissing, ServerError
 from imud.model.event import LEVELS, Event, StoredEvent
@@ -75,7 +75,7 @@ class DeviceLister(Protocol):
 
 
 class DeviceNotes:
-    """Notes on standard error about watched devices without samples, and about dropped samples."""
+    """Notes on standard error about the conditions of watched devices, and about dropped samples."""
 
     def __init__(self, client: DeviceLister, names: Sequence[str]) -> None:
         """`names`: the watched devices; empty for all devices."""
@@ -90,25 +90,27 @@ class DeviceNotes:
         self._dropped[device] = self._dropped.get(device, 0) + count
 
     def look(self, now_s: float) -> None:
-        """Request the device states, at most once per LOOK_S, and print the changes."""
+        """Request the conditions, at most once per LOOK_S, and print the changes."""
         if now_s < self._due_s:
             return
         self._due_s = now_s + LOOK_S
         found = {str(device["name"]): device for device in self._client.devices()}
         for name in self._names or sorted({*found, *self._noted}):
-            words = _why_silent(found[name]) if name in found else "no longer in the configuration"
-            if words != self._noted.get(name, ""):
-                complain(f"imud watch: {name} is {words or 'running'}")
-            self._noted[name] = words
+            cause, words = _condition(found[name]) if name in found else ("gone", "no longer in the configuration")
+            if cause != self._noted.get(name, ""):
+                complain(f"imud watch: {name}: {words}")
+            self._noted[name] = cause
         for name, count in self._dropped.items():
             complain(f"imud watch: the daemon dropped {count} samples of {name} because imud watch was too slow")
         self._dropped.clear()
 
 
-def _why_silent(device: Mapping[str, Any]) -> str:
-    """Describe state and problem of a device. Empty if the device runs."""
-    state, problem = device["state"], device["problem"]
-    return "" if state == DeviceState.RUNNING else f"{state}: {problem}" if problem else str(state)
+def _condition(device: Mapping[str, Any]) -> tuple[str, str]:
+    """Return a text that changes with the reasons of the condition, and the condition with its reasons. The first text
+    is empty for a device that is OK, or whose daemon sends no condition."""
+    condition = msgspec.convert(device.get("condition"), DeviceCondition | None)
+    causes = " ".join(sorted(code + setting for code, setting in signature(condition)))
+    return causes, "ok" if not causes else str(condition)
 
 
 # Log levels by the name of the priority, the highest priority first

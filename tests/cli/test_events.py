@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from threading import Event as Flag
 from threading import Thread
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -185,9 +186,9 @@ def test_waiting_ends_when_nobody_reads_the_output(tmp_path: Path, monkeypatch: 
 
 class Answers:
     def __init__(self) -> None:
-        self.found = [{"name": "bow", "state": "running", "problem": ""}]
+        self.found: list[dict[str, Any]] = [{"name": "bow", "condition": None}]
 
-    def devices(self) -> list[dict[str, str]]:
+    def devices(self) -> list[dict[str, Any]]:
         return self.found
 
 
@@ -196,17 +197,20 @@ def test_a_device_that_is_gone_is_reported_once_and_when_it_is_back(capsys: pyte
     notes = DeviceNotes(client, ["bow"])
     notes.look(0.0)
     assert capsys.readouterr().err == ""
-    client.found = [{"name": "bow", "state": "missing", "problem": "/dev/x is not there"}]
+    reason = {"code": "stopped", "message": "The device stopped sending 5 s ago."}
+    bow = {"name": "bow", "condition": {"condition": "missing", "since_ns": 1, "reasons": [reason]}}
+    client.found = [bow]
     notes.look(1.0)
     assert capsys.readouterr().err == ""
     for now_s in (2.0, 4.0):
         notes.look(now_s)
-    assert capsys.readouterr().err == "imud watch: bow is missing: /dev/x is not there\n"
+        reason["message"] = "The device stopped sending 7 s ago."
+    assert capsys.readouterr().err == "imud watch: bow: missing: The device stopped sending 5 s ago.\n"
     client.found = []
     notes.look(6.0)
-    client.found = [{"name": "bow", "state": "running", "problem": ""}]
+    client.found = [{"name": "bow", "condition": {"condition": "ok", "since_ns": 1}}]
     notes.look(8.0)
-    assert capsys.readouterr().err == "imud watch: bow is no longer in the configuration\nimud watch: bow is running\n"
+    assert capsys.readouterr().err == "imud watch: bow: no longer in the configuration\nimud watch: bow: ok\n"
 
 
 def test_dropped_samples_are_reported_together(capsys: pytest.CaptureFixture[str]) -> None:
