@@ -138,6 +138,12 @@ def desktop(folder: Path, url: str, bow: Module, daemon: RunningDaemon) -> None:
         fit(page, 1320)
         shot(page, "device")
 
+        page.js("location.hash = '#/compare/bow/mast'")
+        page.until("return window.imud.view.difference?.data[0].length >= 580")
+        page.until("return !document.querySelector('.figures-table tbody').innerText.includes('NaN')")
+        fit(page, 1320)
+        shot(page, "compare")
+
 
 def phone(folder: Path, url: str) -> None:
     with browser(folder / "phone", phone=True) as page:
@@ -145,6 +151,9 @@ def phone(folder: Path, url: str) -> None:
         page.until("return Boolean(window.imud?.view?.plots)")
         page.until(FULL)
         shot(page, "phone")
+        page.js("location.hash = '#/device/bow/settings'")
+        page.until("return document.querySelector('[data-setting=mode].off')")
+        shot(page, "phone-settings")
 
 
 def calibration(folder: Path) -> None:

@@ -40,6 +40,7 @@ class Wish(NamedTuple):
     news_s: float = 0.25  # time between two `News`, s
     newest: bool = False  # whether to read the newest sample of every device, for any `devices`
     newest_s: float = STATUS_S  # time between two reads of the newest samples, s
+    convention: str | None = None  # convention of the watched samples; None for the convention of the configuration
 
 
 class News(NamedTuple):
@@ -144,7 +145,7 @@ class _Reading:
         self._client = client
         self._status_due_s = self._newest_due_s = 0.0
         self._known: frozenset[str] = frozenset()
-        self._watched: tuple[tuple[str, ...] | None, float | None, float] | None = None
+        self._watched: tuple[tuple[str, ...] | None, float | None, float, str | None] | None = None
         self._watch: Watch | None = None
         self._dropped = 0
         self._ahead_ns = 0
@@ -178,7 +179,7 @@ class _Reading:
     def _follow(self, wanted: Wish) -> None:
         """Watch the known devices of the wish."""
         devices = None if wanted.devices is None else tuple(name for name in wanted.devices if name in self._known)
-        chosen = (devices, wanted.rate_hz, wanted.news_s)
+        chosen = (devices, wanted.rate_hz, wanted.news_s, wanted.convention)
         if chosen == self._watched:
             return
         if devices == ():
@@ -189,8 +190,9 @@ class _Reading:
             # without a rate, a hold of `news_s` saves CPU time on both sides: the daemon sends several samples together
             latency_ms = None if wanted.rate_hz is not None else wanted.news_s * 1e3
             self._watch = self._client.watch(
-                devices, rate_hz=wanted.rate_hz, timeout_s=wanted.news_s, latency_ms=latency_ms
-            )
+                devices, rate_hz=wanted.rate_hz, timeout_s=wanted.news_s, latency_ms=latency_ms,
+                convention=wanted.convention,
+            )  # fmt: skip
             self._watch.on_dropped = self._note_dropped
         self._watched = chosen
 

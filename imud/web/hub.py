@@ -1,7 +1,8 @@
 """Hub of the browsers: requests the data that all pages need, and sends each message to the pages that show it.
 
-The hub uses one connection to the daemon (the feed), and none while no page is visible. Synchronization: the feed's
-thread calls `take`. The event loop calls all other methods.
+The hub uses one connection to the daemon (the feed), and none while no page is visible. A comparison uses a second
+feed, whose samples have one convention. Synchronization: the threads of the feeds call `take` and `take_compared`. The
+event loop calls all other methods.
 """
 
 import asyncio
@@ -13,6 +14,7 @@ from typing import Final
 
 import msgspec
 
+from imud.attitude.conventions import Convention
 from imud.client.feed import Feed, News, Wish
 from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceStatus, RecentStatus
 from imud.model.bucket import VECTORS, Bucket, Range
@@ -170,6 +172,9 @@ WAIT_S: Final = 1.0
 DEVICES_MAX: Final = 32
 """Maximum number of devices with all samples. At 1 kHz, each costs about 1 % of a core."""
 
+COMPARED: Final = Convention.ENU_FLU
+"""Convention of the samples of a comparison, so that the curves of two vendors have the same axes."""
+
 
 class Browser:
     """One open page."""
@@ -190,15 +195,17 @@ class BrowserHub:
         self._call_soon = call_soon
         self._room = BoundedSemaphore(WAITING_MAX)
         self._feed: Feed | None = None
+        self._compared: Feed | None = None  # feed of the samples of comparisons
         self._state = messages.StateMessage("connecting to the daemon", "", "")
         self._statuses: dict[str, DeviceStatus] = {}
         self._clients = 0
-        self._buckets: dict[tuple[str, int], Bucketing] = {}
+        self._buckets: dict[tuple[bool, str, int], Bucketing] = {}  # by comparison or not, device and rate
         self._newest: dict[str, Sample] = {}
-        self._watched: tuple[str, ...] = ()  # devices with samples for a page
+        # devices with samples for a page; for False without a comparison, for True in a comparison
+        self._watched: dict[bool, tuple[str, ...]] = {False: (), True: ()}
 
-    def attach(self, feed: Feed) -> None:
-        self._feed = feed
+    def attach(self, feed: Feed, compared: Feed) -> None:
+        self._feed, self._compared = feed, compared
 
     # --- browsers ---------------------------------------------------------------------------------------------------
 
@@ -223,7 +230,8 @@ class BrowserHub:
         self._want()
         if is_other_view and wanted.look != "nothing":
             browser.mailbox.put_newest("state", _text(self._state))
-        if any(name not in self._watched and self._exists(name) for name in wanted.devices):
+        watched = self._watched[wanted.is_comparison]
+        if any(name not in watched and self._exists(name) for name in wanted.devices):
             words = f"pages of {DEVICES_MAX} other devices are open, the maximum; close one of them"
             browser.mailbox.put(_text(messages.ProblemMessage(words)))
 
@@ -232,21 +240,30 @@ class BrowserHub:
         return not self._statuses or device in self._statuses
 
     def _want(self) -> None:
-        """Request the data that all pages need from the feed."""
+        """Request the data that all pages need from the feeds."""
         looks = [one.look for one in self.browsers if one.look.look != "nothing"]
-        named = {name for look in looks for name in look.devices if self._exists(name)}
-        stay = [name for name in self._watched if name in named]
-        devices = self._watched = tuple([*stay, *sorted(named.difference(stay))][:DEVICES_MAX])
+        devices, compared = (self._watch(looks, is_comparison) for is_comparison in (False, True))
         rates = [look.rate_hz for look in looks if look.look == "device"]
-        used = {(name, look.rate_hz) for look in looks for name in look.devices}
-        self._buckets = {key: self._buckets.get(key) or Bucketing(key[1]) for key in used}
+        used = {(look.is_comparison, name, look.rate_hz) for look in looks for name in look.devices}
+        self._buckets = {key: self._buckets.get(key) or Bucketing(key[2]) for key in used}
         if not looks:
             self._newest.clear()
-        if self._feed is not None:
-            news_s = 1 / max(rates) if rates else OVERVIEW_NEWS_S
-            has_overview = any(look.look == "overview" for look in looks)
-            wanted = Wish(devices, news_s=news_s, newest=has_overview, newest_s=NEWEST_S)
-            self._feed.want(wanted if looks else None)
+        if self._feed is None or self._compared is None:
+            return
+        news_s = 1 / max(rates) if rates else OVERVIEW_NEWS_S
+        has_overview = any(look.look == "overview" for look in looks)
+        self._feed.want(Wish(devices, news_s=news_s, newest=has_overview, newest_s=NEWEST_S) if looks else None)
+        self._compared.want(Wish(compared, news_s=news_s, convention=COMPARED) if compared else None)
+
+    def _watch(self, looks: Iterable[Look], is_comparison: bool) -> tuple[str, ...]:
+        """Choose the devices with samples for these pages, and return them."""
+        named = {
+            name for one in looks if one.is_comparison is is_comparison for name in one.devices if self._exists(name)
+        }
+        stay = [name for name in self._watched[is_comparison] if name in named]
+        chosen = tuple([*stay, *sorted(named.difference(stay))][:DEVICES_MAX])
+        self._watched[is_comparison] = chosen
+        return chosen
 
     # --- news -------------------------------------------------------------------------------------------------------
 
@@ -255,9 +272,21 @@ class BrowserHub:
         if self._room.acquire(timeout=WAIT_S):
             self._call_soon(self._take_in_loop, news)
 
+    def take_compared(self, news: News) -> None:
+        """Pass samples of comparisons to the event loop, as `take`. The other feed supplies all other data."""
+        if (news.samples or news.dropped) and self._room.acquire(timeout=WAIT_S):
+            self._call_soon(self._take_compared_in_loop, news)
+
     def _take_in_loop(self, news: News) -> None:
         try:
             self.spread(news)
+        finally:
+            self._room.release()
+
+    def _take_compared_in_loop(self, news: News) -> None:
+        try:
+            self.dropped_samples += news.dropped
+            self._spread_samples(news, is_comparison=True)
         finally:
             self._room.release()
 
@@ -306,14 +335,18 @@ class BrowserHub:
         )
         self._to(lambda look: look.look != "nothing", messages.EventsMessage(fresh))
 
-    def _spread_samples(self, news: News) -> None:
+    def _spread_samples(self, news: News, *, is_comparison: bool = False) -> None:
         by_device: dict[str, list[Sample]] = {}
         for sample in news.samples:
             by_device.setdefault(sample.device, []).append(sample)
-        for (name, rate_hz), bucketing in self._buckets.items():
+        for (kind, name, rate_hz), bucketing in self._buckets.items():
+            if kind is not is_comparison:
+                continue
             if buckets := bucketing.add(by_device.get(name, ()), news.now_ns):
                 self._to(
-                    lambda look, key=(name, rate_hz): key[0] in look.devices and look.rate_hz == key[1],  # type: ignore[misc]
+                    lambda look, key=(is_comparison, rate_hz, name): (  # type: ignore[misc]
+                        (look.is_comparison, look.rate_hz) == key[:2] and key[2] in look.devices
+                    ),
                     messages.SamplesMessage(name, rate_hz, tuple(buckets)),
                 )
         for name, member in {(one.look.device, one.look.spectrum) for one in self.browsers if one.look.spectrum}:

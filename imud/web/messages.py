@@ -129,7 +129,7 @@ class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     look: Literal["overview", "device", "nothing"] = "nothing"
     device: str = ""
-    other: str = ""  # second device of a comparison
+    other: str = ""  # second device of a comparison; the samples of both devices then have the convention enu-flu
     rate_hz: Literal[10, 20, 50] = 20
     spectrum: Literal["", "accel_m_s2", "gyro_rad_s", "mag_t"] = ""
     acknowledged: int = 0
@@ -137,13 +137,13 @@ class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     view."""
 
     @property
+    def is_comparison(self) -> bool:
+        return self.look == "device" and bool(self.other)
+
+    @property
     def devices(self) -> tuple[str, ...]:
         """Names of the shown devices."""
-        return (
-            (self.device, self.other)
-            if self.look == "device" and self.other
-            else (self.device,) * (self.look == "device")
-        )
+        return (self.device, self.other) if self.is_comparison else (self.device,) * (self.look == "device")
 
 
 class LoginRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

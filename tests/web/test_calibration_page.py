@@ -1,5 +1,6 @@
 """Calibrations on the page in a real browser: a rotating device, the sphere, the result."""
 
+import os
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -86,13 +87,13 @@ def test_a_calibration_is_seen_without_the_token_and_stopped_with_it(page: Page,
         page.until_text("#calibration .running", "Magnetometer calibration is running")
         page.until(COVERED)
         assert not page.js("return document.querySelector('#calibration-stop').getClientRects().length")
-        with daemon.client() as other:
-            other.call("stop_calibration", device="bow")
+        page.until_text("#calibration .running", f"started by uid {os.getuid()}")
+        log_in(page, TOKEN)
+        page.click("#calibration-stop")  # of another client
         with pytest.raises(RpcError, match="was cancelled"):
             running.result(LIMIT_S)
         page.until_text("#calibration-result", "calibration magnetometer: it was cancelled")
-        assert page.js("return document.querySelector('#calibration .running').hidden")
-        log_in(page, TOKEN)
+        page.until("return document.querySelector('#calibration .running').hidden")
         page.until("return document.querySelector(arguments[0])", BEGIN.format("level"))
         page.click(BEGIN.format("level"))
         page.until_text("#calibration-progress", "waiting for rest: ")

@@ -70,6 +70,7 @@ def test_every_vector_and_angle_is_plotted_as_it_was_sent_in_the_units_of_people
             open_page(page, url, "bow")
             page.until("return window.imud.view.plots.get('accel_m_s2').data[0].length >= 100", what="five seconds")
             page.click("#pause")
+            page_values = page.text("#euler_rad .key:last-child output")
             plots = {member: np.array(rows, dtype=float) for member, rows in page.js(PLOTTED).items()}
             assert page.problems() == []
     greatest, least = plots["accel_m_s2"][1:3] / RISE["accel_m_s2"][0]
@@ -79,19 +80,16 @@ def test_every_vector_and_angle_is_plotted_as_it_was_sent_in_the_units_of_people
         assert plots[member].shape == (7, len(spans)), member
         for axis in range(3):
             shown, wanted = plots[member][1 + 2 * axis : 3 + 2 * axis].T, expected(member, axis, spans)
-            is_yaw = (member, axis) == ("euler_rad", 2)
-            drawn = ~np.isnan(shown).any(axis=1) if is_yaw else np.ones(len(spans), dtype=bool)
-            assert np.allclose(shown[drawn], wanted[drawn], rtol=1e-5, atol=1e-4), (member, axis)
-    turns = {number for number in range(spans[0][0], spans[-1][1] + 1) if _is_turn(number) and number > spans[0][0]}
-    broken = [span for span, value in zip(spans, plots["euler_rad"][5], strict=True) if math.isnan(value)]
-    assert len(turns) >= 2, "yaw went over ±180° more than once"
-    assert len(broken) == len(turns), "the line of yaw is broken there, and nowhere else"
-    assert all(any(first <= turn <= last for turn in turns) for first, last in broken)
-
-
-def _is_turn(number: int) -> bool:
-    """Return whether yaw passed ±180° since the previous measurement."""
-    return abs(vector("euler_rad", number)[2] - vector("euler_rad", number - 1)[2]) > math.pi
+            if (member, axis) != ("euler_rad", 2):
+                assert np.allclose(shown, wanted, rtol=1e-5, atol=1e-4), (member, axis)
+    turned = np.degrees(TURN_RAD * np.array(spans)[:, ::-1])
+    yaw = plots["euler_rad"][5:].T
+    offset = yaw[0, 0] - turned[0, 0]
+    assert offset / 360 == pytest.approx(round(offset / 360), abs=1e-5)
+    assert turned[-1, 0] - turned[0, 0] > 720, "yaw went over ±180° more than once"
+    inside = (yaw - offset <= turned[:, :1] + 1e-3) & (yaw - offset >= turned[:, 1:] - 1e-3)
+    assert inside.all(), "the line of yaw continues over ±180°"
+    assert all(-180 <= float(one.replace("−", "-")) <= 180 for one in page_values.split(" … "))
 
 
 def test_the_corners_of_the_block_are_round_and_it_hides_no_name(scripts: Page) -> None:

@@ -40,7 +40,7 @@ def at_once(function: Callable[[News], None], news: News) -> None:
 
 def make() -> tuple[BrowserHub, FakeFeed]:
     hub, feed = BrowserHub(at_once), FakeFeed()
-    hub.attach(feed)
+    hub.attach(feed, FakeFeed())
     return hub, feed
 
 
@@ -156,17 +156,23 @@ async def test_overview_page_and_state() -> None:
 
 
 async def test_pages_get_new_events_and_the_samples_of_both_compared_devices() -> None:
-    hub, feed = make()
+    hub, feed, compared = BrowserHub(at_once), FakeFeed(), FakeFeed()
+    hub.attach(feed, compared)
     browser = opened(hub, look="overview")
     hub.spread(News(events=(Event(2 * 10**9, "bow", EventKind.UP, "is there", {"n": 1}),)))
     (last,) = (await heard(browser, "events"))[-1]["events"]
     assert last == {"t_s": 2.0, "device": "bow", "event": "up", "message": "is there", "detail": {"n": 1}}
     late = opened(hub, look="device", device="bow", other="stern")
     assert await heard(late, "events") == [], "a page reads the stored events with the method `events`"
-    assert (wanted := feed.wanted[-1]) is not None
-    assert set(wanted.devices or ()) == {"bow", "stern"}
+    assert compared.wanted[-1] == Wish(("bow", "stern"), news_s=0.05, convention="enu-flu")
     hub.spread(News(statuses=(device("bow"), device("stern", 1), device("keel", 2))))
     assert {one["device"] for one in await heard(late, "status")} == {"bow", "stern"}
+    single = opened(hub, look="device", device="bow")
+    assert (wanted := feed.wanted[-1]) is not None
+    assert wanted.devices == ("bow",)
+    hub.take_compared(news(1, 60))
+    assert await heard(late, "samples")
+    assert not await heard(single, "samples"), "other axes"
 
 
 async def test_dropped_messages_and_samples_are_reported() -> None:

@@ -1,16 +1,37 @@
 """The page in a real browser: plots of the sent frames, restarts, phones, the token."""
 
+import math
 import re
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.json import decode
 
 from imud.device.calibration import cell_of
-from tests.support.daemon_process import RunningDaemon, wait_until
+from imud.web.hub import row_of
+from imud.web.messages import encode
+from tests.support.daemon_process import RunningDaemon, running_daemon, wait_until
+from tests.support.metrics import device
 from tests.test_daemon import cable
-from tests.web.browser import MISSING, PHONE, Page, Sender, enter, sent_by, serving_web, upright
+from tests.test_daemon import device as configured
+from tests.web.browser import (
+    MISSING,
+    PERIOD_MS,
+    PHONE,
+    Page,
+    Sender,
+    enter,
+    log_in,
+    open_page,
+    sent_by,
+    serving_web,
+    upright,
+)
 
 pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.live]
 
@@ -25,6 +46,40 @@ TEXT_ON = [
 ]  # fmt: skip
 """Colors of text and of the ground behind it."""
 PEAK_EVERY = 40
+CONTROLS = {
+    "button", "link", "textbox", "searchbox", "spinbutton", "combobox", "checkbox", "switch", "radio", "radiogroup",
+    "img", "image", "progressbar", "dialog", "region",
+}  # fmt: skip
+"""Roles of the accessibility tree that need a name."""
+LOW_CONTRAST = """
+    const context = new OffscreenCanvas(1, 1).getContext('2d', { willReadFrequently: true });
+    const rgb = (colors) => {
+        for (const color of colors) { context.fillStyle = color; context.fillRect(0, 0, 1, 1); }
+        return [...context.getImageData(0, 0, 1, 1).data].slice(0, 3);
+    };
+    const linear = (one) => (one <= 0.04045 ? one / 12.92 : ((one + 0.055) / 1.055) ** 2.4);
+    const luminance = (rgb) => rgb.reduce((sum, one, at) => sum + linear(one / 255) * [0.2126, 0.7152, 0.0722][at], 0);
+    const hasText = (one) => [...one.childNodes].some((node) => node.nodeType === 3 && node.data.trim());
+    const isShown = (one) => one.checkVisibility() && !one.closest(':disabled, [inert], option, noscript');
+    return [...document.querySelectorAll('body *')].filter((one) => hasText(one) && isShown(one)).flatMap((one) => {
+        const grounds = [];
+        for (let node = one; node; node = node.parentElement) grounds.unshift(getComputedStyle(node).backgroundColor);
+        const style = getComputedStyle(one);
+        const size = parseFloat(style.fontSize);
+        const [low, high] = [rgb(grounds), rgb([...grounds, style.color])].map(luminance).sort((a, b) => a - b);
+        const least = size >= 24 || (size >= 18.7 && style.fontWeight >= 700) ? 3 : 4.5;
+        return (high + 0.05) / (low + 0.05) < least - 0.05 ? [`${one.innerText.slice(0, 30)} ${style.color}`] : [];
+    });"""
+"""Texts with a contrast below that of WCAG 2, on the color of the ground behind each text."""
+PINCH = """const box = document.querySelector('#accel_m_s2 .plot');
+    const { left, width } = box.querySelector('.u-over').getBoundingClientRect();
+    const finger = (share, identifier) => new Touch({ identifier, target: box, clientX: left + share * width });
+    const touch = (type, shares) =>
+        box.dispatchEvent(new TouchEvent(type, { cancelable: true, touches: shares.map(finger) }));
+    touch('touchstart', [0.4, 0.6]);
+    touch('touchmove', [0.3, 0.7]);
+    touch('touchend', []);"""
+"""Two fingers move to twice their distance."""
 POINTS = "return window.imud.view.plots?.get('accel_m_s2').data[0].length >= arguments[0]"
 PLOTTED = """const plot = window.imud.view.plots.get('accel_m_s2');
     const lines = [plot.plot.data[0].map((x) => x - plot.offset_s), plot.plot.data[6], plot.plot.data[5]];
@@ -183,6 +238,18 @@ def test_settings_are_planned_only_with_the_token(page: Page, site: Site, tmp_pa
         page.click("#bar .primary")
         page.until_text("#dialog", "takes effect")
         assert "9-axis" in page.text("#dialog")
+        page.click("#dialog [role=switch]")
+        page.until_text("#dialog", "The device loses these changes at power-off.")
+        page.click("#dialog .primary")
+        page.until_text("#outcome", "Applied. The device loses “")
+        page.until("return document.querySelector('#bar').hidden", what="the edit has ended")
+        page.js(
+            "[...document.querySelectorAll('#dialog button')].find((one) => one.innerText === 'Save to flash').click()"
+        )
+        page.until_text("#toast", "Save: ")
+        with daemon.client() as client:
+            (mode,) = [one for one in client.call("settings.get", device="bow")["settings"] if one["name"] == "mode"]
+        assert (mode["actual"], mode["saved_state"]) == ("9-axis", "same")
         cookies = page.driver.get_cookies()
         assert [(one["httpOnly"], one["sameSite"]) for one in cookies] == [(True, "Strict")]
         assert TOKEN not in page.driver.current_url
@@ -231,6 +298,133 @@ def test_no_section_overflows_at_any_width_in_both_color_schemes(page: Page, sit
     page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
     assert found == []
     assert page.problems() == []
+
+
+def test_each_control_has_a_name_and_each_text_has_contrast(page: Page, site: Site, tmp_path: Path) -> None:
+    file = tmp_path / "token"
+    file.write_text(TOKEN)
+    with serving_web(site[0].socket, "--token-file", str(file)) as url:
+        open_page(page, url, "bow")
+        log_in(page, TOKEN)
+        page.until("return document.querySelectorAll('[data-setting]').length > 3")
+        page.until("return document.querySelectorAll('#calibration details').length > 3")
+        page.js("document.querySelectorAll('main details').forEach((one) => (one.open = true))")
+        for address in ("#/device/bow", "#/", "#/wall", "#/compare"):
+            page.js("location.hash = arguments[0]", address)
+            page.until("return document.querySelector('main').children.length > 1")
+            for theme in ("light", "dark"):
+                page.js("document.documentElement.dataset.theme = arguments[0]", theme)
+                assert page.js(LOW_CONTRAST) == [], (address, theme)
+            tree = page.driver.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
+            controls = [one for one in tree if not one["ignored"] and one["role"]["value"] in CONTROLS]
+            assert controls
+            nameless = [one["backendDOMNodeId"] for one in controls if not one["name"]["value"].strip()]
+            describe = partial(page.driver.execute_cdp_cmd, "DOM.describeNode")
+            assert [describe({"backendNodeId": one, "depth": 2})["node"] for one in nameless] == [], address
+        assert page.problems() == []
+
+
+def test_keys_the_filter_and_stored_events(page: Page, site: Site) -> None:
+    _, url = site
+    page.driver.get(f"{url}#/device/bow")
+    page.until_text("#event-list", "Device found")
+    page.driver.refresh()
+    page.until_text("#event-list", "Device found")
+
+    def press(key: str, selector: str = "body") -> None:
+        page.driver.find_element("css selector", selector).send_keys(key)
+
+    for key, script in (
+        (" ", "return window.imud.view.live.group.isPaused"),
+        ("4", "return location.hash === '#/device/bow/settings'"),
+        ("g", "return location.hash === '#/' && document.querySelector('[data-device]')"),
+        ("]", "return location.hash === '#/device/bow' && window.imud.view.plots.get('accel_m_s2').plot"),
+        ("?", "return document.querySelector('#dialog').open"),
+    ):
+        press(key)
+        page.until(script)
+    page.click("#dialog button")
+    press("+", "#accel_m_s2 .plot")
+    assert page.js("const [from, to] = window.imud.view.live.group.zoomed; return to - from") == pytest.approx(24)
+    press("0", "#accel_m_s2 .plot")
+    assert page.js("return window.imud.view.live.group.zoomed") is None
+    page.js(PINCH)
+    assert page.js("const [from, to] = window.imud.view.live.group.zoomed; return to - from") == pytest.approx(15)
+    press("g")
+    page.until("return document.querySelector('[data-device]')")
+    rows = [decode(encode(row_of(device(f"imu{number}"), None, 5))) for number in range(9)]
+    show = "window.imud.view.onMessage({ kind: 'overview', now_s: 1, devices: arguments[0] })"
+    page.js(show, rows)
+    press("3g", "#filter")
+    page.js("const box = document.querySelector('#filter'); box.value = '3'; box.dispatchEvent(new Event('input'))")
+    shown = page.js("return [...document.querySelectorAll('main [data-device]')].map((one) => one.dataset.device)")
+    assert (shown, page.js("return location.hash")) == (["imu3"], "#/")
+    page.js("location.hash = '#/wall'")
+    page.until("return document.querySelector('.wall')")
+    page.js(show, rows)
+    assert page.js("return document.querySelectorAll('.wall [data-device] h2').length") == 9
+    assert page.problems() == []
+
+
+def test_two_devices_are_compared_with_their_delay(page: Page, tmp_path: Path) -> None:
+    """Both devices move in the same way, the second 100 ms later, with an offset of 0.5 m/s²."""
+
+    def moved(offset: float, late_s: float) -> Callable[[int], bytes]:
+        def value(number: int) -> float:
+            t = begun_s.setdefault(late_s, monotonic()) + number * PERIOD_MS / 1000 - late_s
+            return 9.8 + offset + math.sin(8 * t) + math.sin(3.2 * t)
+
+        return upright(value)
+
+    begun_s: dict[float, float] = {}
+
+    (tmp_path / "other").mkdir()
+    with cable(tmp_path) as one, cable(tmp_path / "other") as other:
+        devices = {"bow": configured(one.name), "stern": configured(other.name)}
+        with (
+            running_daemon(tmp_path, devices, python=()) as daemon,
+            Sender(one, moved(0.5, 0.0)), Sender(other, moved(0.0, 0.1)), serving_web(daemon.socket) as url,
+        ):  # fmt: skip
+            daemon.wait_for("bow", "running")
+            daemon.wait_for("stern", "running")
+            page.driver.get(f"{url}#/compare/bow/stern")
+            page.until("return Boolean(window.imud?.view?.plots)")
+            page.click(".timebar [aria-label=quantity] :nth-child(2)")
+            cells = "return [...document.querySelectorAll('.figures-table tbody tr')].at(-1).innerText.split('\\t')"
+            page.until("return window.imud.view.difference.data[0].length > 160")
+            name, mean, _rms, _most, same, delay = page.until(
+                f"{cells.replace('return ', 'const row = ')}; return !row.includes('–') && row"
+            )
+            page.until_text(".notes", "Both devices use the same axes: body: x forward, y left, z up")
+            assert "imud rotates the values of bow and stern." in page.text(".notes")
+            assert page.problems() == []
+    assert name == "z"
+    assert float(mean.split()[0]) == pytest.approx(0.5, abs=0.2)
+    assert float(same) > 0.6
+    assert int(delay.replace("−", "-").split()[0]) == pytest.approx(100, abs=40)
+
+
+def test_statistics_of_a_comparison_and_angles_over_a_half_turn(scripts: Page) -> None:
+    found, delay, none, [least, most] = scripts.module(
+        """const { statistics } = await import('/static/compare.js');
+        const { RollingPlot } = await import('/static/plots.js');
+        const motion = (t) => Math.sin(t / 9) + Math.sin(t / 5);
+        const wave = (late) => Array.from({ length: 300 }, (_, index) => motion(index - late));
+        const [a, b] = [wave(0).map((one) => one + 2), wave(3.5)];
+        b[7] = a[9] = null;
+        const plot = new RollingPlot('t', 't', '°', ['yaw'], { isAngle: true });
+        const turn = [[170, 175], [-179, 178], [-175, -170], [-10, 20], [120, 130], [-150, -140]];
+        const bucket = (t) => ({ first_s: t, last_s: t, utc_s: t, seq: t, count: 1 });
+        turn.forEach((one, t) => plot.add(bucket(t), one.map((angle) => [angle]), 1));
+        const other = wave(0).map((_, index) => index);
+        return [statistics(a, a), statistics(a, b), statistics(a, other), [plot.data[2], plot.data[1]]]"""
+    )
+    assert found["mean"] == found["rms"] == 0
+    assert (found["correlation"], found["delay"]) == (pytest.approx(1), pytest.approx(0, abs=1e-6))
+    assert delay["mean"] == pytest.approx(2, abs=0.05)
+    assert delay["delay"] == pytest.approx(3.5, abs=0.05)
+    assert none["delay"] is None
+    assert (least, most) == ([170, 178, 185, -10, 120, 210], [175, 181, 190, 20, 130, 220])
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])

@@ -2,7 +2,7 @@
 
 import { session } from "./state.js";
 import { button, section, toast } from "./ui.js";
-import { call, copy, duration, el, facts, number, shown } from "./util.js";
+import { call, command, copy, duration, el, facts, number, shown } from "./util.js";
 
 const seconds = (ns) => duration(ns / 1e9);
 const times = (count) => (count === 1 ? "once" : `${number(count)} times`);
@@ -153,13 +153,7 @@ export class AboutSection {
   async run(name, title, risk) {
     if (risk && !confirm(`${risk}\n${title}?`)) return;
     this.result.textContent = `${title}…`;
-    try {
-      const answer = await call("command", { device: this.device, name, arguments: {} });
-      const evidence = answer?.evidence ? `${answer.verified ? "verified" : "sent, not verified"}: ${answer.evidence}` : "sent, not verified";
-      this.result.textContent = [`${title}: ${evidence}`, answer?.not_saved].filter(Boolean).join(". ");
-    } catch (error) {
-      this.result.textContent = error.message;
-    }
+    this.result.textContent = await command(this.device, name, title);
   }
 
   draw(message) {

@@ -15,20 +15,22 @@ const SIDES = [
   ["+y", 1, 1, "Turn the device so that its y axis points down."], ["-y", 1, -1, "Turn the device so that its y axis points up."],
 ];
 
-/** Return the sentence for the user from the covered directions: the emptiest side first, then the turns. */
+/** Return the sentence for the user and the cells to measure next: the emptiest side first, then the turns. */
 export function instruction(detail) {
-  if (detail.cells === undefined) return "Do not touch the device.";
+  if (detail.cells === undefined) return { words: "Do not touch the device.", next: [] };
   const covered = coveredCells(detail.cells);
   const open = SIDES.map(([, axis, sign, words]) => {
-    const cells = covered.map((is, cell) => [is, cellDirection(cell)[axis] * sign]).filter(([, along]) => along > 0.6);
-    return { words, share: cells.filter(([is]) => !is).length / Math.max(1, cells.length) };
+    const cells = covered.map((is, cell) => [is, cellDirection(cell)[axis] * sign, cell]).filter(([, along]) => along > 0.6);
+    const next = cells.filter(([is]) => !is).map(([, , cell]) => cell);
+    return { words, next, share: next.length / Math.max(1, cells.length) };
   });
   const worst = open.reduce((best, one) => (one.share > best.share ? one : best));
-  if (worst.share > 0.5) return worst.words;
+  if (worst.share > 0.5) return worst;
   const turns = ["x", "y", "z"].map((axis) => [axis, detail[`turned_${axis}_rad`] ?? 0]);
   const [axis, angle] = turns.reduce((least, one) => (one[1] < least[1] ? one : least));
-  if (angle < TURN_RAD) return `Turn the device around its ${axis} axis: ${number(angle / DEGREE)}° of 360°.`;
-  return "Turn the device slowly in all directions.";
+  const next = covered.flatMap((is, cell) => (is ? [] : [cell]));
+  if (angle < TURN_RAD) return { words: `Turn the device around its ${axis} axis: ${number(angle / DEGREE)}° of 360°.`, next };
+  return { words: "Turn the device slowly in all directions.", next };
 }
 
 const dayOf = (utc_ns) => new Date(utc_ns / 1e6).toLocaleDateString("en-GB", { day: "numeric", month: "short" });
@@ -40,6 +42,7 @@ export class CalibrationSection {
     this.infos = [];
     this.status = null; // member `calibration` of the status
     this.isOwn = false;
+    this.ended_ns = 0; // start of the calibration of the newest reply
     this.isReplied = false; // whether the reply to this page has shown the result, before the event of the end
     this.now_s = 0;
     this.progress = el("p", { class: "instruction", id: "calibration-instruction", role: "status" });
@@ -54,7 +57,7 @@ export class CalibrationSection {
     this.bar = el("progress", { max: 1, "aria-label": "progress of the calibration" });
     this.measures = el("dl", { class: "measures" });
     this.turns = el("div", { class: "turns" });
-    const legend = el("p", { class: "legend-line" }, el("span", {}, el("i", { class: "sw-ok" }), "measured"));
+    const legend = el("p", { class: "legend-line" }, el("span", {}, el("i", { class: "sw-ok" }), "measured"), el("span", {}, el("i", { class: "sw-next" }), "measure next"));
     this.turning = el("div", { class: "running-grid", hidden: true }, this.sphere.canvas,
       el("div", {}, el("div", { class: "progress" }, this.percent, el("span", { text: "%" }), this.bar), this.measures, this.turns, legend));
     this.running = el("div", { class: "panel running", hidden: true },
@@ -79,8 +82,9 @@ export class CalibrationSection {
     this.showRunning();
   }
 
-  redraw() {
-    if (this.cells !== undefined) this.sphere.draw(this.cells);
+  redraw(detail = this.detail) {
+    this.detail = detail;
+    if (detail) this.sphere.draw(detail.cells, instruction(detail).next);
   }
 
   drawList() {
@@ -121,6 +125,7 @@ export class CalibrationSection {
     }
     this.isOwn = false;
     this.isReplied = true;
+    this.ended_ns = this.status?.begun_ns ?? 0;
     this.showRunning(false);
     this.load();
   }
@@ -157,11 +162,13 @@ export class CalibrationSection {
   onStatus(status, now_s) {
     this.now_s = now_s;
     const before = this.status;
-    this.status = status.calibration;
+    const isOld = status.calibration?.begun_ns <= this.ended_ns; // a status from the time before the reply
+    this.status = isOld ? null : status.calibration;
     if (!this.status) {
       if (before && !this.isOwn) this.showRunning(false);
       return;
     }
+    this.isReplied = false; // another calibration, also if its first event did not arrive
     this.kind = this.status.kind;
     setText(this.message, this.status.message);
     this.showRunning(true);
@@ -189,7 +196,7 @@ export class CalibrationSection {
     const at = { turn: 1, check: 2, save: 3 }[detail.phase] ?? 0;
     this.steps.replaceChildren(...STEPS.map((words, index) =>
       el("li", { class: index < at ? "done" : index === at ? "now" : "", "aria-current": index === at ? "step" : null }, el("i", {}, index < at && icon("ok")), words)));
-    if (detail.phase !== undefined || detail.cells !== undefined) setText(this.progress, instruction(detail));
+    if (detail.phase !== undefined || detail.cells !== undefined) setText(this.progress, instruction(detail).words);
     this.turning.hidden = detail.cells === undefined;
     if (detail.cells === undefined) return;
     this.showTurning(detail);
@@ -198,7 +205,7 @@ export class CalibrationSection {
   showTurning(detail) {
     if (detail.cells !== this.cells) {
       this.cells = detail.cells;
-      this.sphere.draw(detail.cells);
+      this.redraw(detail);
       if (navigator.userActivation?.hasBeenActive) navigator.vibrate?.(60);
     }
     this.bar.value = detail.progress ?? 0;

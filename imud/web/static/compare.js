@@ -1,37 +1,64 @@
-// Two devices on one time axis: both curves of each axis, and the statistics of their difference.
+// Two devices on one time axis: both curves of each axis, their difference, and its statistics.
 
 import { sorted } from "./condition.js";
-import { COLOURS, grid, ink, labels, PlotGroup } from "./plots.js";
+import { COLOURS, ink, near, PlotGroup, RollingPlot, timeBar } from "./plots.js";
 import { world } from "./state.js";
 import { icon, segmented } from "./ui.js";
 import { AXES, DEGREE, duration, el, number } from "./util.js";
 
 const RATE_HZ = 20;
-const KEPT_S = 60;
-const DRAW_MS = 200;
+const SPANS = [["10", "10 s"], ["30", "30 s"], ["600", "10 min"]];
+const DRAW_MS = 1000; // time between two computations of the statistics
+const LATE_S = 2; // time to wait for the values of B
+const HOLE_S = 5 / RATE_HZ; // longest time between two values of B that is interpolated
+const WAITING_MAX = 200; // number of buckets of B that wait for A
+const LAGS_MAX = RATE_HZ; // largest delay in periods: 1 s
+const CORRELATION_LEAST = 0.5;
+const CORRELATION_FALL = 0.05; // a delay is clear if the correlation at other delays is lower by this
 const KINDS = {
   euler_rad: { title: "Attitude", unit: "°", names: ["roll", "pitch", "yaw"], scale: 1 / DEGREE, isAngle: true },
   accel_m_s2: { title: "Acceleration", unit: "m/s²", names: AXES, scale: 1 },
   gyro_rad_s: { title: "Angular rate", unit: "°/s", names: AXES, scale: 1 / DEGREE },
 };
 
-/** Return mean, rms and maximum from the mean of the differences, and the correlation; null without two pairs. */
-export function statistics(pairs) {
-  if (pairs.length < 2) return null;
-  const mean = (values) => values.reduce((sum, one) => sum + one, 0) / values.length;
-  const [a, b] = [pairs.map((one) => one[0]), pairs.map((one) => one[1])];
-  const difference = pairs.map(([one, other]) => one - other);
-  const [middle, ma, mb] = [mean(difference), mean(a), mean(b)];
-  const power = (values, from) => mean(values.map((one) => (one - from) ** 2));
-  const both = Math.sqrt(power(a, ma) * power(b, mb));
-  return {
-    mean: middle, rms: Math.sqrt(power(difference, middle)), most: Math.max(...difference.map((one) => Math.abs(one - middle))),
-    correlation: both > 0 ? mean(pairs.map(([one, other]) => (one - ma) * (other - mb))) / both : null,
-  };
+const mean = (values) => values.reduce((sum, one) => sum + one, 0) / values.length;
+
+/** Return the correlation of pairs; null without variation. */
+function correlation(pairs) {
+  const [a, b] = [0, 1].map((index) => mean(pairs.map((one) => one[index])));
+  let [ab, aa, bb] = [0, 0, 0];
+  for (const [one, other] of pairs) {
+    ab += (one - a) * (other - b);
+    aa += (one - a) ** 2;
+    bb += (other - b) ** 2;
+  }
+  return aa * bb > 0 ? ab / Math.sqrt(aa * bb) : null;
 }
 
-/** Return an angle, moved by whole turns to less than half a turn from `to`. */
-const near = (angle, to) => angle - 360 * Math.round((angle - to) / 360);
+/** Return the pairs of values that both rows contain, with the second row moved by `lag` places. */
+const pairsOf = (a, b, lag = 0) => a.map((one, index) => [one, b[index + lag] ?? null]).filter(([one, other]) => one !== null && other !== null);
+
+/** Return how much later b shows the motion of a, in places; null if it is not clear. */
+export function delayOf(a, b) {
+  const scores = Array.from({ length: 2 * LAGS_MAX + 1 }, (_, index) => {
+    const pairs = pairsOf(a, b, index - LAGS_MAX);
+    return pairs.length > 2 * LAGS_MAX ? correlation(pairs) ?? 0 : 0;
+  });
+  const at = scores.indexOf(Math.max(...scores));
+  const [before, best, after] = [scores[at - 1], scores[at], scores[at + 1]];
+  if (before === undefined || after === undefined || best < CORRELATION_LEAST || best - Math.min(...scores) < CORRELATION_FALL) return null;
+  return at - LAGS_MAX + (before - after) / 2 / (before - 2 * best + after);
+}
+
+/** Return mean, rms and maximum from the mean of the differences, correlation and delay; null without two pairs. */
+export function statistics(a, b) {
+  const pairs = pairsOf(a, b);
+  if (pairs.length < 2) return null;
+  const difference = pairs.map(([one, other]) => one - other);
+  const middle = mean(difference);
+  const rms = Math.sqrt(mean(difference.map((one) => (one - middle) ** 2)));
+  return { mean: middle, rms, most: Math.max(...difference.map((one) => Math.abs(one - middle))), correlation: correlation(pairs), delay: delayOf(a, b) };
+}
 
 export class Compare {
   constructor(main, stream, first, second) {
@@ -39,18 +66,19 @@ export class Compare {
     this.names = [first, second];
     this.kind = "euler_rad";
     this.statuses = new Map();
-    this.group = new PlotGroup(30);
+    this.span_s = 30;
     this.picks = el("div", { class: "picks" });
+    this.tools = el("div");
     this.plotsBox = el("div", { class: "panel plots" });
     this.table = el("tbody");
     this.notes = el("ul", { class: "notes" });
-    const kinds = segmented("quantity", Object.entries(KINDS).map(([key, one]) => [key, one.title]), this.kind, (value) => { this.kind = value; this.restart(); });
-    const head = ["", "mean", "rms", "maximum", "correlation"].map((text) => el("th", { text, scope: "col" }));
-    main.append(el("div", { class: "device-head" }, el("h1", { text: "Compare" })), this.picks, el("div", { class: "timebar" }, kinds),
-      el("div", { class: "compare-grid" }, this.plotsBox, el("div", {},
-        el("div", { class: "panel" }, el("h3", { text: "Difference in the shown time range" }), el("table", { class: "plain figures-table" }, el("thead", {}, el("tr", {}, head)), this.table), el("p", { class: "help", text: "rms and maximum are measured from the mean." })),
-        el("div", { class: "panel" }, el("h3", { text: "Notes" }), this.notes))));
-    this.timer = setInterval(() => this.draw(), DRAW_MS);
+    const head = ["", "mean", "rms", "maximum", "correlation", "delay"].map((text) => el("th", { text, scope: "col" }));
+    this.help = el("p", { class: "help" });
+    this.grid = el("div", { class: "compare-grid" }, this.plotsBox, el("div", {},
+        el("div", { class: "panel" }, el("h3", { text: "Difference in the shown time range" }), el("div", { class: "scroll" }, el("table", { class: "plain figures-table" }, el("thead", {}, el("tr", {}, head)), this.table)), this.help),
+        el("div", { class: "panel" }, el("h3", { text: "Notes" }), this.notes)));
+    main.append(el("div", { class: "device-head" }, el("h1", { text: "Compare" })), this.picks, this.tools, this.grid);
+    this.timer = setInterval(() => this.drawTable(), DRAW_MS);
     this.restart();
   }
 
@@ -59,11 +87,12 @@ export class Compare {
     const names = sorted(world.devices).reverse().map((one) => one.name);
     this.names = this.names.map((name, index) => name || names.find((one) => one !== this.names[1 - index]) || "");
     if (!this.names[1] || this.names[0] === this.names[1]) this.names[1] = names.find((one) => one !== this.names[0]) ?? "";
-    this.data = this.names.map(() => []); // [time, values of the axes]
-    for (const plot of this.plots ?? []) plot.destroy();
-    this.plots = null;
     this.drawPicks(names);
-    if (this.names.every(Boolean)) this.stream.look({ look: "device", device: this.names[0], other: this.names[1], rate_hz: RATE_HZ });
+    this.makePlots();
+    const [a, b] = this.names;
+    this.grid.hidden = this.tools.hidden = !a || !b;
+    this.help.textContent = `rms and maximum are measured from the mean. Delay: ${b} shows the same motion this much later than ${a}; “–” if it is not clear.`;
+    if (a && b) this.stream.look({ look: "device", device: a, other: b, rate_hz: RATE_HZ });
     else this.stream.look({ look: "overview" });
   }
 
@@ -76,101 +105,113 @@ export class Compare {
     this.known = names.length;
   }
 
+  makePlots() {
+    this.closePlots();
+    const { names, unit, isAngle, title } = KINDS[this.kind];
+    this.waiting = this.names.map(() => []); // buckets that are not in the plots: [bucket, time, values of the axes]
+    this.latest = [];
+    this.group = new PlotGroup(this.span_s);
+    const more = { isAngle, decimals: 2 };
+    this.plots = names.map((name, axis) => new RollingPlot(`compare-${name}`, name, unit, this.names, { ...more, styles: [{ stroke: COLOURS[axis], mark: `axis${axis}` }, { stroke: ink, dash: [6, 4], mark: "dashed" }] }, this.group));
+    this.difference = new RollingPlot("compare-difference", `${this.names[0]} − ${this.names[1]}`, unit, names, { decimals: 2, lanes: true }, this.group);
+    this.plotsBox.replaceChildren(...[...this.plots, this.difference].map((one) => one.node));
+    this.plotsBox.setAttribute("aria-label", `plots of ${title}`);
+    const kinds = segmented("quantity", Object.entries(KINDS).map(([key, one]) => [key, one.title]), this.kind, (value) => { this.kind = value; this.restart(); });
+    this.tools.replaceChildren(timeBar(this.group, SPANS, kinds));
+  }
+
   onMessage(message) {
     if (message.kind === "overview" && message.devices.length !== this.known) this.restart();
     if (message.kind === "status" && message.status) {
       this.statuses.set(message.device, message.status);
       this.drawNotes();
     }
-    if (message.kind !== "samples") return;
-    const index = this.names.indexOf(message.device);
-    const kind = KINDS[this.kind];
-    for (const bucket of index < 0 ? [] : message.buckets) {
-      const range = bucket[this.kind];
-      if (!range) continue;
-      this.offset_s ??= bucket.utc_s - bucket.last_s;
-      const before = this.data[index].at(-1)?.[1] ?? this.data[1 - index].at(-1)?.[1];
-      const values = kind.names.map((_, axis) => {
-        const half = range[1][axis] - range[0][axis] > Math.PI && kind.isAngle ? range[1][axis] : (range[0][axis] + range[1][axis]) / 2;
-        return kind.isAngle && before ? near(half * kind.scale, before[axis]) : half * kind.scale;
-      });
-      this.data[index].push([(bucket.first_s + bucket.last_s) / 2 + this.offset_s, values]);
-      while (this.data[index][0][0] < this.data[index].at(-1)[0] - KEPT_S) this.data[index].shift();
-    }
+    const index = message.kind === "samples" && !this.group.isPaused ? this.names.indexOf(message.device) : -1;
+    for (const bucket of index < 0 ? [] : message.buckets) if (bucket[this.kind]) this.waiting[index].push([bucket, (bucket.first_s + bucket.last_s) / 2, this.values(index, bucket[this.kind])]);
+    if (index >= 0) this.pair();
   }
 
-  /** Return the pairs of values of one axis: each bucket of A with the interpolated value of B. */
-  pairs(axis, from) {
-    const [a, b] = this.data;
-    let at = 0;
-    const found = [];
-    for (const [t, values] of a) {
-      while (at + 1 < b.length && b[at + 1][0] < t) at += 1;
-      const [before, after] = [b[at], b[at + 1]];
-      if (t < from || !after || before[0] > t || after[0] - before[0] > 5 / RATE_HZ) continue;
-      const share = (t - before[0]) / (after[0] - before[0]);
-      found.push([values[axis], before[1][axis] + share * (after[1][axis] - before[1][axis]), t]);
-    }
+  /** Return the middle of each range. An angle is at most half a turn from the previous angle of a device. */
+  values(index, [least, greatest]) {
+    const { names, scale, isAngle } = KINDS[this.kind];
+    const before = this.latest[index] ?? this.latest[1 - index];
+    const found = names.map((_, axis) => {
+      if (!isAngle) return ((least[axis] + greatest[axis]) / 2) * scale;
+      const other = greatest[axis] - least[axis] > Math.PI ? greatest[axis] - 2 * Math.PI : greatest[axis];
+      const angle = ((least[axis] + other) / 2) * scale;
+      return before ? near(angle, before[axis]) : angle;
+    });
+    this.latest[index] = found;
     return found;
   }
 
-  draw() {
-    const newest = Math.max(...this.data.map((one) => one.at(-1)?.[0] ?? 0));
-    if (!newest || document.hidden) return;
-    this.plots ??= this.makePlots();
-    const from = newest - this.group.span_s;
-    const kind = KINDS[this.kind];
-    this.newest = newest;
-    kind.names.forEach((name, axis) => {
-      const tables = this.data.map((rows) => [rows.map((one) => one[0]), rows.map((one) => one[1][axis])]);
-      this.plots[axis].setData(uPlot.join(tables));
-    });
-    const rows = kind.names.map((name, axis) => {
-      const found = statistics(this.pairs(axis, from));
-      const texts = found ? [found.mean, found.rms, found.most].map((one) => `${number(one, 2)} ${kind.unit}`).concat(number(found.correlation, 3)) : ["–", "–", "–", "–"];
-      return el("tr", {}, el("th", { scope: "row", text: name }), texts.map((text) => el("td", { text })));
-    });
-    this.table.replaceChildren(...rows);
+  /** Add each bucket of A to the plots, with the interpolated value of B at its time. */
+  pair() {
+    const [a, b] = this.waiting;
+    while (a.length) {
+      const [bucket, t, values] = a[0];
+      while (b.length > 1 && b[1][1] <= t) b.shift();
+      const [before, after] = b;
+      const isBetween = before && after && before[1] <= t && after[1] - before[1] <= HOLE_S;
+      if (!after && !(before && before[1] > t) && a.at(-1)[1] - t < LATE_S) break; // B is later
+      a.shift();
+      const share = isBetween ? (t - before[1]) / (after[1] - before[1]) : 0;
+      const others = values.map((_, axis) => (isBetween ? before[2][axis] + share * (after[2][axis] - before[2][axis]) : null));
+      values.forEach((one, axis) => this.plots[axis].add(bucket, [[one, others[axis]], [one, others[axis]]], 1 / RATE_HZ));
+      const difference = values.map((one, axis) => one - others[axis]);
+      this.difference.add(bucket, isBetween ? [difference, difference] : null, 1 / RATE_HZ);
+    }
+    b.splice(0, Math.max(0, b.length - WAITING_MAX));
   }
 
-  makePlots() {
-    const kind = KINDS[this.kind];
-    this.plotsBox.replaceChildren();
-    const axis = { stroke: ink, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1 } };
-    const seconds = (_, splits) => splits.map((at) => new Date(at * 1000).toTimeString().slice(0, 8));
-    return kind.names.map((name, index) => {
-      const box = el("div", { class: "plot", role: "img", "aria-label": `plot of ${name} of both devices` });
-      this.plotsBox.append(el("figure", { class: "chart" }, el("figcaption", {}, el("b", { text: name }), el("span", { class: "unit", text: kind.unit })), box));
-      const line = { width: 1.4, points: { show: false }, spanGaps: true };
-      return new uPlot({
-        width: Math.max(box.clientWidth, 120), height: 168, legend: { show: false }, cursor: { sync: { key: "compare" }, drag: { x: false, y: false } },
-        series: [{}, { ...line, label: this.names[0], stroke: COLOURS[index] }, { ...line, label: this.names[1], stroke: ink, dash: [6, 4] }],
-        axes: [{ ...axis, values: seconds, space: 80, size: 30 }, { ...axis, size: 52, values: labels }],
-        scales: { x: { time: true, range: () => [this.newest - this.group.span_s, this.newest] } },
-      }, [[], [], []], box);
-    });
+  drawTable() {
+    const { names, unit } = KINDS[this.kind];
+    if (document.hidden) return;
+    const [from, to] = this.group.range(this.difference.newest);
+    this.table.replaceChildren(...names.map((name, axis) => {
+      const { data } = this.plots[axis];
+      const inRange = data[0].map((t, index) => index).filter((index) => data[0][index] >= from && data[0][index] <= to);
+      const [times, a, b] = [0, 1, 3].map((line) => inRange.map((index) => data[line][index]));
+      const found = statistics(a, b);
+      const texts = found ? [found.mean, found.rms, found.most].map((one) => `${number(one, 2)} ${unit}`).concat(number(found.correlation, 3)) : ["–", "–", "–", "–"];
+      const period_s = (times.at(-1) - times[0]) / (times.length - 1);
+      const delay = found && found.delay !== null ? `${number(found.delay * period_s * 1e3, 0)} ms` : "–";
+      return el("tr", {}, el("th", { scope: "row", text: name }), [...texts, delay].map((text) => el("td", { text })));
+    }));
   }
 
   drawNotes() {
     const [a, b] = this.names.map((name) => this.statuses.get(name));
     if (!a || !b) return;
-    const isSame = a.frame?.frame === b.frame?.frame && a.frame?.convention === b.frame?.convention;
+    const rotated = this.names.filter((_, index) => [a, b][index].frame && [a, b][index].frame.convention !== "enu-flu");
+    const isKnown = a.frame && b.frame;
+    const axes = a.frame?.conventions?.["enu-flu"]?.frame;
     const notes = [
-      [isSame, isSame ? `Both devices use the same axes: ${a.frame?.frame ?? "unknown"}.` : `The axes differ: ${this.names[0]} ${a.frame?.frame ?? "unknown"}, ${this.names[1]} ${b.frame?.frame ?? "unknown"}. Set convention in the configuration.`],
+      [isKnown, isKnown ? `Both devices use the same axes${axes ? `: ${axes}` : ""} (enu-flu).${rotated.length ? ` imud rotates the values of ${rotated.join(" and ")}.` : ""}` : "The axes of a device are not known."],
       [true, `Both devices use one clock, time stamp error ±${duration(a.clock.t_err_ns / 1e9)} and ±${duration(b.clock.t_err_ns / 1e9)}.`],
     ];
+    [a, b].forEach((one, index) => one.condition?.condition === "missing" && notes.push([false, `${this.names[index]} is missing and sends no samples.`]));
     if ([a, b].some((one) => one.frame?.heading === "relative")) notes.push([false, "Yaw is measured from the direction at power-on of each device. Compare only changes of yaw."]);
     const drawn = JSON.stringify(notes);
     if (drawn !== this.drawn) this.notes.replaceChildren(...notes.map(([isOk, text]) => el("li", {}, icon(isOk ? "ok" : "degraded"), el("span", { text }))));
     this.drawn = drawn;
   }
 
+  onPause() {
+    this.group.pause();
+    return true;
+  }
+
   onTheme() {
-    for (const plot of this.plots ?? []) plot.redraw();
+    for (const plot of [...this.plots, this.difference]) plot.draw();
+  }
+
+  closePlots() {
+    for (const plot of [...(this.plots ?? []), this.difference]) plot?.close();
   }
 
   close() {
     clearInterval(this.timer);
-    for (const plot of this.plots ?? []) plot.destroy();
+    this.closePlots();
   }
 }

@@ -15,6 +15,7 @@ import { call, clock, copy, el, setText } from "./util.js";
 const PHONE = matchMedia("(max-width: 820px)");
 const HOUR = { points: 600, period_s: 6 };
 const RECENT_S = 599; // the newest part of the history has a point per second
+const HISTORY_OFF = "the history is off";
 const GAP_S = 5; // time without buckets after which the page requests the history
 
 export class DevicePage {
@@ -73,15 +74,16 @@ export class DevicePage {
       const older = hour.filter((one) => one.last_s < Math.floor(from_s)).map((one) => [one, HOUR.period_s]);
       const buckets = [...older, ...recent.filter((one) => one.last_s < end_s).map((one) => [one, 1])];
       for (const part of [this.live, this.time]) part.restore(buckets);
-    } catch {
-      // without the history, the plots begin with the page
+      this.live.showHistory(true);
+    } catch (error) {
+      if (error.message.includes(HISTORY_OFF)) this.live.showHistory(false);
     } finally {
       this.isRestoring = false;
     }
   }
 
   onPause() {
-    this.live.onPause();
+    this.live.group.pause();
     return true;
   }
 
@@ -99,7 +101,7 @@ export class DevicePage {
     if (message.device !== this.name) return;
     if (message.kind === "status") this.showStatus(message);
     if (message.kind === "raw") this.live.addRaw(message);
-    if (message.kind === "samples" && message.rate_hz === this.live.rate_hz && !this.live.isPaused) {
+    if (message.kind === "samples" && message.rate_hz === this.live.rate_hz && !this.live.group.isPaused) {
       for (const bucket of message.buckets) {
         if (bucket.first_s - this.last_s > GAP_S) this.restore(); // this page was hidden or not connected
         this.last_s = bucket.last_s;

@@ -1,9 +1,9 @@
 // The section Live: five figures, the orientation, the plots on one time axis or the spectrum.
 
 import { AttitudeView, gravityOf } from "./attitude.js";
-import { PlotGroup, RollingPlot } from "./plots.js";
+import { PlotGroup, RollingPlot, timeBar } from "./plots.js";
 import { SpectrumPlot } from "./spectrum-plot.js";
-import { button, icon, section, segmented, toggle } from "./ui.js";
+import { icon, section, segmented, toggle } from "./ui.js";
 import { AXES, DEGREE, duration, el, number, setText } from "./util.js";
 
 const RATES_HZ = [10, 20, 50];
@@ -19,6 +19,7 @@ const HEADINGS = {
   relative: "Yaw is measured from the direction at power-on. It is not a compass heading.",
   magnetic: "Heading: magnetic north.", true: "Heading: true north.",
 };
+const NO_HISTORY = "The plots begin with this page, because the history of imud is off. To keep the last hour, set socket: {history: true} in the configuration.";
 const NO_ATTITUDE = "The device sends no attitude, so imud cannot subtract gravity.";
 
 export class LiveSection {
@@ -26,10 +27,9 @@ export class LiveSection {
   constructor(name, onLook) {
     this.onLook = onLook;
     this.rate_hz = 20;
-    this.isPaused = false;
     this.isFree = false;
     this.frame = "ENU";
-    this.group = new PlotGroup(30, () => this.showZoom());
+    this.group = new PlotGroup(30);
     this.plots = new Map(PLOTS.map(([member, title, ...more]) => [member, new RollingPlot(member, title, ...more, this.group)]));
     this.free = new RollingPlot("free_m_s2", "Acceleration without gravity", "m/s²", AXES, { decimals: 2 }, this.group);
     for (const plot of [...this.plots.values(), this.free]) plot.node.hidden = true;
@@ -38,7 +38,6 @@ export class LiveSection {
     this.figures = new Map(["Rate", "Lost in last minute", "Time stamp error", "Latency", "Temperature"].map((title) => [title, figure(title)]));
     this.node = section("live", "Live", el("dl", { class: "bigs" }, [...this.figures.values()].map((one) => one.node)), el("div", { class: "live-grid" }, this.orientation(), this.views()));
     this.node.querySelector(".section-head").append(this.tools());
-    this.showZoom();
   }
 
   orientation() {
@@ -57,43 +56,25 @@ export class LiveSection {
     this.gravity.disabled = true;
     this.gravityNote = el("p", { class: "help", text: NO_ATTITUDE });
     this.lost = el("p", { class: "help lost-note", hidden: true }, el("i"), "lost samples");
+    this.noHistory = el("p", { class: "help", id: "no-history", hidden: true, text: NO_HISTORY });
     const all = [...this.plots.values()].map((one) => one.node);
-    this.time = el("div", { class: "panel plots" }, el("div", { class: "plot-tools" }, gravity, this.gravityNote), all[0], this.free.node, all.slice(1), this.lost);
+    this.time = el("div", { class: "panel plots" }, el("div", { class: "plot-tools" }, gravity, this.gravityNote), all[0], this.free.node, all.slice(1), this.lost, this.noHistory);
     this.other = el("div", { class: "panel", id: "spectrum", hidden: true }, this.spectrum.node);
     return el("div", {}, this.time, this.other);
   }
 
   tools() {
-    const spans = segmented("time range", SPANS, String(this.group.span_s), (value) => this.group.setSpan(Number(value)));
-    this.pause = el("button", { type: "button", id: "pause", class: "quiet pause", onclick: () => this.onPause() });
-    this.reset = button("Reset zoom", () => this.group.zoom(null), { kind: "quiet", glyph: "zoom" });
-    this.reset.hidden = true;
     const kind = segmented("type of plot", [["time", "Over time"], ["spectrum", "Spectrum"]], "time", (value) => {
       this.time.hidden = value !== "time";
       this.other.hidden = value === "time";
     });
     const rates = el("select", { id: "rate", "aria-label": "points per second", onchange: (event) => this.setRate(Number(event.target.value)) }, RATES_HZ.map((one) => el("option", { value: one, text: `${one} Hz`, selected: one === this.rate_hz })));
-    this.showPause();
-    return el("div", { class: "timebar" }, spans, this.pause, this.reset, kind, rates);
+    return timeBar(this.group, SPANS, kind, rates);
   }
 
   setRate(rate_hz) {
     this.rate_hz = rate_hz;
     this.onLook();
-  }
-
-  onPause() {
-    this.isPaused = !this.isPaused;
-    if (!this.isPaused) this.group.zoom(null);
-    this.showPause();
-  }
-
-  showPause() {
-    this.pause.replaceChildren(icon(this.isPaused ? "play" : "pause"), el("span", { text: this.isPaused ? "Continue" : "Pause" }));
-  }
-
-  showZoom() {
-    if (this.reset) this.reset.hidden = !this.group.zoomed;
   }
 
   showFree() {
@@ -113,7 +94,7 @@ export class LiveSection {
     this.lost.hidden = !this.plots.get("accel_m_s2").losses.length;
     const { quat_wxyz, accel_m_s2, euler_rad } = bucket;
     if (quat_wxyz) {
-      if (!this.isPaused) this.attitude.set(quat_wxyz, this.frame);
+      if (!this.group.isPaused) this.attitude.set(quat_wxyz, this.frame);
       this.gravity.disabled = false;
       this.gravityNote.hidden = true;
     }
@@ -131,8 +112,12 @@ export class LiveSection {
     }
   }
 
+  showHistory(is) {
+    this.noHistory.hidden = is;
+  }
+
   addRaw(message) {
-    if (!this.isPaused) this.spectrum.add(message);
+    if (!this.group.isPaused) this.spectrum.add(message);
   }
 
   draw({ status }) {

@@ -1,7 +1,7 @@
 // Rolling plots (uPlot). Each axis has a line through the minimum and a line through the maximum of each bucket, and the
 // area between them. Thus peaks are visible at any rate.
 
-import { segmented } from "./ui.js";
+import { button, icon, segmented } from "./ui.js";
 import { el, number, setText } from "./util.js";
 
 export const COLOURS = ["#d1495b", "#2e8b57", "#3a7bd5"];
@@ -13,6 +13,9 @@ const FINE_S = 600; // age at which a plot merges points
 const MERGED_S = 6; // time span of a merged point
 const MERGE_S = 60; // time span of the points that a plot merges together
 const LANE_MARGIN = 0.12; // free share of the height of a lane, above and below its curve
+const LABEL_MARGIN = 0.14; // share of the height of a lane without a label, so that the labels of two lanes do not overlap
+const ZOOM_LEAST_S = 0.05; // least time range of a zoom
+const TURN_DEG = 360;
 const STEP = 0.2; // share of the time range by which a key moves the cursor or zooms
 
 const color = (name) => () => getComputedStyle(document.documentElement).getPropertyValue(name).trim() || "#888";
@@ -20,10 +23,10 @@ export const ink = color("--mute");
 export const grid = color("--line");
 const lostColor = color("--missing");
 
-/** Time range of several plots: the newest `span_s`, or a zoomed range. */
+/** Time range of several plots: the newest `span_s`, or a zoomed range; and their pause. */
 export class PlotGroup {
-  constructor(span_s, onZoom) {
-    Object.assign(this, { span_s, onZoom, zoomed: null, plots: [] });
+  constructor(span_s) {
+    Object.assign(this, { span_s, zoomed: null, isPaused: false, plots: [], onChange: () => {} });
   }
 
   setSpan(span_s) {
@@ -33,15 +36,40 @@ export class PlotGroup {
 
   /** range: first and last time in s; null for the newest `span_s`. */
   zoom(range) {
+    if (range && (range[1] - range[0] < ZOOM_LEAST_S || range[1] - range[0] > KEPT_S)) return;
     this.zoomed = range;
-    this.onZoom?.();
+    this.onChange();
     for (const plot of this.plots) plot.draw();
+  }
+
+  /** Pause, or continue with the newest values. The owner of the plots adds no values during a pause. */
+  pause() {
+    this.isPaused = !this.isPaused;
+    this.zoom(this.isPaused ? this.zoomed : null);
   }
 
   range(newest) {
     return this.zoomed ?? [newest - this.span_s, newest];
   }
 }
+
+/** Return a bar with the time range, the pause and the reset of the zoom of a group, and other controls. */
+export function timeBar(group, spans, ...more) {
+  const pause = el("button", { type: "button", id: "pause", class: "quiet pause", onclick: () => group.pause() });
+  const reset = button("Reset zoom", () => group.zoom(null), { kind: "quiet", glyph: "zoom" });
+  group.onChange = () => {
+    reset.hidden = !group.zoomed;
+    pause.replaceChildren(icon(group.isPaused ? "play" : "pause"), el("span", { text: group.isPaused ? "Continue" : "Pause" }));
+  };
+  group.onChange();
+  return el("div", { class: "timebar" }, segmented("time range", spans, String(group.span_s), (value) => group.setSpan(Number(value))), pause, reset, more);
+}
+
+/** Return an angle in degrees, moved by whole turns to at most half a turn from `to`. */
+export const near = (angle, to) => angle - TURN_DEG * Math.round((angle - to) / TURN_DEG);
+
+/** Return the labels of an angle: −180 to 180, also after whole turns. */
+const degrees = (_, splits) => labels(_, splits.map((at) => near(at, 0))).map((text) => text.replace(/^−?180$/, "±180"));
 
 /** Return the labels of a linear axis. */
 export function labels(_, splits) {
@@ -58,15 +86,29 @@ function splitsOf(least, most) {
   const rough = (most - least) / 3;
   const power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].map((one) => one * power).find((one) => one >= rough);
-  const first = Math.ceil(least / step + 0.05);
-  return Array.from({ length: 4 }, (_, index) => (first + index) * step).filter((one) => one < most - 0.05 * step);
+  const [lowest, highest] = [least + LABEL_MARGIN * (most - least), most - LABEL_MARGIN * (most - least)];
+  const first = Math.ceil(lowest / step);
+  return Array.from({ length: 4 }, (_, index) => (first + index) * step).filter((one) => one <= highest);
+}
+
+const isNumber = (value) => value !== null && value !== undefined;
+
+/** Return the least and the greatest angle, moved by whole turns to the previous angle. A range of more than half a turn
+ *  contains ±180: then the angles are between its ends in the other direction. */
+function unwrapped([least, greatest], before) {
+  const [from, to] = greatest - least > TURN_DEG / 2 ? [greatest, least + TURN_DEG] : [least, greatest];
+  const moved = before === undefined ? to : near(to, before);
+  return [from + moved - to, moved];
 }
 
 export class RollingPlot {
-  /** axes: names of the lines; scale: what values are multiplied by; isAngle: a step over a half turn breaks the line;
-   *  isLog: the axis is logarithmic; lanes: each line has a lane with a scale of its own; group: common time range. */
-  constructor(id, title, unit, axes, { scale = 1, isAngle = false, isLog = false, decimals = 2, lanes = null } = {}, group = new PlotGroup(30)) {
-    Object.assign(this, { axes, title, scale, isAngle, isLog, decimals, group, lanes: lanes ?? false });
+  /** axes: names of the lines; scale: factor of the values; isAngle: the values are degrees, the lines continue over ±180
+   *  and the labels do not; isLog: the axis is logarithmic; lanes: each line has a lane with a scale of its own;
+   *  styles: stroke, dash and mark (class of the name) of each line; group: common time range. */
+  constructor(id, title, unit, axes, { scale = 1, isAngle = false, isLog = false, decimals = 2, lanes = false, styles = [] } = {}, group = new PlotGroup(30)) {
+    Object.assign(this, { axes, title, scale, isAngle, isLog, decimals, group, lanes });
+    this.styles = axes.map((_, index) => ({ stroke: COLOURS[index], mark: `axis${index}`, ...styles[index] }));
+    this.labels = isLog ? powers : isAngle ? degrees : labels;
     group.plots.push(this);
     this.offset_s = null; // from the daemon's clock to UTC, constant after the first bucket
     this.losses = []; // times of lost samples
@@ -75,7 +117,9 @@ export class RollingPlot {
     this.values = axes.map((name, index) => this.key(name, index));
     const keys = el("div", { class: "keys" }, this.values.map((one) => one.node));
     const scales = isLog ? null : segmented(`scale of ${title}`, [["together", "Combined"], ["lanes", "Separate"]], this.lanes ? "lanes" : "together", (value) => this.setLanes(value === "lanes"));
-    this.box = el("div", { class: "plot", tabindex: "0", role: "img", "aria-label": `plot of ${title}`, onkeydown: (event) => this.onKey(event) });
+    const onTouch = (event) => this.onTouch(event);
+    this.box = el("div", { class: "plot", tabindex: "0", role: "img", "aria-label": `plot of ${title}; arrow keys move the cursor, plus and minus zoom`,
+      onkeydown: (event) => this.onKey(event), ontouchstart: onTouch, ontouchmove: onTouch, ontouchend: onTouch });
     this.node = el("figure", { id, class: "chart" }, el("figcaption", {}, el("b", { text: title }), el("span", { class: "unit", text: unit }), keys, el("div", { class: "chart-tools" }, scales)), this.box);
     this.data = [[], ...axes.flatMap(() => [[], []])];
     this.drawn = 0;
@@ -97,7 +141,7 @@ export class RollingPlot {
       if (!isShown) this.hidden.add(index);
       node.setAttribute("aria-pressed", String(isShown));
       for (const line of [1, 2]) this.plot?.setSeries(2 * index + line, { show: isShown });
-    } }, el("i", { class: `axis${index}` }), el("b", { text: name }), value);
+    } }, el("i", { class: this.styles[index].mark }), el("b", { text: name }), value);
     return { value, node };
   }
 
@@ -120,13 +164,13 @@ export class RollingPlot {
   begin() {
     const axis = (more) => ({ stroke: ink, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1 }, ...more });
     const series = this.axes.flatMap((name, index) => {
-      const line = { stroke: COLOURS[index], width: 1.25, points: { show: false }, spanGaps: false, scale: this.scaleOf(index), show: !this.hidden.has(index) };
+      const line = { stroke: this.styles[index].stroke, dash: this.styles[index].dash, width: 1.25, points: { show: false }, spanGaps: false, scale: this.scaleOf(index), show: !this.hidden.has(index) };
       return [{ ...line, label: `${name} maximum` }, { ...line, label: `${name} minimum` }];
     });
-    const bands = this.axes.map((_, index) => ({ series: [1 + 2 * index, 2 + 2 * index], fill: COLOURS[index] + AREA }));
+    const bands = this.styles.flatMap(({ stroke }, index) => (typeof stroke === "string" ? [{ series: [1 + 2 * index, 2 + 2 * index], fill: stroke + AREA }] : []));
     const seconds = (_, splits) => splits.map((at) => new Date(at * 1000).toTimeString().slice(0, 8));
     const lanes = Object.fromEntries(this.axes.map((_, index) => [`y${index}`, { range: (_plot, least, most) => this.laneRange(index, least, most) }]));
-    const upright = this.lanes ? { scale: "y0", size: 52, values: (_, splits) => splits.map(() => ""), grid: { show: false }, ticks: { show: false } } : { scale: "y", size: 52, values: this.isLog ? powers : labels };
+    const upright = this.lanes ? { scale: "y0", size: 52, values: (_, splits) => splits.map(() => ""), grid: { show: false }, ticks: { show: false } } : { scale: "y", size: 52, values: this.labels };
     this.plot = new uPlot(
       {
         ...this.size(), series: [{}, ...series], bands, legend: { show: false },
@@ -162,7 +206,7 @@ export class RollingPlot {
       const bottom = min + ((count - 1 - index) * (max - min)) / count;
       const top = bottom + (max - min) / count;
       ctx.fillStyle = ink();
-      for (const at of splitsOf(bottom, top)) ctx.fillText(labels(null, [at])[0], bbox.left - 6 * pixels, valToPos(at, `y${index}`, true));
+      for (const at of splitsOf(bottom, top)) ctx.fillText(this.labels(null, [at])[0], bbox.left - 6 * pixels, valToPos(at, `y${index}`, true));
       ctx.fillStyle = grid();
       if (index) ctx.fillRect(bbox.left, valToPos(top, `y${index}`, true), bbox.width, pixels);
     }
@@ -197,6 +241,22 @@ export class RollingPlot {
     event.preventDefault();
   }
 
+  /** Zoom with two fingers: the times below the fingers stay below them. */
+  onTouch(event) {
+    if (event.touches.length !== 2 || !this.plot) {
+      this.pinched = null;
+      return;
+    }
+    event.preventDefault();
+    const { left, width } = this.plot.over.getBoundingClientRect();
+    const [one, other] = [...event.touches].map((touch) => (touch.clientX - left) / width).sort((a, b) => a - b);
+    const [from, to] = this.group.range(this.newest);
+    this.pinched ??= [one, other].map((share) => from + share * (to - from));
+    const [a, b] = this.pinched;
+    const span_s = (b - a) / (other - one);
+    this.group.zoom([a - one * span_s, a + (1 - one) * span_s]);
+  }
+
   /** Add a bucket with its first and last time, and minimum and maximum per axis (null without values). */
   add(bucket, range, period_s) {
     this.offset_s ??= bucket.utc_s - bucket.last_s;
@@ -229,10 +289,9 @@ export class RollingPlot {
       const part = this.data.map((one) => one.slice(first, end).filter((value) => value !== null));
       merged[0].push((part[0][0] + part[0].at(-1)) / 2);
       this.axes.forEach((_, index) => {
-        const [most, least] = [Math.max(...part[1 + 2 * index]), Math.min(...part[2 + 2 * index])];
-        const isKept = part[1 + 2 * index].length && !(this.isAngle && most - least > Math.PI * this.scale);
-        merged[1 + 2 * index].push(isKept ? most : null);
-        merged[2 + 2 * index].push(isKept ? least : null);
+        const isKept = part[1 + 2 * index].length > 0;
+        merged[1 + 2 * index].push(isKept ? Math.max(...part[1 + 2 * index]) : null);
+        merged[2 + 2 * index].push(isKept ? Math.min(...part[2 + 2 * index]) : null);
       });
     }
     this.data.forEach((one, line) => one.splice(this.stored, end - this.stored, ...merged[line]));
@@ -266,7 +325,12 @@ export class RollingPlot {
       before = bucket;
     }
     this.stored = this.data[0].length;
-    this.data = this.data.map((one, line) => one.concat(live[line].slice(end)));
+    this.data = this.data.map((one, line) => {
+      const rest = live[line].slice(end);
+      const [before, after] = [one.findLast(isNumber), rest.find(isNumber)];
+      const turns = this.isAngle && line && isNumber(before) && isNumber(after) ? near(after, before) - after : 0;
+      return one.concat(turns ? rest.map((value) => (value === null ? null : value + turns)) : rest);
+    });
     this.newest = Math.max(this.newest ?? last, last);
     if (this.stored === this.data[0].length) this.step_s = 1; // the incomplete second is no gap
     this.draw();
@@ -275,18 +339,13 @@ export class RollingPlot {
   push(x, range) {
     this.data[0].push(x);
     this.axes.forEach((_, index) => {
-      let least = range ? range[0][index] : null;
-      let greatest = range ? range[1][index] : null;
-      if (this.isAngle && range && this.isStep(index, least, greatest)) least = greatest = null;
-      this.data[1 + 2 * index].push(greatest === null ? null : greatest * this.scale);
-      this.data[2 + 2 * index].push(least === null ? null : least * this.scale);
+      const lines = [this.data[2 + 2 * index], this.data[1 + 2 * index]];
+      let ends = range?.map((vector) => vector[index] ?? null) ?? [null, null];
+      if (ends.includes(null)) ends = [null, null];
+      else ends = ends.map((value) => value * this.scale);
+      if (this.isAngle && ends[0] !== null) ends = unwrapped(ends, lines[1].findLast(isNumber));
+      lines.forEach((line, side) => line.push(ends[side]));
     });
-  }
-
-  /** Return whether an angle passed ±180° in this bucket or since the previous bucket. */
-  isStep(index, least, greatest) {
-    const before = this.data[1 + 2 * index].at(-1);
-    return greatest - least > Math.PI || (before !== null && before !== undefined && Math.abs(greatest - before / this.scale) > Math.PI);
   }
 
   clear() {
@@ -316,7 +375,7 @@ export class RollingPlot {
   showValues() {
     const at = this.plot?.cursor.idx ?? this.data[0].length - 1;
     this.values.forEach(({ value }, index) => {
-      const [most, least] = [this.data[1 + 2 * index][at], this.data[2 + 2 * index][at]];
+      const [most, least] = [1, 2].map((line) => this.data[line + 2 * index][at]).map((one) => (this.isAngle && isNumber(one) ? near(one, 0) : one));
       const same = number(most, this.decimals) === number(least, this.decimals);
       setText(value, same ? number(most, this.decimals) : `${number(least, this.decimals)} … ${number(most, this.decimals)}`);
     });

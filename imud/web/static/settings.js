@@ -5,7 +5,7 @@ import { agrees, changed, control, said, same, words } from "./fields.js";
 import { closeDialog, showDialog } from "./shell.js";
 import { editsOf, keepEdits, session } from "./state.js";
 import { button, icon, section, segmented, toast, toggle } from "./ui.js";
-import { call, copy, el, timeOf } from "./util.js";
+import { call, command, copy, el, timeOf } from "./util.js";
 
 const GROUPS = { measurement: "Measurement", output: "Output", pins: "Pins and alarm", connection: "Connection" };
 const AFTER_RESTART = "after save and restart";
@@ -201,7 +201,7 @@ export class SettingsSection {
     const [wrong] = this.wrong;
     const note = wrong ? `${words(wrong)}: invalid value` : `${this.device}: stored only in this browser${restarts ? ", restart needed" : ""}`;
     bar.replaceChildren(el("div", {}, el("b", { text: `${count} ${count === 1 ? "change" : "changes"} not applied` }), el("span", { class: "help", text: note })),
-      button("Discard", () => this.discard(), { kind: "quiet" }), button("Review", () => this.review(), { kind: "primary", disabled: this.wrong.size > 0 || !session.control }));
+      button("Discard", () => this.discard(), { kind: "quiet" }), button("Review", () => this.review(), { kind: "primary", disabled: !this.report || this.wrong.size > 0 || !session.control }));
   }
 
   discard() {
@@ -283,12 +283,7 @@ export class SettingsSection {
 
   async saveAll() {
     closeDialog();
-    try {
-      const answer = await call("command", { device: this.device, name: "save", arguments: {} });
-      toast(answer?.evidence ? `Save: ${answer.verified ? "verified" : "sent, not verified"}: ${answer.evidence}` : "Save: sent, not verified");
-    } catch (error) {
-      toast(error.message);
-    }
+    toast(await command(this.device, "save", "Save"));
     this.load();
   }
 }

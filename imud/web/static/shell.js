@@ -141,7 +141,7 @@ export class Shell {
   }
 
   onKey(event) {
-    if (event.target.closest("input, select, textarea, dialog, [role=radiogroup]") || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.target.closest("input:not([type=checkbox]), select, textarea, dialog") || event.ctrlKey || event.metaKey || event.altKey) return;
     const route = routeOf();
     const names = sorted(world.devices).map((one) => one.name);
     const section = SECTIONS[Number(event.key) - 1];
@@ -152,7 +152,7 @@ export class Shell {
       const step = event.key === "]" ? 1 : at < 0 ? 0 : -1;
       location.hash = deviceLink(names[(at + step + names.length) % names.length]);
     } else if (route.what === "device" && section) location.hash = deviceLink(route.name, section[0]);
-    else if (event.key === " " && !event.target.closest("button, a, summary") && this.onPause?.()) event.preventDefault();
+    else if (event.key === " " && !event.target.closest("button, a, summary, input") && this.onPause?.()) event.preventDefault();
   }
 }
 

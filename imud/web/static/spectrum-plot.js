@@ -29,7 +29,7 @@ export class SpectrumPlot {
       onChoice(this.member);
     });
     this.note = el("p", { class: "help", text: OFF });
-    this.box = el("div", { class: "plot" });
+    this.box = el("div", { class: "plot", role: "img", "aria-label": "plot of the spectrum; its highest peaks are below" });
     this.node = el("div", { class: "fill" }, el("div", { class: "buttons" }, this.choice), this.box, this.note);
     this.box.hidden = true;
     new ResizeObserver(() => this.plot && this.box.clientWidth && this.plot.setSize(this.size())).observe(this.box);

@@ -13,6 +13,7 @@ const NONE = 255;
 const CIRCLE_STEPS = 90;
 const NEAR_OPACITY = 220; // of 255
 const FAR_OPACITY = 60;
+const NEXT_OPACITY = 110;
 
 /** Return the center of cell 0 … 47: the octant by signs (bit 0: x < 0), then the order of the absolute values. */
 export function cellDirection(cell) {
@@ -85,14 +86,15 @@ export class CoverageSphere {
     this.draw("0");
   }
 
-  draw(mask) {
+  /** Draw the covered cells of a mask, and the cells to measure next. */
+  draw(mask, next = []) {
     const covered = coveredCells(mask);
     this.canvas.dataset.covered = covered.filter(Boolean).length;
     const context = cleared(this.canvas, SIZE);
     const style = getComputedStyle(this.canvas);
     const colour = (name) => style.getPropertyValue(name) || "#888";
     if (this.map?.pixels !== this.canvas.width) this.map = cellMap(this.canvas.width);
-    context.putImageData(this.filled(context, covered, colour("--ok")), 0, 0);
+    context.putImageData(this.filled(context, covered, next, colour("--ok"), colour("--accent")), 0, 0);
     context.strokeStyle = colour("--faint");
     context.lineWidth = 1;
     context.beginPath();
@@ -119,15 +121,18 @@ export class CoverageSphere {
   }
 
   /** Draw the covered cells; cells at the back are visible through the front. */
-  filled(context, covered, colour) {
+  filled(context, covered, next, colour, nextColour) {
     const { pixels, near, far } = this.map;
     const image = context.createImageData(pixels, pixels);
-    context.fillStyle = colour;
-    const rgb = [1, 3, 5].map((at) => parseInt(context.fillStyle.slice(at, at + 2), 16)); // format of the canvas: "#rrggbb"
+    const [done, wanted] = [colour, nextColour].map((one) => {
+      context.fillStyle = one;
+      return [1, 3, 5].map((at) => parseInt(context.fillStyle.slice(at, at + 2), 16)); // format of the canvas: "#rrggbb"
+    });
     for (let index = 0; index < near.length; index += 1) {
       if (near[index] === NONE) continue;
       const opacity = covered[near[index]] ? NEAR_OPACITY : covered[far[index]] ? FAR_OPACITY : 0;
-      if (opacity) image.data.set([...rgb, opacity], 4 * index);
+      if (opacity) image.data.set([...done, opacity], 4 * index);
+      if (next.includes(near[index])) image.data.set([...wanted, NEXT_OPACITY], 4 * index);
     }
     return image;
   }

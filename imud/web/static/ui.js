@@ -35,7 +35,7 @@ const PATHS = {
 };
 
 const SVG = "http://www.w3.org/2000/svg";
-const LINES = { viewBox: "0 0 24 24", fill: "none", stroke: "currentColor", "stroke-width": "2", "stroke-linecap": "round", "stroke-linejoin": "round" };
+const LINES = { viewBox: "0 0 24 24", fill: "none", stroke: "currentColor", "stroke-width": "2", "stroke-linecap": "round", "stroke-linejoin": "round", "aria-hidden": "true" };
 
 function drawing(tag, attributes) {
   const node = document.createElementNS(SVG, tag);

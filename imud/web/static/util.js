@@ -32,7 +32,7 @@ export function cleared(canvas, size) {
 export function number(value, decimals = 0) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   const text = value.toLocaleString("en", { minimumFractionDigits: decimals, maximumFractionDigits: decimals });
-  return text.replace("-", "−");
+  return text.replace(/^-(?=[0.]+$)/, "").replace("-", "−");
 }
 
 export function length(vector) {
@@ -94,6 +94,17 @@ export async function call(method, params) {
   const answer = await response.json();
   if (answer.error) throw new Error(answer.error);
   return answer.result;
+}
+
+/** Run a command of a device. Return a sentence about its result, or about the problem. */
+export async function command(device, name, title) {
+  try {
+    const answer = await call("command", { device, name, arguments: {} });
+    const evidence = answer?.evidence ? `${answer.verified ? "verified" : "sent, not verified"}: ${answer.evidence}` : "sent, not verified";
+    return [`${title}: ${evidence}`, answer?.not_saved].filter(Boolean).join(". ");
+  } catch (error) {
+    return error.message;
+  }
 }
 
 /** Return a span of time as `imud status` prints it: 40 s, 14 min, 3 h, 2 days. */
