@@ -44,7 +44,7 @@ def run_simulator(options: argparse.Namespace, *, stays: bool) -> int:
     if all(name in CAN_SIMULATORS for name, _ in devices):
         return _run_on_can(options, devices, now_ns, stays=stays)
     if len(devices) > 1:
-        print("imud.sim: expected one device on a terminal, or one or more devices on a CAN bus", file=sys.stderr)
+        print("imud sim: expected one device on a terminal, or one or more devices on a CAN bus", file=sys.stderr)
         return 2
     ((name, node),) = devices
     try:
@@ -53,7 +53,7 @@ def run_simulator(options: argparse.Namespace, *, stays: bool) -> int:
         lines = _lines(options, module)
     except (ValueError, OSError) as error:
         file = f"{error.filename}: " if isinstance(error, OSError) and error.filename else ""
-        print(f"imud.sim: {file}{reason_of(error)}", file=sys.stderr)
+        print(f"imud sim: {file}{reason_of(error)}", file=sys.stderr)
         return 2
     sharpen_timers()
     with closing(lines), ExitStack() as stack:
@@ -75,7 +75,7 @@ def _run_on_can(options: argparse.Namespace, devices: list[tuple[str, int]], now
             CanModules(modules) if len(modules) > 1 else modules[0], options.interface or default_interface()
         )
     except (ValueError, LinkError) as error:
-        print(f"imud.sim: {error}", file=sys.stderr)
+        print(f"imud sim: {error}", file=sys.stderr)
         return 2
     sharpen_timers()
     with closing(port):

@@ -72,7 +72,7 @@ class StandardInputControl:
             try:
                 self._run_command(line.decode(errors="replace").split())
             except BadCommand as error:
-                print(f"imud.sim: {error}", file=sys.stderr, flush=True)
+                print(f"imud sim: {error}", file=sys.stderr, flush=True)
 
     def _run_command(self, words: list[str]) -> None:
         port, now_ns = self._port, self._now_ns()

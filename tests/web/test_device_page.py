@@ -73,6 +73,8 @@ def test_every_vector_and_angle_is_plotted_as_it_was_sent_in_the_units_of_people
             page_values = page.text("#euler_rad .key:last-child output")
             plots = {member: np.array(rows, dtype=float) for member, rows in page.js(PLOTTED).items()}
             assert page.problems() == []
+    kept = ~np.isnan(plots["accel_m_s2"]).any(axis=0)  # a late host breaks the lines
+    plots = {member: rows[:, kept] for member, rows in plots.items()}
     greatest, least = plots["accel_m_s2"][1:3] / RISE["accel_m_s2"][0]
     spans = [(round(low), round(high)) for low, high in zip(least, greatest, strict=True)]
     assert sum(last - first + 1 for first, last in spans) == spans[-1][1] - spans[0][0] + 1, "no measurement is missing"

@@ -104,7 +104,7 @@ def test_the_plot_contains_every_sent_peak(page: Page, tmp_path: Path) -> None:
         daemon.wait_for("bow", "running")
         with serving_web(daemon.socket) as url:
             page.driver.get(f"{url}#/device/bow")
-            page.until(POINTS, 80, what="four seconds are plotted")
+            page.until(POINTS, 100, what="five seconds are plotted")
             page.click("#pause")
             page.until("return !window.imud.view.plots.get('accel_m_s2').isDue")
             drawn = [

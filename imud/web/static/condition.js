@@ -1,7 +1,7 @@
 // Conditions of devices: words, order, and the reasons with their next steps.
 
 import { button, CONDITION_WORDS, CONDITIONS, icon } from "./ui.js";
-import { el, span } from "./util.js";
+import { el, marked, span } from "./util.js";
 
 export const known = (state) => (CONDITIONS.includes(state) ? state : "ok"); // a device of a recording has no condition
 
@@ -29,7 +29,7 @@ export function reasonList(reasons, most) {
   if (!first) return null;
   const rest = reasons.length - most;
   return el("ul", { class: "reasons" },
-    el("li", {}, el("p", { text: first.message }), first.next && el("p", { class: "next" }, icon("arrow"), el("span", { text: first.next }))),
+    el("li", {}, el("p", { text: first.message }), first.next && el("p", { class: "next" }, icon("arrow"), el("span", {}, marked(first.next)))),
     others.slice(0, most - 1).map((one) => el("li", { class: "other" }, el("p", { text: one.message }))),
     rest > 0 && el("li", { class: "rest", text: `and ${rest} more` }),
     others.length > 0 && el("li", { class: "rest phone-rest", text: `and ${others.length} more` }));
@@ -71,6 +71,6 @@ export class ConditionView {
   reason(one, condition) {
     const [href, words] = reasonLink(this.device, one);
     const link = condition !== "missing" && el("a", { class: "button small", href, "aria-label": `${words}: ${one.message}` }, icon("next"), el("span", { text: words }));
-    return el("div", { class: "reason", "data-code": one.code }, el("p", { class: "why", text: one.message }), el("p", { class: "next", text: one.next }), link);
+    return el("div", { class: "reason", "data-code": one.code }, el("p", { class: "why", text: one.message }), el("p", { class: "next" }, marked(one.next)), link);
   }
 }

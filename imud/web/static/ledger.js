@@ -53,7 +53,7 @@ export class LedgerSection {
       node.classList.toggle("none", !all);
     }
     const unknown = status.ledger.lost_unknown ?? 0;
-    setText(this.gaps, unknown ? `${number(unknown)} gaps of unknown size since start.` : "");
+    setText(this.gaps, unknown ? `${number(unknown)} ${unknown === 1 ? "gap" : "gaps"} of unknown size since start.` : "");
   }
 }
 

@@ -141,7 +141,7 @@ export class LiveSection {
     const codes = (status.condition?.reasons ?? []).map((one) => one.code);
     const [error, errorUnit = ""] = duration(clock.t_err_ns / 1e9).split(" ");
     const [mean, meanUnit = ""] = duration(count ? status.latency_sum_ns / 1e9 / count : null).split(" ");
-    set("Rate", number(status.rate_hz, 1), status.expected_rate_hz ? `of ${number(status.expected_rate_hz, 1)} Hz` : "Hz", codes.includes("rate"));
+    set("Rate", number(status.rate_hz, 1), status.expected_rate_hz ? `of ${number(status.expected_rate_hz, Math.abs(status.expected_rate_hz % 1) < 0.05 ? 0 : 1)} Hz` : "Hz", codes.includes("rate"));
     set("Lost in last minute", percent === null ? "" : number(percent, percent ? 1 : 0), percent === null ? "" : "%", codes.includes("lost"));
     set("Time stamp error", `±${error}`, errorUnit, codes.includes("time-error"));
     set("Latency", mean, meanUnit);

@@ -5,7 +5,7 @@ import { agrees, changed, control, said, same, words } from "./fields.js";
 import { closeDialog, showDialog } from "./shell.js";
 import { editsOf, keepEdits, session } from "./state.js";
 import { button, icon, section, segmented, toast, toggle } from "./ui.js";
-import { call, command, copy, el, timeOf } from "./util.js";
+import { call, command, copy, el, marked, timeOf } from "./util.js";
 
 const GROUPS = { measurement: "Measurement", output: "Output", pins: "Pins and alarm", connection: "Connection" };
 const AFTER_RESTART = "after save and restart";
@@ -276,7 +276,7 @@ export class SettingsSection {
     return [
       el("ol", { class: "outcome" }, steps), el("p", { class: done.problem ? "wrong" : "", role: "status", id: "outcome" }, el("b", { text: result })),
       ...(!done.saved && !done.problem ? [button("Save to flash", () => this.saveAll(), { glyph: "save" })] : []),
-      ...[done.advice, done.not_saved].filter(Boolean).map((text) => el("p", { class: "help", text })),
+      ...[done.advice, done.not_saved].filter(Boolean).map((text) => el("p", { class: "help" }, marked(text))),
       ...(Object.keys(others).length ? [el("p", { text: "Update the configuration:" }), button("Copy as YAML", async () => { await copy(yaml(others)); toast("Copied."); }, { glyph: "copy" })] : []),
     ];
   }
