@@ -109,6 +109,7 @@ def shot(page: Page, name: str) -> None:
 
 
 def fit(page: Page, width: int) -> None:
+    page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})  # `main` is as high as the window
     height = int(page.js("return document.querySelector('main').getBoundingClientRect().bottom + window.scrollY"))
     metrics = {"width": width, "height": height + 10, "deviceScaleFactor": 1, "mobile": False}
     page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)

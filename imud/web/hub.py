@@ -347,7 +347,7 @@ class BrowserHub:
                     lambda look, key=(is_comparison, rate_hz, name): (  # type: ignore[misc]
                         (look.is_comparison, look.rate_hz) == key[:2] and key[2] in look.devices
                     ),
-                    messages.SamplesMessage(name, rate_hz, tuple(buckets)),
+                    messages.SamplesMessage(name, rate_hz, tuple(buckets), COMPARED if is_comparison else ""),
                 )
         for name, member in {(one.look.device, one.look.spectrum) for one in self.browsers if one.look.spectrum}:
             if name in by_device and (raw := raw_of(name, member, by_device[name])):

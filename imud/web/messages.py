@@ -82,6 +82,7 @@ class SamplesMessage(ToPage, frozen=True, tag="samples"):
     device: str
     rate_hz: int
     buckets: tuple[Bucket, ...]
+    convention: str = ""  # `enu-flu` for a comparison; empty for the convention of the configuration
 
 
 class RawMessage(ToPage, frozen=True, tag="raw"):

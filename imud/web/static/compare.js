@@ -126,7 +126,7 @@ export class Compare {
       this.statuses.set(message.device, message.status);
       this.drawNotes();
     }
-    const index = message.kind === "samples" && !this.group.isPaused ? this.names.indexOf(message.device) : -1;
+    const index = message.kind === "samples" && message.convention && !this.group.isPaused ? this.names.indexOf(message.device) : -1;
     for (const bucket of index < 0 ? [] : message.buckets) if (bucket[this.kind]) this.waiting[index].push([bucket, (bucket.first_s + bucket.last_s) / 2, this.values(index, bucket[this.kind])]);
     if (index >= 0) this.pair();
   }

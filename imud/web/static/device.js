@@ -101,7 +101,7 @@ export class DevicePage {
     if (message.device !== this.name) return;
     if (message.kind === "status") this.showStatus(message);
     if (message.kind === "raw") this.live.addRaw(message);
-    if (message.kind === "samples" && message.rate_hz === this.live.rate_hz && !this.live.group.isPaused) {
+    if (message.kind === "samples" && !message.convention && message.rate_hz === this.live.rate_hz && !this.live.group.isPaused) {
       for (const bucket of message.buckets) {
         if (bucket.first_s - this.last_s > GAP_S) this.restore(); // this page was hidden or not connected
         this.last_s = bucket.last_s;

@@ -112,7 +112,9 @@ export class EventsSection {
       class: one === null ? "unknown" : one.isWarning ? "warning" : "", title: one === null ? "imud was not running" : `${one.count} events`,
       css: { height: `${one?.count ? 6 + (44 * one.count) / most : 2}px` },
     }));
-    this.minutes.replaceChildren(...bars, el("em", { text: "events per minute" }), el("span", { text: timeOf(this.now_s - 3600).slice(-8, -3) }), el("span", { text: timeOf(this.now_s).slice(-8, -3) }));
+    const begun = counts.findIndex((one) => one !== null);
+    this.minutes.replaceChildren(...bars, el("em", { text: "events per minute" }), el("span", { text: timeOf(this.now_s - 3600).slice(-8, -3) }),
+      ...(begun > 0 ? [el("span", { class: "begun", text: "imud started", css: { left: `${(100 * begun) / counts.length}%`, transform: begun > 15 ? "translateX(-100%)" : "none" } })] : []), el("span", { text: timeOf(this.now_s).slice(-8, -3) }));
   }
 
   row(one, open) {
