@@ -74,6 +74,10 @@ def test_the_noise_of_a_capture(resting_file: Path, tmp_path: Path, cli: Cli) ->
     assert gyro["axes"]["y"]["random_walk"]["value"] == pytest.approx(1e-4, rel=0.05)
     assert gyro["axes"]["y"]["random_walk"]["deg/√h"] == pytest.approx(1e-4 * 3437.747, rel=0.05)
     assert accel["axes"]["z"]["random_walk"]["µg/√Hz"] == pytest.approx(5e-4 / 9.80665e-6, rel=0.05)
+    figures = [one for sensor in (gyro, accel) for axis in sensor["axes"].values() for one in axis.values()]
+    judged = [figure for figure in figures if isinstance(figure, dict)]
+    assert {figure["value"] is None for figure in judged} == {True, False}
+    assert all(("below" in figure) == (figure["value"] is None) for figure in judged)
     assert told["measurement"]["temperature_c"] == [25.0, 32.0]
     assert gyro["compared"][0]["ratio"] == pytest.approx(0.34377 / 0.5, rel=0.05)
     assert accel["compared"][0]["ratio"] == pytest.approx(0.03 / 0.001, rel=0.05)

@@ -82,6 +82,8 @@ def test_arguments_are_checked(cli: Cli) -> None:
         (["mqtt://host", "--to", "-", "--key-file", "f"], "add --cert-file"),
     ]:
         cli.refuses(problem, "fleet", "collect", *words)
+    for command in ("fleet", "modbus"):
+        cli.refuses("the following arguments are required: ACTION", command)
 
 
 def made() -> Fleet:

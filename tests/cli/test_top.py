@@ -51,6 +51,7 @@ def lines(app: top.TopApp) -> list[str]:
 
 class SilentFeed(top.TopFeed):
     looked_at: ClassVar[list[str | None]] = []
+    closes = 0
 
     def __init__(self) -> None:
         super().__init__("")
@@ -62,16 +63,18 @@ class SilentFeed(top.TopFeed):
         self.looked_at.append(device)
 
     def close(self) -> None:
-        pass
+        self.closes += 1
 
 
 def played(steps: Steps, feed: top.TopFeed | None = None) -> Callable[[], None]:
     def test() -> None:
         async def run() -> None:
-            app = top.TopApp(feed or SilentFeed())
+            silent = SilentFeed()
+            app = top.TopApp(feed or silent)
             async with app.run_test(size=SIZE) as pilot:
                 await pilot.pause()
                 await steps(pilot, app)
+            assert feed or silent.closes == 1
 
         asyncio.run(run())
 

@@ -3,13 +3,14 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Event as Flag
 from time import monotonic_ns, time_ns
 from unittest.mock import create_autospec
 
 import pytest
 
 from imud.client.connection import Client
-from imud.client.feed import Feed, Wish, clock_ahead_ns, utc_offset_ns
+from imud.client.feed import Feed, News, Wish, clock_ahead_ns, utc_offset_ns
 from imud.model.event import Event, EventKind
 from imud.model.units import NS_PER_S
 from tests.client.news import Listener
@@ -61,6 +62,32 @@ def test_the_first_news_have_the_greeting_and_every_sample_comes(
             found += [sample.seq for sample in news.samples]
         assert found == [*range(1, 51)]
     assert watch.call_count == 1, "the feed repeated its request"
+
+
+def test_the_feed_counts_the_samples_that_the_daemon_dropped(tmp_path: Path) -> None:
+    """The feed does not read until the daemon has published 1.3 MB, with a queue of 16 samples."""
+    may_read, received, dropped = Flag(), 0, 0
+    heard = Listener()
+
+    def on_news(news: News) -> None:
+        assert may_read.wait(LIMIT_S)
+        heard.on_news(news)
+
+    with daemon(tmp_path, queue_samples=16) as served:
+        feed = Feed(str(served.path), Wish(("imu0",), news_s=0.02))
+        may_read.set()
+        feed.start(on_news)
+        heard.wait_for(lambda news: news.statuses)
+        may_read.clear()
+        for number in range(100):
+            published = batch("imu0", 1 + 50 * number, 50)
+            served.do(lambda server: server.publish(published))  # noqa: B023  # `do` waits for the call
+        may_read.set()
+        while received + dropped < 5000:
+            news = heard.wait_for(lambda _: True)
+            received, dropped = received + len(news.samples), dropped + news.dropped
+        feed.close()
+    assert dropped > 0
 
 
 def test_the_feed_is_disconnected_without_a_wish(tmp_path: Path) -> None:

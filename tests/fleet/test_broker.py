@@ -169,7 +169,7 @@ def test_tls_with_certificates_of_both_sides(tmp_path: Path, authority: Authorit
 
 
 @pytest.mark.filterwarnings(LEFT_OPEN)
-def test_websockets_without_and_with_tls(tmp_path: Path, authority: Authority) -> None:
+def test_websockets_without_and_with_tls(tmp_path: Path, authority: Authority, monkeypatch: pytest.MonkeyPatch) -> None:
     port, tls_port = free_port(), free_port()
     first, *others = authority.listener(tls_port)
     lines = ("per_listener_settings true", f"listener {port} 127.0.0.1", "protocol websockets", "allow_anonymous true")
@@ -184,6 +184,8 @@ def test_websockets_without_and_with_tls(tmp_path: Path, authority: Authority) -
             connection.close()
             with pytest.raises(fleet_broker.BrokerError, match=r"(?i)self[- ]signed certificate"):
                 connect(f"wss://127.0.0.1:{tls_port}", **own)
+            monkeypatch.setenv("SSL_CERT_FILE", authority["ca.pem"])  # the certificates of the host
+            connect(f"wss://127.0.0.1:{tls_port}", **own).close()
     except AssertionError as error:
         if "Websockets support not available" in str(error):
             pytest.skip("this mosquitto has no websockets")

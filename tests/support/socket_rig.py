@@ -288,12 +288,12 @@ class Daemon:
 
 
 @contextmanager
-def daemon(directory: Path) -> Iterator[Daemon]:
+def daemon(directory: Path, **settings: Any) -> Iterator[Daemon]:
     ready = threading.Event()
     found: list[Daemon] = []
 
     async def main() -> None:
-        async with serving(directory) as server:
+        async with serving(directory, **settings) as server:
             found.append(Daemon(server))
             ready.set()
             await found[0].stopped()

@@ -49,6 +49,7 @@ class J1939Variant:
     claims_address: bool = True
     confirms_restart: bool = False
     confirms_once: bool = False
+    reset_restarts: bool = False  # whether a factory reset restarts the device
     flash_ms: int = 0  # time of a save until its confirmation, ms
     refuses: frozenset[int] = frozenset()  # registers whose write the device refuses with a status
     ignores: frozenset[int] = frozenset()  # registers whose write the device confirms without an effect
@@ -65,6 +66,7 @@ J1939_VARIANTS: Final[Mapping[str, J1939Variant]] = {
     "address at once, ignores reads": J1939Variant(address_at_once=True, confirms_from="new", reads="ignored"),
     "claims no address": J1939Variant(claims_address=False),
     "slow flash": J1939Variant(flash_ms=1900),
+    "factory reset restarts": J1939Variant(reset_restarts=True),
 }
 
 REFUSED: Final = 1  # Status of a refusal. Assumption: the programs of the vendor accept only 0.
@@ -295,7 +297,7 @@ class HipnucJ1939Module:
             self.writes_to_flash += 1
         elif value == commands.FACTORY:
             self.flash = J1939Settings()
-        else:
+        if value == commands.RESTART or (value == commands.FACTORY and variant.reset_restarts):
             leaving = self._wire.sent(now_ns + NS_PER_S)
             self.reboot(now_ns)
             self._leaving = leaving

@@ -129,6 +129,18 @@ def test_missing_replies_and_unchanged_values_are_reported() -> None:
         played(session.set_interval(PEER, 0xFF37, 50), reply, bytes.fromhex("3701030064000000"))
 
 
+@pytest.mark.parametrize(
+    ("variant", "result"),
+    [
+        ("factory reset restarts", "restored, at address 8"),
+        ("real", "restored; the device has address 8 after the next restart at the latest"),
+    ],
+)
+def test_a_factory_reset_follows_the_device_to_address_8(variant: str, result: str) -> None:
+    bench = J1939Bench(J1939Settings(address=9), variant=J1939_VARIANTS[variant])
+    assert bench.act("factory_reset") == result
+
+
 @pytest.mark.parametrize("status", [1, 0x5A, 0xFF])
 def test_a_reply_with_a_status_is_a_rejection(status: int) -> None:
     """Byte 3 of the reply, in writes and in reads."""
