@@ -417,15 +417,12 @@ class RecentCounts:
         first, last = self._seconds[0], self._seconds[-1]
         causes = _by_cause(first.lost, last.lost)
         gaps = causes.pop("unknown", 0)
-        status = RecentStatus(
+        known = {name: count for name, count in self._loss.items() if name != "unknown"}
+        return RecentStatus(
             self._begun_ns, self.steady_rate_hz(), last.samples - first.samples, causes, gaps,
             last.bytes_in - first.bytes_in, len(self._restarts), last_sample_ns, self._loss_ns,
+            sum(known.values()), max(known, key=lambda name: known[name], default=""),
         )  # fmt: skip
-        if not self._loss:
-            return status
-        known = {name: count for name, count in self._loss.items() if name != "unknown"}
-        cause = max(known, key=lambda name: known[name], default="")
-        return msgspec.structs.replace(status, loss_samples=sum(known.values()), loss_cause=cause)
 
     @property
     def has_losses(self) -> bool:
