@@ -23,7 +23,7 @@ def test_settings_accept_the_documented_values(name: str) -> None:
     assert bool(found) == (table is not None and bool(table.table))
     for row in found:
         assert table is not None
-        setting, in_force = table.table[row.name], row.cells[1]
+        setting, in_force = table.table[row.name], row.cells[0]
         check_values(row, setting.type)
         assert (setting.write is None) == (in_force == "read only"), row.name
         assert (setting.effect is Effect.AFTER_RESTART) == ("after save and restart" in in_force), row.name

@@ -25,18 +25,18 @@ export class SettingsSection {
     this.again = button("Read again", () => this.load(true), { kind: "quiet", glyph: "undo" });
     const filter = segmented("filter of the settings", [["all", "All"], ["look", "Changed or different"]], "all", (value) => { this.only = value; this.filter(); });
     this.node = section("settings", "Settings", this.lead, el("div", { class: "timebar" }, filter, el("span", { class: "push" }), this.again), this.locked, this.groups);
-    this.load();
   }
 
   onSession() {
     this.draw();
   }
 
-  /** Load the settings again if their status changed, for example after a replug. */
+  /** Load the settings with the first status, and again if their status changed, for example after a replug. */
   onStatus(status) {
     const known = JSON.stringify([status.state, status.declared, status.settings]);
-    if (known !== this.known && this.known) this.load();
+    if (known === this.known) return;
     this.known = known;
+    this.load();
   }
 
   /** fresh: read the settings from the device, which needs a login. */
