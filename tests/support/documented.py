@@ -31,15 +31,17 @@ REFERENCE = re.compile(r"(`.*`): as in `([\w-]+)`\.")
 
 
 def rows(page: str, heading: str) -> list[Row]:
-    """Return the rows below a heading that starts with `heading`. A row can refer to the values of an earlier row, and a
-    sentence to the rows below another heading."""
+    """Return the rows below a heading that starts with `heading`.
+
+    A row can refer to the values of an earlier row. A sentence can refer to rows below another heading.
+    """
     found, is_inside, earlier = list[Row](), False, dict[str, str]()
     for line in (DOCS / page).read_text().splitlines():
         if line.startswith("### "):
             is_inside = line.startswith(f"### {heading}")
         if is_inside and (reference := REFERENCE.fullmatch(line)):
-            names = WORD.findall(reference[1])
-            found += [row for row in rows(page, f"`{reference[2]}`") if row.name in names]
+            other = rows(page, f"`{reference[2]}`")
+            found += [row for row in other if row.name in WORD.findall(reference[1])]
         if not line.startswith("| `"):
             continue
         names, values, *cells = line.strip("| ").split(" | ")
