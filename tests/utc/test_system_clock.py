@@ -3,6 +3,7 @@
 import asyncio
 import ctypes
 import time
+from itertools import pairwise
 
 import pytest
 
@@ -102,6 +103,7 @@ async def test_each_names_its_instant_after_it_was_and_within_its_second(rate_hz
     names = [rmc.utc_ns for s, _ in bench.got if isinstance(rmc := parse(s), Rmc)]
     assert len(set(names)) == len(names)
     assert sum(name % NS_PER_S == 0 for name in names) >= 18
+    assert min(b - a for a, b in pairwise(names)) == pytest.approx(1e9 / rate_hz, abs=1e7)  # RMC has 10 ms
     bench.source.close()
 
 
