@@ -254,9 +254,7 @@ def _planned(plan: SettingsPlan) -> str:
 
 def _account(done: AppliedSettings) -> str:
     lines = [f"  {one.name}: {one.outcome}" + (f": {one.message}" if one.message else "") for one in done.steps]
-    # imud reads the settings again after a restart
-    saved = "saved to flash" if done.restarted else "save to flash: sent, not verified: imud cannot read the flash"
-    lines += [f"  {saved}"] * done.saved + ["  restarted"] * done.restarted
+    lines += [f"  {end}" for end in done.ends]
     if done.problem:
         lines.append(f"FAILED: {done.problem}")
     now = (f"{name} is {_value(one.actual)}, expected {_value(one.declared)}" for name, one in done.differences.items())

@@ -324,6 +324,13 @@ class AppliedSettings(msgspec.Struct, frozen=True):
     not_saved: str = ""  # that the flash lacks a change, and the next step; empty if the flash contains all settings
 
     @property
+    def ends(self) -> list[str]:
+        """What imud did after the steps. Only a restart verifies a save, because imud cannot read the flash."""
+        if self.restarted:
+            return ["saved to flash"] * self.saved + ["restarted"]
+        return ["save to flash: sent, not verified: imud cannot read the flash"] * self.saved
+
+    @property
     def failure(self) -> str:
         """Reason why the device lacks a wanted value; empty if it has all wanted values."""
         left_out = [f"{name} {why}" for name, why in self.left_out.items()]

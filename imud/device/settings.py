@@ -651,7 +651,7 @@ def lost_values(saved: Values | None, present: Values) -> dict[str, Any]:
 
 
 def _summary(applied: AppliedSettings) -> str:
-    """Describe the steps, for example `settings: mode set to "6-axis" (was "9-axis"); saved to flash`."""
+    """Describe the steps, for example `settings: mode set to "6-axis" (was "9-axis"); saved to flash; restarted`."""
     parts = []
     for step in applied.steps:
         if step.outcome is StepOutcome.NOT_DONE:
@@ -659,8 +659,7 @@ def _summary(applied: AppliedSettings) -> str:
         before = f" (was {shown(step.before)})" if step.before is not None else ""
         note = "" if step.outcome is StepOutcome.VERIFIED else f": {step.outcome}"
         parts.append(f"{step.name} set to {shown(step.value)}{before}{note}")
-    ends = ["saved to flash"] * applied.saved + ["restarted"] * applied.restarted
-    ends += [applied.problem] if applied.problem else []
+    ends = [*applied.ends, *([applied.problem] if applied.problem else [])]
     return "settings: " + "; ".join([", ".join(parts), *ends] if parts else ends) if parts or ends else ""
 
 

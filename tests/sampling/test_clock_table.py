@@ -1,4 +1,4 @@
-"""Time stamp error in short cells of `tests.bench.clock_table`, and regressions that its cells showed."""
+"""Time stamp error in short cells of `tests.bench.clock_table`, and faults that longer cells showed before."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace

@@ -144,7 +144,7 @@ def pack_rate_of_turn(sid: int, gyro_z_rad_s: float | None) -> bytes:
 
 
 def pack_attitude(sid: int, euler_rad: Vector3, *, has_yaw: bool = True) -> bytes:
-    """Return 127257 of roll, pitch and a counter-clockwise yaw."""
+    """Return the data of a frame with PGN 127257. The yaw of `euler_rad` is counter-clockwise."""
     roll, pitch, yaw = (_clip(angle / RAD_PER_LSB, I16_MOST) for angle in euler_rad)
     return ATTITUDE_LAYOUT.pack(sid, -yaw if has_yaw else 0x7FFF, pitch, roll, 0xFF)
 

@@ -82,7 +82,7 @@ def _line(data: bytes) -> bytes:
 
 
 def _sampled(line: bytes, ratio: float) -> bytes:
-    """Return the bytes of `line`, read with a bit time of `ratio` of its own bits."""
+    """Return the bytes that a receiver reads from `line`. Its bit time is `ratio` times the bit time of the line."""
     end, found, at = len(line), bytearray(), 0
     while (start := line.find(0, at)) >= 0:
         bits = [line[i] if (i := int(start + (n + 0.5) * ratio)) < end else 1 for n in range(BITS_PER_UART_BYTE)]

@@ -19,7 +19,7 @@ export function aboutRows({ status, lost, bytes_open, frames_open }) {
     ["clock", `${clock.sync}, skew ${number(clock.skew_ppm, 2)} ppm, residual ${seconds(clock.residual_ns)}, error ${seconds(clock.t_err_ns)}, ${number(clock.resets)} resets`],
     ["latency", latency(status)],
     ["samples", `${number(ledger.samples)}; lost ${number(lost)} (device ${number(ledger.lost_gap_device)}, damaged ${number(ledger.lost_crc)}, ` +
-      `overrun ${number(ledger.lost_overrun)}, queue ${number(ledger.lost_queue)}), ${number(ledger.lost_unknown)} gaps of unknown size, ${number(ledger.frames_lost)} lost CAN frames`],
+      `overrun ${number(ledger.lost_overrun)}, queue ${number(ledger.lost_queue)}), ${number(ledger.lost_unknown)} ${ledger.lost_unknown === 1 ? "gap" : "gaps"} of unknown size, ${number(ledger.frames_lost)} lost CAN frames`],
     ["bytes", `${number(ledger.bytes_in)}: ${bytes_open || frames_open ? "NOT ALL ACCOUNTED FOR" : "all accounted for"}`],
     ["kernel", `${number(kernel.overrun)} overruns, ${number(kernel.framing)} framing, ${number(kernel.parity)} parity`],
   ];

@@ -54,7 +54,7 @@ class Hole(NamedTuple):
     is_certain: bool
     """Whether the daemon can know the size of the hole."""
     unknown_most: int = 1
-    """Maximum number of unknown gaps for the hole."""
+    """Maximum number of gaps of unknown size that the daemon counts for the hole."""
     is_open: bool = False
     """True if the hole has a sample on one side only: no sample after it (`unknown_most` is 0), or no sample before
     it."""
