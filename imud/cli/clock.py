@@ -111,7 +111,7 @@ def block(status: DeviceStatus, behind_ns: deque[int]) -> str:
         *(f"  {name:<10}{words}" for name, words in aids(status)),
         f"  delay from measurement to arrival, {len(behind_ns)} samples:",
         *histogram([late_ns / NS_PER_US for late_ns in behind_ns], "µs"),
-        f"  verdict   {verdict(clock, behind_ns)}",
+        *paragraph("  verdict   ", verdict(clock, behind_ns)),
     ]
     return "\n".join(lines)
 

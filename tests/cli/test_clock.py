@@ -53,6 +53,7 @@ def test_aids_of_the_clock_have_rows() -> None:
         ("UTC", "error of the host clock 250.0 µs (one sigma)"),
     ]
     text = block(equipped("bow"), deque([9_000_000] * 100))
+    assert max(map(len, text.splitlines())) <= 80
     for words in (
         "\n  SOUT      4998 pulses",
         " 9000 µs 100.0 % ##",
