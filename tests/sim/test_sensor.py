@@ -140,7 +140,7 @@ REPLIES = {
     "hipnuc-uart": 0xB875FD98,
     "hipnuc-modbus": 0xC5960473,
     "hipnuc-canopen": 0x2945F911,
-    "hipnuc-j1939": 0x7AF3B39B,
+    "hipnuc-j1939": 0x814F6064,
     "hipnuc-nmea2000": 0x56276182,
     "imu61x-uart": 0x1D54A669,
     "imu61x-can": 0x1A1332E7,
