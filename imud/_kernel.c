@@ -23,6 +23,10 @@
 #include <stdint.h>
 #include <string.h>
 
+/* The headers of Python 3.12 and later do not count this reference, but Python 3.11 does. */
+#undef Py_RETURN_NONE
+#define Py_RETURN_NONE return Py_NewRef(Py_None)
+
 #ifndef SOURCE_CRC
 #error "compile the kernel with hatch_build.py, which defines the CRC-32 of this file"
 #endif
