@@ -325,7 +325,7 @@ class AppliedSettings(msgspec.Struct, frozen=True):
 
     @property
     def ends(self) -> list[str]:
-        """What imud did after the steps. Only a restart verifies a save, because imud cannot read the flash."""
+        """Results of the save and the restart. Only a restart verifies a save, because imud cannot read the flash."""
         if self.restarted:
             return ["saved to flash"] * self.saved + ["restarted"]
         return ["save to flash: sent, not verified: imud cannot read the flash"] * self.saved

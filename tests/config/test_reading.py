@@ -503,7 +503,7 @@ def test_a_file_of_nothing_but_problems_is_refused_soon(line: str) -> None:
 
 
 def test_pauses_between_pieces_of_work() -> None:
-    """imud pauses twice per device, and once per 64 events of the parser: a list has six events beside its items."""
+    """imud pauses twice per device, and after every 64 events of the parser. A list adds six events to its items."""
     pauses: list[None] = []
     for items, count in ((57, 0), (58, 1), (121, 1), (122, 2)):
         read_yaml(f"[{'0, ' * items}]".encode(), lambda: pauses.append(None))

@@ -82,7 +82,7 @@ CLIENTS_PER_PIECE: Final = 64
 BUCKETS_PER_PIECE: Final = 8
 """Number of buckets in one piece of a reply: about 0.3 ms."""
 HISTORY_DEVICES_MAX: Final = 4
-"""Maximum number of devices of one request of `history`."""
+"""Maximum number of devices in a request for the history."""
 POINTS_MAX: Final = 1000
 """Maximum number of buckets of each device in a reply: 0.8 MB."""
 POINTS_DEFAULT: Final = 600
