@@ -68,7 +68,7 @@ test: $(VENV)/made $(KERNEL)
 # Every test in the repository and the long form of every check, about four hours. As root, with the packages of all `-deps`.
 .PHONY: test-thorough
 test-thorough: lint
-	IMUD_ALERTS=1 $(BIN)/pytest -n $(PROCESSES) --dist worksteal --hypothesis-profile thorough
+	IMUD_ALERTS=1 $(BIN)/pytest -n $(PROCESSES) --dist worksteal --hypothesis-profile thorough --timeout 1800
 	.ci/test-pythons
 	$(MAKE) fuzz
 	$(MAKE) mutants
