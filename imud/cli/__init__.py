@@ -83,6 +83,7 @@ def build_parser(commands: Collection[str] = COMMANDS) -> argparse.ArgumentParse
     for name, command in COMMANDS.items():
         description = command.help[:1].upper() + command.help[1:] + "."
         sub = parsers.add_parser(name, help=command.help, description=description)
+        sub.set_defaults(parser=sub)
         # importing the modules of all commands would slow down the start
         if name in commands:
             command.load().add_arguments(sub)
@@ -98,7 +99,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     name = words[0] if words and words[0] in COMMANDS else ""
     try:
         try:
-            args = build_parser((name,)).parse_args(words)
+            args, unknown = build_parser((name,)).parse_known_args(words)
+            if unknown:  # with the usage of the command, not of imud
+                args.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
             return COMMANDS[args.command].load().run(args)
         finally:
             # inside `try`: a full disk or a closed pipe often appears only here

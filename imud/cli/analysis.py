@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import msgspec
 
-from imud.cli.arguments import CliCommand, add_interface, add_option, add_socket, duration_s
+from imud.cli.arguments import CliCommand, add_duration, add_interface, add_option, add_socket, duration_s
 from imud.cli.output import complain
 from imud.drivers import DRIVERS
 from imud.model.errors import BadArgument
@@ -31,11 +31,7 @@ def common_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of both commands."""
     add_socket(parser)
     parser.add_argument("input", metavar="FILE|DEVICE", help="recording, capture, or device of the running daemon")
-    parser.add_argument(
-        "--for", dest="duration", type=duration_s, metavar="DURATION",
-        help="length of the analysed part, for example 90s, 10min, 2h (default: the complete file; a device until "
-        "Ctrl-C)",
-    )  # fmt: skip
+    add_duration(parser, "length of the analysed part (default: the complete file; a device until Ctrl-C)")
     parser.add_argument(
         "--skip", type=duration_s, metavar="DURATION",
         help="ignore the samples of this time at the start, for example while the device warms up",

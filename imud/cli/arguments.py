@@ -164,6 +164,13 @@ def duration_s(text: str) -> float:
     return seconds
 
 
+def add_duration(parser: argparse.ArgumentParser, purpose: str) -> None:
+    """Add `--duration DURATION`, also as `--for`. The result is `duration`, s, or None."""
+    parser.add_argument(
+        "--duration", "--for", type=duration_s, metavar="DURATION", help=f"{purpose}; 90s, 10min, 2h or seconds"
+    )
+
+
 # --- NAME=VALUE -----------------------------------------------------------------------------------------------------
 
 

@@ -10,7 +10,7 @@ from typing import Final
 
 import msgspec
 
-from imud.cli.arguments import CliCommand, add_socket, connect, finite, statuses
+from imud.cli.arguments import CliCommand, add_duration, add_socket, connect, statuses
 from imud.cli.output import histogram, paragraph
 from imud.client.connection import Client
 from imud.contracts.status import ClockStatus, DeviceStatus
@@ -37,12 +37,7 @@ UNPAIRED_SHARE: Final = 0.1
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_socket(parser)
     parser.add_argument("device", nargs="*", metavar="DEVICE", help="devices to show (default: all)")
-    parser.add_argument(
-        "--duration",
-        type=finite,
-        metavar="S",
-        help="print one report after S seconds (default without a terminal: 2)",
-    )
+    add_duration(parser, "print one report after this time (default without a terminal: 2 s)")
     parser.add_argument("--json", action="store_true", help="print the clocks once, as the socket reports them")
 
 

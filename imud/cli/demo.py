@@ -21,7 +21,7 @@ from typing import TextIO
 
 import msgspec
 
-from imud.cli.arguments import CliCommand, finite, statuses
+from imud.cli.arguments import CliCommand, add_duration, finite, statuses
 from imud.cli.status import block, closes
 from imud.client.connection import Client
 from imud.contracts.driver import CanDriver, PolledDriver
@@ -139,7 +139,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--interface", metavar="NAME", help="CAN interface of CAN devices (default: the first interface that is up)"
     )
-    parser.add_argument("--duration", type=finite, metavar="S", help="stop after S seconds (default: at Ctrl-C)")
+    add_duration(parser, "stop after this time (default: at Ctrl-C)")
     parser.add_argument(
         "--rate", type=finite, default=100.0, metavar="HZ", help="samples per second (default: %(default)s)"
     )

@@ -10,7 +10,7 @@ from contextlib import closing, suppress
 from time import monotonic_ns, time_ns
 from typing import Final, Protocol
 
-from imud.cli.arguments import CliCommand, duration_s
+from imud.cli.arguments import CliCommand, add_duration
 from imud.cli.output import complain, table
 from imud.fleet.accounts import GatewayState, StreamAccount, StreamKey
 from imud.fleet.broker import ReaderAccess
@@ -237,6 +237,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "message",
     )  # fmt: skip
     showing = actions.add_parser("top", help="show all gateways in a full-screen view of the terminal")
+    collecting.set_defaults(parser=collecting)
+    showing.set_defaults(parser=showing)
     _broker(showing)
     add_top(showing)
 
@@ -260,9 +262,7 @@ def _broker(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--key-file", metavar="FILE", help="client key (PEM), if --cert-file does not contain the key")
     for name in ("site", "gateway", "device"):
         parser.add_argument(f"--{name}", help=f"select this {name} only")
-    parser.add_argument(
-        "--duration", type=duration_s, metavar="TIME", help="stop after this time, for example 90s, 10min or 2h"
-    )
+    add_duration(parser, "stop after this time (default: at Ctrl-C)")
 
 
 def run(args: argparse.Namespace) -> int:

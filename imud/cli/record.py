@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, Final
 
 import msgspec
 
-from imud.cli.arguments import CliCommand, add_socket, connect, duration_s
+from imud.cli.arguments import CliCommand, add_duration, add_socket, connect
 from imud.cli.output import discard_output, paragraph
 from imud.client.connection import Client
 from imud.formats import records
@@ -239,10 +239,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--device", action="append", metavar="NAME", help="record this device; repeat for more devices (default: all)"
     )
-    parser.add_argument(
-        "--for", dest="for_s", type=duration_s, metavar="DURATION",
-        help="stop after this time, for example 90s, 10min, 2h (default: at Ctrl-C)",
-    )  # fmt: skip
+    add_duration(parser, "stop after this time (default: at Ctrl-C)")
     parser.add_argument(
         "--snapshot", action="store_true", help="save the last minutes of the flight recorder, then stop"
     )
@@ -259,7 +256,7 @@ def run(args: argparse.Namespace) -> int:
 
     Raises ImudError if the recording cannot start or the file cannot be written.
     """
-    if args.snapshot and (args.device or args.for_s):
+    if args.snapshot and (args.device or args.duration):
         raise BadArgument("--snapshot saves the complete flight recorder; omit --device and --for")
     if args.file == "-" and sys.stdout.isatty():
         raise BadArgument("cannot write a recording to a terminal; name a file, or use a pipe")
@@ -267,7 +264,7 @@ def run(args: argparse.Namespace) -> int:
         descriptor = client.snapshot()[0] if args.snapshot else client.record(args.device)
         with open(descriptor, "rb", buffering=0) as stream, output(args.file) as (name, out):
             copy = Copy(stream, out, name)
-            found = follow(copy, client, interrupt, args.for_s)
+            found = follow(copy, client, interrupt, args.duration)
     return account(copy, found, name, asked=args.snapshot or copy.stopped)
 
 

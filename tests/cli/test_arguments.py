@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from imud.cli import build_parser
 from imud.cli.arguments import argument, check_port, chosen_fields, confirmed, duration_s, named_values, read_noise
 from imud.contracts.status import Deviations
 from imud.model.errors import BadArgument, ImudError
@@ -19,8 +20,7 @@ from tests.support.files import imu61x_log
     ("command", "option", "value"),
     [
         ("watch", "--rate", "nan"), ("watch", "--rate", "-inf"), ("watch", "--rate", "ten"),
-        ("watch", "--latency", "inf"), ("clock", "--duration", "inf"), ("demo", "--duration", "inf"),
-        ("demo", "--rate", "inf"), ("setup", "--wait", "inf"),
+        ("watch", "--latency", "inf"), ("demo", "--rate", "inf"), ("setup", "--wait", "inf"),
     ],
 )  # fmt: skip
 def test_an_option_that_is_not_a_finite_number_is_refused(command: str, option: str, value: str, cli: Cli) -> None:
@@ -41,6 +41,16 @@ def test_durations() -> None:
     for text in ["", "min", "0", "-1s", "1 week", "1e3", "10m", "nan", "9" * 400 + "s"]:
         with pytest.raises(argparse.ArgumentTypeError, match="expected a duration, for example 90s, 10min or 2h"):
             duration_s(text)
+    for words in (["clock"], ["record"], ["noise", "bow"], ["demo"], ["fleet", "top", "mqtt://host"]):
+        parsed = [build_parser(words[:1]).parse_args([*words, name, "2min"]) for name in ("--duration", "--for")]
+        assert [one.duration for one in parsed] == [120, 120]
+
+
+@pytest.mark.parametrize("words", ["clock", "fleet top mqtt://host", "modbus scan /dev/x"])
+def test_an_unknown_option_prints_the_usage_of_its_command(words: str, cli: Cli) -> None:
+    found = cli(*words.split(), "--bogus", status=2).err
+    assert found.startswith(f"usage: imud {words.rpartition(' ')[0] or words} ")
+    assert "unrecognized arguments: --bogus" in found
 
 
 def test_values_are_json_or_text() -> None:
