@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
+from time import monotonic_ns
 
 import msgspec
 
@@ -115,6 +116,8 @@ def block(status: DeviceStatus, without_times: str = "", *, virtual: bool = Fals
     if status.frame is not None:
         rows.insert(2, ("axes", axes(status.frame)))
     lines = paragraph(f"{status.name}: ", status.word)
+    if status.work is not None:
+        lines += paragraph("  ", status.work.words(monotonic_ns()))
     for reason in status.reasons:
         lines += paragraph("  ", f"{reason.message} {reason.next}".rstrip())
     if status.problem and status.condition is None:

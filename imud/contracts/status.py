@@ -9,7 +9,7 @@ from msgspec import Meta
 from imud.attitude.conventions import Heading
 from imud.attitude.published import FrameWords
 from imud.contracts.command import CalibrationStatus
-from imud.contracts.condition import Condition, DeviceCondition, Reason
+from imud.contracts.condition import Condition, DeviceCondition, Reason, duration
 from imud.contracts.setting import SettingsStatus
 from imud.model.options import Options
 from imud.model.sample import Sync
@@ -46,6 +46,20 @@ class DeviceState(StrEnum):
     SILENT = "silent"  # the link is open and the device has stopped sending samples
     FINISHED = "finished"  # a replay is at its end
     FAILED = "failed"  # a fault that the user must repair, see `problem`. imud tries again periodically.
+
+
+class WorkStatus(msgspec.Struct, frozen=True):
+    """Running work that uses a device alone: a command, a calibration or a change of settings."""
+
+    name: str  # for example `the command save`
+    begun_ns: int  # CLOCK_MONOTONIC of the start, ns
+    by: str  # who requested it, for example `uid 1000`; `imud` for its own work
+    stop: str  # how a user can stop it; empty if there is no way
+
+    def words(self, now_ns: int) -> str:
+        """Describe the work for a user who waits for it."""
+        started = f"{self.name} is running, started {duration(now_ns - self.begun_ns)} ago by {self.by}"
+        return f"{started}; {self.stop}" if self.stop else started
 
 
 class ClockStatus(msgspec.Struct, frozen=True):
@@ -245,6 +259,7 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     condition: DeviceCondition | None = None
     recent: RecentStatus | None = None  # counts of the last minute; null for a device of a recording
     calibration: CalibrationStatus | None = None  # running calibration; null if none is running
+    work: WorkStatus | None = None  # running work that uses the device alone; null without work
     # Worst condition in each of the last 60 minutes, the oldest first; null for a minute before the start of imud
     history: tuple[Condition | None, ...] = ()
 

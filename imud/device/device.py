@@ -516,9 +516,8 @@ class Device:
 
     def status(self) -> DeviceStatus:
         """Return the status of the device."""
-        transport, health = self._transport, self._health
-        path, driver = transport.path, transport.driver
-        newest = path.newest if path is not None else None
+        transport, health, path = self._transport, self._health, self._transport.path
+        driver, newest = transport.driver, path.newest if path is not None else None
         latency = path.latency if path is not None else LatencyMeter()
         frame = self._attitude.status(driver, path, self._settings)
         status = DeviceStatus(
@@ -558,6 +557,7 @@ class Device:
             recent=self._judge.counts.status(path.last_sample_ns if path else 0),
             history=self._judge.watch.history,
             calibration=self._calibration.status,
+            work=self._settings.lock.work,
         )
         return transport.add_status(status)
 

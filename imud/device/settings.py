@@ -13,13 +13,12 @@ import logging
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from itertools import islice
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import msgspec
 
 from imud.config.model import DeviceConfig
 from imud.contracts.command import REQUESTED_BY
-from imud.contracts.condition import duration
 from imud.contracts.driver import Identity, PolledDriver
 from imud.contracts.setting import (
     AppliedSettings,
@@ -36,6 +35,7 @@ from imud.contracts.setting import (
     values_of,
     words_of,
 )
+from imud.contracts.status import WorkStatus
 from imud.device.flash import FlashValues, ModuleFlash, SettingsFiles, backup_text
 from imud.device.health import DeviceEvents
 from imud.device.settings_plan import (
@@ -209,20 +209,6 @@ class SettingsComparison:
         self.problem = problem
 
 
-class Work(NamedTuple):
-    """Work that uses the device alone."""
-
-    name: str  # for example `the command save`
-    begun_ns: int  # CLOCK_MONOTONIC of the start, ns
-    by: str  # who requested it
-    stop: str  # how a user can stop it; empty if there is no way
-
-    def words(self, now_ns: int) -> str:
-        """Describe the work for a user who waits for it."""
-        started = f"{self.name} is running, started {duration(now_ns - self.begun_ns)} ago by {self.by}"
-        return f"{started}; {self.stop}" if self.stop else started
-
-
 class WorkLock:
     """Lock of a device for one command, calibration or change of settings at a time."""
 
@@ -230,7 +216,7 @@ class WorkLock:
         self._device = device
         self._host = host
         self._lock = asyncio.Lock()
-        self._work: Work | None = None  # work that holds the lock
+        self.work: WorkStatus | None = None  # work that holds the lock
         self.ended_ns = -OWN_NS  # CLOCK_MONOTONIC of the end of the last work, ns
 
     @property
@@ -247,13 +233,13 @@ class WorkLock:
             async with asyncio.timeout(WAIT_S):
                 await self._lock.acquire()
         except TimeoutError:
-            words = self._work.words(self._host.now_ns()) if self._work is not None else "other work has just ended"
+            words = self.work.words(self._host.now_ns()) if self.work is not None else "other work has just ended"
             raise CommandError(f"{self._device}: {words}; try again later") from None
-        self._work = Work(work, self._host.now_ns(), REQUESTED_BY.get() or "imud", stop)
+        self.work = WorkStatus(work, self._host.now_ns(), REQUESTED_BY.get() or "imud", stop)
         try:
             yield
         finally:
-            self._work = None
+            self.work = None
             self.ended_ns = self._host.now_ns()
             self._lock.release()
 

@@ -384,7 +384,7 @@ def status_message(name: str, status: DeviceStatus | None, now_ns: int) -> messa
 
 
 def row_of(status: DeviceStatus, newest: Sample | None, now_ns: int) -> messages.DeviceRow:
-    condition, calibration, frame = status.condition, status.calibration, status.frame
+    condition, work, frame = status.condition, status.work, status.frame
     return messages.DeviceRow(
         name=status.name,
         state=status.word,
@@ -392,7 +392,7 @@ def row_of(status: DeviceStatus, newest: Sample | None, now_ns: int) -> messages
         since_s=None if condition is None else condition.since_ns / NS_PER_S,
         reasons=status.reasons,
         history=status.history,
-        calibration="" if calibration is None else calibration.kind,
+        work="" if work is None else work.words(now_ns),
         driver=status.driver,
         link=status.link,
         identity=status.identity,

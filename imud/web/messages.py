@@ -40,7 +40,7 @@ class DeviceRow(msgspec.Struct, frozen=True):
     since_s: float | None  # time of the last change of the condition, CLOCK_MONOTONIC
     reasons: tuple[Reason, ...]
     history: tuple[str | None, ...]  # worst condition in each of the last 60 minutes, the newest last
-    calibration: str  # kind of the running calibration; empty if none is running
+    work: str  # running command, calibration or change of settings, one sentence; empty without work
     driver: str
     link: str
     identity: dict[str, str]

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from time import monotonic_ns
 
 from msgspec.structs import replace
 
@@ -10,8 +11,17 @@ from imud.cli.status import axes, block, driven, page, parts, utc, watched
 from imud.client.connection import Client
 from imud.contracts.condition import Condition, DeviceCondition, Reason, ReasonCode
 from imud.contracts.setting import OnDifference, SettingsState, SettingsStatus
-from imud.contracts.status import CKernelStatus, DeviceState, FrameStatus, LinesStatus, MqttStatus, UtcStatus
+from imud.contracts.status import (
+    CKernelStatus,
+    DeviceState,
+    FrameStatus,
+    LinesStatus,
+    MqttStatus,
+    UtcStatus,
+    WorkStatus,
+)
 from imud.formats import kernel
+from imud.model.units import NS_PER_S
 from tests.cli.conftest import Cli
 from tests.support.metrics import LINES, POLLING, UTC, device, equipped
 from tests.support.socket_rig import daemon
@@ -81,10 +91,14 @@ def test_json_is_all_that_the_socket_sends(tmp_path: Path, cli: Cli) -> None:
 
 def test_a_device_shows_its_condition_with_reasons_and_next_steps() -> None:
     reasons = Reason(ReasonCode.ALARM, "The ALARM pin is active.", "Look."), Reason(ReasonCode.LOST, "Lost.", "Step.")
-    degraded = device("mast", condition=DeviceCondition(Condition.ATTENTION, 0, reasons))
+    work = WorkStatus("the command save", monotonic_ns() - 600 * NS_PER_S, "uid 1000", "")
+    degraded = device("mast", condition=DeviceCondition(Condition.ATTENTION, 0, reasons), work=work)
     text = page([degraded])
-    assert text.startswith("mast: attention\n  The ALARM pin is active. Look.\n  Lost. Step.\n  link   ")
-    old = replace(degraded, condition=None, problem="an old daemon")
+    assert text.startswith(
+        "mast: attention\n  the command save is running, started 10 min ago by uid 1000\n"
+        "  The ALARM pin is active. Look.\n  Lost. Step.\n  link   "
+    )
+    old = replace(degraded, condition=None, problem="an old daemon", work=None)
     assert block(old).startswith("mast: running\n  an old daemon\n")
 
 

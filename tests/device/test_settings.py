@@ -671,8 +671,12 @@ async def test_a_command_waits_for_another_command_for_a_limited_time(bench: Mod
     with pytest.raises(CommandError, match="the command wait is running, started 11 s ago by imud; try again later"):
         await bench.doing(bench.device.settings_report(fresh=True))
     assert bench.clock.now_ns() - begin_ns == pytest.approx(10e9, rel=0.1)
+    work = bench.device.status().work
+    assert work is not None
+    assert (work.name, work.by, work.stop) == ("the command wait", "imud", "")
     waiting.cancel()
     await bench.pass_s(1)
+    assert bench.device.status().work is None
     await bench.doing(bench.device.settings_report(fresh=True))
 
 

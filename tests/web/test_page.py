@@ -215,6 +215,13 @@ def test_ledger_latency_status_and_settings_are_those_of_the_daemon(page: Page, 
     assert page.text("#calibration-progress") == "half of the directions"
     assert page.text("#calibration-instruction").startswith("Turn the device")
     assert {"48.5 µT", "2.5 %"} <= set(re.findall(r"[\d.]+ (?:µT|%)", page.text("#calibration .measures")))
+    page.js(
+        """const { view } = window.imud, show = view.onMessage.bind(view), message = structuredClone(view.status);
+        view.onMessage = () => {};
+        message.status.work = { name: 'the command save', begun_ns: (message.now_s - 60) * 1e9, by: 'uid 1000' };
+        show(message)"""
+    )
+    assert page.text(".activity") == "the command save is running, started 60 s ago by uid 1000"
     assert page.problems() == []
 
 
@@ -353,10 +360,12 @@ def test_keys_the_filter_and_stored_events(page: Page, site: Site) -> None:
     press("g")
     page.until("return document.querySelector('[data-device]')")
     rows = [decode(encode(row_of(device(f"imu{number}"), None, 5))) for number in range(9)]
+    rows[0]["work"] = "the command save is running"
     # nine devices in place of the devices of the daemon, whose later messages the view ignores
     show = "const { view } = window.imud, show = view.onMessage.bind(view); view.onMessage = () => {};"
     show += "show({ kind: 'overview', now_s: 1, devices: arguments[0] });"
     page.js(show, rows)
+    assert "the command save is running" in page.text("[data-device=imu0]")
     press("3g", "#filter")
     page.js("const box = document.querySelector('#filter'); box.value = '3'; box.dispatchEvent(new Event('input'))")
     shown = page.js("return [...document.querySelectorAll('main [data-device]')].map((one) => one.dataset.device)")

@@ -10,7 +10,7 @@ import { SettingsSection } from "./settings.js";
 import { SECTIONS } from "./shell.js";
 import { TimeSection } from "./time.js";
 import { button, icon, toast } from "./ui.js";
-import { call, clock, copy, el, setText } from "./util.js";
+import { call, clock, copy, el, setText, span } from "./util.js";
 
 const PHONE = matchMedia("(max-width: 820px)");
 const HOUR = { points: 600, period_s: 6 };
@@ -123,8 +123,9 @@ export class DevicePage {
     const isMissing = status.condition?.condition === "missing";
     this.missing.hidden = !isMissing;
     this.live.node.hidden = this.time.node.hidden = isMissing; // a missing device has no figures
-    this.activity.hidden = !status.calibration;
-    if (status.calibration) this.activity.replaceChildren(icon("calibration"), `Calibration: ${status.calibration.kind}`);
+    const { work } = status;
+    this.activity.hidden = !work;
+    if (work) this.activity.replaceChildren(icon("calibration"), `${work.name} is running, started ${span(now_s - work.begun_ns / 1e9)} ago by ${work.by}`);
     for (const part of [this.live, this.time, this.ledger, this.aboutSection]) part.draw(message);
     this.events.onStatus(status, now_s);
     this.settings.onStatus(status);

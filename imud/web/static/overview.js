@@ -42,20 +42,19 @@ function figures(row) {
 }
 
 const about = (row) => [row.identity.product, row.driver, row.link].filter(Boolean).join(" · ");
-const activity = (row) => (row.calibration ? `Calibration: ${row.calibration}` : "");
 
 function card(row, now_s) {
   const since = el("span", { text: ` ${sinceWords(row.since_s, now_s)}` });
   const head = el("div", { class: "card-head" }, icon(row.state), el("div", {}, el("h3", { text: row.name }), el("p", { class: "cond", text: CONDITION_WORDS[row.state] }, since)));
   const foot = row.state === "missing" ? el("p", { class: "help", text: about(row) }) : figures(row);
-  return el("a", { class: `card k-${row.state}`, href: deviceLink(row.name), "data-device": row.name }, head, reasonList(row.reasons, 3), activity(row) && el("p", { class: "help", text: activity(row) }),
+  return el("a", { class: `card k-${row.state}`, href: deviceLink(row.name), "data-device": row.name }, head, reasonList(row.reasons, 3), row.work && el("p", { class: "help", text: row.work }),
     el("div", { class: "card-foot" }, foot, strip(row.history), el("p", { class: "strip-label" }, el("span", { text: "1 h ago" }), el("span", { text: "now" }))));
 }
 
 function line(row) {
   const turn = row.heading === "relative" ? "yaw" : "heading";
   const angles = row.euler_rad ? row.euler_rad.map((one) => `${number(one / DEGREE, 1)}°`).join("  ") : "";
-  return el("a", { class: "row k-ok", href: deviceLink(row.name), "data-device": row.name }, icon("ok", row.state), el("div", { class: "row-name" }, el("h3", { text: row.name }), el("p", { class: "help", text: activity(row) || about(row) })),
+  return el("a", { class: "row k-ok", href: deviceLink(row.name), "data-device": row.name }, icon("ok", row.state), el("div", { class: "row-name" }, el("h3", { text: row.name }), el("p", { class: "help", text: row.work || about(row) })),
     el("div", { class: "row-angles" }, angles && el("span", { class: "help", text: `roll, pitch, ${turn}` }), el("output", { class: "angles", text: angles })), figures(row), el("div", { class: "row-strip" }, strip(row.history)));
 }
 
