@@ -4,6 +4,7 @@ import asyncio
 import errno
 import os
 import socket
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -45,14 +46,20 @@ class FakeSocket:
         self.closed = True
 
 
-@pytest.mark.parametrize("fails_at", range(1, 6))
-def test_a_raw_socket_is_closed_when_a_step_fails(monkeypatch: pytest.MonkeyPatch, fails_at: int) -> None:
-    made = FakeSocket(fails_at)
-    monkeypatch.setattr(socket, "socket", lambda *_: made)
-    with pytest.raises(OSError, match="No such device"):
-        open_raw(SocketCanOptions(interface="can0"), [])
-    assert made.closed
-    assert len(made.calls) == fails_at
+@pytest.mark.parametrize(
+    ("make", "steps"),
+    [(lambda: open_raw(SocketCanOptions(interface="can0"), []), 5), (lambda: KernelSender("can0", FRAMES), 3)],
+    ids=["raw", "broadcast manager"],
+)
+def test_a_socket_is_closed_when_a_step_fails(
+    monkeypatch: pytest.MonkeyPatch, make: Callable[[], object], steps: int
+) -> None:
+    for fails_at in range(1, steps + 1):
+        made = FakeSocket(fails_at)
+        monkeypatch.setattr(socket, "socket", lambda *_, made=made: made)
+        with pytest.raises(OSError, match="No such device"):
+            make()
+        assert (made.closed, len(made.calls)) == (True, fails_at)
 
 
 def test_a_raw_socket_has_the_permitted_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,17 +114,6 @@ def test_a_refused_frame_is_explained(sys_with_can0: Path, error: int, words: st
     link.open()
     with pytest.raises(LinkError, match=words):
         link.write(pack_frame(1, False, b""))
-
-
-@pytest.mark.parametrize("fails_at", range(1, 4))
-def test_a_socket_of_the_broadcast_manager_is_closed_when_a_step_fails(
-    monkeypatch: pytest.MonkeyPatch, fails_at: int
-) -> None:
-    made = FakeSocket(fails_at)
-    monkeypatch.setattr(socket, "socket", lambda *_: made)
-    with pytest.raises(OSError, match="No such device"):
-        KernelSender("can0", FRAMES)
-    assert made.closed
 
 
 @in_loop

@@ -211,22 +211,18 @@ class BrokenFile(BytesIO):
     readline = read
 
 
-@pytest.mark.parametrize("kind", [ReplayLink, CanReplayLink])
-def test_a_file_whose_read_fails_is_closed(
-    monkeypatch: pytest.MonkeyPatch, kind: type[ReplayLink | CanReplayLink]
+@pytest.mark.parametrize(
+    ("kind", "file", "words"),
+    [(ReplayLink, BrokenFile(), "cannot read a: Input/output error"),
+     (CanReplayLink, BrokenFile(), "cannot read a: Input/output error"),
+     (ReplayLink, BytesIO(bytes(512)), "raw capture without times")],
+)  # fmt: skip
+def test_a_file_that_is_refused_or_whose_read_fails_is_closed(
+    monkeypatch: pytest.MonkeyPatch, kind: type[ReplayLink | CanReplayLink], file: BytesIO, words: str
 ) -> None:
-    file = BrokenFile()
     monkeypatch.setattr("imud.links.replay.open_regular", lambda _path: file)
-    with pytest.raises(LinkError, match="cannot read a: Input/output error"):
+    with pytest.raises(LinkError, match=words):
         kind(ReplayOptions(path="a")).open()
-    assert file.closed
-
-
-def test_a_capture_that_is_refused_is_closed(raw: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = raw.open("rb")
-    monkeypatch.setattr("imud.links.replay.open_regular", lambda _path: file)
-    with pytest.raises(LinkError, match="raw capture without times"):
-        ReplayLink(ReplayOptions(path=str(raw))).open()
     assert file.closed
 
 

@@ -112,8 +112,13 @@ def test_modules_of_a_line_share_its_port(tmp_path: Path, chunk_bytes: int) -> N
             one.transfer(SERIAL)
         with pytest.raises(LinkBusy):
             open_port(str(path), BAUD, PROC)
-        with pytest.raises(LinkError, match="the same baud for all its devices, got 921600 and 9600"), ExitStack() as s:
-            s.enter_context(opened(path, ports, 3, baud=9600))
+        other: list[dict[str, Any]] = [{"baud": 9600}, {"echo": True}, {"direction": "none"}]
+        for more, got in zip(other, (", got 921600 and 9600", "", ""), strict=True):
+            with (
+                pytest.raises(LinkError, match=f"the same {next(iter(more))} for all its devices{got}"),
+                ExitStack() as s,
+            ):
+                s.enter_context(opened(path, ports, 3, **more))
         two.close()
         open_port(str(path), BAUD, PROC).close()
 
@@ -138,48 +143,45 @@ def test_adapter_that_echoes(tmp_path: Path, setting: str | bool, chunk_bytes: i
                 link.transfer(write)  # the port receives only the echo
 
 
-def test_noise_before_the_first_echo_does_not_hide_that_there_are_echoes(pty: PtyPort) -> None:
-    request, reply = framed(1, SERIAL.sends[0]), framed(1, b"\x03\x08" + serial_of(1))
+@contextmanager
+def answered(pty: PtyPort, *replies: bytes) -> Iterator[list[bytes]]:
+    """Send one of the replies after each request. Yield the received requests."""
+    heard: list[bytes] = []
 
     def answer() -> None:
-        for noise in (b"\0", b""):
+        for reply in replies:
             select.select([pty.master], [], [], LIMIT_S)
-            assert pty.received() == request
-            pty.send(noise + request + reply)
+            heard.append(pty.received())
+            pty.send(reply)
 
     far = threading.Thread(target=answer)
     far.start()
     try:
-        with opened(pty.path, reply_ms=1000) as link:
-            assert link.transfer(SERIAL) == reply
-            assert (link.heard.strange, link.heard.echoed) == (1 + len(request), 0)
-            assert link.transfer(SERIAL) == reply
-            assert (link.heard.strange, link.heard.echoed) == (1 + len(request), 1)
+        yield heard
     finally:
         far.join(LIMIT_S)
 
 
-@pytest.mark.parametrize("more", [{"echo": True}, {"direction": "none"}])
-def test_devices_of_a_line_agree_on_it(pty: PtyPort, more: dict[str, object]) -> None:
-    ports = rs485.SharedPorts()
-    with opened(pty.path, ports):
-        with (
-            pytest.raises(LinkError, match=r"expected the same (direction|echo) for all its devices"),
-            opened(pty.path, ports, 2, **more),
-        ):
-            pass
-        with opened(pty.path, ports, 2):
-            pass
+def test_noise_before_the_first_echo_does_not_hide_that_there_are_echoes(pty: PtyPort) -> None:
+    request, reply = framed(1, SERIAL.sends[0]), framed(1, b"\x03\x08" + serial_of(1))
+    with answered(pty, b"\0" + request + reply, request + reply) as heard, opened(pty.path) as link:
+        for number in range(2):
+            assert link.transfer(SERIAL) == reply
+            assert (link.heard.strange, link.heard.echoed) == (1 + len(request), number)
+    assert heard == [request] * 2
 
 
 def test_a_reply_can_be_an_exception_or_damaged(tmp_path: Path) -> None:
-    with wired(tmp_path, slave(1, bad_crc=1)) as (path, _), opened(path) as link:
+    twins = slave(2, serial=0x0F), slave(2, serial=0xF0)
+    with wired(tmp_path, slave(1, bad_crc=1), *twins) as (path, _), opened(path) as link:
         damaged = link.transfer(SERIAL)
         assert len(damaged) == SERIAL.read_bytes
         assert not is_whole(damaged)
         assert is_whole(link.transfer(SERIAL))
         assert is_exception(link.transfer(read_registers(0x33, 4)))
         assert link.heard.timeouts == 0
+        link.select(2)
+        assert not is_whole(link.transfer(SERIAL)), "two devices of one address reply together"
 
 
 def test_silent_module_costs_its_time_out_and_comes_back(tmp_path: Path) -> None:
@@ -219,7 +221,7 @@ def test_slow_devices_of_a_bus_reply_in_time(tmp_path: Path) -> None:
         assert link.heard.timeouts == 0
 
 
-def test_the_time_for_a_reply_follows_the_slowest_reply_of_a_device() -> None:
+def test_the_time_for_a_reply_follows_the_slowest_reply_and_the_round_of_a_search() -> None:
     times, ms = rs485.ReplyTimes(), 1_000_000
     assert [times.wait_ns(target, 20 * ms) for target in (80, 1, 80, 2)] == [3000 * ms, 20 * ms, 3000 * ms, 20 * ms]
     times.add_late(2)
@@ -232,11 +234,7 @@ def test_the_time_for_a_reply_follows_the_slowest_reply_of_a_device() -> None:
     for _ in range(60):  # a stall of the host has a short effect
         times.add(80, -ms)
     assert [times.wait_ns(target, 20 * ms) for target in (80, 2)] == [20 * ms, 3000 * ms]
-
-
-def test_a_search_asks_each_address_with_a_long_timeout() -> None:
-    """The first round is fast. In each of 16 further rounds, one of 16 addresses gets 0.5 s."""
-    times, ms = rs485.ReplyTimes(), 1_000_000
+    times = rs485.ReplyTimes()  # a fast round, then in each of 16 rounds one of 16 addresses gets 0.5 s
     rounds = [[times.wait_ns(target, 20 * ms) for target in (80, *range(1, 80))][1:] for _ in range(17)]
     assert set(rounds[0]) == {20 * ms}
     assert [sorted({one[at] for one in rounds}) for at in range(79)] == [[20 * ms, 500 * ms]] * 79
@@ -264,26 +262,13 @@ def test_after_a_time_out_one_register_is_read_first_and_then_no_more(pty: PtyPo
         (long, b""), (bytes.fromhex("03 007f 0001"), bytes.fromhex("03 02 a000")), (long, serial), (long, serial),
         (one, b""), (bytes.fromhex("03 0004 0002"), bytes.fromhex("03 04 0008 0001")), (one, value), (one, value),
     ]  # fmt: skip
-    heard = []
-
-    def answer() -> None:
-        for _, reply in script:
-            select.select([pty.master], [], [], LIMIT_S)
-            heard.append(pty.received())
-            if reply:
-                pty.send(framed(1, reply))
-
-    far = threading.Thread(target=answer)
-    far.start()
-    try:
-        with opened(pty.path, reply_ms=500, echo=False) as link:
-            for transfer, reply in ((SERIAL, serial), (read_registers(4, 1), value)):
-                with pytest.raises(TransferError):
-                    link.transfer(transfer)
-                for _ in range(2):
-                    assert link.transfer(transfer) == framed(1, reply)
-    finally:
-        far.join(LIMIT_S)
+    replies = [reply and framed(1, reply) for _, reply in script]
+    with answered(pty, *replies) as heard, opened(pty.path, reply_ms=500, echo=False) as link:
+        for transfer, reply in ((SERIAL, serial), (read_registers(4, 1), value)):
+            with pytest.raises(TransferError):
+                link.transfer(transfer)
+            for _ in range(2):
+                assert link.transfer(transfer) == framed(1, reply)
     assert heard == [framed(1, request) for request, _ in script]
 
 
@@ -298,26 +283,11 @@ def test_unrequested_bytes_are_discarded_and_counted(pty: PtyPort) -> None:
         assert pty.received() == framed(1, SERIAL.sends[0])
 
 
-def test_two_modules_of_one_address_are_detected(tmp_path: Path) -> None:
-    twins = slave(1, serial=0x0F), slave(1, serial=0xF0)
-    with wired(tmp_path, *twins) as (path, _), opened(path) as link:
-        assert not is_whole(link.transfer(SERIAL))
-
-
 def test_garbage_instead_of_a_reply_is_reported(pty: PtyPort) -> None:
-    def babble() -> None:
-        select.select([pty.master], [], [], LIMIT_S)
-        pty.send(b"\x81\x00\xfe" * 7)
-
-    speaker = threading.Thread(target=babble)
-    speaker.start()
-    try:
-        with opened(pty.path, reply_ms=1000) as link:
-            with pytest.raises(TransferError, match=r"other bytes: 81 00 fe .* check the baud rate"):
-                link.transfer(SERIAL)
-            assert link.serial_line() == SerialLineCounters(timeouts=1, strange_bytes=21)
-    finally:
-        speaker.join(LIMIT_S)
+    with answered(pty, b"\x81\x00\xfe" * 7), opened(pty.path) as link:
+        with pytest.raises(TransferError, match=r"other bytes: 81 00 fe .* check the baud rate"):
+            link.transfer(SERIAL)
+        assert link.serial_line() == SerialLineCounters(timeouts=1, strange_bytes=21)
 
 
 def test_request_to_all_expects_no_reply(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -341,8 +311,8 @@ def test_request_to_all_expects_no_reply(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_cable_pulled_and_back(pty: PtyPort) -> None:
     ports = rs485.SharedPorts()
-    link_a = rs485.Rs485Link(rs485.Rs485Options(line=pty.path, baud=BAUD, reply_ms=1), ports=ports)
-    link_b = rs485.Rs485Link(rs485.Rs485Options(line=pty.path, baud=BAUD, reply_ms=1), ports=ports)
+    options = rs485.Rs485Options(line=pty.path, baud=BAUD, reply_ms=1)
+    link_a, link_b = rs485.Rs485Link(options, ports=ports), rs485.Rs485Link(options, ports=ports)
     link_a.open()
     link_b.open()
     pty.unplug()
@@ -518,19 +488,9 @@ def served(*devices: SimDevice) -> Iterator[str]:
         theirs.unplug()
 
 
-@contextmanager
-def linked(path: str) -> Iterator[rs485.Rs485Link]:
-    link = rs485.Rs485Link(rs485.Rs485Options(line=path, baud=BAUD, reply_ms=1000), ports=rs485.SharedPorts())
-    link.open()
-    try:
-        yield link
-    finally:
-        link.close()
-
-
 def test_pymodbus_server_as_modules_under_our_driver() -> None:
     settings = HipnucModbusOptions()
-    with served(device(1, new=False), device(80, new=True)) as path, linked(path) as link:
+    with served(device(1, new=False), device(80, new=True)) as path, opened(path) as link:
         for address, firmware in ((80, "1.6.9"), (1, "1.5.2")):
             link.select(address)
             identity = run_transfer_script(DRIVER.probe(settings), link.transfer)

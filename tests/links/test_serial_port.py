@@ -130,41 +130,34 @@ def usb(dev: Path, sys: Path, name: str, **texts: str) -> None:
     (sys / "class" / "tty" / name / "device").symlink_to(port)
 
 
-def test_an_adapter_is_listed_by_its_lasting_name(dev: Path, sys: Path) -> None:
-    usb(dev, sys, "ttyUSB0", manufacturer="FTDI", product="FT232R USB UART", serial="A1")
-    (dev / "serial" / "by-id" / "usb-FTDI").symlink_to("../../ttyUSB0")
-    (dev / "serial" / "by-path" / "pci-0").symlink_to("../../ttyUSB0")
-    expected = serial_port.SerialPort(f"{dev}/serial/by-id/usb-FTDI", f"{dev}/ttyUSB0", "FTDI FT232R USB UART A1")
-    assert serial_port.list_ports(dev, sys) == [expected]
+FTDI = {"manufacturer": "FTDI", "product": "FT232R USB UART", "serial": "A1"}
+PORT = {"product": "FT2232H", "serial": "A1"}
 
 
-def test_without_by_id_the_path_and_then_the_node_is_the_name(dev: Path, sys: Path) -> None:
-    usb(dev, sys, "ttyUSB0", product="adapter")
-    usb(dev, sys, "ttyUSB1")
-    (dev / "serial" / "by-path" / "pci-0").symlink_to("../../ttyUSB0")
-    assert serial_port.list_ports(dev, sys) == [
-        serial_port.SerialPort(f"{dev}/serial/by-path/pci-0", f"{dev}/ttyUSB0", "adapter"),
-        serial_port.SerialPort(f"{dev}/ttyUSB1", f"{dev}/ttyUSB1", ""),
-    ]
-
-
-def test_equal_adapters_without_serial_numbers_are_named_by_their_sockets(dev: Path, sys: Path) -> None:
-    """Both adapters have the same by-id name, which refers to the adapter that was plugged in last."""
-    for name in ("ttyUSB0", "ttyUSB1"):
-        usb(dev, sys, name, product="CH340")
-        (dev / "serial" / "by-path" / f"pci-{name[-1]}").symlink_to(f"../../{name}")
-    (dev / "serial" / "by-id" / "usb-1a86_CH340").symlink_to("../../ttyUSB1")
-    assert [port.path for port in serial_port.list_ports(dev, sys)] == [f"{dev}/serial/by-path/pci-{n}" for n in (0, 1)]
-
-
-def test_ports_of_one_adapter_keep_their_names(dev: Path, sys: Path) -> None:
-    for number in (0, 1):
-        usb(dev, sys, f"ttyUSB{number}", product="FT2232H", serial="A1")
-        (dev / "serial" / "by-id" / f"usb-FT2232H-if0{number}").symlink_to(f"../../ttyUSB{number}")
-        (dev / "serial" / "by-path" / f"pci-{number}").symlink_to(f"../../ttyUSB{number}")
-    assert [port.path for port in serial_port.list_ports(dev, sys)] == [
-        f"{dev}/serial/by-id/usb-FT2232H-if0{n}" for n in (0, 1)
-    ]
+@pytest.mark.parametrize(
+    ("texts", "links", "expected"),
+    [
+        ({0: FTDI}, {"by-id/FTDI": 0, "by-path/pci-0": 0}, [("serial/by-id/FTDI", 0, "FTDI FT232R USB UART A1")]),
+        ({0: {"product": "x"}, 1: {}}, {"by-path/pci-0": 0}, [("serial/by-path/pci-0", 0, "x"), ("ttyUSB1", 1, "")]),
+        # equal adapters without serial numbers: one by-id name, of the adapter that was plugged in last
+        ({0: {"product": "CH340"}, 1: {"product": "CH340"}}, {"by-id/CH340": 1, "by-path/pci-0": 0, "by-path/pci-1": 1},
+         [("serial/by-path/pci-0", 0, "CH340"), ("serial/by-path/pci-1", 1, "CH340")]),
+        # the ports of one adapter
+        ({0: PORT, 1: PORT}, {"by-id/if00": 0, "by-id/if01": 1, "by-path/pci-0": 0, "by-path/pci-1": 1},
+         [("serial/by-id/if00", 0, "FT2232H A1"), ("serial/by-id/if01", 1, "FT2232H A1")]),
+        ({10: {}, 2: {}, 1: {}}, {}, [(f"ttyUSB{n}", n, "") for n in (1, 2, 10)]),  # the natural order
+    ],
+)  # fmt: skip
+def test_adapters_are_listed_by_their_lasting_names(
+    dev: Path, sys: Path, texts: dict[int, dict[str, str]], links: dict[str, int], expected: list[tuple[str, int, str]]
+) -> None:
+    """By-id, else by-path, else the node."""
+    for number, text in texts.items():
+        usb(dev, sys, f"ttyUSB{number}", **text)
+    for name, number in links.items():
+        (dev / "serial" / name).symlink_to(f"../../ttyUSB{number}")
+    found = [serial_port.SerialPort(f"{dev}/{path}", f"{dev}/ttyUSB{n}", title) for path, n, title in expected]
+    assert serial_port.list_ports(dev, sys) == found
 
 
 def test_ports_without_hardware_and_other_terminals_are_left_out(dev: Path, sys: Path) -> None:
@@ -177,12 +170,6 @@ def test_ports_without_hardware_and_other_terminals_are_left_out(dev: Path, sys:
     usb(dev, sys, "ttyUSB0")
     (dev / "ttyUSB0").unlink()
     assert [port.node for port in serial_port.list_ports(dev, sys)] == [f"{dev}/ttyAMA0", f"{dev}/ttyS0"]
-
-
-def test_the_order_is_the_natural_one(dev: Path, sys: Path) -> None:
-    for number in (10, 2, 1):
-        usb(dev, sys, f"ttyUSB{number}")
-    assert [port.node[-2:] for port in serial_port.list_ports(dev, sys)] == ["B1", "B2", "10"]
 
 
 def test_this_machine_and_one_without_ports_can_be_listed(tmp_path: Path) -> None:

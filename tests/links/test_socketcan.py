@@ -5,7 +5,6 @@ import errno
 import os
 import select
 import socket
-import struct
 import time
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextlib import closing
@@ -136,17 +135,18 @@ def test_a_link_waits_for_its_interface(ends: Ends, monkeypatch: pytest.MonkeyPa
     assert found == [True, False]
 
 
-def test_frames_gather(ends: Ends) -> None:
-
+@pytest.mark.parametrize("sizes", [[1, 3], [1, 64, 64, 5]])
+def test_frames_gather_and_more_than_a_batch_is_read_at_once(ends: Ends, sizes: list[int]) -> None:
     async def story(bus: Bus) -> None:
-        bus.then = lambda: bus.send(2, 3, 4)
-        bus.send(1)
-        await bus.until(lambda: len(bus.batches) == 2)
+        bus.then = lambda: bus.send(*range(1, sum(sizes)))
+        bus.send(0)
+        await bus.until(lambda: len(bus.batches) == len(sizes))
 
     bus = Bus(ends, GATHER_MS)
     bus.run(story)
-    assert [[frame.can_id for frame in batch] for batch in bus.batches] == [[1], [2, 3, 4]]
-    assert (bus.delays_s, bus.by_timer, bus.news) == ([GATHER_MS / 1000] * 2, [False, True], [])
+    assert [frame.can_id for batch in bus.batches for frame in batch] == [*range(sum(sizes))]
+    assert [len(batch) for batch in bus.batches] == sizes
+    assert (bus.delays_s, bus.by_timer[:2], bus.news) == ([GATHER_MS / 1000] * 2, [False, True], [])
 
 
 def test_a_controller_that_is_off_at_the_start_is_news(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -155,18 +155,6 @@ def test_a_controller_that_is_off_at_the_start_is_news(ends: Ends, monkeypatch: 
 
     monkeypatch.setattr(netlink, "can_details", lambda name: netlink.CanDetails(None, 3))
     Bus(ends, 0).run(story)
-
-
-def test_what_is_more_than_a_batch_is_read_at_once(ends: Ends) -> None:
-    async def story(bus: Bus) -> None:
-        bus.then = lambda: bus.send(*range(2 * 64 + 5))
-        bus.send(0x700)
-        await bus.until(lambda: len(bus.batches) == 4)
-
-    bus = Bus(ends, GATHER_MS)
-    bus.run(story)
-    assert [len(batch) for batch in bus.batches] == [1, 64, 64, 5]
-    assert bus.delays_s == [GATHER_MS / 1000] * 2
 
 
 def test_a_bus_that_fell_silent_is_watched_again(ends: Ends) -> None:
@@ -290,7 +278,7 @@ def news_of(bus: BusState, classes: int, status: int = 0) -> str:
     return "".join(news for news, _ in bus.news)
 
 
-def test_life_of_a_controller() -> None:
+def test_life_of_a_controller_from_its_state_at_the_start() -> None:
     bus = BusState("can0", 0)
     assert bus.problem == ""
     assert news_of(bus, 0x4, 0x08) == "can0 is near its error limit (warning)"
@@ -303,20 +291,14 @@ def test_life_of_a_controller() -> None:
     assert news_of(bus, 0x100) == "can0 is error-active again"
     assert bus.problem == ""
     assert (bus.passive_count, bus.bus_off_count) == (1, 1)
-
-
-def test_a_frame_without_news_changes_no_state() -> None:
     bus = BusState("can0", 0)
     assert news_of(bus, 0x4, 0x01) == ""
     assert (bus.overflows, bus.state) == (1, ControllerState.ACTIVE)
     bus = BusState("can0", 2)
     assert news_of(bus, 0x80, 0x20 | 0x01) == ""
     assert (bus.overflows, bus.state) == (0, ControllerState.PASSIVE)
-
-
-@pytest.mark.parametrize(("number", "state"), [(3, ControllerState.BUS_OFF), (None, ControllerState.ACTIVE), (5, 0)])
-def test_state_at_the_start(number: int | None, state: int) -> None:
-    assert BusState("can0", number).state == state
+    for number, state in ((3, ControllerState.BUS_OFF), (None, ControllerState.ACTIVE), (5, 0)):
+        assert BusState("can0", number).state == state
 
 
 HOUR_NS = 3600 * 10**9
@@ -386,7 +368,12 @@ def wire() -> Iterator[Wire]:
         yield made
 
 
-def test_frames_come_with_the_time_of_their_arrival(wire: Wire) -> None:
+def test_a_read_is_bounded_and_frames_come_with_the_time_of_their_arrival(wire: Wire) -> None:
+    wire.send(*range(64 + 5))
+    first, second = wire.read(), wire.read()
+    assert [f.can_id for f in first + second] == list(range(64 + 5))
+    assert (len(first), len(second)) == (64, 5)
+    assert second[0].t_rx_ns >= first[-1].t_rx_ns
     assert wire.reader.read() == []
     before_ns, after_ns = wire.send(1, 2, 0x7FF)
     frames = wire.read()
@@ -400,14 +387,6 @@ def test_frames_come_with_the_time_of_their_arrival(wire: Wire) -> None:
     wire.receiver.close()
     with pytest.raises(OSError, match="Bad file descriptor"):
         wire.reader.read()
-
-
-def test_a_read_is_bounded_and_the_rest_stays(wire: Wire) -> None:
-    wire.send(*range(64 + 5))
-    first, second = wire.read(), wire.read()
-    assert [f.can_id for f in first + second] == list(range(64 + 5))
-    assert (len(first), len(second)) == (64, 5)
-    assert second[0].t_rx_ns >= first[-1].t_rx_ns
 
 
 def test_drops_are_counted_and_marked_where_they_were(wire: Wire) -> None:
@@ -523,8 +502,3 @@ def test_clocks_that_are_always_read_apart_give_the_closest_of_some_readings(wir
     (frame,) = reader.read()
     assert before_ns - 15_000 <= frame.t_rx_ns <= after_ns + 15_000
     assert not list(calls), "three readings, because each needs more than 20 us"
-
-
-def test_layout_of_the_kernels_frame() -> None:
-    assert pack_frame(0x65, False, b"\1\2") == struct.pack("=I", 0x65) + b"\2\0\0\0\1\2" + bytes(6)
-    assert pack_frame(0x65, True, b"")[:4] == struct.pack("=I", 0x8000_0065)
