@@ -18,14 +18,8 @@ from imud.client.connection import Client
 from imud.config.yaml import yaml_block
 from imud.contracts.command import Target
 from imud.contracts.setting import Effect, SettingInfo, SettingsTable, declared_values
-from imud.device.settings_plan import (
-    completed,
-    described_settings,
-    differences,
-    make_plan,
-    setting_instead,
-    wanted_values,
-)
+from imud.device import settings_plan
+from imud.device.settings_plan import differences, make_plan, setting_instead, wanted_values
 from imud.drivers import DRIVERS
 from imud.formats.jsonrpc import RpcError
 from imud.links import LINKS
@@ -48,7 +42,7 @@ def table_of(driver: str) -> SettingsTable:
 
 
 def info_of(driver: str, name: str) -> SettingInfo:
-    return next(one for one in described_settings(table_of(driver), {}, None) if one.name == name)
+    return next(one for one in settings_plan.described_settings(table_of(driver), {}, None) if one.name == name)
 
 
 def example(info: inspect.Type, last: bool = False) -> Any:
@@ -252,7 +246,7 @@ def test_a_removed_command_names_the_new_command(driver: str, name: str, given: 
     assert str(instead).partition(": ")[2] == f"imud settings bow {words}".strip()
     assert instead.data["save"] is ("--save" in words)
     wanted = wanted_values(table, instead.data["settings"])
-    for setting in completed(table, wanted, {}):
+    for setting in settings_plan.completed(table, wanted, {}):
         setting_of = table.table[setting]
         assert "--save" in words or not (setting_of.saves or setting_of.effect is Effect.AFTER_RESTART)
     if given:  # names in place of values, and no values for programs

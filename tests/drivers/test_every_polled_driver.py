@@ -128,7 +128,7 @@ def test_scripts_end_after_any_replies(name: str, seed: int) -> None:
 
 @every_driver
 @pytest.mark.manual("A 3.1 address")
-def test_targets_and_link_of_the_row(name: str) -> None:
+def test_targets_and_link_of_the_row_and_an_address_outside_the_targets(name: str) -> None:
     driver = row(name)
     assert len(set(driver.targets)) == len(driver.targets) > 0
     assert LINKS[driver.link].polled
@@ -139,6 +139,13 @@ def test_targets_and_link_of_the_row(name: str) -> None:
     assert driver.update_ns(driver.settings()) == 0  # not known
     assert driver.update_ns(msgspec.convert({"update_hz": 200}, driver.settings)) == 5_000_000
     assert msgspec.structs.fields(driver.settings)
+    driver = row(name)
+    addresses = (driver.targets[0], driver.targets[-1], "auto", 0x77)
+    links = [object(), *(type("Link", (), {"address": address})() for address in addresses)]
+    expected = [0, 0, 0, 0, int(name.startswith("imu61x"))]  # 0x77 is a valid address of Modbus
+    found = [list(driver.problems(driver.settings(), link)) for link in links]
+    assert [len(problems) for problems in found] == expected
+    assert all("got 0x77" in problem.message for problem in found[-1])
 
 
 READ_NS: list[tuple[str, object, object, int]] = [
@@ -150,19 +157,8 @@ READ_NS: list[tuple[str, object, object, int]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "options", "link", "expected_ns"), READ_NS)
-def test_the_time_of_a_read_on_the_bus(name: str, options: object, link: object, expected_ns: int) -> None:
-    driver = row(name)
-    made = msgspec.convert(options, driver.settings), msgspec.convert(link, LINKS[driver.link].settings)
-    assert driver.read_ns(*made) == expected_ns
-
-
-@every_driver
-def test_an_address_outside_the_targets_is_a_problem(name: str) -> None:
-    driver = row(name)
-    addresses = (driver.targets[0], driver.targets[-1], "auto", 0x77)
-    links = [object(), *(type("Link", (), {"address": address})() for address in addresses)]
-    expected = [0, 0, 0, 0, int(name.startswith("imu61x"))]  # 0x77 is a valid address of Modbus
-    found = [list(driver.problems(driver.settings(), link)) for link in links]
-    assert [len(problems) for problems in found] == expected
-    assert all("got 0x77" in problem.message for problem in found[-1])
+def test_the_time_of_a_read_on_the_bus() -> None:
+    for name, options, link, expected_ns in READ_NS:
+        driver = row(name)
+        made = msgspec.convert(options, driver.settings), msgspec.convert(link, LINKS[driver.link].settings)
+        assert driver.read_ns(*made) == expected_ns

@@ -1,4 +1,5 @@
-"""Every driver, from its row in DRIVERS: the row, its examples, its calibrations and its data sheet are complete."""
+"""Every driver, from its row in DRIVERS: the row, its examples, its calibrations and its data sheet are complete.
+Options and settings are as in the tables of the documents, counters and rates as in the manuals."""
 
 from collections.abc import Callable
 from random import Random
@@ -6,11 +7,13 @@ from random import Random
 import msgspec
 import pytest
 
+from imud.contracts import driver as contract
 from imud.contracts.command import Calibration, CalibrationInfo, Handling, Kept, Risk, infos
-from imud.contracts.driver import CanDriver, DataSheet, Driver, ModelFigures, PolledDriver, SensorFigures, StreamDriver
+from imud.contracts.driver import CanDriver, Driver, PolledDriver, StreamDriver
 from imud.contracts.setting import Effect
 from imud.drivers import DRIVERS
-from imud.model.units import RAD_PER_DEG
+from imud.model.units import NS_PER_MS, NS_PER_US, RAD_PER_DEG
+from tests.support.documented import accepts, check_schema, check_values, rows
 
 every_driver = pytest.mark.parametrize("name", DRIVERS)
 
@@ -87,7 +90,7 @@ EVERY = [
 ]
 
 
-def test_calibrations_filters_and_figures_by_the_longest_begin_of_a_name() -> None:
+def test_calibrations_filters_steps_on_the_wire_and_figures_by_the_longest_begin_of_a_name() -> None:
     for name, limit_deg in (("hipnuc-modbus", 15), ("hipnuc-uart", 5)):  # sections 4.3.5 and 2.2.4
         assert f"within {limit_deg}° of level" in DRIVERS[name].calibrations["accelerometer_level"].help
     assert {name for name, driver in DRIVERS.items() if driver.calibrations} == {
@@ -101,11 +104,22 @@ def test_calibrations_filters_and_figures_by_the_longest_begin_of_a_name() -> No
         assert words({}, "accel") == "low-pass 47 Hz (factory setting; imud has not read the filter)"
     assert DRIVERS["hipnuc-uart"].data_sheet.filter_words({}, "gyro") == ""
 
-    family, model = ModelFigures(source="a"), ModelFigures(gyro=SensorFigures(random_walk=1e-4), source="b")
-    sheet = DataSheet(models={"HI": family, "HI14": model})
+    family, model = (
+        contract.ModelFigures(source="a"),
+        contract.ModelFigures(gyro=contract.SensorFigures(random_walk=1e-4), source="b"),
+    )
+    sheet = contract.DataSheet(models={"HI": family, "HI14": model})
     assert sheet.figures_of("HI14R2N") is model
     assert sheet.figures_of("HI12") is family
     assert sheet.figures_of("CH100") is None
+    for name, gyro, accel in (
+        ("hipnuc-modbus", 0.061035 * RAD_PER_DEG, 0.00048828 * 9.8),
+        ("hipnuc-j1939", 0.061035 * RAD_PER_DEG, 0.00048828 * 9.8), ("hipnuc-canopen", 0.1 * RAD_PER_DEG, 0.001 * 9.8),
+        ("hipnuc-uart", None, None), ("imu61x-spi", None, None),
+    ):  # fmt: skip
+        sheet = DRIVERS[name].data_sheet
+        assert sheet.gyro_step_rad_s == (None if gyro is None else pytest.approx(gyro))
+        assert sheet.accel_step_m_s2 == (None if accel is None else pytest.approx(accel))
 
 
 @pytest.mark.parametrize(("_driver", "kind", "calibration"), EVERY)
@@ -123,15 +137,59 @@ def test_calibrations_are_complete(_driver: str, kind: str, calibration: Calibra
     assert all(expectation.limit > 0 for expectation in calibration.expected)
 
 
-@pytest.mark.parametrize(
-    ("name", "gyro", "accel"),
-    [
-        ("hipnuc-modbus", 0.061035 * RAD_PER_DEG, 0.00048828 * 9.8),
-        ("hipnuc-j1939", 0.061035 * RAD_PER_DEG, 0.00048828 * 9.8), ("hipnuc-canopen", 0.1 * RAD_PER_DEG, 0.001 * 9.8),
-        ("hipnuc-uart", None, None), ("imu61x-spi", None, None),
-    ],
-)  # fmt: skip
-def test_steps_on_the_wire(name: str, gyro: float | None, accel: float | None) -> None:
-    sheet = DRIVERS[name].data_sheet
-    assert sheet.gyro_step_rad_s == (None if gyro is None else pytest.approx(gyro))
-    assert sheet.accel_step_m_s2 == (None if accel is None else pytest.approx(accel))
+@every_driver
+def test_settings_options_and_counters_are_as_documented(name: str) -> None:
+    table = DRIVERS[name].device_settings
+    found = rows("settings.md", f"`{name}`")
+    assert bool(found) == (table is not None and bool(table.table))
+    for row in found:
+        assert table is not None
+        setting, in_force = table.table[row.name], row.cells[0]
+        check_values(row, setting.type)
+        assert (setting.write is None) == (in_force == "read only"), row.name
+        assert (setting.effect is Effect.AFTER_RESTART) == ("after save and restart" in in_force), row.name
+        assert setting.readable == ("not readable" not in in_force), row.name
+        assert setting.connection == ("last" in in_force), row.name
+    driver = DRIVERS[name]
+    check_schema(f"Options of driver `{name}`", driver.settings)
+    found_counters = driver.tick_ns, driver.tick_modulus, driver.stamp_modulus
+    assert found_counters == COUNTERS.get(name, (contract.SAMPLE_COUNTER, 2, 0))
+
+
+def test_alarm_angles_are_within_half_a_turn() -> None:
+    """A roll angle is between -180° and 180° (section 9.1), so an alarm outside this range could not occur."""
+    table = DRIVERS["hipnuc-uart"].device_settings
+    assert table is not None
+    for low, high, is_valid in ((-180, 180, True), (-181, 180, False), (-180, 181, False)):
+        alarm = {"x": {"min_deg": low, "max_deg": high}}
+        assert accepts(table.table["alarm"].type, alarm) == is_valid
+
+
+COUNTERS = {
+    "hipnuc-uart": (NS_PER_MS, 1 << 32, 8192),  # 3.3.1: system_time is uint32 in ms, pps_sync_stamp rolls over at 8192
+    "hipnuc-modbus": (NS_PER_MS, 1 << 32, 0),  # the registers of the system time, as the serial port
+    "imu61x-uart": (NS_PER_US, 1 << 32, 0),  # table 4: timer is uint32 in µs
+    "imu61x-can": (contract.SAMPLE_COUNTER, 1 << 16, 0),  # table 33 and note 1: INDEX has 16 bits and counts frames
+}
+"""Tick, modulus of the counter, and modulus of the PPS time stamp, for the protocols with a counter."""
+
+
+@pytest.mark.manual("A 1.1 rates")
+def test_detection_tries_the_rates_and_addresses_of_the_manual() -> None:
+    for name, rates in (
+        # 2.2.3, and 230400 of 3.7
+        ("hipnuc-uart", {9600, 115_200, 230_400, 256_000, 460_800, 921_600}),
+        ("imu61x-uart", {115_200, 230_400, 460_800, 921_600, 1_500_000}),  # table 9
+    ):
+        driver = DRIVERS[name]
+        assert isinstance(driver, StreamDriver)
+        assert driver.baud_rates[0] == 115_200  # factory value of both families
+        assert sorted(driver.baud_rates) == sorted(rates)
+    for name, targets in (
+        ("imu61x-i2c", (0x18, 0x19, 0x1A, 0x1B)),  # table 12
+        ("imu61x-spi", (0, 3)),  # rising edge: mode 0 (idle low, table 15) or mode 3
+        ("hipnuc-modbus", (80, *range(1, 80), *range(81, 248))),  # factory address, then all addresses of Modbus
+    ):
+        driver = DRIVERS[name]
+        assert isinstance(driver, PolledDriver)
+        assert driver.targets == targets

@@ -6,17 +6,8 @@ from dataclasses import dataclass, field
 import msgspec
 import pytest
 
-from imud.contracts.script import (
-    Outcome,
-    Rejection,
-    Reply,
-    ReplyFrame,
-    Request,
-    RequestScript,
-    Silence,
-    never,
-    says_nothing,
-)
+from imud.contracts import script
+from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request, RequestScript, Silence
 from imud.contracts.setting import Written
 from imud.drivers.readdressing import Readdressing
 from imud.formats.can import RAW_FRAME, CanFilter, pack_frame
@@ -81,10 +72,12 @@ class Bench:
 
         def write(at: int, new: int) -> RequestScript[bool]:
             is_reply = is_from(REPLIES + at)
-            return isinstance((yield Request(frame(at, WRITE, new), "write", is_reply, never, never)), Reply)
+            return isinstance(
+                (yield Request(frame(at, WRITE, new), "write", is_reply, script.never, script.never)), Reply
+            )
 
         def verify(at: int, _new: int) -> RequestScript[Written]:
-            yield Request(frame(at, QUERY), "read", is_from(REPLIES + at), never, never)
+            yield Request(frame(at, QUERY), "read", is_from(REPLIES + at), script.never, script.never)
             return Written.PENDING if at == present else Written.VERIFIED
 
         return Readdressing(
@@ -94,14 +87,16 @@ class Bench:
             boot_data=b"\0", sender_mask=0x7F,
             frames=lambda at: (CanFilter(REPLIES + at, 0x7FF, False), CanFilter(BOOTS + at, 0x7FF, False)),
             describe=hex, query=lambda at: frame(at, QUERY), write=write, verify=verify,
-            read_saved=lambda: says_nothing(self.device.saved),
+            read_saved=lambda: script.says_nothing(self.device.saved),
         )  # fmt: skip
 
     def change(self, new: int) -> Written:
         return run_script(self.readdressing().change(new), self.ask)
 
     def restart(self, bus_bit_s: int = BUS_BIT_S) -> str:
-        request = Request(frame(self.options.node, RESTART), "restart", never, never, never, silent=True)
+        request = Request(
+            frame(self.options.node, RESTART), "restart", script.never, script.never, script.never, silent=True
+        )
         return run_script(self.readdressing().restart(request, bus_bit_s), self.ask)
 
 
@@ -174,7 +169,7 @@ def test_a_restarted_device_is_found_at_its_saved_or_present_place(
     assert bench.options == FakeOptions(place)
 
 
-def test_boot_frames_of_this_device_only() -> None:
+def test_boot_frames_of_this_device_only_and_a_rejected_restart_or_lost_device_is_reported() -> None:
     bench = Bench(FakeDevice(saved={"place": 9}, booted=FACTORY))
     assert bench.restart() == "found as node 8"
     bench = Bench(FakeDevice(saved={"place": 9}, booted=FACTORY, boots=False))
@@ -187,9 +182,6 @@ def test_boot_frames_of_this_device_only() -> None:
     bench = Bench(FakeDevice(booted=33))
     assert bench.restart() == "found as node 33"
     assert bench.options == FakeOptions(33)
-
-
-def test_a_rejected_restart_and_a_lost_device_are_reported() -> None:
     with pytest.raises(Rejected, match="restart: the device rejected the request"):
         Bench(FakeDevice(), rejects=True).restart()
     bench = Bench(FakeDevice(saved={"place": 9, "rate": 0}))

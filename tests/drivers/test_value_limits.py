@@ -48,14 +48,7 @@ def test_both_rules_agree(value: float) -> None:
     assert (value_limits.possible_temperature_c(value) is not None) == (-128 < value <= 150)
 
 
-@pytest.mark.parametrize("value", [131072.0, 3e38, inf, nan])
-def test_the_smallest_impossible_value_is_131072(value: float) -> None:
-    assert not value_limits.is_possible([value])
-    assert value_limits.scaled((0.0, value, 0.0), 2.0) is None
-    assert not value_limits.values_possible(high_byte(-value) + high_byte(0.0))
-
-
-def test_limits_of_values_and_temperatures() -> None:
+def test_limits_of_temperatures_and_of_values_below_131072() -> None:
     assert value_limits.scaled((0.0, 131071.5, -131071.5), 2.0) == (0.0, 262143.0, -262143.0)
     assert value_limits.possible_angles((-tau, 0.0, tau)) == (-tau, 0.0, tau)
     assert value_limits.possible_angles((0.0, tau * 1.00001)) is None
@@ -63,6 +56,10 @@ def test_limits_of_values_and_temperatures() -> None:
         assert value_limits.possible_temperature_c(impossible) is None
         inside = nextafter(impossible, 0.0)
         assert value_limits.possible_temperature_c(inside) == inside
+    for value in (131072.0, 3e38, inf, nan):
+        assert not value_limits.is_possible([value])
+        assert value_limits.scaled((0.0, value, 0.0), 2.0) is None
+        assert not value_limits.values_possible(high_byte(-value) + high_byte(0.0))
 
 
 FLOATS = (nan, inf, -inf, 3e38, -3e38, 1e-45, 2e5, -9e8, 400.0, -361.0, 151.0, 1.0, 0.0)

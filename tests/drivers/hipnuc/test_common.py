@@ -17,15 +17,14 @@ from imud.model.errors import BadArgument
 from tests.support.simulated_modules import CanopenBench
 
 
-@pytest.mark.parametrize(
-    ("value", "bits", "counts"),
-    [
+def test_nearest_count_in_the_range_and_nan_has_none() -> None:
+    for value, bits, counts in (
         (0.4, 16, 0), (-1.6, 16, -2), (32767.4, 16, 32767), (1e9, 16, 32767), (-32768.0, 16, -32768),
         (-inf, 16, -32768), (inf, 32, 2**31 - 1), (-(2.0**40), 32, -(2**31)),
-    ],
-)  # fmt: skip
-def test_nearest_count_in_the_range(value: float, bits: int, counts: int) -> None:
-    assert counts_of(value, bits) == counts
+    ):  # fmt: skip
+        assert counts_of(value, bits) == counts
+    with pytest.raises(ValueError, match="NaN"):
+        counts_of(nan, 16)
 
 
 def test_status_bits_with_an_event() -> None:
@@ -34,24 +33,17 @@ def test_status_bits_with_an_event() -> None:
         assert [bit for bit, one in DRIVERS[name].status_bits.items() if one.notable] == [3, 4, 5, 6, 7]
 
 
-def test_nan_has_no_count() -> None:
-    with pytest.raises(ValueError, match="NaN"):
-        counts_of(nan, 16)
-
-
-@pytest.mark.parametrize("value_pa", [1_000.0, 33_000.0, 101_325.0, 120_000.0])
-def test_a_pressure(value_pa: float) -> None:
-    assert pressure_of(value_pa) == value_pa
-    assert temperature_beside(21, value_pa) == 21
+VALID_PA = (1_000.0, 33_000.0, 101_325.0, 120_000.0)
 
 
 @pytest.mark.parametrize(
     ("value_pa", "temperature_c"),
-    [(0.0, 21), (999.0, 21), (9.99, None), (999.9, None), (120_000.1, None), (-4.2e-25, None), (nan, None),
+    [*((valid_pa, 21) for valid_pa in VALID_PA), (0.0, 21), (999.0, 21), (9.99, None), (999.9, None),
+     (120_000.1, None), (-4.2e-25, None), (nan, None),
      (inf, None), (-101_325.0, None)],
 )  # fmt: skip
-def test_no_pressure(value_pa: float, temperature_c: float | None) -> None:
-    assert pressure_of(value_pa) is None
+def test_valid_and_invalid_pressures(value_pa: float, temperature_c: float | None) -> None:
+    assert pressure_of(value_pa) == (value_pa if value_pa in VALID_PA else None)
     assert temperature_beside(21, value_pa) == temperature_c
 
 
@@ -68,15 +60,11 @@ def test_bits_of_a_message_and_the_limit_of_the_bus() -> None:
         refuse_overload(messages, 73_801, 100_000)
 
 
-@pytest.mark.parametrize(
-    ("values", "heading"),
-    [({"mode": "6-axis"}, Heading.RELATIVE), ({"mode": "9-axis"}, Heading.MAGNETIC), ({}, Heading.UNKNOWN)],
-)
-def test_by_mode(values: dict[str, str], heading: Heading) -> None:
-    assert heading_by_mode(None, values) is heading
-
-
-def test_drivers_that_read_it_back_and_that_know_it_beforehand() -> None:
+def test_heading_by_mode_and_of_drivers_that_know_it_beforehand() -> None:
+    for values, heading in (
+        ({"mode": "6-axis"}, Heading.RELATIVE), ({"mode": "9-axis"}, Heading.MAGNETIC), ({}, Heading.UNKNOWN),
+    ):  # fmt: skip
+        assert heading_by_mode(None, values) is heading
     for name in ("hipnuc-uart", "hipnuc-modbus"):
         assert DRIVERS[name].heading(None, {"mode": "9-axis"}) is Heading.MAGNETIC
     for name in ("imu61x-uart", "imu61x-can", "imu61x-i2c", "imu61x-spi"):
@@ -101,7 +89,7 @@ VERBS = {
 }
 
 
-def test_it_is_made_of_actions() -> None:
+def test_the_zero_is_made_of_actions_on_both_buses() -> None:
     zero = inclinometer_zero("5.4.1", VERBS)["zero"]
     target = Target(None, 0)
     assert zero.begin(target) == Began("zero", "here")
@@ -110,9 +98,6 @@ def test_it_is_made_of_actions() -> None:
     (expectation,) = zero.expected
     assert expectation.value(RestMeans(None, None, None, (0.001, -0.02))) == 0.02
     assert expectation.value(RestMeans(None, None, (0.0, 0.0, 0.0))) is None
-
-
-def test_on_both_buses() -> None:
     bench = CanopenBench()
     zero = DRIVERS["hipnuc-canopen"].calibrations["zero"]
     bench.run_script(zero.begin(Target(HipnucCanopenOptions(node=bench.module.node), 500_000)))

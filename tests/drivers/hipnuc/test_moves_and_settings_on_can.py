@@ -158,6 +158,12 @@ def test_an_unsaved_number_is_lost_at_a_restart(kind: tuple[Protocol, Any]) -> N
         assert numbers(protocol, bench) == (8, 8)
 
 
+def test_present_values_are_read_and_nothing_is_written(kind: tuple[Protocol, Any]) -> None:
+    protocol, bench = kind
+    assert bench.present() == (protocol.delivered if is_told(bench.module.hardware.variant) else {})
+    assert not any(protocol.is_write(data) for _, data in bench.sent)
+
+
 def test_a_number_in_use_is_rejected_without_a_write(kind: tuple[Protocol, Any]) -> None:
     protocol, bench = kind
     with pytest.raises(BadArgument, match=rf"{protocol.noun} 12 is in use: received its (frame 0x|PGN F)"):
@@ -168,16 +174,13 @@ def test_a_number_in_use_is_rejected_without_a_write(kind: tuple[Protocol, Any])
 
 
 @both
-def test_rejected_and_ignored_numbers_are_reported(protocol: Protocol) -> None:
+def test_rejected_and_ignored_numbers_are_reported_and_a_lost_device_is_commanded_back(protocol: Protocol) -> None:
     register = frozenset({protocol.register})
     with pytest.raises((Aborted, Rejected), match=r"invalid value|status 1"):
         move(protocol, protocol.make(variant=protocol.variant(refuses=register)), 9)
     with pytest.raises((DeviceRefused, Rejected), match=r"after the write, got 8"):
         move(protocol, protocol.make(variant=protocol.variant(ignores=register)), 9)
 
-
-@both
-def test_a_lost_device_is_commanded_back(protocol: Protocol) -> None:
     sent: list[bytes] = []
 
     def silent(request: Request) -> Outcome:
@@ -193,7 +196,7 @@ def test_a_lost_device_is_commanded_back(protocol: Protocol) -> None:
 
 
 @both
-def test_a_restart_that_loses_the_device_is_reported(protocol: Protocol) -> None:
+def test_lost_devices_are_reported_and_factory_settings_are_in_force_after_a_restart(protocol: Protocol) -> None:
     bench = protocol.make(boot_ms=300)
     bench.run(BOOTED_NS)
     bench.act("bitrate", bitrate=250_000)
@@ -204,9 +207,6 @@ def test_a_restart_that_loses_the_device_is_reported(protocol: Protocol) -> None
     with pytest.raises(NoReply, match=f"no frame of {protocol.noun} 8 after the restart"):
         bench.act("restart")
 
-
-@both
-def test_factory_settings_are_in_force_after_a_restart(protocol: Protocol) -> None:
     bench = protocol.make(9)
     done = str(bench.act("factory_reset"))
     assert f"{protocol.noun} 8" in done
@@ -248,12 +248,6 @@ def test_the_table_has_order_effects_and_types(protocol: Protocol) -> None:
     for name, value in protocol.wrong.items():
         with pytest.raises(msgspec.ValidationError):
             msgspec.convert(value, table[name].type)
-
-
-def test_present_values_are_read_and_nothing_is_written(kind: tuple[Protocol, Any]) -> None:
-    protocol, bench = kind
-    assert bench.present() == (protocol.delivered if is_told(bench.module.hardware.variant) else {})
-    assert not any(protocol.is_write(data) for _, data in bench.sent)
 
 
 @both

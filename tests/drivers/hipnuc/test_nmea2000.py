@@ -11,16 +11,7 @@ import pytest
 
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
 from imud.drivers.hipnuc import nmea2000 as messages
-from imud.drivers.hipnuc.nmea2000 import (
-    ATTITUDE,
-    DRIVER,
-    HEADING,
-    RATE_OF_TURN,
-    HipnucNmea2000Codec,
-    HipnucNmea2000Options,
-    Reference,
-    encode,
-)
+from imud.drivers.hipnuc.nmea2000 import ATTITUDE, HEADING, RATE_OF_TURN, Reference, encode
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 
@@ -32,8 +23,8 @@ def measured(*rows: tuple[int, str]) -> Measurement:
     return messages.measurement_of([(pgn, bytes.fromhex(data)) for pgn, data in rows])
 
 
-def make(**options: object) -> HipnucNmea2000Codec:
-    return HipnucNmea2000Codec(Ledger(), msgspec.convert(options, HipnucNmea2000Options))
+def make(**options: object) -> messages.HipnucNmea2000Codec:
+    return messages.HipnucNmea2000Codec(Ledger(), msgspec.convert(options, messages.HipnucNmea2000Options))
 
 
 def burst(
@@ -48,7 +39,7 @@ def burst(
     ]
 
 
-def feed(codec: HipnucNmea2000Codec, frames: list[Frame], t_ns: int) -> list[int]:
+def feed(codec: messages.HipnucNmea2000Codec, frames: list[Frame], t_ns: int) -> list[int]:
     events: list[CodecEvent] = []
     for place, (can_id, data) in enumerate(frames):
         events += codec.feed_frame(can_id, True, data, t_ns + place * MS // 2)
@@ -57,7 +48,7 @@ def feed(codec: HipnucNmea2000Codec, frames: list[Frame], t_ns: int) -> list[int
     return [round(roll * 1e4) for roll in rolls if not math.isnan(roll)]
 
 
-def learned(**options: object) -> HipnucNmea2000Codec:
+def learned(**options: object) -> messages.HipnucNmea2000Codec:
     """Return a codec that has learned the bursts; the next burst starts at 1 s."""
     codec = make(**options)
     for n in range(-5, 10):
@@ -65,19 +56,15 @@ def learned(**options: object) -> HipnucNmea2000Codec:
     return codec
 
 
-@pytest.mark.parametrize(
-    ("counts", "yaw_rad"),
-    [(0, 0.0), (1, -0.0001), (15708, -1.5708), (31415, -3.1415), (31416, 3.141585307), (62831, 0.000085307)],
-)
-def test_heading_is_clockwise_from_north(counts: int, yaw_rad: float) -> None:
-    data = struct.pack("<BHhhB", 1, counts, 0x7FFF, 0x7FFF, 0xFD)
-    found = messages.measurement_of([(HEADING, data)])
-    assert found.euler_rad == pytest.approx((math.nan, math.nan, yaw_rad), nan_ok=True, abs=1e-9)
-    assert (found.quat_wxyz, found.gyro_rad_s) == (None, None)
-
-
-def test_rate_of_turn_and_attitude() -> None:
-    """The y axis of the sensor is the bow: heading 90° and pitch 30° point it east and up."""
+def test_heading_clockwise_from_north_rate_of_turn_and_attitude() -> None:
+    for counts, yaw_rad in (
+        (0, 0.0), (1, -0.0001), (15708, -1.5708), (31415, -3.1415), (31416, 3.141585307), (62831, 0.000085307),
+    ):  # fmt: skip
+        data = struct.pack("<BHhhB", 1, counts, 0x7FFF, 0x7FFF, 0xFD)
+        found = messages.measurement_of([(HEADING, data)])
+        assert found.euler_rad == pytest.approx((math.nan, math.nan, yaw_rad), nan_ok=True, abs=1e-9)
+        assert (found.quat_wxyz, found.gyro_rad_s) == (None, None)
+    # The y axis of the sensor is the bow: heading 90° and pitch 30° point it east and up
     # 3200000 · 3.125e-8 = 0.1 rad/s to starboard
     found = measured((RATE_OF_TURN, "05 00d43000 ffffff"))
     assert found.gyro_rad_s == pytest.approx((math.nan, math.nan, -0.1), nan_ok=True)
@@ -109,17 +96,14 @@ def test_the_heading_has_priority_over_the_yaw_of_the_attitude() -> None:
     assert elsewhere == pytest.approx((0, 0, math.nan), nan_ok=True)
 
 
-@pytest.mark.parametrize("last", ["ff", "fe", "fd"])
-def test_the_three_highest_values_are_absent(last: str) -> None:
-    assert measured((HEADING, f"05 {last}ff ff7f ff7f fd")).euler_rad is None
-    assert measured((RATE_OF_TURN, f"05 {last}ffff7f ffffff")).gyro_rad_s is None
-    assert measured((ATTITUDE, f"05 {last}7f {last}7f {last}7f ff")).euler_rad is None
-    only_roll = measured((ATTITUDE, f"05 {last}7f {last}7f 2c01 ff"))
-    assert only_roll.euler_rad == pytest.approx((0.03, math.nan, math.nan), nan_ok=True)
-    assert only_roll.quat_wxyz is None
-
-
-def test_the_next_lower_values_are_values() -> None:
+def test_the_three_highest_values_are_absent_and_the_next_lower_values_are_values() -> None:
+    for last in ("ff", "fe", "fd"):
+        assert measured((HEADING, f"05 {last}ff ff7f ff7f fd")).euler_rad is None
+        assert measured((RATE_OF_TURN, f"05 {last}ffff7f ffffff")).gyro_rad_s is None
+        assert measured((ATTITUDE, f"05 {last}7f {last}7f {last}7f ff")).euler_rad is None
+        only_roll = measured((ATTITUDE, f"05 {last}7f {last}7f 2c01 ff"))
+        assert only_roll.euler_rad == pytest.approx((0.03, math.nan, math.nan), nan_ok=True)
+        assert only_roll.quat_wxyz is None
     assert measured((HEADING, "05 70f5 ff7f ff7f fd")).euler_rad is not None
     assert measured((HEADING, "05 71f5 ff7f ff7f fd")).euler_rad is None  # beyond a full turn
     gyro = measured((RATE_OF_TURN, "05 fcffff7f ffffff")).gyro_rad_s
@@ -210,11 +194,11 @@ def test_a_burst_makes_a_sample_and_other_frames_do_not() -> None:
         assert not codec.feed_frame(can_id, extended, bytes(8), 0)
     assert codec.ledger.bytes_skipped == 32
     assert codec.ledger.closes()
-    assert DRIVER.node_of(0x0DF11905, True, bytes(8)) == 5
+    assert messages.DRIVER.node_of(0x0DF11905, True, bytes(8)) == 5
     for can_id, extended, size in [(0x0DF11905, False, 8), (0x0DF11905, True, 7), (0x0DF119FF, True, 8)]:
-        assert DRIVER.node_of(can_id, extended, bytes(size)) is None
-    assert DRIVER.node_settings(5) == HipnucNmea2000Options(source=5)
-    assert DRIVER.node_title(5) == "source 5"
+        assert messages.DRIVER.node_of(can_id, extended, bytes(size)) is None
+    assert messages.DRIVER.node_settings(5) == messages.HipnucNmea2000Options(source=5)
+    assert messages.DRIVER.node_title(5) == "source 5"
 
 
 def test_sids_and_senders_are_never_mixed() -> None:
@@ -229,8 +213,8 @@ def test_sids_and_senders_are_never_mixed() -> None:
     for n in range(60):
         assert feed(codec, burst(n), n * 100 * MS) == []
     assert codec.ledger.bytes_in == codec.ledger.bytes_skipped
-    assert {f.can_id & 0xFF for f in DRIVER.filters(HipnucNmea2000Options(source=36))} == {36}
-    assert all(f.mask & 0xFF == 0 for f in DRIVER.filters(HipnucNmea2000Options()))
+    assert {f.can_id & 0xFF for f in messages.DRIVER.filters(messages.HipnucNmea2000Options(source=36))} == {36}
+    assert all(f.mask & 0xFF == 0 for f in messages.DRIVER.filters(messages.HipnucNmea2000Options()))
 
     codec = learned()
     assert feed(codec, burst(1, source=36), 1000 * MS) == []
@@ -244,9 +228,7 @@ def test_sids_and_senders_are_never_mixed() -> None:
     assert feed(codec, burst(3), 10300 * MS) == []  # the old address now belongs to another sender
 
 
-@pytest.mark.parametrize(
-    ("heading", "yaw"), [("auto", -0.2), ("true", -0.2), ("magnetic", -0.3)],
-)  # fmt: skip
+@pytest.mark.parametrize(("heading", "yaw"), [("auto", -0.2), ("true", -0.2), ("magnetic", -0.3)])
 def test_a_sender_of_two_headings(heading: str, yaw: float) -> None:
     codec = make(heading=heading)
     events: list[CodecEvent] = []

@@ -150,15 +150,6 @@ def test_temperature_read_between_bursts_is_in_the_samples_after_it() -> None:
     assert made.ledger.closes()
 
 
-@pytest.mark.parametrize("data", [b"\xff" * 28, b"\x00" * 28, b"", GOLDEN[:-1]])
-def test_a_missing_device_is_not_damage(data: bytes) -> None:
-    """The checksum of zeros would match."""
-    made = codec()
-    (event,) = made.decode(0, PIPELINE + data)
-    assert isinstance(event, Vanished)
-    assert made.ledger.bytes_skipped == made.ledger.bytes_in == len(data)
-
-
 def decode_state(**changes: int | bytes) -> list[PolledEvent]:
     device, made = Imu61xRegisters(lambda: 0), codec(gyro_filter=0xB)
     for name, value in changes.items():
@@ -168,7 +159,7 @@ def decode_state(**changes: int | bytes) -> list[PolledEvent]:
     return list(events)
 
 
-def test_state_that_changed_by_itself_is_noticed() -> None:
+def test_a_changed_state_is_noticed_and_a_missing_device_is_not_damage() -> None:
     assert decode_state() == []
     for (event,) in (decode_state(filter=0xB0), decode_state(product_id=b"\x00\x00ICM206")):
         assert isinstance(event, Vanished)
@@ -180,9 +171,16 @@ def test_state_that_changed_by_itself_is_noticed() -> None:
     assert stuck[-2:] == b"\xa5\xfe"
     (event,) = made.decode(1, stuck[:-1] + b"\xff")
     assert event == Vanished("expected WIN_CTRL 0, got 1")
+    # The checksum of zeros would match
+    for data in (b"\xff" * 28, b"\x00" * 28, b"", GOLDEN[:-1]):
+        made = codec()
+        (event,) = made.decode(0, PIPELINE + data)
+        assert isinstance(event, Vanished)
+        assert made.ledger.bytes_skipped == made.ledger.bytes_in == len(data)
 
 
-def test_words_of_the_manual_and_their_answers() -> None:
+@pytest.mark.manual("A 2.3 read and write", "A 2.4.1 reading", "A 2.4.2 write and read")
+def test_words_of_the_manual_their_answers_and_transfers_on_the_wire() -> None:
     """2.4.4: 0xFE01 opens window 1. 2.4.2: 0x8644 sets both filters to 10 Hz, 0x0600 reads them back."""
     assert spi.OPEN == 0xFE01
     assert spi.write(0x06, 0x44) == 0x8644
@@ -192,10 +190,6 @@ def test_words_of_the_manual_and_their_answers() -> None:
     ]  # fmt: skip
     assert spi.answers(bytes.fromhex("aaaa bbbb 0001 fffe")) == (1, 0xFFFE)
     assert spi.answers(b"\x01\x02\x03\x04\x05") == ()
-
-
-@pytest.mark.manual("A 2.3 read and write", "A 2.4.1 reading", "A 2.4.2 write and read")
-def test_transfers_on_the_wire() -> None:
     assert spi.READ_STANDARD.sends == (b"\x80\x00" + bytes(30),)
     assert spi.READ_EXTENDED.sends == (b"\x80\x00" + bytes(50),)
     assert [one.hex() for one in spi.READ_TEMPERATURE.sends] == ["0e00", "1000", "7e00", "7e00"]
@@ -290,12 +284,19 @@ def test_window_is_closed_after_a_failure(fail_at: int) -> None:
     assert len(wire.sent) == 4
 
 
-def test_setting_that_does_not_take_is_refused() -> None:
+def test_a_setting_that_does_not_take_and_another_id_are_refused() -> None:
     with pytest.raises(DeviceRefused, match="FILTER_CTRL: expected 0xb1 after the write, got 0xbb"):
         run_transfer_script(set_up(SpiDeviceOptions(gyro_filter=1)), Wire(deaf=True).transfer)
     words = "expected a burst of the selected kind extended: wrong check value: .* is 0x0000 at 0x0C and 0x0000 at 0x0D"
     with pytest.raises(DeviceRefused, match=words):
         run_transfer_script(set_up(SpiDeviceOptions(burst="extended")), Wire(deaf=True).transfer)
+    for product_id, why in (
+        (b"\xff" * 8, "received only 0xFF"), (b"\x00" * 8, "received only 0x00"), (b"\x00\x00IMU61C", "SPI mode"),
+    ):  # fmt: skip
+        wire = Wire()
+        wire.device.faults.product_id = product_id
+        with pytest.raises(DeviceRefused, match=why):
+            run_transfer_script(probe(SpiDeviceOptions()), wire.transfer)
 
 
 @pytest.mark.parametrize("variant", REGISTER_VARIANTS)
@@ -311,14 +312,3 @@ def test_kind_of_burst_wherever_it_reads_back(
         assert words["burst"] == burst
         assert wire.device.extended == (burst == "extended")
     assert wire.device.window == 0
-
-
-@pytest.mark.parametrize(
-    ("product_id", "why"),
-    [(b"\xff" * 8, "received only 0xFF"), (b"\x00" * 8, "received only 0x00"), (b"\x00\x00IMU61C", "SPI mode")],
-)
-def test_another_id_is_refused(product_id: bytes, why: str) -> None:
-    wire = Wire()
-    wire.device.faults.product_id = product_id
-    with pytest.raises(DeviceRefused, match=why):
-        run_transfer_script(probe(SpiDeviceOptions()), wire.transfer)

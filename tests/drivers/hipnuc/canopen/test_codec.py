@@ -154,7 +154,7 @@ def test_heartbeats_are_news_when_the_state_changes_or_is_not_operational() -> N
 
 
 @pytest.mark.manual("B 5.4.2 SYNC", "B 5.1 defaults")
-def test_filters_sync_and_names_of_the_row() -> None:
+def test_filters_sync_nodes_and_options_of_the_row() -> None:
     filters = DRIVER.filters(HipnucCanopenOptions(node=1))
     taken = [can_id for can_id in range(0x800) if any(wanted.matches(can_id, False) for wanted in filters)]
     assert taken == [0x081, 0x181, 0x281, 0x381, 0x481, 0x581, 0x681, 0x701, 0x781]
@@ -163,26 +163,15 @@ def test_filters_sync_and_names_of_the_row() -> None:
     assert DRIVER.cyclic(HipnucCanopenOptions(sync_hz=0.01)) == [CyclicFrame(0x80, False, b"", 100_000_000_000)]
     assert DRIVER.node_settings(12) == HipnucCanopenOptions(node=12)
     assert DRIVER.node_title(12) == "node 12"
-
-
-@pytest.mark.parametrize(
-    ("can_id", "size", "node"),
-    [
+    for can_id, size, node in (
         (0x188, 6, 8), (0x1FF, 6, 127), (0x180, 6, None), (0x188, 8, None), (0x688, 4, 8), (0x788, 8, 8),
         (0x588, 8, None),
-    ],
-)  # fmt: skip
-def test_identifier_and_length_identify_the_node(can_id: int, size: int, node: int | None) -> None:
-    assert DRIVER.node_of(can_id, False, bytes(size)) == node
-    assert DRIVER.node_of(can_id, True, bytes(size)) is None
-
-
-@pytest.mark.parametrize(
-    "bad", [{"node": 0}, {"node": 128}, {"tpdos": [5]}, {"tpdos": "all"}, {"sync_hz": 201}, {"sync_hz": 5e-324}]
-)
-def test_settings_that_it_cannot_have(bad: dict[str, object]) -> None:
-    with pytest.raises(msgspec.ValidationError):
-        make(**bad)
+    ):  # fmt: skip
+        assert DRIVER.node_of(can_id, False, bytes(size)) == node
+        assert DRIVER.node_of(can_id, True, bytes(size)) is None
+    for bad in ({"node": 0}, {"node": 128}, {"tpdos": [5]}, {"tpdos": "all"}, {"sync_hz": 201}, {"sync_hz": 5e-324}):
+        with pytest.raises(msgspec.ValidationError):
+            make(**bad)
 
 
 SIZES = {0x188: 6, 0x288: 6, 0x388: 6, 0x488: 8, 0x688: 4, 0x788: 8}

@@ -43,16 +43,12 @@ def dictionary() -> canopen.ObjectDictionary:
     od = canopen.ObjectDictionary()  # type: ignore[no-untyped-call]  # the library has it so
     od.bitrate = 500_000
     for index, name, kind in (
-        (0x1000, "device type", datatypes.UNSIGNED32),
-        (0x1008, "device name", datatypes.VISIBLE_STRING),
-        (0x1017, "heartbeat time", datatypes.UNSIGNED16),
-        (0x2000, "control", datatypes.UNSIGNED32),
-        (0x209A, "bit rate", datatypes.UNSIGNED32),
-        (0x209E, "sign x", datatypes.UNSIGNED32),
-        (0x209F, "sign y", datatypes.UNSIGNED32),
-        (0x20A0, "node", datatypes.UNSIGNED32),
+        (0x1000, "device type", datatypes.UNSIGNED32), (0x1008, "device name", datatypes.VISIBLE_STRING),
+        (0x1017, "heartbeat time", datatypes.UNSIGNED16), (0x2000, "control", datatypes.UNSIGNED32),
+        (0x209A, "bit rate", datatypes.UNSIGNED32), (0x209E, "sign x", datatypes.UNSIGNED32),
+        (0x209F, "sign y", datatypes.UNSIGNED32), (0x20A0, "node", datatypes.UNSIGNED32),
         (0x20A5, "zero", datatypes.UNSIGNED32),
-    ):
+    ):  # fmt: skip
         od.add_object(variable(name, index, 0, kind))
     identity = ODRecord("identity", 0x1018)
     for sub in range(1, 5):

@@ -127,9 +127,8 @@ def test_packing_gives_the_golden_messages_and_clips_them() -> None:
     assert messages.pack_utc(2025, 3, 14, 15 * 3600 + 9 * 60 + 26.535).hex() == "19030e0f091a1702"
 
 
-@pytest.mark.parametrize(
-    ("pgn", "data", "field"),
-    [
+def test_absent_is_not_zero_and_one_negative_count_is_a_value() -> None:
+    for pgn, data, field in (
         (0xFF34, NONE, "accel_m_s2"), (0xFF37, NONE, "gyro_rad_s"), (0xFF3A, NONE, "mag_t"),
         (0xFF3A, bytes(8), "mag_t"), (0xFF3D, bytes.fromhex("ffffff7fffffff7f"), "euler_rad"),
         (0xFF3D, bytes.fromhex("0000008000000080"), "euler_rad"), (0xFF41, NONE, "euler_rad"),
@@ -139,13 +138,8 @@ def test_packing_gives_the_golden_messages_and_clips_them() -> None:
         (0xFF43, bytes(8), "pressure_pa"), (0xFF43, bytes.fromhex("ff7f000000000000"), "temperature_c"),
         (0xFF46, NONE, "quat_wxyz"), (0xFF46, bytes(8), "quat_wxyz"),
         (0xFF46, bytes.fromhex("ff7f000000000000"), "quat_wxyz"),
-    ],
-)  # fmt: skip
-def test_absent_is_not_zero(pgn: int, data: bytes, field: str) -> None:
-    assert getattr(messages.measurement_of([(pgn, data)]), field) is None
-
-
-def test_one_negative_count_is_a_value() -> None:
+    ):  # fmt: skip
+        assert getattr(messages.measurement_of([(pgn, data)]), field) is None
     assert measured(0xFF37, "ffffffffffff0000").gyro_rad_s == pytest.approx((-0.00106526,) * 3, abs=1e-8)
     assert measured(0xFF34, "ffffffffffff0000").accel_m_s2 == pytest.approx((-0.00478514,) * 3, abs=1e-8)
     assert measured(0xFF3D, "ffffffff00000000").euler_rad == pytest.approx((-1.74532925e-5, 0, math.nan), nan_ok=True)
@@ -266,7 +260,7 @@ def test_samples_of_several_modules_slow_messages_and_loss() -> None:
         assert codec.ledger.frames_ignored == codec.ledger.lost() == 0
 
 
-def test_which_frames_count() -> None:
+def test_which_frames_count_and_options_that_mean_nothing() -> None:
     codec = make()
     assert codec.feed_frame(0x0CFF3408, True, b"\1\2\3", 0) == (BadFrame(BadReason.LENGTH, b"\1\2\3", 0x0CFF3408),)
     skipped = [(0x0CFF3508, True), (0x0CFF3409, True), (0x0CEF0855, True), (0x0DFF3408, True), (0x0CFF3408, False)]
@@ -301,9 +295,7 @@ def test_which_frames_count() -> None:
         assert DRIVER.node_of(can_id, extended, bytes(size)) is None
     assert DRIVER.node_settings(5) == HipnucJ1939Options(address=5)
     assert DRIVER.node_title(5) == "address 5"
-
-
-@pytest.mark.parametrize("options", [{"address": 254}, {"pgns": []}, {"pgns": ["FF2F"]}, {"pgns": "all"}, {"node": 8}])
-def test_options_that_mean_nothing(options: dict[str, object]) -> None:
-    with pytest.raises(msgspec.ValidationError):
-        make(**options)
+    empty: dict[str, object] = {"pgns": []}
+    for wrong in ({"address": 254}, empty, {"pgns": ["FF2F"]}, {"pgns": "all"}, {"node": 8}):
+        with pytest.raises(msgspec.ValidationError):
+            make(**wrong)

@@ -93,19 +93,17 @@ def test_every_row_of_the_manual(name: str, arguments: dict[str, object], data: 
 @pytest.mark.parametrize(
     ("script", "timeouts_ms"),
     [
-        (session.identify(PEER), [500]),
-        (session.save(PEER), [2500]),
-        (session.factory_reset(PEER), [2500]),
+        (session.identify(PEER), [500]), (session.save(PEER), [2500]), (session.factory_reset(PEER), [2500]),
         (session.read_values(PEER, [1, 2, 3]), [250, 250]),
         (session.change_address(HipnucJ1939Options(), 9), [1100, 500, 500, 500, 500]),
         (session.restart(HipnucJ1939Options(), 500_000), [250, 250, 3000, 1100]),
     ],
-)
+)  # fmt: skip
 def test_timeouts_without_replies(script: RequestScript[object], timeouts_ms: list[float]) -> None:
     assert [*unanswered_ms(script)] == timeouts_ms
 
 
-def test_missing_replies_and_unchanged_values_are_reported() -> None:
+def test_missing_replies_unchanged_values_resets_and_rejected_arguments_are_reported() -> None:
     with pytest.raises(Rejected, match="restart: the device rejected the request"):
         J1939Bench(variant=J1939Variant(refuses=frozenset({session.CONTROL}))).act("restart")
     begins: list[Callable[[], RequestScript[object]]] = [
@@ -127,31 +125,30 @@ def test_missing_replies_and_unchanged_values_are_reported() -> None:
     reply = bytes.fromhex("3701060064000000")
     with pytest.raises(Rejected, match="expected 50 after the write, got 100"):
         played(session.set_interval(PEER, 0xFF37, 50), reply, bytes.fromhex("3701030064000000"))
-
-
-@pytest.mark.parametrize(
-    ("variant", "result"),
-    [
+    for variant, result in (
         ("factory reset restarts", "restored, at address 8"),
         ("real", "restored; the device has address 8 after the next restart at the latest"),
-    ],
-)
-def test_a_factory_reset_follows_the_device_to_address_8(variant: str, result: str) -> None:
-    bench = J1939Bench(J1939Settings(address=9), variant=J1939_VARIANTS[variant])
-    assert bench.act("factory_reset") == result
+    ):
+        bench = J1939Bench(J1939Settings(address=9), variant=J1939_VARIANTS[variant])
+        assert bench.act("factory_reset") == result
+    for name, arguments in (
+        ("interval", {"pgn": "FF34", "interval_ms": 4}), ("interval", {"pgn": "FF34", "interval_ms": 1001}),
+        ("interval", {"pgn": "FF35", "interval_ms": 10}), ("bitrate", {"bitrate": 100_000}),
+        ("address", {"address": 0}), ("address", {"address": 129}), ("direction", {"axis": "Z", "reversed": True}),
+        ("zero", {"zero": "there"}), ("send_once", {"pgn": "FF35"}),
+    ):  # fmt: skip
+        with pytest.raises(BadArgument, match=r"expected (a|one of)"):
+            script_of(DRIVER, J1939Bench().target(), name, arguments)
 
 
 @pytest.mark.parametrize("status", [1, 0x5A, 0xFF])
 def test_a_reply_with_a_status_is_a_rejection(status: int) -> None:
     """Byte 3 of the reply, in writes and in reads."""
     for begin, head in (
-        (session.save(PEER), "000006"),
-        (session.zero(PEER, Zero.HERE), "A50006"),
-        (session.set_interval(PEER, 0xFF34, 10), "340106"),
-        (session.send_once(PEER, 0xFF34), "960006"),
-        (session.factory_reset(PEER), "000006"),
-        (session.read(PEER, 0x009C), "9C0003"),
-    ):
+        (session.save(PEER), "000006"), (session.zero(PEER, Zero.HERE), "A50006"),
+        (session.set_interval(PEER, 0xFF34, 10), "340106"), (session.send_once(PEER, 0xFF34), "960006"),
+        (session.factory_reset(PEER), "000006"), (session.read(PEER, 0x009C), "9C0003"),
+    ):  # fmt: skip
         request = next(begin)
         reply = ReplyFrame(0x0CEF5508, bytes.fromhex(head) + bytes([status]) + bytes(4))
         assert request.is_rejection(reply)
@@ -182,20 +179,6 @@ def test_which_frames_answer_a_request() -> None:
     talk.start(next(session.read(PEER, Y_SIGN)), 3)
     assert talk.on_time(3 + session.REPLY_TIMEOUT_NS - 1) is None
     assert isinstance(talk.on_time(3 + session.REPLY_TIMEOUT_NS), Silence)
-
-
-@pytest.mark.parametrize(
-    ("name", "arguments"),
-    [
-        ("interval", {"pgn": "FF34", "interval_ms": 4}), ("interval", {"pgn": "FF34", "interval_ms": 1001}),
-        ("interval", {"pgn": "FF35", "interval_ms": 10}), ("bitrate", {"bitrate": 100_000}),
-        ("address", {"address": 0}), ("address", {"address": 129}), ("direction", {"axis": "Z", "reversed": True}),
-        ("zero", {"zero": "there"}), ("send_once", {"pgn": "FF35"}),
-    ],
-)  # fmt: skip
-def test_arguments_are_checked_before_anything_is_sent(name: str, arguments: dict[str, object]) -> None:
-    with pytest.raises(BadArgument, match=r"expected (a|one of)"):
-        script_of(DRIVER, J1939Bench().target(), name, arguments)
 
 
 @pytest.mark.parametrize(

@@ -10,14 +10,8 @@ from imud.contracts.codec import BadFrame, BadReason, Vanished
 from imud.contracts.script import Transfer, run_transfer_script
 from imud.contracts.setting import words_of
 from imud.drivers.hipnuc.common import QUAT_PER_LSB
-from imud.drivers.hipnuc.modbus.codec import (
-    READ_BLOCK,
-    READ_SERIAL,
-    READ_SHORT_BLOCK,
-    HipnucModbusCodec,
-    HipnucModbusOptions,
-    pack_block,
-)
+from imud.drivers.hipnuc.modbus import codec as modbus
+from imud.drivers.hipnuc.modbus.codec import READ_BLOCK, HipnucModbusCodec, HipnucModbusOptions
 from imud.drivers.hipnuc.modbus.commands import probe, read_settings
 from imud.drivers.hipnuc.modbus.driver import DRIVER
 from imud.drivers.hipnuc.modbus.registers import QUAT_OLD_PER_LSB, registers_reply
@@ -57,7 +51,7 @@ def block(
     incli: tuple[int, int] = (0, 0), pitch_deg: float = 0.0, uptime_ms: int = 5,
     mag_t: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> bytes:  # fmt: skip
-    data = pack_block(
+    data = modbus.pack_block(
         accel_m_s2=(0, 0, 9.8), gyro_rad_s=(0, 0, 0), mag_t=mag_t, euler_rad=(0, radians(pitch_deg), 0),
         quat_wxyz=quat, temperature_c=0, pressure_pa=0, uptime_ms=uptime_ms, incli_counts=incli, quat_per_lsb=per_lsb,
     )  # fmt: skip
@@ -96,7 +90,7 @@ def test_identity_sensors_and_the_block_of_newer_firmware() -> None:
     values: dict[str, Any] = {name: getattr(m, name) for name in ("accel_m_s2", "gyro_rad_s", "mag_t", "euler_rad")}
     values |= {"quat_wxyz": m.quat_wxyz, "quat_per_lsb": QUAT_OLD_PER_LSB, "temperature_c": 0, "pressure_pa": 0}
     incli = struct.unpack(">2h", SENSORS[-6:-2])
-    assert pack_block(uptime_ms=None, incli_counts=incli, **values) == SENSORS[3:-2]
+    assert modbus.pack_block(uptime_ms=None, incli_counts=incli, **values) == SENSORS[3:-2]
     words = "0000 0000 0800 0000 0000 0000 0000 0000 0000" + "0000 0000" * 3 + "09D0 009A9C14" + "2710 0000 0000 0000"
     m = measured(codec(), framed(1, registers_reply(bytes.fromhex(words + "0000 0000 0001 2345"))))
     assert (m.size_bytes, m.dev_ticks) == (57, 74_565)
@@ -114,15 +108,13 @@ def test_identity_sensors_and_the_block_of_newer_firmware() -> None:
     assert (DRIVER.targets[0], sorted(DRIVER.targets)) == (0x50, list(range(1, 248)))
 
 
-@pytest.mark.parametrize(
-    ("counts", "pressure_pa"), [(0, None), (99_900, None), (100_000, 1_000), (12_000_000, 120_000), (12_000_001, None)]
-)
-def test_a_device_without_barometer_has_no_pressure(counts: int, pressure_pa: float | None) -> None:
+def test_a_device_without_barometer_has_no_pressure() -> None:
     """99,900 counts of 0.01 Pa are the placeholder 999 in Pa."""
-    words = "0000" * 9 + "0000 0000" * 3 + "09D0" + counts.to_bytes(4, "big").hex() + "2710 0000 0000 0000"
-    m = measured(codec(), framed(1, registers_reply(bytes.fromhex(words + "0000 0000 0001 2345"))))
-    assert m.temperature_c == pytest.approx(25.12)
-    assert m.pressure_pa == pressure_pa
+    for counts, pressure_pa in ((0, None), (99_900, None), (100_000, 1_000), (12_000_000, 120_000), (12_000_001, None)):
+        words = "0000" * 9 + "0000 0000" * 3 + "09D0" + counts.to_bytes(4, "big").hex() + "2710 0000 0000 0000"
+        m = measured(codec(), framed(1, registers_reply(bytes.fromhex(words + "0000 0000 0001 2345"))))
+        assert m.temperature_c == pytest.approx(25.12)
+        assert m.pressure_pa == pressure_pa
 
 
 def test_the_short_block_is_read_from_older_firmware() -> None:
@@ -130,9 +122,9 @@ def test_the_short_block_is_read_from_older_firmware() -> None:
     assert made.polls[0].transfer == READ_BLOCK
     (event,) = made.decode(0, EXCEPTION)
     assert isinstance(event, Vanished)
-    assert made.polls[0].transfer == READ_SHORT_BLOCK
+    assert made.polls[0].transfer == modbus.READ_SHORT_BLOCK
     made.reset()
-    assert made.polls[0].transfer == READ_SHORT_BLOCK
+    assert made.polls[0].transfer == modbus.READ_SHORT_BLOCK
     assert measured(made, SENSORS)
     assert made.decode(0, SENSORS) == ()
     assert made.stale == 1
@@ -145,7 +137,7 @@ def test_the_short_block_is_read_from_older_firmware() -> None:
     (event,) = made.on_silence(0)
     assert isinstance(event, Vanished)
     made.reset()
-    assert made.polls[0].transfer == READ_SHORT_BLOCK
+    assert made.polls[0].transfer == modbus.READ_SHORT_BLOCK
     assert [made.on_silence(0) for _ in range(5)] == [()] * 5
     made.reset()
     assert made.polls[0].transfer == READ_BLOCK
@@ -162,25 +154,25 @@ def test_the_short_block_is_read_from_older_firmware() -> None:
     made.reset()
     first, second = (framed(9, registers_reply(bytes([n] * 8))) for n in (1, 2))
     made.decode(1, first)
-    assert made.polls[0].transfer == READ_SHORT_BLOCK
+    assert made.polls[0].transfer == modbus.READ_SHORT_BLOCK
     (event,) = made.decode(1, second)
     assert isinstance(event, Vanished)
     made.reset()
     assert made.polls[0].transfer == READ_BLOCK
 
 
-@pytest.mark.parametrize("code", [1, 3, 4, 6, 0x0A])
-def test_any_exception_to_the_first_reading_leads_to_the_block_of_the_manual(code: int) -> None:
-    made = codec()
-    (event,) = made.decode(0, framed(0x50, bytes([0x83, code])))
-    assert isinstance(event, Vanished)
-    assert "up to 0x4B" in event.why
-    made.reset()
-    assert made.polls[0].transfer == READ_SHORT_BLOCK
-    assert measured(made, SENSORS).dev_ticks is None
-    made.reset()  # identified again: the device may have been busy before
-    assert made.polls[0].transfer == READ_BLOCK
-    assert made.ledger.closes()
+def test_any_exception_to_the_first_reading_leads_to_the_block_of_the_manual() -> None:
+    for code in (1, 3, 4, 6, 0x0A):
+        made = codec()
+        (event,) = made.decode(0, framed(0x50, bytes([0x83, code])))
+        assert isinstance(event, Vanished)
+        assert "up to 0x4B" in event.why
+        made.reset()
+        assert made.polls[0].transfer == modbus.READ_SHORT_BLOCK
+        assert measured(made, SENSORS).dev_ticks is None
+        made.reset()  # identified again: the device may have been busy before
+        assert made.polls[0].transfer == READ_BLOCK
+        assert made.ledger.closes()
 
 
 @pytest.mark.parametrize("per_lsb", [QUAT_OLD_PER_LSB, QUAT_PER_LSB])
@@ -195,26 +187,20 @@ def test_scale_of_the_quaternion_is_decided_once(per_lsb: float) -> None:
         made.reset()
 
 
-@pytest.mark.parametrize(
-    ("incli", "pitch_deg", "degrees_read"),
-    [
+@pytest.mark.manual("B 4.2 inclinometer")
+def test_axes_of_the_inclinometer_are_found_kept_or_configured() -> None:
+    for incli, pitch_deg, degrees_read in (
         ((0, 0), 20.0, None),  # a product without inclinometer
         ((1584, 6018), 33.0, (8.7012, 33.0579)),  # two axes, as in the manual
         ((-16384, 0), 0.0, (-90.0, 0.0)),  # one axis has no negative angle
         ((16384, 0), 5.0, (180.0, 0.0)),  # Y would be 5 degrees with two axes
         ((16384, 0), 0.2, None),  # undecided while the device is level
-    ],
-)
-@pytest.mark.manual("B 4.2 inclinometer")
-def test_axes_of_the_inclinometer(
-    incli: tuple[int, int], pitch_deg: float, degrees_read: tuple[float, float] | None
-) -> None:
-    m = measured(codec(), block(incli=incli, pitch_deg=pitch_deg))
-    assert m.incli_rad == (None if degrees_read is None else pytest.approx(tuple(map(radians, degrees_read)), abs=1e-6))
-
-
-def test_axes_of_the_inclinometer_are_kept_or_configured() -> None:
-    """MAIN_STATUS, register 0x09: bits 3 and 9 are 0x0208."""
+    ):
+        m = measured(codec(), block(incli=incli, pitch_deg=pitch_deg))
+        assert m.incli_rad == (
+            None if degrees_read is None else pytest.approx(tuple(map(radians, degrees_read)), abs=1e-6)
+        )
+    # MAIN_STATUS, register 0x09: bits 3 and 9 are 0x0208
     made = codec()
     measured(made, block(incli=(-100, 1)))
     assert measured(made, block(incli=(16384, 0), pitch_deg=5, uptime_ms=6)).incli_rad == (radians(90), 0)
@@ -241,7 +227,7 @@ def test_axes_of_the_inclinometer_are_kept_or_configured() -> None:
 def test_identity_is_watched_and_settings_are_read() -> None:
     made = codec()
     first, second = (framed(9, registers_reply(bytes([n] * 8))) for n in (1, 2))
-    assert made.polls[1].transfer == READ_SERIAL
+    assert made.polls[1].transfer == modbus.READ_SERIAL
     assert made.decode(1, first) == made.decode(1, first) == ()
     assert made.decode(1, EXCEPTION) == made.decode(1, first[:-1] + b"\x00") == made.decode(1, b"") == ()
     (event,) = made.decode(1, second)

@@ -147,7 +147,7 @@ def test_hand_made_hi92() -> None:
 
 
 @pytest.mark.manual("B 3.1 sub-packets")
-def test_the_word_and_sub_packets() -> None:
+def test_the_word_that_a_version_or_the_configuration_selects_and_sub_packets() -> None:
     codec = make()
     frame = hi91(word_1_2=0x0208)
     assert one(codec.feed(frame)).pps_age_ms == 0x0208
@@ -172,30 +172,23 @@ def test_the_word_and_sub_packets() -> None:
     assert codec.feed(framed(b"\x77" + MANUAL_HI91[6:])) == []
     assert (codec.ledger.unknown_tags, codec.ledger.frames_ignored, codec.ledger.frames_bad()) == (1, 1, 0)
     assert codec.ledger.closes()
+    for word, version in (("pps", "200"), ("status", "100")):
+        codec = make(hi91_word=word)
+        DRIVER.apply_identity(codec, Identity(details={"APP_VER": version}))
+        for frame in (hi91(word_1_2=7), framed(hi91(word_1_2=7)[6:] + b"\x77")):
+            m = one(codec.feed(frame))
+            assert (m.status, m.pps_age_ms) == ((None, 7) if word == "pps" else (7, None))
 
 
-@pytest.mark.parametrize(("word", "version"), [("pps", "200"), ("status", "100")])
-def test_a_configured_word_stays(word: str, version: str) -> None:
-    codec = make(hi91_word=word)
-    DRIVER.apply_identity(codec, Identity(details={"APP_VER": version}))
-    for frame in (hi91(word_1_2=7), framed(hi91(word_1_2=7)[6:] + b"\x77")):
-        m = one(codec.feed(frame))
-        assert (m.status, m.pps_age_ms) == ((None, 7) if word == "pps" else (7, None))
-
-
-@pytest.mark.parametrize("length", [0, 513, 0xFFFF])
-@pytest.mark.manual("B 3.1 length")
-def test_an_impossible_length_costs_the_sync_word_only(length: int) -> None:
-    codec = make()
-    header = uart_codec.HEADER.pack(b"\x5a\xa5", length, 0)
-    events = codec.feed(header[:4] + MANUAL_HI91)
-    assert events[0] == BadFrame(BadReason.LENGTH, header[:4])
-    assert isinstance(events[1], Measurement)
-    assert codec.ledger.bytes_in_bad_frames == 4
-
-
-@pytest.mark.manual("B 3.4 CRC")
-def test_lengths_of_payloads_and_every_single_bit_error() -> None:
+@pytest.mark.manual("B 3.1 length", "B 3.4 CRC")
+def test_lengths_of_frames_and_payloads_and_every_single_bit_error() -> None:
+    for length in (0, 513, 0xFFFF):
+        codec = make()
+        header = uart_codec.HEADER.pack(b"\x5a\xa5", length, 0)
+        events = codec.feed(header[:4] + MANUAL_HI91)
+        assert events[0] == BadFrame(BadReason.LENGTH, header[:4])
+        assert isinstance(events[1], Measurement)
+        assert codec.ledger.bytes_in_bad_frames == 4
     for cut_off in (MANUAL_HI91[6:-1], HI92_PAYLOAD[:-1], HI92_PAYLOAD + b"\x91"):  # a sub-packet is incomplete
         codec, frame = make(), framed(cut_off)
         assert codec.feed(frame) == [BadFrame(BadReason.CONTENT, frame)]
@@ -418,13 +411,6 @@ def test_filler_bytes_are_no_values(
             assert (one_event.mag_t is None) == (field == "mag_t")
 
 
-def test_the_limit_of_the_time_since_a_pulse_is_a_value() -> None:
-    for data in (hi91(word_1_2=8192) * 2, uart_codec.encode_hi92(pps_stamp_ms=8192, **LEVEL)):
-        assert [m.pps_age_ms for m in make().feed(data) if isinstance(m, Measurement)] == [8192] * data.count(
-            b"\x5a\xa5"
-        )
-
-
 def test_damaged_frames_among_lines() -> None:
     codec = make()
     damaged = uart_codec.HEADER.pack(b"\x5a\xa5", 2, 0x1234)
@@ -468,6 +454,10 @@ def test_text_inside_a_damaged_frame_is_not_a_line(text: bytes, step: int) -> No
 
 
 @pytest.mark.manual("B 3.3.1 size", "B 3.3.2 size", "B 3.3.1 pps_sync_stamp")
-def test_sizes_and_the_pps_stamp_that_runs_free() -> None:
+def test_sizes_and_the_pps_stamp_that_runs_free_up_to_its_limit() -> None:
     assert (uart_codec.HI91.size, uart_codec.HI92.size) == (76, 48)
     assert (8190 + 10) % uart_codec.PPS_STAMP_MODULUS_MS == 8
+    for data in (hi91(word_1_2=8192) * 2, uart_codec.encode_hi92(pps_stamp_ms=8192, **LEVEL)):
+        assert [m.pps_age_ms for m in make().feed(data) if isinstance(m, Measurement)] == [8192] * data.count(
+            b"\x5a\xa5"
+        )

@@ -8,29 +8,14 @@ import pytest
 
 from imud import config
 from imud.config.schema import TABLES
+from imud.contracts import lines as contract
 from imud.contracts.command import Target
-from imud.contracts.lines import (
-    AlarmRange,
-    AlarmRanges,
-    DeviceLines,
-    DividedOptions,
-    InputOptions,
-    PpsOptions,
-    SoutOptions,
-    TriggerOptions,
-)
+from imud.contracts.lines import AlarmRange, DeviceLines, DividedOptions, InputOptions, SoutOptions
 from imud.contracts.setting import Effect, values_of, words_of
+from imud.drivers.hipnuc.uart import settings as uart_settings
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.drivers.hipnuc.uart.replies import parse_report
-from imud.drivers.hipnuc.uart.settings import (
-    SETTINGS,
-    alarm_ranges,
-    declared_line_differences,
-    line_differences,
-    message_limits,
-    report_values,
-    shown,
-)
+from imud.drivers.hipnuc.uart.settings import SETTINGS, alarm_ranges, report_values, shown
 from imud.model.errors import BadArgument, ConfigError
 from imud.sim.hipnuc.uart_settings import VARIANTS, AlarmSetting, Behaviour, ModuleSettings, Output
 from tests.support.simulated_modules import HipnucLine, hardware_of
@@ -74,7 +59,7 @@ def test_factory_settings_and_the_table() -> None:
     assert len(line.wait(200)) == pytest.approx(20, abs=2)
 
 
-def test_the_same_in_words_with_units() -> None:
+def test_the_same_in_words_with_units_and_lines_of_an_unknown_form_unchanged() -> None:
     settings = ModuleSettings(
         att_mode=1, hi91=Output(40), hi92=Output(on_mark=True), alarm_y=AlarmSetting(-5, 7.5, True), sout_div=4,
         urfr=(0.8, -0.6, 0, 0.6, 0.8, 0, 0, 0, 1),
@@ -99,32 +84,24 @@ def test_the_same_in_words_with_units() -> None:
         == "0, 0, 0 µT: not calibrated"
     )
 
-
-@pytest.mark.parametrize(
-    "raw",
-    [
+    for raw in (
         {},
         {"ATT_MODE": "7", "URFR": "1,2,3", "EN_MCAL": "x", "PMUX1": "IO0", "SOUT_DIV": "", "MB": "nan, 0, 0"},
         {"URFR": "1,0,0,0,1,0,0,0,inf", "BAUD": "123", "ALARM_X": "-5,5", "COMCONFIG 1": "LOG HI93 ONTIME 1"},
-    ],
-)
-def test_lines_of_an_unknown_form_are_shown_unchanged(raw: dict[str, str]) -> None:
-    assert report_values(raw) == {}
-    assert shown(raw) == raw
+    ):
+        assert report_values(raw) == {}
+        assert shown(raw) == raw
 
 
 CHANGES: list[tuple[str, Any, dict[str, Any]]] = [
-    ("mode", "9-axis", {"att_mode": 1}),
-    ("mounting", "x_up", {"urfr": (0, 0, -1, 0, 1, 0, 1, 0, 0)}),
+    ("mode", "9-axis", {"att_mode": 1}), ("mounting", "x_up", {"urfr": (0, 0, -1, 0, 1, 0, 1, 0, 0)}),
     ("mounting", [0.8, -0.6, 0, 0.6, 0.8, 0, 0, 0, 1], {"urfr": (0.8, -0.6, 0, 0.6, 0.8, 0, 0, 0, 1)}),
     ("magnetic_calibration", False, {"mag_calibration": False}),
-    ("pins", {"led": 3, "sout_div": 7}, {"pins": (1, 2, 3, 7, 9)}),
-    ("sout_divisor", 64, {"sout_div": 64}),
+    ("pins", {"led": 3, "sout_div": 7}, {"pins": (1, 2, 3, 7, 9)}), ("sout_divisor", 64, {"sout_div": 64}),
     ("alarm", {"y": {"min_deg": -5, "max_deg": 5}}, {"alarm_y": AlarmSetting(-5, 5, True)}),
     ("output", {"hi91": 0, "hi92": 8}, {"hi91": Output(), "hi92": Output(125)}),
-    ("output", {"hi91": "on_mark"}, {"hi91": Output(on_mark=True)}),
-    ("baud", 921600, {"baud": 921600}),
-]
+    ("output", {"hi91": "on_mark"}, {"hi91": Output(on_mark=True)}), ("baud", 921600, {"baud": 921600}),
+]  # fmt: skip
 
 
 IN_EVERY_VARIANT = ("mode", "baud")
@@ -155,44 +132,29 @@ def test_written_read_back_saved_and_kept_over_a_restart(
     assert {field: getattr(line.module.settings, field) for field in changed} == changed
 
 
-@pytest.mark.parametrize(
-    ("values", "words"),
-    [
+@pytest.mark.manual("B 2.2.4 PMUX")
+def test_combinations_are_accepted_or_rejected_and_a_declaration_is_checked_by_its_types() -> None:
+    for values, words in (
         ({"output": {"hi91": 200}}, "HI91: expected at most 100 Hz at 115200 baud, got 200 Hz"),
         ({"output": {"hi91": 100, "hi92": 100}}, "got 136000 bit/s by HI91 at 100 Hz and HI92 at 100 Hz"),
         ({"output": {"hi91": 100}, "baud": 9600}, "at most 10 Hz at 9600 baud"),
         ({"pins": {"sin": 2, "sout": 2}}, "pins: expected another pin for each function, got IO2 for sin and sout"),
         ({"alarm": {"x": {"min_deg": 5, "max_deg": 5}}}, "alarm.x: expected the minimum below the maximum"),
-    ],
-)
-@pytest.mark.manual("B 2.2.4 PMUX")
-def test_impossible_combinations_are_rejected(values: dict[str, Any], words: str) -> None:
-    with pytest.raises(BadArgument, match=words):
-        SETTINGS.check(Target(None, 115200), values)
-
-
-def test_possible_combinations_are_accepted() -> None:
-    for values in (
-        DELIVERED,
-        {"output": {"hi91": 1000}, "baud": 921600},
-        {"output": {"hi91": "on_mark", "hi92": 200}},
-        {"output": {"hi91": 100, "hi92": 50}},
-        {},
     ):
-        SETTINGS.check(Target(None, 115200), values)
-
-
-@pytest.mark.parametrize(
-    "given",
-    [
+        with pytest.raises(BadArgument, match=words):
+            SETTINGS.check(Target(None, 115200), values)
+    for accepted in (
+        DELIVERED, {"output": {"hi91": 1000}, "baud": 921600}, {"output": {"hi91": "on_mark", "hi92": 200}},
+        {"output": {"hi91": 100, "hi92": 50}}, {},
+    ):  # fmt: skip
+        SETTINGS.check(Target(None, 115200), accepted)
+    for given in (
         {"output": {"hi93": 1}}, {"output": {"hi91": 300}}, {"mode": "7-axis"}, {"mounting": "x+90"},
         {"pins": {"sin": 10}}, {"sout_divisor": 65}, {"alarm": {"z": {"min_deg": 0, "max_deg": 1}}},
         {"alarm": {"x": {"min_deg": -181, "max_deg": 1}}}, {"baud": 57600}, {"magnetometer_bias": [0, 0, 0]},
-    ],
-)  # fmt: skip
-def test_a_declaration_is_checked_by_its_types(given: dict[str, Any]) -> None:
-    with pytest.raises(msgspec.ValidationError):
-        msgspec.convert(given, SETTINGS.declarable)
+    ):  # fmt: skip
+        with pytest.raises(msgspec.ValidationError):
+            msgspec.convert(given, SETTINGS.declarable)
 
 
 def x(low_deg: float, high_deg: float, enabled: bool = True) -> dict[str, AlarmRange]:
@@ -206,13 +168,20 @@ def y(low_deg: float, high_deg: float, enabled: bool = True) -> dict[str, AlarmR
 
 
 @pytest.mark.manual("B 2.2.4 alarm range")
-def test_the_modules_own_lines_are_read() -> None:
+def test_the_alarm_is_read_from_the_modules_own_lines_and_from_other_forms() -> None:
     settings = ModuleSettings(alarm_x=AlarmSetting(-5, 5.5, False), alarm_y=AlarmSetting(-30.25, 12, True))
     report = parse_report([*settings.user_lines(), "OK"]).values
     assert DRIVER.alarm_ranges is not None
-    assert DRIVER.alarm_ranges(report_values(report)) == AlarmRanges(
+    assert DRIVER.alarm_ranges(report_values(report)) == contract.AlarmRanges(
         {**x(-5, 5.5, False), **y(-30.25, 12)}, "PMUX5", "URFR"
     )
+    for name, value, expected in (
+        ("PMUX5", "Y,-5,5,0,1", y(-5, 5)), ("ALARM X", " +1.5 , 2 , 0 , 0 ", x(1.5, 2, False)),
+        ("pmux5_y", "-5,5,0,1", y(-5, 5)), ("IO_ALARM", "x,-5,5,0,1", x(-5, 5)), ("PMUX5", "IO9", {}),
+        ("PMUX5", "-5,5,0,1", {}),  # the axis is missing
+        ("ALARM_X", "-5,5,0,2", {}), ("ALARM_X", "-5,5,1", {}), ("URFR", "1,0,0,0,1,0,0,0,1", {}),
+    ):  # fmt: skip
+        assert alarm_ranges(report_values({name: value})).by_axis == expected
 
 
 @pytest.mark.parametrize(
@@ -233,23 +202,10 @@ def test_coordinates_select_axes_and_the_angles_of_the_alarm(line: str, value: s
     assert (by_axis["X"].euler_index, by_axis["Y"].euler_index) == ((0, 1) if value == "4" else (1, 0))
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "expected"),
-    [
-        ("PMUX5", "Y,-5,5,0,1", y(-5, 5)), ("ALARM X", " +1.5 , 2 , 0 , 0 ", x(1.5, 2, False)),
-        ("pmux5_y", "-5,5,0,1", y(-5, 5)), ("IO_ALARM", "x,-5,5,0,1", x(-5, 5)), ("PMUX5", "IO9", {}),
-        ("PMUX5", "-5,5,0,1", {}),  # the axis is missing
-        ("ALARM_X", "-5,5,0,2", {}), ("ALARM_X", "-5,5,1", {}), ("URFR", "1,0,0,0,1,0,0,0,1", {}),
-    ],
-)  # fmt: skip
-def test_other_forms(name: str, value: str, expected: dict[str, AlarmRange]) -> None:
-    assert alarm_ranges(report_values({name: value})).by_axis == expected
-
-
 SOUT = DeviceLines(sout=SoutOptions(line="A"))
 DIVIDED = DeviceLines(sout_div=DividedOptions(line="B", divisor=4))
-SIN = DeviceLines(sin=TriggerOptions(line="C", rate_hz=200))
-PPS = DeviceLines(pps=PpsOptions(line="D"))
+SIN = DeviceLines(sin=contract.TriggerOptions(line="C", rate_hz=200))
+PPS = DeviceLines(pps=contract.PpsOptions(line="D"))
 ALARM = DeviceLines(alarm=InputOptions(line="E"))
 MARKED = Output(on_mark=True)
 
@@ -278,15 +234,12 @@ MARKED = Output(on_mark=True)
 def test_contradictions_of_the_device_are_found(
     lines: DeviceLines, settings: ModuleSettings, found: dict[str, str]
 ) -> None:
-    differences = line_differences(values_of(HipnucLine(settings).run(SETTINGS.read(Target(None, 0), None))), lines)
+    differences = uart_settings.line_differences(
+        values_of(HipnucLine(settings).run(SETTINGS.read(Target(None, 0), None))), lines
+    )
     assert differences.keys() == found.keys()
     for key, words in found.items():
         assert words in differences[key]
-
-
-@pytest.mark.parametrize("lines", [SOUT, DIVIDED, SIN, PPS, ALARM])
-def test_unreported_settings_are_not_compared(lines: DeviceLines) -> None:
-    assert line_differences({"mode": "6-axis"}, lines) == {}
 
 
 @pytest.mark.parametrize(
@@ -304,19 +257,21 @@ def test_unreported_settings_are_not_compared(lines: DeviceLines) -> None:
 def test_contradictions_of_declared_settings_are_found(
     lines: DeviceLines, declared: dict[str, object], found: dict[str, str]
 ) -> None:
-    differences = declared_line_differences(declared, lines)
+    differences = uart_settings.declared_line_differences(declared, lines)
     assert differences.keys() == found.keys()
     for key, words in found.items():
         assert words in differences[key]
 
 
-def test_check_refuses_a_line_that_declared_settings_contradict() -> None:
+def test_check_refuses_a_line_that_declared_settings_contradict_but_compares_no_unreported_settings() -> None:
     text = (
         "devices:\n  bow:\n    driver: hipnuc-uart\n    uart: {port: /dev/ttyUSB0, baud: 921600}\n"
         "    lines: {sin: {line: GPIO1, rate_hz: 10}}\n    settings: {output: {hi91: 0, hi92: on_mark}}\n"
     )
     with pytest.raises(ConfigError, match=r"f:5:\d+: devices\.bow\.lines\.sin: .*HI92 on mark has no device time"):
         config.parse(text, "f", TABLES)
+    for lines in (SOUT, DIVIDED, SIN, PPS, ALARM):
+        assert uart_settings.line_differences({"mode": "6-axis"}, lines) == {}
 
 
 @pytest.mark.parametrize(
@@ -326,7 +281,7 @@ def test_check_refuses_a_line_that_declared_settings_contradict() -> None:
         ({"output": {"hi91": 100, "hi92": 0}}, DeviceLines(), True, []),
         ({"output": {"hi92": 100}}, DeviceLines(), False, []),
         ({"output": {"hi92": 100}}, DeviceLines(), True, ["HI92 has no UTC"]),
-        ({"output": {"hi92": 100}}, DeviceLines(pps=PpsOptions(line="GPIO1")), False, ["HI92 has no UTC"]),
+        ({"output": {"hi92": 100}}, DeviceLines(pps=contract.PpsOptions(line="GPIO1")), False, ["HI92 has no UTC"]),
         (
             {"output": {"hi91": 50, "hi92": 50}}, DeviceLines(), False,
             ["HI92 next to HI91 is time-stamped by its arrival"],
@@ -336,6 +291,6 @@ def test_check_refuses_a_line_that_declared_settings_contradict() -> None:
 def test_limits_of_hi92_are_reported(
     declared: dict[str, object], lines: DeviceLines, fed: bool, found: list[str]
 ) -> None:
-    limits = message_limits(declared, lines, fed)
+    limits = uart_settings.message_limits(declared, lines, fed)
     assert len(limits) == len(found)
     assert all(limit.startswith(words) for limit, words in zip(limits, found, strict=True))

@@ -220,18 +220,6 @@ def test_frames_of_other_kinds_and_lengths() -> None:
             uart_codec.encode_frame(uart_codec.DEVICE_SYNC, 1, bytes(size))
 
 
-@pytest.mark.parametrize("length", [0, uart_codec.PAYLOAD_BYTES_MAX + 1, 0xFFFF])
-@pytest.mark.manual("A 1.2 ID and length")
-def test_a_length_above_the_maximum_is_rejected_immediately(length: int) -> None:
-    lie = b"\xaa\x55\x02\x00" + length.to_bytes(2, "little")
-    tested = codec()
-    bad, measurement = tested.feed(lie + GOLDEN)
-    assert bad == BadFrame(BadReason.LENGTH, lie)
-    assert isinstance(measurement, Measurement)
-    assert (tested.ledger.frames_bad_length, tested.ledger.bytes_in_bad_frames) == (1, len(lie))
-    assert tested.ledger.closes()
-
-
 def test_frames_inside_damaged_ones_and_false_lengths() -> None:
     damaged = GOLDEN[:20] + GOLDEN
     tested = codec()
@@ -282,8 +270,8 @@ def test_bytes_where_a_damaged_frame_claimed_to_be_are_its_in_any_split(end: byt
     assert whole.ledger.closes()
 
 
-@pytest.mark.manual("A 1.2 CRC")
-def test_short_frames_are_bad_and_every_single_bit_matters() -> None:
+@pytest.mark.manual("A 1.2 CRC", "A 1.2 ID and length")
+def test_short_and_overlong_frames_are_bad_and_every_single_bit_matters() -> None:
     for frame_id, size in ((2, 43), (0xFF, 21), (6, 23), (2, 5)):
         frame, tested = uart_codec.encode_frame(uart_codec.DEVICE_SYNC, frame_id, bytes(size)), codec()
         assert tested.feed(frame) == [BadFrame(BadReason.CONTENT, frame)]
@@ -297,6 +285,14 @@ def test_short_frames_are_bad_and_every_single_bit_matters() -> None:
             events = [*tested.feed(bytes(flipped)), *tested.feed(bytes(uart_codec.FRAME_BYTES_MAX))]
             assert not any(isinstance(event, Measurement) for event in events), (place, bit)
             assert tested.ledger.closes()
+    for length in (0, uart_codec.PAYLOAD_BYTES_MAX + 1, 0xFFFF):
+        lie = b"\xaa\x55\x02\x00" + length.to_bytes(2, "little")
+        tested = codec()
+        bad, measurement = tested.feed(lie + GOLDEN)
+        assert bad == BadFrame(BadReason.LENGTH, lie)
+        assert isinstance(measurement, Measurement)
+        assert (tested.ledger.frames_bad_length, tested.ledger.bytes_in_bad_frames) == (1, len(lie))
+        assert tested.ledger.closes()
 
 
 S1 = bytes.fromhex(
@@ -314,7 +310,7 @@ FULL = uart_codec.Status(
 
 
 @pytest.mark.manual("A 1.4 software version", "A 1.4 hardware version", "A 1.4 status members", "A 1.4 frame")
-def test_s1() -> None:
+def test_s1_and_other_messages() -> None:
     assert len(S1) == 0x42
     assert uart_codec.parse_status(ReplyFrame(0xFF, S1)) == FULL
     assert uart_codec.pack_status(FULL) == S1
@@ -324,6 +320,8 @@ def test_s1() -> None:
     (event,) = uart_codec.Imu61xCodec(Ledger()).feed(frame)
     assert isinstance(event, ReplyFrame)
     assert uart_codec.parse_status(event) == FULL
+    for message in (ReplyFrame(0xFF, S1[:21]), ReplyFrame(0xFE, S1), "S1", ReplyFrame(6, bytes(24))):
+        assert uart_codec.parse_status(message) is None
 
 
 @pytest.mark.parametrize("size", [uart_codec.STATUS_BYTES_MIN, 25, 26, 28, 30, 31, 32, 33, 34, 65, 66, 89])
@@ -342,13 +340,8 @@ def test_s1_of_any_length_contains_its_complete_members(size: int) -> None:
         assert uart_codec.pack_status(status) == S1[:size]
 
 
-@pytest.mark.parametrize("message", [ReplyFrame(0xFF, S1[:21]), ReplyFrame(0xFE, S1), "S1", ReplyFrame(6, bytes(24))])
-def test_messages_other_than_s1(message: ReplyFrame | str) -> None:
-    assert uart_codec.parse_status(message) is None
-
-
 @pytest.mark.manual("A 1.5 frame", "A 1.5 parameter 3", "A 1.7 K1")
-def test_p1_and_k1() -> None:
+def test_p1_k1_and_replies_by_id_and_length() -> None:
     """Parameter 3 = 921600 bit/s: 0x49610000 as a float."""
     payload = bytes.fromhex("00006149 00000000 03000000 00000000 00000000 00000000")
     assert uart_codec.parse_parameter(ReplyFrame(6, payload)) == uart_codec.ParameterValue(3, 921600.0)
@@ -362,11 +355,8 @@ def test_p1_and_k1() -> None:
     assert uart_codec.pack_acknowledgement(14, 5) == payload
     assert uart_codec.parse_acknowledgement(ReplyFrame(0x1234, payload + b"\x00")) is None
     assert uart_codec.parse_acknowledgement("K1") is None
-
-
-@pytest.mark.parametrize(
-    ("frame_id", "size", "wanted"),
-    [(0xFF, 22, True), (0xFF, 21, False), (6, 24, True), (6, 23, False), (9, 4, True), (2, 44, False), (9, 24, False)],
-)
-def test_replies_by_id_and_length(frame_id: int, size: int, wanted: bool) -> None:
-    assert uart_codec.is_reply(frame_id, bytes(size)) is wanted
+    for frame_id, size, wanted in (
+        (0xFF, 22, True), (0xFF, 21, False), (6, 24, True), (6, 23, False), (9, 4, True), (2, 44, False),
+        (9, 24, False),
+    ):  # fmt: skip
+        assert uart_codec.is_reply(frame_id, bytes(size)) is wanted
