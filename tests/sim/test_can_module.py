@@ -1,4 +1,4 @@
-"""Several simulated devices as one object, and their transfer to the kernel."""
+"""Several simulated devices as one object, their transfer to the kernel, and the frames of single devices."""
 
 import socket
 from collections.abc import Mapping
@@ -10,12 +10,15 @@ from imud.attitude.rotation import euler_zyx_from_quat
 from imud.contracts.codec import CodecEvent
 from imud.contracts.driver import CanDriver
 from imud.drivers import DRIVERS
-from imud.drivers.imu61x.can import DRIVER
+from imud.drivers.imu61x.can import DRIVER, Imu61xCanCodec, Imu61xCanOptions
 from imud.formats.can import RAW_FRAME
+from imud.formats.j1939 import split
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.sim import CAN_SIMULATORS
 from imud.sim.can_module import CanModules, FrameWire, SentFrame
+from imud.sim.hipnuc.nmea2000 import SIMULATOR, HipnucNmea2000Module
+from imud.sim.imu61x.can import Imu61xCanHardware, Imu61xCanModule
 from imud.sim.ports.can_port import CanPort
 from imud.sim.sensor import SimulatorOptions
 
@@ -93,21 +96,18 @@ def test_several_modules_are_one_and_are_told_apart() -> None:
         CAN_SIMULATORS["imu61x-can"].make(SimulatorOptions(node=2045), 0)
 
 
-@pytest.mark.parametrize("bitrate", [0, 500_000])
-def test_frames_of_one_instant_leave_together_where_there_is_no_bit_rate(bitrate: int) -> None:
-    wire = FrameWire(bitrate, 0)
-    for number in range(5):
-        wire.send(1000, number, False, bytes(8))
-    assert len(wire.sent(1000)) == (5 if bitrate == 0 else 0)
-    assert len(wire.sent(1000 + 5 * 240_000)) == (0 if bitrate == 0 else 5)
-
-
-@pytest.mark.parametrize(("extended", "bits"), [(False, 120), (True, 140)])
-def test_a_frame_takes_its_time(extended: bool, bits: int) -> None:
-    """47 or 67 bits around the data, 64 of data, some stuff bits."""
-    wire = FrameWire(500_000, 0)
-    wire.send(1000, 1, extended, bytes(8))
-    assert wire.next_ns() == 1000 + bits * 2000
+def test_a_frame_takes_its_time_and_frames_leave_together_where_there_is_no_bit_rate() -> None:
+    for bitrate in (0, 500_000):
+        wire = FrameWire(bitrate, 0)
+        for number in range(5):
+            wire.send(1000, number, False, bytes(8))
+        assert len(wire.sent(1000)) == (5 if bitrate == 0 else 0)
+        assert len(wire.sent(1000 + 5 * 240_000)) == (0 if bitrate == 0 else 5)
+    # 47 or 67 bits around the data, 64 of data, some stuff bits
+    for extended, bits in ((False, 120), (True, 140)):
+        wire = FrameWire(500_000, 0)
+        wire.send(1000, 1, extended, bytes(8))
+        assert wire.next_ns() == 1000 + bits * 2000
 
 
 IMPOSSIBLE: dict[str, list[dict[str, Any]]] = {
@@ -123,6 +123,15 @@ def test_impossible_options_are_refused(name: str) -> None:
     for options in IMPOSSIBLE[name]:
         with pytest.raises(ValueError, match=next(iter(options)).removesuffix("_hz")):
             CAN_SIMULATORS[name].make(SimulatorOptions(**options), 0)
+
+
+@pytest.mark.parametrize("name", CAN_SIMULATORS)
+def test_frames_of_a_sample_take_their_time_at_the_bit_rate(name: str) -> None:
+    module = CAN_SIMULATORS[name].make(SimulatorOptions(rate_hz=20.0, baud=250_000, boot_ms=0, noise="none"), BEGIN_NS)
+    frames = [frame for frame in module.advance(BEGIN_NS + 1000 * MS) if frame.sample_ns is not None]
+    first, second = (frame.due_ns for frame in frames[:2])
+    assert frames[0].sample_ns == frames[1].sample_ns
+    assert second - first == (140 if frames[0].extended else 120) * 4000
 
 
 BEGIN_NS: Final = 5_000_000_000
@@ -175,10 +184,42 @@ def test_values_are_the_truth_of_the_sample_instant(name: str) -> None:
     assert codec.ledger.lost() == 0
 
 
-@pytest.mark.parametrize("name", CAN_SIMULATORS)
-def test_frames_of_a_sample_take_their_time_at_the_bit_rate(name: str) -> None:
-    module = CAN_SIMULATORS[name].make(SimulatorOptions(rate_hz=20.0, baud=250_000, boot_ms=0, noise="none"), BEGIN_NS)
-    frames = [frame for frame in module.advance(BEGIN_NS + 1000 * MS) if frame.sample_ns is not None]
-    first, second = (frame.due_ns for frame in frames[:2])
-    assert frames[0].sample_ns == frames[1].sample_ns
-    assert second - first == (140 if frames[0].extended else 120) * 4000
+SECOND_NS = 1_000_000_000
+
+
+def made(**options: object) -> HipnucNmea2000Module:
+    given = {"rate_hz": 20.0, "noise": "none", "boot_ms": 0, **options}
+    module = SIMULATOR.make(SimulatorOptions(**given), BEGIN_NS)  # type: ignore[arg-type]  # a mapping of options
+    assert isinstance(module, HipnucNmea2000Module)
+    return module
+
+
+@pytest.mark.parametrize(
+    ("message", "pgns"), [("", [127250, 127251, 127257]), ("heading", [127250]), ("attitude", [127257])]
+)
+def test_what_it_sends(message: str, pgns: list[int]) -> None:
+    module = made(message=message, node=5)
+    frames = module.advance(BEGIN_NS + 20 * SECOND_NS)
+    assert [split(f.can_id).pgn for f in frames[: len(pgns)]] == pgns
+    assert {split(f.can_id).source for f in frames} == {5}
+    sids = [f.data[0] for f in frames[:: len(pgns)]]
+    assert sids[250:255] == [250, 251, 252, 0, 1]
+    assert all(f.data[0] == sids[n // len(pgns)] for n, f in enumerate(frames))
+    module.reboot(BEGIN_NS + 20 * SECOND_NS)
+    due_ns = module.next_ns()
+    assert due_ns is not None
+    assert module.advance(due_ns)[0].data[0] == 0
+
+
+def indices(frames: list[SentFrame]) -> list[int | None]:
+    codec = Imu61xCanCodec(Ledger(), Imu61xCanOptions())
+    events = [event for f in frames for event in codec.feed_frame(f.can_id, f.extended, f.data, f.due_ns)]
+    return [event.dev_ticks for event in events if isinstance(event, Measurement)]
+
+
+def test_the_index_has_16_bits_and_starts_again_after_a_restart() -> None:
+    module = Imu61xCanModule(BEGIN_NS, Imu61xCanHardware(boot_ms=0, index=65530))
+    found = indices(module.advance(BEGIN_NS + SECOND_NS))
+    assert found[:8] == [65530, 65531, 65532, 65533, 65534, 65535, 0, 1]
+    module.reboot(BEGIN_NS + SECOND_NS)
+    assert indices(module.advance(BEGIN_NS + SECOND_NS + SECOND_NS // 10))[0] == 0

@@ -154,10 +154,8 @@ def test_signals_end_it_well(start: Start, number: signal.Signals) -> None:
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["--rate", "300"], "rate 300"),
-        (["--faults", "flop=1"], "flop"),
-        (["--variant", "odd"], "variant 'odd': expected one of as in the manual, "),
-        (["--baud", "1200"], "baud 1200"),
+        (["--rate", "300"], "rate 300"), (["--faults", "flop=1"], "flop"),
+        (["--variant", "odd"], "variant 'odd': expected one of as in the manual, "), (["--baud", "1200"], "baud 1200"),
         (["--device", "imu61x-can:101", "--device", "hipnuc-uart"], "one device on a terminal"),
         (["--device", "imu61x-can:x"], "with or without :NODE"),
         (["--device", "imu61x-can:9999", "--interface", "vcan0"], "node 9999"),
@@ -168,7 +166,7 @@ def test_signals_end_it_well(start: Start, number: signal.Signals) -> None:
         (["--pins", "sout=/dev/null", "--pin-faults", "extra=x"], "expected a number, got 'x'"),
         (["--pins", "sout=/dev/null", "--pin-faults", "extra=2"], "expected a probability"),
     ],
-)
+)  # fmt: skip
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # main leaves the file of a pin open
 def test_bad_arguments_are_explained(
     arguments: list[str], named: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

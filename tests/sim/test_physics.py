@@ -80,17 +80,7 @@ def test_at_rest_the_force_is_gravity_and_nothing_turns(gravity_m_s2: float) -> 
     assert still.at(0.0).temperature_c != truth.temperature_c
 
 
-@pytest.mark.parametrize(
-    ("roll_deg", "pitch_deg", "force"),
-    [(0, 0, (0.0, 0.0, 1.0)), (0, 30, (0.0, 0.5, 0.75**0.5)), (30, 0, (-0.5, 0.0, 0.75**0.5))],
-)
-def test_axes_have_the_signs_of_chapter_9(roll_deg: float, pitch_deg: float, force: Vector3) -> None:
-    # pitch about x lifts y, the forward axis; roll about y lowers x, the right-hand axis
-    truth = physics.Still(radians(roll_deg), radians(pitch_deg), 0.7, gravity_m_s2=1.0).at(0.0)
-    assert truth.accel_m_s2 == pytest.approx(force, abs=1e-12)
-
-
-def test_yaw_is_counter_clockwise_and_pitch_below_ninety_degrees() -> None:
+def test_axes_and_yaw_have_the_signs_of_chapter_9_and_pitch_is_below_ninety_degrees() -> None:
     truth = physics.Still(0.0, 0.0, radians(90), field_enu_t=(0.0, 1.0, 0.0)).at(0.0)
     assert truth.mag_t == pytest.approx((1.0, 0.0, 0.0), abs=1e-12)  # facing west, north is on the right
     motion = physics.swing()
@@ -100,6 +90,12 @@ def test_yaw_is_counter_clockwise_and_pitch_below_ninety_degrees() -> None:
     with pytest.raises(ValueError, match="90°"):
         physics.Swing(pitch=(physics.Sine(1.0, 0.1), physics.Sine(0.6, 0.2)))
     assert max(abs(degrees(asin(sin(physics.swing().at(t / 10).euler_rad[1])))) for t in range(600)) < 30
+    for roll_deg, pitch_deg, force in (
+        (0, 0, (0.0, 0.0, 1.0)), (0, 30, (0.0, 0.5, 0.75**0.5)), (30, 0, (-0.5, 0.0, 0.75**0.5)),
+    ):  # fmt: skip
+        # pitch about x lifts y, the forward axis; roll about y lowers x, the right-hand axis
+        truth = physics.Still(radians(roll_deg), radians(pitch_deg), 0.7, gravity_m_s2=1.0).at(0.0)
+        assert truth.accel_m_s2 == pytest.approx(force, abs=1e-12)
 
 
 A = quat_from_euler312((0.3, -0.5, 2.0))
@@ -126,15 +122,7 @@ def test_products_and_rotations_agree_with_matrices() -> None:
     assert sum(part * part for part in q) == pytest.approx(1.0, abs=1e-12)
 
 
-@pytest.mark.parametrize("upside_down", [False, True])
-def test_level_keeps_yaw(upside_down: bool) -> None:
-    roll, pitch, yaw = euler312_from_quat(quat_product(A, physics.level_of(A, upside_down)))
-    assert abs(roll) == pytest.approx(pi if upside_down else 0.0, abs=1e-12)
-    assert pitch == pytest.approx(0.0, abs=1e-12)
-    assert yaw == pytest.approx(2.0, abs=1e-12)
-
-
-def test_heading_turns_about_the_vertical_and_leaves_vectors() -> None:
+def test_heading_turns_about_the_vertical_and_level_keeps_yaw() -> None:
     truth = physics.Still(0.2, 0.1, 0.5).at(0.0)
     turned = physics.MountingRotation(yaw_rad=radians(90)).turned(truth)
     assert turned.euler_rad == pytest.approx((0.2, 0.1, 0.5 + pi / 2), abs=1e-12)
@@ -148,6 +136,12 @@ def test_heading_turns_about_the_vertical_and_leaves_vectors() -> None:
     assert with_accel.accel_m_s2 == pytest.approx((0.0, 0.0, 9.8), abs=1e-12)
     assert with_accel.gyro_rad_s == truth.gyro_rad_s
     assert physics.UPRIGHT == (1.0, 0.0, 0.0, 0.0)
+
+    for upside_down in (False, True):
+        roll, pitch, yaw = euler312_from_quat(quat_product(A, physics.level_of(A, upside_down)))
+        assert abs(roll) == pytest.approx(pi if upside_down else 0.0, abs=1e-12)
+        assert pitch == pytest.approx(0.0, abs=1e-12)
+        assert yaw == pytest.approx(2.0, abs=1e-12)
 
 
 TRUTH = physics.Still().at(0.0)

@@ -1,7 +1,9 @@
-"""The sensor inside every simulated device follows the options."""
+"""The sensor inside every simulated device follows the options, which arrive from the command line."""
 
 import re
 import struct
+from argparse import ArgumentTypeError
+from dataclasses import replace
 from typing import Any
 from zlib import crc32
 
@@ -11,6 +13,7 @@ from imud.drivers.imu61x.uart.codec import HOST_SYNC, encode_frame, pack_paramet
 from imud.formats.modbus import framed
 from imud.model.units import NS_PER_S
 from imud.sim import CAN_SIMULATORS, SIMULATORS
+from imud.sim.control import make_parser, module_options, simulated
 from imud.sim.hipnuc import canopen, j1939, modbus, uart_settings
 from imud.sim.imu61x import uart
 from imud.sim.physics import Noise, swing
@@ -137,14 +140,9 @@ VARIANTS_OF: dict[str, Any] = {
     "hipnuc-canopen": canopen.NODE_VARIANTS, "hipnuc-j1939": j1939.J1939_VARIANTS, "imu61x-uart": uart.VARIANTS,
 }  # fmt: skip
 REPLIES = {
-    "hipnuc-uart": 0xB875FD98,
-    "hipnuc-modbus": 0xC5960473,
-    "hipnuc-canopen": 0x2945F911,
-    "hipnuc-j1939": 0x814F6064,
-    "hipnuc-nmea2000": 0x56276182,
-    "imu61x-uart": 0x1D54A669,
-    "imu61x-can": 0x1A1332E7,
-}
+    "hipnuc-uart": 0xB875FD98, "hipnuc-modbus": 0xC5960473, "hipnuc-canopen": 0x2945F911, "hipnuc-j1939": 0x814F6064,
+    "hipnuc-nmea2000": 0x56276182, "imu61x-uart": 0x1D54A669, "imu61x-can": 0x1A1332E7,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", REQUESTS)
@@ -167,3 +165,30 @@ def test_each_variant_replies_as_before(name: str) -> None:
         log += module.advance(now_ns + 2_500_000_000)
         found[variant] = crc32(repr(log).encode())
     assert crc32(repr(found).encode()) == REPLIES[name], found
+
+
+GIVEN = SimulatorOptions(
+    rate_hz=50.0, baud=921600, message="HI92", motion="still", gravity_m_s2=9.7, noise="none", skew_ppm=-3.0,
+    firmware=169, boot_ms=250, processing_ns=12_500, seed=5, node=9, at_once=True, variant="slow flash",
+)  # fmt: skip
+ARGUMENTS = (
+    "--rate 50 --baud 921600 --message HI92 --motion still --gravity 9.7 --no-noise --skew-ppm -3 --firmware 169 "
+    "--boot 0.25 --processing-us 12.5 --seed 5 --node 9 --at-once"
+)
+
+
+def test_options_arrive_in_their_units() -> None:
+    options = make_parser().parse_args([*ARGUMENTS.split(), "--variant", "slow flash"])
+    assert make_parser().parse_args(["--rest"]).motion == "still"
+    assert module_options(options, 0) == GIVEN
+    assert module_options(options, 12) == replace(GIVEN, node=12)
+    assert module_options(make_parser().parse_args([]), 0) == SimulatorOptions()
+
+
+@pytest.mark.parametrize("name", [*SIMULATORS, *CAN_SIMULATORS])
+def test_a_device_is_a_name_with_or_without_a_node(name: str) -> None:
+    assert simulated(name) == (name, 0)
+    assert simulated(f"{name}:17") == (name, 17)
+    for text in (f"{name}:x", f"{name}x", ":1", ""):
+        with pytest.raises(ArgumentTypeError, match="expected one of"):
+            simulated(text)

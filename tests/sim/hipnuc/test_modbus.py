@@ -50,7 +50,7 @@ def here(address: int, **more: Any) -> Slave:
     return slave(address, baud=BAUD, **more)
 
 
-def test_time_of_bytes_pieces_and_echo() -> None:
+def test_time_of_bytes_pieces_echo_and_a_request_after_a_silence() -> None:
     rig = ModbusMaster(here(1, processing_ns=100_000))
     (burst,) = rig.bursts(framed(1, READ_BLOCK))
     assert burst.due_ns == BEGIN_NS + 8 * BYTE_NS + GAP_NS + 100_000 + 57 * BYTE_NS
@@ -69,15 +69,13 @@ def test_time_of_bytes_pieces_and_echo() -> None:
     assert (echo.data, echo.due_ns) == (frame, BEGIN_NS + 8 * BYTE_NS)
     assert is_whole(reply.data)
 
-
-def test_a_request_after_a_silence_is_another_request() -> None:
     line = ModbusMaster(here(1)).line
     for later_ns in (0, NS_PER_S):
         line.receive(framed(1, READ_BLOCK), BEGIN_NS + later_ns)
     assert [is_whole(burst.data) for burst in line.advance(BEGIN_NS + 2 * NS_PER_S)] == [True, True]
 
 
-def test_values_are_the_truth_of_that_instant() -> None:
+def test_values_are_the_truth_of_that_instant_and_counts_of_an_inclinometer() -> None:
     for firmware, resolution in ((152, 2**-15), (169, 1e-4)):
         rig = ModbusMaster(here(1, firmware=firmware, inclinometer="dual"))
         codec = HipnucModbusCodec(Ledger(), HipnucModbusOptions())
@@ -99,6 +97,13 @@ def test_values_are_the_truth_of_that_instant() -> None:
         assert m.euler_rad == pytest.approx(truth.euler_rad, abs=1e-5)
         assert m.incli_rad[0] == pytest.approx(truth.euler_rad[0], abs=1e-4)
         assert (m.dev_ticks is None) == (firmware == 152)
+    # One count of 360°/32768 for X from 0 to 360°, of 180°/32768 for ±180°. Y is 67.8° at pitch 60° and roll -45°
+    for kind, roll_deg, pitch_deg, counts in (
+        ("single", 90, 0, (8192, 0)), ("single", -90, 0, (24576, 0)), ("single", 360, 0, (0, 0)),
+        ("dual", 90, 0, (16384, 0)), ("dual", -45, 60, (-8192, 12341)), ("", 90, 45, (0, 0)),
+    ):  # fmt: skip
+        truth = STILL._replace(euler_rad=(radians(roll_deg), radians(pitch_deg), 0.3))
+        assert incli_counts(truth, kind) == pytest.approx(counts, abs=1)
 
 
 def test_who_answers_and_which_replies_are_whole() -> None:
@@ -135,12 +140,9 @@ def test_ids_exceptions_and_common_options() -> None:
 
     rig = ModbusMaster(here(1))
     for request, code in (
-        (read_registers(0x34, 27).sends[0], 2),
-        (read_registers(0x33, 1).sends[0], 2),
-        (write_register(0x34, 0).sends[0], 2),
-        (write_register(6, 2).sends[0], 3),
-        (b"\x04\x00\x34\x00\x01", 1),
-    ):
+        (read_registers(0x34, 27).sends[0], 2), (read_registers(0x33, 1).sends[0], 2),
+        (write_register(0x34, 0).sends[0], 2), (write_register(6, 2).sends[0], 3), (b"\x04\x00\x34\x00\x01", 1),
+    ):  # fmt: skip
         reply = rig.ask(1, request)
         assert reply == framed(1, bytes([request[0] | 0x80, code]))
 
@@ -152,16 +154,3 @@ def test_ids_exceptions_and_common_options() -> None:
     for wrong in ({"message": "1,x"}, {"message": "0"}, {"message": "248"}, {"baud": 12345}, {"motion": "none"}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             make(SimulatorOptions(**wrong), BEGIN_NS)
-
-
-@pytest.mark.parametrize(
-    ("kind", "roll_deg", "pitch_deg", "counts"),
-    [
-        ("single", 90, 0, (8192, 0)), ("single", -90, 0, (24576, 0)), ("single", 360, 0, (0, 0)),
-        ("dual", 90, 0, (16384, 0)), ("dual", -45, 60, (-8192, 12341)), ("", 90, 45, (0, 0)),
-    ],
-)  # fmt: skip
-def test_counts_of_an_inclinometer(kind: str, roll_deg: float, pitch_deg: float, counts: tuple[int, int]) -> None:
-    """One count of 360°/32768 for X from 0 to 360°, of 180°/32768 for ±180°. Y is 67.8° at pitch 60° and roll -45°."""
-    truth = STILL._replace(euler_rad=(radians(roll_deg), radians(pitch_deg), 0.3))
-    assert incli_counts(truth, kind) == pytest.approx(counts, abs=1)

@@ -161,25 +161,18 @@ def test_codec_reads_every_frame(message: str) -> None:
     assert ledger.closes()
 
 
-@pytest.mark.parametrize(
-    ("rate_hz", "message", "baud"),
-    [(1, "", 115_200), (100, "hi91", 115_200), (200, "HI92", 115_200), (200, "HI91", 230_400), (1000, "", 921_600)],
-)
-def test_baud_follows_from_the_rate(rate_hz: float, message: str, baud: int) -> None:
-    assert make(SimulatorOptions(rate_hz=rate_hz, message=message), 0).baud == baud
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
+def test_impossible_options_are_refused_and_the_baud_rate_follows_from_the_rate() -> None:
+    for options in (
         SimulatorOptions(rate_hz=0), SimulatorOptions(rate_hz=-1), SimulatorOptions(rate_hz=2000),
         SimulatorOptions(rate_hz=300), SimulatorOptions(rate_hz=float("nan")), SimulatorOptions(baud=57_600),
         SimulatorOptions(message="HI93"), SimulatorOptions(motion="dance"),
-    ],
-)  # fmt: skip
-def test_impossible_options_are_refused(options: SimulatorOptions) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        make(options, 0)
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match="expected"):
+            make(options, 0)
+    for rate_hz, message, baud in (
+        (1, "", 115_200), (100, "hi91", 115_200), (200, "HI92", 115_200), (200, "HI91", 230_400), (1000, "", 921_600),
+    ):  # fmt: skip
+        assert make(SimulatorOptions(rate_hz=rate_hz, message=message), 0).baud == baud
 
 
 VERSION = ["PNAME=HI14R3", "BUILD=Oct 15 2024", "UUID=043995698D6E1708", "APP_VER=156", "BL_VER=109", "OK"]
@@ -230,28 +223,24 @@ def test_replies_stand_between_whole_frames() -> None:
     assert bench.ask("LOG USRCONFIG")[0] == "ATT_MODE: 1"
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
+@pytest.mark.manual("B 2 line end")
+def test_line_ends_garbage_unknown_commands_and_bad_values() -> None:
+    for line in (
         "LOG VERSION\n", "LOG VERSION\r\n", "\xff\x80\x01LOG VERSION\r\n", "\r\n\r\nLOG VERSION\n",
         "LOG D\xffLOG VERSION\n",
-    ],
-)  # fmt: skip
-@pytest.mark.manual("B 2 line end")
-def test_line_ends_and_garbage_before_a_command(line: str) -> None:
-    bench = HipnucUartBench()
-    bench.module.receive(line.encode("latin-1"), bench.now_ns)
-    assert bench.text(30.0) == VERSION
-
-
-@pytest.mark.parametrize(
-    "line", ["", "HELLO", "log version", "LOG", "LOG VERSIONS", "LOG HI93 ONTIME 1", "CONFIG ATT", "AT+RST", "X" * 5000]
-)
-def test_unknown_commands_get_no_reply(line: str) -> None:
-    bench = HipnucUartBench()
-    assert bench.ask(line) == []
-    assert bench.ask("LOG VERSION") == VERSION
-    assert bench.module.settings == ModuleSettings()
+    ):  # fmt: skip
+        bench = HipnucUartBench()
+        bench.module.receive(line.encode("latin-1"), bench.now_ns)
+        assert bench.text(30.0) == VERSION
+    for line in (
+        "", "HELLO", "log version", "LOG", "LOG VERSIONS", "LOG HI93 ONTIME 1", "CONFIG ATT", "AT+RST", "X" * 5000,
+    ):  # fmt: skip
+        bench = HipnucUartBench()
+        assert bench.ask(line) == []
+        assert bench.ask("LOG VERSION") == VERSION
+        assert bench.module.settings == ModuleSettings()
+    for line in ("CONFIG ATT RST 4", "CONFIG YAW 2 0", "CONFIG YAW 1 181", "CONFIG YAW 1 nan"):
+        assert HipnucUartBench().ask(line) == ["ERR"]
 
 
 def test_reboot_baud_rate_and_factory_reset() -> None:
@@ -358,11 +347,6 @@ def test_levels_and_yaw() -> None:
     bench.ask("SAVECONFIG")
     bench.reboot()
     assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, 40.0), abs=1e-4)
-
-
-@pytest.mark.parametrize("line", ["CONFIG ATT RST 4", "CONFIG YAW 2 0", "CONFIG YAW 1 181", "CONFIG YAW 1 nan"])
-def test_bad_values_are_refused(line: str) -> None:
-    assert HipnucUartBench().ask(line) == ["ERR"]
 
 
 HIGH_NS = 80_000  # SOUT pulse, 80 us

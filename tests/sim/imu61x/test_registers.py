@@ -71,7 +71,7 @@ def test_values_are_the_truth_of_the_update(burst: str) -> None:
 
 
 @pytest.mark.manual("A 2.4 WIN_CTRL", "A 2.4.1 reading", "A 2.1 mode")
-def test_windows_bursts_modes_and_a_restart() -> None:
+def test_windows_bursts_modes_a_restart_and_variants_of_burst_ctrl() -> None:
     one, _ = device()
     assert spoken(one, 0x0600, 0x6C00, 0, 0)[2:] == [0, 0]  # configuration is not in window 0
     assert spoken(one, 0xFE01, 0x0600, 0x0E00, 0, 0)[3:] == [0xBB, 0]  # values are not in window 1
@@ -113,16 +113,10 @@ def test_windows_bursts_modes_and_a_restart() -> None:
     one.faults.error = errno.ENXIO
     with pytest.raises(OSError, match="ENXIO"):
         one.i2c([b"\x6a", 8])
-
-
-@pytest.mark.parametrize(
-    ("behaviour", "low", "high"),
-    [
+    for behaviour, low, high in (
         (RegisterBehaviour(), 0x0100, 0x0001),
         (RegisterBehaviour(high_address=False), 0x0100, 0),
         (RegisterBehaviour(low_address=False), 0, 0x0001),
-    ],
-)
-def test_burst_ctrl_reads_back_where_the_variant_has_it(behaviour: RegisterBehaviour, low: int, high: int) -> None:
-    one, _ = device(behaviour=behaviour)
-    assert spoken(one, 0xFE01, 0x8D01, 0x0C00, 0x0D00, 0x7E00, 0x7E00)[4:] == [low, high]
+    ):
+        one, _ = device(behaviour=behaviour)
+        assert spoken(one, 0xFE01, 0x8D01, 0x0C00, 0x0D00, 0x7E00, 0x7E00)[4:] == [low, high]

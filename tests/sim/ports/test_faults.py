@@ -52,7 +52,7 @@ def test_length_tells_the_kind(kind: FaultKind, least: int, most: int) -> None:
         assert least <= change <= most or (kind is FaultKind.CUT and len(before.data) > 82 and change < 0)
 
 
-def test_flips_wrong_rates_delays_and_unplugging() -> None:
+def test_flips_wrong_rates_delays_unplugging_and_invalid_rates() -> None:
     for before, after in passed(Faults(3, FaultRates(flip=1.0)), 50):
         assert after
         assert sum((a ^ b).bit_count() for a, b in zip(before.data, after.data, strict=True)) == 1
@@ -73,6 +73,10 @@ def test_flips_wrong_rates_delays_and_unplugging() -> None:
     assert [after for _, after in pairs[first : first + 6]] == [None] * 6
     assert faults.unplugged_until_ns >= first * STEP_NS + 55 * NS_PER_MS
     assert sum(after is None for _, after in pairs) == faults.bursts_hit
+
+    for text in ("flop=0.1", "flip", "flip=often", "flip=1.5", "flip=-1", "flip=nan"):
+        with pytest.raises(ValueError, match="fault"):
+            rates_from(text)
 
 
 def test_the_ledger_of_a_codec_tells_the_same() -> None:
@@ -99,9 +103,3 @@ def test_the_ledger_of_a_codec_tells_the_same() -> None:
 
     assert run(1) == run(1)
     assert run(1) != run(2)
-
-
-@pytest.mark.parametrize("text", ["flop=0.1", "flip", "flip=often", "flip=1.5", "flip=-1", "flip=nan"])
-def test_bad_rates_are_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="fault"):
-        rates_from(text)

@@ -1,4 +1,5 @@
-"""A simulated device behind a real pseudo-terminal, stepped by the test: no clock, no waiting."""
+"""A simulated device behind a real pseudo-terminal, stepped by the test: no clock, no waiting.
+The wire of a UART: duration of bursts, and bytes at ends with different rates."""
 
 import fcntl
 import io
@@ -7,6 +8,7 @@ import termios
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from random import Random
 
 import pytest
 
@@ -19,6 +21,7 @@ from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings, Output
 from imud.sim.ports.arrival import BARE_UART, USB_16MS, ArrivalProfile
 from imud.sim.ports.faults import FaultRates, Faults
 from imud.sim.ports.pty import Adapter, PtyNode, SimulatedPort, set_baud
+from imud.sim.ports.uart_wire import Transmitter, heard
 
 BEGIN_NS = 77 * NS_PER_S
 QUICK = HipnucHardware(skew_ppm=0, boot_ms=0)
@@ -80,6 +83,8 @@ def frames_of(data: bytes) -> int:
 
 def test_a_program_reads_frames_and_gets_answers(rig: PluggedPort) -> None:
     rig.open(115_200)
+    fcntl.ioctl(rig.fd, termios.TIOCEXCL)  # an exclusive program is no obstacle
+    fcntl.flock(rig.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     assert frames_of(rig.run(1000)) == pytest.approx(99, abs=1)
     os.write(rig.fd, b"LOG DISABLE\r\nLOG VERSION\r\n")
     text = rig.run(50)
@@ -133,22 +138,22 @@ def test_with_no_reader_bytes_are_lost_and_counted(rig: PluggedPort) -> None:
     assert rig.port.summary()["bytes_written"] == before
 
 
-def test_a_silent_module_notices_soon_that_a_program_opened_the_port(rig: PluggedPort) -> None:
-    rig.module.receive(b"UNLOGALL\r\n", rig.now_ns)
-    rig.run(50)
-    assert rig.module.next_ns() is None
-    assert rig.port.next_ns(rig.now_ns) == rig.now_ns + 20 * NS_PER_MS
-    rig.open()
-    assert rig.port.next_ns(rig.now_ns) == rig.now_ns + NS_PER_S  # select reports its bytes after this step
-
-
-def test_a_command_of_a_program_that_left_at_once_is_obeyed(rig: PluggedPort) -> None:
+def test_a_command_of_a_program_that_left_is_obeyed_and_a_silent_module_notices_the_next_program(
+    rig: PluggedPort,
+) -> None:
     rig.open(115_200)
     os.write(rig.fd, b"LOG DISABLE\r\n")
     rig.close()
     rig.run(50)
     rig.open()
     assert rig.run(100) == b""
+    rig.close()
+    rig.module.receive(b"UNLOGALL\r\n", rig.now_ns)
+    rig.run(50)
+    assert rig.module.next_ns() is None
+    assert rig.port.next_ns(rig.now_ns) == rig.now_ns + 20 * NS_PER_MS
+    rig.open()
+    assert rig.port.next_ns(rig.now_ns) == rig.now_ns + NS_PER_S  # select reports its bytes after this step
 
 
 def test_unplugging_takes_the_node_away_and_brings_it_back(rig: PluggedPort) -> None:
@@ -173,13 +178,6 @@ def test_unplugging_takes_the_node_away_and_brings_it_back(rig: PluggedPort) -> 
     counted = rig.port.summary()
     assert counted["unplugs"] == 1
     assert counted["bytes_written"] + counted["bytes_unheard"] == pytest.approx(counted["frames_sent"] * 82, abs=3 * 82)
-
-
-def test_an_exclusive_program_is_no_obstacle(rig: PluggedPort) -> None:
-    rig.open(115_200)
-    fcntl.ioctl(rig.fd, termios.TIOCEXCL)
-    fcntl.flock(rig.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    assert frames_of(rig.run(100)) == pytest.approx(10, abs=1)
 
 
 def test_adapters_with_a_timer_and_a_reader_that_stops(tmp_path: Path) -> None:
@@ -270,3 +268,77 @@ def test_closing_twice_is_allowed_and_leaves_nothing(tmp_path: Path) -> None:
     rig.port.close()
     assert list(tmp_path.iterdir()) == []
     assert set(os.listdir("/proc/self/fd")) == before
+
+
+BYTE_NS = 10_000_000  # 1000 baud: 10 bits of 1 ms
+DATA = bytes(range(256)) * 2
+RATES = DRIVER.baud_rates
+
+
+def test_what_ends_at_equal_near_and_other_rates_hear_and_garbage_by_hand() -> None:
+    for baud in RATES:
+        assert heard(DATA, baud, baud) == heard(DATA, baud, round(baud * 1.02)) == DATA
+    assert heard(DATA, 104_000, 100_000) == DATA  # a difference of 4 % is within half a bit at bit 10
+    assert heard(DATA, 100_000, 104_000) == DATA
+    assert heard(DATA, 115_200, 100_000) != DATA
+    assert heard(DATA, 115_200, 0) == b""
+    assert heard(DATA, 0, 115_200) == b""
+    assert heard(b"", 9600, 115_200) == b""
+    assert len(heard(DATA, 921_600, 9600)) < len(DATA) / 20
+    assert len(heard(DATA, 9600, 115_200)) > len(DATA)
+    for data, sent, listening, expected in (
+        (b"\xff", 100, 200, b"\xfe"),  # two half bits: a start bit, then ones
+        (b"\x00", 100, 200, b"\x00"),  # nine zeros become eighteen: a break, then the UART waits for idle
+        (b"\x55", 100, 200, b"\x66\xe6"),  # every bit twice; stop bit wrong at 9, idle at 10, next start at 12
+        (b"\xff", 400, 100, b""),  # the start bit is shorter than half a bit: a glitch
+    ):
+        assert heard(data, sent, listening) == expected
+
+
+@pytest.mark.parametrize("sent", [9600, 115_200, 921_600])
+@pytest.mark.parametrize("listening", RATES)
+def test_no_frame_survives_a_wrong_rate(sent: int, listening: int) -> None:
+    random, ledger = Random(f"{sent} {listening}"), Ledger()
+    codec = DRIVER.make_codec(ledger, DRIVER.settings())
+    events = [
+        event
+        for _ in range(10)
+        for event in codec.feed(heard(DRIVER.example_frame(random), sent, listening))
+        if isinstance(event, Measurement)
+    ]
+    assert bool(events) == (sent == listening)
+
+
+def transmitter() -> Transmitter:
+    return Transmitter(1000, 20, free_ns=1000)
+
+
+def test_wire_time_buffer_and_power_loss() -> None:
+    wire = transmitter()
+    wire.send(0, b"abc")
+    wire.send(5, b"de", sample_ns=4, device_ms=1)
+    assert wire.next_ns() == 1000 + 3 * BYTE_NS
+    assert wire.sent(1000 + 3 * BYTE_NS - 1) == []
+    assert [burst.data for burst in wire.sent(1000 + 3 * BYTE_NS)] == [b"abc"]
+    assert wire.sent(10**12) == [(1000 + 5 * BYTE_NS, b"de", 4, 1)]
+    assert wire.next_ns() is None
+
+    wire = transmitter()
+    assert wire.due_ns(10**9, 2) == 10**9 + 2 * BYTE_NS
+
+    wire = transmitter()
+    wire.send(1000, bytes(15))
+    assert wire.fits(1000, 5)
+    assert not wire.fits(1000, 6)
+    assert wire.fits(1000 + BYTE_NS, 6)
+
+    wire = transmitter()
+    for data in (b"whole", b"broken", b"never"):
+        wire.send(1000, data)
+    through = wire.stopped(1000 + 5 * BYTE_NS + 2 * BYTE_NS + BYTE_NS // 2)
+    assert [burst.data for burst in through] == [b"whole", b"br"]
+    assert wire.sent(10**12) == []
+
+    wire = transmitter()
+    wire.send(1000, b"never")
+    assert wire.stopped(500) == []
