@@ -1,7 +1,7 @@
 """Verbs: check and description of arguments, and the actions in the rows of all drivers."""
 
 from math import pi, radians
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import pytest
@@ -43,18 +43,15 @@ def _turn(target: Target, *, angle_deg: Annotated[float, Meta(ge=-180, le=180)],
 ACTION = Verb("turn it", _turn)
 
 
-def test_arguments_are_converted_and_completed_by_defaults() -> None:
+def test_arguments_are_completed_by_defaults_and_bad_arguments_name_the_good_ones() -> None:
     arguments = ACTION.arguments({"angle_deg": 5})
     assert msgspec.structs.asdict(arguments) == {"angle_deg": 5.0, "relative": False}
     assert ACTION.script(Target(None, 9600), arguments) == "9600 5.0 False"
-
-
-@pytest.mark.parametrize("given", [{}, {"angle_deg": "x"}, {"angle_deg": 1, "turns": 2}, {"angle_deg": 181}])
-def test_bad_arguments_name_the_good_ones(given: dict[str, object]) -> None:
-    good = r"angle_deg \(a number from -180 to 180\), relative \(true or false; default false\)"
-    with pytest.raises(BadArgument, match=good):
-        ACTION.arguments(given)
-    assert ", ".join(map(str, parameters_of(ACTION))) == good.replace("\\", "")
+    for given in ({}, {"angle_deg": "x"}, {"angle_deg": 1, "turns": 2}, {"angle_deg": 181}):
+        good = r"angle_deg \(a number from -180 to 180\), relative \(true or false; default false\)"
+        with pytest.raises(BadArgument, match=good):
+            ACTION.arguments(given)
+        assert ", ".join(map(str, parameters_of(ACTION))) == good.replace("\\", "")
 
 
 def test_description_for_people() -> None:
@@ -70,16 +67,15 @@ def test_description_for_people() -> None:
     }
 
 
-@pytest.mark.parametrize(
-    ("options", "effect"),
-    [({}, (False, True)), ({"restarts": True}, (True, False)), ({"saves": True}, (False, False)),
-     ({"restarts": True, "restarts_with": lambda _: False}, (False, False)), ({"changes": False}, (False, False))],
-)  # fmt: skip
-def test_effect_on_the_flash(options: dict[str, Any], effect: tuple[bool, bool]) -> None:
-    verb = Verb("turn it", _turn, **options)
-    arguments = verb.arguments({"angle_deg": 5})
-    assert verb.effect_on_flash(arguments) == effect
-    assert verb.expected(arguments) == ()
+def test_effect_on_the_flash() -> None:
+    for options, effect in (
+        ({}, (False, True)), ({"restarts": True}, (True, False)), ({"saves": True}, (False, False)),
+        ({"restarts": True, "restarts_with": lambda _: False}, (False, False)), ({"changes": False}, (False, False)),
+    ):  # fmt: skip
+        verb = Verb("turn it", _turn, **options)
+        arguments = verb.arguments({"angle_deg": 5})
+        assert verb.effect_on_flash(arguments) == effect
+        assert verb.expected(arguments) == ()
 
 
 def test_expected_means_at_rest() -> None:

@@ -5,22 +5,8 @@ from inspect import GEN_CLOSED, getgeneratorstate
 
 import pytest
 
-from imud.contracts.script import (
-    Outcome,
-    Rejection,
-    Reply,
-    ReplyFrame,
-    Request,
-    RequestScript,
-    Silence,
-    Transfer,
-    TransferScript,
-    never,
-    pause,
-    run_transfer_script,
-    says_nothing,
-    with_undo,
-)
+from imud.contracts import script as scripts
+from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request, Silence, Transfer, TransferScript
 from imud.device.scripts import REPLY_MESSAGES_MAX, ScriptRunner
 from imud.model.errors import CommandError, TransferError, Trouble
 from imud.model.ledger import Ledger
@@ -54,42 +40,27 @@ def strays(ledger: Ledger) -> tuple[int, int]:
     return (ledger.replies_late, ledger.replies_unsolicited)
 
 
-def test_reply(session: ScriptRunner, ledger: Ledger) -> None:
+def test_replies_refusals_silent_requests_and_silence_at_the_deadline(session: ScriptRunner, ledger: Ledger) -> None:
     assert session.start(command("ask", "a"), 0) == b"ask"
-    assert session.deadline_ns is not None
     assert session.deadline_ns == TIMEOUT_NS
     assert session.on_message("a=1", 5) is None
     assert session.on_message("OK", 6) == Reply(("a=1", "OK"))
     assert session.deadline_ns is None
-    assert session.deadline_ns is None
     assert session.on_time(1000) is None
     assert strays(ledger) == (0, 0)
-
-
-def test_refusal_needs_no_lines(session: ScriptRunner) -> None:
     session.start(command("ask", "a"), 0)
     assert session.on_message("ERR", 5) == Rejection(("ERR",))
-
-
-def test_silence_at_the_deadline_and_not_before(session: ScriptRunner) -> None:
+    session.start(command("first"), 0)
+    with pytest.raises(CommandError, match="second: still waiting for the reply to first"):
+        session.start(command("second"), 1)
+    assert session.on_message("OK", 2) == Reply(("OK",))
+    assert session.start(command("reboot", silent=True), 0) == b"reboot"
+    assert session.deadline_ns is None
     session.start(command("ask", "a"), 0)
     session.on_message("a=1", 5)
     assert session.on_time(TIMEOUT_NS - 1) is None
     assert session.on_time(TIMEOUT_NS) == Silence(("a=1",))
     assert session.on_time(TIMEOUT_NS) is None
-    assert session.deadline_ns is None
-
-
-def test_one_request_at_a_time(session: ScriptRunner) -> None:
-    session.start(command("first"), 0)
-    with pytest.raises(CommandError, match="second: still waiting for the reply to first"):
-        session.start(command("second"), 1)
-    assert session.on_message("OK", 2) == Reply(("OK",))
-
-
-def test_silent_request_is_done_at_once(session: ScriptRunner) -> None:
-    assert session.start(command("reboot", silent=True), 0) == b"reboot"
-    assert session.deadline_ns is None
     assert session.deadline_ns is None
 
 
@@ -141,7 +112,7 @@ def test_a_late_reply_does_not_answer_the_next_request(
     assert strays(ledger) == late_and_unsolicited
 
 
-def test_cancel_forgets_the_request(session: ScriptRunner, ledger: Ledger) -> None:
+def test_cancel_forgets_the_request_and_an_endless_reply_is_bounded(session: ScriptRunner, ledger: Ledger) -> None:
     session.start(command("ask", "a"), 0)
     session.on_message("a=1", 1)
     session.cancel()
@@ -152,9 +123,6 @@ def test_cancel_forgets_the_request(session: ScriptRunner, ledger: Ledger) -> No
     session.start(command("ask", "a"), 3)
     session.on_message("a=2", 4)
     assert session.on_message("OK", 4) == Reply(("a=2", "OK"))
-
-
-def test_endless_reply_is_bounded(session: ScriptRunner) -> None:
     session.start(command("ask", "a"), 0)
     for number in range(REPLY_MESSAGES_MAX + 50):
         session.on_message(f"a={number}", 1)
@@ -164,11 +132,8 @@ def test_endless_reply_is_bounded(session: ScriptRunner) -> None:
 
 
 def frame_command(frame_id: int) -> Request:
-    return Request(
-        payload=b"?", name=f"frame {frame_id}",
-        is_end=lambda message: isinstance(message, ReplyFrame) and message.frame_id == frame_id, is_rejection=never,
-        is_part=never, timeout_ns=TIMEOUT_NS,
-    )  # fmt: skip
+    is_end = lambda message: isinstance(message, ReplyFrame) and message.frame_id == frame_id  # noqa: E731
+    return Request(b"?", f"frame {frame_id}", is_end, scripts.never, scripts.never, timeout_ns=TIMEOUT_NS)
 
 
 def test_a_frame_answers_as_a_line_does(session: ScriptRunner, ledger: Ledger) -> None:
@@ -193,7 +158,7 @@ def test_a_late_frame_is_told_from_the_next_reply(session: ScriptRunner, ledger:
 def test_a_pause_sends_nothing_and_late_replies_stay_late(session: ScriptRunner, ledger: Ledger) -> None:
     session.start(command("ask", "a"), 0)
     session.on_time(TIMEOUT_NS)
-    assert session.start(pause(50), TIMEOUT_NS) == b""
+    assert session.start(scripts.pause(50), TIMEOUT_NS) == b""
     assert session.on_message("a=1", TIMEOUT_NS + 10) is None
     assert session.on_time(TIMEOUT_NS + 49) is None
     assert session.on_time(TIMEOUT_NS + 50) == Silence(())
@@ -203,24 +168,24 @@ def test_a_pause_sends_nothing_and_late_replies_stay_late(session: ScriptRunner,
 
 def test_a_script_with_undo_passes_requests_on_and_is_closed_with_it() -> None:
     inner = asking()
-    outer = with_undo(inner, b"undo")
+    outer = scripts.with_undo(inner, b"undo")
     assert next(outer).undo == b"undo"
     outer.close()
     assert getgeneratorstate(inner) == GEN_CLOSED
-    outer = with_undo(asking(), b"undo")
+    outer = scripts.with_undo(asking(), b"undo")
     next(outer)
     with pytest.raises(StopIteration) as end:
         outer.send(Reply(("OK",)))
     assert end.value.value == Reply(("OK",))
 
 
-def asking() -> RequestScript[Outcome]:
-    return (yield command("ask"))
-
-
 def test_a_request_has_half_a_second_for_one_message() -> None:
-    request = Request(payload=b"", name="ask", is_end=never, is_rejection=never, is_part=never)
+    request = Request(payload=b"", name="ask", is_end=scripts.never, is_rejection=scripts.never, is_part=scripts.never)
     assert (request.timeout_ns, request.messages_min) == (500_000_000, 1)
+
+
+def asking() -> scripts.RequestScript[Outcome]:
+    return (yield command("ask"))
 
 
 def test_a_transfer_script_can_continue_after_a_failed_transfer() -> None:
@@ -235,9 +200,9 @@ def test_a_transfer_script_can_continue_after_a_failed_transfer() -> None:
             raise TransferError(Trouble.ABSENT, "no acknowledgement")
         return wanted.sends[0]
 
-    assert run_transfer_script(script(), transfer) == b"works"
+    assert scripts.run_transfer_script(script(), transfer) == b"works"
     with pytest.raises(StopIteration) as end:
-        next(says_nothing(5))
+        next(scripts.says_nothing(5))
     assert end.value.value == 5
 
 

@@ -25,7 +25,7 @@ def signals() -> SignalBench:
     return SignalBench()
 
 
-def test_at_the_start_only_an_active_alarm_is_an_event(signals: SignalBench) -> None:
+def test_an_active_alarm_at_the_start_edges_and_a_line_that_came_back_are_events(signals: SignalBench) -> None:
     line = AlarmLine(signals.raise_event)
     line.on_level(5, False)
     assert (line.active, line.raised, len(signals.events)) == (False, 0, 0)
@@ -38,9 +38,7 @@ def test_at_the_start_only_an_active_alarm_is_an_event(signals: SignalBench) -> 
     # The edge that arrived between opening the line and reading its level
     line.on_edges([Edge(10 * NS_PER_S, True, 1)])
     assert (len(signals.events), line.raised) == (1, 1)
-
-
-def test_edges_are_events_at_their_own_time(signals: SignalBench) -> None:
+    signals.events.clear()
     line = AlarmLine(signals.raise_event)
     line.on_level(0, False)
     line.on_edges([Edge(10 * NS_PER_S, True, 1)])
@@ -49,6 +47,15 @@ def test_edges_are_events_at_their_own_time(signals: SignalBench) -> None:
         (10 * NS_PER_S, "alarm"), (20 * NS_PER_S, "alarm ended")
     ]  # fmt: skip
     assert (line.active, line.raised) == (False, 1)
+    signals.events.clear()
+    line = AlarmLine(signals.raise_event)
+    line.on_level(0, True)
+    line.on_level(NS_PER_S, None)
+    assert line.active is None
+    line.tick(10 * NS_PER_S)
+    line.on_level(20 * NS_PER_S, True)
+    assert line.raised == 2
+    assert len(signals.events) == 2
 
 
 def test_a_chattering_line_makes_one_event_a_second_and_the_last_state_is_reported(signals: SignalBench) -> None:
@@ -68,17 +75,6 @@ def test_a_chattering_line_makes_one_event_a_second_and_the_last_state_is_report
     line.tick(NS_PER_S)
     line.tick(3 * NS_PER_S)
     assert signals.messages() == ["alarm", "alarm ended"]
-
-
-def test_a_line_that_went_away_and_came_back(signals: SignalBench) -> None:
-    line = AlarmLine(signals.raise_event)
-    line.on_level(0, True)
-    line.on_level(NS_PER_S, None)
-    assert line.active is None
-    line.tick(10 * NS_PER_S)
-    line.on_level(20 * NS_PER_S, True)
-    assert line.raised == 2
-    assert len(signals.events) == 2
 
 
 # --- against the angles -----------------------------------------------------------------------------------------------
@@ -195,9 +191,9 @@ def angles(x_deg: float, y_deg: float) -> Vector3:
     return radians(y_deg), radians(x_deg), radians(77)
 
 
-@pytest.mark.parametrize(
-    ("ranges", "euler_rad", "level", "verdict"),
-    [
+@pytest.mark.manual("B 2.2.4 alarm level")
+def test_verdicts_and_at_the_limit_either_level_is_right() -> None:
+    for ranges, euler_rad, level, verdict in (
         (BOTH, angles(0, 0), False, AlarmVerdict.RIGHT), (BOTH, angles(0, 0), True, AlarmVerdict.STUCK_HIGH),
         (BOTH, angles(0, -6), True, AlarmVerdict.RIGHT), (BOTH, angles(12, 12), False, AlarmVerdict.STUCK_LOW),
         (BOTH, angles(-12, 0), False, AlarmVerdict.STUCK_LOW), (BOTH, angles(7, 0), True, AlarmVerdict.STUCK_HIGH),
@@ -205,14 +201,8 @@ def angles(x_deg: float, y_deg: float) -> Vector3:
         (BOTH, angles(9.6, 0), False, AlarmVerdict.UNKNOWN), (BOTH, angles(9.6, 7), False, AlarmVerdict.STUCK_LOW),
         (BOTH, angles(10.4, 0), True, AlarmVerdict.UNKNOWN), (BOTH, None, True, AlarmVerdict.UNKNOWN),
         ({}, angles(0, 0), True, AlarmVerdict.UNKNOWN),
-    ],
-)  # fmt: skip
-@pytest.mark.manual("B 2.2.4 alarm level")
-def test_verdicts(ranges: dict[str, AlarmRange], euler_rad: Vector3 | None, level: bool, verdict: AlarmVerdict) -> None:
-    assert judge(ranges, euler_rad, level) is verdict
-
-
-def test_at_the_limit_either_level_is_right() -> None:
+    ):  # fmt: skip
+        assert judge(ranges, euler_rad, level) is verdict
     for at in (-5, 5):
         for off in (-0.9, 0.9):
             assert judge(ONLY_Y, angles(0, at + off * MARGIN_DEG), True) is AlarmVerdict.UNKNOWN

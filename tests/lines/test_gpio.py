@@ -218,17 +218,13 @@ def test_an_output_whose_chip_vanishes_or_that_is_no_line(
     assert calls == [(9, request, [1, 1]), (9, request, [0, 1])]
 
 
-def test_size_of_the_kernel_struct() -> None:
-    assert gpio.EVENT.size == 48
-
-
 def event(t_ns: int, kind: int, seqno: int) -> bytes:
     """Return a `struct gpio_v2_line_event` of line 5, in a request with another count."""
     words = (kind, 5, 77, seqno)
     return t_ns.to_bytes(8, "little") + b"".join(word.to_bytes(4, "little") for word in words) + bytes(24)
 
 
-def test_edges_with_jumps_of_the_count_which_are_losses() -> None:
+def test_jumps_of_the_count_are_losses_and_numbers_go_on_when_it_wraps_and_after_a_restart() -> None:
     events = gpio.LineEventDecoder()
     data = event(0x0102030405060708, 1, 1) + event(2**63 - 1, 2, 2)
     assert events.decode(data) == [Edge(0x0102030405060708, True, 1), Edge(2**63 - 1, False, 2)]
@@ -237,9 +233,6 @@ def test_edges_with_jumps_of_the_count_which_are_losses() -> None:
     events = gpio.LineEventDecoder()
     assert [edge.number for edge in events.decode(event(1, 1, 2) + event(2, 2, 10) + event(3, 1, 11))] == [2, 10, 11]
     assert events.lost == 1 + 7
-
-
-def test_numbers_go_on_when_the_count_wraps_and_after_a_restart() -> None:
     events = gpio.LineEventDecoder()
     events.decode(event(1, 1, 2**32 - 1))
     assert [edge.number for edge in events.decode(event(2, 2, 0) + event(3, 1, 1))] == [2**32, 2**32 + 1]
@@ -249,6 +242,7 @@ def test_numbers_go_on_when_the_count_wraps_and_after_a_restart() -> None:
     events.restart()
     assert [edge.number for edge in events.decode(event(3, 1, 1))] == [3]
     assert events.lost == 0
+    assert gpio.EVENT.size == 48
 
 
 # ruff: noqa: E501 - a row of the table is a case and the whole message for it
@@ -300,7 +294,7 @@ def test_no_chip_at_all_or_two_of_a_label(tmp_path: Path, gpiod: FakeGpiod) -> N
         gpio.find_line(gpiod, LineOptions(line=0, chip="pinctrl-bcm2711"), tmp_path)
 
 
-def test_a_denied_chip_matters_only_if_no_other_chip_has_the_line(gpiod: FakeGpiod, tmp_path: Path) -> None:
+def test_a_denied_or_missing_chip_matters_only_if_no_other_chip_has_the_line(gpiod: FakeGpiod, tmp_path: Path) -> None:
     gpiod.errors["gpiochip0"] = errno.EACCES
     assert gpio.find_line(gpiod, LineOptions(line="RESET"), tmp_path).offset == 0
     for settings in (LineOptions(line="SOUT"), LineOptions(line=0, chip="gpiochip0"), LineOptions(line=0, chip="x")):
@@ -308,9 +302,6 @@ def test_a_denied_chip_matters_only_if_no_other_chip_has_the_line(gpiod: FakeGpi
             LinkDenied, match=r"cannot open .*gpiochip0: user .* lacks the permission; the node must belong to group"
         ):
             gpio.find_line(gpiod, settings, tmp_path)
-
-
-def test_a_missing_chip_matters_only_if_no_other_chip_has_the_line(gpiod: FakeGpiod, tmp_path: Path) -> None:
     gpiod.errors["gpiochip0"] = errno.ENODEV
     assert gpio.find_line(gpiod, LineOptions(line="RESET"), tmp_path).offset == 0
     with pytest.raises(LinkMissing, match="gpiochip0 is missing, or is not a GPIO chip: No such device"):
@@ -348,7 +339,8 @@ def test_a_holder_without_a_name(gpiod: FakeGpiod, tmp_path: Path) -> None:
     assert isinstance(gpio.request_error(gpiod, OSError(errno.EBUSY, ""), place), LinkBusy)
 
 
-def test_gpiod_is_missing_or_that_of_libgpiod_1(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gpiod_of_the_environment_is_missing_or_that_of_libgpiod_1(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert hasattr(gpio.load_gpiod(), "request_lines")
     monkeypatch.setitem(sys.modules, "gpiod", None)
     with pytest.raises(LinkError, match="need the Python package gpiod, got none; run `pip install"):
         gpio.load_gpiod()
@@ -357,7 +349,3 @@ def test_gpiod_is_missing_or_that_of_libgpiod_1(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(sys.modules, "gpiod", old)
     with pytest.raises(LinkError, match=r"2\.3 or later, got the module of libgpiod 1 \(/usr/lib.*Debian 12"):
         gpio.load_gpiod()
-
-
-def test_gpiod_of_the_environment() -> None:
-    assert hasattr(gpio.load_gpiod(), "request_lines")

@@ -24,7 +24,7 @@ SETTINGS = ResetOptions(line="RESET", hold_ms=20)
 
 @in_loop
 @pytest.mark.manual("A 2.2 reset")
-async def test_a_pulse_waits_for_the_start_of_the_device() -> None:
+async def test_a_pulse_waits_for_the_start_of_the_device_and_may_be_cancelled() -> None:
     story: list[object] = []
     line = MemoryOutput(on_change=lambda _t_ns, active: story.append(active))
     line.open()
@@ -40,18 +40,15 @@ async def test_a_pulse_waits_for_the_start_of_the_device() -> None:
     with pytest.raises(LinkMissing):
         await reset(line, SETTINGS)
 
-
-@in_loop
-async def test_cancelled_while_it_is_held() -> None:
     line = MemoryOutput()
     line.open()
     held = asyncio.Event()
 
-    async def sleep(_seconds: float) -> None:
+    async def hold(_seconds: float) -> None:
         held.set()
         await asyncio.Event().wait()
 
-    task = asyncio.create_task(reset(line, SETTINGS, sleep))
+    task = asyncio.create_task(reset(line, SETTINGS, hold))
     await asyncio.wait_for(held.wait(), 10)
     assert line.active
     task.cancel()
@@ -158,7 +155,7 @@ def test_the_line_is_kept_inactive_and_left_so() -> None:
 
 
 @in_loop
-async def test_a_busy_line_is_reported_once_and_opened_again() -> None:
+async def test_a_line_that_is_busy_or_fails_when_it_is_driven_is_reported_and_opened_again() -> None:
     it = Scene()
     it.line.open_error = LinkBusy("in use by gpioset")
     for _ in range(6):
@@ -172,9 +169,6 @@ async def test_a_busy_line_is_reported_once_and_opened_again() -> None:
     assert it.line.is_open
     assert not it.reset.problem
 
-
-@in_loop
-async def test_a_line_that_fails_when_it_is_driven() -> None:
     it = Scene()
     it.tick()
     it.line.set_error = LinkMissing("gone")

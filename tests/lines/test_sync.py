@@ -5,16 +5,8 @@ from collections.abc import Sequence
 
 import pytest
 
-from imud.contracts.lines import (
-    TRIGGER_VERB,
-    DeviceLines,
-    DividedOptions,
-    Edge,
-    InputOptions,
-    PpsOptions,
-    SoutOptions,
-    TriggerOptions,
-)
+from imud.contracts import lines as contract
+from imud.contracts.lines import DeviceLines, DividedOptions, Edge, InputOptions, SoutOptions
 from imud.lines.sync import LineVerbs, SyncSignals
 from imud.model.errors import BadArgument, CommandError, LinkBusy, LinkError
 from imud.model.event import EventKind
@@ -28,8 +20,8 @@ RETRY_NS = 5 * 10**9
 ALARM_STATUS = 1 << 31  # docs/lines.md
 
 ALL = DeviceLines(
-    sout=SoutOptions(line="A"), sout_div=DividedOptions(line="B"), pps=PpsOptions(line="C"),
-    alarm=InputOptions(line="D"), sin=TriggerOptions(line="E", rate_hz=0, pulse_ms=2),
+    sout=SoutOptions(line="A"), sout_div=DividedOptions(line="B"), pps=contract.PpsOptions(line="C"),
+    alarm=InputOptions(line="D"), sin=contract.TriggerOptions(line="E", rate_hz=0, pulse_ms=2),
 )  # fmt: skip
 
 
@@ -116,13 +108,13 @@ async def test_one_edge_by_command_where_there_is_sin() -> None:
     bench = SyncBench()
     assert bench.signals.can_trigger
     verbs = LineVerbs(None, bench.signals)
-    assert [*verbs.rows] == [TRIGGER_VERB]
+    assert [*verbs.rows] == [contract.TRIGGER_VERB]
     with pytest.raises(CommandError, match="trigger: bow sin is not driven"):
-        await verbs.run(TRIGGER_VERB, {})
+        await verbs.run(contract.TRIGGER_VERB, {})
     bench.start()
     with pytest.raises(BadArgument, match="pulse_ms"):
-        await verbs.run(TRIGGER_VERB, {"pulse_ms": 1})
-    await verbs.run(TRIGGER_VERB, {})
+        await verbs.run(contract.TRIGGER_VERB, {"pulse_ms": 1})
+    await verbs.run(contract.TRIGGER_VERB, {})
     (worker,) = bench.workers
     worker.work()
     for _ in range(2):

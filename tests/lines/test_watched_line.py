@@ -34,7 +34,7 @@ class Watched:
 
 
 @in_loop
-async def test_it_is_opened_at_once_and_its_level_read_again_after_lost_edges() -> None:
+async def test_it_is_opened_at_once_its_level_is_read_after_lost_edges_and_the_tick_delivers() -> None:
     it = Watched()
     it.watched.drain()  # no edges before it is open
     it.watched.tick(0)
@@ -55,6 +55,14 @@ async def test_it_is_opened_at_once_and_its_level_read_again_after_lost_edges() 
     it.watched.tick(1)
     it.watched.tick(2)
     assert it.levels == [False, True]
+
+    it = Watched(watch=False)
+    it.watched.tick(0)
+    it.line.edge(10, True)
+    await asyncio.sleep(0)
+    assert it.edges == []
+    it.watched.tick(1)
+    assert it.edges == [Edge(10, True, 1)]
 
 
 @in_loop
@@ -93,31 +101,11 @@ async def test_a_line_that_goes_has_no_level_and_comes_back() -> None:
     assert it.edges == [Edge(30, False, 2)]  # the numbers continue: a lost edge is visible
 
 
-@in_loop
-async def test_edges_of_a_line_that_is_not_watched_are_delivered_by_the_tick() -> None:
-    it = Watched(watch=False)
-    it.watched.tick(0)
-    it.line.edge(10, True)
-    await asyncio.sleep(0)
-    assert it.edges == []
-    it.watched.tick(1)
-    assert it.edges == [Edge(10, True, 1)]
-
-
 class Unstartable(MemoryInput):
     """A line that opens and then fails to start."""
 
     def start(self, on_edges: OnEdges, on_end: OnLineEnd, watch: bool = True) -> None:
         raise LinkError("it does not start")
-
-
-@in_loop
-async def test_a_line_that_cannot_start_is_closed_and_tried_again() -> None:
-    it = Watched(Unstartable())
-    for now_ns in (0, RETRY_NS):
-        it.watched.tick(now_ns)
-        assert not it.line.is_open
-    assert (it.reports, it.levels) == (["it does not start"], [])
 
 
 class Blind(MemoryInput):
@@ -126,7 +114,13 @@ class Blind(MemoryInput):
 
 
 @in_loop
-async def test_a_failed_read_of_the_level_closes_the_line() -> None:
+async def test_a_line_that_cannot_start_or_whose_level_cannot_be_read_is_closed() -> None:
+    it = Watched(Unstartable())
+    for now_ns in (0, RETRY_NS):
+        it.watched.tick(now_ns)
+        assert not it.line.is_open
+    assert (it.reports, it.levels) == (["it does not start"], [])
+
     it = Watched(Blind())
     it.watched.tick(it.clock.now_ns())
     assert not it.line.is_open

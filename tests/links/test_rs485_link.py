@@ -119,6 +119,8 @@ def test_modules_of_a_line_share_its_port(tmp_path: Path, chunk_bytes: int) -> N
                 ExitStack() as s,
             ):
                 s.enter_context(opened(path, ports, 3, **more))
+        with opened(path, ports, 3):
+            pass
         two.close()
         open_port(str(path), BAUD, PROC).close()
 

@@ -1,10 +1,12 @@
-"""Holds of a CAN link, on a socket of another family with the same reads, time stamps and event loop."""
+"""Holds of a CAN link, on a socket of another family with the same reads, time stamps and event loop. Network
+interfaces: a file tree and prepared netlink replies. Cyclic sending by the kernel, and by a timer of the event loop."""
 
 import asyncio
 import errno
 import os
 import select
 import socket
+import struct
 import time
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextlib import closing
@@ -12,18 +14,14 @@ from pathlib import Path
 
 import pytest
 
-from imud.formats.can import RAW_FRAME, CanFrame, pack_frame
-from imud.links import netlink
-from imud.links.socketcan import (
-    SO_TIMESTAMPNS_NEW,
-    BusState,
-    ControllerState,
-    FrameReader,
-    SocketCanLink,
-    SocketCanOptions,
-)
+from imud.formats.can import RAW_FRAME, CanFrame, CyclicFrame, pack_frame
+from imud.links import netlink, socketcan
+from imud.links.cyclic_sender import LoopSender, setup
+from imud.links.netlink import CanDetails, absence, can_details, can_interfaces, parse_details, wait_until
+from imud.links.socketcan import BusState, ControllerState, FrameReader, SocketCanLink, SocketCanOptions
 from imud.model.errors import LinkError, LinkMissing
 from tests.support.daemon_process import LIMIT_S
+from tests.support.event_loops import in_loop
 
 GATHER_MS = 10  # hold of frames
 
@@ -478,7 +476,10 @@ def test_limits_of_a_step_and_of_a_backlog(wire: Wire) -> None:
 
     def stamps(offset_ns: int, now_ns: int, *times_ns: int) -> list[int]:
         reader = FrameReader(wire.receiver, BusState("can0"), lambda: 0, lambda: 0)
-        rows = [((1, 0, bytes(8)), (SO_TIMESTAMPNS_NEW, 0, t_ns, 0, 0)) for t_ns in (20_000_000 + offset_ns, *times_ns)]
+        rows = [
+            ((1, 0, bytes(8)), (socketcan.SO_TIMESTAMPNS_NEW, 0, t_ns, 0, 0))
+            for t_ns in (20_000_000 + offset_ns, *times_ns)
+        ]
         return [frame.t_rx_ns for frame in reader._decoded(rows, offset_ns, now_ns)][1:]
 
     assert stamps(99_999, 21_000_000, 20_050_000) == [20_000_000]
@@ -502,3 +503,117 @@ def test_clocks_that_are_always_read_apart_give_the_closest_of_some_readings(wir
     (frame,) = reader.read()
     assert before_ns - 15_000 <= frame.t_rx_ns <= after_ns + 15_000
     assert not list(calls), "three readings, because each needs more than 20 us"
+
+
+def interface(sys: Path, name: str, kind: int, flags: int) -> None:
+    folder = sys / "class/net" / name
+    folder.mkdir(parents=True)
+    (folder / "type").write_text(f"{kind}\n")
+    (folder / "flags").write_text(f"{flags:#x}\n")
+
+
+def test_absence_says_what_to_do(tmp_path: Path) -> None:
+    interface(tmp_path, "can0", 280, 0x40081)
+    interface(tmp_path, "can1", 280, 0x40080)
+    interface(tmp_path, "eth0", 1, 0x1003)
+    assert absence("can0", tmp_path) == ""
+    assert "can1 is down" in absence("can1", tmp_path)
+    assert "can9 does not exist" in absence("can9", tmp_path)
+    with pytest.raises(LinkError, match="eth0 is not a CAN interface"):
+        absence("eth0", tmp_path)
+    assert can_interfaces(tmp_path) == ["can0"]
+    assert can_interfaces(tmp_path / "none") == []
+
+
+def attribute(kind: int, data: bytes) -> bytes:
+    return struct.pack("=HH", 4 + len(data), kind) + data + bytes(-len(data) % 4)
+
+
+def answer(info: bytes) -> bytes:
+    body = bytes(16) + attribute(3, b"can0\0") + (attribute(18, info) if info else b"")
+    return struct.pack("=IHHII", 16 + len(body), 16, 0, 1, 0) + body
+
+
+def test_details_of_an_interface(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits_s: list[float] = []
+    monkeypatch.setattr(socket.socket, "settimeout", lambda _socket, limit_s: limits_s.append(limit_s))
+    timing = struct.pack("=8I", 250_000, 875, 0, 0, 0, 0, 0, 0)
+    data = attribute(1, timing) + attribute(4, struct.pack("=I", 3))
+    info = attribute(1, b"can\0") + attribute(2, data)
+    assert parse_details(answer(info)) == CanDetails(250_000, 3)
+    assert parse_details(answer(attribute(1, b"vcan\0"))) == CanDetails(None, None)
+    assert parse_details(answer(b"")) == CanDetails(None, None)
+    assert parse_details(struct.pack("=IHHIIi", 20, 2, 0, 1, 0, -19)) == CanDetails(None, None)
+    assert parse_details(answer(attribute(2, b"\1\0\1\0"))[:-1]) == CanDetails(None, None)
+    assert (can_details("lo"), limits_s) == (CanDetails(None, None), [1])
+    with pytest.raises(LinkError, match="nosuch0"):
+        can_details("nosuch0")
+
+
+@in_loop
+async def test_a_wait_ends_without_a_reader() -> None:
+    held = iter([False, True])
+    waiting = asyncio.create_task(wait_until(lambda: next(held)))
+    await asyncio.sleep(0)
+    waiting.cancel()
+    await asyncio.gather(waiting, return_exceptions=True)
+    await wait_until(lambda: next(held))
+
+
+MS = 1_000_000
+SYNC = CyclicFrame(0x80, False, b"\7", 10 * MS)
+
+
+def test_the_message_to_the_broadcast_manager() -> None:
+    """`struct bcm_msg_head` of linux/can/bcm.h on a 64-bit system has 56 bytes. The frame follows."""
+    if struct.calcsize("P") != 8:
+        pytest.skip("laid out otherwise")
+    message = setup(CyclicFrame(0x18FEE9AA, True, b"\1\2", 1_002_500_000))
+    assert len(message) == 56 + RAW_FRAME.size
+    head = struct.unpack("=IIIIqqqqII", message[:56])
+    assert head == (1, 3, 0, 0, 0, 0, 1, 2500, 0x98FEE9AA, 1)
+    assert message[56:] == pack_frame(0x18FEE9AA, True, b"\1\2")
+
+
+def run(late_ns: list[int], *, fail_after: int = 1 << 30) -> tuple[list[int], list[str]]:
+    """Send; each timer fires late by the next of `late_ns`. Return the times of the frames and the reported errors."""
+    now_ns, sent_at, errors = 0, list[int](), list[str]()
+
+    async def story() -> None:
+        loop, done = asyncio.get_running_loop(), asyncio.Event()
+
+        class Link:
+            def write(self, data: bytes) -> None:
+                if len(sent_at) >= fail_after:
+                    raise LinkError("full")
+                assert data == pack_frame(0x80, False, b"\7")
+                sent_at.append(now_ns)
+
+            def sender_failed(self, error: LinkError) -> None:
+                errors.append(str(error))
+                done.set()
+
+        def call_later(delay_s: float, callback: object, *arguments: object) -> asyncio.TimerHandle:
+            nonlocal now_ns
+            if not late_ns:
+                done.set()
+                return loop_call_later(0, lambda: None)
+            now_ns += round(delay_s * 1e9) + late_ns.pop(0)
+            return loop_call_later(0, callback, *arguments)  # type: ignore[arg-type]  # as it was given
+
+        loop_call_later = loop.call_later
+        loop.call_later = call_later  # type: ignore[assignment]  # the test's own time
+        sender = LoopSender(Link(), [SYNC], lambda: now_ns)
+        await done.wait()
+        sender.close()
+        sender.close()
+
+    asyncio.run(story())
+    return [sent_ns // MS for sent_ns in sent_at], errors
+
+
+def test_deadlines_are_absolute_and_a_failed_link_ends_them() -> None:
+    assert run([3 * MS, 0, 9 * MS, 0]) == ([0, 13, 20, 39, 40], [])
+    assert run([35 * MS, 0]) == ([0, 45, 50], [])
+    assert run([-MS, 0, 0]) == ([0, 10, 20], []), "a timer that fires early waits on"
+    assert run([0] * 5, fail_after=2) == ([0, 10], ["full"])
