@@ -178,9 +178,6 @@ def test_two_names_of_one_port_are_one_port(tmp_path: Path) -> None:
     assert f"expected an unused port, got {late}; a (line 2) uses it" in found
 
 
-# ruff: noqa: E501 - a row of the table has the whole message
-
-
 TABLES = Tables({"fake-module": FAKE_MODULE_DRIVER, "fake-uart": FAKE_DRIVER}, {"wire": fake_row(PortSettings)}, {})
 HEAD = "devices:\n  bow:\n    driver: {driver}\n    wire: {{port: x, baud: {baud}}}\n"
 
@@ -198,17 +195,13 @@ def test_declared_values_and_their_changes() -> None:
     assert device.on_difference is OnDifference.APPLY_AND_SAVE
     for values, baud in (("baud: 921600", "auto"), ("baud: 115200", "115200"), ("output: {a: 1000, b: 500}", "auto")):
         assert parse(f"settings: {{{values}}}", baud=baud).devices[0].declared is not None
+    for lines in ([], ["settings:"], ["settings: {}"], ["settings: {mode: null}"]):
+        (device,) = parse(*lines).devices
+        assert (declared_values(device.declared), device.on_difference) == ({}, OnDifference.REPORT)
     old = parse("settings: {mode: 9-axis}")
     assert differences(old, parse("settings: {mode: 6-axis}")).devices_changed == ("bow",)
     assert differences(old, parse("settings: {mode: 9-axis}", "on_difference: apply")).devices_changed == ("bow",)
     assert str(differences(old, parse("settings: {mode: 9-axis}"))) == "nothing differs"
-
-
-@pytest.mark.parametrize("lines", [[], ["settings:"], ["settings: {}"], ["settings: {mode: null}"]])
-def test_nothing_is_declared(lines: list[str]) -> None:
-    (device,) = parse(*lines).devices
-    assert declared_values(device.declared) == {}
-    assert device.on_difference is OnDifference.REPORT
 
 
 @pytest.mark.parametrize(

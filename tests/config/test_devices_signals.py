@@ -21,6 +21,9 @@ def parse(*devices: str) -> tuple[DeviceConfig, ...]:
     return config.parse("devices:\n" + text, "f").devices
 
 
+HIPNUC = "driver: hipnuc-uart, uart: {port: x}"
+
+
 def hipnuc(lines: str, port: str = "x") -> str:
     return f"driver: hipnuc-uart, uart: {{port: {port}}}, lines: {{{lines}}}"
 
@@ -54,13 +57,17 @@ def test_every_line() -> None:
     )
 
 
-def test_defaults() -> None:
+def test_defaults_and_lines_of_drivers() -> None:
     reset = contracts_lines.ResetOptions(line="R")
     assert (reset.active_low, reset.hold_ms, reset.wait_s, reset.open_drain) == (True, 10.0, 3.0, False)
     assert contracts_lines.DividedOptions(line="D").divisor == 8
     assert not contracts_lines.TriggerOptions(line="S").active_low
     for keys in ("driver: hipnuc-uart, uart: {port: x}", hipnuc("")):
         assert parse(keys)[0].lines is None
+    for name, driver in DRIVERS.items():
+        assert driver.lines <= set(contracts_lines.LINE_SCHEMAS), name
+    assert DRIVERS["hipnuc-uart"].lines == {"sout", "sout_div", "sin", "alarm", "pps"}
+    assert DRIVERS["imu61x-i2c"].lines == {"reset", "data_ready"}
 
 
 @pytest.mark.parametrize(
@@ -96,10 +103,19 @@ def test_defaults() -> None:
         # a device that imud triggers has no pulse per second
         (hipnuc("sin: {line: GPIO17}") + ", rmc: {source: gpsd}", "2:75: devices.a.rmc: expected the pulse per second of a receiver on SIN with rmc, got lines.sin, with which imud drives SIN (line 2); remove one of the keys"),
         (hipnuc("")[:-2] + "5", "devices.a.lines: expected keys and values, got 5"),
+        (HIPNUC + ", rmc: {}", "expected the key source"),
+        (HIPNUC + ", rmc: {source: ntp}", 'expected one of "gpsd", "nmea", "system"'),
+        (HIPNUC + ", rmc: {source: nmea}", "expected the key port for source nmea"),
+        (HIPNUC + ", rmc: {source: gpsd, rate_hz: 11}", "rate_hz"),
+        (HIPNUC + ", rmc: {source: gpsd, rate_hz: 0}", "rate_hz"),
+        (HIPNUC + ", rmc: {source: gpsd, tcp_port: 0}", "tcp_port"),
+        (HIPNUC + ", rmc: {source: gpsd, error_ms: .nan}", "error_ms"),
+        (HIPNUC + ", rmc: {source: gpsd, speed: 1}", "speed"),
     ],
 )  # fmt: skip
 def test_refusals(keys: str, message: str) -> None:
     (found,) = errors(keys)
+    assert found.startswith("2:")
     assert message in found
 
 
@@ -142,19 +158,6 @@ def test_a_changed_line_is_a_changed_device() -> None:
     assert config.differences(before, after).devices_changed == ("a",)
 
 
-def test_drivers_have_lines_that_there_are() -> None:
-    for name, driver in DRIVERS.items():
-        assert driver.lines <= set(contracts_lines.LINE_SCHEMAS), name
-    assert DRIVERS["hipnuc-uart"].lines == {"sout", "sout_div", "sin", "alarm", "pps"}
-    assert DRIVERS["imu61x-i2c"].lines == {"reset", "data_ready"}
-
-
-# --- the source of RMC sentences --------------------------------------------------------------------------------------
-
-
-HIPNUC = "driver: hipnuc-uart, uart: {port: x}"
-
-
 @pytest.mark.parametrize(
     ("keys", "rmc"),
     [
@@ -169,36 +172,11 @@ HIPNUC = "driver: hipnuc-uart, uart: {port: x}"
 )  # fmt: skip
 def test_each_rmc_source(keys: str, rmc: RmcOptions | None) -> None:
     assert parse(keys)[0].rmc == rmc
-
-
-@pytest.mark.parametrize(
-    ("keys", "said"),
-    [
-        (HIPNUC + ", rmc: {}", "expected the key source"),
-        (HIPNUC + ", rmc: {source: ntp}", 'expected one of "gpsd", "nmea", "system"'),
-        (HIPNUC + ", rmc: {source: nmea}", "expected the key port for source nmea"),
-        (HIPNUC + ", rmc: {source: gpsd, rate_hz: 11}", "rate_hz"),
-        (HIPNUC + ", rmc: {source: gpsd, rate_hz: 0}", "rate_hz"),
-        (HIPNUC + ", rmc: {source: gpsd, tcp_port: 0}", "tcp_port"),
-        (HIPNUC + ", rmc: {source: gpsd, error_ms: .nan}", "error_ms"),
-        (HIPNUC + ", rmc: {source: gpsd, speed: 1}", "speed"),
-    ],
-)
-def test_what_is_wrong_with_an_rmc_source(keys: str, said: str) -> None:
-    (found,) = errors(keys)
-    assert found.startswith("2:")
-    assert said in found
-
-
-def test_every_source_has_its_row() -> None:
     assert set(RMC_SOURCES) == set(RmcOptions.__annotations__["source"].__args__)
-    assert all(callable(RMC_SOURCES[name]) for name in RMC_SOURCES)
+    assert all(map(callable, RMC_SOURCES.values()))
 
 
-@pytest.mark.parametrize("name", contracts_lines.LINE_SCHEMAS)
-def test_keys_of_a_line_accept_the_documented_values(name: str) -> None:
-    check_schema(f"Line `{name}`", contracts_lines.LINE_SCHEMAS[name])
-
-
-def test_deviations_are_above_zero() -> None:
+def test_keys_of_lines_and_deviations_accept_the_documented_values() -> None:
+    for name, schema in contracts_lines.LINE_SCHEMAS.items():
+        check_schema(f"Line `{name}`", schema)
     assert check_schema("Noise of a device", Deviations) == 6

@@ -2,6 +2,7 @@
 
 # ruff: noqa: E501 - a row of the table is a whole file and the whole message for it
 
+import builtins
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,7 +30,7 @@ from imud.contracts.setting import SettingsTable
 from imud.drivers import DRIVERS
 from imud.links import LINKS
 from imud.model.errors import ConfigError
-from imud.model.options import NoOptions, Options, got
+from imud.model.options import NoOptions, Options
 from imud.publishers import PUBLISHERS
 from tests.support.files import ROOT
 
@@ -145,7 +146,7 @@ def errors(text: str, tables: Tables = FAKE) -> list[str]:
     return str(caught.value).splitlines()
 
 
-def test_a_good_file() -> None:
+def test_a_good_file_and_defaults() -> None:
     assert parse(GOOD) == Config(
         log_level="debug",
         state_dir="/var/lib/imud",
@@ -159,9 +160,6 @@ def test_a_good_file() -> None:
         ),
         disabled=("spare",),
     )  # fmt: skip
-
-
-def test_defaults() -> None:
     made = parse("devices: {}")
     assert (made.log_level, made.state_dir, made.devices) == ("info", "/var/lib/imud", ())
     assert made.publishers == {"out": OutSettings(), "none": NoOptions()}
@@ -239,12 +237,6 @@ def test_a_problem_inside_of_a_value_has_its_own_key_and_place(text: str, line: 
     assert found.startswith("f.yaml:" + line)
 
 
-def test_all_problems_inside_of_a_value_are_reported() -> None:
-    text = "mqtt: {devices: {a: {whole: xml, batch_s: 0}, b: {event: 1}}}\ndevices: {}"
-    keys = [line.split(": ")[1] for line in errors(text, TABLES)]
-    assert keys == ["mqtt.devices.a.whole", "mqtt.devices.a.batch_s", "mqtt.devices.b.event"]
-
-
 def test_all_errors_are_reported_in_the_order_of_the_file() -> None:
     text = (
         "log_levle: info\nout: {path: 1, ids: no}\ndevices:\n  a: {port: {prot: x, baud: 1}}\n  B: {file: {path: x}}\n"
@@ -254,6 +246,9 @@ def test_all_errors_are_reported_in_the_order_of_the_file() -> None:
         ("1:1", "log_levle"), ("2:13", "out.path"), ("2:21", "out.ids"), ("4:7", "devices.a.port"),
         ("4:14", "devices.a.port.prot"), ("4:29", "devices.a.port.baud"), ("5:3", "devices.B"),
     ]  # fmt: skip
+    text = "mqtt: {devices: {a: {whole: xml, batch_s: 0}, b: {event: 1}}}\ndevices: {}"
+    keys = [line.split(": ")[1] for line in errors(text, TABLES)]
+    assert keys == ["mqtt.devices.a.whole", "mqtt.devices.a.batch_s", "mqtt.devices.b.event"]
 
 
 def test_names_and_number_of_devices() -> None:
@@ -345,16 +340,6 @@ def test_any_tree_is_a_configuration_or_a_config_error(tree: Any) -> None:
             assert line.startswith(("f:", "… and "))
 
 
-# --- words ------------------------------------------------------------
-
-
-def test_got() -> None:
-    assert [got(v) for v in (None, True, 1.5, "x", [1], {"a": 1})] == [
-        "nothing", "true", "1.5", '"x"', "a list", "keys and values",
-    ]  # fmt: skip
-    assert len(got("x" * 1000)) < 70
-
-
 # --- the shipped file, the documentation, the real tables --------------------
 
 
@@ -363,14 +348,9 @@ def uncommented(text: str) -> str:
     return re.sub(r"^( *)#(?=( {2})*([a-z_0-9]+|\"\*\"):)", r"\1", text, flags=re.MULTILINE)
 
 
-def test_shipped_file_loads() -> None:
-    made = config.load(SHIPPED)
-    assert [device.name for device in made.devices] == ["imu"]
-    assert set(made.publishers) == set(PUBLISHERS)
-
-
 def test_shipped_file_shows_the_defaults() -> None:
     plain, full = config.load(SHIPPED), config.parse(uncommented(SHIPPED.read_text()), "etc/imud.yaml")
+    assert ([device.name for device in plain.devices], set(plain.publishers)) == (["imu"], set(PUBLISHERS))
     assert full.publishers == plain.publishers
     assert (full.log_level, full.state_dir) == (plain.log_level, plain.state_dir)
     named = {device.name: device for device in full.devices}
@@ -398,7 +378,7 @@ def test_shipped_file_shows_the_defaults() -> None:
     assert set(shown) == set(LINE_SCHEMAS)
 
 
-def test_shipped_file_has_every_key() -> None:
+def test_shipped_file_has_every_key_of_every_row() -> None:
     tree = read_yaml(uncommented(SHIPPED.read_text()).encode())
     present = {
         tuple("NAME" if i and p[i - 1] == "devices" else part for i, part in enumerate(p)) for p in tree.keys
@@ -406,18 +386,12 @@ def test_shipped_file_has_every_key() -> None:
     for _title, path, schema in references.settings_parts():
         for field in schema.__struct_fields__:
             assert (*path.split(".")[:-1], field) in present, f"{path}{field} is missing in etc/imud.yaml"
-
-
-def test_every_row_is_configurable() -> None:
     titles = {path for _title, path, _schema in references.settings_parts()}
     assert {f"{name}." for name in PUBLISHERS} | {f"devices.NAME.{name}." for name in LINKS} <= titles
     assert TABLES.drivers is DRIVERS
 
 
 def test_loading_opens_only_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
-    import builtins
-    import os
-
     opened: list[object] = []
     for module, name in ((builtins, "open"), (os, "open"), (os, "stat")):
         original = getattr(module, name)

@@ -90,17 +90,11 @@ def test_other_messages_pass_immediately() -> None:
         assert passed(repeats, 0, "%s: up", "bow", level=logging.INFO)
     assert passed(repeats, -100, "%s: %d lost", "bow", 1)  # the clock was set back
     assert passed(repeats, 0, "nothing %s", 5)
-
-
-def test_texts_differ_except_for_numbers() -> None:
     repeats, told = host_log.RepeatFilter(), []
     for text in ("3 samples lost", "5 samples lost", "the adapter is gone"):
         values = {"msg": "%s: %s", "args": ("bow", text), "levelno": logging.WARNING, "created": 0.0}
         told.append(repeats.filter(logging.makeLogRecord(values | host_log.same_as(text))))
     assert told == [True, False, True]
-
-
-def test_remembered_messages_are_bounded() -> None:
     repeats = host_log.RepeatFilter()
     for number in range(513):
         assert passed(repeats, 0, f"message {number}")
@@ -119,12 +113,16 @@ def test_printable_is_one_bounded_line_for_every_encoding(text: str) -> None:
     line.encode("utf-8")
 
 
-def test_printable_marks_a_cut() -> None:
+def test_printable_marks_a_cut_and_shown_is_a_literal_where_it_fits() -> None:
     assert host_log.printable("Überseeschiff 3 °C") == "Überseeschiff 3 °C"
     assert host_log.printable("a\nb\x1b\udc80\u202e") == r"a\nb\x1b\udc80\u202e"
     assert host_log.printable("x" * 201) == "x" * 199 + "…"
     assert host_log.printable("x" * 300, 10) == "x" * 9 + "…"
     assert host_log.printable("\n" * 6, 10) == r"\n\n\n\n\n"[:9] + "…"
+    assert host_log.shown({"rate_hz": 100, "name": "a'b"}) == """{'name': "a'b", 'rate_hz': 100}"""
+    assert host_log.shown(list(range(12))) == "[0, 1, 2, 3, 4, 5, 6, 7, 8, 9, ...]"
+    assert host_log.shown(b"\x01") == r"b'\x01'"
+    assert host_log.shown(nested(100_001)) == "{'a': [{'a': [{...}]}]}"
 
 
 class Unshowable:
@@ -142,13 +140,6 @@ def test_shown_is_one_bounded_line_of_any_value(value: object) -> None:
     line = host_log.shown(value)
     assert line.isprintable()
     assert len(line) <= 200
-
-
-def test_shown_is_a_literal_where_it_fits_and_has_the_outer_levels_of_a_deep_value() -> None:
-    assert host_log.shown({"rate_hz": 100, "name": "a'b"}) == """{'name': "a'b", 'rate_hz': 100}"""
-    assert host_log.shown(list(range(12))) == "[0, 1, 2, 3, 4, 5, 6, 7, 8, 9, ...]"
-    assert host_log.shown(b"\x01") == r"b'\x01'"
-    assert host_log.shown(nested(100_001)) == "{'a': [{'a': [{...}]}]}"
 
 
 # --- messages ---------------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from imud.model.ledger import LEDGER_FIELDS, Ledger, bytes_open, frames_open, lost
 
 
-def test_new_ledger_is_zero_and_closes_and_a_snapshot_is_a_copy() -> None:
+def test_every_byte_and_every_good_frame_must_be_somewhere() -> None:
     ledger = Ledger()
     assert ledger.closes()
     assert set(ledger.values()) == {0}
@@ -11,9 +11,6 @@ def test_new_ledger_is_zero_and_closes_and_a_snapshot_is_a_copy() -> None:
     assert tuple(before) == LEDGER_FIELDS
     ledger.samples += 1
     assert (before["samples"], ledger.snapshot()["samples"]) == (0, 1)
-
-
-def test_every_byte_and_every_good_frame_must_be_somewhere() -> None:
     ledger = Ledger()
     ledger.bytes_in = 100
     assert ledger.bytes_open() == bytes_open(ledger.snapshot()) == 100
@@ -25,9 +22,6 @@ def test_every_byte_and_every_good_frame_must_be_somewhere() -> None:
     assert not ledger.closes()
     ledger.frames_in_samples, ledger.frames_in_replies, ledger.frames_ignored, ledger.frames_pending = 4, 3, 2, 1
     assert ledger.closes()
-
-
-def test_sums_by_reason_and_cause() -> None:
     ledger = Ledger()
     ledger.frames_bad_crc, ledger.frames_bad_length, ledger.frames_bad_content = 1, 2, 4
     assert ledger.frames_bad() == 7

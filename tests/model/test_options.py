@@ -127,12 +127,11 @@ def test_the_place_of_a_wrong_part(value: object, field_type: Any, place: str) -
     assert value_problem(value, field_type).endswith(place)
 
 
-def test_texts_in_errors_are_short_and_printable() -> None:
+def test_the_text_of_a_value_is_short_and_printable_and_a_text_can_be_json() -> None:
     assert got("a" * 60) == got("a" * 61) == '"' + "a" * 60 + '"'
+    words = ["nothing", "true", "1.5", '"x"', "a list", "keys and values"]
+    assert [got(v) for v in (None, True, 1.5, "x", [1], {"a": 1})] == words
     assert got("é\u2028\x9f") == '"é\\u2028\\u009f"'
-
-
-def test_text_of_the_command_line_is_json_or_text() -> None:
     texts = ("1", "true", "[1]", '"1"', "6-axis", "")
     assert [json_or_text(text) for text in texts] == [1, True, [1], "1", "6-axis", ""]
 

@@ -19,13 +19,10 @@ def test_units_by_their_definitions() -> None:
     assert [units.uart_byte_ns(baud) for baud in (0, 9600, 1_000_000)] == [0, 1_041_666, 10_000], "10 bits per byte"
 
 
-def test_every_member_has_its_row_in_its_place() -> None:
+def test_every_member_has_its_row_in_its_place_with_its_meaning() -> None:
     assert tuple(BY_NAME) == SAMPLE_FIELDS
     optional = SAMPLE_FIELDS[-len(Sample.__struct_defaults__) :]
     assert [name for name, field in BY_NAME.items() if not field.always] == list(optional)
-
-
-def test_meanings_of_fields() -> None:
     assert ALARM_STATUS == 1 << 31
     assert "bit 31" in BY_NAME["status"].meaning
     meaning = BY_NAME["edge_seq"].meaning
@@ -33,9 +30,6 @@ def test_meanings_of_fields() -> None:
     assert "trigger on SIN" in meaning
     assert "PPS" not in meaning
     assert (BY_NAME["pps_age_ms"].unit, BY_NAME["pps_age_ms"].frame) == ("ms", "device clock")
-
-
-def test_the_largest_time_stamp_error_fits_into_32_bits() -> None:
     assert struct.pack("<I", T_ERR_MOST) == b"\xff" * 4
     with pytest.raises(struct.error):
         struct.pack("<I", T_ERR_MOST + 1)
