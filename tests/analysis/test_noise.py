@@ -7,23 +7,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, lfilter
 
-from imud.analysis.noise import (
-    BIAS_FACTOR,
-    NoiseTerms,
-    NoiseType,
-    allan_curve,
-    averaging_factors,
-    basis,
-    corner_of,
-    degrees_of_freedom,
-    interval,
-    motion_words,
-    noise_terms,
-    noise_types,
-    sensor_noise,
-    step_of,
-    temperature_drift,
-)
+from imud.analysis import noise as analysis_noise
 from imud.analysis.series import FloatArray, Readings
 from imud.analysis.spectrum import Spectrum, power_spectrum
 from imud.model.errors import BadArgument
@@ -45,7 +29,7 @@ def noise_of_three(seed: int, n: float = 1e-3, count: int = COUNT) -> FloatArray
 
 def test_white_noise_of_three_axes() -> None:
     values = noise_of_three(1) + np.array([0.1, -0.2, 0.3])
-    found = sensor_noise(readings_of(values), values)
+    found = analysis_noise.sensor_noise(readings_of(values), values)
     for axis, mean in zip(found.axes, (0.1, -0.2, 0.3), strict=True):
         assert axis.terms.random_walk.value == pytest.approx(1e-3, rel=0.05)
         assert axis.density == pytest.approx(np.sqrt(2) * 1e-3, rel=0.05), "one-sided: √2 N"
@@ -67,21 +51,21 @@ def test_missing_samples_and_filters_do_not_change_the_coefficients() -> None:
     keep = np.sort(random.choice(COUNT, round(COUNT * 0.99), replace=False))
     keep = keep[(keep < 20_000) | (keep > 20_500)]
     readings = Readings(stamps_ns(COUNT, RATE_HZ)[keep], values[keep], None, None)
-    found = sensor_noise(readings, values[keep])
+    found = analysis_noise.sensor_noise(readings, values[keep])
     assert found.grid.missing == COUNT - len(keep) - (COUNT - 1 - keep[-1]) - keep[0]
     assert len(found.grid.runs) == 2
     for axis in found.axes:
         assert axis.terms.random_walk.value == pytest.approx(1e-3, rel=0.05)
     b, a = butter(1, 20.0, fs=RATE_HZ)
     values = lfilter(b, a, noise_of_three(3), axis=0)
-    found = sensor_noise(readings_of(values), values)
+    found = analysis_noise.sensor_noise(readings_of(values), values)
     assert found.corner_hz == pytest.approx(20.0, rel=0.35)
     assert found.tau_least_s == pytest.approx(5 / (found.corner_hz or 1))
     for axis in found.axes:
         assert axis.terms.random_walk.value == pytest.approx(1e-3, rel=0.07)
     for seed in [4, 5]:
         walk = three(random_walk(np.random.default_rng(seed), COUNT, RATE_HZ, 1.0))
-        assert corner_of(power_spectrum([walk], RATE_HZ)) is None
+        assert analysis_noise.corner_of(power_spectrum([walk], RATE_HZ)) is None
 
 
 @pytest.mark.parametrize(("rise_hz", "drop_hz", "corner_hz"), [(0, 5, 5.0), (0, 4, None), (3, 33, 33.0), (3, 24, None)])
@@ -92,13 +76,15 @@ def test_a_corner_needs_four_flat_bands_below_and_uses_eight(
     frequency_hz = np.arange(1025.0)
     density = np.where(frequency_hz < drop_hz, 1.0, 0.1)
     density[: rise_hz + 1] = 100.0
-    assert corner_of(Spectrum(2048.0, frequency_hz, density[:, None], "hann", 2048, 1.5, 1, 0)) == corner_hz
+    assert (
+        analysis_noise.corner_of(Spectrum(2048.0, frequency_hz, density[:, None], "hann", 2048, 1.5, 1, 0)) == corner_hz
+    )
 
 
 def test_drift_with_temperature() -> None:
     temperature = np.linspace(20.0, 40.0, COUNT)
     values = noise_of_three(6, 1e-4) + np.outer(temperature - 30, [1e-3, 0.0, -2e-3])
-    found = sensor_noise(readings_of(values, np.round(temperature)), values)
+    found = analysis_noise.sensor_noise(readings_of(values, np.round(temperature)), values)
     slopes = [axis.drift for axis in found.axes]
     assert slopes[0] is not None
     assert slopes[1] is not None
@@ -110,16 +96,19 @@ def test_drift_with_temperature() -> None:
     assert slopes[2].slope == pytest.approx(-2e-3, rel=0.02)
     noise = noise_of_three(7)[:, 0]
     for span_c, samples in ((1.9, COUNT), (20.0, 1599)):  # at least 2 K and 8 s
-        assert temperature_drift(np.linspace(20, 20 + span_c, samples), noise[:samples], RATE_HZ) is None
+        assert analysis_noise.temperature_drift(np.linspace(20, 20 + span_c, samples), noise[:samples], RATE_HZ) is None
     for span_c, samples in ((2.1, COUNT), (20.0, 1600)):
-        assert temperature_drift(np.linspace(20, 20 + span_c, samples), noise[:samples], RATE_HZ) is not None
-    halves = temperature_drift(np.linspace(20, 40, 4000), np.tile([0.0, 1.0], 2000), 1.0)
+        assert (
+            analysis_noise.temperature_drift(np.linspace(20, 20 + span_c, samples), noise[:samples], RATE_HZ)
+            is not None
+        )
+    halves = analysis_noise.temperature_drift(np.linspace(20, 40, 4000), np.tile([0.0, 1.0], 2000), 1.0)
     assert halves is not None
     assert halves.sigma == pytest.approx(0.0, abs=1e-12), "at most 2000 means: each of two samples"
     temperature = np.full(COUNT, np.nan)
     temperature[:: int(RATE_HZ)] = np.linspace(20.0, 40.0, COUNT // int(RATE_HZ))
     values = noise_of_three(8, 1e-4) + np.outer(np.linspace(-10, 10, COUNT), [1e-3] * 3)
-    drift = sensor_noise(readings_of(values, temperature), values).axes[0].drift
+    drift = analysis_noise.sensor_noise(readings_of(values, temperature), values).axes[0].drift
     assert drift is not None
     assert drift.slope == pytest.approx(1e-3, rel=0.02)
 
@@ -130,7 +119,7 @@ def test_the_figures_of_a_filtered_walking_and_drifting_sensor() -> None:
     values = lfilter(*butter(1, 20.0, fs=RATE_HZ), noise_of_three(11), axis=0)
     values += 3e-4 * three(random_walk(np.random.default_rng(12), COUNT, RATE_HZ, 1.0))
     values += np.outer(temperature - 30, [1e-3, 0.0, -2e-3])
-    found = sensor_noise(readings_of(values, np.round(temperature)), values)
+    found = analysis_noise.sensor_noise(readings_of(values, np.round(temperature)), values)
     curve, axis = found.curve, found.axes[0]
     assert axis.drift is not None
     assert (found.corner_hz, found.tau_least_s) == pytest.approx((20.458984375, 0.24439140811), rel=1e-4)
@@ -159,11 +148,11 @@ def test_disturbances_and_counts() -> None:
     values[30_000:30_400] += np.sin(np.arange(400))[:, None]
     values[40_000:40_200] *= 5
     values[50_000:50_200] *= 3
-    assert sensor_noise(readings_of(values), values).disturbed_s == 4
+    assert analysis_noise.sensor_noise(readings_of(values), values).disturbed_s == 4
     values = np.round(noise_of_three(10) / 1.065e-3) * 1.065e-3
-    assert step_of(values) == pytest.approx(1.065e-3)
-    assert step_of(noise_of_three(10)) is None
-    assert step_of(np.zeros((100, 3))) is None
+    assert analysis_noise.step_of(values) == pytest.approx(1.065e-3)
+    assert analysis_noise.step_of(noise_of_three(10)) is None
+    assert analysis_noise.step_of(np.zeros((100, 3))) is None
 
 
 SECONDS = np.arange(COUNT) / RATE_HZ
@@ -193,36 +182,33 @@ def shaken(amplitude: float, frequency_hz: float, offset: float = 0.0) -> FloatA
 def test_rest_has_limits_that_do_not_depend_on_the_motion(
     gyro: FloatArray | None, accel: FloatArray | None, words: str
 ) -> None:
-    found = motion_words(Readings(stamps_ns(COUNT, RATE_HZ), gyro, accel, None))
+    found = analysis_noise.motion_words(Readings(stamps_ns(COUNT, RATE_HZ), gyro, accel, None))
     assert found.startswith(words) if words else not found
 
 
 def test_one_weakly_disturbed_second_in_a_hundred_seconds_is_no_motion() -> None:
     gyro = noise_of_three(8, count=20_000)
     gyro[:200] += 0.03
-    assert not motion_words(readings_of(gyro))
+    assert not analysis_noise.motion_words(readings_of(gyro))
     gyro[:40] += 0.35  # a strong bump increases the standard deviation of all samples by more than 10 %
-    assert "in 1 of 100 seconds" in motion_words(readings_of(gyro))
+    assert "in 1 of 100 seconds" in analysis_noise.motion_words(readings_of(gyro))
     gyro[:40] -= 0.35
     gyro[200:400] += 0.03
-    assert "in 2 of 100 seconds" in motion_words(readings_of(gyro))
+    assert "in 2 of 100 seconds" in analysis_noise.motion_words(readings_of(gyro))
 
 
-ALPHAS = {
-    NoiseType.QUANTISATION: 2, NoiseType.FLICKER_PHASE: 1, NoiseType.WHITE: 0, NoiseType.FLICKER: -1,
-    NoiseType.RATE_RANDOM_WALK: -2,
-}  # fmt: skip
+ALPHAS = {"QUANTISATION": 2, "FLICKER_PHASE": 1, "WHITE": 0, "FLICKER": -1, "RATE_RANDOM_WALK": -2}
 
 
 def test_a_deviation_and_an_interval_by_hand() -> None:
     rate = np.array([[1.0], [2.0], [4.0], [3.0]])  # differences of neighbours 1, 2, -1: 6 / (2 · 3) = 1
-    curve = allan_curve([rate], 1.0, np.array([1]))
+    curve = analysis_noise.allan_curve([rate], 1.0, np.array([1]))
     assert curve.deviation[0, 0] == pytest.approx(1.0)
     means = [1.5, 3.0, 3.5]  # averages of two samples, overlapping: the first and the last average differ by 2
-    curve = allan_curve([rate], 1.0, np.array([2]))
+    curve = analysis_noise.allan_curve([rate], 1.0, np.array([2]))
     assert curve.deviation[0, 0] == pytest.approx((means[2] - means[0]) / np.sqrt(2))
     # χ² of 10 degrees of freedom at 5 and 95 %: 3.940 and 18.307 (any table)
-    low, high = interval(np.array([1.0]), np.array([10.0]), confidence=0.9)
+    low, high = analysis_noise.interval(np.array([1.0]), np.array([10.0]), confidence=0.9)
     assert low[0] == pytest.approx(np.sqrt(10 / 18.307), rel=1e-4)
     assert high[0] == pytest.approx(np.sqrt(10 / 3.940), rel=1e-4)
 
@@ -231,7 +217,7 @@ def test_it_is_that_of_allantools() -> None:
     random = np.random.default_rng(1)
     rate_hz = 50.0
     one = white(random, 20_000, rate_hz, 0.1) + random_walk(random, 20_000, rate_hz, 0.02) + 9.81
-    curve = allan_curve([three(one)], rate_hz)
+    curve = analysis_noise.allan_curve([three(one)], rate_hz)
     tau_s, deviation, _, _ = allantools.oadev(one, rate=rate_hz, data_type="freq", taus=curve.tau_s)
     assert tau_s == pytest.approx(curve.tau_s)
     assert curve.deviation[:, 0] == pytest.approx(deviation, rel=1e-9)
@@ -241,27 +227,24 @@ def test_runs_are_taken_together_without_a_difference_across_the_gap() -> None:
     random = np.random.default_rng(3)
     first, second = white(random, 500, 1.0, 1.0)[:, None], white(random, 300, 1.0, 1.0)[:, None] + 1000.0
     factors = np.array([1, 10])
-    both = allan_curve([first, second], 1.0, factors).deviation[:, 0] ** 2
-    alone = [allan_curve([run], 1.0, factors).deviation[:, 0] ** 2 for run in (first, second)]
+    both = analysis_noise.allan_curve([first, second], 1.0, factors).deviation[:, 0] ** 2
+    alone = [analysis_noise.allan_curve([run], 1.0, factors).deviation[:, 0] ** 2 for run in (first, second)]
     counts = [np.array([len(run) + 1 - 2 * m for m in factors]) for run in (first, second)]
     assert both == pytest.approx((alone[0] * counts[0] + alone[1] * counts[1]) / (counts[0] + counts[1]))
-
-
-def test_runs_that_are_too_short_have_no_degrees_of_freedom() -> None:
     run = white(np.random.default_rng(4), 500, 1.0, 1.0)[:, None]
-    curve = allan_curve([run, run[:20], run[:19]], 1.0, np.array([10]))
-    noise = NoiseType(int(curve.types[0, 0]))
-    assert curve.freedom[0, 0] == sum(degrees_of_freedom(noise, 10, n) for n in (501, 21))
+    curve = analysis_noise.allan_curve([run, run[:20], run[:19]], 1.0, np.array([10]))
+    noise = analysis_noise.NoiseType(int(curve.types[0, 0]))
+    assert curve.freedom[0, 0] == sum(analysis_noise.degrees_of_freedom(noise, 10, n) for n in (501, 21))
 
 
-@pytest.mark.parametrize("noise", list(NoiseType))
+@pytest.mark.parametrize("noise", list(analysis_noise.NoiseType))
 @pytest.mark.parametrize(("m", "n"), [(1, 1001), (4, 1001), (100, 1001), (7, 50)])
-def test_degrees_of_freedom_are_those_of_allantools(noise: NoiseType, m: int, n: int) -> None:
-    if noise is NoiseType.FLICKER and m == 1:
+def test_degrees_of_freedom_are_those_of_allantools(noise: analysis_noise.NoiseType, m: int, n: int) -> None:
+    if noise is analysis_noise.NoiseType.FLICKER and m == 1:
         theirs = 2 * (n - 2) ** 2 / (2.3 * n - 4.9)  # SP 1065, table 5; allantools 2024.6 returns 0.87
     else:
-        theirs = allantools.edf_simple(n, m, ALPHAS[noise])
-    assert degrees_of_freedom(noise, m, n) == pytest.approx(max(theirs, 1.0), rel=1e-9)
+        theirs = allantools.edf_simple(n, m, ALPHAS[noise.name])
+    assert analysis_noise.degrees_of_freedom(noise, m, n) == pytest.approx(max(theirs, 1.0), rel=1e-9)
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
@@ -270,31 +253,34 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     held = np.zeros(3)
     rounds = 300
     for _ in range(rounds):
-        curve = allan_curve([white(random, 400, 1.0, 1.0)[:, None]], 1.0, factors)
+        curve = analysis_noise.allan_curve([white(random, 400, 1.0, 1.0)[:, None]], 1.0, factors)
         held += (curve.low[:, 0] <= truth) & (truth <= curve.high[:, 0])
     assert held / rounds == pytest.approx([0.683] * 3, abs=0.08)
 
 
 def test_types_of_noise_factors_and_short_runs() -> None:
     for made, expected in [
-        (quantisation(np.random.default_rng(5), 4000, 1.0, 1.0), NoiseType.QUANTISATION),
-        (white(np.random.default_rng(5), 4000, 1.0, 1.0), NoiseType.WHITE),
-        (flicker(np.random.default_rng(5), 4000, 1.0), NoiseType.FLICKER),
-        (random_walk(np.random.default_rng(5), 4000, 1.0, 1.0), NoiseType.RATE_RANDOM_WALK),
+        (quantisation(np.random.default_rng(5), 4000, 1.0, 1.0), analysis_noise.NoiseType.QUANTISATION),
+        (white(np.random.default_rng(5), 4000, 1.0, 1.0), analysis_noise.NoiseType.WHITE),
+        (flicker(np.random.default_rng(5), 4000, 1.0), analysis_noise.NoiseType.FLICKER),
+        (random_walk(np.random.default_rng(5), 4000, 1.0, 1.0), analysis_noise.NoiseType.RATE_RANDOM_WALK),
     ]:
-        types = noise_types(made[:, None], np.array([1, 4, 1000]))
+        types = analysis_noise.noise_types(made[:, None], np.array([1, 4, 1000]))
         assert types[0, 0] == expected
         assert types[2, 0] == types[1, 0], "too few averages: as at the τ before"
-    assert [noise_types(made[:n, None], np.array([1]))[0, 0] for n in (59, 60)] == [NoiseType.WHITE, expected]
-    factors = averaging_factors(3000)
+    assert [analysis_noise.noise_types(made[:n, None], np.array([1]))[0, 0] for n in (59, 60)] == [
+        analysis_noise.NoiseType.WHITE,
+        expected,
+    ]
+    factors = analysis_noise.averaging_factors(3000)
     assert (factors[0], factors[-1]) == (1, 1000)
     assert len(factors) > 24
     with pytest.raises(BadArgument, match="at least 3 samples"):
-        averaging_factors(2)
-    curve = allan_curve([np.full((200, 3), 9.81)], 100.0)
+        analysis_noise.averaging_factors(2)
+    curve = analysis_noise.allan_curve([np.full((200, 3), 9.81)], 100.0)
     assert curve.deviation == pytest.approx(0.0, abs=1e-9)
     with pytest.raises(BadArgument, match="at least 200 samples"):
-        allan_curve([np.zeros((50, 1))], 1.0, np.array([100]))
+        analysis_noise.allan_curve([np.zeros((50, 1))], 1.0, np.array([100]))
 
 
 TERM_HZ = 100.0
@@ -302,18 +288,30 @@ TERMS_COUNT = 1 << 18
 WITHIN = 0.05
 
 
-def terms_of(series: FloatArray, rate_hz: float = TERM_HZ) -> NoiseTerms:
-    return noise_terms(allan_curve([series[:, None]], rate_hz), 0)
+def terms_of(series: FloatArray, rate_hz: float = TERM_HZ) -> analysis_noise.NoiseTerms:
+    return analysis_noise.noise_terms(analysis_noise.allan_curve([series[:, None]], rate_hz), 0)
 
 
-def test_basis_factor_and_a_constant() -> None:
-    assert pytest.approx(0.664, abs=5e-4) == BIAS_FACTOR
-    assert basis(np.array([2.0]))[0] == pytest.approx([3 / 4, 1 / 2, 2 * np.log(2) / np.pi, 2 / 3, 2.0])
+def test_basis_factor_and_the_fit_makes_the_curve_again() -> None:
+    assert pytest.approx(0.664, abs=5e-4) == analysis_noise.BIAS_FACTOR
+    assert analysis_noise.basis(np.array([2.0]))[0] == pytest.approx([3 / 4, 1 / 2, 2 * np.log(2) / np.pi, 2 / 3, 2.0])
     found = terms_of(np.zeros(500))
     assert all(term.value is None for term in found)
+    random = np.random.default_rng(31)
+    curve = analysis_noise.allan_curve([white(random, TERMS_COUNT, TERM_HZ, 1e-3)[:, None]], TERM_HZ)
+    fitted = analysis_noise.noise_terms(curve, 0).deviation(curve.tau_s)
+    near = curve.freedom[:, 0] > 100
+    assert fitted[near] == pytest.approx(curve.deviation[near, 0], rel=0.15)
+    random = np.random.default_rng(61)
+    smooth = np.convolve(white(random, TERMS_COUNT, TERM_HZ, 1e-3), np.ones(8) / 8, mode="same")
+    curve = analysis_noise.allan_curve([smooth[:, None]], TERM_HZ)
+    assert analysis_noise.noise_terms(curve, 0, tau_least_s=0.8).random_walk.value == pytest.approx(1e-3, rel=WITHIN)
+    assert analysis_noise.noise_terms(curve, 0, tau_least_s=curve.tau_s[-6])
+    with pytest.raises(BadArgument, match=r"at least 6 points .*, got 5; record a longer series"):
+        analysis_noise.noise_terms(curve, 0, tau_least_s=curve.tau_s[-5])
 
 
-def test_each_term_over_white_noise() -> None:
+def test_each_term_over_white_noise_and_all_together() -> None:
     random = np.random.default_rng(11)
     found = terms_of(white(random, TERMS_COUNT, TERM_HZ, 2e-4))
     assert found.random_walk.value == pytest.approx(2e-4, rel=WITHIN)
@@ -331,9 +329,6 @@ def test_each_term_over_white_noise() -> None:
     found = terms_of(noise + ramp(TERMS_COUNT, TERM_HZ, 1e-5))
     assert found.random_walk.value == pytest.approx(1e-3, rel=WITHIN)
     assert found.rate_ramp.value == pytest.approx(1e-5, rel=WITHIN)
-
-
-def test_all_of_a_gyroscope_together() -> None:
     random, count = np.random.default_rng(21), 1 << 20
     series = (
         white(random, count, TERM_HZ, 1e-3) + flicker(random, count, 8e-3) + random_walk(random, count, TERM_HZ, 8e-3)
@@ -342,14 +337,6 @@ def test_all_of_a_gyroscope_together() -> None:
     assert found.random_walk.value == pytest.approx(1e-3, rel=WITHIN)
     assert found.bias_instability.value == pytest.approx(8e-3, rel=WITHIN)
     assert found.rate_random_walk.value == pytest.approx(8e-3, rel=WITHIN)
-
-
-def test_the_fit_makes_the_curve_again() -> None:
-    random = np.random.default_rng(31)
-    curve = allan_curve([white(random, TERMS_COUNT, TERM_HZ, 1e-3)[:, None]], TERM_HZ)
-    fitted = noise_terms(curve, 0).deviation(curve.tau_s)
-    near = curve.freedom[:, 0] > 100
-    assert fitted[near] == pytest.approx(curve.deviation[near, 0], rel=0.15)
 
 
 def test_spreads_and_bounds_are_those_of_many_series() -> None:
@@ -362,13 +349,3 @@ def test_spreads_and_bounds_are_those_of_many_series() -> None:
     unresolved = terms_of(white(random, 4096, TERM_HZ, 1e-3)).rate_ramp
     assert unresolved.value is None
     assert unresolved.below > 0
-
-
-def test_short_filtered_points_are_left_out() -> None:
-    random = np.random.default_rng(61)
-    smooth = np.convolve(white(random, TERMS_COUNT, TERM_HZ, 1e-3), np.ones(8) / 8, mode="same")
-    curve = allan_curve([smooth[:, None]], TERM_HZ)
-    assert noise_terms(curve, 0, tau_least_s=0.8).random_walk.value == pytest.approx(1e-3, rel=WITHIN)
-    assert noise_terms(curve, 0, tau_least_s=curve.tau_s[-6])
-    with pytest.raises(BadArgument, match=r"at least 6 points .*, got 5; record a longer series"):
-        noise_terms(curve, 0, tau_least_s=curve.tau_s[-5])

@@ -23,13 +23,20 @@ from imud.model.sample import Vector3
 FRONT_LEFT_UP: tuple[Vector3, Vector3, Vector3] = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 
-def test_axes_of_conventions_and_of_frames_with_z_down() -> None:
+def test_axes_and_words_of_conventions_and_of_frames_with_z_down() -> None:
     assert [matrix_times(body_axes(Convention.ENU_FLU), v) for v in FRONT_LEFT_UP] == list(FRONT_LEFT_UP)
     assert matrix_times(body_axes(Convention.NED_FRD), (1, 2, 3)) == (1, -2, -3), "front, right, down"
     # At yaw 0, the x axis (ZYX) or the y axis (ZXY) of the sensor is parallel to the same axis of the frame.
     assert matrix_times(DeviceAxes(order=EulerOrder.ZYX, z_down=True).to_z_up, (1, 2, 3)) == (1, -2, -3)
     assert matrix_times(DeviceAxes(order=EulerOrder.ZXY, z_down=True).to_z_up, (1, 2, 3)) == (-1, 2, -3)
     assert matrix_times(RFU_ENU.to_z_up, (1, 2, 3)) == (1, 2, 3)
+    assert FLU_LEVEL.with_order(None) == FLU_LEVEL
+    assert FLU_LEVEL.with_order(EulerOrder.ZXY).to_body == RFU_ENU.to_body
+    assert not FLU_LEVEL.with_order(EulerOrder.ZXY).has_north
+    assert RFU_ENU.words == "sensor: x right, y forward, z up, right-handed"
+    assert FLU_LEVEL.words == "sensor: x forward, y left, z up, right-handed"
+    assert [navigation_words(one, True) for one in Convention] == ["ENU", "NED"]
+    assert navigation_words(Convention.NED_FRD, False).startswith("level, Z down")
 
 
 def test_navigation_axes() -> None:
@@ -40,6 +47,12 @@ def test_navigation_axes() -> None:
     assert matrix_times(navigation_axes(Convention.ENU_FLU, False), (1, 2, 3)) == (1, 2, 3)
     assert matrix_times(navigation_axes(Convention.NED_FRD, False), (1, 2, 3)) == (1, -2, -3)
     assert is_rotation(ENU_TO_NED)
+    # North, west, up: the x axis is north, the y axis is west.
+    north, west, up = 1.0, 2.0, 3.0
+    assert matrix_times(FLU_NWU.to_z_up, (north, west, up)) == (-west, north, up)
+    ned = replace(FLU_NWU, z_down=True)  # north, east, down
+    assert matrix_times(ned.to_z_up, (north, -west, -up)) == (-west, north, up)
+    assert [matrix_times(FLU_NWU.to_body, v) for v in FRONT_LEFT_UP] == list(FRONT_LEFT_UP)
 
 
 @pytest.mark.parametrize(
@@ -56,28 +69,6 @@ def test_front_left_and_up_in_the_axes_of_a_device(
 ) -> None:
     assert [matrix_times(axes.to_body, v) for v in (front, left, up)] == list(FRONT_LEFT_UP)
     assert is_rotation(axes.to_body)
-
-
-def test_the_navigation_frame_nwu() -> None:
-    """North, west, up: the x axis is north, the y axis is west."""
-    north, west, up = 1.0, 2.0, 3.0
-    assert matrix_times(FLU_NWU.to_z_up, (north, west, up)) == (-west, north, up)
-    ned = replace(FLU_NWU, z_down=True)  # north, east, down
-    assert matrix_times(ned.to_z_up, (north, -west, -up)) == (-west, north, up)
-    assert [matrix_times(FLU_NWU.to_body, v) for v in FRONT_LEFT_UP] == list(FRONT_LEFT_UP)
-
-
-def test_another_order_is_another_device() -> None:
-    assert FLU_LEVEL.with_order(None) == FLU_LEVEL
-    assert FLU_LEVEL.with_order(EulerOrder.ZXY).to_body == RFU_ENU.to_body
-    assert not FLU_LEVEL.with_order(EulerOrder.ZXY).has_north
-
-
-def test_words() -> None:
-    assert RFU_ENU.words == "sensor: x right, y forward, z up, right-handed"
-    assert FLU_LEVEL.words == "sensor: x forward, y left, z up, right-handed"
-    assert [navigation_words(one, True) for one in Convention] == ["ENU", "NED"]
-    assert navigation_words(Convention.NED_FRD, False).startswith("level, Z down")
 
 
 @pytest.mark.parametrize("name", DRIVERS)

@@ -179,7 +179,7 @@ def judged(samples: Iterator[Sample]) -> int:
     return sum(check.add(one) for one in samples)
 
 
-def test_motion_is_not_judged() -> None:
+def test_only_samples_at_rest_count() -> None:
     assert judged(ticks(WRONG, 60)) == 60 // 5 - 1, "each takes a tick more than 5 s"
     turning = (0.0, 0.06, 0.0)
     assert judged(replace(one, gyro_rad_s=turning) for one in ticks(WRONG, 60)) == 0
@@ -187,9 +187,6 @@ def test_motion_is_not_judged() -> None:
     assert judged(replace(one, accel_m_s2=driving) for one in ticks(WRONG, 60)) == 0
     swinging = (replace(one, gyro_rad_s=(sin(one.t_ns / 1e9), 0, 0)) for one in ticks(WRONG, 60))
     assert judged(swinging) == 0, "slow for moments only"
-
-
-def test_only_samples_at_rest_count() -> None:
     biased = (replace(one, gyro_rad_s=(0.02, -0.02, 0.01), accel_m_s2=(0.1, 0.1, -9.7)) for one in ticks(WRONG))
     assert judged(biased) == 1
     samples = list(ticks(WRONG, 9.9))
@@ -199,15 +196,12 @@ def test_only_samples_at_rest_count() -> None:
     assert judged(iter([*ticks(WRONG, 4), *ticks(WRONG, 4, start=80)])) == 0
 
 
-def test_the_same_sample_counts_once() -> None:
+def test_the_same_sample_counts_once_and_samples_without_vectors_never() -> None:
     """The watch can call the check several times between two samples."""
     check = GravityCheck(FLU_LEVEL)
     assert not any(check.add(replace(WRONG, t_ns=number * NS_PER_S)) for number in range(20))
     slow = [replace(WRONG, seq=number, t_ns=number * NS_PER_S) for number in range(7)]
     assert judged(one for one in slow for _ in range(10)) == 1
-
-
-def test_samples_without_vectors_are_ignored() -> None:
     assert judged(replace(one, gyro_rad_s=None) for one in ticks(WRONG, 20)) == 0
     assert judged(replace(one, accel_m_s2=None) for one in ticks(WRONG, 20)) == 0
     assert found(FLU_LEVEL, replace(WRONG, quat_wxyz=None, euler_rad=None)) is None
@@ -218,17 +212,14 @@ def test_samples_without_vectors_are_ignored() -> None:
         assert judged(replace(one, accel_m_s2=accel) for one in ticks(WRONG, 20)) == 0
 
 
-def test_the_finding_ends_when_rest_shows_no_contradiction() -> None:
+def test_the_finding_ends_at_rest_without_contradiction() -> None:
     check = GravityCheck(FLU_LEVEL)
     assert any(check.add(one) for one in ticks(WRONG))
     assert check.finding is not None
     right = ticks(zyx(0, 0), start=100)
     assert any(check.add(one) for one in right)
     assert check.finding is None
-
-
-def test_a_sensor_error_is_not_a_contradiction() -> None:
-    """15° of difference come from acceleration and from an unsettled filter; 25° do not."""
+    # 15° of difference come from acceleration and from an unsettled filter; 25° do not.
     for angle_deg, is_found in ((15, False), (25, True)):
         tilt = radians(angle_deg)
         one = replace(zyx(0, 0), accel_m_s2=(G * sin(tilt), 0, G * cos(tilt)))

@@ -6,28 +6,10 @@ import msgspec
 import pytest
 
 from imud import config
-from imud.contracts.condition import (
-    OK,
-    Condition,
-    ConditionLimits,
-    DeviceCondition,
-    Reason,
-    ReasonCode,
-    Section,
-    condition_of,
-)
+from imud.contracts import condition as contracts_condition
 from imud.contracts.setting import OnDifference, SettingDifference, SettingsState, SettingsStatus
 from imud.contracts.status import DeviceState, DeviceStatus, FrameProblem, LinesStatus, RecentStatus
-from imud.device.condition import (
-    Cause,
-    ConditionJudge,
-    ConditionWatch,
-    ConfiguredPort,
-    Facts,
-    RecentCounts,
-    Rule,
-    causes_of,
-)
+from imud.device import condition as device_condition
 from imud.device.health import SEARCH_BEGUN, DeviceEvents
 from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
@@ -35,9 +17,9 @@ from tests.support.metrics import device
 
 S = 1_000_000_000
 NOW_NS = 1000 * S
-PORT = ConfiguredPort("/dev/ttyUSB0", "uart.port", True, lambda: ["/dev/ttyUSB1", "/dev/ttyS0"])
+PORT = device_condition.ConfiguredPort("/dev/ttyUSB0", "uart.port", True, lambda: ["/dev/ttyUSB1", "/dev/ttyS0"])
 THERE = "Ports on this host: /dev/ttyUSB1, /dev/ttyS0."
-BUS = ConfiguredPort("can0", "can.interface", False, list)
+BUS = device_condition.ConfiguredPort("can0", "can.interface", False, list)
 APPLY = "Apply the declared value, or change the configuration."
 SAVE = "Save the settings to the device's flash."
 DOCTOR = "Run `sudo imud doctor`."
@@ -48,22 +30,28 @@ def recent(rate_hz: float | None = None, **changes: Any) -> RecentStatus:
     return RecentStatus(NOW_NS - 840 * S, rate_hz, **known)
 
 
-def facts(state: DeviceState = DeviceState.RUNNING, problem: str = "", **changes: Any) -> Facts:
+def facts(state: DeviceState = DeviceState.RUNNING, problem: str = "", **changes: Any) -> device_condition.Facts:
     known = {"now_ns": NOW_NS, "place": PORT, "recent": recent(), "expected_rate_hz": 50.0, **changes}
-    return Facts(state=state, problem=problem, rate_hz=known["recent"].rate_hz, **known)
+    return device_condition.Facts(state=state, problem=problem, rate_hz=known["recent"].rate_hz, **known)
 
 
-def declared(state: SettingsState = SettingsState.AGREE, **changes: Any) -> Facts:
+def declared(state: SettingsState = SettingsState.AGREE, **changes: Any) -> device_condition.Facts:
     return facts(declared=SettingsStatus(state, OnDifference.REPORT, **changes))
 
 
-def axes(kind: FrameProblem, problem: str) -> Facts:
+def axes(kind: FrameProblem, problem: str) -> device_condition.Facts:
     return facts(axes=kind, axes_problem=problem)
 
 
-def reasons_of(known: Facts, limits: ConditionLimits) -> list[Reason]:
+def reasons_of(
+    known: device_condition.Facts, limits: contracts_condition.ConditionLimits
+) -> list[contracts_condition.Reason]:
     """Return the reasons that are not ok."""
-    return [cause.reason() for cause in causes_of(known, limits) if cause.code not in OK]
+    return [
+        cause.reason()
+        for cause in device_condition.causes_of(known, limits)
+        if cause.code not in contracts_condition.OK
+    ]
 
 
 LATE = facts(t_err_ns=2_100_000)
@@ -163,10 +151,10 @@ LATE = facts(t_err_ns=2_100_000)
         (facts(DeviceState.FINISHED, ""), "ok", "The replay is at its end.", ""),
     ],
 )  # fmt: skip
-def test_each_sentence(known: Facts, condition: str, message: str, step: str) -> None:
-    limits = ConditionLimits(t_err_ms=2.0)
-    reason = causes_of(known, limits)[0].reason()
-    assert (reason.message, reason.next, condition_of(reason.code)) == (message, step, condition)
+def test_each_sentence(known: device_condition.Facts, condition: str, message: str, step: str) -> None:
+    limits = contracts_condition.ConditionLimits(t_err_ms=2.0)
+    reason = device_condition.causes_of(known, limits)[0].reason()
+    assert (reason.message, reason.next, contracts_condition.condition_of(reason.code)) == (message, step, condition)
 
 
 @pytest.mark.parametrize(
@@ -181,14 +169,14 @@ def test_each_sentence(known: Facts, condition: str, message: str, step: str) ->
         declared(SettingsState.UNKNOWN),
     ],
 )
-def test_no_reason_within_the_limits(known: Facts) -> None:
-    assert reasons_of(known, ConditionLimits()) == []
+def test_no_reason_within_the_limits(known: device_condition.Facts) -> None:
+    assert reasons_of(known, contracts_condition.ConditionLimits()) == []
 
 
 def test_ports_of_other_links() -> None:
     gone = facts(DeviceState.MISSING, "can0 is down: imud waits", place=BUS)
     quiet = facts(DeviceState.SEARCHING, "nothing came", place=BUS)
-    (missing,), (silent,) = (reasons_of(one, ConditionLimits()) for one in (gone, quiet))
+    (missing,), (silent,) = (reasons_of(one, contracts_condition.ConditionLimits()) for one in (gone, quiet))
     assert missing.message == "can0 is down: imud waits."
     assert (silent.message, "bit rate" in silent.next) == ("No data arrives at can0.", True)
 
@@ -209,22 +197,26 @@ def test_ports_of_other_links() -> None:
     ],
 )
 def test_sentence_without_a_problem(changes: dict[str, Any], message: str) -> None:
-    (cause,) = causes_of(facts(recent=recent(**changes)), ConditionLimits())
-    assert (cause.reason().message, cause.code in OK) == (message, True)
+    (cause,) = device_condition.causes_of(facts(recent=recent(**changes)), contracts_condition.ConditionLimits())
+    assert (cause.reason().message, cause.code in contracts_condition.OK) == (message, True)
 
 
 # --- hysteresis -------------------------------------------------------------------------------------------------------
 
 
-def cause(code: ReasonCode, message: str, setting: str = "") -> Cause:
-    return Cause(Rule(code, Section.LIVE, lambda _facts, _limits: True, message), facts(), setting)
+def cause(code: contracts_condition.ReasonCode, message: str, setting: str = "") -> device_condition.Cause:
+    return device_condition.Cause(
+        device_condition.Rule(code, contracts_condition.Section.LIVE, lambda _facts, _limits: True, message),
+        facts(),
+        setting,
+    )
 
 
-LOST = cause(ReasonCode.LOST, "lost")
-ALARM = cause(ReasonCode.ALARM, "alarm")
-SETTING = cause(ReasonCode.SETTING, "differs", "mode")
-GONE = cause(ReasonCode.STOPPED, "stopped")
-NONE = cause(ReasonCode.NONE_LOST, "none")
+LOST = cause(contracts_condition.ReasonCode.LOST, "lost")
+ALARM = cause(contracts_condition.ReasonCode.ALARM, "alarm")
+SETTING = cause(contracts_condition.ReasonCode.SETTING, "differs", "mode")
+GONE = cause(contracts_condition.ReasonCode.STOPPED, "stopped")
+NONE = cause(contracts_condition.ReasonCode.NONE_LOST, "none")
 
 
 class Watched:
@@ -233,9 +225,11 @@ class Watched:
     def __init__(self) -> None:
         self.events: list[Event] = []
         self.now_s = 0
-        self.watch = ConditionWatch(ConditionLimits(), DeviceEvents("bow", Ledger(), self.events.append), 0)
+        self.watch = device_condition.ConditionWatch(
+            contracts_condition.ConditionLimits(), DeviceEvents("bow", Ledger(), self.events.append), 0
+        )
 
-    def after(self, seconds: int, *causes: Cause) -> Condition:
+    def after(self, seconds: int, *causes: device_condition.Cause) -> contracts_condition.Condition:
         for _ in range(seconds):
             self.watch.update(self.now_s * S, causes if GONE in causes else (*causes, NONE))
             self.now_s += 1
@@ -299,8 +293,15 @@ def test_history_contains_the_worst_condition_of_each_minute() -> None:
 
 
 def test_text_of_a_condition() -> None:
-    assert str(DeviceCondition(Condition.DEGRADED, 0, (LOST.reason(), ALARM.reason()))) == "degraded: lost alarm"
-    assert str(DeviceCondition(Condition.MISSING, 0)) == "missing"
+    assert (
+        str(
+            contracts_condition.DeviceCondition(
+                contracts_condition.Condition.DEGRADED, 0, (LOST.reason(), ALARM.reason())
+            )
+        )
+        == "degraded: lost alarm"
+    )
+    assert str(contracts_condition.DeviceCondition(contracts_condition.Condition.MISSING, 0)) == "missing"
 
 
 # --- counts -----------------------------------------------------------------------------------------------------------
@@ -311,7 +312,7 @@ class Counted:
 
     def __init__(self, *, timed: bool = True) -> None:
         self.ledger, self.now_s, self.resets, self.expected_hz = Ledger(), 0, 0, 50.0
-        self.counts = RecentCounts(self.ledger, 0, timed=timed)
+        self.counts = device_condition.RecentCounts(self.ledger, 0, timed=timed)
 
     def pass_seconds(self, seconds: int, samples: int = 50, **lost: int) -> RecentStatus:
         for _ in range(seconds):
@@ -368,7 +369,7 @@ class Judged:
         (device_config,) = config.parse(msgspec.json.encode(tree), "test").devices
         self.ledger, self.now_ns = Ledger(), 0
         events = DeviceEvents("imu0", self.ledger, lambda _event: None)
-        self.judge = ConditionJudge(device_config, PORT.port, self.ledger, events, 0)
+        self.judge = device_condition.ConditionJudge(device_config, PORT.port, self.ledger, events, 0)
 
     def is_steady(
         self, seconds: int = 1, samples: int = 50, problem: str = "", state: DeviceState = DeviceState.RUNNING
@@ -395,7 +396,7 @@ def test_the_rules_run_again_after_a_change_of_a_fact() -> None:
     assert not judged.is_steady(60)  # the reason ends 60 s after its cause
     assert judged.is_steady(2)
     assert not judged.is_steady(10, samples=40)
-    assert judged.judge.watch.condition.condition is Condition.DEGRADED
+    assert judged.judge.watch.condition.condition is contracts_condition.Condition.DEGRADED
 
 
 def test_a_device_without_samples_is_missing_after_5_s_without_another_change() -> None:
@@ -405,7 +406,7 @@ def test_a_device_without_samples_is_missing_after_5_s_without_another_change() 
     for seconds in (5, 1):
         judged.is_steady(seconds, samples=0, state=DeviceState.SILENT)
         levels.append(judged.judge.watch.level)
-    assert levels == [Condition.OK, Condition.MISSING]
+    assert levels == [contracts_condition.Condition.OK, contracts_condition.Condition.MISSING]
 
 
 def test_restarts_of_the_last_hour() -> None:

@@ -8,21 +8,7 @@ import pytest
 
 from imud.contracts.command import Risk, Target
 from imud.contracts.setting import PlannedStep, SettingDifference, SettingsPlan, title_of
-from imud.device.settings_plan import (
-    CANNOT_SAVE,
-    NEEDS_SAVE,
-    SAVES_ITSELF,
-    completed,
-    described_settings,
-    differences,
-    first_sentence,
-    make_plan,
-    merged,
-    setting_instead,
-    unverified,
-    wanted_values,
-    words,
-)
+from imud.device import settings_plan
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.uart.settings import AngleAlarm
 from imud.model.errors import BadArgument
@@ -33,7 +19,7 @@ TARGET = Target(None, 115200)
 
 
 def planned(wanted: dict[str, Any], *, save: bool = True, unsaved: bool = False, **written: Any) -> SettingsPlan:
-    return make_plan(FAKE_SETTINGS, TARGET, wanted, ACTUAL, written, save=save, unsaved=unsaved)
+    return settings_plan.make_plan(FAKE_SETTINGS, TARGET, wanted, ACTUAL, written, save=save, unsaved=unsaved)
 
 
 def names(plan: SettingsPlan) -> list[str]:
@@ -62,7 +48,9 @@ def test_settings_of_the_connection_are_last() -> None:
     baud = replace(FAKE_SETTINGS.table["baud"], saves=False)
     table = replace(FAKE_SETTINGS, table={**FAKE_SETTINGS.table, "baud": baud})
     assert next(iter(table.table)) == "baud"
-    plan = make_plan(table, TARGET, {"baud": 921600, "mode": "9-axis"}, ACTUAL, {}, save=True, unsaved=False)
+    plan = settings_plan.make_plan(
+        table, TARGET, {"baud": 921600, "mode": "9-axis"}, ACTUAL, {}, save=True, unsaved=False
+    )
     assert (names(plan), plan.save) == (["mode", "baud"], True)
 
 
@@ -70,15 +58,17 @@ def test_settings_that_need_a_restart_need_a_save() -> None:
     wanted = {"mounting": "x_up", "mode": "9-axis", "baud": 921600}
     plan = planned(wanted, save=False)
     assert names(plan) == ["mode"]
-    assert plan.left_out == {"baud": SAVES_ITSELF, "mounting": NEEDS_SAVE}
+    assert plan.left_out == {"baud": settings_plan.SAVES_ITSELF, "mounting": settings_plan.NEEDS_SAVE}
     assert not plan.restart
     saving = planned({"mounting": "x_up"})
     assert (names(saving), saving.save, saving.restart) == (["mounting"], True, True)
     table = replace(FAKE_SETTINGS, save=None)
-    plan = make_plan(table, TARGET, {"mounting": "x_up", "mode": "9-axis"}, ACTUAL, {}, save=True, unsaved=False)
-    assert (names(plan), plan.left_out, plan.save) == (["mode"], {"mounting": CANNOT_SAVE}, False)
+    plan = settings_plan.make_plan(
+        table, TARGET, {"mounting": "x_up", "mode": "9-axis"}, ACTUAL, {}, save=True, unsaved=False
+    )
+    assert (names(plan), plan.left_out, plan.save) == (["mode"], {"mounting": settings_plan.CANNOT_SAVE}, False)
     table = replace(FAKE_SETTINGS, restart=None)
-    plan = make_plan(table, TARGET, {"mounting": "x_up"}, ACTUAL, {}, save=True, unsaved=False)
+    plan = settings_plan.make_plan(table, TARGET, {"mounting": "x_up"}, ACTUAL, {}, save=True, unsaved=False)
     assert (names(plan), plan.save, plan.restart) == (["mounting"], True, False)
 
 
@@ -91,7 +81,7 @@ def test_values_are_checked_together_with_the_present_ones() -> None:
 
 
 def test_values_of_several_keys_are_merged() -> None:
-    assert merged({"output": {"a": 1, "b": 2}, "mode": "6"}, {"output": {"b": 3}, "mode": "9"}) == {
+    assert settings_plan.merged({"output": {"a": 1, "b": 2}, "mode": "6"}, {"output": {"b": 3}, "mode": "9"}) == {
         "output": {"a": 1, "b": 3}, "mode": "9",
     }  # fmt: skip
 
@@ -109,18 +99,18 @@ def test_a_user_moves_a_bus_to_another_rate_in_two_steps(driver: str, name: str,
     row = DRIVERS[driver]
     table, target, actual = row.device_settings, Target(row.settings(), present), {name: present}
     assert table is not None
-    plan = make_plan(table, target, {name: other}, actual, {}, save=True, unsaved=False, by_name=True)
+    plan = settings_plan.make_plan(table, target, {name: other}, actual, {}, save=True, unsaved=False, by_name=True)
     assert (names(plan), plan.save, plan.restart, plan.risk) == ([name], True, False, Risk.CONNECTION)
     assert f"{name}: the device uses the new rate after its restart" in plan.advice
     with pytest.raises(BadArgument, match=f"{name}: expected {present}.*, got {other}"):
-        make_plan(table, target, {name: other}, actual, {}, save=True, unsaved=False)  # declared
+        settings_plan.make_plan(table, target, {name: other}, actual, {}, save=True, unsaved=False)  # declared
     actual = {name: other}  # saved, before the restart
-    plan = make_plan(table, target, {name: present}, actual, {}, save=True, unsaved=False, by_name=True)
+    plan = settings_plan.make_plan(table, target, {name: present}, actual, {}, save=True, unsaved=False, by_name=True)
     assert (names(plan), plan.save, plan.restart, plan.advice) == ([name], True, True, "")
     restarting = (
         {"mounting": "x_up"} if driver == "hipnuc-modbus" else {"node" if "canopen" in driver else "address": 9}
     )
-    plan = make_plan(table, target, restarting, actual, {}, save=True, unsaved=False, by_name=True)
+    plan = settings_plan.make_plan(table, target, restarting, actual, {}, save=True, unsaved=False, by_name=True)
     assert (names(plan), plan.save, plan.restart) == (list(restarting), True, False)
 
 
@@ -130,7 +120,7 @@ def test_a_present_contradiction_does_not_prevent_another_change() -> None:
     actual = {"mode": "6-axis", "pins": {"sin": 1, "sout": 2, "led": 1}}
 
     def plan(**wanted: Any) -> SettingsPlan:
-        return make_plan(table, TARGET, wanted, actual, {}, save=False, unsaved=False, by_name=True)
+        return settings_plan.make_plan(table, TARGET, wanted, actual, {}, save=False, unsaved=False, by_name=True)
 
     assert names(plan(mode="9-axis")) == ["mode"]
     assert names(plan(pins={"led": 5})) == ["pins"]
@@ -140,7 +130,7 @@ def test_a_present_contradiction_does_not_prevent_another_change() -> None:
 
 
 def test_a_user_writes_an_unreadable_value_again() -> None:
-    plan = make_plan(
+    plan = settings_plan.make_plan(
         FAKE_SETTINGS, TARGET, {"secret": 5}, ACTUAL, {"secret": 5}, save=False, unsaved=False, by_name=True
     )
     assert names(plan) == ["secret"]
@@ -149,7 +139,7 @@ def test_a_user_writes_an_unreadable_value_again() -> None:
 def differing(
     wanted: dict[str, Any], actual: dict[str, Any] = ACTUAL, unreadable: dict[str, Any] | None = None
 ) -> list[str]:
-    return list(differences(FAKE_SETTINGS, wanted, actual, unreadable or {}))
+    return list(settings_plan.differences(FAKE_SETTINGS, wanted, actual, unreadable or {}))
 
 
 def test_the_table_compares_values_and_unreadable_values_differ_unless_written() -> None:
@@ -157,23 +147,23 @@ def test_the_table_compares_values_and_unreadable_values_differ_unless_written()
     assert differing({"offset_deg": 0.02, "output": {"a": 100, "b": 1}, "mode": "9-axis"}) == [
         "mode", "output", "offset_deg",
     ]  # fmt: skip
-    found = differences(FAKE_SETTINGS, {"mode": "6-axis"}, {}, {})
+    found = settings_plan.differences(FAKE_SETTINGS, {"mode": "6-axis"}, {}, {})
     assert found == {"mode": SettingDifference("6-axis", None)}
-    assert words(found) == 'mode is not reported, declared "6-axis"'
+    assert settings_plan.words(found) == 'mode is not reported, declared "6-axis"'
     assert differing({"mode": "6-axis"}, {}, {"mode": "6-axis"}) == []
     assert differing({"mode": "6-axis"}, {"mode": "9-axis"}, {"mode": "6-axis"}) == [
         "mode"
     ]  # the reported value counts
     assert differing({"secret": 5}) == []
-    assert unverified(FAKE_SETTINGS, {"secret": 5, "mode": "6-axis"}, ACTUAL) == ("secret",)
-    assert unverified(FAKE_SETTINGS, {"secret": 5, "mode": "6-axis"}, {}) == ("mode", "secret")
+    assert settings_plan.unverified(FAKE_SETTINGS, {"secret": 5, "mode": "6-axis"}, ACTUAL) == ("secret",)
+    assert settings_plan.unverified(FAKE_SETTINGS, {"secret": 5, "mode": "6-axis"}, {}) == ("mode", "secret")
 
 
 def test_words_contain_both_values() -> None:
-    assert words({"mode": SettingDifference("6-axis", "9-axis"), "n": SettingDifference(1, 2)}) == (
+    assert settings_plan.words({"mode": SettingDifference("6-axis", "9-axis"), "n": SettingDifference(1, 2)}) == (
         'mode is "9-axis", declared "6-axis", n is 2, declared 1'
     )
-    made = wanted_values(FAKE_SETTINGS, {"offset_deg": 5, "mode": "9-axis"})
+    made = settings_plan.wanted_values(FAKE_SETTINGS, {"offset_deg": 5, "mode": "9-axis"})
     assert list(made.items()) == [("mode", "9-axis"), ("offset_deg", 5.0)]
     assert type(made["offset_deg"]) is float
 
@@ -190,12 +180,15 @@ def test_words_contain_both_values() -> None:
 )
 def test_errors_contain_the_expected_values(given: dict[str, Any], message: str) -> None:
     with pytest.raises(BadArgument) as caught:
-        wanted_values(FAKE_SETTINGS, given)
+        settings_plan.wanted_values(FAKE_SETTINGS, given)
     assert message in str(caught.value)
 
 
 def test_every_setting_is_described() -> None:
-    found = {one.name: one for one in described_settings(FAKE_SETTINGS, {"mode": "9-axis", "secret": 3}, ACTUAL)}
+    found = {
+        one.name: one
+        for one in settings_plan.described_settings(FAKE_SETTINGS, {"mode": "9-axis", "secret": 3}, ACTUAL)
+    }
     assert list(found) == list(FAKE_SETTINGS.table)
     mode, secret, hours, offset = found["mode"], found["secret"], found["hours"], found["offset_deg"]
     assert (mode.values, mode.declared, mode.actual, mode.differs) == (
@@ -204,14 +197,14 @@ def test_every_setting_is_described() -> None:
     assert (secret.declared, secret.actual, secret.readable, secret.differs) == (3, None, False, False)
     assert (hours.actual, hours.declarable) == (7, False)
     assert (offset.unit, offset.section, offset.description) == ("°", "2.3", "added to the heading")
-    assert all(one.actual is None for one in described_settings(FAKE_SETTINGS, {}, None))
+    assert all(one.actual is None for one in settings_plan.described_settings(FAKE_SETTINGS, {}, None))
     assert (offset.title, offset.help, offset.group) == ("Offset", "added to the heading", "measurement")
     assert mode.schema["enum"] == ["6-axis", "9-axis"]
     names = ("tpdo1_interval_ms", "sout_divisor", "ff2f_interval_ms", "gyro_offset_deg_s", "second_bus")
     assert [title_of(name) for name in names] == [
         "TPDO1 interval", "SOUT divisor", "FF2F interval", "Gyro offset", "Second bus",
     ]  # fmt: skip
-    assert first_sentence("off; other functions. More") == "off"
+    assert settings_plan.first_sentence("off; other functions. More") == "off"
 
 
 HIPNUC = DRIVERS["hipnuc-uart"].device_settings
@@ -230,9 +223,9 @@ ALARM = {"x": {"min_deg": -20, "max_deg": 20, "enabled": True}}
 def test_a_dot_selects_a_part_of_a_setting(given: dict[str, Any], expected: dict[str, Any]) -> None:
     assert HIPNUC is not None
     actual = {"output": {"hi91": 100, "hi92": 50}, "alarm": msgspec.convert(ALARM, dict[str, AngleAlarm])}
-    made = completed(HIPNUC, wanted_values(HIPNUC, given), actual)
+    made = settings_plan.completed(HIPNUC, settings_plan.wanted_values(HIPNUC, given), actual)
     assert msgspec.to_builtins(made) == expected
-    assert made == wanted_values(HIPNUC, expected)  # the types of the table
+    assert made == settings_plan.wanted_values(HIPNUC, expected)  # the types of the table
 
 
 @pytest.mark.parametrize(
@@ -254,7 +247,9 @@ def test_a_dot_selects_a_part_of_a_setting(given: dict[str, Any], expected: dict
 def test_an_error_names_the_wrong_part(given: dict[str, Any], message: str) -> None:
     assert HIPNUC is not None
     with pytest.raises(BadArgument) as caught:
-        completed(HIPNUC, wanted_values(HIPNUC, given), {"alarm": msgspec.convert(ALARM, dict[str, AngleAlarm])})
+        settings_plan.completed(
+            HIPNUC, settings_plan.wanted_values(HIPNUC, given), {"alarm": msgspec.convert(ALARM, dict[str, AngleAlarm])}
+        )
     assert message in str(caught.value)
 
 
@@ -271,7 +266,7 @@ def test_an_error_names_the_wrong_part(given: dict[str, Any], message: str) -> N
 def test_a_command_that_a_setting_replaces(
     name: str, given: dict[str, Any], command: str, settings: dict[str, Any]
 ) -> None:
-    found = setting_instead("bow", name, DRIVERS["hipnuc-uart"], given)
+    found = settings_plan.setting_instead("bow", name, DRIVERS["hipnuc-uart"], given)
     assert found is not None
     assert str(found) == f"{name} is a setting: imud settings bow {command}"
     assert found.data == {"settings": settings, "save": command.endswith("--save")}

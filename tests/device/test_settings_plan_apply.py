@@ -6,17 +6,8 @@ from typing import Any
 
 import pytest
 
+from imud.contracts import setting
 from imud.contracts.command import Target
-from imud.contracts.setting import (
-    AppliedSettings,
-    DeviceReport,
-    Effect,
-    Reports,
-    Setting,
-    SettingsTable,
-    StepOutcome,
-    Written,
-)
 from imud.device.evidence import SampleWatch
 from imud.device.flash import FlashWrites, ModuleFlash
 from imud.device.settings_plan import Applying, SettingsPort, make_plan
@@ -29,13 +20,15 @@ TARGET = Target(None, 0)
 class TableOfOne:
     """A device with the setting `x`. Its scripts run when they are created."""
 
-    def __init__(self, result: object, *, readable: bool = True, effect: Effect = Effect.AT_ONCE, **more: Any) -> None:
+    def __init__(
+        self, result: object, *, readable: bool = True, effect: setting.Effect = setting.Effect.AT_ONCE, **more: Any
+    ) -> None:
         self.actual: dict[str, Any] = {"x": 1}
         self.active: dict[str, Any] = {"x": 1} if readable else {}
         self.done: list[str] = []
         self.result = result
-        self.table = SettingsTable(
-            table={"x": Setting(type=int, write=self._write, effect=effect, **more)},
+        self.table = setting.SettingsTable(
+            table={"x": setting.Setting(type=int, write=self._write, effect=effect, **more)},
             read=self._read, save=lambda _target: self._do("save"), restart=lambda _target: self._restart(),
         )  # fmt: skip
 
@@ -45,15 +38,15 @@ class TableOfOne:
     def _write(self, _target: Target, value: int) -> object:
         self._do(f"x={value}")
         self.actual = {"x": value}
-        if self.result is Written.VERIFIED or self.result is None:
+        if self.result is setting.Written.VERIFIED or self.result is None:
             self.active = dict(self.actual) if self.active else {}
         if isinstance(self.result, Exception):
             raise self.result
         return self.result
 
-    def _read(self, _target: Target, _names: Collection[str] | None) -> Reports:
+    def _read(self, _target: Target, _names: Collection[str] | None) -> setting.Reports:
         self._do("read")
-        return {"": DeviceReport(values=dict(self.active))}
+        return {"": setting.DeviceReport(values=dict(self.active))}
 
     def _restart(self) -> None:
         self._do("restart")
@@ -86,9 +79,9 @@ class CountedFlash(ModuleFlash):
 
 def applied(
     device: TableOfOne, *, save: bool = True, flash: CountedFlash | None = None, by_name: bool = False
-) -> AppliedSettings:
+) -> setting.AppliedSettings:
     plan = make_plan(device.table, TARGET, {"x": 2}, device.active, {}, save=save, unsaved=False, by_name=by_name)
-    port, reports = OnePort(), {"": DeviceReport(values=device.active)}
+    port, reports = OnePort(), {"": setting.DeviceReport(values=device.active)}
     applying = Applying(device.table, port, flash or CountedFlash(), {"x": 2}, reports)
     return asyncio.run(applying.carry_out(plan))
 
@@ -98,35 +91,35 @@ def test_values_are_written_read_back_saved_and_compared() -> None:
     found = applied(device, flash=flash)
     assert device.done == ["x=2", "read", "save"]
     assert (found.steps[0].outcome, found.saved, found.restarted, found.differences) == (
-        StepOutcome.VERIFIED, True, False, {},
+        setting.StepOutcome.VERIFIED, True, False, {},
     )  # fmt: skip
     assert flash.counted == 1
-    device = TableOfOne(Written.PENDING, effect=Effect.AFTER_RESTART)
+    device = TableOfOne(setting.Written.PENDING, effect=setting.Effect.AFTER_RESTART)
     found = applied(device)
     assert device.done == ["x=2", "read", "save", "restart", "read"]
-    assert (found.steps[0].outcome, found.restarted) == (StepOutcome.VERIFIED, True)
-    device = TableOfOne(Written.PENDING)
+    assert (found.steps[0].outcome, found.restarted) == (setting.StepOutcome.VERIFIED, True)
+    device = TableOfOne(setting.Written.PENDING)
     found = applied(device)
     assert device.done == ["x=2", "read", "save", "restart", "read"]
-    assert found.steps[0].outcome is StepOutcome.VERIFIED
-    device = TableOfOne(Written.PENDING)
+    assert found.steps[0].outcome is setting.StepOutcome.VERIFIED
+    device = TableOfOne(setting.Written.PENDING)
     found = applied(device, save=False)
     assert device.done == ["x=2", "read"]
-    assert found.steps[0].outcome is StepOutcome.WRITTEN
+    assert found.steps[0].outcome is setting.StepOutcome.WRITTEN
     assert list(found.differences) == ["x"]
 
 
-@pytest.mark.parametrize("result", [Written.UNVERIFIED, Written.UNVERIFIED_PENDING])
-def test_an_unreadable_value_is_not_verified_and_another_value_is_a_failure(result: Written) -> None:
+@pytest.mark.parametrize("result", [setting.Written.UNVERIFIED, setting.Written.UNVERIFIED_PENDING])
+def test_an_unreadable_value_is_not_verified_and_another_value_is_a_failure(result: setting.Written) -> None:
     found = applied(TableOfOne(result, readable=False))
-    assert found.steps[0].outcome is StepOutcome.NOT_VERIFIED
+    assert found.steps[0].outcome is setting.StepOutcome.NOT_VERIFIED
     assert (found.saved, found.problem, found.differences) == (True, "", {})
-    found = applied(TableOfOne(Written.UNVERIFIED))
+    found = applied(TableOfOne(setting.Written.UNVERIFIED))
     assert found.steps[0].message == "wrote 2, read back 1"
 
 
 def test_a_setting_that_saves_itself_is_saved_once() -> None:
-    device, flash = TableOfOne(Written.VERIFIED, saves=True, connection=True), CountedFlash()
+    device, flash = TableOfOne(setting.Written.VERIFIED, saves=True, connection=True), CountedFlash()
     found = applied(device, flash=flash)
     assert device.done == ["x=2", "read"]
     assert (found.saved, flash.counted) == (True, 1)
@@ -142,7 +135,7 @@ def test_errors_of_device_and_link_are_part_of_the_result(error: Exception) -> N
 
 
 def test_a_device_with_another_rate_than_its_bus_is_not_restarted() -> None:
-    device = TableOfOne(Written.PENDING, effect=Effect.AFTER_RESTART, connection=True, bus_rate=True)
+    device = TableOfOne(setting.Written.PENDING, effect=setting.Effect.AFTER_RESTART, connection=True, bus_rate=True)
     done = applied(device, by_name=True)
     assert (done.saved, done.restarted, done.problem) == (True, False, "")
     assert [one for one in device.done if one != "read"] == ["x=2", "save"]

@@ -9,16 +9,9 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from imud.attitude import rotation
 from imud.attitude.conventions import FLU_LEVEL, RFU_ENU, Convention, EulerOrder, Heading
 from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes, mounting_of, published_frame
-from imud.attitude.rotation import (
-    euler312_from_quat,
-    matrix_from_quat,
-    matrix_product,
-    quat_from_euler_zyx,
-    quat_from_matrix,
-    quat_product,
-)
 from imud.config.model import DeviceConfig
 from imud.contracts.driver import StatusBit, status_words
 from imud.contracts.publisher import Batch
@@ -49,9 +42,9 @@ STEP_S = 0.01
 def in_body(frame: FrameOptions, euler_deg: Vector3 = BODY_DEG, device: Any = RFU_ENU) -> Still:
     """Return the motion of a mounted sensor in a body at rest. `Still` uses the order 312."""
     roll, pitch, yaw = euler_deg
-    body = matrix_from_quat(quat_from_euler_zyx((radians(roll), radians(pitch), radians(yaw))))
-    sensor = quat_from_matrix(matrix_product(body, mounting_of(frame, device)))
-    return Still(*euler312_from_quat(sensor))
+    body = rotation.matrix_from_quat(rotation.quat_from_euler_zyx((radians(roll), radians(pitch), radians(yaw))))
+    sensor = rotation.quat_from_matrix(rotation.matrix_product(body, mounting_of(frame, device)))
+    return Still(*rotation.euler312_from_quat(sensor))
 
 
 class ZDown:
@@ -65,7 +58,7 @@ class ZDown:
         x, y, z = truth.accel_m_s2
         p, q, r = truth.gyro_rad_s
         flip = (0.0, 1.0, 0.0, 0.0)
-        quat = quat_product(quat_product(flip, truth.quat_wxyz), flip)
+        quat = rotation.quat_product(rotation.quat_product(flip, truth.quat_wxyz), flip)
         return truth._replace(accel_m_s2=(x, -y, -z), gyro_rad_s=(p, -q, -r), quat_wxyz=quat)
 
 
@@ -142,7 +135,7 @@ def test_a_module_in_any_mounting_shows_the_attitude_of_the_body(name: str) -> N
     assert made.newest.accel_m_s2 == pytest.approx(straight.newest.accel_m_s2, abs=1e-4)
     assert made.newest.mag_t == pytest.approx(straight.newest.mag_t, abs=1e-10)
     assert made.newest.gyro_rad_s == pytest.approx((0, 0, 0), abs=1e-6)
-    up = matrix_from_quat(made.newest.quat_wxyz or (0, 0, 0, 0))[2]
+    up = rotation.matrix_from_quat(made.newest.quat_wxyz or (0, 0, 0, 0))[2]
     assert made.newest.accel_m_s2 == pytest.approx([9.8 * one for one in up], abs=1e-3)
     assert (made.events, made.status.problem) == ([], "")
 

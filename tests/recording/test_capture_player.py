@@ -68,7 +68,7 @@ def test_a_stamped_capture_has_the_times_of_its_reads_and_utc_if_it_says_when_it
     assert sample.utc_ns - sample.t_ns == 1_763_717_507 * NS_PER_S - (BEGIN_NS + 8 * NS_PER_MS)
 
 
-def test_a_raw_capture_has_the_time_of_the_device_and_an_empty_one_no_sample() -> None:
+def test_a_raw_capture_has_the_time_of_the_device_or_of_the_bytes_on_the_wire() -> None:
     played = Played("hipnuc-uart")
     played.player.play_bytes(CaptureReader(BytesIO(b"".join(hi91(10 * i + 70) for i in range(50)))), 115200)
     assert played.player.times is KnownTimes.NONE
@@ -82,9 +82,6 @@ def test_a_raw_capture_has_the_time_of_the_device_and_an_empty_one_no_sample() -
     played.player.play_bytes(CaptureReader(BytesIO()), 115200)
     assert played.samples == []
     assert played.player.device.path is None
-
-
-def test_a_raw_capture_of_a_device_without_time_has_the_time_of_the_bytes_on_the_wire() -> None:
     samples: list[Sample] = []
     player = CapturePlayer(lambda batch: samples.extend(batch.samples), FAKE_DRIVER, FAKE_DRIVER.settings(), "file")
     frame = fake_frame(bytes(94))

@@ -12,24 +12,14 @@ from imud.model.sample import Measurement, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from imud.sampling.clock import SampleClock
 from imud.sim.ports.arrival import BARE_UART, LOADED, USB_16MS, Arrival, ArrivalModel, ArrivalProfile, Crystal
+from tests.bench import host_clocks
 from tests.bench.clock import TICK_MODULUS, TICK_NS, accuracy
-from tests.bench.host_clocks import (
-    BEGIN_NS,
-    UTC_AHEAD_NS,
-    DatedArrival,
-    SteeredHost,
-    Steering,
-    clock_on,
-    date,
-    rises,
-    run,
-)
 from tests.bench.line_model import LineFaults, measured_ns, pps_age_ms, pulses_per_second, simulate_reads, triggered
 
-ALONE = Steering("not steered")
-USUAL = Steering("20 ppm", ((-1000, 20),))
-NTP = Steering("500 ppm", ((8, 500), (14, -500), (20, 0)))
-CHRONY = Steering("83,333 ppm", ((1, 83_333), (4, 0), (12, -83_333), (15, 0)))
+ALONE = host_clocks.Steering("not steered")
+USUAL = host_clocks.Steering("20 ppm", ((-1000, 20),))
+NTP = host_clocks.Steering("500 ppm", ((8, 500), (14, -500), (20, 0)))
+CHRONY = host_clocks.Steering("83,333 ppm", ((1, 83_333), (4, 0), (12, -83_333), (15, 0)))
 STEERED = (
     pytest.param(USUAL, marks=pytest.mark.thorough), pytest.param(NTP, marks=pytest.mark.thorough), CHRONY,
 )  # fmt: skip
@@ -40,17 +30,19 @@ def model(profile: ArrivalProfile, rate_hz: int = 100) -> ArrivalModel:
     return ArrivalModel(profile, rate_hz, 5, Crystal(50.0), 921_600 if rate_hz > 100 else 115_200)
 
 
-def on(steering: Steering, profile: ArrivalProfile = BARE_UART) -> tuple[SteeredHost, SampleClock]:
-    host = SteeredHost(steering)
-    host.at(BEGIN_NS)
-    return host, clock_on(host, model(profile))
+def on(
+    steering: host_clocks.Steering, profile: ArrivalProfile = BARE_UART
+) -> tuple[host_clocks.SteeredHost, SampleClock]:
+    host = host_clocks.SteeredHost(steering)
+    host.at(host_clocks.BEGIN_NS)
+    return host, host_clocks.clock_on(host, model(profile))
 
 
-def assert_honest(dated: Sequence[DatedArrival], settle_s: float = 10) -> None:
+def assert_honest(dated: Sequence[host_clocks.DatedArrival], settle_s: float = 10) -> None:
     got = accuracy([d.point for d in dated], settle_ns=int(settle_s * NS_PER_S))
     assert got.share >= 0.97
     assert got.share_settling >= 0.95
-    assert rises(dated)
+    assert host_clocks.rises(dated)
 
 
 @pytest.mark.parametrize(
@@ -67,9 +59,11 @@ def assert_honest(dated: Sequence[DatedArrival], settle_s: float = 10) -> None:
     ],
     ids=lambda value: value.name,
 )  # fmt: skip
-def test_time_stamps_equal_those_of_an_undisturbed_host(steering: Steering, profile: ArrivalProfile) -> None:
-    dated = run(model(profile), steering, 100 * SECONDS)
-    alone = run(model(profile), ALONE, 100 * SECONDS)
+def test_time_stamps_equal_those_of_an_undisturbed_host(
+    steering: host_clocks.Steering, profile: ArrivalProfile
+) -> None:
+    dated = host_clocks.run(model(profile), steering, 100 * SECONDS)
+    alone = host_clocks.run(model(profile), ALONE, 100 * SECONDS)
     assert_honest(dated)
     apart = [abs(a.point.off_ns - b.point.off_ns) for a, b in zip(dated, alone, strict=True)]
     more = [ns - 0.09 * abs(b.point.off_ns) for ns, b in zip(apart, alone, strict=True)]  # and their slew
@@ -80,27 +74,27 @@ def test_time_stamps_equal_those_of_an_undisturbed_host(steering: Steering, prof
 
 def test_without_the_unsteered_clock_the_slew_is_visible() -> None:
     """The tests above prove nothing unless the slew would be visible."""
-    dated = run(model(BARE_UART), NTP, 100 * SECONDS, unseen=True)
+    dated = host_clocks.run(model(BARE_UART), NTP, 100 * SECONDS, unseen=True)
     assert max(abs(d.point.off_ns) for d in dated) > NS_PER_MS
 
 
 def test_the_rate_of_the_device_is_against_the_unsteered_clock() -> None:
     host, clock = on(NTP)
     for a in model(BARE_UART).run(1300):
-        date(clock, host, a)
+        host_clocks.date(clock, host, a)
     assert clock.status().skew_ppm == pytest.approx(50, abs=10)
     assert host.clock.steady.rate == pytest.approx(500e-6, abs=1e-6)
 
 
 @pytest.mark.parametrize("steering", STEERED[1:], ids=lambda steering: steering.name)
-def test_frames_of_a_stalled_host_use_the_rate_of_their_time(steering: Steering) -> None:
+def test_frames_of_a_stalled_host_use_the_rate_of_their_time(steering: host_clocks.Steering) -> None:
     """Frames of 300 ms in one read, every two seconds. The rate between two clock readings is unknown."""
     host, clock = on(steering)
     dated = []
     for a in model(BARE_UART).run(100 * SECONDS):
-        since_ns = (a.t_rx_ns - BEGIN_NS) % (2 * NS_PER_S)
+        since_ns = (a.t_rx_ns - host_clocks.BEGIN_NS) % (2 * NS_PER_S)
         late_ns = max(300 * NS_PER_MS - since_ns, 0)
-        dated.append(date(clock, host, replace(a, t_rx_ns=a.t_rx_ns + late_ns)))
+        dated.append(host_clocks.date(clock, host, replace(a, t_rx_ns=a.t_rx_ns + late_ns)))
     assert_honest(dated)
     settled = [abs(d.point.off_ns) for d in dated[1000:]]
     assert sorted(settled)[int(0.95 * len(settled))] < 500 * NS_PER_US
@@ -113,22 +107,24 @@ def test_a_read_that_waits_for_its_decoding_uses_the_rate_of_its_time() -> None:
     for a in model(BARE_UART).run(100 * SECONDS):
         host.at(a.t_rx_ns + 50 * NS_PER_MS)
         measured = Measurement(a.size_bytes, a.trailing_bytes, a.dev_ns // TICK_NS % TICK_MODULUS)
-        dated.append(DatedArrival(clock.sample(measured, to(a.t_rx_ns), UTC_AHEAD_NS), to(a.t_ns)))
+        dated.append(
+            host_clocks.DatedArrival(clock.sample(measured, to(a.t_rx_ns), host_clocks.UTC_AHEAD_NS), to(a.t_ns))
+        )
     assert_honest(dated)
     offs = sorted(abs(d.point.off_ns) for d in dated[1000:])
     assert offs[int(0.97 * len(offs))] < 300 * NS_PER_US
 
 
-def steered_edges(edges: Sequence[Edge], steering: Steering) -> list[Edge]:
+def steered_edges(edges: Sequence[Edge], steering: host_clocks.Steering) -> list[Edge]:
     """Return edges with the kernel's time stamps in CLOCK_MONOTONIC."""
     return [edge._replace(t_ns=steering.monotonic_ns(edge.t_ns)) for edge in edges]
 
 
 @pytest.mark.parametrize("steering", STEERED, ids=lambda steering: steering.name)
-def test_edges_of_sout_are_paired_and_stamp_as_well_as_ever(steering: Steering) -> None:
+def test_edges_of_sout_are_paired_and_stamp_as_well_as_ever(steering: host_clocks.Steering) -> None:
     m = model(BARE_UART)
-    host = SteeredHost(steering)
-    host.at(BEGIN_NS)
+    host = host_clocks.SteeredHost(steering)
+    host.at(host_clocks.BEGIN_NS)
     clock = SampleClock(
         "imu", tick_ns=TICK_NS, tick_modulus=TICK_MODULUS, byte_ns=m.byte_ns, hold_ns=0, sout=SoutTiming(bias_us=0.0),
         host=host.clock.steady,
@@ -141,10 +137,10 @@ def test_edges_of_sout_are_paired_and_stamp_as_well_as_ever(steering: Steering) 
             clock.add_edges("sout", edges)
             clock.add_edges("sout_div", [edge for edge in edges if edge.rising and edge.number % 10 == 1])
             read.edges.clear()
-            d = date(clock, host, a)
+            d = host_clocks.date(clock, host, a)
             dated.append(d._replace(truth_ns=steering.monotonic_ns(measured_ns(a))))
         divided += clock.take_marks()
-    assert rises(dated)
+    assert host_clocks.rises(dated)
     settled = dated[500:]
     assert {d.sample.sync for d in settled} == {Sync.EDGE}
     assert sum(d.sample.edge_seq is not None for d in settled) > 0.99 * len(settled)
@@ -157,20 +153,20 @@ def test_edges_of_sout_are_paired_and_stamp_as_well_as_ever(steering: Steering) 
 
 
 @pytest.mark.parametrize("steering", STEERED, ids=lambda steering: steering.name)
-def test_triggers_are_paired_with_their_answers(steering: Steering) -> None:
+def test_triggers_are_paired_with_their_answers(steering: host_clocks.Steering) -> None:
     host, clock = on(steering)
     dated = []
     for stamp, a in triggered(model(BARE_UART), 100 * SECONDS, 1.0):
         assert a is not None
         host.at(stamp.t_ns)
         clock.add_triggers([TriggerStamp(steering.monotonic_ns(stamp.t_ns), stamp.err_ns, stamp.number)])
-        dated.append(date(clock, host, a))
+        dated.append(host_clocks.date(clock, host, a))
     assert_honest(dated)
     assert sum(d.sample.edge_seq is not None for d in dated[500:]) > 0.99 * (len(dated) - 500)
 
 
 @pytest.mark.parametrize("steering", STEERED, ids=lambda steering: steering.name)
-def test_pulses_per_second_time_stamp_samples_by_age(steering: Steering) -> None:
+def test_pulses_per_second_time_stamp_samples_by_age(steering: host_clocks.Steering) -> None:
     host, clock = on(steering, USB_16MS)
     arrivals = list(model(USB_16MS).run(100 * SECONDS))
     pulses = pulses_per_second(arrivals, 1)
@@ -181,34 +177,36 @@ def test_pulses_per_second_time_stamp_samples_by_age(steering: Steering) -> None
             clock.add_edges("pps", steered_edges([pulses.pop(0)], steering))
         host.at(a.t_rx_ns)
         m = Measurement(a.size_bytes, a.trailing_bytes, a.dev_ns // TICK_NS, pps_age_ms=pps_age_ms(a, 50.0))
-        sample = clock.sample(m, steering.monotonic_ns(a.t_rx_ns), UTC_AHEAD_NS)
-        dated.append(DatedArrival(sample, steering.monotonic_ns(a.t_ns)))
+        sample = clock.sample(m, steering.monotonic_ns(a.t_rx_ns), host_clocks.UTC_AHEAD_NS)
+        dated.append(host_clocks.DatedArrival(sample, steering.monotonic_ns(a.t_ns)))
     assert_honest(dated)
     assert any(d.sample.sync is Sync.EDGE for d in dated)
 
 
 @pytest.mark.parametrize("steering", STEERED, ids=lambda steering: steering.name)
-def test_a_device_on_utc_stays_on_it(steering: Steering) -> None:
+def test_a_device_on_utc_stays_on_it(steering: host_clocks.Steering) -> None:
     """The reference is set once per second and is correct for each rate of CLOCK_MONOTONIC."""
     host, clock = on(steering)
     dated, given_s = [], -1
     for a in model(BARE_UART).run(100 * SECONDS):
         offset_ns = host.at(a.t_rx_ns)
-        if (a.t_rx_ns - BEGIN_NS) // NS_PER_S != given_s:
-            given_s = (a.t_rx_ns - BEGIN_NS) // NS_PER_S
-            ahead_ns = UTC_AHEAD_NS + a.t_rx_ns - steering.monotonic_ns(a.t_rx_ns)  # UTC minus CLOCK_MONOTONIC
+        if (a.t_rx_ns - host_clocks.BEGIN_NS) // NS_PER_S != given_s:
+            given_s = (a.t_rx_ns - host_clocks.BEGIN_NS) // NS_PER_S
+            ahead_ns = (
+                host_clocks.UTC_AHEAD_NS + a.t_rx_ns - steering.monotonic_ns(a.t_rx_ns)
+            )  # UTC minus CLOCK_MONOTONIC
             clock.set_utc_reference(UtcReference(ahead_ns, 20_000))
             assert clock.utc_reference == UtcReference(ahead_ns, 20_000)
-        m = Measurement(a.size_bytes, a.trailing_bytes, (a.t_ns + UTC_AHEAD_NS) // TICK_NS % TICK_MODULUS)
+        m = Measurement(a.size_bytes, a.trailing_bytes, (a.t_ns + host_clocks.UTC_AHEAD_NS) // TICK_NS % TICK_MODULUS)
         sample = clock.sample(m, steering.monotonic_ns(a.t_rx_ns), offset_ns)
-        dated.append(DatedArrival(sample, steering.monotonic_ns(a.t_ns)))
+        dated.append(host_clocks.DatedArrival(sample, steering.monotonic_ns(a.t_ns)))
     assert_honest(dated)
     assert {d.sample.sync for d in dated[200:]} == {Sync.UTC}
 
 
 @cache
-def usual_run() -> list[DatedArrival]:
-    return run(model(BARE_UART), USUAL, 1000)
+def usual_run() -> list[host_clocks.DatedArrival]:
+    return host_clocks.run(model(BARE_UART), USUAL, 1000)
 
 
 @pytest.mark.parametrize("step_ns", [-NS_PER_S, 3600 * NS_PER_S, -50 * NS_PER_US], ids=["leap second", "hour", "50 µs"])
@@ -218,14 +216,16 @@ def test_a_step_of_the_wall_clock_moves_only_utc(step_ns: int) -> None:
     for i, a in enumerate(model(BARE_UART).run(1000)):
         if i == 500:
             host.ahead_ns += step_ns
-        dated.append(date(clock, host, a))
+        dated.append(host_clocks.date(clock, host, a))
     alone = usual_run()
     assert all(abs(d.sample.t_ns - b.sample.t_ns) < 2 * NS_PER_US for d, b in zip(dated, alone, strict=True))
-    assert all(d.sample.utc_ns - d.sample.t_ns == UTC_AHEAD_NS for d in dated[:500])
-    assert all(d.sample.utc_ns - d.sample.t_ns == UTC_AHEAD_NS + step_ns for d in dated[500:])
+    assert all(d.sample.utc_ns - d.sample.t_ns == host_clocks.UTC_AHEAD_NS for d in dated[:500])
+    assert all(d.sample.utc_ns - d.sample.t_ns == host_clocks.UTC_AHEAD_NS + step_ns for d in dated[500:])
 
 
-def counted(arrivals: Iterator[Arrival], host: SteeredHost) -> tuple[list[DatedArrival], int, int]:
+def counted(
+    arrivals: Iterator[Arrival], host: host_clocks.SteeredHost
+) -> tuple[list[host_clocks.DatedArrival], int, int]:
     """Return (samples, number of lost samples, gaps of unknown size)."""
     unknown: list[int] = []
     clock = SampleClock(
@@ -234,7 +234,7 @@ def counted(arrivals: Iterator[Arrival], host: SteeredHost) -> tuple[list[DatedA
     )  # fmt: skip
     dated, missed = [], 0
     for a in arrivals:
-        dated.append(date(clock, host, a))
+        dated.append(host_clocks.date(clock, host, a))
         missed += clock.missed
     return dated, missed, len(unknown)
 
@@ -247,7 +247,7 @@ def test_the_time_continues_after_a_suspend(away_s: int) -> None:
         for i, a in enumerate(model(BARE_UART).run(3000)):
             yield a if i < 1500 else replace(a, dev_ns=a.dev_ns + away_s * NS_PER_S)
 
-    host = SteeredHost(USUAL)
+    host = host_clocks.SteeredHost(USUAL)
     dated, missed, unknown = counted(device(), host)
     assert_honest(dated)
     assert_honest(dated[1500:], 5)
@@ -255,7 +255,7 @@ def test_the_time_continues_after_a_suspend(away_s: int) -> None:
 
 
 @pytest.mark.parametrize("steering", [ALONE, NTP], ids=lambda steering: steering.name)
-def test_a_stopped_host_loses_exactly_the_unread_samples(steering: Steering) -> None:
+def test_a_stopped_host_loses_exactly_the_unread_samples(steering: host_clocks.Steering) -> None:
     """The host stops for 5 s: the first three frames wait in the UART, the others are lost."""
     away = range(1000, 1500)
     arrivals = list(model(BARE_UART).run(2400))
@@ -267,7 +267,7 @@ def test_a_stopped_host_loses_exactly_the_unread_samples(steering: Steering) -> 
             elif i < away.start + 3:
                 yield replace(a, t_rx_ns=arrivals[away.stop].t_ns)
 
-    dated, missed, unknown = counted(seen(), SteeredHost(steering))
+    dated, missed, unknown = counted(seen(), host_clocks.SteeredHost(steering))
     assert_honest(dated)
     assert (missed, unknown) == (len(away) - 3, 0)
 
@@ -275,16 +275,16 @@ def test_a_stopped_host_loses_exactly_the_unread_samples(steering: Steering) -> 
 def test_frames_with_a_begin_of_their_own_are_converted_as_well() -> None:
     """CAN: the first frame of a sample arrived some ms before the last frame. The kernel time-stamped both."""
     m = replace(model(BARE_UART), size_bytes=0, baud=0)
-    host = SteeredHost(CHRONY)
-    host.at(BEGIN_NS)
-    clock, dated = clock_on(host, m), []
+    host = host_clocks.SteeredHost(CHRONY)
+    host.at(host_clocks.BEGIN_NS)
+    clock, dated = host_clocks.clock_on(host, m), []
     for t_rx_ns, group in groupby(m.run(100 * SECONDS), key=lambda a: a.t_rx_ns):
         for a in group:
             host.at(t_rx_ns + 3 * NS_PER_MS)
             to = CHRONY.monotonic_ns
             measured = Measurement(0, 0, a.dev_ns // TICK_NS % TICK_MODULUS)
-            sample = clock.sample(measured, to(t_rx_ns + 2 * NS_PER_MS), UTC_AHEAD_NS, to(t_rx_ns))
-            dated.append(DatedArrival(sample, to(a.t_ns)))
+            sample = clock.sample(measured, to(t_rx_ns + 2 * NS_PER_MS), host_clocks.UTC_AHEAD_NS, to(t_rx_ns))
+            dated.append(host_clocks.DatedArrival(sample, to(a.t_ns)))
     assert_honest(dated)
     offs = sorted(abs(d.point.off_ns) for d in dated[1000:])
     assert offs[int(0.97 * len(offs))] < 300 * NS_PER_US

@@ -8,18 +8,8 @@ from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.clock import SampleClock
 from imud.sampling.device_utc import IntervalFit
 from imud.sim.ports.arrival import BARE_UART, LOADED, USB_16MS, USB_16MS_PACKET, ArrivalModel, ArrivalProfile, Crystal
+from tests.bench import line_runs
 from tests.bench.clock import BAUD_OF_RATE, clock_for
-from tests.bench.line_runs import (
-    REFERENCE,
-    UTC_OFFSET_NS,
-    after,
-    run_pps,
-    run_triggers,
-    run_utc,
-    share_honest,
-    steepest,
-    syncs,
-)  # fmt: skip
 from tests.support.clock_feed import BEGIN_NS, rises
 
 UNIX = 1 << 32
@@ -39,57 +29,57 @@ def model(profile: ArrivalProfile, rate_hz: int = 100, ppm: float = 0.0, seed: i
 )
 @pytest.mark.manual("B 1.2.1 UTC by PPS and RMC")
 def test_a_device_that_turns_to_utc_is_recognised(profile: ArrivalProfile, turn_ms: int, seed: int) -> None:
-    dated, clock = run_utc(model(profile, seed=seed), 45, turn_ms=turn_ms)
+    dated, clock = line_runs.run_utc(model(profile, seed=seed), 45, turn_ms=turn_ms)
     assert clock.status().resets == 0
-    assert clock.status().reference_error_ns == REFERENCE.error_ns
-    assert syncs(dated[1500:]) == {Sync.UTC}
-    assert share_honest(dated) >= 0.95
-    assert steepest(dated[1100:]) < 2 * SLEW  # the slew of the fit and of its correction
+    assert clock.status().reference_error_ns == line_runs.REFERENCE.error_ns
+    assert line_runs.syncs(dated[1500:]) == {Sync.UTC}
+    assert line_runs.share_honest(dated) >= 0.95
+    assert line_runs.steepest(dated[1100:]) < 2 * SLEW  # the slew of the fit and of its correction
     assert rises(t.sample for t in dated)
-    assert max(abs(t.off_ns) for t in after(dated, 30)) < 600_000
-    assert max(t.sample.t_err_ns for t in after(dated, 30)) < NS_PER_MS
+    assert max(abs(t.off_ns) for t in line_runs.after(dated, 30)) < 600_000
+    assert max(t.sample.t_err_ns for t in line_runs.after(dated, 30)) < NS_PER_MS
 
 
 @pytest.mark.parametrize("ppm", [-50_000.0, 50.0])
 def test_the_old_rate_of_the_crystal_is_forgotten_after_the_jump(ppm: float) -> None:
     """With the crystal's old rate, the time moved by 0.8 s until the new fit was in use, 16 s after the jump."""
-    dated, clock = run_utc(model(USB_16MS, 100, ppm), 32, turn_ms=UNIX)
+    dated, clock = line_runs.run_utc(model(USB_16MS, 100, ppm), 32, turn_ms=UNIX)
     assert clock.status().resets == 0
-    assert share_honest(dated) >= 0.95
-    assert max(abs(t.off_ns) for t in after(dated, 9)) < 3 * NS_PER_MS
-    assert max(t.sample.t_err_ns for t in after(dated, 9)) < 5 * NS_PER_MS
+    assert line_runs.share_honest(dated) >= 0.95
+    assert max(abs(t.off_ns) for t in line_runs.after(dated, 9)) < 3 * NS_PER_MS
+    assert max(t.sample.t_err_ns for t in line_runs.after(dated, 9)) < 5 * NS_PER_MS
 
 
 def test_a_turn_before_anything_is_known_gives_the_time_itself() -> None:
-    dated, clock = run_utc(model(USB_16MS), 20, turn_ms=UNIX, turn_at=0.02)
+    dated, clock = line_runs.run_utc(model(USB_16MS), 20, turn_ms=UNIX, turn_at=0.02)
     assert clock.status().resets == 0
-    assert syncs(dated[40:]) == {Sync.UTC}
+    assert line_runs.syncs(dated[40:]) == {Sync.UTC}
     assert max(abs(t.off_ns) for t in dated[40:]) < 2 * NS_PER_MS
-    assert share_honest(dated) >= 0.95
+    assert line_runs.share_honest(dated) >= 0.95
 
 
 def test_samples_that_hardly_drift_through_the_milliseconds_of_utc() -> None:
     """Device time and UTC are each accurate within a tick, and both can stay at their limits for seconds."""
-    dated, _ = run_utc(model(USB_16MS_PACKET, 200, -50.0, 2002), 15, turn_ms=UNIX, turn_at=0.06)
-    assert share_honest(dated) >= 0.95
+    dated, _ = line_runs.run_utc(model(USB_16MS_PACKET, 200, -50.0, 2002), 15, turn_ms=UNIX, turn_at=0.06)
+    assert line_runs.share_honest(dated) >= 0.95
 
 
-@pytest.mark.parametrize("error_ns", [REFERENCE.error_ns, 10 * NS_PER_S])
+@pytest.mark.parametrize("error_ns", [line_runs.REFERENCE.error_ns, 10 * NS_PER_S])
 def test_gps_time_is_refused(error_ns: int) -> None:
     """The clock rejects a time that is 18 s off, even if the error of the host's time is 10 s."""
-    unsure = UtcReference(UTC_OFFSET_NS, error_ns)
-    dated, clock = run_utc(model(BARE_UART), 25, turn_ms=UNIX, ahead_ns=18 * NS_PER_S, reference=unsure)
-    assert Sync.UTC not in syncs(dated)
+    unsure = UtcReference(line_runs.UTC_OFFSET_NS, error_ns)
+    dated, clock = line_runs.run_utc(model(BARE_UART), 25, turn_ms=UNIX, ahead_ns=18 * NS_PER_S, reference=unsure)
+    assert Sync.UTC not in line_runs.syncs(dated)
     assert clock.status().resets == 1
 
 
 def test_a_device_that_was_on_utc_before_is_recognised() -> None:
-    dated, _ = run_utc(model(BARE_UART), 20, turn_ms=UNIX)
+    dated, _ = line_runs.run_utc(model(BARE_UART), 20, turn_ms=UNIX)
     clock = clock_for(model(BARE_UART))
-    clock.set_utc_reference(REFERENCE)
+    clock.set_utc_reference(line_runs.REFERENCE)
     samples = []
     for t in dated[600:]:
-        ticks = (t.truth_ns + UTC_OFFSET_NS) // NS_PER_MS % UNIX
+        ticks = (t.truth_ns + line_runs.UTC_OFFSET_NS) // NS_PER_MS % UNIX
         samples.append(clock.sample(Measurement(82, 0, ticks), t.sample.t_rx_ns, 0))
     assert [s.sync for s in samples[300:]] == [Sync.UTC] * (len(samples) - 300)
 
@@ -99,7 +89,7 @@ def on_utc(clock: SampleClock, count: int, status: int | None, off_ms: float, fi
     found = []
     for i in range(first, first + count):
         at = BEGIN_NS + 10 * i * NS_PER_MS
-        ticks = (at + UTC_OFFSET_NS + int(off_ms * (i - first) * NS_PER_MS)) // NS_PER_MS % UNIX
+        ticks = (at + line_runs.UTC_OFFSET_NS + int(off_ms * (i - first) * NS_PER_MS)) // NS_PER_MS % UNIX
         found.append(clock.sample(Measurement(82, 0, ticks, status=status), at + 2 * NS_PER_MS, 0).sync)
     return found
 
@@ -107,7 +97,7 @@ def on_utc(clock: SampleClock, count: int, status: int | None, off_ms: float, fi
 def utc_clock(not_utc: int = 0) -> SampleClock:
     bits = TimeBits(not_utc=not_utc)
     clock = SampleClock("imu", tick_ns=NS_PER_MS, tick_modulus=UNIX, byte_ns=10_850, hold_ns=0, bits=bits)
-    clock.set_utc_reference(REFERENCE)
+    clock.set_utc_reference(line_runs.REFERENCE)
     return clock
 
 
@@ -137,37 +127,37 @@ def test_a_missing_reference_causes_no_step() -> None:
 @pytest.mark.parametrize(("rate_hz", "ppm", "seconds"), [(1, 0.0, 100), (1, 50.0, 100), (100, 50_000.0, 25)])
 @pytest.mark.manual("B 1.2.1 pulse per second")
 def test_a_pulse_per_second_is_better_than_a_slow_adapter(rate_hz: int, ppm: float, seconds: int) -> None:
-    dated = run_pps(model(USB_16MS_PACKET, rate_hz, ppm), seconds)
-    assert share_honest(dated) >= 0.95
+    dated = line_runs.run_pps(model(USB_16MS_PACKET, rate_hz, ppm), seconds)
+    assert line_runs.share_honest(dated) >= 0.95
     assert rises(t.sample for t in dated)
-    settled = after(dated, 0.6 * seconds)
+    settled = line_runs.after(dated, 0.6 * seconds)
     assert sum(abs(t.off_ns) for t in settled) < 600_000 * len(settled)  # without it 1.5 ms at 100 Hz, 6 ms at 1 Hz
-    assert Sync.EDGE in syncs(settled)
+    assert Sync.EDGE in line_runs.syncs(settled)
 
 
 def test_a_young_fit_does_not_mislead_the_pulse() -> None:
     """A slope error of 0.1 % is one millisecond at an age of one second. The intervals must contain it."""
-    dated = run_pps(model(LOADED, 1000, 50.0, 1007), 4)
-    assert share_honest(dated) >= 0.95
+    dated = line_runs.run_pps(model(LOADED, 1000, 50.0, 1007), 4)
+    assert line_runs.share_honest(dated) >= 0.95
     assert all(abs(t.off_ns) < 3 * t.sample.t_err_ns for t in dated)
 
 
 def test_losing_and_regaining_the_pulse_makes_no_step() -> None:
-    dated = run_pps(model(USB_16MS_PACKET, 50, 50.0), 90, silent_s=range(40, 60))
+    dated = line_runs.run_pps(model(USB_16MS_PACKET, 50, 50.0), 90, silent_s=range(40, 60))
     assert {dated[1950].sample.sync, dated[-1].sample.sync} == {Sync.EDGE}
     assert dated[2500].sample.sync is Sync.REGRESSION
-    assert steepest(dated[1000:]) < 2 * SLEW
-    assert share_honest(dated) >= 0.95
+    assert line_runs.steepest(dated[1000:]) < 2 * SLEW
+    assert line_runs.share_honest(dated) >= 0.95
 
 
 @pytest.mark.parametrize(("rate_hz", "ppm"), [(100, 50_000.0), (1000, -50.0)])
 @pytest.mark.manual("B 1.2.1 delay of the answer")
 def test_triggers_find_their_answers(rate_hz: int, ppm: float) -> None:
-    dated, clock, missed = run_triggers(model(BARE_UART, rate_hz, ppm), 5, 0.95)
+    dated, clock, missed = line_runs.run_triggers(model(BARE_UART, rate_hz, ppm), 5, 0.95)
     paired = [t for t in dated if t.sample.edge_seq is not None]
     assert len(paired) > 0.9 * len(dated)
     assert all(t.sample.edge_seq == t.number for t in paired)
-    assert share_honest(dated) >= 0.95
+    assert line_runs.share_honest(dated) >= 0.95
     assert abs(clock.status().triggers_missed - missed) <= 20
     assert clock.status().edges == rate_hz * 5
 

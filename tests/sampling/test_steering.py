@@ -12,31 +12,10 @@ from imud.model.sample import Measurement, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.clock import SampleClock
 from imud.sampling.steering import Holdover, Slew
-from imud.sim.ports.arrival import (
-    BARE_UART,
-    LOADED,
-    USB_1MS,
-    USB_16MS,
-    USB_16MS_PACKET,
-    ArrivalModel,
-    ArrivalProfile,
-    Crystal,
-)
+from imud.sim.ports import arrival
+from tests.bench import line_runs
 from tests.bench.clock import BAUD_OF_RATE
 from tests.bench.line_model import LineFaults, measured_ns, restarted, simulate_reads
-from tests.bench.line_runs import (
-    REFERENCE,
-    UTC_OFFSET_NS,
-    DatedSample,
-    after,
-    measurement,
-    run_sout,
-    share_honest,
-    sout_clock,
-    steepest,
-    syncs,
-    with_sout,
-)  # fmt: skip
 from tests.support.clock_feed import BEGIN_NS, make_clock, message, rises
 
 # --- slewing ----------------------------------------------------------------------------------------------------------
@@ -68,17 +47,24 @@ JITTER_STEP_NS = 60_000
 HALF_LOST = LineFaults(pulse_loss=0.1, edge_loss=0.02, frame_loss=0.1, extra=0.02, loaded=True)
 
 
-def model(profile: ArrivalProfile, rate_hz: int = 100, seed: int = 1, crystal: Crystal | None = None) -> ArrivalModel:
-    return ArrivalModel(profile, rate_hz, seed, crystal or Crystal(50.0), BAUD_OF_RATE[rate_hz])
+def model(
+    profile: arrival.ArrivalProfile, rate_hz: int = 100, seed: int = 1, crystal: arrival.Crystal | None = None
+) -> arrival.ArrivalModel:
+    return arrival.ArrivalModel(profile, rate_hz, seed, crystal or arrival.Crystal(50.0), BAUD_OF_RATE[rate_hz])
 
 
 @pytest.mark.parametrize(
     ("profile", "rate_hz", "seconds", "rising_only"),
-    [(BARE_UART, 1000, 2, False), (USB_16MS, 100, 10, True), (LOADED, 100, 10, False), (LOADED, 1000, 3, True)],
+    [
+        (arrival.BARE_UART, 1000, 2, False),
+        (arrival.USB_16MS, 100, 10, True),
+        (arrival.LOADED, 100, 10, False),
+        (arrival.LOADED, 1000, 3, True),
+    ],
     ids=lambda value: getattr(value, "name", None),
 )
 def test_every_pair_is_right_under_loss_on_either_side(
-    profile: ArrivalProfile, rate_hz: int, seconds: int, rising_only: bool
+    profile: arrival.ArrivalProfile, rate_hz: int, seconds: int, rising_only: bool
 ) -> None:
     """The kernel reports and numbers all edges, or only rising edges."""
     m = model(profile, rate_hz, 3)
@@ -91,109 +77,116 @@ def test_every_pair_is_right_under_loss_on_either_side(
             )
             for read in reads
         ]
-    dated = with_sout(sout_clock(m), reads)
+    dated = line_runs.with_sout(line_runs.sout_clock(m), reads)
     paired = [t for t in dated if t.sample.edge_seq is not None]
     assert len(paired) > 0.6 * len(dated)
     assert all(t.sample.edge_seq == t.number for t in paired)
     assert rises(t.sample for t in dated)
-    assert share_honest(dated) >= 0.95
+    assert line_runs.share_honest(dated) >= 0.95
 
 
-@pytest.mark.parametrize("crystal", [Crystal(-50_000.0), Crystal(20.0, 0.1)], ids=["-5 %", "drifting"])
-def test_with_edges_only_their_own_jitter_is_left(crystal: Crystal) -> None:
+@pytest.mark.parametrize("crystal", [arrival.Crystal(-50_000.0), arrival.Crystal(20.0, 0.1)], ids=["-5 %", "drifting"])
+def test_with_edges_only_their_own_jitter_is_left(crystal: arrival.Crystal) -> None:
     """The simulated time stamps are late by 3 µs and an exponential law of 4 µs."""
-    dated = after(run_sout(model(USB_16MS, 100, 1, crystal), 30, LineFaults(pulse_loss=0.01, extra=0.01)), 5)
+    dated = line_runs.after(
+        line_runs.run_sout(model(arrival.USB_16MS, 100, 1, crystal), 30, LineFaults(pulse_loss=0.01, extra=0.01)), 5
+    )
     mean = sum(t.off_ns for t in dated) / len(dated)
     assert sqrt(sum((t.off_ns - mean) ** 2 for t in dated) / len(dated)) < 5_000
-    assert syncs(dated) == {Sync.EDGE}
+    assert line_runs.syncs(dated) == {Sync.EDGE}
 
 
 def test_the_error_covers_the_truth_without_a_bias() -> None:
-    dated = run_sout(model(BARE_UART), 30, HALF_LOST, SoutTiming(bias_us=0.0))
-    assert share_honest(dated) >= 0.95
-    assert sum(t.sample.t_err_ns for t in after(dated, 10)) / len(after(dated, 10)) < 20_000
+    dated = line_runs.run_sout(model(arrival.BARE_UART), 30, HALF_LOST, SoutTiming(bias_us=0.0))
+    assert line_runs.share_honest(dated) >= 0.95
+    assert sum(t.sample.t_err_ns for t in line_runs.after(dated, 10)) / len(line_runs.after(dated, 10)) < 20_000
 
 
 @pytest.mark.parametrize(
-    "profile", [USB_16MS_PACKET, pytest.param(BARE_UART, marks=pytest.mark.thorough)], ids=lambda p: p.name
+    "profile",
+    [arrival.USB_16MS_PACKET, pytest.param(arrival.BARE_UART, marks=pytest.mark.thorough)],
+    ids=lambda p: p.name,
 )
-def test_edges_that_stop_and_come_back_make_no_step(profile: ArrivalProfile) -> None:
+def test_edges_that_stop_and_come_back_make_no_step(profile: arrival.ArrivalProfile) -> None:
     m = model(profile, 100)
     reads = simulate_reads(m.run(3600), 1, LineFaults())
     silent = range(len(reads) // 3, 2 * len(reads) // 3)
-    dated = with_sout(sout_clock(m), reads, silent=silent)
+    dated = line_runs.with_sout(line_runs.sout_clock(m), reads, silent=silent)
     begin = sum(len(read.arrivals) for read in reads[: silent.start])
     end = sum(len(read.arrivals) for read in reads[: silent.stop])
     assert {t.sample.sync for t in dated[begin - 300 : begin]} == {Sync.EDGE}
     last = max(i for i, t in enumerate(dated[:end]) if t.sample.edge_seq is not None)  # for a pulse before
     assert last <= begin + 2
-    assert syncs(dated[last + 3 : end]) == {Sync.REGRESSION}
-    assert syncs(dated[end + 50 :]) == {Sync.EDGE}
+    assert line_runs.syncs(dated[last + 3 : end]) == {Sync.REGRESSION}
+    assert line_runs.syncs(dated[end + 50 :]) == {Sync.EDGE}
     # jitter of the time stamps; only slewing may exceed it
     assert max(abs(b.off_ns - a.off_ns) for a, b in pairwise(dated[1010:])) < JITTER_STEP_NS
-    assert steepest(dated[begin + 3 : end]) < 2 * STEEPEST
-    assert share_honest(dated) >= 0.95
+    assert line_runs.steepest(dated[begin + 3 : end]) < 2 * STEEPEST
+    assert line_runs.share_honest(dated) >= 0.95
 
 
 def test_device_time_that_creeps_does_not_throw_the_line_off() -> None:
     """A device on UTC whose crystal is 5 % slow: its milliseconds do not identify the pulse of a sample."""
-    m = model(LOADED, 1000, 3078, Crystal(-50_000.0))
-    clock, dated = sout_clock(m), []
-    clock.set_utc_reference(REFERENCE)
+    m = model(arrival.LOADED, 1000, 3078, arrival.Crystal(-50_000.0))
+    clock, dated = line_runs.sout_clock(m), []
+    clock.set_utc_reference(line_runs.REFERENCE)
     for read in simulate_reads(m.run(12_000), 3078, LineFaults(frame_loss=0.1, pulse_loss=0.1, loaded=True)):
         clock.add_edges("sout", read.edges)
         for a in read.arrivals:
             truth_ns = measured_ns(a)
-            ticks = (truth_ns + UTC_OFFSET_NS) // NS_PER_MS % UNIX
-            dated.append(DatedSample(clock.sample(measurement(a, ticks), a.t_rx_ns, 0), truth_ns, 0))
-    assert max(abs(t.off_ns) for t in after(dated, 1)) < 4 * NS_PER_MS
+            ticks = (truth_ns + line_runs.UTC_OFFSET_NS) // NS_PER_MS % UNIX
+            dated.append(
+                line_runs.DatedSample(clock.sample(line_runs.measurement(a, ticks), a.t_rx_ns, 0), truth_ns, 0)
+            )
+    assert max(abs(t.off_ns) for t in line_runs.after(dated, 1)) < 4 * NS_PER_MS
     assert rises(t.sample for t in dated)
 
 
 def test_the_fit_keeps_the_delay_learned_from_edges() -> None:
     """Behind this adapter, the fit without edges is 1.5 ms off."""
-    m = model(USB_16MS_PACKET, 100)
+    m = model(arrival.USB_16MS_PACKET, 100)
     reads = simulate_reads(m.run(3000), 1, LineFaults())
-    dated = with_sout(sout_clock(m), reads, silent=range(len(reads) // 2, len(reads)))
+    dated = line_runs.with_sout(line_runs.sout_clock(m), reads, silent=range(len(reads) // 2, len(reads)))
     assert abs(dated[-1].off_ns) < 300_000
     assert dated[-1].sample.sync is Sync.REGRESSION
 
 
 def test_a_delay_learned_by_a_young_fit_adds_to_the_error() -> None:
     """Pulses for 6 s only: then the fit moves by one millisecond, and the learned delay does not follow."""
-    m = model(USB_16MS, 100, 1048, Crystal(-50.0))
+    m = model(arrival.USB_16MS, 100, 1048, arrival.Crystal(-50.0))
     reads = simulate_reads(m.run(4500), 1048, LineFaults())
     begin = next(i for i, read in enumerate(reads) if read.arrivals[0].t_ns > m.begin_ns + 6 * NS_PER_S)
-    dated = with_sout(sout_clock(m), reads, silent=range(begin, len(reads)))
-    assert share_honest(dated) >= 0.95
+    dated = line_runs.with_sout(line_runs.sout_clock(m), reads, silent=range(begin, len(reads)))
+    assert line_runs.share_honest(dated) >= 0.95
 
 
 def test_a_restarted_device_is_paired_again() -> None:
-    m = model(USB_1MS, 100)
-    dated = with_sout(
-        clock := sout_clock(m), simulate_reads(restarted(m, 2500, 2 * NS_PER_S), 1, LineFaults(edge_loss=0.01))
+    m = model(arrival.USB_1MS, 100)
+    dated = line_runs.with_sout(
+        clock := line_runs.sout_clock(m),
+        simulate_reads(restarted(m, 2500, 2 * NS_PER_S), 1, LineFaults(edge_loss=0.01)),
     )
     assert clock.status().resets == 1
-    assert syncs(dated[-500:]) == {Sync.EDGE}
+    assert line_runs.syncs(dated[-500:]) == {Sync.EDGE}
     assert all(t.sample.edge_seq in (None, t.number) for t in dated)
     assert rises(t.sample for t in dated)
-    assert share_honest(dated) >= 0.95
+    assert line_runs.share_honest(dated) >= 0.95
 
 
 def test_a_lost_rising_edge_is_counted_back_and_the_offset_of_the_edge_is_configured() -> None:
-    dated = after(run_sout(model(BARE_UART), 20, LineFaults(edge_loss=0.2)), 5)
+    dated = line_runs.after(line_runs.run_sout(model(arrival.BARE_UART), 20, LineFaults(edge_loss=0.2)), 5)
     unpaired = sum(t.sample.edge_seq is None for t in dated)
     assert 0 < unpaired < 0.07 * len(dated)  # both edges lost: 4 %
     assert all(t.sample.edge_seq in (None, t.number) for t in dated)
-    here = run_sout(model(BARE_UART), 10, LineFaults())
-    there = run_sout(model(BARE_UART), 10, LineFaults(), SoutTiming(offset_us=-200.0))
+    here = line_runs.run_sout(model(arrival.BARE_UART), 10, LineFaults())
+    there = line_runs.run_sout(model(arrival.BARE_UART), 10, LineFaults(), SoutTiming(offset_us=-200.0))
     assert here[-1].sample.t_ns - there[-1].sample.t_ns == 200_000
 
 
 def test_lost_samples_are_counted() -> None:
-    m = model(BARE_UART)
+    m = model(arrival.BARE_UART)
     reads = simulate_reads(m.run(2000), 1, LineFaults(pulse_loss=0.1, frame_loss=0.05))
-    dated = with_sout(clock := sout_clock(m), reads)
+    dated = line_runs.with_sout(clock := line_runs.sout_clock(m), reads)
     status = clock.status()
     seen = sum(edge.rising for read in reads for edge in read.edges)
     assert status.edges == seen

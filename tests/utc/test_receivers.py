@@ -265,20 +265,6 @@ async def test_a_port_that_goes_away_or_is_held_is_opened_again() -> None:
     source.close()
 
 
-@in_loop
-async def test_make_nmea_uses_the_configured_port() -> None:
-    asked: list[tuple[str, int]] = []
-
-    def make_port(path: str, baud: int) -> Port:
-        asked.append((path, baud))
-        return Port()
-
-    context = receivers.SourceContext(make_port, time.monotonic_ns, lambda: 0)
-    source = receivers.make_nmea(receivers.RmcOptions(source="nmea", port="/dev/ttyGNSS", baud=38400), context)
-    assert source.title == "NMEA receiver on /dev/ttyGNSS"
-    assert asked == [("/dev/ttyGNSS", 38400)]
-
-
 def test_keys_of_rmc_accept_the_documented_values() -> None:
     assert check_schema("RMC sentences", receivers.RmcOptions) == 8
     defaults = receivers.RmcOptions(source="gpsd")
@@ -287,14 +273,22 @@ def test_keys_of_rmc_accept_the_documented_values() -> None:
 
 def test_sources_by_their_name() -> None:
     """`nmea` needs a port, the others read gpsd or the clock of the host."""
-    context = receivers.SourceContext(lambda *_where: Port(), time.monotonic_ns, lambda: 0)
-    kinds = {
-        name: type(
-            RMC_SOURCES[name](msgspec.convert({"source": name, "port": "/dev/a"}, receivers.RmcOptions), context)
-        )
-        for name in RMC_SOURCES
-    }
-    assert kinds == {"gpsd": receivers.GpsdSource, "nmea": receivers.NmeaPortSource, "system": SystemClockSource}
+    asked: list[tuple[str, int]] = []
+
+    def make_port(path: str, baud: int) -> Port:
+        asked.append((path, baud))
+        return Port()
+
+    context = receivers.SourceContext(make_port, time.monotonic_ns, lambda: 0)
+    options = {"port": "/dev/ttyGNSS", "baud": 38400}
+    made = [
+        make(msgspec.convert({"source": name, **options}, receivers.RmcOptions), context)
+        for name, make in RMC_SOURCES.items()
+    ]
+    kinds = {"gpsd": receivers.GpsdSource, "nmea": receivers.NmeaPortSource, "system": SystemClockSource}
+    assert dict(zip(RMC_SOURCES, map(type, made), strict=True)) == kinds
+    assert asked == [("/dev/ttyGNSS", 38400)]
+    assert "NMEA receiver on /dev/ttyGNSS" in [one.title for one in made]
 
 
 GGA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
@@ -309,7 +303,7 @@ def test_any_split_gives_the_same(size: int) -> None:
     assert found == SENTENCES
 
 
-def test_broken_and_too_long_sentences_are_skipped() -> None:
+def test_broken_and_too_long_sentences_and_lines_are_skipped() -> None:
     broken = SENTENCES[0][:30] + SENTENCES[1]
     assert receivers.SentenceSplitter().feed(broken + b"noise\xff$" + SENTENCES[2]) == SENTENCES[1:3]
     splitter = receivers.SentenceSplitter()
@@ -320,9 +314,6 @@ def test_broken_and_too_long_sentences_are_skipped() -> None:
     assert splitter.feed(b"$GPRMC," + b"1" * 120 + b"\r\n") == []
     for _ in range(100):
         splitter.feed(random.randbytes(random.randrange(200)))
-
-
-def test_a_line_without_end_is_skipped_and_not_buffered() -> None:
     splitter = receivers.SentenceSplitter()
     tracemalloc.start()
     try:

@@ -19,7 +19,7 @@ GOOD = system_clock.KernelClock(True, 500, 1000)
 OFFSET_NS = 1_795_000_000 * NS_PER_S + 123_456_789
 
 
-def test_the_kernel_answers_sensibly() -> None:
+def test_the_kernel_answers_sensibly_and_a_refused_call_means_not_synchronized() -> None:
     clock = system_clock.kernel_clock()
     assert 0 <= clock.most_error_us <= 16_000_000  # NTP_PHASE_LIMIT
     assert 0 <= clock.estimated_error_us <= 16_000_000
@@ -27,6 +27,13 @@ def test_the_kernel_answers_sensibly() -> None:
     assert ctypes.sizeof(system_clock.Timex) == 26 * ctypes.sizeof(ctypes.c_long)  # <linux/timex.h>
     offset_ns = HostClock().utc_offset_ns()
     assert abs(time.monotonic_ns() + offset_ns - time.time_ns()) < 5 * NS_PER_S  # the host may stall in between
+
+    def ask(_timex: system_clock.Timex) -> int:
+        raise PermissionError(1, "Operation not permitted")
+
+    assert not system_clock.kernel_clock(ask).synchronised
+    assert system_clock.system_reference(system_clock.kernel_clock(ask), 42) is None
+    assert system_clock.system_reference(system_clock.KernelClock(False, 1, NS_PER_MS), 42) is None
 
 
 @pytest.mark.parametrize(
@@ -40,15 +47,6 @@ def test_states_that_count_as_synchronized(state: int, status: int, synchronised
         return state
 
     assert system_clock.kernel_clock(ask) == system_clock.KernelClock(synchronised, 7, 99)
-
-
-def test_a_refused_call_means_not_synchronized() -> None:
-    def ask(_timex: system_clock.Timex) -> int:
-        raise PermissionError(1, "Operation not permitted")
-
-    assert not system_clock.kernel_clock(ask).synchronised
-    assert system_clock.system_reference(system_clock.kernel_clock(ask), 42) is None
-    assert system_clock.system_reference(system_clock.KernelClock(False, 1, NS_PER_MS), 42) is None
 
 
 @pytest.mark.parametrize(
