@@ -129,38 +129,24 @@ async def test_calibration_at_rest_is_verified_and_saved(rig: GuideRig) -> None:
 
 
 @played(GuideRig)
-async def test_a_result_is_saved_only_on_request(rig: GuideRig) -> None:
+async def test_a_result_is_saved_only_on_request_and_if_it_is_verified(rig: GuideRig) -> None:
     result = await rig.guide.run("gyro", gyro(rig), save=False)
-    assert result.verified
-    assert not result.saved
-    assert rig.ran == ["begin"]
-
-
-@played(GuideRig)
-async def test_a_result_that_the_device_does_not_show_is_not_verified_and_not_saved(rig: GuideRig) -> None:
+    assert (result.verified, result.saved, rig.ran) == (True, False, ["begin"])
+    rig.ran.clear()
     for done in (True, False):
         begin = rig.does("begin", Verdict(done, "the parameters are 0, 0, 0"))
         result = await rig.guide.run("gyro", gyro(rig, begin=begin), save=True)
         assert (result.verified, result.saved, result.device) == (done, done, "the parameters are 0, 0, 0")
         assert result.problem == ("" if done else "the parameters are 0, 0, 0")
     assert rig.ran == ["begin", "save", "begin"]
-
-
-@played(GuideRig)
-async def test_a_remaining_bias_is_reported_and_not_saved(rig: GuideRig) -> None:
-    rig.motion = lambda _t_s: (0.0, radians(0.3), 0.0)
-    result = await rig.guide.run("gyro", gyro(rig), save=True)
-    assert not result.verified
-    assert result.problem == "mean angular rate: expected at most 0.00175 rad/s, got 0.00524 rad/s"
-    assert not result.saved
-    assert rig.ran == ["begin"]
-
-
-@played(GuideRig)
-async def test_a_value_that_samples_do_not_contain_is_not_verified(rig: GuideRig) -> None:
     expectation = replace(GYRO_ZERO, value=lambda _means: None)
     result = await rig.guide.run("gyro", gyro(rig, expected=(expectation,)), save=False)
     assert result.problem == "mean angular rate: the samples do not contain this value"
+    rig.ran.clear()
+    rig.motion = lambda _t_s: (0.0, radians(0.3), 0.0)
+    result = await rig.guide.run("gyro", gyro(rig), save=True)
+    assert result.problem == "mean angular rate: expected at most 0.00175 rad/s, got 0.00524 rad/s"
+    assert (result.verified, result.saved, rig.ran) == (False, False, ["begin"])
 
 
 @played(GuideRig)
@@ -218,18 +204,15 @@ async def test_motion_during_the_calibration_is_an_error(rig: GuideRig) -> None:
 
 
 @played(GuideRig)
-async def test_no_samples(rig: GuideRig) -> None:
+async def test_no_samples_and_refusals(rig: GuideRig) -> None:
+    async def refuse() -> None:
+        raise Rejected("no")
+
     rig.silent = True
     with pytest.raises(CommandError, match="gyro: expected samples of the device, got no sample for 20 s"):
         await rig.guide.run("gyro", gyro(rig), save=False)
     assert rig.clock.now_ns() >= 1020 * NS_PER_S
-
-
-@played(GuideRig)
-async def test_refusals(rig: GuideRig) -> None:
-    async def refuse() -> None:
-        raise Rejected("no")
-
+    rig.silent = False
     with pytest.raises(CommandError, match="heading: cannot save: the result lasts until power-off"):
         await rig.guide.run("heading", gyro(rig, kept=Kept.NEVER), save=True)
     with pytest.raises(CommandError, match="gyro: set the mode first"):
@@ -378,17 +361,6 @@ async def test_magnetometer_of_a_module(it: WiredDevice) -> None:
     assert any(event.kind is EventKind.CALIBRATION for event in it.events)
 
 
-@played(lambda: module(tumble(), 0))
-async def test_six_axis_mode_refuses_the_magnetometer_calibration(it: WiredDevice) -> None:
-    await it.wait(2)
-    with pytest.raises(
-        CommandError, match=r"magnetometer: expected 9-axis mode, .*`imud settings NAME --set mode=9-axis`"
-    ):
-        await it.device.calibrate("magnetometer", save=False)
-    with pytest.raises(BadArgument, match=r"unknown calibration 'gyro'; expected: magnetometer, .*, heading"):
-        await it.device.calibrate("gyro", save=False)
-
-
 @pytest.mark.manual("B 2.2.4 YAW range")
 @played(lambda: module(Still(0.05, -0.03, 0.4), 0))
 async def test_level_and_heading_of_a_module(it: WiredDevice) -> None:
@@ -409,8 +381,14 @@ async def test_level_and_heading_of_a_module(it: WiredDevice) -> None:
 
 @pytest.mark.manual("B 2.2.4 rest")
 @played(lambda: module(tumble(), 0))
-async def test_a_module_that_moves_is_not_levelled(it: WiredDevice) -> None:
+async def test_a_module_in_six_axis_mode_that_moves_refuses_calibrations(it: WiredDevice) -> None:
     await it.wait(2)
+    with pytest.raises(
+        CommandError, match=r"magnetometer: expected 9-axis mode, .*`imud settings NAME --set mode=9-axis`"
+    ):
+        await it.device.calibrate("magnetometer", save=False)
+    with pytest.raises(BadArgument, match=r"unknown calibration 'gyro'; expected: magnetometer, .*, heading"):
+        await it.device.calibrate("gyro", save=False)
     before = it.module.settings.level
     with pytest.raises(CommandError, match="expected the device at rest"):
         await it.device.calibrate("level", save=True)
@@ -452,15 +430,12 @@ def window(*samples: Sample) -> RestWindow:
     return made
 
 
-def test_rest() -> None:
-    assert window(*[sample()] * WINDOW_SAMPLES).motion() == ""
-    assert window(sample(gyro=(radians(2), 0.0, 0.0))).motion() == ""  # a constant bias is not a motion
-    assert window(sample(accel=None, gyro=None)).motion() == ""
-
-
 @pytest.mark.parametrize(
     ("samples", "words"),
     [
+        ([sample()] * WINDOW_SAMPLES, ""),
+        ([sample(gyro=(radians(2), 0.0, 0.0))], ""),  # a constant bias is not a motion
+        ([sample(accel=None, gyro=None)], ""),
         ([sample(), sample(gyro=(radians(4), 0, 0))], "the angular rate changes by 2 °/s (at most 1 °/s at rest)"),
         ([sample(gyro=(0, radians(6), 0))], "it turns at 6 °/s (at most 5 °/s at rest)"),
         (
@@ -473,7 +448,7 @@ def test_rest() -> None:
         ),
     ],
 )
-def test_motion(samples: list[Sample], words: str) -> None:
+def test_rest_and_motion(samples: list[Sample], words: str) -> None:
     assert window(*samples).motion() == words
 
 
@@ -520,7 +495,7 @@ def axes(x: float, r: float = 45e-6) -> list[Vector3]:
     return [(a + x, b, c), (a - x, b, c), (a, b + r, c), (a, b - r, c), (a, b, c + r), (a, b, c - r)] * 2
 
 
-def test_each_cell_has_one_direction_of_each_order_and_sign() -> None:
+def test_each_cell_is_one_direction_and_coverage_is_seen_from_the_centre() -> None:
     directions = [
         tuple(sign * value for sign, value in zip(signs, values, strict=True))
         for signs in product((1, -1), repeat=3)
@@ -530,6 +505,16 @@ def test_each_cell_has_one_direction_of_each_order_and_sign() -> None:
     assert cells == set(range(48))
     assert cell_of((3.0, 2.0, 1.0)) == 0
     assert coverage(0b1011) == 3 / 48
+    # A field of 45 µT with a bias of 60 µT covers half of the directions, seen from the origin.
+    truth = [tumble().at(second / 10).mag_t for second in range(1000)]
+    turning = of([(x + 60e-6, y, z) for x, y, z in truth])
+    sphere = turning.fit()
+    assert sphere is not None
+    assert sphere.centre_t == pytest.approx((60e-6, 0.0, 0.0), abs=1e-9)
+    assert coverage(turning.cells(sphere)) > 0.9
+    assert coverage(turning.cells(None)) < 0.6
+    turning.restart_field()
+    assert not turning.has_field
 
 
 def test_sphere_of_six_points_and_its_residual() -> None:
@@ -553,31 +538,11 @@ def test_sphere_of_six_points_and_its_residual() -> None:
         assert of([(apart_t / 2, 0.0, 0.0), (-apart_t / 2, 0.0, 0.0)]).cells(None).bit_count() == points
 
 
-@pytest.mark.parametrize(
-    "points",
-    [
-        [],
-        [(1e-6, 0.0, 0.0)] * 50,
-        [(4e-5 * x, 4e-5 * y, 0.0) for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1), (0.6, 0.8), (-0.6, 0.8))] * 4,
-        [(0.0, 0.0, 0.0)] * 50,
-    ],
-    ids=["none", "one point", "a plane", "zeros"],
-)
-def test_no_sphere(points: list[Vector3]) -> None:
-    assert of(points).fit() is None
-
-
-def test_coverage_is_seen_from_the_centre() -> None:
-    """A field of 45 µT with a bias of 60 µT covers half of the directions, seen from the origin."""
-    truth = [tumble().at(second / 10).mag_t for second in range(1000)]
-    turning = of([(x + 60e-6, y, z) for x, y, z in truth])
-    sphere = turning.fit()
-    assert sphere is not None
-    assert sphere.centre_t == pytest.approx((60e-6, 0.0, 0.0), abs=1e-9)
-    assert coverage(turning.cells(sphere)) > 0.9
-    assert coverage(turning.cells(None)) < 0.6
-    turning.restart_field()
-    assert not turning.has_field
+def test_no_sphere() -> None:
+    circle = ((1, 0), (0, 1), (-1, 0), (0, -1), (0.6, 0.8), (-0.6, 0.8))
+    plane: list[Vector3] = [(4e-5 * x, 4e-5 * y, 0.0) for x, y in circle]
+    for points in ([], [(1e-6, 0.0, 0.0)] * 50, plane * 4, [(0.0, 0.0, 0.0)] * 50):
+        assert of(points).fit() is None, points[:6]
 
 
 def test_turns_and_bounded_memory() -> None:

@@ -74,6 +74,8 @@ def test_one_device_is_found_and_several_are_listed() -> None:
     assert Round().hear(*frames).complaint() == (
         "3 devices send on can0: fake-can node 8, fake-can node 9, imu61x-can base_id 101; configure driver and options"
     )
+    unnamed = fake_can_frame(8)._replace(data=b"7 bytes")
+    assert Round().hear(unnamed, fake_can_frame(8), fake_can_frame(8, 1)).found() == "fake-can node 8"
 
 
 def test_incomplete_samples_extend_the_round_and_are_reported() -> None:
@@ -88,6 +90,9 @@ def test_incomplete_samples_extend_the_round_and_are_reported() -> None:
         "frames of imu61x-can base_id 101 arrive on can0, but no complete sample; configure driver and options"
     )
     assert 6 * NS_PER_S <= heard.until_ns < 6 * NS_PER_S + 2 * LISTEN_NS
+    first, second = imu61x(1), imu61x(2)
+    heard = Round().hear(*imu61x(0), *first[:2], second[2]._replace(after_loss=True), *second[3:])
+    assert [device.title for device in heard.search.survey.doubtful()] == ["imu61x-can base_id 101"]
 
 
 def test_unknown_frames_and_silence_are_reported() -> None:
@@ -136,11 +141,6 @@ def test_two_samples_are_enough(driver: CanDriver) -> None:
     assert isinstance(search.on_time(LISTEN_NS), CanFound)
 
 
-def test_frames_before_the_naming_frame_do_not_prevent_the_search() -> None:
-    unnamed = fake_can_frame(8)._replace(data=b"7 bytes")
-    assert Round().hear(unnamed, fake_can_frame(8), fake_can_frame(8, 1)).found() == "fake-can node 8"
-
-
 def test_only_drivers_with_samples_are_listed() -> None:
     """A second driver recognizes the same frames, but decodes no sample."""
     search = CanSearch([fake_can_driver("wrong", BASE - 1), FAKE], "can0")
@@ -155,12 +155,6 @@ def test_only_drivers_with_samples_are_listed() -> None:
     step = search.on_time(LISTEN_NS)
     assert isinstance(step, GaveUp)
     assert "twin node 8, fake-can node 8" in step.summary
-
-
-def test_frames_after_a_loss_are_not_joined_with_those_before() -> None:
-    first, second = imu61x(1), imu61x(2)
-    heard = Round().hear(*imu61x(0), *first[:2], second[2]._replace(after_loss=True), *second[3:])
-    assert [device.title for device in heard.search.survey.doubtful()] == ["imu61x-can base_id 101"]
 
 
 @pytest.mark.parametrize("extended", [False, True])

@@ -387,7 +387,7 @@ def filters(*can_ids: int) -> list[CanFilter]:
     return [CanFilter(can_id, 0x7FF, False) for can_id in can_ids]
 
 
-def test_frames_of_others_on_the_same_bus_are_claimed() -> None:
+def test_claims_and_conflicts_of_devices_on_one_bus() -> None:
     buses = CanBuses()
     for name, bus, can_id, load in (("front", "can0", 0x181, 100.0), ("rear", "can1", 0x182, 20.0)):
         buses.join(name, bus, filters(can_id), (), partial(float, load))
@@ -401,9 +401,6 @@ def test_frames_of_others_on_the_same_bus_are_claimed() -> None:
     buses.leave("front")
     buses.leave("front")
     assert not claimed(0x181, False)
-
-
-def test_the_second_of_two_devices_with_equal_frames_is_refused() -> None:
     buses = CanBuses()
     buses.join("front", "can0", (), [SYNC])
     buses.join("rear", "can0", (), [CyclicFrame(0x80, False, b"", 20_000_000)])

@@ -19,7 +19,7 @@ def make() -> tuple[DeviceEvents, Ledger, list[Event]]:
     return DeviceEvents("bow", ledger, events.append), ledger, events
 
 
-def test_only_a_change_of_sync_raises_an_event() -> None:
+def test_a_change_of_sync_losses_and_bad_frames_raise_limited_events() -> None:
     device_events, _, events = make()
     for t in range(5):
         device_events.tick(t * S, Sync.ARRIVAL)
@@ -29,9 +29,6 @@ def test_only_a_change_of_sync_raises_an_event() -> None:
     device_events.tick(1, Sync.ARRIVAL)
     device_events.tick(2, Sync.REGRESSION)
     assert [(e.kind, e.detail) for e in events] == [(EventKind.SYNC, {"sync": "regression", "before": "arrival"})]
-
-
-def test_losses_and_bad_frames_raise_one_event_per_second() -> None:
     device_events, ledger, events = make()
     ledger.lost_crc = 2
     device_events.tick(10 * S, None)

@@ -298,6 +298,8 @@ def test_results_survive_a_restart_and_are_written_once(tmp_path: Path) -> None:
     assert [recalled(tmp_path, f"d{number % 7}") for number in range(493, 500)] == [
         RememberedDevice("hipnuc-uart", number) for number in range(493, 500)
     ]
+    remember(tmp_path / "var" / "imud", bow=FOUND)
+    assert recalled(tmp_path / "var" / "imud", "bow") == FOUND
 
 
 DEEP = b'{"bow": {"driver": "x", "baud": 1, "more": ' + b"[" * 100_000
@@ -325,11 +327,6 @@ def test_an_invalid_file_is_reported_and_replaced(
     remember(tmp_path, bow=FOUND)
     assert "cannot use" in caplog.text
     assert recalled(tmp_path, "bow") == FOUND
-
-
-def test_a_missing_state_directory_is_created(tmp_path: Path) -> None:
-    remember(tmp_path / "var" / "imud", bow=FOUND)
-    assert recalled(tmp_path / "var" / "imud", "bow") == FOUND
 
 
 def test_a_directory_in_place_of_the_file_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -186,16 +186,6 @@ async def test_the_value_in_flash_is_inferred_from_starts_and_saves(bench: Modul
     assert await mode() == ("same", "9-axis", "9-axis")
 
 
-@played(lambda: ModuleBench(declared={"mode": "6-axis"}))
-async def test_a_save_makes_one_request(bench: ModuleBench) -> None:
-    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
-    before = len(bench.module.commands)
-    await bench.doing(bench.device.act("save", {}))
-    await bench.pass_s(5)
-    assert bench.module.commands[before:] == ["SAVE"]
-    assert bench.is_in(SettingsState.AGREE)
-
-
 @played(ModuleBench)
 async def test_without_declared_settings_imud_reads_the_settings_after_a_restart(bench: ModuleBench) -> None:
     await bench.pass_s(5)
@@ -236,9 +226,12 @@ async def test_a_difference_raises_one_event_and_no_write(bench: ModuleBench) ->
 
 
 @played(lambda: ModuleBench(declared={"mode": "6-axis"}))
-async def test_settings_are_compared_after_replug_restart_and_command(bench: ModuleBench) -> None:
+async def test_settings_are_compared_after_replug_restart_and_command_but_not_after_a_save(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.is_in(SettingsState.AGREE))
+    before = len(bench.module.commands)
+    await bench.doing(bench.device.act("save", {}))
     await bench.pass_s(20)
+    assert (bench.module.commands[before:], bench.is_in(SettingsState.AGREE)) == (["SAVE"], True)
     bench.module.disappear()
     await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
     assert bench.is_in(SettingsState.UNKNOWN)
@@ -261,22 +254,19 @@ async def test_settings_are_compared_after_replug_restart_and_command(bench: Mod
 
 
 @pytest.mark.parametrize("declared", [None, {"mode": "6-axis"}])
-def test_restarts_after_commands_are_counted_as_requested(declared: dict[str, Any] | None) -> None:
-    @played(lambda: ModuleBench(declared=declared))
-    async def story(bench: ModuleBench) -> None:
-        await bench.pass_s(60)
-        counts = list[tuple[int, int]]()
-        for pause_s in (0.1, 5.0, 30.0, None):
-            if pause_s is not None:
-                await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
-                await bench.pass_s(pause_s)
-            bench.module.restart()
-            await bench.pass_s(30)
-            status = bench.device.status()
-            counts.append((status.clock.resets, status.resets_requested))
-        assert counts == [(1, 1), (2, 2), (3, 2), (4, 2)]
-
-    story()
+@played(lambda declared: ModuleBench(declared=declared))
+async def test_restarts_after_commands_are_counted_as_requested(bench: ModuleBench, declared: object) -> None:
+    await bench.pass_s(60)
+    counts = list[tuple[int, int]]()
+    for pause_s in (0.1, 5.0, 30.0, None):
+        if pause_s is not None:
+            await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
+            await bench.pass_s(pause_s)
+        bench.module.restart()
+        await bench.pass_s(30)
+        status = bench.device.status()
+        counts.append((status.clock.resets, status.resets_requested))
+    assert counts == [(1, 1), (2, 2), (3, 2), (4, 2)]
 
 
 @played(lambda: ModuleBench(declared={"mode": "6-axis"}, pauses_clock=True))
@@ -399,22 +389,8 @@ async def test_a_failed_save_of_a_command_is_repeated(bench: ModuleBench) -> Non
 
 
 @played(lambda: ModuleBench("apply_and_save", {"mode": "9-axis", "secret": 5}))
-async def test_a_replaced_module_gets_the_declared_settings(bench: ModuleBench) -> None:
+async def test_each_replaced_module_gets_the_declared_settings_without_pause(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.module.saves == 1)
-    bench.module.disappear()
-    await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
-    bench.module.serial, bench.module.flash = "B2", dict(FACTORY)
-    bench.module.restart()
-    bench.module.appear()
-    await bench.until(lambda: bench.module.saves == 2)
-    await bench.until(lambda: bench.is_in(SettingsState.AGREE))
-    assert (bench.module.flash["mode"], bench.module.flash["secret"]) == ("9-axis", 5)
-    assert bench.status.flash_writes == 1  # writes of this module
-
-
-@played(lambda: ModuleBench("apply", {"mode": "9-axis"}))
-async def test_each_replaced_module_is_repaired_without_pause(bench: ModuleBench) -> None:
-    await bench.until(lambda: bench.status.repairs == 1)
     for number, serial in enumerate(("B2", "C3", "D4"), start=2):
         bench.module.disappear()
         await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
@@ -422,6 +398,9 @@ async def test_each_replaced_module_is_repaired_without_pause(bench: ModuleBench
         bench.module.restart()
         bench.module.appear()
         await bench.until(partial(bench.repaired, number), limit_s=10)
+        await bench.until(lambda: bench.is_in(SettingsState.AGREE), limit_s=10)
+        assert (bench.module.flash["mode"], bench.module.flash["secret"], bench.module.saves) == ("9-axis", 5, number)
+        assert bench.status.flash_writes == 1  # writes of this module
 
 
 @played(lambda: ModuleBench("apply", {"mode": "9-axis"}, forgets={"mode"}))
@@ -473,6 +452,13 @@ async def test_flash_writes_of_imud_have_a_lower_limit_than_requests(bench: Modu
 @played(ModuleBench)
 async def test_plan_and_apply_of_given_values(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+    for given, message in (
+        ({"mode": "x"}, 'mode: expected one of "6-axis", "9-axis", got "x"'),
+        (None, "expected values, or `settings` in the configuration, got neither"),
+        ({"output": {"a": 1000, "b": 1000}}, "at most 1152 Hz in all"),
+    ):
+        with pytest.raises(BadArgument, match=message):
+            await bench.doing(bench.device.settings_apply(given, save=True))
     plan = await bench.doing(bench.device.settings_plan({"mode": "9-axis", "baud": 921600}, save=True))
     assert [step.name for step in plan.steps] == ["mode", "baud"]
     assert bench.written() == []
@@ -483,6 +469,14 @@ async def test_plan_and_apply_of_given_values(bench: ModuleBench) -> None:
     assert (saved.steps, saved.saved) == ((), True)  # the previous value is saved
     again = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
     assert (again.steps, again.saved, bench.module.saves) == ((), False, 1)
+    bench.module.disappear()
+    await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
+    for work in (
+        bench.device.settings_report(fresh=True), bench.device.settings_plan({}, save=False),
+        bench.device.settings_apply({}, save=False),
+    ):  # fmt: skip
+        with pytest.raises(CommandError, match="bow is missing"):
+            await work
 
 
 @played(lambda: ModuleBench(declared={"mode": "9-axis"}))
@@ -498,36 +492,6 @@ async def test_a_report_contains_the_last_or_new_values(bench: ModuleBench) -> N
         name: value for name, value in FACTORY.items() if name != "secret"
     }
     assert [one.name for one in fresh.settings if one.differs] == ["mode"]
-
-
-@pytest.mark.parametrize(
-    ("given", "error", "message"),
-    [
-        ({"mode": "x"}, BadArgument, 'mode: expected one of "6-axis", "9-axis", got "x"'),
-        (None, BadArgument, "expected values, or `settings` in the configuration, got neither"),
-        ({"output": {"a": 1000, "b": 1000}}, BadArgument, "at most 1152 Hz in all"),
-    ],
-)
-@played(ModuleBench)
-async def test_invalid_values_are_refused_before_the_first_write(
-    bench: ModuleBench, given: Any, error: type[Exception], message: str
-) -> None:
-    await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
-    with pytest.raises(error, match=message):
-        await bench.doing(bench.device.settings_apply(given, save=True))
-    assert bench.written() == []
-
-
-@played(ModuleBench)
-async def test_a_missing_device_is_not_read(bench: ModuleBench) -> None:
-    bench.module.disappear()
-    await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
-    for work in (
-        bench.device.settings_report(fresh=True), bench.device.settings_plan({}, save=False),
-        bench.device.settings_apply({}, save=False),
-    ):  # fmt: skip
-        with pytest.raises(CommandError, match="bow is missing"):
-            await work
 
 
 # --- steps that fail --------------------------------------------------------------------------------------------------
@@ -711,19 +675,15 @@ async def test_a_reset_without_backup_raises_an_event(bench: ModuleBench, silent
 # --- on other links ---------------------------------------------------------------------------------------------------
 
 
-def declaring(config: DeviceConfig, on_difference: OnDifference, **declared: Any) -> DeviceConfig:
-    """Return the configuration with declared settings."""
-    table = DRIVERS[config.driver].device_settings
-    assert table is not None
-    return replace(config, declared=msgspec.convert(declared, table.declarable), on_difference=on_difference)
-
-
 def test_a_polled_device_is_repaired_after_a_restart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("imud.device.settings.AGAIN_NS", NS_PER_S)
     bench = PolledBusBench(tmp_path, monkeypatch, VirtualClock())
     device = bench.registers()
     bench.i2c.devices[0x18] = device
-    config = declaring(on_i2c(), OnDifference.APPLY, accel_filter="10 Hz")
+    table = DRIVERS["imu61x-i2c"].device_settings
+    assert table is not None
+    wanted = msgspec.convert({"accel_filter": "10 Hz"}, table.declarable)
+    config = replace(on_i2c(), declared=wanted, on_difference=OnDifference.APPLY)
 
     async def body() -> None:
         async with bench.running(config) as (rig,):

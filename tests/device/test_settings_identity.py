@@ -17,9 +17,9 @@ from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
 
 
-def known_by(events: list[Event], host: HostClock | None = None) -> DeviceSettings:
+def known_by(events: list[Event]) -> DeviceSettings:
     """Return the settings of a device without a driver."""
-    host = host or HostClock(lambda: 5)
+    host = HostClock(lambda: 5)
     config = DeviceConfig("bow", "auto", None, True, "memory", MemoryOptions(name="/dev/fake", baud=115200))
     told = DeviceEvents("bow", Ledger(), events.append)
     return DeviceSettings(config, Mock(driver=None), told, Mock(), host, SettingsFiles(None, host))
@@ -50,7 +50,7 @@ def test_only_differences_to_a_known_device_are_reported() -> None:
     assert not events
 
 
-def test_lost_members_of_an_identity_are_kept() -> None:
+def test_lost_members_of_an_identity_are_kept_and_its_words_have_no_empty_member() -> None:
     """A new adapter can lose bytes of the first replies."""
     events: list[Event] = []
     known = known_by(events)
@@ -72,9 +72,6 @@ def test_lost_members_of_an_identity_are_kept() -> None:
     assert known.identity == Identity("CH0", "B2")
     update(known, Identity("HI14"), {})
     assert known.identity == Identity("HI14")
-
-
-def test_identity_words_contain_no_empty_member() -> None:
     assert identity_words(Identity("HI14", details={"BUILD": "x", "EMPTY": ""})) == {"product": "HI14", "BUILD": "x"}
 
 

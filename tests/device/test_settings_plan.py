@@ -1,36 +1,44 @@
-"""The plan: written settings, their order, and settings that need a save."""
+"""The plan: written settings, their order, and settings that need a save. Results of writes, order of save and restart.
+test_settings.py tests failures."""
 
+import asyncio
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Any
 
 import msgspec
 import pytest
 
+from imud.contracts import setting
 from imud.contracts.command import Risk, Target
-from imud.contracts.setting import PlannedStep, SettingDifference, SettingsPlan, title_of
 from imud.device import settings_plan
+from imud.device.evidence import SampleWatch
+from imud.device.flash import FlashWrites, ModuleFlash
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.uart.settings import AngleAlarm
-from imud.model.errors import BadArgument
+from imud.host.clock import HostClock
+from imud.model.errors import BadArgument, LinkMissing, NoReply
 from tests.support.fake_drivers import FACTORY, FAKE_SETTINGS
 
 ACTUAL = {name: value for name, value in FACTORY.items() if name != "secret"}
 TARGET = Target(None, 115200)
 
 
-def planned(wanted: dict[str, Any], *, save: bool = True, unsaved: bool = False, **written: Any) -> SettingsPlan:
+def planned(
+    wanted: dict[str, Any], *, save: bool = True, unsaved: bool = False, **written: Any
+) -> setting.SettingsPlan:
     return settings_plan.make_plan(FAKE_SETTINGS, TARGET, wanted, ACTUAL, written, save=save, unsaved=unsaved)
 
 
-def names(plan: SettingsPlan) -> list[str]:
+def names(plan: setting.SettingsPlan) -> list[str]:
     return [step.name for step in plan.steps]
 
 
 def test_only_different_or_unreadable_settings_are_written() -> None:
-    assert planned({"mode": "6-axis", "output": {"a": 100}}) == SettingsPlan()
+    assert planned({"mode": "6-axis", "output": {"a": 100}}) == setting.SettingsPlan()
     assert planned({"mode": "6-axis"}).empty
     plan = planned({"mode": "9-axis", "output": {"a": 100}})
-    assert plan == SettingsPlan((PlannedStep("mode", "9-axis", "6-axis"),), save=True)
+    assert plan == setting.SettingsPlan((setting.PlannedStep("mode", "9-axis", "6-axis"),), save=True)
     assert not planned({"mode": "9-axis"}, save=False).save
     assert planned({"mode": "6-axis"}, unsaved=True).save  # a previous write is not saved
     assert not planned({"mode": "6-axis"}, save=False, unsaved=True).save
@@ -119,7 +127,7 @@ def test_a_present_contradiction_does_not_prevent_another_change() -> None:
     assert table is not None
     actual = {"mode": "6-axis", "pins": {"sin": 1, "sout": 2, "led": 1}}
 
-    def plan(**wanted: Any) -> SettingsPlan:
+    def plan(**wanted: Any) -> setting.SettingsPlan:
         return settings_plan.make_plan(table, TARGET, wanted, actual, {}, save=False, unsaved=False, by_name=True)
 
     assert names(plan(mode="9-axis")) == ["mode"]
@@ -148,7 +156,7 @@ def test_the_table_compares_values_and_unreadable_values_differ_unless_written()
         "mode", "output", "offset_deg",
     ]  # fmt: skip
     found = settings_plan.differences(FAKE_SETTINGS, {"mode": "6-axis"}, {}, {})
-    assert found == {"mode": SettingDifference("6-axis", None)}
+    assert found == {"mode": setting.SettingDifference("6-axis", None)}
     assert settings_plan.words(found) == 'mode is not reported, declared "6-axis"'
     assert differing({"mode": "6-axis"}, {}, {"mode": "6-axis"}) == []
     assert differing({"mode": "6-axis"}, {"mode": "9-axis"}, {"mode": "6-axis"}) == [
@@ -160,9 +168,9 @@ def test_the_table_compares_values_and_unreadable_values_differ_unless_written()
 
 
 def test_words_contain_both_values() -> None:
-    assert settings_plan.words({"mode": SettingDifference("6-axis", "9-axis"), "n": SettingDifference(1, 2)}) == (
-        'mode is "9-axis", declared "6-axis", n is 2, declared 1'
-    )
+    assert settings_plan.words(
+        {"mode": setting.SettingDifference("6-axis", "9-axis"), "n": setting.SettingDifference(1, 2)}
+    ) == ('mode is "9-axis", declared "6-axis", n is 2, declared 1')
     made = settings_plan.wanted_values(FAKE_SETTINGS, {"offset_deg": 5, "mode": "9-axis"})
     assert list(made.items()) == [("mode", "9-axis"), ("offset_deg", 5.0)]
     assert type(made["offset_deg"]) is float
@@ -201,7 +209,7 @@ def test_every_setting_is_described() -> None:
     assert (offset.title, offset.help, offset.group) == ("Offset", "added to the heading", "measurement")
     assert mode.schema["enum"] == ["6-axis", "9-axis"]
     names = ("tpdo1_interval_ms", "sout_divisor", "ff2f_interval_ms", "gyro_offset_deg_s", "second_bus")
-    assert [title_of(name) for name in names] == [
+    assert [setting.title_of(name) for name in names] == [
         "TPDO1 interval", "SOUT divisor", "FF2F interval", "Gyro offset", "Second bus",
     ]  # fmt: skip
     assert settings_plan.first_sentence("off; other functions. More") == "off"
@@ -270,3 +278,129 @@ def test_a_command_that_a_setting_replaces(
     assert found is not None
     assert str(found) == f"{name} is a setting: imud settings bow {command}"
     assert found.data == {"settings": settings, "save": command.endswith("--save")}
+
+
+class TableOfOne:
+    """A device with the setting `x`. Its scripts run when they are created."""
+
+    def __init__(
+        self, result: object, *, readable: bool = True, effect: setting.Effect = setting.Effect.AT_ONCE, **more: Any
+    ) -> None:
+        self.actual: dict[str, Any] = {"x": 1}
+        self.active: dict[str, Any] = {"x": 1} if readable else {}
+        self.done: list[str] = []
+        self.result = result
+        self.table = setting.SettingsTable(
+            table={"x": setting.Setting(type=int, write=self._write, effect=effect, **more)},
+            read=self._read, save=lambda _target: self._do("save"), restart=lambda _target: self._restart(),
+        )  # fmt: skip
+
+    def _do(self, name: str) -> None:
+        self.done.append(name)
+
+    def _write(self, _target: Target, value: int) -> object:
+        self._do(f"x={value}")
+        self.actual = {"x": value}
+        if self.result is setting.Written.VERIFIED or self.result is None:
+            self.active = dict(self.actual) if self.active else {}
+        if isinstance(self.result, Exception):
+            raise self.result
+        return self.result
+
+    def _read(self, _target: Target, _names: Collection[str] | None) -> setting.Reports:
+        self._do("read")
+        return {"": setting.DeviceReport(values=dict(self.active))}
+
+    def _restart(self) -> None:
+        self._do("restart")
+        self.active = dict(self.actual) if self.active else {}
+
+
+class OnePort(settings_plan.SettingsPort):
+    """Port that runs each script when it is created."""
+
+    driver = path = None
+    where, can_be_asked = "", True
+
+    def __init__(self) -> None:
+        self.samples = SampleWatch(self)
+
+    async def run_script(self, make: Callable[..., Any], *arguments: Any) -> Any:
+        return make(TARGET, *arguments)
+
+
+class CountedFlash(ModuleFlash):
+    """Flash that may be written, and the number of writes."""
+
+    def __init__(self) -> None:
+        super().__init__(FlashWrites(None, HostClock()), "module", asked=True)
+
+    @property
+    def counted(self) -> int:
+        return self.writes.record("module").writes
+
+
+def applied(
+    device: TableOfOne, *, save: bool = True, flash: CountedFlash | None = None, by_name: bool = False
+) -> setting.AppliedSettings:
+    plan = settings_plan.make_plan(
+        device.table, TARGET, {"x": 2}, device.active, {}, save=save, unsaved=False, by_name=by_name
+    )
+    port, reports = OnePort(), {"": setting.DeviceReport(values=device.active)}
+    applying = settings_plan.Applying(device.table, port, flash or CountedFlash(), {"x": 2}, reports)
+    return asyncio.run(applying.carry_out(plan))
+
+
+def test_values_are_written_read_back_saved_and_compared() -> None:
+    device, flash = TableOfOne(None), CountedFlash()
+    found = applied(device, flash=flash)
+    assert device.done == ["x=2", "read", "save"]
+    assert (found.steps[0].outcome, found.saved, found.restarted, found.differences) == (
+        setting.StepOutcome.VERIFIED, True, False, {},
+    )  # fmt: skip
+    assert flash.counted == 1
+    device = TableOfOne(setting.Written.PENDING, effect=setting.Effect.AFTER_RESTART)
+    found = applied(device)
+    assert device.done == ["x=2", "read", "save", "restart", "read"]
+    assert (found.steps[0].outcome, found.restarted) == (setting.StepOutcome.VERIFIED, True)
+    device = TableOfOne(setting.Written.PENDING)
+    found = applied(device)
+    assert device.done == ["x=2", "read", "save", "restart", "read"]
+    assert found.steps[0].outcome is setting.StepOutcome.VERIFIED
+    device = TableOfOne(setting.Written.PENDING)
+    found = applied(device, save=False)
+    assert device.done == ["x=2", "read"]
+    assert found.steps[0].outcome is setting.StepOutcome.WRITTEN
+    assert list(found.differences) == ["x"]
+
+
+@pytest.mark.parametrize("result", [setting.Written.UNVERIFIED, setting.Written.UNVERIFIED_PENDING])
+def test_an_unreadable_value_is_not_verified_and_another_value_is_a_failure(result: setting.Written) -> None:
+    found = applied(TableOfOne(result, readable=False))
+    assert found.steps[0].outcome is setting.StepOutcome.NOT_VERIFIED
+    assert (found.saved, found.problem, found.differences) == (True, "", {})
+    found = applied(TableOfOne(setting.Written.UNVERIFIED))
+    assert found.steps[0].message == "wrote 2, read back 1"
+
+
+def test_a_setting_that_saves_itself_is_saved_once() -> None:
+    device, flash = TableOfOne(setting.Written.VERIFIED, saves=True, connection=True), CountedFlash()
+    found = applied(device, flash=flash)
+    assert device.done == ["x=2", "read"]
+    assert (found.saved, flash.counted) == (True, 1)
+
+
+@pytest.mark.parametrize("error", [NoReply("no answer"), LinkMissing("pulled out")])
+def test_errors_of_device_and_link_are_part_of_the_result(error: Exception) -> None:
+    device = TableOfOne(error)
+    device.result = error
+    found = applied(device)
+    assert found.problem == f"x: {error}; no other setting was written"
+    assert device.done == ["x=2", "read"]
+
+
+def test_a_device_with_another_rate_than_its_bus_is_not_restarted() -> None:
+    device = TableOfOne(setting.Written.PENDING, effect=setting.Effect.AFTER_RESTART, connection=True, bus_rate=True)
+    done = applied(device, by_name=True)
+    assert (done.saved, done.restarted, done.problem) == (True, False, "")
+    assert [one for one in device.done if one != "read"] == ["x=2", "save"]

@@ -54,7 +54,7 @@ def test_the_line_model_changes_bytes_at_a_wrong_rate() -> None:
     assert received(b"\x55", 115200, 230400)[0][1] == 0b01100110
 
 
-def test_a_wrong_remembered_rate_costs_little_time() -> None:
+def test_a_wrong_remembered_rate_costs_little_time_and_a_latency_timer_extends_the_visits() -> None:
     search = Search([FAKE_DRIVER], remembered=("fake-uart", 9600))
     found, took_ns, listens = found_by(search, device(921600, 100, 777))
     assert found.baud == 921600
@@ -64,9 +64,6 @@ def test_a_wrong_remembered_rate_costs_little_time() -> None:
     assert first_visit(Search([FAKE_DRIVER], remembered=("gone-uart", 9600))).baud == BAUD_RATES[0]
     assert first_visit(Search([FAKE_DRIVER], remembered=("fake-uart", 57600))).baud == BAUD_RATES[0]
     assert first_visit(Search([FAKE_DRIVER], bauds=(9600,), remembered=("fake-uart", 115200))).baud == 9600
-
-
-def test_a_latency_timer_extends_the_visits() -> None:
     first, longer = (first_visit(Search([FAKE_DRIVER], hold_ns=hold_ns)).until_ns for hold_ns in (0, 16 * NS_PER_MS))
     assert longer - first == 16 * NS_PER_MS
 
@@ -207,11 +204,13 @@ def test_a_visit_ends_at_its_deadline_or_byte_limit() -> None:
     assert changes[-1].baud != step.baud
 
 
-def test_the_frames_determine_the_driver() -> None:
+def test_the_frames_determine_one_of_the_drivers() -> None:
     other = replace(FAKE_DRIVER, name="other-uart", make_codec=lambda ledger, options: DeafCodec(ledger))
     for drivers in ([other, FAKE_DRIVER], [FAKE_DRIVER, other]):
         found, _, _ = found_by(Search(drivers), device(115200, 100))
         assert found.driver is FAKE_DRIVER
+    with pytest.raises(ValueError, match="at least one driver"):
+        Search([])
 
 
 class DeafCodec:
@@ -234,11 +233,6 @@ def test_cut_frames_and_random_bytes_are_not_a_device() -> None:
         far = replace(device(115200, 100, 3_000_000), noise=noise)
         given_up(Search([FAKE_DRIVER], may_ask=True), far)
         assert far.sent_to == []
-
-
-def test_a_search_needs_drivers() -> None:
-    with pytest.raises(ValueError, match="at least one driver"):
-        Search([])
 
 
 def test_a_reply_behind_other_frames_and_frames_of_several_visits_count() -> None:
@@ -314,13 +308,19 @@ def test_a_streaming_device_is_found_without_a_remembered_rate(
 
 
 @every_rate
-def test_a_remembered_device_is_found_immediately(driver: StreamDriver, baud: int) -> None:
+def test_a_remembered_device_is_found_immediately_and_a_silent_device_by_its_reply(
+    driver: StreamDriver, baud: int
+) -> None:
     search = Search(FAMILIES, remembered=(driver.name, baud))
     found, took_ns, listens = found_by(search, family_device(driver, baud, 100, 1_234_567))
     assert found.driver is driver
     assert {listen.baud for listen in listens} == {baud}
     assert found.wasted_bytes == 0
     assert took_ns < (0.3 if baud > 9600 else 0.4) * NS_PER_S  # two frames of 136 bytes take 283 ms at 9600 baud
+    far = family_device(driver, baud, 0)
+    found, took_ns, _ = found_by(Search(FAMILIES, may_ask=True), far)
+    assert (found.driver.name, found.baud) == (driver.name, baud)
+    assert took_ns < 8 * NS_PER_S
 
 
 @pytest.mark.parametrize(("before", "now"), [(HIPNUC, IMU61X), (IMU61X, HIPNUC)])
@@ -332,15 +332,7 @@ def test_a_replaced_device_of_another_family_is_found(before: StreamDriver, now:
     assert took_ns < 0.3 * NS_PER_S
 
 
-@every_rate
-def test_a_silent_device_is_found_by_its_reply(driver: StreamDriver, baud: int) -> None:
-    far = family_device(driver, baud, 0)
-    found, took_ns, _ = found_by(Search(FAMILIES, may_ask=True), far)
-    assert (found.driver.name, found.baud) == (driver.name, baud)
-    assert took_ns < 8 * NS_PER_S
-
-
-def test_each_driver_is_queried_equally_often() -> None:
+def test_each_driver_is_queried_equally_often_and_an_acknowledgement_is_no_reply() -> None:
     far = family_device(HIPNUC, 57600, 0)
     result, _, _ = given_up(Search(FAMILIES, may_ask=True), far)
     assert "no reply to a query" in result.summary
@@ -349,8 +341,5 @@ def test_each_driver_is_queried_equally_often() -> None:
         asked = [baud for baud, sent in far.sent_to if sent == query]
         assert set(asked) == bauds
         assert len(asked) == len(bauds) * ASK_TRIES
-
-
-def test_an_acknowledgement_is_not_a_reply() -> None:
     far = replace(family_device(IMU61X, 115200, 0), reply=encode_acknowledgement(1))
     given_up(Search(FAMILIES, may_ask=True), far)

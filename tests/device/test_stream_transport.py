@@ -149,23 +149,40 @@ async def test_a_silent_device_raises_one_event_and_returns(rig: DeviceRig) -> N
     assert rig.kinds == [EventKind.UP, EventKind.DOWN, EventKind.UP]
 
 
-def test_a_busy_port_is_reported_and_tried_again() -> None:
-    class Busy(MemoryLink):
+def test_a_link_that_fails_is_reported_closed_and_opened_again() -> None:
+    class Faulty(MemoryLink):
+        """A port that is busy twice. Then its link fails to start twice. Bytes arrive before the search starts."""
+
+        opens = starts = 0
+
         def open(self) -> None:
-            if len(self.bauds) < 3:
-                self.bauds.append(0)
+            assert not self.is_open
+            self.opens += 1
+            if self.opens < 3:
                 raise LinkBusy("memory is in use by minicom (pid 4711)")
             super().open()
+
+        def start(self, on_data: OnData, on_end: OnEnd) -> None:
+            self.starts += 1
+            if self.starts < 3:
+                raise LinkError("it does not start")
+            super().start(on_data, on_end)
+            for size in (3, 5):
+                self.feed(bytes(size), monotonic_ns())
 
     async def story(rig: DeviceRig) -> None:
         await rig.turn(lambda: rig.state is DeviceState.FAILED)
         assert rig.problem == "memory is in use by minicom (pid 4711)"
-        await rig.turn(lambda: rig.link.listening)
-        feed(rig, hi91(10))
-        rig.tick()
-        assert rig.is_in(DeviceState.RUNNING)
+        for connects in (3, 4):
+            await rig.turn(lambda: rig.link.listening and rig.device.status().connects == connects)  # noqa: B023
+            feed(rig, hi91(10 * connects))
+            rig.tick()
+            assert rig.is_in(DeviceState.RUNNING)
+            if connects == 3:
+                assert (rig.ledger.bytes_in, rig.ledger.bytes_skipped, len(rig.samples)) == (8 + 82, 8, 1)
+                rig.link.end(LinkError("input/output error: the adapter stopped answering"))
 
-    play(story, link=Busy(MemoryOptions(baud=115200)))
+    play(story, link=Faulty(MemoryOptions(baud=115200)))
 
 
 @in_loop
@@ -227,7 +244,9 @@ async def test_detection_counts_each_byte_and_is_stored(rig: DeviceRig) -> None:
     rig.link.disappear()
     await rig.turn(lambda: rig.state is DeviceState.MISSING)
     rig.link.appear()
-    await rig.turn(lambda: rig.state is not DeviceState.MISSING)
+    await rig.turn(lambda: rig.state is DeviceState.SEARCHING)
+    rig.tick()  # during a search, earlier samples do not change the state to RUNNING
+    assert (rig.state, rig.kinds) == (DeviceState.SEARCHING, [EventKind.UP, EventKind.DOWN])
     feed(rig, hi91(1000) + hi91(1010))
     await rig.turn(lambda: len(rig.samples) == 5)
     assert rig.link.baud == right
@@ -239,6 +258,9 @@ async def test_a_device_without_samples_reports_what_to_check(rig: DeviceRig) ->
     assert rig.problem == "no sample has arrived yet; wait for the search"
     rig.tick(ahead_ns=3000 * MS)
     assert rig.problem.startswith("no byte arrives on memory at 115200 baud")
+    rig.link.feed(bytes(100), rig.now_ns() + 5500 * MS)
+    rig.tick(ahead_ns=5600 * MS)
+    assert rig.problem.startswith("bytes arrive on memory at 115200 baud, but no valid frame")
     rig.tick()
     feed(rig, hi91(10))
     rig.tick()
@@ -361,44 +383,6 @@ def test_a_refused_wake_is_repeated_and_reported_once(monkeypatch: pytest.Monkey
     module.play(story)
 
 
-def test_a_link_that_cannot_start_is_closed_before_it_is_opened_again() -> None:
-    class Failing(MemoryLink):
-        starts = 0
-
-        def open(self) -> None:
-            assert not self.is_open
-            super().open()
-
-        def start(self, on_data: OnData, on_end: OnEnd) -> None:
-            self.starts += 1
-            if self.starts < 3:
-                raise LinkError("it does not start")
-            super().start(on_data, on_end)
-
-    async def story(rig: DeviceRig) -> None:
-        await rig.turn(lambda: rig.link.listening)
-        feed(rig, hi91(10))
-        rig.tick()
-        assert rig.is_in(DeviceState.RUNNING)
-        assert rig.device.status().connects == 3
-
-    play(story, link=Failing(MemoryOptions(baud=115200)))
-
-
-def test_bytes_that_come_before_the_search_begins_are_counted() -> None:
-    class Early(MemoryLink):
-        def start(self, on_data: OnData, on_end: OnEnd) -> None:
-            super().start(on_data, on_end)
-            for size in (3, 5):
-                self.feed(bytes(size), monotonic_ns())
-
-    async def story(rig: DeviceRig) -> None:
-        feed(rig, hi91(10))
-        assert (rig.ledger.bytes_in, rig.ledger.bytes_skipped, len(rig.samples)) == (8 + 82, 8, 1)
-
-    play(story, link=Early(MemoryOptions(baud=115200)))
-
-
 @pytest.mark.parametrize("baud", [115200, "auto"])
 def test_the_time_unplugged_is_not_silence(baud: Any) -> None:
     """A device that was unplugged for 6 s and boots for 3 s: one UP event, and no silence."""
@@ -470,14 +454,6 @@ def test_a_port_of_another_configured_device_reports_its_name() -> None:
     play_rigs(rigs, story, clock)
 
 
-@told(play)
-async def test_bytes_without_frames_are_reported(rig: DeviceRig) -> None:
-    later_ns = rig.now_ns() + 2500 * MS
-    rig.link.feed(b"\x00" * 100, later_ns)
-    rig.device.tick(later_ns + 100 * MS)
-    assert rig.problem.startswith("bytes arrive on memory at 115200 baud, but no valid frame")
-
-
 HI83, HI81, OTHER = (encode_frame(bytes([tag]) + bytes(size)) for tag, size in ((0x83, 55), (0x81, 103), (0x77, 9)))
 RAW = imu61x_frame(DEVICE_SYNC, 0x0666, bytes(28))
 HI_NEXT = "imud decodes HI91 and HI92: select one with `imud settings bow --set output.hi91=100`"
@@ -527,15 +503,6 @@ def test_valid_frames_of_unknown_types_are_named(
     play(story, configured(driver=driver, baud=baud, identify=True))
 
 
-@told(play)
-async def test_an_error_of_the_link_is_a_failed_device(rig: DeviceRig) -> None:
-    rig.link.end(LinkError("input/output error: the adapter stopped answering"))
-    await rig.turn(lambda: rig.device.status().connects == 2)
-    feed(rig, hi91(10))
-    rig.tick()
-    assert rig.is_in(DeviceState.RUNNING)
-
-
 def test_an_action_that_changes_the_rate_changes_port_and_stored_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     def at_921600(_target: object) -> RequestScript[None]:
         yield Request(b"?", "?", never, never, never, silent=True, baud=921600)
@@ -561,19 +528,3 @@ def test_an_action_that_changes_the_rate_changes_port_and_stored_rate(monkeypatc
         await story(rigs, made[0])
 
     play_rigs(rigs, told, clock)
-
-
-@told(play, configured(baud="auto"))
-async def test_a_returned_device_needs_new_samples(rig: DeviceRig) -> None:
-    """During a search, earlier samples do not change the state to RUNNING."""
-    for ms in range(0, 400, 10):
-        feed(rig, hi91(ms))
-    rig.tick()
-    assert rig.is_in(DeviceState.RUNNING)
-    rig.link.disappear()
-    await rig.turn(lambda: rig.state is DeviceState.MISSING)
-    rig.link.appear()
-    await rig.turn(lambda: rig.state is DeviceState.SEARCHING)
-    rig.tick()
-    assert rig.is_in(DeviceState.SEARCHING)
-    assert rig.kinds == [EventKind.UP, EventKind.DOWN]

@@ -174,7 +174,7 @@ async def test_every_variant_is_followed_to_another_rate_and_back(
     assert device.device.ledger.frames_bad() < 10
 
 
-@played(LinkedDevice)
+@played(lambda: LinkedDevice(hardware=hardware_of(Behaviour(refuses=("CONFIG ATT RST",)))))
 async def test_settings_are_read_again_after_each_action(device: LinkedDevice) -> None:
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
     await device.act("pin", function="led", pin=7)
@@ -184,11 +184,6 @@ async def test_settings_are_read_again_after_each_action(device: LinkedDevice) -
     assert (settings["pins.led"], settings["mounting"]) == ("IO7", "y_up")
     assert settings["output.hi91"] == "25 Hz"
     assert "a command changed settings of the device: pins.led is IO7, was IO5" in device.messages
-
-
-@played(lambda: LinkedDevice(hardware=hardware_of(Behaviour(refuses=("CONFIG ATT RST",)))))
-async def test_settings_are_read_again_after_a_failed_action(device: LinkedDevice) -> None:
-    await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
     device.module.receive(b"CONFIG ATT MODE 1\r\n", device.clock.now_ns())  # by another program
     await device.wait(0.1)
     with pytest.raises(CommandError, match="the device rejected the request"):

@@ -378,6 +378,20 @@ def test_set_and_cleared_bits_raise_events() -> None:
     assert bench.step(None, 50) == []
     assert bench.step(DISTURBED, 5) == []
     assert bench.step(0, 12) == ["status: cleared: magnetic disturbance"]
+    bench = WatchBench()
+    assert bench.step(DISTURBED | OVER_RANGE, 20)
+    bench.path = FakePath()
+    assert bench.step(AT_REST, 20) == []  # no bit of the previous device is cleared
+    assert bench.step(DISTURBED) == ["status: magnetic disturbance"]
+    assert bench.step(0, 20) == ["status: cleared: magnetic disturbance"]
+    bench = WatchBench()
+    bench.path.status = ~0
+    bench.watch.tick(bench.now_ns, DRIVERS["imu61x-can"], bench.path)
+    bench.watch.tick(bench.now_ns, None, None)
+    assert bench.events == []
+    bits = {0: StatusBit("first"), 9: StatusBit("tenth")}
+    assert status_words(bits, 1 << 9 | 1 << 4) == ("tenth",)
+    assert status_words(bits, None) == ()
 
 
 def test_one_event_per_second_contains_all_changes() -> None:
@@ -392,26 +406,3 @@ def test_one_event_per_second_contains_all_changes() -> None:
     assert other.step(0) == ["status: cleared: accelerometer over range"]
     assert other.step(OVER_RANGE) == []
     assert other.step(0, 9) == ["status: accelerometer over range, cleared: magnetic disturbance"]
-
-
-def test_the_bits_of_a_replaced_device_raise_events_again() -> None:
-    bench = WatchBench()
-    assert bench.step(DISTURBED | OVER_RANGE, 20)
-    bench.path = FakePath()
-    assert bench.step(AT_REST, 20) == []  # no bit of the previous device is cleared
-    assert bench.step(DISTURBED) == ["status: magnetic disturbance"]
-    assert bench.step(0, 20) == ["status: cleared: magnetic disturbance"]
-
-
-def test_a_driver_without_notable_bits_is_not_watched() -> None:
-    bench = WatchBench()
-    bench.path.status = ~0
-    bench.watch.tick(bench.now_ns, DRIVERS["imu61x-can"], bench.path)
-    bench.watch.tick(bench.now_ns, None, None)
-    assert bench.events == []
-
-
-def test_words_of_a_status() -> None:
-    bits = {0: StatusBit("first"), 9: StatusBit("tenth")}
-    assert status_words(bits, 1 << 9 | 1 << 4) == ("tenth",)
-    assert status_words(bits, None) == ()

@@ -12,7 +12,7 @@ from typing import cast
 
 import pytest
 
-from imud.host.threads import BusThread, DescriptorWait, Job, WakeEvent, rare_garbage_collection, share_interpreter
+from imud.host.threads import BusThread, DescriptorWait, Job, WakeEvent, rare_garbage_collection
 
 LIMIT_S = 60.0
 NEVER_NS = 10**12
@@ -163,7 +163,7 @@ def test_settings_of_the_interpreter_are_restored() -> None:
     try:
         for interval_s, expected_s in ((0.005, 0.0003), (0.0001, 0.0001)):  # a shorter interval stays
             sys.setswitchinterval(interval_s)
-            share_interpreter()
+            started(lambda: None).end()
             assert sys.getswitchinterval() == pytest.approx(expected_s, rel=0.02)
     finally:
         sys.setswitchinterval(switch_s)
