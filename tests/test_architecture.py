@@ -484,7 +484,6 @@ CROSS_CUTTING = {
     "test_architecture.py": "the tree itself",
     "test_docs.py": "README.md, docs, Makefile",
     "test_end_to_end.py": "the daemon as a process, with its clients",
-    "utc/test_gpsd_daemon.py": "a real gpsd and the daemon",
     "web/test_calibration_page.py": "the calibrations of imud/web/static in a real browser",
     "web/test_device_page.py": "the page of a device of imud/web/static in a real browser: vectors, status, settings",
     "web/test_page.py": "imud/web/static in a real browser, with the daemon and a device",

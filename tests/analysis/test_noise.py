@@ -295,8 +295,7 @@ def terms_of(series: FloatArray, rate_hz: float = TERM_HZ) -> analysis_noise.Noi
 def test_basis_factor_and_the_fit_makes_the_curve_again() -> None:
     assert pytest.approx(0.664, abs=5e-4) == analysis_noise.BIAS_FACTOR
     assert analysis_noise.basis(np.array([2.0]))[0] == pytest.approx([3 / 4, 1 / 2, 2 * np.log(2) / np.pi, 2 / 3, 2.0])
-    found = terms_of(np.zeros(500))
-    assert all(term.value is None for term in found)
+    assert all(term.value is None for term in terms_of(np.zeros(500)))
     random = np.random.default_rng(31)
     curve = analysis_noise.allan_curve([white(random, TERMS_COUNT, TERM_HZ, 1e-3)[:, None]], TERM_HZ)
     fitted = analysis_noise.noise_terms(curve, 0).deviation(curve.tau_s)

@@ -144,8 +144,7 @@ def test_a_contradiction_has_its_cause(device: DeviceAxes, sample: Sample, kind:
 def test_a_body_that_is_not_level(axes: tuple[str, str, str], sample: Sample, side: str) -> None:
     words = f"and the {side} of the body"
     finding = contradiction(FLU_LEVEL, sample, Contradiction.MOUNTING, words, matrix_from_axes(*axes))
-    up = nearest_axis(sample.accel_m_s2 or (0, 0, 0))
-    assert f"axes needs z: {up};" in finding.message
+    assert f"axes needs z: {nearest_axis(sample.accel_m_s2 or (0, 0, 0))};" in finding.message
     assert found(FLU_LEVEL, sample) is None, "without a mounting nothing is known of a body"
 
 
@@ -216,8 +215,7 @@ def test_the_finding_ends_at_rest_without_contradiction() -> None:
     check = GravityCheck(FLU_LEVEL)
     assert any(check.add(one) for one in ticks(WRONG))
     assert check.finding is not None
-    right = ticks(zyx(0, 0), start=100)
-    assert any(check.add(one) for one in right)
+    assert any(check.add(one) for one in ticks(zyx(0, 0), start=100))
     assert check.finding is None
     # 15° of difference come from acceleration and from an unsettled filter; 25° do not.
     for angle_deg, is_found in ((15, False), (25, True)):

@@ -140,13 +140,19 @@ def test_bow_east_nose_up_right_side_down(convention: Convention, expected: Vect
     assert made.accel_m_s2 == pytest.approx((up[1] * G, back_side_up, up[2] * G if convention is ENU else -up[2] * G))
 
 
-def test_an_imu61x_keeps_the_direction_of_its_power_on() -> None:
+def test_axes_of_a_device_without_north_and_with_another_order_of_angles() -> None:
     """The device has no north: at power-on yaw is 0 in both conventions. Left is + in one convention and - in the
     other.
     """
     one = sample((0, 0, G), (10, 20, 30))
     assert degrees_of(turned(one, frame(convention=ENU)).euler_rad) == pytest.approx((10, 20, 30))
     assert degrees_of(turned(one, frame(convention=NED)).euler_rad) == pytest.approx((10, -20, -30))
+    # The device sends pitch 30° about its x axis, y forward. imud does not use its quaternion.
+    one = replace(sample((0, G * SIN30, G * COS30), (0, 30, 0)), quat_wxyz=quat_from_euler_zyx((0, radians(30), 0)))
+    made = turned(one, frame(FrameOptions(euler_order=EulerOrder.ZXY)))
+    assert made.accel_m_s2 == pytest.approx((G * SIN30, 0, G * COS30)), "its y axis is the front, nose up"
+    assert degrees_of(made.euler_rad)[:2] == pytest.approx((0, -30), abs=1e-9)
+    assert matrix_from_quat(made.quat_wxyz or (0, 0, 0, 0))[2] == pytest.approx((SIN30, 0, COS30))
 
 
 # --- mountings of a sensor with FLU axes ------------------------------------------------------------------------------
@@ -226,29 +232,21 @@ def test_roll_and_pitch_that_were_read_level_are_taken_away(convention: Conventi
     assert degrees_of(turned(one, frame(settings, convention)).euler_rad) == pytest.approx((0, 0, shown[2]), abs=1e-9)
 
 
-def test_a_heading_offset_is_added_clockwise() -> None:
+def test_heading_offset_declination_and_reference_of_the_heading() -> None:
     one = sample((0, 0, G), (0, 0, -40), mag=(1.0, 0.0, 0.0))
     settings = FrameOptions(heading_offset_deg=15)
     assert degrees_of(turned(one, frame(settings, NED)).euler_rad)[2] == pytest.approx(40 + 15)
     assert degrees_of(turned(one, frame(settings, ENU)).euler_rad)[2] == pytest.approx(-40 - 15)
     # the sensor points 15° to the left of the front: its forward direction is left of the body's front
-    mag = turned(one, frame(settings, ENU)).mag_t
-    assert mag == pytest.approx((cos(radians(15)), sin(radians(15)), 0.0))
-
-
-def test_a_declination_turns_the_heading_and_nothing_else() -> None:
-    """Magnetic heading 90°, magnetic north 5° east of true north: true heading 95°."""
+    assert turned(one, frame(settings, ENU)).mag_t == pytest.approx((cos(radians(15)), sin(radians(15)), 0.0))
+    # Magnetic heading 90°, magnetic north 5° east of true north: true heading 95°.
     one = sample((1, 2, 3), (10, 20, -90), mag=(1, 2, 3))
-    ned = turned(one, frame(None, NED, 5.0, RFU_ENU))
-    assert degrees_of(ned.euler_rad) == pytest.approx((10, 20, 95))
+    assert degrees_of(turned(one, frame(None, NED, 5.0, RFU_ENU)).euler_rad) == pytest.approx((10, 20, 95))
     own = turned(one, frame(None, None, 5.0, RFU_ENU))
     assert degrees_of(own.euler_rad) == pytest.approx((10, 20, -95)), "in the device's own convention"
     assert own.quat_wxyz is not None
     assert degrees_of(euler312_from_quat(own.quat_wxyz)) == pytest.approx((10, 20, -95))
     assert (own.accel_m_s2, own.mag_t) == ((1, 2, 3), (1, 2, 3))
-
-
-def test_the_reference_of_the_heading() -> None:
     true = frame(None, None, 5.0, RFU_ENU)
     assert true.heading(Heading.MAGNETIC) is Heading.TRUE
     assert true.heading(Heading.UNKNOWN) is Heading.TRUE, "the configuration says that it is magnetic"
@@ -291,15 +289,6 @@ def test_a_device_with_z_down(
     assert degrees_of(made.euler_rad) == pytest.approx(euler, abs=1e-9)
 
 
-def test_another_order_of_angles() -> None:
-    """The device sends pitch 30° about its x axis, y forward. imud does not use its quaternion."""
-    one = replace(sample((0, G * SIN30, G * COS30), (0, 30, 0)), quat_wxyz=quat_from_euler_zyx((0, radians(30), 0)))
-    made = turned(one, frame(FrameOptions(euler_order=EulerOrder.ZXY)))
-    assert made.accel_m_s2 == pytest.approx((G * SIN30, 0, G * COS30)), "its y axis is the front, nose up"
-    assert degrees_of(made.euler_rad)[:2] == pytest.approx((0, -30), abs=1e-9)
-    assert matrix_from_quat(made.quat_wxyz or (0, 0, 0, 0))[2] == pytest.approx((SIN30, 0, COS30))
-
-
 # --- partial angles ---------------------------------------------------------------------------------------------------
 
 
@@ -327,7 +316,7 @@ def test_angles_in_part(said: Vector3, settings: FrameOptions | None, expected: 
     assert made.euler_rad is None if expected is None else known(made.euler_rad) == expected
 
 
-def test_the_quaternion_has_priority_unless_it_is_zero() -> None:
+def test_the_quaternion_has_priority_unless_it_is_zero_and_nan_stays_one_element() -> None:
     made = turned(sample(euler_deg=(0, 0, 30), quat=(HALF, 0, 0, HALF)), frame(convention=ENU))
     assert degrees_of(made.euler_rad) == pytest.approx((0, 0, 90))
     made = turned(sample(euler_deg=(0, 0, 30), quat=(0, 0, 0, 0)), frame(convention=ENU))
@@ -337,9 +326,6 @@ def test_the_quaternion_has_priority_unless_it_is_zero() -> None:
     assert for_client is not None
     made = for_client.sample(sample(euler_deg=(0, 0, 30), quat=(HALF, 0, 0, HALF)))
     assert made.quat_wxyz == for_client.sample(sample(quat=(HALF, 0, 0, HALF))).quat_wxyz
-
-
-def test_an_element_that_is_nan_stays_one_element_in_quarter_turns() -> None:
     made = turned(sample(gyro=(nan, 2, 3)), frame(FrameOptions(axes=MountingAxes(x="y", y="-x", z="z"))))
     assert made.gyro_rad_s is not None
     assert (made.gyro_rad_s[0], made.gyro_rad_s[2]) == (2, 3)
@@ -379,8 +365,7 @@ def test_lengths_and_the_direction_of_gravity_are_kept(
         up = matrix_times(matrix_from_quat(quat), before)[2] * (-1 if published.device.z_down else 1)
         up_after = matrix_times(matrix_from_quat(made.quat_wxyz), after)[2] * (-1 if published.convention is NED else 1)
         assert up_after == pytest.approx(up, abs=1e-9)
-    volume = _triple(accel, gyro, mag)
-    assert _triple(*vectors) == pytest.approx(volume, abs=1e-6), "no mirror image"
+    assert _triple(*vectors) == pytest.approx(_triple(accel, gyro, mag), abs=1e-6), "no mirror image"
     assert hypot(*made.quat_wxyz) == pytest.approx(1.0)
     assert same_rotation(quat_from_euler_zyx(made.euler_rad), made.quat_wxyz)
 
@@ -488,19 +473,14 @@ def test_the_three_ways_agree_with_the_drawing(
     assert matrix_from_mounting_quat(quat) == by_axes
 
 
-def test_an_angle_of_30_degrees() -> None:
+def test_angles_of_30_degrees_and_every_choice_of_axes_are_rotations() -> None:
     """30° to the left: the x axis of the sensor points to the front and, with half its length, to the left."""
     matrix = matrix_from_angles(0, 0, 30)
     assert matrix_times(matrix, (1, 0, 0)) == pytest.approx((C30, S30, 0))
-    nose_down = matrix_from_angles(0, 30, 0)
-    assert matrix_times(nose_down, (1, 0, 0)) == pytest.approx((C30, 0, -S30))
-    left_side_up = matrix_from_angles(30, 0, 0)
-    assert matrix_times(left_side_up, (0, 1, 0)) == pytest.approx((0, C30, S30))
+    assert matrix_times(matrix_from_angles(0, 30, 0), (1, 0, 0)) == pytest.approx((C30, 0, -S30))
+    assert matrix_times(matrix_from_angles(30, 0, 0), (0, 1, 0)) == pytest.approx((0, C30, S30))
     # yaw first: the x axis of the sensor is pitched in its new direction, to the left
     assert matrix_times(matrix_from_angles(0, 30, 90), (1, 0, 0)) == pytest.approx((0, C30, -S30))
-
-
-def test_every_choice_of_axes_is_a_rotation_or_is_refused() -> None:
     matrices = []
     for axes in product(AXES, repeat=3):
         with suppress(ValueError):
@@ -532,7 +512,7 @@ def test_an_invalid_quaternion_is_rejected(quat: tuple[float, float, float, floa
         assert is_rotation(matrix_from_mounting_quat(near)), "three digits are enough"
 
 
-def test_levelling_subtracts_the_published_angles() -> None:
+def test_levelling_and_heading_offset_subtract_the_published_angles_behind_the_mounting() -> None:
     """A sensor with 10° nose-down error: its x axis is the x axis of the body, rotated back up."""
     level = levelling(Convention.ENU_FLU, 0.0, 10.0, 0.0)
     ten = radians(10)
@@ -542,15 +522,9 @@ def test_levelling_subtracts_the_published_angles() -> None:
     assert levelling(Convention.NED_FRD, 0.0, -10.0, 0.0) == level
     left_up = levelling(Convention.NED_FRD, 10.0, 0.0, 0.0)
     assert matrix_times(left_up, (0.0, sin(ten), cos(ten))) == pytest.approx((0, 0, 1))
-
-
-def test_a_sensor_that_points_to_the_left_has_a_heading_offset() -> None:
-    """The x axis points 90° to the left of the front: imud adds 90° to the heading."""
+    # The x axis points 90° to the left of the front: imud adds 90° to the heading.
     assert levelling(Convention.ENU_FLU, 0.0, 0.0, 90.0) == matrix_from_axes("-y", "x", "z")
     assert levelling(Convention.NED_FRD, 0.0, 0.0, 90.0) == matrix_from_axes("-y", "x", "z")
-
-
-def test_errors_are_taken_away_behind_the_mounting() -> None:
     upside_down: Matrix3 = matrix_from_axes("x", "-y", "-z")
     assert mounted(upside_down, IDENTITY) == upside_down
     whole = mounted(upside_down, levelling(Convention.ENU_FLU, 0.0, 0.0, 90.0))

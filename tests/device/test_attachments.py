@@ -113,7 +113,9 @@ async def test_a_device_that_hangs_is_reset_and_set_up_again(bench: PolledBusBen
 
 
 @in_bench
-async def test_search_rounds_before_the_newest_sample_cause_no_reset(bench: PolledBusBench) -> None:
+async def test_search_rounds_before_the_newest_sample_cause_no_reset_of_the_open_line(
+    bench: PolledBusBench,
+) -> None:
     async with polled(bench) as it:
         for _ in range(3):
             await it.rig.until_samples(5, 20)
@@ -121,7 +123,14 @@ async def test_search_rounds_before_the_newest_sample_cause_no_reset(bench: Poll
             await it.rig.until(lambda: it.rig.state is DeviceState.SEARCHING, "left")
             await it.search(4)
             it.boot()
-        assert it.pulses == 0
+        assert (it.pulses, it.line.is_open) == (0, True)
+        status = it.rig.device.status()
+        assert status.lines is not None
+        assert status.lines.problems == {}
+    assert not it.line.is_open
+    it.rig.device.tick(bench.clock.now_ns())
+    assert not it.line.is_open
+    assert it.line.history == []
 
 
 @in_bench
@@ -165,20 +174,6 @@ async def test_reset_needs_a_line_but_no_device(bench: PolledBusBench) -> None:
         assert it.pulses == 1
         await it.rig.until_samples(5)
         assert it.told == []
-
-
-@in_bench
-async def test_the_reset_line_stays_open_and_the_status_shows_its_problem(bench: PolledBusBench) -> None:
-    async with polled(bench) as it:
-        await it.rig.until_samples(1)
-        assert it.line.is_open
-        status = it.rig.device.status()
-        assert status.lines is not None
-        assert status.lines.problems == {}
-    assert not it.line.is_open
-    it.rig.device.tick(bench.clock.now_ns())
-    assert not it.line.is_open
-    assert it.line.history == []
 
 
 def frame(timer_us: int) -> bytes:

@@ -162,26 +162,22 @@ async def test_motion_prevents_the_start(rig: GuideRig) -> None:
     assert rig.events[-1].detail["verified"] is False
 
 
-@pytest.mark.parametrize("until_s", [19.7, 20.05])
-@played(GuideRig)
-async def test_motion_is_reported_even_if_no_sample_follows(rig: GuideRig, until_s: float) -> None:
-    rig.motion = lambda _t_s: (0.0, 0.0, 0.5)
-    running = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
-    await asyncio.sleep(until_s - 18)
-    rig.silent = True
-    with pytest.raises(CommandError, match="expected the device at rest"):
-        await running
-
-
 @pytest.mark.parametrize(
-    ("rate_rad_s", "words"), [(0.5, "it turns at 28.6 °/s"), (0.0, "only 11 samples came")], ids=["moved", "at rest"]
-)
+    ("rate_rad_s", "silent", "change_s", "words"),
+    [
+        (0.5, False, 1.7, ""), (0.5, False, 2.05, ""), (0.5, True, 19.05, "it turns at 28.6 °/s"),
+        (0.0, True, 19.05, "only 11 samples came"),
+    ],
+    ids=["no sample follows", "none after the window", "moved, few samples", "at rest, few samples"],
+)  # fmt: skip
 @played(GuideRig)
-async def test_too_few_samples_are_reported(rig: GuideRig, rate_rad_s: float, words: str) -> None:
-    rig.motion, rig.silent = lambda _t_s: (0.0, 0.0, rate_rad_s), True
+async def test_motion_and_too_few_samples_are_reported(
+    rig: GuideRig, rate_rad_s: float, silent: bool, change_s: float, words: str
+) -> None:
+    rig.motion, rig.silent = lambda _t_s: (0.0, 0.0, rate_rad_s), silent
     running = asyncio.create_task(rig.guide.run("gyro", gyro(rig), save=False))
-    await asyncio.sleep(19.05)
-    rig.silent = False
+    await asyncio.sleep(change_s)
+    rig.silent = not silent
     with pytest.raises(CommandError, match=f"expected the device at rest, got: {words}"):
         await running
 
@@ -501,8 +497,7 @@ def test_each_cell_is_one_direction_and_coverage_is_seen_from_the_centre() -> No
         for signs in product((1, -1), repeat=3)
         for values in permutations((1.0, 2.0, 3.0))
     ]
-    cells = {cell_of((x, y, z)) for x, y, z in directions}
-    assert cells == set(range(48))
+    assert {cell_of((x, y, z)) for x, y, z in directions} == set(range(48))
     assert cell_of((3.0, 2.0, 1.0)) == 0
     assert coverage(0b1011) == 3 / 48
     # A field of 45 µT with a bias of 60 µT covers half of the directions, seen from the origin.

@@ -34,7 +34,7 @@ class Told:
         return self.needs[-1].latency_ns / NS_PER_MS, self.needs[-1].who
 
 
-def test_the_smallest_latency_counts_for_a_device() -> None:
+def test_the_smallest_latency_counts_and_a_device_is_notified_of_changes() -> None:
     budget = LatencyBudget()
     bow, stern = Told(budget, "bow"), Told(budget, "stern")
     assert bow.needs == [NOBODY]
@@ -59,9 +59,6 @@ def test_the_smallest_latency_counts_for_a_device() -> None:
     budget.remove_device("bow")
     budget.ask("named", 3 * NS_PER_MS, ["bow"])
     assert Told(budget, "bow").now == (3, "named")
-
-
-def test_a_device_is_notified_of_changes_within_the_limits() -> None:
     budget = LatencyBudget()
     bow = Told(budget, "bow")
     budget.ask("client 1", 5 * NS_PER_MS)
@@ -174,10 +171,8 @@ class Path:
         return Came(self.samples, self.messages, self.ledger.snapshot())
 
 
-def stream_path(driver: StreamDriver) -> Path:
-    return Path(
-        lambda ledger, context: StreamPath(driver.make_codec(ledger, driver.settings()), clock_of(driver), context)
-    )
+def path_of(kind: Any, driver: Any) -> Path:
+    return Path(lambda ledger, context: kind(driver.make_codec(ledger, driver.settings()), clock_of(driver), context))
 
 
 def damaged(frame: bytes, random: Random) -> bytes:
@@ -201,7 +196,7 @@ def stream_of(driver: StreamDriver, random: Random) -> bytes:
 def test_held_bytes_give_the_same_samples_and_ledger(driver: StreamDriver, seed: int) -> None:
     random = Random(f"{driver.name} {seed}")
     stream = stream_of(driver, random)
-    plain, held = stream_path(driver), stream_path(driver)
+    plain, held = path_of(StreamPath, driver), path_of(StreamPath, driver)
     for part in cut(stream, random):
         plain.clock.advance(random.randrange(NS_PER_MS))
         plain.path.on_data(part, plain.clock.now_ns())
@@ -226,12 +221,6 @@ def test_held_bytes_give_the_same_samples_and_ledger(driver: StreamDriver, seed:
     assert all(sample.t_ns <= sample.t_rx_ns for sample in held.samples)
 
 
-def can_path(driver: CanDriver) -> Path:
-    return Path(
-        lambda ledger, context: CanPath(driver.make_codec(ledger, driver.settings()), clock_of(driver), context)
-    )
-
-
 def frames_of(driver: CanDriver, random: Random) -> list[CanFrame]:
     """Return frames of samples, 10 ms apart, without some frames."""
     found = []
@@ -248,7 +237,7 @@ def frames_of(driver: CanDriver, random: Random) -> list[CanFrame]:
 def test_held_frames_give_the_same_samples_and_times(driver: CanDriver, seed: int) -> None:
     random = Random(f"{driver.name} {seed}")
     frames = frames_of(driver, random)
-    plain, held = can_path(driver), can_path(driver)
+    plain, held = path_of(CanPath, driver), path_of(CanPath, driver)
     for frame in frames:
         plain.path.on_frames([frame])
     at = 0

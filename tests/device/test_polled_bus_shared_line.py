@@ -274,8 +274,7 @@ async def test_declared_settings_are_applied_to_every_kind_of_module(bench: Line
         await rig.until_samples(10)
         assert rig.kinds.count(EventKind.UP) == 1
         assert rig.ledger.lost_gap_device == (2 if module.variant.long_block == "silent" else 0)
-        taken = await rig.device.settings_apply({"address": 2}, save=True)
-        assert "address 2 is in use" in taken.problem
+        assert "address 2 is in use" in (await rig.device.settings_apply({"address": 2}, save=True)).problem
         applied = await rig.device.settings_apply({"mode": "9-axis", "mounting": "x_up", "address": 9}, save=True)
         assert applied.problem == "", applied
         assert {step.name: str(step.outcome) for step in applied.steps}["mounting"] == "sent, not verified"

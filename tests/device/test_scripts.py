@@ -99,19 +99,7 @@ async def test_requests_and_scripts_run_one_at_a_time() -> None:
 
 
 @in_loop
-async def test_a_timeout_ends_a_request_and_a_late_reply_is_counted() -> None:
-    ledger = Ledger()
-    runner = offline_runner(ledger)
-    assert await runner.run(ask(request("A", timeout_ns=1))) == [Silence(())]
-    runner.on_message("A=1", 0)
-    runner.on_message("OK", 0)
-    assert (ledger.replies_late, ledger.replies_unsolicited) == (1, 0)
-    runner.on_message("OK", 0)
-    assert ledger.replies_unsolicited == 1
-
-
-@in_loop
-async def test_a_cancelled_or_failed_script_allows_the_next_script() -> None:
+async def test_a_timed_out_cancelled_or_failed_script_allows_the_next_script() -> None:
     gone = True
 
     def write(data: bytes) -> None:
@@ -129,6 +117,14 @@ async def test_a_cancelled_or_failed_script_allows_the_next_script() -> None:
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
     assert await runner.run(ask(request("B", silent=True))) == [Reply(())]
+    ledger = Ledger()
+    runner = offline_runner(ledger)
+    assert await runner.run(ask(request("A", timeout_ns=1))) == [Silence(())]
+    runner.on_message("A=1", 0)
+    runner.on_message("OK", 0)
+    assert (ledger.replies_late, ledger.replies_unsolicited) == (1, 0)
+    runner.on_message("OK", 0)
+    assert ledger.replies_unsolicited == 1
 
 
 def test_a_device_without_reply_raises_no_reply() -> None:
@@ -262,12 +258,16 @@ def ok(name: str, *, kind: str = "OK", repeatable: bool = False) -> Request:
     return Request(name.encode(), name, numbered, never, numbered, kind=kind, repeatable=repeatable, probe=PROBE)
 
 
-def test_the_timeout_follows_the_slowest_reply() -> None:
+def test_the_timeout_follows_the_slowest_reply_also_of_a_further_reply() -> None:
     """Twice the slowest reply, at most 3 s, and at least the own timeout of the request."""
     texts, sent_ms = on_slow_device([400, 750, 1400, 2700, None, 0], *map(ok, "ABCDE"), ok("F", kind="F"))
     assert texts == ["1 OK", "2 OK", "3 OK", "4 OK", "", "6 OK"]
     assert sent_ms == [0, 400, 1150, 2550, 5250, 8250]
     assert on_slow_device([100, None, 0], ok("A"), ok("B"), ok("C", kind="C"))[1] == [0, 100, 600]
+    further = replace(ok("A"), payload=b"", name="A, further reply")
+    texts, sent_ms = on_slow_device([400, 700], ok("A"), further, ok("B"))
+    # no reply within twice 400 ms, then the reply to a probe
+    assert (texts, sent_ms) == (["1 OK", "", "2 OK"], [0, 400 + 800 + 1])
 
 
 @pytest.mark.parametrize(
@@ -295,13 +295,6 @@ def test_a_late_reply_never_answers_the_next_similar_request(
     texts, sent_ms = on_slow_device([100, late_ms, 50, 900], ok("A"), ok("B"), ok("C"), ok("D"))
     assert texts == ["1 OK", "", *outcomes]
     assert sent_ms[:3] == [0, 100, next_ms]
-
-
-def test_a_wait_for_a_further_reply_follows_the_slowest_reply_and_its_late_reply_counts_for_no_request() -> None:
-    further = replace(ok("A"), payload=b"", name="A, further reply")
-    texts, sent_ms = on_slow_device([400, 700], ok("A"), further, ok("B"))
-    # no reply within twice 400 ms, then the reply to a probe
-    assert (texts, sent_ms) == (["1 OK", "", "2 OK"], [0, 400 + 800 + 1])
 
 
 def test_a_request_with_another_reply_or_the_same_read_is_sent_immediately() -> None:

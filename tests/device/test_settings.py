@@ -399,6 +399,7 @@ async def test_each_replaced_module_gets_the_declared_settings_without_pause(ben
         bench.module.appear()
         await bench.until(partial(bench.repaired, number), limit_s=10)
         await bench.until(lambda: bench.is_in(SettingsState.AGREE), limit_s=10)
+        assert f"another device: serial number {serial}" in " ".join(event.message for event in bench.rig.events)
         assert (bench.module.flash["mode"], bench.module.flash["secret"], bench.module.saves) == ("9-axis", 5, number)
         assert bench.status.flash_writes == 1  # writes of this module
 
@@ -441,8 +442,7 @@ async def test_flash_writes_of_imud_have_a_lower_limit_than_requests(bench: Modu
     assert "the limit of imud itself" in bench.status.problem
     assert bench.module.saves == LIMIT_ITSELF
     assert bench.module.set["mode"] == "9-axis"  # imud sets it anyway
-    applied = await bench.doing(bench.device.settings_apply({"mode": "6-axis"}, save=True))
-    assert applied.saved
+    assert (await bench.doing(bench.device.settings_apply({"mode": "6-axis"}, save=True))).saved
     assert bench.status.flash_writes_day == LIMIT_ITSELF + 1
 
 
@@ -522,7 +522,7 @@ def outcomes(applied: AppliedSettings) -> Outcomes:
 WANTED = {"mode": "9-axis", "output": {"a": 10}, "mounting": "x_up", "offset_deg": 1.5}
 
 
-def test_a_failed_step_ends_the_plan_without_save() -> None:
+def test_a_failed_step_or_a_device_without_reply_ends_the_plan_without_save() -> None:
     bench, applied = applied_with(WANTED, lambda module: module.refuses.add("output"))
     assert outcomes(applied) == {
         "mode": StepOutcome.VERIFIED, "output": StepOutcome.NOT_APPLIED, "mounting": StepOutcome.NOT_DONE,
@@ -543,8 +543,6 @@ def test_a_failed_step_ends_the_plan_without_save() -> None:
     assert applied.steps[-1].message == "wrote 1.5, read back 0.0"
     assert not applied.saved
 
-
-def test_a_device_without_reply_during_the_plan() -> None:
     class Dying(set[str]):
         """Commands without a reply: all commands after the write of `output`."""
 

@@ -394,8 +394,7 @@ def test_a_setting_that_saves_itself_is_saved_once() -> None:
 def test_errors_of_device_and_link_are_part_of_the_result(error: Exception) -> None:
     device = TableOfOne(error)
     device.result = error
-    found = applied(device)
-    assert found.problem == f"x: {error}; no other setting was written"
+    assert applied(device).problem == f"x: {error}; no other setting was written"
     assert device.done == ["x=2", "read"]
 
 

@@ -3,7 +3,6 @@
 import asyncio
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from time import monotonic_ns
 from typing import Any
@@ -97,41 +96,6 @@ async def test_after_a_replug_sequence_numbers_and_times_increase(rig: DeviceRig
     assert rig.kinds == [EventKind.UP, EventKind.DOWN, EventKind.UP]
     assert rig.device.status().connects == 2
     assert rig.ledger.lost() == 0
-
-
-def test_a_changed_setting_is_reported_after_a_replug() -> None:
-    async def answer(rig: DeviceRig, mode: bytes, uuid: bytes = b"043995698D6E1708") -> None:
-        done = 0
-        while done < 4:
-            await rig.turn(partial(lambda seen: len(rig.link.written) > seen, done))
-            request = rig.link.written[done]
-            done += 1
-            if b"VERSION" in request:
-                feed(rig, VERSION % uuid)
-            elif b"USRCONFIG" in request:
-                feed(rig, b"ATT_MODE: " + mode + b"\r\nOK\r\n")
-            elif b"MAGCONFIG" in request:
-                feed(rig, b"MB=14.14, -2.08, -8.75\r\nOK\r\n")
-            else:
-                feed(rig, b"COM1=115200\r\nOK\r\n")
-        rig.link.written.clear()
-
-    async def story(rig: DeviceRig) -> None:
-        await answer(rig, b"0")
-        await rig.turn(lambda: rig.device.status().settings)
-        assert rig.device.status().identity["product"] == "HI14R3"
-        assert rig.device.status().identity["serial_number"] == "043995698D6E1708"
-        rig.link.disappear()
-        await rig.turn(lambda: rig.state is DeviceState.MISSING)
-        rig.link.appear()
-        await answer(rig, b"1", b"0000000000000001")
-        await rig.turn(lambda: EventKind.CONFIGURATION in rig.kinds)
-        await rig.turn(lambda: len(rig.events) >= 2)
-        messages = [event.message for event in rig.events]
-        assert any("another device: serial number 0000000000000001" in message for message in messages)
-        assert any("mode is 9-axis, was 6-axis" in message for message in messages)
-
-    play(story, configured(identify=True))
 
 
 @told(play)

@@ -191,8 +191,7 @@ def test_a_hold_does_not_change_the_time_stamps(latency_ms: float) -> None:
 
 @played(lambda: HoldBench(10, anew=True))
 async def test_no_hold_before_the_fit_and_after_a_restart(bench: HoldBench) -> None:
-    single = [len(samples) for _, samples in bench.rig.published[:100]]
-    assert single == [1] * 100
+    assert [len(samples) for _, samples in bench.rig.published[:100]] == [1] * 100
     assert bench.rig.samples[99].sync is Sync.ARRIVAL
     since, begun = len(bench.rig.samples), bench.sent
     await bench.send(1000, lambda number: bench.frame(number - begun))  # the device time restarts

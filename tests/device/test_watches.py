@@ -259,8 +259,7 @@ def test_a_replaced_device_is_checked_again() -> None:
 def test_a_moving_device_raises_no_event() -> None:
     """A wrongly mounted module that swings and never rests."""
     swing = Swing(roll=(Sine(0.3, 0.5), Sine(3.1, 0.0, 1.57)), pitch=(Sine(0.3, 0.4),), yaw=(Sine(0.5, 0.3),))
-    made = played("hipnuc-uart", swing, 20.0, frame=FrameOptions())
-    assert made.events == []
+    assert played("hipnuc-uart", swing, 20.0, frame=FrameOptions()).events == []
 
 
 def test_each_published_sample_is_rotated_once() -> None:

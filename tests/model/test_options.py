@@ -115,16 +115,10 @@ def test_types_in_words(field_type: Any, words: str) -> None:
     assert expected(field_type) == words
 
 
-@pytest.mark.parametrize(
-    ("value", "field_type", "place"),
-    [
-        ([1, "x"], list[int], ' with "x" at [1]'),
-        (["", 1], list[int], ' with "" at [0]'),
-        ({"rate_hz": 1, "names": ["a", 2]}, Trip, " with 2 at names[1]"),
-    ],
-)
-def test_the_place_of_a_wrong_part(value: object, field_type: Any, place: str) -> None:
-    assert value_problem(value, field_type).endswith(place)
+def test_the_place_of_a_wrong_part() -> None:
+    assert value_problem([1, "x"], list[int]).endswith(' with "x" at [1]')
+    assert value_problem(["", 1], list[int]).endswith(' with "" at [0]')
+    assert value_problem({"rate_hz": 1, "names": ["a", 2]}, Trip).endswith(" with 2 at names[1]")
 
 
 def test_the_text_of_a_value_is_short_and_printable_and_a_text_can_be_json() -> None:

@@ -106,7 +106,7 @@ def test_readings_of_the_clocks_are_recorded() -> None:
     assert len(records) == 2
 
 
-def test_recordable_devices_ignore_an_unknown_device_and_end() -> None:
+def test_recordable_devices_ignore_an_unknown_device_and_end_and_check_the_newest_sample() -> None:
     one, put = ObservedPath(), list[bytes]()
     device = SimpleNamespace(observer=one.observer, record=lambda send: one.observer.begin(send, "", {}, {}))
     devices = RecordableDevices({"bow": cast(Device, device)}, one.host)
@@ -122,9 +122,6 @@ def test_recordable_devices_ignore_an_unknown_device_and_end() -> None:
     one.clock.advance(2_000_000_000)
     one.host.utc_offset_ns()
     assert len(put) == 4
-
-
-def test_a_check_contains_the_newest_sample() -> None:
     one, put = ObservedPath(), list[bytes]()
     one.observer.check(put.append)
     one.path.on_data(hi91(0), 5)

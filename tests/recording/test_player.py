@@ -27,7 +27,6 @@ from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.recording.player import Player, RecordedClock, _reading
 from tests.device import test_can_transport as can
 from tests.device import test_polled_transport as polled
-from tests.device import test_polled_transport_data_ready as data_ready
 from tests.device import test_stream_transport_stream_hold as waiting
 from tests.device import test_watches as watches
 from tests.lines import test_end_to_end as signals
@@ -73,7 +72,7 @@ def test_a_run_on_a_line_or_can_bus_is_replayed(run: Callable[[], None]) -> None
 @pytest.mark.parametrize(
     "run",
     [
-        data_ready.test_each_edge_is_a_sample_with_its_time,
+        polled.test_each_edge_is_a_sample_with_its_time,
         polled.test_one_damaged_reading_loses_one_sample,
         lambda bench: polled.test_readings_after_an_absence_need_an_identification(
             bench=bench, fault={"error": errno.EIO}, why="transfer failed"

@@ -64,8 +64,7 @@ def test_objects_are_restored_with_objects_of_the_daemon() -> None:
     assert ledger.lost_gap_device == 2
     there_and_back(ledger.add_unknown_gap, {"ledger": ledger})()
     assert ledger.lost_unknown == 1
-    made = there_and_back(partial(JumpDetector))()
-    assert type(made) is JumpDetector
+    assert type(there_and_back(partial(JumpDetector))()) is JumpDetector
     steady, new = SteadyTime(), SteadyTime()
     for second in range(50):
         steady.add_pair(second * 1_000_000_500, second * 1_000_000_000)

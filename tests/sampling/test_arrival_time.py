@@ -25,18 +25,12 @@ def fed(times: ArrivalTime, count: int, *, numbered: bool = False, alone: bool =
     return t_ns
 
 
-def test_the_first_frame_has_the_arrival_time() -> None:
-    times = ArrivalTime(DELAY, 0, lambda: None)
-    assert fed(times, 1) == -DELAY.floor_ns // 2
-    assert times.error_ns > FIRST_SPREAD_NS
-
-
 def off_ns(times: ArrivalTime, late_ns: int, number: int | None = None, *, alone: bool = True) -> int:
     """Return the time from the time stamp of a frame to its arrival at `late_ns`, ns."""
     return late_ns - times.time_stamp(number, late_ns, 82, alone=alone, triggered=False, is_first=False)
 
 
-def test_a_late_frame_is_time_stamped_by_the_pace() -> None:
+def test_the_first_frame_has_its_arrival_and_later_frames_the_pace_or_the_number() -> None:
     for alone in (True, False):
         times = ArrivalTime(DELAY, 0, lambda: None)
         fed(times, 100, alone=alone)
@@ -44,9 +38,9 @@ def test_a_late_frame_is_time_stamped_by_the_pace() -> None:
         assert (off_ns(times, late_ns, alone=alone) > 3 * NS_PER_MS) is alone
         times.restart()  # after a missing link, the pace is measured again
         assert off_ns(times, late_ns + 400 * PERIOD_NS, alone=alone) == DELAY.floor_ns // 2
-
-
-def test_a_number_counts_what_is_missing() -> None:
+    times = ArrivalTime(DELAY, 0, lambda: None)
+    assert fed(times, 1) == -DELAY.floor_ns // 2
+    assert times.error_ns > FIRST_SPREAD_NS
     times = ArrivalTime(DELAY, 256, lambda: None)
     fed(times, 100, numbered=True)
     late_ns = BEGIN_NS + 102 * PERIOD_NS + 5 * NS_PER_MS
@@ -54,16 +48,13 @@ def test_a_number_counts_what_is_missing() -> None:
     assert times.missed == 2
 
 
-def test_hold_of_a_timer_and_receive_timeout_of_a_uart() -> None:
+def test_hold_of_a_timer_and_spread_of_even_and_uneven_arrivals() -> None:
     delay = LinkDelay(byte_ns=10_850, hold_ns=16 * NS_PER_MS)
     assert delay.held_ns(0.0, 82) == 16 * NS_PER_MS
     assert delay.held_ns(1e6, 82) == 1e6 - 82 * 10_850
     assert delay.held_ns(1e9, 82) == 16 * NS_PER_MS
     assert delay.held_ns(1e5, 82) == 0.0
     assert LinkDelay(86_805, 0).floor_ns - LinkDelay(0, 0).floor_ns == 4 * 86_805
-
-
-def test_spread_of_even_and_uneven_arrivals() -> None:
     even, uneven = ArrivalSpread(), ArrivalSpread()
     assert even.sigma_ns == FIRST_SPREAD_NS
     for i in range(1, 500):
@@ -104,7 +95,7 @@ def test_arrivals_need_a_known_pace() -> None:
         assert any(used) is is_used
 
 
-def test_delayed_frames_are_time_stamped_by_the_fit() -> None:
+def test_delayed_numbered_and_triggered_frames_are_time_stamped_by_the_fit() -> None:
     """Frames of two seconds arrive together."""
     even = EvenArrivals()
     due_ns = settled(even)
@@ -114,6 +105,17 @@ def test_delayed_frames_are_time_stamped_by_the_fit() -> None:
         off_ns = even.t_ns - (due_ns + i * PERIOD_NS)
         assert abs(off_ns) < 200 * NS_PER_US
         assert 2 * even.error_ns >= abs(off_ns)
+    even = EvenArrivals()
+    for i in range(300):
+        even.add_arrival(DELAY, BEGIN_NS + i * PERIOD_NS, 1, triggered=False)
+    late_ns = BEGIN_NS + 305 * PERIOD_NS
+    assert even.add_arrival(DELAY, late_ns + 3 * PERIOD_NS, 6, triggered=False)
+    assert abs(even.t_ns - late_ns) < 200 * NS_PER_US
+    assert even.error_ns < 200 * NS_PER_US
+    even = EvenArrivals()
+    due_ns = settled(even)
+    assert even.add_arrival(DELAY, due_ns + 4 * NS_PER_MS, 0, triggered=True)
+    assert 2 * even.error_ns >= 4 * NS_PER_MS
 
 
 @pytest.mark.parametrize("missing", [1, 2, 3, 4, 40])
@@ -129,23 +131,6 @@ def test_lost_samples_are_counted_after_four_frames(missing: int) -> None:
         if i >= 3:
             assert abs(off_ns) < 200 * NS_PER_US
             assert even.error_ns < 200 * NS_PER_US
-
-
-def test_a_number_shows_the_loss_at_once() -> None:
-    even = EvenArrivals()
-    for i in range(300):
-        even.add_arrival(DELAY, BEGIN_NS + i * PERIOD_NS, 1, triggered=False)
-    late_ns = BEGIN_NS + 305 * PERIOD_NS
-    assert even.add_arrival(DELAY, late_ns + 3 * PERIOD_NS, 6, triggered=False)
-    assert abs(even.t_ns - late_ns) < 200 * NS_PER_US
-    assert even.error_ns < 200 * NS_PER_US
-
-
-def test_a_triggered_sample_may_be_as_late_as_it_arrives() -> None:
-    even = EvenArrivals()
-    due_ns = settled(even)
-    assert even.add_arrival(DELAY, due_ns + 4 * NS_PER_MS, 0, triggered=True)
-    assert 2 * even.error_ns >= 4 * NS_PER_MS
 
 
 @pytest.mark.parametrize(("period_ns", "undecided"), [(5 * NS_PER_MS, 1), (20 * NS_PER_MS, 33)])

@@ -1,14 +1,21 @@
-"""The complete clock: three rules for any input, disturbances by devices and hosts, polled samples."""
+"""The complete clock: three rules for any input, disturbances by devices and hosts, polled samples.
+Frames in one loop (`add_run`): the same samples, losses and state of the clock as frame by frame."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise, product
+from random import Random
+from typing import Final
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from imud.contracts.codec import BadFrame, BadReason, CodecEvent
+from imud.contracts.status import ClockStatus
+from imud.host.clock import SteadyTime
 from imud.model.sample import Measurement, Sample, Sync
-from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from imud.sampling.clock import SampleClock
 from imud.sim.ports.arrival import LOADED, PROFILES, USB_1MS, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
 from tests.bench.clock import BAUD_OF_RATE, accuracy, run
@@ -42,7 +49,7 @@ def test_a_believable_device_never_resets(steps: list[int], first: int) -> None:
     assert samples[-1].t_dev_ns == (first + points[-1][1]) * NS_PER_MS
 
 
-def test_it_comes_from_arrival_to_regression() -> None:
+def test_it_comes_from_arrival_to_regression_and_learns_fast_and_slow_counters() -> None:
     clock = make_clock()
     samples = feed(clock, steady(5000, 0, 200))
     assert samples[0].sync is Sync.ARRIVAL
@@ -53,6 +60,18 @@ def test_it_comes_from_arrival_to_regression() -> None:
     assert abs(status.skew_ppm) < 1
     assert status.t_err_ns == samples[-1].t_err_ns
     assert abs(status.offset_ns - (BEGIN_NS - 5000 * NS_PER_MS)) < NEAR_NS
+    clock = make_clock()
+    points: list[Point] = [(int(10.5 * i), 10 * i) for i in range(6000)]
+    samples = feed(clock, points)
+    assert abs(clock.status().skew_ppm - 50_000) < 20
+    assert abs(clock.expected_rate_hz - 100) < 0.01
+    assert far(samples[1000:], points[1000:]) < NEAR_NS
+    # A pty reports 9600 baud and delivers 1 kHz. The clock must not subtract 85 ms of time on the wire.
+    clock = make_clock(byte_ns=1_041_666)
+    points = steady(0, 0, 5000, step_ms=1)
+    samples = feed(clock, points)
+    assert far(samples[-500:], points[-500:]) < NEAR_NS
+    assert clock.status().resets == 0
 
 
 @pytest.mark.parametrize(
@@ -112,48 +131,26 @@ def test_a_busy_host_causes_no_reset(reads: tuple[tuple[int, int], ...]) -> None
     assert len(reads) > 1 or far(samples, steady(20_000, 20_000, 200)) < NEAR_NS
 
 
-def test_a_repeated_stamp_still_rises() -> None:
+def test_repeated_stamps_rise_and_a_stuck_counter_falls_back_to_arrival() -> None:
     clock = make_clock()
     points = [(10 * (i // 2), 10 * (i // 2) + i % 2) for i in range(400)]
     samples = feed(clock, points)
     assert rises(samples)
     assert clock.missed == 0
     assert clock.status().resets == 0
-
-
-def test_an_arrival_without_room_for_more_samples_is_lifted() -> None:
     clock = make_clock()
     clock.sample_polled(FRAME, BEGIN_NS, 1, BEGIN_NS, 0)
     samples = [clock.sample(message(None), BEGIN_NS, 0) for _ in range(2)]
     assert [(s.t_ns, s.t_rx_ns) for s in samples] == [(BEGIN_NS + 1,) * 2, (BEGIN_NS + 2,) * 2]
-
-
-def test_a_stuck_counter_falls_back_to_arrival() -> None:
     clock = make_clock()
     feed(clock, steady(0, 0, 300))
-    points: list[Point] = [(2990, 3000 + 10 * i) for i in range(600)]
-    samples = feed(clock, points)
+    samples = feed(clock, [(2990, 3000 + 10 * i) for i in range(600)])
     assert rises(samples)
     assert samples[-1].sync is Sync.ARRIVAL
     assert samples[-1].t_rx_ns - samples[-1].t_ns < NS_PER_S
 
 
-def test_fast_and_slow_counters_are_learned() -> None:
-    clock = make_clock()
-    points: list[Point] = [(int(10.5 * i), 10 * i) for i in range(6000)]
-    samples = feed(clock, points)
-    assert abs(clock.status().skew_ppm - 50_000) < 20
-    assert abs(clock.expected_rate_hz - 100) < 0.01
-    assert far(samples[1000:], points[1000:]) < NEAR_NS
-    # A pty reports 9600 baud and delivers 1 kHz. The clock must not subtract 85 ms of time on the wire.
-    clock = make_clock(byte_ns=1_041_666)
-    points = steady(0, 0, 5000, step_ms=1)
-    samples = feed(clock, points)
-    assert far(samples[-500:], points[-500:]) < NEAR_NS
-    assert clock.status().resets == 0
-
-
-def test_without_device_time() -> None:
+def test_without_device_time_or_with_it_in_every_second_message() -> None:
     clock = make_clock()
     points: list[Point] = [(None, 10 * i) for i in range(100)]
     samples = feed(clock, points)
@@ -164,6 +161,10 @@ def test_without_device_time() -> None:
     samples = [clock.sample(message(None, 82 * (3 - i)), BEGIN_NS, 0) for i in range(4)]
     assert [b.t_ns - a.t_ns for a, b in pairwise(samples)] == [82_000] * 3
     assert samples[0].t_ns <= BEGIN_NS - 4 * 82_000
+    clock = make_clock()
+    samples = feed(clock, [(10 * (i // 2) if i % 2 else None, 10 * (i // 2) + 3 * (i % 2)) for i in range(600)])
+    assert rises(samples)
+    assert [s.sync for s in samples[-4:]] == [Sync.ARRIVAL, Sync.REGRESSION] * 2
 
 
 def test_corrections_are_slewed() -> None:
@@ -215,14 +216,6 @@ def test_every_value_of_the_measurement_is_in_the_sample() -> None:
     assert s.device == "imu"
 
 
-def test_messages_with_and_without_device_time_mix() -> None:
-    clock = make_clock()
-    points: list[Point] = [(10 * (i // 2) if i % 2 else None, 10 * (i // 2) + 3 * (i % 2)) for i in range(600)]
-    samples = feed(clock, points)
-    assert rises(samples)
-    assert [s.sync for s in samples[-4:]] == [Sync.ARRIVAL, Sync.REGRESSION] * 2
-
-
 # --- polled samples ---------------------------------------------------------------------------------------------------
 
 
@@ -230,7 +223,7 @@ def polled_clock() -> SampleClock:
     return SampleClock("imu", tick_ns=0, tick_modulus=2, byte_ns=0, hold_ns=0)
 
 
-def test_time_is_that_of_the_poll() -> None:
+def test_the_time_of_polled_samples_is_that_of_the_poll_or_edge_and_rises() -> None:
     one = polled_clock()
     sample = one.sample_polled(FRAME, 1_000_000, 300, 1_200_000, 5_000_000_000)
     assert (sample.t_ns, sample.t_err_ns, sample.t_rx_ns, sample.utc_ns) == (1_000_000, 300, 1_200_000, 5_001_000_000)
@@ -240,18 +233,12 @@ def test_time_is_that_of_the_poll() -> None:
     other.continue_from(one)
     sample = other.sample_polled(FRAME, 500, 1, 1_000_001, 0)
     assert (sample.seq, sample.t_ns) == (2, 1_000_001)
-
-
-def test_polled_time_rises_strictly_and_the_error_contains_the_change() -> None:
     one = polled_clock()
     samples = [one.sample_polled(FRAME, t_ns, 1, t_ns + 5, 0) for t_ns in (100, 100, 50, 103, 200)]
     assert [sample.t_ns for sample in samples] == [100, 101, 102, 103, 200]
     assert [sample.t_err_ns for sample in samples] == [1, 2, 53, 1, 1]
     assert all(sample.t_ns <= sample.t_rx_ns for sample in samples)
     assert [sample.seq for sample in samples] == [1, 2, 3, 4, 5]
-
-
-def test_by_an_edge() -> None:
     one = polled_clock()
     samples = [
         one.sample_polled(FRAME, t_ns, 5, t_ns + 50, 0, edge) for t_ns, edge in ((100, 7), (200, None), (300, 8))
@@ -315,3 +302,146 @@ def test_bursts_behind_a_slow_timer(rate_hz: int) -> None:
     assert got.share >= 0.95
     assert got.rms_ns < 1_500_000
     assert got.mean_t_err_ns < 4 * got.rms_ns
+
+
+BYTES: Final = 82
+BYTE_NS: Final = 10_850
+MODULUS: Final = 1 << 12
+"""Modulus of the counter, ticks. It wraps several times in a trial."""
+ROUNDS: Final = 600
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Properties of the device and its link."""
+
+    name: str
+    period_ms: float = 1.0
+    hold_ns: int = 0
+    most: int = 24
+    """Maximum number of frames in a read."""
+    waits: bool = False
+    """Whether frames wait and are read together."""
+    lost: float = 0.0
+    odd: float = 0.0
+    """Share of frames without device time, and of jumps of the counter."""
+    slewed: float = 0.0
+    """Rate of CLOCK_MONOTONIC relative to steady time."""
+    early_ns: int = 0
+    """Time by which some reads are too early, ns."""
+
+
+TRIALS: Final = (
+    Trial("even"), Trial("waits", waits=True), Trial("waits at 200 Hz", period_ms=5.0, most=6, waits=True),
+    Trial("USB adapter", hold_ns=16 * NS_PER_MS), Trial("400 Hz in ms", period_ms=2.5),
+    Trial("slewed host", waits=True, slewed=20e-6), Trial("losses", lost=0.0005, waits=True),
+    Trial("jumps", odd=0.001, waits=True), Trial("early reads", early_ns=200 * NS_PER_US, waits=True),
+)  # fmt: skip
+
+
+class Device:
+    """Reads of a device, each with its time and the maximum wait of its frames."""
+
+    def __init__(self, trial: Trial, random: Random) -> None:
+        self._trial = trial
+        self._random = random
+        self._number = self._jumped = 0
+        self._t_rx_ns = BEGIN_NS
+
+    def read(self) -> tuple[list[CodecEvent], int, int]:
+        """Return the next read."""
+        trial, random = self._trial, self._random
+        count = random.choice((1, 1, trial.most // 2, trial.most))
+        events = [event for place in range(count) for event in self._message(count - 1 - place)]
+        period_ns = int(trial.period_ms * NS_PER_MS)
+        late_ns = int(random.expovariate(1 / (20 * NS_PER_US))) + (count > 1) * random.randrange(period_ns)
+        late_ns -= trial.early_ns * (random.random() < 0.05)
+        due_ns = BEGIN_NS + self._number * int(period_ns * 1.00004) + BYTES * BYTE_NS + late_ns
+        self._t_rx_ns = max(self._t_rx_ns, due_ns + int(self._number * period_ns * trial.slewed))
+        return events, self._t_rx_ns, count * period_ns if trial.waits and count > 1 else 0
+
+    def _message(self, behind: int) -> list[CodecEvent]:
+        trial, random = self._trial, self._random
+        self._number += 1
+        self._jumped += random.randrange(5000) * (random.random() < trial.odd / 2)
+        if random.random() < trial.lost:
+            return [BadFrame(BadReason.CRC, b"")] if random.random() < 0.5 else []
+        ticks = (int(self._number * trial.period_ms) + self._jumped) % MODULUS
+        return [
+            Measurement(
+                BYTES, behind * BYTES, None if random.random() < trial.odd / 2 else ticks,
+                accel_m_s2=(float(self._number), 0.0, 9.8), status=random.choice((None, 5)), pps_age_ms=self._number,
+            )
+        ]  # fmt: skip
+
+
+class Dated:
+    """A clock with its samples of the reads."""
+
+    def __init__(self, trial: Trial) -> None:
+        self.host = SteadyTime()
+        self.unknown = 0
+        self.clock = SampleClock(
+            "imu", tick_ns=NS_PER_MS, tick_modulus=MODULUS, byte_ns=BYTE_NS, hold_ns=trial.hold_ns, host=self.host,
+            on_unknown_gap=self._on_unknown_gap,
+        )  # fmt: skip
+        self.samples: list[Sample] = []
+        self.missed: list[int] = []
+        self.states: list[ClockStatus] = []
+        self.in_runs = 0
+
+    def _on_unknown_gap(self) -> None:
+        self.unknown += 1
+
+    def take(self, events: Sequence[CodecEvent], t_rx_ns: int, waited_ns: int, *, runs: bool) -> None:
+        """Time-stamp the frames of a read, in runs or one by one."""
+        self.clock.waited_ns = waited_ns
+        at = 0
+        while at < len(events):
+            after = self.clock.add_run(self.samples, events, at, t_rx_ns, 7) if runs else at
+            if after > at:
+                self.in_runs += after - at
+                self.missed += [self.clock.missed] * (after - at)
+                at = after
+                continue
+            event = events[at]
+            at += 1
+            if isinstance(event, Measurement):
+                self.samples.append(self.clock.sample(event, t_rx_ns, 7))
+                self.missed.append(self.clock.missed)
+        self.clock.waited_ns = 0
+        self.states.append(self.clock.status())
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (1, 2))])
+@pytest.mark.parametrize("trial", TRIALS, ids=lambda trial: trial.name)
+def test_a_run_gives_the_same_samples_as_single_frames(trial: Trial, seed: int) -> None:
+    random = Random(f"{trial.name} {seed}")
+    device, one, many = Device(trial, random), Dated(trial), Dated(trial)
+    for number in range(ROUNDS):
+        events, t_rx_ns, waited_ns = device.read()
+        own = random.choice((None, 1 << 31))
+        for dated in (one, many):
+            if trial.slewed:
+                dated.host.add_pair(t_rx_ns, int(t_rx_ns * (1 - trial.slewed)))
+            if not number % 50:
+                dated.clock.set_own_status(own)
+            dated.take(events, t_rx_ns, waited_ns, runs=dated is many)
+    assert (many.samples, many.missed, many.states) == (one.samples, one.missed, one.states)
+    assert many.unknown == one.unknown
+    if trial.period_ms == int(trial.period_ms):  # otherwise no step equals the period
+        assert many.in_runs > 0.05 * len(many.samples)
+
+
+def test_no_run_without_a_fit_in_use() -> None:
+    for settle in (False, True):
+        trial = Trial("even")
+        device, dated = Device(trial, Random(1)), Dated(trial)
+        for _ in range(ROUNDS * settle):
+            dated.take(*device.read(), runs=True)
+        if settle:
+            assert dated.in_runs
+            assert dated.clock._sources().edge_seq is None  # the clock has aiding sources now
+        before, (events, t_rx_ns, _) = len(dated.samples), device.read()
+        assert dated.clock.add_run(dated.samples, events, 0, t_rx_ns, 0) == 0
+        assert len(dated.samples) == before

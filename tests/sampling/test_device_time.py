@@ -1,4 +1,5 @@
-"""Device time: unwrapped, finer than a tick, even over corrections of the counter; lost samples; numbers."""
+"""Device time: unwrapped, finer than a tick, even over corrections of the counter; lost samples; numbers.
+Ticks from 13-bit values (`pps_age_ms`): wraps, resets by pulses, delayed frames, and frames with device time."""
 
 from collections.abc import Callable
 from itertools import pairwise, product
@@ -11,7 +12,7 @@ from imud.model.sample import Measurement, Sample, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.arrival_fit import ArrivalFit
 from imud.sampling.clock import SampleClock
-from imud.sampling.device_time import DeviceTime, PeriodLearner
+from imud.sampling.device_time import DeviceTime, PeriodLearner, StampTime
 from imud.sim.ports.arrival import BARE_UART, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
 from tests.bench.clock import BAUD_OF_RATE
 from tests.bench.line_model import LineFaults, measured_ns, simulate_reads
@@ -31,22 +32,27 @@ from tests.support.clock_feed import BEGIN_NS, feed, make_clock, rises, steady
 # --- unwrapping -------------------------------------------------------------------------------------------------------
 
 
-def test_it_wraps_any_number_of_times() -> None:
+def test_it_wraps_has_no_sign_and_counts_losses() -> None:
     time = DeviceTime(NS_PER_MS, 1000)
     time.begin(990)
     for i in range(1, 1001):
         time.advance((990 + 10 * i) % 1000)
     assert (time.raw_ns, time.even_ns, time.error_ns) == ((990 + 10_000) * NS_PER_MS, time.raw_ns, 0)
-
-
-def test_a_backward_step_counts_as_a_long_forward_step() -> None:
-    """The caller compares it with the host time. Device time has no sign."""
+    # The caller compares it with the host time. Device time has no sign.
     time = DeviceTime(NS_PER_MS, 1 << 32)
     time.begin(5000)
     assert time.elapsed_ns(4990) == ((1 << 32) - 10) * NS_PER_MS
+    time = DeviceTime(NS_PER_MS, 1 << 32)
+    time.begin(0)
+    for i in range(1, 11):
+        time.advance(10 * i)
+    time.advance(130)
+    assert time.missed == 2
+    time.begin(0)
+    assert time.missed == 0
 
 
-def test_an_uneven_rate_becomes_even() -> None:
+def test_uneven_and_repeated_ticks_become_even() -> None:
     """400 Hz in milliseconds: the counter steps 2, 3, 2, 3, the samples 2.5."""
     time = DeviceTime(NS_PER_MS, 1 << 32)
     time.begin(0)
@@ -58,10 +64,7 @@ def test_an_uneven_rate_becomes_even() -> None:
     steps = [b - a for a, b in pairwise(even[1000:])]
     assert max(abs(step - 2_500_000) for step in steps) < 2_000
     assert 0 < time.error_ns < 50_000
-
-
-def test_two_samples_in_one_tick_are_distinguished() -> None:
-    """1 kHz in milliseconds, 100 ppm fast: after 5 s, a counter value occurs twice."""
+    # 1 kHz in milliseconds, 100 ppm fast: after 5 s, a counter value occurs twice.
     time = DeviceTime(NS_PER_MS, 1 << 32)
     time.begin(0)
     even = []
@@ -69,17 +72,6 @@ def test_two_samples_in_one_tick_are_distinguished() -> None:
         time.advance(int(i * 0.9999 + 0.5))
         even.append(time.even_ns)
     assert all(abs(b - a - NS_PER_MS) < 1000 for a, b in pairwise(even[100:]))
-
-
-def test_a_loss_is_counted_with_the_step() -> None:
-    time = DeviceTime(NS_PER_MS, 1 << 32)
-    time.begin(0)
-    for i in range(1, 11):
-        time.advance(10 * i)
-    time.advance(130)
-    assert time.missed == 2
-    time.begin(0)
-    assert time.missed == 0
 
 
 # --- the period and missing samples -----------------------------------------------------------------------------------
@@ -128,7 +120,7 @@ def test_gaps_from_before_a_period_is_known_are_noted_when_it_is(steps: list[int
     assert len(noted) == gaps
 
 
-def test_a_step_to_another_counter_is_reported_by_the_caller_of_restart() -> None:
+def test_steps_to_another_counter_and_steps_that_never_agree() -> None:
     noted: list[int] = []
     learner = PeriodLearner(lambda: noted.append(1))
     learner.add_step(1 << 31)
@@ -137,9 +129,6 @@ def test_a_step_to_another_counter_is_reported_by_the_caller_of_restart() -> Non
         learner.add_step(100)
     assert learner.period_ticks == 100
     assert not noted
-
-
-def test_steps_that_never_agree_are_kept_in_bounds() -> None:
     learner = PeriodLearner()
     random = Random(7)
     for _ in range(1000):
@@ -166,7 +155,7 @@ def test_uneven_and_equal_ticks_cause_no_loss() -> None:
     assert 0 < learner.changes < 5
 
 
-def test_losses_do_not_blur_an_uneven_rate() -> None:
+def test_random_losses_neither_blur_an_uneven_rate_nor_make_a_slower_one() -> None:
     """The mean without the lost steps is wrong by a thousandth. The device time would move through its tick."""
     random = Random(3)
     learner = PeriodLearner()
@@ -179,9 +168,6 @@ def test_losses_do_not_blur_an_uneven_rate() -> None:
         learner.add_step(ticks - before)
         found.append(learner.period_ticks)
     assert all(abs(period - 2.5) < 5e-4 for period in found[5000:])
-
-
-def test_random_losses_are_not_a_slower_rate() -> None:
     random = Random(1)
     learner = PeriodLearner()
     for _ in range(20_000):
@@ -321,32 +307,15 @@ def stamps(*steps: int) -> tuple[DeviceTime, list[int]]:
     return time, [x - found[0] for x in found[1:]]
 
 
-def test_two_small_corrections_cause_no_step() -> None:
+def test_two_small_corrections_cause_no_step_and_uneven_samples_are_followed() -> None:
     """The correction uses the rest of the tick. The next normal step finds no rest."""
     time, found = stamps(9, *[10] * 70, 9, 10)
     assert max(abs(b - a - 10 * NS_PER_MS) for a, b in pairwise([0, *found])) < 0.05 * NS_PER_MS
     assert time.doubt_ns > NS_PER_MS // 3
-
-
-def test_samples_that_are_uneven_are_followed() -> None:
-    """A device whose counter values change all the time: its samples are at these values, within a tick."""
+    # A device whose counter values change all the time: its samples are at these values, within a tick.
     time, found = stamps(*[11, 11, 11, 9, 9, 9] * 10)
     assert abs(found[-1] - 600 * NS_PER_MS) <= 2 * NS_PER_MS
     assert not time.uneven
-
-
-def test_a_pause_is_not_a_correction() -> None:
-    """The device paused once for 13 ms, and its frame arrived in time."""
-    clock = make_clock()
-    points = steady(0, 0, 1000) + steady(9_993 + 10, 10_003, 500)
-    samples = feed(clock, points)
-    assert (
-        max(
-            abs(s.t_ns - BEGIN_NS - int(ms * NS_PER_MS) - NS_PER_MS)
-            for s, (_, ms) in zip(samples[500:], points[500:], strict=True)
-        )
-        < NS_PER_MS
-    )
 
 
 @pytest.mark.parametrize("set_ms", [-2_000, 2_000])
@@ -369,6 +338,17 @@ def test_a_correction_needs_an_arrival_that_confirms_it() -> None:
     assert first.t_err_ns > 10 * NS_PER_MS
     assert second.t_err_ns < NS_PER_MS
     assert abs(first.t_ns - last.t_ns - 10 * NS_PER_MS) < NS_PER_MS // 100
+    # The device paused once for 13 ms, and its frame arrived in time.
+    clock = make_clock()
+    points = steady(0, 0, 1000) + steady(9_993 + 10, 10_003, 500)
+    samples = feed(clock, points)
+    assert (
+        max(
+            abs(s.t_ns - BEGIN_NS - int(ms * NS_PER_MS) - NS_PER_MS)
+            for s, (_, ms) in zip(samples[500:], points[500:], strict=True)
+        )
+        < NS_PER_MS
+    )
 
 
 @pytest.mark.parametrize(("seconds", "seen"), [(4, False), (6, True)])
@@ -465,3 +445,114 @@ def test_a_change_of_rate_is_noticed_within_twelve_samples(steps: list[int], is_
     assert learner.is_new is is_new
     if is_new or steps[-1] == 1:
         assert learner.period_ticks == pytest.approx(sum(steps[-12:]) / 12, abs=0.1)
+
+
+MODULUS = 8192
+
+
+def ticks_of(stamps: list[int], step_ms: int = 10) -> list[int | None]:
+    """Return the ticks of values with a step of `step_ms`."""
+    time, known = StampTime(MODULUS), None
+    found = []
+    for i, stamp in enumerate(stamps):
+        ticks = time.ticks(stamp, BEGIN_NS + i * step_ms * NS_PER_MS, known)
+        known = ticks if ticks is not None else known
+        found.append(ticks)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("stamps", "ticks"),
+    [
+        ([8170, 8180, 8190, 8, 18], [8180, 8190, 8200, 8210]),  # the wrap of a real device at 100 Hz, recorded
+        # a pulse per second does not look like a loss of seven seconds
+        ([950, 960, 970, 980, 990, 2, 12, 22, 32], [960, 970, 980, 990, 1002, 1012, 1022, 1032]),
+        ([0] * 50, [None] * 49),  # frames that answer triggers contain no time
+        ([4711] * 50, [None] * 49),
+    ],
+)
+def test_ticks_of_stamps(stamps: list[int], ticks: list[int | None]) -> None:
+    assert ticks_of(stamps) == [None, *ticks]
+
+
+def test_pulses_that_stay_away_and_come_again_and_triggers() -> None:
+    """After the last pulse, the value increases until its wrap. Then a pulse resets it again."""
+    truth = list(range(500, 30_000, 10))
+    stamps = [t % 1000 if t < 3000 or t >= 20_000 else (t - 2000) % MODULUS for t in truth]
+    assert ticks_of(stamps)[1:] == truth[1:]
+    found = ticks_of([*range(0, 500, 10), *[0] * 20])
+    assert found[49] == 490
+    assert found[-12:] == [None] * 12
+
+
+def test_losses_within_a_turn_and_missed_turns() -> None:
+    """Frames of 4 s are lost, and the frames around the gap arrive together: only the value shows the loss."""
+    time = StampTime(MODULUS)
+    known: int | None = None
+    for i in range(100):
+        known = time.ticks(10 * i, BEGIN_NS + 10 * i * NS_PER_MS, known)
+    late_ns = BEGIN_NS + 5_000 * NS_PER_MS
+    assert time.ticks(1000, late_ns, known) == 1000
+    assert time.ticks(5000, late_ns, 1000) == 5000
+    # 20 s are lost. The value shows 20000 - 2 · 8192 = 3616 ms of them.
+    time = StampTime(MODULUS)
+    known = None
+    truth = [*range(0, 3000, 10), *range(23_000, 25_000, 10)]
+    found = []
+    for ms in truth:
+        ticks = time.ticks(ms % MODULUS, BEGIN_NS + ms * NS_PER_MS, known)
+        known = ticks if ticks is not None else known
+        found.append(ticks)
+    assert (found[1:300], found[300], found[-100:]) == (truth[1:300], 23_000 - 2 * MODULUS, truth[-100:])
+    assert sum(b - a > 10 for a, b in pairwise(found[1:]) if a is not None and b is not None) == 2
+
+
+def test_messages_that_carry_time_are_preferred() -> None:
+    time = StampTime(MODULUS)
+    for i in range(200):
+        ms = 10 * i
+        assert time.ticks(ms % MODULUS, BEGIN_NS + ms * NS_PER_MS, 77_000 + ms) is None
+    later_ns = BEGIN_NS + 1990 * NS_PER_MS + NS_PER_S
+    assert time.ticks(4000, later_ns, 78_990) is None
+    assert time.ticks(4010, later_ns + 10 * NS_PER_MS, 78_990) == 78_990 + 1010
+
+
+def hi92(stamp: int) -> Measurement:
+    """Return an HI92 frame with only `pps_age_ms`."""
+    return Measurement(54, 0, None, pps_age_ms=stamp)
+
+
+def stamp_clock(unknown: list[int]) -> SampleClock:
+    """Return the clock of a device that sends HI91 or HI92 at 115200 baud."""
+    return SampleClock(
+        "bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=86_806, hold_ns=0, stamp_modulus=MODULUS,
+        on_unknown_gap=lambda: unknown.append(1),
+    )  # fmt: skip
+
+
+def test_samples_are_time_stamped_by_the_fit_of_their_values() -> None:
+    """Every third arrival is 4 ms late. The fit does not follow them."""
+    unknown: list[int] = []
+    clock, truth_ns, errors = stamp_clock(unknown), BEGIN_NS, []
+    for i in range(3000):
+        truth_ns += 10 * NS_PER_MS
+        late_ns = 54 * 86_806 + (4 * NS_PER_MS if i % 3 == 2 else 0)
+        sample = clock.sample(hi92(10 * i % MODULUS), truth_ns + late_ns, 0)
+        errors.append(abs(sample.t_ns - truth_ns))
+        assert clock.missed == 0
+    assert sample.sync is Sync.REGRESSION
+    assert max(errors[500:]) < NS_PER_MS
+    assert not unknown
+    assert clock.status().resets == 0
+
+
+def test_a_module_changed_from_hi91_to_hi92_and_back_goes_on() -> None:
+    unknown: list[int] = []
+    clock, samples = stamp_clock(unknown), []
+    for i in range(3000):
+        m = hi92(10 * i % MODULUS) if 1000 <= i < 2000 else Measurement(82, 0, 500_000 + 10 * i)
+        samples.append(clock.sample(m, BEGIN_NS + 10 * i * NS_PER_MS + 8_000_000, 0))
+        assert clock.missed == 0
+    assert all(a.t_ns < b.t_ns for a, b in pairwise(samples))
+    assert [samples[i].sync for i in (900, 1900, 2900)] == [Sync.REGRESSION] * 3
+    assert not unknown

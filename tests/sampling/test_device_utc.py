@@ -50,16 +50,13 @@ def test_the_old_rate_of_the_crystal_is_forgotten_after_the_jump(ppm: float) -> 
     assert max(t.sample.t_err_ns for t in line_runs.after(dated, 9)) < 5 * NS_PER_MS
 
 
-def test_a_turn_before_anything_is_known_gives_the_time_itself() -> None:
+def test_a_turn_before_anything_is_known_and_a_slow_drift_through_the_milliseconds() -> None:
     dated, clock = line_runs.run_utc(model(USB_16MS), 20, turn_ms=UNIX, turn_at=0.02)
     assert clock.status().resets == 0
     assert line_runs.syncs(dated[40:]) == {Sync.UTC}
     assert max(abs(t.off_ns) for t in dated[40:]) < 2 * NS_PER_MS
     assert line_runs.share_honest(dated) >= 0.95
-
-
-def test_samples_that_hardly_drift_through_the_milliseconds_of_utc() -> None:
-    """Device time and UTC are each accurate within a tick, and both can stay at their limits for seconds."""
+    # Device time and UTC are each accurate within a tick, and both can stay at their limits for seconds.
     dated, _ = line_runs.run_utc(model(USB_16MS_PACKET, 200, -50.0, 2002), 15, turn_ms=UNIX, turn_at=0.06)
     assert line_runs.share_honest(dated) >= 0.95
 
@@ -101,20 +98,14 @@ def utc_clock(not_utc: int = 0) -> SampleClock:
     return clock
 
 
-def test_the_status_bit_is_respected() -> None:
+def test_utc_ends_with_the_status_bit_a_drift_or_a_missing_reference() -> None:
     clock = utc_clock(0x800)
     assert Sync.UTC not in on_utc(clock, 500, 0x800, 0.0)
     assert on_utc(clock, 500, 0, 0.0, 500)[-1] is Sync.UTC
     assert on_utc(clock, 10, 0x800, 0.0, 1000)[0] is Sync.REGRESSION
-
-
-def test_a_drifting_utc_is_dropped() -> None:
     clock = utc_clock()
     assert on_utc(clock, 1000, None, 0.0)[-1] is Sync.UTC
     assert on_utc(clock, 3000, None, 0.01, 1000)[-1] is Sync.REGRESSION  # 30 ms
-
-
-def test_a_missing_reference_causes_no_step() -> None:
     clock = utc_clock()
     on_utc(clock, 1000, None, 0.0)
     before = clock.status()
@@ -135,14 +126,11 @@ def test_a_pulse_per_second_is_better_than_a_slow_adapter(rate_hz: int, ppm: flo
     assert Sync.EDGE in line_runs.syncs(settled)
 
 
-def test_a_young_fit_does_not_mislead_the_pulse() -> None:
+def test_a_young_fit_and_a_lost_pulse_cause_no_step() -> None:
     """A slope error of 0.1 % is one millisecond at an age of one second. The intervals must contain it."""
     dated = line_runs.run_pps(model(LOADED, 1000, 50.0, 1007), 4)
     assert line_runs.share_honest(dated) >= 0.95
     assert all(abs(t.off_ns) < 3 * t.sample.t_err_ns for t in dated)
-
-
-def test_losing_and_regaining_the_pulse_makes_no_step() -> None:
     dated = line_runs.run_pps(model(USB_16MS_PACKET, 50, 50.0), 90, silent_s=range(40, 60))
     assert {dated[1950].sample.sync, dated[-1].sample.sync} == {Sync.EDGE}
     assert dated[2500].sample.sync is Sync.REGRESSION
@@ -187,16 +175,13 @@ def test_a_drift_through_the_milliseconds_narrows(ppm: float, most_ns: int) -> N
         assert error == pytest.approx(289_000, rel=0.2)
 
 
-def test_the_estimate_runs_at_the_slope_of_the_intervals() -> None:
+def test_the_estimate_runs_at_the_slope_of_the_intervals_and_a_better_fit_within_them() -> None:
     intervals = IntervalFit()
     for x in range(0, 20 * NS_PER_S + 1, NS_PER_S // 10):
         low = int(x * (1 + 50e-6))
         intervals.add_interval(x, low, low + MS, FAR, 1.0)  # 50 ppm in addition to the given slope
     at, fits = 60 * NS_PER_S, int(60 * NS_PER_S * (1 + 50e-6)) + MS // 2
     assert abs(intervals.combined(at, fits, 1e12, 0.0)[0]) < 300_000
-
-
-def test_a_better_fit_stays_within() -> None:
     intervals, x = filled(0.0)
     assert abs(intervals.combined(x, x + 50_000, 1000.0, 0.0)[0]) < 100
     fix, error = intervals.combined(x, x + 5 * MS, 1000.0, 0.0)
@@ -229,7 +214,7 @@ def test_the_width_grows_with_time_and_arrivals_bound_it() -> None:
     assert intervals.width_ns(4 * NS_PER_S) < 200_000
 
 
-def test_contradictions_drop_old_intervals() -> None:
+def test_contradictions_drop_old_intervals_or_are_covered() -> None:
     intervals, x = filled(0.0)
     for i in range(1, 200):
         intervals.add_interval(
@@ -238,10 +223,7 @@ def test_contradictions_drop_old_intervals() -> None:
     assert intervals.known
     at = x + 199 * NS_PER_S // 10
     assert intervals.combined(at, at, 1e9, 0.0)[0] == pytest.approx(20.5 * MS, abs=0.6 * MS)
-
-
-def test_a_fit_that_contradicts_narrow_intervals_is_covered() -> None:
-    """A device without pulses drifts away and reports UTC: its milliseconds only agree with each other."""
+    # A device without pulses drifts away and reports UTC: its milliseconds only agree with each other.
     intervals, x = IntervalFit(), 0
     for _ in range(1000):
         x += 10_037_000

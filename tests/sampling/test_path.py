@@ -1,4 +1,5 @@
-"""The three paths with scripted codecs: batches, losses, faults, gaps, and the reports to an observer."""
+"""The three paths with scripted codecs: batches, losses, faults, gaps, and the reports to an observer.
+Edge of a read, by time stamps only."""
 
 from collections.abc import Callable, Sequence
 from math import sqrt
@@ -234,7 +235,7 @@ def since(t_first_ns: int) -> Measurement:
     return msgspec.structs.replace(VALUES, t_first_ns=t_first_ns)
 
 
-def test_a_sample_was_measured_before_its_first_frame() -> None:
+def test_samples_of_can_frames_start_before_the_first_frame_and_end_at_a_loss() -> None:
     """Three frames at 0, 1 and 2 ms, 0.2 ms each on the wire: the first one started at -0.2 ms."""
     rig = PathRig("imu61x-can")
     path, now = rig.can(), rig.now
@@ -253,9 +254,6 @@ def test_a_sample_was_measured_before_its_first_frame() -> None:
     assert [sample.t_rx_ns - now for sample in samples] == [13 * MS, 14 * MS]
     assert [sample.t_ns - now for sample in samples] == [at * MS - 200_000 - WAKE_NS for at in (10, 13)]
     assert rig.noted.named() == [("call", "path", "set_frame_time"), ("frames",), ("frames",)]
-
-
-def test_lost_frames_and_a_closed_link_end_a_sample_and_an_idle_bus_publishes_it() -> None:
     rig = PathRig("imu61x-can")
     path, now, clock_reads = rig.can(), rig.now, list[int]()
     rig.context.host.on_measured = lambda *_: clock_reads.append(1)
@@ -325,7 +323,7 @@ def test_the_error_of_a_read_covers_the_age_of_its_registers(update_ms: int, err
     assert [sample.t_err_ns for sample in samples] == [sigma_ns(error_ms) for error_ms in errors_ms]
 
 
-def test_readings_of_one_turn_are_one_batch_and_end_at_a_vanished_device() -> None:
+def test_readings_of_one_turn_are_one_batch_and_end_at_an_error_or_a_vanished_device() -> None:
     rig = PathRig("imu61x-i2c")
     path = rig.polled()
     path.observe(rig.noted)
@@ -339,6 +337,14 @@ def test_readings_of_one_turn_are_one_batch_and_end_at_a_vanished_device() -> No
     path.skip(readings[0])
     assert (rig.ledger.bytes_in, rig.ledger.bytes_skipped) == (16, 16)
     assert rig.noted.reports[-2:] == [("readings", [*readings, gone, *later]), ("call", "path", "skip", 8)]
+    rig = PathRig("imu61x-i2c")
+    path = rig.polled()
+    missing = rig.reading(0, [], TransferError(Trouble.ABSENT, "no reply"))
+    assert path.on_readings([missing]) == "no reply"
+    rig.codec.silence = [Vanished("silent")]
+    assert path.on_readings([missing]) == "silent"
+    path.on_readings([rig.reading(10, [VALUES])])
+    assert rig.batches[0][0].t_err_ns == sigma_ns(11)  # the age counts from the period, because the last read failed
 
 
 @pytest.mark.parametrize(
@@ -374,17 +380,6 @@ def test_three_faults_in_a_row_identify_the_device_again(kind: str) -> None:
     assert rig.ledger.lost() == 6  # the sample of this frame follows
 
 
-def test_another_error_ends_the_reads_and_so_does_a_codec_without_replies() -> None:
-    rig = PathRig("imu61x-i2c")
-    path = rig.polled()
-    missing = rig.reading(0, [], TransferError(Trouble.ABSENT, "no reply"))
-    assert path.on_readings([missing]) == "no reply"
-    rig.codec.silence = [Vanished("silent")]
-    assert path.on_readings([missing]) == "silent"
-    path.on_readings([rig.reading(10, [VALUES])])
-    assert rig.batches[0][0].t_err_ns == sigma_ns(11)  # the age counts from the period, because the last read failed
-
-
 @pytest.mark.parametrize(("pause_ms", "gaps"), [(14, 0), (15, 1)])
 def test_a_long_pause_before_an_identified_device_is_an_unknown_gap(pause_ms: int, gaps: int) -> None:
     """One and a half periods of 10 ms, only for the first read after the identification."""
@@ -417,3 +412,88 @@ def test_edges_of_a_data_ready_line_time_stamp_the_reads() -> None:
     assert rig.noted.named()[-3:] == [("call", "edges", "restart"), ("edges",), ("readings",)]
     path.observe(None)
     assert edges.observer is None
+
+
+KEPT = 1024
+
+EXACT = ReadyOptions(line="Y", bias_us=0)
+
+
+def edge(number: int, t_ns: int | None = None) -> Edge:
+    """Return an edge at number · 1 ms by default."""
+    return Edge(number * MS if t_ns is None else t_ns, True, number)
+
+
+def edges(*numbers: int, settings: ReadyOptions = EXACT) -> ReadyEdges:
+    made = ReadyEdges(settings, MS)
+    made.on_edges([edge(number) for number in numbers])
+    return made
+
+
+def read(made: ReadyEdges, start_ms: float, end_ms: float) -> tuple[int, int] | None:
+    """Return the number of the edge and its time, ns."""
+    stamp = made.match(round(start_ms * MS), round(end_ms * MS))
+    return (stamp.number, stamp.t_ns) if stamp is not None else None
+
+
+def test_a_read_is_of_the_newest_edge_before_it_and_others_are_missed_once() -> None:
+    made = edges(1, 2, 3)
+    assert [read(made, at, at + 0.2) for at in (1.1, 2.0, 3.3)] == [(1, MS), (2, 2 * MS), (3, 3 * MS)]
+    assert made.missed == 0
+    made = edges(1, 2, 3, 4)
+    assert read(made, 1.1, 1.2) == (1, MS)
+    assert read(made, 4.2, 4.3) == (4, 4 * MS)
+    assert made.missed == 2
+    made = edges(1, 5)
+    assert read(made, 1.1, 1.2) == (1, MS)
+    assert read(made, 5.1, 5.2) == (5, 5 * MS)
+    assert (made.missed, made.interval_ns) == (3, MS)
+    made = edges(1, 2)
+    assert [read(made, at, at + 0.1) for at in (1.1, 1.5, 2.1)] == [(1, MS), (1, MS), (2, 2 * MS)]
+    assert made.missed == 0
+    made = edges(1, 2, 3, 4)
+    read(made, 1.1, 1.2)
+    made.restart()
+    assert read(made, 4.1, 4.2) == (4, 4 * MS)
+    assert made.missed == 0
+
+
+def test_a_read_without_an_edge_has_no_time_stamp() -> None:
+    made = edges(2, 3)
+    assert read(made, 1.9, 1.95) is None
+    assert read(made, 4.5, 4.6) == (3, 3 * MS)
+    assert read(made, 4.6, 4.7) is None
+    assert read(ReadyEdges(EXACT, MS), 1, 2) is None
+    made = edges(1, 2, 3)
+    assert read(made, 1.1, 1.2) == (1, MS)
+    assert read(made, 400, 401) == (3, 3 * MS)
+    assert read(made, 402, 403) is None
+    made.on_edges([edge(4, 500 * MS)])
+    assert read(made, 1300, 1301) is None
+    made = edges(*range(1, 3 * KEPT))
+    assert read(made, 2 * KEPT - 0.5, 2 * KEPT - 0.4) is None
+    assert read(made, 2 * KEPT + 0.1, 2 * KEPT + 0.2) == (2 * KEPT, 2 * KEPT * MS)
+    assert read(made, 3 * KEPT - 0.9, 3 * KEPT - 0.8) == (3 * KEPT - 1, (3 * KEPT - 1) * MS)
+
+
+def test_the_error_is_that_of_the_stamp_and_of_the_assumption() -> None:
+    plain, assumed = edges(1).match(MS, MS + 1), edges(1, settings=ReadyOptions(line="Y")).match(MS, MS + 1)
+    assert plain is not None
+    assert assumed is not None
+    assert plain.err_ns == pytest.approx(3_000, abs=2)
+    assert assumed.err_ns == pytest.approx(3_000 + 100_000 / sqrt(3), abs=2)
+
+
+@pytest.mark.parametrize(("end_ms", "either"), [(1.999, False), (2.0, True), (2.7, True)])
+def test_new_values_during_a_read_may_be_those_that_were_read(end_ms: float, either: bool) -> None:
+    stamp = edges(1, 2).match(round(1.9 * MS), round(end_ms * MS))
+    assert stamp is not None
+    assert stamp.number == 1
+    assert stamp.err_ns == pytest.approx(MS / sqrt(2) if either else 3_000, abs=10)
+
+
+@pytest.mark.parametrize(("offset_us", "t_ns"), [(-400, 600_000), (50, 1_050_000), (500, 1_100_000)])
+def test_the_offset_moves_the_stamp_but_not_behind_the_read(offset_us: float, t_ns: int) -> None:
+    stamp = edges(1, settings=ReadyOptions(line="Y", offset_us=offset_us)).match(round(1.1 * MS), 2 * MS)
+    assert stamp is not None
+    assert stamp.t_ns == t_ns

@@ -26,8 +26,7 @@ from tests.support.clock_feed import BEGIN_NS, make_clock, message, rises
 def test_the_rate_of_a_slew_is_limited_and_it_ends_at_zero(sign: int, age_ns: int, rate: float) -> None:
     slew = Slew()
     slew.set(sign * 10.0 * NS_PER_S)
-    before = slew.left_ns
-    assert before - slew.advance(10 * NS_PER_MS, age_ns) == pytest.approx(sign * rate * 10 * NS_PER_MS)
+    assert slew.left_ns - slew.advance(10 * NS_PER_MS, age_ns) == pytest.approx(sign * rate * 10 * NS_PER_MS)
     slew.set(sign * 3.0)
     assert slew.advance(NS_PER_S, age_ns) == slew.left_ns == 0.0
 
@@ -142,17 +141,14 @@ def test_device_time_that_creeps_does_not_throw_the_line_off() -> None:
     assert rises(t.sample for t in dated)
 
 
-def test_the_fit_keeps_the_delay_learned_from_edges() -> None:
+def test_a_delay_learned_from_edges_is_kept_or_adds_to_the_error() -> None:
     """Behind this adapter, the fit without edges is 1.5 ms off."""
     m = model(arrival.USB_16MS_PACKET, 100)
     reads = simulate_reads(m.run(3000), 1, LineFaults())
     dated = line_runs.with_sout(line_runs.sout_clock(m), reads, silent=range(len(reads) // 2, len(reads)))
     assert abs(dated[-1].off_ns) < 300_000
     assert dated[-1].sample.sync is Sync.REGRESSION
-
-
-def test_a_delay_learned_by_a_young_fit_adds_to_the_error() -> None:
-    """Pulses for 6 s only: then the fit moves by one millisecond, and the learned delay does not follow."""
+    # Pulses for 6 s only: then the fit moves by one millisecond, and the learned delay does not follow.
     m = model(arrival.USB_16MS, 100, 1048, arrival.Crystal(-50.0))
     reads = simulate_reads(m.run(4500), 1048, LineFaults())
     begin = next(i for i, read in enumerate(reads) if read.arrivals[0].t_ns > m.begin_ns + 6 * NS_PER_S)
@@ -160,7 +156,7 @@ def test_a_delay_learned_by_a_young_fit_adds_to_the_error() -> None:
     assert line_runs.share_honest(dated) >= 0.95
 
 
-def test_a_restarted_device_is_paired_again() -> None:
+def test_a_restarted_device_is_paired_again_and_lost_samples_are_counted() -> None:
     m = model(arrival.USB_1MS, 100)
     dated = line_runs.with_sout(
         clock := line_runs.sout_clock(m),
@@ -171,19 +167,6 @@ def test_a_restarted_device_is_paired_again() -> None:
     assert all(t.sample.edge_seq in (None, t.number) for t in dated)
     assert rises(t.sample for t in dated)
     assert line_runs.share_honest(dated) >= 0.95
-
-
-def test_a_lost_rising_edge_is_counted_back_and_the_offset_of_the_edge_is_configured() -> None:
-    dated = line_runs.after(line_runs.run_sout(model(arrival.BARE_UART), 20, LineFaults(edge_loss=0.2)), 5)
-    unpaired = sum(t.sample.edge_seq is None for t in dated)
-    assert 0 < unpaired < 0.07 * len(dated)  # both edges lost: 4 %
-    assert all(t.sample.edge_seq in (None, t.number) for t in dated)
-    here = line_runs.run_sout(model(arrival.BARE_UART), 10, LineFaults())
-    there = line_runs.run_sout(model(arrival.BARE_UART), 10, LineFaults(), SoutTiming(offset_us=-200.0))
-    assert here[-1].sample.t_ns - there[-1].sample.t_ns == 200_000
-
-
-def test_lost_samples_are_counted() -> None:
     m = model(arrival.BARE_UART)
     reads = simulate_reads(m.run(2000), 1, LineFaults(pulse_loss=0.1, frame_loss=0.05))
     dated = line_runs.with_sout(clock := line_runs.sout_clock(m), reads)
@@ -194,6 +177,16 @@ def test_lost_samples_are_counted() -> None:
     assert 0.03 * seen < status.edges_unpaired < 0.07 * seen
     assert seen - paired - status.edges_unpaired < 100  # events of the first seconds
     assert 0 <= len(dated) - paired - status.samples_unpaired < 100
+
+
+def test_a_lost_rising_edge_is_counted_back_and_the_offset_of_the_edge_is_configured() -> None:
+    dated = line_runs.after(line_runs.run_sout(model(arrival.BARE_UART), 20, LineFaults(edge_loss=0.2)), 5)
+    unpaired = sum(t.sample.edge_seq is None for t in dated)
+    assert 0 < unpaired < 0.07 * len(dated)  # both edges lost: 4 %
+    assert all(t.sample.edge_seq in (None, t.number) for t in dated)
+    here = line_runs.run_sout(model(arrival.BARE_UART), 10, LineFaults())
+    there = line_runs.run_sout(model(arrival.BARE_UART), 10, LineFaults(), SoutTiming(offset_us=-200.0))
+    assert here[-1].sample.t_ns - there[-1].sample.t_ns == 200_000
 
 
 @pytest.mark.parametrize(("every", "bit"), [(5, 0x1000), (1, 0)], ids=["bit", "never set"])

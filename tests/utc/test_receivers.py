@@ -1,11 +1,17 @@
-"""Sources with a receiver: gpsd on a server of the test, and a serial port with a fake link."""
+"""Sources with a receiver: gpsd on a server of the test and a real gpsd, and a serial port with a fake or real link."""
 
 import asyncio
 import json
+import os
+import select
+import shutil
 import socket
+import subprocess
 import time
 import tracemalloc
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from random import Random
 
 import msgspec
@@ -13,14 +19,17 @@ import pytest
 
 from imud.contracts.link import OnData, OnEnd
 from imud.contracts.status import KernelCounters
-from imud.formats.nmea0183 import build
+from imud.formats.nmea0183 import Rmc, build, checksum, parse
 from imud.model.errors import LinkError, LinkMissing
 from imud.model.units import NS_PER_S
 from imud.utc import RMC_SOURCES, receivers
 from imud.utc.system_clock import SystemClockSource
+from tests.support.daemon_process import running_daemon
 from tests.support.documented import check_schema
 from tests.support.event_loops import VirtualClock, in_loop, run_virtually
+from tests.support.pty_port import PtyPort
 from tests.support.rmc_sources import LIMIT_S, Sentences, soon
+from tests.support.surroundings import free_port
 
 SENTENCES = [build((1_795_000_000 + n) * NS_PER_S) for n in range(5)]
 VERSION = b'{"class":"VERSION","release":"3.22","rev":"3.22","proto_major":3,"proto_minor":14}\r\n'
@@ -65,7 +74,7 @@ def test_it_asks_for_nmea_and_gives_rmc_with_its_time() -> None:
         writer.write(VERSION)
         asked.append(await reader.readline())
         writer.write(b'{"class":"WATCH","enable":true,"nmea":true}\r\n' + SENTENCES[0] + b"$GPGGA,,,*00\r\n")
-        writer.write(SENTENCES[1])
+        writer.write(b"x" * 100_000 + b"\n" + SENTENCES[1])  # it skips a line that is too long
         assert await reader.read() == b""
         ended.set()
 
@@ -156,19 +165,6 @@ def test_a_server_that_does_not_answer_is_retried_after_5_s(monkeypatch: pytest.
     run_virtually(clock, scene())
     assert paused_s == [pytest.approx(5, abs=0.1)]
     assert source.problem == "cannot connect to gpsd at 127.0.0.1:2947: no answer; is gpsd running?"
-
-
-def test_a_line_that_is_too_long_is_skipped() -> None:
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        await reader.readline()
-        writer.write(b"x" * 100_000 + b"\n" + SENTENCES[0])
-        await reader.read()
-
-    async def scene(source: receivers.GpsdSource, sentences: Sentences) -> None:
-        await sentences.until(lambda: bool(sentences.got))
-        assert source.problem == ""
-
-    assert play(serve, scene).data == SENTENCES[:1]
 
 
 # --- a serial port ----------------------------------------------------------------------------------------------------
@@ -299,8 +295,7 @@ JSON = b'{"class":"TPV","device":"/dev/ttyS0","mode":3}\r\n'
 def test_any_split_gives_the_same(size: int) -> None:
     data = JSON + b"".join(sentence + GGA for sentence in SENTENCES)
     splitter = receivers.SentenceSplitter()
-    found = [s for at in range(0, len(data), size) for s in splitter.feed(data[at : at + size])]
-    assert found == SENTENCES
+    assert [s for at in range(0, len(data), size) for s in splitter.feed(data[at : at + size])] == SENTENCES
 
 
 def test_broken_and_too_long_sentences_and_lines_are_skipped() -> None:
@@ -338,3 +333,97 @@ async def test_pauses() -> None:
     retry.reset()
     await retry.pause()
     assert pauses == [0.5, 1, 2, 4, 8, 16, 30, 30, 30, 30, 0.5]
+
+
+WANTED = 3
+UTC_S = 1_795_000_000
+NO_GPSD = "" if shutil.which("gpsd") else "gpsd is not installed (Debian package gpsd)"
+
+
+class Receiver(PtyPort):
+    """A GNSS receiver with a fix, on a pty. It sends one cycle of sentences after the other."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        os.chmod(self.path, 0o666)  # gpsd drops its privileges
+        self.second = UTC_S
+
+    def cycle(self) -> None:
+        rmc = build(self.second * NS_PER_S)
+        time = rmc.split(b",")[1].decode()
+        gga = f"GPGGA,{time},0000.000,N,00000.000,E,1,08,0.9,12.0,M,0.0,M,,"
+        gsa = "GPGSA,A,3,01,02,03,04,05,06,07,08,,,,,1.6,0.9,1.3"
+        rest = "".join(f"${body}*{checksum(body.encode()):02X}\r\n" for body in (gga, gsa))
+        self.received()  # no reply to the requests of gpsd
+        self.send(rmc + rest.encode())
+        self.second += 1
+
+
+@contextmanager
+def gpsd(port: int, device: str, folder: Path) -> Iterator[None]:
+    with (folder / "gpsd.log").open("w") as log:
+        command = ["gpsd", "-N", "-n", "-b", "-D", "2", "-S", str(port), device]
+        process = subprocess.Popen(command, stdout=log, stderr=log)
+        try:
+            yield
+        finally:
+            process.terminate()
+            process.wait(timeout=LIMIT_S)
+            print((folder / "gpsd.log").read_text())
+
+
+@pytest.fixture
+def receiver() -> Iterator[Receiver]:
+    made = Receiver()
+    yield made
+    made.unplug()
+
+
+class FarEnd(PtyPort):
+    """The far end of a serial port, with a device that only receives."""
+
+    text = b""
+
+    def lines(self, wait_s: float) -> list[bytes]:
+        select.select([self.master], [], [], wait_s)
+        *whole, self.text = (self.text + self.received()).split(b"\n")
+        return [line + b"\n" for line in whole]
+
+
+@pytest.fixture
+def port() -> Iterator[FarEnd]:
+    made = FarEnd()
+    yield made
+    made.unplug()
+
+
+@pytest.mark.live
+@pytest.mark.skipif(bool(NO_GPSD), reason=NO_GPSD)
+def test_a_device_gets_the_sentences_of_gpsd(receiver: Receiver, port: FarEnd, tmp_path: Path) -> None:
+    tcp_port = free_port()
+    device = {
+        "driver": "hipnuc-uart", "identify": False, "uart": {"port": port.path, "baud": 115200},
+        "rmc": {"source": "gpsd", "tcp_port": tcp_port},
+    }  # fmt: skip
+    fed: list[Rmc] = []
+    with gpsd(tcp_port, receiver.path, tmp_path), running_daemon(tmp_path, {"bow": device}) as daemon:
+        receiver.second = 0
+        end = time.monotonic() + LIMIT_S
+        while len(fed) < WANTED:
+            assert time.monotonic() < end, daemon.statuses()["bow"].utc
+            now_s = time.time()
+            if int(now_s) > receiver.second and now_s % 1 < 0.5:  # a receiver sends each sentence early in its second
+                receiver.second = int(now_s)
+                receiver.cycle()
+                receiver.second -= 1
+            for line in port.lines(0.1):
+                assert line.startswith(b"$GPRMC,")
+                rmc = parse(line)
+                assert isinstance(rmc, Rmc)
+                assert rmc.unix_s <= time.time()
+                fed.append(rmc)
+        utc = daemon.statuses()["bow"].utc
+    assert all(rmc.valid and rmc.fraction_ns == 0 for rmc in fed)
+    assert utc is not None
+    assert (utc.source, utc.problem) == (f"gpsd at 127.0.0.1:{tcp_port}", "")
+    assert utc.sentences >= utc.sent >= WANTED
