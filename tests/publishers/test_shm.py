@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from random import Random
 from typing import Any, Self
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -53,17 +54,29 @@ def test_invalid_options_are_reported(values: dict[str, object], message: str) -
         msgspec.convert(values, ShmOptions)
 
 
-def test_file_of_a_new_ring(board: Board) -> None:
+def test_the_file_of_a_ring_and_its_slots(board: Board) -> None:
     header = layout.decode_header(board.path.read_bytes()[: layout.HEADER_BYTES], "x")
     assert header == layout.RingHeader(77, os.getpid(), layout.STATE_LIVE, DEVICE, 3, SLOTS, 0, 1, START_NS)
     status = board.path.stat()
     assert status.st_size == layout.HEADER_BYTES + SLOTS * SLOT_BYTES
     assert status.st_blocks * 512 >= status.st_size  # st_blocks counts units of 512 bytes: all blocks are allocated
+    board.publish([1, 2])
+    board.publish([3])
+    assert (board.word("newest_seq"), board.word("first_seq")) == (3, 1)
+    board.publish(range(4, SLOTS + 3))
+    raw = board.path.read_bytes()
+    for seq in range(3, SLOTS + 3):
+        assert raw[slot_at(seq) :][:SLOT_BYTES] == encode_slot(make_sample(seq), 3)
+    assert len(raw) == layout.HEADER_BYTES + SLOTS * SLOT_BYTES
+    board.publish([507, 508])  # the gap moves the first number
+    assert (board.word("first_seq"), board.word("newest_seq")) == (507, 508)
 
 
 def test_ring_is_complete_before_it_appears(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[tuple[bool, layout.RingHeader, int]] = []
     rename = os.rename
+    for name in (f".imud.{DEVICE}.new", ".imud.x", "x.new"):  # the first is a file of a dead daemon
+        (tmp_path / name).write_bytes(b"half")
 
     def spy(source: str, target: str, **directories: int) -> None:
         file = tmp_path / source
@@ -75,22 +88,10 @@ def test_ring_is_complete_before_it_appears(tmp_path: Path, monkeypatch: pytest.
 
     monkeypatch.setattr(os, "rename", spy)
     board = Board(tmp_path)
-    board.publisher.close()
     [(existed, header, mode)] = seen
     assert (existed, header.device, header.state, mode) == (False, DEVICE, layout.STATE_LIVE, 0o640)
-
-
-def test_slots_are_at_the_position_of_their_number_and_the_ring_wraps(board: Board) -> None:
-    board.publish([1, 2])
-    board.publish([3])
-    assert (board.word("newest_seq"), board.word("first_seq")) == (3, 1)
-    board.publish(range(4, SLOTS + 3))
-    raw = board.path.read_bytes()
-    for seq in range(3, SLOTS + 3):
-        assert raw[slot_at(seq) :][:SLOT_BYTES] == encode_slot(make_sample(seq), 3)
-    assert len(raw) == layout.HEADER_BYTES + SLOTS * SLOT_BYTES
-    board.publish([507, 508])  # the gap moves the first number
-    assert (board.word("first_seq"), board.word("newest_seq")) == (507, 508)
+    assert {file.name for file in tmp_path.iterdir()} == {f"imud.{DEVICE}", ".imud.x", "x.new"}
+    board.publisher.close()
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -243,9 +244,7 @@ def test_close_marks_the_ring_and_removes_the_file(board: Board) -> None:
     assert block.ledger == {"bytes_in": 9}
     assert not list(board.path.parent.iterdir())
     board.publisher.close()
-
-
-def test_close_leaves_the_ring_of_a_successor(board: Board) -> None:
+    board = Board(board.path.parent)
     successor = board.path.with_name("other")
     successor.write_bytes(b"new")
     successor.rename(board.path)
@@ -266,14 +265,6 @@ def test_events_and_unknown_devices_are_ignored(board: Board) -> None:
     board.tick()
     assert not board.path.exists()
     board.publisher.remove_device(DEVICE)
-
-
-def test_temporary_files_of_a_dead_daemon_are_removed(tmp_path: Path) -> None:
-    for name in (f".imud.{DEVICE}.new", ".imud.x", "x.new"):
-        (tmp_path / name).write_bytes(b"half")
-    board = Board(tmp_path)
-    assert {file.name for file in tmp_path.iterdir()} == {f"imud.{DEVICE}", ".imud.x", "x.new"}
-    board.publisher.close()
 
 
 def other_writer(path: Path, pid: int, *, heartbeat_ns: int = START_NS - 1, state: int = layout.STATE_LIVE) -> None:
@@ -406,7 +397,14 @@ def test_full_memory_delays_the_ring(
     assert not board.context.outputs.without_ring
 
 
-def test_missing_or_read_only_directory_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paths_that_cannot_be_used_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    publisher = make(Path("/proc"))
+    publisher.add_device(DEVICE, 0)
+    assert "check the permissions of /proc" in caplog.text
+    publisher.publish(Batch(DEVICE, 0, [make_sample(1)]))
+    publisher.close()
     with pytest.raises(ServerError, match="expected a directory for shared memory"):
         make(tmp_path / "none" / "shm").start()
     assert not (tmp_path / "none").exists()
@@ -419,18 +417,6 @@ def test_missing_or_read_only_directory_is_reported(tmp_path: Path, monkeypatch:
         make(tmp_path).start()
 
 
-def test_file_that_cannot_be_created_is_reported(caplog: pytest.LogCaptureFixture) -> None:
-    publisher = make(Path("/proc"))
-    publisher.add_device(DEVICE, 0)
-    assert "check the permissions of /proc" in caplog.text
-    publisher.publish(Batch(DEVICE, 0, [make_sample(1)]))
-    publisher.close()
-
-
-def refuse_group(*_: object) -> None:
-    raise PermissionError(errno.EPERM, "Operation not permitted")
-
-
 @pytest.mark.parametrize("exists", [False, True])
 def test_group_that_does_not_exist_or_cannot_be_given(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, exists: bool
@@ -439,7 +425,7 @@ def test_group_that_does_not_exist_or_cannot_be_given(
     if exists:
         group = next(one.gr_name for one in grp.getgrall() if one.gr_gid != os.getegid())
         why = f"does not contain user {os.geteuid()}, so imud cannot give it files;"
-        monkeypatch.setattr(os, "fchown", refuse_group)
+        monkeypatch.setattr(os, "fchown", Mock(side_effect=PermissionError(errno.EPERM, "Operation not permitted")))
     publisher = make(tmp_path, group=group)
     with caplog.at_level(logging.WARNING):
         publisher.start()

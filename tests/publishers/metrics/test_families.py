@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from itertools import chain
 
 import msgspec
 import pytest
@@ -68,31 +69,24 @@ DEVICES = (
 )  # fmt: skip
 
 LEDGER_LINES = {
-    "bytes_in": ("imud_bytes_in_total", {}),
-    "bytes_in_good_frames": ("imud_bytes_total", {"fate": "good_frames"}),
+    "bytes_in": ("imud_bytes_in_total", {}), "bytes_in_good_frames": ("imud_bytes_total", {"fate": "good_frames"}),
     "bytes_in_bad_frames": ("imud_bytes_total", {"fate": "bad_frames"}),
-    "bytes_skipped": ("imud_bytes_total", {"fate": "skipped"}),
-    "bytes_pending": ("imud_bytes_pending", {}),
-    "frames_good": ("imud_frames_good_total", {}),
-    "frames_in_samples": ("imud_frames_total", {"fate": "samples"}),
+    "bytes_skipped": ("imud_bytes_total", {"fate": "skipped"}), "bytes_pending": ("imud_bytes_pending", {}),
+    "frames_good": ("imud_frames_good_total", {}), "frames_in_samples": ("imud_frames_total", {"fate": "samples"}),
     "frames_in_replies": ("imud_frames_total", {"fate": "replies"}),
-    "frames_ignored": ("imud_frames_total", {"fate": "ignored"}),
-    "frames_pending": ("imud_frames_pending", {}),
+    "frames_ignored": ("imud_frames_total", {"fate": "ignored"}), "frames_pending": ("imud_frames_pending", {}),
     "frames_bad_crc": ("imud_frames_bad_total", {"reason": "crc"}),
     "frames_bad_length": ("imud_frames_bad_total", {"reason": "length"}),
     "frames_bad_content": ("imud_frames_bad_total", {"reason": "content"}),
     "frames_not_finite": ("imud_frames_bad_total", {"reason": "not_finite"}),
-    "frames_lost": ("imud_frames_lost_total", {}),
-    "unknown_tags": ("imud_unknown_tags_total", {}),
-    "samples": ("imud_samples_total", {}),
-    "lost_gap_device": ("imud_samples_lost_total", {"cause": "gap_device"}),
+    "frames_lost": ("imud_frames_lost_total", {}), "unknown_tags": ("imud_unknown_tags_total", {}),
+    "samples": ("imud_samples_total", {}), "lost_gap_device": ("imud_samples_lost_total", {"cause": "gap_device"}),
     "lost_crc": ("imud_samples_lost_total", {"cause": "crc"}),
     "lost_overrun": ("imud_samples_lost_total", {"cause": "overrun"}),
-    "lost_queue": ("imud_samples_lost_total", {"cause": "queue"}),
-    "lost_unknown": ("imud_gaps_unknown_total", {}),
+    "lost_queue": ("imud_samples_lost_total", {"cause": "queue"}), "lost_unknown": ("imud_gaps_unknown_total", {}),
     "replies_late": ("imud_replies_stray_total", {"kind": "late"}),
     "replies_unsolicited": ("imud_replies_stray_total", {"kind": "unsolicited"}),
-}
+}  # fmt: skip
 
 
 def test_each_ledger_counter_has_a_metric() -> None:
@@ -101,9 +95,6 @@ def test_each_ledger_counter_has_a_metric() -> None:
     for status in DEVICES:
         for field, (name, labels) in LEDGER_LINES.items():
             assert shown[key(name, device=status.name, **labels)] == status.ledger[field], field
-
-
-def test_the_ledger_balances_in_a_scrape_and_a_difference_is_shown() -> None:
     ledger = dict(DEVICES[0].ledger)
     ledger["bytes_in"] += 3
     ledger["frames_in_replies"] += 2
@@ -115,7 +106,7 @@ def test_the_ledger_balances_in_a_scrape_and_a_difference_is_shown() -> None:
     assert shown[key("imud_ledger_unaccounted_frames", device="leaky")] == -2
 
 
-def test_values_in_base_units() -> None:
+def test_values_states_and_identity() -> None:
     shown = rendered(Snapshot(DEVICES, heartbeat_age_ns=250_000_000, log_messages_dropped=3))
     front = {"device": "front"}
     expected = {
@@ -132,13 +123,22 @@ def test_values_in_base_units() -> None:
         assert shown[key("imud_kernel_errors_total", kind=kind, **front)] == count
     assert shown[key("imud_heartbeat_age_seconds")] == 0.25
     assert shown[key("imud_log_messages_dropped_total")] == 3
-
-
-def test_absent_is_not_zero() -> None:
-    shown = rendered(Snapshot(DEVICES))
     for name in ("imud_temperature_celsius", "imud_status_bits", "imud_sample_rate_expected_hertz"):
         assert key(name, device="front") in shown
         assert key(name, device="rear") not in shown
+    for name, state, up in (("front", "running", 1), ("rear", "missing", 0)):
+        assert shown[key("imud_device_up", device=name)] == up
+        for other in states.DeviceState:
+            assert shown[key("imud_device_state", device=name, state=other.value)] == (other.value == state)
+    for sync in Sync:
+        assert shown[key("imud_clock_sync", device="front", sync=sync.value)] == (sync is Sync.REGRESSION)
+    identity = {"product": "HI13", "serial_number": "00000000", "firmware": "1.7.6"}
+    link = "/dev/ttyUSB0 at 115200 baud"
+    assert shown[key("imud_device_info", device="front", driver="hipnuc-uart", link=link, **identity)] == 1
+    (build,) = [dict(labels) for name, labels in shown if name == "imud_build_info"]
+    assert build["version"] == imud.__version__
+    assert shown[key("process_resident_memory_bytes")] > 1_000_000
+    assert key("process_cpu_seconds_total") in shown
 
 
 # All lines of the parts that only some devices have
@@ -180,9 +180,19 @@ def test_every_part_is_shown_in_base_units() -> None:
     assert shown.keys() == PARTS.keys()
     for line, value in PARTS.items():
         assert shown[line] == pytest.approx(value, rel=1e-12), line
+    means = {"late_mean_ns", "trigger_late_mean_ns"}  # sum divided by count
+    before = parts_of("bow", rendered(Snapshot((equipped("bow"),))))
+    for part in ("polling", "serial_line", "lines", "utc"):
+        status = equipped("bow")
+        value = getattr(status, part)
+        for field in msgspec.structs.fields(value):
+            if field.type is int and field.name not in means:
+                more = msgspec.structs.replace(value, **{field.name: getattr(value, field.name) + 1_000_000})
+                changed = parts_of("bow", rendered(Snapshot((equipped("bow", **{part: more}),))))
+                assert changed != before, f"{part}.{field.name}"
 
 
-def test_missing_parts_of_a_device_are_absent() -> None:
+def test_missing_parts_and_settings_are_absent() -> None:
     plain = device("plain", 2)
     unsure = equipped(
         "unsure", 3, polling=None, serial_line=None,
@@ -201,9 +211,6 @@ def test_missing_parts_of_a_device_are_absent() -> None:
     }  # fmt: skip
     assert (found["imud_utc_problem", ()], found["imud_line_problem", (("line", "sout"),)]) == (0, 0)
     assert ("imud_line_problem", (("line", "sin"),)) not in found
-
-
-def test_settings_are_absent_without_a_declaration_or_a_report() -> None:
     for state, number in ((SettingsState.UNDECLARED, 0), (SettingsState.UNKNOWN, 2), (SettingsState.AGREE, 3)):
         settings = SettingsStatus(state, OnDifference.REPORT)
         shown = rendered(Snapshot((device("bow", declared=settings),)))
@@ -221,20 +228,6 @@ def test_problems_of_lines_and_of_gravity_are_shown() -> None:
     assert shown[key("imud_frame_problem", device="good")] == 0
     assert shown[key("imud_frame_problem", device="bad")] == 1
     assert key("imud_frame_problem", device="unknown") not in shown
-
-
-def test_every_number_of_the_parts_has_a_metric() -> None:
-    """A new field of a part must have a metric: a change of the field must change a scrape."""
-    means = {"late_mean_ns", "trigger_late_mean_ns"}  # sum divided by count
-    before = parts_of("bow", rendered(Snapshot((equipped("bow"),))))
-    for part in ("polling", "serial_line", "lines", "utc"):
-        status = equipped("bow")
-        value = getattr(status, part)
-        for field in msgspec.structs.fields(value):
-            if field.type is int and field.name not in means:
-                more = msgspec.structs.replace(value, **{field.name: getattr(value, field.name) + 1_000_000})
-                changed = parts_of("bow", rendered(Snapshot((equipped("bow", **{part: more}),))))
-                assert changed != before, f"{part}.{field.name}"
 
 
 def test_rings_and_motion_are_shown() -> None:
@@ -263,16 +256,6 @@ def test_rings_and_motion_are_shown() -> None:
     }  # fmt: skip
 
 
-def test_state_and_sync_are_one_hot() -> None:
-    shown = rendered(Snapshot(DEVICES))
-    for name, state, up in (("front", "running", 1), ("rear", "missing", 0)):
-        assert shown[key("imud_device_up", device=name)] == up
-        for other in states.DeviceState:
-            assert shown[key("imud_device_state", device=name, state=other.value)] == (other.value == state)
-    for sync in Sync:
-        assert shown[key("imud_clock_sync", device="front", sync=sync.value)] == (sync is Sync.REGRESSION)
-
-
 def test_latency_histogram_is_cumulative() -> None:
     shown = rendered(Snapshot(DEVICES))
     bounds = [f"{bound / 1e9:.6g}" for bound in states.LATENCY_BOUNDS_NS]
@@ -285,17 +268,6 @@ def test_latency_histogram_is_cumulative() -> None:
     assert [counts[bound] for bound in sorted(counts)] == [1, 3, 6, 10, 15, 21, 28, 36, 45, 55, 66]
     assert shown[key("imud_sample_latency_seconds_count", device="front")] == 66
     assert shown[key("imud_sample_latency_seconds_sum", device="front")] == 2.5
-
-
-def test_identity_build_and_process() -> None:
-    shown = rendered(Snapshot(DEVICES))
-    identity = {"product": "HI13", "serial_number": "00000000", "firmware": "1.7.6"}
-    link = "/dev/ttyUSB0 at 115200 baud"
-    assert shown[key("imud_device_info", device="front", driver="hipnuc-uart", link=link, **identity)] == 1
-    (build,) = [dict(labels) for name, labels in shown if name == "imud_build_info"]
-    assert build["version"] == imud.__version__
-    assert shown[key("process_resident_memory_bytes")] > 1_000_000
-    assert key("process_cpu_seconds_total") in shown
 
 
 def test_identity_with_quotes_and_newlines_stays_one_label() -> None:
@@ -386,14 +358,8 @@ def test_every_metric_and_label_value_is_documented() -> None:
 
 
 def test_names_contain_type_and_unit() -> None:
-    more = (
-        *families.MQTT_FAMILIES,
-        *families.OUTPUT_FAMILIES,
-        *families.RECORDER_FAMILIES,
-        *families.FLIGHT_FAMILIES,
-        *families.RECORDINGS_FAMILIES,
-    )
-    for family in (*families.FAMILIES, *more):
+    more = (families.MQTT_FAMILIES, families.OUTPUT_FAMILIES, families.RECORDER_FAMILIES, families.FLIGHT_FAMILIES)
+    for family in chain(families.FAMILIES, families.RECORDINGS_FAMILIES, *more):
         assert family.name.startswith("imud_")
         if isinstance(family, Family):
             assert family.help.endswith(".")
@@ -442,12 +408,9 @@ def test_each_metric_is_a_value_of_the_output() -> None:
         "commands_total": 11, "commands_refused_total": 12, "replies_lost_total": 13,
     }  # fmt: skip
     assert shown("imud_mqtt_", Snapshot()) == {}
-
-
-def test_a_failure_is_zero() -> None:
     status = MqttStatus("", "refused", "full", 0, 0, 0, 0, 0, 0, 0, {}, 0)
-    values = shown("imud_mqtt_", Snapshot(mqtts=(status,)))
-    assert (values["connected"], values["spooling"]) == (0, 0)
+    failed = shown("imud_mqtt_", Snapshot(mqtts=(status,)))
+    assert (failed["connected"], failed["spooling"]) == (0, 0)
 
 
 RECORDER = RecorderStatus("a", "", 1, 2, 3, 4, 5, 6)
