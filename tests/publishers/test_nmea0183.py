@@ -9,7 +9,7 @@ import shutil
 import socket
 import subprocess
 import tty
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from math import nan, radians
 from pathlib import Path
@@ -31,7 +31,7 @@ from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.publishers import nmea0183
 from imud.publishers.nmea0183 import open_serial as open_real_port
 from tests.support.event_loops import VirtualClock, in_loop
-from tests.support.publisher_context import publisher_context
+from tests.support.publisher_context import FakeLatencies, publisher_context
 from tests.support.socket_rig import device_status, in_context
 from tests.support.surroundings import free_port
 
@@ -44,22 +44,11 @@ GPSD_VERSION = "" if NO_GPSD else subprocess.check_output(["gpsd", "-V"], text=T
 LEFT_45: Vector3 = (radians(10), radians(5), radians(-45))
 
 
-class Asked:
-    def __init__(self) -> None:
-        self.of: dict[str, tuple[int, tuple[str, ...]]] = {}
-
-    def ask(self, who: str, latency_ns: int, devices: Collection[str] | None = None) -> None:
-        self.of[who] = (latency_ns, tuple(devices or ()))
-
-    def release(self, who: str) -> None:
-        self.of.pop(who, None)
-
-
 class OutputBench:
     def __init__(
         self, *, heading: Heading = Heading.TRUE, declination_deg: float | None = 3.0, **settings: object
     ) -> None:
-        self.clock, self.asked = VirtualClock(), Asked()
+        self.clock, self.asked = VirtualClock(), FakeLatencies()
         frame = FrameStatus("", "device", "", "", heading, declination_deg, {})
         statuses = [
             msgspec.structs.replace(device_status(name, n), frame=frame) for n, name in enumerate(("bow", "mast"))
@@ -150,9 +139,7 @@ async def test_each_udp_address_gets_the_sentences() -> None:
 
 @pytest.mark.parametrize("convention", [None, *Convention])
 @in_output(sentences={"PASHR": 1.0, "HDG": 1.0, "XDR": 1.0, "ROT": 1.0})
-async def test_values_use_the_axes_of_ships_for_all_device_axes(
-    bench: OutputBench, convention: Convention | None
-) -> None:
+async def test_values_use_ship_axes_for_all_device_axes(bench: OutputBench, convention: Convention | None) -> None:
     frame = published_frame(None, convention, None, AS_SENT.device)
     euler, gyro_z = LEFT_45, radians(-2.0)
     if frame.rotation is not None:
@@ -218,17 +205,17 @@ async def test_the_heading_reference_is_read_again(bench: OutputBench) -> None:
 @in_loop
 async def test_the_only_device_or_the_configured_device_is_used(caplog: pytest.LogCaptureFixture) -> None:
     bench = OutputBench(sentences={"HDT": 100.0})
-    assert bench.asked.of == {nmea0183.WHO: (10 * NS_PER_MS, ("bow",))}
+    assert bench.asked.asked == {nmea0183.WHO: (10 * NS_PER_MS, ("bow",))}
     bench.output.add_device("mast", 1)
-    assert bench.asked.of == {}
+    assert bench.asked.asked == {}
     assert "nmea0183.device: expected the name of one device (bow, mast), got none" in caplog.text
     bench.output.remove_device("bow")
-    assert bench.asked.of == {nmea0183.WHO: (10 * NS_PER_MS, ("mast",))}
+    assert bench.asked.asked == {nmea0183.WHO: (10 * NS_PER_MS, ("mast",))}
     bench.output.close()
-    assert (bench.asked.of, bench.context.outputs.sentences) == ({}, [])
+    assert (bench.asked.asked, bench.context.outputs.sentences) == ({}, [])
 
     named = OutputBench(device="mast", sentences={"HDT": 100.0})
-    assert named.asked.of == {}
+    assert named.asked.asked == {}
     named.output.add_device("mast", 1)
     named.tick()
     await named.connect()
@@ -262,18 +249,15 @@ def test_invalid_options_are_rejected(given: dict[str, object], words: str) -> N
     assert words in "; ".join(map(str, wrong_values(nmea0183.Nmea0183Options, given)))
 
 
-def test_a_serial_port_can_be_filled() -> None:
+def test_addresses_and_a_full_serial_port() -> None:
+    assert nmea0183.address_of("192.168.1.255:65535") == ("192.168.1.255", 65535)
+    assert nmea0183.address_of("[fe80::1]:2000") == ("fe80::1", 2000)
     full = {"serial_port": "/dev/ttyS0", "serial_baud": 4800, "sentences": {"HDT": 21, "HDG": 3}}  # 19 and 27 bytes
     assert not wrong_values(nmea0183.Nmea0183Options, full)
 
 
-def test_addresses() -> None:
-    assert nmea0183.address_of("192.168.1.255:65535") == ("192.168.1.255", 65535)
-    assert nmea0183.address_of("[fe80::1]:2000") == ("fe80::1", 2000)
-
-
 @pytest.mark.parametrize("kind", nmea0183.Formatter)
-def test_usual_bytes_covers_complete_sentences(kind: nmea0183.Formatter) -> None:
+def test_usual_bytes_covers_full_sentences_and_empty_samples_make_none(kind: nmea0183.Formatter) -> None:
     full = Sample(
         "bow", 1, 0, 0, Sync.ARRIVAL, 0, NS_PER_S, euler_rad=(radians(-80), radians(-80), radians(211.5)),
         gyro_rad_s=(0.0, 0.0, radians(-0.3)), temperature_c=23.4, pressure_pa=101_325.0,
@@ -281,6 +265,7 @@ def test_usual_bytes_covers_complete_sentences(kind: nmea0183.Formatter) -> None
     made = nmea0183.make(kind, full, nmea0183.HeadingReference(Heading.TRUE, 12.6))
     assert made is not None
     assert len(made) <= nmea0183.USUAL_BYTES[kind]
+    assert nmea0183.make(kind, sample(euler_deg=None), CORRECTED) is None
 
 
 # --- independent reader -----------------------------------------------------------------------------------------------
@@ -380,16 +365,14 @@ def body(kind: nmea0183.Formatter, one: Sample, reference: nmea0183.HeadingRefer
         (nmea0183.HeadingReference(Heading.UNKNOWN), (None, None, None)),
     ],
 )
-def test_a_heading_is_sent_with_its_reference(
-    reference: nmea0183.HeadingReference, sentences: tuple[str | None, ...]
-) -> None:
+def test_a_heading_has_its_reference(reference: nmea0183.HeadingReference, sentences: tuple[str | None, ...]) -> None:
     kinds = (nmea0183.Formatter.HDT, nmea0183.Formatter.HDG, nmea0183.Formatter.HDM)
     assert tuple(body(kind, sample(), reference) for kind in kinds) == sentences
     if sentences == (None, None, None):
         assert body(nmea0183.Formatter.PASHR, sample(), reference) == "PASHR,000000.000,,T,+1.00,-2.00,,,,,0,0"
 
 
-def test_roll_pitch_temperature_pressure() -> None:
+def test_roll_pitch_temperature_pressure_and_the_talker() -> None:
     one = sample(temperature_c=23.44, pressure_pa=101_325.0)
     assert (
         body(nmea0183.Formatter.XDR, one, MAGNETIC)
@@ -397,9 +380,6 @@ def test_roll_pitch_temperature_pressure() -> None:
     )
     assert body(nmea0183.Formatter.XDR, sample(euler_deg=(nan, 1, 2), temperature_c=nan), MAGNETIC) is None
     assert body(nmea0183.Formatter.XDR, sample(euler_deg=None), MAGNETIC) is None
-
-
-def test_the_configured_talker_is_used_for_all_sentences() -> None:
     assert body(nmea0183.Formatter.HDT, sample(), TRUE, "II") == "IIHDT,45.0,T"
     assert str(body(nmea0183.Formatter.PASHR, sample(), TRUE, "II")).startswith("PASHR,")
 
@@ -412,18 +392,10 @@ def test_the_rate_of_turn_is_the_rate_of_the_heading() -> None:
     # bow up by 60°: the heading turns twice as fast as the body about its z axis
     assert nmea0183.turn_rate_rad_s(sample((0, 60, 0), (0, 0, 1))) == pytest.approx(radians(2))
     assert nmea0183.turn_rate_rad_s(sample(None, (0, 0, 1))) == pytest.approx(radians(1))
-
-
-def test_there_is_no_rate_of_turn_with_the_bow_straight_up_or_without_rates() -> None:
     assert nmea0183.turn_rate_rad_s(sample((0, 85, 0), (0, 0, 1))) is None
     assert nmea0183.turn_rate_rad_s(sample((0, 0, 0))) is None
     assert nmea0183.turn_rate_rad_s(sample((0, 0, 0), (0, 0, math.inf))) is None
     assert body(nmea0183.Formatter.ROT, sample((0, 0, 0), (0, 0, 1.5)), MAGNETIC) == "TIROT,90.0,A"
-
-
-@pytest.mark.parametrize("kind", nmea0183.Formatter)
-def test_a_sample_without_values_makes_no_sentence(kind: nmea0183.Formatter) -> None:
-    assert nmea0183.make(kind, sample(euler_deg=None), CORRECTED) is None
 
 
 CLIENTS_MAX, RETRY_FIRST_NS, STUCK_NS = 32, NS_PER_S, 30 * NS_PER_S
@@ -484,6 +456,8 @@ async def test_every_client_gets_every_sentence(made: Server) -> None:
         made.put(ONE)
         assert first.recv(100) == ONE
     assert made.status().readers == 1
+    with pytest.raises(ServerError, match=r"nmea0183\.tcp_port"):
+        nmea0183.TcpOutput("127.0.0.1", made.port, VirtualClock().now_ns).open()
 
 
 @in_context("made", serving)
@@ -554,12 +528,6 @@ async def test_clients_above_the_limit_are_rejected(made: Server) -> None:
     one_more = made.clients[3]
     await until(is_closed)
     assert made.status().readers == CLIENTS_MAX
-
-
-@in_context("made", serving)
-async def test_a_port_in_use_is_reported(made: Server) -> None:
-    with pytest.raises(ServerError, match=r"nmea0183\.tcp_port"):
-        nmea0183.TcpOutput("127.0.0.1", made.port, VirtualClock().now_ns).open()
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1", "127.255.255.255"])

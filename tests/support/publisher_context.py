@@ -44,12 +44,17 @@ class NoLine:
         pass
 
 
-class NoLatencies:
+class FakeLatencies:
+    """Latency requests by requester: latency, ns, and devices."""
+
+    def __init__(self) -> None:
+        self.asked: dict[str, tuple[int, tuple[str, ...] | None]] = {}
+
     def ask(self, who: str, latency_ns: int, devices: Collection[str] | None = None) -> None:
-        pass
+        self.asked[who] = (latency_ns, None if devices is None else tuple(devices))
 
     def release(self, who: str) -> None:
-        pass
+        self.asked.pop(who, None)
 
 
 def _no_device(name: str) -> DeviceControl:
@@ -84,5 +89,5 @@ def publisher_context(
     )  # fmt: skip
     return PublisherContext(
         epoch, PublisherClock(now_ns, utc_offset_ns, utc_reference, cpu_ns), devices, outputs or OutputFacts(),
-        latencies or NoLatencies(), watch_line, raise_event,
+        latencies or FakeLatencies(), watch_line, raise_event,
     )  # fmt: skip

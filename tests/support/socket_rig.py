@@ -78,9 +78,7 @@ def context(
     recording: RecordingSource | None = None,
 ) -> PublisherContext:
     statuses = [device_status(*item) for item in DEVICES.items()]
-    return publisher_context(
-        lambda: statuses, EPOCH, now_ns, FakeControl, latencies=latencies, recording=recording,
-    )  # fmt: skip
+    return publisher_context(lambda: statuses, EPOCH, now_ns, FakeControl, latencies=latencies, recording=recording)
 
 
 def turn(_target: command.Target, *, angle_deg: float, relative: bool = False) -> None:
@@ -186,11 +184,11 @@ class SteppingClock:
     """A clock that advances by `step_ns` with each reading."""
 
     def __init__(self) -> None:
-        self.step_ns, self._now_ns = 0, NOW_NS
+        self.step_ns, self.ns = 0, NOW_NS
 
     def __call__(self) -> int:
-        self._now_ns += self.step_ns
-        return self._now_ns
+        self.ns += self.step_ns
+        return self.ns
 
 
 @asynccontextmanager

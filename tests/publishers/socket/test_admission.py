@@ -4,12 +4,11 @@ Rights of clients by the credentials of the kernel."""
 import asyncio
 import os
 import resource
-import shutil
 import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,7 @@ import pytest
 from imud.formats.jsonrpc import Code, RpcError
 from imud.publishers.socket import admission as quota
 from imud.publishers.socket.scheduler import TokenBucket
-from tests.support.socket_rig import run, serving
+from tests.support.socket_rig import alone, serving
 from tests.support.surroundings import needs_root
 
 READ, ALL = quota.Rights.READ, quota.Rights.READ | quota.Rights.CONTROL
@@ -51,15 +50,12 @@ class House:
             self.clients.remove(client)
 
 
-def test_one_user_gets_its_share_and_others_get_in() -> None:
+def test_a_user_gets_its_share_and_users_leave_places_for_root() -> None:
     house = House()
     refusals = [house.connect(1000) for _ in range(25)]
     assert refusals[:20] == [""] * 20
     assert all("socket.clients_per_user" in words for words in refusals[20:])
     assert house.connect(1001) == ""
-
-
-def test_many_users_leave_places_for_root_and_control() -> None:
     house = House()
     outcomes = [house.connect(1000 + number) for number in range(70)]
     assert outcomes.count("") == 48  # 64 minus 16 reserved places
@@ -70,17 +66,7 @@ def test_many_users_leave_places_for_root_and_control() -> None:
     assert [house.connect(2001, ALL) for _ in range(14)].count("") == 3
 
 
-def test_root_and_another_member_connect_when_other_users_take_all_places() -> None:
-    """Defaults: without reserved places, 128 + 112 clients of two readers and 16 of one member would be all 256."""
-    house = House(clients=256, per_user=128)
-    assert house.fill((1000, 1001)) == 240
-    assert house.fill((2000,), ALL) == 3
-    assert "uid 2000 has 3 of the reserved places" in house.connect(2000, ALL)
-    assert house.connect(2001, ALL) == ""
-    assert [house.connect(0, ALL) for _ in range(4)] == [""] * 4
-
-
-def test_no_other_user_can_take_the_places_of_root() -> None:
+def test_root_and_members_connect_when_others_take_all_places() -> None:
     house = House(clients=256, per_user=128)
     house.fill(tuple(range(1000, 1010)))
     house.fill((OWN_UID, *range(2000, 2010)), ALL)
@@ -93,6 +79,13 @@ def test_no_other_user_can_take_the_places_of_root() -> None:
     assert house.fill((OWN_UID,)) == 243
     assert house.connect(2000, ALL) == ""
     assert house.connect(0, ALL) == ""
+    # without reserved places, 128 + 112 clients of two readers and 16 of one member would be all 256
+    house = House(clients=256, per_user=128)
+    assert house.fill((1000, 1001)) == 240
+    assert house.fill((2000,), ALL) == 3
+    assert "uid 2000 has 3 of the reserved places" in house.connect(2000, ALL)
+    assert house.connect(2001, ALL) == ""
+    assert [house.connect(0, ALL) for _ in range(4)] == [""] * 4
 
 
 def test_free_places_do_not_give_a_member_more_reserved_places() -> None:
@@ -114,7 +107,7 @@ def test_free_places_do_not_give_a_member_more_reserved_places() -> None:
         house.leave(0, 1)
 
 
-def test_members_and_root_with_many_clients_keep_their_reserved_places() -> None:
+def test_reserved_places_with_many_clients_and_in_a_small_house() -> None:
     house = House(clients=256, per_user=128)
     assert [house.connect(2000, ALL) for _ in range(20)] == [""] * 20
     house.fill((1000, 1001))
@@ -126,9 +119,6 @@ def test_members_and_root_with_many_clients_keep_their_reserved_places() -> None
     assert [house.connect(0, ALL) for _ in range(20)] == [""] * 20
     assert house.fill((1000, 1001)) == 224  # the other 16 clients of root have open places
     assert [house.connect(uid, ALL) for uid in (2000, 2001, 2002, 2003)] == [""] * 4
-
-
-def test_a_small_house_has_few_reserved_places_or_none() -> None:
     house = House(clients=3)
     assert [house.connect(1000) for _ in range(4)].count("") == 3
     house = House(clients=4)
@@ -174,7 +164,7 @@ def test_a_user_that_has_not_connected_lately_is_forgotten(monkeypatch: pytest.M
         assert len(made) == buckets
 
 
-def test_high_descriptors_are_kept_for_devices() -> None:
+def test_descriptors_and_wakers_are_limited() -> None:
     house = House(fd_limit=1024)
     assert house.connect(1000, fd=767) == ""
     assert "descriptor" in house.connect(1000, fd=768)
@@ -184,9 +174,6 @@ def test_high_descriptors_are_kept_for_devices() -> None:
     house.quota.check_fds((5, 767))
     with pytest.raises(RpcError, match="file descriptors for clients are in use"):
         house.quota.check_fds((5, 768))
-
-
-def test_wakers_of_all_clients_of_a_user_count() -> None:
     house = House(per_user=2)
     with pytest.raises(RpcError, match="uid 1000 has 8 descriptors, the maximum"):
         house.quota.check_waker(1000, 8)
@@ -234,24 +221,14 @@ def test_the_limit_of_descriptors_is_raised(monkeypatch: pytest.MonkeyPatch) -> 
     assert quota.raise_fd_limit() == 4096
 
 
-NONE, READ_RIGHT, ALL_RIGHTS = quota.Rights.NONE, quota.Rights.READ, quota.Rights.READ | quota.Rights.CONTROL
-
-
-@pytest.mark.parametrize(
-    ("uid", "groups", "expected"),
-    [
-        (0, (), ALL_RIGHTS),
-        (500, (), READ_RIGHT),  # the user of the daemon
-        (1000, (), NONE), (1000, (7, 80), READ_RIGHT), (1000, (7, 90), ALL_RIGHTS), (500, (90,), ALL_RIGHTS),
-    ],
-)  # fmt: skip
-def test_rules(uid: int, groups: tuple[int, ...], expected: quota.Rights) -> None:
-    assert quota.Guard(500, 80, 90).rights_of(quota.Peer(1, uid, frozenset(groups))) == expected
-
-
-def test_a_group_that_does_not_exist_gives_nothing() -> None:
+def test_rights_of_users_and_groups() -> None:
+    for uid, groups, expected in (
+        (0, (), ALL), (500, (), READ),  # root, and the user of the daemon
+        (1000, (), quota.Rights.NONE), (1000, (7, 80), READ), (1000, (7, 90), ALL), (500, (90,), ALL),
+    ):  # fmt: skip
+        assert quota.Guard(500, 80, 90).rights_of(quota.Peer(1, uid, frozenset(groups))) == expected, (uid, groups)
     assert quota.gid_of("no-such-group-here") is None
-    assert quota.Guard(500, None, None).rights_of(quota.Peer(1, 1000, frozenset((7, 80)))) == NONE
+    assert quota.Guard(500, None, None).rights_of(quota.Peer(1, 1000, frozenset((7, 80)))) == quota.Rights.NONE
 
 
 def test_the_peer_of_a_socket_is_this_process() -> None:
@@ -276,14 +253,6 @@ except PermissionError:
 """
 
 
-@pytest.fixture
-def open_directory() -> Iterator[Path]:
-    path = Path(tempfile.mkdtemp(prefix="imud-"))
-    path.chmod(0o755)
-    yield path
-    shutil.rmtree(path)
-
-
 MANY_GROUPS = [*map(str, range(70_000, 70_300)), "daemon", "bin"]
 """More than 256 groups, the maximum of Python's getsockopt."""
 
@@ -296,20 +265,17 @@ MANY_GROUPS = [*map(str, range(70_000, 70_300)), "daemon", "bin"]
         (["bin"], 0o666, '"rights":["read","control"]'), (MANY_GROUPS, None, '"rights":["read","control"]'),
     ],
 )  # fmt: skip
-def test_other_users(open_directory: Path, groups: list[str], mode: int | None, expected: str) -> None:
-    async def body() -> str:
-        async with serving(open_directory, group="daemon", control_group="bin") as server:
+@alone()
+async def test_other_users(groups: list[str], mode: int | None, expected: str) -> None:
+    with tempfile.TemporaryDirectory(prefix="imud-") as name:
+        os.chmod(name, 0o755)
+        async with serving(Path(name), group="daemon", control_group="bin") as server:
             if mode is not None:
                 os.chmod(server.hub.path, mode)
             numbers = [int(name) if name.isdigit() else quota.gid_of(name) for name in groups]
-            return await asyncio.to_thread(ask, server.hub.path, numbers)
-
-    assert expected in run(body)
+            assert expected in await asyncio.to_thread(ask, server.hub.path, numbers)
 
 
 def ask(path: str, groups: Sequence[int | None]) -> str:
-    done = subprocess.run(
-        [sys.executable, "-I", "-S", "-c", CLIENT, path, *map(str, groups)], capture_output=True, text=True,
-        timeout=60, check=True,
-    )  # fmt: skip
-    return done.stdout
+    command = [sys.executable, "-I", "-S", "-c", CLIENT, path, *map(str, groups)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout

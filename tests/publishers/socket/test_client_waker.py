@@ -5,6 +5,7 @@ import os
 import select
 import socket
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -12,7 +13,7 @@ from imud.formats.jsonrpc import encode_notification
 from imud.publishers.socket.client import BYTE, ClientConnection, Waker
 from imud.publishers.socket.outbox import NO_FD
 from imud.publishers.socket.server import SocketServer
-from tests.support.socket_rig import Peer, SteppingClock, batch, in_server, run, serving, until
+from tests.support.socket_rig import Peer, SteppingClock, alone, batch, in_server, serving, until
 
 
 async def notified(peer: Peer, device: str = "imu0") -> int:
@@ -44,7 +45,7 @@ def read_all(fd: int) -> bytes | None:
 
 
 @in_server()
-async def test_notify_wakes_for_batches_of_one_device(server: SocketServer) -> None:
+async def test_notify_wakes_for_one_device_and_ends_the_old_descriptor(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     fd = await notified(peer)
     (connection,) = server.hub.connections.values()
@@ -66,10 +67,6 @@ async def test_notify_wakes_for_batches_of_one_device(server: SocketServer) -> N
     assert (read_all(fd), read_all(other)) == (b"", b"")
     os.close(fd)
     os.close(other)
-
-
-@in_server()
-async def test_notify_again_ends_the_old_descriptor(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     before = len(os.listdir("/proc/self/fd"))
     fds = [await notified(peer) for _ in range(5)]
@@ -81,24 +78,21 @@ async def test_notify_again_ends_the_old_descriptor(server: SocketServer) -> Non
         os.close(fd)
 
 
-def test_many_clients_are_woken_in_several_turns(tmp_path: Path) -> None:
+@alone()
+async def test_many_clients_are_woken_in_several_turns(tmp_path: Path) -> None:
     """imud wakes clients for 0.3 ms per turn, and reads the clock after 16 clients."""
     clock = SteppingClock()
-
-    async def body() -> None:
-        async with serving(tmp_path, clock) as server:
-            fds = [await notified(await Peer.greeted(server)) for _ in range(40)]
-            clock.step_ns = 200_000
-            server.publish(batch("imu0"))
-            woken = []
-            for _ in range(2):
-                await asyncio.sleep(0)
-                woken.append(sum(read_all(fd) == BYTE for fd in fds))
-            assert woken == [32, 8]
-            for fd in fds:
-                os.close(fd)
-
-    run(body)
+    async with serving(tmp_path, clock) as server:
+        fds = [await notified(await Peer.greeted(server)) for _ in range(40)]
+        clock.step_ns = 200_000
+        server.publish(batch("imu0"))
+        woken = []
+        for _ in range(2):
+            await asyncio.sleep(0)
+            woken.append(sum(read_all(fd) == BYTE for fd in fds))
+        assert woken == [32, 8]
+        for fd in fds:
+            os.close(fd)
 
 
 @pytest.mark.timeout(60)  # a blocked daemon never returns
@@ -166,14 +160,10 @@ async def test_unread_replies_do_not_gather_descriptors(server: SocketServer) ->
 
 
 @in_server()
-async def test_notify_without_a_free_descriptor(server: SocketServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_arguments: object) -> None:
-        raise OSError(24, "Too many open files")
-
+async def test_notify_without_a_free_descriptor(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     fd = await notified(peer)
-    with monkeypatch.context() as patch:
-        patch.setattr(socket, "socketpair", refuse)
+    with patch.object(socket, "socketpair", side_effect=OSError(24, "Too many open files")):
         code, message = await peer.error("notify", device="imu0")
     assert code == -32004
     assert "Too many open files" in message

@@ -25,7 +25,7 @@ def request(number: int, name: str, **arguments: Any) -> bytes:
 
 
 @in_server()
-async def test_other_requests_get_replies_before_a_late_reply(server: SocketServer) -> None:
+async def test_late_replies_and_the_error_of_a_removed_command(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     await peer.send(request(70, "wait"))
     assert len(await peer.result("devices")) == 2
@@ -36,6 +36,12 @@ async def test_other_requests_get_replies_before_a_late_reply(server: SocketServ
     assert await peer.message() == {"jsonrpc": "2.0", "id": 70, "result": {"waited": "imu0"}}
     await peer.send(request(72, "yaw", angle_deg=5))
     assert (await peer.message())["result"] is None
+    words = "mode is a setting: imud settings imu0 --set mode=9-axis"
+    error = {"code": -32005, "message": words, "data": {"settings": {"mode": "9-axis"}, "save": False}}
+    await peer.send(request(73, "mode", axes=9))
+    assert (await peer.message())["error"] == error
+    assert rpc_error(error).data == error["data"]
+    assert (await peer.ask("command", device="imu0", name="explode"))["error"].keys() == {"code", "message"}
 
 
 @pytest.mark.parametrize(
@@ -57,17 +63,6 @@ async def test_a_failed_command_gives_a_reason(
     assert error["code"] == -32005
     assert words in error["message"]
     assert not server.hub.running
-
-
-@in_server()
-async def test_the_error_of_a_removed_command_contains_the_setting(server: SocketServer) -> None:
-    words = "mode is a setting: imud settings imu0 --set mode=9-axis"
-    error = {"code": -32005, "message": words, "data": {"settings": {"mode": "9-axis"}, "save": False}}
-    peer = await Peer.greeted(server)
-    await peer.send(request(1, "mode", axes=9))
-    assert (await peer.message())["error"] == error
-    assert rpc_error(error).data == error["data"]
-    assert (await peer.ask("command", device="imu0", name="explode"))["error"].keys() == {"code", "message"}
 
 
 @in_server(control_group="imud-test-control")
@@ -92,11 +87,8 @@ async def test_reading_is_not_enough(server: SocketServer, monkeypatch: pytest.M
 @in_server(control_group="root")
 async def test_a_group_that_exists_is_named(server: SocketServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Guard, "rights_of", lambda _guard, _peer: Rights.READ)
-    peer = await Peer.greeted(server)
-    assert await peer.error("command", device="imu0", name="yaw") == (
-        -32001,
-        "command: expected root or a member of group 'root'",
-    )
+    error = (-32001, "command: expected root or a member of group 'root'")
+    assert await (await Peer.greeted(server)).error("command", device="imu0", name="yaw") == error
 
 
 def test_a_command_continues_without_its_client_and_ends_with_the_server(tmp_path: Path) -> None:
@@ -115,7 +107,7 @@ def test_a_command_continues_without_its_client_and_ends_with_the_server(tmp_pat
 
 
 @in_server()
-async def test_settings_are_planned_and_applied_as_asked_for(server: SocketServer) -> None:
+async def test_settings_are_planned_and_applied_one_change_at_a_time(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     assert (await peer.result("settings.get", device="imu0", fresh=True))["status"]["read_ns"] > 80 * 10**12
     plan = await peer.result("settings.plan", device="imu0", settings={"output": {"hi91": 5}}, save=True)
@@ -128,11 +120,6 @@ async def test_settings_are_planned_and_applied_as_asked_for(server: SocketServe
     assert "settings: expected keys" in message
     code, _message = await peer.error("settings.apply", device="imu7")
     assert code == -32602
-
-
-@in_server()
-async def test_a_connection_runs_one_change_at_a_time(server: SocketServer) -> None:
-    peer = await Peer.greeted(server)
     params = {"device": "imu0", "settings": {"wait": 1}}
     line = {"jsonrpc": "2.0", "id": 90, "method": "settings.apply", "params": params}
     await peer.send(json.dumps(line).encode() + b"\n")

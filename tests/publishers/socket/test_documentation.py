@@ -96,10 +96,9 @@ def test_numbers_and_codes_of_the_text() -> None:
         f"at most {limits.samples:,} samples and {limits.sample_bytes >> 20} MiB",
         f"more than {limits.replies:,} or {limits.reply_bytes >> 20} MiB",
         f"{RATE_MIN_HZ} … {RATE_MAX_HZ}",
-        f"`{settings.group}`",
-        f"`{settings.control_group}`",
-        f"`{DEFAULT_PATH}`",
         *(f"| {code.value} |" for code in Code if code is not Code.INTERNAL),
+        *(f"`{name}`" for name in (settings.group, settings.control_group, DEFAULT_PATH)),
+        *(f"`{word}`" for word in (*SettingsState, *StepOutcome, *EventKind)),
     ):
         assert words in DOCUMENT, words
     assert os.path.isabs(settings.path)
@@ -118,7 +117,3 @@ def test_every_member_of_status_is_explained() -> None:
     names = ("ClockStatus", "KernelCounters", "PollingStatus", "SerialLineCounters", "LinesStatus", "UtcStatus")
     for part in (*(getattr(states, name) for name in names), SettingsStatus):
         assert set(part.__struct_encode_fields__) <= named, part.__name__
-
-
-def test_every_state_of_settings_outcome_of_a_step_and_kind_of_event_is_named() -> None:
-    assert all(f"`{word}`" in DOCUMENT for word in (*SettingsState, *StepOutcome, *EventKind))

@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
 from io import BytesIO
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -19,7 +20,7 @@ from imud.model.event import Event, EventKind
 from imud.publishers.socket.admission import Guard, Quota, Rights
 from imud.publishers.socket.server import SocketServer
 from tests.publishers.recorder.recording_bench import HandSource
-from tests.support.socket_rig import NOW_NS, Peer, in_context, in_server, run, serving, until
+from tests.support.socket_rig import NOW_NS, Peer, alone, in_context, in_server, serving, until
 
 RECORDINGS_MAX = 4
 
@@ -146,20 +147,17 @@ async def test_it_ends_with_the_connection_and_with_the_descriptor(recorded: Rec
 
 
 @pytest.mark.parametrize("stopped", [False, True])
-def test_a_stop_of_imud_ends_a_recording_regularly(tmp_path: Path, stopped: bool) -> None:
-
-    async def body() -> None:
-        async with recording(tmp_path) as (server, source):
-            peer = await RecordingPeer.greeted(server)
-            await peer.result("record.start")
-            source.deliver()
-            if stopped:
-                await peer.result("record.stop")
-        assert source.listening == []
-        found = records_of(os.read(peer.fds[0], 1 << 16))
-        assert decode_object(found[-1], EndRecord).reason == ("it was stopped" if stopped else "imud stopped")
-
-    run(body)
+@alone()
+async def test_a_stop_of_imud_ends_a_recording_regularly(tmp_path: Path, stopped: bool) -> None:
+    async with recording(tmp_path) as (server, source):
+        peer = await RecordingPeer.greeted(server)
+        await peer.result("record.start")
+        source.deliver()
+        if stopped:
+            await peer.result("record.stop")
+    assert source.listening == []
+    found = records_of(os.read(peer.fds[0], 1 << 16))
+    assert decode_object(found[-1], EndRecord).reason == ("it was stopped" if stopped else "imud stopped")
 
 
 @in_context("recorded", recording)
@@ -183,9 +181,7 @@ async def test_the_maximum_counts_recordings_that_run_and_those_that_still_send(
 
 
 @in_server()
-async def test_reading_is_not_enough_and_devices_must_be_known(
-    server: SocketServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_reading_is_not_enough(server: SocketServer, monkeypatch: pytest.MonkeyPatch) -> None:
     peer = await Peer.greeted(server)
     code, message = await peer.error("record.start", devices=["imu7"])
     assert (code, message) == (-32602, "no device named 'imu7'; there are: imu0, imu1")
@@ -198,18 +194,13 @@ async def test_reading_is_not_enough_and_devices_must_be_known(
 
 
 @pytest.mark.parametrize("method", ["record.start", "record.snapshot"])
-def test_a_request_that_fails_leaves_no_descriptor(
+@alone()
+async def test_a_failed_request_leaves_no_descriptor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
 ) -> None:
-    def fail(*_: object) -> float:
-        raise RuntimeError("can't start new thread")
-
-    def refuse(_sock: socket.socket) -> float:
-        raise ServerError("nothing is kept: it has just begun")
-
-    def no_socket(*_: object) -> None:
-        raise OSError(24, "Too many open files")
-
+    fail = Mock(side_effect=RuntimeError("can't start new thread"))
+    refuse = Mock(side_effect=ServerError("nothing is kept: it has just begun"))
+    no_socket = Mock(side_effect=OSError(24, "Too many open files"))
     checked: list[int] = []
     refusing: list[bool] = []
 
@@ -220,30 +211,27 @@ def test_a_request_that_fails_leaves_no_descriptor(
 
     monkeypatch.setattr(Quota, "check_fds", check_fds)
 
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            peer = await Peer.greeted(server)
-            if method == "record.snapshot":
-                code, message = await peer.error(method)
-                assert code == -32004
-                assert "`recorder: {flight: {enabled: true}}`" in message
-                server.hub.context.outputs.snapshots.append(refuse)
-                why = "nothing is kept: it has just begun"
-            else:
-                monkeypatch.setattr(BusThread, "__init__", fail)
-                why = "the daemon cannot record: can't start new thread"
-            before = open_descriptors()
-            for _ in range(2):  # the second call succeeds only if the first closed its descriptor
-                assert await peer.error(method) == (-32004, f"{method}: {why}")
-            assert (open_descriptors(), len(checked), len(set(checked))) == (before, 4, 2)
-            refusing.append(True)
-            assert await peer.error(method) == (-32004, "none to spare")
-            assert open_descriptors() == before
-            monkeypatch.setattr(socket, "socketpair", no_socket)
-            why = "the daemon cannot make a descriptor: Too many open files"
+    async with serving(tmp_path) as server:
+        peer = await Peer.greeted(server)
+        if method == "record.snapshot":
+            code, message = await peer.error(method)
+            assert code == -32004
+            assert "`recorder: {flight: {enabled: true}}`" in message
+            server.hub.context.outputs.snapshots.append(refuse)
+            why = "nothing is kept: it has just begun"
+        else:
+            monkeypatch.setattr(BusThread, "__init__", fail)
+            why = "the daemon cannot record: can't start new thread"
+        before = open_descriptors()
+        for _ in range(2):  # the second call succeeds only if the first closed its descriptor
             assert await peer.error(method) == (-32004, f"{method}: {why}")
-
-    run(body)
+        assert (open_descriptors(), len(checked), len(set(checked))) == (before, 4, 2)
+        refusing.append(True)
+        assert await peer.error(method) == (-32004, "none to spare")
+        assert open_descriptors() == before
+        monkeypatch.setattr(socket, "socketpair", no_socket)
+        why = "the daemon cannot make a descriptor: Too many open files"
+        assert await peer.error(method) == (-32004, f"{method}: {why}")
 
 
 @in_server()

@@ -31,23 +31,6 @@ def test_the_file_in_docs_and_the_types_of_methods() -> None:
     assert free <= {"command"}  # the result of an action can have any type
     fields = [(name, one) for name, method in METHODS.items() for one in msgspec.structs.fields(method.params)]
     assert [(name, one.name) for name, one in fields if not one.required and NoneType not in get_args(one.type)] == []
-
-
-@needs_jsonschema
-def test_the_schema_is_valid_and_finds_invalid_messages() -> None:
-    from jsonschema import Draft202012Validator
-
-    whole = socket_document()
-    Draft202012Validator.check_schema(whole)
-    good = {"jsonrpc": "2.0", "method": "device", "params": {"device": "a", "device_id": 1}}
-    CHECKER.check("notification.device", good)
-    Draft202012Validator(whole).validate(good)
-    for params in ({"device": "a"}, {"device": 1, "device_id": 1}, {"device": "a", "device_id": 1, "more": 2}):
-        with pytest.raises(AssertionError, match=r"notification\.device"):
-            CHECKER.check("notification.device", {**good, "params": params})
-
-
-def test_every_notification_of_the_server_is_described() -> None:
     sent = set()
     for path in (ROOT / "imud" / "publishers" / "socket").glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -58,7 +41,17 @@ def test_every_notification_of_the_server_is_described() -> None:
 
 
 @needs_jsonschema
-def test_the_requests_of_the_document_are_of_these_types() -> None:
+def test_the_schema_finds_invalid_messages_and_accepts_the_document() -> None:
+    from jsonschema import Draft202012Validator
+
+    whole = socket_document()
+    Draft202012Validator.check_schema(whole)
+    good = {"jsonrpc": "2.0", "method": "device", "params": {"device": "a", "device_id": 1}}
+    CHECKER.check("notification.device", good)
+    Draft202012Validator(whole).validate(good)
+    for params in ({"device": "a"}, {"device": 1, "device_id": 1}, {"device": "a", "device_id": 1, "more": 2}):
+        with pytest.raises(AssertionError, match=r"notification\.device"):
+            CHECKER.check("notification.device", {**good, "params": params})
     lines = [line[2:] for line in (ROOT / "docs" / "socket.md").read_text().splitlines() if line.startswith("→ {")]
     requests = [json.loads(line) for line in lines]
     assert {request["method"] for request in requests} == set(METHODS)
@@ -67,21 +60,9 @@ def test_the_requests_of_the_document_are_of_these_types() -> None:
 
 
 @in_server()
-async def test_optional_parameters_may_be_null(server: SocketServer) -> None:
-    peer = await Peer.greeted(server)
-    nothing: dict[str, Any] = {"devices": None, "fields": None, "convention": None}
-    assert (await peer.result("watch", **nothing, rate_hz=None, encoding=None))["encoding"] == "json"
-    assert (await peer.result("poll", **nothing))["samples"] == []
-    assert await peer.result("events", devices=None, enable=None) == {"enable": True}
-    assert (await peer.result("options", big_numbers=None))["big_numbers"] == "number"
-
-
-@in_server()
 async def test_big_numbers_are_strings_on_request(server: SocketServer) -> None:
     plain, text = await Peer.greeted(server), await Peer.greeted(server)
-    assert await text.result("options", big_numbers="string") == {
-        "big_numbers": "string", "epoch": str(EPOCH),
-    }  # fmt: skip
+    assert await text.result("options", big_numbers="string") == {"big_numbers": "string", "epoch": str(EPOCH)}
     assert (await plain.result("options"))["epoch"] == EPOCH
     for peer in (plain, text):
         await peer.result("watch")
@@ -121,7 +102,7 @@ async def test_clients_that_watch_a_removed_device_get_device_removed(server: So
 
 
 @in_server()
-async def test_the_path_of_the_ring_is_with_the_device(server: SocketServer, tmp_path: Path) -> None:
+async def test_rings_of_devices_and_optional_parameters(server: SocketServer, tmp_path: Path) -> None:
     shm = ShmPublisher(ShmOptions(directory=str(tmp_path), slots=64), server.hub.context)
     shm.start()
     shm.add_device("imu0", 0)
@@ -129,6 +110,11 @@ async def test_the_path_of_the_ring_is_with_the_device(server: SocketServer, tmp
     assert [one["ring"] for one in await peer.result("devices")] == [f"{tmp_path}/imud.imu0", None]
     shm.close()
     assert [one["ring"] for one in await peer.result("devices")] == [None, None]
+    nothing: dict[str, Any] = {"devices": None, "fields": None, "convention": None}
+    assert (await peer.result("watch", **nothing, rate_hz=None, encoding=None))["encoding"] == "json"
+    assert (await peer.result("poll", **nothing))["samples"] == []
+    assert await peer.result("events", devices=None, enable=None) == {"enable": True}
+    assert (await peer.result("options", big_numbers=None))["big_numbers"] == "number"
 
 
 @in_server()

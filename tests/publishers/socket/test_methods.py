@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 from msgspec.structs import replace
@@ -28,7 +29,7 @@ from imud.publishers.socket.admission import Rights
 from imud.publishers.socket.methods import METHODS
 from imud.publishers.socket.server import SocketOptions, SocketServer
 from tests.support.publisher_context import publisher_context
-from tests.support.socket_rig import NOW_NS, Peer, batch, device_status, in_context, in_server, run, serving, until
+from tests.support.socket_rig import NOW_NS, Peer, batch, device_status, in_context, in_server, until
 
 LINE_MAX_BYTES, DEVICES_PER_PIECE, BYTES_BURST = 65_536, 8, 1 << 20
 
@@ -42,10 +43,7 @@ LINE_MAX_BYTES, DEVICES_PER_PIECE, BYTES_BURST = 65_536, 8, 1 << 20
         (b"[" * 60_000, -32700, None, "nested too deeply"),
         (b'{"jsonrpc":"2.0","id":1,"method":"watch","params":{"rate_hz":NaN}}', -32700, None, "not JSON"),
         (b'{"jsonrpc":"2.0","id":1,"method":"watch","params":{"rate_hz":1e999}}', -32700, None, "not JSON"),
-        (
-            b'{"jsonrpc":"2.0","id":1,"method":"x","params":' + b'{"a":' * 974 + b"1" + b"}" * 975, -32700, None,
-            "nested",
-        ),
+        (b'{"jsonrpc":"2.0","id":1,"method":"","params":' + b'{"a":' * 974 + b"1" + b"}" * 975, -32700, None, "nested"),
         (b"[" + b"1," * 3000 + b"1]", -32700, None, "too many values: expected at most 2048"),
         (b"7", -32600, None, "got a number"),
         (b'[{"jsonrpc":"2.0","id":1,"method":"devices"}]', -32600, None, "one JSON object per line, got an array"),
@@ -112,13 +110,17 @@ def watching(server: SocketServer) -> set[int]:
 
 
 @in_server()
-async def test_the_limits_themselves_are_allowed_and_unknown_members_ignored(server: SocketServer) -> None:
+async def test_limits_are_allowed_unknown_members_ignored_and_nan_is_null(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     for rate_hz in (0.001, 1_000_000):
         assert (await peer.result("watch", rate_hz=rate_hz))["rate_hz"] == rate_hz
     line = b'{"later":1,"jsonrpc":"2.0","id":1,"method":"watch","params":{"later":[],"rate_hz":null}}\r\n'
     await peer.send(line)
     assert (await peer.message())["result"]["rate_hz"] == 0
+    nan = batch()
+    values = (float("nan"), float("inf"), -float("inf"))
+    server.publish(Batch("imu0", 0, [replace(nan.samples[0], gyro_rad_s=values)]))
+    assert (await peer.message())["params"]["gyro_rad_s"] == [None, None, None]
 
 
 def test_rights_and_effects_of_the_methods() -> None:
@@ -132,7 +134,7 @@ def test_rights_and_effects_of_the_methods() -> None:
 
 
 @in_server()
-async def test_notifications_act_without_a_reply(server: SocketServer) -> None:
+async def test_notifications_several_requests_half_and_blank_lines(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     await peer.send(b'{"jsonrpc":"2.0","method":"status"}\n')
     await peer.send(b'{"jsonrpc":"2.0","method":"nonsense"}\n')
@@ -143,11 +145,6 @@ async def test_notifications_act_without_a_reply(server: SocketServer) -> None:
     (connection,) = server.hub.connections.values()
     assert connection.number in watching(server)
     assert not connection.wakers.by_device
-
-
-@in_server()
-async def test_half_lines_several_requests_and_blank_lines(server: SocketServer) -> None:
-    peer = await Peer.greeted(server)
     lines = b"".join(b'{"jsonrpc":"2.0","id":%d,"method":"poll"}\n\r\n\n' % number for number in range(25))
     await peer.send(lines)  # more requests than one turn serves
     assert [reply["id"] for reply in await peer.messages(25)] == list(range(25))
@@ -203,40 +200,22 @@ async def test_a_name_with_control_characters_is_refused(server: SocketServer) -
         assert (await peer.error("calibrate", device="imu0", kind=name))[0] == expected
 
 
-def test_an_internal_error_in_an_action_ends_only_its_client(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    async def body() -> None:
-        async with serving(tmp_path) as server:
-            other = await Peer.greeted(server)
-            for _ in range(3):
-                peer = await Peer.greeted(server)
-                params = b'{"device":"imu0","name":"break"}'
-                await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"command","params":' + params + b"}\n")
-                assert (await peer.message())["error"]["code"] == -32603
-                assert await peer.ended()
-                peer.close()
-            assert server.hub.status().failed == 3
-            assert len(await other.result("devices")) == 2
-            other.close()
-
-    run(body)
-    assert caplog.text.count("internal error while serving a client") == 1
-
-
 @in_server()
-async def test_an_internal_error_in_a_reply_ends_only_its_client(
-    server: SocketServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> None:
-        raise RecursionError("deep")
-
-    peer, other = await Peer.greeted(server), await Peer.greeted(server)
-    with monkeypatch.context() as patch:
-        patch.setattr("imud.publishers.socket.methods.encode_result", fail)
-        await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"devices"}\n')
-        assert (await peer.message())["error"]["code"] == -32603
+async def test_an_internal_error_ends_only_its_client(server: SocketServer, caplog: pytest.LogCaptureFixture) -> None:
+    other = await Peer.greeted(server)
+    for failed in range(1, 5):
+        peer = await Peer.greeted(server)
+        if failed < 4:  # in an action
+            await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"command","params":{"device":"imu0","name":"break"}}\n')
+            assert (await peer.message())["error"]["code"] == -32603
+        else:
+            with patch("imud.publishers.socket.methods.encode_result", side_effect=RecursionError("deep")):
+                await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"devices"}\n')
+                assert (await peer.message())["error"]["code"] == -32603
         assert await peer.ended()
-    assert server.hub.status().failed == 1
-    assert len(await other.result("devices")) == 2
+        assert server.hub.status().failed == failed
+        assert len(await other.result("devices")) == 2
+    assert caplog.text.count("internal error while serving a client") == 1
 
 
 @in_server()
@@ -254,16 +233,6 @@ async def test_empty_lines_use_up_the_allowance_of_their_client(server: SocketSe
         await asyncio.sleep(0)
     assert written < 2 * BYTES_BURST
     assert len(await other.result("devices")) == 2
-
-
-@in_server()
-async def test_nan_and_infinity_are_null(server: SocketServer) -> None:
-    peer = await Peer.greeted(server)
-    await peer.result("watch")
-    nan = batch()
-    values = (float("nan"), float("inf"), -float("inf"))
-    server.publish(Batch("imu0", 0, [replace(nan.samples[0], gyro_rad_s=values)]))
-    assert (await peer.message())["params"]["gyro_rad_s"] == [None, None, None]
 
 
 @pytest.mark.parametrize(("part", "count"), [(b"[", 64), (b"{", 64), (b",", 2048)])
@@ -305,11 +274,8 @@ def test_messages_as_bytes() -> None:
     assert frame_of(whole) == (SLOT_BYTES + 1).to_bytes(4, "little") + whole + b"\n\n"
 
 
-TURN_NS = 1_000_000
-
-DEVICES = 100
-DEVICE_NS = 30_000
-"""Time to make the status of a running device, ns."""
+TURN_NS, DEVICES, DEVICE_NS = 1_000_000, 100, 30_000
+"""`DEVICE_NS`: time to make the status of a running device, ns."""
 
 
 class Fleet:

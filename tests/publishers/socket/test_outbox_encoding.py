@@ -77,9 +77,7 @@ FRAMES = {
 @pytest.mark.parametrize("name", FRAMES)
 @pytest.mark.parametrize("convention", ["enu-flu", "ned-frd"])
 @in_server()
-async def test_a_client_gets_the_requested_convention_for_every_configuration(
-    server: SocketServer, name: str, convention: str
-) -> None:
+async def test_a_client_gets_the_requested_convention(server: SocketServer, name: str, convention: str) -> None:
     """Yield the samples as JSON, as binary slots, and from `poll`."""
     lines, frames = await Peer.greeted(server), await Peer.greeted(server)
     assert (await lines.result("watch", convention=convention))["convention"] == convention
@@ -97,7 +95,7 @@ async def test_a_client_gets_the_requested_convention_for_every_configuration(
 
 
 @in_server()
-async def test_clients_side_by_side(server: SocketServer) -> None:
+async def test_clients_side_by_side_and_an_unknown_convention(server: SocketServer) -> None:
     plain, down, few = [await Peer.greeted(server) for _ in range(3)]
     assert "convention" not in await plain.result("watch")
     await down.result("watch", convention="ned-frd")
@@ -112,16 +110,11 @@ async def test_clients_side_by_side(server: SocketServer) -> None:
     await down.result("watch")
     server.publish(published([SENT]))
     assert_is((await down.message())["params"], None)
-
-
-@in_server()
-async def test_an_unknown_convention_is_refused(server: SocketServer) -> None:
-    peer = await Peer.greeted(server)
     for method in ("watch", "poll"):
-        code, message = await peer.error(method, convention="enu")
+        code, message = await plain.error(method, convention="enu")
         assert code == -32602
         assert "enu" in message
-        assert (await peer.result(method, convention=None)).get("convention") is None
+        assert (await plain.result(method, convention=None)).get("convention") is None
 
 
 @in_server()
@@ -138,9 +131,8 @@ async def test_schema_and_status_describe_the_conventions(server: SocketServer) 
     assert known["conventions"]["enu-flu"]["navigation_frame"] == "ENU"
     (status, _) = (await peer.result("status"))["devices"]
     assert status["frame"]["problem"] == ""
-    assert {name: status["frame"][name] for name in known.keys() & status["frame"].keys()} == {
-        name: known[name] for name in known.keys() & status["frame"].keys()
-    }
+    both = known.keys() & status["frame"].keys()
+    assert {name: status["frame"][name] for name in both} == {name: known[name] for name in both}
 
 
 # --- the encoding itself ----------------------------------------------------------------------------------------------
@@ -155,18 +147,6 @@ def test_a_batch_is_turned_once_for_all_clients() -> None:
     assert turned.packed is batch.converted(Convention.NED_FRD).packed
     down = published([SENT], published_frame(None, Convention.NED_FRD, None, RFU_ENU))
     assert down.converted(Convention.NED_FRD) is down, "published so already"
-
-
-@pytest.mark.parametrize("encoding", [BinaryEncoding(), BinaryEncoding(Convention.NED_FRD), JsonEncoding(None, False)])
-def test_a_batch_of_slots_is_the_batch_of_its_samples(encoding: Encoding) -> None:
-    whole = published([SENT, replace(SENT, seq=2)])
-    packed = Batch("imu0", 0, None, whole.frame, whole.packed)
-    assert (len(packed), packed.seqs, list(packed.times_ns)) == (2, whole.seqs, list(whole.times_ns))
-    assert list(encoding.encode(packed)) == list(encoding.encode(whole))
-    assert packed.samples == whole.samples
-
-
-def test_losses_are_reported_with_converted_samples() -> None:
     batch = published([SENT, replace(SENT, seq=2)])
     plain = JsonEncoding(None, framed=False)
     turned = JsonEncoding(None, framed=False, convention=Convention.NED_FRD)
@@ -178,6 +158,15 @@ def test_losses_are_reported_with_converted_samples() -> None:
     binary = BinaryEncoding(Convention.NED_FRD)
     assert binary.message_bytes == BinaryEncoding.message_bytes
     assert list(binary.encode(batch)) == list(BinaryEncoding().encode(batch.converted(Convention.NED_FRD)))
+
+
+@pytest.mark.parametrize("encoding", [BinaryEncoding(), BinaryEncoding(Convention.NED_FRD), JsonEncoding(None, False)])
+def test_a_batch_of_slots_is_the_batch_of_its_samples(encoding: Encoding) -> None:
+    whole = published([SENT, replace(SENT, seq=2)])
+    packed = Batch("imu0", 0, None, whole.frame, whole.packed)
+    assert (len(packed), packed.seqs, list(packed.times_ns)) == (2, whole.seqs, list(whole.times_ns))
+    assert list(encoding.encode(packed)) == list(encoding.encode(whole))
+    assert packed.samples == whole.samples
 
 
 @in_server()

@@ -6,23 +6,16 @@ import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from imud.publishers.socket.scheduler import ScheduledClient, Scheduler, TokenBucket
-from tests.support.socket_rig import in_context, until
+from tests.support.socket_rig import SteppingClock, in_context, until
 
 CPU_NEW_NS, CPU_PER_S_NS, OVER_TICKS_MAX = 100_000_000, 100_000_000, 100
 
 MS = 1_000_000
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.ns = 80_000 * MS
-
-    def __call__(self) -> int:
-        return self.ns
 
 
 class Worker(ScheduledClient):
@@ -64,7 +57,7 @@ class Worker(ScheduledClient):
 
 class SchedulerBench:
     def __init__(self) -> None:
-        self.clock = Clock()
+        self.clock = SteppingClock()
         self.log: list[str] = []
         self.on_piece: Callable[[], object] = lambda: None
         """Called after each piece."""
@@ -236,7 +229,9 @@ async def test_without_time_for_serving_all_clients_are_served_every_10_ms(rig: 
 
 
 @in_context("rig", scheduling)
-async def test_an_error_ends_only_its_client(rig: SchedulerBench, caplog: pytest.LogCaptureFixture) -> None:
+async def test_errors_end_only_their_client(
+    rig: SchedulerBench, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bad = rig.add("bad", 1, 2, 1000)
     bad.error = RecursionError("deep")
     other = rig.add("other", 1, 3, 1000)
@@ -245,20 +240,26 @@ async def test_an_error_ends_only_its_client(rig: SchedulerBench, caplog: pytest
     await until(lambda: not other.pieces and not bad.pieces)
     assert [str(error) for error in bad.failures] == ["deep"]
     assert not other.failures
+    rig.log.clear()
+    bad = rig.add("bad", 1, 1000, 1000)
+    bad.error = RecursionError("deep")
+    monkeypatch.setattr(bad, "on_failure", Mock(side_effect=ZeroDivisionError))
+    other = rig.add("other", 1, 3, 1000)
+    bad.enqueue()
+    other.enqueue()
+    await until(lambda: not other.pieces)
+    assert rig.log.count("bad") == 1
+    assert "no longer served" in caplog.text
 
 
 @pytest.mark.parametrize("where", ["evict", "on_ready", "wanted_events"])
 @in_context("rig", scheduling)
-async def test_an_error_outside_of_a_piece_ends_only_its_client(
+async def test_an_error_outside_a_piece_ends_its_client(
     rig: SchedulerBench, where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No exception may reach the handler of the event loop, which ends the daemon."""
     bad = rig.add("bad", 1, 10_000 if where == "evict" else 1, 5 * MS)
-
-    def broken(*_: object) -> int:
-        raise ZeroDivisionError(where)
-
-    monkeypatch.setattr(bad, where, broken)
+    monkeypatch.setattr(bad, where, Mock(side_effect=ZeroDivisionError(where)))
     if where == "on_ready":
         rig.socks[1].send(b"x")
     else:
@@ -274,25 +275,6 @@ async def test_an_error_outside_of_a_piece_ends_only_its_client(
     other = rig.add("other", 1, 1, 1000)
     other.enqueue()
     await until(lambda: not other.pieces)
-
-
-@in_context("rig", scheduling)
-async def test_a_client_that_cannot_be_ended_is_not_served_again(
-    rig: SchedulerBench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    bad = rig.add("bad", 1, 1000, 1000)
-    bad.error = RecursionError("deep")
-
-    def broken(_error: Exception) -> None:
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(bad, "on_failure", broken)
-    other = rig.add("other", 1, 3, 1000)
-    bad.enqueue()
-    other.enqueue()
-    await until(lambda: not other.pieces)
-    assert rig.log.count("bad") == 1
-    assert "no longer served" in caplog.text
 
 
 @in_context("rig", scheduling)
