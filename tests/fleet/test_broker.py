@@ -17,7 +17,19 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
-from imud.fleet import broker as fleet_broker
+from imud.fleet.broker import (
+    BrokerError,
+    BrokerTurn,
+    MessageRefused,
+    PacketGuard,
+    PahoConnection,
+    ReaderAccess,
+    Will,
+    check_websocket_buffer,
+    connection_problem,
+    paho_client,
+    properties_of,
+)
 from imud.fleet.reader import ReaderConnection
 from imud.fleet.settings import Broker, MqttOptions, broker_of
 from tests.fleet.authority import Authority
@@ -29,16 +41,16 @@ FIRST_S, PACKET_BYTES, RECEIVED_MAX = 4.0, 16_384, 100
 STABLE_NS, UNREAD_MAX, WEBSOCKET_BYTES = 30_000_000_000, 10_000, 1 << 24
 
 pytestmark = [pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO), pytest.mark.live]
-WILL = fleet_broker.Will("imud/s/g/state", b'{"online":false}')
+WILL = Will("imud/s/g/state", b'{"online":false}')
 
 
-def connect(url: str, **settings: object) -> fleet_broker.PahoConnection:
+def connect(url: str, **settings: object) -> PahoConnection:
     broker = broker_of(url)
     assert broker is not None
-    return fleet_broker.PahoConnection(broker, msgspec.convert(settings, MqttOptions), "gateway", WILL)
+    return PahoConnection(broker, msgspec.convert(settings, MqttOptions), "gateway", WILL)
 
 
-def send(connection: fleet_broker.PahoConnection, payload: bytes = b"{}", topic: str = "imud/s/g/state") -> None:
+def send(connection: PahoConnection, payload: bytes = b"{}", topic: str = "imud/s/g/state") -> None:
     number = connection.publish(topic, payload, "application/json", retain=False)
     for _ in range(1000):
         if number in connection.acknowledged:
@@ -47,7 +59,7 @@ def send(connection: fleet_broker.PahoConnection, payload: bytes = b"{}", topic:
     raise AssertionError(connection.acknowledged)
 
 
-def wait_for_the_end(connection: fleet_broker.PahoConnection) -> None:
+def wait_for_the_end(connection: PahoConnection) -> None:
     """Wait until the connection is lost. Raises BrokerError."""
     for _ in range(60):
         connection.wait(1.0)
@@ -63,7 +75,7 @@ def test_a_message_is_acknowledged_and_the_will_is_published(tmp_path: Path, ver
         taken = connect(f"mqtt://127.0.0.1:{broker.port}")  # same client ID: the broker ends the first connection
         collector.wait_for(lambda: len(collector.messages) == 2)
         assert collector.messages == [("imud/s/g/state", b'{"a":1}'), (WILL.topic, WILL.payload)]
-        with pytest.raises(fleet_broker.BrokerError, match=r"taken over|lost"):
+        with pytest.raises(BrokerError, match=r"taken over|lost"):
             wait_for_the_end(connection)
         for one in (connection, connection, taken, collector):
             one.close()
@@ -77,14 +89,14 @@ LEFT_OPEN = "ignore::pytest.PytestUnraisableExceptionWarning"
 def test_a_stopped_broker_is_detected_and_a_missing_broker_is_named(tmp_path: Path) -> None:
     with running_broker(tmp_path / "broker") as broker:
         url = f"mqtt://127.0.0.1:{broker.port}"
-        with pytest.raises(fleet_broker.BrokerError, match=r"mqtts://127.0.0.1"):
+        with pytest.raises(BrokerError, match=r"mqtts://127.0.0.1"):
             connect(f"mqtts://127.0.0.1:{broker.port}")
         connection = connect(url)
         broker.stop()
-        with pytest.raises(fleet_broker.BrokerError, match=r"lost|ended|reset"):
+        with pytest.raises(BrokerError, match=r"lost|ended|reset"):
             wait_for_the_end(connection)
         connection.close()
-        with pytest.raises(fleet_broker.BrokerError, match=rf"{url}: Connection refused"):
+        with pytest.raises(BrokerError, match=rf"{url}: Connection refused"):
             connect(url)
 
 
@@ -113,9 +125,7 @@ def test_refused_messages_are_named(tmp_path: Path) -> None:
     with running_broker(tmp_path / "broker", *lines) as broker:
         connection = connect(f"mqtt://127.0.0.1:{broker.port}")
         send(connection, bytes(1700))
-        with pytest.raises(
-            fleet_broker.MessageRefused, match=r"at most 2000 bytes, .* imud/s/g/state with 2000: raise"
-        ):
+        with pytest.raises(MessageRefused, match=r"at most 2000 bytes, .* imud/s/g/state with 2000: raise"):
             send(connection, bytes(2000))
         number = connection.publish("imud/s/g/events", b"{}", "application/json", retain=False)
         while not connection.refused:
@@ -136,11 +146,11 @@ def test_user_and_password(tmp_path: Path) -> None:
         connection = connect(url, user="gate", password_file=str(tmp_path / "good"))
         send(connection)
         connection.close()
-        with pytest.raises(fleet_broker.BrokerError, match=r"refuses the connection: Not authorized"):
+        with pytest.raises(BrokerError, match=r"refuses the connection: Not authorized"):
             connect(url, user="gate", password_file=str(tmp_path / "bad"))
-        with pytest.raises(fleet_broker.BrokerError, match=r"refuses the connection"):
+        with pytest.raises(BrokerError, match=r"refuses the connection"):
             connect(url, version="3.1.1")
-        with pytest.raises(fleet_broker.BrokerError, match=r"none: No such file or directory"):
+        with pytest.raises(BrokerError, match=r"none: No such file or directory"):
             connect(url, user="gate", password_file=str(tmp_path / "none"))
 
 
@@ -155,14 +165,14 @@ def test_tls_with_certificates_of_both_sides(tmp_path: Path, authority: Authorit
         connection = connect(f"mqtts://127.0.0.1:{port}", ca_file=authority["ca.pem"], **own)
         send(connection, b"x" * 200_000)
         connection.close()
-        with pytest.raises(fleet_broker.BrokerError, match=r"(?i)self[- ]signed certificate"):
+        with pytest.raises(BrokerError, match=r"(?i)self[- ]signed certificate"):
             connect(f"mqtts://127.0.0.1:{port}", **own)
-        with pytest.raises(fleet_broker.BrokerError):
+        with pytest.raises(BrokerError):
             connect(f"mqtts://127.0.0.1:{port}", ca_file=authority["ca.pem"])
-        with pytest.raises(fleet_broker.BrokerError, match=r"(?i)hostname mismatch|not valid for"):
+        with pytest.raises(BrokerError, match=r"(?i)hostname mismatch|not valid for"):
             connect(f"mqtts://localhost:{port}", ca_file=authority["ca.pem"], **own)
         with pytest.raises(
-            fleet_broker.BrokerError,
+            BrokerError,
             match="without a reply; check the log of the broker, and whether the port requires TLS",
         ):
             connect(f"mqtt://127.0.0.1:{port}")
@@ -182,7 +192,7 @@ def test_websockets_without_and_with_tls(tmp_path: Path, authority: Authority, m
             connection = connect(f"wss://127.0.0.1:{tls_port}", ca_file=authority["ca.pem"], **own)
             send(connection, b"x" * 200_000)
             connection.close()
-            with pytest.raises(fleet_broker.BrokerError, match=r"(?i)self[- ]signed certificate"):
+            with pytest.raises(BrokerError, match=r"(?i)self[- ]signed certificate"):
                 connect(f"wss://127.0.0.1:{tls_port}", **own)
             monkeypatch.setenv("SSL_CERT_FILE", authority["ca.pem"])  # the certificates of the host
             connect(f"wss://127.0.0.1:{tls_port}", **own).close()
@@ -228,14 +238,12 @@ def scripted(*replies: bytes) -> Iterator[Broker]:
         listener.close()
 
 
-def gateway(broker: Broker) -> fleet_broker.PahoConnection:
-    return fleet_broker.PahoConnection(
-        broker, MqttOptions(user="without-password"), "gateway", fleet_broker.Will("imud/s/g/state", b"{}")
-    )
+def gateway(broker: Broker) -> PahoConnection:
+    return PahoConnection(broker, MqttOptions(user="without-password"), "gateway", Will("imud/s/g/state", b"{}"))
 
 
 async def reader(broker: Broker) -> ReaderConnection:
-    return await ReaderConnection.open(broker, fleet_broker.ReaderAccess(), "reader", ["imud/#"], 0)
+    return await ReaderConnection.open(broker, ReaderAccess(), "reader", ["imud/#"], 0)
 
 
 @pytest.mark.parametrize(
@@ -253,11 +261,13 @@ def test_a_reader_names_the_refusal_of_a_broker(replies: tuple[bytes, ...], word
             while await connection.next(LIMIT_S) is not None:
                 pass
 
-    with scripted(*replies) as broker, pytest.raises(fleet_broker.BrokerError, match=words):
+    with scripted(*replies) as broker, pytest.raises(BrokerError, match=words):
         asyncio.run(run(broker))
 
 
-def test_a_reader_counts_messages_that_cannot_be_acknowledged() -> None:
+def test_a_reader_counts_messages_without_acknowledgement_and_waits_a_limited_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     async def run(broker: Broker) -> None:
         with closing(await reader(broker)) as connection:
             while not connection.refused:
@@ -266,25 +276,18 @@ def test_a_reader_counts_messages_that_cannot_be_acknowledged() -> None:
 
     with scripted(CONNACK, SUBACK + QOS_0) as broker:
         asyncio.run(run(broker))
-
-
-def test_a_reader_waits_a_limited_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ReaderConnection._until, "__defaults__", (0.01,))
-    with scripted(b"\x20") as broker, pytest.raises(fleet_broker.BrokerError, match="no answer within"):
+    with scripted(b"\x20") as broker, pytest.raises(BrokerError, match="no answer within"):
         asyncio.run(reader(broker))
 
 
-def test_a_gateway_names_the_refusal_of_a_broker(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    with (
-        scripted(NOT_AUTHORIZED) as broker,
-        pytest.raises(fleet_broker.BrokerError, match="refuses the connection: Not authorized"),
-    ):
+def test_a_gateway_names_the_refusal(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    refused = pytest.raises(BrokerError, match="refuses the connection: Not authorized")
+    with scripted(NOT_AUTHORIZED) as broker, refused:
         gateway(broker)
-    with scripted(b"") as broker, pytest.raises(fleet_broker.BrokerError, match=broker.name):
+    with scripted(b"") as broker, pytest.raises(BrokerError, match=broker.name):
         gateway(broker)
-    ended = pytest.raises(fleet_broker.BrokerError, match="the broker ended the connection: Server shutting down")
+    ended = pytest.raises(BrokerError, match="the broker ended the connection: Server shutting down")
     with scripted(CONNACK + SHUTTING_DOWN) as broker, ended, closing(gateway(broker)) as connection:
         connection.wait(LIMIT_S)
     with scripted(CONNACK, NO_SUBACK) as broker, closing(gateway(broker)) as connection:
@@ -293,18 +296,16 @@ def test_a_gateway_names_the_refusal_of_a_broker(
     assert "the broker refuses to send requests: Not authorized" in caplog.text
     monkeypatch.setattr("imud.fleet.broker.LOOK_S", 0.01)
     monkeypatch.setattr("imud.fleet.broker.CONNECT_S", 0.02)
-    with scripted(b"\x20") as broker, pytest.raises(fleet_broker.BrokerError, match="no answer within"):
+    with scripted(b"\x20") as broker, pytest.raises(BrokerError, match="no answer within"):
         gateway(broker)
 
 
 def test_a_gateway_keeps_the_limits_of_the_broker() -> None:
     with scripted(TWO_AT_A_TIME) as broker, closing(gateway(broker)) as connection:
         assert connection.in_flight_max == 2
-        with pytest.raises(fleet_broker.BrokerError, match="the output ends"):
-            fleet_broker.PahoConnection(
-                broker, msgspec.convert({}, MqttOptions), "gateway", fleet_broker.Will("t", b""), lambda: False
-            )
-    too_long = pytest.raises(fleet_broker.MessageRefused, match="at most 100 bytes, got a message of t with 100")
+        with pytest.raises(BrokerError, match="the output ends"):
+            PahoConnection(broker, msgspec.convert({}, MqttOptions), "gateway", Will("t", b""), lambda: False)
+    too_long = pytest.raises(MessageRefused, match="at most 100 bytes, got a message of t with 100")
     with scripted(AT_MOST_100_BYTES) as broker, too_long, closing(gateway(broker)) as connection:
         connection.publish("t", bytes(100), "", retain=False)
 
@@ -320,58 +321,51 @@ def of_tls(authority: Authority) -> MqttOptions:
     )  # fmt: skip
 
 
-def test_a_password_file_has_the_password_in_its_first_line(tmp_path: Path) -> None:
+def test_password_files_and_keys_with_a_passphrase(tmp_path: Path, authority: Authority) -> None:
     secret = tmp_path / "password"
     secret.write_text("first line\r\nsecond\n")
     settings = MqttOptions(user="reader", password_file=str(secret))
-    client = fleet_broker.paho_client(BROKER, settings, "one", is_v5=True, packet_bytes=99, manual_ack=True)
+    client = paho_client(BROKER, settings, "one", is_v5=True, packet_bytes=99, manual_ack=True)
     assert (client.username, client.password) == ("reader", "first line")
     secret.write_bytes(b"\xff\n")
     with pytest.raises(ValueError, match=f"^password_file {secret}: expected text in UTF-8"):
-        fleet_broker.paho_client(BROKER, settings, "one", is_v5=True, packet_bytes=99)
-
-
-@pytest.mark.parametrize("name", ["password_file", "ca_file", "cert_file", "key_file"])
-def test_a_file_that_cannot_be_read_is_named_with_its_key(tmp_path: Path, authority: Authority, name: str) -> None:
-    path = tmp_path / "absent"
-    settings = msgspec.structs.replace(of_tls(authority), **{name: str(path)})
-    with pytest.raises(ValueError, match=f"^{name} {path}: No such file or directory$"):
-        fleet_broker.paho_client(TLS_BROKER, settings, "one", is_v5=True, packet_bytes=99)
-    path.mkdir()
-    with pytest.raises(ValueError, match=f"^{name} {path}: Is a directory$"):
-        fleet_broker.paho_client(TLS_BROKER, settings, "one", is_v5=True, packet_bytes=99)
-
-
-@pytest.mark.parametrize("name", ["ca_file", "cert_file", "key_file"])
-def test_an_invalid_certificate_or_key_file_is_named(tmp_path: Path, authority: Authority, name: str) -> None:
-    path = tmp_path / "garbage"
-    path.write_text("no certificate\n")
-    settings = msgspec.structs.replace(of_tls(authority), **{name: str(path)})
-    with pytest.raises(ValueError, match=rf"{name} {path}.*: expected .* \(PEM\)"):
-        fleet_broker.paho_client(TLS_BROKER, settings, "one", is_v5=True, packet_bytes=99)
-
-
-def test_a_key_with_a_passphrase_is_rejected_without_a_prompt(tmp_path: Path, authority: Authority) -> None:
+        paho_client(BROKER, settings, "one", is_v5=True, packet_bytes=99)
     locked = tmp_path / "locked.key"
     words = ["openssl", "rsa", "-aes256", "-passout", "pass:x", "-in", authority["gateway.key"], "-out", str(locked)]
     subprocess.run(words, check=True, capture_output=True)
     settings = msgspec.structs.replace(of_tls(authority), key_file=str(locked))
     with pytest.raises(ValueError, match=r"^key_file: expected a key without a passphrase"):
-        fleet_broker.paho_client(TLS_BROKER, settings, "one", is_v5=True, packet_bytes=99)
+        paho_client(TLS_BROKER, settings, "one", is_v5=True, packet_bytes=99)
+
+
+@pytest.mark.parametrize("name", ["password_file", "ca_file", "cert_file", "key_file"])
+def test_a_file_that_cannot_be_used_is_named_with_its_key(tmp_path: Path, authority: Authority, name: str) -> None:
+    path = tmp_path / "absent"
+    settings = msgspec.structs.replace(of_tls(authority), **{name: str(path)})
+    with pytest.raises(ValueError, match=f"^{name} {path}: No such file or directory$"):
+        paho_client(TLS_BROKER, settings, "one", is_v5=True, packet_bytes=99)
+    path.mkdir()
+    with pytest.raises(ValueError, match=f"^{name} {path}: Is a directory$"):
+        paho_client(TLS_BROKER, settings, "one", is_v5=True, packet_bytes=99)
+    if name != "password_file":
+        path.rmdir()
+        path.write_text("no certificate\n")
+        with pytest.raises(ValueError, match=rf"{name} {path}.*: expected .* \(PEM\)"):
+            paho_client(TLS_BROKER, settings, "one", is_v5=True, packet_bytes=99)
 
 
 def test_problems_and_properties() -> None:
     error = ssl.SSLCertVerificationError("certificate verify failed")
     error.verify_message = "self-signed certificate"
-    assert fleet_broker.connection_problem(error) == "self-signed certificate"
-    assert fleet_broker.properties_of("CONNECT", ReceiveMaximum=7).ReceiveMaximum == 7
+    assert connection_problem(error) == "self-signed certificate"
+    assert properties_of("CONNECT", ReceiveMaximum=7).ReceiveMaximum == 7
 
 
 TOPIC = b"\x00\x01t"
 
 
 def use_gateway(broker: Broker) -> None:
-    with closing(fleet_broker.PahoConnection(broker, MqttOptions(), "me", fleet_broker.Will("t", b""))) as connection:
+    with closing(PahoConnection(broker, MqttOptions(), "me", Will("t", b""))) as connection:
         while True:
             connection.wait(60.0)
 
@@ -394,7 +388,7 @@ HOSTILE = {
 @pytest.mark.parametrize("use", [use_gateway, use_reader])
 @pytest.mark.parametrize("words", HOSTILE)
 def test_packets_that_could_fill_the_memory_end_the_connection(words: str, use: Callable[[Broker], None]) -> None:
-    with scripted(HOSTILE[words]) as broker, pytest.raises(fleet_broker.BrokerError, match=words):
+    with scripted(HOSTILE[words]) as broker, pytest.raises(BrokerError, match=words):
         use(broker)
 
 
@@ -402,19 +396,12 @@ def test_packets_that_could_fill_the_memory_end_the_connection(words: str, use: 
 def test_messages_that_imud_did_not_request_end_the_connection(head: bytes) -> None:
     message = b"\x30\x05" + TOPIC + b"\x00x"
     data = head + message * (RECEIVED_MAX + 1)
-    with scripted(data) as broker, pytest.raises(fleet_broker.BrokerError, match="message that imud did not request"):
+    with scripted(data) as broker, pytest.raises(BrokerError, match="message that imud did not request"):
         use_gateway(broker)
 
 
-def test_a_long_websocket_frame_ends_the_connection() -> None:
-    fleet_broker.check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES)))
-    fleet_broker.check_websocket_buffer(SimpleNamespace())  # a connection without WebSocket
-    with pytest.raises(ValueError, match="WebSocket frame of at most"):
-        fleet_broker.check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES + 1)))
-
-
-def test_the_guard_finds_packets_in_any_pieces() -> None:
-    guard = fleet_broker.PacketGuard(PACKET_BYTES)
+def test_long_packets_and_websocket_frames_are_detected_in_any_pieces() -> None:
+    guard = PacketGuard(PACKET_BYTES)
     data = b"\x32\x80\x01" + b"\x34" * 128 + b"\xd0\x00"
     for at in range(len(data)):
         guard.take(data[at : at + 1], is_writing=False)
@@ -423,38 +410,35 @@ def test_the_guard_finds_packets_in_any_pieces() -> None:
     with pytest.raises(ValueError, match="does not read"):
         guard.take(b"\xc0\x00" * (UNREAD_MAX + 1), is_writing=True)
     with pytest.raises(ValueError, match="at most 10 bytes"):
-        fleet_broker.PacketGuard(10).take(b"\x30\x0b", is_writing=False)
-    fleet_broker.PacketGuard(10).take(b"\x30\x0a", is_writing=False)
+        PacketGuard(10).take(b"\x30\x0b", is_writing=False)
+    PacketGuard(10).take(b"\x30\x0a", is_writing=False)
+    check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES)))
+    check_websocket_buffer(SimpleNamespace())  # a connection without WebSocket
+    with pytest.raises(ValueError, match="WebSocket frame of at most"):
+        check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES + 1)))
 
 
 A, B = (Broker(name, 1883, False, False, "") for name in "ab")
 
 
-def longest(_low: float = 0.0) -> float:
-    return 1.0
-
-
-def test_pauses_double_up_to_the_maximum() -> None:
-    turn = fleet_broker.BrokerTurn([A], 60.0, longest)
+def test_pauses_double_up_to_the_maximum_and_brokers_take_turns() -> None:
+    turn = BrokerTurn([A], 60.0, lambda: 1.0)
     assert [turn.failed(0) for _ in range(6)] == [4.0, 8.0, 16.0, 32.0, 60.0, 60.0]
     for _ in range(1100):  # 2.0 to the power of this number exceeds a float
         assert turn.failed(0) == 60.0
     draw = random.Random(25).random
-    pauses = [fleet_broker.BrokerTurn([A], 60.0, draw).failed(0) for _ in range(500)]
+    pauses = [BrokerTurn([A], 60.0, draw).failed(0) for _ in range(500)]
     in_second = [sum(second <= pause < second + 1 for pause in pauses) for second in range(4)]
     assert sum(in_second) == 500
     assert max(in_second) < 170
-
-
-def test_brokers_take_turns() -> None:
-    turn = fleet_broker.BrokerTurn([A, B], 60.0, longest)
+    turn = BrokerTurn([A, B], 60.0, lambda: 1.0)
     seen, pauses = [], []
     for _ in range(4):
         seen.append(turn.broker)
         pauses.append(turn.failed(0))
     assert seen == [A, B, A, B]
     assert pauses == [4.0, 4.0, 8.0, 8.0]
-    turn = fleet_broker.BrokerTurn([A, B], 60.0, longest)
+    turn = BrokerTurn([A, B], 60.0, lambda: 1.0)
     turn.failed(0)
     assert turn.broker == B
     turn.connected(0)
@@ -466,7 +450,7 @@ def test_brokers_take_turns() -> None:
 
 @pytest.mark.parametrize(("held_ns", "pause_s"), [(STABLE_NS, FIRST_S), (STABLE_NS - 1, 32.0)])
 def test_only_a_stable_connection_resets_the_pause(held_ns: int, pause_s: float) -> None:
-    turn = fleet_broker.BrokerTurn([A], 60.0, longest)
+    turn = BrokerTurn([A], 60.0, lambda: 1.0)
     for _ in range(3):
         turn.failed(0)
     turn.connected(0)

@@ -50,9 +50,7 @@ def batch(first: int, count: int = 100, device: str = "bow", *, whole: bool = Tr
 
 
 class SpoolBench:
-    def __init__(
-        self, path: Path, kilobytes: int = 100_000, hours: float = 100.0, *, newest_first: bool = False
-    ) -> None:
+    def __init__(self, path: Path, kilobytes: int = 100_000, hours: float = 100, *, newest_first: bool = False) -> None:
         self.spool = spool.Spool(path, kilobytes * 1000, round(hours * HOUR_NS), newest_first=newest_first)
         self.spool.open()
         self.now_ns = 0
@@ -284,7 +282,7 @@ def test_the_reserve_is_created_again_when_the_disk_has_room(small_disk: Path) -
     assert reserve.stat().st_size > 100_000
 
 
-def test_a_damaged_file_is_renamed(tmp_path: Path) -> None:
+def test_a_damaged_file_and_a_file_with_the_maximum_row_id_are_renamed(tmp_path: Path) -> None:
     (tmp_path / spool.FILE).write_bytes(b"This is no database at all, and it is long enough to be seen as none." * 100)
     bench = SpoolBench(tmp_path)
     assert bench.spool.set_aside == str(tmp_path / "spool.db.damaged")
@@ -293,6 +291,15 @@ def test_a_damaged_file_is_renamed(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(spool.SpoolError, match="file"):
         spool.Spool(tmp_path / "file" / "spool", 1_000_000, HOUR_NS).open()
+    folder = tmp_path / "maximum"
+    bench = SpoolBench(folder)
+    bench.commit(batch(1))
+    bench.spool.close()
+    damage(folder, "id = 9223372036854775807", "id = 1")
+    again = SpoolBench(folder)
+    again.commit(batch(101))
+    assert again.spool.set_aside
+    assert [row.first for row in again.all()] == [101]
 
 
 def test_a_file_that_is_damaged_later_is_renamed_at_the_next_attempt(tmp_path: Path) -> None:
@@ -363,7 +370,7 @@ def test_a_damaged_row_does_not_affect_other_rows(tmp_path: Path, change: str, k
     assert again.spool.dropped["damaged"]
 
 
-def test_a_damaged_row_with_known_numbers_becomes_a_dropped_message(tmp_path: Path) -> None:
+def test_damaged_rows_are_dropped_or_deleted_and_damaged_positions_ignored(tmp_path: Path) -> None:
     bench = SpoolBench(tmp_path)
     bench.commit(*(batch(100 * number + 1) for number in range(3)))
     damage(tmp_path, "payload = 17")
@@ -371,36 +378,19 @@ def test_a_damaged_row_with_known_numbers_becomes_a_dropped_message(tmp_path: Pa
     assert (counts.whole, counts.dropped, counts.missing) == (200, {"damaged": 100}, 0)
     assert bench.counts() == counts, "the note is stored, and counts once"
     assert (bench.spool.dropped, bench.spool.messages) == ({"damaged": 100}, 3)
-
-
-def test_messages_after_deleted_damaged_rows_are_given(tmp_path: Path) -> None:
-    bench = SpoolBench(tmp_path)
+    bench = SpoolBench(tmp_path / "deleted")
     bench.commit(*(batch(100 * number + 1) for number in range(4)))
-    damage(tmp_path, "topic = ''", "id <= 2")
+    damage(tmp_path / "deleted", "topic = ''", "id <= 2")
     assert [row.first for row in bench.spool.after(2)] == [201, 301]
     assert bench.spool.messages == 2
-
-
-def test_a_damaged_position_is_ignored(tmp_path: Path) -> None:
-    bench = SpoolBench(tmp_path)
+    bench = SpoolBench(tmp_path / "position")
     bench.commit(batch(1), batch(1, device="stern"))
-    damage(tmp_path, "stored_utc_ns = 'never', boot = CAST(x'ff' AS TEXT)", "device = 'stern'", "progress")
+    damage(tmp_path / "position", "stored_utc_ns = 'never', boot = CAST(x'ff' AS TEXT)", "device = 'stern'", "progress")
     bench.commit(batch(101))
     assert [(one.device, one.last) for one in bench.spool.positions()] == [("bow", 200)]
 
 
-def test_a_file_with_the_maximum_row_id_is_renamed(tmp_path: Path) -> None:
-    bench = SpoolBench(tmp_path)
-    bench.commit(batch(1))
-    bench.spool.close()
-    damage(tmp_path, "id = 9223372036854775807", "id = 1")
-    again = SpoolBench(tmp_path)
-    again.commit(batch(101))
-    assert again.spool.set_aside
-    assert [row.first for row in again.all()] == [101]
-
-
-def test_positions_belong_to_one_name_of_the_gateway(tmp_path: Path) -> None:
+def test_positions_and_dropped_messages_belong_to_one_name_of_the_gateway(tmp_path: Path) -> None:
     old = spool.Spool(tmp_path, 1 << 30, HOUR_NS, gateway="gw")
     old.open()
     old.commit([batch(1)], (), 1, UTC_NS)
@@ -412,17 +402,12 @@ def test_positions_belong_to_one_name_of_the_gateway(tmp_path: Path) -> None:
     new.commit([row._replace(topic=row.topic.replace("gw", "other"))], (), 1, UTC_NS)
     assert [(one.begin, one.last) for one in new.positions()] == [(101, 200)]
     new.close()
-
-
-def test_dropped_messages_of_two_gateway_names_are_not_joined(tmp_path: Path) -> None:
-    bench = SpoolBench(tmp_path, hours=1)
+    bench = SpoolBench(tmp_path / "dropped", hours=1)
     first, second = batch(1), batch(101)
     bench.commit(first, second._replace(topic=second.topic.replace("gw", "other")))
     bench.commit(utc_ns=UTC_NS + 2 * HOUR_NS)
-    assert [(row.gateway, row.first, row.last, row.kind) for row in bench.spool.after(9)] == [
-        ("gw", 1, 100, "dropped"),
-        ("other", 101, 200, "dropped"),
-    ]
+    found = [(row.gateway, row.first, row.last, row.kind) for row in bench.spool.after(9)]
+    assert found == [("gw", 1, 100, "dropped"), ("other", 101, 200, "dropped")]
 
 
 def test_the_streams_of_the_maximum_number_of_devices_keep_their_begin(tmp_path: Path) -> None:
@@ -435,18 +420,20 @@ def test_the_streams_of_the_maximum_number_of_devices_keep_their_begin(tmp_path:
     assert {(one.begin, one.last) for one in positions} == {(1, 2)}
 
 
-FOREIGN = (None, 1.5, "text", b"\xff", -1, 1 << 63)  # values that SQLite can return in any column
-
-
-def test_a_row_survives_storing() -> None:
+def test_a_row_survives_storing_and_its_numbers_are_checked() -> None:
     assert spool.undamaged_row(tuple(batch(1))) == batch(1)
     assert spool.undamaged_row(tuple(batch(7, 1, whole=False))) == batch(7, 1, whole=False)
+    message = decode_message(batch(1).payload)
+    for name, value in (("first", 2), ("last", 99), ("boot", "2"), ("device", "stern"), ("gateway", "other")):
+        other = msgspec.structs.replace(message, kind=MessageKind.EVENTS, samples=[], **{name: value})
+        row = spool.row_of(batch(1).topic, Stream.SAMPLES, message, msgspec.json.encode(other), 0)
+        assert spool.undamaged_row(tuple(row)) is None, name
 
 
 @pytest.mark.parametrize("column", spool.SpoolRow._fields[1:])
 def test_a_column_of_another_type_is_detected_or_harmless(column: str) -> None:
     """Any number is a valid time. No sent message contains `items`."""
-    for value in FOREIGN:
+    for value in (None, 1.5, "text", b"\xff", -1, 1 << 63):  # values that SQLite can return in any column
         row = spool.undamaged_row(tuple(value if name == column else one for name, one in batch(1)._asdict().items()))
         assert row is None or column in ("stored_utc_ns", "items"), value
 
@@ -467,14 +454,6 @@ def test_a_row_with_known_numbers_becomes_a_dropped_message(column: str) -> None
 def test_a_row_with_inconsistent_numbers_does_not_become_a_dropped_message(change: dict[str, object]) -> None:
     """A `dropped` message with wrong numbers would make other messages duplicates."""
     assert spool.repaired_row([change.get(name, one) for name, one in batch(101)._asdict().items()]) is None
-
-
-def test_the_numbers_of_the_payload_are_checked() -> None:
-    message = decode_message(batch(1).payload)
-    for name, value in (("first", 2), ("last", 99), ("boot", "2"), ("device", "stern"), ("gateway", "other")):
-        other = msgspec.structs.replace(message, kind=MessageKind.EVENTS, samples=[], **{name: value})
-        row = spool.row_of(batch(1).topic, Stream.SAMPLES, message, msgspec.json.encode(other), 0)
-        assert spool.undamaged_row(tuple(row)) is None, name
 
 
 def test_positions() -> None:

@@ -34,12 +34,12 @@ HOUR_NS = 3600 * NS_PER_S
 
 
 class FailingSpool(Spool):
-    fails = False
+    fails, new_max = False, 1000
 
-    def commit(self, new: object, acknowledged: object, now_ns: int, utc_ns: int) -> None:
-        if self.fails:
+    def commit(self, new: Any, acknowledged: Any, now_ns: int, utc_ns: int) -> None:
+        if self.fails or len(new) > self.new_max:
             raise SpoolError("No space left on device")
-        super().commit(new, acknowledged, now_ns, utc_ns)  # type: ignore[arg-type]
+        super().commit(new, acknowledged, now_ns, utc_ns)
 
 
 class WriterBench:
@@ -69,9 +69,8 @@ class WriterBench:
         made = []
         for n in range(count):
             self.seq += 1
-            made.append(
-                Sample("bow", self.seq, base_ns + n * NS_PER_MS, 0, Sync.EDGE, 0, 0, accel_m_s2=(self.seq / 3, 0, 1))
-            )
+            t_ns = base_ns + n * NS_PER_MS
+            made.append(Sample("bow", self.seq, t_ns, 0, Sync.EDGE, 0, 0, accel_m_s2=(self.seq / 3, 0, 1)))
         self.queue.put_batch(Batch("bow", 0, made))
         self.clock.advance(count * NS_PER_MS)
 
@@ -84,10 +83,8 @@ class WriterBench:
             self.clock.advance(COMMIT_NS)
 
     def arrived(self) -> list[bytes]:
-        rows = []
-        for connection in self.broker.connections:
-            rows += [payload for topic, payload, retain in connection.sent if not retain]
-        return rows
+        connections = self.broker.connections
+        return [payload for each in connections for topic, payload, retain in each.sent if not retain]
 
     def counts(self) -> StreamCounts:
         ledger = FleetLedger(from_begin=True)
@@ -233,7 +230,7 @@ def test_samples_without_room_are_counted_and_reported(tmp_path: Path) -> None:
     assert bench.counts() == StreamCounts(1, 26_000, whole=21_000, dropped={"queue": 5000})
 
 
-def test_a_short_failure_of_the_disk_loses_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_short_failure_and_a_full_disk_lose_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     bench = WriterBench(tmp_path)
     bench.put(1000)
     bench.work()
@@ -249,17 +246,8 @@ def test_a_short_failure_of_the_disk_loses_nothing(tmp_path: Path, caplog: pytes
     bench.disk.fails = True
     bench.writer.close()
     assert "2 messages are lost at the end because the spool failed: No space left" in caplog.text
-
-
-class TightSpool(Spool):
-    def commit(self, new: Any, acknowledged: Any, now_ns: int, utc_ns: int) -> None:
-        if len(new) > 1:
-            raise SpoolError("database or disk is full")
-        super().commit(new, acknowledged, now_ns, utc_ns)
-
-
-def test_waiting_messages_are_stored_one_by_one_on_a_full_disk(tmp_path: Path) -> None:
-    bench = WriterBench(tmp_path, spool=TightSpool(tmp_path, 100_000_000, HOUR_NS))
+    bench = WriterBench(tmp_path / "full")
+    bench.disk.new_max = 1
     bench.put(5000)
     bench.workers[0].work()
     assert bench.writer.problem
@@ -328,6 +316,21 @@ def test_events_of_the_gateway_and_of_devices(tmp_path: Path) -> None:
     bench.work(4)
     topics = [topic for connection in bench.broker.connections for topic, _, _ in connection.sent]
     assert topics == ["imud/site/gw/events", "imud/site/gw/bow/events"]
+    bench = WriterBench(tmp_path / "limited", queue=WriterQueue(events_max=2))
+    for _ in range(2):
+        for device in ("bow", "", "bow", "bow", "", "bow"):
+            bench.queue.put_event(Event(bench.clock.now_ns(), device, EventKind.LINK, "x"))
+        bench.work(4)
+    ledgers = FleetLedger(from_begin=True)
+    for payload in bench.arrived():
+        ledgers.take(decode_message(payload), Stream.EVENTS)
+    counts = {key.device: one for key, one in ledgers.counts.items()}
+    assert counts == {
+        "bow": StreamCounts(1, 8, whole=2, dropped={"queue": 6}),
+        "": StreamCounts(1, 4, whole=2, dropped={"queue": 2}),
+    }
+    assert bench.queue.dropped == 8
+    bench.writer.close()
 
 
 def test_the_queues_of_events_and_states_are_limited() -> None:
@@ -348,24 +351,6 @@ def test_the_queues_of_events_and_states_are_limited() -> None:
     queue.put_state(SentState({"b": device_status("b", 1)}, {"a": None}))
     assert queue.take() == SentState({"b": device_status("b", 1)}, {"c": 999, "a": None})
     assert (queue.take(), queue.dropped) == (None, 0)
-
-
-def test_events_without_room_keep_their_numbers(tmp_path: Path) -> None:
-    bench = WriterBench(tmp_path, queue=WriterQueue(events_max=2))
-    for _ in range(2):
-        for device in ("bow", "", "bow", "bow", "", "bow"):
-            bench.queue.put_event(Event(bench.clock.now_ns(), device, EventKind.LINK, "x"))
-        bench.work(4)
-    ledgers = FleetLedger(from_begin=True)
-    for payload in bench.arrived():
-        ledgers.take(decode_message(payload), Stream.EVENTS)
-    counts = {key.device: one for key, one in ledgers.counts.items()}
-    assert counts == {
-        "bow": StreamCounts(1, 8, whole=2, dropped={"queue": 6}),
-        "": StreamCounts(1, 4, whole=2, dropped={"queue": 2}),
-    }
-    assert bench.queue.dropped == 8
-    bench.writer.close()
 
 
 LIFTED_NS = 1_750_000_000 * NS_PER_S  # time to which systemd sets a clock without a battery: after 2020, but wrong
