@@ -71,9 +71,6 @@ def test_each_number_counts_once_and_is_delivered_once() -> None:
     assert counts == StreamCounts(1, 12, whole=12, duplicates=13)
     ledger.take(message(1, 3, boot="2"), Stream.SAMPLES)
     assert [one.whole for one in ledger.counts.values()] == [12, 3]
-
-
-def test_a_duplicate_fills_no_gap() -> None:
     counts = counts_of(message(3, 4), message(8, 9), message(4, 4), message(8, 8), message(5, 7), message(5, 7))
     assert counts == StreamCounts(1, 9, whole=7, missing=2, duplicates=5)
 
@@ -107,13 +104,18 @@ def test_old_boots_leave_the_ledger_of_the_gateway_with_the_most_streams(monkeyp
     assert ledger.take(good[0], Stream.SAMPLES) is None, "the ledger still recognizes duplicates"
 
 
-def test_the_sum_of_duplicates_is_limited() -> None:
+def test_duplicates_are_limited_and_a_stored_ledger_does_not_change() -> None:
     ledger, long = FleetLedger(), message(1, 1, MessageKind.DROPPED)
     long = msgspec.structs.replace(long, last=NUMBER_MOST - 1)
     for _ in range(9):
         ledger.take(long, Stream.SAMPLES)
     assert ledger.counts[key_of(long, Stream.SAMPLES)].duplicates == NUMBER_MOST
     assert msgspec.json.encode(ledger.stored(key_of(long, Stream.SAMPLES)))
+    ledger = FleetLedger()
+    ledger.take(message(1, 4, MessageKind.DROPPED), Stream.SAMPLES)
+    stored = ledger.stored(KEY)
+    ledger.take(message(5, 9, MessageKind.DROPPED), Stream.SAMPLES)
+    assert stored == StoredAccount(StreamCounts(1, 4, dropped={"space": 4}), [])
 
 
 SET = GatewayClock(0, UTC_NS, synchronised=True, error_ns=40)
@@ -208,7 +210,7 @@ def account_of(positions: SpoolPositions, ledger: FleetLedger) -> tuple[int, int
     return account.sent, account.received, account.in_spool
 
 
-def test_numbers_spooled_before_the_first_state_count_only_with_from_begin() -> None:
+def test_the_spooled_numbers_follow_the_states() -> None:
     positions, ledger = SpoolPositions(), FleetLedger()
     positions.take("gw", state(40))
     assert account_of(positions, ledger) == (0, 0, 0)
@@ -219,9 +221,6 @@ def test_numbers_spooled_before_the_first_state_count_only_with_from_begin() -> 
     positions = SpoolPositions(from_begin=True)
     positions.take("gw", state(40))
     assert account_of(positions, FleetLedger()) == (40, 0, 40)
-
-
-def test_an_old_state_does_not_reduce_the_positions() -> None:
     positions, ledger = SpoolPositions(), FleetLedger()
     ledger.take(message(1, 30), Stream.SAMPLES)
     positions.take("gw", state(50))
@@ -314,14 +313,6 @@ def test_the_number_of_positions_is_limited(monkeypatch: pytest.MonkeyPatch) -> 
     for boot in ("1", "2", "1", "3"):
         positions.take("gw", state(5, boot))
     assert [key.boot for key in positions.accounts(FleetLedger())] == ["1", "3"]
-
-
-def test_a_stored_ledger_does_not_change() -> None:
-    ledger = FleetLedger()
-    ledger.take(message(1, 4, MessageKind.DROPPED), Stream.SAMPLES)
-    stored = ledger.stored(KEY)
-    ledger.take(message(5, 9, MessageKind.DROPPED), Stream.SAMPLES)
-    assert stored == StoredAccount(StreamCounts(1, 4, dropped={"space": 4}), [])
 
 
 def test_the_size_of_the_stored_states_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:

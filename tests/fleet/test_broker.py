@@ -17,19 +17,8 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
-from imud.fleet.broker import (
-    BrokerError,
-    BrokerTurn,
-    MessageRefused,
-    PacketGuard,
-    PahoConnection,
-    ReaderAccess,
-    Will,
-    check_websocket_buffer,
-    connection_problem,
-    paho_client,
-    properties_of,
-)
+from imud.fleet import broker as fleet_broker
+from imud.fleet.broker import BrokerError, BrokerTurn, MessageRefused, PahoConnection, Will, paho_client
 from imud.fleet.reader import ReaderConnection
 from imud.fleet.settings import Broker, MqttOptions, broker_of
 from tests.fleet.authority import Authority
@@ -243,7 +232,7 @@ def gateway(broker: Broker) -> PahoConnection:
 
 
 async def reader(broker: Broker) -> ReaderConnection:
-    return await ReaderConnection.open(broker, ReaderAccess(), "reader", ["imud/#"], 0)
+    return await ReaderConnection.open(broker, fleet_broker.ReaderAccess(), "reader", ["imud/#"], 0)
 
 
 @pytest.mark.parametrize(
@@ -357,8 +346,8 @@ def test_a_file_that_cannot_be_used_is_named_with_its_key(tmp_path: Path, author
 def test_problems_and_properties() -> None:
     error = ssl.SSLCertVerificationError("certificate verify failed")
     error.verify_message = "self-signed certificate"
-    assert connection_problem(error) == "self-signed certificate"
-    assert properties_of("CONNECT", ReceiveMaximum=7).ReceiveMaximum == 7
+    assert fleet_broker.connection_problem(error) == "self-signed certificate"
+    assert fleet_broker.properties_of("CONNECT", ReceiveMaximum=7).ReceiveMaximum == 7
 
 
 TOPIC = b"\x00\x01t"
@@ -401,7 +390,7 @@ def test_messages_that_imud_did_not_request_end_the_connection(head: bytes) -> N
 
 
 def test_long_packets_and_websocket_frames_are_detected_in_any_pieces() -> None:
-    guard = PacketGuard(PACKET_BYTES)
+    guard = fleet_broker.PacketGuard(PACKET_BYTES)
     data = b"\x32\x80\x01" + b"\x34" * 128 + b"\xd0\x00"
     for at in range(len(data)):
         guard.take(data[at : at + 1], is_writing=False)
@@ -410,12 +399,12 @@ def test_long_packets_and_websocket_frames_are_detected_in_any_pieces() -> None:
     with pytest.raises(ValueError, match="does not read"):
         guard.take(b"\xc0\x00" * (UNREAD_MAX + 1), is_writing=True)
     with pytest.raises(ValueError, match="at most 10 bytes"):
-        PacketGuard(10).take(b"\x30\x0b", is_writing=False)
-    PacketGuard(10).take(b"\x30\x0a", is_writing=False)
-    check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES)))
-    check_websocket_buffer(SimpleNamespace())  # a connection without WebSocket
+        fleet_broker.PacketGuard(10).take(b"\x30\x0b", is_writing=False)
+    fleet_broker.PacketGuard(10).take(b"\x30\x0a", is_writing=False)
+    fleet_broker.check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES)))
+    fleet_broker.check_websocket_buffer(SimpleNamespace())  # a connection without WebSocket
     with pytest.raises(ValueError, match="WebSocket frame of at most"):
-        check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES + 1)))
+        fleet_broker.check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES + 1)))
 
 
 A, B = (Broker(name, 1883, False, False, "") for name in "ab")

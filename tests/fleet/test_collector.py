@@ -19,16 +19,8 @@ from imud.fleet.reader import Fleet, FleetBatch
 from imud.host.threads import rare_garbage_collection
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
-from tests.fleet.fleet_gateway import (
-    UTC_NS,
-    SendingGateway,
-    dropped_message,
-    event_message,
-    intervals_message,
-    not_set,
-    samples_message,
-    synchronised,
-)
+from tests.fleet import fleet_gateway
+from tests.fleet.fleet_gateway import UTC_NS, SendingGateway, intervals_message, samples_message, synchronised
 from tests.fleet.mosquitto import Mosquitto
 from tests.fleet.proxy import Proxy
 from tests.support.daemon_process import LIMIT_S
@@ -95,9 +87,7 @@ def begin_session(broker: Mosquitto) -> None:
     assert not fleet.problem
 
 
-def test_messages_that_a_store_refused_are_delivered_to_the_next_collector(
-    broker: Mosquitto, gateway: SendingGateway
-) -> None:
+def test_refused_messages_are_delivered_to_the_next_collector(broker: Mosquitto, gateway: SendingGateway) -> None:
     begin_session(broker)
     gateway.send(samples_message(1, 5), samples_message(6, 9))
     store = MemoryStore()
@@ -132,9 +122,7 @@ class ResettingStore(MemoryStore):
             self.proxy.reset()
 
 
-def test_a_reset_during_the_acknowledgements_loses_only_the_connection(
-    broker: Mosquitto, gateway: SendingGateway, proxy: Proxy
-) -> None:
+def test_a_reset_loses_only_the_connection(broker: Mosquitto, gateway: SendingGateway, proxy: Proxy) -> None:
     begin_session(broker)
     number = BATCHES_MAX + 100
     gateway.send(*(samples_message(n, n) for n in range(1, number + 1)))
@@ -161,9 +149,7 @@ class SlowStore(MemoryStore):
         super().write(batches, accounts, offsets)
 
 
-def test_a_slow_store_receives_larger_transactions_and_its_ledger_balances(
-    broker: Mosquitto, gateway: SendingGateway
-) -> None:
+def test_a_slow_store_receives_larger_transactions(broker: Mosquitto, gateway: SendingGateway) -> None:
     begin_session(broker)
     number = RECEIVE_MAX + BATCHES_MAX
     store = SlowStore(is_slow=True)
@@ -241,9 +227,9 @@ def test_the_line_of_a_sample_contains_its_values() -> None:
 def test_lines_of_dropped_records_intervals_and_events_have_kinds() -> None:
     out = io.TextIOWrapper(io.BytesIO())
     batches = [
-        FleetBatch("mill", Stream.SAMPLES, dropped_message(1, 4)),
+        FleetBatch("mill", Stream.SAMPLES, fleet_gateway.dropped_message(1, 4)),
         FleetBatch("mill", Stream.SAMPLES, intervals_message(1, 2)),
-        FleetBatch("mill", Stream.EVENTS, event_message(1, 5)),
+        FleetBatch("mill", Stream.EVENTS, fleet_gateway.event_message(1, 5)),
     ]
     JsonLines(out).write(batches, {}, {})
     dropped, found, up = map(json.loads, out.buffer.getvalue().splitlines())
@@ -256,8 +242,8 @@ def test_lines_of_dropped_records_intervals_and_events_have_kinds() -> None:
 
 def test_lines_report_an_unset_clock_and_a_later_line_contains_its_offset() -> None:
     messages = [
-        samples_message(1, 1, utc_ns=0), intervals_message(2, 3, utc_ns=0), event_message(4, 4_000_000, utc_ns=0),
-        dropped_message(5, 6),
+        samples_message(1, 1, utc_ns=0), intervals_message(2, 3, utc_ns=0),
+        fleet_gateway.event_message(4, 4_000_000, utc_ns=0), fleet_gateway.dropped_message(5, 6),
     ]  # fmt: skip
     out, clocks = io.StringIO(), fleet_accounts.BootClocks()
 
@@ -266,9 +252,9 @@ def test_lines_report_an_unset_clock_and_a_later_line_contains_its_offset() -> N
         JsonLines(out).write([FleetBatch("mill", Stream.SAMPLES, message, offset)], {}, clocks.take_fresh())
 
     for one in messages:
-        write(not_set(one))
+        write(fleet_gateway.not_set(one))
     write(synchronised(samples_message(7, 7), t_ns=7_000_000, error_ns=900))
-    write(not_set(samples_message(8, 8, utc_ns=0)))
+    write(fleet_gateway.not_set(samples_message(8, 8, utc_ns=0)))
     lines = [json.loads(line) for line in out.getvalue().splitlines()]
     assert [line.get("utc") for line in lines] == ["not set"] * 4 + [None] * 3
     assert [line["kind"] for line in lines] == ["sample", "interval", "event", "dropped", "sample", "clock", "sample"]

@@ -7,6 +7,7 @@ import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -83,9 +84,8 @@ def test_birth_states_and_farewell(tmp_path: Path) -> None:
     assert {"imud/default/gw/state", "imud/default/gw/imu0/status", "imud/default/gw/imu0/schema"} == set(topics)
     assert json.loads(sent[0][1])["online"] is True
     assert json.loads(sent[0][1])["boot"] == "000000000000004d"
-    assert topics["imud/default/gw/state"] == {
-        "v": 1, "online": False, "boot": "000000000000004d", "reason": "imud stopped",
-    }  # fmt: skip
+    farewell = {"v": 1, "online": False, "boot": "000000000000004d", "reason": "imud stopped"}
+    assert topics["imud/default/gw/state"] == farewell
     assert topics["imud/default/gw/imu0/schema"]["slot"]["bytes"] == 256
     assert topics["imud/default/gw/imu0/status"]["state"] == "running"
     assert bench.broker.will is not None
@@ -132,9 +132,8 @@ def test_settings_are_published_when_they_change(tmp_path: Path) -> None:
 
     def declare(state: SettingsState, read_ns: int, **differences: SettingDifference) -> None:
         declared = SettingsStatus(state, OnDifference.REPORT, differences=differences, read_ns=read_ns)
-        bench.statuses = [
-            msgspec.structs.replace(device_status("imu0", 0), settings={"rate_hz": "50"}, declared=declared)
-        ]
+        status = msgspec.structs.replace(device_status("imu0", 0), settings={"rate_hz": "50"}, declared=declared)
+        bench.statuses = [status]
         bench.output.event(Event(0, "imu0", EventKind.CONFIGURATION, "x"))
         bench.tick()
 
@@ -223,9 +222,7 @@ def test_the_host_name_is_the_default_gateway_name(tmp_path: Path) -> None:
 
 
 def test_without_the_extra_only_this_output_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(name: str) -> None:
-        raise ImportError(name)
-
+    refuse = Mock(side_effect=ImportError("paho"))
     monkeypatch.setattr(importlib, "import_module", refuse)
     output = MqttPublisher(MqttOptions(spool_directory=str(tmp_path)), PublisherBench(tmp_path).context)
     with pytest.raises(ServerError) as found:
@@ -246,13 +243,9 @@ def test_without_the_extra_only_this_output_does_not_start(tmp_path: Path, monke
         ({"key_file": "/k"}, "key_file: expected cert_file as well"),
         ({"password_file": "/p"}, "password_file: expected user as well"),
         ({"devices": {"a b": {}}}, "devices: expected names of devices"),
-        (
-            {"devices": {"*": {"rate_hz": 0.001}}},
-            'devices: expected a number from 0.01 to 100, or null, got 0.001, at "*.rate_hz"',
-        ),
+        ({"devices": {"*": {"rate_hz": 0.001}}}, 'a number from 0.01 to 100, or null, got 0.001, at "*.rate_hz"'),
         ({"devices": {"*": {"whole": "xml"}}}, 'expected one of "none", "json", "slots", got "xml", at "*.whole"'),
-        ({"devices": {"*": {"wole": "json"}}}, "wole"),
-        ({"version": "3.1"}, "version: expected"),
+        ({"devices": {"*": {"wole": "json"}}}, "wole"), ({"version": "3.1"}, "version: expected"),
     ],
 )  # fmt: skip
 def test_bad_settings_are_named(given: Mapping[str, Any], words: str) -> None:

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -38,10 +39,8 @@ def fleet_at(broker: Mosquitto, name: str = "") -> Fleet:
     return Fleet(f"mqtt://127.0.0.1:{broker.port}", name=name, retry_max_s=1.0)
 
 
-async def taken(
-    fleet: Fleet, number: int, settled: Callable[[], bool] = lambda: True, **wanted: str
-) -> list[FleetBatch]:
-    """Return `number` batches. The last one is not acknowledged. Close the connection when `settled` returns True."""
+async def taken(fleet: Fleet, number: int, done: Callable[[], bool] = lambda: True, **wanted: str) -> list[FleetBatch]:
+    """Return `number` batches. The last one is not acknowledged. Close the connection when `done` returns True."""
     found = []
     async with asyncio.timeout(LIMIT_S):
         batches = fleet.watch(**wanted)
@@ -49,7 +48,7 @@ async def taken(
             found.append(batch)
             if len(found) == number:
                 break
-        await until(settled)
+        await until(done)
         await batches.aclose()
     return found
 
@@ -87,9 +86,7 @@ async def test_batches_contain_samples_and_the_ledger_balances(broker: Mosquitto
 
 
 @in_loop
-async def test_only_messages_without_acknowledgement_are_delivered_again(
-    broker: Mosquitto, gateway: SendingGateway
-) -> None:
+async def test_only_unacknowledged_messages_are_delivered_again(broker: Mosquitto, gateway: SendingGateway) -> None:
     gateway.send_state(STATE)
 
     def acknowledged() -> int:
@@ -106,9 +103,7 @@ async def test_only_messages_without_acknowledgement_are_delivered_again(
 
 
 @in_loop
-async def test_the_broker_sends_no_more_than_the_reader_has_room_for(
-    broker: Mosquitto, gateway: SendingGateway
-) -> None:
+async def test_the_broker_sends_no_more_than_the_reader_can_hold(broker: Mosquitto, gateway: SendingGateway) -> None:
     gateway.send_state(STATE)
     fleet = fleet_at(broker, "slow")
     await session_begun(fleet)
@@ -150,22 +145,17 @@ async def test_a_broker_that_restarts_loses_nothing(broker: Mosquitto, gateway: 
 
 
 @in_loop
-async def test_only_selected_topics_are_delivered_although_the_session_has_more(
-    broker: Mosquitto, gateway: SendingGateway
-) -> None:
+async def test_only_selected_topics_of_a_session_are_delivered(broker: Mosquitto, gateway: SendingGateway) -> None:
     gateway.send_state(STATE)
     await session_begun(fleet_at(broker, "archive"))
     gateway.send(samples_message(1, 1, gateway="other"), samples_message(1, 1, device="stern"))
     gateway.send(samples_message(1, 2))
-    assert [one.message.last for one in (await taken(fleet_at(broker, "archive"), 1, gateway="gw", device="bow"))] == [
-        2
-    ]
+    (only,) = await taken(fleet_at(broker, "archive"), 1, gateway="gw", device="bow")
+    assert only.message.last == 2
 
 
 @in_loop
-async def test_messages_of_unknown_senders_are_counted_and_acknowledged(
-    broker: Mosquitto, gateway: SendingGateway
-) -> None:
+async def test_messages_of_unknown_senders_are_acknowledged(broker: Mosquitto, gateway: SendingGateway) -> None:
     gateway.send_state(STATE)
     fleet = fleet_at(broker, "archive")
     await session_begun(fleet)
@@ -272,9 +262,7 @@ BOTH = pytest.mark.parametrize("is_v5", [True, False], ids=["5", "3.1.1"])
 
 @BOTH
 @in_loop
-async def test_a_message_is_delivered_until_it_is_acknowledged(
-    broker: Mosquitto, gateway: SendingGateway, is_v5: bool
-) -> None:
+async def test_a_message_is_sent_until_acknowledged(broker: Mosquitto, gateway: SendingGateway, is_v5: bool) -> None:
     gateway.publish([("imud/kept", b"x" * 200_000)], retain=True)
     connection = await opened(broker.port, is_v5=is_v5)
     found = await connection.next(LIMIT_S)
@@ -390,18 +378,15 @@ async def test_a_reset_during_an_acknowledgement_is_a_loss_and_removes_the_descr
 
 
 @in_loop
-async def test_an_error_of_the_event_loop_does_not_prevent_the_end_of_the_connection(
-    broker: Mosquitto, gateway: SendingGateway, monkeypatch: pytest.MonkeyPatch
+async def test_an_error_of_the_event_loop_does_not_prevent_the_end(
+    broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """epoll raises for a closed descriptor if the loop waited for reading and writing."""
     connection = await opened(broker.port)
     waiting = asyncio.ensure_future(connection.next())
     await asyncio.sleep(0)
     loop = asyncio.get_running_loop()
-
-    def refuse(number: int) -> bool:
-        raise OSError(errno.EBADF, "Bad file descriptor")
-
+    refuse = Mock(side_effect=OSError(errno.EBADF, "Bad file descriptor"))
     monkeypatch.setattr(loop, "remove_writer", refuse)
     connection.close()
     with pytest.raises(BrokerError, match="the connection is closed"):

@@ -117,11 +117,8 @@ def test_retained_messages_are_sent_first_at_each_connection() -> None:
     bench.sender.work()
     bench.sender.give(1, [row(1, b"data")])
     bench.sender.work()
-    assert bench.broker.connections[0].sent == [
-        ("state", b"born", True),
-        ("status", b"1", True),
-        ("topic", b"data", False),
-    ]
+    sent = bench.broker.connections[0].sent
+    assert sent == [("state", b"born", True), ("status", b"1", True), ("topic", b"data", False)]
     bench.sender.retain({"status": b"1"})
     bench.sender.work()
     assert len(bench.sent()) == 3, "what is the same is not sent again"
@@ -173,7 +170,7 @@ def test_a_connection_that_completes_after_the_end_sends_nothing() -> None:
     assert bench.broker.asked == ["a"], "it does not try again"
 
 
-def test_a_reply_without_acknowledgement_is_sent_again() -> None:
+def test_replies_without_acknowledgement_are_sent_again_up_to_a_limit() -> None:
     bench = SenderBench()
     bench.broker.answers = 1
     bench.sender.work()
@@ -189,9 +186,6 @@ def test_a_reply_without_acknowledgement_is_sent_again() -> None:
     assert bench.sent() == [b"1", b"2", b"3"]
     assert bench.broker.connections[-1].correlations == [b"c", b"c", None]
     assert not any(retained for _, _, retained in bench.broker.connections[-1].sent)
-
-
-def test_the_number_of_waiting_replies_is_limited() -> None:
     bench = SenderBench()
     bench.broker.window, bench.broker.answers = 1000, 0
     bench.sender.work()
@@ -248,7 +242,7 @@ def test_forbidden_topics_do_not_block_other_messages(way: str, monkeypatch: pyt
     assert ("ha/a", b"5", True) in [one for made in bench.broker.connections for one in made.sent]
 
 
-def test_an_innocent_topic_is_not_refused_after_lost_connections() -> None:
+def test_lost_connections_refuse_no_innocent_topic_and_a_silent_broker_is_left() -> None:
     bench = SenderBench()
     for number in range(1, 20):
         bench.broker.problem, bench.broker.answers = "", 0
@@ -263,9 +257,6 @@ def test_an_innocent_topic_is_not_refused_after_lost_connections() -> None:
         bench.broker.problem = "the cable was pulled"
         bench.sender.work()
     assert bench.sender.refused == {}
-
-
-def test_a_silent_broker_is_left() -> None:
     bench = SenderBench()
     bench.broker.answers = 0
     bench.drive(1)

@@ -11,19 +11,10 @@ from random import Random
 import msgspec
 import pytest
 
+from imud.fleet import messages as fleet_messages
 from imud.fleet import spool
 from imud.fleet.accounts import FleetLedger, StreamCounts
-from imud.fleet.messages import (
-    VERSION,
-    DropCause,
-    FleetMessage,
-    MessageKind,
-    Stream,
-    decode_message,
-    encode_message,
-    encode_slots_message,
-    topic_of,
-)
+from imud.fleet.messages import FleetMessage, MessageKind, Stream, decode_message, encode_message
 from imud.formats.slot import encode_slots
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_S
@@ -42,11 +33,13 @@ def batch(first: int, count: int = 100, device: str = "bow", *, whole: bool = Tr
         for seq in range(first, last + 1)
     ]
     message = FleetMessage(
-        v=VERSION, gateway="gw", boot="1", device=device, begin=1,
+        v=fleet_messages.VERSION, gateway="gw", boot="1", device=device, begin=1,
         kind=MessageKind.SLOTS if whole else MessageKind.EVENTS, first=first, last=last, count=count, utc_ns=last,
     )  # fmt: skip
-    payload = encode_slots_message(message, encode_slots(samples, 0)) if whole else encode_message(message)
-    return spool.row_of(topic_of("site", "gw", device, stream), stream, message, payload, 0)
+    payload = (
+        fleet_messages.encode_slots_message(message, encode_slots(samples, 0)) if whole else encode_message(message)
+    )
+    return spool.row_of(fleet_messages.topic_of("site", "gw", device, stream), stream, message, payload, 0)
 
 
 class SpoolBench:
@@ -444,7 +437,7 @@ def test_a_row_with_known_numbers_becomes_a_dropped_message(column: str) -> None
     assert row is not None
     note = decode_message(row.payload)
     assert (note.kind, note.cause, note.first, note.last, note.count) == (
-        MessageKind.DROPPED, DropCause.DAMAGED, 101, 200, 100,
+        MessageKind.DROPPED, fleet_messages.DropCause.DAMAGED, 101, 200, 100,
     )  # fmt: skip
     assert (note.gateway, note.boot, note.device) == ("gw", "1", "bow")
     assert spool.undamaged_row(tuple(row)) == row

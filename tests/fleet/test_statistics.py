@@ -15,12 +15,8 @@ def made(seq: int, **values: object) -> Sample:
 
 
 def test_statistics_have_the_computed_values() -> None:
-    interval = summed_up(
-        [
-            made(3, temperature_c=1.0, gyro_rad_s=(0.0, 3.0, -1.0)),
-            made(4, temperature_c=3.0, gyro_rad_s=(0.0, 4.0, 1.0)),
-        ]
-    )
+    first = made(3, temperature_c=1.0, gyro_rad_s=(0.0, 3.0, -1.0))
+    interval = summed_up([first, made(4, temperature_c=3.0, gyro_rad_s=(0.0, 4.0, 1.0))])
     assert interval is not None
     assert (interval.first, interval.last, interval.count) == (3, 4, 2)
     assert (interval.begin_t_ns, interval.end_t_ns, interval.t_err_ns) == (3000, 4000, 40)
@@ -60,9 +56,8 @@ def test_the_division_into_batches_has_no_effect(cut: int) -> None:
 
 
 def test_the_mean_of_headings_near_south_is_near_south() -> None:
-    interval = summed_up(
-        [made(n, euler_rad=(0.0, 0.0, radians(one))) for n, one in enumerate((179.0, -179.0, -178.0), 1)]
-    )
+    headings = enumerate((179.0, -179.0, -178.0), 1)
+    interval = summed_up([made(n, euler_rad=(0.0, 0.0, radians(one))) for n, one in headings])
     assert interval is not None
     yaw = interval.values["euler_rad"]
     assert yaw.mean is not None

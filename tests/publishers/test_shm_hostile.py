@@ -48,7 +48,8 @@ HOSTILE: Final[dict[str, Callable[[Path], object]]] = {
     "device node": lambda path: os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(5, 0)),  # /dev/tty
     "forged ring": lambda path: path.write_bytes(FORGED + bytes(SLOTS * SLOT_BYTES)),
     "forged header": lambda path: path.write_bytes(FORGED),
-    "empty file": lambda path: path.touch(), "huge file": lambda path: (path.touch(), os.truncate(path, 1 << 40)),
+    "empty file": lambda path: path.touch(),
+    "huge file": lambda path: subprocess.run(["truncate", "-s", "1T", path], check=True),
 }  # fmt: skip
 
 

@@ -13,17 +13,7 @@ from msgspec.structs import replace
 
 from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceStatus
-from imud.formats.jsonrpc import (
-    Code,
-    RpcError,
-    encode_error,
-    encode_notification,
-    encode_request,
-    encode_result,
-    frame_of,
-    line_of,
-    parse_request,
-)
+from imud.formats import jsonrpc
 from imud.formats.slot import SLOT_BYTES
 from imud.publishers.socket.admission import Rights
 from imud.publishers.socket.methods import METHODS
@@ -248,30 +238,30 @@ def test_the_limits_of_a_request_are_the_documented_ones(part: bytes, count: int
             line = start + opened * (count - 2 + more) + b"1" + closed * (count - 2 + more) + b"}}"
         assert line.count(part) + (line.count(b"{") if part == b"[" else 0) == count + more
         if more:
-            with pytest.raises(RpcError, match="expected at most"):
-                parse_request(line)
+            with pytest.raises(jsonrpc.RpcError, match="expected at most"):
+                jsonrpc.parse_request(line)
         else:
-            assert parse_request(line).method == "m"
+            assert jsonrpc.parse_request(line).method == "m"
 
 
 def test_messages_as_bytes() -> None:
     """Integers that can exceed 2⁵³ are strings on request: `epoch` and times in ns (docs/socket.md)."""
-    assert encode_request("watch", {"rate_hz": 1}, 3) == (
+    assert jsonrpc.encode_request("watch", {"rate_hz": 1}, 3) == (
         b'{"jsonrpc":"2.0","id":3,"method":"watch","params":{"rate_hz":1}}'
     )
     value = {"epoch": 1, "t_ns": 2**60, "seq": 5, "list": [{"utc_ns": -1, "is_ns": True}], "r_ns": 1.5, "x_ns": None}
     plain = b'{"epoch":1,"t_ns":%d,"seq":5,"list":[{"utc_ns":-1,"is_ns":true}],"r_ns":1.5,"x_ns":null}' % (2**60)
     texts = b'{"epoch":"1","t_ns":"%d","seq":5,"list":[{"utc_ns":"-1","is_ns":true}],"r_ns":1.5,"x_ns":null}' % (2**60)
     for is_text, body in ((False, plain), (True, texts)):
-        assert encode_result("a", value, texts=is_text) == b'{"jsonrpc":"2.0","id":"a","result":' + body + b"}"
-        notified = encode_notification("event", value, texts=is_text)
+        assert jsonrpc.encode_result("a", value, texts=is_text) == b'{"jsonrpc":"2.0","id":"a","result":' + body + b"}"
+        notified = jsonrpc.encode_notification("event", value, texts=is_text)
         assert notified == b'{"jsonrpc":"2.0","method":"event","params":' + body + b"}"
-    error = encode_error(RpcError(Code.INVALID_PARAMS, "no", 4))
+    error = jsonrpc.encode_error(jsonrpc.RpcError(jsonrpc.Code.INVALID_PARAMS, "no", 4))
     assert error == b'{"jsonrpc":"2.0","id":4,"error":{"code":-32602,"message":"no"}}'
-    assert line_of(b"{}") == b"{}\n"
-    assert frame_of(b"{}") == b"\3\0\0\0{}\n"
+    assert jsonrpc.line_of(b"{}") == b"{}\n"
+    assert jsonrpc.frame_of(b"{}") == b"\3\0\0\0{}\n"
     whole = b"x" * (SLOT_BYTES - 1)  # a multiple of the size of a slot would be slots
-    assert frame_of(whole) == (SLOT_BYTES + 1).to_bytes(4, "little") + whole + b"\n\n"
+    assert jsonrpc.frame_of(whole) == (SLOT_BYTES + 1).to_bytes(4, "little") + whole + b"\n\n"
 
 
 TURN_NS, DEVICES, DEVICE_NS = 1_000_000, 100, 30_000

@@ -149,12 +149,12 @@ def test_a_batch_is_turned_once_for_all_clients() -> None:
     assert down.converted(Convention.NED_FRD) is down, "published so already"
     batch = published([SENT, replace(SENT, seq=2)])
     plain = JsonEncoding(None, framed=False)
-    turned = JsonEncoding(None, framed=False, convention=Convention.NED_FRD)
-    first, second = turned.encode(batch)
-    assert turned.encode_one(batch, 1) == second
+    encoding = JsonEncoding(None, framed=False, convention=Convention.NED_FRD)
+    first, second = encoding.encode(batch)
+    assert encoding.encode_one(batch, 1) == second
     assert first != plain.encode(batch)[0]
-    assert b'"dropped":3' in turned.with_dropped(first, "imu0", {"imu0": 3})
-    assert turned.message_bytes == len(second)
+    assert b'"dropped":3' in encoding.with_dropped(first, "imu0", {"imu0": 3})
+    assert encoding.message_bytes == len(second)
     binary = BinaryEncoding(Convention.NED_FRD)
     assert binary.message_bytes == BinaryEncoding.message_bytes
     assert list(binary.encode(batch)) == list(BinaryEncoding().encode(batch.converted(Convention.NED_FRD)))

@@ -22,20 +22,7 @@ from imud.model.event import Event, EventKind
 from imud.model.sample import SAMPLE_FIELDS
 from imud.publishers.socket.server import Listener, SocketOptions, SocketServer
 from tests.support import socket_rig
-from tests.support.socket_rig import (
-    DEVICES,
-    EPOCH,
-    NOW_NS,
-    Peer,
-    SteppingClock,
-    alone,
-    batch,
-    context,
-    in_server,
-    sample,
-    serving,
-    until,
-)
+from tests.support.socket_rig import Peer, alone, batch, in_server, sample, serving, until
 
 CHECK_NS, PATH_MAX_BYTES, SOCKET_MODE = 950_000_000, 99, 0o660
 
@@ -45,7 +32,7 @@ FORMS_PER_USER = 16
 @in_server()
 async def test_hello_devices_status_and_schema(server: SocketServer) -> None:
     rights = ["read", "control"] if os.getuid() == 0 else ["read"]
-    params = {"protocol": 1, "version": __version__, "epoch": EPOCH, "rights": rights}
+    params = {"protocol": 1, "version": __version__, "epoch": socket_rig.EPOCH, "rights": rights}
     peer = await Peer.connect(server)
     assert await peer.message() == {"jsonrpc": "2.0", "method": "hello", "params": params}
     devices = await peer.result("devices")
@@ -54,7 +41,7 @@ async def test_hello_devices_status_and_schema(server: SocketServer) -> None:
         ("imu1", 1, "running", "regression"),
     ]
     status = await peer.result("status")
-    assert (status["now_ns"], status["devices"][1]["ledger"]) == (NOW_NS, {"bytes_in": 82})
+    assert (status["now_ns"], status["devices"][1]["ledger"]) == (socket_rig.NOW_NS, {"bytes_in": 82})
     (client,) = status["socket"]["clients"]
     assert (client["pid"], client["uid"], client["sent"]) == (os.getpid(), os.getuid(), 0)
     schema = await peer.result("schema")
@@ -66,7 +53,7 @@ async def test_hello_devices_status_and_schema(server: SocketServer) -> None:
 async def test_json_samples_have_the_names_of_the_design_and_only_the_selected_members(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
     assert await peer.result("watch") == {
-        "encoding": "json", "devices": DEVICES, "rate_hz": 0.0, "latency_ms": 0.0,
+        "encoding": "json", "devices": socket_rig.DEVICES, "rate_hz": 0.0, "latency_ms": 0.0,
     }  # fmt: skip
     server.publish(batch("imu0", 7, 2))
     server.publish(batch("imu1", 1))
@@ -94,7 +81,7 @@ async def test_json_samples_have_the_names_of_the_design_and_only_the_selected_m
 @in_server()
 async def test_binary_frames_hold_one_slot_each(server: SocketServer, seq: int) -> None:
     peer = await Peer.greeted(server)
-    assert (await peer.result("watch", encoding="binary"))["devices"] == DEVICES
+    assert (await peer.result("watch", encoding="binary"))["devices"] == socket_rig.DEVICES
     peer.framed = True
     server.publish(batch("imu1", seq, 2))
     for number in (seq, seq + 1):
@@ -151,7 +138,7 @@ async def test_a_device_that_appears_later_matches_a_watch_of_all(server: Socket
 @in_server()
 async def test_poll_gives_the_newest_of_each_device(server: SocketServer) -> None:
     peer = await Peer.greeted(server)
-    assert await peer.result("poll") == {"now_ns": NOW_NS, "samples": []}
+    assert await peer.result("poll") == {"now_ns": socket_rig.NOW_NS, "samples": []}
     server.publish(batch("imu0", 1, 3))
     server.publish(batch("imu1", 5))
     assert [s["seq"] for s in (await peer.result("poll"))["samples"]] == [3, 5]
@@ -206,7 +193,7 @@ async def test_a_user_s_clients_watch_a_limited_number_of_selections(server: Soc
 
 @alone()
 async def test_to_many_clients_samples_go_in_several_turns_and_none_is_lost(tmp_path: Path) -> None:
-    clock = SteppingClock()
+    clock = socket_rig.SteppingClock()
     async with serving(tmp_path, clock) as server:
         peers = [await Peer.greeted(server) for _ in range(100)]
         for number, peer in enumerate(peers):
@@ -299,7 +286,7 @@ async def test_out_of_descriptors_pauses_accepting_until_the_next_tick_and_is_lo
 @alone()
 async def test_accepting_takes_a_limited_part_of_a_turn(tmp_path: Path, step_ns: int, accepted: list[int]) -> None:
     """At most 16 clients, and at most 0.3 ms."""
-    clock = SteppingClock()
+    clock = socket_rig.SteppingClock()
     async with serving(tmp_path, clock) as server:
         for _ in range(40):
             await Peer.connect(server)
@@ -388,16 +375,16 @@ async def test_a_stale_socket_is_replaced_and_those_of_other_daemons_are_left_al
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(tmp_path / "imud.sock"))
     async with serving(tmp_path) as server:
-        second = SocketServer(SocketOptions(path=server.hub.path), context())
+        second = SocketServer(SocketOptions(path=server.hub.path), socket_rig.context())
         with pytest.raises(ServerError, match="another daemon serves"):
             second.start()
         second.close()
         await Peer.greeted(server)  # the first server still works
     path = tmp_path / "imud.sock"
-    server = SocketServer(SocketOptions(path=str(path)), context())
+    server = SocketServer(SocketOptions(path=str(path)), socket_rig.context())
     server.start()
     path.unlink()
-    successor = SocketServer(SocketOptions(path=str(path)), context())
+    successor = SocketServer(SocketOptions(path=str(path)), socket_rig.context())
     successor.start()
     server.close()
     server.close()
@@ -409,7 +396,7 @@ async def test_a_stale_socket_is_replaced_and_those_of_other_daemons_are_left_al
 
 @alone()
 async def test_the_directory_is_made_or_the_error_names_the_next_step(tmp_path: Path) -> None:
-    server = SocketServer(SocketOptions(path=str(tmp_path / "run" / "imud" / "s")), context())
+    server = SocketServer(SocketOptions(path=str(tmp_path / "run" / "imud" / "s")), socket_rig.context())
     server.start()
     assert (tmp_path / "run" / "imud").stat().st_mode & 0o777 == 0o755
     server.close()
@@ -418,7 +405,7 @@ async def test_the_directory_is_made_or_the_error_names_the_next_step(tmp_path: 
         (tmp_path / "file" / "s", "cannot make the directory"),
         (tmp_path / "file", "another kind of file"),
     ):
-        blocked = SocketServer(SocketOptions(path=str(path)), context())
+        blocked = SocketServer(SocketOptions(path=str(path)), socket_rig.context())
         with pytest.raises(ServerError, match=words):
             blocked.start()
         blocked.close()
@@ -431,7 +418,7 @@ async def test_a_failed_start_leaves_nothing(tmp_path: Path, monkeypatch: pytest
     refuse = Mock(side_effect=OSError(12, "Cannot allocate memory"))
     owner = {"chmod": os, "listen": socket.socket, "rename": Path}[step]
     descriptors = len(os.listdir("/proc/self/fd"))
-    server = SocketServer(SocketOptions(path=str(tmp_path / "imud.sock")), context())
+    server = SocketServer(SocketOptions(path=str(tmp_path / "imud.sock")), socket_rig.context())
     with monkeypatch.context() as patch:
         patch.setattr(owner, step, refuse)
         with pytest.raises(ServerError, match="Cannot allocate memory"):
