@@ -169,9 +169,7 @@ def test_diagnostics_come_and_are_stale_without_the_daemon(tmp_path: Path) -> No
             viewer.wait_for("/diagnostics", lambda said: set(levels(said).values()) == {0})
 
 
-def test_the_topic_of_transforms_stays_while_another_device_has_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_topic_of_transforms_stays_for_another_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     viewer = FakeViewer()
 
     def until(topic: str) -> list[str]:
@@ -263,10 +261,10 @@ def received(connection: socket.socket, size: int) -> bytes:
     return data
 
 
-def answer(gate: ViewerGate, request: bytes) -> str:
+def answer(gate: ViewerGate, request: bytes, size: int = 1 << 30) -> str:
     with connect(gate) as connection:
         connection.sendall(request)
-        return received(connection, 1 << 30).decode()
+        return received(connection, size).decode()
 
 
 def test_a_viewer_comes_through_with_every_byte_in_both_directions(echo: Echo) -> None:
@@ -284,7 +282,7 @@ def test_a_viewer_comes_through_with_every_byte_in_both_directions(echo: Echo) -
     assert echo.ended == 1
 
 
-def test_pages_of_other_sites_are_refused_and_named_once(echo: Echo) -> None:
+def test_other_sites_and_programs_are_refused(echo: Echo) -> None:
     notes: list[str] = []
     with gated(echo, notes) as gate:
         for _ in range(2):
@@ -294,19 +292,12 @@ def test_pages_of_other_sites_are_refused_and_named_once(echo: Echo) -> None:
     assert len(notes) == 1
     assert notes[0].startswith("refused a connection: pages of 'https://attacker.example' may not read")
     assert echo.ended == 0
-
-
-def test_requests_of_other_programs_are_refused(echo: Echo) -> None:
-    for request_, status in [
-        (head("Origin: file://", "Origin: https://attacker.example"), 400),
-        (head("Host: 127.0.0.1"), 400),
-        (head("no colon", "Origin: https://attacker.example"), 400),
-        (head(request="GET / HTTP/1.0"), 400),
-        (head(*["A: b"] * 200), 400),
-        (b"\x16\x03\x01\r\n\r\n", 400),
-        (head(upgrade="Upgrade: h2c"), 426),
+    for request_, status in (
+        (head("Origin: file://", "Origin: https://attacker.example"), 400), (head("Host: 127.0.0.1"), 400),
+        (head("no colon", "Origin: https://attacker.example"), 400), (head(request="GET / HTTP/1.0"), 400),
+        (head(*["A: b"] * 200), 400), (b"\x16\x03\x01\r\n\r\n", 400), (head(upgrade="Upgrade: h2c"), 426),
         (b"GET / HTTP/1.1\r\nHost: attacker.example\r\nUpgrade: websocket\r\n\r\n", 403),
-    ]:
+    ):  # fmt: skip
         with gated(echo) as gate:
             assert answer(gate, request_).startswith(f"HTTP/1.1 {status} ")
         assert echo.ended == 0
@@ -337,7 +328,7 @@ def test_the_number_of_viewers_is_limited(echo: Echo) -> None:
             assert received(viewer, len(head())) == head()
         assert answer(gate, head()).startswith("HTTP/1.1 503 ")
         viewers.pop().close()
-        wait_until(lambda: not answer_starts(gate).startswith(b"HTTP/1.1 503"), "there is room again")
+        wait_until(lambda: not answer(gate, head(), 12).startswith("HTTP/1.1 503"), "there is room again")
         for viewer in viewers:
             viewer.close()
 
@@ -352,12 +343,6 @@ def test_connections_without_a_head_are_limited_and_occupy_no_place_of_a_viewer(
         assert is_closed(silent[1])
         silent[-1].sendall(head())
         assert received(silent[-1], len(head())) == head()
-
-
-def answer_starts(gate: ViewerGate) -> bytes:
-    with connect(gate) as connection:
-        connection.sendall(head())
-        return connection.recv(20)
 
 
 def test_the_gate_ends_beside_its_viewers_and_leaves_nothing_open(echo: Echo) -> None:

@@ -112,29 +112,21 @@ def test_the_command_shows_what_the_device_sent(tmp_path: Path) -> None:
     assert t_ns == imu["timestamp"]["sec"] * 10**9 + imu["timestamp"]["nsec"]
 
 
-def test_arguments_that_are_refused(cli: Cli) -> None:
+def test_refused_arguments_and_the_warning(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     tunnel = "add --open, or omit --address and use a tunnel: ssh -L 8765:"
     for address in ("0.0.0.0", "::", "192.168.1.2", "gateway"):
         cli.refuses(tunnel, "foxglove", "--address", address, "--port", "0")
     for option, value in {"--port": "70000", "--rate": "-1", "--allow-origin": "viewer.example"}.items():
         cli.refuses(f"{option}: expected", "foxglove", option, value)
     cli.refuses("--rate: expected", "foxglove", "--rate", "nan")
-
-
-def test_the_warning_precedes_the_first_sample(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
     monkeypatch.setattr("imud.web.foxglove.Relay.run", lambda _relay: None)
     handler = signal.getsignal(signal.SIGTERM)
     try:
-        assert (
-            "WARNING: 0.0.0.0 is not a loopback address"
-            in cli("foxglove", "--address", "0.0.0.0", "--open", "--port", "0").err
-        )
+        err = cli("foxglove", "--address", "0.0.0.0", "--open", "--port", "0").err
+        assert "WARNING: 0.0.0.0 is not a loopback address" in err
         assert "WARNING" not in cli("foxglove", "--port", "0").err
     finally:
         signal.signal(signal.SIGTERM, handler)
-
-
-def test_without_the_library_the_error_names_the_package(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
     monkeypatch.setitem(sys.modules, "foxglove", None)
     monkeypatch.delitem(sys.modules, "imud.web.foxglove", raising=False)
     cli.refuses("pip install 'imud[foxglove]'", "foxglove")
@@ -153,23 +145,17 @@ OTHERS = (
 )  # fmt: skip
 
 
-def test_viewers_and_pages_of_this_host_may_read_and_other_sites_are_named() -> None:
+def test_hosts_and_origins_that_may_read() -> None:
     assert [origin for origin in VIEWERS if RULE.problem(HOST, origin)] == []
     for origin in OTHERS:
         problem = RULE.problem(HOST, origin)
         assert "may not read" in problem, origin
         assert f"--allow-origin {origin}" in problem
-
-
-def test_only_own_host_names_are_accepted() -> None:
     for host in ("localhost:8765", "[::1]:8765", "192.168.1.7:8765", "gateway.example:8765"):
         assert RULE.problem(host, "file://") == "", host
     for host in ("attacker.example:8765", "127.0.0.1.attacker.example", ""):
         assert "--host NAME" in RULE.problem(host, "")
         assert "expected an IP address or one of gateway.example, localhost" in RULE.problem(host, "file://")
-
-
-@pytest.mark.parametrize("words", ["viewer.example", "*", "null", "https://", "https://viewer.example/page", "ftp://a"])
-def test_an_invalid_origin_is_refused(words: str) -> None:
-    with pytest.raises(BadArgument, match=r"--allow-origin: expected a site as https://viewer\.example:8080"):
-        ViewerOrigins(origins=[words])
+    for words in ("viewer.example", "*", "null", "https://", "https://viewer.example/page", "ftp://a"):
+        with pytest.raises(BadArgument, match=r"--allow-origin: expected a site as https://viewer\.example:8080"):
+            ViewerOrigins(origins=[words])

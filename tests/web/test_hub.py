@@ -34,12 +34,8 @@ class FakeFeed(Feed):
         self.wanted.append(wanted)
 
 
-def at_once(function: Callable[[News], None], news: News) -> None:
-    function(news)
-
-
 def make() -> tuple[BrowserHub, FakeFeed]:
-    hub, feed = BrowserHub(at_once), FakeFeed()
+    hub, feed = BrowserHub(lambda function, news: function(news)), FakeFeed()
     hub.attach(feed, FakeFeed())
     return hub, feed
 
@@ -153,11 +149,14 @@ async def test_overview_page_and_state() -> None:
     assert [one["problem"] for one in await heard(browser, "state")] == ["the connection is lost"]
     late = opened(hub, look="overview")
     assert (await heard(late, "state"))[0]["problem"] == "the connection is lost"
+    counted = msgspec.structs.replace(device("bow"), ledger={"bytes_in": 5, "bytes_pending": 5})
+    assert status_message("bow", counted, 0).lost == 0
+    assert row_of(counted, None, 0).lost == 0
 
 
 async def test_pages_get_new_events_and_the_samples_of_both_compared_devices() -> None:
-    hub, feed, compared = BrowserHub(at_once), FakeFeed(), FakeFeed()
-    hub.attach(feed, compared)
+    hub, feed = make()
+    hub.attach(feed, compared := FakeFeed())
     browser = opened(hub, look="overview")
     hub.spread(News(events=(Event(2 * 10**9, "bow", EventKind.UP, "is there", {"n": 1}),)))
     (last,) = (await heard(browser, "events"))[-1]["events"]
@@ -206,7 +205,7 @@ def test_the_feed_waits_for_a_late_event_loop() -> None:
     assert len(waiting) == WAITING_MAX
 
 
-def test_unknown_devices_take_no_places() -> None:
+async def test_unknown_devices_take_no_places_and_the_maximum_is_reported() -> None:
     hub, feed = make()
     opened(hub, look="device", device="later")
     hub.spread(News(statuses=(device("bow"),), now_ns=1))
@@ -217,25 +216,15 @@ def test_unknown_devices_take_no_places() -> None:
     hub.spread(News(statuses=(device("bow"), device("later")), now_ns=2))
     assert feed.wanted[-1] is not None
     assert feed.wanted[-1].devices == ("bow", "later")
-
-
-async def test_devices_above_the_maximum_are_reported() -> None:
     hub, feed = make()
     for number in range(DEVICES_MAX):
         opened(hub, look="device", device=f"imu{number}")
     late = opened(hub, look="device", device="a")
     assert any("maximum" in one["message"] for one in await heard(late, "problem"))
-    wanted = feed.wanted[-1]
-    assert wanted is not None
+    assert (wanted := feed.wanted[-1]) is not None
     assert wanted.devices is not None
     assert len(wanted.devices) == DEVICES_MAX
     assert "a" not in wanted.devices
-
-
-def test_missing_counters_of_another_version_are_zero() -> None:
-    status = msgspec.structs.replace(device("bow"), ledger={"bytes_in": 5, "bytes_pending": 5})
-    assert status_message("bow", status, 0).lost == 0
-    assert row_of(status, None, 0).lost == 0
 
 
 MS = 1_000_000
@@ -247,7 +236,7 @@ def at(ms: float, seq: int = 1, z: float = 9.75) -> Sample:
     return msgspec.structs.replace(made, t_ns=t_ns, t_rx_ns=t_ns + 300_000, accel_m_s2=(0.5, -0.5, z))
 
 
-def test_buckets() -> None:
+def test_buckets_and_raw_values() -> None:
     bucketing = Bucketing(20)
     early = [at(ms, seq) for seq, ms in enumerate((0, 10, 49.999), start=1)]
     assert bucketing.add(early, early[-1].t_ns) == []
@@ -274,9 +263,6 @@ def test_buckets() -> None:
     good = msgspec.structs.replace(at(0), quat_wxyz=(0.5, 0.5, 0.5, 0.5))
     bad = msgspec.structs.replace(at(1, 2), quat_wxyz=(nan, 0.0, 0.0, 0.0))
     assert bucket_of([good, bad, at(2, 3)]).quat_wxyz == (0.5, 0.5, 0.5, 0.5)
-
-
-def test_raw_values_keep_their_sequence_numbers() -> None:
     raw = raw_of("bow", "accel_m_s2", [at(0, 1, 1.0), at(1, 2, nan), at(2, 5, 3.0)])
     assert raw is not None
     assert (raw.seq, raw.t_s) == ((1, 5), (80000.0, 80000.002))
@@ -307,9 +293,6 @@ async def test_messages_wait_in_order_and_are_dropped_or_forgotten() -> None:
     mailbox.forget()
     assert mailbox.waiting == 0
     assert mailbox.dropped == 0, "nobody misses it"
-
-
-async def test_a_page_that_does_not_acknowledge_gets_no_more() -> None:
     mailbox = Mailbox()
     for _ in range(2):
         for number in range(WINDOW_MAX // 2):

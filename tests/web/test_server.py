@@ -179,9 +179,8 @@ async def test_control_needs_the_token_and_a_cookie_does_for_it(tmp_path: Path) 
             assert (await site.post("/api/call", call))[0] == 401, method
             status, answer = await site.post("/api/call", call, **BEARER)
             assert (status, "result" in answer) == (200, True), (method, answer)
-        assert (await site.get("/api/session"))[1] | {"version": ""} == {
-            "read": True, "control": False, "has_token": True, "version": "",
-        }  # fmt: skip
+        session = (await site.get("/api/session"))[1] | {"version": ""}
+        assert session == {"read": True, "control": False, "has_token": True, "version": ""}
         response = await site.client.post("/api/login", json={"token": TOKEN}, headers=site.origin)
         cookie = response.headers["Set-Cookie"]
         assert response.status == 200
@@ -272,9 +271,7 @@ async def test_bad_bodies_and_errors_of_the_daemon_are_reported(tmp_path: Path) 
         assert (status, "no daemon at" in answer["error"]) == (502, True)
 
 
-async def test_samples_statuses_and_events_come_while_a_page_is_open_and_nothing_is_read_without(
-    tmp_path: Path,
-) -> None:
+async def test_samples_statuses_and_events_come_only_while_a_page_is_open(tmp_path: Path) -> None:
     async with running(tmp_path) as site:
         assert not site.daemon.hub.connections
         socket = await site.stream(look="device", device="imu0", rate_hz=50)
@@ -297,9 +294,7 @@ async def test_samples_statuses_and_events_come_while_a_page_is_open_and_nothing
         await until(lambda: not site.daemon.hub.connections)
 
 
-async def test_a_page_that_does_not_read_delays_no_other_page_and_its_queue_is_bounded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_page_that_does_not_read_delays_no_other_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The page acknowledges although its connection is full, so that only the connection can stop the server."""
     rounds, samples, waiting_max = 50, 400, 20
     look = {"look": "device", "device": "imu0", "rate_hz": 50, "spectrum": "accel_m_s2"}
@@ -373,13 +368,8 @@ class FakeTransport(asyncio.Transport):
         self.aborted = True
 
 
-class FakeHandler:
-    def __init__(self) -> None:
-        self.transport = FakeTransport()
-
-
-def connected(connections: WebConnections) -> tuple[FakeHandler, FakeTransport]:
-    one = FakeHandler()
+def connected(connections: WebConnections) -> tuple[Any, FakeTransport]:
+    one = SimpleNamespace(transport=FakeTransport())
     connections.accept(one)  # type: ignore[arg-type]  # only its transport is used
     return one, one.transport
 
@@ -425,7 +415,7 @@ MALFORMED = (
 
 
 @pytest.mark.parametrize("request_bytes", MALFORMED)
-async def test_malformed_requests_cause_no_log_line(
+async def test_malformed_requests_are_not_logged(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, request_bytes: bytes
 ) -> None:
     async with listening(tmp_path) as (host, port):
@@ -447,7 +437,7 @@ async def test_connections_without_a_complete_request_end(tmp_path: Path, monkey
         await web_app._body(SimpleNamespace(read=asyncio.Event().wait))  # type: ignore[arg-type]
 
 
-async def test_a_request_uses_a_connection_that_ends_after_the_reply(tmp_path: Path) -> None:
+async def test_a_request_uses_its_own_connection_and_names_a_missing_daemon(tmp_path: Path) -> None:
     async with serving(tmp_path) as server:
         calls = Calls(server.hub.path)
         report = await calls.call("settings.get", {"device": "imu0"})
@@ -458,6 +448,8 @@ async def test_a_request_uses_a_connection_that_ends_after_the_reply(tmp_path: P
         with pytest.raises(RpcError, match="no device named 'none'") as caught:
             await Calls(server.hub.path).call("actions", {"device": "none"})
         assert caught.value.code == Code.INVALID_PARAMS
+    with pytest.raises(LinkMissing, match=r"no daemon at .*/none: No such file"):
+        await Calls(str(tmp_path / "none")).call("schema", {})
 
 
 async def test_long_orders_hold_up_no_others_and_are_bounded(tmp_path: Path) -> None:
@@ -474,11 +466,6 @@ async def test_long_orders_hold_up_no_others_and_are_bounded(tmp_path: Path) -> 
             await calls.call("actions", {"device": "imu1"})
         socket_rig.done_late.set()
         assert await asyncio.gather(*waiting) == [{"waited": "imu0"}] * AT_A_TIME_MAX
-
-
-async def test_without_a_daemon_the_error_names_the_path(tmp_path: Path) -> None:
-    with pytest.raises(LinkMissing, match=r"no daemon at .*/none: No such file"):
-        await Calls(str(tmp_path / "none")).call("schema", {})
 
 
 @pytest.mark.parametrize(
