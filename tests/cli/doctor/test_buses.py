@@ -4,7 +4,9 @@ import errno
 import json
 import re
 from copy import deepcopy
+from functools import partial
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -25,10 +27,9 @@ KEEL = "keel: {driver: imu61x-i2c, i2c: {bus: 3, address: 0x18}}"
 MAST = "mast: {driver: imu61x-spi, spi: {port: /dev/spidev0.0, mode: 3}}"
 
 
-def polled(name: str, state: DeviceState = DeviceState.RUNNING, counts: dict[str, int] | None = None) -> DeviceStatus:
-    made = device(
-        name, state=state, polling=PollingStatus(**(counts or {})), problem="" if state == "running" else "no answer"
-    )
+def polled(name: str, state: DeviceState = DeviceState.RUNNING, /, **counts: int) -> DeviceStatus:
+    problem = "" if state == "running" else "no answer"
+    made = device(name, state=state, polling=PollingStatus(**counts), problem=problem)
     return msgspec.structs.replace(made, ledger=dict.fromkeys(made.ledger, 0))
 
 
@@ -44,14 +45,11 @@ def test_nodes(machine: Machine) -> None:
     assert [finding.severity for finding in machine.find(NODES)] == ["ok", "ok"]
 
 
-def test_transfers_need_the_daemon_and_the_device_in_it(machine: Machine) -> None:
+def test_transfers(machine: Machine) -> None:
     machine.configure(KEEL, MAST)
     assert [machine.find(check)[0].severity for check in (I2C, SPI)] == ["not checked", "not checked"]
     machine.status = []
     assert "does not use this device" in machine.told(I2C)[0][1]
-
-
-def test_failed_transfers_damaged_answers_and_clock_stretching(machine: Machine) -> None:
     for counts, severity, words in [
         ({"polls": 10_000, "failed": 10}, "ok", "10 failed"),
         ({"polls": 10_000, "failed": 11}, "warning", "11 of 10000 transfers failed"),
@@ -61,19 +59,17 @@ def test_failed_transfers_damaged_answers_and_clock_stretching(machine: Machine)
         ({}, "not checked", "has not read the device yet"),
     ]:
         machine.configure(KEEL)
-        machine.status = [polled("keel", counts=counts)]
+        machine.status = [polled("keel", **counts)]
         machine.tells(I2C, severity, words)
     machine.configure(MAST)
-    one = polled("mast", counts={"polls": 1000})
+    one = polled("mast", polls=1000)
     machine.status = [msgspec.structs.replace(one, ledger=one.ledger | {"frames_bad_crc": 1})]
     machine.tells(SPI, "ok", "1000 transfers")
     machine.status = [msgspec.structs.replace(one, ledger=one.ledger | {"frames_bad_crc": 2})]
-    assert (
-        "2 of 1000 replies were damaged → use shorter wires, or a lower clock than 1000000 Hz"
-        in machine.told(SPI)[0][1]
-    )
+    advice = "use shorter wires, or a lower clock than 1000000 Hz"
+    assert f"2 of 1000 replies were damaged → {advice}" in machine.told(SPI)[0][1]
     machine.configure(KEEL)
-    machine.status = [polled("keel", counts={"polls": 100, "failed": 50})]
+    machine.status = [polled("keel", polls=100, failed=50)]
     assert "stretching" not in machine.told(I2C)[0][1]
     machine.write("/sys/class/i2c-adapter/i2c-3/name", "bcm2835 (i2c@7e804000)\n")
     assert "defect in clock stretching" in machine.told(I2C)[0][1]
@@ -146,19 +142,17 @@ def mast(machine: Machine) -> Machine:
     return machine
 
 
-def interface(
-    machine: Machine, flags: str = "0x40081", *, packets: int = 0, data: dict[str, Any] | None = None
-) -> None:
+def interface(machine: Machine, *, packets: int = 0, data: dict[str, Any] | None = None) -> None:
     """Set the recorded reply of `ip` with changed members. Without `data`, the interface is virtual."""
-    up(machine, flags)
+    up(machine)
     answer = deepcopy(RECORDED["error-active"])
     (link,) = answer
     link["stats64"]["rx"]["packets"] = packets
-    data = dict(data or {})
-    link["linkinfo"]["info_xstats"]["bus_off"] = data.pop("bus_off", 0)
-    link["linkinfo"]["info_data"].update(data)
-    if not data:
+    if data is None:
         link["linkinfo"] = {"info_kind": "vcan"}
+    else:
+        link["linkinfo"]["info_xstats"]["bus_off"] = data.get("bus_off", 0)
+        link["linkinfo"]["info_data"].update(data)
     machine.prints(COMMAND, json.dumps(answer))
 
 
@@ -168,10 +162,8 @@ def up(machine: Machine, flags: str = "0x40081") -> None:
 
 
 def controller(state: str = "ERROR-ACTIVE", tx: int = 0, rx: int = 0, **more: object) -> dict[str, object]:
-    counters = {"tx": tx, "rx": rx}
-    return {
-        "state": state, "berr_counter": counters, "restart_ms": 100, "bittiming": {"bitrate": 500_000}, **more
-    }  # fmt: skip
+    fixed = {"berr_counter": {"tx": tx, "rx": rx}, "restart_ms": 100, "bittiming": {"bitrate": 500_000}}
+    return {"state": state, **fixed, **more}
 
 
 def test_an_interface_that_is_absent_down_up_or_virtual(mast: Machine) -> None:
@@ -185,14 +177,13 @@ def test_an_interface_that_is_absent_down_up_or_virtual(mast: Machine) -> None:
     assert mast.find(STATE) == []  # the state of an interface that is down is unknown
     interface(mast)
     assert mast.find(UP)[0].severity == "ok"
-    interface(mast)
     assert mast.told(STATE) == [("ok", "can0 is a virtual interface without a controller → ")]
     assert mast.find(RATE) == []
 
 
-@pytest.mark.parametrize(
-    ("data", "packets", "severity", "words"),
-    [
+def test_state_and_error_counters(mast: Machine) -> None:
+    """The kernel also counts frames from before a change of the bit rate, or from before the device was unplugged."""
+    for data, packets, severity, words in [
         (controller(), 100, "ok", "100 frames received"),
         (controller("BUS-OFF", 248, 0), 100, "error", "left the bus"),
         (controller("ERROR-PASSIVE", 128, 0), 0, "error", "no other node acknowledges"),
@@ -200,18 +191,11 @@ def test_an_interface_that_is_absent_down_up_or_virtual(mast: Machine) -> None:
         (controller("ERROR-PASSIVE", 0, 130), 100, "warning", "60 Ω"),
         (controller("ERROR-ACTIVE", 0, 96), 100, "warning", "60 Ω"),
         (controller("ERROR-ACTIVE", 0, 3), 100, "ok", "rx 3"),
-    ],
-)
-def test_state_and_error_counters(
-    mast: Machine, data: dict[str, object], packets: int, severity: str, words: str
-) -> None:
-    interface(mast, packets=packets, data=data)
-    mast.on_pause = lambda: interface(mast, packets=packets + 20, data=data)
-    mast.tells(STATE, severity, words)
-
-
-def test_errors_on_a_bus_that_carried_frames_before(mast: Machine) -> None:
-    """The kernel also counts frames from before a change of the bit rate, or from before the device was unplugged."""
+    ]:
+        interface(mast, packets=packets, data=data)
+        mast.on_pause = partial(interface, mast, packets=packets + 20, data=data)
+        mast.tells(STATE, severity, words)
+    mast.on_pause, mast.paused_s = Mock(), 0.0
     interface(mast, packets=100, data=controller("ERROR-PASSIVE", 128, 0))
     mast.tells(STATE, "error", "100 frames received, no frame arrives now → no other node acknowledges")
     assert mast.paused_s == 2.0
@@ -219,26 +203,20 @@ def test_errors_on_a_bus_that_carried_frames_before(mast: Machine) -> None:
     assert mast.find(STATE)[0].severity == "warning"
 
 
-@pytest.mark.parametrize(
-    ("state", "severities", "words"),
-    [
+def test_recorded_states_and_bus_off_before(mast: Machine) -> None:
+    for state, severities, words in [
         ("error-active", ["ok", "note"], "can0 is ERROR-ACTIVE, error counters tx 0, rx 0, 2 frames received → "),
         ("bus-off", ["error", "note"],
          "the controller left the bus → restart it: `sudo ip link set can0 down`, then `sudo ip"),
         ("error-passive", ["error", "warning", "note"],
          "2 frames received, no frame arrives now → no other node acknowledges"),
-    ],
-)  # fmt: skip
-def test_states_as_they_were_recorded(mast: Machine, state: str, severities: list[str], words: str) -> None:
-    up(mast)
-    mast.prints(COMMAND, json.dumps(RECORDED[state]))
-    found = mast.told(STATE)
-    assert [severity for severity, _ in found] == severities
-    assert words in found[0][1]
-    assert mast.told(RATE) == [("ok", "can0 has 500000 bit/s, 2 frames received → ")]
-
-
-def test_bus_off_before_and_no_restart(mast: Machine) -> None:
+    ]:  # fmt: skip
+        up(mast)
+        mast.prints(COMMAND, json.dumps(RECORDED[state]))
+        found = mast.told(STATE)
+        assert [severity for severity, _ in found] == severities, state
+        assert words in found[0][1]
+        assert mast.told(RATE) == [("ok", "can0 has 500000 bit/s, 2 frames received → ")]
     interface(mast, packets=9, data=controller(bus_off=4, restart_ms=0))
     found = mast.told(STATE)
     assert [severity for severity, _ in found] == ["ok", "warning", "note"]
@@ -249,14 +227,13 @@ def test_bus_off_before_and_no_restart(mast: Machine) -> None:
     assert mast.told(STATE)[-1][1].endswith(commands)
 
 
-@pytest.mark.parametrize("file", ["docs/can.md", "docs/monitoring.md", "etc/prometheus/imud.rules.yml"])
-def test_documents_set_restart_ms_while_the_interface_is_down(file: str) -> None:
+def test_documents_set_restart_ms_while_the_interface_is_down() -> None:
     """Otherwise the kernel refuses restart-ms with EBUSY (drivers/net/can/dev/netlink.c)."""
-    text = (ROOT / file).read_text()
-    commands = re.findall(r"^.*?type can .*?restart-ms", text, re.MULTILINE)
-    assert commands
-    for command in commands:
-        assert re.search(r"\bdown\b.* up type|pre-up ip|^ip link set can0 type can bitrate", command), command
+    for file in ("docs/can.md", "docs/monitoring.md", "etc/prometheus/imud.rules.yml"):
+        commands = re.findall(r"^.*?type can .*?restart-ms", (ROOT / file).read_text(), re.MULTILINE)
+        assert commands, file
+        for command in commands:
+            assert re.search(r"\bdown\b.* up type|pre-up ip|^ip link set can0 type can bitrate", command), command
 
 
 def test_bit_rates(mast: Machine) -> None:

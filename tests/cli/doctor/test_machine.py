@@ -1,7 +1,8 @@
 """Checks of the clock, the storage, the power supply and the processors of a simulated host."""
 
+from unittest.mock import Mock
+
 import msgspec
-import pytest
 
 from imud.cli.doctor.machine import host_clock, kernel_log, power, processor, storage
 from imud.cli.doctor.surroundings import DoctorCheck
@@ -10,12 +11,18 @@ from imud.utc.system_clock import KernelClock
 from tests.support.metrics import device
 from tests.support.surroundings import Machine
 
-CLOCK, STORAGE, POWER, PROCESSOR = (
-    DoctorCheck("c", host_clock), DoctorCheck("s", storage), DoctorCheck("p", power), DoctorCheck("u", processor),
-)  # fmt: skip
+CLOCK, STORAGE, POWER = DoctorCheck("c", host_clock), DoctorCheck("s", storage), DoctorCheck("p", power)
+PROCESSOR, LOG = DoctorCheck("u", processor), DoctorCheck("k", kernel_log)
 
 
 def test_clock_and_storage(machine: Machine) -> None:
+    assert machine.find(STORAGE)[0].severity == "not checked"
+    machine.write("/var/lib/imud/x")
+    at = machine.surroundings()
+    at.sync_s = Mock(side_effect=PermissionError(13, "Permission denied"))
+    (finding,) = storage(at)
+    assert finding.severity == "not checked"
+    assert "sudo imud doctor" in finding.advice
     for clock, severity in [
         (KernelClock(True, 100_000, 1000), "ok"),
         (KernelClock(True, 100_001, 1000), "note"),
@@ -26,63 +33,42 @@ def test_clock_and_storage(machine: Machine) -> None:
     for worst_s, severity in [(0.05, "ok"), (0.2, "warning"), (1.0, "error")]:
         machine.write("/srv/imud/x")
         machine.configure(more="state_dir: /srv/imud\n")
-        machine.write(
-            "/proc/mounts", "/dev/sda1 / ext4 rw 0 0\n/dev/mmcblk0p2 /srv ext4 rw 0 0\n/dev/sdb /srv/im ext4 rw 0 0\n"
-        )
+        mounts = ("/dev/sda1 /", "/dev/mmcblk0p2 /srv", "/dev/sdb /srv/im")
+        machine.write("/proc/mounts", "".join(f"{mount} ext4 rw 0 0\n" for mount in mounts))
         machine.sync_s = [0.01, worst_s, 0.02]
         machine.tells(STORAGE, severity, f"to /srv/imud (/dev/mmcblk0p2) took up to {worst_s * 1000:.0f} ms")
 
 
-def test_storage_that_is_not_there_or_may_not_be_written(machine: Machine) -> None:
-    assert machine.find(STORAGE)[0].severity == "not checked"
-    machine.write("/var/lib/imud/x")
-    at = machine.surroundings()
-
-    def refuse(_folder: object) -> float:
-        raise PermissionError(13, "Permission denied")
-
-    at.sync_s = refuse
-    (finding,) = storage(at)
-    assert finding.severity == "not checked"
-    assert "sudo imud doctor" in finding.advice
-
-
-@pytest.mark.parametrize(
-    ("word", "severities"),
-    [
-        ("0", ["ok"]), ("50005", ["error", "warning"]), ("50000", ["warning", "note"]), ("80008", ["warning"]),
-        ("20000", ["note"]),
-    ],
-)  # fmt: skip
-def test_power_of_a_raspberry_pi(machine: Machine, word: str, severities: list[str]) -> None:
-    machine.write("/proc/device-tree/model", "Raspberry Pi 4 Model B Rev 1.4\0")
-    machine.write("/sys/devices/platform/soc/soc:firmware/get_throttled", word + "\n")
-    assert [finding.severity for finding in machine.find(POWER)] == severities
-
-
-def test_vcgencmd_is_asked_where_sysfs_has_nothing(machine: Machine) -> None:
+def test_power_of_a_raspberry_pi_from_vcgencmd_and_from_sysfs(machine: Machine) -> None:
     assert machine.find(POWER) == []  # not a Raspberry Pi
     machine.write("/proc/device-tree/model", "Raspberry Pi 3 Model B\0")
     assert machine.find(POWER)[0].severity == "not checked"
     machine.prints("vcgencmd get_throttled", "throttled=0x1\n")
     assert machine.find(POWER)[0].severity == "error"
-    machine.prints("vcgencmd get_throttled", "", 255, "Can't open device file")
-    assert machine.find(POWER)[0].severity == "not checked"
-    machine.prints("vcgencmd get_throttled", "throttled=strange\n")
-    assert machine.find(POWER)[0].severity == "not checked"
+    for reply in (("", 255, "Can't open device file"), ("throttled=strange\n",)):
+        machine.prints("vcgencmd get_throttled", *reply)
+        assert machine.find(POWER)[0].severity == "not checked"
+    for word, severities in [
+        ("0", ["ok"]), ("50005", ["error", "warning"]), ("50000", ["warning", "note"]), ("80008", ["warning"]),
+        ("20000", ["note"]),
+    ]:  # fmt: skip
+        machine.write("/proc/device-tree/model", "Raspberry Pi 4 Model B Rev 1.4\0")
+        machine.write("/sys/devices/platform/soc/soc:firmware/get_throttled", word + "\n")
+        assert [finding.severity for finding in machine.find(POWER)] == severities, word
 
 
-@pytest.mark.parametrize(
-    ("load", "pressure", "severity"),
-    [("3.0", "20.00", "ok"), ("3.1", "19.00", "warning"), ("0.1", "20.01", "warning"), ("0.1", None, "ok")],
-)
-def test_load_of_two_processors(machine: Machine, load: str, pressure: str | None, severity: str) -> None:
+def test_load_of_two_processors(machine: Machine) -> None:
     for name in ("cpu0", "cpu1", "cpufreq"):
         machine.write(f"/sys/devices/system/cpu/{name}/x")
-    machine.write("/proc/loadavg", f"9.00 {load} 9.00 1/200 999\n")
-    if pressure is not None:
-        machine.write("/proc/pressure/cpu", f"some avg10=0.00 avg60={pressure} avg300=0.00 total=1\nfull avg10=0.00\n")
-    machine.tells(PROCESSOR, severity, "on 2 processors")
+    for load, pressure, severity in [
+        ("0.1", None, "ok"), ("3.0", "20.00", "ok"), ("3.1", "19.00", "warning"), ("0.1", "20.01", "warning"),
+    ]:  # fmt: skip
+        machine.write("/proc/loadavg", f"9.00 {load} 9.00 1/200 999\n")
+        if pressure is not None:
+            machine.write(
+                "/proc/pressure/cpu", f"some avg10=0.00 avg60={pressure} avg300=0.00 total=1\nfull avg10=0.00\n"
+            )
+        machine.tells(PROCESSOR, severity, "on 2 processors")
 
 
 def test_samples_lost_and_reads_late_by_a_busy_machine(machine: Machine) -> None:
@@ -101,7 +87,6 @@ def test_samples_lost_and_reads_late_by_a_busy_machine(machine: Machine) -> None
     assert "b: 51 of 1000 reads were late, by up to 3.0 ms" in found[2][1]
 
 
-LOG = DoctorCheck("k", kernel_log)
 QUIET = (
     "usb 1-1: new full-speed USB device number 4 using xhci_hcd\nhub 1-0:1.0: USB hub found\n"
     "ftdi_sio ttyUSB0: FTDI USB Serial Device converter now disconnected from ttyUSB0\n"
@@ -110,7 +95,7 @@ QUIET = (
 )
 
 
-def test_each_kind_of_trouble_a_quiet_log_and_other_sources(machine: Machine) -> None:
+def test_each_kind_of_trouble_in_the_kernel_log_and_its_sources(machine: Machine) -> None:
     for line, words in [
         ("usb 1-1.2: reset full-speed USB device number 4 using dwc_otg", "resets of USB devices"),
         ("usb 1-1-port2: cannot reset port (err = -71)", "resets of USB devices"),
@@ -140,12 +125,9 @@ def test_each_kind_of_trouble_a_quiet_log_and_other_sources(machine: Machine) ->
     machine.prints("journalctl", "")
     machine.prints("dmesg", "", 1, "dmesg: read kernel buffer failed: Operation not permitted")
     machine.tells(LOG, "not checked", "Operation not permitted → run `sudo imud doctor`")
-
-
-def test_missing_programs_and_only_the_newest_lines(machine: Machine) -> None:
     machine.prints("journalctl", "usb 1-1: reset full-speed USB device\n" + "usb: fine\n" * 5000)
     machine.tells(LOG, "ok", "in 5000 lines")
-    del machine.outputs["journalctl"]
+    machine.outputs.clear()
     machine.tells(LOG, "not checked", "cannot read the kernel log: journalctl: No such file", "join the group adm")
     machine.outputs["journalctl"] = PermissionError(13, "Permission denied", "journalctl")
     machine.tells(LOG, "not checked", "journalctl: Permission denied")
