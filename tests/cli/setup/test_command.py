@@ -3,6 +3,7 @@
 import argparse
 import json
 from pathlib import Path
+from unittest.mock import Mock, call
 
 import pytest
 
@@ -10,13 +11,11 @@ from imud.cli.doctor.surroundings import Surroundings
 from imud.cli.setup import command
 from imud.cli.setup.command import numbered, sudo_user
 from imud.cli.setup.hardware import Wanted
-from imud.cli.setup.steps import Conversation
 from tests.cli.conftest import Cli
 
 
 def test_names_with_a_rate() -> None:
-    for text, parts in [("can0=500000", ("can0", 500000)), ("/dev/ttyUSB0", ("/dev/ttyUSB0", 0))]:
-        assert numbered(text) == parts
+    assert (numbered("can0=500000"), numbered("/dev/ttyUSB0")) == (("can0", 500000), ("/dev/ttyUSB0", 0))
     for text in ["", "=5", "can0=", "can0=fast", "can0=0", "can0=-5"]:
         with pytest.raises(argparse.ArgumentTypeError, match="500000"):
             numbered(text)
@@ -55,39 +54,22 @@ def test_a_look_at_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("words", "can", "options"),
-    [
-        (("--yes",), [], {"control": False, "wait_s": 30.0}),
-        (("--yes", "--control", "--wait", "5", "--can", "can0=1000000"), [("can0", 1_000_000)],
-         {"control": True, "wait_s": 5.0}),
-    ],
-)  # fmt: skip
-def test_options_have_an_effect(
-    words: tuple[str, ...], can: list[tuple[str, int]], options: dict[str, object],
-    cli: Cli, monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    made: list[object] = []
-
-    class Steps:
-        def __init__(self, _look: object, talk: Conversation, *_more: object, **given: object) -> None:
-            made.extend([talk.asks, given["dry_run"], given["user"]])
-
-        def set_up(self, *given: object, **more: object) -> int:
-            made.extend([*given, more])
-            return 1
-
-        def undo(self) -> int:
-            return 0
-
-    monkeypatch.setattr(command, "SetupSteps", Steps)
+def test_options_have_an_effect(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = Mock(set_up=Mock(return_value=1), undo=Mock(return_value=0))
+    made = Mock(return_value=steps)
+    monkeypatch.setattr(command, "SetupSteps", made)
     monkeypatch.setenv("SUDO_USER", "ann")
     places = (
         "/dev/ttyS0", "--active", "/dev/ttyS1", "--rs485", "/dev/ttyS2=9600", "--i2c", "1", "--spi", "/dev/spidev0.0",
     )  # fmt: skip
-    cli("setup", *places, *words, status=1)
-    wanted = Wanted(
-        ("/dev/ttyS0",), ("/dev/ttyS1",), (("/dev/ttyS2", 9600),), (("i2c", "1"), ("spi", "/dev/spidev0.0"))
-    )
-    assert made == [False, False, "ann", wanted, can, options]
+    buses = (("i2c", "1"), ("spi", "/dev/spidev0.0"))
+    wanted = Wanted(("/dev/ttyS0",), ("/dev/ttyS1",), (("/dev/ttyS2", 9600),), buses)
+    more = ("--control", "--wait", "5", "--can", "can0=1000000")
+    for words, can, options in [
+        ((), [], {"control": False, "wait_s": 30.0}), (more, [("can0", 1_000_000)], {"control": True, "wait_s": 5.0}),
+    ]:  # fmt: skip
+        cli("setup", *places, "--yes", *words, status=1)
+        assert made.call_args.args[1].asks is False
+        assert (made.call_args.kwargs["dry_run"], made.call_args.kwargs["user"]) == (False, "ann")
+        assert steps.set_up.call_args == call(wanted, can, **options)
     cli("setup", "--undo")

@@ -10,16 +10,7 @@ import pytest
 
 from imud.cli.setup import hardware as finders
 from imud.cli.setup.changes import CommandChange, FileChange
-from imud.cli.setup.hardware import (
-    FINDERS,
-    Attached,
-    Wanted,
-    free_console,
-    look,
-    network_file,
-    raise_can,
-    without_console,
-)
+from imud.cli.setup.hardware import FINDERS, Attached, Wanted, free_console, look, raise_can
 from imud.contracts.driver import StreamDriver
 from imud.drivers import DRIVERS
 from imud.links.i2c import I2cLink, I2cOptions
@@ -44,26 +35,28 @@ def found(machine: LivingMachine, attachments: Attachments, wanted: Wanted = Wan
     return look(machine.surroundings(), wanted, attachments.finders())
 
 
-def test_only_what_is_named_is_listened_to(gateway: LivingMachine, attachments: Attachments) -> None:
+def test_only_what_is_named_is_listened_to_and_no_port_of_others(
+    gateway: LivingMachine, attachments: Attachments
+) -> None:
     gateway.can("can0", up=True)
     found(gateway, attachments, Wanted(("/dev/ttyUSB1",)))
     assert attachments.listened == [USB1]
     attachments.listened.clear()
     found(gateway, attachments, Wanted(("can0", USB0), active=("/dev/ttyUSB0",)))
     assert (attachments.listened, attachments.active) == ([USB0, "can0"], {USB0})
+    gateway.hold("ttyUSB0", "ModemManager")
+    assert "run imud setup again" in found(gateway, attachments)[0].problem
 
 
 def test_a_port_that_is_asked_by_modbus_is_not_listened_to(gateway: LivingMachine, attachments: Attachments) -> None:
-    keys = {"driver": "hipnuc-modbus", "rs485": {"line": USB0, "baud": 115200, "address": 80}}
-    attachments.lines[USB0] = [Attached(USB0, USB0, driver="hipnuc-modbus", device="address 80", keys=keys)]
+    keys = [{"driver": "hipnuc-modbus", "rs485": {"line": USB0, "baud": 115200, "address": at}} for at in (80, 81)]
+    attachments.lines[USB0] = [Attached(USB0, USB0, driver="hipnuc-modbus", keys=one) for one in keys]
     here = found(gateway, attachments, Wanted(rs485=((USB0, 0),)))
     assert attachments.listened == [USB1]
-    assert [one.keys for one in here if one.driver] == [keys]
-
-
-def test_modem_manager_lets_go_of_a_port(gateway: LivingMachine, attachments: Attachments) -> None:
-    gateway.hold("ttyUSB0", "ModemManager")
-    assert "run imud setup again" in found(gateway, attachments)[0].problem
+    assert [(one.keys, one.configured) for one in here if one.driver] == [(one, "") for one in keys]
+    gateway.configure(f"deck: {{driver: hipnuc-modbus, rs485: {{line: {USB0}, address: 80}}}}")
+    here = found(gateway, attachments, Wanted(rs485=((USB0, 0),)))
+    assert [one.configured for one in here if one.driver] == ["deck", ""]
 
 
 def test_a_configured_port_is_shown_with_what_the_daemon_says(gateway: LivingMachine, attachments: Attachments) -> None:
@@ -76,67 +69,39 @@ def test_a_configured_port_is_shown_with_what_the_daemon_says(gateway: LivingMac
     assert attachments.listened == []
 
 
-@pytest.mark.parametrize(
-    ("configured", "names"),
-    [
-        (["a: {driver: hipnuc-canopen, options: {node: 8}, socketcan: {interface: can0}}"], ["a", ""]),
-        (["a: {driver: hipnuc-canopen, options: {node: 7}, socketcan: {interface: can0}}"], ["", ""]),
-        (["a: {driver: hipnuc-canopen, options: {node: 8}, socketcan: {interface: can1}}"], ["", ""]),
-        (["a: {driver: auto, socketcan: {interface: can0}}"], ["a", ""]),
-        (
-            [
-                "a: {driver: auto, socketcan: {interface: can0}}",
-                "b: {driver: hipnuc-canopen, options: {node: 8}, socketcan: {interface: can0}}",
-            ],
-            ["b", "a"],
-        ),
-    ],
-)
-def test_devices_of_a_bus_are_told_apart(
-    machine: LivingMachine, attachments: Attachments, configured: list[str], names: list[str]
-) -> None:
+def test_devices_of_a_bus_are_told_apart(machine: LivingMachine, attachments: Attachments) -> None:
     machine.can("can0", up=True)
-    machine.configure(*configured)
     attachments.hears("can0", "hipnuc-canopen", "node 8", 500_000)
     attachments.hears("can0", "imu61x-can", "base_id 101", 500_000)
-    here = found(machine, attachments)
-    assert [one.configured for one in here] == names
-    assert here[1].keys == {"driver": "imu61x-can", "options": {"base_id": 101}, "socketcan": {"interface": "can0"}}
+    node8 = "driver: hipnuc-canopen, options: {node: 8}"
+    for configured, names in [
+        ([f"a: {{{node8}, socketcan: {{interface: can0}}}}"], ["a", ""]),
+        (["a: {driver: hipnuc-canopen, options: {node: 7}, socketcan: {interface: can0}}"], ["", ""]),
+        ([f"a: {{{node8}, socketcan: {{interface: can1}}}}"], ["", ""]),
+        (["a: {driver: auto, socketcan: {interface: can0}}"], ["a", ""]),
+        (["a: {driver: auto, socketcan: {interface: can0}}", f"b: {{{node8}, socketcan: {{interface: can0}}}}"],
+         ["b", "a"]),
+        ([f"deck: {{driver: auto, rs485: {{line: {USB0}, address: 80}}}}"], ["", ""]),  # a device of another bus
+    ]:  # fmt: skip
+        machine.configure(*configured)
+        here = found(machine, attachments)
+        assert [one.configured for one in here] == names, configured
+        keys = {"driver": "imu61x-can", "options": {"base_id": 101}, "socketcan": {"interface": "can0"}}
+        assert here[1].keys == keys
 
 
-def test_an_rs485_module_that_is_configured_is_known(gateway: LivingMachine, attachments: Attachments) -> None:
-    gateway.configure(f"deck: {{driver: hipnuc-modbus, rs485: {{line: {USB0}, address: 80}}}}")
-    keys = {"driver": "hipnuc-modbus", "rs485": {"line": USB0, "baud": 115200, "address": 80}}
-    other = {"driver": "hipnuc-modbus", "rs485": {"line": USB0, "baud": 115200, "address": 81}}
-    attachments.lines[USB0] = [
-        Attached(USB0, USB0, driver="hipnuc-modbus", keys=one) for one in (keys, other)
-    ]  # fmt: skip
-    here = found(gateway, attachments, Wanted(rs485=((USB0, 0),)))
-    assert [one.configured for one in here if one.driver] == ["deck", ""]
-
-
-def test_devices_of_other_buses_are_not_the_configured_device(machine: LivingMachine, attachments: Attachments) -> None:
-    machine.configure(f"deck: {{driver: auto, rs485: {{line: {USB0}, address: 80}}}}")
-    machine.can("can0", up=True)
-    attachments.hears("can0", "hipnuc-canopen", "node 8", 500_000)
-    assert [one.configured for one in found(machine, attachments)] == [""]
-
-
-def test_an_interface_that_is_down_is_not_listened_to(machine: LivingMachine, attachments: Attachments) -> None:
+def test_a_bus_that_is_asked_for_and_one_that_is_down(machine: LivingMachine, attachments: Attachments) -> None:
+    machine.configure("keel: {driver: imu61x-i2c, i2c: {bus: 1}}")
+    keys = {"driver": "imu61x-i2c", "i2c": {"bus": 1, "address": 0x18}}
+    attachments.buses["i2c1"] = [Attached("/dev/i2c-1", "/dev/i2c-1", driver="imu61x-i2c", keys=keys)]
+    (here,) = found(machine, attachments, Wanted(buses=(("i2c", "1"),)))
+    assert here.configured == "keel"
     machine.can("can0")
     machine.can("can1")
     problem = "the interface is down; bring it up with --can {0}=BITRATE"
     for wanted, names in ((Wanted(("can0",)), ["can0"]), (Wanted(), ["can0", "can1"])):
         assert [one.problem for one in found(machine, attachments, wanted)] == list(map(problem.format, names))
     assert attachments.listened == []
-
-
-def test_a_bus_that_is_asked_for(machine: LivingMachine, attachments: Attachments) -> None:
-    machine.configure("keel: {driver: imu61x-i2c, i2c: {bus: 1}}")
-    keys = {"driver": "imu61x-i2c", "i2c": {"bus": 1, "address": 0x18}}
-    attachments.buses["i2c1"] = [Attached("/dev/i2c-1", "/dev/i2c-1", driver="imu61x-i2c", keys=keys)]
-    (here,) = found(machine, attachments, Wanted(buses=(("i2c", "1"),)))
-    assert here.configured == "keel"
 
 
 def test_what_is_named_and_not_there_is_said_to_be(gateway: LivingMachine, attachments: Attachments) -> None:
@@ -193,25 +158,19 @@ def on_bus(monkeypatch: pytest.MonkeyPatch, bus: InProcessI2c) -> None:
     monkeypatch.setattr(finders, "LINKS", {"i2c": row})
 
 
-def test_a_bus_is_asked_at_every_address(monkeypatch: pytest.MonkeyPatch) -> None:
-    on_bus(monkeypatch, InProcessI2c({0x19: Imu61xRegisters(lambda: 0, product="IMU612")}))
-    (found,) = FINDERS.ask_bus("i2c", "1")
-    assert found.keys == {"driver": "imu61x-i2c", "i2c": {"bus": 1, "address": 0x19}}
-    assert (found.node, found.title, found.device) == ("/dev/i2c-1", "IMU612", "address 0x19")
-
-
-def test_a_bus_without_a_sensor_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
-    on_bus(monkeypatch, InProcessI2c({}))
-    (found,) = FINDERS.ask_bus("i2c", "1")
-    assert (found.driver, "no acknowledgement at address 0x18" in found.problem) == ("", True)
-
-
-def test_a_bus_that_is_not_there_and_a_number_that_no_bus_has() -> None:
+def test_a_bus_is_asked_at_every_address_and_one_without_a_sensor_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     for kind, bus in [("i2c", "250"), ("i2c", "900"), ("spi", "/dev/spidev250.0")]:
         (found,) = FINDERS.ask_bus(kind, bus)
         assert found.problem
     (found,) = FINDERS.ask_bus("i2c", "256")
     assert found.problem == "bus: expected a whole number from 0 to 255, got 256"
+    on_bus(monkeypatch, InProcessI2c({0x19: Imu61xRegisters(lambda: 0, product="IMU612")}))
+    (found,) = FINDERS.ask_bus("i2c", "1")
+    assert found.keys == {"driver": "imu61x-i2c", "i2c": {"bus": 1, "address": 0x19}}
+    assert (found.node, found.title, found.device) == ("/dev/i2c-1", "IMU612", "address 0x19")
+    on_bus(monkeypatch, InProcessI2c({}))
+    (found,) = FINDERS.ask_bus("i2c", "1")
+    assert (found.driver, "no acknowledgement at address 0x18" in found.problem) == ("", True)
 
 
 NETWORK = "/etc/systemd/network/80-imud-can0.network"
@@ -236,7 +195,7 @@ def test_only_the_consoles_of_the_port_leave_the_command_line(machine: LivingMac
         ("console=tty1 root=/dev/x console=ttyAMA1,9600\n", "console=tty1 root=/dev/x console=ttyAMA1,9600\n"),
         ("root=/dev/x  quiet", "root=/dev/x  quiet"),
     ]:
-        assert without_console(before, {"ttyAMA0", "serial0"}) == after
+        assert finders.without_console(before, {"ttyAMA0", "serial0"}) == after
     machine.uart("ttyAMA0", console=True)
     machine.write("/boot/cmdline.txt", "console=ttyAMA0,115200 root=/dev/x\n")
     changes, notes = free_console(machine.surroundings(), "/dev/ttyAMA0")
@@ -261,7 +220,7 @@ def test_elsewhere_the_boot_loader_is_left_alone_and_the_login_ends(machine: Liv
     assert free_console(machine.surroundings(), "/dev/ttyS0")[0] == []
 
 
-def test_a_can_interface_comes_up_by_networkd(bus: LivingMachine) -> None:
+def test_a_can_interface_comes_up_by_networkd_and_a_virtual_one_without_a_bit_rate(bus: LivingMachine) -> None:
     changes, notes = raise_can(bus.surroundings(), "can0", 250_000)
     assert isinstance(changes[0], FileChange)
     assert (changes[0].path, changes[0].then) == (NETWORK, (("networkctl", "reload"),))
@@ -270,48 +229,38 @@ def test_a_can_interface_comes_up_by_networkd(bus: LivingMachine) -> None:
     assert notes == []
     bus.write(NETWORK, changes[0].content.decode())
     assert raise_can(bus.surroundings(), "can0", 250_000) == ([], [])
+    bus.can("vcan0")
+    (bus.root / "sys/devices/virtual/net/vcan0").mkdir(parents=True)
+    changes, _ = raise_can(bus.surroundings(), "vcan0", 500_000)
+    assert isinstance(changes[0], FileChange)
+    assert changes[0].content == finders.network_file("vcan0", 0)
+    assert b"[CAN]" not in changes[0].content
 
 
-@pytest.mark.parametrize(
-    ("unit", "name"), [("NetworkManager.service", "NetworkManager"), ("networking.service", "ifupdown")]
-)
-def test_networkd_is_enabled_beside_others_and_that_is_said(bus: LivingMachine, unit: str, name: str) -> None:
-    bus.units |= {"systemd-networkd.service": ["disabled", "inactive"], unit: ["enabled", "active"]}
-    changes, notes = raise_can(bus.surroundings(), "can0", 500_000)
-    assert commands(changes)[0] == "systemctl enable --now systemd-networkd.service"
-    assert commands(changes)[1] == "systemctl disable systemd-networkd-wait-online.service"
-    assert [one.optional for one in changes if isinstance(one, CommandChange)] == [False, True, False]
-    assert notes[0].startswith(f"{name} manages the network")
-
-
-def test_networkd_is_not_enabled_where_it_would_use_more(bus: LivingMachine) -> None:
-    bus.units["systemd-networkd.service"] = ["disabled", "inactive"]
+def test_networkd_is_enabled_beside_others_but_not_where_it_would_use_more(bus: LivingMachine) -> None:
+    for unit, name in (("NetworkManager.service", "NetworkManager"), ("networking.service", "ifupdown")):
+        bus.units = {"systemd-networkd.service": ["disabled", "inactive"], unit: ["enabled", "active"]}
+        changes, notes = raise_can(bus.surroundings(), "can0", 500_000)
+        assert commands(changes)[0] == "systemctl enable --now systemd-networkd.service"
+        assert commands(changes)[1] == "systemctl disable systemd-networkd-wait-online.service"
+        assert [one.optional for one in changes if isinstance(one, CommandChange)] == [False, True, False]
+        assert notes[0].startswith(f"{name} manages the network")
+    del bus.units["networking.service"]
     bus.write("/etc/systemd/network/10-eth.network", "[Match]\nName=eth*\n")
     changes, notes = raise_can(bus.surroundings(), "can0", 500_000)
     assert [type(one) for one in changes] == [FileChange]
     assert "would also use /etc/systemd/network/10-eth.network" in notes[0]
 
 
-def test_a_file_of_the_administrator_is_left(bus: LivingMachine) -> None:
+def test_without_networkd_or_interface_and_beside_another_file_nothing_is_changed(bus: LivingMachine) -> None:
     bus.write("/etc/systemd/network/can.network", "[Match]\nName=vcan* can*\n")
     changes, notes = raise_can(bus.surroundings(), "can0", 500_000)
     assert changes == []
     assert "/etc/systemd/network/can.network configures" in notes[0]
-
-
-def test_without_networkd_or_interface_nothing_is_changed(bus: LivingMachine) -> None:
+    (bus.root / "etc/systemd/network/can.network").unlink()
     assert raise_can(bus.surroundings(), "can1", 500_000)[1] == [
         "can1 does not exist; CAN interfaces of this host: can0"
     ]
     del bus.units["systemd-networkd.service"]
     changes, notes = raise_can(bus.surroundings(), "can0", 500_000)
     assert (changes, "not installed" in notes[0]) == ([], True)
-
-
-def test_a_virtual_interface_has_no_bit_rate(bus: LivingMachine) -> None:
-    bus.can("vcan0")
-    (bus.root / "sys/devices/virtual/net/vcan0").mkdir(parents=True)
-    changes, _ = raise_can(bus.surroundings(), "vcan0", 500_000)
-    assert isinstance(changes[0], FileChange)
-    assert changes[0].content == network_file("vcan0", 0)
-    assert b"[CAN]" not in changes[0].content

@@ -1,6 +1,6 @@
 """udev rules of adapters from simulated /sys trees."""
 
-from typing import NoReturn
+from unittest.mock import Mock
 
 import pytest
 
@@ -30,25 +30,19 @@ def test_an_adapter_is_found_and_gets_a_latency_timer(machine: LivingMachine) ->
     assert plan.usb_adapter(at, "/dev/ttyUSB0") == FTDI
     assert plan.usb_adapter(at, "/dev/ttyAMA0") is None
     assert lines(machine, FTDI, OTHER) == [LATENCY]
+    (line,) = lines(machine, FTDI._replace(serial='A"*[1]|$x\n'))
+    assert 'ATTRS{serial}=="A???1???x?"' in line
 
 
-@pytest.mark.parametrize(
-    ("states", "ignores"),
-    [(["enabled", "inactive"], True), (["disabled", "active"], True), (["disabled", "inactive"], False)],
-)
-def test_modem_manager_ignores_all_where_it_may_run(machine: LivingMachine, states: list[str], ignores: bool) -> None:
-    machine.units["ModemManager.service"] = states
-    other = 'ATTRS{idVendor}=="10c4", ATTRS{idProduct}=="ea60"'
-    both = [LATENCY, MODEM, MODEM.replace(WHICH, other)] if ignores else [LATENCY]
-    assert lines(machine, FTDI, OTHER) == both
-
-
-def test_a_host_without_systemctl_has_no_modem_manager(machine: LivingMachine) -> None:
-    def missing(_words: object) -> NoReturn:
-        raise FileNotFoundError(2, "No such file or directory")
-
+def test_modem_manager_ignores_all_where_it_may_run(machine: LivingMachine) -> None:
+    both = [LATENCY, MODEM, MODEM.replace(WHICH, 'ATTRS{idVendor}=="10c4", ATTRS{idProduct}=="ea60"')]
+    for enabled, active, expected in [
+        ("enabled", "inactive", both), ("disabled", "active", both), ("disabled", "inactive", [LATENCY]),
+    ]:  # fmt: skip
+        machine.units["ModemManager.service"] = [enabled, active]
+        assert lines(machine, FTDI, OTHER) == expected
     at = machine.surroundings()
-    at.run = missing
+    at.run = Mock(side_effect=FileNotFoundError(2, "No such file or directory"))  # a host without systemctl
     assert not plan.modem_manager_runs(at)
 
 
@@ -60,11 +54,6 @@ def test_lines_that_are_there_stay_and_are_not_proposed_again(machine: LivingMac
     assert change is not None
     assert change.content.decode().splitlines() == ["# mine", LATENCY, LATENCY.replace('"A1"', '"A2"')]
     assert "--sysname-match=ttyUSB3" in change.then[1]
-
-
-def test_what_means_something_in_a_pattern_matches_any_character(machine: LivingMachine) -> None:
-    (line,) = lines(machine, FTDI._replace(serial='A"*[1]|$x\n'))
-    assert 'ATTRS{serial}=="A???1???x?"' in line
 
 
 NEW = {"imu": {"driver": "auto", "uart": {"port": "/dev/serial/by-id/usb-A"}}}

@@ -4,8 +4,10 @@ Output of setup in 80 columns, and its questions."""
 import json
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
-from unittest.mock import Mock
+from unittest import mock
+from unittest.mock import Mock, call
 
 import pytest
 
@@ -37,7 +39,7 @@ def gateway(machine: LivingMachine, attachments: Attachments) -> LivingMachine:
     return machine
 
 
-def test_a_new_gateway_is_set_up_and_taken_back(gateway: LivingMachine, setup: Setup) -> None:
+def test_a_new_gateway_is_set_up_once_and_taken_back(gateway: LivingMachine, setup: Setup) -> None:
     before = gateway.files()
     assert setup.steps(user="ann").set_up(PORT, ()) == 0
     out = setup.said()
@@ -54,25 +56,21 @@ def test_a_new_gateway_is_set_up_and_taken_back(gateway: LivingMachine, setup: S
     assert gateway.units["imud.service"] == ["enabled", "active"]
     assert "imud:x:990:ann\n" in (gateway.root / "etc/group").read_text()
 
+    after, ran = gateway.files(), list(gateway.ran)
+    setup.attachments.listened.clear()
+    assert setup.steps(user="ann", date="LATER").set_up(PORT, ()) == 0
+    out = setup.said()
+    assert "No changes needed." in out
+    assert "Changes:" not in out
+    assert setup.attachments.listened == []  # the daemon uses the port
+    assert (gateway.files(), gateway.ran) == (after, ran)
+
     assert setup.steps().undo() == 0
     assert "imud undid all changes" in setup.said()
     assert gateway.files() == before
     assert gateway.units["imud.service"] == ["disabled", "inactive"]
     assert setup.steps().undo() == 0
     assert "there are no changes to undo" in setup.said()
-
-
-def test_a_second_run_changes_nothing(gateway: LivingMachine, setup: Setup) -> None:
-    setup.steps(user="ann").set_up(PORT, ())
-    before, ran = gateway.files(), list(gateway.ran)
-    setup.attachments.listened.clear()
-    setup.said()
-    assert setup.steps(user="ann", date="LATER").set_up(PORT, ()) == 0
-    out = setup.said()
-    assert "No changes needed." in out
-    assert "Changes:" not in out
-    assert setup.attachments.listened == []  # the daemon uses the port
-    assert (gateway.files(), gateway.ran) == (before, ran)
 
 
 def test_a_dry_run_changes_nothing_and_tells_all(gateway: LivingMachine, setup: Setup) -> None:
@@ -127,12 +125,15 @@ def test_a_running_daemon_is_left_running_and_reads_the_new_file(gateway: Living
     assert gateway.units["imud.service"] == ["enabled", "active"]
 
 
-def test_a_file_and_its_copy_keep_the_mode(gateway: LivingMachine, setup: Setup) -> None:
+def test_modes_of_a_file_its_copy_and_the_journal(gateway: LivingMachine, setup: Setup) -> None:
     """The umask must not change the mode."""
     file, copy = gateway.root / "etc/imud.yaml", gateway.root / "etc/imud.yaml.DATE"
     file.chmod(0o662)
     assert setup.steps().set_up(PORT, ()) == 0
     assert [path.stat().st_mode & 0o777 for path in (file, copy)] == [0o662, 0o662]
+    folder = gateway.root / "var/lib/imud-setup"
+    assert (folder.stat().st_mode & 0o777, (folder / "journal.json").stat().st_mode & 0o777) == (0o700, 0o600)
+    assert "imud.yaml" in (folder / "journal.json").read_text()
 
 
 def test_an_example_that_the_daemon_uses_is_no_example(gateway: LivingMachine, setup: Setup) -> None:
@@ -196,9 +197,7 @@ def test_nothing_is_changed_after_a_refusal(
 
 
 @pytest.mark.parametrize("activity", ["inactive", "active"])
-def test_a_service_with_another_configuration_is_left_as_it_is(
-    activity: str, gateway: LivingMachine, setup: Setup
-) -> None:
+def test_a_service_with_another_configuration_is_unchanged(activity: str, gateway: LivingMachine, setup: Setup) -> None:
     """Such a service would not use the new devices."""
     gateway.started = "/usr/bin/imud run --config /home/ann/bow.yaml"
     gateway.units["imud.service"] = ["disabled", activity]
@@ -210,29 +209,22 @@ def test_a_service_with_another_configuration_is_left_as_it_is(
     assert not any("systemctl" in line for line in gateway.ran)
 
 
-@pytest.mark.parametrize(
-    ("program", "note"),
-    [
+def test_a_missing_program_is_told_and_the_rest_is_done(gateway: LivingMachine, setup: Setup) -> None:
+    before, no_unit = gateway.files(), "note: systemd does not know imud.service, so imud starts no service"
+    for program, note in [
         ("udevadm", "note: cannot run `udevadm control --reload`: No such file or directory"),
         ("usermod", "note: cannot run `usermod --append --groups imud ann`: No such file"),
-        ("getent", "All devices send samples."),
-        ("systemctl", "note: systemd does not know imud.service, so imud starts no service"),
-        ("", "note: systemd does not know imud.service, so imud starts no service"),  # systemd without the unit
-    ],
-)
-def test_a_missing_program_is_told_and_the_rest_is_done(
-    gateway: LivingMachine, setup: Setup, program: str, note: str
-) -> None:
-    before = gateway.files()
-    gateway.missing = {program}
-    if not program:
-        gateway.units.clear()
-    assert setup.steps(user="ann").set_up(PORT, ()) == 0
-    assert note in setup.said()
-    assert BY_ID in (gateway.root / "etc/imud.yaml").read_text()
-    gateway.missing = set() if program == "getent" else {program}
-    assert setup.steps().undo() == 0
-    assert gateway.files() == before
+        ("getent", "All devices send samples."), ("systemctl", no_unit), ("", no_unit),  # systemd without the unit
+    ]:  # fmt: skip
+        gateway.missing = {program}
+        if not program:
+            gateway.units.clear()
+        assert setup.steps(user="ann").set_up(PORT, ()) == 0
+        assert note in setup.said(), program
+        assert BY_ID in (gateway.root / "etc/imud.yaml").read_text()
+        gateway.missing = set() if program == "getent" else {program}
+        assert setup.steps().undo() == 0
+        assert gateway.files() == before, program
 
 
 def test_a_masked_service_and_a_missing_group_are_told(gateway: LivingMachine, setup: Setup) -> None:
@@ -281,9 +273,7 @@ def test_questions_name_and_leave_out(gateway: LivingMachine, setup: Setup, answ
     assert (gateway.root / "etc/group").read_text().count(":ann\n") == 2
 
 
-def test_a_proposed_name_is_not_one_that_was_just_given(
-    gateway: LivingMachine, setup: Setup, answers: dict[str, str]
-) -> None:
+def test_a_proposed_name_is_a_new_one(gateway: LivingMachine, setup: Setup, answers: dict[str, str]) -> None:
     gateway.usb_port("ttyUSB1", "usb-B", serial="B")
     setup.attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
     answers["on /dev/ttyUSB0?"] = "imu2"
@@ -292,7 +282,7 @@ def test_a_proposed_name_is_not_one_that_was_just_given(
     assert [one.name for one in config.load(gateway.root / "etc/imud.yaml").devices] == ["imu2", "imu"]
 
 
-def test_a_device_without_a_usable_name_is_left_out_and_that_is_said(
+def test_a_device_without_a_valid_name_is_left_out(
     gateway: LivingMachine, setup: Setup, answers: dict[str, str]
 ) -> None:
     answers["on /dev/ttyUSB0?"] = "My Sensor"
@@ -302,7 +292,9 @@ def test_a_device_without_a_usable_name_is_left_out_and_that_is_said(
     assert said.count("My Sensor: expected an unused name") == 10
 
 
-def test_a_bit_rate_that_is_none_is_explained(gateway: LivingMachine, setup: Setup, answers: dict[str, str]) -> None:
+def test_a_bit_rate_that_is_none_is_explained_and_another_one_is_used(
+    gateway: LivingMachine, setup: Setup, answers: dict[str, str]
+) -> None:
     gateway.can("can0")
     answers |= {"can0 is down": "y", "Bit rate": "500k"}
     with pytest.raises(ImudError, match="expected a bit rate for can0"):
@@ -312,39 +304,27 @@ def test_a_bit_rate_that_is_none_is_explained(gateway: LivingMachine, setup: Set
         answers["Bit rate"] = word
         with pytest.raises(ImudError, match="got 10 invalid answers"):
             setup.steps(ask=True).set_up(PORT, ())
-
-
-@pytest.mark.parametrize("rate", [1, 1_000_000])
-def test_an_interface_comes_up_with_the_given_bit_rate(
-    gateway: LivingMachine, setup: Setup, answers: dict[str, str], rate: int
-) -> None:
-    gateway.can("can0")
     gateway.units["systemd-networkd.service"] = ["enabled", "active"]
-    answers |= {"can0 is down": "y", "Bit rate": str(rate)}
-    setup.steps(ask=True).set_up(PORT, ())
-    text = (gateway.root / "etc/systemd/network/80-imud-can0.network").read_text()
-    assert f"[CAN]\nBitRate={rate}\n" in text
-    assert setup.slept[:25] == [0.2] * 25, "imud waits 5 s for the interface, which stays down here"
+    for rate in (1, 1_000_000):
+        answers["Bit rate"] = str(rate)
+        setup.slept.clear()
+        setup.steps(ask=True).set_up(PORT, ())
+        text = (gateway.root / "etc/systemd/network/80-imud-can0.network").read_text()
+        assert f"[CAN]\nBitRate={rate}\n" in text
+        assert setup.slept[:25] == [0.2] * 25, "imud waits 5 s for the interface, which stays down here"
 
 
-def test_the_default_keeps_consoles_and_interfaces(
-    gateway: LivingMachine, setup: Setup, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    questions: list[str] = []
-
-    def take_default(question: str) -> str:
-        questions.append(question)
-        return ""
-
-    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
-    monkeypatch.setattr("builtins.input", take_default)
+def test_the_default_keeps_consoles_and_can(gateway: LivingMachine, setup: Setup, answers: dict[str, str]) -> None:
+    asked = Mock(return_value="")
     gateway.uart("ttyAMA0", console=True)
     gateway.can("can0")
-    setup.steps(ask=True).set_up(PORT, ())
-    assert questions[:2] == [
-        "/dev/ttyAMA0 has a console. Is a device connected, so that imud can remove the console? [y/N] ",
-        "The CAN interface can0 is down. Bring it up now and at every boot? [y/N] ",
+    with mock.patch("builtins.input", asked):
+        setup.steps(ask=True).set_up(PORT, ())
+    assert asked.call_args_list[:2] == [
+        call("/dev/ttyAMA0 has a console. Is a device connected, so that imud can remove the console? [y/N] "),
+        call("The CAN interface can0 is down. Bring it up now and at every boot? [y/N] "),
     ]
+    assert answers == {}
     assert "can0" not in str(gateway.ran)
 
 
@@ -401,7 +381,7 @@ def test_a_can_interface_is_brought_up_before_the_search(gateway: LivingMachine,
     run = gateway.run
 
     def brings_up(words: list[str]) -> object:
-        if words[:2] == ["networkctl", "reconfigure"] or tuple(words[:2]) == ("networkctl", "reconfigure"):
+        if tuple(words[:2]) == ("networkctl", "reconfigure"):
             gateway.can("can0", up=True)
         return run(words)
 
@@ -427,18 +407,9 @@ class Killed(BaseException):
 
 
 @pytest.mark.parametrize("step", range(14))
-def test_killed_at_any_step_all_is_taken_back(
-    gateway: LivingMachine, setup: Setup, monkeypatch: pytest.MonkeyPatch, step: int
-) -> None:
+def test_killed_at_any_step_all_is_undone(gateway: LivingMachine, setup: Setup, step: int) -> None:
     """The process ends before or after each write of a file or of the journal, and each command."""
-    before = gateway.files()
-    left = [step]
-
-    def fuse() -> None:
-        left[0] -= 1
-        if left[0] < 0:
-            raise Killed
-
+    before, fuse = gateway.files(), Mock(side_effect=[*[None] * step, *[Killed] * 14])
     write, run = changes.write, gateway.run
 
     def writes(*args: object) -> None:
@@ -447,48 +418,34 @@ def test_killed_at_any_step_all_is_taken_back(
         fuse()
 
     def runs(words: list[str]) -> object:
-        if words[0] in ("usermod",) or tuple(words[:2]) in (("systemctl", "enable"), ("systemctl", "restart")):
-            fuse()
-            output = run(words)
-            fuse()
-            return output
-        return run(words)
+        if words[0] != "usermod" and tuple(words[:2]) not in (("systemctl", "enable"), ("systemctl", "restart")):
+            return run(words)
+        fuse()
+        output = run(words)
+        fuse()
+        return output
 
-    monkeypatch.setattr(changes, "write", writes)
-    gateway.run = runs  # type: ignore[method-assign,assignment]
-    ended = False
-    try:
+    with mock.patch.object(changes, "write", writes), mock.patch.object(gateway, "run", runs), suppress(Killed):
         assert setup.steps(user="ann").set_up(PORT, ()) == 0
-        ended = True
-    except Killed:
-        pass
-    assert ended == (step >= 12)
-    monkeypatch.undo()
-    gateway.run = run  # type: ignore[method-assign]
+    assert (fuse.call_count <= step) == (step >= 12)
     assert setup.steps().undo() == 0
     assert gateway.files() == before
     assert gateway.units["imud.service"] == ["disabled", "inactive"]
 
 
-def test_a_full_disk_stops_before_the_change_that_could_not_be_recorded(
-    gateway: LivingMachine, setup: Setup, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    before = gateway.files()
-    replace = replace_file
-    count = [0]
+def test_a_full_disk_stops_before_the_first_change_without_a_record(gateway: LivingMachine, setup: Setup) -> None:
+    before, names = gateway.files(), list[str]()
 
     def full(path: Path, content: bytes, **more: object) -> None:
-        count[0] += path.name == "journal.json"
-        if count[0] == 5:
+        names.append(path.name)
+        if names.count("journal.json") == 5:
             raise OSError(28, "No space left on device", str(path))
-        replace(path, content, **more)  # type: ignore[arg-type]
+        replace_file(path, content, **more)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(journal, "replace_file", full)
-    with pytest.raises(OSError, match="No space"):
+    with mock.patch.object(journal, "replace_file", full), pytest.raises(OSError, match="No space"):
         setup.steps().set_up(PORT, ())
     assert "imud made 2 of 5 changes; undo: `sudo imud setup --undo`" in setup.said()
     assert (gateway.root / "etc/imud.yaml").read_text() == EXAMPLE
-    monkeypatch.undo()
     assert setup.steps().undo() == 0
     assert gateway.files() == before
 
@@ -508,22 +465,17 @@ def test_a_file_changed_since_is_left_and_the_rest_taken_back(gateway: LivingMac
     assert (gateway.root / "etc/imud.yaml").read_text() == EXAMPLE
 
 
-@pytest.mark.parametrize("gone", [False, True])
-def test_the_former_content_of_a_file_that_is_left_stays_to_be_put_back(
-    gone: bool, gateway: LivingMachine, setup: Setup
-) -> None:
+def test_the_former_content_of_a_file_that_is_left_is_kept(gateway: LivingMachine, setup: Setup) -> None:
     before = gateway.files()
-    setup.steps().set_up(PORT, ())
     file, copy = gateway.root / "etc/imud.yaml", gateway.root / "etc/imud.yaml.DATE"
-    file.write_text("devices: {}\n")
-    if gone:
-        file.unlink()
-    assert setup.steps().undo() == 1
-    out = setup.said()
-    assert "imud keeps /etc/imud.yaml.DATE, the backup of /etc/imud.yaml" in out
-    shutil.copy2(copy, file)  # the user solves the problem
-    assert setup.steps().undo() == 0
-    assert gateway.files() == before
+    for spoil in (file.unlink, lambda: file.write_text("devices: {}\n")):
+        setup.steps().set_up(PORT, ())
+        spoil()
+        assert setup.steps().undo() == 1
+        assert "imud keeps /etc/imud.yaml.DATE, the backup of /etc/imud.yaml" in setup.said()
+        shutil.copy2(copy, file)  # the user solves the problem
+        assert setup.steps().undo() == 0
+        assert gateway.files() == before
 
 
 def test_what_two_runs_changed_and_a_person_since_is_named_once(gateway: LivingMachine, setup: Setup) -> None:
@@ -564,38 +516,25 @@ def test_a_service_that_failed_too_often_is_started(gateway: LivingMachine, setu
     assert gateway.ran[-2:] == ["systemctl reset-failed imud.service", "systemctl restart imud.service"]
 
 
-def test_two_at_a_time_are_refused(gateway: LivingMachine, setup: Setup) -> None:
+def test_two_at_a_time_and_an_unreadable_journal_are_refused(gateway: LivingMachine, setup: Setup) -> None:
     with journal.locked(gateway.surroundings()), pytest.raises(ImudError, match="another `imud setup`"):
         setup.steps().set_up(PORT, ())
     assert gateway.ran == []
-
-
-def test_a_journal_that_nobody_can_read_is_an_error(gateway: LivingMachine, setup: Setup) -> None:
     gateway.write("/var/lib/imud-setup/journal.json", "[")
     with pytest.raises(ImudError, match="cannot read the journal"):
         setup.steps().undo()
 
 
-def test_only_root_may_read_the_journal(gateway: LivingMachine, setup: Setup) -> None:
-    setup.steps().set_up(PORT, ())
-    folder = gateway.root / "var/lib/imud-setup"
-    assert (folder.stat().st_mode & 0o777, (folder / "journal.json").stat().st_mode & 0o777) == (0o700, 0o600)
-    assert "imud.yaml" in (folder / "journal.json").read_text()
-
-
 SEARCHING = device("bow", state=DeviceState.SEARCHING, problem="nothing is heard")
 
 
-def waited(
-    answers: Callable[[float], Sequence[DeviceStatus]], names: Sequence[str]
-) -> tuple[list[DeviceStatus], float]:
+def waited(look: Callable[[float], list[DeviceStatus]], names: Sequence[str]) -> tuple[list[DeviceStatus], float]:
     now = [0.0]
 
     def sleep(s: float) -> None:
         now[0] += s
 
-    found = wait_for_samples(lambda: list(answers(now[0])), names, 30.0, lambda: now[0], sleep)
-    return found, now[0]
+    return wait_for_samples(lambda: look(now[0]), names, 30.0, lambda: now[0], sleep), now[0]
 
 
 def test_waiting_ends_four_seconds_after_all_run_or_at_the_limit() -> None:
@@ -606,17 +545,11 @@ def test_waiting_ends_four_seconds_after_all_run_or_at_the_limit() -> None:
     assert (found[0].state, end_s) == ("running", 9.0)
     found, end_s = waited(lambda _: [SEARCHING, device("mast")], ["bow", "mast"])
     assert ([one.state for one in found], end_s) == (["searching", "running"], 30.0)
-
-
-def test_a_daemon_that_never_answers_is_an_error() -> None:
-    def gone(_: float) -> Sequence[DeviceStatus]:
-        raise LinkMissing("no daemon")
-
     with pytest.raises(ImudError, match="does not reply: no daemon"):
-        waited(gone, ["bow"])
+        waited(Mock(side_effect=LinkMissing("no daemon")), ["bow"])
 
 
-def test_reasons_and_table() -> None:
+def test_reasons_and_tables_of_80_columns() -> None:
     assert reasons([device("bow")], ["bow"]) == []
     assert reasons([SEARCHING, device("mast")], ["bow", "mast", "keel"]) == [
         "bow: nothing is heard", "keel: the daemon does not use this device: check `systemctl status imud`",
@@ -629,6 +562,20 @@ def test_reasons_and_table() -> None:
     named = device("n" * 32, identity={"product": "p" * 40}, state=DeviceState.SEARCHING, rate_hz=1000.5)
     assert max(map(len, samples_table([named]).splitlines())) <= 80
     assert mast.split() == ["mast", "missing", "999.5", "-", "-"]
+    here = [
+        Attached("/dev/serial/by-id/usb-A", "/dev/ttyUSB0", "Adapter " * 9, "hipnuc-uart", "", 115200, {}, "bow"),
+        Attached("can0", "can0", "", problem="nothing is heard: " + "is the bus terminated? " * 6),
+    ]
+    lines = attached_table(here)
+    assert max(map(len, lines)) <= 80
+    assert lines[1].split()[:3] == ["/dev/ttyUSB0", "hipnuc-uart", "115200"]
+    assert lines[1].endswith("bow")
+    assert lines[3].startswith("  can0: nothing is heard")
+    assert lines[4].startswith("  ")
+    widest = Attached(
+        "/dev/ttyUSB10", "/dev/ttyUSB10", "t" * 90, "hipnuc-nmea2000", "source 253", 1_000_000, {}, "n" * 32
+    )
+    assert max(map(len, attached_table([widest]))) == 80
 
 
 def test_paragraphs_silence_and_defaults(capsys: pytest.CaptureFixture[str]) -> None:
@@ -647,44 +594,24 @@ def test_paragraphs_silence_and_defaults(capsys: pytest.CaptureFixture[str]) -> 
     assert talk.answer("name?", "imu") == "imu"
 
 
-@pytest.mark.parametrize(
-    ("word", "default", "agreed"),
-    [("", True, True), ("", False, False), ("Y", False, True), ("yes", False, True), ("n", True, False),
-     ("x", True, False)],
-)  # fmt: skip
-def test_answers(answers: dict[str, str], word: str, default: bool, agreed: bool) -> None:
-    answers["Sure?"] = word
-    assert Conversation(ask=True).agreed("Sure?", default=default) is agreed
+def test_answers(answers: dict[str, str]) -> None:
+    for word, default, agreed in [
+        ("", True, True), ("", False, False), ("Y", False, True), ("yes", False, True), ("n", True, False),
+        ("x", True, False),
+    ]:  # fmt: skip
+        answers["Sure?"] = word
+        assert Conversation(ask=True).agreed("Sure?", default=default) is agreed, word
 
 
-@pytest.mark.parametrize(
-    ("ended", "error", "words", "out"),
-    [(EOFError, BadArgument, "end of the input", "\n"),
-     (KeyboardInterrupt, KeyboardInterrupt, "^$", "\nimud setup made no further changes.\n")],
-)  # fmt: skip
 def test_a_question_without_an_answer_ends_it_on_a_new_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], ended: type[BaseException],
-    error: type[BaseException], words: str, out: str,
-) -> None:  # fmt: skip
-    monkeypatch.setattr("builtins.input", Mock(side_effect=ended))
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
-    with pytest.raises(error, match=words):
-        Conversation(ask=True).agreed("Sure?", default=True)
-    assert capsys.readouterr().out == out
-
-
-def test_the_table_has_80_columns() -> None:
-    here = [
-        Attached("/dev/serial/by-id/usb-A", "/dev/ttyUSB0", "Adapter " * 9, "hipnuc-uart", "", 115200, {}, "bow"),
-        Attached("can0", "can0", "", problem="nothing is heard: " + "is the bus terminated? " * 6),
-    ]
-    lines = attached_table(here)
-    assert max(map(len, lines)) <= 80
-    assert lines[1].split()[:3] == ["/dev/ttyUSB0", "hipnuc-uart", "115200"]
-    assert lines[1].endswith("bow")
-    assert lines[3].startswith("  can0: nothing is heard")
-    assert lines[4].startswith("  ")
-    widest = Attached(
-        "/dev/ttyUSB10", "/dev/ttyUSB10", "t" * 90, "hipnuc-nmea2000", "source 253", 1_000_000, {}, "n" * 32
-    )
-    assert max(map(len, attached_table([widest]))) == 80
+    interrupted = "\nimud setup made no further changes.\n"
+    for ended, error, words, out in [
+        (EOFError, BadArgument, "end of the input", "\n"), (KeyboardInterrupt, KeyboardInterrupt, "^$", interrupted),
+    ]:  # fmt: skip
+        monkeypatch.setattr("builtins.input", Mock(side_effect=ended))
+        with pytest.raises(error, match=words):
+            Conversation(ask=True).agreed("Sure?", default=True)
+        assert capsys.readouterr().out == out
