@@ -1,13 +1,18 @@
-"""Table of samples: columns, units, 80 columns, repeated header."""
+"""Table of samples: columns, units, 80 columns, repeated header. JSON and CSV of chosen fields (RFC 4180)."""
 
+import csv
+import io
+import json
+import math
 import os
 import sys
 
 import msgspec
 import pytest
 
-from imud.cli.watch import FIELDS, SampleTable, lines_of, usual_fields
+from imud.cli.watch import FIELDS, OUTPUTS, SampleTable, lines_of, usual_fields
 from imud.model.sample import SAMPLE_FIELDS, Sample, Sync
+from tests.cli.conftest import Terminal
 
 UTC_NS = 1_790_000_000_123_999_999  # 2026-09-21 14:13:20 UTC
 ONE = Sample("bow", 7, 12_345_678_900, 250_000, Sync.EDGE, 12_350_000_000, UTC_NS)
@@ -25,14 +30,10 @@ LARGEST = Sample(
 pytestmark = pytest.mark.usefixtures("in_kolkata")
 
 
-class Terminal:
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, columns: int, rows: int) -> None:
-        monkeypatch.setenv("COLUMNS", str(columns))
-        monkeypatch.setenv("LINES", str(rows))
-        monkeypatch.setattr(sys, "stdout", self)
-
-    def isatty(self) -> bool:
-        return True
+def terminal(monkeypatch: pytest.MonkeyPatch, columns: int, rows: int) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    monkeypatch.setenv("LINES", str(rows))
+    monkeypatch.setattr(sys, "stdout", Terminal())
 
 
 def test_lines_have_80_columns() -> None:
@@ -93,18 +94,15 @@ def test_a_wider_terminal_shows_more_and_a_narrow_one_every_column() -> None:
 
 
 def test_headers(monkeypatch: pytest.MonkeyPatch) -> None:
-    piped = SampleTable()
-    heads = [piped.text(WHOLE).count("TIME") for _ in range(100)]
-    assert heads == [1, *[0] * 99]
-    Terminal(monkeypatch, 80, 23)
-    table = SampleTable()
-    heads = [table.text(WHOLE).count("TIME") for _ in range(41)]
-    assert [n for n, head in enumerate(heads) if head] == [0, 20, 40]
-    Terminal(monkeypatch, 80, 5)
-    low = SampleTable()
-    heads = [low.text(WHOLE).count("TIME") for _ in range(11)]
-    assert [n for n, head in enumerate(heads) if head] == [0, 10]
-    Terminal(monkeypatch, 80, 23)
+    def headed(count: int) -> list[int]:
+        table = SampleTable()
+        return [number for number in range(count) if "TIME" in table.text(WHOLE)]
+
+    assert headed(100) == [0]
+    for rows, expected in ((23, [0, 20, 40]), (5, [0, 10])):
+        terminal(monkeypatch, 80, rows)
+        assert headed(expected[-1] + 1) == expected
+    terminal(monkeypatch, 80, 23)
     table = SampleTable()
     before = [table.text(WHOLE) for _ in range(20)]
     os.environ["COLUMNS"] = "86"
@@ -121,3 +119,31 @@ def test_a_second_device_makes_a_new_header() -> None:
     assert other.splitlines()[1].startswith("DEVICE")
     assert other.splitlines()[2].startswith("stern ")
     assert table.text(WHOLE).startswith("bow ")
+
+
+def test_json_and_csv() -> None:
+    one = msgspec.structs.replace(ONE, utc_ns=0)
+    whole = msgspec.structs.replace(one, accel_m_s2=(0.5, -1.25, 9.8), quat_wxyz=(1.0, 0.0, 0.0, 0.0), status=8)
+
+    def as_csv(sample: Sample, fields: tuple[str, ...]) -> str:
+        return OUTPUTS["csv"](fields).text(sample)
+
+    assert json.loads(OUTPUTS["json"](None).text(one)) == {
+        "device": "bow", "seq": 7, "t_ns": 12_345_678_900, "t_err_ns": 250_000, "sync": "edge",
+        "t_rx_ns": 12_350_000_000, "utc_ns": 0,
+    }  # fmt: skip
+    line = OUTPUTS["json"](("t_ns", "gyro_rad_s", "accel_m_s2")).text(whole)
+    assert line == '{"t_ns":12345678900,"accel_m_s2":[0.5,-1.25,9.8]}\n'
+    assert OUTPUTS["csv"](("device", "accel_m_s2", "euler_rad", "quat_wxyz")).begin(()) == (
+        "device,accel_x_m_s2,accel_y_m_s2,accel_z_m_s2,roll_rad,pitch_rad,yaw_rad,quat_w,quat_x,quat_y,quat_z\r\n"
+    )
+    text = OUTPUTS["csv"](SAMPLE_FIELDS).begin(()) + as_csv(one, SAMPLE_FIELDS)
+    head, *rows = csv.reader(io.StringIO(text), strict=True)
+    assert len(head) == len(set(head)) == len(rows[0])
+    fields = ("seq", "sync", "accel_m_s2", "gyro_rad_s", "status", "temperature_c")
+    assert as_csv(whole, fields) == "7,edge,0.5,-1.25,9.8,,,,8,\r\n"
+    strange = msgspec.structs.replace(whole, temperature_c=math.nan)
+    assert as_csv(strange, ("temperature_c", "seq")) == "nan,7\r\n"
+    text = as_csv(msgspec.structs.replace(one, device='a "b", c'), ("device", "seq"))
+    assert text == '"a ""b"", c",7\r\n'
+    assert list(csv.reader([text], strict=True)) == [['a "b", c', "7"]]
