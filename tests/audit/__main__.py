@@ -7,8 +7,7 @@ import sys
 from collections.abc import Iterator
 
 from tests.audit import manuals
-from tests.audit.descriptions import described
-from tests.audit.item import Item, faults, marks
+from tests.audit.item import Item, described, faults, marks
 
 TITLES = {"A": "Forsense IMU61x", "B": "HiPNUC CH0x0, CH10x, HI14"}
 ITEMS = {item.key: item for item in manuals.ITEMS}

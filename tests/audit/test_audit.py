@@ -4,8 +4,7 @@ import re
 
 from tests.audit import manuals
 from tests.audit.__main__ import ITEMS
-from tests.audit.descriptions import described
-from tests.audit.item import faults, marks
+from tests.audit.item import described, faults, marks
 
 
 def test_every_item_has_code_and_a_test() -> None:
