@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import pytest
@@ -14,6 +15,7 @@ import pytest
 from imud.cli import main
 from tests.fleet.conftest import broker
 from tests.support.daemon_process import LIMIT_S
+from tests.support.surroundings import Machine
 
 __all__ = ["broker"]
 
@@ -47,6 +49,11 @@ class Cli:
     def refuses(self, problem: str, *words: object) -> None:
         """Run a command. Check that it ends with status 2 and prints this problem to standard error."""
         assert problem in " ".join(self(*words, status=2).err.split())
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Machine:
+    return Machine(tmp_path)
 
 
 @pytest.fixture

@@ -141,6 +141,13 @@ class Machine:
         node.chmod(mode)
         return node
 
+    def hold(self, name: str, program: str, pid: int = 10, command: str = "") -> None:
+        """Make a process that has a port open. `command` is its command line, with spaces between the arguments."""
+        self.write(f"/proc/{pid}/comm", program + "\n")
+        self.write(f"/proc/{pid}/cmdline", (command or program).replace(" ", "\0"))
+        self.write(f"/proc/{pid}/fd/0")
+        (self.root / f"proc/{pid}/fd/3").symlink_to((self.root / "dev" / name).resolve())
+
     def unit(self, *lines: str) -> None:
         """Set the output of `systemctl show` for an existing unit."""
         self.outputs["systemctl show"] = CommandOutput(0, "\n".join(("LoadState=loaded", *lines)), "")

@@ -108,9 +108,8 @@ def unusable(**refuse: int) -> str:
     raise AssertionError("it was not refused")
 
 
-@pytest.mark.parametrize(
-    ("problem", "words"),
-    [
+def test_mode_and_word_size_by_what_was_read(machine: Machine) -> None:
+    for problem, words in [
         # 00 00 'IMU614': 0000 494D 5536 3134; one bit early: 0000 929A AA6C 6268; late: 0000 24A6 AA9B 189A
         (refused("0000929aaa6c6268"), "→ SPI mode: the reply is shifted by one bit"),
         (refused("000024a6aa9b189a"), "→ SPI mode"),
@@ -122,12 +121,10 @@ def unusable(**refuse: int) -> str:
         (unusable(request=WR_BITS_PER_WORD), "→ the controller refuses words of 16 and 8 bits"),
         (unusable(request=WR_BITS_PER_WORD).replace("Invalid argument", "Permission denied"), "→ if all bytes are 00"),
         (unusable(request=WR_MODE, least=3), "→ the controller does not support this mode"),
-    ],
-)
-def test_mode_and_word_size_by_what_was_read(machine: Machine, problem: str, words: str) -> None:
-    machine.configure(MAST)
-    machine.status = [msgspec.structs.replace(polled("mast", DeviceState.SEARCHING), problem=problem)]
-    machine.tells(SPI, "error", words)
+    ]:
+        machine.configure(MAST)
+        machine.status = [msgspec.structs.replace(polled("mast", DeviceState.SEARCHING), problem=problem)]
+        machine.tells(SPI, "error", words)
 
 
 UP, STATE, RATE = DoctorCheck("u", can_up), DoctorCheck("s", can_state), DoctorCheck("r", can_bitrate)

@@ -178,23 +178,19 @@ def test_the_endpoint_itself_is_understood(running: Machine) -> None:
 RINGS, FLIGHT = "shm: {directory: /dev/shm}\n", "recorder: {flight: {enabled: true, directory: /dev/shm/imud-flight}}\n"
 
 
-@pytest.mark.parametrize(
-    ("more", "removes", "severities"),
-    [
+def test_files_in_shared_memory_that_systemd_removes(machine: Machine) -> None:
+    for more, removes, severities in [
         (RINGS + FLIGHT, "yes", ["warning", "warning"]), (RINGS + FLIGHT, "no", ["ok", "ok"]),
         (FLIGHT, "yes", ["warning"]), (FLIGHT.replace("true", "false"), "yes", []),
         ("shm: {directory: /dev/shmem}\n", "yes", []), ("", "yes", []),
-    ],
-)  # fmt: skip
-def test_files_in_shared_memory_that_systemd_removes(
-    machine: Machine, more: str, removes: str, severities: list[str]
-) -> None:
-    machine.configure(more=more)
-    assert machine.find(SHARED) == [], "without a service nothing removes them"
-    machine.unit(f"RemoveIPC={removes}")
-    told = machine.told(SHARED)
-    assert [severity for severity, _ in told] == severities
-    assert all("RemoveIPC=no" in text for severity, text in told if severity == "warning")
+    ]:  # fmt: skip
+        machine.configure(more=more)
+        machine.outputs.clear()
+        assert machine.find(SHARED) == [], "without a service nothing removes them"
+        machine.unit(f"RemoveIPC={removes}")
+        told = machine.told(SHARED)
+        assert [severity for severity, _ in told] == severities
+        assert all("RemoveIPC=no" in text for severity, text in told if severity == "warning")
 
 
 WIRED = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}, lines: {sout: {line: GPIO17}}}"
@@ -209,19 +205,8 @@ def counted(state: DeviceState = DeviceState.SEARCHING, **counts: int) -> Device
     return msgspec.structs.replace(made, ledger=dict.fromkeys(made.ledger, 0) | counts)
 
 
-def test_without_the_daemon_a_port_or_samples(machine: Machine) -> None:
-    machine.configure(WIRED)
-    for check in (HEARD, LINES):
-        assert [finding.severity for finding in machine.find(check)] == ["not checked"]
-    assert machine.find(HALF) == []  # this line is not configured
-    machine.configure(BOW)
-    machine.status = [counted(DeviceState.MISSING)]
-    assert machine.find(HEARD) == []
-
-
-@pytest.mark.parametrize(
-    ("status", "severity", "words"),
-    [
+def test_serial_data(machine: Machine) -> None:
+    for status, severity, words in [
         (counted(), "error", "are TX and RX swapped"),
         (counted(bytes_in=199), "error", "echoes of imud's requests"),
         (counted(bytes_in=200), "error", "the baud rate, the driver or the device is wrong"),
@@ -233,12 +218,10 @@ def test_without_the_daemon_a_port_or_samples(machine: Machine) -> None:
         (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=5), "ok", "5 damaged"),
         (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=6), "warning", "6 damaged and"),
         (msgspec.structs.replace(counted(**GOOD), kernel=KernelCounters(overrun=2)), "warning", "overrun"),
-    ],
-)  # fmt: skip
-def test_serial_data(machine: Machine, status: DeviceStatus, severity: str, words: str) -> None:
-    machine.configure(BOW)
-    machine.status = [status]
-    machine.tells(HEARD, severity, words)
+    ]:  # fmt: skip
+        machine.configure(BOW)
+        machine.status = [status]
+        machine.tells(HEARD, severity, words)
 
 
 def one_way(**changes: object) -> DeviceStatus:
@@ -248,30 +231,24 @@ def one_way(**changes: object) -> DeviceStatus:
     return msgspec.structs.replace(made, **changes)
 
 
-@pytest.mark.parametrize(
-    ("status", "severities"),
-    [
+def test_a_device_that_never_answers_does_not_hear_imud(machine: Machine) -> None:
+    for status, severities in [
         (one_way(), ["ok", "warning"]), (one_way(identity={"product": "HI14"}), ["ok"]),
         (one_way(ledger=one_way().ledger | {"frames_in_replies": 1}), ["ok"]),
         (one_way(ledger=one_way().ledger | {"samples": 6000}), ["ok"]), (one_way(state=DeviceState.SILENT), ["ok"]),
         (one_way(expected_rate_hz=0.0, rate_hz=0.0), ["ok"]),
-    ],
-)  # fmt: skip
-def test_a_device_that_never_answers_does_not_hear_imud(
-    machine: Machine, status: DeviceStatus, severities: list[str]
-) -> None:
-    machine.configure(BOW)
-    machine.status = [status]
-    told = machine.told(HEARD)
-    assert [severity for severity, _ in told] == severities
-    assert all("RX of the device is not connected" in text for severity, text in told if severity == "warning")
-    machine.configure(BOW.replace("bow: {", "bow: {identify: false, "))
-    assert [finding.severity for finding in machine.find(HEARD)] == ["ok"]
+    ]:  # fmt: skip
+        machine.configure(BOW)
+        machine.status = [status]
+        told = machine.told(HEARD)
+        assert [severity for severity, _ in told] == severities
+        assert all("RX of the device is not connected" in text for severity, text in told if severity == "warning")
+        machine.configure(BOW.replace("bow: {", "bow: {identify: false, "))
+        assert [finding.severity for finding in machine.find(HEARD)] == ["ok"]
 
 
-@pytest.mark.parametrize(
-    ("state", "line", "severity", "words"),
-    [
+def test_rs485(machine: Machine) -> None:
+    for state, line, severity, words in [
         (DeviceState.RUNNING, Counters(timeouts=10, echoes=1000), "ok", "ignores the echoes"),
         (DeviceState.RUNNING, Counters(timeouts=10, strange_bytes=10), "ok", "bus works"),
         (DeviceState.RUNNING, Counters(strange_bytes=1), "ok", "bus works"),
@@ -279,17 +256,14 @@ def test_a_device_that_never_answers_does_not_hear_imud(
         (DeviceState.RUNNING, Counters(strange_bytes=5), "warning", "5 invalid bytes"),
         (DeviceState.SEARCHING, Counters(timeouts=9, echoes=9), "error", "only 9 echoes"),
         (DeviceState.SEARCHING, Counters(timeouts=9), "error", "no byte arrived"),
-    ],
-)
-def test_rs485(machine: Machine, state: DeviceState, line: Counters, severity: str, words: str) -> None:
-    machine.configure(RS485)
-    machine.status = [device("bow", state=state, serial_line=line, polling=POLLING)]  # 1000 reads
-    machine.tells(HALF, severity, words)
+    ]:
+        machine.configure(RS485)
+        machine.status = [device("bow", state=state, serial_line=line, polling=POLLING)]  # 1000 reads
+        machine.tells(HALF, severity, words)
 
 
-@pytest.mark.parametrize(
-    ("samples", "found", "severity", "words"),
-    [
+def test_edges_of_lines(machine: Machine) -> None:
+    for samples, found, severity, words in [
         (5000, LinesStatus({}, {"sout": 4999}, {"sout": 0}), "ok", "4999 edges"),
         (5000, LinesStatus({}, {"sout": 4990}, {"sout": 9}), "warning", "the kernel lost 9 of 4999 edges"),
         (101, LinesStatus({}, {"sout": 0}, {}), "warning", "no edge in 101 samples"),
@@ -298,10 +272,8 @@ def test_rs485(machine: Machine, state: DeviceState, line: Counters, severity: s
         (1000, LinesStatus({}, {"pps": 0}, {}), "not checked", "too few samples"),
         (1001, LinesStatus({}, {"pps": 0}, {}), "warning", "does the receiver have a fix"),
         (5000, LinesStatus({"sout": "GPIO17 is in use"}, {"sout": 0}, {}), "error", "GPIO17 is in use"),
-    ],
-)
-def test_edges_of_lines(machine: Machine, samples: int, found: LinesStatus, severity: str, words: str) -> None:
-    machine.configure(WIRED)
-    running = counted(DeviceState.RUNNING, samples=samples)
-    machine.status = [msgspec.structs.replace(running, lines=found, expected_rate_hz=100.0)]
-    machine.tells(LINES, severity, words)
+    ]:
+        machine.configure(WIRED)
+        running = counted(DeviceState.RUNNING, samples=samples)
+        machine.status = [msgspec.structs.replace(running, lines=found, expected_rate_hz=100.0)]
+        machine.tells(LINES, severity, words)

@@ -113,13 +113,6 @@ PRESENT, TAKEN = DoctorCheck("p", ports_present), DoctorCheck("t", ports_taken)
 MODEM, LATENCY = DoctorCheck("m", modem_manager), DoctorCheck("l", latency_timer)
 
 
-def hold(machine: Machine, pid: int, name: str, *, command: str = "") -> None:
-    machine.write(f"/proc/{pid}/comm", name + "\n")
-    machine.write(f"/proc/{pid}/cmdline", command.replace(" ", "\0"))
-    (machine.root / f"proc/{pid}/fd").mkdir()
-    (machine.root / f"proc/{pid}/fd/3").symlink_to(os.path.realpath(machine.root / "dev/ttyUSB0"))
-
-
 def test_a_port_that_is_absent_and_one_with_a_stable_name(machine: Machine) -> None:
     machine.configure(BOW)
     assert machine.told(PRESENT)[0][1].startswith(
@@ -153,9 +146,9 @@ def test_who_uses_a_port(machine: Machine) -> None:
     machine.status = [device("bow", state=DeviceState.FAILED, problem=problem)]
     assert machine.told(TAKEN) == [("error", f"{problem} → `sudo imud doctor` shows the program")]
     machine.uid, machine.status = 0, []
-    hold(machine, 10, "python3", command="/usr/bin/python3 /usr/bin/imud run")
+    machine.hold("ttyUSB0", "python3", command="/usr/bin/python3 /usr/bin/imud run")
     assert machine.find(TAKEN)[0].severity == "ok"
-    hold(machine, 11, "minicom")
+    machine.hold("ttyUSB0", "minicom", 11)
     machine.tells(TAKEN, "error", "/dev/ttyUSB0 is open in another program: minicom (pid 11)")
 
 

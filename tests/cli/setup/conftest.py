@@ -119,12 +119,6 @@ class LivingMachine(Machine):
         self.write(f"/sys/class/net/{name}/type", "280\n")
         self.write(f"/sys/class/net/{name}/flags", "0x1\n" if up else "0x0\n")
 
-    def hold(self, name: str, program: str, pid: int = 10) -> None:
-        self.write(f"/proc/{pid}/comm", program + "\n")
-        self.write(f"/proc/{pid}/cmdline", program.replace(" ", "\0"))
-        (self.root / f"proc/{pid}/fd").mkdir()
-        (self.root / f"proc/{pid}/fd/3").symlink_to((self.root / "dev" / name).resolve())
-
     def files(self) -> dict[str, tuple[str, int]]:
         """Return content and mode of every file that setup can change."""
         found = {}
