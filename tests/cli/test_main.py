@@ -1,10 +1,12 @@
-"""All commands: help texts, and one line per error."""
+"""All commands: help texts, and one line per error. `imud schema`: fields of a sample, conventions of the drivers."""
 
+import json
 import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
 from pkgutil import walk_packages
+from unittest import mock
 
 import pytest
 
@@ -12,6 +14,9 @@ import imud.cli
 from imud import __version__
 from imud.cli import COMMANDS
 from imud.cli.arguments import CliCommand
+from imud.cli.schema import driver_schemas
+from imud.drivers import DRIVERS
+from imud.model.sample import SAMPLE_FIELDS
 from tests.cli.conftest import Cli
 from tests.support.daemon_process import LIMIT_S
 
@@ -30,35 +35,23 @@ def test_the_table_has_every_command_of_every_module() -> None:
     assert written == set(loaded)
 
 
-def test_without_a_command_the_usage_is_printed(cli: Cli) -> None:
+def test_version_and_usage_without_a_command(cli: Cli) -> None:
     cli.refuses("usage: imud ")
-
-
-def test_version(cli: Cli) -> None:
     assert cli("--version").out == f"imud {__version__}\n"
 
 
-@pytest.mark.parametrize("command", ["devices", "status", "watch", "events", "clock", "record"])
-def test_no_daemon_is_one_line(command: str, tmp_path: Path, cli: Cli) -> None:
-    error = cli(command, "--socket", tmp_path / "none", status=2).err
-    assert error.count("\n") == 1
-    assert error.startswith(f"imud {command}: no daemon at {tmp_path}/none: is imud running?")
+def test_no_daemon_is_one_line(tmp_path: Path, cli: Cli) -> None:
+    for command in ("devices", "status", "watch", "events", "clock", "record"):
+        error = cli(command, "--socket", tmp_path / "none", status=2).err
+        assert error.count("\n") == 1, error
+        assert error.startswith(f"imud {command}: no daemon at {tmp_path}/none: is imud running?")
 
 
-def hang(path: str, **_more: object) -> None:
-    raise TimeoutError(f"{path}: waited in vain for hello")
-
-
-def test_a_daemon_that_hangs_is_named_and_an_interrupt_is_status_130(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("imud.cli.arguments.Client", hang)
-    printed = cli("status", "--socket", "/run/x.sock", status=2)
-    assert printed.err == "imud status: /run/x.sock: waited in vain for hello\n"
-
-    def interrupted(*_arguments: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("imud.cli.arguments.Client", interrupted)
-    assert cli("status", "--socket", "/run/x.sock", status=130).err == ""
+def test_a_daemon_that_hangs_is_named_and_an_interrupt_is_status_130(cli: Cli) -> None:
+    words, hang = ("status", "--socket", "/run/x.sock"), TimeoutError("/run/x.sock: waited in vain for hello")
+    for error, status, said in [(hang, 2, f"imud status: {hang}\n"), (KeyboardInterrupt, 130, "")]:
+        with mock.patch("imud.cli.arguments.Client", side_effect=error):
+            assert cli(*words, status=status).err == said
 
 
 HEAVY = {"asyncio", "ssl", "http", "email", "multiprocessing", "concurrent", "sqlite3", "unittest", "xml"}
@@ -89,3 +82,16 @@ def test_a_command_that_is_called_often_imports_little(words: list[str], foreign
     if words == ["--help"]:
         assert "calibrate" in done.stdout
         assert not [name for name in loaded if name.startswith(("imud.c", "imud.d")) and "imud.cli" not in name]
+
+
+def test_schema_has_every_field_and_every_driver(cli: Cli) -> None:
+    text = cli("schema").out
+    for word in ("accel_m_s2", "m/s²", "gyro_rad_s", "rad/s", "hipnuc-uart", "ENU"):
+        assert word in text
+    row = next(line for line in text.splitlines() if "magnetic disturbance" in line)
+    assert row.split()[:2] == ["hipnuc-uart", "4"]
+    found = json.loads(cli("schema", "--json").out)
+    assert tuple(field["name"] for field in found["fields"]) == SAMPLE_FIELDS
+    assert found["drivers"].keys() == DRIVERS.keys() == driver_schemas().keys()
+    assert found["drivers"]["hipnuc-uart"]["navigation_frame"] == "ENU"
+    assert found["drivers"]["hipnuc-uart"]["status_bits"]["3"] == "gyroscope bias not converged"
