@@ -4,6 +4,7 @@ import argparse
 import json
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 
@@ -16,26 +17,24 @@ from tests.cli.test_decode import MANUAL_FRAME
 from tests.support.files import imu61x_log
 
 
-@pytest.mark.parametrize(
-    ("command", "option", "value"),
-    [
+def test_an_unknown_option_and_one_that_is_not_a_finite_number_are_refused(cli: Cli) -> None:
+    for command, option, value in [
         ("watch", "--rate", "nan"), ("watch", "--rate", "-inf"), ("watch", "--rate", "ten"),
         ("watch", "--latency", "inf"), ("demo", "--rate", "inf"), ("setup", "--wait", "inf"),
-    ],
-)  # fmt: skip
-def test_an_option_that_is_not_a_finite_number_is_refused(command: str, option: str, value: str, cli: Cli) -> None:
-    cli.refuses(f"argument {option}: expected a number, got '{value}'", command, f"{option}={value}")
+    ]:  # fmt: skip
+        cli.refuses(f"argument {option}: expected a number, got '{value}'", command, f"{option}={value}")
+    for words in ("clock", "fleet top mqtt://host", "modbus scan /dev/x"):
+        found = cli(*words.split(), "--bogus", status=2).err
+        assert found.startswith(f"usage: imud {words.rpartition(' ')[0] or words} ")
+        assert "unrecognized arguments: --bogus" in found
 
 
-def test_a_port_is_0_to_65535() -> None:
+def test_ports_and_durations() -> None:
     for port in (0, 65535):
         check_port(port)
     for port in (-1, 65536):
         with pytest.raises(BadArgument, match=f"--port: expected 0 to 65535, got {port}"):
             check_port(port)
-
-
-def test_durations() -> None:
     texts = {"90": 90, "90s": 90, "10min": 600, "1.5h": 5400, "2 d": 172_800, " .5s ": 0.5}
     assert {text: duration_s(text) for text in texts} == texts
     for text in ["", "min", "0", "-1s", "1 week", "1e3", "10m", "nan", "9" * 400 + "s"]:
@@ -44,13 +43,6 @@ def test_durations() -> None:
     for words in (["clock"], ["record"], ["noise", "bow"], ["demo"], ["fleet", "top", "mqtt://host"]):
         parsed = [build_parser(words[:1]).parse_args([*words, name, "2min"]) for name in ("--duration", "--for")]
         assert [one.duration for one in parsed] == [120, 120]
-
-
-@pytest.mark.parametrize("words", ["clock", "fleet top mqtt://host", "modbus scan /dev/x"])
-def test_an_unknown_option_prints_the_usage_of_its_command(words: str, cli: Cli) -> None:
-    found = cli(*words.split(), "--bogus", status=2).err
-    assert found.startswith(f"usage: imud {words.rpartition(' ')[0] or words} ")
-    assert "unrecognized arguments: --bogus" in found
 
 
 def test_values_are_json_or_text() -> None:
@@ -65,18 +57,18 @@ def test_values_are_json_or_text() -> None:
         named_values(["a=1", "b=1", "a=x"])
 
 
-@pytest.mark.parametrize(("typed", "agreed"), [("y", True), (" YES ", True), ("n", False), ("", False)])
-def test_a_risk_is_confirmed_on_a_terminal(
-    typed: str, agreed: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    answers = {"all is lost; reset bow? [y/N] ": typed}
-    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
-    monkeypatch.setattr("builtins.input", answers.pop)
-    assert confirmed("reset bow", "all is lost", yes=False) is agreed
-    assert capsys.readouterr().out == ("" if agreed else "imud changed nothing\n")
-    assert confirmed("reset bow", "all is lost", yes=True)
-    monkeypatch.setattr("sys.stdin.isatty", lambda: False, raising=False)
-    with pytest.raises(BadArgument, match="all is lost: cannot ask for confirmation without a terminal"):
+def test_a_risk_is_confirmed_on_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    question = "all is lost; reset bow? [y/N] "
+    with mock.patch("sys.stdin.isatty", return_value=True):
+        for typed, agreed in [("y", True), (" YES ", True), ("n", False), ("", False)]:
+            with mock.patch("builtins.input", {question: typed}.pop):
+                assert confirmed("reset bow", "all is lost", yes=False) is agreed, typed
+            assert capsys.readouterr().out == ("" if agreed else "imud changed nothing\n")
+        assert confirmed("reset bow", "all is lost", yes=True)
+    with (
+        mock.patch("sys.stdin.isatty", return_value=False),
+        pytest.raises(BadArgument, match="all is lost: cannot ask for confirmation without a terminal"),
+    ):
         confirmed("reset bow", "all is lost", yes=False)
 
 
@@ -110,20 +102,16 @@ def test_settings_of_a_stream_driver(tmp_path: Path, cli: Cli) -> None:
     assert "pps_age_ms" not in json.loads(cli(*decode, "hi91_word=status").out)
 
 
-@pytest.mark.parametrize("command", ["decode", "replay"])
-@pytest.mark.parametrize(
-    ("option", "said"),
-    [
+def test_bad_option_is_one_clear_line(moved: Path, cli: Cli) -> None:
+    unknown = 'expected an option of imu61x-can that imud knows, got "baseid"; did you mean base_id? known: base_id'
+    for option, said in [
         ("base_id=high", '--option base_id: expected a whole number from 0 to 2043, got "high"'),
         ("base_id=4000", "--option base_id: expected a whole number from 0 to 2043, got 4000"),
-        ("baseid=201", "--option baseid: expected an option of imu61x-can that imud knows, got \"baseid\"; "
-         "did you mean base_id? known: base_id"),
-        ("base_id", "expected NAME=VALUE, got 'base_id'"),
-    ],
-)  # fmt: skip
-def test_bad_option_is_one_clear_line(command: str, option: str, said: str, moved: Path, cli: Cli) -> None:
-    printed = cli(command, "--driver", "imu61x-can", "--option", option, moved, status=2)
-    assert printed.err == f"imud {command}: {said}\n"
+        ("baseid=201", f"--option baseid: {unknown}"), ("base_id", "expected NAME=VALUE, got 'base_id'"),
+    ]:  # fmt: skip
+        for command in ("decode", "replay"):
+            printed = cli(command, "--driver", "imu61x-can", "--option", option, moved, status=2)
+            assert printed.err == f"imud {command}: {said}\n"
 
 
 def test_fields_come_in_their_order_and_wrong_names_are_an_error() -> None:

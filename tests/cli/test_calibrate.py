@@ -160,7 +160,7 @@ def account(kept: Kept, *checks: Check, problem: str = "", asked_to_save: bool =
     return _account(result, asked_to_save=asked_to_save).splitlines()
 
 
-def test_a_result_has_its_checks_in_units_of_people() -> None:
+def test_a_result_has_its_checks_in_units_of_people_and_a_way_to_save_it() -> None:
     checks = (
         Check("roll", 0.01, 0.02, "rad", True), Check("turn", 0.1, 0.05, "rad/s", False),
         Check("field", 45.1e-6, 67e-6, "T", True), Check("share", 0.5, 1.0, "", True),
@@ -172,14 +172,9 @@ def test_a_result_has_its_checks_in_units_of_people() -> None:
         "  share: 50.0%, limit 100.0%: passed", "  force: not reported, limit 1 m/s²: NOT passed",
         "  not saved: lasts until power-off, unless it is saved; save it with --save",
     ]  # fmt: skip
-
-
-def test_a_result_that_is_not_saved_names_a_way_to_save_it_only_if_there_is_one() -> None:
     assert account(Kept.BY_SAVE, asked_to_save=True)[-1].endswith("unless it is saved")
     assert account(Kept.NEVER)[-1] == "  not saved: lasts until power-off; it cannot be saved"
     assert account(Kept.BY_DEVICE)[-1] == "  saved"
     failed = account(Kept.BY_SAVE, problem="it moved")
-    assert (failed[0], failed[-1]) == (
-        "NOT verified: it moved",
-        "  not saved: lasts until power-off, unless it is saved",
-    )
+    unsaved = "  not saved: lasts until power-off, unless it is saved"
+    assert (failed[0], failed[-1]) == ("NOT verified: it moved", unsaved)

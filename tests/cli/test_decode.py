@@ -43,47 +43,32 @@ def test_one_object_per_message(tmp_path: Path, cli: Cli) -> None:
     assert (ledger["bytes_in"], ledger["frames_in_samples"]) == (82 + 4 + 82 + 1, 1)
 
 
-def test_standard_input(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
+def test_standard_input_a_file_without_a_message_and_none(
+    tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "noise").write_bytes(bytes(range(128, 256)) * 8)
+    assert json.loads(cli(*DECODE, tmp_path / "noise", status=1).err)["bytes_in"] == 1024
+    error = cli(*DECODE, tmp_path / "none", status=2).err
+    assert error == f"imud decode: cannot open {tmp_path}/none: No such file or directory\n"
+    cli.refuses("/dev/zero is a character device, expected a regular file", *DECODE, "/dev/zero")
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(MANUAL_FRAME * 3)))
     assert len(lines(cli(*DECODE, "-").out)) == 3
 
 
-def test_a_file_without_a_message_and_none(tmp_path: Path, cli: Cli) -> None:
-    (tmp_path / "noise").write_bytes(bytes(range(128, 256)) * 8)
-    assert json.loads(cli(*DECODE, tmp_path / "noise", status=1).err)["bytes_in"] == 1024
-    assert (
-        cli(*DECODE, tmp_path / "none", status=2).err
-        == f"imud decode: cannot open {tmp_path}/none: No such file or directory\n"
-    )
-    cli.refuses("/dev/zero is a character device, expected a regular file", *DECODE, "/dev/zero")
-
-
-@pytest.mark.parametrize(
-    ("capture", "status", "words"),
-    [
-        (
-            encode_frame(b"\x83" + bytes(55)) * 3,
-            1,
-            "found valid frames of unknown types (HI83 (tag 0x83): 3), but no sample; ",
-        ),
-        (encode_frame(b"\x83" + bytes(55)) + b"OK\r\n", 1, "`imud settings NAME --set output.hi91=100`"),
-        (encode_frame(b"\x83" + bytes(55)) + MANUAL_FRAME, 0, ""),
-        (b"OK\r\n", 0, ""),  # a capture of replies
-    ],
-)
-def test_a_capture_without_samples_names_its_frames(
-    capture: bytes, status: int, words: str, tmp_path: Path, cli: Cli
-) -> None:
-    (tmp_path / "capture").write_bytes(capture)
-    err = cli(*DECODE, tmp_path / "capture", status=status).err
-    assert words in err
-    assert ("unknown types" in err) == bool(words)
-    if status:
-        assert "types (HI83" in cli("replay", "--driver", DECODE[2], tmp_path / "capture", status=1).err
-
-
-def test_a_log_without_samples_names_its_frames(tmp_path: Path, cli: Cli) -> None:
+def test_a_capture_without_samples_names_its_frames(tmp_path: Path, cli: Cli) -> None:
     """The number of named types has a limit."""
+    unknown, file = encode_frame(b"\x83" + bytes(55)), tmp_path / "capture"
+    found = "found valid frames of unknown types (HI83 (tag 0x83): 3), but no sample; "
+    for capture, status, words in [
+        (unknown * 3, 1, found), (unknown + b"OK\r\n", 1, "`imud settings NAME --set output.hi91=100`"),
+        (unknown + MANUAL_FRAME, 0, ""), (b"OK\r\n", 0, ""),  # a capture of replies
+    ]:  # fmt: skip
+        file.write_bytes(capture)
+        err = cli(*DECODE, file, status=status).err
+        assert words in err
+        assert ("unknown types" in err) == bool(words)
+        if status:
+            assert "types (HI83" in cli("replay", "--driver", DECODE[2], file, status=1).err
     log = tmp_path / "drive.log"
     log.write_text("".join(f"({one}.0) can0 0CFF{0x60 + one % 12:02X}08#00\n" for one in range(24)))
     err = cli("decode", "--driver", "hipnuc-j1939", log, status=1).err
@@ -107,9 +92,7 @@ def test_log_of_a_can_bus(tmp_path: Path, cli: Cli) -> None:
     assert ledger["frames_in_samples"] == 10
 
 
-def test_a_fifo_is_read_as_it_comes_and_not_waited_for_without_a_writer(
-    tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fifo_is_read_and_needs_a_writer(tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "fifo"
     os.mkfifo(path)
     monkeypatch.setattr("imud.cli.decode.FIFO_WAIT_MS", 1)

@@ -111,7 +111,7 @@ def test_children_that_end_too_early_are_named(
     assert capsys.readouterr().err.endswith("the child did not stop within 0 s; imud killed it\n")
 
 
-def test_devices_that_cannot_be_shown(cli: Cli) -> None:
+def test_devices_that_cannot_be_shown(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     for words, said in [
         (["--device", "imu61x-i2c"], "cannot simulate imu61x-i2c; name the bus of a real device, for example --bus 1"),
         (["--device", "imu61x-spi", "--bus", "1"],
@@ -124,9 +124,6 @@ def test_devices_that_cannot_be_shown(cli: Cli) -> None:
          "expected different devices, for example --device imu61x-can:101 --device imu61x-can:201"),
     ]:  # fmt: skip
         assert cli("demo", *words, status=2).err == f"imud demo: {said}\n"
-
-
-def test_a_can_device_needs_an_interface(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
     monkeypatch.setattr("imud.sim.ports.can_port.can_interfaces", list)
     cli.refuses("ip link add vcan0 type vcan", "demo", "--device", "imu61x-can", "--duration", "1")
 
@@ -149,20 +146,13 @@ def test_view_counts_what_is_missing_of_each_device() -> None:
     assert (view.samples, view.missed) == (4, 1)
 
 
-def test_live_view_draws_ten_times_per_second(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_live_view_draws_in_place_ten_times_per_second(monkeypatch: pytest.MonkeyPatch) -> None:
     out = io.StringIO()
     view = View(out, live=True)
     for number, now_ms in enumerate((1000, 1099, 1100, 1199, 1200), 1):
         monkeypatch.setattr("imud.cli.demo.monotonic_ns", lambda now_ms=now_ms: now_ms * 1_000_000)
         view.add(sample(number))
     assert [number for number in range(1, 6) if f"demo #{number}" in out.getvalue()] == [1, 3, 5]
-
-
-def test_live_view_draws_in_place() -> None:
-    out = io.StringIO()
-    view = View(out, live=True)
-    view.add(sample(1))
-    first = out.getvalue()
-    assert "demo #1" in first
+    first = out.getvalue().partition("demo #3")[0]
     assert "5.730" in first  # 0.1 rad in degrees
-    assert "\x1b[5A" not in first
+    assert "\x1b[5A" not in first.partition("demo #1")[0]

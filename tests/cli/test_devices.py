@@ -8,7 +8,7 @@ import pytest
 from tests.cli.conftest import Cli
 from tests.support.daemon_process import RunningDaemon, daemon_with_module, running_daemon
 
-live = pytest.mark.live
+pytestmark = pytest.mark.live
 
 
 @pytest.fixture(scope="module")
@@ -17,7 +17,6 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
         yield daemon
 
 
-@live
 def test_devices_and_verbs_are_listed_and_a_module_obeys(daemon: RunningDaemon, cli: Cli) -> None:
     head, bow = cli("devices", "--socket", daemon.socket).out.splitlines()
     assert head.split() == ["DEVICE", "CONDITION", "RATE", "HZ", "DRIVER", "PRODUCT", "SERIAL", "NUMBER", "LINK"]
@@ -32,10 +31,8 @@ def test_devices_and_verbs_are_listed_and_a_module_obeys(daemon: RunningDaemon, 
     assert out.startswith("sent, not verified: the device moves: ")
 
 
-@live
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
+def test_mistakes_are_explained(daemon: RunningDaemon, cli: Cli) -> None:
+    for words, expected in [
         (["yaw", "angle_deg=181"], "arguments: angle_deg (a number from -180 to 180)"),
         (["mode", "axes=9"], "mode is a setting: imud settings bow --set mode=9-axis"),
         (["output", "message=HI91", "rate_hz=200"], "output is a setting: imud settings bow --set output.hi91=200"),
@@ -43,18 +40,12 @@ def test_devices_and_verbs_are_listed_and_a_module_obeys(daemon: RunningDaemon, 
         (["yaw", "angle_deg=1", "angle_deg=2"], "angle_deg: expected one value, got 1 and 2"),
         (["dance"], "unknown command 'dance'; expected: save, restart"),
         (["mode", "nine"], "expected NAME=VALUE, got 'nine'"),
-    ],
-)
-def test_mistakes_are_explained(daemon: RunningDaemon, words: list[str], expected: str, cli: Cli) -> None:
-    cli.refuses(expected, "command", "--socket", daemon.socket, "bow", *words)
+    ]:
+        cli.refuses(expected, "command", "--socket", daemon.socket, "bow", *words)
+    cli.refuses("the following arguments are required: DEVICE", "command")
 
 
-@live
 def test_without_a_running_device_the_status_is_1(tmp_path: Path, cli: Cli) -> None:
     device = {"driver": "hipnuc-uart", "uart": {"port": str(tmp_path / "none"), "baud": 115200}}
     with running_daemon(tmp_path, {"bow": device}) as daemon:
         assert "bow" in cli("devices", "--socket", daemon.socket, status=1).out
-
-
-def test_only_the_device_is_required(cli: Cli) -> None:
-    cli.refuses("the following arguments are required: DEVICE", "command")

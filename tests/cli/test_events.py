@@ -7,22 +7,19 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
-from functools import partial
+from operator import methodcaller
 from pathlib import Path
 from threading import Event as Flag
 from threading import Thread
-from typing import Any
 from unittest.mock import Mock
 
 import pytest
 
 from imud.cli.events import DeviceNotes, as_json, as_text, keep_connected, printed
-from imud.client.connection import Client
 from imud.formats.jsonrpc import RpcError
 from imud.model.errors import LinkMissing, ServerError
 from imud.model.event import Event, EventKind
 from imud.model.units import NS_PER_S
-from imud.publishers.socket.server import SocketServer
 from tests.cli.conftest import Cli
 from tests.support.socket_rig import NOW_NS, Daemon, daemon
 from tests.support.surroundings import pipe
@@ -51,10 +48,6 @@ def test_a_line_and_an_object_have_local_time_and_priority() -> None:
     assert priorities == ["info", "info", "debug", "warning"]
 
 
-def raising(event: Event, server: SocketServer) -> None:
-    server.event(event)
-
-
 @contextmanager
 def events_of(served: Daemon) -> Iterator[tuple[object, ...]]:
     """Send two events of one device and one of another device repeatedly. Return the command for this daemon."""
@@ -64,13 +57,11 @@ def events_of(served: Daemon) -> Iterator[tuple[object, ...]]:
         number = 0
         while not ended.wait(0.01):
             number += 1
-            t_ns = NOW_NS - 3600 * NS_PER_S
-            for event in (
-                Event(t_ns, "imu0", EventKind.UP, f"number {number}"),
-                Event(t_ns, "imu1", EventKind.MARK, f"pulse {number}"),
-                Event(t_ns, "imu1", EventKind.LOSS, f"{number} samples lost"),
-            ):
-                served.do(partial(raising, event))
+            for device, kind, words in (
+                ("imu0", EventKind.UP, f"number {number}"), ("imu1", EventKind.MARK, f"pulse {number}"),
+                ("imu1", EventKind.LOSS, f"{number} samples lost"),
+            ):  # fmt: skip
+                served.do(methodcaller("event", Event(NOW_NS - 3600 * NS_PER_S, device, kind, words)))
 
     sender = Thread(target=send)
     sender.start()
@@ -88,41 +79,32 @@ def words(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[object, ..
 
 
 @pytest.mark.live
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
+def test_events_as_they_come(words: tuple[object, ...], cli: Cli) -> None:
+    rows: list[tuple[list[str], set[str]]] = [
         ([], {"up: number ", "mark: pulse ", "samples lost"}),
         (["--device", "imu1"], {"mark: pulse ", "samples lost"}),
         (["--priority", "info"], {"up: number ", "samples lost"}),
         (["--priority", "warning", "--device", "imu0", "--device", "imu1"], {"samples lost"}),
         (["--json", "--device", "imu0"], {'"message":"number '}),
-    ],
-)
-def test_events_as_they_come(words: tuple[object, ...], cli: Cli, options: list[str], expected: set[str]) -> None:
-    lines = cli(*words, "--count", 6, *options).out.splitlines()
-    assert len(lines) == 6
-    assert {word for word in expected for line in lines if word in line} == expected
-    assert all(any(word in line for word in expected) for line in lines)
+    ]
+    for options, expected in rows:
+        lines = cli(*words, "--count", 6, *options).out.splitlines()
+        assert len(lines) == 6
+        assert {word for word in expected for line in lines if word in line} == expected, options
+        assert all(any(word in line for word in expected) for line in lines), options
 
 
 @pytest.mark.live
-def test_the_time_is_right_where_the_daemons_clock_is_another(words: tuple[object, ...], cli: Cli) -> None:
+def test_the_time_of_another_clock_and_an_unknown_device(words: tuple[object, ...], cli: Cli) -> None:
     """As with a forwarded socket (SSH): the daemon has another CLOCK_MONOTONIC than this host."""
     shown = datetime.fromisoformat(cli(*words, "--count", 1).out.split()[0])
     assert (datetime.now(UTC) - shown).total_seconds() == pytest.approx(3600, abs=120)
-
-
-@pytest.mark.live
-def test_an_unknown_device_is_an_error(words: tuple[object, ...], cli: Cli) -> None:
     cli.refuses("imu7", *words, "--device", "imu7")
 
 
 def test_without_follow_a_missing_daemon_is_an_error_and_a_refusal_always_is(tmp_path: Path) -> None:
-    def work(_client: Client) -> None:
-        raise AssertionError
-
     with pytest.raises(LinkMissing, match="is imud running"):
-        keep_connected("imud watch", str(tmp_path / "none"), work, follow=False)
+        keep_connected("imud watch", str(tmp_path / "none"), Mock(side_effect=AssertionError), follow=False)
     with daemon(tmp_path) as served, pytest.raises(RpcError, match="imu7"):
         keep_connected("imud watch", str(served.path), lambda c: print(c.watch(["imu7"])), follow=True)
 
@@ -180,48 +162,32 @@ def test_waiting_ends_when_nobody_reads_the_output(tmp_path: Path, monkeypatch: 
                 os.close(reader)
 
         with pytest.raises(BrokenPipeError):
-            keep_connected("imud watch", str(tmp_path / "none"), lambda _c: None, follow=True, wait=wait)
+            keep_connected("imud watch", str(tmp_path / "none"), Mock(), follow=True, wait=wait)
     assert len(waits) == 2
 
 
-class Answers:
-    def __init__(self) -> None:
-        self.found: list[dict[str, Any]] = [{"name": "bow", "condition": None}]
-
-    def devices(self) -> list[dict[str, Any]]:
-        return self.found
-
-
-def test_a_device_that_is_gone_is_reported_once_and_when_it_is_back(capsys: pytest.CaptureFixture[str]) -> None:
-    client = Answers()
-    notes = DeviceNotes(client, ["bow"])
-    notes.look(0.0)
-    assert capsys.readouterr().err == ""
+def test_notes_of_devices_that_are_gone_and_of_dropped_samples(capsys: pytest.CaptureFixture[str]) -> None:
     reason = {"code": "stopped", "message": "The device stopped sending 5 s ago."}
-    bow = {"name": "bow", "condition": {"condition": "missing", "since_ns": 1, "reasons": [reason]}}
-    client.found = [bow]
-    notes.look(1.0)
-    assert capsys.readouterr().err == ""
-    for now_s in (2.0, 4.0):
+    missing = {"name": "bow", "condition": {"condition": "missing", "since_ns": 1, "reasons": [reason]}}
+    client = Mock(devices=Mock(return_value=[{"name": "bow", "condition": None}]))
+    notes = DeviceNotes(client, ["bow"])
+
+    def told(now_s: float) -> str:
         notes.look(now_s)
-        reason["message"] = "The device stopped sending 7 s ago."
-    assert capsys.readouterr().err == "imud watch: bow: missing: The device stopped sending 5 s ago.\n"
-    client.found = []
-    notes.look(6.0)
-    client.found = [{"name": "bow", "condition": {"condition": "ok", "since_ns": 1}}]
-    notes.look(8.0)
-    assert capsys.readouterr().err == "imud watch: bow: no longer in the configuration\nimud watch: bow: ok\n"
+        return capsys.readouterr().err
 
-
-def test_dropped_samples_are_reported_together(capsys: pytest.CaptureFixture[str]) -> None:
-    notes = DeviceNotes(Answers(), [])
-    notes.look(0.0)
+    assert told(0.0) == ""
+    client.devices.return_value = [missing]
+    assert told(1.0) == "", "a look every 2 s"
+    assert told(2.0) == "imud watch: bow: missing: The device stopped sending 5 s ago.\n"
+    reason["message"] = "The device stopped sending 7 s ago."
+    assert told(4.0) == "", "once"
+    client.devices.return_value = []
+    assert told(6.0) == "imud watch: bow: no longer in the configuration\n"
+    client.devices.return_value = [{"name": "bow", "condition": {"condition": "ok", "since_ns": 1}}]
+    assert told(8.0) == "imud watch: bow: ok\n"
     for count in (5, 7):
         notes.add_dropped("bow", count)
-    notes.look(1.0)
-    assert capsys.readouterr().err == ""
-    notes.look(2.0)
-    notes.look(4.0)
-    assert (
-        capsys.readouterr().err == "imud watch: the daemon dropped 12 samples of bow because imud watch was too slow\n"
-    )
+    assert told(9.0) == ""
+    assert told(10.0) == "imud watch: the daemon dropped 12 samples of bow because imud watch was too slow\n"
+    assert told(12.0) == ""

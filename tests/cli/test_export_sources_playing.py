@@ -5,6 +5,8 @@ import sys
 from fcntl import F_GETPIPE_SZ, fcntl
 from io import BytesIO, StringIO
 from pathlib import Path
+from unittest import mock
+from unittest.mock import Mock
 
 import pytest
 
@@ -81,38 +83,31 @@ def test_the_pipe_is_as_large_as_the_kernel_allows(file: Path, monkeypatch: pyte
     monkeypatch.setattr(playing, "fcntl", kept)
     playing.play_beside(file, KeepingSink(), [], lambda _at: None)
     assert sizes == [playing.PIPE_BYTES]
-
-    def refuse(*_arguments: int) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr(playing, "fcntl", refuse)
+    monkeypatch.setattr(playing, "fcntl", Mock(side_effect=PermissionError(1, "Operation not permitted")))
     sink = KeepingSink()
     playing.play_beside(file, sink, [], lambda _at: None)
     assert len(sink.taken) > FRAMES
 
 
-def test_an_error_of_the_player_comes_out(tmp_path: Path) -> None:
+def test_errors_of_the_player_and_of_the_sink_come_out(tmp_path: Path, file: Path) -> None:
     (tmp_path / "a").write_bytes(b"\x89imudREC" + bytes(100))
     with pytest.raises(ImudError, match="at least one complete block"):
         playing.play_beside(tmp_path / "a", KeepingSink(), [], lambda _at: None)
+    full = KeepingSink()
+    with mock.patch.object(full, "samples", side_effect=ImudError("full")), pytest.raises(ImudError, match="full"):
+        playing.play_beside(file, full, [], lambda _at: None)
 
 
-WHOLE = playing.HEAD.pack(playing.EVENT, 4, 0)  # header of a message with four bytes of data
-
-
-@pytest.mark.parametrize(
-    "sent", [b"", WHOLE[:-1], WHOLE, WHOLE + b"abc"], ids=["nothing", "in a head", "head", "in data"]
-)
-def test_a_player_that_ends_early_is_an_error(
-    sent: bytes, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "sent").write_bytes(sent)
+def test_a_player_that_ends_early_is_an_error(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = playing.HEAD.pack(playing.EVENT, 4, 0)  # header of a message with four bytes of data
     player = tmp_path / "player"
     player.write_text(f"#!/bin/sh\ncat {tmp_path}/sent\n")
     player.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(player))
-    with pytest.raises(ImudError, match="player process ended early"):
-        playing.play_beside(file, KeepingSink(), [], lambda _at: None)
+    for sent in (b"", whole[:-1], whole, whole + b"abc"):
+        (tmp_path / "sent").write_bytes(sent)
+        with pytest.raises(ImudError, match="player process ended early"):
+            playing.play_beside(file, KeepingSink(), [], lambda _at: None)
 
 
 def test_the_player_uses_the_tree_of_this_process(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,15 +119,6 @@ def test_the_player_uses_the_tree_of_this_process(file: Path, tmp_path: Path, mo
         playing.play_beside(file, KeepingSink(), [], lambda _at: None)
 
 
-def test_an_error_of_the_sink_ends_the_player(file: Path) -> None:
-    class Full(KeepingSink):
-        def samples(self, batch: Batch) -> None:
-            raise ImudError("full")
-
-    with pytest.raises(ImudError, match="full"):
-        playing.play_beside(file, Full(), [], lambda _at: None)
-
-
 def test_the_player_ends_quietly_when_nobody_reads(file: Path) -> None:
     argv = [sys.executable, "-m", "imud.cli.export_sources", str(file)]
     with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
@@ -142,16 +128,13 @@ def test_the_player_ends_quietly_when_nobody_reads(file: Path) -> None:
         assert process.stderr.read() == ""
 
 
-def test_the_command_writes_the_same_file(
-    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli
-) -> None:
-    cli("export", "--to", "csv", "-o", tmp_path / "here", file)
+def test_the_command_writes_the_same(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
+    here, beside, to = tmp_path / "here", tmp_path / "beside", ("export", "--to", "csv")
+    cli(*to, "-o", here, file)
     monkeypatch.setattr("imud.cli.export_sources.BESIDE_BYTES", 0)
-    cli("export", "--to", "csv", "-o", tmp_path / "beside", file)
-    assert (tmp_path / "here").read_bytes() == (tmp_path / "beside").read_bytes()
-    cli.refuses(
-        "expected a device of the recording: bow, mast", "export", "--to", "csv", "--device", "stern", str(file)
-    )
+    cli(*to, "-o", beside, file)
+    assert here.read_bytes() == beside.read_bytes()
+    cli.refuses("expected a device of the recording: bow, mast", *to, "--device", "stern", str(file))
 
 
 def pictures(terminal: Terminal) -> list[str]:
@@ -170,7 +153,7 @@ def test_a_bar_with_share_samples_and_time() -> None:
     assert progress.spent_s == 10.0
 
 
-def test_it_is_drawn_immediately_and_after_each_fifth_of_a_second() -> None:
+def test_how_often_it_is_drawn() -> None:
     terminal, now_s = Terminal(), [100.0]
     progress = playing.Progress(1000, terminal, lambda: now_s[0])
     for samples, second, expected in [(1999, 100.0, 0), (1, 100.0, 1), (2000, 100.19, 1), (2000, 100.2, 2)]:
@@ -178,9 +161,6 @@ def test_it_is_drawn_immediately_and_after_each_fifth_of_a_second() -> None:
         progress.add(samples, lambda: 20)
         assert len(pictures(terminal)) == expected
     assert pictures(terminal)[-1] == "[........................]   2 %  6000 samples"  # no estimate up to 2 %
-
-
-def test_it_is_not_drawn_more_often_than_it_can_be_read_or_without_a_terminal() -> None:
     terminal, now_s = Terminal(), [0.0]
     progress = playing.Progress(1000, terminal, lambda: now_s[0])
     for step in range(100):

@@ -76,12 +76,15 @@ def test_what_was_not_acknowledged_by_a_killed_collector_comes_again(broker: Mos
 
 def test_arguments_are_checked(cli: Cli) -> None:
     for words, problem in [
-        (["mqtt://host", "--to", "elsewhere"], "--to: expected"),
-        (["host", "--to", "-"], "expected a URL"),
-        (["mqtt://host", "--to", "-", "--password-file", "f"], "add --user"),
-        (["mqtt://host", "--to", "-", "--key-file", "f"], "add --cert-file"),
+        (["collect", "mqtt://host", "--to", "elsewhere"], "--to: expected"),
+        (["collect", "host", "--to", "-"], "expected a URL"),
+        (["collect", "mqtt://host", "--to", "-", "--password-file", "f"], "add --user"),
+        (["collect", "mqtt://host", "--to", "-", "--key-file", "f"], "add --cert-file"),
+        (["top", "--plain", "http://host"], "expected a URL"),
+        (["top", "--plain", "mqtt://host", "--interval", "0"], "--interval: expected 0.1 to 3600"),
+        (["top", "--plain", "mqtt://host", "--gateway", "a/b"], "gateway: expected 1 to 64 letters"),
     ]:
-        cli.refuses(problem, "fleet", "collect", *words)
+        cli.refuses(problem, "fleet", *words)
     for command in ("fleet", "modbus"):
         cli.refuses("the following arguments are required: ACTION", command)
 
@@ -142,9 +145,6 @@ def test_the_wall_clock_has_its_error_and_without_a_gateway_there_is_a_reason() 
     assert FleetOverview(fleet).text() == "no gateway yet; refused"
 
 
-TOP = ("fleet", "top")
-
-
 @pytest.fixture
 def gateway(broker: Mosquitto) -> Iterator[tuple[Mosquitto, SendingGateway]]:
     made = SendingGateway(broker.port)
@@ -156,7 +156,7 @@ def gateway(broker: Mosquitto) -> Iterator[tuple[Mosquitto, SendingGateway]]:
 @pytest.mark.live
 def test_tables_come_until_it_is_told_to_end(gateway: tuple[Mosquitto, SendingGateway]) -> None:
     broker, sender = gateway
-    with imud_process(*TOP, URL.format(broker.port), "--plain", "--interval", "0.2") as process:
+    with imud_process("fleet", "top", URL.format(broker.port), "--plain", "--interval", "0.2") as process:
         first = 1
         for line in process.out:
             if line.startswith("mill/gw ") and line.split()[1:3] == ["online", "1"] and line.split()[3] != "0.0":
@@ -170,7 +170,7 @@ def test_tables_come_until_it_is_told_to_end(gateway: tuple[Mosquitto, SendingGa
 def test_on_a_terminal_the_picture_is_redrawn(gateway: tuple[Mosquitto, SendingGateway]) -> None:
     broker, _ = gateway
     master, slave = pty.openpty()
-    words = (*TOP, URL.format(broker.port), "--interval", "0.2")
+    words = ("fleet", "top", URL.format(broker.port), "--interval", "0.2")
     environment = os.environ | {"TERM": "xterm", "COLUMNS": "100", "LINES": "30"}
     with imud_process(*words, stdin=slave, stdout=slave, env=environment) as process:
         os.close(slave)
@@ -189,12 +189,3 @@ def test_no_gateway_is_an_answer_of_no_and_the_reason_is_told(cli: Cli) -> None:
     printed = cli("fleet", "top", "mqtt://127.0.0.1:1", "--plain", "--interval", "0.2", "--duration", "1s", status=1)
     assert "no gateway yet; " in printed.out
     assert "the broker connection failed at the end: mqtt://127.0.0.1:1" in printed.err
-
-
-def test_arguments_of_top_are_checked(cli: Cli) -> None:
-    for words, problem in [
-        (["http://host"], "expected a URL"),
-        (["mqtt://host", "--interval", "0"], "--interval: expected 0.1 to 3600"),
-        (["mqtt://host", "--gateway", "a/b"], "gateway: expected 1 to 64 letters"),
-    ]:
-        cli.refuses(problem, "fleet", "top", "--plain", *words)

@@ -108,7 +108,7 @@ def test_scan_lists_the_modules_in_the_order_of_their_addresses(modbus: Commands
     assert "no device replies" in modbus("scan", *ON, "--addresses", "8", status=1)
 
 
-def test_scan_asks_again_for_a_missing_reply(modbus: Commands) -> None:
+def test_scan_asks_again_for_a_missing_reply_and_at_every_rate(modbus: Commands) -> None:
     """One reply is lost, one is damaged, and one is lost twice on a bus with other devices."""
     modbus.bus = Bus(modbus_slave(1), modbus_slave(2, mute=1), modbus_slave(3, bad_crc=1), modbus_slave(4, mute=2))
     assert [(one["address"], one.get("problem", "")) for one in modbus.scan("1-5")] == [(n, "") for n in (1, 2, 3, 4)]
@@ -117,9 +117,6 @@ def test_scan_asks_again_for_a_missing_reply(modbus: Commands) -> None:
     assert [one["address"] for one in modbus.scan("2")] == [2], "the only module of a bus"
     modbus.bus = Bus(modbus_slave(2, mute=2))
     assert modbus.scan("2", status=1) == [], "the third request needs a module that replied"
-
-
-def test_scan_at_every_rate(modbus: Commands) -> None:
     modbus.bus = Bus(slave(3, baud=19200))
     found = modbus.scan("3", "--baud", "all")
     assert [(one["baud"], one["address"]) for one in found if "problem" not in one] == [(19200, 3)]
@@ -158,13 +155,11 @@ def test_an_address_is_changed_and_saved_unless_not_wanted(modbus: Commands) -> 
     assert modbus.bus.line.slaves[1].flash.slave == 3
 
 
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
+def test_a_refused_assignment_changes_nothing(modbus: Commands) -> None:
+    for words, why in [
         (("--from", "1", "--id", "2"), "address 2 is used by HI14R2N-485-000"),
         (("--from", "5", "--id", "6"), "no device replies at address 5"),
-        (("--from", "1", "--id", "200"), "1 … 128"),
-        (("--from", "0", "--id", "9"), "1 … 247"),
+        (("--from", "1", "--id", "200"), "1 … 128"), (("--from", "0", "--id", "9"), "1 … 247"),
         (("--from", "1"), "--id: expected the new address"),
         (("--random", "1-9", "--id", "1"), "--id: expected the new address"),
         (("--random", "9"), "lowest below the highest"),
@@ -174,28 +169,22 @@ def test_an_address_is_changed_and_saved_unless_not_wanted(modbus: Commands) -> 
         (("--from", "1", "--id", "9", "--reply-ms", "0"), "--reply-ms: expected 1 to 1000, got 0"),
         (("--from", "1", "--id", "9", "--reply-ms", "1001"), "--reply-ms: expected 1 to 1000, got 1001"),
         (("--from", "1", "--id", "9", "--baud", "12345"), "--baud: expected one of"),
-    ],
-)
-def test_a_refused_assignment_changes_nothing(modbus: Commands, words: tuple[str, ...], why: str) -> None:
-    modbus.bus = Bus(modbus_slave(1), modbus_slave(2))
-    assert why in modbus("assign", *ON, *words, status=2)
-    assert modbus.bus.slaves() == [1, 2]
-
-
-def test_another_module_at_the_new_address_is_not_taken_for_the_wanted_one(modbus: Commands) -> None:
+    ]:  # fmt: skip
+        modbus.bus = Bus(modbus_slave(1), modbus_slave(2))
+        assert why in modbus("assign", *ON, *words, status=2), words
+        assert modbus.bus.slaves() == [1, 2]
     asleep = modbus_slave(2, mute=4)  # three requests that check the new address, then the broadcast
     modbus.bus = Bus(asleep)
     said = modbus("assign", *ON, "--serial", serial(9), "--id", "2", status=2)
     assert f"expected serial number {serial(9)} at address 2" in said
-    assert asleep.flash == asleep.settings
+    assert asleep.flash == asleep.settings, "another device at the new address is not the wanted device"
 
 
-@pytest.mark.parametrize("text", ["0-5", "5-1", "1-248", "x", "1-x", ""])
-def test_invalid_addresses(text: str, cli: Cli) -> None:
-    cli.refuses("expected", "modbus", "scan", "/dev/null", "--addresses", text)
-
-
-def test_a_module_cannot_write_to_the_terminal(modbus: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_addresses_and_identities_for_a_terminal(
+    cli: Cli, modbus: Commands, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for text in ("0-5", "5-1", "1-248", "x", "1-x", ""):
+        cli.refuses("expected", "modbus", "scan", "/dev/null", "--addresses", text)
     said = Identity("HI\x1b[2J14\n", "\x9b1A", "1.6.9")
     monkeypatch.setattr("imud.cli.modbus.probe", lambda _settings: says_nothing(said))
     modbus.bus = Bus(modbus_slave(2))

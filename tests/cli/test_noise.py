@@ -50,16 +50,13 @@ def test_figures_hold_or_not_and_open_ones_have_no_verdict() -> None:
     assert walk.ratio == pytest.approx(1 / 1.2, rel=0.05)
     assert (density.quantity.key, density.verdict) == ("noise_density", "ABOVE")
     assert density.ratio == pytest.approx(np.sqrt(2), rel=0.05)
-    report = noise.noise_report(
-        sample_set_of(noise_of_three()),
-        ModelFigures(gyro=SensorFigures(bias_instability=1e-6, rate_random_walk=10.0), source="a sheet"),
-    )
-    bias, walk = noise.comparisons(report, "gyro")
+    sheet = ModelFigures(gyro=SensorFigures(bias_instability=1e-6, rate_random_walk=10.0), source="a sheet")
+    bias, walk = noise.comparisons(noise.noise_report(sample_set_of(noise_of_three()), sheet), "gyro")
     assert (bias.measured, bias.verdict) == (None, "not resolved")
     assert walk.verdict == "within"
 
 
-def test_what_limits_the_figures() -> None:
+def test_what_limits_the_figures_and_what_is_not_compared() -> None:
     values = np.round(noise_of_three() / 1.7453293e-3) * 1.7453293e-3
     report = noise.noise_report(sample_set_of(values), None)
     words = " ".join(noise.limits(report, "gyro"))
@@ -69,9 +66,6 @@ def test_what_limits_the_figures() -> None:
     words = " ".join(noise.limits(noise.noise_report(sample_set_of(moved, "imu61x-can"), None), "gyro"))
     assert "DISTURBED: in 20 of 100 seconds" in words
     assert "filter of the device: low-pass 47 Hz (factory setting" in words
-
-
-def test_the_text_names_what_is_not_compared_and_a_device_without_sensors_is_refused() -> None:
     words = text(noise.noise_report(sample_set_of(noise_of_three()), None))
     assert "bow: noise" in words
     assert "product HI14" in words
@@ -112,18 +106,14 @@ def test_figures_become_si_and_those_of_the_user_come_first(tmp_path: Path) -> N
     assert noise.figures_for(sheet, "CH100", None) is None
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
+def test_what_is_wrong_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "sheet.yaml"
+    for content, words in [
         ("gyro: {random_walk: 0.3}", "random_walk"), ("gyro: {random_walk_deg_sqrt_h: -1}", "gyro"),
         ("gyro: {random_walk_deg_sqrt_h: .nan}", "gyro"), ("gyroscope: {}", "gyroscope"), ("- 1", "mapping"),
         ("a: [", "YAML"), ("x" * 65537, "at most"),
-    ],
-    ids=["unknown figure", "negative", "not a number", "unknown sensor", "a list", "no YAML", "too long"],
-)  # fmt: skip
-def test_what_is_wrong_is_named(tmp_path: Path, text: str, words: str) -> None:
-    file = tmp_path / "sheet.yaml"
-    file.write_text(text)
-    with pytest.raises(BadArgument, match=words) as caught:
-        noise.read_sheet(file)
-    assert str(file) in str(caught.value)
+    ]:  # fmt: skip
+        file.write_text(content)
+        with pytest.raises(BadArgument, match=words) as caught:
+            noise.read_sheet(file)
+        assert str(file) in str(caught.value)

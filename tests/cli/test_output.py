@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 
@@ -20,7 +21,7 @@ from tests.support.files import hi91
 from tests.support.surroundings import pipe
 
 
-def test_a_histogram_has_bars_with_shares() -> None:
+def test_a_histogram_and_a_paragraph_with_a_long_label() -> None:
     assert histogram([], "µs") == []
     assert histogram([7.0] * 10, "µs") == ["           7 µs 100.0 % " + "#" * 40]
     lines = histogram([0.0] * 50 + [1.5] * 25 + [8.0] * 25, "ms")
@@ -39,9 +40,6 @@ def test_a_histogram_has_bars_with_shares() -> None:
     assert float(lines[-1].split()[2]) == pytest.approx(10.0)  # the last bar counts the outlier
     for span, width in [(0, 1), (11, 1), (11.1, 2), (22, 2), (50, 5), (100, 10), (0.011, 0.001)]:
         assert bar_width(span) == pytest.approx(width)
-
-
-def test_a_paragraph_with_a_label_longer_than_a_line_has_room_for_its_text() -> None:
     assert paragraph("x" * 200, "some words") == ["x" * 200 + "some words"]
 
 
@@ -90,6 +88,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+Captured = pytest.CaptureFixture[str]
 COMMANDS: dict[str, Callable[[Path], list[str]]] = {
     "check": lambda folder: ["check", f"{folder}/imud.yaml"],
     "schema": lambda _: ["schema", "--json"],
@@ -103,30 +102,26 @@ COMMANDS: dict[str, Callable[[Path], list[str]]] = {
 }
 
 
-def ended(words: list[str], output: int, monkeypatch: pytest.MonkeyPatch) -> object:
+def ended(words: list[str], output: int) -> object:
     """Run a command with this descriptor as standard output. Return the exit status."""
-    with open(os.dup(output), "w", encoding="utf-8") as out, monkeypatch.context() as patch:
-        patch.setattr(sys, "stdout", out)
+    with open(os.dup(output), "w", encoding="utf-8") as out, mock.patch.object(sys, "stdout", out):
         try:
             return main(words)
         except SystemExit as end:
             return end.code
 
 
-@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
-def test_a_full_disk_is_an_error_and_a_reader_that_has_gone_is_none(
-    command: Callable[[Path], list[str]], folder: Path,
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    words = command(folder)
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_full_disk_is_an_error_and_a_closed_pipe_is_none(command: str, folder: Path, capsys: Captured) -> None:
+    words = COMMANDS[command](folder)
     with open("/dev/full", "wb") as full:
-        assert ended(words, full.fileno(), monkeypatch) == 2
+        assert ended(words, full.fileno()) == 2
     error = capsys.readouterr().err
     assert "standard output: No space left on device" in error.splitlines()[-1]
     assert "Traceback" not in error
     with pipe() as (reader, writer):
         os.close(reader)
-        assert ended(words, writer, monkeypatch) == 0
+        assert ended(words, writer) == 0
     error = capsys.readouterr().err
     assert "Traceback" not in error
     assert "Broken pipe" not in error
@@ -192,32 +187,24 @@ def test_ascii_locale(folder: Path, tmp_path: Path) -> None:
     assert done.stdout.isascii()
 
 
-def test_names_of_files_are_escaped_in_errors(tmp_path: Path, cli: Cli) -> None:
+def test_a_configuration_from_standard_input(cli: Cli) -> None:
+    with mock.patch.object(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"devices: {}\n"))):
+        assert cli("check", "-") == ("-: valid; devices: none\n", "")
+    with mock.patch.object(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"devices: {a: 1}\n"))):
+        cli.refuses("standard input:1:", "check", "-")
+
+
+def test_check_of_what_is_no_file_and_names_with_escapes(tmp_path: Path, cli: Cli) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    for special in ("fifo", "/dev/zero", "/dev/tty", "."):
+        cli.refuses("cannot read", "check", tmp_path / special)
     error = cli("check", os.fsdecode(os.fsencode(tmp_path) + b"/\xff\x1b[31m\nimud: fine"), status=2).err
     assert "\x1b" not in error
     assert "\\udcff\\x1b[31m" in error
 
 
-def test_a_configuration_from_standard_input(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
-    def given(text: bytes) -> None:
-        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(text)))
-
-    given(b"devices: {}\n")
-    assert cli("check", "-") == ("-: valid; devices: none\n", "")
-    given(b"devices: {a: 1}\n")
-    cli.refuses("standard input:1:", "check", "-")
-
-
-@pytest.mark.parametrize("special", ["fifo", "/dev/zero", "/dev/tty", "."])
-def test_check_of_what_is_no_file(special: str, tmp_path: Path, cli: Cli) -> None:
-    os.mkfifo(tmp_path / "fifo")
-    cli.refuses("cannot read", "check", tmp_path / special)
-
-
 @pytest.mark.live
-def test_a_full_disk_is_an_error_of_commands_that_ask_the_daemon(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_an_error_of_commands_that_ask_the_daemon(tmp_path: Path) -> None:
     with running_daemon(tmp_path, {}) as daemon, open("/dev/full", "wb") as full:
         for words in (["status"], ["status", "--json"], ["devices"], ["clock"]):
-            assert ended([*words, "--socket", str(daemon.socket)], full.fileno(), monkeypatch) == 2, words
+            assert ended([*words, "--socket", str(daemon.socket)], full.fileno()) == 2, words

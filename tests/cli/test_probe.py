@@ -4,11 +4,11 @@ import asyncio
 import json
 from collections.abc import Callable, Sequence
 from typing import ClassVar
+from unittest.mock import Mock
 
 import pytest
 
 from imud.cli import probe
-from imud.cli import probe as probe_can
 from imud.cli.probe import ProbeReport, block
 from imud.contracts.driver import Driver
 from imud.contracts.link import LinkType, OnBusNews, OnEnd, OnFrames
@@ -106,14 +106,11 @@ def test_a_port_is_listened_to_and_only_asked_with_active(ports: Ports, cli: Cli
     assert lines[-1] == "  FT232R"
     assert max(map(len, lines)) <= 80
     assert port.opened == 3, "a port that is named twice is opened once"
-
-
-def test_a_device_that_does_not_answer_has_no_identity(ports: Ports, cli: Cli) -> None:
-    port = ports(Port())
-    port.is_deaf = True
-    assert printed(cli, "--active", PORT) == ProbeReport(PORT, "FT232R", "hipnuc-uart", "", 460_800)
-    assert port.written
-    assert not port.is_open
+    deaf = ports(Port())
+    deaf.is_deaf = True
+    found = printed(cli, "--active", PORT)
+    assert found == ProbeReport(PORT, "FT232R", "hipnuc-uart", "", 460_800), "without a reply: no identity"
+    assert (deaf.written != [], deaf.is_open) == (True, False)
 
 
 def test_a_silent_port_a_port_that_ends_and_one_that_cannot_be_opened(ports: Ports, cli: Cli) -> None:
@@ -173,9 +170,9 @@ def bus(monkeypatch: pytest.MonkeyPatch) -> type[Bus]:
         made: ClassVar[list[Bus]] = []
 
     table: dict[str, Driver] = {**dict(DRIVERS), "fake-can": fake_can_driver()}
-    monkeypatch.setattr(probe_can, "DRIVERS", table)
-    monkeypatch.setattr(probe_can, "LINKS", {"socketcan": LinkType("socketcan", SocketCanOptions, make_can=Own)})
-    monkeypatch.setattr(probe_can, "can_details", lambda name: CanDetails(500_000, 0))
+    monkeypatch.setattr(probe, "DRIVERS", table)
+    monkeypatch.setattr(probe, "LINKS", {"socketcan": LinkType("socketcan", SocketCanOptions, make_can=Own)})
+    monkeypatch.setattr(probe, "can_details", lambda name: CanDetails(500_000, 0))
     monkeypatch.setattr(detection, "LISTEN_NS", 5 * NS_PER_MS)
     return Own
 
@@ -184,7 +181,7 @@ def examined(*, ask: bool = False) -> list[ProbeReport]:
     return asyncio.run(probe.examine_all(["can0"], {"can0"} if ask else set(), {}))
 
 
-def test_every_device_of_the_bus_is_listed(bus: type[Bus]) -> None:
+def test_every_device_of_the_bus_is_listed_and_queried_where_it_is_allowed(bus: type[Bus]) -> None:
     bus.frames = [fake_can_frame(node, number) for number in (1, 2) for node in (8, 9)]
     reports = examined()
     assert [(r.port, r.driver, r.device, r.baud, r.title, r.identity) for r in reports] == [
@@ -194,14 +191,11 @@ def test_every_device_of_the_bus_is_listed(bus: type[Bus]) -> None:
     assert block(reports[0]) == "can0\n  fake-can node 8 at 500000 bit/s\n  error-active"
     assert bus.made[0].written == []
     assert not bus.made[0].is_open
-
-
-def test_a_query_where_it_is_allowed(bus: type[Bus]) -> None:
     bus.frames = [fake_can_frame(8, number) for number in (1, 2)]
     assert [report.identity for report in examined(ask=True)] == [{"product": "FAKE"}]
 
 
-def test_why_nobody_is_listed(bus: type[Bus]) -> None:
+def test_why_nobody_is_listed(bus: type[Bus], monkeypatch: pytest.MonkeyPatch) -> None:
     assert "no frame arrives on can0" in examined()[0].problem
     bus.frames = [CanFrame(0x123, False, b"", 0)]
     assert "frames of unknown types arrive on can0 (0x123)" in examined()[0].problem
@@ -209,25 +203,16 @@ def test_why_nobody_is_listed(bus: type[Bus]) -> None:
     assert examined()[0].problem == "can0 is bus-off: x"
     bus.down = True
     assert examined() == [ProbeReport("can0", problem="can0 is down: set its bit rate")]
-
-
-def test_a_bus_that_ends_is_reported(bus: type[Bus], monkeypatch: pytest.MonkeyPatch) -> None:
-    def start(self: Bus, on_frames: OnFrames, on_news: OnBusNews, on_end: OnEnd) -> None:
-        on_end(LinkError("can0 was taken down"))
-
-    monkeypatch.setattr(bus, "start", start)
+    bus.down = False
+    ended = LinkError("can0 was taken down")
+    monkeypatch.setattr(bus, "start", lambda _self, _on_frames, _on_news, on_end: on_end(ended))
     assert examined()[0].problem == "can0 was taken down"
 
 
-@pytest.mark.parametrize(
-    ("details", "words"),
-    [
-        ((None, None), "bus without a bit rate"), ((500_000, 3), "bus-off"), ((500_000, 2), "error-passive"),
-        ((1, 9), ""), ((1, len(ControllerState)), ""),
-    ],
-)  # fmt: skip
-def test_the_state_in_words(
-    details: tuple[int | None, int | None], words: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(probe_can, "can_details", lambda name: CanDetails(*details))
-    assert probe_can.state_of("can0") == words
+def test_the_state_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    for details, words in [
+        (CanDetails(None, None), "bus without a bit rate"), (CanDetails(500_000, 3), "bus-off"),
+        (CanDetails(500_000, 2), "error-passive"), (CanDetails(1, 9), ""), (CanDetails(1, len(ControllerState)), ""),
+    ]:  # fmt: skip
+        monkeypatch.setattr(probe, "can_details", Mock(return_value=details))
+        assert probe.state_of("can0") == words

@@ -71,9 +71,7 @@ def test_a_recording_from_the_middle_of_a_run_replays_as_it_ran(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_regularly(
-    words: tuple[object, ...], tmp_path: Path, cli: Cli, number: signal.Signals
-) -> None:
+def test_a_signal_ends_it(words: tuple[object, ...], tmp_path: Path, cli: Cli, number: signal.Signals) -> None:
     file = tmp_path / "b.imudrec"
     with imud_process(*words, file) as record:
         wait_until(lambda: file.exists() and file.stat().st_size > 20_000, "a second of records")
@@ -86,15 +84,14 @@ def written_to(stdout: Any, *words: object) -> "subprocess.CompletedProcess[str]
     return subprocess.run(argv, stdout=stdout, stderr=subprocess.PIPE, text=True, timeout=LIMIT_S, check=False)
 
 
-def test_standard_output_takes_it(words: tuple[object, ...], tmp_path: Path, cli: Cli) -> None:
+def test_standard_output_a_full_disk_and_a_pipe_without_a_reader(
+    words: tuple[object, ...], tmp_path: Path, cli: Cli
+) -> None:
     with (tmp_path / "c.imudrec").open("wb") as out:
         done = written_to(out, *words, "--for", "1.2s", "--device", "mast")
     assert done.returncode == 0, done.stderr
     assert done.stderr.startswith("standard output: ")
     replayed(tmp_path / "c.imudrec", cli, "mast")
-
-
-def test_a_full_disk_and_a_pipe_without_a_reader_end_it_with_a_message(words: tuple[object, ...]) -> None:
     with open("/dev/full", "wb") as full:
         done = written_to(full, *words, "--for", "50s")
     assert done.returncode == 2
@@ -142,9 +139,7 @@ def example(word: str, **options: Any) -> str:
     return str(done.stdout)
 
 
-def test_the_examples_of_the_document(
-    daemon: RunningDaemon, words: tuple[object, ...], tmp_path: Path, cli: Cli
-) -> None:
+def test_examples_of_the_page(daemon: RunningDaemon, words: tuple[object, ...], tmp_path: Path, cli: Cli) -> None:
     """The second program finds the HI91 frames in the order of time without imud."""
     assert example("imud.client", env=os.environ | {"IMUD_SOCKET": str(daemon.socket)}) == "b'\\x89imudREC'\n"
     cli(*words, "--for", "1s", "--device", "bow", tmp_path / "file")
@@ -220,7 +215,6 @@ def test_a_device_that_was_removed_and_added_counts_from_the_begin_again() -> No
     assert device.rate_hz == pytest.approx(700 / (4 + 1 + 2))
 
 
-@pytest.mark.live
 @pytest.mark.parametrize("place", ["memory", "directory"])
 def test_a_snapshot_whose_begin_is_gone_replays_as_the_daemon_ran(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli, place: str
@@ -241,13 +235,10 @@ def test_a_snapshot_whose_begin_is_gone_replays_as_the_daemon_ran(
     assert "integrity  complete" in cli("info", file).out
 
 
-@pytest.mark.live
 def test_a_client_saves_the_last_minutes(tmp_path: Path, cli: Cli) -> None:
-    capture = str(stamped_capture(tmp_path / "capture"))
-    played = {"driver": "hipnuc-uart", "replay": {"path": capture, "speed": "recorded", "repeat": True}}
     recorder = {"directory": str(tmp_path / "recordings"), "flight": {"enabled": True}}
     file = tmp_path / "snapshot.imudrec"
-    with running_daemon(tmp_path, {"bow": played}, recorder=recorder) as daemon:
+    with running_daemon(tmp_path, {"bow": played(tmp_path)}, recorder=recorder) as daemon:
         wait_until(lambda: daemon.wait_for("bow", "running").newest_seq > 150, "150 samples")
         assert "samples of 1 device" in cli("record", "--socket", daemon.socket, "--snapshot", file).err
     printed = cli("replay", "--json", file)

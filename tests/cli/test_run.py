@@ -4,19 +4,19 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import AsyncMock
 
 import pytest
 
 from imud import config
 from imud.cli.run import state_dir
-from imud.config.model import Config
 from imud.model.errors import ImudError, ServerError
 from tests.cli.conftest import Cli
 from tests.support.files import ROOT
 from tests.support.surroundings import pipe
 
 
-def test_check_accepts_the_shipped_file_and_names_a_mistake(tmp_path: Path, cli: Cli) -> None:
+def test_check_accepts_the_shipped_file_and_names_a_mistake_or_a_missing_file(tmp_path: Path, cli: Cli) -> None:
     shipped = ROOT / "etc" / "imud.yaml"
     assert "valid" in cli("check", shipped).out
     bad = tmp_path / "bad.yaml"
@@ -24,16 +24,10 @@ def test_check_accepts_the_shipped_file_and_names_a_mistake(tmp_path: Path, cli:
     error = cli("check", bad, status=2).err
     assert error.startswith(f"{bad}:5:7: devices.bow.uart.baut: expected a key that imud knows")
     assert "did you mean baud?" in error
-
-
-@pytest.mark.parametrize(
-    ("words", "hint", "status"), [(["check"], "is the path right?", 2), (["run", "--config"], "--config", 78)]
-)
-def test_a_file_that_is_not_there(words: list[str], hint: str, status: int, tmp_path: Path, cli: Cli) -> None:
-    """The advice names an existing argument of the command."""
-    error = cli(*words, tmp_path / "none", status=status).err
-    assert error.startswith(f"cannot read {tmp_path}/none: No such file or directory; ")
-    assert hint in error
+    for words, hint, status in [(["check"], "is the path right?", 2), (["run", "--config"], "--config", 78)]:
+        error = cli(*words, tmp_path / "none", status=status).err
+        assert error.startswith(f"cannot read {tmp_path}/none: No such file or directory; ")
+        assert hint in error
 
 
 @pytest.mark.live
@@ -55,25 +49,21 @@ def test_what_is_wrong_has_its_priority_in_the_journal(tmp_path: Path) -> None:
 RMC = "devices: {a: {driver: hipnuc-uart, uart: {port: x}, rmc: {source: gpsd, host: '%s'}}}"
 
 
-@pytest.mark.parametrize(
-    ("text", "place"),
-    [
+def test_an_invalid_address_is_named(tmp_path: Path, cli: Cli) -> None:
+    file = tmp_path / "imud.yaml"
+    for text, place in [
         ("metrics: {address: 127.0.0.300}", "1:20: metrics.address: expected an IP address such as 127.0.0.1 or ::1, "),
         ("metrics: {address: not an address}", "1:20: metrics.address: expected an IP address"),
-        ("metrics: {address: '::1'}", ""),
-        ("metrics: {address: localhost}", ""),
+        ("metrics: {address: '::1'}", ""), ("metrics: {address: localhost}", ""),
         ("metrics: {address: gateway}", "1:20: metrics.address: expected an IP address"),
         *((RMC % host, "") for host in ("10.1.2.3", "gps.local")),
         *((RMC % host, "1:79: devices.a.rmc.host: expected") for host in ("10.1.2.300", "a b", "")),
         ("socket: {path: /%s}" % ("x" * 99), "1:16: socket.path: expected at most 99 bytes, got 100"),
         ("socket: {path: /%s}" % ("x" * 98), ""),
         ("socket: {path: imud.sock}", '1:16: socket.path: expected an absolute path, got "imud.sock"'),
-    ],
-)
-def test_an_invalid_address_is_named(text: str, place: str, tmp_path: Path, cli: Cli) -> None:
-    file = tmp_path / "imud.yaml"
-    file.write_text(text + ("" if "devices" in text else "\ndevices: {}\n"))
-    assert cli("check", file, status=2 if place else 0).err.startswith(f"{file}:{place}" if place else "")
+    ]:  # fmt: skip
+        file.write_text(text + ("" if "devices" in text else "\ndevices: {}\n"))
+        assert cli("check", file, status=2 if place else 0).err.startswith(f"{file}:{place}" if place else ""), text
 
 
 def test_check_has_notes(tmp_path: Path, cli: Cli) -> None:
@@ -109,32 +99,24 @@ def test_check_has_notes(tmp_path: Path, cli: Cli) -> None:
     assert note.startswith(f"{file}:2: note: bow: HI92 next to HI91 is time-stamped by its arrival")
 
 
-@pytest.mark.parametrize(
-    ("error", "status", "said"),
-    [
+def test_exit_statuses_of_the_daemon(tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "imud.yaml").write_text(f"devices: {{}}\nstate_dir: {tmp_path}\n")
+    for error, status, said in [
         (ServerError("the socket is in use"), 75, "<2>the socket is in use\n"),
         (ImudError("no such thing"), 2, "imud run: no such thing\n"),
-        (ValueError("a bug"), 1, "<2>imud stops because of an internal error"),
-        (None, 0, ""),
-    ],
-)
-def test_exit_statuses_of_the_daemon(
-    error: Exception | None, status: int, said: str, tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def serve(settings: Config, file: Path) -> None:
+        (ValueError("a bug"), 1, "<2>imud stops because of an internal error"), (None, 0, ""),
+    ]:  # fmt: skip
+        serve = AsyncMock(side_effect=error)
+        with pipe() as (reader, writer), monkeypatch.context() as patch:
+            patch.setattr("imud.cli.run.serve", serve)
+            patch.setattr("imud.cli.run.STDERR", writer)
+            patch.setenv("JOURNAL_STREAM", f"{os.fstat(writer).st_dev}:{os.fstat(writer).st_ino}")
+            printed = cli("run", "--config", tmp_path / "imud.yaml", status=status).err
+            os.write(writer, b"\n")
+            logged = os.read(reader, 65536).decode()
+        assert said in printed + logged
+        settings, file = serve.call_args.args
         assert (settings.state_dir, file) == (str(tmp_path), tmp_path / "imud.yaml")
-        if error is not None:
-            raise error
-
-    monkeypatch.setattr("imud.cli.run.serve", serve)
-    (tmp_path / "imud.yaml").write_text(f"devices: {{}}\nstate_dir: {tmp_path}\n")
-    with pipe() as (reader, writer), monkeypatch.context() as patch:
-        patch.setattr("imud.cli.run.STDERR", writer)
-        patch.setenv("JOURNAL_STREAM", f"{os.fstat(writer).st_dev}:{os.fstat(writer).st_ino}")
-        printed = cli("run", "--config", tmp_path / "imud.yaml", status=status).err
-        os.write(writer, b"\n")
-        logged = os.read(reader, 65536).decode()
-    assert said in printed + logged
 
 
 def test_the_state_is_in_the_folder_of_the_service_manager(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,7 +44,7 @@ def test_values_come_in_order_with_nan_for_what_is_absent() -> None:
     assert found.temperature_c is None
 
 
-def test_a_part_of_the_time() -> None:
+def test_a_part_of_the_time_more_samples_than_fit_and_other_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     collector = Collector(skip_s=1.0, for_s=2.0)
     for number in range(100):
         collector.add(sample(number))
@@ -52,9 +52,12 @@ def test_a_part_of_the_time() -> None:
     assert collector.readings().gyro_rad_s is not None
     taken = collector.readings().t_ns
     assert (taken[0], taken[-1]) == (2 * NS_PER_S, 4 * NS_PER_S)
-
-
-def test_other_devices_are_passed_over_and_named_where_none_was_chosen() -> None:
+    monkeypatch.setattr("imud.cli.sample_set.SAMPLES_MOST", 2)
+    collector = Collector()
+    collector.add(sample(0))
+    collector.add(sample(1))
+    with pytest.raises(BadArgument, match="at most 2 samples; select a part"):
+        collector.add(sample(2))
     for name, others in (("", {"stern"}), ("bow", set())):
         collector = Collector(name)
         collector.add(sample(0))
@@ -63,7 +66,7 @@ def test_other_devices_are_passed_over_and_named_where_none_was_chosen() -> None
         assert collector.others == others
 
 
-def test_the_devices_own_time_where_reads_have_none() -> None:
+def test_the_devices_own_time_and_a_live_view_that_drops_the_past() -> None:
     collector = Collector()
     collector.by_device_time = True
     collector.add(sample(7))
@@ -71,9 +74,6 @@ def test_the_devices_own_time_where_reads_have_none() -> None:
     assert "the device's crystal" in collector.stamps()
     with pytest.raises(BadArgument, match="neither arrival times nor device times"):
         collector.add(sample(8, t_dev_ns=None))
-
-
-def test_a_live_view_drops_the_past_and_a_device_may_be_unknown() -> None:
     collector = Collector()
     for number in range(10):
         collector.add(sample(number))
@@ -84,15 +84,6 @@ def test_a_live_view_drops_the_past_and_a_device_may_be_unknown() -> None:
     assert found.gyro_rad_s[:, 0].tolist() == [6.0, 7.0, 8.0, 9.0]
     with pytest.raises(BadArgument, match="bow: expected a file, or a device of the daemon"):
         status_of([], "bow")
-
-
-def test_more_samples_than_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("imud.cli.sample_set.SAMPLES_MOST", 2)
-    collector = Collector()
-    collector.add(sample(0))
-    collector.add(sample(1))
-    with pytest.raises(BadArgument, match="at most 2 samples; select a part"):
-        collector.add(sample(2))
 
 
 def test_losses_are_those_between_the_looks_although_a_ledger_begins_anew() -> None:
@@ -152,7 +143,7 @@ def kept(sample_set: SampleSet) -> int:
     return len(sample_set.readings.t_ns)
 
 
-def test_a_live_device_is_taken_until_the_duration_or_an_interrupt(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_live_device_is_taken_until_the_duration_an_interrupt_or_silence(monkeypatch: pytest.MonkeyPatch) -> None:
     live = Live(monkeypatch, 100)
     sample_set = live.take(duration=3.0)
     assert (kept(sample_set), live.now_s) == (31, 4.0), "the sample after the duration ends it"
@@ -162,14 +153,9 @@ def test_a_live_device_is_taken_until_the_duration_or_an_interrupt(monkeypatch: 
     assert live.notes == [(1.0, 8), (2.0, 16), (3.0, 24), (4.0, 31)]
     assert kept(Live(monkeypatch, 100).take(skip=2.0, duration=1.0)) == 11
     assert kept(Live(monkeypatch, 45, interrupted=True).take()) == 45
-
-
-def test_a_device_that_falls_silent_loses_nothing_of_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    live = Live(monkeypatch, 40)
-    assert kept(live.take(duration=20.0)) == 40
-    assert 20 <= live.now_s < 20 + 5.0
-    live = Live(monkeypatch, 40)
-    assert kept(live.take(skip=1.0, duration=20.0)) == 30
-    assert 21 <= live.now_s < 21 + 5.0
+    for skip_s, count in ((0.0, 40), (1.0, 30)):
+        live = Live(monkeypatch, 40)
+        assert kept(live.take(skip=skip_s or None, duration=20.0)) == count
+        assert 20 + skip_s <= live.now_s < 20 + skip_s + 5.0
     with pytest.raises(BadArgument, match="bow sends no samples; find the reason with `imud status`"):
         Live(monkeypatch, 0).take(duration=20.0)

@@ -18,6 +18,7 @@ from tests.support.daemon_process import LIMIT_S, RunningDaemon, daemon_with_mod
 
 pytestmark = pytest.mark.live
 
+Words = tuple[object, ...]
 DECLARED = {"mode": "9-axis", "output": {"hi91": 50}}
 
 
@@ -28,7 +29,7 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
 
 
 @pytest.fixture
-def words(daemon: RunningDaemon) -> tuple[object, ...]:
+def words(daemon: RunningDaemon) -> Words:
     return "settings", "--socket", daemon.socket, "bow"
 
 
@@ -38,9 +39,7 @@ def actual(daemon: RunningDaemon) -> dict[str, Any]:
     return {one["name"]: one["actual"] for one in found["settings"]}
 
 
-def test_from_difference_to_agreement_and_back(
-    daemon: RunningDaemon, words: tuple[object, ...], cli: Cli, tmp_path: Path
-) -> None:
+def test_from_difference_to_agreement(daemon: RunningDaemon, words: Words, cli: Cli, tmp_path: Path) -> None:
     # report
     out = cli(*words, status=1).out
     assert out.splitlines()[0].split() == ["SETTING", "DECLARED", "ACTUAL"]
@@ -77,7 +76,7 @@ def test_from_difference_to_agreement_and_back(
     assert '  settings  differ: mode is "6-axis", declared "9-axis"' in out
 
 
-def test_values_in_place_of_the_declared_ones(daemon: RunningDaemon, words: tuple[object, ...], cli: Cli) -> None:
+def test_values_in_place_of_the_declared_ones(daemon: RunningDaemon, words: Words, cli: Cli) -> None:
     cli(*words, "--set", "sout_divisor=4", 'output={"hi91": 20}')
     assert (actual(daemon)["sout_divisor"], actual(daemon)["output"]["hi91"]) == (4, 20)
     cli(*words, "--set", "sout_divisor=5", "magnetic_calibration=false", "--set", "mode=6-axis")
@@ -92,9 +91,7 @@ def test_values_in_place_of_the_declared_ones(daemon: RunningDaemon, words: tupl
     assert "not set: mounting needs a save and a restart" in out
 
 
-def test_another_rate_is_asked_for_and_followed(
-    daemon: RunningDaemon, words: tuple[object, ...], cli: Cli, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_rate(daemon: RunningDaemon, words: Words, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     more = (*words, "--save", "--set", "baud=460800")
     cli.refuses("the device may not be reached afterwards: cannot ask for confirmation without a terminal", *more)
     monkeypatch.setattr(sys, "stdin", Terminal("n\n"))
@@ -107,7 +104,7 @@ def test_another_rate_is_asked_for_and_followed(
     assert actual(daemon)["baud"] == 115200
 
 
-def test_mistakes_are_explained(words: tuple[object, ...], cli: Cli, tmp_path: Path) -> None:
+def test_mistakes_are_explained(words: Words, cli: Cli, tmp_path: Path) -> None:
     for value, problem in {
         "mode": "expected NAME=VALUE, got 'mode'",
         "mod=9": 'expected a setting that imud knows, got "mod"; did you mean mode?',
@@ -126,7 +123,9 @@ def test_mistakes_are_explained(words: tuple[object, ...], cli: Cli, tmp_path: P
         cli.refuses(problem, *words, "--restore", file)
 
 
-def test_a_backup_of_another_module_is_told_of(words: tuple[object, ...], cli: Cli, tmp_path: Path) -> None:
+def test_a_backup_of_another_device_is_told_of_and_none_is_overwritten_unasked(
+    words: Words, cli: Cli, tmp_path: Path
+) -> None:
     file = tmp_path / "other.yaml"
     file.write_text(
         'driver: hipnuc-uart\nidentity: {product: "CH020", serial_number: "77"}\nsettings: {mode: 6-axis, strange: 1}\n'
@@ -140,9 +139,6 @@ def test_a_backup_of_another_module_is_told_of(words: tuple[object, ...], cli: C
     ):
         assert problem in err
     cli(*words, "--restore", file, "--yes")
-
-
-def test_a_backup_is_not_written_over_unasked(words: tuple[object, ...], cli: Cli, tmp_path: Path) -> None:
     file = tmp_path / "bow.yaml"
     file.write_text("mine")
     cli(*words, "--backup", file, status=2)
@@ -161,18 +157,12 @@ def test_a_factory_reset_is_asked_for_and_backed_up(daemon: RunningDaemon, cli: 
     assert len(list(backups.iterdir())) == 1
 
 
-@pytest.mark.parametrize(
-    ("word", "value"),
-    [
+def test_values_in_the_notation_of_yaml() -> None:
+    for word, value in [
         ("output={hi91: 50}", {"hi91": 50}), ('output={"hi91": 50}', {"hi91": 50}), ("mounting=[1, 0]", [1, 0]),
         ("mode=9-axis", "9-axis"), ("mode=a{b", "a{b"),
-    ],
-)  # fmt: skip
-def test_values_in_the_notation_of_yaml(word: str, value: object) -> None:
-    assert list(given_values([word]).values()) == [value]
-
-
-@pytest.mark.parametrize("word", ["output={hi91: ", "output={hi91: 50} {}", "output={a: 1, a: 2}"])
-def test_broken_yaml_is_explained(word: str) -> None:
-    with pytest.raises(BadArgument, match=r"output: expected YAML, for example \{hi91: 50\}, got "):
-        given_values([word])
+    ]:  # fmt: skip
+        assert list(given_values([word]).values()) == [value]
+    for word in ("output={hi91: ", "output={hi91: 50} {}", "output={a: 1, a: 2}"):
+        with pytest.raises(BadArgument, match=r"output: expected YAML, for example \{hi91: 50\}, got "):
+            given_values([word])

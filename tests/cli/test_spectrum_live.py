@@ -34,7 +34,7 @@ def collected(frequency_hz: float, count: int = COUNT) -> Collector:
     return collector
 
 
-def test_the_page() -> None:
+def test_the_page_also_of_too_few_samples_and_of_no_values() -> None:
     view = LiveView("bow", "accel")
     pages = [view.page(collected(hz), SpectrumOptions(("accel",))).splitlines() for hz in (25.0, 75.0)]
     for page in pages:
@@ -48,14 +48,9 @@ def test_the_page() -> None:
     darkest = [max(range(len(row)), key=lambda at, row=row: SHADES.index(row[at])) for row in past]  # type: ignore[misc]
     assert darkest == [pytest.approx(60, abs=2), pytest.approx(20, abs=2)], "newest row first"
     assert any(line.startswith("  P1") and " 75.0" in line for line in second)
-
-
-def test_too_few_samples_and_no_values_are_said() -> None:
-    view = LiveView("bow", "accel")
     assert "at least 64 samples" in view.page(collected(25.0, 10), SpectrumOptions(("accel",)))
-    assert "sends no values of the gyroscope" in LiveView("bow", "gyro").page(
-        collected(25.0), SpectrumOptions(("gyro",))
-    )
+    page_of_gyro = LiveView("bow", "gyro").page(collected(25.0), SpectrumOptions(("gyro",)))
+    assert "sends no values of the gyroscope" in page_of_gyro
 
 
 def test_columns_bars_and_axis() -> None:

@@ -78,18 +78,15 @@ def test_json_is_all_that_the_socket_sends(tmp_path: Path, cli: Cli) -> None:
             said = client.status()
         shown = json.loads(cli("status", "--socket", served.path, "--json").out)
         assert said["c_kernel"] == {"active": kernel.present.module is not None, "problem": kernel.present.problem}
-        assert (
-            shown.keys()
-            == said.keys()
-            == {"now_ns", "devices", "socket", "configuration", "mqtt", "outputs", "c_kernel"}
-        )
+        members = {"now_ns", "devices", "socket", "configuration", "mqtt", "outputs", "c_kernel"}
+        assert shown.keys() == said.keys() == members
         assert shown["devices"] == said["devices"]
         one = json.loads(cli("status", "--socket", served.path, "--json", "imu1").out)
         assert [device["name"] for device in one["devices"]] == ["imu1"]
         cli.refuses('that imud knows, got "imu9"', "status", "--socket", served.path, "imu1", "imu9")
 
 
-def test_a_device_shows_its_condition_with_reasons_and_next_steps() -> None:
+def test_condition_with_reasons_and_problems_of_mqtt_and_the_kernel_in_c() -> None:
     reasons = Reason(ReasonCode.ALARM, "The ALARM pin is active.", "Look."), Reason(ReasonCode.LOST, "Lost.", "Step.")
     work = WorkStatus("the command save", monotonic_ns() - 600 * NS_PER_S, "uid 1000", "")
     degraded = device("mast", condition=DeviceCondition(Condition.ATTENTION, 0, reasons), work=work)
@@ -100,9 +97,6 @@ def test_a_device_shows_its_condition_with_reasons_and_next_steps() -> None:
     )
     old = replace(degraded, condition=None, problem="an old daemon", work=None)
     assert block(old).startswith("mast: running\n  an old daemon\n")
-
-
-def test_problems_of_mqtt_and_the_kernel_in_c_are_shown() -> None:
     mqtt = MqttStatus("", "no route", "", 0, 0, 0, 0, 0, 0, 0, {}, 0, refused={"a/b": "Not authorized"})
     assert page([], c_kernel=CKernelStatus(True)) == "C kernel: active"
     assert page([], [mqtt], {"metrics": "no IPv6"}, CKernelStatus(False, "no file")).splitlines() == [
@@ -111,7 +105,7 @@ def test_problems_of_mqtt_and_the_kernel_in_c_are_shown() -> None:
     ]  # fmt: skip
 
 
-def test_lines_and_utc_say_only_what_is_known() -> None:
+def test_lines_utc_settings_and_status_bits() -> None:
     lines = LinesStatus({"sin": "GPIO4 is in use by another program"}, {}, {}, sin=True)
     for alarm, words in ((True, "ACTIVE"), (False, "inactive"), (None, "level unknown")):
         assert watched(replace(LINES, alarm=alarm), "alarm", 2).startswith(f"{words}, raised")
@@ -125,9 +119,6 @@ def test_lines_and_utc_say_only_what_is_known() -> None:
     assert utc(UtcStatus("", "", pulses=3)) == "3 pulses, 0 ignored"
     assert utc(replace(UTC, refused={}, pulses=0, pulses_ignored=0, chrony_refused=0, chrony_sent=0,
                                        problem="")) == "gpsd at 127.0.0.1:2947: 100 sentences, 90 sent"  # fmt: skip
-
-
-def test_settings_and_status_bits_have_names() -> None:
     shown = replace(
         device("bow"), settings={"mode": "6-axis", "output.hi91": "100 Hz"}, status_bits=1 << 5,
         status_words=("accelerometer over range",), status_bit_names={"5": "accelerometer over range"},

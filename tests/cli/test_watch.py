@@ -5,7 +5,7 @@ import json
 import signal
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from functools import partial
+from operator import methodcaller
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -14,18 +14,11 @@ import pytest
 
 from imud.cli import main
 from imud.client.connection import Client
-from imud.contracts.publisher import Batch
-from imud.publishers.socket.server import SocketServer
 from tests.cli.conftest import Cli, imud_process
 from tests.support.socket_rig import Daemon, batch, daemon
 
 pytestmark = pytest.mark.live
-
-PERIOD_NS = 10_000_000
-
-
-def publishing(sent: Batch, server: SocketServer) -> None:
-    server.publish(sent)
+Words = tuple[object, ...]
 
 
 @contextmanager
@@ -37,7 +30,7 @@ def samples_of(served: Daemon, devices: Sequence[str] = ("imu0",)) -> Iterator[N
         while not ended.wait(0.002):
             seq += 1
             for device in devices:
-                served.do(partial(publishing, batch(device, seq, period_ns=PERIOD_NS)))
+                served.do(methodcaller("publish", batch(device, seq, period_ns=10_000_000)))
 
     sender = Thread(target=publish)
     sender.start()
@@ -49,13 +42,13 @@ def samples_of(served: Daemon, devices: Sequence[str] = ("imu0",)) -> Iterator[N
 
 
 @pytest.fixture(scope="module")
-def words(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[object, ...]]:
+def words(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Words]:
     with daemon(tmp_path_factory.mktemp("watch")) as served, samples_of(served, ("imu0", "imu1")):
         yield "watch", "--socket", served.path
 
 
 @pytest.mark.parametrize("option", ["--json", "--format=json"])
-def test_json_has_every_sample(words: tuple[object, ...], cli: Cli, option: str) -> None:
+def test_json_has_every_sample(words: Words, cli: Cli, option: str) -> None:
     seqs = [json.loads(line)["seq"] for line in cli(*words, "--count", 5, option, "imu0").out.splitlines()]
     assert seqs == list(range(seqs[0], seqs[0] + 5))
     fields = ("--fields", "temperature_c,accel_m_s2,mag_t")
@@ -63,17 +56,17 @@ def test_json_has_every_sample(words: tuple[object, ...], cli: Cli, option: str)
     assert text == '{"temperature_c":31.5,"accel_m_s2":[0.125,-0.5,9.75]}\n' * 2
 
 
-@pytest.mark.parametrize(("rate", "step"), [((), 10), (("--rate", "0"), 1), (("--rate", "20"), 5)])
-def test_the_rate_of_the_table(words: tuple[object, ...], cli: Cli, rate: tuple[str, ...], step: int) -> None:
-    more = ("--count", 3, *rate, "--fields", "device,seq,accel_m_s2", "imu0")
-    _labels, head, *rows = cli(*words, *more).out.splitlines()
-    assert head.split() == ["DEVICE", "SEQ", "X", "Y", "Z"]
-    assert rows[0].endswith("  0.12  -0.50   9.75")
-    seqs = [int(row.split()[1]) for row in rows]
-    assert seqs == [seqs[0], seqs[0] + step, seqs[0] + 2 * step]
+def test_the_rate_of_the_table(words: Words, cli: Cli) -> None:
+    for rate, step in [((), 10), (("--rate", "0"), 1), (("--rate", "20"), 5)]:
+        more = ("--count", 3, *rate, "--fields", "device,seq,accel_m_s2", "imu0")
+        _labels, head, *rows = cli(*words, *more).out.splitlines()
+        assert head.split() == ["DEVICE", "SEQ", "X", "Y", "Z"]
+        assert rows[0].endswith("  0.12  -0.50   9.75")
+        seqs = [int(row.split()[1]) for row in rows]
+        assert seqs == [seqs[0], seqs[0] + step, seqs[0] + 2 * step], rate
 
 
-def test_several_devices_are_named_and_a_convention_turns_the_values(words: tuple[object, ...], cli: Cli) -> None:
+def test_several_devices_are_named_and_a_convention_turns_the_values(words: Words, cli: Cli) -> None:
     _labels, head, *rows = cli(*words, "--count", 8).out.splitlines()
     assert head.split()[:2] == ["DEVICE", "TIME"]
     assert {row.split()[0] for row in rows} == {"imu0", "imu1"}
@@ -81,9 +74,7 @@ def test_several_devices_are_named_and_a_convention_turns_the_values(words: tupl
     assert turned.splitlines()[-1].split() == ["-0.50", "0.12", "-9.75"]
 
 
-def test_csv_has_a_header_and_every_sample(
-    words: tuple[object, ...], capfdbinary: pytest.CaptureFixture[bytes]
-) -> None:
+def test_csv_has_a_header_and_all_samples(words: Words, capfdbinary: pytest.CaptureFixture[bytes]) -> None:
     assert main([*map(str, words), "--count", "3", "--format", "csv", "imu0"]) == 0
     text = capfdbinary.readouterr().out.decode()
     assert text.count("\r\n") == text.count("\n") == 4
@@ -94,7 +85,7 @@ def test_csv_has_a_header_and_every_sample(
     assert (found[0]["accel_z_m_s2"], found[0]["mag_x_t"], found[0]["sync"]) == ("9.75", "", "regression")
 
 
-def test_options_are_sent_to_the_daemon(words: tuple[object, ...], cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_are_sent_to_the_daemon(words: Words, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[Any, ...]] = []
 
     def watch(_client: Client, names: list[str] | None, **options: Any) -> None:
@@ -119,15 +110,12 @@ def test_mistakes_are_found_before_the_daemon_is_asked(tmp_path: Path, cli: Cli)
     cli.refuses("not allowed with argument", "watch", "--json", "--format", "csv")
 
 
-@pytest.mark.parametrize("form", ["table", "json", "csv"])
-def test_a_reader_that_ends_is_no_error(words: tuple[object, ...], form: str) -> None:
-    with imud_process(*words, "--format", form) as watch:
-        assert watch.out.readline()
-        watch.out.close()
-        assert watch.end() == ("", "")
-
-
-def test_an_interrupt_ends_it_quietly(words: tuple[object, ...]) -> None:
+def test_a_reader_that_ends_is_no_error_and_an_interrupt_ends_it_quietly(words: Words) -> None:
+    for form in ("table", "json", "csv"):
+        with imud_process(*words, "--format", form) as watch:
+            assert watch.out.readline()
+            watch.out.close()
+            assert watch.end() == ("", ""), form
     with imud_process(*words) as watch:
         assert watch.out.readline()
         assert watch.end(signal.SIGINT, status=130).err == ""

@@ -13,6 +13,7 @@ import pytest
 from imud.cli import build_parser
 from imud.cli.web import _say, guard_of
 from imud.model.errors import BadArgument
+from imud.web.guard import WebGuard
 from imud.web.server import CONNECTIONS_MAX
 from tests.cli.conftest import Cli, imud_process
 from tests.support.daemon_process import LIMIT_S
@@ -27,25 +28,22 @@ def token(tmp_path: Path) -> str:
     return str(file)
 
 
-def parsed(*words: str) -> object:
+def parsed(*words: str) -> WebGuard:
     return guard_of(build_parser(("web",)).parse_args(["web", *words]))
 
 
-def test_another_address_needs_a_token() -> None:
+def test_another_address_needs_a_token_and_who_may_look(token: str) -> None:
     for address in ("0.0.0.0", "::", "192.168.1.5", "gateway"):
         with pytest.raises(BadArgument, match="add --token-file FILE, or omit --address and use a tunnel: ssh -L"):
             parsed("--address", address)
     with pytest.raises(BadArgument, match="--reading token: add --token-file"):
         parsed("--reading", "token")
 
-
-def test_who_may_look(token: str) -> None:
     def can_read(*words: str) -> bool:
-        guard = guard_of(build_parser(("web",)).parse_args(["web", *words]))
-        return guard.rights(None, None).read
+        return parsed(*words).rights(None, None).read
 
     assert can_read()
-    guard = guard_of(build_parser(("web",)).parse_args(["web", "--host", "gw.example"]))
+    guard = parsed("--host", "gw.example")
     assert (guard.host_problem("gw.example"), guard.host_problem("other.example") != "") == ("", True)
     assert can_read("--token-file", token)
     assert not can_read("--token-file", token, "--reading", "token")
@@ -60,10 +58,8 @@ def test_without_the_library_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.live
-@pytest.mark.parametrize(("words", "is_open"), [(("--address", "0.0.0.0"), True), ((), False)])
-def test_it_serves_until_a_signal_and_says_where_it_is_open(
-    words: tuple[str, ...], is_open: bool, token: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("words", [("--address", "0.0.0.0"), ()])
+def test_it_serves_until_a_signal_and_says_where_it_is_open(words: tuple[str, ...], token: str, tmp_path: Path) -> None:
     more = ("--port", 0, "--token-file", token, *words, "--socket", tmp_path / "none")
     with imud_process("web", *more, python=("-X", "dev", "-W", "error")) as web:
         line = web.out.readline().strip()
@@ -79,7 +75,7 @@ def test_it_serves_until_a_signal_and_says_where_it_is_open(
         assert b"<title>imud</title>" in asked.getresponse().read()
         asked.close()
         errors = web.end(signal.SIGTERM).err
-    assert ("OPEN: other hosts can reach 0.0.0.0 port" in errors) == is_open
+    assert ("OPEN: other hosts can reach 0.0.0.0 port" in errors) == bool(words)
     assert "Traceback" not in errors
     assert TOKEN not in line + errors
 
