@@ -170,9 +170,7 @@ class Site:
         self._broker = stack.enter_context(running_broker(folder / "broker"))
         stack.enter_context(mock.patch.object(RecordQueue, "put", self._put_or_drop(RecordQueue.put)))
         settings = config.load(self._write(faulty=False))
-        self.daemon = AlteredDaemon(
-            settings, file=folder / "imud.yaml", state_dir=folder, lines=self.memory.maker
-        )  # fmt: skip
+        self.daemon = AlteredDaemon(settings, file=folder / "imud.yaml", state_dir=folder, lines=self.memory.maker)
         self._thread = threading.Thread(target=event_loop.run, args=(self._serve(),), name="daemon")
         self._thread.start()
         stack.callback(self._stop)

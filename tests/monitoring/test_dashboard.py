@@ -17,7 +17,7 @@ from tests.support.files import ROOT
 from tests.support.surroundings import free_port
 
 
-def test_panels_stand_beside_each_other() -> None:
+def test_panels_stand_beside_each_other_and_are_in_the_picture() -> None:
     assert dashboard.FILE.read_text() == dashboard.text(), "run python -m docs.generate.dashboard"
     taken: set[tuple[int, int]] = set()
     panels = json.loads(dashboard.text())["panels"]
@@ -29,6 +29,10 @@ def test_panels_stand_beside_each_other() -> None:
         assert max(x for x, _ in cells) < dashboard.COLUMNS
         taken |= cells
     assert len({panel["id"] for panel in panels}) == len(panels)
+    drawn = {unescape(words) for words in re.findall(r">([^<]+)</text>", picture.FILE.read_text())}
+    titles = {panel["title"].replace("$device", picture.CHOSEN) for panel in dashboard.dashboard()["panels"]}
+    assert titles <= drawn, "run python -m docs.generate.dashboard_picture"
+    assert f"]({picture.FILE.relative_to(ROOT / 'docs')})" in (ROOT / "docs/monitoring.md").read_text()
 
 
 @needs("promtool")
@@ -91,10 +95,3 @@ def assert_devices_are_told_apart(prometheus: RealPrometheus, one: Site) -> None
                 assert series["metric"].get("device", "quiet") == "quiet", title
     devices = prometheus.query("count(max_over_time(imud_device_up[5m]))")  # also if the last scrape was late
     assert devices[0]["value"][1] == str(len(one.wires) + 2)
-
-
-def test_the_picture_is_of_the_dashboard_as_it_is() -> None:
-    drawn = {unescape(words) for words in re.findall(r">([^<]+)</text>", picture.FILE.read_text())}
-    titles = {panel["title"].replace("$device", picture.CHOSEN) for panel in dashboard.dashboard()["panels"]}
-    assert titles <= drawn, "run python -m docs.generate.dashboard_picture"
-    assert f"]({picture.FILE.relative_to(ROOT / 'docs')})" in (ROOT / "docs/monitoring.md").read_text()

@@ -24,12 +24,6 @@ def run(*argv: str) -> str:
     return done.stdout
 
 
-@needs("promtool")
-def test_prometheus_accepts_rules_and_configuration() -> None:
-    assert f"{len(ALERTS)} rules found" in run("promtool", "check", "rules", str(RULES))
-    run("promtool", "check", "config", str(FOLDER / "prometheus.yml"))
-
-
 @needs("amtool")
 def test_alertmanager_accepts_its_configuration() -> None:
     file = str(FOLDER / "alertmanager.yml")
@@ -37,11 +31,6 @@ def test_alertmanager_accepts_its_configuration() -> None:
     for severity, receiver in (("critical", "on-call"), ("warning", "operators")):
         labels = ("alertname=ImudDeviceDown", f"severity={severity}", "device=bow")
         assert run("amtool", "config", "routes", "test", f"--config.file={file}", *labels).strip() == receiver
-
-
-@needs("promtool")
-def test_every_alert_waits_fires_and_clears() -> None:
-    assert "SUCCESS" in run("promtool", "test", "rules", str(TESTS))
 
 
 def test_every_alert_has_a_case_that_fires_and_others_that_do_not() -> None:
@@ -94,7 +83,10 @@ EXAMPLES = dict(re.findall(r"^```yaml\n# ([\w.-]+\.yml)[^\n]*\n(.*?)^```", PAGE,
 
 
 @needs("promtool")
-def test_examples_of_the_page_are_accepted(tmp_path: Path) -> None:
+def test_prometheus_accepts_rules_tests_of_alerts_configuration_and_examples(tmp_path: Path) -> None:
+    assert f"{len(ALERTS)} rules found" in run("promtool", "check", "rules", str(RULES))
+    run("promtool", "check", "config", str(FOLDER / "prometheus.yml"))
+    assert "SUCCESS" in run("promtool", "test", "rules", str(TESTS))
     assert EXAMPLES.keys() == {"prometheus.yml", "imud-targets.yml", "my.rules.yml"}
     for name, text in EXAMPLES.items():
         (tmp_path / name).write_text(text)

@@ -1,15 +1,16 @@
-"""The manual pages match `--help` and the option classes, in roff that every reader supports."""
+"""The manual pages match `--help` and the option classes, in valid roff. Each shell accepts its completions."""
 
 import argparse
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import msgspec
 import pytest
 
 from docs.generate import references
-from docs.generate.completions import every_parser
+from docs.generate.completions import FILES, completions, every_parser
 from docs.generate.manual_pages import escaped, help_of, marked, pages, sentence
 from imud.cli import COMMANDS, build_parser
 from imud.cli.doctor.command import STATUS
@@ -96,3 +97,42 @@ def test_mandoc_finds_nothing_wrong(name: str) -> None:
     argv = ["mandoc", "-T", "lint", "-W", "warning"]
     done = subprocess.run(argv, input=PAGES[name], capture_output=True, text=True, timeout=LIMIT_S, check=False)
     assert not [line for line in done.stdout.splitlines() if "missing date" not in line]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the completions of each shell."""
+    pytest.importorskip("shtab", reason="cannot find shtab (extra dev)")
+    path = tmp_path_factory.mktemp("completions")
+    for file, text in completions().items():
+        (path / file).parent.mkdir()
+        (path / file).write_text(text)
+    return path
+
+
+@pytest.mark.live
+def test_every_shell_can_read_its_file_and_knows_all_commands(folder: Path) -> None:
+    for shell in FILES:
+        text = (folder / FILES[shell]).read_text()
+        assert [word for word in (*COMMANDS, "scan", "assign", "convention", "ned-frd") if word not in text] == []
+    for shell in FILES:
+        if shutil.which(shell) is None:
+            pytest.skip(f"cannot find {shell}")
+        subprocess.run([shell, "-n", str(folder / FILES[shell])], check=True, timeout=LIMIT_S)
+
+
+def completed_by_bash(folder: Path, *words: str) -> list[str]:
+    script = 'source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _shtab_imud; echo "${COMPREPLY[@]}"'
+    argv = ["bash", "--norc", "-c", script, "bash", str(folder / FILES["bash"]), *words]
+    return subprocess.run(argv, capture_output=True, text=True, check=True, timeout=LIMIT_S).stdout.split()
+
+
+@pytest.mark.live
+@pytest.mark.skipif(shutil.which("bash") is None, reason="cannot find bash")
+def test_bash_completes_commands_options_values_and_files(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert completed_by_bash(folder, "imud", "wa") == ["watch"]
+    assert completed_by_bash(folder, "imud", "watch", "--conv") == ["--convention"]
+    assert completed_by_bash(folder, "imud", "watch", "--convention", "n") == ["ned-frd"]
+    (folder / "boat.yaml").touch()
+    monkeypatch.chdir(folder)
+    assert completed_by_bash(folder, "imud", "check", "boa") == ["boat.yaml"]
