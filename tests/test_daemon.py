@@ -1,4 +1,4 @@
-"""The daemon as a process: reconnected devices, reloads of the configuration, and exits with a reason."""
+"""The daemon as a process: reconnected devices, reloads, exits with a reason. An unread log, signals and kills."""
 
 import asyncio
 import os
@@ -11,7 +11,7 @@ import sys
 import threading
 import tty
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic_ns, sleep, time_ns
@@ -24,15 +24,20 @@ import pytest
 from imud.client.ring import Ring
 from imud.config.model import Config
 from imud.contracts.publisher import Publisher
-from imud.daemon import Daemon
+from imud.daemon import Daemon, Reloader
 from imud.host.clock import HostClock
-from imud.model.errors import CommandError
+from imud.model.errors import CommandError, ConfigError
 from imud.model.units import NS_PER_S
 from imud.publishers.shm import ShmOptions
 from imud.utc.system_clock import KernelClock
 from tests.support.daemon_process import LIMIT_S, RunningDaemon, running_daemon, wait_until, write_config
 from tests.support.event_loops import in_loop
 from tests.support.files import hi91
+from tests.support.surroundings import pipe
+
+MISSING = 250
+RUN = (sys.executable, "-m", "imud", "run", "--config")
+EMPTY = Config("info", "", {}, ())
 
 
 class Cable:
@@ -105,7 +110,7 @@ def test_a_port_that_appears_is_taken_each_time(tmp_path: Path) -> None:
 @in_loop
 async def test_the_thread_that_closes_is_there_from_the_beginning() -> None:
     """A new thread after an unplug would need memory and a process id, which may not be available."""
-    daemon = Daemon(Config("info", "", {}, ()))
+    daemon = Daemon(EMPTY)
     running = asyncio.create_task(daemon.run())
     await asyncio.sleep(0)
     threads = set(threading.enumerate())
@@ -117,31 +122,35 @@ async def test_the_thread_that_closes_is_there_from_the_beginning() -> None:
     await running
 
 
-@pytest.mark.parametrize("is_kept", [True, False])
-def test_outputs_learn_whether_the_clock_is_kept(monkeypatch: pytest.MonkeyPatch, is_kept: bool) -> None:
-    monkeypatch.setattr("imud.daemon.kernel_clock", lambda: KernelClock(is_kept, 50, 0))
-    found = Daemon(Config("info", "", {}, ()))._context.clock.utc_reference()
-    assert (found is not None) == is_kept
-    if found is not None:
-        assert found.error_ns == 50_000
-        assert abs(found.offset_ns - (time_ns() - monotonic_ns())) < NS_PER_S
+def test_outputs_learn_whether_the_clock_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    for is_kept in (True, False):
+        monkeypatch.setattr("imud.daemon.kernel_clock", lambda: KernelClock(is_kept, 50, 0))  # noqa: B023 - called here
+        found = Daemon(EMPTY)._context.clock.utc_reference()
+        assert (found is not None) == is_kept
+        if found is not None:
+            assert found.error_ns == 50_000
+            assert abs(found.offset_ns - (time_ns() - monotonic_ns())) < NS_PER_S
 
 
 def test_outputs_do_not_read_the_clocks_that_stamp_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     """A thread of an output that read them changed the steady time between two samples, and a replay differed."""
     monkeypatch.setattr("imud.daemon.kernel_clock", lambda: KernelClock(True, 50, 0))
-    clock = Daemon(Config("info", "", {}, ()))._context.clock
+    clock = Daemon(EMPTY)._context.clock
     monkeypatch.delattr(HostClock, "utc_offset_ns")
     assert abs(clock.utc_offset_ns() - (time_ns() - monotonic_ns())) < NS_PER_S
     assert clock.utc_reference() is not None
 
 
 @in_loop
-async def test_the_daemon_ticks_twice_per_second_until_a_part_needs_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    alarm, daemon = Mock(is_set=True), Daemon(Config("info", "", {}, ()))
+async def test_the_daemon_has_no_other_device_and_ticks_twice_per_second_until_a_part_needs_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    alarm, daemon = Mock(is_set=True), Daemon(EMPTY)
     monkeypatch.setattr("imud.daemon.Alarm", lambda _owner: alarm)
     running = asyncio.create_task(daemon.run())
     await asyncio.sleep(0)
+    with pytest.raises(CommandError, match=r"^nobody: no such device$"):
+        daemon.control("nobody")
     daemon.tick_soon()
     daemon.tick_soon()  # the first request is enough
     monkeypatch.setattr("imud.publishers.outputs.Outputs.tick", lambda *_: daemon.tick_soon())
@@ -150,11 +159,6 @@ async def test_the_daemon_ticks_twice_per_second_until_a_part_needs_more(monkeyp
     assert [call.args for call in alarm.set.call_args_list] == [(0.5,), (0.1,), (0.1,)]
     daemon.stop()
     await running
-
-
-def test_a_device_that_there_is_not_is_an_error_of_who_asks() -> None:
-    with pytest.raises(CommandError, match=r"^nobody: no such device$"):
-        Daemon(Config("info", "", {}, ())).control("nobody")
 
 
 @in_loop
@@ -180,7 +184,7 @@ async def test_a_reload_without_any_usable_directory_keeps_the_daemon(tmp_path: 
 
 
 class EndingOutput:
-    """An output that raises an exception in `close` on request."""
+    """An output that raises an exception in some methods on request."""
 
     def __init__(self, *failing: str) -> None:
         self.failing = failing
@@ -188,12 +192,12 @@ class EndingOutput:
         self.ends = False
 
     def __getattr__(self, name: str) -> Any:
-        return lambda *_: self._do(name)
+        def do(*_: object) -> None:
+            self.did.append(name)
+            if self.ends and name in self.failing:
+                raise RuntimeError(name)
 
-    def _do(self, name: str) -> None:
-        self.did.append(name)
-        if self.ends and name in self.failing:
-            raise RuntimeError(name)
+        return do
 
 
 @pytest.mark.parametrize("is_ticking", [True, False])
@@ -203,7 +207,7 @@ async def test_whatever_a_part_raises_at_the_end_all_others_are_closed(
 ) -> None:
     outputs = {"a": EndingOutput("tick", "close"), "b": EndingOutput("close"), "c": EndingOutput()}
     extra = cast("dict[str, Publisher]", outputs if is_ticking else {})
-    daemon = Daemon(Config("info", "", {}, ()), extra=extra)
+    daemon = Daemon(EMPTY, extra=extra)
     running = asyncio.create_task(daemon.run())
     await asyncio.sleep(0)
     for name in () if is_ticking else ("bow", "stern"):
@@ -287,10 +291,8 @@ def test_a_reload_that_changes_little_or_cannot_be_used_is_an_event(tmp_path: Pa
 @pytest.mark.live
 def test_second_daemon_is_refused_with_the_reason(tmp_path: Path) -> None:
     with running_daemon(tmp_path, {}) as daemon:
-        again = subprocess.run(
-            [sys.executable, "-m", "imud", "run", "--config", str(tmp_path / "imud.yaml")],
-            capture_output=True, text=True, timeout=LIMIT_S, check=False,
-        )  # fmt: skip
+        argv = [*RUN, str(tmp_path / "imud.yaml")]
+        again = subprocess.run(argv, capture_output=True, text=True, timeout=LIMIT_S, check=False)
         assert again.returncode == 75
         assert re.search(r"CRITICAL .*imud\.sock", again.stderr)
         assert "Traceback" not in again.stderr
@@ -335,9 +337,7 @@ def test_metrics_and_socket_and_shared_memory_show_the_same_ledger(tmp_path: Pat
             wait_until(lambda: daemon.statuses()["bow"].ledger["bytes_in"] == 4 * 82 + 59, "all bytes are in")
             ledger = daemon.statuses()["bow"].ledger
             with Ring(tmp_path / "imud.bow") as ring:
-                wait_until(
-                    lambda: (found := ring.ledger()) is not None and found.ledger == ledger, "the same in the ring"
-                )
+                wait_until(lambda: (now := ring.ledger()) is not None and now.ledger == ledger, "the same in the ring")
             with urllib.request.urlopen(f"http://127.0.0.1:{number}/metrics", timeout=LIMIT_S) as answer:
                 text = answer.read().decode()
     assert f'imud_bytes_in_total{{device="bow"}} {float(ledger["bytes_in"])}' in text
@@ -359,3 +359,216 @@ def test_found_device_is_remembered_over_a_restart(tmp_path: Path) -> None:
             wait_until(heard, "the device is found")
         remembered = msgspec.json.decode((tmp_path / "found.json").read_bytes())
         assert remembered["bow"]["driver"] == "hipnuc-uart"
+
+
+def missing(folder: Path, count: int, **more: Any) -> dict[str, Any]:
+    """Return devices with missing ports."""
+    return {f"m{number}": device(folder / f"none{number}", **more) for number in range(count)}
+
+
+@pytest.mark.live
+def test_a_log_that_nobody_reads_costs_no_sample(tmp_path: Path) -> None:
+    """Reports of noise and of reloads fill the log. Its pipe is full from the start."""
+    file = write_config(tmp_path, {"bow": device(tmp_path / "port")})
+    with (
+        pipe(full=True) as (_, descriptor),
+        cable(tmp_path) as port,
+        subprocess.Popen([*RUN, str(file)], stderr=descriptor, stdin=subprocess.DEVNULL, text=True) as process,
+    ):
+        daemon = RunningDaemon(tmp_path, process)
+        try:
+            wait_until(daemon.socket.exists, "the daemon's socket")
+            daemon.wait_for("bow", "searching")
+            for sent in range(0, 1000, 100):
+                os.write(port.master, b"\x5a\xa5garbage")
+                daemon.signal(signal.SIGHUP)
+                for _ in range(4):
+                    port.send(25)
+                wait_until(lambda: samples(daemon) == sent + 100, "every sample is there")  # noqa: B023 - called here
+            assert daemon.statuses()["bow"].ledger["lost_queue"] == 0
+        finally:
+            process.terminate()
+            assert process.wait(LIMIT_S) == 0
+
+
+class Manager:
+    """Socket of a service manager, and the received messages with their times."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(path))
+        self.states: list[str] = []
+        self.status = ""
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while (data := self._socket.recv(4096)) != b"end":
+            state, _, value = data.decode().partition("=")
+            if state == "STATUS":
+                self.status = value
+            else:
+                self.states.append(state)
+
+    def close(self) -> None:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+            sender.sendto(b"end", str(self.path))
+        self._thread.join(LIMIT_S)
+        self._socket.close()
+
+
+class SlowTarget(Daemon):
+    """A daemon that applies a configuration when `go` is set."""
+
+    def __init__(self) -> None:
+        self.begun, self.go = asyncio.Event(), asyncio.Event()
+        self.applied: list[str] = []
+
+    async def change_to(self, new: Config) -> None:
+        self.begun.set()
+        await self.go.wait()
+        self.applied.append(new.log_level)
+
+    def refuse(self, error: ConfigError) -> None:
+        self.applied.append(str(error))
+
+
+@in_loop
+async def test_requests_during_a_reload_are_one_reload_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    monkeypatch.setattr("imud.daemon.notify", told.append)
+    file, target, done = tmp_path / "imud.yaml", SlowTarget(), asyncio.Event()
+    reloader = Reloader(file, cast(Daemon, target), HostClock(lambda: 5000))
+
+    def request(level: str) -> None:
+        file.write_text(f"log_level: {level}\ndevices: {{}}")
+        reloader.request(lambda _task: done.set())
+
+    request("debug")
+    await target.begun.wait()
+    for level in ("error", "info", "warning"):
+        request(level)
+    target.go.set()
+    await done.wait()
+    assert target.applied == ["debug", "warning"]
+    done.clear()
+    request("loud")
+    await done.wait()
+    assert target.applied[2].startswith(f"{file}:1:12: log_level: ")
+    done.clear()
+    monkeypatch.setattr("imud.daemon.configuration.load", lambda _file, pause: pause() or 1 // 0)
+    request("info")
+    await done.wait()
+    assert target.applied[3].startswith(f"{file}: ZeroDivisionError: ")
+    assert told == ["RELOADING=1\nMONOTONIC_USEC=5", "READY=1"] * 4
+    await reloader.close()
+    await reloader.close()
+
+
+@in_loop
+async def test_a_reload_ends_with_an_error_of_its_own_and_with_the_daemon(tmp_path: Path) -> None:
+    file, target = tmp_path / "imud.yaml", SlowTarget()
+    file.write_text("devices: {}")
+    reloader = Reloader(file, cast(Daemon, target), HostClock())
+    tasks: list[asyncio.Task[None]] = []
+    reloader.request(tasks.append)
+    await asyncio.sleep(0)
+    await reloader.close()
+    await asyncio.sleep(0)
+    assert [task.cancelled() for task in tasks] == [True]
+    assert target.applied == []
+
+
+@pytest.mark.live
+def test_the_manager_knows_of_reloads_and_one_may_be_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    manager = Manager(tmp_path / "manager")
+    monkeypatch.setenv("NOTIFY_SOCKET", str(manager.path))
+    quiet: dict[str, Any] = {"shm": {"enabled": False}}
+    try:
+        with running_daemon(tmp_path, {}, python=(), **quiet) as daemon:
+            wait_until(lambda: manager.states == ["READY"], "it is ready")
+            write_config(tmp_path, missing(tmp_path, MISSING), **quiet)
+            for _ in range(20):
+                daemon.signal(signal.SIGHUP)
+            wait_until(lambda: len(daemon.statuses()) == MISSING, "all devices are there")
+            problem = f"{MISSING} of {MISSING} devices have a problem: "
+            wait_until(lambda: manager.status.startswith(problem), "the status line names the devices")
+            write_config(tmp_path, {}, **quiet)
+            daemon.signal(signal.SIGHUP)
+            wait_until(lambda: not daemon.statuses(), "the newest file counts")
+            wait_until(lambda: manager.states[-1] == "READY", "it is ready again")
+            reloads = manager.states[1:]
+            assert reloads == ["RELOADING", "READY"] * (len(reloads) // 2)
+            write_config(tmp_path, missing(tmp_path, MISSING), **quiet)
+            daemon.signal(signal.SIGHUP)
+            wait_until(lambda: manager.states[-1] == "RELOADING" or daemon.statuses(), "the reload has begun")
+    finally:
+        manager.close()
+    assert manager.states[-1] == "STOPPING"
+
+
+@pytest.mark.live
+def test_killed_at_any_moment_it_starts_again(tmp_path: Path) -> None:
+    devices, log, state = missing(tmp_path, 20), tmp_path / "log", tmp_path / "imud.sock"
+    file = write_config(tmp_path, devices)
+    moments: list[Callable[[], object]] = [
+        lambda: True, lambda: list(tmp_path.glob("imud.m*")), state.exists, lambda: "has started" in log.read_text()
+    ]  # fmt: skip
+    for moment in moments:
+        for left in tmp_path.glob("imud.[ms]*"):
+            left.unlink()
+        with log.open("wb") as stream, subprocess.Popen([*RUN, str(file)], stderr=stream) as process:
+            wait_until(moment, "the moment")
+            process.kill()
+            process.wait(LIMIT_S)
+    with running_daemon(tmp_path, devices) as daemon:
+        assert len(daemon.statuses()) == 20
+
+
+@pytest.mark.live
+def test_a_holder_of_the_port_with_a_name_that_is_no_text(tmp_path: Path) -> None:
+    """The name of the process is in the problem of the device, in the log and in replies. Before, it ended the
+    daemon."""
+    name = b"\xff\n\x1b[31m"
+    with cable(tmp_path) as port:
+        holder = subprocess.Popen(
+            [sys.executable, "-c", HOLD, str(port.name), name.hex()], stdout=subprocess.PIPE, stdin=subprocess.PIPE
+        )
+        try:
+            assert holder.stdout is not None
+            assert holder.stdout.readline() == b"held\n"
+            with running_daemon(tmp_path, {"bow": device(port.name)}) as daemon:
+                problem = daemon.wait_for("bow", "failed").problem
+                assert str(holder.pid) in problem
+                assert problem.isprintable()
+            lines = (tmp_path / "log").read_text().splitlines()
+            assert any("pid" in line for line in lines)
+            assert all(line.isprintable() for line in lines)
+        finally:
+            holder.communicate(b"")
+
+
+HOLD = """
+import ctypes, fcntl, os, sys, termios
+fd = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY)
+fcntl.flock(fd, fcntl.LOCK_EX)
+fcntl.ioctl(fd, termios.TIOCEXCL)
+ctypes.CDLL(None).prctl(15, bytes.fromhex(sys.argv[2]), 0, 0, 0)
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+@in_loop
+async def test_a_second_signal_at_the_end_does_not_change_the_exit_status() -> None:
+    """A fixture of all tests restores the handlers."""
+    daemon = Daemon(EMPTY)
+    daemon.install_signals()
+    running = asyncio.create_task(daemon.run())
+    await asyncio.sleep(0)
+    signal.raise_signal(signal.SIGTERM)
+    await running
+    assert [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)] == [
+        signal.SIG_IGN
+    ] * 3

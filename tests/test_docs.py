@@ -51,9 +51,14 @@ def imud_lines() -> Iterator[list[str]]:
                 yield words[1 : words.index(">")] if ">" in words else words[1:]
 
 
-def test_links_lead_somewhere() -> None:
+def test_links_and_their_anchors_lead_somewhere() -> None:
     targets = [(page, target) for page in PAGES for target in LINK.findall(page.read_text()) if "://" not in target]
     assert [(page.name, target) for page, target in targets if not (page.parent / target).exists()] == []
+    for page in PAGES:
+        for target, anchor in ANCHOR_LINK.findall(page.read_text()):
+            linked = page.parent / target if target else page
+            if linked.suffix == ".md":
+                assert anchor in anchors(linked), f"{page.name}: {target}#{anchor}"
 
 
 def anchors(page: Path) -> set[str]:
@@ -64,14 +69,6 @@ def anchors(page: Path) -> set[str]:
     return {
         re.sub(r"[^\w\- ]", "", re.sub(r"\]\([^)]*\)", "", title).lower()).replace(" ", "-") for title in titles
     } | {*named}
-
-
-def test_anchors_of_links_exist() -> None:
-    for page in PAGES:
-        for target, anchor in ANCHOR_LINK.findall(page.read_text()):
-            linked = page.parent / target if target else page
-            if linked.suffix == ".md":
-                assert anchor in anchors(linked), f"{page.name}: {target}#{anchor}"
 
 
 def test_command_lines_are_accepted(capsys: pytest.CaptureFixture[str]) -> None:
@@ -85,11 +82,10 @@ def test_command_lines_are_accepted(capsys: pytest.CaptureFixture[str]) -> None:
     assert not refused
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_configurations_are_good(page: Path) -> None:
+def test_configurations_are_good() -> None:
     for example in examples("yaml"):
-        if example.page == page and not example.text.startswith("# "):
-            config.parse(example.text, f"{page.name}:{example.text.splitlines()[0]}")
+        if not example.text.startswith("# "):
+            config.parse(example.text, f"{example.page.name}:{example.text.splitlines()[0]}")
 
 
 @pytest.mark.live
@@ -139,46 +135,26 @@ def test_the_picture_of_time_stamps_shows_what_the_readme_says() -> None:
     assert pictures.time_stamps(samples).count("<path") > 10
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/cli.md"])
-def test_page_names_every_command(page: str) -> None:
-    text = (ROOT / page).read_text()
-    assert [command for command in COMMANDS if f"`imud {command}" not in text] == []
-
-
-def test_sample_page_names_every_field() -> None:
-    text = (ROOT / "docs/sample.md").read_text()
-    assert [field for field in Sample.__struct_fields__ if f"`{field}`" not in text] == []
-
-
-def test_index_links_every_page() -> None:
+def test_pages_name_every_command_driver_field_and_page() -> None:
+    readme = (ROOT / "README.md").read_text()
+    for text in (readme, (ROOT / "docs/cli.md").read_text()):
+        assert [command for command in COMMANDS if f"`imud {command}" not in text] == []
+    assert [driver for driver in DRIVERS if f"`{driver}`" not in readme] == []
+    fields = (ROOT / "docs/sample.md").read_text()
+    assert [field for field in Sample.__struct_fields__ if f"`{field}`" not in fields] == []
     linked = set(LINK.findall((ROOT / "docs/index.md").read_text()))
     assert {page.name for page in (ROOT / "docs").glob("*.md")} - linked == {"index.md"}
-
-
-def test_readme_names_every_driver() -> None:
-    text = (ROOT / "README.md").read_text()
-    for driver in DRIVERS:
-        assert f"`{driver}`" in text, driver
-
-
-def test_make_targets_of_the_readme_exist() -> None:
     makefile = (ROOT / "Makefile").read_text()
-    for target in re.findall(r"^make (\w+)", (ROOT / "README.md").read_text(), re.MULTILINE):
+    for target in re.findall(r"^make (\w+)", readme, re.MULTILINE):
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
 
 
-@pytest.mark.parametrize("page", references.PAGES)
-def test_generated_parts_are_those_of_the_code(page: str) -> None:
-    assert references.generated(page) == references.current(page), "run python -m docs.generate.references"
-
-
-def test_layout_tables_have_their_fields() -> None:
-    assert "| 0 | `uint64_t` | `seq` |" in references.current("docs/shm.md")
-
-
-def test_tables_of_actions_are_those_of_the_drivers() -> None:
+def test_generated_parts_are_those_of_the_code_with_its_actions_and_layouts() -> None:
+    for page in references.PAGES:
+        assert references.generated(page) == references.current(page), "run python -m docs.generate.references"
     text = references.current("docs/commands.md")
     for driver in DRIVERS.values():
         assert f"\n### `{driver.name}`: " in text if driver.verbs else f"`{driver.name}`" in text
         for action in driver.verbs:
             assert f"\n| `{action}` | " in text, action
+    assert "| 0 | `uint64_t` | `seq` |" in references.current("docs/shm.md")

@@ -53,8 +53,7 @@ Row = dict[str, str]
 
 def frame(row: Row) -> bytes:
     """Return the frame of a row of the recording."""
-    three = {name: tuple(float(row[f"{name}_{axis}"]) for axis in "xyz") for name in ("acc", "gyr", "mag")}
-    acc, gyr, mag = three["acc"], three["gyr"], three["mag"]
+    acc, gyr, mag = ([float(row[f"{name}_{axis}"]) for axis in "xyz"] for name in ("acc", "gyr", "mag"))
     return encode_hi91(
         system_time_ms=int(row["sys_time"]), accel_m_s2=(acc[0] * G, acc[1] * G, acc[2] * G),
         gyro_rad_s=(radians(gyr[0]), radians(gyr[1]), radians(gyr[2])),
@@ -68,7 +67,6 @@ def frame(row: Row) -> bytes:
 
 def check(sample: Sample, row: Row) -> None:
     """Check that the sample is equal to the row, with the precision of 32-bit floats."""
-    assert sample.t_dev_ns is not None
     assert sample.t_dev_ns == int(row["sys_time"]) * 1_000_000
     expected = {
         "accel_m_s2": [f32(float(row[f"acc_{axis}"])) * G for axis in "xyz"],
@@ -137,17 +135,14 @@ def test_simulated_modules_in_bodies_of_known_attitude(tmp_path: Path) -> None:
     up_m_s2 = (body[2][0] * G, body[2][1] * G, body[2][2] * G)
     field_t = rotation.matrix_times(rotation.transposed(body), FIELD_ENU_T)
     with raw_ports(len(MOUNTINGS)) as ports:
-        devices = {
-            name: device(path, frame=keys)
-            for (name, (keys, _)), (_, path) in zip(MOUNTINGS.items(), ports, strict=True)
-        }
+        named = zip(MOUNTINGS.items(), ports, strict=True)
+        devices = {name: device(path, frame=keys) for (name, (keys, _)), (_, path) in named}
         with running_daemon(tmp_path, devices) as daemon, daemon.client() as plain, daemon.client() as other:
             for (name, (_, mounting)), (master, _) in zip(MOUNTINGS.items(), ports, strict=True):
                 daemon.wait_for(name, "searching")
                 sensor = rotation.quat_from_matrix(rotation.matrix_product(body, mounting))
-                module = HipnucModule(
-                    0, None, HipnucHardware(motion=Still(*rotation.euler312_from_quat(sensor)), skew_ppm=0)
-                )
+                hardware = HipnucHardware(motion=Still(*rotation.euler312_from_quat(sensor)), skew_ppm=0)
+                module = HipnucModule(0, None, hardware)
                 as_configured = plain.watch([name], timeout_s=LIMIT_S, encoding="json")
                 asked = other.watch([name], timeout_s=LIMIT_S, convention="ned-frd")
                 os.write(master, b"".join(burst.data for burst in module.advance(int(1.5e9))))
