@@ -107,7 +107,7 @@ bench: $(VENV)/made $(KERNEL)
 bench-instructions: $(VENV)/made $(KERNEL)
 	$(BIN)/python -m tests.bench.instructions $(ARGS)
 
-# BASE=COMMIT ARGS="clock socket": both checkouts in turns
+# BASE=COMMIT ARGS="clock_table latency": both checkouts in turns
 bench-compare: $(VENV)/made
 	$(BIN)/python -m tests.bench.compare --base $(BASE) $(ARGS)
 

@@ -1,6 +1,6 @@
 """`make bench`: run all measurements, print one table, and write the same rows to build/bench.json.
 
-`make bench ARGS="clock latency"` runs only these parts.
+`make bench ARGS="latency gpsd"` runs only these parts.
 `make bench ARGS=--short` runs all parts with fewer and shorter rounds. It takes at most SHORT_LIMIT_S on an idle host.
 """
 
@@ -16,9 +16,7 @@ import msgspec
 
 from tests.bench.rows import Row
 
-PARTS = (
-    "clock", "clock_table", "clock_lines", "can_devices", "end_to_end", "latency", "gpsd", "recording",
-)  # fmt: skip
+PARTS = ("clock_table", "latency", "gpsd")
 SHORT_LIMIT_S: Final = 300.0  # goal on an idle host
 OUTPUT = Path("build/bench.json")
 

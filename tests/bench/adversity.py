@@ -66,8 +66,7 @@ NAMED: Final = tuple(
         ((-30.0, 12.0), (14.0, -43.0), (3.0, 50.0), (-11.0, -7.0), (40.0, 28.0), (0.0, 0.0))
     )
 )
-"""Installations of the seeds 0 to 5: evenly distributed shares, and one adapter timer in lockstep with the device. The
-figures in `clock_table.json` are from these six."""
+"""Installations of the seeds 0 to 5: evenly distributed shares, and one adapter timer in lockstep with the device."""
 
 
 def machine_of(seed: int) -> Machine:

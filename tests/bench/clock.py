@@ -1,4 +1,4 @@
-"""Accuracy and speed of the clock in a simulation: `python -m tests.bench.clock` prints the table.
+"""Accuracy of the clock in a simulation: `python -m tests.bench.clock` prints the table.
 
 The simulation knows the true time of each sample. A row is a combination of an arrival profile, a rate and a crystal.
 Its figures are from all seeds, after the fit has settled for 70 s. `clock_lines` prints the second table, for lines and
@@ -9,15 +9,13 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import sqrt
-from time import perf_counter_ns
 from typing import NamedTuple
 
 from imud.model.sample import Measurement, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.clock import SampleClock
-from imud.sim.ports.arrival import BARE_UART, LOADED, PROFILES, USB_1MS, USB_16MS, ArrivalModel, ArrivalProfile, Crystal
+from imud.sim.ports.arrival import PROFILES, ArrivalModel, ArrivalProfile, Crystal
 from tests.bench.clock_figures import ARRIVAL_HEAD, ArrivalFigures, Spread, keep
-from tests.bench.rows import Row, at_least, at_most
 
 TICK_NS = NS_PER_MS  # HI91 has a device time in ms
 TICK_MODULUS = 1 << 32  # u32, wraps after 49.7 days
@@ -97,39 +95,6 @@ def over_seeds(profile: ArrivalProfile, rate_hz: int, crystal: Crystal, seeds: S
         for p in points:
             (settled if p.truth_ns - begin > SETTLED_NS else settling).append(p)
     return summary(settled, settling)
-
-
-def speed_ns(profile: ArrivalProfile, rate_hz: int = 1000, count: int = 20_000) -> float:
-    """Return the mean time of a `sample()` call with a full measurement, ns, best of three runs. The fit is settled."""
-    v = (1.0, 2.0, 3.0)
-    model = ArrivalModel(profile, rate_hz, 1, baud=BAUD_OF_RATE[rate_hz])
-    calls = [
-        (Measurement(82, a.trailing_bytes, a.dev_ns // TICK_NS, v, v, v, (1.0, 0.0, 0.0, 0.0), v, 20.0, 1e5), a.t_rx_ns)
-        for a in model.run(count)
-    ]
-    best = float("inf")
-    for _ in range(3):
-        clock = clock_for(model)
-        # the first half settles the fit
-        for m, t_rx_ns in calls[: count // 2]:
-            clock.sample(m, t_rx_ns, 0)
-        begin = perf_counter_ns()
-        for m, t_rx_ns in calls[count // 2 :]:
-            clock.sample(m, t_rx_ns, 0)
-        best = min(best, (perf_counter_ns() - begin) / (count - count // 2))
-    return best
-
-
-def rows(*, quick: bool = False) -> Iterator[Row]:
-    for profile in (BARE_UART, USB_16MS):
-        yield at_most(f"clock: one sample at 1 kHz, {profile.name}", speed_ns(profile), "ns", 3000)
-    for profile in (BARE_UART, USB_1MS, USB_16MS, LOADED):
-        got = over_seeds(profile, 100, CRYSTALS["+50 ppm"], (1, 2))
-        name = f"clock: t_ns - truth at 100 Hz, {profile.name}"
-        yield Row(f"{name}, sigma", got.sigma_ns / 1000, "us")
-        yield Row(f"{name}, rms", got.rms_ns / 1000, "us")
-        yield Row(f"{name}, p99.9", got.p999_ns / 1000, "us")
-        yield at_least(f"{name}, share within 2 t_err", got.share, "", 0.95)
 
 
 # columns with a range over the crystals

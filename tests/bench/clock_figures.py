@@ -4,7 +4,7 @@
 `python -m docs.generate.clock_pictures` draws the plots.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -84,9 +84,3 @@ def spread(values: Spread) -> str:
 
 def microseconds(value: float) -> str:
     return f"{value:.0f}" if abs(value) > WHOLE_FROM_US else f"{value:.1f}"
-
-
-def markdown(head: str, found: Iterable[ArrivalFigures | LineFigures]) -> Iterator[str]:
-    yield head
-    for one in found:
-        yield one.row()

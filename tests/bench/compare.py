@@ -1,6 +1,6 @@
 """`make bench-compare BASE=COMMIT`: run parts of `make bench` in two checkouts and print the ratio of each figure.
 
-    make bench-compare BASE=v0.1.0 ARGS="clock latency --rounds 5"
+    make bench-compare BASE=v0.1.0 ARGS="clock_table latency --rounds 5"
 
 Both checkouts use this Python and the same dependencies. The checkout of BASE is temporary. The rounds alternate, so
 that other load on the host affects both checkouts equally. The table compares the medians of the rounds.
