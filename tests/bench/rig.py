@@ -44,9 +44,7 @@ class Load:
     phases: int = 1
     apart: int = 0
     """Number of frames between the starts of two devices; 0 starts all devices at the same time."""
-    shm: bool = True
-    record_to: str = ""
-    """Directory of the recording; empty for no recording."""
+    recorded: bool = False
 
     @property
     def frames(self) -> int:
@@ -59,8 +57,6 @@ class Outcome:
     cpu_share: float
     p50_us: float
     p99_us: float
-    max_us: float
-    received: int
     gaps: int
     refused: int
     rss_mb: float
@@ -123,10 +119,9 @@ def configuration(folder: Path, ports: Sequence[str], load: Load) -> Path:
     }
     tree = {
         "log_level": "error", "state_dir": str(folder), "socket": {"path": str(folder / "s")},
-        "shm": {"enabled": load.shm, "directory": str(folder)}
-        | ({} if load.latency_ms is None else {"latency_ms": load.latency_ms}),
+        "shm": {"directory": str(folder)} | ({} if load.latency_ms is None else {"latency_ms": load.latency_ms}),
         "metrics": {"port": 0},
-        "recorder": {"enabled": bool(load.record_to), "directory": load.record_to or str(folder)},
+        "recorder": {"enabled": load.recorded, "directory": str(folder / "recordings")},
         "devices": devices,
     }  # fmt: skip
     file = folder / "imud.yaml"
@@ -216,7 +211,7 @@ def run(load: Load) -> Outcome:
     counted = used.elapsed_s * load.rate_hz * load.devices
     return Outcome(
         cpu_us_per_sample=used.cpu_ns / 1e3 / counted, cpu_share=used.cpu_ns / 1e9 / used.elapsed_s,
-        p50_us=figures["p50_us"], p99_us=figures["p99_us"], max_us=figures["max_us"], received=figures["samples"],
+        p50_us=figures["p50_us"], p99_us=figures["p99_us"],
         # a client with `rate_hz` receives only a part of the samples
         gaps=figures["gaps"] + total - figures["samples"] if load.clients and load.client_hz is None else 0,
         refused=used.refused, rss_mb=memory_mb, statuses=statuses,
