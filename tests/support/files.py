@@ -11,7 +11,7 @@ import pytest
 from imud.drivers.hipnuc.uart.codec import encode_hi91
 from imud.drivers.imu61x.can import encode_set
 from imud.formats.can import DATA_BYTES_MAX, EXTENDED_ID_MAX, STANDARD_ID_MAX, CanFrame
-from imud.formats.capture import HEADER_BYTES_MAX, MAGIC, RECORD, RECORD_BYTES_MAX, VERSION
+from imud.formats.capture import MAGIC, RECORD, RECORD_BYTES_MAX, VERSION
 from imud.model.units import NS_PER_S, NS_PER_US
 
 ROOT: Final = Path(__file__).parents[2]
@@ -29,44 +29,26 @@ def shared(name: str) -> Path:
     return path
 
 
-WRITE_BYTES_MAX: Final = 1 << 30
-"""Default size limit of a written capture: 1 GiB, 26 hours at 115200 baud."""
-
-
 class CaptureWriter:
-    """Writes a capture with time stamps, up to a size limit. The caller flushes and closes the file."""
+    """Writes a capture with time stamps. The caller flushes and closes the file."""
 
     def __init__(
-        self, file: BinaryIO, *, driver: str = "", baud: int = 0, details: Mapping[str, str | int] | None = None,
-        bytes_max: int = WRITE_BYTES_MAX,
-    ) -> None:  # fmt: skip
-        """Write the first line without empty values and zeros. Raises ValueError if the line is too long."""
+        self, file: BinaryIO, *, driver: str = "", baud: int = 0, details: Mapping[str, str | int] | None = None
+    ) -> None:
+        """Write the first line without empty values and zeros."""
         self._file = file
-        self._room = bytes_max
         self._newest_ns = -(1 << 63)
-        self.bytes_refused = 0
-        """Number of bytes that were not written because of the size limit."""
         values: dict[str, str | int] = {"driver": driver, "baud": baud, **(details or {})}
         pairs = [f"{key}={quote(str(value), safe='')}" for key, value in values.items() if value not in ("", 0)]
-        header = MAGIC + " ".join([VERSION, *pairs]).encode("ascii") + b"\n"
-        if len(header) > HEADER_BYTES_MAX:
-            raise ValueError(f"first line of {len(header)} bytes: at most {HEADER_BYTES_MAX} can be read back")
-        self._room -= self._file.write(header)
+        file.write(MAGIC + " ".join([VERSION, *pairs]).encode("ascii") + b"\n")
 
-    def write(self, data: bytes, t_ns: int) -> bool:
-        """Append one read. Return False after the limit. A time that runs backwards is replaced by the previous
-        time."""
-        if not data:
-            return self.bytes_refused == 0
-        if self.bytes_refused or RECORD.size + len(data) > self._room:
-            self.bytes_refused += len(data)
-            return False
-        self._newest_ns = max(self._newest_ns, t_ns)
+    def write(self, data: bytes, t_ns: int) -> None:
+        """Append one read. A time that runs backwards is replaced by the previous time."""
+        if data:
+            self._newest_ns = max(self._newest_ns, t_ns)
         for start in range(0, len(data), RECORD_BYTES_MAX):
             piece = data[start : start + RECORD_BYTES_MAX]
             self._file.write(RECORD.pack(self._newest_ns, len(piece)) + piece)
-            self._room -= RECORD.size + len(piece)
-        return True
 
 
 def candump_line(frame: CanFrame, bus: str = "can0") -> str:
