@@ -24,19 +24,32 @@ from imud.formats.can import RAW_FRAME, pack_frame
 from imud.links.socketcan import MessageBuffers, Vector, libc
 from imud.sim import CAN_SIMULATORS
 from imud.sim.can_module import CanModules
-from imud.sim.physics import MOTIONS
+from imud.sim.physics import GRAVITY_M_S2, MOTIONS, Truth
 from imud.sim.ports.pty import sharpen_timers
 from imud.sim.sensor import SimulatorOptions
-from tests.lab.can_phase import LOOP_S, Phased
 
 BURST_NS = 2_000_000
 AHEAD_NS = 300_000_000
 FRAMES_MAX = 256  # frames per system call
 BEGIN_NS = 1_000_000_000  # time from the first line of standard input to the first sample
+LOOP_S = 4.0
+"""Duration of the repeated motion, s. The guest needs longer to compute the motion than to play it."""
 LOOP_NS = round(LOOP_S * 1e9)
+PHASE_S = 7.3
+"""Time offset between the motions of two devices, s. Frames of two devices are thus never equal."""
 INDEX = struct.Struct("<H")
 INDEX_AT = 8 + 6
 """Offset of INDEX in the last frame of a set: the last two data bytes. The data starts at offset 8."""
+
+
+class Phased:
+    def __init__(self, number: int, gravity_m_s2: float = GRAVITY_M_S2) -> None:
+        self._motion = MOTIONS["swing"](gravity_m_s2)
+        self._phase_s = PHASE_S * number
+
+    def at(self, t_s: float) -> Truth:
+        """Return the true attitude `t_s` seconds after the start of the device's motion."""
+        return self._motion.at(t_s + self._phase_s)
 
 
 @dataclass

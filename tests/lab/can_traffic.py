@@ -13,9 +13,8 @@ import msgspec
 from imud.contracts.driver import CanDriver
 from imud.drivers import DRIVERS
 from imud.model.sample import Sample, Vector3
-from imud.sim import CAN_SIMULATORS
 from imud.sim.physics import Truth
-from tests.lab.can_phase import LOOP_S, Phased
+from tests.lab.can_player import LOOP_S, Phased
 
 GYRO_RAD_S: Final = 0.004  # tolerance of rotation rates
 ACCEL_M_S2: Final = 0.02  # tolerance of accelerations
@@ -43,13 +42,9 @@ class Module:
 
 
 def fleet() -> list[Module]:
-    """Return four CANopen nodes, four J1939 nodes and one IMU61x; more IMU61x if a simulator does not exist."""
-    spare = iter(range(201, 2000, 100))
-    return [
-        Module(driver, node) if driver in CAN_SIMULATORS and driver in DRIVERS else Module("imu61x-can", next(spare))
-        for driver in ("hipnuc-canopen", "hipnuc-j1939")
-        for node in (8, 9, 10, 11)
-    ] + [Module("imu61x-can", 101)]
+    """Return four CANopen nodes, four J1939 nodes and one IMU61x."""
+    names = ("hipnuc-canopen", "hipnuc-j1939")
+    return [*(Module(name, node) for name in names for node in (8, 9, 10, 11)), Module("imu61x-can", 101)]
 
 
 class Traffic:
@@ -113,12 +108,11 @@ class Against:
     def _worst(self, sample: Sample, t_s: float) -> float:
         """Return the largest deviation from the truth at an instant, in units of the permitted deviation."""
         truth = self._motion.at(t_s)
-        found = [
+        return max(
             _distance(sample.gyro_rad_s, truth.gyro_rad_s) / GYRO_RAD_S,
             _distance(sample.accel_m_s2, truth.accel_m_s2) / ACCEL_M_S2,
             _turn(sample, truth) / ANGLE_RAD,
-        ]
-        return max(found)
+        )
 
 
 def _distance(a: Vector3 | None, b: Vector3) -> float:
