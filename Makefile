@@ -132,7 +132,7 @@ fleet-load: $(VENV)/made
 	$(BIN)/python -m tests.bench.fleet_load $(ARGS)
 
 fleet-cluster: $(VENV)/made
-	$(BIN)/python -m tests.bench.fleet_cluster $(ARGS)
+	$(BIN)/python -m tests.bench.fleet_load --cluster --gateways 200 $(ARGS)
 
 soak: $(VENV)/made
 	$(BIN)/python -m tests.bench.soak $(ARGS)
