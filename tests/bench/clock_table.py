@@ -1,7 +1,7 @@
 """Compare `t_err_ns` with the real error in difficult conditions: `python -m tests.bench.clock_table` (3 minutes).
 
-A cell is one condition on one link, simulated in several installations (`adversity`). The table shows these
-figures of each cell:
+A cell is one condition on one link, simulated in several installations (`adversity`). The table shows the figures of
+each cell next to the figures of the commit in `clock_table.json`:
 
     σ           root mean square of `t_ns` - truth, µs, over the whole run
     settling    share of samples within 2 × t_err_ns in the first 30 s
@@ -11,28 +11,32 @@ figures of each cell:
 
 The median describes normal samples. A few samples with a large error dominate σ. If a cell has both, t_err/rms is low
 even if each t_err_ns is exact. rms/rms is 1 in this case. If a few samples have a much too large t_err_ns, rms/rms is
-high. The goals are: settling ≥ 0.95, settled ≥ 0.97, t_err/rms from 0.8 to 3. `make bench-compare` compares σ with the
-σ of another commit.
+high. The goals are: settling ≥ 0.95, settled ≥ 0.97, t_err/rms from 0.8 to 3, σ not larger than at the base commit.
 
 On hosts with steered, stepped or stopped clocks, the truth is CLOCK_MONOTONIC as it ran. The error of a sample is the
 larger error of `t_ns` and `utc_ns`.
 
 `--quick`: two installations instead of six. `--only TEXT`: cells whose name contains TEXT. `--seeds FIRST`: other
-installations.
+installations. `--base COMMIT`: run this commit now and compare with it. `--keep COMMIT`: also store the
+figures.
 """
 
 import argparse
+import os
+import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from inspect import signature
 from math import sqrt
+from pathlib import Path
 from statistics import median
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 
-from imud.host.clock import SteadyTime
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 from imud.sampling.clock import SampleClock
 from tests.bench.adversity import (
@@ -54,9 +58,13 @@ from tests.bench.adversity import (
     Stalls,
     messages,
 )
-from tests.bench.host_clocks import BEGIN_NS, DECODE_NS, UTC_AHEAD_NS, SteeredHost, Steering
+from tests.bench.compare import ROOT, checked_out
 from tests.bench.rows import Row, at_least
 
+if TYPE_CHECKING:  # older base commits do not have this module
+    from imud.host.clock import SteadyTime
+
+FILE: Final = Path(__file__).with_suffix(".json")
 SETTLING_NS: Final = 30 * NS_PER_S  # first part of a run
 MACHINES: Final = 6  # seeds per cell
 QUICK: Final = (1, 4)
@@ -65,6 +73,8 @@ SETTLED_LEAST: Final = 0.97
 SETTLING_LEAST: Final = 0.95
 RATIO_LEAST: Final = 0.8  # below: t_err_ns is too small
 RATIO_MOST: Final = 3.0  # above: t_err_ns is too large
+WORSE_MOST: Final = 1.02
+"""Maximum ratio of σ to the base. 2 % allow for the random values of two runs."""
 
 
 class CellFigures(msgspec.Struct, frozen=True):
@@ -72,10 +82,10 @@ class CellFigures(msgspec.Struct, frozen=True):
     settling: float
     settled: float
     ratio: float
-    rms_ratio: float
+    rms_ratio: float | None = None
+    """None in figures that an older version stored."""
 
-    @property
-    def missed(self) -> list[str]:
+    def short_of(self, base: "CellFigures | None") -> list[str]:
         missed = []
         if self.settling < SETTLING_LEAST:
             missed.append("settling")
@@ -83,7 +93,12 @@ class CellFigures(msgspec.Struct, frozen=True):
             missed.append("settled")
         if not RATIO_LEAST <= self.ratio <= RATIO_MOST:
             missed.append("t_err/rms")
+        if base is not None and self.sigma_us > WORSE_MOST * base.sigma_us:
+            missed.append("σ")
         return missed
+
+
+Figures = Mapping[str, CellFigures]
 
 
 class Dated(NamedTuple):
@@ -164,6 +179,8 @@ HOST_CLOCKS: Final = (
 
 
 def _host_clocks() -> Iterator[Cell]:
+    if "host" not in signature(SampleClock).parameters:
+        return  # the base commit has no `host` argument
     for host in HOST_CLOCKS:
         for link in LINKS:
             yield Cell(host.name, link, host=host)
@@ -173,7 +190,7 @@ def _host_clocks() -> Iterator[Cell]:
 # --- figures --------------------------------------------------------------------------------------------------------
 
 
-def clock_of(cell: Cell, host: SteadyTime | None = None) -> SampleClock:
+def clock_of(cell: Cell, host: "SteadyTime | None" = None) -> SampleClock:
     says = cell.device.says
     clock = partial(
         SampleClock, "bench", tick_ns=0 if says == "number" else NS_PER_MS,
@@ -195,6 +212,9 @@ def dated(cell: Cell, seed: int, seconds: int = SECONDS) -> Iterator[Dated]:
 
 
 def _dated_on(clocks: HostClocks, cell: Cell, seed: int, seconds: int) -> Iterator[Dated]:
+    # import here: older base commits do not have host_clocks.py
+    from tests.bench.host_clocks import BEGIN_NS, DECODE_NS, UTC_AHEAD_NS, SteeredHost, Steering
+
     host = SteeredHost(Steering(clocks.name, clocks.slews))
     host.at(BEGIN_NS)
     clock, to, settled_ns = clock_of(cell, host.clock.steady), host.steering.monotonic_ns, 0
@@ -233,13 +253,56 @@ def table(seeds: Sequence[int], only: str = "") -> Iterator[tuple[str, CellFigur
             yield cell.name, figures_of(cell, seeds)
 
 
+# --- the base -------------------------------------------------------------------------------------------------------
+
+
+class Base(msgspec.Struct, frozen=True):
+    commit: str
+    cells: dict[str, CellFigures]
+
+
+def kept_base() -> Base:
+    return msgspec.json.decode(FILE.read_bytes(), type=Base)
+
+
+def base_of(commit: str, arguments: Sequence[str]) -> Base:
+    program = [sys.executable, "-P", "-m", "tests.bench.clock_table", "--json", *arguments]
+    # imud of the base commit, tests of this tree
+    with checked_out(commit) as tree, tempfile.TemporaryDirectory(prefix="imud-clock-table-") as folder:
+        (Path(folder) / "imud").symlink_to(tree / "imud")
+        (Path(folder) / "tests").symlink_to(ROOT / "tests")
+        done = subprocess.run(
+            program, env={**os.environ, "PYTHONPATH": folder}, cwd=folder, stdout=subprocess.PIPE, check=True
+        )
+    return Base(commit, msgspec.json.decode(done.stdout, type=dict[str, CellFigures]))
+
+
 def rows(*, quick: bool = False) -> Iterator[Row]:
     for name, got in table(QUICK, "loaded host") if quick else table(range(MACHINES)):
         yield Row(f"clock table: {name}, sigma", got.sigma_us, "us")
         yield at_least(f"clock table: {name}, share settled", got.settled, "", SETTLED_LEAST)
         yield at_least(f"clock table: {name}, share settling", got.settling, "", SETTLING_LEAST)
         yield Row(f"clock table: {name}, median t_err / rms", got.ratio, "")
-        yield Row(f"clock table: {name}, rms t_err / rms", got.rms_ratio, "")
+        yield Row(f"clock table: {name}, rms t_err / rms", got.rms_ratio or 0.0, "")
+
+
+def show(found: Iterable[tuple[str, CellFigures]], base: Figures) -> int:
+    columns = "σ, µs | settling | settled | t_err/rms | rms/rms"
+    print(f"| cell | {columns} | base: {columns} | missed |")
+    print(f"|{12 * '---|'}")
+    short = 0
+    for name, got in found:
+        was = base.get(name)
+        before = _cells_of(was) if was else "– | – | – | – | –"
+        missed = got.short_of(was)
+        short += bool(missed)
+        print(f"| {name} | {_cells_of(got)} | {before} | {', '.join(missed)} |", flush=True)
+    return short
+
+
+def _cells_of(got: CellFigures) -> str:
+    rms_ratio = "–" if got.rms_ratio is None else f"{got.rms_ratio:.2f}"
+    return f"{got.sigma_us:.0f} | {got.settling:.3f} | {got.settled:.3f} | {got.ratio:.2f} | {rms_ratio}"
 
 
 def main() -> int:
@@ -247,13 +310,24 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--only", default="", metavar="TEXT")
     parser.add_argument("--seeds", type=int, default=0, metavar="FIRST")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--base", metavar="COMMIT")
+    parser.add_argument("--keep", metavar="COMMIT")
     args = parser.parse_args()
-    seeds, short = [args.seeds + i for i in (QUICK if args.quick else range(MACHINES))], 0
-    print(f"| cell | σ, µs | settling | settled | t_err/rms | rms/rms | missed |\n|{7 * '---|'}")
-    for name, got in table(seeds, args.only):
-        short += bool(got.missed)
-        figures = f"{got.sigma_us:.0f} | {got.settling:.3f} | {got.settled:.3f} | {got.ratio:.2f} | {got.rms_ratio:.2f}"
-        print(f"| {name} | {figures} | {', '.join(got.missed)} |", flush=True)
+    seeds = [args.seeds + i for i in (QUICK if args.quick else range(MACHINES))]
+    found = table(seeds, args.only)
+    if args.json:
+        sys.stdout.buffer.write(msgspec.json.encode(dict(found)))
+        return 0
+    if args.base or args.keep:
+        arguments = ["--only", args.only, "--seeds", str(args.seeds), *(["--quick"] if args.quick else [])]
+        base = base_of(args.base or args.keep, arguments)
+        if args.keep:
+            FILE.write_bytes(msgspec.json.format(msgspec.json.encode(base)) + b"\n")
+    else:
+        # the stored figures are from six installations from seed 0 on
+        base = kept_base() if not args.quick and not args.seeds and FILE.exists() else Base("", {})
+    short = show(found, base.cells)
     print(f"\n{short} cells miss a goal")
     return 0
 
