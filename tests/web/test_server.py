@@ -368,8 +368,13 @@ class FakeTransport(asyncio.Transport):
         self.aborted = True
 
 
-def connected(connections: WebConnections) -> tuple[Any, FakeTransport]:
-    one = SimpleNamespace(transport=FakeTransport())
+class FakeHandler:
+    def __init__(self) -> None:
+        self.transport = FakeTransport()
+
+
+def connected(connections: WebConnections) -> tuple[FakeHandler, FakeTransport]:
+    one = FakeHandler()
     connections.accept(one)  # type: ignore[arg-type]  # only its transport is used
     return one, one.transport
 
