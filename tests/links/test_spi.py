@@ -34,6 +34,8 @@ def test_same_bits_on_the_wires_whatever_the_words(word_bits: int) -> None:
     assert bus.mode == 3
     for _ in range(2):  # the second transfer uses the stored buffers
         assert link.transfer(Transfer((b"\x80\x00\x12\x34", b"\xfe\x01"))) == b"\x7f\xff\xed\xcb\x01\xfe"
+    bus.device, bus.keep_messages = None, False
+    assert link.transfer(Transfer((b"\x80\x00",))) == b"\0\0", "a bus without a device reads zeros"
     assert bus.messages == [((b"\x80\x00\x12\x34", b"\xfe\x01"), word_bits, 2_000_000)] * 2
     link.close()
     link.close()
