@@ -151,7 +151,7 @@ PORT = {"product": "FT2232H", "serial": "A1"}
 def test_adapters_are_listed_by_their_lasting_names(
     dev: Path, sys: Path, texts: dict[int, dict[str, str]], links: dict[str, int], expected: list[tuple[str, int, str]]
 ) -> None:
-    """By-id, else by-path, else the node."""
+    """The name is the link by-id, else the link by-path, else the node."""
     for number, text in texts.items():
         usb(dev, sys, f"ttyUSB{number}", **text)
     for name, number in links.items():

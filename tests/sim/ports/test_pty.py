@@ -83,7 +83,7 @@ def frames_of(data: bytes) -> int:
 
 def test_a_program_reads_frames_and_gets_answers(rig: PluggedPort) -> None:
     rig.open(115_200)
-    fcntl.ioctl(rig.fd, termios.TIOCEXCL)  # an exclusive program is no obstacle
+    fcntl.ioctl(rig.fd, termios.TIOCEXCL)  # an exclusive program also gets the frames
     fcntl.flock(rig.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     assert frames_of(rig.run(1000)) == pytest.approx(99, abs=1)
     os.write(rig.fd, b"LOG DISABLE\r\nLOG VERSION\r\n")
