@@ -153,13 +153,6 @@ def test_two_wires(one: str, other: str) -> None:
     assert parse(hipnuc(f"sout: {{{one}}}"), hipnuc(f"sout: {{{one}}}", "z") + ", enabled: false"), "has no wire"
 
 
-def test_a_changed_line_is_a_changed_device() -> None:
-    before, after = (
-        config.parse(f"devices:\n  a: {{{hipnuc(keys)}}}\n", "f") for keys in ("sout: {line: A}", "sout: {line: B}")
-    )
-    assert config.differences(before, after).devices_changed == ("a",)
-
-
 @pytest.mark.parametrize(
     ("keys", "rmc"),
     [
@@ -204,7 +197,7 @@ def problem(keys: str, driver: str = "hipnuc-uart") -> str:
     return line
 
 
-def test_the_keys_of_a_frame_are_part_of_the_device_in_every_form() -> None:
+def test_the_keys_of_frame_and_lines_are_part_of_the_device() -> None:
     plain = device("")
     assert (plain.frame, plain.convention, plain.declination_deg, plain.noise) == (None, None, None, None)
     assert device("    noise: {gyro_rad_s: 0.001, mag_t: 2.0e-7}\n").noise == Deviations(gyro_rad_s=0.001, mag_t=2e-7)
@@ -220,6 +213,10 @@ def test_the_keys_of_a_frame_are_part_of_the_device_in_every_form() -> None:
     down = device("    frame: {z_down: true, euler_order: zxy}\n", "imu61x-uart").frame
     assert down == FrameOptions(z_down=True, euler_order=EulerOrder.ZXY)
     assert device("    frame: {}\n").frame == FrameOptions()
+    before, after = (
+        config.parse(f"devices:\n  a: {{{hipnuc(keys)}}}\n", "f") for keys in ("sout: {line: A}", "sout: {line: B}")
+    )
+    assert config.differences(before, after).devices_changed == ("a",)
 
 
 @pytest.mark.parametrize(

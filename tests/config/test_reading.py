@@ -264,11 +264,14 @@ def test_names_and_number_of_devices() -> None:
     assert "at most 256 devices, got 257" in errors(text(257))[0]
 
 
-def test_a_part_that_is_not_installed() -> None:
+def test_a_part_that_is_not_installed_or_not_searchable() -> None:
     tables = replace(FAKE, links=Broken())
     assert errors("devices: {a: {exotic: {x: 1}}}", tables) == [
         "f.yaml:1:15: devices.a.exotic: expected the installed packages of exotic, got: No module named 'exotic'"
     ]
+    tables = Tables(FAKE.drivers, {"port": fake_row(PortSettings, searchable=False)}, FAKE.publishers)
+    (line,) = errors("devices:\n  a: {port: {port: x}}", tables)
+    assert "expected the name of a driver for port (acme-uart, plain-uart), got auto" in line
 
 
 def test_load(tmp_path: Path) -> None:
@@ -460,12 +463,6 @@ def test_what_a_device_and_a_bus_can_do_is_accepted(devices: list[str], driver: 
     made = config.parse(text, "x.yaml").devices
     assert [(device.name, device.driver) for device in made] == [(name, driver) for name in "ab"[: len(devices)]]
     assert driver != "auto" or made[0].options is None
-
-
-def test_a_link_on_which_nothing_is_searched_needs_a_driver() -> None:
-    tables = Tables(FAKE.drivers, {"port": fake_row(PortSettings, searchable=False)}, FAKE.publishers)
-    (line,) = errors("devices:\n  a: {port: {port: x}}", tables)
-    assert "expected the name of a driver for port (acme-uart, plain-uart), got auto" in line
 
 
 @pytest.mark.parametrize("line", ["d{0}: no", "d{0}: {{baud: 1}}", "same: 1", "? {0}", "d{0}: [!a b, !c d]"])

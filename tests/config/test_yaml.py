@@ -107,21 +107,18 @@ def test_refused_with_its_place(text: str, line: int, column: int, path: str, sa
     assert says in got[3]
 
 
-def test_columns_count_characters_and_a_byte_order_mark_is_no_text() -> None:
-    assert only_problem(b"a: 1\nb: caf\xe9\n") == (2, 7, "", "expected UTF-8 text, got byte 0xe9")
-    assert only_problem(b"\xef\xbb\xbf\xe9")[:2] == (1, 1)
-    tree = config_yaml.read_yaml("\ufeffñandú: [é, no]\n".encode())
-    assert [(p.mark.line, p.mark.column) for p in tree.problems] == [(1, 12)]
-    assert "ñandú" in (tree.data if isinstance(tree.data, dict) else {})
-
-
-def test_all_problems_are_found_and_the_second_of_two_equal_keys_has_no_data() -> None:
+def test_all_problems_are_found_and_their_columns_count_characters() -> None:
     tree = config_yaml.read_yaml(b"a: no\nb: .nan\nc: 1:20\nc: 2\n")
     assert [p.mark.line for p in tree.problems] == [1, 2, 3, 4]
     assert tree.complete
     tree = config_yaml.read_yaml(b"a: {x: 1, y: 1}\na: {x: 2, z: no}\n")
     assert [config_yaml.path_text(p.path) for p in tree.problems] == ["a", "a.(again).z"]
     assert tree.data == {"a": {"x": 1, "y": 1}}
+    assert only_problem(b"a: 1\nb: caf\xe9\n") == (2, 7, "", "expected UTF-8 text, got byte 0xe9")
+    assert only_problem(b"\xef\xbb\xbf\xe9")[:2] == (1, 1)
+    tree = config_yaml.read_yaml("\ufeffñandú: [é, no]\n".encode())
+    assert [(p.mark.line, p.mark.column) for p in tree.problems] == [(1, 12)]
+    assert "ñandú" in (tree.data if isinstance(tree.data, dict) else {})
 
 
 @pytest.mark.parametrize("opening", ["[", "{a: ", "- ", "? "])

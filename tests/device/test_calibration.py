@@ -512,7 +512,7 @@ def test_each_cell_is_one_direction_and_coverage_is_seen_from_the_centre() -> No
     assert not turning.has_field
 
 
-def test_sphere_of_six_points_and_its_residual() -> None:
+def test_sphere_of_six_points_and_points_without_a_sphere() -> None:
     """Points on the axes at 45 µT about the centre, then the same with a radius of 40 µT along X."""
     assert of(axes(45e-6)[:-1]).fit() is None, "it needs 12 points"
     sphere = of(axes(45e-6)).fit()
@@ -531,13 +531,10 @@ def test_sphere_of_six_points_and_its_residual() -> None:
         assert (strength.limit, strength.passed) == (67e-6, passed)
     for apart_t, points in ((4.9e-6, 1), (5.1e-6, 2)):
         assert of([(apart_t / 2, 0.0, 0.0), (-apart_t / 2, 0.0, 0.0)]).cells(None).bit_count() == points
-
-
-def test_no_sphere() -> None:
     circle = ((1, 0), (0, 1), (-1, 0), (0, -1), (0.6, 0.8), (-0.6, 0.8))
     plane: list[Vector3] = [(4e-5 * x, 4e-5 * y, 0.0) for x, y in circle]
-    for points in ([], [(1e-6, 0.0, 0.0)] * 50, plane * 4, [(0.0, 0.0, 0.0)] * 50):
-        assert of(points).fit() is None, points[:6]
+    for without in ([], [(1e-6, 0.0, 0.0)] * 50, plane * 4, [(0.0, 0.0, 0.0)] * 50):
+        assert of(without).fit() is None, without[:6]
 
 
 def test_turns_and_bounded_memory() -> None:

@@ -106,7 +106,7 @@ def test_unknown_frames_and_silence_are_reported() -> None:
     assert "no frame arrives on can0" in Round().complaint()
 
 
-def test_claimed_devices_are_not_found() -> None:
+def test_claimed_devices_are_not_found_and_a_remembered_device_is_found_if_it_is_free() -> None:
     claimed = {BASE + 8}
     heard = Round(claimed=lambda can_id, extended: can_id in claimed and not extended)
     heard.hear(*(fake_can_frame(node, n) for n in (1, 2) for node in (8, 9)))
@@ -116,9 +116,6 @@ def test_claimed_devices_are_not_found() -> None:
     heard = Round(claimed=lambda can_id, _: can_id == 0x7AA)
     heard.hear(*(CanFrame(can_id, False, bytes(8), 0) for can_id in (0x7AA, 0x7AB)))
     assert "unknown types arrive on can0 (0x7AB);" in heard.complaint()
-
-
-def test_the_remembered_device_is_found_immediately_if_it_is_free() -> None:
     heard = Round(remembered=("fake-can", 9))
     heard.hear(fake_can_frame(8, 1), fake_can_frame(9, 1), fake_can_frame(8, 2))
     assert heard.early is None

@@ -45,6 +45,10 @@ def test_only_different_or_unreadable_settings_are_written() -> None:
     assert names(planned({"secret": 5})) == ["secret"]
     assert names(planned({"secret": 5}, secret=5)) == []
     assert names(planned({"secret": 5}, secret=4)) == ["secret"]
+    plan = settings_plan.make_plan(
+        FAKE_SETTINGS, TARGET, {"secret": 5}, ACTUAL, {"secret": 5}, save=False, unsaved=False, by_name=True
+    )
+    assert names(plan) == ["secret"]
 
 
 def test_settings_of_the_connection_are_last() -> None:
@@ -80,15 +84,12 @@ def test_settings_that_need_a_restart_need_a_save() -> None:
     assert (names(plan), plan.save, plan.restart) == (["mounting"], True, False)
 
 
-def test_values_are_checked_together_with_the_present_ones() -> None:
+def test_values_are_merged_and_checked_together_with_the_present_ones() -> None:
     assert names(planned({"output": {"b": 1000}})) == ["output"]  # with `a` at 100 Hz the load is 1100 of 1152
     with pytest.raises(BadArgument, match="at most 96 Hz in all at 9600 baud, got 100 Hz"):
         planned({"baud": 9600})
     planned({"baud": 9600, "output": {"a": 90}})
     planned({"baud": 9600}, save=False)  # the plan leaves it out
-
-
-def test_values_of_several_keys_are_merged() -> None:
     assert settings_plan.merged({"output": {"a": 1, "b": 2}, "mode": "6"}, {"output": {"b": 3}, "mode": "9"}) == {
         "output": {"a": 1, "b": 3}, "mode": "9",
     }  # fmt: skip
@@ -137,20 +138,13 @@ def test_a_present_contradiction_does_not_prevent_another_change() -> None:
             plan(pins=pins)
 
 
-def test_a_user_writes_an_unreadable_value_again() -> None:
-    plan = settings_plan.make_plan(
-        FAKE_SETTINGS, TARGET, {"secret": 5}, ACTUAL, {"secret": 5}, save=False, unsaved=False, by_name=True
-    )
-    assert names(plan) == ["secret"]
-
-
 def differing(
     wanted: dict[str, Any], actual: dict[str, Any] = ACTUAL, unreadable: dict[str, Any] | None = None
 ) -> list[str]:
     return list(settings_plan.differences(FAKE_SETTINGS, wanted, actual, unreadable or {}))
 
 
-def test_the_table_compares_values_and_unreadable_values_differ_unless_written() -> None:
+def test_the_table_compares_values_and_words_contain_both() -> None:
     assert differing({"mode": "6-axis", "output": {"a": 100}, "offset_deg": 0.009}) == []
     assert differing({"offset_deg": 0.02, "output": {"a": 100, "b": 1}, "mode": "9-axis"}) == [
         "mode", "output", "offset_deg",
@@ -165,9 +159,6 @@ def test_the_table_compares_values_and_unreadable_values_differ_unless_written()
     assert differing({"secret": 5}) == []
     assert settings_plan.unverified(FAKE_SETTINGS, {"secret": 5, "mode": "6-axis"}, ACTUAL) == ("secret",)
     assert settings_plan.unverified(FAKE_SETTINGS, {"secret": 5, "mode": "6-axis"}, {}) == ("mode", "secret")
-
-
-def test_words_contain_both_values() -> None:
     assert settings_plan.words(
         {"mode": setting.SettingDifference("6-axis", "9-axis"), "n": setting.SettingDifference(1, 2)}
     ) == ('mode is "9-axis", declared "6-axis", n is 2, declared 1')
@@ -372,6 +363,14 @@ def test_values_are_written_read_back_saved_and_compared() -> None:
     assert device.done == ["x=2", "read"]
     assert found.steps[0].outcome is setting.StepOutcome.WRITTEN
     assert list(found.differences) == ["x"]
+    device, flash = TableOfOne(setting.Written.VERIFIED, saves=True, connection=True), CountedFlash()
+    found = applied(device, flash=flash)
+    assert device.done == ["x=2", "read"]
+    assert (found.saved, flash.counted) == (True, 1)
+    device = TableOfOne(setting.Written.PENDING, effect=setting.Effect.AFTER_RESTART, connection=True, bus_rate=True)
+    done = applied(device, by_name=True)
+    assert (done.saved, done.restarted, done.problem) == (True, False, "")
+    assert [one for one in device.done if one != "read"] == ["x=2", "save"]
 
 
 @pytest.mark.parametrize("result", [setting.Written.UNVERIFIED, setting.Written.UNVERIFIED_PENDING])
@@ -383,23 +382,9 @@ def test_an_unreadable_value_is_not_verified_and_another_value_is_a_failure(resu
     assert found.steps[0].message == "wrote 2, read back 1"
 
 
-def test_a_setting_that_saves_itself_is_saved_once() -> None:
-    device, flash = TableOfOne(setting.Written.VERIFIED, saves=True, connection=True), CountedFlash()
-    found = applied(device, flash=flash)
-    assert device.done == ["x=2", "read"]
-    assert (found.saved, flash.counted) == (True, 1)
-
-
 @pytest.mark.parametrize("error", [NoReply("no answer"), LinkMissing("pulled out")])
 def test_errors_of_device_and_link_are_part_of_the_result(error: Exception) -> None:
     device = TableOfOne(error)
     device.result = error
     assert applied(device).problem == f"x: {error}; no other setting was written"
     assert device.done == ["x=2", "read"]
-
-
-def test_a_device_with_another_rate_than_its_bus_is_not_restarted() -> None:
-    device = TableOfOne(setting.Written.PENDING, effect=setting.Effect.AFTER_RESTART, connection=True, bus_rate=True)
-    done = applied(device, by_name=True)
-    assert (done.saved, done.restarted, done.problem) == (True, False, "")
-    assert [one for one in device.done if one != "read"] == ["x=2", "save"]

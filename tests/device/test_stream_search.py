@@ -125,7 +125,7 @@ def test_noise_stops_the_queries() -> None:
     assert sent == 0
 
 
-def test_two_good_frames_are_enough_with_few_bad_frames() -> None:
+def test_two_good_frames_are_enough_with_few_bad_frames_and_noise() -> None:
     search = Search([FAKE_DRIVER], bauds=(115200,))
     search.start(0)
     step = search.on_data(fake_frame(b"x" * 76), 1)
@@ -139,9 +139,6 @@ def test_two_good_frames_are_enough_with_few_bad_frames() -> None:
     for place, frame in enumerate([bad, bad, bad, bad, bad, good, good, good]):
         assert not isinstance(search.on_data(frame, place), StreamFound)
     assert isinstance(search.on_data(good, 9), StreamFound)
-
-
-def test_a_device_on_a_noisy_line_is_found() -> None:
     far = replace(device(460800, 100, 4_000_000), damage=0.4)
     _, took_ns, _ = found_by(Search([FAKE_DRIVER]), far)
     assert took_ns < 2 * NS_PER_S

@@ -70,16 +70,13 @@ def passed(
     return host_log.LineFormatter(journal=True).format(record) if repeats.filter(record) else ""
 
 
-def test_repeated_messages_pass_less_and_less_often() -> None:
+def test_repeated_messages_pass_less_and_less_often_and_others_immediately() -> None:
     repeats = host_log.RepeatFilter()
     told = {t: line for t in range(200) if (line := passed(repeats, 1000 + t, "%s: %d lost", "bow", t))}
     assert (list(told), told[1]) == ([0, 1, 3, 7, 15, 31, 63, 123, 183], "<4>bow: 1 lost")
     assert told[7] == "<4>bow: 7 lost, 3 similar messages in 4 s"
     assert told[183] == "<4>bow: 183 lost, 59 similar messages in 60 s"
     assert passed(repeats, 1300, "%s: %d lost", "bow", 1) == "<4>bow: 1 lost"  # new after one quiet minute
-
-
-def test_other_messages_pass_immediately() -> None:
     repeats = host_log.RepeatFilter()
     assert passed(repeats, 0, "%s: %d lost", "bow", 1)
     assert not passed(repeats, 0, "%s: %d lost", "bow", 2)
@@ -90,11 +87,11 @@ def test_other_messages_pass_immediately() -> None:
         assert passed(repeats, 0, "%s: up", "bow", level=logging.INFO)
     assert passed(repeats, -100, "%s: %d lost", "bow", 1)  # the clock was set back
     assert passed(repeats, 0, "nothing %s", 5)
-    repeats, told = host_log.RepeatFilter(), []
+    repeats, passes = host_log.RepeatFilter(), list[bool]()
     for text in ("3 samples lost", "5 samples lost", "the adapter is gone"):
         values = {"msg": "%s: %s", "args": ("bow", text), "levelno": logging.WARNING, "created": 0.0}
-        told.append(repeats.filter(logging.makeLogRecord(values | host_log.same_as(text))))
-    assert told == [True, False, True]
+        passes.append(repeats.filter(logging.makeLogRecord(values | host_log.same_as(text))))
+    assert passes == [True, False, True]
     repeats = host_log.RepeatFilter()
     for number in range(513):
         assert passed(repeats, 0, f"message {number}")

@@ -164,6 +164,6 @@ def test_settings_of_the_interpreter_are_restored() -> None:
         for interval_s, expected_s in ((0.005, 0.0003), (0.0001, 0.0001)):  # a shorter interval stays
             sys.setswitchinterval(interval_s)
             started(lambda: None).end()
-            assert sys.getswitchinterval() == pytest.approx(expected_s, rel=0.02)
+            assert sys.getswitchinterval() == pytest.approx(expected_s, abs=2e-6)
     finally:
         sys.setswitchinterval(switch_s)

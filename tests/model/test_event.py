@@ -27,9 +27,6 @@ def test_repeated_events_are_one_group_while_they_continue() -> None:
     log.add(event(124, EventKind.ALARM, "inactive"))
     log.add(event(125, EventKind.ALARM, "active"))
     assert seen(log, 123) == [(124, 124, 1), (123, 125, 2)]
-
-
-def test_progress_of_a_calibration_is_one_group_per_phase() -> None:
     log = EventLog()
     for t_s, phase in enumerate(("begin", "turn", "turn", "end")):
         log.add(Event(t_s * S, "bow", EventKind.CALIBRATION, str(t_s), {"kind": "magnetometer", "phase": phase}))

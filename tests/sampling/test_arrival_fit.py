@@ -38,7 +38,7 @@ def test_the_fit_follows_the_frames_without_delay(slope: float) -> None:
     assert fit.error_ns < 20_000
 
 
-def test_the_window_is_bounded() -> None:
+def test_the_window_is_bounded_and_the_fit_is_over_the_bins_that_are_left() -> None:
     fit, off_ns = fitted(1.0, 1_000_000, 1)
     assert abs(off_ns) < 1_000_000
     assert fit.slope_error > 1e-5
@@ -53,6 +53,16 @@ def test_the_window_is_bounded() -> None:
         device_ns = i * 10 * NS_PER_MS
         add(fit, device_ns, device_ns)
     assert abs(at(fit, device_ns) - device_ns) < 10
+    # The hull has no corner of a dropped or merged bin.
+    random = Random(3)
+    fit, points = ArrivalFit(0, 0), [(0, 0)]
+    for i in range(1, 4000):
+        device_ns = i * 50 * NS_PER_MS
+        arrival_ns = int(1.00002 * device_ns + 1e-16 * -(device_ns**2) + random.expovariate(1e-5))
+        points.append((device_ns, arrival_ns))
+        if add(fit, device_ns, arrival_ns):
+            kept = [(x, y) for x, y in points if x >= device_ns - fit.span_ns]
+            assert min(y - at(fit, x) for x, y in kept) > -10_000  # lowest point above an earlier fit
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -71,19 +81,6 @@ def test_no_point_is_under_the_hull_however_it_was_made(seed: int) -> None:
     for begin in range(0, 80, 7):
         extend_lower_hull(at_once, points[begin : begin + 7])
     assert at_once == hull
-
-
-def test_the_fit_is_over_the_bins_that_are_left() -> None:
-    """The hull has no corner of a dropped or merged bin."""
-    random = Random(3)
-    fit, points = ArrivalFit(0, 0), [(0, 0)]
-    for i in range(1, 4000):
-        device_ns = i * 50 * NS_PER_MS
-        arrival_ns = int(1.00002 * device_ns + 1e-16 * -(device_ns**2) + random.expovariate(1e-5))
-        points.append((device_ns, arrival_ns))
-        if add(fit, device_ns, arrival_ns):
-            kept = [(x, y) for x, y in points if x >= device_ns - fit.span_ns]
-            assert min(y - at(fit, x) for x, y in kept) > -10_000  # lowest point above an earlier fit
 
 
 # --- latency timers -------------------------------------------------------------------------------------------------

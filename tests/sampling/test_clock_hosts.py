@@ -219,13 +219,10 @@ def test_time_stamps_equal_those_of_an_undisturbed_host(
     assert max(apart[i] - 2 * dated[i].sample.t_err_ns for i in range(len(apart))) < 0
 
 
-def test_without_the_unsteered_clock_the_slew_is_visible() -> None:
+def test_the_slew_and_the_rate_of_the_device_are_against_the_unsteered_clock() -> None:
     """The tests above prove nothing unless the slew would be visible."""
     dated = host_clocks.run(model(arrival.BARE_UART), NTP, 100 * SECONDS, unseen=True)
     assert max(abs(d.point.off_ns) for d in dated) > NS_PER_MS
-
-
-def test_the_rate_of_the_device_is_against_the_unsteered_clock() -> None:
     host, clock = on(NTP)
     for a in model(arrival.BARE_UART).run(1300):
         host_clocks.date(clock, host, a)

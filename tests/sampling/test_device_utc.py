@@ -189,8 +189,14 @@ def test_the_estimate_runs_at_the_slope_of_the_intervals_and_a_better_fit_within
     assert error > 200_000
 
 
-def test_a_fit_beside_the_intervals_is_moved_and_doubted_by_that() -> None:
-    """Intervals of one second show no slope, and the feasible lines are as wide as the intervals."""
+def test_the_width_grows_with_time_and_a_fit_beside_the_intervals_is_moved() -> None:
+    intervals, x = filled(50.0, 5)
+    assert intervals.width_ns(x + NS_PER_S) > intervals.width_ns(x) + 10_000
+    intervals = IntervalFit()
+    for x in range(0, 5 * NS_PER_S, NS_PER_S):
+        intervals.add_interval(x, x, x + MS, x + 100_000, 1.0)
+    assert intervals.width_ns(4 * NS_PER_S) < 200_000
+    # Intervals of one second show no slope, and the feasible lines are as wide as the intervals.
     intervals = IntervalFit()
     for x in (0, NS_PER_S // 2, NS_PER_S):
         intervals.add_interval(x, x, x + MS, FAR, 1.0)
@@ -203,15 +209,6 @@ def test_a_fit_beside_the_intervals_is_moved_and_doubted_by_that() -> None:
     fix, error = intervals.combined(NS_PER_S, beside, 1000.0, 0.0)
     assert fix == pytest.approx(-MS, rel=0.01)
     assert error == pytest.approx(MS, rel=0.01)
-
-
-def test_the_width_grows_with_time_and_arrivals_bound_it() -> None:
-    intervals, x = filled(50.0, 5)
-    assert intervals.width_ns(x + NS_PER_S) > intervals.width_ns(x) + 10_000
-    intervals = IntervalFit()
-    for x in range(0, 5 * NS_PER_S, NS_PER_S):
-        intervals.add_interval(x, x, x + MS, x + 100_000, 1.0)
-    assert intervals.width_ns(4 * NS_PER_S) < 200_000
 
 
 def test_contradictions_drop_old_intervals_or_are_covered() -> None:

@@ -155,13 +155,10 @@ def accepted(*steps_ns: int) -> list[bool]:
     return found
 
 
-def test_a_pulse_follows_by_one_to_ten_seconds_within_half_a_millisecond_each() -> None:
+def test_pulses_follow_each_other_and_give_utc_for_ten_minutes() -> None:
     second, off = NS_PER_S, NS_PER_MS // 2
     assert accepted(second - off, second + off, 10 * second - 10 * off, 10 * second + 10 * off) == [True] * 4
     assert accepted(second - off - 1, second + off + 1, 10 * second + 10 * off + 1, 11 * second, 0) == [False] * 5
-
-
-def test_utc_is_known_with_three_pulses_and_until_ten_minutes_after_the_last() -> None:
     receiver = Receiver(0)
     receiver.go(3, says=None)
     for after_s in (0, 0.1):  # a receiver with 10 Hz

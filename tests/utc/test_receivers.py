@@ -261,13 +261,7 @@ async def test_a_port_that_goes_away_or_is_held_is_opened_again() -> None:
     source.close()
 
 
-def test_keys_of_rmc_accept_the_documented_values() -> None:
-    assert check_schema("RMC sentences", receivers.RmcOptions) == 8
-    defaults = receivers.RmcOptions(source="gpsd")
-    assert (defaults.rate_hz, defaults.tcp_port, defaults.baud, defaults.error_ms) == (1, 2947, 9600, 50)
-
-
-def test_sources_by_their_name() -> None:
+def test_sources_by_their_name_and_documented_values() -> None:
     """`nmea` needs a port, the others read gpsd or the clock of the host."""
     asked: list[tuple[str, int]] = []
 
@@ -285,6 +279,9 @@ def test_sources_by_their_name() -> None:
     assert dict(zip(RMC_SOURCES, map(type, made), strict=True)) == kinds
     assert asked == [("/dev/ttyGNSS", 38400)]
     assert "NMEA receiver on /dev/ttyGNSS" in [one.title for one in made]
+    assert check_schema("RMC sentences", receivers.RmcOptions) == 8
+    defaults = receivers.RmcOptions(source="gpsd")
+    assert (defaults.rate_hz, defaults.tcp_port, defaults.baud, defaults.error_ms) == (1, 2947, 9600, 50)
 
 
 GGA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
