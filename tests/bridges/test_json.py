@@ -5,15 +5,8 @@ from typing import Any
 
 from jsonschema import Draft202012Validator
 
-from imud.bridges.channel import (
-    Diagnoses,
-    Diagnosis,
-    DiagnosisLevel,
-    LossCounts,
-    MessageChannel,
-    MessageFrames,
-    StampedEvent,
-)
+from imud.bridges import channel as bridge
+from imud.bridges.channel import MessageChannel, MessageFrames, StampedEvent
 from imud.bridges.json import JsonDialect, status_channel
 from imud.contracts.status import Deviations
 from imud.model.event import Event, EventKind
@@ -90,15 +83,15 @@ def test_messages_and_schemas() -> None:
     }  # fmt: skip
     long = StampedEvent(Event(1, "bow", EventKind.UP, "x" * 5000), UTC_NS)
     assert read(DIALECT.events(), long).items() >= {"level": 2, "message": f"up: {4091 * 'x'}…"}.items()
-    losses = read(DIALECT.losses("bow"), LossCounts(1, UTC_NS, "bow", 100, 1, 2, 3, 4, 5))
+    losses = read(DIALECT.losses("bow"), bridge.LossCounts(1, UTC_NS, "bow", 100, 1, 2, 3, 4, 5))
     assert losses == {
         "timestamp": STAMP, "samples": 100, "lost_gap_device": 1, "lost_crc": 2, "lost_overrun": 3, "lost_queue": 4,
         "lost_unknown": 5,
     }  # fmt: skip
     status = read(status_channel("bow"), (device_status("bow", 0), UTC_NS))
     assert (status["state"], status["rate_hz"], status["clock"]["sync"]) == ("running", 1000.0, "regression")
-    bow = Diagnosis("bow", DiagnosisLevel.WARN, "searching", "17", {"t_err_ns": "12000"})
-    assert read(DIALECT.diagnostics(), Diagnoses(UTC_NS, (bow,))) == {
+    bow = bridge.Diagnosis("bow", bridge.DiagnosisLevel.WARN, "searching", "17", {"t_err_ns": "12000"})
+    assert read(DIALECT.diagnostics(), bridge.Diagnoses(UTC_NS, (bow,))) == {
         "header": {"stamp": STAMP, "frame_id": ""},
         "status": [
             {

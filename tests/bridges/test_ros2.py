@@ -7,15 +7,8 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from imud.bridges.channel import (
-    Diagnoses,
-    Diagnosis,
-    DiagnosisLevel,
-    LossCounts,
-    MessageChannel,
-    MessageFrames,
-    StampedEvent,
-)
+from imud.bridges import channel as bridge
+from imud.bridges.channel import MessageChannel, MessageFrames, StampedEvent
 from imud.bridges.ros2 import ENCAPSULATION, FIELDS, CdrWriter, Layout, Ros2Dialect, schema, time_of
 from imud.contracts.status import Deviations
 from imud.model.event import Event, EventKind
@@ -106,7 +99,7 @@ def test_transform_stamp_and_alignment() -> None:
 
 
 def test_losses_events_and_diagnoses() -> None:
-    losses = read(DIALECT.losses("bow"), LossCounts(1, UTC_NS, "bow", 100, 1, 2, 3, 4, 5))
+    losses = read(DIALECT.losses("bow"), bridge.LossCounts(1, UTC_NS, "bow", 100, 1, 2, 3, 4, 5))
     assert (losses.samples, losses.lost_gap_device, losses.lost_crc) == (100, 1, 2)
     assert (losses.lost_overrun, losses.lost_queue, losses.lost_unknown) == (3, 4, 5)
     log = read(DIALECT.events(), StampedEvent(EVENT, UTC_NS))
@@ -114,18 +107,18 @@ def test_losses_events_and_diagnoses() -> None:
     assert log.stamp.sec == 1_790_000_000
     assert read(DIALECT.events(), StampedEvent(Event(1, "bow", EventKind.UP, "there"), UTC_NS)).level == 20
     values = {"t_err_ns": "12000", "state": "running"}
-    bow = Diagnosis("bow", DiagnosisLevel.OK, "running", "17", values)
-    mast = Diagnosis("mast", DiagnosisLevel.STALE, "silent: nothing comes", "", {})
+    bow = bridge.Diagnosis("bow", bridge.DiagnosisLevel.OK, "running", "17", values)
+    mast = bridge.Diagnosis("mast", bridge.DiagnosisLevel.STALE, "silent: nothing comes", "", {})
     channel = DIALECT.diagnostics()
     assert channel.topic == "/diagnostics"
-    array = read(channel, Diagnoses(UTC_NS, (bow, mast)))
+    array = read(channel, bridge.Diagnoses(UTC_NS, (bow, mast)))
     assert (array.header.stamp.sec, array.header.stamp.nanosec) == (1_790_000_000, 123_456_789)
     first, second = array.status
     assert (first.level, first.name, first.message, first.hardware_id) == (first.OK, "imud: bow", "running", "17")
-    assert list(DiagnosisLevel) == [first.OK, first.WARN, first.ERROR, first.STALE]
+    assert list(bridge.DiagnosisLevel) == [first.OK, first.WARN, first.ERROR, first.STALE]
     assert {one.key: one.value for one in first.values} == values
     assert (second.level, second.name, second.values) == (second.STALE, "imud: mast", [])
-    assert bytes(ROS.serialize_cdr(array, channel.schema.name)) == channel.encode(Diagnoses(UTC_NS, (bow, mast)))
+    assert bytes(ROS.serialize_cdr(array, channel.schema.name)) == channel.encode(bridge.Diagnoses(UTC_NS, (bow, mast)))
 
 
 def test_definitions_are_those_of_ros_2_and_times_are_clipped() -> None:

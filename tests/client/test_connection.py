@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from msgspec.structs import replace
@@ -38,7 +39,7 @@ def publish(served: Daemon, *batches: Batch) -> None:
     served.do(work)
 
 
-def test_requests(served: Daemon) -> None:
+def test_requests_and_conventions(served: Daemon) -> None:
     with Client(served.path) as client:
         assert (client.hello.protocol, client.hello.epoch) == (1, EPOCH)
         assert "read" in client.hello.rights
@@ -51,13 +52,10 @@ def test_requests(served: Daemon) -> None:
         assert client.poll(["imu1"]) == [sample("imu1", 5)]
         (bucket,) = client.history(["imu1"], convention="enu-flu")["imu1"]
         assert (bucket.seq, bucket.accel_m_s2) == (5, ((-0.5, -0.125, 9.75),) * 2)
-
-
-def test_a_convention_is_asked_for(served: Daemon) -> None:
-    """A device with x right, y forward, z up: its y axis points to the front."""
+    # a device with x right, y forward, z up: its y axis points to the front
     with Client(served.path) as client:
         publish(served, batch("imu0", 4))
-        (newest,) = client.poll(convention="enu-flu")
+        (newest,) = client.poll(["imu0"], convention="enu-flu")
         assert newest.accel_m_s2 == (-0.5, -0.125, 9.75)
         watch = client.watch(convention="ned-frd", timeout_s=60)
         publish(served, batch("imu0", 5))
@@ -115,6 +113,14 @@ def test_watch_selects_and_a_second_watch_ends_the_first(served: Daemon) -> None
         publish(served, batch("imu0", 2), batch("imu1"))
         assert next(new) == sample("imu1")
         assert list(old) == []
+    with Client(served.path) as client:
+        watch = client.watch(encoding="json", timeout_s=60)
+        odd = replace(sample(), gyro_rad_s=(math.nan, 1.0, math.inf), temperature_c=math.nan)
+        publish(served, Batch("imu0", 0, [odd]))
+        got = next(watch)
+        assert got.gyro_rad_s is not None
+        assert got.temperature_c is not None
+        assert [math.isnan(value) for value in (*got.gyro_rad_s, got.temperature_c)] == [True, False, True, True]
 
 
 @pytest.mark.parametrize("encoding", ["json", "binary"])
@@ -153,17 +159,6 @@ def test_recordings_and_snapshots_are_descriptors(served: Daemon) -> None:
             assert is_recording(file.read())
 
 
-def test_null_is_nan(served: Daemon) -> None:
-    with Client(served.path) as client:
-        watch = client.watch(encoding="json", timeout_s=60)
-        odd = replace(sample(), gyro_rad_s=(math.nan, 1.0, math.inf), temperature_c=math.nan)
-        publish(served, Batch("imu0", 0, [odd]))
-        got = next(watch)
-        assert got.gyro_rad_s is not None
-        assert got.temperature_c is not None
-        assert [math.isnan(value) for value in (*got.gyro_rad_s, got.temperature_c)] == [True, False, True, True]
-
-
 def test_events(served: Daemon) -> None:
     with Client(served.path) as client:
         events = client.events(["imu1"], timeout_s=60)
@@ -178,9 +173,6 @@ def test_events(served: Daemon) -> None:
         short = client.events(timeout_s=0.01)
         with pytest.raises(TimeoutError, match="no event within"):
             next(short)
-
-
-def test_an_event_of_a_kind_to_come_is_accepted() -> None:
     assert [rpc_error({"code": 7, "message": "m", "data": data}).data for data in ({"a": 1}, [1])] == [{"a": 1}, None]
     event = event_of({"t_ns": 1, "device": "imu0", "kind": "earthquake", "message": "m", "later": 1})
     assert event.kind == "earthquake"
@@ -240,10 +232,7 @@ def test_no_daemon_there_and_no_permission(tmp_path: Path, monkeypatch: pytest.M
         waiting.connect(str(path))
         with pytest.raises(LinkError, match=r"cannot connect to .*: Resource temporarily unavailable"):
             Client(path, timeout_s=0.01)
-
-    def deny(_sock: socket.socket, _path: str) -> None:
-        raise PermissionError(13, "Permission denied")
-
+    deny = Mock(side_effect=PermissionError(13, "Permission denied"))
     monkeypatch.setattr(socket.socket, "connect", deny)
     with pytest.raises(LinkDenied, match="group imud"):
         Client("/x")
@@ -293,7 +282,7 @@ def answering(path: Path, answer: bytes) -> Iterator[None]:
         (HELLO + b'{"id":1,"result":{"devices":{}}}\n\xff\xff\xff\xff', ServerError, "expected a frame of at most"),
         (HELLO + b'{"id":1,"result":{"devices":{"a":0}}}\n\x00\x01\x00\x00' + bytes(256), ServerError, "CRC"),
         (
-            HELLO + b'{"id":1,"result":{"devices":{}}}\n\x00\x01\x00\x00' + bytes(256),
+            HELLO + b'{"id":1,"result":{"devices":{}}}\n\0\1\0\0' + bytes(256),
             ServerError,
             "known device number .*, got 0",
         ),

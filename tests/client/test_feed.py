@@ -43,9 +43,7 @@ def until(condition: Callable[[], object], heard: Listener) -> None:
         heard.wait_for(lambda news: True)
 
 
-def test_the_first_news_have_the_greeting_and_every_sample_comes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_news_have_the_greeting_and_every_sample_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     watch = create_autospec(Client.watch, side_effect=Client.watch)
     monkeypatch.setattr(Client, "watch", watch)
     with daemon(tmp_path) as served, feeding(str(served.path), Wish(("imu0",), news_s=0.02)) as (_, heard):
@@ -103,9 +101,12 @@ def test_the_feed_is_disconnected_without_a_wish(tmp_path: Path) -> None:
         assert heard.wait_for(lambda news: news.hello).hello is not None
 
 
-def test_newest_samples_and_events_come_without_a_watch(tmp_path: Path) -> None:
+def test_newest_samples_events_and_the_time_come_without_a_watch(tmp_path: Path) -> None:
     with daemon(tmp_path) as served, feeding(str(served.path), OVERVIEW) as (_, heard):
-        heard.wait_for(lambda news: news.statuses)
+        news = heard.wait_for(lambda news: news.statuses)
+        assert news.ahead_ns == pytest.approx(NOW_NS - monotonic_ns(), abs=LIMIT_S * NS_PER_S)
+        assert news.now_ns == pytest.approx(NOW_NS, abs=LIMIT_S * NS_PER_S)
+        assert NOW_NS + utc_offset_ns(news.ahead_ns) == pytest.approx(time_ns(), abs=LIMIT_S * NS_PER_S)
         served.do(lambda server: server.publish(batch("imu1", 7)))
         news = heard.wait_for(lambda news: news.newest)
         assert news.newest is not None
@@ -145,14 +146,6 @@ def test_it_connects_again_to_a_daemon_that_was_restarted(tmp_path: Path) -> Non
         assert heard.wait_for(lambda news: news.hello).statuses
         feed.close()
         feed.close()
-
-
-def test_news_contain_the_time_of_the_daemons_host(tmp_path: Path) -> None:
-    with daemon(tmp_path) as served, feeding(str(served.path), OVERVIEW) as (_, heard):
-        news = heard.wait_for(lambda news: news.statuses)
-        assert news.ahead_ns == pytest.approx(NOW_NS - monotonic_ns(), abs=LIMIT_S * NS_PER_S)
-        assert news.now_ns == pytest.approx(NOW_NS, abs=LIMIT_S * NS_PER_S)
-        assert NOW_NS + utc_offset_ns(news.ahead_ns) == pytest.approx(time_ns(), abs=LIMIT_S * NS_PER_S)
 
 
 @pytest.mark.parametrize("sign", [1, -1])

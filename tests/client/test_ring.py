@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from random import Random
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -53,10 +54,7 @@ def test_no_such_ring_and_no_permission(board: Board, tmp_path: Path, monkeypatc
     os.truncate(board.path, HEADER_BYTES + SLOTS * SLOT_BYTES - 1)
     with pytest.raises(ServerError, match="expected 20480 bytes, got 20479"):
         Ring(board.path)
-
-    def refuse(*_: object) -> None:
-        raise PermissionError(13, "Permission denied")
-
+    refuse = Mock(side_effect=PermissionError(13, "Permission denied"))
     monkeypatch.setattr(os, "open", refuse)
     with pytest.raises(ServerError, match="add this user to the group"):
         Ring(board.path)
@@ -85,16 +83,11 @@ def test_directory_of_the_environment(board: Board, tmp_path: Path, monkeypatch:
     assert default_directory(DEVICE) == str(first)
 
 
-def test_errors_of_the_operating_system_are_named(
-    board: Board, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_errors_of_the_system_are_named(board: Board, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "loop").symlink_to("loop")
     with pytest.raises(ServerError, match=r"cannot read .*loop: Too many levels of symbolic links"):
         Ring(tmp_path / "loop")
-
-    def fail(*_: object, **__: object) -> None:
-        raise OSError(errno.ENOMEM, "Cannot allocate memory")
-
+    fail = Mock(side_effect=OSError(errno.ENOMEM, "Cannot allocate memory"))
     monkeypatch.setattr(mmap, "mmap", fail)
     with pytest.raises(ServerError, match="Cannot allocate memory"):
         Ring(board.path)

@@ -243,7 +243,10 @@ def test_without_the_extra_only_this_output_does_not_start(tmp_path: Path, monke
         ({"key_file": "/k"}, "key_file: expected cert_file as well"),
         ({"password_file": "/p"}, "password_file: expected user as well"),
         ({"devices": {"a b": {}}}, "devices: expected names of devices"),
-        ({"devices": {"*": {"rate_hz": 0.001}}}, 'a number from 0.01 to 100, or null, got 0.001, at "*.rate_hz"'),
+        (
+            {"devices": {"*": {"rate_hz": 0.001}}},
+            'devices: expected a number from 0.01 to 100, or null, got 0.001, at "*.rate_hz"',
+        ),
         ({"devices": {"*": {"whole": "xml"}}}, 'expected one of "none", "json", "slots", got "xml", at "*.whole"'),
         ({"devices": {"*": {"wole": "json"}}}, "wole"), ({"version": "3.1"}, "version: expected"),
     ],

@@ -32,6 +32,9 @@ def test_check_value_and_frames() -> None:
     assert not modbus.is_exception(modbus.framed(5, b"\x03\x02"))
     assert modbus.exception_text(2) == "exception 2: the register does not exist"
     assert modbus.exception_text(77) == "exception 77: unknown code"
+    assert list(modbus.SLAVES) == list(
+        range(1, 248)
+    )  # 0 is the broadcast, 248 to 255 are reserved (Modbus over serial line V1.02, 2.2)
 
 
 @pytest.mark.parametrize(("baud", "gap_ns"), [(9600, 3_645_831), (19200, 1_822_915), (38400, 1_750_000)])
@@ -84,6 +87,8 @@ def test_a_damaged_reply_is_returned_only_in_its_place() -> None:
     found = finder()
     assert found.feed(OTHER) is None
     assert not found.looks_damaged
+    for data, sender in ((b"\x06" + OTHER + REPLY, 6), (REPLY + OTHER[:-1], None), (REPLY, None), (EXCEPTION, None)):
+        assert modbus.late_sender(data, {6, 7}) == sender
 
 
 def test_confirmation_is_distinguished_from_the_echo() -> None:
@@ -101,13 +106,3 @@ def test_confirmation_is_distinguished_from_the_echo() -> None:
         assert found.feed(b"\xee" * 100) is None
     assert len(found.rest()) <= 256
     assert found.strange + len(found.rest()) == 10_000
-
-
-def test_addresses_of_slaves() -> None:
-    """0 is the broadcast, 248 to 255 are reserved (Modbus over serial line V1.02, section 2.2)."""
-    assert list(modbus.SLAVES) == list(range(1, 248))
-
-
-def test_a_late_reply_names_its_sender() -> None:
-    for data, sender in ((b"\x06" + OTHER + REPLY, 6), (REPLY + OTHER[:-1], None), (REPLY, None), (EXCEPTION, None)):
-        assert modbus.late_sender(data, {6, 7}) == sender

@@ -13,16 +13,7 @@ from hypothesis import strategies as st
 
 from imud.formats import records
 from imud.formats.can import CanFrame
-from imud.formats.records import (
-    CallRecord,
-    CheckRecord,
-    ClocksRecord,
-    EdgeRecord,
-    Kind,
-    LostRecord,
-    ReadingRecord,
-    Record,
-)
+from imud.formats.records import Kind, Record
 from imud.model.errors import ImudError
 from tests.support.documented import DOCS
 
@@ -43,21 +34,21 @@ def test_a_data_record_by_hand_and_round_trip_of_objects() -> None:
     record = only(data)
     assert (record.kind, record.device) == (Kind.DATA, 3)
     assert records.decode_data(record.body) == (258, -1, b"\x5a\xa5")
-    call = CallRecord("clock", "link_changed", [], {"byte_ns": 86_806, "hold_ns": 0})
+    call = records.CallRecord("clock", "link_changed", [], {"byte_ns": 86_806, "hold_ns": 0})
     record = only(records.encode_object(Kind.CALL, 1, call))
-    assert records.decode_object(record, CallRecord) == call
+    assert records.decode_object(record, records.CallRecord) == call
     with pytest.raises(ImudError, match="cannot read a record of kind 9"):
-        records.decode_object(record._replace(body=b"\xc1"), CallRecord)
+        records.decode_object(record._replace(body=b"\xc1"), records.CallRecord)
     with pytest.raises(ImudError, match="expected a ledger with "):
-        records.decode_object(only(records.encode_object(Kind.CHECK, 1, CHECK)), CheckRecord)
+        records.decode_object(only(records.encode_object(Kind.CHECK, 1, CHECK)), records.CheckRecord)
 
 
 FRAMES = [
     CanFrame(0x188, False, b"\1\2\3", 10), CanFrame(0x0CFF3408, True, b"", 11, True),
     CanFrame(0x7FF, False, bytes(64), 12),
 ]  # fmt: skip
-READINGS = [ReadingRecord(0, 5, 9, 0, b"\1" * 300), ReadingRecord(1, 10, 12, 2, "bus é".encode())]
-CLOCKS, LOST = ClocksRecord(1, -2, 3, 4, 5, 6), LostRecord(1, 2, -3)
+READINGS = [records.ReadingRecord(0, 5, 9, 0, b"\1" * 300), records.ReadingRecord(1, 10, 12, 2, "bus é".encode())]
+CLOCKS, LOST = records.ClocksRecord(1, -2, 3, 4, 5, 6), records.LostRecord(1, 2, -3)
 CHECK = {"t_ns": 1, "seq": 2, "sample_t_ns": 3, "sample_t_err_ns": 4, "ledger": {}}
 
 
@@ -85,7 +76,7 @@ GOLDEN = [
         "06 0201 1e000000" + int64(10) + "0834ff0c 03 02 abcd" + int64(9) + "88010000 00 00",
     ),
     (
-        records.encode_readings(1, [ReadingRecord(3, 5, 9, 2, b"no")]),
+        records.encode_readings(1, [records.ReadingRecord(3, 5, 9, 2, b"no")]),
         "07 0100 18000000" + int64(5, 9) + "03 02 02000000 6e6f",
     ),
     (records.encode_edges(0, "alarm", [(-5, True, 258)]), "08 0000 12000000 04" + int64(-5) + "01" + int64(258)),
@@ -105,7 +96,7 @@ def test_records_have_the_documented_bytes() -> None:
 
 @pytest.mark.parametrize("line", records.LINES)
 def test_round_trip_of_edges(line: str) -> None:
-    edges = [EdgeRecord(-5, True, 1), EdgeRecord(1 << 60, False, 1 << 40)]
+    edges = [records.EdgeRecord(-5, True, 1), records.EdgeRecord(1 << 60, False, 1 << 40)]
     assert records.decode_edges(only(records.encode_edges(0, line, edges)).body) == (line, edges)
 
 

@@ -9,23 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from imud.formats import slot as slot_format
 from imud.formats.slot import (
     CRC_OFFSET,
     PRESENT_BITS,
-    SEQ_INVALID,
     SLOT_BYTES,
-    SLOT_FIELDS,
-    SYNC_CODES,
     decode_slot,
-    decode_slots,
     encode_slot,
     encode_slots,
     slot_is_whole,
-    slot_quality,
-    slot_seqs,
-    slot_status_bits,
-    slot_times_ns,
-    slots_in,
 )
 from imud.model.sample import Sample, Sync
 from tests.support.rings import check_layout
@@ -83,7 +75,7 @@ def test_golden_bytes() -> None:
     assert crc32_bit_by_bit(b"123456789") == 0xCBF4_3926  # the published check value of CRC-32
     raw = bytes.fromhex(GOLDEN)
     assert decode_slot(raw + zlib.crc32(raw).to_bytes(4, "little"), "imu0") == FULL
-    check_layout(SLOT_FIELDS, SLOT_BYTES)
+    check_layout(slot_format.SLOT_FIELDS, SLOT_BYTES)
 
 
 @pytest.mark.parametrize("name", PRESENT_BITS)
@@ -100,7 +92,12 @@ def test_presence_bit_of_each_field(name: str) -> None:
 
 
 def test_sync_codes_are_in_order_of_quality() -> None:
-    assert [SYNC_CODES[sync] for sync in (Sync.ARRIVAL, Sync.REGRESSION, Sync.EDGE, Sync.UTC)] == [0, 1, 2, 3]
+    assert [slot_format.SYNC_CODES[sync] for sync in (Sync.ARRIVAL, Sync.REGRESSION, Sync.EDGE, Sync.UTC)] == [
+        0,
+        1,
+        2,
+        3,
+    ]
     for sync in Sync:
         assert decode_slot(encode_slot(msgspec.structs.replace(BARE, sync=sync), 0), "imu0").sync is sync
 
@@ -121,7 +118,7 @@ def test_any_flipped_bit_and_the_sync_of_a_newer_layout_are_found() -> None:
 @pytest.mark.parametrize("slot", [b"", bytes(SLOT_BYTES), encode_slot(FULL, 1)[:-1], b"\xff" * SLOT_BYTES])
 def test_bytes_that_are_not_a_slot(slot: bytes) -> None:
     assert not slot_is_whole(slot)
-    assert SEQ_INVALID == 0xFFFF_FFFF_FFFF_FFFF
+    assert slot_format.SEQ_INVALID == 0xFFFF_FFFF_FFFF_FFFF
 
 
 @pytest.mark.parametrize(
@@ -161,12 +158,12 @@ def test_a_batch_is_its_samples_one_by_one_also_where_one_does_not_fit() -> None
         assert slots == [encode_slot(sample, 9) for sample in batch]
         decoded, packed = [decode_slot(slot, "imu0") for slot in slots], b"".join(slots)
         assert [one.seq for one in decoded] == [sample.seq for sample in batch]
-        assert decode_slots(packed, "imu0") == decoded
-        assert slot_seqs(packed) == (decoded[0].seq, decoded[-1].seq)
-        assert slot_times_ns(packed) == [one.t_ns for one in decoded]
-        assert [slot for (slot,) in slots_in(packed)] == slots
-        assert [slot_quality(slot) for slot in slots] == [(one.sync, one.t_err_ns) for one in decoded]
-        assert slot_status_bits(packed) == reduce(or_, [one.status or 0 for one in decoded])
+        assert slot_format.decode_slots(packed, "imu0") == decoded
+        assert slot_format.slot_seqs(packed) == (decoded[0].seq, decoded[-1].seq)
+        assert slot_format.slot_times_ns(packed) == [one.t_ns for one in decoded]
+        assert [slot for (slot,) in slot_format.slots_in(packed)] == slots
+        assert [slot_format.slot_quality(slot) for slot in slots] == [(one.sync, one.t_err_ns) for one in decoded]
+        assert slot_format.slot_status_bits(packed) == reduce(or_, [one.status or 0 for one in decoded])
 
 
 HI91: dict[str, Any] = {

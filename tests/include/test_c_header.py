@@ -137,9 +137,7 @@ def numbers_of(s: Sample) -> list[float]:
 
 
 @pytest.mark.parametrize("language", LANGUAGES)
-def test_layout_is_that_of_the_tables_and_samples_are_read(
-    build: Build, board: Board, tmp_path: Path, language: str
-) -> None:
+def test_layout_is_that_of_the_tables(build: Build, board: Board, tmp_path: Path, language: str) -> None:
     source = tmp_path / "layout.c"
     text, expected = layout_program()
     source.write_text(text)
@@ -295,12 +293,14 @@ def test_directories_of_names(build: Build, tmp_path: Path) -> None:
     assert opened(IMUD_SHM="/" + "x" * 300) == "-6"
 
 
-def test_no_wait_for_a_fifo(build: Build, tmp_path: Path) -> None:
+def test_other_files_and_names_are_refused_without_a_wait(build: Build, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "link").symlink_to("fifo")
     (tmp_path / "directory").mkdir()
     for name in ("fifo", "link", "directory"):
         assert run_reader(build, str(tmp_path / name)) == "-3", name
+    for name, code in (("", "-6"), ("x" * 250, "-6"), ("no-such-device-of-the-tests", "-1")):
+        assert run_reader(build, name) == code, name
 
 
 @needs_root
@@ -384,11 +384,6 @@ def test_what_cannot_be_opened(build: Build, tmp_path: Path, content: bytes | No
     if content is not None:
         path.write_bytes(content)
     assert run_reader(build, str(path)) == str(code)
-
-
-@pytest.mark.parametrize(("name", "code"), [("", -6), ("x" * 250, -6), ("no-such-device-of-the-tests", -1)])
-def test_names_that_cannot_be_opened(build: Build, name: str, code: int) -> None:
-    assert run_reader(build, name) == str(code)
 
 
 @pytest.mark.live

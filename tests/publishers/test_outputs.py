@@ -179,9 +179,7 @@ def test_the_pause_doubles_and_is_short_again_after_a_long_run(rig: Rig) -> None
 
 
 @pytest.mark.parametrize("error", [ServerError("port in use"), OSError(97, "no IPv6")])
-def test_an_optional_output_that_cannot_start_is_tried_again(
-    rig: Rig, caplog: pytest.LogCaptureFixture, error: Exception
-) -> None:
+def test_an_output_that_cannot_start_tries_again(rig: Rig, caplog: pytest.LogCaptureFixture, error: Exception) -> None:
     caplog.set_level("INFO")
     rig.failing[("two", "start")] = error
     rig.start()
@@ -192,10 +190,8 @@ def test_an_optional_output_that_cannot_start_is_tried_again(
     caplog.clear()
     rig.failing |= {("two", "start"): KeyError("mode"), ("two", "close"): KeyError("thread")}
     rig.run(1)
-    new = ["two: internal error KeyError: 'mode'; imud continues without this output and tries again"]
-    assert caplog.messages == ["two: the end failed", *new], (
-        "another reason, and an error of the clean-up, are reported"
-    )
+    new = "two: internal error KeyError: 'mode'; imud continues without this output and tries again"
+    assert caplog.messages == ["two: the end failed", new], "another reason, and an error of the clean-up"
     rig.failing.clear()
     rig.run(2)
     assert rig.done("start", "close") == [("two", "start"), ("two", "close"), ("two", "start")]
@@ -267,11 +263,8 @@ def error_through(*modules: str) -> Exception:
 def test_an_error_in_a_callback_restarts_the_output_whose_code_it_passed(
     monkeypatch: pytest.MonkeyPatch, modules: tuple[str, ...], taken: str | None
 ) -> None:
-    places = {
-        "nmea0183": "imud.publishers.nmea0183", "socket": "imud.publishers.socket.server",
-        "mqtt": "imud.fleet.publisher",
-    }  # fmt: skip
-    rig = Rig(monkeypatch, places)
+    names = "publishers.nmea0183", "publishers.socket.server", "fleet.publisher"
+    rig = Rig(monkeypatch, {name: f"imud.{at}" for name, at in zip(("nmea0183", "socket", "mqtt"), names, strict=True)})
     rig.start()
     assert rig.outputs.take_error(error_through(*modules)) == (taken is not None)
     assert rig.done("close") == ([(taken, "close")] if taken else [])

@@ -18,18 +18,8 @@ from imud.model.event import EventKind
 from imud.model.ledger import LEDGER_FIELDS
 from imud.model.sample import Sync
 from imud.publishers.metrics import families
-from imud.publishers.metrics.metric import (
-    ACCELERATION,
-    BYTES,
-    CELSIUS,
-    HERTZ,
-    RADIANS,
-    RATIO,
-    SECONDS,
-    Family,
-    MetricType,
-    Snapshot,
-)
+from imud.publishers.metrics import metric as units
+from imud.publishers.metrics.metric import Family, MetricType, Snapshot
 from imud.publishers.metrics.publisher import ClientTotals, Renderer
 from imud.publishers.metrics.rings import RingView
 from imud.utc.rmc_feed import Refusal
@@ -367,7 +357,15 @@ def test_names_contain_type_and_unit() -> None:
             assert (family.type is MetricType.INFO) == family.name.endswith("_info")
             stem = family.name.removesuffix("_total")
             assert stem.endswith(family.unit.name)
-            for unit in (ACCELERATION, BYTES, CELSIUS, HERTZ, RADIANS, RATIO, SECONDS):
+            for unit in (
+                units.ACCELERATION,
+                units.BYTES,
+                units.CELSIUS,
+                units.HERTZ,
+                units.RADIANS,
+                units.RATIO,
+                units.SECONDS,
+            ):
                 assert stem.endswith("_" + unit.name) == (family.unit is unit), family.name
 
 

@@ -80,9 +80,8 @@ async def test_scrape_over_http_reads_the_status_in_the_loops_thread() -> None:
 
 @in_loop
 async def test_scrapes_are_counted_without_requests_of_the_count() -> None:
-    async with publisher(
-        publisher_context(lambda: DEVICES, 1, iter(range(10**11, 10**12, 2 * 10**9)).__next__)
-    ) as served:
+    stepping = publisher_context(lambda: DEVICES, 1, iter(range(10**11, 10**12, 2 * 10**9)).__next__)
+    async with publisher(stepping) as served:
         assert (await ask(served.port, "/scrapes"))[2] == '{"scrapes":0,"age_s":2.0}', "since the start"
         await ask(served.port)
         line, head, body = await ask(served.port, "/scrapes")
@@ -171,10 +170,8 @@ async def test_rings_of_the_daemon_are_read(board: Board) -> None:
     board.now_ns = 20_000_000
     board.publish(range(1, 11))
     board.tick(0)
-    context = publisher_context(
-        lambda: [newest], 1, lambda: board.now_ns, outputs=replace(board.context.outputs, without_ring={"other"})
-    )
-
+    outputs = replace(board.context.outputs, without_ring={"other"})
+    context = publisher_context(lambda: [newest], 1, lambda: board.now_ns, outputs=outputs)
     for motion in (True, False):
         async with publisher(context, motion=motion) as served:
             body = (await ask(served.port))[2]
@@ -200,46 +197,34 @@ async def test_paths_and_methods() -> None:
 
 
 @in_loop
-async def test_a_blocked_loop_causes_status_503() -> None:
+async def test_a_blocked_loop_causes_status_503_and_close_does_not_wait() -> None:
     async with publisher(context(), snapshot_s=0.05) as served:
         with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
             connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
             assert b"503 Service Unavailable" in read_all(connection)  # this read blocks the event loop
-
-
-@in_loop
-async def test_close_while_a_scrape_waits_for_the_loop_does_not_wait() -> None:
-    served = MetricsPublisher(MetricsOptions(port=0), context(), snapshot_s=3600)
-    served.start()
-    with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
+    other = MetricsPublisher(MetricsOptions(port=0), context(), snapshot_s=3600)
+    other.start()
+    with socket.create_connection(("127.0.0.1", other.port), LIMIT_S) as connection:
         connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
-        served.close()
+        other.close()
         assert b"200" not in read_all(connection)
 
 
 @in_loop
-async def test_disabled_opens_nothing_and_closes_twice() -> None:
-    async with publisher(context(), enabled=False) as served:
-        assert served.port == 0
-
-
-@in_loop
-async def test_port_in_use_is_reported() -> None:
+async def test_a_port_in_use_a_port_after_close_and_no_port() -> None:
     async with publisher(context()) as first:
         second = MetricsPublisher(MetricsOptions(port=first.port), context())
         with pytest.raises(ServerError, match=rf"127\.0\.0\.1 port {first.port}: Address already in use; .*ss -ltnp"):
             second.start()
         second.close()
         assert (await ask(first.port))[0] == "HTTP/1.1 200 OK"
-
-
-@in_loop
-async def test_port_is_free_after_close() -> None:
     async with publisher(context()) as first:
         port = first.port
         await ask(port)
     async with publisher(context(), port=port) as second:
         assert second.port == port
+    async with publisher(context(), enabled=False) as served:
+        assert served.port == 0
 
 
 def test_the_address_is_checked() -> None:

@@ -80,9 +80,6 @@ def test_missing_values_are_absent() -> None:
     assert few.accel_norm_m_s2 == pytest.approx(G)
     assert few.vibration_rms_m_s2 is few.vibration_peak_m_s2 is None
     assert motion(slots([(0.0, 0.0, G)] * 8, rate_hz=10)).vibration_rms_m_s2 is not None
-
-
-def test_samples_without_acceleration_are_ignored() -> None:
     data: list[Vector3 | None] = [(0.5 if n % 4 == 0 else -0.5, 0.0, G) if n % 2 == 0 else None for n in range(100)]
     found = motion(slots(data))
     assert found.vibration_rms_m_s2 == pytest.approx((0.5, 0.0, 0.0), abs=1e-6)
@@ -114,19 +111,20 @@ def test_a_ring_that_has_wrapped_is_read_in_order(board: Board) -> None:
     assert found.motion.accel_norm_m_s2 == pytest.approx(math.hypot(123.0, 123.25, 123.5))
 
 
-def test_only_samples_of_the_snapshot_are_used(board: Board) -> None:
+def test_only_samples_of_the_snapshot_with_consecutive_numbers_are_used(board: Board) -> None:
     board.publish(range(1, 41))
     board.now_ns = 0
     found = read(board, 30)
     assert found.motion is not None
     assert found.motion.span_ns == 29 * NS_PER_MS
     assert read(board, 0).motion is None
+    assert read(board, 30).motion is not None
+    board.poke(4096 + 20 * SLOT_BYTES, (7).to_bytes(8, "little"))
+    assert read(board, 30).motion is None
 
 
 @pytest.mark.parametrize("more", [1, 10, 54, 63, 64, 65, 500])
-def test_slots_overwritten_during_the_copy_are_ignored(
-    board: Board, more: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_slots_overwritten_in_the_copy_are_ignored(board: Board, more: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The writer writes `more` samples during the copy. imud ignores slots that can be incomplete."""
     board.publish(range(1, 65))
     board.now_ns = 0
@@ -151,18 +149,11 @@ def test_slots_overwritten_during_the_copy_are_ignored(
         assert found.motion is None
 
 
-def test_slots_without_consecutive_numbers_are_ignored(board: Board) -> None:
-    board.publish(range(1, 31))
-    board.now_ns = 0
-    assert read(board, 30).motion is not None
-    board.poke(4096 + 20 * SLOT_BYTES, (7).to_bytes(8, "little"))
-    assert read(board, 30).motion is None
-
-
 def test_a_ring_is_written_if_its_file_exists_and_has_a_heartbeat(board: Board) -> None:
     board.publish(range(1, 31))
     board.tick()
     assert read(board, 30).written
+    assert read(board, 30, motion=False) == RingView(True), "the option motion"
     board.now_ns += NS_PER_S
     assert not read(board, 30).written
     board.tick()
@@ -187,12 +178,6 @@ def test_a_pause_follows_each_number_of_values(tmp_path: Path) -> None:
         reader.read({DEVICE: str(board.path)}, {DEVICE: count}, 0)
         assert len(pauses) == expected
         board.publisher.close()
-
-
-def test_the_option_motion_disables_motion(board: Board) -> None:
-    board.publish(range(1, 31))
-    board.tick()
-    assert read(board, 30, motion=False) == RingView(True)
 
 
 def test_scrapes_within_one_second_share_one_reading(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,11 +211,8 @@ def test_the_span_is_the_time_since_the_previous_reading_at_least_ten_seconds(tm
         return view.motion.span_ns / NS_PER_S
 
     for seq in range(1, 4001, 100):  # samples at 100 Hz until 40 s
-        data = [
-            Sample(DEVICE, n, n * 10 * NS_PER_MS, 1, Sync.ARRIVAL, 0, 0, accel_m_s2=(0.0, 0.0, G))
-            for n in range(seq, seq + 100)
-        ]
-        board.publish_samples(data)
+        times = [(n, n * 10 * NS_PER_MS) for n in range(seq, seq + 100)]
+        board.publish_samples([Sample(DEVICE, n, t, 1, Sync.ARRIVAL, 0, 0, accel_m_s2=(0, 0, G)) for n, t in times])
     assert span_s(40.0) == 10.0
     assert span_s(41.5) == 8.5  # the last sample is at 40 s, the span starts at 31.5 s
     reader = RingReader(lambda: None, motion=True)

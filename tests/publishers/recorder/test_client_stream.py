@@ -123,9 +123,14 @@ def test_only_selected_devices_are_recorded_until_the_client_disconnects() -> No
     bench.close()
     assert bench.source.listening == []
     assert bench.workers[0].ended
+    ours, theirs = stream_pair()
+    with ours, theirs:
+        assert ours.recv(1) == b""
+        with pytest.raises(BrokenPipeError):
+            theirs.send(b"?", socket.MSG_NOSIGNAL)
 
 
-def test_a_client_without_progress_is_disconnected_after_the_end() -> None:
+def test_a_client_without_progress_and_an_internal_error_end_the_recording() -> None:
     bench = StreamBench()
     for _ in range(100):
         bench.source.deliver(100_000)
@@ -137,6 +142,11 @@ def test_a_client_without_progress_is_disconnected_after_the_end() -> None:
     bench.clock.advance(1)
     bench.workers[0].work()
     assert bench.recording.ended
+    bench.close()
+    bench = StreamBench()
+    bench.workers[0].failed(ZeroDivisionError("a mistake"))
+    with pytest.raises(ZeroDivisionError):
+        bench.recording.tick(0)
     bench.close()
 
 
@@ -156,19 +166,3 @@ def test_waiting_records_are_sent_when_imud_stops(monkeypatch: pytest.MonkeyPatc
     assert stuck.recording.ended
     bench.close()
     stuck.close()
-
-
-def test_an_internal_error_in_the_thread_ends_the_daemon() -> None:
-    bench = StreamBench()
-    bench.workers[0].failed(ZeroDivisionError("a mistake"))
-    with pytest.raises(ZeroDivisionError):
-        bench.recording.tick(0)
-    bench.close()
-
-
-def test_the_daemon_ignores_data_from_the_client() -> None:
-    ours, theirs = stream_pair()
-    with ours, theirs:
-        assert ours.recv(1) == b""
-        with pytest.raises(BrokenPipeError):
-            theirs.send(b"?", socket.MSG_NOSIGNAL)

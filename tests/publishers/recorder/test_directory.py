@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -19,9 +20,8 @@ def filled(folder: Path, keep_bytes: int, *sizes: int) -> RecordingDirectory:
 
 def test_names_sort_by_time_and_are_recognized(tmp_path: Path) -> None:
     directory = filled(tmp_path, 1000, 10, 20)
-    assert directory.new_file(1_763_717_507 * NS_PER_S, 0x1_0000_00AB, 12).name == (
-        "20251121T093147Z-000000ab-000012.imudrec"
-    )
+    name = directory.new_file(1_763_717_507 * NS_PER_S, 0x1_0000_00AB, 12).name
+    assert name == "20251121T093147Z-000000ab-000012.imudrec"
     assert [file.size for file in directory.files()] == [10, 20]
     assert all(NAME.fullmatch(file.name) for file in directory.files())
 
@@ -33,6 +33,15 @@ def test_the_oldest_are_removed_until_there_is_room(tmp_path: Path) -> None:
     assert removed.endswith("-000000.imudrec")
     assert [file.size for file in directory.files()] == [30, 20]
     assert directory.removed == 1
+    directory = filled(tmp_path / "measured", 100, 40, 30, 20)
+    assert directory.kept_bytes == 0
+    directory.measure()
+    assert directory.kept_bytes == 90
+    directory.in_use.add(directory.files()[-1].name)
+    directory.make_room(20)
+    assert directory.kept_bytes == 30  # imud removed the oldest file, and the newest is open
+    directory.add(7)
+    assert directory.kept_bytes == 37
 
 
 def test_the_open_file_and_other_files_are_not_removed(tmp_path: Path) -> None:
@@ -46,18 +55,6 @@ def test_the_open_file_and_other_files_are_not_removed(tmp_path: Path) -> None:
     directory.make_room(0)
     assert [file.name for file in directory.files()] == [newest]
     assert all(path.exists() for path in foreign)
-
-
-def test_the_measured_size_excludes_open_files(tmp_path: Path) -> None:
-    directory = filled(tmp_path, 100, 40, 30, 20)
-    assert directory.kept_bytes == 0
-    directory.measure()
-    assert directory.kept_bytes == 90
-    directory.in_use.add(directory.files()[-1].name)
-    directory.make_room(20)
-    assert directory.kept_bytes == 30  # imud removed the oldest file, and the newest is open
-    directory.add(7)
-    assert directory.kept_bytes == 37
 
 
 CASES = {
@@ -88,9 +85,8 @@ def test_the_order_of_removal_does_not_depend_on_the_wall_clock(
         path = tmp_path / f"20260101T000000Z-{run:0>8}-{number:06d}{kind}.imudrec"
         path.write_bytes(bytes(10))
         os.utime(path, (time_s, time_s))
-    (tmp_path / ".runs").write_bytes(
-        b"".join(b"%08s\n" % run.encode("latin-1") for run in known.split()).replace(b" ", b"0")
-    )
+    runs = b"".join(b"%08s\n" % run.encode("latin-1") for run in known.split())
+    (tmp_path / ".runs").write_bytes(runs.replace(b" ", b"0"))
     directory = RecordingDirectory(tmp_path, 0)
     following = max([number + 1 for run, number, kind, _ in files if (run, kind) == ("01", "")], default=0)
     assert directory.begin_run(1) == following  # the files after a reload continue the numbers
@@ -112,9 +108,7 @@ def test_files_of_this_run_have_the_order_of_their_creation(tmp_path: Path) -> N
 
 
 def test_the_order_of_runs_after_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_arguments: object) -> None:
-        raise OSError
-
+    refuse = Mock(side_effect=OSError)
     directory, runs = RecordingDirectory(tmp_path, 100), tmp_path / ".runs"
     with monkeypatch.context() as patch:
         patch.setattr("imud.publishers.recorder.directory.replace_file", refuse)

@@ -39,20 +39,13 @@ def test_both_write_to_one_directory_and_one_alone_does_not_start_the_other(tmp_
         made.publish(batch("bow"))
         made.close()
         made.close()
-    ends = [
-        sorted(file.name.split("-", 2)[2] for file in (tmp_path / str(one)).glob("*.imudrec")) for one in (True, False)
-    ]
+    files = [(tmp_path / str(one)).glob("*.imudrec") for one in (True, False)]
+    ends = [sorted(file.name.split("-", 2)[2] for file in each) for each in files]
     for file in tmp_path.rglob("*.imudrec"):
         kinds = [(record.kind, record.device) for record in records_in(file)]
         assert [device for kind, device in kinds if kind == Kind.EVENT] == [7]
         assert kinds.count((Kind.DEVICE, 0)) == 2
     assert ends == [["000000-snapshot.imudrec", "000000.imudrec"], ["000000-snapshot.imudrec"]]
-
-
-def test_the_output_is_enabled_for_either_recorder() -> None:
-    assert not PUBLISHER.wanted(RecorderOptions())
-    assert PUBLISHER.wanted(RecorderOptions(enabled=True))
-    assert PUBLISHER.wanted(RecorderOptions(flight=FlightOptions(enabled=True)))
 
 
 def test_a_failed_start_leaves_no_recorder_running(tmp_path: Path) -> None:
@@ -63,6 +56,9 @@ def test_a_failed_start_leaves_no_recorder_running(tmp_path: Path) -> None:
     with pytest.raises(ServerError):
         made.start()
     assert (bench.context.outputs.recorders, bench.context.outputs.snapshots) == ([], [])
+    assert not PUBLISHER.wanted(RecorderOptions())
+    assert PUBLISHER.wanted(RecorderOptions(enabled=True))
+    assert PUBLISHER.wanted(RecorderOptions(flight=FlightOptions(enabled=True)))
 
 
 RETRY_NS, CHECK_NS = 60 * NS_PER_S, NS_PER_S
@@ -173,9 +169,7 @@ def test_a_file_contains_the_losses_and_then_the_states(tmp_path: Path, monkeypa
     assert f"{lost.records} records were dropped" in event.message
 
 
-def test_a_full_disk_causes_one_event_and_recording_continues_with_free_space(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_causes_one_event_and_recording_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = RecorderBench(tmp_path)
     bench.tick()
     write = os.write
@@ -214,16 +208,13 @@ def test_old_files_are_removed_for_new_files(tmp_path: Path) -> None:
     assert bench.recorder.status().files_removed >= 3
 
 
-def test_an_invalid_directory_and_a_limit_below_two_files_are_rejected(tmp_path: Path) -> None:
+def test_invalid_options_are_rejected_and_an_error_of_the_thread_ends_the_daemon(tmp_path: Path) -> None:
     (tmp_path / "recordings").write_bytes(b"")
     with pytest.raises(ServerError, match="recordings"):
         RecorderBench(tmp_path)
     with pytest.raises(ValueError, match="room for two files of file_mb"):
         RecorderOptions(keep_gb=0.1)
-
-
-def test_an_internal_error_in_the_thread_ends_the_daemon(tmp_path: Path) -> None:
-    bench = RecorderBench(tmp_path)
+    bench = RecorderBench(tmp_path / "valid")
     bench.workers[0].failed(ZeroDivisionError("a mistake"))
     with pytest.raises(ZeroDivisionError):
         bench.tick(work=False)
