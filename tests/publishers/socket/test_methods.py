@@ -33,7 +33,7 @@ LINE_MAX_BYTES, DEVICES_PER_PIECE, BYTES_BURST = 65_536, 8, 1 << 20
         (b"[" * 60_000, -32700, None, "nested too deeply"),
         (b'{"jsonrpc":"2.0","id":1,"method":"watch","params":{"rate_hz":NaN}}', -32700, None, "not JSON"),
         (b'{"jsonrpc":"2.0","id":1,"method":"watch","params":{"rate_hz":1e999}}', -32700, None, "not JSON"),
-        (b'{"jsonrpc":"2.0","id":1,"method":"x","params":' + b'{"a":' * 974 + b"1" + b"}" * 975, -32700, None, "neste"),
+        (b'{"jsonrpc":"2.0","id":1,"method":"x","params":' + b'{"a":' * 974 + b"1" + b"}" * 975, -32700, None, "deep"),
         (b"[" + b"1," * 3000 + b"1]", -32700, None, "too many values: expected at most 2048"),
         (b"7", -32600, None, "got a number"),
         (b'[{"jsonrpc":"2.0","id":1,"method":"devices"}]', -32600, None, "one JSON object per line, got an array"),
