@@ -247,15 +247,13 @@ TOO_MUCH = 1 << 62
 @pytest.mark.parametrize(
     "bad",
     [
-        msgspec.structs.replace(state(3), boot="x" * 65),
-        msgspec.structs.replace(state(3), reason="\0"),
+        msgspec.structs.replace(state(3), boot="x" * 65), msgspec.structs.replace(state(3), reason="\0"),
         msgspec.structs.replace(state(3), clock=GatewayClock(TOO_MUCH, 0, synchronised=True)),
         msgspec.structs.replace(state(3), clock=GatewayClock(0, -TOO_MUCH, synchronised=True)),
         msgspec.structs.replace(state(3), clock=GatewayClock(0, 0, synchronised=True, error_ns=TOO_MUCH)),
-        msgspec.structs.replace(state(3), positions=[StreamPosition("", "bow", "samples", 1, 2)]),
-        state(TOO_MUCH),
+        msgspec.structs.replace(state(3), positions=[StreamPosition("", "bow", "samples", 1, 2)]), state(TOO_MUCH),
     ],
-)
+)  # fmt: skip
 def test_values_that_no_database_can_store_are_rejected(bad: GatewayState) -> None:
     with pytest.raises(ValueError, match="expected"):
         decode_state(msgspec.json.encode(bad))

@@ -254,7 +254,7 @@ def test_a_reader_names_the_refusal_of_a_broker(replies: tuple[bytes, ...], word
         asyncio.run(run(broker))
 
 
-def test_a_reader_counts_messages_without_acknowledgement_and_waits_a_limited_time(
+def test_a_reader_counts_refused_messages_and_waits_a_limited_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async def run(broker: Broker) -> None:

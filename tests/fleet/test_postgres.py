@@ -318,9 +318,7 @@ def send(gateway: SendingGateway, sent: int) -> int:
     return sent + 3000
 
 
-def test_rows_are_exactly_once_after_random_kills(
-    database: str, collecting: Collecting, gateway: SendingGateway
-) -> None:
+def test_rows_are_exactly_once_after_kills(database: str, collecting: Collecting, gateway: SendingGateway) -> None:
     draw, sent = random.Random(5), 0
     for _ in range(3):
         sent = send(gateway, sent)

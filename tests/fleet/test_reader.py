@@ -378,9 +378,7 @@ async def test_a_reset_during_an_acknowledgement_is_a_loss_and_removes_the_descr
 
 
 @in_loop
-async def test_an_error_of_the_event_loop_does_not_prevent_the_end(
-    broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_errors_of_the_loop_do_not_prevent_the_end(broker: Mosquitto, monkeypatch: pytest.MonkeyPatch) -> None:
     """epoll raises for a closed descriptor if the loop waited for reading and writing."""
     connection = await opened(broker.port)
     waiting = asyncio.ensure_future(connection.next())

@@ -136,9 +136,8 @@ def test_limits_of_a_block() -> None:
 def test_a_block_with_another_number_is_whole() -> None:
     encoder = recording.BlockEncoder()
     blocks = [encoder.encode(content) for content in (b"a", b"b" * 1000)]
-    found = list(
-        recording.BlockReader(io.BytesIO(recording.renumbered(blocks[1], 0) + recording.renumbered(blocks[0], 1)))
-    )
+    data = recording.renumbered(blocks[1], 0) + recording.renumbered(blocks[0], 1)
+    found = list(recording.BlockReader(io.BytesIO(data)))
     assert [(block.number, block.content) for block in found] == [(0, b"b" * 1000), (1, b"a")]
     assert recording.renumbered(blocks[1], 1) == blocks[1]
 
@@ -172,9 +171,8 @@ def test_blocks_inside_a_cut_block_are_read_and_the_first_bad_byte_is_known() ->
 
 
 def session(version: int = records.VERSION) -> bytes:
-    return records.encode_object(
-        Kind.SESSION, records.NO_DEVICE, SessionRecord(version, "0.1.0", "3.11", "gateway", 5, 0, 10, 20)
-    )
+    made = SessionRecord(version, "0.1.0", "3.11", "gateway", 5, 0, 10, 20)
+    return records.encode_object(Kind.SESSION, records.NO_DEVICE, made)
 
 
 END = records.encode_object(Kind.END, records.NO_DEVICE, EndRecord(1, 2, "stopped"))
@@ -206,7 +204,7 @@ def test_round_trip_of_records_over_several_blocks() -> None:
     assert reader.problems == []
 
 
-def test_a_file_without_an_end_is_reported() -> None:
+def test_a_missing_end_damage_and_missing_blocks_are_reported() -> None:
     data = written(session(), *reads(10), END, each=True)
     reader = recording.RecordingReader(io.BytesIO(data[:-5]), "a.rec")
     assert len(list(reader)) == 11
@@ -214,19 +212,13 @@ def test_a_file_without_an_end_is_reported() -> None:
     assert (reader.ended, reader.is_damaged) == (False, False)
     assert "incomplete" in reader.problems[0]
     assert "no regular end" in reader.problems[1]
-
-
-def test_damage_and_missing_blocks_are_named() -> None:
-    data = bytearray(written(session(), *reads(10), END, each=True))
-    data[400] ^= 1
-    reader = recording.RecordingReader(io.BytesIO(bytes(data)), "a.rec")
+    damaged = bytearray(written(session(), *reads(10), END, each=True))
+    damaged[400] ^= 1
+    reader = recording.RecordingReader(io.BytesIO(bytes(damaged)), "a.rec")
     assert len(list(reader)) == 11
     assert "are damaged" in reader.problems[0]
     assert reader.problems[1] == "missing blocks according to their numbers: 1"
     assert reader.is_damaged
-
-
-def test_a_block_without_records_costs_only_itself() -> None:
     reader = recording.RecordingReader(io.BytesIO(written(session(), b"\xff" * 9, *reads(2), END, each=True)), "a.rec")
     assert len(list(reader)) == 4
     assert (reader.records_unreadable, reader.blocks_read, reader.is_damaged, reader.ended) == (1, 5, True, True)

@@ -137,9 +137,7 @@ CALLS: dict[str, Callable[[Rig], None]] = {
 
 @pytest.mark.parametrize("method", CALLS)
 @pytest.mark.parametrize("name", ["one", "must"])
-def test_an_exception_in_a_method_restarts_only_this_output(
-    rig: Rig, caplog: pytest.LogCaptureFixture, name: str, method: str
-) -> None:
+def test_an_exception_restarts_its_output(rig: Rig, caplog: pytest.LogCaptureFixture, name: str, method: str) -> None:
     rig.start()
     rig.failing[(name, method)] = OverflowError("too large")
     CALLS[method](rig)

@@ -103,9 +103,7 @@ def test_a_calibration_is_seen_without_the_token_and_stopped_with_it(page: Page,
         assert [one for one in page.problems() if "401" not in one] == []
 
 
-def test_the_sphere_shows_covered_cells_and_the_page_shows_errors(
-    page: Page, site: tuple[RunningDaemon, str], token: str
-) -> None:
+def test_the_sphere_shows_covered_cells_and_errors(page: Page, site: tuple[RunningDaemon, str], token: str) -> None:
     daemon, _ = site
     with serving_web(daemon.socket, "--token-file", token) as url:
         open_page(page, url, "bow")

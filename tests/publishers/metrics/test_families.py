@@ -357,15 +357,8 @@ def test_names_contain_type_and_unit() -> None:
             assert (family.type is MetricType.INFO) == family.name.endswith("_info")
             stem = family.name.removesuffix("_total")
             assert stem.endswith(family.unit.name)
-            for unit in (
-                units.ACCELERATION,
-                units.BYTES,
-                units.CELSIUS,
-                units.HERTZ,
-                units.RADIANS,
-                units.RATIO,
-                units.SECONDS,
-            ):
+            motion = units.ACCELERATION, units.HERTZ, units.RADIANS, units.RATIO
+            for unit in (*motion, units.BYTES, units.CELSIUS, units.SECONDS):
                 assert stem.endswith("_" + unit.name) == (family.unit is unit), family.name
 
 

@@ -195,9 +195,7 @@ async def test_reading_is_not_enough(server: SocketServer, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("method", ["record.start", "record.snapshot"])
 @alone()
-async def test_a_failed_request_leaves_no_descriptor(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
-) -> None:
+async def test_a_failed_request_leaves_no_fd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str) -> None:
     fail = Mock(side_effect=RuntimeError("can't start new thread"))
     refuse = Mock(side_effect=ServerError("nothing is kept: it has just begun"))
     no_socket = Mock(side_effect=OSError(24, "Too many open files"))

@@ -27,8 +27,7 @@ LINE_MAX_BYTES, DEVICES_PER_PIECE, BYTES_BURST = 65_536, 8, 1 << 20
 @pytest.mark.parametrize(
     ("line", "code", "request_id", "words"),
     [
-        (b"{", -32700, None, "not JSON"),
-        (b"\xff\xfe", -32700, None, "not JSON"),
+        (b"{", -32700, None, "not JSON"), (b"\xff\xfe", -32700, None, "not JSON"),
         (b'{"jsonrpc":"2.0","id":1,"method":"x\xff"}', -32700, None, "not JSON"),
         (b"[" * 60_000, -32700, None, "nested too deeply"),
         (b'{"jsonrpc":"2.0","id":1,"method":"watch","params":{"rate_hz":NaN}}', -32700, None, "not JSON"),
@@ -37,8 +36,7 @@ LINE_MAX_BYTES, DEVICES_PER_PIECE, BYTES_BURST = 65_536, 8, 1 << 20
         (b"[" + b"1," * 3000 + b"1]", -32700, None, "too many values: expected at most 2048"),
         (b"7", -32600, None, "got a number"),
         (b'[{"jsonrpc":"2.0","id":1,"method":"devices"}]', -32600, None, "one JSON object per line, got an array"),
-        (b"{}", -32600, None, '"2.0"'),
-        (b'{"jsonrpc":2.0,"id":1,"method":"devices"}', -32600, 1, '"2.0"'),
+        (b"{}", -32600, None, '"2.0"'), (b'{"jsonrpc":2.0,"id":1,"method":"devices"}', -32600, 1, '"2.0"'),
         (b'{"jsonrpc":"2.0","id":"a"}', -32600, "a", "method: expected a string, got null"),
         (b'{"jsonrpc":"2.0","id":1.5,"method":[]}', -32600, 1.5, "method: expected a string, got an array"),
         (b'{"jsonrpc":"2.0","id":true,"method":"devices"}', -32600, None, "id: expected"),

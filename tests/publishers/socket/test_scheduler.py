@@ -254,9 +254,7 @@ async def test_errors_end_only_their_client(
 
 @pytest.mark.parametrize("where", ["evict", "on_ready", "wanted_events"])
 @in_context("rig", scheduling)
-async def test_an_error_outside_a_piece_ends_its_client(
-    rig: SchedulerBench, where: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_other_errors_end_their_client(rig: SchedulerBench, where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """No exception may reach the handler of the event loop, which ends the daemon."""
     bad = rig.add("bad", 1, 10_000 if where == "evict" else 1, 5 * MS)
     monkeypatch.setattr(bad, where, Mock(side_effect=ZeroDivisionError(where)))

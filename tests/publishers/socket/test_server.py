@@ -334,9 +334,7 @@ async def test_an_error_while_a_client_is_greeted_ends_only_this_client(
 
 @pytest.mark.parametrize("what", ["wake", "tick", "event", "reply"])
 @in_server()
-async def test_an_error_in_the_code_for_one_client_ends_only_this_client(
-    server: SocketServer, monkeypatch: pytest.MonkeyPatch, what: str
-) -> None:
+async def test_an_error_ends_only_this_client(server: SocketServer, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
     socket_rig.done_late.clear()
     bad, good = await Peer.greeted(server), await Peer.greeted(server)
     connection, _ = server.hub.connections.values()
