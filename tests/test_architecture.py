@@ -409,17 +409,6 @@ def test_time_is_an_argument() -> None:
     assert not wrong, wrong
 
 
-def test_the_search_for_clocks_finds_them(tmp_path: Path) -> None:
-    file = tmp_path / "module.py"
-    file.write_text(
-        "import asyncio, time\nfrom datetime import datetime\nfrom time import monotonic_ns as now\n"
-        "a = time.time_ns()\nb = now()\nc = datetime.now()\nd = asyncio.get_running_loop().time()\n"
-        "def f(now_ns=time.monotonic_ns): time.sleep(1); return now_ns()\n"
-    )
-    lines = sorted(int(use.partition(":")[0]) for use in clock_uses(file))
-    assert lines == [4, 5, 6, 7, 8]
-
-
 # --- tests ------------------------------------------------------------------------------------------------------------
 
 

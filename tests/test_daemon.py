@@ -142,9 +142,7 @@ def test_outputs_do_not_read_the_clocks_that_stamp_samples(monkeypatch: pytest.M
 
 
 @in_loop
-async def test_the_daemon_has_no_other_device_and_ticks_twice_per_second_until_a_part_needs_more(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_an_unknown_device_and_ticks_at_two_rates(monkeypatch: pytest.MonkeyPatch) -> None:
     alarm, daemon = Mock(is_set=True), Daemon(EMPTY)
     monkeypatch.setattr("imud.daemon.Alarm", lambda _owner: alarm)
     running = asyncio.create_task(daemon.run())

@@ -57,9 +57,8 @@ def test_mistakes_are_explained(daemon: RunningDaemon, cli: Cli, monkeypatch: py
     cli.refuses("cannot save: the result lasts until power-off", *words, "heading", "--yes", "--save")
     cli.refuses("expected 9-axis mode", *words, "magnetometer", "--yes")
     cli.refuses("cannot ask for confirmation without a terminal; confirm with --yes", *words, "level")
-    asked = iter(
-        ["Press Enter to start the calibration, or type n", "Start to turn the device, then press Enter to start"]
-    )
+    turn = "Start to turn the device, then press Enter to start"
+    asked = iter(["Press Enter to start the calibration, or type n", turn])
 
     def refuse(question: str) -> str:
         assert question.startswith(next(asked))

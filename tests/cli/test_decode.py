@@ -43,9 +43,7 @@ def test_one_object_per_message(tmp_path: Path, cli: Cli) -> None:
     assert (ledger["bytes_in"], ledger["frames_in_samples"]) == (82 + 4 + 82 + 1, 1)
 
 
-def test_standard_input_a_file_without_a_message_and_none(
-    tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_standard_input_and_files_without_a_message(tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "noise").write_bytes(bytes(range(128, 256)) * 8)
     assert json.loads(cli(*DECODE, tmp_path / "noise", status=1).err)["bytes_in"] == 1024
     error = cli(*DECODE, tmp_path / "none", status=2).err

@@ -88,7 +88,7 @@ def pasted(*lines: str) -> str:
 
 
 @pytest.mark.live
-def test_children_that_end_too_early_are_named(
+def test_children_that_end_early(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(command, "START_LIMIT_S", LIMIT_S)

@@ -32,13 +32,11 @@ pytestmark = pytest.mark.usefixtures("in_kolkata")
 
 
 def test_a_line_and_an_object_have_local_time_and_priority() -> None:
-    assert as_text(printed(DOWN, OFFSET_NS)) == (
-        "2026-09-21T19:43:25.123+05:30 warning bow: down: the adapter was pulled out"
-    )
+    text = as_text(printed(DOWN, OFFSET_NS))
+    assert text == "2026-09-21T19:43:25.123+05:30 warning bow: down: the adapter was pulled out"
     event = Event(0, "", EventKind.CONFIGURATION, "read anew\nand more")
-    assert as_text(printed(event, OFFSET_NS)) == (
-        r"2026-09-21T19:43:20.123+05:30 warning imud: configuration: read anew\nand more"
-    )
+    text = as_text(printed(event, OFFSET_NS))
+    assert text == r"2026-09-21T19:43:20.123+05:30 warning imud: configuration: read anew\nand more"
     assert json.loads(as_json(printed(DOWN, OFFSET_NS))) == {
         "time": "2026-09-21T19:43:25.123+05:30", "priority": "warning", "t_ns": 5 * NS_PER_S, "device": "bow",
         "kind": "down", "message": "the adapter was pulled out", "detail": {"errno": 5},
@@ -134,7 +132,7 @@ def test_follow_waits_for_the_daemon_and_says_so_once(tmp_path: Path, capsys: py
     assert lines[0].endswith("; waiting for the daemon")
 
 
-def test_only_follow_goes_on_after_a_lost_connection_and_a_timeout(
+def test_follow_goes_on_after_a_lost_connection_and_a_timeout(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     silent, lost = TimeoutError("waited in vain for devices"), LinkMissing("the daemon closed the connection")

@@ -332,9 +332,7 @@ def test_a_damaged_recording_is_exported_as_far_as_it_goes(recorded: Recorded, t
     assert len(rows(out.read_text())) >= len(recorded.samples)
 
 
-def test_files_that_are_no_recordings_and_options_that_mean_nothing(
-    tmp_path: Path, cli: Cli, recorded: Recorded
-) -> None:
+def test_files_and_options_that_are_refused(tmp_path: Path, cli: Cli, recorded: Recorded) -> None:
     (tmp_path / "noise").write_bytes(b"\x00" * 500)
     cli("export", "--to", "csv", tmp_path / "noise", status=1)
     cli.refuses("expected a recording or a capture", "export", "--to", "csv", str(tmp_path / "none"))
@@ -353,7 +351,7 @@ def test_files_that_are_no_recordings_and_options_that_mean_nothing(
         cli.refuses(expected, "export", *options, recorded.file)
 
 
-def test_a_full_disk_is_named_and_only_mcap_needs_the_library(
+def test_a_full_disk_and_a_missing_library(
     recorded: Recorded, monkeypatch: pytest.MonkeyPatch, cli: Cli, tmp_path: Path
 ) -> None:
     for to in ("csv", "mcap"):

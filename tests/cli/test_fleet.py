@@ -34,9 +34,8 @@ def lines(process: ImudProcess, number: int) -> list[dict[str, Any]]:
 @pytest.mark.live
 def test_lines_come_and_the_ledger_is_printed_at_the_end(broker: Mosquitto) -> None:
     gateway = SendingGateway(broker.port)
-    gateway.send_state(
-        GatewayState(v=1, online=True, boot="1", positions=[StreamPosition("1", "bow", "samples", 1, 9)])
-    )
+    positions = [StreamPosition("1", "bow", "samples", 1, 9)]
+    gateway.send_state(GatewayState(v=1, online=True, boot="1", positions=positions))
     with collecting(broker) as process:
         while not any("SUBSCRIBE" in line or "imud-reader-collector 1 imud" in line for line in broker.log):
             assert process.process.poll() is None

@@ -180,9 +180,7 @@ def test_a_refused_assignment_changes_nothing(modbus: Commands) -> None:
     assert asleep.flash == asleep.settings, "another device at the new address is not the wanted device"
 
 
-def test_invalid_addresses_and_identities_for_a_terminal(
-    cli: Cli, modbus: Commands, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_invalid_addresses_and_identities(cli: Cli, modbus: Commands, monkeypatch: pytest.MonkeyPatch) -> None:
     for text in ("0-5", "5-1", "1-248", "x", "1-x", ""):
         cli.refuses("expected", "modbus", "scan", "/dev/null", "--addresses", text)
     said = Identity("HI\x1b[2J14\n", "\x9b1A", "1.6.9")

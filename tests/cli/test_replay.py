@@ -252,7 +252,7 @@ def test_an_interface_is_for_logs_of_a_can_bus(tmp_path: Path, cli: Cli) -> None
 @pytest.mark.parametrize("second_ns", [3_300_000, 5_000_000])
 @every_command
 @every_driver
-def test_two_devices_with_one_address_are_reported(
+def test_two_devices_of_one_address_are_told(
     driver: str, command: str, second_ns: int, tmp_path: Path, cli: Cli
 ) -> None:
     """The second device at opposite phases is visible only in the values or in INDEX."""

@@ -74,9 +74,8 @@ def test_check_has_notes(tmp_path: Path, cli: Cli) -> None:
         f"devices:\n  a: {{driver: hipnuc-uart, replay: {{path: {there}, speed: maximum}}}}\n"
         f"  b: {{driver: hipnuc-uart, replay: {{path: {there}2}}}}\n"
     )
-    assert cli("check", file).out.splitlines()[1:] == [
-        f"{file}:3: note: b: {there}2 does not exist; imud waits for the file"
-    ]
+    notes = cli("check", file).out.splitlines()[1:]
+    assert notes == [f"{file}:3: note: b: {there}2 does not exist; imud waits for the file"]
     file = tmp_path / "imud.yaml"
     file.write_text(
         "devices: {bow: {uart: {port: /dev/a}}, mast: {enabled: false, uart: {port: /dev/b}}}\n"

@@ -43,9 +43,8 @@ def test_from_difference_to_agreement(daemon: RunningDaemon, words: Words, cli: 
     # report
     out = cli(*words, status=1).out
     assert out.splitlines()[0].split() == ["SETTING", "DECLARED", "ACTUAL"]
-    assert [line.split() for line in out.splitlines() if line.startswith("mode")] == [
-        ["mode", "9-axis", "6-axis", "differs"]
-    ]
+    (mode,) = [line.split() for line in out.splitlines() if line.startswith("mode")]
+    assert mode == ["mode", "9-axis", "6-axis", "differs"]
     assert "2 of 11 differ; set them with --apply" in out
     assert "2.2.4" not in out
     assert "2.2.4" in cli(*words, "--verbose", status=1).out
@@ -123,9 +122,7 @@ def test_mistakes_are_explained(words: Words, cli: Cli, tmp_path: Path) -> None:
         cli.refuses(problem, *words, "--restore", file)
 
 
-def test_a_backup_of_another_device_is_told_of_and_none_is_overwritten_unasked(
-    words: Words, cli: Cli, tmp_path: Path
-) -> None:
+def test_a_backup_of_another_device_and_an_existing_backup(words: Words, cli: Cli, tmp_path: Path) -> None:
     file = tmp_path / "other.yaml"
     file.write_text(
         'driver: hipnuc-uart\nidentity: {product: "CH020", serial_number: "77"}\nsettings: {mode: 6-axis, strange: 1}\n'

@@ -27,10 +27,8 @@ def healthy(machine: Machine) -> None:
     machine.write("/etc/passwd", "root:x:0:0::/root:/bin/sh\n")
     machine.unit("ActiveState=active", "UnitFileState=enabled", "User=root")
     machine.prints("systemctl is-active", "inactive", 3)
-    running = device("bow", kernel=KernelCounters())
-    machine.status = [
-        device("bow", kernel=KernelCounters(), ledger=running.ledger | {"lost_queue": 0, "frames_good": 10**8})
-    ]
+    ledger = device("bow").ledger | {"lost_queue": 0, "frames_good": 10**8}
+    machine.status = [device("bow", kernel=KernelCounters(), ledger=ledger)]
     machine.write("/proc/loadavg", "0.10 0.10 0.10 1/200 999\n")
     machine.write("/var/lib/imud/x")
     machine.sync_s = [0.01, 0.01, 0.01]

@@ -23,9 +23,8 @@ def bow(machine: Machine) -> Machine:
     node = machine.port("ttyUSB0")
     if ROOT:
         os.chown(node, 0, PORT_GID)
-    machine.write(
-        "/etc/passwd", "root:x:0:0::/root:/bin/sh\nimud:x:4000:4001::/:/bin/false\nann:x:4002:4003::/:/bin/sh\n"
-    )
+    users = ("root:x:0:0::/root:/bin/sh", "imud:x:4000:4001::/:/bin/false", "ann:x:4002:4003::/:/bin/sh")
+    machine.write("/etc/passwd", "\n".join(users) + "\n")
     machine.write("/etc/group", f"port:x:{PORT_GID}:\nimud:x:4001:\nann:x:4003:\n")
     machine.uid, machine.gids = 4002, frozenset({4003})
     return machine

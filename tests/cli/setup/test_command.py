@@ -47,9 +47,8 @@ def test_a_look_at_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
         return real(file, *arguments, root=tmp_path, **more)  # type: ignore[arg-type]
 
     monkeypatch.setattr(command, "Surroundings", elsewhere)
-    said = json.loads(
-        cli("setup", "--dry-run", "--json", "--socket", tmp_path / "none", "-c", "/etc/imud.yaml", status=1).out
-    )
+    words = ("setup", "--dry-run", "--json", "--socket", tmp_path / "none", "-c", "/etc/imud.yaml")
+    said = json.loads(cli(*words, status=1).out)
     assert said == {"found": [], "changes": [], "made": False, "notes": [], "devices": []}
     assert list(tmp_path.iterdir()) == []
 
@@ -59,9 +58,8 @@ def test_options_have_an_effect(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> No
     made = Mock(return_value=steps)
     monkeypatch.setattr(command, "SetupSteps", made)
     monkeypatch.setenv("SUDO_USER", "ann")
-    places = (
-        "/dev/ttyS0", "--active", "/dev/ttyS1", "--rs485", "/dev/ttyS2=9600", "--i2c", "1", "--spi", "/dev/spidev0.0",
-    )  # fmt: skip
+    ports = ("/dev/ttyS0", "--active", "/dev/ttyS1", "--rs485", "/dev/ttyS2=9600")
+    places = (*ports, "--i2c", "1", "--spi", "/dev/spidev0.0")
     buses = (("i2c", "1"), ("spi", "/dev/spidev0.0"))
     wanted = Wanted(("/dev/ttyS0",), ("/dev/ttyS1",), (("/dev/ttyS2", 9600),), buses)
     more = ("--control", "--wait", "5", "--can", "can0=1000000")

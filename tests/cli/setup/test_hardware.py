@@ -2,6 +2,7 @@
 
 import os
 import threading
+from functools import partial
 from pathlib import Path
 from random import Random
 from types import SimpleNamespace
@@ -35,9 +36,7 @@ def found(machine: LivingMachine, attachments: Attachments, wanted: Wanted = Wan
     return look(machine.surroundings(), wanted, attachments.finders())
 
 
-def test_only_what_is_named_is_listened_to_and_no_port_of_others(
-    gateway: LivingMachine, attachments: Attachments
-) -> None:
+def test_only_free_ports_that_are_named_are_listened_to(gateway: LivingMachine, attachments: Attachments) -> None:
     gateway.can("can0", up=True)
     found(gateway, attachments, Wanted(("/dev/ttyUSB1",)))
     assert attachments.listened == [USB1]
@@ -152,9 +151,8 @@ def test_a_line_is_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def on_bus(monkeypatch: pytest.MonkeyPatch, bus: InProcessI2c) -> None:
-    row = SimpleNamespace(
-        settings=I2cOptions, make_polled=lambda settings: I2cLink(settings, open_bus=bus.open, ioctl=bus.ioctl)
-    )
+    make = partial(I2cLink, open_bus=bus.open, ioctl=bus.ioctl)
+    row = SimpleNamespace(settings=I2cOptions, make_polled=make)
     monkeypatch.setattr(finders, "LINKS", {"i2c": row})
 
 
@@ -258,9 +256,8 @@ def test_without_networkd_or_interface_and_beside_another_file_nothing_is_change
     assert changes == []
     assert "/etc/systemd/network/can.network configures" in notes[0]
     (bus.root / "etc/systemd/network/can.network").unlink()
-    assert raise_can(bus.surroundings(), "can1", 500_000)[1] == [
-        "can1 does not exist; CAN interfaces of this host: can0"
-    ]
+    notes = raise_can(bus.surroundings(), "can1", 500_000)[1]
+    assert notes == ["can1 does not exist; CAN interfaces of this host: can0"]
     del bus.units["systemd-networkd.service"]
     changes, notes = raise_can(bus.surroundings(), "can0", 500_000)
     assert (changes, "not installed" in notes[0]) == ([], True)

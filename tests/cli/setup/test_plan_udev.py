@@ -101,9 +101,8 @@ def test_a_block_goes_behind_the_key_or_is_left_to_the_person() -> None:
 def test_the_example_of_the_package_is_known_and_only_its_device_is_replaced() -> None:
     assert plan.is_example(EXAMPLE)
     assert not plan.is_example(EXAMPLE + b"  bow: {uart: {port: /dev/ttyS9}}\n")
-    made = plan.with_devices(
-        EXAMPLE, {"mast": {"driver": "imu61x-can", "socketcan": {"interface": "can0"}}}, replace="imu"
-    )
+    mast = {"driver": "imu61x-can", "socketcan": {"interface": "can0"}}
+    made = plan.with_devices(EXAMPLE, {"mast": mast}, replace="imu")
     assert plan.device_names(made) == ["mast"]
     kept = made.decode().splitlines()
     lost = [line for line in EXAMPLE.decode().splitlines() if line not in kept]
