@@ -131,7 +131,7 @@ def example(word: str, **options: Any) -> str:
     """Return the output of the program in docs/recording.md that contains this word."""
     codes = re.findall(r"```python\n(.*?)```", (ROOT / "docs/recording.md").read_text(), re.DOTALL)
     (code,) = (one for one in codes if word in one)
-    return subprocess.check_output([sys.executable, "-c", code], text=True, timeout=LIMIT_S, **options)
+    return str(subprocess.check_output([sys.executable, "-c", code], text=True, timeout=LIMIT_S, **options))
 
 
 def test_examples_of_the_page(daemon: RunningDaemon, words: tuple[object, ...], tmp_path: Path, cli: Cli) -> None:

@@ -440,7 +440,7 @@ def test_a_full_disk_stops_before_the_first_change_without_a_record(gateway: Liv
     assert gateway.files() == before
 
 
-def test_a_file_changed_since_is_left_and_the_rest_taken_back(gateway: LivingMachine, setup: Setup) -> None:
+def test_a_file_changed_since_is_left_and_named_once(gateway: LivingMachine, setup: Setup) -> None:
     setup.steps().set_up(PORT, ())
     mine = (gateway.root / "etc/imud.yaml").read_text() + "# mine\n"
     gateway.write("/etc/imud.yaml", mine)
@@ -453,6 +453,14 @@ def test_a_file_changed_since_is_left_and_the_rest_taken_back(gateway: LivingMac
     gateway.write("/etc/imud.yaml", mine.removesuffix("# mine\n"))  # the user undoes the edit
     assert setup.steps().undo() == 0
     assert (gateway.root / "etc/imud.yaml").read_text() == EXAMPLE
+    setup.steps().set_up(PORT, ())
+    gateway.usb_port("ttyUSB1", "usb-B", serial="B")
+    setup.attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
+    setup.steps(date="LATER").set_up(PORT, (), wait_s=1)
+    gateway.write("/etc/imud.yaml", "devices: {}\n")
+    setup.said()
+    assert setup.steps().undo() == 1
+    assert setup.said().count("/etc/imud.yaml was changed after") == 1
 
 
 def test_the_former_content_of_a_file_that_is_left_is_kept(gateway: LivingMachine, setup: Setup) -> None:
@@ -466,17 +474,6 @@ def test_the_former_content_of_a_file_that_is_left_is_kept(gateway: LivingMachin
         shutil.copy2(copy, file)  # the user solves the problem
         assert setup.steps().undo() == 0
         assert gateway.files() == before
-
-
-def test_what_two_runs_changed_and_a_person_since_is_named_once(gateway: LivingMachine, setup: Setup) -> None:
-    setup.steps().set_up(PORT, ())
-    gateway.usb_port("ttyUSB1", "usb-B", serial="B")
-    setup.attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
-    setup.steps(date="LATER").set_up(PORT, (), wait_s=1)
-    gateway.write("/etc/imud.yaml", "devices: {}\n")
-    setup.said()
-    assert setup.steps().undo() == 1
-    assert setup.said().count("/etc/imud.yaml was changed after") == 1
 
 
 def test_a_link_in_place_of_the_configuration_is_followed(gateway: LivingMachine, setup: Setup) -> None:
