@@ -206,6 +206,13 @@ def counted(state: DeviceState = DeviceState.SEARCHING, **counts: int) -> Device
 
 
 def test_serial_data(machine: Machine) -> None:
+    machine.configure(WIRED)
+    for check in (HEARD, LINES):
+        assert [finding.severity for finding in machine.find(check)] == ["not checked"]
+    assert machine.find(HALF) == []  # this line is not configured
+    machine.configure(BOW)
+    machine.status = [counted(DeviceState.MISSING)]
+    assert machine.find(HEARD) == []
     for status, severity, words in [
         (counted(), "error", "are TX and RX swapped"),
         (counted(bytes_in=199), "error", "echoes of imud's requests"),
@@ -219,7 +226,6 @@ def test_serial_data(machine: Machine) -> None:
         (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=6), "warning", "6 damaged and"),
         (msgspec.structs.replace(counted(**GOOD), kernel=KernelCounters(overrun=2)), "warning", "overrun"),
     ]:  # fmt: skip
-        machine.configure(BOW)
         machine.status = [status]
         machine.tells(HEARD, severity, words)
 
