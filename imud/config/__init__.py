@@ -14,9 +14,8 @@ A new row of a registry needs no change here. Errors name file, line, column, th
 reports all problems together.
 """
 
-from imud.config.devices import DEVICE_NAME, DEVICES_MAX
 from imud.config.model import Config, DeviceConfig, Differences, differences
-from imud.config.reading import PROBLEMS_SHOWN, load, parse
+from imud.config.reading import DEVICE_NAME, DEVICES_MAX, PROBLEMS_SHOWN, load, parse
 from imud.config.schema import TABLES, DeviceGeneral, General, Tables
 
 __all__ = [

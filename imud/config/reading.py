@@ -1,15 +1,34 @@
-"""Load a configuration file: read and check the whole file, then make a `Config`."""
+"""Load a configuration file: read and check the whole file with its devices, then make a `Config`."""
 
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from itertools import islice
 from pathlib import Path
-from typing import Final
+from re import compile as pattern
+from typing import Any, Final, NamedTuple
 
-from imud.config.devices import DeviceReader
-from imud.config.model import Config
-from imud.config.schema import TABLES, General, Keys, Tables
+import msgspec
+
+from imud.attitude.conventions import RFU_ENU, Heading
+from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes, mounting_of
+from imud.config.model import Config, DeviceConfig
+from imud.config.schema import TABLES, DeviceGeneral, General, Keys, Tables
 from imud.config.yaml import FILE_BYTES_MAX, Problem, no_pause, path_text, read_yaml
+from imud.config.yaml import Path as KeyPath
+from imud.contracts.command import Target
+from imud.contracts.condition import ConditionLimits
+from imud.contracts.driver import CanDriver, Driver, PolledDriver
+from imud.contracts.lines import LINE_SCHEMAS, DeviceLines, LineOptions
+from imud.contracts.link import CanUse, Claim, LinkType, conflict_of
+from imud.contracts.setting import SettingsTable, declared_values
+from imud.contracts.status import Deviations
 from imud.host.files import read_regular
-from imud.model.errors import ConfigError
+from imud.model.errors import BadArgument, ConfigError
+from imud.model.options import Options, got, shown, unknown_name
+from imud.model.sample import DEVICE_NAME_PATTERN
+from imud.model.units import NS_PER_S, NS_PER_US
+from imud.utc.receivers import RmcOptions
 
 PROBLEMS_SHOWN: Final = 20
 
@@ -78,3 +97,495 @@ def _report(problems: Sequence[Problem], filename: str) -> str:
     if len(problems) > PROBLEMS_SHOWN:
         lines.append(f"… and {len(problems) - PROBLEMS_SHOWN} more problems")
     return "\n".join(lines)
+
+
+# --- conflicts of ports, addresses and frames -------------------------------------------------------------------------
+
+
+class Clash(NamedTuple):
+    """Two devices, or an output and a device, that cannot have the same port, address or frames."""
+
+    path: KeyPath  # key to change
+    message: str  # expected value, received value, and the owner
+
+
+class _Owned(NamedTuple):
+    claim: Claim
+    owner: str
+
+
+def clashes(
+    devices: Sequence[DeviceConfig],
+    links: Mapping[str, LinkType[Any]],
+    drivers: Mapping[str, Driver],
+    pause: Callable[[], None] = no_pause,
+    outputs: Mapping[str, Sequence[Claim]] = {},
+) -> Iterator[Clash]:
+    """Return the conflicts of each device with the devices before it, and of each output with the devices. imud follows
+    symbolic links and opens no port."""
+    places: dict[str, list[_Owned]] = {}
+    buses: dict[str, list[tuple[CanUse, str]]] = {}
+    for device in devices:
+        owner = f"{device.name} (line {device.line})" if device.line else device.name
+        for part, claim in _claims(device, links):
+            held = places.setdefault(_place(claim), [])
+            for other in held:
+                if conflict := conflict_of(claim, other.claim, other.owner):
+                    yield Clash(("devices", device.name, part, conflict.key), conflict.message)
+                    break
+            held.append(_Owned(claim, owner))
+        use = _can_use(device, links, drivers)
+        if use is not None:
+            uses = buses.setdefault(use.bus, [])
+            yield from _can_clash(device.name, use, uses)
+            uses.append((use, owner))
+        pause()
+    for output, claims in outputs.items():
+        for claim in claims:
+            for other in places.get(_place(claim), ()):
+                if conflict := conflict_of(claim, other.claim, other.owner):
+                    yield Clash((output, conflict.key), conflict.message)
+                    break
+
+
+def owner_of(device: DeviceConfig, others: Sequence[DeviceConfig], links: Mapping[str, LinkType[Any]]) -> str:
+    """Return the device in `others` with which `device` cannot share its port; empty if there is none."""
+    mine = _claims(device, links)
+    for other in others:
+        for _, theirs in _claims(other, links) if other.name != device.name else ():
+            if any(_place(theirs) == _place(one) and conflict_of(one, theirs, "") for _, one in mine):
+                return other.name
+    return ""
+
+
+def _claims(device: DeviceConfig, links: Mapping[str, LinkType[Any]]) -> list[tuple[str, Claim]]:
+    """Return the claims of a device, each with its part of the configuration."""
+    found = [(device.link, claim) for claim in links[device.link].claims(device.link_settings)]
+    if device.rmc is not None and device.rmc.port:
+        found.append(("rmc", Claim(place=device.rmc.port, key="port")))
+    return found
+
+
+def _place(claim: Claim) -> str:
+    return os.path.realpath(claim.place) if claim.place.startswith("/") else claim.place
+
+
+def _can_use(device: DeviceConfig, links: Mapping[str, LinkType[Any]], drivers: Mapping[str, Driver]) -> CanUse | None:
+    """Return the frames that a device needs on a shared bus; None if they are unknown before the detection."""
+    claims = _claims(device, links)
+    if device.options is None or not claims:
+        return None
+    driver = drivers[device.driver]
+    if not isinstance(driver, CanDriver):
+        return None
+    return CanUse(_place(claims[0][1]), driver.filters(device.options), driver.cyclic(device.options))
+
+
+def _can_clash(name: str, use: CanUse, uses: Sequence[tuple[CanUse, str]]) -> Iterator[Clash]:
+    """Yield the conflicts of the frames that a device needs. The first owner of a frame is enough."""
+    path: KeyPath = ("devices", name, "options")
+    for other, owner in uses:
+        if both := use.both_receive(other):
+            yield Clash(path, f"expected no device on {use.bus} with the frame {both} of {owner}, got this device")
+            return
+        if both := use.both_send(other):
+            message = f"expected one device on {use.bus} for which imud sends {both}, got this device and {owner}"
+            yield Clash(path, f"{message}; remove the key here")
+            return
+
+
+class DeclaredReader:
+    """Reader of the declared settings of devices. `drivers` is the registry of drivers."""
+
+    def __init__(self, keys: Keys, drivers: Mapping[str, Driver]) -> None:
+        self._keys = keys
+        self._drivers = drivers
+
+    def read(self, path: KeyPath, device: Mapping[str, Any]) -> Options | None:
+        """Read the key `settings` of a device; None if the key is absent or invalid."""
+        key = (*path, "settings")
+        if device.get("settings") is None:
+            return None
+        driver = device.get("driver", "auto")
+        if driver == "auto":
+            message = f"expected the name of a driver next to settings, got auto; {self._known()}"
+            self._keys.problem(key, message, at_key=True)
+            return None
+        if not isinstance(driver, str) or driver not in self._drivers:
+            return None  # the driver reports this problem
+        table = self._table(driver)
+        if table is None:
+            message = f"expected a driver with a table of settings, got {driver}; "
+            self._keys.problem(key, message + self._known(), at_key=True)
+            return None
+        if device.get("identify") is False:
+            message = "expected identify: true, because imud reads the settings only then, got false"
+            self._keys.problem(key, message, at_key=True)
+            return None
+        return self._keys.part(table.declarable, device["settings"], key)
+
+    def check(self, path: KeyPath, driver: str, declared: Options, options: Options | None, link: Options) -> None:
+        """Report settings that exclude each other or contradict the address of the device."""
+        table = self._drivers[driver].device_settings
+        assert table is not None  # `read` has accepted the settings
+        key, values = (*path, "settings"), declared_values(declared)
+        for name, value in values.items():
+            place = _fixed(name, options, link) if table.table[name].connection else None
+            if place not in (None, value):
+                message = f"expected {shown(place)}, the value that imud uses to open the device, got {shown(value)}; "
+                hint = f"change it with `imud settings {path[-1]} --set {name}=… --save`, "
+                self._keys.problem((*key, name), f"{message}{hint}or use auto if the link supports it")
+        baud = getattr(link, "baud", 0)
+        try:
+            table.check(Target(options, baud if isinstance(baud, int) else 0), values)
+        except BadArgument as error:
+            self._keys.problem(key, str(error))
+
+    def check_lines(self, path: KeyPath, driver: str, declared: Options, lines: DeviceLines) -> None:
+        """Report lines that have no function with the declared settings."""
+        found = self._drivers[driver].declared_line_differences(declared_values(declared), lines)
+        for key, words in found.items():
+            self._keys.problem((*path, "lines", key), f"with the declared settings, {words}", at_key=True)
+
+    def _table(self, driver: str) -> SettingsTable | None:
+        try:
+            return self._drivers[driver].device_settings
+        except ImportError:  # the driver reports this problem
+            return None
+
+    def _known(self) -> str:
+        names = [name for name in self._drivers if self._table(name) is not None]
+        return f"drivers with settings: {', '.join(names) or 'none'}"
+
+
+def _fixed(name: str, options: Options | None, link: Options) -> object:
+    """Return the value with which imud opens the device; None if imud searches for it or the key does not exist."""
+    for part in (link, options):
+        value = getattr(part, name, None)
+        if value is not None and value != "auto":
+            return value
+    return None
+
+
+KEY: Final = "frame"
+# Keys of `frame` with keys of their own.
+NESTED: Final[Mapping[str, type[Options]]] = {"axes": MountingAxes, "euler": MountingAngles}
+WAYS: Final = ("axes", "euler", "quat_wxyz")  # keys for a rotation
+
+
+def read_frame(keys: Keys, path: KeyPath, device: Mapping[str, Any]) -> FrameOptions | None:
+    """Read the key `frame` of a device; None if the key is absent or invalid."""
+    if KEY not in device:
+        return None
+    found = keys.mapping(path, device[KEY])
+    if found is None:
+        return None
+    given = [way for way in WAYS if found.get(way) is not None]
+    if len(given) > 1:
+        message = f"expected one key for the rotation ({', '.join(WAYS)}), got {' and '.join(given)}"
+        keys.problem((*path, given[1]), message, at_key=True)
+    nested = {
+        name: keys.part(schema, found[name], (*path, name))
+        for name, schema in NESTED.items()
+        if found.get(name) is not None
+    }
+    settings = keys.part(FrameOptions, {name: value for name, value in found.items() if name not in NESTED}, path)
+    if settings is None:
+        return None
+    frame = msgspec.structs.replace(settings, **nested)
+    if len(given) == 1:
+        try:
+            mounting_of(frame, RFU_ENU)
+        except ValueError as error:
+            keys.problem((*path, given[0]), str(error))
+            return None
+    return frame
+
+
+def check_declination(
+    keys: Keys, path: KeyPath, general: DeviceGeneral, options: Options | None, drivers: Mapping[str, Driver]
+) -> None:
+    """Report a declination if the heading is not magnetic or the configuration does not name the driver."""
+    if general.declination_deg is None:
+        return
+    place = (*path, "declination_deg")
+    if general.driver == "auto":
+        keys.problem(place, "expected the name of a driver next to declination_deg, got auto", at_key=True)
+        return
+    heading = Heading.UNKNOWN
+    if general.driver in drivers:
+        with suppress(ImportError):  # another check reports this problem
+            heading = drivers[general.driver].heading(options, {})
+    if heading in (Heading.TRUE, Heading.RELATIVE):
+        why = "is relative to power-on" if heading is Heading.RELATIVE else "is already true"
+        message = f"expected declination_deg only with a magnetic heading, got {general.driver}"
+        keys.problem(place, f"{message}, whose heading {why}", at_key=True)
+
+
+LINK: Final = "uart"
+PULSE: Final = "pps"  # Key of the line for a pulse per second. A device with this line uses PPS and RMC sentences.
+TRIGGER: Final = "sin"  # key of the line with which imud drives the pulse input of the device
+
+
+def read_lines(
+    keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, Driver]
+) -> DeviceLines | None:
+    """Read the key `lines` of a device; None if the key is absent."""
+    if "lines" not in device:
+        return None
+    found = keys.mapping(path, device["lines"])
+    if found is None:
+        return None
+    _fit(keys, path, found, device.get("driver", "auto"), drivers)
+    made: dict[str, LineOptions] = {}
+    for name, schema in LINE_SCHEMAS.items():
+        if name in found:
+            inside = keys.mapping((*path, name), found[name])
+            settings = None if inside is None else keys.part(schema, inside, (*path, name))
+            if settings is not None:
+                made[name] = settings
+    return DeviceLines(**made) if made else None  # type: ignore[arg-type]  # each was made by the schema of its key
+
+
+def lines_once(keys: Keys, devices: Sequence[DeviceConfig]) -> None:
+    """Report a GPIO line that is used twice, by one device or by two devices."""
+    owners: list[tuple[LineOptions, str]] = []
+    for device in devices:
+        for name, settings in _lines_of_device(device):
+            path: KeyPath = ("devices", device.name, "lines", name)
+            first = next((place for other, place in owners if _same_line(other, settings)), None)
+            if first is not None:
+                wire = f"{settings.chip} line {settings.line}" if settings.chip else f"line {settings.line}"
+                keys.problem(path, f"expected an unused line, got {wire}, which {first} uses", at_key=True)
+            owners.append((settings, f"{device.name}.lines.{name} (line {keys.tree.key_mark(path).line})"))
+
+
+def read_rmc(keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, Driver]) -> RmcOptions | None:
+    """Read the key `rmc` of a device; None if the key is absent."""
+    if "rmc" not in device:
+        return None
+    driver = device.get("driver", "auto")
+    if LINK not in device or (driver != "auto" and PULSE not in _lines_of_driver(drivers, driver)):
+        message = f"expected rmc only with the link {LINK} and a device with SIN/PPS, got driver {shown(driver)}"
+        keys.problem(path, message, at_key=True)
+    if driver == "auto":
+        keys.problem(path, "expected the name of a driver next to rmc, got auto", at_key=True)
+    lines = device.get("lines")
+    if isinstance(lines, dict) and TRIGGER in lines:
+        mark = keys.tree.key_mark((*path[:-1], "lines", TRIGGER))
+        message = (
+            "expected the pulse per second of a receiver on SIN with rmc, got lines.sin, with which imud drives SIN "
+            f"(line {mark.line}); remove one of the keys"
+        )
+        keys.problem(path, message, at_key=True)
+    return keys.part(RmcOptions, device["rmc"], path)
+
+
+def _fit(keys: Keys, path: KeyPath, found: Mapping[str, Any], driver: object, drivers: Mapping[str, Driver]) -> None:
+    """Report unknown lines, and lines that devices of this driver do not have."""
+    keys.unknown_keys(path, found, list(LINE_SCHEMAS))
+    if driver == "auto":
+        message = "expected the name of a driver next to lines, got auto; drivers with lines"
+        keys.problem(path, f"{message}: {', '.join(_with_lines(drivers))}", at_key=True)
+    if not isinstance(driver, str) or driver not in drivers:
+        return
+    try:
+        lines = drivers[driver].lines
+    except ImportError:
+        return  # the driver reports its failed import
+    for name in found:
+        if name in LINE_SCHEMAS and name not in lines:
+            known = ", ".join(key for key in LINE_SCHEMAS if key in lines) or "none"
+            message = f"expected a line of {driver} devices ({known}), got {shown(name)}"
+            keys.problem((*path, name), message, at_key=True)
+
+
+def _with_lines(drivers: Mapping[str, Driver]) -> Iterator[str]:
+    for name in drivers:
+        with suppress(ImportError):
+            if drivers[name].lines:
+                yield name
+
+
+def _lines_of_device(device: DeviceConfig) -> Iterator[tuple[str, LineOptions]]:
+    for name in LINE_SCHEMAS if device.lines is not None else ():
+        settings = getattr(device.lines, name)
+        if settings is not None:
+            yield name, settings
+
+
+def _same_line(one: LineOptions, other: LineOptions) -> bool:
+    """Return whether both options name the same line. A line name without a chip matches a line of any chip."""
+    chips = {one.chip.removeprefix("/dev/"), other.chip.removeprefix("/dev/")}
+    return one.line == other.line and (len(chips) == 1 or "" in chips)
+
+
+def _lines_of_driver(drivers: Mapping[str, Driver], driver: object) -> frozenset[str]:
+    try:
+        return drivers[driver].lines if isinstance(driver, str) and driver in drivers else frozenset({PULSE})
+    except ImportError:
+        return frozenset({PULSE})  # another check reports this problem and an unknown driver
+
+
+# Maximum number of devices, more than one process can serve. A longer file is a mistake of a generator.
+DEVICES_MAX: Final = 256
+NOISE: Final = "noise"
+CONDITION: Final = "condition"
+DEVICE_NAME: Final = pattern(DEVICE_NAME_PATTERN)
+
+
+class DeviceReader:
+    def __init__(
+        self, keys: Keys, tables: Tables, pause: Callable[[], None], outputs: Mapping[str, Sequence[Claim]]
+    ) -> None:
+        """imud calls `pause` after each device. `outputs` contains the ports that each output uses."""
+        self._keys = keys
+        self._outputs = outputs
+        self._tables = tables
+        self._declared = DeclaredReader(keys, tables.drivers)
+        self._pause = pause
+
+    def devices(self, top: Mapping[str, Any]) -> list[tuple[DeviceConfig, bool]] | None:
+        """Read the valid devices, each with its key `enabled`; None if the key is missing or empty."""
+        path: KeyPath = ("devices",)
+        if "devices" not in top:
+            self._keys.problem((), "expected the key devices with a name and keys for each device, got none")
+            return None
+        if top["devices"] is None:
+            self._keys.problem(path, "expected a name and keys for each device, got nothing; write {} for no device")
+            return None
+        found = self._keys.mapping(path, top["devices"]) or {}
+        if len(found) > DEVICES_MAX:
+            self._keys.problem(path, f"expected at most {DEVICES_MAX} devices, got {len(found)}")
+        devices = [self._device(name, data) for name, data in islice(found.items(), DEVICES_MAX)]
+        made = [device for device in devices if device is not None]
+        used = [device for device, enabled in made if enabled]
+        for clash in clashes(used, self._tables.links, self._tables.drivers, self._pause, self._outputs):
+            self._keys.problem(*clash)
+        self._buses_carry(used)
+        lines_once(self._keys, used)
+        return made
+
+    def _device(self, name: str, data: object) -> tuple[DeviceConfig, bool] | None:
+        self._pause()
+        path: KeyPath = ("devices", name)
+        if not DEVICE_NAME.fullmatch(name):
+            rule = "1 to 32 characters of a-z, 0-9, _ and -, starting with a letter or digit"
+            self._keys.problem(path, f"expected a device name of {rule}, got {got(name)}", at_key=True)
+        keys = self._keys.mapping(path, data)
+        if keys is None:
+            return None
+        own = DeviceGeneral.__struct_fields__
+        self._keys.unknown_keys(
+            path, keys, [*own, "options", "settings", "lines", "rmc", "frame", NOISE, CONDITION, *self._tables.links]
+        )
+        general = self._keys.settings(DeviceGeneral, path, {key: keys[key] for key in own if key in keys})
+        options = self._options(path, keys)
+        declared = self._declared.read(path, keys)
+        link = self._link(path, keys)
+        lines = read_lines(self._keys, (*path, "lines"), keys, self._tables.drivers)
+        rmc = read_rmc(self._keys, (*path, "rmc"), keys, self._tables.drivers)
+        frame = read_frame(self._keys, (*path, "frame"), keys)
+        noise = self._keys.part(Deviations, keys[NOISE], (*path, NOISE)) if NOISE in keys else None
+        limits = self._keys.part(ConditionLimits, keys.get(CONDITION), (*path, CONDITION))
+        if general is None or link is None or limits is None:
+            return None
+        link_name, link_settings = link
+        known = general.driver == "auto" or options is not None
+        if known and self._driver_fits(path, general.driver, link_name) and options is not None:
+            self._go_together(path, general.driver, options, link_name, link_settings)
+        self._usable(path, general.driver, link_name, link_settings)
+        if declared is not None:
+            self._declared.check(path, general.driver, declared, options, link_settings)
+            if lines is not None:
+                self._declared.check_lines(path, general.driver, declared, lines)
+        check_declination(self._keys, path, general, options, self._tables.drivers)
+        line = self._keys.tree.key_mark(path).line
+        own_keys = general.driver, options, general.identify, link_name, link_settings
+        frames = frame, general.convention, general.declination_deg
+        made = DeviceConfig(name, *own_keys, line, lines, rmc, declared, general.on_difference, *frames, noise, limits)
+        return made, general.enabled
+
+    def _options(self, path: KeyPath, keys: Mapping[str, Any]) -> Options | None:
+        driver = keys.get("driver", "auto")
+        if driver == "auto":
+            if keys.get("options") is not None:
+                names = ", ".join(self._tables.drivers)
+                message = f"expected the name of a driver next to options, got auto; drivers: {names}"
+                self._keys.problem((*path, "options"), message, at_key=True)
+            return None
+        if not isinstance(driver, str):
+            return None
+        if driver not in self._tables.drivers:
+            self._keys.problem((*path, "driver"), unknown_name("a driver", driver, ["auto", *self._tables.drivers]))
+            return None
+        return self._keys.row(self._tables.drivers, driver, keys.get("options"), (*path, "options"))
+
+    def _link(self, path: KeyPath, keys: Mapping[str, Any]) -> tuple[str, Options] | None:
+        names = [name for name in self._tables.links if name in keys]
+        if len(names) != 1:
+            found = " and ".join(names) or "none"
+            message = f"expected exactly one link ({', '.join(self._tables.links)}), got {found}"
+            self._keys.problem(path, message, at_key=True)
+            return None
+        settings = self._keys.row(self._tables.links, names[0], keys[names[0]], (*path, names[0]))
+        return None if settings is None else (names[0], settings)
+
+    def _driver_fits(self, path: KeyPath, driver: str, link: str) -> bool:
+        """Report a driver if the link cannot carry its protocol."""
+        links, drivers = self._tables.links, self._tables.drivers
+        if driver == "auto" and not links[link].searchable:
+            known = ", ".join(self._fitting((name, name, link) for name in drivers))
+            self._keys.problem(path, f"expected the name of a driver for {link} ({known}), got auto", at_key=True)
+            return False
+        if driver in drivers and link not in (fitting := self._fitting((name, driver, name) for name in links)):
+            message = f"expected a link that {driver} can use ({', '.join(fitting)}), got {link}"
+            self._keys.problem((*path, link), message, at_key=True)
+            return False
+        return True
+
+    def _go_together(self, path: KeyPath, driver: str, options: Options, link: str, link_settings: Options) -> None:
+        """Report values of options and link that the driver does not support."""
+        for problem in self._tables.drivers[driver].problems(options, link_settings):
+            part = link if problem.part == "link" else problem.part
+            self._keys.problem((*path, part, problem.key), problem.message)
+
+    def _usable(self, path: KeyPath, driver: str, link: str, settings: Options) -> None:
+        """Report options that the link does not support."""
+        frames = False
+        with suppress(ImportError, KeyError):  # another check reports a missing or failing driver
+            frames = isinstance(self._tables.drivers[driver], CanDriver)
+        if problem := self._tables.links[link].problem(settings, frames):
+            self._keys.problem((*path, link), problem)
+
+    def _fitting(self, pairs: Iterable[tuple[str, str, str]]) -> list[str]:
+        """Return the names of the fitting (name, driver, link), as far as their libraries are installed."""
+        found = []
+        for name, driver, link in pairs:
+            with suppress(ImportError):
+                if self._tables.links[link].fits(self._tables.drivers[driver]):
+                    found.append(name)
+        return found
+
+    def _buses_carry(self, devices: Sequence[DeviceConfig]) -> None:
+        """Report rates whose reads take more time than a bus has for all its devices."""
+        shares: dict[tuple[str, str], float] = {}
+        for device in devices:
+            driver = self._tables.drivers.get(device.driver)
+            bus = self._tables.links[device.link].bus_of(device.link_settings)
+            rate_hz = getattr(device.link_settings, "rate_hz", 0.0)
+            if not isinstance(driver, PolledDriver) or device.options is None or not bus or not rate_hz:
+                continue  # another check reports invalid options
+            if not self._tables.links[device.link].fits(driver):
+                continue
+            read_ns = driver.read_ns(device.options, device.link_settings)
+            before = shares.get((device.link, bus), 0.0)
+            share = shares[device.link, bus] = before + rate_hz * read_ns / NS_PER_S
+            if share > 1 and read_ns:
+                others = f", and other devices use {before:.0%} of it" if before else ""
+                most = int(max(0.0, 1 - before) * NS_PER_S / read_ns)
+                message = (
+                    f"expected at most {most}, got {rate_hz:g}: a read takes at least {read_ns / NS_PER_US:.0f} µs of "
+                    f"{bus}{others}"
+                )
+                self._keys.problem(("devices", device.name, device.link, "rate_hz"), message)

@@ -14,8 +14,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from imud.config.devices import owner_of
 from imud.config.model import DeviceConfig
+from imud.config.reading import owner_of
 from imud.contracts.command import (
     CalibrationResult,
     Calibrations,

@@ -43,7 +43,7 @@ from imud.cli.setup.plan import (
     real_path,
     service_reads,
 )
-from imud.config.devices import DEVICE_NAME
+from imud.config.reading import DEVICE_NAME
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
 from imud.links.netlink import absence, can_interfaces

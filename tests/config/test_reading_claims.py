@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from imud import config
-from imud.config.devices import owner_of
 from imud.config.model import Config, differences
+from imud.config.reading import owner_of
 from imud.config.schema import Tables
 from imud.contracts.setting import OnDifference, declared_values
 from imud.links import LINKS
