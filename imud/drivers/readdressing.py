@@ -1,4 +1,7 @@
-"""Follow a device on CAN to another place, its node number or address, after a write or a restart."""
+"""Follow a device on CAN to another place, its node number or address, after a write or a restart.
+
+The scripts of a UART and of Modbus follow a device without this module: adapters for it need more lines than they save.
+"""
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
