@@ -194,7 +194,7 @@ class ArrivalFit:
         return False
 
     def open_bin(self) -> tuple[int, int, float, float, float, float, int, int, float]:
-        """Return the state of the newest bin, which the kernel changes."""
+        """Return the state of the newest bin. The C kernel changes this state."""
         b = self._open
         return (
             b.device_ns, b.arrival_ns, b.lowest, b.wait, b.wait_least, b.wait_most, b.count, b.late, b.late_ns,

@@ -601,7 +601,7 @@ class SampleClock:
         return self._less_bias(arrival_ns, size_bytes)
 
     def _ran_on(self, device_ns: int, arrival_ns: int) -> bool:
-        """Return whether the device counter allows a frame below the fit: then the fit is late."""
+        """Return whether the counter continued at a frame below the fit. In this case, the fit is late."""
         return self._line is not None and self._line.carries(device_ns, arrival_ns)
 
     def _hold_over(self, aiding: AidingSources, ticks: int, arrival_ns: int, utc_ns: int, missed: int | None) -> int:

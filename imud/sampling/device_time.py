@@ -1,4 +1,4 @@
-"""Device time from the device counter: unwrapped, finer than a tick, without corrections; lost samples and jumps.
+"""Device time from the device counter, without wraps and corrections, finer than a tick. Finds lost samples and jumps.
 
     ticks ─▶ DeviceTime.advance ─▶ raw_ns, even_ns, missed        PeriodLearner: the step between samples
                     │
@@ -91,7 +91,7 @@ class PeriodLearner:
 
     def restart(self, *, was_added: bool = False) -> None:
         """Forget the newest step: the counter restarted, or imud did not receive frames for a time. `was_added`: the
-        last added step was not a step of one counter, and the caller reports the gap."""
+        newest step was already added, and it is not a step of one counter. The caller reports the gap."""
         if was_added and self._unjudged and not self.is_gap:
             self._unjudged.pop()
         self._run, self.is_gap = 0, False
@@ -585,7 +585,7 @@ class StampTime:
         self._live_ticks, self._live_arrival_ns = self._ticks, arrival_ns
 
     def _late_ns(self, ticks: int, arrival_ns: int) -> float:
-        """Return the lateness of a frame at `ticks` compared to the least late frame, ns."""
+        """Return the lateness of a frame at `ticks` after the frame with the smallest lateness, ns."""
         return arrival_ns - self._origin_ns - ticks * NS_PER_MS - self._lowest_ns
 
     def _step(self, stamp: int, before: int, arrival_ns: int, elapsed_ns: int) -> int:
@@ -606,14 +606,14 @@ class StampTime:
         return pulsed if self._pulsed else turned
 
     def _follow(self, arrival_ns: int, elapsed_ns: int) -> None:
-        """Update the lateness. Add the turns that are lost according to live frames."""
+        """Update the smallest lateness. Add the turns of the value that imud missed."""
         self._lowest_ns += DRIFT * elapsed_ns
         if self._ticks - self._live_ticks >= LIVE_TICKS:
             self._add_turns(arrival_ns)
         self._lowest_ns += min(self._late_ns(self._ticks, arrival_ns), 0.0)
 
     def _add_turns(self, arrival_ns: int) -> None:
-        """Add whole turns if frames are late by whole turns and keep pace with their values."""
+        """Add whole turns if the frames are late by whole turns and their values rise as fast as the arrivals."""
         pace = (arrival_ns - self._live_arrival_ns) / ((self._ticks - self._live_ticks) * NS_PER_MS)
         late_ns = self._late_ns(self._ticks, arrival_ns)
         turn = PULSE_TICKS if self._pulsed else self._modulus

@@ -166,7 +166,7 @@ class EdgePairing:
         self._drop_line()
 
     def _drop_line(self) -> None:
-        """Drop the line. Keep a learned delay of the fit behind the events."""
+        """Drop the line. Keep the delay from the events to the fit if it is learned."""
         self._tracker = None
         self._first.clear()
         self.misses = self._wrong = 0

@@ -185,7 +185,7 @@ class ArrivalPace:
         return 0, certain
 
     def _judge(self, arrival_ns: int) -> tuple[int, bool]:
-        """Distinguish lost samples from an inaccurate period, by the lateness that a window shares."""
+        """Distinguish lost samples from an inaccurate period, by the lateness of all frames of a window."""
         late_ns, turn_ns = self._least_ns, self._turn * self.period_ns
         off = late_ns / (self._unjudged * self.period_ns)
         has_phase, self._has_phase = self._has_phase, True
@@ -249,14 +249,14 @@ class SampleNumber:
         return steps if steps <= most else 0
 
     def is_sure(self, arrival_ns: int) -> bool:
-        """Return whether a number without steps leaves no gap."""
-        # The first number leaves no gap. A number after a very short time leaves no gap either.
+        """Return whether no sample is missing before a number for which `steps` returns 0."""
+        # no sample is missing before the first number, or after a very short time
         if not self.known:
             return not self._was_known
         return self._pace.has_no_room(arrival_ns)
 
     def advance(self, number: int, arrival_ns: int, steps: int) -> int:
-        """Set the newest sample, `steps` after the previous sample. Return the number of lost samples in lost turns."""
+        """Set the newest sample, `steps` after the previous sample. Return the number of samples in lost turns."""
         was_known = self.known or self._was_known
         self._number, self._arrival_ns, self.known, self._was_known = number, arrival_ns, True, False
         if steps and was_known:

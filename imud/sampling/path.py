@@ -603,7 +603,7 @@ class PolledPath(SamplePath):
         self._before_ns = 0  # start of the previous successful read
         self._faults = 0  # consecutive damaged or disturbed reads
         self._read_ns = 0  # start of the newest read with a new, stale or lost sample, ns; 0 before the first read
-        self._is_back = False  # whether imud has identified the device and not read it yet
+        self._is_back = False  # whether imud has identified the device and has not read a sample yet
         # whether imud stopped its reads for a time after the newest sample
         self._gap_unknown = context.ledger.samples > 0
 

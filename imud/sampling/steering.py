@@ -145,7 +145,7 @@ class AidingSources:
         self._sout_timing = sout_timing
         self._sin_timing = sin_timing
         self._pulses = PulseDecoder(int(sout_timing.width_us * NS_PER_US))
-        # order of their first edges: the first source has priority
+        # in the order of their first edges; the first source has priority
         self._sources: list[EdgeSource] = []
         self._source: EdgeSource | None = None
         self._fix_ns = 0.0  # correction of the fit of arrivals, ns

@@ -80,7 +80,7 @@ PHASE_SHARE, PERIOD_SHARE = 8, 128  # divisors of the lateness of one burst that
 
 
 class Cadence:
-    """Period of the bursts of one device, and the losses that it proves. Synchronization: one thread."""
+    """Period of the bursts of one device. The period proves lost bursts. Synchronization: one thread."""
 
     __slots__ = ("_due_ns", "_is_silent", "_late_ns", "_newest_ns", "_odd_ns", "_room", "_usual_ns", "period_ns")
 

@@ -90,8 +90,8 @@ def pressure_of(value_pa: float) -> float | None:
 def temperature_beside(temperature_c: float, pressure_pa: float) -> float | None:
     """Return the temperature next to a pressure field of HI91, °C; None if the firmware wrote neither field.
 
-    The inertial sensor measures the temperature, so it exists without a barometer. But if no firmware writes this
-    pressure value, the bytes are old content of the device's buffer.
+    The inertial sensor measures the temperature, so it also exists without a barometer. If the pressure has a value
+    that no firmware writes, both fields are old content of the device's buffer.
     """
     is_written = pressure_pa in PLACEHOLDERS or pressure_of(pressure_pa) is not None
     return temperature_c if is_written else None

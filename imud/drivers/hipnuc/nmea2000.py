@@ -239,7 +239,7 @@ class HipnucNmea2000Codec:
         return self._assembly.watched(made)
 
     def _is_reference(self, reference: Reference) -> bool:
-        """Return whether imud uses this heading. An error counts for both references, without a value."""
+        """Return whether imud uses this heading. It uses the code "error" with both references."""
         if self._reference is None and reference is not Reference.ERROR:
             self._reference = reference
         return reference in (self._reference, Reference.ERROR)

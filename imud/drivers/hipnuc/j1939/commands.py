@@ -144,7 +144,7 @@ def identify(peer: J1939Node) -> RequestScript[Identity]:
 
 
 def read_values(peer: J1939Node, registers: Sequence[int]) -> RequestScript[dict[int, int]]:
-    """Read registers. The result does not contain registers without reply; it is empty if the first ones do not
+    """Read registers. The result does not contain registers without reply; it is empty if the first registers do not
     reply.
     """
     values: dict[int, int] = {}

@@ -77,7 +77,7 @@ GYRO_RAD_S_PER_LSB: Final = 0.001  # scale of HI92
 PRESSURE_OFFSET_PA: Final = 100_000.0
 
 
-# HI91 after its tag, the word as two bytes. In the native layout, `struct` reads a float in half the time.
+# HI91 without its tag. The word is two bytes. In the native layout, `struct` reads a float in half the time.
 HI91_VALUES: Final = struct.Struct(("@" if sys.byteorder == "little" else "<") + "xBBbfI16f")
 # Slices of the high bytes in HI91 sub-packets: pressure, system_time, 16 floats and the next temperature of adjacent
 # sub-packets (76 is a multiple of 4); the temperatures in these bytes; system_time in the rest
@@ -500,7 +500,7 @@ class HipnucCodec:
         events += found
 
     def _spend_sync(self, data: bytes, at: int, end: int, reason: BadReason, events: list[CodecEvent]) -> int:
-        """Reject the frame from `at` to its `end` by the length field: skip only the sync word."""
+        """Reject a frame, and skip only its sync word. `end` is its end according to its length field."""
         ledger = self.ledger
         if reason is BadReason.CRC:
             ledger.frames_bad_crc += 1
@@ -515,7 +515,7 @@ class HipnucCodec:
         return at + len(SYNC)
 
     def _whole_inside(self) -> int:
-        """Return the start of the first complete frame in the tail, or the end of a line at its end; otherwise 0."""
+        """Return the start of the first complete frame in the tail; otherwise the end of a complete line, or 0."""
         tail = self._tail
         at = tail.find(SYNC, len(SYNC))
         while at >= 0:
