@@ -37,7 +37,8 @@ from imud.model.units import NS_PER_MS, NS_PER_S
 
 MINUTE_NS: Final = 60 * NS_PER_S
 
-# Reasons that end with their cause: only the user or a new start of the samples ends them, so they do not flicker
+# Reasons that end immediately with their cause. Only the user or a new start of the samples ends these causes, so that
+# the reasons do not flicker.
 ENDS_AT_ONCE: Final = frozenset((*MISSING, *OK, ReasonCode.SETTING, ReasonCode.UNSAVED, ReasonCode.DECLINATION))
 
 

@@ -200,7 +200,7 @@ T = TypeVar("T")
 
 IDLE_NS = 60 * NS_PER_S  # maximum sleep of a thread without a due read, ns
 FAR_NS = 1 << 63  # time of the next read if there is none: after all other times
-# Reads before a script gets one transfer on a bus that is never idle: maximum number, and time after which none starts
+# On a bus that is never idle, a script gets one transfer after this number of reads, or after this time
 POLLS_IN_ROW = 8
 ROW_NS = 100 * NS_PER_MS
 READINGS_MAX = 10_000

@@ -175,7 +175,7 @@ class FleetMessage(msgspec.Struct, frozen=True, gc=False, omit_defaults=True, kw
     begin: int  # first number of the stream in this boot
     first: int  # first number that this message covers
     last: int
-    count: int  # number of samples or events that the numbers stand for
+    count: int  # number of samples or events in this range
     utc_ns: int  # CLOCK_REALTIME of the newest sample or event
     # Wall clock when the message was made; None if the version of the gateway does not send it
     clock: GatewayClock | None = None

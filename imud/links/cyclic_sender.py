@@ -20,7 +20,7 @@ from imud.model.errors import LinkError
 from imud.model.units import NS_PER_S, NS_PER_US
 
 TX_SETUP: Final = 1  # operation: send a frame cyclically
-SETTIMER: Final = 0x0001  # flag: the intervals in this message hold
+SETTIMER: Final = 0x0001  # flag: the message contains valid intervals
 STARTTIMER: Final = 0x0002  # flag: start now and send one frame immediately
 # Errors of a kernel without CAN_BCM.
 NO_MANAGER: Final = frozenset({errno.EPROTONOSUPPORT, errno.ESOCKTNOSUPPORT, errno.EAFNOSUPPORT})

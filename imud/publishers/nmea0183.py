@@ -370,7 +370,7 @@ class HeadingReference:
     """Reference of the yaw of samples."""
 
     heading: Heading = Heading.UNKNOWN
-    # Declination of a true heading made from a magnetic one, degrees; None if yaw was not corrected
+    # Declination that imud added to a magnetic heading, degrees; None if imud did not correct yaw
     declination_deg: float | None = None
 
 

@@ -28,7 +28,7 @@ GAP_FACTOR: Final = 1.5
 LEARNED_STEPS: Final = 4
 # Number of equal steps after which the period is a whole number of ticks. An earlier different step was a loss.
 WHOLE_AFTER: Final = 64
-WHOLE_OFF: Final = 0.5  # Maximum distance of a whole number of ticks from the mean. Beyond that, the rate is another.
+WHOLE_OFF: Final = 0.5  # Maximum distance of a whole number of ticks from the mean. Beyond that, the rate changed.
 # Maximum number of steps that are stored until the period is known. A device with an even rate needs a few.
 UNJUDGED_MOST: Final = 64
 # Period in ticks below which two samples can be in one tick. With a longer period, the tick contains the same sample.
@@ -502,9 +502,9 @@ class JumpDetector:
 PULSE_TICKS: Final = 1000  # time between pulses, ms
 EARLY_NS: Final = 100 * NS_PER_MS  # minimum time before the earliest possible arrival, ns, that shows a pulse
 DRIFT: Final = 200e-6  # maximum rate error of a device's crystal compared to the host
-LATE_NS: Final = 400 * NS_PER_MS  # maximum distance of the lateness of live frames from whole turns, ns
-# Live frames: over this number of ticks, their pace equals the pace of their values within this share. A step that
-# differs from the time between arrivals by more than a latency timer restarts the count.
+LATE_NS: Final = 400 * NS_PER_MS  # maximum distance of their lateness from a whole number of turns, ns
+# Frames are live if their values and their arrival times rise by the same time, within this share, over this number
+# of ticks. A step that differs from the time between arrivals by more than a latency timer restarts the count.
 LIVE_TICKS: Final = 640
 LIVE_SHARE: Final = 0.04
 LIVE_BREAK_NS: Final = 40 * NS_PER_MS

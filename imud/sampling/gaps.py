@@ -41,7 +41,7 @@ PACE_KNOWN: Final = 0.002  # relative error of the period below which it counts 
 # Maximum relative error of a first estimate of the period that is corrected. A larger error restarts the measurement.
 PACE_NEAR: Final = 0.05
 PACE_FLOOR: Final = 1e-5  # minimum relative error of the period, because crystals drift and frames wait
-# number of consecutive windows that are later or earlier than the period allows, after which the rate is another
+# number of consecutive windows that are later or earlier than the period allows, after which the rate counts as changed
 OFF_WINDOWS: Final = 4
 UNCERTAIN: Final = 0.75  # maximum error of the period over a gap, in samples, for a gap of known size
 RESUME_STEPS: Final = 8  # maximum distance of a number from its due value after the link was missing
@@ -108,7 +108,7 @@ class ArrivalPace:
         self._turn = turn
         self.period_ns = 0.0  # time between samples, ns; 0.0 if unknown
         self._error = 1.0  # relative error of the period
-        # consecutive windows that were late or early: samples were lost, the phase was wrong, or the rate is another
+        # consecutive windows that were late or early: samples were lost, the phase was wrong, or the rate changed
         self._off_windows = 0
         # lateness of the newest of these windows without lost samples, 0.0 if it was early
         self._off_ns = 0.0
@@ -166,7 +166,7 @@ class ArrivalPace:
 
     def _close(self, arrival_ns: int) -> tuple[int, bool]:
         """Judge a window, unless frames waited in it: then the next window shows the lost samples."""
-        # If all frames were early, none waited for long: the phase or the rate is another.
+        # If all frames were early, none waited for long: the phase or the rate changed.
         if not self.period_ns:
             return self._learn(arrival_ns)
         self._unjudged += self._steps
@@ -275,7 +275,7 @@ class ArrivalLosses:
         self._on_unknown_gap = on_unknown_gap
         self._number = SampleNumber(modulus) if modulus else None
         self._pace: ArrivalPace | None = None
-        self.missed = 0  # number of lost samples directly before the newest number, and of earlier ones that it shows
+        self.missed = 0  # lost samples directly before the newest number, and earlier lost samples that it shows
         self.resets = 0  # number of restarts of the frame number
 
     def restart(self) -> None:
