@@ -194,8 +194,9 @@ class ReaderSelector(selectors.EpollSelector):
                     self._failed(alarm.ring, error)
 
     def _failed(self, callback: Callable[[], object], error: Exception) -> None:
-        if self.on_error is not None:
-            self.on_error({"message": f"Exception in reader {callback!r}", "exception": error})
+        if self.on_error is None:
+            raise error
+        self.on_error({"message": f"Exception in reader {callback!r}", "exception": error})
 
 
 class SampleLoop(asyncio.SelectorEventLoop):

@@ -5,6 +5,7 @@ import select
 import socket
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
 from typing import Final
 
 from imud.contracts.status import ClientStatus
@@ -261,12 +262,13 @@ class ClientConnection(Outbox, ScheduledClient):
         if self.closed:
             return
         self.closed = True
-        self._scheduler.remove(self)
-        self.discard()
-        self._sock.close()
-        self.wakers.close()
-        self._drop_requests()
-        self._clients.remove(self)
+        with ExitStack() as steps:  # after an error of a step, the other steps run, so that the client keeps no place
+            steps.callback(self._clients.remove, self)
+            steps.callback(self._drop_requests)
+            steps.callback(self.wakers.close)
+            steps.callback(self._sock.close)
+            steps.callback(self.discard)
+            steps.callback(self._scheduler.remove, self)
 
     # --- called by the scheduler --------------------------------------------------------------------------------------
 

@@ -3,7 +3,7 @@
 import asyncio
 import json
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -190,19 +190,21 @@ async def test_a_name_with_control_characters_is_refused(server: SocketServer) -
 
 @in_server()
 async def test_an_internal_error_ends_only_its_client(server: SocketServer, caplog: pytest.LogCaptureFixture) -> None:
+    """A second error, in a step of the end of the client, does not keep its place."""
     other = await Peer.greeted(server)
-    for failed in range(1, 5):
+    steps = ("client.ClientConnection.post", "outbox.Outbox.discard", "hub.Hub.unsubscribe")
+    for failed, broken in enumerate(("", "", "", "methods.encode_result", *steps), 1):
         peer = await Peer.greeted(server)
-        if failed < 4:  # in an action
-            await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"command","params":{"device":"imu0","name":"break"}}\n')
-            assert (await peer.message())["error"]["code"] == -32603
-        else:
-            with patch("imud.publishers.socket.methods.encode_result", side_effect=RecursionError("deep")):
-                await peer.send(b'{"jsonrpc":"2.0","id":1,"method":"devices"}\n')
+        await peer.result("watch")
+        request = '"devices"' if failed == 4 else '"command","params":{"device":"imu0","name":"break"}'
+        with patch(f"imud.publishers.socket.{broken}", side_effect=ZeroDivisionError) if broken else nullcontext():
+            await peer.send(b'{"jsonrpc":"2.0","id":1,"method":%b}\n' % request.encode())
+            if broken != steps[0]:
                 assert (await peer.message())["error"]["code"] == -32603
-        assert await peer.ended()
-        assert server.hub.status().failed == failed
+            assert await peer.ended()
+        assert server.hub.status().failed >= failed
         assert len(await other.result("devices")) == 2
+        assert len(server.hub.clients()) == 1
     assert caplog.text.count("internal error while serving a client") == 1
 
 
