@@ -270,7 +270,7 @@ PLATEAU_LEAST, PLATEAU_MOST = 4, 8
 # of white noise by less than 5 %: 3 / (4π) periods divided by τ.
 FILTER_PERIODS: Final = 5.0
 FLAT_LOW, FLAT_HIGH = 0.05, 0.6  # band of the noise density, as shares of the corner frequency
-KNOWN_PARTS: Final = 10  # duration divided by the largest τ with an error of the deviation below about 25 %
+KNOWN_PARTS: Final = 10  # minimum ratio of the duration to τ: the error of the deviation is then below about 25 %
 STILL_S: Final = 1.0  # length of the blocks that imud checks for motion, s
 STILL_FACTOR: Final = 4.0  # minimum standard deviation of a disturbed block, as a multiple of the median block
 MOVED_SHARE: Final = 0.01  # maximum share of blocks with motion in a measurement at rest

@@ -178,7 +178,7 @@ class Driver:
     decoded: str = "select another frame type on the device"
 
     def unknown_words(self, unknown: Mapping[int, int], device: str = "NAME", *, counted: bool = False) -> str:
-        """Describe valid frames that the codec cannot decode, with the next step, one sentence without its start.
+        """Describe valid frames that the codec cannot decode, with the next step, for the end of a sentence.
 
         `counted`: with the number of frames of each type.
         """

@@ -28,7 +28,7 @@ class Attachment(Protocol):
     """A part of a device next to its link. Synchronization: the loop's thread only."""
 
     def start(self, clock: SampleClock) -> None:
-        """Start the delivery to this clock: imud has found the device."""
+        """Start to work with this clock: imud has found the device."""
         ...
 
     def tick(self, now_ns: int, newest: Sample | None) -> None:
@@ -36,7 +36,7 @@ class Attachment(Protocol):
         ...
 
     def stop(self) -> None:
-        """Stop the delivery: the link of the device ended. A second call does nothing."""
+        """Stop to work with the clock: the link of the device ended. A second call does nothing."""
         ...
 
     def close(self) -> None:

@@ -47,9 +47,9 @@ SECOND: Final = Struct("<qqqqQIIIB3x12f12f4fff")
 _NEW: Final = bytes(SECOND.size)
 # seq, t_ns, t_rx_ns, utc_ns, t_err_ns, present, sync, values
 _SLOT: Final = Struct("<Qqqq16xII6xBx9d4d3ddd48x")
-# bit of `present`, first place in `_SLOT`, first place in the values of a second
+# bit of `present`, index of the first value in `_SLOT`, index of the first value in a second
 _VECTOR_PLACES: Final = ((HAS_ACCEL, 7, 0), (HAS_GYRO, 10, 3), (HAS_MAG, 13, 6), (HAS_EULER, 20, 9))
-# bit of `present`, first and last place in `_SLOT`, first place in the values of a second
+# bit of `present`, range of the values in `_SLOT`, index of the first value in a second
 _LAST_PLACES: Final = ((HAS_QUAT, 16, 20, 24), (HAS_TEMPERATURE, 23, 24, 28), (HAS_PRESSURE, 24, 25, 29))
 _FLOAT_MAX: Final = (2 - 2**-23) * 2.0**127
 _VECTOR_BITS: Final = (HAS_ACCEL, HAS_GYRO, HAS_MAG, HAS_EULER)

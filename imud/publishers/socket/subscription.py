@@ -65,7 +65,7 @@ class Subscription:
 
 
 class DeliveryGroup:
-    """Clients of one device with the same form. imud encodes each message once for all of them.
+    """Clients that receive the same messages of one device. imud encodes each message once for all of them.
 
     The lists of clients are replaced, never changed, because a client may leave while imud sends a batch to its list.
     imud makes the lists for the next batch, not for each change. Thus 256 clients that change their subscription all
