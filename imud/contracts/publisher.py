@@ -162,9 +162,31 @@ class Publisher(Protocol):
         ...
 
 
+class SettingsControl(Protocol):
+    """Settings of one device for clients with permission. All methods raise ImudError. `imud.device` implements it, and
+    outputs may not import that part."""
+
+    async def report(self, *, fresh: bool) -> SettingsReport:
+        """Return the device settings; with `fresh`, read them first."""
+        ...
+
+    async def plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
+        """Return the steps that change the device settings to `given` (None: declared settings)."""
+        ...
+
+    async def apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
+        """Change the device settings to `given` (None: declared settings). Raises an error before the first write."""
+        ...
+
+
 class DeviceControl(Protocol):
     """Operations on one device for clients with permission. Results are values that JSON can represent. `imud.device`
     implements it, and outputs may not import that part."""
+
+    @property
+    def settings(self) -> SettingsControl:
+        """Settings of the device."""
+        ...
 
     @property
     def verbs(self) -> Verbs:
@@ -191,18 +213,6 @@ class DeviceControl(Protocol):
 
     def stop_calibration(self) -> bool:
         """Stop the running calibration. Return whether a calibration was running."""
-        ...
-
-    async def settings_report(self, *, fresh: bool) -> SettingsReport:
-        """Return the device settings; with `fresh`, read them first. Raises ImudError."""
-        ...
-
-    async def settings_plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
-        """Return the steps that change the device settings to `given` (None: declared settings). Raises ImudError."""
-        ...
-
-    async def settings_apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
-        """Change the device settings to `given` (None: declared settings). Raises ImudError before the first write."""
         ...
 
 

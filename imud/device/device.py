@@ -32,7 +32,6 @@ from imud.contracts.driver import status_words
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link
 from imud.contracts.publisher import PutRecord
-from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
 from imud.device.attachments import Attachments
 from imud.device.calibration import CalibrationRun, RestWindow, check
@@ -48,7 +47,7 @@ from imud.device.watches import AttitudeWatch, StatusWatch
 from imud.host.clock import HostClock
 from imud.host.log import printable, shown
 from imud.links import LINKS
-from imud.model.errors import BadArgument, CommandError, ImudError, LinkBusy, LinkError, LinkMissing
+from imud.model.errors import BadArgument, ImudError, LinkBusy, LinkError, LinkMissing
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.options import shown as json_words
@@ -226,13 +225,13 @@ class Device:
         )
         self._transport = transport = make_transport(context)
         self._attachments = Attachments(config, shared.lines, transport, self._events, host)
-        self._settings = DeviceSettings(config, transport, self._events, self.observer, host, shared.files)
-        transport.serve(self._attachments, self._settings)
+        self.settings = DeviceSettings(config, transport, self._events, self.observer, host, shared.files)
+        transport.serve(self._attachments, self.settings)
         self._calibration = CalibrationRun(transport, self._events)
         self._attachments.add(self._calibration)
-        self._attachments.add(self._settings)
+        self._attachments.add(self.settings)
         self._attachments.add(transport.samples)
-        self._verb_run = VerbRun(self._settings, transport)
+        self._verb_run = VerbRun(self.settings, transport)
         self._attitude = AttitudeWatch(config, self._events)
         self._status = StatusWatch(self._events)
         self._judge = ConditionJudge(config, transport.link.title, self.ledger, self._events, host.now_ns())
@@ -290,7 +289,7 @@ class Device:
 
     def _judge_condition(self, now_ns: int) -> None:
         """Update the condition from the facts that it depends on."""
-        transport, settings, path = self._transport, self._settings, self._transport.path
+        transport, settings, path = self._transport, self.settings, self._transport.path
         self._is_slow = path is None or not 0 < path.period_ns <= IDLE_FLUSH_NS
         has_settings = bool(settings.declared or settings.is_unsaved or settings.comparison.problem)
         axes, axes_problem = self._attitude.problem(transport.driver, settings, transport.axes_problem)
@@ -323,7 +322,7 @@ class Device:
     def _needs_ticks(self) -> bool:
         """Return whether the device needs ten ticks per second."""
         state, path = self._health.state, self._transport.path
-        if self._attachments.needs_ticks or self._transport.busy or self._settings.lock.busy:
+        if self._attachments.needs_ticks or self._transport.busy or self.settings.lock.busy:
             return True
         if state is not DeviceState.RUNNING or path is None:
             return state in WATCHED
@@ -362,7 +361,7 @@ class Device:
             transport.start(self._on_end)
             tasks = [
                 asyncio.create_task(transport.work(), name=f"{self.config.name} work"),
-                asyncio.create_task(self._settings.comparison.run(), name=f"{self.config.name} settings"),
+                asyncio.create_task(self.settings.comparison.run(), name=f"{self.config.name} settings"),
             ]
             await asyncio.wait({*tasks, ended}, return_when=asyncio.FIRST_COMPLETED)
             if not ended.done():
@@ -400,7 +399,7 @@ class Device:
 
     def record(self, put: PutRecord) -> None:
         """Start a recording: write the description of the device, then its data. `observer.end` stops the recording."""
-        self.observer.begin(put, self._transport.where, identity_words(self._settings.identity), self._settings.shown)
+        self.observer.begin(put, self._transport.where, identity_words(self.settings.identity), self.settings.shown)
 
     # --- verbs -----------------------------------------------------------------------------------------------------
 
@@ -420,7 +419,7 @@ class Device:
             raise BadArgument(f"{self.config.name}: unknown command {name[:64]!r}; expected: {self._known_verbs()}")
         if name in self._attachments.verbs:
             return await self._verb_run.run_line(name, arguments, self._attachments)
-        self._require_replies()
+        self._transport.require_replies()
         return await self._verb_run.run(name, verb, arguments)
 
     @property
@@ -432,7 +431,7 @@ class Device:
     @property
     def last_calibrations(self) -> Mapping[str, LastCalibration]:
         """Result of the last calibration of each kind."""
-        return self._shared.files.flash.record(self._settings.module).calibrations
+        return self._shared.files.flash.record(self.settings.module).calibrations
 
     async def calibrate(self, kind: str, *, save: bool) -> CalibrationResult:
         """Guide a calibration. Raises CommandError, TransferError, DeviceRefused, LinkError."""
@@ -441,52 +440,25 @@ class Device:
             known = ", ".join(self.calibrations) or "none"
             raise BadArgument(f"{self.config.name}: unknown calibration {kind[:64]!r}; expected: {known}")
         log.info("%s: calibrate %s%s", self.config.name, kind, ", save" if save else "")
-        self._require_replies()
+        self._transport.require_replies()
         stop = f"stop it with imud calibrate {self.config.name} --stop"
-        async with self._settings.lock.hold(f"the calibration {kind}", stop):
+        async with self.settings.lock.hold(f"the calibration {kind}", stop):
             if save:
-                self._settings.spend_flash()
+                self.settings.spend_flash()
             result = None
             try:
                 result = await self._calibration.run(kind, calibration, save=save)
-                self._shared.files.flash.keep_calibration(self._settings.module, result)
+                self._shared.files.flash.keep_calibration(self.settings.module, result)
                 return result
             finally:
                 saved = result is not None and (result.saved or result.kept is not Kept.BY_SAVE)
                 if result is not None and result.saved:  # the save writes all settings
-                    self._settings.flash_is_current(changed=False)
-                self._settings.changed(unsaved=not saved)
+                    self.settings.flash_is_current(changed=False)
+                self.settings.changed(unsaved=not saved)
 
     def stop_calibration(self) -> bool:
         """Stop the running calibration; return whether one was running."""
         return self._calibration.cancel()
-
-    # --- settings -----------------------------------------------------------------------------------------------------
-
-    async def settings_report(self, *, fresh: bool) -> SettingsReport:
-        """Return the device settings: read now if `fresh`, otherwise the last values.
-
-        Raises CommandError, TransferError, DeviceRefused, LinkError.
-        """
-        if fresh:
-            self._require_replies()
-        return await self._settings.report(fresh=fresh)
-
-    async def settings_plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
-        """Return the plan to set the values `given` (None: the declared settings). Raises as `settings_report`."""
-        self._require_replies()
-        return await self._settings.plan(given, save=save)
-
-    async def settings_apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
-        """Set the values `given` (None: the declared settings). Raises as `settings_report`, before the first write."""
-        self._require_replies()
-        return await self._settings.apply(given, save=save)
-
-    def _require_replies(self) -> None:
-        self._shared.owner.tick_soon()  # a command watches the samples
-        if not self._transport.accepts_scripts:
-            problem = self._health.problem or "it cannot reply to commands now"
-            raise CommandError(f"{self.config.name} is {self._health.state}: {problem}")
 
     def _known_verbs(self) -> str:
         return ", ".join(self.verbs) or "none" + " while no device is found" * (self._transport.driver is None)
@@ -519,7 +491,7 @@ class Device:
         transport, health, path = self._transport, self._health, self._transport.path
         driver, newest = transport.driver, path.newest if path is not None else None
         latency = path.latency if path is not None else LatencyMeter()
-        frame = self._attitude.status(driver, path, self._settings)
+        frame = self._attitude.status(driver, path, self.settings)
         status = DeviceStatus(
             name=self.config.name,
             device_id=self.device_id,
@@ -530,8 +502,8 @@ class Device:
             link=transport.where,
             state=health.state,
             problem=health.problem,
-            identity=identity_words(self._settings.identity),
-            settings=dict(self._settings.shown),
+            identity=identity_words(self.settings.identity),
+            settings=dict(self.settings.shown),
             rate_hz=self._judge.counts.rate_hz(),
             expected_rate_hz=transport.expected_rate_hz,
             newest_seq=newest.seq if newest else 0,
@@ -550,9 +522,9 @@ class Device:
             connects=self._connects,
             lines=transport.add_lines(self._attachments.lines_status()),
             utc=self._attachments.utc_status(),
-            declared=self._settings.status(),
+            declared=self.settings.status(),
             noise=self.config.noise,
-            resets_requested=self._settings.resets_requested,
+            resets_requested=self.settings.resets_requested,
             condition=self._judge.watch.condition,
             recent=self._judge.counts.status(path.last_sample_ns if path else 0),
             history=self._judge.watch.history,

@@ -429,6 +429,8 @@ class DeviceSettings:
 
         Raises CommandError, TransferError, DeviceRefused, LinkError.
         """
+        if fresh:
+            self._transport.require_replies()
         table = self._table()
         if fresh:
             async with self.lock.hold("a read of the settings"):
@@ -441,6 +443,7 @@ class DeviceSettings:
 
     async def plan(self, given: Mapping[str, Any] | None, *, save: bool) -> SettingsPlan:
         """Return the plan to set the values `given` (None: the declared settings). Raises as `report`."""
+        self._transport.require_replies()
         table = self._table()
         wanted = _wanted(self._config.name, table, given, self.declared)
         async with self.lock.hold("a plan of settings"):
@@ -452,6 +455,7 @@ class DeviceSettings:
 
     async def apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
         """Set the values `given` (None: the declared settings). Raises as `report`, before the first write."""
+        self._transport.require_replies()
         table = self._table()
         wanted = _wanted(self._config.name, table, given, self.declared)
         async with self.lock.hold("a change of settings"):

@@ -397,6 +397,10 @@ class SettingsPort(SampleSource):
     def can_be_asked(self) -> bool:
         """Whether imud can run a script on the device now."""
 
+    @abstractmethod
+    def require_replies(self) -> None:
+        """Raise CommandError if the device cannot reply to a command now."""
+
     @property
     def may_ask(self) -> bool:
         """Whether the configuration allows requests that no user made."""

@@ -233,6 +233,12 @@ class Transport(SettingsPort):
         health = self._health
         return health.streaming or (health.state is DeviceState.SEARCHING and self.hears_replies)
 
+    def require_replies(self) -> None:
+        self._context.owner.tick_soon()  # a command watches the samples
+        if not self.accepts_scripts:
+            problem = self._health.problem or "it cannot reply to commands now"
+            raise CommandError(f"{self._config.name} is {self._health.state}: {problem}")
+
     @property
     def can_be_asked(self) -> bool:
         """Whether imud can run a script on the device now."""

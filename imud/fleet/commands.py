@@ -247,7 +247,7 @@ class CommandChannel:
             raise BadArgument(f"{SAVE}: expected true or false, got {got(save)}")
         if not settings and not save:
             raise BadArgument(f"{SET}: expected at least one setting by name, or `{SAVE}`, got neither")
-        applied = await control.settings_apply(settings, save=save)
+        applied = await control.settings.apply(settings, save=save)
         failure, result = applied.failure, msgspec.to_builtins(applied)
         log.info("mqtt: %s: request %s set %s", asked.device, asked.request.id, failure or shown(settings))
         self._end(asked, Outcome.FAILED if failure else Outcome.DONE, result=result, error=failure)

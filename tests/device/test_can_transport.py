@@ -481,10 +481,10 @@ class BusInProcess:
 async def made_so(bus: BusInProcess, wanted: Mapping[str, object], saves: Callable[[], int], *, verified: bool) -> None:
     """Apply and save settings with a number that is in use, then with number 9. Check the result of each setting."""
     number = "node" if "node" in wanted else "address"
-    taken = await bus.done(bus.rig.device.settings_apply({number: 12}, save=True))
+    taken = await bus.done(bus.rig.device.settings.apply({number: 12}, save=True))
     assert f"{number} 12 is in use" in taken.problem
     assert saves() == 0
-    applied = await bus.done(bus.rig.device.settings_apply(wanted, save=True))
+    applied = await bus.done(bus.rig.device.settings.apply(wanted, save=True))
     assert applied.problem == "", applied
     assert {step.name for step in applied.steps} == set(wanted)
     assert any("not verified" in str(step.outcome) for step in applied.steps) is not verified, applied
@@ -529,7 +529,7 @@ def test_a_found_node_with_another_number_is_followed(monkeypatch: pytest.Monkey
     bus = BusInProcess(clock, "auto", None, module, identify=False)
 
     async def story() -> None:
-        await bus.done(bus.rig.device.settings_apply({"tpdo1_interval_ms": 20}, save=False))
+        await bus.done(bus.rig.device.settings.apply({"tpdo1_interval_ms": 20}, save=False))
         assert module.objects.settings.periods_ms[1] == 20
 
     bus.play(story)

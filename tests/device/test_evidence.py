@@ -40,10 +40,10 @@ async def test_a_restart_is_verified_by_the_device_counter(bench: ModuleBench, i
     seen = "the device counter continued, so the device has ignored the command"
     assert (found.verified, found.evidence) == ((False, seen) if ignores else (True, "the device counter restarted"))
     if not ignores:  # the device loses a setting that it has not saved
-        await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=False))
+        await bench.doing(bench.device.settings.apply({"mode": "9-axis"}, save=False))
         lost = '; the restart changed settings: mode is "6-axis", was "9-axis"'
         assert (await result_of(bench, "restart")).evidence == "the device counter restarted" + lost
-    applied = await bench.doing(bench.device.settings_apply({"mounting": "x_up"}, save=True))
+    applied = await bench.doing(bench.device.settings.apply({"mounting": "x_up"}, save=True))
     assert (applied.restarted, applied.problem) == ((False, f"restart: {seen}") if ignores else (True, ""))
 
 
@@ -83,7 +83,7 @@ async def test_a_reset_is_verified_by_changed_settings(
 ) -> None:
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
     if unsaved:
-        await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=False))
+        await bench.doing(bench.device.settings.apply({"mode": "9-axis"}, save=False))
     bench.module.set["mode"], bench.module.flash["mode"] = "9-axis", flash
     found = await result_of(bench, "factory_reset")
     assert found.verified is verified
@@ -105,7 +105,7 @@ async def test_the_log_has_no_warning_about_a_requested_change(
 ) -> None:
     caplog.set_level("INFO", "imud")
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
-    await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=False))
+    await bench.doing(bench.device.settings.apply({"mode": "9-axis"}, save=False))
     records = [(r.levelname, r.getMessage()) for r in caplog.records if "settings of the device" in r.getMessage()]
     assert [level for level, _ in records] == ["INFO"], records
 

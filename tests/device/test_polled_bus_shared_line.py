@@ -274,8 +274,8 @@ async def test_declared_settings_are_applied_to_every_kind_of_module(bench: Line
         await rig.until_samples(10)
         assert rig.kinds.count(EventKind.UP) == 1
         assert rig.ledger.lost_gap_device == (2 if module.variant.long_block == "silent" else 0)
-        assert "address 2 is in use" in (await rig.device.settings_apply({"address": 2}, save=True)).problem
-        applied = await rig.device.settings_apply({"mode": "9-axis", "mounting": "x_up", "address": 9}, save=True)
+        assert "address 2 is in use" in (await rig.device.settings.apply({"address": 2}, save=True)).problem
+        applied = await rig.device.settings.apply({"mode": "9-axis", "mounting": "x_up", "address": 9}, save=True)
         assert applied.problem == "", applied
         assert {step.name: str(step.outcome) for step in applied.steps}["mounting"] == "sent, not verified"
         await rig.until_samples(5)
@@ -290,12 +290,12 @@ async def test_a_device_with_another_rate_keeps_the_rate_of_its_bus_until_the_re
     module, other = modbus_slave(1), modbus_slave(2)
     async with bench.running(module, other) as (rig, beside):
         await rig.until_samples(5)
-        applied = await rig.device.settings_apply({"baud": 921600}, save=True)
+        applied = await rig.device.settings.apply({"baud": 921600}, save=True)
         assert (applied.failure, applied.saved, applied.restarted) == ("", True, False)
         assert "restart them with `imud command NAME restart`" in applied.advice
         assert module.flash.baud == 921600
         await rig.until_samples(5)
-        applied = await rig.device.settings_apply({"mode": "9-axis"}, save=False)
+        applied = await rig.device.settings.apply({"mode": "9-axis"}, save=False)
         assert applied.failure == ""
         assert (rig.kinds.count(EventKind.DOWN), beside.kinds.count(EventKind.DOWN)) == (0, 0)
 

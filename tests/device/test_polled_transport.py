@@ -383,10 +383,10 @@ async def test_settings_are_applied_and_read_again_after_an_action(bench: Polled
     bench.spi.device = device.spi
     async with bench.running(bench.on_spi(burst="extended")) as (rig,):
         await rig.until_samples(5)
-        report = await rig.device.settings_report(fresh=True)
+        report = await rig.device.settings.report(fresh=True)
         actual = {one.name: one.actual for one in report.settings}
         assert actual == {"accel_filter": "47 Hz", "gyro_filter": "47 Hz", "burst": "extended"}
-        applied = await rig.device.settings_apply({"accel_filter": "average 16"}, save=False)
+        applied = await rig.device.settings.apply({"accel_filter": "average 16"}, save=False)
         assert [(step.name, str(step.outcome)) for step in applied.steps] == [("accel_filter", "verified")]
         assert device.filter == 0xDB
         assert rig.device.status().settings["gyro_filter"] == "47 Hz"

@@ -139,7 +139,7 @@ class ModuleBench:
         (lambda _bench: asyncio.sleep(0), False),
         (lambda bench: bench.pass_s(11), True),
         (lambda bench: bench.doing(bench.device.act("save", {})), True),
-        (lambda bench: bench.doing(bench.device.settings_report(fresh=True)), False),
+        (lambda bench: bench.doing(bench.device.settings.report(fresh=True)), False),
     ],
     ids=["immediately", "late", "after a command", "after a read"],
 )
@@ -148,10 +148,10 @@ async def test_apply_uses_the_values_of_a_recent_plan(
     bench: ModuleBench, between: Callable[[ModuleBench], Coroutine[Any, Any, Any]], reads_again: bool
 ) -> None:
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
-    await bench.doing(bench.device.settings_plan({"mode": "9-axis"}, save=False))
+    await bench.doing(bench.device.settings.plan({"mode": "9-axis"}, save=False))
     await between(bench)
     before = len(bench.module.commands)
-    applied = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=False))
+    applied = await bench.doing(bench.device.settings.apply({"mode": "9-axis"}, save=False))
     assert outcomes(applied) == {"mode": StepOutcome.VERIFIED}
     # one read-back, which the status uses too
     assert bench.module.commands[before:] == [*["GET"] * reads_again, 'SET mode="9-axis"', "GET"]
@@ -164,7 +164,7 @@ async def test_apply_uses_the_values_of_a_recent_plan(
 @played(ModuleBench)
 async def test_the_value_in_flash_is_inferred_from_starts_and_saves(bench: ModuleBench) -> None:
     async def mode() -> tuple[str, object, object]:
-        report = await bench.doing(bench.device.settings_report(fresh=False))
+        report = await bench.doing(bench.device.settings.report(fresh=False))
         one = next(one for one in report.settings if one.name == "mode")
         return str(one.saved_state), one.saved, one.actual
 
@@ -173,12 +173,12 @@ async def test_the_value_in_flash_is_inferred_from_starts_and_saves(bench: Modul
     assert await mode() == ("unknown", None, "6-axis")  # read once after detection, without declared settings
     await bench.doing(bench.device.act("save", {}))
     assert await mode() == ("same", "6-axis", "6-axis")
-    await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=False))
+    await bench.doing(bench.device.settings.apply({"mode": "9-axis"}, save=False))
     assert await mode() == ("differs", "6-axis", "9-axis")
     reasons = bench.device.status().declared
     assert reasons is not None
     assert reasons.lost_at_power_off == {"mode": "9-axis"}
-    await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
+    await bench.doing(bench.device.settings.apply({"mode": "9-axis"}, save=True))
     assert await mode() == ("same", "9-axis", "9-axis")
     await bench.pass_s(12)
     bench.module.restart()
@@ -442,7 +442,7 @@ async def test_flash_writes_of_imud_have_a_lower_limit_than_requests(bench: Modu
     assert "the limit of imud itself" in bench.status.problem
     assert bench.module.saves == LIMIT_ITSELF
     assert bench.module.set["mode"] == "9-axis"  # imud sets it anyway
-    assert (await bench.doing(bench.device.settings_apply({"mode": "6-axis"}, save=True))).saved
+    assert (await bench.doing(bench.device.settings.apply({"mode": "6-axis"}, save=True))).saved
     assert bench.status.flash_writes_day == LIMIT_ITSELF + 1
 
 
@@ -458,22 +458,22 @@ async def test_plan_and_apply_of_given_values(bench: ModuleBench) -> None:
         ({"output": {"a": 1000, "b": 1000}}, "at most 1152 Hz in all"),
     ):
         with pytest.raises(BadArgument, match=message):
-            await bench.doing(bench.device.settings_apply(given, save=True))
-    plan = await bench.doing(bench.device.settings_plan({"mode": "9-axis", "baud": 921600}, save=True))
+            await bench.doing(bench.device.settings.apply(given, save=True))
+    plan = await bench.doing(bench.device.settings.plan({"mode": "9-axis", "baud": 921600}, save=True))
     assert [step.name for step in plan.steps] == ["mode", "baud"]
     assert bench.written() == []
-    applied = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=False))
+    applied = await bench.doing(bench.device.settings.apply({"mode": "9-axis"}, save=False))
     assert [(one.name, one.before, one.outcome) for one in applied.steps] == [("mode", "6-axis", StepOutcome.VERIFIED)]
     assert (applied.problem, applied.saved, applied.differences) == ("", False, {})
-    saved = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
+    saved = await bench.doing(bench.device.settings.apply({"mode": "9-axis"}, save=True))
     assert (saved.steps, saved.saved) == ((), True)  # the previous value is saved
-    again = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
+    again = await bench.doing(bench.device.settings.apply({"mode": "9-axis"}, save=True))
     assert (again.steps, again.saved, bench.module.saves) == ((), False, 1)
     bench.module.disappear()
     await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
     for work in (
-        bench.device.settings_report(fresh=True), bench.device.settings_plan({}, save=False),
-        bench.device.settings_apply({}, save=False),
+        bench.device.settings.report(fresh=True), bench.device.settings.plan({}, save=False),
+        bench.device.settings.apply({}, save=False),
     ):  # fmt: skip
         with pytest.raises(CommandError, match="bow is missing"):
             await work
@@ -483,10 +483,10 @@ async def test_plan_and_apply_of_given_values(bench: ModuleBench) -> None:
 async def test_a_report_contains_the_last_or_new_values(bench: ModuleBench) -> None:
     await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
     bench.module.set["hours"] = 8
-    known = await bench.device.settings_report(fresh=False)
+    known = await bench.device.settings.report(fresh=False)
     assert [one.actual for one in known.settings if one.name == "hours"] == [7]
     bench.module.set["hours"] = 7
-    fresh = await bench.doing(bench.device.settings_report(fresh=True))
+    fresh = await bench.doing(bench.device.settings.report(fresh=True))
     assert (fresh.device, fresh.driver, fresh.identity["serial_number"]) == ("bow", "fake-module", "A1")
     assert {one.name: one.actual for one in fresh.settings if one.readable} == {
         name: value for name, value in FACTORY.items() if name != "secret"
@@ -509,7 +509,7 @@ def applied_with(
         await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
         await bench.pass_s(1)
         prepare(bench.module)
-        answers.append(await bench.doing(bench.device.settings_apply(given, save=save)))
+        answers.append(await bench.doing(bench.device.settings.apply(given, save=save)))
 
     bench.play(story)
     return bench, answers[0]
@@ -606,17 +606,17 @@ async def test_commands_that_save_count_and_are_limited(bench: ModuleBench) -> N
     assert not bench.status.unsaved
     for _ in range(LIMIT_ASKED - 2):
         await bench.doing(bench.device.act("save", {}))
-    applied = await bench.doing(bench.device.settings_apply({"mode": "9-axis"}, save=True))
+    applied = await bench.doing(bench.device.settings.apply({"mode": "9-axis"}, save=True))
     assert (applied.saved, applied.problem) == (True, "")
     assert bench.status.flash_writes_day == bench.module.saves == LIMIT_ASKED
     sent = bench.module.commands.count("ZERO")
     for saving in (bench.device.act("save", {}), bench.device.calibrate("zero", save=True)):
         with pytest.raises(CommandError, match="bow: its flash was written 40 times in 24 hours"):
             await bench.doing(saving)
-    applied = await bench.doing(bench.device.settings_apply({"mode": "6-axis"}, save=True))
+    applied = await bench.doing(bench.device.settings.apply({"mode": "6-axis"}, save=True))
     assert "not saved: its flash was written 40 times" in applied.problem
     # the step of this setting saves
-    applied = await bench.doing(bench.device.settings_apply({"baud": 921600}, save=True))
+    applied = await bench.doing(bench.device.settings.apply({"baud": 921600}, save=True))
     assert applied.problem.startswith("baud: its flash was written 40 times")
     assert (bench.module.saves, bench.module.commands.count("ZERO"), bench.module.baud) == (LIMIT_ASKED, sent, 115200)
     assert (await bench.doing(bench.device.calibrate("zero", save=False))).verified
@@ -631,7 +631,7 @@ async def test_a_command_waits_for_another_command_for_a_limited_time(bench: Mod
     await bench.pass_s(1)
     begin_ns = bench.clock.now_ns()
     with pytest.raises(CommandError, match="the command wait is running, started 11 s ago by imud; try again later"):
-        await bench.doing(bench.device.settings_report(fresh=True))
+        await bench.doing(bench.device.settings.report(fresh=True))
     assert bench.clock.now_ns() - begin_ns == pytest.approx(10e9, rel=0.1)
     work = bench.device.status().work
     assert work is not None
@@ -639,7 +639,7 @@ async def test_a_command_waits_for_another_command_for_a_limited_time(bench: Mod
     waiting.cancel()
     await bench.pass_s(1)
     assert bench.device.status().work is None
-    await bench.doing(bench.device.settings_report(fresh=True))
+    await bench.doing(bench.device.settings.report(fresh=True))
 
 
 # --- a backup before all is lost --------------------------------------------------------------------------------------

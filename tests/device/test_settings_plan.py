@@ -316,6 +316,9 @@ class OnePort(settings_plan.SettingsPort):
     def __init__(self) -> None:
         self.samples = SampleWatch(self)
 
+    def require_replies(self) -> None:
+        """Raise no error: the device always replies."""
+
     async def run_script(self, make: Callable[..., Any], *arguments: Any) -> Any:
         return make(TARGET, *arguments)
 

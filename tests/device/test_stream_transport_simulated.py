@@ -165,7 +165,7 @@ async def test_every_variant_is_followed_to_another_rate_and_back(
     device: LinkedDevice, variant: str, link: dict[str, Any]
 ) -> None:
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
-    applying = asyncio.ensure_future(device.device.settings_apply({"baud": 921600}, save=True))
+    applying = asyncio.ensure_future(device.device.settings.apply({"baud": 921600}, save=True))
     await device.until(applying.done, "the new rate", 60)
     assert device.link.baud == device.module.baud == device.module.flash.baud == 921600
     assert ("in the configuration" in applying.result().advice) is (not link)
@@ -241,7 +241,7 @@ async def test_declared_settings_reach_every_variant(device: LinkedDevice, behav
     """An output that needs the new baud rate, together with this rate."""
     wanted = {"mode": "9-axis", "mounting": "y_up", "sout_divisor": 3, "output": {"hi91": 500}, "baud": 921600}
     await device.until(lambda: len(device.samples) > 20 and device.device.status().settings)
-    applying = asyncio.ensure_future(device.device.settings_apply(wanted, save=True))
+    applying = asyncio.ensure_future(device.device.settings.apply(wanted, save=True))
     await device.until(applying.done, "the end of the plan", 90)
     applied = applying.result()
     assert applied.problem == ""
@@ -421,7 +421,7 @@ async def test_settings_are_applied_in_an_order_that_keeps_the_connection(bench:
     with pytest.raises(BadArgument, match="rate_hz and baud: expected at most 200 Hz at 115200 baud"):
         await act(device, "rate", {"rate_hz": 400})
     await bench.until_samples()
-    applied = await device.settings_apply({"baud": 460800}, save=True)
+    applied = await device.settings.apply({"baud": 460800}, save=True)
     assert ("not known whether the device executed" in applied.problem) is (variant == "no K1")
     assert device.status().settings["baud"] == "460800"
     assert bench.line.baud == bench.module.baud == 460800
@@ -435,10 +435,10 @@ async def test_settings_are_applied_in_an_order_that_keeps_the_connection(bench:
     assert (bench.line.baud, bench.module.flash) == (115200, Imu61xSettings())
     await bench.until_samples()
     with pytest.raises(BadArgument, match="output_rate_hz and baud: expected at most 200 Hz at 115200 baud"):
-        await device.settings_apply({"output_rate_hz": 400}, save=False)
+        await device.settings.apply({"output_rate_hz": 400}, save=False)
     assert bench.module.settings == Imu61xSettings()
     wanted: dict[str, Any] = {"baud": 460800, "output_rate_hz": 400, "gyro_filter": "10 Hz", "i2c_address": "0x1a"}
-    applied = await device.settings_apply(wanted, save=variant != "no K1")
+    applied = await device.settings.apply(wanted, save=variant != "no K1")
     assert {step.name for step in applied.steps} == set(wanted)
     assert {step.outcome for step in applied.steps} == {StepOutcome.VERIFIED}
     assert (applied.problem, applied.differences) == ("", {})
@@ -458,7 +458,7 @@ async def test_a_device_that_refuses_all_commands_keeps_its_settings(bench: Imu6
     for name in ("save", "restart", "factory_reset", "stop_streaming"):
         with pytest.raises(CommandError):
             await bench.device.act(name, {})
-    applied = await bench.device.settings_apply({"output_rate_hz": 10}, save=True)
+    applied = await bench.device.settings.apply({"output_rate_hz": 10}, save=True)
     assert [step.outcome for step in applied.steps] == [StepOutcome.NOT_APPLIED]
     assert "after the write, got 50" in applied.problem
     assert (bench.module.settings, bench.module.flash) == (SLOW, SLOW)

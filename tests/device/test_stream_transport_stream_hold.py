@@ -128,7 +128,7 @@ async def test_a_device_needs_ten_ticks_per_second_if_it_is_slow_or_busy(
     device = bench.device
     bench.rig.tick()
     assert device._needs_ticks() is needed, period_ms
-    async with device._settings.lock.hold("the command save"):
+    async with device.settings.lock.hold("the command save"):
         assert device._needs_ticks()
     device._health.state = DeviceState.SILENT
     assert device._needs_ticks()

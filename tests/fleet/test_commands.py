@@ -37,6 +37,7 @@ DOCS = Path(__file__).parents[2] / "docs" / "fleet.md"
 
 class FakeDevice:
     def __init__(self) -> None:
+        self.settings = self
         self.done: list[tuple[object, ...]] = []
         self.applied = AppliedSettings()
         self.go_on: asyncio.Event | None = None
@@ -54,7 +55,7 @@ class FakeDevice:
             await self.go_on.wait()
         return self.result
 
-    async def settings_apply(self, given: Mapping[str, Any], *, save: bool) -> AppliedSettings:
+    async def apply(self, given: Mapping[str, Any], *, save: bool) -> AppliedSettings:
         self.done.append(("set", given, save))
         return self.applied
 

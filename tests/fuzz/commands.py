@@ -54,7 +54,7 @@ class _Control(FakeControl):
         VERBS[name].arguments(arguments)
         return {"done": name}
 
-    async def settings_apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
+    async def apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
         self._asked.append((self._device, f"set.{next(iter(given or {'': None})).partition('.')[0]}"))
         assert DRIVER.device_settings is not None
         wanted_values(DRIVER.device_settings, given or {})

@@ -92,7 +92,7 @@ async def test_a_node_of_the_kernel_under_our_driver(vcan: CanInterface) -> None
                     await asyncio.sleep(0.05)
                 await rig.until(lambda: rolls(rig.samples)[-1:] == [39], "the last sample")
                 await rig.until(lambda: rig.device.state is DeviceState.RUNNING, "running")
-                applied = await rig.device.settings_apply({"ff37_interval_ms": 50}, save=False)
+                applied = await rig.device.settings.apply({"ff37_interval_ms": 50}, save=False)
                 assert applied.problem == ""
                 assert intervals[0x0137] == 50
                 with pytest.raises(NoReply):
@@ -169,7 +169,7 @@ async def test_driver_and_simulator_with_every_message_and_changes(vcan: CanInte
         assert rig.device.ledger.lost() == 0
         await told("zero", zero="here")
         wanted = {"x_reversed": True, "bit_rate": 250_000, "ff34_interval_ms": 50, "ff37_interval_ms": 50}
-        applied = await rig.done(rig.device.settings_apply(wanted, save=True))
+        applied = await rig.done(rig.device.settings.apply(wanted, save=True))
         assert (applied.problem, applied.saved, applied.restarted, len(applied.steps)) == ("", True, False, 4)
         assert "restart them" in applied.advice
         await told("save")
@@ -198,7 +198,7 @@ async def test_nmea_2000_from_the_simulator(vcan: CanInterface) -> None:
 
 
 async def made_so(rig: BusRig, wanted: Mapping[str, object], *, verified: bool) -> None:
-    applied = await rig.done(rig.device.settings_apply(wanted, save=True))
+    applied = await rig.done(rig.device.settings.apply(wanted, save=True))
     assert applied.problem == "", applied
     assert {step.name for step in applied.steps} == set(wanted)
     outcomes = {str(step.outcome) for step in applied.steps}
@@ -220,7 +220,7 @@ async def test_a_canopen_node_is_made_as_declared(vcan: CanInterface, variant: s
     beside = HipnucCanopenModule(now_ns, HipnucCanopenHardware(factory=rare, boot_ms=0))
     rig = BusRig(vcan.name, "hipnuc-canopen", HipnucCanopenOptions(), module, beside)
     async with rig.played():
-        taken = await rig.done(rig.device.settings_apply({"node": 12}, save=True))
+        taken = await rig.done(rig.device.settings.apply({"node": 12}, save=True))
         assert "node 12 is in use" in taken.problem
         assert module.objects.writes_to_flash == 0
         wanted = {"tpdo2_interval_ms": 200, "incli_x_reversed": True, "node": 9}
@@ -239,7 +239,7 @@ async def test_a_j1939_module_is_made_as_declared(vcan: CanInterface, variant: s
     beside = HipnucJ1939Module(now_ns, J1939Settings(address=12), J1939Hardware(bitrate=0, boot_ms=0))
     rig = BusRig(vcan.name, "hipnuc-j1939", HipnucJ1939Options(), module, beside)
     async with rig.played():
-        taken = await rig.done(rig.device.settings_apply({"address": 12}, save=True))
+        taken = await rig.done(rig.device.settings.apply({"address": 12}, save=True))
         assert "address 12 is in use" in taken.problem
         assert module.writes_to_flash == 0
         wanted = {"ff37_interval_ms": 50, "y_reversed": True, "address": 9}

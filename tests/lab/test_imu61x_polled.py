@@ -173,7 +173,7 @@ async def test_kind_of_burst_in_every_variant(spi8: Bus[SpiTransfer], variant: s
         await rig.until_samples(10, LIMIT_S)
         assert rig.device.status().settings["burst"] == burst
         assert device.extended == (burst == "extended")
-        applied = await rig.device.settings_apply({"gyro_filter": "10 Hz"}, save=False)
+        applied = await rig.device.settings.apply({"gyro_filter": "10 Hz"}, save=False)
         assert device.filter == 0xB4
         assert rig.device.status().settings["gyro_filter"] == "10 Hz", applied
         await rig.until_samples(5, LIMIT_S)

@@ -40,7 +40,7 @@ async def act(device: Device, name: str, arguments: Mapping[str, Any]) -> object
     try:
         return await device.act(name, arguments)
     except IsSetting as instead:
-        done = await device.settings_apply(instead.data["settings"], save=instead.data["save"])
+        done = await device.settings.apply(instead.data["settings"], save=instead.data["save"])
         assert done.left_out == {}
         if done.problem:
             raise CommandError(done.problem) from None

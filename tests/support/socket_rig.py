@@ -105,6 +105,7 @@ class FakeControl:
 
     def __init__(self, device: str) -> None:
         self._device = device
+        self.settings = self
 
     async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
         if name == "wait":
@@ -132,7 +133,7 @@ class FakeControl:
     def stop_calibration(self) -> bool:
         return False
 
-    async def settings_report(self, *, fresh: bool) -> setting.SettingsReport:
+    async def report(self, *, fresh: bool) -> setting.SettingsReport:
         differences = {"mode": setting.SettingDifference("9-axis", "6-axis")}
         status = setting.SettingsStatus(
             setting.SettingsState.DIFFER, setting.OnDifference.REPORT, differences=differences, flash_writes=3,
@@ -144,17 +145,17 @@ class FakeControl:
         )
         return setting.SettingsReport(self._device, "hipnuc-uart", {"product": "HI13"}, status, (mode,))
 
-    async def settings_plan(self, given: Mapping[str, Any] | None, *, save: bool) -> setting.SettingsPlan:
+    async def plan(self, given: Mapping[str, Any] | None, *, save: bool) -> setting.SettingsPlan:
         """Make one step of a plan: for the given settings or for the declared settings."""
         mode = {"mode": "9-axis"} if given is None else given
         return setting.SettingsPlan(
             tuple(setting.PlannedStep(name, value, "6-axis") for name, value in mode.items()), save=save
         )
 
-    async def settings_apply(self, given: Mapping[str, Any] | None, *, save: bool) -> setting.AppliedSettings:
+    async def apply(self, given: Mapping[str, Any] | None, *, save: bool) -> setting.AppliedSettings:
         if given and "wait" in given:
             await done_late.wait()
-        plan = await self.settings_plan(given, save=save)
+        plan = await self.plan(given, save=save)
         steps = [
             setting.AppliedStep(one.name, one.value, one.before, setting.StepOutcome.VERIFIED) for one in plan.steps
         ]

@@ -434,12 +434,12 @@ def _settings(hub: Hub, connection: ClientConnection, params: SettingsParams) ->
             message = f"settings.get: for fresh, expected root or a member of {hub.control_group}"
             raise RpcError(Code.DENIED, message)
         _control(hub, params.device, connection, "settings.get")
-    return control.settings_report(fresh=bool(params.fresh))
+    return control.settings.report(fresh=bool(params.fresh))
 
 
 def _settings_change(method: str, hub: Hub, connection: ClientConnection, params: SettingsChangeParams) -> Later:
-    control = _control(hub, params.device, connection, method)
-    change = control.settings_plan if method == "settings.plan" else control.settings_apply
+    settings = _control(hub, params.device, connection, method).settings
+    change = settings.plan if method == "settings.plan" else settings.apply
     return change(params.settings, save=bool(params.save))
 
 
