@@ -244,7 +244,7 @@ def _shift(power: FloatArray, place: int) -> float:
 
 
 def _named(line: Peak, lines: Sequence[Peak], bin_hz: float) -> Peak:
-    """Return the line, with its multiple of the first stronger line if its frequency is such a multiple."""
+    """Return the line as a harmonic of the first stronger line if its frequency is a multiple of that frequency."""
     for number, other in enumerate(lines):
         multiple = round(line.frequency_hz / other.frequency_hz)
         near = abs(line.frequency_hz - multiple * other.frequency_hz) <= HARMONIC_BINS * bin_hz

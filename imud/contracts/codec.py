@@ -35,7 +35,7 @@ class BadFrame(msgspec.Struct, frozen=True, gc=False):
 
 
 def wrong_length_words(ledger: Ledger, frame: BadFrame | None) -> str:
-    """Describe the CAN frames of a wrong length by the newest one, one clause; empty without such a frame."""
+    """Describe the CAN frames of a wrong length by the newest such frame, one clause; empty without such a frame."""
     if frame is None or frame.can_id is None:
         return ""
     count = ledger.frames_bad_length
@@ -43,7 +43,7 @@ def wrong_length_words(ledger: Ledger, frame: BadFrame | None) -> str:
 
 
 def wrong_length(ledger: Ledger, can_id: int, data: bytes) -> tuple[BadFrame]:
-    """Count a CAN frame of a known identifier with another length than the manual's. Return its event."""
+    """Count a CAN frame of a known identifier with another length than in the manual. Return its event."""
     ledger.bytes_in_bad_frames += len(data)
     ledger.frames_bad_length += 1
     return (BadFrame(BadReason.LENGTH, data, can_id),)

@@ -87,7 +87,7 @@ class Verb:
     changes: bool = True  # Whether the verb can change a setting. imud reads all settings again after such a verb.
     # Whether the device has the settings of its flash afterwards. imud also reads the identity again.
     restarts: bool = False
-    # Returns the same from the arguments, for a verb that restarts the device with some arguments only
+    # Returns whether the device restarts, from the arguments, for a verb that restarts it with some arguments only
     restarts_with: "Callable[[Any], bool]" = _always
     proof: Proof = Proof.VALUE
     evidence: str = ""  # evidence of `Proof.SCRIPT`, or the reason of `Proof.NONE`, one clause

@@ -214,7 +214,7 @@ class StreamDriver(Driver):
     wake: Callable[[], RequestScript[bool | None]] | None = None
     # Request that starts the output, if scripts other than `wake` also send it: they cannot know whether it was on
     output_on: bytes = b""
-    # Returns why a device with these values of its settings replies and sends no samples, one clause
+    # Returns why a device with these values of its settings replies but sends no samples, one clause
     why_silent: Callable[[Mapping[str, Any]], str] = lambda _settings: "its output is off"
     # Returns one valid frame with random values, for property tests and fault injection
     example_frame: Callable[[Random], bytes]

@@ -23,7 +23,7 @@ class Claim:
 
     place: str  # port or bus: a path, or the name of an interface
     key: str  # key of the option with the port or bus
-    shared: bool = False  # whether several devices can use the place, each with a different part
+    shared: bool = False  # whether several devices can use this port or bus, each with another `part`
     part: int | None = None  # part of a shared place, for example a Modbus address; None before detection (`auto`)
     part_key: str = ""  # key of the option with the part
     # Options that must be equal for all devices of a shared place, by key

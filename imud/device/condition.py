@@ -111,7 +111,7 @@ class Facts(msgspec.Struct, kw_only=True):
 
 
 class Rule(NamedTuple):
-    """Rule for a reason: when it holds, and its sentences."""
+    """Rule for a reason: the test whether the reason holds, and the sentences for the user."""
 
     code: ReasonCode
     section: Section

@@ -349,7 +349,7 @@ def _give_edges(device: PlayedDevice, line: str, found: list[records.EdgeRecord]
 def _reading(one: records.ReadingRecord) -> Reading:
     if not one.trouble:
         return Reading(one.poll, one.data, None, one.start_ns, one.end_ns)
-    trouble = TROUBLES[min(one.trouble, len(TROUBLES)) - 1]  # a trouble of a newer imud
+    trouble = TROUBLES[min(one.trouble, len(TROUBLES)) - 1]  # a newer imud can record further kinds
     error = TransferError(trouble, one.data.decode(errors="replace"))
     return Reading(one.poll, b"", error, one.start_ns, one.end_ns)
 

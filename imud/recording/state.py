@@ -154,7 +154,7 @@ class StateReader:
     def restore(self, name: str, root: object) -> None:
         """Set the attributes of a root. Restore the roots in the order of the state.
 
-        Raises StateError. The root is then invalid.
+        Raises StateError. After this error, do not use the root.
         """
         known = attributes(root)
         if name not in self._tree:

@@ -158,7 +158,7 @@ def report_values(raw: Mapping[str, str]) -> dict[str, Any]:
 
 
 def why_silent(settings: Mapping[str, Any]) -> str:
-    """Return why a device with these values of its settings replies and sends no samples."""
+    """Return why a device with these values of its settings replies but sends no samples."""
     output = settings.get("output", {})
     rates = {name: rate for name, rate in output.items() if rate not in (0, ON_MARK)}
     if rates:
