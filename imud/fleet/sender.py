@@ -265,7 +265,7 @@ class MqttSender:
                 if rest_s > 0 and not self._ended:
                     self._wake_after(rest_s)
             self._say_farewell()
-        except BaseException as error:  # noqa: BLE001 - an internal error must end the daemon, not just this thread
+        except BaseException as error:  # noqa: BLE001 - `MqttPublisher.tick` raises the error again
             self.failure = error
 
     def _wake_after(self, seconds: float) -> None:

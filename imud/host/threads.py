@@ -206,7 +206,7 @@ class BusThread:
                 rest_ns = do_round()
                 if rest_ns > 0 and not self._ended:
                     (self._descriptors or self._wake).wait(rest_ns / NS_PER_S)
-        except BaseException as error:  # noqa: BLE001 - an internal error must end the daemon, not just this thread
+        except BaseException as error:  # noqa: BLE001 - the owner of the job raises the error again
             self._job.round_failed(error)
 
 
