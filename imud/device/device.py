@@ -529,7 +529,7 @@ class Device:
             recent=self._judge.counts.status(path.last_sample_ns if path else 0),
             history=self._judge.watch.history,
             calibration=self._calibration.status,
-            work=self._settings.lock.work,
+            work=self.settings.lock.work,
         )
         return transport.add_status(status)
 
