@@ -6,14 +6,16 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
+from random import Random
 from time import monotonic, sleep
+from typing import Final
 
-from tests.attack import rings, starvation
-from tests.attack.bounds import CLIENTS
+from tests.attack import rings
 from tests.attack.hostile import KINDS, Deeds
-from tests.attack.stage import HOSTILE_UIDS, PIPE_BYTES, READ_GID, AttackedDaemon
+from tests.attack.stage import CLIENTS, HOSTILE_UIDS, PIPE_BYTES, READ_GID, AttackedDaemon
 
 SHORT = (
     "nested", "empty-lines", "field-orders", "rates", "statuses", "watch-unread", "connects", "event-storm", "scrapes",
@@ -25,6 +27,11 @@ STARVE_S, STARVE_SEED = 4.0, 5
 """Duration of the attack, s, and seed of the stops. The second stop takes 2 s, more than a port can buffer."""
 LINE_BYTES = 512
 """Maximum length of a log message, bytes. A pipe with less room accepts no further message."""
+STOPS_S: Final = (0.05, 0.2, 0.7, 2.0)
+"""Durations of the stops, s: shorter and longer than the buffer of a terminal lasts at 1 kHz (50 ms) and than the
+maximum delay of a frame (500 ms)."""
+BETWEEN_S: Final = (0.02, 0.3, 1.0)  # time between two stops, s
+HOG: Final = "while True: pass"
 
 
 @dataclass
@@ -126,13 +133,41 @@ def shared_memory(stage: AttackedDaemon, seconds: float, sticky: bool) -> Done:
 
 def starved(stage: AttackedDaemon, seconds: float) -> Done:
     before = stage.port_refused
-    stops = starvation.attack(stage.pid, max(seconds, STARVE_S), STARVE_SEED)
+    stops = starve(stage.pid, max(seconds, STARVE_S), STARVE_SEED)
     problems = (
         []
         if stops and stage.port_refused > before
         else ["expected frames that the port rejected, got none: no stop was long enough"]
     )
     return Done(problems, Deeds(requests=stops), stops)
+
+
+def starve(pid: int, seconds: float, seed: int) -> int:
+    """Stop a process with signals and limit its CPU time. Return the number of stops."""
+    random, end, stops = Random(seed), monotonic() + seconds, 0
+    hogs = [_hog(cpu) for cpu in os.sched_getaffinity(pid)]
+    try:
+        while (left := end - monotonic()) > 0:
+            os.kill(pid, signal.SIGSTOP)
+            stops += 1
+            try:
+                sleep(min(random.choice(STOPS_S), left))
+            finally:
+                os.kill(pid, signal.SIGCONT)
+            sleep(random.choice(BETWEEN_S))
+    finally:
+        for hog in hogs:
+            hog.kill()
+            hog.wait()
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGCONT)
+    return stops
+
+
+def _hog(cpu: int) -> subprocess.Popen[bytes]:
+    hog = subprocess.Popen([sys.executable, "-S", "-c", HOG], stdin=subprocess.DEVNULL)
+    os.sched_setaffinity(hog.pid, {cpu})
+    return hog
 
 
 def calm(_stage: AttackedDaemon, seconds: float) -> Done:

@@ -37,6 +37,7 @@ PRIORITY = 10
 SETTLE_S = 3.0  # time before the first figures, s
 IDLE_DEVICES = 3
 REPLUG_LIMIT_S = 5.0  # time to open a device again
+CLIENTS = 256  # hostile clients at the same time
 CLIENTS_MAX = 320
 """Maximum number of clients: 256 hostile clients and the reserved places."""
 FDS_MAX = 16_384

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from tests.fuzz import c_header, corpus
-from tests.fuzz.groups import all_names, load
+from tests.fuzz import c_header
+from tests.fuzz.target import all_names, inputs_of, load, write_all
 
 BUILD: Final = Path("build/fuzz")
 SECONDS: Final = 60.0
@@ -66,7 +66,7 @@ def fuzz(target: str, engine: str, seconds: float, seed: int) -> Result:
     if seed:
         shutil.rmtree(grown, ignore_errors=True)
     grown.mkdir(parents=True, exist_ok=True)
-    paths = [str(path) for path in corpus.inputs_of(target)]
+    paths = [str(path) for path in inputs_of(target)]
     command = [sys.executable, "-m", "tests.fuzz.worker", engine, target, str(seconds), str(seed), str(folder)]
     command += [str(grown), *paths]
     if engine == "clang":
@@ -161,7 +161,7 @@ def main() -> int:
         print("\n".join([*all_names(), c_header.TARGET]))
         return 0
     if args.corpus:
-        return corpus.write_all()
+        return write_all()
     if args.replay:
         return replay(args.replay, args.target)
     BUILD.mkdir(parents=True, exist_ok=True)

@@ -15,8 +15,7 @@ from pathlib import Path
 from random import Random
 from typing import Final, Protocol, cast
 
-from tests.fuzz.groups import load
-from tests.fuzz.target import Target
+from tests.fuzz.target import Target, load
 
 INPUT_S_MAX: Final = 120
 """Maximum time for one input, s. An input needs milliseconds, but a busy host gives a nice process little time."""

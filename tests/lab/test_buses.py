@@ -16,9 +16,8 @@ import can
 import pytest
 import serial
 
-from tests.lab.bus import Bus
+from tests.lab.bus import Bus, RegisterDevice
 from tests.lab.can_interface import CanInterface
-from tests.lab.register_device import RegisterDevice
 from tests.lab.serial_port import PseudoTerminal
 from tests.lab.tool import ToolError, tool
 from tests.lab.wire import I2cTransfer, SpiTransfer

@@ -20,7 +20,7 @@ from imud.formats.slot import SLOT_BYTES, SLOT_FIELDS, decode_slot
 from imud.model.sample import Sample
 from tests.lab.can_interface import CanInterface
 from tests.lab.can_traffic import Against, Module, fleet, traffic
-from tests.lab.demo import demo
+from tests.lab.tool import demo
 from tests.support.daemon_process import RunningDaemon, running_daemon
 
 SECONDS = float(os.environ.get("IMUD_LAB_SECONDS", "6"))  # duration of the measurement

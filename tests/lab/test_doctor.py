@@ -16,8 +16,10 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from threading import Event, Thread
+from typing import Final
 from urllib.request import urlopen
 
+import msgspec
 import pytest
 import serial
 
@@ -25,7 +27,6 @@ import imud
 from imud.contracts.status import DeviceState, DeviceStatus
 from tests.lab.bus import Bus
 from tests.lab.can_interface import CanInterface
-from tests.lab.diagnosis import LIMIT_S, ORDINARY_USER, Diagnosis, diagnose
 from tests.lab.gpio_chip import GpioChip
 from tests.lab.imu61x_bus import on_i2c, on_spi, registers
 from tests.lab.imu_process import running_imu, tell, tty
@@ -35,6 +36,59 @@ from tests.lab.tool import running, tool
 from tests.lab.wire import I2cTransfer, Refuse, SpiTransfer
 from tests.support.daemon_process import RunningDaemon, running_daemon, wait_until, write_config
 from tests.support.files import ROOT, hi91
+
+LIMIT_S: Final = 150.0
+STATUS: Final = {"error": 2, "warning": 1}
+"""Exit status by severity (docs/doctor.md); 0 for all other severities."""
+ORDINARY_USER: Final = (
+    "setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "--inh-caps=+dac_read_search",
+    "--ambient-caps=+dac_read_search",
+)  # fmt: skip
+"""Runs a program as `nobody` without groups. It may read all files: the interpreter may be in root's home."""
+
+
+class Found(msgspec.Struct, frozen=True):
+    severity: str
+    seen: str
+    advice: str
+
+
+class CheckOutcome(msgspec.Struct, frozen=True):
+    name: str
+    findings: list[Found]
+
+
+class Diagnosis(msgspec.Struct, frozen=True):
+    status: int
+    complete: bool
+    verdict: str
+    checks: list[CheckOutcome]
+
+    def of(self, severity: str) -> list[tuple[str, str]]:
+        return [
+            (check.name, found.seen) for check in self.checks for found in check.findings if found.severity == severity
+        ]
+
+    def advice(self, check: str, severity: str, seen: str, advice: str = "") -> str:
+        found = [one for each in self.checks if each.name == check for one in each.findings]
+        fitting = [one for one in found if one.severity == severity and seen in one.seen and advice in one.advice]
+        assert fitting, f"{check}: expected {severity} with {seen!r} and the step {advice!r}, got {found}"
+        return fitting[0].advice
+
+    def has(self, check: str, severity: str, seen: str, advice: str = "") -> None:
+        self.advice(check, severity, seen, advice)
+
+
+def diagnose(config: Path, socket: Path, *prefix: str) -> Diagnosis:
+    """Run `imud doctor` after the words `prefix`. Check that the exit status matches the worst finding."""
+    doctor = (sys.executable, "-m", "imud", "doctor", "--json", "--socket", str(socket), "--config", str(config))
+    result = subprocess.run([*prefix, *doctor], capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    assert not result.stderr, result.stderr
+    found = msgspec.json.decode(result.stdout, type=Diagnosis)
+    severities = [one.severity for check in found.checks for one in check.findings]
+    assert result.returncode == found.status == max(STATUS.get(severity, 0) for severity in severities)
+    return found
+
 
 pytestmark = pytest.mark.timeout(600)
 

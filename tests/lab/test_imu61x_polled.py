@@ -11,11 +11,10 @@ from imud.drivers.imu61x import spi
 from imud.drivers.imu61x.i2c import READ_ID
 from imud.drivers.imu61x.spi import READ_STATE
 from imud.sim.imu61x.uart import REGISTER_VARIANTS
-from tests.lab.bus import Bus
-from tests.lab.demo import demo
+from tests.lab.bus import Bus, RegisterDevice
 from tests.lab.imu61x_bus import LIMIT_S, comes_back, on_i2c, on_spi, physics_holds, registers, vanishes
-from tests.lab.register_device import RegisterDevice
 from tests.lab.short_form import cases
+from tests.lab.tool import demo
 from tests.lab.wire import I2cTransfer, SpiTransfer
 from tests.support.device_rig import DeviceRig, device_config, running
 

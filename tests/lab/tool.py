@@ -1,4 +1,4 @@
-"""Independent programs: i2c-tools, can-utils, gpiod, spi-tools, iproute2."""
+"""Independent programs: i2c-tools, can-utils, gpiod, spi-tools, iproute2. Also `imud demo`, as a process."""
 
 import subprocess
 import sys
@@ -29,3 +29,21 @@ def running(*command: str) -> Iterator[subprocess.Popen[str]]:
         process.kill()
         process.wait(LIMIT_S)
         process.stdout.close()
+
+
+PATIENT = """
+import sys
+from imud.cli import main
+from imud.cli import demo
+demo.START_LIMIT_S = demo.FOUND_LIMIT_S = demo.STOP_LIMIT_S = 60.0
+sys.exit(main(["demo", "--plain", *sys.argv[1:]]))
+"""
+DEMO_LIMIT_S = 200.0  # for an emulated processor
+
+
+def demo(*words: str) -> str:
+    """Run `imud demo` to its end. Return its output."""
+    argv = [sys.executable, "-c", PATIENT, *words]
+    ended = subprocess.run(argv, capture_output=True, text=True, timeout=DEMO_LIMIT_S, check=False)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    return ended.stdout

@@ -11,18 +11,78 @@ the counts without a comparison.
 
 import argparse
 import os
+import platform
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
-from tests.bench.instructions import figures
-from tests.bench.instructions.measured import MARK, MARKS
+import msgspec
+
+from tests.bench.instructions.measured import INTERPRETER, MARK, MARKS
+
+FILE: Final = Path(__file__).with_name("figures.json")
+GROWTH_MOST: Final = 0.05
+"""Maximum growth of a stage, as a share. Two runs of the same code agree within 0.5 %."""
+LESS_NOTED: Final = 0.005  # report a decrease above this share
+BUILD_MOST: Final = 0.01
+"""Maximum difference of the stage `interpreter`, as a share. A larger difference means another build of Python."""
+
+Figures = dict[str, int]
+
+
+class Line(NamedTuple):
+    stage: str
+    now: int
+    kept: int | None
+
+    @property
+    def growth(self) -> float:
+        """Return the growth since the stored figure, as a share."""
+        return self.now / self.kept - 1 if self.kept else 0.0
+
+    @property
+    def is_good(self) -> bool:
+        return self.kept is not None and self.now <= self.kept * (1 + GROWTH_MOST)
+
+    def __str__(self) -> str:
+        if self.kept is None:
+            return f"{self.stage:58} {self.now:8}  NO FIGURE"
+        mark = "" if self.is_good else "  TOO MANY"
+        return f"{self.stage:58} {self.now:8} {self.kept:8} {self.growth:+8.1%}{mark}"
+
+
+def python_build() -> str:
+    python = f"{platform.python_implementation()} {platform.python_version()}"
+    return f"{python}, {platform.python_compiler()}, {platform.machine()}"
+
+
+def load() -> dict[str, Figures]:
+    return msgspec.json.decode(FILE.read_bytes(), type=dict[str, Figures])
+
+
+def keep(build: str, measured: Mapping[str, int]) -> None:
+    """Store the figures of one build. Keep the figures of stages that were not measured."""
+    kept = load()
+    kept[build] = {**kept.get(build, {}), **measured}
+    FILE.write_bytes(msgspec.json.format(msgspec.json.encode(kept), indent=1) + b"\n")
+
+
+def is_same_build(kept: Figures | None, measured: Mapping[str, int]) -> bool:
+    """Return whether the figures are from this build of Python: the same loop takes the same number of instructions."""
+    if kept is None or INTERPRETER not in kept:
+        return False
+    return abs(measured[INTERPRETER] / kept[INTERPRETER] - 1) <= BUILD_MOST
+
+
+def compare(kept: Figures, measured: Mapping[str, int]) -> list[Line]:
+    return [Line(stage, now, kept.get(stage)) for stage, now in measured.items()]
+
 
 LIMIT_S: Final = 900.0  # whole run under valgrind
 ROOT: Final = Path(__file__).parents[3]
@@ -84,29 +144,29 @@ def main() -> int:
         print("cannot find valgrind; try `make bench-deps` as root", file=sys.stderr)
         return 2
     try:
-        measured = measure([*args.words, figures.INTERPRETER] if args.words else [])
+        measured = measure([*args.words, INTERPRETER] if args.words else [])
     except MeasurementError as error:
         print(f"cannot count instructions: {error}", file=sys.stderr)
         return 1
-    build = figures.python_build()
-    kept = figures.load().get(build)
-    known = kept is not None and figures.is_same_build(kept, measured)
+    build = python_build()
+    kept = load().get(build)
+    known = kept is not None and is_same_build(kept, measured)
     print(f"# instructions per sample or frame; {build}")
-    lines = figures.compare(kept if known and kept else {}, measured)
+    lines = compare(kept if known and kept else {}, measured)
     for line in lines:
         print(line if known else f"{line.stage:58} {line.now:8}")
     if args.update:
-        figures.keep(build, measured)
-        print(f"# stored in {figures.FILE.relative_to(ROOT)}")
+        keep(build, measured)
+        print(f"# stored in {FILE.relative_to(ROOT)}")
         return 0
     if not known:
         print("# no comparison: figures.json has no figures for this build of Python; try ARGS=--update")
         return 0
     bad = [line.stage for line in lines if not line.is_good]
-    if any(line.growth < -figures.LESS_NOTED for line in lines):
+    if any(line.growth < -LESS_NOTED for line in lines):
         print('# some counts are lower than the stored figures; store them with ARGS="--update"')
     if bad:
-        print(f"# {len(bad)} stages take more than {figures.GROWTH_MOST:.0%} above their figure or have no figure")
+        print(f"# {len(bad)} stages take more than {GROWTH_MOST:.0%} above their figure or have no figure")
     return 1 if bad else 0
 
 

@@ -18,6 +18,8 @@ from tests.bench.instructions import virtual_time
 
 MARK = "getpgid"  # system call that imud does not use
 MARKS = 3  # dumps per stage
+INTERPRETER = "interpreter: a loop without imud"
+"""The stage that does not use imud. It shows differences between two builds of Python."""
 
 
 def mark() -> None:

@@ -34,7 +34,7 @@ from imud.sampling.clock import SampleClock
 from imud.sampling.path import PathContext, StreamPath
 from tests.bench.instructions import virtual_time
 from tests.bench.instructions.daemon import BUFFER, DRAIN_EVERY, QUIET_PERIOD_TICKS, VirtualDaemon, own_group
-from tests.bench.instructions.figures import INTERPRETER
+from tests.bench.instructions.measured import INTERPRETER
 from tests.bench.instructions.module import BAUD, SETTLE_READS, Module, Read
 from tests.support.publisher_context import publisher_context
 

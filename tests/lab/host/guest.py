@@ -6,18 +6,18 @@ raise LabError.
 """
 
 import os
+import re
 import selectors
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.lab.host.diagnosis import cause, last_line, out_of_memory
 from tests.lab.host.errors import HungGuest, LabError
-from tests.lab.host.monitor import examine, stop_and_continue
 
 TICK_S = 0.5
 GOODBYE_S = 5.0  # time from the exit status to the end of QEMU; about 0.1 s
@@ -153,3 +153,91 @@ def _status(folder: Folder, qemu_status: int) -> int:
 def to_terminal(data: bytes) -> None:
     sys.stdout.buffer.write(data)
     sys.stdout.buffer.flush()
+
+
+# --- known causes in the console log of a guest without a result --------------------------------------------------
+
+CAUSES = (
+    (r"Kernel panic - not syncing: System is deadlocked on memory", "guest out of memory"),
+    (r"VFS: Unable to mount root fs|Cannot open root device", "guest could not mount the host's root over 9p"),
+    (r"Requested init .* failed|No working init found", "guest could not start its init"),
+    (r"Out of memory: Killed process", "guest out of memory"),
+    (r"soft lockup|rcu_preempt detected stalls|blocked for more than", "guest kernel stuck"),
+    (r"BUG: |Oops: |general protection fault", "kernel fault in the guest"),
+    (r"Kernel panic", "kernel panic in the guest"),
+    (r"lab init failed", "guest set-up failed"),
+)
+"""Patterns of console lines with their meaning, the most significant pattern first."""
+
+KILLED = re.compile(r"Out of memory: Killed process")
+
+
+def cause(console: str) -> str | None:
+    for pattern, meaning in CAUSES:
+        line = next((line for line in console.splitlines() if re.search(pattern, line)), None)
+        if line is not None:
+            return f"{meaning}: {_bare(line)}"
+    return None
+
+
+def out_of_memory(console: str) -> bool:
+    """Return whether the guest's kernel killed a process because memory was full."""
+    return KILLED.search(console) is not None
+
+
+def last_line(console: str) -> str:
+    lines = [line for line in console.splitlines() if line.strip()]
+    return _bare(lines[-1]) if lines else "no output on the console"
+
+
+def _bare(line: str) -> str:
+    """Return a console line without time stamp and control characters, at most 160 characters."""
+    plain = re.sub(r"^\[ *[\d.]+\](\[[^]]*\])? *", "", line.strip())
+    return "".join(character for character in plain if character.isprintable())[:160]
+
+
+# --- the monitor of QEMU ------------------------------------------------------------------------------------------
+
+QUESTIONS = ("info status", "info registers", "info lapic", "info pic")
+PROMPT = b"(qemu) "
+ANSWER_S = 10.0
+PANIC_S = 60.0
+"""Maximum time of a panic, s. A panic that prints a hundred tasks takes a few seconds."""
+
+
+def stop_and_continue(monitor: socket.socket) -> None:
+    """Stop the guest and continue it, which wakes QEMU's processor thread. `examine` skips the replies."""
+    print("lab: the guest is silent; QEMU stops and continues it", file=sys.stderr, flush=True)
+    with suppress(OSError):  # QEMU has ended or does not read
+        monitor.sendall(b"stop\ncont\n", socket.MSG_DONTWAIT)
+
+
+def examine(monitor: socket.socket, log: Path) -> None:
+    """Examine a hung guest: write all commands to QEMU's monitor and their replies to `log`.
+
+    The last command is a non-maskable interrupt, which the kernel of the guest always accepts (`PANIC_BY_NMI` of the
+    command line): it prints its tasks and timers on the console, and its panic ends QEMU. Return when QEMU has ended or
+    does not reply.
+    """
+    with log.open("wb") as file, suppress(OSError):  # TimeoutError is an OSError
+        monitor.settimeout(ANSWER_S)
+        file.write(_answer(monitor))  # the banner
+        for question in (*QUESTIONS, "nmi"):
+            monitor.sendall(question.encode() + b"\n")
+            _echo, _, answer = _answer(monitor).partition(b"\n")  # the echo has one line for each typed character
+            file.write(question.encode() + b"\n" + answer)
+            file.flush()
+        monitor.settimeout(PANIC_S)
+        while monitor.recv(4096):
+            pass
+
+
+def _answer(monitor: socket.socket) -> bytes:
+    """Return all bytes up to the next prompt. Raises TimeoutError."""
+    found = b""
+    while not found.endswith(PROMPT):
+        part = monitor.recv(65536)
+        if not part:
+            return found
+        found += part
+    return found

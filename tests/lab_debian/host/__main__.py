@@ -18,8 +18,8 @@ from tests.lab.host import guest, results
 from tests.lab.host.__main__ import Parser, run_program
 from tests.lab.host.environment import ROOT
 from tests.lab.host.errors import HungGuest, LabError
-from tests.lab_debian.host import image, packages, requests, unit_tests
-from tests.lab_debian.host.machine import SENSOR, DebianMachine
+from tests.lab_debian.host import image, packages, unit_tests
+from tests.lab_debian.host.machine import SENSOR, DebianMachine, answered
 from tests.lab_debian.host.release import AMD64, ARM64, Release
 
 GUEST = Path(__file__).resolve().parents[1] / "guest"
@@ -105,7 +105,7 @@ def boot(options: argparse.Namespace, release: Release, groups: list[str], made:
         machine = DebianMachine(release, made, folder, Path(sockets))
         python = options.venv.absolute() / "bin" / "python"
         try:
-            with simulator(python, Path(sockets) / SENSOR) as sensor, requests.answered(Path(sockets), sensor):
+            with simulator(python, Path(sockets) / SENSOR) as sensor, answered(Path(sockets), sensor):
                 status = guest.run(
                     lambda _uart_fds, monitor_fd: machine.command(monitor_fd), guest.Folder(folder), LIMITS,
                     guest.to_terminal,
