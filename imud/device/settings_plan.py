@@ -488,7 +488,7 @@ class Applying:
                 break
         # an error can be the sign of a restart, which loses unsaved values
         why = await self._read(None if failure or sent[-1].saves else names) if names else ""
-        last = self._compared(sent.pop(), failure, why)  # first: a failed write is the problem that imud reports
+        last = self._compared(sent.pop(), failure, why)  # before the others: imud reports the problem of a failed write
         return [*map(partial(self._compared, why_unread=why), sent), last]
 
     def _compared(

@@ -404,7 +404,7 @@ class DeviceTime:
         return False
 
     def _absorb_step(self, before_ns: int, elapsed_ns: float, above_ns: float, early_ns: float, hold_ns: int) -> bool:
-        """Make an uneven step even if the arrival confirms this, `elapsed_ns` after the previous sample."""
+        """Replace an uneven step by an even step if the arrival confirms it, `elapsed_ns` after the previous sample."""
         period_ns = self.period.period_ticks * self.tick_ns
         waited_ns = elapsed_ns - period_ns
         if waited_ns < -early_ns:  # earlier than one period
