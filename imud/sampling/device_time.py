@@ -33,6 +33,14 @@ WHOLE_OFF: Final = 0.5  # Maximum distance of a whole number of ticks from the m
 UNJUDGED_MOST: Final = 64
 # Period in ticks below which two samples can be in one tick. With a longer period, the tick contains the same sample.
 EVERY_TICK: Final = 1.5
+# Period in ticks up to which one step can be a single period or contain a lost sample: at 700 Hz and 1 ms, a step of
+# two ticks. The position of the samples in their ticks then decides, and imud counts only a proven loss.
+AMBIGUOUS_TICKS: Final = 2.0
+# Distance of a sample from its tick, ticks, after which equal steps show a period of a whole number of ticks.
+OUTSIDE_MOST: Final = 0.5
+# Number of steps of two ticks, each after the same number of steps of one tick, that show an uneven rate (900 Hz at
+# 1 ms). Frames that are lost at random are not regular.
+REGULAR: Final = 8
 MEMORY: Final = 4096  # Number of steps in the mean of an uneven period. After that, both sums are halved.
 
 
@@ -45,8 +53,9 @@ class PeriodLearner:
     """
 
     __slots__ = (
-        "_before", "_candidate", "_count", "_even", "_odd_at", "_on_unknown_gap", "_run", "_run_sum", "_steady", "_sum",
-        "_uneven", "_uneven_sum", "_unjudged", "changes", "is_gap", "is_new", "period_ticks",
+        "_before", "_candidate", "_count", "_even", "_high", "_low", "_odd_at", "_on_unknown_gap", "_outside",
+        "_regular", "_run", "_run_sum", "_spacing", "_steady", "_sum", "_uneven", "_uneven_sum", "_unjudged", "changes",
+        "is_gap", "is_new", "period_ticks",
     )  # fmt: skip
 
     def __init__(self, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
@@ -69,6 +78,11 @@ class PeriodLearner:
         # Number of changes of the step, if the period is not a whole number of ticks; else 0. They show the phase in
         # the tick.
         self.changes = 0
+        # possible positions of the newest sample in its tick, for a period below `AMBIGUOUS_TICKS`
+        self._low, self._high = 0.0, 1.0
+        self._outside = 0.0  # how far equal steps moved the samples out of their ticks, ticks
+        # number of equal steps before the last step of two ticks, and number of consecutive times it was the same
+        self._spacing, self._regular = 0.0, 0
 
     def add_step(self, ticks: int) -> int:
         """Add the step to the newest sample. Return the number of lost samples in the step."""
@@ -80,7 +94,7 @@ class PeriodLearner:
         if ticks == period:
             self.add_even_steps()
             return 0
-        if period and abs(ticks - period) <= 1 and int(ticks / period + 0.5) == 1:  # an uneven rate
+        if period and abs(ticks - period) <= 1 and self._periods(ticks) == 1:  # an uneven rate
             self._refine(ticks)
             return 0
         if self._learn(ticks):
@@ -95,6 +109,7 @@ class PeriodLearner:
         if was_added and self._unjudged and not self.is_gap:
             self._unjudged.pop()
         self._run, self.is_gap = 0, False
+        self._low, self._high = 0.0, 1.0
 
     def add_even_steps(self, count: int = 1) -> None:
         """Add `count` steps that equal the period exactly, at least one."""
@@ -104,7 +119,8 @@ class PeriodLearner:
     def steps_in(self, ticks: int) -> int:
         """Return the number of periods in a longer step. The period must be known."""
         period = self.period_ticks
-        steps = max(int(ticks / period + 0.5), 1)
+        steps = self._periods(ticks)
+        self._move(steps, ticks)
         if not self.changes:
             return steps
         if steps <= LEARNED_STEPS and abs(ticks - steps * period) <= 1:
@@ -112,6 +128,28 @@ class PeriodLearner:
         elif steps > (self._count + self._even) * period:  # the error of the mean exceeds one tick
             self._on_unknown_gap()
         return steps
+
+    def _periods(self, ticks: int) -> int:
+        """Return the number of periods in a step; of two possible numbers the smaller one."""
+        period = self.period_ticks
+        steps = max(int(ticks / period + 0.5), 1)
+        if not 1 < period < AMBIGUOUS_TICKS:
+            return 1 if period != 1 and ticks - period <= 1 else steps
+        low, high = self._low - ticks, self._high - ticks
+        for count in range(max(int((ticks - 1) / period), 1), int((ticks + 1) / period) + 1):
+            if low + count * period <= 1 and high + count * period >= 0:
+                return count
+        return steps
+
+    def _move(self, steps: int, ticks: int) -> None:
+        """Limit the positions of the newest sample in its tick by a step of `steps` periods."""
+        if not 1 < self.period_ticks < AMBIGUOUS_TICKS:
+            return
+        off, error = steps * self.period_ticks - ticks, 1 / (self._count + self._even)
+        low, high = self._low + off - error, self._high + off + error
+        self._low, self._high = min(max(low, 0.0), 1.0), max(min(high, 1.0), 0.0)
+        outside = max(low - 1, -high, 0.0)
+        self._outside = (self._outside + outside) if outside else 0.0
 
     def _average(self, ticks: int, steps: int) -> None:
         self._sum += ticks + int(self._even * self.period_ticks)
@@ -121,6 +159,7 @@ class PeriodLearner:
 
     def _refine(self, ticks: int) -> None:
         self._run = 0
+        self._move(1, ticks)
         if self._even:
             self._uneven = self._uneven_sum = 0
         self._uneven += 1
@@ -129,13 +168,15 @@ class PeriodLearner:
             count, total = self._uneven, self._uneven_sum
             self._uneven = self._uneven_sum = 0
             if abs(total - count * self.period_ticks) > OFF_MOST:
-                self._note_odd()
+                self._note_odd(ticks)
                 self._adopt(total, count, is_new=self._steady)
                 return
         self._average(ticks, 1)
         same, self._before = ticks == self._before, ticks
         self.changes += not same
-        if same and self.changes <= 1 and self._count >= WHOLE_AFTER:  # a whole number of ticks
+        is_whole = same and self.changes <= 1 and self._count >= WHOLE_AFTER
+        if is_whole or (self._outside > OUTSIDE_MOST and ticks):  # a whole number of ticks
+            self._outside = 0.0
             self.is_new = abs(ticks - self.period_ticks) > WHOLE_OFF
             self._odd_at = 0.0
             self.period_ticks, self._sum, self._count, self.changes = float(ticks), float(ticks), 1.0, 0
@@ -162,7 +203,9 @@ class PeriodLearner:
                     if longer in self._unjudged:
                         self._unjudged.remove(longer)
             self._candidate, self._run, self._run_sum = ticks, 1, ticks
-            self._note_odd()
+            if self._note_odd(ticks) and self.period_ticks == 1:
+                self._adopt(int(self._spacing) + 2, int(self._spacing) + 1, is_new=False)
+                return True
         longer = 0 < self.period_ticks < self._candidate
         if self._run < (CONSISTENT_LONGER if longer or self._steady else CONSISTENT):
             return False
@@ -178,12 +221,16 @@ class PeriodLearner:
                 self._on_unknown_gap()
         self._unjudged.clear()
 
-    def _note_odd(self) -> None:
-        """Count a step of another length, and store whether many equal steps preceded it."""
+    def _note_odd(self, ticks: int) -> bool:
+        """Count a step of another length, and store whether many equal steps preceded it. Return whether steps of two
+        ticks are regular."""
         even = self._count + self._even - self._odd_at
+        self._regular = self._regular + 1 if ticks == 2 and even and abs(even - self._spacing) <= 1 else 0
+        self._spacing = even
         if even:
             self._steady = not 0 < even < STEADY_STEPS
             self._odd_at += even
+        return self._regular >= REGULAR
 
     def _adopt(self, ticks: int, steps: int, *, is_new: bool) -> None:
         self.is_new = is_new
@@ -191,7 +238,8 @@ class PeriodLearner:
         self._sum, self._count = float(ticks), float(steps)
         self.period_ticks = self._sum / self._count
         self._run = self._even = self._uneven = self._uneven_sum = self.changes = 0
-        self._before = -1
+        self._before, self._low, self._high = -1, 0.0, 1.0
+        self._outside, self._regular = 0.0, 0
 
 
 # --- device time finer than a tick ----------------------------------------------------------------------------------
