@@ -37,7 +37,7 @@ from imud.formats.records import (
 )
 from imud.host.files import open_regular
 from imud.model.errors import BadArgument, ImudError, reason_of
-from imud.model.ledger import lost
+from imud.model.ledger import LOST_FIELDS, lost
 from imud.model.units import NS_PER_S
 
 INPUTS: Final = (Kind.DATA, Kind.FRAMES, Kind.READINGS)
@@ -55,40 +55,43 @@ class DeviceContents:
     input_bytes: int = 0
     edges: int = 0
     events: int = 0
-    # First and last check of each interval without a restart of sequence numbers and ledger. A device that the user
-    # removed and added again restarts both.
-    spans: list[tuple[CheckRecord, CheckRecord]] = field(default_factory=list)
-    begins_anew: bool = False  # whether the next check starts a new span
+    # Initial ledger, first and last check of each interval without a restart of the ledger. A device that the user
+    # removed and added again restarts it.
+    spans: list[tuple[Mapping[str, int], CheckRecord, CheckRecord]] = field(default_factory=list)
+    begun: Mapping[str, int] | None = None  # ledger before the first input of the next span
 
     def check(self, found: CheckRecord) -> None:
         """Add a check record of the live run."""
+        newest = self.spans[-1][2] if self.spans else None
         # a smaller sequence number: the device or the daemon restarted
-        if self.begins_anew or not self.spans or found.seq < self.spans[-1][1].seq:
-            self.spans.append((found, found))
-            self.begins_anew = False
+        if self.begun is not None or newest is None or found.seq < newest.seq:
+            self.spans.append((self.begun or found.ledger, found, found))
+            self.begun = None
         else:
-            self.spans[-1] = (self.spans[-1][0], found)
+            self.spans[-1] = (*self.spans[-1][:2], found)
 
     def begin_path(self, ledger: Mapping[str, int]) -> None:
-        """Compare the initial ledger of a new codec with the last check."""
-        before = self.spans[-1][1].ledger if self.spans else {}
-        self.begins_anew = ledger.get("samples", 0) < before.get("samples", 0)
+        """Compare the initial ledger of a new codec with the newest ledger."""
+        newest = self.begun or (self.spans[-1][2].ledger if self.spans else None)
+        if newest is None or ledger.get("samples", 0) < newest.get("samples", 0):
+            self.begun = dict.fromkeys(LOST_FIELDS, 0) | dict(ledger)
 
     @property
     def samples(self) -> int:
-        """Number of samples between the first and the last check of all spans."""
-        return sum(last.seq - first.seq for first, last in self.spans)
+        """Number of samples from the start to the last check of all spans."""
+        return sum(last.ledger.get("samples", 0) - begun.get("samples", 0) for begun, _, last in self.spans)
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second; 0 if unknown."""
-        spent_ns = sum(last.t_ns - first.t_ns for first, last in self.spans)
-        return self.samples * NS_PER_S / spent_ns if spent_ns > 0 else 0.0
+        """Samples per second between the checks; 0 if unknown."""
+        spent_ns = sum(last.t_ns - first.t_ns for _, first, last in self.spans)
+        samples = sum(last.seq - first.seq for _, first, last in self.spans)
+        return samples * NS_PER_S / spent_ns if spent_ns > 0 else 0.0
 
     @property
     def lost(self) -> int:
         """Number of lost samples, all causes."""
-        return sum(lost(last.ledger) - lost(first.ledger) for first, last in self.spans)
+        return sum(lost(last.ledger) - lost(begun) for begun, _, last in self.spans)
 
 
 class Contents:

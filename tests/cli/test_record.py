@@ -66,8 +66,9 @@ def test_a_recording_replays_as_it_ran(
 ) -> None:
     before, file = daemon.statuses()["bow"].newest_seq, tmp_path / "a.imudrec"
     assert " samples of 1 device, no records dropped" in cli(*words, "--device", "bow", "--for", "2.2s", file).err
-    assert replayed(file, cli, "bow")[0]["seq"] > before
-    cli("info", file)
+    samples = replayed(file, cli, "bow")
+    assert samples[0]["seq"] > before
+    assert json.loads(cli("info", "--json", file).out)["devices"][0]["samples"] == len(samples)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -193,6 +194,7 @@ def test_a_device_that_was_removed_and_added_counts_from_the_begin_again() -> No
         ledger = dict.fromkeys(LEDGER_FIELDS, 0) | {"samples": seq, "lost_crc": lost}
         add(Kind.CHECK, CheckRecord(t_s * NS_PER_S, seq, 0, 0, ledger))
 
+    add(Kind.PATH, PathRecord("hipnuc-uart", {}, 0, {"samples": 4950, "lost_crc": 6}, b""))  # before the first input
     check(10, 5000, 7)
     check(12, 5200, 9)
     add(Kind.PATH, PathRecord("hipnuc-uart", {}, 0, {"samples": 5250}, b""))  # the port opens again
@@ -206,7 +208,7 @@ def test_a_device_that_was_removed_and_added_counts_from_the_begin_again() -> No
     with pytest.raises(ImudError, match="record of kind 10: expected a ledger with lost_gap_device"):
         add(Kind.CHECK, without)
     device = contents.devices[0]
-    assert (device.samples, device.lost) == (400 + 100 + 200, 2 + 3 + 5)
+    assert (device.samples, device.lost) == (450 + 100 + 400, 3 + 3 + 5)
     assert device.rate_hz == pytest.approx(700 / (4 + 1 + 2))
 
 
