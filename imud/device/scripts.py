@@ -9,7 +9,7 @@ from dataclasses import replace
 from itertools import dropwhile
 from typing import TypeVar
 
-from imud.contracts.script import Message, Outcome, Rejection, Reply, Request, RequestScript, Silence
+from imud.contracts.script import Message, Outcome, Rejection, Reply, Request, RequestScript, Silence, pause
 from imud.formats.can import CanFilter
 from imud.host.clock import HostClock
 from imud.model.errors import CommandError, LinkError
@@ -76,7 +76,8 @@ class ScriptRunner:
     """Runner of one request script at a time. Synchronization: one thread.
 
     Devices reply in the order of the requests. A message is late if it can belong to a request that timed out and not
-    to the outstanding request, or if it ends a reply with late messages. Before a request whose reply looks like a late
+    to the outstanding request, or if it ends a reply with late messages. The runner skips a copy of the newest reply
+    if its lines show the difference. Before a request whose reply looks like a late
     reply, the runner sends the `probe` of the request. The reply to the probe shows that no earlier reply can follow.
     If no reply to a probe arrives, the next matching reply counts for the oldest request without a reply.
 
@@ -101,7 +102,8 @@ class ScriptRunner:
         self._replied = False  # whether the time of a reply is known
         self._owed: deque[_Owed] = deque(maxlen=OWED_MAX)  # requests without a reply, oldest first
         self._baud = 0  # baud rate that a script has set; 0: unchanged
-        self._late_messages = 0  # number of messages of the late reply that is arriving
+        self._late_messages = 0  # number of messages of the late reply or the copy that is arriving
+        self._newest: tuple[Request, tuple[Message, ...]] = pause(0), ()  # newest complete reply, with its request
         self.deadline_ns: int | None = None
         """CLOCK_MONOTONIC of the deadline of the outstanding request; None without a request."""
         self.answered_ns = 0  # CLOCK_MONOTONIC of the newest complete reply; 0 before the first reply
@@ -219,13 +221,17 @@ class ScriptRunner:
             request is None
             or not (ends or request.is_part(message))
             or (ends and not self._messages and request.messages_min > 1 and request.is_end(message))  # too short
-            or (ends and not self._messages and bool(self._owed) and self._ends_late(request, message))
+            or (ends and not self._messages and self._ends_late(request, message))
         ):
             self._count_stray(message, now_ns)
             return None
         self._late_messages = 0
         self._messages.append(message)
         if not ends:
+            return None
+        if self._is_copy(request):
+            self._ledger.replies_unsolicited += len(self._messages)
+            self._messages.clear()
             return None
         # it can be the reply to the oldest similar request, and no earlier one follows
         if request.timeout_ns <= ORDINARY_TIMEOUT_NS and not self._owed:
@@ -234,6 +240,7 @@ class ScriptRunner:
             self._owed.popleft()
         if request.kind and self._owed:
             self._owed[0].partial = False  # a complete reply of this kind can follow
+        self._newest = request, tuple(self._messages)
         made = Rejection if request.is_rejection(message) else Reply
         return self._finish(made(tuple(self._messages)))
 
@@ -286,8 +293,15 @@ class ScriptRunner:
             self._late_messages = len(self._messages)
 
     def _ends_late(self, request: Request, message: Message) -> bool:
-        """Return whether `message`, the end of a reply, ends a late reply. Requires a request without a reply."""
-        return self._late_messages > 0 or (self.is_owed(request) and self._owing(message) is not None)
+        """Return whether `message`, the end of a reply, ends a late reply or a copy of the newest reply."""
+        return self._late_messages > 0 or (
+            bool(self._owed) and self.is_owed(request) and self._owing(message) is not None
+        )
+
+    def _is_copy(self, request: Request) -> bool:
+        """Return whether the device sent its newest reply again: the lines of a report in the reply to another one."""
+        newest, messages = self._newest
+        return len(messages) > 1 and newest.payload != request.payload and tuple(self._messages) == messages
 
     def _owing(self, message: Message) -> _Owed | None:
         """Return the oldest request without a reply that `message` can belong to; None if there is none."""
@@ -300,6 +314,11 @@ class ScriptRunner:
         late = self._owing(message)
         if late is None:
             self._ledger.replies_unsolicited += 1
+            *lines, end = self._newest[1] or ("",)
+            if message in lines:  # the device sends its newest reply again: the next end belongs to this copy
+                self._late_messages += 1
+            elif message == end:
+                self._late_messages = 0
             return
         self._late_messages += 1
         if _ends(late.request, message):

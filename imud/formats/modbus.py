@@ -173,10 +173,13 @@ class ReplyFinder:
     def _size_at(self, at: int) -> int:
         """Return the size of the reply that starts at `at`; 0 if there is none."""
         data, request = self._data, self._request
-        head = data[at : at + 3]
+        head = data[at : at + 4]
         if head[:1] != request[:1]:
             return 0
         if head[1:2] == self._error_function:
             return EXCEPTION_BYTES
-        good = request[:2] + (bytes([self._size - READ_OVERHEAD_BYTES]) if request[1] == READ_HOLDING else request[2:3])
-        return self._size if good.startswith(head) else 0
+        if request[1] == READ_HOLDING:
+            good = request[:2] + bytes([self._size - READ_OVERHEAD_BYTES])
+        else:  # the confirmation of a write contains the register, which shows a copy of an earlier confirmation
+            good = request[: 4 if request[1] == WRITE_SINGLE else 3]
+        return self._size if good.startswith(head[: len(good)]) else 0

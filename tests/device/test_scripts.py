@@ -8,14 +8,26 @@ from typing import Any
 import pytest
 
 from imud.contracts.driver import StreamDriver
-from imud.contracts.script import Outcome, Reply, ReplyFrame, Request, RequestScript, Silence, never, pause, with_undo
+from imud.contracts.script import (
+    Outcome,
+    Rejection,
+    Reply,
+    ReplyFrame,
+    Request,
+    RequestScript,
+    Silence,
+    never,
+    pause,
+    with_undo,
+)
 from imud.device.scripts import RequestPort, ScriptRunner
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.canopen import cia301
 from imud.drivers.hipnuc.j1939.codec import J1939Node
-from imud.drivers.hipnuc.j1939.commands import WRITE, exchange
+from imud.drivers.hipnuc.j1939.commands import LAYOUT, READ, WRITE, exchange
 from imud.drivers.hipnuc.uart import commands
 from imud.drivers.imu61x.uart import commands as imu61x
+from imud.drivers.imu61x.uart.codec import PARAMETER_FRAME, Parameter, pack_parameters
 from imud.host.clock import HostClock
 from imud.model.errors import CommandError, LinkMissing, NoReply
 from imud.model.ledger import Ledger
@@ -327,3 +339,47 @@ def test_a_request_after_an_equal_request_without_reply_follows_a_probe(request_
 
     run_virtually(clock, body())
     assert port.written == [one.payload, *[one.probe.payload] * 3, one.payload]
+
+
+def sdo(index: int, command: int = 0x43) -> ReplyFrame:
+    return ReplyFrame(cia301.SDO_REPLY + 8, bytes([command]) + index.to_bytes(2, "little") + bytes(5))
+
+
+def register_reply(register: int) -> ReplyFrame:
+    return ReplyFrame(sorted(NODE.reply_ids())[0], LAYOUT.pack(register, READ, 0, 7))
+
+
+def parameter_reply(parameter: Parameter) -> ReplyFrame:
+    return ReplyFrame(PARAMETER_FRAME, pack_parameters(1, parameter))
+
+
+NODE = J1939Node(128, 85)
+VERSION, REPORT = ("PNAME=HI14", "UUID=1", "OK"), ("ATT_MODE: 0", "OK")
+BAUD, RATE = Parameter.BAUD, Parameter.AHRS_RATE
+
+
+@pytest.mark.parametrize(
+    ("first", "reply", "second", "own"),
+    [
+        (commands.ask(commands.Query.VERSION), VERSION, commands.log_enable(), ("OK",)),
+        (commands.ask(commands.Query.USRCONFIG), REPORT, commands.save_config(), ("ERR",)),
+        (commands.ask(commands.Query.USRCONFIG), REPORT, commands.ask(commands.Query.COMCONFIG), ("B: 1", "OK")),
+        (next(cia301.read_object(8, 1, 0)), (sdo(1),), next(cia301.read_object(8, 2, 0)), (sdo(2),)),
+        (next(cia301.read_object(8, 1, 0)), (sdo(1),), next(cia301.write_object(8, 1, 0, 5, 2)), (sdo(1, 0x60),)),
+        (exchange(NODE, 1, READ, 0, ""), (register_reply(1),), exchange(NODE, 2, READ, 0, ""), (register_reply(2),)),
+        (imu61x.read_parameter(BAUD), (parameter_reply(BAUD),), imu61x.read_parameter(RATE), (parameter_reply(RATE),)),
+    ],
+    ids=["uart", "uart save", "uart report", "canopen", "canopen write", "j1939", "imu61x-uart"],
+)  # fmt: skip
+def test_a_reply_that_a_device_sends_again_is_no_reply_to_the_next_request(
+    first: Request, reply: Sequence[Any], second: Request, own: Sequence[Any]
+) -> None:
+    ledger = Ledger()
+    runner = offline_runner(ledger)
+    for request, messages in ((first, reply), (second, (*reply, *own))):
+        runner.start(request, 0)
+        outcomes = [runner.on_message(message, 1) for message in messages]
+        assert outcomes[:-1] == [None] * (len(messages) - 1)
+        assert isinstance(outcomes[-1], Rejection if own == ("ERR",) and request is second else Reply)
+        assert outcomes[-1].messages == messages[-len(own) if request is second else 0 :]
+    assert ledger.replies_unsolicited == len(reply)
