@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Iterable
+from io import BytesIO
 from itertools import count
 from math import inf, isnan, nan, nextafter, radians, tau
 from random import Random
@@ -17,6 +18,7 @@ from imud.attitude.published import as_sent
 from imud.bridges import csv
 from imud.bridges.channel import MessageFrames
 from imud.bridges.json import JsonDialect
+from imud.bridges.mcap import McapFile
 from imud.bridges.ros2 import Ros2Dialect
 from imud.contracts.driver import CanDriver, PolledDriver, StreamDriver
 from imud.contracts.publisher import Batch
@@ -33,7 +35,10 @@ from imud.formats.modbus import framed
 from imud.formats.slot import decode_slots
 from imud.model.ledger import Ledger
 from imud.model.sample import SAMPLE_FIELDS, Measurement, Sample, Sync
+from imud.publishers.metrics.rings import motion_of
 from imud.publishers.nmea0183 import Formatter, HeadingReference, make
+from imud.publishers.socket.history import History, buckets
+from imud.publishers.socket.outbox import BinaryEncoding, JsonEncoding
 from imud.web.hub import bucket_of, raw_of
 
 
@@ -153,17 +158,28 @@ def test_no_output_raises_or_contains_an_impossible_value(name: str, seed: int) 
         assert not impossible(sample), sample
     slots = Batch("bow", 1, samples).packed
     assert repr(decode_slots(slots, "bow")) == repr(samples)
-    text = msgspec.json.encode(samples) + csv.csv_text(map(csv.sample_row(SAMPLE_FIELDS), samples))
+    batch, motion = Batch("bow", 1, samples), motion_of(slots, 0)
+    assert motion is not None
+    assert inf not in (motion.accel_norm_m_s2, *(motion.vibration_rms_m_s2 or ()), *(motion.vibration_peak_m_s2 or ()))
+    assert len(BinaryEncoding(Convention.NED_FRD).encode(batch.converted(Convention.ENU_FLU))) == len(samples)
+    history = History()
+    history.add(batch)
+    text = msgspec.json.encode(list(buckets(history.seconds("bow"), 0, 10**15, 1, rotation)))
+    text += b"".join(JsonEncoding(None, framed=True, texts=True, convention=Convention.NED_FRD).encode(batch))
+    text += msgspec.json.encode(samples) + csv.csv_text(map(csv.sample_row(SAMPLE_FIELDS), samples))
     message = FleetMessage(
         v=1, gateway="g", boot="0" * 16, device="bow", kind=MessageKind.SAMPLES, begin=1, first=1, last=len(samples),
         count=len(samples), utc_ns=1, samples=samples,
     )  # fmt: skip
     text += encode_message(message) + msgspec.json.encode((summed_up(samples), bucket_of(samples)))
     text += msgspec.json.encode([raw_of("bow", vector, samples) for vector in ("accel_m_s2", "euler_rad")])
+    file = McapFile(BytesIO(), "", "", {})
     for dialect in (JsonDialect(), Ros2Dialect()):
         for channel in dialect.samples(MessageFrames("bow")):
             made = [channel.encode(sample) for sample in samples]
+            file.add_channel(channel).add_run([sample.utc_ns for sample in samples], [one or b"" for one in made])
             text += b"".join(one or b"" for one in made) if channel.message_encoding == "json" else b""
+    file.finish()
     for kind in Formatter:
         text += b"".join(make(kind, one, HeadingReference(Heading.TRUE, 1.0)) or b"" for one in turned)
     assert b"Infinity" not in text
