@@ -76,10 +76,10 @@ class ScriptRunner:
     """Runner of one request script at a time. Synchronization: one thread.
 
     Devices reply in the order of the requests. A message is late if it can belong to a request that timed out and not
-    to the outstanding request, or if it ends a reply with late messages. The runner skips a copy of the newest reply
-    if its lines show the difference. Before a request whose reply looks like a late
-    reply, the runner sends the `probe` of the request. The reply to the probe shows that no earlier reply can follow.
-    If no reply to a probe arrives, the next matching reply counts for the oldest request without a reply.
+    to the outstanding request, or if it ends a reply with late messages. The runner skips a copy of the newest reply if
+    its lines show the difference. Before a request whose reply looks like a late reply, the runner sends the `probe` of
+    the request. The reply to the probe shows that no earlier reply can follow. If no reply to a probe arrives, the next
+    matching reply counts for the oldest request without a reply.
 
     The timeout of a request is at least PATIENCE_FACTOR times the slowest reply of the device, at most
     PATIENCE_MAX_NS. Before the first reply, each timeout doubles the next timeout.

@@ -391,7 +391,10 @@ class MqttPublisher:
                 f"{directory}: another imud process uses this spool; set mqtt.spool_directory to another folder"
             ) from None
         except OSError as error:
-            raise ServerError(f"spool in {directory}: {reason_of(error)}") from error
+            raise ServerError(
+                f"cannot use {directory}: {reason_of(error)}; expected a directory that imud can write; "
+                f"set mqtt.spool_directory"
+            ) from error
 
 
 def schema_of(status: DeviceStatus) -> Mapping[str, object]:

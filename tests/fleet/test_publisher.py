@@ -196,6 +196,9 @@ def test_an_internal_error_in_a_thread_ends_the_daemon(tmp_path: Path) -> None:
     first.output.start()
     with pytest.raises(ServerError, match="another imud process"):
         second.output.start()  # two outputs cannot use one spool
+    (tmp_path / "file").touch()
+    with pytest.raises(ServerError, match=r"expected a directory that imud can write; set mqtt\.spool_directory"):
+        PublisherBench(tmp_path / "file").output.start()
     first.workers[0].failed(ZeroDivisionError())
     with pytest.raises(ZeroDivisionError):
         first.output.tick(0)

@@ -508,7 +508,10 @@ class FlightRecorder:
             self._directory.measure()
             left = self._left_behind()
         except OSError as error:
-            raise ServerError(f"flight recorder: {error.filename or ''}: {reason_of(error)}") from error
+            raise ServerError(
+                f"flight recorder: cannot use {error.filename or ''}: {reason_of(error)}; expected a directory that "
+                f"imud can write; set recorder.directory or recorder.flight.directory"
+            ) from error
         context = self._context
         self._writer = FlightWriter(self._queue, self._ring, self._directory, context.clock.now_ns, self._start_worker)
         for mark in left:

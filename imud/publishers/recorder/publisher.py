@@ -51,7 +51,10 @@ class Recorder:
             self._number = self._directory.begin_run(self._context.epoch)
             self._directory.make_room(self._file_bytes)
         except OSError as error:
-            raise ServerError(f"recordings in {self._settings.directory}: {reason_of(error)}") from error
+            raise ServerError(
+                f"cannot use {self._settings.directory}: {reason_of(error)}; expected a directory that imud can write; "
+                f"set recorder.directory"
+            ) from error
         self._writer = RecordingWriter(self._queue, self._context.clock.now_ns, self._start_worker)
         self._begin_file()
         self._context.outputs.recorders.append(self.status)

@@ -53,7 +53,7 @@ def test_a_failed_start_leaves_no_recorder_running(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     flight = FlightOptions(enabled=True, directory=str(tmp_path / "file" / "no"))
     made = PUBLISHER.make(RecorderOptions(enabled=True, directory=str(tmp_path / "a"), flight=flight), bench.context)
-    with pytest.raises(ServerError):
+    with pytest.raises(ServerError, match=r"file/no: Not a directory; .*; set .* or recorder\.flight\.directory"):
         made.start()
     assert (bench.context.outputs.recorders, bench.context.outputs.snapshots) == ([], [])
     assert not PUBLISHER.wanted(RecorderOptions())
@@ -210,7 +210,7 @@ def test_old_files_are_removed_for_new_files(tmp_path: Path) -> None:
 
 def test_invalid_options_are_rejected_and_an_error_of_the_thread_ends_the_daemon(tmp_path: Path) -> None:
     (tmp_path / "recordings").write_bytes(b"")
-    with pytest.raises(ServerError, match="recordings"):
+    with pytest.raises(ServerError, match=r"write; set recorder\.directory$"):
         RecorderBench(tmp_path)
     with pytest.raises(ValueError, match="room for two files of file_mb"):
         RecorderOptions(keep_gb=0.1)
