@@ -77,7 +77,9 @@ class RecordingDirectory:
         except OSError:
             return ""
         for level, status in found:
-            is_open = stat.S_ISDIR(status.st_mode) and status.st_mode & stat.S_IWOTH
+            # the group of root or of this process may write above the directory
+            others = stat.S_IWOTH if status.st_gid in (0, os.getegid()) else stat.S_IWOTH | stat.S_IWGRP
+            is_open = stat.S_ISDIR(status.st_mode) and status.st_mode & others
             if is_open or status.st_uid not in (0, os.geteuid()):  # also the owner of a symbolic link
                 problems.append(can_replace(status, level, "its files"))
         return next(filter(None, problems), "")

@@ -217,7 +217,7 @@ def test_a_client_receives_the_present_data(tmp_path: Path) -> None:
 
 @needs_root
 @pytest.mark.parametrize(
-    "untrusted", ["owner", "owner with sticky bit", "0777", "0770", "link", "parent", "file of another user"]
+    "untrusted", ["owner", "owner with sticky bit", "0777", "0770", "link", "parent", "group", "file of another user"]
 )
 def test_a_directory_that_another_user_can_change(tmp_path: Path, untrusted: str) -> None:
     """imud rescues and removes no file there, keeps the data in memory, and uses the directory again later."""
@@ -235,6 +235,9 @@ def test_a_directory_that_another_user_can_change(tmp_path: Path, untrusted: str
             os.chown(folder, HOSTILE_UID, HOSTILE_UID, follow_symlinks=False)
         case "parent":
             os.chown(parent, HOSTILE_UID, HOSTILE_UID)
+        case "group":
+            parent.chmod(0o775)
+            os.chown(parent, 0, HOSTILE_UID)
         case "file of another user":
             os.chown(forged, HOSTILE_UID, HOSTILE_UID)
             folder.chmod(0o1777)
