@@ -43,7 +43,9 @@
 #define FLOATS 16                /* accel, gyro, mag, euler, quaternion */
 #define QUAT_SQUARE_MIN 0.9604   /* limits of the squared length of a rotation, see value_limits.py */
 #define QUAT_SQUARE_MAX 1.0404
-#define VALUE_HIGH_BYTE 0x48     /* a float of 131,072 or more has this high byte or a larger one, also NaN */
+/* A float has this high byte or a larger one if it is not usual, also NaN: 32 g or more, other values 2048 or more */
+#define ACCEL_HIGH_BYTE 0x42
+#define VALUE_HIGH_BYTE 0x45
 #define TURN_DEG 360.0f          /* maximum magnitude of a usual angle */
 #define PRESSURE_MIN_PA 1000.0
 #define PRESSURE_MAX_PA 120000.0
@@ -161,7 +163,7 @@ static int is_usual(const uint8_t *frame)
     if (crc16_xmodem(payload, PAYLOAD_BYTES, crc16_xmodem(frame, 4, 0)) != (uint16_t)(frame[4] | frame[5] << 8))
         return 0;
     for (int i = 0; i < FLOATS; i++)
-        if ((payload[15 + 4 * i] & 0x7F) >= VALUE_HIGH_BYTE)
+        if ((payload[15 + 4 * i] & 0x7F) >= (i < 3 ? ACCEL_HIGH_BYTE : VALUE_HIGH_BYTE))
             return 0;
     memcpy(angles_deg, payload + 48, sizeof angles_deg);
     for (int i = 0; i < 3; i++)

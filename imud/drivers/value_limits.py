@@ -1,9 +1,13 @@
 """Limits of the values that a device sends. A value outside is not a measurement.
 
-A damaged device or a hostile frame with a correct check value can send any 32-bit float. No inertial sensor measures
-131,072 g, °/s or µT, or a temperature outside -128 … 150 °C. VALUE_LIMIT is a power of two: the high byte of a float
-shows whether the value is inside, so that one call checks all values of many frames, also an air pressure in Pa. An
-angle beyond a full turn is not an angle. A quaternion is a rotation only if its length is 1.
+A damaged device or a hostile frame with a correct check value can send any 32-bit float. The limits are above the
+ranges in the manuals: the widest field of an acceleration and of an angular rate is CANopen with ±32.77 g and ±3277 °/s
+(manual B, section 5.1; most sensors have ±16 g and ±2000 °/s), the widest field of a magnetic field is HI92 with ±1000
+µT (section 3.3.2). No sensor measures a temperature outside -128 … 150 °C. An angle beyond a full turn is not an angle.
+A quaternion is a rotation only if its length is 1.
+
+The high byte of a float shows its magnitude up to a factor of 4. Thus one call shows whether all values of many frames
+are usual: accelerations below 32 g, other values below 2048. Only other frames need a check of each value.
 """
 
 from collections.abc import Sequence
@@ -12,7 +16,10 @@ from typing import Final, TypeVar
 from imud.model.sample import Quaternion, Vector3
 from imud.model.units import RAD_PER_DEG
 
-VALUE_LIMIT: Final = 131_072.0  # magnitude that no value reaches, in g, °/s, µT or Pa
+# Magnitudes that no sensor reaches
+ACCEL_LIMIT_G: Final = 40.0
+GYRO_LIMIT_DEG_S: Final = 4000.0
+MAG_LIMIT_UT: Final = 4000.0
 TEMPERATURE_LIMITS_C: Final = (-128.0, 150.0)  # a measured temperature is above the first value, up to the second, °C
 TURN_DEG: Final = 360.001  # no angle reaches this magnitude: a full turn with its rounding
 TURN_RAD: Final = TURN_DEG * RAD_PER_DEG
@@ -22,15 +29,16 @@ TURN_SQUARE: Final = 360.0**2
 QUAT_SQUARE_MIN, QUAT_SQUARE_MAX = 0.9604, 1.0404
 
 # High bytes of little-endian 32-bit floats inside the limits. The high byte is the sign and the
-# upper seven bits of the exponent: 131,072 is 0x48000000, ±128 is 0x43000000 and 0xC3000000.
-VALUE_HIGH_BYTES: Final = bytes(byte for byte in range(256) if byte & 0x7F < 0x48)
+# upper seven bits of the exponent: 32 is 0x42000000, 2048 is 0x45000000, ±128 is 0x43000000 and 0xC3000000.
+ACCEL_HIGH_BYTES: Final = bytes(byte for byte in range(256) if byte & 0x7F < 0x42)
+VALUE_HIGH_BYTES: Final = bytes(byte for byte in range(256) if byte & 0x7F < 0x45)
 TEMPERATURE_HIGH_BYTES: Final = bytes([*range(0x43), *range(0x80, 0xC3)])
 
 
-def values_possible(high_bytes: bytes | bytearray) -> bool:
-    """Return whether all floats with these high bytes are inside VALUE_LIMIT. NaN and infinity are outside."""
-    # for less than about 30 bytes, `not high_bytes.strip(VALUE_HIGH_BYTES)` is faster
-    return not high_bytes.translate(None, VALUE_HIGH_BYTES)
+def are_usual(accel: bytes | bytearray, others: bytes | bytearray) -> bool:
+    """Return whether all floats with these high bytes are usual. NaN and infinity are not usual."""
+    # for less than about 30 bytes, `not accel.strip(ACCEL_HIGH_BYTES)` is faster
+    return not (accel.translate(None, ACCEL_HIGH_BYTES) or others.translate(None, VALUE_HIGH_BYTES))
 
 
 def temperatures_possible(high_bytes: bytes | bytearray) -> bool:
@@ -39,15 +47,15 @@ def temperatures_possible(high_bytes: bytes | bytearray) -> bool:
     return not high_bytes.translate(None, TEMPERATURE_HIGH_BYTES)
 
 
-def is_possible(values: Sequence[float]) -> bool:
-    """Return whether all values are inside VALUE_LIMIT. NaN and infinity are outside."""
-    return all(-VALUE_LIMIT < value < VALUE_LIMIT for value in values)
+def are_within(values: Sequence[float], limit: float) -> bool:
+    """Return whether the magnitude of all values is below `limit`. NaN is outside."""
+    return all(-limit < value < limit for value in values)
 
 
-def scaled(values: Sequence[float], factor: float, limit: float = VALUE_LIMIT) -> Vector3 | None:
+def scaled(values: Sequence[float], factor: float, limit: float) -> Vector3 | None:
     """Return three values times `factor`; None if the magnitude of one is not below `limit`."""
     x, y, z = values
-    # `is_possible` without a call, which costs as much as the rest of a frame
+    # `are_within` without a call, which costs as much as the rest of a frame
     if -limit < x < limit and -limit < y < limit and -limit < z < limit:
         return (x * factor, y * factor, z * factor)
     return None

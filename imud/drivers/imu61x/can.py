@@ -48,10 +48,10 @@ from imud.drivers.imu61x.common import (
     relative_heading,
 )
 from imud.drivers.value_limits import (
-    TEMPERATURE_LIMITS_C,
+    ACCEL_LIMIT_G,
+    GYRO_LIMIT_DEG_S,
     TURN_DEG,
-    VALUE_HIGH_BYTES,
-    is_possible,
+    are_within,
     possible_temperature_c,
     scaled,
 )
@@ -76,8 +76,7 @@ _NEVER_NS: Final = 1 << 63
 ALTERNATIONS: Final = 32  # number of alternating INDEX values after which two devices have the same identifiers
 STEADY: Final = 256  # number of consecutive INDEX values after which there is one device again
 
-TEMPERATURE_COUNTS: Final = tuple(round(limit_c / C_PER_COUNT) for limit_c in TEMPERATURE_LIMITS_C)
-_HIGH_BYTES: Final = slice(3, 36, 4)  # high bytes of the nine floats of a set
+_LIMITS: Final = (*[TURN_DEG] * 3, *[GYRO_LIMIT_DEG_S] * 3, *[ACCEL_LIMIT_G] * 3)  # of the nine floats of a set
 _CLOSING: Final = SET_FRAMES - 1
 _FLOATS: Final = tuple(struct.Struct(layout) for layout in ("<2f", "<2f", "<2f", "<2f", "<f4x"))
 _IN_ORDER: Final = (0, 1, 2, 3)
@@ -215,10 +214,12 @@ class Imu61xCanCodec:
         ledger.frames_pending -= _CLOSING
         ledger.frames_in_samples += SET_FRAMES
         *values, temperature, _ = SET.unpack(raw)
-        low, high = TEMPERATURE_COUNTS
-        if low < temperature <= high and not raw[_HIGH_BYTES].strip(VALUE_HIGH_BYTES):
-            return (_measurement(values, temperature, index, first_ns),)
-        return (*self._not_finite(raw), _measurement(values, temperature, index, first_ns))
+        measurement = _measurement(values, temperature, index, first_ns)
+        if None not in (
+            measurement.euler_rad, measurement.gyro_rad_s, measurement.accel_m_s2, measurement.temperature_c
+        ):  # fmt: skip
+            return (measurement,)
+        return (*self._not_finite(raw), measurement)
 
     def _note_series(self, index: int, before: int) -> None:
         """Note an INDEX that does not follow `before`. Two devices continue two series, which can have equal INDEX."""
@@ -232,7 +233,8 @@ class Imu61xCanCodec:
         events: list[CodecEvent] = []
         for slot, layout in enumerate(_FLOATS):
             data = raw[slot * FRAME_BYTES : (slot + 1) * FRAME_BYTES]
-            is_good = is_possible(layout.unpack(data))
+            limits = _LIMITS[2 * slot :]
+            is_good = all(are_within([value], limit) for value, limit in zip(layout.unpack(data), limits, strict=False))
             if slot == _CLOSING:
                 is_good = is_good and possible_temperature_c(SET.unpack(raw)[9] * C_PER_COUNT) is not None
             if not is_good:
@@ -246,8 +248,8 @@ def _measurement(values: Sequence[float], temperature: int, index: int, first_ns
     euler = scaled(values[:3], RAD_PER_DEG, TURN_DEG)
     return Measurement(
         SET.size, 0, index,
-        accel_m_s2=scaled(values[6:9], M_S2_PER_G),
-        gyro_rad_s=scaled(values[3:6], RAD_S_PER_DEG_S),
+        accel_m_s2=scaled(values[6:9], M_S2_PER_G, ACCEL_LIMIT_G),
+        gyro_rad_s=scaled(values[3:6], RAD_S_PER_DEG_S, GYRO_LIMIT_DEG_S),
         quat_wxyz=None if euler is None else quat_from_euler_zyx(euler),
         euler_rad=euler,
         temperature_c=possible_temperature_c(temperature * C_PER_COUNT),

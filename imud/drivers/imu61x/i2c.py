@@ -41,7 +41,7 @@ from imud.drivers.imu61x.registers import (
     wanted_filter,
 )
 from imud.drivers.polled_frames import Measured, PolledFrameDecoder
-from imud.drivers.value_limits import possible_temperature_c, scaled
+from imud.drivers.value_limits import ACCEL_LIMIT_G, GYRO_LIMIT_DEG_S, possible_temperature_c, scaled
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Vector3
 from imud.model.units import NS_PER_S
@@ -141,7 +141,8 @@ def _check(data: bytes) -> BadReason | None:
 
 def _measure(data: bytes) -> Measured:
     *values, temperature_c, _ = FRAME.unpack(data)
-    accel, gyro = scaled(values[:3], M_S2_PER_G), scaled(values[3:], RAD_S_PER_DEG_S)
+    accel = scaled(values[:3], M_S2_PER_G, ACCEL_LIMIT_G)
+    gyro = scaled(values[3:], RAD_S_PER_DEG_S, GYRO_LIMIT_DEG_S)
     temperature = possible_temperature_c(temperature_c)
     measurement = Measurement(FRAME.size, 0, None, accel, gyro, temperature_c=temperature)
     return measurement, None not in (accel, gyro, temperature)

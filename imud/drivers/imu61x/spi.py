@@ -40,7 +40,7 @@ from imud.drivers.imu61x.registers import (
     wanted_filter,
 )
 from imud.drivers.polled_frames import Measured, PolledFrameDecoder, absence
-from imud.drivers.value_limits import TURN_DEG, VALUE_LIMIT, possible_temperature_c, scaled
+from imud.drivers.value_limits import ACCEL_LIMIT_G, GYRO_LIMIT_DEG_S, TURN_DEG, possible_temperature_c, scaled
 from imud.model.errors import DeviceRefused, TransferError
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Vector3
@@ -347,8 +347,9 @@ class Imu61xSpiCodec:
         return None if sum_matches(frame, self._settings.checksum_bits) else BadReason.CRC
 
     def _standard(self, frame: bytes) -> Measured:
-        gyro, accel = _in_si(_joined(frame, 0), RAD_S_PER_COUNT), _in_si(_joined(frame, 12), M_S2_PER_COUNT)
-        return Measurement(len(frame), 0, None, accel, gyro, temperature_c=self._temperature_c), True
+        gyro, accel = _in_si(_joined(frame, 0), _joined(frame, 12), M_S2_PER_COUNT)
+        measurement = Measurement(len(frame), 0, None, accel, gyro, temperature_c=self._temperature_c)
+        return measurement, None not in (accel, gyro)
 
 
 _SIX: Final = struct.Struct(">6H")
@@ -366,17 +367,19 @@ def _signed(value: int) -> int:
     return value - 0x1_0000_0000 if value & 0x8000_0000 else value
 
 
-def _in_si(counts: Sequence[int], factor: float) -> Vector3:
-    x, y, z = counts
-    return (x * factor, y * factor, z * factor)
+def _in_si(gyro: Sequence[int], accel: Sequence[int], m_s2_per_count: float) -> tuple[Vector3 | None, Vector3 | None]:
+    """Return angular rate and acceleration, None if not possible."""
+    return (
+        scaled(gyro, RAD_S_PER_COUNT, GYRO_LIMIT_DEG_S * RAD_S_PER_DEG_S / RAD_S_PER_COUNT),
+        scaled(accel, m_s2_per_count, ACCEL_LIMIT_G * M_S2_PER_G / m_s2_per_count),
+    )
 
 
 def _registers(frame: bytes) -> Measured:
     temperature = possible_temperature_c(temperature_c(*struct.unpack_from(">i", frame)))
-    gyro = _in_si(_THREE.unpack_from(frame, 4), RAD_S_PER_COUNT)
-    accel = _in_si(_THREE.unpack_from(frame, 16), M_S2_PER_COUNT_REGISTER)
+    gyro, accel = _in_si(_THREE.unpack_from(frame, 4), _THREE.unpack_from(frame, 16), M_S2_PER_COUNT_REGISTER)
     measurement = Measurement(len(frame), 0, None, accel, gyro, temperature_c=temperature)
-    return measurement, temperature is not None
+    return measurement, None not in (accel, gyro, temperature)
 
 
 def _never_bad(_frame: bytes) -> BadReason | None:
@@ -392,7 +395,7 @@ def _extended(frame: bytes) -> Measured:
     gyro, accel, euler = (
         scaled(part, factor, limit)
         for part, factor, limit in (
-            (values[0:3], RAD_S_PER_DEG_S, VALUE_LIMIT), (values[3:6], M_S2_PER_G, VALUE_LIMIT),
+            (values[0:3], RAD_S_PER_DEG_S, GYRO_LIMIT_DEG_S), (values[3:6], M_S2_PER_G, ACCEL_LIMIT_G),
             (values[7:10], RAD_PER_DEG, TURN_DEG),
         )
     )  # fmt: skip

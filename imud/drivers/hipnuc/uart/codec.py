@@ -24,7 +24,7 @@ import sys
 from binascii import crc_hqx as crc16_xmodem
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import isfinite
+from math import inf, isfinite
 from typing import Any, ClassVar, Final, Literal, ParamSpec
 
 import msgspec
@@ -43,16 +43,19 @@ from imud.drivers.hipnuc.common import (
 )
 from imud.drivers.hipnuc.uart.replies import LINE_CHARACTERS_MAX, LineFinder
 from imud.drivers.value_limits import (
+    ACCEL_HIGH_BYTES,
+    ACCEL_LIMIT_G,
+    GYRO_LIMIT_DEG_S,
+    MAG_LIMIT_UT,
     QUAT_SQUARE_MAX,
     QUAT_SQUARE_MIN,
     TURN_DEG,
     TURN_SQUARE,
     VALUE_HIGH_BYTES,
-    is_possible,
+    are_usual,
+    are_within,
     possible_angles,
     possible_quaternion,
-    scaled,
-    values_possible,
 )
 from imud.model.ledger import Ledger
 from imud.model.options import Options
@@ -80,13 +83,16 @@ PRESSURE_OFFSET_PA: Final = 100_000.0
 # HI91 without its tag. The word is two bytes. In the native layout, `struct` reads a float in half the time.
 HI91_VALUES: Final = struct.Struct(("@" if sys.byteorder == "little" else "<") + "xBBbfI16f")
 # Slices of the high bytes in HI91 sub-packets: pressure, system_time, 16 floats and the next temperature of adjacent
-# sub-packets (76 is a multiple of 4); the temperatures in these bytes; system_time in the rest
+# sub-packets (76 is a multiple of 4); the pressures in these bytes; in the rest, the accelerations, the temperatures,
+# and system_time without the temperatures
 _RUN_HIGH_BYTES: Final = slice(7, None, 4)
-_RUN_TEMPERATURES: Final = slice(18, None, 19)
-_RUN_TIMES: Final = slice(1, None, 18)
-_PRESSURE_HIGH_BYTE: Final = 7
-_HIGH_BYTES: Final = slice(15, None, 4)  # high bytes of the 16 floats of one sub-packet
-_NOT_FINITE_BYTES: Final = b"\x7f\xff"  # high bytes of NaN and infinity
+_RUN_PRESSURES: Final = slice(0, None, 19)
+_RUN_ACCEL: Final = tuple(slice(at, None, 18) for at in (1, 2, 3))
+_RUN_TEMPERATURES: Final = slice(17, None, 18)
+_RUN_TIMES: Final = slice(0, None, 17)
+# High bytes of the floats of one sub-packet: accelerations, other values
+_ACCEL_HIGH_BYTES: Final = slice(15, 24, 4)
+_OTHER_HIGH_BYTES: Final = slice(27, None, 4)
 
 
 def decode_hi91(values: Sequence[Any], word_is_status: bool, size: int, trailing: int) -> Measurement:
@@ -110,9 +116,9 @@ def decode_hi91(values: Sequence[Any], word_is_status: bool, size: int, trailing
 
 
 def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int) -> list[Measurement] | None:
-    """Return `decode_hi91` of adjacent sub-packets, one per frame; None if an angle may be beyond a full turn.
+    """Return `decode_hi91` of adjacent sub-packets with usual values, one per frame.
 
-    `trailing` bytes follow the first frame.
+    None if an angle may be beyond a full turn, or a pressure is not finite. `trailing` bytes follow the first frame.
     """
     g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
     low_pa, high_pa, most_ms = PRESSURE_MIN_PA, PRESSURE_MAX_PA, PPS_STAMP_MODULUS_MS
@@ -127,6 +133,8 @@ def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int
             return None
         temperature += 0.0  # noqa: PLW2901
         if not low_pa <= pressure <= high_pa:
+            if not isfinite(pressure):
+                return None
             temperature, pressure = temperature_beside(temperature, pressure), None  # noqa: PLW2901
         word = low + 256 * high
         keep(
@@ -142,35 +150,36 @@ def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int
     return made
 
 
-def _run_possible(hi91s: bytes) -> bool:
-    """Return whether all floats of adjacent sub-packets are possible."""
+def _run_usual(hi91s: bytes) -> bool:
+    """Return whether all floats of adjacent sub-packets are usual, except the pressures."""
     high_bytes = bytearray(hi91s[_RUN_HIGH_BYTES])
-    if values_possible(high_bytes):
+    del high_bytes[_RUN_PRESSURES]
+    x, y, z = _RUN_ACCEL
+    accel = high_bytes[x] + high_bytes[y] + high_bytes[z]
+    if are_usual(accel, high_bytes):
         return True
     # a large system_time and a negative temperature have other high bytes
     del high_bytes[_RUN_TEMPERATURES], high_bytes[_RUN_TIMES]
-    return values_possible(high_bytes)
+    return are_usual(accel, high_bytes)
 
 
 def _decode_hi91(data: bytes, at: int, word_is_status: bool, size: int, trailing: int) -> tuple[Measurement, bool]:
     values = HI91_VALUES.unpack_from(data, at)
     measurement = decode_hi91(values, word_is_status, size, trailing)
-    if isfinite(values[3]) and is_possible(values[5:]) and scaled(values[_ANGLES], 1.0, TURN_DEG):
-        return measurement, True
-    return _possible_groups(measurement, values), False
+    without = {name: None for name, (at, limit) in _GROUPS.items() if not are_within(values[at], limit)}
+    if without:
+        measurement = msgspec.structs.replace(measurement, **without)
+    return measurement, not without and are_within([values[3], *values[_QUAT]], inf)
 
 
-_ANGLES: Final = slice(14, 17)  # angles in HI91_VALUES
-# other groups in HI91_VALUES
-_GROUPS: Final = {"accel_m_s2": slice(5, 8), "gyro_rad_s": slice(8, 11), "mag_t": slice(11, 14)}
-
-
-def _possible_groups(m: Measurement, values: Sequence[Any]) -> Measurement:
-    """Return the measurement without groups with a value that is not possible."""
-    without = {name: None for name, at in _GROUPS.items() if not is_possible(values[at])}
-    if scaled(values[_ANGLES], 1.0, TURN_DEG) is None:
-        without["euler_rad"] = None
-    return msgspec.structs.replace(m, **without)
+# groups in HI91_VALUES and their limits
+_GROUPS: Final = {
+    "accel_m_s2": (slice(5, 8), ACCEL_LIMIT_G),
+    "gyro_rad_s": (slice(8, 11), GYRO_LIMIT_DEG_S),
+    "mag_t": (slice(11, 14), MAG_LIMIT_UT),
+    "euler_rad": (slice(14, 17), TURN_DEG),
+}
+_QUAT: Final = slice(17, 21)
 
 
 def _decode_hi92(data: bytes, at: int, _word_is_status: bool, size: int, trailing: int) -> tuple[Measurement, bool]:
@@ -349,14 +358,15 @@ class HipnucCodec:
             if (
                 crc16_xmodem(payload, _RUN_SEED) == data[4] | data[5] << 8
                 and payload[0] == TAG_HI91
-                and payload[_PRESSURE_HIGH_BYTE] not in _NOT_FINITE_BYTES
-                and not payload[_HIGH_BYTES].strip(VALUE_HIGH_BYTES)
+                and not payload[_ACCEL_HIGH_BYTES].strip(ACCEL_HIGH_BYTES)
+                and not payload[_OTHER_HIGH_BYTES].strip(VALUE_HIGH_BYTES)
+                and (made := decode_hi91_run(payload, self.word_is_status, _HI91_FRAME_BYTES, 0))
             ):
                 ledger = self.ledger
                 ledger.bytes_in_good_frames += _HI91_FRAME_BYTES
                 ledger.frames_good += 1
                 ledger.frames_in_samples += 1
-                return (decode_hi91(HI91_VALUES.unpack(payload), self.word_is_status, _HI91_FRAME_BYTES, 0),)
+                return made
         return self._scan(self._tail + data if self._tail else data, 0)
 
     # --- frames for the kernel --------------------------------------------------------------------------------------
@@ -453,9 +463,7 @@ class HipnucCodec:
         count = len(payloads)
         end = at + count * size
         hi91s = b"".join(payloads)
-        made = (
-            decode_hi91_run(hi91s, self.word_is_status, size, len(data) - at - size) if _run_possible(hi91s) else None
-        )
+        made = decode_hi91_run(hi91s, self.word_is_status, size, len(data) - at - size) if _run_usual(hi91s) else None
         if made is None:  # `_decode_payload` checks each value at three times the cost
             for begin in range(at, end, size):
                 self._decode_payload(data, begin, begin + size, events)

@@ -28,14 +28,18 @@ from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
 from imud.contracts.script import Message, ReplyFrame
 from imud.drivers.imu61x.common import CRC_INVERSION, CRC_START, M_S2_PER_G, RAD_S_PER_DEG_S, crc32
 from imud.drivers.value_limits import (
+    ACCEL_HIGH_BYTES,
+    ACCEL_LIMIT_G,
+    GYRO_LIMIT_DEG_S,
     TEMPERATURE_HIGH_BYTES,
     TURN_DEG,
     TURN_SQUARE,
     VALUE_HIGH_BYTES,
+    are_usual,
+    are_within,
     possible_temperature_c,
     scaled,
     temperatures_possible,
-    values_possible,
 )
 from imud.model.ledger import Ledger
 from imud.model.options import Options
@@ -339,6 +343,7 @@ _ONLY: Final = struct.Struct(
 # high bytes of the temperature and of the other floats in a frame
 _ONLY_TEMPERATURE: Final = AHRS_FRAME_BYTES - CRC_BYTES - 1
 _ONLY_HIGH_BYTES: Final = slice(HEADER.size + 7, AHRS_FRAME_BYTES - CRC_BYTES - 4, 4)
+_ONLY_ACCEL: Final = slice(HEADER.size + 19, HEADER.size + 28, 4)  # high bytes of the accelerations in a frame
 # pattern of adjacent AHRS frames by their headers
 _RUN: Final = re.compile(rb"(?s:%b.{%d})+" % (re.escape(_HEAD), AHRS_FRAME_BYTES - HEADER.size))
 _RUN_PARTS: Final = struct.Struct(f"<{HEADER.size}x{AHRS.size}sI")  # payload and CRC
@@ -350,7 +355,7 @@ _RUN_VALUES: Final = struct.Struct(("@" if sys.byteorder == "little" else "<") +
 _RUN_HIGH_BYTES: Final = slice(3, None, 4)
 _RUN_TEMPERATURES: Final = slice(10, None, 11)
 _RUN_TIMERS: Final = slice(0, None, 10)
-_HIGH_BYTES: Final = slice(7, AHRS.size - 4, 4)  # in a payload: high bytes of the floats without the temperature
+_RUN_ACCEL: Final = tuple(slice(at, None, 9) for at in (3, 4, 5))  # the accelerations in the remaining bytes
 
 
 class Imu61xCodec:
@@ -374,6 +379,7 @@ class Imu61xCodec:
             and inverted_crc32(data, CRC_START) == CRC_INVERSION
             and data.startswith(_HEAD)
             and not data[_ONLY_HIGH_BYTES].strip(VALUE_HIGH_BYTES)
+            and not data[_ONLY_ACCEL].strip(ACCEL_HIGH_BYTES)
             and data[_ONLY_TEMPERATURE] in TEMPERATURE_HIGH_BYTES
             and (made := _measurements((_ONLY.unpack(data),), AHRS_FRAME_BYTES, 0))
         ):
@@ -416,7 +422,9 @@ class Imu61xCodec:
         high_bytes = bytearray(joined[_RUN_HIGH_BYTES])
         temperatures = high_bytes[_RUN_TEMPERATURES]
         del high_bytes[_RUN_TEMPERATURES], high_bytes[_RUN_TIMERS]
-        if not (values_possible(high_bytes) and temperatures_possible(temperatures)):
+        x, y, z = _RUN_ACCEL
+        accel = high_bytes[x] + high_bytes[y] + high_bytes[z]
+        if not (are_usual(accel, high_bytes) and temperatures_possible(temperatures)):
             possible: list[bytes] = list(takewhile(_is_possible, payloads))
             joined = b"".join(possible)
         made = _measurements(_RUN_VALUES.iter_unpack(joined), size, len(data) - size)
@@ -460,7 +468,7 @@ class Imu61xCodec:
     def _measure(self, frame: Frame, events: list[CodecEvent]) -> None:
         values = AHRS.unpack_from(frame.payload)
         size, trailing = len(frame.raw), frame.trailing_bytes
-        if not (_is_possible(frame.payload) and max(map(abs, values[1:4])) < TURN_DEG):
+        if not _is_possible(frame.payload):
             self.ledger.frames_not_finite += 1
             events.append(BadFrame(BadReason.NOT_FINITE, frame.raw))
         events.append(_partial_measurement(values, size, trailing))
@@ -479,8 +487,13 @@ _REPLY_FRAMES: Final = (STATUS_FRAME, PARAMETER_FRAME)
 
 
 def _is_possible(payload: bytes) -> bool:
-    *_, temperature_c = AHRS.unpack_from(payload)
-    return values_possible(payload[_HIGH_BYTES]) and possible_temperature_c(temperature_c) is not None
+    values = AHRS.unpack_from(payload)
+    return (
+        are_within(values[1:4], TURN_DEG)
+        and are_within(values[4:7], ACCEL_LIMIT_G)
+        and are_within(values[7:10], GYRO_LIMIT_DEG_S)
+        and possible_temperature_c(values[10]) is not None
+    )
 
 
 def _measurements(frames: Iterable[Sequence[Any]], size: int, trailing: int) -> list[Measurement]:
@@ -518,8 +531,8 @@ def _partial_measurement(values: Sequence[Any], size: int, trailing: int) -> Mea
     euler = scaled((roll, pitch, yaw), RAD_PER_DEG, TURN_DEG)
     return Measurement(
         size, trailing, us,
-        accel_m_s2=scaled(values[4:7], M_S2_PER_G),
-        gyro_rad_s=scaled(values[7:10], RAD_S_PER_DEG_S),
+        accel_m_s2=scaled(values[4:7], M_S2_PER_G, ACCEL_LIMIT_G),
+        gyro_rad_s=scaled(values[7:10], RAD_S_PER_DEG_S, GYRO_LIMIT_DEG_S),
         quat_wxyz=None if euler is None else quat_from_euler_zyx(euler),
         euler_rad=euler,
         temperature_c=possible_temperature_c(values[10]),
