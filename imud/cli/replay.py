@@ -15,7 +15,7 @@ from imud.cli.arguments import CliCommand, add_interface, add_option, chosen_int
 from imud.cli.output import paragraph
 from imud.cli.status import block
 from imud.contracts.codec import wrong_length_words
-from imud.contracts.driver import CanDriver
+from imud.contracts.driver import CanDriver, StreamDriver
 from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceStatus
 from imud.daemon import Daemon
@@ -99,10 +99,13 @@ def device_block(device: PlayedDevice, without: Collection[str] = ()) -> list[st
     if path is not None and path.clock.expected_rate_hz:
         clock += f", {path.clock.expected_rate_hz:.1f} Hz by the device's clock"
     closes = not bytes_open(counts) and not frames_open(counts)
-    words = ""
-    if device.driver is not None and path is not None and path.unknown and not counts["samples"]:
-        words = device.driver.unknown_words(path.unknown, device.described.name, counted=True)
-    odd = wrong_length_words(device.ledger, device.last_bad)
+    driver, words = device.driver, ""
+    if driver is not None and path is not None and path.unknown:
+        if not counts["samples"]:
+            words = driver.unknown_words(path.unknown, device.described.name, counted=True)
+        elif isinstance(driver, StreamDriver):
+            words = driver.unknown_types(path.unknown)
+    odd = wrong_length_words(device.ledger, device.wrong_length)
     rows = [
         ("link", f"{device.described.where}, driver {device.driver.name if device.driver else 'unknown'}"),
         *(("problem", one) for one in (words, odd) if one),

@@ -144,6 +144,8 @@ def parts(status: DeviceStatus) -> Iterator[tuple[str, str]]:
         yield "settings", declared(status.declared)
     if status.declared is not None and status.declared.unsaved:
         yield "unsaved", f"the flash of the device lacks a change: run `imud command {status.name} save`"
+    if status.unused:
+        yield "unused", status.unused
     if status.status_bit_names and status.status_bits is not None:
         yield "status", ", ".join(status.status_words) or "no known bit is set"
     if status.settings:

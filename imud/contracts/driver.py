@@ -182,8 +182,13 @@ class Driver:
 
         `counted`: with the number of frames of each type.
         """
+        types = self.unknown_types(unknown, counted=counted)
+        return f"{types}, but no sample; {self.decoded.replace('NAME', device)}"
+
+    def unknown_types(self, unknown: Mapping[int, int], *, counted: bool = True) -> str:
+        """Describe valid frames that the codec cannot decode."""
         types = ", ".join(self.unknown_name(one) + f": {count}" * counted for one, count in unknown.items())
-        return f"valid frames of unknown types ({types}), but no sample; {self.decoded.replace('NAME', device)}"
+        return f"valid frames of unknown types ({types})"
 
     def sent_axes(self, settings: Mapping[str, str]) -> SentAxes:
         """Return axes and angles of a device with these readable settings (empty: not read yet)."""

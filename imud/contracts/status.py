@@ -260,6 +260,7 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     recent: RecentStatus | None = None  # counts of the last minute; null for a device of a recording
     calibration: CalibrationStatus | None = None  # running calibration; null if none is running
     work: WorkStatus | None = None  # running work that uses the device alone; null without work
+    unused: str = ""  # received frames that imud cannot decode: wrong length or unknown type; empty without such frames
     # Worst condition in each of the last 60 minutes, the oldest first; null for a minute before the start of imud
     history: tuple[Condition | None, ...] = ()
 

@@ -530,6 +530,7 @@ class Device:
             history=self._judge.watch.history,
             calibration=self._calibration.status,
             work=self.settings.lock.work,
+            unused=transport.unused_words(),
         )
         return transport.add_status(status)
 

@@ -35,6 +35,7 @@ class DeviceEvents:
         self._lost = 0
         self._bad = 0
         self._last_bad: BadFrame | None = None
+        self._wrong_length: BadFrame | None = None
         self._sync: Sync | None = None
 
     def raise_event(
@@ -57,10 +58,12 @@ class DeviceEvents:
     def bad_frame(self, frame: BadFrame) -> None:
         """Note a damaged frame. The next event shows the newest frame."""
         self._last_bad = frame
+        if frame.can_id is not None:
+            self._wrong_length = frame
 
     def wrong_length_words(self) -> str:
         """Describe the CAN frames of a wrong length; empty without such a frame."""
-        return wrong_length_words(self._ledger, self._last_bad)
+        return wrong_length_words(self._ledger, self._wrong_length)
 
     def tick(self, now_ns: int, sync: Sync | None) -> None:
         """Send the events of the counters since the previous interval."""

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 from imud.attitude.conventions import DeviceAxes
 from imud.attitude.published import PublishedAxes, published_frame
 from imud.config.model import DeviceConfig
-from imud.contracts.driver import Driver, Identity
+from imud.contracts.driver import Driver, Identity, StreamDriver
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link, OnEnd
 from imud.contracts.publisher import Batch
@@ -263,6 +263,15 @@ class Transport(SettingsPort):
         if driver is None or path is None or not path.unknown:
             return ""
         return driver.unknown_words(path.unknown, self._config.name)
+
+    def unused_words(self) -> str:
+        """Describe the received frames that imud cannot decode; empty without such frames."""
+        driver, path = self.driver, self.path
+        words = self._context.events.wrong_length_words()
+        # unknown frames on a CAN bus can be from other devices
+        if isinstance(driver, StreamDriver) and path is not None and path.unknown:
+            words = driver.unknown_types(path.unknown)
+        return words
 
 
 class ReceivingTransport(Transport, RequestPort):

@@ -62,7 +62,7 @@ class PlayedDevice:
     path: SamplePath | None = None
     driver: Driver | None = None
     config: DeviceConfig | None = None
-    last_bad: BadFrame | None = None  # newest damaged frame
+    wrong_length: BadFrame | None = None  # newest CAN frame of a wrong length
     # overruns that the kernel counted in the live run
     overruns: int = 0
     before: dict[str, int] | None = None  # counters of the live run at the start of the recording; None if unknown
@@ -73,8 +73,9 @@ class PlayedDevice:
     fresh_starts: list[str] = field(default_factory=list)
 
     def note_frame(self, frame: BadFrame) -> None:
-        """Note a damaged frame. The codec counts it in the ledger."""
-        self.last_bad = frame
+        """Note a CAN frame of a wrong length. The codec counts damaged frames in the ledger."""
+        if frame.can_id is not None:
+            self.wrong_length = frame
 
 
 class RecordedEvent(msgspec.Struct, frozen=True):

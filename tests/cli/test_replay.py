@@ -14,6 +14,7 @@ import pytest
 from imud import drivers
 from imud.cli.replay import play_to_end
 from imud.contracts.driver import CanDriver, of_kind
+from imud.drivers.hipnuc.uart.codec import encode_frame
 from imud.drivers.imu61x.can import encode_set
 from imud.formats.can import CanFrame
 from imud.formats.capture import RECORD
@@ -53,6 +54,21 @@ def test_a_stamped_capture_has_its_own_rate_and_no_figures_of_how_fast_it_was_re
         assert "Hz by the device's clock" in said
         assert "Hz seen" not in said
         assert "latency" not in said
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.raw", hi91(0) + encode_frame(b"\x83" + bytes(9)) + hi91(10), "valid frames of unknown types (HI83 (tag"),
+        ("a.log", b"(1.0) can0 388#0000\n(1.1) can0 188#00000000E803\n", "1 frame of a wrong length, the last of CAN"),
+    ],
+)  # fmt: skip
+def test_the_summary_names_unused_frames_beside_samples(
+    tmp_path: Path, cli: Cli, name: str, content: bytes, words: str
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    driver = "hipnuc-canopen" if name == "a.log" else "hipnuc-uart"
+    assert f"  unused    {words}" in cli("replay", "--driver", driver, tmp_path / name).err
 
 
 def test_a_raw_capture_says_what_it_cannot_know_and_one_without_samples(tmp_path: Path, cli: Cli) -> None:

@@ -289,7 +289,9 @@ async def test_a_silent_device_reports_the_received_frames(bench: CanDeviceBench
     if lost:
         bench.link.feed([bench.frames(2)[0]._replace(data=b"short")])
         bench.rig.tick(ahead_ns=3000 * MS)
-        assert bench.rig.problem.endswith("; 1 frame of a wrong length, the last of CAN identifier 065")
+        odd = "1 frame of a wrong length, the last of CAN identifier 065"
+        assert bench.rig.problem.endswith(f"; {odd}")
+        assert bench.rig.device.status().unused == odd
 
 
 @pytest.mark.parametrize(
