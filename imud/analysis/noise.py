@@ -8,15 +8,17 @@ Reference: NIST Special Publication 1065 (SP 1065).
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from math import degrees
 from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.optimize import nnls
+from scipy.signal import welch
 from scipy.stats import chi2
 
 from imud.analysis.series import FloatArray, Grid, IntArray, Readings, even_runs, grid_of, with_values
 from imud.analysis.spectrum import Spectrum, power_spectrum
-from imud.attitude.gravity import REST_M_S2, REST_RAD_S
+from imud.attitude.gravity import REST_M_S2
 from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_S, STANDARD_GRAVITY_M_S2
 
@@ -413,26 +415,90 @@ class RestLimits(NamedTuple):
     change: float  # maximum difference of the mean of an axis from its median
 
 
-# A gyroscope with a noise density of 0.05 °/s/√Hz scatters by 1.1 °/s at 1 kHz. Its bias changes by less than 0.5 °/s
-# while it warms up.
-GYRO_AT_REST: Final = RestLimits("angular rate", "rad/s", 0.0, REST_RAD_S, 0.05, 0.01)
-ACCEL_AT_REST: Final = RestLimits("acceleration", "m/s²", STANDARD_GRAVITY_M_S2, REST_M_S2, 0.5, 0.2)
+# The bias of a gyroscope with a factory calibration is below 1 °/s and changes by less than 0.5 °/s during the warm-up.
+# A noise density of 0.05 °/s/√Hz scatters by 1.1 °/s at 1 kHz, an accelerometer with 400 µg/√Hz by 0.09 m/s².
+GYRO_AT_REST: Final = RestLimits("angular rate", "rad/s", 0.0, 0.0175, 0.025, 0.01)
+ACCEL_AT_REST: Final = RestLimits("acceleration", "m/s²", STANDARD_GRAVITY_M_S2, REST_M_S2, 0.15, 0.1)
+# Minimum standard deviation of a tone that is a vibration, by quantity, and its minimum ratio to the power density of
+# the neighbouring frequencies
+TONES: Final = {"angular rate": 0.003, "acceleration": 0.03}
+TONE_RATIO: Final = 20.0
+TONE_S: Final = 8.0  # length of the segments of the power density, s
+TONE_LEAST, TONE_MOST = 256, 8192  # minimum and maximum length of these segments, samples
+TONE_BINS: Final = range(6, 16)  # distances of neighbouring frequencies, without the width of a tone
+TONE_FIRST: Final = 4  # first frequency of a tone; the noise of lower frequencies is not white
+# Maximum change of an angle from second to second, and of roll and pitch from their median, at rest
+ANGLE_AT_REST_RAD: Final = 0.0087
+STEEP_RAD: Final = 1.3  # minimum pitch at which roll and yaw of a device at rest can jump
 
 
 def motion_words(readings: Readings) -> str:
     """Return how the device moved in the worst seconds; empty if it was at rest."""
+    # sensors without angles cannot show a slow turn about the direction of gravity
     found: list[str] = []
     for values, limits in ((readings.gyro_rad_s, GYRO_AT_REST), (readings.accel_m_s2, ACCEL_AT_REST)):
         if values is not None and (motion := _motion(*with_values(readings.t_ns, values), limits)):
             found.append(motion)
-    return "; ".join(found)
+    return "; ".join(filter(None, (*found, _turn(readings))))
+
+
+def _blocks(t_ns: IntArray, values: FloatArray) -> FloatArray:
+    """Return the values in blocks of one second, shape (blocks, n, axes)."""
+    size = max(round(STILL_S * NS_PER_S / float(np.median(np.diff(t_ns)))), 2)
+    return values[: len(values) // size * size].reshape(-1, size, values.shape[1])
+
+
+def _turn(readings: Readings) -> str:
+    """Return how roll, pitch or yaw changed; empty if they did not change."""
+    angles = readings.euler_rad
+    if angles is None:
+        return ""
+    usable = ~(np.abs(angles[:, 1]) > STEEP_RAD)
+    t_ns, angles = readings.t_ns[usable], angles[usable]
+    for name, column in zip(("roll", "pitch", "yaw"), angles.T, strict=True):
+        good = np.isfinite(column)
+        if good.sum() < BLOCKS_LEAST:
+            continue
+        mean = _blocks(t_ns[good], np.unwrap(column[good])[:, None]).mean(axis=1)[:, 0]
+        changes = np.abs(np.diff(mean, prepend=mean[:1]))
+        if name != "yaw":
+            changes = np.maximum(changes, np.abs(mean - np.median(mean)))
+        count = int((changes > ANGLE_AT_REST_RAD).sum())
+        if count > MOVED_SHARE * len(changes):
+            return (
+                f"{name}: expected a change of at most {degrees(ANGLE_AT_REST_RAD):.1f}° in each second, got up to "
+                f"{degrees(changes.max()):.3g}° in {count} of {len(changes)} seconds"
+            )
+    return ""
+
+
+def _tone(t_ns: IntArray, values: FloatArray, limits: RestLimits) -> str:
+    """Return the strongest tone of a vibration; empty without a vibration."""
+    rate_hz = NS_PER_S / float(np.median(np.diff(t_ns)))
+    if len(values) < TONE_LEAST:
+        return ""
+    size = min(max(round(TONE_S * rate_hz), TONE_LEAST), TONE_MOST, len(values))
+    frequency_hz, density = welch(values, rate_hz, nperseg=size, axis=0)
+    edge, bins = TONE_BINS[-1], len(density)
+    wide = np.pad(density, ((edge, edge), (0, 0)), constant_values=np.nan)
+    near = [wide[edge + at : edge + at + bins] for one in TONE_BINS for at in (one, -one)]
+    floor = np.nanmedian(near, axis=0)
+    power = sum(np.roll(density, at, axis=0) for at in (-1, 0, 1)) * frequency_hz[1]
+    is_tone = (density > TONE_RATIO * floor) & (np.sqrt(power) > TONES[limits.quantity])
+    is_tone[:TONE_FIRST] = False
+    if not is_tone.any():
+        return ""
+    place = int(np.where(is_tone, power, 0.0).max(axis=1).argmax())
+    return (
+        f"{limits.quantity}: expected no vibration, got {np.sqrt(power[place].max()):.2g} {limits.unit} at "
+        f"{frequency_hz[place]:.3g} Hz"
+    )
 
 
 def _motion(t_ns: IntArray, values: FloatArray, limits: RestLimits) -> str:
     if len(t_ns) < BLOCKS_LEAST:
         return ""
-    size = max(round(STILL_S * NS_PER_S / float(np.median(np.diff(t_ns)))), 2)
-    blocks = values[: len(values) // size * size].reshape(-1, size, values.shape[1])
+    blocks = _blocks(t_ns, values)
     mean = blocks.mean(axis=1)
     for words, found, limit in (
         (
@@ -453,7 +519,7 @@ def _motion(t_ns: IntArray, values: FloatArray, limits: RestLimits) -> str:
                 f"{limits.quantity}: expected a {words} of at most {limit:.3g} {limits.unit} in each second, got up to "
                 f"{found.max():.3g} {limits.unit} in {count} of {len(found)} seconds"
             )
-    return ""
+    return _tone(t_ns, values, limits)
 
 
 def _temperature(readings: Readings, t_ns: np.ndarray) -> FloatArray | None:

@@ -40,6 +40,7 @@ class Readings:
     gyro_rad_s: FloatArray | None
     accel_m_s2: FloatArray | None  # specific force, shape (n, 3); NaN and None as above
     temperature_c: FloatArray | None  # temperature, shape (n,); NaN and None as above
+    euler_rad: FloatArray | None = None  # roll, pitch, yaw, shape (n, 3); NaN and None as above
 
     @property
     def duration_s(self) -> float:

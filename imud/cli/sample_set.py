@@ -86,7 +86,7 @@ class Collector:
         self._begin_ns: int | None = None
         self._errors_ns = 0
         self._times = array("q")
-        self._gyro, self._accel, self._temperature = array("d"), array("d"), array("d")
+        self._gyro, self._accel, self._euler, self._temperature = array("d"), array("d"), array("d"), array("d")
 
     def __len__(self) -> int:
         return len(self._times)
@@ -124,19 +124,21 @@ class Collector:
         # NaN keeps the arrays at equal length
         self._gyro.extend(sample.gyro_rad_s or _NONE3)
         self._accel.extend(sample.accel_m_s2 or _NONE3)
+        self._euler.extend(sample.euler_rad or _NONE3)
         self._temperature.append(nan if sample.temperature_c is None else sample.temperature_c)
 
     def drop_before(self, t_ns: int) -> None:
         """Remove the samples before a time."""
         count = int(np.searchsorted(np.frombuffer(self._times, dtype=np.int64), t_ns)) if self._times else 0
-        del self._times[:count], self._temperature[:count], self._gyro[: 3 * count], self._accel[: 3 * count]
+        del self._times[:count], self._temperature[:count]
+        del self._gyro[: 3 * count], self._accel[: 3 * count], self._euler[: 3 * count]
 
     def readings(self) -> Readings:
         """Return the collected samples as arrays."""
         temperature = np.array(self._temperature)
         return Readings(
             np.array(self._times, dtype=np.int64), _sensor(self._gyro), _sensor(self._accel),
-            temperature if np.isfinite(temperature).any() else None,
+            temperature if np.isfinite(temperature).any() else None, _sensor(self._euler),
         )  # fmt: skip
 
     def stamps(self) -> str:

@@ -170,19 +170,35 @@ def shaken(amplitude: float, frequency_hz: float, offset: float = 0.0) -> FloatA
     ("gyro", "accel", "words"),
     [
         (shaken(0.0, 1.0), shaken(0.0, 1.0) + AT_REST, ""),
-        (shaken(0.0, 1.0, 0.04), shaken(0.0, 1.0) * 20 + AT_REST * 1.02, ""),  # an uncalibrated sensor with much noise
-        (shaken(0.0, 1.0, 0.06), None, "angular rate: expected a difference of the mean from 0 rad/s of at most 0.05"),
-        (shaken(0.1, 10.0), None, "angular rate: expected a standard deviation of at most 0.05 rad/s"),
-        (shaken(0.02, 0.05), None, "angular rate: expected a change of the mean of at most 0.01 rad/s"),
+        (shaken(0.0, 1.0, 0.012), shaken(0.0, 1.0) * 8 + AT_REST * 1.02, ""),  # much noise
+        (shaken(0.0, 1.0, 0.02), None, "angular rate: expected a difference of the mean from 0 rad/s of at most 0.0"),
+        (shaken(0.1, 10.0), None, "angular rate: expected a standard deviation of at most 0.025 rad/s"),
+        (shaken(0.02, 33.0), None, "angular rate: expected no vibration, got 0.014 rad/s at"),
+        (None, shaken(0.1, 1.0) + AT_REST, "acceleration: expected no vibration, got 0.071 m/s² at"),
+        (shaken(0.015, 0.05), None, "angular rate: expected a change of the mean of at most 0.01 rad/s"),
         (None, shaken(0.0, 1.0, 5.0) + AT_REST, "acceleration: expected a difference of the mean from 9.807 m/s² of"),
-        (None, shaken(1.0, 10.0) + AT_REST, "acceleration: expected a standard deviation of at most 0.5 m/s²"),
-        (None, shaken(0.5, 0.05) + AT_REST, "acceleration: expected a change of the mean of at most 0.2 m/s²"),
+        (None, shaken(1.0, 10.0) + AT_REST, "acceleration: expected a standard deviation of at most 0.15 m/s²"),
+        (None, shaken(0.5, 0.05) + AT_REST, "acceleration: expected a change of the mean of at most 0.1 m/s²"),
     ],
 )  # fmt: skip
 def test_rest_has_limits_that_do_not_depend_on_the_motion(
     gyro: FloatArray | None, accel: FloatArray | None, words: str
 ) -> None:
     found = analysis_noise.motion_words(Readings(stamps_ns(COUNT, RATE_HZ), gyro, accel, None))
+    assert found.startswith(words) if words else not found
+
+
+@pytest.mark.parametrize(
+    ("angle", "slope", "pitch", "words"),
+    [
+        (2, 0.0, 0.0, ""), (2, 0.0175, 0.0, "yaw: expected a change of at most 0.5° in each second, got up to 1°"),
+        (2, 1.0, 1.5, ""), (2, 1.0, np.nan, "yaw: "), (0, 0.001, 0.0, "roll: "), (2, 0.001, 0.0, ""),
+    ],
+)  # fmt: skip
+def test_angles_show_a_turn_without_other_evidence(angle: int, slope: float, pitch: float, words: str) -> None:
+    euler = np.tile([0.0, pitch, 0.0], (COUNT, 1))
+    euler[:, angle] += np.angle(np.exp(1j * slope * SECONDS))
+    found = motion_words(Readings(stamps_ns(COUNT, RATE_HZ), None, shaken(0.0, 1.0) + AT_REST, None, euler))
     assert found.startswith(words) if words else not found
 
 
