@@ -325,10 +325,14 @@ class AppliedSettings(msgspec.Struct, frozen=True):
 
     @property
     def ends(self) -> list[str]:
-        """Results of the save and the restart. Only a restart verifies a save, because imud cannot read the flash."""
-        if self.restarted:
-            return ["saved to flash"] * self.saved + ["restarted"]
-        return ["save to flash: sent, not verified: imud cannot read the flash"] * self.saved
+        """Results of the save and the restart. A value that the device reports after a restart verifies a save, because
+        imud cannot read the flash."""
+        outcomes = [step.outcome for step in self.steps]
+        is_verified = StepOutcome.VERIFIED in outcomes and StepOutcome.NOT_APPLIED not in outcomes
+        save = "saved to flash"
+        if not (self.restarted and is_verified):
+            save = "save to flash: sent, not verified: imud cannot read the flash"
+        return [save] * self.saved + ["restarted"] * self.restarted
 
     @property
     def failure(self) -> str:

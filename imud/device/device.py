@@ -449,12 +449,14 @@ class Device:
             try:
                 result = await self._calibration.run(kind, calibration, save=save)
                 self._shared.files.flash.keep_calibration(self.settings.module, result)
-                return result
             finally:
                 saved = result is not None and (result.saved or result.kept is not Kept.BY_SAVE)
                 if result is not None and result.saved:  # the save writes all settings
                     self.settings.flash_is_current(changed=False)
                 self.settings.changed(unsaved=not saved)
+            if self.settings.table is not None:  # a calibration changes reports, for example the offset of a gyroscope
+                await self.settings.read_again(identity=False)
+            return result
 
     def stop_calibration(self) -> bool:
         """Stop the running calibration; return whether one was running."""

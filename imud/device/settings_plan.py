@@ -533,7 +533,7 @@ class Applying:
             self.problem = f"not saved: {error}"
 
     async def _restart(self, done: list[AppliedStep]) -> list[AppliedStep]:
-        """Restart the device, and compare the settings that needed the restart."""
+        """Restart the device, and compare the written settings with its reports."""
         restart = self.table.restart
         assert restart is not None
         self.transport.samples.mark()
@@ -548,7 +548,9 @@ class Applying:
             self.problem = self.problem or "the device does not report its settings after its restart"
         if self.problem:
             return done
-        return [self._compared(one) if one.outcome is StepOutcome.WRITTEN else one for one in done]
+        # a device that has ignored the save loses values that it reported before the restart
+        is_due = (StepOutcome.WRITTEN, StepOutcome.VERIFIED)
+        return [self._compared(one) if one.outcome in is_due else one for one in done]
 
     async def _read(self, names: Collection[str] | None) -> str:
         """Read reports, None: all. Return an empty text, or the reason if the device did not reply."""

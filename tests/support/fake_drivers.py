@@ -307,7 +307,8 @@ class FakeModule(MemoryLink):
 
     def _save(self) -> list[str]:
         self.saves += 1
-        self.flash = {**self.set, "baud": self.flash["baud"]}
+        if "SAVE" not in self.forgets:
+            self.flash = {**self.set, "baud": self.flash["baud"]}
         return ["OK"]
 
     def _set(self, words: str) -> list[str]:

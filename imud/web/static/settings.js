@@ -272,7 +272,8 @@ export class SettingsSection {
     const steps = done.steps.map((one) => el("li", {}, icon(isGood(one) ? "ok" : "missing", isGood(one) ? "done" : "not done"), `${titles[one.name] ?? one.name}: ${one.outcome}${one.message ? ` (${one.message})` : ""}`));
     const others = Object.fromEntries(done.steps.filter((one) => isGood(one) && !agrees(this.all.find((each) => each.name === one.name)?.declared, one.value)).map((one) => [one.name, one.value]));
     const lost = done.steps.filter(isGood).map((one) => `“${titles[one.name] ?? one.name}”`).join(", ");
-    const saved = done.restarted ? "Applied and saved to flash." : "Applied. The save to flash is not verified: imud cannot read the flash.";
+    const is = (outcome) => done.steps.some((one) => one.outcome === outcome);
+    const saved = done.restarted && is("verified") && !is("not applied") ? "Applied and saved to flash." : "Applied. The save to flash is not verified: imud cannot read the flash.";
     const result = done.problem || (done.saved ? saved : `Applied. The device loses ${lost} at power-off.`);
     return [
       el("ol", { class: "outcome" }, steps), el("p", { class: done.problem ? "wrong" : "", role: "status", id: "outcome" }, el("b", { text: result })),
