@@ -450,12 +450,10 @@ class Device:
                 result = await self._calibration.run(kind, calibration, save=save)
                 self._shared.files.flash.keep_calibration(self.settings.module, result)
             finally:
-                saved = result is not None and (result.saved or result.kept is not Kept.BY_SAVE)
                 if result is not None and result.saved:  # the save writes all settings
                     self.settings.flash_is_current(changed=False)
-                self.settings.changed(unsaved=not saved)
-            if self.settings.table is not None:  # a calibration changes reports, for example the offset of a gyroscope
-                await self.settings.read_again(identity=False)
+                self.settings.changed(unsaved=result is None or (result.kept is Kept.BY_SAVE and not result.saved))
+            await self.settings.read_again(identity=False)  # a calibration changes reports, for example an offset
             return result
 
     def stop_calibration(self) -> bool:
@@ -532,7 +530,6 @@ class Device:
             history=self._judge.watch.history,
             calibration=self._calibration.status,
             work=self.settings.lock.work,
-            unused=transport.unused_words(),
         )
         return transport.add_status(status)
 

@@ -379,7 +379,7 @@ class DeviceSettings:
     async def read_again(self, *, identity: bool) -> None:
         """Read all reports after a command, and the identity if the device may have restarted."""
         self.is_current = False
-        if not self._transport.may_ask:
+        if self.table is None or not self._transport.may_ask:
             return
         try:
             if identity:

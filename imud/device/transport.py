@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from itertools import chain, repeat
 from typing import Any, Protocol
 
+import msgspec
+
 from imud.attitude.conventions import DeviceAxes
 from imud.attitude.published import PublishedAxes, published_frame
 from imud.config.model import DeviceConfig
@@ -246,7 +248,7 @@ class Transport(SettingsPort):
 
     def add_status(self, status: DeviceStatus) -> DeviceStatus:
         """Return `status` with the fields of this kind of transport."""
-        return status
+        return msgspec.structs.replace(status, unused=self._unused_words())
 
     def add_lines(self, status: LinesStatus | None) -> LinesStatus | None:
         """Return `status` with the lines of this kind of transport."""
@@ -264,7 +266,7 @@ class Transport(SettingsPort):
             return ""
         return driver.unknown_words(path.unknown, self._config.name)
 
-    def unused_words(self) -> str:
+    def _unused_words(self) -> str:
         """Describe the received frames that imud cannot decode; empty without such frames."""
         driver, path = self.driver, self.path
         words = self._context.events.wrong_length_words()
