@@ -255,7 +255,8 @@ class DeafModule:
             if b"VERSION" in request:
                 self.asked_ns.append(self.clock.now_ns())
             if len(self.asked_ns) > self._deaf_to + self._deaf_to_settings * (b"VERSION" not in request):
-                reply = VERSION % b"043995698D6E1708" if b"VERSION" in request else b"COM1=115200\r\nOK\r\n"
+                report = b"%s=115200\r\nOK\r\n" % request.split()[-1]
+                reply = VERSION % b"043995698D6E1708" if b"VERSION" in request else report
                 assert self.rig.link.feed(reply, self.clock.now_ns())
 
     async def pass_s(self, duration_s: float) -> None:
