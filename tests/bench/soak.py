@@ -301,8 +301,9 @@ def run_fleet(seconds: float, metrics_port: int) -> int:
         wait_for(folder / "s")
         wait_open(folder / "s", fleet)
         names = list(ask_all(folder / "s")[0])
-        argv = ["--socket", str(folder / "s"), "--clients", str(CLIENTS), "--devices", *names]
-        readers = stack.enter_context(Process(REST_CORES, "-m", "tests.bench.readers", *argv))
+        limit_s = seconds + 10 * START_LIMIT_S  # the end of the input ends the readers before this limit
+        argv = ["--socket", str(folder / "s"), "--clients", str(CLIENTS), "--seconds", str(limit_s), "--devices"]
+        readers = stack.enter_context(Process(REST_CORES, "-m", "tests.bench.readers", *argv, *names))
         readers.line()
         watched, recordings = Watched(server.popen.pid, folder / "s", metrics_port), Recordings(folder / "recordings")
         begin = ask_line(folder / "s", line)
