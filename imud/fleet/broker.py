@@ -298,13 +298,15 @@ class Received(NamedTuple):
 class BrokerConnection(Protocol):
     """Connection to one broker. Synchronization: one thread; any thread may call `ring`."""
 
-    acknowledged: list[int]  # Packet identifiers of acknowledged messages. The reader clears the list.
+    # Packet identifiers of acknowledged messages and accepted subscriptions. The reader clears the list.
+    acknowledged: list[int]
     in_flight_max: int  # maximum number of messages without an acknowledgement
     received: list[Received]  # Messages received from subscriptions. The reader clears the list.
-    refused: list[tuple[int, str]]  # packet identifiers of refused messages with the reason; the reader clears the list
+    # Packet identifiers of refused messages and subscriptions with the reason. The reader clears the list.
+    refused: list[tuple[int, str]]
 
-    def subscribe(self, topic: str) -> None:
-        """Subscribe to a topic. Raises BrokerError."""
+    def subscribe(self, topic: str) -> int:
+        """Subscribe to a topic. Return the packet identifier. Raises BrokerError."""
         ...
 
     def publish(
@@ -399,12 +401,15 @@ class PahoConnection:
 
     # --- as a connection ---------------------------------------------------------------------------------------------
 
-    def subscribe(self, topic: str) -> None:
-        """Subscribe to a topic. Raises BrokerError."""
+    def subscribe(self, topic: str) -> int:
+        """Subscribe to a topic. Return the packet identifier. Raises BrokerError."""
         try:
-            self._client.subscribe(topic, qos=1)
+            failure, number = self._client.subscribe(topic, qos=1)
         except (OSError, ValueError) as error:
             raise BrokerError(f"{self._broker.name}: {connection_problem(error)}") from error
+        if failure:
+            self._fail(LOST)
+        return int(number)
 
     def publish(
         self, topic: str, payload: bytes, content_type: str, *, retain: bool, correlation: bytes | None = None
@@ -520,10 +525,12 @@ class PahoConnection:
             )
         )
 
-    def _on_subscribe(self, _client: Any, _data: Any, _mid: int, reasons: Any, _properties: Any) -> None:
-        for reason in reasons:
-            if reason.value >= REFUSED:
-                log.warning("mqtt: %s: the broker refuses to send requests: %s", self._broker.name, reason)
+    def _on_subscribe(self, _client: Any, _data: Any, mid: int, reasons: Any, _properties: Any) -> None:
+        problem = next((str(reason) for reason in reasons if reason.value >= REFUSED), "")
+        if problem:
+            self.refused.append((mid, problem))
+        else:
+            self.acknowledged.append(mid)
 
     def _on_disconnect(self, _client: Any, _data: Any, flags: Any, reason: Any, _properties: Any) -> None:
         if flags.is_disconnect_packet_from_server:

@@ -47,6 +47,11 @@ SKIP_MOST_NS: Final = 3600 * NS_PER_S
 TOPICS_MAX: Final = 500
 
 
+def is_subscription(topic: str) -> bool:
+    """Return whether a topic is the filter of the subscription. A message cannot have a topic with a wildcard."""
+    return "+" in topic
+
+
 class _Refusal(NamedTuple):
     """Refusal of a topic."""
 
@@ -57,6 +62,8 @@ class _Refusal(NamedTuple):
 
 class TopicRefusals:
     """Topics that the broker refuses, and suspected topics. Synchronization: the caller holds its lock.
+
+    The filter of the subscription is one of the topics: a broker can also refuse the subscription.
 
     A broker refuses a message with a reason code (MQTT 5), or it closes the connection. In the second case several
     messages can be in flight. The sender then sends the next message of each of these topics alone. A topic is refused
@@ -89,6 +96,8 @@ class TopicRefusals:
         """Skip a topic, because the broker refused a message. Do nothing for a skipped topic."""
         if topic in self._skipped:
             return
+        if is_subscription(topic):
+            problem += "; commands over MQTT do not work"
         known = self._refused.pop(topic, None)
         skip_ns = SKIP_NS if known is None else min(2 * known.skip_ns, SKIP_MOST_NS)
         self._suspects.pop(topic, None)
@@ -112,7 +121,8 @@ class TopicRefusals:
             losses = self._suspects.setdefault(topic, 0) + (len(topics) == 1)
             self._suspects[topic] = losses
             if losses >= LOSSES_MAX:
-                self.refuse(topic, f"{problem}, {losses} times after a message of this topic", now_ns)
+                packet = "the subscription" if is_subscription(topic) else "a message"
+                self.refuse(topic, f"{problem}, {losses} times after {packet} of this topic", now_ns)
         while len(self._suspects) > TOPICS_MAX:
             del self._suspects[next(iter(self._suspects))]
 
@@ -126,7 +136,7 @@ class TopicRefusals:
 
 
 class _Message(NamedTuple):
-    """Message that the sender sends next, or that is in flight."""
+    """Message or subscription that the sender sends next, or that is in flight."""
 
     topic: str
     payload: bytes
@@ -168,6 +178,7 @@ class MqttSender:
         self._answers: list[tuple[int, int]] = []
         self._retained: dict[str, bytes] = {}  # newest payload by topic
         self._due: dict[str, None] = {}  # topics of retained messages to send, in order
+        self._subscription = ""  # filter of the subscription to send; empty if there is none
         self._connection: BrokerConnection | None = None
         self._wake = WakeEvent()
         self._ended = False
@@ -301,20 +312,20 @@ class MqttSender:
         if self._ended:
             connection.close()
             return
-        if self.commands is not None:
-            connection.subscribe(self.commands.subscription)
         self._turn.connected(self._now_ns())
         self.reconnects += self._was_connected
         self._was_connected = True
         with self._lock:
             self._connection = connection
             self._due = dict.fromkeys(topic for topic in self._retained if topic not in self.skipped)
+            wanted = self.commands.subscription if self.commands is not None else ""
+            self._subscription = wanted if wanted not in self.skipped else ""
             self.session += 1
             self.connected, self.broker, self.problem = True, broker.name, ""
         self.wanting()
 
     def _send(self, connection: BrokerConnection) -> None:
-        """Send messages up to the window of the broker: replies first, then retained messages, then the spool."""
+        """Send packets up to the window of the broker: subscription, replies, retained messages, then the spool."""
         while len(self._in_flight) < connection.in_flight_max:
             with self._lock:
                 message = self._next_message()
@@ -326,9 +337,12 @@ class MqttSender:
         kind = SLOTS_TYPE if message.payload.startswith(MAGIC) else JSON_TYPE
         correlation = message.reply.correlation if message.reply is not None else None
         try:
-            number = connection.publish(
-                message.topic, message.payload, kind, retain=message.is_retained, correlation=correlation
-            )
+            if is_subscription(message.topic):
+                number = connection.subscribe(message.topic)
+            else:
+                number = connection.publish(
+                    message.topic, message.payload, kind, retain=message.is_retained, correlation=correlation
+                )
         except MessageRefused as error:
             self.replies_lost += message.reply is not None
             self._refuse(message.topic, str(error))
@@ -350,7 +364,9 @@ class MqttSender:
             found = min(self._waiting(), key=lambda one: refusals.losses(one.topic), default=None)
         if found is None:
             return None
-        if found.reply is not None:
+        if is_subscription(found.topic):
+            self._subscription = ""
+        elif found.reply is not None:
             self._replies.remove(found.reply)
         elif found.is_retained:
             del self._due[found.topic]
@@ -363,7 +379,8 @@ class MqttSender:
         replies = (_Message(one.topic, one.payload, reply=one) for one in self._replies)
         due = (_Message(topic, self._retained[topic], is_retained=True) for topic in self._due)
         rows = (_Message(row.topic, row.payload, row.id) for row in self._outbox)
-        return chain(replies, due, rows)
+        subscription = (_Message(topic, b"") for topic in (self._subscription,) if topic)
+        return chain(subscription, replies, due, rows)
 
     def _take_acknowledgements(self, connection: BrokerConnection) -> None:
         """Pass the acknowledgements to the writer, and skip the topics of refused messages."""
@@ -411,6 +428,7 @@ class MqttSender:
         with self._lock:
             ended = self._refusals.take_ended(self._now_ns())
             self._due |= dict.fromkeys(topic for topic in ended if topic in self._retained)
+            self._subscription = next(filter(is_subscription, ended), self._subscription)
         if ended:
             self._update_refusals()
 

@@ -14,7 +14,7 @@ class FakeConnection:
         self.in_flight_max = broker.window
         self.received: list[Received] = []
         self.refused: list[tuple[int, str]] = []
-        self.subscribed: list[str] = []
+        self.packets: list[str] = []  # topic of each message and subscription
         self.correlations: list[bytes | None] = []
         self.sent: list[tuple[str, bytes, bool]] = []
         self.types: list[str] = []
@@ -24,8 +24,9 @@ class FakeConnection:
         self._broker = broker
         self._answered = 0
 
-    def subscribe(self, topic: str) -> None:
-        self.subscribed.append(topic)
+    def subscribe(self, topic: str) -> int:
+        self.packets.append(topic)
+        return len(self.packets)
 
     def publish(
         self, topic: str, payload: bytes, content_type: str, *, retain: bool, correlation: bytes | None = None
@@ -34,19 +35,20 @@ class FakeConnection:
             raise MessageRefused("Not authorized")
         self.correlations.append(correlation)
         self.sent.append((topic, payload, retain))
+        self.packets.append(topic)
         self.types.append(content_type)
         with self._broker.changed:
             self._broker.changed.notify_all()
-        return len(self.sent)
+        return len(self.packets)
 
     def wait(self, seconds: float) -> None:
         """Acknowledge messages if the test allows it. Raise BrokerError if the broker has a problem."""
         if self._broker.problem:
             raise BrokerError(self._broker.problem)
-        while self._answered < len(self.sent) and self._broker.answers > 0:
+        while self._answered < len(self.packets) and self._broker.answers > 0:
             self._broker.answers -= 1
             self._answered += 1
-            topic = self.sent[self._answered - 1][0]
+            topic = self.packets[self._answered - 1]
             if topic in self._broker.closes_on:
                 raise BrokerError("the connection was lost")
             if topic in self._broker.refuses:

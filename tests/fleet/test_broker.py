@@ -270,7 +270,7 @@ def test_a_reader_counts_refused_messages_and_waits_a_limited_time(
         asyncio.run(reader(broker))
 
 
-def test_a_gateway_names_the_refusal(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_gateway_names_the_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
     refused = pytest.raises(BrokerError, match="refuses the connection: Not authorized")
     with scripted(NOT_AUTHORIZED) as broker, refused:
         gateway(broker)
@@ -279,10 +279,11 @@ def test_a_gateway_names_the_refusal(monkeypatch: pytest.MonkeyPatch, caplog: py
     ended = pytest.raises(BrokerError, match="the broker ended the connection: Server shutting down")
     with scripted(CONNACK + SHUTTING_DOWN) as broker, ended, closing(gateway(broker)) as connection:
         connection.wait(LIMIT_S)
-    with scripted(CONNACK, NO_SUBACK) as broker, closing(gateway(broker)) as connection:
-        connection.subscribe("imud/+")
-        connection.wait(LIMIT_S)
-    assert "the broker refuses to send requests: Not authorized" in caplog.text
+    for reply, acknowledged, refusals in ((SUBACK, [1], []), (NO_SUBACK, [], [(1, "Not authorized")])):
+        with scripted(CONNACK, reply) as broker, closing(gateway(broker)) as connection:
+            assert connection.subscribe("imud/+") == 1
+            connection.wait(LIMIT_S)
+            assert (connection.acknowledged, connection.refused) == (acknowledged, refusals)
     monkeypatch.setattr("imud.fleet.broker.LOOK_S", 0.01)
     monkeypatch.setattr("imud.fleet.broker.CONNECT_S", 0.02)
     with scripted(b"\x20") as broker, pytest.raises(BrokerError, match="no answer within"):

@@ -1,15 +1,17 @@
 """Sender: window of messages, retained messages first, and all messages again in order after a lost connection."""
 
 import threading
+from unittest.mock import Mock
 
 import pytest
 
 from imud.fleet.broker import BrokerTurn, Will
-from imud.fleet.commands import CommandReply
+from imud.fleet.commands import CommandChannel, CommandReply
 from imud.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
 from imud.fleet.sender import MqttSender
-from imud.fleet.settings import Broker, MqttOptions
+from imud.fleet.settings import Broker, CommandOptions, MqttOptions
 from imud.fleet.spool import SpoolRow
+from imud.fleet.streams import Gateway
 from imud.model.units import NS_PER_S
 from tests.fleet.fake_broker import FakeBroker
 from tests.support.daemon_process import LIMIT_S
@@ -209,13 +211,16 @@ def test_replies_without_acknowledgement_are_sent_again_up_to_a_limit() -> None:
 
 LONG_NS = 600 * NS_PER_S  # longer than the pauses of this test
 FORBIDDEN = {"ha/a", "ha/b", "data/x", "answer/x"}
+REQUESTS = "imud/s/gw/+/command"
 
 
 @pytest.mark.parametrize("way", ["closes_on", "refuses", "rejects"])
 def test_forbidden_topics_do_not_block_other_messages(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("imud.fleet.sender.SKIP_NS", LONG_NS)
     bench = SenderBench()
-    setattr(bench.broker, way, set(FORBIDDEN))
+    bench.sender.commands = CommandChannel(CommandOptions(), Gateway("s", "gw", ""), Mock(), bench.clock.now_ns, Mock())
+    forbidden = FORBIDDEN if way == "rejects" else FORBIDDEN | {REQUESTS}
+    setattr(bench.broker, way, forbidden)
     rows = [row(n, b"%d" % n, "data/x" if n % 3 == 0 else f"data/{n % 3}") for n in range(1, 31)]
     bench.sender.retain({"ha/a": b"1", "state": b"2", "ha/b": b"3", "status": b"4"})
     bench.drive(1)
@@ -225,10 +230,11 @@ def test_forbidden_topics_do_not_block_other_messages(way: str, monkeypatch: pyt
     assert bench.done == {one.id for one in rows if one.topic != "data/x"}
     sent = [topic for one in bench.broker.connections for topic, _, _ in one.sent]
     assert {"state", "status", "answer/y"} <= set(sent)
-    assert bench.sender.skipped == set(bench.sender.refused) == FORBIDDEN
-    assert all("lost" in one or one == "Not authorized" for one in bench.sender.refused.values())
+    assert bench.sender.skipped == set(bench.sender.refused) == forbidden
+    assert all("lost" in one or one.startswith("Not authorized") for one in bench.sender.refused.values())
+    assert way == "rejects" or "commands over MQTT do not work" in bench.sender.refused[REQUESTS]
     losses = len(bench.broker.connections) - 1
-    assert losses <= (2 + LOSSES_MAX * len(FORBIDDEN) if way == "closes_on" else 0)
+    assert losses <= (3 + LOSSES_MAX * len(forbidden) if way == "closes_on" else 0)
     assert bench.sender.connected
     bench.sender.retain({"ha/a": b"5"})
     bench.sender.reply(CommandReply("answer/x", b"", None))
@@ -240,6 +246,7 @@ def test_forbidden_topics_do_not_block_other_messages(way: str, monkeypatch: pyt
     assert bench.sender.skipped == set(bench.sender.refused) - {"answer/x"} == {"ha/b"}
     assert bench.done == {one.id for one in rows}
     assert ("ha/a", b"5", True) in [one for made in bench.broker.connections for one in made.sent]
+    assert REQUESTS in bench.broker.connections[-1].packets
 
 
 def test_lost_connections_refuse_no_innocent_topic_and_a_silent_broker_is_left() -> None:
