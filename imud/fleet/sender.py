@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from itertools import chain
 from typing import Final, NamedTuple
 
-from imud.fleet.broker import BrokerConnection, BrokerError, BrokerTurn, Connect, MessageRefused, Will
+from imud.fleet.broker import CONNECT_S, BrokerConnection, BrokerError, BrokerTurn, Connect, MessageRefused, Will
 from imud.fleet.commands import CommandChannel, CommandReply
 from imud.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
 from imud.fleet.settings import MqttOptions
@@ -36,6 +36,7 @@ SHORT_RUNS: Final = 3
 FAREWELL_S: Final = 0.3  # part of CLOSE_S for the acknowledgement of the farewell, s
 # Maximum time without any acknowledgement while messages are in flight, s. A message of 130 kB takes 52 s at 20 kbit/s.
 UNANSWERED_S: Final = 60.0
+LINK_BYTES_S: Final = 2500.0  # bytes per second of the slowest expected link (20 kbit/s)
 
 
 # Number of lost connections in sequence with only one topic in flight, after which imud skips the topic
@@ -155,7 +156,8 @@ class MqttSender:
         self.session = 0  # Number of the connection. It changes at each connection and each loss.
         self.connected = False
         self.broker = ""  # name of the connected broker; empty if there is none
-        # Cause of a missing connection, one sentence; empty if the connection works, and before the first attempt
+        # Cause of a missing connection or of missing acknowledgements, one sentence; empty if the connection works, and
+        # before the first attempt
         self.problem = ""
         self.sent = 0  # number of sent messages of the spool, including repeated messages
         self.acknowledged = 0  # number of acknowledged messages of the spool
@@ -174,6 +176,7 @@ class MqttSender:
         self._outbox: deque[SpoolRow] = deque()  # rows of the spool
         self._in_flight: dict[int, _Message] = {}  # messages without an acknowledgement, by packet identifier
         self._answered_ns = 0  # time of the newest acknowledgement, or of the first message in flight
+        self._unanswered = ""  # `problem` of missing acknowledgements; empty after an acknowledgement
         self._refusals = TopicRefusals()
         self._answers: list[tuple[int, int]] = []
         self._retained: dict[str, bytes] = {}  # newest payload by topic
@@ -321,7 +324,7 @@ class MqttSender:
             wanted = self.commands.subscription if self.commands is not None else ""
             self._subscription = wanted if wanted not in self.skipped else ""
             self.session += 1
-            self.connected, self.broker, self.problem = True, broker.name, ""
+            self.connected, self.broker, self.problem = True, broker.name, self._unanswered
         self.wanting()
 
     def _send(self, connection: BrokerConnection) -> None:
@@ -395,6 +398,7 @@ class MqttSender:
         connection.acknowledged.clear()
         with self._lock:
             self._answered_ns = self._now_ns()
+            self.problem = self._unanswered = ""
             messages = [self._in_flight.pop(number) for number in numbers if number in self._in_flight]
             for one in messages:
                 self._refusals.accept(one.topic)
@@ -409,8 +413,18 @@ class MqttSender:
             self.wanting()
 
     def _check_answers(self) -> None:
-        """Raise BrokerError if the broker acknowledges nothing, although messages are in flight."""
-        if self._in_flight and self._now_ns() - self._answered_ns > UNANSWERED_S * NS_PER_S:
+        """Set `problem` if the broker acknowledges nothing. Raise BrokerError after UNANSWERED_S."""
+        oldest = next(iter(self._in_flight.values()), None)
+        if oldest is None:
+            return
+        silent_s = (self._now_ns() - self._answered_ns) / NS_PER_S
+        limit_s = round(CONNECT_S + len(oldest.payload) / LINK_BYTES_S)
+        if silent_s > limit_s and not self._unanswered:
+            self.problem = self._unanswered = (
+                f"{self.broker}: expected an acknowledgement of a message of {oldest.topic} within {limit_s} s, "
+                f"got none"
+            )
+        if silent_s > UNANSWERED_S:
             raise BrokerError(
                 f"{self.broker}: no acknowledgement of {len(self._in_flight)} messages within {UNANSWERED_S:g} s"
             )

@@ -268,6 +268,18 @@ def test_lost_connections_refuse_no_innocent_topic_and_a_silent_broker_is_left()
     bench.broker.answers = 0
     bench.drive(1)
     bench.sender.give(1, [row(1), row(2, topic="other")])
+    bench.drive(1)
+    bench.clock.advance(4 * NS_PER_S)
+    assert bench.sender.problem == ""
+    bench.drive(2)
+    named = "mqtt://a:1: expected an acknowledgement of a message of topic within 4 s, got none"
+    assert bench.sender.problem == named
     bench.drive(650)
     assert not bench.sender.connected or len(bench.broker.connections) > 1
     assert bench.broker.connections[0].closed
+    bench.drive(50)
+    assert (bench.sender.connected, bench.sender.problem) == (True, named), "a new connection acknowledged nothing yet"
+    bench.broker.answers = 9
+    bench.sender.give(bench.sender.session, [row(1)])
+    bench.drive(2)
+    assert bench.sender.problem == ""
