@@ -13,8 +13,11 @@ import pwd
 import queue
 import select
 import stat
+import tempfile
 import threading
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO, Final, TypeVar
 
@@ -169,6 +172,7 @@ class StateFile:
         self._without = without
         self._contents: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
+        self._problem = ""  # reported reason why imud cannot write the file; empty if it can
         if file is not None:
             self._thread = threading.Thread(target=self._save, args=(file,), name=thread, daemon=True)
             self._thread.start()
@@ -199,19 +203,27 @@ class StateFile:
             self._thread = None
 
     def _save(self, file: Path) -> None:
-        """Write the newest content of the queue. Runs in the thread."""
+        """Check the directory, then write the newest content of the queue. Runs in the thread."""
+        self._try(file, lambda: tempfile.TemporaryFile(dir=file.parent).close())
         while (content := self._contents.get()) is not None:
             ended = False
             while not ended and not self._contents.empty():
                 newer = self._contents.get()
                 ended, content = newer is None, newer or content
-            try:
-                file.parent.mkdir(mode=0o750, parents=True, exist_ok=True)
-                replace_file(file, content)
-            except OSError as error:
-                log.warning(
-                    "cannot write %s: %s; after the next start %s; give this user write permission for state_dir",
-                    file, reason_of(error), self._without,
-                )  # fmt: skip
+            self._try(file, partial(replace_file, file, content))
             if ended:
                 return
+
+    def _try(self, file: Path, write: Callable[[], None]) -> None:
+        """Create the directory and write. Report each new problem once."""
+        before, self._problem = self._problem, ""
+        try:
+            file.parent.mkdir(mode=0o750, parents=True, exist_ok=True)
+            write()
+        except OSError as error:
+            self._problem = reason_of(error)
+        if self._problem and self._problem != before:
+            log.warning(
+                "cannot write %s: %s; after the next start %s; set state_dir to a directory that this user can write",
+                file, self._problem, self._without,
+            )  # fmt: skip

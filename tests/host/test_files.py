@@ -152,6 +152,12 @@ def test_a_state_file_keeps_the_newest_content(tmp_path: Path, caplog: pytest.Lo
     state.write({})
     state.close()
     assert f"cannot write {path}: Is a directory; after the next start is empty" in caplog.messages[-1]
+    for folder in (Path("/proc/imud"), Path("/dev/null")):
+        caplog.clear()
+        state = files.StateFile(folder / "file", "saving", "is empty")
+        state.close()  # without content
+        (message,) = caplog.messages
+        assert f"cannot write {folder}/file: " in message
     assert files.StateFile(None, "", "").read(dict[str, int]) == {}
 
 

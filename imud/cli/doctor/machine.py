@@ -6,6 +6,7 @@ from typing import Final, NamedTuple
 
 from imud.cli.doctor.surroundings import DoctorFinding, Findings, Surroundings, error, not_checked, note, ok, warning
 from imud.contracts.status import DeviceStatus
+from imud.model.errors import reason_of
 from imud.model.units import NS_PER_MS
 
 CLOCK_ERROR_NS: Final = 100 * NS_PER_MS  # maximum one-sigma error of a clock with NTP over the Internet, ns
@@ -51,7 +52,7 @@ def storage(at: Surroundings) -> Findings:
     """Measure the time of a synchronised write to the state directory."""
     folder = at.config.state_dir if at.config is not None else "/var/lib/imud"
     place = at.at(folder)
-    if not place.is_dir():
+    if not place.exists():
         yield not_checked(
             f"{folder} does not exist yet, so imud did not measure the storage", "the service creates it at its start"
         )
@@ -62,6 +63,11 @@ def storage(at: Surroundings) -> Findings:
     except PermissionError:
         yield not_checked(
             f"this user cannot write to {folder}, so imud did not measure the storage", "run `sudo imud doctor`"
+        )
+        return
+    except OSError as problem:
+        yield error(
+            f"cannot write to {folder}: {reason_of(problem)}", "set state_dir to a directory that imud can write"
         )
         return
     medium = _medium(at, Path(folder))

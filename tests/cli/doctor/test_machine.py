@@ -23,6 +23,9 @@ def test_clock_and_storage(machine: Machine) -> None:
     (finding,) = storage(at)
     assert finding.severity == "not checked"
     assert "sudo imud doctor" in finding.advice
+    at.sync_s = Mock(side_effect=OSError(30, "Read-only file system"))
+    (finding,) = storage(at)
+    assert (finding.severity, finding.advice) == ("error", "set state_dir to a directory that imud can write")
     for clock, severity in [
         (KernelClock(True, 100_000, 1000), "ok"),
         (KernelClock(True, 100_001, 1000), "note"),
