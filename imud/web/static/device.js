@@ -17,6 +17,7 @@ const HOUR = { points: 600, period_s: 6 };
 const RECENT_S = 599; // the newest part of the history has a point per second
 const HISTORY_OFF = "the history is off";
 const GAP_S = 5; // time without buckets after which the page requests the history
+const OVERLAP_S = 2.5; // time of buckets before this request; the history then ends after the first of them
 
 export class DevicePage {
   constructor(main, name, stream, shell) {
@@ -38,6 +39,8 @@ export class DevicePage {
     this.sections = el("div", { class: "sections" }, parts.map((one) => one.node));
     const head = el("div", { class: "device-head" }, el("div", {}, el("h1", { text: name }), this.about), el("div", { class: "chips" }, this.activity));
     main.append(head, this.condition.node, this.trouble, this.missing, this.sections);
+    this.last_s = -Infinity;
+    this.begun_s = NaN; // start of the buckets that the history must reach
     this.spy();
     this.look();
     this.restore();
@@ -103,10 +106,14 @@ export class DevicePage {
     if (message.kind === "raw") this.live.addRaw(message);
     if (message.kind === "samples" && !message.convention && message.rate_hz === this.live.rate_hz && !this.live.group.isPaused) {
       for (const bucket of message.buckets) {
-        if (bucket.first_s - this.last_s > GAP_S) this.restore(); // this page was hidden or not connected
+        if (bucket.first_s - this.last_s > GAP_S) this.begun_s = bucket.first_s; // this page is new, was hidden or not connected
         this.last_s = bucket.last_s;
         this.live.add(bucket);
         this.time.add(bucket, 1 / message.rate_hz);
+      }
+      if (!this.isRestoring && this.last_s - this.begun_s > OVERLAP_S) {
+        this.begun_s = NaN;
+        this.restore();
       }
     }
   }

@@ -311,7 +311,7 @@ export class RollingPlot {
     const { utc_s, last_s } = buckets.at(-1)[0];
     this.offset_s ??= utc_s - last_s;
     const xOf = (bucket) => (bucket.first_s + bucket.last_s) / 2 + this.offset_s;
-    const [first, last] = [xOf(buckets[0][0]), xOf(buckets.at(-1)[0])];
+    const [first, last] = [buckets[0][0].first_s, last_s].map((one) => one + this.offset_s);
     const [begin, end] = [first, last].map((x, index) => live[0].filter((one) => (index ? one <= x : one < x)).length);
     this.data = live.map((one) => one.slice(0, begin));
     this.losses = this.losses.filter((one) => one < first || one > last);
