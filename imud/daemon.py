@@ -173,8 +173,7 @@ class Daemon:
             outputs=OutputFacts(),
             latencies=self._latencies,
             watch_line=watching(lines, host),
-            raise_event=self.send_event,
-            tick_soon=self.tick_soon,
+            owner=self,
             configuration="" if file is None else str(file.absolute()),
         )
         self._outputs = Outputs(self._context, extra or {})

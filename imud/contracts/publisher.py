@@ -154,7 +154,7 @@ class Publisher(Protocol):
 
     def tick(self, now_ns: int) -> None:
         """Send heartbeats and ledgers and check timeouts. Called twice per second, and ten times per second after
-        calls of `PublisherContext.tick_soon`."""
+        calls of `OutputOwner.tick_soon`."""
         ...
 
     def close(self) -> None:
@@ -292,7 +292,16 @@ class OutputFacts:
         return self.failed | {f"nmea0183 {port.name}": port.problem for port in ports if port.problem}
 
 
-def _do_nothing() -> None: ...
+class OutputOwner(Protocol):
+    """Owner of outputs. `imud.daemon` implements it, and this part may not import `imud.daemon`."""
+
+    def send_event(self, event: Event) -> None:
+        """Send an event of the daemon to all outputs."""
+        ...
+
+    def tick_soon(self) -> None:
+        """Tick the outputs within 0.1 s."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,8 +314,7 @@ class PublisherContext:
     outputs: OutputFacts
     latencies: Latencies  # register of the latencies that readers need
     watch_line: WatchLine  # watches a GPIO line that belongs to no device
-    raise_event: Callable[[Event], None]  # sends an event of the daemon to all outputs
-    tick_soon: Callable[[], None] = _do_nothing  # requests the next tick within 0.1 s
+    owner: OutputOwner
     configuration: str = ""  # absolute path of the configuration file; empty without a file
     past_events: EventLog = field(default_factory=EventLog)
     kept: dict[str, Any] = field(default_factory=dict)  # data that a restarted output continues with, by name

@@ -251,7 +251,7 @@ class MqttPublisher:
         self._report_problems(now_ns, writer, sender)
         if self._commands is not None:
             self._commands.run_next()
-            self._context.tick_soon()  # a request can arrive at any time
+            self._context.owner.tick_soon()  # a request can arrive at any time
         if now_ns - self._state_ns >= STATE_NS:
             self._state_ns = now_ns
             self._send_states(now_ns)
@@ -376,7 +376,7 @@ class MqttPublisher:
 
     def _raise(self, now_ns: int, message: str) -> None:
         log.warning("mqtt: %s", message)
-        self._context.raise_event(Event(now_ns, "", EventKind.MQTT, message))
+        self._context.owner.send_event(Event(now_ns, "", EventKind.MQTT, message))
 
     def _lock_spool(self, directory: Path) -> None:
         """Lock the spool against another daemon. Raises ServerError."""

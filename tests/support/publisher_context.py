@@ -74,6 +74,13 @@ class FakeDevices:
     ledgers: Callable[[], Sequence[DeviceLedger]]
 
 
+@dataclass
+class FakeOwner:
+    send_event: Callable[[Event], None]
+
+    def tick_soon(self) -> None: ...
+
+
 def publisher_context(
     status: Callable[[], Sequence[DeviceStatus]] = list, epoch: int = 1, now_ns: Callable[[], int] = lambda: 0,
     control: Callable[[str], DeviceControl] = _no_device, *, cpu_ns: Callable[[], int] = lambda: 0,
@@ -89,5 +96,5 @@ def publisher_context(
     )  # fmt: skip
     return PublisherContext(
         epoch, PublisherClock(now_ns, utc_offset_ns, utc_reference, cpu_ns), devices, outputs or OutputFacts(),
-        latencies or FakeLatencies(), watch_line, raise_event,
+        latencies or FakeLatencies(), watch_line, FakeOwner(raise_event),
     )  # fmt: skip

@@ -701,4 +701,4 @@ class FlightRecorder:
 
     def _raise(self, now_ns: int, message: str, device: str = "", **detail: str | int) -> None:
         log.warning("%s", message)
-        self._context.raise_event(Event(now_ns, device, EventKind.RECORDER, message, dict(detail)))
+        self._context.owner.send_event(Event(now_ns, device, EventKind.RECORDER, message, dict(detail)))

@@ -176,7 +176,7 @@ class Recorder:
 
     def _raise(self, now_ns: int, message: str) -> None:
         log.warning("%s", message)
-        self._context.raise_event(Event(now_ns, "", EventKind.RECORDER, message))
+        self._context.owner.send_event(Event(now_ns, "", EventKind.RECORDER, message))
 
 
 class RecorderOutput:

@@ -371,7 +371,7 @@ class SocketServer:
             needs_ticks = self._scheduler.tick() or needs_ticks
             self.hub.pool.trim()
         if needs_ticks:
-            self._context.tick_soon()
+            self._context.owner.tick_soon()
         self._quota.tick()
         if now_ns >= self._check_ns and self._listener is not None:
             self._check_ns = now_ns + CHECK_NS
@@ -418,7 +418,7 @@ class SocketServer:
             log.warning("cannot accept a client: %s (%d times since the last report)", error.strerror, count)
         asyncio.get_running_loop().remove_reader(self._listener.sock)
         self._paused = True
-        self._context.tick_soon()
+        self._context.owner.tick_soon()
 
     def _let_in(self, sock: socket.socket) -> None:
         """Greet a new client, or refuse it. Do nothing if it has already left."""
