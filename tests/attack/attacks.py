@@ -16,6 +16,7 @@ from typing import Final
 from tests.attack import rings
 from tests.attack.hostile import KINDS, Deeds
 from tests.attack.stage import CLIENTS, HOSTILE_UIDS, PIPE_BYTES, READ_GID, AttackedDaemon
+from tests.support.daemon_process import LIMIT_S
 
 SHORT = (
     "nested", "empty-lines", "field-orders", "rates", "statuses", "watch-unread", "connects", "event-storm", "scrapes",
@@ -115,6 +116,9 @@ def unread_log(stage: AttackedDaemon, seconds: float) -> Done:
     waiting_bytes = stage.log.waiting_bytes
     stage.log.read_on()
     stage.change()
+    end_s = monotonic() + LIMIT_S
+    while stage.log.spoilt == seen and monotonic() < end_s:
+        sleep(0.01)
     if waiting_bytes < PIPE_BYTES - LINE_BYTES:
         done.problems.append(f"expected a full log, got {waiting_bytes} bytes of {PIPE_BYTES}")
     if stage.log.spoilt == seen:
