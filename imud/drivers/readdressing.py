@@ -29,7 +29,7 @@ class Readdressing:
     noun: str  # noun of a place and its key in `options`
     number: str  # noun of a place after "another" and "the factory"
     words: str  # words before a place in a report
-    lost: str  # error without a reply at the new and the present place; fields {confirmed}, {new} and {present}
+    lost: str  # error if no place has a reply; contains {confirmed}, {new} and {present}
     factory: int  # place after a factory reset
     valid: range  # places that a device can have
     registers: tuple[Hashable, Hashable]  # registers that store the place, and the code of the bit rate

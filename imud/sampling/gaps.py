@@ -165,7 +165,7 @@ class ArrivalPace:
         return self._close(arrival_ns)
 
     def _close(self, arrival_ns: int) -> tuple[int, bool]:
-        """Judge a window, unless frames waited in it: then the next window shows the lost samples."""
+        """Compute the losses of a window. If frames waited in this window, the next window shows its losses."""
         # If all frames were early, none waited for long: the phase or the rate changed.
         if not self.period_ns:
             return self._learn(arrival_ns)

@@ -439,7 +439,7 @@ class _Kind:
         if self.every == 1:
             return True
         since = round((t_ns - self.seen_ns) / period_ns)
-        # after a loss, the time shows the number of periods; if frames arrive together, the number of anchors
+        # After a loss, use the time to count periods. If frames arrive together, use the number of anchors.
         by_count = not is_even and self.anchors - self.leads == self.every
         return by_count or (since > 0 and since % self.every == 0)
 
