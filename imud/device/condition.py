@@ -129,10 +129,6 @@ class Cause(NamedTuple):
     setting: str = ""
     value: Any = None
 
-    @property
-    def code(self) -> ReasonCode:
-        return self.rule.code
-
     def reason(self) -> Reason:
         """Return the reason with its sentences."""
         rule, known = self.rule, (self.facts, self.setting, self.value)
@@ -148,7 +144,8 @@ def causes_of(facts: Facts, limits: ConditionLimits) -> list[Cause]:
     for rule in RULES:
         if found := rule.holds(facts, limits):
             values = {"": None} if isinstance(found, bool) else found
-            causes += [Cause(rule, facts, name, value) for name, value in values.items()]
+            for name, value in values.items():
+                causes.append(Cause(rule, facts, name, value))
     return causes
 
 
@@ -418,7 +415,8 @@ class RecentCounts:
         first, last = self._seconds[0], self._seconds[-1]
         causes = _by_cause(first.lost, last.lost)
         gaps = causes.pop("unknown", 0)
-        known = {name: count for name, count in self._loss.items() if name != "unknown"}
+        known = dict(self._loss)
+        known.pop("unknown", 0)
         return RecentStatus(
             self._begun_ns, self.steady_rate_hz(), last.samples - first.samples, causes, gaps,
             last.bytes_in - first.bytes_in, len(self._restarts), last_sample_ns, self._loss_ns,
@@ -493,33 +491,33 @@ class ConditionWatch:
     def update(self, now_ns: int, causes: Sequence[Cause]) -> None:
         """Take the present causes into account. Raise an event if the condition or its reasons changed."""
         before = self._counted
-        if len(causes) == 1 and causes[0].code in OK and not self._causes:
+        if len(causes) == 1 and causes[0].rule.code in OK and not self._causes:
             self._missing_ns, self._found = None, True
             counted = causes
         else:
             counted = self._now_counted(now_ns, causes) or causes[-1:]
-            counted = sorted(counted, key=lambda cause: _ORDER[condition_of(cause.code)])
-        self._counted, level = counted, condition_of(counted[0].code)
+            counted = sorted(counted, key=lambda cause: _ORDER[condition_of(cause.rule.code)])
+        self._counted, level = counted, condition_of(counted[0].rule.code)
         if level is not self.level:
             self._since_ns, self.level = now_ns, level
         self.remember(now_ns)
         if before and _keys(before) != _keys(counted):
             condition = self.condition
-            codes = ", ".join(dict.fromkeys(cause.code for cause in counted))
+            codes = ", ".join(dict.fromkeys(cause.rule.code for cause in counted))
             self._events.raise_event(now_ns, EventKind.CONDITION, str(condition), condition=str(level), reasons=codes)
 
     def _now_counted(self, now_ns: int, causes: Sequence[Cause]) -> Sequence[Cause]:
         """Return the causes that count now: they lasted long enough, or ended a short time ago."""
-        if missing := [cause for cause in causes if cause.code in MISSING]:
+        if causes[0].rule.code in MISSING:  # then there is no other cause
             self._missing_ns = now_ns if self._missing_ns is None else self._missing_ns
             if self._found and now_ns - self._missing_ns < self._begin_ns:
                 return self._counted
             self._causes.clear()
-            return missing
+            return causes
         self._missing_ns, self._found = None, True
         for cause in causes:
-            if cause.code not in OK:
-                key = cause.code, cause.setting
+            if cause.rule.code not in OK:
+                key = cause.rule.code, cause.setting
                 self._causes[key] = self._causes[key][0] if key in self._causes else now_ns, now_ns, cause
         counted = []
         for key, (first_ns, last_ns, cause) in list(self._causes.items()):
@@ -542,7 +540,7 @@ class ConditionWatch:
 
 def _keys(causes: Sequence[Cause]) -> frozenset[_Key]:
     """Return the keys of the reasons that are not ok."""
-    return frozenset((cause.code, cause.setting) for cause in causes if cause.code not in OK)
+    return frozenset((cause.rule.code, cause.setting) for cause in causes if cause.rule.code not in OK)
 
 
 JUDGE_NS: Final = NS_PER_S - 50 * NS_PER_MS  # minimum interval of the condition, ns: each second tick in a quiet state

@@ -160,7 +160,7 @@ def test_each_sentence(known: device_condition.Facts, condition: str, message: s
 )
 def test_no_reason_within_the_limits(known: device_condition.Facts) -> None:
     causes = device_condition.causes_of(known, contracts_condition.ConditionLimits())
-    assert all(cause.code in contracts_condition.OK for cause in causes)
+    assert all(cause.rule.code in contracts_condition.OK for cause in causes)
 
 
 def test_ports_of_other_links() -> None:
@@ -189,7 +189,7 @@ def test_ports_of_other_links() -> None:
 )
 def test_sentence_without_a_problem(changes: dict[str, Any], message: str) -> None:
     (cause,) = device_condition.causes_of(facts(recent=recent(**changes)), contracts_condition.ConditionLimits())
-    assert (cause.reason().message, cause.code in contracts_condition.OK) == (message, True)
+    assert (cause.reason().message, cause.rule.code in contracts_condition.OK) == (message, True)
 
 
 # --- hysteresis -------------------------------------------------------------------------------------------------------
