@@ -148,8 +148,9 @@ class Publisher(Protocol):
         """Remove a device that was removed from the configuration."""
         ...
 
-    def event(self, event: Event) -> None:
-        """Send an event to readers."""
+    @property
+    def event(self) -> Callable[[Event], None] | None:
+        """Method that sends an event to readers. None: no events."""
         ...
 
     def tick(self, now_ns: int) -> None:

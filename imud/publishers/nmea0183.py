@@ -28,7 +28,6 @@ from imud.formats import nmea0183
 from imud.formats.nmea0183 import Transducer
 from imud.host.network import listen, open_socket
 from imud.model.errors import ServerError, reason_of
-from imud.model.event import Event
 from imud.model.options import Options, is_ip_address, shown
 from imud.model.sample import Sample, Vector3
 from imud.model.units import NS_PER_S
@@ -583,6 +582,8 @@ class Nmea0183:
         self._names.pop(name, None)
         self._choose()
 
+    event: Final = None  # no sentence describes an event
+
     def publish(self, batch: Batch) -> None:
         """Send the due sentences with the values of the newest sample. Ignore the batches of other devices."""
         if batch.device != self._device:
@@ -603,9 +604,6 @@ class Nmea0183:
         if sentences:
             for output in self._outputs:
                 output.put(sentences)
-
-    def event(self, event: Event) -> None:
-        """Do nothing: no sentence describes an event."""
 
     def tick(self, now_ns: int) -> None:
         """Check the ports and read the heading reference."""

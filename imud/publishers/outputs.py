@@ -127,7 +127,8 @@ class Outputs:
     def send_event(self, event: Event) -> None:
         """Pass an event to the outputs."""
         for name, publisher in self._ticked:
-            if self._running.get(name) is publisher:  # the failure of another output can end this output
+            # the failure of another output can end this output
+            if publisher.event is not None and self._running.get(name) is publisher:
                 try:
                     publisher.event(event)
                 except Exception as error:  # noqa: BLE001 - an internal error of one output

@@ -49,7 +49,6 @@ from imud.formats.ring import (
 from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, newest_seq, slot_seqs, slots_in
 from imud.host.files import can_replace, user_name
 from imud.model.errors import ServerError
-from imud.model.event import Event
 from imud.model.options import Options
 from imud.model.units import NS_PER_MS
 
@@ -509,6 +508,8 @@ class ShmPublisher:
         if ring is not None:
             ring.close()
 
+    event: Final = None  # rings contain only samples
+
     def publish(self, batch: Batch) -> None:
         """Write samples over the oldest samples of the ring."""
         ring = self._rings.get(batch.device)
@@ -516,9 +517,6 @@ class ShmPublisher:
             ring.write(batch.packed)
         elif batch.device in self._places:
             self._places[batch.device].newest = batch.seqs[1]
-
-    def event(self, event: Event) -> None:
-        """Do nothing: rings contain only samples."""
 
     def tick(self, now_ns: int) -> None:
         """Write heartbeats. Once per second, create missing or truncated rings again, and write ledgers."""

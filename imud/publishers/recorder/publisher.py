@@ -4,7 +4,7 @@ import logging
 import os
 from pathlib import Path
 
-from imud.contracts.publisher import Batch, Publisher, PublisherContext, PublisherType
+from imud.contracts.publisher import Batch, PublisherContext, PublisherType
 from imud.contracts.status import RecorderStatus
 from imud.host.threads import BusThread, StartWorker
 from imud.model.errors import ServerError, reason_of
@@ -187,7 +187,7 @@ class RecorderOutput:
     ) -> None:
         directory = RecordingDirectory(Path(settings.directory), settings.keep_bytes)
         self._flight = FlightRecorder(settings, context, directory, start_worker) if settings.flight.enabled else None
-        self._parts: list[Publisher] = [self._flight] if self._flight is not None else []
+        self._parts: list[FlightRecorder | Recorder] = [self._flight] if self._flight is not None else []
         if settings.enabled:
             self._parts.append(Recorder(settings, context, directory, start_worker))
 

@@ -32,6 +32,7 @@ def test_both_write_to_one_directory_and_one_alone_does_not_start_the_other(tmp_
         assert (len(outputs.recorders), len(outputs.flights)) == (enabled, 1)
         made.add_device("bow", 7)
         made.tick(bench.advance(0.1))
+        assert made.event is not None
         made.event(Event(1, "bow", EventKind.UP, "up"))
         made.remove_device("bow")
         made.tick(bench.advance(0.1))  # the device exists again, with another description
