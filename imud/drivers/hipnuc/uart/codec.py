@@ -418,8 +418,7 @@ class HipnucCodec:
             sync = data.find(SYNC, at)
             if sync != at:
                 end = sync if sync >= 0 else total - data.endswith(SYNC[:1], at)
-                bad, barred = (max(min(ahead, end) - at, 0) for ahead in (self._bad_ahead, self._barred_ahead))
-                events += self._lines.add(data[at:end], bad, barred)
+                events += self._lines.add(data[at:end], self._bad_ahead - at, self._barred_ahead - at)
                 at = end
                 if sync < 0:
                     break

@@ -154,16 +154,30 @@ class LineFinder:
     def add(self, data: bytes, bad: int, barred: int) -> list[TextLine]:
         """Add bytes outside frames. Return complete lines.
 
-        The first `bad` bytes are inside a damaged frame, the first `barred` bytes inside a complete damaged frame.
+        The first `bad` bytes are inside a damaged frame, the first `barred` bytes inside a complete damaged frame. Both
+        can be negative or more than all bytes.
         """
         lines: list[TextLine] = []
-        start = 0
-        while (feed := data.find(b"\n", start)) >= 0:
-            self._extend(data[start:feed], max(bad - start, 0), max(barred - start, 0))
-            self._end(bad > feed, barred > feed, lines)
+        ledger, start = self._ledger, 0
+        while start < len(data):
+            feed = data.find(b"\n", start)
+            self._extend(data[start : feed if feed >= 0 else None], max(bad - start, 0), max(barred - start, 0))
+            if feed < 0:
+                break
             start = feed + 1
-        if start < len(data):
-            self._extend(data[start:], max(bad - start, 0), max(barred - start, 0))
+            text = self._held.removesuffix(b"\r")
+            if text and not (self._overlong or barred > feed or self._held_barred):
+                lines.append(TextLine(text.decode("ascii")))
+                ledger.bytes_in_good_frames += len(self._held) + 1
+                ledger.frames_good += 1
+                ledger.frames_in_replies += 1
+                self._held, self._held_bad = b"", 0
+                continue
+            self.break_off()
+            if bad > feed:
+                ledger.bytes_in_bad_frames += 1
+            else:
+                ledger.bytes_skipped += 1
         return lines
 
     def break_off(self) -> None:
@@ -191,23 +205,6 @@ class LineFinder:
             self._overlong = True
         if self._overlong:
             self._drop(characters)
-
-    def _end(self, bad: bool, barred: bool, lines: list[TextLine]) -> None:
-        """Finish a line at its LF. `bad`: LF inside a damaged frame, `barred`: inside a complete damaged frame."""
-        ledger = self._ledger
-        text = self._held.removesuffix(b"\r")
-        if text and not (self._overlong or barred or self._held_barred):
-            lines.append(TextLine(text.decode("ascii")))
-            ledger.bytes_in_good_frames += len(self._held) + 1
-            ledger.frames_good += 1
-            ledger.frames_in_replies += 1
-            self._held, self._held_bad = b"", 0
-            return
-        self.break_off()
-        if bad:
-            ledger.bytes_in_bad_frames += 1
-        else:
-            ledger.bytes_skipped += 1
 
     def _drop(self, count: int) -> None:
         """Drop the first `count` held bytes."""

@@ -140,12 +140,18 @@ def report_values(raw: Mapping[str, str]) -> dict[str, Any]:
     for function in PinFunction:
         if found := _PIN.match(raw.get(f"PMUX{function.value}", "")):
             pins[function.name.lower()] = int(found[1])
+    urfr = numbers_of(raw.get("URFR", ""), 9)
+    mounting: str | list[float] | None = urfr
+    for one in Mounting:
+        if urfr is not None and _near(chain(*one.value), urfr):
+            mounting = one.name.lower()
+            break
     calibrates, baud = whole(raw.get("EN_MCAL")), whole(raw.get("BAUD"))
     divisor = _DIVISOR.match(raw.get("SOUT_DIV", ""))
     reported: dict[str, Any] = {
         "output": output or None,
         "mode": MODES.get(whole(raw.get("ATT_MODE"))),
-        "mounting": _mounting_name(numbers_of(raw.get("URFR", ""), 9)),
+        "mounting": mounting,
         "magnetic_calibration": None if calibrates is None else calibrates != 0,
         "pins": pins or None,
         "sout_divisor": int(divisor[1]) if divisor else None,
@@ -194,15 +200,6 @@ def shown(raw: Mapping[str, str]) -> dict[str, str]:
                 found[name] = {True: "on", False: "off"}[value] if isinstance(value, bool) else str(value)
     # a line contains no known setting if the known settings are the same without its text
     return found | {name: text for name, text in raw.items() if report_values({**raw, name: ""}) == known}
-
-
-def _mounting_name(urfr: list[float] | None) -> str | list[float] | None:
-    """Return the name of a mounting by its nine numbers, rows first; the numbers if it has no name."""
-    if urfr is not None:
-        for mounting in Mounting:
-            if _near(chain(*mounting.value), urfr):
-                return mounting.name.lower()
-    return urfr
 
 
 def _near(one: Iterable[float], other: Iterable[float]) -> bool:
