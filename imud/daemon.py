@@ -379,7 +379,7 @@ class Daemon:
         """Tick within TICK_S. A part that needs ten ticks per second calls this method in each tick."""
         if not self._is_soon:
             self._is_soon = True
-            if self._alarm is not None and self._alarm.is_set:
+            if self._alarm is not None and self._alarm.due_s is not None:
                 self._alarm.set(TICK_S)
 
     def on_alarm(self) -> None:

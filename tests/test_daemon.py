@@ -143,7 +143,7 @@ def test_outputs_do_not_read_the_clocks_that_stamp_samples(monkeypatch: pytest.M
 
 @in_loop
 async def test_an_unknown_device_and_ticks_at_two_rates(monkeypatch: pytest.MonkeyPatch) -> None:
-    alarm, daemon = Mock(is_set=True), Daemon(EMPTY)
+    alarm, daemon = Mock(due_s=1.0), Daemon(EMPTY)
     monkeypatch.setattr("imud.daemon.Alarm", lambda _owner: alarm)
     running = asyncio.create_task(daemon.run())
     await asyncio.sleep(0)
@@ -152,7 +152,7 @@ async def test_an_unknown_device_and_ticks_at_two_rates(monkeypatch: pytest.Monk
     daemon.tick_soon()
     daemon.tick_soon()  # the first request is enough
     monkeypatch.setattr("imud.publishers.outputs.Outputs.tick", lambda *_: daemon.tick_soon())
-    alarm.is_set = False  # as during a tick
+    alarm.due_s = None  # as during a tick
     daemon.on_alarm()
     assert [call.args for call in alarm.set.call_args_list] == [(0.5,), (0.1,), (0.1,)]
     daemon.stop()

@@ -217,11 +217,13 @@ class ScriptRunner:
         """Process a text line or a reply frame. Return the outcome if it ends the outstanding request."""
         request = self._request
         ends = request is not None and _ends(request, message)
+        is_alone = ends and not self._messages
         if (
             request is None
             or not (ends or request.is_part(message))
-            or (ends and not self._messages and request.messages_min > 1 and request.is_end(message))  # too short
-            or (ends and not self._messages and self._ends_late(request, message))
+            or (is_alone and request.messages_min > 1 and request.is_end(message))  # too short
+            or (is_alone and self._late_messages > 0)  # the end of a late reply, or of a copy of the newest reply
+            or (is_alone and self._owed and self.is_owed(request) and self._owing(message) is not None)
         ):
             self._count_stray(message, now_ns)
             return None
@@ -229,7 +231,9 @@ class ScriptRunner:
         self._messages.append(message)
         if not ends:
             return None
-        if self._is_copy(request):
+        newest, messages = self._newest
+        if len(messages) > 1 and newest.payload != request.payload and tuple(self._messages) == messages:
+            # the device sent its newest reply again: the lines of a report in the reply to another request
             self._ledger.replies_unsolicited += len(self._messages)
             self._messages.clear()
             return None
@@ -291,17 +295,6 @@ class ScriptRunner:
             if not self._replied:
                 self._slowest_ns = max(self._slowest_ns, now_ns - self._sent_ns)
             self._late_messages = len(self._messages)
-
-    def _ends_late(self, request: Request, message: Message) -> bool:
-        """Return whether `message`, the end of a reply, ends a late reply or a copy of the newest reply."""
-        return self._late_messages > 0 or (
-            bool(self._owed) and self.is_owed(request) and self._owing(message) is not None
-        )
-
-    def _is_copy(self, request: Request) -> bool:
-        """Return whether the device sent its newest reply again: the lines of a report in the reply to another one."""
-        newest, messages = self._newest
-        return len(messages) > 1 and newest.payload != request.payload and tuple(self._messages) == messages
 
     def _owing(self, message: Message) -> _Owed | None:
         """Return the oldest request without a reply that `message` can belong to; None if there is none."""

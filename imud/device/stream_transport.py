@@ -81,7 +81,7 @@ class StreamHold:
     def release(self) -> None:
         """Read and publish the held bytes now. Do nothing without held bytes."""
         self._watch_ns = 0  # publishing can call this method: no new hold follows
-        if self._alarm.is_set:
+        if self._alarm.due_s is not None:
             self._alarm.cancel()
             self.on_alarm()
 
@@ -139,7 +139,8 @@ class StreamTransport(ReceivingTransport):
         self._ledger = context.ledger
         self._discard = _Discard(context.ledger)
         self._receiver: DataReceiver = self._discard
-        self._hold: StreamHold | None = None  # holds the samples; None if the path receives each read on arrival
+        # holds the samples; `_discard` if the path receives each read on arrival
+        self._hold: StreamHold | _Discard = self._discard
         self._fixed_baud = 0 if link.auto_baud else link.baud
         self._samples_before = 0  # number of samples before the link was opened
         self._started = False  # whether a script has started the output of a device that replied and sent no samples
@@ -155,7 +156,7 @@ class StreamTransport(ReceivingTransport):
 
     def stop(self) -> None:
         self._search.stop()
-        self._release()
+        self._hold.release()
         self.link.close()
         self._receiver = self._discard
 
@@ -169,7 +170,7 @@ class StreamTransport(ReceivingTransport):
             assert isinstance(driver, StreamDriver)
             self._begin(StreamFound(driver, link.baud))
             return None
-        self._release()
+        self._hold.release()
         last = self._remembered.get(config.name)
         searching = StreamRound(config, link, self._ledger, last, self._host)
         self._receiver = searching
@@ -299,7 +300,7 @@ class StreamTransport(ReceivingTransport):
 
     def on_busy(self, busy: bool) -> None:
         """Release held samples when a script starts or ends: the reply must not wait."""
-        self._release()
+        self._hold.release()
 
     async def run_script(self, make: Callable[..., Any], *arguments: Any) -> Any:
         """Run a request script. Follow the device if the script changes the baud rate."""
@@ -320,21 +321,17 @@ class StreamTransport(ReceivingTransport):
 
     @property
     def hold_ns(self) -> int:
-        return self._hold.hold_ns if self._hold is not None else 0
+        return self._hold.hold_ns
 
     def _receive(self) -> None:
         """Pass the bytes to the path, on arrival or after a hold."""
         path, latency_ns = self.path, self._latency_ns
         assert path is not None
-        self._release()
-        self._receiver, self._hold = path, None
+        self._hold.release()
+        self._receiver, self._hold = path, self._discard
         if latency_ns:
             self._receiver = self._hold = StreamHold(self.link, path, self.scripts, self._host)
             self._hold.latency_ns = latency_ns
-
-    def _release(self) -> None:
-        if self._hold is not None:
-            self._hold.release()
 
     def _on_data(self, data: bytes, t_rx_ns: int) -> None:
         self._receiver.on_data(data, t_rx_ns)
@@ -420,7 +417,7 @@ class StreamTransport(ReceivingTransport):
 
     @property
     def receiving(self) -> bool:
-        return self._receiver is self.path or self._receiver is self._hold
+        return isinstance(self._receiver, StreamPath | StreamHold)
 
     @property
     def hears_replies(self) -> bool:
@@ -433,7 +430,9 @@ class StreamTransport(ReceivingTransport):
 
 
 class _Discard:
-    """Receiver that only counts bytes, while no search and no path use the port."""
+    """Receiver that only counts bytes, while no search and no path use the port. It holds no samples."""
+
+    hold_ns = 0
 
     def __init__(self, ledger: Ledger) -> None:
         self._ledger = ledger
@@ -441,3 +440,6 @@ class _Discard:
     def on_data(self, data: bytes, _t_rx_ns: int) -> None:
         self._ledger.bytes_in += len(data)
         self._ledger.bytes_skipped += len(data)
+
+    def release(self) -> None:
+        """Do nothing."""

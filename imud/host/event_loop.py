@@ -65,14 +65,10 @@ class Alarm:
 
     def __init__(self, owner: AlarmOwner) -> None:
         """Call `owner.on_alarm` in the running loop each time that the alarm is due. The alarm is not set."""
-        self.due_s = inf  # time of the loop's clock; inf if the alarm is not set
+        self.due_s: float | None = None  # time of the loop's clock; None if the alarm is not set
         self._owner = owner
         self._loop = asyncio.get_running_loop()
         self._handle: asyncio.TimerHandle | None = None  # timer of a loop that has no alarms
-
-    @property
-    def is_set(self) -> bool:
-        return self.due_s != inf
 
     def set(self, delay_s: float) -> None:
         """Call the owner once after `delay_s`, in place of an earlier `set`."""
@@ -87,13 +83,13 @@ class Alarm:
 
     def cancel(self) -> None:
         """Do not call the owner. Do nothing if the alarm is not set."""
-        self.due_s = inf
+        self.due_s = None
         if self._handle is not None:
             self._handle.cancel()
 
     def ring(self) -> None:
         """Call the owner. Only the event loop calls this method."""
-        self.due_s = inf
+        self.due_s = None
         self._owner.on_alarm()
 
 
