@@ -68,7 +68,7 @@ def got(value: object) -> str:
 def shown(value: object) -> str:
     """Return `value` as one line of YAML with printable characters only."""
     text = msgspec.json.encode(value).decode()
-    return "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text)
+    return text if text.isprintable() else "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text)
 
 
 def json_or_text(text: str) -> Any:
