@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cache
-from operator import eq
+from operator import attrgetter, eq
 from typing import Any, cast
 
 import msgspec
@@ -59,20 +59,14 @@ class DeviceReport:
 Reports = Mapping[str, DeviceReport]  # reports of a device by name, without reports that the device does not send
 
 
-def words_of(reports: Reports) -> dict[str, str]:
-    """Return the text of all settings in the reports, by the names that the device uses."""
+def combined(reports: Reports) -> DeviceReport:
+    """Return the settings of all reports as one report."""
     words: dict[str, str] = {}
-    for report in reports.values():
-        words |= report.words
-    return words
-
-
-def values_of(reports: Reports) -> dict[str, Any]:
-    """Return the values of all settings in the reports."""
     values: dict[str, Any] = {}
     for report in reports.values():
+        words |= report.words
         values |= report.values
-    return values
+    return DeviceReport(words, values)
 
 
 def nothing_wrong(_target: Target, _values: Mapping[str, Any]) -> None:
@@ -327,7 +321,7 @@ class AppliedSettings(msgspec.Struct, frozen=True):
     def ends(self) -> list[str]:
         """Results of the save and the restart. A value that the device reports after a restart verifies a save, because
         imud cannot read the flash."""
-        outcomes = [step.outcome for step in self.steps]
+        outcomes = set(map(attrgetter("outcome"), self.steps))
         is_verified = StepOutcome.VERIFIED in outcomes and StepOutcome.NOT_APPLIED not in outcomes
         save = "saved to flash"
         if not (self.restarted and is_verified):

@@ -126,29 +126,20 @@ class FlashValues:
     """
 
     def __init__(self) -> None:
+        self.follows = False  # whether the next read values are equal to the flash
         self._values: Mapping[str, Any] | None = None
-        self._follow = False  # whether the next read values are equal to the flash
 
     def found(self) -> None:
         """Note that imud found a device. It can have unsaved changes of another program."""
-        self._values, self._follow = None, False
+        self._values, self.follows = None, False
 
     def started(self) -> None:
         """Note that the device started and now has the values of its flash, or that it saved unknown values."""
-        self._values, self._follow = None, True
-
-    def wrote(self) -> None:
-        """Note a write that may be missing in flash."""
-        self._follow = False
-
-    def read(self, values: Mapping[str, Any]) -> None:
-        """Take the values that the device reports into account."""
-        if self._follow:
-            self.saved(values)
+        self._values, self.follows = None, True
 
     def saved(self, values: Mapping[str, Any]) -> None:
         """Note that the device saved these values."""
-        self._values, self._follow = dict(values), False
+        self._values, self.follows = dict(values), False
 
     def state(self, name: str, actual: object) -> tuple[SavedState, object]:
         """Compare a present value with the flash. Return the state and the value in flash; None if it is unknown."""

@@ -31,9 +31,8 @@ from imud.contracts.setting import (
     SettingsStatus,
     SettingsTable,
     StepOutcome,
+    combined,
     declared_values,
-    values_of,
-    words_of,
 )
 from imud.contracts.status import WorkStatus
 from imud.device.flash import FlashValues, ModuleFlash, SettingsFiles, backup_text
@@ -49,8 +48,6 @@ from imud.device.settings_plan import (
     described_settings,
     differences,
     make_plan,
-    unverified,
-    valid_values,
     wanted_values,
     words,
 )
@@ -253,6 +250,8 @@ class DeviceSettings:
     ) -> None:  # fmt: skip
         """All devices share `files`."""
         self.identity = Identity()
+        # key of the device in the counts of flash writes: its serial number; without one the name of the device
+        self.module = f"device {config.name}"
         self.shown: Mapping[str, str] = {}  # settings with readable names and values
         self.answered = False  # whether the device replied to all requests of the newest query; set by the transport
         self._config = config
@@ -335,6 +334,8 @@ class DeviceSettings:
         """Store a new identity. Raise an event if another device has replied."""
         before = self.identity
         self.identity = identity = completed_identity(printable_identity(identity), before)
+        number = identity.serial_number
+        self.module = f"{self._driver_name} {number}" if number else f"device {self._config.name}"
         if before.serial_number and identity.serial_number != before.serial_number:
             message = f"another device: serial number {identity.serial_number}, was {before.serial_number}"
             self.raise_event(message, serial_number=identity.serial_number)
@@ -344,11 +345,12 @@ class DeviceSettings:
 
         `own`: a command of imud has just run, so the change is expected.
         """
-        driver, known = self._transport.driver, self.shown
-        self._reports, self.values, self.is_current = reports, values_of(reports), True
+        driver, known, report = self._transport.driver, self.shown, combined(reports)
+        self._reports, self.values, self.is_current = reports, report.values, True
         self._read_ns = now_ns = self._host.now_ns()
-        self._in_flash.read(self.values)
-        text = printable_words(words_of(reports))
+        if self._in_flash.follows:
+            self._in_flash.saved(self.values)
+        text = printable_words(report.words)
         self.shown = printable_words(driver.shown_settings(text)) if driver is not None else text
         changed, texts = {}, []
         for name, value in self.shown.items():
@@ -412,16 +414,19 @@ class DeviceSettings:
         found = self.differences()
         state = SettingsState.DIFFER if found else SettingsState.AGREE
         state = state if self.is_current else SettingsState.UNKNOWN
+        not_reported = self.declared.keys() - self.values.keys()
+        is_known = self._unsaved and self.is_current and self._saved is not None
+        before, now = as_json(self._saved or {}), as_json(self.values if is_known else {})
         return SettingsStatus(
             state if self.declared else SettingsState.UNDECLARED,
             self._config.on_difference,
             self.comparison.problem,
             found,
-            unverified(table, self.declared, self.values) if self.is_current else (),
+            tuple(filter(not_reported.__contains__, table.table)) if self.is_current else (),
             self._read_ns, self.comparison.repairs,
             self._files.flash.record(self.module).writes, self._files.flash.writes_day(self.module),
             self._unsaved and table.save is not None,
-            lost_values(self._saved, self.values if self._unsaved and self.is_current else {}),
+            {name: one for name, one in now.items() if before.get(name) != one},
         )  # fmt: skip
 
     async def report(self, *, fresh: bool) -> SettingsReport:
@@ -497,7 +502,7 @@ class DeviceSettings:
         """Note that the flash does not contain the present settings. `before`: the values before the write."""
         if not self._unsaved:
             self._unsaved, self._saved, self._resets = True, before, self.counter_resets
-        self._in_flash.wrote()
+        self._in_flash.follows = False
 
     def spend_flash(self) -> None:
         """Count a write to flash before a command makes it. Raises CommandError if the limit is reached."""
@@ -575,7 +580,11 @@ class DeviceSettings:
 
     def _all_written(self, table: SettingsTable) -> dict[str, Any]:
         """Return the written values of settings that the device does not report: saved, or since its restart."""
-        return valid_values(table, self._files.flash.record(self.module).unreadable) | self._written
+        found: dict[str, Any] = {}
+        for name, value in self._files.flash.record(self.module).unreadable.items():
+            with suppress(BadArgument):  # another version of imud saved the value
+                found |= wanted_values(table, {name: value})
+        return found | self._written
 
     # --- events -------------------------------------------------------------------------------------------------------
 
@@ -598,12 +607,6 @@ class DeviceSettings:
     def _driver_name(self) -> str:
         driver = self._transport.driver
         return driver.name if driver is not None else self._config.driver
-
-    @property
-    def module(self) -> str:
-        """Key of the device in the counts of flash writes: serial number; without one the name of the device."""
-        serial_number = self.identity.serial_number
-        return f"{self._driver_name} {serial_number}" if serial_number else f"device {self._config.name}"
 
     def differences(self) -> dict[str, SettingDifference]:
         """Return the differences of the present settings from the declared settings."""
@@ -632,12 +635,6 @@ def _wanted(device: str, table: SettingsTable, given: Mapping[str, Any] | None, 
     if not declared:
         raise BadArgument(f"{device}: expected values, or `settings` in the configuration, got neither")
     return declared
-
-
-def lost_values(saved: Values | None, present: Values) -> dict[str, Any]:
-    """Return the present values that differ from the values in flash; empty if those are unknown."""
-    values = {name: as_json(one) for name, one in present.items()} if saved is not None else {}
-    return {name: one for name, one in values.items() if as_json((saved or {}).get(name)) != one}
 
 
 def _summary(applied: AppliedSettings) -> str:

@@ -8,7 +8,6 @@ imud leaves out the settings that need a restart, because the restart loses unsa
 import re
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import attrgetter
@@ -26,17 +25,16 @@ from imud.contracts.setting import (
     Effect,
     PlannedStep,
     Reports,
-    Setting,
     SettingDifference,
     SettingInfo,
     SettingsPlan,
     SettingsTable,
     StepOutcome,
     Written,
+    combined,
     group_of,
     schemas_of,
     title_of,
-    values_of,
 )
 from imud.device.attachments import Attachments
 from imud.device.evidence import SampleSource, SampleWatch
@@ -68,11 +66,6 @@ def differences(
         for name, setting in table.table.items()
         if name in wanted and setting.readable and not has(table, name, wanted, actual, unreadable)
     }
-
-
-def unverified(table: SettingsTable, wanted: Values, actual: Values) -> tuple[str, ...]:
-    """Return the wanted settings that the device does not report, in the order of the table."""
-    return tuple(name for name in table.table if name in wanted and name not in actual)
 
 
 def words(found: Mapping[str, SettingDifference]) -> str:
@@ -173,15 +166,6 @@ def _part_type(name: str, value_type: Any, path: Sequence[str]) -> Any:
             raise BadArgument(unknown_name(f"a part of {name}", key, list(types)))
         name, value_type = f"{name}.{key}", types[key]
     return value_type
-
-
-def valid_values(table: SettingsTable, saved: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the saved values in the types of the table, without values of another version of imud."""
-    found: dict[str, Any] = {}
-    for name, value in saved.items():
-        with suppress(BadArgument):
-            found |= wanted_values(table, {name: value})
-    return found
 
 
 def described_settings(
@@ -304,18 +288,21 @@ def make_plan(
     rate = ""
     for name, setting in table.table.items():
         if name in wanted and not has(table, name, wanted, actual, unreadable):
-            if why := _why_left_out(table, setting, save):
-                left_out[name] = why
+            needs_save = setting.saves or setting.effect is Effect.AFTER_RESTART
+            if needs_save and not save:
+                left_out[name] = SAVES_ITSELF if setting.saves else NEEDS_SAVE
+            elif needs_save and not setting.saves and table.save is None:
+                left_out[name] = CANNOT_SAVE
             else:
                 written[name] = wanted[name]
         if setting.bus_rate and (name in actual or name in written):
             rate = name
-    values = merged(actual, written)
+    new_rate: Any = written.get(rate, actual.get(rate))
     is_moved = by_name and rate in written  # the user moves the whole bus to another rate
     if written:
-        _require_agreement(table, replace(target, baud=values[rate]) if is_moved else target, actual, values)
+        _require_agreement(table, replace(target, baud=new_rate) if is_moved else target, actual, written)
     # at another rate than the bus, a device is lost after its restart and disturbs the bus
-    is_other_rate = bool(rate) and values[rate] != target.baud and (is_moved or target.baud != 0)
+    is_other_rate = bool(rate) and new_rate != target.baud and (is_moved or target.baud != 0)
     steps, notes = [], []
     for name in written:
         setting, before = table.table[name], as_json(actual.get(name))
@@ -336,11 +323,17 @@ def make_plan(
     )
 
 
-def _require_agreement(table: SettingsTable, target: Target, actual: Values, values: Values) -> None:
-    """Raise BadArgument if the new values contradict each other.
+def _require_agreement(table: SettingsTable, target: Target, actual: Values, written: Values) -> None:
+    """Raise BadArgument if the values after the change contradict each other.
 
-    imud accepts a contradiction that the device already has, because the user changes another setting.
+    In a setting with several keys, `written` replaces only its own keys. imud accepts a contradiction that the device
+    already has, because the user changes another setting.
     """
+    values = dict(actual)
+    for name, value in written.items():
+        present = values.get(name)
+        both = isinstance(value, Mapping) and isinstance(present, Mapping)
+        values[name] = {**present, **value} if both else value  # type: ignore[dict-item]  # both are mappings
     try:
         table.check(target, values)
     except BadArgument as error:
@@ -350,26 +343,6 @@ def _require_agreement(table: SettingsTable, target: Target, actual: Values, val
             if str(before) == str(error):
                 return
         raise
-
-
-def merged(actual: Values, wanted: Values) -> dict[str, Any]:
-    """Return all values after the change. In a setting with several keys, `wanted` replaces only its own keys."""
-    values = dict(actual)
-    for name, value in wanted.items():
-        present = values.get(name)
-        both = isinstance(value, Mapping) and isinstance(present, Mapping)
-        values[name] = {**present, **value} if both else value  # type: ignore[dict-item]  # both are mappings
-    return values
-
-
-def _why_left_out(table: SettingsTable, setting: Setting, save: bool) -> str:
-    if setting.saves:
-        return "" if save else SAVES_ITSELF
-    if setting.effect is Effect.AT_ONCE:
-        return ""
-    if not save:
-        return NEEDS_SAVE
-    return "" if table.save is not None else CANNOT_SAVE
 
 
 DEVICE_ERRORS: Final = (CommandError, DeviceRefused, LinkError, TransferError)
@@ -453,7 +426,7 @@ class Applying:
         needs_restart = bool(self.pending) and self.saved and not is_planned
         if not self.problem and (plan.restart or (needs_restart and self.table.restart is not None)):
             done = await self._restart(done)
-        found = differences(self.table, self.wanted, values_of(self.reports) if self.heard else {}, self.written)
+        found = differences(self.table, self.wanted, combined(self.reports).values if self.heard else {}, self.written)
         problem = self.problem and self.problem + self._present()
         return AppliedSettings(tuple(done), self.saved, self.restarted, problem, plan.left_out, found)
 
@@ -498,7 +471,7 @@ class Applying:
 
         `why_unread`: reason why imud could not read the report; empty if imud read it.
         """
-        name, setting, actual = step.name, self.table.table[step.name], values_of(self.reports)
+        name, setting, actual = step.name, self.table.table[step.name], combined(self.reports).values
         is_read = setting.readable and not why_unread and name in actual
         agrees = is_read and setting.agrees(self.wanted[name], actual[name])
         has_failed = error is not None and not agrees  # it has not failed if only the reply was lost

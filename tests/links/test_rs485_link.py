@@ -26,7 +26,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 from imud.contracts.codec import Vanished
 from imud.contracts.script import Transfer, run_transfer_script
-from imud.contracts.setting import words_of
+from imud.contracts.setting import combined
 from imud.contracts.status import KernelCounters, SerialLineCounters
 from imud.drivers.hipnuc.common import AttitudeMode
 from imud.drivers.hipnuc.modbus.codec import READ_BLOCK, READ_SHORT_BLOCK, HipnucModbusCodec, HipnucModbusOptions
@@ -498,7 +498,7 @@ def test_pymodbus_server_as_modules_under_our_driver() -> None:
             identity = run_transfer_script(DRIVER.probe(settings), link.transfer)
             assert (identity.product, identity.firmware) == ("HI14R2N-485-000", firmware)
             assert identity.serial_number == serial_of(address).hex().upper()
-            found = words_of(run_transfer_script(DRIVER.set_up(settings), link.transfer))
+            found = combined(run_transfer_script(DRIVER.set_up(settings), link.transfer)).words
             assert found == {"baud": "921600", "id": str(address), "heading_mode": "six axes"}
             codec = HipnucModbusCodec(Ledger(), settings)
             if address == 1:
@@ -512,7 +512,8 @@ def test_pymodbus_server_as_modules_under_our_driver() -> None:
             assert codec.decode(1, link.transfer(codec.polls[1].transfer)) == ()
             run_transfer_script(set_heading_mode(AttitudeMode.NINE_AXIS), link.transfer)
             run_transfer_script(set_mounting(LineMounting.Y_UP), link.transfer)
-            assert words_of(run_transfer_script(DRIVER.set_up(settings), link.transfer))["heading_mode"] == "nine axes"
+            words = combined(run_transfer_script(DRIVER.set_up(settings), link.transfer)).words
+            assert words["heading_mode"] == "nine axes"
             assert link.heard.strange == link.heard.late == link.heard.timeouts == 0
 
 

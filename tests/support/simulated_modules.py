@@ -16,7 +16,7 @@ from imud.contracts.codec import CanCodec, CodecEvent, StreamCodec, message_of
 from imud.contracts.command import Target
 from imud.contracts.driver import CanDriver
 from imud.contracts.script import Outcome, Reply, ReplyFrame, Request, RequestScript, Transfer
-from imud.contracts.setting import Written, values_of
+from imud.contracts.setting import Written, combined
 from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.drivers.hipnuc.canopen.driver import DRIVER as CANOPEN_DRIVER
 from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
@@ -263,7 +263,7 @@ class CanBench:
 
     def present(self) -> dict[str, Any]:
         assert self.driver.device_settings is not None
-        return values_of(self.run_script(self.driver.device_settings.read(self.target(), None)))
+        return dict(combined(self.run_script(self.driver.device_settings.read(self.target(), None))).values)
 
     def set_for_good(self, name: str, value: object) -> Written:
         """Write a setting like the driver, save it and restart the device."""

@@ -11,7 +11,7 @@ from imud.contracts.codec import BadFrame, BadReason, Vanished
 from imud.contracts.command import Target
 from imud.contracts.driver import PolledDriver
 from imud.contracts.script import Transfer, run_transfer_script
-from imud.contracts.setting import values_of, words_of
+from imud.contracts.setting import combined
 from imud.drivers.imu61x import common
 from imud.drivers.imu61x.i2c import DRIVER as I2C
 from imud.drivers.imu61x.i2c import Imu61xI2cCodec, probe, set_up
@@ -108,7 +108,7 @@ def test_filters_that_there_are_not_are_answered_with_the_table() -> None:
 
 def read_table(wires: Wires, driver: PolledDriver, target: Target) -> Mapping[str, object]:
     assert driver.device_settings is not None
-    return values_of(run_transfer_script(driver.device_settings.read(target, None), wires.over(driver)))
+    return combined(run_transfer_script(driver.device_settings.read(target, None), wires.over(driver))).values
 
 
 @pytest.mark.parametrize("driver", [I2C, SPI])
@@ -191,7 +191,7 @@ def test_set_up_writes_reads_back_and_leaves_alone_and_probe_names_every_product
         log.append(one)
         return over_i2c(device, one)
 
-    words = words_of(run_transfer_script(set_up(RegisterOptions(accel_filter=4)), transfer))
+    words = combined(run_transfer_script(set_up(RegisterOptions(accel_filter=4)), transfer)).words
     assert words == {"accel_filter": "10 Hz", "gyro_filter": "47 Hz"}
     assert [(one.sends[0].hex(), one.read_bytes) for one in log] == [("06", 1), ("064b", 0), ("06", 1)]
     log.clear()

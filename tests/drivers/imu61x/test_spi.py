@@ -9,7 +9,7 @@ import pytest
 
 from imud.contracts.codec import BadFrame, BadReason, PolledEvent, Vanished
 from imud.contracts.script import Transfer, run_transfer_script
-from imud.contracts.setting import words_of
+from imud.contracts.setting import combined
 from imud.drivers.imu61x import spi
 from imud.drivers.imu61x.registers import temperature_c
 from imud.drivers.imu61x.spi import READ_STATE, BurstKind, SpiDeviceOptions, burst_problem, probe, set_up
@@ -248,11 +248,11 @@ def test_probe_and_set_up() -> None:
     assert len(wire.sent) == 1
 
     wire = Wire()
-    words = words_of(run_transfer_script(set_up(SpiDeviceOptions()), wire.transfer))
+    words = combined(run_transfer_script(set_up(SpiDeviceOptions()), wire.transfer)).words
     assert words == {"accel_filter": "47 Hz", "gyro_filter": "47 Hz", "burst": "standard"}
     assert len(wire.sent) == 2  # the state and a burst
     settings = SpiDeviceOptions(accel_filter=4, gyro_filter=4, burst="extended")
-    words = words_of(run_transfer_script(set_up(settings), wire.transfer))
+    words = combined(run_transfer_script(set_up(settings), wire.transfer)).words
     assert words == {"accel_filter": "10 Hz", "gyro_filter": "10 Hz", "burst": "extended"}
     assert wire.sent[3] == "fe01 8644 fe00 7e00 7e00"  # 10 Hz in the manual's example: 0x8644
     assert wire.sent[5] == "fe01 8d01 fe00 7e00 7e00"
@@ -267,7 +267,7 @@ def test_probe_and_set_up() -> None:
         wire.device.faults.flips = next(flips)
         return wire.transfer(one)
 
-    assert words_of(run_transfer_script(set_up(SpiDeviceOptions()), transfer))["burst"] == "standard"
+    assert combined(run_transfer_script(set_up(SpiDeviceOptions()), transfer)).words["burst"] == "standard"
     assert wire.device.extended == 0
 
 
@@ -307,7 +307,7 @@ def test_kind_of_burst_wherever_it_reads_back(
 ) -> None:
     wire = Wire(behaviour=REGISTER_VARIANTS[variant])
     wire.device.extended = before
-    words = words_of(run_transfer_script(set_up(SpiDeviceOptions(burst=burst)), wire.transfer))
+    words = combined(run_transfer_script(set_up(SpiDeviceOptions(burst=burst)), wire.transfer)).words
     if burst != "registers":
         assert words["burst"] == burst
         assert wire.device.extended == (burst == "extended")

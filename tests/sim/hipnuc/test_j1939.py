@@ -10,7 +10,7 @@ import pytest
 
 from imud.contracts.command import Target
 from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request, RequestScript, Silence
-from imud.contracts.setting import words_of
+from imud.contracts.setting import combined
 from imud.drivers.hipnuc.j1939 import codec, commands
 from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Options, J1939Node
 from imud.drivers.hipnuc.j1939.driver import SETTINGS
@@ -106,7 +106,7 @@ def test_what_is_set_read_back_saved_and_lost_at_a_restart() -> None:
     assert counts[0xFF37] == pytest.approx(50, abs=1)
     assert counts[0xFF4A] == 2
     reports: Any = bench.talk(lambda peer: SETTINGS.read(Target(HipnucJ1939Options(), 0), None))
-    settings = words_of(reports)
+    settings = combined(reports).words
     assert (settings["interval_ms_FF37"], settings["address"], settings["bitrate"]) == ("20", "8", "500000")
 
     bench = J1939Host(made(boot_ms=200))

@@ -6,7 +6,7 @@ import pytest
 
 from imud.contracts.command import Target
 from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request, RequestScript, Silence
-from imud.contracts.setting import Written, words_of
+from imud.contracts.setting import Written, combined
 from imud.drivers.hipnuc.canopen import cia301
 from imud.drivers.hipnuc.canopen import commands as moves
 from imud.drivers.hipnuc.canopen import commands as session
@@ -72,7 +72,8 @@ def test_identify_and_read_settings() -> None:
     with pytest.raises(NoReply, match="node 9"):
         CanopenBench().run_script(session.identify(9))
 
-    settings = words_of(CanopenBench(NodeSettings()).run_script(SETTINGS.read(Target(HipnucCanopenOptions(), 0), None)))
+    target = Target(HipnucCanopenOptions(), 0)
+    settings = combined(CanopenBench(NodeSettings()).run_script(SETTINGS.read(target, None))).words
     assert (settings["1800.2"], settings["1804.5"], settings["1805.5"]) == ("255", "50", "10")
     assert (settings["20A0.0"], settings["209A.0"]) == ("8", "2")
     assert len(settings) == 17

@@ -16,7 +16,7 @@ from canopen.objectdictionary import ODRecord, ODVariable, datatypes
 from imud.contracts.codec import CodecEvent, message_of
 from imud.contracts.command import Target
 from imud.contracts.script import Outcome, Reply, ReplyFrame, Request
-from imud.contracts.setting import words_of
+from imud.contracts.setting import combined
 from imud.drivers.hipnuc.canopen import cia301
 from imud.drivers.hipnuc.canopen import commands as session
 from imud.drivers.hipnuc.canopen.cia301 import NmtCommand
@@ -245,7 +245,7 @@ def test_our_conversations_with_their_node(local: canopen.LocalNode, host: Host)
     run_script(session.set_bit_rate(NODE, 250_000), host.ask)
     assert local.get_data(0x209A, 0) == b"\x03\0\0\0"
     run_script(session.save(NODE), host.ask)
-    settings = words_of(run_script(SETTINGS.read(Target(HipnucCanopenOptions(node=NODE), 0), None), host.ask))
+    settings = combined(run_script(SETTINGS.read(Target(HipnucCanopenOptions(node=NODE), 0), None), host.ask)).words
     assert (settings["1804.5"], settings["1801.2"], settings["209A.0"]) == ("50", "1", "3")
     assert "20A0.0" not in settings  # never written there: no data available
 

@@ -7,7 +7,7 @@ import pytest
 
 from imud.contracts.command import Target
 from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request, RequestScript, Silence
-from imud.contracts.setting import Written, words_of
+from imud.contracts.setting import Written, combined
 from imud.drivers.hipnuc.j1939 import commands as session
 from imud.drivers.hipnuc.j1939.codec import HOST_ADDRESS, HipnucJ1939Options, J1939Node
 from imud.drivers.hipnuc.j1939.commands import X_SIGN, Y_SIGN, Zero
@@ -215,7 +215,7 @@ def test_all_that_can_be_read() -> None:
         SETTINGS.read(Target(HipnucJ1939Options(), 0), None),
         *(None if text is None else bytes.fromhex(text) for text in replies),
     )
-    assert words_of(reports) == {
+    assert combined(reports).words == {
         "address": "8", "bitrate": "500000", "x_reversed": "1", "y_reversed": "0", "interval_ms_FF34": "100",
         "interval_ms_FF37": "10", "interval_ms_FF3D": "100", "interval_ms_FF41": "100",
     }  # fmt: skip

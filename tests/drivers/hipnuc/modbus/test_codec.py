@@ -8,7 +8,7 @@ import pytest
 
 from imud.contracts.codec import BadFrame, BadReason, Vanished
 from imud.contracts.script import Transfer, run_transfer_script
-from imud.contracts.setting import words_of
+from imud.contracts.setting import combined
 from imud.drivers.hipnuc.common import QUAT_PER_LSB
 from imud.drivers.hipnuc.modbus import codec as modbus
 from imud.drivers.hipnuc.modbus.codec import READ_BLOCK, HipnucModbusCodec, HipnucModbusOptions
@@ -245,6 +245,6 @@ def test_identity_is_watched_and_settings_are_read() -> None:
         asked.append(transfer)
         return framed(7, registers_reply(bytes.fromhex("0008 0007 0001")))
 
-    found = words_of(run_transfer_script(read_settings(), answer))
+    found = combined(run_transfer_script(read_settings(), answer)).words
     assert found == {"baud": "921600", "id": "7", "heading_mode": "nine axes"}
     assert [transfer.sends[0][0] for transfer in asked] == [3]

@@ -10,7 +10,7 @@ import pytest
 
 from imud.contracts.command import Target, Verdict, parameters_of
 from imud.contracts.script import Transfer, TransferScript, run_transfer_script
-from imud.contracts.setting import Effect, Written, values_of
+from imud.contracts.setting import Effect, Written, combined
 from imud.drivers.hipnuc.common import AttitudeMode, LevelReset
 from imud.drivers.hipnuc.modbus import commands, registers
 from imud.drivers.hipnuc.modbus.codec import HipnucModbusOptions
@@ -297,7 +297,7 @@ def write(bench: ModbusBench, name: str, value: object) -> object:
 
 
 def present(bench: ModbusBench) -> dict[str, Any]:
-    return values_of(bench.run(SETTINGS.read(bench.target, None)))
+    return dict(combined(bench.run(SETTINGS.read(bench.target, None))).values)
 
 
 def test_the_table_has_effects_and_types() -> None:

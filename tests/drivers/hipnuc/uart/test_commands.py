@@ -9,7 +9,7 @@ import pytest
 
 from imud.contracts.command import Calibration, Kept, RestMeans, Target, Verdict
 from imud.contracts.script import Outcome, Rejection, Reply, Request, RequestScript, Silence
-from imud.contracts.setting import words_of
+from imud.contracts.setting import combined
 from imud.drivers.hipnuc.common import AttitudeMode, LevelReset
 from imud.drivers.hipnuc.uart import commands as c
 from imud.drivers.hipnuc.uart import replies as r
@@ -156,13 +156,13 @@ def test_identity_refusal_and_flat_settings() -> None:
     with pytest.raises(Rejected, match="ERR 3"):
         hold(identify(), lambda _: Rejection(("ERR 3",)))
 
-    assert words_of(hold(SETTINGS.read(Target(None, 0), None), lambda name: Reply(REPLIES[name]))) == {
+    assert combined(hold(SETTINGS.read(Target(None, 0), None), lambda name: Reply(REPLIES[name]))).words == {
         "ATT_MODE": "0", "BAUD": "115200", "COMCONFIG 1": "LOG HI91 ONTIME 0.01", "MB": "14.14, -2.08, -8.75",
     }  # fmt: skip
     without = hold(
         SETTINGS.read(Target(None, 0), None), lambda n: Silence(()) if n == "LOG MAGCONFIG" else Reply(REPLIES[n])
     )
-    settings = words_of(without)
+    settings = combined(without).words
     assert "ATT_MODE" in settings
     assert "MB" not in settings
     for silent in ("LOG USRCONFIG", "LOG COMCONFIG"):

@@ -11,7 +11,7 @@ from imud.config.schema import TABLES
 from imud.contracts import lines as contract
 from imud.contracts.command import Target
 from imud.contracts.lines import AlarmRange, DeviceLines, DividedOptions, InputOptions, SoutOptions
-from imud.contracts.setting import Effect, values_of, words_of
+from imud.contracts.setting import Effect, combined
 from imud.drivers.hipnuc.uart import settings as uart_settings
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.drivers.hipnuc.uart.replies import parse_report
@@ -31,7 +31,8 @@ DELIVERED = {
 
 def read(line: HipnucLine) -> dict[str, Any]:
     """Return the settings that the table reads, as JSON values."""
-    values: dict[str, Any] = msgspec.to_builtins(values_of(line.run(SETTINGS.read(Target(None, line.baud), None))))
+    reports = line.run(SETTINGS.read(Target(None, line.baud), None))
+    values: dict[str, Any] = msgspec.to_builtins(combined(reports).values)
     return values
 
 
@@ -67,7 +68,7 @@ def test_the_same_in_words_with_units_and_lines_of_an_unknown_form_unchanged() -
     line = HipnucLine(settings, hardware_of(Behaviour(), mag_bias_t=(14.14e-6, -2.08e-6, -8.75e-6)))
     words = shown(
         {
-            **words_of(line.run(SETTINGS.read(Target(None, 0), None))),
+            **combined(line.run(SETTINGS.read(Target(None, 0), None))).words,
             "TEMP_COEF": "1.5",
             "COMCONFIG 7": "a line of another form",
         }
@@ -80,7 +81,7 @@ def test_the_same_in_words_with_units_and_lines_of_an_unknown_form_unchanged() -
         "baud": "115200 bit/s", "TEMP_COEF": "1.5", "COMCONFIG 7": "a line of another form",
     }  # fmt: skip
     assert (
-        shown(words_of(HipnucLine().run(SETTINGS.read(Target(None, 0), None))))["magnetometer_bias"]
+        shown(combined(HipnucLine().run(SETTINGS.read(Target(None, 0), None))).words)["magnetometer_bias"]
         == "0, 0, 0 µT: not calibrated"
     )
 
@@ -123,12 +124,12 @@ def test_written_read_back_saved_and_kept_over_a_restart(
     assert SETTINGS.save is not None
     assert SETTINGS.restart is not None
     value = msgspec.convert(given, setting.type)
-    assert not setting.agrees(value, values_of(line.run(SETTINGS.read(Target(None, 0), None)))[name])
+    assert not setting.agrees(value, combined(line.run(SETTINGS.read(Target(None, 0), None))).values[name])
     line.run(setting.write(Target(None, line.baud), value))
-    assert setting.agrees(value, values_of(line.run(SETTINGS.read(Target(None, 0), None)))[name])
+    assert setting.agrees(value, combined(line.run(SETTINGS.read(Target(None, 0), None))).values[name])
     line.run(SETTINGS.save(Target(None, line.baud)))
     line.run(SETTINGS.restart(Target(None, line.baud)))
-    assert setting.agrees(value, values_of(line.run(SETTINGS.read(Target(None, 0), None)))[name])
+    assert setting.agrees(value, combined(line.run(SETTINGS.read(Target(None, 0), None))).values[name])
     assert {field: getattr(line.module.settings, field) for field in changed} == changed
 
 
@@ -235,7 +236,7 @@ def test_contradictions_of_the_device_are_found(
     lines: DeviceLines, settings: ModuleSettings, found: dict[str, str]
 ) -> None:
     differences = uart_settings.line_differences(
-        values_of(HipnucLine(settings).run(SETTINGS.read(Target(None, 0), None))), lines
+        combined(HipnucLine(settings).run(SETTINGS.read(Target(None, 0), None))).values, lines
     )
     assert differences.keys() == found.keys()
     for key, words in found.items():

@@ -10,7 +10,7 @@ import pytest
 
 from imud.contracts.command import Target
 from imud.contracts.script import RequestScript, Silence
-from imud.contracts.setting import values_of, words_of
+from imud.contracts.setting import combined
 from imud.drivers.imu61x.uart import commands
 from imud.drivers.imu61x.uart import settings as following
 from imud.drivers.imu61x.uart import settings as session
@@ -33,7 +33,7 @@ def target(far: Imu61xBench, variant: str = "executes commands while it streams"
 
 
 def read(far: Imu61xBench, variant: str = "executes commands while it streams") -> dict[str, Any]:
-    return values_of(far.run(SETTINGS.read(target(far, variant), None)))
+    return dict(combined(far.run(SETTINGS.read(target(far, variant), None))).values)
 
 
 def write(far: Imu61xBench, name: str, value: object, variant: str = "executes commands while it streams") -> None:
@@ -254,7 +254,7 @@ def test_identity_settings_and_modes(variant: str) -> None:
     far = variant_bench(
         variant, Imu61xSettings(rate_hz=50, filter_control=0x4B, i2c_address=0x1A, gyro_off_deg_s=(0.5, -0.25, 0.0))
     )
-    assert words_of(far.run(session.SETTINGS.read(Target(None, 0), None))) == {
+    assert combined(far.run(session.SETTINGS.read(Target(None, 0), None))).words == {
         "baud": "115200", "output_rate_hz": "50", "accel_filter": "10 Hz", "gyro_filter": "47 Hz", "second_bus": "spi",
         "i2c_address": "0x1a", "gyro_offset_deg_s": "0.5, -0.25, 0", "installation_angles_deg": "0, 0, 0",
     }  # fmt: skip
