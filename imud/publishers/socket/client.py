@@ -79,76 +79,6 @@ class Waker:
         self._client_sock.close()
 
 
-class ClientWakers:
-    """The descriptors of one client: at most one waker per device, and one other that waits for its reply.
-
-    The daemon keeps a copy of each descriptor until the reply with it is sent. A client that does not read its replies
-    must not accumulate descriptors in the daemon. Synchronization: the event loop's thread.
-    """
-
-    def __init__(self) -> None:
-        self.by_device: dict[str, Waker] = {}  # the wakers by device
-        self._lent: socket.socket | None = None
-
-    def lend(self, sock: socket.socket) -> int:
-        """Take a socket, and close it when its descriptor is sent. Return the descriptor for the next reply.
-
-        Raises RpcError if the previous one is not sent yet.
-        """
-        if self._lent is not None:
-            message = "the previous reply with a descriptor is not sent yet; read it, then ask again"
-            raise RpcError(Code.UNAVAILABLE, message)
-        self._lent = sock
-        return sock.fileno()
-
-    def make(self, device: str, check: Callable[[Sequence[int]], None]) -> int:
-        """Make a waker in place of the previous waker of `device`. Return the descriptor for the next reply.
-
-        `check` receives both descriptors, and raises RpcError if clients may not use them. Raises RpcError also if no
-        socket pair can be made, or if the previous descriptor is not sent yet.
-        """
-        old = self.by_device.get(device)
-        if old is not None and old.client_end != NO_FD:
-            message = "notify: the previous reply for this device is not sent yet; read it, then ask again"
-            raise RpcError(Code.UNAVAILABLE, message)
-        try:
-            waker = Waker()
-        except OSError as error:
-            raise RpcError(Code.UNAVAILABLE, f"notify: the daemon cannot make a descriptor: {error.strerror}") from None
-        try:
-            check(waker.fds)
-        except RpcError:
-            waker.close()
-            raise
-        if old is not None:
-            old.close()
-        self.by_device[device] = waker
-        return waker.client_end
-
-    def wake(self, device: str) -> bool:
-        """Wake the client if it has a waker for `device`. Return False, once, if the client has closed the waker."""
-        waker = self.by_device.get(device)
-        if waker is None or waker.wake():
-            return True
-        self.by_device.pop(device).close()
-        return False
-
-    def close_copies(self) -> None:
-        """Close the daemon's copies of descriptors, because all replies are sent."""
-        for waker in self.by_device.values():
-            waker.close_copy()
-        if self._lent is not None:
-            self._lent.close()
-            self._lent = None
-
-    def close(self) -> None:
-        """Close all descriptors. A second call does nothing."""
-        self.close_copies()
-        for waker in self.by_device.values():
-            waker.close()
-        self.by_device.clear()
-
-
 class Clients(ABC):
     """Base class of the hub: all clients, their common memory, and the counters of `status`."""
 
@@ -182,7 +112,11 @@ class Clients(ABC):
 
 
 class ClientConnection(Outbox, ScheduledClient):
-    """A connected client that may at least read. Synchronization: the event loop's thread."""
+    """A connected client that may at least read. Synchronization: the event loop's thread.
+
+    The daemon keeps a copy of each descriptor for the client until the reply with it is sent. A client that does not
+    read its replies must not accumulate descriptors in the daemon: a waker for each device, and one other descriptor.
+    """
 
     def __init__(
         self, sock: socket.socket, peer: Peer, rights: Rights, place: Place, clients: Clients, scheduler: Scheduler
@@ -193,7 +127,8 @@ class ClientConnection(Outbox, ScheduledClient):
         self.peer = peer
         self.rights = rights
         self.place = place
-        self.wakers = ClientWakers()
+        self.wakers: dict[str, Waker] = {}  # by device
+        self._lent: socket.socket | None = None  # the socket of the other descriptor
         self.closed = False
         self.text_numbers = False  # whether imud sends integers that may exceed 2⁵³ as strings
         self.framed = False  # whether imud sends messages as frames; never reset
@@ -213,7 +148,7 @@ class ClientConnection(Outbox, ScheduledClient):
         if not self.closed:
             self.put_reply(frame_of(body) if self.framed else line_of(body), fd)
             if not self.waiting:
-                self.wakers.close_copies()
+                self._close_copies()
 
     def status(self, encoding: str) -> ClientStatus:
         """Return the state of this client; `encoding` is the encoding of its subscription, empty without one."""
@@ -265,10 +200,66 @@ class ClientConnection(Outbox, ScheduledClient):
         with ExitStack() as steps:  # after an error of a step, the other steps run, so that the client keeps no place
             steps.callback(self._clients.remove, self)
             steps.callback(self._drop_requests)
-            steps.callback(self.wakers.close)
+            steps.callback(self.wakers.clear)
+            for waker in self.wakers.values():
+                steps.callback(waker.close)
+            steps.callback(self._close_copies)
             steps.callback(self._sock.close)
             steps.callback(self.discard)
             steps.callback(self._scheduler.remove, self)
+
+    # --- descriptors for the client -----------------------------------------------------------------------------------
+
+    def lend(self, sock: socket.socket) -> int:
+        """Take a socket, and close it when its descriptor is sent. Return the descriptor for the next reply.
+
+        Raises RpcError if the previous one is not sent yet.
+        """
+        if self._lent is not None:
+            message = "the previous reply with a descriptor is not sent yet; read it, then ask again"
+            raise RpcError(Code.UNAVAILABLE, message)
+        self._lent = sock
+        return sock.fileno()
+
+    def make_waker(self, device: str, check: Callable[[Sequence[int]], None]) -> int:
+        """Make a waker in place of the previous waker of `device`. Return the descriptor for the next reply.
+
+        `check` receives both descriptors, and raises RpcError if clients may not use them. Raises RpcError also if no
+        socket pair can be made, or if the previous descriptor is not sent yet.
+        """
+        old = self.wakers.get(device)
+        if old is not None and old.client_end != NO_FD:
+            message = "notify: the previous reply for this device is not sent yet; read it, then ask again"
+            raise RpcError(Code.UNAVAILABLE, message)
+        try:
+            waker = Waker()
+        except OSError as error:
+            raise RpcError(Code.UNAVAILABLE, f"notify: the daemon cannot make a descriptor: {error.strerror}") from None
+        try:
+            check(waker.fds)
+        except RpcError:
+            waker.close()
+            raise
+        if old is not None:
+            old.close()
+        self.wakers[device] = waker
+        return waker.client_end
+
+    def wake(self, device: str) -> bool:
+        """Wake the client if it has a waker for `device`. Return False, once, if the client has closed the waker."""
+        waker = self.wakers.get(device)
+        if waker is None or waker.wake():
+            return True
+        self.wakers.pop(device).close()
+        return False
+
+    def _close_copies(self) -> None:
+        """Close the daemon's copies of descriptors, because all replies are sent."""
+        for waker in self.wakers.values():
+            waker.close_copy()
+        if self._lent is not None:
+            self._lent.close()
+            self._lent = None
 
     # --- called by the scheduler --------------------------------------------------------------------------------------
 
@@ -400,6 +391,6 @@ class ClientConnection(Outbox, ScheduledClient):
         self._scheduler.enqueue(self)
 
     def on_emptied(self) -> None:
-        self.wakers.close_copies()
+        self._close_copies()
         if self.finishing:
             self.close()

@@ -100,7 +100,7 @@ class ClientRecordings:
             raise RpcError(Code.UNAVAILABLE, message) from None
         try:
             self._check_fds((ours.fileno(), theirs.fileno()))
-            return ours, connection.wakers.lend(theirs)
+            return ours, connection.lend(theirs)
         except RpcError:
             ours.close()
             theirs.close()
@@ -118,10 +118,6 @@ class ClientRecordings:
         self._ids.pop(name, None)
         for made in self.running.values():
             made.remove_device(name)
-
-    def event(self, event: Event) -> None:
-        for made in self.running.values():
-            made.event(event)
 
     @property
     def is_active(self) -> bool:
@@ -229,7 +225,8 @@ class Hub(Clients):
 
     def event(self, event: Event) -> None:
         """Send an event to the clients that asked for it. Events of the daemon (device "") go to all of them."""
-        self.recordings.event(event)
+        for recording in self.recordings.running.values():
+            recording.event(event)
         if not self._events:
             return
         device = event.device
@@ -273,7 +270,7 @@ class Hub(Clients):
 
     def _wake(self, connection: ClientConnection, device: str) -> None:
         try:
-            if not connection.wakers.wake(device):
+            if not connection.wake(device):
                 self._forget_waker(connection, device)
         except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
             connection.on_failure(error)
@@ -329,13 +326,11 @@ class Hub(Clients):
     def make_waker(self, connection: ClientConnection, device: str, latency_ns: int = 0) -> int:
         """Make a descriptor that wakes a client at most `latency_ns` after a batch of `device`.
 
-        Raises RpcError as `ClientWakers.make`, or if the user has too many wakers.
+        Raises RpcError as `ClientConnection.make_waker`, or if the user has too many wakers.
         """
         uid = connection.uid
-        self._quota.check_waker(
-            uid, sum(len(one.wakers.by_device) for one in self.connections.values() if one.uid == uid)
-        )
-        fd = connection.wakers.make(device, self._quota.check_fds)
+        self._quota.check_waker(uid, sum(len(one.wakers) for one in self.connections.values() if one.uid == uid))
+        fd = connection.make_waker(device, self._quota.check_fds)
         self._wanting_wake.setdefault(device, {})[connection] = None
         self.context.latencies.ask(_requester(connection, device), latency_ns, (device,))
         return fd
@@ -347,7 +342,7 @@ class Hub(Clients):
     def has_news_for(self, connection: ClientConnection) -> bool:
         number = connection.number
         is_asked = number in self._subscriptions or number in self._events or number in self.running
-        return is_asked or number in self.recordings.running or bool(connection.wakers.by_device)
+        return is_asked or number in self.recordings.running or bool(connection.wakers)
 
     # --- clients ------------------------------------------------------------------------------------------------------
 

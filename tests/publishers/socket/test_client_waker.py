@@ -27,7 +27,7 @@ async def notified(peer: Peer, device: str = "imu0") -> int:
 
 def copies_held(connection: ClientConnection) -> list[Waker]:
     """Return the wakers with a copy of the client's end in the daemon."""
-    return [waker for waker in connection.wakers.by_device.values() if waker.client_end != NO_FD]
+    return [waker for waker in connection.wakers.values() if waker.client_end != NO_FD]
 
 
 async def wakened() -> None:
@@ -128,11 +128,11 @@ async def test_a_client_that_closes_its_descriptor_is_not_woken_any_more(server:
         server.publish(batch("imu0", seq))
         await wakened()
         assert read_all(fd) == BYTE
-        assert not first.wakers.by_device
+        assert not first.wakers
     os.close(fd)
     server.publish(batch("imu0", 3))
     await wakened()
-    assert not second.wakers.by_device
+    assert not second.wakers
     server.publish(batch("imu0", 4))
     assert not server.hub.wakes("imu0")  # no waker is left
     for peer in (closing, other):
@@ -149,7 +149,7 @@ async def test_unread_replies_do_not_gather_descriptors(server: SocketServer) ->
     for number, device in requests:
         line = b'{"jsonrpc":"2.0","id":%d,"method":"notify","params":{"device":"%s"}}\n'
         await peer.send(line % (number, device.encode()))
-    await until(lambda: len(connection.wakers.by_device) == 2)
+    await until(lambda: len(connection.wakers) == 2)
     assert len(os.listdir("/proc/self/fd")) == before + 4  # both ends of two wakers
     replies = (await peer.messages(7))[1:]
     assert ["error" in reply for reply in replies] == [False, True, True, True, True, False]

@@ -90,7 +90,7 @@ async def test_bad_parameters(server: SocketServer, method: str, params: dict[st
     assert words in message
     (connection,) = server.hub.connections.values()
     assert connection.number not in watching(server)
-    assert not connection.wakers.by_device
+    assert not connection.wakers
 
 
 def watching(server: SocketServer) -> set[int]:
@@ -132,7 +132,7 @@ async def test_notifications_several_requests_half_and_blank_lines(server: Socke
     assert (await peer.message())["id"] == 9
     (connection,) = server.hub.connections.values()
     assert connection.number in watching(server)
-    assert not connection.wakers.by_device
+    assert not connection.wakers
     lines = b"".join(b'{"jsonrpc":"2.0","id":%d,"method":"poll"}\n\r\n\n' % number for number in range(25))
     await peer.send(lines)  # more requests than one turn serves
     assert [reply["id"] for reply in await peer.messages(25)] == list(range(25))

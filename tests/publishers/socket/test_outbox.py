@@ -182,11 +182,11 @@ async def test_a_descriptor_waits_behind_the_queue(server: SocketServer) -> None
     fill(server)
     (connection,) = server.hub.connections.values()
     await peer.send(b'{"jsonrpc":"2.0","id":7,"method":"notify","params":{"device":"imu0"}}\n')
-    await until(lambda: bool(connection.wakers.by_device))
+    await until(lambda: bool(connection.wakers))
     server.publish(batch("imu1", 8000, 2))  # queued after the reply
     assert await descriptors(peer, connection) == 1
     await until(lambda: not connection.waiting)
-    assert connection.wakers.by_device["imu0"].client_end == NO_FD  # sent, so the daemon closed its copy
+    assert connection.wakers["imu0"].client_end == NO_FD  # sent, so the daemon closed its copy
     data, fds, _flags, _address = socket.recv_fds(peer.sock, 65536, 4)
     assert b'"seq":8001' in data
     assert not fds
@@ -218,7 +218,7 @@ async def descriptors(peer: Peer, connection: ClientConnection) -> int:
             at = len(data)
             found += fds
     assert at - READ_BYTES <= data.index(b'{"jsonrpc":"2.0","id":7,') < at  # at the start of its reply
-    assert connection.wakers.wake("imu0")
+    assert connection.wake("imu0")
     assert [os.read(fd, 64) for fd in found] == [BYTE]
     for fd in found:
         os.close(fd)

@@ -342,7 +342,7 @@ async def test_an_error_ends_only_this_client(server: SocketServer, monkeypatch:
         await peer.result("events")
     os.close(await descriptor(bad))
     if what == "wake":
-        monkeypatch.setattr(connection.wakers, "wake", broken)
+        monkeypatch.setattr(connection, "wake", broken)
         server.publish(batch())
     elif what == "tick":
         monkeypatch.setattr(connection, "tick", broken)
