@@ -112,9 +112,21 @@ class Guard:
 
 
 def peer_of(sock: socket.socket) -> Peer:
-    """Return the credentials of the peer of a connected UNIX socket. Raises OSError."""
+    """Return the credentials of the peer of a connected UNIX socket. Raises OSError.
+
+    The supplementary groups are from the kernel; before Linux 4.13 they are from the user database.
+    """
     pid, uid, gid = _UCRED.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _UCRED.size))
-    return Peer(pid, uid, frozenset((gid, *_supplementary(sock, uid, gid))))
+    try:
+        raw = sock.getsockopt(socket.SOL_SOCKET, SO_PEERGROUPS, _GETSOCKOPT_MAX_BYTES)
+        groups = memoryview(raw).cast("I").tolist()
+    except OSError as error:
+        try:
+            is_long = error.errno == errno.ERANGE  # more than 256 groups
+            groups = _long_list(sock) if is_long else os.getgrouplist(pwd.getpwuid(uid).pw_name, gid)
+        except KeyError:
+            groups = []
+    return Peer(pid, uid, frozenset((gid, *groups)))
 
 
 def gid_of(group: str) -> int | None:
@@ -123,20 +135,6 @@ def gid_of(group: str) -> int | None:
         return grp.getgrnam(group).gr_gid
     except KeyError:
         return None
-
-
-def _supplementary(sock: socket.socket, uid: int, gid: int) -> list[int]:
-    """Return the groups from the kernel; from the user database before Linux 4.13. Raises OSError."""
-    try:
-        raw = sock.getsockopt(socket.SOL_SOCKET, SO_PEERGROUPS, _GETSOCKOPT_MAX_BYTES)
-    except OSError as error:
-        if error.errno == errno.ERANGE:  # more than 256 groups
-            return _long_list(sock)
-        try:
-            return os.getgrouplist(pwd.getpwuid(uid).pw_name, gid)
-        except KeyError:
-            return []
-    return memoryview(raw).cast("I").tolist()
 
 
 def _long_list(sock: socket.socket) -> list[int]:
@@ -252,7 +250,7 @@ class Quota:
         now_ns = self._now_ns()
         bucket = self._connects.get(uid)
         if bucket is None:
-            bucket = self._connects[uid] = TokenBucket(CONNECTS_PER_S, CONNECTS_BURST, now_ns)
+            bucket = self._connects[uid] = TokenBucket(CONNECTS_PER_S, CONNECTS_BURST, now_ns, CONNECTS_BURST)
         bucket.fill(now_ns)
         if bucket.level < 1:
             return False

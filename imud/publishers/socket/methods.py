@@ -9,7 +9,6 @@ from typing import Any, Final, Generic, TypeVar
 
 import msgspec
 
-from imud import __version__
 from imud.attitude.conventions import Convention
 from imud.contracts.command import REQUESTED_BY, CalibrationInfo, CalibrationResult, VerbInfo, described, infos
 from imud.contracts.publisher import Batch, DeviceControl
@@ -23,7 +22,6 @@ from imud.formats.jsonrpc import (
     RpcRequest,
     encode,
     encode_error,
-    encode_notification,
     encode_result,
     parse_request,
     with_texts,
@@ -47,7 +45,6 @@ from imud.publishers.socket.messages import (
     DeviceSummary,
     EventsParams,
     EventsResult,
-    Greeting,
     HistoryParams,
     HistoryResult,
     NoParams,
@@ -137,12 +134,6 @@ class Method(Generic[P]):
 
 
 # --- requests and replies -------------------------------------------------------------------------------------------
-
-
-def hello(hub: Hub, connection: ClientConnection) -> bytes:
-    """Return the notification that greets a client."""
-    rights = str(connection.rights.name).lower().split("|")  # the name of two rights is READ|CONTROL
-    return encode_notification("hello", Greeting(PROTOCOL, __version__, hub.context.epoch, rights))
 
 
 def handle_line(hub: Hub, connection: ClientConnection, line: bytes) -> None:

@@ -17,6 +17,7 @@ import logging
 import select
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from enum import Enum, auto
 from heapq import heappop, heappush
 from typing import Final
@@ -57,25 +58,23 @@ OVER_TICKS_MAX: Final = 100
 """Number of ticks (100 ms each) without allowance after which imud evicts a client."""
 
 
+@dataclass(slots=True)
 class TokenBucket:
     """An allowance: `rate` per second, at most `burst`."""
 
-    __slots__ = ("_at_ns", "_burst", "_rate", "level")
-
-    def __init__(self, rate: int, burst: int, now_ns: int, level: int | None = None) -> None:
-        self._rate = rate
-        self._burst = burst
-        self._at_ns = now_ns
-        self.level: float = burst if level is None else level  # unused allowance; negative after a piece that used more
+    rate: int
+    burst: int
+    at_ns: int  # CLOCK_MONOTONIC of the last call of `fill`
+    level: float  # unused allowance; negative after a piece that used more
 
     def use(self, amount: int) -> None:
         """Subtract the used amount; the debt is at most `burst`."""
-        self.level = max(-self._burst, self.level - amount)
+        self.level = max(-self.burst, self.level - amount)
 
     def fill(self, now_ns: int) -> None:
         """Add the allowance of the time since the last call."""
-        self.level = min(self._burst, self.level + self._rate * (now_ns - self._at_ns) / NS_PER_S)
-        self._at_ns = now_ns
+        self.level = min(self.burst, self.level + self.rate * (now_ns - self.at_ns) / NS_PER_S)
+        self.at_ns = now_ns
 
 
 class _State(Enum):
@@ -86,18 +85,16 @@ class _State(Enum):
     GONE = auto()
 
 
+@dataclass(slots=True, eq=False)
 class _User:
     """The clients of one user."""
 
-    __slots__ = ("clients", "queue", "run_ns", "served_ns", "uid")
-
-    def __init__(self, uid: int, run_ns: int) -> None:
-        self.uid = uid
-        self.clients = 0
-        self.run_ns = run_ns
-        self.served_ns = 0  # run time of the client that was served last
-        # heap of the queued clients: False for a light client, run time, number
-        self.queue: list[tuple[bool, int, int, ScheduledClient]] = []
+    uid: int
+    run_ns: int
+    clients: int = 0
+    served_ns: int = 0  # run time of the client that was served last
+    # heap of the queued clients: False for a light client, run time, number
+    queue: list[tuple[bool, int, int, "ScheduledClient"]] = field(default_factory=list)
 
     def urgency(self) -> tuple[bool, int]:
         """Return the key of the queue: the user with the smallest key is next."""
@@ -114,7 +111,7 @@ class ScheduledClient(ABC):
         self.state = _State.IDLE
         self.over_ticks = 0
         self.cpu = TokenBucket(CPU_PER_S_NS, CPU_BURST_NS, now_ns, CPU_NEW_NS)
-        self.data = TokenBucket(BYTES_PER_S, BYTES_BURST, now_ns)
+        self.data = TokenBucket(BYTES_PER_S, BYTES_BURST, now_ns, BYTES_BURST)
         self.user = scheduler.add(self, uid)
         self.run_ns = self.user.served_ns
 

@@ -21,9 +21,10 @@ from typing import Annotated, Final
 
 import msgspec
 
+from imud import __version__
 from imud.contracts.publisher import PublisherContext, PublisherType
 from imud.formats import kernel
-from imud.formats.jsonrpc import DEFAULT_PATH, Code, RpcError, encode_error, line_of
+from imud.formats.jsonrpc import DEFAULT_PATH, PROTOCOL, Code, RpcError, encode_error, encode_notification, line_of
 from imud.model.errors import ServerError, reason_of
 from imud.model.options import Options, shown
 from imud.model.units import NS_PER_MS, NS_PER_S
@@ -39,7 +40,8 @@ from imud.publishers.socket.admission import (
 from imud.publishers.socket.client import ClientConnection
 from imud.publishers.socket.history import History
 from imud.publishers.socket.hub import Hub
-from imud.publishers.socket.methods import handle_line, hello
+from imud.publishers.socket.messages import Greeting
+from imud.publishers.socket.methods import handle_line
 from imud.publishers.socket.outbox import Limits, Pool
 from imud.publishers.socket.scheduler import SERVING_BURST_NS, SERVING_PER_S_NS, Scheduler, TokenBucket
 
@@ -301,7 +303,7 @@ class SocketServer:
         self._quota = Quota(
             settings.clients_max, settings.clients_per_user, own_uid, raise_fd_limit(), context.clock.now_ns
         )  # fmt: skip
-        self._time = TokenBucket(SERVING_PER_S_NS, SERVING_BURST_NS, context.clock.now_ns())
+        self._time = TokenBucket(SERVING_PER_S_NS, SERVING_BURST_NS, context.clock.now_ns(), SERVING_BURST_NS)
         limits = Limits(settings.queue_samples, settings.queue_bytes)
         pool = Pool(settings.memory_mb * MIB, limits)
         self.hub = Hub(settings.path, context, self._quota, self._time, pool, handle_line)
@@ -439,7 +441,9 @@ class SocketServer:
             assert self._scheduler is not None
             connection = ClientConnection(sock, peer, rights, place, hub, self._scheduler)
             hub.connections[connection.number] = connection
-            connection.post(hello(hub, connection))
+            names = str(rights.name).lower().split("|")  # the name of two rights is READ|CONTROL
+            greeting = Greeting(PROTOCOL, __version__, hub.context.epoch, names)
+            connection.post(encode_notification("hello", greeting))
         except RpcError as refusal:
             hub.refused += 1
             _refuse(sock, refusal)

@@ -61,7 +61,7 @@ class SchedulerBench:
         self.log: list[str] = []
         self.on_piece: Callable[[], object] = lambda: None
         """Called after each piece."""
-        time = TokenBucket(1_000_000_000, 1_000 * MS, self.clock())
+        time = TokenBucket(1_000_000_000, 1_000 * MS, self.clock(), 1_000 * MS)
         self.scheduler = Scheduler(self.clock, self.clock, time)
         self.socks: list[socket.socket] = []
 

@@ -312,7 +312,7 @@ broken = Mock(side_effect=ZeroDivisionError("a mistake"))
 
 
 @pytest.mark.parametrize(
-    "place", ["Quota.admit", "ClientConnection.__init__", "hello", "peer_of"], ids=lambda place: place.split(".")[0]
+    "place", ["Quota.admit", "ClientConnection.__init__", "Greeting", "peer_of"], ids=lambda place: place.split(".")[0]
 )
 @in_server()
 async def test_an_error_while_a_client_is_greeted_ends_only_this_client(
@@ -322,7 +322,7 @@ async def test_an_error_while_a_client_is_greeted_ends_only_this_client(
     with monkeypatch.context() as patch:
         patch.setattr(f"imud.publishers.socket.server.{place}", broken)
         bad = await Peer.connect(server)
-        if place == "hello":
+        if place == "Greeting":
             assert (await bad.message())["error"]["code"] == -32603
         assert await bad.ended()
     assert server.hub.status().failed == 1
