@@ -143,7 +143,6 @@ SMALL_LINES = 130
 LONG_MODULES = {
     "imud.cli.noise": "one report in three forms: text, JSON and HTML",
     "imud.cli.top": "the display of one command: table, details of a device, keys",
-    "imud.drivers.hipnuc.assembly": "one algorithm: samples of CAN frames, their losses, address conflicts",
     "imud.device.settings": "one state machine: identity and settings of a device, with its comparison",
     "imud.drivers.imu61x.uart.settings": "the table of settings with its scripts",
     "imud.publishers.metrics.families": "one table: the metric families",

@@ -372,7 +372,7 @@ async def test_the_status_shows_two_devices_with_one_address(bench: CanDeviceBen
     bench.feed(*(index for n in range(60) for index in (n, 5000 + n)))
     rig.tick()
     rig.tick()
-    assert "do two devices on the bus have this base_id?" in rig.device.status().problem
+    assert "do two or more devices on the bus have this base_id?" in rig.device.status().problem
     assert [event.kind for event in rig.events].count(EventKind.LINK) == 1
     bench.link.news("error-passive", "the bus is error-passive")
     assert "error-passive; INDEX alternates" in rig.device.status().problem

@@ -17,17 +17,16 @@ one instant back to back (a burst), some devices send each kind by its own timer
 - imud counts a lost frame of any kind only if the SID or the period of this kind proves the loss (`KindLosses`).
 - If many samples lack the anchor, imud selects another anchor.
 
-If each kind arrives twice per period at fixed phases, if the values alternate, or if extra frames of the anchor arrive
-at a period of their own, two devices have the same address.
+`same_address.py` detects several devices with the same address.
 """
 
 from collections import deque
 from collections.abc import Container, Sequence
 from itertools import pairwise
-from math import isfinite
 from statistics import median
 from typing import Final, NamedTuple
 
+from imud.drivers.hipnuc.same_address import SameAddress
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_MS, NS_PER_S
@@ -179,24 +178,18 @@ LATE_BURSTS: Final = 4  # number of bursts that can arrive together
 class SidSeries:
     """Series of the SIDs of one kind. Synchronization: one thread."""
 
-    __slots__ = ("_modulus", "_newest", "_others", "_run", "_step")
+    __slots__ = ("_modulus", "_newest", "_run", "_step")
 
     def __init__(self) -> None:
         self._newest: int | None = None
         self._modulus = 0  # 0: unknown
         self._step = 0  # newest difference of two SIDs
         self._run = 0  # number of consecutive differences of this size
-        self._others = 0  # number of consecutive differences of other sizes, since the step is known
 
     @property
     def is_known(self) -> bool:
         """Whether the SIDs have risen by equal steps."""
         return self._run >= SID_RUN
-
-    @property
-    def is_of_one(self) -> bool:
-        """Whether the newest SIDs rise by equal steps: they are from one device."""
-        return self.is_known and self._others < SID_RUN
 
     def add(self, sid: int | None, *, is_next: bool) -> int | None:
         """Add a SID. Return the number of missing SIDs before it; None if the SIDs do not show this number.
@@ -215,7 +208,6 @@ class SidSeries:
                 self._modulus = modulus
             return None
         if self.is_known and rise > 0 and rise % self._step == 0:
-            self._others = 0 if rise == self._step else self._others + 1
             return rise // self._step - 1
         self._run = self._run + 1 if rise == self._step and rise > 0 else 0
         self._step = rise
@@ -268,123 +260,6 @@ class KindLosses:
         return missing
 
 
-# Number of alternating distances, and of alternating values, after which two devices have the same address
-DISTANCES, VALUES = 64, 256
-PHASE_LEAST: Final = 0.1  # Minimum phase of the second device, in periods. A gateway can send two frames back to back.
-ANGLE_LEAST_RAD, ACCEL_LEAST_M_S2 = 0.02, 5.0  # minimum differences of the values of two devices; vibration is smaller
-STABLE: Final = 4  # minimum ratio of the difference of adjacent numbers to the change of every second number
-
-
-class Alternation:
-    """Numbers that alternate between two values, as from two devices. Synchronization: one thread."""
-
-    __slots__ = ("_count", "_needed", "newest")
-
-    def __init__(self, needed: int) -> None:
-        """`needed`: number of alternating numbers that show two devices."""
-        self.newest = (0.0, 0.0)  # the two newest numbers
-        self._needed = needed
-        self._count = 0
-
-    @property
-    def is_found(self) -> bool:
-        return self._count >= self._needed
-
-    def add(self, number: float, *, differs: bool) -> None:
-        """Add a number. `differs`: the number and the previous number can be from two devices."""
-        before, previous = self.newest
-        self.newest = (previous, number)
-        if differs and STABLE * abs(number - before) < abs(number - previous):
-            self._count = min(self._count + 1, 2 * self._needed)
-        elif self._count:
-            self._count -= 1 if self.is_found else self._count
-
-
-class ValueAlternation:
-    """Alternating values of consecutive samples: two devices with the same address and opposite phases."""
-
-    def __init__(self) -> None:
-        self._yaw, self._tilt, self._accel = (Alternation(VALUES) for _ in range(3))
-
-    @property
-    def is_found(self) -> bool:
-        return self._yaw.is_found or self._tilt.is_found or self._accel.is_found
-
-    def add(self, m: Measurement) -> None:
-        """Add a measurement."""
-        if m.euler_rad is not None:
-            roll, pitch, yaw = m.euler_rad
-            _add_value(self._yaw, yaw, ANGLE_LEAST_RAD)
-            _add_value(self._tilt, roll + 2 * pitch, ANGLE_LEAST_RAD)
-        if m.accel_m_s2 is not None:
-            x, y, z = m.accel_m_s2
-            _add_value(self._accel, x + 2 * y + 3 * z, ACCEL_LEAST_M_S2)
-
-
-def _add_value(found: Alternation, value: float, least: float) -> None:
-    if isfinite(value):
-        found.add(value, differs=abs(value - found.newest[1]) >= least)
-
-
-EXTRAS: Final = 32  # number of regular extra frames after which two devices have the same address
-# Number of distances that show the usual distance, and maximum number of longer distances, across lost frames
-USUAL_OF, LONGER = 64, 5
-EVEN, REGULAR = 1 / 16, 1 / 8  # maximum deviations of an extra frame from the other device and from its own period
-EXTRAS_END: Final = 4  # number of its periods without an extra frame after which the conflict has ended
-
-
-class ExtraFrames:
-    """Frames of a slower device with the same address, between the frames of a device. Synchronization: one thread."""
-
-    __slots__ = ("_newest", "_previous", "_steps_ns", "_times_ns", "kind", "usual_ns")
-
-    def __init__(self, kind: int | None) -> None:
-        self.kind = kind  # kind of the frames; None: unknown
-        self.usual_ns = 0  # time between two frames of the faster device, ns; 0 if unknown
-        # arrival time and SID of the two newest frames
-        self._previous: tuple[int, int | None] = (0, None)
-        self._newest: tuple[int, int | None] = (0, None)
-        self._steps_ns: list[int] = []
-        self._times_ns: deque[int] = deque(maxlen=EXTRAS)
-
-    @property
-    def period_ns(self) -> int:
-        """Time between two extra frames, ns; 0 if they do not show two devices."""
-        times_ns = self._times_ns
-        if len(times_ns) < EXTRAS:
-            return 0
-        steps_ns = [after - before for before, after in pairwise(times_ns)]
-        counts = [max(round(step_ns / median(steps_ns)), 1) for step_ns in steps_ns]  # an extra frame can be lost
-        period_ns, limit_ns = sum(steps_ns) // sum(counts), REGULAR * self.usual_ns
-        off_ns = max(abs(step_ns - count * period_ns) for step_ns, count in zip(steps_ns, counts, strict=True))
-        has_ended = self._newest[0] - times_ns[-1] > EXTRAS_END * period_ns
-        # after many lost frames, the usual distance is several periods of one device
-        is_faster = period_ns < (1 - REGULAR) * self.usual_ns
-        return 0 if off_ns > limit_ns or has_ended or is_faster else period_ns
-
-    def add(self, t_ns: int, sid: int | None) -> None:
-        """Add a frame."""
-        (first_ns, first_sid), (middle_ns, middle_sid) = self._previous, self._newest
-        self._previous, self._newest = self._newest, (t_ns, sid)
-        self._steps_ns.append(t_ns - middle_ns)
-        if len(self._steps_ns) == USUAL_OF:
-            before_ns, self.usual_ns = self.usual_ns, sorted(self._steps_ns)[-1 - LONGER]
-            self._steps_ns.clear()
-            if abs(self.usual_ns - before_ns) > EVEN * before_ns:
-                self._times_ns.clear()
-        usual_ns = self.usual_ns
-        if abs(t_ns - first_ns - usual_ns) > EVEN * usual_ns:
-            return
-        is_of_one = (
-            sid is not None
-            and middle_sid is not None
-            and first_sid is not None
-            and (sid - middle_sid == middle_sid - first_sid != 0)
-        )
-        if not is_of_one and min(middle_ns - first_ns, t_ns - middle_ns) > PHASE_LEAST * usual_ns:
-            self._times_ns.append(middle_ns)
-
-
 COPY_NS: Final = 2 * NS_PER_MS  # maximum time from a frame to its copy, ns: a repetition by the bus
 # Number of frames near the anchor, less FAR_WEIGHT for each other frame, from which a kind is near
 NEAR_FRAMES: Final = 4
@@ -405,7 +280,7 @@ class _Kind:
     """State of one kind of frame."""
 
     __slots__ = (
-        "agree", "alternation", "anchors", "behind_ns", "every", "leads", "losses", "missed", "near", "run", "seen_ns",
+        "agree", "anchors", "behind_ns", "every", "leads", "losses", "missed", "near", "run", "seen_ns",
         "step", "step_ns",
     )  # fmt: skip
 
@@ -421,7 +296,6 @@ class _Kind:
         self.agree = 0  # frames with the SID of the anchor, less the other frames
         self.missed = 0  # number of samples that waited for this kind in vain since its newest frame
         self.behind_ns = 0  # delay that short distances may still make up for, ns
-        self.alternation = Alternation(DISTANCES)
         self.losses = KindLosses()
 
     @property
@@ -459,9 +333,6 @@ class _Kind:
                 self.leads = 2 * offset_ns > period_ns
             self._learn(round(self.step_ns / period_ns))
         self.seen_ns, self.missed, self.anchors = t_ns, 0, 0
-        step_ns, previous_ns = self.step_ns, self.alternation.newest[1]
-        least_ns = PHASE_LEAST * (step_ns + previous_ns)
-        self.alternation.add(step_ns, differs=step_ns > least_ns and previous_ns > least_ns)
 
     def _learn(self, step: int) -> None:
         self.run = self.run + 1 if step == self.step else 1
@@ -507,8 +378,7 @@ class Assembly:
         self._cadence = Cadence(0, 0)
         self._sids = SidSeries()
         self._strays = 0
-        self._values = ValueAlternation()
-        self._extras = ExtraFrames(None)  # extra frames of the anchor
+        self._same_address = SameAddress()
         self._incomplete = 0  # number of bursts without the anchor since the newest anchor
 
     @property
@@ -519,25 +389,7 @@ class Assembly:
     @property
     def problem(self) -> str:
         """Address conflict that the frames show, one sentence; empty without a conflict."""
-        if self._anchor is None:
-            return ""
-        if extra_ns := self._extras.period_ns:
-            return (
-                f"an extra frame arrives every {extra_ns / NS_PER_MS:.1f} ms between the frames of a device with a "
-                f"period of {self._extras.usual_ns / NS_PER_MS:.1f} ms; do two devices on the bus have this address?"
-            )
-        if self._sids.is_of_one:
-            return ""
-        own = self._kinds[self._anchor].alternation
-        often = [kind.alternation for kind in self._kinds.values() if kind.every == 1]
-        if own.is_found and all(one.is_found for one in often):
-            return (
-                f"each frame arrives twice per period of {sum(own.newest) / NS_PER_MS:.1f} ms, "
-                f"{min(own.newest) / NS_PER_MS:.1f} ms apart; do two devices on the bus have this address?"
-            )
-        if self._values.is_found:
-            return "the values alternate from sample to sample; do two devices on the bus have this address?"
-        return ""
+        return self._same_address.problem
 
     def add_frame(self, kind: int, data: bytes, t_rx_ns: int, sid: int | None = None) -> Sequence[Assembled]:
         """Add one frame. Return the samples that it completes, oldest first."""
@@ -545,6 +397,7 @@ class Assembly:
             self._ledger.frames_ignored += 1
             return ()
         self._newest = (kind, data, t_rx_ns)
+        self._same_address.add_frame(kind, t_rx_ns, sid)
         if self._anchor is None:
             return self._add_unknown(kind, Part(data, t_rx_ns, sid))
         done = []
@@ -565,7 +418,7 @@ class Assembly:
     def watched(self, measurements: list[Measurement]) -> list[Measurement]:
         """Return the measurements of samples. Watch their values for an address conflict."""
         for one in measurements:
-            self._values.add(one)
+            self._same_address.add_values(one)
         return measurements
 
     def reset(self) -> None:
@@ -630,7 +483,6 @@ class Assembly:
         is_even = 3 * period_ns <= 4 * (t_rx_ns - self._anchor_ns) <= 5 * period_ns
         known.arrive(t_rx_ns, t_rx_ns, period_ns)
         known.every = 1
-        self._extras.add(t_rx_ns, sid)
         self._anchor_ns = t_rx_ns
         for number, one in kinds.items():
             one.anchors += 1
@@ -733,8 +585,6 @@ class Assembly:
         self._anchor = learned.anchor
         self._cadence = Cadence(learned.period_ns, frames[-1][1])
         self._sids = SidSeries()
-        if self._extras.kind != learned.anchor:
-            self._extras = ExtraFrames(learned.anchor)
         self._kinds = {kind: _Kind() for kind, _ in frames}
         self._kinds[learned.anchor].near = NEAR_FRAMES_MAX
         begin = next(place for place, (kind, _) in enumerate(frames) if kind == learned.anchor)

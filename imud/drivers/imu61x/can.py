@@ -73,8 +73,10 @@ DOWN: Final = 4
 UP: Final = 16  # Divisors: part of a difference by which the learned times decrease or increase
 SURE_SETS: Final = 8  # number of sets before the learned times count: a late set would have too much weight
 _NEVER_NS: Final = 1 << 63
-ALTERNATIONS: Final = 32  # number of alternating INDEX values after which two devices have the same identifiers
+ALTERNATIONS: Final = 32  # number of changes to another known series after which devices have the same identifiers
 STEADY: Final = 256  # number of consecutive INDEX values after which there is one device again
+SERIES_MAX: Final = 8  # maximum number of known series
+STEP_MOST: Final = 16  # maximum step of INDEX within a series: some samples can be lost
 
 _LIMITS: Final = (*[TURN_DEG] * 3, *[GYRO_LIMIT_DEG_S] * 3, *[ACCEL_LIMIT_G] * 3)  # of the nine floats of a set
 _CLOSING: Final = SET_FRAMES - 1
@@ -118,6 +120,43 @@ def _moved(mean_ns: int, new_ns: int) -> int:
     return mean_ns + (min(new_ns, 2 * mean_ns) - mean_ns) // UP
 
 
+class _Series:
+    """Series of INDEX. Each device continues a series of its own. Synchronization: one thread."""
+
+    __slots__ = ("_alternations", "_newest", "_steady")
+
+    def __init__(self) -> None:
+        self._newest: list[int] = []  # newest INDEX of each series, the series with the newest frame last
+        self._steady = 0  # number of consecutive 105 that follow their predecessor
+        self._alternations = 0  # number of changes to a known series since the start of the newest series
+
+    @property
+    def are_several(self) -> bool:
+        """Whether INDEX alternates between series."""
+        return self._alternations >= ALTERNATIONS
+
+    def add(self, index: int) -> None:
+        """Add the INDEX of a 105."""
+        known = self._newest
+        steps = [(index - newest) % INDEX_MODULUS for newest in known]
+        if steps and steps[-1] == 1:
+            self._steady += 1
+            known.pop()
+            if self._steady >= STEADY:
+                self._alternations = 0
+                known.clear()
+        else:
+            self._steady = 0
+            step = min((one for one in steps if one), default=STEP_MOST + 1)
+            if step <= STEP_MOST:
+                known.pop(steps.index(step))
+                self._alternations += step == 1
+            elif 0 not in steps:
+                self._alternations = 0
+            del known[: 1 - SERIES_MAX]
+        known.append(index)
+
+
 class Imu61xCanCodec:
     """Decoder of the frames of one device. Synchronization: one thread."""
 
@@ -132,16 +171,14 @@ class Imu61xCanCodec:
         self._closed_ns = 0  # arrival of the newest 105, ns
         self._pace = _Pace()
         self._closing = b""  # data of the newest 105
-        self._other: int | None = None  # newest INDEX of the series before the newest jump
-        self._steady = 0  # number of consecutive 105 that follow their predecessor
-        self._alternations = 0  # number of 105 of the other series since a jump to a third series
+        self._series = _Series()
 
     @property
     def problem(self) -> str:
-        """Return the conflict of two devices with the same identifiers; empty without a conflict."""
-        if self._alternations < ALTERNATIONS:
+        """Return the conflict of devices with the same identifiers; empty without a conflict."""
+        if not self._series.are_several:
             return ""
-        return "INDEX alternates between two series; do two devices on the bus have this base_id?"
+        return "INDEX alternates between series; do two or more devices on the bus have this base_id?"
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
         """Decode one frame. Return the completed events. Never raises an exception."""
@@ -192,12 +229,8 @@ class Imu61xCanCodec:
         before_ns, self._closed_ns = self._closed_ns, t_rx_ns
         span_ns = t_rx_ns - self._first_ns
         follows = before is not None and (index - before) % INDEX_MODULUS == 1
-        if before is not None and not follows and data != self._closing:
-            self._note_series(index, before)
-        elif follows:
-            self._steady += 1
-            if self._steady >= STEADY:
-                self._alternations = 0
+        if data != self._closing:
+            self._series.add(index)
         self._closing = data
         places = tuple(held)
         in_time = places == _IN_ORDER and span_ns <= pace.longest_ns
@@ -220,13 +253,6 @@ class Imu61xCanCodec:
         ):  # fmt: skip
             return (measurement,)
         return (*self._not_finite(raw), measurement)
-
-    def _note_series(self, index: int, before: int) -> None:
-        """Note an INDEX that does not follow `before`. Two devices continue two series, which can have equal INDEX."""
-        is_other = self._other is not None and (index - self._other) % INDEX_MODULUS == 1
-        is_equal = index == before and self._steady > 0  # 0: the device repeats its INDEX
-        self._alternations = self._alternations + 1 if is_other or is_equal else 0
-        self._other, self._steady = before, 0
 
     def _not_finite(self, raw: bytes) -> list[CodecEvent]:
         """Return a `BadFrame` for every frame with a value that is not possible."""

@@ -338,16 +338,6 @@ def test_frames_reach_one_sample_each_under_any_loss(seed: int, kinds: dict[int,
     assert rig.ledger.lost() <= 1.25 * lost + 3 * (rate > 0)
 
 
-@pytest.mark.parametrize("kinds", [{1: 1}, EQUAL, MIXED])
-@pytest.mark.parametrize("rate", [0.05, 0.1, 0.2, 0.4])
-def test_lost_frames_are_not_a_second_device(kinds: dict[int, int], rate: float) -> None:
-    random, assembly = Random(3), Assembly(Ledger())
-    for frame in stream(kinds, range(2000)):
-        if random.random() > rate:
-            assembly.add_frame(frame.kind, frame.data, frame.t_ns + random.randrange(100_000))
-            assert assembly.problem == ""
-
-
 @given(seed=st.integers(0, 2**32))
 def test_any_frames_at_any_time_keep_the_ledger_closed(seed: int) -> None:
     random = Random(seed)
@@ -394,64 +384,6 @@ def test_sids_without_a_loss_and_sids_that_no_longer_agree() -> None:
     assert rig.ledger.lost() == 0
     assert rig.ledger.lost_unknown == 0
     assert all(rig.kinds_of(burst) == (1, 2, 3) for burst in range(120, 199))
-
-
-@pytest.mark.parametrize("phase", [0.15, 0.33, 0.45, 0.7, 0.85])
-@pytest.mark.parametrize("kinds", [{1: 1}, EQUAL])
-@pytest.mark.parametrize("has_sids", [False, True])
-def test_two_devices_with_one_address_are_reported(phase: float, kinds: dict[int, int], has_sids: bool) -> None:
-    """The second device starts later. It has a crystal of its own, 100 ppm slower, and its own SIDs."""
-
-    def frames(bursts: range) -> list[Frame]:
-        first = stream(kinds, bursts)
-        second = [
-            f._replace(
-                t_ns=f.t_ns + round(phase * PERIOD_NS) + f.burst * PERIOD_NS // 10_000, data=b"\0\0\0\1" + f.data
-            )
-            for f in first
-        ]
-        return sorted(first + second, key=lambda frame: frame.t_ns)
-
-    def add(sent: list[Frame]) -> None:
-        for frame in sent:
-            sid = (frame.burst + 77 * len(frame.data)) % 253 if has_sids else None
-            assembly.add_frame(frame.kind, frame.data, frame.t_ns, sid)
-
-    assembly = Assembly(Ledger())
-    add(stream(kinds, range(30)))
-    assert assembly.problem == ""
-    add(frames(range(30, 180)))
-    assert "each frame arrives twice per period of 5.0 ms, " in assembly.problem
-    add(stream(kinds, range(190, 530)))
-    assert assembly.problem == ""
-
-
-@pytest.mark.parametrize("every", [1.3, 2, 3.3, 5, 10])
-@pytest.mark.parametrize("phase", [0.15, 0.5, 0.8])
-@pytest.mark.parametrize("kinds", [{1: 1}, EQUAL])
-@pytest.mark.parametrize("sids", [0, 1])
-@pytest.mark.parametrize("begin", [0, 100])
-def test_two_devices_with_one_address_at_different_rates_are_reported(
-    every: float, phase: float, kinds: dict[int, int], sids: int, begin: int
-) -> None:
-    """The SIDs of each device rise by one. The arrival times have a jitter of 0.1 ms."""
-    random = Random(1)
-
-    def add(*sent: list[Frame]) -> None:
-        for frame in sorted((f for one in sent for f in one), key=lambda frame: frame.t_ns):
-            sid = (frame.burst + 77 * len(frame.data)) % 253 if sids else None
-            assembly.add_frame(frame.kind, frame.data, frame.t_ns + random.randrange(100_000), sid)
-
-    def slow(bursts: int) -> list[Frame]:
-        delay_ns = round((begin + phase) * PERIOD_NS)
-        made = stream(kinds, range(bursts), round(every * PERIOD_NS * 1.0001))
-        return [f._replace(t_ns=f.t_ns + delay_ns, data=b"\0\0\0\1" + f.data) for f in made]
-
-    assembly = Assembly(Ledger())
-    add(stream(kinds, range(700)), slow(int((699 - begin) / every)))
-    assert f"an extra frame arrives every {every * 5:.1f} ms between " in assembly.problem
-    add(stream(kinds, range(710, 1100)))
-    assert assembly.problem == ""
 
 
 def lost(*times_ms: float, period_ms: int = 5) -> int:

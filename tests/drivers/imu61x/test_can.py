@@ -51,6 +51,9 @@ def indices(events: list[CodecEvent]) -> list[int | None]:
     ("pairs", "is_found"),
     [([(n, 5000 + n) for n in range(40)], True), ([(n, n) for n in range(40)], True),  # same power switch
      ([(n, n + 1) for n in range(40)], True), ([(2 * n, 2 * n + 1, 500 + n) for n in range(40)], True),  # half the rate
+     ([(n, 300 + n, 600 + n) for n in range(40)], True), ([(n, n, n) for n in range(40)], True),
+     ([(n, 300 + n, 600 + n, 900 + n)[: 3 + (n % 7 > 0)] for n in range(40)], True),  # the fourth loses samples
+     ([(n + n // 5,) for n in range(90)], False),
      ([(7, 7)] * 40, False), ([(n * n,) for n in range(90)], False), ([(n,) for n in range(90)], False)],
 )  # fmt: skip
 def test_two_devices_with_one_base_id_are_found(pairs: list[tuple[int, ...]], *, is_found: bool) -> None:
