@@ -97,7 +97,12 @@ DISORDER_NS: Final = NS_PER_MS
 # Minimum rise of the time from line to line that counts as a step of the clock, ns. A shorter rise is a pause.
 STEP_NS: Final = 3600 * NS_PER_S
 PAUSE_NS: Final = 10 * NS_PER_S  # minimum pause that imud reports, ns
+SHIFT_NS: Final = NS_PER_MS  # minimum shift of the times of an identifier that imud reports, ns
+SHIFT_PERIOD_NS: Final = NS_PER_S  # maximum distance of the times of such an identifier, ns
+SHIFT_IDS: Final = 256  # maximum number of identifiers whose shifts imud detects
+REGULAR, SHIFTED = 8, 4  # number of regular distances before and after a shift
 PAUSES_KEPT: Final = 16  # number of known distances. The longest one replaces the unknown distance at a step.
+PAUSE: Final = "a pause or a step of the clock"
 JUMPS_SHOWN: Final = 5  # maximum number of steps and pauses in a text
 INTERFACES_MAX: Final = 16  # maximum number of interfaces in a text
 
@@ -115,6 +120,41 @@ def _several(names: Iterable[str]) -> BadArgument:
     return BadArgument(
         f"the log has frames of the interfaces {_listed(names, 'and')}: select one of them (--interface, key interface)"
     )
+
+
+class _Times:
+    """Times of one identifier. A shift of regular times can be a step of the clock that is shorter than the distances
+    of the lines.
+    """
+
+    __slots__ = ("_distances_ns", "_newest_ns", "_since", "_step")
+
+    def __init__(self, t_ns: int) -> None:
+        self._newest_ns = t_ns
+        self._distances_ns: deque[int] = deque(maxlen=REGULAR)
+        self._step = (0, 0)  # line and size of a possible shift, ns; 0: none
+        self._since = 0  # number of regular distances since then
+
+    def add(self, t_ns: int, number: int) -> tuple[int, int] | None:
+        """Add the time of a line. Return line and size (ns) of an earlier shift if this line proves it."""
+        distance_ns, self._newest_ns = t_ns - self._newest_ns, t_ns
+        known = sorted(self._distances_ns)
+        if len(known) == REGULAR:
+            usual_ns, spread_ns = known[REGULAR // 2], known[-1] - known[0]
+            rise_ns = distance_ns - usual_ns
+            if abs(rise_ns) <= max(spread_ns, SHIFT_NS // 2):
+                self._since += 1
+                if self._step[0] and self._since == SHIFTED:
+                    step, self._step = self._step, (0, 0)
+                    return step
+            elif rise_ns < -max(2 * spread_ns, SHIFT_NS) and usual_ns <= SHIFT_PERIOD_NS and not self._step[0]:
+                self._step, self._since = (number, rise_ns), 0
+                return None
+            else:
+                self._step = (0, 0)
+                self._distances_ns.clear()
+        self._distances_ns.append(distance_ns)
+        return None
 
 
 class CandumpReader:
@@ -139,6 +179,8 @@ class CandumpReader:
         self._newest_ns: int | None = None  # newest time in the log
         self._offset_ns = 0  # offset of the newest time to `t_rx_ns`
         self._distances_ns: deque[int] = deque(maxlen=PAUSES_KEPT)
+        self._times: dict[int, _Times] = {}  # times since the newest step by identifier
+        self._shifted = 0  # line of the newest shift
 
     @property
     def problem(self) -> str:
@@ -172,6 +214,7 @@ class CandumpReader:
             if not self._is_own(_text(name)):
                 continue
             t_ns, is_jump = self._time(int(seconds) * NS_PER_S + int(fraction.ljust(9, b"0")), number)
+            self._look_for_shift(can_id, t_ns, number, is_jump=is_jump)
             yield CanFrame(can_id, len(digits) == 8, bytes.fromhex(data.decode("ascii")), t_ns, is_jump)
         if self._others and not self._has_frames:
             raise BadArgument(f"interface {self.interface}: expected {_listed(self._others, 'or')}, as in the log")
@@ -208,7 +251,9 @@ class CandumpReader:
         rise_ns = log_ns - self._newest_ns
         is_step = rise_ns < -DISORDER_NS or rise_ns >= STEP_NS
         if is_step or rise_ns >= PAUSE_NS:
-            self._note_jump(rise_ns, number, is_step=is_step)
+            self._note_jump(rise_ns, number, "a step of the clock, removed by imud" if is_step else PAUSE)
+        elif rise_ns < 0:
+            self._note_jump(rise_ns, number, "lines in another order, or a short step of the clock")
         if is_step:
             self._offset_ns += rise_ns - max(self._distances_ns, default=0)
             self._newest_ns = log_ns
@@ -217,11 +262,23 @@ class CandumpReader:
             self._newest_ns = log_ns
         return self._newest_ns - self._offset_ns, is_step
 
-    def _note_jump(self, rise_ns: int, number: int, *, is_step: bool) -> None:
+    def _look_for_shift(self, can_id: int, t_ns: int, number: int, *, is_jump: bool) -> None:
+        """Report a step of the clock that is shorter than the distance of two lines."""
+        if is_jump:
+            self._times.clear()
+        times = self._times.get(can_id)
+        if times is None:
+            if len(self._times) < SHIFT_IDS:
+                self._times[can_id] = _Times(t_ns)
+        elif (shift := times.add(t_ns, number)) and shift[0] > self._shifted:
+            self._shifted = number  # the other identifiers show the same step in the lines before this line
+            self._note_jump(shift[1], shift[0], "a step of the clock, or another phase of the sender", "shifts")
+
+    def _note_jump(self, rise_ns: int, number: int, what: str, verb: str = "changes") -> None:
         self._jump_count += 1
         if len(self._jumps) < JUMPS_SHOWN:
-            what = "a step of the clock, removed by imud" if is_step else "a pause or a step of the clock"
-            self._jumps.append(f"line {number}: the time changes by {rise_ns / NS_PER_S:+.3f} s ({what})")
+            digits = 3 if abs(rise_ns) >= NS_PER_MS else 6
+            self._jumps.append(f"line {number}: the time {verb} by {rise_ns / NS_PER_S:+.{digits}f} s ({what})")
 
     def _note(self, line: bytes, number: int, *, passed: bool = False) -> None:
         if passed or _OTHER.fullmatch(line):

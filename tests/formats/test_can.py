@@ -79,7 +79,13 @@ def test_lines_of_candump() -> None:
 @pytest.mark.parametrize(
     ("times_s", "expected_s", "words"),
     [
-        ((5, 4.9995, 6), (5, 5, 6), ""),  # two lines in another order
+        ((5, 4.9995, 6), (5, 5, 6), "line 2: the time changes by -0.000500 s (lines in another order, or"),
+        ((*range(10), 9.996, *range(11, 15)), (*range(10), 9.996, *range(11, 15)), ""),  # one late frame before
+        ((*range(10), *(t - 0.004 for t in range(10, 15))), (*range(10), *(t - 0.004 for t in range(10, 15))),
+         "line 11: the time shifts by -0.004 s (a step of the clock, or another phase of the sender)"),
+        ((*range(10), *(t - 0.9 for t in range(10, 15))), (*range(10), *(t - 0.9 for t in range(10, 15))),
+         "line 11: the time shifts by -0.900 s (a step"),
+        ((*range(9), *(8 + t / 2 for t in range(1, 12))), (*range(9), *(8 + t / 2 for t in range(1, 12))), ""),  # rate
         ((5, 5.01, 4, 4.01), (5, 5.01, 5.02, 5.03), "line 3: the time changes by -1.010 s (a step of"),
         ((5, 5.01, 3605.01, 3605.11), (5, 5.01, 5.02, 5.12), "line 3: the time changes by +3600.000 s (a step of"),
         ((5, 14.999, 24.999), (5, 14.999, 24.999), "line 3: the time changes by +10.000 s (a pause or a step"),
