@@ -98,7 +98,8 @@ def events_in(
                 frame_codec.reset()
             yield from frame_codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns)
         yield from frame_codec.flush()
-        for problem in filter(None, (log.problem, frame_codec.problem)):
+        others = driver.other_nodes(settings, log.identifiers.values())
+        for problem in filter(None, (log.problem, frame_codec.problem, others)):
             print(problem, file=sys.stderr)
         unknown = frame_codec.unknown
     else:

@@ -433,7 +433,15 @@ def export_capture(
     else:
         player.play_bytes(reader, baud)
     device = player.device
-    words = [(reader.problem, "file: "), (player.problem, "device: "), (player.times.value, "times: ")]
+    others = ""
+    if isinstance(reader, CandumpReader) and isinstance(driver, CanDriver):
+        others = driver.other_nodes(options, reader.identifiers.values())
+    words = [
+        (reader.problem, "file: "),
+        (others, "file: "),
+        (player.problem, "device: "),
+        (player.times.value, "times: "),
+    ]
     lines = [line for text, label in words if text for line in paragraph(label, text)]
     is_damaged = isinstance(reader, CaptureReader) and reader.is_damaged
     status = 0 if device.ledger.samples and not is_damaged else 1

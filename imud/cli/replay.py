@@ -226,7 +226,10 @@ def run(args: argparse.Namespace) -> int:
         status = play(args)
     status = replace(status, condition=None)  # the condition uses the time of this host
     print(block(status, without_times, virtual=args.speed == "maximum"), file=sys.stderr)
-    is_damaged = not isinstance(DRIVERS[args.driver], CanDriver) and problem_of(args)[1]
+    driver = DRIVERS[args.driver]
+    if isinstance(driver, CanDriver) and (others := others_of(args, driver)):
+        print("\n".join(paragraph("file: ", others)), file=sys.stderr)
+    is_damaged = not isinstance(driver, CanDriver) and problem_of(args)[1]
     return 0 if status.ledger["samples"] and not is_damaged else 1
 
 
@@ -256,6 +259,14 @@ def names_rate(args: argparse.Namespace) -> bool:
         return False
     with open_regular(args.file) as file:
         return CaptureReader(file).baud > 0
+
+
+def others_of(args: argparse.Namespace, driver: CanDriver) -> str:
+    """Describe the devices of a CAN log that the options do not select; empty if there are none."""
+    with open_regular(args.file) as file:
+        log = CandumpReader(file, args.interface or "")
+        deque(log, maxlen=0)
+    return driver.other_nodes(driver_settings(driver, given_options(driver, args.option)), log.identifiers.values())
 
 
 def problem_of(args: argparse.Namespace) -> tuple[str, bool]:

@@ -16,8 +16,18 @@ import numpy as np
 from imud import config
 from imud.analysis.series import FloatArray, Readings
 from imud.cli.arguments import connect, statuses
-from imud.cli.replay import BAUD, DRIVER, check, configuration, has_times, looks_like_recording, problem_of, serve
-from imud.contracts.driver import DataSheet
+from imud.cli.replay import (
+    BAUD,
+    DRIVER,
+    check,
+    configuration,
+    has_times,
+    looks_like_recording,
+    others_of,
+    problem_of,
+    serve,
+)
+from imud.contracts.driver import CanDriver, DataSheet
 from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceStatus
 from imud.daemon import Daemon
@@ -296,7 +306,9 @@ def take_capture(args: argparse.Namespace) -> SampleSet:
     status = daemon.status()[0]
     sample_set = SampleSet(args.input, driver=status.driver, link=status.link, identity=status.identity)
     sample_set.settings = status.settings
-    sample_set.notes += filter(None, (problem_of(replayed)[0], status.problem))
+    driver = DRIVERS[replayed.driver]
+    others = others_of(replayed, driver) if isinstance(driver, CanDriver) else ""
+    sample_set.notes += filter(None, (problem_of(replayed)[0], status.problem, others))
     finished = _finished(sample_set, collector, tally.found())
     finished.device, finished.begun_utc_ns = args.device or "capture", None
     return finished

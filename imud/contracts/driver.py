@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from random import Random
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Final, Literal, NamedTuple, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -279,6 +279,31 @@ class CanDriver(Driver):
     example_frames: Callable[[Random], Sequence[CanFrame]]
     # Returns the frames that imud sends cyclically while the link is open. Read-only links do not send them.
     cyclic: Callable[[Any], Sequence[CyclicFrame]] = nothing_cyclic
+
+    def other_nodes(self, options: Any, frames: Iterable[Sequence[CanFrame]]) -> str:
+        """Describe the devices that these options do not select; empty if there are none.
+
+        `frames`: first frames of each identifier. A single frame does not show a device.
+        """
+        filters = self.filters(options)
+        repeated = [one[0] for one in frames if len(one) > 1]
+        nodes = {
+            node
+            for one in repeated
+            if not any(wanted.matches(one.can_id, one.extended) for wanted in filters)
+            and (node := self.node_of(one.can_id, one.extended, one.data)) is not None
+        }
+        titles = [self.node_title(node) for node in sorted(nodes)]
+        if not titles:
+            return ""
+        more = f" and {len(titles) - NODES_SHOWN} more" * (len(titles) > NODES_SHOWN)
+        return (
+            f"the log has frames of other devices, which imud ignores: {', '.join(titles[:NODES_SHOWN])}{more}; "
+            "--option selects one of them"
+        )
+
+
+NODES_SHOWN: Final = 8  # maximum number of other devices in a text
 
 
 T = TypeVar("T")

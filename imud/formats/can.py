@@ -104,6 +104,8 @@ REGULAR, SHIFTED = 8, 4  # number of regular distances before and after a shift
 PAUSES_KEPT: Final = 16  # number of known distances. The longest one replaces the unknown distance at a step.
 PAUSE: Final = "a pause or a step of the clock"
 JUMPS_SHOWN: Final = 5  # maximum number of steps and pauses in a text
+IDENTIFIERS_MAX: Final = 4096  # maximum number of known identifiers
+FIRST: Final = 2  # number of known frames of each identifier
 INTERFACES_MAX: Final = 16  # maximum number of interfaces in a text
 
 
@@ -171,6 +173,7 @@ class CandumpReader:
         self.passed_over = 0  # number of valid lines without a data frame
         self.bad_lines = 0
         self.first_bad = 0  # number of the first invalid line, starting at 1; 0 if all lines are valid
+        self.identifiers: dict[tuple[int, bool], list[CanFrame]] = {}  # first frames of each identifier, at most FIRST
         self._is_chosen = bool(interface)
         self._has_frames = False
         self._others: dict[str, None] = {}  # names of the ignored interfaces
@@ -215,7 +218,12 @@ class CandumpReader:
                 continue
             t_ns, is_jump = self._time(int(seconds) * NS_PER_S + int(fraction.ljust(9, b"0")), number)
             self._look_for_shift(can_id, t_ns, number, is_jump=is_jump)
-            yield CanFrame(can_id, len(digits) == 8, bytes.fromhex(data.decode("ascii")), t_ns, is_jump)
+            frame = CanFrame(can_id, len(digits) == 8, bytes.fromhex(data.decode("ascii")), t_ns, is_jump)
+            if len(self.identifiers) < IDENTIFIERS_MAX:
+                first = self.identifiers.setdefault((can_id, frame.extended), [])
+                if len(first) < FIRST:
+                    first.append(frame)
+            yield frame
         if self._others and not self._has_frames:
             raise BadArgument(f"interface {self.interface}: expected {_listed(self._others, 'or')}, as in the log")
 

@@ -282,6 +282,23 @@ def test_two_devices_of_one_address_are_told(
     assert status == 2 or "do two or more devices on the bus have this" in report
 
 
+@every_command
+@pytest.mark.parametrize(
+    ("driver", "words"),
+    [("hipnuc-canopen", "imud ignores: node 9;"), ("hipnuc-j1939", "imud ignores: address 9;"),
+     ("hipnuc-nmea2000", "imud uses source 35 and ignores source 36;")],
+)  # fmt: skip
+def test_a_second_device_with_an_address_of_its_own_is_named(
+    driver: str, words: str, command: str, tmp_path: Path, cli: Cli
+) -> None:
+    lines = [candump_line(f._replace(can_id=f.can_id + add)) for one in sets(driver) for f in one for add in (0, 1)]
+    (tmp_path / "x.log").write_text("".join(lines))
+    status = status_of(command, driver)
+    report = run(cli, command, driver, tmp_path / "x.log", status=status)
+    assert status == 2 or words in report
+    assert f'"frames_good":{len(lines) // 2}' in report or command != "decode"
+
+
 def test_one_device_is_not_a_conflict_and_json_lines_are_complete(tmp_path: Path, cli: Cli) -> None:
     for driver in DRIVERS:
         (tmp_path / "x.log").write_text("".join(candump_line(f) for one in sets(driver) for f in one))

@@ -155,6 +155,7 @@ def _clip(value: float, most: int) -> int:
 
 # Time without a message after which imud selects another sender, ns. The slowest message has a period of 1 s.
 SILENT_NS: Final = 3 * NS_PER_S
+SENDERS_SHOWN: Final = 8  # maximum number of other senders in a text
 
 _PGNS: Final = {join(J1939Id(0, pgn, 0)): pgn for pgn in PGNS}  # PGN by identifier without priority and source
 _REFERENCES: Final = {"true": Reference.TRUE, "magnetic": Reference.MAGNETIC, "auto": None}
@@ -179,12 +180,21 @@ class HipnucNmea2000Codec:
         self._wanted_reference = _REFERENCES[settings.heading]
         self._set_sender(self._fixed)
         self._heard_ns = 0
+        self._frames: dict[int, int] = {}  # number of frames by source, at most 2; empty if options.source is set
         self.unknown: dict[int, int] = {}  # number of frames by unknown PGN
 
     @property
     def problem(self) -> str:
-        """Return the address conflict that the frames show; empty without a conflict."""
-        return self._assembly.problem
+        """Return the address conflict, or the other senders that the frames show; empty without them."""
+        others = [f"source {source}" for source in self._frames if source != self._source and self._frames[source] > 1]
+        if not others:
+            return self._assembly.problem
+        more = f" and {len(others) - SENDERS_SHOWN} more" * (len(others) > SENDERS_SHOWN)
+        named = (
+            f"several devices send these PGNs: imud uses source {self._source} and ignores "
+            f"{', '.join(others[:SENDERS_SHOWN])}{more}; select a device with options.source"
+        )
+        return "; ".join(filter(None, (self._assembly.problem, named)))
 
     def feed_frame(self, can_id: int, extended: bool, data: bytes, t_rx_ns: int) -> Sequence[CodecEvent]:
         """Add one frame. Return the completed events. Never raises an exception."""
@@ -218,6 +228,8 @@ class HipnucNmea2000Codec:
     # --- selection of sender and reference --------------------------------------------------------------------------
 
     def _is_sender(self, source: int, t_rx_ns: int) -> bool:
+        if self._fixed is None and source <= ADDRESS_MAX:
+            self._frames[source] = min(self._frames.get(source, 0) + 1, 2)
         if source != self._source:
             silent = t_rx_ns - self._heard_ns > SILENT_NS
             if self._fixed is not None or source > ADDRESS_MAX or (self._source is not None and not silent):

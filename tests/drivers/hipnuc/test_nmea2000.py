@@ -219,6 +219,7 @@ def test_sids_and_senders_are_never_mixed() -> None:
     codec = learned()
     assert feed(codec, burst(1, source=36), 1000 * MS) == []
     assert codec.ledger.bytes_skipped == 24
+    assert "imud uses source 35 and ignores source 36; select" in codec.problem
     found = [value for n in range(2, 42) for value in feed(codec, burst(n), n * 100 * MS + 800 * MS)]
     assert found == list(range(2, 42))
     assert feed(codec, burst(1, source=36), 4950 * MS) == []  # received 50 ms after the first sender
