@@ -432,14 +432,59 @@ ANGLE_AT_REST_RAD: Final = 0.0087
 STEEP_RAD: Final = 1.3  # minimum pitch at which roll and yaw of a device at rest can jump
 
 
+# Minimum step of the mean angular rate at the start or end of a slow turn, rad/s and standard errors. The bias of a
+# sensor at rest changes by less than 0.04 °/s in this time during the warm-up.
+TURN_STEP_RAD_S, TURN_SIGMAS = 0.0017, 8.0
+TURN_S: Final = 5  # number of seconds before and after the step; the median ignores a short bump
+
+
 def motion_words(readings: Readings) -> str:
     """Return how the device moved in the worst seconds; empty if it was at rest."""
-    # sensors without angles cannot show a slow turn about the direction of gravity
     found: list[str] = []
     for values, limits in ((readings.gyro_rad_s, GYRO_AT_REST), (readings.accel_m_s2, ACCEL_AT_REST)):
         if values is not None and (motion := _motion(*with_values(readings.t_ns, values), limits)):
             found.append(motion)
-    return "; ".join(filter(None, (*found, _turn(readings))))
+    return "; ".join(filter(None, (*found, _turn(readings), "" if found else _turn_step(readings))))
+
+
+def unverified_words(readings: Readings) -> str:
+    """Return why the data do not show rest; empty if they show it."""
+    angles, gyro, accel = readings.euler_rad, readings.gyro_rad_s, readings.accel_m_s2
+    if angles is not None and np.isfinite(angles[:, 2]).sum() >= BLOCKS_LEAST:
+        return ""
+    if gyro is None:
+        return "rest is not verified: the data contain neither angular rates nor a heading, which show slow turns"
+    mean = np.nanmean(gyro, axis=0)
+    if accel is None:
+        return (
+            f"rest is not verified: without angles and accelerations, a turn at the mean angular rate of "
+            f"{degrees(np.sqrt(mean @ mean)):.2g} °/s is the same as the bias of the sensor"
+        )
+    up = np.nanmean(accel, axis=0)
+    rate = abs(float(mean @ up)) / float(np.sqrt(up @ up))
+    return (
+        f"rest around the vertical axis is not verified: without a heading, a steady turn at the mean vertical angular "
+        f"rate of {degrees(rate):.2g} °/s is the same as the bias of the sensor"
+    )
+
+
+def _turn_step(readings: Readings) -> str:
+    """Return the start or end of a slow turn; empty without one."""
+    if readings.gyro_rad_s is None:
+        return ""
+    t_ns, values = with_values(readings.t_ns, readings.gyro_rad_s)
+    if len(t_ns) < BLOCKS_LEAST or len(mean := _blocks(t_ns, values).mean(axis=1)) < 2 * TURN_S:
+        return ""
+    level = np.median(np.lib.stride_tricks.sliding_window_view(mean, TURN_S, axis=0), axis=-1)
+    steps = np.abs(level[TURN_S:] - level[:-TURN_S])
+    error = np.median(np.abs(np.diff(mean, axis=0)), axis=0) / np.sqrt(TURN_S)
+    if not (steps > np.maximum(TURN_STEP_RAD_S, TURN_SIGMAS * error)).any():
+        return ""
+    place = int(steps.max(axis=1).argmax())
+    return (
+        f"angular rate: expected a step of the mean of at most {degrees(TURN_STEP_RAD_S):.1f} °/s, got "
+        f"{degrees(steps.max()):.2g} °/s after {(place + TURN_S) * STILL_S:.0f} s: a slow turn started or ended"
+    )
 
 
 def _blocks(t_ns: IntArray, values: FloatArray) -> FloatArray:

@@ -26,6 +26,7 @@ from imud.analysis.noise import (
     SensorNoise,
     motion_words,
     sensor_noise,
+    unverified_words,
 )
 from imud.analysis.plots import DPI, density_figure, deviation_figure, page_figure
 from imud.analysis.quantities import (
@@ -67,6 +68,7 @@ class NoiseReport:
     sensors: dict[SensorName, SensorNoise]
     sheet: ModelFigures | None  # values of a data sheet for the comparison; None for no comparison
     motion: str  # how the device moved; empty at rest
+    unverified: str  # why the data do not show rest; empty if they do, or if the device moved
 
 
 def noise_report(sample_set: SampleSet, sheet: ModelFigures | None) -> NoiseReport:
@@ -79,7 +81,8 @@ def noise_report(sample_set: SampleSet, sheet: ModelFigures | None) -> NoiseRepo
         sensors["accel"] = sensor_noise(readings, readings.accel_m_s2)
     if not sensors:
         raise ImudError(f"{sample_set.source}: {sample_set.device} sends neither angular rate nor acceleration")
-    return NoiseReport(sample_set, sensors, sheet, motion_words(readings))
+    motion = motion_words(readings)
+    return NoiseReport(sample_set, sensors, sheet, motion, "" if motion else unverified_words(readings))
 
 
 def readings_of(sample_set: SampleSet) -> Readings:
@@ -250,6 +253,8 @@ def text(report: NoiseReport) -> str:
     lines = [f"{report.sample_set.device}: noise"]
     if report.motion:
         lines += paragraph("  ", not_at_rest(report))
+    if report.unverified:
+        lines += paragraph("  ", report.unverified)
     for name, words in circumstances(report.sample_set):
         lines += paragraph(f"  {name:<13}", words)
     for sensor_name, sensor in report.sensors.items():
@@ -316,6 +321,7 @@ def as_object(report: NoiseReport) -> dict[str, Any]:
         "measurement": measurement_object(report.sample_set),
         "at_rest": not report.motion,
         "motion": report.motion or None,
+        "not_verified": report.unverified or None,
         "sensors": {name: _sensor_object(report, name, sensor) for name, sensor in report.sensors.items()},
         "data_sheet": report.sheet.source if report.sheet is not None else None,
         "manual": report.sample_set.sheet.document,

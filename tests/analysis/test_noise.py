@@ -2,6 +2,8 @@
 Allan deviation compared with allantools and with values by hand, and the coverage of the intervals.
 Noise coefficients: synthetic noise within 5 %, and no value for a coefficient that the series does not resolve."""
 
+from dataclasses import replace
+
 import allantools
 import numpy as np
 import pytest
@@ -202,6 +204,23 @@ def test_angles_show_a_turn_without_other_evidence(angle: int, slope: float, pit
         Readings(stamps_ns(COUNT, RATE_HZ), None, shaken(0.0, 1.0) + AT_REST, None, euler)
     )
     assert found.startswith(words) if words else not found
+
+
+def test_slow_turns_without_angles() -> None:
+    """A turn that starts shows a step. A steady turn around the vertical axis is not verified."""
+    gyro, accel = noise_of_three(7) / 10, shaken(0.0, 1.0) + AT_REST
+    gyro[:, 2] += 0.0035 * (SECONDS[-1] / 2 < SECONDS)
+    assert "a step of the mean of at most 0.1 °/s, got 0.2 °/s after" in analysis_noise.motion_words(readings_of(gyro))
+    readings = Readings(stamps_ns(COUNT, RATE_HZ), gyro[COUNT // 2 :], accel[COUNT // 2 :], None)
+    readings = replace(readings, t_ns=readings.t_ns[COUNT // 2 :])
+    assert not analysis_noise.motion_words(readings)
+    assert "a steady turn at the mean vertical angular rate of 0.2 °/s" in analysis_noise.unverified_words(readings)
+    assert "a turn at the mean angular rate of 0.2 °/s" in analysis_noise.unverified_words(
+        replace(readings, accel_m_s2=None)
+    )
+    assert "not verified" in analysis_noise.unverified_words(replace(readings, gyro_rad_s=None))
+    turned = replace(readings, euler_rad=np.zeros_like(readings.gyro_rad_s))
+    assert not analysis_noise.unverified_words(turned)
 
 
 def test_one_weakly_disturbed_second_in_a_hundred_seconds_is_no_motion() -> None:
