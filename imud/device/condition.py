@@ -88,6 +88,7 @@ class Facts(msgspec.Struct, kw_only=True):
     axes: FrameProblem | None = None  # kind of the contradiction in axes, angles or heading
     axes_problem: str = ""  # text of this contradiction
     lines: LinesStatus | None = None
+    has_scattered_time: bool = False  # whether the device time does not show lost samples
     utc_problem: str = ""
     open_bytes: int = 0  # bytes and frames that the ledger does not account for
     open_frames: int = 0
@@ -329,6 +330,10 @@ RULES: Final = (
         lambda f, limits: limits.t_err_ms is not None and f.t_err_ns / NS_PER_MS > limits.t_err_ms,
         lambda f, *_: f"The time stamp error is ±{f.t_err_ns / NS_PER_MS:.2g} ms.",
         "Connect SOUT, or reduce the latency timer.",
+    ),
+    Rule(
+        ReasonCode.TIME_ERROR, Section.TIME, lambda f, _: f.has_scattered_time,
+        "The device time scatters: imud cannot count lost samples.", DOCTOR,
     ),
     Rule(ReasonCode.LINK, Section.ABOUT, lambda f, _: bool(f.problem), _problem, DOCTOR),
     # the condition ok: one of these rules always holds

@@ -299,6 +299,7 @@ class Device:
             "state": self._health.state, "problem": self._health.problem, "is_polled": transport.is_polled,
             "declared": settings.status() if has_settings else None, "axes": axes, "axes_problem": axes_problem,
             "lines": transport.add_lines(self._attachments.lines_status()), "open_bytes": self.ledger.bytes_open(),
+            "has_scattered_time": path is not None and path.clock.has_scattered_time,
             "utc_problem": self._attachments.utc_problem, "open_frames": self.ledger.frames_open(),
         })  # fmt: skip
 

@@ -420,6 +420,11 @@ class SampleClock:
         """Number of resets of the device counter."""
         return self._resets + self._arrivals.resets
 
+    @property
+    def has_scattered_time(self) -> bool:
+        """Whether the device time does not show lost samples, because it scatters."""
+        return self._time.period.is_scattered
+
     def status(self) -> ClockStatus:
         self.settle()
         fit = self._fit if self._fit_sync is not Sync.ARRIVAL else None
@@ -570,7 +575,7 @@ class SampleClock:
 
     def _begin_counter(self, ticks: int, arrival_ns: int, missed: int | None) -> None:
         """Start with a new counter value. `missed` is the number of lost samples; None if unknown."""
-        if missed is None and self._seq and not self._time.period.is_gap:
+        if missed is None and self._seq:
             period_ns = self._period_ns()
             if not period_ns or arrival_ns - self._host.steady_ns(self._t_ns) >= GAP_PERIODS * period_ns:
                 self._on_unknown_gap()

@@ -41,6 +41,10 @@ OUTSIDE_MOST: Final = 0.5
 # Number of steps of two ticks, each after the same number of steps of one tick, that show an uneven rate (900 Hz at
 # 1 ms). Frames that are lost at random are not regular.
 REGULAR: Final = 8
+# Number of steps that are not whole periods, less half of the other steps, after which the device time scatters. A
+# change of the rate has at most CONSISTENT_LONGER such steps.
+SCATTERED, SCATTERED_MOST = 16, 32
+SCATTER_SHARE: Final = 1 / 8  # maximum difference between a step and whole periods, in periods, or one tick
 MEMORY: Final = 4096  # Number of steps in the mean of an uneven period. After that, both sums are halved.
 
 
@@ -54,13 +58,13 @@ class PeriodLearner:
 
     __slots__ = (
         "_before", "_candidate", "_count", "_even", "_high", "_low", "_odd_at", "_on_unknown_gap", "_outside",
-        "_regular", "_run", "_run_sum", "_spacing", "_steady", "_sum", "_uneven", "_uneven_sum", "_unjudged", "changes",
-        "is_gap", "is_new", "period_ticks",
+        "_regular", "_run", "_run_sum", "_scatter", "_spacing", "_steady", "_sum", "_uneven", "_uneven_sum",
+        "_unjudged", "changes", "is_new", "period_ticks",
     )  # fmt: skip
 
     def __init__(self, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
         self._on_unknown_gap = on_unknown_gap
-        self.is_gap = False  # whether the newest step of another length was reported as a gap of unknown size
+        self._scatter = 0.0
         self.period_ticks = 0.0  # mean step, ticks; 0 if unknown
         self._sum = 0.0
         self._count = 0.0
@@ -70,7 +74,7 @@ class PeriodLearner:
         self._run = 0
         self._run_sum = 0
         self._uneven = self._uneven_sum = 0  # consecutive steps that are not exactly the period, and their sum
-        self._unjudged: list[int] = []  # steps before the first period that were not reported as gaps
+        self._unjudged: list[int] = []  # steps before the first period
         self._odd_at = 0.0  # number of the last step of another length
         # whether many equal steps preceded it; a period from steps with losses is not a rate
         self._steady = False
@@ -84,8 +88,21 @@ class PeriodLearner:
         # number of equal steps before the last step of two ticks, and number of consecutive times it was the same
         self._spacing, self._regular = 0.0, 0
 
+    @property
+    def is_scattered(self) -> bool:
+        """Whether the steps do not show lost samples, because the device time scatters."""
+        return self._scatter >= SCATTERED
+
     def add_step(self, ticks: int) -> int:
         """Add the step to the newest sample. Return the number of lost samples in the step."""
+        period = self.period_ticks
+        off = abs(ticks - max(round(ticks / period), 1) * period) if period else 0.0
+        is_off = off > max(1.0, SCATTER_SHARE * period) or len(self._unjudged) == UNJUDGED_MOST
+        self._scatter = min(self._scatter + 1, SCATTERED_MOST) if is_off else max(self._scatter - 0.5, 0.0)
+        lost = self._lost_in(ticks)
+        return 0 if self.is_scattered else lost
+
+    def _lost_in(self, ticks: int) -> int:
         period = self.period_ticks
         if ticks <= 0:  # two samples in one tick, or the same sample again
             if 0 < period < EVERY_TICK:
@@ -106,15 +123,16 @@ class PeriodLearner:
     def restart(self, *, was_added: bool = False) -> None:
         """Forget the newest step: the counter restarted, or imud did not receive frames for a time. `was_added`: the
         newest step was already added, and it is not a step of one counter. The caller reports the gap."""
-        if was_added and self._unjudged and not self.is_gap:
+        if was_added and self._unjudged:
             self._unjudged.pop()
-        self._run, self.is_gap = 0, False
+        self._run = 0
         self._low, self._high = 0.0, 1.0
 
     def add_even_steps(self, count: int = 1) -> None:
         """Add `count` steps that equal the period exactly, at least one."""
         self._run = 0
         self._even += count
+        self._scatter = max(self._scatter - count / 2, 0.0) if self._scatter else 0.0
 
     def steps_in(self, ticks: int) -> int:
         """Return the number of periods in a longer step. The period must be known."""
@@ -125,7 +143,9 @@ class PeriodLearner:
             return steps
         if steps <= LEARNED_STEPS and abs(ticks - steps * period) <= 1:
             self._average(ticks, steps)  # the mean without the lost steps is wrong by a thousandth
-        elif steps > (self._count + self._even) * period:  # the error of the mean exceeds one tick
+        elif (
+            steps > (self._count + self._even) * period and not self.is_scattered
+        ):  # the error of the mean exceeds one tick
             self._on_unknown_gap()
         return steps
 
@@ -186,7 +206,7 @@ class PeriodLearner:
 
     def _learn(self, ticks: int) -> bool:
         """Use another period if the last steps agree on it. Return whether they agree."""
-        self._uneven, self._uneven_sum, self.is_gap = 0, 0, False
+        self._uneven = self._uneven_sum = 0
         is_first = not self.period_ticks
         if is_first and len(self._unjudged) < UNJUDGED_MOST:
             self._unjudged.append(ticks)
@@ -194,14 +214,6 @@ class PeriodLearner:
             self._run += 1
             self._run_sum += ticks
         else:
-            if self._run and is_first:
-                # without a period, the longer of two adjacent steps contains the gap
-                shorter, longer = sorted((ticks, self._candidate))
-                if longer > GAP_FACTOR * shorter + 1:
-                    self.is_gap = True
-                    self._on_unknown_gap()
-                    if longer in self._unjudged:
-                        self._unjudged.remove(longer)
             self._candidate, self._run, self._run_sum = ticks, 1, ticks
             if self._note_odd(ticks) and self.period_ticks == 1:
                 self._adopt(int(self._spacing) + 2, int(self._spacing) + 1, is_new=False)
@@ -215,10 +227,12 @@ class PeriodLearner:
         return True
 
     def _judge(self) -> None:
-        """Report the gaps among the steps before the first period. Two adjacent gaps can have the same length."""
-        for ticks in self._unjudged:
-            if int(ticks / self.period_ticks + 0.5) > 1 and ticks - self.period_ticks >= 1:
-                self._on_unknown_gap()
+        """Report the gaps among the steps before the first period, unless shorter steps make up for them."""
+        period = self.period_ticks
+        gaps = sum(int(ticks / period + 0.5) > 1 and ticks - period >= 1 for ticks in self._unjudged)
+        missing = sum(self._unjudged) / period - len(self._unjudged)
+        for _ in range(min(gaps, max(round(missing), 0)) if not self.is_scattered else 0):
+            self._on_unknown_gap()
         self._unjudged.clear()
 
     def _note_odd(self, ticks: int) -> bool:

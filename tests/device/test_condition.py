@@ -106,6 +106,8 @@ LATE = facts(t_err_ns=2_100_000)
             "Compare the measured values with the limits of the device (docs/lines.md).",
         ),
         (facts(lines=LinesStatus({"sout": "no chip"}, {}, {})), "attention", "Line sout: no chip.", DOCTOR),
+        (facts(has_scattered_time=True), "degraded", "The device time scatters: imud cannot count lost samples.",
+         DOCTOR),
         (facts(utc_problem="gpsd is down"), "attention", "gpsd is down.".capitalize(), DOCTOR),
         (
             facts(open_bytes=3), "attention", "The ledger does not balance: 3 bytes.",

@@ -103,7 +103,8 @@ def test_missing_samples_of_steps(steps: list[int], missed: list[int], period: i
     [
         ([400, 300, 100, 100, 100, 100], 2),  # of about the same length: neither is longer than the other
         ([300, 300, 100, 100, 100, 100], 2),
-        ([400, 100, 300, 100, 100, 100, 100], 3),  # 300 is longer than the period before and after it
+        ([400, 100, 300, 100, 100, 100, 100], 2),
+        ([100, 160, 40, 100, 101, 100, 100], 0),  # the short step makes up for the long step
         ([100, 101, 99, 100], 0),
         ([2, 3, 2, 3, 2, 3], 0),
         ([1, 1, 2, 1], 0),  # 750 Hz in milliseconds, or a loss: accurate within one sample
@@ -118,6 +119,20 @@ def test_gaps_from_before_a_period_is_known_are_noted_when_it_is(steps: list[int
     assert len(noted) == gaps
     learner.add_even_steps(1000)
     assert len(noted) == gaps
+
+
+@pytest.mark.parametrize(("period", "scatter"), [(10, 4), (20, 6), (50, 20), (50, 40), (100, 30)])
+def test_a_device_time_that_scatters_does_not_show_losses(period: int, scatter: int) -> None:
+    random, noted, learner, newest = Random(1), list[int](), PeriodLearner(lambda: noted.append(1)), 0
+    lost = 0
+    for number in range(1, 3000):
+        ticks = max(number * period + random.randint(-scatter, scatter), newest)
+        lost += learner.add_step(ticks - newest)
+        newest = ticks
+    assert (lost, len(noted), learner.is_scattered) == (0, 0, True)
+    for _ in range(40):
+        lost += learner.add_step(period)
+    assert (learner.add_step(2 * period), lost, learner.is_scattered) == (1, 0, False)
 
 
 def test_steps_to_another_counter_and_steps_that_never_agree() -> None:
