@@ -304,11 +304,13 @@ class CalibrationRun:
         self._tick_future: asyncio.Future[tuple[int, Sample | None]] | None = None
         self._now_ns = 0
         self._seen_seq = 0
+        self._clock: SampleClock | None = None  # clock of the device; None before imud has found the device
 
     # --- the attachment ----------------------------------------------------------------------------------------------
 
-    def start(self, _clock: SampleClock) -> None:
-        """Do nothing. A calibration starts only on request."""
+    def start(self, clock: SampleClock) -> None:
+        """Watch this clock. A calibration starts only on request."""
+        self._clock = clock
 
     def tick(self, now_ns: int, newest: Sample | None) -> None:
         """Pass the newest sample to the calibration, ten times per second."""
@@ -361,11 +363,14 @@ class CalibrationRun:
 
     async def _begun(self, kind: str, calibration: Calibration, save: bool) -> CalibrationResult:
         """Run a calibration after its first event, and report its end. The caller reports errors."""
+        resets = self._resets
         if calibration.handling is Handling.REST:
             device, checks, problem = await self._at_rest(kind, calibration)
         else:
             device, checks, problem = await self._turned(kind, calibration)
         problem = problem or _failed(checks)
+        if self._resets != resets:
+            problem = "the device restarted during the calibration; check its power supply and repeat the calibration"
         saved = calibration.kept is Kept.BY_DEVICE and not problem
         if save and not problem and calibration.save is not None:
             await self._transport.run_script(calibration.save)
@@ -428,6 +433,11 @@ class CalibrationRun:
         return verdict.words, checks, problem
 
     # --- samples -----------------------------------------------------------------------------------------------------
+
+    @property
+    def _resets(self) -> int:
+        """Number of restarts of the device counter."""
+        return self._clock.resets if self._clock is not None else 0
 
     async def _rest(self, kind: str) -> RestMeans:
         """Wait for the rest of the device and return the means of its samples. Raises CommandError."""

@@ -114,6 +114,8 @@ class VerbRun:
             match verb.proof:
                 case Proof.SCRIPT if isinstance(answer, VerbResult):
                     verified, evidence, answer = answer.verified, answer.evidence, answer.result
+                    if verified and not restarts and await self._samples.has_restarted():
+                        verified, evidence = False, "the device restarted during the command"
                 case Proof.VALUE:
                     return answer
                 case Proof.NONE:

@@ -87,6 +87,11 @@ class SampleWatch:
         """Return whether a sample has arrived since `mark`."""
         return await self.next(self._before) is not None
 
+    async def has_restarted(self) -> bool:
+        """Return whether the next sample shows a restart of the device counter since `mark`."""
+        await self.next(self.newest)
+        return self.counter_resets != self._resets
+
     async def evidence(self, proof: Proof, is_quiet: bool) -> tuple[bool | None, str]:
         """Return whether the samples show the effect of a verb since `mark`, None: unknown, and the observation.
 

@@ -6,6 +6,7 @@ from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import replace
 from itertools import permutations, product
 from math import pi, radians
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -20,6 +21,7 @@ from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
 from imud.model.sample import Pair, Sample, Sync, Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.sampling.clock import SampleClock
 from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings
 from imud.sim.physics import Motion, Still, Truth, tumble
 from tests.support.event_loops import VirtualClock, run_virtually
@@ -196,6 +198,18 @@ async def test_motion_during_the_calibration_is_an_error(rig: GuideRig) -> None:
     result = await rig.guide.run("gyro", gyro(rig), save=True)
     assert result.problem.startswith("the device moved during the calibration: the angular rate changes by 2")
     assert not result.saved
+    assert rig.ran == ["begin"]
+
+
+@played(GuideRig)
+async def test_a_restart_during_the_calibration_is_an_error(rig: GuideRig) -> None:
+    clock = SimpleNamespace(resets=4)
+    rig.guide.start(cast(SampleClock, clock))
+    running = asyncio.ensure_future(rig.guide.run("gyro", gyro(rig), save=True))
+    await asyncio.sleep(4)
+    clock.resets += 1
+    result = await running
+    assert result.problem.startswith("the device restarted during the calibration")
     assert rig.ran == ["begin"]
 
 

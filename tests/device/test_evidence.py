@@ -43,6 +43,7 @@ async def test_a_restart_is_verified_by_the_device_counter(bench: ModuleBench, i
         await bench.doing(bench.device.settings.apply({"mode": "9-axis"}, save=False))
         lost = '; the restart changed settings: mode is "6-axis", was "9-axis"'
         assert (await result_of(bench, "restart")).evidence == "the device counter restarted" + lost
+    assert await bench.doing(bench.device._transport.samples.has_restarted()) is not ignores
     applied = await bench.doing(bench.device.settings.apply({"mounting": "x_up"}, save=True))
     assert (applied.restarted, applied.problem) == ((False, f"restart: {seen}") if ignores else (True, ""))
 

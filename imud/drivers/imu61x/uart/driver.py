@@ -42,6 +42,7 @@ from imud.drivers.imu61x.uart.codec import (
 )
 from imud.drivers.imu61x.uart.commands import (
     BAUD_RATES,
+    REPLY_TIMEOUT_NS,
     STREAM,
     Imu61xUartOptions,
     Parameters3,
@@ -65,6 +66,8 @@ from imud.model.sample import Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
 POLL_NS: Final = 500 * NS_PER_MS
+# Number of polls with equal parameters after a change, 3 s: a device can write intermediate values (assumed)
+EQUAL_POLLS: Final = 6
 # Maximum time of a calibration until its parameters change, ns (assumed: the manual states no time)
 CALIBRATION_NS: Final = 30 * NS_PER_S
 GYRO_KEY: Final = "gyro_offset_deg_s"
@@ -76,7 +79,12 @@ class Calibrated:
     """Result of a calibration."""
 
     values: Vector3  # parameters after the calibration: °/s for the gyroscope, ° for the mounting error
-    changed: bool  # whether the parameters changed, which shows the end of the calibration
+    doubt: str = ""  # reason why the parameters do not show the end of the calibration; empty if they show it
+
+    @property
+    def changed(self) -> bool:
+        """Whether the parameters changed, which shows the end of the calibration."""
+        return not self.doubt
 
     @property
     def words(self) -> str:
@@ -86,13 +94,13 @@ class Calibrated:
     @property
     def evidence(self) -> str:
         """Evidence, or the reason of a result that is not verified."""
-        values = ", ".join(f"{value:g}" for value in self.values)
         if self.changed:
-            return f"the parameters changed to {values}"
-        return (
-            f"the parameters stayed at {values} for {CALIBRATION_NS // NS_PER_S} s; nothing else "
-            "shows the end of a calibration: keep the device at rest, check the samples, and repeat the calibration"
-        )
+            return f"the parameters changed to {_shown(self.values)}"
+        return f"{self.doubt}: keep the device at rest, check the samples, and repeat the calibration"
+
+
+def _shown(values: Vector3) -> str:
+    return ", ".join(f"{value:g}" for value in values)
 
 
 def calibrate_gyro(*, done: int = RESULT_DONE) -> RequestScript[Calibrated]:
@@ -112,23 +120,36 @@ def _calibrated(request: Request, parameters: Parameters3, done: int) -> Request
     """Start a calibration, and wait until its parameters changed and are constant, at most CALIBRATION_NS.
 
     An acknowledgement shows only that the device received the command. S1 contains no progress, and no document states
-    the reply to CMD 8.
+    the reply to CMD 8. Zeros can be the start of a calibration: the device may clear its parameters first.
     """
     before = last = yield from read3(parameters)
+    fault = (yield from settled()).calibration_fault
     is_acknowledged = yield from ordered(request, done)
-    for _ in range(CALIBRATION_NS // POLL_NS):
+    left_ns, equal, is_heard = CALIBRATION_NS, 0, True
+    while left_ns > 0 and not (equal >= EQUAL_POLLS and last != before and any(last)):
         yield pause(POLL_NS)
+        left_ns -= POLL_NS
         try:
             values = yield from read3(parameters, tries=1)
         except NoReply:  # the device is busy
+            left_ns, is_heard = left_ns - REPLY_TIMEOUT_NS, False
             continue
-        if values != before and values == last:
-            return Calibrated(values, changed=True)
-        last = values
-    if not is_acknowledged:
-        yield from settled()  # raises NoReply if the device does not reply at all
-        raise no_acknowledgement(request)
-    return Calibrated(last, changed=False)
+        equal, last, is_heard = equal + 1 if values == last else 0, values, True
+    if not is_heard or not is_acknowledged or last != before:
+        status = yield from settled()  # raises NoReply if the device does not reply at all
+        if status.calibration_fault not in (0, None, fault):
+            return Calibrated(last, f"the device reports calibration fault {status.calibration_fault}")
+    if last == before:
+        if not is_acknowledged:
+            raise no_acknowledgement(request)
+        limit_s = CALIBRATION_NS // NS_PER_S
+        words = f"the parameters stayed at {_shown(last)} for {limit_s} s"
+        return Calibrated(last, f"{words}; nothing else shows the end of a calibration")
+    if equal < EQUAL_POLLS:
+        return Calibrated(last, f"the parameters still change, to {_shown(last)}")
+    if not any(last):
+        return Calibrated(last, "the parameters changed to 0, 0, 0, which can be the start of a calibration")
+    return Calibrated(last)
 
 
 def installation_status() -> RequestScript[Mapping[str, str]]:

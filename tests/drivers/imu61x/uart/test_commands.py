@@ -22,7 +22,8 @@ from imud.drivers.imu61x.uart.driver import CALIBRATIONS, DRIVER
 from imud.drivers.imu61x.uart.settings import SETTINGS, BaudChange
 from imud.model.errors import BadArgument, CommandError, NoReply, Rejected
 from imud.model.sample import Measurement
-from imud.sim.imu61x.uart import REFUSING, STATUS, VARIANTS, Imu61xHardware, Imu61xSettings
+from imud.model.units import NS_PER_S
+from imud.sim.imu61x.uart import REFUSING, STATUS, VARIANTS, Imu61xHardware, Imu61xModule, Imu61xSettings
 from imud.sim.physics import Noise, Still, swing
 from tests.support.old_spellings import script_of
 from tests.support.script_runners import unanswered_ms
@@ -316,7 +317,7 @@ def test_unsupported_values_are_rejected(name: str, arguments: dict[str, Any], n
 ACKNOWLEDGING = [calibrating.calibrate_gyro, calibrating.calibrate_installation]
 CALIBRATING = frozenset({Command.CALIBRATE_GYRO, Command.CALIBRATE_INSTALLATION})
 # Maximum time of a calibration of 3 s, ns: imud waits for K1, and for a device that is quiet after each reply
-LIMIT_NS = {"no K1": 14e9, "quiet after an answer": 12e9, "all at once": 12e9}
+LIMIT_NS = {"no K1": 20e9, "quiet after an answer": 17e9, "all at once": 17e9}
 
 
 @every_variant
@@ -328,13 +329,13 @@ def test_gyro_calibration_takes_the_bias_off(variant: str) -> None:
     result = far.run(calibrating.calibrate_gyro(done=done(variant)))
     offsets_deg_s = result.values
     assert result.changed
-    assert 3e9 <= far.now_ns - begun_ns < LIMIT_NS.get(variant, 6e9)
+    assert 3e9 <= far.now_ns - begun_ns < LIMIT_NS.get(variant, 9e9)
     far.samples(800)
     after = far.samples(2000)
     assert any(abs(radians(offset)) > 3e-4 for offset in offsets_deg_s)
     for axis in range(3):
         means = [sum(m.gyro_rad_s[axis] for m in part if m.gyro_rad_s) / len(part) for part in (before, after)]
-        assert means[0] - means[1] == pytest.approx(radians(offsets_deg_s[axis]), abs=2.5e-4)  # the bias drifts
+        assert means[0] - means[1] == pytest.approx(radians(offsets_deg_s[axis]), abs=3e-4)  # the bias drifts
         assert abs(means[1]) < 2.5e-4
 
 
@@ -347,7 +348,7 @@ def test_installation_calibration_ends_with_the_angles(variant: str) -> None:
     result = far.run(calibrating.calibrate_installation(done=done(variant)))
     assert result.changed
     assert result.values == pytest.approx((0, 4, 0), abs=1e-5)
-    assert 3e9 <= far.now_ns - begun_ns < LIMIT_NS.get(variant, 6e9)
+    assert 3e9 <= far.now_ns - begun_ns < LIMIT_NS.get(variant, 9e9)
     far.samples(800)
     assert len(far.samples(100)) >= 5
 
@@ -385,7 +386,7 @@ def test_the_end_is_a_change_of_the_parameters(
     assert result.changed
     assert result.words.startswith("verified: the parameters changed to ")
     assert any(result.values)
-    assert duration_s <= (far.now_ns - begun_ns) / 1e9 < duration_s + 2
+    assert duration_s <= (far.now_ns - begun_ns) / 1e9 < duration_s + 5
 
 
 @pytest.mark.parametrize("whole_status", [True, False])
@@ -400,6 +401,39 @@ def test_without_a_change_the_result_is_not_verified(
     assert (result.values, result.changed) == ((0, 0, 0), False)
     assert result.words.startswith("sent, not verified: the parameters stayed at 0, 0, 0 for 30 s")
     assert 30e9 <= far.now_ns - begun_ns < 35e9
+
+
+@pytest.mark.parametrize(
+    ("seconds", "at_begin", "at_end", "words"),
+    [
+        (8, {"install_off_deg": (0.0, 0.0, 0.0)}, {}, "verified: the parameters changed to 0.149333, 3.99999, 0"),
+        (99, {"install_off_deg": (0.0, 0.0, 0.0)}, {}, "changed to 0, 0, 0, which can be the start of a calibration"),
+        (29, {}, {}, "the parameters still change, to 0.149333, 3.99999, 0"),
+        (8, {}, {"calibration_fault": 2}, "sent, not verified: the device reports calibration fault 2"),
+        (8, None, {}, "expected a reply, got none"),
+    ],
+    ids=["cleared", "cleared, no end", "late", "fault", "no replies"],
+)
+def test_only_new_parameters_without_a_fault_are_verified(
+    seconds: int, at_begin: dict[str, Any] | None, at_end: dict[str, Any], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Other(Imu61xModule):
+        def _calibrate(self, command: Command, now_ns: int) -> None:
+            super()._calibrate(command, now_ns)
+            self.settings = replace(self.settings, **(at_begin or {}))
+            self._busy_ns = 10**18 if at_begin is None else self._busy_ns
+
+        def _finish_calibration(self, command: Command, done_ns: int) -> None:
+            super()._finish_calibration(command, done_ns)
+            self.hardware = replace(self.hardware, status=replace(STATUS, **at_end))
+
+    monkeypatch.setattr("tests.support.simulated_modules.Imu61xModule", Other)
+    monkeypatch.setattr("imud.sim.imu61x.uart.CALIBRATION_NS", seconds * NS_PER_S)
+    far = imu61x_bench(Imu61xSettings(install_off_deg=(3.0, 3.0, 3.0)), motion=Still(radians(4)))
+    try:
+        assert words in far.run(calibrating.calibrate_installation()).words
+    except NoReply as error:
+        assert words in str(error)  # noqa: PT017 - one row has no reply
 
 
 @every_variant
