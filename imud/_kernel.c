@@ -199,9 +199,13 @@ static void decode(Slot *slot, const uint8_t *payload, const Run *run)
         for (int i = 0; i < 4; i++)
             slot->quat_wxyz[i] = floats[12 + i];
     }
-    slot->temperature_c = (int8_t)payload[3];
+    /* the ends of the range are filler bytes */
+    if (payload[3] == 0x7F || payload[3] == 0x80)
+        present &= ~(uint32_t)HAS_TEMPERATURE;
+    else
+        slot->temperature_c = (int8_t)payload[3];
     slot->pressure_pa = pressure_pa;
-    if (run->word_is_status) {
+    if (run->word_is_status && word <= PPS_STAMP_MODULUS_MS) {
         present |= HAS_STATUS;
         slot->status = word;
     } else if (word <= PPS_STAMP_MODULUS_MS) {

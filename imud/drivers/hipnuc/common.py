@@ -39,7 +39,7 @@ from imud.contracts.command import (
 )
 from imud.contracts.driver import DataSheet, StatusBit
 from imud.model.errors import BadArgument
-from imud.model.sample import Quaternion
+from imud.model.sample import Quaternion, Vector3
 from imud.model.units import RAD_PER_DEG, T_PER_UT
 
 M_S2_PER_G: Final = 9.8  # G of the firmware, m/s²: it divides by 9.8, not by standard gravity
@@ -87,14 +87,35 @@ def pressure_of(value_pa: float) -> float | None:
     return value_pa if PRESSURE_MIN_PA <= value_pa <= PRESSURE_MAX_PA else None
 
 
-def temperature_beside(temperature_c: float, pressure_pa: float) -> float | None:
+def byte_temperature_c(temperature_c: int) -> float | None:
+    """Return the temperature in a byte, °C; None for the ends of the range, which are filler bytes."""
+    return temperature_c + 0.0 if -128 < temperature_c < 127 else None
+
+
+# Counts of filler bytes in three 16-bit fields, if all three are equal: the ends of the range and 7F 7F. No sensor
+# measures its maximum on three axes. Zeros and FF FF are only in a field without a magnetometer not a measurement.
+FILLERS: Final = (0x7FFF, 0x7F7F, -0x8000)
+FIELD_FILLERS: Final = (*FILLERS, 0, -1)
+
+
+def vector_of(x: int, y: int, z: int, factor: float) -> Vector3 | None:
+    """Return three 16-bit counts times `factor`; None for filler bytes."""
+    return None if x == y == z and x in FILLERS else (x * factor, y * factor, z * factor)
+
+
+def field_of(x: int, y: int, z: int) -> Vector3 | None:
+    """Return the magnetic field of three counts of MAG_T_PER_LSB, T; None for filler bytes."""
+    return None if x == y == z and x in FIELD_FILLERS else vector_of(x, y, z, MAG_T_PER_LSB)
+
+
+def temperature_beside(temperature_c: float | None, pressure_pa: float) -> float | None:
     """Return the temperature next to a pressure field of HI91, °C; None if the firmware wrote neither field.
 
     The inertial sensor measures the temperature, so it also exists without a barometer. If the pressure has a value
     that no firmware writes, both fields are old content of the device's buffer.
     """
     is_written = pressure_pa in PLACEHOLDERS or pressure_of(pressure_pa) is not None
-    return temperature_c if is_written else None
+    return temperature_c if is_written and (temperature_c or pressure_pa) else None
 
 
 DOCUMENT: Final = "HiPNUC IMU configuration manual V1.5.9 (CH0x0, CH10x, HI14): no noise figures for any model"

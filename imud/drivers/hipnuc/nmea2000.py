@@ -59,6 +59,7 @@ RATE_RAD_S_PER_LSB: Final = 1e-6 / 32
 
 I16_MOST, I32_MOST, SID_MOST = 0x7FFC, 0x7FFF_FFFC, 252  # maximum counts that are values
 HEADING_MOST: Final = 62_832  # maximum heading in counts: a full turn
+_NOTHING: Final = (b"\xff" * 7, b"\x7f" * 7)  # filler bytes after the SID of a message without values
 
 
 class Reference(IntEnum):
@@ -94,7 +95,9 @@ def measurement_of(
     roll = pitch = yaw = rate = nan
     has_heading = heading_elsewhere
     for pgn, data in messages:
-        if pgn == HEADING:
+        if data.endswith(_NOTHING):
+            has_heading = has_heading or pgn == HEADING
+        elif pgn == HEADING:
             _, heading, _, _, reference = HEADING_LAYOUT.unpack(data)
             has_heading = True
             is_good = heading <= HEADING_MOST and reference & 3 != Reference.ERROR

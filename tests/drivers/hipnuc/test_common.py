@@ -44,6 +44,7 @@ VALID_PA = (1_000.0, 33_000.0, 101_325.0, 120_000.0)
 def test_valid_and_invalid_pressures(value_pa: float, temperature_c: float | None) -> None:
     assert pressure_of(value_pa) == (value_pa if value_pa in VALID_PA else None)
     assert temperature_beside(21, value_pa) == temperature_c
+    assert temperature_beside(0, value_pa) == (0 if temperature_c and value_pa else None)
 
 
 def test_bits_of_a_message_and_the_limit_of_the_bus() -> None:

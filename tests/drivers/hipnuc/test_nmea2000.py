@@ -4,6 +4,7 @@ SIDs.
 
 import math
 import struct
+from itertools import product
 from random import Random
 
 import msgspec
@@ -168,6 +169,9 @@ def test_we_decode_messages_of_the_library() -> None:
 
 def test_the_library_and_we_agree_on_absent_values() -> None:
     pgns = pytest.importorskip("nmea2000.pgns")
+    for pgn, filler in product((HEADING, RATE_OF_TURN, ATTITUDE), (b"\xff", b"\x7f")):
+        found = messages.measurement_of([(pgn, b"\x01" + filler * 7)])
+        assert (found.euler_rad, found.gyro_rad_s, found.quat_wxyz) == (None, None, None)
     for last in range(0xF8, 0x100):
         heading = bytes([1, last, 0xFF, 0xFF, 0x7F, 0xFF, 0x7F, 0xFD])
         rate = bytes([1, last, 0xFF, 0xFF, 0x7F, 0xFF, 0xFF, 0xFF])

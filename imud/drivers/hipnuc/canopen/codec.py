@@ -42,7 +42,7 @@ from imud.drivers.hipnuc.canopen.cia301 import (
     NmtState,
     TpdoNumber,
 )
-from imud.drivers.hipnuc.common import M_S2_PER_G, QUAT_PER_LSB, pressure_of
+from imud.drivers.hipnuc.common import M_S2_PER_G, QUAT_PER_LSB, pressure_of, vector_of
 from imud.drivers.value_limits import possible_angles, possible_quaternion
 from imud.model.ledger import Ledger
 from imud.model.options import Options
@@ -179,7 +179,7 @@ def _vector(data: bytes | None, factor: float) -> Vector3 | None:
     if data is None:
         return None
     x, y, z = THREE.unpack(data)
-    return (x * factor, y * factor, z * factor)
+    return vector_of(x, y, z, factor)
 
 
 # --- encoder for simulated devices ------------------------------------------------------------------------------

@@ -30,6 +30,8 @@ from imud.drivers.hipnuc.common import (
     QUAT_PER_LSB,
     TEMPERATURE_C_PER_LSB,
     counts_of,
+    field_of,
+    vector_of,
 )
 from imud.drivers.value_limits import possible_quaternion, possible_temperature_c
 from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, join, split
@@ -62,7 +64,6 @@ PLACEHOLDER: Final = 999  # reserved bytes 4-7 of FF43 as devices without barome
 YEAR_ZERO: Final = 2000
 
 _NOTHING: Final = bytes([0xFF]) * MESSAGE_BYTES
-_ZERO_VECTOR: Final = bytes(6)
 
 
 def measurement_of(messages: Sequence[tuple[int, bytes]], t_first_ns: int | None = None) -> Measurement:
@@ -109,10 +110,12 @@ class _Parts:
             self.gyro = _vector(data, GYRO_RAD_S_PER_LSB)
 
     def decode_mag(self, data: bytes) -> None:
-        if data != _NOTHING and data[:6] != _ZERO_VECTOR:
-            self.mag = _vector(data, MAG_T_PER_LSB)
+        x, y, z, _ = VECTOR.unpack(data)
+        self.mag = field_of(x, y, z)
 
     def decode_roll_pitch(self, data: bytes) -> None:
+        if data == _NOTHING:
+            return
         roll, pitch = TWO_ANGLES.unpack(data)
         self.roll, self.pitch = _angle(roll), _angle(pitch)
 
@@ -123,7 +126,7 @@ class _Parts:
 
     def decode_inclinometer(self, data: bytes) -> None:
         x, y = (_angle(counts) for counts in TWO_ANGLES.unpack(data))
-        if isfinite(x) or isfinite(y):
+        if data != _NOTHING and (isfinite(x) or isfinite(y)):
             self.incli = x, y
 
     def decode_temperature(self, data: bytes) -> None:
@@ -149,9 +152,9 @@ _DECODE: Final[dict[int, Callable[[_Parts, bytes], None]]] = {
 }
 
 
-def _vector(data: bytes, factor: float) -> Vector3:
+def _vector(data: bytes, factor: float) -> Vector3 | None:
     x, y, z, _ = VECTOR.unpack(data)
-    return x * factor, y * factor, z * factor
+    return vector_of(x, y, z, factor)
 
 
 def _angle(counts: int) -> float:

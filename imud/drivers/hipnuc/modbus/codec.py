@@ -30,13 +30,16 @@ from imud.contracts.codec import BadFrame, BadReason, Poll, PolledEvent, Vanishe
 from imud.drivers.hipnuc.common import (
     ACCEL_M_S2_PER_LSB,
     EULER_RAD_PER_LSB,
+    FIELD_FILLERS,
     GYRO_RAD_S_PER_LSB,
     MAG_T_PER_LSB,
     PRESSURE_PA_PER_LSB,
     QUAT_PER_LSB,
     TEMPERATURE_C_PER_LSB,
     counts_of,
+    field_of,
     pressure_of,
+    vector_of,
 )
 from imud.drivers.hipnuc.modbus.registers import (
     BLOCK_FIRST,
@@ -80,6 +83,7 @@ READ_SERIAL: Final = read_registers(BY_NAME["SN"].address, BY_NAME["SN"].count)
 READ_STATUS: Final = read_registers(BY_NAME["MAIN_STATUS"].address, BY_NAME["MAIN_STATUS"].count)
 # Time between two reads of MAIN_STATUS, which is not in the block: maximum age of `status` of a sample, ns
 STATUS_NS: Final = NS_PER_S
+RESERVED_STATUS: Final = 1 << 13  # lowest reserved bit of MAIN_STATUS: with it, the register has filler bytes
 _SAMPLE, _SERIAL, _STATUS = 0, 1, 2
 
 
@@ -190,7 +194,8 @@ class HipnucModbusCodec:
         whole = len(data) == READ_STATUS.read_bytes and is_whole(data) and data[1] == READ_HOLDING
         self._book.add_reply(data, good=whole or is_exception(data))
         if whole:
-            self._status = int.from_bytes(data[DATA_AT:-CRC_BYTES], "big")
+            status = int.from_bytes(data[DATA_AT:-CRC_BYTES], "big")
+            self._status = status if status < RESERVED_STATUS else None
         return ()
 
     def _bad(self, data: bytes) -> BadReason | None:
@@ -205,13 +210,13 @@ class HipnucModbusCodec:
         ) = BLOCK.unpack_from(data, DATA_AT)  # fmt: skip
         has_time = len(data) == READ_BLOCK.read_bytes
         self._answered = True
-        a, w, b, angle = ACCEL_M_S2_PER_LSB, GYRO_RAD_S_PER_LSB, MAG_T_PER_LSB, EULER_RAD_PER_LSB
+        a, w, angle = ACCEL_M_S2_PER_LSB, GYRO_RAD_S_PER_LSB, EULER_RAD_PER_LSB
         euler = possible_angles((roll * angle, pitch * angle, yaw * angle))
         temperature = possible_temperature_c(celsius * TEMPERATURE_C_PER_LSB)
         return Measurement(
             len(data), 0, UPTIME.unpack_from(data, DATA_AT + BLOCK.size)[0] if has_time else None,
-            (ax * a, ay * a, az * a), (gx * w, gy * w, gz * w), (mx * b, my * b, mz * b) if mx or my or mz else None,
-            self._quaternion(qw, qx, qy, qz), euler, temperature if celsius or pressure else None,
+            vector_of(ax, ay, az, a), vector_of(gx, gy, gz, w), field_of(mx, my, mz),
+            self._quaternion(qw, qx, qy, qz), euler, None if celsius == pressure in (0, -1) else temperature,
             pressure_of(pressure * PRESSURE_PA_PER_LSB), self._inclination(ix, iy, euler), self._status,
         ), euler is not None and temperature is not None  # fmt: skip
 
@@ -224,7 +229,7 @@ class HipnucModbusCodec:
 
     def _inclination(self, x: int, y: int, euler_rad: Vector3 | None) -> Pair | None:
         if not self._incli_scale:
-            if not x and not y:
+            if x == y and x in FIELD_FILLERS:
                 return None
             if y or x < 0:
                 self._incli_scale = INCLI_DUAL_RAD_PER_LSB

@@ -38,6 +38,8 @@ from imud.drivers.hipnuc.common import (
     PRESSURE_MAX_PA,
     PRESSURE_MIN_PA,
     QUAT_PER_LSB,
+    byte_temperature_c,
+    field_of,
     pressure_of,
     temperature_beside,
 )
@@ -74,6 +76,10 @@ TAG_HI92: Final = 0x92
 # Modulus of pps_sync_stamp without an edge, ms (in a recording at 100 Hz, 8 follows 8190). The manual gives the range
 # 0 … 8192. Larger values are filler bytes of firmware that does not write the field.
 PPS_STAMP_MODULUS_MS: Final = 8192
+# Maximum of bytes 1-2 of HI91. Bits 13 to 15 of the status are reserved: with them, the word is filler bytes.
+WORD_MOST: Final = PPS_STAMP_MODULUS_MS
+# Filler values of the pressure in HI92, and the ends of its range
+PRESSURE_FILLERS: Final = (0, -1, -0x8000, 0x7FFF)
 
 ACCEL_M_S2_PER_LSB: Final = 0.0048828  # scale of HI92 as printed; 160 / 32768 would be 2.6e-6 larger
 GYRO_RAD_S_PER_LSB: Final = 0.001  # scale of HI92
@@ -100,18 +106,18 @@ def decode_hi91(values: Sequence[Any], word_is_status: bool, size: int, trailing
     low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz = values
     # a global name costs twice as much as a local name, and a frame uses thirty of them
     g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
-    temperature += 0.0  # a float, as in a slot
+    temperature = byte_temperature_c(temperature)
     if (
         not PRESSURE_MIN_PA <= pressure <= PRESSURE_MAX_PA
     ):  # `pressure_of` without a call, which costs a tenth of a frame
         temperature, pressure = temperature_beside(temperature, pressure), None
-    word = low + 256 * high
+    word = low + 256 * high if low + 256 * high <= WORD_MOST else None
     # a device without magnetometer sends zeros
     return Measurement(
         size, trailing, ms, (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad),
         (mx * tesla, my * tesla, mz * tesla) if mx or my or mz else None,
         possible_quaternion(qw, qx, qy, qz), (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
-        word if word_is_status else None, None if word_is_status or word > PPS_STAMP_MODULUS_MS else word,
+        word if word_is_status else None, None if word_is_status else word,
     )  # fmt: skip
 
 
@@ -121,7 +127,7 @@ def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int
     None if an angle may be beyond a full turn, or a pressure is not finite. `trailing` bytes follow the first frame.
     """
     g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
-    low_pa, high_pa, most_ms = PRESSURE_MIN_PA, PRESSURE_MAX_PA, PPS_STAMP_MODULUS_MS
+    low_pa, high_pa, word_most = PRESSURE_MIN_PA, PRESSURE_MAX_PA, WORD_MOST
     least, most, turn = QUAT_SQUARE_MIN, QUAT_SQUARE_MAX, TURN_SQUARE
     made: list[Measurement] = []
     make, keep = Measurement, made.append
@@ -131,19 +137,20 @@ def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int
     ) in HI91_VALUES.iter_unpack(hi91s):  # fmt: skip
         if roll * roll + pitch * pitch + yaw * yaw > turn:
             return None
-        temperature += 0.0  # noqa: PLW2901
+        # `byte_temperature_c` without a call
+        temperature = temperature + 0.0 if -128 < temperature < 127 else None  # noqa: PLW2901
         if not low_pa <= pressure <= high_pa:
             if not isfinite(pressure):
                 return None
             temperature, pressure = temperature_beside(temperature, pressure), None  # noqa: PLW2901
-        word = low + 256 * high
+        word = low + 256 * high if low + 256 * high <= word_most else None
         keep(
             make(
                 size, trailing, ms, (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad),
                 (mx * tesla, my * tesla, mz * tesla) if mx or my or mz else None,
                 (qw, qx, qy, qz) if least < qw * qw + qx * qx + qy * qy + qz * qz < most else None,
                 (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
-                word if word_is_status else None, None if word_is_status or word > most_ms else word,
+                word if word_is_status else None, None if word_is_status else word,
             )
         )  # fmt: skip
         trailing -= size
@@ -186,14 +193,15 @@ def _decode_hi92(data: bytes, at: int, _word_is_status: bool, size: int, trailin
     (
         _, _, temperature, pps_ms, pressure, gx, gy, gz, ax, ay, az, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
     ) = HI92.unpack_from(data, at)  # fmt: skip
-    a, w, b, angle, q = ACCEL_M_S2_PER_LSB, GYRO_RAD_S_PER_LSB, MAG_T_PER_LSB, EULER_RAD_PER_LSB, QUAT_PER_LSB
+    a, w, angle, q = ACCEL_M_S2_PER_LSB, GYRO_RAD_S_PER_LSB, EULER_RAD_PER_LSB, QUAT_PER_LSB
     euler = possible_angles((roll * angle, pitch * angle, yaw * angle))
     # no device time: `dev_ticks` is None; the manual reserves the status
     return Measurement(
         size, trailing, None, (ax * a, ay * a, az * a), (gx * w, gy * w, gz * w),
-        (mx * b, my * b, mz * b) if mx or my or mz else None,
+        field_of(mx, my, mz),
         possible_quaternion(qw * q, qx * q, qy * q, qz * q),
-        euler, temperature + 0.0, pressure_of(pressure + PRESSURE_OFFSET_PA), None, None,
+        euler, byte_temperature_c(temperature),
+        None if pressure in PRESSURE_FILLERS else pressure_of(pressure + PRESSURE_OFFSET_PA), None, None,
         pps_ms if pps_ms <= PPS_STAMP_MODULUS_MS else None,
     ), euler is not None  # fmt: skip
 

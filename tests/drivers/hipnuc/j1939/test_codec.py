@@ -134,6 +134,9 @@ def test_absent_is_not_zero_and_one_negative_count_is_a_value() -> None:
         (0xFF3D, bytes.fromhex("0000008000000080"), "euler_rad"), (0xFF41, NONE, "euler_rad"),
         (0xFF41, bytes.fromhex("000000fe00000000"), "euler_rad"),
         (0xFF41, bytes.fromhex("417e050000000000"), "euler_rad"),  # 360.001°
+        (0xFF3A, bytes.fromhex("ffffffffffff0000"), "mag_t"), (0xFF3A, bytes.fromhex("ff7fff7fff7f0000"), "mag_t"),
+        (0xFF34, b"\x7f" * 8, "accel_m_s2"), (0xFF37, bytes.fromhex("0080008000800000"), "gyro_rad_s"),
+        (0xFF3D, NONE, "euler_rad"), (0xFF4A, NONE, "incli_rad"),
         (0xFF43, NONE, "temperature_c"), (0xFF43, NONE, "pressure_pa"), (0xFF43, bytes(8), "temperature_c"),
         (0xFF43, bytes(8), "pressure_pa"), (0xFF43, bytes.fromhex("ff7f000000000000"), "temperature_c"),
         (0xFF46, NONE, "quat_wxyz"), (0xFF46, bytes(8), "quat_wxyz"),

@@ -45,6 +45,12 @@ def short(**options: object) -> HipnucModbusCodec:
     return made
 
 
+LEVEL: dict[str, Any] = {
+    "accel_m_s2": (0, 0, 9.8), "gyro_rad_s": (0, 0, 0), "mag_t": (0, 0, 0), "euler_rad": (0, 0, 0),
+    "quat_wxyz": (1, 0, 0, 0), "temperature_c": 25, "pressure_pa": 1e5,
+}  # fmt: skip
+
+
 def block(
     *,
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0), per_lsb: float = QUAT_PER_LSB,
@@ -115,6 +121,18 @@ def test_a_device_without_barometer_has_no_pressure() -> None:
         m = measured(codec(), framed(1, registers_reply(bytes.fromhex(words + "0000 0000 0001 2345"))))
         assert m.temperature_c == pytest.approx(25.12)
         assert m.pressure_pa == pressure_pa
+
+
+@pytest.mark.parametrize("filler", ["00", "ff", "7f", "7fff", "8000"])
+def test_filler_bytes_are_no_values(filler: str) -> None:
+    data = bytearray(modbus.pack_block(**(LEVEL | {"uptime_ms": 5})))
+    for start, end in ((12, 18), (30, 48)):  # field, then temperature to inclinometer
+        data[start:end] = (bytes.fromhex(filler) * 18)[: end - start]
+    m = next(one for one in codec().decode(0, framed(9, registers_reply(bytes(data)))) if isinstance(one, Measurement))
+    assert (m.mag_t, m.temperature_c, m.pressure_pa, m.quat_wxyz, m.incli_rad) == (None,) * 5
+    made = codec()
+    made.decode(2, framed(9, b"\x03\x02" + (bytes.fromhex(filler) * 2)[:2]))
+    assert measured(made, block()).status == (0 if filler == "00" else None)
 
 
 def test_the_short_block_is_read_from_older_firmware() -> None:

@@ -365,7 +365,7 @@ def test_clipping_the_check_value_and_a_driver_of_other_settings() -> None:
     m = one(make().feed(uart_codec.encode_hi92(pps_stamp_ms=-1, **far)))
     assert m.accel_m_s2 == pytest.approx((159.994, -159.9996, 0.0), abs=1e-2)
     assert m.gyro_rad_s == pytest.approx((32.767, -32.768, 0.0))
-    assert (m.temperature_c, m.pressure_pa, m.pps_age_ms) == (127, None, 0)  # 132767 Pa is not an air pressure
+    assert (m.temperature_c, m.pressure_pa, m.pps_age_ms) == (None, None, 0)  # ends of the ranges
     bad, last = make().feed(
         uart_codec.encode_hi91(system_time_ms=2**32 + 7, **(far | {"accel_m_s2": (1e300, 0.0, 0.0)}))
     )
@@ -384,7 +384,9 @@ def test_clipping_the_check_value_and_a_driver_of_other_settings() -> None:
 FILLER = [
     ("pps_age_ms", {"word_1_2": 8193}, {"pps_stamp_ms": 8193}),
     ("pps_age_ms", {"word_1_2": 0x2323}, {"pps_stamp_ms": 0x2323}),
-    ("mag_t", {"mag_t": (0.0, 0.0, 0.0)}, {"mag_t": (0.0, 0.0, 0.0)}),
+    *(("mag_t", {"mag_t": (0.0, 0.0, 0.0)}, {"mag_t": (tesla,) * 3}) for tesla in (0.0, -3.05e-8, 1.0, -1.0)),
+    *(("temperature_c", {"temperature_c": celsius}, {"temperature_c": celsius}) for celsius in (127, -128)),
+    *(("pressure_pa", {"pressure_pa": 0.0}, {"pressure_pa": pa}) for pa in (100_000.0, 99_999.0, 0.0, 1e6)),
     *(
         ("quat_wxyz", {"quat_wxyz": quat}, {"quat_wxyz": quat})
         for quat in ((0, 0, 0, 0), (0.5, 0.5, 0.5, 0), (3.2767,) * 4)
@@ -409,6 +411,9 @@ def test_filler_bytes_are_no_values(
             assert one_event.status is None
             assert one_event.accel_m_s2 == pytest.approx((0, 0, 9.8), abs=1e-3)
             assert (one_event.mag_t is None) == (field == "mag_t")
+    newer = uart_codec.HipnucCodec(Ledger(), uart_codec.HipnucOptions(hi91_word="status"))
+    for word, status in ((0x2323, None), (0xFFFF, None), (0x1FFF, 0x1FFF)):
+        assert [one.status for one in newer.feed(hi91(word_1_2=word) * count)] == [status] * count  # type: ignore[union-attr]
 
 
 def test_damaged_frames_among_lines() -> None:
