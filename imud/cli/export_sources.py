@@ -72,6 +72,10 @@ class Sink(Protocol):
         """Write an event."""
         ...
 
+    def session(self, epoch: int) -> None:
+        """Note that the content of a file of another run of imud follows."""
+        ...
+
     def finish(self) -> None:
         """Write buffered data."""
         ...
@@ -107,6 +111,8 @@ class CsvSink:
         if self._table == "events":
             self._text += table.csv_text([table.event_row(event)])
 
+    def session(self, epoch: int) -> None: ...
+
     def finish(self) -> None:
         self._out.write(bytes(self._text))
         self._text.clear()
@@ -123,7 +129,7 @@ PIPE_BYTES: Final = 1 << 20
 SAMPLES: Final = 64
 # Number of allocated objects between two garbage collections. The player creates almost no reference cycles.
 GC_ALLOCATIONS: Final = 50_000
-DEVICE, BATCH, LOSSES, EVENT, END, ERROR = range(1, 7)
+DEVICE, BATCH, LOSSES, EVENT, END, ERROR, SESSION = range(1, 8)
 _LOST: Final = attrgetter("samples", *LossCounts._fields[4:])  # counters of a ledger in the order of `LossCounts`
 
 Played = tuple[str, int, list[str]]  # report as text, exit status, names of the devices
@@ -159,7 +165,11 @@ class LossWatch:
 def play_here(file: BinaryIO, name: str, sink: Sink, devices: Collection[str]) -> Played:
     """Play a recording in this process. Raises ImudError."""
     watch = LossWatch(sink, devices)
-    player = Player(lambda batch: watch.batch(batch, player.devices[batch.device_id].ledger), on_event=watch.event)
+    player = Player(
+        lambda batch: watch.batch(batch, player.devices[batch.device_id].ledger),
+        on_event=watch.event,
+        on_session=sink.session,
+    )
     report, status = play_to_end(file, name, player)
     return report, status, sorted(device.described.name for device in player.devices.values())
 
@@ -201,6 +211,8 @@ def _take(pipe: IO[bytes], path: Path, sink: Sink, at: Callable[[int], None]) ->
             recorded, utc_ns = msgspec.msgpack.decode(data, type=tuple[RecordedEvent, int])
             event = Event(recorded.t_ns, recorded.device, kind_of(recorded.kind), recorded.message, recorded.detail)
             sink.event(StampedEvent(event, utc_ns))
+        elif kind == SESSION:
+            sink.session(msgspec.msgpack.decode(data, type=int))
         elif kind == END:
             played: Played = msgspec.msgpack.decode(data, type=Played)
             return played
@@ -240,6 +252,10 @@ class PipeSink:
     def event(self, event: StampedEvent) -> None:
         self.finish()
         self._put(EVENT, self._encode(event))
+
+    def session(self, epoch: int) -> None:
+        self.finish()
+        self._put(SESSION, self._encode(epoch))
 
     def end(self, kind: int, value: Any) -> None:
         """Write the last message: the result (END), or the text of an error (ERROR)."""
@@ -346,10 +362,13 @@ def recorded_facts(file: BinaryIO, name: str) -> RecordedFacts:
     Read the complete file: the description of a device can come after the first samples of another device.
     """
     found, clock = dict[str, Deviations](), RecordedClock()
-    for record in RecordingReader(file, name):
+    reader = RecordingReader(file, name)
+    for record in reader:
         if record.kind == Kind.CLOCKS:
             read = decode_clocks(record.body)
             clock.add(read.monotonic_ns, read.utc_offset_ns, read.suspends)
+        elif record.kind == Kind.SESSION and reader.session is not None:
+            clock.begin(reader.session.epoch)
         elif record.kind == Kind.CALL and record.device == NO_DEVICE:
             call = decode_object(record, CallRecord)
             match (call.target, call.method, *call.arguments):
@@ -400,6 +419,9 @@ class ExportFeed:
 
     def event(self, event: StampedEvent) -> None:
         self._sink.event(event._replace(utc_ns=self._clock.utc_ns(event.event.t_ns, event.utc_ns)))
+
+    def session(self, epoch: int) -> None:
+        self._clock.begin(epoch)
 
     def finish(self) -> None:
         self._sink.finish()
@@ -517,6 +539,8 @@ class McapSink:
         if data is not None:
             channel.add(event.utc_ns, data)
         self._diagnose(self._diagnosis.event(event))
+
+    def session(self, epoch: int) -> None: ...
 
     def _diagnose(self, diagnoses: Diagnoses | None) -> None:
         if diagnoses is None:

@@ -106,30 +106,45 @@ class PlayedClock(HostClock):
 STEP_NS: Final = 1 * NS_PER_MS
 
 
+class _Offsets:
+    """Offsets of CLOCK_REALTIME to CLOCK_MONOTONIC in one run of imud."""
+
+    def __init__(self) -> None:
+        self.suspends = 0  # number of suspends at the newest reading
+        self.starts_ns: list[int] = []  # CLOCK_MONOTONIC at the start of each offset
+        self.offsets_ns: list[int] = []
+
+
 class RecordedClock:
     """CLOCK_REALTIME of a recording: CLOCK_MONOTONIC plus the last recorded offset. Times before a step of the wall
     clock then match the corrected clock. CLOCK_MONOTONIC stops during a suspend, so each suspend starts a new offset.
+    Each run of imud has its own offsets: joined files can be from different boots.
     """
 
     def __init__(self) -> None:
-        self._suspends = 0
-        self._starts_ns: list[int] = []  # CLOCK_MONOTONIC at the start of each offset
-        self._offsets_ns: list[int] = []
+        self._runs: dict[int, _Offsets] = {}
+        self.begin(0)
+
+    def begin(self, epoch: int) -> None:
+        """Continue with the records of a run of imud."""
+        self._run = self._runs.setdefault(epoch, _Offsets())
 
     def add(self, monotonic_ns: int, offset_ns: int, suspends: int) -> None:
         """Add a reading of the clocks, in the order of the file."""
-        if self._offsets_ns and suspends == self._suspends:
-            self._offsets_ns[-1] = offset_ns
+        run = self._run
+        if run.offsets_ns and suspends == run.suspends:
+            run.offsets_ns[-1] = offset_ns
             return
-        self._suspends = suspends
-        self._starts_ns.append(monotonic_ns)
-        self._offsets_ns.append(offset_ns)
+        run.suspends = suspends
+        run.starts_ns.append(monotonic_ns)
+        run.offsets_ns.append(offset_ns)
 
     def utc_ns(self, t_ns: int, recorded_ns: int) -> int:
         """Return CLOCK_REALTIME at a CLOCK_MONOTONIC time; `recorded_ns` if the wall clock did not step after it."""
-        if not self._offsets_ns:
+        run = self._run
+        if not run.offsets_ns:
             return recorded_ns
-        utc_ns = t_ns + self._offsets_ns[max(bisect_right(self._starts_ns, t_ns) - 1, 0)]
+        utc_ns = t_ns + run.offsets_ns[max(bisect_right(run.starts_ns, t_ns) - 1, 0)]
         return utc_ns if abs(utc_ns - recorded_ns) > STEP_NS else recorded_ns
 
     def placed(self, batch: Batch) -> Batch:
@@ -150,8 +165,10 @@ class Player:
         *,
         fresh: bool = False,
         on_event: Callable[[Event, int], None] = lambda _event, _utc_ns: None,
+        on_session: Callable[[int], None] = lambda _epoch: None,
     ) -> None:
-        """Publish the batches of all devices to `publish`. Pass each event with its CLOCK_REALTIME to `on_event`.
+        """Publish the batches of all devices to `publish`. Pass each event with its CLOCK_REALTIME to `on_event`, and
+        the epoch of each file to `on_session`.
 
         With `fresh`, or if another version of imud wrote the recording, codecs and clocks start without their recorded
         state.
@@ -160,6 +177,7 @@ class Player:
         self.lost = 0  # number of records that the recorder dropped
         self._publish = publish
         self._on_event = on_event
+        self._on_session = on_session
         self._host = PlayedClock()
         # reason to ignore recorded states; empty if the player uses them
         self._no_state = "a new clock was requested" if fresh else ""
@@ -216,6 +234,7 @@ class Player:
             _check(device, records.decode_object(record, CheckRecord))
 
     def _begin(self, session: SessionRecord) -> None:
+        self._on_session(session.epoch)
         if session.imud != __version__:
             self._no_state = self._no_state or f"imud {session.imud} wrote the recording, this is imud {__version__}"
 

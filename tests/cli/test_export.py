@@ -21,7 +21,16 @@ from imud.cli.export_sources import recorded_facts
 from imud.contracts.publisher import Batch
 from imud.contracts.status import Deviations
 from imud.formats.recording import BlockGatherer, RecordingReader
-from imud.formats.records import ClocksRecord, Kind, encode, encode_clocks, encode_object
+from imud.formats.records import (
+    NO_DEVICE,
+    VERSION,
+    ClocksRecord,
+    Kind,
+    SessionRecord,
+    encode,
+    encode_clocks,
+    encode_object,
+)
 from imud.model.errors import BadArgument, ImudError
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample
@@ -247,14 +256,17 @@ def test_the_noise_of_a_device_that_is_described_after_samples_of_another_one(tm
     assert recorded_facts(BytesIO(data + gatherer.finish()), "a").noise == {"mast": Deviations(gyro_rad_s=0.5)}
 
 
-@pytest.mark.parametrize("suspends", [0, 1])
-def test_rows_before_a_step_of_the_wall_clock(recorded: Recorded, tmp_path: Path, cli: Cli, suspends: int) -> None:
-    """imud places all rows with the last offset of the recording, and rows before a suspend with the last offset before
+@pytest.mark.parametrize(("suspends", "joined"), [(0, False), (1, False), (0, True)])
+def test_rows_before_a_step_of_the_wall_clock(
+    recorded: Recorded, tmp_path: Path, cli: Cli, suspends: int, joined: bool
+) -> None:
+    """imud places all rows with the last offset of their run, and rows before a suspend with the last offset before
     it, because CLOCK_MONOTONIC stops during a suspend."""
     step_ns, newest = 1168 * 86_400 * NS_PER_S, recorded.samples[-1]
     last = ClocksRecord(newest.t_ns + 1, 1, 1, 1, newest.utc_ns - newest.t_ns + step_ns, suspends)
-    file = copied(recorded.file, tmp_path / "a.imudrec", encode_clocks(last))
-    shift_ns = 0 if suspends else step_ns
+    other = encode_object(Kind.SESSION, NO_DEVICE, SessionRecord(VERSION, "", "", "", 7, 0, 0, 0))
+    file = copied(recorded.file, tmp_path / "a.imudrec", *[other] * joined, encode_clocks(last))
+    shift_ns = 0 if suspends or joined else step_ns
     found = rows(cli("export", "--to", "csv", file).out)
     for row, sample in zip(found, recorded.samples, strict=True):
         assert abs(int(row["utc_ns"]) - sample.utc_ns - shift_ns) < NS_PER_MS

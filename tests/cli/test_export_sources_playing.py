@@ -33,6 +33,8 @@ class KeepingSink:
     def losses(self, losses: LossCounts) -> None:
         self.taken.append(losses)
 
+    def session(self, epoch: int) -> None: ...
+
     def event(self, event: StampedEvent) -> None:
         self.taken.append(event)
 
