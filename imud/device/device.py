@@ -473,6 +473,8 @@ class Device:
         if (state is DeviceState.SEARCHING and path.fresh) or (
             state is DeviceState.SILENT and now_ns - path.last_sample_ns < SILENCE_NS
         ):
+            if state is DeviceState.SILENT:
+                self.settings.after_silence()
             self._up(now_ns)
         elif state is DeviceState.RUNNING and quiet_ns > SILENCE_NS and quiet_ns > SILENCE_PERIODS * path.period_ns:
             seconds = f"{quiet_ns / NS_PER_S:.1f} s"

@@ -19,7 +19,7 @@ import msgspec
 
 from imud.config.model import DeviceConfig
 from imud.contracts.command import REQUESTED_BY
-from imud.contracts.driver import Identity, PolledDriver
+from imud.contracts.driver import SAMPLE_COUNTER, Identity, PolledDriver
 from imud.contracts.setting import (
     AppliedSettings,
     OnDifference,
@@ -306,6 +306,13 @@ class DeviceSettings:
         if not busy and self._transport.can_be_asked:
             self.comparison.start_if_due(now_ns)
 
+    def after_silence(self) -> None:
+        """Compare the settings of a device that has no counter: it can have restarted in the pause of its samples."""
+        driver, may_ask = self._transport.driver, bool(self.declared) or (self._unsaved and self._transport.may_ask)
+        if driver is not None and driver.tick_ns == SAMPLE_COUNTER and may_ask:
+            self._read_resets = None
+            self.comparison.schedule(SETTLE_NS)
+
     def forget(self) -> None:
         """Note that the settings of the device may differ from the last values."""
         self.is_current = False
@@ -345,11 +352,13 @@ class DeviceSettings:
 
         `own`: a command of imud has just run, so the change is expected.
         """
-        driver, known, report = self._transport.driver, self.shown, combined(reports)
+        driver, known, report, before = self._transport.driver, self.shown, combined(reports), self.values
         self._reports, self.values, self.is_current = reports, report.values, True
         self._read_ns = now_ns = self._host.now_ns()
         if self._in_flash.follows:
             self._in_flash.saved(self.values)
+        if self._unsaved and not own and before != self._saved == self.values:
+            self._unsaved = False  # a restart without a counter: the device has the values of its flash again
         text = printable_words(report.words)
         self.shown = printable_words(driver.shown_settings(text)) if driver is not None else text
         changed, texts = {}, []

@@ -12,6 +12,7 @@ import msgspec
 import pytest
 
 from imud.config.model import DeviceConfig
+from imud.contracts.driver import SAMPLE_COUNTER
 from imud.contracts.setting import AppliedSettings, OnDifference, SettingsState, SettingsStatus, StepOutcome
 from imud.contracts.status import DeviceState
 from imud.device import stream_transport
@@ -332,6 +333,29 @@ async def test_apply_and_save_writes_flash_once(bench: ModuleBench) -> None:
     bench.module.restart()
     await bench.pass_s(300)
     assert bench.module.saves == 1
+
+
+@pytest.mark.parametrize("reverts", [False, True])
+def test_without_a_counter_the_values_after_silence_show_a_restart(
+    reverts: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driver = replace(FAKE_MODULE_DRIVER, tick_ns=SAMPLE_COUNTER)
+    monkeypatch.setattr(stream_transport, "DRIVERS", {**dict(DRIVERS), "fake-module": driver})
+    bench = ModuleBench(declared={"mode": "9-axis"})
+
+    async def story() -> None:
+        await bench.until(lambda: bench.is_in(SettingsState.DIFFER))
+        await bench.doing(bench.device.settings.apply(None, save=False))
+        sample, bench.module.sample = bench.module.sample, lambda: None  # type: ignore[method-assign]
+        await bench.until(lambda: bench.device.state is DeviceState.SILENT)
+        assert bench.status.unsaved
+        if reverts:
+            bench.module.set = dict(bench.module.flash)
+        bench.module.sample = sample  # type: ignore[method-assign]
+        await bench.pass_s(3)
+        assert (bench.status.unsaved, bench.is_in(SettingsState.DIFFER)) == (not reverts, reverts)
+
+    bench.play(story)
 
 
 @played(lambda: ModuleBench("apply_and_save", {"mode": "9-axis"}))

@@ -5,6 +5,7 @@ not state whether parameters 27 and 30 take effect immediately or after the next
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Annotated, Any, Final, Literal
@@ -59,6 +60,7 @@ SAMPLE_NS: Final = 3 * NS_PER_S
 # Time without a sample after which the stream has stopped, ns: more than the longest period
 QUIET_NS: Final = 1200 * NS_PER_MS
 # Time for samples in buffers when the stream stops, ns: 512 bytes at 115200 baud, and an adapter
+PARAMETER_ROUNDS: Final = 2  # number of requests for a parameter: one reply can be lost, or late
 DRAIN_NS: Final = 200 * NS_PER_MS
 
 GYRO_OFFSETS: Final = (Parameter.GYRO_X_OFF, Parameter.GYRO_Y_OFF, Parameter.GYRO_Z_OFF)
@@ -153,11 +155,11 @@ def read_parameters(wanted: Collection[Parameter] = tuple(Parameter)) -> Request
     """
     first, *others = sorted(wanted, key=lambda parameter: parameter is not Parameter.BAUD)
     values = {first: (yield from read(first))}
-    for parameter in others:
-        try:
-            values[parameter] = yield from read(parameter, 1)
-        except NoReply:
-            continue
+    for _ in range(PARAMETER_ROUNDS):
+        for parameter in others:
+            if parameter not in values:
+                with suppress(NoReply):
+                    values[parameter] = yield from read(parameter, 1)
     return values
 
 
