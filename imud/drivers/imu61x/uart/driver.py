@@ -125,20 +125,19 @@ def _calibrated(request: Request, parameters: Parameters3, done: int) -> Request
     before = last = yield from read3(parameters)
     fault = (yield from settled()).calibration_fault
     is_acknowledged = yield from ordered(request, done)
-    left_ns, equal, is_heard = CALIBRATION_NS, 0, True
+    left_ns, equal = CALIBRATION_NS, 0
     while left_ns > 0 and not (equal >= EQUAL_POLLS and last != before and any(last)):
         yield pause(POLL_NS)
         left_ns -= POLL_NS
         try:
             values = yield from read3(parameters, tries=1)
         except NoReply:  # the device is busy
-            left_ns, is_heard = left_ns - REPLY_TIMEOUT_NS, False
+            left_ns -= REPLY_TIMEOUT_NS
             continue
-        equal, last, is_heard = equal + 1 if values == last else 0, values, True
-    if not is_heard or not is_acknowledged or last != before:
-        status = yield from settled()  # raises NoReply if the device does not reply at all
-        if status.calibration_fault not in (0, None, fault):
-            return Calibrated(last, f"the device reports calibration fault {status.calibration_fault}")
+        equal, last = equal + 1 if values == last else 0, values
+    status = yield from settled()  # raises NoReply if the device does not reply at all
+    if status.calibration_fault not in (0, None, fault):
+        return Calibrated(last, f"the device reports calibration fault {status.calibration_fault}")
     if last == before:
         if not is_acknowledged:
             raise no_acknowledgement(request)
