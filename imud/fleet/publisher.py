@@ -168,6 +168,7 @@ class MqttPublisher:
         self._settings_known: dict[str, dict[str, object]] = {}  # published settings of each device
         self._state_ns = self._all_ns = 0
         self._is_changed = True  # True after an event of STATE_KINDS
+        self._is_first = True  # True before the first states
         self._spool_problem = self._problem = ""
         self._refused: Mapping[str, str] = {}  # reported topics that the broker refuses
         self._lock = -1
@@ -297,6 +298,9 @@ class MqttPublisher:
         self._is_changed = False
         statuses: dict[str, DeviceStatus] = {}
         other: dict[str, object] = {}
+        if self._is_first:
+            self._is_first = False
+            other |= dict.fromkeys(self._left_over())
         for status in self._context.devices.status():
             sending = self._settings.sending(status.name)
             if status.name not in self._sent or sending is None:
@@ -319,6 +323,20 @@ class MqttPublisher:
             other[self._topic("", STATE)] = state | {"mqtt": self.status(), "positions": self._positions()}
         if statuses or other:
             self._queue.put_state(SentState(statuses, other))
+
+    def _left_over(self) -> set[str]:
+        """Return the retained topics of this gateway from earlier runs that the configuration no longer contains."""
+        mine = (self._topic("", STATE).removesuffix(STATE), f"{PREFIX}/device/imud_{self._gateway.gateway}_")
+        wanted = {self._topic("", STATE)}
+        for name in self._sent:
+            sending = self._settings.sending(name)
+            if sending is not None and sending.status:
+                wanted |= {self._topic(name, STATUS), self._topic(name, SCHEMA)}
+                wanted |= {discovery_topic(self._gateway, name)} if self._settings.home_assistant else set()
+            if sending is not None and sending.settings:
+                wanted.add(self._topic(name, SETTINGS))
+        former = self._writer.former if self._writer is not None else ()
+        return {topic for topic in former if topic.startswith(mine) and topic not in wanted}
 
     def _changed_settings(self, status: DeviceStatus) -> dict[str, object]:
         """Return the message about the settings of a device; empty if they did not change."""

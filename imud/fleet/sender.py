@@ -144,6 +144,7 @@ class _Message(NamedTuple):
     row: int = 0  # ID of a row of the spool; 0 for other messages
     reply: CommandReply | None = None  # reply to a request
     is_retained: bool = False
+    due_ns: int = 0  # time of the acknowledgement at the latest, for a message in flight
 
 
 class MqttSender:
@@ -176,7 +177,8 @@ class MqttSender:
         self._outbox: deque[SpoolRow] = deque()  # rows of the spool
         self._in_flight: dict[int, _Message] = {}  # messages without an acknowledgement, by packet identifier
         self._answered_ns = 0  # time of the newest acknowledgement, or of the first message in flight
-        self._unanswered = ""  # `problem` of missing acknowledgements; empty after an acknowledgement
+        self._unanswered = ""  # `problem` of missing acknowledgements
+        self._has_answer = False  # whether an acknowledgement arrived after `_unanswered`
         self._refusals = TopicRefusals()
         self._answers: list[tuple[int, int]] = []
         self._retained: dict[str, bytes] = {}  # newest payload by topic
@@ -236,10 +238,10 @@ class MqttSender:
                         self._due[topic] = None
         self._ring()
 
-    def removals(self) -> frozenset[str]:
-        """Return the topics whose removal the broker has not acknowledged."""
+    def retained_topics(self) -> frozenset[str]:
+        """Return the topics of retained messages, until the broker has acknowledged their removal."""
         with self._lock:
-            return frozenset(topic for topic, payload in self._retained.items() if not payload)
+            return frozenset(self._retained)
 
     def reply(self, reply: CommandReply) -> None:
         """Send a reply before all other messages, and again after a lost connection. Any thread may call it."""
@@ -351,10 +353,14 @@ class MqttSender:
             self._refuse(message.topic, str(error))
             return
         self.sent += bool(message.row)
+        now_ns = self._now_ns()
         with self._lock:
             if not self._in_flight:
-                self._answered_ns = self._now_ns()
-            self._in_flight[number] = message
+                self._answered_ns = now_ns
+            # earlier messages delay the acknowledgement
+            size = len(message.payload) + sum(len(one.payload) for one in self._in_flight.values())
+            due_ns = now_ns + round((CONNECT_S + size / LINK_BYTES_S) * NS_PER_S)
+            self._in_flight[number] = message._replace(due_ns=due_ns)
 
     def _next_message(self) -> _Message | None:
         """Remove and return the next message; None if there is none. A message of a suspected topic follows all other
@@ -397,8 +403,7 @@ class MqttSender:
         numbers = connection.acknowledged[:]
         connection.acknowledged.clear()
         with self._lock:
-            self._answered_ns = self._now_ns()
-            self.problem = self._unanswered = ""
+            self._answered_ns, self._has_answer = self._now_ns(), True
             messages = [self._in_flight.pop(number) for number in numbers if number in self._in_flight]
             for one in messages:
                 self._refusals.accept(one.topic)
@@ -413,17 +418,26 @@ class MqttSender:
             self.wanting()
 
     def _check_answers(self) -> None:
-        """Set `problem` if the broker acknowledges nothing. Raise BrokerError after UNANSWERED_S."""
-        oldest = next(iter(self._in_flight.values()), None)
-        if oldest is None:
-            return
-        silent_s = (self._now_ns() - self._answered_ns) / NS_PER_S
-        limit_s = round(CONNECT_S + len(oldest.payload) / LINK_BYTES_S)
-        if silent_s > limit_s and not self._unanswered:
-            self.problem = self._unanswered = (
-                f"{self.broker}: expected an acknowledgement of a message of {oldest.topic} within {limit_s} s, "
-                f"got none"
+        """Set `problem` if the broker does not acknowledge a message or the subscription. Raise BrokerError after
+        UNANSWERED_S without any acknowledgement."""
+        now_ns = self._now_ns()
+        late = next((one for one in self._in_flight.values() if now_ns > one.due_ns), None)
+        if late is not None:
+            packet = (
+                f"the subscription to {late.topic}" if is_subscription(late.topic) else f"a message of {late.topic}"
             )
+            what = f"{self.broker}: expected an acknowledgement of {packet} within"
+            if not self._unanswered.startswith(what):
+                more = "; commands over MQTT do not work" if is_subscription(late.topic) else ""
+                limit_s = round(CONNECT_S + len(late.payload) / LINK_BYTES_S)
+                self._has_answer = False
+                self._unanswered = f"{what} {limit_s} s, got none{more}"
+            self.problem = self._unanswered
+        elif self._unanswered and self._has_answer:
+            self.problem = self._unanswered = ""
+        if not self._in_flight:
+            return
+        silent_s = (now_ns - self._answered_ns) / NS_PER_S
         if silent_s > UNANSWERED_S:
             raise BrokerError(
                 f"{self.broker}: no acknowledgement of {len(self._in_flight)} messages within {UNANSWERED_S:g} s"

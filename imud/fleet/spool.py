@@ -163,8 +163,8 @@ STEPS_MAX: Final = 64  # maximum number of steps in one transaction: 2,048 messa
 # Maximum number of streams with a stored position: three streams of each of 256 devices, and streams of earlier boots.
 # A state message with all positions has 120 kB, not more than the longest message.
 POSITIONS_MAX: Final = 1024
-# Maximum number of stored removals of retained messages: four topics of each of 256 devices
-REMOVALS_MAX: Final = 1024
+# Maximum number of stored topics of retained messages: four topics of each of 256 devices, also of removed devices
+RETAINED_MAX: Final = 2048
 BUSY_S: Final = 1.0  # time to wait for a program that has locked the file, s
 
 _SCHEMA: Final = """
@@ -178,8 +178,8 @@ CREATE TABLE IF NOT EXISTS progress (
     last INTEGER NOT NULL, stored_utc_ns INTEGER NOT NULL, PRIMARY KEY (gateway, boot, device, stream)
 ) WITHOUT ROWID;
 """
-# created at the first removal: an empty table occupies a page of a small disk
-_REMOVALS: Final = "CREATE TABLE IF NOT EXISTS removal (topic TEXT PRIMARY KEY) WITHOUT ROWID"
+# Topics of retained messages. Earlier versions stored only the topics to remove.
+_RETAINED: Final = "CREATE TABLE IF NOT EXISTS removal (topic TEXT PRIMARY KEY) WITHOUT ROWID"
 # Earlier versions stored positions without the name of the gateway, in the table `position`
 _COLUMNS: Final = "id, boot, device, stream, kind, topic, first, last, items, stored_utc_ns, payload"
 # Condition for messages that the sender did not receive. imud may thin or drop only these.
@@ -396,26 +396,26 @@ class Spool:
             self._rename_if_damaged(error)
             raise SpoolError(f"{self._path}: {reason_of(error)}") from error
 
-    def removals(self) -> list[str]:
-        """Return the topics whose retained messages the broker has not removed yet. Raises SpoolError."""
+    def retained_topics(self) -> list[str]:
+        """Return the topics of retained messages that the broker may have. Raises SpoolError."""
         try:
             base = self._connection()
             if not base.execute("SELECT 1 FROM sqlite_master WHERE name = 'removal'").fetchone():
                 return []
-            rows = base.execute("SELECT topic FROM removal LIMIT ?", (REMOVALS_MAX,))
+            rows = base.execute("SELECT topic FROM removal LIMIT ?", (RETAINED_MAX,))
             return [topic for (topic,) in rows if isinstance(topic, str) and topic]
         except sqlite3.Error as error:
             self._rename_if_damaged(error)
             raise SpoolError(f"{self._path}: {reason_of(error)}") from error
 
-    def store_removals(self, topics: Collection[str]) -> None:
-        """Replace the stored removals. Raises SpoolError."""
+    def store_topics(self, topics: Collection[str]) -> None:
+        """Replace the stored topics of retained messages. Raises SpoolError."""
         try:
             base = self._connection()
             base.execute("BEGIN IMMEDIATE")
-            base.execute(_REMOVALS)
+            base.execute(_RETAINED)
             base.execute("DELETE FROM removal")
-            base.executemany("INSERT INTO removal VALUES (?)", [(one,) for one in sorted(topics)[:REMOVALS_MAX]])
+            base.executemany("INSERT INTO removal VALUES (?)", [(one,) for one in sorted(topics)[:RETAINED_MAX]])
             base.execute("COMMIT")
         except sqlite3.Error as error:
             with suppress(sqlite3.Error):

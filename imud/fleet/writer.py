@@ -170,7 +170,9 @@ class SpoolWriter:
         self._boots: dict[str, int] = {}
         self._rows: list[SpoolRow] = []
         self._acknowledged: set[int] = set()
-        self._removals: frozenset[str] = frozenset()  # removals of retained messages in the spool
+        # Topics of retained messages of earlier runs, without the topics that this run has published or removed
+        self.former: set[str] = set()
+        self._topics: frozenset[str] = frozenset()  # topics of retained messages in the spool
         self._session = 0
         self._skipped: frozenset[str] = frozenset()  # topics that the sender did not want at the last call
         self._due_ns = 0
@@ -206,7 +208,7 @@ class SpoolWriter:
         for streams in self._streams.values():
             self._rows += streams.flush()
         self._due_ns = 0
-        self._store_removals()
+        self._store_topics()
         self._store(self._clock.now_ns())
         if self._rows:
             log.error(
@@ -230,7 +232,7 @@ class SpoolWriter:
         self._take_all()
         now_ns = self._clock.now_ns()
         if now_ns >= self._due_ns:
-            self._store_removals()
+            self._store_topics()
             for streams in self._streams.values():
                 self._rows += streams.take_due(now_ns)
             self._store(now_ns)
@@ -265,6 +267,7 @@ class SpoolWriter:
                 made |= {
                     topic: b"" if value is None else msgspec.json.encode(value) for topic, value in item.other.items()
                 }
+                self.former -= made.keys()
                 self._sender.retain(made)
 
     def _take_batch(self, batch: Batch) -> None:
@@ -298,11 +301,11 @@ class SpoolWriter:
         try:
             self._spool.open()
             self.positions = self._spool.positions()
-            self._removals = frozenset(self._spool.removals())
+            self._topics = frozenset(self._spool.retained_topics())
+            self.former = set(self._topics)
         except SpoolError as error:
             self.problem = str(error)
             return
-        self._sender.retain(dict.fromkeys(self._removals, b""))
         for position in self.positions:
             boot, _, number = position.boot.partition("-")
             # the identifier of a boot is `EPOCH`, and `EPOCH-N` after the N-th start of a device
@@ -337,13 +340,13 @@ class SpoolWriter:
         self.problem = ""
         self._acknowledged -= acknowledged
 
-    def _store_removals(self) -> None:
-        """Store the removals that the broker has not acknowledged, because they must survive a restart of imud."""
-        removals = self._sender.removals()
-        if removals != self._removals:
+    def _store_topics(self) -> None:
+        """Store the topics of retained messages. After a restart, imud removes the messages of removed devices."""
+        topics = self._sender.retained_topics() | self.former
+        if topics != self._topics:
             with suppress(SpoolError):  # the next transaction reports the problem
-                self._spool.store_removals(removals)
-                self._removals = removals
+                self._spool.store_topics(topics)
+                self._topics = topics
 
     def _commit(self, acknowledged: frozenset[int], now_ns: int) -> None:
         """Store the waiting messages. Raises SpoolError. After a problem, store them one by one, because a full disk

@@ -53,7 +53,7 @@ class FakeConnection:
                 raise BrokerError("the connection was lost")
             if topic in self._broker.refuses:
                 self.refused.append((self._answered, "Not authorized"))
-            else:
+            elif topic not in self._broker.ignores:
                 self.acknowledged.append(self._answered)
         if self._broker.blocks and not self.acknowledged:
             self._bell.wait(seconds)
@@ -80,6 +80,7 @@ class FakeBroker:
         self.window = 4
         self.closes_on: set[str] = set()  # topics for which the broker closes the connection
         self.refuses: set[str] = set()  # topics that the broker refuses with a reason
+        self.ignores: set[str] = set()  # topics that the broker never acknowledges
         self.rejects: set[str] = set()  # topics whose messages are too long for the broker
         self.will: Will | None = None
         self.connecting, self.accepts = threading.Event(), threading.Event()

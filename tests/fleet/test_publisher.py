@@ -126,6 +126,24 @@ def test_a_removed_device_leaves_no_retained_state(tmp_path: Path) -> None:
     assert bench.output.status().broker == ""
 
 
+def test_a_device_removed_between_two_runs_leaves_no_retained_state(tmp_path: Path) -> None:
+    """The broker acknowledges the removal in the fourth run."""
+    removed = []
+    for device, answers in (("imu0", 99), ("imu1", 0), ("imu1", 0), ("imu1", 99), ("imu1", 99)):
+        bench = PublisherBench(tmp_path)
+        bench.broker.answers = answers
+        bench.broker.window = 20
+        bench.statuses = [device_status(device, 0)]
+        bench.start(device=device)
+        bench.broker.wait_for("imud/default/gw/state")
+        bench.tick()
+        bench.broker.wait_for(f"imud/default/gw/{device}/schema")
+        bench.tick()
+        removed.append({topic for topic, payload, _ in bench.close() if not payload})
+    stale = {"imud/default/gw/imu0/status", "imud/default/gw/imu0/schema"}
+    assert removed == [set(), stale, stale, stale, set()]
+
+
 def test_settings_are_published_when_they_change(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path)
     topic = "imud/default/gw/imu0/settings"

@@ -214,6 +214,25 @@ FORBIDDEN = {"ha/a", "ha/b", "data/x", "answer/x"}
 REQUESTS = "imud/s/gw/+/command"
 
 
+@pytest.mark.parametrize(
+    ("topic", "words"),
+    [
+        (REQUESTS, f"the subscription to {REQUESTS} within 4 s, got none; commands over"),
+        ("data/x", "a message of data/x"),
+    ],
+)
+def test_one_missing_acknowledgement_among_others_is_named(topic: str, words: str) -> None:
+    bench = SenderBench()
+    bench.sender.commands = CommandChannel(CommandOptions(), Gateway("s", "gw", ""), Mock(), bench.clock.now_ns, Mock())
+    bench.broker.ignores = {topic}
+    bench.drive(1)
+    for number in range(60):
+        bench.sender.give(1, [row(number + 2, topic="data/y"), *[row(1, topic="data/x")] * (number == 0)])
+        bench.drive(1)
+    assert f"expected an acknowledgement of {words}" in bench.sender.problem
+    assert (len(bench.done), bench.sender.connected) == (60 + (topic == REQUESTS), True)
+
+
 @pytest.mark.parametrize("way", ["closes_on", "refuses", "rejects"])
 def test_forbidden_topics_do_not_block_other_messages(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("imud.fleet.sender.SKIP_NS", LONG_NS)
