@@ -73,7 +73,7 @@ class Sink(Protocol):
         ...
 
     def session(self, epoch: int) -> None:
-        """Note that the content of a file of another run of imud follows."""
+        """Note that another file follows. `epoch` identifies its run of imud."""
         ...
 
     def finish(self) -> None:

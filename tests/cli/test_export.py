@@ -21,16 +21,7 @@ from imud.cli.export_sources import recorded_facts
 from imud.contracts.publisher import Batch
 from imud.contracts.status import Deviations
 from imud.formats.recording import BlockGatherer, RecordingReader
-from imud.formats.records import (
-    NO_DEVICE,
-    VERSION,
-    ClocksRecord,
-    Kind,
-    SessionRecord,
-    encode,
-    encode_clocks,
-    encode_object,
-)
+from imud.formats.records import NO_DEVICE, ClocksRecord, Kind, SessionRecord, encode, encode_clocks, encode_object
 from imud.model.errors import BadArgument, ImudError
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample
@@ -264,7 +255,7 @@ def test_rows_before_a_step_of_the_wall_clock(
     it, because CLOCK_MONOTONIC stops during a suspend."""
     step_ns, newest = 1168 * 86_400 * NS_PER_S, recorded.samples[-1]
     last = ClocksRecord(newest.t_ns + 1, 1, 1, 1, newest.utc_ns - newest.t_ns + step_ns, suspends)
-    other = encode_object(Kind.SESSION, NO_DEVICE, SessionRecord(VERSION, "", "", "", 7, 0, 0, 0))
+    other = encode_object(Kind.SESSION, NO_DEVICE, SessionRecord(1, "", "", "", 7, 0, 0, 0))
     file = copied(recorded.file, tmp_path / "a.imudrec", *[other] * joined, encode_clocks(last))
     shift_ns = 0 if suspends or joined else step_ns
     found = rows(cli("export", "--to", "csv", file).out)

@@ -139,18 +139,6 @@ def test_samples_of_a_refused_topic_wait_in_the_spool(tmp_path: Path, monkeypatc
     assert (len(bench.broker.connections), bench.sender.refused) == (1, {})
 
 
-def test_the_topics_of_retained_messages_survive_a_restart_until_they_are_removed(tmp_path: Path) -> None:
-    former: list[set[str]] = []
-    for value, answers in (("on", 9), (None, 0), (None, 9), (None, 9)):
-        bench = WriterBench(tmp_path)
-        bench.broker.answers = answers
-        former.append(set(bench.writer.former))
-        bench.queue.put_state(SentState({}, {"gw/old/status": value} if value else dict.fromkeys(former[-1])))
-        bench.work(3)
-        bench.writer.close()
-    assert former == [set(), {"gw/old/status"}, {"gw/old/status"}, set()]
-
-
 def test_waiting_messages_are_sent_in_order_with_the_allowed_rate(tmp_path: Path) -> None:
     bench = WriterBench(tmp_path, messages_per_s=3)
     bench.broker.problem = "no route"

@@ -45,12 +45,6 @@ def short(**options: object) -> HipnucModbusCodec:
     return made
 
 
-LEVEL: dict[str, Any] = {
-    "accel_m_s2": (0, 0, 9.8), "gyro_rad_s": (0, 0, 0), "mag_t": (0, 0, 0), "euler_rad": (0, 0, 0),
-    "quat_wxyz": (1, 0, 0, 0), "temperature_c": 25, "pressure_pa": 1e5,
-}  # fmt: skip
-
-
 def block(
     *,
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0), per_lsb: float = QUAT_PER_LSB,
@@ -125,7 +119,7 @@ def test_a_device_without_barometer_has_no_pressure() -> None:
 
 @pytest.mark.parametrize("filler", ["00", "ff", "7f", "7fff", "8000"])
 def test_filler_bytes_are_no_values(filler: str) -> None:
-    data = bytearray(modbus.pack_block(**(LEVEL | {"uptime_ms": 5})))
+    data = bytearray(block()[3:-2])
     for start, end in ((12, 18), (30, 48)):  # field, then temperature to inclinometer
         data[start:end] = (bytes.fromhex(filler) * 18)[: end - start]
     m = next(one for one in codec().decode(0, framed(9, registers_reply(bytes(data)))) if isinstance(one, Measurement))
