@@ -82,8 +82,8 @@ _NAME: Final = re.compile(rf"(?:{PIN_SETTING}|.*ALARM)(?:[_ ]?([XY]))?", re.IGNO
 _VALUES: Final = re.compile(
     rf"(?:([XY])\s*,\s*)?({_NUMBER})\s*,\s*({_NUMBER})\s*,\s*{_NUMBER}\s*,\s*([01])", re.IGNORECASE
 )
-# `COORD 4`, `COORD=4` or `COORD: 4`; no document of the vendor shows the line
-_COORD: Final = re.compile(r"(?<![A-Za-z])COORD(?![A-Za-z])\s*[=:]?\s*0*(\w+)")
+# `COORD 4`, `COORD=4`, `COORD: 4` or `coord,4`; no document of the vendor shows the line
+_COORD: Final = re.compile(r"(?<![A-Z])COORD(?![A-Z])\s*[=:,]*\s*([^\s,;]*)", re.IGNORECASE)
 _PIN: Final = re.compile(r"IO([1-9])\b")
 _DIVISOR: Final = re.compile(r"(?:.*\bDIV)?\s*(\d{1,2})\b")
 
@@ -135,7 +135,8 @@ def report_values(raw: Mapping[str, str]) -> dict[str, Any]:
             low, high = float(values[2]), float(values[3])
             alarms[axis] = AngleAlarm(min_deg=low, max_deg=high, enabled=values[4] == "1")
         if coordinates is None and (found := _COORD.search(f"{name}: {text}")):
-            coordinates = found[1]
+            number = numbers_of(found[1], 1)
+            coordinates = f"{number[0]:g}" if number is not None else found[1] or "no value"
     pins = {}
     for function in PinFunction:
         if found := _PIN.match(raw.get(f"PMUX{function.value}", "")):
