@@ -412,7 +412,6 @@ def test_without_a_change_the_result_is_not_verified(
         (8, {}, {"calibration_fault": 2}, "sent, not verified: the device reports calibration fault 2"),
         (8, None, {}, "expected a reply, got none"),
     ],
-    ids=["cleared", "cleared, no end", "late", "fault", "no replies"],
 )
 def test_only_new_parameters_without_a_fault_are_verified(
     seconds: int, at_begin: dict[str, Any] | None, at_end: dict[str, Any], words: str, monkeypatch: pytest.MonkeyPatch
