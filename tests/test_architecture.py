@@ -450,6 +450,7 @@ and monitoring."""
 
 CROSS_CUTTING = {
     "cli/test_main.py": "`main` of imud/cli/__init__.py",
+    "contracts/test_facts.py": "words, counts and defaults in codec, driver, lines, setting and status",
     "drivers/hipnuc/canopen/test_peers.py": "the canopen library as a peer of codec and simulator",
     "drivers/hipnuc/test_moves_and_settings_on_can.py": "settings and new addresses of the drivers on CAN",
     "drivers/imu61x/test_one_truth.py": "one motion through every protocol of the family",
@@ -494,8 +495,7 @@ TESTED_IN = {
     "imud.drivers.imu61x.registers": "drivers/imu61x/test_i2c.py",
     "imud.drivers.imu61x.uart.driver": "drivers/imu61x/uart/test_commands.py",
     "imud.drivers.polled_frames": "drivers/test_every_polled_driver.py",
-    "imud.fleet.settings": "fleet/test_publisher.py", "imud.formats.jsonrpc": "publishers/socket/test_methods.py",
-    "imud.formats.kernel": "sampling/test_path_kernel.py",
+    "imud.fleet.settings": "fleet/test_publisher.py",
     "imud.links.cyclic_sender": "links/test_socketcan.py", "imud.links.netlink": "links/test_socketcan.py",
     "imud.model.bucket": "publishers/socket/test_history.py",
     "imud.publishers.metrics.metric": "publishers/metrics/test_families.py",

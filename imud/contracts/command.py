@@ -121,10 +121,7 @@ def _parameters(begin: Callable[..., Any]) -> type[Options]:
     hints = get_type_hints(begin, include_extras=True)
     given = [p for p in signature(begin).parameters.values() if p.kind is p.KEYWORD_ONLY]
     fields = [(p.name, hints[p.name]) if p.default is p.empty else (p.name, hints[p.name], p.default) for p in given]
-    made = msgspec.defstruct(
-        "Parameters", fields, bases=(Options,), frozen=True, kw_only=True, forbid_unknown_fields=True
-    )
-    return cast(type[Options], made)
+    return cast(type[Options], msgspec.defstruct("Parameters", fields, bases=(Options,), kw_only=True))
 
 
 Verbs = Mapping[str, Verb]

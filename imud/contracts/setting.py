@@ -143,10 +143,7 @@ def declared_values(declared: Options | None) -> dict[str, Any]:
 @cache
 def _declarable(settings: SettingsTable) -> type[Options]:
     fields = [(name, one.type | None, None) for name, one in settings.table.items() if one.write is not None]
-    made = msgspec.defstruct(
-        "Declared", fields, bases=(Options,), frozen=True, kw_only=True, forbid_unknown_fields=True
-    )
-    return cast(type[Options], made)
+    return cast(type[Options], msgspec.defstruct("Declared", fields, bases=(Options,)))
 
 
 # --- reports about settings --------------------------------------------------------------------------------------

@@ -155,9 +155,6 @@ def test_deviations_are_the_quadratic_mean_of_the_axes(tmp_path: Path) -> None:
     moved = report(gyro=[0.001, 0.007, 0.005]) | {"at_rest": False, "motion": "angular rate: too large"}
     with pytest.raises(ImudError, match=r"at rest, got motion \(angular rate: too large\); measure again"):
         read_noise(written(tmp_path, moved))
-    had = Deviations(gyro_rad_s=1.0, mag_t=2.0)
-    new = had.updated(Deviations(gyro_rad_s=3.0, accel_m_s2=4.0))
-    assert new == Deviations(gyro_rad_s=3.0, mag_t=2.0, accel_m_s2=4.0)
     for content in [[], {}, {"measurement": {"device": "bow"}, "sensors": {"gyro": 1}}, "text"]:
         with pytest.raises(ImudError, match="expected a report of `imud noise --json`"):
             read_noise(written(tmp_path, content))

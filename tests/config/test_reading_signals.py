@@ -14,7 +14,6 @@ from imud.drivers import DRIVERS
 from imud.model.errors import ConfigError
 from imud.utc import RMC_SOURCES
 from imud.utc.receivers import RmcOptions
-from tests.support.documented import check_schema
 
 
 def parse(*devices: str) -> tuple[DeviceConfig, ...]:
@@ -60,10 +59,6 @@ def test_every_line() -> None:
 
 
 def test_defaults_and_lines_of_drivers() -> None:
-    reset = contracts_lines.ResetOptions(line="R")
-    assert (reset.active_low, reset.hold_ms, reset.wait_s, reset.open_drain) == (True, 10.0, 3.0, False)
-    assert contracts_lines.DividedOptions(line="D").divisor == 8
-    assert not contracts_lines.TriggerOptions(line="S").active_low
     for keys in ("driver: hipnuc-uart, uart: {port: x}", hipnuc("")):
         assert parse(keys)[0].lines is None
     for name, driver in DRIVERS.items():
@@ -169,12 +164,6 @@ def test_each_rmc_source(keys: str, rmc: RmcOptions | None) -> None:
     assert parse(keys)[0].rmc == rmc
     assert set(RMC_SOURCES) == set(RmcOptions.__annotations__["source"].__args__)
     assert all(map(callable, RMC_SOURCES.values()))
-
-
-def test_keys_of_lines_and_deviations_accept_the_documented_values() -> None:
-    for name, schema in contracts_lines.LINE_SCHEMAS.items():
-        check_schema(f"Line `{name}`", schema)
-    assert check_schema("Noise of a device", Deviations) == 6
 
 
 HEAD = """\

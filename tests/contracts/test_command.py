@@ -36,7 +36,7 @@ def test_every_action_is_described_and_says_what_it_saves_and_risks(driver: str)
     assert [info.kind for info in infos(DRIVERS[driver].calibrations)] == [*DRIVERS[driver].calibrations]
 
 
-def _turn(target: Target, *, angle_deg: Annotated[float, Meta(ge=-180, le=180)], relative: bool = False) -> str:
+def _turn(target: Target, *, relative: bool = False, angle_deg: Annotated[float, Meta(ge=-180, le=180)]) -> str:
     return f"{target.baud} {angle_deg} {relative}"
 
 
@@ -48,7 +48,7 @@ def test_arguments_are_completed_by_defaults_and_bad_arguments_name_the_good_one
     assert msgspec.structs.asdict(arguments) == {"angle_deg": 5.0, "relative": False}
     assert ACTION.script(Target(None, 9600), arguments) == "9600 5.0 False"
     for given in ({}, {"angle_deg": "x"}, {"angle_deg": 1, "turns": 2}, {"angle_deg": 181}):
-        good = r"angle_deg \(a number from -180 to 180\), relative \(true or false; default false\)"
+        good = r"relative \(true or false; default false\), angle_deg \(a number from -180 to 180\)"
         with pytest.raises(BadArgument, match=good):
             ACTION.arguments(given)
         assert ", ".join(map(str, parameters_of(ACTION))) == good.replace("\\", "")
@@ -60,8 +60,8 @@ def test_description_for_people() -> None:
         "name": "yaw",
         "help": "turn it",
         "parameters": [
-            {"name": "angle_deg", "values": "a number from -180 to 180", "default": None, "required": True},
             {"name": "relative", "values": "true or false", "default": "false", "required": False},
+            {"name": "angle_deg", "values": "a number from -180 to 180", "default": None, "required": True},
         ],
         "risk": "",
     }

@@ -6,6 +6,8 @@ from imud.contracts import condition as conditions
 from imud.contracts.condition import Condition, DeviceCondition, Reason, ReasonCode
 from tests.support.documented import check_schema
 
+MISSING = "devices have a problem: a (missing), b (missing), c (missing), d (missing), e (missing)"
+
 
 @pytest.mark.parametrize(
     ("words", "line"),
@@ -15,11 +17,8 @@ from tests.support.documented import check_schema
         ({"bow": "missing"}, "1 device has a problem: bow (missing)."),
         ({"a": "ok", "b": "degraded", "c": "ok"}, "1 of 3 devices has a problem: b (degraded)."),
         ({"a": "ok", "b": "ok"}, "All 2 devices are OK."),
-        (
-            {f"d{n}": "attention" for n in range(6)},
-            "6 of 6 devices have a problem: "
-            "d0 (attention), d1 (attention), d2 (attention), d3 (attention), d4 (attention) and 1 more.",
-        ),
+        (dict.fromkeys("abcde", "missing"), f"5 of 5 {MISSING}."),
+        (dict.fromkeys("abcdef", "missing"), f"6 of 6 {MISSING} and 1 more."),
     ],
 )
 def test_summary(words: dict[str, str], line: str) -> None:

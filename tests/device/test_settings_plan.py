@@ -194,10 +194,6 @@ def test_every_setting_is_described() -> None:
     assert all(one.actual is None for one in settings_plan.described_settings(FAKE_SETTINGS, {}, None))
     assert (offset.title, offset.help, offset.group) == ("Offset", "added to the heading", "measurement")
     assert mode.schema["enum"] == ["6-axis", "9-axis"]
-    names = ("tpdo1_interval_ms", "sout_divisor", "ff2f_interval_ms", "gyro_offset_deg_s", "second_bus")
-    assert [setting.title_of(name) for name in names] == [
-        "TPDO1 interval", "SOUT divisor", "FF2F interval", "Gyro offset", "Second bus",
-    ]  # fmt: skip
     assert settings_plan.first_sentence("off; other functions. More") == "off"
 
 

@@ -13,7 +13,6 @@ from imud.attitude import rotation
 from imud.attitude.conventions import FLU_LEVEL, RFU_ENU, Convention, EulerOrder, Heading
 from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes, mounting_of, published_frame
 from imud.config.model import DeviceConfig
-from imud.contracts.driver import StatusBit, status_words
 from imud.contracts.publisher import Batch
 from imud.contracts.status import FrameStatus
 from imud.device.health import DeviceEvents
@@ -385,9 +384,6 @@ def test_set_and_cleared_bits_raise_one_event_per_second() -> None:
     bench.watch.tick(bench.now_ns, DRIVERS["imu61x-can"], bench.path)
     bench.watch.tick(bench.now_ns, None, None)
     assert bench.events == []
-    bits = {0: StatusBit("first"), 9: StatusBit("tenth")}
-    assert status_words(bits, 1 << 9 | 1 << 4) == ("tenth",)
-    assert status_words(bits, None) == ()
     bench = WatchBench()
     messages = [message for i in range(600) for message in bench.step(OVER_RANGE if i // 14 % 2 else DISTURBED)]
     times = [event.t_ns for event in bench.events]

@@ -104,14 +104,6 @@ def test_calibrations_filters_steps_on_the_wire_and_figures_by_the_longest_begin
         assert words({}, "accel") == "low-pass 47 Hz (factory setting; imud has not read the filter)"
     assert DRIVERS["hipnuc-uart"].data_sheet.filter_words({}, "gyro") == ""
 
-    family, model = (
-        contract.ModelFigures(source="a"),
-        contract.ModelFigures(gyro=contract.SensorFigures(random_walk=1e-4), source="b"),
-    )
-    sheet = contract.DataSheet(models={"HI": family, "HI14": model})
-    assert sheet.figures_of("HI14R2N") is model
-    assert sheet.figures_of("HI12") is family
-    assert sheet.figures_of("CH100") is None
     for name, gyro, accel in (
         ("hipnuc-modbus", 0.061035 * RAD_PER_DEG, 0.00048828 * 9.8),
         ("hipnuc-j1939", 0.061035 * RAD_PER_DEG, 0.00048828 * 9.8), ("hipnuc-canopen", 0.1 * RAD_PER_DEG, 0.001 * 9.8),

@@ -10,8 +10,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from imud.contracts.link import CanUse
-from imud.formats.can import CanFilter, CyclicFrame, pack_frame
+from imud.formats.can import CyclicFrame, pack_frame
 from imud.links import LINKS, netlink
 from imud.links.cyclic_sender import KernelSender, LoopSender
 from imud.links.socketcan import SO_RCVBUFFORCE, SocketCanLink, SocketCanOptions, open_raw
@@ -182,24 +181,3 @@ def test_claims_of_a_link(name: str, keys: dict[str, object], expected: tuple[ob
     row = LINKS[name]
     (claim,) = row.claims(msgspec.convert(keys, row.settings))
     assert (claim.place, claim.key, claim.shared, claim.part, claim.part_key, claim.terms) == expected
-
-
-@pytest.mark.parametrize(
-    ("bus", "can_id", "extended", "receive", "send"),
-    [
-        ("can0", 0x80, False, "0x080", "0x080"), ("can0", 0x81, False, "", ""), ("can0", 0x80, True, "", ""),
-        ("can1", 0x80, False, "", ""),
-    ],
-)  # fmt: skip
-def test_devices_of_one_bus_differ_in_their_identifiers(
-    bus: str, can_id: int, extended: bool, receive: str, send: str
-) -> None:
-    def use(bus: str, can_id: int, extended: bool) -> CanUse:
-        cyclic = (CyclicFrame(can_id, extended, b"", 1_000_000),)
-        return CanUse(bus, (CanFilter(can_id, 0x7FF, extended),), cyclic)
-
-    one, other = use("can0", 0x80, False), use(bus, can_id, extended)
-    assert (one.both_receive(other), other.both_receive(one)) == (receive, receive)
-    assert (one.both_send(other), other.both_send(one)) == (send, send)
-    assert other.receives(can_id, extended)
-    assert not other.receives(can_id, not extended)
