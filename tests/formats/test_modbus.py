@@ -20,7 +20,7 @@ def finder(echoes: bool | None = False, request: bytes = REQUEST, size: int = le
 
 @pytest.mark.manual("B 4.1.3 CRC")
 def test_check_value_and_frames() -> None:
-    assert modbus.crc16_modbus(b"123456789") == 0x4B37
+    assert (modbus.crc16_modbus(b"123456789"), modbus.crc16_modbus(b"\0")) == (0x4B37, 0x40BF)
     assert modbus.crc16_modbus(b"123456789\x37\x4b") == 0
     assert (modbus.READ_HOLDING, modbus.WRITE_SINGLE, modbus.REGISTERS_MAX) == (0x03, 0x06, 125)
     assert modbus.framed(0x50, bytes.fromhex("03 0034 0018")).hex() == "50030034001809" + "8f"
@@ -32,9 +32,8 @@ def test_check_value_and_frames() -> None:
     assert not modbus.is_exception(modbus.framed(5, b"\x03\x02"))
     assert modbus.exception_text(2) == "exception 2: the register does not exist"
     assert modbus.exception_text(77) == "exception 77: unknown code"
-    assert list(modbus.SLAVES) == list(
-        range(1, 248)
-    )  # 0 is the broadcast, 248 to 255 are reserved (Modbus over serial line V1.02, 2.2)
+    # 0 is the broadcast, 248 to 255 are reserved (Modbus over serial line V1.02, 2.2)
+    assert list(modbus.SLAVES) == list(range(1, 248))
 
 
 @pytest.mark.parametrize(("baud", "gap_ns"), [(9600, 3_645_831), (19200, 1_822_915), (38400, 1_750_000)])
@@ -87,7 +86,10 @@ def test_a_damaged_reply_is_returned_only_in_its_place() -> None:
     found = finder()
     assert found.feed(OTHER) is None
     assert not found.looks_damaged
-    for data, sender in ((b"\x06" + OTHER + REPLY, 6), (REPLY + OTHER[:-1], None), (REPLY, None), (EXCEPTION, None)):
+    for data, sender in (
+        (b"\x06" + OTHER + REPLY, 6), (REPLY + OTHER, 6), (REPLY + OTHER[:-1], None), (OTHER[:-1] + b"\0", None),
+        (REPLY, None), (EXCEPTION, None), (modbus.framed(7, b"\x03\1\2"), 7), (modbus.framed(7, b"\4\1\2"), None),
+    ):  # fmt: skip
         assert modbus.late_sender(data, {6, 7}) == sender
 
 

@@ -40,7 +40,7 @@ def rules() -> dict[str, Any]:
 def stages(path: str) -> list[list[str]]:
     """Return the test modules for a module of imud: its own, then its folder, the subfolders, the folders above.
 
-    Tests of the whole daemon run for modules at the top only. Contracts have no tests of their own: their users do.
+    Tests of the whole daemon run for modules at the top only. Without an own test module, the tests of users run.
     """
     module = Path(path).with_suffix("")
     dotted = ".".join(module.parts)
@@ -91,6 +91,8 @@ class Tree:
             if name and (ROOT / name).is_file():
                 (self.root / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(ROOT / name, self.root / name, follow_symlinks=False)
+        for path in (ROOT / "imud").glob("*.so"):  # git ignores the kernel; tests compare the Python code with it
+            shutil.copy2(path, self.root / "imud")
         self.mtime = count(int(time.time()))
         self._make_environment()
 

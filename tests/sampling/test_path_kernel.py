@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from unittest.mock import Mock
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from imud.attitude.conventions import Convention
@@ -28,7 +28,7 @@ from imud.recording.state import StateWriter
 from imud.sampling.clock import SampleClock
 from imud.sampling.path import PathContext, StreamPath, make_clock
 from tests.support.event_loops import UTC_AHEAD_NS
-from tests.support.files import ROOT, hi91
+from tests.support.files import hi91
 
 BYTE_NS = 10_851
 SETTLE = 400  # frames of 1 ms until imud uses the fit and does not watch the counter
@@ -91,7 +91,7 @@ class Run:
     def __init__(self, options: HipnucOptions, turned: bool) -> None:
         self.slots = b""
         self.now_ns, self.slewed_ns, self.ms, self.number = BEGIN_NS, 0, 0, 0
-        self.kernel_batches = 0
+        self.kernel_batches, self.held = 0, list[bool]()
         self.late_bytes = b""
         self.ledger = Ledger()
         self.seen = Mock()
@@ -138,6 +138,7 @@ class Run:
             path.on_data(bytes(data), t_rx_ns)
         else:
             path.gather(bytes(data), t_rx_ns, step.waited_ms * NS_PER_MS)
+            self.held.append(path.held_by_fit)
             if step.publish:
                 path.publish_gathered()
 
@@ -145,12 +146,12 @@ class Run:
         path = self.path
         path.publish_gathered()
         external = {"ledger": self.ledger, "steady": self.steady, "observer": self.seen.observer}
-        newest, taken = path.newest, path.take_status()
+        newest, taken = (path.quality, path.clock.t_ns, path.clock.t_rx_ns, path.newest), path.take_status()
         path.clock.settle()
         state = StateWriter(external, path.NOT_STATE).write({"path": path})
         return (
             self.slots, self.ledger.snapshot(), path.latency.buckets, path.latency.sum_ns, newest, taken,
-            self.seen.mock_calls, path.clock.status(), state,
+            self.seen.mock_calls, path.clock.status(), state, self.held,
         )  # fmt: skip
 
 
@@ -165,18 +166,10 @@ def play(steps: Sequence[Step], options: HipnucOptions, turned: bool, found: ker
     return run
 
 
-def test_a_variable_of_the_environment_switches_the_kernel_off(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert kernel.load("0") == kernel.Kernel(None, "IMUD_KERNEL=0 switches it off")
-    assert kernel.load("1").module is kernel.load(None).module is not None
-    monkeypatch.setattr(kernel, "SOURCE", ROOT / "hatch_build.py")
-    assert kernel.load(None).problem.startswith("it was compiled from another version")
-    monkeypatch.setitem(sys.modules, "imud._kernel", None)
-    assert kernel.load(None).problem.startswith("it is not installed: ")
-
-
 @given(
     st.lists(STEPS, max_size=30), st.sampled_from([HipnucOptions(), HipnucOptions(hi91_word="status")]), st.booleans()
 )
+@example([Step(1), Step(2, waited_ms=0, publish=False), Step(1, waited_ms=5)], HipnucOptions(), False)
 def test_kernel_and_python_are_equal(steps: list[Step], options: HipnucOptions, turned: bool) -> None:
     by_kernel, by_python = (play(steps, options, turned, one) for one in (kernel.present, kernel.Kernel(None)))
     for one, other in zip(by_kernel.result(), by_python.result(), strict=True):
