@@ -62,12 +62,9 @@ def test_turns_about_one_axis(quat: Quaternion, euler_deg: Vector3) -> None:
 @pytest.mark.manual("B 9.2 matrix of a quaternion")
 def test_the_matrix_turns_body_to_navigation() -> None:
     """A body that is rotated left by 90° has its x axis (before: east) pointing north."""
-    assert rotation.matrix_times(rotation.matrix_from_quat((HALF, 0.0, 0.0, HALF)), (1, 0, 0)) == pytest.approx(
-        (0, 1, 0), abs=1e-15
-    )
-    assert rotation.matrix_times(rotation.matrix_from_euler312((0, math.pi / 2, 0)), (0, 1, 0)) == pytest.approx(
-        (0, 0, 1), abs=1e-15
-    )
+    left, up = rotation.matrix_from_quat((HALF, 0.0, 0.0, HALF)), rotation.matrix_from_euler312((0, math.pi / 2, 0))
+    assert rotation.matrix_times(left, (1, 0, 0)) == pytest.approx((0, 1, 0), abs=1e-15)
+    assert rotation.matrix_times(up, (0, 1, 0)) == pytest.approx((0, 0, 1), abs=1e-15)
 
 
 @given(quats)
@@ -78,6 +75,7 @@ def test_quaternion_to_matrix_or_euler_and_back(quat: Quaternion) -> None:
     assert back[0] >= 0
     assert angle_between(quat, back) < 1e-7
     assert angle_between(quat, rotation.quat_from_euler312(rotation.euler312_from_quat(quat))) < 1e-7
+    assert rotation.quat_from_matrix(((-1, 0, 0), (0, -1, 0), (0, 0, 1))) == (0, 0, 0, 1)
 
 
 @given(angles, steep, angles)
@@ -116,6 +114,13 @@ def test_straight_up_and_down_all_of_the_turn_is_yaw(sign: int) -> None:
     ):
         assert found[0] == 0
         assert found[1:] == pytest.approx((up, yaw), abs=1e-7)
+    limit = rotation.GIMBAL_COS_PITCH  # cosine of the pitch from which the roll is known
+    rolls = (
+        rotation.euler312_from_matrix(((0.6, 0.8, 0.0), (0.8, -0.6, 0.0), (-limit, sign, 0.0)))[0],
+        rotation.euler_zyx_from_matrix(((0.0, -0.6, 0.8), (0.0, 0.8, 0.6), (-sign, limit, 0.0)))[0],
+        rotation.euler_zyx_from_quat((1.0, limit, sign, 0.0))[0],
+    )
+    assert rolls == pytest.approx((math.pi / 2,) * 3, abs=1e-7)
 
 
 @pytest.mark.parametrize("convert", [rotation.euler312_from_quat, rotation.euler_zyx_from_quat])
@@ -129,7 +134,7 @@ def test_quaternions_without_direction_are_refused(quat: Quaternion, convert: Ca
     "matrix",
     [
         ((1, 0, 0), (0, 1, 0), (0, 0, -1)), ((1, 0, 0), (0, 2, 0), (0, 0, 1)), ((1, 0, 0), (1, 0, 0), (0, 0, 1)),
-        ((math.nan, 0, 0), (0, 1, 0), (0, 0, 1)),
+        ((math.nan, 0, 0), (0, 1, 0), (0, 0, 1)), ((1, 0, 0), (0, 1 + 8e-7, 0), (0, 0, 1)),
     ],
 )  # fmt: skip
 def test_other_matrices_are_rejected(matrix: rotation.Matrix3) -> None:
@@ -177,9 +182,8 @@ def test_zyx_is_the_product_of_its_turns(roll: float, pitch: float, yaw: float) 
         rotation.matrix_from_euler312(one) for one in ((0, 0, yaw), (pitch, 0, 0), (0, roll, 0))
     )
     wanted = rotation.matrix_product(rotation.matrix_product(about_z, about_y), about_x)
-    for row, other in zip(
-        rotation.matrix_from_quat(rotation.quat_from_euler_zyx((roll, pitch, yaw))), wanted, strict=True
-    ):
+    found = rotation.matrix_from_quat(rotation.quat_from_euler_zyx((roll, pitch, yaw)))
+    for row, other in zip(found, wanted, strict=True):
         assert row == pytest.approx(other, abs=1e-12)
 
 

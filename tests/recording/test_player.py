@@ -170,9 +170,8 @@ def test_without_the_state_a_new_clock_starts_and_a_removed_option_is_ignored(
     session, player = SessionRecord(1, "0.1", "3.11", "host", 1, 0, 1, 2), Player(lambda _batch: None)
     data = [records.encode_object(Kind.SESSION, records.NO_DEVICE, session), *rig.recorded]
     player.play(record for one in data for record in records_of(one))
-    assert player.devices[played.device_id].fresh_starts == [
-        f"imud 0.1 wrote the recording, this is imud {__version__}"
-    ]
+    starts = player.devices[played.device_id].fresh_starts
+    assert starts == [f"imud 0.1 wrote the recording, this is imud {__version__}"]
 
 
 def without_state(record: Record) -> Record:

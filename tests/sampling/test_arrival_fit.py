@@ -179,6 +179,7 @@ FITS: dict[str, Callable[[], ArrivalFit]] = {
     "clock stopped": lambda: followed(ArrivalFit(0, 0), 150, 1.0, lambda t_s: 3e8 * (t_s > 130)),
     "short timer": lambda: followed(ArrivalFit(0, 0, NS_PER_MS), 20, 1.00002, noise(4e5)),
     "timer and late host": lambda: followed(ArrivalFit(0, 0, 16 * NS_PER_MS), 20, 1.00002, held(Random(5))),
+    "timer and stopped clock": lambda: followed(ArrivalFit(0, 0, 16 * NS_PER_MS), 20, 1.0, lambda t_s: 3e7 * (t_s > 5)),
     "timer and stalls": lambda: behind_timer(
         40, [(at_ms * NS_PER_MS, (at_ms + 90) * NS_PER_MS) for at_ms in range(0, 40_000, 350)], 16 * NS_PER_MS,
         3 * NS_PER_MS,
@@ -192,6 +193,7 @@ FIGURES: dict[str, tuple[float, ...]] = {
     "clock stopped": (300000000, 15000000, 3160705.36, 49749609.4, 324154052, 3.81469727e-06, 0, 0),
     "short timer": (329241.914, 16594.8545, 17052.7379, 5180.79118, 106344.792, 0, 617066.586, 222003.103),
     "timer and late host": (417593.346, 21048.0517, 261989.757, 540287.147, 3723227.27, 0, 6942595.18, 2522798.8),
+    "timer and stopped clock": (3e7, 2016129.03, 461436.207, 2251237.41, 14699696.6, 0, 6e6, 3e6),
     "timer and stalls": (409842.83, 10328.7004, 46476.1538, 96461.7138, 619397.552, 0, 3205560.35, 1155153.68),
 }  # fmt: skip
 

@@ -193,6 +193,12 @@ def test_one_clock_or_link_follows_another() -> None:
     assert clock.missed == 0
     assert rises(samples)
     assert samples[-300].t_dev_ns == 7 * NS_PER_MS
+    clock = make_clock()
+    feed(clock, steady(0, 0, 500))
+    clock.sample(message(5000), BEGIN_NS + 10_000 * NS_PER_MS, 0)  # the host read this frame 5 s late
+    clock.link_changed(byte_ns=10_850, hold_ns=0)
+    feed(clock, [(10_010, 10_010)])
+    assert (clock.missed, clock.status().resets) == (500, 0)
     first, second = make_clock(), make_clock()
     samples = feed(first, steady(0, 0, 100))
     second.continue_from(first)

@@ -158,6 +158,9 @@ def test_uneven_and_equal_ticks_cause_no_loss() -> None:
     assert [learner.add_step(2 + i % 2) for i in range(1000)] == [0] * 1000
     assert learner.period_ticks == pytest.approx(2.5, abs=0.01)
     assert learner.add_step(8) == 2
+    learner = PeriodLearner()  # regular steps of two ticks are a rate, and not losses, after eight steps
+    assert sum(learner.add_step(1 + (i % 20 == 19)) for i in range(1000)) == 8
+    assert learner.period_ticks == pytest.approx(1.05)
     # 1 kHz in milliseconds, 100 ppm fast: a counter value occurs twice after 10 s.
     learner = PeriodLearner()
     for i in range(10_100):

@@ -10,7 +10,7 @@ from imud.sampling.device_utc import IntervalFit
 from imud.sim.ports.arrival import BARE_UART, LOADED, USB_16MS, USB_16MS_PACKET, ArrivalModel, ArrivalProfile, Crystal
 from tests.bench import line_runs
 from tests.bench.clock import BAUD_OF_RATE, clock_for
-from tests.support.clock_feed import BEGIN_NS, rises
+from tests.support.clock_feed import BEGIN_NS, feed, message, rises, steady
 
 UNIX = 1 << 32
 DAY = 86_400_000
@@ -59,6 +59,14 @@ def test_a_turn_before_anything_is_known_and_a_slow_drift_through_the_millisecon
     # Device time and UTC are each accurate within a tick, and both can stay at their limits for seconds.
     dated, _ = line_runs.run_utc(model(USB_16MS_PACKET, 200, -50.0, 2002), 15, turn_ms=UNIX, turn_at=0.06)
     assert line_runs.share_honest(dated) >= 0.95
+
+
+@pytest.mark.parametrize(("count", "off_ms", "late_ns"), [(500, 0, 38_600), (500, 4, 43_211), (5, 4, 43_211)])
+def test_a_device_can_restart_its_sampling_when_it_turns_to_utc(count: int, off_ms: int, late_ns: int) -> None:
+    clock, at_ns = utc_clock(), BEGIN_NS + (10 * count + off_ms) * MS
+    feed(clock, steady(0, 0, count))
+    sample = clock.sample(message((at_ns + line_runs.UTC_OFFSET_NS) // MS % UNIX), at_ns + 2 * MS, 0)
+    assert (sample.t_ns - at_ns, sample.sync, clock.status().resets) == (late_ns, Sync.UTC, 0)
 
 
 @pytest.mark.parametrize("error_ns", [line_runs.REFERENCE.error_ns, 10 * NS_PER_S])
@@ -209,16 +217,18 @@ def test_the_width_grows_with_time_and_a_fit_beside_the_intervals_is_moved() -> 
     fix, error = intervals.combined(NS_PER_S, beside, 1000.0, 0.0)
     assert fix == pytest.approx(-MS, rel=0.01)
     assert error == pytest.approx(MS, rel=0.01)
+    # up to 1.75 standard errors next to the intervals, both can be right; otherwise it is unknown which one is wrong
+    beside = NS_PER_S + int(MS / 2 + intervals.width_ns(NS_PER_S) / 2 + 1.75 * NS_PER_S)
+    errors = [intervals.combined(NS_PER_S, beside + more, 1e9, 0.0)[1] for more in (0, 1)]
+    assert errors == pytest.approx([577_638_944, 1_531_179_641], abs=1)
 
 
 def test_contradictions_drop_old_intervals_or_are_covered() -> None:
     intervals, x = filled(0.0)
     for i in range(1, 200):
-        intervals.add_interval(
-            x + i * NS_PER_S // 10, x + 20 * MS + i * NS_PER_S // 10, x + 21 * MS + i * NS_PER_S // 10, FAR, 1.0
-        )
+        at = x + i * NS_PER_S // 10
+        intervals.add_interval(at, at + 20 * MS, at + 21 * MS, FAR, 1.0)
     assert intervals.known
-    at = x + 199 * NS_PER_S // 10
     assert intervals.combined(at, at, 1e9, 0.0)[0] == pytest.approx(20.5 * MS, abs=0.6 * MS)
     # A device without pulses drifts away and reports UTC: its milliseconds only agree with each other.
     intervals, x = IntervalFit(), 0

@@ -52,6 +52,7 @@ class Scripted:
         self.silence: Sequence[PolledEvent] = ()
         self.flush: Callable[[], Sequence[Any]] = tuple
         self.resets = 0
+        self.unknown = {7: 1}
 
     def feed_frame(self, *_frame: object) -> Sequence[Any]:
         events, self.ledger.frames_pending = self.results.pop(0)
@@ -124,19 +125,28 @@ def test_bytes_are_published_on_arrival_or_together() -> None:
     path, now = rig.stream(), rig.now
     path.watch_status(0b10)
     path.begin(now)
-    assert (path.begun_ns, path.last_data_ns, path.fresh, path.period_ns) == (now, now, False, 0)
-    assert not path.gather(b"O", now + MS)
+    assert (path.begun_ns, path.last_data_ns, path.fresh, path.period_ns, path.quality) == (
+        now,
+        now,
+        False,
+        0,
+        (None, 0),
+    )
+    assert (path.gather(b"O", now + MS), path.held_by_fit, path.unknown is path.codec.unknown) == (False, False, True)
     path.on_data(b"K\r\n" + hi91(1000), now + 2 * MS)
     assert rig.messages == [("OK", now + 2 * MS)]
     assert (path.last_data_ns, path.last_sample_ns, path.fresh) == (now + 2 * MS, now + 2 * MS, True)
     assert path.gather(hi91(1010), now + 12 * MS)
     assert path.gather(hi91(1020), now + 22 * MS, waited_ns=MS)
-    assert path.clock.waited_ns == 0
+    assert (path.clock.waited_ns, path.held_by_fit) == (0, False)
     assert rig.sizes == [1]
     path.publish_gathered()
     path.publish_gathered()
     assert (rig.sizes, rig.ledger.samples) == ([1, 2], 3)
-    assert (path.newest, path.last_sample_ns) == (rig.batches[-1][-1], now + 22 * MS)
+    newest = rig.batches[-1][-1]
+    assert (path.newest, path.last_sample_ns, path.quality) == (newest, now + 22 * MS, (newest.sync, newest.t_err_ns))
+    assert (path.clock.t_ns, path.clock.t_rx_ns) == (newest.t_ns, now + 22 * MS)
+    assert make_clock("bow", None, DRIVERS["hipnuc-uart"], path.clock).t_ns == newest.t_ns
     assert sum(path.latency.buckets) == 3
     head = hi91(1030)[:3]
     path.on_data(head + hi91(1030), now + 32 * MS)  # the length of the cut frame contains the next frame
@@ -270,6 +280,8 @@ def test_samples_of_can_frames_start_before_the_first_frame_and_end_at_a_loss() 
     assert rig.sizes == [1]
     path.flush(now + 6 * MS)  # no frame since the previous call
     assert (rig.sizes, rig.batches[1][0].t_rx_ns) == ([1, 1], now + 2 * MS)
+    path.reset()  # no frame of the waiting sample follows
+    assert (rig.sizes, path.unknown) == ([1, 1, 1], {7: 1})
 
 
 def test_each_input_is_reported_before_its_samples_are_published() -> None:
