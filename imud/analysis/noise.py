@@ -502,9 +502,9 @@ def _turn(readings: Readings) -> str:
     t_ns, angles = readings.t_ns[usable], angles[usable]
     for name, column in zip(("roll", "pitch", "yaw"), angles.T, strict=True):
         good = np.isfinite(column)
-        if good.sum() < BLOCKS_LEAST:
+        if good.sum() < BLOCKS_LEAST or not len(blocks := _blocks(t_ns[good], np.unwrap(column[good])[:, None])):
             continue
-        mean = _blocks(t_ns[good], np.unwrap(column[good])[:, None]).mean(axis=1)[:, 0]
+        mean = blocks.mean(axis=1)[:, 0]
         changes = np.abs(np.diff(mean, prepend=mean[:1]))
         if name != "yaw":
             changes = np.maximum(changes, np.abs(mean - np.median(mean)))
@@ -541,9 +541,8 @@ def _tone(t_ns: IntArray, values: FloatArray, limits: RestLimits) -> str:
 
 
 def _motion(t_ns: IntArray, values: FloatArray, limits: RestLimits) -> str:
-    if len(t_ns) < BLOCKS_LEAST:
+    if len(t_ns) < BLOCKS_LEAST or not len(blocks := _blocks(t_ns, values)):
         return ""
-    blocks = _blocks(t_ns, values)
     mean = blocks.mean(axis=1)
     for words, found, limit in (
         (

@@ -78,9 +78,9 @@ def test_a_corner_needs_four_flat_bands_below_and_uses_eight(
     frequency_hz = np.arange(1025.0)
     density = np.where(frequency_hz < drop_hz, 1.0, 0.1)
     density[: rise_hz + 1] = 100.0
-    assert (
-        analysis_noise.corner_of(Spectrum(2048.0, frequency_hz, density[:, None], "hann", 2048, 1.5, 1, 0)) == corner_hz
-    )
+    for power, expected_hz in ((density, corner_hz), (0 * density, None)):
+        spectrum = Spectrum(2048.0, frequency_hz, power[:, None], "hann", 2048, 1.5, 1, 0)
+        assert analysis_noise.corner_of(spectrum) == expected_hz
 
 
 def test_drift_with_temperature() -> None:
@@ -221,6 +221,16 @@ def test_slow_turns_without_angles() -> None:
     assert "not verified" in analysis_noise.unverified_words(replace(readings, gyro_rad_s=None))
     turned = replace(readings, euler_rad=np.zeros_like(readings.gyro_rad_s))
     assert not analysis_noise.unverified_words(turned)
+
+
+def test_a_series_below_one_second_shows_no_motion_and_256_samples_show_a_vibration() -> None:
+    values = noise_of_three(11, count=150)
+    found = analysis_noise.sensor_noise(readings_of(values, np.full(150, np.nan)), values)
+    assert (found.disturbed_s, found.still_s, found.axes[0].drift) == (0, 0, None)
+    for count, words in ((7, ""), (8, ""), (255, ""), (256, "angular rate: expected no vibration, got 0.014")):
+        gyro = shaken(0.02, 33.0)[:count]
+        motion = analysis_noise.motion_words(Readings(stamps_ns(count, RATE_HZ), gyro, None, None, 0 * gyro))
+        assert motion.partition(" rad/s at ")[0] == words
 
 
 def test_one_weakly_disturbed_second_in_a_hundred_seconds_is_no_motion() -> None:

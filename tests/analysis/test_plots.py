@@ -40,6 +40,9 @@ def test_plots_are_drawn_in_units_of_data_sheets(sensor: SensorNoise) -> None:
     assert "µg/√Hz" in axes.get_ylabel()
     middle = np.asarray(axes.get_lines()[0].get_ydata())[-10:].mean()
     assert middle == pytest.approx(np.sqrt(2) * 1e-3 / 9.80665e-6, rel=0.05)
+    filtered = replace(sensor, corner_hz=20.0, tau_least_s=0.25)
+    drawings = [draw("gyro", filtered).axes[0] for draw in (deviation_figure, density_figure)]
+    assert [(len(axes.patches), len(axes.get_lines())) for axes in drawings] == [(1, 6), (1, 4)]
     figure = page_figure({"gyro": sensor, "accel": sensor}, ["first line", "second line"])
     assert [axes.get_xlabel() for axes in figure.axes] == ["τ, s", "τ, s", "f, Hz", "f, Hz"]
     assert figure.get_size_inches() == pytest.approx((8.27, 11.69 * 0.0105 * 2 + 0.5 + 6.4)), "A4 is 8.27 in wide"
@@ -68,3 +71,6 @@ def test_peaks_are_named_in_the_picture() -> None:
     ]  # fmt: skip
     assert [text.get_text() for text in figure.axes[0].texts] == ["P1 12.50 Hz"]
     assert figure.axes[0].get_xlim() == (0.0, 50.0)
+    even = replace(vibration, spectrum=replace(spectrum, density=np.ones_like(spectrum.density)), peaks=())
+    low, high = spectrum_figure({"accel": even}, "", []).axes[0].get_ylim()
+    assert (low, high) == pytest.approx((0.0501187, 19.95262), rel=1e-5), "two decades and the margins"
