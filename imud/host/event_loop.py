@@ -21,6 +21,7 @@ import asyncio
 import select
 import selectors
 from collections.abc import Callable, Coroutine
+from contextlib import suppress
 from contextvars import Context
 from functools import partial
 from heapq import heappop, heappush
@@ -96,10 +97,11 @@ class Alarm:
 class ReaderSelector(selectors.EpollSelector):
     """Selector for asyncio's descriptors that calls readers itself. Synchronization: the thread of the event loop."""
 
+    on_error: OnError  # receives the errors of readers and alarms; set by the loop
+
     def __init__(self, poller: Poller | None = None) -> None:
         """`poller` watches the readers and the epoll of asyncio; None for an epoll of the kernel."""
         super().__init__()
-        self.on_error: OnError | None = None
         # Whether the loop received a callback, a timer or `stop` since the wait started. Set by the loop.
         self.has_news = False
         self._readers: dict[int, Callable[[], object]] = {}
@@ -126,10 +128,8 @@ class ReaderSelector(selectors.EpollSelector):
         if self._readers.pop(fd, None) is None:
             return False
         self._removed.add(fd)
-        try:
+        with suppress(OSError):  # the kernel removes a closed descriptor itself
             self._outer.unregister(fd)
-        except OSError:  # the kernel removes a closed descriptor itself
-            return True
         return True
 
     def add_alarm(self, due_s: float, alarm: Alarm) -> None:
@@ -190,8 +190,6 @@ class ReaderSelector(selectors.EpollSelector):
                     self._failed(alarm.ring, error)
 
     def _failed(self, callback: Callable[[], object], error: Exception) -> None:
-        if self.on_error is None:
-            raise error
         self.on_error({"message": f"Exception in reader {callback!r}", "exception": error})
 
 

@@ -61,8 +61,10 @@ def test_the_first_reading_measures_and_later_readings_cost_two_calls() -> None:
         assert abs(first - AHEAD_NS) <= host.clock.error_ns <= 501
         assert (host.clock.kept_utc_offset_ns(), host.clock.kept()) == (first, (first, 0))
         assert abs(host.clock.utc_ns() - host.realtime_ns()) <= 1500
-    host = Host()
+    host, measured = Host(), list[tuple[int, ...]]()
+    host.clock.on_measured = lambda *given: measured.append(given)
     first, calls = host.offset_ns(), host.calls
+    assert measured == [(1000 * NS_PER_S + 650, 1000 * NS_PER_S + 700, 0)]
     for number in range(1, 100):
         host.sleep(NS_PER_MS)
         assert host.offset_ns() == first

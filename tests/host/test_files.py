@@ -90,9 +90,9 @@ def test_owner_and_mode_change_only_if_they_differ(tmp_path: Path, monkeypatch: 
     own = os.getuid(), os.getgid()
     files.replace_file(tmp_path / "file", b"", mode=0o600, owner=own)
     assert calls == []
-    files.replace_file(tmp_path / "file", b"", mode=0o4600, owner=(own[0], own[1] + 1))
+    files.replace_file(tmp_path / "file", b"", mode=0o666, owner=(own[0], own[1] + 1))  # the umask reduces this mode
     files.replace_file(tmp_path / "file", b"", mode=0o600, owner=(own[0] + 1, own[1]))
-    assert (calls[0], calls[-1]) == ((own[0], own[1] + 1), (own[0] + 1, own[1]))
+    assert calls == [(own[0], own[1] + 1), (0o666,), (own[0] + 1, own[1])]
 
 
 def test_a_fifo_is_opened_only_with_data(tmp_path: Path) -> None:
@@ -122,6 +122,9 @@ def test_group_of_a_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         assert files.group_of("/dev/ttyUSB0", "other") == expected
     monkeypatch.undo()
     assert files.group_of(str(tmp_path / "absent"), "other") == "other"
+    for uid, user in ((0, "root"), (4_000_000_000, "4000000000")):
+        monkeypatch.setattr("imud.host.files.os.geteuid", lambda uid=uid: uid)
+        assert files.user_name() == user
 
 
 def test_a_state_file_keeps_the_newest_content(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from imud.host.network import resolve
+from imud.host.network import listen, resolve
 from imud.model.errors import ServerError
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 from imud.publishers.nmea0183 import TcpOutput, UdpOutput
@@ -38,6 +38,14 @@ async def test_a_kernel_without_ipv6(monkeypatch: pytest.MonkeyPatch) -> None:
         TcpOutput("::1", 0, VirtualClock().now_ns).open()
     with pytest.raises(ServerError, match="::1 port 0: Address family not supported by protocol"):
         ScrapeServer("::1", 0).start(answer)
+
+
+def test_a_server_socket_does_not_block_and_its_port_is_in_use() -> None:
+    with listen("127.0.0.1", 0) as listener:
+        options = [listener.getsockopt(socket.SOL_SOCKET, one) for one in (socket.SO_REUSEADDR, socket.SO_ACCEPTCONN)]
+        assert (listener.getblocking(), options) == (False, [1, 1])
+        with pytest.raises(OSError, match="in use"):
+            listen("127.0.0.1", listener.getsockname()[1])
 
 
 @in_loop

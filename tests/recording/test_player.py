@@ -258,6 +258,18 @@ def test_counters_of_the_ledger_that_are_not_integers_are_an_error(recorded: pyt
             Player(lambda _batch: None).play([*found[: made + 1], Record(Kind.CALL, found[made].device, call)])
 
 
+def test_the_reference_of_utc_and_its_end_are_replayed(recorded: pytest.MonkeyPatch) -> None:
+    found = recorded_run()
+    made = next(number for number, record in enumerate(found) if record.kind == Kind.PATH)
+    calls = [msgspec.msgpack.encode(CallRecord("clock", "set_utc_reference", [one])) for one in ([5, 7], None)]
+    for count, error_ns in ((1, 7), (2, 0)):
+        player = Player(lambda _batch: None)
+        player.play([*found[: made + 1], *(Record(Kind.CALL, found[made].device, call) for call in calls[:count])])
+        ((_, played),) = player.devices.items()
+        assert played.path is not None
+        assert played.path.clock.status().reference_error_ns == error_ns
+
+
 def test_lost_records_and_events_are_passed_on_and_an_unknown_trouble_is_the_last_known() -> None:
     told: list[tuple[str, int]] = []
     player = Player(lambda _batch: None, on_event=lambda event, utc_ns: told.append((event.message, utc_ns)))

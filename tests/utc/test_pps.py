@@ -131,13 +131,13 @@ def test_another_receiver_takes_over() -> None:
     ("sentence", "after_s"),
     [
         (build(UTC_S * NS_PER_S, valid=False), 0.3), (build(UTC_S * NS_PER_S)[:-6], 0.3),
-        (build(UTC_S * NS_PER_S + 500 * NS_PER_MS), 0.3), (build(UTC_S * NS_PER_S), 1.1),
-        (build(UTC_S * NS_PER_S), -0.1),
+        (build(UTC_S * NS_PER_S + 500 * NS_PER_MS), 0.3), (build(UTC_S * NS_PER_S), 1.0),
+        (build(UTC_S * NS_PER_S), -1e-9),
     ],
-    ids=["status V", "damaged", "not yet", "after the next pulse", "before the pulse"],
+    ids=["status V", "damaged", "not yet", "at the next pulse", "before the pulse"],
 )  # fmt: skip
 def test_sentences_that_name_no_pulse_are_ignored(sentence: bytes, after_s: float) -> None:
-    receiver = Receiver()
+    receiver = Receiver(0)
     receiver.go(5, says=None)
     for _ in range(3):
         receiver.reference.on_sentence(sentence, receiver.t_ns(after_s))

@@ -13,6 +13,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from random import Random
+from unittest.mock import AsyncMock
 
 import msgspec
 import pytest
@@ -66,7 +67,10 @@ def play(serve: Serve, scene: Scene, gps: str = "", retry: receivers.Retry | Non
     return asyncio.run(whole())
 
 
-def test_it_asks_for_nmea_and_gives_rmc_with_its_time() -> None:
+def test_it_asks_for_nmea_and_gives_rmc_with_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second address of the host accepts the connection."""
+    addresses = AsyncMock(return_value=["127.0.0.2", "127.0.0.1", "127.0.0.3"])
+    monkeypatch.setattr(receivers, "resolve", addresses)
     asked: list[bytes] = []
     ended = asyncio.Event()
 
@@ -282,6 +286,10 @@ def test_sources_by_their_name_and_documented_values() -> None:
     assert check_schema("RMC sentences", receivers.RmcOptions) == 8
     defaults = receivers.RmcOptions(source="gpsd")
     assert (defaults.rate_hz, defaults.tcp_port, defaults.baud, defaults.error_ms) == (1, 2947, 9600, 50)
+    with pytest.raises(ValueError, match=r'^host: expected an IP address or a host name, got "a b"$'):
+        receivers.RmcOptions(source="gpsd", host="a b")
+    with pytest.raises(ValueError, match=r"^expected the key port for source nmea, "):
+        receivers.RmcOptions(source="nmea")
 
 
 GGA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"

@@ -2,8 +2,10 @@
 
 import asyncio
 import ctypes
+import errno
 import time
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 
@@ -34,6 +36,16 @@ def test_the_kernel_answers_sensibly_and_a_refused_call_means_not_synchronized()
     assert not system_clock.kernel_clock(ask).synchronised
     assert system_clock.system_reference(system_clock.kernel_clock(ask), 42) is None
     assert system_clock.system_reference(system_clock.KernelClock(False, 1, NS_PER_MS), 42) is None
+
+
+def test_a_state_of_the_kernel_is_returned_and_a_failed_call_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    states = iter((0, 5, -1))
+    called = SimpleNamespace(adjtimex=lambda _timex: next(states))
+    monkeypatch.setattr(ctypes, "CDLL", lambda _name, *, use_errno: called if use_errno else None)
+    assert [system_clock.ask_kernel(system_clock.Timex()) for _ in range(2)] == [0, 5]
+    ctypes.set_errno(errno.EPERM)
+    with pytest.raises(PermissionError, match="not permitted"):
+        system_clock.ask_kernel(system_clock.Timex())
 
 
 @pytest.mark.parametrize(
