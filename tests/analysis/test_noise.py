@@ -128,18 +128,15 @@ def test_the_figures_of_a_filtered_walking_and_drifting_sensor() -> None:
     assert found.flat_hz == pytest.approx((1.02294921875, 12.275390625), rel=1e-4)
     assert (len(curve.tau_s), found.disturbed_s, found.still_s) == (49, 0, 300)
     assert (curve.low[5, 0], curve.high[5, 0]) == pytest.approx((0.00455677485, 0.00461482738), rel=1e-4)
-    assert (axis.least_deviation, axis.least_tau_s, axis.density) == pytest.approx(
-        (0.00066820761, 3.925, 0.00133997352), rel=1e-4
-    )
+    figures = (axis.least_deviation, axis.least_tau_s, axis.density)
+    assert figures == pytest.approx((0.00066820761, 3.925, 0.00133997352), rel=1e-4)
     assert not axis.least_at_end
-    assert (axis.drift.slope, axis.drift.sigma, axis.drift.r2) == pytest.approx(
-        (0.00122897744, 1.98019364e-5, 0.9281906555), rel=1e-4
-    )
+    figures = (axis.drift.slope, axis.drift.sigma, axis.drift.r2)
+    assert figures == pytest.approx((0.00122897744, 1.98019364e-5, 0.9281906555), rel=1e-4)
     terms = axis.terms
     assert (terms.random_walk.value, terms.random_walk.sigma) == pytest.approx((9.8109261e-4, 1.5264768e-5), rel=1e-3)
-    assert (terms.rate_random_walk.value, terms.rate_random_walk.sigma) == pytest.approx(
-        (4.7583391e-4, 3.4083908e-5), rel=1e-3
-    )
+    walk = terms.rate_random_walk
+    assert (walk.value, walk.sigma) == pytest.approx((4.7583391e-4, 3.4083908e-5), rel=1e-3)
     below = [one.below for one in (terms.quantisation, terms.bias_instability, terms.rate_ramp)]
     assert below == pytest.approx([1.980569e-4, 1.0131024e-3, 1.2697425e-4], rel=1e-3)
 

@@ -93,29 +93,23 @@ def test_reports_are_joined_and_a_declaration_has_the_writable_settings() -> Non
     assert setting.schemas_of(FAKE_SETTINGS)["secret"]["maximum"] == 9
 
 
-@pytest.mark.parametrize(
-    ("name", "title", "group"),
-    [
+def test_title_and_group_of_a_setting() -> None:
+    for name, title, group in (
         ("tpdo1_interval_ms", "TPDO1 interval", "output"), ("sout_divisor", "SOUT divisor", "pins"),
         ("gyro_offset_deg_s", "Gyro offset", "measurement"), ("second_bus", "Second bus", "connection"),
-    ],
-)  # fmt: skip
-def test_title_and_group_of_a_setting(name: str, title: str, group: str) -> None:
-    assert (setting.title_of(name), setting.group_of(name, setting.Setting(type=int))) == (title, group)
-    assert setting.group_of(name, setting.Setting(type=int, connection=True)) == "connection"
+    ):  # fmt: skip
+        assert (setting.title_of(name), setting.group_of(name, setting.Setting(type=int))) == (title, group)
+        assert setting.group_of(name, setting.Setting(type=int, connection=True)) == "connection"
 
 
-@pytest.mark.parametrize(
-    ("outcomes", "saved", "restarted", "ends"),
-    [
+def test_a_value_after_a_restart_verifies_a_save() -> None:
+    for outcomes, saved, restarted, ends in (
         ("VERIFIED NOT_VERIFIED", True, True, ["saved to flash", "restarted"]), ("VERIFIED", True, False, [UNSURE]),
         ("VERIFIED", False, True, ["restarted"]), ("NOT_VERIFIED", True, True, [UNSURE, "restarted"]),
         ("VERIFIED NOT_APPLIED", True, True, [UNSURE, "restarted"]),
-    ],
-)  # fmt: skip
-def test_a_value_after_a_restart_verifies_a_save(outcomes: str, saved: bool, restarted: bool, ends: list[str]) -> None:
-    steps = tuple(setting.AppliedStep("mode", 1, 0, StepOutcome[one]) for one in outcomes.split())
-    assert AppliedSettings(steps, saved, restarted).ends == ends
+    ):  # fmt: skip
+        steps = tuple(setting.AppliedStep("mode", 1, 0, StepOutcome[one]) for one in outcomes.split())
+        assert AppliedSettings(steps, saved, restarted).ends == ends
 
 
 def test_the_failure_is_the_problem_or_else_all_missing_values_and_a_plan_can_be_empty() -> None:

@@ -206,35 +206,18 @@ def test_a_transfer_script_can_continue_after_a_failed_transfer() -> None:
     assert end.value.value == 5
 
 
-# --- measurements -----------------------------------------------------------------------------------------------------
-
-
-def measured(tick: int) -> Measurement:
-    return Measurement(54, 0, tick)
-
-
-def waiting(ledger: Ledger, tick: int) -> ScriptRunner:
-    """Return a runner. Its request waits for the measurement at `tick`."""
-    session = offline_runner(ledger)
-    session.start(replace(command("once"), is_sample=lambda sample: sample.dev_ticks == tick), 0)
-    return session
-
-
-def test_a_measurement_ends_a_request_that_waits_for_it(ledger: Ledger) -> None:
-    session = waiting(ledger, 7)
+def test_a_measurement_ends_a_request_that_waits_for_it_and_no_other(session: ScriptRunner, ledger: Ledger) -> None:
+    once = replace(command("once"), is_sample=lambda sample: sample.dev_ticks == 7)
+    session.start(once, 0)
     assert session.wants_samples
-    assert session.on_sample(measured(6)) is None
-    assert session.on_sample(measured(7)) == Reply((), measured(7))
+    early, right = Measurement(54, 0, 6), Measurement(54, 0, 7)
+    assert [session.on_sample(one) for one in (early, right, right)] == [None, Reply((), right), None]
     assert not session.wants_samples
-    assert session.on_sample(measured(7)) is None
-    assert ledger.replies_unsolicited == ledger.replies_late == 0
-
-
-def test_a_request_without_its_measurement_is_refused_or_silent_and_others_take_none(ledger: Ledger) -> None:
-    assert waiting(ledger, 7).on_message("ERR", 1) == Rejection(("ERR",))
-    assert waiting(ledger, 7).on_time(TIMEOUT_NS) == Silence(())
-    session = offline_runner(ledger)
+    assert strays(ledger) == (0, 0)
+    session.start(once, 0)
+    assert session.on_message("ERR", 1) == Rejection(("ERR",))
+    session.start(once, 0)
+    assert session.on_time(TIMEOUT_NS) == Silence(())
     session.start(command("save"), 0)
-    assert not session.wants_samples
-    assert session.on_sample(measured(1)) is None
+    assert (session.wants_samples, session.on_sample(right)) == (False, None)
     assert session.deadline_ns is not None

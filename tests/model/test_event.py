@@ -2,7 +2,7 @@
 
 import msgspec
 
-from imud.model.event import Event, EventKind, EventLog
+from imud.model.event import Event, EventKind, EventLog, kind_of
 
 S = 1_000_000_000
 
@@ -43,6 +43,7 @@ def test_devices_are_merged_by_time_and_events_of_the_daemon_always_included() -
     assert [one[1] for one in seen(log, 3)] == [3, 4]
     log.remove("bow")
     assert [one[1] for one in seen(log)] == [2, 3]
+    assert [kind_of(name) for name in ("up", "of a newer imud")] == [EventKind.UP, "of a newer imud"]
 
 
 def test_the_oldest_groups_are_removed() -> None:

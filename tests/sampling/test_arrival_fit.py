@@ -227,9 +227,8 @@ def test_bounds_hold_for_every_line_that_fits() -> None:
     seen = []
     for _ in range(5000):
         slope, at_end = random.uniform(-0.4, 0.4), random.uniform(-40, 40)
-        if all(at_end + slope * (x - 100) <= y for x, y in ceiling) and all(
-            at_end + slope * (x - 100) >= y for x, y in floor
-        ):
+        is_below = all(at_end + slope * (x - 100) <= y for x, y in ceiling)
+        if is_below and all(at_end + slope * (x - 100) >= y for x, y in floor):
             seen.append(at_end)
             assert found.slope_lowest <= slope <= found.slope_highest
             assert found.lowest_ns <= at_end <= found.highest_ns

@@ -164,9 +164,7 @@ def test_a_batch_is_turned_once_for_all_clients() -> None:
 def test_a_batch_of_slots_is_the_batch_of_its_samples(encoding: Encoding) -> None:
     whole = published([SENT, replace(SENT, seq=2)])
     packed = Batch("imu0", 0, None, whole.frame, whole.packed)
-    assert (len(packed), packed.seqs, list(packed.times_ns)) == (2, whole.seqs, list(whole.times_ns))
     assert list(encoding.encode(packed)) == list(encoding.encode(whole))
-    assert packed.samples == whole.samples
 
 
 @in_server()
