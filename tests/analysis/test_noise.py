@@ -197,9 +197,8 @@ def test_rest_has_limits_that_do_not_depend_on_the_motion(
 def test_angles_show_a_turn_without_other_evidence(angle: int, slope: float, pitch: float, words: str) -> None:
     euler = np.tile([0.0, pitch, 0.0], (COUNT, 1))
     euler[:, angle] += np.angle(np.exp(1j * slope * SECONDS))
-    found = analysis_noise.motion_words(
-        Readings(stamps_ns(COUNT, RATE_HZ), None, shaken(0.0, 1.0) + AT_REST, None, euler)
-    )
+    readings = Readings(stamps_ns(COUNT, RATE_HZ), None, shaken(0.0, 1.0) + AT_REST, None, euler)
+    found = analysis_noise.motion_words(readings)
     assert found.startswith(words) if words else not found
 
 

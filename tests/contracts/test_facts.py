@@ -84,8 +84,7 @@ def test_lines_have_the_documented_values_and_the_instant_of_the_measurement() -
 
 def test_reports_are_joined_and_a_declaration_has_the_writable_settings() -> None:
     reports = {"a": DeviceReport({"Rate": "100"}, {"rate": 100}), "b": DeviceReport({"Mode": "6"}, {"mode": 6})}
-    assert setting.words_of(reports) == {"Rate": "100", "Mode": "6"}
-    assert setting.values_of(reports) == {"rate": 100, "mode": 6}
+    assert setting.combined(reports) == DeviceReport({"Rate": "100", "Mode": "6"}, {"rate": 100, "mode": 6})
     kind = FAKE_SETTINGS.declarable
     assert kind.__struct_fields__ == ("baud", "mode", "output", "mounting", "offset_deg", "secret")
     declared = msgspec.convert({"mode": "9-axis", "secret": 0}, kind)

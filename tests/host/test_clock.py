@@ -287,13 +287,11 @@ def test_the_rate_is_that_of_the_last_two_seconds_and_its_change_is_in_the_error
     assert slewed(FAST, 2).rate == pytest.approx(FAST, rel=1e-6)
     steady = slewed(0.0, 3001, NS_PER_MS)
     for ms in range(1, 2001):
-        steady.add_pair(
-            BEGIN_NS + 3 * NS_PER_S + int(ms * NS_PER_MS * (1 + FAST)), RAW_NS + 3 * NS_PER_S + ms * NS_PER_MS
-        )
+        begin_ns, raw_ns = BEGIN_NS + 3 * NS_PER_S, RAW_NS + 3 * NS_PER_S
+        steady.add_pair(begin_ns + int(ms * NS_PER_MS * (1 + FAST)), raw_ns + ms * NS_PER_MS)
     assert steady.rate == pytest.approx(FAST, rel=1e-6)
-    steady.add_pair(
-        BEGIN_NS + 5 * NS_PER_S + int(2 * NS_PER_S * FAST) + 400 * NS_PER_MS, RAW_NS + 5 * NS_PER_S + 400 * NS_PER_MS
-    )
+    later_ns = 5 * NS_PER_S + 400 * NS_PER_MS
+    steady.add_pair(BEGIN_NS + later_ns + int(2 * NS_PER_S * FAST), RAW_NS + later_ns)
     assert steady.rate == pytest.approx(FAST * 0.8, rel=1e-3)
     # The true time is in a triangle above the chord: at most a quarter of the step times the change.
     steady = slewed(0.0, 5)

@@ -129,7 +129,6 @@ def test_recordable_devices_ignore_an_unknown_device_and_end_and_check_the_newes
     newest = one.path.newest
     assert newest is not None
     found = [decode_object(record, CheckRecord) for data in put for record in records_of(data)]
-    assert [(check.seq, check.sample_t_ns, check.sample_t_err_ns) for check in found] == [
-        (0, 0, 0), (newest.seq, newest.t_ns, newest.t_err_ns)
-    ]  # fmt: skip
+    written = [(check.seq, check.sample_t_ns, check.sample_t_err_ns) for check in found]
+    assert written == [(0, 0, 0), (newest.seq, newest.t_ns, newest.t_err_ns)]
     assert found[1].ledger == one.ledger.snapshot()

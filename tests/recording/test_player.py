@@ -177,9 +177,8 @@ def test_without_the_state_a_new_clock_starts_and_a_removed_option_is_ignored(
 def without_state(record: Record) -> Record:
     if record.kind != Kind.PATH:
         return record
-    made = msgspec.structs.replace(
-        records.decode_object(record, PathRecord), state=b"", options={"calibration_done": 0}
-    )
+    path = records.decode_object(record, PathRecord)
+    made = msgspec.structs.replace(path, state=b"", options={"calibration_done": 0})
     return record._replace(body=msgspec.msgpack.encode(made))
 
 
@@ -239,9 +238,8 @@ def test_damaged_records_raise_imud_error(recorded: pytest.MonkeyPatch, seed: in
 def test_a_device_name_that_no_configuration_accepts_is_an_error(recorded: pytest.MonkeyPatch, name: str) -> None:
     for kind, key in ((Kind.DEVICE, "name"), (Kind.EVENT, "device")):
         event = {"t_ns": 7, "device": "bow", "kind": "up", "message": "hello"}
-        record = next(
-            (one for one in recorded_run() if one.kind == kind), Record(kind, 0, msgspec.msgpack.encode(event))
-        )
+        other = Record(kind, 0, msgspec.msgpack.encode(event))
+        record = next((one for one in recorded_run() if one.kind == kind), other)
         forged = record._replace(body=msgspec.msgpack.encode(msgspec.msgpack.decode(record.body) | {key: name}))
         if kind == Kind.EVENT and not name:  # an event of the daemon
             continue

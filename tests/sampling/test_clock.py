@@ -243,9 +243,8 @@ def test_the_time_of_polled_samples_is_that_of_the_poll_or_edge_and_rises() -> N
     assert all(sample.t_ns <= sample.t_rx_ns for sample in samples)
     assert [sample.seq for sample in samples] == [1, 2, 3, 4, 5]
     one = polled_clock()
-    samples = [
-        one.sample_polled(FRAME, t_ns, 5, t_ns + 50, 0, edge) for t_ns, edge in ((100, 7), (200, None), (300, 8))
-    ]
+    stamps = ((100, 7), (200, None), (300, 8))
+    samples = [one.sample_polled(FRAME, t_ns, 5, t_ns + 50, 0, edge) for t_ns, edge in stamps]
     assert [(sample.sync, sample.edge_seq, sample.t_ns) for sample in samples] == [
         (Sync.EDGE, 7, 100), (Sync.ARRIVAL, None, 200), (Sync.EDGE, 8, 300),
     ]  # fmt: skip

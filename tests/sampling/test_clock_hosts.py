@@ -251,9 +251,8 @@ def test_a_read_that_waits_for_its_decoding_uses_the_rate_of_its_time() -> None:
     for a in model(arrival.BARE_UART).run(100 * SECONDS):
         host.at(a.t_rx_ns + 50 * NS_PER_MS)
         measured = Measurement(a.size_bytes, a.trailing_bytes, a.dev_ns // TICK_NS % TICK_MODULUS)
-        dated.append(
-            host_clocks.DatedArrival(clock.sample(measured, to(a.t_rx_ns), host_clocks.UTC_AHEAD_NS), to(a.t_ns))
-        )
+        sample = clock.sample(measured, to(a.t_rx_ns), host_clocks.UTC_AHEAD_NS)
+        dated.append(host_clocks.DatedArrival(sample, to(a.t_ns)))
     assert_honest(dated)
     offs = sorted(abs(d.point.off_ns) for d in dated[1000:])
     assert offs[int(0.97 * len(offs))] < 300 * NS_PER_US

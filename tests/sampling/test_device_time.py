@@ -278,9 +278,8 @@ def run(
             age_ns = truth_ns - first_ns
             moved_ns = set_ms * NS_PER_MS * (age_ns >= SET_AT_S * NS_PER_S)
             ticks = (truth_ns + UTC_OFFSET_NS + NS_PER_MS // 3 + int(moved_ns)) // NS_PER_MS % UNIX
-            dated.append(
-                DatedSample(clock.sample(measurement(a, ticks), a.t_rx_ns, 0), truth_ns, number, begun_ns(model, a))
-            )
+            sample = clock.sample(measurement(a, ticks), a.t_rx_ns, 0)
+            dated.append(DatedSample(sample, truth_ns, number, begun_ns(model, a)))
     return dated, lambda: clock.status().resets
 
 

@@ -134,9 +134,8 @@ def test_device_time_that_creeps_does_not_throw_the_line_off() -> None:
         for a in read.arrivals:
             truth_ns = measured_ns(a)
             ticks = (truth_ns + line_runs.UTC_OFFSET_NS) // NS_PER_MS % UNIX
-            dated.append(
-                line_runs.DatedSample(clock.sample(line_runs.measurement(a, ticks), a.t_rx_ns, 0), truth_ns, 0)
-            )
+            sample = clock.sample(line_runs.measurement(a, ticks), a.t_rx_ns, 0)
+            dated.append(line_runs.DatedSample(sample, truth_ns, 0))
     assert max(abs(t.off_ns) for t in line_runs.after(dated, 1)) < 4 * NS_PER_MS
     assert rises(t.sample for t in dated)
 

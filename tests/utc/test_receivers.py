@@ -137,9 +137,8 @@ async def test_an_unreachable_server_is_reported_and_retried() -> None:
         paused.set()
         await asyncio.sleep(0)
 
-    source = receivers.GpsdSource(
-        receivers.RmcOptions(source="gpsd", tcp_port=port), time.monotonic_ns, receivers.Retry(sleep)
-    )
+    options = receivers.RmcOptions(source="gpsd", tcp_port=port)
+    source = receivers.GpsdSource(options, time.monotonic_ns, receivers.Retry(sleep))
     source.start(Sentences())
     async with asyncio.timeout(LIMIT_S):
         await paused.wait()
