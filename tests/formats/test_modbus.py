@@ -24,12 +24,9 @@ def test_check_value_and_frames() -> None:
     assert modbus.crc16_modbus(b"123456789\x37\x4b") == 0
     assert (modbus.READ_HOLDING, modbus.WRITE_SINGLE, modbus.REGISTERS_MAX) == (0x03, 0x06, 125)
     assert modbus.framed(0x50, bytes.fromhex("03 0034 0018")).hex() == "50030034001809" + "8f"
-    assert modbus.is_whole(REPLY)
-    assert not modbus.is_whole(REPLY[:-1])
-    assert not modbus.is_whole(b"")
-    assert modbus.is_exception(EXCEPTION)
-    assert not modbus.is_exception(EXCEPTION[:-1] + b"\x00")
-    assert not modbus.is_exception(modbus.framed(5, b"\x03\x02"))
+    assert [modbus.is_whole(one) for one in (REPLY, REPLY[:-1], b"\xff\xff", b"")] == [True, False, False, False]
+    others = (EXCEPTION[:-1] + b"\x00", modbus.framed(5, b"\x03\x02"))
+    assert [modbus.is_exception(one) for one in (EXCEPTION, *others)] == [True, False, False]
     assert modbus.exception_text(2) == "exception 2: the register does not exist"
     assert modbus.exception_text(77) == "exception 77: unknown code"
     # 0 is the broadcast, 248 to 255 are reserved (Modbus over serial line V1.02, 2.2)
@@ -105,6 +102,10 @@ def test_confirmation_is_distinguished_from_the_echo() -> None:
     found = finder(None, request, len(reply))
     assert found.feed(request[: len(reply)]) is None  # the register 0x02… looks like the length of the reply
     assert found.feed(request[len(reply) :] + reply) == reply
+    assert [finder(echoes).missing for echoes in (False, None, True)] == [5, 5, 13]  # an exception has five bytes
+    for data, missing in ((REPLY[:2], 7), (EXCEPTION[:2], 3)):
+        found = finder()
+        assert (found.feed(data), found.missing) == (None, missing)
     found = finder()
     for _ in range(100):
         assert found.feed(b"\xee" * 100) is None
