@@ -57,8 +57,8 @@ def test_bytes_that_are_not_the_reply_are_skipped_and_counted() -> None:
     found = finder()
     assert found.feed(OTHER) is None
     assert found.feed(b"\x05\x03" + REPLY[:4]) is None
-    assert found.feed(REPLY[4:]) == REPLY
-    assert found.strange == len(OTHER) + 2
+    assert found.feed(REPLY[4:] + b"\xaa") == REPLY
+    assert (found.strange, found.rest()) == (len(OTHER) + 2, b"\xaa")
     # late reply to a previous request: imud now requests another number of registers
     old = modbus.framed(5, bytes.fromhex("03 06 11 22 33 44 55 66"))
     found = finder()
