@@ -97,6 +97,14 @@ def test_a_report_for_a_supplier(resting_file: Path, tmp_path: Path, cli: Cli, e
             word for word in (b"angle random walk", b"Allan deviation", b"<svg", b"hipnuc-uart") if word not in text
         ] == []
         assert [word for word in (b"src=", b"<script") if word in text] == []
+    if end == ".html":
+        page = text.decode()
+        # facts; of each sensor: units of data sheets, SI units, and a comparison, each with a head
+        assert [table.count("<tr>") for table in page.split("<table>")] == [0, 10, 12, 11, 2, 13, 11, 2]
+        parts = ("</table>", "<figure><svg", "<details>", "</details>", "<ul>", "<li>", "</ul>", "<p>", "class='above'")
+        assert [page.count(one) for one in parts] == [7, 4, 2, 2, 2, 4, 2, 3, 1]
+        for cells in ("2.84e-5", "2.843e-05", "50.5 ±0.4", "30.00</td><td class='above'>ABOVE"):
+            assert f"<td class='number'>{cells}</td>" in page, cells
 
 
 def test_without_a_sheet_the_report_says_what_the_manual_has(resting_file: Path, cli: Cli) -> None:

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import Mock
 from urllib.request import urlopen
 
 import msgspec
@@ -126,6 +127,17 @@ def test_devices_that_cannot_be_shown(cli: Cli, monkeypatch: pytest.MonkeyPatch)
         assert cli("demo", *words, status=2).err == f"imud demo: {said}\n"
     monkeypatch.setattr("imud.sim.ports.can_port.can_interfaces", list)
     cli.refuses("ip link add vcan0 type vcan", "demo", "--device", "imu61x-can", "--duration", "1")
+    shown = Mock(return_value=0)
+    monkeypatch.setattr(command, "watch_daemon", shown)
+    for words, link in (
+        (["imu61x-i2c", "--bus", "1"], {"i2c": {"bus": 1, "rate_hz": 50.0}}),
+        (["imu61x-spi", "--port", "/dev/spidev0.0"], {"spi": {"port": "/dev/spidev0.0", "rate_hz": 50.0}}),
+    ):
+        cli("demo", "--rate", "50", "--device", *words)
+        assert shown.call_args.args[2] == {"demo": {"driver": words[0], **link}}
+    for node, options in ((9, {"base_id": 9}), (0, {})):
+        found = command.device(Path("/run"), "imu61x-can", "vcan0", node)
+        assert found == {"driver": "imu61x-can", "options": options, "socketcan": {"interface": "vcan0"}}
 
 
 def sample(seq: int) -> Sample:

@@ -18,7 +18,7 @@ import pytest
 from imud.cli.events import DeviceNotes, as_json, as_text, keep_connected, printed
 from imud.formats.jsonrpc import RpcError
 from imud.model.errors import LinkMissing, ServerError
-from imud.model.event import Event, EventKind
+from imud.model.event import Event, EventKind, StoredEvent
 from imud.model.units import NS_PER_S
 from tests.cli.conftest import Cli
 from tests.support.socket_rig import NOW_NS, Daemon, daemon
@@ -44,6 +44,10 @@ def test_a_line_and_an_object_have_local_time_and_priority() -> None:
     kinds = (EventKind.UP, EventKind.SYNC, EventKind.MARK, EventKind.LOSS)
     priorities = [printed(Event(0, "bow", kind, ""), 0).priority for kind in kinds]
     assert priorities == ["info", "info", "debug", "warning"]
+    for count in (1, 2):
+        stored = printed(StoredEvent(6 * NS_PER_S, "bow", EventKind.LOSS, "few", {}, count, 5 * NS_PER_S), 0)
+        assert as_text(stored).endswith("bow: loss: few" + " (×2 in 1 s)" * (count == 2))
+        assert ("first_ns" in as_json(stored)) is (count == 2)
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+import msgspec
 import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
@@ -21,7 +22,16 @@ from imud.cli.export_sources import recorded_facts
 from imud.contracts.publisher import Batch
 from imud.contracts.status import Deviations
 from imud.formats.recording import BlockGatherer, RecordingReader
-from imud.formats.records import NO_DEVICE, ClocksRecord, Kind, SessionRecord, encode, encode_clocks, encode_object
+from imud.formats.records import (
+    NO_DEVICE,
+    CallRecord,
+    ClocksRecord,
+    Kind,
+    SessionRecord,
+    encode,
+    encode_clocks,
+    encode_object,
+)
 from imud.model.errors import BadArgument, ImudError
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample
@@ -244,7 +254,12 @@ def test_the_noise_of_a_device_that_is_described_after_samples_of_another_one(tm
     gatherer, data = BlockGatherer(), b""
     for record in [*(one for one in records if one is not late and one.device != late.device), late]:
         data += gatherer.add(encode(Kind(record.kind), record.device, record.body))
-    assert recorded_facts(BytesIO(data + gatherer.finish()), "a").noise == {"mast": Deviations(gyro_rad_s=0.5)}
+    for number, target in enumerate(("host", "clock")):  # only the first is the state of the host's clocks
+        call = CallRecord(target, "restore", [None, 7_000_000_000 + number, 1 + number])
+        data += gatherer.add(encode(Kind.CALL, NO_DEVICE, msgspec.msgpack.encode(call)))
+    facts = recorded_facts(BytesIO(data + gatherer.finish()), "a")
+    assert facts.noise == {"mast": Deviations(gyro_rad_s=0.5)}
+    assert (facts.clock.utc_ns(5, 0), facts.clock.utc_ns(10**18, 0)) == (7_000_000_005, 10**18 + 7_000_000_000)
 
 
 @pytest.mark.parametrize(("suspends", "joined"), [(0, False), (1, False), (0, True)])
@@ -342,6 +357,8 @@ def test_files_and_options_that_are_refused(tmp_path: Path, cli: Cli, recorded: 
     (tmp_path / "c.raw").write_bytes(hi91(0))
     words = ("export", "--to", "csv", "--driver", "hipnuc-modbus", tmp_path / "c.raw")
     cli.refuses("expected a driver of bytes or CAN frames", *words)
+    words = ("export", "--to", "csv", "--device", "bow", tmp_path / "c.raw")
+    cli.refuses("--device applies to recordings only; a capture contains one device", *words)
     for options, expected in [
         (["--to", "csv", "--schema", "ros2"], "--schema applies to --to mcap only"),
         (["--to", "csv", "--noise", "a.json"], "--noise applies to --to mcap only"),

@@ -76,6 +76,8 @@ def test_what_was_not_acknowledged_by_a_killed_collector_comes_again(broker: Mos
 def test_arguments_are_checked(cli: Cli) -> None:
     for words, problem in [
         (["collect", "mqtt://host", "--to", "elsewhere"], "--to: expected"),
+        (["collect", "mqtt://host", "--to", "postgresql://127.0.0.1:1/a"], "PostgreSQL: "),
+        (["collect", "mqtt://host", "--to", "postgres://127.0.0.1:1/a"], "PostgreSQL: "),
         (["collect", "host", "--to", "-"], "expected a URL"),
         (["collect", "mqtt://host", "--to", "-", "--password-file", "f"], "add --user"),
         (["collect", "mqtt://host", "--to", "-", "--key-file", "f"], "add --cert-file"),
@@ -187,4 +189,6 @@ def test_on_a_terminal_the_picture_is_redrawn(gateway: tuple[Mosquitto, SendingG
 def test_no_gateway_is_an_answer_of_no_and_the_reason_is_told(cli: Cli) -> None:
     printed = cli("fleet", "top", "mqtt://127.0.0.1:1", "--plain", "--interval", "0.2", "--duration", "1s", status=1)
     assert "no gateway yet; " in printed.out
+    assert "the broker connection failed at the end: mqtt://127.0.0.1:1" in printed.err
+    printed = cli("fleet", "collect", "mqtt://127.0.0.1:1", "--to", "-", "--duration", "0.1s", status=1)
     assert "the broker connection failed at the end: mqtt://127.0.0.1:1" in printed.err

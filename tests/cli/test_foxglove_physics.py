@@ -11,12 +11,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from math import hypot
 from typing import Any, NamedTuple
+from unittest.mock import Mock
 
 import pytest
 
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.physics import FIELD_ENU_T, GRAVITY_M_S2, MOTIONS, Truth
-from tests.cli.conftest import imud_process
+from tests.cli.conftest import Cli, imud_process
 from tests.cli.protocol_client import ProtocolClient, connected
 from tests.support.daemon_process import RunningDaemon, daemon_with_module
 
@@ -174,3 +175,16 @@ def test_diagnostics_have_state_losses_and_the_error_of_the_clock(seen: Seen) ->
     (bow,) = seen.stale.status
     assert (bow.name, bow.level) == ("imud: bow", bow.STALE)
     assert "daemon" in bow.message
+
+
+def test_an_open_address_needs_an_option_and_gives_a_warning(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    cli.refuses("--rate: expected samples per second, or 0 for every sample, got -0.5", "foxglove", "--rate", "-0.5")
+    cli.refuses("without a password; add --open", "foxglove", "--address", "0.0.0.0")
+    server, relay = Mock(return_value=Mock(url="ws://0.0.0.0:8765")), Mock()
+    monkeypatch.setattr("imud.web.foxglove.FoxgloveServer", server)
+    monkeypatch.setattr("imud.web.foxglove.Relay", relay)
+    for address, more, rate_hz in (("0.0.0.0", ["--open", "--rate", "0"], None), ("127.0.0.1", ["--rate", "7"], 7.0)):
+        err = cli("foxglove", "--address", address, *more).err
+        assert err.count("\n") == 1 + (address == "0.0.0.0")
+        assert relay.call_args.kwargs["rate_hz"] == rate_hz
+    assert relay.return_value.run.call_count == server.return_value.close.call_count == 2

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -10,7 +11,7 @@ from imud.contracts.driver import Identity
 from imud.contracts.script import Transfer, says_nothing
 from imud.formats.modbus import BROADCAST, ReplyFinder, framed
 from imud.links.rs485 import LineCounters, Rs485Options
-from imud.model.errors import TransferError, Trouble
+from imud.model.errors import DeviceRefused, TransferError, Trouble
 from imud.model.units import NS_PER_MS, uart_byte_ns
 from imud.sim.hipnuc.modbus import Slave
 from tests.cli.conftest import Cli
@@ -188,6 +189,9 @@ def test_invalid_addresses_and_identities(cli: Cli, modbus: Commands, monkeypatc
     modbus.bus = Bus(modbus_slave(2))
     (found,) = modbus.scan("2")
     assert (found["product"], found["serial_number"]) == ("HI\\x1b[2J14\\n", "\\x9b1A")
+    monkeypatch.setattr("imud.cli.modbus.probe", Mock(side_effect=DeviceRefused("exception 4")))
+    problem = "address 2: exception 4; do two devices have this address?"
+    assert problem in modbus("assign", *ON, "--from", "2", "--id", "9", status=2)
 
 
 @pytest.mark.live

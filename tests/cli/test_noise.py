@@ -1,5 +1,6 @@
 """Cells, comparisons and limits in a noise report."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +71,11 @@ def test_what_limits_the_figures_and_what_is_not_compared() -> None:
     assert "bow: noise" in words
     assert "product HI14" in words
     assert "No comparison with a data sheet: HiPNUC" in words
+    made = noise.noise_report(sample_set_of(noise_of_three(), "<can>"), None)
+    page = noise.html(replace(made, motion="it <turned>"))
+    assert "<p class='above'>NOT AT REST: it &lt;turned&gt;. All values below" in page
+    assert page.count("<h3>Comparison") == noise.html(made).count("class='above'") == 0
+    assert f"<p>{noise.without_sheet(made).replace('<', '&lt;').replace('>', '&gt;')}.</p>" in page
     empty = Readings(stamps_ns(COUNT, RATE_HZ), None, None, None)
     with pytest.raises(ImudError, match="bow sends neither angular rate nor acceleration"):
         noise.noise_report(SampleSet("a file", "bow", readings=empty), None)

@@ -9,13 +9,17 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import pytest
 
-from imud.cli.record import Contents
+from imud.cli import record
+from imud.cli.record import Contents, Copy, account, interrupts
+from imud.formats import records
 from imud.formats.records import CheckRecord, Kind, PathRecord, encode_object, records_of
 from imud.model.errors import ImudError
 from imud.model.ledger import LEDGER_FIELDS
@@ -184,7 +188,26 @@ def test_whole_damaged_cut_and_foreign_files(file: Path, cli: Cli, tmp_path: Pat
     cli.refuses("No such file", "info", str(tmp_path / "none"))
 
 
-def test_a_device_that_was_removed_and_added_counts_from_the_begin_again() -> None:
+def test_an_interrupt_a_silent_daemon_and_a_terminal(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    with interrupts(are_noted=True) as interrupt:
+        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+        assert interrupt.asked
+    times_s = iter((0.0, 100.0, 110.0, 110.1))  # start, request, two looks
+    monkeypatch.setattr(record, "monotonic", lambda: next(times_s))
+    monkeypatch.setattr(record, "LOOK_S", 0.0)
+    with pipe() as (reader, _), open(reader, "rb", buffering=0, closefd=False) as stream:
+        copy = Copy(stream, BytesIO(), "a")
+        looks = iter((False, True, False))
+        copy.look = lambda: copy.stop() if next(looks) else None
+        assert copy.read(9) == b""
+        assert list(times_s) == []
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    cli.refuses("cannot write a recording to a terminal; name a file, or use a pipe", "record", "-")
+
+
+def test_a_device_that_was_removed_and_added_counts_from_the_begin_again(capsys: pytest.CaptureFixture[str]) -> None:
     contents = Contents()
 
     def add(kind: Kind, value: object) -> None:
@@ -207,6 +230,15 @@ def test_a_device_that_was_removed_and_added_counts_from_the_begin_again() -> No
     without = {"t_ns": 0, "seq": 0, "sample_t_ns": 0, "sample_t_err_ns": 0, "ledger": {"lost_crc": 0}}
     with pytest.raises(ImudError, match="record of kind 10: expected a ledger with lost_gap_device"):
         add(Kind.CHECK, without)
+    for count in (3, 7):
+        contents.add(next(records_of(records.encode_edges(0, "pps", [(5, True, 0)] * count))))
+        contents.add(next(records_of(records.encode_lost(records.LostRecord(count, 99, 0)))))
+    assert (contents.devices[0].edges, contents.dropped) == (10, 10)
+    copy = Copy(BytesIO(), BytesIO(), "a")
+    assert account(copy, (contents, Mock(problems=["cut"], ended=False)), "a", asked=False) == 1
+    err = capsys.readouterr().err
+    assert "a: 0.0 s, 0.00 MB, 0 samples of 0 devices, 10 records dropped\n" in err
+    assert err.endswith("record: cut\nimud record: 10 records are missing because imud record was too slow\n")
     device = contents.devices[0]
     assert (device.samples, device.lost) == (450 + 100 + 400, 3 + 3 + 5)
     assert device.rate_hz == pytest.approx(700 / (4 + 1 + 2))

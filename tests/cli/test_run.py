@@ -76,6 +76,10 @@ def test_check_has_notes(tmp_path: Path, cli: Cli) -> None:
     )
     notes = cli("check", file).out.splitlines()[1:]
     assert notes == [f"{file}:3: note: b: {there}2 does not exist; imud waits for the file"]
+    for more, count in (("", 1), (", enabled: false", 0)):
+        file.write_text(f"devices: {{}}\nshm: {{directory: {tmp_path}/none/imud{more}}}\n")
+        notes = cli("check", file).out.splitlines()[1:]
+        assert [line.endswith("; ignore this note if another user runs the daemon") for line in notes] == [True] * count
     file = tmp_path / "imud.yaml"
     file.write_text(
         "devices: {bow: {uart: {port: /dev/a}}, mast: {enabled: false, uart: {port: /dev/b}}}\n"

@@ -2,6 +2,7 @@
 
 from argparse import Namespace
 from contextlib import nullcontext
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from imud.contracts.status import DeviceStatus
 from imud.model.errors import BadArgument
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_S
+from tests.cli.conftest import Terminal
 from tests.support.metrics import device
 
 
@@ -84,6 +86,20 @@ def test_the_devices_own_time_and_a_live_view_that_drops_the_past() -> None:
     assert found.gyro_rad_s[:, 0].tolist() == [6.0, 7.0, 8.0, 9.0]
     with pytest.raises(BadArgument, match="bow: expected a file, or a device of the daemon"):
         status_of([], "bow")
+
+
+def test_notes_about_a_replay_and_the_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    for differences, fresh, notes in ((0, [], []), (2, ["x", "y"], ["clock: x", "replay: 2 of 7 checks differ"])):
+        one = Mock(driver=None, fresh_starts=fresh, differences=["a"] * differences, checks=7)
+        one.described.name = "bow"
+        for name, found in (("stern", []), ("bow", notes)):
+            made = SampleSet("a", name)
+            taking._describe(made, Mock(devices={0: one}), name)
+            assert (made.notes, made.driver) == (found, one.described.driver if name == "bow" else "")
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stderr", terminal)
+    taking.progress(61.4, 1200)
+    assert terminal.getvalue() == "61 s, 1200 samples\r"
 
 
 def test_losses_are_those_between_the_looks_although_a_ledger_begins_anew() -> None:

@@ -5,13 +5,24 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
+import msgspec
 import pytest
 
 from imud import config
+from imud.cli import settings as cli_settings
 from imud.cli.settings import given_values
 from imud.client.connection import Client
-from imud.contracts.setting import declared_values
+from imud.contracts.setting import (
+    AppliedSettings,
+    OnDifference,
+    SettingsReport,
+    SettingsState,
+    SettingsStatus,
+    declared_values,
+)
+from imud.formats.jsonrpc import Code, RpcError
 from imud.model.errors import BadArgument
 from tests.cli.conftest import Cli, Terminal
 from tests.support.daemon_process import LIMIT_S, RunningDaemon, daemon_with_module
@@ -122,7 +133,9 @@ def test_mistakes_are_explained(words: Words, cli: Cli, tmp_path: Path) -> None:
         cli.refuses(problem, *words, "--restore", file)
 
 
-def test_a_backup_of_another_device_and_an_existing_backup(words: Words, cli: Cli, tmp_path: Path) -> None:
+def test_a_backup_of_another_device_and_an_existing_backup(
+    words: Words, cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = tmp_path / "other.yaml"
     file.write_text(
         'driver: hipnuc-uart\nidentity: {product: "CH020", serial_number: "77"}\nsettings: {mode: 6-axis, strange: 1}\n'
@@ -135,23 +148,60 @@ def test_a_backup_of_another_device_and_an_existing_backup(words: Words, cli: Cl
         "the backup is from another device: cannot ask for confirmation without a terminal",
     ):
         assert problem in err
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdin", Terminal("n\n"))
+        assert "plan:" not in cli(*words, "--restore", file, status=1).out
     cli(*words, "--restore", file, "--yes")
+    assert json.loads(cli(*words, "--restore", file, "--yes", "--json").out)["steps"] == []
     file = tmp_path / "bow.yaml"
     file.write_text("mine")
     cli(*words, "--backup", file, status=2)
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdin", Terminal("n\n"))
+        cli(*words, "--backup", file, status=1)
     assert file.read_text() == "mine"
     cli(*words, "--backup", file, "--yes")
     assert 'driver: "hipnuc-uart"' in file.read_text()
     assert 'driver: "hipnuc-uart"' in cli(*words, "--backup", "-").out
 
 
-def test_a_factory_reset_is_asked_for_and_backed_up(daemon: RunningDaemon, cli: Cli) -> None:
+def test_a_factory_reset_is_asked_for_and_backed_up(
+    daemon: RunningDaemon, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
     command = ("command", "--socket", daemon.socket, "bow", "factory_reset")
     cli.refuses("all settings of the device are lost: cannot ask for confirmation without a terminal", *command)
+    monkeypatch.setattr(sys, "stdin", Terminal("n\n"))
+    cli(*command, status=1)
     backups = daemon.folder / "backups"
     assert not backups.exists()
     cli(*command, "--yes")
     assert len(list(backups.iterdir())) == 1
+
+
+def test_settings_that_cannot_be_read_now(capsys: pytest.CaptureFixture[str]) -> None:
+    status = SettingsStatus(SettingsState.UNKNOWN, OnDifference.REPORT, problem="no reply", read_ns=5)
+    known = SettingsReport("bow", "hipnuc-uart", {}, status, ())
+    failed, denied = RpcError(Code.FAILED, "no reply"), RpcError(Code.DENIED, "no")
+    rights = Mock(rights=["watch", "control"])
+
+    def report(*replies: object, rights: object = rights, needed: bool = False) -> SettingsReport:
+        return cli_settings._report(Mock(hello=rights, call=Mock(side_effect=replies)), "bow", needed=needed)
+
+    assert report(failed, msgspec.to_builtins(known)) == known
+    assert "no reply; imud prints the last reported settings:\n" in capsys.readouterr().err
+    for replies, more in (((denied,), {}), ((failed,), {"needed": True}), ((failed,), {"rights": Mock(rights=[])})):
+        with pytest.raises(RpcError):
+            report(*replies, known, **more)
+    assert report(msgspec.to_builtins(known), needed=True) == known
+    unread = msgspec.structs.replace(known, status=msgspec.structs.replace(status, read_ns=None))
+    with pytest.raises(BadArgument, match="bow has not reported its settings yet"):
+        report(msgspec.to_builtins(unread), needed=True)
+    assert cli_settings._shown(known, verbose=False).splitlines()[1:] == [
+        "", "the device has not reported its settings", "problem: no reply",
+        "imud wrote the flash 0 times, 0 within 24 hours",
+    ]  # fmt: skip
+    done = AppliedSettings(problem="it is missing", advice="plug it in")
+    assert cli_settings._account(done).splitlines() == ["tried:", "FAILED: it is missing", "plug it in"]
 
 
 def test_values_in_the_notation_of_yaml() -> None:

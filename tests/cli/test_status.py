@@ -7,7 +7,7 @@ from time import monotonic_ns
 from msgspec.structs import replace
 
 from imud.attitude.conventions import Heading
-from imud.cli.status import axes, block, driven, page, parts, utc, watched
+from imud.cli.status import axes, block, declared, driven, page, parts, utc, watched
 from imud.client.connection import Client
 from imud.contracts.condition import Condition, DeviceCondition, Reason, ReasonCode
 from imud.contracts.setting import OnDifference, SettingsState, SettingsStatus
@@ -113,6 +113,8 @@ def test_lines_utc_settings_and_status_bits() -> None:
     assert [name for name, _ in parts(device("bow", lines=LinesStatus({}, {}, {}, sin=True)))] == ["sin"]
     unsaved = SettingsStatus(SettingsState.UNDECLARED, OnDifference.REPORT, unsaved=True)
     assert dict(parts(device("bow", declared=unsaved)))["unsaved"].endswith("run `imud command bow save`")
+    unseen = SettingsStatus(SettingsState.DIFFER, OnDifference.REPORT, "no reply", {}, ("mode", "baud"))
+    assert declared(unseen) == "differ; not reported by the device: mode, baud (no reply)"
     lines = LinesStatus({"reset": "GPIO5 is in use by another program"}, {}, {})
     assert list(parts(device("bow", lines=lines))) == [("reset", "GPIO5 is in use by another program")]
     assert utc(UtcStatus("", "")) == "no pulse and no sentence yet"

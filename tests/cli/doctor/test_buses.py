@@ -258,6 +258,9 @@ def test_ip_that_fails_is_missing_or_answers_in_another_form_is_not_checked(mast
         (examined,) = examine([STATE], mast.surroundings())
         assert [finding.severity for finding in examined.findings] == ["not checked"]
     interface(mast)
+    mast.prints(COMMAND, "", 1, "Device does not exist")
+    (examined,) = examine([STATE], mast.surroundings())
+    assert "ip link show can0: Device does not exist" in examined.findings[0].seen
     mast.prints("ip", "", 1, "Device does not exist")
     mast.outputs[COMMAND] = FileNotFoundError(2, "No such file", "ip")
     (examined,) = examine([STATE], mast.surroundings())

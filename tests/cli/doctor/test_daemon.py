@@ -1,8 +1,11 @@
 """Checks of the configuration, the unit, the socket, the outputs, the device states and their counters."""
 
 import asyncio
+import errno
 import os
+from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import msgspec
 import pytest
@@ -30,6 +33,9 @@ ACTIVE = ("ActiveState=active", "UnitFileState=enabled", "Result=success", "NRes
 
 def test_configurations(machine: Machine) -> None:
     machine.tells(CONFIGURATION, "error", "No such file", "`sudo imud setup`")
+    for number in (errno.EACCES, errno.EPERM):
+        with mock.patch.object(Path, "open", side_effect=OSError(number, "denied")):
+            machine.tells(CONFIGURATION, "not checked", "this user cannot read /etc/imud.yaml", "`sudo imud doctor`")
     machine.configure(BOW, "old: {enabled: false, driver: hipnuc-uart, uart: {port: /dev/ttyUSB1, baud: 115200}}")
     assert machine.told(CONFIGURATION) == [
         ("ok", "/etc/imud.yaml is valid; devices: bow → "),
@@ -254,6 +260,10 @@ def test_a_device_that_never_answers_does_not_hear_imud(machine: Machine) -> Non
 
 
 def test_rs485(machine: Machine) -> None:
+    machine.configure(RS485)
+    machine.tells(HALF, "not checked")
+    machine.status = [device("bow")]  # a daemon of an older version sends no counters
+    assert machine.find(HALF) == []
     for state, line, severity, words in [
         (DeviceState.RUNNING, Counters(timeouts=10, echoes=1000), "ok", "ignores the echoes"),
         (DeviceState.RUNNING, Counters(timeouts=10, strange_bytes=10), "ok", "bus works"),
@@ -269,6 +279,9 @@ def test_rs485(machine: Machine) -> None:
 
 
 def test_edges_of_lines(machine: Machine) -> None:
+    machine.configure(WIRED)
+    machine.status = [device("bow", lines=None)]
+    assert machine.find(LINES) == []
     for samples, found, severity, words in [
         (5000, LinesStatus({}, {"sout": 4999}, {"sout": 0}), "ok", "4999 edges"),
         (5000, LinesStatus({}, {"sout": 4990}, {"sout": 9}), "warning", "the kernel lost 9 of 4999 edges"),

@@ -49,6 +49,10 @@ def test_a_node_of_group_root_needs_a_udev_rule(bow: Machine) -> None:
     os.chown(bow.root / "dev/ttyUSB0", 0, 0)
     ((_, text),) = bow.told(RIGHTS)
     assert 'udev rule SUBSYSTEM=="tty", KERNEL=="ttyUSB*", GROUP="dialout", MODE="0660" in' in text
+    os.chown(bow.root / "dev/ttyUSB0", bow.uid, 0)
+    for mode, severity in ((0o600, "ok"), (0o466, "error"), (0o266, "error")):  # only the permissions of the owner
+        (bow.root / "dev/ttyUSB0").chmod(mode)
+        assert bow.find(RIGHTS)[0].severity == severity
 
 
 def test_the_rule_is_for_nodes_of_the_kind_only(bow: Machine) -> None:
@@ -132,6 +136,11 @@ def test_a_port_that_is_absent_and_one_with_a_stable_name(machine: Machine) -> N
         ("note", "/dev/ttyUSB0 can get another number when the adapter is plugged in again → "
          "use the name /dev/serial/by-id/usb-FTDI_1 in the configuration")
     ]  # fmt: skip
+    for name in ("serial0", "ttyAMA10"):
+        machine.configure(BOW.replace("ttyUSB0", name))
+        machine.tells(PRESENT, "error", f"/dev/{name} does not exist", "→ enable the UART: `enable_uart=1` in /boot")
+        machine.port(name)
+        machine.tells(PRESENT, "ok", f"/dev/{name} exists")
 
 
 def test_who_uses_a_port(machine: Machine) -> None:

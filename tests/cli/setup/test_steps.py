@@ -265,6 +265,9 @@ def test_questions_name_and_leave_out(gateway: LivingMachine, setup: Setup, answ
     assert [one.name for one in config.load(gateway.root / "etc/imud.yaml").devices] == ["mast"]
     assert "-: expected an unused name" not in setup.said()
     assert (gateway.root / "etc/group").read_text().count(":ann\n") == 2
+    with mock.patch("builtins.input", Mock(return_value="n")) as asked:
+        setup.steps(ask=True, user="ann").set_up(PORT, ())
+        assert "Allow ann" not in str(asked.call_args_list), "a member is not asked again"
 
 
 def test_a_proposed_name_is_a_new_one(gateway: LivingMachine, setup: Setup, answers: dict[str, str]) -> None:
@@ -302,6 +305,9 @@ def test_an_invalid_and_a_valid_bit_rate(gateway: LivingMachine, setup: Setup, a
         text = (gateway.root / "etc/systemd/network/80-imud-can0.network").read_text()
         assert f"[CAN]\nBitRate={rate}\n" in text
         assert setup.slept[:25] == [0.2] * 25, "imud waits 5 s for the interface, which stays down here"
+    answers |= {"Bit rate": "250000", "Make these changes?": "n"}
+    setup.attachments.listened.clear()
+    assert (setup.steps(ask=True).set_up(PORT, ()), setup.attachments.listened) == (1, [])
 
 
 def test_the_default_keeps_consoles_and_can(gateway: LivingMachine, setup: Setup, answers: dict[str, str]) -> None:
@@ -347,6 +353,9 @@ def test_ports_of_others_and_consoles_are_not_opened(gateway: LivingMachine, set
 
 def test_a_console_is_taken_off_the_port_that_is_named(gateway: LivingMachine, setup: Setup) -> None:
     gateway.uart("ttyAMA0", console=True)
+    own = mock.patch("imud.cli.setup.steps.own_terminal", Mock(return_value="/dev/ttyAMA0"))
+    with own, pytest.raises(ImudError, match="on the terminal /dev/ttyAMA0; use another"):
+        setup.steps().set_up(Wanted(("/dev/ttyAMA0",)), ())
     (gateway.root / "dev/serial0").symlink_to("ttyAMA0")
     line = "console=serial0,115200 console=tty1 root=PARTUUID=1-02 rootwait\n"
     gateway.write("/boot/firmware/cmdline.txt", line)
@@ -453,6 +462,11 @@ def test_a_file_changed_since_is_left_and_named_once(gateway: LivingMachine, set
     gateway.write("/etc/imud.yaml", mine.removesuffix("# mine\n"))  # the user undoes the edit
     assert setup.steps().undo() == 0
     assert (gateway.root / "etc/imud.yaml").read_text() == EXAMPLE
+    record = journal.begun(gateway.surroundings(), journal.FileChange("a test", "/etc/imud.yaml", b"a: 1\n"))
+    gateway.write("/etc/imud.yaml", "mine")
+    with pytest.raises(journal.ChangeRefused, match=r"changed /etc/imud\.yaml in the meantime; run `imud setup` again"):
+        journal.make(gateway.surroundings(), record)
+    gateway.write("/etc/imud.yaml", EXAMPLE)
     setup.steps().set_up(PORT, ())
     gateway.usb_port("ttyUSB1", "usb-B", serial="B")
     setup.attachments.hears("/dev/serial/by-id/usb-B", "imu61x-uart")
@@ -492,6 +506,9 @@ def test_a_command_that_fails_ends_it_and_what_was_done_is_told(gateway: LivingM
     with pytest.raises(ImudError, match=r"`systemctl restart imud.service` failed: Job for imud.service failed\."):
         setup.steps().set_up(PORT, ())
     assert "imud made 4 of 5 changes" in setup.said()
+    gateway.failing = {"systemctl disable": "no bus"}
+    assert setup.steps().undo() == 1
+    assert "not undone: `systemctl disable" in setup.said()
     gateway.failing.clear()
     assert setup.steps().undo() == 0
     assert gateway.units["imud.service"] == ["disabled", "inactive"]
