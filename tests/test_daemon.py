@@ -219,6 +219,22 @@ async def test_whatever_a_part_raises_at_the_end_all_others_are_closed(
     assert not is_ticking or [output.did[-2:] for output in outputs.values()] == [["tick", "close"]] * 3
 
 
+@pytest.mark.parametrize("name", ["_on_done", "_on_reloaded"])
+@in_loop
+async def test_a_task_that_fails_ends_the_daemon_and_other_ends_do_not(name: str) -> None:
+    daemon = Daemon(EMPTY)
+    running = asyncio.create_task(daemon.run())
+    for end, *result in (("set_result", None), ("cancel",), ("set_exception", KeyError("broken"))):
+        for _ in range(9):
+            await asyncio.sleep(0)
+        assert not running.done()
+        future = asyncio.get_running_loop().create_future()
+        getattr(future, end)(*result)
+        getattr(daemon, name)(future)
+    with pytest.raises(KeyError, match="broken"):
+        await running
+
+
 def reload(daemon: RunningDaemon, devices: dict[str, Any], **more: Any) -> None:
     """Write another configuration and reload the daemon."""
     write_config(daemon.folder, devices, **more)

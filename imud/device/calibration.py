@@ -34,7 +34,7 @@ from imud.device.transport import Transport
 from imud.model.errors import CommandError, ImudError
 from imud.model.event import EventKind
 from imud.model.sample import Pair, Sample, Vector3
-from imud.model.units import NS_PER_S, RAD_PER_DEG, STANDARD_GRAVITY_M_S2
+from imud.model.units import NS_PER_S, RAD_PER_DEG, STANDARD_GRAVITY_M_S2, T_PER_UT
 from imud.sampling.clock import SampleClock
 
 WINDOW_SAMPLES: Final = 20  # number of samples of a rest: 2 s at ten samples per second
@@ -137,7 +137,6 @@ POINTS_MAX: Final = 1024
 """Maximum number of points for the coverage. A slow calibration of five minutes has about 700."""
 POINT_DISTANCE_T: Final = 5e-6  # minimum distance of two points, T: an eighth of a cell in Earth's field
 FIT_POINTS_MIN: Final = 12  # minimum number of points for a fit
-T_PER_UT: Final = 1e-6
 STEP_MAX_NS: Final = NS_PER_S  # maximum time between two samples in the integral of the angular rate, ns
 TURNS_WANTED_RAD: Final = 2 * pi  # minimum angle about each axis, rad (manual B, section 8.1.1)
 COVERAGE_WANTED: Final = 0.6

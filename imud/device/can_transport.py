@@ -103,6 +103,7 @@ class CanTransport(ReceivingTransport):
         self._buses = buses
         # filters of frames from other senders that can answer the outstanding request
         self._also: Sequence[CanFilter] = ()
+        self._filters: Sequence[CanFilter] = ()  # filters of the device's samples and replies
         # the search round that receives the frames; None while the path receives them
         self._round: CanRound | None = None
         self._options: Options | None = None
@@ -191,6 +192,7 @@ class CanTransport(ReceivingTransport):
         clock = context.new_clock(driver, self.path)
         self.driver = driver
         self._options = options
+        self._filters = driver.filters(options)
         self._codec = driver.make_codec(context.ledger, options)
         self.path = CanPath(self._codec, clock, context.path_context(driver, self.link, self.scripts.on_message, {}))
         context.observer.path_made(self.path, driver.name, options)
@@ -215,18 +217,15 @@ class CanTransport(ReceivingTransport):
     # --- other devices of the bus ------------------------------------------------------------------------------------
 
     def _join(self) -> None:
-        driver, options = self.driver, self._options
+        driver, path = self.driver, self.path
         assert driver is not None
-        cyclic = driver.cyclic(options) if self.link.writable else ()
-        self._buses.join(self._config.name, self.link.bus, driver.filters(options), cyclic, self._bits_per_s)
+        assert path is not None
+        cyclic = driver.cyclic(self._options) if self.link.writable else ()
+        bits = sum(frame_bits(one.extended, len(one.data)) for one in driver.example_frames(Random(0)))
+        self._buses.join(
+            self._config.name, self.link.bus, self._filters, cyclic, lambda: bits * path.clock.expected_rate_hz
+        )
         self._joined = True
-
-    def _bits_per_s(self) -> float:
-        """Return the present bus load of the samples, bit/s without stuff bits."""
-        if self.path is None or self.driver is None:
-            return 0.0
-        bits = sum(frame_bits(one.extended, len(one.data)) for one in self.driver.example_frames(Random(0)))
-        return bits * self.path.clock.expected_rate_hz
 
     def _leave(self) -> None:
         if self._joined:
@@ -288,7 +287,7 @@ class CanTransport(ReceivingTransport):
         if wide and not self._is_wide:
             codec.unknown.clear()
         self._is_wide = wide
-        passed = driver.sent_by(self._options) if wide else driver.filters(self._options)
+        passed = driver.sent_by(self._options) if wide else self._filters
         self.link.filters = (*passed, *self._also)
 
     async def run_script(self, make: Callable[..., Any], *arguments: Any) -> Any:
@@ -321,8 +320,8 @@ class CanTransport(ReceivingTransport):
 
     def _is_foreign(self, frame: CanFrame) -> bool:
         """Return whether only another configured device receives a frame."""
-        at, driver = (frame.can_id, frame.extended), self.driver
-        is_own = driver is not None and any(one.matches(*at) for one in driver.filters(self._options))
+        at = frame.can_id, frame.extended
+        is_own = any(one.matches(*at) for one in self._filters)
         return not is_own and self._buses.claimed(self._config.name, self.link.bus)(*at)
 
     def _answer(self, frames: Sequence[CanFrame]) -> None:

@@ -237,7 +237,7 @@ class ReaderConnection:
 
     def _watch_writable(self) -> None:
         """Wait until the socket is writable if paho-mqtt has data to write."""
-        if self._problem or self._socket is None:
+        if self._socket is None:
             return
         loop = asyncio.get_running_loop()
         if self._client.want_write():

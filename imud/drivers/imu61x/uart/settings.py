@@ -148,12 +148,12 @@ def sample_words(measurement: Measurement) -> Mapping[str, Any]:
 # --- settings ---------------------------------------------------------------------------------------------------------
 
 
-def read_parameters(wanted: Collection[Parameter] = tuple(Parameter)) -> RequestScript[ParameterValues]:
+def read_parameters(wanted: Sequence[Parameter]) -> RequestScript[ParameterValues]:
     """Read parameters of table 9. Raises NoReply if the device does not reply for the first parameter either.
 
     The result does not contain other parameters without a reply: some models lack some parameters (assumed).
     """
-    first, *others = sorted(wanted, key=lambda parameter: parameter is not Parameter.BAUD)
+    first, *others = wanted
     values = {first: (yield from read(first))}
     for _ in range(PARAMETER_ROUNDS):
         for parameter in others:
