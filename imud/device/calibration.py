@@ -236,9 +236,7 @@ class _SphereFit:
         if solved is None:
             return None
         a, b, c, d = solved
-        squared = d + a * a + b * b + c * c
-        if squared <= 0:
-            return None
+        squared = d + a * a + b * b + c * c  # the mean square distance from the centre: positive
         right_side = [row[4] for row in self._sums]
         # a point at distance e from the sphere has a residual of about 2 r e in its equation
         missed = right_side[4] - sum(value * right for value, right in zip(solved, right_side[:4], strict=True))
@@ -339,10 +337,9 @@ class CalibrationRun:
         try:
             return await task
         except asyncio.CancelledError:
-            if task.cancelled():
-                raise CommandError("the calibration was cancelled; the device can still finish it") from None
-            task.cancel()
-            raise
+            if not task.cancelled():
+                raise
+            raise CommandError("the calibration was cancelled; the device can still finish it") from None
         finally:
             self._running = self.status = None
 

@@ -376,6 +376,7 @@ async def test_level_and_heading_of_a_module(it: WiredDevice) -> None:
     assert [check.name for check in level.checks] == ["roll", "pitch"]
     heading = await it.device.calibrate("heading", save=False)
     assert heading.verified, heading.problem
+    assert [*it.device.last_calibrations] == ["level", "heading"]
     it.module.reboot(it.clock.now_ns())
     await it.wait(5)
     newest = it.samples[-1].euler_rad
@@ -473,8 +474,7 @@ def test_the_newest_samples_count_and_have_means() -> None:
     assert (means.accel_m_s2, means.gyro_rad_s) == ((2.0, 0.0, 9.5), (0.2, 0.0, 0.0))
     assert means.euler_rad == pytest.approx((0.2, 0.0, -pi + 0.1))  # angles on both sides of ±180°
     assert means.incli_rad is not None
-    assert means.incli_rad[0] == pytest.approx(0.3)
-    assert abs(means.incli_rad[1]) == pytest.approx(pi)
+    assert (means.incli_rad[0], abs(means.incli_rad[1])) == (pytest.approx(0.3), pytest.approx(pi))
     assert window(sample(None, None)).means().incli_rad is None
 
 
@@ -507,8 +507,7 @@ def test_each_cell_is_one_direction_and_coverage_is_seen_from_the_centre() -> No
         for values in permutations((1.0, 2.0, 3.0))
     ]
     assert {cell_of((x, y, z)) for x, y, z in directions} == set(range(48))
-    assert cell_of((3.0, 2.0, 1.0)) == 0
-    assert coverage(0b1011) == 3 / 48
+    assert (cell_of((3.0, 2.0, 1.0)), coverage(0b1011)) == (0, 3 / 48)
     # A field of 45 µT with a bias of 60 µT covers half of the directions, seen from the origin.
     truth = [tumble().at(second / 10).mag_t for second in range(1000)]
     turning = of([(x + 60e-6, y, z) for x, y, z in truth])

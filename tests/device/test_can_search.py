@@ -156,9 +156,9 @@ def test_only_drivers_with_samples_are_listed() -> None:
 
 @pytest.mark.parametrize("extended", [False, True])
 def test_noise_on_the_bus_uses_limited_memory(extended: bool) -> None:
-    survey, random = CanSurvey([fake_can_driver(base=0), FAKE]), Random(3)
+    survey, random = CanSurvey([fake_can_driver(base=0), fake_can_driver("other", 128), FAKE]), Random(3)
     most = 0x1FFF_FFFF if extended else 0x7FF
     for _ in range(IDENTIFIERS_MAX + 500):
         survey.on_frames([CanFrame(random.randint(0, most), extended, random.randbytes(8), 0)])
-    assert len(survey.others()) <= IDENTIFIERS_MAX
-    assert len(survey.devices()) + len(survey.doubtful()) <= DEVICES_MAX
+    assert len(survey.others()) == IDENTIFIERS_MAX or not extended
+    assert len(survey.devices()) + len(survey.doubtful()) == (0 if extended else DEVICES_MAX)

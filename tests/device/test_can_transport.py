@@ -17,6 +17,7 @@ from imud.contracts.script import RequestScript, pause
 from imud.contracts.setting import OnDifference, SettingsState
 from imud.contracts.status import DeviceState, KernelCounters
 from imud.device.can_transport import CanBuses
+from imud.device.device import RecordableDevices
 from imud.device.latency import Need
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
@@ -99,8 +100,7 @@ async def test_samples_of_one_read_are_one_batch_with_their_own_times(bench: Can
     bench.feed(1, 2, 3)
     rig.tick()
     assert rig.is_in(DeviceState.RUNNING)
-    assert rig.batches == 1
-    assert [s.seq for s in rig.samples] == [1, 2, 3]
+    assert (rig.batches, [s.seq for s in rig.samples]) == (1, [1, 2, 3])
     # measured before the end of its first frame (111 bits at 500 kbit/s), complete after the fifth frame
     assert all(4 * MS + 222_000 <= s.t_rx_ns - s.t_ns < 4 * MS + 500_000 for s in rig.samples)
     assert [b.t_rx_ns - a.t_rx_ns for a, b in zip(rig.samples, rig.samples[1:], strict=False)] == [5 * MS] * 2
@@ -138,11 +138,13 @@ def test_the_time_stamp_precedes_the_first_frame_by_its_length(name: str, settin
 
 @told(play, configured(base_id=300))
 async def test_only_own_identifiers_pass(bench: CanDeviceBench) -> None:
-    """Before the first sample, all frames pass: imud names unknown types."""
-    for index, bytes_in in ((1, 80), (2, 120)):
+    """Before the first sample, all frames pass: imud names unknown types. Frames that only another device receives do
+    not pass. A second device with the same address is refused, and the first one continues."""
+    buses = vars(bench.rig.device._transport)["_buses"]
+    buses.join("rear", "can0", filters(101, *range(300, 305)), (), float)
+    for index, bytes_in in ((1, 72), (2, 112)):
         bench.link.feed(bench.frames(index) + bench.frames(index, base_id=300))
-        assert len(bench.rig.samples) == index
-        assert bench.rig.ledger.bytes_in == bytes_in
+        assert (len(bench.rig.samples), bench.rig.ledger.bytes_in) == (index, bytes_in)
         bench.rig.tick()
         bench.rig.tick()
 
@@ -355,15 +357,22 @@ def with_pause(pause_ns: int) -> RequestScript[str]:
 
 @told(play, configured(bitrate=500_000))
 async def test_a_recording_starts_with_the_device_and_its_state(bench: CanDeviceBench) -> None:
-    records: list[bytes] = []
+    records, clock = list[bytes](), VirtualClock()
+    devices = RecordableDevices({"mast": bench.rig.device}, clock.host)
+    assert devices.names() == ["mast"]
     bench.feed(1)
-    bench.rig.device.record(records.append)
+    for name in ("stern", "mast"):
+        devices.begin(name, records.append)
     bench.feed(2)
-    bench.rig.device.observer.end(records.append)
+    for name in ("stern", "mast"):
+        devices.check(name, records.append)
+    devices.begin_host(records.append)
+    devices.end(records.append)
     bench.feed(3)
+    clock.advance(2 * NS_PER_S)
+    clock.host.utc_offset_ns()
     kinds = [record.kind for block in records for record in records_of(block)]
-    assert [kinds[0], kinds[1], kinds[-1]] == [Kind.DEVICE, Kind.PATH, Kind.FRAMES]
-    assert kinds.count(Kind.FRAMES) == 1
+    assert kinds == [Kind.DEVICE, Kind.PATH, Kind.FRAMES, Kind.CHECK, Kind.CALL]
 
 
 @told(play)

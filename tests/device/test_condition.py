@@ -231,15 +231,12 @@ class Watched:
 
 def test_a_reason_counts_after_5_s_and_ends_60_s_after_its_cause() -> None:
     watched = Watched()
-    assert watched.after(1) == "ok"
-    assert watched.after(5, LOST) == "ok"
-    assert watched.after(1, LOST) == "degraded"
-    assert watched.after(60, ALARM) == "attention"
+    assert (watched.after(1), watched.after(5, LOST)) == ("ok", "ok")
+    assert (watched.after(1, LOST), watched.after(60, ALARM)) == ("degraded", "attention")
     assert [reason.code for reason in watched.watch.condition.reasons] == ["alarm", "lost"]
     assert watched.after(1, ALARM) == "attention"
     assert [reason.code for reason in watched.watch.condition.reasons] == ["alarm"]
-    assert watched.after(60) == "attention"
-    assert watched.after(1) == "ok"
+    assert (watched.after(60), watched.after(1)) == ("attention", "ok")
     assert watched.watch.condition.since_ns == (watched.now_s - 1) * S
     assert [event.detail["reasons"] for event in watched.events] == ["lost", "alarm, lost", "alarm", "none-lost"]
     assert {event.kind for event in watched.events} == {EventKind.CONDITION}
@@ -251,14 +248,11 @@ def test_a_short_cause_a_repaired_setting_and_a_missing_device() -> None:
     assert watched.events == []
     watched = Watched()
     watched.after(1)
-    assert watched.after(6, SETTING) == "attention"
-    assert watched.after(1) == "ok"
+    assert (watched.after(6, SETTING), watched.after(1)) == ("attention", "ok")
     watched = Watched()
     assert watched.after(1, GONE) == "missing"  # before the first sample without a delay
-    assert watched.after(1) == "ok"
-    assert watched.after(6, LOST) == "degraded"
-    assert watched.after(5, GONE) == "degraded"
-    assert watched.after(1, GONE) == "missing"
+    assert (watched.after(1), watched.after(6, LOST)) == ("ok", "degraded")
+    assert (watched.after(5, GONE), watched.after(1, GONE)) == ("degraded", "missing")
     assert watched.watch.condition.reasons == (GONE.reason(),)
     assert watched.after(1) == "ok"
 

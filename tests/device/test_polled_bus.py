@@ -245,9 +245,7 @@ async def test_the_thread_closes_the_link_of_a_device_that_has_left(it: BusBench
     it.member.leave()
     calls = it.sink.calls
     await stays.run(three(), 1)
-    assert it.sink.calls == calls
-    assert it.wire.closed == 1
-    assert other.closed == 0
+    assert (it.sink.calls, it.wire.closed, other.closed) == (calls, 1, 0)
 
 
 @played(BusBench)
@@ -456,8 +454,7 @@ def test_devices_alternate_even_after_a_return() -> None:
         first.begun(now_ns)
         now_ns += 1000 if number % 7 else 500_000
         first.done(now_ns)
-    assert order == [0, 1, 2] * 10
-    assert [one.polls for one in counts] == [10] * 3
+    assert (order, [one.polls for one in counts]) == ([0, 1, 2] * 10, [10] * 3)
     assert [one.late + one.missed + one.worst_ns for one in counts] == [0] * 3
     busy, back = RoundRobin(0, Deadlines()), RoundRobin(50, Deadlines())
     busy.done(49)

@@ -516,6 +516,14 @@ async def test_a_report_contains_the_last_or_new_values(bench: ModuleBench) -> N
         name: value for name, value in FACTORY.items() if name != "secret"
     }
     assert [one.name for one in fresh.settings if one.differs] == ["mode"]
+    assert [step.name for step in (await bench.doing(bench.device.settings.plan(None, save=False))).steps] == ["mode"]
+
+
+@played(lambda: ModuleBench("apply", {"output": {"a": 1000}}, set={**FACTORY, "output": {"a": 100, "b": 1000}}))
+async def test_declared_values_that_do_not_fit_the_present_ones_are_reported(bench: ModuleBench) -> None:
+    await bench.until(lambda: bench.status.problem)
+    assert bench.status.problem.startswith("cannot set the settings: output: expected at most 1152 Hz in all")
+    assert bench.written() == []
 
 
 # --- steps that fail --------------------------------------------------------------------------------------------------
@@ -602,8 +610,7 @@ def test_a_failed_restart_or_save_reports_the_written_settings() -> None:
     )
     bench, applied = applied_with({"baud": 921600, "mounting": "x_up", "mode": "9-axis"}, lambda _: None, save=False)
     assert list(applied.left_out) == ["baud", "mounting"]
-    assert outcomes(applied) == {"mode": StepOutcome.VERIFIED}
-    assert bench.module.flash == FACTORY
+    assert (outcomes(applied), bench.module.flash) == ({"mode": StepOutcome.VERIFIED}, FACTORY)
 
 
 def test_a_new_rate_is_followed_if_the_device_replies() -> None:
@@ -614,8 +621,7 @@ def test_a_new_rate_is_followed_if_the_device_replies() -> None:
     assert applied.advice == (
         "change `memory.baud: 115200` in the configuration to 921600: imud uses this value at its next start"
     )
-    assert bench.status.flash_writes == 1
-    assert bench.rig.kinds.count(EventKind.UP) == 1
+    assert (bench.status.flash_writes, bench.rig.kinds.count(EventKind.UP)) == (1, 1)
     bench, applied = applied_with({"baud": 921600, "mode": "9-axis"}, lambda module: module.forgets.add("baud"))
     assert outcomes(applied) == {"mode": StepOutcome.VERIFIED, "baud": StepOutcome.NOT_APPLIED}
     assert "does not reply at 921600 baud; the bus has 115200 baud again" in applied.problem

@@ -250,16 +250,22 @@ def test_an_error_names_the_wrong_part(given: dict[str, Any], message: str) -> N
         ("baud", {"baud": 460800}, "--set baud=460800 --save", {"baud": 460800}),
         ("baud", {"baud": "x" * 395}, f"--set baud={'x' * 395} --save", {"baud": "x" * 395}),
         ("baud", {"baud": "x" * 396}, "--set baud=BAUD --save", {}),
+        ("sout_divisor", {}, "--set sout_divisor=SOUT_DIVISOR", {}),
+        ("bit_rate", {"bit_rate": 250000}, "--set bit_rate=250000 --save", {"bit_rate": 250000}),
         ("output_none", {}, "--set output.hi91=0 output.hi92=0", {"output.hi91": 0, "output.hi92": 0}),
     ],
 )
 def test_a_command_that_a_setting_replaces(
     name: str, given: dict[str, Any], command: str, settings: dict[str, Any]
 ) -> None:
-    found = settings_plan.setting_instead("bow", name, DRIVERS["hipnuc-uart"], given)
+    driver = DRIVERS["hipnuc-canopen" if name == "bit_rate" else "hipnuc-uart"]
+    found = settings_plan.setting_instead("bow", name, driver, given)
     assert found is not None
     assert str(found) == f"{name} is a setting: imud settings bow {command}"
     assert found.data == {"settings": settings, "save": command.endswith("--save")}
+    assert settings_plan.setting_instead("bow", name, None, given) is None
+    for other in ("dance", "magnetometer_bias"):
+        assert settings_plan.setting_instead("bow", other, DRIVERS["hipnuc-uart"], given) is None
 
 
 class TableOfOne:

@@ -57,8 +57,7 @@ def test_the_line_model_changes_bytes_at_a_wrong_rate() -> None:
 def test_a_wrong_remembered_rate_costs_little_time_and_a_latency_timer_extends_the_visits() -> None:
     search = Search([FAKE_DRIVER], remembered=("fake-uart", 9600))
     found, took_ns, listens = found_by(search, device(921600, 100, 777))
-    assert found.baud == 921600
-    assert listens[0].baud == 9600
+    assert (found.baud, listens[0].baud) == (921600, 9600)
     assert found.wasted_bytes > 0
     assert took_ns < 0.8 * NS_PER_S  # invalid bytes end the long wait
     assert first_visit(Search([FAKE_DRIVER], remembered=("gone-uart", 9600))).baud == BAUD_RATES[0]
@@ -92,8 +91,7 @@ def test_a_silent_device_is_queried_only_after_the_quiet_time(baud: int) -> None
 def test_no_query_without_permission_or_to_another_device() -> None:
     far = device(115200, 0)
     result, _, listens = given_up(Search([FAKE_DRIVER]), far)
-    assert far.sent_to == []
-    assert {listen.baud for listen in listens} == set(BAUD_RATES)
+    assert (far.sent_to, {listen.baud for listen in listens}) == ([], set(BAUD_RATES))
     assert "got no byte at 115200" in result.summary
     assert "query" not in result.summary
     far = replace(device(115200, 10), noise=b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n")
@@ -147,6 +145,11 @@ def test_two_good_frames_are_enough_with_few_bad_frames_and_noise() -> None:
     lie = b"\x5a\xa5\x00\x02\x00\x00"  # its length field is 512
     assert search.on_data(lie + fake_frame(b"a" * 76) + fake_frame(b"b" * 76), 1) is None
     assert isinstance(search.on_time(step.until_ns), StreamFound)
+    search = Search([FAKE_DRIVER], bauds=(115200,))
+    step = first_visit(search)
+    assert search.on_data(lie + fake_frame(b"a" * 76), 1) is None
+    longer = search.on_time(step.until_ns)  # one valid frame inside the damaged one
+    assert longer == replace(step, until_ns=2 * step.until_ns)
 
 
 def test_each_byte_is_in_the_result_or_counted_as_wasted() -> None:
@@ -311,8 +314,7 @@ def test_a_remembered_device_is_found_immediately_and_a_silent_device_by_its_rep
     search = Search(FAMILIES, remembered=(driver.name, baud))
     found, took_ns, listens = found_by(search, family_device(driver, baud, 100, 1_234_567))
     assert found.driver is driver
-    assert {listen.baud for listen in listens} == {baud}
-    assert found.wasted_bytes == 0
+    assert ({listen.baud for listen in listens}, found.wasted_bytes) == ({baud}, 0)
     assert took_ns < (0.3 if baud > 9600 else 0.4) * NS_PER_S  # two frames of 136 bytes take 283 ms at 9600 baud
     far = family_device(driver, baud, 0)
     found, took_ns, _ = found_by(Search(FAMILIES, may_ask=True), far)
@@ -336,7 +338,6 @@ def test_each_driver_is_queried_equally_often_and_an_acknowledgement_is_no_reply
     bauds = {baud for driver in FAMILIES for baud in driver.baud_rates}
     for query, _ in ANSWERS.values():
         asked = [baud for baud, sent in far.sent_to if sent == query]
-        assert set(asked) == bauds
-        assert len(asked) == len(bauds) * ASK_TRIES
+        assert (set(asked), len(asked)) == (bauds, len(bauds) * ASK_TRIES)
     far = replace(family_device(IMU61X, 115200, 0), reply=encode_acknowledgement(1))
     given_up(Search(FAMILIES, may_ask=True), far)

@@ -70,8 +70,7 @@ async def test_samples_make_the_device_run(rig: DeviceRig) -> None:
     assert rig.kinds == [EventKind.UP]
     status = rig.device.status()
     assert (status.newest_seq, status.driver, status.connects) == (5, "hipnuc-uart", 1)
-    assert sum(status.latency_buckets) == 5
-    assert status.temperature_c == 20.0
+    assert (sum(status.latency_buckets), status.temperature_c) == (5, 20.0)
 
 
 @told(play)
@@ -92,8 +91,7 @@ async def test_after_a_replug_sequence_numbers_and_times_increase(rig: DeviceRig
     assert rig.is_in(DeviceState.RUNNING)
     assert [s.seq for s in rig.samples] == list(range(1, 9))
     times = [s.t_ns for s in rig.samples]
-    assert times == sorted(set(times))
-    assert rig.kinds == [EventKind.UP, EventKind.DOWN, EventKind.UP]
+    assert (times, rig.kinds) == (sorted(set(times)), [EventKind.UP, EventKind.DOWN, EventKind.UP])
     assert rig.device.status().connects == 2
     assert rig.ledger.lost() == 0
 
@@ -202,8 +200,7 @@ async def test_detection_counts_each_byte_and_is_stored(rig: DeviceRig) -> None:
     await rig.turn(lambda: rig.ledger.frames_good)
     rig.tick()
     assert rig.is_in(DeviceState.RUNNING)
-    assert len(rig.samples) == 3
-    assert rig.ledger.bytes_in == len(noise) + len(stream)
+    assert (len(rig.samples), rig.ledger.bytes_in) == (3, len(noise) + len(stream))
     assert rig.ledger.bytes_skipped == len(noise)
     rig.link.disappear()
     await rig.turn(lambda: rig.state is DeviceState.MISSING)
@@ -283,8 +280,7 @@ async def test_a_streaming_device_is_queried_until_it_replies(module: DeafModule
     """Three queries, further queries after 5, 30 and 120 s, then a query per five minutes."""
     await module.rig.until(lambda: module.product, limit_s=2000, step=module.step, step_s=0.25)
     await module.pass_s(310)
-    assert len(module.asked_ns) == deaf_to + 1
-    assert module.product == "HI14R3"
+    assert (len(module.asked_ns), module.product) == (deaf_to + 1, "HI14R3")
 
 
 @played(lambda: DeafModule(1_000_000))

@@ -64,16 +64,14 @@ async def test_a_module_with_its_output_off_is_known_and_stays_silent(
         f"it replies (HI14R3, firmware 1.5.6) but sends no samples: {why}; the command wake starts its output"
     )
     assert device.device.status().identity["serial_number"] == "043995698D6E1708"
-    assert device.module.settings == settings
-    assert turns(device) == []
+    assert (device.module.settings, turns(device)) == (settings, [])
     await device.act("mode", axes=9)
     assert device.module.settings.att_mode == 1
     assert device.device.status().settings["mode"] == "9-axis"
     await device.act("wake")
     await device.until(lambda: len(device.samples) > 20)
     assert device.rig.is_in(DeviceState.RUNNING)
-    assert device.problem == ""
-    assert turns(device) == [EventKind.UP]
+    assert (device.problem, turns(device)) == ("", [EventKind.UP])
 
 
 @played(lambda: LinkedDevice(NO_RATE))

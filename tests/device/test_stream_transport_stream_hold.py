@@ -207,8 +207,7 @@ async def test_no_hold_before_the_fit_and_after_a_restart(bench: HoldBench) -> N
 async def test_no_hold_with_fewer_than_two_samples(bench: HoldBench) -> None:
     since = len(bench.rig.published)
     await bench.send(50)
-    assert bench.sizes(since) == [1] * 50
-    assert bench.waits_ns(since) == [0] * 50
+    assert (bench.sizes(since), bench.waits_ns(since)) == ([1] * 50, [0] * 50)
     assert bench.device.status().hold_ns == 0
     assert bench.device.status().hold_wanted_ns == 10 * NS_PER_MS
 
@@ -223,8 +222,7 @@ async def test_a_latency_of_0_releases_held_samples(bench: HoldBench) -> None:
     assert len(bench.rig.samples) == bench.sent
     since = len(bench.rig.published)
     await bench.send(10)
-    assert bench.sizes(since) == [1] * 10
-    assert bench.waits_ns(since) == [0] * 10
+    assert (bench.sizes(since), bench.waits_ns(since)) == ([1] * 10, [0] * 10)
     assert bench.device.status().hold_ns == 0
     bench.want(20)
     since = len(bench.rig.published)
@@ -247,8 +245,7 @@ async def test_a_hold_does_not_exceed_the_buffer(bench: HoldBench) -> None:
 @played(lambda: HoldBench(50, waiting_bytes=0))
 async def test_a_link_without_pause_has_no_hold(bench: HoldBench) -> None:
     await bench.send(100)
-    assert bench.link.taken == []
-    assert len(bench.rig.published) == bench.sent
+    assert (bench.link.taken, len(bench.rig.published)) == ([], bench.sent)
 
 
 @played(lambda: HoldBench(20, anew=True))
@@ -303,8 +300,7 @@ async def test_a_hold_does_not_delay_a_reply(bench: HoldBench) -> None:
     running = asyncio.create_task(bench.device._transport.run_script(lambda _target: asking()))
     await asyncio.sleep(0)
     await asyncio.sleep(0)
-    assert len(bench.rig.samples) == bench.sent
-    assert bench.link.written == [b"WHO\r\n"]
+    assert (len(bench.rig.samples), bench.link.written) == (bench.sent, [b"WHO\r\n"])
     await bench.send(5)
     assert len(bench.rig.samples) == bench.sent
     bench.link.feed(b"OK\r\n", bench.clock.now_ns())

@@ -92,8 +92,7 @@ def bench() -> KeeperBench:
 def test_sentences_are_sent_or_refused_and_give_pulses_utc(bench: KeeperBench) -> None:
     for number in range(6):
         bench.second(number)
-    assert len(bench.written) == 6
-    assert bench.written[3] == build((UTC_S + 3) * NS_PER_S)
+    assert (len(bench.written), bench.written[3]) == (6, build((UTC_S + 3) * NS_PER_S))
     reference = bench.clock.utc_reference
     assert reference is not None
     assert reference.offset_ns == pytest.approx(OFFSET_NS, abs=1000)
@@ -154,8 +153,7 @@ def test_a_receiver_with_a_wrong_date(
     for number in range(6):
         bench.second(number, off_s=off_s)
     status = bench.keeper.status()
-    assert status.refused.get("implausible", 0) == refused
-    assert len(bench.chrony.pulses) == pulses
+    assert (status.refused.get("implausible", 0), len(bench.chrony.pulses)) == (refused, pulses)
     assert (problem in status.problem) == (not problem or bool(status.problem))
     assert sum(record.getMessage() == status.problem for record in caplog.records) == (1 if problem else 0)
     if problem:

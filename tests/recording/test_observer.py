@@ -1,11 +1,7 @@
 """Observers: the path has an observer only while a recording runs, and the records contain every input in order."""
 
-from types import SimpleNamespace
-from typing import cast
-
 from imud.config.model import DeviceConfig
 from imud.contracts.lines import Edge
-from imud.device.device import Device, RecordableDevices
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.formats.records import CheckRecord, Kind, PathRecord, decode_object, records_of
 from imud.model.ledger import Ledger
@@ -106,22 +102,7 @@ def test_readings_of_the_clocks_are_recorded() -> None:
     assert len(records) == 2
 
 
-def test_recordable_devices_ignore_an_unknown_device_and_end_and_check_the_newest_sample() -> None:
-    one, put = ObservedPath(), list[bytes]()
-    device = SimpleNamespace(observer=one.observer, record=lambda send: one.observer.begin(send, "", {}, {}))
-    devices = RecordableDevices({"bow": cast(Device, device)}, one.host)
-    assert devices.names() == ["bow"]
-    for name in ("stern", "bow"):
-        devices.begin(name, put.append)
-        devices.check(name, put.append)
-    devices.begin_host(put.append)
-    kinds = [record.kind for data in put for record in records_of(data)]
-    assert kinds == [Kind.DEVICE, Kind.PATH, Kind.CHECK, Kind.CALL]
-    devices.end(put.append)
-    assert one.observers == {None}
-    one.clock.advance(2_000_000_000)
-    one.host.utc_offset_ns()
-    assert len(put) == 4
+def test_a_check_contains_the_newest_sample_and_the_ledger() -> None:
     one, put = ObservedPath(), list[bytes]()
     one.observer.check(put.append)
     one.path.on_data(hi91(0), 5)
