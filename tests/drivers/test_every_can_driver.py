@@ -34,6 +34,7 @@ def make(driver: CanDriver) -> CanCodec:
     codec = driver.make_codec(Ledger(), driver.settings())
     for frame in (frame for number in range(LEARNING_SETS) for frame in timed(driver, Random(number), number)):
         codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns)
+    assert codec.problem == ""
     assert codec.ledger.closes()
     assert codec.ledger.frames_in_samples >= driver.sample_frames
     assert codec.ledger.frames_pending == codec.ledger.frames_bad() == codec.ledger.bytes_skipped == 0

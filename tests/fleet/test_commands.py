@@ -13,6 +13,7 @@ import msgspec
 import pytest
 
 from imud.contracts.setting import AppliedSettings, SettingDifference
+from imud.drivers import DRIVERS
 from imud.fleet.broker import Received
 from imud.fleet.commands import CommandChannel, CommandReply
 from imud.fleet.messages import CommandAnswer, Outcome, answer_topic
@@ -133,6 +134,18 @@ def test_commands_that_are_not_allowed_are_denied() -> None:
     assert wrong_values(CommandOptions, {"actions": ["a", "bow/a", "set", "set.mode", "bow/set.mode"]}) == []
     (problem,) = check_commands(MqttOptions(commands=CommandOptions(actions=["set", "bow/set", "save"])), {}).values()
     assert problem.startswith('expected a command that imud knows, got "save"')
+    drivers = {name: DRIVERS[name] for name in ("hipnuc-uart", "hipnuc-canopen", "hipnuc-j1939", "imu61x-uart")}
+    for action, step in (
+        ("bow/output", "use bow/set.output"), ("rate", "use set.output_rate_hz"), ("settings", "remove it"),
+        ("direction", "use set.incli_x_reversed, set.incli_y_reversed, set.x_reversed, set.y_reversed"),
+    ):  # fmt: skip
+        problems = check_commands(MqttOptions(commands=CommandOptions(actions=["save", action])), drivers)
+        words = f'expected a command, got "{action}", which is a setting now; {step}'
+        assert problems == {("commands", "actions"): words}
+    valid = MqttOptions(commands=CommandOptions(actions=["set.mode", "bow/set.baud", "reset"]))
+    assert check_commands(valid, drivers) == {}
+    (problem,) = check_commands(MqttOptions(commands=CommandOptions(actions=["set.mod"])), drivers).values()
+    assert problem.startswith('expected a setting after set. that imud knows, got "mod"; did you mean mode?')
     for entry in ("set.", "set.output.hi91", "get.mode"):
         assert wrong_values(CommandOptions, {"actions": [entry]})
 
@@ -298,8 +311,10 @@ def test_retained_requests_and_foreign_reply_topics_are_ignored() -> None:
                   "imud/mill/gw/bow/answer/a/b", "imud/mill/gw/bow/answer/#", "imud/mill/gw/bow/answer/"):  # fmt: skip
         bench.ask(2, response_topic=topic)
         assert answer_topic("mill", "gw", "bow", topic) is None
+    for topic in ("imud/mill/other/bow/command", "imud/mill/gw/bow/status", "imud/mill/gw"):
+        bench.channel.take(Received(topic, VALID, False, "", b""))
     bench.run()
-    assert (bench.channel.refused, bench.replies, bench.device.done) == (8, [], [])
+    assert (bench.channel.refused, bench.replies, bench.device.done) == (11, [], [])
 
 
 def test_errors_and_internal_errors_have_a_reply() -> None:

@@ -159,7 +159,10 @@ def test_settings_are_published_when_they_change(tmp_path: Path) -> None:
     declare(SettingsState.AGREE, 2)  # another reading without a difference
     declare(SettingsState.DIFFER, 3, rate_hz=SettingDifference(100, 50))
     bench.broker.wait_for(topic, lambda payload: b'"differ"' in payload)
-    sent = [json.loads(payload) for one, payload, retain in bench.close() if one == topic and retain]
+    bench.output.remove_device("imu0")
+    bench.tick()
+    bench.broker.wait_for(topic, lambda payload: not payload)
+    sent = [json.loads(payload) for one, payload, _ in bench.close() if one == topic and payload]
     assert [one["state"] for one in sent] == ["agree", "differ"]
     assert sent[1]["differences"] == {"rate_hz": {"declared": 100, "actual": 50}}
     assert sent[1]["actual"] == {"rate_hz": "50"}
@@ -285,8 +288,7 @@ def test_bad_settings_are_named(given: Mapping[str, Any], words: str) -> None:
     ],
 )
 def test_urls_of_brokers_and_names_of_devices(url: str, broker: Broker) -> None:
-    assert broker_of(url) == broker
-    assert broker_of(broker.name) == broker
+    assert (broker_of(url), broker_of(broker.name)) == (broker, broker)
     settings = msgspec.convert({"devices": {"bow": {"rate_hz": 5}, "*": {"rate_hz": 2}}}, MqttOptions)
     assert [getattr(settings.sending(name), "rate_hz", None) for name in ("bow", "mast")] == [5, 2]
     alone = msgspec.convert({"devices": {"bow": {}}}, MqttOptions)

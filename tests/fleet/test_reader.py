@@ -13,6 +13,7 @@ from unittest.mock import Mock
 
 import pytest
 
+import imud.fleet
 from imud.fleet.accounts import GatewayState, StreamKey, StreamPosition
 from imud.fleet.broker import BrokerError, ReaderAccess
 from imud.fleet.messages import topic_of
@@ -78,8 +79,7 @@ async def test_batches_contain_samples_and_the_ledger_balances(broker: Mosquitto
     gateway.send(samples_message(1, 10), samples_message(1, 10), dropped_message(11, 15), samples_message(19, 20))
     batches = await taken(fleet, 3)
     assert [one.site for one in batches] == ["mill"] * 3
-    assert batches[0].message == samples_message(1, 10)
-    assert fleet.states["mill", "gw"] == STATE
+    assert (batches[0].message, fleet.states["mill", "gw"]) == (samples_message(1, 10), STATE)
     account = fleet.accounts[KEY]
     assert (account.sent, account.received, account.in_spool, account.balance) == (50, 12, 30, 0)
     assert (account.counts.dropped, account.counts.missing, account.counts.duplicates) == ({"space": 5}, 3, 10)
@@ -120,8 +120,7 @@ async def test_the_broker_sends_no_more_than_the_reader_can_hold(broker: Mosquit
             break
     await batches.aclose()
     assert sent <= RECEIVE_MAX + 1
-    assert count == 2 * RECEIVE_MAX
-    assert fleet.accounts[KEY].counts.missing == 0
+    assert (count, fleet.accounts[KEY].counts.missing) == (2 * RECEIVE_MAX, 0)
 
 
 @in_loop
@@ -227,6 +226,9 @@ def test_the_example_of_the_document(broker: Mosquitto, gateway: SendingGateway)
 
 
 def test_names_are_checked() -> None:
+    assert (imud.fleet.Fleet, imud.fleet.FleetBatch) == (Fleet, FleetBatch)
+    with pytest.raises(AttributeError, match=r"module 'imud\.fleet' has no attribute 'Fleets'"):
+        imud.fleet.Fleets  # noqa: B018
     for url in ("http://host", "mqtt://user:secret@host", "mqtt://", "host:1883", "mqtt://host:0"):
         with pytest.raises(BadArgument, match="expected a URL"):
             Fleet("mqtt://host", url)
@@ -390,3 +392,24 @@ async def test_errors_of_the_loop_do_not_prevent_the_end(broker: Mosquitto, monk
     with pytest.raises(BrokerError, match="the connection is closed"):
         async with asyncio.timeout(LIMIT_S):
             await waiting
+
+
+@in_loop
+async def test_data_that_the_socket_did_not_accept_is_sent_when_it_is_writable() -> None:
+    broker = broker_of("mqtt://host")
+    assert broker is not None
+    ours, theirs = socket.socketpair()
+    waiting = [b"ab", b"cd"]
+    connection = ReaderConnection(broker)
+    connection._client = Mock(
+        want_write=lambda: waiting, loop_write=lambda: ours.send(waiting.pop(0)), socket=lambda: ours
+    )
+    connection._socket, connection._descriptor = ours, ours.fileno()
+    with ours, theirs:
+        connection.acknowledge(7)
+        connection._client.ack.assert_called_once_with(7, 1)
+        await until(lambda: not waiting)
+        await asyncio.sleep(0)
+        assert theirs.recv(9) == b"abcd"
+        assert not asyncio.get_running_loop().remove_writer(ours), "imud does not wait without data"
+        connection.close()

@@ -8,7 +8,7 @@ import pytest
 from imud.fleet.broker import BrokerTurn, Will
 from imud.fleet.commands import CommandChannel, CommandReply
 from imud.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
-from imud.fleet.sender import MqttSender
+from imud.fleet.sender import TOPICS_MAX, MqttSender, TopicRefusals
 from imud.fleet.settings import Broker, CommandOptions, MqttOptions
 from imud.fleet.spool import SpoolRow
 from imud.fleet.streams import Gateway
@@ -207,6 +207,15 @@ def test_replies_without_acknowledgement_are_sent_again_up_to_a_limit() -> None:
         bench.sender.reply(CommandReply("answer", b"%d" % number, None))
         bench.drive(3)
     assert bench.sender.replies_lost == 8
+
+
+def test_the_number_of_refused_topics_is_limited() -> None:
+    refusals = TopicRefusals()
+    for number in range(TOPICS_MAX + 1):
+        refusals.refuse(f"t{number}", "no", 0)
+    refusals.refuse("t1", "a skipped topic keeps its reason", 1)
+    assert (len(refusals.problems), *refusals.skipped) == (TOPICS_MAX, *(f"t{n + 1}" for n in range(TOPICS_MAX)))
+    assert set(refusals.problems.values()) == {"no"}
 
 
 LONG_NS = 600 * NS_PER_S  # longer than the pauses of this test

@@ -72,8 +72,7 @@ def test_messages_are_given_in_order_until_they_are_acknowledged(tmp_path: Path)
     bench.commit(batch(1), batch(101), batch(201))
     first = bench.spool.after(2)
     assert [row.first for row in first] == [1, 101]
-    assert [row.first for row in bench.spool.after(5)] == [201]
-    assert bench.spool.after(5) == []
+    assert ([row.first for row in bench.spool.after(5)], bench.spool.after(5)) == ([201], [])
     bench.commit(done=(first[0].id,))
     assert [row.first for row in bench.all()] == [101, 201]
     assert bench.spool.messages == 2
@@ -105,8 +104,7 @@ def test_the_oldest_samples_become_statistics_before_anything_is_dropped(tmp_pat
     assert counts.dropped == {}
     assert counts.thinned >= 3_000
     assert counts.whole >= 1000
-    assert counts.whole + counts.thinned == 15_000
-    assert bench.spool.thinned == counts.thinned
+    assert (counts.whole + counts.thinned, bench.spool.thinned) == (15_000, counts.thinned)
     kinds = [row.kind for row in bench.all()]
     assert kinds == sorted(kinds), "intervals are the oldest, slots the newest"
 
@@ -312,6 +310,14 @@ def test_a_file_that_is_damaged_later_is_renamed_at_the_next_attempt(tmp_path: P
             continue
     assert bench.spool.set_aside
     assert bench.counts().whole == 100
+    for use in (spool.Spool.positions, spool.Spool.removals, lambda one: one.store_removals(["a"])):
+        bench = SpoolBench(tmp_path)
+        bench.commit(batch(1))
+        for one in tmp_path.glob("spool.db*"):
+            one.write_bytes(b"\xff" * 10_000)
+        with pytest.raises(spool.SpoolError, match="not a database"):
+            use(bench.spool)
+        assert not path.exists()
 
 
 def test_an_invalid_payload_is_dropped_as_damaged(tmp_path: Path) -> None:
@@ -374,8 +380,7 @@ def test_damaged_rows_are_dropped_or_deleted_and_damaged_positions_ignored(tmp_p
     bench = SpoolBench(tmp_path / "deleted")
     bench.commit(*(batch(100 * number + 1) for number in range(4)))
     damage(tmp_path / "deleted", "topic = ''", "id <= 2")
-    assert [row.first for row in bench.spool.after(2)] == [201, 301]
-    assert bench.spool.messages == 2
+    assert ([row.first for row in bench.spool.after(2)], bench.spool.messages) == ([201, 301], 2)
     bench = SpoolBench(tmp_path / "position")
     bench.commit(batch(1), batch(1, device="stern"))
     damage(tmp_path / "position", "stored_utc_ns = 'never', boot = CAST(x'ff' AS TEXT)", "device = 'stern'", "progress")
@@ -409,8 +414,7 @@ def test_the_streams_of_the_maximum_number_of_devices_keep_their_begin(tmp_path:
         for whole in (True, False):
             bench.commit(*(batch(first, 1, f"device-{number}", whole=whole) for number in range(256)))
     positions = bench.spool.positions()
-    assert len(positions) == 512
-    assert {(one.begin, one.last) for one in positions} == {(1, 2)}
+    assert (len(positions), {(one.begin, one.last) for one in positions}) == (512, {(1, 2)})
 
 
 def test_a_row_survives_storing_and_its_numbers_are_checked() -> None:

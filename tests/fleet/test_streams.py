@@ -49,6 +49,7 @@ def test_complete_samples_are_sent_in_batches_of_batch_s() -> None:
     assert ranges(one.missed_events(2, 77), Stream.EVENTS) == [("dropped", 4, 5)]
     assert ranges(streams().missed_events(2, 77), Stream.EVENTS) == [("dropped", 1, 2)]
     assert streams(events=False).event(Event(0, "bow", EventKind.UP, "up"), 77) == []
+    assert streams(events=False).missed_events(2, 77) == []
 
 
 @pytest.mark.parametrize(("whole", "most"), [(Whole.JSON, SAMPLES_MAX), (Whole.SLOTS, SLOTS_MAX)])
@@ -72,8 +73,7 @@ def test_intervals_start_on_the_grid() -> None:
 
 def test_due_messages_are_sent_without_new_samples() -> None:
     one = streams(rate_hz=1, whole="slots", batch_s=1)
-    assert one.add(samples(1000, 1010)) == []
-    assert one.take_due(NS_PER_S * 2) == []
+    assert (one.add(samples(1000, 1010)), one.take_due(NS_PER_S * 2)) == ([], [])
     assert one.take_due(NS_PER_S * 2 + LATE_NS - 1) == []
     made = one.take_due(NS_PER_S * 2 + LATE_NS)
     assert [(row.stream, row.first, row.last) for row in made] == [
@@ -101,9 +101,13 @@ def test_a_later_run_in_the_same_boot_continues_the_numbers() -> None:
     made = one.add(samples(151, 160)) + one.flush()
     assert ranges(made, Stream.SAMPLES) == [("dropped", 101, 150), ("samples", 151, 160)]
     assert messages(made)[0].cause is DropCause.OFF
-    assert messages(made)[1].begin == 1
-    assert one.gaps == 0
+    assert (messages(made)[1].begin, one.gaps) == (1, 0)
     assert one.event(Event(0, "bow", EventKind.UP, "up"), 77)[0].first == 8
+    one = streams(rate_hz=100, whole="json")
+    one.resume("samples", StreamPosition(GATEWAY.boot, "bow", "samples", 1, 100))
+    one.resume("statistics", StreamPosition(GATEWAY.boot, "bow", "statistics", 1, 160))
+    made = one.add(samples(161, 170)) + one.flush()
+    assert ranges(made, Stream.SAMPLES) == [("samples", 161, 170)]
 
 
 def test_dropped_messages_keep_the_numbers() -> None:

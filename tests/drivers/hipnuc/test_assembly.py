@@ -175,10 +175,8 @@ def test_samples_are_complete_after_silence_after_a_reset_and_with_equal_values_
     rig = learnt(MIXED)
     for burst in range(60, 81):
         *head, last = stream(MIXED, [burst])
-        assert rig.feed(head) == []
-        assert rig.ledger.frames_pending == len(head)
-        assert rig.feed([last]) == [burst]
-        assert rig.ledger.frames_pending == 0
+        assert (rig.feed(head), rig.ledger.frames_pending) == ([], len(head))
+        assert (rig.feed([last]), rig.ledger.frames_pending) == ([burst], 0)
 
     rig = learnt(MIXED)
     made = rig.feed(without(stream(MIXED, range(60, 400)), lambda f: 81 <= f.burst < 290))
@@ -189,13 +187,11 @@ def test_samples_are_complete_after_silence_after_a_reset_and_with_equal_values_
     first, second = stream(EQUAL, [60]), stream(EQUAL, [61])
     rig.feed(first[:2])
     rig.assembly.reset()
-    assert rig.ledger.frames_pending == 0
-    assert rig.feed(first[2:] + second) == [60, 61]
+    assert (rig.ledger.frames_pending, rig.feed(first[2:] + second)) == (0, [60, 61])
     rig = learnt({1: 1})
     late = [frame._replace(data=bytes([0, 0, 0, 0, 1])) for frame in stream({1: 1}, range(60, 70))]
     rig.feed(frame._replace(t_ns=late[-1].t_ns) for frame in late)
-    assert rig.ledger.frames_ignored == 0
-    assert len(rig.made) == 70
+    assert (rig.ledger.frames_ignored, len(rig.made)) == (0, 70)
 
 
 @pytest.mark.parametrize("kind", EQUAL)
@@ -222,8 +218,7 @@ def test_the_end_of_one_burst_and_the_beginning_of_another_are_not_joined(cut: i
         return 700 + cut < 10 * frame.burst + frame.kind <= 10 * last + cut
 
     made = rig.feed(without(stream(EQUAL, range(60, 90)), is_lost))
-    assert made == [*range(60, 71), *range(last, 90)]
-    assert rig.ledger.lost_gap_device == bursts - 1
+    assert (made, rig.ledger.lost_gap_device) == ([*range(60, 71), *range(last, 90)], bursts - 1)
 
 
 @pytest.mark.parametrize("kinds", [EQUAL, MIXED, LEADING])
@@ -231,8 +226,7 @@ def test_the_end_of_one_burst_and_the_beginning_of_another_are_not_joined(cut: i
 def test_bursts_that_are_lost_whole_are_counted(kinds: dict[int, int], lost: int) -> None:
     rig = learnt(kinds)
     made = rig.feed(without(stream(kinds, range(60, 300)), lambda f: 81 <= f.burst < 81 + lost))
-    assert made == [*range(60, 81), *range(81 + lost, 300)]
-    assert rig.ledger.lost_gap_device == lost
+    assert (made, rig.ledger.lost_gap_device) == ([*range(60, 81), *range(81 + lost, 300)], lost)
     assert rig.ledger.frames_lost == sum(len(whole(kinds, burst)) for burst in range(81, 81 + lost))
     assert all(names == whole(kinds, burst) for burst, names in rig.made if burst >= 81 + lost + 4)
 
@@ -258,8 +252,7 @@ def test_a_stall_between_two_bursts_costs_nothing(kinds: dict[int, int], stall_n
 def test_repeated_frames_cost_no_sample(kinds: dict[int, int]) -> None:
     rig, random = learnt(kinds), Random(3)
     frames = [frame for frame in stream(kinds, range(60, 160)) for _ in range(random.choice((1, 1, 2)))]
-    assert rig.feed(frames) == list(range(60, 160))
-    assert rig.ledger.lost_gap_device == 0
+    assert (rig.feed(frames), rig.ledger.lost_gap_device) == (list(range(60, 160)), 0)
     assert rig.ledger.frames_ignored == len(frames) - len(set(frames))
 
 
@@ -275,8 +268,7 @@ def test_kinds_that_are_switched_off_or_stay_out() -> None:
     assert rig.feed(stream({2: 1, 3: 1}, range(60, 120))) == list(range(60, 120))
     rig = learnt(MIXED)
     off, on = stream({1: 1, 2: 1, 3: 2}, range(60, 300)), stream(MIXED, range(300, 400))
-    assert rig.feed(off) == list(range(60, 300))
-    assert set(rig.feed(on)) == set(range(300, 400))
+    assert (rig.feed(off), set(rig.feed(on))) == (list(range(60, 300)), set(range(300, 400)))
     assert rig.kinds_of(380) == (1, 2, 3, 6)
     rig = AssemblyBench({1, 3})
     made = rig.feed(stream(MIXED, range(60)))
@@ -299,8 +291,7 @@ def test_a_kind_that_is_switched_on_joins_and_a_new_rate_is_not_a_loss() -> None
             frame._replace(t_ns=frame.t_ns - 10**9 + begin_ns - 60 * period_ns)
             for frame in stream(EQUAL, range(60, 110), period_ns)
         ]
-        assert rig.feed(frames) == list(range(60, 110))
-        assert rig.ledger.lost_gap_device == 0
+        assert (rig.feed(frames), rig.ledger.lost_gap_device) == (list(range(60, 110)), 0)
         assert rig.assembly.period_ns == pytest.approx(period_ns, rel=0.05)
 
 

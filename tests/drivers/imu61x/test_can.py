@@ -97,8 +97,7 @@ def test_golden_set_in_si_units_and_back_with_the_temperature_in_hundredths() ->
     assert found == [[65534], [65535], [0], [1]]
 
     moved = [(can_id - 101 + 600, data) for can_id, data in GOLDEN]
-    assert indices(feed(make(600), moved)) == [65535]
-    assert feed(make(600), GOLDEN) == []
+    assert (indices(feed(make(600), moved)), feed(make(600), GOLDEN)) == ([65535], [])
     wanted = DRIVER.filters(Imu61xCanOptions(base_id=600))
     assert [f.can_id for f in wanted] == [600, 601, 602, 603, 604]
     assert not any(f.matches(605, False) or f.matches(600, True) for f in wanted)
@@ -138,8 +137,7 @@ def test_incomplete_mixed_and_disordered_sets() -> None:
     mixed = [sample(5)[n] for n in (2, 0, 3, 1, 4)]
     assert indices(feed(codec, mixed)) == [5]
     mixed = [sample(7)[n] for n in (2, 0, 3, 1, 4)]
-    assert indices(feed(codec, mixed)) == []
-    assert codec.ledger.frames_ignored == 10
+    assert (indices(feed(codec, mixed)), codec.ledger.frames_ignored) == ([], 10)
 
 
 PERIOD_NS = 10_000_000
@@ -172,10 +170,8 @@ def test_time_separates_frames_of_two_samples() -> None:
         codec = learned()
         first, rest = "12345"[:cut], "12345"[cut:]
         assert timed(codec, 10, first) + timed(codec, 11, rest) == []
-        assert codec.ledger.frames_ignored == 5
-        assert timed(codec, 12) == [12]
-        assert timed(codec, 60, first) + timed(codec, 77, rest) == []
-        assert timed(codec, 78) == [78]
+        assert (codec.ledger.frames_ignored, timed(codec, 12)) == (5, [12])
+        assert (timed(codec, 60, first) + timed(codec, 77, rest), timed(codec, 78)) == ([], [78])
 
 
 def test_time_separates_complete_and_mixed_sets() -> None:

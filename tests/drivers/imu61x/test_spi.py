@@ -182,9 +182,7 @@ def test_a_changed_state_is_noticed_and_a_missing_device_is_not_damage() -> None
 @pytest.mark.manual("A 2.3 read and write", "A 2.4.1 reading", "A 2.4.2 write and read")
 def test_words_of_the_manual_their_answers_and_transfers_on_the_wire() -> None:
     """2.4.4: 0xFE01 opens window 1. 2.4.2: 0x8644 sets both filters to 10 Hz, 0x0600 reads them back."""
-    assert spi.OPEN == 0xFE01
-    assert spi.write(0x06, 0x44) == 0x8644
-    assert spi.read(0x06) == 0x0600
+    assert (spi.OPEN, spi.write(0x06, 0x44), spi.read(0x06)) == (0xFE01, 0x8644, 0x0600)
     assert [one.hex() for one in spi.READ_STATE.sends] == [
         "fe01", "6a00", "6c00", "6e00", "7000", "0600", "0c00", "0d00", "fe00", "7e00", "7e00", "7e00"
     ]  # fmt: skip
@@ -244,8 +242,7 @@ class Wire:
 def test_probe_and_set_up() -> None:
     wire = Wire()
     assert run_transfer_script(probe(SpiDeviceOptions()), wire.transfer).product == "IMU614"
-    assert wire.device.window == 0
-    assert len(wire.sent) == 1
+    assert (wire.device.window, len(wire.sent)) == (0, 1)
 
     wire = Wire()
     words = combined(run_transfer_script(set_up(SpiDeviceOptions()), wire.transfer)).words
@@ -255,8 +252,7 @@ def test_probe_and_set_up() -> None:
     words = combined(run_transfer_script(set_up(settings), wire.transfer)).words
     assert words == {"accel_filter": "10 Hz", "gyro_filter": "10 Hz", "burst": "extended"}
     assert wire.sent[3] == "fe01 8644 fe00 7e00 7e00"  # 10 Hz in the manual's example: 0x8644
-    assert wire.sent[5] == "fe01 8d01 fe00 7e00 7e00"
-    assert len(wire.sent) == 7
+    assert (wire.sent[5], len(wire.sent)) == ("fe01 8d01 fe00 7e00 7e00", 7)
     assert (wire.device.filter, wire.device.extended, wire.device.window) == (0x44, 1, 0)
 
     wire = Wire()
@@ -309,6 +305,5 @@ def test_kind_of_burst_wherever_it_reads_back(
     wire.device.extended = before
     words = combined(run_transfer_script(set_up(SpiDeviceOptions(burst=burst)), wire.transfer)).words
     if burst != "registers":
-        assert words["burst"] == burst
-        assert wire.device.extended == (burst == "extended")
+        assert (words["burst"], wire.device.extended) == (burst, burst == "extended")
     assert wire.device.window == 0

@@ -124,6 +124,9 @@ def test_which_frames_count() -> None:
     assert codec.feed_frame(0x588, False, data, 0) == (ReplyFrame(0x588, data),)
     assert codec.feed_frame(0x588, False, data[:7], 0) == (BadFrame(BadReason.LENGTH, data[:7], 0x588),)
     assert codec.feed_frame(0x608, False, data, 0) == ()  # from another master
+    for can_id, extended in ((0x508, False), (0x508, False), (0x508, True), (0x509, False), (0x088, False)):
+        assert codec.feed_frame(can_id, extended, data, 0) == ()
+    assert codec.unknown == {0x508: 2}
     assert codec.ledger.frames_in_replies == 1
     assert codec.ledger.closes()
     codec = make(node=9)

@@ -217,8 +217,7 @@ def test_a_burst_of_any_priority_makes_a_sample() -> None:
     assert isinstance(sample, Measurement)
     assert sample.accel_m_s2 == pytest.approx((0, 0, 9.799974912))
     assert sample.gyro_rad_s == (0, 0, 0)
-    assert counts([sample]) == [1234]
-    assert sample.size_bytes == 32
+    assert (counts([sample]), sample.size_bytes) == ([1234], 32)
     codec = learned()
     frames = [(can_id & 0x03FFFFFF | priority << 26, data) for priority, (can_id, data) in enumerate(burst(77), 4)]
     assert counts(feed(codec, frames, 100 * MS)) == [77]
@@ -269,8 +268,7 @@ def test_which_frames_count_and_options_that_mean_nothing() -> None:
     skipped = [(0x0CFF3508, True), (0x0CFF3409, True), (0x0CEF0855, True), (0x0DFF3408, True), (0x0CFF3408, False)]
     for can_id, extended in skipped:
         assert not codec.feed_frame(can_id, extended, bytes(8), 0)
-    assert codec.ledger.bytes_skipped == 8 * len(skipped)
-    assert codec.ledger.frames_bad_length == 1
+    assert (codec.ledger.bytes_skipped, codec.ledger.frames_bad_length) == (8 * len(skipped), 1)
     assert codec.ledger.closes()
     reply = bytes.fromhex("3701060064000000")
     for options, destinations in (({}, [0x55]), ({"host_address": 0x20}, [0x55, 0x20])):

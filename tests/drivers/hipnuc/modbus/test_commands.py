@@ -152,6 +152,10 @@ def test_devices_with_unexpected_replies() -> None:
         return framed(7, request if request[0] == 6 else b"\x83\x02")
 
     assert run_transfer_script(commands.set_heading_mode(NINE), answer) is Written.UNVERIFIED
+    assert run_transfer_script(commands.read_present(), answer) == (None, None, None)
+    bench = ModbusBench(module(7, variant=SlaveVariant(ignores=frozenset({"UART1_BAUD"}))))
+    with pytest.raises(DeviceRefused, match="UART1_BAUD: expected 1 after the write, got 5"):
+        bench.run(commands.set_baud(9600))
     (report,) = run_transfer_script(
         commands.read_settings(), lambda _transfer: framed(7, bytes((3, 6, 0, 10, 0, 7, 0, 2)))
     ).values()
@@ -275,8 +279,7 @@ def test_calibrations_levels_verdict_by_progress_and_the_required_mode() -> None
         ask = CALIBRATIONS["magnetometer"].verdict
         assert ask is not None
         made, found = value_of(ask(TARGET), {0x0A: 1, 0x0B: percent})
-        assert made == [read_registers(0x0A, 1), read_registers(0x0B, 1)]
-        assert found == verdict
+        assert (made, found) == ([read_registers(0x0A, 1), read_registers(0x0B, 1)], verdict)
     for mode, words in ((0, "`imud settings NAME --set mode=9-axis`"), (1, "")):
         calibration = CALIBRATIONS["magnetometer"]
         assert calibration.unready is not None
@@ -441,7 +444,6 @@ def test_table_of_registers() -> None:
     assert {0x00, 0x04, 0x05, 0x06, 0x09, 0x0A, 0x0B, 0x70, 0x78, 0x79, 0x7F, 0x82, 0xA5, 0xA6} <= set(taken)
     assert all(register.values for register in registers.REGISTERS if register.access is not registers.Access.READ)
     assert all(register.meaning for register in registers.REGISTERS)
-    assert registers.BAUD_RATES[5] == 115200
-    assert len({row[0] for row in PRINTED}) == 27
+    assert (registers.BAUD_RATES[5], len({row[0] for row in PRINTED})) == (115200, 27)
     assert registers.BAUD_RATES[8:] == (921600, 256000)
     assert registers.BY_NAME["CTRL"].values == (0, 1, 255)

@@ -199,8 +199,7 @@ def test_lengths_of_frames_and_payloads_and_every_single_bit_error() -> None:
             uart_codec.encode_frame(payload)
     for length in (1, 512):
         codec = make()
-        assert codec.feed(framed(b"\x77" * length)) == []
-        assert codec.ledger.frames_ignored == 1
+        assert (codec.feed(framed(b"\x77" * length)), codec.ledger.frames_ignored) == ([], 1)
     for bit in range(0, 8 * len(MANUAL_HI91), 3):
         damaged = bytearray(MANUAL_HI91)
         damaged[bit // 8] ^= 1 << bit % 8
@@ -220,8 +219,7 @@ def test_bytes_of_damaged_frames_count_as_bad() -> None:
 
     codec = make()
     false = uart_codec.HEADER.pack(b"\x5a\xa5", 200, 0x1234)
-    assert codec.feed(false + MANUAL_HI91) == []
-    assert codec.ledger.bytes_pending == 88
+    assert (codec.feed(false + MANUAL_HI91), codec.ledger.bytes_pending) == ([], 88)
     events = codec.feed(bytes(117) + b"\x01\x02")
     assert reasons(events) == [BadReason.CRC]
     assert isinstance(events[1], Measurement)
@@ -275,8 +273,7 @@ def test_impossible_values_are_removed_and_reported() -> None:
             assert events[1] == BadFrame(BadReason.NOT_FINITE, frame)
             assert isinstance(m := events[2], Measurement)
             assert [field for field in names if getattr(m, field) is None] == [name]
-            assert m.dev_ticks == 5
-            assert len(events) == 4
+            assert (m.dev_ticks, len(events)) == (5, 4)
             assert (codec.ledger.frames_good, codec.ledger.frames_not_finite, codec.ledger.frames_bad()) == (3, 1, 0)
             assert codec.ledger.closes()
             assert make().feed(frame)[1] == msgspec.structs.replace(m, trailing_bytes=0)
@@ -322,21 +319,22 @@ def test_no_barometer_no_pressure(
         assert (event.temperature_c, event.pressure_pa) == expected
 
 
+def test_names_of_tags() -> None:
+    assert [uart_codec.tag_name(tag) for tag in (0x83, 0x05)] == ["HI83 (tag 0x83)", "tag 0x05"]
+
+
 def texts(data: bytes) -> list[str]:
     return [event.text for event in make().feed(data) if isinstance(event, TextLine)]
 
 
 def test_lines_of_text() -> None:
-    assert texts(b"OK\r\nERR\nA\tB\r\n") == ["OK", "ERR", "A\tB"]
-    assert texts(b"\r\n\n\r\n") == []
-    assert texts(b"a\rb\r\n") == ["b"]
-    assert texts(b"a\x00b\xffc\n") == ["c"]
+    assert (texts(b"OK\r\nERR\nA\tB\r\n"), texts(b"\r\n\n\r\n")) == (["OK", "ERR", "A\tB"], [])
+    assert (texts(b"a\rb\r\n"), texts(b"a\x00b\xffc\n")) == (["b"], ["c"])
     assert texts(b"x" * 255 + b"\r\n" + b"x" * 256 + b"\r\nOK\n") == ["x" * 255, "OK"]
     assert texts(b"x" * 300 + b"\ry\nz\n") == ["y", "z"]
 
     codec = make()
-    assert codec.feed(b"QUIZ") == []
-    assert codec.feed(b"\r\n") == [TextLine("QUIZ")]
+    assert (codec.feed(b"QUIZ"), codec.feed(b"\r\n")) == ([], [TextLine("QUIZ")])
     assert codec.feed(b"Z") == []
     assert isinstance(codec.feed(MANUAL_HI91[1:])[0], Measurement)
     assert codec.ledger.bytes_skipped == 0
@@ -374,8 +372,7 @@ def test_clipping_the_check_value_and_a_driver_of_other_settings() -> None:
     assert last.dev_ticks == 7
     assert (last.temperature_c, last.pressure_pa) == (None, None)  # 1e6 Pa: bytes that the firmware did not write
     assert struct.unpack_from("<f", bad.raw, 6 + 12)[0] == pytest.approx(3.4028e38, rel=1e-4)
-    assert crc_hqx(b"123456789", 0) == 0x31C3
-    assert crc_hqx(b"6789", crc_hqx(b"12345", 0)) == 0x31C3
+    assert (crc_hqx(b"123456789", 0), crc_hqx(b"6789", crc_hqx(b"12345", 0))) == (0x31C3, 0x31C3)
     codec = replace(DRIVER, name="other").make_codec(Ledger(), uart_codec.HipnucOptions(hi91_word="status"))
     assert one(codec.feed(hi91(word_1_2=3))).status == 3
     assert DRIVER.example_frame(Random(0))
@@ -436,8 +433,7 @@ def test_damaged_frames_among_lines() -> None:
     cut = frame.index(b"\n") + 1
     assert codec.feed(frame[:cut]) == []
     assert codec.flush() == []
-    assert len(codec.feed(frame[cut:])) == 1
-    assert codec.ledger.bytes_in_good_frames == len(frame)
+    assert (len(codec.feed(frame[cut:])), codec.ledger.bytes_in_good_frames) == (1, len(frame))
 
 
 @pytest.mark.parametrize("text", [b"AOK\r\n", b"KERR\r\n", b"OK\r\nOK\r\n", b"\nOK\r\n"])

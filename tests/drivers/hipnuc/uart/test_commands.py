@@ -90,8 +90,7 @@ def test_replies_in_lower_case_and_between_nmea_lines_count(request_: Request) -
         runner.start(request_, 5)
         for line in ("$GPHDT,1.0,T*00", *part, "$PASHR,1,2*00"):
             assert runner.on_message(line, 6) is None
-        assert runner.on_message(end, 7) == outcome((*part, end))
-        assert ledger.replies_unsolicited == 2
+        assert (runner.on_message(end, 7), ledger.replies_unsolicited) == (outcome((*part, end)), 2)
 
 
 IDENTITY = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
@@ -205,8 +204,7 @@ def test_a_late_version_is_not_taken_for_the_settings() -> None:
     session.on_time(10**9)
     session.start(ask(Query.VERSION), 10**9)
     outcomes = [session.on_message(line, 10**9 + 1) for line in ("OK", *VERSION)]
-    assert outcomes == [None] * 6 + [Reply(VERSION)]
-    assert ledger.replies_late == 1
+    assert (outcomes, ledger.replies_late) == ([None] * 6 + [Reply(VERSION)], 1)
 
 
 every_variant = pytest.mark.parametrize("behaviour", VARIANTS.values(), ids=VARIANTS)

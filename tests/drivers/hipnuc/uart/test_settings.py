@@ -90,8 +90,7 @@ def test_the_same_in_words_with_units_and_lines_of_an_unknown_form_unchanged() -
         {"ATT_MODE": "7", "URFR": "1,2,3", "EN_MCAL": "x", "PMUX1": "IO0", "SOUT_DIV": "", "MB": "nan, 0, 0"},
         {"URFR": "1,0,0,0,1,0,0,0,inf", "BAUD": "123", "ALARM_X": "-5,5", "COMCONFIG 1": "LOG HI93 ONTIME 1"},
     ):
-        assert report_values(raw) == {}
-        assert shown(raw) == raw
+        assert (report_values(raw), shown(raw)) == ({}, raw)
 
 
 CHANGES: list[tuple[str, Any, dict[str, Any]]] = [
@@ -197,8 +196,7 @@ def test_coordinates_select_axes_and_the_angles_of_the_alarm(line: str, value: s
     raw = {**report.values, **{f"USRCONFIG {n}": other for n, other in enumerate(filter(None, report.other), 1)}}
     assert report_values(raw).get("coordinates") == value
     sent = DRIVER.sent_axes(shown(raw))
-    assert (sent.navigation_frame == "NWU") == (value == "4")
-    assert bool(sent.problem) == (value not in ("0", "4", None))
+    assert (sent.navigation_frame == "NWU", bool(sent.problem)) == (value == "4", value not in ("0", "4", None))
     by_axis = alarm_ranges(report_values(raw)).by_axis
     assert (by_axis["X"].euler_index, by_axis["Y"].euler_index) == ((0, 1) if value == "4" else (1, 0))
 

@@ -212,8 +212,7 @@ def test_frames_of_other_kinds_and_lengths() -> None:
 
     tested = codec()
     command = bytes.fromhex("55AA 0300 1800 0000803F") + bytes(20) + bytes.fromhex("52D88EE8")
-    assert tested.feed(command) == []
-    assert tested.ledger.bytes_skipped == len(command)
+    assert (tested.feed(command), tested.ledger.bytes_skipped) == ([], len(command))
 
     for size in (0, uart_codec.PAYLOAD_BYTES_MAX + 1):
         with pytest.raises(ValueError, match="payload"):
@@ -248,8 +247,7 @@ def test_frames_inside_damaged_ones_and_false_lengths() -> None:
         assert tested.ledger.bytes_pending < uart_codec.FRAME_BYTES_MAX
         events += tested.feed(GOLDEN)
     sent = (tested.ledger.bytes_in - len(lie)) // len(GOLDEN)
-    assert sent == 5
-    assert sum(isinstance(event, Measurement) for event in events) == sent
+    assert (sent, sum(isinstance(event, Measurement) for event in events)) == (5, sent)
     assert tested.ledger.closes()
 
 
@@ -311,12 +309,10 @@ FULL = uart_codec.Status(
 
 @pytest.mark.manual("A 1.4 software version", "A 1.4 hardware version", "A 1.4 status members", "A 1.4 frame")
 def test_s1_and_other_messages() -> None:
-    assert len(S1) == 0x42
-    assert uart_codec.parse_status(ReplyFrame(0xFF, S1)) == FULL
+    assert (len(S1), uart_codec.parse_status(ReplyFrame(0xFF, S1))) == (0x42, FULL)
     assert uart_codec.pack_status(FULL) == S1
     frame = uart_codec.encode_status(FULL)
-    assert frame[:6] == bytes.fromhex("AA55FF004200")
-    assert len(frame) == 76
+    assert (frame[:6], len(frame)) == (bytes.fromhex("AA55FF004200"), 76)
     (event,) = uart_codec.Imu61xCodec(Ledger()).feed(frame)
     assert isinstance(event, ReplyFrame)
     assert uart_codec.parse_status(event) == FULL
