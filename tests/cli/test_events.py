@@ -128,8 +128,7 @@ def test_follow_waits_for_the_daemon_and_says_so_once(tmp_path: Path, capsys: py
 
     with pytest.raises(KeyboardInterrupt):
         attempt()
-    assert waits == [1.0] * 3
-    assert len(versions) == 1
+    assert (waits, len(versions)) == ([1.0] * 3, 1)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
     assert lines[0].startswith(f"imud watch: no daemon at {path}: is imud running?")

@@ -188,8 +188,7 @@ def test_mcap_with_ros_2_is_a_bag_for_rosbags(recorded: Recorded, tmp_path: Path
             assert (force.x, force.y, force.z) == sample.accel_m_s2
             assert (turn.w, turn.x, turn.y, turn.z) == sample.quat_wxyz
             assert (stamp.seq, stamp.t_ns, stamp.t_err_ns) == (sample.seq, sample.t_ns, sample.t_err_ns)
-    assert len(found["/tf"]) == len(recorded.samples)
-    assert found["/bow/losses"][0][1].lost_crc == 0
+    assert (len(found["/tf"]), found["/bow/losses"][0][1].lost_crc) == (len(recorded.samples), 0)
 
 
 def test_diagnostics_have_losses_states_and_errors(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:

@@ -201,8 +201,7 @@ def test_an_interrupt_a_silent_daemon_and_a_terminal(cli: Cli, monkeypatch: pyte
         copy = Copy(stream, BytesIO(), "a")
         looks = iter((False, True, False))
         copy.look = lambda: copy.stop() if next(looks) else None
-        assert copy.read(9) == b""
-        assert list(times_s) == []
+        assert (copy.read(9), list(times_s)) == (b"", [])
     monkeypatch.setattr("sys.stdout.isatty", lambda: True)
     cli.refuses("cannot write a recording to a terminal; name a file, or use a pipe", "record", "-")
 

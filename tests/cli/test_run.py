@@ -41,8 +41,7 @@ def test_what_is_wrong_has_its_priority_in_the_journal(tmp_path: Path) -> None:
         command = [sys.executable, "-m", "imud", "run", "--config", str(bad)]
         done = subprocess.run(command, stderr=writer, env=os.environ | journal, cwd=ROOT, timeout=60, check=False)
         lines = os.read(reader, 1 << 16).decode().splitlines()
-    assert done.returncode == 78
-    assert len(lines) == 3
+    assert (done.returncode, len(lines)) == (78, 3)
     assert all(line.startswith(f"<2>{bad}:") for line in lines)
 
 

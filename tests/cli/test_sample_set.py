@@ -64,8 +64,7 @@ def test_a_part_of_the_time_more_samples_than_fit_and_other_devices(monkeypatch:
         collector = Collector(name)
         collector.add(sample(0))
         collector.add(sample(0, "stern"))
-        assert len(collector) == 1
-        assert collector.others == others
+        assert (len(collector), collector.others) == (1, others)
 
 
 def test_the_devices_own_time_and_a_live_view_that_drops_the_past() -> None:

@@ -64,8 +64,7 @@ def test_long_names_fit_80_columns_and_keep_both_ends() -> None:
     port = "/dev/serial/by-id/usb-Silicon_Labs_CP2102N_USB_to_UART_Bridge_Controller_7cb5c9f6a1e4e811-if00-port0"
     missing = device("n" * 32, link=f"{port} at 115200 baud", state=DeviceState.MISSING, problem=f"{port} is not there")
     lines = block(missing).splitlines()
-    assert max(map(len, lines)) == 80
-    assert lines[0] == f"{'n' * 32}: missing"
+    assert (max(map(len, lines)), lines[0]) == (80, f"{'n' * 32}: missing")
     assert lines[1].startswith("  /dev/serial/by-id/usb-Silicon")
     assert lines[1].endswith("-if00-port0")
     assert "…" in lines[1]

@@ -267,8 +267,7 @@ def test_devices_come_and_go_and_vectors_have_a_length() -> None:
     fleet.update([device("bow", 1, rate_hz=5.0)], 2)
     assert list(fleet.devices) == ["bow"]
     assert fleet.devices["bow"].newest == sample("bow")
-    assert fleet.devices["bow"].status.rate_hz == 5.0
-    assert fleet.clients == 2
+    assert (fleet.devices["bow"].status.rate_hz, fleet.clients) == (5.0, 2)
     for vector, length in [((3.0, 0.0, 4.0), 5.0), (None, None), ((math.nan, 1.0, 1.0), None)]:
         assert top.norm(vector) == length
 

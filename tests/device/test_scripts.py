@@ -305,8 +305,7 @@ def test_a_late_reply_never_answers_the_next_similar_request(
 ) -> None:
     """The reply to a probe shows that the late reply has arrived or is lost. Three probes follow within 3.5 s."""
     texts, sent_ms = on_slow_device([100, late_ms, 50, 900], ok("A"), ok("B"), ok("C"), ok("D"))
-    assert texts == ["1 OK", "", *outcomes]
-    assert sent_ms[:3] == [0, 100, next_ms]
+    assert (texts, sent_ms[:3]) == (["1 OK", "", *outcomes], [0, 100, next_ms])
 
 
 def test_a_request_with_another_reply_or_the_same_read_is_sent_immediately() -> None:

@@ -128,8 +128,7 @@ def test_a_present_contradiction_does_not_prevent_another_change() -> None:
     def plan(**wanted: Any) -> setting.SettingsPlan:
         return settings_plan.make_plan(table, TARGET, wanted, actual, {}, save=False, unsaved=False, by_name=True)
 
-    assert names(plan(mode="9-axis")) == ["mode"]
-    assert names(plan(pins={"led": 5})) == ["pins"]
+    assert (names(plan(mode="9-axis")), names(plan(pins={"led": 5}))) == (["mode"], ["pins"])
     for pins, problem in ({"sout": 1}, "IO1 for sin and sout"), ({"alarm": 2}, "IO2 for sout and alarm"):
         with pytest.raises(BadArgument, match=f"pins: expected another pin for each function, got {problem}"):
             plan(pins=pins)

@@ -426,8 +426,7 @@ def test_pauses_double_up_to_the_maximum_and_brokers_take_turns() -> None:
     for _ in range(4):
         seen.append(turn.broker)
         pauses.append(turn.failed(0))
-    assert seen == [A, B, A, B]
-    assert pauses == [4.0, 4.0, 8.0, 8.0]
+    assert (seen, pauses) == ([A, B, A, B], [4.0, 4.0, 8.0, 8.0])
     turn = BrokerTurn([A, B], 60.0, lambda: 1.0)
     turn.failed(0)
     assert turn.broker == B

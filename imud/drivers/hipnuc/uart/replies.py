@@ -166,7 +166,7 @@ class LineFinder:
                 break
             start = feed + 1
             text = self._held.removesuffix(b"\r")
-            if text and not (self._overlong or barred > feed or self._held_barred):
+            if text and not (barred > feed or self._held_barred):
                 lines.append(TextLine(text.decode("ascii")))
                 ledger.bytes_in_good_frames += len(self._held) + 1
                 ledger.frames_good += 1

@@ -126,8 +126,7 @@ def test_which_frames_count() -> None:
     assert codec.feed_frame(0x608, False, data, 0) == ()  # from another master
     for can_id, extended in ((0x508, False), (0x508, False), (0x508, True), (0x509, False), (0x088, False)):
         assert codec.feed_frame(can_id, extended, data, 0) == ()
-    assert codec.unknown == {0x508: 2}
-    assert codec.ledger.frames_in_replies == 1
+    assert (codec.unknown, codec.ledger.frames_in_replies) == ({0x508: 2}, 1)
     assert codec.ledger.closes()
     codec = make(node=9)
     assert feed_bursts(codec, [1, 2]) == []
@@ -143,8 +142,7 @@ def test_heartbeats_are_news_when_the_state_changes_or_is_not_operational() -> N
     codec = make()
     states = [5, 5, 0x7F, 0x7F, 5, 5, 4, 0, 5]
     told = [state for state in states if codec.feed_frame(0x708, False, bytes([state]), 0)]
-    assert told == [0x7F, 0x7F, 5, 4, 0, 5]
-    assert codec.ledger.frames_ignored == 3
+    assert (told, codec.ledger.frames_ignored) == ([0x7F, 0x7F, 5, 4, 0, 5], 3)
     assert codec.feed_frame(0x708, False, b"", 0) == (BadFrame(BadReason.LENGTH, b"", 0x708),)
     assert codec.ledger.closes()
     codec = make()
