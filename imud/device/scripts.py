@@ -185,7 +185,7 @@ class ScriptRunner:
 
     def _timeout_ns(self, request: Request) -> int:
         """Return the timeout of a request by the slowest reply. A pause keeps its time."""
-        if request.silent or not (request.payload or request.kind):
+        if not (request.payload or request.kind):
             return request.timeout_ns
         return max(request.timeout_ns, min(PATIENCE_FACTOR * self._slowest_ns, PATIENCE_MAX_NS))
 
@@ -255,7 +255,7 @@ class ScriptRunner:
 
     def on_time(self, now_ns: int) -> Outcome | None:
         """Return `Silence` if the deadline has passed."""
-        if self._request is None or self.deadline_ns is None or now_ns < self.deadline_ns:
+        if self.deadline_ns is None or now_ns < self.deadline_ns:
             return None
         self._expect_late(now_ns)
         return self._finish(Silence(tuple(self._messages)))
@@ -282,8 +282,8 @@ class ScriptRunner:
         """Follow the slowest reply, also with the timeout of the outstanding request."""
         self._slowest_ns = max(self._slowest_ns, duration_ns) if self._replied else duration_ns
         self._replied = True
-        if self._request is not None and self.deadline_ns is not None:
-            self.deadline_ns = max(self.deadline_ns, self._sent_ns + self._timeout_ns(self._request))
+        if self._request is not None:
+            self.deadline_ns = max(self.deadline_ns or 0, self._sent_ns + self._timeout_ns(self._request))
 
     def _expect_late(self, now_ns: int) -> None:
         """Expect the late reply to the outstanding request. No late reply can follow a pause."""

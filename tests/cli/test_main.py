@@ -31,8 +31,7 @@ def test_the_table_has_every_command_of_every_module() -> None:
     modules = [import_module(name) for _, name, _ in walk_packages(imud.cli.__path__, "imud.cli.")]
     written = {id(value) for module in modules for value in vars(module).values() if isinstance(value, CliCommand)}
     loaded = [id(row.load()) for row in COMMANDS.values()]
-    assert len(loaded) == len(set(loaded))
-    assert written == set(loaded)
+    assert (len(loaded), written) == (len(set(loaded)), set(loaded))
 
 
 def test_version_and_usage_without_a_command(cli: Cli) -> None:

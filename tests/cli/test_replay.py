@@ -157,8 +157,7 @@ def test_a_cut_file_is_replayed_as_far_as_it_goes(recorded: Recorded) -> None:
     printed: list[str] = []
     player = Player(lambda batch: printed.extend(msgspec.json.encode(sample).decode() for sample in batch.samples))
     report, status = play_to_end(BytesIO(file.read_bytes()[:-7]), "cut", player)
-    assert printed == lines[: len(printed)]
-    assert status == (0 if printed else 1)
+    assert (printed, status) == (lines[: len(printed)], 0 if printed else 1)
     assert "no regular end" in report
     assert "incomplete" in report
 

@@ -277,8 +277,7 @@ async def test_at_start_a_device_on_a_bus_is_reset_before_the_first_request(benc
         await it.rig.until(lambda: EventKind.DOWN in it.rig.kinds, "down")
         it.boot()
         await it.rig.until_samples(5)
-        assert it.pulses == 1
-        assert it.told == ["restarted by its reset line at the start"]
+        assert (it.pulses, it.told) == (1, ["restarted by its reset line at the start"])
 
 
 @played(lambda: Uart(DeviceLines(reset=ResetOptions(line="R", at_start=True)), baud=115200))

@@ -20,7 +20,7 @@ from imud.contracts.script import (
     pause,
     with_undo,
 )
-from imud.device.scripts import RequestPort, ScriptRunner
+from imud.device.scripts import REPLY_MESSAGES_MAX, RequestPort, ScriptRunner
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.canopen import cia301
 from imud.drivers.hipnuc.j1939.codec import J1939Node
@@ -382,3 +382,205 @@ def test_a_reply_that_a_device_sends_again_is_no_reply_to_the_next_request(
         assert isinstance(outcomes[-1], Rejection if own == ("ERR",) and request is second else Reply)
         assert outcomes[-1].messages == messages[-len(own) if request is second else 0 :]
     assert ledger.replies_unsolicited == len(reply)
+
+
+# --- a runner without an event loop -----------------------------------------------------------------------------------
+
+TIMEOUT_NS = 100
+
+
+def command(name: str, part: str = "", silent: bool = False) -> Request:
+    """Return a request. Its reply is lines that start with `part`, then OK; without `part`, only OK."""
+    return Request(
+        payload=name.encode(), name=name, is_end=of_text(lambda line: line == "OK"),
+        is_rejection=of_text(lambda line: line == "ERR"),
+        is_part=of_text(lambda line: bool(part) and line.startswith(part)), timeout_ns=TIMEOUT_NS, silent=silent,
+        messages_min=2 if part else 1,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def ledger() -> Ledger:
+    return Ledger()
+
+
+@pytest.fixture
+def session(ledger: Ledger) -> ScriptRunner:
+    return offline_runner(ledger)
+
+
+def strays(ledger: Ledger) -> tuple[int, int]:
+    return (ledger.replies_late, ledger.replies_unsolicited)
+
+
+def test_replies_refusals_silent_requests_and_silence_at_the_deadline(session: ScriptRunner, ledger: Ledger) -> None:
+    assert (session.start(command("ask", "a"), 0), session.deadline_ns) == (b"ask", TIMEOUT_NS)
+    assert session.on_message("a=1", 5) is None
+    assert session.on_message("OK", 6) == Reply(("a=1", "OK"))
+    assert session.deadline_ns is None
+    assert session.on_time(1000) is None
+    assert strays(ledger) == (0, 0)
+    session.start(command("ask", "a"), 0)
+    assert session.on_message("ERR", 5) == Rejection(("ERR",))
+    assert session.start(command("reboot", silent=True), 0) == b"reboot"
+    assert session.deadline_ns is None
+    session.start(command("ask", "a"), 0)
+    session.on_message("a=1", 5)
+    assert session.on_time(TIMEOUT_NS - 1) is None
+    assert session.on_time(TIMEOUT_NS) == Silence(("a=1",))
+    assert session.on_time(TIMEOUT_NS) is None
+    assert session.deadline_ns is None
+
+
+def test_other_text_is_unsolicited_and_not_part_of_the_reply(session: ScriptRunner, ledger: Ledger) -> None:
+    assert session.on_message("boot", 0) is None
+    session.start(command("ask", "a"), 0)
+    for line in ("noise", "a=1", "noise"):
+        assert session.on_message(line, 1) is None
+    assert session.on_message("OK", 2) == Reply(("a=1", "OK"))
+    assert strays(ledger) == (0, 3)
+
+
+Step = Request | str | ReplyFrame
+"""A request to start, or a frame that the device sends."""
+
+
+@pytest.mark.parametrize(
+    ("first", "steps", "outcomes", "late_and_unsolicited"),
+    [
+        (["a"], ["a=1", "OK", "OK"], [], (1, 1)),  # no pending request
+        ([], ["ERR"], [], (1, 0)),  # a late refusal is also late
+        # the reply to the next request is only OK: the lines before an OK identify its request
+        (["a"], [command("set"), "a=1", "a=2", "OK", "OK"], [Reply(("OK",))], (1, 0)),
+        # the rest of a reply with a timeout in the middle
+        (["a", "a=1"], [command("set"), "OK", "ERR"], [Rejection(("ERR",))], (1, 0)),
+        # the OK of a request with a timeout arrives after the next request
+        ([], [command("ask", "a"), "OK", "a=1", "OK"], [Reply(("a=1", "OK"))], (1, 0)),
+        # without a probe, the next matching reply counts for the oldest request
+        ([], [command("first"), "OK", "ERR"], [Rejection(("ERR",))], (1, 0)),
+        (["a"], [command("ask", "a"), "a=1", "OK"], [Reply(("a=1", "OK"))], (0, 0)),  # the same request again
+    ],
+)
+def test_a_late_reply_does_not_answer_the_next_request(
+    session: ScriptRunner, ledger: Ledger, first: list[str], steps: list[Step], outcomes: list[Outcome],
+    late_and_unsolicited: tuple[int, int],
+) -> None:  # fmt: skip
+    """The first request expects `first`, receives some lines in time, and then times out."""
+    session.start(command("first", first[0] if first else ""), 0)
+    for line in first[1:]:
+        session.on_message(line, 5)
+    session.on_time(TIMEOUT_NS)
+    found, at_ns = [], TIMEOUT_NS
+    for step in steps:
+        if isinstance(step, Request):
+            session.start(step, at_ns)
+        elif (outcome := session.on_message(step, at_ns)) is not None:
+            found.append(outcome)
+    assert (found, strays(ledger)) == (outcomes, late_and_unsolicited)
+
+
+def test_cancel_forgets_the_request_and_an_endless_reply_is_bounded(session: ScriptRunner, ledger: Ledger) -> None:
+    session.start(command("ask", "a"), 0)
+    session.on_message("a=1", 1)
+    session.cancel()
+    assert session.deadline_ns is None
+    assert session.on_time(TIMEOUT_NS) is None
+    session.on_message("OK", 2)
+    assert strays(ledger) == (1, 0)
+    session.start(command("ask", "a"), 3)
+    session.on_message("a=2", 4)
+    assert session.on_message("OK", 4) == Reply(("a=2", "OK"))
+    session.start(command("ask", "a"), 0)
+    for number in range(REPLY_MESSAGES_MAX + 50):
+        session.on_message(f"a={number}", 1)
+    silence = session.on_time(TIMEOUT_NS)
+    assert silence is not None
+    assert len(silence.lines) == REPLY_MESSAGES_MAX
+
+
+def frame_command(frame_id: int) -> Request:
+    is_end = lambda message: isinstance(message, ReplyFrame) and message.frame_id == frame_id  # noqa: E731
+    return Request(b"?", f"frame {frame_id}", is_end, never, never, timeout_ns=TIMEOUT_NS)
+
+
+def test_a_frame_answers_as_a_line_does(session: ScriptRunner, ledger: Ledger) -> None:
+    session.start(frame_command(6), 0)
+    assert session.on_message("6", 1) is None
+    assert session.on_message(ReplyFrame(7, b""), 2) is None
+    reply = session.on_message(ReplyFrame(6, b"x"), 3)
+    assert reply == Reply((ReplyFrame(6, b"x"),))
+    assert (reply.frames, reply.lines) == ((ReplyFrame(6, b"x"),), ())
+    assert strays(ledger) == (0, 2)
+
+
+def test_a_late_frame_is_told_from_the_next_reply(session: ScriptRunner, ledger: Ledger) -> None:
+    session.start(frame_command(6), 0)
+    session.on_time(TIMEOUT_NS)
+    session.start(frame_command(7), TIMEOUT_NS)
+    assert session.on_message(ReplyFrame(6, b""), TIMEOUT_NS + 1) is None
+    assert strays(ledger) == (1, 0)
+    assert session.on_message(ReplyFrame(7, b""), TIMEOUT_NS + 2) == Reply((ReplyFrame(7, b""),))
+
+
+def test_only_replies_to_ordinary_requests_extend_timeouts_and_only_similar_requests_wait(
+    session: ScriptRunner,
+) -> None:
+    session.start(pause(10**9), 0)
+    session.on_time(10**9)  # no late reply follows a pause
+    for request_, reply_ns, deadline_ns in (
+        (replace(command("slow"), timeout_ns=10**9), 5 * 10**8, 10**9), (command("a"), 80, 100), (command("b"), 0, 160),
+    ):  # fmt: skip
+        session.start(request_, 0)
+        assert session.deadline_ns == deadline_ns
+        assert session.on_message("OK", reply_ns) == Reply(("OK",))
+    session.start(command("b"), 0)
+    session.cancel()
+    session._baud = 9600
+    similar = [command("b"), replace(command("b"), baud=9600)]
+    others = [command("b", silent=True), pause(5), replace(command("b"), baud=115200), command("c")]
+    assert [session.is_owed(one) for one in (*similar, *others)] == [True] * 2 + [False] * 4
+
+
+def test_a_pause_sends_nothing_and_late_replies_stay_late(session: ScriptRunner, ledger: Ledger) -> None:
+    session.start(command("ask", "a"), 0)
+    session.on_time(TIMEOUT_NS)
+    assert session.start(pause(50), TIMEOUT_NS) == b""
+    assert session.on_message("a=1", TIMEOUT_NS + 10) is None
+    assert session.on_time(TIMEOUT_NS + 49) is None
+    assert session.on_time(TIMEOUT_NS + 50) == Silence(())
+    session.on_message("OK", TIMEOUT_NS + 60)
+    assert strays(ledger) == (1, 0)
+
+
+# --- measurements -----------------------------------------------------------------------------------------------------
+
+
+def measured(tick: int) -> Measurement:
+    return Measurement(54, 0, tick)
+
+
+def waiting(ledger: Ledger, tick: int) -> ScriptRunner:
+    """Return a runner. Its request waits for the measurement at `tick`."""
+    session = offline_runner(ledger)
+    session.start(replace(command("once"), is_sample=lambda sample: sample.dev_ticks == tick), 0)
+    return session
+
+
+def test_a_measurement_ends_a_request_that_waits_for_it(ledger: Ledger) -> None:
+    session = waiting(ledger, 7)
+    assert session.wants_samples
+    assert session.on_sample(measured(6)) is None
+    assert session.on_sample(measured(7)) == Reply((), measured(7))
+    assert not session.wants_samples
+    assert session.on_sample(measured(7)) is None
+    assert ledger.replies_unsolicited == ledger.replies_late == 0
+
+
+def test_a_request_without_its_measurement_is_refused_or_silent_and_others_take_none(ledger: Ledger) -> None:
+    assert waiting(ledger, 7).on_message("ERR", 1) == Rejection(("ERR",))
+    assert waiting(ledger, 7).on_time(TIMEOUT_NS) == Silence(())
+    session = offline_runner(ledger)
+    session.start(command("save"), 0)
+    assert not session.wants_samples
+    assert session.on_sample(measured(1)) is None
+    assert session.deadline_ns is not None

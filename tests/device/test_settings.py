@@ -12,6 +12,7 @@ import msgspec
 import pytest
 
 from imud.config.model import DeviceConfig
+from imud.contracts.condition import ReasonCode
 from imud.contracts.driver import SAMPLE_COUNTER
 from imud.contracts.setting import AppliedSettings, OnDifference, SettingsState, SettingsStatus, StepOutcome
 from imud.contracts.status import DeviceState
@@ -217,8 +218,8 @@ async def test_a_difference_raises_one_event_and_no_write(bench: ModuleBench) ->
     message = f"settings differ from the declared settings: {found}"
     assert bench.messages == [message]
     assert bench.told[0].detail == {"mode": '"6-axis"', "offset_deg": "0.0"}
-    assert bench.status.differences["mode"].declared == "9-axis"
-    assert bench.written() == []
+    assert (bench.status.differences["mode"].declared, bench.written()) == ("9-axis", [])
+    assert [reason.code for reason in bench.device.status().reasons] == [ReasonCode.SETTING] * 2
     asked = bench.module.commands.count("GET")
     await bench.doing(bench.device.act("set_mode", {"mode": "6-axis"}))
     await bench.until(lambda: bench.module.commands.count("GET") > asked)

@@ -129,6 +129,10 @@ def test_the_better_of_two_references_counts(bench: KeeperBench) -> None:
     by_pulses = bench.clock.utc_reference
     assert by_pulses is not None
     assert by_pulses.offset_ns != good.offset_ns
+    for number, off_ns in ((8, 4 * NS_PER_S // 10), (9, 6 * NS_PER_S // 10)):  # at most 0.5 s
+        bench.system = UtcReference(OFFSET_NS + off_ns, 0)
+        bench.second(number)
+    assert bench.chrony.pulses[-1][1] == UTC_S + 8
 
 
 ROLLOVER_S = 1024 * 7 * 86_400  # GPS week rollover
@@ -143,6 +147,7 @@ ROLLOVER_S = 1024 * 7 * 86_400  # GPS week rollover
         (ROLLOVER_S, NS_PER_MS, 6, 0, "the sentences of test: they differ by +619315199.8 s from the synchronized"),
         (-3, NS_PER_MS, 6, 0, "the sentences of test: they differ by -3.2 s from"),
         (-3, NS_PER_S, 0, 2, ""),
+        (-5, NS_PER_S, 6, 0, "the sentences of test: they differ by -5.2 s from"),
         (1, NS_PER_MS, 0, 0, "the pulses of test: they differ by +1.0 s from"),
         (0, NS_PER_MS, 0, 2, ""),
     ],

@@ -138,8 +138,7 @@ def test_verdict_exit_status_json_and_page() -> None:
         ([WARNING, ERROR, ERROR], 2, "2 errors, 1 warning"),
     ]:
         examined = [Examined("a", findings[:1]), Examined("b", findings[1:])]
-        assert exit_status(examined) == status
-        assert verdict(examined) == words
+        assert (exit_status(examined), verdict(examined)) == (status, words)
         assert page(examined).splitlines()[-1] == words
         told = json.loads(as_json(examined))
         assert (told["status"], told["verdict"]) == (status, words)

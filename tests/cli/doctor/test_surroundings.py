@@ -54,5 +54,4 @@ def test_the_daemon_files_and_the_unit(machine: Machine) -> None:
     at = machine.surroundings()
     assert at.installed
     assert at.unit["DeviceAllow"] == ["char-ttyUSB rw", "/dev/i2c-1 rw"]
-    assert at.unit_value("Environment") == "A=b"
-    assert at.unit_value("User") == ""
+    assert (at.unit_value("Environment"), at.unit_value("User")) == ("A=b", "")

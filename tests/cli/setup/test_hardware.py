@@ -223,8 +223,7 @@ def test_a_can_interface_comes_up_by_networkd_and_a_virtual_one_without_a_bit_ra
     assert isinstance(changes[0], FileChange)
     assert (changes[0].path, changes[0].then) == (NETWORK, (("networkctl", "reload"),))
     assert b"BitRate=250000\nRestartSec=100ms\n" in changes[0].content
-    assert commands(changes) == ["networkctl reconfigure can0"]
-    assert notes == []
+    assert (commands(changes), notes) == (["networkctl reconfigure can0"], [])
     bus.write(NETWORK, changes[0].content.decode())
     assert raise_can(bus.surroundings(), "can0", 250_000) == ([], [])
     bus.can("vcan0")

@@ -271,8 +271,7 @@ def test_aborts_silence_and_values_in_segments() -> None:
     assert request.is_rejection(refused)
     with pytest.raises(cia301.Aborted, match=r"node 8, read 0x2345.1: .*object does not exist.*0x06020000") as caught:
         conversation.send(Rejection((refused,)))
-    assert caught.value.code == 0x0602_0000
-    assert cia301.abort_text(0x1234) == "unknown abort code"
+    assert (caught.value.code, cia301.abort_text(0x1234)) == (0x0602_0000, "unknown abort code")
     assert len(cia301.ABORT_TEXTS) == 31
     conversation = cia301.read_object(8, 0x1000, 0)
     next(conversation)

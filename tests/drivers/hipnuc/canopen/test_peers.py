@@ -295,8 +295,7 @@ def test_their_tpdos_are_our_samples(network: canopen.Network, local: canopen.Lo
     for _ in range(2 * len(counts)):
         measured += [event for event in host.events(LIMIT_S) if isinstance(event, Measurement)]
     assert network is local.network
-    assert host.codec.ledger.frames_good == 2 * len(counts)
-    assert len(measured) == len(counts)
+    assert (host.codec.ledger.frames_good, len(measured)) == (2 * len(counts), len(counts))
     for sample, mg in zip(measured[::-1], counts[::-1], strict=False):
         assert sample.accel_m_s2 == pytest.approx([value * 0.0098 for value in mg])
         assert sample.gyro_rad_s == pytest.approx([math.radians(value * 0.1) for value in mg])

@@ -245,7 +245,6 @@ def test_identity(variant: str) -> None:
     identity = bench.run_script(DRIVER.identify(bench.settings))
     assert (identity.product, identity.firmware) == ("HI14R2N-CAN-000", "1.6.9")
     claims = {"J1939 NAME": "80000000002A1708"} if J1939_VARIANTS[variant].claims_address else {}
-    assert identity.details == {"address": "8", **claims}
-    assert HOST_ADDRESS == 0x55
+    assert (identity.details, HOST_ADDRESS) == ({"address": "8", **claims}, 0x55)
     assert {data[0] for _, data in bench.sent} == {0x9C, 0, 0x78, *range(0x70, 0x78)}, "section 6.2.2"
     assert {name for name, _, _ in ROWS} == {*DRIVER.verbs, *DRIVER.renamed}
