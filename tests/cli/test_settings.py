@@ -14,14 +14,8 @@ from imud import config
 from imud.cli import settings as cli_settings
 from imud.cli.settings import given_values
 from imud.client.connection import Client
-from imud.contracts.setting import (
-    AppliedSettings,
-    OnDifference,
-    SettingsReport,
-    SettingsState,
-    SettingsStatus,
-    declared_values,
-)
+from imud.contracts import setting
+from imud.contracts.setting import SettingsReport, declared_values
 from imud.formats.jsonrpc import Code, RpcError
 from imud.model.errors import BadArgument
 from tests.cli.conftest import Cli, Terminal
@@ -179,7 +173,9 @@ def test_a_factory_reset_is_asked_for_and_backed_up(
 
 
 def test_settings_that_cannot_be_read_now(capsys: pytest.CaptureFixture[str]) -> None:
-    status = SettingsStatus(SettingsState.UNKNOWN, OnDifference.REPORT, problem="no reply", read_ns=5)
+    status = setting.SettingsStatus(
+        setting.SettingsState.UNKNOWN, setting.OnDifference.REPORT, problem="no reply", read_ns=5
+    )
     known = SettingsReport("bow", "hipnuc-uart", {}, status, ())
     failed, denied = RpcError(Code.FAILED, "no reply"), RpcError(Code.DENIED, "no")
     rights = Mock(rights=["watch", "control"])
@@ -200,7 +196,7 @@ def test_settings_that_cannot_be_read_now(capsys: pytest.CaptureFixture[str]) ->
         "", "the device has not reported its settings", "problem: no reply",
         "imud wrote the flash 0 times, 0 within 24 hours",
     ]  # fmt: skip
-    done = AppliedSettings(problem="it is missing", advice="plug it in")
+    done = setting.AppliedSettings(problem="it is missing", advice="plug it in")
     assert cli_settings._account(done).splitlines() == ["tried:", "FAILED: it is missing", "plug it in"]
 
 

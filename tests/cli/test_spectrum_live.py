@@ -12,17 +12,9 @@ import numpy as np
 import pytest
 
 from imud.analysis.spectrum import power_spectrum
+from imud.cli import spectrum as command
 from imud.cli.sample_set import Collector, SampleSet
-from imud.cli.spectrum import (
-    CLEAR,
-    SHADES,
-    LiveView,
-    SpectrumOptions,
-    axis_line,
-    curve_rows,
-    in_columns,
-    spectrum_report,
-)
+from imud.cli.spectrum import CLEAR, SHADES, LiveView, SpectrumOptions, axis_line, curve_rows, in_columns
 from imud.model.errors import ImudError
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_S
@@ -62,9 +54,9 @@ def test_the_page_also_of_too_few_samples_and_of_no_values() -> None:
     page_of_gyro = LiveView("bow", "gyro").page(collected(25.0), SpectrumOptions(("gyro",)))
     assert "sends no values of the gyroscope" in page_of_gyro
     found = SampleSet("a file", "bow", readings=collected(25.0).readings())
-    assert list(spectrum_report(found, SpectrumOptions(("gyro", "accel"))).sensors) == ["accel"]
+    assert list(command.spectrum_report(found, SpectrumOptions(("gyro", "accel"))).sensors) == ["accel"]
     with pytest.raises(ImudError, match="a file: bow sends no values of gyro"):
-        spectrum_report(found, SpectrumOptions(("gyro",)))
+        command.spectrum_report(found, SpectrumOptions(("gyro",)))
 
 
 def test_columns_bars_and_axis() -> None:

@@ -221,8 +221,9 @@ def test_problems_are_in_the_status_and_a_late_sentence_is_refused(bench: Keeper
     assert bench.keeper.status().problem == "no gpsd"
     bench.second(0, sentence=False)
     bench.now_ns = BEGIN_NS + NS_PER_S - 25 * NS_PER_MS  # 6 ms transmission, and at least 20 ms before the next second
-    bench.source.give(build(UTC_S * NS_PER_S), bench.now_ns)
-    assert bench.keeper.status().refused == {"stale": 1}
+    for sentence in (b"$GPGGA,1*00\r\n", build(UTC_S * NS_PER_S)):
+        bench.source.give(sentence, bench.now_ns)
+    assert bench.keeper.status().refused == {"damaged": 1, "stale": 1}
 
 
 def test_the_system_clock_is_used_only_while_it_is_synchronized(monkeypatch: pytest.MonkeyPatch) -> None:

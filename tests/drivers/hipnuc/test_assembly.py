@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from imud.drivers.hipnuc.assembly import Assembly, Cadence, Learned, learned_from
+from imud.drivers.hipnuc.assembly import Assembly, Cadence, Learned, SidSeries, learned_from
 from imud.model.ledger import Ledger
 
 MS = 1_000_000
@@ -344,6 +344,16 @@ def test_any_frames_at_any_time_keep_the_ledger_closed(seed: int) -> None:
             assembly.reset()
         assert ledger.closes()
         assert 0 <= ledger.frames_pending <= 4
+
+
+def test_the_step_and_the_modulus_of_a_series_of_sids() -> None:
+    series = SidSeries()
+    known = [(series.add(sid, is_next=False), series.is_known) for sid in range(0, 20, 2)]
+    assert known == [(None, False)] * 9 + [(None, True)]  # eight differences like the one before
+    assert ([series.add(sid, is_next=False) for sid in (20, 26, 27)], series.is_known) == ([0, 2, None], False)
+    series = SidSeries()
+    assert [series.add(sid, is_next=True) for sid in range(253)] == [None] * 10 + [0] * 243
+    assert [series.add(sid, is_next=True) for sid in (0, 1, 3, 252, 2, None, 3)] == [None, 0, 1, 248, 2, None, None]
 
 
 @pytest.mark.parametrize("modulus", [251, 253, 256])

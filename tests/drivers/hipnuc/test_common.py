@@ -8,17 +8,10 @@ import pytest
 from imud.attitude.conventions import Heading
 from imud.contracts.command import RestMeans, Target, Verb
 from imud.drivers import DRIVERS
+from imud.drivers.hipnuc import common
 from imud.drivers.hipnuc.bus_load import CyclicMessage, refuse_overload
 from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
-from imud.drivers.hipnuc.common import (
-    counts_of,
-    heading_by_mode,
-    inclinometer_zero,
-    levelled,
-    pressure_of,
-    temperature_beside,
-    zeroed,
-)
+from imud.drivers.hipnuc.common import counts_of, heading_by_mode, inclinometer_zero, pressure_of, temperature_beside
 from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options
 from imud.drivers.hipnuc.nmea2000 import HipnucNmea2000Options
 from imud.model.errors import BadArgument
@@ -71,9 +64,9 @@ def test_bits_of_a_message_and_the_limit_of_the_bus() -> None:
 
 def test_angles_that_show_the_effect_of_level_and_zero() -> None:
     for kind, names in (("cancel", []), ("relative", ["roll", "pitch"])):
-        assert [one.name for one in levelled(SimpleNamespace(level=kind))] == names
+        assert [one.name for one in common.levelled(SimpleNamespace(level=kind))] == names
     for kind, names in (("cancel", []), ("relative", ["inclination"])):
-        assert [one.name for one in zeroed(SimpleNamespace(zero=kind))] == names
+        assert [one.name for one in common.zeroed(SimpleNamespace(zero=kind))] == names
 
 
 def test_heading_by_mode_and_of_drivers_that_know_it_beforehand() -> None:

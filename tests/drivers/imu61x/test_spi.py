@@ -182,7 +182,7 @@ def test_a_changed_state_is_noticed_and_a_missing_device_is_not_damage() -> None
 @pytest.mark.manual("A 2.3 read and write", "A 2.4.1 reading", "A 2.4.2 write and read")
 def test_words_of_the_manual_their_answers_and_transfers_on_the_wire() -> None:
     """2.4.4: 0xFE01 opens window 1. 2.4.2: 0x8644 sets both filters to 10 Hz, 0x0600 reads them back."""
-    assert (spi.OPEN, spi.write(0x06, 0x44), spi.read(0x06)) == (0xFE01, 0x8644, 0x0600)
+    assert (spi.OPEN, spi.write(0x06, 0x44), spi.read(0x06), spi.MODES) == (0xFE01, 0x8644, 0x0600, (0, 3))
     assert [one.hex() for one in spi.READ_STATE.sends] == [
         "fe01", "6a00", "6c00", "6e00", "7000", "0600", "0c00", "0d00", "fe00", "7e00", "7e00", "7e00"
     ]  # fmt: skip
