@@ -494,6 +494,10 @@ async def test_plan_and_apply_of_given_values(bench: ModuleBench) -> None:
     assert (saved.steps, saved.saved) == ((), True)  # the previous value is saved
     again = await bench.doing(bench.device.settings.apply({"mode": "9-axis"}, save=True))
     assert (again.steps, again.saved, bench.module.saves) == ((), False, 1)
+    bench.module.commands.clear()
+    await bench.doing(bench.device.settings.apply({"mode": "6-axis", "offset_deg": 1.5}, save=False))
+    # both values are written before the only read
+    assert bench.module.commands == ["GET", 'SET mode="6-axis"', "SET offset_deg=1.5", "GET"]
     bench.module.disappear()
     await bench.rig.until(lambda: bench.device.state is DeviceState.MISSING)
     for work in (
