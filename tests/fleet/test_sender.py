@@ -8,7 +8,7 @@ import pytest
 from imud.fleet.broker import BrokerTurn, Will
 from imud.fleet.commands import CommandChannel, CommandReply
 from imud.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
-from imud.fleet.sender import TOPICS_MAX, MqttSender, TopicRefusals
+from imud.fleet.sender import SKIP_NS, TOPICS_MAX, MqttSender, TopicRefusals
 from imud.fleet.settings import Broker, CommandOptions, MqttOptions
 from imud.fleet.spool import SpoolRow
 from imud.fleet.streams import Gateway
@@ -216,6 +216,12 @@ def test_the_number_of_refused_topics_is_limited() -> None:
     refusals.refuse("t1", "a skipped topic keeps its reason", 1)
     assert (len(refusals.problems), *refusals.skipped) == (TOPICS_MAX, *(f"t{n + 1}" for n in range(TOPICS_MAX)))
     assert set(refusals.problems.values()) == {"no"}
+    assert (len(refusals.take_ended(SKIP_NS)), refusals.losses("t1")) == (TOPICS_MAX, LOSSES_MAX - 1)
+    (bench := SenderBench()).broker.refuses, bench.broker.window = {"answer"}, 1
+    for _ in range(3):
+        bench.sender.reply(CommandReply("answer", b"", None))
+    bench.drive(3)
+    assert bench.sender.replies_lost == 3, "one is refused, and two wait for the same topic"
 
 
 LONG_NS = 600 * NS_PER_S  # longer than the pauses of this test

@@ -317,7 +317,7 @@ def test_a_file_that_is_damaged_later_is_renamed_at_the_next_attempt(tmp_path: P
             one.write_bytes(b"\xff" * 10_000)
         with pytest.raises(spool.SpoolError, match="not a database"):
             use(bench.spool)
-        assert not path.exists()
+        assert [one.name for one in tmp_path.glob("spool.db*")] == ["spool.db.damaged"]
 
 
 def test_an_invalid_payload_is_dropped_as_damaged(tmp_path: Path) -> None:
