@@ -332,8 +332,7 @@ class ReplayLink(FileReplay):
         return max((offset_ns for _, offset_ns in self._pieces(reader)), default=0)
 
     def _reader(self) -> CaptureReader:
-        if self._file is None:
-            raise LinkError(f"{self.title} is not open")
+        assert self._file is not None
         self._file.seek(0)
         try:
             return CaptureReader(self._file)

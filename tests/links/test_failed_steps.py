@@ -6,6 +6,7 @@ import os
 import socket
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -13,7 +14,7 @@ import pytest
 from imud.formats.can import CyclicFrame, pack_frame
 from imud.links import LINKS, netlink
 from imud.links.cyclic_sender import KernelSender, LoopSender
-from imud.links.socketcan import SO_RCVBUFFORCE, SocketCanLink, SocketCanOptions, open_raw
+from imud.links.socketcan import SO_RCVBUFFORCE, SocketCanLink, SocketCanOptions, open_raw, pack_filters
 from imud.model.errors import LinkDenied, LinkError, LinkMissing
 from tests.support.documented import check_schema
 from tests.support.event_loops import in_loop
@@ -69,6 +70,8 @@ def test_a_raw_socket_has_the_permitted_buffer(monkeypatch: pytest.MonkeyPatch) 
     assert made.calls[2] == (socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES // 2), "the kernel doubles the value"
     assert made.calls[3] == (socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES // 2)
     assert (made.calls[-1], made.closed) == ((("can0",),), False)
+    KernelSender("can0", FRAMES).close()
+    assert made.closed
 
 
 @pytest.fixture
@@ -105,8 +108,12 @@ def test_a_link_that_cannot_be_set_up_is_closed(
 
 
 @pytest.mark.parametrize(
-    ("error", "words"), [(errno.ENOBUFS, "queue is full"), (errno.EAGAIN, "queue is full"), (errno.ENETDOWN, "is down")]
-)
+    ("error", "words"),
+    [
+        (errno.ENOBUFS, "queue is full"), (errno.EAGAIN, "queue is full"), (errno.ENETDOWN, "is down"),
+        (errno.ENODEV, "is missing"), (errno.EIO, "^can0: Input/output error$"),
+    ],
+)  # fmt: skip
 def test_a_refused_frame_is_explained(sys_with_can0: Path, error: int, words: str) -> None:
     made = FakeSocket(4, error)  # after two options and the buffer size
     link = link_of(made, sys_with_can0)
@@ -154,6 +161,24 @@ def test_a_link_has_one_cyclic_sender_at_a_time(monkeypatch: pytest.MonkeyPatch,
         assert [sender.closed for sender in made] == expected
     link.close()
     assert [sender.closed for sender in made] == [True, True]
+
+
+@in_loop
+async def test_an_open_link_changes_its_filters_and_sends_without_the_manager(
+    monkeypatch: pytest.MonkeyPatch, sys_with_can0: Path
+) -> None:
+    link = link_of(made := FakeSocket(), sys_with_can0)
+    link.open()
+    link.filters = wanted = [CanFilter(0x65, 0x7FF, False)]
+    set_filters = socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters(wanted)
+    assert (link.filters, made.calls[-1]) == (wanted, set_filters)
+    errors = [OSError(errno.ENODEV, ""), OSError(errno.EPROTONOSUPPORT, "")]
+    monkeypatch.setattr("imud.links.socketcan.KernelSender", Mock(side_effect=errors))
+    with pytest.raises(LinkMissing, match="can0 is missing"):
+        link.send_cyclic(FRAMES)
+    link.send_cyclic(FRAMES)
+    assert made.calls[-2:] == [(pack_frame(number, False, b""),) for number in (1, 2)]
+    link.close()
 
 
 @pytest.mark.parametrize("name", [name for name in LINKS if name != "memory"])

@@ -1,11 +1,14 @@
 """The I2C link on a simulated bus: repeated start, SMBus transfers, failures."""
 
+import asyncio
 import errno
+from unittest.mock import AsyncMock
 
 import pytest
 from smbus2 import I2cFunc
 
 from imud.contracts.script import Transfer
+from imud.contracts.status import KernelCounters
 from imud.links import LINKS
 from imud.links.i2c import I2C_TIMEOUT, I2cLink, I2cOptions
 from imud.model.errors import LinkDenied, LinkError, LinkMissing, TransferError, Trouble
@@ -89,3 +92,7 @@ def test_names_time_out_and_close() -> None:
     assert row_link.place(0x1B) == "address 0x1b"
     with pytest.raises(LinkError):
         row_link.write(b"x")
+    assert row_link.kernel_counters() == KernelCounters()
+    link._node = node = AsyncMock()
+    asyncio.run(link.wait_present())
+    node.wait_present.assert_awaited_once_with()

@@ -7,7 +7,7 @@ import pytest
 
 from imud.contracts.link import StreamLink
 from imud.contracts.status import KernelCounters
-from imud.formats.can import CanFilter, CanFrame
+from imud.formats.can import CanFilter, CanFrame, CyclicFrame
 from imud.links import LINKS
 from imud.links.memory import MemoryCanLink, MemoryLink, MemoryOptions
 from imud.model.errors import LinkBusy, LinkError, LinkMissing
@@ -42,6 +42,9 @@ def test_what_is_fed_arrives_with_its_time() -> None:
     assert not link.feed(b"b", 6)
     assert (listener.chunks, listener.ends) == ([(b"a", 5)], [])
     link, listener = opened()
+    link.pause()
+    assert [link.feed(b"c", 7), link.feed(b"d", 8), link.take(), link.take()] == [True, True, b"cd", b""]
+    assert listener.chunks == []
     link.write(b"LOG VERSION\r\n")
     link.set_baud(9600)
     assert (link.written, link.bauds, link.baud) == ([b"LOG VERSION\r\n"], [9600], 9600)
@@ -58,12 +61,17 @@ def test_a_can_link_delivers_the_frames_that_pass_its_filters() -> None:
     one, two = CanFrame(1, False, b"", 5), CanFrame(2, False, b"", 6)
     assert not link.feed([one])
     link.filters = [CanFilter(1, 0x7FF, False)]
+    with pytest.raises(LinkError, match="and cannot send"):
+        link.send_cyclic([])
     link.open()
+    link.send_cyclic(cyclic := [CyclicFrame(1, False, b"", 1_000_000)])
     link.start(lambda frames: passed.append(list(frames)), lambda *told: news.append(told), lambda _error: None)
     assert link.feed([two, one])
     assert link.feed([two])
     link.news("bus off", "bus off")
-    assert (passed, news, link.listening) == ([[one]], [("bus off", "bus off")], True)
+    assert (passed, news, link.listening, link.cyclic) == ([[one]], [("bus off", "bus off")], True, cyclic)
+    link.close()
+    assert (link.is_open, link.listening, link.cyclic) == (False, False, ())
 
 
 @in_loop

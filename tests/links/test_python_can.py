@@ -10,6 +10,7 @@ import msgspec
 import pytest
 
 from imud.contracts.link import CanLink
+from imud.contracts.status import KernelCounters
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame, pack_frame
 from imud.links import LINKS
 from imud.links.python_can import PythonCanLink
@@ -130,6 +131,8 @@ async def test_a_failed_bus_ends_an_open_link(monkeypatch: pytest.MonkeyPatch, c
     monkeypatch.setattr(bus, "recv", Mock(side_effect=can.CanOperationError("gone")))
     monkeypatch.setattr(can, "Bus", lambda *_, **__: bus)
     link = make("fake")
+    assert isinstance(link, PythonCanLink)
+    link.sender_failed(LinkError("a link that is not started"))
     link.open()
     link.start(lambda frames: None, lambda news, problem: None, lambda error: ends.append(str(error)))
     for thread in [one for one in threading.enumerate() if one.name == link.title]:
@@ -138,6 +141,8 @@ async def test_a_failed_bus_ends_an_open_link(monkeypatch: pytest.MonkeyPatch, c
         link.close()
     await asyncio.sleep(0)
     assert ends == ([] if closed else [f"{link.title} ended: gone"])
+    link.sender_failed(LinkError("full"))
+    assert (ends.pop(), link.kernel_counters()) == ("full", KernelCounters())
     link.close()
 
 
@@ -157,8 +162,8 @@ async def test_cyclic_frames_are_replaced_and_end_with_the_link(monkeypatch: pyt
 
 
 def test_the_bit_rate_is_set_only_if_it_is_configured(monkeypatch: pytest.MonkeyPatch) -> None:
-    opened: list[dict[str, object]] = []
-    monkeypatch.setattr(can, "Bus", lambda *_where, **keys: opened.append(keys))
+    opened, bus = list[dict[str, object]](), Mock()
+    monkeypatch.setattr(can, "Bus", lambda *_where, **keys: opened.append(keys) or bus)  # type: ignore[func-returns-value]
     for bitrate in (0, 250_000):
         link = PythonCanLink("virtual", "x", bitrate)
         link.filters = wanted = [CanFilter(0x65, 0x7FF, False)]
@@ -166,3 +171,5 @@ def test_the_bit_rate_is_set_only_if_it_is_configured(monkeypatch: pytest.Monkey
         link.open()
     shared = {"can_filters": [{"can_id": 0x65, "can_mask": 0x7FF, "extended": False}], "ignore_config": True}
     assert opened == [shared, shared | {"bitrate": 250_000}]
+    link.filters = [CanFilter(0x66, 0x7FE, True)]
+    bus.set_filters.assert_called_once_with([{"can_id": 0x66, "can_mask": 0x7FE, "extended": True}])

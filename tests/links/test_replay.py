@@ -215,6 +215,7 @@ class BrokenFile(BytesIO):
     ("kind", "file", "words"),
     [(ReplayLink, BrokenFile(), "cannot read a: Input/output error"),
      (CanReplayLink, BrokenFile(), "cannot read a: Input/output error"),
+     (CanReplayLink, BytesIO(b"(1.0) a 100#\n(1.1) b 100#\n"), "^a: "),
      (ReplayLink, BytesIO(bytes(512)), "raw capture without times")],
 )  # fmt: skip
 def test_a_file_that_is_refused_or_whose_read_fails_is_closed(

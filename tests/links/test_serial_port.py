@@ -84,7 +84,7 @@ def test_the_timer_is_found_through_a_link(tmp_path: Path) -> None:
     assert serial_port.read_latency_timer_ms("/dev/ttyUSB4", tmp_path) is None
 
 
-def test_only_what_was_counted_since_the_start_is_reported() -> None:
+def test_only_what_was_counted_since_the_start_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     assert serial_port.relative(START, START) == KernelCounters()
     # one value contains overruns of the UART's FIFO (9 - 7) and of the tty's buffer (22 - 17)
     assert serial_port.relative(START, LATER) == KernelCounters(overrun=7, framing=1, parity=3, break_=4)
@@ -94,6 +94,8 @@ def test_only_what_was_counted_since_the_start_is_reported() -> None:
     port = PtyPort()
     assert serial_port.TtyCounters(port.master).read() == KernelCounters()
     port.unplug()
+    monkeypatch.setattr(fcntl, "ioctl", lambda _fd, _request, buffer: buffer.__setitem__(6, 5))
+    assert serial_port.read_counters(0) == (*[0] * 6, 5, *[0] * 13)
     answers = iter([START, LATER, None])
     counters = serial_port.TtyCounters(0, lambda _fd: next(answers))
     assert counters.read() == counters.read() == serial_port.relative(START, LATER)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from imud.contracts.status import KernelCounters
 from imud.formats.can import RAW_FRAME, CanFrame, CyclicFrame, pack_frame
 from imud.links import netlink, socketcan
 from imud.links.cyclic_sender import LoopSender, setup
@@ -130,6 +131,8 @@ def test_a_link_waits_for_its_interface(ends: Ends, monkeypatch: pytest.MonkeyPa
     for flags in (netlink.IFF_UP, 0):
         (ends[2] / "class/net/lo/flags").write_text(f"{flags:#x}\n")
         asyncio.run(Bus(ends, 0).link.wait_present())
+    with pytest.raises(LinkMissing, match="lo is down"):
+        Bus(ends, 0).link.open()
     assert found == [True, False]
 
 
@@ -150,6 +153,18 @@ def test_frames_gather_and_more_than_a_batch_is_read_at_once(ends: Ends, sizes: 
 def test_a_controller_that_is_off_at_the_start_is_news(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
     async def story(bus: Bus) -> None:
         assert [news == problem and news.startswith("lo is bus-off: ") for news, problem in bus.news] == [True]
+        bus.news.clear()
+        bus._sender.send(RAW_FRAME.pack(0x2000_0100, 8, bytes(8)))
+        bus.send(1)
+        await bus.until(lambda: bus.batches)
+        assert bus.news == [("lo is error-active again", "")]
+        bus.link.sender_failed(failure := LinkError("full"))
+        assert bus.ends == [failure]
+        state, bus.link._reader.dropped = bus.link._state, 4  # type: ignore[union-attr]
+        state.overflows, state.passive_count, state.bus_off_count = 1, 2, 3
+        assert bus.link.kernel_counters() == KernelCounters(overrun=5, error_passive=2, bus_off=3)
+        bus.link.close()
+        assert bus.link.kernel_counters() == KernelCounters(overrun=1, error_passive=2, bus_off=3)
 
     monkeypatch.setattr(netlink, "can_details", lambda name: netlink.CanDetails(None, 3))
     Bus(ends, 0).run(story)
@@ -181,23 +196,27 @@ def test_without_it_every_frame_is_read_as_it_comes(ends: Ends) -> None:
     assert bus.delays_s == []
 
 
-@pytest.mark.parametrize("at", ["delivery", "pause"])
+@pytest.mark.parametrize("at", ["delivery", "pause", "timer"])
 def test_closed_while_frames_gather(ends: Ends, at: str) -> None:
 
     async def story(bus: Bus) -> None:
-        if at == "delivery":
+        def fill() -> None:
+            bus.send(*range(64))
             bus.then = bus.link.close
+
+        if at != "pause":
+            bus.then = bus.link.close if at == "delivery" else fill
         bus.send(1)
-        await bus.until(lambda: bus.batches)
+        await bus.until(lambda: len(bus.batches) == (2 if at == "timer" else 1))
         bus.send(2)
         bus.link.close()
         await asyncio.sleep(0.005)
 
     bus = Bus(ends, 1)
     bus.run(story)
-    assert [frame.can_id for batch in bus.batches for frame in batch] == [1]
-    assert bus.looks == 0
-    assert len(bus.delays_s) == (at == "pause")
+    assert [frame.can_id for batch in bus.batches for frame in batch] == [1, *range(64 if at == "timer" else 0)]
+    assert bus.looks == (at == "timer")
+    assert len(bus.delays_s) == (at != "delivery")
 
 
 def test_a_bus_that_ends_in_the_pause_says_so_once(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -487,9 +506,11 @@ def test_limits_of_a_step_and_of_a_backlog(wire: Wire) -> None:
     assert stamps(0, 21_000_000, 15_000_000, 14_999_999) == [20_000_000, 21_000_000]
 
 
-def test_clocks_that_are_always_read_apart_give_the_closest_of_some_readings(wire: Wire) -> None:
-    """Each time, the thread stops between the readings of both clocks: first for 30 us, then for 20 ms."""
-    away_ns, calls = [0, 0, 30_000, 0, 20_000_000, 0, 20_000_000], iter(range(7))
+@pytest.mark.parametrize("closest", [2, 4])
+def test_clocks_that_are_always_read_apart_give_the_closest_of_some_readings(wire: Wire, closest: int) -> None:
+    """Each time, the thread stops between the readings of both clocks: once for 30 us, else for 20 ms."""
+    away_ns, calls = [0, 0, 20_000_000, 0, 20_000_000, 0, 20_000_000], iter(range(7))
+    away_ns[closest] = 30_000
     gone_ns, base_ns, begun = 0, real_ns(), False
 
     def now_ns() -> int:
@@ -545,6 +566,8 @@ def test_details_of_an_interface(monkeypatch: pytest.MonkeyPatch) -> None:
     assert parse_details(answer(b"")) == CanDetails(None, None)
     assert parse_details(struct.pack("=IHHIIi", 20, 2, 0, 1, 0, -19)) == CanDetails(None, None)
     assert parse_details(answer(attribute(2, b"\1\0\1\0"))[:-1]) == CanDetails(None, None)
+    assert parse_details(answer(b"\3\0\7\0" + info)) == CanDetails(None, None), "an attribute has at least 4 bytes"
+    assert parse_details(answer(attribute(7, b"") + info)) == CanDetails(250_000, 3)
     assert (can_details("lo"), limits_s) == (CanDetails(None, None), [1])
     with pytest.raises(LinkError, match="nosuch0"):
         can_details("nosuch0")
@@ -558,6 +581,26 @@ async def test_a_wait_ends_without_a_reader() -> None:
     waiting.cancel()
     await asyncio.gather(waiting, return_exceptions=True)
     await wait_until(lambda: next(held))
+
+
+@in_loop
+async def test_each_change_of_an_interface_is_one_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    class News(socket.socket):
+        def bind(self, address: object) -> None:
+            assert address == (0, 1)
+
+    theirs, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    news, looks = News(fileno=theirs.detach()), list[bool]()
+    news.setblocking(False)
+    monkeypatch.setattr(socket, "socket", lambda *_: news)
+    waiting = asyncio.create_task(wait_until(lambda: looks.append(len(looks) == 2) or looks[-1]))  # type: ignore[func-returns-value]
+    for count in (1, 2, 3):
+        for _ in range(5):
+            await asyncio.sleep(0)
+        assert (len(looks), waiting.done()) == (count, count == 3)
+        if count < 3:
+            ours.send(b"changed")
+    ours.close()
 
 
 MS = 1_000_000

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from imud.contracts.script import Transfer
+from imud.contracts.status import KernelCounters
 from imud.links import LINKS
 from imud.links.spi import WR_MAX_SPEED_HZ, SpiLink, SpiOptions
 from imud.model.errors import LinkBusy, LinkDenied, LinkError, LinkMissing, TransferError, Trouble
@@ -111,7 +112,7 @@ def test_transfer_that_fails_says_whether_the_bus_is_gone(number: int, expected:
     def fail(_selections: object, _mode: int) -> list[bytes]:
         raise OSError(number, "by the test")
 
-    link = link_to(InProcessSpi(fail))
+    link = link_to(InProcessSpi(fail, word_bits=16))
     link.open()
     link.select(0)
     with pytest.raises((TransferError, LinkError)) as error:
@@ -124,7 +125,7 @@ def test_row_and_names(tmp_path: Path) -> None:
     node = tmp_path / "spidev3.1"
     link = row.make_polled(SpiOptions(port=str(node), mode=3))
     assert (link.bus, link.target, link.shared) == (str(tmp_path / "spidev3"), 3, False)
-    assert link.place(3) == "mode 3"
+    assert (link.place(3), link.kernel_counters()) == ("mode 3", KernelCounters())
     assert row.make_polled(SpiOptions(port="/dev/spidev0.0")).target is None
     with pytest.raises(LinkError):
         link.write(b"x")
