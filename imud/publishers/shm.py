@@ -308,7 +308,6 @@ class ShmRing:
         self._known: tuple[str, Sequence[int]] | None = None
         # minimum size of the file for a write; larger than any file after the file was truncated
         self._least_bytes = self._size_bytes
-        self._closed = False
 
     @property
     def newest(self) -> int:
@@ -384,10 +383,7 @@ class ShmRing:
         return directory.names(self._name, self._status)
 
     def close(self) -> None:
-        """Mark the ring as closed and remove its file. A second call does nothing."""
-        if self._closed:
-            return
-        self._closed = True
+        """Mark the ring as closed and remove its file."""
         if self._is_whole():
             self._halves[STATE_HALF_WORD] = STATE_CLOSED
         self._directory.remove(self._name, self._status)

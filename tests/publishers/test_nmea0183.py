@@ -7,6 +7,7 @@ import math
 import os
 import shutil
 import socket
+import struct
 import subprocess
 import tty
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -14,6 +15,7 @@ from contextlib import asynccontextmanager, contextmanager, suppress
 from math import nan, radians
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import pynmea2
@@ -131,7 +133,9 @@ async def test_each_udp_address_gets_the_sentences() -> None:
             receiver.bind(("127.0.0.1", 0))
             receiver.settimeout(LIMIT_S)
         ports = [receiver.getsockname()[1] for receiver in (one, two)]
-        bench = OutputBench(sentences={"HDT": 1.0}, udp=[f"127.0.0.1:{port}" for port in ports])
+        udp = [f"127.0.0.1:{port}" for port in ports]
+        bench = OutputBench(sentences={"HDT": 1.0}, udp=udp, serial_port="/dev/none")
+        assert bench.output.status()[-1].name == "serial /dev/none"
         bench.publish()
         assert [receiver.recv(100)[:14] for receiver in (one, two)] == [b"$HCHDT,45.0,T*"] * 2
         bench.output.close()
@@ -469,6 +473,27 @@ async def test_data_from_a_client_is_ignored_and_an_idle_client_stays_connected(
     assert made.status().readers == 1
     made.put(ONE)
     assert client.recv(100) == ONE
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    client.close()  # a reset
+    await until(lambda: made.status().readers == 0)
+
+
+@in_context("made", serving)
+async def test_without_descriptors_the_server_accepts_again_after_a_pause(
+    made: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert made._listener is not None
+    full, later, loop = Mock(wraps=made._listener), Mock(), asyncio.get_running_loop()
+    full.accept = Mock(side_effect=OSError(24, "Too many open files"))
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "call_later", later)
+        made._accept(full)
+    later.assert_called_once_with(nmea0183.ACCEPT_PAUSE_S, made._listen_again)
+    assert not loop.remove_reader(made._listener), "a full server does not watch the listener"
+    made._listen_again()
+    await made.connected()
+    made.close()
+    made._listen_again()
 
 
 @in_context("made", serving)

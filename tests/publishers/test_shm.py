@@ -258,12 +258,18 @@ def test_events_and_unknown_devices_are_ignored(board: Board) -> None:
     assert board.path.read_bytes() == before
     with pytest.raises(ServerError, match="without '/'"):
         board.publisher.add_device("../imu", 4)
+    assert board.path.exists()
     board.publisher.remove_device(DEVICE)
     assert not board.path.exists()
     board.publish([1])  # a batch that arrives late
     board.tick()
     assert not board.path.exists()
     board.publisher.remove_device(DEVICE)
+    starting = make(board.path.parent)
+    starting.add_device(DEVICE, 3)
+    with pytest.raises(ServerError, match="without '/'"):
+        starting.add_device("../imu", 4)
+    assert not board.path.exists(), "a daemon that does not start leaves no ring"
 
 
 def other_writer(path: Path, pid: int, *, heartbeat_ns: int = START_NS - 1, state: int = layout.STATE_LIVE) -> None:
@@ -388,9 +394,12 @@ def test_full_memory_delays_the_ring(
         assert [s.seq for s in reader.read().samples] == [4]
         assert reader.missed == 0
     assert (board.context.outputs.rings, board.context.outputs.without_ring) == ({DEVICE: str(board.path)}, set())
-    monkeypatch.setattr(os, "posix_fallocate", refuse)
     board.path.unlink()
+    descriptors = len(os.listdir("/proc/self/fd"))
+    monkeypatch.setattr(mmap, "mmap", Mock(side_effect=OSError(errno.ENOMEM, "Cannot allocate memory")))
     board.tick()
+    assert f"cannot map 20480 bytes of imud.{DEVICE}: Cannot allocate memory" in caplog.text
+    assert (board.path.exists(), len(os.listdir("/proc/self/fd"))) == (False, descriptors)
     assert board.context.outputs.without_ring == {DEVICE}
     board.publisher.close()
     assert not board.context.outputs.without_ring

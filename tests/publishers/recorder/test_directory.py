@@ -2,12 +2,12 @@
 
 import os
 from pathlib import Path
-from unittest.mock import Mock
+from unittest.mock import Mock, patch
 
 import pytest
 
 from imud.model.units import NS_PER_S
-from imud.publishers.recorder.directory import NAME, SNAPSHOT, RecordingDirectory
+from imud.publishers.recorder.directory import NAME, SNAPSHOT, FlightOptions, RecorderOptions, RecordingDirectory
 
 
 def filled(folder: Path, keep_bytes: int, *sizes: int) -> RecordingDirectory:
@@ -23,6 +23,10 @@ def test_names_sort_by_time_and_are_recognized(tmp_path: Path) -> None:
     name = directory.new_file(1_763_717_507 * NS_PER_S, 0x1_0000_00AB, 12).name
     assert name == "20251121T093147Z-000000ab-000012.imudrec"
     assert [file.size for file in directory.files()] == [10, 20]
+    with patch("imud.publishers.recorder.directory.FILES_MAX", 1):
+        assert len(directory.files()) == 1
+    with pytest.raises(ValueError, match=f"another directory than {tmp_path}, got the same"):
+        RecorderOptions(directory=str(tmp_path), flight=FlightOptions(directory=f"{tmp_path}/."))
     assert all(NAME.fullmatch(file.name) for file in directory.files())
 
 

@@ -3,10 +3,12 @@ Thread of the flight recorder: snapshots to files and clients, with failing disk
 
 import errno
 import os
+import re
 from collections.abc import Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock, patch
 
 import pytest
 from msgspec.structs import replace
@@ -111,6 +113,9 @@ def test_an_acceleration_above_the_limit_is_saved_with_the_data_before_and_after
     assert bench.source.listening == []
     assert not bench.context.outputs.snapshots
     assert not bench.context.outputs.flights
+    bench.flight.event(Event(1, "bow", EventKind.DOWN, ""))
+    bench.flight.tick(0)
+    assert bench.flight._gate.pending is None
 
 
 def test_a_missing_recorded_device_and_an_active_line_are_alerts(tmp_path: Path) -> None:
@@ -280,6 +285,14 @@ def test_a_failed_segment_is_reported_once_and_tried_again(tmp_path: Path) -> No
     ours, theirs = stream_pair()
     with ours, theirs, pytest.raises(ServerError, match="the flight recorder has no data: No such file"):
         bench.flight.snapshot(ours)
+    bench.flight.event(Event(1, "bow", EventKind.DOWN, "pulled out"))
+    bench.tick(11)
+    event = bench.events.pop()
+    assert re.fullmatch(
+        rf"cannot save the snapshot {bench.folder}/\S+-000000-snapshot\.imudrec: nothing was kept; "
+        "alert: bow is lost: pulled out", event.message,
+    )  # fmt: skip
+    assert (event.device, bench.flight.status().saved, bench.flight.status().failed) == ("bow", 0, 1)
     folder.mkdir()
     bench.tick(RETRY_NS / NS_PER_S)
     assert bench.messages[1:] == ["flight recorder: recording again after: No such file or directory"]
@@ -496,6 +509,16 @@ def test_a_full_file_system_drops_segments_and_then_fails(tmp_path: Path, monkey
         bench.add()
     assert raised.value.errno == errno.ENOSPC
     bench.ring.clear()
+    monkeypatch.undo()
+    bench = RingBench()
+    for number, dropped in ((errno.EIO, 0), (errno.ENOMEM, 1), (errno.EDQUOT, 1)):
+        bench.add()
+        bench.add()
+        before_ns = bench.ring.oldest_ns
+        with patch.object(os, "write", side_effect=OSError(number, "")), pytest.raises(OSError, match="Errno"):
+            bench.ring.append(b"x")
+        assert (bench.ring.oldest_ns > before_ns) == dropped, "only a file system without room drops segments"
+    bench.ring.clear()
 
 
 LINGER_NS = 10_000_000_000
@@ -637,7 +660,9 @@ def test_a_full_disk_leaves_no_incomplete_snapshot(bench: FlightWriterBench, mon
     assert bench.writer.saved[1].problem == ""
 
 
-def test_after_a_failed_segment_nothing_is_saved_until_the_next(bench: FlightWriterBench, tmp_path: Path) -> None:
+def test_after_a_failed_segment_nothing_is_saved_until_the_next(
+    bench: FlightWriterBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bench.begin(tmp_path / "no" / "folder")
     bench.put(0)
     bench.queue.mark(recorder_flight.Save(bench.folder / "a", END))
@@ -651,6 +676,10 @@ def test_after_a_failed_segment_nothing_is_saved_until_the_next(bench: FlightWri
     bench.work()
     assert bench.writer.problem == ""
     assert kinds_in(bench.folder / "b") == [Kind.SESSION, Kind.DATA, Kind.END]
+    monkeypatch.setattr(os, "write", Mock(side_effect=OSError(errno.EIO, "Input/output error")))
+    bench.put(2)
+    bench.work()
+    assert bench.writer.problem == "Input/output error"
 
 
 def test_snapshots_stay_below_the_limit(tmp_path: Path) -> None:

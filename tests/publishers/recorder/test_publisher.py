@@ -4,6 +4,7 @@ Continuous recorder: consecutive files, reported losses and full disks, new and 
 import os
 import shutil
 from pathlib import Path
+from unittest.mock import Mock, patch
 
 import pytest
 
@@ -40,6 +41,7 @@ def test_both_write_to_one_directory_and_one_alone_does_not_start_the_other(tmp_
         made.publish(batch("bow"))
         made.close()
         made.close()
+        made.tick(bench.advance(0.1))
     files = [(tmp_path / str(one)).glob("*.imudrec") for one in (True, False)]
     ends = [sorted(file.name.split("-", 2)[2] for file in each) for each in files]
     for file in tmp_path.rglob("*.imudrec"):
@@ -118,8 +120,11 @@ def test_a_new_file_starts_by_size_or_time_with_all_states(tmp_path: Path) -> No
     bench.tick(1.1)
     bench.tick(1.1)
     bench.tick(121)
+    with patch.object(RecordingDirectory, "make_room", side_effect=OSError(5, "Input/output error")):
+        bench.tick(121)
+    assert bench.events[0].message == f"cannot record to {bench.folder}: Input/output error; the other outputs continue"
     bench.recorder.close()
-    assert len(list(bench.folder.glob("*.imudrec"))) == 3
+    assert len(list(bench.folder.glob("*.imudrec"))) == 4
     for number in range(3):
         found = bench.kinds(number)
         assert [found[0], found[-1]] == [Kind.SESSION, Kind.END]
@@ -185,7 +190,10 @@ def test_a_full_disk_causes_one_event_and_recording_continues(tmp_path: Path, mo
     assert bench.recorder.status().problem
     monkeypatch.undo()
     shutil.rmtree(bench.folder)  # imud makes the directory again
-    bench.tick(RETRY_NS / NS_PER_S - 0.1)  # since the second of the three ticks
+    for blocks, events in ((499_999, 1), (500_000, 2)):
+        with patch.object(os, "statvfs", return_value=Mock(f_bavail=blocks, f_frsize=2)):
+            bench.tick(RETRY_NS / NS_PER_S)
+        assert len(bench.events) == events
     bench.tick()
     assert "recording again" in bench.events[1].message
     bench.source.deliver()

@@ -2,6 +2,7 @@
 Rights of clients by the credentials of the kernel."""
 
 import asyncio
+import errno
 import os
 import resource
 import socket
@@ -10,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -237,6 +239,11 @@ def test_the_peer_of_a_socket_is_this_process() -> None:
         peer = quota.peer_of(ours)
     assert (peer.pid, peer.uid) == (os.getpid(), os.geteuid())
     assert peer.groups == {os.getegid(), *os.getgroups()}
+    old = Mock(getsockopt=Mock(side_effect=OSError(errno.ENOPROTOOPT, "")), fileno=lambda: -1)
+    assert quota._supplementary(old, 0, 77) == os.getgrouplist("root", 77)
+    assert quota._supplementary(old, 4_000_000_000, 77) == []
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        quota._long_list(old)
 
 
 CLIENT = """

@@ -80,17 +80,20 @@ async def test_notify_wakes_for_one_device_and_ends_the_old_descriptor(server: S
 
 @alone()
 async def test_many_clients_are_woken_in_several_turns(tmp_path: Path) -> None:
-    """imud wakes clients for 0.3 ms per turn, and reads the clock after 16 clients."""
+    """imud wakes clients for 0.3 ms per turn, first the clients that the last batch did not wake."""
     clock = SteppingClock()
     async with serving(tmp_path, clock) as server:
         fds = [await notified(await Peer.greeted(server)) for _ in range(40)]
         clock.step_ns = 200_000
-        server.publish(batch("imu0"))
-        woken = []
-        for _ in range(2):
-            await asyncio.sleep(0)
-            woken.append(sum(read_all(fd) == BYTE for fd in fds))
-        assert woken == [32, 8]
+        for batches, expected in ((1, [32, 8]), (2, [32, 32, 8])):
+            for _ in range(batches):
+                server.publish(batch("imu0"))
+            woken = []
+            for _ in expected:
+                await asyncio.sleep(0)
+                woken.append([fd for fd in fds if read_all(fd) == BYTE])
+            assert [len(turn) for turn in woken] == expected
+            assert {*woken[0], *woken[1]} == {*fds}
         for fd in fds:
             os.close(fd)
 
@@ -157,6 +160,10 @@ async def test_unread_replies_do_not_gather_descriptors(server: SocketServer) ->
     assert replies[1]["error"]["code"] == -32004
     assert len(os.listdir("/proc/self/fd")) == before + 2
     os.close(await notified(peer))
+    connection.post(encode_notification("big", "x" * 500_000))
+    assert not connection.tick()
+    connection.finish()
+    assert connection.tick()
 
 
 @in_server()

@@ -154,6 +154,11 @@ async def test_the_method(server: SocketServer) -> None:
     server.remove_device("imu0")
     server.add_device("imu0", 0)
     assert (await peer.result("history", devices=["imu0"]))["devices"] == {"imu0": []}
+    names = [f"imu{number}" for number in range(5)]
+    for number in (2, 3, 4):
+        server.add_device(names[number], number)
+    assert [*(await peer.result("history", devices=names[:4]))["devices"]] == names[:4]
+    assert await peer.error("history", devices=names) == (-32602, "devices: expected at most 4 names, got 5")
     server.hub.history = None
     assert await peer.error("history", devices=["imu0"]) == (
         -32004, "history: the history is off; set `socket: {history: true}` in the configuration",

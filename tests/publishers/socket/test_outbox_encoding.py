@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Sequence
 from math import radians, sqrt
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 from msgspec.structs import replace
@@ -11,6 +12,7 @@ from msgspec.structs import replace
 from imud.attitude.conventions import RFU_ENU, Convention
 from imud.attitude.published import FrameOptions, MountingAxes, PublishedAxes, as_sent, published_frame
 from imud.contracts.publisher import Batch
+from imud.formats import kernel
 from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.model.sample import Sample
 from imud.publishers.socket.outbox import BinaryEncoding, Encoding, JsonEncoding
@@ -158,6 +160,8 @@ def test_a_batch_is_turned_once_for_all_clients() -> None:
     binary = BinaryEncoding(Convention.NED_FRD)
     assert binary.message_bytes == BinaryEncoding.message_bytes
     assert list(binary.encode(batch)) == list(BinaryEncoding().encode(batch.converted(Convention.NED_FRD)))
+    with patch.object(kernel, "present", kernel.Kernel(None)):
+        assert list(binary.encode(batch)) == [binary.encode_one(batch, at) for at in range(len(batch.samples))]
 
 
 @pytest.mark.parametrize("encoding", [BinaryEncoding(), BinaryEncoding(Convention.NED_FRD), JsonEncoding(None, False)])

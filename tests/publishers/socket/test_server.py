@@ -20,7 +20,7 @@ from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.model.sample import SAMPLE_FIELDS
-from imud.publishers.socket.server import Listener, SocketOptions, SocketServer
+from imud.publishers.socket.server import Listener, SocketOptions, SocketServer, _is_leftover
 from tests.support import socket_rig
 from tests.support.socket_rig import Peer, alone, batch, in_server, sample, serving, until
 
@@ -530,6 +530,8 @@ def test_paths_of_the_socket_are_checked(tmp_path: Path, monkeypatch: pytest.Mon
     longer = path.with_name(path.name + "x")
     with pytest.raises(ServerError, match=f"at most {PATH_MAX_BYTES} bytes, got {PATH_MAX_BYTES + 1}"):
         Listener(longer, GROUP)
+    with pytest.raises(ValueError, match=f"path: expected at most {PATH_MAX_BYTES} bytes, got {PATH_MAX_BYTES + 1}: "):
+        SocketOptions(path=str(longer))
     file = tmp_path / f"imud.sock.{os.getpid()}"
     file.touch()
     with pytest.raises(ServerError, match=f"{file.name} exists; remove it"):
@@ -607,6 +609,7 @@ def test_an_existing_socket_that_cannot_be_checked_stays(
         patch.setattr(f"imud.publishers.socket.server.{function}", Mock(side_effect=error))
         with pytest.raises(ServerError, match=words):
             Listener(path, GROUP)
+        assert _is_leftover(path, os.getpid()) == (function == "Path.lstat")  # the socket of a dead daemon
     assert path.is_socket()
 
 

@@ -1,9 +1,14 @@
 """Subscriptions: matching devices, and the rate of each client and device."""
 
+from itertools import count
+from unittest.mock import Mock
+
 import pytest
 
+from imud.publishers.socket.outbox import Outbox
+from imud.publishers.socket.scheduler import TokenBucket
 from imud.publishers.socket.server import SocketServer
-from imud.publishers.socket.subscription import Form, Subscription
+from imud.publishers.socket.subscription import DeliveryPlan, Form, Subscription
 from tests.support.socket_rig import Peer, batch, in_server
 
 
@@ -13,6 +18,30 @@ def test_subscription_matches() -> None:
     assert everything.matches("new")
     assert one.matches("imu0")
     assert not one.matches("imu1")
+
+
+def test_many_clients_and_forms_have_a_limited_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """imud reads the clock from 33 clients of a form, and encodes 16 forms at once."""
+    monkeypatch.setattr(Outbox, "put_samples", Mock())
+    plan, now_ns, time = DeliveryPlan(count(1).__next__), Mock(return_value=0), TokenBucket(1, 1, 0)
+    for clients in range(1, 34):
+        plan.add(Subscription(None, None, 0, Form.JSON), Mock())
+        plan.send(batch(), now_ns, time)
+        assert bool(now_ns.called) == (clients > 32)
+    outboxes = [Mock() for _ in range(17)]
+    for number, outbox in enumerate(outboxes):
+        plan.add(Subscription(None, ("seq",) * number, 100 * (number == 16), Form.JSON), outbox)
+    plan.add(wanted := Subscription(None, ("seq",) * 16, 0, Form.JSON), whole := Mock())
+    plan.discard(wanted, Mock())
+    assert len(plan) == 18
+    plan.send(batch("imu0", 1, 20), now_ns, time)
+    deferred = [[call.args[0] for call in outbox.defer.call_args_list] for outbox in (*outboxes, whole)]
+    assert [[(one.order, one._chosen) for one in each] for each in deferred] == [
+        *[[]] * 15, [(1, None)], [(2, (0, 10))], [(3, None)]
+    ]  # fmt: skip
+    plan.discard(wanted, whole)
+    plan.discard(Subscription(None, ("seq",) * 16, 100, Form.JSON), outboxes[16])
+    assert len(plan) == 17
 
 
 @pytest.mark.parametrize("encoding", ["json", "binary"])
