@@ -430,11 +430,8 @@ TONE_FIRST: Final = 4  # first frequency of a tone; the noise of lower frequenci
 # Maximum change of an angle from second to second, and of roll and pitch from their median, at rest
 ANGLE_AT_REST_RAD: Final = 0.0087
 STEEP_RAD: Final = 1.3  # minimum pitch at which roll and yaw of a device at rest can jump
-
-
-# Minimum step of the mean angular rate at the start or end of a slow turn, rad/s and standard errors. The bias of a
-# sensor at rest changes by less than 0.04 °/s in this time during the warm-up.
-TURN_STEP_RAD_S, TURN_SIGMAS = 0.0017, 8.0
+# Minimum step of the mean rate when a slow turn starts, rad/s and standard errors. A warm-up causes at most 0.04 °/s.
+TURN_STEP_RAD_S, TURN_SIGMAS = 0.001745, 8.0
 TURN_S: Final = 5  # number of seconds before and after the step; the median ignores a short bump
 
 
@@ -444,7 +441,9 @@ def motion_words(readings: Readings) -> str:
     for values, limits in ((readings.gyro_rad_s, GYRO_AT_REST), (readings.accel_m_s2, ACCEL_AT_REST)):
         if values is not None and (motion := _motion(*with_values(readings.t_ns, values), limits)):
             found.append(motion)
-    return "; ".join(filter(None, (*found, _turn(readings), "" if found else _turn_step(readings))))
+    if not found and readings.gyro_rad_s is not None:
+        found.append(_turn_step(readings.t_ns, readings.gyro_rad_s))
+    return "; ".join(filter(None, (*found, _turn(readings))))
 
 
 def unverified_words(readings: Readings) -> str:
@@ -456,23 +455,16 @@ def unverified_words(readings: Readings) -> str:
         return "rest is not verified: the data contain neither angular rates nor a heading, which show slow turns"
     mean = np.nanmean(gyro, axis=0)
     if accel is None:
-        return (
-            f"rest is not verified: without angles and accelerations, a turn at the mean angular rate of "
-            f"{degrees(np.sqrt(mean @ mean)):.2g} °/s is the same as the bias of the sensor"
-        )
-    up = np.nanmean(accel, axis=0)
-    rate = abs(float(mean @ up)) / float(np.sqrt(up @ up))
-    return (
-        f"rest around the vertical axis is not verified: without a heading, a steady turn at the mean vertical angular "
-        f"rate of {degrees(rate):.2g} °/s is the same as the bias of the sensor"
-    )
+        words, rate = "rest is not verified: without angles and accelerations, a turn at the mean", np.sqrt(mean @ mean)
+    else:
+        words = "rest around the vertical axis is not verified: without a heading, a steady turn at the mean vertical"
+        rate = abs(mean @ (up := np.nanmean(accel, axis=0))) / np.sqrt(up @ up)
+    return f"{words} angular rate of {degrees(rate):.2g} °/s is the same as the bias of the sensor"
 
 
-def _turn_step(readings: Readings) -> str:
+def _turn_step(t_ns: IntArray, gyro_rad_s: FloatArray) -> str:
     """Return the start or end of a slow turn; empty without one."""
-    if readings.gyro_rad_s is None:
-        return ""
-    t_ns, values = with_values(readings.t_ns, readings.gyro_rad_s)
+    t_ns, values = with_values(t_ns, gyro_rad_s)
     if len(t_ns) < BLOCKS_LEAST or len(mean := _blocks(t_ns, values).mean(axis=1)) < 2 * TURN_S:
         return ""
     level = np.median(np.lib.stride_tricks.sliding_window_view(mean, TURN_S, axis=0), axis=-1)
@@ -480,11 +472,10 @@ def _turn_step(readings: Readings) -> str:
     error = np.median(np.abs(np.diff(mean, axis=0)), axis=0) / np.sqrt(TURN_S)
     if not (steps > np.maximum(TURN_STEP_RAD_S, TURN_SIGMAS * error)).any():
         return ""
-    place = int(steps.max(axis=1).argmax())
-    return (
-        f"angular rate: expected a step of the mean of at most {degrees(TURN_STEP_RAD_S):.1f} °/s, got "
-        f"{degrees(steps.max()):.2g} °/s after {(place + TURN_S) * STILL_S:.0f} s: a slow turn started or ended"
-    )
+    most, step = (f"{degrees(rate):.2g} °/s" for rate in (TURN_STEP_RAD_S, steps.max()))
+    after_s = (int(steps.max(axis=1).argmax()) + TURN_S) * STILL_S
+    words = f"got {step} after {after_s:.0f} s: a slow turn started or ended"
+    return f"angular rate: expected a step of the mean of at most {most}, {words}"
 
 
 def _blocks(t_ns: IntArray, values: FloatArray) -> FloatArray:

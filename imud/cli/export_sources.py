@@ -120,15 +120,11 @@ class CsvSink:
     def close(self) -> None: ...
 
 
-# Header of a message in the pipe: kind, length in bytes, read position in the file in bytes
-HEAD: Final = struct.Struct("<BIQ")
+HEAD: Final = struct.Struct("<BIQ")  # head of a message in the pipe: kind, length and read position in the file, bytes
 LENGTH_MAX: Final = 1 << 26  # Maximum length of a message, bytes. Valid messages are much shorter.
-# Requested size of the pipe, bytes. The player continues while the writer compresses a chunk.
-PIPE_BYTES: Final = 1 << 20
-# Maximum number of samples in a message: 0.16 s at 400 Hz, so that devices stay nearly in the order of time
-SAMPLES: Final = 64
-# Number of allocated objects between two garbage collections. The player creates almost no reference cycles.
-GC_ALLOCATIONS: Final = 50_000
+PIPE_BYTES: Final = 1 << 20  # requested size of the pipe: the player continues while the writer compresses a chunk
+SAMPLES: Final = 64  # maximum in a message: 0.16 s at 400 Hz, so that devices stay nearly in the order of time
+GC_ALLOCATIONS: Final = 50_000  # allocations between two garbage collections: almost no reference cycles occur
 DEVICE, BATCH, LOSSES, EVENT, END, ERROR, SESSION = range(1, 8)
 _LOST: Final = attrgetter("samples", *LossCounts._fields[4:])  # counters of a ledger in the order of `LossCounts`
 
@@ -142,14 +138,13 @@ class LossWatch:
         """`devices`: the selected devices; empty for all devices."""
         self._sink = sink
         self._devices = devices
-        self._lost: dict[str, tuple[int, ...]] = {}
+        self._lost: dict[str, list[int]] = {}
 
     def batch(self, batch: Batch, ledger: Ledger) -> None:
         """Pass samples to the sink. If the ledger contains new losses, pass the losses first."""
         if self._devices and batch.device not in self._devices:
             return
-        samples, *lost = _LOST(ledger)
-        counts = tuple(lost)
+        samples, *counts = _LOST(ledger)
         if counts != self._lost.get(batch.device):
             self._lost[batch.device] = counts
             first, before = batch.samples[0], samples - len(batch.samples)
@@ -165,11 +160,11 @@ class LossWatch:
 def play_here(file: BinaryIO, name: str, sink: Sink, devices: Collection[str]) -> Played:
     """Play a recording in this process. Raises ImudError."""
     watch = LossWatch(sink, devices)
-    player = Player(
-        lambda batch: watch.batch(batch, player.devices[batch.device_id].ledger),
-        on_event=watch.event,
-        on_session=sink.session,
-    )
+
+    def count(batch: Batch) -> None:
+        watch.batch(batch, player.devices[batch.device_id].ledger)
+
+    player = Player(count, on_event=watch.event, on_session=sink.session)
     report, status = play_to_end(file, name, player)
     return report, status, sorted(device.described.name for device in player.devices.values())
 
@@ -237,8 +232,7 @@ class PipeSink:
         device_id = batch.device_id
         if device_id != self._device_id or batch.frame is not self._frames.get(device_id):
             self.finish()
-            self._device_id, self._frames[device_id] = device_id, batch.frame
-            frame = batch.frame
+            self._device_id, self._frames[device_id] = device_id, (frame := batch.frame)
             words = (frame.device, frame.mounting, frame.convention, frame.declination_deg, frame.from_angles)
             self._put(DEVICE, self._encode((device_id, batch.device, PublishedAxes(*words))))
         self._waiting += batch.samples
@@ -315,8 +309,7 @@ class Progress:
         if self._out is None or self.samples < self._looked + LOOK_SAMPLES:
             return
         self._looked = self.samples
-        now_s = self._now_s()
-        if now_s >= self._due_s:
+        if (now_s := self._now_s()) >= self._due_s:
             self._due_s = now_s + EVERY_S
             self._draw(position(), now_s - self._begun_s)
 

@@ -145,8 +145,7 @@ def causes_of(facts: Facts, limits: ConditionLimits) -> list[Cause]:
     for rule in RULES:
         if found := rule.holds(facts, limits):
             values = {"": None} if isinstance(found, bool) else found
-            for name, value in values.items():
-                causes.append(Cause(rule, facts, name, value))
+            causes += [Cause(rule, facts, name, value) for name, value in values.items()]
     return causes
 
 

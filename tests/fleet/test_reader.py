@@ -392,24 +392,3 @@ async def test_errors_of_the_loop_do_not_prevent_the_end(broker: Mosquitto, monk
     with pytest.raises(BrokerError, match="the connection is closed"):
         async with asyncio.timeout(LIMIT_S):
             await waiting
-
-
-@in_loop
-async def test_data_that_the_socket_did_not_accept_is_sent_when_it_is_writable() -> None:
-    broker = broker_of("mqtt://host")
-    assert broker is not None
-    ours, theirs = socket.socketpair()
-    waiting = [b"ab", b"cd"]
-    connection = ReaderConnection(broker)
-    connection._client = Mock(
-        want_write=lambda: waiting, loop_write=lambda: ours.send(waiting.pop(0)), socket=lambda: ours
-    )
-    connection._socket, connection._descriptor = ours, ours.fileno()
-    with ours, theirs:
-        connection.acknowledge(7)
-        connection._client.ack.assert_called_once_with(7, 1)
-        await until(lambda: not waiting)
-        await asyncio.sleep(0)
-        assert theirs.recv(9) == b"abcd"
-        assert not asyncio.get_running_loop().remove_writer(ours), "imud does not wait without data"
-        connection.close()

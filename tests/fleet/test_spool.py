@@ -310,7 +310,7 @@ def test_a_file_that_is_damaged_later_is_renamed_at_the_next_attempt(tmp_path: P
             continue
     assert bench.spool.set_aside
     assert bench.counts().whole == 100
-    for use in (spool.Spool.positions, spool.Spool.removals, lambda one: one.store_removals(["a"])):
+    for use in (spool.Spool.positions, spool.Spool.retained_topics, lambda one: one.store_topics(["a"])):
         bench = SpoolBench(tmp_path)
         bench.commit(batch(1))
         for one in tmp_path.glob("spool.db*"):

@@ -11,7 +11,7 @@ from unittest.mock import Mock
 import msgspec
 import pytest
 
-from imud.formats.can import CyclicFrame, pack_frame
+from imud.formats.can import CanFilter, CyclicFrame, pack_frame
 from imud.links import LINKS, netlink
 from imud.links.cyclic_sender import KernelSender, LoopSender
 from imud.links.socketcan import SO_RCVBUFFORCE, SocketCanLink, SocketCanOptions, open_raw, pack_filters

@@ -10,6 +10,7 @@ from smbus2 import I2cFunc
 from imud.contracts.script import Transfer
 from imud.contracts.status import KernelCounters
 from imud.links import LINKS
+from imud.links.device_node import DeviceNode
 from imud.links.i2c import I2C_TIMEOUT, I2cLink, I2cOptions
 from imud.model.errors import LinkDenied, LinkError, LinkMissing, TransferError, Trouble
 from imud.sim.imu61x.registers import Imu61xRegisters
@@ -77,7 +78,7 @@ def test_open_that_fails_says_why_and_leaves_nothing_open(number: int, kind: typ
         opened(bus)
 
 
-def test_names_time_out_and_close() -> None:
+def test_names_time_out_and_close(monkeypatch: pytest.MonkeyPatch) -> None:
     bus, requests = InProcessI2c({}), list[tuple[int, int]]()
     link = I2cLink(I2cOptions(), open_bus=bus.open, ioctl=lambda _fd, *request: requests.append(request))
     link.open()
@@ -93,6 +94,6 @@ def test_names_time_out_and_close() -> None:
     with pytest.raises(LinkError):
         row_link.write(b"x")
     assert row_link.kernel_counters() == KernelCounters()
-    link._node = node = AsyncMock()
+    monkeypatch.setattr(DeviceNode, "wait_present", waits := AsyncMock())
     asyncio.run(link.wait_present())
-    node.wait_present.assert_awaited_once_with()
+    waits.assert_awaited_once_with()

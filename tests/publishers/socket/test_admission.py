@@ -239,9 +239,10 @@ def test_the_peer_of_a_socket_is_this_process() -> None:
         peer = quota.peer_of(ours)
     assert (peer.pid, peer.uid) == (os.getpid(), os.geteuid())
     assert peer.groups == {os.getegid(), *os.getgroups()}
-    old = Mock(getsockopt=Mock(side_effect=OSError(errno.ENOPROTOOPT, "")), fileno=lambda: -1)
-    assert quota._supplementary(old, 0, 77) == os.getgrouplist("root", 77)
-    assert quota._supplementary(old, 4_000_000_000, 77) == []
+    for uid, groups in ((0, os.getgrouplist("root", 77)), (4_000_000_000, [77])):
+        replies = quota._UCRED.pack(1, uid, 77), OSError(errno.ENOPROTOOPT, "")
+        old = Mock(getsockopt=Mock(side_effect=replies), fileno=lambda: -1)
+        assert quota.peer_of(old).groups == {*groups}
     with pytest.raises(OSError, match="Bad file descriptor"):
         quota._long_list(old)
 

@@ -23,7 +23,7 @@ def test_subscription_matches() -> None:
 def test_many_clients_and_forms_have_a_limited_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """imud reads the clock from 33 clients of a form, and encodes 16 forms at once."""
     monkeypatch.setattr(Outbox, "put_samples", Mock())
-    plan, now_ns, time = DeliveryPlan(count(1).__next__), Mock(return_value=0), TokenBucket(1, 1, 0)
+    plan, now_ns, time = DeliveryPlan(count(1).__next__), Mock(return_value=0), TokenBucket(1, 1, 0, 1)
     for clients in range(1, 34):
         plan.add(Subscription(None, None, 0, Form.JSON), Mock())
         plan.send(batch(), now_ns, time)
