@@ -140,7 +140,7 @@ class SettingsComparison:
             await self._wanted.wait()
             self._wanted.clear()
             with suppress(CommandError):  # another command is running: imud compares after it
-                async with settings.lock.hold("the comparison of the settings"):
+                async with settings.lock.hold("the comparison of the settings", can_restart=False):
                     self.due_ns = None
                     if settings.table is not None:
                         await self._compare(settings.table)
@@ -214,15 +214,17 @@ class WorkLock:
         self._host = host
         self._lock = asyncio.Lock()
         self.work: WorkStatus | None = None  # work that holds the lock
-        self.ended_ns = -OWN_NS  # CLOCK_MONOTONIC of the end of the last work, ns
+        self.can_restart = False  # whether this work can restart the device counter
+        self.ended_ns = -OWN_NS - BOOT_NS  # CLOCK_MONOTONIC of the end of the last work that can restart it, ns
 
     @property
     def busy(self) -> bool:
         return self._lock.locked()
 
     @asynccontextmanager
-    async def hold(self, work: str, stop: str = "") -> AsyncIterator[None]:
-        """Hold the lock for `work`, for example `the command save`. `stop`: how a user can stop it.
+    async def hold(self, work: str, stop: str = "", *, can_restart: bool = True) -> AsyncIterator[None]:
+        """Hold the lock for `work`, for example `the command save`. `stop`: how a user can stop it. `can_restart`:
+        whether the work can restart the device counter.
 
         Raises CommandError if other work, for example a calibration, does not end within WAIT_S. The error names it.
         """
@@ -233,11 +235,13 @@ class WorkLock:
             words = self.work.words(self._host.now_ns()) if self.work is not None else "other work has just ended"
             raise CommandError(f"{self._device}: {words}; try again later") from None
         self.work = WorkStatus(work, self._host.now_ns(), REQUESTED_BY.get() or "imud", stop)
+        self.can_restart = can_restart
         try:
             yield
         finally:
-            self.work = None
-            self.ended_ns = self._host.now_ns()
+            if self.can_restart:
+                self.ended_ns = self._host.now_ns()
+            self.work, self.can_restart = None, False
             self._lock.release()
 
 
@@ -295,11 +299,11 @@ class DeviceSettings:
         busy = self.lock.busy
         if (resets := self.counter_resets) != self._resets:
             own_until_ns = self.lock.ended_ns + OWN_NS
-            is_own = busy or now_ns < own_until_ns + BOOT_NS
+            is_own = self.lock.can_restart or now_ns < own_until_ns + BOOT_NS
             self.resets_requested, self._resets = self.resets_requested + is_own * (resets - self._resets), resets
             if not is_own:
                 self._in_flash.started()
-            if not busy and now_ns >= own_until_ns:
+            if not self.lock.can_restart and now_ns >= own_until_ns:
                 self._after_start(SETTLE_NS)
                 if not self.declared and (self._read_ns is None or not self._transport.may_ask):
                     self.comparison.cancel()  # imud has not read the settings, or must not
@@ -447,7 +451,7 @@ class DeviceSettings:
             self._transport.require_replies()
         table = self._table()
         if fresh:
-            async with self.lock.hold("a read of the settings"):
+            async with self.lock.hold("a read of the settings", can_restart=False):
                 await self.read()
         status = self.status()
         assert status is not None
@@ -460,7 +464,7 @@ class DeviceSettings:
         self._transport.require_replies()
         table = self._table()
         wanted = _wanted(self._config.name, table, given, self.declared)
-        async with self.lock.hold("a plan of settings"):
+        async with self.lock.hold("a plan of settings", can_restart=False):
             actual = await self.read()
             wanted = completed(table, wanted, actual)
             target, written = self._transport.target, self._all_written(table)
@@ -552,6 +556,7 @@ class DeviceSettings:
         applying = Applying(table, self._transport, flash, wanted, self._reports)
         self._transport.attachments.set_alarm_ranges(None)  # the new settings can change the ranges
         self._read_resets = None
+        self.lock.can_restart = True
         try:
             done = await applying.carry_out(plan)
         finally:

@@ -264,8 +264,6 @@ class FakeModule(MemoryLink):
         self.silent: set[str] = set()
         self.commands: list[str] = []
         self.saves = 0
-        self.pauses_clock = False
-        """Whether the device clock starts again with each reply to GET."""
         self._now_ns = now_ns
         self._boot_ns = now_ns()
 
@@ -300,8 +298,6 @@ class FakeModule(MemoryLink):
         return ["NAME=FAKE", f"SN={self.serial}", "OK"]
 
     def _get(self) -> list[str]:
-        if self.pauses_clock:
-            self._boot_ns = self._now_ns()
         values = {**self.set, "mounting": self.mounting}
         return [*(f"{name}={msgspec.json.encode(values[name]).decode()}" for name in TOLD), "OK"]
 
