@@ -351,6 +351,11 @@ class DeviceTime:
         """Return the device time from the newest counter value to `ticks`, ns, with at most one wrap."""
         return (ticks - self.ticks) % self.modulus * self.tick_ns
 
+    @property
+    def is_new_day(self) -> bool:
+        """Whether the newest uneven step is the end of a day: a device that knows UTC sends the time of the day."""
+        return 0 <= self._step_ns + DAY_NS <= DAY_EDGE_NS and self.ticks * self.tick_ns <= DAY_EDGE_NS
+
     def missed_since(self, line: CounterLine, ticks: int, arrival_ns: int) -> int | None:
         """Return the number of lost samples since the newest sample; None if the counter did not continue to `ticks`.
         `arrival_ns` is the arrival of the frame. The counter may have wrapped several times."""
@@ -575,6 +580,8 @@ STUCK_MESSAGES: Final = 8
 # time without a frame with device time after which `pps_age_ms` makes the time stamps, ns
 FOREIGN_NS: Final = 1000 * NS_PER_MS
 WRAP: Final = 1 << 32
+DAY_NS: Final = 86_400 * NS_PER_S
+DAY_EDGE_NS: Final = 2 * NS_PER_S  # maximum distance of a sample to the end of a day, ns: two periods of 1 s
 
 
 class StampTime:

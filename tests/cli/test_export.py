@@ -261,17 +261,15 @@ def test_the_noise_of_a_device_that_is_described_after_samples_of_another_one(tm
     assert (facts.clock.utc_ns(5, 0), facts.clock.utc_ns(10**18, 0)) == (7_000_000_005, 10**18 + 7_000_000_000)
 
 
-@pytest.mark.parametrize(("suspends", "joined"), [(0, False), (1, False), (0, True)])
-def test_rows_before_a_step_of_the_wall_clock(
-    recorded: Recorded, tmp_path: Path, cli: Cli, suspends: int, joined: bool
-) -> None:
+@pytest.mark.parametrize("way", ["step", "suspend", "joined"])
+def test_rows_before_a_step_of_the_wall_clock(recorded: Recorded, tmp_path: Path, cli: Cli, way: str) -> None:
     """imud places all rows with the last offset of their run, and rows before a suspend with the last offset before
     it, because CLOCK_MONOTONIC stops during a suspend."""
     step_ns, newest = 1168 * 86_400 * NS_PER_S, recorded.samples[-1]
-    last = ClocksRecord(newest.t_ns + 1, 1, 1, 1, newest.utc_ns - newest.t_ns + step_ns, suspends)
+    last = ClocksRecord(newest.t_ns + 1, 1, 1, 1, newest.utc_ns - newest.t_ns + step_ns, way == "suspend")
     other = encode_object(Kind.SESSION, NO_DEVICE, SessionRecord(1, "", "", "", 7, 0, 0, 0))
-    file = copied(recorded.file, tmp_path / "a.imudrec", *[other] * joined, encode_clocks(last))
-    shift_ns = 0 if suspends or joined else step_ns
+    file = copied(recorded.file, tmp_path / "a.imudrec", *[other] * (way == "joined"), encode_clocks(last))
+    shift_ns = step_ns if way == "step" else 0
     found = rows(cli("export", "--to", "csv", file).out)
     for row, sample in zip(found, recorded.samples, strict=True):
         assert abs(int(row["utc_ns"]) - sample.utc_ns - shift_ns) < NS_PER_MS

@@ -117,6 +117,12 @@ def test_a_counter_that_stays_late_has_restarted(before: list[Point], after: lis
     assert (max(sample.t_err_ns for sample in samples) == 0xFFFF_FFFF) == (settled == 150)
 
 
+def test_the_end_of_a_day_is_no_reset() -> None:
+    for at_ms, resets in ((86_400_000, 0), (86_300_000, 1)):
+        feed(clock := make_clock(), steady(at_ms - 3000, 0, 300) + steady(0, 3000, 500))
+        assert clock.status().resets == resets
+
+
 @pytest.mark.parametrize("reads", [((200, 22_001),), ((150, 22_001), (150, 23_500))])
 def test_a_busy_host_causes_no_reset(reads: tuple[tuple[int, int], ...]) -> None:
     """The reader of a busy host gets old frames. Several frames in one read count as one late read."""
