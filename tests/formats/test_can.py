@@ -40,7 +40,7 @@ def test_frames_in_the_layout_of_the_kernel() -> None:
     ],
 )
 def test_filters_overlap_if_one_frame_passes_both(one: can.CanFilter, other: can.CanFilter, expected: bool) -> None:
-    assert one.overlaps(other) == other.overlaps(one) == expected
+    assert one.overlaps(other) == other.overlaps(one) == one.matches(other.can_id, other.extended) == expected
     if expected:  # the identifier with all bits of both masks
         can_id = (one.can_id & one.mask) | (other.can_id & other.mask)
         assert one.matches(can_id, one.extended)

@@ -107,7 +107,7 @@ def test_hexadecimal_text_is_refused(text: bytes) -> None:
         CaptureReader(io.BytesIO(text))
 
 
-@pytest.mark.parametrize("baud", ["", "fast", "-1", "²", "9" * 30])
+@pytest.mark.parametrize("baud", ["", "fast", "-1", "²", "9" * 19])
 def test_an_invalid_baud_rate_is_unknown(baud: str) -> None:
     file = io.BytesIO()
     CaptureWriter(file, details={"note": baud})

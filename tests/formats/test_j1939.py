@@ -10,7 +10,7 @@ from imud.formats.j1939 import GLOBAL, J1939Id, all_of, filter_of, join, sender_
 KNOWN = [
     (0x0CFF3408, J1939Id(3, 0xFF34, 0x08)), (0x0CEF0855, J1939Id(3, 0xEF00, 0x55, 0x08)),
     (0x0CEF5508, J1939Id(3, 0xEF00, 0x08, 0x55)), (0x09F11223, J1939Id(2, 127250, 0x23)),
-    (0x0DF119FE, J1939Id(3, 127257, 0xFE)),
+    (0x0DF119FE, J1939Id(3, 127257, 0xFE)), (0x0DEF0855, J1939Id(3, 0x1EF00, 0x55, 0x08)),
     (0x18EAFF00, J1939Id(6, 0xEA00, 0x00, GLOBAL)),  # a request to all
     (0x1CEFFF01, J1939Id(7, 0xEF00, 0x01, 0xFF)),
     (0x02F00400, J1939Id(0, 0x2F004, 0x00)),  # EDP set: J1939's upper half
@@ -62,6 +62,5 @@ def test_filters_and_senders() -> None:
     pgns = (0xFF34,)
     assert [sender_of(can_id, True, bytes(8), pgns) for can_id in (0x0CFF3400, 0x1CFF34FD)] == [0, 253]
     assert sender_of(0x0CFF34FE, True, bytes(8), pgns) is None  # a node without an address
-    assert sender_of(0x0CFF3708, True, bytes(8), pgns) is None
-    assert sender_of(0x0CFF3408, False, bytes(8), pgns) is None
-    assert sender_of(0x0CFF3408, True, bytes(7), pgns) is None
+    others = ((0x0CFF3708, True, 8), (0x0CFF3408, False, 8), (0x0CFF3408, True, 7))
+    assert [sender_of(can_id, extended, bytes(size), pgns) for can_id, extended, size in others] == [None] * 3
