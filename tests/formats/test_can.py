@@ -22,7 +22,7 @@ def test_length_of_a_frame(extended: bool, data_bytes: int, bits: int) -> None:
 
 def test_frames_in_the_layout_of_the_kernel() -> None:
     assert can.RAW_FRAME.unpack(can.pack_frame(0x7FF, False, b"ab")) == (0x7FF, 2, b"ab" + bytes(6))
-    assert can.RAW_FRAME.unpack(can.pack_frame(0x1FFF_FFFF, True, b"")) == (0x9FFF_FFFF, 0, bytes(8))
+    assert can.RAW_FRAME.unpack(can.pack_frame(0, True, bytes(range(8)))) == (0x8000_0000, 8, bytes(range(8)))
     assert (can.EXTENDED_FLAG, can.REMOTE_FLAG, can.ERROR_FLAG) == (1 << 31, 1 << 30, 1 << 29)  # linux/can.h
     wrong = [(0x800, False, b""), (-1, False, b""), (0x2000_0000, True, b""), (1, True, bytes(9))]
     for can_id, extended, data in wrong:
