@@ -211,8 +211,8 @@ class CandumpReader:
                 continue
             seconds, fraction, name, digits, data = match.groups()
             can_id = int(digits, 16)
-            if can_id & ERROR_FLAG or can_id > EXTENDED_ID_MAX or (len(digits) == 3 and can_id > STANDARD_ID_MAX):
-                self._note(line if can_id & ERROR_FLAG else b"bad", number, passed=bool(can_id & ERROR_FLAG))
+            if can_id > EXTENDED_ID_MAX or (len(digits) == 3 and can_id > STANDARD_ID_MAX):
+                self._note(b"bad", number, passed=bool(can_id & ERROR_FLAG))
                 continue
             if not self._is_own(_text(name)):
                 continue
