@@ -40,7 +40,7 @@ def test_header() -> None:
     words, half_words = memoryview(raw).cast("Q"), memoryview(raw).cast("I")
     places = ring.NEWEST_WORD, ring.FIRST_WORD, ring.HEARTBEAT_WORD
     assert [words[place] for place in places] == [10, 2, (1 << 64) - 5]
-    assert half_words[ring.STATE_HALF_WORD] == 1
+    assert half_words[ring.STATE_HALF_WORD] == ring.STATE_LIVE == 1
     assert (ring.LEDGER_UPDATE_WORD, ring.STATE_CLOSED, ring.HEARTBEAT_LIMIT_NS) == (32, 2, 1_000_000_000)
 
 
