@@ -358,21 +358,20 @@ def with_pause(pause_ns: int) -> RequestScript[str]:
 @told(play, configured(bitrate=500_000))
 async def test_a_recording_starts_with_the_device_and_its_state(bench: CanDeviceBench) -> None:
     records, clock = list[bytes](), VirtualClock()
-    devices = RecordableDevices({"mast": bench.rig.device}, clock.host)
+    devices = RecordableDevices({"mast": bench.rig.device}, host := clock.host)
     assert devices.names() == ["mast"]
     bench.feed(1)
-    for name in ("stern", "mast"):
-        devices.begin(name, records.append)
-    bench.feed(2)
-    for name in ("stern", "mast"):
-        devices.check(name, records.append)
+    for put, number in ((devices.begin, 2), (devices.check, 3)):
+        for name in ("stern", "mast"):
+            put(name, records.append)
+        bench.feed(number)
     devices.begin_host(records.append)
     devices.end(records.append)
-    bench.feed(3)
+    bench.feed(4)
     clock.advance(2 * NS_PER_S)
-    clock.host.utc_offset_ns()
+    host.utc_offset_ns()
     kinds = [record.kind for block in records for record in records_of(block)]
-    assert kinds == [Kind.DEVICE, Kind.PATH, Kind.FRAMES, Kind.CHECK, Kind.CALL]
+    assert kinds == [Kind.DEVICE, Kind.PATH, Kind.FRAMES, Kind.CHECK, Kind.FRAMES, Kind.CALL]
 
 
 @told(play)
