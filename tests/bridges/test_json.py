@@ -113,8 +113,7 @@ def test_messages_and_schemas() -> None:
         "type": "array", "items": number, "minItems": 9, "maxItems": 9, "description": "rad²/s²"
     }  # fmt: skip
     fields = json.loads(channels()["/bow/stamp"].schema.data)["properties"]
-    assert fields["t_err_ns"]["type"] == "integer"
-    assert fields["incli_rad"]["items"] == number
+    assert (fields["t_err_ns"]["type"], fields["incli_rad"]["items"]) == ("integer", number)
     assert [name for name, field in fields.items() if not field.get("description") and name != "timestamp"] == []
     diagnoses = json.loads(DIALECT.diagnostics().schema.data)["properties"]["status"]["items"]["properties"]
     assert diagnoses["values"]["items"]["properties"] == {"key": {"type": "string"}, "value": {"type": "string"}}

@@ -54,8 +54,7 @@ def test_an_active_alarm_at_the_start_edges_and_a_line_that_came_back_are_events
     assert line.active is None
     line.tick(10 * NS_PER_S)
     line.on_level(20 * NS_PER_S, True)
-    assert line.raised == 2
-    assert len(signals.events) == 2
+    assert (line.raised, len(signals.events)) == (2, 2)
 
 
 def test_a_chattering_line_makes_one_event_a_second_and_the_last_state_is_reported(signals: SignalBench) -> None:
@@ -64,8 +63,7 @@ def test_a_chattering_line_makes_one_event_a_second_and_the_last_state_is_report
     line.on_edges([Edge(NS_PER_S + n * NS_PER_MS, n % 2 == 0, n + 1) for n in range(1500)])
     assert [event.t_ns for event in signals.events] == [NS_PER_S, 2 * NS_PER_S]
     assert signals.events[1].message == "alarm (the line changed 1000 times)"
-    assert signals.events[1].detail == {"active": True, "raised": 501, "changes": 1000}
-    assert line.raised == 750
+    assert (signals.events[1].detail, line.raised) == ({"active": True, "raised": 501, "changes": 1000}, 750)
     signals.events.clear()
     line = AlarmLine(signals.raise_event)
     line.on_level(0, True)

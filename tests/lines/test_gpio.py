@@ -241,8 +241,7 @@ def test_jumps_of_the_count_are_losses_and_numbers_go_on_when_it_wraps_and_after
     events.decode(event(1, 1, 1) + event(2, 2, 2))
     events.restart()
     assert [edge.number for edge in events.decode(event(3, 1, 1))] == [3]
-    assert events.lost == 0
-    assert gpio.EVENT.size == 48
+    assert (events.lost, gpio.EVENT.size) == (0, 48)
 
 
 # ruff: noqa: E501 - a row of the table is a case and the whole message for it

@@ -33,16 +33,15 @@ from imud.drivers.hipnuc.modbus.codec import READ_BLOCK, READ_SHORT_BLOCK, Hipnu
 from imud.drivers.hipnuc.modbus.commands import LineMounting, set_heading_mode, set_mounting
 from imud.drivers.hipnuc.modbus.driver import DRIVER
 from imud.drivers.hipnuc.modbus.registers import pack_identity, read_registers, set_id_by_serial, write_register
-from imud.formats.modbus import frame_gap_ns, framed, is_exception, is_whole
+from imud.formats.modbus import framed, is_exception, is_whole
 from imud.links import rs485
 from imud.links.serial_port import TtyCounters, open_port
 from imud.model.errors import LinkBusy, LinkError, LinkMissing, TransferError, Trouble
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
-from imud.model.units import NS_PER_S, uart_byte_ns
+from imud.model.units import uart_byte_ns
 from tests.drivers.hipnuc.modbus.test_codec import SENSORS
 from tests.support.daemon_process import LIMIT_S, wait_until
-from tests.support.event_loops import VirtualClock
 from tests.support.pty_port import BAUD, PtyPort, serial_of, slave, waiting_bytes, wired
 
 SETTINGS = read_registers(4, 3)
@@ -355,26 +354,6 @@ def test_the_line_gets_the_longer_time_for_a_reply_and_has_the_counters_of_the_k
             link.transfer(replace(SERIAL, reply_ms=reply_ms))
         assert waits == [30_000_000, 31_000_000]
         assert link.kernel_counters() == KernelCounters(overrun=3)
-
-
-def test_a_bus_that_is_stuck_never_silent_or_closed(pty: PtyPort, monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = VirtualClock(0)
-    line = rs485.Rs485Line(rs485.PortSetup(pty.path, BAUD), Path("/sys"), PROC, clock.now_ns)
-    transfer = 1, SERIAL.sends[0], 13, 0
-    with monkeypatch.context() as patch:
-        patch.setattr(time, "sleep", lambda seconds: clock.advance(round(seconds * 1e9)))
-        patch.setattr(os, "read", lambda _fd, _size: b"x")
-        with pytest.raises(TransferError, match="never silent") as busy:
-            line.transfer(*transfer)
-    assert 1 < (clock.now_ns() - 512 * uart_byte_ns(BAUD)) / frame_gap_ns(BAUD) <= 2
-    clock.advance(NS_PER_S)
-    pty.fill()
-    with pytest.raises(TransferError, match="does not accept bytes") as stuck:
-        line.transfer(*transfer)
-    assert busy.value.trouble is stuck.value.trouble is Trouble.STUCK
-    line.close()
-    with pytest.raises(LinkError, match="is not open"):
-        line.transfer(*transfer)
 
 
 class Driver:

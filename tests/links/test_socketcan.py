@@ -211,8 +211,7 @@ def test_closed_while_frames_gather(ends: Ends, at: str) -> None:
     bus = Bus(ends, 1)
     bus.run(story)
     assert [frame.can_id for batch in bus.batches for frame in batch] == [1]
-    assert bus.looks == 0
-    assert len(bus.delays_s) == (at == "pause")
+    assert (bus.looks, len(bus.delays_s)) == (0, at == "pause")
 
 
 def test_a_bus_that_ends_in_the_pause_says_so_once(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -237,8 +236,7 @@ def test_a_bus_that_ends_in_the_pause_says_so_once(ends: Ends, monkeypatch: pyte
     bus.run(story)
     (ended,) = bus.ends
     assert isinstance(ended, LinkMissing)
-    assert bus.looks == 1
-    assert len(bus.delays_s) == 1
+    assert (bus.looks, len(bus.delays_s)) == (1, 1)
 
 
 def test_what_gathers_is_read_when_nothing_may_wait_any_more(ends: Ends) -> None:
@@ -253,8 +251,7 @@ def test_what_gathers_is_read_when_nothing_may_wait_any_more(ends: Ends) -> None
 
     bus = Bus(ends, GATHER_MS)
     bus.run(story)
-    assert bus.looks == 0
-    assert len(bus.delays_s) == 1
+    assert (bus.looks, len(bus.delays_s)) == (0, 1)
 
 
 def test_a_full_bus_leaves_the_loop_time_for_others(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:

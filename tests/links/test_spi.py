@@ -6,13 +6,29 @@ import gc
 from pathlib import Path
 
 import pytest
+from smbus2 import I2cFunc, i2c_msg
 
 from imud.contracts.script import Transfer
 from imud.contracts.status import KernelCounters
 from imud.links import LINKS
 from imud.links.spi import WR_MAX_SPEED_HZ, SpiLink, SpiOptions
 from imud.model.errors import LinkBusy, LinkDenied, LinkError, LinkMissing, TransferError, Trouble
-from imud.sim.ports.in_process_bus import InProcessSpi
+from imud.sim.imu61x.registers import Imu61xRegisters
+from imud.sim.ports.in_process_bus import InProcessI2c, InProcessSpi
+
+
+def test_a_simulated_i2c_bus_has_the_calls_of_smbus2() -> None:
+    bus = InProcessI2c({0x19: Imu61xRegisters(lambda: 0, product="IMU612")})
+    assert (bus.open(""), bus.fd, bus.funcs, bus.ioctl(0, 0, 0), bus.opened) == (bus, 1_000_000, I2cFunc.I2C, 0, 1)
+    bus.i2c_rdwr(i2c_msg.write(0x19, b"\x6a"), read := i2c_msg.read(0x19, 8))
+    bus.write_i2c_block_data(0x19, 6, [0x4B])
+    assert (bytes(read), bus.read_i2c_block_data(0x19, 6, 1)) == (b"\0\0IMU612", [0x4B])
+    assert bus.calls == [(0x19, (b"\x6a", 8)), (0x19, (b"\x06\x4b",)), (0x19, (b"\x06", 1))]
+    with pytest.raises(OSError, match="no device acknowledges"):
+        bus.write_i2c_block_data(0x1A, 6, [0])
+    bus.open_error = errno.EACCES
+    with pytest.raises(OSError, match="by the test"):
+        bus.open("")
 
 
 def echo(selections: object, _mode: int) -> list[bytes]:

@@ -9,7 +9,6 @@ import termios
 import time
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
-from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -156,13 +155,8 @@ def test_what_the_port_does_not_take_is_queued_in_order_bounded_and_ends_with_th
     play(link, scene)
 
 
-@pytest.mark.parametrize("reason", ["hung up", "Input/output error"])
-def test_unplugging_ends_the_link_once(
-    pty: PtyPort, link: UartLink, monkeypatch: pytest.MonkeyPatch, reason: str
-) -> None:
+def test_unplugging_ends_the_link_once(pty: PtyPort, link: UartLink) -> None:
     async def scene(receiver: Receiver) -> None:
-        if reason != "hung up":  # as the drivers of USB adapters report
-            monkeypatch.setattr(os, "read", Mock(side_effect=OSError(errno.EIO, "")))
         pty.unplug()
         await receiver.until(lambda: bool(receiver.ends))
         for _ in range(20):
@@ -171,7 +165,7 @@ def test_unplugging_ends_the_link_once(
     receiver = play(link, scene)
     assert len(receiver.ends) == 1
     assert isinstance(receiver.ends[0], LinkMissing)
-    assert f"{pty.path} is missing ({reason})" in str(receiver.ends[0])
+    assert pty.path in str(receiver.ends[0])
 
 
 def test_a_spurious_wake_up_is_no_end(pty: PtyPort) -> None:
@@ -404,16 +398,12 @@ def test_a_paused_port_keeps_what_comes_until_it_is_taken(
 
 
 @pytest.mark.parametrize("resumed", [False, True])
-def test_the_end_of_a_paused_port_is_reported_once(
-    pty: PtyPort, link: UartLink, monkeypatch: pytest.MonkeyPatch, resumed: bool
-) -> None:
+def test_the_end_of_a_paused_port_is_reported_once(pty: PtyPort, link: UartLink, resumed: bool) -> None:
     async def scene(receiver: Receiver) -> None:
         link.pause()
         pty.unplug()
         await asyncio.sleep(0.01)
         assert receiver.ends == []
-        if resumed:
-            monkeypatch.setattr(os, "read", Mock(side_effect=OSError(errno.EIO, "")))
         assert link.take() == b""
         assert len(receiver.ends) == 1
         if resumed:

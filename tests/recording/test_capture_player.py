@@ -97,8 +97,7 @@ def test_a_log_of_a_can_bus_has_the_wall_clock_and_frames_of_others_are_left_out
     played = Played("imu61x-can")
     played.player.play_frames(CandumpReader(BytesIO("".join([other, *lines]).encode())))
     assert played.player.times is KnownTimes.WALL_CLOCK
-    assert len(played.samples) == 600
-    assert played.samples[-1].utc_ns == played.samples[-1].t_ns
+    assert (len(played.samples), played.samples[-1].utc_ns) == (600, played.samples[-1].t_ns)
     assert abs(played.samples[-1].t_ns - (LOG_NS + 599 * 10 * NS_PER_MS)) < NS_PER_MS
     assert played.counted == {
         "bytes_in": 24000, "bytes_in_good_frames": 24000, "frames_good": 3000, "frames_in_samples": 3000,

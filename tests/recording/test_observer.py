@@ -70,8 +70,7 @@ def test_two_recorders_get_the_same_records_and_the_state_of_a_new_path() -> Non
     one.path.on_data(hi91(0), 5)
     one.observer.end(one.records.append)
     one.path.on_data(hi91(10), 6)
-    assert one.records[-1] == other[-2]
-    assert len(other) == 4
+    assert (one.records[-1], len(other)) == (other[-2], 4)
     one = ObservedPath()
     one.begin()
     before = one.path

@@ -5,12 +5,14 @@ import json
 import os
 import select
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -18,6 +20,7 @@ from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.sim.__main__ import main
+from imud.sim.ports.can_port import CanPort
 from imud.sim.ports.pins import PinFaultRates, pin_rates
 from tests.support.daemon_process import LIMIT_S
 
@@ -255,3 +258,25 @@ def test_a_rise_on_sin_is_answered(start: Start, tmp_path: Path) -> None:
         while select.select([fd], [], [], 0.05)[0]:
             os.read(fd, 4096)
     os.close(fd)
+
+
+def test_devices_on_a_can_bus_run_until_quit(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (near, far), (commands, write) = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM), os.pipe()
+    near.setblocking(False)
+    os.write(write, b"stats\nquit\n")
+    os.close(write)
+    monkeypatch.setattr(sys, "stdin", os.fdopen(commands))
+    monkeypatch.setattr("imud.sim.__main__.signal", sharpened := Mock())
+    for name, put in {
+        "CanPort": lambda module, name: CanPort(module, name, open_socket=lambda _name: near),
+        "sharpen_timers": sharpened.timers, "default_interface": lambda: "can7",
+    }.items():  # fmt: skip
+        monkeypatch.setattr(f"imud.sim.__main__.{name}", put)
+    assert main(["--device", "hipnuc-canopen:8", "--device", "hipnuc-canopen:9"]) == 0
+    interface, stats, summary = capsys.readouterr().out.splitlines()
+    assert (interface, json.loads(stats).keys()) == ("can7", json.loads(summary).keys())
+    assert (near.fileno(), sharpened.timers.call_count) == (-1, 1)
+    far.close()
+    sys.stdin.close()

@@ -70,8 +70,7 @@ async def test_examples(server: SocketServer) -> None:
             happen(server, json.loads(text), published)
             assert_like(await peer.message(), json.loads(text))
     asked = {json.loads(line[2:])["method"] for line in lines if line.startswith("→ {")}
-    assert asked == set(METHODS)
-    assert published == [2]
+    assert (asked, published) == (set(METHODS), [2])
 
 
 def test_python_example(tmp_path: Path, capsys: Any) -> None:

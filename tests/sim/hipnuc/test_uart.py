@@ -373,8 +373,7 @@ def test_each_frame_has_its_pulse_right_before_it(settings: ModuleSettings) -> N
     found = pulses(edges, Pin.SOUT)[: len(bursts)]
     assert len(bursts) > 90
     for burst, (rise, fall) in zip(bursts, found, strict=True):
-        assert fall.due_ns == burst.due_ns - wire_ns
-        assert fall.due_ns - rise.due_ns == HIGH_NS
+        assert (fall.due_ns, fall.due_ns - rise.due_ns) == (burst.due_ns - wire_ns, HIGH_NS)
         assert rise.sample_ns == fall.sample_ns == burst.sample_ns
         assert rise.due_ns >= (burst.sample_ns or 0)
 
@@ -399,8 +398,7 @@ def test_which_frames_have_a_pulse_and_how_long_it_is() -> None:
 
     _, edges = run(HipnucUartBench(hardware=HipnucHardware(processing_ns=30_000, skew_ppm=0)), 100.0)
     for rise, fall in pulses(edges, Pin.SOUT):
-        assert fall.due_ns - rise.due_ns == 30_000
-        assert rise.due_ns == rise.sample_ns
+        assert (fall.due_ns - rise.due_ns, rise.due_ns) == (30_000, rise.sample_ns)
 
 
 def test_edges_come_in_order_whatever_the_steps() -> None:

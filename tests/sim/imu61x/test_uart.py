@@ -44,8 +44,7 @@ def test_the_frame_on_the_wire_by_the_offsets_of_table_4() -> None:
     data = burst.data
     assert data[:6] == bytes.fromhex("AA5502002C00")
     timer, pitch, roll, yaw, ax, ay, az, gx, gy, gz, temp = struct.unpack("<I10f", data[6:-4])
-    assert timer == 510_000
-    assert burst.device_ms == 510
+    assert (timer, burst.device_ms) == (510_000, 510)
     assert (roll, pitch, yaw) == pytest.approx((-2.998, 2.003, 39.895), abs=0.01)
     assert (ax**2 + ay**2 + az**2) ** 0.5 == pytest.approx(9.8 / 9.80665, abs=1e-6)
     assert (gx, gy, gz) == (0, 0, 0)

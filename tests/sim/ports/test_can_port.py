@@ -5,6 +5,7 @@ import socket
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock, call
 
 import pytest
 
@@ -113,3 +114,13 @@ def test_an_interface_that_is_not_there_is_an_error(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(can_port, "can_interfaces", list)
     with pytest.raises(LinkError, match="got none"):
         default_interface()
+
+
+def test_a_socket_is_bound_to_an_interface_that_is_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Mock()
+    monkeypatch.setattr(socket, "socket", lambda *_: made)
+    assert open_can_socket("can0") is made
+    made.getsockopt.side_effect = OSError(errno.ENETDOWN, "Network is down")
+    with pytest.raises(LinkError, match="can0: Network is down: expected a CAN interface that is up"):
+        open_can_socket("can0")
+    assert (made.bind.call_args_list, made.close.call_count) == ([call(("can0",))] * 2, 1)

@@ -41,8 +41,7 @@ def test_what_was_not_hit_arrives_as_it_was_and_what_was_is_noted(kind: FaultKin
             assert after == before
     assert set(faults.counts) == {kind}
     assert (1 if kind is FaultKind.UNPLUG else 10) <= faults.counts[kind] <= 60
-    assert faults.counts[kind] == len(faults.log)
-    assert faults.bursts == 300
+    assert (faults.counts[kind], faults.bursts) == (len(faults.log), 300)
 
 
 @pytest.mark.parametrize(
@@ -98,6 +97,9 @@ def test_the_ledger_of_a_codec_tells_the_same() -> None:
     assert rates_from("flip=0.5,delay=0.1,delay_ns=7") == FaultRates(flip=0.5, delay=0.1, delay_ns=7)
     assert not rates_from("").any()
     assert rates_from("cut=0.1").any()
+    empty = Faults(1, FaultRates(cut=1, drop=1))
+    assert empty.pass_on(Burst(0, b"x")) is None
+    assert (empty.counts, empty.bursts_hit) == ({FaultKind.CUT: 1, FaultKind.DROP: 1}, 1)
     rates = FaultRates(flip=0.1, cut=0.1, delay=0.1)
 
     def run(seed: int) -> list[Fault]:
