@@ -103,7 +103,7 @@ class Faults:
             if kind is FaultKind.DELAY:
                 due_ns += self._random.randint(1, self.rates.delay_ns)
                 self._held_until_ns = due_ns
-            else:
+            elif data:  # an earlier fault can remove all bytes
                 data = self._damaged(kind, data)
         self.bursts_hit += data != burst.data
         return burst._replace(due_ns=due_ns, data=data) if data else None
@@ -125,8 +125,6 @@ class Faults:
 
     def _damaged(self, kind: FaultKind, data: bytes) -> bytes:
         random = self._random
-        if not data:
-            return data
         at = random.randrange(len(data))
         match kind:
             case FaultKind.CUT:
