@@ -273,7 +273,7 @@ async def test_restarts_after_commands_are_counted_as_requested(bench: ModuleBen
         bench.module.restart()
         await bench.pass_s(4)
     status = bench.device.status()
-    assert (status.clock.resets, status.resets_requested, status.recent.restarts) == (7, 2, 5)
+    assert (status.clock.resets, status.resets_requested, status.recent and status.recent.restarts) == (7, 2, 5)
 
 
 @played(lambda: ModuleBench(declared={"mode": "6-axis"}, silent={"GET"}))
