@@ -181,7 +181,7 @@ class MqttPublisher:
             check_extra()
         settings, context = self._settings, self._context
         gateway = settings.gateway or self._host_name().partition(".")[0]
-        if not is_name(gateway) or gateway.lower() == LOCALHOST:
+        if not is_name(gateway) or gateway.lower() in LOCALHOST:
             raise ServerError(
                 f"mqtt.gateway: expected 1 to 64 letters, digits, '_' or '-', and a name that no other gateway has, "
                 f"got the host name {gateway!r}; set mqtt.gateway"

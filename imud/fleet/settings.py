@@ -22,7 +22,7 @@ Measure = Literal["mean", "min", "max", "rms"]
 Name = Annotated[str, msgspec.Meta(pattern=f"^({NAME_PATTERN})?$", extra={"words": "letters, digits, _ and -"})]
 
 
-LOCALHOST: Final = "localhost"  # host name of many hosts, so it does not identify a gateway
+LOCALHOST: Final = ("localhost", "localhost6", "ip6-localhost")  # names of many hosts, which identify no gateway
 
 
 class Whole(StrEnum):
@@ -183,7 +183,7 @@ class MqttOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def __post_init__(self) -> None:
         """Raise ValueError if a URL, a name, or a combination of keys is invalid."""
-        if self.gateway.lower() == LOCALHOST:
+        if self.gateway.lower() in LOCALHOST:
             raise ValueError(f"gateway: expected a name that no other gateway has, got {shown(self.gateway)}")
         for url in self.brokers:
             if broker_of(url) is None:

@@ -232,7 +232,7 @@ def test_the_host_name_is_the_default_gateway_name(tmp_path: Path) -> None:
     bench.close()
     assert bench.broker.will is not None
     assert bench.broker.will.topic == "imud/default/host/state"
-    for name in ("Gerät", "localhost", "localhost.localdomain"):
+    for name in ("Gerät", "localhost", "localhost.localdomain", "localhost6"):
         odd = MqttPublisher(
             MqttOptions(spool_directory=str(tmp_path)), bench.context, connect=bench.broker.connect,
             host_name=name.__str__,
@@ -240,7 +240,7 @@ def test_the_host_name_is_the_default_gateway_name(tmp_path: Path) -> None:
         with pytest.raises(ServerError, match=f"mqtt.gateway: expected 1 to 64 .* '{name.partition('.')[0]}'"):
             odd.start()
     with pytest.raises(ValueError, match="gateway: expected a name that no other gateway has"):
-        MqttOptions(gateway="Localhost")
+        MqttOptions(gateway="IP6-localhost")
 
 
 def test_without_the_extra_only_this_output_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
