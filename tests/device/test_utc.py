@@ -1,6 +1,7 @@
 """UTC of one device: sentences for its port, a reference for its clock, pulses for chronyd."""
 
 from typing import cast
+from unittest.mock import Mock
 
 import pytest
 
@@ -190,6 +191,11 @@ def test_a_clock_has_the_reference_of_each_second_from_its_start_to_the_end_of_t
     assert other.utc_reference == UtcReference(5, 5)
     bench.keeper.start(other)
     assert other.utc_reference == UtcReference(6, 6)
+    steered = Mock(steady=Mock(rate=-2e-6, steady_ns=int))  # chronyd steers the clock: 2 µs until the next update
+    keeper = UtcFeed(None, None, lambda: UtcReference(6, 6), steered)
+    keeper.start(other)
+    keeper.tick(BEGIN_NS, None)
+    assert other.utc_reference == UtcReference(6, 6 + 2000)
 
 
 def test_close_releases_source_and_socket() -> None:

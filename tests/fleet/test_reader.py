@@ -392,3 +392,20 @@ async def test_errors_of_the_loop_do_not_prevent_the_end(broker: Mosquitto, monk
     with pytest.raises(BrokerError, match="the connection is closed"):
         async with asyncio.timeout(LIMIT_S):
             await waiting
+
+
+@in_loop
+async def test_data_that_the_socket_did_not_accept_is_sent_later(
+    broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    connection, waiting, ack = await opened(broker.port), [b"ab", b"cd"], Mock()
+    client = connection._client
+    monkeypatch.setattr(client, "want_write", lambda: waiting)
+    monkeypatch.setattr(client, "loop_write", lambda: waiting and waiting.pop())
+    monkeypatch.setattr(client, "ack", ack)
+    connection.acknowledge(7)
+    await until(lambda: not waiting)
+    await asyncio.sleep(0)
+    ack.assert_called_once_with(7, 1)
+    assert not asyncio.get_running_loop().remove_writer(client.socket()), "imud does not wait without data"
+    connection.close()

@@ -349,7 +349,7 @@ def test_any_frames_at_any_time_keep_the_ledger_closed(seed: int) -> None:
 def test_the_step_and_the_modulus_of_a_series_of_sids() -> None:
     series = SidSeries()
     known = [(series.add(sid, is_next=False), series.is_known) for sid in range(0, 20, 2)]
-    assert known == [(None, False)] * 9 + [(None, True)]  # eight differences like the one before
+    assert known == [(None, False)] * 9 + [(None, True)]  # eight equal differences
     assert ([series.add(sid, is_next=False) for sid in (20, 26, 27)], series.is_known) == ([0, 2, None], False)
     series = SidSeries()
     assert [series.add(sid, is_next=True) for sid in range(253)] == [None] * 10 + [0] * 243
