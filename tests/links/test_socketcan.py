@@ -580,17 +580,17 @@ async def test_a_wait_ends_without_a_reader() -> None:
 async def test_each_change_of_an_interface_is_one_look(monkeypatch: pytest.MonkeyPatch) -> None:
     class News(socket.socket):
         def bind(self, address: object) -> None:
-            assert address == (0, 1)
+            groups.append(address)
 
     theirs, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-    news, looks = News(fileno=theirs.detach()), list[bool]()
+    news, looks, groups = News(fileno=theirs.detach()), list[bool](), list[object]()
     news.setblocking(False)
     monkeypatch.setattr(socket, "socket", lambda *_: news)
     waiting = asyncio.create_task(wait_until(lambda: looks.append(len(looks) == 2) or looks[-1]))  # type: ignore[func-returns-value]
     for count in (1, 2, 3):
         for _ in range(5):
             await asyncio.sleep(0)
-        assert (len(looks), waiting.done()) == (count, count == 3)
+        assert (len(looks), waiting.done(), groups) == (count, count == 3, [(0, 1)])
         if count < 3:
             ours.send(b"changed")
     ours.close()
