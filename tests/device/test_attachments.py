@@ -113,9 +113,7 @@ async def test_a_device_that_hangs_is_reset_and_set_up_again(bench: PolledBusBen
 
 
 @in_bench
-async def test_search_rounds_before_the_newest_sample_cause_no_reset_of_the_open_line(
-    bench: PolledBusBench,
-) -> None:
+async def test_search_rounds_before_the_newest_sample_cause_no_reset_of_the_open_line(bench: PolledBusBench) -> None:
     async with polled(bench) as it:
         for _ in range(3):
             await it.rig.until_samples(5, 20)

@@ -266,9 +266,7 @@ async def test_a_stuck_bus_is_tried_once_in_a_round(bench: PolledBusBench) -> No
 
 
 @in_bench
-async def test_readings_are_held_in_twos_and_a_failed_read_of_settings_loses_none(
-    bench: PolledBusBench,
-) -> None:
+async def test_readings_are_held_in_twos_and_a_failed_read_of_settings_loses_none(bench: PolledBusBench) -> None:
     bench.spi.device = bench.registers().spi
     async with bench.running(bench.on_spi()) as (rig,):
         for latency_ns, hold_ns in ((8_000_000, 8_000_000), (7_999_999, 0)):  # the period is 4 ms

@@ -161,8 +161,7 @@ def test_tls_with_certificates_of_both_sides(tmp_path: Path, authority: Authorit
         with pytest.raises(BrokerError, match=r"(?i)hostname mismatch|not valid for"):
             connect(f"mqtts://localhost:{port}", ca_file=authority["ca.pem"], **own)
         with pytest.raises(
-            BrokerError,
-            match="without a reply; check the log of the broker, and whether the port requires TLS",
+            BrokerError, match="without a reply; check the log of the broker, and whether the port requires TLS"
         ):
             connect(f"mqtt://127.0.0.1:{port}")
 
@@ -254,9 +253,7 @@ def test_a_reader_names_the_refusal_of_a_broker(replies: tuple[bytes, ...], word
         asyncio.run(run(broker))
 
 
-def test_a_reader_counts_refused_messages_and_waits_a_limited_time(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_reader_counts_refused_messages_and_waits_a_limited_time(monkeypatch: pytest.MonkeyPatch) -> None:
     async def run(broker: Broker) -> None:
         with closing(await reader(broker)) as connection:
             while not connection.refused:

@@ -227,11 +227,7 @@ async def test_the_queues_of_all_clients_together_are_bounded(server: SocketServ
 
 @in_server(clients_max=2)
 async def test_one_client_too_many_gets_an_error(server: SocketServer) -> None:
-    _first, second, third = (
-        await Peer.greeted(server),
-        await Peer.greeted(server),
-        await Peer.connect(server),
-    )
+    _first, second, third = (await Peer.greeted(server), await Peer.greeted(server), await Peer.connect(server))
     assert (await third.message())["error"]["code"] == -32002
     assert await third.ended()
     assert server.hub.status().refused == 1
