@@ -200,40 +200,40 @@ STABLE: Final = 4  # minimum ratio of the difference of the devices to the chang
 class _Order:
     """Numbers of several devices that arrive in a fixed order. Synchronization: one thread."""
 
-    __slots__ = ("_count", "_least", "_mean", "_newest", "_place")
+    __slots__ = ("_mean", "_place", "count")
 
-    def __init__(self, devices: int, least: float) -> None:
-        """`least`: minimum difference of the numbers of two devices."""
-        self._newest: deque[float] = deque([0.0] * devices, maxlen=devices)
+    def __init__(self, devices: int) -> None:
+        self.count = 0  # number of numbers in a fixed order
         self._mean = [0.0] * devices  # mean difference of the number of each device to the mean of all devices
-        self._least = least
-        self._place = self._count = 0
+        self._place = 0
 
     @property
     def is_found(self) -> bool:
-        return self._count >= VALUES
+        return self.count >= VALUES
 
-    def add(self, number: float) -> None:
-        """Add a number."""
-        newest, mean, place = self._newest, self._mean, self._place
-        newest.append(number)
-        offset = number - sum(newest) / len(newest)
+    def add(self, numbers: Sequence[float], least: float) -> None:
+        """Add the last of `numbers`. `least`: minimum difference of the numbers of two devices."""
+        mean, place, count = self._mean, self._place, self.count
+        newest = numbers[-len(mean) :]
+        offset = newest[-1] - sum(newest) / len(newest)
         spread = max(newest) - min(newest)
         self._place = (place + 1) % len(mean)
-        change, count = offset - mean[place], self._count
+        change = offset - mean[place]
         mean[place] += change / min(count // len(mean) + 1, SETTLE)
-        if spread >= self._least and (STABLE * abs(change) < spread or count < len(mean)):
-            self._count = min(count + 1, 2 * VALUES)
+        if spread >= least and (STABLE * abs(change) < spread or count < len(mean)):
+            self.count = min(count + 1, 2 * VALUES)
         elif count:
-            self._count -= 1 if self.is_found else count
+            self.count -= 1 if self.is_found else count
 
 
 class ValueOrder:
     """Values of consecutive samples that repeat in a fixed order. Synchronization: one thread."""
 
     def __init__(self) -> None:
-        least = ANGLE_LEAST_RAD, ANGLE_LEAST_RAD, ACCEL_LEAST_M_S2
-        self._orders = [[_Order(devices, one) for devices in range(2, SERIES_MOST + 1)] for one in least]
+        self._least = ANGLE_LEAST_RAD, ANGLE_LEAST_RAD, ACCEL_LEAST_M_S2
+        self._newest = [deque([0.0] * SERIES_MOST, maxlen=SERIES_MOST) for _ in self._least]
+        self._orders = [[_Order(devices) for devices in range(2, SERIES_MOST + 1)] for _ in self._least]
+        self._counts = [False] * len(self._orders)  # whether an order of the kind has numbers
         self._yaw = 0.0
 
     @property
@@ -253,9 +253,15 @@ class ValueOrder:
             self._add(2, x + 2 * y + 3 * z)
 
     def _add(self, kind: int, number: float) -> None:
-        if isfinite(number):
+        if not isfinite(number):
+            return
+        newest, least = self._newest[kind], self._least[kind]
+        newest.append(number)
+        if self._counts[kind] or max(newest) - min(newest) >= least:  # usually the values of one device are near
+            numbers = list(newest)
             for order in self._orders[kind]:
-                order.add(number)
+                order.add(numbers, least)
+            self._counts[kind] = any(order.count for order in self._orders[kind])
 
 
 class SameAddress:

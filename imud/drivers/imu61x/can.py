@@ -138,22 +138,22 @@ class _Series:
     def add(self, index: int) -> None:
         """Add the INDEX of a 105."""
         known = self._newest
-        steps = [(index - newest) % INDEX_MODULUS for newest in known]
-        if steps and steps[-1] == 1:
+        if known and (index - known[-1]) % INDEX_MODULUS == 1:
+            known[-1] = index
             self._steady += 1
-            known.pop()
             if self._steady >= STEADY:
                 self._alternations = 0
-                known.clear()
-        else:
-            self._steady = 0
-            step = min((one for one in steps if one), default=STEP_MOST + 1)
-            if step <= STEP_MOST:
-                known.pop(steps.index(step))
-                self._alternations += step == 1
-            elif 0 not in steps:
-                self._alternations = 0
-            del known[: 1 - SERIES_MAX]
+                del known[:-1]
+            return
+        self._steady = 0
+        steps = [(index - newest) % INDEX_MODULUS for newest in known]
+        step = min((one for one in steps if one), default=STEP_MOST + 1)
+        if step <= STEP_MOST:
+            known.pop(steps.index(step))
+            self._alternations += step == 1
+        elif 0 not in steps:
+            self._alternations = 0
+        del known[: 1 - SERIES_MAX]
         known.append(index)
 
 
