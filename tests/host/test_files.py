@@ -128,7 +128,7 @@ def test_group_of_a_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_state_file_keeps_the_newest_content(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    path = tmp_path / "state" / "file"
+    path = tmp_path / "new" / "state" / "file"
     for content in ({"a": 1}, {"b": 2}):
         state = files.StateFile(path, "saving", "is empty")
         state.read(dict[str, int])

@@ -114,6 +114,8 @@ def test_the_history_ends_after_an_hour_or_at_the_limit_of_memory(monkeypatch: p
     assert [found(of)[place].first_s for place in (0, -1)] == [99.0, 3699.0]
     made(at(7300.0), into=of)
     assert len(found(of)) == 3601, "3600 complete seconds and the open second"
+    made(at(7301.0), into=of)
+    assert [one.first_s for one in found(of)] == [7300.0, 7301.0]
     monkeypatch.setattr(history, "BYTES_MAX", 10 * SECOND.size)
     made(*(at(second, device="imu1") for second in range(50)), device="imu1", into=of)
     assert of.kept_s == 5

@@ -97,6 +97,8 @@ def test_identity_sensors_and_the_block_of_newer_firmware() -> None:
     assert m.accel_m_s2 == pytest.approx((0, 0, 9.799975), abs=1e-6)
     assert m.temperature_c == pytest.approx(25.12)
     assert m.pressure_pa == pytest.approx(101_325.0)
+    values["pressure_pa"] = 101_325
+    assert modbus.pack_block(uptime_ms=None, **values)[32:36].hex() == "009a9c14"
     assert m.quat_wxyz == (1, 0, 0, 0)
     assert m.mag_t is None
     assert m.incli_rad is None
