@@ -13,7 +13,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from threading import Event, Thread
 from typing import Final
@@ -154,10 +154,13 @@ def echo(far: PseudoTerminal) -> Callable[[Event], None]:
 def one_way(path: Path) -> Callable[[Event], None]:
     def step(ended: Event) -> None:
         number = 0
-        with serial.Serial(str(path), 115200) as port:
+        with serial.Serial(str(path), 115200, write_timeout=1) as port:
             while not ended.wait(1 / DEAF_RATE_HZ):
                 number += 1
-                port.write(hi91(number * 1000 // DEAF_RATE_HZ))
+                # QEMU takes no byte while the port at the other end is closed
+                with suppress(serial.SerialTimeoutException):
+                    port.write(hi91(number * 1000 // DEAF_RATE_HZ))
+            port.reset_output_buffer()
 
     return step
 
