@@ -1,8 +1,7 @@
 """Faults for `imud doctor`, caused on the buses of the kernel and diagnosed next to the real daemon.
 
-Each diagnosis runs the command in its own process and compares its exit status with its findings. The buses of QEMU
-have no electrical errors. The kernel module of the lab sets the error counters of a CAN controller (README.md). Bytes
-of a UART at a wrong rate come from the simulator behind a pseudo-terminal.
+The kernel module of the lab sets the error counters of a CAN controller (README.md). Bytes of a UART at a wrong rate
+come from the simulator behind a pseudo-terminal.
 """
 
 import errno
