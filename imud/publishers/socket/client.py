@@ -174,6 +174,8 @@ class ClientConnection(Outbox, ScheduledClient):
 
     def finish(self) -> None:
         """Stop reading, send the queue, then close. A second call does nothing."""
+        if self.closed or self.finishing:
+            return
         self._drop_requests()
         self.finishing = True
         if not self.waiting:
@@ -280,8 +282,11 @@ class ClientConnection(Outbox, ScheduledClient):
                     line = self._next_line()
                 if line is not None:
                     self._clients.handle_line(self, line)
-        if not self.closed:
-            self.set_request_bytes(len(self._input) + self._work_bytes)
+        if self.closed:
+            return False
+        self.set_request_bytes(len(self._input) + self._work_bytes)
+        if self.closed:
+            return False
         if self._writable and self.waiting:
             return True
         return not self.finishing and (
@@ -296,6 +301,8 @@ class ClientConnection(Outbox, ScheduledClient):
 
     def on_failure(self, error: Exception) -> None:
         self._clients.count_failed(error)
+        if self.closed:
+            return
         self._drop_requests()
         try:
             message = "internal error in the daemon, see its log; this connection ends"

@@ -168,6 +168,7 @@ class Scheduler:
         self._epoll = select.epoll()
         self._loop.add_reader(self._epoll.fileno(), self._schedule)
         self._next_turn: asyncio.Handle | None = None
+        self._pausing = False  # whether the next turn begins after a pause
         self._clients: dict[int, ScheduledClient] = {}  # all clients by descriptor
         self._users: dict[int, _User] = {}
         self._queued: dict[_User, None] = {}  # users with queued clients
@@ -260,13 +261,14 @@ class Scheduler:
     # --- a turn -----------------------------------------------------------------------------------------------------
 
     def _schedule(self, *, pause: bool = False) -> None:
-        """Run `_turn` in the next turn of the event loop, or after a pause."""
+        """Run `_turn` in the next turn of the event loop, or after a pause. An event of a client ends the pause."""
         # not now: the loop reads samples before and after a turn
         if self._next_turn is not None:
-            if not pause:
+            if not (pause or self._pausing):
                 return
             self._next_turn.cancel()
         self._next_turn = self._loop.call_later(PAUSE_S, self._turn) if pause else self._loop.call_soon(self._turn)
+        self._pausing = pause
 
     def _turn(self) -> None:
         """Serve pieces until TURN_NS is over, or the queue contains no client that may be served."""
