@@ -18,7 +18,8 @@ from imud.model.event import Event, EventKind
 from imud.publishers.socket.client import BYTE, ClientConnection
 from imud.publishers.socket.outbox import NO_FD, BinaryEncoding, Delivery, JsonEncoding, Limits, Outbox, Pool
 from imud.publishers.socket.server import SocketServer
-from tests.support.socket_rig import Peer, batch, done_late, in_server, run, until
+from tests.support import socket_rig
+from tests.support.socket_rig import Peer, batch, in_server, run, until
 
 REPLY_BYTES, SAMPLE_BYTES = 200, 300
 
@@ -243,13 +244,13 @@ async def test_a_client_that_has_shut_down_its_side_gets_its_replies(server: Soc
     peer = await Peer.greeted(server)
     (connection,) = server.hub.connections.values()
     parameters = {"device": "imu0", "name": "wait"} if method == "command" else {}
-    done_late.clear()
+    socket_rig.done_late = asyncio.Event()
     await peer.send(encode({"jsonrpc": "2.0", "id": 1, "method": method, "params": parameters}) + b"\n")
     peer.sock.shutdown(socket.SHUT_WR)
     if method == "command":
         await until(lambda: connection.number in server.hub.running)
         server.tick(0)
-        done_late.set()
+        socket_rig.done_late.set()
     assert (await peer.message())["id"] == 1
     for number in range(3 if method in ("watch", "events") else 0):
         server.tick(0)
