@@ -202,7 +202,9 @@ class ScriptRunner:
     # --- a request ---------------------------------------------------------------------------------------------------
 
     def start(self, request: Request, now_ns: int) -> bytes:
-        """Make `request` the outstanding request and return its bytes."""
+        """Make `request` the outstanding request and return its bytes. Raises CommandError if one is outstanding."""
+        if self._request is not None:
+            raise CommandError(f"{request.name}: still waiting for the reply to {self._request.name}")
         self._messages.clear()
         if not request.silent:
             self._request = request

@@ -175,7 +175,9 @@ class TcpOutput:
             asyncio.get_running_loop().add_reader(self._listener, self._accept, self._listener)
 
     def _read(self, number: int) -> None:
-        client = self._clients[number]
+        client = self._clients.get(number)
+        if client is None:
+            return
         try:
             if not client.sock.recv(RECV_BYTES):  # the next sentences show whether the client still reads
                 client.is_half_closed = True

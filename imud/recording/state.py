@@ -218,11 +218,13 @@ class StateReader:
         raise StateError(f"cannot restore the state: unexpected value {str(written)[:80]}")
 
     def _instance(self, number: int, kind: Any, parts: dict[str, Any], depth: int) -> Any:
+        if not isinstance(kind, type) or issubclass(kind, BaseException):
+            raise StateError(f"cannot restore the state: an object must not be of {kind}")
         if issubclass(kind, msgspec.Struct):
             made: Any = kind(**{key: self._value(one, depth) for key, one in parts.items()})
             self._made[number] = made
             return made
-        made = self._made[number] = object.__new__(kind)  # raises TypeError for a function or an exception
+        made = self._made[number] = object.__new__(kind)
         for key, one in parts.items():
             _set(made, key, self._value(one, depth))
         return made

@@ -357,6 +357,8 @@ def extend_lower_hull(hull: list[Point], points: list[Point]) -> None:
 
 def _edge_over(hull: list[Point], x: float, lowest: float, highest: float) -> tuple[float, float, float]:
     """Return (slope, x, y): slope of the hull's edge above `x`, limited to two bounds, and a point of this line."""
+    if len(hull) < 2:
+        return (lowest + highest) / 2, *hull[0]
     i = 1
     while i < len(hull) - 1 and hull[i][0] < x:
         i += 1
