@@ -1,14 +1,15 @@
 """Detection of several devices with the same address, from frames without a counter.
 
 Each device sends a kind of frame with its own period and phase. The frames of several devices are therefore several
-*series* of equal distances (`series_of`). FrameSeries of one device are excluded:
+*series* of equal distances (`series_of`). The frames of one device can look like several series. imud excludes these
+cases:
 
 - A delayed frame leaves a hole in the series, so the frames are not more than the periods of the fastest series.
 - A gateway sends frames of several periods together. Frames immediately after each other are one series.
 - Frames at nearly equal distances are one series: a bus delays frames, and the timer of a device has a resolution.
 
-Devices of equal rates whose phases differ by an equal part of the period look as one faster device. Their values
-show them (`ValueSeries`).
+Devices of equal rates whose phases differ by an equal part of the period look like one faster device. Their values
+show them (`ValueOrder`).
 """
 
 from bisect import bisect_left
@@ -35,6 +36,7 @@ TOGETHER, TOGETHER_NS = 0.2, 2 * NS_PER_MS
 EQUAL: Final = 0.01  # maximum relative difference of two equal periods
 IN_ORDER: Final = 0.9  # minimum share of the frames of one device whose SID is between its neighbours
 EXTRAS: Final = 24  # number of extra frames of slow devices that imud examines together
+QUESTION: Final = "do two or more devices on the bus have this address?"
 EXTRAS_END: Final = 4  # number of periods without an extra frame after which the conflict has ended
 
 
@@ -292,6 +294,3 @@ class SameAddress:
     def add_values(self, m: Measurement) -> None:
         """Add a measurement."""
         self._values.add(m)
-
-
-QUESTION: Final = "do two or more devices on the bus have this address?"
