@@ -135,7 +135,7 @@ async def test_a_failed_bus_ends_an_open_link(monkeypatch: pytest.MonkeyPatch, c
     link.sender_failed(LinkError("a link that is not started"))
     link.open()
     link.start(lambda frames: None, lambda news, problem: None, lambda error: ends.append(str(error)))
-    for thread in [one for one in threading.enumerate() if one.name == link.title]:
+    for thread in [one for one in threading.enumerate() if one.name == "can fake"]:
         thread.join()
     if closed:
         link.close()
