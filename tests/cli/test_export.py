@@ -42,9 +42,9 @@ from tests.cli.recorded_daemon import FRAMES, run_recorded, stamped_capture
 from tests.support.files import hi91, imu61x_log
 
 EVENTS = (
-    Event(1000 * NS_PER_S, "bow", EventKind.UP, "is there", {"rate_hz": 100.0}),
-    Event(1001 * NS_PER_S, "mast", cast("EventKind", "new-kind"), "of a newer imud"),
-    Event(1002 * NS_PER_S, "", EventKind.RECORDER, "the disk is full"),
+    Event(1 * NS_PER_S, "bow", EventKind.UP, "is there", {"rate_hz": 100.0}),
+    Event(2 * NS_PER_S, "mast", cast("EventKind", "new-kind"), "of a newer imud"),
+    Event(3 * NS_PER_S, "", EventKind.RECORDER, "the disk is full"),
 )
 
 
