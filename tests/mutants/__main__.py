@@ -1,8 +1,8 @@
 """Prints which small changes of imud the tests detect: `make mutants ARGS="--seed 7"`.
 
 Each job has its own copy of the tree. It changes one file of the copy and runs pytest until a test fails: first the
-tests of the module, then of its folder, then of the folders above. A failure counts if it happens twice with the change
-and does not happen without the change.
+tests of the module, then of its folder, then of the folders above, then the tests in other folders that import the
+module. A failure counts if it happens twice with the change and does not happen without the change.
 An undetected mutant is a gap of the tests, or it is equivalent to the original: the reader decides.
 """
 
@@ -17,9 +17,9 @@ from queue import SimpleQueue
 from typing import Final
 
 from tests.mutants.changes import Mutant, choose, source_of
-from tests.mutants.trees import Run, Tree, stages
+from tests.mutants.trees import USERS, Run, Tree, stages
 
-DETECTED, MISSED, HUNG = "detected", "NOT DETECTED", "time-out"
+DETECTED, BY_USERS, MISSED, HUNG = "detected", "detected in another folder", "NOT DETECTED", "time-out"
 MEMORY_MAX_BYTES: Final = 6 << 30
 """Maximum data of one process: a mutant can append to a list without end."""
 
@@ -34,7 +34,8 @@ def judge(trees: SimpleQueue[Tree], mutant: Mutant) -> tuple[str, str, str]:
             if run.status is None:
                 return HUNG, "", output
             if not run.passed:
-                return DETECTED, [*run.failed, "the end of pytest"][0], output
+                result = BY_USERS if tests[0] == USERS[0] else DETECTED
+                return result, [*run.failed, "the end of pytest"][0], output
         return MISSED, "", output
     finally:
         trees.put(tree)
@@ -77,7 +78,7 @@ def main() -> int:
         return 0
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_MAX_BYTES, MEMORY_MAX_BYTES))
     trees: SimpleQueue[Tree] = SimpleQueue()
-    missed = 0
+    missed = elsewhere = 0
     with tempfile.TemporaryDirectory(prefix="mutants-", ignore_cleanup_errors=True) as folder:
         Path(folder).chmod(0o755)  # some tests run programs as another user
         for job in range(options.jobs):
@@ -86,11 +87,12 @@ def main() -> int:
             verdicts = pool.map(partial(judge, trees), mutants.values())
             for number, (result, test, output) in zip(mutants, verdicts, strict=True):
                 missed += result == MISSED
+                elsewhere += result == BY_USERS
                 print(f"{number:3}  {mutants[number]}  |  {result}{' by ' if test else ''}{test}", flush=True)
                 if options.mutant:
                     print(output)
     found = len(mutants) - missed
-    print(f"\n{found} of {len(mutants)} mutants detected, {found / len(mutants):.1%}")
+    print(f"\n{found} of {len(mutants)} mutants detected, {found / len(mutants):.1%}; {elsewhere} in another folder")
     return int(missed > 0)
 
 

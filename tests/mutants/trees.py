@@ -19,6 +19,8 @@ from typing import Any, Final
 from tests.mutants.changes import ROOT
 
 DOCUMENT_TESTS: Final = {"tests/test_docs.py", "tests/test_architecture.py"}
+USERS: Final = ("-m", "not live and not thorough")
+"""Options of pytest for the tests in other folders."""
 LIMIT_S: Final = 900
 """Maximum time of one run of pytest."""
 
@@ -38,9 +40,10 @@ def rules() -> dict[str, Any]:
 
 
 def stages(path: str) -> list[list[str]]:
-    """Return the test modules for a module of imud: its own, then its folder, the subfolders, the folders above.
+    """Return the arguments of pytest for a module of imud: its tests, its folder, the subfolders, the folders above.
 
-    Tests of the whole daemon run for modules at the top only. Without an own test module, the tests of users run.
+    The last stage has the tests in other folders that import the module, without slow tests. Tests of the whole daemon
+    run for modules at the top only.
     """
     module = Path(path).with_suffix("")
     dotted = ".".join(module.parts)
@@ -52,13 +55,13 @@ def stages(path: str) -> list[list[str]]:
     below = sorted(folders[0].glob("*/**/")) if len(folders) > 1 else []
     found = [first, tests_in(folders[0]), [test for folder in below for test in tests_in(folder)]]
     found += map(tests_in, folders[1:-1])
-    if not first:
-        tests = [
-            path for path in sorted((ROOT / "tests").rglob("test_*.py")) if path.parts[-2] not in rules()["ELSEWHERE"]
-        ]
-        found.append([path.relative_to(ROOT).as_posix() for path in tests if dotted in path.read_text()])
+    every = [folder for folder in sorted((ROOT / "tests").glob("**/")) if folder.name not in rules()["ELSEWHERE"]]
+    found.append([test for folder in every for test in tests_in(folder) if dotted in (ROOT / test).read_text()])
     stage_of = {test: number for number, stage in reversed(list(enumerate(found))) for test in stage}
-    return [new for number, stage in enumerate(found) if (new := [test for test in stage if stage_of[test] == number])]
+    own_stages = [[test for test in stage if stage_of[test] == number] for number, stage in enumerate(found)]
+    if users := own_stages.pop():
+        own_stages.append([*USERS, *users])
+    return [stage for stage in own_stages if stage]
 
 
 @dataclass
