@@ -123,8 +123,11 @@ async def test_waiting_scrapes_share_one_page_per_format() -> None:
 
 
 @in_loop
-async def test_a_scrape_reads_a_limited_number_of_devices_per_turn() -> None:
-    turn, seen = 0, []
+async def test_a_scrape_reads_few_devices_per_turn_and_pauses_before_each_metric(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    turn, seen, pauses_s = 0, [], list[float]()
+    monkeypatch.setattr(time, "sleep", pauses_s.append)
 
     def each_status() -> Iterator[DeviceStatus]:
         for number in range(2 * DEVICES_PER_TURN + 1):
@@ -142,6 +145,7 @@ async def test_a_scrape_reads_a_limited_number_of_devices_per_turn() -> None:
         _, _, body = await ask(served.port)
         counting.cancel()
         assert f'imud_device_up{{device="imu{2 * DEVICES_PER_TURN}"' in str(body)
+    assert pauses_s.count(100e-6) > 50
     assert max(Counter(seen).values()) == DEVICES_PER_TURN
     assert len(set(seen)) == 3
 
@@ -197,7 +201,7 @@ async def test_paths_and_methods() -> None:
 
 
 @in_loop
-async def test_a_blocked_loop_causes_status_503_and_close_does_not_wait() -> None:
+async def test_a_blocked_or_closed_loop_causes_status_503_and_close_does_not_wait() -> None:
     async with publisher(context(), snapshot_s=0.05) as served:
         with socket.create_connection(("127.0.0.1", served.port), LIMIT_S) as connection:
             connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
@@ -208,6 +212,15 @@ async def test_a_blocked_loop_causes_status_503_and_close_does_not_wait() -> Non
         connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
         other.close()
         assert b"200" not in read_all(connection)
+    ended = MetricsPublisher(MetricsOptions(port=0), context())
+
+    async def start() -> None:
+        ended.start()
+
+    await asyncio.to_thread(asyncio.run, start())
+    line, _, body = await ask(ended.port)
+    assert (line, body) == ("HTTP/1.1 503 Service Unavailable", "the daemon did not reply within 2 s\n")
+    ended.close()
 
 
 @in_loop

@@ -166,17 +166,18 @@ def test_a_ring_is_written_if_its_file_exists_and_has_a_heartbeat(board: Board) 
     assert reader.read({"bow": ""}, {}, START_NS) == {"bow": RingView(False)}
 
 
-def test_a_pause_follows_each_number_of_values(tmp_path: Path) -> None:
+def test_a_pause_follows_each_number_of_values_and_the_newest_4096_samples_are_read(tmp_path: Path) -> None:
     """Few samples cause no pause. 4096 samples are read, then added up in four blocks on three axes."""
-    for count, expected in ((100, 0), (4096, 3)):
+    for count, expected in ((100, 0), (5000, 4)):
         pauses: list[int] = []
         folder = tmp_path / str(count)
         folder.mkdir()
-        board = Board(folder, slots=SAMPLES_MAX, now_ns=0)
+        board = Board(folder, slots=2 * SAMPLES_MAX, now_ns=0)
         board.publish(range(1, count + 1))
         reader = RingReader(lambda pauses=pauses: pauses.append(1), motion=True)  # type: ignore[misc]
-        reader.read({DEVICE: str(board.path)}, {DEVICE: count}, 0)
-        assert len(pauses) == expected
+        motion = reader.read({DEVICE: str(board.path)}, {DEVICE: count}, 0)[DEVICE].motion
+        assert motion is not None
+        assert (len(pauses), motion.span_ns) == (expected, (min(count, SAMPLES_MAX) - 1) * NS_PER_MS)
         board.publisher.close()
 
 

@@ -3,15 +3,16 @@
 import asyncio
 import errno
 import socket
+import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from time import monotonic
 from typing import Any
+from unittest.mock import Mock, call
 
 import pytest
 
 from imud.model.errors import ServerError
-from imud.publishers.metrics import scrape_server
 from imud.publishers.metrics.scrape_server import Answer, HttpRequest, HttpResponse, ScrapeServer, parse_request
 from tests.support.event_loops import in_loop
 from tests.support.metrics import LIMIT_S, ask, read_all
@@ -42,14 +43,13 @@ async def test_silent_clients_and_incomplete_requests_end_in_time(said: bytes) -
 
 @in_loop
 async def test_silent_clients_cannot_lock_out_a_scraper() -> None:
-    async with server(hello, connections_max=4, connection_s=60) as served:
-        silent = [socket.create_connection(("127.0.0.1", served.port), LIMIT_S) for _ in range(12)]
+    async with server(hello, connection_s=60) as served:
+        silent = [socket.create_connection(("127.0.0.1", served.port), LIMIT_S) for _ in range(40)]
         for _ in range(3):
             assert (await ask(served.port))[2] == "hello"
-        ended = 0
-        for connection in silent[:8]:  # the server closed the oldest connections
-            ended += read_all(connection) == b""
-        assert ended == 8
+        assert served.connections == 31
+        # the server closed the oldest connections
+        assert [read_all(connection) for connection in silent[:9]] == [b""] * 9
         for connection in silent:
             connection.close()
 
@@ -94,8 +94,11 @@ async def test_a_request_above_the_limit_is_disconnected(size: int, is_answered:
 
 
 @in_loop
-async def test_the_server_pauses_without_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_server_pauses_without_descriptors_and_limits_times(monkeypatch: pytest.MonkeyPatch) -> None:
     accept, calls_s = socket.socket.accept, list[float]()
+    call_later, pauses_s = asyncio.BaseEventLoop.call_later, list[float]()
+    interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(0.5)
 
     def refuse_twice(listener: socket.socket) -> tuple[socket.socket, Any]:
         calls_s.append(monotonic())
@@ -103,10 +106,20 @@ async def test_the_server_pauses_without_descriptors(monkeypatch: pytest.MonkeyP
             raise OSError(errno.EMFILE, "Too many open files")
         return accept(listener)
 
+    def soon(loop: asyncio.BaseEventLoop, delay_s: float, *work: Any) -> asyncio.TimerHandle:
+        pauses_s.append(delay_s)
+        return call_later(loop, delay_s / 20, *work)
+
+    timeout = Mock(wraps=asyncio.timeout)
     async with server(hello) as served:
-        monkeypatch.setattr(scrape_server, "ACCEPT_PAUSE_S", 0.05)
+        assert sys.getswitchinterval() < 0.001, "a scrape does not delay the event loop"
+        sys.setswitchinterval(interval_s)
+        monkeypatch.setattr(asyncio.BaseEventLoop, "call_later", soon)
+        monkeypatch.setattr(asyncio, "timeout", timeout)
         monkeypatch.setattr(socket.socket, "accept", refuse_twice)
         assert (await ask(served.port))[2] == "hello"
+    assert pauses_s == [1.0, 1.0]
+    assert call(5.0) in timeout.mock_calls, "the maximum time of a connection"
     first_s, second_s, third_s = calls_s
     assert second_s - first_s >= 0.05
     assert third_s - second_s >= 0.05
