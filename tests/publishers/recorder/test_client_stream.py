@@ -126,6 +126,8 @@ def test_only_selected_devices_are_recorded_until_the_client_disconnects() -> No
     ours, theirs = stream_pair()
     with ours, theirs:
         assert ours.recv(1) == b""
+        sizes = [end.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF) for end in (theirs, ours)]
+        assert sizes[0] < sizes[1], "the default is too small for two blocks"
         with pytest.raises(BrokenPipeError):
             theirs.send(b"?", socket.MSG_NOSIGNAL)
 
@@ -164,5 +166,9 @@ def test_waiting_records_are_sent_when_imud_stops(monkeypatch: pytest.MonkeyPatc
     stuck.recording.stop("imud stopped")
     stuck.recording.close(flush=True)
     assert stuck.recording.ended
+    quick = StreamBench()
+    quick.recording.close()
+    assert (quick.read(), quick.got) == (True, b"")
     bench.close()
+    quick.close()
     stuck.close()

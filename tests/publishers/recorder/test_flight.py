@@ -308,9 +308,10 @@ def test_invalid_options_are_rejected_and_an_error_of_the_thread_ends_the_daemon
     with pytest.raises(ServerError, match="flight recorder"):
         FlightBench(tmp_path, directory=str(tmp_path / "a" / "b"))
     with pytest.raises(ValueError, match="room for a snapshot"):
-        RecorderOptions(keep_gb=0.25, enabled=True, flight=FlightOptions(enabled=True))
-    RecorderOptions(keep_gb=0.25, flight=FlightOptions(enabled=True))
-    assert (records.VERSION, RecorderOptions().keep_bytes) == (1, 10_000_000_000)
+        RecorderOptions(keep_gb=0.263, enabled=True, flight=FlightOptions(enabled=True))
+    for keep_gb, enabled in ((0.264, True), (0.2, False)):  # two files of 100 MB and a snapshot of 64 MB
+        options = RecorderOptions(keep_gb=keep_gb, enabled=enabled, flight=FlightOptions(enabled=True))
+    assert (records.VERSION, options.keep_bytes) == (1, 200_000_000)
     bench = FlightBench(tmp_path)
     bench.workers[0].failed(ZeroDivisionError("a mistake"))
     with pytest.raises(ZeroDivisionError):
