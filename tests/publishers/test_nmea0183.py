@@ -443,7 +443,10 @@ async def test_every_client_gets_every_sentence(made: Server) -> None:
     assert first.recv(100) == second.recv(100) == ONE * 2
     assert made.status().sent == 4
     assert made.status().dropped == 0
+    (number, client), *_ = made._clients.items()
     first.shutdown(socket.SHUT_WR)  # kplex direction=in, ncat </dev/null
+    await until(lambda: client.is_half_closed)
+    assert not asyncio.get_running_loop().remove_reader(number), "imud does not watch the readable socket"
     second.close()
 
     def is_alone() -> bool:
@@ -488,7 +491,7 @@ async def test_without_descriptors_the_server_accepts_again_after_a_pause(
     with monkeypatch.context() as patch:
         patch.setattr(loop, "call_later", later)
         made._accept(full)
-    later.assert_called_once_with(nmea0183.ACCEPT_PAUSE_S, made._listen_again)
+    later.assert_called_once_with(1.0, made._listen_again)
     assert not loop.remove_reader(made._listener), "a full server does not watch the listener"
     made._listen_again()
     await made.connected()

@@ -10,7 +10,7 @@ import asyncio
 import selectors
 from collections.abc import Callable, Coroutine
 from functools import wraps
-from typing import Any, ParamSpec
+from typing import Any, ParamSpec, TypeVar
 
 from imud.device.polled_bus import PolledBuses
 from imud.host import event_loop
@@ -19,23 +19,25 @@ from imud.host.threads import Job
 from imud.model.units import NS_PER_S
 
 P = ParamSpec("P")
+T = TypeVar("T")
 
 
 def in_loop(test: Callable[P, Coroutine[None, None, None]]) -> Callable[P, None]:
 
     @wraps(test)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
-        event_loop.run(_without_readers_left(test(*args, **kwargs)))
+        event_loop.run(without_readers_left(test(*args, **kwargs)))
 
     return run
 
 
-async def _without_readers_left(body: Coroutine[Any, Any, None]) -> None:
-    await body
+async def without_readers_left(body: Coroutine[Any, Any, T]) -> T:
+    result = await body
     loop = asyncio.get_running_loop()
     assert isinstance(loop, event_loop.SampleLoop)
     assert not loop._reader_selector._readers, "a descriptor is still watched"
     assert not timers_left(loop)
+    return result
 
 
 def timers_left(loop: Any) -> list[str]:

@@ -28,6 +28,7 @@ from imud.model.sample import Sample, Sync
 from imud.publishers.socket.messages import NOTIFICATIONS
 from imud.publishers.socket.methods import METHODS
 from imud.publishers.socket.server import SocketOptions, SocketServer
+from tests.support.event_loops import without_readers_left
 from tests.support.publisher_context import publisher_context
 
 
@@ -225,7 +226,7 @@ def run(body: Callable[[], Awaitable[T]]) -> T:
             return await body()
 
     try:
-        result = event_loop.run(limited())
+        result = event_loop.run(without_readers_left(limited()))
     finally:
         while _peers:
             _peers.pop().close()
