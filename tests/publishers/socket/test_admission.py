@@ -213,14 +213,16 @@ def test_a_frequent_message_is_logged_once_a_minute_with_its_count() -> None:
 
 
 def test_the_limit_of_descriptors_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
-    limits = [(1024, 524_288)]
-    monkeypatch.setattr(resource, "getrlimit", lambda _which: limits[-1])
+    limits: list[tuple[int, int]] = []
+    monkeypatch.setattr(resource, "getrlimit", lambda _which: limits[0])
     monkeypatch.setattr(resource, "setrlimit", lambda _which, pair: limits.append(pair))
-    assert quota.raise_fd_limit() == 16_384
-    assert limits[-1] == (16_384, 524_288)
-    assert quota.raise_fd_limit() == 16_384
-    limits[:] = [(1024, 4096)]
-    assert quota.raise_fd_limit() == 4096
+    most = resource.RLIM_INFINITY
+    for soft, hard, limit in ((1024, 524_288, 16_384), (1024, 4096, 4096), (1024, most, 16_384)):
+        limits[:] = [(soft, hard)]
+        assert (quota.raise_fd_limit(), limits[1:]) == (limit, [(limit, hard)])
+    for soft, hard, limit in ((16_384, most, 16_384), (65_536, 65_536, 65_536), (most, most, 16_384)):
+        limits[:] = [(soft, hard)]
+        assert (quota.raise_fd_limit(), limits[1:]) == (limit, []), "imud does not lower a limit"
 
 
 def test_rights_of_users_and_groups() -> None:
