@@ -1,7 +1,9 @@
 """Recording for a client: complete for a client that reads, with marked losses for a slow client, without waiting."""
 
+import select
 import socket
 from io import BytesIO
+from unittest.mock import Mock, call
 
 import pytest
 
@@ -159,13 +161,15 @@ def test_waiting_records_are_sent_when_imud_stops(monkeypatch: pytest.MonkeyPatc
     bench.recording.close(flush=True)
     assert bench.read()
     assert bench.records()[-1].kind == Kind.END
-    monkeypatch.setattr(module, "CLOSE_WAIT_MS", 0)
+    poll = Mock()
+    monkeypatch.setattr(select, "poll", lambda: poll)
     stuck = StreamBench()
     for _ in range(100):
         stuck.source.deliver(100_000)
     stuck.recording.stop("imud stopped")
     stuck.recording.close(flush=True)
     assert stuck.recording.ended
+    assert poll.poll.mock_calls == [call(50)] * 10, "half a second"
     quick = StreamBench()
     quick.recording.close()
     assert (quick.read(), quick.got) == (True, b"")

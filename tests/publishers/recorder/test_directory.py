@@ -27,6 +27,13 @@ def test_names_sort_by_time_and_are_recognized(tmp_path: Path) -> None:
         assert len(directory.files()) == 1
     with pytest.raises(ValueError, match=f"another directory than {tmp_path}, got the same"):
         RecorderOptions(directory=str(tmp_path), flight=FlightOptions(directory=f"{tmp_path}/."))
+    with pytest.raises(ValueError, match="room for two files of file_mb"):
+        RecorderOptions(keep_gb=0.199)
+    with pytest.raises(ValueError, match="room for a snapshot"):
+        RecorderOptions(keep_gb=0.263, enabled=True, flight=FlightOptions(enabled=True))
+    for keep_gb, enabled in ((0.264, True), (0.2, False)):  # two files of 100 MB and a snapshot of 64 MB
+        options = RecorderOptions(keep_gb=keep_gb, enabled=enabled, flight=FlightOptions(enabled=True))
+    assert options.keep_bytes == 200_000_000
     assert all(NAME.fullmatch(file.name) for file in directory.files())
 
 
