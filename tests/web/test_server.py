@@ -11,6 +11,7 @@ from contextlib import asynccontextmanager, closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock, call
 
 import pytest
 from aiohttp import ClientWebSocketResponse, WSMsgType, WSServerHandshakeError
@@ -216,6 +217,7 @@ async def login(site: Site) -> tuple[int, dict[str, str]]:
 
 
 async def test_replies_to_wrong_tokens_are_delayed_and_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    failure_s, sleep, delays_s = web_app.FAILURE_S, asyncio.sleep, set[float]()
     monkeypatch.setattr(web_app, "FAILURE_S", 3600.0)
     async with running(tmp_path) as site:
         _, session = await login(site)
@@ -237,11 +239,23 @@ async def test_replies_to_wrong_tokens_are_delayed_and_limited(tmp_path: Path, m
         assert (await right)[1]["control"], "a right token waits and is accepted"
         async with site.client.get("/", headers=forged) as page:
             assert (page.status, page.cookies[COOKIE].value) == (200, "")
-    monkeypatch.setattr(web_app, "FAILURE_S", 0.0)
+    monkeypatch.setattr(web_app, "FAILURE_S", failure_s)
+
+    async def skip(delay_s: float) -> None:
+        delays_s.add(delay_s)
+        await sleep(0 if delay_s == 2.0 else delay_s)
+
     async with running(tmp_path) as site:
-        assert await site.post("/api/login", {"token": "wrong"}) == (401, {"error": "wrong token"})
-        monkeypatch.setattr(web_app, "CHECKS_TOTAL_MAX", 0)
+        with monkeypatch.context() as patch:
+            patch.setattr(asyncio, "sleep", skip)
+            assert await site.post("/api/login", {"token": "wrong"}) == (401, {"error": "wrong token"})
+        assert 2.0 in delays_s
+        requests: list[Any] = [SimpleNamespace(remote=f"192.0.2.{number % 3}") for number in range(64)]
+        checks = [asyncio.create_task(site.web.checks.check(one, lambda: False)) for one in requests]
+        await until(lambda: site.web.checks.total == len(checks))
         assert (await site.post("/api/login", {"token": TOKEN}))[0] == 429, "too many from all addresses"
+        for check in checks:
+            check.cancel()
     async with running(tmp_path, token="") as site:
         assert (await site.post("/api/login", {"token": ""}))[0] == 403
 
@@ -348,16 +362,17 @@ async def test_an_invalid_message_of_a_page_is_reported_to_it(tmp_path: Path) ->
         assert last.data == 1009, "too long a message ends the connection"
 
 
-async def test_pages_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(web_app, "BROWSERS_MAX", 1)
+async def test_pages_are_bounded(tmp_path: Path) -> None:
     async with running(tmp_path) as site:
+        assert site.web.hub is not None
+        for _ in range(63):
+            site.web.hub.add(mailbox.Browser())
         socket = await site.stream(look="overview")
         with pytest.raises(WSServerHandshakeError, match="503"):
             await site.client.ws_connect("/api/stream", headers=site.origin)
         await socket.close()
-        assert site.web.hub is not None
-        hub = site.web.hub
-        await until(lambda: not hub.browsers)
+        browsers = site.web.hub.browsers
+        await until(lambda: len(browsers) == 63)
         await (await site.stream(look="overview")).close()
 
 
@@ -432,23 +447,31 @@ async def test_malformed_requests_are_not_logged(
 
 
 async def test_connections_without_a_complete_request_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("IDLE_S", "CHECK_S", "BODY_S"):
+    for name in ("IDLE_S", "CHECK_S"):
         monkeypatch.setattr(web_app, name, 0.01)
     async with listening(tmp_path) as (host, port):
         reader, writer = await asyncio.open_connection(host, port)
         assert await reader.read() == b""
         writer.close()
+    limits = Mock(return_value=asyncio.timeout(0))
+    monkeypatch.setattr(asyncio, "timeout", limits)
     with pytest.raises(HTTPRequestTimeout):
         await web_app._body(SimpleNamespace(read=asyncio.Event().wait))  # type: ignore[arg-type]
+    limits.assert_called_once_with(10.0)
 
 
-async def test_a_request_uses_its_own_connection_and_names_a_missing_daemon(tmp_path: Path) -> None:
+async def test_a_request_uses_its_own_connection_and_names_a_missing_daemon(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limits = Mock(wraps=asyncio.timeout)
+    monkeypatch.setattr(asyncio, "timeout", limits)
     async with serving(tmp_path) as server:
         calls = Calls(server.hub.path)
         report = await calls.call("settings.get", {"device": "imu0"})
         assert report["settings"][0]["actual"] == "6-axis"
         request = {"device": "imu0", "name": "yaw", "arguments": {"angle_deg": 5}}
         assert await calls.call("command", request) is None
+        assert limits.call_args_list == [call(10.0), call(660.0)], "a calibration takes up to 600 s"
         await socket_rig.until(lambda: not server.hub.connections)
         with pytest.raises(RpcError, match="no device named 'none'") as caught:
             await Calls(server.hub.path).call("actions", {"device": "none"})
@@ -478,6 +501,7 @@ async def test_long_orders_hold_up_no_others_and_are_bounded(tmp_path: Path) -> 
     [
         (b"", "closed the connection"),
         (b"GET / HTTP/1.1\n", "not JSON"),
+        (b"x" * 5_000_000, "at most 4194304 bytes"),
         (b'{"jsonrpc":"2.0","method":"hello","params":{"protocol":9}}\n', "protocol 1"),
         (b'{"jsonrpc":"2.0","method":"hello","params":{"protocol":1}}\nhalf', "closed the connection|is lost"),
         (b'{"jsonrpc":"2.0","id":null,"error":{"code":-32002,"message":"too many clients"}}\n', "too many clients"),
