@@ -264,7 +264,7 @@ def test_usual_bytes_covers_full_sentences_and_empty_samples_make_none(kind: nme
     )  # fmt: skip
     made = nmea0183.make(kind, full, nmea0183.HeadingReference(Heading.TRUE, 12.6))
     assert made is not None
-    assert len(made) <= nmea0183.USUAL_BYTES[kind]
+    assert 0 <= nmea0183.USUAL_BYTES[kind] - len(made) <= 8
     assert nmea0183.make(kind, sample(euler_deg=None), CORRECTED) is None
 
 
@@ -524,6 +524,18 @@ async def test_a_client_that_does_not_read_loses_complete_sentences_and_is_disco
     made.clock.advance(1)
     made.tick(made.clock.now_ns())
     assert made.status().readers == 0
+
+
+def test_the_rest_of_a_sentence_precedes_the_next_sentence() -> None:
+    got = bytearray()
+
+    def send_some(data: bytes) -> int:
+        got.extend(data[:5])
+        return len(data[:5])
+
+    client = nmea0183.TcpClient(Mock(send=send_some), "")
+    assert [client.put(ONE, 0) for _ in range(8)] == [True, False, False, True, False, False, True, False]
+    assert bytes(got) == (ONE * 3)[: len(got)]
 
 
 @in_context("made", serving)
