@@ -30,7 +30,7 @@ from imud.model.units import NS_PER_S
 from imud.publishers import shm as ring
 from imud.publishers.shm import ShmOptions, ShmPublisher
 from tests.support.files import ROOT
-from tests.support.publisher_context import publisher_context
+from tests.support.publisher_context import FakeLatencies, publisher_context
 from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample, slot_at
 
 
@@ -232,9 +232,13 @@ def test_a_tick_reads_ledgers_without_the_complete_state(tmp_path: Path) -> None
 
 
 def test_close_marks_the_ring_and_removes_the_file(board: Board) -> None:
+    latencies = board.context.latencies
+    assert isinstance(latencies, FakeLatencies)
+    assert latencies.asked == {"shared memory": (5_000_000, None)}
     with board.path.open("rb") as file:
         board.ledger.bytes_in, board.now_ns = 9, START_NS + 7
         board.publisher.close()
+        assert latencies.asked == {}
         raw = file.read()
     header = layout.decode_header(raw[: layout.HEADER_BYTES], "x")
     block = layout.decode_ledger_block(raw[layout.LEDGER_BLOCK_OFFSET :][: layout.LEDGER_BLOCK_BYTES], 1)
