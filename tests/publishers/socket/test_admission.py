@@ -167,15 +167,16 @@ def test_a_user_that_has_not_connected_lately_is_forgotten(monkeypatch: pytest.M
 
 
 def test_descriptors_and_wakers_are_limited() -> None:
-    house = House(fd_limit=1024)
-    assert house.connect(1000, fd=767) == ""
-    assert "descriptor" in house.connect(1000, fd=768)
-    assert "descriptor" in house.connect(OWN_UID, fd=784)
-    assert [house.connect(uid, ALL, fd=783) for uid in (0, 2000)] == ["", ""]  # a descriptor of a reserved place
-    assert "descriptor" in house.connect(0, ALL, fd=784)
-    house.quota.check_fds((5, 767))
-    with pytest.raises(RpcError, match="file descriptors for clients are in use"):
-        house.quota.check_fds((5, 768))
+    for limit, end in ((1000, 750), (4096, 3840)):
+        house = House(fd_limit=limit)
+        assert house.connect(1000, fd=end - 1) == ""
+        assert "descriptor" in house.connect(1000, fd=end)
+        assert "descriptor" in house.connect(OWN_UID, fd=end + 16)
+        assert [house.connect(uid, ALL, fd=end + 15) for uid in (0, 2000)] == ["", ""], "for a reserved place"
+        assert "descriptor" in house.connect(0, ALL, fd=end + 16)
+        house.quota.check_fds((5, end - 1))
+        with pytest.raises(RpcError, match="file descriptors for clients are in use"):
+            house.quota.check_fds((5, end))
     house = House(per_user=2)
     with pytest.raises(RpcError, match="uid 1000 has 8 descriptors, the maximum"):
         house.quota.check_waker(1000, 8)
