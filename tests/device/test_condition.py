@@ -49,95 +49,60 @@ LATE = facts(t_err_ns=2_100_000)
 @pytest.mark.parametrize(
     ("known", "condition", "message", "step"),
     [
-        (
-            facts(DeviceState.MISSING, "the port is missing"), "missing", "The port /dev/ttyUSB0 does not exist.",
-            f"Plug in the cable, or correct uart.port in the configuration. {THERE}",
-        ),
-        (
-            facts(DeviceState.SEARCHING, "no byte arrives"), "missing", "No data arrives at /dev/ttyUSB0.",
-            "Check the power supply, and check that TX and RX are not swapped.",
-        ),
-        (
-            facts(DeviceState.SILENT, "no sample for 1.0 s, but the link is open"), "missing",
-            "The device stopped sending 12 s ago. Its port still exists.", "Check the power supply and the connector.",
-        ),
+        (facts(DeviceState.MISSING, "the port is missing"), "missing", "The port /dev/ttyUSB0 does not exist.",
+         f"Plug in the cable, or correct uart.port in the configuration. {THERE}"),
+        (facts(DeviceState.SEARCHING, "no byte arrives"), "missing", "No data arrives at /dev/ttyUSB0.",
+         "Check the power supply, and check that TX and RX are not swapped."),
+        (facts(DeviceState.SILENT, "no sample for 1.0 s, but the link is open"), "missing",
+         "The device stopped sending 12 s ago. Its port still exists.", "Check the power supply and the connector."),
         (facts(DeviceState.FAILED, "port is in use by gpsd"), "missing", "Port is in use by gpsd.", DOCTOR),
-        (
-            facts(DeviceState.SEARCHING, SEARCH_BEGUN), "missing",
-            "imud searches for the device at /dev/ttyUSB0.", "Wait for the search.",
-        ),
-        (
-            facts(DeviceState.SEARCHING, "bytes arrive, but no valid frame", recent=recent(bytes_in=9)), "missing",
-            "Bytes arrive, but no valid frame.", DOCTOR,
-        ),
+        (facts(DeviceState.SEARCHING, SEARCH_BEGUN), "missing",
+         "imud searches for the device at /dev/ttyUSB0.", "Wait for the search."),
+        (facts(DeviceState.SEARCHING, "bytes arrive, but no valid frame", recent=recent(bytes_in=9)), "missing",
+         "Bytes arrive, but no valid frame.", DOCTOR),
         (facts(DeviceState.SILENT, "it replies but sends none"), "missing", "It replies but sends none.", DOCTOR),
-        (
-            declared(SettingsState.DIFFER, differences={"mounting": SettingDifference("x up", "level")}), "attention",
-            "Mounting is “level” on the device, but “x up” in the configuration.", APPLY,
-        ),
-        (
-            declared(SettingsState.DIFFER, differences={"low_pass_hz": SettingDifference(20)}), "attention",
-            "Low pass is not known on the device, but “20” in the configuration.", APPLY,
-        ),
-        (
-            declared(unsaved=True, lost_at_power_off={"mode": "9 axes"}), "attention",
-            "Mode “9 axes” is lost at power-off because it is not saved.", SAVE,
-        ),
+        (declared(SettingsState.DIFFER, differences={"mounting": SettingDifference("x up", "level")}), "attention",
+         "Mounting is “level” on the device, but “x up” in the configuration.", APPLY),
+        (declared(SettingsState.DIFFER, differences={"low_pass_hz": SettingDifference(20)}), "attention",
+         "Low pass is not known on the device, but “20” in the configuration.", APPLY),
+        (declared(unsaved=True, lost_at_power_off={"mode": "9 axes"}), "attention",
+         "Mode “9 axes” is lost at power-off because it is not saved.", SAVE),
         (declared(unsaved=True), "attention", "A change is lost at power-off because it is not saved.", SAVE),
-        (
-            declared(problem="cannot read the settings: no reply"), "attention", "Cannot read the settings: no reply.",
-            "Run `imud settings` with the name of the device.",
-        ),
-        (
-            axes(
-                FrameProblem.DECLINATION,
-                "declination_deg is configured, but yaw is measured from the direction at power-on",
-            ),
-            "attention", "declination_deg is configured, but yaw is measured from the direction at power-on.",
-            "Calibrate the magnetometer, or remove declination_deg from the configuration.",
-        ),
-        (
-            axes(FrameProblem.GRAVITY, "at rest, up is +x: set frame"), "attention",
-            "The measured gravity does not match the attitude.", "At rest, up is +x: set frame.",
-        ),
+        (declared(problem="cannot read the settings: no reply"), "attention", "Cannot read the settings: no reply.",
+         "Run `imud settings` with the name of the device."),
+        (axes(
+             FrameProblem.DECLINATION,
+             "declination_deg is configured, but yaw is measured from the direction at power-on",
+         ),
+         "attention", "declination_deg is configured, but yaw is measured from the direction at power-on.",
+         "Calibrate the magnetometer, or remove declination_deg from the configuration."),
+        (axes(FrameProblem.GRAVITY, "at rest, up is +x: set frame"), "attention",
+         "The measured gravity does not match the attitude.", "At rest, up is +x: set frame."),
         (axes(FrameProblem.AXES, "imud does not know urfr 9"), "attention", "imud does not know urfr 9.", DOCTOR),
-        (
-            facts(lines=LinesStatus({}, {}, {}, alarm=True)), "attention", "The ALARM pin is active.",
-            "Compare the measured values with the limits of the device (docs/lines.md).",
-        ),
+        (facts(lines=LinesStatus({}, {}, {}, alarm=True)), "attention", "The ALARM pin is active.",
+         "Compare the measured values with the limits of the device (docs/lines.md)."),
         (facts(lines=LinesStatus({"sout": "no chip"}, {}, {})), "attention", "Line sout: no chip.", DOCTOR),
         (facts(has_scattered_time=True), "degraded", "The device time scatters: imud cannot count lost samples.",
          DOCTOR),
         (facts(utc_problem="gpsd is down"), "attention", "gpsd is down.".capitalize(), DOCTOR),
-        (
-            facts(open_bytes=3), "attention", "The ledger does not balance: 3 bytes.",
-            "Report this fault of imud with the output of `imud status --json`.",
-        ),
-        (
-            facts(recent=recent(restarts=3)), "attention", "The device restarted 3 times in the last hour.",
-            "Measure the supply voltage at the device.",
-        ),
-        (
-            facts(recent=recent(samples=961, lost={"crc": 38, "queue": 1})), "degraded",
-            "3.9 % of the samples are lost because frames are damaged.",
-            "Check the cable, its length and its ground. If they are correct, use a lower bit rate.",
-        ),
-        (
-            facts(recent=recent(samples=998, lost={"overrun": 2})), "degraded",
-            "0.20 % of the samples are lost in kernel buffer overruns.",
-            "Reduce the load of this host, or use a lower rate.",
-        ),
-        (
-            facts(recent=recent(gaps=2)), "degraded",
-            "Samples are lost in 2 gaps of unknown size in the last minute.", DOCTOR,
-        ),
-        (
-            facts(recent=recent(45.9)), "degraded", "The device sends 45.9 samples per second instead of 50.",
-            "Compare the output rate in the settings of the device with its bit rate.",
-        ),
-        (
-            LATE, "degraded", "The time stamp error is ±2.1 ms.", "Connect SOUT, or reduce the latency timer.",
-        ),
+        (facts(open_bytes=3), "attention", "The ledger does not balance: 3 bytes.",
+         "Report this fault of imud with the output of `imud status --json`."),
+        (facts(recent=recent(restarts=3)), "attention", "The device restarted 3 times in the last hour.",
+         "Measure the supply voltage at the device."),
+        (facts(recent=recent(samples=961, lost={"crc": 38, "queue": 1})), "degraded",
+         "3.9 % of the samples are lost because frames are damaged.",
+         "Check the cable, its length and its ground. If they are correct, use a lower bit rate."),
+        (facts(recent=recent(samples=998, lost={"overrun": 2})), "degraded",
+         "0.20 % of the samples are lost in kernel buffer overruns.",
+         "Reduce the load of this host, or use a lower rate."),
+        (facts(recent=recent(gaps=2)), "degraded",
+         "Samples are lost in 2 gaps of unknown size in the last minute.", DOCTOR),
+        (facts(recent=recent(45.9)), "degraded", "The device sends 45.9 samples per second instead of 50.",
+         "Compare the output rate in the settings of the device with its bit rate."),
+        (LATE, "degraded", "The time stamp error is ±2.1 ms.", "Connect SOUT, or reduce the latency timer."),
+        (facts(recent=recent(0.79), expected_rate_hz=1.0), "degraded",
+         "The device sends 0.8 samples per second instead of 1.",
+         "Compare the output rate in the settings of the device with its bit rate."),
         (facts(problem="can0 is error-passive"), "degraded", "can0 is error-passive.", DOCTOR),
         (facts(DeviceState.FINISHED, ""), "ok", "The replay is at its end.", ""),
     ],
@@ -154,6 +119,7 @@ def test_each_sentence(known: device_condition.Facts, condition: str, message: s
         facts(recent=recent(samples=999, lost={"crc": 1})),
         facts(recent=recent(49.0)),
         facts(recent=recent(51.0)),
+        facts(recent=recent(0.81), expected_rate_hz=1.0),
         facts(recent=recent(30.0), expected_rate_hz=0.0),
         facts(recent=recent(restarts=2)),
         LATE,
@@ -313,9 +279,11 @@ def test_losses_of_the_last_minute_by_cause_and_restarts_of_the_last_hour() -> N
     found = counted.pass_seconds(29, lost_unknown=1)
     assert (found.samples, found.lost, found.gaps) == (59 * 50, {"crc": 60, "queue": 30}, 29)
     assert (found.loss_ns, found.loss_samples, found.loss_cause) == (59 * S, 90, "crc")
+    counted.pass_seconds(59)
+    assert counted.pass_seconds(1, lost_queue=1).loss_samples == 91  # 60 s after the previous loss
     later = counted.pass_seconds(61)
     assert (later.samples, later.lost, later.gaps) == (60 * 50, {}, 0)
-    assert (later.loss_ns, later.loss_samples) == (59 * S, 90)
+    assert (later.loss_ns, later.loss_samples) == (119 * S, 91)
     again = counted.pass_seconds(1, lost_overrun=1)
     assert (again.loss_samples, again.loss_cause) == (1, "overrun")
     counted = Counted()
@@ -334,8 +302,9 @@ def test_the_rate_contains_lost_samples_and_the_short_rate_falls_to_zero() -> No
     assert counted.pass_seconds(11, samples=45).rate_hz == 45.0
     assert counted.pass_seconds(1, lost_unknown=1).rate_hz is None
     counted.pass_seconds(12)
-    counted.expected_hz = 25.0
-    assert counted.pass_seconds(10, samples=25).rate_hz is None  # the device changed its rate
+    for counted.expected_hz, rate_hz in ((50.4, 50.0), (50.6, None), (25.0, None)):  # the device changed its rate
+        assert counted.pass_seconds(1).rate_hz == rate_hz
+    assert counted.pass_seconds(9, samples=25).rate_hz is None
     assert counted.pass_seconds(2, samples=25).rate_hz == 25.0
     assert Counted(timed=False).pass_seconds(30).rate_hz is None
     counted = Counted()
