@@ -134,7 +134,7 @@ def test_two_good_frames_are_enough_with_few_bad_frames_and_noise() -> None:
     good = fake_frame(b"z" * 76)
     search = Search([FAKE_DRIVER], bauds=(115200,))
     search.start(0)
-    for place, frame in enumerate([bad, bad, bad, bad, bad, good, good, good]):
+    for place, frame in enumerate([bad, bad, good, good, bad, bad, bad, good]):
         assert not isinstance(search.on_data(frame, place), StreamFound)
     assert isinstance(search.on_data(good, 9), StreamFound)
     far = replace(device(460800, 100, 4_000_000), damage=0.4)
