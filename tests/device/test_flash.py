@@ -99,10 +99,10 @@ T_NS = 1_795_000_000 * NS_PER_S
 
 
 def test_a_backup_has_identity_time_and_settings_and_the_newest_are_kept(tmp_path: Path) -> None:
-    folder = BackupFolder(tmp_path)
+    folder = BackupFolder(tmp_path / "state")
     other = folder.write("bow-2", "x", T_NS)
     files = [folder.write("bow", str(number), T_NS + number * NS_PER_S) for number in range(BACKUPS_MAX + 3)]
-    assert {file.name for file in (tmp_path / "backups").iterdir()} == {
+    assert {file.name for file in (tmp_path / "state" / "backups").iterdir()} == {
         other.name, *(file.name for file in files[3:]),
     }  # fmt: skip
     assert (files[-1].name, files[-1].read_text()) == ("bow.20261118T110652.000000Z.yaml", "12")
