@@ -703,6 +703,7 @@ async def test_the_thread_watches_an_open_line_during_reads() -> None:
     member.schedule.begun(clock.now_ns())
     ready.drain()
     assert (member.noted, member.commands) == (1, 0)  # a read already covers it
+    assert ready.expected_rate_hz == DEADLINES_HZ  # one edge shows no interval
     line.edge(clock.now_ns() + 1, True)
     ready.drain()
     assert (member.noted, member.commands) == (1, 1)
