@@ -52,6 +52,19 @@ def test_it_wraps_has_no_sign_and_counts_losses() -> None:
     assert time.missed == 0
 
 
+@pytest.mark.parametrize(("first", "gaps"), [(5100, 0), (0, 1)])
+def test_the_caller_reports_the_gap_of_a_step_between_two_counters(first: int, gaps: int) -> None:
+    noted: list[int] = []
+    time = DeviceTime(NS_PER_MS, 1 << 32, lambda: noted.append(1))
+    time.begin(0)
+    for ticks in (100, 5100):
+        time.advance(ticks)
+    time.begin(first)
+    for ticks in range(first + 100, first + 600, 100):
+        time.advance(ticks)
+    assert len(noted) == gaps
+
+
 def test_uneven_and_repeated_ticks_become_even() -> None:
     """400 Hz in milliseconds: the counter steps 2, 3, 2, 3, the samples 2.5."""
     time = DeviceTime(NS_PER_MS, 1 << 32)

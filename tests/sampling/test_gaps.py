@@ -280,12 +280,20 @@ def paced(pace: ArrivalPace, begin_ns: int, messages: int, late_ns: int = 0) -> 
     return sum(missed for missed, _ in found), sum(not certain for _, certain in found)
 
 
-def known_pace() -> ArrivalPace:
+def known_pace(turn: int = 1) -> ArrivalPace:
     """Return the pace of 100 Hz after one minute."""
-    pace = ArrivalPace()
+    pace = ArrivalPace(turn)
     pace.begin(BEGIN_NS)
     assert paced(pace, BEGIN_NS + 10 * NS_PER_MS, 6000) == (0, 0)
     return pace
+
+
+@pytest.mark.parametrize(
+    ("turn", "steps", "resumed"),
+    [(100, 58, 158), (100, 59, 0), (100, 42, 142), (100, 41, 0), (66, 18, 150), (64, 22, 0)],
+)
+def test_a_frame_number_continues_within_8_frames_of_its_due_value(turn: int, steps: int, resumed: int) -> None:
+    assert known_pace(turn).resume(steps, BEGIN_NS + 61_500 * NS_PER_MS) == resumed
 
 
 @pytest.mark.parametrize("waited_ms", [0, 18, 300])
