@@ -8,17 +8,9 @@ import pytest
 from scipy.signal import welch
 from scipy.stats import chi2
 
+from imud.analysis import spectrum as analysis_spectrum
 from imud.analysis.series import FloatArray, even_runs, grid_of
-from imud.analysis.spectrum import (
-    bands_of,
-    images_hz,
-    noise_bandwidth,
-    peaks,
-    power_spectrum,
-    spectrogram,
-    threshold,
-    window_size,
-)
+from imud.analysis.spectrum import bands_of, images_hz, peaks, power_spectrum, spectrogram, threshold, window_size
 from imud.model.errors import BadArgument
 from tests.analysis.synthetic import stamps_ns, three, white
 
@@ -37,7 +29,7 @@ def test_density_bandwidth_and_windows() -> None:
     assert found.density[:, 0].sum() * found.bin_hz == pytest.approx(series.var(), rel=0.01)
     found = power_spectrum([white(np.random.default_rng(3), 5000, RATE_HZ, 1.0)[:, None]], RATE_HZ, 256)
     assert found.bandwidth_hz / found.bin_hz == pytest.approx(1.5, rel=1e-6)
-    assert noise_bandwidth(np.ones(10), 10.0) == pytest.approx(1.0)
+    assert analysis_spectrum.noise_bandwidth(np.ones(10), 10.0) == pytest.approx(1.0)
     assert "1.50 bins" in found.words()
     random = np.random.default_rng(4)
     runs = [white(random, count, RATE_HZ, 1.0)[:, None] for count in (1000, 300, 600)]

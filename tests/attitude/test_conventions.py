@@ -4,18 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from imud.attitude.conventions import (
-    ENU_TO_NED,
-    FLU_LEVEL,
-    FLU_NWU,
-    RFU_ENU,
-    Convention,
-    DeviceAxes,
-    EulerOrder,
-    body_axes,
-    navigation_axes,
-    navigation_words,
-)
+from imud.attitude import conventions
+from imud.attitude.conventions import FLU_LEVEL, FLU_NWU, RFU_ENU, Convention, DeviceAxes, EulerOrder, navigation_axes
 from imud.attitude.rotation import is_rotation, matrix_times
 from imud.drivers import DRIVERS
 from imud.model.sample import Vector3
@@ -24,8 +14,8 @@ FRONT_LEFT_UP: tuple[Vector3, Vector3, Vector3] = ((1, 0, 0), (0, 1, 0), (0, 0, 
 
 
 def test_axes_and_words_of_conventions_and_of_frames_with_z_down() -> None:
-    assert [matrix_times(body_axes(Convention.ENU_FLU), v) for v in FRONT_LEFT_UP] == list(FRONT_LEFT_UP)
-    assert matrix_times(body_axes(Convention.NED_FRD), (1, 2, 3)) == (1, -2, -3), "front, right, down"
+    assert [matrix_times(conventions.body_axes(Convention.ENU_FLU), v) for v in FRONT_LEFT_UP] == list(FRONT_LEFT_UP)
+    assert matrix_times(conventions.body_axes(Convention.NED_FRD), (1, 2, 3)) == (1, -2, -3), "front, right, down"
     # At yaw 0, the x axis (ZYX) or the y axis (ZXY) of the sensor is parallel to the same axis of the frame.
     assert matrix_times(DeviceAxes(order=EulerOrder.ZYX, z_down=True).to_z_up, (1, 2, 3)) == (1, -2, -3)
     assert matrix_times(DeviceAxes(order=EulerOrder.ZXY, z_down=True).to_z_up, (1, 2, 3)) == (-1, 2, -3)
@@ -35,8 +25,8 @@ def test_axes_and_words_of_conventions_and_of_frames_with_z_down() -> None:
     assert not FLU_LEVEL.with_order(EulerOrder.ZXY).has_north
     assert RFU_ENU.words == "sensor: x right, y forward, z up, right-handed"
     assert FLU_LEVEL.words == "sensor: x forward, y left, z up, right-handed"
-    assert [navigation_words(one, True) for one in Convention] == ["ENU", "NED"]
-    assert navigation_words(Convention.NED_FRD, False).startswith("level, Z down")
+    assert [conventions.navigation_words(one, True) for one in Convention] == ["ENU", "NED"]
+    assert conventions.navigation_words(Convention.NED_FRD, False).startswith("level, Z down")
 
 
 def test_navigation_axes() -> None:
@@ -46,7 +36,7 @@ def test_navigation_axes() -> None:
     # without north, the x axis stays unchanged
     assert matrix_times(navigation_axes(Convention.ENU_FLU, False), (1, 2, 3)) == (1, 2, 3)
     assert matrix_times(navigation_axes(Convention.NED_FRD, False), (1, 2, 3)) == (1, -2, -3)
-    assert is_rotation(ENU_TO_NED)
+    assert is_rotation(conventions.ENU_TO_NED)
     # North, west, up: the x axis is north, the y axis is west.
     north, west, up = 1.0, 2.0, 3.0
     assert matrix_times(FLU_NWU.to_z_up, (north, west, up)) == (-west, north, up)

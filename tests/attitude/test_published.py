@@ -10,36 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from imud.attitude import published as attitude_published
+from imud.attitude import rotation as attitude_rotation
 from imud.attitude.conventions import FLU_LEVEL, RFU_ENU, Convention, DeviceAxes, EulerOrder, Heading
-from imud.attitude.published import (
-    AXES,
-    FrameOptions,
-    MountingAngles,
-    MountingAxes,
-    PublishedAxes,
-    as_sent,
-    levelling,
-    matrix_from_angles,
-    matrix_from_axes,
-    matrix_from_mounting_quat,
-    mounted,
-    published_frame,
-)
-from imud.attitude.rotation import (
-    IDENTITY,
-    Matrix3,
-    euler312_from_quat,
-    euler_zyx_from_quat,
-    is_rotation,
-    matrix_from_quat,
-    matrix_product,
-    matrix_times,
-    quat_from_euler312,
-    quat_from_euler_zyx,
-    quat_from_matrix,
-    quat_normalized,
-    transposed,
-)
+from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes, as_sent, levelling, published_frame
+from imud.attitude.rotation import IDENTITY, Matrix3, is_rotation, matrix_from_quat, matrix_times, quat_from_euler_zyx
 from imud.model.sample import Quaternion, Sample, Sync, Vector3
 
 G = 9.8
@@ -59,11 +34,11 @@ def sample(
 def frame(
     settings: FrameOptions | None = None, convention: Convention | None = None, declination_deg: float | None = None,
     device: DeviceAxes = FLU_LEVEL,
-) -> PublishedAxes:  # fmt: skip
+) -> attitude_published.PublishedAxes:  # fmt: skip
     return published_frame(settings, convention, declination_deg, device)
 
 
-def turned(one: Sample, published: PublishedAxes) -> Sample:
+def turned(one: Sample, published: attitude_published.PublishedAxes) -> Sample:
     assert published.rotation is not None
     return published.rotation.samples([one])[0]
 
@@ -125,7 +100,7 @@ def test_a_hipnuc_module_in_both_conventions(
 def test_bow_east_nose_up_right_side_down(convention: Convention, expected: Vector3, members: str) -> None:
     """As a HiPNUC device sends it: yaw -90° (east), pitch +30° (nose up), roll +10° (right side down)."""
     euler = (radians(10), radians(30), radians(-90))
-    quat = quat_from_euler312(euler)
+    quat = attitude_rotation.quat_from_euler312(euler)
     up = (-cos(radians(30)) * sin(radians(10)), sin(radians(30)), cos(radians(30)) * cos(radians(10)))
     one = replace(
         sample((up[0] * G, up[1] * G, up[2] * G)),
@@ -135,7 +110,7 @@ def test_bow_east_nose_up_right_side_down(convention: Convention, expected: Vect
     made = turned(one, frame(convention=convention, device=RFU_ENU))
     assert degrees_of(made.euler_rad) == pytest.approx(expected, abs=1e-9)
     assert made.quat_wxyz is not None
-    assert degrees_of(euler_zyx_from_quat(made.quat_wxyz)) == pytest.approx(expected, abs=1e-9)
+    assert degrees_of(attitude_rotation.euler_zyx_from_quat(made.quat_wxyz)) == pytest.approx(expected, abs=1e-9)
     back_side_up = -up[0] * G if convention is ENU else up[0] * G
     assert made.accel_m_s2 == pytest.approx((up[1] * G, back_side_up, up[2] * G if convention is ENU else -up[2] * G))
 
@@ -213,8 +188,8 @@ def test_devices_in_different_mountings_report_the_same_attitude() -> None:
     for given_frame in (FrameOptions(euler=MountingAngles(roll_deg=33, pitch_deg=-50, yaw_deg=170)), FrameOptions()):
         for device in (RFU_ENU, FLU_LEVEL):
             mounting = frame(given_frame, ENU, device=device).mounting
-            quat = quat_from_matrix(matrix_product(matrix, mounting))
-            one = replace(sample(matrix_times(transposed(mounting), body_accel)), quat_wxyz=quat)
+            quat = attitude_rotation.quat_from_matrix(attitude_rotation.matrix_product(matrix, mounting))
+            one = replace(sample(matrix_times(attitude_rotation.transposed(mounting), body_accel)), quat_wxyz=quat)
             made = turned(one, frame(given_frame, ENU, device=device))
             assert made.accel_m_s2 == pytest.approx(body_accel)
             assert same_rotation(made.quat_wxyz, attitude)
@@ -245,7 +220,7 @@ def test_heading_offset_declination_and_reference_of_the_heading() -> None:
     own = turned(one, frame(None, None, 5.0, RFU_ENU))
     assert degrees_of(own.euler_rad) == pytest.approx((10, 20, -95)), "in the device's own convention"
     assert own.quat_wxyz is not None
-    assert degrees_of(euler312_from_quat(own.quat_wxyz)) == pytest.approx((10, 20, -95))
+    assert degrees_of(attitude_rotation.euler312_from_quat(own.quat_wxyz)) == pytest.approx((10, 20, -95))
     assert (own.accel_m_s2, own.mag_t) == ((1, 2, 3), (1, 2, 3))
     true = frame(None, None, 5.0, RFU_ENU)
     assert true.heading(Heading.MAGNETIC) is Heading.TRUE
@@ -282,7 +257,7 @@ Z_DOWN = sample((0.5, 0.25, -G), (10, 20, 30), gyro=(1, 2, 3))
     ],
 )  # fmt: skip
 def test_a_device_with_z_down(
-    one: Sample, published: PublishedAxes, accel: Vector3, gyro: Vector3, euler: Vector3
+    one: Sample, published: attitude_published.PublishedAxes, accel: Vector3, gyro: Vector3, euler: Vector3
 ) -> None:
     made = turned(one, published)
     assert (made.accel_m_s2, made.gyro_rad_s) == (accel, gyro)
@@ -335,7 +310,7 @@ def test_the_quaternion_has_priority_unless_it_is_zero_and_nan_stays_one_element
 # --- invariants -------------------------------------------------------------------------------------------------------
 
 VECTORS = st.tuples(*[st.floats(-50, 50)] * 3)
-QUATS = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: hypot(*q) > 0.1).map(quat_normalized)
+QUATS = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: hypot(*q) > 0.1).map(attitude_rotation.quat_normalized)
 MOUNTINGS = st.builds(
     FrameOptions,
     euler=st.builds(
@@ -352,7 +327,7 @@ FRAMES = st.builds(
 
 @given(FRAMES, VECTORS, VECTORS, VECTORS, QUATS)
 def test_lengths_and_the_direction_of_gravity_are_kept(
-    published: PublishedAxes, accel: Vector3, gyro: Vector3, mag: Vector3, quat: Quaternion
+    published: attitude_published.PublishedAxes, accel: Vector3, gyro: Vector3, mag: Vector3, quat: Quaternion
 ) -> None:
     """Angles between vectors, and between a vector and the vertical, are equal before and after a rotation."""
     one = Sample("bow", 1, 1, 1, Sync.ARRIVAL, 1, 1, accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, quat_wxyz=quat)
@@ -419,7 +394,7 @@ ANY3 = st.none() | st.tuples(ANY, ANY, ANY)
 
 @given(FRAMES, ANY3, ANY3, st.none() | st.tuples(ANY, ANY, ANY, ANY))
 def test_no_value_of_a_device_raises(
-    published: PublishedAxes, vector: Vector3 | None, euler: Vector3 | None, quat: Quaternion | None
+    published: attitude_published.PublishedAxes, vector: Vector3 | None, euler: Vector3 | None, quat: Quaternion | None
 ) -> None:
     one = Sample(
         "bow", 1, 1, 1, Sync.ARRIVAL, 1, 1, accel_m_s2=vector, gyro_rad_s=vector, quat_wxyz=quat, euler_rad=euler
@@ -467,24 +442,24 @@ KEYS = [
 def test_the_three_ways_agree_with_the_drawing(
     name: str, axes: tuple[str, str, str], angles: Vector3, quat: tuple[float, float, float, float], body: Vector3
 ) -> None:
-    by_axes = matrix_from_axes(*axes)
+    by_axes = attitude_published.matrix_from_axes(*axes)
     assert matrix_times(by_axes, SENSOR) == body, name
-    assert matrix_from_angles(*angles) == by_axes, "without a rounding error of the cosine of 90°"
-    assert matrix_from_mounting_quat(quat) == by_axes
+    assert attitude_published.matrix_from_angles(*angles) == by_axes, "without a rounding error of the cosine of 90°"
+    assert attitude_published.matrix_from_mounting_quat(quat) == by_axes
 
 
 def test_angles_of_30_degrees_and_every_choice_of_axes_are_rotations() -> None:
     """30° to the left: the x axis of the sensor points to the front and, with half its length, to the left."""
-    matrix = matrix_from_angles(0, 0, 30)
+    matrix = attitude_published.matrix_from_angles(0, 0, 30)
     assert matrix_times(matrix, (1, 0, 0)) == pytest.approx((C30, S30, 0))
-    assert matrix_times(matrix_from_angles(0, 30, 0), (1, 0, 0)) == pytest.approx((C30, 0, -S30))
-    assert matrix_times(matrix_from_angles(30, 0, 0), (0, 1, 0)) == pytest.approx((0, C30, S30))
+    assert matrix_times(attitude_published.matrix_from_angles(0, 30, 0), (1, 0, 0)) == pytest.approx((C30, 0, -S30))
+    assert matrix_times(attitude_published.matrix_from_angles(30, 0, 0), (0, 1, 0)) == pytest.approx((0, C30, S30))
     # yaw first: the x axis of the sensor is pitched in its new direction, to the left
-    assert matrix_times(matrix_from_angles(0, 30, 90), (1, 0, 0)) == pytest.approx((0, C30, -S30))
+    assert matrix_times(attitude_published.matrix_from_angles(0, 30, 90), (1, 0, 0)) == pytest.approx((0, C30, -S30))
     matrices = []
-    for axes in product(AXES, repeat=3):
+    for axes in product(attitude_published.AXES, repeat=3):
         with suppress(ValueError):
-            matrices.append(matrix_from_axes(*axes))
+            matrices.append(attitude_published.matrix_from_axes(*axes))
     assert all(is_rotation(matrix) for matrix in matrices)
     assert len(matrices) == 24, "of 216; a cube can be laid down in 24 ways"
 
@@ -499,7 +474,7 @@ def test_angles_of_30_degrees_and_every_choice_of_axes_are_rotations() -> None:
 )
 def test_impossible_axes_are_rejected(axes: tuple[str, str, str], words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        matrix_from_axes(*axes)
+        attitude_published.matrix_from_axes(*axes)
 
 
 @pytest.mark.parametrize(
@@ -507,9 +482,9 @@ def test_impossible_axes_are_rejected(axes: tuple[str, str, str], words: str) ->
 )
 def test_an_invalid_quaternion_is_rejected(quat: tuple[float, float, float, float]) -> None:
     with pytest.raises(ValueError, match="of length 1"):
-        matrix_from_mounting_quat(quat)
+        attitude_published.matrix_from_mounting_quat(quat)
     for near in ((0.7071, 0.7071, 0.0, 0.0), (1.0009, 0.0, 0.0, 0.0), (0.9991, 0.0, 0.0, 0.0)):
-        assert is_rotation(matrix_from_mounting_quat(near)), "three digits are enough"
+        assert is_rotation(attitude_published.matrix_from_mounting_quat(near)), "three digits are enough"
 
 
 def test_levelling_and_heading_offset_subtract_the_published_angles_behind_the_mounting() -> None:
@@ -523,10 +498,10 @@ def test_levelling_and_heading_offset_subtract_the_published_angles_behind_the_m
     left_up = levelling(Convention.NED_FRD, 10.0, 0.0, 0.0)
     assert matrix_times(left_up, (0.0, sin(ten), cos(ten))) == pytest.approx((0, 0, 1))
     # The x axis points 90° to the left of the front: imud adds 90° to the heading.
-    assert levelling(Convention.ENU_FLU, 0.0, 0.0, 90.0) == matrix_from_axes("-y", "x", "z")
-    assert levelling(Convention.NED_FRD, 0.0, 0.0, 90.0) == matrix_from_axes("-y", "x", "z")
-    upside_down: Matrix3 = matrix_from_axes("x", "-y", "-z")
-    assert mounted(upside_down, IDENTITY) == upside_down
-    whole = mounted(upside_down, levelling(Convention.ENU_FLU, 0.0, 0.0, 90.0))
+    assert levelling(Convention.ENU_FLU, 0.0, 0.0, 90.0) == attitude_published.matrix_from_axes("-y", "x", "z")
+    assert levelling(Convention.NED_FRD, 0.0, 0.0, 90.0) == attitude_published.matrix_from_axes("-y", "x", "z")
+    upside_down: Matrix3 = attitude_published.matrix_from_axes("x", "-y", "-z")
+    assert attitude_published.mounted(upside_down, IDENTITY) == upside_down
+    whole = attitude_published.mounted(upside_down, levelling(Convention.ENU_FLU, 0.0, 0.0, 90.0))
     assert matrix_times(whole, (1, 0, 0)) == (0, 1, 0), "first upside down, then to the left"
     assert matrix_times(whole, (0, 1, 0)) == (1, 0, 0)

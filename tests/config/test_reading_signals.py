@@ -120,11 +120,10 @@ def test_refusals(keys: str, message: str) -> None:
     ("one", "other"),
     [
         ("line: 17, chip: gpiochip0", "line: 17, chip: gpiochip0"),
-        ("line: 17, chip: gpiochip0", "line: 17, chip: /dev/gpiochip0, active_low: true"),
-        ("line: A", "line: A"),
+        ("line: 17, chip: gpiochip0", "line: 17, chip: /dev/gpiochip0, active_low: true"), ("line: A", "line: A"),
         ("line: A, chip: gpiochip0", "line: A"),
     ],
-)
+)  # fmt: skip
 def test_one_wire_under_two_keys(one: str, other: str) -> None:
     (found,) = errors(hipnuc(f"sout: {{{one}}}, pps: {{{other}}}"))
     assert "devices.a.lines.pps: expected an unused line, got " in found
@@ -139,10 +138,9 @@ def test_one_wire_under_two_keys(one: str, other: str) -> None:
     [
         ("line: 17, chip: gpiochip0", "line: 17, chip: gpiochip1"),
         ("line: 17, chip: gpiochip0", "line: 18, chip: gpiochip0"),
-        ("line: A, chip: gpiochip0", "line: A, chip: gpiochip1"),
-        ("line: A", "line: B"),
+        ("line: A, chip: gpiochip0", "line: A, chip: gpiochip1"), ("line: A", "line: B"),
     ],
-)
+)  # fmt: skip
 def test_two_wires(one: str, other: str) -> None:
     assert parse(hipnuc(f"sout: {{{one}}}, pps: {{{other}}}"))
     assert parse(hipnuc(f"sout: {{{one}}}"), hipnuc(f"sout: {{{one}}}", "z") + ", enabled: false"), "has no wire"

@@ -78,26 +78,18 @@ def test_traps_are_refused(word: str, says: str) -> None:
     [
         ("a: 1\nb: 2\na: 3\n", 3, 1, "a", "stands in line 1"),
         ("a: {x: {y: 1}}\nb:\n  c: 1\n  c: 1\n", 4, 3, "b.c", "stands in line 3"),
-        ("1: a\n", 1, 1, "", "key of text, got 1"),
-        ("true: a\n", 1, 1, "", "key of text, got true"),
-        ("~: a\n", 1, 1, "", "key of text, got ~"),
-        ("no: a\n", 1, 1, "", "got no"),
-        ("? [a]\n: b\n", 1, 3, "", "key of plain text"),
-        ("a: &x 1\nb: *x\n", 2, 4, "b", "alias *x"),
+        ("1: a\n", 1, 1, "", "key of text, got 1"), ("true: a\n", 1, 1, "", "key of text, got true"),
+        ("~: a\n", 1, 1, "", "key of text, got ~"), ("no: a\n", 1, 1, "", "got no"),
+        ("? [a]\n: b\n", 1, 3, "", "key of plain text"), ("a: &x 1\nb: *x\n", 2, 4, "b", "alias *x"),
         ("a: {c: 1}\nb:\n  <<: {c: 1}\n", 3, 3, "b", "merge key"),
-        ("a: !!python/object/apply:os.system [ls]\n", 1, 4, "a", "tag"),
-        ("a: !!float 1\n", 1, 4, "a", "tag"),
-        ("a: 1\n---\nb: 2\n", 2, 1, "", "second one"),
-        ("", 1, 1, "", "empty"),
-        ("# only a comment\n", 1, 1, "", "empty"),
-        ("a: 1\n\tb: 2\n", 2, 1, "", "tab"),
-        ("a:\n  b: 1\n\tc: 2\n", 3, 1, "", "tab"),
-        ("a: b: c\n", 1, 5, "", "mapping values are not allowed"),
-        ("a: [1, 2\nb: 3\n", 2, 2, "", "expected"),
-        ("a: 'x\n", 2, 1, "", "quoted scalar"),
+        ("a: !!python/object/apply:os.system [ls]\n", 1, 4, "a", "tag"), ("a: !!float 1\n", 1, 4, "a", "tag"),
+        ("a: 1\n---\nb: 2\n", 2, 1, "", "second one"), ("", 1, 1, "", "empty"),
+        ("# only a comment\n", 1, 1, "", "empty"), ("a: 1\n\tb: 2\n", 2, 1, "", "tab"),
+        ("a:\n  b: 1\n\tc: 2\n", 3, 1, "", "tab"), ("a: b: c\n", 1, 5, "", "mapping values are not allowed"),
+        ("a: [1, 2\nb: 3\n", 2, 2, "", "expected"), ("a: 'x\n", 2, 1, "", "quoted scalar"),
         ("a: \x01\n", 1, 4, "", "U+0001"),
     ],
-)
+)  # fmt: skip
 def test_refused_with_its_place(text: str, line: int, column: int, path: str, says: str) -> None:
     got = only_problem(text)
     assert got[:1] == (line,)

@@ -12,15 +12,13 @@ MISSING = "devices have a problem: a (missing), b (missing), c (missing), d (mis
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ({}, "The configuration has no devices."),
-        ({"bow": "ok"}, "1 device is OK."),
+        ({}, "The configuration has no devices."), ({"bow": "ok"}, "1 device is OK."),
         ({"bow": "missing"}, "1 device has a problem: bow (missing)."),
         ({"a": "ok", "b": "degraded", "c": "ok"}, "1 of 3 devices has a problem: b (degraded)."),
-        ({"a": "ok", "b": "ok"}, "All 2 devices are OK."),
-        (dict.fromkeys("abcde", "missing"), f"5 of 5 {MISSING}."),
+        ({"a": "ok", "b": "ok"}, "All 2 devices are OK."), (dict.fromkeys("abcde", "missing"), f"5 of 5 {MISSING}."),
         (dict.fromkeys("abcdef", "missing"), f"6 of 6 {MISSING} and 1 more."),
     ],
-)
+)  # fmt: skip
 def test_summary(words: dict[str, str], line: str) -> None:
     assert conditions.summary({name: Condition(word) for name, word in words.items()}) == line
 

@@ -97,18 +97,15 @@ def valid_crc(stored: bytes, plain: int, method: int = 1) -> bytes:
 
 FRAME = zstandard.compress(b"abcd" * 1000)
 DAMAGED = {
-    "no Zstandard frame": valid_crc(b"x" * 40, 4000),
-    "a frame that is cut": valid_crc(FRAME[:-3], 4000),
+    "no Zstandard frame": valid_crc(b"x" * 40, 4000), "a frame that is cut": valid_crc(FRAME[:-3], 4000),
     "a frame with damaged data": valid_crc(FRAME[:-4] + b"\xff\xff\xff\xff", 4000),
-    "a frame with a byte too much": valid_crc(FRAME, 3999),
-    "a frame with a byte too few": valid_crc(FRAME, 4001),
+    "a frame with a byte too much": valid_crc(FRAME, 3999), "a frame with a byte too few": valid_crc(FRAME, 4001),
     "a frame without its size": valid_crc(zstandard.ZstdCompressor(write_content_size=False).compress(b"a" * 99), 99),
     "a frame of 64 MB": valid_crc(zstandard.compress(bytes(64 << 20)), 1 << 16),
     "a content that is too large": valid_crc(Random(1).randbytes(1 << 17), PLAIN_MAX + 1),
-    "a frame as large as its content": valid_crc(FRAME, len(FRAME)),
-    "another method": valid_crc(b"abc", 3, method=2),
+    "a frame as large as its content": valid_crc(FRAME, len(FRAME)), "another method": valid_crc(b"abc", 3, method=2),
     "stored bytes of another size": valid_crc(b"abc", 4, method=0),
-}
+}  # fmt: skip
 """Blocks with a correct CRC and invalid content, from another program or a defect."""
 
 

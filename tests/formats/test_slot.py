@@ -10,15 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from imud.formats import slot as slot_format
-from imud.formats.slot import (
-    CRC_OFFSET,
-    PRESENT_BITS,
-    SLOT_BYTES,
-    decode_slot,
-    encode_slot,
-    encode_slots,
-    slot_is_whole,
-)
+from imud.formats.slot import CRC_OFFSET, PRESENT_BITS, SLOT_BYTES, decode_slot, encode_slot, encode_slots
 from imud.model.sample import Sample, Sync
 from tests.support.rings import check_layout
 
@@ -106,7 +98,7 @@ def test_any_flipped_bit_and_the_sync_of_a_newer_layout_are_found() -> None:
     for at in range(SLOT_BYTES):
         slot = bytearray(encode_slot(FULL, 1))
         slot[at] ^= 1 << at % 8
-        assert not slot_is_whole(bytes(slot)), at
+        assert not slot_format.slot_is_whole(bytes(slot)), at
         with pytest.raises(ValueError, match="during the copy"):
             decode_slot(bytes(slot), "imu0")
     raw = bytearray(encode_slot(FULL, 1)[:CRC_OFFSET])
@@ -117,7 +109,7 @@ def test_any_flipped_bit_and_the_sync_of_a_newer_layout_are_found() -> None:
 
 @pytest.mark.parametrize("slot", [b"", bytes(SLOT_BYTES), encode_slot(FULL, 1)[:-1], b"\xff" * SLOT_BYTES])
 def test_bytes_that_are_not_a_slot(slot: bytes) -> None:
-    assert not slot_is_whole(slot)
+    assert not slot_format.slot_is_whole(slot)
     assert slot_format.SEQ_INVALID == 0xFFFF_FFFF_FFFF_FFFF
 
 
