@@ -111,6 +111,9 @@ def test_losses_and_absent_devices_of_a_recording() -> None:
     found = diagnosis.event(StampedEvent(Event(6, "bow", EventKind.UP, "is back"), UTC_NS + 1))
     assert found is not None
     assert found.devices[0].level is OK
+    found = diagnosis.event(StampedEvent(Event(6, "mast", EventKind.UP, "is there"), UTC_NS + 1))
+    assert found is not None
+    assert found.devices[1][1:3] == (OK, "no sample yet")
     assert diagnosis.event(StampedEvent(Event(7, "bow", EventKind.MARK, "a pulse"), UTC_NS)) is None
     diagnosis, levels = RecordedDiagnosis(), []
     for second in range(12):

@@ -166,6 +166,10 @@ def test_events(served: Daemon) -> None:
         served.do(lambda server: server.event(replace(down, device="imu0")))
         served.do(lambda server: server.event(down))
         assert next(iter(events)) == down
+        watch = client.watch(timeout_s=60)
+        publish(served, batch("imu0", 5))
+        served.do(lambda server: server.event(down))
+        assert (next(events), next(watch)) == (down, sample("imu0", 5))  # the sample arrived first
         served.do(lambda server: server.hub.context.past_events.add(down))
         (stored,) = client.past_events(7, ["imu1"])
         assert (stored.t_ns, stored.message) == (7, down.message)

@@ -49,7 +49,7 @@ def test_the_news_have_the_greeting_and_every_sample_comes(tmp_path: Path, monke
     with daemon(tmp_path) as served, feeding(str(served.path), Wish(("imu0",), news_s=0.02)) as (_, heard):
         first = heard.wait_for(lambda news: news.statuses)
         assert first.hello is not None
-        assert first.hello.epoch == 4886718345
+        assert (first.hello.epoch, first.newest) == (4886718345, None)
         served.do(lambda server: server.publish(batch("imu1", 1)))
         served.do(lambda server: server.publish(batch("imu0", 1, 50)))
         found: list[int] = []
@@ -120,7 +120,7 @@ def test_newest_samples_events_and_the_time_come_without_a_watch(tmp_path: Path)
         assert found == ["is there", "is not there"]
 
 
-def test_the_feed_ignores_unknown_devices(tmp_path: Path) -> None:
+def test_the_feed_ignores_unknown_devices_and_ends_its_watch(tmp_path: Path) -> None:
     with daemon(tmp_path) as served, feeding(str(served.path), Wish(("gone",), news_s=0.02)) as (feed, heard):
         assert not heard.wait_for(lambda news: news.statuses).problem
         feed.want(Wish(("gone", "imu1"), news_s=0.03))
@@ -132,6 +132,10 @@ def test_the_feed_ignores_unknown_devices(tmp_path: Path) -> None:
             return bool(heard.wait_for(lambda news: True).samples)
 
         until(came, heard)
+        served.do(lambda server: server.event(Event(5, "imu1", EventKind.UP, "is there")))
+        assert heard.wait_for(lambda news: news.events).events[0].message == "is there"
+        feed.want(Wish(("gone",), news_s=0.02))
+        until(lambda: served.do(lambda server: server.hub.clients()[0].encoding == ""), heard)
 
 
 def test_it_connects_again_to_a_daemon_that_was_restarted(tmp_path: Path) -> None:

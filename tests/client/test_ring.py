@@ -308,7 +308,7 @@ def test_successor_of_another_layout(board: Board, ring: Ring) -> None:
         ring.read()
 
 
-def test_heartbeat_ledger_and_reopen(board: Board, ring: Ring) -> None:
+def test_heartbeat_ledger_and_reopen(board: Board, ring: Ring, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not ring.reopen()  # the file did not change
     assert ring.alive(START_NS + 999_999_999)
     assert not ring.alive(START_NS + 1_000_000_000)
@@ -321,6 +321,15 @@ def test_heartbeat_ledger_and_reopen(board: Board, ring: Ring) -> None:
     assert (block.update, block.driver, block.ledger) == (1, "hipnuc-uart", board.ledger.snapshot())
     board.publisher.close()
     assert not ring.reopen()
+    opened = os.open
+
+    def remove_and_open(path: Path, flags: int) -> int:
+        path.unlink()
+        return opened(path, flags)
+
+    board.path.touch()
+    monkeypatch.setattr(os, "open", remove_and_open)
+    assert not ring.reopen()  # removed between the check of the file and its opening
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from imud.drivers import DRIVERS
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from tests.support.documented import check_schema
-from tests.support.fake_drivers import FAKE_DRIVER, FAKE_SETTINGS, fake_can_driver
+from tests.support.fake_drivers import FAKE_DRIVER, FAKE_SETTINGS, fake_can_driver, fake_can_frame
 from tests.support.socket_rig import device_status
 
 CAN = fake_can_driver()
@@ -63,6 +63,14 @@ def test_problems_of_options_and_defaults_of_a_driver() -> None:
     found = {baud: stream.problems(None, SimpleNamespace(baud=baud)) for baud in (4800, 9600, 0, "auto")}
     assert found == {4800: [own, wrong], 9600: [own], 0: [own], "auto": [own]}
     assert can.problems(None, None) == [own]
+    frames = [[fake_can_frame(node)] * 2 for node in range(12, 0, -1)]
+    ignored = "the log has frames of other devices, which imud ignores: {}; --option selects one of them"
+    listed = [ignored.format(", ".join(f"node {node}" for node in range(2, last + 1))) for last in (3, 9)]
+    assert CAN.other_nodes(CAN.node_settings(1), frames[-3:]) == listed[0]
+    assert CAN.other_nodes(CAN.node_settings(1), frames[-9:]) == listed[1]
+    assert CAN.other_nodes(CAN.node_settings(1), frames) == listed[1].replace(";", " and 3 more;")
+    foreign = [[fake_can_frame(0)] * 2, [fake_can_frame(7)], [fake_can_frame(1)] * 2]
+    assert CAN.other_nodes(CAN.node_settings(1), foreign) == ""  # one frame does not show a device
     assert (CAN.check(None, None), CAN.heading(None, {}), driver.nothing_cyclic(None)) == ((), Heading.UNKNOWN, ())
     assert driver.of_kind([FAKE_DRIVER, CAN], StreamDriver) == [FAKE_DRIVER]
     assert DRIVERS["imu61x-i2c"].tick_modulus == 2

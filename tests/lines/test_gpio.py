@@ -48,8 +48,9 @@ def test_an_input_asks_for_both_edges_and_a_large_buffer(gpiod: FakeGpiod, tmp_p
     line = gpio.GpioInput(
         InputOptions(line="SOUT", active_low=True, bias="pull-down"), "bow sout " + "x" * 40, devices=tmp_path
     )
+    assert line.fileno() == -1
     line.open()
-    assert line.title == "gpiochip0 line 0 (SOUT)"
+    assert (line.title, line.fileno()) == ("gpiochip0 line 0 (SOUT)", gpiod.requests[0].fd)
     ((chip, offset, consumer, events),) = gpiod.asked
     assert (chip, offset, events) == ("gpiochip0", 0, 1024)
     assert consumer == "imud bow sout " + "x" * 17
