@@ -13,20 +13,25 @@ import tty
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from time import monotonic_ns, sleep, time_ns
 from typing import Any, cast
-from unittest.mock import Mock
+from unittest.mock import AsyncMock, Mock
 
 import msgspec
 import pytest
 
 from imud.client.ring import Ring
+from imud.config import load
 from imud.config.model import Config
 from imud.contracts.publisher import Publisher
+from imud.contracts.status import DeviceState
 from imud.daemon import Daemon, Reloader
+from imud.device.device import Device
 from imud.host.clock import HostClock
-from imud.model.errors import CommandError, ConfigError
+from imud.model.errors import CommandError, ConfigError, ServerError
+from imud.model.event import Event, EventKind
 from imud.model.units import NS_PER_S
 from imud.publishers.shm import ShmOptions
 from imud.utc.system_clock import KernelClock
@@ -233,6 +238,65 @@ async def test_a_task_that_fails_ends_the_daemon_and_other_ends_do_not(name: str
         getattr(daemon, name)(future)
     with pytest.raises(KeyError, match="broken"):
         await running
+    daemon = Daemon(EMPTY)
+    running = asyncio.create_task(daemon.run())
+    await asyncio.sleep(0)
+    asyncio.get_running_loop().call_exception_handler({"message": "it failed"})
+    with pytest.raises(RuntimeError, match=r"^it failed$"):
+        await running
+
+
+def config_of(folder: Path, **devices: dict[str, Any]) -> Config:
+    """Return a configuration without outputs for devices with missing ports and these keys."""
+    found = load(write_config(folder, {name: device(folder / name, **keys) for name, keys in devices.items()}))
+    return replace(EMPTY, devices=found.devices)
+
+
+@in_loop
+async def test_a_reload_starts_and_stops_devices_and_lets_other_tasks_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def past() -> list[str]:
+        return [event.message for event in daemon._context.past_events.newest(0, 99)]
+
+    async def count_turns() -> None:
+        while not running.done():
+            turns.append(1)
+            await asyncio.sleep(0)
+
+    output, turns = EndingOutput(), list[int]()
+    daemon = Daemon(config_of(tmp_path, bow={}, stern={}), extra={"a": cast(Publisher, output)})
+    running = asyncio.create_task(daemon.run())
+    for _ in range(9):
+        await asyncio.sleep(0)
+    statuses, counting = daemon.each_status(), asyncio.create_task(count_turns())
+    assert [(status.name, status.state) for status in daemon.status()] == [("bow", "missing"), ("stern", "missing")]
+    assert next(statuses).name == "bow"
+    for name in ("bow", "stern"):
+        daemon.send_event(Event(1, name, EventKind.MARK, name))
+    await daemon.change_to(config_of(tmp_path, bow={"convention": "enu-flu"}, mast={}))
+    assert len(turns) == 4  # one stopped, one stopped and started again, one started
+    assert list(statuses) == []  # a reload removed the device in the meantime
+    assert [one.name for one in daemon.configured_devices()] == [one.name for one in daemon.status()] == ["bow", "mast"]
+    assert {"bow", "mast", "stern"} & {task.get_name() for task in asyncio.all_tasks()} == {"bow", "mast"}
+    assert (set(past()) & {"bow", "stern"}, output.did.count("remove_device")) == ({"bow"}, 2)
+    assert daemon._latencies.need("bow")
+    with pytest.raises(KeyError):
+        daemon._latencies.need("stern")
+    daemon.refuse(ConfigError("f.yaml:3: wrong"))
+    assert past()[-1] == "the new configuration is invalid: f.yaml:3: wrong"
+    monkeypatch.setattr("imud.publishers.outputs.Outputs.add_device", Mock(side_effect=ServerError("it is full")))
+    await daemon.change_to(config_of(tmp_path, stern={}))
+    assert past()[-1].endswith("; stern cannot be started: it is full")
+    monkeypatch.undo()
+    monkeypatch.setattr(Device, "run", AsyncMock(side_effect=KeyError("broken")))
+    await daemon.change_to(config_of(tmp_path, stern={}))  # the next reload starts the device
+    with pytest.raises(KeyError, match="broken"):
+        await running
+    await counting
+    monkeypatch.setattr(Device, "run", AsyncMock())
+    monkeypatch.setattr(Device, "state", DeviceState.FINISHED)
+    await Daemon(config_of(tmp_path, bow={}), until_finished=True).run()
 
 
 def reload(daemon: RunningDaemon, devices: dict[str, Any], **more: Any) -> None:
@@ -583,6 +647,4 @@ async def test_a_second_signal_at_the_end_does_not_change_the_exit_status() -> N
     await asyncio.sleep(0)
     signal.raise_signal(signal.SIGTERM)
     await running
-    assert [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)] == [
-        signal.SIG_IGN
-    ] * 3
+    assert {signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)} == {signal.SIG_IGN}
