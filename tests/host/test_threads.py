@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
+from unittest.mock import Mock
 
 import pytest
 
@@ -53,10 +54,17 @@ def test_rings_end_one_wait(kind: type[WakeEvent] | type[DescriptorWait]) -> Non
         waiter.close()
 
 
-def test_a_descriptor_calls_once_per_arrival_until_it_is_discarded(pipe: tuple[int, int]) -> None:
+def test_a_descriptor_calls_once_per_arrival_until_it_is_discarded(
+    pipe: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     reader, writer = pipe
     waiter, calls = DescriptorWait(), list[int]()
-    assert waiter.is_usable
+    for number, is_usable in ((1023, True), (1024, False)):  # `select` does not accept larger numbers
+        with monkeypatch.context() as patch:
+            patch.setattr("imud.host.threads.select.epoll", Mock(return_value=Mock(fileno=lambda: number)))  # noqa: B023
+            other = DescriptorWait()
+        assert other.is_usable == is_usable
+        other.close()
     waiter.add(reader, lambda: calls.append(reader))
     for expected in (1, 1, 2):  # the second wait has no new data: the bytes of the first wait are still unread
         if expected > len(calls):
