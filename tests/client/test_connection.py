@@ -285,13 +285,9 @@ def answering(path: Path, answer: bytes) -> Iterator[None]:
         (b"", TimeoutError, "no hello within"),
         (HELLO + b'{"id":1,"result":{"devices":{}}}\n\xff\xff\xff\xff', ServerError, "expected a frame of at most"),
         (HELLO + b'{"id":1,"result":{"devices":{"a":0}}}\n\x00\x01\x00\x00' + bytes(256), ServerError, "CRC"),
-        (
-            HELLO + b'{"id":1,"result":{"devices":{}}}\n\0\1\0\0' + bytes(256),
-            ServerError,
-            "known device number .*, got 0",
-        ),
+        (HELLO + b'{"id":1,"result":{"devices":{}}}\n\0\1\0\0' + bytes(256), ServerError, "known device .*, got 0"),
     ],
-)
+)  # fmt: skip
 def test_invalid_servers_raise_errors(tmp_path: Path, answer: bytes, error: type[Exception], words: str) -> None:
     path = tmp_path / "s"
     limit_s = 0.2 if error is TimeoutError else 60

@@ -92,16 +92,12 @@ def test_what_two_devices_cannot_have_together(devices: list[str], expected: str
         ["a " + CANOPEN.format("node: 8", "can0"), "b " + CANOPEN.format("node: 8", "can1")],
         ["a " + CANOPEN.format("node: 8", "can0"), "b " + CANOPEN.format("node: 9", "can0")],
         ["a " + CANOPEN.format("", "can0"), "b {driver: imu61x-can, socketcan: {interface: can0}}"],
-        [
-            "a {driver: hipnuc-j1939, socketcan: {interface: c}}",
-            "b {driver: hipnuc-nmea2000, socketcan: {interface: c}}",
-        ],
+        ["a {driver: hipnuc-j1939, socketcan: {interface: c}}", "b {driver: hipnuc-nmea2000, socketcan: {interface: c}}"],
         ["a {socketcan: {interface: can0}}", "b {socketcan: {interface: can0}}"],
         ["a {spi: {port: /dev/spidev0.0}}", "b {spi: {port: /dev/spidev0.1, speed_hz: 200000}}"],
-        ["a {i2c: {bus: 1}}", "b {i2c: {bus: 1}}"],
-        ["a {memory: {}}", "b {memory: {}}"],
+        ["a {i2c: {bus: 1}}", "b {i2c: {bus: 1}}"], ["a {memory: {}}", "b {memory: {}}"],
     ],
-)
+)  # fmt: skip
 def test_what_they_can_have_together(devices: list[str]) -> None:
     assert problems(*devices) == []
 
@@ -109,18 +105,14 @@ def test_what_they_can_have_together(devices: list[str]) -> None:
 @pytest.mark.parametrize(
     ("device", "message"),
     [
-        (
-            "{replay: {path: PATH}}",
-            "PATH is a raw capture without times: use speed real with the key baud, or speed maximum",
-        ),
+        ("{replay: {path: PATH}}", "PATH is a raw capture without times: use speed real with the key baud, or speed maximum"),
         ("{replay: {path: PATH, speed: real}}", "PATH does not contain its baud rate: speed real needs the key baud"),
-        ("{replay: {path: PATH, speed: real, baud: 9600}}", ""),
-        ("{replay: {path: PATH, speed: maximum}}", ""),
+        ("{replay: {path: PATH, speed: real, baud: 9600}}", ""), ("{replay: {path: PATH, speed: maximum}}", ""),
         ("{replay: {path: PATH.none}}", ""),
         ("{driver: imu61x-can, replay: {path: PATH}}", "PATH is not a CAN log: expected frames"),
         ("{driver: imu61x-can, replay: {path: PATH.log}}", ""),
     ],
-)
+)  # fmt: skip
 def test_a_capture_must_have_what_its_replay_needs(device: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "raw"
     path.write_bytes(RAW)

@@ -57,14 +57,12 @@ def test_arguments_are_completed_by_defaults_and_bad_arguments_name_the_good_one
 def test_description_for_people() -> None:
     (info,) = described({"yaw": ACTION})
     assert msgspec.json.decode(msgspec.json.encode(info)) == {
-        "name": "yaw",
-        "help": "turn it",
+        "name": "yaw", "help": "turn it", "risk": "",
         "parameters": [
             {"name": "relative", "values": "true or false", "default": "false", "required": False},
             {"name": "angle_deg", "values": "a number from -180 to 180", "default": None, "required": True},
         ],
-        "risk": "",
-    }
+    }  # fmt: skip
 
 
 def test_effect_on_the_flash() -> None:

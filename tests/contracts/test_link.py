@@ -69,14 +69,9 @@ def test_a_link_serves_the_drivers_that_it_can_carry() -> None:
     drivers: list[Driver] = [FAKE_DRIVER, fake_can_driver(), DRIVERS["imu61x-i2c"], DRIVERS["hipnuc-modbus"]]
     none = LinkType("none", NoOptions)
     facts = {
-        name: (
-            one.searchable,
-            one.polled,
-            one.frames_only,
-            [at for at, driver in enumerate(drivers) if one.fits(driver)],
-        )
+        name: (one.searchable, one.polled, one.frames_only, [i for i, driver in enumerate(drivers) if one.fits(driver)])
         for name, one in {**LINKS, "none": none}.items()
-    }
+    }  # fmt: skip
     assert facts == {
         "uart": (True, False, False, [0]), "socketcan": (True, False, True, [1]), "i2c": (True, True, False, [2]),
         "spi": (True, True, False, []), "rs485": (True, True, False, [3]), "replay": (True, False, False, [0, 1]),

@@ -21,10 +21,8 @@ def test_a_batch_makes_the_other_form_at_its_first_use(monkeypatch: pytest.Monke
     samples = [make_sample(seq) for seq in seqs]
     slots = b"".join(encode_slot(sample, 3) for sample in samples)
     made, packed, both = (
-        Batch(DEVICE, 3, samples),
-        Batch(DEVICE, 3, None, packed=slots),
-        Batch(DEVICE, 3, samples, packed=b"?"),
-    )
+        Batch(DEVICE, 3, samples), Batch(DEVICE, 3, None, packed=slots), Batch(DEVICE, 3, samples, packed=b"?"),
+    )  # fmt: skip
     assert (made.is_packed, packed.is_packed, both.is_packed) == (False, True, False)
     with monkeypatch.context() as patch:
         for name in ("decode_slots", "encode_slots"):  # these facts need no other form
@@ -45,10 +43,8 @@ def test_a_batch_rotates_its_samples_once_for_each_convention() -> None:
     assert batch.converted(None) is batch
     enu, ned = batch.converted(ENU), batch.converted(NED)
     assert [one.samples[0].accel_m_s2 for one in (batch, enu, ned)] == [
-        (2, 2.25, 2.5),
-        (2.25, -2, 2.5),
-        (2.25, 2, -2.5),
-    ]
+        (2, 2.25, 2.5), (2.25, -2, 2.5), (2.25, 2, -2.5),
+    ]  # fmt: skip
     assert (batch.converted(ENU), batch.converted(NED)) == (enu, ned)
     published = Batch(DEVICE, 3, [make_sample(2)], published_frame(None, NED, None, RFU_ENU))
     assert published.converted(NED) is published

@@ -311,16 +311,14 @@ def add_writer(loop: SampleLoop, done: asyncio.Future[None]) -> None:
         lambda loop, done: loop.call_soon(done.set_result, None),
         lambda loop, done: loop.call_later(0.001, done.set_result, None),
         lambda loop, done: loop.call_at(loop.time() + 0.001, done.set_result, None),
-        lambda _loop, done: done.set_result(None),
-        lambda loop, done: loop.call_soon_threadsafe(done.set_result, None),
+        lambda _loop, done: done.set_result(None), lambda loop, done: loop.call_soon_threadsafe(done.set_result, None),
         lambda loop, done: threading.Timer(0.01, loop.call_soon_threadsafe, (done.set_result, None)).start(),
         lambda loop, done: loop.run_in_executor(None, int).add_done_callback(lambda _: done.set_result(None)),
         lambda loop, done: loop.create_task(asyncio.sleep(0.001)).add_done_callback(lambda _: done.set_result(None)),
-        send_signal,
-        add_writer,
+        send_signal, add_writer,
     ],
     ids=["soon", "later", "at", "future", "threadsafe", "thread", "executor", "task", "signal", "writer"],
-)
+)  # fmt: skip
 def test_callbacks_of_a_reader_end_the_wait(
     pair: Pair, give: Callable[[SampleLoop, asyncio.Future[None]], object]
 ) -> None:

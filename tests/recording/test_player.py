@@ -72,14 +72,13 @@ def test_a_run_on_a_line_or_can_bus_is_replayed(run: Callable[[], None]) -> None
 @pytest.mark.parametrize(
     "run",
     [
-        polled.test_each_edge_is_a_sample_with_its_time,
-        polled.test_one_damaged_reading_loses_one_sample,
+        polled.test_each_edge_is_a_sample_with_its_time, polled.test_one_damaged_reading_loses_one_sample,
         lambda bench: polled.test_readings_after_an_absence_need_an_identification(
             bench=bench, fault={"error": errno.EIO}, why="transfer failed"
         ),
     ],
     ids=["edges", "damage", "failed transfers"],
-)
+)  # fmt: skip
 def test_a_run_of_a_polled_device_is_replayed(bench: PolledBusBench, run: Callable[..., None]) -> None:
     run(bench=bench)
 
