@@ -97,15 +97,22 @@ DISORDER_NS: Final = NS_PER_MS
 # Minimum rise of the time from line to line that counts as a step of the clock, ns. A shorter rise is a pause.
 STEP_NS: Final = 3600 * NS_PER_S
 PAUSE_NS: Final = 10 * NS_PER_S  # minimum pause that imud reports, ns
-SHIFT_NS: Final = NS_PER_MS  # minimum shift of the times of an identifier that imud reports, ns
+# Minimum shift of the times of an identifier that imud reports, ns. A step of 1 ms changes a distance by about 1 ms.
+SHIFT_NS: Final = NS_PER_MS * 9 // 10
+MILLISECONDS_NS: Final = NS_PER_MS  # the same in a log with times in whole milliseconds
 SHIFT_PERIOD_NS: Final = NS_PER_S  # maximum distance of the times of such an identifier, ns
 SHIFT_IDS: Final = 256  # maximum number of identifiers whose shifts imud detects
 REGULAR, SHIFTED = 8, 4  # number of regular distances before and after a shift
 PAUSES_KEPT: Final = 16  # number of known distances. The longest one replaces the unknown distance at a step.
 PAUSE: Final = "a pause or a step of the clock"
+SHIFT_BACKWARD: Final = "a step of the clock, or another phase of the sender"
+SHIFT_FORWARD: Final = "lost frames, a pause or a step of the clock"
 JUMPS_SHOWN: Final = 5  # maximum number of steps and pauses in a text
 IDENTIFIERS_MAX: Final = 4096  # maximum number of known identifiers
 FIRST: Final = 2  # number of known frames of each identifier
+DIFFERENCES_NS: Final = NS_PER_S  # maximum first time of a log of time differences, ns
+DIFFERENCES_LINES, DIFFERENCES_FALLS = 64, 3  # number of first lines and of their falls that show time differences
+EQUAL_MIN: Final = 16  # minimum number of frames of a log whose times imud checks
 INTERFACES_MAX: Final = 16  # maximum number of interfaces in a text
 
 
@@ -149,7 +156,11 @@ class _Times:
                 if self._step[0] and self._since == SHIFTED:
                     step, self._step = self._step, (0, 0)
                     return step
-            elif rise_ns < -max(2 * spread_ns, SHIFT_NS) and usual_ns <= SHIFT_PERIOD_NS and not self._step[0]:
+            elif (
+                abs(rise_ns) > max(2 * spread_ns, SHIFT_NS if t_ns % NS_PER_MS else MILLISECONDS_NS)
+                and usual_ns <= SHIFT_PERIOD_NS
+                and not self._step[0]
+            ):
                 self._step, self._since = (number, rise_ns), 0
                 return None
             else:
@@ -157,6 +168,37 @@ class _Times:
                 self._distances_ns.clear()
         self._distances_ns.append(distance_ns)
         return None
+
+
+class _TimeKind:
+    """Check that the times of a log are times of a clock."""
+
+    def __init__(self) -> None:
+        self._first_ns = self._newest_ns = self._frames = self._falls = self._equal = 0
+
+    def add(self, t_ns: int, number: int) -> None:
+        """Add the time of a frame. Raises BadArgument for time differences."""
+        distance_ns, self._newest_ns = t_ns - self._newest_ns, t_ns
+        self._frames += 1
+        if self._frames == 1:
+            self._first_ns = t_ns
+            return
+        self._equal = 0 if distance_ns else self._equal + 1
+        self._falls += distance_ns < 0
+        is_often = self._falls >= max(DIFFERENCES_FALLS, self._frames // 12)
+        if self._first_ns < DIFFERENCES_NS and is_often and self._frames <= DIFFERENCES_LINES:
+            raise BadArgument(
+                f"line {number}: expected times of a clock, got time differences (candump -t d): record the log again "
+                "with candump -L"
+            )
+
+    def end(self) -> None:
+        """Raise BadArgument if half of the frames have the time of the last frame."""
+        if self._frames >= EQUAL_MIN and self._equal > self._frames // 2:
+            raise BadArgument(
+                f"expected rising times, got {self._equal + 1} successive frames with the time "
+                f"{self._newest_ns / NS_PER_S:.6f} s: record the log again with candump -L"
+            )
 
 
 class CandumpReader:
@@ -183,7 +225,7 @@ class CandumpReader:
         self._offset_ns = 0  # offset of the newest time to `t_rx_ns`
         self._distances_ns: deque[int] = deque(maxlen=PAUSES_KEPT)
         self._times: dict[int, _Times] = {}  # times since the newest step by identifier
-        self._shifted = 0  # line of the newest shift
+        self._kind = _TimeKind()
 
     @property
     def problem(self) -> str:
@@ -196,6 +238,8 @@ class CandumpReader:
                 f"expected a candump log (candump -L), got {self.bad_lines} invalid lines "
                 f"(first: line {self.first_bad})"
             )
+        elif not self.identifiers:
+            found.append(f"found no data frame, and {self.passed_over} error frames, remote frames or CAN FD frames")
         return "; ".join(found)
 
     def __iter__(self) -> Iterator[CanFrame]:
@@ -217,13 +261,14 @@ class CandumpReader:
             if not self._is_own(_text(name)):
                 continue
             t_ns, is_jump = self._time(int(seconds) * NS_PER_S + int(fraction.ljust(9, b"0")), number)
-            self._look_for_shift(can_id, t_ns, number, is_jump=is_jump)
+            self._look_for_shift(can_id, t_ns, number)
             frame = CanFrame(can_id, len(digits) == 8, bytes.fromhex(data.decode("ascii")), t_ns, is_jump)
             if len(self.identifiers) < IDENTIFIERS_MAX:
                 first = self.identifiers.setdefault((can_id, frame.extended), [])
                 if len(first) < FIRST:
                     first.append(frame)
             yield frame
+        self._kind.end()
         if self._others and not self._has_frames:
             raise BadArgument(f"interface {self.interface}: expected {_listed(self._others, 'or')}, as in the log")
 
@@ -254,6 +299,7 @@ class CandumpReader:
 
     def _time(self, log_ns: int, number: int) -> tuple[int, bool]:
         """Return the time of a frame, and whether the clock stepped before it."""
+        self._kind.add(log_ns, number)
         if self._newest_ns is None:
             self._newest_ns = log_ns
         rise_ns = log_ns - self._newest_ns
@@ -270,19 +316,18 @@ class CandumpReader:
             self._newest_ns = log_ns
         return self._newest_ns - self._offset_ns, is_step
 
-    def _look_for_shift(self, can_id: int, t_ns: int, number: int, *, is_jump: bool) -> None:
-        """Report a step of the clock that is shorter than the distance of two lines."""
-        if is_jump:
-            self._times.clear()
+    def _look_for_shift(self, can_id: int, t_ns: int, number: int) -> None:
+        """Report a short step of the clock: backward shorter than the distance of two lines, forward like a pause."""
         times = self._times.get(can_id)
         if times is None:
             if len(self._times) < SHIFT_IDS:
                 self._times[can_id] = _Times(t_ns)
-        elif (shift := times.add(t_ns, number)) and shift[0] > self._shifted:
-            self._shifted = number  # the other identifiers show the same step in the lines before this line
-            self._note_jump(shift[1], shift[0], "a step of the clock, or another phase of the sender", "shifts")
+        elif shift := times.add(t_ns, number):
+            causes = SHIFT_FORWARD if shift[1] > 0 else SHIFT_BACKWARD
+            self._note_jump(shift[1], shift[0], causes, "shifts")
 
     def _note_jump(self, rise_ns: int, number: int, what: str, verb: str = "changes") -> None:
+        self._times.clear()  # all identifiers show the same step
         self._jump_count += 1
         if len(self._jumps) < JUMPS_SHOWN:
             digits = 3 if abs(rise_ns) >= NS_PER_MS else 6

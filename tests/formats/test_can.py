@@ -11,16 +11,10 @@ from imud.model.errors import BadArgument
 from tests.support.files import candump_line
 
 
-@pytest.mark.parametrize(
-    ("extended", "data_bytes", "bits"),
+def test_length_of_a_frame_and_layout_of_the_kernel() -> None:
     # start 1, identifier 11, RTR, IDE, r0, DLC 4, data, CRC 15 + 1, ACK 2, end 7, pause 3; SRR, r1 and 18 bits more
-    [(False, 8, 111), (False, 6, 95), (False, 0, 47), (True, 8, 131), (True, 0, 67)],
-)
-def test_length_of_a_frame(extended: bool, data_bytes: int, bits: int) -> None:
-    assert can.frame_bits(extended, data_bytes) == bits
-
-
-def test_frames_in_the_layout_of_the_kernel() -> None:
+    bits = {(False, 8): 111, (False, 6): 95, (False, 0): 47, (True, 8): 131, (True, 0): 67}
+    assert {one: can.frame_bits(*one) for one in bits} == bits
     assert can.RAW_FRAME.unpack(can.pack_frame(0x7FF, False, b"ab")) == (0x7FF, 2, b"ab" + bytes(6))
     assert can.RAW_FRAME.unpack(can.pack_frame(0, True, bytes(range(8)))) == (0x8000_0000, 8, bytes(range(8)))
     assert (can.EXTENDED_FLAG, can.REMOTE_FLAG, can.ERROR_FLAG) == (1 << 31, 1 << 30, 1 << 29)  # linux/can.h
@@ -30,21 +24,18 @@ def test_frames_in_the_layout_of_the_kernel() -> None:
             can.pack_frame(can_id, extended, data)
 
 
-@pytest.mark.parametrize(
-    ("one", "other", "expected"),
-    [
+def test_filters_overlap_if_one_frame_passes_both() -> None:
+    for one, other, expected in (
         (can.CanFilter(0x180, 0x7F0, False), can.CanFilter(0x185, 0x7FF, False), True),
         (can.CanFilter(0x180, 0x7FF, False), can.CanFilter(0x185, 0x7FF, False), False),
         (can.CanFilter(0x180, 0x7F0, False), can.CanFilter(0x185, 0x7FF, True), False),
         (can.CanFilter(0, 0, True), can.CanFilter(0x1FFF_FFFF, 0x1FFF_FFFF, True), True),
-    ],
-)
-def test_filters_overlap_if_one_frame_passes_both(one: can.CanFilter, other: can.CanFilter, expected: bool) -> None:
-    assert one.overlaps(other) == other.overlaps(one) == one.matches(other.can_id, other.extended) == expected
-    if expected:  # the identifier with all bits of both masks
-        can_id = (one.can_id & one.mask) | (other.can_id & other.mask)
-        assert one.matches(can_id, one.extended)
-        assert other.matches(can_id, other.extended)
+    ):
+        assert one.overlaps(other) == other.overlaps(one) == one.matches(other.can_id, other.extended) == expected
+        if expected:  # the identifier with all bits of both masks
+            can_id = (one.can_id & one.mask) | (other.can_id & other.mask)
+            assert one.matches(can_id, one.extended)
+            assert other.matches(can_id, other.extended)
 
 
 US = 1000
@@ -86,6 +77,9 @@ def test_lines_of_candump() -> None:
         ((*range(10), *(t - 0.9 for t in range(10, 15))), (*range(10), *(t - 0.9 for t in range(10, 15))),
          "line 11: the time shifts by -0.900 s (a step"),
         ((*range(9), *(8 + t / 2 for t in range(1, 12))), (*range(9), *(8 + t / 2 for t in range(1, 12))), ""),  # rate
+        (shifted := (*range(10), *(t + 0.0011 for t in range(10, 15))), shifted, "line 11: the time shifts by +0.001"),
+        (shifted := (*range(10), *range(20, 25)), shifted, "line 11: the time changes by +11.000 s (a pause or a step"),
+        (shifted := (*range(10), *range(15, 20)), shifted, "line 11: the time shifts by +5.000 s (lost frames, a"),
         ((5, 5.01, 4, 4.01), (5, 5.01, 5.02, 5.03), "line 3: the time changes by -1.010 s (a step of"),
         ((5, 5.01, 3605.01, 3605.11), (5, 5.01, 5.02, 5.12), "line 3: the time changes by +3600.000 s (a step of"),
         ((5, 14.999, 24.999), (5, 14.999, 24.999), "line 3: the time changes by +10.000 s (a pause or a step"),
@@ -104,6 +98,13 @@ def test_steps_of_the_clock(times_s: Sequence[float], expected_s: Sequence[float
 
 def test_interfaces() -> None:
     log = b"(1.0) can1 001#\n(2.0) can0 002#\n(3.0) can1 003#\n"
+    assert read(b"(1.0) can0 123#R8\n")[1].problem.startswith("found no data frame, and 1 error frames")
+    for times, words in (
+        ("0 .01 .02 .01 .02 .01 .02 .01", "line 8: .*got time differences"),
+        ("1" * 16, "got 16 succ"),
+    ):
+        with pytest.raises(BadArgument, match=words):
+            read("".join(f"({float(t):.6f}) a 001#\n" for t in (times.split() if " " in times else times)).encode())
     for name, ids in (("can0", [2]), ("can1", [1, 3])):
         assert [frame.can_id for frame in can.CandumpReader(io.BytesIO(log), name)] == ids
     with pytest.raises(BadArgument, match="interfaces can1 and can0: select one"):
@@ -121,18 +122,14 @@ def test_interfaces() -> None:
         list(can.CandumpReader(escapes))
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
+def test_other_lines_are_reported() -> None:
+    for line in (
         b"no log at all", b"(1.0) can0 900#00", b"(1.0) can0 123#0", b"(1.0) can0 123#001122334455667788",
         b"(1.0) can0 1234#00", b"can0  123  [2]  11 22", b"\x00\xff" * 400, b"(1.0) %s 123#00" % (b"c" * 500),
-    ],
-)  # fmt: skip  # 0x900 is above 11 bits
-def test_other_lines_are_reported(line: bytes) -> None:
-    frames, reader = read(b"(1.0) can0 001#00\n" + line + b"\n(2.0) can0 002#00\n")
-    assert [frame.can_id for frame in frames] == [1, 2]
-    assert reader.bad_lines >= 1
-    assert "line 2" in reader.problem
+    ):  # fmt: skip  # 0x900 is above 11 bits
+        frames, reader = read(b"(1.0) can0 001#00\n" + line + b"\n(2.0) can0 002#00\n")
+        assert ([frame.can_id for frame in frames], reader.bad_lines >= 1) == ([1, 2], True), line
+        assert "line 2" in reader.problem, line
 
 
 def test_what_is_written_is_read() -> None:

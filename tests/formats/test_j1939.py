@@ -17,32 +17,22 @@ KNOWN = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("can_id", "parts"), KNOWN, ids=[f"{can_id:08X}" for can_id, _ in KNOWN])
-def test_known_identifiers(can_id: int, parts: J1939Id) -> None:
-    assert split(can_id) == parts
-    assert join(parts) == can_id
-
-
 @given(st.integers(0, EXTENDED_ID_MAX))
 def test_round_trip_of_every_identifier(can_id: int) -> None:
     assert join(split(can_id)) == can_id
 
 
-@pytest.mark.parametrize(
-    "parts",
-    [
+def test_known_and_invalid_identifiers_and_filters() -> None:
+    for can_id, parts in KNOWN:
+        assert (split(can_id), join(parts)) == (parts, can_id)
+    for parts in (
         J1939Id(8, 0xFF34, 8), J1939Id(3, 0x40000, 8), J1939Id(3, 0xFF34, 256), J1939Id(3, 0xEF00, 8, 256),
         J1939Id(3, 0xEF01, 8, 5),  # a destination in the number
         J1939Id(3, 0xFF34, 8, 5),  # a destination in a broadcast
         J1939Id(-1, 0xFF34, 8),
-    ],
-)  # fmt: skip
-def test_invalid_identifiers(parts: J1939Id) -> None:
-    with pytest.raises(ValueError, match="J1939"):
-        join(parts)
-
-
-def test_filters_and_senders() -> None:
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match="J1939"):
+            join(parts)
     one = filter_of(0xFF34, 8)
     assert all(one.matches(priority << 26 | 0xFF3408, True) for priority in range(8))
     assert not one.matches(0x0CFF3409, True)

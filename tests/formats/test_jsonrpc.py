@@ -34,17 +34,14 @@ def test_an_invalid_request_has_a_code_and_its_id(line: bytes, code: int, reques
     assert words in str(error.value)
 
 
-def test_requests_within_the_limits_are_accepted_and_replies_are_nested_deeper() -> None:
+def test_requests_within_the_limits_are_accepted_and_messages_are_bytes() -> None:
+    """Integers that can exceed 2⁵³ are strings on request: `epoch` and times in ns (docs/socket.md)."""
     assert jsonrpc.parse_request(b'{"jsonrpc":"2.0","method":"m"}') == RpcRequest("m", {}, None, wants_reply=False)
     assert jsonrpc.parse_request(HEAD + b'{"a":2}}') == RpcRequest("m", {"a": 2}, 1, wants_reply=True)
     assert jsonrpc.parse_request(HEAD + b'{"a":' + b"[" * 62 + b"]" * 62 + b"}}").request_id == 1
     assert jsonrpc.parse_request(HEAD + b'{"a":[' + b"1," * 2045 + b"1]}}").request_id == 1
     with pytest.raises(RpcError, match=r"^cannot read the JSON: nested too deeply$"):
         jsonrpc.parse_object(b"[" * 100_000)
-
-
-def test_messages_as_bytes() -> None:
-    """Integers that can exceed 2⁵³ are strings on request: `epoch` and times in ns (docs/socket.md)."""
     assert jsonrpc.encode_request("m", {"a": 2}, 1) == HEAD + b'{"a":2}}'
     value = {"epoch": 1, "t_ns": 2**60, "seq": 5, "list": [{"utc_ns": -1, "is_ns": True}], "r_ns": 1.5, "x_ns": None}
     plain = b'{"epoch":1,"t_ns":%d,"seq":5,"list":[{"utc_ns":-1,"is_ns":true}],"r_ns":1.5,"x_ns":null}' % (2**60)

@@ -31,12 +31,9 @@ def test_check_value_and_frames() -> None:
     assert modbus.exception_text(77) == "exception 77: unknown code"
     # 0 is the broadcast, 248 to 255 are reserved (Modbus over serial line V1.02, 2.2)
     assert list(modbus.SLAVES) == list(range(1, 248))
-
-
-@pytest.mark.parametrize(("baud", "gap_ns"), [(9600, 3_645_831), (19200, 1_822_915), (38400, 1_750_000)])
-def test_silence_between_frames(baud: int, gap_ns: int) -> None:
-    """3.5 characters of 10 bits up to 19200 baud, 1.75 ms above."""
-    assert modbus.frame_gap_ns(baud) == pytest.approx(gap_ns, abs=2)
+    for baud, gap_ns in ((9600, 3_645_831), (19200, 1_822_915), (38400, 1_750_000)):
+        # silence: 3.5 characters of 10 bits up to 19200 baud, 1.75 ms above
+        assert modbus.frame_gap_ns(baud) == pytest.approx(gap_ns, abs=2)
 
 
 @given(seed=st.integers(0, 2**32), echo=st.booleans(), known=st.booleans(), exception=st.booleans())
@@ -53,7 +50,7 @@ def test_the_reply_is_found_in_any_split(seed: int, echo: bool, known: bool, exc
     assert found.echo_seen is (echo if echo or not known else None)
 
 
-def test_bytes_that_are_not_the_reply_are_skipped_and_counted() -> None:
+def test_other_bytes_are_skipped_and_a_damaged_reply_is_returned_only_in_its_place() -> None:
     found = finder()
     assert found.feed(OTHER) is None
     assert found.feed(b"\x05\x03" + REPLY[:4]) is None
@@ -65,9 +62,6 @@ def test_bytes_that_are_not_the_reply_are_skipped_and_counted() -> None:
     assert found.feed(old) is None
     assert found.feed(REPLY) == REPLY
     assert found.strange == len(old)
-
-
-def test_a_damaged_reply_is_returned_only_in_its_place() -> None:
     damaged = REPLY[:-1] + bytes([REPLY[-1] ^ 1])
     assert finder().feed(damaged) == damaged
     assert finder().feed(REPLY[:3] + EXCEPTION) is None  # registers with the bytes of an exception
