@@ -48,6 +48,8 @@ StartRun = Callable[..., Any]  # function of the kernel that starts a run, with 
 
 _EARLY_NS: Final = -JUMP_EARLY_NS
 _T_ERR_MOST: Final = float(T_ERR_MOST)
+# Before each time stamp. Times of a replay are negative if the capture is longer than the uptime of the host.
+_BEFORE_ALL_NS: Final = -(1 << 62)
 
 
 class RunStart(NamedTuple):
@@ -179,7 +181,8 @@ class SampleClock:
         self._fit_sync = Sync.ARRIVAL  # REGRESSION if the fit is in use
         self._sync = Sync.ARRIVAL  # source of the newest time stamp if there are aiding sources
         self._known, self._resets = False, 0  # known: the device time has started
-        self._seq = self._t_ns = self._t_rx_ns = self._t_err_ns = 0
+        self._seq = self._t_err_ns = 0
+        self._t_ns = self._t_rx_ns = _BEFORE_ALL_NS
         self._error_ns = 0.0  # one-sigma error of the newest time stamp before its correction
         self._own_status: int | None = None
         self._run: Any = None  # `Run` of the kernel, which has the state of the newest samples; None without a run

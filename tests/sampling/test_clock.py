@@ -146,6 +146,7 @@ def test_repeated_stamps_rise_and_a_stuck_counter_falls_back_to_arrival() -> Non
     assert clock.status().resets == 0
     clock = make_clock()
     clock.sample_polled(FRAME, BEGIN_NS, 1, BEGIN_NS, 0)
+    assert make_clock().sample(message(None), -BEGIN_NS, 0).t_ns <= -BEGIN_NS, "a capture longer than the uptime"
     samples = [clock.sample(message(None), BEGIN_NS, 0) for _ in range(2)]
     assert [(s.t_ns, s.t_rx_ns) for s in samples] == [(BEGIN_NS + 1,) * 2, (BEGIN_NS + 2,) * 2]
     clock = make_clock()
