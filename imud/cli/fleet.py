@@ -296,6 +296,8 @@ async def _collect(args: argparse.Namespace) -> int:
         store.close()
     if ledger := account_table(fleet.accounts):
         print(ledger, file=sys.stderr)
+    if fleet.ignored:
+        print(f"{fleet.ignored} messages were invalid and not stored; the log names them", file=sys.stderr)
     if fleet.problem:
         print(f"the broker connection failed at the end: {fleet.problem}", file=sys.stderr)
     return 1 if fleet.problem else 0

@@ -4,7 +4,8 @@
 
 Each record is stored exactly once, because one transaction contains the rows and the ledger. The primary key is
 gateway, boot, device, number and time. If the database contains rows that the ledger does not, COPY fails. Then imud
-repeats the transaction with temporary tables and ON CONFLICT DO NOTHING, which takes twice as long.
+repeats the transaction with temporary tables and ON CONFLICT DO NOTHING, which takes twice as long. If the server ends
+the connection, imud connects again and repeats the transaction.
 
 A gateway without a battery-backed clock starts with a wrong time. Its rows have the time of this clock and `utc_set`
 false, until a message or a state of the same boot contains a synchronized clock. The same transaction then moves all
@@ -12,8 +13,9 @@ rows of the boot to their UTC time. It uses DELETE and INSERT, because Timescale
 """
 
 import logging
+import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from datetime import datetime, timedelta
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
@@ -158,6 +160,10 @@ log = logging.getLogger(__name__)
 OF_VALUES: Final = ("22", "54")
 LOCK: Final = 0x696D7564  # Number of the advisory lock, "imud". One collector at a time writes to a database.
 LOCK_S: Final = 20  # Maximum wait for the lock, s. The lock of a killed collector ends with its last statement.
+CONNECT_S: Final = 10  # maximum time of an attempt to connect, s
+# Number of attempts to connect again, and the pause before each, s. The restart of a server takes some seconds.
+ATTEMPTS: Final = 20
+ATTEMPT_PAUSE_S: Final = 0.5
 EXTRA_MISSING: Final = "--to postgresql needs the extra fleet: pip install 'imud[fleet]'"
 _UTC_NS: Final = "t_ns + %(utc_offset_ns)s"
 # SQL expressions of the columns that change when the clock of a boot is known, equal to `accounts.placed`
@@ -181,12 +187,20 @@ class PostgresStore:
             import psycopg
         except ImportError as error:
             raise ServerError(EXTRA_MISSING) from error
+        self._url = url
         self._error: type[Exception] = psycopg.Error
         self._conflict: type[Exception] = psycopg.errors.UniqueViolation
         self.refused = 0  # number of messages, ledgers and offsets that the database could not store
         self._offsets: dict[BootKey, BootOffset] = {}  # clock offsets in the table `imud_boots`
+        self._connect()
+
+    def _connect(self) -> None:
+        import psycopg
+
         try:
-            self._connection: Any = psycopg.connect(url, connect_timeout=10, application_name="imud fleet collect")
+            self._connection: Any = psycopg.connect(
+                self._url, connect_timeout=CONNECT_S, application_name="imud fleet collect"
+            )
             with self._connection.transaction(), self._connection.cursor() as cursor:
                 cursor.execute(f"SET lock_timeout = '{round(LOCK_S * 1000)}ms'")
                 cursor.execute("SELECT pg_advisory_lock(%s)", (LOCK,))
@@ -224,7 +238,26 @@ class PostgresStore:
 
     def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
         """Store batches, changed ledgers and clock offsets in one transaction. Raises ServerError. If the database
-        cannot store a message, store each part in its own transaction and ignore the parts that fail."""
+        cannot store a message, store each part in its own transaction and ignore the parts that fail. If the server
+        ends the connection, connect again and repeat the transaction."""
+        try:
+            self._write(batches, accounts, offsets)
+        except ServerError as error:
+            if not self._connection.closed:
+                raise
+            self._connect_again(error)
+            self._write(batches, accounts, offsets)
+
+    def _connect_again(self, cause: ServerError) -> None:
+        """Connect to a server that ended the connection. Raises ServerError after ATTEMPTS attempts."""
+        log.warning("%s; connecting again", cause)
+        for attempt in range(ATTEMPTS):
+            time.sleep(ATTEMPT_PAUSE_S)
+            with suppress(ServerError) if attempt < ATTEMPTS - 1 else nullcontext():
+                self._connect()
+                return
+
+    def _write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
         known = [batch._replace(offset=batch.offset or self._offsets.get(boot_of(batch.message))) for batch in batches]
         fresh = {key: offset for key, offset in offsets.items() if key not in self._offsets}
         try:

@@ -6,6 +6,7 @@ import random
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from typing import Any
 
 import msgspec
@@ -211,6 +212,21 @@ def test_a_bad_message_affects_only_itself(database: str, caplog: pytest.LogCapt
     assert query(database, "SELECT count(*) FROM imud_ledger") == [(3,)]
 
 
+def test_a_lost_connection_is_replaced(caplog: pytest.LogCaptureFixture) -> None:
+    with running_server() as server, closing(PostgresStore(server.url)) as store:
+        for first in (1, 6, 11):
+            store.write([FleetBatch("mill", Stream.SAMPLES, samples_message(first, first + 4))], {}, {})
+            if first == 1:
+                query(
+                    server.url, "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE pid <> pg_backend_pid()"
+                )
+            elif first == 6:
+                server.kill()
+                server.start()
+        assert query(server.url, "SELECT count(*) FROM imud_samples") == [(15,)]
+    assert caplog.text.count("connecting again") == 2
+
+
 def test_ledgers_of_old_boots_are_removed(database: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("imud.fleet.accounts.STREAMS_MAX", 3)
     for boot in "12345":
@@ -255,14 +271,11 @@ def test_a_second_collector_reports_the_first(database: str, monkeypatch: pytest
         ("postgresql://u:secret@h/x?port=1&colour=2", "invalid URI query parameter"),
     ],
 )
-def test_an_invalid_url_is_not_printed(url: str, problem: str) -> None:
+def test_an_invalid_url_is_not_printed_and_a_missing_server_is_named(url: str, problem: str) -> None:
     with pytest.raises(ServerError, match=f"^PostgreSQL: cannot parse the URL: {problem}; imud does not ") as refused:
         PostgresStore(url)
     assert refused.value.__suppress_context__, "a traceback does not print it either"
     assert "cret" not in str(refused.value)
-
-
-def test_a_missing_server_is_named() -> None:
     with pytest.raises(ServerError, match=r"PostgreSQL: .*nowhere"):
         PostgresStore("postgresql:///postgres?host=/nowhere")
 
