@@ -185,6 +185,8 @@ class WebConnections:
         # start of the connection, or end of its last request, oldest first
         self._since_s: dict[web.RequestHandler, float] = {}
         self._busy: set[web.RequestHandler] = set()
+        self._answering: set[web.RequestHandler] = set()  # connections whose request has no reply
+        self._half_closed: set[web.RequestHandler] = set()  # clients that closed their sending direction
 
     def accept(self, connection: web.RequestHandler) -> web.RequestHandler:
         """Add a new connection and return it. Close the oldest idle connection if there are too many."""
@@ -193,9 +195,25 @@ class WebConnections:
         return connection
 
     def close_idle(self) -> None:
-        """Close the connections that are idle for IDLE_S. Call this method every CHECK_S."""
+        """Close the connections that are idle for IDLE_S, and half-closed ones after the reply to their last request.
+
+        Call this method every CHECK_S.
+        """
         self._now_s += CHECK_S
         self._close(lambda idle_s: idle_s >= IDLE_S)
+        for connection in self._half_closed - self._busy - self._answering:
+            # two checks: the next of several requests can start between them
+            if connection.transport is not None and self._now_s - self._since_s.get(connection, 0.0) > CHECK_S:
+                connection.transport.close()  # sends the rest of the reply
+
+    def half_close(self, connection: web.RequestHandler) -> None:
+        """Note that the client of a connection sends no further requests, but can receive replies."""
+        self._half_closed.add(connection)
+
+    def remove(self, connection: web.RequestHandler) -> None:
+        """Remove a closed connection."""
+        self._since_s.pop(connection, None)
+        self._half_closed.discard(connection)
 
     def _close(self, is_wanted: Callable[[float], bool]) -> None:
         for connection, since_s in list(self._since_s.items()):
@@ -217,8 +235,13 @@ class WebConnections:
         finally:
             self._busy.discard(connection)
 
+    def begin_request(self, request: web.Request) -> None:
+        """Note that a connection has a request without a reply."""
+        self._answering.add(request.protocol)
+
     def end_request(self, request: web.Request) -> None:
         """Restart the idle time of a connection."""
+        self._answering.discard(request.protocol)
         if self._since_s.pop(request.protocol, None) is not None:
             self._since_s[request.protocol] = self._now_s
 
@@ -233,6 +256,29 @@ class WebConnections:
         checking = asyncio.create_task(check())
         yield
         checking.cancel()
+
+
+class HalfCloseProtocol(asyncio.Protocol):
+    """Protocol of aiohttp for clients that can close their sending direction before they receive the reply.
+
+    asyncio closes the connection of such a client if `eof_received` does not return True.
+    """
+
+    def __init__(self, handler: web.RequestHandler, connections: WebConnections) -> None:
+        self._handler, self._connections = handler, connections
+        self.data_received = handler.data_received  # type: ignore[method-assign]  # one call less per read
+        self.pause_writing, self.resume_writing = handler.pause_writing, handler.resume_writing  # type: ignore[method-assign]
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._handler.connection_made(transport)
+
+    def eof_received(self) -> bool:
+        self._connections.half_close(self._handler)
+        return True
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._connections.remove(self._handler)
+        self._handler.connection_lost(exc)
 
 
 class LimitedSite(web.TCPSite):
@@ -250,15 +296,18 @@ class LimitedSite(web.TCPSite):
         # asyncio does not report a family that the kernel lacks
         socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET).close()
         self._server = await asyncio.get_running_loop().create_server(
-            lambda: self._connections.accept(make()), host, port, backlog=self._backlog
+            lambda: HalfCloseProtocol(self._connections.accept(make()), self._connections),
+            host,
+            port,
+            backlog=self._backlog,
         )
 
 
 class _OfPrograms(logging.Filter):
-    """Filter that keeps errors of imud, and discards errors about malformed requests."""
+    """Filter that keeps errors of imud, and discards errors about malformed requests and disconnected clients."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        return not (record.exc_info and isinstance(record.exc_info[1], BAD_INPUT))
+        return not (record.exc_info and isinstance(record.exc_info[1], (*BAD_INPUT, ConnectionError)))
 
 
 def server_log() -> logging.Logger:
@@ -347,6 +396,7 @@ class WebServer:
     @web.middleware
     async def _guarded(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Refuse malformed requests, and requests that another site could have sent."""
+        self.connections.begin_request(request)
         try:
             return await self._checked(request, handler)
         except BAD_INPUT:

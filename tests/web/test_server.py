@@ -453,6 +453,14 @@ async def test_connections_without_a_complete_request_end(tmp_path: Path, monkey
         reader, writer = await asyncio.open_connection(host, port)
         assert await reader.read() == b""
         writer.close()
+        for is_pipelined in (False, True):  # a client that closes its sending direction receives all replies
+            reader, writer = await asyncio.open_connection(host, port)
+            writer.write(f"GET / HTTP/1.1\r\nHost: {host}:{port}\r\n\r\n".encode() * (1 + is_pipelined))
+            if not is_pipelined:
+                await reader.readuntil(b"\r\n\r\n")
+            writer.write_eof()
+            assert (await reader.read()).endswith(b"</html>\n")
+            writer.close()
     limits = Mock(return_value=asyncio.timeout(0))
     monkeypatch.setattr(asyncio, "timeout", limits)
     with pytest.raises(HTTPRequestTimeout):
