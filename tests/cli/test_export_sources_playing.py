@@ -141,7 +141,7 @@ def pictures(terminal: Terminal) -> list[str]:
     return [one for one in terminal.getvalue().split(playing.CLEAR) if one]
 
 
-def test_a_bar_with_share_samples_and_time() -> None:
+def test_a_bar_with_share_samples_and_time_and_how_often_it_is_drawn() -> None:
     terminal, now_s = Terminal(), [100.0]
     progress = playing.Progress(1000, terminal, lambda: now_s[0])
     now_s[0] = 110.0
@@ -151,9 +151,6 @@ def test_a_bar_with_share_samples_and_time() -> None:
     assert pictures(terminal) == [f"[######..................]  25 %  {playing.LOOK_SAMPLES} samples, 30 s left"]
     assert terminal.getvalue().endswith(playing.CLEAR)
     assert progress.spent_s == 10.0
-
-
-def test_how_often_it_is_drawn() -> None:
     terminal, now_s = Terminal(), [100.0]
     progress = playing.Progress(1000, terminal, lambda: now_s[0])
     for samples, second, expected in [(1999, 100.0, 0), (1, 100.0, 1), (2000, 100.19, 1), (2000, 100.2, 2)]:

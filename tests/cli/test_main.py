@@ -39,17 +39,14 @@ def test_version_and_usage_without_a_command(cli: Cli) -> None:
     assert cli("--version").out == f"imud {__version__}\n"
 
 
-def test_no_daemon_is_one_line(tmp_path: Path, cli: Cli) -> None:
+def test_no_daemon_a_daemon_that_hangs_and_an_interrupt(tmp_path: Path, cli: Cli) -> None:
     for command in ("devices", "status", "watch", "events", "clock", "record"):
         error = cli(command, "--socket", tmp_path / "none", status=2).err
         assert error.count("\n") == 1, error
         assert error.startswith(f"imud {command}: no daemon at {tmp_path}/none: is imud running?")
-
-
-def test_a_daemon_that_hangs_is_named_and_an_interrupt_is_status_130(cli: Cli) -> None:
     words, hang = ("status", "--socket", "/run/x.sock"), TimeoutError("/run/x.sock: waited in vain for hello")
-    for error, status, said in [(hang, 2, f"imud status: {hang}\n"), (KeyboardInterrupt, 130, "")]:
-        with mock.patch("imud.cli.arguments.Client", side_effect=error):
+    for failure, status, said in [(hang, 2, f"imud status: {hang}\n"), (KeyboardInterrupt, 130, "")]:
+        with mock.patch("imud.cli.arguments.Client", side_effect=failure):
             assert cli(*words, status=status).err == said
 
 

@@ -30,7 +30,7 @@ def capture(file: Path, count: int) -> Path:
     return file
 
 
-def test_every_sample_is_printed_and_the_account_is_given(tmp_path: Path, cli: Cli) -> None:
+def test_every_sample_is_printed_and_the_report_names_unknown_times(tmp_path: Path, cli: Cli) -> None:
     file = capture(tmp_path / "c.raw", 50)
     printed = cli("replay", "--json", "--baud", "115200", file)
     samples = [json.loads(line) for line in printed.out.splitlines()]
@@ -40,6 +40,13 @@ def test_every_sample_is_printed_and_the_account_is_given(tmp_path: Path, cli: C
     assert times == sorted(set(times))
     assert "samples   50; lost 0" in printed.err
     assert "all accounted for" in printed.err
+    (tmp_path / "noise").write_bytes(b"\x00" * 500)
+    assert "samples   0" in cli("replay", tmp_path / "noise", status=1).err
+    cli.refuses("none", "replay", str(tmp_path / "none"))
+    words = " ".join(cli("replay", capture(tmp_path / "c.raw", 300)).err.split())
+    assert "times unknown: a raw capture does not contain arrival times" in words
+    assert [word for word in ("ppm", "Hz") if word in words] == []
+    assert "samples 300; lost 0" in words
 
 
 def test_a_stamped_capture_has_its_own_rate_and_no_figures_of_how_fast_it_was_read(tmp_path: Path, cli: Cli) -> None:
@@ -69,16 +76,6 @@ def test_the_summary_names_unused_frames_beside_samples(
     (tmp_path / name).write_bytes(content)
     driver = "hipnuc-canopen" if name == "a.log" else "hipnuc-uart"
     assert f"  unused    {words}" in cli("replay", "--driver", driver, tmp_path / name).err
-
-
-def test_a_raw_capture_says_what_it_cannot_know_and_one_without_samples(tmp_path: Path, cli: Cli) -> None:
-    (tmp_path / "noise").write_bytes(b"\x00" * 500)
-    assert "samples   0" in cli("replay", tmp_path / "noise", status=1).err
-    cli.refuses("none", "replay", str(tmp_path / "none"))
-    printed = " ".join(cli("replay", capture(tmp_path / "c.raw", 300)).err.split())
-    assert "times unknown: a raw capture does not contain arrival times" in printed
-    assert [word for word in ("ppm", "Hz") if word in printed] == []
-    assert "samples 300; lost 0" in printed
 
 
 def test_a_damaged_capture_is_status_1_and_one_that_is_cut_short_is_not(tmp_path: Path, cli: Cli) -> None:
@@ -133,12 +130,9 @@ def test_the_samples_are_those_that_the_daemon_published(recorded: Recorded, cli
     assert "the file" not in printed.err
 
 
-def test_options_of_captures_are_refused(recorded: Recorded, cli: Cli) -> None:
-    for words in (["--driver", "hipnuc-uart"], ["--baud", "9600"], ["--speed", "real"], ["--option", "a=1"]):
-        cli.refuses(f"{words[0]} applies to captures only", "replay", *words, str(recorded[0]))
-
-
-def test_a_fresh_clock_and_dropped_records_are_told(recorded: Recorded, cli: Cli) -> None:
+def test_options_of_captures_a_fresh_clock_and_dropped_records(recorded: Recorded, cli: Cli) -> None:
+    for option in (["--driver", "hipnuc-uart"], ["--baud", "9600"], ["--speed", "real"], ["--option", "a=1"]):
+        cli.refuses(f"{option[0]} applies to captures only", "replay", *option, str(recorded[0]))
     printed = cli("replay", "--json", "--fresh", recorded[0])
     assert len(printed.out.splitlines()) == len(recorded[1])
     assert printed.err.count("a new clock was requested") == 2
@@ -151,7 +145,7 @@ def test_a_fresh_clock_and_dropped_records_are_told(recorded: Recorded, cli: Cli
         assert (got, "the recorder dropped 3 records" in report) == (status, lost == 3)
 
 
-def test_a_cut_file_is_replayed_as_far_as_it_goes(recorded: Recorded) -> None:
+def test_cut_and_damaged_recordings(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
     """A slow host writes several blocks, so the blocks before the cut can contain samples."""
     file, lines, _ = recorded
     printed: list[str] = []
@@ -160,10 +154,6 @@ def test_a_cut_file_is_replayed_as_far_as_it_goes(recorded: Recorded) -> None:
     assert (printed, status) == (lines[: len(printed)], 0 if printed else 1)
     assert "no regular end" in report
     assert "incomplete" in report
-
-
-def test_damaged_recordings(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
-    file = recorded[0]
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 1
     (tmp_path / "damaged").write_bytes(data)
@@ -171,9 +161,9 @@ def test_damaged_recordings(recorded: Recorded, tmp_path: Path, cli: Cli) -> Non
     file = tmp_path / "damaged.imudrec"
     file.write_bytes(bytes(8) + recorded[0].read_bytes()[8:])
     for command in (["replay"], ["export", "--to", "csv"]):
-        printed = cli(*command, file, status=1).err
-        assert "bytes from byte 0 are damaged" in printed
-        assert "the capture" not in printed
+        report = cli(*command, file, status=1).err
+        assert "bytes from byte 0 are damaged" in report
+        assert "the capture" not in report
     (tmp_path / "a").write_bytes(b"\x89imudREC" + bytes(100))
     cli.refuses("at least one complete block", "replay", tmp_path / "a")
 
@@ -245,6 +235,9 @@ def test_a_step_of_the_clock_is_reported_and_removed(
 @every_command
 @every_driver
 def test_a_log_of_two_interfaces_needs_a_choice(driver: str, command: str, tmp_path: Path, cli: Cli) -> None:
+    (tmp_path / "x.raw").write_bytes(bytes(100))
+    report = run(cli, command, "hipnuc-uart", tmp_path / "x.raw", "--interface", "can0", status=2)
+    assert "--interface applies to logs of a CAN bus" in report
     lines = [candump_line(f, bus) for one in sets(driver) for bus in ("can0", "vcan1") for f in one]
     (tmp_path / "x.log").write_text("".join(lines))
     assert "interfaces can0 and vcan1: select one" in run(cli, command, driver, tmp_path / "x.log", status=2)
@@ -257,13 +250,6 @@ def test_a_log_of_two_interfaces_needs_a_choice(driver: str, command: str, tmp_p
         few = run(cli, command, driver, tmp_path / "x.log", *options, status=2)
         assert "--option sync_hz: expected 0, or" in few
         assert f"{SETS} samples" in report or f"samples {SETS};" in report or '"frames_good":1200' in report
-
-
-def test_an_interface_is_for_logs_of_a_can_bus(tmp_path: Path, cli: Cli) -> None:
-    (tmp_path / "x.raw").write_bytes(bytes(100))
-    for command in COMMANDS:
-        report = run(cli, command, "hipnuc-uart", tmp_path / "x.raw", "--interface", "can0", status=2)
-        assert "--interface applies to logs of a CAN bus" in report, command
 
 
 @pytest.mark.parametrize("second_ns", [3_300_000, 5_000_000])

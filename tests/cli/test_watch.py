@@ -56,7 +56,7 @@ def test_json_has_every_sample(words: Words, cli: Cli, option: str) -> None:
     assert text == '{"temperature_c":31.5,"accel_m_s2":[0.125,-0.5,9.75]}\n' * 2
 
 
-def test_the_rate_of_the_table(words: Words, cli: Cli) -> None:
+def test_the_rate_devices_and_convention_of_the_table(words: Words, cli: Cli) -> None:
     for rate, step in [((), 10), (("--rate", "0"), 1), (("--rate", "20"), 5)]:
         more = ("--count", 3, *rate, "--fields", "device,seq,accel_m_s2", "imu0")
         _labels, head, *rows = cli(*words, *more).out.splitlines()
@@ -64,9 +64,6 @@ def test_the_rate_of_the_table(words: Words, cli: Cli) -> None:
         assert rows[0].endswith("  0.12  -0.50   9.75")
         seqs = [int(row.split()[1]) for row in rows]
         assert seqs == [seqs[0], seqs[0] + step, seqs[0] + 2 * step], rate
-
-
-def test_several_devices_are_named_and_a_convention_turns_the_values(words: Words, cli: Cli) -> None:
     _labels, head, *rows = cli(*words, "--count", 8).out.splitlines()
     assert head.split()[:2] == ["DEVICE", "TIME"]
     assert {row.split()[0] for row in rows} == {"imu0", "imu1"}
