@@ -60,8 +60,8 @@ SAMPLE_NS: Final = 3 * NS_PER_S
 # Time without a sample after which the stream has stopped, ns: more than the longest period
 QUIET_NS: Final = 1200 * NS_PER_MS
 # Time for samples in buffers when the stream stops, ns: 512 bytes at 115200 baud, and an adapter
-PARAMETER_ROUNDS: Final = 2  # number of requests for a parameter: one reply can be lost, or late
 DRAIN_NS: Final = 200 * NS_PER_MS
+PARAMETER_ROUNDS: Final = 2  # maximum number of requests for a parameter: one reply can be lost, or late
 
 GYRO_OFFSETS: Final = (Parameter.GYRO_X_OFF, Parameter.GYRO_Y_OFF, Parameter.GYRO_Z_OFF)
 INSTALLATION_ANGLES: Final = (Parameter.INSTALL_X_OFF, Parameter.INSTALL_Y_OFF, Parameter.INSTALL_Z_OFF)

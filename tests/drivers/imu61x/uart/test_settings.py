@@ -1,5 +1,6 @@
 """Settings of an IMU61x on a UART, with simulated devices in all variants."""
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from math import radians
@@ -9,7 +10,7 @@ import msgspec
 import pytest
 
 from imud.contracts.command import Target
-from imud.contracts.script import RequestScript, Silence
+from imud.contracts.script import Outcome, Request, RequestScript, Silence
 from imud.contracts.setting import combined
 from imud.drivers.imu61x.uart import commands
 from imud.drivers.imu61x.uart import settings as following
@@ -19,7 +20,7 @@ from imud.drivers.imu61x.uart.commands import BusMode, Command, Imu61xUartOption
 from imud.drivers.imu61x.uart.settings import SETTINGS, settings_of
 from imud.model.errors import BadArgument, NoReply, Rejected
 from imud.sim.imu61x.uart import REFUSING, STATUS, Imu61xSettings
-from tests.support.simulated_modules import Imu61xBench, done, every_variant, imu61x_bench, variant_bench
+from tests.support.simulated_modules import Imu61xBench, done, every_variant, imu61x_bench, run_script, variant_bench
 
 FACTORY = {
     "output_rate_hz": 100, "accel_filter": "47 Hz", "gyro_filter": "47 Hz", "second_bus": "spi", "i2c_address": "0x18",
@@ -49,6 +50,20 @@ def test_settings_are_read_in_the_types_of_the_table(variant: str) -> None:
     for name, value in found.items():
         assert msgspec.convert(msgspec.to_builtins(value), SETTINGS.table[name].type) == value
     assert set(found) == set(SETTINGS.table)
+
+
+@pytest.mark.parametrize(("lost", "missing"), [(1, set()), (2, {"i2c_address"})])
+def test_a_parameter_is_missing_after_two_requests_without_a_reply(lost: int, missing: set[str]) -> None:
+    far, asked = imu61x_bench(), Counter[str]()
+
+    def ask(request: Request) -> Outcome:
+        asked[request.name] += 1
+        is_lost = request.name == "read parameter I2C_ADDRESS" and asked[request.name] <= lost
+        return Silence(()) if is_lost else far.ask(request)
+
+    reports = run_script(SETTINGS.read(target(far), None), ask)
+    assert combined(reports).values.keys() == FACTORY.keys() - missing
+    assert asked["read parameter I2C_ADDRESS"] == 2
 
 
 @every_variant
@@ -191,7 +206,15 @@ def test_rates_that_are_refused_not_saved_or_lost(monkeypatch: pytest.MonkeyPatc
     assert far.streams()
 
 
-def test_nothing_changes_without_replies() -> None:
+def test_nothing_changes_without_replies_or_for_read_only_parameters() -> None:
+    far = imu61x_bench()
+    for parameter, value in (
+        (Parameter.BAUD, 115200), (Parameter.GYRO_X_OFF, 0), (Parameter.BUS_MODE, 1),
+        (Parameter.AHRS_RATE, BusMode.SPI),
+    ):  # fmt: skip
+        with pytest.raises(BadArgument):
+            far.run(session.write_parameter(parameter, value))
+        assert far.asked == []
     for change in (following.change_baud(921600, 115200), following.factory_reset(115200)):
         far = imu61x_bench()
         far.connected = False
@@ -281,17 +304,6 @@ def test_identity_settings_and_modes(variant: str) -> None:
         "voltage_raw": 50, "user_config_fault_raw": 0, "calibration_fault_raw": 0, "imu_health_bits": "00" * 32,
     }  # fmt: skip
     assert words == (head if variant == "short status" else head | rest)
-
-
-def test_read_only_parameters_are_rejected_before_sending() -> None:
-    for parameter, value in (
-        (Parameter.BAUD, 115200), (Parameter.GYRO_X_OFF, 0), (Parameter.BUS_MODE, 1),
-        (Parameter.AHRS_RATE, BusMode.SPI),
-    ):  # fmt: skip
-        far = imu61x_bench()
-        with pytest.raises(BadArgument):
-            far.run(session.write_parameter(parameter, value))
-        assert far.asked == []
 
 
 def test_modes_at_any_rate_words_of_unusual_values_and_questions_only() -> None:
