@@ -39,7 +39,7 @@ from imud.contracts.status import Deviations
 from imud.formats.can import CandumpReader
 from imud.formats.capture import CaptureReader
 from imud.formats.recording import RecordingReader
-from imud.formats.records import NO_DEVICE, CallRecord, DeviceRecord, Kind, decode_clocks, decode_object
+from imud.formats.records import DeviceRecord, Kind, decode_object
 from imud.host.files import open_regular
 from imud.host.threads import rare_garbage_collection
 from imud.model.errors import BadArgument, ImudError, reason_of
@@ -166,7 +166,7 @@ def play_here(file: BinaryIO, name: str, sink: Sink, devices: Collection[str]) -
 
     player = Player(count, on_event=watch.event, on_session=sink.session)
     report, status = play_to_end(file, name, player)
-    return report, status, sorted(device.described.name for device in player.devices.values())
+    return report, status, sorted({device.described.name for device in player.all_devices})
 
 
 def play_beside(path: Path, sink: Sink, devices: Sequence[str], at: Callable[[int], None]) -> Played:
@@ -355,19 +355,9 @@ def recorded_facts(file: BinaryIO, name: str) -> RecordedFacts:
     Read the complete file: the description of a device can come after the first samples of another device.
     """
     found, clock = dict[str, Deviations](), RecordedClock()
-    reader = RecordingReader(file, name)
-    for record in reader:
-        if record.kind == Kind.CLOCKS:
-            read = decode_clocks(record.body)
-            clock.add(read.monotonic_ns, read.utc_offset_ns, read.suspends)
-        elif record.kind == Kind.SESSION and reader.session is not None:
-            clock.begin(reader.session.epoch)
-        elif record.kind == Kind.CALL and record.device == NO_DEVICE:
-            call = decode_object(record, CallRecord)
-            match (call.target, call.method, *call.arguments):
-                case ("host", "restore", _, int(offset_ns), int(suspends)):
-                    clock.add(0, offset_ns, suspends)
-        elif record.kind == Kind.DEVICE:
+    for record in RecordingReader(file, name):
+        clock.read(record)
+        if record.kind == Kind.DEVICE:
             device = decode_object(record, DeviceRecord)
             if device is not None and NOISE in device.configuration:
                 try:

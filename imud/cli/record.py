@@ -39,6 +39,7 @@ from imud.host.files import open_regular
 from imud.model.errors import BadArgument, ImudError, reason_of
 from imud.model.ledger import LOST_FIELDS, lost
 from imud.model.units import NS_PER_S
+from imud.recording.player import RecordedClock
 
 INPUTS: Final = (Kind.DATA, Kind.FRAMES, Kind.READINGS)
 
@@ -59,6 +60,7 @@ class DeviceContents:
     # removed and added again restarts it.
     spans: list[tuple[Mapping[str, int], CheckRecord, CheckRecord]] = field(default_factory=list)
     begun: Mapping[str, int] | None = None  # ledger before the first input of the next span
+    is_earlier: bool = False  # whether the newest span belongs to an earlier run of imud
 
     def check(self, found: CheckRecord) -> None:
         """Add a check record of the live run."""
@@ -73,7 +75,8 @@ class DeviceContents:
     def begin_path(self, ledger: Mapping[str, int]) -> None:
         """Compare the initial ledger of a new codec with the newest ledger."""
         newest = self.begun or (self.spans[-1][2].ledger if self.spans else None)
-        if newest is None or ledger.get("samples", 0) < newest.get("samples", 0):
+        if newest is None or self.is_earlier or ledger.get("samples", 0) < newest.get("samples", 0):
+            self.is_earlier = False
             self.begun = dict.fromkeys(LOST_FIELDS, 0) | dict(ledger)
 
     @property
@@ -103,9 +106,13 @@ class Contents:
         self.devices: dict[int, DeviceContents] = {}
         self.dropped = 0  # number of records that the recorder dropped
         self.newest_ns = 0
+        self.clock = RecordedClock()
+        self._run: SessionRecord | None = None  # first session of the newest run: joined files can have several runs
+        self._earlier_ns = 0  # duration of the earlier runs, ns
 
     def add(self, record: Record) -> None:
         """Add one record. Raises ImudError if the content of the record is invalid."""
+        self.clock.read(record)
         device = self.devices.setdefault(record.device, DeviceContents())
         if record.kind in INPUTS:
             device.reads += 1
@@ -124,7 +131,12 @@ class Contents:
     def _add_object(self, record: Record, device: DeviceContents) -> None:
         if record.kind == Kind.SESSION:
             # later blocks repeat the session record
-            self.session = self.session or decode_object(record, SessionRecord)
+            session = decode_object(record, SessionRecord)
+            self.session = self.session or session
+            if self._run is None or session.epoch != self._run.epoch:
+                self._earlier_ns, self._run, self.newest_ns = self.duration_ns, session, 0
+                for earlier in self.devices.values():
+                    earlier.is_earlier = True
         elif record.kind == Kind.END:
             self.end = decode_object(record, EndRecord)
             self.newest_ns = self.end.t_ns if self.end is not None else 0
@@ -140,10 +152,22 @@ class Contents:
             device.check(decode_object(record, CheckRecord))
 
     @property
+    def duration_ns(self) -> int:
+        """Time from the start to the newest record with a time, ns, without the time between two runs."""
+        return self._earlier_ns + (max(0, self.newest_ns - self._run.t_ns) if self._run is not None else 0)
+
+    @property
     def duration_s(self) -> float:
-        """Time from the start to the newest record with a time, s; 0 if unknown."""
-        begun_ns = self.session.t_ns if self.session is not None else 0
-        return max(0, self.newest_ns - begun_ns) / NS_PER_S if begun_ns else 0.0
+        """Duration in seconds; 0 if unknown."""
+        return self.duration_ns / NS_PER_S
+
+    @property
+    def begun_utc_ns(self) -> int | None:
+        """CLOCK_REALTIME of the start, with the last offset of the first run; None if unknown."""
+        if self.session is None:
+            return None
+        self.clock.begin(self.session.epoch)
+        return self.clock.utc_ns(self.session.t_ns, self.session.utc_ns)
 
 
 def add_info_arguments(parser: argparse.ArgumentParser) -> None:
@@ -170,7 +194,7 @@ def summary(contents: Contents, reader: RecordingReader) -> dict[str, Any]:
     """Return the content for `--json`."""
     session = contents.session
     return {
-        "begun_utc_ns": session.utc_ns if session is not None else None,
+        "begun_utc_ns": contents.begun_utc_ns,
         "imud": session.imud if session is not None else "",
         "host": session.host if session is not None else "",
         "file_number": session.number if session is not None else None,

@@ -83,7 +83,7 @@ def play_to_end(file: BinaryIO, name: str, player: Player) -> tuple[str, int]:
     """
     reader = RecordingReader(file, name)
     player.play(reader)
-    devices = list(player.devices.values())
+    devices = player.all_devices
     report = "\n\n".join(["\n".join(device_block(device)) for device in devices] + remarks(reader, player))
     same = all(not device.differences for device in devices) and not player.lost and not reader.is_damaged
     return report, 0 if same and any(device.ledger.samples for device in devices) else 1

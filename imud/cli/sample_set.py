@@ -257,7 +257,7 @@ def take_recording(args: argparse.Namespace) -> SampleSet:
                 break
         if not collector.done:
             look()
-    names = [device.described.name for device in player.devices.values()]
+    names = list(dict.fromkeys(device.described.name for device in player.all_devices))
     if collector.others:
         raise BadArgument(f"{args.input} contains several devices: {', '.join(names)}; select one with --device")
     if args.device and args.device not in names:
@@ -271,8 +271,8 @@ def take_recording(args: argparse.Namespace) -> SampleSet:
 
 
 def played(player: Player, name: str) -> PlayedDevice | None:
-    """Return the device of this name; None before the player found it."""
-    return next((device for device in player.devices.values() if device.described.name == name), None)
+    """Return the newest device of this name; None before the player found it."""
+    return next((device for device in reversed(player.all_devices) if device.described.name == name), None)
 
 
 def _describe(sample_set: SampleSet, player: Player, name: str) -> None:

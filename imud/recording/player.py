@@ -125,6 +125,19 @@ class RecordedClock:
         self._runs: dict[int, _Offsets] = {}
         self.begin(0)
 
+    def read(self, record: Record) -> None:
+        """Add the clocks in a record, in the order of the file."""
+        if record.kind == Kind.CLOCKS:
+            read = records.decode_clocks(record.body)
+            self.add(read.monotonic_ns, read.utc_offset_ns, read.suspends)
+        elif record.kind == Kind.SESSION:
+            self.begin(records.decode_object(record, SessionRecord).epoch)
+        elif record.kind == Kind.CALL and record.device == records.NO_DEVICE:
+            call = records.decode_object(record, CallRecord)
+            match (call.target, call.method, *call.arguments):
+                case ("host", "restore", _, int(offset_ns), int(suspends)):
+                    self.add(0, offset_ns, suspends)
+
     def begin(self, epoch: int) -> None:
         """Continue with the records of a run of imud."""
         self._run = self._runs.setdefault(epoch, _Offsets())
@@ -174,11 +187,13 @@ class Player:
         state.
         """
         self.devices: dict[int, PlayedDevice] = {}  # devices by their number in the recorded daemon
+        self.earlier: list[PlayedDevice] = []  # devices of the earlier runs of imud in joined files
         self.lost = 0  # number of records that the recorder dropped
         self._publish = publish
         self._on_event = on_event
         self._on_session = on_session
         self._host = PlayedClock()
+        self._epoch: int | None = None  # run of the newest file; None before the first
         # reason to ignore recorded states; empty if the player uses them
         self._no_state = "a new clock was requested" if fresh else ""
 
@@ -235,6 +250,10 @@ class Player:
 
     def _begin(self, session: SessionRecord) -> None:
         self._on_session(session.epoch)
+        if session.epoch != self._epoch:  # another run numbers its devices and samples from the start
+            self.earlier += self.devices.values()
+            self.devices.clear()
+            self._epoch = session.epoch
         if session.imud != __version__:
             self._no_state = self._no_state or f"imud {session.imud} wrote the recording, this is imud {__version__}"
 
@@ -260,6 +279,11 @@ class Player:
         self._host.offset_ns, self._host.suspends = offset_ns, suspends
 
     # --- devices -----------------------------------------------------------------------------------------------------
+
+    @property
+    def all_devices(self) -> list[PlayedDevice]:
+        """Devices of all runs."""
+        return [*self.earlier, *self.devices.values()]
 
     def _describe(self, device_id: int, described: DeviceRecord) -> None:
         known = self.devices.get(device_id)

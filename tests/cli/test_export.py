@@ -98,7 +98,7 @@ def test_csv_has_every_sample_with_all_its_digits(recorded: Recorded, cli: Cli) 
     assert f"{len(found)} samples to standard output" in printed.err
 
 
-def test_csv_is_that_of_rfc_4180_and_has_chosen_fields(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
+def test_csv_of_rfc_4180_chosen_fields_events_and_losses(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
     cli("export", "-o", tmp_path / "a.csv", recorded.file)
     for words in (["-o", tmp_path / "a.txt"], []):
         problem = "expected --to, or an output file with the suffix .csv or .mcap, got "
@@ -112,9 +112,6 @@ def test_csv_is_that_of_rfc_4180_and_has_chosen_fields(recorded: Recorded, tmp_p
     found = rows(cli(*words).out)
     assert list(found[0]) == ["gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s", "t_ns"]
     assert len(found) == sum(sample.device == "mast" for sample in recorded.samples)
-
-
-def test_events_and_losses_are_tables_of_their_own(recorded: Recorded, cli: Cli) -> None:
     events = rows(cli("export", "--to", "csv", "--table", "events", recorded.file).out)
     assert [(one["device"], one["kind"], one["t_ns"]) for one in events[-3:]] == [
         (event.device, event.kind, str(event.t_ns)) for event in EVENTS
@@ -273,6 +270,8 @@ def test_rows_before_a_step_of_the_wall_clock(recorded: Recorded, tmp_path: Path
     found = rows(cli("export", "--to", "csv", file).out)
     for row, sample in zip(found, recorded.samples, strict=True):
         assert abs(int(row["utc_ns"]) - sample.utc_ns - shift_ns) < NS_PER_MS
+    begun, before = (json.loads(cli("info", "--json", one).out)["begun_utc_ns"] for one in (file, recorded.file))
+    assert abs(begun - before - shift_ns) < NS_PER_MS
     cli("export", "--to", "mcap", "-o", tmp_path / "a.mcap", file)
     (first, *_), (*_, last_event) = (
         [t_ns for topic, _, t_ns, _ in messages(tmp_path / "a.mcap") if topic == wanted]
@@ -339,15 +338,12 @@ def test_a_stamped_capture_and_a_log_of_candump_have_their_own_times(tmp_path: P
 # --- what goes wrong --------------------------------------------------------------------------------------------------
 
 
-def test_a_damaged_recording_is_exported_as_far_as_it_goes(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
+def test_damaged_recordings_and_refused_files_and_options(recorded: Recorded, tmp_path: Path, cli: Cli) -> None:
     data, damaged, out = recorded.file.read_bytes(), tmp_path / "damaged", tmp_path / "a.csv"
     damaged.write_bytes(data[:-40] + bytes(20) + data)
     printed = cli("export", "--to", "csv", "-o", out, damaged, status=1)
     assert "damaged" in printed.err + cli("replay", damaged, status=1).err
     assert len(rows(out.read_text())) >= len(recorded.samples)
-
-
-def test_files_and_options_that_are_refused(tmp_path: Path, cli: Cli, recorded: Recorded) -> None:
     (tmp_path / "noise").write_bytes(b"\x00" * 500)
     cli("export", "--to", "csv", tmp_path / "noise", status=1)
     cli.refuses("expected a recording or a capture", "export", "--to", "csv", str(tmp_path / "none"))

@@ -188,6 +188,19 @@ def test_whole_damaged_cut_and_foreign_files(file: Path, cli: Cli, tmp_path: Pat
     cli.refuses("No such file", "info", str(tmp_path / "none"))
 
 
+def test_each_run_in_joined_files_has_its_own_time_and_samples(file: Path, cli: Cli, tmp_path: Path) -> None:
+    _, _, (other,) = run_recorded(tmp_path)
+    joined = tmp_path / "joined"
+    joined.write_bytes(other.read_bytes() + file.read_bytes())  # CLOCK_MONOTONIC steps backward, as in a new boot
+    found, *parts = (json.loads(cli("info", "--json", one).out) for one in (joined, other, file))
+    assert found["begun_utc_ns"] == parts[0]["begun_utc_ns"]
+    assert found["duration_s"] == pytest.approx(sum(part["duration_s"] for part in parts))
+    for one, *same in zip(*(part["devices"] for part in (found, *parts)), strict=True):
+        assert one["samples"] == sum(part["samples"] for part in same)
+    report = cli("replay", joined).err
+    assert (report.count("equal to the live run"), report.count("  samples   300; lost 0")) == (4, 2)
+
+
 def test_an_interrupt_a_silent_daemon_and_a_terminal(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     with interrupts(are_noted=True) as interrupt:
         signal.raise_signal(signal.SIGINT)

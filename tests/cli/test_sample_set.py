@@ -93,7 +93,7 @@ def test_notes_about_a_replay_and_the_progress(monkeypatch: pytest.MonkeyPatch) 
         one.described.name = "bow"
         for name, found in (("stern", []), ("bow", notes)):
             made = SampleSet("a", name)
-            taking._describe(made, Mock(devices={0: one}), name)
+            taking._describe(made, Mock(all_devices=[one]), name)
             assert (made.notes, made.driver) == (found, one.described.driver if name == "bow" else "")
     terminal = Terminal()
     monkeypatch.setattr("sys.stderr", terminal)
