@@ -73,7 +73,6 @@ def test_several_modules_are_one_and_are_told_apart() -> None:
     assert (first.marks, second.marks, both.next_ns(), both.epoch_ns) == ([40], [40], 50, 1)
     with pytest.raises(ValueError, match="at least one"):
         CanModules([])
-
     made = [
         CAN_SIMULATORS["imu61x-can"].make(SimulatorOptions(boot_ms=0, node=node, at_once=True), 0) for node in (0, 201)
     ]
@@ -160,8 +159,7 @@ def test_values_are_the_truth_of_the_sample_instant(name: str) -> None:
     module: Any = CAN_SIMULATORS[name].make(options, BEGIN_NS)
     frames = module.advance(BEGIN_NS + SECONDS * 1000 * MS)
     codec = driver.make_codec(Ledger(), driver.settings())
-    instants = {frame.due_ns: frame.sample_ns for frame in frames}
-    seen = list[str]()
+    instants, seen = {frame.due_ns: frame.sample_ns for frame in frames}, list[str]()
     for frame in frames:
         for event in codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.due_ns):
             if not isinstance(event, Measurement):

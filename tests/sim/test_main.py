@@ -33,8 +33,7 @@ def start() -> Iterator[Start]:
     started: list[subprocess.Popen[str]] = []
 
     def begin(*arguments: str, program: Sequence[str] = ("imud.sim",)) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", *program, "--boot", "0", *arguments]
-        pipe = subprocess.PIPE
+        command, pipe = [sys.executable, "-m", *program, "--boot", "0", *arguments], subprocess.PIPE
         process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
         started.append(process)
         return process
@@ -195,8 +194,7 @@ def edges(tmp_path: Path) -> list[dict[str, str]]:
 
 
 def test_pins_move_in_step_with_frames(start: Start, tmp_path: Path) -> None:
-    pins = lines(tmp_path, "sout", "sout_div")
-    truth = tmp_path / "truth.csv"
+    pins, truth = lines(tmp_path, "sout", "sout_div"), tmp_path / "truth.csv"
     process = start(
         "--rate", "100", "--pins", pins, "--pin-truth", str(tmp_path / "pins.csv"), "--truth", str(truth),
         "--pin-settle", "0.5",
@@ -205,8 +203,7 @@ def test_pins_move_in_step_with_frames(start: Start, tmp_path: Path) -> None:
     read(fd, 30)
     os.close(fd)
     process_out, problems = process.communicate(timeout=LIMIT_S)
-    summary = json.loads(process_out.splitlines()[-1])
-    noted = edges(tmp_path)
+    summary, noted = json.loads(process_out.splitlines()[-1]), edges(tmp_path)
     assert len(noted) == summary["pin_edges"]
     rises = [int(edge["sample_ns"]) for edge in noted if edge["pin"] == "sout" and edge["level"] == "1"]
     sent = [int(row.split(",")[0]) for row in truth.read_text().splitlines()[2:]]

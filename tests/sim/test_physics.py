@@ -107,15 +107,12 @@ def test_products_and_rotations_agree_with_matrices() -> None:
     for i in range(3):
         for j in range(3):
             assert ab[i][j] == pytest.approx(sum(a[i][k] * b[k][j] for k in range(3)), abs=1e-12)
-
     v, matrix = (1.0, -2.0, 0.5), matrix_from_quat(A)
     expected = [sum(matrix[k][i] * v[k] for k in range(3)) for i in range(3)]
     assert physics.turned_back(A, v) == pytest.approx(expected, abs=1e-12)
-
     truth = physics.swing().at(1.0)
     assert not physics.MountingRotation().active
     assert physics.MountingRotation().turned(truth) is truth
-
     rows = [[round(value, 3) for value in row] for row in matrix]
     q = physics.frame_of(((*rows[0],), (*rows[1],), (*rows[2],)))  # type: ignore[arg-type]  # three numbers each
     assert q == pytest.approx(A, abs=2e-3)
@@ -128,15 +125,12 @@ def test_heading_turns_about_the_vertical_and_level_keeps_yaw() -> None:
     assert turned.euler_rad == pytest.approx((0.2, 0.1, 0.5 + pi / 2), abs=1e-12)
     assert turned.accel_m_s2 == pytest.approx(truth.accel_m_s2, abs=1e-12)
     assert turned.mag_t == pytest.approx(truth.mag_t, abs=1e-18)
-
     truth = physics.Still(0.05, 0.02, 0.5).at(0.0)
     level = physics.level_of(truth.quat_wxyz)
     assert physics.MountingRotation(level=level).turned(truth).accel_m_s2 == pytest.approx(truth.accel_m_s2, abs=1e-12)
     with_accel = physics.MountingRotation(level=level, level_accel=True).turned(truth)
     assert with_accel.accel_m_s2 == pytest.approx((0.0, 0.0, 9.8), abs=1e-12)
-    assert with_accel.gyro_rad_s == truth.gyro_rad_s
-    assert physics.UPRIGHT == (1.0, 0.0, 0.0, 0.0)
-
+    assert (with_accel.gyro_rad_s, physics.UPRIGHT) == (truth.gyro_rad_s, (1.0, 0.0, 0.0, 0.0))
     for upside_down in (False, True):
         roll, pitch, yaw = euler312_from_quat(quat_product(A, physics.level_of(A, upside_down)))
         assert abs(roll) == pytest.approx(pi if upside_down else 0.0, abs=1e-12)
@@ -160,8 +154,7 @@ def test_white_noise_has_the_stated_spread() -> None:
 
 def test_noise_is_white_around_truth_plus_bias() -> None:
     noise = physics.Noise(5)
-    read = [noise.add(TRUTH, 42.0) for _ in range(2000)]
-    bias = noise.bias(42.0)[1]
+    read, bias = [noise.add(TRUTH, 42.0) for _ in range(2000)], noise.bias(42.0)[1]
     for axis in range(3):
         mean = fmean(r.gyro_rad_s[axis] for r in read)
         assert mean == pytest.approx(TRUTH.gyro_rad_s[axis] + bias[axis], abs=5e-5)

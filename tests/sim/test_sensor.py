@@ -63,8 +63,7 @@ def test_a_device_sends_exactly_at_the_time_of_next_ns(name: str) -> None:
 @pytest.mark.parametrize("name", [*(name for name in SIMULATORS if name != "hipnuc-modbus"), *CAN_SIMULATORS])
 def test_the_crystal_and_the_boot_time_decide_the_times_of_frames(name: str) -> None:
     """A crystal that is 1 % fast makes all periods 1 % shorter. A device is silent while it boots."""
-    simulator = SIMULATORS[name] if name in SIMULATORS else CAN_SIMULATORS[name]
-    spans_ns = []
+    simulator, spans_ns = SIMULATORS[name] if name in SIMULATORS else CAN_SIMULATORS[name], []
     for skew_ppm in (0.0, 10_000.0):
         module = simulator.make(SimulatorOptions(noise="none", skew_ppm=skew_ppm, boot_ms=300), BEGIN_NS)
         frames: list[Any] = [*module.advance(BEGIN_NS + 20 * NS_PER_S)]

@@ -25,6 +25,8 @@ def times_of(frames: list[SentFrame], can_id: int) -> list[int]:
 
 @pytest.mark.manual("B 5.1 defaults")
 def test_timers_and_wire() -> None:
+    periods_ms, types = {1: 10, 2: 10, 3: 10, 4: 10, 6: 50, 7: 10}, dict.fromkeys((1, 2, 3, 4, 6, 7), 0xFF)
+    assert canopen.NodeSettings() == canopen.NodeSettings(8, 500_000, periods_ms, types, 0, 0, 0)
     settings = canopen.NodeSettings(periods_ms={1: 5, 2: 20, 3: 0, 4: 0, 6: 100, 7: 0}, bit_rate=250_000)
     module = canopen.HipnucCanopenModule(
         BEGIN_NS, canopen.HipnucCanopenHardware(factory=settings, boot_ms=0, skew_ppm=1000)
@@ -32,6 +34,7 @@ def test_timers_and_wire() -> None:
     frames = module.advance(BEGIN_NS + SECOND_NS + 2 * MS)
     counts = [len(times_of(frames, can_id)) for can_id in (0x188, 0x288, 0x388, 0x488, 0x688, 0x788)]
     assert counts == [200, 50, 0, 0, 10, 0]
+    assert module.counters() == {"samples_sent": 200, "frames_sent": 261}  # with the boot-up message
     first = times_of(frames, 0x188)[:3]
     assert [b - a for a, b in itertools.pairwise(first)] == pytest.approx([4_995_005] * 2, abs=2)
     together = [frame for frame in frames if frame.sample_ns == frames[-1].sample_ns]
@@ -39,10 +42,9 @@ def test_timers_and_wire() -> None:
     silent = canopen.HipnucCanopenModule(BEGIN_NS, canopen.HipnucCanopenHardware(factory=QUIET, boot_ms=0))
     silent.advance(BEGIN_NS + SECOND_NS)
     assert silent.next_ns() is None
-
     bench = CanopenBench(canopen.NodeSettings(periods_ms=QUIET.periods_ms, heartbeat_ms=100), boot_ms=50)
     bench.run(400 * MS)
-    assert bench.heard == [(0x708, b"\0"), *[(0x708, b"\5")] * 3]
+    assert (bench.heard, bench.module.samples_sent) == ([(0x708, b"\0"), *[(0x708, b"\5")] * 3], 0)
 
 
 @pytest.mark.manual("B 5.4.2 transmission type")
@@ -61,7 +63,6 @@ def test_sync_sends_what_is_of_type_1() -> None:
     bench.heard.clear()
     bench.run(35 * MS)
     assert sum(can_id == 0x188 for can_id, _ in bench.heard) >= 3
-
     bench = CanopenBench(canopen.NodeSettings())
     bench.run_script(session.nmt(8, NmtCommand.PRE_OPERATIONAL))
     bench.run(20 * MS)
@@ -76,7 +77,23 @@ def test_sync_sends_what_is_of_type_1() -> None:
     assert bench.heard == []
     bench.send(0x000, b"\1\0")
     bench.run(50 * MS)
-    assert (0x188) in {can_id for can_id, _ in bench.heard}
+    assert 0x188 in {can_id for can_id, _ in bench.heard}
+    for code in (b"\x81", b"\x82"):  # reset of the node, and of its communication
+        bench.heard.clear()
+        bench.send(0x000, code + b"\0")
+        bench.run(5 * MS)
+        assert (0x708, b"\0") in bench.heard
+
+
+@pytest.mark.parametrize("name", canopen.NODE_VARIANTS)
+def test_which_variant_confirms_a_restart(name: str) -> None:
+    bench = CanopenBench(variant=canopen.NODE_VARIANTS[name])
+    bench.run(5 * MS)
+    bench.heard.clear()
+    bench.send(0x608, cia301.write_frame(0x2000, 0, b"\xff\0\0\0"))
+    bench.run(5 * MS)
+    expected = {"restarts without a reply": [], "no boot-up message": [0x588]}.get(name, [0x588, 0x708])
+    assert [can_id for can_id, _ in bench.heard] == expected
 
 
 def test_what_applies_at_once_and_what_after_a_restart() -> None:
@@ -91,7 +108,6 @@ def test_what_applies_at_once_and_what_after_a_restart() -> None:
     bench.send(0x608, cia301.write_frame(0x2000, 0, b"\xff\0\0\0"))
     assert bench.module.node == 8  # the setting was not saved
     assert bench.module.objects.settings == QUIET
-
     bench = CanopenBench()
     bench.run_script(session.set_node_id(8, 20))
     bench.run_script(session.set_tpdo_period(8, 2, 100))
@@ -132,19 +148,23 @@ def test_inclinometer_signs_and_zero() -> None:
         ("40 34 12 00 00 00 00 00", 0x0602_0000), ("40 00 18 07 00 00 00 00", 0x0609_0011),
         ("40 00 20 00 00 00 00 00", 0x0601_0001), ("23 00 10 00 00 00 00 00", 0x0601_0002),
         ("23 00 18 05 0A 00 00 00", 0x0607_0010), ("2B 00 18 05 04 00 00 00", 0x0609_0030),
-        ("A0 00 10 00 00 00 00 00", 0x0504_0001),
+        ("A0 00 10 00 00 00 00 00", 0x0504_0001), ("2B 00 18 05 E9 03 00 00", 0x0609_0030),  # 1001 ms
     ],
 )  # fmt: skip
 def test_abort_codes(request_hex: str, code: int) -> None:
-    request = bytes.fromhex(request_hex)
-    reply, _ = canopen.ObjectDictionary(canopen.NodeSettings()).serve(request)
+    request, objects = bytes.fromhex(request_hex), canopen.ObjectDictionary(canopen.NodeSettings())
+    for period_ms in (5, 1000):  # the limits
+        assert objects.serve(b"\x2b\x00\x18\x05" + period_ms.to_bytes(4, "little"))[0][0] == 0x60
+    reply, _ = objects.serve(request)
     assert reply == b"\x80" + request[1:4] + code.to_bytes(4, "little")
 
 
-@pytest.mark.parametrize("rate_hz", [1, 125, 200])
-def test_options_make_rates_that_divide(rate_hz: float) -> None:
+@pytest.mark.parametrize(("rate_hz", "period_ms", "pressure_ms"), [(1, 1000, 1000), (125, 8, 48), (200, 5, 50)])
+def test_options_make_rates_that_divide(rate_hz: float, period_ms: int, pressure_ms: int) -> None:
     module = canopen.SIMULATOR.make(SimulatorOptions(rate_hz=rate_hz, node=5, at_once=True), BEGIN_NS)
     assert isinstance(module, canopen.HipnucCanopenModule)
     assert module.node == 5
-    periods = module.objects.settings.periods_ms
-    assert (periods[1], periods[6] % periods[1]) == (1000 / rate_hz, 0)
+    assert module.objects.settings.periods_ms == dict.fromkeys((1, 2, 3, 4, 7), period_ms) | {6: pressure_ms}
+    for rate in (0, 0.5, 250, 3 * rate_hz / 2):
+        with pytest.raises(ValueError, match="expected a period of 5 … 1000 whole milliseconds"):
+            canopen.SIMULATOR.make(SimulatorOptions(rate_hz=rate), BEGIN_NS)

@@ -20,7 +20,8 @@ from imud.model.errors import NoReply, Rejected
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.sim.can_module import CanModules, SentFrame
-from imud.sim.hipnuc.j1939 import SIMULATOR, HipnucJ1939Module, J1939Hardware, J1939Settings, J1939Variant, _within_pi
+from imud.sim.hipnuc import j1939
+from imud.sim.hipnuc.j1939 import SIMULATOR, HipnucJ1939Module, J1939Hardware, J1939Settings, J1939Variant
 from imud.sim.physics import Still
 from imud.sim.sensor import SimulatorOptions
 from tests.support.simulated_modules import run_script
@@ -89,11 +90,21 @@ def test_four_modules_crystal_wire_and_the_next_frame() -> None:
     frames = CanModules(modules).advance(BEGIN_NS + SECOND_NS)
     for module in modules:
         assert samples_of(frames, module.settings.address) >= 94
-
     module = made(skew_ppm=1000.0)
     frames = [f for f in module.advance(BEGIN_NS + SECOND_NS) if split(f.can_id).pgn != commands.CLAIMED]
     assert [split(frame.can_id).pgn for frame in frames[:4]] == [0xFF34, 0xFF37, 0xFF3D, 0xFF41]
     assert module.counters() == {"samples_sent": 101, "frames_sent": 405, "requests": 0}
+    for at_once in (False, True):
+        hardware = J1939Hardware(boot_ms=0, bitrate=0, processing_ns=0) if at_once else J1939Hardware()
+        module = HipnucJ1939Module(BEGIN_NS, hardware=hardware)
+        for _ in range(10):
+            next_ns = module.next_ns()
+            assert next_ns is not None
+            assert module.advance(next_ns - 1) == []
+            assert {frame.due_ns for frame in module.advance(next_ns)} == {next_ns}
+    assert J1939Settings().intervals_ms == dict.fromkeys((0xFF34, 0xFF37, 0xFF3D, 0xFF41), 100)
+    slow = {pgn: ms for pgn, ms in made(message="all", rate_hz=30.0).settings.intervals_ms.items() if ms != 33}
+    assert slow == {codec.TEMPERATURE: 990, codec.UTC: 990}  # ms, a multiple of 33
 
 
 @pytest.mark.manual("B 6.2.2 intervals", "B 6.2.2 bit rate", "B 6.2.2 address")
@@ -108,7 +119,6 @@ def test_what_is_set_read_back_saved_and_lost_at_a_restart() -> None:
     reports: Any = bench.talk(lambda peer: SETTINGS.read(Target(HipnucJ1939Options(), 0), None))
     settings = combined(reports).words
     assert (settings["interval_ms_FF37"], settings["address"], settings["bitrate"]) == ("20", "8", "500000")
-
     bench = J1939Host(made(boot_ms=200))
     bench.wait(300 * MS)
     bench.talk(lambda peer: commands.set_interval(peer, 0xFF34, 50))
@@ -123,8 +133,7 @@ def test_what_is_set_read_back_saved_and_lost_at_a_restart() -> None:
     bench.wait(300 * MS)
     bench.talk(commands.factory_reset)
     bench.talk(restarted)
-    assert bench.module.settings == J1939Settings()
-
+    assert (bench.module.settings, bench.module.writes_to_flash) == (J1939Settings(), 1)
     bench = J1939Host(HipnucJ1939Module(BEGIN_NS, hardware=J1939Hardware(boot_ms=0)))
     bench.talk(lambda peer: commands.set_address(peer, 20))
     bench.talk(lambda peer: commands.set_bitrate(peer, 125_000))
@@ -133,8 +142,7 @@ def test_what_is_set_read_back_saved_and_lost_at_a_restart() -> None:
     bench.talk(restarted)
     bench.wait(100 * MS)
     frames = bench.wait(SECOND_NS)
-    assert {split(f.can_id).source for f in frames} == {20}
-    assert frames[1].due_ns - frames[0].due_ns == 1_120_000
+    assert ({split(f.can_id).source for f in frames}, frames[1].due_ns - frames[0].due_ns) == ({20}, 1_120_000)
     assert bench.talk(commands.identify, address=20) is not None
 
 
@@ -154,6 +162,8 @@ def test_values_out_of_range_do_not_take() -> None:
     with pytest.raises(Rejected):
         bench.talk(lambda peer: commands.set_address(peer, 129))
     assert bench.module.settings == bench.module.flash
+    for value in (5, 1000):  # the limits
+        assert bench.talk(partial(written_and_read, register=0x0134, value=value)) == value
     with pytest.raises(NoReply):
         bench.talk(lambda peer: commands.read(peer, 0x0042))
     with pytest.raises(NoReply):
@@ -165,16 +175,42 @@ def test_values_out_of_range_do_not_take() -> None:
     assert bench.module.requests == before
 
 
+READ_0, READ_1, WRITE_20 = (
+    bytes.fromhex(text) for text in ("9C00030000000000", "9C00030001000000", "9C00060014000000")
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "request_data", "sources"),
+    [
+        ("real", READ_0, [8]), ("reads need the value 1", READ_0, []), ("reads need the value 1", READ_1, [8]),
+        ("ignores reads", READ_1, []), ("real", WRITE_20, [8]), ("address at once", WRITE_20, [8, 20]),
+        ("address at once, confirmed from there", WRITE_20, [20, 20]),
+    ],
+)  # fmt: skip
+def test_which_variant_replies_and_from_which_address(name: str, request_data: bytes, sources: list[int]) -> None:
+    hardware = J1939Hardware(boot_ms=0, variant=j1939.J1939_VARIANTS[name])
+    module = HipnucJ1939Module(BEGIN_NS, J1939Settings({}), hardware)
+    module.advance(BEGIN_NS + MS)
+    module.receive(0x0CEF0855, True, request_data, BEGIN_NS + MS)
+    frames = module.advance(BEGIN_NS + 2 * MS)
+    module.receive(0x0CEF1455, True, READ_1, BEGIN_NS + 2 * MS)  # to address 20
+    frames += module.advance(BEGIN_NS + 3 * MS)
+    assert [split(frame.can_id).source for frame in frames] == sources
+    assert [frame.due_ns for frame in frames[:1]] == [BEGIN_NS + MS + 200_000 + 280_000] * bool(sources)
+
+
 @pytest.mark.manual("B 6.2.2 restart")
 @pytest.mark.parametrize("confirms", [False, True])
 def test_a_restart_is_answered_before_it_happens_or_not_at_all(confirms: bool) -> None:
     hardware = J1939Hardware(boot_ms=0, variant=J1939Variant(confirms_restart=confirms))
     module = HipnucJ1939Module(BEGIN_NS, hardware=hardware)
     module.advance(BEGIN_NS + 50 * MS)
-    module.receive(0x0CEF0855, True, bytes.fromhex("00000600FF000000"), BEGIN_NS + 50 * MS)
-    replies = [f for f in module.advance(BEGIN_NS + 60 * MS) if split(f.can_id).pgn == 0xEF00]
-    expected = [(0x0CEF5508, bytes.fromhex("00000600FF000000"))] if confirms else []
-    assert [(f.can_id, f.data) for f in replies] == expected
+    for data in (READ_1, bytes.fromhex("00000600FF000000")):
+        module.receive(0x0CEF0855, True, data, BEGIN_NS + 50 * MS)
+    sent = [f for now_us in (50_500, 60_000) for f in module.advance(BEGIN_NS + now_us * 1000)]
+    expected = [bytes.fromhex("9C00030008000000"), bytes.fromhex("00000600FF000000")][: 1 + confirms]
+    assert [f.data for f in sent if f.can_id == 0x0CEF5508] == expected
 
 
 def test_an_address_is_claimed_after_power_on_and_when_asked() -> None:
@@ -196,12 +232,10 @@ def test_registers_replies_and_a_single_message() -> None:
     bench = J1939Host(made())
     assert bench.talk(lambda peer: commands.read(peer, 0x78)) == 169
     assert bench.talk(lambda peer: commands.read(peer, 0x70)) == 0x4849  # "HI"
-
     bench = J1939Host(made(), host=0x20)
     assert bench.talk(lambda peer: commands.read(peer, commands.ADDRESS)) == 8
     replies = [f for f in bench.heard if split(f.can_id).pgn == codec.CONFIGURE]
     assert {split(f.can_id).destination for f in replies} == {0x55}
-
     bench = J1939Host(made())
     bench.talk(lambda peer: commands.send_once(peer, 0xFF46))
     assert pgns(bench.heard)[0xFF46] == 1
@@ -229,7 +263,7 @@ def test_zero_and_directions_of_the_inclinometer() -> None:
     assert shown() == (0.0, 0.0)
     bench.talk(lambda peer: commands.zero(peer, commands.Zero.CANCEL))
     assert shown() == (-10.0, -20.28)
-    assert [math.degrees(_within_pi(math.radians(angle))) for angle in (350, -190)] == pytest.approx([-10, 170])
+    assert [math.degrees(j1939._within_pi(math.radians(angle))) for angle in (350, -190)] == pytest.approx([-10, 170])
 
 
 def test_the_time_of_day_starts_again_after_a_day() -> None:

@@ -29,23 +29,18 @@ def test_frames_and_their_times() -> None:
     frames = HipnucUartBench().frames(1000.0)
     assert len(frames) == pytest.approx(100, abs=1)
     assert {after.system_time_ms - before.system_time_ms for before, after in pairwise(frames)} == {10}
-
     module = HipnucModule(BEGIN_NS)
     assert module.advance(BEGIN_NS + 500 * NS_PER_MS) == []
     assert unpack_hi91(module.advance(BEGIN_NS + 520 * NS_PER_MS)[0].data).system_time_ms == 510
-
     (frame, *_) = HipnucUartBench(hardware=HIPNUC_STILL).frames(20.0)
     assert hypot(*frame.accel_g) == pytest.approx(1.0, abs=1e-6)
     assert frame.gyro_deg_s == (0.0, 0.0, 0.0)
-
     settings = ModuleSettings(baud=115_200)
     for burst in HipnucUartBench(settings, HipnucHardware(processing_ns=125_000)).wait(50.0):
         assert burst.sample_ns
         assert burst.due_ns - burst.sample_ns == 125_000 + 82 * 10 * NS_PER_S // 115_200
-
     coarse, fine = HipnucUartBench(FAST), HipnucUartBench(FAST)
     assert coarse.wait(60.0) == [burst for _ in range(240) for burst in fine.wait(0.25)]
-
     bench = HipnucUartBench(ModuleSettings(hi91=Output(20), hi92=Output(50)))
     sizes = [len(burst.data) for burst in bench.wait(1000.0)]
     assert (sizes.count(82), sizes.count(54)) == pytest.approx((50, 20), abs=1)
@@ -112,18 +107,15 @@ def test_main_status_noise_the_end_of_32_bits_and_pulses() -> None:
     assert bench.ask("CONFIG ATT MODE 1") == ["OK"]
     assert bench.frames(20.0)[0].word_1_2 & 1 << 10
     assert not HipnucUartBench(hardware=HipnucHardware(firmware=169)).frames(20.0)[0].word_1_2 & 1 << 9
-
     clean = HipnucUartBench(hardware=HIPNUC_STILL).frames(50.0)
     noisy = HipnucUartBench(hardware=HipnucHardware(motion=HIPNUC_STILL.motion, skew_ppm=0, noise=Noise(1))).frames(
         50.0
     )
     assert all(a.accel_g != b.accel_g and a.quat_wxyz == b.quat_wxyz for a, b in zip(clean, noisy, strict=True))
-
     frames = HipnucUartBench(hardware=HipnucHardware(uptime_ms=2**32 - 700)).frames(1000.0)
     times = [frame.system_time_ms for frame in frames]
     assert times[0] > 2**32 - 250
     assert times[-1] < 1000
-
     bench = HipnucUartBench(hardware=HipnucHardware(skew_ppm=0))
     bench.wait(125.0)
     bench.module.mark(bench.now_ns)
@@ -186,18 +178,15 @@ def test_the_vendors_probe_split_long_and_early_commands() -> None:
     assert bench.ask("LOG VERSION") == VERSION
     assert bench.ask("LOG ENABLE") == ["OK"]
     assert len(bench.frames(100.0)) == 10
-
     bench = HipnucUartBench()
     for byte in b"LOG VERSION\r\n":
         bench.module.receive(bytes([byte]), bench.now_ns)
     assert bench.text(30.0) == VERSION
-
     identity = [1, 0, 0, 0, 1, 0, 0, 0, 1]
     fits, too_long = ("CONFIG IMU URFR " + ",".join(f"{n:.{digits}f}" for n in identity) for digits in (9, 10))
     assert len(fits) <= 128 < len(too_long)
     assert HipnucUartBench().ask(fits) == ["OK"]
     assert HipnucUartBench().ask(too_long) == []
-
     bench = HipnucUartBench()
     bench.module.receive(b"REBOOT\r\nLOG VERSION\r\n", bench.now_ns)
     assert bench.ask("LOG VERSION", 800.0) == []
@@ -215,7 +204,6 @@ def test_replies_stand_between_whole_frames() -> None:
     assert text == ["".join(f"{line}\r\n" for line in VERSION).encode()] * 20
     ends = [burst.due_ns - len(burst.data) * 10 * NS_PER_S // 921_600 for burst in bursts]
     assert all(start >= before.due_ns - 1 for start, before in zip(ends[1:], bursts, strict=False))
-
     bench = HipnucUartBench(hardware=HipnucHardware(mag_bias_t=(14.14e-6, -2.08e-6, -8.75e-6)))
     assert bench.ask("LOG MAGCONFIG") == ["MB=14.14, -2.08, -8.75", "OK"]
     assert bench.ask("LOG USRCONFIG")[0] == "ATT_MODE: 0"
@@ -253,14 +241,12 @@ def test_reboot_baud_rate_and_factory_reset() -> None:
     frames = bench.frames(1000.0)
     assert len(frames) == pytest.approx(50, abs=1)
     assert frames[0].system_time_ms == 520
-
     bench = HipnucUartBench(ModuleSettings(baud=9600, hi91=Output(100)), HipnucHardware(skew_ppm=0, processing_ns=0))
     bench.wait(100.0 + 41.5 * 10 / 9.6)
     bench.module.receive(b"REBOOT\r\n", bench.now_ns)
     (burst,) = bench.wait(300.0)
     assert len(burst.data) == 41
     assert burst.sample_ns is None
-
     bench = HipnucUartBench()
     assert bench.ask("SERIALCONFIG 921600") == ["OK"]
     assert bench.module.baud == 115_200
@@ -272,7 +258,6 @@ def test_reboot_baud_rate_and_factory_reset() -> None:
     assert bench.module.baud == 115_200
     bench.reboot()
     assert bench.module.baud == 921_600
-
     bench = HipnucUartBench(FAST)
     assert bench.ask("CONFIG ATT MODE 1") == ["OK"]
     assert bench.ask("FRESET") == ["OK"]
@@ -318,13 +303,11 @@ def test_levels_and_yaw() -> None:
     assert abs(levelled.accel_g[0]) > 0.01
     assert bench.ask("CONFIG ATT RST 5") == ["OK"]
     assert bench.frames(20.0)[-1].euler_deg == pytest.approx((2.0, -3.0, 40.0), abs=1e-4)
-
     bench = HipnucUartBench(hardware=HIPNUC_STILL)
     assert bench.ask("CONFIG ATT RST 3") == ["OK"]
     frame = bench.frames(20.0)[-1]
     assert frame.euler_deg == pytest.approx((0.0, 0.0, 40.0), abs=1e-4)
     assert frame.accel_g == pytest.approx((0.0, 0.0, 1.0), abs=1e-5)
-
     steep = HipnucUartBench(hardware=HipnucHardware(motion=Still(radians(2), radians(6), 0.0)))
     assert steep.ask("CONFIG ATT RST 3") == ["ERR"]
     assert steep.frames(20.0)[-1].euler_deg[1] == pytest.approx(6.0, abs=1e-4)
@@ -333,13 +316,11 @@ def test_levels_and_yaw() -> None:
     roll, pitch, _ = turned.frames(20.0)[-1].euler_deg
     assert abs(roll) == pytest.approx(180.0, abs=1e-4)
     assert pitch == pytest.approx(0.0, abs=1e-4)
-
     bench = HipnucUartBench(hardware=HIPNUC_STILL)
     bench.ask("CONFIG ATT RST 2")
     bench.ask("SAVECONFIG")
     bench.reboot()
     assert bench.frames(20.0)[-1].euler_deg == pytest.approx((0.0, 0.0, 40.0), abs=1e-4)
-
     bench = HipnucUartBench(hardware=HIPNUC_STILL)
     for command, yaw_deg in (("CONFIG YAW 1 16", 16.0), ("CONFIG YAW 0 1.5", 17.5), ("CONFIG YAW 1 -170", -170.0)):
         assert bench.ask(command) == ["OK"]
@@ -369,8 +350,7 @@ def run(bench: HipnucUartBench, duration_ms: float) -> tuple[list[Burst], list[P
 def test_each_frame_has_its_pulse_right_before_it(settings: ModuleSettings) -> None:
     bench = HipnucUartBench(settings)
     bursts, edges = run(bench, 1000.0)
-    wire_ns = 82 * 10 * NS_PER_S // settings.baud
-    found = pulses(edges, Pin.SOUT)[: len(bursts)]
+    wire_ns, found = 82 * 10 * NS_PER_S // settings.baud, pulses(edges, Pin.SOUT)[: len(bursts)]
     assert len(bursts) > 90
     for burst, (rise, fall) in zip(bursts, found, strict=True):
         assert (fall.due_ns, fall.due_ns - rise.due_ns) == (burst.due_ns - wire_ns, HIGH_NS)
@@ -383,19 +363,16 @@ def test_which_frames_have_a_pulse_and_how_long_it_is() -> None:
     _, edges = run(bench, 1000.0)
     assert bench.module.frames_dropped > 800
     assert len(pulses(edges, Pin.SOUT)) == pytest.approx(bench.module.frames_sent, abs=6)  # frames in the buffer
-
     bench = HipnucUartBench(ModuleSettings(baud=921_600, hi91=Output(10), hi92=Output(10)))
     bursts, edges = run(bench, 1000.0)
     assert len(bursts) == pytest.approx(200, abs=2)
     for burst, (_, fall) in zip(bursts, pulses(edges, Pin.SOUT), strict=True):
         assert fall.due_ns == burst.due_ns - len(burst.data) * 10 * NS_PER_S // 921_600
-
     bench = HipnucUartBench()
     bench.ask("UNLOGALL")
     bench.module.pins(bench.now_ns)
     assert bench.ask("LOG VERSION")[-1] == "OK"
     assert bench.module.pins(bench.now_ns) == []
-
     _, edges = run(HipnucUartBench(hardware=HipnucHardware(processing_ns=30_000, skew_ppm=0)), 100.0)
     for rise, fall in pulses(edges, Pin.SOUT):
         assert (fall.due_ns - rise.due_ns, rise.due_ns) == (30_000, rise.sample_ns)
@@ -403,8 +380,7 @@ def test_which_frames_have_a_pulse_and_how_long_it_is() -> None:
 
 def test_edges_come_in_order_whatever_the_steps() -> None:
     settings = ModuleSettings(hi91=Output(5), hi92=Output(7), baud=921_600, alarm_x=AlarmSetting(-1, 1, True))
-    whole = run(HipnucUartBench(settings), 500.0)[1]
-    bench = HipnucUartBench(settings)
+    whole, bench = run(HipnucUartBench(settings), 500.0)[1], HipnucUartBench(settings)
     steps = [edge for _ in range(2500) for edge in run(bench, 0.2)[1]]
     assert steps == whole
     assert all(after.due_ns >= before.due_ns for before, after in pairwise(whole))
@@ -444,12 +420,10 @@ def test_dividers_and_pins_that_nobody_watches() -> None:
     assert bench.ask("CONFIG PMUX4 DIV20", 0.5) == []
     rises = [rise.due_ns for rise, _ in pulses(run(bench, 1000.0)[1], Pin.SOUT_DIV)]
     assert rises[0] - bench.now_ns + 1000 * NS_PER_MS == pytest.approx(20 * 10 * NS_PER_MS, abs=10 * NS_PER_MS)
-
     _, edges = run(HipnucUartBench(), 1000.0)
     periods = [(b.due_ns - a.due_ns) / NS_PER_MS for (a, _), (b, _) in pairwise(pulses(edges, Pin.SOUT_DIV))]
     assert periods == pytest.approx([80.0] * len(periods), rel=1e-4)  # manual, PMUX4
     assert len(periods) >= 11
-
     bench = HipnucUartBench(FAST)
     bench.wait(10_000.0)
     assert len(bench.module.pins(bench.now_ns)) <= 8192
@@ -466,12 +440,10 @@ def test_alarm_follows_the_angles() -> None:
     assert level
     for edge in edges:
         assert edge.rising is not level
-        level = edge.rising
-        t_s = (edge.due_ns - BEGIN_NS) / NS_PER_S
+        level, t_s = edge.rising, (edge.due_ns - BEGIN_NS) / NS_PER_S
         rolls = [degrees(motion.at(t_s - back_s).euler_rad[0]) for back_s in (0.0, 0.0101)]
         assert (abs(rolls[0]) > 5) is edge.rising
         assert (abs(rolls[1]) > 5) is not edge.rising  # the device checks the angle every 10 ms
-
     bench = HipnucUartBench(ModuleSettings(alarm_y=AlarmSetting(-1, 1, True)), HIPNUC_STILL)
     run(bench, 100.0)
     assert bench.ask("CONFIG PMUX5 Y,-1,1,0,0") == ["OK"]
@@ -520,7 +492,6 @@ def test_a_trigger_is_answered_125_us_later_on_average() -> None:
         delays.append(pulse[1].due_ns - marked_ns)
     assert sum(delays) / len(delays) == pytest.approx(125_000, abs=2000)
     assert 20_000 < max(delays) - min(delays) <= 30_000
-
     bench = HipnucUartBench(FAST, HIPNUC_STILL)
     bench.wait(0.7)
     bench.module.mark(bench.now_ns)

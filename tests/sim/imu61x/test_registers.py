@@ -40,7 +40,6 @@ def test_answer_comes_with_the_second_word_after_it_even_in_another_transaction(
     assert spoken(one, 0xFE01, 0x6A00, 0x6C00, 0x6E00, 0x7000)[3:] == [0x0000, 0x494D]
     assert spoken(one, 0x7E00, 0x7E00) == [0x5536, 0x3138]
     assert spoken(one, 0x7E00) == [1]
-
     one, clock = device(update_ns=10 * MS)
     clock.now = 19 * MS
     before = one.i2c([b"\x12", 32])
@@ -78,27 +77,22 @@ def test_windows_bursts_modes_a_restart_and_variants_of_burst_ctrl() -> None:
     one.spi([b"\xfe\x00"])
     spoken(one, 0x8644, 0x8D01)
     assert (one.filter, one.extended) == (0xBB, 0)  # writes to window 1 need this window
-
     one, _ = device()
     whole = one.spi(spi.READ_STANDARD.sends)[0]
     assert len(whole) == 32
     cut = b"".join(one.spi([spi.READ_STANDARD.sends[0][:8], bytes(24)]))
     assert cut[:8] == whole[:8] or cut[4:8] == whole[4:8]
     assert cut[12:] == bytes(len(cut) - 12)
-
     assert State(b"".join(device()[0].spi(READ_STATE.sends, 3))).product_id == b"\x00\x00IMU614"
     one, _ = device(modes=frozenset({3}))
-    right = b"".join(one.spi(READ_STATE.sends, 3))
-    wrong = b"".join(one.spi(READ_STATE.sends, 0))
+    right, wrong = b"".join(one.spi(READ_STATE.sends, 3)), b"".join(one.spi(READ_STATE.sends, 0))
     assert State(right).product_id == b"\x00\x00IMU614"
     assert State(wrong).product_id != b"\x00\x00IMU614"
-
     one, _ = device()
     spoken(one, 0xFE01, 0x8644, 0x8D01)
     assert (one.filter, one.extended, one.window) == (0x44, 1, 1)
     one.restart()
     assert (one.filter, one.extended, one.window) == (0xBB, 0, 0)
-
     one, _ = device(behaviour=RegisterBehaviour(window_bits=0xA5FE))
     assert spoken(one, 0xFE01, 0x7E00, 0xFE00, 0x7E00, 0, 0)[3::2] == [0xA5FF, 0xA5FE]
     one, _ = device()

@@ -46,10 +46,8 @@ def test_the_frame_on_the_wire_by_the_offsets_of_table_4() -> None:
     timer, pitch, roll, yaw, ax, ay, az, gx, gy, gz, temp = struct.unpack("<I10f", data[6:-4])
     assert (timer, burst.device_ms) == (510_000, 510)
     assert (roll, pitch, yaw) == pytest.approx((-2.998, 2.003, 39.895), abs=0.01)
-    assert (ax**2 + ay**2 + az**2) ** 0.5 == pytest.approx(9.8 / 9.80665, abs=1e-6)
-    assert (gx, gy, gz) == (0, 0, 0)
+    assert ((ax**2 + ay**2 + az**2) ** 0.5, (gx, gy, gz)) == (pytest.approx(9.8 / 9.80665, abs=1e-6), (0, 0, 0))
     assert 30 < temp < 40
-
     hardware = replace(IMU61X_STILL, motion=swing())
     far = Imu61xBench(hardware=hardware)
     assert far.samples(40)
@@ -122,13 +120,11 @@ def test_what_power_off_restart_and_factory_reset_change_and_cut() -> None:
     assert acknowledged(far, c.save()) == 0
     far.restart()
     assert parameter(far, Parameter.AHRS_RATE) == 50
-
     far = imu61x_bench()
     acknowledged(far, c.output_mode(c.OutputMode.COMMAND))
     acknowledged(far, c.save())
     far.restart()
     assert far.samples(1000) == []
-
     far = imu61x_bench()
     assert acknowledged(far, c.restart()) == 0
     assert far.wait(far.module.hardware.boot_ms - 20) == []
@@ -136,15 +132,12 @@ def test_what_power_off_restart_and_factory_reset_change_and_cut() -> None:
     assert len(samples) >= 15
     assert samples[0].dev_ticks is not None
     assert samples[0].dev_ticks <= 520_000
-
     far = imu61x_bench(Imu61xSettings(rate_hz=50), reset_acts_at_start=True)
     assert acknowledged(far, c.factory_reset()) == 0
     assert (far.module.settings.rate_hz, far.module.flash.rate_hz) == (50, 100)
     far.restart()
     assert far.module.settings.rate_hz == 100
-
-    module = Imu61xModule(BEGIN_NS, hardware=IMU61X_STILL)
-    now_ns = BEGIN_NS + 512_000_000
+    module, now_ns = Imu61xModule(BEGIN_NS, hardware=IMU61X_STILL), BEGIN_NS + 512_000_000
     assert module.advance(now_ns) == []
     module.reboot(now_ns)
     assert module.next_ns() == now_ns
@@ -160,13 +153,11 @@ def test_commands_at_another_rate_or_damaged() -> None:
     assert far.module.baud == 921600
     far.baud = 921600
     assert parameter(far, Parameter.BAUD) == 921600
-
     far = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
     far.baud = 460800
     far.send(c.factory_reset().payload)
     far.baud = 115200
     assert far.wait(100) == []
-
     far = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
     damaged = bytearray(c.ask_status().payload)
     damaged[12] ^= 1
@@ -176,7 +167,6 @@ def test_commands_at_another_rate_or_damaged() -> None:
     far.send(whole[:10])
     far.send(whole[10:])
     assert len(far.wait(100)) == 1
-
     settings = Imu61xSettings(baud=921600, rate_hz=400)
     assert changed(settings, 3, 9600.0).baud == 115200
     assert changed(settings, 21, 77.0).rate_hz == 100
@@ -205,8 +195,7 @@ def test_commands_at_another_rate_or_damaged() -> None:
 def heard(far: Imu61xBench, request: Request, duration_ms: float) -> list[tuple[float, int]]:
     """Send a request without waiting. Return the times (ms) and the results of its acknowledgements."""
     far.send(request.payload)
-    begun_ns = far.now_ns
-    found = []
+    begun_ns, found = far.now_ns, []
     while far.now_ns < begun_ns + duration_ms * 1e6:
         for event in far.wait(2):
             reply = parse_acknowledgement(event) if isinstance(event, ReplyFrame) else None
@@ -222,20 +211,17 @@ def test_behaviour_of_the_variants() -> None:
     ((at_ms, result),) = heard(far, c.ask_status(), 100)
     assert (at_ms < 30, result) == (True, 0)  # the device did not receive the status request
     assert len(far.samples(500)) >= 48
-
     far = imu61x_bench(quiet_ms=700)
     ((at_ms, _),) = heard(far, c.reset_heading(0), 20)
     assert at_ms < 10
     far.send(c.ask_status().payload)
     assert [event for event in far.wait(650) if not isinstance(event, Measurement)] == []
     assert far.samples(200)
-
     for at_end, expected_ms in ((False, 0), (True, 3000)):
         far = imu61x_bench(acknowledges_at_end=at_end)
         ((at_ms, result),) = heard(far, c.calibrate_gyro(), 3500)
         assert at_ms == pytest.approx(expected_ms, abs=20)
         assert result == 0
-
     far = imu61x_bench(result_done=1, result_refused=0, refuses=frozenset({c.Command.SAVE}))
     assert [result for _, result in heard(far, c.reset_heading(0), 20)] == [1]
     assert [result for _, result in heard(far, c.save(), 20)] == [0]
@@ -252,7 +238,6 @@ def test_installation_calibration_takes_its_time() -> None:
     far.wait(3000)
     assert acknowledged(far, c.ask_installation_status()) == 0
     assert parameter(far, Parameter.INSTALL_X_OFF) == pytest.approx(-2.998, abs=0.01)
-
     far = imu61x_bench()
     assert acknowledged(far, c.reset_heading(270)) == 0
     euler = far.samples(50)[-1].euler_rad

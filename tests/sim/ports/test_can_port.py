@@ -80,7 +80,6 @@ def test_a_port_passes_frames_in_both_directions(pair: tuple[socket.socket, sock
     assert received == []
     port.step(6, readable=True)
     assert received == [(0x7FF, False, b"abc", 6), (0, True, b"", 6)]
-
     frame = SentFrame(10, 0x188, False, b"x")
     due.append(frame)
     port.step(10, readable=False)

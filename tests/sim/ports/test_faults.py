@@ -59,24 +59,19 @@ def test_flips_wrong_rates_delays_unplugging_and_invalid_rates() -> None:
     for before, after in passed(Faults(3, FaultRates(flip=1.0)), 50):
         assert after
         assert sum((a ^ b).bit_count() for a, b in zip(before.data, after.data, strict=True)) == 1
-
     faults = Faults(2, FaultRates(wrong_baud=1.0), baud=115_200)
     assert all(after is None or after.data != before.data for before, after in passed(faults, 100))
-
     faults = Faults(3, FaultRates(delay=0.5, delay_ns=25 * NS_PER_MS))
     pairs = passed(faults)
     times = [after.due_ns for _, after in pairs if after]
     assert times == sorted(times)
     assert all(after and after.due_ns >= before.due_ns for before, after in pairs)
     assert faults.bursts_hit == 0
-
     faults = Faults(3, FaultRates(unplug=0.02, unplug_ns=55 * NS_PER_MS))
-    pairs = passed(faults)
-    first = faults.log[0].burst
+    pairs, first = passed(faults), faults.log[0].burst
     assert [after for _, after in pairs[first : first + 6]] == [None] * 6
     assert faults.unplugged_until_ns >= first * STEP_NS + 55 * NS_PER_MS
     assert sum(after is None for _, after in pairs) == faults.bursts_hit
-
     for text in ("flop=0.1", "flip", "flip=often", "flip=1.5", "flip=-1", "flip=nan"):
         with pytest.raises(ValueError, match="fault"):
             rates_from(text)
@@ -93,7 +88,6 @@ def test_the_ledger_of_a_codec_tells_the_same() -> None:
     assert ledger.closes()
     assert untouched <= ledger.frames_in_samples <= untouched + survivable
     assert measured >= untouched
-
     assert rates_from("flip=0.5,delay=0.1,delay_ns=7") == FaultRates(flip=0.5, delay=0.1, delay_ns=7)
     assert not rates_from("").any()
     assert rates_from("cut=0.1").any()
@@ -158,22 +152,18 @@ def test_the_mean_delay_of_a_profile(profile: arrival.ArrivalProfile, late_ns: i
 def test_wires_timers_and_packets() -> None:
     """At 115200 baud 82 bytes take 7.1 ms, so that at 200 Hz each frame waits for the previous frames."""
     assert {one_way(a) // 2 for a in arrivals(arrival.PERFECT)} <= {-1, 0}
-
     got = arrivals(arrival.USB_16MS, 1000)
     reads = {a.t_rx_ns for a in got}
     assert 115 <= len(reads) <= 130
     assert max(a.trailing_bytes for a in got) > 82 * 12
     waits = [a.t_rx_ns - a.t_ns for a in got]
     assert 13 * NS_PER_MS < max(waits) < 30 * NS_PER_MS
-
     for a, b in pairwise(arrivals(arrival.USB_16MS, 1000)):
         if a.t_rx_ns == b.t_rx_ns:
             assert a.trailing_bytes - b.trailing_bytes == 82
         else:
             assert a.trailing_bytes < 82
-
     assert len({a.t_rx_ns for a in arrivals(arrival.USB_16MS_PACKET, 1000)}) > 1900
-
     got = list(arrival.ArrivalModel(arrival.PERFECT, 200, 1, baud=115_200).run(400))
     assert got[-1].t_rx_ns - got[-1].t_ns > NS_PER_S // 2
 

@@ -70,7 +70,6 @@ def test_next_ns_names_the_next_edge_even_one_that_a_fault_made() -> None:
         assert all(t_ns == next_ns for t_ns, _ in line.edges[seen:])
         seen = len(line.edges)
     assert seen > 100
-
     rates = PinFaultRates(lose_pulse=0.1, lose_edge=0.05, extra=0.05)
     assert run(PinFaults(7, rates))[0].edges == run(PinFaults(7, rates))[0].edges
     assert run(PinFaults(7, rates))[0].edges != run(PinFaults(8, rates))[0].edges
@@ -95,21 +94,21 @@ def test_single_edges_lost_extra_pulses_lost_frames_and_probabilities() -> None:
     assert 150 <= faults.counts["lose_edge"] <= 250
     assert len(line.edges) == pytest.approx(2000 - faults.counts["lose_edge"], abs=3)
     assert any(after[1] is before[1] for before, after in pairwise(line.edges))
-
     faults = PinFaults(3, PinFaultRates(extra=0.1))
     line, _, _ = run(faults)
     assert 70 <= faults.counts["extra"] <= 130
     assert len(line.edges) == pytest.approx(2000 + 2 * faults.counts["extra"], abs=4)
     assert all(after[0] >= before[0] for before, after in pairwise(line.edges))
-
-    frame_faults = Faults(4, FaultRates(lose=0.1))
-    bursts = HipnucUartBench(FAST).wait(1000.0)
+    _, rise, fall = PinFaults(3, PinFaultRates(extra=1.0)).pass_on(PinEdge(0, Pin.SOUT, False))
+    assert (rise.rising, fall.rising, fall.due_ns - rise.due_ns) == (True, False, 80_000)
+    assert pin_ports.pin_rates("lose_edge=0.5,extra=1") == PinFaultRates(lose_edge=0.5, extra=1.0)
+    frame_faults, bursts = Faults(4, FaultRates(lose=0.1)), HipnucUartBench(FAST).wait(1000.0)
     arrived = [burst for burst in map(frame_faults.pass_on, bursts) if burst]
     assert 70 <= frame_faults.counts[FaultKind.LOSE] <= 130
     assert len(arrived) == len(bursts) - frame_faults.counts[FaultKind.LOSE]
     assert set(arrived) <= set(bursts)
     assert frame_faults.bursts_hit == frame_faults.counts[FaultKind.LOSE]
-
+    assert PinFaultRates(lose_pulse=0.0, extra=1.0)
     for value in (-0.1, 1.1, float("nan")):
         with pytest.raises(ValueError, match="expected a probability"):
             PinFaultRates(lose_pulse=value)
@@ -154,13 +153,18 @@ async def test_a_line_in_memory_counts_lost_edges_and_ends_inactive() -> None:
     with pytest.raises(LinkError, match="reset is not open"):
         output.set(True)
     output.open()
+    assert not output.active
     output.set(True)
     output.close()
-    output.close()
     assert (output.history, output.is_open) == ([(7, True), (7, False)], False)
+    output.close()
 
 
-def test_pull_files_are_written_as_the_kernel_wants_and_other_pins_are_refused(tmp_path: Path) -> None:
+def test_pull_files_are_written_as_the_kernel_wants_and_other_pins_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settles_s = list[float]()
+    monkeypatch.setattr(pin_ports, "sleep", settles_s.append)
     for name in ("a", "b"):
         (tmp_path / name).write_bytes(b"")
     files = pin_ports.pull_files(f"sout={tmp_path / 'a'},alarm={tmp_path / 'b'}")
@@ -169,8 +173,12 @@ def test_pull_files_are_written_as_the_kernel_wants_and_other_pins_are_refused(t
     assert (tmp_path / "a").read_bytes() == b"pull-up"
     files[Pin.SOUT](0, False)
     assert (tmp_path / "a").read_bytes() == b"pull-uppull-down"
-    assert (tmp_path / "b").read_bytes() == b""
-    for file in files.values():
+    assert ((tmp_path / "b").read_bytes(), settles_s) == (b"", [])
+    (settling,) = pin_ports.pull_files(f"sout={tmp_path / 'a'}", 0.1).values()
+    settling(0, True)
+    settling(0, False)
+    assert settles_s == [0.1]
+    for file in (*files.values(), settling):
         file.close()
         file.close()
     with pytest.raises(FileNotFoundError):
@@ -223,7 +231,7 @@ def test_lines_deliver_edges_read_sin_and_write_the_truth(
     now_ns = bench.now_ns
     for _ in range(40):
         next_ns = lines.next_ns(now_ns)
-        assert now_ns < next_ns <= now_ns + 4 * NS_PER_MS  # SIN is read every 4 ms
+        assert now_ns < next_ns <= now_ns + 4 * NS_PER_MS
         now_ns = next_ns
         lines.step(now_ns)
     value(1)
@@ -239,10 +247,10 @@ def test_lines_deliver_edges_read_sin_and_write_the_truth(
     assert all(row[2] == row[4] for row in rows[1:])  # each edge was delivered when it was due
     assert len(rows) == edges + 1
     assert files[Pin.SOUT]._file.closed
-
     bare = pin_ports.SimulatedLines(bench.module, {})
     bare.step(now_ns)
     assert (bare.next_ns(5), bare.summary()) == (5 + NS_PER_S, {})
     bare.close()
+    assert pin_ports.SimulatedLines(bench.module, {}, sin=value(0)).next_ns(5) == 5 + 4 * NS_PER_MS
     with pytest.raises(ValueError, match="expected a device with simulated pins"):
         pin_ports.SimulatedLines(object(), files)  # type: ignore[arg-type]  # not a simulated device

@@ -192,7 +192,6 @@ def test_adapters_with_a_timer_and_a_reader_that_stops(tmp_path: Path) -> None:
     assert all(0 < row[2] - row[0] <= 17.1 * NS_PER_MS for row in rows)
     rig.close()
     rig.port.close()
-
     rig = PluggedPort(tmp_path / "tty", settings=ModuleSettings(baud=921_600, hi91=Output(1)), profile=USB_16MS)
     rig.open(921_600)
     rig.run(16 * 3 + 10)
@@ -201,7 +200,6 @@ def test_adapters_with_a_timer_and_a_reader_that_stops(tmp_path: Path) -> None:
     assert rig.port.summary()["bytes_unheard"] == pytest.approx(10 * 82, abs=82)
     rig.close()
     rig.port.close()
-
     rig = PluggedPort(tmp_path / "tty", settings=ModuleSettings(baud=921_600, hi91=Output(1)))
     rig.open(921_600)
     rig.read = lambda: b""  # type: ignore[method-assign]  # a program that never reads
@@ -239,7 +237,6 @@ def test_faults_of_the_line_and_of_the_cable(tmp_path: Path) -> None:
     assert rig.port.summary()["fault_flip"] == len(faults.log) > 20
     rig.close()
     rig.port.close()
-
     rig = PluggedPort(tmp_path / "tty", faults=Faults(1, FaultRates(flip=0.5)))
     rig.run(100)
     assert rig.port.summary()["fault_flip"] > 0
@@ -248,10 +245,8 @@ def test_faults_of_the_line_and_of_the_cable(tmp_path: Path) -> None:
     rig.run(900)
     assert rig.port.summary()["fault_flip"] == before
     rig.port.close()
-
     faults = Faults(4, FaultRates(unplug=0.05, unplug_ns=100 * NS_PER_MS))
-    rig = PluggedPort(tmp_path / "tty", faults=faults)
-    seen = set()
+    rig, seen = PluggedPort(tmp_path / "tty", faults=faults), set()
     for _ in range(200):
         rig.run(10)
         seen.add(rig.path.is_symlink())
@@ -261,12 +256,12 @@ def test_faults_of_the_line_and_of_the_cable(tmp_path: Path) -> None:
 
 
 def test_closing_twice_is_allowed_and_leaves_nothing(tmp_path: Path) -> None:
-    before = set(os.listdir("/proc/self/fd"))
-    rig = PluggedPort(tmp_path / "tty")
+    before, rig = set(os.listdir("/proc/self/fd")), PluggedPort(tmp_path / "tty")
     rig.run(20)
     rig.port.close()
     rig.port.close()
     assert list(tmp_path.iterdir()) == []
+    assert not PtyNode(tmp_path / "tty").is_open
     assert set(os.listdir("/proc/self/fd")) == before
 
 
@@ -322,23 +317,19 @@ def test_wire_time_buffer_and_power_loss() -> None:
     assert [burst.data for burst in wire.sent(1000 + 3 * BYTE_NS)] == [b"abc"]
     assert wire.sent(10**12) == [(1000 + 5 * BYTE_NS, b"de", 4, 1)]
     assert wire.next_ns() is None
-
     wire = transmitter()
     assert wire.due_ns(10**9, 2) == 10**9 + 2 * BYTE_NS
-
     wire = transmitter()
     wire.send(1000, bytes(15))
     assert wire.fits(1000, 5)
     assert not wire.fits(1000, 6)
     assert wire.fits(1000 + BYTE_NS, 6)
-
     wire = transmitter()
     for data in (b"whole", b"broken", b"never"):
         wire.send(1000, data)
     through = wire.stopped(1000 + 5 * BYTE_NS + 2 * BYTE_NS + BYTE_NS // 2)
     assert [burst.data for burst in through] == [b"whole", b"br"]
     assert wire.sent(10**12) == []
-
     wire = transmitter()
     wire.send(1000, b"never")
     assert wire.stopped(500) == []
