@@ -4,6 +4,7 @@ Clients of paho-mqtt with a scripted broker: refusals, limits, hostile packets; 
 import asyncio
 import os
 import random
+import select
 import shutil
 import socket
 import ssl
@@ -13,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import msgspec
 import pytest
@@ -24,6 +26,7 @@ from imud.fleet.settings import Broker, MqttOptions, broker_of
 from tests.fleet.authority import Authority
 from tests.fleet.mosquitto import NO_MOSQUITTO, Collector, running_broker
 from tests.support.daemon_process import LIMIT_S
+from tests.support.leaks import open_descriptors
 from tests.support.surroundings import free_port
 
 FIRST_S, PACKET_BYTES, RECEIVED_MAX = 4.0, 16_384, 100
@@ -91,9 +94,8 @@ def test_a_stopped_broker_is_detected_and_a_missing_broker_is_named(tmp_path: Pa
 
 def test_the_wake_up_descriptor_is_not_closed_during_ring(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with running_broker(tmp_path / "broker") as broker:
-        connection = connect(f"mqtt://127.0.0.1:{broker.port}")
-        closing = threading.Thread(target=connection.close)
-        write = os.eventfd_write
+        before, connection = open_descriptors(), connect(f"mqtt://127.0.0.1:{broker.port}")
+        closing, write = threading.Thread(target=connection.close), os.eventfd_write
 
         def write_late(bell: int, value: int) -> None:
             closing.start()
@@ -105,6 +107,7 @@ def test_the_wake_up_descriptor_is_not_closed_during_ring(tmp_path: Path, monkey
         closing.join()
         monkeypatch.undo()
         connection.ring()  # nothing happens: the descriptor may belong to another file
+        assert open_descriptors() == before
 
 
 def test_refused_messages_are_named(tmp_path: Path) -> None:
@@ -287,9 +290,14 @@ def test_a_gateway_names_the_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
         gateway(broker)
 
 
-def test_a_gateway_keeps_the_limits_of_the_broker() -> None:
+def test_a_gateway_keeps_the_limits_of_the_broker(monkeypatch: pytest.MonkeyPatch) -> None:
+    poll = Mock(**{"poll.return_value": []})
     with scripted(TWO_AT_A_TIME) as broker, closing(gateway(broker)) as connection:
         assert connection.in_flight_max == 2
+        with monkeypatch.context() as patch:
+            patch.setattr(select, "poll", lambda: poll)
+            connection.wait(0.25)
+        poll.poll.assert_called_once_with(250.0)  # ms
         with pytest.raises(BrokerError, match="the output ends"):
             PahoConnection(broker, msgspec.convert({}, MqttOptions), "gateway", Will("t", b""), lambda: False)
     too_long = pytest.raises(MessageRefused, match="at most 100 bytes, got a message of t with 100")

@@ -151,8 +151,7 @@ class SlowStore(MemoryStore):
 
 def test_a_slow_store_receives_larger_transactions(broker: Mosquitto, gateway: SendingGateway) -> None:
     begin_session(broker)
-    number = RECEIVE_MAX + BATCHES_MAX
-    store = SlowStore(is_slow=True)
+    number, store = RECEIVE_MAX + BATCHES_MAX, SlowStore(is_slow=True)
 
     def send() -> None:
         gateway.send(samples_message(1, 1))

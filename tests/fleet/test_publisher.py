@@ -18,8 +18,9 @@ from imud.contracts.publisher import Batch
 from imud.contracts.setting import OnDifference, SettingDifference, SettingsState, SettingsStatus
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.fleet.broker import EXTRA_MISSING
-from imud.fleet.publisher import MqttPublisher
+from imud.fleet.publisher import MqttPublisher, discovery_topic
 from imud.fleet.settings import Broker, MqttOptions, broker_of
+from imud.fleet.streams import Gateway
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.model.options import wrong_values
@@ -75,7 +76,8 @@ class PublisherBench:
 
 
 def test_birth_states_and_farewell(tmp_path: Path) -> None:
-    bench = PublisherBench(tmp_path)
+    bench = PublisherBench(tmp_path, devices={"imu0": {"settings": False}})
+    bench.statuses = [msgspec.structs.replace(device_status("imu0", 0), settings={"rate_hz": "50"})]
     bench.start()
     bench.tick()
     bench.broker.wait_for("imud/default/gw/imu0/schema")
@@ -130,20 +132,21 @@ def test_a_device_removed_between_two_runs_leaves_no_retained_state(tmp_path: Pa
     """The broker acknowledges the removal in the fourth run."""
     removed = []
     for device, answers in (("imu0", 99), ("imu1", 0), ("imu1", 0), ("imu1", 99), ("imu1", 99)):
-        bench = PublisherBench(tmp_path)
-        bench.broker.answers = answers
-        bench.broker.window = 20
-        bench.statuses = [device_status(device, 0)]
+        bench = PublisherBench(tmp_path, home_assistant=True)
+        bench.broker.answers, bench.broker.window = answers, 20
+        bench.statuses = [msgspec.structs.replace(device_status(device, 0), settings={"rate_hz": "50"})]
         bench.start(device=device)
         bench.tick()
         bench.broker.wait_for(f"imud/default/gw/{device}/schema")
         bench.tick()
         removed.append({topic for topic, payload, _ in bench.close() if not payload})
-    assert removed == [set(), *[{"imud/default/gw/imu0/status", "imud/default/gw/imu0/schema"}] * 3, set()]
+    topics = {f"imud/default/gw/imu0/{leaf}" for leaf in ("status", "schema", "settings")}
+    topics.add(discovery_topic(Gateway("default", "gw", ""), "imu0"))
+    assert removed == [set(), topics, topics, topics, set()]
 
 
 def test_settings_are_published_when_they_change(tmp_path: Path) -> None:
-    bench = PublisherBench(tmp_path)
+    bench = PublisherBench(tmp_path, devices={"imu0": {"status": False}})
     topic = "imud/default/gw/imu0/settings"
 
     def declare(state: SettingsState, read_ns: int, **differences: SettingDifference) -> None:
@@ -162,7 +165,9 @@ def test_settings_are_published_when_they_change(tmp_path: Path) -> None:
     bench.output.remove_device("imu0")
     bench.tick()
     bench.broker.wait_for(topic, lambda payload: not payload)
-    sent = [json.loads(payload) for one, payload, _ in bench.close() if one == topic and payload]
+    messages = bench.close()
+    assert {one for one, _, retain in messages if retain} == {"imud/default/gw/state", topic}
+    sent = [json.loads(payload) for one, payload, _ in messages if one == topic and payload]
     assert [one["state"] for one in sent] == ["agree", "differ"]
     assert sent[1]["differences"] == {"rate_hz": {"declared": 100, "actual": 50}}
     assert sent[1]["actual"] == {"rate_hz": "50"}
@@ -178,8 +183,7 @@ def test_only_configured_devices_are_queued(tmp_path: Path) -> None:
         bench.output.event(Event(0, name, EventKind.LOSS, "x"))
     assert bench.output.status().queued == 3
     bench.output.event(Event(0, "", EventKind.CONFIGURATION, "x"))
-    assert bench.output.status().queued == 4
-    assert bench.context.outputs.mqtts == [bench.output.status]
+    assert (bench.output.status().queued, bench.context.outputs.mqtts) == (4, [bench.output.status])
     bench.close()
     assert bench.context.outputs.mqtts == []
 
@@ -347,8 +351,7 @@ def test_slots_can_be_decoded_with_the_published_schema(tmp_path: Path) -> None:
     layout = json.loads(topics["imud/default/gw/imu0/schema"])["slot"]
     payload = topics["imud/default/gw/imu0/samples"]
     begin = 8 + int.from_bytes(payload[6:8], "little")  # "IMUB", version, 0, length of the header (docs/fleet.md)
-    slots = zstandard.ZstdDecompressor().decompress(payload[begin:])
-    size = layout["bytes"]
+    slots, size = zstandard.ZstdDecompressor().decompress(payload[begin:]), layout["bytes"]
     assert len(slots) == 3 * size
     for at, one in enumerate(sent):
         found = fields_by_schema(slots[at * size : (at + 1) * size], layout)

@@ -41,8 +41,7 @@ def finish(gateway: LiveGateway, collector: Collector) -> StreamCounts:
 
 
 def test_a_restart_of_the_broker_loses_nothing(tmp_path: Path, broker: Mosquitto) -> None:
-    collector = Collector(broker.port)
-    gateway = LiveGateway(tmp_path / "spool", broker.port)
+    collector, gateway = Collector(broker.port), LiveGateway(tmp_path / "spool", broker.port)
     for _ in range(3):
         gateway.publish(1000)
         gateway.wait_for(lambda: gateway.output.status().acknowledged > 0)
@@ -56,8 +55,7 @@ def test_a_restart_of_the_broker_loses_nothing(tmp_path: Path, broker: Mosquitto
 
 
 def test_a_frozen_broker_is_replaced_without_loss(tmp_path: Path, broker: Mosquitto) -> None:
-    collector = Collector(broker.port)
-    gateway = LiveGateway(tmp_path / "spool", broker.port)
+    collector, gateway = Collector(broker.port), LiveGateway(tmp_path / "spool", broker.port)
     gateway.publish(2000)
     gateway.wait_for(lambda: gateway.output.status().acknowledged > 0)
     broker.freeze()
@@ -75,8 +73,7 @@ def test_refused_messages_are_not_lost(tmp_path: Path, monkeypatch: pytest.Monke
     rights.write_text("topic read #\ntopic write imud/default/gw/state\n")
     port = free_port()
     with running_broker(tmp_path / "broker", "allow_anonymous true", f"acl_file {rights}", port=port) as broker:
-        collector = Collector(port)
-        gateway = LiveGateway(tmp_path / "spool", port)
+        collector, gateway = Collector(port), LiveGateway(tmp_path / "spool", port)
         gateway.publish(3000)
         gateway.wait_for(lambda: "imud/default/gw/bow/samples" in gateway.output.status().refused)
         rights.write_text("topic readwrite #\n")
@@ -96,8 +93,7 @@ def test_the_ledger_balances_after_a_kill_with_a_full_spool(tmp_path: Path) -> N
     gateway.wait_until(1)
     gateway.kill()
     with running_broker(tmp_path / "broker", port=port):
-        collector = Collector(port)
-        gateway = KilledGateway(port, spool, 9, megabytes=1)
+        collector, gateway = Collector(port), KilledGateway(port, spool, 9, megabytes=1)
         collector.wait_for(lambda: any(key.boot == f"{9:016x}" for key in collector.ledger.counts))
         gateway.kill()
         counts = closes(collector, spool)
@@ -137,8 +133,7 @@ BATCH_SAMPLES = 200  # samples of `batch_s` (0.2 s) at 1 kHz that wait for their
 def test_a_kill_loses_only_the_samples_in_memory(tmp_path: Path) -> None:
     port, spool = free_port(), tmp_path / "spool"
     with running_broker(tmp_path / "broker", port=port):
-        collector = Collector(port)
-        killings = Killings(port, spool, seed=16)
+        collector, killings = Collector(port), Killings(port, spool, seed=16)
         for epoch in range(1, KILLS + 1):
             killings.kill_one(epoch, in_commit=bool(epoch % 2))
         counts = closes(collector, spool)
@@ -158,8 +153,7 @@ def test_a_kill_within_one_boot_shows_the_loss_as_a_gap(tmp_path: Path) -> None:
     port, spool = free_port(), tmp_path / "spool"
     begun = 0
     with running_broker(tmp_path / "broker", port=port):
-        collector = Collector(port)
-        killings = Killings(port, spool, seed=17)
+        collector, killings = Collector(port), Killings(port, spool, seed=17)
         for number in range(KILLS):
             killings.kill_one(7, in_commit=bool(number % 2), newest_seq=begun)
             # more than the gateway can have stored without a report
@@ -172,15 +166,13 @@ def test_a_kill_within_one_boot_shows_the_loss_as_a_gap(tmp_path: Path) -> None:
         whole.take(decode_message(payload), Stream.SAMPLES)
     (one,) = whole.counts.values()
     (last,) = [position.last for position in positions if position.stream == "samples"]
-    assert (one.newest, one.missing, one.balance) == (last, 0, 0)
-    assert set(one.dropped) == {"off"}
+    assert ((one.newest, one.missing, one.balance), set(one.dropped)) == ((last, 0, 0), {"off"})
     assert one.dropped["off"] > (KILLS - 2) * 5000  # the last gateway may have stored nothing
 
 
 def test_a_slow_network_neither_blocks_nor_loses_samples(tmp_path: Path, broker: Mosquitto) -> None:
     with closing(Proxy(broker.port)) as proxy:
-        collector = Collector(broker.port)
-        gateway = LiveGateway(tmp_path / "spool", proxy.port)
+        collector, gateway = Collector(broker.port), LiveGateway(tmp_path / "spool", proxy.port)
         proxy.bytes_s = 20_000
         gateway.publish(5000)
         gateway.wait_for(lambda: (now := gateway.output.status()).waiting > 20 and bool(now.broker))

@@ -76,6 +76,9 @@ def test_messages_are_sent_in_order_within_the_window() -> None:
     bench.sender.work()
     bench.sender.work()
     assert bench.broker.connections[0].types[6:] == [SLOTS_TYPE]
+    bench.sender.reply(CommandReply("answer", b"", None))
+    bench.sender.close(b"bye")
+    assert bench.broker.connections[0].rings == 5
 
 
 @pytest.mark.parametrize("stable", [False, True])
@@ -98,8 +101,8 @@ def test_a_lost_connection_clears_the_outbox_and_starts_a_new_session() -> None:
     bench.sender.work()
     bench.sender.give(1, [row(1), row(2)])
     bench.sender.work()
-    bench.broker.problem = "the cable was pulled"
-    assert bench.sender.work() == 2.0
+    bench.broker.problem, bench.wanted = "the cable was pulled", 0
+    assert (bench.sender.work(), bench.wanted) == (2.0, 1)
     assert bench.broker.connections[0].closed
     assert (bench.sender.connected, bench.sender.problem, bench.sender.session) == (False, "the cable was pulled", 2)
     assert bench.sender.take_acknowledged() == [(1, 1)]
@@ -109,8 +112,7 @@ def test_a_lost_connection_clears_the_outbox_and_starts_a_new_session() -> None:
     bench.sender.work()
     bench.sender.work()
     assert bench.sent() == []
-    assert (bench.sender.problem, bench.sender.reconnects) == ("", 1)
-    assert bench.broker.asked == ["a", "a", "b"]
+    assert ((bench.sender.problem, bench.sender.reconnects), bench.broker.asked) == (("", 1), ["a", "a", "b"])
 
 
 def test_retained_messages_are_sent_first_at_each_connection() -> None:
@@ -143,8 +145,7 @@ def test_retained_messages_are_sent_first_at_each_connection() -> None:
 
 @pytest.mark.live
 def test_the_sender_ends_with_a_farewell() -> None:
-    bench = SenderBench()
-    connected = threading.Event()
+    bench, connected = SenderBench(), threading.Event()
     bench.sender.wanting = connected.set
     bench.sender.start()
     assert connected.wait(LIMIT_S)
@@ -217,6 +218,11 @@ def test_the_number_of_refused_topics_is_limited() -> None:
     assert (len(refusals.problems), *refusals.skipped) == (TOPICS_MAX, *(f"t{n + 1}" for n in range(TOPICS_MAX)))
     assert set(refusals.problems.values()) == {"no"}
     assert (len(refusals.take_ended(SKIP_NS)), refusals.losses("t1")) == (TOPICS_MAX, LOSSES_MAX - 1)
+    refusals, now_ns = TopicRefusals(), 0
+    for skip_s in (60, 120, 240, 480, 960, 1920, 3600, 3600):
+        refusals.refuse("t", "no", now_ns)
+        now_ns += skip_s * NS_PER_S
+        assert (refusals.take_ended(now_ns - 1), refusals.take_ended(now_ns)) == ([], ["t"])
     (bench := SenderBench()).broker.refuses, bench.broker.window = {"answer"}, 1
     for _ in range(3):
         bench.sender.reply(CommandReply("answer", b"", None))
@@ -317,3 +323,17 @@ def test_lost_connections_refuse_no_innocent_topic_and_a_silent_broker_is_left()
     bench.sender.give(bench.sender.session, [row(1)])
     bench.drive(2)
     assert bench.sender.problem == ""
+    bench.broker.answers = 0
+    bench.sender.give(bench.sender.session, [row(2, bytes(12_500)), row(3, bytes(12_500), "third")])
+    bench.sender.work()
+    problems = []  # a message has 4 s, and 5 s for each 12,500 bytes before its end at 20 kbit/s
+    for later_ns, answers in ((9 * NS_PER_S, 0), (1, 0), (0, 1), (5 * NS_PER_S - 1, 0), (1, 0), (55 * NS_PER_S, 0)):
+        bench.clock.advance(later_ns)
+        bench.broker.answers = answers
+        bench.sender.work()
+        problems.append(bench.sender.problem.removeprefix("mqtt://a:1: expected an acknowledgement of a message of "))
+    late = [f"{topic} within 9 s, got none" for topic in ("topic", "third", "third")]
+    assert problems == ["", late[0], "", "", *late[1:]]
+    bench.clock.advance(5 * NS_PER_S)
+    bench.sender.work()
+    assert bench.sender.problem == "mqtt://a:1: no acknowledgement of 1 messages within 60 s"

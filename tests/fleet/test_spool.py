@@ -26,8 +26,7 @@ UTC_NS = CLOCK_SET_NS + 10_000 * HOUR_NS
 
 
 def batch(first: int, count: int = 100, device: str = "bow", *, whole: bool = True) -> spool.SpoolRow:
-    stream = Stream.SAMPLES if whole else Stream.EVENTS
-    last = first + count - 1
+    stream, last = Stream.SAMPLES if whole else Stream.EVENTS, first + count - 1
     samples = [
         Sample(device, seq, seq, 0, Sync.EDGE, seq, seq, accel_m_s2=(seq * 0.37, seq / 7, 9.8))
         for seq in range(first, last + 1)
@@ -231,8 +230,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_a_full_disk_does_not_change_the_spool_until_messages_are_acknowledged(small_disk: Path) -> None:
-    bench = SpoolBench(small_disk)
-    number = 0
+    bench, number = SpoolBench(small_disk), 0
     with pytest.raises(spool.SpoolError, match="full"):  # noqa: PT012
         while True:
             bench.commit(batch(100 * number + 1))

@@ -65,8 +65,7 @@ class WriterBench:
 
     def put(self, count: int) -> None:
         """Put samples of `count` milliseconds."""
-        base_ns = self.clock.now_ns()
-        made = []
+        base_ns, made = self.clock.now_ns(), []
         for n in range(count):
             self.seq += 1
             t_ns = base_ns + n * NS_PER_MS
@@ -103,8 +102,7 @@ def test_everything_is_spooled_sent_and_removed(tmp_path: Path) -> None:
         bench.work()
     bench.work(4)
     counts = bench.counts()
-    assert (counts.whole, counts.duplicates, counts.missing) == (5000, 0, 0)
-    assert bench.spool.messages == 0
+    assert ((counts.whole, counts.duplicates, counts.missing), bench.spool.messages) == ((5000, 0, 0), 0)
     assert bench.sender.acknowledged == bench.spool.spooled == 10
     bench.disk.fails = True
     bench.put(2000)
@@ -164,8 +162,7 @@ def test_a_rate_below_one_message_per_second_works(tmp_path: Path) -> None:
     bench.put(5000)
     bench.work(21)
     assert len(bench.arrived()) in (5, 6)
-    bench = WriterBench(tmp_path / "other", batch_s=0.1)
-    commits = []
+    bench, commits = WriterBench(tmp_path / "other", batch_s=0.1), []
     bench.spool.commit = lambda new, *_: commits.append(len(new))  # type: ignore[method-assign]
     for _ in range(100):
         bench.put(100)
@@ -191,8 +188,7 @@ def test_messages_without_acknowledgement_are_sent_again_in_order(tmp_path: Path
     firsts = [decode_message(payload).first for payload in bench.arrived()]
     assert firsts == [1, 501, 1001, 1501, 2001, 501, 1001, 1501, 2001, 2501]
     counts = bench.counts()
-    assert (counts.whole, counts.duplicates) == (3000, 2000)
-    assert bench.spool.messages == 0
+    assert ((counts.whole, counts.duplicates), bench.spool.messages) == ((3000, 2000), 0)
     # the sender ignores an acknowledgement of an earlier connection
     bench.put(1000)
     bench.work(2)
