@@ -255,7 +255,6 @@ def test_a_failed_watch_is_an_error_and_leaves_no_descriptor(tmp_path: Path, mon
         with pytest.raises(LinkError, match="may not read"):
             asyncio.run(wait_until(path, path.exists))
     assert closed == [True]
-
     monkeypatch.setattr(os, "O_CLOEXEC", 1 << 30)
     with pytest.raises(LinkError, match=r"Invalid argument; raise fs\.inotify\.max_user_instances"):
         inotify.DirectoryWatch()

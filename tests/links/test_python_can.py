@@ -120,8 +120,7 @@ async def test_only_data_frames_are_delivered_and_nothing_after_close(monkeypatc
     wait_until(lambda: not bus.messages, "the thread has read the frame")
     link.close()
     await asyncio.sleep(0.01)  # the loop would deliver the frame now
-    assert got == [[0, *range(4, 67)], [67]]
-    assert (bus.is_shut_down, bus.timeouts_s) == (True, {0, 0.05})
+    assert (got, (bus.is_shut_down, bus.timeouts_s)) == ([[0, *range(4, 67)], [67]], (True, {0, 0.05}))
 
 
 @in_loop

@@ -19,8 +19,10 @@ from imud.links import LINKS
 from imud.links.replay import CanReplayLink, ReplayLink, ReplayOptions, _problem
 from imud.model.errors import LinkDenied, LinkError, LinkMissing
 from imud.model.units import NS_PER_MS, uart_byte_ns
+from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import VirtualClock, in_loop, run_virtually
 from tests.support.files import CaptureWriter, candump_line
+from tests.support.leaks import open_descriptors
 
 READS = [(b"a" * 82, 1_000_000_000), (b"b" * 41, 1_004_000_000), (b"c", 1_004_000_000), (b"d" * 82, 1_030_000_000)]
 
@@ -130,8 +132,7 @@ def test_maximum_speed_is_virtual_time(tmp_path: Path, stamped: Path) -> None:
     path.write_bytes(bytes(3 * 65536 + 5))
     played = play(path, speed="maximum", baud=921600)
     assert len(played.data) == 3 * 65536 + 5
-    byte_ns = uart_byte_ns(921600)
-    sizes = [len(data) for data, _ in played.chunks]
+    byte_ns, sizes = uart_byte_ns(921600), [len(data) for data, _ in played.chunks]
     assert [b - a for a, b in pairwise(played.offsets_ns)] == [size * byte_ns for size in sizes[1:]]
     check_times(played)
     assert set(play(path, speed="maximum").offsets_ns) == {0}
@@ -144,8 +145,13 @@ def test_maximum_speed_is_virtual_time(tmp_path: Path, stamped: Path) -> None:
 @in_loop
 async def test_others_get_their_turn_at_maximum_speed(tmp_path: Path) -> None:
     path = tmp_path / "long"
-    path.write_bytes(bytes(1 << 20))
     link = ReplayLink(ReplayOptions(path=str(path), speed="maximum"))
+    waiting = asyncio.create_task(link.wait_present())
+    for _ in range(20):
+        await asyncio.sleep(0)
+    assert not waiting.done()
+    path.write_bytes(bytes(1 << 20))
+    await asyncio.wait_for(waiting, LIMIT_S)
     order: list[str] = []
     done = asyncio.Event()
     link.open()
@@ -288,6 +294,7 @@ def play_log(
                 done.set()
 
         def end(error: LinkError | None) -> None:
+            assert str(path) not in open_descriptors().values()
             ends.append(error)
             done.set()
 
@@ -304,8 +311,7 @@ def play_log(
 
 def test_maximum_speed_ends_now_and_keeps_the_recorded_steps(tmp_path: Path) -> None:
     frames, ends, took_ns = play_log(write_log(tmp_path / "a.log", 1600), speed="maximum")
-    assert (ends, took_ns) == ([None], 0)
-    assert len(frames) == sum(n % 3 != 0 for n in range(1600))
+    assert ((ends, took_ns), len(frames)) == (([None], 0), sum(n % 3 != 0 for n in range(1600)))
     assert {frame.can_id for frame in frames} == {101, 102}
     assert frames[1].t_rx_ns - frames[0].t_rx_ns == 10 * NS_PER_MS
     assert VirtualClock().now_ns() - frames[-1].t_rx_ns == 10 * NS_PER_MS, "the last frame does not pass the filters"
@@ -321,8 +327,7 @@ def test_recorded_speed_takes_its_time(tmp_path: Path) -> None:
 
 def test_it_can_repeat_and_be_closed_by_the_receiver(tmp_path: Path) -> None:
     frames, ends, _ = play_log(write_log(tmp_path / "a.log", 3, step_ms=1), enough=7, repeat=True)
-    assert [frame.can_id for frame in frames[:6]] == [101, 102] * 3
-    assert ends == []
+    assert ([frame.can_id for frame in frames[:6]], ends) == ([101, 102] * 3, [])
     times = [frame.t_rx_ns for frame in frames]
     assert times == sorted(times)
 

@@ -312,8 +312,7 @@ def test_request_to_all_expects_no_reply(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_cable_pulled_and_back(pty: PtyPort) -> None:
-    ports = rs485.SharedPorts()
-    options = rs485.Rs485Options(line=pty.path, baud=BAUD, reply_ms=1)
+    ports, options = rs485.SharedPorts(), rs485.Rs485Options(line=pty.path, baud=BAUD, reply_ms=1)
     link_a, link_b = rs485.Rs485Link(options, ports=ports), rs485.Rs485Link(options, ports=ports)
     link_a.open()
     link_b.open()

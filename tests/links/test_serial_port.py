@@ -41,8 +41,7 @@ def test_each_number_has_its_error_which_names_the_port(number: int, kind: type[
 
 
 def test_an_open_port_has_one_descriptor_and_leaves_none() -> None:
-    pty = PtyPort()
-    before = len(open_descriptors())
+    pty, before = PtyPort(), len(open_descriptors())
     port = serial_port.open_port(str(pty.path), 115200, PROC)
     assert len(open_descriptors()) == before + 1
     port.close()

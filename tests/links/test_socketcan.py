@@ -192,8 +192,7 @@ def test_without_it_every_frame_is_read_as_it_comes(ends: Ends) -> None:
 
     bus = Bus(ends, 0)
     bus.run(story)
-    assert [len(batch) for batch in bus.batches] == [1, 1, 1]
-    assert bus.delays_s == []
+    assert ([len(batch) for batch in bus.batches], bus.delays_s) == ([1, 1, 1], [])
 
 
 @pytest.mark.parametrize("at", ["delivery", "pause"])
@@ -299,8 +298,7 @@ def test_life_of_a_controller_from_its_state_at_the_start() -> None:
     assert news_of(bus, 0x40).startswith("can0 is bus-off: ")
     assert "`ip link set can0 down`, then `ip link set can0 up type can restart-ms 100`" in bus.problem
     assert news_of(bus, 0x100) == "can0 is error-active again"
-    assert bus.problem == ""
-    assert (bus.passive_count, bus.bus_off_count) == (1, 1)
+    assert (bus.problem, (bus.passive_count, bus.bus_off_count)) == ("", (1, 1))
     bus = BusState("can0", 0)
     assert news_of(bus, 0x4, 0x01) == ""
     assert (bus.overflows, bus.state) == (1, ControllerState.ACTIVE)
@@ -381,8 +379,7 @@ def wire() -> Iterator[Wire]:
 def test_a_read_is_bounded_and_frames_come_with_the_time_of_their_arrival(wire: Wire) -> None:
     wire.send(*range(64 + 5))
     first, second = wire.read(), wire.read()
-    assert [f.can_id for f in first + second] == list(range(64 + 5))
-    assert (len(first), len(second)) == (64, 5)
+    assert ([f.can_id for f in first + second], (len(first), len(second))) == (list(range(64 + 5)), (64, 5))
     assert second[0].t_rx_ns >= first[-1].t_rx_ns
     assert wire.reader.read() == []
     before_ns, after_ns = wire.send(1, 2, 0x7FF)

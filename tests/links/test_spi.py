@@ -137,8 +137,7 @@ def test_transfer_that_fails_says_whether_the_bus_is_gone(number: int, expected:
 
 
 def test_row_and_names(tmp_path: Path) -> None:
-    row = LINKS["spi"]
-    node = tmp_path / "spidev3.1"
+    row, node = LINKS["spi"], tmp_path / "spidev3.1"
     link = row.make_polled(SpiOptions(port=str(node), mode=3))
     assert (link.bus, link.target, link.shared) == (str(tmp_path / "spidev3"), 3, False)
     assert (link.place(3), link.kernel_counters()) == ("mode 3", KernelCounters())
