@@ -4,13 +4,13 @@ import asyncio
 import json
 import re
 import signal
-import socket
 import sys
 from collections.abc import Callable
 from contextlib import closing
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from foxglove import start_server
@@ -73,25 +73,23 @@ def test_messages_reach_a_client_that_subscribed() -> None:
     assert notes == ["no daemon", "connected to the daemon again"]
 
 
-def test_the_server_behind_the_gate_is_not_found_by_trying_and_ends_if_a_port_is_taken(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    opened = []
+def test_the_server_behind_the_gate_is_hidden_and_ends_if_a_port_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    servers: list[Mock] = []
 
-    def start(**options: Any) -> Any:
+    def start(**options: Any) -> Mock:
         server = start_server(**options)
-        opened.append((options["host"], server.port))
-        return server
+        servers.append(Mock(wraps=server, port=server.port))
+        return servers[-1]
 
     monkeypatch.setattr("foxglove.start_server", start)
     with closing(serve([])) as server:
         port = int(server.url.rpartition(":")[2])
         with pytest.raises(ServerError, match=f"cannot listen on 127.0.0.1 port {port}"):
             FoxgloveServer("127.0.0.1", port, ViewerOrigins(), note=print)
-        socket.create_connection(opened[0]).close()
-    for address in (*opened, ("127.0.0.1", port)):
-        with pytest.raises(ConnectionRefusedError):
-            socket.create_connection(address)
+        server.problem("no daemon")
+        server.problem("")
+        servers[0].remove_status.assert_called_once_with(["daemon"])
+    assert [one.stop.call_count for one in servers] == [1, 1]
     addresses = {hidden_address() for _ in range(100)}
     assert len(addresses) >= 99, "of 16 million"
     assert all(ip_address(one).is_loopback for one in addresses)
