@@ -116,10 +116,13 @@ def test_the_history_ends_after_an_hour_or_at_the_limit_of_memory(monkeypatch: p
     assert len(found(of)) == 3601, "3600 complete seconds and the open second"
     made(at(7301.0), into=of)
     assert [one.first_s for one in found(of)] == [7300.0, 7301.0]
+    many = History()
+    for number in range(300):
+        made(at(0.0), device=f"imu{number}", into=many)
+    assert many.kept_s == (64 << 20) // (300 * SECOND.size)
     monkeypatch.setattr(history, "BYTES_MAX", 10 * SECOND.size)
     made(*(at(second, device="imu1") for second in range(50)), device="imu1", into=of)
-    assert of.kept_s == 5
-    assert [len(of.seconds(name)) // SECOND.size for name in ("imu1", "imu2")] == [6, 0]
+    assert (of.kept_s, [len(of.seconds(name)) // SECOND.size for name in ("imu1", "imu2")]) == (5, [6, 0])
     made(at(3.0), at(4.0), into=of)  # another recording
     assert [one.first_s for one in found(of)] == [3.0, 4.0]
     of.remove("imu0")
