@@ -364,14 +364,11 @@ def test_file_of_an_earlier_daemon_is_replaced(tmp_path: Path, leave: Callable[[
         board = Board(tmp_path)
         board.publish([1])
         old.seek(0)
-        assert old.read() == before
-        assert board.word("epoch") == 77
+        assert (old.read(), board.word("epoch")) == (before, 77)
         board.publisher.close()
 
 
-def test_full_memory_delays_the_ring(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_ring_in_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     """The daemon runs without the ring, logs it once, and creates the ring when there is room."""
     tries: list[int] = []
 
@@ -395,8 +392,7 @@ def test_full_memory_delays_the_ring(
     board.tick()
     with Ring(board.path, now_ns=lambda: board.now_ns) as reader:
         board.publish([4])
-        assert [s.seq for s in reader.read().samples] == [4]
-        assert reader.missed == 0
+        assert ([s.seq for s in reader.read().samples], reader.missed) == ([4], 0)
     assert (board.context.outputs.rings, board.context.outputs.without_ring) == ({DEVICE: str(board.path)}, set())
     board.path.unlink()
     descriptors = len(os.listdir("/proc/self/fd"))
@@ -409,9 +405,7 @@ def test_full_memory_delays_the_ring(
     assert not board.context.outputs.without_ring
 
 
-def test_paths_that_cannot_be_used_are_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_unusable_paths_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     publisher = make(Path("/proc"))
     publisher.add_device(DEVICE, 0)
     assert "check the permissions of /proc" in caplog.text

@@ -117,8 +117,7 @@ def test_a_file_that_cannot_be_replaced_affects_one_ring_only(shared: Path, kind
     plant(path, kind)
     with python_as(DAEMON_UID, DAEMON, str(shared)) as daemon:
         ask(daemon, "publish 7")
-        assert path.lstat().st_uid == HOSTILE_UID
-        assert (shared / "imud.other").stat().st_uid == DAEMON_UID
+        assert (path.lstat().st_uid, (shared / "imud.other").stat().st_uid) == (HOSTILE_UID, DAEMON_UID)
         path.rename(shared.parent / f"{shared.name}-away")
         ask(daemon, "tick 1000000000")
         ask(daemon, "publish 8")
@@ -225,8 +224,7 @@ def test_a_user_without_a_directory_is_told_before_the_start(
         for environment, expected in (({}, problem), ({"XDG_RUNTIME_DIR": str(own)}, "")):
             assert directory_problem(str(system), environment).endswith(expected)
             assert bool(directory_problem(str(system), environment)) == bool(expected)
-        assert directory_problem(str(own), {}) == ""
-        assert directory_problem(str(own / "none"), {}) == ""
+        assert (directory_problem(str(own), {}), directory_problem(str(own / "none"), {})) == ("", "")
         assert "create its parent, or set" in directory_problem(str(own / "none" / "shm"), {})
     assert directory_problem(str(system), {}) == ""  # root
     with unprivileged(), pytest.raises(ServerError, match="; or set XDG_RUNTIME_DIR"):

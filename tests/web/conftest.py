@@ -15,7 +15,6 @@ from tests.support.socket_rig import run
 from tests.web.browser import Page, browser, serving_web
 
 __all__ = ["cli"]
-
 PICTURES: Final = ROOT / "build/web"
 """Folder for the picture of a failed test."""
 

@@ -15,7 +15,6 @@ from tests.web.browser import MISSING, Page, log_in, open_page, serving_web
 from tests.web.turned import BIAS, turned_module
 
 pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.live]
-
 TOKEN = "correct-horse-battery-staple"
 COVERED = "return Number(document.querySelector('#calibration canvas').dataset.covered)"
 CALIBRATION_EVENTS = "return document.querySelectorAll('#event-list li[data-kind=calibration]').length"

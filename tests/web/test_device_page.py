@@ -22,7 +22,6 @@ from tests.test_daemon import cable
 from tests.web.browser import MISSING, PERIOD_MS, Page, Sender, open_page, sent_by, serving_web
 
 pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.live]
-
 Rows = NDArray[np.float64]
 PLOTTED = """return Object.fromEntries([...window.imud.view.plots].map(([member, plot]) =>
     [member, plot.data.map((values) => [...values])]))"""
@@ -113,8 +112,7 @@ def test_the_corners_of_the_block_are_round_and_it_hides_no_name(scripts: Page) 
         return calls"""
     )
     names = [name for name, _ in drawn]
-    assert {join for _, join in drawn} == {"round"}
-    assert names.count("face") == 6
+    assert ({join for _, join in drawn}, names.count("face")) == ({"round"}, 6)
     last = max(at for at, name in enumerate(names) if name == "face")
     assert {"N", "E", "S", "W", "x", "y", "z"} <= set(names[last:])
 

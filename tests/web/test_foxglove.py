@@ -27,9 +27,7 @@ from tests.support.daemon_process import LIMIT_S, wait_until
 from tests.support.socket_rig import NOW_NS, batch, daemon
 
 CONNECTIONS_MAX, HEAD_BYTES_MAX, WAITING_MAX = 32, 16_384, 64
-
 pytestmark = pytest.mark.live
-
 OFFSET_NS = 1_000_000_000_000
 
 
@@ -160,8 +158,7 @@ def test_diagnostics_come_and_are_stale_without_the_daemon(tmp_path: Path) -> No
     with relaying(tmp_path / "imud.sock", viewer):
         with daemon(tmp_path):
             said = viewer.wait_for("/diagnostics")
-            assert levels(said) == {"imud: imu0": 0, "imud: imu1": 0}
-            assert said.utc_ns == NOW_NS + OFFSET_NS
+            assert (levels(said), said.utc_ns) == ({"imud: imu0": 0, "imud: imu1": 0}, NOW_NS + OFFSET_NS)
         stale = viewer.wait_for("/diagnostics", lambda said: 0 not in levels(said).values())
         assert levels(stale) == {"imud: imu0": 3, "imud: imu1": 3}
         assert str(tmp_path) in stale.message["status"][0]["message"]

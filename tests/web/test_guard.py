@@ -8,7 +8,6 @@ from imud.model.errors import BadArgument
 from imud.web.guard import WebGuard, WebRights, host_name, is_loopback, read_token, safety_headers
 
 SESSION_S = 43_200
-
 TOKEN = "correct-horse-battery-staple"
 
 

@@ -19,7 +19,6 @@ from tests.support.metrics import device
 from tests.support.socket_rig import sample
 
 DEVICES_MAX, FRAMES_MAX, WAITING_MAX, WINDOW_MAX = 32, 100, 8, 100
-
 HELLO = Hello(1, "0.1.0", 2**62 + 1, ("read",))
 
 
@@ -117,8 +116,7 @@ async def test_a_message_is_encoded_once_for_all_browsers() -> None:
             text = await browser.mailbox.take()
             if '"samples"' in text:
                 texts.append(text)
-    assert len(texts) == 20
-    assert len({id(text) for text in texts}) == 1
+    assert (len(texts), len({id(text) for text in texts})) == (20, 1)
 
 
 async def test_overview_page_and_state() -> None:
@@ -147,11 +145,9 @@ async def test_overview_page_and_state() -> None:
     assert await heard(browser, "state") == []
     hub.spread(News("the connection is lost"))
     assert [one["problem"] for one in await heard(browser, "state")] == ["the connection is lost"]
-    late = opened(hub, look="overview")
-    assert (await heard(late, "state"))[0]["problem"] == "the connection is lost"
+    assert (await heard(opened(hub, look="overview"), "state"))[0]["problem"] == "the connection is lost"
     counted = msgspec.structs.replace(device("bow"), ledger={"bytes_in": 5, "bytes_pending": 5})
-    assert status_message("bow", counted, 0).lost == 0
-    assert row_of(counted, None, 0).lost == 0
+    assert (status_message("bow", counted, 0).lost, row_of(counted, None, 0).lost) == (0, 0)
 
 
 async def test_pages_get_new_events_and_the_samples_of_both_compared_devices() -> None:
@@ -264,8 +260,7 @@ def test_buckets_and_raw_values() -> None:
     assert bucket_of([good, bad, at(2, 3)]).quat_wxyz == (0.5, 0.5, 0.5, 0.5)
     raw = raw_of("bow", "accel_m_s2", [at(0, 1, 1.0), at(1, 2, nan), at(2, 5, 3.0)])
     assert raw is not None
-    assert (raw.seq, raw.t_s) == ((1, 5), (80000.0, 80000.002))
-    assert raw.axes == ((0.5, 0.5), (-0.5, -0.5), (1.0, 3.0))
+    assert (raw.seq, raw.t_s, raw.axes) == ((1, 5), (80000.0, 80000.002), ((0.5, 0.5), (-0.5, -0.5), (1.0, 3.0)))
     assert raw_of("bow", "mag_t", [at(0)]) is None
 
 

@@ -34,7 +34,6 @@ from tests.web.browser import (
 )
 
 pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.live]
-
 Site = tuple[RunningDaemon, str]
 TOKEN = "correct-horse-battery-staple"
 SECTIONS = ("time", "ledger", "settings", "calibration", "events", "about", "live")
@@ -87,7 +86,6 @@ PLOTTED = """const plot = window.imud.view.plots.get('accel_m_s2');
 
 
 DIRECTIONS = [(x, y, z) for x in (-0.9, 0.1, 0.5) for y in (-0.2, 0.3) for z in (-0.6, 0.4, 1.0)]
-
 TURNING = {
     "t_s": 5.0, "device": "bow", "event": "calibration", "message": "half of the directions",
     "detail": {"cells": "0000000000ff", "field_t": 48.5e-6, "residual": 0.025},
@@ -260,8 +258,7 @@ def test_settings_are_planned_only_with_the_token(page: Page, site: Site, tmp_pa
         cookies = page.driver.get_cookies()
         assert [(one["httpOnly"], one["sameSite"]) for one in cookies] == [(True, "Strict")]
         assert TOKEN not in page.driver.current_url
-        refused = [one for one in page.problems() if "401" not in one]
-        assert refused == []
+        assert [one for one in page.problems() if "401" not in one] == []
 
 
 def test_both_views_fit_a_telephone(phone: Page, site: Site) -> None:
@@ -303,8 +300,7 @@ def test_no_section_overflows_at_any_width_in_both_color_schemes(page: Page, sit
                 if page.js("return document.documentElement.scrollWidth > innerWidth"):
                     found.append((width, theme, address))
     page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-    assert found == []
-    assert page.problems() == []
+    assert (found, page.problems()) == ([], [])
 
 
 def test_each_control_has_a_name_and_each_text_has_contrast(page: Page, site: Site, tmp_path: Path) -> None:
@@ -373,8 +369,7 @@ def test_keys_the_filter_and_stored_events(page: Page, site: Site) -> None:
     page.js("location.hash = '#/wall'")
     page.until("return document.querySelector('.wall')")
     page.js(show, rows)
-    assert page.js("return document.querySelectorAll('.wall [data-device] h2').length") == 9
-    assert page.problems() == []
+    assert (page.js("return document.querySelectorAll('.wall [data-device] h2').length"), page.problems()) == (9, [])
 
 
 def test_two_devices_are_compared_with_their_delay(page: Page, tmp_path: Path) -> None:
@@ -388,7 +383,6 @@ def test_two_devices_are_compared_with_their_delay(page: Page, tmp_path: Path) -
         return upright(value)
 
     begun_s: dict[float, float] = {}
-
     (tmp_path / "other").mkdir()
     with cable(tmp_path) as one, cable(tmp_path / "other") as other:
         devices = {"bow": configured(one.name), "stern": configured(other.name)}

@@ -14,7 +14,6 @@ from tests.test_daemon import cable
 from tests.web.browser import MISSING, Page, Sender, choose, open_page, sent_by, serving_web, upright
 
 pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.live]
-
 WAVE_HZ = 20.0
 RATE_HZ = 200
 LOST = (7, 20, 21, 33)

@@ -27,7 +27,6 @@ from tests.support.files import ROOT
 from tests.support.metrics import FRAME, LINES, UTC, client, device, equipped, shown, views
 
 SAMPLES_PER_TURN = 64
-
 Key = tuple[str, frozenset[tuple[str, str]]]
 
 
@@ -42,8 +41,7 @@ def values(metrics: Sequence[Metric]) -> dict[Key, float]:
 
 
 def rendered(snapshot: Snapshot) -> dict[Key, float]:
-    body = Renderer(pause=lambda: None).render(snapshot, "").body.decode()
-    return values(list(parse_text(body)))
+    return values(list(parse_text(Renderer(pause=lambda: None).render(snapshot, "").body.decode())))
 
 
 def key(name: str, **labels: str) -> Key:
@@ -57,7 +55,6 @@ DEVICES = (
         expected_rate_hz=0.0, identity={},
     ),
 )  # fmt: skip
-
 LEDGER_LINES = {
     "bytes_in": ("imud_bytes_in_total", {}), "bytes_in_good_frames": ("imud_bytes_total", {"fate": "good_frames"}),
     "bytes_in_bad_frames": ("imud_bytes_total", {"fate": "bad_frames"}),
@@ -111,8 +108,7 @@ def test_values_states_and_identity() -> None:
     kinds = {"overrun": 7, "framing": 8, "parity": 9, "break": 10}
     for kind, count in kinds.items():
         assert shown[key("imud_kernel_errors_total", kind=kind, **front)] == count
-    assert shown[key("imud_heartbeat_age_seconds")] == 0.25
-    assert shown[key("imud_log_messages_dropped_total")] == 3
+    assert (shown[key("imud_heartbeat_age_seconds")], shown[key("imud_log_messages_dropped_total")]) == (0.25, 3)
     for name in ("imud_temperature_celsius", "imud_status_bits", "imud_sample_rate_expected_hertz"):
         assert key(name, device="front") in shown
         assert key(name, device="rear") not in shown
@@ -173,8 +169,7 @@ def test_every_part_is_shown_in_base_units() -> None:
     means = {"late_mean_ns", "trigger_late_mean_ns"}  # sum divided by count
     before = parts_of("bow", rendered(Snapshot((equipped("bow"),))))
     for part in ("polling", "serial_line", "lines", "utc"):
-        status = equipped("bow")
-        value = getattr(status, part)
+        value = getattr(equipped("bow"), part)
         for field in msgspec.structs.fields(value):
             if field.type is int and field.name not in means:
                 more = msgspec.structs.replace(value, **{field.name: getattr(value, field.name) + 1_000_000})
@@ -202,8 +197,7 @@ def test_missing_parts_and_settings_are_absent() -> None:
     assert (found["imud_utc_problem", ()], found["imud_line_problem", (("line", "sout"),)]) == (0, 0)
     assert ("imud_line_problem", (("line", "sin"),)) not in found
     for state, number in ((SettingsState.UNDECLARED, 0), (SettingsState.UNKNOWN, 2), (SettingsState.AGREE, 3)):
-        settings = SettingsStatus(state, OnDifference.REPORT)
-        shown = rendered(Snapshot((device("bow", declared=settings),)))
+        shown = rendered(Snapshot((device("bow", declared=SettingsStatus(state, OnDifference.REPORT)),)))
         names = "differ", "problem", "repairs_total"
         assert sum(key(f"imud_settings_{name}", device="bow") in shown for name in names) == number
 
@@ -215,8 +209,7 @@ def test_problems_of_lines_and_of_gravity_are_shown() -> None:
     assert problems == {"sout": 0, "sin": 1, "reset": 1}
     bad = msgspec.structs.replace(FRAME, problem="upside down")
     shown = rendered(Snapshot((device("good", 0, frame=FRAME), device("bad", 1, frame=bad), device("unknown", 2))))
-    assert shown[key("imud_frame_problem", device="good")] == 0
-    assert shown[key("imud_frame_problem", device="bad")] == 1
+    assert (shown[key("imud_frame_problem", device="good")], shown[key("imud_frame_problem", device="bad")]) == (0, 1)
     assert key("imud_frame_problem", device="unknown") not in shown
 
 

@@ -14,7 +14,6 @@ from imud.publishers.metrics.rings import MotionValues, RingReader, RingView, mo
 from tests.support.rings import DEVICE, SLOTS, START_NS, Board
 
 OVERTAKEN_SLOTS, SAMPLES_MAX = 8, 4096
-
 G = 9.81
 
 
@@ -74,8 +73,7 @@ def test_slow_motion_is_not_vibration_and_the_span_does_not_change_the_rms() -> 
 def test_missing_values_are_absent() -> None:
     assert motion_of(b"", 0) is None
     assert motion_of(slots([(0.0, 0.0, G)]), 1) is None  # older than the span
-    angles = motion(slot(1, 5, None, (0.1, 0.2, 0.3)))
-    assert angles == MotionValues(0, (0.1, 0.2, 0.3), None, None, None)
+    assert motion(slot(1, 5, None, (0.1, 0.2, 0.3))) == MotionValues(0, (0.1, 0.2, 0.3), None, None, None)
     few = motion(slots([(0.0, 0.0, G)] * 7, rate_hz=7))
     assert few.accel_norm_m_s2 == pytest.approx(G)
     assert few.vibration_rms_m_s2 is few.vibration_peak_m_s2 is None
@@ -162,8 +160,7 @@ def test_a_ring_is_written_if_its_file_exists_and_has_a_heartbeat(board: Board) 
     assert read(board, 30) == RingView(False)
     board.path.unlink()
     assert read(board, 30) == RingView(False)
-    reader = RingReader(lambda: None, motion=True)
-    assert reader.read({"bow": ""}, {}, START_NS) == {"bow": RingView(False)}
+    assert RingReader(lambda: None, motion=True).read({"bow": ""}, {}, START_NS) == {"bow": RingView(False)}
 
 
 def test_a_pause_follows_each_number_of_values_and_the_newest_4096_samples_are_read(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from imud.publishers.recorder.writer import RecordQueue
 from tests.publishers.recorder.recording_bench import RecordingBench
 
 FULL_NS = 20_000_000
-
 LINGER_NS = 10_000_000_000
 
 

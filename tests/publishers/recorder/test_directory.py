@@ -21,8 +21,7 @@ def filled(folder: Path, keep_bytes: int, *sizes: int) -> RecordingDirectory:
 def test_names_sort_by_time_and_are_recognized(tmp_path: Path) -> None:
     directory = filled(tmp_path, 1000, 10, 20)
     name = directory.new_file(1_763_717_507 * NS_PER_S, 0x1_0000_00AB, 12).name
-    assert name == "20251121T093147Z-000000ab-000012.imudrec"
-    assert [file.size for file in directory.files()] == [10, 20]
+    assert (name, [file.size for file in directory.files()]) == ("20251121T093147Z-000000ab-000012.imudrec", [10, 20])
     with patch("imud.publishers.recorder.directory.FILES_MAX", 1):
         assert len(directory.files()) == 1
     with pytest.raises(ValueError, match=f"another directory than {tmp_path}, got the same"):
@@ -42,8 +41,7 @@ def test_the_oldest_are_removed_until_there_is_room(tmp_path: Path) -> None:
     assert len(directory.make_room(10)) == 0
     (removed,) = directory.make_room(11)
     assert removed.endswith("-000000.imudrec")
-    assert [file.size for file in directory.files()] == [30, 20]
-    assert directory.removed == 1
+    assert ([file.size for file in directory.files()], directory.removed) == ([30, 20], 1)
     directory = filled(tmp_path / "measured", 100, 40, 30, 20)
     assert directory.kept_bytes == 0
     directory.measure()

@@ -107,8 +107,7 @@ def test_an_acceleration_above_the_limit_is_saved_with_the_data_before_and_after
     assert decode_object(found[-1], EndRecord).reason == "|a| of bow was 51.5 m/s²"
     kinds = [one.kind for one in found]
     assert kinds[:4] == [Kind.SESSION, Kind.CALL, Kind.DEVICE, Kind.DEVICE]
-    assert kinds[-3:] == [Kind.CHECK, Kind.CHECK, Kind.END]
-    assert kinds.count(Kind.SESSION) == 1
+    assert (kinds[-3:], kinds.count(Kind.SESSION)) == ([Kind.CHECK, Kind.CHECK, Kind.END], 1)
     (status,) = [source() for source in bench.context.outputs.flights]
     assert 60 <= status.kept_ns / NS_PER_S <= 79
     assert status.kept_bytes >= file.stat().st_size // 2
@@ -215,8 +214,7 @@ def test_a_client_receives_the_present_data(tmp_path: Path) -> None:
     with theirs, theirs.makefile("rb") as file:
         reader = RecordingReader(file, "")
         kinds = [one.kind for one in reader]
-    assert reader.problems == []
-    assert (kinds[0], kinds[-1]) == (Kind.SESSION, Kind.END)
+    assert (reader.problems, kinds[0], kinds[-1]) == ([], Kind.SESSION, Kind.END)
     assert kinds.count(Kind.DATA) >= 28
     pairs = [stream_pair() for _ in range(SENDS_MAX + 1)]
     for ours, _ in pairs[:-1]:
@@ -269,8 +267,7 @@ def test_a_directory_that_another_user_can_change(tmp_path: Path, untrusted: str
         bench.flight.close()
         killed.flight.close()
         return
-    assert sorted(folder.iterdir()) == left
-    assert bench.files == []
+    assert (sorted(folder.iterdir()), bench.files) == (left, [])
     assert bench.flight.status().kept_ns > 0
     (message,) = bench.messages
     assert message.startswith(f"flight recorder: {parent}")
@@ -353,7 +350,6 @@ def test_alerts_are_due_once_and_limited_per_hour() -> None:
 
 
 SEGMENTS_MAX = 64
-
 END = records.encode_object(Kind.END, NO_DEVICE, EndRecord(9, 9, "a blow"))
 
 
@@ -399,16 +395,14 @@ def test_a_snapshot_has_one_session_record_and_an_end_record() -> None:
         bench.add()
     found = read(bench.ring.reader(END))
     assert [one.kind for one in found] == [Kind.SESSION, Kind.DATA, Kind.DATA, Kind.DATA, Kind.END]
-    assert records.decode_object(found[0], SessionRecord).number == 0
-    assert devices(found) == [0, 1, 2]
+    assert (records.decode_object(found[0], SessionRecord).number, devices(found)) == (0, [0, 1, 2])
     bench.ring.clear()
     assert (bench.ring.bytes, bench.ring.oldest_ns) == (0, 0)
     bench = RingBench()
     for _ in range(5):
         bench.add()
     bench.add(drop_before_ns=3)  # segment 2 ends at 3, when segment 3 starts
-    assert devices(read(bench.ring.reader(END))) == [3, 4, 5]
-    assert bench.ring.oldest_ns == 3
+    assert (devices(read(bench.ring.reader(END))), bench.ring.oldest_ns) == ([3, 4, 5], 3)
     bench.ring.clear()
 
 
@@ -527,7 +521,6 @@ def test_a_full_file_system_drops_segments_and_then_fails(tmp_path: Path, monkey
 
 
 LINGER_NS = 10_000_000_000
-
 SESSION = records.encode_object(Kind.SESSION, NO_DEVICE, SessionRecord(1, "", "", "", 7, 0, 1, 1))
 
 
@@ -633,8 +626,7 @@ def test_a_client_always_reads_end_of_file(bench: FlightWriterBench, monkeypatch
     monkeypatch.setattr(bench.ring, "reader", lambda _ending: os.open("/none", os.O_RDONLY))
     bench.queue.mark(recorder_flight.Send(refused[0], END))
     bench.work()
-    assert refused[1].recv(1) == b""
-    assert bench.writer.sends_ended == 1
+    assert (refused[1].recv(1), bench.writer.sends_ended) == (b"", 1)
     bench.writer.close()
     while stopped[1].recv(1 << 20):
         pass
@@ -657,8 +649,7 @@ def test_a_full_disk_leaves_no_incomplete_snapshot(bench: FlightWriterBench, mon
     bench.queue.mark(recorder_flight.Save(bench.folder / "a", END))
     bench.work()
     assert [saved.problem for saved in bench.writer.saved] == ["No space left on device"]
-    assert list(bench.folder.glob("*.imudrec")) == []
-    assert bench.writer.problem == ""
+    assert (list(bench.folder.glob("*.imudrec")), bench.writer.problem) == ([], "")
     monkeypatch.undo()
     bench.queue.mark(recorder_flight.Save(bench.folder / "b", END))
     bench.work()
@@ -679,8 +670,7 @@ def test_after_a_failed_segment_nothing_is_saved_until_the_next(
     bench.put(1)
     bench.queue.mark(recorder_flight.Save(bench.folder / "b", END))
     bench.work()
-    assert bench.writer.problem == ""
-    assert kinds_in(bench.folder / "b") == [Kind.SESSION, Kind.DATA, Kind.END]
+    assert (bench.writer.problem, kinds_in(bench.folder / "b")) == ("", [Kind.SESSION, Kind.DATA, Kind.END])
     monkeypatch.setattr(os, "write", Mock(side_effect=OSError(errno.EIO, "Input/output error")))
     bench.put(2)
     bench.work()

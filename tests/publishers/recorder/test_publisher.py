@@ -46,8 +46,7 @@ def test_both_write_to_one_directory_and_one_alone_does_not_start_the_other(tmp_
     ends = [sorted(file.name.split("-", 2)[2] for file in each) for each in files]
     for file in tmp_path.rglob("*.imudrec"):
         kinds = [(record.kind, record.device) for record in records_in(file)]
-        assert [device for kind, device in kinds if kind == Kind.EVENT] == [7]
-        assert kinds.count((Kind.DEVICE, 0)) == 2
+        assert ([device for kind, device in kinds if kind == Kind.EVENT], kinds.count((Kind.DEVICE, 0))) == ([7], 2)
     assert ends == [["000000-snapshot.imudrec", "000000.imudrec"], ["000000-snapshot.imudrec"]]
 
 
@@ -127,8 +126,7 @@ def test_a_new_file_starts_by_size_or_time_with_all_states(tmp_path: Path) -> No
     assert len(list(bench.folder.glob("*.imudrec"))) == 4
     for number in range(3):
         found = bench.kinds(number)
-        assert [found[0], found[-1]] == [Kind.SESSION, Kind.END]
-        assert found.count(Kind.DEVICE) == 2
+        assert ([found[0], found[-1]], found.count(Kind.DEVICE)) == ([Kind.SESSION, Kind.END], 2)
     sessions = [records.decode_object(bench.read(n)[0], records.SessionRecord) for n in range(3)]
     assert [one.number for one in sessions] == [0, 1, 2]
 
@@ -158,8 +156,7 @@ def test_a_file_contains_the_losses_and_then_the_states(tmp_path: Path, monkeypa
     for _ in range(100):
         bench.source.deliver()
     bench.tick(work=False)
-    dropped = bench.recorder.status().records_dropped
-    assert dropped > 50
+    assert bench.recorder.status().records_dropped > 50
     bench.tick()
     assert bench.events == []
     bench.tick()

@@ -62,8 +62,7 @@ def test_a_user_gets_its_share_and_users_leave_places_for_root() -> None:
     outcomes = [house.connect(1000 + number) for number in range(70)]
     assert outcomes.count("") == 48  # 64 minus 16 reserved places
     assert all("reserved" in words for words in outcomes[48:])
-    assert house.connect(0, ALL) == ""
-    assert house.connect(OWN_UID) == ""
+    assert (house.connect(0, ALL), house.connect(OWN_UID)) == ("", "")
     assert [house.connect(2000, ALL) for _ in range(14)].count("") == 3
     assert [house.connect(2001, ALL) for _ in range(14)].count("") == 3
 
@@ -78,16 +77,13 @@ def test_root_and_members_connect_when_others_take_all_places() -> None:
     assert len(house.clients) == 256  # the limit of all clients
     assert "socket.clients_max" in house.connect(0, ALL)
     house = House(clients=256, per_user=128)
-    assert house.fill((OWN_UID,)) == 243
-    assert house.connect(2000, ALL) == ""
+    assert (house.fill((OWN_UID,)), house.connect(2000, ALL)) == (243, "")
     assert house.connect(0, ALL) == ""
     # without reserved places, 128 + 112 clients of two readers and 16 of one member would be all 256
     house = House(clients=256, per_user=128)
-    assert house.fill((1000, 1001)) == 240
-    assert house.fill((2000,), ALL) == 3
+    assert (house.fill((1000, 1001)), house.fill((2000,), ALL)) == (240, 3)
     assert "uid 2000 has 3 of the reserved places" in house.connect(2000, ALL)
-    assert house.connect(2001, ALL) == ""
-    assert [house.connect(0, ALL) for _ in range(4)] == [""] * 4
+    assert (house.connect(2001, ALL), [house.connect(0, ALL) for _ in range(4)]) == ("", [""] * 4)
 
 
 def test_free_places_do_not_give_a_member_more_reserved_places() -> None:
@@ -115,8 +111,7 @@ def test_reserved_places_with_many_clients_and_in_a_small_house() -> None:
     house.fill((1000, 1001))
     assert house.connect(2000, ALL) == ""
     house = House(clients=256, per_user=128)
-    assert [house.connect(0, ALL) for _ in range(4)] == [""] * 4
-    assert house.fill((1000, 1001)) == 240
+    assert ([house.connect(0, ALL) for _ in range(4)], house.fill((1000, 1001))) == ([""] * 4, 240)
     house = House(clients=256, per_user=128)
     assert [house.connect(0, ALL) for _ in range(20)] == [""] * 20
     assert house.fill((1000, 1001)) == 224  # the other 16 clients of root have open places
@@ -124,8 +119,7 @@ def test_reserved_places_with_many_clients_and_in_a_small_house() -> None:
     house = House(clients=3)
     assert [house.connect(1000) for _ in range(4)].count("") == 3
     house = House(clients=4)
-    assert [house.connect(1000) for _ in range(4)].count("") == 3
-    assert house.connect(0, ALL) == ""
+    assert ([house.connect(1000) for _ in range(4)].count(""), house.connect(0, ALL)) == (3, "")
     house = House(clients=8)
     assert [house.connect(1000) for _ in range(8)].count("") == 6
     assert [house.connect(2000, ALL), house.connect(0, ALL)] == ["", ""]

@@ -92,8 +92,7 @@ async def test_many_clients_are_woken_in_several_turns(tmp_path: Path) -> None:
             for _ in expected:
                 await asyncio.sleep(0)
                 woken.append([fd for fd in fds if read_all(fd) == BYTE])
-            assert [len(turn) for turn in woken] == expected
-            assert {*woken[0], *woken[1]} == {*fds}
+            assert ([len(turn) for turn in woken], {*woken[0], *woken[1]}) == (expected, {*fds})
         for fd in fds:
             os.close(fd)
 
@@ -157,8 +156,7 @@ async def test_unread_replies_do_not_gather_descriptors(server: SocketServer) ->
     replies = (await peer.messages(7))[1:]
     assert ["error" in reply for reply in replies] == [False, True, True, True, True, False]
     assert "ask again" in replies[1]["error"]["message"]
-    assert replies[1]["error"]["code"] == -32004
-    assert len(os.listdir("/proc/self/fd")) == before + 2
+    assert (replies[1]["error"]["code"], len(os.listdir("/proc/self/fd"))) == (-32004, before + 2)
     os.close(await notified(peer))
     connection.post(encode_notification("big", "x" * 500_000))
     assert not connection.tick()

@@ -54,9 +54,7 @@ async def test_late_replies_and_the_error_of_a_removed_command(server: SocketSer
     ],
 )
 @in_server()
-async def test_a_failed_command_gives_a_reason(
-    server: SocketServer, name: str, arguments: dict[str, Any], words: str
-) -> None:
+async def test_a_failure_has_a_reason(server: SocketServer, name: str, arguments: dict[str, Any], words: str) -> None:
     peer = await Peer.greeted(server)
     await peer.send(request(1, name, **arguments))
     error = (await peer.message())["error"]
@@ -75,8 +73,7 @@ async def test_reading_is_not_enough(server: SocketServer, monkeypatch: pytest.M
     assert message.startswith("command: expected root or a member of group 'imud-test-control', which does not")
     assert "make it with `sudo groupadd --system imud-test-control`" in message
     # readers may read the last known settings; all other requests need the right to control
-    found = await peer.result("settings.get", device="imu0")
-    assert found["settings"][0]["actual"] == "6-axis"
+    assert (await peer.result("settings.get", device="imu0"))["settings"][0]["actual"] == "6-axis"
     for method, more in (("settings.get", {"fresh": True}), ("settings.plan", {}), ("settings.apply", {})):
         code, message = await peer.error(method, device="imu0", **more)
         assert code == -32001

@@ -23,7 +23,6 @@ from tests.publishers.recorder.recording_bench import HandSource
 from tests.support.socket_rig import NOW_NS, Peer, alone, in_context, in_server, serving, until
 
 RECORDINGS_MAX = 4
-
 Recorded = tuple[SocketServer, HandSource]
 
 
@@ -69,7 +68,6 @@ async def recording_of(server: SocketServer, peer: RecordingPeer) -> list[Record
     """Return the records from the descriptor, to end of file. They must be complete."""
     fd = peer.fds.pop()
     os.set_blocking(fd, False)
-
     chunks: list[bytes] = []
 
     def is_read() -> bool:
@@ -120,8 +118,7 @@ async def test_a_recording_comes_through_the_descriptor_to_its_regular_end(recor
     assert kinds.count(Kind.EVENT) == 2
     assert kinds.count(Kind.DEVICE) == 2  # described again when the device was added again
     assert {record.device for record in found if record.kind in (Kind.DEVICE, Kind.CHECK, Kind.EVENT)} == {1}
-    assert decode_object(found[-1], EndRecord).reason == "it was stopped"
-    assert source.listening == []
+    assert (decode_object(found[-1], EndRecord).reason, source.listening) == ("it was stopped", [])
     await tick_until(server, lambda: open_descriptors() == before)
     assert await peer.result("record.start") == {"devices": None}
 
@@ -208,7 +205,6 @@ async def test_a_failed_request_leaves_no_fd(tmp_path: Path, monkeypatch: pytest
             raise RpcError(Code.UNAVAILABLE, "none to spare")
 
     monkeypatch.setattr(Quota, "check_fds", check_fds)
-
     async with serving(tmp_path) as server:
         peer = await Peer.greeted(server)
         if method == "record.snapshot":
@@ -242,5 +238,4 @@ async def test_a_snapshot_contains_the_data_of_the_flight_recorder(server: Socke
     peer = await RecordingPeer.greeted(server)
     server.hub.context.outputs.snapshots.append(take)
     assert await peer.result("record.snapshot") == {"seconds": 299.5}
-    assert os.read(peer.fds[0], 100) == b"a snapshot"
-    assert os.read(peer.fds[0], 100) == b""
+    assert (os.read(peer.fds[0], 100), os.read(peer.fds[0], 100)) == (b"a snapshot", b"")

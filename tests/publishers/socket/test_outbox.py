@@ -59,8 +59,7 @@ def assert_accounted(seen: list[tuple[str, int, dict[str, int]]], devices: tuple
         assert seq > newest[device]
         newest[device] = seq
     for device in devices:
-        came = sum(name == device for name, _, _ in seen)
-        assert came + dropped[device] == newest[device]
+        assert sum(name == device for name, _, _ in seen) + dropped[device] == newest[device]
     return dropped
 
 
@@ -83,8 +82,7 @@ async def test_a_client_that_does_not_read_loses_its_oldest_samples(server: Sock
     assert first.dropped > total  # of 2 × total samples
     assert (second.dropped, second.sent, second.queue_samples) == (0, 2 * total, 0)
     seen = await read_samples(slow, {"imu0": total, "imu1": total})
-    dropped = assert_accounted(seen, ("imu0", "imu1"))
-    assert sum(dropped.values()) == first.dropped
+    assert sum(assert_accounted(seen, ("imu0", "imu1")).values()) == first.dropped
     assert sum(bool(reported) for _, _, reported in seen) == 1  # one report of all drops
     server.publish(batch("imu0", total + 1))  # the queue is empty, so this sample is sent directly
     assert [await read_one(peer) for peer in (slow, fast)] == [("imu0", total + 1)] * 2
@@ -359,8 +357,7 @@ def test_messages_stay_whole_wherever_a_send_is_cut(seed: int) -> None:
             else:
                 dropped = params.get("dropped", 0)
                 seen.append((params["device"], params["seq"], {"imu0": dropped} if dropped else {}))
-        assert others == 10
-        assert assert_accounted(seen, ("imu0",)) == {"imu0": outbox.dropped}
+        assert (others, assert_accounted(seen, ("imu0",))) == (10, {"imu0": outbox.dropped})
         assert outbox.sent == len(seen)
         outbox.discard()
         ours.close()

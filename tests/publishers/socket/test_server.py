@@ -25,7 +25,6 @@ from tests.support import socket_rig
 from tests.support.socket_rig import Peer, alone, batch, in_server, sample, serving, until
 
 CHECK_NS, PATH_MAX_BYTES, SOCKET_MODE = 950_000_000, 99, 0o660
-
 FORMS_PER_USER = 16
 
 
@@ -163,8 +162,7 @@ async def test_events_go_to_the_clients_that_requested_them(server: SocketServer
     assert [(await one.message())["params"]["device"] for _ in range(2)] == ["imu1", ""]
     await everything.result("events", enable=False)
     server.event(Event(6, "imu0", EventKind.UP, "back"))
-    assert len(await everything.result("devices")) == 2
-    assert len(await none.result("devices")) == 2
+    assert (len(await everything.result("devices")), len(await none.result("devices"))) == (2, 2)
 
 
 @in_server()
@@ -298,8 +296,7 @@ async def test_accepting_takes_a_limited_part_of_a_turn(tmp_path: Path, step_ns:
 async def test_a_client_that_left_before_accept(server: SocketServer, monkeypatch: pytest.MonkeyPatch) -> None:
     gone = Mock(side_effect=OSError(107, "Transport endpoint is not connected"))
     monkeypatch.setattr("imud.publishers.socket.server.peer_of", gone)
-    peer = await Peer.connect(server)
-    assert await peer.ended()
+    assert await (await Peer.connect(server)).ended()
     status = server.hub.status()
     assert (status.accepted, status.refused, status.failed) == (0, 0, 0)
 
@@ -321,8 +318,7 @@ async def test_an_error_while_a_client_is_greeted_ends_only_this_client(
         if place == "Greeting":
             assert (await bad.message())["error"]["code"] == -32603
         assert await bad.ended()
-    assert server.hub.status().failed == 1
-    assert len(server.hub.connections) == 1
+    assert (server.hub.status().failed, len(server.hub.connections)) == (1, 1)
     other = await Peer.greeted(server)
     for peer in (good, other):
         assert len(await peer.result("devices")) == 2
@@ -459,8 +455,7 @@ async def test_a_removed_socket_file_is_created_again(
         server.tick(CHECK_NS)
     assert path.stat().st_mode & 0o777 == 0o660
     assert await peer.result("unwatch") == {}
-    second = await Peer.greeted(server)
-    assert await second.result("unwatch") == {}
+    assert await (await Peer.greeted(server)).result("unwatch") == {}
     assert len(server.hub.connections) == 3
     assert sum("created it again" in one.getMessage() for one in caplog.records) == 1
     unaccepted.close()
@@ -609,9 +604,7 @@ def test_an_existing_socket_that_cannot_be_checked_stays(
     assert path.is_socket()
 
 
-def test_missing_permissions_are_warnings(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_missing_rights_warn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     denied = Mock(side_effect=PermissionError(errno.EPERM, "Operation not permitted"))
     monkeypatch.setattr("imud.publishers.socket.server.os.chown", denied)
     monkeypatch.setattr("imud.publishers.socket.server.os.setxattr", denied)
