@@ -60,6 +60,7 @@ class RecordingDirectory:
         self._keep_bytes = keep_bytes
         self._lock = Lock()
         self._run = ""  # run of this daemon
+        self._is_noted = True  # whether RUNS_FILE contains this run
         self._runs: dict[str, int] = {}  # known runs, with their places in the order
         self._made: dict[str, int] = {}  # files of this daemon, with their places in the order
         self._next_place = count(1)
@@ -91,6 +92,12 @@ class RecordingDirectory:
             self._run, files = _run_of(epoch), self.files()
             self._note_run(files)
         return max((file.number + 1 for file in files if (file.run, file.kind) == (self._run, kind)), default=0)
+
+    def note_run(self) -> None:
+        """Add the run of this daemon to RUNS_FILE if the last attempt failed."""
+        if not self._is_noted:
+            with self._lock, suppress(OSError):
+                self._note_run(self.files())
 
     def measure(self) -> None:
         """Measure the size of the files. Raises OSError."""
@@ -173,11 +180,13 @@ class RecordingDirectory:
             known = RUN.findall(read_regular(path, RUNS_BYTES).decode("ascii", "replace"))
         except OSError:
             known = []
-        if self._run not in known:
+        self._is_noted = self._run in known
+        if not self._is_noted:
             present = {file.run for file in files}
             known = [*(run for run in known if run in present), self._run]
             with suppress(OSError):  # a full disk: the next call tries again
                 replace_file(path, "".join(f"{run}\n" for run in known).encode())
+                self._is_noted = True
         self._runs = {run: place for place, run in enumerate(known)}
 
 

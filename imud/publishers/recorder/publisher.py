@@ -92,8 +92,12 @@ class Recorder:
         if lost := self._feed.note_losses(now_ns):
             self._raise(now_ns, f"the disk is too slow: {lost} records were dropped")
         is_full = writer.file_bytes >= self._file_bytes or now_ns - self._begun_ns >= self._file_ns
-        if self._feed.check_if_due(now_ns) and is_full:
-            self._next_file(now_ns)
+        if self._feed.check_if_due(now_ns):
+            if is_full:
+                self._next_file(now_ns)
+            elif now_ns >= self._due_ns:  # the disk can have been full at the start
+                self._due_ns = now_ns + RETRY_NS
+                self._directory.note_run()
 
     def close(self) -> None:
         """End the file with its end record. A second call does nothing."""

@@ -173,14 +173,15 @@ def test_a_file_contains_the_losses_and_then_the_states(tmp_path: Path, monkeypa
 
 
 def test_a_full_disk_causes_one_event_and_recording_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench = RecorderBench(tmp_path)
+    with patch("imud.publishers.recorder.directory.replace_file", side_effect=OSError):
+        bench = RecorderBench(tmp_path)
     bench.tick()
+    assert (bench.folder / ".runs").exists()  # imud notes its run before the next file
     write = os.write
     monkeypatch.setattr(os, "write", lambda descriptor, data: write(descriptor, data[:10]))
     bench.source.deliver()
-    bench.tick()
-    bench.tick()
-    bench.tick()
+    for _ in range(3):
+        bench.tick()
     (event,) = bench.events
     assert "No space left on device; the other outputs continue" in event.message
     assert bench.source.listening == []
