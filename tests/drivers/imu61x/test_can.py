@@ -49,11 +49,12 @@ def indices(events: list[CodecEvent]) -> list[int | None]:
 
 @pytest.mark.parametrize(
     ("pairs", "is_found"),
-    [([(n, 5000 + n) for n in range(40)], True), ([(n, n) for n in range(40)], True),  # same power switch
+    [([(65530 + n, 5000 + n) for n in range(17)], True), ([(n, n) for n in range(40)], True),  # same power switch
      ([(n, n + 1) for n in range(40)], True), ([(2 * n, 2 * n + 1, 500 + n) for n in range(40)], True),  # half the rate
-     ([(n, 300 + n, 600 + n) for n in range(40)], True), ([(n, n, n) for n in range(40)], True),
+     ([(65400 + n, n, 600 + n) for n in range(40)], True), ([(n, n, n) for n in range(40)], True),
      ([(n, 300 + n, 600 + n, 900 + n)[: 3 + (n % 7 > 0)] for n in range(40)], True),  # the fourth loses samples
-     ([(n + n // 5,) for n in range(90)], False),
+     ([(n, 5000 + n)[: 33 - 2 * n] for n in range(17)], False), ([(n + n // 5,) for n in range(90)], False),
+     ([(16 * n, 5000 + n) for n in range(40)], True), ([(17 * n, 5000 + n) for n in range(40)], False),
      ([(7, 7)] * 40, False), ([(n * n,) for n in range(90)], False), ([(n,) for n in range(90)], False)],
 )  # fmt: skip
 def test_two_devices_with_one_base_id_are_found(pairs: list[tuple[int, ...]], *, is_found: bool) -> None:
@@ -61,11 +62,11 @@ def test_two_devices_with_one_base_id_are_found(pairs: list[tuple[int, ...]], *,
     for pair in pairs:
         for device, index in enumerate(pair):
             feed(codec, sample(index, 0.5 * device + index / 1000))
-    assert bool(codec.problem) is is_found
-    newest = pairs[-1][0] + 1
-    for index in range(newest, newest + 300):  # one device was removed
+    newest, found = pairs[-1][0] + 1, [codec.problem]
+    for index in range(newest, newest + 257):  # one device was removed
         feed(codec, sample(index))
-    assert not codec.problem
+        found.append(codec.problem)
+    assert ([bool(one) for one in found[:256]], found[-1]) == ([is_found] * 256, "")
 
 
 @pytest.mark.manual(
@@ -91,13 +92,18 @@ def test_golden_set_in_si_units_and_back_with_the_temperature_in_hundredths() ->
     codec = make()
     for can_id, data in GOLDEN:
         assert not codec.feed_frame(can_id, True, data, 0)
-    assert codec.ledger.bytes_skipped == 40
+    assert (codec.ledger.bytes_skipped, codec.unknown) == (40, {})
     codec = make()
-    found = [indices(feed(codec, sample(index))) for index in (65534, 65535, 65536, 65537)]
-    assert found == [[65534], [65535], [0], [1]]
+    found = [indices(feed(codec, [sample(index)[n] for n in (2, 0, 3, 1, 4)])) for index in range(65534, 65538)]
+    assert found == [[], [65535], [0], [1]]  # the order counts only without the previous INDEX
 
     moved = [(can_id - 101 + 600, data) for can_id, data in GOLDEN]
-    assert (indices(feed(make(600), moved)), feed(make(600), GOLDEN)) == ([65535], [])
+    codec = make(600)
+    assert (indices(feed(codec, moved)), feed(codec, GOLDEN)) == ([65535], [])
+    assert codec.unknown == dict.fromkeys(range(101, 106), 1)
+    nodes = [DRIVER.node_of(can_id, False, bytes(8)) for can_id in range(100, 107)]
+    assert nodes == [None, *[Imu61xCanOptions().base_id] * 5, None] == [None, *[101] * 5, None]
+    assert (DRIVER.node_of(101, True, bytes(8)), DRIVER.node_of(101, False, bytes(7))) == (None, None)
     wanted = DRIVER.filters(Imu61xCanOptions(base_id=600))
     assert [f.can_id for f in wanted] == [600, 601, 602, 603, 604]
     assert not any(f.matches(605, False) or f.matches(600, True) for f in wanted)
@@ -178,9 +184,13 @@ def test_time_separates_complete_and_mixed_sets() -> None:
     """At 100 Hz, on a nearly full bus, before the period is known, after a pause and at another rate."""
     codec = learned()
     assert [timed(codec, index) for index in (17, 18, 400, 401)] == [[17], [18], [400], [401]]
-    # the last frame is 4.9 ms late: 5.9 ms is less than 1 ms + half of 10 ms
-    assert timed(codec, 410, "1234") + timed(codec, 410, "5", late_ns=4_900_000) == [410]
-    assert timed(codec, 420, "1234") + timed(codec, 420, "5", late_ns=5_100_000) == []
+    # the last frame is 5 ms late: 6 ms is 1 ms + half of 10 ms
+    assert timed(codec, 410, "1234") + timed(codec, 410, "5", late_ns=5_000_000) == [410]
+    assert timed(codec, 420, "1234") + timed(codec, 420, "5", late_ns=5_000_001) == []
+    codec = learned()
+    timed(codec, 10, late_ns=10**9)  # counts as a period of 20 ms, which increases the mean by 10 ms / 16
+    assert timed(codec, 112, "1234") + timed(codec, 112, "5", late_ns=5_312_500) == [112]
+    assert timed(codec, 114, "1234") + timed(codec, 114, "5", late_ns=5_312_501) == []
 
     period_ns = 1_250_000
     codec = learned(period_ns)
@@ -227,8 +237,9 @@ def test_wrong_length_is_a_bad_frame() -> None:
     assert measured.gyro_rad_s is not None
     assert (codec.ledger.frames_not_finite, codec.ledger.frames_in_samples) == (2, 5)
     for place in range(9):
-        values = [1.0] * place + [math.inf] + [1.0] * (8 - place)
-        data = struct.pack("<9fhH", *values, 2500, 1)
+        values = [360.0] * 3 + [3999.0] * 3 + [39.0] * 3
+        values[place] = math.inf
+        data = struct.pack("<9fhH", *values, 10000, 1)
         bad, measured = feed(make(), [(101 + slot, data[8 * slot : 8 * slot + 8]) for slot in range(5)])
         assert isinstance(bad, BadFrame)
         assert bad.raw == data[place // 2 * 8 :][:8]
