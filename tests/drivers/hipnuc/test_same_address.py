@@ -5,8 +5,11 @@ from random import Random
 
 import pytest
 
+from imud.contracts.driver import CanDriver, of_kind
+from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.assembly import Assembly
 from imud.drivers.hipnuc.same_address import SameAddress
+from imud.formats.can import CanFrame
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 
@@ -50,8 +53,7 @@ def feed(
         ([(5, 0), (5, 0.75)], "2 series with the periods 5.0 ms, 5.0 ms;"),
         ([(10, 0), (10, 3.5)], "2 series with the periods 10.0 ms, 10.0 ms;"),
         ([(10, 0), (10, 2), (10, 5.5)], "3 series with the periods 10.0 ms, 10.0 ms, 10.0 ms;"),
-        ([(10, 0), (10, 1.3), (10, 2.6)], "3 series with"),
-        ([(10, 0), (10, 1.5), (10, 4), (10, 6.2)], "4 series with"),
+        ([(10, 0), (10, 1.3), (10, 2.6)], "3 series with"), ([(10, 0), (10, 1.5), (10, 4), (10, 6.2)], "4 series with"),
         ([(20, 0), (20, 1), (20, 2.1), (20, 3.4)], "4 series with"),
         ([(10, 0), (20, 3)], "2 series with the periods 10.0 ms, 20.0 ms;"),
         ([(10, 0), (33.3, 3)], "2 series with the periods 10.0 ms, 33.3 ms;"),
@@ -86,6 +88,17 @@ def test_devices_with_one_address_are_reported_until_one_remains(
 )  # fmt: skip
 def test_one_device_is_not_a_conflict(late: Callable[[int, Random], float], loss: float, kinds: int) -> None:
     assert not any(feed(Assembly(Ledger()), [(10, 0)], end=6000, late=late, loss=loss, kinds=kinds))
+
+
+@pytest.mark.parametrize("driver", [one for one in of_kind(DRIVERS.values(), CanDriver) if "hipnuc" in one.name])
+def test_every_codec_reports_the_conflict(driver: CanDriver) -> None:
+    codec, frames = driver.make_codec(Ledger(), driver.settings()), list[CanFrame]()
+    for t_ms in (*range(0, 3000, 10), *range(3, 3000, 10)):
+        burst = driver.example_frames(Random(t_ms))
+        frames += (one._replace(t_rx_ns=t_ms * MS + place * 240_000) for place, one in enumerate(burst))
+    for frame in sorted(frames, key=lambda frame: frame.t_rx_ns):
+        codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns)
+    assert "frames arrive in 2 series with the periods 10.0 ms, 10.0 ms;" in codec.problem
 
 
 @pytest.mark.parametrize("devices", [1, 2, 3, 4])

@@ -269,6 +269,7 @@ def test_which_frames_count_and_options_that_mean_nothing() -> None:
     for can_id, extended in skipped:
         assert not codec.feed_frame(can_id, extended, bytes(8), 0)
     assert (codec.ledger.bytes_skipped, codec.ledger.frames_bad_length) == (8 * len(skipped), 1)
+    assert codec.unknown == {0xFF35: 1, 0x1FF34: 1}
     assert codec.ledger.closes()
     reply = bytes.fromhex("3701060064000000")
     for options, destinations in (({}, [0x55]), ({"host_address": 0x20}, [0x55, 0x20])):

@@ -46,8 +46,7 @@ def short(**options: object) -> HipnucModbusCodec:
 
 
 def block(
-    *,
-    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0), per_lsb: float = QUAT_PER_LSB,
+    *, quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0), per_lsb: float = QUAT_PER_LSB,
     incli: tuple[int, int] = (0, 0), pitch_deg: float = 0.0, uptime_ms: int = 5,
     mag_t: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> bytes:  # fmt: skip

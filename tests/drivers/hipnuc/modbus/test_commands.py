@@ -419,10 +419,9 @@ def test_requests_to_all_and_invalid_requests() -> None:
         (lambda: registers.set_id_by_serial("047D955F8D2A1708", 0), "1 … 247"),
         (lambda: registers.set_id_by_serial("047D955F8D2A1708", 248), "1 … 247"),
         (lambda: registers.randomise_ids(9, 9), "below the highest"),
-        (lambda: registers.randomise_ids(0, 9), "1 … 247"),
-        (lambda: registers.randomise_ids(True, 9), "1 … 247"), (lambda: next(commands.set_id(129)), "1 … 128"),
-        (lambda: next(commands.set_id(0)), "1 … 128"), (lambda: registers.read_registers(0, 126), "1 … 125"),
-        (lambda: registers.read_registers(0xFFFF, 2), "0xFFFF"),
+        (lambda: registers.randomise_ids(0, 9), "1 … 247"), (lambda: registers.randomise_ids(True, 9), "1 … 247"),
+        (lambda: next(commands.set_id(129)), "1 … 128"), (lambda: next(commands.set_id(0)), "1 … 128"),
+        (lambda: registers.read_registers(0, 126), "1 … 125"), (lambda: registers.read_registers(0xFFFF, 2), "0xFFFF"),
         (lambda: registers.write_register(0, 0x10000), "0xFFFF"),
     ):  # fmt: skip
         assert callable(begin)
