@@ -141,7 +141,7 @@ class PythonCanLink:
                 frames = _batch(bus)
                 if frames:
                     loop.call_soon_threadsafe(deliver, frames)
-        except (can.CanError, OSError) as error:
+        except Exception as error:  # noqa: BLE001 - a backend raises any error, for example slcan for a damaged line
             loop.call_soon_threadsafe(end, LinkError(f"{self.title} ended: {reason_of(error)}"))
 
 

@@ -124,10 +124,10 @@ async def test_only_data_frames_are_delivered_and_nothing_after_close(monkeypatc
 
 
 @in_loop
-@pytest.mark.parametrize("closed", [False, True])
-async def test_a_failed_bus_ends_an_open_link(monkeypatch: pytest.MonkeyPatch, closed: bool) -> None:
+@pytest.mark.parametrize(("closed", "kind"), [(False, can.CanOperationError), (True, OSError), (False, ValueError)])
+async def test_a_failed_bus_ends_a_link(monkeypatch: pytest.MonkeyPatch, closed: bool, kind: type[Exception]) -> None:
     bus, ends = FakeBus(), list[str]()
-    monkeypatch.setattr(bus, "recv", Mock(side_effect=can.CanOperationError("gone")))
+    monkeypatch.setattr(bus, "recv", Mock(side_effect=kind("gone")))
     monkeypatch.setattr(can, "Bus", lambda *_, **__: bus)
     link = make("fake")
     assert isinstance(link, PythonCanLink)
