@@ -97,8 +97,7 @@ async def test_after_a_binary_watch_everything_is_framed_for_good(server: Socket
     assert len(await peer.result("devices")) == 2
     await peer.result("watch", encoding="json", fields=["sync"])
     server.publish(batch())
-    assert (await peer.message())["params"]["sync"] == "regression"
-    assert (await peer.error("nonsense"))[0] == -32601
+    assert ((await peer.message())["params"]["sync"], (await peer.error("nonsense"))[0]) == ("regression", -32601)
     lines, frames = await Peer.greeted(server), await Peer.greeted(server)
     await frames.result("watch", encoding="binary")
     frames.framed = True
@@ -106,8 +105,7 @@ async def test_after_a_binary_watch_everything_is_framed_for_good(server: Socket
         await peer.result("watch")
     server.publish(batch("imu0", 1, 2))
     for seq in (1, 2):
-        assert (await lines.message())["params"]["seq"] == seq
-        assert (await frames.message())["params"]["seq"] == seq
+        assert ((await lines.message())["params"]["seq"], (await frames.message())["params"]["seq"]) == (seq, seq)
 
 
 def test_framed_json_is_never_as_long_as_slots() -> None:
