@@ -314,16 +314,14 @@ async def test_a_calibrated_device_only_needs_the_turns(rig: GuideRig) -> None:
     ("prepare", "words"),
     [
         (lambda _rig: None, "its samples contain no magnetic field"),
-        (
-            lambda rig: setattr(rig, "mag_t", lambda _t_s: (3e-5, 0.0, 0.0)),
-            "turned to 2% of the directions, expected 60%",
-        ),
+        (lambda rig: setattr(rig, "mag_t", lambda _t_s: (3e-5, 0.0, 0.0)),
+         "turned to 2% of the directions, expected 60%"),
         (lambda rig: setattr(rig, "mag_t", lambda t_s: tumble().at(t_s).mag_t), "turned by less than 360°"),
         (turned_by_hand, "the field is good: repeat the calibration more slowly"),
         (turned_where_it_is_disturbed, "the field is disturbed: go outdoors"),
     ],
     ids=["no field", "at rest", "gyroscope at rest", "not accepted", "disturbed"],
-)
+)  # fmt: skip
 @pytest.mark.manual("B 8.1.1 procedure", "B 8.1.2 disturbance")
 @played(GuideRig)
 async def test_advice(rig: GuideRig, prepare: Callable[[GuideRig], object], words: str) -> None:
@@ -447,16 +445,12 @@ def window(*samples: Sample) -> RestWindow:
         ([sample(accel=None, gyro=None)], ""),
         ([sample(), sample(gyro=(radians(4), 0, 0))], "the angular rate changes by 2 °/s (at most 1 °/s at rest)"),
         ([sample(gyro=(0, radians(6), 0))], "it turns at 6 °/s (at most 5 °/s at rest)"),
-        (
-            [sample(), sample(accel=(2.0, 0.0, 9.80665))],
-            "the acceleration changes by 1 m/s² (at most 0.5 m/s² at rest)",
-        ),
-        (
-            [sample(accel=(0.0, 0.0, 10.80665))],
-            "the acceleration differs from gravity by 1 m/s² (at most 0.49 m/s² at rest)",
-        ),
+        ([sample(), sample(accel=(2.0, 0.0, 9.80665))],
+         "the acceleration changes by 1 m/s² (at most 0.5 m/s² at rest)"),
+        ([sample(accel=(0.0, 0.0, 10.80665))],
+         "the acceleration differs from gravity by 1 m/s² (at most 0.49 m/s² at rest)"),
     ],
-)
+)  # fmt: skip
 def test_rest_and_motion(samples: list[Sample], words: str) -> None:
     assert window(*samples).motion() == words
 

@@ -144,17 +144,13 @@ def test_ports_of_other_links() -> None:
     ("changes", "message"),
     [
         ({}, "No sample was lost since imud started 14 min ago."),
-        (
-            {"loss_ns": NOW_NS - 600 * S, "loss_samples": 19, "loss_cause": "overrun"},
-            "19 samples were lost 10 min ago in a kernel buffer overrun. No sample was lost after that.",
-        ),
-        (
-            {"loss_ns": NOW_NS - S, "loss_samples": 1, "loss_cause": "crc"},
-            "1 sample was lost 1 s ago because frames were damaged. No sample was lost after that.",
-        ),
+        ({"loss_ns": NOW_NS - 600 * S, "loss_samples": 19, "loss_cause": "overrun"},
+         "19 samples were lost 10 min ago in a kernel buffer overrun. No sample was lost after that."),
+        ({"loss_ns": NOW_NS - S, "loss_samples": 1, "loss_cause": "crc"},
+         "1 sample was lost 1 s ago because frames were damaged. No sample was lost after that."),
         ({"loss_ns": NOW_NS - S}, "Samples were lost 1 s ago. No sample was lost after that."),
     ],
-)
+)  # fmt: skip
 def test_sentence_without_a_problem(changes: dict[str, Any], message: str) -> None:
     (cause,) = device_condition.causes_of(facts(recent=recent(**changes)), contracts_condition.ConditionLimits())
     assert (cause.reason().message, cause.rule.code in contracts_condition.OK) == (message, True)

@@ -55,13 +55,11 @@ def model(
 @pytest.mark.parametrize(
     ("profile", "rate_hz", "seconds", "rising_only"),
     [
-        (arrival.BARE_UART, 1000, 2, False),
-        (arrival.USB_16MS, 100, 10, True),
-        (arrival.LOADED, 100, 10, False),
-        (arrival.LOADED, 1000, 3, True),
+        (arrival.BARE_UART, 1000, 2, False), (arrival.USB_16MS, 100, 10, True),
+        (arrival.LOADED, 100, 10, False), (arrival.LOADED, 1000, 3, True),
     ],
     ids=lambda value: getattr(value, "name", None),
-)
+)  # fmt: skip
 def test_every_pair_is_right_under_loss_on_either_side(
     profile: arrival.ArrivalProfile, rate_hz: int, seconds: int, rising_only: bool
 ) -> None:
