@@ -520,8 +520,8 @@ def test_an_edge_is_read_once_and_counted_by_its_time() -> None:
     made = by_edges()
     made.on_edges([BEGIN + MS], MS)
     read(made, BEGIN + 2 * MS + 100_000)
-    made.on_edges([BEGIN + 2 * MS], MS)
-    assert made.due_ns == BEGIN + 2 * MS + QUIET_NS
+    made.on_edges([BEGIN + 2 * MS + 100_000], MS)
+    assert made.due_ns == BEGIN + 2 * MS + 100_000 + QUIET_NS
     made.on_edges([BEGIN + 2 * MS + 100_001], MS)
     assert made.due_ns == BEGIN + 2 * MS + 100_001
     made = by_edges()
@@ -593,5 +593,5 @@ def test_missing_edges_start_and_two_edges_end_the_use_of_deadlines() -> None:
     assert (made.by_edges, made.due_ns) == (False, deadline_ns)
     made.on_edges([t_ns + QUIET_NS + 1], QUIET_NS)
     assert not made.by_edges
-    made.on_edges([t_ns + QUIET_NS + MS], MS)
-    assert (made.by_edges, made.due_ns) == (True, t_ns + QUIET_NS + MS)
+    made.on_edges([t_ns + 2 * QUIET_NS + 1], MS)
+    assert (made.by_edges, made.due_ns) == (True, t_ns + 2 * QUIET_NS + 1)
