@@ -65,7 +65,7 @@ def test_each_event_is_paired_with_its_sample_and_distant_or_many_events_are_not
     at = 100 * PERIOD_NS
     pairing.add_events([(at - 3 * NS_PER_MS, 1), (at - 20_000, 2), (at + 5_000, 3), (at + 3 * NS_PER_MS, 4)])
     assert pair(pairing, 100)
-    assert (pairing.stamp_ns, pairing.number) == (at + 5_000, 3)
+    assert (pairing.stamp_ns, pairing.number, pairing.events_unpaired) == (at + 5_000, 3, 2)
     assert not pair(pairing, 101)
     pairing = running()
     pairing.add_events([(100 * PERIOD_NS + NS_PER_MS, 100)])
@@ -86,6 +86,12 @@ def test_a_line_begins_with_the_eighth_pair_after_a_restart() -> None:
         pair(pairing, i)
         begins += [i] if pairing.running and not before else []
     assert begins == [10, 27]
+    pairing, i = EdgePairing(LEAD_NS), 0
+    while not pairing.running:
+        pairing.add_events([(i * PERIOD_NS + 2_000_000 * (i in (2, 4, 6)), i)])
+        pair(pairing, i)
+        i += 1
+    assert i == 12  # four more pairs, because the first eight pairs do not agree
 
 
 @pytest.mark.parametrize(

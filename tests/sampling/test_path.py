@@ -282,6 +282,12 @@ def test_samples_of_can_frames_start_before_the_first_frame_and_end_at_a_loss() 
     assert (rig.sizes, rig.batches[1][0].t_rx_ns) == ([1, 1], now + 2 * MS)
     path.reset()  # no frame of the waiting sample follows
     assert (rig.sizes, path.unknown) == ([1, 1, 1], {7: 1})
+    rig.codec.results = [((since(now + at * MS),), 0) for at in range(10, 410, 10)]
+    path.on_frames([frame(now + at * MS) for at in range(10, 410, 10)])
+    due_ns = now + 400 * MS + 2 * path.period_ns
+    for at_ns, sizes in ((now + 400 * MS, [40]), (due_ns - 1, [40]), (due_ns, [40, 1])):
+        path.flush(at_ns)
+        assert rig.sizes[3:] == sizes
 
 
 def test_each_input_is_reported_before_its_samples_are_published() -> None:
