@@ -41,10 +41,10 @@ def test_a_change_of_sync_losses_and_bad_frames_raise_limited_events() -> None:
     assert events[1].detail == {"gap_device": 5, "crc": 2, "overrun": 0, "queue": 0}
     device_events, ledger, events = make()
     ledger.frames_bad_crc = 3
-    device_events.bad_frame(BadFrame(BadReason.CRC, b"\x5a\xa5\x01", 0x188))
+    device_events.bad_frame(BadFrame(BadReason.CRC, b"\x5a\xa5" + bytes(31), 0x188))
     device_events.tick(S, None)
     assert events[0].kind is EventKind.BAD_FRAME
-    assert events[0].message == "3 bad frames, the last by crc of CAN identifier 188: 5a a5 01"
+    assert events[0].message == "3 bad frames, the last by crc of CAN identifier 188: 5a a5" + 30 * " 00"  # 32 bytes
 
 
 def test_texts_of_an_event_are_printable_and_bounded() -> None:
