@@ -5,8 +5,10 @@ import grp
 import os
 import socket
 import stat
+import threading
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import create_autospec
 
 import msgspec
 import pytest
@@ -127,8 +129,12 @@ def test_group_of_a_node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         assert files.user_name() == user
 
 
-def test_a_state_file_keeps_the_newest_content(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_state_file_keeps_the_newest_content(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "new" / "state" / "file"
+    join = create_autospec(threading.Thread.join, side_effect=threading.Thread.join)
+    monkeypatch.setattr(threading.Thread, "join", join)
     for content in ({"a": 1}, {"b": 2}):
         state = files.StateFile(path, "saving", "is empty")
         state.read(dict[str, int])
@@ -140,6 +146,7 @@ def test_a_state_file_keeps_the_newest_content(tmp_path: Path, caplog: pytest.Lo
         assert path.read_bytes() == msgspec.json.encode(content)
         assert files.StateFile(None, "", "").read(dict[str, int]) == {}
     assert path.parent.stat().st_mode & 0o777 == 0o750 & ~_umask()
+    assert [call.args[1:] for call in join.call_args_list] == [(1.0,)] * 2  # a slow disk delays the end by at most 1 s
     state = files.StateFile(path, "saving", "is empty")
     assert (state.read(dict[str, int]), caplog.messages) == ({"b": 2}, [])
     path.unlink()

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
-from unittest.mock import Mock
+from unittest.mock import Mock, create_autospec
 
 import pytest
 
@@ -54,9 +54,7 @@ def test_rings_end_one_wait(kind: type[WakeEvent] | type[DescriptorWait]) -> Non
         waiter.close()
 
 
-def test_a_descriptor_calls_once_per_arrival_until_it_is_discarded(
-    pipe: tuple[int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_descriptor_calls_once_per_arrival(pipe: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     reader, writer = pipe
     waiter, calls = DescriptorWait(), list[int]()
     for number, is_usable in ((1023, True), (1024, False)):  # `select` does not accept larger numbers
@@ -82,9 +80,7 @@ def test_a_descriptor_calls_once_per_arrival_until_it_is_discarded(
     waiter.close()
 
 
-def test_a_worker_sleeps_until_a_ring_or_a_descriptor_and_ends(
-    pipe: tuple[int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_worker_sleeps_until_a_ring_or_a_descriptor(pipe: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     rounds, arrived = threading.Semaphore(0), threading.Event()
     worker = started(rounds.release)
     assert rounds.acquire(timeout=LIMIT_S)
@@ -108,8 +104,10 @@ def test_a_worker_sleeps_until_a_ring_or_a_descriptor_and_ends(
     assert not rounds.acquire(blocking=False)
 
 
-def test_a_worker_that_does_not_sleep_repeats_its_round_with_an_exact_timer() -> None:
+def test_a_worker_that_does_not_sleep_repeats_its_round_with_an_exact_timer(monkeypatch: pytest.MonkeyPatch) -> None:
     rounds, slack = threading.Semaphore(0), set[str]()
+    join = create_autospec(threading.Thread.join, side_effect=threading.Thread.join)
+    monkeypatch.setattr(threading.Thread, "join", join)
 
     def work() -> int:
         slack.add(Path(f"/proc/{threading.get_native_id()}/timerslack_ns").read_text().strip())
@@ -119,7 +117,7 @@ def test_a_worker_that_does_not_sleep_repeats_its_round_with_an_exact_timer() ->
     worker = started(work)
     assert all(rounds.acquire(timeout=LIMIT_S) for _ in range(3))
     assert worker.end()
-    assert slack == {"1"}
+    assert (slack, join.call_args.args[1:]) == ({"1"}, (5.0,))
 
 
 def test_an_error_of_a_round_ends_the_worker_and_is_reported() -> None:
