@@ -43,6 +43,10 @@ def test_opens_by_name(board: Board) -> None:
 def test_no_such_ring_and_no_permission(board: Board, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ServerError, match=r"imud.imu9: no such ring; there are rings for: imu0"):
         Ring("imu9", directory=str(tmp_path))
+    for number in range(40):
+        (tmp_path / f"imud.x{number:02}").touch()
+    with pytest.raises(ServerError, match=r"there are rings for: imu0, x00, (x\d\d, ){29}x30$"):
+        Ring("imu9", directory=str(tmp_path))
     (tmp_path / "none").mkdir()
     with pytest.raises(ServerError, match="is imud running"):
         Ring("imu9", directory=str(tmp_path / "none"))

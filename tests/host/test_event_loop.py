@@ -319,9 +319,7 @@ def add_writer(loop: SampleLoop, done: asyncio.Future[None]) -> None:
     ],
     ids=["soon", "later", "at", "future", "threadsafe", "thread", "executor", "task", "signal", "writer"],
 )  # fmt: skip
-def test_callbacks_of_a_reader_end_the_wait(
-    pair: Pair, give: Callable[[SampleLoop, asyncio.Future[None]], object]
-) -> None:
+def test_callbacks_of_readers_end_waits(pair: Pair, give: Callable[[SampleLoop, asyncio.Future[None]], object]) -> None:
     """No timer and no other event ends the wait of the loop: otherwise the limit of the test ends it."""
     ours, theirs = pair
 

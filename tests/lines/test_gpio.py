@@ -123,9 +123,7 @@ async def test_a_line_closed_by_the_handler_of_its_edges(gpiod: FakeGpiod, tmp_p
 
 
 @in_loop
-async def test_a_chip_that_vanishes_ends_the_line(
-    gpiod: FakeGpiod, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_vanished_chip_ends_the_line(gpiod: FakeGpiod, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     line, sink = gpio.GpioInput(SOUT, devices=tmp_path), Sink()
     line.open()
     line.start(sink.on_edges, sink.on_end)
