@@ -230,8 +230,7 @@ async def test_a_wait_does_not_poll_and_leaves_no_descriptor_when_it_is_cancelle
         asked += 1
         return False
 
-    before = len(open_descriptors())
-    waiting = asyncio.create_task(wait_until(tmp_path / "tty", ready))
+    before, waiting = len(open_descriptors()), asyncio.create_task(wait_until(tmp_path / "tty", ready))
     await turns(1000)
     assert len(open_descriptors()) == before + 1
     waiting.cancel()

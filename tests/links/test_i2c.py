@@ -82,7 +82,7 @@ def test_names_time_out_and_close(monkeypatch: pytest.MonkeyPatch) -> None:
     bus, requests = InProcessI2c({}), list[tuple[int, int]]()
     link = I2cLink(I2cOptions(), open_bus=bus.open, ioctl=lambda _fd, *request: requests.append(request))
     link.open()
-    assert requests == [(I2C_TIMEOUT, 5)]
+    assert (requests, link.title, link.rate_hz) == ([(I2C_TIMEOUT, 5)], "/dev/i2c-1", 100.0)
     link.close()
     link.close()
     assert bus.fd is None

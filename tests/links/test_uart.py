@@ -85,8 +85,7 @@ def test_bytes_pass_as_they_are(pty: PtyPort, link: UartLink) -> None:
         pty.send(everything)
         await receiver.until(lambda: len(receiver.data) == 256)
 
-    before_ns = time.monotonic_ns()
-    receiver = play(UartLink(UartOptions(port=pty.path, baud=115200)), scene)
+    before_ns, receiver = time.monotonic_ns(), play(UartLink(UartOptions(port=pty.path, baud=115200)), scene)
     assert receiver.data == everything
     assert all(before_ns < t_rx_ns <= time.monotonic_ns() for _, t_rx_ns in receiver.chunks)
     assert receiver.ends == []
