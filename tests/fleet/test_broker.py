@@ -396,8 +396,7 @@ def test_messages_that_imud_did_not_request_end_the_connection(head: bytes) -> N
 
 
 def test_long_packets_and_websocket_frames_are_detected_in_any_pieces() -> None:
-    guard = fleet_broker.PacketGuard(PACKET_BYTES)
-    data = b"\x32\x80\x01" + b"\x34" * 128 + b"\xd0\x00"
+    guard, data = fleet_broker.PacketGuard(PACKET_BYTES), b"\x32\x80\x01" + b"\x34" * 128 + b"\xd0\x00"
     for at in range(len(data)):
         guard.take(data[at : at + 1], is_writing=False)
     for _ in range(3):

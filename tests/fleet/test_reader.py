@@ -108,12 +108,10 @@ async def test_the_broker_sends_no_more_than_the_reader_can_hold(broker: Mosquit
     fleet = fleet_at(broker, "slow")
     await session_begun(fleet)
     await asyncio.to_thread(gateway.send, *(samples_message(n, n) for n in range(1, 2 * RECEIVE_MAX + 1)))
-    before = sum("Sending PUBLISH to imud-reader-slow" in line for line in broker.log)
-    batches = fleet.watch()
+    before, batches = sum("Sending PUBLISH to imud-reader-slow" in line for line in broker.log), fleet.watch()
     await anext(batches)
     gateway.send_state(STATE)  # the broker has processed all earlier messages
-    sent = sum("Sending PUBLISH to imud-reader-slow" in line for line in broker.log) - before
-    count = 1
+    sent, count = sum("Sending PUBLISH to imud-reader-slow" in line for line in broker.log) - before, 1
     async for _ in batches:
         count += 1
         if count == 2 * RECEIVE_MAX:
@@ -385,8 +383,7 @@ async def test_errors_of_the_loop_do_not_prevent_the_end(broker: Mosquitto, monk
     connection = await opened(broker.port)
     waiting = asyncio.ensure_future(connection.next())
     await asyncio.sleep(0)
-    loop = asyncio.get_running_loop()
-    refuse = Mock(side_effect=OSError(errno.EBADF, "Bad file descriptor"))
+    loop, refuse = asyncio.get_running_loop(), Mock(side_effect=OSError(errno.EBADF, "Bad file descriptor"))
     monkeypatch.setattr(loop, "remove_writer", refuse)
     connection.close()
     with pytest.raises(BrokerError, match="the connection is closed"):

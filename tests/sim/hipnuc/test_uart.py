@@ -44,6 +44,12 @@ def test_frames_and_their_times() -> None:
     bench = HipnucUartBench(ModuleSettings(hi91=Output(20), hi92=Output(50)))
     sizes = [len(burst.data) for burst in bench.wait(1000.0)]
     assert (sizes.count(82), sizes.count(54)) == pytest.approx((50, 20), abs=1)
+    for settings in (ModuleSettings(hi91=Output(10), hi92=Output(7)), ModuleSettings(hi91=Output(), hi92=Output(10))):
+        module = HipnucModule(BEGIN_NS, settings)
+        for _ in range(20):
+            next_ns = module.next_ns()
+            assert next_ns is not None
+            assert (module.advance(next_ns - 1), module.advance(next_ns)[0].due_ns) == ([], next_ns)
 
 
 @pytest.mark.parametrize("skew_ppm", [-50_000.0, 0.0, 123.4])
@@ -492,6 +498,10 @@ def test_a_trigger_is_answered_125_us_later_on_average() -> None:
         delays.append(pulse[1].due_ns - marked_ns)
     assert sum(delays) / len(delays) == pytest.approx(125_000, abs=2000)
     assert 20_000 < max(delays) - min(delays) <= 30_000
+    bench = HipnucUartBench(ModuleSettings(hi91=Output(10), hi92=Output(on_mark=True)), HIPNUC_STILL)
+    bench.now_ns += 15 * NS_PER_MS
+    bench.module.mark(bench.now_ns)
+    assert [burst.sample_ns for burst in bench.wait(10.0)] == [BEGIN_NS + ms * NS_PER_MS for ms in (510, 515)]
     bench = HipnucUartBench(FAST, HIPNUC_STILL)
     bench.wait(0.7)
     bench.module.mark(bench.now_ns)

@@ -158,8 +158,7 @@ def test_commands_at_another_rate_or_damaged() -> None:
     far.send(c.factory_reset().payload)
     far.baud = 115200
     assert far.wait(100) == []
-    far = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND))
-    damaged = bytearray(c.ask_status().payload)
+    far, damaged = imu61x_bench(Imu61xSettings(mode=c.OutputMode.COMMAND)), bytearray(c.ask_status().payload)
     damaged[12] ^= 1
     far.send(bytes(damaged))
     assert far.wait(100) == []

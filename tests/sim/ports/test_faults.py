@@ -82,8 +82,7 @@ def test_the_ledger_of_a_codec_tells_the_same() -> None:
     codec = DRIVER.make_codec(ledger, DRIVER.settings())
     events = [event for _, after in passed(faults, 400) if after for event in codec.feed(after.data)]
     events += codec.flush()
-    untouched = 400 - len(hit(faults))
-    measured = sum(isinstance(event, Measurement) for event in events)
+    untouched, measured = 400 - len(hit(faults)), sum(isinstance(event, Measurement) for event in events)
     survivable = faults.counts[FaultKind.INSERT]  # bytes inserted directly before a frame do not damage it
     assert ledger.closes()
     assert untouched <= ledger.frames_in_samples <= untouched + survivable

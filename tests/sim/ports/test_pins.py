@@ -227,8 +227,7 @@ def test_lines_deliver_edges_read_sin_and_write_the_truth(
     bench, marks = HipnucUartBench(FAST), list[int]()
     monkeypatch.setattr(type(bench.module), "mark", lambda _module, now_ns: marks.append(now_ns))
     files, truth = pin_ports.pull_files(f"sout={tmp_path / 'pull'}"), (tmp_path / "truth").open("w")
-    lines = pin_ports.SimulatedLines(bench.module, files, None, truth, value(0))
-    now_ns = bench.now_ns
+    lines, now_ns = pin_ports.SimulatedLines(bench.module, files, None, truth, value(0)), bench.now_ns
     for _ in range(40):
         next_ns = lines.next_ns(now_ns)
         assert now_ns < next_ns <= now_ns + 4 * NS_PER_MS
