@@ -12,6 +12,7 @@ from imud.contracts.setting import Written
 from imud.drivers.readdressing import Readdressing
 from imud.formats.can import RAW_FRAME, CanFilter, pack_frame
 from imud.model.errors import BadArgument, NoReply, Rejected
+from tests.support.script_runners import unanswered_ms
 from tests.support.simulated_modules import run_script
 
 QUERY, WRITE, RESTART = 1, 2, 3
@@ -55,6 +56,7 @@ class Bench:
 
     def ask(self, request: Request) -> Outcome:
         if request.settings is not None:
+            assert request.silent
             self.options = request.settings
             return Reply(())
         can_id, _, data = RAW_FRAME.unpack(request.payload)
@@ -117,13 +119,12 @@ def test_a_device_stays_is_followed_or_the_place_is_refused() -> None:
         bench.change(12)
     assert bench.sent == [(12, QUERY, 0)]
     bench = Bench(FakeDevice(immediate=True))
-    assert bench.change(9) is Written.VERIFIED
-    assert bench.options == FakeOptions(9)
+    assert (bench.change(9), bench.options) == (Written.VERIFIED, FakeOptions(9))
     # the device confirms the first write at 5 and then uses 9
     assert bench.sent == [(9, QUERY, 0), (5, WRITE, 9), (5, WRITE, 9), (9, WRITE, 9), (9, QUERY, 0)]
     bench = Bench(FakeDevice())
-    assert bench.change(9) is Written.PENDING
-    assert bench.options == FakeOptions(5)
+    bench.beside = [ReplyFrame(REPLIES + 12, b"\0")]
+    assert (bench.change(9), bench.options) == (Written.PENDING, FakeOptions(5))
     assert bench.sent == [(9, QUERY, 0), (5, WRITE, 9), (5, WRITE, 9), (5, QUERY, 0)]
 
 
@@ -146,8 +147,9 @@ def test_the_command_back_does_not_wait() -> None:
 
     with pytest.raises(NoReply):
         run_script(Bench(FakeDevice()).readdressing().change(9), silent)
-    assert last[0].silent
-    assert last[0].also == ()
+    assert (last[0].silent, last[0].also) == (True, ())
+    restart = Request(b"", "restart", script.never, script.never, script.never)
+    assert [*unanswered_ms(Bench(FakeDevice()).readdressing().restart(restart, BUS_BIT_S))] == [3000, 1100]
 
 
 # --- restart ----------------------------------------------------------------------------------------------------------
@@ -165,8 +167,7 @@ def test_a_restarted_device_is_found_at_its_saved_or_present_place(
     saved: dict[str, int], place: int, boots: bool
 ) -> None:
     bench = Bench(FakeDevice(saved=saved, booted=place, boots=boots))
-    assert bench.restart() == f"found as node {place}"
-    assert bench.options == FakeOptions(place)
+    assert (bench.restart(), bench.options) == (f"found as node {place}", FakeOptions(place))
 
 
 def test_boot_frames_of_this_device_only_and_a_rejected_restart_or_lost_device_is_reported() -> None:
@@ -180,8 +181,8 @@ def test_boot_frames_of_this_device_only_and_a_rejected_restart_or_lost_device_i
     bench.beside = [ReplyFrame(BOOTS + 12, b"\0"), ReplyFrame(BOOTS + 9, b"\5"), ReplyFrame(REPLIES + 12, b"\0")]
     assert bench.restart() == "found as node 5"
     bench = Bench(FakeDevice(booted=33))
-    assert bench.restart() == "found as node 33"
-    assert bench.options == FakeOptions(33)
+    bench.beside = [ReplyFrame(REPLIES + 12, b"\0")]
+    assert (bench.restart(), bench.options) == ("found as node 33", FakeOptions(33))
     with pytest.raises(Rejected, match="restart: the device rejected the request"):
         Bench(FakeDevice(), rejects=True).restart()
     bench = Bench(FakeDevice(saved={"place": 9, "rate": 0}))

@@ -61,6 +61,8 @@ def test_limits_of_values_and_temperatures() -> None:
         assert value_limits.scaled((0.0, -value, 0.0), 2.0, 40.0) is None
     assert value_limits.possible_angles((-tau, 0.0, tau)) == (-tau, 0.0, tau)
     assert value_limits.possible_angles((0.0, tau * 1.00001)) is None
+    found = [value_limits.possible_quaternion(0.0, 0.0, 0.0, w) is not None for w in (0.979, 0.981, 1.019, 1.021)]
+    assert found == [False, True, True, False]
     for impossible in (-128.0, nextafter(150.0, 151.0)):
         assert value_limits.possible_temperature_c(impossible) is None
         inside = nextafter(impossible, 0.0)
