@@ -163,7 +163,7 @@ def test_values_near_infinity_and_quaternions_to_the_last_bit() -> None:
     ("place", "missing"),
     [
         (0, {"euler_rad", "quat_wxyz"}), (2, {"euler_rad", "quat_wxyz"}), (3, {"accel_m_s2"}), (8, {"gyro_rad_s"}),
-        (9, {"temperature_c"}),
+        (5, {"accel_m_s2"}), (6, {"gyro_rad_s"}), (9, {"temperature_c"}),
     ],
 )  # fmt: skip
 def test_groups_that_are_not_finite_are_removed_and_reported(place: int, missing: set[str], value: float) -> None:
@@ -200,11 +200,13 @@ def test_frames_of_other_kinds_and_lengths() -> None:
         (event,) = codec().feed(uart_codec.encode_acknowledgement(3, 0, frame_id=frame_id))
         assert event == ReplyFrame(frame_id, b"\x03\x00\x00\x00")
 
-    tested = codec()
-    assert tested.feed(uart_codec.encode_frame(uart_codec.DEVICE_SYNC, 0x0123, bytes(30))) == []
-    assert (tested.ledger.frames_ignored, tested.ledger.frames_good) == (1, 1)
-    assert tested.ledger.bytes_in_good_frames == 40
-    assert tested.ledger.closes()
+    for size in (1, 30, uart_codec.PAYLOAD_BYTES_MAX):
+        tested = codec()
+        assert tested.feed(uart_codec.encode_frame(uart_codec.DEVICE_SYNC, 0x0123, bytes(size))) == []
+        assert (tested.ledger.frames_ignored, tested.ledger.frames_good, tested.unknown) == (1, 1, {0x0123: 1})
+        assert tested.ledger.bytes_in_good_frames == 10 + size
+        assert tested.ledger.closes()
+    assert [*map(uart_codec.frame_name, (0x0666, 0x0123))] == ["raw data (identifier 0x0666)", "identifier 0x0123"]
 
     longer = uart_codec.encode_frame(uart_codec.DEVICE_SYNC, uart_codec.AHRS_FRAME, GOLDEN[6:-4] + bytes(8))
     measurement = only(codec().feed(longer))
