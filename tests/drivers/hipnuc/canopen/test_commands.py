@@ -58,16 +58,14 @@ def test_identify_and_read_settings() -> None:
     bench = CanopenBench()
     identity = bench.run_script(session.identify(8))
     assert (identity.product, identity.serial_number, identity.firmware) == ("HI14", "0x17080042", "0x0000009C")
-    assert identity.details is not None
-    assert identity.details["device type"] == "0x00000000"
-    assert "NMT state" not in identity.details
+    assert (identity.details or {})["device type"] == "0x00000000"
+    assert "NMT state" not in (identity.details or {})
     assert all(data[0] == 0x40 for _, data in bench.sent)
     bench = CanopenBench(NodeSettings(periods_ms=QUIET.periods_ms, heartbeat_ms=200))
     bench.run_script(session.nmt(8, NmtCommand.PRE_OPERATIONAL))
     bench.run(1_000_000_000)
     identity = bench.run_script(session.identify(8))
-    assert identity.details is not None
-    assert identity.details["NMT state"] == "pre-operational"
+    assert (identity.details or {})["NMT state"] == "pre-operational"
     with pytest.raises(NoReply, match="node 9"):
         CanopenBench().run_script(session.identify(9))
 

@@ -110,8 +110,7 @@ def test_heading_is_clockwise_and_yaw_is_not(clockwise: int, yaw_deg: float) -> 
         found = messages.measurement_of([(0xFF41, data)]).euler_rad
         assert found is not None
         assert found[2] == pytest.approx(math.radians(yaw_deg), abs=1e-12)
-        assert math.isnan(found[0])
-        assert math.isnan(found[1])
+        assert all(map(math.isnan, found[:2]))
 
 
 def test_packing_gives_the_golden_messages_and_clips_them() -> None:
@@ -124,6 +123,12 @@ def test_packing_gives_the_golden_messages_and_clips_them() -> None:
     assert messages.pack_gyro((math.radians(61.035), -1e9, 1e9)).hex() == "e8030080ff7f0000"
     assert messages.pack_roll_pitch(math.radians(10.5), math.radians(-20.25)).hex() == "04290000e6b0ffff"
     assert messages.pack_temperature(25.0).hex() == "c4090000e7030000"
+    packed = (
+        messages.pack_roll_pitch(1e9, -1e9),
+        messages.pack_temperature(1e9),
+        messages.pack_quaternion((9, -9, 0, 0)),
+    )
+    assert [data[:8].hex() for data in packed] == ["ffffff7f00000080", "ff7f0000e7030000", "ff7f008000000000"]
     assert messages.pack_utc(2025, 3, 14, 15 * 3600 + 9 * 60 + 26.535).hex() == "19030e0f091a1702"
 
 
@@ -146,6 +151,8 @@ def test_absent_is_not_zero_and_one_negative_count_is_a_value() -> None:
     assert measured(0xFF37, "ffffffffffff0000").gyro_rad_s == pytest.approx((-0.00106526,) * 3, abs=1e-8)
     assert measured(0xFF34, "ffffffffffff0000").accel_m_s2 == pytest.approx((-0.00478514,) * 3, abs=1e-8)
     assert measured(0xFF3D, "ffffffff00000000").euler_rad == pytest.approx((-1.74532925e-5, 0, math.nan), nan_ok=True)
+    assert measured(0xFF3D, "407e0500c081faff").euler_rad == pytest.approx((math.tau, -math.tau, math.nan), nan_ok=True)
+    assert measured(0xFF3D, "00000000ffffff7f").euler_rad == pytest.approx((0, math.nan, math.nan), nan_ok=True)
     assert measured(0xFF43, "00000000e7030000").temperature_c == 0.0  # with the placeholder it is 0 °C
     # counts of 0.01 °C up to 150 °C
     assert [measured(0xFF43, f"{counts}000000000000").temperature_c for counts in ("983a", "993a")] == [150.0, None]
@@ -283,8 +290,7 @@ def test_which_frames_count_and_options_that_mean_nothing() -> None:
     codec = learned(pgns=["FF34", "FF3D"])
     (sample,) = feed(codec, burst(5), 100 * MS)
     assert isinstance(sample, Measurement)
-    assert sample.gyro_rad_s is None
-    assert sample.size_bytes == 16
+    assert (sample.gyro_rad_s, sample.size_bytes) == (None, 16)
     assert [f.can_id >> 8 for f in DRIVER.filters(HipnucJ1939Options(pgns=("FF34", "FF3D")))] == [
         0xFF2F, 0xFF34, 0xFF3D, 0xEF55,
     ]  # fmt: skip

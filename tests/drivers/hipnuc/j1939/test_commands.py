@@ -220,6 +220,9 @@ def test_all_that_can_be_read() -> None:
         "interval_ms_FF37": "10", "interval_ms_FF3D": "100", "interval_ms_FF41": "100",
     }  # fmt: skip
     assert len(frames) == 13
+    bit_rate = SETTINGS.read(Target(HipnucJ1939Options(), 0), {SETTINGS.table["bit_rate"].report})
+    found = combined(played(bit_rate, bytes.fromhex("9A00030005000000"))[1])  # type: ignore[arg-type]  # reports
+    assert (found.words, found.values) == ({"bitrate": "5"}, {})
     assert all(data[2:] == b"\3\0\1\0\0\0" for _, data in frames)
 
     def answer(request: Request) -> Outcome:

@@ -99,9 +99,7 @@ def check_manual_values(m: Measurement) -> None:
 def test_manual_hi91() -> None:
     m = one(make().feed(MANUAL_HI91))
     check_manual_values(m)
-    assert m.pps_age_ms == 5384
-    assert m.status is None
-    m = one(make().feed(MANUAL_HI91))
+    assert (m.pps_age_ms, m.status) == (5384, None)
     assert m.quat_wxyz is not None
     assert euler312_from_quat(m.quat_wxyz) == pytest.approx(m.euler_rad, abs=2e-6)
     codec = make()
@@ -121,9 +119,7 @@ def test_frames_back_to_back_are_decoded_like_one(word: str) -> None:
     check_manual_values(alone)
     run = make(hi91_word=word).feed(3 * MANUAL_HI91)
     assert run == [msgspec.structs.replace(alone, trailing_bytes=frames * len(MANUAL_HI91)) for frames in (2, 1, 0)]
-    general = make(hi91_word=word).feed(
-        framed(MANUAL_HI91[uart_codec.HEADER.size :] + b"\x00")
-    )  # an unknown tag after it
+    general = make(hi91_word=word).feed(framed(MANUAL_HI91[6:] + b"\x00"))  # an unknown tag after it
     assert general == [msgspec.structs.replace(alone, size_bytes=len(MANUAL_HI91) + 1)]
 
 
@@ -310,11 +306,11 @@ OLD_MANUAL = bytes.fromhex("5AA54C006C519100A03B01A80297BDBB04009CA0653EA226453F
 def test_no_barometer_no_pressure(
     pressure_pa: float, temperature_c: int, expected: tuple[float | None, float | None], frames: int
 ) -> None:
-    """Alone and in a run of frames, which has its own decoder."""
+    """Alone, in a run of frames, and before an unknown tag: three decoders."""
     frame = hi91(5, pressure_pa=pressure_pa, temperature_c=temperature_c)
     events = make().feed(frame * frames)
     assert len(events) == frames
-    for event in events:
+    for event in (*events, *make().feed(framed(frame[6:] + b"\x00"))):
         assert isinstance(event, Measurement)
         assert (event.temperature_c, event.pressure_pa) == expected
 

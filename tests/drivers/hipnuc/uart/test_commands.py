@@ -148,8 +148,7 @@ def test_identity_refusal_and_flat_settings() -> None:
     identity = hold(identify(), answer)
     assert asked == ["LOG VERSION"]
     assert (identity.product, identity.serial_number, identity.firmware) == ("HI14R3", "043995698D6E1708", "1.5.6")
-    assert identity.details is not None
-    assert identity.details["APP_VER"] == "156"
+    assert (identity.details or {})["APP_VER"] == "156"
     assert hold(identify(), lambda _: Reply(("PNAME=CH0", "OK"))).firmware == ""
     with pytest.raises(Rejected, match="ERR 3"):
         hold(identify(), lambda _: Rejection(("ERR 3",)))
@@ -160,9 +159,7 @@ def test_identity_refusal_and_flat_settings() -> None:
     without = hold(
         SETTINGS.read(Target(None, 0), None), lambda n: Silence(()) if n == "LOG MAGCONFIG" else Reply(REPLIES[n])
     )
-    settings = combined(without).words
-    assert "ATT_MODE" in settings
-    assert "MB" not in settings
+    assert {"ATT_MODE", "MB"}.intersection(combined(without).words) == {"ATT_MODE"}
     for silent in ("LOG USRCONFIG", "LOG COMCONFIG"):
         script = SETTINGS.read(Target(None, 0), None)
         with pytest.raises(NoReply, match=silent):
@@ -530,8 +527,7 @@ def test_refusal_silence_restart_and_the_expected_value_of_a_heading() -> None:
         sent("baud", left, baud=921600)
 
     requests, value = sent("restart", [Reply(()), Silence(()), Silence(()), Silence(()), NAMED])
-    assert requests[0].silent
-    assert getattr(value, "product", "") == "HI14R3"
+    assert (requests[0].silent, getattr(value, "product", "")) == (True, "HI14R3")
 
     # The samples contain the heading 15°; the verb set 45°
     for relative, expected in ((False, [pytest.approx(math.pi / 6)]), (True, [])):
