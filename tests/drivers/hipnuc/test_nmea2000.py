@@ -196,7 +196,7 @@ def test_a_burst_makes_a_sample_and_other_frames_do_not() -> None:
     skipped = [(0x09F11423, True), (0x11223, False), (0x09F112FE, True), (0x08F11223, True)]
     for can_id, extended in skipped:
         assert not codec.feed_frame(can_id, extended, bytes(8), 0)
-    assert codec.ledger.bytes_skipped == 32
+    assert (codec.ledger.bytes_skipped, codec.unknown) == (32, {0x1F114: 1, 0xF112: 1})
     assert codec.ledger.closes()
     assert messages.DRIVER.node_of(0x0DF11905, True, bytes(8)) == 5
     for can_id, extended, size in [(0x0DF11905, False, 8), (0x0DF11905, True, 7), (0x0DF119FF, True, 8)]:
