@@ -71,8 +71,7 @@ MISSING = {
 
 def test_an_empty_host_and_one_on_which_all_checks_run(machine: Machine) -> None:
     examined = examine(CHECKS, machine.surroundings())
-    assert [one.name for one in examined] == [check.name for check in CHECKS]
-    assert exit_status(examined) == 2
+    assert ([one.name for one in examined], exit_status(examined)) == ([check.name for check in CHECKS], 2)
     assert "not checked" in verdict(examined)
     healthy(machine)
     examined = examine(CHECKS, machine.surroundings())
@@ -147,8 +146,7 @@ def test_verdict_exit_status_json_and_page() -> None:
         {"name": "a", "findings": [{"severity": "warning", "seen": "slow", "advice": "faster"}]},
         {"name": "b", "findings": []},
     ]
-    long = error("word " * 60, "another " * 40)
-    lines = page([Examined("a", [long, GOOD, UNSEEN])]).splitlines()
+    lines = page([Examined("a", [error("word " * 60, "another " * 40), GOOD, UNSEEN])]).splitlines()
     assert max(map(len, lines)) <= 80
     assert (lines[0], lines[1]) == ("ok           fine", "not checked  hidden")
     assert lines[2].startswith("error        word word")
@@ -170,5 +168,4 @@ def test_a_check_that_cannot_look_ends_no_other_and_findings_are_bounded(machine
     ]:  # fmt: skip
         examined = examine([DoctorCheck("x", broken), DoctorCheck("y", fine)], machine.surroundings())
         assert (examined[0].findings, examined[1].findings) == ([GOOD, not_checked(why)], [NOTE])
-    endless = DoctorCheck("x", lambda _at: repeat(GOOD))
-    assert len(examine([endless], machine.surroundings())[0].findings) == 300
+    assert len(examine([DoctorCheck("x", lambda _at: repeat(GOOD))], machine.surroundings())[0].findings) == 300

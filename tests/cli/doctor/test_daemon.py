@@ -13,6 +13,7 @@ import pytest
 from imud.cli.doctor import daemon as checks
 from imud.cli.doctor.command import examine, exit_status
 from imud.cli.doctor.surroundings import DoctorCheck, fetch_over_http
+from imud.contracts.condition import DOCTOR, Condition, DeviceCondition, Reason, ReasonCode
 from imud.contracts.status import CKernelStatus, DeviceState, DeviceStatus, KernelCounters, LinesStatus
 from imud.contracts.status import SerialLineCounters as Counters
 from imud.model.errors import LinkDenied, LinkMissing, ServerError
@@ -31,7 +32,7 @@ BOW = "bow: {driver: hipnuc-uart, uart: {port: /dev/ttyUSB0, baud: 115200}}"
 ACTIVE = ("ActiveState=active", "UnitFileState=enabled", "Result=success", "NRestarts=2", "NeedDaemonReload=no")
 
 
-def test_configurations(machine: Machine) -> None:
+def test_configurations_and_a_service_without_systemd_or_a_unit_or_with_a_fault(machine: Machine) -> None:
     machine.tells(CONFIGURATION, "error", "No such file", "`sudo imud setup`")
     for number in (errno.EACCES, errno.EPERM):
         with mock.patch.object(Path, "open", side_effect=OSError(number, "denied")):
@@ -48,9 +49,6 @@ def test_configurations(machine: Machine) -> None:
     assert found
     assert {severity for severity, _ in found} == {"error"}
     assert any("imud.yaml:2:" in text and "prt" in text for _, text in found)
-
-
-def test_a_service_without_systemd_or_a_unit_or_with_a_fault(machine: Machine) -> None:
     assert machine.find(SERVICE)[0].severity == "not checked"
     machine.prints("systemctl show", "LoadState=not-found\n")
     assert machine.find(SERVICE)[0].severity == "warning"
@@ -114,6 +112,10 @@ def test_states_come_with_the_reason_of_the_daemon(machine: Machine) -> None:
     found = machine.told(STATES)
     assert [severity for severity, _ in found] == ["ok", "error", "error"]
     assert "b: /dev/ttyUSB1 is not there" in found[1][1]
+    away, slow = Reason(ReasonCode.UTC, "No UTC.", DOCTOR), Reason(ReasonCode.NONE_LOST, "Slow.", "Set a rate.")
+    machine.status = [device("d", condition=DeviceCondition(Condition.DEGRADED, 0, (away, slow)))]
+    steps = [("warning", "d: No UTC. → see the findings about its port, bus and lines")]
+    assert machine.told(STATES) == [*steps, ("warning", "d: Slow. → Set a rate.")]
 
 
 AT = ("127.0.0.1", 9321, "/scrapes")

@@ -15,7 +15,7 @@ CLOCK, STORAGE, POWER = DoctorCheck("c", host_clock), DoctorCheck("s", storage),
 PROCESSOR, LOG = DoctorCheck("u", processor), DoctorCheck("k", kernel_log)
 
 
-def test_clock_and_storage(machine: Machine) -> None:
+def test_clock_and_storage_and_power_of_a_raspberry_pi_from_vcgencmd_and_from_sysfs(machine: Machine) -> None:
     assert machine.find(STORAGE)[0].severity == "not checked"
     machine.write("/var/lib/imud/x")
     at = machine.surroundings()
@@ -40,9 +40,6 @@ def test_clock_and_storage(machine: Machine) -> None:
         machine.write("/proc/mounts", "".join(f"{mount} ext4 rw 0 0\n" for mount in mounts))
         machine.sync_s = [0.01, worst_s, 0.02]
         machine.tells(STORAGE, severity, f"to /srv/imud (/dev/mmcblk0p2) took up to {worst_s * 1000:.0f} ms")
-
-
-def test_power_of_a_raspberry_pi_from_vcgencmd_and_from_sysfs(machine: Machine) -> None:
     assert machine.find(POWER) == []  # not a Raspberry Pi
     machine.write("/proc/device-tree/model", "Raspberry Pi 3 Model B\0")
     assert machine.find(POWER)[0].severity == "not checked"
@@ -53,14 +50,14 @@ def test_power_of_a_raspberry_pi_from_vcgencmd_and_from_sysfs(machine: Machine) 
         assert machine.find(POWER)[0].severity == "not checked"
     for word, severities in [
         ("0", ["ok"]), ("50005", ["error", "warning"]), ("50000", ["warning", "note"]), ("80008", ["warning"]),
-        ("20000", ["note"]),
+        ("20000", ["note"]), ("1", ["error"]), ("10000", ["warning"]),
     ]:  # fmt: skip
         machine.write("/proc/device-tree/model", "Raspberry Pi 4 Model B Rev 1.4\0")
         machine.write("/sys/devices/platform/soc/soc:firmware/get_throttled", word + "\n")
         assert [finding.severity for finding in machine.find(POWER)] == severities, word
 
 
-def test_load_of_two_processors(machine: Machine) -> None:
+def test_load_of_two_processors_and_samples_lost_and_reads_late_by_a_busy_machine(machine: Machine) -> None:
     for name in ("cpu0", "cpu1", "cpufreq"):
         machine.write(f"/sys/devices/system/cpu/{name}/x")
     for load, pressure, severity in [
@@ -72,9 +69,6 @@ def test_load_of_two_processors(machine: Machine) -> None:
                 "/proc/pressure/cpu", f"some avg10=0.00 avg60={pressure} avg300=0.00 total=1\nfull avg10=0.00\n"
             )
         machine.tells(PROCESSOR, severity, "on 2 processors")
-
-
-def test_samples_lost_and_reads_late_by_a_busy_machine(machine: Machine) -> None:
     assert machine.find(PROCESSOR)[0].severity == "not checked"
     machine.write("/proc/loadavg", "0.00 0.00 0.00 1/200 999\n")
     busy = device("a")
@@ -82,8 +76,7 @@ def test_samples_lost_and_reads_late_by_a_busy_machine(machine: Machine) -> None
     late = device("b", polling=PollingStatus(polls=1000, late=51, late_worst_ns=3_000_000))
     late = msgspec.structs.replace(late, ledger=late.ledger | {"lost_queue": 0})
     good = msgspec.structs.replace(late, polling=PollingStatus(polls=1000, late=50))
-    level = msgspec.structs.replace(busy, ledger=busy.ledger | {"lost_queue": 10})
-    machine.status = [busy, late, good, level]
+    machine.status = [busy, late, good, msgspec.structs.replace(busy, ledger=busy.ledger | {"lost_queue": 10})]
     found = machine.told(PROCESSOR)
     assert [severity for severity, _ in found] == ["ok", "warning", "warning"]
     assert "a: 11 samples lost" in found[1][1]
@@ -130,6 +123,8 @@ def test_each_kind_of_trouble_in_the_kernel_log_and_its_sources(machine: Machine
     machine.tells(LOG, "not checked", "Operation not permitted → run `sudo imud doctor`")
     machine.prints("journalctl", "usb 1-1: reset full-speed USB device\n" + "usb: fine\n" * 5000)
     machine.tells(LOG, "ok", "in 5000 lines")
+    machine.prints("journalctl", line := "usb 1-1: reset full-speed USB device " + "x" * 120)
+    assert machine.told(LOG)[0][1].partition(", the last: ")[2].partition(" → ")[0] == line[:120]
     machine.outputs.clear()
     machine.tells(LOG, "not checked", "cannot read the kernel log: journalctl: No such file", "join the group adm")
     machine.outputs["journalctl"] = PermissionError(13, "Permission denied", "journalctl")

@@ -69,7 +69,7 @@ def test_the_rule_is_for_nodes_of_the_kind_only(bow: Machine) -> None:
         bow.tells(RIGHTS, "error", rule)
 
 
-def test_a_user_who_joined_the_group_after_login_and_the_mode(bow: Machine) -> None:
+def test_a_user_who_joined_the_group_after_login_and_the_mode_and_rules_of_the_unit(bow: Machine) -> None:
     bow.write("/etc/group", f"port:x:{PORT_GID}:ann\n")
     bow.tells(RIGHTS, "error", "log out and log in again")
     bow.gids = frozenset({4003, PORT_GID})
@@ -81,9 +81,6 @@ def test_a_user_who_joined_the_group_after_login_and_the_mode(bow: Machine) -> N
     assert bow.find(RIGHTS)[0].severity == "error"  # only the permissions of the group apply
     bow.gids = frozenset({4003})
     assert bow.find(RIGHTS)[0].severity == "ok"
-
-
-def test_rules_of_the_unit(bow: Machine) -> None:
     for line, severity, words in [
         ("DeviceAllow=char-ttyUSB rw", "ok", "allows"), ("DeviceAllow=char-tty* rw", "ok", "allows"),
         ("DeviceAllow=/dev/ttyUSB0 rw", "ok", "allows"), ("DeviceAllow=char-ttyACM rw", "error", "EPERM"),
@@ -160,7 +157,7 @@ def test_who_uses_a_port(machine: Machine) -> None:
     machine.tells(TAKEN, "error", "/dev/ttyUSB0 is open in another program: minicom (pid 11)")
 
 
-def test_a_console_and_latency_timers(machine: Machine) -> None:
+def test_a_console_and_latency_timers_and_modem_manager_concerns_usb_ports_only(machine: Machine) -> None:
     machine.configure(BOW)
     machine.port("ttyUSB0")
     machine.uid = 0
@@ -170,13 +167,10 @@ def test_a_console_and_latency_timers(machine: Machine) -> None:
     assert "console=ttyUSB0" in text
     machine.port("ttyUSB0")
     assert machine.find(LATENCY) == []  # an adapter without a latency timer
-    machine.write("/sys/class/tty/ttyUSB0/device/latency_timer", "16\n")
-    machine.tells(LATENCY, "warning", "up to 16 ms", 'ATTR{latency_timer}="1"')
+    machine.write("/sys/class/tty/ttyUSB0/device/latency_timer", "2\n")
+    machine.tells(LATENCY, "warning", "up to 2 ms", 'ATTR{latency_timer}="1"')
     machine.write("/sys/class/tty/ttyUSB0/device/latency_timer", "1\n")
     assert machine.find(LATENCY)[0].severity == "ok"
-
-
-def test_modem_manager_concerns_usb_ports_only(machine: Machine) -> None:
     machine.configure(BOW)
     machine.prints("systemctl is-active ModemManager", "active\n")
     assert machine.find(MODEM)[0].severity == "warning"
