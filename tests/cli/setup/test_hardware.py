@@ -152,8 +152,7 @@ def test_a_line_is_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 def on_bus(monkeypatch: pytest.MonkeyPatch, bus: InProcessI2c) -> None:
     make = partial(I2cLink, open_bus=bus.open, ioctl=bus.ioctl)
-    row = SimpleNamespace(settings=I2cOptions, make_polled=make)
-    monkeypatch.setattr(finders, "LINKS", {"i2c": row})
+    monkeypatch.setattr(finders, "LINKS", {"i2c": SimpleNamespace(settings=I2cOptions, make_polled=make)})
 
 
 def test_a_bus_is_asked_at_every_address_and_one_without_a_sensor_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
