@@ -12,7 +12,7 @@ import pytest
 
 import imud.cli
 from imud import __version__
-from imud.cli import COMMANDS
+from imud.cli import COMMANDS, build_parser
 from imud.cli.arguments import CliCommand
 from imud.cli.schema import driver_schemas
 from imud.drivers import DRIVERS
@@ -37,6 +37,33 @@ def test_the_table_has_every_command_of_every_module() -> None:
 def test_version_and_usage_without_a_command(cli: Cli) -> None:
     cli.refuses("usage: imud ")
     assert cli("--version").out == f"imud {__version__}\n"
+
+
+ARGUMENTS = """\
+schema: json; doctor: config json; info F: file=F json; status: device json; probe: active json port
+clock: device duration json; record: device duration file snapshot; command B: arguments device=B name yes
+calibrate B: device=B json kind save stop yes; events: count device follow json priority=debug since
+web: address=127.0.0.1 host port=9322 reading token_file; demo: bus device duration interface plain port rate=100.0
+replay F: baud driver file=F fresh interface json option speed
+watch: convention count device fields follow format=table latency rate
+settings B: apply backup device=B json restore save set verbose yaml yes
+decode --driver hipnuc-uart F: driver=hipnuc-uart file=F interface option
+noise B: baud device driver duration input=B interface json option output sheet skip
+modbus scan P: action=scan addresses=range(1, 248) baud=115200 json port=P reply_ms=20
+foxglove: address=127.0.0.1 allow_origin device host noise open port=8765 rate=100.0 schema=ros2
+setup: active can config=/etc/imud.yaml control dry_run i2c json place rs485 spi undo wait=30.0 yes
+spectrum B: bands baud device driver duration input=B interface json option output resolution sensor skip
+modbus assign P --from 2: action=assign address=2 baud=115200 id json no_save port=P random reply_ms=20 serial
+export --to csv F: baud convention device driver fields file=F force interface noise option output schema table to=csv
+"""  # arguments of each command, with the defaults that are not empty
+
+
+@pytest.mark.parametrize("line", ARGUMENTS.strip().replace("; ", "\n").splitlines())
+def test_arguments_and_their_defaults(line: str) -> None:
+    words, _, expected = line.partition(": ")
+    parsed = vars(build_parser(words.split()[:1]).parse_args(words.split()))
+    shown = [name + (f"={parsed[name]}" if parsed[name] else "") for name in sorted(parsed)]
+    assert " ".join(one for one in shown if one.partition("=")[0] not in ("command", "parser", "socket")) == expected
 
 
 def test_no_daemon_a_daemon_that_hangs_and_an_interrupt(tmp_path: Path, cli: Cli) -> None:
