@@ -32,7 +32,7 @@ def noise_of_three(n: float = 1e-3) -> FloatArray:
     return np.stack([white(random, COUNT, RATE_HZ, n) for _ in range(3)], axis=1)
 
 
-def test_cells_and_durations() -> None:
+def test_cells_and_durations_and_figures_hold_or_not_and_open_ones_have_no_verdict() -> None:
     for figure, words in [
         (None, "-"), (Coefficient(0.00123456, 0.0, 0.0), "1.23"),
         (Coefficient(0.00123456, 0.0000412, 0.0), "1.23 ±0.04"), (Coefficient(None, 0.0, 0.005), "< 5"),
@@ -41,26 +41,20 @@ def test_cells_and_durations() -> None:
         assert noise.cell(figure, MILLI) == words
     for seconds, words in [(12.34, "12.3 s"), (150.0, "2 min 30 s"), (7260.0, "2 h 1 min")]:
         assert noise.duration_words(seconds) == words
-
-
-def test_figures_hold_or_not_and_open_ones_have_no_verdict() -> None:
     sheet = ModelFigures(gyro=SensorFigures(random_walk=1.2e-3, noise_density=1e-3), source="a sheet")
-    report = noise.noise_report(sample_set_of(noise_of_three()), sheet)
-    walk, density = noise.comparisons(report, "gyro")
+    walk, density = noise.comparisons(noise.noise_report(sample_set_of(noise_of_three()), sheet), "gyro")
     assert (walk.quantity.key, walk.verdict) == ("random_walk", "within")
     assert walk.ratio == pytest.approx(1 / 1.2, rel=0.05)
     assert (density.quantity.key, density.verdict) == ("noise_density", "ABOVE")
     assert density.ratio == pytest.approx(np.sqrt(2), rel=0.05)
     sheet = ModelFigures(gyro=SensorFigures(bias_instability=1e-6, rate_random_walk=10.0), source="a sheet")
     bias, walk = noise.comparisons(noise.noise_report(sample_set_of(noise_of_three()), sheet), "gyro")
-    assert (bias.measured, bias.verdict) == (None, "not resolved")
-    assert walk.verdict == "within"
+    assert (bias.measured, bias.verdict, walk.verdict) == (None, "not resolved", "within")
 
 
 def test_what_limits_the_figures_and_what_is_not_compared() -> None:
     values = np.round(noise_of_three() / 1.7453293e-3) * 1.7453293e-3
-    report = noise.noise_report(sample_set_of(values), None)
-    words = " ".join(noise.limits(report, "gyro"))
+    words = " ".join(noise.limits(noise.noise_report(sample_set_of(values), None), "gyro"))
     assert "multiples of 0.001745 rad/s (in the manual)" in words
     moved = noise_of_three()
     moved[2000:4000] += np.sin(np.arange(2000) / 10)[:, None]
@@ -69,6 +63,8 @@ def test_what_limits_the_figures_and_what_is_not_compared() -> None:
     assert "filter of the device: low-pass 47 Hz (factory setting" in words
     words = text(noise.noise_report(sample_set_of(noise_of_three()), None))
     assert "bow: noise" in words
+    head = f"\ngyroscope{'x':>39}{'y':>15}{'z':>15}\n  angle random walk N    deg/√h         3."
+    assert head in words
     assert "product HI14" in words
     assert "No comparison with a data sheet: HiPNUC" in words
     made = noise.noise_report(sample_set_of(noise_of_three(), "<can>"), None)
@@ -83,7 +79,7 @@ def test_what_limits_the_figures_and_what_is_not_compared() -> None:
         noise.noise_report(SampleSet("a file", "bow"), None)
 
 
-def test_figures_become_si_and_those_of_the_user_come_first(tmp_path: Path) -> None:
+def test_figures_become_si_and_those_of_the_user_come_first_and_what_is_wrong_is_named(tmp_path: Path) -> None:
     file = tmp_path / "sheet.yaml"
     file.write_text(
         "source: data sheet, table 2\n"
@@ -110,9 +106,6 @@ def test_figures_become_si_and_those_of_the_user_come_first(tmp_path: Path) -> N
     assert noise.figures_for(sheet, "HI14R2", given) is given
     assert noise.figures_for(sheet, "HI14R2", None) is stated
     assert noise.figures_for(sheet, "CH100", None) is None
-
-
-def test_what_is_wrong_is_named(tmp_path: Path) -> None:
     file = tmp_path / "sheet.yaml"
     for content, words in [
         ("gyro: {random_walk: 0.3}", "random_walk"), ("gyro: {random_walk_deg_sqrt_h: -1}", "gyro"),

@@ -27,16 +27,16 @@ COUNT = 2000
 PAGES = 4
 
 
-def collected(frequency_hz: float, count: int = COUNT) -> Collector:
+def collected(*frequencies_hz: float, count: int = COUNT) -> Collector:
     collector = Collector("bow")
-    accel, _ = shaken(count, RATE_HZ, frequency_hz)
+    accel = sum((shaken(count, RATE_HZ, hz)[0] for hz in frequencies_hz), np.zeros((count, 3)))
     for number, (x, y, z) in enumerate(accel.tolist()):
         t_ns = NS_PER_S + round(number * NS_PER_S / RATE_HZ)
         collector.add(Sample("bow", number + 1, t_ns, 0, Sync.EDGE, t_ns, t_ns, accel_m_s2=(x, y, z)))
     return collector
 
 
-def test_the_page_also_of_too_few_samples_and_of_no_values() -> None:
+def test_the_page_also_of_too_few_samples_and_of_no_values_and_columns_bars_and_axis() -> None:
     view = LiveView("bow", "accel")
     pages = [view.page(collected(hz), SpectrumOptions(("accel",))).splitlines() for hz in (25.0, 75.0)]
     for page in pages:
@@ -50,27 +50,27 @@ def test_the_page_also_of_too_few_samples_and_of_no_values() -> None:
     darkest = [max(range(len(row)), key=lambda at, row=row: SHADES.index(row[at])) for row in past]  # type: ignore[misc]
     assert darkest == [pytest.approx(60, abs=2), pytest.approx(20, abs=2)], "newest row first"
     assert any(line.startswith("  P1") and " 75.0" in line for line in second)
-    assert "at least 64 samples" in view.page(collected(25.0, 10), SpectrumOptions(("accel",)))
+    assert int(second[1].split()[0]) - int(second[11].split()[0]) == 60, "range in dB"
+    several = collected(*range(10, 80, 10))
+    newest = [view.page(several, SpectrumOptions(("accel",))) for _ in range(9)][-1]
+    assert ("; last 8 s, newest row first:" in newest, newest.splitlines()[-1][:4]) == (True, "  P5")
+    assert view.page(collected(0.0), SpectrumOptions(("accel",))).endswith("\n  no line is above the noise")
+    assert "at least 64 samples" in view.page(collected(25.0, count=10), SpectrumOptions(("accel",)))
     page_of_gyro = LiveView("bow", "gyro").page(collected(25.0), SpectrumOptions(("gyro",)))
     assert "sends no values of the gyroscope" in page_of_gyro
     found = SampleSet("a file", "bow", readings=collected(25.0).readings())
     assert list(command.spectrum_report(found, SpectrumOptions(("gyro", "accel"))).sensors) == ["accel"]
     with pytest.raises(ImudError, match="a file: bow sends no values of gyro"):
         command.spectrum_report(found, SpectrumOptions(("gyro",)))
-
-
-def test_columns_bars_and_axis() -> None:
     accel, _ = shaken(20_000, RATE_HZ, 30.0)
     spectrum = power_spectrum([accel], RATE_HZ, 2048)
     columns = in_columns(spectrum)
-    assert len(columns) == 80
-    assert columns.max() == spectrum.density[1:].sum(axis=1).max()
+    assert (len(columns), columns.max()) == (80, spectrum.density[1:].sum(axis=1).max())
     few = in_columns(power_spectrum([accel], RATE_HZ, 64))
     assert len(few) == 80
     assert (few > 0).all()
     rows = curve_rows(np.concatenate(([1.0, 0.5, 1 / 64], np.zeros(77))))
-    assert len(rows) == 8
-    assert (rows[0], rows[4], rows[-1]) == ("█", "██", "██▁")
+    assert (len(rows), rows[0], rows[4], rows[-1]) == (8, "█", "██", "██▁")
     line = axis_line(200.0)
     assert len(line) == 80
     assert line.startswith("0")
