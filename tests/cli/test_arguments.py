@@ -29,23 +29,20 @@ def test_an_unknown_option_and_one_that_is_not_a_finite_number_are_refused(cli: 
         assert "unrecognized arguments: --bogus" in found
 
 
-def test_ports_and_durations() -> None:
+def test_ports_and_durations_and_values_are_json_or_text() -> None:
     for port in (0, 65535):
         check_port(port)
     for port in (-1, 65536):
         with pytest.raises(BadArgument, match=f"--port: expected 0 to 65535, got {port}"):
             check_port(port)
-    texts = {"90": 90, "90s": 90, "10min": 600, "1.5h": 5400, "2 d": 172_800, " .5s ": 0.5}
-    assert {text: duration_s(text) for text in texts} == texts
+    durations = {"90": 90, "90s": 90, "10min": 600, "1.5h": 5400, "2 d": 172_800, " .5s ": 0.5}
+    assert {text: duration_s(text) for text in durations} == durations
     for text in ["", "min", "0", "-1s", "1 week", "1e3", "10m", "nan", "9" * 400 + "s"]:
         with pytest.raises(argparse.ArgumentTypeError, match="expected a duration, for example 90s, 10min or 2h"):
             duration_s(text)
     for words in (["clock"], ["record"], ["noise", "bow"], ["demo"], ["fleet", "top", "mqtt://host"]):
         parsed = [build_parser(words[:1]).parse_args([*words, name, "2min"]) for name in ("--duration", "--for")]
         assert [one.duration for one in parsed] == [120, 120]
-
-
-def test_values_are_json_or_text() -> None:
     texts = ("axes=9", "enabled=false", "turned=[1,0,0]", "turned=x-90", "a=b=c", "a=")
     assert [argument(text)[1] for text in texts] == [9, False, [1, 0, 0], "x-90", "b=c", ""]
     assert argument("axes=9")[0] == "axes"
@@ -143,8 +140,7 @@ def written(tmp_path: Path, content: object) -> Path:
 
 
 def test_deviations_are_the_quadratic_mean_of_the_axes(tmp_path: Path) -> None:
-    file = written(tmp_path, report(gyro=[0.001, 0.007, 0.005], accel=[0.02, 0.02, 0.02]))
-    device, noise = read_noise(file)
+    device, noise = read_noise(written(tmp_path, report(gyro=[0.001, 0.007, 0.005], accel=[0.02, 0.02, 0.02])))
     assert device == "bow"
     assert noise.gyro_rad_s == pytest.approx(0.005)  # (1 + 49 + 25) / 3 = 25
     assert noise.accel_m_s2 == pytest.approx(0.02)

@@ -29,13 +29,11 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
 def test_calibrations_are_listed_verified_and_saved(daemon: RunningDaemon, cli: Cli) -> None:
     words = ("calibrate", "--socket", daemon.socket, "bow")
     out = cli(*words).out
-    assert "magnetometer_once" in out
-    assert "not done yet" in out
-    assert "until power-off; it cannot be saved" in out
+    found = "magnetometer_once", "not done yet", "until power-off; it cannot be saved"
+    assert [words for words in found if words not in out] == []
     out = cli(*words, "level", "--yes", "--save").out
     assert "  1. Put the device down in the attitude that must be level, and do not touch it.\n" in out
-    assert "\nverified\n  roll: " in out
-    assert "°, limit 0.5°: passed\n  saved\n" in out
+    assert [words for words in ("\nverified\n  roll: ", "°, limit 0.5°: passed\n  saved\n") if words not in out] == []
     (level,) = [line for line in cli(*words).out.splitlines() if line.startswith("level ")]
     assert ", saved " in level
     past = cli("events", "--since", "1h", "--socket", daemon.socket).out.splitlines()
@@ -149,8 +147,7 @@ def test_progress_is_a_bar_on_a_terminal_and_only_begin_and_end_elsewhere() -> N
         _show(event, terminal, as_json=False)
         _show(event, plain, as_json=False)
         _show(event, for_programs, as_json=True)
-    assert terminal.getvalue() == f"\r\x1b[2K{line}\r\x1b[2Kverified"
-    assert plain.getvalue() == "verified\n"
+    assert (terminal.getvalue(), plain.getvalue()) == (f"\r\x1b[2K{line}\r\x1b[2Kverified", "verified\n")
     assert [json.loads(one)["message"] for one in for_programs.getvalue().splitlines()] == ["half of it", "verified"]
 
 

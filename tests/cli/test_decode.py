@@ -13,8 +13,7 @@ from imud.drivers.hipnuc.uart.codec import encode_frame
 from tests.cli.conftest import Cli
 from tests.support.files import hi91, imu61x_log
 
-# Frame of the manual, section 3.5
-MANUAL_FRAME = bytes.fromhex(
+MANUAL_FRAME = bytes.fromhex(  # Frame of the manual, section 3.5
     "5AA54C0014BB910815 2309A2C447 08151C00 CCE861BE9A35563E65EA723F 31D07CBD75DDC5BB6BD724BC"
     "8988FC4001006A41AB2A70C2 96D45041ED03434141F4F4C2 CCCAF8BE736A19BEF0001C3D8D375C3F".replace(" ", "")
 )
@@ -84,8 +83,9 @@ def test_log_of_a_can_bus(tmp_path: Path, cli: Cli) -> None:
     problem, counted = printed.err.splitlines()
     assert "expected a candump log (candump -L), got 1 invalid lines" in problem
     ledger = json.loads(counted)
-    assert (ledger["bytes_in"], ledger["bytes_skipped"]) == (81, 1)
-    assert ledger["frames_in_samples"] == 10
+    assert (ledger["bytes_in"], ledger["bytes_skipped"], ledger["frames_in_samples"]) == (81, 1, 10)
+    log.write_text("(1.0) can0 588#6017100000000000\n")  # a device confirms a written setting
+    assert cli("decode", "--driver", "hipnuc-canopen", log).out == '{"reply":1416,"payload":"6017100000000000"}\n'
 
 
 def test_a_fifo_is_read_and_needs_a_writer(tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,13 +2,15 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
+from imud.contracts.command import Risk
 from tests.cli.conftest import Cli
 from tests.support.daemon_process import RunningDaemon, daemon_with_module, running_daemon
 
-pytestmark = pytest.mark.live
+live = pytest.mark.live
 
 
 @pytest.fixture(scope="module")
@@ -17,6 +19,7 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
         yield daemon
 
 
+@live
 def test_devices_and_verbs_are_listed_and_a_module_obeys(daemon: RunningDaemon, cli: Cli) -> None:
     head, bow = cli("devices", "--socket", daemon.socket).out.splitlines()
     assert head.split() == ["DEVICE", "CONDITION", "RATE", "HZ", "DRIVER", "PRODUCT", "SERIAL", "NUMBER", "LINK"]
@@ -31,6 +34,7 @@ def test_devices_and_verbs_are_listed_and_a_module_obeys(daemon: RunningDaemon, 
     assert out.startswith("sent, not verified: the device moves: ")
 
 
+@live
 def test_mistakes_are_explained(daemon: RunningDaemon, cli: Cli) -> None:
     for words, expected in [
         (["yaw", "angle_deg=181"], "arguments: angle_deg (a number from -180 to 180)"),
@@ -45,6 +49,22 @@ def test_mistakes_are_explained(daemon: RunningDaemon, cli: Cli) -> None:
     cli.refuses("the following arguments are required: DEVICE", "command")
 
 
+def test_a_risk_is_confirmed_and_the_result_has_its_evidence(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = {"verified": True, "evidence": "it replied", "result": [1], "not_saved": "lasts until power-off"}
+    answers = iter([result, result | {"result": None, "not_saved": ""}, {"verified": True}, None])
+    verbs = [{"name": "reset", "help": "h", "parameters": [], "risk": Risk.RESET}]
+    client = MagicMock(call=lambda method, **_more: verbs if method == "actions" else next(answers))
+    monkeypatch.setattr("imud.cli.devices.Client", made := MagicMock())
+    made.return_value.__enter__.return_value = client
+    cli.refuses(f"{Risk.RESET}: cannot ask for confirmation without a terminal", "command", "bow", "reset")
+    for words in (
+        "verified: it replied\n[1]\nlasts until power-off", "verified: it replied", '{"verified":true}', "done",
+    ):  # fmt: skip
+        assert cli("command", "bow", "reset", "--yes").out == words + "\n"
+    assert made.call_args.kwargs == {"timeout_s": 180.0}, "a calibration takes two minutes"
+
+
+@live
 def test_without_a_running_device_the_status_is_1(tmp_path: Path, cli: Cli) -> None:
     device = {"driver": "hipnuc-uart", "uart": {"port": str(tmp_path / "none"), "baud": 115200}}
     with running_daemon(tmp_path, {"bow": device}) as daemon:

@@ -34,8 +34,7 @@ pytestmark = pytest.mark.usefixtures("in_kolkata")
 def test_a_line_and_an_object_have_local_time_and_priority() -> None:
     text = as_text(printed(DOWN, OFFSET_NS))
     assert text == "2026-09-21T19:43:25.123+05:30 warning bow: down: the adapter was pulled out"
-    event = Event(0, "", EventKind.CONFIGURATION, "read anew\nand more")
-    text = as_text(printed(event, OFFSET_NS))
+    text = as_text(printed(Event(0, "", EventKind.CONFIGURATION, "read anew\nand more"), OFFSET_NS))
     assert text == r"2026-09-21T19:43:20.123+05:30 warning imud: configuration: read anew\nand more"
     assert json.loads(as_json(printed(DOWN, OFFSET_NS))) == {
         "time": "2026-09-21T19:43:25.123+05:30", "priority": "warning", "t_ns": 5 * NS_PER_S, "device": "bow",

@@ -103,8 +103,7 @@ def test_csv_of_rfc_4180_chosen_fields_events_and_losses(recorded: Recorded, tmp
     for words in (["-o", tmp_path / "a.txt"], []):
         problem = "expected --to, or an output file with the suffix .csv or .mcap, got "
         cli.refuses(problem, "export", recorded.file, *words)
-    data = (tmp_path / "a.csv").read_bytes()
-    lines = data.split(b"\r\n")
+    lines = (tmp_path / "a.csv").read_bytes().split(b"\r\n")
     assert lines[-1] == b""
     assert b"\n" not in b"".join(lines)
     assert len({line.count(b",") for line in lines[:-1]}) == 1
@@ -170,8 +169,7 @@ def test_mcap_with_ros_2_is_a_bag_for_rosbags(recorded: Recorded, tmp_path: Path
         types = {connection.topic: connection.msgtype for connection in reader.connections}
         for connection, t_ns, data in reader.messages():
             found.setdefault(connection.topic, []).append((t_ns, reader.deserialize(data, connection.msgtype)))
-    assert types["/bow/imu/data"] == "sensor_msgs/msg/Imu"
-    assert types["/bow/imu/mag"] == "sensor_msgs/msg/MagneticField"
+    assert (types["/bow/imu/data"], types["/bow/imu/mag"]) == ("sensor_msgs/msg/Imu", "sensor_msgs/msg/MagneticField")
     assert types["/bow/pressure"] == "sensor_msgs/msg/FluidPressure"
     assert (types["/tf"], types["/events"]) == ("tf2_msgs/msg/TFMessage", "rcl_interfaces/msg/Log")
     assert types["/diagnostics"] == "diagnostic_msgs/msg/DiagnosticArray"
@@ -181,8 +179,7 @@ def test_mcap_with_ros_2_is_a_bag_for_rosbags(recorded: Recorded, tmp_path: Path
         ):
             header, force, turn = imu.header, imu.linear_acceleration, imu.orientation
             assert t_ns == sample.utc_ns == header.stamp.sec * 10**9 + header.stamp.nanosec
-            assert header.frame_id == device
-            assert (force.x, force.y, force.z) == sample.accel_m_s2
+            assert (header.frame_id, (force.x, force.y, force.z)) == (device, sample.accel_m_s2)
             assert (turn.w, turn.x, turn.y, turn.z) == sample.quat_wxyz
             assert (stamp.seq, stamp.t_ns, stamp.t_err_ns) == (sample.seq, sample.t_ns, sample.t_err_ns)
     assert (len(found["/tf"]), found["/bow/losses"][0][1].lost_crc) == (len(recorded.samples), 0)
@@ -320,8 +317,7 @@ def test_a_raw_capture_has_the_times_of_the_device_and_says_so(tmp_path: Path, c
 
 
 def test_a_stamped_capture_and_a_log_of_candump_have_their_own_times(tmp_path: Path, cli: Cli) -> None:
-    file = stamped_capture(tmp_path / "c.capture")
-    printed = cli("export", "--to", "csv", file)
+    printed = cli("export", "--to", "csv", stamped_capture(tmp_path / "c.capture"))
     found = rows(printed.out)
     assert len(found) == FRAMES
     assert abs(int(found[-1]["t_ns"]) - (1000 * 10**9 + 299 * 10**7)) < 10**7
@@ -399,8 +395,7 @@ def test_the_file_is_there_when_it_is_whole_and_an_old_one_is_kept_without_force
         out.write(b"one")
         assert not file.exists()
         out.write(b"two")
-    assert file.read_bytes() == b"onetwo"
-    assert out.written_bytes == 6
+    assert (file.read_bytes(), out.written_bytes) == (b"onetwo", 6)
     assert sorted(one.name for one in tmp_path.iterdir()) == ["a", "source"]
     interrupted(output(tmp_path / "b", tmp_path))
     assert sorted(one.name for one in tmp_path.iterdir()) == ["a", "source"]

@@ -82,7 +82,7 @@ def test_the_pipe_is_as_large_as_the_kernel_allows(file: Path, monkeypatch: pyte
 
     monkeypatch.setattr(playing, "fcntl", kept)
     playing.play_beside(file, KeepingSink(), [], lambda _at: None)
-    assert sizes == [playing.PIPE_BYTES]
+    assert sizes == [1 << 20]
     monkeypatch.setattr(playing, "fcntl", Mock(side_effect=PermissionError(1, "Operation not permitted")))
     sink = KeepingSink()
     playing.play_beside(file, sink, [], lambda _at: None)
@@ -134,6 +134,7 @@ def test_the_command_writes_the_same(file: Path, tmp_path: Path, monkeypatch: py
     monkeypatch.setattr("imud.cli.export_sources.BESIDE_BYTES", 0)
     cli(*to, "-o", beside, file)
     assert here.read_bytes() == beside.read_bytes()
+    assert here.stat().st_mode & 0o7111 == 0, "no program"
     cli.refuses("expected a device of the recording: bow, mast", *to, "--device", "stern", str(file))
 
 
@@ -169,5 +170,4 @@ def test_a_bar_with_share_samples_and_time_and_how_often_it_is_drawn() -> None:
     progress = playing.Progress(1000, out, lambda: 0.0)
     progress.add(10 * playing.LOOK_SAMPLES, lambda: 500)
     progress.close()
-    assert out.getvalue() == ""
-    assert progress.samples == 10 * playing.LOOK_SAMPLES
+    assert (out.getvalue(), progress.samples) == ("", 10 * playing.LOOK_SAMPLES)

@@ -170,8 +170,7 @@ def test_diagnostics_have_state_losses_and_the_error_of_the_clock(seen: Seen) ->
     for _, array in seen.messages["/diagnostics"]:
         (bow,) = array.status
         assert (bow.name, bow.message.partition(":")[0]) == ("imud: bow", "ok")
-        values = {one.key: one.value for one in bow.values}
-        assert values.keys() >= {"state", "t_err_ns", "rate_hz", "lost_crc"}
+        assert {one.key: one.value for one in bow.values}.keys() >= {"state", "t_err_ns", "rate_hz", "lost_crc"}
     (bow,) = seen.stale.status
     assert (bow.name, bow.level) == ("imud: bow", bow.STALE)
     assert "daemon" in bow.message
@@ -185,6 +184,5 @@ def test_an_open_address_needs_an_option_and_gives_a_warning(cli: Cli, monkeypat
     monkeypatch.setattr("imud.web.foxglove.Relay", relay)
     for address, more, rate_hz in (("0.0.0.0", ["--open", "--rate", "0"], None), ("127.0.0.1", ["--rate", "7"], 7.0)):
         err = cli("foxglove", "--address", address, *more).err
-        assert err.count("\n") == 1 + (address == "0.0.0.0")
-        assert relay.call_args.kwargs["rate_hz"] == rate_hz
+        assert (err.count("\n"), relay.call_args.kwargs["rate_hz"]) == (1 + (address == "0.0.0.0"), rate_hz)
     assert relay.return_value.run.call_count == server.return_value.close.call_count == 2

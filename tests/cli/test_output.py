@@ -90,16 +90,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 Captured = pytest.CaptureFixture[str]
 COMMANDS: dict[str, Callable[[Path], list[str]]] = {
-    "check": lambda folder: ["check", f"{folder}/imud.yaml"],
-    "schema": lambda _: ["schema", "--json"],
+    "check": lambda folder: ["check", f"{folder}/imud.yaml"], "schema": lambda _: ["schema", "--json"],
     "decode": lambda folder: ["decode", "--driver", "hipnuc-uart", f"{folder}/capture"],
     "replay": lambda folder: ["replay", "--json", f"{folder}/capture"],
     "replay-recording": lambda folder: ["replay", "--json", f"{folder}/recording"],
     "export-csv": lambda folder: ["export", "--to", "csv", f"{folder}/recording"],
     "export-mcap": lambda folder: ["export", "--to", "mcap", f"{folder}/recording"],
-    "help": lambda _: ["run", "--help"],
-    "version": lambda _: ["--version"],
-}
+    "help": lambda _: ["run", "--help"], "version": lambda _: ["--version"],
+}  # fmt: skip
 
 
 def ended(words: list[str], output: int) -> object:

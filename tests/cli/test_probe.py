@@ -132,8 +132,7 @@ def test_a_silent_port_a_port_that_ends_and_one_that_cannot_be_opened(ports: Por
         ending.module_is_on = False
         assert printed(cli, status=1).problem == problem
         assert not ending.is_open
-    gone = ports(Port())
-    gone.is_open = True
+    ports(Port()).is_open = True
     assert printed(cli, status=1) == ProbeReport(PORT, "FT232R", problem=f"{PORT} is already open")
 
 
@@ -188,8 +187,7 @@ def test_every_device_of_the_bus_is_listed_and_queried_where_it_is_allowed(bus: 
         ("can0", "fake-can", "node 8", 500_000, "error-active", {}),
         ("can0", "fake-can", "node 9", 500_000, "error-active", {}),
     ]
-    assert block(reports[0]) == "can0\n  fake-can node 8 at 500000 bit/s\n  error-active"
-    assert bus.made[0].written == []
+    assert (block(reports[0]), bus.made[0].written) == ("can0\n  fake-can node 8 at 500000 bit/s\n  error-active", [])
     assert not bus.made[0].is_open
     bus.frames = [fake_can_frame(8, number) for number in (1, 2)]
     assert [report.identity for report in examined(ask=True)] == [{"product": "FAKE"}]

@@ -2,18 +2,21 @@
 
 import itertools
 import json
+from argparse import Namespace
 from io import BytesIO
 from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
 from random import Random
+from unittest.mock import Mock, patch
 
 import msgspec
 import pytest
 
 from imud import drivers
-from imud.cli.replay import play_to_end
+from imud.cli.replay import Printer, configuration, play_to_end
 from imud.contracts.driver import CanDriver, of_kind
+from imud.contracts.publisher import Batch
 from imud.drivers.hipnuc.uart.codec import encode_frame
 from imud.drivers.imu61x.can import encode_set
 from imud.formats.can import CanFrame
@@ -40,6 +43,14 @@ def test_every_sample_is_printed_and_the_report_names_unknown_times(tmp_path: Pa
     assert times == sorted(set(times))
     assert "samples   50; lost 0" in printed.err
     assert "all accounted for" in printed.err
+    for socket, served in ((None, {"enabled": False}), (Path("/s"), {"enabled": True, "path": "/s"})):
+        args = Namespace(driver="hipnuc-uart", option=[], socket=socket, file=file, speed="", baud=0, interface=None)
+        assert json.loads(configuration(args))["socket"] == served
+    printer = Printer(stop := Mock())
+    with patch("builtins.print", side_effect=OSError(28, "No space left on device")) as print_:
+        printer.close()
+        printer.publish(Batch("bow", 0, []))
+    assert (print_.call_count, stop.call_count, str(printer.problem)) == (1, 1, "[Errno 28] No space left on device")
     (tmp_path / "noise").write_bytes(b"\x00" * 500)
     assert "samples   0" in cli("replay", tmp_path / "noise", status=1).err
     cli.refuses("none", "replay", str(tmp_path / "none"))
@@ -134,8 +145,7 @@ def test_options_of_captures_a_fresh_clock_and_dropped_records(recorded: Recorde
     for option in (["--driver", "hipnuc-uart"], ["--baud", "9600"], ["--speed", "real"], ["--option", "a=1"]):
         cli.refuses(f"{option[0]} applies to captures only", "replay", *option, str(recorded[0]))
     printed = cli("replay", "--json", "--fresh", recorded[0])
-    assert len(printed.out.splitlines()) == len(recorded[1])
-    assert printed.err.count("a new clock was requested") == 2
+    assert (len(printed.out.splitlines()), printed.err.count("a new clock was requested")) == (len(recorded[1]), 2)
     assert cli("replay", recorded[0]).out == "", "samples need --json"
     for lost, status in ((0, 0), (3, 1)):
         player = Player(lambda _batch: None)

@@ -3,8 +3,9 @@
 import os
 import subprocess
 import sys
+from io import BytesIO
 from pathlib import Path
-from unittest.mock import AsyncMock
+from unittest.mock import AsyncMock, Mock, patch
 
 import pytest
 
@@ -19,6 +20,9 @@ from tests.support.surroundings import pipe
 def test_check_accepts_the_shipped_file_and_names_a_mistake_or_a_missing_file(tmp_path: Path, cli: Cli) -> None:
     shipped = ROOT / "etc" / "imud.yaml"
     assert "valid" in cli("check", shipped).out
+    for size, status in ((1 << 20, 0), ((1 << 20) + 1, 2)):
+        with patch("sys.stdin", Mock(buffer=BytesIO(b"devices: {}\n#".ljust(size, b"x")))):
+            assert ("expected at most 1048576 bytes" in cli("check", "-", status=status).err) is (status == 2)
     bad = tmp_path / "bad.yaml"
     bad.write_text("devices:\n  bow:\n    uart:\n      port: /dev/ttyUSB0\n      baut: 9600\n")
     error = cli("check", bad, status=2).err

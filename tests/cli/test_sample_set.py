@@ -29,7 +29,8 @@ def sample(number: int, device: str = "bow", **more: object) -> Sample:
 
 def test_values_come_in_order_with_nan_for_what_is_absent() -> None:
     collector = Collector()
-    collector.publish(Batch("bow", 0, [sample(0, temperature_c=20.0), sample(1, gyro_rad_s=None)]))
+    turned = sample(1, gyro_rad_s=None, euler_rad=(0.1, 0.2, 0.3))
+    collector.publish(Batch("bow", 0, [sample(0, temperature_c=20.0), turned]))
     found = collector.readings()
     assert found.t_ns.tolist() == [NS_PER_S, NS_PER_S + NS_PER_S // 10]
     assert found.gyro_rad_s is not None
@@ -38,6 +39,8 @@ def test_values_come_in_order_with_nan_for_what_is_absent() -> None:
     assert found.temperature_c is not None
     assert found.temperature_c[0] == 20.0
     assert np.isnan(found.temperature_c[1])
+    assert found.euler_rad is not None
+    assert (np.isnan(found.euler_rad[0]).all(), found.euler_rad[1].tolist()) == (True, [0.1, 0.2, 0.3])
     assert collector.stamps() == "100 % edge; mean time stamp error 1 µs"
     collector = Collector()
     collector.add(sample(0, accel_m_s2=None))
@@ -77,12 +80,13 @@ def test_the_devices_own_time_and_a_live_view_that_drops_the_past() -> None:
         collector.add(sample(8, t_dev_ns=None))
     collector = Collector()
     for number in range(10):
-        collector.add(sample(number))
+        collector.add(sample(number, temperature_c=number, euler_rad=(number, 0, 0), accel_m_s2=(number, 0, 0)))
     collector.drop_before(NS_PER_S + 6 * NS_PER_S // 10)
     found = collector.readings()
     assert len(found.t_ns) == len(collector) == 4
-    assert found.gyro_rad_s is not None
-    assert found.gyro_rad_s[:, 0].tolist() == [6.0, 7.0, 8.0, 9.0]
+    for values in (found.gyro_rad_s, found.accel_m_s2, found.euler_rad, found.temperature_c):
+        assert values is not None
+        assert values.reshape(4, -1)[:, 0].tolist() == [6.0, 7.0, 8.0, 9.0]
     with pytest.raises(BadArgument, match="bow: expected a file, or a device of the daemon"):
         status_of([], "bow")
 

@@ -45,8 +45,7 @@ def actual(daemon: RunningDaemon) -> dict[str, Any]:
 
 
 def test_from_difference_to_agreement(daemon: RunningDaemon, words: Words, cli: Cli, tmp_path: Path) -> None:
-    # report
-    out = cli(*words, status=1).out
+    out = cli(*words, status=1).out  # report
     assert out.splitlines()[0].split() == ["SETTING", "DECLARED", "ACTUAL"]
     (mode,) = [line.split() for line in out.splitlines() if line.startswith("mode")]
     assert mode == ["mode", "9-axis", "6-axis", "differs"]
@@ -54,8 +53,7 @@ def test_from_difference_to_agreement(daemon: RunningDaemon, words: Words, cli: 
     assert "2.2.4" not in out
     assert "2.2.4" in cli(*words, "--verbose", status=1).out
     assert json.loads(cli(*words, "--json", status=1).out)["status"]["state"] == "differ"
-    # backup, and output as YAML
-    file = tmp_path / "bow.yaml"
+    file = tmp_path / "bow.yaml"  # backup, and output as YAML
     cli(*words, "--backup", file)
     before = actual(daemon)
     pasted = cli(*words, "--yaml").out
@@ -64,8 +62,7 @@ def test_from_difference_to_agreement(daemon: RunningDaemon, words: Words, cli: 
     )
     (device,) = config.parse(text, "pasted").devices
     assert declared_values(device.declared)["output"] == before["output"]
-    # apply the declared settings
-    out = cli(*words, "--apply").out
+    out = cli(*words, "--apply").out  # apply the declared settings
     assert "plan:\n  mode: 6-axis → 9-axis\n" in out
     assert "done:\n  mode: verified\n  output: verified" in out
     assert (actual(daemon)["mode"], actual(daemon)["output"]["hi91"]) == ("9-axis", 50)
@@ -74,8 +71,7 @@ def test_from_difference_to_agreement(daemon: RunningDaemon, words: Words, cli: 
     assert "save to flash: sent, not verified: " in cli(*words, "--save").out
     assert "imud wrote the flash 1 time, 1 within 24 hours" in cli(*words).out
     # restore the backup
-    assert json.loads(cli(*words, "--restore", file, "--json").out)["problem"] == ""
-    assert actual(daemon) == before
+    assert (json.loads(cli(*words, "--restore", file, "--json").out)["problem"], actual(daemon)) == ("", before)
     out = cli("status", "--socket", daemon.socket).out
     assert '  settings  differ: mode is "6-axis", declared "9-axis"' in out
 
@@ -91,8 +87,7 @@ def test_values_in_place_of_the_declared_ones(daemon: RunningDaemon, words: Word
     assert (found["output"]["hi91"], found["alarm"]["x"]["min_deg"], found["alarm"]["x"]["max_deg"]) == (50, -5, 10)
     assert (found["pins"]["led"], found["pins"]["sin"]) == (7, 1)
     cli.refuses("pins: expected another pin for each function, got IO1 for sin and led", *words, "--set", "pins.led=1")
-    out = cli(*words, "--set", "mounting=x_up", status=1).out
-    assert "not set: mounting needs a save and a restart" in out
+    assert "not set: mounting needs a save and a restart" in cli(*words, "--set", "mounting=x_up", status=1).out
 
 
 def test_another_rate(daemon: RunningDaemon, words: Words, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:

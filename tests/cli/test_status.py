@@ -27,7 +27,7 @@ from tests.support.metrics import LINES, POLLING, UTC, device, equipped
 from tests.support.socket_rig import daemon
 
 
-def test_each_part_of_a_device_has_its_row() -> None:
+def test_each_part_of_a_device_has_its_row_and_long_names_fit_80_columns_and_keep_both_ends() -> None:
     assert list(parts(device("bow"))) == []
     assert block(device("bow")).splitlines()[-1].startswith("  kernel ")
     identity = {"product": "IMU61x", "serial_number": "0032", "firmware": "10203", "hardware_version": "2"}
@@ -48,19 +48,14 @@ def test_each_part_of_a_device_has_its_row() -> None:
     ]
     assert block(equipped("bow")).splitlines()[-10:] == [
         "  line      11 requests without a reply; 12 bytes without a request, 13 invalid",
-        "            bytes; 14 echoes (all devices of the bus)",
-        "  sout      5000 edges, 7 lost",
-        "  alarm     ACTIVE, raised 3 times; 2 edges, 0 lost (/dev/gpiochip0 is not",
-        "            there)",
+        "            bytes; 14 echoes (all devices of the bus)", "  sout      5000 edges, 7 lost",
+        "  alarm     ACTIVE, raised 3 times; 2 edges, 0 lost (/dev/gpiochip0 is not", "            there)",
         "  pps       60 edges, 0 lost",
         "  sin       400 triggers, 8 missed; 30.0 µs after the deadline, maximum 900.0 µs",
         "  utc       gpsd at 127.0.0.1:2947: 100 sentences, 90 sent, not sent: stale 7,",
         "            busy 3; 59 pulses, 1 ignored; chronyd accepted 40, refused 19",
         "            (chronyd does not take samples)",
-    ]
-
-
-def test_long_names_fit_80_columns_and_keep_both_ends() -> None:
+    ]  # fmt: skip
     port = "/dev/serial/by-id/usb-Silicon_Labs_CP2102N_USB_to_UART_Bridge_Controller_7cb5c9f6a1e4e811-if00-port0"
     missing = device("n" * 32, link=f"{port} at 115200 baud", state=DeviceState.MISSING, problem=f"{port} is not there")
     lines = block(missing).splitlines()

@@ -65,8 +65,7 @@ def test_the_rate_devices_and_convention_of_the_table(words: Words, cli: Cli) ->
         seqs = [int(row.split()[1]) for row in rows]
         assert seqs == [seqs[0], seqs[0] + step, seqs[0] + 2 * step], rate
     _labels, head, *rows = cli(*words, "--count", 8).out.splitlines()
-    assert head.split()[:2] == ["DEVICE", "TIME"]
-    assert {row.split()[0] for row in rows} == {"imu0", "imu1"}
+    assert (head.split()[:2], {row.split()[0] for row in rows}) == (["DEVICE", "TIME"], {"imu0", "imu1"})
     turned = cli(*words, "--count", 1, "--convention", "ned-frd", "--fields", "accel_m_s2", "imu0").out
     assert turned.splitlines()[-1].split() == ["-0.50", "0.12", "-9.75"]
 
