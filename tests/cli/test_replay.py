@@ -8,7 +8,7 @@ from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
 from random import Random
-from unittest.mock import Mock, patch
+from unittest.mock import Mock, call, patch
 
 import msgspec
 import pytest
@@ -50,7 +50,8 @@ def test_every_sample_is_printed_and_the_report_names_unknown_times(tmp_path: Pa
     with patch("builtins.print", side_effect=OSError(28, "No space left on device")) as print_:
         printer.close()
         printer.publish(Batch("bow", 0, []))
-    assert (print_.call_count, stop.call_count, str(printer.problem)) == (1, 1, "[Errno 28] No space left on device")
+    assert (print_.call_args_list, stop.call_count) == ([call("", end="", flush=True)], 1)
+    assert str(printer.problem) == "[Errno 28] No space left on device"
     (tmp_path / "noise").write_bytes(b"\x00" * 500)
     assert "samples   0" in cli("replay", tmp_path / "noise", status=1).err
     cli.refuses("none", "replay", str(tmp_path / "none"))
