@@ -409,9 +409,11 @@ def _change_baud(baud: int, present_baud: int, done: int) -> RequestScript[BaudC
     if (yield from _look((present_baud,))) is None:
         yield from resume_streaming()
         raise NoReply(_unheard(f"{request.name}: nothing was changed", (present_baud,)))
-    rate_hz = yield from read(Parameter.AHRS_RATE)
     try:
-        commands.require_fit(rate_hz, baud)
+        commands.require_fit((yield from read(Parameter.AHRS_RATE)), baud)
+    except NoReply:
+        yield from resume_streaming()
+        raise
     except BadArgument as error:
         yield from resume_streaming()
         raise BadArgument(f"baud: {error}; lower the output rate first") from None

@@ -93,14 +93,16 @@ def test_saved_settings_survive_a_restart(variant: str) -> None:
     far = variant_bench(variant, uptime_us=20_000_000)
     assert SETTINGS.save is not None
     assert SETTINGS.restart is not None
-    write(far, "gyro_filter", "5 Hz", variant)
+    changed = {"output_rate_hz": 200, "accel_filter": "10 Hz", "gyro_filter": "5 Hz", "i2c_address": "0x19"}
+    for name, value in changed.items():
+        write(far, name, value, variant)
     if variant == "no K1":
         with pytest.raises(NoReply, match="it is not known whether the device executed the command"):
             far.run(SETTINGS.save(target(far, variant)))
     else:
         far.run(SETTINGS.save(target(far, variant)))
     far.run(SETTINGS.restart(target(far, variant)))
-    assert read(far, variant) == FACTORY | {"gyro_filter": "5 Hz"}
+    assert read(far, variant) == FACTORY | changed
 
 
 def test_combinations_and_declarations() -> None:
@@ -378,7 +380,7 @@ def test_refusals_and_silence_are_errors() -> None:
     ("script", "replies"),
     [
         (session.identify(), 0), (session.save(), 6), (session.restart(), 8),
-        (session.change_baud(921600, 115200), 0), (session.change_baud(921600, 115200), 4),
+        *[(session.change_baud(921600, 115200), replies) for replies in (0, 2, 4)],
         (session.factory_reset(115200), 0), (session.factory_reset(115200), 5),
     ],
 )  # fmt: skip
@@ -414,6 +416,12 @@ def test_a_refusal_is_an_error_that_names_the_option_and_a_missing_acknowledgeme
         far = imu61x_bench(acknowledges=False)
         with pytest.raises(NoReply, match="got none from a device that replies: it is not known whether"):
             far.run(ORDERS[command]())
+    values = {"output_rate_hz": 50, "accel_filter": 0, "gyro_filter": 0, "i2c_address": 0x1B, "second_bus": "i2c"}
+    for name, value in (values | {"baud": 230400}).items():
+        far = imu61x_bench(refuses=frozenset({Command.SET_PARAMETER}))
+        with pytest.raises(Rejected):
+            write(far, name, value)
+        assert read(far) == FACTORY
 
 
 @every_variant
