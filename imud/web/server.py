@@ -214,6 +214,7 @@ class WebConnections:
         """Remove a closed connection."""
         self._since_s.pop(connection, None)
         self._half_closed.discard(connection)
+        self._answering.discard(connection)
 
     def _close(self, is_wanted: Callable[[float], bool]) -> None:
         for connection, since_s in list(self._since_s.items()):
