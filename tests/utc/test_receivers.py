@@ -170,9 +170,6 @@ def test_a_server_that_does_not_answer_is_retried_after_5_s(monkeypatch: pytest.
     assert source.problem == "cannot connect to gpsd at 127.0.0.1:2947: no answer; is gpsd running?"
 
 
-# --- a serial port ----------------------------------------------------------------------------------------------------
-
-
 class Port:
     title = "/dev/ttyGNSS"
     writable = True

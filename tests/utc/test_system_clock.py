@@ -76,9 +76,6 @@ def test_the_error_is_the_greater_of_both(clock: system_clock.KernelClock, error
     assert reference.error_ns == pytest.approx(error_ns, abs=1)
 
 
-# --- sentences --------------------------------------------------------------------------------------------------------
-
-
 class SystemClockBench:
     """A source with a clock of the test. Its timer does not run, because the tests do not wait."""
 

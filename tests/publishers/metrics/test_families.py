@@ -314,9 +314,6 @@ def test_rendering_pauses_often() -> None:
     assert pauses >= sum(line.startswith(b"# HELP imud_") for line in body.splitlines()) - 2  # no event, no reason
 
 
-# --- documentation and alerts ---------------------------------------------------------------------------------------
-
-
 def shown_names() -> set[str]:
     """Return the names of all families after `# HELP`."""
     recorder = states.RecorderStatus("a", "", 1, 2, 3, 4, 5, 6)

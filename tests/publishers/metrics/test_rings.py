@@ -90,9 +90,6 @@ def test_each_part_of_the_work_is_reported() -> None:
     assert pieces == [1000, *[100] * 30]
 
 
-# --- file -----------------------------------------------------------------------------------------------------------
-
-
 def read(board: Board, newest: int, *, motion: bool = True) -> RingView:
     reader = RingReader(lambda: None, motion=motion)
     return reader.read({DEVICE: str(board.path)}, {DEVICE: newest}, board.now_ns)[DEVICE]
