@@ -43,7 +43,7 @@ from imud.host.log import printable
 from imud.host.service_manager import ServiceManager, notify
 from imud.lines.gpio import GPIO_LINES
 from imud.lines.watched_line import watching
-from imud.model.errors import CommandError, ConfigError, ServerError
+from imud.model.errors import CommandError, ConfigError, ImudError, ServerError
 from imud.model.event import Event, EventKind
 from imud.publishers.outputs import Outputs
 from imud.utc.system_clock import kernel_clock, system_reference
@@ -356,7 +356,8 @@ class Daemon:
         error = context.get("exception")
         if isinstance(error, Exception) and self._outputs.take_error(error):
             return
-        log.error("%s", context.get("message"), exc_info=error if isinstance(error, BaseException) else None)
+        if not isinstance(error, ImudError):  # the caller prints the words of an ImudError
+            log.error("%s", context.get("message"), exc_info=error if isinstance(error, BaseException) else None)
         self._failure = error if isinstance(error, BaseException) else RuntimeError(str(context.get("message")))
         self._stop.set()
 

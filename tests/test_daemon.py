@@ -226,7 +226,9 @@ async def test_whatever_a_part_raises_at_the_end_all_others_are_closed(
 
 @pytest.mark.parametrize("name", ["_on_done", "_on_reloaded"])
 @in_loop
-async def test_a_task_that_fails_ends_the_daemon_and_other_ends_do_not(name: str) -> None:
+async def test_a_task_that_fails_ends_the_daemon_and_other_ends_do_not(
+    name: str, caplog: pytest.LogCaptureFixture
+) -> None:
     daemon = Daemon(EMPTY)
     running = asyncio.create_task(daemon.run())
     for end, *result in (("set_result", None), ("cancel",), ("set_exception", KeyError("broken"))):
@@ -238,12 +240,13 @@ async def test_a_task_that_fails_ends_the_daemon_and_other_ends_do_not(name: str
         getattr(daemon, name)(future)
     with pytest.raises(KeyError, match="broken"):
         await running
-    daemon = Daemon(EMPTY)
-    running = asyncio.create_task(daemon.run())
-    await asyncio.sleep(0)
-    asyncio.get_running_loop().call_exception_handler({"message": "it failed"})
-    with pytest.raises(RuntimeError, match=r"^it failed$"):
-        await running
+    for error in (None, ServerError("it failed")):  # the caller prints the words of imud's own errors
+        running = asyncio.create_task(Daemon(EMPTY).run())
+        await asyncio.sleep(0)
+        asyncio.get_running_loop().call_exception_handler({"message": "it failed", "exception": error})
+        with pytest.raises(ServerError if error else RuntimeError, match=r"^it failed$"):
+            await running
+    assert [one.getMessage() for one in caplog.records if one.levelname == "ERROR"][-2:].count("it failed") == 1
 
 
 def config_of(folder: Path, **devices: dict[str, Any]) -> Config:
