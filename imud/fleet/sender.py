@@ -15,7 +15,16 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from itertools import chain
 from typing import Final, NamedTuple
 
-from imud.fleet.broker import CONNECT_S, BrokerConnection, BrokerError, BrokerTurn, Connect, MessageRefused, Will
+from imud.fleet.broker import (
+    CONNECT_S,
+    LOST,
+    BrokerConnection,
+    BrokerError,
+    BrokerTurn,
+    Connect,
+    MessageRefused,
+    Will,
+)
 from imud.fleet.commands import CommandChannel, CommandReply
 from imud.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
 from imud.fleet.settings import MqttOptions
@@ -305,7 +314,7 @@ class MqttSender:
                 self._check_answers()
         except BrokerError as error:
             pause_s, problem = self._turn.failed(self._now_ns()), str(error)
-            if self._turn.short_runs >= SHORT_RUNS:
+            if self._turn.short_runs >= SHORT_RUNS and problem.endswith(LOST):
                 problem += f"; does another gateway use the client ID {self._client_id} (mqtt.gateway)?"
             self._disconnect(problem)
             return pause_s

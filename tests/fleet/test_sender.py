@@ -5,7 +5,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from imud.fleet.broker import BrokerTurn, Will
+from imud.fleet.broker import LOST, BrokerTurn, Will
 from imud.fleet.commands import CommandChannel, CommandReply
 from imud.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
 from imud.fleet.sender import SKIP_NS, TOPICS_MAX, MqttSender, TopicRefusals
@@ -81,18 +81,18 @@ def test_messages_are_sent_in_order_within_the_window() -> None:
     assert bench.broker.connections[0].rings == 5
 
 
-@pytest.mark.parametrize("stable", [False, True])
-def test_connections_that_are_lost_soon_name_a_gateway_with_the_same_name(stable: bool) -> None:
+@pytest.mark.parametrize(("stable", "problem"), [(False, LOST), (True, LOST), (False, "the broker sent QoS 2")])
+def test_connections_that_are_lost_soon_name_a_gateway_with_the_same_name(stable: bool, problem: str) -> None:
     bench, problems = SenderBench(), list[str]()
     for number in range(4):
         bench.broker.problem = ""
         bench.sender.work()
         bench.clock.advance(STABLE_NS if stable and number == 1 else STABLE_NS - 1)
-        bench.broker.problem = "the connection was lost"
+        bench.broker.problem = problem
         bench.sender.work()
         problems.append(bench.sender.problem)
     named = "the connection was lost; does another gateway use the client ID me (mqtt.gateway)?"
-    assert [problem == named for problem in problems] == [False, False, not stable, not stable]
+    assert problems == [problem] * 2 + [problem if stable or problem != LOST else named] * 2
 
 
 def test_a_lost_connection_clears_the_outbox_and_starts_a_new_session() -> None:
