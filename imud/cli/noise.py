@@ -291,8 +291,13 @@ def table(name: SensorName, sensor: SensorNoise) -> list[str]:
     for title, symbol, unit, cells in rows(name, sensor):
         label = f"{title} {symbol}".rstrip()
         words = f"  {shortened(label, TITLE_WIDTH):<{TITLE_WIDTH}}{unit:<{UNIT_WIDTH}}"
-        lines.append((words + "".join(f"{one:>{CELL_WIDTH}}" for one in cells))[:COLUMNS])
+        lines.append((words + "".join(f"{narrow(one):>{CELL_WIDTH}}" for one in cells))[:COLUMNS])
     return lines
+
+
+def narrow(cell: str) -> str:
+    """Return a cell with a space before it in its column."""
+    return cell if len(cell) < CELL_WIDTH else cell.replace(" ±", "±")
 
 
 def compared(report: NoiseReport, name: SensorName) -> list[str]:

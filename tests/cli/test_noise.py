@@ -38,7 +38,8 @@ def test_cells_and_durations_and_figures_hold_or_not_and_open_ones_have_no_verdi
         (Coefficient(0.00123456, 0.0000412, 0.0), "1.23 ±0.04"), (Coefficient(None, 0.0, 0.005), "< 5"),
         (Coefficient(3.26e3, 3e2, 0.0), "3.26e6 ±3e5"),
     ]:  # fmt: skip
-        assert noise.cell(figure, MILLI) == words
+        assert noise.cell(figure, MILLI) == words == noise.narrow(words)
+    assert noise.narrow("0.00666 ±0.0009") == "0.00666±0.0009"
     for seconds, words in [(12.34, "12.3 s"), (150.0, "2 min 30 s"), (7260.0, "2 h 1 min")]:
         assert noise.duration_words(seconds) == words
     sheet = ModelFigures(gyro=SensorFigures(random_walk=1.2e-3, noise_density=1e-3), source="a sheet")
