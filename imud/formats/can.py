@@ -113,6 +113,8 @@ FIRST: Final = 2  # number of known frames of each identifier
 DIFFERENCES_NS: Final = NS_PER_S  # maximum first time of a log of time differences, ns
 DIFFERENCES_LINES, DIFFERENCES_FALLS = 64, 3  # number of first lines and of their falls that show time differences
 EQUAL_MIN: Final = 16  # minimum number of frames of a log whose times imud checks
+# Number of successive frames with one time that a bus cannot send in the resolution of the clock, nor an adapter hold
+STILL_FRAMES: Final = 256
 INTERFACES_MAX: Final = 16  # maximum number of interfaces in a text
 
 
@@ -175,6 +177,13 @@ class _TimeKind:
 
     def __init__(self) -> None:
         self._first_ns = self._newest_ns = self._frames = self._falls = self._equal = 0
+        self._longest = (0, 0)  # longest run of equal times: number of frames, number of its last line
+
+    @property
+    def problem(self) -> str:
+        """A clock that stands still; empty if there is no such part."""
+        frames, number = self._longest
+        return f"line {number}: the last {frames} frames have the same time (the clock stands still)" if frames else ""
 
     def add(self, t_ns: int, number: int) -> None:
         """Add the time of a frame. Raises BadArgument for time differences."""
@@ -184,6 +193,8 @@ class _TimeKind:
             self._first_ns = t_ns
             return
         self._equal = 0 if distance_ns else self._equal + 1
+        if self._equal + 1 >= max(STILL_FRAMES, self._longest[0]):
+            self._longest = (self._equal + 1, number)
         self._falls += distance_ns < 0
         is_often = self._falls >= max(DIFFERENCES_FALLS, self._frames // 12)
         if self._first_ns < DIFFERENCES_NS and is_often and self._frames <= DIFFERENCES_LINES:
@@ -233,6 +244,8 @@ class CandumpReader:
         found = list(self._jumps)
         if self._jump_count > len(found):
             found.append(f"{self._jump_count - len(found)} more steps or pauses")
+        if self._kind.problem:
+            found.append(self._kind.problem)
         if self.bad_lines:
             found.append(
                 f"expected a candump log (candump -L), got {self.bad_lines} invalid lines "

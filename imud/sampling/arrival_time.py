@@ -26,6 +26,7 @@ SIGMA_OF_HIDDEN: Final = sqrt((2 / 12 + 1 / 4) / 3)
 SMOOTHING: Final = 1 / 32
 # factor by which frames can be faster than the wire before imud assumes that no such wire exists
 WIRE_SLACK: Final = 1.05
+STILL_MOST: Final = 16  # number of frames with one arrival time after which the clock of a capture stands still
 
 
 class LinkDelay:
@@ -76,17 +77,19 @@ class LinkDelay:
 class ArrivalSpread:
     """Mean and spread of the steps between arrivals, for devices without device time."""
 
-    __slots__ = ("_last_ns", "_spread", "period_ns")
+    __slots__ = ("_last_ns", "_spread", "_still", "period_ns")
 
     def __init__(self) -> None:
         self._last_ns = 0
         self._spread = 0.0
+        self._still = 0  # number of successive frames with the same arrival
         self.period_ns = 0.0  # mean step between frames, ns; 0 if unknown
 
     def add_arrival(self, arrival_ns: int, steps: int = 1) -> None:
         """Add the arrival of a frame less its time on the wire, `steps` frames after the previous frame."""
         last_ns, self._last_ns = self._last_ns, arrival_ns
-        if not last_ns:
+        self._still = self._still + 1 if arrival_ns <= last_ns else 0
+        if not last_ns or self._still > STILL_MOST:
             return
         step = (arrival_ns - last_ns) / steps
         if not self.period_ns:
