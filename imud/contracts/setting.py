@@ -304,7 +304,7 @@ class AppliedSettings(msgspec.Struct, frozen=True):
 
     steps: tuple[AppliedStep, ...] = ()
     saved: bool = False
-    restarted: bool = False
+    restarted: bool = False  # whether a restart is verified
     problem: str = ""  # reason of a failure, one sentence; empty if imud did all planned steps
     left_out: dict[str, str] = {}  # msgspec copies a mutable default
     # Remaining differences from the wanted values
@@ -313,6 +313,7 @@ class AppliedSettings(msgspec.Struct, frozen=True):
     # empty if no step is necessary
     advice: str = ""
     not_saved: str = ""  # that the flash lacks a change, and the next step; empty if the flash contains all settings
+    restart_doubt: str = ""  # reason why the restart is not verified; empty otherwise
 
     @property
     def ends(self) -> list[str]:
@@ -323,7 +324,8 @@ class AppliedSettings(msgspec.Struct, frozen=True):
         save = "saved to flash"
         if not (self.restarted and is_verified):
             save = "save to flash: sent, not verified: imud cannot read the flash"
-        return [save] * self.saved + ["restarted"] * self.restarted
+        doubt = [f"restart: sent, not verified: {self.restart_doubt}"] if self.restart_doubt else []
+        return [save] * self.saved + ["restarted"] * self.restarted + doubt
 
     @property
     def failure(self) -> str:

@@ -118,6 +118,8 @@ class VerbRun:
                         verified, evidence = False, "the device restarted during the command"
                 case Proof.VALUE:
                     return answer
+                case Proof.RESTART | Proof.NONE if isinstance(answer, VerbResult):  # the script has checked the restart
+                    verified, evidence, answer = answer.verified or None, answer.evidence, answer.result
                 case Proof.NONE:
                     verified = False
                 case Proof.RESTART:

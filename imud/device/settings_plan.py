@@ -17,7 +17,7 @@ from typing import Annotated, Any, Final, get_args, get_origin
 import msgspec
 
 from imud.config.model import DeviceConfig
-from imud.contracts.command import Risk, Target
+from imud.contracts.command import Risk, Target, VerbResult
 from imud.contracts.driver import Driver
 from imud.contracts.setting import (
     AppliedSettings,
@@ -406,6 +406,7 @@ class Applying:
     """Written values of settings that the device does not report."""
     saved: bool = False
     restarted: bool = False
+    restart_doubt: str = ""
     changed: bool = False  # whether imud has written a setting
     # Settings whose script has reported that the value needs a restart, although the table does not require it
     pending: set[str] = field(default_factory=set)
@@ -428,7 +429,9 @@ class Applying:
             done = await self._restart(done)
         found = differences(self.table, self.wanted, combined(self.reports).values if self.heard else {}, self.written)
         problem = self.problem and self.problem + self._present()
-        return AppliedSettings(tuple(done), self.saved, self.restarted, problem, plan.left_out, found)
+        return AppliedSettings(
+            tuple(done), self.saved, self.restarted, problem, plan.left_out, found, restart_doubt=self.restart_doubt
+        )
 
     async def _write(self, steps: Sequence[PlannedStep]) -> list[AppliedStep]:
         """Write settings up to the first error, read back their reports once, and compare each setting.
@@ -511,10 +514,15 @@ class Applying:
         assert restart is not None
         self.transport.samples.mark()
         try:
-            await self.transport.run_script(restart)
-            verified, words = await self.transport.samples.restarted()
-            self.restarted = verified is not False
-            self.problem = "" if self.restarted else f"restart: {words}"
+            result = await self.transport.run_script(restart)
+            verified: bool | None
+            if isinstance(result, VerbResult):  # the script has checked the effect
+                verified, words = result.verified or None, result.evidence
+            else:
+                verified, words = await self.transport.samples.restarted()
+            self.restarted = verified is True
+            self.problem = f"restart: {words}" if verified is False else ""
+            self.restart_doubt = words if verified is None else ""
         except DEVICE_ERRORS as error:
             self.problem = f"restart: {error}"
         if await self._read(None):

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from msgspec.structs import replace as with_fields
 
+from imud.contracts.command import VerbResult
 from imud.contracts.script import Message, Rejection, Reply, ReplyFrame, Request, RequestScript, never
 from imud.contracts.setting import Written
 from imud.formats.can import CanFilter
@@ -65,18 +66,18 @@ class Readdressing:
         yield replace(next(self.write(new, self.present)), also=(), silent=True)
         raise NoReply(self.lost.format(confirmed=confirmed, new=new, present=self.present))
 
-    def restart(self, request: Request, bus_bit_s: int) -> RequestScript[str]:
-        """Restart the device by `request`, follow it to its place, and return a report.
+    def restart(self, request: Request, bus_bit_s: int) -> RequestScript[str | VerbResult]:
+        """Restart the device by `request`, follow it to its place, and return a report, with evidence if there is any.
 
-        `bus_bit_s` is the bit rate of the bus; 0 if it is not known. Raises NoReply if the device does not reply
-        afterwards.
+        A new place shows the restart, and so does a boot frame that a device sends only then. `bus_bit_s` is the bit
+        rate of the bus; 0 if it is not known. Raises NoReply if the device does not reply afterwards.
         """
         saved = yield from self.read_saved()
         place, code = (saved.get(register, -1) for register in self.registers)
         bit_s = self.bit_rates.get(code, bus_bit_s)
         # a device without a valid saved place keeps its present place
         places = tuple(dict.fromkeys((self.present, place if place in self.valid else self.present)))
-        found = yield from self._boot(request, (*places, self.factory) if saved else None)
+        booted = found = yield from self._boot(request, (*places, self.factory) if saved else None)
         for place in places:
             if found is None and (yield from self.heard(place)):
                 found = place
@@ -86,9 +87,13 @@ class Readdressing:
                 return f"the device now uses {rate} and the bus does not; set the bus to {rate}"
             words = " or ".join(map(str, places))
             raise NoReply(f"no frame of {self.noun} {words} after the restart; does it use another bit rate now?")
+        report = f"found {self.words} {found}"
         if found != self.present:
             yield self.move(found)
-        return f"found {self.words} {found}"
+            return VerbResult(True, f"the device moved from {self.noun} {self.present} to {found}", report)
+        if booted is not None and self.boot_data is not None:
+            return VerbResult(True, "the device sent its boot message", report)
+        return report
 
     def check_factory(self) -> RequestScript[None]:
         """Raise BadArgument if another device uses the factory place."""

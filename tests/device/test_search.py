@@ -226,9 +226,6 @@ async def test_a_problem_of_the_bus_is_the_reason_for_no_result(bus: Bus) -> Non
     await bench.until(lambda: bench.rig.problem == "can0 is bus-off: x")
 
 
-# --- frames that are sent cyclically ----------------------------------------------------------------------------------
-
-
 def syncing(bus: Bus, name: str, node: int, *, writable: bool = True) -> OnBus:
     return bus.add(name, "fake-can", FakeCanSettings(node=node, sync_ms=10), writable=writable)
 

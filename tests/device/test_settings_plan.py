@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from imud.contracts import setting
-from imud.contracts.command import Risk, Target
+from imud.contracts.command import Risk, Target, VerbResult
 from imud.device import settings_plan
 from imud.device.evidence import SampleWatch
 from imud.device.flash import FlashWrites, ModuleFlash
@@ -277,6 +277,7 @@ class TableOfOne:
         self.active: dict[str, Any] = {"x": 1} if readable else {}
         self.done: list[str] = []
         self.result = result
+        self.restarted: VerbResult | None = VerbResult(True, "")
         self.table = setting.SettingsTable(
             table={"x": setting.Setting(type=int, write=self._write, effect=effect, **more)},
             read=self._read, save=lambda _target: self._do("save"), restart=lambda _target: self._restart(),
@@ -298,9 +299,10 @@ class TableOfOne:
         self._do("read")
         return {"": setting.DeviceReport(values=dict(self.active))}
 
-    def _restart(self) -> None:
+    def _restart(self) -> VerbResult | None:
         self._do("restart")
         self.active = dict(self.actual) if self.active else {}
+        return self.restarted
 
 
 class OnePort(settings_plan.SettingsPort):
@@ -357,6 +359,12 @@ def test_values_are_written_read_back_saved_and_compared() -> None:
     found = applied(device)
     assert device.done == ["x=2", "read", "save", "restart", "read"]
     assert found.steps[0].outcome is setting.StepOutcome.VERIFIED
+    no_samples = "the device sends no samples that show a restart"
+    for device.restarted, doubt in ((VerbResult(False, "no pause"), "no pause"), (None, no_samples)):
+        device.active = {"x": 1}
+        found = applied(device)
+        assert (found.steps[0].outcome, found.restarted, found.problem) == (setting.StepOutcome.WRITTEN, False, "")
+        assert found.ends[-1] == f"restart: sent, not verified: {doubt}"
     device = TableOfOne(setting.Written.PENDING)
     found = applied(device, save=False)
     assert device.done == ["x=2", "read"]

@@ -405,9 +405,6 @@ async def test_a_missing_link_needs_no_undo(bench: Imu61xDevice) -> None:
     assert bench.rig.is_in(DeviceState.RUNNING)
 
 
-# --- settings ---------------------------------------------------------------------------------------------------------
-
-
 @every_variant
 @played(lambda variant: Imu61xDevice(STREAMING, behaviour=IMU61X_VARIANTS[variant], uptime_us=20_000_000))
 async def test_settings_are_applied_in_an_order_that_keeps_the_connection(bench: Imu61xDevice, variant: str) -> None:

@@ -174,9 +174,6 @@ def test_declination_and_heading_reference() -> None:
     )
 
 
-# --- the event --------------------------------------------------------------------------------------------------------
-
-
 def test_z_down_and_a_wrong_order_of_angles_are_detected() -> None:
     """The axes of an IMU61x are uncertain: with z down the event names the right option."""
     motion = ZDown(in_body(FrameOptions(), device=FLU_LEVEL))
@@ -281,9 +278,6 @@ def test_each_published_sample_is_rotated_once() -> None:
     assert frame.rotation is not None
     assert frame.rotation.sample(path.newest) == batch.samples[-1]
     assert batch.frame is frame
-
-
-# --- axes of newer firmware -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("keys", [{}, {"declination_deg": 3.0}, {"frame": FrameOptions(level_roll_deg=1.0)}], ids=str)

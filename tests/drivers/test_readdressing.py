@@ -7,6 +7,7 @@ import msgspec
 import pytest
 
 from imud.contracts import script
+from imud.contracts.command import VerbResult
 from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request, RequestScript, Silence
 from imud.contracts.setting import Written
 from imud.drivers.readdressing import Readdressing
@@ -99,7 +100,9 @@ class Bench:
         request = Request(
             frame(self.options.node, RESTART), "restart", script.never, script.never, script.never, silent=True
         )
-        return run_script(self.readdressing().restart(request, bus_bit_s), self.ask)
+        found = run_script(self.readdressing().restart(request, bus_bit_s), self.ask)
+        self.evidence = found.evidence if isinstance(found, VerbResult) else ""
+        return str(found.result) if isinstance(found, VerbResult) else found
 
 
 def frame(at: int, operation: int, value: int = 0) -> bytes:
@@ -108,9 +111,6 @@ def frame(at: int, operation: int, value: int = 0) -> bytes:
 
 def is_from(can_id: int) -> Callable[[object], bool]:
     return lambda message: isinstance(message, ReplyFrame) and message.frame_id == can_id
-
-
-# --- another place ----------------------------------------------------------------------------------------------------
 
 
 def test_a_device_stays_is_followed_or_the_place_is_refused() -> None:
@@ -152,9 +152,6 @@ def test_the_command_back_does_not_wait() -> None:
     assert [*unanswered_ms(Bench(FakeDevice()).readdressing().restart(restart, BUS_BIT_S))] == [3000, 1100]
 
 
-# --- restart ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("boots", [True, False], ids=["with a boot frame", "without"])
 @pytest.mark.parametrize(
     ("saved", "place"),
@@ -168,6 +165,8 @@ def test_a_restarted_device_is_found_at_its_saved_or_present_place(
 ) -> None:
     bench = Bench(FakeDevice(saved=saved, booted=place, boots=boots))
     assert (bench.restart(), bench.options) == (f"found as node {place}", FakeOptions(place))
+    unmoved = "the device sent its boot message" if boots else ""
+    assert bench.evidence == (unmoved if place == 5 else f"the device moved from node 5 to {place}")
 
 
 def test_boot_frames_of_this_device_only_and_a_rejected_restart_or_lost_device_is_reported() -> None:

@@ -278,7 +278,7 @@ export class SettingsSection {
     return [
       el("ol", { class: "outcome" }, steps), el("p", { class: done.problem ? "wrong" : "", role: "status", id: "outcome" }, el("b", { text: result })),
       ...(!done.saved && !done.problem ? [button("Save to flash", () => this.saveAll(), { glyph: "save" })] : []),
-      ...[done.advice, done.not_saved].filter(Boolean).map((text) => el("p", { class: "help" }, marked(text))),
+      ...[done.restart_doubt && `The restart is not verified: ${done.restart_doubt}.`, done.advice, done.not_saved].filter(Boolean).map((text) => el("p", { class: "help" }, marked(text))),
       ...(Object.keys(others).length ? [el("p", { text: "Update the configuration:" }), button("Copy as YAML", async () => { await copy(yaml(others)); toast("Copied."); }, { glyph: "copy" })] : []),
     ];
   }

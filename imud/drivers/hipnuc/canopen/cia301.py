@@ -182,14 +182,14 @@ def write_object(
 ) -> RequestScript[None]:
     """Write an unsigned object of 1 … 4 bytes. `also`: filters for replies of another node. Raises Aborted, NoReply."""
     name = f"node {node}, write 0x{index:04X}.{sub} = {value}"
-    ends = _answers(node, index, sub, (WRITTEN,))
+    ends = answers(node, index, sub, (WRITTEN,))
     frame = write_frame(index, sub, value.to_bytes(size, "little"))
     request = replace(_request(node, name, frame, ends, index, sub), timeout_ns=timeout_ns, also=also)
     _reply(name, (yield request))
 
 
 def _request(node: int, name: str, frame: bytes, ends: Callable[[Message], bool], index: int, sub: int) -> Request:
-    refuses = _answers(node, index, sub, (ABORT,))
+    refuses = answers(node, index, sub, (ABORT,))
     reads = frame[0] == READ
     kind = f"node {node}, 0x{index:04X}.{sub}"  # an abort does not contain the direction of the transfer
     payload = pack_frame(SDO_REQUEST + node, False, frame)
@@ -198,7 +198,7 @@ def _request(node: int, name: str, frame: bytes, ends: Callable[[Message], bool]
 
 
 def _read_request(node: int, index: int, sub: int) -> Request:
-    ends = _answers(node, index, sub, (*READ_SIZES, *READ_SEGMENTED))
+    ends = answers(node, index, sub, (*READ_SIZES, *READ_SEGMENTED))
     return _request(node, f"node {node}, read 0x{index:04X}.{sub}", read_frame(index, sub), ends, index, sub)
 
 
@@ -212,7 +212,7 @@ def _reply(name: str, outcome: Outcome) -> bytes:
     return data
 
 
-def _answers(node: int, index: int, sub: int, commands: tuple[int, ...]) -> Callable[[Message], bool]:
+def answers(node: int, index: int, sub: int, commands: tuple[int, ...]) -> Callable[[Message], bool]:
     """Return a test for replies of this node about this object with one of these commands."""
     can_id, address = SDO_REPLY + node, _address(index, sub)
 

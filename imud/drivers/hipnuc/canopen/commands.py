@@ -13,10 +13,12 @@ from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from typing import Final, Literal
 
+from imud.contracts.command import VerbResult
 from imud.contracts.driver import Identity
 from imud.contracts.script import Message, Reply, ReplyFrame, Request, RequestScript, never
 from imud.contracts.setting import Written
 from imud.drivers.hipnuc.canopen.cia301 import (
+    ABORT,
     DEVICE_TYPE,
     EMERGENCY,
     FLASH_TIMEOUT_NS,
@@ -34,6 +36,7 @@ from imud.drivers.hipnuc.canopen.cia301 import (
     NmtCommand,
     NmtState,
     TpdoNumber,
+    answers,
     read_frame,
     read_object,
     state_name,
@@ -202,7 +205,7 @@ def restart_request(node: int) -> Request:
     # silent: the manual does not state whether the node confirms it
     frame = write_frame(CONTROL, 0, RESTART.to_bytes(4, "little"))
     payload = pack_frame(SDO_REQUEST + node, False, frame)
-    return Request(payload, f"node {node}, restart", never, never, never, silent=True)
+    return Request(payload, f"node {node}, restart", never, answers(node, CONTROL, 0, (ABORT,)), never, silent=True)
 
 
 def nmt(node: int, command: NmtCommand) -> RequestScript[None]:
@@ -262,12 +265,12 @@ def change_node(settings: HipnucCanopenOptions, new: int) -> RequestScript[Writt
     return set_node_id(new, new) if new == settings.node else _readdressing(settings).change(new)
 
 
-def restart(settings: HipnucCanopenOptions, bus_bit_s: int) -> RequestScript[str]:
+def restart(settings: HipnucCanopenOptions, bus_bit_s: int) -> RequestScript[str | VerbResult]:
     """Restart the node, as after power-on, and follow it to its number (`Readdressing.restart`)."""
     return _readdressing(settings).restart(restart_request(settings.node), bus_bit_s)
 
 
-def reset(settings: HipnucCanopenOptions, bus_bit_s: int, command: NmtCommand) -> RequestScript[str]:
+def reset(settings: HipnucCanopenOptions, bus_bit_s: int, command: NmtCommand) -> RequestScript[str | VerbResult]:
     """Reset the node by an NMT command and follow it like `restart`."""
     return _readdressing(settings).restart(nmt_request(settings.node, command), bus_bit_s)
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Final, Literal, get_args
 
 from msgspec import Meta
 
-from imud.contracts.command import Proof, Risk, Target, Verb, Verbs
+from imud.contracts.command import Proof, Risk, Target, Verb, VerbResult, Verbs
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, DataSheet, random_vector
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import DeviceReport, Effect, Reports, Setting, SettingsTable
@@ -249,7 +249,7 @@ def _nmt(
             extra={"section": "CiA 301, 7.2.8.2"},
         ),
     ],
-) -> RequestScript[str | None]:
+) -> RequestScript[str | VerbResult | None]:
     made = NmtCommand[command.upper()]
     if command in RESETS:
         return commands.reset(target.settings, target.baud, made)

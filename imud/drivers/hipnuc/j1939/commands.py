@@ -24,6 +24,7 @@ from dataclasses import replace
 from enum import Enum
 from typing import Final, Literal, get_args
 
+from imud.contracts.command import VerbResult
 from imud.contracts.driver import Identity
 from imud.contracts.script import Message, Outcome, Rejection, Reply, ReplyFrame, Request, RequestScript, Silence, never
 from imud.contracts.setting import Written
@@ -284,7 +285,7 @@ def change_address(settings: HipnucJ1939Options, new: int) -> RequestScript[Writ
     return set_address(settings.peer, new) if new == settings.address else _readdressing(settings).change(new)
 
 
-def restart(settings: HipnucJ1939Options, bus_bit_s: int) -> RequestScript[str]:
+def restart(settings: HipnucJ1939Options, bus_bit_s: int) -> RequestScript[str | VerbResult]:
     """Restart the device and follow it to its address (`Readdressing.restart`)."""
     return _readdressing(settings).restart(restart_request(settings.peer), bus_bit_s)
 

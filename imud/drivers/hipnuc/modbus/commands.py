@@ -16,7 +16,7 @@ from dataclasses import replace
 from enum import Enum
 from typing import Any, Final, Literal
 
-from imud.contracts.command import Target
+from imud.contracts.command import Target, VerbResult
 from imud.contracts.driver import Identity
 from imud.contracts.script import TransferScript
 from imud.contracts.setting import DeviceReport, Reports, Written
@@ -56,6 +56,8 @@ TRIES: Final = 3
 # together 3 s for a restart; the manual states no time
 BOOT_TRIES: Final = 30
 BOOT_REPLY_MS: Final = 100
+# Minimum number of requests without a reply that shows a restart: more than the addresses, one more for noise
+SILENCES_MIN: Final = 3
 
 
 Mode = Literal["6-axis", "9-axis"]
@@ -117,7 +119,7 @@ def save() -> TransferScript[None]:
     return _write_only(BY_NAME["CTRL"], SAVE)
 
 
-def restart(places: tuple[int, ...], line_baud: int) -> TransferScript[str]:
+def restart(places: tuple[int, ...], line_baud: int) -> TransferScript[VerbResult]:
     """Restart the device, as after power-on, wait until it replies, and return a report.
 
     The script tries `places`, the present address first, and the address in its register. `line_baud` is the baud rate
@@ -128,9 +130,16 @@ def restart(places: tuple[int, ...], line_baud: int) -> TransferScript[str]:
     yield from send_control(RESTART)
     rate = BAUD_RATES[baud] if baud is not None and baud < len(BAUD_RATES) else line_baud
     if line_baud and rate != line_baud:
-        return f"the device now uses {rate} baud and the RS-485 bus does not; set the bus to {rate} baud"
+        words = f"the device now uses {rate} baud and the RS-485 bus does not; set the bus to {rate} baud"
+        return VerbResult(False, "imud cannot receive the device at another baud rate", words)
     known = (address, *places) if address is not None and address in SLAVES else places
-    return (yield from _await(serial, tuple(dict.fromkeys(known)), places[0]))
+    silences, place = yield from _await(serial, tuple(dict.fromkeys(known)), places[0])
+    words = f"found at address {place}"
+    if place != places[0]:
+        return VerbResult(True, f"the device moved from address {places[0]} to {place}", words)
+    if silences < SILENCES_MIN:  # requests themselves stop the reads: a pause of the samples is no evidence
+        return VerbResult(False, "the device replied without a pause", words)
+    return VerbResult(True, f"the device did not reply to {silences} requests, and then replied again", words)
 
 
 def factory_reset(places: tuple[int, ...], line_baud: int) -> TransferScript[str]:
@@ -145,7 +154,8 @@ def factory_reset(places: tuple[int, ...], line_baud: int) -> TransferScript[str
     yield from send_control(RESTART, lost_is_fine=True)
     if line_baud not in (0, FACTORY_BAUD):
         return f"restored; the device has {FACTORY_BAUD} baud and address {FACTORY_ID} after the next restart"
-    return (yield from _await(serial, tuple(dict.fromkeys((FACTORY_ID, *places))), places[0]))
+    _, place = yield from _await(serial, tuple(dict.fromkeys((FACTORY_ID, *places))), places[0])
+    return f"found at address {place}"
 
 
 def change_address(at: int, new: int) -> TransferScript[Written]:
@@ -310,13 +320,16 @@ def _move(address: int) -> TransferScript[None]:
         yield replace(READ_ADDRESS, at=address, then_at=address)
 
 
-def _await(serial: tuple[int, ...], places: tuple[int, ...], at: int) -> TransferScript[str]:
-    """Wait until a restarting device replies at one of the addresses. Raises NoReply."""
+def _await(serial: tuple[int, ...], places: tuple[int, ...], at: int) -> TransferScript[tuple[int, int]]:
+    """Wait until a restarting device replies at one of the addresses. Raises NoReply.
+
+    Return the number of requests without a reply, and the address.
+    """
     for attempt in range(BOOT_TRIES):
         place = places[attempt % len(places)]
         if (yield from _is_at(serial, place, BOOT_REPLY_MS)):
             if place != at:
                 yield from _move(place)
-            return f"found at address {place}"
+            return attempt, place
     words = " or ".join(map(str, places))
     raise NoReply(f"the device does not reply at address {words} after its restart; does it use another baud rate now?")

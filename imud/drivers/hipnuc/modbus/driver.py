@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final, Literal
 from msgspec import Meta
 
 from imud.attitude.rotation import euler312_from_quat
-from imud.contracts.command import Calibrations, Proof, Risk, Target, Verb, Verbs, Verdict
+from imud.contracts.command import Calibrations, Proof, Risk, Target, Verb, VerbResult, Verbs, Verdict
 from imud.contracts.driver import PolledDriver, random_vector
 from imud.contracts.script import TransferScript
 from imud.contracts.setting import Effect, Setting, SettingsTable
@@ -40,7 +40,7 @@ from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_MS
 
 
-def _restart(target: Target) -> TransferScript[str]:
+def _restart(target: Target) -> TransferScript[VerbResult]:
     return commands.restart(commands.places_of(target), target.baud)
 
 

@@ -4,7 +4,7 @@ from typing import Any, Literal
 
 import pytest
 
-from imud.contracts.command import Target
+from imud.contracts.command import Target, VerbResult
 from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request, RequestScript, Silence
 from imud.contracts.setting import Written, combined
 from imud.drivers.hipnuc.canopen import cia301
@@ -29,6 +29,8 @@ def test_a_restart_a_slow_save_and_a_refused_write() -> None:
             next(session.set_tpdo_period(8, 1, period_ms))
     restart = 0x608, bytes.fromhex("23 00 20 00 FF 00 00 00")
     assert unpack(session.restart_request(8).payload) == restart
+    aborts = [ReplyFrame(at, bytes.fromhex("80 00 20 00 02 00 01 06")) for at in (0x588, 0x589)]
+    assert [session.restart_request(8).is_rejection(one) for one in aborts] == [True, False]
     script = session.restart(HipnucCanopenOptions(), 500_000)
     next(script)
     script.send(Reply((ReplyFrame(0x588, bytes.fromhex("43 A0 20 00 08 00 00 00")),)))
@@ -133,7 +135,8 @@ def test_which_frames_make_a_number_taken_and_a_restart_by_nmt_is_followed() -> 
     bench = CanopenBench(NodeSettings(node=8), boot_ms=300)
     bench.run_script(session.change_node(bench.settings, 9))
     bench.run_script(session.save(bench.settings.node))
-    assert bench.run_script(session.reset(bench.settings, 500_000, NmtCommand.RESET_NODE)) == "found as node 9"
+    found = bench.run_script(session.reset(bench.settings, 500_000, NmtCommand.RESET_NODE))
+    assert found == VerbResult(True, "the device moved from node 8 to 9", "found as node 9")
     assert bench.settings.node == bench.module.node == 9
 
 
@@ -216,7 +219,8 @@ def test_the_module_obeys() -> None:
         **{f"tpdo{tpdo}_interval_ms": 20 * (tpdo == 2) for tpdo in TPDO_OBJECTS},
         "node": 8, "bit_rate": 500_000, "incli_x_reversed": False, "incli_y_reversed": True, "heartbeat_ms": 0,
     }  # fmt: skip
-    assert bench.run_script(begun("nmt", command="reset_node")) == "found as node 8"
+    found = VerbResult(True, "the device sent its boot message", "found as node 8")
+    assert bench.run_script(begun("nmt", command="reset_node")) == found
     assert not bench.module.objects.settings.invert_y  # nothing was saved
 
 

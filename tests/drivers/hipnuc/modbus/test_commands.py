@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from imud.contracts.command import Target, Verdict, parameters_of
+from imud.contracts.command import Target, VerbResult, Verdict, parameters_of
 from imud.contracts.script import Transfer, TransferScript, run_transfer_script
 from imud.contracts.setting import Effect, Written, combined
 from imud.drivers.hipnuc.common import AttitudeMode, LevelReset
@@ -33,7 +33,7 @@ def bench(request: pytest.FixtureRequest) -> ModbusBench:
     return ModbusBench(module(7, variant=SLAVE_VARIANTS[request.param]), module(12))
 
 
-def restarted(bench: ModbusBench) -> str:
+def restarted(bench: ModbusBench) -> VerbResult:
     return bench.run(commands.restart((bench.at, 7), BAUD))
 
 
@@ -66,7 +66,7 @@ def test_a_module_is_followed_to_another_address(bench: ModbusBench) -> None:
     else:
         assert (written, bench.at, bench.slave.address) == (Written.PENDING, 7, 7)
     bench.run(commands.save())
-    assert restarted(bench) == "found at address 9"
+    assert restarted(bench).result == "found at address 9"
     assert (bench.at, bench.slave.address) == (9, 9)
     assert bench.run(commands.read(BY_NAME["MD_ID"])) == (9,)
 
@@ -79,7 +79,7 @@ def test_an_address_that_another_module_has_is_refused_before_anything_is_writte
     assert bench.run(commands.change_address(7, 7)) is Written.VERIFIED
     assert bench.at == 7
     bench.run(commands.change_address(7, 9))
-    assert restarted(bench) == "found at address 7"
+    assert restarted(bench).result == "found at address 7"
     assert bench.at == bench.slave.address == 7
 
 
@@ -129,7 +129,9 @@ def test_a_rate_is_in_force_after_saving_and_restarting(bench: ModbusBench) -> N
     assert bench.run(commands.set_baud(9600)) is Written.PENDING
     assert bench.slave.baud == BAUD
     bench.run(commands.save())
-    assert restarted(bench) == "the device now uses 9600 baud and the RS-485 bus does not; set the bus to 9600 baud"
+    found = restarted(bench)
+    assert found.result == "the device now uses 9600 baud and the RS-485 bus does not; set the bus to 9600 baud"
+    assert (found.verified, found.evidence) == (False, "imud cannot receive the device at another baud rate")
     assert bench.slave.baud == 9600
 
 
@@ -176,6 +178,28 @@ def test_devices_with_unexpected_replies() -> None:
     made.baud = 9600
     bench = ModbusBench(made, baud=9600)
     assert "115200 baud and address 80" in bench.run(commands.factory_reset((7,), 9600))
+
+
+@pytest.mark.parametrize(
+    ("boot_ms", "ignores", "verified", "evidence"),
+    [
+        (800, (), True, "the device did not reply to 8 requests, and then replied again"),
+        (800, ("CTRL",), False, "the device replied without a pause"),
+        (200, (), False, "the device replied without a pause"),
+        (300, (), True, "the device did not reply to 3 requests"),
+    ],
+)  # fmt: skip
+def test_requests_without_a_reply_show_a_restart(
+    boot_ms: int, ignores: tuple[str, ...], verified: bool, evidence: str
+) -> None:
+    bench = ModbusBench(module(7, variant=SlaveVariant(boot_ms=boot_ms, ignores=frozenset(ignores))))
+    found = restarted(bench)
+    assert (found.verified, found.result) == (verified, "found at address 7")
+    assert found.evidence.startswith(evidence)
+    if not ignores:
+        bench.run(commands.change_address(7, 9))
+        found = restarted(bench)
+        assert (found.verified, found.evidence) == (True, "the device moved from address 9 to 7")
 
 
 def test_absence_and_rejections_are_reported() -> None:
