@@ -157,9 +157,6 @@ def test_recording_of_a_module_at_rest() -> None:
     assert worst_deg < 1.2e-4
 
 
-# --- order ZYX --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("euler_deg", "quat"),
     [

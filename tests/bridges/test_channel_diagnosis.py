@@ -26,9 +26,6 @@ def one(found: DeviceStatus) -> Diagnosis:
     return diagnosis
 
 
-# --- a running daemon -------------------------------------------------------------------------------------------------
-
-
 def test_levels_and_messages_of_a_running_daemon() -> None:
     for word, level in (("ok", OK), ("degraded", WARN), ("attention", WARN), ("missing", ERROR)):
         reason = Reason(ReasonCode.LOST, "The adapter was pulled out.")
@@ -54,9 +51,6 @@ def test_without_a_daemon_all_are_stale_and_keep_their_values() -> None:
     (before,) = diagnosis.of([status()], UTC_NS).devices
     (after,) = diagnosis.stale("no daemon", UTC_NS + 1).devices
     assert after == before._replace(level=STALE, message="no daemon")
-
-
-# --- a recording ------------------------------------------------------------------------------------------------------
 
 
 def run_of(device: str, second: int, count: int = 10) -> list[Sample]:

@@ -48,9 +48,6 @@ def test_columns_and_rows() -> None:
     assert {name: len(columns) for name, columns in table.AXES.items()} == lengths
 
 
-# --- many rows at once ------------------------------------------------------------------------------------------------
-
-
 def by_rows(samples: Sequence[Sample], fields: Sequence[str] = SAMPLE_FIELDS) -> bytes:
     """Return the rows as Python's csv module formats them."""
     return table.csv_text(map(table.sample_row(fields), samples))

@@ -78,9 +78,6 @@ def test_the_page_also_of_too_few_samples_and_of_no_values_and_columns_bars_and_
     assert line.split() == ["0", "50", "100", "150", "200", "Hz"]
 
 
-# --- in a terminal ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.live
 def test_it_is_redrawn_until_ctrl_c(tmp_path: Path) -> None:
     accel, gyro = shaken(1000, 100.0, 12.0)

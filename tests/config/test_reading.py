@@ -343,9 +343,6 @@ def test_any_tree_is_a_configuration_or_a_config_error(tree: Any) -> None:
             assert line.startswith(("f:", "… and "))
 
 
-# --- the shipped file, the documentation, the real tables --------------------
-
-
 def uncommented(text: str) -> str:
     """Return the shipped file with all its examples active: remove each `#` directly before a key or list."""
     return re.sub(r"^( *)#(?=( {2})*([a-z_0-9]+|\"\*\"):)", r"\1", text, flags=re.MULTILINE)

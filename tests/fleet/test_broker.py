@@ -146,9 +146,6 @@ def test_user_and_password(tmp_path: Path) -> None:
             connect(url, user="gate", password_file=str(tmp_path / "none"))
 
 
-# --- TLS --------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.filterwarnings(LEFT_OPEN)
 def test_tls_with_certificates_of_both_sides(tmp_path: Path, authority: Authority) -> None:
     port = free_port()

@@ -256,9 +256,6 @@ def test_without_the_extra_only_this_output_does_not_start(tmp_path: Path, monke
     assert str(found.value) == EXTRA_MISSING == "the output mqtt needs the extra mqtt: pip install 'imud[mqtt]'"
 
 
-# --- settings ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("given", "words"),
     [
@@ -315,9 +312,6 @@ def test_birth_and_messages_contain_the_state_of_the_wall_clock(tmp_path: Path) 
     for one in others:
         assert (one["synchronised"], one["utc_offset_ns"], one["error_ns"]) == (True, 100, 40)
         assert one["t_ns"] > first["t_ns"]
-
-
-# --- reader with the published messages only --------------------------------------------------------------------------
 
 
 def fields_by_schema(slot: bytes, layout: Mapping[str, Any]) -> dict[str, Any]:

@@ -75,9 +75,6 @@ def test_a_chattering_line_makes_one_event_a_second_and_the_last_state_is_report
     assert signals.messages() == ["alarm", "alarm ended"]
 
 
-# --- against the angles -----------------------------------------------------------------------------------------------
-
-
 class Monitored:
     def __init__(self, signals: SignalBench) -> None:
         self.signals = signals

@@ -148,9 +148,6 @@ def test_single_edges_without_a_rate_and_between_those_of_the_rate() -> None:
     assert bench.counts.worst_late_ns < 10 * CALL_NS
 
 
-# --- the thread and the loop ------------------------------------------------------------------------------------------
-
-
 class TriggerBench:
     def __init__(self, rate_hz: float) -> None:
         self.time = Time()

@@ -62,9 +62,6 @@ def test_queries_use_metrics_that_exist() -> None:
         assert f"imud_{metric}" in text
 
 
-# --- with a real Prometheus ----------------------------------------------------------------------------------------
-
-
 def without_data(prometheus: RealPrometheus) -> list[str]:
     return [
         f"{title}: {expression}"

@@ -83,9 +83,6 @@ def test_a_run_of_a_polled_device_is_replayed(bench: PolledBusBench, run: Callab
     run(bench=bench)
 
 
-# --- from the middle of a run -----------------------------------------------------------------------------------------
-
-
 def run_of(driver: str, middle: int) -> DeviceRig:
     """A stream of frames with jitter. The recording starts again at frame `middle`, without the earlier records.
 
@@ -179,9 +176,6 @@ def without_state(record: Record) -> Record:
     path = records.decode_object(record, PathRecord)
     made = msgspec.structs.replace(path, state=b"", options={"calibration_done": 0})
     return record._replace(body=msgspec.msgpack.encode(made))
-
-
-# --- a replay that differs, and what is no recording ------------------------------------------------------------------
 
 
 def recorded_run() -> list[Record]:

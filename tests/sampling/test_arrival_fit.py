@@ -83,9 +83,6 @@ def test_no_point_is_under_the_hull_however_it_was_made(seed: int) -> None:
     assert at_once == hull
 
 
-# --- latency timers -------------------------------------------------------------------------------------------------
-
-
 def behind_timer(seconds: int, stalls_ns: Iterable[tuple[int, int]], hold_ns: int, pause_ns: int) -> ArrivalFit:
     """A fit of frames every 10 ms behind a timer of `hold_ns`. The stalls contain no frames."""
     random, fit, stalls = Random(3), ArrivalFit(0, 0, hold_ns), tuple(stalls_ns)
@@ -207,9 +204,6 @@ def test_the_figures_of_a_fit_change_only_on_purpose(name: str) -> None:
         fit.residual_ns, fit.recent_ns, fit.hidden_ns, fit.shift_ns,
     )  # fmt: skip
     assert got == pytest.approx(FIGURES[name], rel=1e-6, abs=1)
-
-
-# --- feasible lines ---------------------------------------------------------------------------------------------------
 
 
 def test_bounds_hold_for_every_line_that_fits() -> None:

@@ -137,9 +137,6 @@ async def test_schema_and_status_describe_the_conventions(server: SocketServer) 
     assert {name: status["frame"][name] for name in both} == {name: known[name] for name in both}
 
 
-# --- the encoding itself ----------------------------------------------------------------------------------------------
-
-
 def test_a_batch_is_turned_once_for_all_clients() -> None:
     batch = published([SENT])
     assert batch.converted(None) is batch
