@@ -181,9 +181,9 @@ class _TimeKind:
 
     @property
     def problem(self) -> str:
-        """A clock that stands still; empty if there is no such part."""
+        """The part of the log with a stopped clock; empty if there is none."""
         frames, number = self._longest
-        return f"line {number}: the last {frames} frames have the same time (the clock stands still)" if frames else ""
+        return f"line {number}: the last {frames} frames have the same time (the clock stopped)" if frames else ""
 
     def add(self, t_ns: int, number: int) -> None:
         """Add the time of a frame. Raises BadArgument for time differences."""

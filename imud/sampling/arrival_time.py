@@ -26,7 +26,7 @@ SIGMA_OF_HIDDEN: Final = sqrt((2 / 12 + 1 / 4) / 3)
 SMOOTHING: Final = 1 / 32
 # factor by which frames can be faster than the wire before imud assumes that no such wire exists
 WIRE_SLACK: Final = 1.05
-STILL_MOST: Final = 16  # number of frames with one arrival time after which the clock of a capture stands still
+STILL_MOST: Final = 16  # number of frames with one arrival time after which the clock of a capture has stopped
 
 
 class LinkDelay:

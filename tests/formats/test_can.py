@@ -85,7 +85,7 @@ def test_lines_of_candump() -> None:
         ((5, 14.999, 24.999), (5, 14.999, 24.999), "line 3: the time changes by +10.000 s (a pause or a step"),
         *((still := (*range(5, 305), *(400,) * count), still, words) for count, words in (
             (255, "line 301: the time changes by +96.000 s (a pause or a step of the clock)"),
-            (256, "line 556: the last 256 frames have the same time (the clock stands still)"),
+            (256, "line 556: the last 256 frames have the same time (the clock stopped)"),
         )),
         ((5, 3604), (5, 3604), "line 2: the time changes by +3599.000 s (a pause or a step"),
         ((0, 2, *range(3, 19), 0), (0, *range(2, 20)), "line 19: the time changes by -18.000 s (a step of"),

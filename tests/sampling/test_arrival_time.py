@@ -143,7 +143,7 @@ def test_another_rate_restarts_the_fit(period_ns: int, undecided: int) -> None:
     assert abs(even.t_ns - (due_ns + 399 * period_ns)) < 200 * NS_PER_US
 
 
-def test_the_period_outlasts_a_clock_that_stands_still() -> None:
+def test_the_period_outlasts_a_stopped_clock() -> None:
     spread = ArrivalSpread()
     for number in (*range(1, 50), *[49] * 500):
         spread.add_arrival(number * 10 * NS_PER_MS)

@@ -137,7 +137,7 @@ def restart(places: tuple[int, ...], line_baud: int) -> TransferScript[VerbResul
     words = f"found at address {place}"
     if place != places[0]:
         return VerbResult(True, f"the device moved from address {places[0]} to {place}", words)
-    if silences < SILENCES_MIN:  # requests themselves stop the reads: a pause of the samples is no evidence
+    if silences < SILENCES_MIN:  # the requests stop the reads, so a pause of the samples does not show a restart
         return VerbResult(False, "the device replied without a pause", words)
     return VerbResult(True, f"the device did not reply to {silences} requests, and then replied again", words)
 
