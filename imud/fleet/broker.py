@@ -360,6 +360,7 @@ class PahoConnection:
         self._answered = self._closed = self._woke = False
         self._problem = ""
         self._topics: dict[int, str] = {}
+        self._requested: set[int] = set()  # packet identifiers of subscriptions without an acknowledgement
         self._packet_bytes = PACKET_BYTES_MOST
         self._client: Any = None
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -409,6 +410,7 @@ class PahoConnection:
             raise BrokerError(f"{self._broker.name}: {connection_problem(error)}") from error
         if failure:
             self._fail(LOST)
+        self._requested.add(number)
         return int(number)
 
     def publish(
@@ -526,9 +528,17 @@ class PahoConnection:
         )
 
     def _on_subscribe(self, _client: Any, _data: Any, mid: int, reasons: Any, _properties: Any) -> None:
-        problem = next((str(reason) for reason in reasons if reason.value >= REFUSED), "")
-        if problem:
-            self.refused.append((mid, problem))
+        if mid not in self._requested:
+            self._problem = self._problem or "the broker confirmed a subscription that imud did not request"
+            return
+        self._requested.remove(mid)
+        if len(reasons) != 1:
+            self._problem = self._problem or (
+                f"expected 1 reason code for a subscription from the broker, got {len(reasons)}"
+            )
+            return
+        if reasons[0].value >= REFUSED:
+            self.refused.append((mid, str(reasons[0])))
         else:
             self.acknowledged.append(mid)
 

@@ -282,6 +282,10 @@ class ReaderConnection:
         self._changed.set()
 
     def _on_subscribe(self, _client: Any, _data: Any, _mid: int, reasons: Any, _properties: Any) -> None:
+        if len(reasons) != self._awaited:
+            self._problem = self._problem or (
+                f"expected {self._awaited} reason codes for subscriptions from the broker, got {len(reasons)}"
+            )
         for reason in reasons:
             if reason.value >= REFUSED:
                 self._problem = self._problem or f"the broker refuses a subscription: {reason}"

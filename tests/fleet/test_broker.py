@@ -196,6 +196,7 @@ NOT_AUTHORIZED = bytes.fromhex("20 03 00 87 00")
 TWO_AT_A_TIME = bytes.fromhex("20 06 00 00 03 21 00 02")  # Receive Maximum 2
 AT_MOST_100_BYTES = bytes.fromhex("20 08 00 00 05 27 00 00 00 64")  # Maximum Packet Size 100
 SUBACK, NO_SUBACK = bytes.fromhex("90 04 00 01 00 01"), bytes.fromhex("90 04 00 01 00 87")
+OTHER_SUBACK, EMPTY_SUBACK = bytes.fromhex("90 04 00 02 00 01"), bytes.fromhex("90 03 00 01 00")
 SHUTTING_DOWN = bytes.fromhex("e0 02 8b 00")
 QOS_0 = bytes.fromhex("30 05 00 01 74 00 78")
 
@@ -240,6 +241,7 @@ async def reader(broker: Broker) -> ReaderConnection:
         ((NOT_AUTHORIZED,), "the broker refuses the connection: Not authorized"),
         ((CONNACK, NO_SUBACK), "the broker refuses a subscription: Not authorized"),
         ((CONNACK, SUBACK + SHUTTING_DOWN), "the broker ended the connection: Server shutting down"),
+        ((CONNACK, EMPTY_SUBACK), "expected 1 reason codes for subscriptions from the broker, got 0"),
         ((b"",), "closed the connection without a reply"),
     ],
 )
@@ -281,6 +283,12 @@ def test_a_gateway_names_the_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
             assert connection.subscribe("imud/+") == 1
             connection.wait(LIMIT_S)
             assert (connection.acknowledged, connection.refused) == (acknowledged, refusals)
+    for reply, words in ((OTHER_SUBACK, "a subscription that imud did not request"), (EMPTY_SUBACK, "1 reason code")):
+        with scripted(CONNACK, reply) as broker, closing(gateway(broker)) as connection:
+            connection.subscribe("imud/+")
+            with pytest.raises(BrokerError, match=words):
+                connection.wait(LIMIT_S)
+            assert connection.acknowledged == []
     monkeypatch.setattr("imud.fleet.broker.LOOK_S", 0.01)
     monkeypatch.setattr("imud.fleet.broker.CONNECT_S", 0.02)
     with scripted(b"\x20") as broker, pytest.raises(BrokerError, match="no answer within"):
