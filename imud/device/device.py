@@ -112,14 +112,14 @@ class VerbRun:
             verified: bool | None = True
             evidence = verb.evidence
             match verb.proof:
-                case Proof.SCRIPT if isinstance(answer, VerbResult):
-                    verified, evidence, answer = answer.verified, answer.evidence, answer.result
-                    if verified and not restarts and await self._samples.has_restarted():
-                        verified, evidence = False, "the device restarted during the command"
                 case Proof.VALUE:
                     return answer
-                case Proof.RESTART | Proof.NONE if isinstance(answer, VerbResult):  # the script has checked the restart
-                    verified, evidence, answer = answer.verified or None, answer.evidence, answer.result
+                case _ if isinstance(answer, VerbResult):  # the script has checked the effect
+                    verified, evidence, answer = answer.verified, answer.evidence, answer.result
+                    if restarts:
+                        verified = verified or None  # changed settings can show the restart below
+                    elif verified and await self._samples.has_restarted():
+                        verified, evidence = False, "the device restarted during the command"
                 case Proof.NONE:
                     verified = False
                 case Proof.RESTART:
