@@ -1,4 +1,4 @@
-"""Condition of a device: one word for all views, with reasons and next steps (docs/condition.md)."""
+"""Condition of a device: one word for all views, with reasons and next steps (docs/views.md)."""
 
 from collections.abc import Mapping
 from enum import StrEnum
@@ -56,6 +56,7 @@ class ReasonCode(StrEnum):
     GAPS = "gaps"
     RATE = "rate"
     TIME_ERROR = "time-error"
+    DEVICE_TIME = "device-time"  # the device time does not show lost samples
     LINK = "link"
     NONE_LOST = "none-lost"
     LOST_BEFORE = "lost-before"
@@ -66,7 +67,9 @@ MISSING: Final = frozenset((
     ReasonCode.NO_PORT, ReasonCode.NO_DATA, ReasonCode.SEARCHING, ReasonCode.NO_SAMPLES, ReasonCode.STOPPED,
     ReasonCode.FAILED,
 ))  # fmt: skip
-DEGRADED: Final = frozenset((ReasonCode.LOST, ReasonCode.GAPS, ReasonCode.RATE, ReasonCode.TIME_ERROR, ReasonCode.LINK))
+DEGRADED: Final = frozenset((
+    ReasonCode.LOST, ReasonCode.GAPS, ReasonCode.RATE, ReasonCode.TIME_ERROR, ReasonCode.DEVICE_TIME, ReasonCode.LINK,
+))  # fmt: skip
 OK: Final = frozenset((ReasonCode.NONE_LOST, ReasonCode.LOST_BEFORE, ReasonCode.FINISHED))
 
 

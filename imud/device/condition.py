@@ -331,7 +331,7 @@ RULES: Final = (
         "Connect SOUT, or reduce the latency timer.",
     ),
     Rule(
-        ReasonCode.TIME_ERROR, Section.TIME, lambda f, _: f.has_scattered_time,
+        ReasonCode.DEVICE_TIME, Section.TIME, lambda f, _: f.has_scattered_time,
         "The device time scatters: imud cannot count lost samples.", DOCTOR,
     ),
     Rule(ReasonCode.LINK, Section.ABOUT, lambda f, _: bool(f.problem), _problem, DOCTOR),

@@ -202,6 +202,9 @@ def test_a_reason_counts_after_5_s_and_ends_60_s_after_its_cause() -> None:
     assert watched.watch.condition.since_ns == (watched.now_s - 1) * S
     assert [event.detail["reasons"] for event in watched.events] == ["lost", "alarm, lost", "alarm", "none-lost"]
     assert {event.kind for event in watched.events} == {EventKind.CONDITION}
+    both = facts(t_err_ns=2_100_000, has_scattered_time=True)
+    watched.after(6, *device_condition.causes_of(both, contracts_condition.ConditionLimits(t_err_ms=2.0))[:2])
+    assert [reason.code for reason in watched.watch.condition.reasons] == ["time-error", "device-time"]
 
 
 def test_a_short_cause_a_repaired_setting_and_a_missing_device() -> None:
@@ -236,15 +239,9 @@ def test_history_contains_the_worst_condition_of_each_minute() -> None:
 
 
 def test_text_of_a_condition_and_status_of_another_version() -> None:
-    assert (
-        str(
-            contracts_condition.DeviceCondition(
-                contracts_condition.Condition.DEGRADED, 0, (LOST.reason(), ALARM.reason())
-            )
-        )
-        == "degraded: lost alarm"
-    )
-    assert str(contracts_condition.DeviceCondition(contracts_condition.Condition.MISSING, 0)) == "missing"
+    reasons = LOST.reason(), ALARM.reason()
+    for level, given, text in (("degraded", reasons, "degraded: lost alarm"), ("missing", (), "missing")):
+        assert str(contracts_condition.DeviceCondition(contracts_condition.Condition(level), 0, given)) == text
     status = msgspec.convert(msgspec.to_builtins(msgspec.structs.replace(device("bow"), condition=None)), DeviceStatus)
     assert (status.has_problem, status.word, status.reasons) == (False, "running", ())
 
