@@ -330,9 +330,10 @@ class Daemon:
         self.tick_soon()
 
     def _stop_device(self, name: str) -> None:
-        self._tasks.pop(name).cancel()
+        if name in self._tasks:  # False if imud could not start the device
+            self._tasks.pop(name).cancel()
+            self._devices.pop(name).close()
         self._latencies.remove_device(name)
-        self._devices.pop(name).close()
         if all(device.name != name for device in self.config.devices):
             self._context.past_events.remove(name)
         self._outputs.remove_device(name)

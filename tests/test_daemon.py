@@ -287,8 +287,9 @@ async def test_a_reload_starts_and_stops_devices(tmp_path: Path, monkeypatch: py
     daemon.refuse(ConfigError("f.yaml:3: wrong"))
     assert past()[-1] == "the new configuration is invalid: f.yaml:3: wrong"
     monkeypatch.setattr("imud.publishers.outputs.Outputs.add_device", Mock(side_effect=ServerError("it is full")))
-    await daemon.change_to(config_of(tmp_path, stern={}))
-    assert past()[-1].endswith("; stern cannot be started: it is full")
+    for keys in ({}, {"convention": "enu-flu"}):  # the second reload changes a device that is not running
+        await daemon.change_to(config_of(tmp_path, stern=keys))
+        assert past()[-1].endswith("; stern cannot be started: it is full")
     monkeypatch.undo()
     monkeypatch.setattr(Device, "run", AsyncMock(side_effect=KeyError("broken")))
     await daemon.change_to(config_of(tmp_path, stern={}))  # the next reload starts the device
