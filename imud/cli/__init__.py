@@ -7,7 +7,7 @@ import argparse
 import sys
 from collections.abc import Collection, Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from imud import __version__
 from imud.cli.output import complain, discard_output, open_standard_streams
@@ -75,15 +75,24 @@ COMMANDS = {
 }
 
 
+class CommandParser(argparse.ArgumentParser):
+    """Parser that rejects unknown arguments with the usage of its own command, not of `imud`."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[argparse.Namespace, list[str]]:  # type: ignore[override]
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return found, unknown
+
+
 def build_parser(commands: Collection[str] = COMMANDS) -> argparse.ArgumentParser:
     """Build the parser of the command line. Only `commands` get their arguments; other modules are not imported."""
-    parser = argparse.ArgumentParser(prog="imud", description="A daemon for inertial sensors.")
+    parser = CommandParser(prog="imud", description="A daemon for inertial sensors.")
     parser.add_argument("--version", action="version", version=f"imud {__version__}")
     parsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, command in COMMANDS.items():
         description = command.help[:1].upper() + command.help[1:] + "."
         sub = parsers.add_parser(name, help=command.help, description=description)
-        sub.set_defaults(parser=sub)
         # importing the modules of all commands would slow down the start
         if name in commands:
             command.load().add_arguments(sub)
@@ -99,9 +108,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     name = words[0] if words and words[0] in COMMANDS else ""
     try:
         try:
-            args, unknown = build_parser((name,)).parse_known_args(words)
-            if unknown:  # with the usage of the command, not of imud
-                args.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+            args = build_parser((name,)).parse_args(words)
             return COMMANDS[args.command].load().run(args)
         finally:
             # inside `try`: a full disk or a closed pipe often appears only here

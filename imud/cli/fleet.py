@@ -237,8 +237,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "message",
     )  # fmt: skip
     showing = actions.add_parser("top", help="show all gateways in a full-screen view of the terminal")
-    collecting.set_defaults(parser=collecting)
-    showing.set_defaults(parser=showing)
     _broker(showing)
     add_top(showing)
 

@@ -207,8 +207,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--no-save", action="store_true", help="do not save the new address in the device; it lasts until power-off"
     )
     _common(giving)
-    scanning.set_defaults(parser=scanning)
-    giving.set_defaults(parser=giving)
 
 
 def _common(parser: argparse.ArgumentParser) -> None:
