@@ -366,7 +366,8 @@ class TopApp(App[None]):
 
     TITLE = "imud top"
     CSS = """
-    #state, #head { height: 1; text-style: bold; }
+    #state { height: auto; max-height: 50%; text-style: bold; }
+    #head { height: 1; text-style: bold; }
     #rows { height: 1fr; border: none; padding: 0; scrollbar-size-vertical: 1; }
     #rows > .option-list--option { padding: 0; }
     #filter { height: 1; border: none; padding: 0; display: none; }
@@ -375,8 +376,7 @@ class TopApp(App[None]):
     .curve Sparkline { width: 1fr; }
     #block { height: auto; margin: 1 0 0 0; }
     #events { height: 6; border-top: solid $secondary; }
-    HelpPanel { split: bottom; width: 100%; max-width: 100%; height: 50%; }
-    HelpPanel { border-left: none; border-top: solid $secondary; }
+    HelpPanel { split: bottom; width: 100%; max-width: 100%; height: 50%; border: none; border-top: solid $secondary; }
     """
     ENABLE_COMMAND_PALETTE = False
     BINDINGS: ClassVar[list[BindingType]] = [

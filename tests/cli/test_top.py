@@ -114,6 +114,13 @@ async def test_the_table_has_every_device_and_fits_80_columns(pilot: Pilot[None]
         "bow", "ok", "999.5", "0.25s", "4066", "12", "28.6",
     ]  # fmt: skip
     assert max(map(len, text)) <= SIZE[0]
+    gone = tuple(device(f"left-outrigger-{one}", state=DeviceState.MISSING, problem="x") for one in range(10))
+    text = await give(pilot, app, News(statuses=gone, clients=1))
+    assert " ".join(text[:4]).startswith(
+        "10 of 10 devices have a problem: left-outrigger-0 (missing), left-outrigger-1"
+    )
+    assert "left-outrigger-4 (missing) and 5 more. 1 client  by DEVICE" in " ".join(text[:4])
+    assert (sum(line.startswith("left-…er-") for line in text), max(map(len, text))) == (10, 78)
 
 
 @played
@@ -176,10 +183,11 @@ async def test_help_shows_the_keys_and_leaves_the_rows_as_they_are(pilot: Pilot[
 
 
 @pytest.mark.live
-def test_without_a_daemon_it_says_so_and_tries_again(tmp_path: Path) -> None:
+def test_without_a_daemon_it_says_so(tmp_path: Path) -> None:
     async def steps(pilot: Pilot[None], app: top.TopApp) -> None:
-        while "no daemon at" not in lines(app)[0]:
+        while not lines(app)[0].startswith("no daemon at"):
             await pilot.pause(LOOK_S)
+        assert f"{tmp_path}/nobody" in "".join(lines(app)[:3])
 
     played(steps, top.TopFeed(str(tmp_path / "nobody")))()
 
