@@ -223,7 +223,8 @@ async def test_a_problem_of_the_bus_is_the_reason_for_no_result(bus: Bus) -> Non
     bench = bus.add()
     await bench.until(lambda: "no frame arrives on can0" in bench.rig.problem)
     bench.link.news("can0 is bus-off: x", "can0 is bus-off: x")
-    await bench.until(lambda: bench.rig.problem == "can0 is bus-off: x")
+    await bench.until(lambda: "bus-off" in bench.rig.problem)
+    assert (bench.rig.problem, bench.rig.state) == ("can0 is bus-off: x", DeviceState.SEARCHING)
 
 
 def syncing(bus: Bus, name: str, node: int, *, writable: bool = True) -> OnBus:

@@ -120,7 +120,8 @@ def test_mode_and_word_size_by_what_was_read(machine: Machine) -> None:
     ]:
         machine.configure(MAST)
         machine.status = [msgspec.structs.replace(polled("mast", DeviceState.SEARCHING), problem=problem)]
-        machine.tells(SPI, "error", words)
+        ((severity, text),) = machine.told(SPI)
+        assert (severity, words in text) == ("error", True), text
 
 
 UP, STATE, RATE = DoctorCheck("u", can_up), DoctorCheck("s", can_state), DoctorCheck("r", can_bitrate)

@@ -66,7 +66,8 @@ def test_the_rule_is_for_nodes_of_the_kind_only(bow: Machine) -> None:
     ]:
         bow.configure(f"bow: {{driver: hipnuc-uart, uart: {{port: /dev/{node}}}}}")
         bow.port(node, mode=0o600)
-        bow.tells(RIGHTS, "error", rule)
+        ((severity, text),) = bow.told(RIGHTS)
+        assert (severity, rule in text) == ("error", True), text
 
 
 def test_a_user_who_joined_the_group_after_login_and_the_mode_and_rules_of_the_unit(bow: Machine) -> None:
