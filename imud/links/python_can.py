@@ -56,14 +56,24 @@ class PythonCanLink:
         """Return an empty text: the state is unknown before the bus is open."""
         return ""
 
-    async def wait_present(self) -> None: ...
+    async def wait_present(self) -> None:
+        """Open the bus in a thread, because the constructor of slcan sleeps for 2 s. Raises LinkError."""
+        opening = asyncio.get_running_loop().run_in_executor(None, self._opened)
+        try:
+            self._bus = await asyncio.shield(opening)
+        except asyncio.CancelledError:
+            opening.add_done_callback(_shut_down)
+            raise
 
     def open(self) -> None:
-        """Open the bus. Raises LinkError with the message of python-can."""
+        """Open the bus if `wait_present` has not opened it. Raises LinkError with the message of python-can."""
+        self._bus = self._bus or self._opened()
+
+    def _opened(self) -> can.BusABC:
         filters = _as_python_can(self._filters)
         rate: dict[str, Any] = {"bitrate": self.bitrate} if self.bitrate else {}
         try:
-            self._bus = can.Bus(self._channel, self._backend, can_filters=filters, ignore_config=True, **rate)
+            return can.Bus(self._channel, self._backend, can_filters=filters, ignore_config=True, **rate)
         except (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError) as error:
             raise LinkError(f"cannot open {self.title}: {reason_of(error)}") from error
 
@@ -143,6 +153,11 @@ class PythonCanLink:
                     loop.call_soon_threadsafe(deliver, frames)
         except Exception as error:  # noqa: BLE001 - a backend raises any error, for example slcan for a damaged line
             loop.call_soon_threadsafe(end, LinkError(f"{self.title} ended: {reason_of(error)}"))
+
+
+def _shut_down(opening: asyncio.Future[can.BusABC]) -> None:
+    if opening.exception() is None:
+        opening.result().shutdown()
 
 
 def _as_python_can(filters: Sequence[CanFilter]) -> CanFilters:

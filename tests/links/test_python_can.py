@@ -100,6 +100,36 @@ class FakeBus:
 
 
 @in_loop
+async def test_a_slow_bus_opens_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The event loop runs while slcan waits for its adapter. imud shuts the bus of a cancelled task down."""
+    may_open, buses = threading.Event(), list[FakeBus]()
+
+    def slow(*_where: object, **_keys: object) -> FakeBus:
+        assert may_open.wait(LIMIT_S if threading.current_thread() is not threading.main_thread() else 0)
+        buses.append(FakeBus())
+        return buses[-1]
+
+    monkeypatch.setattr(can, "Bus", slow)
+    link = make("slow")
+    for is_cancelled in (False, True):
+        may_open.clear()
+        opening = asyncio.create_task(link.wait_present())
+        await asyncio.sleep(0)
+        assert not opening.done()
+        if is_cancelled:
+            opening.cancel()
+        may_open.set()
+        await asyncio.gather(opening, return_exceptions=True)
+        if not is_cancelled:
+            link.open()
+            link.close()
+        async with asyncio.timeout(LIMIT_S):
+            while not (len(buses) > is_cancelled and buses[-1].is_shut_down):
+                await asyncio.sleep(0.001)
+        assert (opening.cancelled(), len(buses)) == (is_cancelled, 1 + is_cancelled)
+
+
+@in_loop
 async def test_only_data_frames_are_delivered_and_nothing_after_close(monkeypatch: pytest.MonkeyPatch) -> None:
     kinds = [{}, {"is_error_frame": True}, {"is_remote_frame": True}, {"is_fd": True}, *[dict[str, bool]()] * 64]
     bus = FakeBus(*(can.Message(arbitration_id=n, is_extended_id=False, **kind) for n, kind in enumerate(kinds)))
