@@ -97,6 +97,8 @@ def page(devices: list[DeviceStatus], behind: dict[str, deque[int]]) -> str:
 def block(status: DeviceStatus, behind_ns: deque[int]) -> str:
     clock = status.clock
     lines = paragraph(f"{status.name}: ", str(status.condition)) if status.has_problem else []
+    if clock.sync is Sync.ARRIVAL and not clock.t_err_ns:
+        return "\n".join([*lines, *paragraph(f"{status.name}: ", miswired(clock) or "no sample yet")])
     lines += [
         f"{status.name}: time stamps by {clock.sync}, error {clock.t_err_ns / NS_PER_US:.1f} µs (one sigma)",
         f"  offset    {clock.offset_ns / NS_PER_S:+.9f} s (host - device), skew {clock.skew_ppm:+.3f} ppm, "
@@ -140,8 +142,6 @@ def verdict(clock: ClockStatus, behind_ns: Sequence[int]) -> str:
     # the GPIO time stamps include the interrupt latency of the kernel
     if clock.sync is Sync.EDGE:
         return f"the kernel's time stamps of the GPIO line limit the time stamps: {error}"
-    if clock.sync is Sync.ARRIVAL and not clock.t_err_ns:  # t_err_ns is 0 until the first sample arrives
-        return TOO_FEW
     if clock.sync is Sync.ARRIVAL:
         return f"imud uses arrival times only, not the device time: {error}; connect SOUT if the device has this pin"
     return _of_arrivals(clock, sorted(behind_ns))

@@ -111,6 +111,8 @@ def block(status: DeviceStatus, without_times: str = "", *, virtual: bool = Fals
     if virtual:
         rows[2] = ("rate", f"{status.expected_rate_hz:.1f} Hz by the device's clock")
         rows = [row for row in rows if row[0] != "latency"]
+    if not ledger["samples"]:
+        without_times = without_times or "no sample yet"
     if without_times:
         rows = [("times", without_times), *(row for row in rows if row[0] not in ("rate", "clock", "latency"))]
     if status.frame is not None:

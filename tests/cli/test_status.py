@@ -89,6 +89,10 @@ def test_condition_with_reasons_and_problems_of_mqtt_and_the_kernel_in_c() -> No
         "mast: attention\n  the command save is running, started 10 min ago by uid 1000\n"
         "  The ALARM pin is active. Look.\n  Lost. Step.\n  link   "
     )
+    rows = [
+        line[2:11].rstrip() for line in block(replace(degraded, ledger=dict.fromkeys(degraded.ledger, 0))).split("\n")
+    ]
+    assert ("times" in rows, {"rate", "clock", "latency"} & {*rows}) == (True, set())  # before the first sample
     old = replace(degraded, condition=None, problem="an old daemon", work=None)
     assert block(old).startswith("mast: running\n  an old daemon\n")
     mqtt = MqttStatus("", "no route", "", 0, 0, 0, 0, 0, 0, 0, {}, 0, refused={"a/b": "Not authorized"})
