@@ -18,7 +18,7 @@ from typing import Any, cast
 import msgspec
 
 from imud.contracts.command import Risk, Target
-from imud.model.options import Options
+from imud.model.options import Options, shown
 
 
 class OnDifference(StrEnum):
@@ -193,6 +193,15 @@ def title_of(name: str) -> str:
     words = _UNIT.sub("", name).split("_")
     title = " ".join(word.upper() if _SHORT_NAME.fullmatch(word) else word for word in words)
     return title[:1].upper() + title[1:]
+
+
+def value_text(value: Any) -> str:
+    """Return the value of a setting for people, without quotes and brackets."""
+    if isinstance(value, dict):
+        value = [f"{name} {value_text(part)}" for name, part in value.items()]
+    if isinstance(value, list):
+        return ", ".join(map(value_text, value))
+    return value if isinstance(value, str) else shown(value)
 
 
 def group_of(name: str, setting: Setting) -> str:

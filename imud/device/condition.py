@@ -26,13 +26,12 @@ from imud.contracts.condition import (
     condition_of,
     duration,
 )
-from imud.contracts.setting import SettingDifference, SettingsState, SettingsStatus, title_of
+from imud.contracts.setting import SettingDifference, SettingsState, SettingsStatus, title_of, value_text
 from imud.contracts.status import DeviceState, FrameProblem, LinesStatus, RecentStatus
 from imud.device.health import NO_SAMPLE, SEARCH_BEGUN, DeviceEvents
 from imud.links.serial_port import list_ports
 from imud.model.event import EventKind
 from imud.model.ledger import LOST_FIELDS, Ledger
-from imud.model.options import shown
 from imud.model.units import NS_PER_MS, NS_PER_S
 
 MINUTE_NS: Final = 60 * NS_PER_S
@@ -156,11 +155,6 @@ def sentence(problem: str) -> str:
         first = first.capitalize()
     text = f"{first} {rest}".strip() or "The reason is not known"
     return text if text.endswith((".", "?", "!")) else f"{text}."
-
-
-def value_text(value: Any) -> str:
-    """Return the value of a setting for people: words without quotes, other values as JSON."""
-    return value if isinstance(value, str) else shown(value)
 
 
 # --- a device without samples: the first rule that holds --------------------------------------------------------------
