@@ -34,7 +34,7 @@ class OnDifference(StrEnum):
 class Effect(StrEnum):
     """Time at which a written setting takes effect."""
 
-    AT_ONCE = "at once"
+    IMMEDIATELY = "immediately"
     AFTER_RESTART = "after save and restart"
 
 
@@ -85,7 +85,7 @@ class Setting:
     """`write(target, value)` returns the script that writes the setting. None: read-only, cannot be declared.
 
     The script raises CommandError, TransferError or DeviceRefused if the device rejects the value."""
-    effect: Effect = Effect.AT_ONCE
+    effect: Effect = Effect.IMMEDIATELY
     # Whether the change affects how imud reaches the device (baud rate, address, node number). imud writes such a
     # setting last. Its script follows the device and returns to the former connection if the device does not reply: by
     # `Request.baud` on UART, `Request.settings` on CAN, `Transfer.then_at` on RS-485 and I2C.
@@ -266,7 +266,7 @@ class PlannedStep(msgspec.Struct, frozen=True):
     name: str
     value: Any
     before: Any = None  # null if the present value is not known
-    effect: Effect = Effect.AT_ONCE
+    effect: Effect = Effect.IMMEDIATELY
     connection: bool = False
     saves: bool = False  # whether this step writes the flash and restarts the device
 

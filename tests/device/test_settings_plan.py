@@ -271,7 +271,7 @@ class TableOfOne:
     """A device with the setting `x`. Its scripts run when they are created."""
 
     def __init__(
-        self, result: object, *, readable: bool = True, effect: setting.Effect = setting.Effect.AT_ONCE, **more: Any
+        self, result: object, *, readable: bool = True, effect: setting.Effect = setting.Effect.IMMEDIATELY, **more: Any
     ) -> None:
         self.actual: dict[str, Any] = {"x": 1}
         self.active: dict[str, Any] = {"x": 1} if readable else {}

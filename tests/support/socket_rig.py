@@ -194,7 +194,7 @@ class FakeControl:
         )  # fmt: skip
         texts = 'one of "6-axis", "9-axis"', "axes that make the attitude", "", "2.2.4"
         mode = setting.SettingInfo(
-            "mode", *texts, setting.Effect.AT_ONCE, False, True, True, "9-axis", "6-axis", differs=True
+            "mode", *texts, setting.Effect.IMMEDIATELY, False, True, True, "9-axis", "6-axis", differs=True
         )
         return setting.SettingsReport(self._device, "hipnuc-uart", {"product": "HI13"}, status, (mode,))
 

@@ -237,7 +237,7 @@ export class SettingsSection {
       const setting = this.all.find((one) => one.name === step.name);
       const differs = setting && !agrees(setting.declared, step.value);
       return el("tr", {}, el("th", { scope: "row", text: setting?.title ?? words(step.name) }), el("td", {}, el("s", { text: said(step.before, setting?.unit) })), el("td", {}, icon("arrow", "to")),
-        el("td", {}, el("b", { text: said(step.value, setting?.unit) }), el("p", { class: "help", text: step.effect === "at once" ? "takes effect immediately" : `takes effect ${step.effect}` }), differs && el("p", { class: "lost", text: `configuration: ${said(setting.declared, setting.unit)}` })));
+        el("td", {}, el("b", { text: said(step.value, setting?.unit) }), el("p", { class: "help", text: `takes effect ${step.effect}` }), differs && el("p", { class: "lost", text: `configuration: ${said(setting.declared, setting.unit)}` })));
     });
     const left = Object.entries(plan.left_out).map(([name, why]) => el("li", { text: `${words(name)} is not written: ${why}` }));
     const { flash_writes, flash_writes_day } = this.report.status;

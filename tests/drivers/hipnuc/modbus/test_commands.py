@@ -333,8 +333,8 @@ def test_the_table_has_effects_and_types() -> None:
     assert set(VALUES) == set(SETTINGS.table)
     effects = {name: (one.effect, one.connection) for name, one in SETTINGS.table.items()}
     assert effects == {
-        "mode": (Effect.AT_ONCE, False), "mounting": (Effect.AFTER_RESTART, False),
-        "baud": (Effect.AFTER_RESTART, True), "address": (Effect.AT_ONCE, True),
+        "mode": (Effect.IMMEDIATELY, False), "mounting": (Effect.AFTER_RESTART, False),
+        "baud": (Effect.AFTER_RESTART, True), "address": (Effect.IMMEDIATELY, True),
     }  # fmt: skip
     for name, values in VALUES.items():
         for value in values:
