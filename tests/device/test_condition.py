@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from imud import config
-from imud.contracts import condition as contracts_condition
+from imud.contracts.condition import OK, Condition, ConditionLimits, DeviceCondition, ReasonCode, Section, condition_of
 from imud.contracts.setting import OnDifference, SettingDifference, SettingsState, SettingsStatus
 from imud.contracts.status import DeviceState, DeviceStatus, FrameProblem, LinesStatus, RecentStatus
 from imud.device import condition as device_condition
@@ -109,12 +109,29 @@ LATE = facts(t_err_ns=2_100_000)
          "Compare the output rate in the settings of the device with its bit rate."),
         (facts(problem="can0 is error-passive"), "degraded", "can0 is error-passive.", DOCTOR),
         (facts(DeviceState.FINISHED, ""), "ok", "The replay is at its end.", ""),
+        (facts(DeviceState.FINISHED, "no frame"), "ok", "The replay is at its end. No frame.", ""),
+        (facts(DeviceState.FAILED, ""), "missing", "The reason is not known.", DOCTOR),
+        (facts(DeviceState.SILENT, "no sample for 1.0 s", recent=recent(last_sample_ns=0)), "missing",
+         "The device stopped sending some time ago. Its port still exists.",
+         "Check the power supply and the connector."),
+        (axes(FrameProblem.DECLINATION, "declination_deg is configured, but yaw is true already"), "attention",
+         "declination_deg is configured, but yaw is true already.", "Remove declination_deg from the configuration."),
+        (facts(open_frames=2), "attention", "The ledger does not balance: 2 frames.",
+         "Report this fault of imud with the output of `imud status --json`."),
+        (facts(recent=recent(samples=98, lost={"queue": 2})), "degraded",
+         "2.0 % of the samples are lost because imud is too late.",
+         "Reduce the load of this host, or use a lower rate."),
+        (facts(recent=recent(samples=98, lost={"gap_device": 2})), "degraded",
+         "2.0 % of the samples are lost before they reach this host.",
+         "Use a lower output rate or a higher bit rate of the device."),
+        (facts(recent=recent(gaps=1)), "degraded",
+         "Samples are lost in 1 gap of unknown size in the last minute.", DOCTOR),
     ],
 )  # fmt: skip
 def test_each_sentence(known: device_condition.Facts, condition: str, message: str, step: str) -> None:
-    limits = contracts_condition.ConditionLimits(t_err_ms=2.0)
+    limits = ConditionLimits(t_err_ms=2.0)
     reason = device_condition.causes_of(known, limits)[0].reason()
-    assert (reason.message, reason.next, contracts_condition.condition_of(reason.code)) == (message, step, condition)
+    assert (reason.message, reason.next, condition_of(reason.code)) == (message, step, condition)
 
 
 @pytest.mark.parametrize(
@@ -131,14 +148,14 @@ def test_each_sentence(known: device_condition.Facts, condition: str, message: s
     ],
 )
 def test_no_reason_within_the_limits(known: device_condition.Facts) -> None:
-    causes = device_condition.causes_of(known, contracts_condition.ConditionLimits(t_err_ms=2.1))
-    assert all(cause.rule.code in contracts_condition.OK for cause in causes)
+    causes = device_condition.causes_of(known, ConditionLimits(t_err_ms=2.1))
+    assert all(cause.rule.code in OK for cause in causes)
 
 
 def test_ports_of_other_links() -> None:
     gone = facts(DeviceState.MISSING, "can0 is down: imud waits", place=BUS)
     quiet = facts(DeviceState.SEARCHING, "nothing came", place=BUS)
-    limits = contracts_condition.ConditionLimits()
+    limits = ConditionLimits()
     missing, silent = (device_condition.causes_of(one, limits)[0].reason() for one in (gone, quiet))
     assert missing.message == "can0 is down: imud waits."
     assert (silent.message, "bit rate" in silent.next) == ("No data arrives at can0.", True)
@@ -153,29 +170,27 @@ def test_ports_of_other_links() -> None:
         ({"loss_ns": NOW_NS - S, "loss_samples": 1, "loss_cause": "crc"},
          "1 sample was lost 1 s ago because frames were damaged. No sample was lost after that."),
         ({"loss_ns": NOW_NS - S}, "Samples were lost 1 s ago. No sample was lost after that."),
+        ({"loss_ns": NOW_NS - S, "loss_samples": 2, "loss_cause": "queue"},
+         "2 samples were lost 1 s ago because imud was too late. No sample was lost after that."),
+        ({"loss_ns": NOW_NS - S, "loss_samples": 2, "loss_cause": "gap_device"},
+         "2 samples were lost 1 s ago before they reached this host. No sample was lost after that."),
     ],
 )  # fmt: skip
 def test_sentence_without_a_problem(changes: dict[str, Any], message: str) -> None:
-    (cause,) = device_condition.causes_of(facts(recent=recent(**changes)), contracts_condition.ConditionLimits())
-    assert (cause.reason().message, cause.rule.code in contracts_condition.OK) == (message, True)
+    (cause,) = device_condition.causes_of(facts(recent=recent(**changes)), ConditionLimits())
+    assert (cause.reason().message, cause.rule.code in OK) == (message, True)
 
 
-# --- hysteresis -------------------------------------------------------------------------------------------------------
+def cause(code: ReasonCode, message: str, setting: str = "") -> device_condition.Cause:
+    rule = device_condition.Rule(code, Section.LIVE, lambda _facts, _limits: True, message)
+    return device_condition.Cause(rule, facts(), setting)
 
 
-def cause(code: contracts_condition.ReasonCode, message: str, setting: str = "") -> device_condition.Cause:
-    return device_condition.Cause(
-        device_condition.Rule(code, contracts_condition.Section.LIVE, lambda _facts, _limits: True, message),
-        facts(),
-        setting,
-    )
-
-
-LOST = cause(contracts_condition.ReasonCode.LOST, "lost")
-ALARM = cause(contracts_condition.ReasonCode.ALARM, "alarm")
-SETTING = cause(contracts_condition.ReasonCode.SETTING, "differs", "mode")
-GONE = cause(contracts_condition.ReasonCode.STOPPED, "stopped")
-NONE = cause(contracts_condition.ReasonCode.NONE_LOST, "none")
+LOST = cause(ReasonCode.LOST, "lost")
+ALARM = cause(ReasonCode.ALARM, "alarm")
+SETTING = cause(ReasonCode.SETTING, "differs", "mode")
+GONE = cause(ReasonCode.STOPPED, "stopped")
+NONE = cause(ReasonCode.NONE_LOST, "none")
 
 
 class Watched:
@@ -184,11 +199,10 @@ class Watched:
     def __init__(self) -> None:
         self.events: list[Event] = []
         self.now_s = 0
-        self.watch = device_condition.ConditionWatch(
-            contracts_condition.ConditionLimits(), DeviceEvents("bow", Ledger(), self.events.append), 0
-        )
+        events = DeviceEvents("bow", Ledger(), self.events.append)
+        self.watch = device_condition.ConditionWatch(ConditionLimits(), events, 0)
 
-    def after(self, seconds: int, *causes: device_condition.Cause) -> contracts_condition.Condition:
+    def after(self, seconds: int, *causes: device_condition.Cause) -> Condition:
         for _ in range(seconds):
             self.watch.update(self.now_s * S, causes if GONE in causes else (*causes, NONE))
             self.now_s += 1
@@ -207,7 +221,7 @@ def test_a_reason_counts_after_5_s_and_ends_60_s_after_its_cause() -> None:
     assert [event.detail["reasons"] for event in watched.events] == ["lost", "alarm, lost", "alarm", "none-lost"]
     assert {event.kind for event in watched.events} == {EventKind.CONDITION}
     both = facts(t_err_ns=2_100_000, has_scattered_time=True)
-    watched.after(6, *device_condition.causes_of(both, contracts_condition.ConditionLimits(t_err_ms=2.0))[:2])
+    watched.after(6, *device_condition.causes_of(both, ConditionLimits(t_err_ms=2.0))[:2])
     assert [reason.code for reason in watched.watch.condition.reasons] == ["time-error", "device-time"]
 
 
@@ -245,12 +259,9 @@ def test_history_contains_the_worst_condition_of_each_minute() -> None:
 def test_text_of_a_condition_and_status_of_another_version() -> None:
     reasons = LOST.reason(), ALARM.reason()
     for level, given, text in (("degraded", reasons, "degraded: lost alarm"), ("missing", (), "missing")):
-        assert str(contracts_condition.DeviceCondition(contracts_condition.Condition(level), 0, given)) == text
+        assert str(DeviceCondition(Condition(level), 0, given)) == text
     status = msgspec.convert(msgspec.to_builtins(msgspec.structs.replace(device("bow"), condition=None)), DeviceStatus)
     assert (status.has_problem, status.word, status.reasons) == (False, "running", ())
-
-
-# --- counts -----------------------------------------------------------------------------------------------------------
 
 
 class Counted:
@@ -349,11 +360,11 @@ def test_the_rules_run_again_after_a_change_of_a_fact_and_after_5_s() -> None:
     assert not judged.is_steady(60)  # the reason ends 60 s after its cause
     assert judged.is_steady(2)
     assert not judged.is_steady(10, samples=40)
-    assert judged.judge.watch.condition.condition is contracts_condition.Condition.DEGRADED
+    assert judged.judge.watch.condition.condition is Condition.DEGRADED
     judged = Judged()
     judged.is_steady(20)
     levels = []
     for seconds in (5, 1):
         judged.is_steady(seconds, samples=0, state=DeviceState.SILENT)
         levels.append(judged.judge.watch.level)
-    assert levels == [contracts_condition.Condition.OK, contracts_condition.Condition.MISSING]
+    assert levels == [Condition.OK, Condition.MISSING]
