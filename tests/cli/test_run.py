@@ -83,7 +83,6 @@ def test_check_has_notes(tmp_path: Path, cli: Cli) -> None:
         file.write_text(f"devices: {{}}\nshm: {{directory: {tmp_path}/none/imud{more}}}\n")
         notes = cli("check", file).out.splitlines()[1:]
         assert [line.endswith("; ignore this note if another user runs the daemon") for line in notes] == [True] * count
-    file = tmp_path / "imud.yaml"
     file.write_text(
         "devices: {bow: {uart: {port: /dev/a}}, mast: {enabled: false, uart: {port: /dev/b}}}\n"
         "recorder: {devices: [bow, mast, bwo]}\nnmea0183: {device: masd}\n"
@@ -95,7 +94,6 @@ def test_check_has_notes(tmp_path: Path, cli: Cli) -> None:
         'nmea0183.device: expected a device that imud knows, got "masd"; did you mean mast? known: bow, mast',
         'mqtt.devices: expected a device that imud knows, got "keel"; known: bow, mast',
     ]
-    file = tmp_path / "imud.yaml"
     file.write_text(
         "devices:\n  bow:\n    driver: hipnuc-uart\n    uart: {port: /dev/ttyUSB0, baud: 921600}\n"
         "    settings: {output: {hi91: 50, hi92: 50}}\n  stern:\n    uart: {port: /dev/ttyUSB1}\n"
@@ -105,7 +103,7 @@ def test_check_has_notes(tmp_path: Path, cli: Cli) -> None:
     assert note.startswith(f"{file}:2: note: bow: HI92 next to HI91 is time-stamped by its arrival")
 
 
-def test_exit_statuses_of_the_daemon(tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exit_statuses_and_state_directory(tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "imud.yaml").write_text(f"devices: {{}}\nstate_dir: {tmp_path}\n")
     for error, status, said in [
         (ServerError("the socket is in use"), 75, "<2>the socket is in use\n"),
@@ -123,9 +121,6 @@ def test_exit_statuses_of_the_daemon(tmp_path: Path, cli: Cli, monkeypatch: pyte
         assert said in printed + logged
         settings, file = serve.call_args.args
         assert (settings.state_dir, file) == (str(tmp_path), tmp_path / "imud.yaml")
-
-
-def test_the_state_is_in_the_folder_of_the_service_manager(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = config.parse("state_dir: /srv/imud\ndevices: {}\n", "imud.yaml")
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
     assert state_dir(settings) == Path("/srv/imud")

@@ -88,7 +88,7 @@ def test_a_silent_device_is_queried_only_after_the_quiet_time(baud: int) -> None
     assert b"".join(data for data, _ in found.chunks) == REPLY
 
 
-def test_no_query_without_permission_or_to_another_device() -> None:
+def test_no_query_without_permission_or_to_another_device_or_into_noise() -> None:
     far = device(115200, 0)
     result, _, listens = given_up(Search([FAKE_DRIVER]), far)
     assert (far.sent_to, {listen.baud for listen in listens}) == ([], set(BAUD_RATES))
@@ -102,9 +102,11 @@ def test_no_query_without_permission_or_to_another_device() -> None:
     assert result.wasted_bytes > 0
     far = replace(device(115200, 0), reply=b"OK\r\n")
     given_up(Search([FAKE_DRIVER], may_ask=True), far)
-
-
-def test_noise_stops_the_queries() -> None:
+    random = Random(7)
+    for noise in (fake_frame(b"x" * 76)[:60], fake_frame(b"x" * 76)[:60] + SYNC, random.randbytes(82), SYNC * 40):
+        far = replace(device(115200, 100, 3_000_000), noise=noise)
+        given_up(Search([FAKE_DRIVER], may_ask=True), far)
+        assert far.sent_to == []
     search = Search([FAKE_DRIVER], may_ask=True)
     step: Step | None = search.start(0)
     now_ns = 0
@@ -169,7 +171,7 @@ def test_each_byte_is_in_the_result_or_counted_as_wasted() -> None:
     assert sum(len(data) for data, _ in found.chunks) + found.wasted_bytes == heard
 
 
-def test_an_unsupported_rate_is_skipped_and_reported() -> None:
+def test_an_unsupported_rate_is_skipped_and_a_visit_ends_at_its_limit() -> None:
     search = Search([FAKE_DRIVER], bauds=(921600, 9600))
     step: Step | None = search.start(0)
     now_ns = 0
@@ -192,16 +194,13 @@ def test_an_unsupported_rate_is_skipped_and_reported() -> None:
         step = search.refused("not to be had", number)
     assert isinstance(step, GaveUp)
     assert "9600: not to be had" in step.summary
-
-
-def test_a_visit_ends_at_its_deadline_or_byte_limit() -> None:
     search = Search([FAKE_DRIVER])
-    step = first_visit(search)
-    assert search.on_time(step.until_ns - 1) is None
+    visit = first_visit(search)
+    assert search.on_time(visit.until_ns - 1) is None
     changes = [search.on_data(bytes(4096), number) for number in range(65)]
     assert changes[:-1] == [None] * 64, "256 KiB are within the limit"
     assert isinstance(changes[-1], Listen)
-    assert changes[-1].baud != step.baud
+    assert changes[-1].baud != visit.baud
 
 
 def test_the_frames_determine_one_of_the_drivers() -> None:
@@ -225,14 +224,6 @@ class DeafCodec:
         return []
 
     def reset(self) -> None: ...
-
-
-def test_cut_frames_and_random_bytes_are_not_a_device() -> None:
-    random = Random(7)
-    for noise in (fake_frame(b"x" * 76)[:60], fake_frame(b"x" * 76)[:60] + SYNC, random.randbytes(82), SYNC * 40):
-        far = replace(device(115200, 100, 3_000_000), noise=noise)
-        given_up(Search([FAKE_DRIVER], may_ask=True), far)
-        assert far.sent_to == []
 
 
 def test_a_reply_behind_other_frames_and_frames_of_several_visits_count() -> None:

@@ -26,7 +26,7 @@ def make(channel: str, **keys: object) -> CanLink:
 
 
 @in_loop
-async def test_frames_pass_the_filters_and_come_in_the_loops_thread() -> None:
+async def test_frames_pass_the_filters_in_the_loops_thread_and_commands_go_out() -> None:
     link = make("pass")
     link.filters = [CanFilter(0x65, 0x7FF, False)]
     await link.wait_present()
@@ -46,36 +46,18 @@ async def test_frames_pass_the_filters_and_come_in_the_loops_thread() -> None:
         for can_id, extended in ((0x65, False), (0x66, False), (0x65, True), (0x65, False)):
             far.send(can.Message(arbitration_id=can_id, is_extended_id=extended, data=b"\1\2"))
         await asyncio.wait_for(done.wait(), LIMIT_S)
+        link.write(pack_frame(0x123, False, b"\7") + pack_frame(0x1234, True, b""))
+        sent = [m for m in (far.recv(LIMIT_S), far.recv(LIMIT_S)) if m]
+    found = [(m.arbitration_id, m.is_extended_id, bytes(m.data)) for m in sent]
+    assert found == [(0x123, False, b"\7"), (0x1234, True, b"")]
     assert threads == {threading.current_thread()}
     link.close()
     link.close()
     assert [frame[:3] for frame in got] == [(0x65, False, b"\1\2")] * 2
     assert 0 < got[0].t_rx_ns <= got[1].t_rx_ns
     assert "can pass" not in [thread.name for thread in threading.enumerate()]
-
-
-def test_commands_go_out() -> None:
-    link = make("out")
-    link.open()
-    with can.Bus("out", "virtual") as far:
-        link.write(pack_frame(0x123, False, b"\7") + pack_frame(0x1234, True, b""))
-        sent = [far.recv(LIMIT_S) for _ in range(2)]
-    link.close()
-    found = [(m.arbitration_id, m.is_extended_id, bytes(m.data)) for m in sent if m]
-    assert found == [(0x123, False, b"\7"), (0x1234, True, b"")]
     with pytest.raises(LinkError, match="not open"):
         link.write(b"")
-
-
-def test_settings_of_other_backends_and_filters() -> None:
-    with pytest.raises(msgspec.ValidationError, match="the system sets it"):
-        msgspec.convert({"interface": "can0", "bitrate": 500000}, SocketCanOptions)
-    assert make("rate", bitrate=250000).bitrate == 250000
-    assert LINK.make_can(SocketCanOptions(interface="can0")).title == "can0"
-    with pytest.raises(LinkError, match="cannot open"):
-        PythonCanLink("nosuch", "x").open()
-    packed = pack_filters([CanFilter(0x65, 0x7FF, False), CanFilter(0x18FEE900, 0x03FFFF00, True)])
-    assert packed.hex() == "65000000ff0700c0" + "00e9fe9800ffffc3"
 
 
 class FakeBus:
@@ -190,7 +172,15 @@ async def test_cyclic_frames_are_replaced_and_end_with_the_link(monkeypatch: pyt
     assert [message.arbitration_id for message in bus.sent] == [1, 2]
 
 
-def test_the_bit_rate_is_set_only_if_it_is_configured(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_of_other_backends_and_filters_and_the_bit_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(msgspec.ValidationError, match="the system sets it"):
+        msgspec.convert({"interface": "can0", "bitrate": 500000}, SocketCanOptions)
+    assert make("rate", bitrate=250000).bitrate == 250000
+    assert LINK.make_can(SocketCanOptions(interface="can0")).title == "can0"
+    with pytest.raises(LinkError, match="cannot open"):
+        PythonCanLink("nosuch", "x").open()
+    packed = pack_filters([CanFilter(0x65, 0x7FF, False), CanFilter(0x18FEE900, 0x03FFFF00, True)])
+    assert packed.hex() == "65000000ff0700c0" + "00e9fe9800ffffc3"
     opened, bus = list[dict[str, object]](), Mock()
     monkeypatch.setattr(can, "Bus", lambda *_where, **keys: opened.append(keys) or bus)  # type: ignore[func-returns-value]
     for bitrate in (0, 250_000):
