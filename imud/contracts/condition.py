@@ -62,6 +62,15 @@ class ReasonCode(StrEnum):
     LOST_BEFORE = "lost-before"
     FINISHED = "finished"
 
+    @classmethod
+    def _missing_(cls, value: object) -> "ReasonCode | None":
+        """Return the code of another version of imud; None if `value` is not a string."""
+        if not isinstance(value, str):
+            return None
+        code = str.__new__(cls, value)
+        code._name_ = code._value_ = value
+        return code
+
 
 MISSING: Final = frozenset((
     ReasonCode.NO_PORT, ReasonCode.NO_DATA, ReasonCode.SEARCHING, ReasonCode.NO_SAMPLES, ReasonCode.STOPPED,
