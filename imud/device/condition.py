@@ -170,8 +170,14 @@ def _stopped(facts: Facts, _name: str, _value: Any) -> str:
 
 
 def _gets_no_data(facts: Facts, _limits: ConditionLimits) -> bool:
+    if facts.state is DeviceState.MISSING:  # the port is not checked yet
+        return False
     has_reply = facts.is_polled or facts.problem.startswith(("it replies", SEARCH_BEGUN))
     return not facts.recent.bytes_in and not has_reply
+
+
+def _has_no_port(facts: Facts, _limits: ConditionLimits) -> bool:
+    return facts.state is DeviceState.MISSING and bool(facts.problem)
 
 
 def _wires(facts: Facts, _name: str, _value: Any) -> str:
@@ -185,7 +191,7 @@ RULES_WITHOUT_SAMPLES: Final = (
         lambda f, *_: f"The replay is at its end. {sentence(f.problem) if f.problem else ''}".rstrip(),
     ),
     Rule(
-        ReasonCode.NO_PORT, Section.ABOUT, lambda f, _: f.state is DeviceState.MISSING and f.place.is_serial,
+        ReasonCode.NO_PORT, Section.ABOUT, lambda f, limits: _has_no_port(f, limits) and f.place.is_serial,
         lambda f, *_: f"The port {f.place.port} does not exist.",
         lambda f, *_: f"Plug in the cable, or correct {f.place.key} in the configuration. "
                       f"Ports on this host: {', '.join(f.place.others()) or 'none'}.",
@@ -196,7 +202,7 @@ RULES_WITHOUT_SAMPLES: Final = (
         "Check the power supply and the connector.",
     ),
     Rule(ReasonCode.FAILED, Section.ABOUT, lambda f, _: f.state is DeviceState.FAILED, _problem, DOCTOR),
-    Rule(ReasonCode.NO_PORT, Section.ABOUT, lambda f, _: f.state is DeviceState.MISSING, _problem, DOCTOR),
+    Rule(ReasonCode.NO_PORT, Section.ABOUT, _has_no_port, _problem, DOCTOR),
     Rule(ReasonCode.NO_DATA, Section.ABOUT, _gets_no_data, lambda f, *_: f"No data arrives at {f.place.port}.", _wires),
     Rule(
         ReasonCode.SEARCHING, Section.LIVE, lambda f, _: f.problem in ("", SEARCH_BEGUN),

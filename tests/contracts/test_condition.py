@@ -23,11 +23,8 @@ def test_summary(words: dict[str, str], line: str) -> None:
     assert conditions.summary({name: Condition(word) for name, word in words.items()}) == line
 
 
-def test_limits_have_the_documented_values() -> None:
+def test_durations_and_documented_limits() -> None:
     assert check_schema("Limits of the condition", conditions.ConditionLimits) == 6
-
-
-def test_duration() -> None:
     for seconds, text in (
         (-1, "0 s"), (119.9, "119 s"), (120, "2 min"), (7199, "119 min"), (7200, "2 h"), (172_800, "2 days"),
     ):  # fmt: skip

@@ -62,6 +62,8 @@ LATE = facts(t_err_ns=2_100_000)
         (facts(DeviceState.FAILED, "port is in use by gpsd"), "missing", "Port is in use by gpsd.", DOCTOR),
         (facts(DeviceState.SEARCHING, SEARCH_BEGUN), "missing",
          "imud searches for the device at /dev/ttyUSB0.", "Wait for the search."),
+        (facts(DeviceState.MISSING), "missing",
+         "imud searches for the device at /dev/ttyUSB0.", "Wait for the search."),
         (facts(DeviceState.SEARCHING, "bytes arrive, but no valid frame", recent=recent(bytes_in=9)), "missing",
          "Bytes arrive, but no valid frame.", DOCTOR),
         (facts(DeviceState.SILENT, "it replies but sends none"), "missing", "It replies but sends none.", DOCTOR),
