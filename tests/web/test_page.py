@@ -44,6 +44,10 @@ TEXT_ON = [
     ("accent", "card"), ("accent", "accent-soft"), ("accent-ink", "accent"),
 ]  # fmt: skip
 """Colors of text and of the ground behind it."""
+SHAPES = ("x", "y", "z", "mute", "faint", "accent", "queue", "degraded-fill", *CONDITIONS)
+"""Colors of curves, bars and marks on a panel."""
+MARKS = ("strip", *(f"h-{one}" for one in CONDITIONS)), ("legend-line", "sw-ok", "sw-next")
+"""Classes of elements with mixed colors, each after the class of its parent."""
 PEAK_EVERY = 40
 CONTROLS = {
     "button", "link", "textbox", "searchbox", "spinbutton", "combobox", "checkbox", "switch", "radio", "radiogroup",
@@ -433,14 +437,27 @@ def test_statistics_of_a_comparison_and_angles_over_a_half_turn(scripts: Page) -
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
-def test_each_color_of_text_has_contrast(scripts: Page, theme: str) -> None:
+def test_each_color_of_text_and_of_graphics_has_contrast(scripts: Page, theme: str) -> None:
     tokens = scripts.js(
         """document.documentElement.dataset.theme = arguments[0];
         const style = getComputedStyle(document.documentElement);
-        return Object.fromEntries(arguments[1].map((one) => [one, style.getPropertyValue(`--${one}`).trim()]))""",
-        theme, sorted({name for pair in TEXT_ON for name in pair}),
+        const context = new OffscreenCanvas(1, 1).getContext('2d', { willReadFrequently: true });
+        const mixed = ([parent, ...names]) => names.map((name) => {
+            document.body.innerHTML = `<p class="${parent}"><i class="${name}"></i></p>`;
+            context.fillStyle = getComputedStyle(document.querySelector('i')).backgroundColor;
+            context.fillRect(0, 0, 1, 1);
+            const hex = [...context.getImageData(0, 0, 1, 1).data].map((one) => one.toString(16).padStart(2, '0'));
+            return [name, `#${hex.slice(0, 3).join('')}`];
+        });
+        const tokens = arguments[1].map((one) => [one, style.getPropertyValue(`--${one}`).trim()]);
+        return Object.fromEntries([...tokens, ...arguments[2].flatMap(mixed)])""",
+        theme, sorted({*SHAPES, *(name for pair in TEXT_ON for name in pair)}), MARKS,
     )  # fmt: skip
-    low = {pair: ratio for pair in TEXT_ON if (ratio := contrast(tokens[pair[0]], tokens[pair[1]])) < 4.5}
+    pairs = dict.fromkeys(TEXT_ON, 4.5)
+    pairs |= {(one, "card"): 3.0 for one in (*SHAPES, *(name for _, *names in MARKS for name in names))} | pairs
+    low = {
+        pair: ratio for pair, least in pairs.items() if (ratio := contrast(tokens[pair[0]], tokens[pair[1]])) < least
+    }
     assert low == {}
 
 
@@ -472,19 +489,24 @@ def test_the_plots_continue_after_a_reload(page: Page, site: Site) -> None:
 
 
 def test_a_plot_merges_old_points_without_loss_of_a_peak(scripts: Page) -> None:
-    stored, xs, most, least = scripts.module(
-        """const { RollingPlot } = await import('/static/plots.js');
-        const plot = new RollingPlot('t', 't', 'm', ['x']);
+    stored, xs, most, least, losses = scripts.module(
+        """const { PlotGroup, RollingPlot } = await import('/static/plots.js');
+        const group = Object.assign(new PlotGroup(30), { rate_hz: 4 });
+        const plot = new RollingPlot('t', 't', 'm', ['x'], {}, group);
         for (let t = 0; t < 8000; t += 1) {
           const range = t === 7003 ? [[-7], [9]] : [[1], [2]];
-          if (t < 6000 || t > 6100) plot.add({ first_s: t, last_s: t, utc_s: t, seq: t, count: 1 }, range, 1);
+          const count = args[0].includes(t) ? 3 : 4;
+          const bucket = { first_s: t, last_s: t, utc_s: t, seq: t, count, t_err_s: t === 7980 ? 0.1 : 0 };
+          if (t < 6000 || t > 6100) plot.add(bucket, range, 1);
         }
-        return [plot.stored, ...plot.data]"""
+        return [plot.stored, ...plot.data, plot.losses]""",
+        [7000, 7980, 7990],
     )
     assert 8000 - 3600 - 60 <= xs[0] < 8000 - 3500
     assert xs == sorted(xs)
-    assert len(xs) - stored <= 662
-    assert (most.index(9), most.count(9), most.count(None)) == (least.index(-7), 1, 1), "one peak and one gap"
+    assert len(xs) - stored <= 663
+    assert (most.index(9), most.count(9), most.count(None)) == (least.index(-7), 1, 2), "one peak, one gap, one loss"
+    assert (losses, xs[most.index(None, stored)]) == ([6101, 7000, 7990], 7989.5), "a time stamp error hides one"
 
 
 def test_a_hidden_page_reads_nothing(page: Page, site: Site) -> None:

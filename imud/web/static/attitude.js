@@ -1,5 +1,6 @@
 // The attitude as a block on a compass. The quaternion rotates from the body to the navigation frame.
 
+import { COLORS } from "./plots.js";
 import { cleared, el } from "./util.js";
 
 const SIZE = 300;
@@ -130,12 +131,12 @@ export class AttitudeView {
 
   /** Return color, name and both ends of each axis of the device, outside of the block. */
   axes() {
-    return ["#d1495b", "#2e8b57", "#3a7bd5"].map((colour, axis) => {
+    return COLORS.map((colorOf, axis) => {
       const end = [0, 0, 0];
       end[axis] = 1.5;
       const start = [0, 0, 0];
       start[axis] = BODY[axis];
-      return { colour, name: "xyz"[axis], start: this.toEnu(start), end: this.toEnu(end) };
+      return { colour: colorOf(), name: "xyz"[axis], start: this.toEnu(start), end: this.toEnu(end) };
     });
   }
 

@@ -1,7 +1,7 @@
 // Two devices on one time axis: both curves of each axis, their difference, and its statistics.
 
 import { sorted } from "./condition.js";
-import { COLOURS, ink, near, PlotGroup, RollingPlot, timeBar } from "./plots.js";
+import { COLORS, ink, near, PlotGroup, RollingPlot, timeBar } from "./plots.js";
 import { world } from "./state.js";
 import { icon, segmented } from "./ui.js";
 import { AXES, DEGREE, duration, el, number } from "./util.js";
@@ -112,7 +112,7 @@ export class Compare {
     this.latest = [];
     this.group = new PlotGroup(this.span_s);
     const more = { isAngle, decimals: 2 };
-    this.plots = names.map((name, axis) => new RollingPlot(`compare-${name}`, name, unit, this.names, { ...more, styles: [{ stroke: COLOURS[axis], mark: `axis${axis}` }, { stroke: ink, dash: [6, 4], mark: "dashed" }] }, this.group));
+    this.plots = names.map((name, axis) => new RollingPlot(`compare-${name}`, name, unit, this.names, { ...more, styles: [{ stroke: COLORS[axis], mark: `axis${axis}` }, { stroke: ink, dash: [6, 4], mark: "dashed" }] }, this.group));
     this.difference = new RollingPlot("compare-difference", `${this.names[0]} − ${this.names[1]}`, unit, names, { decimals: 2, lanes: true }, this.group);
     this.plotsBox.replaceChildren(...[...this.plots, this.difference].map((one) => one.node));
     this.plotsBox.setAttribute("aria-label", `plots of ${title}`);

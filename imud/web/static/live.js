@@ -122,6 +122,7 @@ export class LiveSection {
 
   draw({ status }) {
     this.frame = status.navigation_frame || "ENU";
+    this.group.rate_hz = status.expected_rate_hz;
     const heading = status.frame?.heading;
     this.attitude.isCompass = heading === "true" || heading === "magnetic";
     setText(this.angles[2].name, this.attitude.isCompass ? "heading" : "yaw");

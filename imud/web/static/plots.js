@@ -4,13 +4,15 @@
 import { button, icon, segmented } from "./ui.js";
 import { el, number, setText } from "./util.js";
 
-export const COLOURS = ["#d1495b", "#2e8b57", "#3a7bd5"];
 const AREA = "40"; // opacity, in hexadecimal
 const DRAW_MS = 66;
 const HOLE_BUCKETS = 3; // number of periods without buckets that breaks the line
 const KEPT_S = 3600; // time span of the data that a plot keeps
 const FINE_S = 600; // age at which a plot merges points
 const MERGED_S = 6; // time span of a merged point
+const LOCATED_PERIODS = 0.1; // largest time stamp error, in sample periods, with which a step of the time shows a lost sample
+const COUNTED_S = 2; // time of samples that the sample rate can count
+const GAP_LEAST_S = 1; // least time without values that breaks the line of merged points
 const MERGE_S = 60; // time span of the points that a plot merges together
 const LANE_MARGIN = 0.12; // free share of the height of a lane, above and below its curve
 const LABEL_MARGIN = 0.14; // share of the height of a lane without a label, so that the labels of two lanes do not overlap
@@ -22,11 +24,12 @@ const color = (name) => () => getComputedStyle(document.documentElement).getProp
 export const ink = color("--mute");
 export const grid = color("--line");
 const lostColor = color("--missing");
+export const COLORS = [color("--x"), color("--y"), color("--z")];
 
-/** Time range of several plots: the newest `span_s`, or a zoomed range; and their pause. */
+/** Time range of several plots: the newest `span_s`, or a zoomed range; their pause, and the sample rate of the device. */
 export class PlotGroup {
   constructor(span_s) {
-    Object.assign(this, { span_s, zoomed: null, isPaused: false, plots: [], onChange: () => {} });
+    Object.assign(this, { span_s, rate_hz: 0, zoomed: null, isPaused: false, plots: [], onChange: () => {} });
   }
 
   setSpan(span_s) {
@@ -93,6 +96,16 @@ function splitsOf(least, most) {
 
 const isNumber = (value) => value !== null && value !== undefined;
 
+/** Return whether samples between two buckets are lost. The step of the time shows it if the time stamps are good enough. */
+export function isLossBetween(before, bucket, rate_hz) {
+  if (bucket.seq - before.seq > bucket.count) return true;
+  const steps = Math.round((bucket.last_s - before.last_s) * rate_hz);
+  return bucket.t_err_s * rate_hz < LOCATED_PERIODS && steps > bucket.count && steps < COUNTED_S * rate_hz;
+}
+
+/** Return the indexes of the points without a neighbor. A line does not show them. */
+const alone = ({ data }, line) => data[line].flatMap((one, at, all) => (isNumber(one) && !isNumber(all[at - 1]) && !isNumber(all[at + 1]) ? [at] : []));
+
 /** Return the least and the greatest angle, moved by whole turns to the previous angle. A range of more than half a turn
  *  contains ±180: then the angles are between its ends in the other direction. */
 function unwrapped([least, greatest], before) {
@@ -107,7 +120,7 @@ export class RollingPlot {
    *  styles: stroke, dash and mark (class of the name) of each line; group: common time range. */
   constructor(id, title, unit, axes, { scale = 1, isAngle = false, isLog = false, decimals = 2, lanes = false, styles = [] } = {}, group = new PlotGroup(30)) {
     Object.assign(this, { axes, title, scale, isAngle, isLog, decimals, group, lanes });
-    this.styles = axes.map((_, index) => ({ stroke: COLOURS[index], mark: `axis${index}`, ...styles[index] }));
+    this.styles = axes.map((_, index) => ({ stroke: COLORS[index], mark: `axis${index}`, ...styles[index] }));
     this.labels = isLog ? powers : isAngle ? degrees : labels;
     group.plots.push(this);
     this.offset_s = null; // from the daemon's clock to UTC, constant after the first bucket
@@ -164,10 +177,10 @@ export class RollingPlot {
   begin() {
     const axis = (more) => ({ stroke: ink, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1 }, ...more });
     const series = this.axes.flatMap((name, index) => {
-      const line = { stroke: this.styles[index].stroke, dash: this.styles[index].dash, width: 1.25, points: { show: false }, spanGaps: false, scale: this.scaleOf(index), show: !this.hidden.has(index) };
+      const line = { stroke: this.styles[index].stroke, dash: this.styles[index].dash, width: 1.25, points: { show: false, filter: alone, size: 3 }, spanGaps: false, scale: this.scaleOf(index), show: !this.hidden.has(index) };
       return [{ ...line, label: `${name} maximum` }, { ...line, label: `${name} minimum` }];
     });
-    const bands = this.styles.flatMap(({ stroke }, index) => (typeof stroke === "string" ? [{ series: [1 + 2 * index, 2 + 2 * index], fill: stroke + AREA }] : []));
+    const bands = this.styles.flatMap(({ stroke, dash }, index) => (dash ? [] : [{ series: [1 + 2 * index, 2 + 2 * index], fill: () => stroke() + AREA }]));
     const seconds = (_, splits) => splits.map((at) => new Date(at * 1000).toTimeString().slice(0, 8));
     const lanes = Object.fromEntries(this.axes.map((_, index) => [`y${index}`, { range: (_plot, least, most) => this.laneRange(index, least, most) }]));
     const upright = this.lanes ? { scale: "y0", size: 52, values: (_, splits) => splits.map(() => ""), grid: { show: false }, ticks: { show: false } } : { scale: "y", size: 52, values: this.labels };
@@ -268,8 +281,11 @@ export class RollingPlot {
       this.push(before + period_s, null);
       this.step_s = undefined;
     } else if (before !== undefined) this.step_s = x - before;
-    if (this.seq !== undefined && bucket.seq - this.seq > bucket.count) this.losses.push(x);
-    this.seq = bucket.seq;
+    if (this.last && isLossBetween(this.last, bucket, this.group.rate_hz)) {
+      this.losses.push(x);
+      if (xs.length && isNumber(this.data[1].at(-1))) this.push((xs.at(-1) + x) / 2, null);
+    }
+    this.last = bucket;
     this.push(x, range);
     this.newest = x;
     if (xs[this.stored] < x - FINE_S - MERGE_S) this.merge();
@@ -279,7 +295,7 @@ export class RollingPlot {
   /** Merge the points that are older than FINE_S, and remove the points that are older than KEPT_S. */
   merge() {
     const xs = this.data[0];
-    const isGap = (at) => this.data.every((one, line) => !line || one[at] === null);
+    const isGap = (at) => xs[at + 1] - xs[at - 1] > GAP_LEAST_S && this.data.every((one, line) => !line || one[at] === null);
     const merged = this.data.map(() => []);
     const slot = (at) => Math.floor(xs[at] / MERGED_S);
     let end = this.stored;
@@ -320,7 +336,7 @@ export class RollingPlot {
     for (const [bucket, period_s] of buckets) {
       const x = xOf(bucket);
       if (before && bucket.first_s - before.last_s > period_s) this.push(before.last_s + this.offset_s, null);
-      if (before && bucket.seq - before.seq > bucket.count) this.losses.push(x);
+      if (before && isLossBetween(before, bucket, 0)) this.losses.push(x); // the sample rate of the past is not known
       this.push(x, rangeOf(bucket));
       before = bucket;
     }
@@ -353,7 +369,7 @@ export class RollingPlot {
     this.offset_s = null;
     this.losses = [];
     this.stored = 0;
-    this.seq = undefined;
+    this.last = null;
   }
 
   draw() {

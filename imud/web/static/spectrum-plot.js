@@ -1,6 +1,6 @@
 // Plot of the spectrum, with the frequency of the highest peak.
 
-import { COLOURS, grid, ink, powers } from "./plots.js";
+import { COLORS, grid, ink, powers } from "./plots.js";
 import { Spectrum } from "./spectrum.js";
 import { AXES, el, number, setText } from "./util.js";
 
@@ -79,7 +79,7 @@ export class SpectrumPlot {
     this.plot = new uPlot(
       {
         ...this.size(), legend: { show: false }, cursor: { drag: { x: true, y: false } },
-        series: [{}, ...COLOURS.map((stroke) => ({ stroke, width: 1.25, points: { show: false } }))],
+        series: [{}, ...COLORS.map((stroke) => ({ stroke, width: 1.25, points: { show: false } }))],
         axes: [{ ...axis, label: "Hz", labelSize: 18, labelFont: "12px system-ui" }, { ...axis, size: 62, label: UNITS[this.member], labelSize: 18, labelFont: "12px system-ui", values: powers }],
         scales: { x: { time: false }, y: { distr: 3 } },
       },

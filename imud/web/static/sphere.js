@@ -13,7 +13,7 @@ const NONE = 255;
 const CIRCLE_STEPS = 90;
 const NEAR_OPACITY = 220; // of 255
 const FAR_OPACITY = 60;
-const NEXT_OPACITY = 110;
+const NEXT_OPACITY = 200;
 
 /** Return the center of cell 0 … 47: the octant by signs (bit 0: x < 0), then the order of the absolute values. */
 export function cellDirection(cell) {
