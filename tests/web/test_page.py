@@ -399,6 +399,11 @@ def test_two_devices_are_compared_with_their_delay(page: Page, tmp_path: Path) -
             page.driver.get(f"{url}#/compare/bow/stern")
             page.until("return Boolean(window.imud?.view?.plots)")
             page.click(".timebar [aria-label=quantity] :nth-child(2)")
+            begin = page.js("return Date.now() / 1000")
+            page.until("return window.imud.view.difference.stored")
+            times, *lines = page.js("return window.imud.view.difference.data.map((one) => one.slice(0, 2))")
+            assert times[0] < begin, "the history is older than the plot"
+            assert all(None not in line for line in lines), "of both devices"
             cells = "return [...document.querySelectorAll('.figures-table tbody tr')].at(-1).innerText.split('\\t')"
             page.until("return window.imud.view.difference.data[0].length > 160")
             name, mean, _rms, _most, same, delay = page.until(
@@ -414,7 +419,7 @@ def test_two_devices_are_compared_with_their_delay(page: Page, tmp_path: Path) -
 
 
 def test_statistics_of_a_comparison_and_angles_over_a_half_turn(scripts: Page) -> None:
-    found, delay, none, [least, most] = scripts.module(
+    found, delay, none, weighed, [least, most] = scripts.module(
         """const { statistics } = await import('/static/compare.js');
         const { RollingPlot } = await import('/static/plots.js');
         const motion = (t) => Math.sin(t / 9) + Math.sin(t / 5);
@@ -426,8 +431,10 @@ def test_statistics_of_a_comparison_and_angles_over_a_half_turn(scripts: Page) -
         const bucket = (t) => ({ first_s: t, last_s: t, utc_s: t, seq: t, count: 1 });
         turn.forEach((one, t) => plot.add(bucket(t), one.map((angle) => [angle]), 1));
         const other = wave(0).map((_, index) => index);
-        return [statistics(a, a), statistics(a, b), statistics(a, other), [plot.data[2], plot.data[1]]]"""
+        const weighed = statistics([1, 4, ...a], [0, 0, ...a], [8, 4, ...a.map(() => 0)], 2);
+        return [statistics(a, a), statistics(a, b), statistics(a, other), weighed, [plot.data[2], plot.data[1]]]"""
     )
+    assert (weighed["mean"], weighed["rms"], weighed["delay"]) == (2, pytest.approx(2**0.5), pytest.approx(0, abs=1e-6))
     assert found["mean"] == found["rms"] == 0
     assert (found["correlation"], found["delay"]) == (pytest.approx(1), pytest.approx(0, abs=1e-6))
     assert delay["mean"] == pytest.approx(2, abs=0.05)

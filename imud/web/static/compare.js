@@ -1,17 +1,22 @@
 // Two devices on one time axis: both curves of each axis, their difference, and its statistics.
 
 import { sorted } from "./condition.js";
+import { Arrivals, pastOf } from "./past.js";
 import { COLORS, ink, near, PlotGroup, RollingPlot, timeBar } from "./plots.js";
 import { world } from "./state.js";
 import { icon, segmented } from "./ui.js";
 import { AXES, DEGREE, duration, el, number } from "./util.js";
 
 const RATE_HZ = 20;
-const SPANS = [["10", "10 s"], ["30", "30 s"], ["600", "10 min"]];
+const CONVENTION = "enu-flu";
+const SPANS = [["10", "10 s"], ["30", "30 s"], ["600", "10 min"], ["3600", "1 h"]];
+const SAME_S = 1; // maximum difference of the limits of two buckets of one time
 const DRAW_MS = 1000; // time between two computations of the statistics
 const LATE_S = 2; // time to wait for the values of B
 const HOLE_S = 5 / RATE_HZ; // longest time between two values of B that is interpolated
 const WAITING_MAX = 200; // number of buckets of B that wait for A
+const DELAY_S = 60; // time span of the newest values that give the delay
+const WEIGHT_MAX_S = 8; // largest weight of a value: the length of a bucket of the history
 const LAGS_MAX = RATE_HZ; // largest delay in periods: 1 s
 const CORRELATION_LEAST = 0.5;
 const CORRELATION_FALL = 0.05; // a delay is clear if the correlation at other delays is lower by this
@@ -21,22 +26,27 @@ const KINDS = {
   gyro_rad_s: { title: "Angular rate", unit: "°/s", names: AXES, scale: 1 / DEGREE },
 };
 
-const mean = (values) => values.reduce((sum, one) => sum + one, 0) / values.length;
+/** Return the mean of of(pair), by the weights of the pairs. */
+function mean(pairs, of) {
+  let [sum, all] = [0, 0];
+  for (const pair of pairs) {
+    sum += pair[2] * of(pair);
+    all += pair[2];
+  }
+  return sum / all;
+}
 
 /** Return the correlation of pairs; null without variation. */
 function correlation(pairs) {
-  const [a, b] = [0, 1].map((index) => mean(pairs.map((one) => one[index])));
-  let [ab, aa, bb] = [0, 0, 0];
-  for (const [one, other] of pairs) {
-    ab += (one - a) * (other - b);
-    aa += (one - a) ** 2;
-    bb += (other - b) ** 2;
-  }
-  return aa * bb > 0 ? ab / Math.sqrt(aa * bb) : null;
+  const [a, b] = [0, 1].map((index) => mean(pairs, (one) => one[index]));
+  const product = (i, j) => mean(pairs, (one) => (one[i] - [a, b][i]) * (one[j] - [a, b][j]));
+  const scale = product(0, 0) * product(1, 1);
+  return scale > 0 ? product(0, 1) / Math.sqrt(scale) : null;
 }
 
-/** Return the pairs of values that both rows contain, with the second row moved by `lag` places. */
-const pairsOf = (a, b, lag = 0) => a.map((one, index) => [one, b[index + lag] ?? null]).filter(([one, other]) => one !== null && other !== null);
+/** Return the pairs of values that both rows contain, with the second row moved by `lag` places, and their weights. */
+const pairsOf = (a, b, lag = 0, weights = []) =>
+  a.map((one, index) => [one, b[index + lag] ?? null, weights[index] ?? 1]).filter(([one, other]) => one !== null && other !== null);
 
 /** Return how much later b shows the motion of a, in places; null if it is not clear. */
 export function delayOf(a, b) {
@@ -50,14 +60,15 @@ export function delayOf(a, b) {
   return at - LAGS_MAX + (before - after) / 2 / (before - 2 * best + after);
 }
 
-/** Return mean, rms and maximum from the mean of the differences, correlation and delay; null without two pairs. */
-export function statistics(a, b) {
-  const pairs = pairsOf(a, b);
+/** Return mean, rms and maximum from the mean of the differences, correlation and delay; null without two pairs. The delay is
+ *  that of the values from index `even` on, which have equal distances. */
+export function statistics(a, b, weights, even = 0) {
+  const pairs = pairsOf(a, b, 0, weights);
   if (pairs.length < 2) return null;
-  const difference = pairs.map(([one, other]) => one - other);
-  const middle = mean(difference);
-  const rms = Math.sqrt(mean(difference.map((one) => (one - middle) ** 2)));
-  return { mean: middle, rms, most: Math.max(...difference.map((one) => Math.abs(one - middle))), correlation: correlation(pairs), delay: delayOf(a, b) };
+  const middle = mean(pairs, ([one, other]) => one - other);
+  const rms = Math.sqrt(mean(pairs, ([one, other]) => (one - other - middle) ** 2));
+  const most = pairs.reduce((so, [one, other]) => Math.max(so, Math.abs(one - other - middle)), 0);
+  return { mean: middle, rms, most, correlation: correlation(pairs), delay: delayOf(a.slice(even), b.slice(even)) };
 }
 
 export class Compare {
@@ -110,10 +121,11 @@ export class Compare {
     const { names, unit, isAngle, title } = KINDS[this.kind];
     this.waiting = this.names.map(() => []); // buckets that are not in the plots: [bucket, time, values of the axes]
     this.latest = [];
+    this.arrivals = new Arrivals();
     this.group = new PlotGroup(this.span_s);
     const more = { isAngle, decimals: 2 };
     this.plots = names.map((name, axis) => new RollingPlot(`compare-${name}`, name, unit, this.names, { ...more, styles: [{ stroke: COLORS[axis], mark: `axis${axis}` }, { stroke: ink, dash: [6, 4], mark: "dashed" }] }, this.group));
-    this.difference = new RollingPlot("compare-difference", `${this.names[0]} − ${this.names[1]}`, unit, names, { decimals: 2, lanes: true }, this.group);
+    this.difference = new RollingPlot("compare-difference", `${this.names[0]} − ${this.names[1]}`, unit, names, { ...more, lanes: true }, this.group);
     this.plotsBox.replaceChildren(...[...this.plots, this.difference].map((one) => one.node));
     this.plotsBox.setAttribute("aria-label", `plots of ${title}`);
     const kinds = segmented("quantity", Object.entries(KINDS).map(([key, one]) => [key, one.title]), this.kind, (value) => { this.kind = value; this.restart(); });
@@ -129,19 +141,42 @@ export class Compare {
     const index = message.kind === "samples" && message.convention && !this.group.isPaused ? this.names.indexOf(message.device) : -1;
     for (const bucket of index < 0 ? [] : message.buckets) if (bucket[this.kind]) this.waiting[index].push([bucket, (bucket.first_s + bucket.last_s) / 2, this.values(index, bucket[this.kind])]);
     if (index >= 0) this.pair();
+    if (index === 0) for (const bucket of message.buckets) if (this.arrivals.add(bucket)) this.restore(bucket.last_s);
+  }
+
+  /** Show the history of the daemon: the middle of minimum and maximum of each interval. */
+  async restore(newest_s) {
+    const { plots, kind } = this;
+    const [a, b] = await pastOf(this.names, newest_s, { convention: CONVENTION }).catch(() => [[], []]); // the history is off
+    if (plots !== this.plots) return; // the user chose another device or quantity
+    const [buckets, others] = [a, b].map((all) => all.filter(([one]) => one[kind]));
+    const [rows, latest] = [new Map(), []];
+    let at = 0;
+    for (const [bucket] of buckets) {
+      while (others[at]?.[0].last_s < bucket.first_s) at += 1;
+      const other = others[at]?.[0];
+      const isSame = other && ["first_s", "last_s"].every((end) => Math.abs(other[end] - bucket[end]) <= SAME_S);
+      rows.set(bucket, [this.values(0, bucket[kind], latest), isSame ? this.values(1, other[kind], latest) : [null, null, null]]);
+    }
+    const both = (values) => [values, values];
+    plots.forEach((plot, axis) => plot.restore(buckets, (bucket) => both(rows.get(bucket).map((one) => one[axis]))));
+    this.difference.restore(buckets, (bucket) => {
+      const [one, other] = rows.get(bucket);
+      return other[0] === null ? null : both(one.map((value, axis) => value - other[axis]));
+    });
   }
 
   /** Return the middle of each range. An angle is at most half a turn from the previous angle of a device. */
-  values(index, [least, greatest]) {
+  values(index, [least, greatest], latest = this.latest) {
     const { names, scale, isAngle } = KINDS[this.kind];
-    const before = this.latest[index] ?? this.latest[1 - index];
+    const before = latest[index] ?? latest[1 - index];
     const found = names.map((_, axis) => {
       if (!isAngle) return ((least[axis] + greatest[axis]) / 2) * scale;
       const other = greatest[axis] - least[axis] > Math.PI ? greatest[axis] - 2 * Math.PI : greatest[axis];
       const angle = ((least[axis] + other) / 2) * scale;
       return before ? near(angle, before[axis]) : angle;
     });
-    this.latest[index] = found;
+    latest[index] = found;
     return found;
   }
 
@@ -165,16 +200,18 @@ export class Compare {
   }
 
   drawTable() {
-    const { names, unit } = KINDS[this.kind];
+    const { names, unit, isAngle } = KINDS[this.kind];
     if (document.hidden) return;
     const [from, to] = this.group.range(this.difference.newest);
     this.table.replaceChildren(...names.map((name, axis) => {
-      const { data } = this.plots[axis];
-      const inRange = data[0].map((t, index) => index).filter((index) => data[0][index] >= from && data[0][index] <= to);
-      const [times, a, b] = [0, 1, 3].map((line) => inRange.map((index) => data[line][index]));
-      const found = statistics(a, b);
-      const texts = found ? [found.mean, found.rms, found.most].map((one) => `${number(one, 2)} ${unit}`).concat(number(found.correlation, 3)) : ["–", "–", "–", "–"];
-      const period_s = (times.at(-1) - times[0]) / (times.length - 1);
+      const { data, stored } = this.plots[axis];
+      const inRange = data[0].map((t, index) => index).filter((index) => data[0][index] >= from && data[0][index] <= to && data[1][index] !== null);
+      const times = inRange.map((index) => data[0][index]);
+      const [a, b] = [1, 3].map((line) => inRange.map((index) => data[line][index] && (data[line][index] + data[line + 1][index]) / 2));
+      const even = Math.max(inRange.filter((index) => index < stored).length, inRange.length - DELAY_S * RATE_HZ);
+      const found = statistics(a, b, times.map((t, index) => Math.min(t - (times[index - 1] ?? t), WEIGHT_MAX_S)), even);
+      const texts = found ? [isAngle ? near(found.mean, 0) : found.mean, found.rms, found.most].map((one) => `${number(one, 2)} ${unit}`).concat(number(found.correlation, 3)) : ["–", "–", "–", "–"];
+      const period_s = (times.at(-1) - times[even]) / (times.length - 1 - even);
       const delay = found && found.delay !== null ? `${number(found.delay * period_s * 1e3, 0)} ms` : "–";
       return el("tr", {}, el("th", { scope: "row", text: name }), [...texts, delay].map((text) => el("td", { text })));
     }));
@@ -183,11 +220,11 @@ export class Compare {
   drawNotes() {
     const [a, b] = this.names.map((name) => this.statuses.get(name));
     if (!a || !b) return;
-    const rotated = this.names.filter((_, index) => [a, b][index].frame && [a, b][index].frame.convention !== "enu-flu");
+    const rotated = this.names.filter((_, index) => [a, b][index].frame && [a, b][index].frame.convention !== CONVENTION);
     const isKnown = a.frame && b.frame;
-    const axes = a.frame?.conventions?.["enu-flu"]?.frame;
+    const axes = a.frame?.conventions?.[CONVENTION]?.frame;
     const notes = [
-      [isKnown, isKnown ? `Both devices use the same axes${axes ? `: ${axes}` : ""} (enu-flu).${rotated.length ? ` imud rotates the values of ${rotated.join(" and ")}.` : ""}` : "The axes of a device are not known."],
+      [isKnown, isKnown ? `Both devices use the same axes${axes ? `: ${axes}` : ""} (${CONVENTION}).${rotated.length ? ` imud rotates the values of ${rotated.join(" and ")}.` : ""}` : "The axes of a device are not known."],
       [true, `Both devices use one clock, time stamp error ±${duration(a.clock.t_err_ns / 1e9)} and ±${duration(b.clock.t_err_ns / 1e9)}.`],
     ];
     [a, b].forEach((one, index) => one.condition?.condition === "missing" && notes.push([false, `${this.names[index]} is missing and sends no samples.`]));

@@ -6,18 +6,15 @@ import { ConditionView, deviceLink } from "./condition.js";
 import { EventsSection } from "./events.js";
 import { LedgerSection } from "./ledger.js";
 import { LiveSection } from "./live.js";
+import { Arrivals, pastOf } from "./past.js";
 import { SettingsSection } from "./settings.js";
 import { SECTIONS } from "./shell.js";
 import { TimeSection } from "./time.js";
 import { button, icon, toast } from "./ui.js";
-import { call, clock, copy, el, setText, span } from "./util.js";
+import { clock, copy, el, setText, span } from "./util.js";
 
 const PHONE = matchMedia("(max-width: 820px)");
-const HOUR = { points: 600, period_s: 6 };
-const RECENT_S = 599; // the newest part of the history has a point per second
 const HISTORY_OFF = "the history is off";
-const GAP_S = 5; // time without buckets after which the page requests the history
-const OVERLAP_S = 2.5; // time of buckets before this request; the history then ends after the first of them
 
 export class DevicePage {
   constructor(main, name, stream, shell) {
@@ -39,8 +36,7 @@ export class DevicePage {
     this.sections = el("div", { class: "sections" }, parts.map((one) => one.node));
     const head = el("div", { class: "device-head" }, el("div", {}, el("h1", { text: name }), this.about), el("div", { class: "chips" }, this.activity));
     main.append(head, this.condition.node, this.trouble, this.missing, this.sections);
-    this.last_s = -Infinity;
-    this.begun_s = NaN; // start of the buckets that the history must reach
+    this.arrivals = new Arrivals();
     this.spy();
     this.look();
     this.restore();
@@ -68,14 +64,8 @@ export class DevicePage {
   async restore() {
     if (this.isRestoring) return;
     this.isRestoring = true;
-    const get = async (more) => (await call("history", { devices: [this.name], points: HOUR.points, ...more })).devices[this.name];
     try {
-      const hour = await get({});
-      const from_s = (hour.at(-1)?.last_s ?? 0) - RECENT_S;
-      const recent = hour.length ? await get({ from_ns: Math.round(from_s * 1e9) }) : [];
-      const end_s = (recent.at(-1)?.last_s ?? 0) - 1; // the newest second is not complete
-      const older = hour.filter((one) => one.last_s < Math.floor(from_s)).map((one) => [one, HOUR.period_s]);
-      const buckets = [...older, ...recent.filter((one) => one.last_s < end_s).map((one) => [one, 1])];
+      const [buckets] = await pastOf([this.name]);
       for (const part of [this.live, this.time]) part.restore(buckets);
       this.live.showHistory(true);
     } catch (error) {
@@ -106,14 +96,9 @@ export class DevicePage {
     if (message.kind === "raw") this.live.addRaw(message);
     if (message.kind === "samples" && !message.convention && message.rate_hz === this.live.rate_hz && !this.live.group.isPaused) {
       for (const bucket of message.buckets) {
-        if (bucket.first_s - this.last_s > GAP_S) this.begun_s = bucket.first_s; // this page is new, was hidden or not connected
-        this.last_s = bucket.last_s;
         this.live.add(bucket);
         this.time.add(bucket, 1 / message.rate_hz);
-      }
-      if (!this.isRestoring && this.last_s - this.begun_s > OVERLAP_S) {
-        this.begun_s = NaN;
-        this.restore();
+        if (this.arrivals.add(bucket, this.isRestoring)) this.restore();
       }
     }
   }
