@@ -177,7 +177,7 @@ def test_a_setting_with_a_difference_is_marked_on_the_page_and_in_the_overview(p
         page.until("return document.querySelector('[data-setting=mode].off')")
         three = page.js("return [...document.querySelectorAll('[data-setting=mode] dd')].map((one) => one.innerText)")
         assert three[:2] == ["9-axis", "6-axis"], "declared, on the device, in flash"
-        assert page.text("[data-setting=magnetic_calibration] .states") == "as declared"
+        assert page.text("[data-setting=magnetic_calibration] .states") == "as declared, in flash: unknown"
         assert page.js("return document.querySelectorAll('[data-setting].off').length") == 1
         page.click("#home")
         page.until_text(".card", "in the configuration")

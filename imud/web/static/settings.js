@@ -23,8 +23,9 @@ export class SettingsSection {
     this.locked = el("p", { class: "locked" }, icon("lock"), el("span", { text: "Read only. Log in to change settings." }));
     this.groups = el("div");
     this.again = button("Read again", () => this.load(true), { kind: "quiet", glyph: "undo" });
+    this.save = button("Save to flash", () => this.saveAll(), { kind: "small", glyph: "save" });
     const filter = segmented("filter of the settings", [["all", "All"], ["look", "Changed or different"]], "all", (value) => { this.only = value; this.filter(); });
-    this.node = section("settings", "Settings", this.lead, el("div", { class: "timebar" }, filter, el("span", { class: "push" }), this.again), this.locked, this.groups);
+    this.node = section("settings", "Settings", this.lead, el("div", { class: "timebar" }, filter, el("span", { class: "push" }), this.save, this.again), this.locked, this.groups);
   }
 
   onSession() {
@@ -75,7 +76,10 @@ export class SettingsSection {
     const unsaved = this.all.filter((one) => !one.differs && this.isUnsaved(one)).length;
     const found = [off && `${off} setting${off === 1 ? " differs" : "s differ"} from the configuration`, unsaved && `${unsaved} setting${unsaved === 1 ? " is" : "s are"} not saved`].filter(Boolean).join(", ");
     const read = status.read_ns ? `Read from the device at ${timeOf(status.read_ns / 1e9)}. ` : "Not read from the device yet. ";
-    this.lead.textContent = `${read}${found ? `${found}. ` : ""}${status.problem}`;
+    const isUnsaved = status.unsaved && !Object.keys(status.lost_at_power_off).length;
+    this.save.hidden = !isUnsaved || !session.control;
+    const change = isUnsaved ? "A change is not saved, and the value in flash is unknown. " : "";
+    this.lead.textContent = `${read}${change}${found ? `${found}. ` : ""}${status.problem}`;
   }
 
   filter() {
@@ -83,7 +87,7 @@ export class SettingsSection {
     for (const group of this.groups.children) group.hidden = !group.querySelector(".setting:not([hidden])");
   }
 
-  isUnsaved(setting) { return setting.saved_state === "differs"; }
+  isUnsaved(setting) { return setting.saved_state === "differs" || (setting.name in this.report.status.lost_at_power_off && setting.saved_state === "unknown"); }
 
   row(setting) {
     const box = el("div", { class: "control" });
@@ -168,7 +172,7 @@ export class SettingsSection {
     const { declared, actual, saved, saved_state, unit } = setting;
     const flash = saved_state === "unknown" ? "unknown" : said(saved, unit);
     const parts = [el("dl", { class: "three" }, declared !== null && line("declared", said(declared, unit), isOff), line("on device", said(actual, unit), isOff), line("in flash", flash, isUnsaved))];
-    if (isUnsaved) parts.push(el("p", { class: "lost", text: "Lost at power-off." }));
+    if (isUnsaved) parts.push(el("p", { class: "lost", text: saved_state === "unknown" ? "Changed, not saved to flash." : "Lost at power-off." }));
     if (isOff && session.control) parts.push(button("Use the declared value", () => this.set(setting, isPartial(declared) ? { ...actual, ...declared } : declared, true), { kind: "small" }));
     if (!isOff && isUnsaved && session.control) parts.push(button("Save to flash", () => this.saveAll(), { kind: "small", glyph: "save" }));
     return parts;
@@ -177,7 +181,7 @@ export class SettingsSection {
   fine(setting) {
     if (!setting.readable) return el("p", { class: "fine" }, el("span", { text: "the device does not report it" }));
     if (setting.declared === null) return el("p", { class: "fine plain" }, el("span", { text: setting.declarable ? "not declared" : "" }));
-    return el("p", { class: "fine" }, icon("ok"), el("span", { text: "as declared" }));
+    return el("p", { class: "fine" }, icon("ok"), el("span", { text: setting.saved_state === "unknown" ? "as declared, in flash: unknown" : "as declared" }));
   }
 
   /** Show a setting that the address names. */
@@ -241,7 +245,7 @@ export class SettingsSection {
     });
     const left = Object.entries(plan.left_out).map(([name, why]) => el("li", { text: `${words(name)} is not written: ${why}` }));
     const { flash_writes, flash_writes_day } = this.report.status;
-    const note = save ? `This uses 1 write to the flash of the device (${flash_writes} by imud, ${flash_writes_day} in the last 24 hours).` : "The device loses these changes at power-off. This page shows that they are not saved.";
+    const note = save ? `This uses 1 write to the flash of the device (${flash_writes} by imud, ${flash_writes_day} in the last 24 hours).` : "The device loses these changes at power-off.";
     return [
       rows.length ? el("table", { class: "plain" }, el("tbody", {}, rows)) : el("p", { text: "No change is necessary." }), left.length ? el("ul", {}, left) : "",
       toggle("Keep after power-off", save, (is) => this.review(is)), el("p", { class: "help", text: note }),
@@ -271,13 +275,16 @@ export class SettingsSection {
     const titles = Object.fromEntries(this.all.map((one) => [one.name, one.title]));
     const steps = done.steps.map((one) => el("li", {}, icon(isGood(one) ? "ok" : "missing", isGood(one) ? "done" : "not done"), `${titles[one.name] ?? one.name}: ${one.outcome}${one.message ? ` (${one.message})` : ""}`));
     const others = Object.fromEntries(done.steps.filter((one) => isGood(one) && !agrees(this.all.find((each) => each.name === one.name)?.declared, one.value)).map((one) => [one.name, one.value]));
-    const lost = done.steps.filter(isGood).map((one) => `“${titles[one.name] ?? one.name}”`).join(", ");
+    const inFlash = (one) => this.all.find((each) => each.name === one.name) ?? {};
+    const lost = done.steps.filter((one) => isGood(one) && !(inFlash(one).saved_state !== "unknown" && same(inFlash(one).saved, one.value)));
+    const loses = lost.some((one) => inFlash(one).saved_state === "unknown") ? "may lose" : "loses";
+    const atPowerOff = lost.length ? `Applied. The device ${loses} ${lost.map((one) => `“${titles[one.name] ?? one.name}”`).join(", ")} at power-off.` : "Applied. The flash already contains these values.";
     const is = (outcome) => done.steps.some((one) => one.outcome === outcome);
     const saved = done.restarted && is("verified") && !is("not applied") ? "Applied and saved to flash." : "Applied. The save to flash is not verified: imud cannot read the flash.";
-    const result = done.problem || (done.saved ? saved : `Applied. The device loses ${lost} at power-off.`);
+    const result = done.problem || (done.saved ? saved : atPowerOff);
     return [
       el("ol", { class: "outcome" }, steps), el("p", { class: done.problem ? "wrong" : "", role: "status", id: "outcome" }, el("b", { text: result })),
-      ...(!done.saved && !done.problem ? [button("Save to flash", () => this.saveAll(), { glyph: "save" })] : []),
+      ...(!done.saved && !done.problem && lost.length ? [button("Save to flash", () => this.saveAll(), { glyph: "save" })] : []),
       ...[done.restart_doubt && `The restart is not verified: ${done.restart_doubt}.`, done.advice, done.not_saved].filter(Boolean).map((text) => el("p", { class: "help" }, marked(text))),
       ...(Object.keys(others).length ? [el("p", { text: "Update the configuration:" }), button("Copy as YAML", async () => { await copy(yaml(others)); toast("Copied."); }, { glyph: "copy" })] : []),
     ];
