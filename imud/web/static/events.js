@@ -13,6 +13,9 @@ const GROUP_NS = 60e9; // maximum time between two events of a group
 const COUNTED = ["loss", "bad-frame", "mark"]; // kinds whose messages contain counts
 const EVENTS_MAX = 1000;
 
+/** Return the message of an event, and the bytes of a damaged frame. */
+export const messageOf = ({ kind, message }) => (kind === "bad-frame" ? message.split(/: (?=[\da-f]{2}(?: |$))/) : [message]);
+
 export const eventWords = (kind) => KINDS[kind] ?? kind;
 
 /** Return the stored events, the oldest first. devices: names; undefined for all. */
@@ -119,12 +122,13 @@ export class EventsSection {
 
   row(one, open) {
     const level = levelOf(one);
-    const detail = Object.entries(one.detail ?? {});
+    const [message, bytes] = messageOf(one);
+    const detail = Object.entries({ ...one.detail, ...(bytes && { bytes }) });
     const first = String(one.first_ns || one.t_ns);
     const summary = one.count > 1 ? `Details, since ${timeOf((one.first_ns || one.t_ns) / 1e9)}` : "Details";
     return el("li", { class: level, "data-kind": one.kind }, icon(level === "warning" ? "degraded" : "about", level),
       el("div", {}, el("p", {}, el("b", { text: eventWords(one.kind) }), one.count > 1 && el("em", { text: `×${number(one.count)}` }), this.whose === "every" && el("span", { class: "tag", text: one.device || "imud" })),
-        el("p", { text: one.message }),
+        el("p", { text: message }),
         (detail.length > 0 || one.count > 1) && el("details", { open: open.has(`${one.kind}${first}`), "data-first": `${one.kind}${first}` }, el("summary", { text: summary }),
           detail.map(([name, value]) => el("code", { text: `${name}: ${shown(value)}` })))),
       el("time", { text: timeOf(one.t_ns / 1e9) }));

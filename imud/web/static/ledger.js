@@ -1,7 +1,7 @@
 // The section Ledger: three bars with parts that add up, and the lost samples by cause.
 
 import { section } from "./ui.js";
-import { el, number, setText } from "./util.js";
+import { el, number, percent, setText } from "./util.js";
 
 const BARS = [
   ["bytes", "Bytes", (one) => one.bytes_in, [
@@ -81,7 +81,7 @@ function drawBar({ whole, made, sum, bar }, ledger) {
     piece.dataset.count = parts[index];
     item.hidden = parts[index] === 0 && !isGood;
     setText(count, number(parts[index]));
-    setText(share, total && parts[index] < total ? `${number((100 * parts[index]) / total, 1)} %` : "");
+    setText(share, total && parts[index] < total ? `${percent((100 * parts[index]) / total)} %` : "");
   });
   bar.dataset.total = total;
   bar.setAttribute("aria-label", made.map(({ name }, index) => `${name} ${parts[index]}`).join(", "));

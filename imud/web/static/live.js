@@ -4,7 +4,7 @@ import { AttitudeView, gravityOf } from "./attitude.js";
 import { PlotGroup, RollingPlot, timeBar } from "./plots.js";
 import { SpectrumPlot } from "./spectrum-plot.js";
 import { icon, section, segmented, toggle } from "./ui.js";
-import { AXES, DEGREE, duration, el, number, setText } from "./util.js";
+import { AXES, DEGREE, duration, el, number, percent, setText } from "./util.js";
 
 const RATES_HZ = [10, 20, 50];
 const SPANS = [["10", "10 s"], ["30", "30 s"], ["600", "10 min"], ["3600", "1 h"]];
@@ -136,14 +136,14 @@ export class LiveSection {
     const { recent, clock } = status;
     const isMissing = status.condition?.condition === "missing";
     const lost = Object.values(recent?.lost ?? {}).reduce((a, b) => a + b, 0);
-    const percent = recent && recent.samples + lost ? (100 * lost) / (recent.samples + lost) : null;
+    const share = recent && recent.samples + lost ? (100 * lost) / (recent.samples + lost) : null;
     const count = status.latency_buckets.reduce((a, b) => a + b, 0);
     const set = (title, value, unit, isBad = false) => this.figures.get(title).set(isMissing ? "" : value, isMissing ? "" : unit, isBad);
     const codes = (status.condition?.reasons ?? []).map((one) => one.code);
     const [error, errorUnit = ""] = duration(clock.t_err_ns / 1e9).split(" ");
     const [mean, meanUnit = ""] = duration(count ? status.latency_sum_ns / 1e9 / count : null).split(" ");
     set("Rate", number(status.rate_hz, 1), status.expected_rate_hz ? `of ${number(status.expected_rate_hz, Math.abs(status.expected_rate_hz % 1) < 0.05 ? 0 : 1)} Hz` : "Hz", codes.includes("rate"));
-    set("Lost in last minute", percent === null ? "" : number(percent, percent ? 1 : 0), percent === null ? "" : "%", codes.includes("lost"));
+    set("Lost in last minute", share === null ? "" : percent(share), share === null ? "" : "%", codes.includes("lost"));
     set("Time stamp error", `±${error}`, errorUnit, codes.includes("time-error"));
     set("Latency", mean, meanUnit);
     set("Temperature", status.temperature_c === null ? "" : number(status.temperature_c, 1), status.temperature_c === null ? "not sent" : "°C");

@@ -1,9 +1,9 @@
 // All devices: the summary, then the devices with a problem, then the devices that are OK. The wall display.
 
 import { deviceLink, known, reasonList, sinceWords, sorted } from "./condition.js";
-import { eventWords, pastEvents } from "./events.js";
+import { eventWords, messageOf, pastEvents } from "./events.js";
 import { CONDITION_WORDS, icon } from "./ui.js";
-import { DEGREE, duration, el, number, setText, timeOf } from "./util.js";
+import { DEGREE, duration, el, number, percent, setText, timeOf } from "./util.js";
 
 const COUNTED = { missing: (n) => `${n} missing`, attention: (n) => `${n} need${n === 1 ? "s" : ""} attention`, degraded: (n) => `${n} degraded`, ok: (n) => `${n} OK` };
 const FILTER_FROM = 9; // number of devices from which a field filters by name
@@ -33,7 +33,7 @@ function figures(row) {
   const isSlow = row.expected_rate_hz > 0 && Math.abs(row.rate_hz / row.expected_rate_hz - 1) > RATE_SHARE;
   const shown = [
     ["rate", number(row.rate_hz, 1), row.expected_rate_hz ? `of ${number(row.expected_rate_hz, 0)} Hz` : "Hz", isSlow],
-    ["lost, 1 min", row.lost_percent ? number(row.lost_percent, 1) : "0", "%", row.lost_percent > LOST_PERCENT],
+    ["lost, 1 min", percent(row.lost_percent ?? 0), "%", row.lost_percent > LOST_PERCENT],
     row.t_err_s !== null && ["time error", `±${error}`, unit ?? "", false],
     row.temperature_c !== null && ["temp.", number(row.temperature_c, 0), "°C", false],
   ];
@@ -87,7 +87,7 @@ export class Overview {
   drawEvents() {
     const shown = (this.events ?? []).slice(-EVENTS_SHOWN).reverse();
     this.happened.replaceChildren(...shown.map((one) => el("li", {}, el("time", { text: timeOf(one.t_ns / 1e9) }), el("b", { text: one.device || "imud" }),
-      el("span", {}, eventWords(one.kind), one.count > 1 && el("em", { text: ` ×${number(one.count)}` }), el("span", { class: "help", text: ` ${one.message}` })))));
+      el("span", {}, eventWords(one.kind), one.count > 1 && el("em", { text: ` ×${number(one.count)}` }), el("span", { class: "help", text: ` ${messageOf(one)[0]}` })))));
   }
 
   onRestart() {

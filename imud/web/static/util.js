@@ -35,9 +35,8 @@ export function number(value, decimals = 0) {
   return text.replace(/^-(?=[0.]+$)/, "").replace("-", "−");
 }
 
-export function length(vector) {
-  return vector ? Math.hypot(...vector) : null;
-}
+/** Return a share in percent as text. A small share is not 0. */
+export const percent = (value) => (value > 0 && value < 0.1 ? "< 0.1" : number(value, value ? 1 : 0));
 
 /** Return a time in s as text with a suitable unit. */
 export function duration(seconds) {
