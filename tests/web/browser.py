@@ -24,6 +24,7 @@ MISSING = "" if CHROMIUM and CHROMEDRIVER else "no chromium and chromedriver on 
 LOOK_S: Final = 0.05
 PHONE: Final = (390, 844)
 PERIOD_MS: Final = 5
+TOKEN: Final = "correct-horse-battery-staple"
 
 
 class Page:

@@ -12,7 +12,7 @@ from tests.cli.conftest import cli
 from tests.support.daemon_process import RunningDaemon, daemon_with_module
 from tests.support.files import ROOT
 from tests.support.socket_rig import run
-from tests.web.browser import Page, browser, serving_web
+from tests.web.browser import TOKEN, Page, browser, serving_web
 
 __all__ = ["cli"]
 PICTURES: Final = ROOT / "build/web"
@@ -60,6 +60,13 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[RunningDaem
     folder = tmp_path_factory.mktemp("site")
     with daemon_with_module(folder, "--rate", "100") as daemon, serving_web(daemon.socket) as url:
         yield daemon, url
+
+
+@pytest.fixture
+def token(tmp_path: Path) -> str:
+    file = tmp_path / "token"
+    file.write_text(TOKEN)
+    return str(file)
 
 
 @pytest.fixture

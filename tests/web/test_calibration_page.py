@@ -11,11 +11,10 @@ from imud.client.connection import Client
 from imud.device.calibration import COVERAGE_WANTED
 from imud.formats.jsonrpc import RpcError
 from tests.support.daemon_process import LIMIT_S, RunningDaemon
-from tests.web.browser import MISSING, Page, log_in, open_page, serving_web
+from tests.web.browser import MISSING, TOKEN, Page, log_in, open_page, serving_web
 from tests.web.turned import BIAS, turned_module
 
 pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.live]
-TOKEN = "correct-horse-battery-staple"
 COVERED = "return Number(document.querySelector('#calibration canvas').dataset.covered)"
 CALIBRATION_EVENTS = "return document.querySelectorAll('#event-list li[data-kind=calibration]').length"
 BEGIN = "#calibration [data-kind={}] button"
@@ -30,13 +29,6 @@ PIXEL = """const { onSphere, coveredCells, cellDirection } = await import('/stat
     sphere.draw(args[0]);
     return coveredCells(args[0]).map((is, cell) => [is, onSphere(cellDirection(cell))[2] > 0.3, colour(cell)]);"""
 """For each cell of a mask: whether it is covered, whether it is in front, and the color of its center."""
-
-
-@pytest.fixture
-def token(tmp_path: Path) -> str:
-    file = tmp_path / "token"
-    file.write_text(TOKEN)
-    return str(file)
 
 
 def test_a_magnetometer_is_calibrated_with_the_token(page: Page, tmp_path: Path, token: str) -> None:

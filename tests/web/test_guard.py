@@ -83,11 +83,12 @@ def test_a_token_comes_from_the_first_line_of_a_file(tmp_path: Path) -> None:
     assert read_token(str(file)) == TOKEN.encode()
     file.write_text("x" * 20)  # docs: at least 20 characters
     assert read_token(str(file)) == b"x" * 20
-    file.write_text("x" * 19)
-    with pytest.raises(BadArgument, match="got 19"):
-        read_token(str(file))
-    file.write_text("short\n")
-    with pytest.raises(BadArgument, match="at least 20 characters, got 5; make one with: openssl rand"):
-        read_token(str(file))
+    for text, words in (
+        ("x" * 19, "got 19"),
+        ("short\n", "at least 20 characters, got 5; make one with: openssl rand"),
+    ):
+        file.write_text(text)
+        with pytest.raises(BadArgument, match=words):
+            read_token(str(file))
     with pytest.raises(BadArgument, match="No such file"):
         read_token(str(tmp_path / "none"))

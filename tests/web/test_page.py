@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from time import monotonic
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +22,7 @@ from tests.web.browser import (
     MISSING,
     PERIOD_MS,
     PHONE,
+    TOKEN,
     Page,
     Sender,
     enter,
@@ -35,7 +35,6 @@ from tests.web.browser import (
 
 pytestmark = [pytest.mark.skipif(bool(MISSING), reason=MISSING), pytest.mark.live]
 Site = tuple[RunningDaemon, str]
-TOKEN = "correct-horse-battery-staple"
 SECTIONS = ("time", "ledger", "settings", "calibration", "events", "about", "live")
 CONDITIONS = ("ok", "degraded", "attention", "missing")
 TEXT_ON = [
@@ -44,10 +43,8 @@ TEXT_ON = [
     ("accent", "card"), ("accent", "accent-soft"), ("accent-ink", "accent"),
 ]  # fmt: skip
 """Colors of text and of the ground behind it."""
-SHAPES = ("x", "y", "z", "mute", "faint", "accent", "queue", "degraded-fill", *CONDITIONS)
+SHAPES = ("x", "y", "z", "mute", "faint", "accent", "queue", "ok-fill", "degraded-fill", *CONDITIONS)
 """Colors of curves, bars and marks on a panel."""
-MARKS = ("strip", *(f"h-{one}" for one in CONDITIONS)), ("legend-line", "sw-ok", "sw-next")
-"""Classes of elements with mixed colors, each after the class of its parent."""
 PEAK_EVERY = 40
 CONTROLS = {
     "button", "link", "textbox", "searchbox", "spinbutton", "combobox", "checkbox", "switch", "radio", "radiogroup",
@@ -74,6 +71,11 @@ LOW_CONTRAST = """
         return (high + 0.05) / (low + 0.05) < least - 0.05 ? [`${one.innerText.slice(0, 30)} ${style.color}`] : [];
     });"""
 """Texts with a contrast below that of WCAG 2, on the color of the ground behind each text."""
+CUT = """return [...document.querySelectorAll('html, main *, dialog[open] *')].filter((one) => {
+        const isWide = one === document.documentElement && one.scrollWidth > innerWidth;
+        return isWide || (one.getBoundingClientRect().right > innerWidth + 1 && !one.closest('.scroll'));
+    }).map((one) => one.outerHTML.slice(0, 80))"""
+"""Elements over the right border of the window."""
 PINCH = """const box = document.querySelector('#accel_m_s2 .plot');
     const { left, width } = box.querySelector('.u-over').getBoundingClientRect();
     const finger = (share, identifier) => new Touch({ identifier, target: box, clientX: left + share * width });
@@ -132,22 +134,13 @@ def test_the_plot_contains_every_sent_peak(page: Page, tmp_path: Path) -> None:
 
 
 def test_directions_and_rotations_are_those_of_the_daemon(scripts: Page) -> None:
-    cells = scripts.module(
-        """const { cellDirection } = await import('/static/sphere.js');
-        return Array.from({ length: 48 }, (_, cell) => cellDirection(cell))"""
-    )
-    cells_of = scripts.module(
-        """const { cellOf } = await import('/static/sphere.js');
-        return args[0].map(cellOf)""",
+    cells, cells_of, covered, turned = scripts.module(
+        """const { cellDirection, cellOf, coveredCells } = await import('/static/sphere.js');
+        const { rotate } = await import('/static/attitude.js');
+        const cells = Array.from({ length: 48 }, (_, cell) => cellDirection(cell));
+        const turned = rotate([Math.SQRT1_2, 0, 0, Math.SQRT1_2], [1, 0, 0]);
+        return [cells, args[0].map(cellOf), coveredCells('800000000005'), turned]""",
         DIRECTIONS,
-    )
-    covered = scripts.module(
-        """const { coveredCells } = await import('/static/sphere.js');
-        return coveredCells('800000000005')"""
-    )
-    turned = scripts.module(
-        """const { rotate } = await import('/static/attitude.js');
-        return rotate([Math.SQRT1_2, 0, 0, Math.SQRT1_2], [1, 0, 0])"""
     )
     assert [cell_of(tuple(one)) for one in cells] == [*range(48)]
     assert cells_of == [cell_of(one) for one in DIRECTIONS]
@@ -227,11 +220,9 @@ def test_ledger_latency_status_and_settings_are_those_of_the_daemon(page: Page, 
     assert page.problems() == []
 
 
-def test_settings_are_planned_only_with_the_token(page: Page, site: Site, tmp_path: Path) -> None:
-    file = tmp_path / "token"
-    file.write_text(TOKEN)
+def test_settings_are_planned_only_with_the_token(page: Page, site: Site, token: str) -> None:
     daemon, _ = site
-    with serving_web(daemon.socket, "--token-file", str(file), "--reading", "token") as url:
+    with serving_web(daemon.socket, "--token-file", token, "--reading", "token") as url:
         page.driver.get(f"{url}#/device/bow")
         page.until("return document.querySelector('#login-dialog').open", what="the token is asked for")
         enter(page, "wrong")
@@ -277,58 +268,45 @@ def test_both_views_fit_a_telephone(phone: Page, site: Site) -> None:
     for section in SECTIONS:
         phone.js("location.hash = `#/device/bow/${arguments[0]}`", section)
         phone.until("return document.getElementById(arguments[0]).getClientRects().length", section)
-        assert phone.js(wide) == [PHONE[0], PHONE[0]], section
-    cut: list[Any] = phone.js(
-        """return [...document.querySelectorAll('main *')].filter((one) => {
-            const box = one.getBoundingClientRect();
-            return box.width && box.right > window.innerWidth + 1 && !one.closest('.scroll');
-        }).map((one) => one.outerHTML.slice(0, 80))"""
-    )
-    assert cut == []
+        assert (phone.js(wide), phone.js(CUT)) == ([PHONE[0], PHONE[0]], []), section
 
 
-def test_no_section_overflows_at_any_width_in_both_color_schemes(page: Page, site: Site) -> None:
-    _, url = site
-    page.driver.get(f"{url}#/device/bow")
-    page.until("return document.querySelectorAll('[data-setting]').length > 3")
-    addresses = [f"#/device/bow/{one}" for one in SECTIONS] + ["#/", "#/wall", "#/compare"]
-    found = []
-    for width in (360, 390, 1024, 1400):
-        metrics = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
-        page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
-        for theme in ("light", "dark"):
-            page.js("document.documentElement.dataset.theme = arguments[0]", theme)
-            for address in addresses:
-                page.js("location.hash = arguments[0]", address)
-                page.until("return document.body.dataset.view && document.querySelector('main').children.length")
-                if page.js("return document.documentElement.scrollWidth > innerWidth"):
-                    found.append((width, theme, address))
-    page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-    assert (found, page.problems()) == ([], [])
-
-
-def test_each_control_has_a_name_and_each_text_has_contrast(page: Page, site: Site, tmp_path: Path) -> None:
-    file = tmp_path / "token"
-    file.write_text(TOKEN)
-    with serving_web(site[0].socket, "--token-file", str(file)) as url:
+def test_each_section_fits_any_width_with_names_and_contrast(page: Page, site: Site, token: str) -> None:
+    with serving_web(site[0].socket, "--token-file", token) as url:
         open_page(page, url, "bow")
         log_in(page, TOKEN)
         page.until("return document.querySelectorAll('[data-setting]').length > 3")
         page.until("return document.querySelectorAll('#calibration details').length > 3")
         page.js("document.querySelectorAll('main details').forEach((one) => (one.open = true))")
-        for address in ("#/device/bow", "#/", "#/wall", "#/compare"):
-            page.js("location.hash = arguments[0]", address)
-            page.until("return document.querySelector('main').children.length > 1")
-            for theme in ("light", "dark"):
-                page.js("document.documentElement.dataset.theme = arguments[0]", theme)
-                assert page.js(LOW_CONTRAST) == [], (address, theme)
-            tree = page.driver.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
-            controls = [one for one in tree if not one["ignored"] and one["role"]["value"] in CONTROLS]
-            assert controls
-            nameless = [one["backendDOMNodeId"] for one in controls if not one["name"]["value"].strip()]
-            describe = partial(page.driver.execute_cdp_cmd, "DOM.describeNode")
-            assert [describe({"backendNodeId": one, "depth": 2})["node"] for one in nameless] == [], address
-        assert page.problems() == []
+        page.click("[data-setting=mode] [aria-checked=false]")
+        page.js("window.imud.view.onMessage({ kind: 'events', events: [arguments[0]] })", TURNING)
+        faults = [fault for section in SECTIONS for fault in faults_of(page, f"#/device/bow/{section}")]
+        page.click("#bar .primary")
+        page.until_text("#dialog", "takes effect")
+        faults += faults_of(page)
+        page.click("#dialog button")
+        faults += [fault for address in ("#/", "#/wall", "#/compare") for fault in faults_of(page, address)]
+        assert (faults, page.problems()) == ([], [])
+
+
+def faults_of(page: Page, address: str = "") -> list[object]:
+    """Return cut elements, low contrasts, and controls without a name, at all widths in both color schemes."""
+    found: list[object] = []
+    for width in (360, 390, 1024, 1400):
+        metrics = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+        page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+        for theme in ("light", "dark"):
+            page.js("document.documentElement.dataset.theme = arguments[0]", theme)
+            page.js("location.hash = arguments[0] || location.hash", address)
+            page.until("return document.body.dataset.view && document.querySelector('main').children.length")
+            found += [(width, theme, address, one) for one in page.js(CUT) + page.js(LOW_CONTRAST)]
+    page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    tree = page.driver.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
+    controls = [one for one in tree if not one["ignored"] and one["role"]["value"] in CONTROLS]
+    assert controls
+    nameless = [one["backendDOMNodeId"] for one in controls if not one["name"]["value"].strip()]
+    describe = partial(page.driver.execute_cdp_cmd, "DOM.describeNode")
+    return found + [(address, describe({"backendNodeId": one, "depth": 2})["node"]) for one in nameless]
 
 
 def test_keys_the_filter_and_stored_events(page: Page, site: Site) -> None:
@@ -351,6 +329,8 @@ def test_keys_the_filter_and_stored_events(page: Page, site: Site) -> None:
         press(key)
         page.until(script)
     page.click("#dialog button")
+    split = "const { messageOf } = await import('/static/events.js'); return messageOf(args[0])"
+    assert page.module(split, {"kind": "bad-frame", "message": "1 bad frame, crc: 5a a5"})[1] == "5a a5"
     press("+", "#accel_m_s2 .plot")
     assert page.js("const [from, to] = window.imud.view.live.group.zoomed; return to - from") == pytest.approx(24)
     press("0", "#accel_m_s2 .plot")
@@ -361,11 +341,16 @@ def test_keys_the_filter_and_stored_events(page: Page, site: Site) -> None:
     page.until("return document.querySelector('[data-device]')")
     rows = [decode(encode(row_of(device(f"imu{number}"), None, 5))) for number in range(9)]
     rows[0]["work"] = "the command save is running"
+    reason = {"code": "lost", "message": "2 samples are lost.", "next": "Run `imud doctor`.", "section": "ledger"}
+    for number, row in enumerate(rows):
+        row |= {"state": CONDITIONS[1 + number % 3], "reasons": [reason] * (1 + number)}
     # nine devices in place of the devices of the daemon, whose later messages the view ignores
     show = "const { view } = window.imud, show = view.onMessage.bind(view); view.onMessage = () => {};"
     show += "show({ kind: 'overview', now_s: 1, devices: arguments[0] });"
     page.js(show, rows)
     assert "the command save is running" in page.text("[data-device=imu0]")
+    assert (page.text("#summary h1"), faults_of(page)) == ("9 of 9 devices have a problem", [])
+    assert page.js("return [...document.querySelectorAll('main .group')].map((one) => one.hidden)") == [True, False]
     press("3g", "#filter")
     page.js("const box = document.querySelector('#filter'); box.value = '3'; box.dispatchEvent(new Event('input'))")
     shown = page.js("return [...document.querySelectorAll('main [data-device]')].map((one) => one.dataset.device)")
@@ -373,7 +358,8 @@ def test_keys_the_filter_and_stored_events(page: Page, site: Site) -> None:
     page.js("location.hash = '#/wall'")
     page.until("return document.querySelector('.wall')")
     page.js(show, rows)
-    assert (page.js("return document.querySelectorAll('.wall [data-device] h2').length"), page.problems()) == (9, [])
+    assert page.js("return document.querySelectorAll('.wall:not([hidden], .wall-ok) [data-device] h2').length") == 9
+    assert (faults_of(page), page.problems()) == ([], [])
 
 
 def test_two_devices_are_compared_with_their_delay(page: Page, tmp_path: Path) -> None:
@@ -401,17 +387,14 @@ def test_two_devices_are_compared_with_their_delay(page: Page, tmp_path: Path) -
             page.click(".timebar [aria-label=quantity] :nth-child(2)")
             begin = page.js("return Date.now() / 1000")
             page.until("return window.imud.view.difference.stored")
-            times, *lines = page.js("return window.imud.view.difference.data.map((one) => one.slice(0, 2))")
-            assert times[0] < begin, "the history is older than the plot"
-            assert all(None not in line for line in lines), "of both devices"
-            cells = "return [...document.querySelectorAll('.figures-table tbody tr')].at(-1).innerText.split('\\t')"
+            oldest = page.js("return window.imud.view.difference.data.map((one) => one[0])")
+            assert (oldest[0] < begin, None in oldest) == (True, False), "the history of both devices"
             page.until("return window.imud.view.difference.data[0].length > 160")
-            name, mean, _rms, _most, same, delay = page.until(
-                f"{cells.replace('return ', 'const row = ')}; return !row.includes('–') && row"
-            )
+            row = "const row = [...document.querySelectorAll('.figures-table tbody tr')].at(-1).innerText.split('\\t')"
+            name, mean, _rms, _most, same, delay = page.until(f"{row}; return !row.includes('–') && row")
             page.until_text(".notes", "Both devices use the same axes: body: x forward, y left, z up")
             assert "imud rotates the values of bow and stern." in page.text(".notes")
-            assert page.problems() == []
+            assert (faults_of(page), page.problems()) == ([], [])
     assert name == "z"
     assert float(mean.split()[0]) == pytest.approx(0.5, abs=0.2)
     assert float(same) > 0.6
@@ -448,24 +431,12 @@ def test_each_color_of_text_and_of_graphics_has_contrast(scripts: Page, theme: s
     tokens = scripts.js(
         """document.documentElement.dataset.theme = arguments[0];
         const style = getComputedStyle(document.documentElement);
-        const context = new OffscreenCanvas(1, 1).getContext('2d', { willReadFrequently: true });
-        const mixed = ([parent, ...names]) => names.map((name) => {
-            document.body.innerHTML = `<p class="${parent}"><i class="${name}"></i></p>`;
-            context.fillStyle = getComputedStyle(document.querySelector('i')).backgroundColor;
-            context.fillRect(0, 0, 1, 1);
-            const hex = [...context.getImageData(0, 0, 1, 1).data].map((one) => one.toString(16).padStart(2, '0'));
-            return [name, `#${hex.slice(0, 3).join('')}`];
-        });
-        const tokens = arguments[1].map((one) => [one, style.getPropertyValue(`--${one}`).trim()]);
-        return Object.fromEntries([...tokens, ...arguments[2].flatMap(mixed)])""",
-        theme, sorted({*SHAPES, *(name for pair in TEXT_ON for name in pair)}), MARKS,
+        return Object.fromEntries(arguments[1].map((one) => [one, style.getPropertyValue(`--${one}`).trim()]))""",
+        theme, sorted({*SHAPES, *(name for pair in TEXT_ON for name in pair)}),
     )  # fmt: skip
-    pairs = dict.fromkeys(TEXT_ON, 4.5)
-    pairs |= {(one, "card"): 3.0 for one in (*SHAPES, *(name for _, *names in MARKS for name in names))} | pairs
-    low = {
-        pair: ratio for pair, least in pairs.items() if (ratio := contrast(tokens[pair[0]], tokens[pair[1]])) < least
-    }
-    assert low == {}
+    pairs = {(one, "card"): 3.0 for one in SHAPES} | dict.fromkeys(TEXT_ON, 4.5)
+    ratios = {(one, ground): contrast(tokens[one], tokens[ground]) for one, ground in pairs}
+    assert {pair: ratio for pair, ratio in ratios.items() if ratio < pairs[pair]} == {}
 
 
 def contrast(one: str, other: str) -> float:

@@ -102,7 +102,7 @@ export class Compare {
     this.makePlots();
     const [a, b] = this.names;
     this.grid.hidden = this.tools.hidden = !a || !b;
-    this.help.textContent = `rms and maximum are measured from the mean. Delay: ${b} shows the same motion this much later than ${a}; “–” if it is not clear.`;
+    this.help.textContent = `rms and maximum are measured from the mean. A value of the history is the middle of the minimum and the maximum in its interval. Delay in the newest minute: ${b} shows the same motion this much later than ${a}; “–” if it is not clear.`;
     if (a && b) this.stream.look({ look: "device", device: a, other: b, rate_hz: RATE_HZ });
     else this.stream.look({ look: "overview" });
   }
