@@ -8,6 +8,7 @@ import { DEGREE, duration, el, number, percent, setText, timeOf } from "./util.j
 const COUNTED = { missing: (n) => `${n} missing`, attention: (n) => `${n} need${n === 1 ? "s" : ""} attention`, degraded: (n) => `${n} degraded`, ok: (n) => `${n} OK` };
 const FILTER_FROM = 9; // number of devices from which a field filters by name
 const EVENTS_SHOWN = 5;
+const ROW_MOST = 3; // number of tiles in a single row
 const LOST_PERCENT = 0.1;
 const RATE_SHARE = 0.02;
 
@@ -158,6 +159,7 @@ export class Wall {
     for (const [box, isOk] of [[this.bad, false], [this.good, true]]) {
       const shown = rows.filter((one) => (known(one.state) === "ok") === isOk);
       box.hidden = !shown.length;
+      box.style.setProperty("--columns", shown.length > ROW_MOST ? Math.ceil(Math.sqrt(shown.length)) : shown.length);
       box.replaceChildren(...shown.map(tile));
     }
   }
