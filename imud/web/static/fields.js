@@ -28,6 +28,7 @@ export function changed(actual, value) {
 export function said(value, unit = "") {
   if (value === null || value === undefined) return "not reported";
   if (typeof value === "boolean") return value ? "on" : "off";
+  if (value === 0 && unit === "Hz") return "off";
   if (typeof value === "number") return `${number(value, Number.isInteger(value) ? 0 : 3)}${unit ? ` ${unit}` : ""}`;
   if (Array.isArray(value)) return value.length === 9 ? "rotation matrix" : `${value.map((one) => said(one)).join(", ")}${unit ? ` ${unit}` : ""}`;
   if (!isObject(value)) return words(value);

@@ -84,14 +84,15 @@ export function powers(_, splits) {
   return splits.map((at) => (at && Math.abs(Math.log10(at) - Math.round(Math.log10(at))) < 1e-9 ? String(Number(at.toPrecision(1))) : ""));
 }
 
-/** Return two or three round values between least and most. */
+/** Return the first and the last of the roundest values between least and most. */
 function splitsOf(least, most) {
-  const rough = (most - least) / 3;
-  const power = 10 ** Math.floor(Math.log10(rough));
-  const step = [1, 2, 5, 10].map((one) => one * power).find((one) => one >= rough);
   const [lowest, highest] = [least + LABEL_MARGIN * (most - least), most - LABEL_MARGIN * (most - least)];
-  const first = Math.ceil(lowest / step);
-  return Array.from({ length: 4 }, (_, index) => (first + index) * step).filter((one) => one <= highest);
+  const power = 10 ** Math.floor(Math.log10(most - least));
+  for (const step of [5, 2, 1, 0.5, 0.2].map((one) => one * power)) {
+    const [first, last] = [Math.ceil(lowest / step), Math.floor(highest / step)];
+    if (last > first) return [first * step, last * step];
+  }
+  return [];
 }
 
 const isNumber = (value) => value !== null && value !== undefined;
