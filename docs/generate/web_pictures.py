@@ -1,7 +1,8 @@
 """Takes the screenshots of `imud web` for README.md and docs/views.md: `make web-pictures`.
 
-The browser shows five simulated devices: a vibrating device with lost samples and a wrong setting, a device with a bad
-cable, a silent device, a missing device, and a rotating device. The files are docs/pictures/web-*.png.
+The browser shows six simulated devices: a vibrating device with lost samples and a wrong setting, a device with a bad
+cable, a silent device, a missing device, a device that is OK, and a rotating device. The files are
+docs/pictures/web-*.png.
 """
 
 import shutil
@@ -15,7 +16,6 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 from PIL import Image
 
 from tests.support.daemon_process import RunningDaemon, running_daemon
@@ -29,10 +29,11 @@ MODULES: Final = {
     "bow": ("hipnuc-uart", "--rate", "200", "--motion", "engine", "--faults", "lose=0.0004,flip=0.0002"),
     "mast": ("imu61x-uart", "--rate", "100", "--faults", "cut=0.01,flip=0.01"),
     "crane": ("hipnuc-uart", "--rate", "100", "--motion", "still"),
+    "keel": ("imu61x-uart", "--rate", "50"),
 }
 DECLARED: Final = {"bow": {"mode": "9-axis", "magnetic_calibration": True, "output": {"hi91": 200}, "sout_divisor": 8}}
 ABSENT: Final = "stern"
-CONDITIONS: Final = {"bow": "attention", "mast": "degraded", "crane": "missing", ABSENT: "missing"}
+CONDITIONS: Final = {"bow": "attention", "mast": "degraded", "crane": "missing", ABSENT: "missing", "keel": "ok"}
 COLOURS_MAX: Final = 256
 """Number of colors of a picture. The file is a third as large and looks the same."""
 FULL = "return window.imud.view.plots.get('accel_m_s2').data[0].length >= 580"
@@ -92,15 +93,9 @@ def ports() -> Iterator[None]:
 
 
 def save(name: str, png: bytes) -> None:
-    """Write a picture with a palette of its most frequent colors. Replace other colors by the nearest one."""
+    """Write a picture with a palette."""
     with Image.open(BytesIO(png)) as read:
-        whole = np.asarray(read.convert("RGB"))
-    colours, places, counts = np.unique(whole.reshape(-1, 3), axis=0, return_inverse=True, return_counts=True)
-    frequent = colours[np.argsort(-counts)[:COLOURS_MAX]]
-    distances = ((colours[:, None, :].astype(np.float64) - frequent[None, :, :]) ** 2).sum(axis=2)
-    numbers = distances.argmin(axis=1).astype(np.uint8)[places.reshape(whole.shape[:2])]
-    few = Image.fromarray(numbers)
-    few.putpalette(frequent.tobytes())
+        few = read.convert("RGB").quantize(COLOURS_MAX, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     few.save(FOLDER / f"web-{name}.png", optimize=True)
 
 
@@ -126,6 +121,11 @@ def desktop(folder: Path, url: str, bow: Module, daemon: RunningDaemon) -> None:
             page.until("return document.querySelector(arguments[0])", f".k-{condition}[data-device={name}]")
         fit(page, 1320)
         shot(page, "overview")
+        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+        page.js("document.documentElement.dataset.theme = 'dark'; location.hash = '#/wall'")
+        page.until("return document.querySelectorAll('.tile').length === arguments[0]", len(CONDITIONS))
+        shot(page, "wall")
+        page.js("document.documentElement.dataset.theme = 'light'")
         log_in(page, TOKEN)
         open_page(page, url, "bow")
         bow.unplug(1.5)
@@ -139,7 +139,7 @@ def desktop(folder: Path, url: str, bow: Module, daemon: RunningDaemon) -> None:
         fit(page, 1320)
         shot(page, "device")
 
-        page.js("location.hash = '#/compare/bow/mast'")
+        page.js("location.hash = '#/compare/bow/keel'")
         page.until("return window.imud.view.difference?.data[0].length >= 580")
         page.until("return !document.querySelector('.figures-table tbody').innerText.includes('NaN')")
         fit(page, 1320)
