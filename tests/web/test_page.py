@@ -51,6 +51,10 @@ CONTROLS = {
     "img", "image", "progressbar", "dialog", "region",
 }  # fmt: skip
 """Roles of the accessibility tree that need a name."""
+RECEIVED = """return performance.getEntries()
+    .filter((one) => one.encodedBodySize && !/api|uplot/.test(one.name))
+    .map((one) => [new URL(one.name).pathname, one.encodedBodySize]);"""
+"""Path and compressed size of each file of the page, bytes, without uPlot and the replies of the API."""
 LOW_CONTRAST = """
     const context = new OffscreenCanvas(1, 1).getContext('2d', { willReadFrequently: true });
     const rgb = (colors) => {
@@ -287,6 +291,9 @@ def test_each_section_fits_any_width_with_names_and_contrast(page: Page, site: S
         page.click("#dialog button")
         faults += [fault for address in ("#/", "#/wall", "#/compare") for fault in faults_of(page, address)]
         assert (faults, page.problems()) == ([], [])
+        sizes = dict(page.js(RECEIVED))
+        assert set(sizes) == {"/", "/static/main.js", "/static/style.css", "/static/icon.svg"}
+        assert sum(sizes.values()) <= 63_000, sizes
 
 
 def faults_of(page: Page, address: str = "") -> list[object]:

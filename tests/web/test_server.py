@@ -25,7 +25,17 @@ from imud.publishers.socket.server import SocketServer
 from imud.web import hub as mailbox
 from imud.web import server as web_app
 from imud.web.guard import COOKIE, WebGuard
-from imud.web.server import STATIC, Busy, Calls, LimitedSite, WebConnections, WebServer, server_log
+from imud.web.server import (
+    STATIC,
+    Busy,
+    Calls,
+    LimitedSite,
+    WebConnections,
+    WebServer,
+    bundle,
+    server_log,
+    static_files,
+)
 from tests.support import socket_rig
 from tests.support.socket_rig import batch, serving, until
 
@@ -126,7 +136,9 @@ async def test_the_page_has_safe_headers_and_other_names_and_sites_are_refused(t
             assert answer.status == 200, path
             assert "Content-Security-Policy" in answer.headers
             assert (answer.headers["Content-Encoding"], answer.charset) == ("gzip", "utf-8")
-            file = (STATIC / path.removeprefix("/static/")).read_bytes()
+            name = path.removeprefix("/static/")
+            file = static_files()[name].body
+            assert name == "main.js" or file == (STATIC / name).read_bytes()
             assert await answer.read() == file
             assert int(answer.headers["Content-Length"]) < 0.8 * len(file)
             plain = await site.client.get(path, headers={"Accept-Encoding": "identity"})
@@ -159,6 +171,8 @@ def test_nothing_is_loaded_from_elsewhere_and_the_bundled_library_is_the_publish
             text = file.read_text()
             assert "innerHTML" not in text, file
             assert not re.search(r"(?:src|href|import|url|fetch)\W*https?://", text), file
+    modules = {"main.js": 'import { b } from "./b.js";\nb();\n', "b.js": "export const b = () => 1;\n"}
+    assert bundle(modules) == "const b = () => 1;\nb();\n"
     table = (STATIC / "uplot" / "README.md").read_text()
     rows = re.findall(r"^\| (\S+) \| ([0-9a-f]{64}) \|$", table, re.MULTILINE)
     assert {name for name, _ in rows} == {"uPlot.iife.min.js", "uPlot.min.css", "LICENSE"}

@@ -2,9 +2,8 @@
 
 import { session } from "./state.js";
 import { button, section, toast } from "./ui.js";
-import { call, command, copy, duration, el, facts, number, shown } from "./util.js";
+import { call, command, copy, el, facts, number, seconds, shown } from "./util.js";
 
-const seconds = (ns) => duration(ns / 1e9);
 const times = (count) => (count === 1 ? "once" : `${number(count)} times`);
 const inBrackets = (words) => (words ? ` (${words})` : "");
 const pairs = (values) => Object.entries(values).map(([name, value]) => `${name} ${shown(value)}`).join(", ");

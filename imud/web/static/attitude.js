@@ -3,7 +3,7 @@
 import { COLORS } from "./plots.js";
 import { cleared, el } from "./util.js";
 
-const SIZE = 300;
+const BLOCK_SIZE = 300;
 const BODY = [1.0, 0.7, 0.18]; // half edges along x, y, z of the device
 const CAMERA = { azimuth: -2.3, elevation: 0.5 }; // view from the south-west, from above
 const GROUND = -1.6; // height of the compass
@@ -52,12 +52,12 @@ export class AttitudeView {
     const away = e * -Math.cos(azimuth) + n * -Math.sin(azimuth);
     const up = u * Math.cos(elevation) + away * Math.sin(elevation);
     const near = u * Math.sin(elevation) - away * Math.cos(elevation);
-    const scale = (SIZE * 0.225) / (1 - near * 0.12);
-    return [SIZE / 2 + right * scale, SIZE * 0.41 - up * scale, near];
+    const scale = (BLOCK_SIZE * 0.225) / (1 - near * 0.12);
+    return [BLOCK_SIZE / 2 + right * scale, BLOCK_SIZE * 0.41 - up * scale, near];
   }
 
   draw() {
-    const context = cleared(this.canvas, SIZE);
+    const context = cleared(this.canvas, BLOCK_SIZE);
     const style = getComputedStyle(this.canvas);
     context.font = "13px system-ui, sans-serif";
     context.textAlign = "center";

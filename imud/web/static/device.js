@@ -11,7 +11,7 @@ import { SettingsSection } from "./settings.js";
 import { SECTIONS } from "./shell.js";
 import { TimeSection } from "./time.js";
 import { button, icon, toast } from "./ui.js";
-import { clock, copy, el, setText, span } from "./util.js";
+import { byId, clock, copy, el, setText, span } from "./util.js";
 
 const PHONE = matchMedia("(max-width: 820px)");
 const HISTORY_OFF = "the history is off";
@@ -131,7 +131,7 @@ export class DevicePage {
     for (const node of this.sections.children) node.classList.toggle("here", node.id === here);
     this.shell.mark(here);
     if (PHONE.matches && !item) scrollTo(0, 0);
-    else if (id) document.getElementById(here)?.scrollIntoView({ block: "start" });
+    else if (id) byId(here)?.scrollIntoView({ block: "start" });
     else scrollTo(0, 0);
     this.settings.goTo(item);
     this.settings.drawBar();

@@ -3,20 +3,20 @@
 import { button, icon, section, segmented, toast } from "./ui.js";
 import { call, copy, el, number, shown, timeOf } from "./util.js";
 
-const KINDS = {
+const EVENT_WORDS = {
   up: "Device found", down: "Device lost", condition: "Condition", sync: "Time source", loss: "Lost samples", configuration: "Configuration", alarm: "Alarm",
   attitude: "Gravity and attitude", "bad-frame": "Damaged frames", link: "Port or bus", mark: "Marks", calibration: "Calibration", recorder: "Recorder",
   mqtt: "MQTT", output: "Output",
 };
 const CALM = ["up", "sync", "condition", "mark", "calibration"]; // kinds that are not warnings
 const GROUP_NS = 60e9; // maximum time between two events of a group
-const COUNTED = ["loss", "bad-frame", "mark"]; // kinds whose messages contain counts
+const REPEATED = ["loss", "bad-frame", "mark"]; // kinds whose messages contain counts
 const EVENTS_MAX = 1000;
 
 /** Return the message of an event, and the bytes of a damaged frame. */
 export const messageOf = ({ kind, message }) => (kind === "bad-frame" ? message.split(/: (?=[\da-f]{2}(?: |$))/) : [message]);
 
-export const eventWords = (kind) => KINDS[kind] ?? kind;
+export const eventWords = (kind) => EVENT_WORDS[kind] ?? kind;
 
 /** Return the stored events, the oldest first. devices: names; undefined for all. */
 export async function pastEvents(devices, limit = EVENTS_MAX) {
@@ -24,7 +24,7 @@ export async function pastEvents(devices, limit = EVENTS_MAX) {
 }
 
 const levelOf = (one) => (CALM.includes(one.kind) ? "info" : "warning");
-const isSame = (a, b) => a.kind === b.kind && a.device === b.device && (COUNTED.includes(a.kind) || a.message === b.message) && b.t_ns - a.t_ns <= GROUP_NS;
+const isSame = (a, b) => a.kind === b.kind && a.device === b.device && (REPEATED.includes(a.kind) || a.message === b.message) && b.t_ns - a.t_ns <= GROUP_NS;
 
 /** Add an event of the stream to a list of groups, in the order of their newest events. */
 export function addEvent(groups, event) {

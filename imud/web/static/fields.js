@@ -3,7 +3,7 @@
 import { segmented, toggle, button } from "./ui.js";
 import { el, number } from "./util.js";
 
-const SEGMENTS_MAX = 3; // more words need a list
+const CHOICES_MAX = 3; // more words need a list
 const IDENTITY = [1, 0, 0, 0, 1, 0, 0, 0, 1];
 const ROTATION_ERROR = 1e-3;
 const MATRIX = "matrix"; // option of a list: nine numbers in place of a word
@@ -62,7 +62,7 @@ export function control(setting, value, { disabled, onChange, onInvalid }) {
   const choice = (schema, one, label, change) => {
     const isArray = Array.isArray(one);
     const choices = one === null || one === undefined || isArray || schema.enum.includes(one) ? schema.enum : [one, ...schema.enum];
-    if (choices.length <= SEGMENTS_MAX && choices.every((word) => typeof word === "string") && !schema.array) {
+    if (choices.length <= CHOICES_MAX && choices.every((word) => typeof word === "string") && !schema.array) {
       const node = segmented(label, choices.map((word) => [word, words(word)]), one, change);
       node.inert = disabled;
       return node;

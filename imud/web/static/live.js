@@ -7,7 +7,7 @@ import { icon, section, segmented, toggle } from "./ui.js";
 import { AXES, DEGREE, duration, el, number, percent, setText } from "./util.js";
 
 const RATES_HZ = [10, 20, 50];
-const SPANS = [["10", "10 s"], ["30", "30 s"], ["600", "10 min"], ["3600", "1 h"]];
+const LIVE_SPANS = [["10", "10 s"], ["30", "30 s"], ["600", "10 min"], ["3600", "1 h"]];
 const ANGLES = ["roll", "pitch", "yaw"];
 const PLOTS = [
   ["accel_m_s2", "Acceleration", "m/s²", AXES, { decimals: 2, lanes: true }],
@@ -69,7 +69,7 @@ export class LiveSection {
       this.other.hidden = value === "time";
     });
     const rates = el("select", { id: "rate", "aria-label": "points per second", onchange: (event) => this.setRate(Number(event.target.value)) }, RATES_HZ.map((one) => el("option", { value: one, text: `${one} Hz`, selected: one === this.rate_hz })));
-    return timeBar(this.group, SPANS, kind, rates);
+    return timeBar(this.group, LIVE_SPANS, kind, rates);
   }
 
   setRate(rate_hz) {

@@ -7,9 +7,8 @@ import { routeOf, Shell } from "./shell.js";
 import { session, world } from "./state.js";
 import { Stream } from "./stream.js";
 import { icon } from "./ui.js";
-import { clock, el, setText, timeOf } from "./util.js";
+import { byId, clock, el, setText, timeOf } from "./util.js";
 
-const byId = (id) => document.getElementById(id);
 const shell = new Shell();
 let view = null;
 let shownKey = null;

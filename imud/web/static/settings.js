@@ -5,7 +5,7 @@ import { agrees, changed, control, said, same, words } from "./fields.js";
 import { closeDialog, showDialog } from "./shell.js";
 import { editsOf, keepEdits, session } from "./state.js";
 import { button, icon, section, segmented, toast, toggle } from "./ui.js";
-import { call, command, copy, el, marked, timeOf } from "./util.js";
+import { byId, call, command, copy, el, marked, timeOf } from "./util.js";
 
 const GROUPS = { measurement: "Measurement", output: "Output", pins: "Pins and alarm", connection: "Connection" };
 const AFTER_RESTART = "after save and restart";
@@ -186,7 +186,7 @@ export class SettingsSection {
 
   /** Show a setting that the address names. */
   goTo(name) {
-    const node = name && document.getElementById(`setting-${name}`);
+    const node = name && byId(`setting-${name}`);
     this.wanted = node ? "" : name;
     if (!node) return;
     node.scrollIntoView({ block: "center" });
@@ -197,7 +197,7 @@ export class SettingsSection {
 
   drawBar() {
     if (this.wanted) this.goTo(this.wanted);
-    const bar = document.getElementById("bar");
+    const bar = byId("bar");
     const count = new Set([...this.edits.keys(), ...this.wrong]).size;
     bar.hidden = !count;
     if (!count) return;

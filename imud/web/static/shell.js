@@ -3,7 +3,7 @@
 import { deviceLink, known, sorted } from "./condition.js";
 import { edits, world } from "./state.js";
 import { button, icon, toast } from "./ui.js";
-import { el } from "./util.js";
+import { byId, el } from "./util.js";
 
 export const SECTIONS = [
   ["live", "Live"], ["time", "Time"], ["ledger", "Ledger"], ["settings", "Settings"], ["calibration", "Calibration"],
@@ -16,8 +16,6 @@ const KEYS = [
   ["g", "all devices"], ["[ ]", "previous device, next device"], ["1 … 7", "sections"], ["Space", "pause, continue"],
   ["← →", "move the cursor in a plot"], ["+ − 0", "zoom in, zoom out, reset the zoom"], ["?", "show this list"],
 ];
-
-const byId = (id) => document.getElementById(id);
 
 /** Return the parts of the address. */
 export function routeOf() {

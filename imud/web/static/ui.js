@@ -1,6 +1,6 @@
 // Parts of the page: icons, buttons, sections, switches, short messages.
 
-import { el } from "./util.js";
+import { byId, el } from "./util.js";
 
 const PATHS = {
   ok: '<circle cx="12" cy="12" r="9.5"/><path d="M7.6 12.4l3 3 5.8-6.4"/>',
@@ -92,7 +92,7 @@ export function toggle(label, isOn, onChange, { disabled = false, name = null } 
 }
 
 export function toast(words) {
-  const box = document.getElementById("toast");
+  const box = byId("toast");
   box.textContent = words;
   box.className = "shown";
   clearTimeout(box.timer);

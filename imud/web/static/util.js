@@ -14,6 +14,8 @@ export function el(tag, attributes = {}, ...children) {
   return node;
 }
 
+export const byId = (id) => document.getElementById(id);
+
 export const DEGREE = Math.PI / 180;
 export const AXES = ["x", "y", "z"];
 
@@ -49,6 +51,8 @@ export function duration(seconds) {
   if (size < 7200) return `${number(seconds / 60, 0)} min`;
   return size < 172800 ? `${number(seconds / 3600, 0)} h` : `${number(seconds / 86400, 0)} d`;
 }
+
+export const seconds = (ns) => duration(ns / 1e9);
 
 const SHOWN_UNITS = { rad: [1 / DEGREE, "°"], "rad/s": [1 / DEGREE, "°/s"], T: [1e6, "µT"], "": [100, "%"] };
 
