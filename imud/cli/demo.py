@@ -21,8 +21,9 @@ from typing import TextIO
 
 import msgspec
 
+from imud.bridges.status import closes
 from imud.cli.arguments import CliCommand, add_duration, finite, statuses
-from imud.cli.status import block, closes
+from imud.cli.status import block
 from imud.client.connection import Client
 from imud.contracts.driver import CanDriver, PolledDriver
 from imud.drivers import DRIVERS

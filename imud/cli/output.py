@@ -106,11 +106,6 @@ def _is_number(cell: str) -> bool:
     return cell.replace(".", "", 1).replace("-", "", 1).isdecimal()
 
 
-def times(count: int) -> str:
-    """Format a number of repetitions, for example `1 time`."""
-    return f"{count} time{'' if count == 1 else 's'}"
-
-
 STANDARD_STREAMS: Final = 3
 ERROR_WAIT_MS: Final = 1000  # maximum wait for the reader of standard error, ms
 

@@ -9,8 +9,9 @@ from typing import Any, Final
 
 import msgspec
 
+from imud.bridges.status import times
 from imud.cli.arguments import CliCommand, add_socket, confirmed, named_values
-from imud.cli.output import table, times
+from imud.cli.output import table
 from imud.client.connection import Client
 from imud.config.yaml import FILE_BYTES_MAX, no_pause, read_yaml, yaml_block, yaml_comment
 from imud.contracts.setting import AppliedSettings, SettingInfo, SettingsPlan, SettingsReport, SettingsState

@@ -15,6 +15,7 @@ from typing import Final
 import msgspec
 
 from imud.attitude.conventions import Convention
+from imud.bridges.status import rows
 from imud.client.feed import Feed, News, Wish
 from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceStatus, RecentStatus
 from imud.model.bucket import VECTORS, Bucket, Range
@@ -377,10 +378,10 @@ def status_message(name: str, status: DeviceStatus | None, now_ns: int) -> messa
     """Return the message with the complete status of a device; with null if the device is not configured."""
     bounds_s = tuple(bound / NS_PER_S for bound in LATENCY_BOUNDS_NS)
     if status is None:
-        return messages.StatusMessage(name, now_ns / NS_PER_S, None, 0, 0, 0, bounds_s)
+        return messages.StatusMessage(name, now_ns / NS_PER_S, None, 0, 0, 0, bounds_s, ())
     ledger, whole = _counts(status), msgspec.to_builtins(status)
     opens = bytes_open(ledger), frames_open(ledger)
-    return messages.StatusMessage(name, now_ns / NS_PER_S, whole, lost(ledger), *opens, bounds_s)
+    return messages.StatusMessage(name, now_ns / NS_PER_S, whole, lost(ledger), *opens, bounds_s, tuple(rows(status)))
 
 
 def row_of(status: DeviceStatus, newest: Sample | None, now_ns: int) -> messages.DeviceRow:

@@ -74,6 +74,7 @@ class StatusMessage(ToPage, frozen=True, tag="status"):
     bytes_open: int  # 0 if the ledger balances
     frames_open: int  # 0 if the ledger balances
     latency_bounds_s: tuple[float, ...]
+    rows: tuple[tuple[str, str], ...]  # name and text, as `imud status` prints them
 
 
 class SamplesMessage(ToPage, frozen=True, tag="samples"):

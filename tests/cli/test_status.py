@@ -6,49 +6,38 @@ from time import monotonic_ns
 
 from msgspec.structs import replace
 
-from imud.attitude.conventions import Heading
-from imud.cli.status import axes, block, declared, driven, page, parts, utc, watched
+from imud.cli.status import block, page
 from imud.client.connection import Client
 from imud.contracts.condition import Condition, DeviceCondition, Reason, ReasonCode
-from imud.contracts.setting import OnDifference, SettingsState, SettingsStatus
 from imud.contracts.status import (
     CKernelStatus,
     DeviceState,
-    FrameStatus,
-    LinesStatus,
     MqttStatus,
-    UtcStatus,
     WorkStatus,
 )
 from imud.formats import kernel
 from imud.model.units import NS_PER_S
 from tests.cli.conftest import Cli
-from tests.support.metrics import LINES, POLLING, UTC, device, equipped
+from tests.support.metrics import POLLING, device, equipped
 from tests.support.socket_rig import daemon
 
 
 def test_each_part_of_a_device_has_its_row_and_long_names_fit_80_columns_and_keep_both_ends() -> None:
-    assert list(parts(device("bow"))) == []
     assert block(device("bow")).splitlines()[-1].startswith("  kernel ")
     identity = {"product": "IMU61x", "serial_number": "0032", "firmware": "10203", "hardware_version": "2"}
     lines = block(replace(device("bow"), identity=identity)).splitlines()
     at = lines.index("  identity  product IMU61x, serial_number 0032, firmware 10203, hardware_version")
     assert lines[at + 1] == "            2"
     assert "  identity  not known" in block(replace(device("bow"), identity={})).splitlines()
-    frame = FrameStatus("body: x forward", "ned-frd", "ZYX", "NED", Heading.TRUE, -3.5, {}, "its z axis points down")
-    lines = block(replace(device("bow"), frame=frame)).splitlines()
-    at = lines.index("  axes      ned-frd, body: x forward; heading true with a declination of -3.5°")
-    ignored = replace(frame, heading=Heading.RELATIVE)
-    assert axes(ignored) == "ned-frd, body: x forward; heading relative to power-on; declination_deg is ignored"
-    own = replace(frame, frame="sensor: x right", convention="device", declination_deg=None, problem="")
-    assert axes(own) == "sensor: x right; heading true"
     assert block(device("front", polling=POLLING)).splitlines()[-2:] == [
         "  polling   1000 reads, 20 late, 3 missed, 4 stale, 5 failed; 70.0 µs after the",
         "            deadline, maximum 8000.0 µs; vanished 6 times",
     ]
-    assert block(equipped("bow")).splitlines()[-10:] == [
+    assert block(equipped("bow")).splitlines()[-12:] == [
         "  line      11 requests without a reply; 12 bytes without a request, 13 invalid",
-        "            bytes; 14 echoes (all devices of the bus)", "  sout      5000 edges, 7 lost",
+        "            bytes; 14 echoes (all devices of the bus)",
+        "  pulses    4998, 9 without a sample, 21 triggers without a frame; 17 samples", "            without a pulse",
+        "  sout      5000 edges, 7 lost",
         "  alarm     ACTIVE, raised 3 times; 2 edges, 0 lost (/dev/gpiochip0 is not", "            there)",
         "  pps       60 edges, 0 lost",
         "  sin       400 triggers, 8 missed; 30.0 µs after the deadline, maximum 900.0 µs",
@@ -101,27 +90,3 @@ def test_condition_with_reasons_and_problems_of_mqtt_and_the_kernel_in_c() -> No
         "mqtt: no route", "", "mqtt: the broker refuses messages of a/b: Not authorized", "", "metrics: no IPv6",
         "", "C kernel: not active: no file",
     ]  # fmt: skip
-
-
-def test_lines_utc_settings_and_status_bits() -> None:
-    lines = LinesStatus({"sin": "GPIO4 is in use by another program"}, {}, {}, sin=True)
-    for alarm, words in ((True, "ACTIVE"), (False, "inactive"), (None, "level unknown")):
-        assert watched(replace(LINES, alarm=alarm), "alarm", 2).startswith(f"{words}, raised")
-    assert driven(lines).endswith("(GPIO4 is in use by another program)")
-    assert [name for name, _ in parts(device("bow", lines=LinesStatus({}, {}, {}, sin=True)))] == ["sin"]
-    unsaved = SettingsStatus(SettingsState.UNDECLARED, OnDifference.REPORT, unsaved=True)
-    assert dict(parts(device("bow", declared=unsaved)))["unsaved"].endswith("run `imud command bow save`")
-    unseen = SettingsStatus(SettingsState.DIFFER, OnDifference.REPORT, "no reply", {}, ("mode", "baud"))
-    assert declared(unseen) == "differ; not reported by the device: mode, baud (no reply)"
-    lines = LinesStatus({"reset": "GPIO5 is in use by another program"}, {}, {})
-    assert list(parts(device("bow", lines=lines))) == [("reset", "GPIO5 is in use by another program")]
-    assert utc(UtcStatus("", "")) == "no pulse and no sentence yet"
-    assert utc(UtcStatus("", "", pulses=3)) == "3 pulses, 0 ignored"
-    assert utc(replace(UTC, refused={}, pulses=0, pulses_ignored=0, chrony_refused=0, chrony_sent=0,
-                                       problem="")) == "gpsd at 127.0.0.1:2947: 100 sentences, 90 sent"  # fmt: skip
-    shown = replace(
-        device("bow"), settings={"mode": "6-axis", "output.hi91": "100 Hz"}, status_bits=1 << 5,
-        status_words=("accelerometer over range",), status_bit_names={"5": "accelerometer over range"},
-    )  # fmt: skip
-    assert dict(parts(shown)) == {"status": "accelerometer over range", "present": "mode 6-axis, output.hi91 100 Hz"}
-    assert dict(parts(replace(shown, status_bits=0, status_words=())))["status"] == "no known bit is set"

@@ -5,19 +5,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from imud.cli.status import block
-from imud.contracts.setting import OnDifference, SettingDifference, SettingsState, SettingsStatus
-from imud.contracts.status import ClockStatus, LinesStatus, PollingStatus, SerialLineCounters, UtcStatus
 from imud.drivers.hipnuc.uart.codec import encode_hi91
-from imud.web.hub import status_message
-from imud.web.messages import encode
 from tests.support.daemon_process import daemon_with_module
-from tests.support.metrics import device
 from tests.test_daemon import cable
 from tests.web.browser import MISSING, PERIOD_MS, Page, Sender, open_page, sent_by, serving_web
 
@@ -117,62 +110,11 @@ def test_the_corners_of_the_block_are_round_and_it_hides_no_name(scripts: Page) 
     assert {"N", "E", "S", "W", "x", "y", "z"} <= set(names[last:])
 
 
-STATUS = msgspec.structs.replace(
-    device("bow"),
-    clock=ClockStatus(t_err_ns=31_000, edges=4101, edges_unpaired=17, samples_unpaired=19, triggers_missed=23),
-    settings={"mode": "6-axis"}, status_bits=4, status_words=("gyroscope-saturated",),
-    status_bit_names={"2": "gyroscope-saturated"}, hold_ns=5_000_000, hold_by="shared memory",
-    polling=PollingStatus(4211, 223, 227, 229, 233, 1, 41_000, 913_000),
-    serial_line=SerialLineCounters(311, 313, 317, 331),
-    lines=LinesStatus(
-        {"sin": "it is used by another program", "pps": "no such line"}, {"sout": 5003, "alarm": 6}, {"sout": 509},
-        alarm=True, alarms=3, sin=True, triggers=6007, triggers_missed=601, trigger_late_mean_ns=61_000,
-        trigger_late_worst_ns=613_000,
-    ),
-    utc=UtcStatus("gpsd at localhost", "no fix", 7001, 701, {"no fix": 709}, 719, 727, 733, 739),
-    declared=SettingsStatus(
-        SettingsState.DIFFER, OnDifference.REPORT, differences={"mode": SettingDifference("9-axis", "6-axis")},
-        unverified=("baud",),
-    ),
-)  # fmt: skip
-"""A status with all optional parts. Each counter has another value."""
-WORDS = {
-    "clock": ("error 31.0 µs", "0 resets"),
-    "polling": ("4,211 reads", "223 late", "227 missed", "229 stale", "233 failed",
-                "41.0 µs after the deadline", "maximum 913 µs", "vanished once"),
-    "line": ("311 requests without a reply", "313 bytes without a request", "317 invalid bytes", "331 echoes"),
-    "sout": ("5,003 edges, 509 lost",),
-    "alarm": ("ACTIVE, raised 3 times; 6 edges, 0 lost",),
-    "pulses": ("4,101", "17 without a sample", "19 samples without a pulse"),
-    "sin": ("6,007 triggers, 601 missed", "maximum 613 µs", "23 without a frame", "(it is used by another program)"),
-    "pps": ("no such line",),
-    "utc": ("gpsd at localhost: 7,001 sentences, 701 sent, not sent: no fix 709", "719 pulses, 727 ignored",
-            "chronyd accepted 733, refused 739", "(no fix)"),
-    "settings": ("mode is 6-axis, declared 9-axis", "not reported by the device: baud"),
-    "status": ("gyroscope-saturated",),
-    "present": ("mode 6-axis",),
-    "latency": ("batching 5.0 ms", "shared memory"),
-}  # fmt: skip
-
-
-def test_the_status_panel_has_every_row_of_imud_status(scripts: Page) -> None:
-    script = "const { aboutRows } = await import('/static/about.js'); return aboutRows(args[0])"
-    full = dict(scripts.module(script, msgspec.json.decode(encode(status_message("bow", STATUS, 5)))))
-    plain = dict(scripts.module(script, msgspec.json.decode(encode(status_message("bow", device("bow"), 5)))))
-    printed = [line.split()[0] for line in block(STATUS).splitlines() if line.startswith("  ") and line[2:3].islower()]
-    assert {"polling", "line", "sout", "alarm", "sin", "pps", "utc", "settings"} <= set(printed)
-    assert set(printed) <= set(full)
-    for name, words in WORDS.items():
-        for one in words:
-            assert one in full[name], name
-    assert not {"polling", "line", "sin", "utc", "settings", "pulses"} & set(plain), "rows that this device has not"
-
-
 def test_a_setting_with_a_difference_is_marked_on_the_page_and_in_the_overview(page: Page, tmp_path: Path) -> None:
     declared = {"mode": "9-axis", "magnetic_calibration": True}
     with daemon_with_module(tmp_path, "--rate", "100", settings=declared) as daemon, serving_web(daemon.socket) as url:
         open_page(page, url, "bow")
-        page.until_text("#about", "mode is 6-axis, declared 9-axis")
+        page.until_text("#about", 'mode is "6-axis", declared "9-axis"')
         # actual values arrive after the names
         page.until("return document.querySelector('[data-setting=mode].off')")
         three = page.js("return [...document.querySelectorAll('[data-setting=mode] dd')].map((one) => one.innerText)")

@@ -209,6 +209,9 @@ def test_ledger_latency_status_and_settings_are_those_of_the_daemon(page: Page, 
     assert page.js("return document.querySelectorAll('#settings .control :enabled:not([inert] *)').length") == 0
     page.until("return window.imud.view.live.attitude.quaternion")
     assert page.js("return document.querySelector('#attitude3d canvas').toDataURL().length") > 3000
+    about = page.js("return [...document.querySelectorAll('#about :is(dt, dd)')].map((one) => one.textContent)")
+    names = page.js("return window.imud.view.status.rows.map(([name]) => name)")
+    assert (about[::2], len(about), "bytes" in names) == (names, 2 * len(names), True)
     page.js("window.imud.view.onMessage({ kind: 'events', events: [arguments[0]] })", TURNING)
     assert page.js("return document.querySelector('#calibration canvas').dataset.covered") == "8"
     assert page.text("#calibration-progress") == "half of the directions"

@@ -1,13 +1,12 @@
-// The section Time: the causes of the time stamp error as a chain, a plot of error and latency, a histogram.
-
 import { PlotGroup, RollingPlot } from "./plots.js";
 import { section } from "./ui.js";
-import { duration, el, number, seconds, setText } from "./util.js";
+import { duration, el, number, setText } from "./util.js";
 
 const SYNC = {
   arrival: "the arrival times of the bytes", regression: "the device time, fitted to the arrival times", edge: "the device time, fitted to pulses",
   utc: "the device time, which the device synchronizes to UTC",
 };
+const seconds = (ns) => duration(ns / 1e9);
 
 export class TimeSection {
   constructor() {

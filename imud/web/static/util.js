@@ -52,8 +52,6 @@ export function duration(seconds) {
   return size < 172800 ? `${number(seconds / 3600, 0)} h` : `${number(seconds / 86400, 0)} d`;
 }
 
-export const seconds = (ns) => duration(ns / 1e9);
-
 const SHOWN_UNITS = { rad: [1 / DEGREE, "°"], "rad/s": [1 / DEGREE, "°/s"], T: [1e6, "µT"], "": [100, "%"] };
 
 /** Return an SI value as text with three digits in a usual unit. A value without a unit is a ratio. */
@@ -66,7 +64,6 @@ export function quantity(value, unit) {
   return name === "°" ? text + name : `${text} ${name}`;
 }
 
-/** Return a value of a setting or of an identity as text. */
 export function shown(value) {
   if (value === null || value === undefined) return "–";
   return typeof value === "object" ? JSON.stringify(value) : String(value);
@@ -75,13 +72,6 @@ export function shown(value) {
 /** Return the parts of a text, with the parts between backticks as code. */
 export function marked(text) {
   return text.split("`").map((part, index) => (index % 2 ? el("code", { text: part }) : part));
-}
-
-/** Return a list of rows with name and value. */
-export function facts(rows) {
-  const list = el("dl", { class: "facts" });
-  for (const [name, value] of rows) list.append(el("dt", { text: name }), el("dd", { text: value }));
-  return list;
 }
 
 /** Set the text of a node if it differs, so that the browser draws less. */
@@ -129,7 +119,7 @@ export function timeOf(t_s, { date = false } = {}) {
   return day + at.toTimeString().slice(0, 8);
 }
 
-/** Copy a text. Browsers permit it only on HTTPS and localhost, so there is a second way. */
+/** Copy a text, also without HTTPS. */
 export async function copy(text) {
   try {
     await navigator.clipboard.writeText(text);
