@@ -1,4 +1,4 @@
-// The attitude as a block on a compass. The quaternion rotates from the body to the navigation frame.
+// The attitude as a block on a compass.
 
 import { COLORS } from "./plots.js";
 import { cleared, el } from "./util.js";
@@ -72,7 +72,6 @@ export class AttitudeView {
     this.drawNames(context, style);
   }
 
-  /** Draw the names of directions and axes in front of the block, with a border in the color of the panel. */
   drawNames(context, style) {
     const quiet = style.getPropertyValue("--mute");
     const names = QUARTERS.map(([name, e, n]) => [this.isCompass ? name : DEGREES[name], quiet, [1.85 * e, 1.85 * n, GROUND]]);

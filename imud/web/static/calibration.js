@@ -1,5 +1,3 @@
-// Calibrations: the list with the last result of each, and the running calibration, whoever started it.
-
 import { session } from "./state.js";
 import { CoverageSphere, cellDirection, coveredCells } from "./sphere.js";
 import { button, icon, section, toast } from "./ui.js";
@@ -15,7 +13,7 @@ const SIDES = [
   ["+y", 1, 1, "Turn the device so that its y axis points down."], ["-y", 1, -1, "Turn the device so that its y axis points up."],
 ];
 
-/** Return the sentence for the user and the cells to measure next: the emptiest side first, then the turns. */
+/** Return the sentence for the user and the cells to measure next. */
 export function instruction(detail) {
   if (detail.cells === undefined) return { words: "Do not touch the device.", next: [] };
   const covered = coveredCells(detail.cells);
@@ -138,7 +136,6 @@ export class CalibrationSection {
     }
   }
 
-  /** Show an event of the kind `calibration`, also if another client started it. */
   onEvent({ message, detail }) {
     if (detail.kind) this.kind = detail.kind;
     if (detail.phase === "begin") this.isReplied = false;
@@ -158,7 +155,6 @@ export class CalibrationSection {
     }
   }
 
-  /** Show the running calibration after a reload of the page. */
   onStatus(status, now_s) {
     this.now_s = now_s;
     const before = this.status;

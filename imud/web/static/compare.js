@@ -9,9 +9,8 @@ import { AXES, DEGREE, duration, el, number } from "./util.js";
 
 const RATE_HZ = 20;
 const CONVENTION = "enu-flu";
-const SPANS = [["10", "10 s"], ["30", "30 s"], ["600", "10 min"], ["3600", "1 h"]];
 const SAME_S = 1; // maximum difference of the limits of two buckets of one time
-const TABLE_MS = 1000; // time between two computations of the statistics
+const DRAW_MS = 1000; // time between two computations of the statistics
 const LATE_S = 2; // time to wait for the values of B
 const HOLE_S = 5 / RATE_HZ; // longest time between two values of B that is interpolated
 const WAITING_MAX = 200; // number of buckets of B that wait for A
@@ -89,7 +88,7 @@ export class Compare {
         el("div", { class: "panel" }, el("h3", { text: "Difference in the shown time range" }), el("div", { class: "scroll" }, el("table", { class: "plain figures-table" }, el("thead", {}, el("tr", {}, head)), this.table)), this.help),
         el("div", { class: "panel" }, el("h3", { text: "Notes" }), this.notes)));
     main.append(el("div", { class: "device-head" }, el("h1", { text: "Compare" })), this.picks, this.tools, this.grid);
-    this.timer = setInterval(() => this.drawTable(), TABLE_MS);
+    this.timer = setInterval(() => this.drawTable(), DRAW_MS);
     this.restart();
   }
 
@@ -129,7 +128,7 @@ export class Compare {
     this.plotsBox.replaceChildren(...[...this.plots, this.difference].map((one) => one.node));
     this.plotsBox.setAttribute("aria-label", `plots of ${title}`);
     const kinds = segmented("quantity", Object.entries(KINDS).map(([key, one]) => [key, one.title]), this.kind, (value) => { this.kind = value; this.restart(); });
-    this.tools.replaceChildren(timeBar(this.group, SPANS, kinds));
+    this.tools.replaceChildren(timeBar(this.group, kinds));
   }
 
   onMessage(message) {

@@ -1,11 +1,9 @@
-// Conditions of devices: words, order, and the reasons with their next steps.
-
 import { button, CONDITION_WORDS, CONDITIONS, icon } from "./ui.js";
 import { el, marked, span } from "./util.js";
 
 export const known = (state) => (CONDITIONS.includes(state) ? state : "ok"); // a device of a recording has no condition
 
-/** Return the devices in the order of their conditions, the worst first. */
+/** Return the devices, the worst condition first. */
 export const sorted = (rows) => [...rows].sort((a, b) => CONDITIONS.indexOf(known(a.state)) - CONDITIONS.indexOf(known(b.state)));
 
 export const deviceLink = (name, ...parts) => `#/device/${[name, ...parts].map(encodeURIComponent).join("/")}`;
@@ -17,7 +15,6 @@ const LINKS = {
   events: "Show events", about: "Show details",
 };
 
-/** Return the address of the section that shows the details of a reason, and the words for it. */
 export function reasonLink(device, reason) {
   if (reason.setting) return [deviceLink(device, "settings", reason.setting), "Show setting"];
   return [deviceLink(device, reason.section), LINKS[reason.section] ?? "Show details"];
@@ -35,7 +32,6 @@ export function reasonList(reasons, most) {
     others.length > 0 && el("li", { class: "rest phone-rest", text: `and ${others.length} more` }));
 }
 
-/** The condition at the top of a device page. */
 export class ConditionView {
   constructor(device) {
     this.device = device;

@@ -1,4 +1,4 @@
-// The page of one device: the condition with its reasons, then seven sections. On a phone, each section is a screen.
+// The page of one device. On a phone, each section is a screen.
 
 import { AboutSection } from "./about.js";
 import { CalibrationSection } from "./calibration.js";

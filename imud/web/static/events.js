@@ -1,5 +1,3 @@
-// Events, grouped. The daemon stores them, so the list includes events from times when no page was open.
-
 import { button, icon, section, segmented, toast } from "./ui.js";
 import { call, copy, el, number, shown, timeOf } from "./util.js";
 
@@ -26,7 +24,6 @@ export async function pastEvents(devices, limit = EVENTS_MAX) {
 const levelOf = (one) => (CALM.includes(one.kind) ? "info" : "warning");
 const isSame = (a, b) => a.kind === b.kind && a.device === b.device && (REPEATED.includes(a.kind) || a.message === b.message) && b.t_ns - a.t_ns <= GROUP_NS;
 
-/** Add an event of the stream to a list of groups, in the order of their newest events. */
 export function addEvent(groups, event) {
   const at = groups.findLastIndex((one) => isSame(one, event));
   const before = at >= 0 ? groups.splice(at, 1)[0] : null;
@@ -63,7 +60,6 @@ export class EventsSection {
     this.load();
   }
 
-  /** Load the stored events. Events that arrive meanwhile are in the reply, or are added after it. */
   async load() {
     this.groups = null;
     this.early = [];

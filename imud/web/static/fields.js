@@ -1,4 +1,4 @@
-// Controls for the values of settings, made from their JSON Schemas, and values as text.
+// Controls for settings, from their JSON Schemas.
 
 import { segmented, toggle, button } from "./ui.js";
 import { el, number } from "./util.js";
@@ -9,7 +9,7 @@ const ROTATION_ERROR = 1e-3;
 const MATRIX = "matrix"; // option of a list: nine numbers in place of a word
 
 export const same = (a, b) => JSON.stringify(a) === JSON.stringify(b);
-const isObject = (value) => value !== null && typeof value === "object" && !Array.isArray(value);
+export const isObject = (value) => value !== null && typeof value === "object" && !Array.isArray(value);
 export const words = (name) => String(name).replaceAll("_", " ");
 
 /** Return whether the device has the declared value. A declared object may contain only some keys. */
@@ -24,7 +24,6 @@ export function changed(actual, value) {
   return Object.fromEntries(Object.entries(value).filter(([key, one]) => !same(one, actual[key])));
 }
 
-/** Return a value as text. */
 export function said(value, unit = "") {
   if (value === null || value === undefined) return "not reported";
   if (typeof value === "boolean") return value ? "on" : "off";
@@ -35,7 +34,7 @@ export function said(value, unit = "") {
   return Object.entries(value).map(([key, one]) => `${words(key)} ${isObject(one) ? `(${said(one)})` : said(one, unit)}`).join(", ");
 }
 
-/** Return a schema without references: the choices of an `anyOf` together, and whether nine numbers are possible too. */
+/** Return a schema without references and `anyOf`. */
 function plain(schema, definitions) {
   if (schema.$ref) return plain(definitions[schema.$ref.split("/").at(-1)] ?? {}, definitions);
   const parts = (schema.anyOf ?? []).map((one) => plain(one, definitions)).filter((one) => one.type !== "null");
@@ -45,8 +44,7 @@ function plain(schema, definitions) {
   return choices.length ? { enum: choices, array } : parts[0];
 }
 
-/** Return a control. setting: its title, unit and schema. onChange(value) gets each valid value; onInvalid() is called
- *  for text that is no value. */
+/** Return a control. It calls onChange(value) for a valid value, otherwise onInvalid(). */
 export function control(setting, value, { disabled, onChange, onInvalid }) {
   const definitions = setting.schema.$defs ?? {};
   const make = (schema_, one, label, change) => {
@@ -140,7 +138,6 @@ export function control(setting, value, { disabled, onChange, onInvalid }) {
   return make(setting.schema, value, setting.title, onChange);
 }
 
-/** Return whether nine numbers are a rotation matrix, by rows. */
 export function isRotation(m) {
   const rows = [m.slice(0, 3), m.slice(3, 6), m.slice(6, 9)];
   const dot = (a, b) => a.reduce((sum, one, index) => sum + one * b[index], 0);

@@ -1,5 +1,4 @@
-// Regular grid of the samples from their time stamps, as in imud/analysis/series.py (`imud spectrum`): the true rate, the lost
-// samples, and the ends of runs. A lost sample causes a step in time, but no step in `seq`.
+// Regular grid of the samples from their time stamps. imud/analysis/series.py explains the method.
 
 export const FILL_MOST = 4; // maximum number of adjacent lost samples that are filled; more end a run
 const SCATTER_MOST = 0.2; // maximum scatter of the time stamps, in periods, at which a single lost sample is visible
@@ -16,13 +15,12 @@ function median(values) {
 const differences = (values) => Array.from({ length: values.length - 1 }, (_, index) => values[index + 1] - values[index]);
 const whole = (ratio) => Math.max(Math.round(ratio), 1);
 
-/** Return the standard deviation of one time stamp, from the differences of two, without outliers. */
 function scatterOf(residuals) {
   const middle = median(residuals);
   return (1.4826 * median(residuals.map((one) => Math.abs(one - middle)))) / Math.SQRT2;
 }
 
-/** Return the least-squares period of the parts between long gaps. A gap may contain a fraction of a period. */
+/** Return the least-squares period of the parts between long gaps. */
 function slope(times, steps) {
   let [above, below] = [0, 0];
   for (let first = 0, end = 1; end <= times.length; end += 1) {
@@ -40,9 +38,8 @@ function slope(times, steps) {
   return above / below;
 }
 
-/** Return the grid. times: ascending time stamps in s, more than STEP_FOR_PERIOD. numbers: `seq` of the samples.
- *  steps: periods between two samples, 1 if no sample is lost between them. isLocated: whether a single lost sample is visible
- *  in the time stamps. Otherwise only a step in `numbers` or a silence shows lost samples. */
+/** times: time stamps in s; numbers: `seq`; steps: periods between two samples; isLocated: whether the time stamps show a single
+ *  lost sample. */
 export function gridOf(times, numbers) {
   const steps_s = differences(times);
   const far = times.slice(STEP_FOR_PERIOD).map((time, index) => time - times[index]);
@@ -64,8 +61,7 @@ export function gridOf(times, numbers) {
   return { rate_hz: 1 / slope(times, steps), steps, scatter_s, isLocated };
 }
 
-/** Return values at 0 … count - 1 from the values at `places` (ascending from 0 to count - 1 or more). A natural cubic spline
- *  fills the gaps: a straight line would reduce the power of a vibration. */
+/** Return values at 0 … count - 1 from the values at `places`. A natural cubic spline fills the gaps. */
 export function filled(places, values, count) {
   if (places[count - 1] === count - 1) return values.slice(0, count);
   const bends = secondDerivatives(places, values);
@@ -81,7 +77,6 @@ export function filled(places, values, count) {
   return found;
 }
 
-/** Return the second derivatives of the natural cubic spline at its knots. Solve a tridiagonal system. */
 function secondDerivatives(places, values) {
   const n = places.length;
   const bends = new Float64Array(n);

@@ -1,5 +1,3 @@
-// The section Ledger: three bars with parts that add up, and the lost samples by cause.
-
 import { section } from "./ui.js";
 import { el, number, percent, setText } from "./util.js";
 

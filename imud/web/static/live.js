@@ -1,5 +1,3 @@
-// The section Live: five figures, the orientation, the plots on one time axis or the spectrum.
-
 import { AttitudeView, gravityOf } from "./attitude.js";
 import { PlotGroup, RollingPlot, timeBar } from "./plots.js";
 import { SpectrumPlot } from "./spectrum-plot.js";
@@ -7,7 +5,6 @@ import { icon, section, segmented, toggle } from "./ui.js";
 import { AXES, DEGREE, duration, el, number, percent, setText } from "./util.js";
 
 const RATES_HZ = [10, 20, 50];
-const LIVE_SPANS = [["10", "10 s"], ["30", "30 s"], ["600", "10 min"], ["3600", "1 h"]];
 const ANGLES = ["roll", "pitch", "yaw"];
 const PLOTS = [
   ["accel_m_s2", "Acceleration", "m/s²", AXES, { decimals: 2, lanes: true }],
@@ -69,7 +66,7 @@ export class LiveSection {
       this.other.hidden = value === "time";
     });
     const rates = el("select", { id: "rate", "aria-label": "points per second", onchange: (event) => this.setRate(Number(event.target.value)) }, RATES_HZ.map((one) => el("option", { value: one, text: `${one} Hz`, selected: one === this.rate_hz })));
-    return timeBar(this.group, LIVE_SPANS, kind, rates);
+    return timeBar(this.group, kind, rates);
   }
 
   setRate(rate_hz) {
@@ -103,7 +100,7 @@ export class LiveSection {
     if (euler_rad) euler_rad[1].forEach((one, axis) => setText(this.angles[axis].value, `${number(one / DEGREE, 1)}°`));
   }
 
-  /** Show buckets of the history. Gravity needs the attitude of each sample, so its plot begins with the page. */
+  /** Gravity needs the attitude of each sample, so its plot has no history. */
   restore(buckets) {
     for (const [member, plot] of this.plots) {
       if (!buckets.some(([bucket]) => bucket[member])) continue;

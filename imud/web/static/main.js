@@ -1,5 +1,3 @@
-// The page: selects the view, shows the state of the daemon, and logs in.
-
 import { Compare } from "./compare.js";
 import { DevicePage } from "./device.js";
 import { Overview, Wall } from "./overview.js";

@@ -1,5 +1,3 @@
-// All devices: the summary, then the devices with a problem, then the devices that are OK. The wall display.
-
 import { deviceLink, known, reasonList, sinceWords, sorted } from "./condition.js";
 import { eventWords, messageOf, pastEvents } from "./events.js";
 import { CONDITION_WORDS, icon } from "./ui.js";
@@ -12,7 +10,6 @@ const ROW_MOST = 3; // number of tiles in a single row
 const LOST_PERCENT = 0.1;
 const RATE_SHARE = 0.02;
 
-/** Return the sentence about all devices, the worst condition, and the number of devices by condition. */
 export function verdict(rows) {
   const counts = Object.fromEntries(Object.keys(COUNTED).map((one) => [one, rows.filter((row) => known(row.state) === one).length]));
   const bad = rows.length - counts.ok;
@@ -22,7 +19,6 @@ export function verdict(rows) {
   return { counts, worst, words: rows.length ? words : "The configuration contains no devices" };
 }
 
-/** Return one mark for each of the last 60 minutes. */
 function strip(history) {
   const said = history.filter(Boolean);
   const ok = said.filter((one) => one === "ok").length;
@@ -129,7 +125,6 @@ export class Overview {
   close() {}
 }
 
-/** Replace the links, and keep the focus on the link of the same device. */
 function replaceKeepingFocus(box, nodes) {
   const name = box.contains(document.activeElement) ? document.activeElement.dataset.device : null;
   const before = [...box.children];
@@ -139,7 +134,6 @@ function replaceKeepingFocus(box, nodes) {
   if (name) [...box.children].find((one) => one.dataset.device === name)?.focus();
 }
 
-/** Page for a wall display: name and condition of each device, as large as possible. */
 export class Wall {
   constructor(main, stream) {
     this.title = el("h1");

@@ -1,11 +1,10 @@
-// Rolling plots (uPlot). Each axis has a line through the minimum and a line through the maximum of each bucket, and the
-// area between them. Thus peaks are visible at any rate.
+// Rolling plots (uPlot) of the minimum and the maximum of each bucket. Thus peaks are visible at any rate.
 
 import { button, icon, segmented } from "./ui.js";
 import { el, number, setText } from "./util.js";
 
 const AREA = "40"; // opacity, in hexadecimal
-const DRAW_MS = 66;
+const PERIOD_MS = 66;
 const HOLE_BUCKETS = 3; // number of periods without buckets that breaks the line
 const KEPT_S = 3600; // time span of the data that a plot keeps
 const FINE_S = 600; // age at which a plot merges points
@@ -18,6 +17,7 @@ const LANE_MARGIN = 0.12; // free share of the height of a lane, above and below
 const LABEL_MARGIN = 0.14; // share of the height of a lane without a label, so that the labels of two lanes do not overlap
 const ZOOM_LEAST_S = 0.05; // least time range of a zoom
 const TURN_DEG = 360;
+const SPANS = [["10", "10 s"], ["30", "30 s"], ["600", "10 min"], ["3600", "1 h"]];
 const STEP = 0.2; // share of the time range by which a key moves the cursor or zooms
 
 const color = (name) => () => getComputedStyle(document.documentElement).getPropertyValue(name).trim() || "#888";
@@ -45,7 +45,7 @@ export class PlotGroup {
     for (const plot of this.plots) plot.draw();
   }
 
-  /** Pause, or continue with the newest values. The owner of the plots adds no values during a pause. */
+  /** The owner of the plots adds no values during a pause. */
   pause() {
     this.isPaused = !this.isPaused;
     this.zoom(this.isPaused ? this.zoomed : null);
@@ -56,8 +56,8 @@ export class PlotGroup {
   }
 }
 
-/** Return a bar with the time range, the pause and the reset of the zoom of a group, and other controls. */
-export function timeBar(group, spans, ...more) {
+/** Return a bar with the controls of a group. */
+export function timeBar(group, ...more) {
   const pause = el("button", { type: "button", id: "pause", class: "quiet pause", onclick: () => group.pause() });
   const reset = button("Reset zoom", () => group.zoom(null), { kind: "quiet", glyph: "zoom" });
   group.onChange = () => {
@@ -65,7 +65,7 @@ export function timeBar(group, spans, ...more) {
     pause.replaceChildren(icon(group.isPaused ? "play" : "pause"), el("span", { text: group.isPaused ? "Continue" : "Pause" }));
   };
   group.onChange();
-  return el("div", { class: "timebar" }, segmented("time range", spans, String(group.span_s), (value) => group.setSpan(Number(value))), pause, reset, more);
+  return el("div", { class: "timebar" }, segmented("time range", SPANS, String(group.span_s), (value) => group.setSpan(Number(value))), pause, reset, more);
 }
 
 /** Return an angle in degrees, moved by whole turns to at most half a turn from `to`. */
@@ -116,9 +116,8 @@ function unwrapped([least, greatest], before) {
 }
 
 export class RollingPlot {
-  /** axes: names of the lines; scale: factor of the values; isAngle: the values are degrees, the lines continue over ±180
-   *  and the labels do not; isLog: the axis is logarithmic; lanes: each line has a lane with a scale of its own;
-   *  styles: stroke, dash and mark (class of the name) of each line; group: common time range. */
+  /** axes: names of the lines; isAngle: degrees, the lines continue over ±180; lanes: each line has its own scale;
+   *  styles: stroke, dash and mark (class of the name) of each line. */
   constructor(id, title, unit, axes, { scale = 1, isAngle = false, isLog = false, decimals = 2, lanes = false, styles = [] } = {}, group = new PlotGroup(30)) {
     Object.assign(this, { axes, title, scale, isAngle, isLog, decimals, group, lanes });
     this.styles = axes.map((_, index) => ({ stroke: COLORS[index], mark: `axis${index}`, ...styles[index] }));
@@ -206,7 +205,6 @@ export class RollingPlot {
     return [bottom - below * height, bottom + (this.axes.length - below) * height];
   }
 
-  /** Draw the labels and borders of the lanes, and a mark for each lost sample. */
   drawMore({ ctx, bbox, valToPos, scales }) {
     const pixels = devicePixelRatio || 1;
     ctx.save();
@@ -255,7 +253,7 @@ export class RollingPlot {
     event.preventDefault();
   }
 
-  /** Zoom with two fingers: the times below the fingers stay below them. */
+  /** Zoom with two fingers. */
   onTouch(event) {
     if (event.touches.length !== 2 || !this.plot) {
       this.pinched = null;
@@ -376,7 +374,7 @@ export class RollingPlot {
   draw() {
     if (this.isDue || !this.isVisible || !this.data[0].length || !this.box.clientWidth) return;
     this.isDue = true;
-    setTimeout(() => requestAnimationFrame(() => this.drawNow()), Math.max(0, this.drawn + DRAW_MS - performance.now()));
+    setTimeout(() => requestAnimationFrame(() => this.drawNow()), Math.max(0, this.drawn + PERIOD_MS - performance.now()));
   }
 
   drawNow() {

@@ -1,7 +1,6 @@
-// Settings: a control for each type, with the declared value, the value on the device and the value in flash.
-// Edits stay in the browser until the user applies them.
+// Settings. Edits stay in the browser until the user applies them.
 
-import { agrees, changed, control, said, same, words } from "./fields.js";
+import { agrees, changed, control, isObject, said, same, words } from "./fields.js";
 import { closeDialog, showDialog } from "./shell.js";
 import { editsOf, keepEdits, session } from "./state.js";
 import { button, icon, section, segmented, toast, toggle } from "./ui.js";
@@ -32,7 +31,6 @@ export class SettingsSection {
     this.draw();
   }
 
-  /** Load the settings with the first status, and again if their status changed, for example after a replug. */
   onStatus(status) {
     const known = JSON.stringify([status.state, status.declared, status.settings]);
     if (known === this.known) return;
@@ -140,7 +138,6 @@ export class SettingsSection {
     this.fillState(setting);
   }
 
-  /** Show the edit, or the declared value, the value on the device and the value in flash if they differ. */
   fillState(setting) {
     const { node, state } = this.rows.get(setting.name);
     const isEdited = this.edits.has(setting.name);
@@ -173,7 +170,7 @@ export class SettingsSection {
     const flash = saved_state === "unknown" ? "unknown" : said(saved, unit);
     const parts = [el("dl", { class: "three" }, declared !== null && line("declared", said(declared, unit), isOff), line("on device", said(actual, unit), isOff), line("in flash", flash, isUnsaved))];
     if (isUnsaved) parts.push(el("p", { class: "lost", text: saved_state === "unknown" ? "Changed, not saved to flash." : "Lost at power-off." }));
-    if (isOff && session.control) parts.push(button("Use the declared value", () => this.set(setting, isPartial(declared) ? { ...actual, ...declared } : declared, true), { kind: "small" }));
+    if (isOff && session.control) parts.push(button("Use the declared value", () => this.set(setting, isObject(declared) ? { ...actual, ...declared } : declared, true), { kind: "small" }));
     if (!isOff && isUnsaved && session.control) parts.push(button("Save to flash", () => this.saveAll(), { kind: "small", glyph: "save" }));
     return parts;
   }
@@ -214,8 +211,6 @@ export class SettingsSection {
     for (const one of this.all) this.fill(one);
     this.changed();
   }
-
-  // --- review and apply --------------------------------------------------------------------------------------------------
 
   given() {
     return Object.fromEntries(this.all.filter((one) => this.edits.has(one.name)).map((one) => [one.name, changed(one.actual, this.edits.get(one.name))]));
@@ -296,8 +291,6 @@ export class SettingsSection {
     this.load();
   }
 }
-
-const isPartial = (value) => value !== null && typeof value === "object" && !Array.isArray(value);
 
 /** Return settings in the notation of the configuration. JSON values are YAML. */
 function yaml(values) {

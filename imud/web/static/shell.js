@@ -1,4 +1,4 @@
-// The frame of the page: top bar, rail of devices and sections, bar at the bottom of a phone, colors, keys.
+// The frame of the page.
 
 import { deviceLink, known, sorted } from "./condition.js";
 import { edits, world } from "./state.js";
@@ -17,7 +17,6 @@ const KEYS = [
   ["← →", "move the cursor in a plot"], ["+ − 0", "zoom in, zoom out, reset the zoom"], ["?", "show this list"],
 ];
 
-/** Return the parts of the address. */
 export function routeOf() {
   let parts;
   try {
@@ -31,7 +30,6 @@ export function routeOf() {
   return { what: what === "wall" ? what : "overview", name: "", section: "" };
 }
 
-/** Show a dialog with these parts. */
 export function showDialog(kind, ...parts) {
   const dialog = byId("dialog");
   dialog.className = kind;
@@ -53,7 +51,11 @@ export class Shell {
       event.preventDefault(); // the address is the route
       byId("main").focus();
     });
-    this.theme = localStorageItem("theme") ?? "auto";
+    try {
+      this.theme = localStorage.getItem("theme");
+    } catch {
+      // a private window
+    }
     this.setTheme(this.theme);
     byId("theme").addEventListener("click", () => {
       this.setTheme(THEMES[(THEMES.indexOf(this.theme) + 1) % THEMES.length]);
@@ -75,7 +77,6 @@ export class Shell {
     this.onTheme?.();
   }
 
-  /** Draw the lists of devices and sections if they differ from the drawn ones. */
   draw() {
     const route = routeOf();
     const rows = sorted(world.devices);
@@ -129,7 +130,6 @@ export class Shell {
       link(`#/compare/${encodeURIComponent(name)}`, "compare", "Compare", "this device with another device")), button("Close", closeDialog));
   }
 
-  /** Mark the visible section in the rail. */
   mark(section) {
     for (const link of document.querySelectorAll("#rail [data-section]")) {
       link.toggleAttribute("data-here", link.dataset.section === section);
@@ -151,13 +151,5 @@ export class Shell {
       location.hash = deviceLink(names[(at + step + names.length) % names.length]);
     } else if (route.what === "device" && section) location.hash = deviceLink(route.name, section[0]);
     else if (event.key === " " && !event.target.closest("button, a, summary, input") && this.onPause?.()) event.preventDefault();
-  }
-}
-
-function localStorageItem(name) {
-  try {
-    return localStorage.getItem(name);
-  } catch {
-    return null;
   }
 }

@@ -1,6 +1,4 @@
-// Amplitude spectral density of one vector from all samples (not from buckets): Welch's method with a Hann window, the mean
-// of the newest segments, which overlap by a half. The sample rate is from the time stamps. The page fills a few lost samples.
-// A longer gap ends a segment (grid.js).
+// Amplitude spectral density of a vector from all samples: Welch's method with a Hann window and half overlap.
 
 import { FILL_MOST, filled, gridOf } from "./grid.js";
 
@@ -38,7 +36,7 @@ export function fft(re, im) {
   }
 }
 
-/** Return the one-sided power spectral density of one segment, unit² / Hz, without the mean. */
+/** Return the one-sided power spectral density of a segment, unit² / Hz. */
 export function density(values, rate_hz) {
   const n = values.length;
   const mean = values.reduce((sum, value) => sum + value, 0) / n;
@@ -67,7 +65,6 @@ export class Spectrum {
     this.begin([], [], [[], [], []]);
   }
 
-  /** Restart with these samples. */
   begin(times, numbers, axes) {
     [this.times, this.numbers, this.axes] = [times, numbers, axes];
     this.segments = [];
@@ -114,8 +111,7 @@ export class Spectrum {
     return true;
   }
 
-  /** Make a segment from the oldest samples. Keep its second half for the next segment. */
-  transform(steps) {
+    transform(steps) {
     const places = [0];
     for (const step of steps) places.push(places.at(-1) + step);
     this.segments.push(this.axes.map((axis) => density(filled(places, axis, this.points), this.rate_hz)));

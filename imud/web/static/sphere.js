@@ -1,5 +1,4 @@
-// Sphere of a calibration: 48 cells of equal area, with the covered cells filled. A cell is a sixth of an octant, by the order
-// of |x|, |y|, |z|. The page computes the cell of each pixel once.
+// Sphere of a calibration: 48 cells of equal area. A cell is a sixth of an octant, by the order of |x|, |y|, |z|.
 
 import { rotate } from "./attitude.js";
 import { cleared, el } from "./util.js";
@@ -43,7 +42,7 @@ export function onSphere(direction) {
   return [SIZE / 2 + x * RADIUS, SIZE / 2 - z * RADIUS, -away];
 }
 
-/** Return the front cell and the back cell of each pixel of a square canvas; NONE outside of the sphere. */
+/** Return the front cell and the back cell of each pixel; NONE outside of the sphere. */
 function cellMap(pixels) {
   const back = [TILT[0], -TILT[1], -TILT[2], -TILT[3]];
   const near = new Uint8Array(pixels * pixels).fill(NONE);
@@ -60,7 +59,7 @@ function cellMap(pixels) {
   return { pixels, near, far };
 }
 
-/** Return the great circles between the cells, in pieces: in planes through two axes, and between two axes. */
+/** Return the great circles between the cells, in pieces. */
 function edges() {
   const pieces = [];
   for (const normal of [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1], [0, 1, 1], [0, 1, -1]]) {
@@ -86,7 +85,6 @@ export class CoverageSphere {
     this.draw("0");
   }
 
-  /** Draw the covered cells of a mask, and the cells to measure next. */
   draw(mask, next = []) {
     const covered = coveredCells(mask);
     this.canvas.dataset.covered = covered.filter(Boolean).length;
@@ -120,7 +118,6 @@ export class CoverageSphere {
     }
   }
 
-  /** Draw the covered cells; cells at the back are visible through the front. */
   filled(context, covered, next, colour, nextColour) {
     const { pixels, near, far } = this.map;
     const image = context.createImageData(pixels, pixels);

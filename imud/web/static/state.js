@@ -1,14 +1,12 @@
-// State that all views share: the session, the devices, and edits of settings that exist only in this browser.
+// State that all views share.
 
 export const session = { read: false, control: false, has_token: false, version: "" };
 
 /** The newest `overview` of imud/web/messages.py. */
 export const world = { now_s: 0, clients: 0, devices: [], isKnown: false };
 
-export const deviceRow = (name) => world.devices.find((one) => one.name === name);
-
 const KEY = "imud-edits";
-/** Edits of settings: by device, then by setting. sessionStorage keeps them during a reload. */
+/** Edits of settings: by device, then by setting. */
 export const edits = new Map();
 try {
   for (const [device, values] of Object.entries(JSON.parse(sessionStorage.getItem(KEY) ?? "{}"))) edits.set(device, new Map(Object.entries(values)));

@@ -1,12 +1,10 @@
-// WebSocket to imud web. It connects again after a loss, and requests nothing while the page is hidden.
+// WebSocket to imud web. A hidden page requests nothing.
 
 const RETRY_FIRST_MS = 500;
 const RETRY_MOST_MS = 5000;
 const ACKNOWLEDGE_MS = 250;
 
 export class Stream {
-  /** Call onMessage(message) for each message, and onLink(connected) when the connection opens or closes. Connect only if
-   *  mayRead() is true. */
   constructor(onMessage, onLink, mayRead) {
     this.mayRead = mayRead;
     this.onMessage = onMessage;
@@ -14,7 +12,6 @@ export class Stream {
     this.wish = { look: "nothing" };
     this.handled = 0;
     this.retry = RETRY_FIRST_MS;
-    this.closed = false;
     document.addEventListener("visibilitychange", () => this.send());
     setInterval(() => this.handled && this.send(), ACKNOWLEDGE_MS);
   }

@@ -1,5 +1,3 @@
-// Parts of the page: icons, buttons, sections, switches, short messages.
-
 import { byId, el } from "./util.js";
 
 const PATHS = {
@@ -27,7 +25,6 @@ const PATHS = {
   play: '<path d="M7 4.5v15l12-7.5z"/>',
   undo: '<path d="M8.5 5 4.5 9l4 4M5 9h9a5.5 5.5 0 0 1 0 11h-3"/>',
   copy: '<rect x="8.5" y="8.5" width="12" height="12" rx="2"/><path d="M5 15.5H3.5v-12h12V5"/>',
-  close: '<path d="M6 6l12 12M18 6 6 18"/>',
   arrow: '<path d="M4 12h15M13 6l6 6-6 6"/>',
   wall: '<rect x="2.5" y="4" width="19" height="13" rx="2"/><path d="M8 21h8"/>',
   zoom: '<circle cx="10.5" cy="10.5" r="6.5"/><path d="M15.5 15.5 21 21"/>',
@@ -43,7 +40,6 @@ function drawing(tag, attributes) {
   return node;
 }
 
-/** Return an icon. Without a label, it is decoration for a screen reader. */
 export function icon(name, label = "") {
   const picture = drawing("svg", LINES);
   for (const [, tag, text] of (PATHS[name] ?? "").matchAll(/<(\w+) ([^>]*)\/>/g))
