@@ -16,7 +16,6 @@ import zlib
 from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from graphlib import TopologicalSorter
 from pathlib import Path, PurePath
 from typing import Any, Final, NamedTuple
 
@@ -166,8 +165,14 @@ class StaticFile(NamedTuple):
 
 
 def bundle(modules: Mapping[str, str]) -> str:
-    """Return JavaScript modules by their names as one module, each after the modules that it imports."""
-    order = TopologicalSorter({name: IMPORT.findall(text) for name, text in modules.items()}).static_order()
+    """Return JavaScript modules by their names as one module, each after the modules that it imports.
+
+    The names at the top level of all modules must differ.
+    """
+    imports = {name: set(IMPORT.findall(text)) for name, text in modules.items()}
+    order: list[str] = []
+    while len(order) < len(modules):
+        order.append(next(name for name in modules if name not in order and imports[name] <= set(order)))
     return re.sub(r"^export ", "", IMPORT.sub("", "".join(modules[name] for name in order)), flags=re.MULTILINE)
 
 
@@ -177,7 +182,9 @@ def static_files() -> dict[str, StaticFile]:
     main.js contains all modules: 3 requests replace 26, and one stream needs 9 kB less than 24 compressed modules.
     """
     bodies = {file.relative_to(STATIC).as_posix(): file.read_bytes() for file in STATIC.rglob("*") if file.is_file()}
-    bodies["main.js"] = bundle({file.name: file.read_text("utf-8") for file in STATIC.glob("*.js")}).encode()
+    # the largest first: similar modules are then closer to each other than the 32 kB that deflate remembers
+    modules = sorted(STATIC.glob("*.js"), key=lambda file: (-file.stat().st_size, file.name))
+    bodies["main.js"] = bundle({file.name: file.read_text("utf-8") for file in modules}).encode()
     return {
         name: StaticFile(
             STATIC_TYPES.get(PurePath(name).suffix, "text/plain"), body, gzip.compress(body),

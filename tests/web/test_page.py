@@ -296,7 +296,7 @@ def test_each_section_fits_any_width_with_names_and_contrast(page: Page, site: S
         assert (faults, page.problems()) == ([], [])
         sizes = dict(page.js(RECEIVED))
         assert set(sizes) == {"/", "/static/main.js", "/static/style.css", "/static/icon.svg"}
-        assert sum(sizes.values()) <= 63_000, sizes
+        assert sum(sizes.values()) <= 60_000, sizes
 
 
 def faults_of(page: Page, address: str = "") -> list[object]:

@@ -128,7 +128,6 @@ export class AttitudeView {
     }
   }
 
-  /** Return color, name and both ends of each axis of the device, outside of the block. */
   axes() {
     return COLORS.map((colorOf, axis) => {
       const end = [0, 0, 0];

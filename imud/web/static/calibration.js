@@ -1,7 +1,7 @@
 import { session } from "./state.js";
 import { CoverageSphere, cellDirection, coveredCells } from "./sphere.js";
 import { button, icon, section, toast } from "./ui.js";
-import { call, DEGREE, el, marked, number, quantity, setText, span, timeOf } from "./util.js";
+import { AXES, call, DEGREE, el, marked, number, quantity, setText, span, timeOf } from "./util.js";
 
 const SAVED_ON_REQUEST = "until power-off, unless it is saved";
 const STEPS = ["Prepare", "Turn", "Check", "Save"];
@@ -24,7 +24,7 @@ export function instruction(detail) {
   });
   const worst = open.reduce((best, one) => (one.share > best.share ? one : best));
   if (worst.share > 0.5) return worst;
-  const turns = ["x", "y", "z"].map((axis) => [axis, detail[`turned_${axis}_rad`] ?? 0]);
+  const turns = AXES.map((axis) => [axis, detail[`turned_${axis}_rad`] ?? 0]);
   const [axis, angle] = turns.reduce((least, one) => (one[1] < least[1] ? one : least));
   const next = covered.flatMap((is, cell) => (is ? [] : [cell]));
   if (angle < TURN_RAD) return { words: `Turn the device around its ${axis} axis: ${number(angle / DEGREE)}° of 360°.`, next };
@@ -213,7 +213,7 @@ export class CalibrationSection {
       ["Device reports", detail.device || "–", ""],
     ];
     this.measures.replaceChildren(...shown.map(([name, value, more]) => el("div", {}, el("dt", { text: name }), el("dd", {}, el("b", { text: value }), el("span", { class: "help", text: ` ${more}` })))));
-    this.turns.replaceChildren(...["x", "y", "z"].map((axis, index) => {
+    this.turns.replaceChildren(...AXES.map((axis, index) => {
       const angle = detail[`turned_${axis}_rad`] ?? 0;
       const bar = el("b", { class: `axis${index}`, css: { width: `${Math.min(100, (100 * angle) / TURN_RAD)}%` } });
       return el("div", { class: angle >= TURN_RAD ? "good" : "" }, el("span", { text: `around ${axis}` }), el("i", {}, bar), el("output", { text: `${number(angle / DEGREE)}°` }));

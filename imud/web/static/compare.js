@@ -1,4 +1,4 @@
-// Two devices on one time axis: both curves of each axis, their difference, and its statistics.
+// Comparison of two devices on one time axis.
 
 import { sorted } from "./condition.js";
 import { Arrivals, pastOf } from "./past.js";

@@ -1,4 +1,4 @@
-// Rolling plots (uPlot) of the minimum and the maximum of each bucket. Thus peaks are visible at any rate.
+// Rolling plots (uPlot) of the minimum and the maximum of each bucket.
 
 import { button, icon, segmented } from "./ui.js";
 import { el, number, setText } from "./util.js";
@@ -196,7 +196,7 @@ export class RollingPlot {
     );
   }
 
-  /** Return a range that places the curve in its lane: one share of the height for each line, the first at the top. */
+  /** Return a range that places the curve in its lane, the first at the top. */
   laneRange(index, least, most) {
     if (least === null || most === null) return [0, 1];
     const height = Math.max(most - least, 10 ** -this.decimals, 1e-9) * (1 + 2 * LANE_MARGIN);
@@ -291,7 +291,6 @@ export class RollingPlot {
     this.draw();
   }
 
-  /** Merge the points that are older than FINE_S, and remove the points that are older than KEPT_S. */
   merge() {
     const xs = this.data[0];
     const isGap = (at) => xs[at + 1] - xs[at - 1] > GAP_LEAST_S && this.data.every((one, line) => !line || one[at] === null);

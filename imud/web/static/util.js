@@ -19,7 +19,7 @@ export const byId = (id) => document.getElementById(id);
 export const DEGREE = Math.PI / 180;
 export const AXES = ["x", "y", "z"];
 
-/** Return the cleared context of a square canvas of `size` CSS pixels, in the resolution of the screen. */
+/** Return the cleared context of a square canvas of `size` CSS pixels. */
 export function cleared(canvas, size) {
   const scale = Math.max(devicePixelRatio || 1, 1);
   const pixels = Math.round(size * scale);
