@@ -4,7 +4,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
 from socket import socket
-from typing import Any, Final, Protocol
+from typing import Any, ClassVar, Final, Protocol
 
 from imud.attitude.conventions import Convention
 from imud.attitude.published import PublishedAxes, as_sent
@@ -60,44 +60,36 @@ DeviceLedger = tuple[str, str, Sequence[int]]
 class Batch:
     """Samples from one read of one device, oldest first, at least one. All publishers share the object. Immutable.
 
-    A batch contains sample objects, packed slots, or both: the first use of the other form makes it. An output that
-    needs only slots thus creates no sample objects.
+    A batch has sample objects and packed slots: the first use of the other form makes it. An output that needs only
+    slots thus creates no sample objects.
     """
 
-    __slots__ = ("_converted", "device", "device_id", "frame", "is_packed", "packed", "samples")
+    __slots__ = ("_converted", "_packed", "_samples", "device", "device_id", "frame")
 
-    samples: Sequence[Sample]  # sample objects
-    packed: bytes  # slots (`imud.formats.slot`) back to back
+    is_packed: ClassVar = False  # whether the path made slots without sample objects
 
-    def __init__(
-        self,
-        device: str,
-        device_id: int,
-        samples: Sequence[Sample] | None,
-        frame: PublishedAxes = AS_SENT,
-        packed: bytes = b"",
-    ) -> None:
-        """`packed` contains the samples as valid slots back to back, and `samples` can be None."""
+    def __init__(self, device: str, device_id: int, samples: Sequence[Sample], frame: PublishedAxes = AS_SENT) -> None:
         self.device = device
         self.device_id = device_id  # number of the device in slots
         self.frame = frame  # axes and angles of the samples
-        self.is_packed = samples is None  # whether the path made slots without sample objects
-        if samples is not None:
-            self.samples = samples
-        if packed or samples is None:
-            self.packed = packed
+        self._samples: Sequence[Sample] | None = samples
+        self._packed: bytes | None = None
         self._converted: dict[Convention, Batch] | None = None
 
-    def __getattr__(self, name: str) -> Any:
-        """Make the missing form. Python calls this method for an empty slot only, so that each later use is fast."""
-        if name == "samples":
-            self.samples = decode_slots(self.packed, self.device)
-            return self.samples
-        if name == "packed":
+    @property
+    def samples(self) -> Sequence[Sample]:
+        """Sample objects."""
+        if self._samples is None:
+            self._samples = decode_slots(self.packed, self.device)
+        return self._samples
+
+    @property
+    def packed(self) -> bytes:
+        """Slots (`imud.formats.slot`) back to back."""
+        if self._packed is None:
             slots = encode_slots(self.samples, self.device_id)
-            self.packed = slots[0] if len(slots) == 1 else b"".join(slots)
-            return self.packed
-        raise AttributeError(name)
+            self._packed = slots[0] if len(slots) == 1 else b"".join(slots)
+        return self._packed
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -125,6 +117,22 @@ class Batch:
             made = Batch(self.device, self.device_id, rotation.samples(self.samples), self.frame)
             self._converted[convention] = made
         return made
+
+
+class SlotBatch(Batch):
+    """Batch of valid slots without sample objects."""
+
+    __slots__ = ("packed",)
+
+    is_packed = True
+    packed: bytes  # an attribute, because a property costs a function call for each use
+
+    def __init__(self, device: str, device_id: int, packed: bytes, frame: PublishedAxes = AS_SENT) -> None:
+        self.device = device
+        self.device_id = device_id
+        self.frame = frame
+        self.packed = packed
+        self._samples = self._converted = None
 
 
 class Publisher(Protocol):

@@ -27,7 +27,7 @@ from imud.contracts.codec import (
 from imud.contracts.driver import Driver
 from imud.contracts.lines import DeviceLines, Edge, ReadyOptions
 from imud.contracts.observer import InputObserver
-from imud.contracts.publisher import AS_SENT, Batch
+from imud.contracts.publisher import AS_SENT, Batch, SlotBatch
 from imud.contracts.script import Message, ReplyFrame, TextLine
 from imud.formats import kernel
 from imud.formats.can import CanFrame
@@ -268,7 +268,7 @@ class SamplePath(ABC):
         self._ledger.samples += len(packed) // SLOT_BYTES
         self._newest = packed if len(packed) == SLOT_BYTES else packed[-SLOT_BYTES:]
         self.last_sample_ns = t_rx_ns
-        self._publish(Batch(self._device, self._device_id, None, self.frame, packed))
+        self._publish(SlotBatch(self._device, self._device_id, packed, self.frame))
         if mask := self._status_mask:
             self._status_seen |= slot_status_bits(packed) & mask
         if len(packed) == SLOT_BYTES:

@@ -7,7 +7,7 @@ import pytest
 from imud.attitude.conventions import RFU_ENU, Convention
 from imud.attitude.published import published_frame
 from imud.contracts import publisher
-from imud.contracts.publisher import Batch, OutputFacts
+from imud.contracts.publisher import Batch, OutputFacts, SlotBatch
 from imud.contracts.status import OutputStatus
 from imud.formats.slot import encode_slot
 from imud.publishers import PUBLISHERS
@@ -20,21 +20,17 @@ ENU, NED = Convention
 def test_a_batch_makes_the_other_form_at_its_first_use(monkeypatch: pytest.MonkeyPatch, seqs: Sequence[int]) -> None:
     samples = [make_sample(seq) for seq in seqs]
     slots = b"".join(encode_slot(sample, 3) for sample in samples)
-    made, packed, both = (
-        Batch(DEVICE, 3, samples), Batch(DEVICE, 3, None, packed=slots), Batch(DEVICE, 3, samples, packed=b"?"),
-    )  # fmt: skip
-    assert (made.is_packed, packed.is_packed, both.is_packed) == (False, True, False)
+    made, packed = Batch(DEVICE, 3, samples), SlotBatch(DEVICE, 3, slots)
+    assert (made.is_packed, packed.is_packed) == (False, True)
     with monkeypatch.context() as patch:
         for name in ("decode_slots", "encode_slots"):  # these facts need no other form
             patch.setattr(publisher, name, None)
-        for batch in (made, packed, both):
+        for batch in (made, packed):
             assert (len(batch), batch.seqs) == (len(seqs), (seqs[0], seqs[-1]))
             assert list(batch.times_ns) == [seq * 1_000_000 for seq in seqs]
-        assert (packed.packed, both.packed, both.samples) == (slots, b"?", samples)
+        assert (packed.packed, made.samples) == (slots, samples)
     assert (made.packed, packed.samples) == (slots, samples)
     assert (made.packed, packed.samples) == (slots, samples)
-    with pytest.raises(AttributeError, match=r"^other$"):
-        _ = made.other
 
 
 def test_a_batch_rotates_its_samples_once_for_each_convention() -> None:

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from imud.attitude.conventions import RFU_ENU, Convention
 from imud.attitude.published import FrameOptions, MountingAxes, PublishedAxes, as_sent, published_frame
-from imud.contracts.publisher import Batch
+from imud.contracts.publisher import Batch, SlotBatch
 from imud.formats import kernel
 from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.model.sample import Sample
@@ -164,7 +164,7 @@ def test_a_batch_is_turned_once_for_all_clients() -> None:
 @pytest.mark.parametrize("encoding", [BinaryEncoding(), BinaryEncoding(Convention.NED_FRD), JsonEncoding(None, False)])
 def test_a_batch_of_slots_is_the_batch_of_its_samples(encoding: Encoding) -> None:
     whole = published([SENT, replace(SENT, seq=2)])
-    packed = Batch("imu0", 0, None, whole.frame, whole.packed)
+    packed = SlotBatch("imu0", 0, whole.packed, whole.frame)
     assert list(encoding.encode(packed)) == list(encoding.encode(whole))
 
 
