@@ -7,7 +7,7 @@
  *   is_usual, decode ─▶ HipnucCodec (imud/drivers/hipnuc/uart/codec.py)
  *   stamp ─▶ add_even_run (imud/sampling/clock.py), ArrivalFit.add_arrival (imud/sampling/arrival_fit.py),
  *                 encode_slots (imud/formats/slot.py)
- *   write_slots ─▶ ShmRing (imud/publishers/shm.py)
+ *   write_ring ─▶ ShmRing (imud/publishers/shm.py)
  *   frame_slots ─▶ BinaryEncoding (imud/publishers/socket/outbox.py)
  *   add_slots ─▶ add_slots (imud/publishers/socket/history.py)
  *
@@ -22,6 +22,7 @@
 #include <stddef.h>
 #include <stdint.h>
 #include <string.h>
+#include <unistd.h>
 
 /* The headers of Python 3.12 and later do not count this reference, but Python 3.11 does. */
 #undef Py_RETURN_NONE
@@ -476,43 +477,93 @@ static void put_word(uint8_t *memory, uint64_t value)
     __atomic_store_n((uint64_t *)memory, value, __ATOMIC_RELEASE);
 }
 
-/* write_slots(memory, mask, newest_seq, slots): write slots one after the other into a ring of mask + 1 slots */
-static PyObject *write_slots(PyObject *self, PyObject *const *args, Py_ssize_t count)
+/* Ring of slots in the memory of a file. */
+typedef struct {
+    PyObject_HEAD
+    Py_buffer memory;
+    int64_t mask; /* number of slots - 1 */
+    int64_t newest; /* sequence number of the newest slot */
+    int fd;
+} RingObject;
+
+static PyObject *ring_type;
+
+/* open_ring(memory, mask, newest_seq, fd) -> Ring of mask + 1 slots */
+static PyObject *open_ring(PyObject *self, PyObject *args)
 {
-    Py_buffer ring;
+    Py_buffer memory;
+    int64_t mask, newest;
+    int fd;
+    if (!PyArg_ParseTuple(args, "w*LLi:open_ring", &memory, &mask, &newest, &fd))
+        return NULL;
+    RingObject *made = NULL;
+    if (mask < 0 || mask > (INT64_C(1) << 32) || memory.len < RING_HEADER_BYTES + (mask + 1) * (int64_t)sizeof(Slot) ||
+        (uintptr_t)memory.buf % sizeof(uint64_t))
+        PyErr_SetString(PyExc_ValueError, "expected the memory of a ring of mask + 1 slots");
+    else
+        made = PyObject_New(RingObject, (PyTypeObject *)ring_type);
+    if (made == NULL) {
+        PyBuffer_Release(&memory);
+        return NULL;
+    }
+    made->memory = memory;
+    made->mask = mask;
+    made->newest = newest;
+    made->fd = fd;
+    return (PyObject *)made;
+}
+
+/* Ring.write(slots): write slots one after the other -> False without a change if the file is shorter than the memory */
+static PyObject *write_ring(RingObject *self, PyObject *packed)
+{
     char *slots;
     Py_ssize_t size;
-    int64_t mask, newest;
-    if (count != 4) {
-        PyErr_Format(PyExc_TypeError, "write_slots: expected 4 arguments, got %zd", count);
+    uint8_t *memory = self->memory.buf;
+    if (PyBytes_AsStringAndSize(packed, &slots, &size) < 0)
         return NULL;
-    }
-    if (!integer(args[1], &mask) || !integer(args[2], &newest) || PyBytes_AsStringAndSize(args[3], &slots, &size) < 0 ||
-        PyObject_GetBuffer(args[0], &ring, PyBUF_WRITABLE) < 0)
-        return NULL;
-    uint8_t *memory = ring.buf;
-    if (mask < 0 || mask > (INT64_C(1) << 32) || ring.len < RING_HEADER_BYTES + (mask + 1) * (int64_t)sizeof(Slot) ||
-        (uintptr_t)memory % sizeof(uint64_t)) {
-        PyBuffer_Release(&ring);
-        PyErr_SetString(PyExc_ValueError, "expected the memory of a ring of mask + 1 slots");
-        return NULL;
-    }
+    if (lseek(self->fd, 0, SEEK_END) < self->memory.len)
+        return PyBool_FromLong(0);
     for (; size >= (Py_ssize_t)sizeof(Slot); size -= (Py_ssize_t)sizeof(Slot), slots += sizeof(Slot)) {
         uint64_t seq;
         memcpy(&seq, slots, sizeof seq);
-        uint8_t *slot = memory + RING_HEADER_BYTES + (seq & (uint64_t)mask) * sizeof(Slot);
+        uint8_t *slot = memory + RING_HEADER_BYTES + (seq & (uint64_t)self->mask) * sizeof(Slot);
         put_word(slot, UINT64_MAX); /* invalid while it changes */
         __atomic_thread_fence(__ATOMIC_SEQ_CST);
         memcpy(slot + sizeof seq, slots + sizeof seq, sizeof(Slot) - sizeof seq);
         put_word(slot, seq);
         put_word(memory + RING_NEWEST_OFFSET, seq);
-        if (seq != (uint64_t)newest + 1) /* the ring does not contain the samples between */
+        if (seq != (uint64_t)self->newest + 1) /* the ring does not contain the samples between */
             put_word(memory + RING_FIRST_OFFSET, seq);
-        newest = (int64_t)seq;
+        self->newest = (int64_t)seq;
     }
-    PyBuffer_Release(&ring);
-    Py_RETURN_NONE;
+    return PyBool_FromLong(1);
 }
+
+static void free_ring(PyObject *self)
+{
+    PyTypeObject *type = Py_TYPE(self);
+    PyBuffer_Release(&((RingObject *)self)->memory);
+    PyObject_Free(self);
+    Py_DECREF(type);
+}
+
+static PyMethodDef ring_methods[] = {
+    {"write", (PyCFunction)write_ring, METH_O, "Write slots; return False if the file was truncated."},
+    {NULL, NULL, 0, NULL},
+};
+
+static PyMemberDef ring_members[] = {
+    {"newest", T_LONGLONG, offsetof(RingObject, newest), READONLY, "sequence number of the newest slot"},
+    {NULL, 0, 0, 0, NULL},
+};
+
+static PyType_Slot ring_slots[] = {
+    {Py_tp_methods, ring_methods}, {Py_tp_members, ring_members}, {Py_tp_dealloc, (void *)free_ring}, {0, NULL},
+};
+
+static PyType_Spec ring_spec = {
+    "imud._kernel.Ring", sizeof(RingObject), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_DISALLOW_INSTANTIATION, ring_slots,
+};
 
 #define FRAME_HEADER_BYTES 4 /* size of the message, little-endian (`FRAME_HEADER` of imud/formats/jsonrpc.py) */
 
@@ -654,7 +705,7 @@ static PyObject *add_slots(PyObject *self, PyObject *args)
 static PyMethodDef methods[] = {
     {"add_slots", add_slots, METH_VARARGS, "Add slots to the minimum and maximum of a second."},
     {"frame_slots", frame_slots, METH_O, "Return slots as messages of the socket, back to back."},
-    {"write_slots", (PyCFunction)(void (*)(void))write_slots, METH_FASTCALL, "Write slots into a ring."},
+    {"open_ring", open_ring, METH_VARARGS, "Return a Ring in the memory of a file."},
     {"start_hi91", start_hi91, METH_VARARGS, "Return a Run for HI91 frames that starts with a state; or None."},
     {NULL, NULL, 0, NULL},
 };
@@ -665,6 +716,8 @@ PyMODINIT_FUNC PyInit__kernel(void)
 {
     make_tables();
     if (run_type == NULL && (run_type = PyType_FromSpec(&run_spec)) == NULL)
+        return NULL;
+    if (ring_type == NULL && (ring_type = PyType_FromSpec(&ring_spec)) == NULL)
         return NULL;
     PyObject *made = PyModule_Create(&module);
     PyObject *source_crc = PyLong_FromUnsignedLong(SOURCE_CRC);

@@ -270,12 +270,6 @@ def slot_seqs(packed: bytes) -> tuple[int, int]:
     return _SEQ.unpack_from(packed)[0], _SEQ.unpack_from(packed, len(packed) - SLOT_BYTES)[0]
 
 
-def newest_seq(packed: bytes) -> int:
-    """Return the sequence number of the last of packed slots."""
-    seq: int = _SEQ.unpack_from(packed, len(packed) - SLOT_BYTES)[0]
-    return seq
-
-
 def slot_times_ns(packed: bytes) -> list[int]:
     """Return the time stamps `t_ns` of packed slots."""
     return [t_ns for (t_ns,) in _T_NS.iter_unpack(packed)]

@@ -14,12 +14,12 @@ import secrets
 import stat
 import struct
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import msgspec
 
@@ -46,7 +46,7 @@ from imud.formats.ring import (
     encode_ledger_block,
     ring_path,
 )
-from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, newest_seq, slot_seqs, slots_in
+from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, slot_seqs, slots_in
 from imud.host.files import can_replace, user_name
 from imud.model.errors import ServerError
 from imud.model.options import Options
@@ -278,7 +278,6 @@ def _process(descriptor: int) -> str:
         return "of another version"
 
 
-_lseek, _END = os.lseek, os.SEEK_END  # looked up once, because `write` uses them for each batch
 _CLOSED = struct.pack("<I", STATE_CLOSED)
 _INVALID = struct.pack("<Q", SEQ_INVALID)
 _SEQ = struct.Struct("<Q")
@@ -301,9 +300,10 @@ class ShmRing:
         with memoryview(self._memory) as view:
             self._words, self._halves = view.cast("Q"), view.cast("I")
         self._mask = header.slot_count - 1
-        # function of the kernel in C, if it is installed
-        self._write_slots: Callable[..., None] | None = getattr(kernel.present.module, "write_slots", None)
         self._newest = header.newest_seq
+        # `Ring` of the kernel in C, which writes the slots while the file has its size; None without the kernel
+        open_ring = getattr(kernel.present.module, "open_ring", None)
+        self._ring: Any = open_ring and open_ring(self._memory, self._mask, self._newest, self._fd)
         self._update = 0
         self._known: tuple[str, Sequence[int]] | None = None
         # minimum size of the file for a write; larger than any file after the file was truncated
@@ -312,16 +312,14 @@ class ShmRing:
     @property
     def newest(self) -> int:
         """Return the sequence number of the newest sample; 0 before the first."""
-        return self._newest
+        return self._newest if self._ring is None else int(self._ring.newest)
 
     def write(self, packed: bytes) -> None:
         """Write slots that are back to back, oldest first. Do nothing if the file was truncated."""
-        if _lseek(self._fd, 0, _END) < self._least_bytes:
-            self._restore_size()
+        if self._ring is not None and self._ring.write(packed):
+            return
+        if not self._is_whole():
             self._newest = slot_seqs(packed)[1]
-        elif self._write_slots is not None:
-            self._write_slots(self._memory, self._mask, self._newest, packed)
-            self._newest = newest_seq(packed)
         elif len(packed) == SLOT_BYTES:
             self._write_one(packed)
         elif not self._write_run(packed):
@@ -387,6 +385,7 @@ class ShmRing:
         if self._is_whole():
             self._halves[STATE_HALF_WORD] = STATE_CLOSED
         self._directory.remove(self._name, self._status)
+        self._ring = None
         for view in (self._words, self._halves):
             view.release()
         self._memory.close()
@@ -401,7 +400,7 @@ class ShmRing:
             raise ServerError(f"cannot map {self._size_bytes} bytes of {self._name}: {error.strerror}") from error
 
     def _is_whole(self) -> bool:
-        whole = _lseek(self._fd, 0, _END) >= self._least_bytes
+        whole = os.lseek(self._fd, 0, os.SEEK_END) >= self._least_bytes
         if not whole:
             self._restore_size()
         return whole
@@ -409,6 +408,7 @@ class ShmRing:
     def _restore_size(self) -> None:
         """Restore the size of a truncated file and mark it as closed, without the mapping. Readers can have the file
         mapped. imud does not write to it after that."""
+        self._newest, self._ring = self.newest, None
         self._least_bytes = sys.maxsize
         with suppress(OSError):
             os.ftruncate(self._fd, self._size_bytes)

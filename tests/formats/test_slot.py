@@ -148,7 +148,6 @@ def test_a_batch_is_its_samples_one_by_one_also_where_one_does_not_fit() -> None
         assert slot_format.decode_slots(packed, "imu0") == decoded
         assert slot_format.slot_seqs(packed) == (decoded[0].seq, decoded[-1].seq)
         assert slot_format.slot_times_ns(packed) == [one.t_ns for one in decoded]
-        assert slot_format.newest_seq(packed) == decoded[-1].seq
         assert [slot for (slot,) in slot_format.slots_in(packed)] == slots
         pieces = slot_format.EqualPieces(packed, SLOT_BYTES)
         assert (len(pieces), list(pieces), pieces[-1], pieces[:2]) == (len(slots), slots, slots[-1], slots[:2])
