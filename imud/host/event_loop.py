@@ -153,7 +153,8 @@ class ReaderSelector(selectors.EpollSelector):
         while True:
             if removed:
                 removed.clear()
-            wait_s = (alarms[0][0] if alarms and alarms[0][0] < end_s else end_s) - now_s
+            due_s = alarms[0][0] if alarms else inf
+            wait_s = (due_s if due_s < end_s else end_s) - now_s
             for fd, _ in poll(None if wait_s == inf else wait_s if wait_s > 0 else 0, EVENTS_MAX):
                 callback = readers.get(fd)
                 if callback is None:
@@ -165,7 +166,7 @@ class ReaderSelector(selectors.EpollSelector):
                     except Exception as error:  # noqa: BLE001 - asyncio does the same with the callback of a handle
                         self._failed(callback, error)
             now_s = monotonic()
-            if alarms and alarms[0][0] <= now_s:
+            if due_s <= now_s:  # an alarm that a reader has set rings after the next poll
                 self._ring(now_s)
             if found or self.has_news or end_s <= now_s:
                 return found
