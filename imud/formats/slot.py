@@ -109,7 +109,7 @@ _CRC = struct.Struct("<I")
 _SLOT = struct.Struct(f"{SLOT_BYTES}s")
 _SEQ = struct.Struct("<Q")
 _T_NS = struct.Struct("<8xq240x")
-slot_time_ns: Final = _T_NS.unpack  # returns a tuple with the field `t_ns` of one slot
+slot_time_and_status: Final = struct.Struct("<8xq40xI196x").unpack  # returns the fields `t_ns` and `status` of one slot
 _STATUS = struct.Struct("<56xI196x")
 _QUALITY = struct.Struct("<48xI10xB193x")
 _SYNC_OFFSET: Final = next(field.offset for field in SLOT_FIELDS if field.name == "sync")

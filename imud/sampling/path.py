@@ -37,7 +37,7 @@ from imud.formats.slot import (
     decode_slots,
     slot_quality,
     slot_status_bits,
-    slot_time_ns,
+    slot_time_and_status,
     slot_times_ns,
 )
 from imud.host.clock import UNSTEERED, HostClock, SteadyTime
@@ -265,17 +265,18 @@ class SamplePath(ABC):
         if self._rotation is not None:
             self._finish(decode_slots(packed, self._device), t_rx_ns)
             return
-        self._ledger.samples += len(packed) // SLOT_BYTES
-        self._newest = packed if len(packed) == SLOT_BYTES else packed[-SLOT_BYTES:]
+        count = len(packed) // SLOT_BYTES
+        self._ledger.samples += count
+        self._newest = packed if count == 1 else packed[-SLOT_BYTES:]
         self.last_sample_ns = t_rx_ns
         self._publish(SlotBatch(self._device, self._device_id, packed, self.frame))
-        if mask := self._status_mask:
-            self._status_seen |= slot_status_bits(packed) & mask
-        if len(packed) == SLOT_BYTES:
-            (t_ns,) = slot_time_ns(packed)
+        if count == 1:  # the usual case
+            t_ns, status = slot_time_and_status(packed)
             self.latency.add_one(self._now_ns() - t_ns)
         else:
+            status = slot_status_bits(packed)
             self.latency.add(self._now_ns(), slot_times_ns(packed))
+        self._status_seen |= status & self._status_mask
 
 
 KERNEL_BYTES: Final = 82  # minimum size of a read for the kernel, bytes: one HI91 frame

@@ -218,7 +218,7 @@ class Hub(Clients):
         plan = self._plans.get(device)
         if plan is None:
             plan = self._plans[device] = self._new_plan(device)
-        plan.send(batch, self.context.clock.now_ns, self._time)
+        plan.send(batch)
         if device in self._wanting_wake:
             # later: a woken client reads shared memory, and its publisher may run after this one
             asyncio.get_running_loop().call_soon(self._wake_all, device)
@@ -241,7 +241,7 @@ class Hub(Clients):
                 post_all(some, encode_notification("event", event, texts=texts))
 
     def _new_plan(self, device: str) -> DeliveryPlan:
-        plan = DeliveryPlan(self.pool.next_order)
+        plan = DeliveryPlan(self.pool.next_order, self.context.clock.now_ns, self._time)
         for number, wanted in self._subscriptions.items():
             if wanted.matches(device):
                 plan.add(wanted, self.connections[number])

@@ -166,11 +166,14 @@ def _in_parts(outboxes: list[Outbox]) -> list[list[Outbox]]:
 class DeliveryPlan:
     """The clients that watch one device: a group for each form.
 
-    `next_order` returns the order number of the next queued message.
+    `next_order` returns the order number of the next queued message, and `now_ns` returns CLOCK_MONOTONIC. `time` is
+    the allowance for serving.
     """
 
-    def __init__(self, next_order: Callable[[], int]) -> None:
+    def __init__(self, next_order: Callable[[], int], now_ns: Callable[[], int], time: TokenBucket) -> None:
         self._next_order = next_order
+        self._now_ns = now_ns
+        self._time = time
         self._thinner = RateThinner()
         self._groups: dict[FormKey, DeliveryGroup] = {}
         # a copy of `_groups`: a client may leave while `send` iterates over it
@@ -211,17 +214,17 @@ class DeliveryPlan:
         self._thins = bool(self._thinner)
         self._only = groups[0] if len(groups) == 1 and groups[0].is_small else None
 
-    def send(self, batch: Batch, now_ns: Callable[[], int], time: TokenBucket) -> None:
+    def send(self, batch: Batch) -> None:
         """Send a batch to all clients: to a small group without a time limit, otherwise for PUBLISH_NS, then queue it.
 
-        `time` is the allowance for serving. If it is used up, imud queues the batch for most of many clients.
+        If the allowance for serving is used up, imud queues the batch for most of many clients.
         """
-        groups = self._in_order
-        if not groups:
-            return
         chosen = self._thinner.choose(batch.times_ns) if self._thins else NOTHING
         if self._only is not None:
-            self._only.send(batch, chosen, now_ns, NEVER_NS)
+            self._only.send(batch, chosen, self._now_ns, NEVER_NS)
+            return
+        groups, now_ns, time = self._in_order, self._now_ns, self._time
+        if not groups:
             return
         begun_ns = now_ns()
         time.fill(begun_ns)

@@ -22,10 +22,11 @@ def test_subscription_matches() -> None:
 def test_many_clients_and_forms_have_a_limited_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """imud reads the clock if a form has 33 clients or more. It encodes at most 16 forms per batch immediately."""
     monkeypatch.setattr(Outbox, "put_samples", Mock())
-    plan, now_ns = DeliveryPlan(Mock(side_effect=[1, 2, 3])), Mock(return_value=0)
+    now_ns = Mock(return_value=0)
+    plan = DeliveryPlan(Mock(side_effect=[1, 2, 3]), now_ns, TokenBucket(1, 1, 0, 1))
     for clients in range(1, 34):
         plan.add(Subscription(None, None, 0, Form.JSON), Mock())
-        plan.send(batch(), now_ns, TokenBucket(1, 1, 0, 1))
+        plan.send(batch())
         assert bool(now_ns.called) == (clients > 32)
     outboxes = [Mock() for _ in range(17)]
     for number, outbox in enumerate(outboxes):
@@ -33,7 +34,7 @@ def test_many_clients_and_forms_have_a_limited_time(monkeypatch: pytest.MonkeyPa
     plan.add(wanted := Subscription(None, ("seq",) * 16, 0, Form.JSON), whole := Mock())
     plan.discard(wanted, Mock())
     assert len(plan) == 18
-    plan.send(batch("imu0", 1, 20), now_ns, TokenBucket(1, 1, 0, 1))
+    plan.send(batch("imu0", 1, 20))
     deferred = [[call.args[0] for call in outbox.defer.call_args_list] for outbox in (*outboxes, whole)]
     assert [[(one.order, one._chosen) for one in each] for each in deferred] == [
         *[[]] * 15, [(1, None)], [(2, (0, 10))], [(3, None)]

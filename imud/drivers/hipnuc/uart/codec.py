@@ -391,12 +391,12 @@ class HipnucCodec:
         ledger.bytes_in_good_frames += size
         ledger.frames_good += count
         ledger.frames_in_samples += count
-        if size == len(frames):  # the usual case, without a slice
-            self._tail, rest, is_start = b"", b"", True
-        else:
-            rest = frames[size:]
-            is_start = len(rest) < _HI91_FRAME_BYTES and rest[: len(_HI91_HEAD)] == _HI91_HEAD[: len(rest)]
-            self._tail = rest if is_start else b""
+        if frames is data and size == len(data):  # the usual case: complete frames only
+            ledger.bytes_in += size
+            return b""
+        rest = frames[size:]
+        is_start = len(rest) < _HI91_FRAME_BYTES and rest[: len(_HI91_HEAD)] == _HI91_HEAD[: len(rest)]
+        self._tail = rest if is_start else b""
         ledger.bytes_in += len(data) if is_start else len(data) - len(rest)
         ledger.bytes_pending = len(self._tail)
         return b"" if is_start else rest
