@@ -279,7 +279,7 @@ class SamplePath(ABC):
         self._status_seen |= status & self._status_mask
 
 
-KERNEL_BYTES: Final = 82  # minimum size of a read for the kernel, bytes: one HI91 frame
+KERNEL_BYTES: Final = 82  # minimum number of bytes for the kernel: one HI91 frame
 
 
 class SampleListener(Protocol):
@@ -324,12 +324,11 @@ class StreamPath(SamplePath):
         """Process the bytes of one read. `t_rx_ns` is CLOCK_MONOTONIC right after the read."""
         self.last_data_ns = t_rx_ns
         samples: list[Sample] = []
-        packed = None
-        listener = self._listener
+        packed, listener = b"", self._listener
         try:
             if self._drain_edges is not None:
                 self._drain_edges()
-            if len(data) >= KERNEL_BYTES and (listener is None or not listener.wants_samples):
+            if listener is None or not listener.wants_samples:
                 packed, events = self._stamp(data, t_rx_ns, samples)
             else:
                 events = self.codec.feed(data)
@@ -342,7 +341,7 @@ class StreamPath(SamplePath):
             self._finish([*decode_slots(packed, self._device), *samples] if packed else samples, t_rx_ns)
         elif packed:
             self._finish_slots(packed, t_rx_ns)
-        if listener is not None and listener.wants_samples:
+        if events and listener is not None and listener.wants_samples:
             for event in events:
                 if type(event) is Measurement:
                     listener.on_sample(event)
@@ -355,7 +354,7 @@ class StreamPath(SamplePath):
             self.clock.waited_ns = waited_ns
             samples: list[Sample] = []
             packed = b""
-            if len(data) >= KERNEL_BYTES and (not self.gathered or isinstance(self.gathered[-1], bytes)):
+            if not self.gathered or isinstance(self.gathered[-1], bytes):
                 packed, _ = self._stamp(data, t_rx_ns, samples)
                 if packed:
                     self.gathered.append(packed)
@@ -390,10 +389,10 @@ class StreamPath(SamplePath):
         """Process usual frames at the start of `data` with the kernel, then the rest as `_sort`. Return the slots of
         the frames and the events of the rest."""
         codec: Any = self.codec  # a KernelCodec if `_start_run` is not None
-        packed, utc_offset_ns = b"", None
-        if self._start_run is not None and (frames := codec.usual_frames(data)):
+        start, packed, utc_offset_ns = self._start_run, b"", None
+        if start is not None and len(frames := codec.usual_frames(data)) >= KERNEL_BYTES:
             utc_offset_ns = self._utc_offset_ns()
-            packed = self.clock.stamp_frames(self._start_run, frames, codec.word_is_status, t_rx_ns, utc_offset_ns)
+            packed = self.clock.stamp_frames(start, frames, codec.word_is_status, t_rx_ns, utc_offset_ns)
             if packed:
                 self.loss.bad_frames = 0
                 data = codec.take(frames, len(packed) // SLOT_BYTES, data)

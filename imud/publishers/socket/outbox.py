@@ -370,11 +370,14 @@ class Outbox(ABC):
     ) -> None:  # fmt: skip
         """Send samples of one device to several clients: the same bytes, one `send` each."""
         # one loop here: a method call per client would cost as much as all other code around `send`
-        if type(messages) is EqualPieces:
+        samples = len(messages)
+        if samples == 1:
+            whole = messages[0]
+        elif type(messages) is EqualPieces:
             whole = messages.whole
         else:
-            whole = messages[0] if len(messages) == 1 else b"".join(messages)
-        size, samples = len(whole), len(messages)
+            whole = b"".join(messages)
+        size = len(whole)
         delivery: Delivery | None = None
         for outbox in outboxes:
             if outbox.waiting:

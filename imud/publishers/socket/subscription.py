@@ -101,22 +101,25 @@ class DeliveryGroup:
 
     def send(self, batch: Batch, chosen: ChosenSamples, now_ns: Callable[[], int], end_ns: int) -> None:
         """Send the batch to the clients of the group until `end_ns`, then queue it for the others."""
+        messages = self.send_first(batch)
+        if len(self._direct) > 1:
+            self._send_parts(self._direct[1:], messages, batch, None, now_ns, end_ns)
+        for indices, outboxes in self._due(chosen):
+            if messages:
+                some: Sequence[bytes] = [messages[index] for index in indices]
+            else:
+                some = [self.encoding.encode_one(batch, index) for index in indices]
+            self._send_parts(_in_parts(outboxes), some, batch, indices, now_ns, end_ns)
+
+    def send_first(self, batch: Batch) -> Sequence[bytes]:
+        """Send the batch to the first clients without a rate. Return the messages; empty without such clients."""
         if self._changed:
             self._make_lists()
-        encoding = self.encoding
-        messages: Sequence[bytes] = ()
-        if self._direct:
-            messages = encoding.encode(batch)
-            Outbox.put_samples(self._direct[0], messages, batch, encoding)
-            if len(self._direct) > 1:
-                self._send_parts(self._direct[1:], messages, batch, None, now_ns, end_ns)
-        if chosen:
-            for indices, outboxes in self._due(chosen):
-                if messages:
-                    some: Sequence[bytes] = [messages[index] for index in indices]
-                else:
-                    some = [encoding.encode_one(batch, index) for index in indices]
-                self._send_parts(_in_parts(outboxes), some, batch, indices, now_ns, end_ns)
+        if not self._direct:
+            return ()
+        messages = self.encoding.encode(batch)
+        Outbox.put_samples(self._direct[0], messages, batch, self.encoding)
+        return messages
 
     def defer(self, batch: Batch, chosen: ChosenSamples) -> None:
         """Queue the batch for every client. imud encodes it when it serves the first client."""
@@ -219,9 +222,13 @@ class DeliveryPlan:
 
         If the allowance for serving is used up, imud queues the batch for most of many clients.
         """
+        only = self._only
+        if only is not None and not self._thins:  # the usual case
+            only.send_first(batch)
+            return
         chosen = self._thinner.choose(batch.times_ns) if self._thins else NOTHING
-        if self._only is not None:
-            self._only.send(batch, chosen, self._now_ns, NEVER_NS)
+        if only is not None:
+            only.send(batch, chosen, self._now_ns, NEVER_NS)
             return
         groups, now_ns, time = self._in_order, self._now_ns, self._time
         if not groups:
