@@ -25,6 +25,7 @@ from contextlib import suppress
 from contextvars import Context
 from functools import partial
 from heapq import heappop, heappush
+from itertools import count
 from math import inf
 from time import monotonic
 from typing import Any, Final, Protocol, TypeVar, TypeVarTuple
@@ -33,6 +34,7 @@ T = TypeVar("T")
 Arguments = TypeVarTuple("Arguments")
 
 EVENTS_MAX: Final = 256  # maximum number of descriptors in one turn; the next turn handles all others
+_NUMBERS: Final = count()  # numbers of the calls of `Alarm.set`, which make equal due times comparable
 
 OnError = Callable[[dict[str, Any]], None]  # `loop.call_exception_handler`
 
@@ -62,25 +64,26 @@ class AlarmOwner(Protocol):
 class Alarm:
     """A timer that one owner sets again and again. Synchronization: the thread of the event loop."""
 
-    __slots__ = ("_handle", "_loop", "_owner", "due_s")
+    __slots__ = ("_alarms", "_handle", "_loop", "_owner", "due_s")
 
     def __init__(self, owner: AlarmOwner) -> None:
         """Call `owner.on_alarm` in the running loop each time that the alarm is due. The alarm is not set."""
         self.due_s: float | None = None  # time of the loop's clock; None if the alarm is not set
         self._owner = owner
-        self._loop = asyncio.get_running_loop()
+        self._loop = loop = asyncio.get_running_loop()
+        self._alarms = loop.alarms if isinstance(loop, SampleLoop) else None
         self._handle: asyncio.TimerHandle | None = None  # timer of a loop that has no alarms
 
     def set(self, delay_s: float) -> None:
         """Call the owner once after `delay_s`, in place of an earlier `set`."""
-        loop = self._loop
-        self.due_s = due_s = loop.time() + delay_s
-        if isinstance(loop, SampleLoop):
-            loop.watch_alarm(due_s, self)
+        if self._alarms is not None:
+            self.due_s = due_s = monotonic() + delay_s
+            heappush(self._alarms, (due_s, next(_NUMBERS), self))
             return
         if self._handle is not None:
             self._handle.cancel()
-        self._handle = loop.call_at(due_s, self.ring)
+        self.due_s = due_s = self._loop.time() + delay_s
+        self._handle = self._loop.call_at(due_s, self.ring)
 
     def cancel(self) -> None:
         """Do not call the owner. Do nothing if the alarm is not set."""
@@ -107,9 +110,8 @@ class ReaderSelector(selectors.EpollSelector):
         self._readers: dict[int, Callable[[], object]] = {}
         # Descriptors that were removed in the present turn. The kernel may already use the number for another file.
         self._removed: set[int] = set()
-        # Heap of due times. An entry is void if the alarm has another due time now.
-        self._alarms: list[tuple[float, int, Alarm]] = []
-        self._alarms_set = 0  # number of calls of `add_alarm`, which makes the entries comparable
+        # Heap of due times (`Alarm.set`). An entry is void if the alarm has another due time now.
+        self.alarms: list[tuple[float, int, Alarm]] = []
         self._outer: Poller = poller or select.epoll()
         self._poll = self._outer.poll
         self._inner = self.fileno()
@@ -132,21 +134,11 @@ class ReaderSelector(selectors.EpollSelector):
             self._outer.unregister(fd)
         return True
 
-    def add_alarm(self, due_s: float, alarm: Alarm) -> None:
-        """Ring `alarm` at `due_s` if this is still its due time."""
-        self._alarms_set += 1
-        heappush(self._alarms, (due_s, self._alarms_set, alarm))
-
-    @property
-    def alarms(self) -> list[Alarm]:
-        """Alarms that are set."""
-        return [alarm for due_s, _, alarm in self._alarms if due_s == alarm.due_s]
-
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         """Wait, call the readers of all readable descriptors and the due alarms, and return the events of asyncio.
         Returns at an asyncio event, at the timeout, and if a callback gave the loop a callback, a timer or `stop`."""
         found: list[tuple[selectors.SelectorKey, int]] = []
-        readers, removed, poll, alarms = self._readers, self._removed, self._poll, self._alarms
+        readers, removed, poll, alarms = self._readers, self._removed, self._poll, self.alarms
         now_s = monotonic()
         end_s = inf if timeout is None else now_s + timeout
         self.has_news = False
@@ -174,13 +166,13 @@ class ReaderSelector(selectors.EpollSelector):
     def close(self) -> None:
         """Release both descriptors. A second call does nothing."""
         self._readers.clear()
-        self._alarms.clear()
+        self.alarms.clear()
         self._outer.close()
         super().close()
 
     def _ring(self, now_s: float) -> None:
         """Ring the due alarms. An alarm that is set again rings in a later turn, so that readers are called between."""
-        alarms, due = self._alarms, list[tuple[float, int, Alarm]]()
+        alarms, due = self.alarms, list[tuple[float, int, Alarm]]()
         while alarms and alarms[0][0] <= now_s:
             due.append(heappop(alarms))
         for due_s, _, alarm in due:
@@ -221,9 +213,10 @@ class SampleLoop(asyncio.SelectorEventLoop):
         self._reader_selector.has_news = True
         super().stop()
 
-    def watch_alarm(self, due_s: float, alarm: Alarm) -> None:
-        """Ring `alarm` at a time of the loop's clock (`Alarm.set`)."""
-        self._reader_selector.add_alarm(due_s, alarm)
+    @property
+    def alarms(self) -> list[tuple[float, int, Alarm]]:
+        """Heap of the alarms."""
+        return self._reader_selector.alarms
 
     def add_reader(self, fd: Any, callback: Callable[[*Arguments], Any], *args: *Arguments) -> None:
         """Call `callback` with `args` in each turn in which `fd`, a descriptor or a file, is readable or at its end."""

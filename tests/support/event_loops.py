@@ -44,7 +44,7 @@ def timers_left(loop: Any) -> list[str]:
     """Return the timers of imud that are neither cancelled nor due. A closed object must not be called again."""
     pending = (timer for timer in loop._scheduled if not timer.cancelled())
     found = [repr(timer) for timer in pending if str(getattr(timer._callback, "__module__", "")).startswith("imud.")]
-    return found + [repr(alarm) for alarm in getattr(getattr(loop, "_reader_selector", None), "alarms", ())]
+    return found + [repr(alarm) for due_s, _, alarm in getattr(loop, "alarms", ()) if due_s == alarm.due_s]
 
 
 DESCRIPTOR_LIMIT_S = 60.0
