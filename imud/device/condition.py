@@ -7,7 +7,6 @@ Facts ──▶ causes_of (RULES) ──▶ ConditionWatch (begins after 5 s, en
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
 import msgspec
@@ -31,7 +30,7 @@ from imud.contracts.status import DeviceState, FrameProblem, LinesStatus, Recent
 from imud.device.health import NO_SAMPLE, SEARCH_BEGUN, DeviceEvents
 from imud.links.serial_port import list_ports
 from imud.model.event import EventKind
-from imud.model.ledger import LOST_FIELDS, Ledger
+from imud.model.ledger import LOST_FIELDS, Ledger, counters_of
 from imud.model.units import NS_PER_MS, NS_PER_S
 
 MINUTE_NS: Final = 60 * NS_PER_S
@@ -350,7 +349,7 @@ NUMBER_RULES: Final = tuple(rule for rule in RULES if rule.code in (ReasonCode.R
 
 # --- counts of the last minute ----------------------------------------------------------------------------------------
 
-_LOST: Final = attrgetter(*LOST_FIELDS)
+_LOST: Final = counters_of(LOST_FIELDS)
 CAUSES: Final = tuple(name.removeprefix("lost_") for name in LOST_FIELDS)
 HOUR_NS: Final = 60 * MINUTE_NS
 STEADY: Final = 0.01  # maximum change of the expected rate within the window of a rate, as a share

@@ -5,13 +5,12 @@ A lasting problem of the link (for example an error-passive CAN bus) stays in th
 
 import logging
 from collections.abc import Callable, Mapping
-from operator import attrgetter
 
 from imud.contracts.codec import BadFrame, wrong_length_words
 from imud.contracts.status import DeviceState
 from imud.host.log import MESSAGE_CHARACTERS_MAX, printable, same_as
 from imud.model.event import LEVELS, Event, EventKind
-from imud.model.ledger import LOST_FIELDS, Ledger
+from imud.model.ledger import LOST_FIELDS, Ledger, counters_of
 from imud.model.sample import Sync
 from imud.model.units import NS_PER_S
 
@@ -19,7 +18,9 @@ log = logging.getLogger(__name__)
 
 INTERVAL_NS = NS_PER_S  # minimum interval of loss events and of bad-frame events, ns
 # Counters that cause events: `Ledger.lost`, `Ledger.frames_bad`, and `frames_not_finite`
-_TROUBLES = attrgetter(*LOST_FIELDS, "frames_bad_crc", "frames_bad_length", "frames_bad_content", "frames_not_finite")
+_TROUBLES = counters_of(
+    (*LOST_FIELDS, "frames_bad_crc", "frames_bad_length", "frames_bad_content", "frames_not_finite")
+)
 RAW_SHOWN_BYTES = 32  # maximum number of bytes of a bad frame in an event
 
 

@@ -94,8 +94,8 @@ LEDGER_BLOCK_BYTES: Final = LEDGER_CRC_OFFSET + 4 - LEDGER_BLOCK_OFFSET
 _CONSTANT = struct.Struct("<8s6IQ3I12x64s64x")  # magic … reserved1
 _LIVELY = struct.Struct("<QQq")  # newest_seq, first_seq, heartbeat_ns
 _BLOCK = struct.Struct(f"<Q32s{LEDGER_ROOM}Q")
+_OWN_BLOCK = struct.Struct(f"<Q32s{len(LEDGER_FIELDS)}Q{8 * (LEDGER_ROOM - len(LEDGER_FIELDS))}x")
 _CRC = struct.Struct("<I")
-_NO_COUNTERS = (0,) * LEDGER_ROOM
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,8 +174,8 @@ def decode_header(raw: bytes, where: str) -> RingHeader:
 
 
 def encode_ledger_block(update: int, driver: str, counters: Sequence[int]) -> bytes:
-    """Return LEDGER_BLOCK_BYTES bytes. `counters` is in the order of LEDGER_FIELDS. A name is cut to 31 bytes."""
-    body = _BLOCK.pack(update, driver.encode()[:31], *counters, *_NO_COUNTERS[len(counters) :])
+    """Return LEDGER_BLOCK_BYTES bytes. `counters` are all LEDGER_FIELDS in their order. A name is cut to 31 bytes."""
+    body = _OWN_BLOCK.pack(update, driver.encode()[:31], *counters)
     return body + _CRC.pack(zlib.crc32(body))
 
 

@@ -5,8 +5,8 @@ ledger, between two callbacks. Another thread requests a snapshot from the loop,
 does not balance.
 """
 
-from collections.abc import Mapping
-from operator import attrgetter, itemgetter
+from collections.abc import Callable, Iterable, Mapping
+from operator import itemgetter
 from typing import Final
 
 # Names in the order of shared memory. Append new names at the end.
@@ -98,18 +98,23 @@ class Ledger:
 
     def values(self) -> tuple[int, ...]:
         """Return all counters in the order of LEDGER_FIELDS."""
-        values: tuple[int, ...] = _ALL(self)
-        return values
+        return _ALL(self)
 
     def snapshot(self) -> dict[str, int]:
         """Return all counters by name."""
         return dict(zip(LEDGER_FIELDS, self.values(), strict=True))
 
 
+def counters_of(names: Iterable[str]) -> Callable[[Ledger], tuple[int, ...]]:
+    """Return a function that reads the counters `names`. It is faster than `attrgetter`."""
+    read: Callable[[Ledger], tuple[int, ...]] = eval(f"lambda ledger: ({', '.join(f'ledger.{one}' for one in names)},)")
+    return read
+
+
 # The first counter of each balance is the sum of the others.
 BYTE_FIELDS: Final = ("bytes_in", "bytes_in_good_frames", "bytes_in_bad_frames", "bytes_skipped", "bytes_pending")
 FRAME_FIELDS: Final = ("frames_good", "frames_in_samples", "frames_in_replies", "frames_ignored", "frames_pending")
-_ALL, _BYTES, _FRAMES = attrgetter(*LEDGER_FIELDS), attrgetter(*BYTE_FIELDS), attrgetter(*FRAME_FIELDS)
+_ALL, _BYTES, _FRAMES = counters_of(LEDGER_FIELDS), counters_of(BYTE_FIELDS), counters_of(FRAME_FIELDS)
 LOST_FIELDS: Final = tuple(name for name in LEDGER_FIELDS if name.startswith("lost_"))  # counters of losses by cause
 
 

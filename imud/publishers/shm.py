@@ -74,7 +74,7 @@ class RingDirectory:
         self.path = path
         self._fd = _open(path)
         try:
-            self._identity = _identity(_checked(self._fd, path))
+            self._status = _checked(self._fd, path)
         except BaseException:  # close the descriptor after any error
             os.close(self._fd)
             raise
@@ -83,17 +83,11 @@ class RingDirectory:
     @property
     def current(self) -> bool:
         """Return whether `path` still names this directory. False after it was removed, renamed or mounted over."""
-        try:
-            return _identity(os.stat(self.path, follow_symlinks=False)) == self._identity
-        except OSError:
-            return False
+        return _is_at(self.path, self._status)
 
     def names(self, name: str, file: os.stat_result) -> bool:
         """Return whether the directory entry `name` is the file `file`."""
-        try:
-            return _identity(os.stat(name, dir_fd=self._fd, follow_symlinks=False)) == _identity(file)
-        except OSError:
-            return False
+        return _is_at(name, file, self._fd)
 
     def refuse_second_writer(self, name: str) -> None:
         """Raise ServerError if another daemon of this user or of root writes the ring `name`. `make` replaces any other
@@ -255,8 +249,13 @@ def _credible(status: os.stat_result) -> bool:
     return stat.S_ISREG(status.st_mode) and status.st_uid in (0, os.geteuid())
 
 
-def _identity(status: os.stat_result) -> tuple[int, int]:
-    return status.st_dev, status.st_ino
+def _is_at(path: str, known: os.stat_result, directory: int | None = None) -> bool:
+    """Return whether `path`, relative to a descriptor, is the file or directory `known`, and not a link to it."""
+    try:
+        found = os.lstat(path, dir_fd=directory)
+    except OSError:
+        return False
+    return found.st_ino == known.st_ino and found.st_dev == known.st_dev
 
 
 def _lock(descriptor: int) -> None:
@@ -291,7 +290,8 @@ class ShmRing:
     def __init__(self, directory: RingDirectory, header: RingHeader, mode: int, group_id: int | None) -> None:
         """Create the complete file in `directory`. Raises ServerError."""
         self._directory = directory
-        self._name = ring_path(directory.path, header.device).name
+        path = ring_path(directory.path, header.device)
+        self._path, self._name = str(path), path.name
         self._size_bytes = HEADER_BYTES + header.slot_count * SLOT_BYTES
         self._fd = directory.make(self._name, self._size_bytes, encode_header(header), mode, group_id)
         self._status = os.fstat(self._fd)
@@ -372,9 +372,9 @@ class ShmRing:
         self._memory[_LEDGER_PAYLOAD] = block[8:]
         self._words[LEDGER_UPDATE_WORD] = self._update
 
-    def is_intact(self, directory: RingDirectory) -> bool:
-        """Return whether the file has its size and its name in `directory`."""
-        return self._is_whole() and self.is_named(directory)
+    def is_intact(self) -> bool:
+        """Return whether the file has its size, and readers find it at its path."""
+        return self._is_whole() and _is_at(self._path, self._status)
 
     def is_named(self, directory: RingDirectory) -> bool:
         """Return whether the file has its name in `directory`."""
@@ -518,11 +518,10 @@ class ShmPublisher:
         """Write heartbeats. Once per second, create missing or truncated rings again, and write ledgers."""
         if now_ns >= self._check_ns:
             self._check_ns = now_ns + CHECK_NS
-            directory = self._current_directory()
             for name in self._places:
                 ring = self._rings.get(name)
-                if ring is None or not ring.is_intact(directory):
-                    self._replace(name, directory, now_ns)
+                if ring is None or not ring.is_intact():
+                    self._replace(name, self._current_directory(), now_ns)
             self._show_ledgers()
         self._beat(now_ns)
 

@@ -340,7 +340,7 @@ def test_heartbeat_ledger_and_reopen(board: Board, ring: Ring, monkeypatch: pyte
     ("at", "data"),
     [
         (0, b"\xff" * 8), (8, b"X"), (40, b"\1"), (0, struct.pack("<Q", 2)), (512, b"\0\0\0\0"),
-        (0, encode_ledger_block(SEQ_INVALID, "", [])),
+        (0, encode_ledger_block(SEQ_INVALID, "", [0] * 24)),
     ],
 )  # fmt: skip
 def test_torn_ledger_is_refused(board: Board, ring: Ring, at: int, data: bytes) -> None:

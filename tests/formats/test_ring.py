@@ -81,7 +81,7 @@ def test_ledger_block_also_of_a_writer_with_other_counters() -> None:
     block = ring.decode_ledger_block(ring.encode_ledger_block(1, "", tuple(LEDGER.values())), ring.LEDGER_ROOM)
     assert block is not None
     assert block.ledger == LEDGER
-    block = ring.decode_ledger_block(ring.encode_ledger_block(1, "d" * 40, [5]), 1)
+    block = ring.decode_ledger_block(ring.encode_ledger_block(1, "d" * 40, [5] * 24), 1)
     assert block is not None
     assert (block.driver, block.ledger) == ("d" * 31, {"bytes_in": 5})
 

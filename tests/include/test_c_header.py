@@ -343,7 +343,7 @@ def test_ledger(board: Board, reader: Reader) -> None:
     assert reader.ask("ledger") == expected
     board.poke(shm_layout.LEDGER_BLOCK_OFFSET + 100, b"\1")
     assert reader.ask("ledger") == ["ledger", "0"]
-    board.poke(shm_layout.LEDGER_BLOCK_OFFSET, shm_layout.encode_ledger_block(SEQ_INVALID, "", []))
+    board.poke(shm_layout.LEDGER_BLOCK_OFFSET, shm_layout.encode_ledger_block(SEQ_INVALID, "", [0] * 24))
     assert reader.ask("ledger") == ["ledger", "0"]
 
 
