@@ -23,7 +23,7 @@ from typing import Final
 from imud import __version__
 from imud import config as configuration
 from imud.config.model import Config, DeviceConfig
-from imud.contracts.condition import summary
+from imud.contracts.condition import Condition, summary
 from imud.contracts.lines import LineFactory
 from imud.contracts.publisher import (
     DeviceControl,
@@ -187,6 +187,8 @@ class Daemon:
         self._is_soon = False  # whether the next tick follows after TICK_S
         self._failure: BaseException | None = None
         self._manager = ServiceManager()
+        self._conditions: dict[str, Condition] | None = None  # conditions of the devices at the last status line
+        self._summary_line = ""
         self._signals: list[int] = []  # signals with a handler of this daemon
 
     # --- life ------------------------------------------------------------------------------------------------------
@@ -397,7 +399,10 @@ class Daemon:
         self._alarm.set(TICK_S if self._is_soon else QUIET_TICK_S)
 
     def _status_line(self) -> str:
-        return summary({name: device.condition for name, device in self._devices.items()})
+        conditions = {name: device.condition for name, device in self._devices.items()}
+        if conditions != self._conditions:
+            self._conditions, self._summary_line = conditions, summary(conditions)
+        return self._summary_line
 
     async def _close(self) -> None:
         if self._reloader is not None:

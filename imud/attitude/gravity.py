@@ -62,10 +62,7 @@ class GravityCheck:
         self._device = device
         self._mounting = mounting
         self._seq = 0
-        self._begin_ns = self._last_ns = 0
-        self._count = 0
-        self._accel: Vector3 = (0.0, 0.0, 0.0)
-        self._up: dict[str, Vector3] = {}  # sum of the directions of up, by the member of the sample
+        self._window: list[Sample] = []  # samples at rest, without a break
 
     def add(self, sample: Sample) -> bool:
         """Add a sample. Return whether it completed a window, so that `finding` is new."""
@@ -73,30 +70,26 @@ class GravityCheck:
         if sample.seq == self._seq or accel is None or gyro is None:
             return False
         self._seq = sample.seq
+        window = self._window
         at_rest = hypot(*gyro) <= REST_RAD_S and abs(hypot(*accel) - STANDARD_GRAVITY_M_S2) <= REST_M_S2
-        if not at_rest or not self._count or sample.t_ns - self._last_ns > BREAK_NS:
-            self._begin(sample.t_ns)
-        self._last_ns = sample.t_ns
+        if window and (not at_rest or sample.t_ns - window[-1].t_ns > BREAK_NS):
+            window.clear()
         if not at_rest:
             return False
-        self._count += 1
-        self._accel = _sum(self._accel, accel)
-        for name, up in _directions(self._device, sample):
-            self._up[name] = _sum(self._up.get(name, (0.0, 0.0, 0.0)), up)
-        if sample.t_ns - self._begin_ns < WINDOW_NS or self._count < SAMPLES_MIN:
+        window.append(sample)
+        if sample.t_ns - window[0].t_ns < WINDOW_NS or len(window) < SAMPLES_MIN:
             return False
         self.finding = self._judge()
-        self._begin(sample.t_ns)
+        window.clear()
         return True
 
-    def _begin(self, t_ns: int) -> None:
-        self._begin_ns, self._count = t_ns, 0
-        self._accel, self._up = (0.0, 0.0, 0.0), {}
-
     def _judge(self) -> Finding | None:
-        gravity = _unit(self._accel)
-        for name, total in self._up.items():
-            up = _unit(total)
+        """Compare the mean acceleration with the attitude in the middle of the window, also in a slow rotation."""
+        window = self._window
+        accelerations = [sample.accel_m_s2 for sample in window if sample.accel_m_s2 is not None]
+        x, y, z = map(sum, zip(*accelerations, strict=True))
+        gravity = _unit((x, y, z))
+        for name, up in _directions(self._device, window[len(window) // 2]):
             if _angle_deg(gravity, up) > CONTRADICTION_DEG:
                 return _explained(self._device, name, gravity, up)
         if self._mounting is not None and matrix_times(self._mounting, gravity)[2] < cos_deg(LEVEL_DEG):
@@ -217,10 +210,6 @@ def axis_words(direction: Vector3) -> str:
     if name is not None and dot(AXES[name], direction) > cos_deg(EXPLAINED_DEG):
         return name if name.startswith("-") else f"+{name}"
     return f"({x:+.2f}, {y:+.2f}, {z:+.2f})"
-
-
-def _sum(a: Vector3, b: Vector3) -> Vector3:
-    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
 def _unit(v: Vector3) -> Vector3:

@@ -300,10 +300,11 @@ class CanTransport(ReceivingTransport):
 
     def set_latency(self, latency_ns: int) -> None:
         self._latency_ns = latency_ns
-        self.on_busy(self.scripts.busy)
+        self.on_busy(self.busy)
 
     def on_busy(self, busy: bool) -> None:
         """Hold no frames while a request waits for a reply, or during a search."""
+        self.busy = busy
         self.link.gather_ns = 0 if busy or self._round is not None else self._latency_ns
 
     @property

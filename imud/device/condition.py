@@ -27,7 +27,7 @@ from imud.contracts.condition import (
 )
 from imud.contracts.setting import SettingDifference, SettingsState, SettingsStatus, title_of, value_text
 from imud.contracts.status import DeviceState, FrameProblem, LinesStatus, RecentStatus
-from imud.device.health import NO_SAMPLE, SEARCH_BEGUN, DeviceEvents
+from imud.device.health import NO_SAMPLE, RUNNING, SEARCH_BEGUN, DeviceEvents
 from imud.links.serial_port import list_ports
 from imud.model.event import EventKind
 from imud.model.ledger import LOST_FIELDS, Ledger, counters_of
@@ -73,14 +73,12 @@ LOSSES: Final[Mapping[str, LossCause]] = {
 }  # fmt: skip
 
 
-class Facts(msgspec.Struct, kw_only=True):
-    """Facts of a device at one moment that its condition depends on. The properties are words for sentences."""
+class Known(msgspec.Struct):
+    """Facts of a device that rarely change. The rules run again if one of them changes."""
 
-    now_ns: int
     state: DeviceState
     problem: str
-    place: ConfiguredPort
-    recent: RecentStatus
+    resets: int = 0  # number of restarts of the device since the start of imud that imud did not request
     is_polled: bool = False
     declared: SettingsStatus | None = None  # None if the settings cannot cause a reason
     axes: FrameProblem | None = None  # kind of the contradiction in axes, angles or heading
@@ -90,6 +88,14 @@ class Facts(msgspec.Struct, kw_only=True):
     utc_problem: str = ""
     open_bytes: int = 0  # bytes and frames that the ledger does not account for
     open_frames: int = 0
+
+
+class Facts(Known, kw_only=True):
+    """Facts of a device at one moment that its condition depends on. The properties are words for sentences."""
+
+    now_ns: int
+    place: ConfiguredPort
+    recent: RecentStatus
     rate_hz: float | None = None  # as in `RecentStatus`
     expected_rate_hz: float = 0.0
     t_err_ns: int = 0  # 0 if the time stamp error has no limit
@@ -235,16 +241,20 @@ def _lost(facts: Facts, _name: str, _value: Any) -> str:
 
 
 RATE_WINDOW_NS: Final = 10 * NS_PER_S  # time over which imud measures the rate, ns
+RATE_SECONDS: Final = RATE_WINDOW_NS // NS_PER_S + 1  # number of counts in this time
 SHORT_NS: Final = 2 * NS_PER_S  # time of the rate in the status, ns: two samples of a device at 1 Hz
 RATE_SAMPLES: Final = 2  # deviation that the start and the end of the window can cause, samples
 
 
-def _has_other_rate(facts: Facts, limits: ConditionLimits) -> bool:
-    rate_hz, expected_hz = facts.rate_hz, facts.expected_rate_hz
+def _is_other_rate(rate_hz: float | None, expected_hz: float, limits: ConditionLimits) -> bool:
     if rate_hz is None or not expected_hz:
         return False
     tolerance_hz = max(limits.rate_percent / 100 * expected_hz, RATE_SAMPLES * NS_PER_S / RATE_WINDOW_NS)
     return abs(rate_hz - expected_hz) > tolerance_hz
+
+
+def _is_inexact(t_err_ns: int, limits: ConditionLimits) -> bool:
+    return limits.t_err_ms is not None and t_err_ns / NS_PER_MS > limits.t_err_ms
 
 
 def _rate(facts: Facts, _name: str, _value: Any) -> str:
@@ -320,12 +330,12 @@ RULES: Final = (
         DOCTOR,
     ),
     Rule(
-        ReasonCode.RATE, Section.SETTINGS, _has_other_rate, _rate,
+        ReasonCode.RATE, Section.SETTINGS,
+        lambda f, limits: _is_other_rate(f.rate_hz, f.expected_rate_hz, limits), _rate,
         "Compare the output rate in the settings of the device with its bit rate.",
     ),
     Rule(
-        ReasonCode.TIME_ERROR, Section.TIME,
-        lambda f, limits: limits.t_err_ms is not None and f.t_err_ns / NS_PER_MS > limits.t_err_ms,
+        ReasonCode.TIME_ERROR, Section.TIME, lambda f, limits: _is_inexact(f.t_err_ns, limits),
         lambda f, *_: f"The time stamp error is ±{f.t_err_ns / NS_PER_MS:.2g} ms.",
         "Connect SOUT, or reduce the latency timer.",
     ),
@@ -343,10 +353,6 @@ RULES: Final = (
 )  # fmt: skip
 
 
-NUMBER_RULES: Final = tuple(rule for rule in RULES if rule.code in (ReasonCode.RATE, ReasonCode.TIME_ERROR))
-"""Rules for facts that change in each second."""
-
-
 # --- counts of the last minute ----------------------------------------------------------------------------------------
 
 _LOST: Final = counters_of(LOST_FIELDS)
@@ -355,20 +361,12 @@ HOUR_NS: Final = 60 * MINUTE_NS
 STEADY: Final = 0.01  # maximum change of the expected rate within the window of a rate, as a share
 RESTARTS_MAX: Final = 60  # maximum number of stored restarts, as in `ConditionLimits.restarts`
 _Lost = tuple[int, ...]  # in the order of CAUSES
+_Second = tuple[int, int, int, _Lost]  # CLOCK_MONOTONIC, ns, and the counters `samples`, `bytes_in` and of lost samples
 
 
 def _by_cause(before: _Lost, after: _Lost) -> dict[str, int]:
     """Return the numbers of samples lost between two counts, without causes with no loss."""
-    if before == after:
-        return {}
     return {name: now - then for name, then, now in zip(CAUSES, before, after, strict=True) if now > then}
-
-
-class _Second(NamedTuple):
-    t_ns: int
-    samples: int
-    bytes_in: int
-    lost: _Lost
 
 
 class RecentCounts:
@@ -379,79 +377,75 @@ class RecentCounts:
         self._ledger = ledger
         self._begun_ns = begun_ns
         self._timed = timed
-        self._seconds: deque[_Second] = deque([self._present(begun_ns)], maxlen=64)
-        self._steady: deque[_Second] = deque()  # seconds with the same expected rate and without a gap of unknown size
-        self._steady_hz = 0.0  # expected rate at the start of `_steady`
+        self._seconds: deque[_Second] = deque([(begun_ns, ledger.samples, ledger.bytes_in, _LOST(ledger))], maxlen=64)
+        # CLOCK_MONOTONIC since which the expected rate is the same, without a gap of unknown size
+        self._steady_ns = begun_ns
+        self._steady_hz = 0.0  # expected rate at this time; 0.0 while the rate is not known
         self._restarts: deque[int] = deque(maxlen=RESTARTS_MAX)
         self._resets = 0
         self._loss: dict[str, int] = {}  # number of samples in the last loss by cause
         self._loss_ns = 0
 
-    def _present(self, now_ns: int) -> _Second:
-        ledger = self._ledger
-        return _Second(now_ns, ledger.samples, ledger.bytes_in, _LOST(ledger))
-
-    def add(self, now_ns: int, rate_hz: float, resets: int) -> None:
-        """Add the present counts. `rate_hz`: expected rate, 0 if the device does not run; `resets`: own restarts."""
-        second, seconds, steady = self._present(now_ns), self._seconds, self._steady
-        if lost := _by_cause(seconds[-1].lost, second.lost):
-            self._loss = {} if now_ns - self._loss_ns > MINUTE_NS else self._loss
-            self._loss_ns = now_ns
-            for name, count in lost.items():
-                self._loss[name] = self._loss.get(name, 0) + count
-        seconds.append(second)
-        _forget(seconds, now_ns - MINUTE_NS)
-        if abs(rate_hz - self._steady_hz) > STEADY * self._steady_hz or "unknown" in lost:
-            steady.clear()
-            self._steady_hz = rate_hz
-        if rate_hz and self._timed:
-            steady.append(second)
-            _forget(steady, now_ns - RATE_WINDOW_NS)
+    def add(self, now_ns: int, rate_hz: float, resets: int) -> bool:
+        """Add the present counts. Return whether samples were lost in the last minute. `rate_hz`: expected rate, 0 if
+        the device does not run; `resets`: own restarts."""
+        ledger, seconds = self._ledger, self._seconds
+        lost, before = _LOST(ledger), seconds[-1][3]
+        if lost != before:
+            self._add_loss(now_ns, _by_cause(before, lost))
+        seconds.append((now_ns, ledger.samples, ledger.bytes_in, lost))
+        while seconds[1][0] <= now_ns - MINUTE_NS:  # one count remains before the minute
+            seconds.popleft()
+        if abs(rate_hz - self._steady_hz) > STEADY * self._steady_hz:
+            self._steady_ns, self._steady_hz = now_ns, rate_hz
         if resets != self._resets or self._restarts:
             self._restarts.extend([now_ns] * min(max(resets - self._resets, 0), RESTARTS_MAX))
             self._resets = resets
             while self._restarts and self._restarts[0] <= now_ns - HOUR_NS:
                 self._restarts.popleft()
+        return seconds[0][3] != lost
+
+    def _add_loss(self, now_ns: int, lost: Mapping[str, int]) -> None:
+        """Add a loss to the last loss, or start the next loss."""
+        self._loss = {} if now_ns - self._loss_ns > MINUTE_NS else self._loss
+        self._loss_ns = now_ns
+        for name, count in lost.items():
+            self._loss[name] = self._loss.get(name, 0) + count
+        if "unknown" in lost:
+            self._steady_ns = now_ns
 
     def status(self, last_sample_ns: int) -> RecentStatus:
         """Return the counts."""
-        first, last = self._seconds[0], self._seconds[-1]
-        causes = _by_cause(first.lost, last.lost)
+        (_, samples, bytes_in, before), last = self._seconds[0], self._seconds[-1]
+        causes = _by_cause(before, last[3])
         gaps = causes.pop("unknown", 0)
         known = dict(self._loss)
         known.pop("unknown", 0)
         return RecentStatus(
-            self._begun_ns, self.steady_rate_hz(), last.samples - first.samples, causes, gaps,
-            last.bytes_in - first.bytes_in, len(self._restarts), last_sample_ns, self._loss_ns,
+            self._begun_ns, self.steady_rate_hz(), last[1] - samples, causes, gaps,
+            last[2] - bytes_in, len(self._restarts), last_sample_ns, self._loss_ns,
             sum(known.values()), max(known, key=lambda name: known[name], default=""),
         )  # fmt: skip
 
-    @property
-    def has_losses(self) -> bool:
-        """Whether samples were lost in the last minute."""
-        return self._seconds[0].lost != self._seconds[-1].lost
-
     def rate_hz(self) -> float:
         """Return the rate of received samples over the last SHORT_NS; 0.0 without two counts."""
-        last = self._seconds[-1]
-        first = next((one for one in reversed(self._seconds) if one.t_ns <= last.t_ns - SHORT_NS), self._seconds[0])
-        span_ns = last.t_ns - first.t_ns
-        return (last.samples - first.samples) * NS_PER_S / span_ns if span_ns > 0 else 0.0
+        now_ns, count, *_ = self._seconds[-1]
+        first = next((one for one in reversed(self._seconds) if one[0] <= now_ns - SHORT_NS), self._seconds[0])
+        span_ns = now_ns - first[0]
+        return (count - first[1]) * NS_PER_S / span_ns if span_ns > 0 else 0.0
 
     def steady_rate_hz(self) -> float | None:
         """Return the rate of received and lost samples; None without a steady rate or after a gap of unknown size."""
-        steady = self._steady
-        if not steady or (span_ns := steady[-1].t_ns - steady[0].t_ns) < RATE_WINDOW_NS:
-            return None
-        first, last = steady[0], steady[-1]
-        lost = sum(last.lost) - sum(first.lost) if last.lost != first.lost else 0
-        return (last.samples - first.samples + lost) * NS_PER_S / span_ns
-
-
-def _forget(seconds: deque[_Second], before_ns: int) -> None:
-    """Remove old seconds. Keep one second before the window."""
-    while len(seconds) > 2 and seconds[1].t_ns <= before_ns:
-        seconds.popleft()
+        seconds = self._seconds
+        if self._steady_hz and self._timed and len(seconds) > RATE_SECONDS:
+            now_ns, samples, _, lost = seconds[-1]
+            begin_ns, samples_before, _, lost_before = seconds[-RATE_SECONDS]
+            if now_ns - begin_ns < RATE_WINDOW_NS:  # a second can be 50 ms shorter
+                begin_ns, samples_before, _, lost_before = seconds[-RATE_SECONDS - 1]
+            if begin_ns >= self._steady_ns and now_ns - begin_ns >= RATE_WINDOW_NS:
+                lost_now = 0 if lost == lost_before else sum(lost) - sum(lost_before)
+                return (samples - samples_before + lost_now) * NS_PER_S / (now_ns - begin_ns)
+        return None
 
 
 # --- hysteresis -------------------------------------------------------------------------------------------------------
@@ -471,20 +465,19 @@ class ConditionWatch:
         self._missing_ns: int | None = None  # CLOCK_MONOTONIC since which no samples arrive; None while they arrive
         self._found = False  # whether the device was running since start
         self._minute = 0
+        self.minute_end_ns = 0  # CLOCK_MONOTONIC of the next minute of the history
         self._history: deque[Condition | None] = deque([None] * HISTORY_MINUTES, maxlen=HISTORY_MINUTES)
         self._since_ns = now_ns
         self._counted: Sequence[Cause] = ()
         self.level = Condition.MISSING
+        self.is_ok = (
+            False  # whether no reason counts, no cause of a reason exists or ended recently, and samples arrive
+        )
 
     @property
     def condition(self) -> DeviceCondition:
         """Present condition with its sentences."""
         return DeviceCondition(self.level, self._since_ns, tuple(cause.reason() for cause in self._counted))
-
-    @property
-    def is_ok(self) -> bool:
-        """Whether no reason counts, no cause of a reason exists or ended a short time ago, and samples arrive."""
-        return self.level is Condition.OK and not self._causes and self._missing_ns is None
 
     @property
     def history(self) -> tuple[Condition | None, ...]:
@@ -503,6 +496,7 @@ class ConditionWatch:
         self._counted, level = counted, condition_of(counted[0].rule.code)
         if level is not self.level:
             self._since_ns, self.level = now_ns, level
+        self.is_ok = level is Condition.OK and not self._causes and self._missing_ns is None
         self.remember(now_ns)
         if before and _keys(before) != _keys(counted):
             condition = self.condition
@@ -535,7 +529,7 @@ class ConditionWatch:
         minute, history, level = now_ns // MINUTE_NS, self._history, self.level
         if minute != self._minute:
             history.extend([None] * min(minute - self._minute, HISTORY_MINUTES))
-            self._minute = minute
+            self._minute, self.minute_end_ns = minute, (minute + 1) * MINUTE_NS
         known = history[-1]
         if known is not level:
             history[-1] = level if known is None else min(known, level, key=lambda one: _ORDER[one])
@@ -564,35 +558,33 @@ class ConditionJudge:
         self.due_ns = now_ns  # CLOCK_MONOTONIC of the next update: once per second
         self.state: DeviceState | None = None  # state of the device at the last update
         self._facts: Facts | None = None
-        self._seen: tuple[int, Mapping[str, Any]] = 0, {}  # arguments `resets` and `known` of the last `judge`
+        self._known: Known | None = None  # argument of the last `judge`
 
-    def judge(
-        self, now_ns: int, rate_hz: float, t_err_ns: int, last_sample_ns: int, resets: int, known: Mapping[str, Any]
-    ) -> bool:
+    def judge(self, now_ns: int, rate_hz: float, t_err_ns: int, last_sample_ns: int, known: Known) -> bool:
         """Update the counts and the condition. Return whether the rules ran: they give the same result for the same
-        facts. `rate_hz`: expected rate; `resets`: own restarts; `known`: fields of `Facts` that are not numbers."""
-        self.due_ns, self.state, counts = now_ns + JUDGE_NS, known["state"], self.counts
-        counts.add(now_ns, rate_hz if self.state is DeviceState.RUNNING else 0.0, resets)
-        is_same, self._seen = self._seen == (resets, known), (resets, known)
-        if is_same and not counts.has_losses and self.watch.is_ok and self._has_good_numbers(now_ns, rate_hz, t_err_ns):
-            self.watch.remember(now_ns)
+        facts. `rate_hz`: expected rate."""
+        self.due_ns, self.state, counts, watch = now_ns + JUDGE_NS, known.state, self.counts, self.watch
+        has_losses = counts.add(now_ns, rate_hz if known.state is RUNNING else 0.0, known.resets)
+        is_same, self._known = known == self._known, known
+        if (
+            is_same
+            and watch.is_ok
+            and not has_losses
+            and not _is_other_rate(counts.steady_rate_hz(), rate_hz, self._limits)
+            and not _is_inexact(t_err_ns, self._limits)
+            and self._facts is not None
+        ):
+            self._facts.now_ns = now_ns  # for the sentences
+            if now_ns >= watch.minute_end_ns:
+                watch.remember(now_ns)
             return False
         recent = counts.status(last_sample_ns)
         self._facts = facts = Facts(
-            now_ns=now_ns, place=self.place, recent=recent, rate_hz=recent.rate_hz, expected_rate_hz=rate_hz,
-            t_err_ns=t_err_ns, **known,
+            *msgspec.structs.astuple(known), now_ns=now_ns, place=self.place, recent=recent, rate_hz=recent.rate_hz,
+            expected_rate_hz=rate_hz, t_err_ns=t_err_ns,
         )  # fmt: skip
-        self.watch.update(now_ns, causes_of(facts, self._limits))
+        watch.update(now_ns, causes_of(facts, self._limits))
         return True
-
-    def _has_good_numbers(self, now_ns: int, rate_hz: float, t_err_ns: int) -> bool:
-        """Update the numbers and the time of the facts. Return whether no rule for numbers holds."""
-        facts = self._facts
-        if facts is None:
-            return False
-        facts.now_ns, facts.rate_hz = now_ns, self.counts.steady_rate_hz()
-        facts.expected_rate_hz, facts.t_err_ns = rate_hz, t_err_ns
-        return not any(rule.holds(facts, self._limits) for rule in NUMBER_RULES)
 
 
 def _serial_ports() -> Sequence[str]:

@@ -35,10 +35,10 @@ from imud.contracts.publisher import PutRecord
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
 from imud.device.attachments import Attachments
 from imud.device.calibration import CalibrationRun, RestWindow, check
-from imud.device.condition import ConditionJudge
+from imud.device.condition import ConditionJudge, Known
 from imud.device.evidence import STEP_S
 from imud.device.flash import SettingsFiles
-from imud.device.health import NO_SAMPLE, DeviceEvents, Health
+from imud.device.health import NO_SAMPLE, RUNNING, DeviceEvents, Health
 from imud.device.latency import Need
 from imud.device.settings import DeviceSettings, identity_words
 from imud.device.settings_plan import Values, as_json, setting_instead
@@ -277,37 +277,44 @@ class Device:
     def tick(self, now_ns: int) -> None:
         """Update the state, detect an idle link, and send collected events. Called twice per second, and ten times per
         second while `_needs_ticks`. The other work is due once per second."""
-        transport, path = self._transport, self._transport.path
-        needs_ticks, is_due = self._needs_ticks(), now_ns >= self._judge.due_ns
+        transport, health, judge, path = self._transport, self._health, self._judge, self._transport.path
+        needs_ticks, is_due = self._needs_ticks(), now_ns >= judge.due_ns
         if needs_ticks:
             self._shared.owner.tick_soon()
-        if needs_ticks or is_due:  # only watches of a command and of GPIO lines use the sample
-            self._attachments.tick(now_ns, path.newest if needs_ticks and path is not None else None)
+            self._attachments.tick(now_ns, path.newest if path is not None else None)
+        elif is_due:  # the other attachments wait for a command, or have a line and need ticks
+            self.settings.tick(now_ns, None)
         transport.tick(now_ns)
-        if path is not None:
-            self._tick_path(path, now_ns)
-            if is_due:
-                self._attitude.tick(now_ns, path)
-        if is_due or self._health.state is not self._judge.state:
+        if path is not None and (
+            now_ns - path.last_sample_ns > IDLE_FLUSH_NS
+            or health.state is not RUNNING
+            or self._suspends != self._host.suspends
+        ):
+            self._tick_flow(path, now_ns)
+        if path is not None and (needs_ticks or is_due):
+            self._status.tick(now_ns, transport.driver, path)
+            self._events.tick(now_ns, path.quality[0])
+            self._attitude.tick(now_ns, path)
+        if is_due or health.state is not judge.state:
             self._judge_condition(now_ns)
 
     def _judge_condition(self, now_ns: int) -> None:
         """Update the condition from the facts that it depends on."""
-        transport, settings, path = self._transport, self.settings, self._transport.path
-        self._is_slow = path is None or not 0 < path.period_ns <= IDLE_FLUSH_NS
+        transport, settings, health, path = self._transport, self.settings, self._health, self._transport.path
+        rate_hz, attachments, ledger = transport.expected_rate_hz, self._attachments, self.ledger
+        self._is_slow = rate_hz * IDLE_FLUSH_NS < NS_PER_S
         has_settings = bool(settings.declared or settings.is_unsaved or settings.comparison.problem)
         axes, axes_problem = self._attitude.problem(transport.driver, settings, transport.axes_problem)
         t_err_ns, last_ns = (path.quality[1], path.last_sample_ns) if path is not None else (0, 0)
-        resets = settings.counter_resets - settings.resets_requested
-        self._judge.judge(now_ns, transport.expected_rate_hz, t_err_ns, last_ns, resets, {
-            "state": self._health.state, "problem": self._health.problem, "is_polled": transport.is_polled,
-            "declared": settings.status() if has_settings else None, "axes": axes, "axes_problem": axes_problem,
-            "lines": transport.add_lines(self._attachments.lines_status()), "open_bytes": self.ledger.bytes_open(),
-            "has_scattered_time": path is not None and path.clock.has_scattered_time,
-            "utc_problem": self._attachments.utc_problem, "open_frames": self.ledger.frames_open(),
-        })  # fmt: skip
+        self._judge.judge(now_ns, rate_hz, t_err_ns, last_ns, Known(
+            health.state, health.problem, settings.resets - settings.resets_requested, transport.is_polled,
+            settings.status() if has_settings else None, axes, axes_problem,
+            transport.add_lines(attachments.lines_status()), path is not None and path.clock.has_scattered_time,
+            attachments.utc_problem, ledger.bytes_open(), ledger.frames_open(),
+        ))  # fmt: skip
 
-    def _tick_path(self, path: SamplePath, now_ns: int) -> None:
+    def _tick_flow(self, path: SamplePath, now_ns: int) -> None:
+        """Flush an idle link, and detect silence and the first sample. Not necessary while recent samples arrive."""
         transport = self._transport
         if self._suspends != self._host.suspends:
             self._suspends = self._host.suspends
@@ -317,8 +324,6 @@ class Device:
             path.flush(now_ns)
         if transport.receiving:
             self._watch_flow(path, now_ns)
-        self._status.tick(now_ns, transport.driver, path)
-        self._events.tick(now_ns, path.quality[0])
 
     @property
     def condition(self) -> Condition:
@@ -326,12 +331,14 @@ class Device:
 
     def _needs_ticks(self) -> bool:
         """Return whether the device needs ten ticks per second."""
-        state, path = self._health.state, self._transport.path
-        if self._attachments.needs_ticks or self._transport.busy or self.settings.lock.busy:
-            return True
-        if state is not DeviceState.RUNNING or path is None:
-            return state in WATCHED
-        return self._is_slow  # `flush` must complete the samples of a slow device
+        state, settings = self._health.state, self.settings
+        return (
+            self._attachments.needs_ticks
+            or self._transport.busy
+            or settings.lock.work is not None
+            # `flush` must complete the samples of a slow device
+            or (self._is_slow if state is RUNNING else state in WATCHED)
+        )
 
     def close(self) -> None:
         """Release the link. A second call does nothing."""
@@ -452,6 +459,7 @@ class Device:
                 self.settings.spend_flash()
             result = None
             try:
+                self._calibration.tick(self._host.now_ns(), None)  # no tick in a quiet state
                 result = await self._calibration.run(kind, calibration, save=save)
                 self._shared.files.flash.keep_calibration(self.settings.module, result)
             finally:

@@ -5,6 +5,7 @@ A lasting problem of the link (for example an error-passive CAN bus) stays in th
 
 import logging
 from collections.abc import Callable, Mapping
+from typing import Final
 
 from imud.contracts.codec import BadFrame, wrong_length_words
 from imud.contracts.status import DeviceState
@@ -116,6 +117,7 @@ NO_SAMPLE = "no sample for"
 """Start of the problem of a device that stopped sending."""
 SEARCH_BEGUN = "no sample has arrived yet; wait for the search"
 """Problem of a device right after imud has opened its link."""
+RUNNING: Final = DeviceState.RUNNING  # a name of its own, because Python 3.11 looks up members of an enum slowly
 STREAMING = (DeviceState.RUNNING, DeviceState.SILENT)
 
 

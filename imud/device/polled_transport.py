@@ -442,11 +442,6 @@ class PolledTransport(Transport):
         """False: imud can run scripts only after the identification, and samples follow immediately."""
         return False
 
-    @property
-    def busy(self) -> bool:
-        """False: scripts and reads alternate."""
-        return False
-
     def add_status(self, status: DeviceStatus) -> DeviceStatus:
         """Return `status` with the state of the reads."""
         return msgspec.structs.replace(status, polling=self._polling_status(), serial_line=self.link.serial_line())

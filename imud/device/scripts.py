@@ -32,6 +32,8 @@ T = TypeVar("T")
 class RequestPort(ABC):
     """Link of a device, as a script runner uses it."""
 
+    busy = False  # whether a request script is running
+
     @abstractmethod
     def write(self, data: bytes) -> None:
         """Send the bytes of a request. Raises CommandError or LinkError."""
@@ -48,8 +50,9 @@ class RequestPort(ABC):
         """Receive further CAN frames; empty: only frames of the device. Raises CommandError if there is no CAN bus."""
         raise CommandError(f"{request.name}: expected a CAN bus, to receive other devices, got another link")
 
-    def on_busy(self, busy: bool) -> None:  # noqa: B027  # most links have nothing to do
+    def on_busy(self, busy: bool) -> None:
         """Note that a script starts (True) or has ended (False)."""
+        self.busy = busy
 
 
 class _Owed:
@@ -109,11 +112,6 @@ class ScriptRunner:
         self.answered_ns = 0  # CLOCK_MONOTONIC of the newest complete reply; 0 before the first reply
         self.wants_samples = False
         """Whether a request waits for a measurement. An attribute, because the path reads it for each batch."""
-
-    @property
-    def busy(self) -> bool:
-        """Whether a script is running."""
-        return self._lock.locked()
 
     # --- a script ----------------------------------------------------------------------------------------------------
 

@@ -217,10 +217,6 @@ class WorkLock:
         self.can_restart = False  # whether this work can restart the device counter
         self.ended_ns = -OWN_NS - BOOT_NS  # CLOCK_MONOTONIC of the end of the last work that can restart it, ns
 
-    @property
-    def busy(self) -> bool:
-        return self._lock.locked()
-
     @asynccontextmanager
     async def hold(self, work: str, stop: str = "", *, can_restart: bool = True) -> AsyncIterator[None]:
         """Hold the lock for `work`, for example `the command save`. `stop`: how a user can stop it. `can_restart`:
@@ -272,7 +268,7 @@ class DeviceSettings:
         # resets of the device counter at the newest read of all reports if no other script followed; None otherwise
         self._read_resets: int | None = None
         self._clock: SampleClock | None = None
-        self._resets = 0  # resets of the device counter at the last tick
+        self.resets = 0  # resets of the device counter at the last tick
         self.resets_requested = 0  # number of restarts of the device counter that a script of imud caused
         self.lock = WorkLock(config.name, host)
         # values that imud wrote since the last restart, of settings that the device does not report
@@ -287,7 +283,7 @@ class DeviceSettings:
 
     def start(self, clock: SampleClock) -> None:
         """Note that the settings may differ: imud has found the device again, or another device."""
-        self._clock, self._resets = clock, clock.resets
+        self._clock, self.resets = clock, clock.resets
         self.is_current = False
         self._after_start(BEGIN_NS)
         if not self.declared:
@@ -296,18 +292,17 @@ class DeviceSettings:
 
     def tick(self, now_ns: int, _newest: Sample | None) -> None:
         """Detect a restart of the device counter. Start a comparison if one is due and the device can reply."""
-        busy = self.lock.busy
-        if (resets := self.counter_resets) != self._resets:
+        if (resets := self.counter_resets) != self.resets:
             own_until_ns = self.lock.ended_ns + OWN_NS
             is_own = self.lock.can_restart or now_ns < own_until_ns + BOOT_NS
-            self.resets_requested, self._resets = self.resets_requested + is_own * (resets - self._resets), resets
+            self.resets_requested, self.resets = self.resets_requested + is_own * (resets - self.resets), resets
             if not is_own:
                 self._in_flash.started()
             if not self.lock.can_restart and now_ns >= own_until_ns:
                 self._after_start(SETTLE_NS)
                 if not self.declared and (self._read_ns is None or not self._transport.may_ask):
                     self.comparison.cancel()  # imud has not read the settings, or must not
-        if not busy and self._transport.can_be_asked:
+        if self.comparison.due_ns is not None and self.lock.work is None and self._transport.can_be_asked:
             self.comparison.start_if_due(now_ns)
 
     def after_silence(self) -> None:
@@ -514,7 +509,7 @@ class DeviceSettings:
     def _mark_unsaved(self, before: Values | None) -> None:
         """Note that the flash does not contain the present settings. `before`: the values before the write."""
         if not self._unsaved:
-            self._unsaved, self._saved, self._resets = True, before, self.counter_resets
+            self._unsaved, self._saved, self.resets = True, before, self.counter_resets
         self._in_flash.follows = False
 
     def spend_flash(self) -> None:

@@ -12,7 +12,7 @@ from imud.contracts.script import Request, RequestScript
 from imud.contracts.setting import declared_values
 from imud.contracts.status import DeviceState
 from imud.device.latency import MOST_NS
-from imud.device.scripts import ScriptRunner
+from imud.device.scripts import RequestPort
 from imud.device.search import Remembered, RememberedDevice
 from imud.device.stream_search import StreamFound, StreamRound
 from imud.device.transport import (
@@ -49,12 +49,12 @@ class StreamHold:
     The bytes wait in the kernel: `link.pause` stops the reads, and `link.take` reads all bytes at the end of the hold.
     """
 
-    def __init__(self, link: StreamLink, path: StreamPath, scripts: ScriptRunner, host: HostClock) -> None:
+    def __init__(self, link: StreamLink, path: StreamPath, port: RequestPort, host: HostClock) -> None:
         self.latency_ns = 0  # maximum hold, ns; set by the transport
         self.hold_ns = 0  # present hold, ns
         self._link = link
         self._path = path
-        self._scripts = scripts
+        self._port = port
         self._host = host
         self._alarm = Alarm(self)
         self._paused_ns = 0  # CLOCK_MONOTONIC of the start of the hold
@@ -87,7 +87,7 @@ class StreamHold:
 
     def _allowed_ns(self) -> int:
         latency_ns, path = min(self.latency_ns, self._most_ns), self._path
-        if latency_ns < PERIODS_LEAST * path.period_ns or path.clock.utc_reference is not None or self._scripts.busy:
+        if latency_ns < PERIODS_LEAST * path.period_ns or path.clock.utc_reference is not None or self._port.busy:
             return 0
         return latency_ns
 
@@ -300,6 +300,7 @@ class StreamTransport(ReceivingTransport):
 
     def on_busy(self, busy: bool) -> None:
         """Release held samples when a script starts or ends: the reply must not wait."""
+        self.busy = busy
         self._hold.release()
 
     async def run_script(self, make: Callable[..., Any], *arguments: Any) -> Any:
@@ -330,7 +331,7 @@ class StreamTransport(ReceivingTransport):
         self._hold.release()
         self._receiver, self._hold = path, self._discard
         if latency_ns:
-            self._receiver = self._hold = StreamHold(self.link, path, self.scripts, self._host)
+            self._receiver = self._hold = StreamHold(self.link, path, self, self._host)
             self._hold.latency_ns = latency_ns
 
     def _on_data(self, data: bytes, t_rx_ns: int) -> None:

@@ -122,6 +122,7 @@ class Transport(SettingsPort):
     link: Link
     settings: DeviceSettings
     is_polled = False  # whether imud requests each sample
+    busy = False  # whether a request script is running; always False for a polled device: scripts and reads alternate
 
     def __init__(self, context: DeviceContext) -> None:
         self.samples = SampleWatch(self)
@@ -213,11 +214,6 @@ class Transport(SettingsPort):
     @abstractmethod
     def hears_replies(self) -> bool:
         """Whether the codec can receive replies before the first sample."""
-
-    @property
-    @abstractmethod
-    def busy(self) -> bool:
-        """Whether a request script is running."""
 
     @property
     @abstractmethod
@@ -345,10 +341,6 @@ class ReceivingTransport(Transport, RequestPort):
     def unanswered(self) -> bool:
         """Whether imud must query the identity again."""
         return self.may_ask and not self.settings.answered
-
-    @property
-    def busy(self) -> bool:
-        return self.scripts.busy
 
     @property
     def may_ask(self) -> bool:

@@ -137,11 +137,12 @@ class Outputs:
     def tick(self, now_ns: int) -> None:
         """Call `tick` of the outputs. Start failed outputs after their pause."""
         for name, publisher in self._ticked:
-            if self._running.get(name) is publisher:  # the failure of another output can end this output
-                try:
+            try:
+                # the failure of another output can end this output
+                if not self._failures or self._running.get(name) is publisher:
                     publisher.tick(now_ns)
-                except Exception as error:  # noqa: BLE001 - an internal error of one output
-                    self._fail(name, error)
+            except Exception as error:  # noqa: BLE001 - an internal error of one output
+                self._fail(name, error)
         if self._failures:
             for name, failure in list(self._failures.items()):
                 if name not in self._running and now_ns >= failure.due_ns:

@@ -334,8 +334,8 @@ class Judged:
         for _ in range(seconds):
             self.now_ns += S
             self.ledger.samples += samples
-            known = {"state": state, "problem": problem}
-            has_run = self.judge.judge(self.now_ns, 50.0, 0, self.now_ns, 0, known)
+            known = device_condition.Known(state, problem)
+            has_run = self.judge.judge(self.now_ns, 50.0, 0, self.now_ns, known)
         return not has_run
 
 

@@ -141,7 +141,7 @@ async def test_no_command_is_sent_during_a_search(device: LinkedDevice) -> None:
 @played(lambda: LinkedDevice(baud="auto", identify=False))
 async def test_a_search_ends_a_running_script(device: LinkedDevice, monkeypatch: pytest.MonkeyPatch) -> None:
     """A running script does not send at the rates of the search, even if the search does not wait for the script."""
-    monkeypatch.setattr(StreamTransport, "busy", property(lambda _transport: False))
+    monkeypatch.setattr(StreamTransport, "busy", property(lambda _transport: False, lambda *_: None))
     await device.until(lambda: len(device.samples) > 20)
     device.link.module_is_on = False
     acting = [asyncio.ensure_future(device.device.act("restart", {})) for _ in range(3)]

@@ -89,6 +89,8 @@ class Clients(ABC):
         self.pool = pool
         self.handle_line = handle_line
         self.connections: dict[int, ClientConnection] = {}  # the clients by number
+        # clients that need ticks: they have shut down their sending direction, or only send their queue
+        self.ending: dict[ClientConnection, None] = {}
         self.accepted = 0  # connections accepted since start; the number of the newest
         self.refused = 0
         self.evicted = 0  # clients disconnected because they exceeded a limit
@@ -178,19 +180,19 @@ class ClientConnection(Outbox, ScheduledClient):
             return
         self._drop_requests()
         self.finishing = True
+        self._clients.ending[self] = None
         if not self.waiting:
             self.close()
 
-    def tick(self) -> bool:
+    def tick(self) -> None:
         """Close the connection LINGER_TICKS after `finish`. Finish it after the last reply to a client that has shut
-        down its sending direction. Return whether the connection needs the next tick within 100 ms."""
+        down its sending direction."""
         if self._input_ended:
             self._finish_if_done()
         if self.finishing:
             self._linger_ticks -= 1
             if self._linger_ticks <= 0:
                 self.close()
-        return self._input_ended or self.finishing
 
     def close(self) -> None:
         """Close the connection immediately. A second call does nothing."""
@@ -345,6 +347,7 @@ class ClientConnection(Outbox, ScheduledClient):
             return
         if not data:
             self._input_ended, self._readable = True, False
+            self._clients.ending[self] = None
             self._finish_if_done()
             return
         self._readable = len(data) == RECV_BYTES

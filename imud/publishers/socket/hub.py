@@ -350,6 +350,7 @@ class Hub(Clients):
         """Remove a client and its subscriptions. Do nothing if it is unknown."""
         number = connection.number
         self.connections.pop(number, None)
+        self.ending.pop(connection, None)
         if number in self._subscriptions:
             self.unsubscribe(connection)
         self._events.pop(number, None)
@@ -377,12 +378,14 @@ class Hub(Clients):
         """Close clients whose time to read their queue is over, and check the recordings. Return whether a client needs
         the next tick within 100 ms."""
         needs_ticks = self.recordings.is_active and self.recordings.tick(now_ns)
-        for connection in list(self.connections.values()):
+        if not self.ending:
+            return needs_ticks
+        for connection in list(self.ending):
             try:
-                needs_ticks = connection.tick() or needs_ticks
+                connection.tick()
             except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
                 connection.on_failure(error)
-        return needs_ticks
+        return True
 
     def close(self) -> None:
         """Close every client and cancel running requests. A second call does nothing."""

@@ -88,6 +88,7 @@ class Listener:
         _check_free(path)
         _remove_leftovers(path)
         self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._name = os.fspath(path)
         self._file = path.with_name(f"{path.name}.{os.getpid()}")
         self._inode = (0, 0)
         try:
@@ -122,7 +123,7 @@ class Listener:
     def has_file(self) -> bool:
         """Return whether `path` still names the socket file of this listener."""
         try:
-            return _inode_of(self.path) == self._inode
+            return _inode_of(self._name) == self._inode
         except OSError:
             return False
 
@@ -140,8 +141,8 @@ class Listener:
         self.sock.close()
 
 
-def _inode_of(path: Path) -> tuple[int, int]:
-    found = path.lstat()
+def _inode_of(path: Path | str) -> tuple[int, int]:
+    found = os.lstat(path)
     return found.st_dev, found.st_ino
 
 
