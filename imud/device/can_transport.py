@@ -94,6 +94,7 @@ class CanTransport(ReceivingTransport):
     link: CanLink
     driver: CanDriver | None
     path: CanPath | None
+    has_ticks = True
 
     def __init__(self, context: DeviceContext, link: CanLink, buses: CanBuses, remembered: Remembered) -> None:
         """All devices of the daemon share `buses`. Raises LinkError if the configured driver is not for CAN."""

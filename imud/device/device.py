@@ -240,6 +240,7 @@ class Device:
         self._status = StatusWatch(self._events)
         self._judge = ConditionJudge(config, transport.link.title, self.ledger, self._events, host.now_ns())
         self._is_slow = True  # whether the sample period is longer than IDLE_FLUSH_NS, or not known
+        self._is_quick = False  # whether a tick can end immediately while samples arrive and no command runs
         self._connects = 0
         self._need = Need(0, "")
         self._ended: asyncio.Future[LinkError | None] | None = None
@@ -276,20 +277,20 @@ class Device:
 
     def tick(self, now_ns: int) -> None:
         """Update the state, detect an idle link, and send collected events. Called twice per second, and ten times per
-        second while `_needs_ticks`. The other work is due once per second."""
+        second while `_needs_ticks`. While samples arrive, the work is due once per second."""
         transport, health, judge, path = self._transport, self._health, self._judge, self._transport.path
-        needs_ticks, is_due = self._needs_ticks(), now_ns >= judge.due_ns
+        has_news = path is None or now_ns - path.last_sample_ns > IDLE_FLUSH_NS or health.state is not RUNNING
+        is_due = now_ns >= judge.due_ns
+        if self._is_quick and not (is_due or has_news or transport.busy or self.settings.lock.work is not None):
+            return
+        needs_ticks = self._needs_ticks()
         if needs_ticks:
             self._shared.owner.tick_soon()
             self._attachments.tick(now_ns, path.newest if path is not None else None)
         elif is_due:  # the other attachments wait for a command, or have a line and need ticks
             self.settings.tick(now_ns, None)
         transport.tick(now_ns)
-        if path is not None and (
-            now_ns - path.last_sample_ns > IDLE_FLUSH_NS
-            or health.state is not RUNNING
-            or self._suspends != self._host.suspends
-        ):
+        if path is not None and (has_news or self._suspends != self._host.suspends):
             self._tick_flow(path, now_ns)
         if path is not None and (needs_ticks or is_due):
             self._status.tick(now_ns, transport.driver, path)
@@ -303,9 +304,12 @@ class Device:
         transport, settings, health, path = self._transport, self.settings, self._health, self._transport.path
         rate_hz, attachments, ledger = transport.expected_rate_hz, self._attachments, self.ledger
         self._is_slow = rate_hz * IDLE_FLUSH_NS < NS_PER_S
+        self._is_quick = not (self._is_slow or attachments.needs_ticks or transport.has_ticks)
         has_settings = bool(settings.declared or settings.is_unsaved or settings.comparison.problem)
         axes, axes_problem = self._attitude.problem(transport.driver, settings, transport.axes_problem)
-        t_err_ns, last_ns = (path.quality[1], path.last_sample_ns) if path is not None else (0, 0)
+        t_err_ns, last_ns = 0, path.last_sample_ns if path is not None else 0
+        if path is not None and self.config.condition.t_err_ms is not None:
+            t_err_ns = path.quality[1]
         self._judge.judge(now_ns, rate_hz, t_err_ns, last_ns, Known(
             health.state, health.problem, settings.resets - settings.resets_requested, transport.is_polled,
             settings.status() if has_settings else None, axes, axes_problem,
@@ -331,14 +335,11 @@ class Device:
 
     def _needs_ticks(self) -> bool:
         """Return whether the device needs ten ticks per second."""
-        state, settings = self._health.state, self.settings
-        return (
-            self._attachments.needs_ticks
-            or self._transport.busy
-            or settings.lock.work is not None
-            # `flush` must complete the samples of a slow device
-            or (self._is_slow if state is RUNNING else state in WATCHED)
-        )
+        state = self._health.state
+        # `flush` must complete the samples of a slow device
+        if self._is_slow if state is RUNNING else state in WATCHED:
+            return True
+        return self._attachments.needs_ticks or self._transport.busy or self.settings.lock.work is not None
 
     def close(self) -> None:
         """Release the link. A second call does nothing."""

@@ -188,7 +188,7 @@ class PolledTransport(Transport):
     """Transport of one device on a polled bus. Synchronization: the loop's thread only."""
 
     link: PolledLink
-    is_polled = True
+    is_polled = has_ticks = True
     driver: PolledDriver | None
     path: PolledPath | None
 

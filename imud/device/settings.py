@@ -273,8 +273,8 @@ class DeviceSettings:
         self.lock = WorkLock(config.name, host)
         # values that imud wrote since the last restart, of settings that the device does not report
         self._written: dict[str, Any] = {}
-        self._unsaved = False  # whether a write since the last restart may be missing in flash
-        self._saved: Values | None = None  # while `_unsaved`: the values before the write; None if they are unknown
+        self.is_unsaved = False  # whether a write since the last restart may be missing in flash
+        self._saved: Values | None = None  # while `is_unsaved`: the values before the write; None if they are unknown
         self._in_flash = FlashValues()
         self._differing: Mapping[str, SettingDifference] = {}
         self.comparison = SettingsComparison(self, config, host)
@@ -307,7 +307,7 @@ class DeviceSettings:
 
     def after_silence(self) -> None:
         """Compare the settings of a device that has no counter: it can have restarted in the pause of its samples."""
-        driver, may_ask = self._transport.driver, bool(self.declared) or (self._unsaved and self._transport.may_ask)
+        driver, may_ask = self._transport.driver, bool(self.declared) or (self.is_unsaved and self._transport.may_ask)
         if driver is not None and driver.tick_ns == SAMPLE_COUNTER and may_ask:
             self._read_resets = None
             self.comparison.schedule(SETTLE_NS)
@@ -330,7 +330,7 @@ class DeviceSettings:
 
     def _after_start(self, after_ns: int) -> None:
         """Note that the device has the settings of its flash, and compare them after `after_ns`."""
-        self._differing, self._written, self._unsaved = {}, {}, False
+        self._differing, self._written, self.is_unsaved = {}, {}, False
         self._read_resets = None
         self.comparison.schedule(after_ns)
 
@@ -356,8 +356,8 @@ class DeviceSettings:
         self._read_ns = now_ns = self._host.now_ns()
         if self._in_flash.follows:
             self._in_flash.saved(self.values)
-        if self._unsaved and not own and before != self._saved == self.values:
-            self._unsaved = False  # a restart without a counter: the device has the values of its flash again
+        if self.is_unsaved and not own and before != self._saved == self.values:
+            self.is_unsaved = False  # a restart without a counter: the device has the values of its flash again
         text = printable_words(report.words)
         self.shown = printable_words(driver.shown_settings(text)) if driver is not None else text
         changed, texts = {}, []
@@ -423,7 +423,7 @@ class DeviceSettings:
         state = SettingsState.DIFFER if found else SettingsState.AGREE
         state = state if self.is_current else SettingsState.UNKNOWN
         not_reported = self.declared.keys() - self.values.keys()
-        is_known = self._unsaved and self.is_current and self._saved is not None
+        is_known = self.is_unsaved and self.is_current and self._saved is not None
         before, now = as_json(self._saved or {}), as_json(self.values if is_known else {})
         return SettingsStatus(
             state if self.declared else SettingsState.UNDECLARED,
@@ -433,7 +433,7 @@ class DeviceSettings:
             tuple(filter(not_reported.__contains__, table.table)) if self.is_current else (),
             self._read_ns, self.comparison.repairs,
             self._files.flash.record(self.module).writes, self._files.flash.writes_day(self.module),
-            self._unsaved and table.save is not None,
+            self.is_unsaved and table.save is not None,
             {name: one for name, one in now.items() if before.get(name) != one},
         )  # fmt: skip
 
@@ -463,7 +463,7 @@ class DeviceSettings:
             actual = await self.read()
             wanted = completed(table, wanted, actual)
             target, written = self._transport.target, self._all_written(table)
-            by_name, unsaved = given is not None, self._unsaved
+            by_name, unsaved = given is not None, self.is_unsaved
             return make_plan(table, target, wanted, actual, written, save=save, unsaved=unsaved, by_name=by_name)
 
     async def apply(self, given: Mapping[str, Any] | None, *, save: bool) -> AppliedSettings:
@@ -487,16 +487,11 @@ class DeviceSettings:
 
         `changed`: the settings can differ from the last values.
         """
-        self._unsaved = False
+        self.is_unsaved = False
         if changed or not self.is_current:
             self._in_flash.started()
         else:
             self._in_flash.saved(self.values)
-
-    @property
-    def is_unsaved(self) -> bool:
-        """Whether the flash may lack a change."""
-        return self._unsaved
 
     def changed(self, *, unsaved: bool) -> None:
         """Note that a command can have changed any setting, and whether the flash may not contain the change."""
@@ -508,8 +503,8 @@ class DeviceSettings:
 
     def _mark_unsaved(self, before: Values | None) -> None:
         """Note that the flash does not contain the present settings. `before`: the values before the write."""
-        if not self._unsaved:
-            self._unsaved, self._saved, self.resets = True, before, self.counter_resets
+        if not self.is_unsaved:
+            self.is_unsaved, self._saved, self.resets = True, before, self.counter_resets
         self._in_flash.follows = False
 
     def spend_flash(self) -> None:
@@ -545,7 +540,7 @@ class DeviceSettings:
         self, table: SettingsTable, wanted: Values, actual: Values, *, save: bool, asked: bool, by_name: bool = False
     ) -> AppliedSettings:
         """Set the values `wanted`. `asked`: a user or program requested it. The caller holds `exclusive`."""
-        target, written, unsaved = self._transport.target, self._all_written(table), self._unsaved
+        target, written, unsaved = self._transport.target, self._all_written(table), self.is_unsaved
         plan = make_plan(table, target, wanted, actual, written, save=save, unsaved=unsaved, by_name=by_name)
         flash = ModuleFlash(self._files.flash, self.module, asked=asked)
         applying = Applying(table, self._transport, flash, wanted, self._reports)
@@ -561,7 +556,7 @@ class DeviceSettings:
             self.update(applying.reports, own=True)
             self.is_current = applying.heard
             if applying.saved:
-                self._unsaved = False
+                self.is_unsaved = False
                 self._in_flash.saved(self.values)
                 unreadable = {name: as_json(value) for name, value in self._all_written(table).items()}
                 self._files.flash.keep_unreadable(self.module, unreadable)
@@ -577,14 +572,14 @@ class DeviceSettings:
     @property
     def not_saved(self) -> str:
         """That the flash lacks a change, and the next step; empty if it contains all settings or cannot be written."""
-        is_lost = self._unsaved and self.table is not None and self.table.save is not None
+        is_lost = self.is_unsaved and self.table is not None and self.table.save is not None
         return f"not saved; run `imud command {self._config.name} save`" if is_lost else ""
 
     def plan_repair(self, table: SettingsTable, actual: Values, *, save: bool) -> SettingsPlan:
         """Return the plan to set the declared settings. Raises BadArgument."""
         # flash contains the declared settings if commands changed no value
         saved = actual == self._saved and all(name in actual for name in self.declared)
-        target, written, unsaved = self._transport.target, self._all_written(table), self._unsaved and not saved
+        target, written, unsaved = self._transport.target, self._all_written(table), self.is_unsaved and not saved
         return make_plan(table, target, self.declared, actual, written, save=save, unsaved=unsaved)
 
     def _all_written(self, table: SettingsTable) -> dict[str, Any]:

@@ -122,6 +122,7 @@ class Transport(SettingsPort):
     link: Link
     settings: DeviceSettings
     is_polled = False  # whether imud requests each sample
+    has_ticks = False  # whether `tick` has work while samples arrive
     busy = False  # whether a request script is running; always False for a polled device: scripts and reads alternate
 
     def __init__(self, context: DeviceContext) -> None:
@@ -192,7 +193,7 @@ class Transport(SettingsPort):
     def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
         """Report the received data, or search again. Called after UNHEARD_NS without a sample."""
 
-    def tick(self, now_ns: int) -> None:  # only a polled bus counts deadlines
+    def tick(self, now_ns: int) -> None:
         """Do periodic work before the device checks its samples."""
 
     def on_reset(self) -> None:  # a stream or CAN device sends again without a request

@@ -136,12 +136,14 @@ class Outputs:
 
     def tick(self, now_ns: int) -> None:
         """Call `tick` of the outputs. Start failed outputs after their pause."""
+        has_failed = False
         for name, publisher in self._ticked:
             try:
                 # the failure of another output can end this output
-                if not self._failures or self._running.get(name) is publisher:
+                if not has_failed or self._running.get(name) is publisher:
                     publisher.tick(now_ns)
             except Exception as error:  # noqa: BLE001 - an internal error of one output
+                has_failed = True
                 self._fail(name, error)
         if self._failures:
             for name, failure in list(self._failures.items()):

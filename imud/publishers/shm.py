@@ -523,14 +523,15 @@ class ShmPublisher:
                 if ring is None or not ring.is_intact():
                     self._replace(name, self._current_directory(), now_ns)
             self._show_ledgers()
-        self._beat(now_ns)
+        for ring in self._rings.values():
+            ring.beat(now_ns)
 
     def close(self) -> None:
         """Write the final ledgers and close all rings. A second call does nothing."""
         self._context.latencies.release(ASKER)
-        if self._rings:
-            self._show_ledgers()
-            self._beat(self._context.clock.now_ns())
+        self._show_ledgers()
+        for ring in self._rings.values():
+            ring.beat(self._context.clock.now_ns())
         for name in list(self._places):
             self.remove_device(name)
         if self._directory is not None:
@@ -542,10 +543,6 @@ class ShmPublisher:
             ring = self._rings.get(name)
             if ring is not None:
                 ring.set_ledger(driver, ledger)
-
-    def _beat(self, now_ns: int) -> None:
-        for ring in self._rings.values():
-            ring.beat(now_ns)
 
     def _opened_directory(self) -> RingDirectory:
         if self._directory is None:

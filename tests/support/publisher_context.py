@@ -17,6 +17,7 @@ from imud.contracts.publisher import (
 from imud.contracts.status import DeviceStatus
 from imud.model.errors import CommandError
 from imud.model.event import Event
+from imud.model.ledger import LEDGER_FIELDS
 
 
 class NothingRecorded:
@@ -92,7 +93,7 @@ def publisher_context(
 ) -> PublisherContext:  # fmt: skip
     devices = FakeDevices(
         status, control, recording or NothingRecorded(), each_status or (lambda: iter(status())),
-        ledgers or (lambda: [(one.name, one.driver, tuple(one.ledger.values())) for one in status()]),
+        ledgers or (lambda: [(d.name, d.driver, [d.ledger.get(key, 0) for key in LEDGER_FIELDS]) for d in status()]),
     )  # fmt: skip
     return PublisherContext(
         epoch, PublisherClock(now_ns, utc_offset_ns, utc_reference, cpu_ns), devices, outputs or OutputFacts(),

@@ -119,10 +119,6 @@ class ClientRecordings:
         for made in self.running.values():
             made.remove_device(name)
 
-    @property
-    def is_active(self) -> bool:
-        return bool(self.running or self._ending)
-
     def tick(self, now_ns: int) -> bool:
         """Check all recordings, and close the finished ones. Return whether one needs the next tick within 100 ms."""
         for number, made in list(self.running.items()):
@@ -135,7 +131,7 @@ class ClientRecordings:
             if made.ended:
                 self._ending.remove(made)
                 made.close()
-        return self.is_active
+        return bool(self.running or self._ending)
 
     def close(self) -> None:
         """Stop all recordings regularly. A second call does nothing."""
@@ -377,7 +373,7 @@ class Hub(Clients):
     def tick(self, now_ns: int) -> bool:
         """Close clients whose time to read their queue is over, and check the recordings. Return whether a client needs
         the next tick within 100 ms."""
-        needs_ticks = self.recordings.is_active and self.recordings.tick(now_ns)
+        needs_ticks = self.recordings.tick(now_ns)
         if not self.ending:
             return needs_ticks
         for connection in list(self.ending):

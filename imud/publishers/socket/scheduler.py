@@ -173,7 +173,7 @@ class Scheduler:
         self._users: dict[int, _User] = {}
         self._queued: dict[_User, None] = {}  # users with queued clients
         self._served_ns = 0  # run time of the user that was served last
-        self._parked: dict[ScheduledClient, None] = {}
+        self.parked: dict[ScheduledClient, None] = {}  # clients that wait for their allowance
         self._charged: dict[ScheduledClient, None] = {}  # clients whose allowances are not full
 
     def add(self, client: ScheduledClient, uid: int) -> _User:
@@ -193,7 +193,7 @@ class Scheduler:
             return
         client.state = _State.GONE
         self._clients.pop(client.fd, None)
-        self._parked.pop(client, None)
+        self.parked.pop(client, None)
         self._charged.pop(client, None)
         if not self._epoll.closed:
             self._epoll.unregister(client.fd)
@@ -239,14 +239,14 @@ class Scheduler:
                 needs_ticks = True
             elif client.is_full:
                 del self._charged[client]
-        for client in list(self._parked):
+        for client in list(self.parked):
             if client.over_ticks > OVER_TICKS_MAX:
                 try:
                     client.evict("it keeps asking for more than the allowance of a client")
                 except Exception as error:  # noqa: BLE001 - an internal error ends this client, not the daemon
                     self._fail(client, error)
             elif not client.is_over:
-                del self._parked[client]
+                del self.parked[client]
                 client.state = _State.IDLE
                 self.enqueue(client)
         return needs_ticks
@@ -348,7 +348,7 @@ class Scheduler:
             return
         if has_more and client.is_over:
             client.state = _State.PARKED
-            self._parked[client] = None
+            self.parked[client] = None
             return
         client.state = _State.IDLE
         if has_more:

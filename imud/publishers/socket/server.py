@@ -321,6 +321,7 @@ class SocketServer:
         self._scheduler: Scheduler | None = None
         self._listener: Listener | None = None
         self._guard = Guard(own_uid, None, None)
+        self._needs_ticks = False  # whether a client or the pause needs the next tick within 100 ms
         self._paused = False  # whether imud accepts no client until the next tick
         self._pauses = RateLimitedLog(context.clock.now_ns)
         self._file_problem = ""  # why imud cannot create the removed socket file again
@@ -368,21 +369,25 @@ class SocketServer:
 
     def tick(self, now_ns: int) -> None:
         """Close lingering clients, fill allowances, and accept clients again after a pause. The limits of clients count
-        ticks of 100 ms: request them while a client lingers or waits for its allowance."""
-        needs_ticks = self.hub.tick(now_ns)
-        if self._scheduler is not None:
-            needs_ticks = self._scheduler.tick() or needs_ticks
-            self.hub.pool.trim()
+        ticks of 100 ms: request them while a client lingers or waits for its allowance. Otherwise once per second."""
+        hub, scheduler, listener, is_due = self.hub, self._scheduler, self._listener, now_ns >= self._check_ns
+        if scheduler is None or listener is None:
+            return
+        if not (is_due or self._needs_ticks or hub.ending or hub.recordings.running or scheduler.parked):
+            return
+        needs_ticks = hub.tick(now_ns)
+        self._needs_ticks = needs_ticks = scheduler.tick() or needs_ticks
+        hub.pool.trim()
         if needs_ticks:
             self._context.owner.tick_soon()
         self._quota.tick()
-        if now_ns >= self._check_ns and self._listener is not None:
+        if is_due:
             self._check_ns = now_ns + CHECK_NS
-            if not self._listener.has_file:
-                self._replace_file(self._listener)
-        if self._paused and self._listener is not None:
+            if not listener.has_file:
+                self._replace_file(listener)
+        if self._paused:
             self._paused = False
-            asyncio.get_running_loop().add_reader(self._listener.sock, self._accept)
+            asyncio.get_running_loop().add_reader(listener.sock, self._accept)
 
     def close(self) -> None:
         """Stop listening, close every client, remove the socket file if it is ours. A second call does nothing."""
@@ -420,7 +425,7 @@ class SocketServer:
         if count:
             log.warning("cannot accept a client: %s (%d times since the last report)", error.strerror, count)
         asyncio.get_running_loop().remove_reader(self._listener.sock)
-        self._paused = True
+        self._paused = self._needs_ticks = True
         self._context.owner.tick_soon()
 
     def _let_in(self, sock: socket.socket) -> None:

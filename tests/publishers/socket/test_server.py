@@ -336,6 +336,7 @@ async def test_an_error_ends_only_this_client(server: SocketServer, monkeypatch:
         server.publish(batch())
     elif what == "tick":
         monkeypatch.setattr(connection, "tick", broken)
+        server.hub.ending[connection] = None
         server.tick(0)
     else:
         monkeypatch.setattr(connection, "post", broken)
