@@ -112,7 +112,7 @@ def test_a_recording_or_file_that_cannot_be_made(words: tuple[object, ...], tmp_
     there.write_bytes(b"mine")
     cli.refuses("exists; name a new file", *words, there)
     cli.refuses("No such file or directory", *words, tmp_path / "no" / "folder")
-    cli.refuses("no device named 'keel'; there are: bow, mast", *words, "--device", "keel", tmp_path / "d")
+    cli.refuses('a device that imud knows, got "keel"; known: bow, mast', *words, "--device", "keel", tmp_path / "d")
     cli.refuses("the flight recorder is off", *words, "--snapshot", tmp_path / "e")
     for option in (("--for", "1s"), ("--device", "bow")):
         cli.refuses("omit --device and --for", *words, "--snapshot", *option)

@@ -66,10 +66,10 @@ def test_requests_and_conventions(served: Daemon) -> None:
 
 def test_a_refused_request_raises_and_the_connection_stays_open(served: Daemon) -> None:
     with Client(served.path) as client:
-        with pytest.raises(RpcError, match="there are: imu0, imu1") as caught:
+        with pytest.raises(RpcError, match="known: imu0, imu1") as caught:
             client.watch(["imu7"])
         assert caught.value.code == -32602
-        with pytest.raises(RpcError, match="no method"):
+        with pytest.raises(RpcError, match="expected a method that imud knows"):
             client.call("config.get")
         with pytest.raises(TypeError, match="list of names"):
             client.poll("imu0")

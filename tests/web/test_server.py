@@ -291,7 +291,7 @@ async def test_bad_bodies_and_errors_of_the_daemon_are_reported(tmp_path: Path) 
         assert (await site.client.post("/api/call", data=b" " * 100_000, headers=site.origin)).status == 413
         status, answer = await site.post("/api/call", {"method": "actions", "params": {"device": "none"}})
         assert (status, answer["code"]) == (200, -32602)
-        assert "no device named 'none'" in answer["error"]
+        assert 'a device that imud knows, got "none"' in answer["error"]
         site.daemon.close()
         status, answer = await site.post("/api/call", {"method": "actions", "params": {"device": "imu0"}})
         assert (status, "no daemon at" in answer["error"]) == (502, True)
@@ -487,7 +487,7 @@ async def test_a_request_has_its_own_connection_and_time_limit(tmp_path: Path, m
         assert await calls.call("command", request) is None
         assert limits.call_args_list == [call(10.0), call(660.0)], "a calibration takes up to 600 s"
         await socket_rig.until(lambda: not server.hub.connections)
-        with pytest.raises(RpcError, match="no device named 'none'") as caught:
+        with pytest.raises(RpcError, match='got "none"; known: imu0') as caught:
             await Calls(server.hub.path).call("actions", {"device": "none"})
         assert caught.value.code == Code.INVALID_PARAMS
     with pytest.raises(LinkMissing, match=r"no daemon at .*/none: No such file"):

@@ -29,7 +29,7 @@ from imud.formats.jsonrpc import (
 from imud.formats.slot import PRESENT_BITS, SLOT_BYTES, SLOT_FIELDS, SLOT_LAYOUT_VERSION, SYNC_CODES
 from imud.model.errors import ImudError
 from imud.model.event import EVENTS_MAX
-from imud.model.options import wrong_values
+from imud.model.options import unknown_name, wrong_values
 from imud.model.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA, Sample
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.publishers.socket.admission import Rights
@@ -146,7 +146,7 @@ def handle_line(hub: Hub, connection: ClientConnection, line: bytes) -> None:
     try:
         method = METHODS.get(request.method)
         if method is None:
-            message = f"no method {request.method[:64]!r}; there are: {', '.join(METHODS)}"
+            message = unknown_name("a method", request.method[:64], list(METHODS))
             raise RpcError(Code.METHOD_NOT_FOUND, message)
         if method.right not in connection.rights:
             raise RpcError(Code.DENIED, f"{request.method}: expected root or a member of {hub.control_group}")
@@ -511,8 +511,7 @@ def _known(kind: str, names: list[str], known: Collection[str]) -> tuple[str, ..
         raise RpcError(Code.INVALID_PARAMS, f"{kind}s: expected at least one name; leave `{kind}s` out for all")
     for name in names:
         if name not in known:
-            message = f"no {kind} named {name[:64]!r}; there are: {', '.join(known) or 'none'}"
-            raise RpcError(Code.INVALID_PARAMS, message)
+            raise RpcError(Code.INVALID_PARAMS, unknown_name(f"a {kind}", name[:64], list(known)))
     return tuple(dict.fromkeys(names))
 
 

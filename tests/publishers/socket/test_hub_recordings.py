@@ -181,7 +181,8 @@ async def test_the_maximum_counts_recordings_that_run_and_those_that_still_send(
 async def test_reading_is_not_enough(server: SocketServer, monkeypatch: pytest.MonkeyPatch) -> None:
     peer = await Peer.greeted(server)
     code, message = await peer.error("record.start", devices=["imu7"])
-    assert (code, message) == (-32602, "no device named 'imu7'; there are: imu0, imu1")
+    words = 'expected a device that imud knows, got "imu7"; did you mean imu1? known: imu0, imu1'
+    assert (code, message) == (-32602, words)
     monkeypatch.setattr(Guard, "rights_of", lambda _guard, _peer: Rights.READ)
     peer = await Peer.greeted(server)
     for method in ("record.start", "record.stop", "record.snapshot"):

@@ -31,8 +31,8 @@ LINE_MAX_BYTES, DEVICES_PER_PIECE, BYTES_BURST = 65_536, 8, 1 << 20
         (b"[" + b"1," * 3000 + b"1]", -32700, None, "too many values: expected at most 2048"),
         (b"{}", -32600, None, '"2.0"'), (b'{"jsonrpc":2.0,"id":1,"method":"devices"}', -32600, 1, '"2.0"'),
         (b'{"jsonrpc":"2.0","id":1,"method":"devices","params":[1]}', -32602, 1, "the parameters by name"),
-        (b'{"jsonrpc":"2.0","id":1,"method":"config.get"}', -32601, 1, "there are: devices, status"),
-        (b'{"jsonrpc":"2.0","id":null,"method":"x"}', -32601, None, "no method 'x'"),
+        (b'{"jsonrpc":"2.0","id":1,"method":"config.get"}', -32601, 1, 'a method that imud knows, got "config.get"'),
+        (b'{"jsonrpc":"2.0","id":null,"method":"x"}', -32601, None, 'a method that imud knows, got "x"'),
     ],
 )  # fmt: skip
 @in_server()
@@ -53,13 +53,13 @@ async def test_bad_lines(server: SocketServer, line: bytes, code: int, request_i
         ("watch", {"rate_hz": 1_000_001}, "expected 0 (every sample) or 0.001"),
         ("watch", {"rate_hz": True}, "rate_hz: expected a number, or null, got true"),
         ("watch", {"rate_hz": "fast"}, 'got "fast"'),
-        ("watch", {"devices": ["imu7"]}, "no device named 'imu7'; there are: imu0, imu1"),
+        ("watch", {"devices": ["imu7"]}, 'a device that imud knows, got "imu7"'),
         ("watch", {"devices": []}, "devices: expected at least one name"),
         ("watch", {"devices": "imu0"}, 'expected a list, each item text, or null, got "imu0"'),
         ("watch", {"devices": [1]}, "got a list with 1 at [0]"),
-        ("watch", {"fields": ["accel"]}, "no field named 'accel'; there are: device, seq, t_ns"),
+        ("watch", {"fields": ["accel"]}, 'got "accel"; did you mean accel_m_s2? known: accel_m_s2'),
         ("watch", {"encoding": "xml"}, "xml"),
-        ("poll", {"devices": ["imu7"]}, "there are: imu0, imu1"),
+        ("poll", {"devices": ["imu7"]}, "known: imu0, imu1"),
         ("events", {"limit": 1001}, "limit: expected 1 to 1000, got 1001"),
         ("events", {"enable": "yes"}, 'enable: expected true or false, or null, got "yes"'),
         ("history", {}, "history: expected the parameter devices"),
@@ -67,7 +67,7 @@ async def test_bad_lines(server: SocketServer, line: bytes, code: int, request_i
         ("history", {"devices": ["imu0"], "from_ns": 2, "to_ns": 1}, "from_ns: expected at most to_ns (1), got 2"),
         ("history", {"devices": ["imu0"], "convention": "up"}, "up"),
         ("notify", {}, "notify: expected the parameter device (text), got none"),
-        ("notify", {"device": "imu7"}, "there are: imu0, imu1"),
+        ("notify", {"device": "imu7"}, "known: imu0, imu1"),
     ],
 )
 @in_server()
