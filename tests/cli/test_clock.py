@@ -97,3 +97,4 @@ def test_the_cause_is_named_and_wires_that_do_not_fit_first() -> None:
         (ClockStatus(Sync.REGRESSION, edges=100, edges_unpaired=100), "100 of 100 pulses have no sample"),
     ]:
         assert expected in verdict(clock, WIRE)
+    assert "1000 edges in total" in block(device("bow", clock=ClockStatus(Sync.ARRIVAL, edges=1000)), deque())
