@@ -126,9 +126,8 @@ class Attachments:
         """Return the status of the UTC feed; None for a device without UTC feed."""
         return self._utc.status() if self._utc is not None else None
 
-    @property
     def utc_problem(self) -> str:
-        """Present fault of the UTC feed; empty if there is no fault."""
+        """Return the present fault of the UTC feed; empty if there is no fault."""
         return self._utc.problem if self._utc is not None else ""
 
     # --- the reset line ----------------------------------------------------------------------------------------------

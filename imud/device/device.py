@@ -314,7 +314,7 @@ class Device:
             health.state, health.problem, settings.resets - settings.resets_requested, transport.is_polled,
             settings.status() if has_settings else None, axes, axes_problem,
             transport.add_lines(attachments.lines_status()), path is not None and path.clock.has_scattered_time,
-            attachments.utc_problem, ledger.bytes_open(), ledger.frames_open(),
+            attachments.utc_problem(), ledger.bytes_open(), ledger.frames_open(),
         ))  # fmt: skip
 
     def _tick_flow(self, path: SamplePath, now_ns: int) -> None:

@@ -119,7 +119,6 @@ class Listener:
         if left_behind:
             log.info("replaced the socket %s of a daemon that no longer runs", self.path)
 
-    @property
     def has_file(self) -> bool:
         """Return whether `path` still names the socket file of this listener."""
         try:
@@ -383,7 +382,7 @@ class SocketServer:
         self._quota.tick()
         if is_due:
             self._check_ns = now_ns + CHECK_NS
-            if not listener.has_file:
+            if not listener.has_file():
                 self._replace_file(listener)
         if self._paused:
             self._paused = False
