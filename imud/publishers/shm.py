@@ -14,7 +14,7 @@ import secrets
 import stat
 import struct
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
@@ -277,7 +277,6 @@ def _process(descriptor: int) -> str:
         return "of another version"
 
 
-_CLOSED = struct.pack("<I", STATE_CLOSED)
 _INVALID = struct.pack("<Q", SEQ_INVALID)
 _SEQ = struct.Struct("<Q")
 _PAYLOAD = slice(8, SLOT_BYTES)
@@ -300,11 +299,11 @@ class ShmRing:
         with memoryview(self._memory) as view:
             self._words, self._halves = view.cast("Q"), view.cast("I")
         self._mask = header.slot_count - 1
-        self._newest = header.newest_seq
-        # `Ring` of the kernel in C, which writes the slots while the file has its size; None without the kernel
+        self._newest, self._update = header.newest_seq, 0
+        # `Ring` of the kernel in C; None without the kernel. Its `write` returns False if the file was truncated.
         open_ring = getattr(kernel.present.module, "open_ring", None)
         self._ring: Any = open_ring and open_ring(self._memory, self._mask, self._newest, self._fd)
-        self._update = 0
+        self.write: Callable[[bytes], bool] = self._ring.write if self._ring else self.write_in_python
         self._known: tuple[str, Sequence[int]] | None = None
         # minimum size of the file for a write; larger than any file after the file was truncated
         self._least_bytes = self._size_bytes
@@ -314,10 +313,8 @@ class ShmRing:
         """Return the sequence number of the newest sample; 0 before the first."""
         return self._newest if self._ring is None else int(self._ring.newest)
 
-    def write(self, packed: bytes) -> None:
-        """Write slots that are back to back, oldest first. Do nothing if the file was truncated."""
-        if self._ring is not None and self._ring.write(packed):
-            return
+    def write_in_python(self, packed: bytes) -> bool:
+        """Write slots that are back to back, oldest first. Do nothing if the file was truncated. Return True."""
         if not self._is_whole():
             self._newest = slot_seqs(packed)[1]
         elif len(packed) == SLOT_BYTES:
@@ -325,6 +322,7 @@ class ShmRing:
         elif not self._write_run(packed):
             for (slot,) in slots_in(packed):
                 self._write_one(slot)
+        return True
 
     def _write_one(self, slot: bytes) -> None:
         (seq,) = _SEQ.unpack_from(slot)
@@ -385,7 +383,7 @@ class ShmRing:
         if self._is_whole():
             self._halves[STATE_HALF_WORD] = STATE_CLOSED
         self._directory.remove(self._name, self._status)
-        self._ring = None
+        self._ring, self.write = None, self.write_in_python
         for view in (self._words, self._halves):
             view.release()
         self._memory.close()
@@ -408,11 +406,11 @@ class ShmRing:
     def _restore_size(self) -> None:
         """Restore the size of a truncated file and mark it as closed, without the mapping. Readers can have the file
         mapped. imud does not write to it after that."""
-        self._newest, self._ring = self.newest, None
+        self._newest, self._ring, self.write = self.newest, None, self.write_in_python
         self._least_bytes = sys.maxsize
         with suppress(OSError):
             os.ftruncate(self._fd, self._size_bytes)
-            os.pwrite(self._fd, _CLOSED, OFFSETS["state"])
+            os.pwrite(self._fd, struct.pack("<I", STATE_CLOSED), OFFSETS["state"])
 
 
 ASKER: Final = "shared memory"  # name of this output in latency requests
@@ -510,7 +508,9 @@ class ShmPublisher:
         """Write samples over the oldest samples of the ring."""
         ring = self._rings.get(batch.device)
         if ring is not None:
-            ring.write(batch.packed)
+            write, packed = ring.write, batch.packed
+            if not write(packed):
+                ring.write_in_python(packed)
         elif batch.device in self._places:
             self._places[batch.device].newest = batch.seqs[1]
 
