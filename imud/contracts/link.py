@@ -189,6 +189,10 @@ class StreamLink(Link, Protocol):
         """Start the delivery of bytes. Requires a running loop and an open port."""
         ...
 
+    def deliver_to(self, on_data: OnData) -> None:
+        """Deliver the following bytes to another function. Do nothing if the link ended or is closed."""
+        ...
+
     def set_baud(self, baud: int) -> None:
         """Change the baud rate and discard bytes received at the old baud rate. Raises LinkError."""
         ...

@@ -151,7 +151,7 @@ class StreamTransport(ReceivingTransport):
 
     def start(self, on_end: OnEnd) -> None:
         self._samples_before, self._started = self._ledger.samples, False
-        self.link.start(self._on_data, on_end)
+        self.link.start(self._receiver.on_data, on_end)
         self._search.start()
 
     def stop(self) -> None:
@@ -173,7 +173,7 @@ class StreamTransport(ReceivingTransport):
         self._hold.release()
         last = self._remembered.get(config.name)
         searching = StreamRound(config, link, self._ledger, last, self._host)
-        self._receiver = searching
+        self._pass_to(searching)
         searching.start(self._begin)
         return searching
 
@@ -189,7 +189,7 @@ class StreamTransport(ReceivingTransport):
         path.begin(self._host.now_ns())
         self._remember()
         self.attachments.start(path.clock)
-        self._receiver = path
+        self._pass_to(path)
         for data, t_rx_ns in found.chunks:
             path.on_data(data, t_rx_ns)
         self._receive()
@@ -329,13 +329,16 @@ class StreamTransport(ReceivingTransport):
         path, latency_ns = self.path, self._latency_ns
         assert path is not None
         self._hold.release()
-        self._receiver, self._hold = path, self._discard
+        self._hold = self._discard
         if latency_ns:
-            self._receiver = self._hold = StreamHold(self.link, path, self, self._host)
+            self._hold = StreamHold(self.link, path, self, self._host)
             self._hold.latency_ns = latency_ns
+        self._pass_to(self._hold if latency_ns else path)
 
-    def _on_data(self, data: bytes, t_rx_ns: int) -> None:
-        self._receiver.on_data(data, t_rx_ns)
+    def _pass_to(self, receiver: DataReceiver) -> None:
+        """Pass the following bytes of the link to `receiver`, without a function call in between."""
+        self._receiver = receiver
+        self.link.deliver_to(receiver.on_data)
 
     def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
         """Report the received bytes or replies, and search again if a search can find the device."""

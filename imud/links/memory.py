@@ -139,6 +139,10 @@ class MemoryLink(MemoryPort):
     def start(self, on_data: OnData, on_end: OnEnd) -> None:
         self._on_data, self._on_end = on_data, on_end
 
+    def deliver_to(self, on_data: OnData) -> None:
+        if self.listening:
+            self._on_data = on_data
+
     def set_baud(self, baud: int) -> None:
         """Store the rate in `bauds`. Raises LinkError if the port is closed."""
         if not self.is_open:

@@ -223,6 +223,7 @@ class ReplayLink(FileReplay):
     def __init__(self, settings: ReplayOptions, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         super().__init__(settings, now_ns)
         self._player: Iterator[tuple[bytes, int]] = iter(())
+        self._on_data: OnData
         self._span_ns = 0
         self.baud = settings.baud
         self.auto_baud = False
@@ -258,13 +259,17 @@ class ReplayLink(FileReplay):
 
     def start(self, on_data: OnData, on_end: OnEnd) -> None:
         self._player = self._play(self._now_ns() - self._span_ns)
-        self._timer = asyncio.get_running_loop().call_soon(self._turn, on_data, on_end, None)
+        self._on_data = on_data
+        self._timer = asyncio.get_running_loop().call_soon(self._turn, on_end, None)
+
+    def deliver_to(self, on_data: OnData) -> None:
+        self._on_data = on_data
 
     def set_baud(self, baud: int) -> None:
         """Raises LinkError: the rate of a recording is fixed."""
         raise LinkError(f"{self.title} is a replay with a fixed baud rate")
 
-    def _turn(self, on_data: OnData, on_end: OnEnd, waiting: tuple[bytes, int] | None) -> None:
+    def _turn(self, on_end: OnEnd, waiting: tuple[bytes, int] | None) -> None:
         """Deliver the due bytes, at most TURN_BYTES, then return to the event loop."""
         loop, file, room, now_ns = asyncio.get_running_loop(), self._file, TURN_BYTES, self._now_ns()
         while self._file is file:  # False after the receiver closed the link
@@ -276,13 +281,13 @@ class ReplayLink(FileReplay):
                 return
             if due_ns > now_ns and due_ns > (now_ns := self._now_ns()):
                 delay_s = (due_ns - now_ns) / NS_PER_S
-                self._timer = loop.call_later(delay_s, self._turn, on_data, on_end, item)
+                self._timer = loop.call_later(delay_s, self._turn, on_end, item)
                 return
             if room <= 0:
-                self._timer = loop.call_soon(self._turn, on_data, on_end, item)
+                self._timer = loop.call_soon(self._turn, on_end, item)
                 return
             room -= len(data)
-            on_data(data, due_ns)
+            self._on_data(data, due_ns)
 
     def _play(self, origin_ns: int) -> Iterator[tuple[bytes, int]]:
         """Yield pieces of bytes, each with its due time in CLOCK_MONOTONIC."""

@@ -86,6 +86,9 @@ class UartLink:
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self._fd, self._read)
 
+    def deliver_to(self, on_data: OnData) -> None:
+        self._on_data = on_data
+
     def pause(self) -> None:
         """Stop the delivery until `resume`. Bytes wait in the kernel. imud does not detect a removed port."""
         if self._loop is not None:
@@ -161,7 +164,8 @@ class UartLink:
         if not data:
             self._end(None)
             return
-        self._on_data(data, time.monotonic_ns())
+        on_data = self._on_data
+        on_data(data, time.monotonic_ns())
 
     def _end(self, error: OSError | None) -> None:
         self._stop()
