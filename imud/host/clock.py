@@ -182,7 +182,8 @@ class HostClock:
     def utc_offset_ns(self) -> int:
         """Return CLOCK_REALTIME minus CLOCK_MONOTONIC, ns. Update `steady`. Call this method between a reading of
         CLOCK_MONOTONIC and its conversion by `steady`."""
-        ahead_ns = self._realtime_ns() - (raw_ns := self._raw_ns())
+        realtime, raw = self._realtime_ns, self._raw_ns  # a call of a function in an attribute of `self` is slower
+        ahead_ns = realtime() - (raw_ns := raw())
         if self._least_ns <= ahead_ns <= self._most_ns and raw_ns < self._due_ns:
             self._held_ns = raw_ns
         else:

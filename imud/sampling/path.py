@@ -84,7 +84,7 @@ class SamplePath(ABC):
         self.loss = LossMeter(context.ledger)
         # Observer of the input; None if no recording runs. Set by `observe`.
         self.observer: InputObserver | None = None
-        self._newest: Sample | bytes | None = None  # sample object, or slot of the kernel
+        self._newest: Sample | bytes | None = None  # sample object, or slots of the kernel
         self.frame = context.frame
         self.begun_ns = 0  # CLOCK_MONOTONIC at the last `begin`, ns
         self.last_data_ns = 0
@@ -131,7 +131,7 @@ class SamplePath(ABC):
         """Newest sample, in the axes of the sensor."""
         newest = self._newest
         if isinstance(newest, bytes):
-            (newest,) = decode_slots(newest, self._device)
+            (newest,) = decode_slots(newest[-SLOT_BYTES:], self._device)
             self._newest = newest
         return newest
 
@@ -140,7 +140,7 @@ class SamplePath(ABC):
         """Return `sync` and `t_err_ns` of the newest sample; (None, 0) without a sample. Cheaper than `newest`."""
         newest = self._newest
         if isinstance(newest, bytes):
-            return slot_quality(newest)
+            return slot_quality(newest[-SLOT_BYTES:])
         return (newest.sync, newest.t_err_ns) if newest is not None else (None, 0)
 
     @property
@@ -267,19 +267,17 @@ class SamplePath(ABC):
             return
         count = len(packed) // SLOT_BYTES
         self._ledger.samples += count
-        self._newest = packed if count == 1 else packed[-SLOT_BYTES:]
+        self._newest = packed
         self.last_sample_ns = t_rx_ns
-        self._publish(SlotBatch(self._device, self._device_id, packed, self.frame))
+        publish, now_ns = self._publish, self._now_ns  # a call of a function in an attribute of `self` is slower
+        publish(SlotBatch(self._device, self._device_id, packed, self.frame))
         if count == 1:  # the usual case
             t_ns, status = slot_time_and_status(packed)
-            self.latency.add_one(self._now_ns() - t_ns)
+            self.latency.add_one(now_ns() - t_ns)
         else:
             status = slot_status_bits(packed)
-            self.latency.add(self._now_ns(), slot_times_ns(packed))
+            self.latency.add(now_ns(), slot_times_ns(packed))
         self._status_seen |= status & self._status_mask
-
-
-KERNEL_BYTES: Final = 82  # minimum number of bytes for the kernel: one HI91 frame
 
 
 class SampleListener(Protocol):
@@ -328,12 +326,8 @@ class StreamPath(SamplePath):
         try:
             if self._drain_edges is not None:
                 self._drain_edges()
-            if listener is None or not listener.wants_samples:
-                packed, events = self._stamp(data, t_rx_ns, samples)
-            else:
-                events = self.codec.feed(data)
-                if events:
-                    self._sort(events, t_rx_ns, self._utc_offset_ns(), samples)
+            # a listener needs measurements, which only Python makes
+            packed, events = self._stamp(data, t_rx_ns, samples, listener is None or not listener.wants_samples)
         finally:  # a recording must contain the data that caused an exception
             if self.observer is not None:
                 self.observer.data(data, t_rx_ns, -1)
@@ -353,14 +347,8 @@ class StreamPath(SamplePath):
         try:
             self.clock.waited_ns = waited_ns
             samples: list[Sample] = []
-            packed = b""
-            if not self.gathered or isinstance(self.gathered[-1], bytes):
-                packed, _ = self._stamp(data, t_rx_ns, samples)
-                if packed:
-                    self.gathered.append(packed)
-            elif events := self.codec.feed(data):
-                self._sort(events, t_rx_ns, self._utc_offset_ns(), samples)
-            self.gathered += samples
+            packed, _ = self._stamp(data, t_rx_ns, samples, not self.gathered or isinstance(self.gathered[-1], bytes))
+            self.gathered += [packed, *samples] if packed else samples
             self.clock.waited_ns = 0
             return bool(packed or samples)
         finally:
@@ -385,13 +373,15 @@ class StreamPath(SamplePath):
         newest = self.gathered[-1] if self.gathered else None
         return isinstance(newest, bytes) or (newest is not None and newest.sync is Sync.REGRESSION)
 
-    def _stamp(self, data: bytes, t_rx_ns: int, samples: list[Sample]) -> tuple[bytes, Sequence[CodecEvent]]:
+    def _stamp(
+        self, data: bytes, t_rx_ns: int, samples: list[Sample], use_kernel: bool
+    ) -> tuple[bytes, Sequence[CodecEvent]]:
         """Process usual frames at the start of `data` with the kernel, then the rest as `_sort`. Return the slots of
         the frames and the events of the rest."""
         codec: Any = self.codec  # a KernelCodec if `_start_run` is not None
-        start, packed, utc_offset_ns = self._start_run, b"", None
-        if start is not None and len(frames := codec.usual_frames(data)) >= KERNEL_BYTES:
-            utc_offset_ns = self._utc_offset_ns()
+        packed, start, utc_offset = b"", self._start_run, self._utc_offset_ns
+        utc_offset_ns = utc_offset()  # in all cases: the result must not depend on the use of the kernel
+        if start is not None and use_kernel and (frames := codec.usual_frames(data)):
             packed = self.clock.stamp_frames(start, frames, codec.word_is_status, t_rx_ns, utc_offset_ns)
             if packed:
                 self.loss.bad_frames = 0
@@ -400,7 +390,7 @@ class StreamPath(SamplePath):
                     return packed, ()
         events = codec.feed(data)
         if events:
-            self._sort(events, t_rx_ns, self._utc_offset_ns() if utc_offset_ns is None else utc_offset_ns, samples)
+            self._sort(events, t_rx_ns, utc_offset_ns, samples)
         return packed, events
 
     def _flush(self, now_ns: int, samples: list[Sample]) -> None:

@@ -214,8 +214,11 @@ class Hub(Clients):
         plan = self._plans.get(device)
         if plan is None:
             plan = self._plans[device] = self._new_plan(device)
-        plan.send(batch)
-        if device in self._wanting_wake:
+        if plan.simple is not None:  # the usual case
+            plan.simple.send_first(batch)
+        else:
+            plan.send(batch)
+        if self._wanting_wake and device in self._wanting_wake:
             # later: a woken client reads shared memory, and its publisher may run after this one
             asyncio.get_running_loop().call_soon(self._wake_all, device)
 

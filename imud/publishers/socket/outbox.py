@@ -384,8 +384,9 @@ class Outbox(ABC):
                 delivery = delivery or Delivery(outbox._pool.next_order(), batch, encoding, messages, chosen)
                 outbox._queue_samples(delivery)
                 continue
+            send = outbox._send
             try:
-                count = outbox._send(outbox._fd, whole)
+                count = send(outbox._fd, whole)
             except BlockingIOError:
                 count = 0
             except OSError as error:

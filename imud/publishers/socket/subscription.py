@@ -183,6 +183,8 @@ class DeliveryPlan:
         self._in_order: tuple[DeliveryGroup, ...] = ()
         self._only: DeliveryGroup | None = None  # the only group, if it is small; otherwise None
         self._thins = False  # whether a client has a rate
+        # the only group, if it is small and no client has a rate; the caller then uses its `send_first` for each batch
+        self.simple: DeliveryGroup | None = None
 
     def __len__(self) -> int:
         return len(self._groups)
@@ -216,19 +218,16 @@ class DeliveryPlan:
         groups = self._in_order
         self._thins = bool(self._thinner)
         self._only = groups[0] if len(groups) == 1 and groups[0].is_small else None
+        self.simple = None if self._thins else self._only
 
     def send(self, batch: Batch) -> None:
         """Send a batch to all clients: to a small group without a time limit, otherwise for PUBLISH_NS, then queue it.
 
         If the allowance for serving is used up, imud queues the batch for most of many clients.
         """
-        only = self._only
-        if only is not None and not self._thins:  # the usual case
-            only.send_first(batch)
-            return
         chosen = self._thinner.choose(batch.times_ns) if self._thins else NOTHING
-        if only is not None:
-            only.send(batch, chosen, self._now_ns, NEVER_NS)
+        if self._only is not None:
+            self._only.send(batch, chosen, self._now_ns, NEVER_NS)
             return
         groups, now_ns, time = self._in_order, self._now_ns, self._time
         if not groups:

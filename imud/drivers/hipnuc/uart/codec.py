@@ -382,9 +382,10 @@ class HipnucCodec:
     kernel_start: ClassVar = "start_hi91"
 
     def usual_frames(self, data: bytes) -> bytes:
-        if self._bad_ahead or self._barred_ahead or self._lines.pending_bytes:
+        tail = self._tail
+        if self._bad_ahead or self._barred_ahead or self.ledger.bytes_pending != len(tail):  # a line is incomplete
             return b""
-        return self._tail + data if self._tail else data
+        return tail + data if tail else data
 
     def take(self, frames: bytes, count: int, data: bytes) -> bytes:
         ledger, size = self.ledger, count * _HI91_FRAME_BYTES
