@@ -1,10 +1,11 @@
-/* Fast path of HI91 samples: check the frames of a read, decode them, time-stamp them, and pack them as slots.
+/* Fast path of samples: check the frames of a read, decode them, time-stamp them, and pack them as slots.
  *
  * A Run contains a copy of the state of clock and fit. `Run.stamp` does the same as the Python code and stops before the
  * first frame that is not usual. Python then copies the state back (`SampleClock.settle`) and continues with this frame.
  * The names are the names of the Python code:
  *
- *   is_usual, decode ─▶ HipnucCodec (imud/drivers/hipnuc/uart/codec.py)
+ *   is_usual_…, decode_… ─▶ HipnucCodec, Imu61xCodec (imud/drivers/hipnuc/uart/codec.py, …/imu61x/uart/codec.py)
+ *   add_stamp ─▶ StampTime (imud/sampling/device_time.py)
  *   stamp ─▶ add_even_run (imud/sampling/clock.py), ArrivalFit.add_arrival (imud/sampling/arrival_fit.py),
  *                 encode_slots (imud/formats/slot.py)
  *   write_ring ─▶ ShmRing (imud/publishers/shm.py)
@@ -21,6 +22,7 @@
 #include <math.h>
 #include <stddef.h>
 #include <stdint.h>
+#include <stdlib.h>
 #include <string.h>
 #include <unistd.h>
 
@@ -36,24 +38,47 @@
 #error "frames and slots are little-endian: use the Python code on this host"
 #endif
 
-#define SYNC_AND_LENGTH "\x5a\xa5\x4c\x00" /* start of an HI91 frame: the payload has 76 bytes */
-#define HEAD_BYTES 6
-#define PAYLOAD_BYTES 76
-#define FRAME_BYTES (HEAD_BYTES + PAYLOAD_BYTES)
+#define HEAD_BYTES 6 /* header of a frame, before the payload */
+#define HI91_HEAD "\x5a\xa5\x4c\x00" /* the payload has 76 bytes */
+#define HI92_HEAD "\x5a\xa5\x30\x00" /* the payload has 48 bytes */
+#define HIPNUC_HEAD_BYTES 4      /* the check value follows */
+#define HI91_BYTES 76
+#define HI92_BYTES 48
 #define TAG_HI91 0x91
-#define FLOATS 16                /* accel, gyro, mag, euler, quaternion */
+#define TAG_HI92 0x92
+#define AHRS_HEAD "\xaa\x55\x02\x00\x2c\x00" /* identifier 2, the payload has 44 bytes and precedes the check value */
+#define AHRS_BYTES 44
+#define AHRS_CRC_BYTES 4
+#define AHRS_CRC_START 1u        /* register before the first byte; no final inversion */
+#define HI91_FLOATS 16           /* accel, gyro, mag, euler, quaternion */
+#define HI92_COUNTS 9            /* gyro, accel, mag */
+#define AHRS_FLOATS 10           /* pitch roll yaw, accel, gyro, temperature */
 #define QUAT_SQUARE_MIN 0.9604   /* limits of the squared length of a rotation, see value_limits.py */
 #define QUAT_SQUARE_MAX 1.0404
 /* A float has this high byte or a larger one if it is not usual, also NaN: 32 g or more, other values 2048 or more */
 #define ACCEL_HIGH_BYTE 0x42
 #define VALUE_HIGH_BYTE 0x45
 #define TURN_DEG 360.0f          /* maximum magnitude of a usual angle */
+#define TEMPERATURE_MIN_C (-128.0f)
+#define TEMPERATURE_MAX_C 150.0f
 #define PRESSURE_MIN_PA 1000.0
 #define PRESSURE_MAX_PA 120000.0
 #define PPS_STAMP_MODULUS_MS 8192
-#define M_S2_PER_G 9.8
+#define HIPNUC_M_S2_PER_G 9.8
+#define STANDARD_GRAVITY_M_S2 9.80665
 #define RAD_PER_DEG (3.141592653589793 / 180)
 #define T_PER_UT 1e-6
+#define HI92_M_S2_PER_LSB 0.0048828
+#define HI92_RAD_S_PER_LSB 0.001
+#define HI92_T_PER_LSB (0.030517 * T_PER_UT)
+#define HI92_RAD_PER_LSB (0.001 * RAD_PER_DEG)
+#define HI92_QUAT_PER_LSB 0.0001
+#define HI92_PRESSURE_OFFSET_PA 100000.0
+#define DRIFT 200e-6             /* maximum rate error of the device's crystal */
+#define LIVE_TICKS 640           /* `StampTime` compares values and arrivals over this time, ms */
+#define LIVE_BREAK_NS 40000000
+#define TURN_LATE_NS 4e8         /* before a later frame, the value can have restarted */
+#define NS_PER_MS 1000000
 #define EARLY_NS (-5e6)          /* an earlier frame can be a jump of the device counter */
 #define JUMP_LATE_NS 5e8         /* a later frame can be a jump of the device counter */
 #define T_ERR_MOST 4294967295.0
@@ -85,8 +110,18 @@ typedef struct {
     double lowest, wait, wait_least, wait_most, late_ns;
 } Bin;
 
+/* State of `StampTime`: ticks of 1 ms from a value that restarts after PPS_STAMP_MODULUS_MS. */
+typedef struct {
+    int in_use;
+    int64_t stamp, before, ticks, arrival_ns, origin_ns, live_ticks, live_arrival_ns;
+    double lowest_ns;
+} Stamps;
+
+typedef struct Format Format;
+
 /* State of codec, clock, host and fit at the start of a run. */
 typedef struct {
+    const Format *format;
     int word_is_status, device_id, sync;
     int64_t own_status; /* -1: none */
     int64_t seq, t_ns, t_rx_ns, utc_offset_ns, byte_ns, waited_ns;
@@ -97,7 +132,18 @@ typedef struct {
     int64_t ref_arrival_ns, ref_device_ns, fitted_ns, until_ns;
     double slope, slope_error, wait_most;
     Bin bin;
+    Stamps stamps;
 } Run;
+
+/* Format of a frame: a header of HEAD_BYTES, a payload that contains the device counter, and perhaps a check value. */
+struct Format {
+    const char *name;
+    int frame_bytes;
+    int ticks_offset;   /* place of the device counter in the payload */
+    int has_stamp;      /* whether the counter is the value of `StampTime`, 16 bits; otherwise it has 32 bits */
+    int (*is_usual)(const uint8_t *frame);
+    uint32_t (*decode)(Slot *slot, const uint8_t *payload, int word_is_status); /* returns the bits of `present` */
+};
 
 /* table k: effect of a byte that k bytes follow */
 static uint16_t crc16_table[8][256];
@@ -136,10 +182,9 @@ static uint16_t crc16_xmodem(const uint8_t *data, size_t size, uint16_t crc)
     return crc;
 }
 
-/* Return the CRC-32 of `size` bytes, as zlib.crc32. Eight bytes per step. */
-static uint32_t crc32_of(const uint8_t *data, size_t size)
+/* Return the register of the CRC-32 of zlib after `size` bytes, from the register `crc`. Eight bytes per step. */
+static uint32_t crc32_register(const uint8_t *data, size_t size, uint32_t crc)
 {
-    uint32_t crc = 0xFFFFFFFFu;
     for (; size >= 8; data += 8, size -= 8) {
         uint32_t low, high;
         memcpy(&low, data, 4);
@@ -151,68 +196,201 @@ static uint32_t crc32_of(const uint8_t *data, size_t size)
     }
     for (; size; data++, size--)
         crc = (crc >> 8) ^ crc32_table[0][(crc ^ *data) & 0xFF];
-    return ~crc;
+    return crc;
+}
+
+static uint32_t crc32_of(const uint8_t *data, size_t size)
+{
+    return ~crc32_register(data, size, UINT32_MAX);
+}
+
+/* Return whether a frame starts with `head` and `tag`, and has the correct check value. */
+static int is_hipnuc(const uint8_t *frame, const char *head, int tag, size_t payload_bytes)
+{
+    const uint8_t *payload = frame + HEAD_BYTES;
+    return !memcmp(frame, head, HIPNUC_HEAD_BYTES) && payload[0] == tag &&
+           crc16_xmodem(payload, payload_bytes, crc16_xmodem(frame, HIPNUC_HEAD_BYTES, 0)) ==
+               (uint16_t)(frame[4] | frame[5] << 8);
+}
+
+/* Return whether the magnitudes of `count` floats are usual by their high bytes. */
+static int are_usual(const uint8_t *floats, int count, int high_byte)
+{
+    for (int i = 0; i < count; i++)
+        if ((floats[4 * i + 3] & 0x7F) >= high_byte)
+            return 0;
+    return 1;
+}
+
+/* Return whether no angle is beyond a full turn. False for NaN. */
+static int are_angles(const uint8_t *floats)
+{
+    float angles_deg[3];
+    memcpy(angles_deg, floats, sizeof angles_deg);
+    return fabsf(angles_deg[0]) <= TURN_DEG && fabsf(angles_deg[1]) <= TURN_DEG && fabsf(angles_deg[2]) <= TURN_DEG;
+}
+
+static void scale(double *to, const float *from, double factor)
+{
+    for (int i = 0; i < 3; i++)
+        to[i] = from[i] * factor;
+}
+
+static uint32_t put_quat(Slot *slot, double w, double x, double y, double z)
+{
+    double square = w * w + x * x + y * y + z * z;
+    if (!(QUAT_SQUARE_MIN < square && square < QUAT_SQUARE_MAX))
+        return 0;
+    slot->quat_wxyz[0] = w;
+    slot->quat_wxyz[1] = x;
+    slot->quat_wxyz[2] = y;
+    slot->quat_wxyz[3] = z;
+    return HAS_QUAT;
+}
+
+/* Write the temperature in a byte. The ends of the range are filler bytes. */
+static uint32_t put_temperature(Slot *slot, uint8_t byte)
+{
+    if (byte == 0x7F || byte == 0x80)
+        return 0;
+    slot->temperature_c = (int8_t)byte;
+    return HAS_TEMPERATURE;
 }
 
 /* Return whether a usual HI91 frame starts at `frame`: correct check value, possible values, and a known pressure. */
-static int is_usual(const uint8_t *frame)
+static int is_usual_hi91(const uint8_t *frame)
 {
     const uint8_t *payload = frame + HEAD_BYTES;
-    float pressure_pa, angles_deg[3];
-    if (memcmp(frame, SYNC_AND_LENGTH, 4) || payload[0] != TAG_HI91)
-        return 0;
-    if (crc16_xmodem(payload, PAYLOAD_BYTES, crc16_xmodem(frame, 4, 0)) != (uint16_t)(frame[4] | frame[5] << 8))
-        return 0;
-    for (int i = 0; i < FLOATS; i++)
-        if ((payload[15 + 4 * i] & 0x7F) >= (i < 3 ? ACCEL_HIGH_BYTE : VALUE_HIGH_BYTE))
-            return 0;
-    memcpy(angles_deg, payload + 48, sizeof angles_deg);
-    for (int i = 0; i < 3; i++)
-        if (!(fabsf(angles_deg[i]) <= TURN_DEG))
-            return 0;
+    float pressure_pa;
     memcpy(&pressure_pa, payload + 4, 4);
-    return PRESSURE_MIN_PA <= pressure_pa && pressure_pa <= PRESSURE_MAX_PA; /* false for NaN */
+    return is_hipnuc(frame, HI91_HEAD, TAG_HI91, HI91_BYTES) && are_usual(payload + 12, 3, ACCEL_HIGH_BYTE) &&
+           are_usual(payload + 24, HI91_FLOATS - 3, VALUE_HIGH_BYTE) && are_angles(payload + 48) &&
+           PRESSURE_MIN_PA <= pressure_pa && pressure_pa <= PRESSURE_MAX_PA; /* false for NaN */
 }
+
+/* Write the values of a usual frame into a slot, which contains zeros. */
+static uint32_t decode_hi91(Slot *slot, const uint8_t *payload, int word_is_status)
+{
+    float pressure_pa, floats[HI91_FLOATS];
+    unsigned word = payload[1] + 256u * payload[2];
+    uint32_t present = HAS_T_DEV | HAS_ACCEL | HAS_GYRO | HAS_EULER | HAS_PRESSURE;
+    memcpy(&pressure_pa, payload + 4, 4);
+    memcpy(floats, payload + 12, sizeof floats);
+    scale(slot->accel_m_s2, floats, HIPNUC_M_S2_PER_G);
+    scale(slot->gyro_rad_s, floats + 3, RAD_PER_DEG);
+    scale(slot->euler_rad, floats + 9, RAD_PER_DEG);
+    /* a device without magnetometer sends zeros */
+    if (floats[6] || floats[7] || floats[8]) {
+        present |= HAS_MAG;
+        scale(slot->mag_t, floats + 6, T_PER_UT);
+    }
+    slot->pressure_pa = pressure_pa;
+    if (word <= PPS_STAMP_MODULUS_MS) {
+        present |= word_is_status ? HAS_STATUS : HAS_PPS_AGE;
+        *(word_is_status ? &slot->status : &slot->pps_age_ms) = word;
+    }
+    return present | put_quat(slot, floats[12], floats[13], floats[14], floats[15]) | put_temperature(slot, payload[3]);
+}
+
+static void angles_of(double *euler_rad, const uint8_t *payload)
+{
+    int32_t counts[3];
+    memcpy(counts, payload + 28, sizeof counts);
+    for (int i = 0; i < 3; i++)
+        euler_rad[i] = counts[i] * HI92_RAD_PER_LSB;
+}
+
+/* Return whether a usual HI92 frame starts at `frame`: correct check value, possible angles, and a known counter. */
+static int is_usual_hi92(const uint8_t *frame)
+{
+    const uint8_t *payload = frame + HEAD_BYTES;
+    double euler_rad[3];
+    angles_of(euler_rad, payload);
+    for (int i = 0; i < 3; i++)
+        if (!(fabs(euler_rad[i]) <= (double)TURN_DEG * RAD_PER_DEG))
+            return 0;
+    return payload[4] + 256 * payload[5] <= PPS_STAMP_MODULUS_MS &&
+           is_hipnuc(frame, HI92_HEAD, TAG_HI92, HI92_BYTES);
+}
+
+static uint32_t decode_hi92(Slot *slot, const uint8_t *payload, int word_is_status)
+{
+    int16_t pressure, counts[HI92_COUNTS], quat[4];
+    uint32_t present = HAS_T_DEV | HAS_ACCEL | HAS_GYRO | HAS_EULER | HAS_PPS_AGE;
+    memcpy(&pressure, payload + 6, sizeof pressure);
+    memcpy(counts, payload + 10, sizeof counts);
+    memcpy(quat, payload + 40, sizeof quat);
+    for (int i = 0; i < 3; i++) {
+        slot->gyro_rad_s[i] = counts[i] * HI92_RAD_S_PER_LSB;
+        slot->accel_m_s2[i] = counts[3 + i] * HI92_M_S2_PER_LSB;
+    }
+    angles_of(slot->euler_rad, payload);
+    const int16_t *field = counts + 6, x = field[0];
+    /* filler bytes */
+    if (x != field[1] || x != field[2] || (x != 0 && x != -1 && x != 0x7FFF && x != 0x7F7F && x != -0x8000)) {
+        present |= HAS_MAG;
+        for (int i = 0; i < 3; i++)
+            slot->mag_t[i] = field[i] * HI92_T_PER_LSB;
+    }
+    double pressure_pa = pressure + HI92_PRESSURE_OFFSET_PA;
+    if (pressure != 0 && pressure != -1 && pressure != 0x7FFF && pressure != -0x8000 &&
+        pressure_pa <= PRESSURE_MAX_PA) {
+        present |= HAS_PRESSURE;
+        slot->pressure_pa = pressure_pa;
+    }
+    slot->pps_age_ms = payload[4] + 256u * payload[5];
+    (void)word_is_status; /* the manual reserves the status of HI92 */
+    return present | put_temperature(slot, payload[3]) |
+           put_quat(slot, quat[0] * HI92_QUAT_PER_LSB, quat[1] * HI92_QUAT_PER_LSB, quat[2] * HI92_QUAT_PER_LSB,
+                    quat[3] * HI92_QUAT_PER_LSB);
+}
+
+/* Return whether a usual AHRS frame starts at `frame`: correct check value and possible values. */
+static int is_usual_ahrs(const uint8_t *frame)
+{
+    const uint8_t *payload = frame + HEAD_BYTES;
+    uint32_t crc;
+    float temperature_c;
+    memcpy(&crc, payload + AHRS_BYTES, sizeof crc);
+    memcpy(&temperature_c, payload + 40, sizeof temperature_c);
+    return !memcmp(frame, AHRS_HEAD, HEAD_BYTES) && are_angles(payload + 4) &&
+           are_usual(payload + 16, 3, ACCEL_HIGH_BYTE) && are_usual(payload + 28, 3, VALUE_HIGH_BYTE) &&
+           TEMPERATURE_MIN_C < temperature_c && temperature_c <= TEMPERATURE_MAX_C && /* false for NaN */
+           crc32_register(frame, HEAD_BYTES + AHRS_BYTES, AHRS_CRC_START) == crc;
+}
+
+/* As `quat_from_euler_zyx` (imud/attitude/rotation.py). */
+static uint32_t decode_ahrs(Slot *slot, const uint8_t *payload, int word_is_status)
+{
+    float floats[AHRS_FLOATS];
+    memcpy(floats, payload + 4, sizeof floats);
+    double roll = floats[1] * RAD_PER_DEG, pitch = floats[0] * RAD_PER_DEG, yaw = floats[2] * RAD_PER_DEG;
+    double cr = cos(roll / 2), sr = sin(roll / 2), cp = cos(pitch / 2), sp = sin(pitch / 2);
+    double cy = cos(yaw / 2), sy = sin(yaw / 2);
+    slot->euler_rad[0] = roll;
+    slot->euler_rad[1] = pitch;
+    slot->euler_rad[2] = yaw;
+    scale(slot->accel_m_s2, floats + 3, STANDARD_GRAVITY_M_S2);
+    scale(slot->gyro_rad_s, floats + 6, RAD_PER_DEG);
+    slot->temperature_c = floats[9];
+    slot->quat_wxyz[0] = cy * cp * cr + sy * sp * sr;
+    slot->quat_wxyz[1] = cy * cp * sr - sy * sp * cr;
+    slot->quat_wxyz[2] = cy * sp * cr + sy * cp * sr;
+    slot->quat_wxyz[3] = sy * cp * cr - cy * sp * sr;
+    (void)word_is_status; /* the frame has no status */
+    return HAS_T_DEV | HAS_ACCEL | HAS_GYRO | HAS_EULER | HAS_QUAT | HAS_TEMPERATURE;
+}
+
+static const Format formats[] = {
+    {"HI91", HEAD_BYTES + HI91_BYTES, 8, 0, is_usual_hi91, decode_hi91},
+    {"HI92", HEAD_BYTES + HI92_BYTES, 4, 1, is_usual_hi92, decode_hi92},
+    {"AHRS", HEAD_BYTES + AHRS_BYTES + AHRS_CRC_BYTES, 0, 0, is_usual_ahrs, decode_ahrs},
+};
 
 /* Write the values of a usual frame into a slot, which contains zeros. */
 static void decode(Slot *slot, const uint8_t *payload, const Run *run)
 {
-    float pressure_pa, floats[FLOATS];
-    unsigned word = payload[1] + 256u * payload[2];
-    uint32_t present = HAS_T_DEV | HAS_ACCEL | HAS_GYRO | HAS_EULER | HAS_TEMPERATURE | HAS_PRESSURE;
-    memcpy(&pressure_pa, payload + 4, 4);
-    memcpy(floats, payload + 12, sizeof floats);
-    for (int i = 0; i < 3; i++) {
-        slot->accel_m_s2[i] = floats[i] * M_S2_PER_G;
-        slot->gyro_rad_s[i] = floats[3 + i] * RAD_PER_DEG;
-        slot->euler_rad[i] = floats[9 + i] * RAD_PER_DEG;
-    }
-    /* a device without magnetometer sends zeros */
-    if (floats[6] || floats[7] || floats[8]) {
-        present |= HAS_MAG;
-        for (int i = 0; i < 3; i++)
-            slot->mag_t[i] = floats[6 + i] * T_PER_UT;
-    }
-    double w = floats[12], x = floats[13], y = floats[14], z = floats[15];
-    double square = w * w + x * x + y * y + z * z;
-    if (QUAT_SQUARE_MIN < square && square < QUAT_SQUARE_MAX) {
-        present |= HAS_QUAT;
-        for (int i = 0; i < 4; i++)
-            slot->quat_wxyz[i] = floats[12 + i];
-    }
-    /* the ends of the range are filler bytes */
-    if (payload[3] == 0x7F || payload[3] == 0x80)
-        present &= ~(uint32_t)HAS_TEMPERATURE;
-    else
-        slot->temperature_c = (int8_t)payload[3];
-    slot->pressure_pa = pressure_pa;
-    if (run->word_is_status && word <= PPS_STAMP_MODULUS_MS) {
-        present |= HAS_STATUS;
-        slot->status = word;
-    } else if (word <= PPS_STAMP_MODULUS_MS) {
-        present |= HAS_PPS_AGE;
-        slot->pps_age_ms = word;
-    }
+    uint32_t present = run->format->decode(slot, payload, run->word_is_status);
     if (run->own_status >= 0) {
         present |= HAS_STATUS;
         slot->status |= (uint32_t)run->own_status;
@@ -220,6 +398,33 @@ static void decode(Slot *slot, const uint8_t *payload, const Run *run)
     slot->present = present;
     slot->device_id = (uint16_t)run->device_id;
     slot->sync = (uint8_t)run->sync;
+}
+
+/* Add the value of a frame. Return 0 if the value did not rise, or if it can have restarted. */
+static int add_stamp(Stamps *stamps, int64_t stamp, int64_t arrival_ns)
+{
+    int64_t step = stamp - stamps->stamp, elapsed_ns = arrival_ns - stamps->arrival_ns;
+    if (step <= 0 || step >= PPS_STAMP_MODULUS_MS)
+        return 0;
+    stamps->before = stamps->ticks & UINT32_MAX;
+    stamps->stamp = stamp;
+    stamps->arrival_ns = arrival_ns;
+    stamps->ticks += step;
+    if (llabs(elapsed_ns - step * NS_PER_MS) > LIVE_BREAK_NS) {
+        stamps->live_ticks = stamps->ticks;
+        stamps->live_arrival_ns = arrival_ns;
+    }
+    stamps->lowest_ns += DRIFT * (double)elapsed_ns;
+    double late_ns = (double)(arrival_ns - stamps->origin_ns - stamps->ticks * NS_PER_MS) - stamps->lowest_ns;
+    if (stamps->ticks - stamps->live_ticks >= LIVE_TICKS) {
+        stamps->live_ticks = stamps->ticks;
+        stamps->live_arrival_ns = arrival_ns;
+        if (!(late_ns < TURN_LATE_NS))
+            return 0;
+    }
+    if (late_ns < 0.0)
+        stamps->lowest_ns += late_ns;
+    return 1;
 }
 
 /* Add an arrival to the open bin of the fit. */
@@ -250,11 +455,18 @@ static void add_arrival(Bin *bin, int64_t device_ns, int64_t arrival_ns, int64_t
 static int stamp(Run *run, double *error_ns, Slot *slot, const uint8_t *frame, int64_t trailing_bytes)
 {
     const uint8_t *payload = frame + HEAD_BYTES;
+    const Format *format = run->format;
+    Stamps stamps = run->stamps;
     uint32_t ticks, step;
-    memcpy(&ticks, payload + 8, 4);
-    step = ticks - (uint32_t)run->ticks;
     int64_t trailing_ns = trailing_bytes * run->byte_ns;
-    int64_t arrival_ns = run->t_rx_ns - (FRAME_BYTES * run->byte_ns + trailing_ns + run->offset_ns);
+    int64_t arrival_ns = run->t_rx_ns - (format->frame_bytes * run->byte_ns + trailing_ns + run->offset_ns);
+    memcpy(&ticks, payload + format->ticks_offset, sizeof ticks);
+    if (format->has_stamp) {
+        if (!add_stamp(&stamps, ticks & UINT16_MAX, arrival_ns))
+            return 0;
+        ticks = (uint32_t)stamps.ticks;
+    }
+    step = ticks - (uint32_t)run->ticks;
     /* a gap, a repeated counter value, or a change of the host's rate */
     if (step != run->period_ticks || !step || arrival_ns < run->even_from_ns)
         return 0;
@@ -275,6 +487,7 @@ static int stamp(Run *run, double *error_ns, Slot *slot, const uint8_t *frame, i
         return 0;
     if (is_new)
         add_arrival(&run->bin, next_ns, arrival_ns, trailing_ns, above_ns, run->wait_most);
+    run->stamps = stamps;
     run->ticks = ticks;
     run->device_ns = next_ns;
     run->raw_ns += step_ns;
@@ -297,6 +510,7 @@ static int is_in_range(const Run *run)
     const int64_t times_ns[] = {
         run->seq, run->t_ns, run->t_rx_ns, run->utc_offset_ns / 4, run->waited_ns, run->offset_ns, run->device_ns,
         run->raw_ns, run->ref_arrival_ns, run->ref_device_ns, run->fitted_ns, run->bin.count, run->bin.late,
+        run->stamps.arrival_ns, run->stamps.origin_ns, run->stamps.stamp, run->stamps.live_ticks,
     };
     for (size_t i = 0; i < sizeof times_ns / sizeof *times_ns; i++)
         if (times_ns[i] > TIME_MOST_NS || times_ns[i] < -TIME_MOST_NS)
@@ -304,7 +518,7 @@ static int is_in_range(const Run *run)
     /* limits of the products: 1e9 ns per byte, and 1e6 ns per tick of a step below 2³² */
     return run->seq >= 0 && run->byte_ns >= 0 && run->byte_ns <= 1000000000 && run->tick_ns > 0 &&
            run->tick_ns <= 1000000 && run->own_status <= UINT32_MAX && run->device_id >= 0 &&
-           run->device_id <= UINT16_MAX;
+           run->device_id <= UINT16_MAX && run->stamps.ticks >= 0 && run->stamps.ticks <= TIME_MOST_NS / NS_PER_MS;
 }
 
 enum { DATA, WORD_IS_STATUS, T_RX_NS, UTC_OFFSET_NS, WAITED_NS, OFFSET_NS, EVEN_FROM_NS, ARGUMENTS };
@@ -320,21 +534,34 @@ typedef struct {
 
 static PyObject *run_type;
 
-/* start_hi91(…state…) -> Run, or None if a value is out of range */
-static PyObject *start_hi91(PyObject *self, PyObject *args)
+/* start(device_id, format, …state…) -> Run, or None if Python must process the next frame */
+static PyObject *start(PyObject *self, PyObject *args)
 {
     Run run;
     Bin *bin = &run.bin;
+    Stamps *stamps = &run.stamps;
+    const char *name;
     memset(&run, 0, sizeof run);
     if (!PyArg_ParseTuple(
-            args, "i(iLLLLLdd)(LLLLddLLLLddd)(LLddddLLd):start_hi91", &run.device_id, &run.sync, &run.own_status,
+            args, "is(iLLLLLdd)(LLLLddLLLLddd)(LLddddLLd)(pLLLLLLLd):start", &run.device_id, &name, &run.sync,
+            &run.own_status,
             &run.seq, &run.t_ns, &run.t_rx_ns, &run.byte_ns, &run.bias_ns, &run.fit_error_ns, &run.ticks,
             &run.device_ns, &run.raw_ns, &run.tick_ns, &run.period_ticks, &run.doubt_ns, &run.ref_arrival_ns,
             &run.ref_device_ns, &run.fitted_ns, &run.until_ns, &run.slope, &run.slope_error, &run.wait_most,
             &bin->device_ns, &bin->arrival_ns, &bin->lowest, &bin->wait, &bin->wait_least, &bin->wait_most,
-            &bin->count, &bin->late, &bin->late_ns))
+            &bin->count, &bin->late, &bin->late_ns, &stamps->in_use, &stamps->stamp, &stamps->before, &stamps->ticks,
+            &stamps->arrival_ns, &stamps->origin_ns, &stamps->live_ticks, &stamps->live_arrival_ns, &stamps->lowest_ns))
         return NULL;
-    if (!is_in_range(&run))
+    for (size_t i = 0; i < sizeof formats / sizeof *formats; i++)
+        if (!strcmp(name, formats[i].name))
+            run.format = formats + i;
+    if (run.format == NULL) {
+        PyErr_Format(PyExc_ValueError, "start: expected a format of the kernel, got %s", name);
+        return NULL;
+    }
+    /* the counter of the newest frame must be the value of `StampTime` */
+    if (!is_in_range(&run) ||
+        (run.format->has_stamp && !(stamps->in_use && (stamps->ticks & UINT32_MAX) == run.ticks)))
         Py_RETURN_NONE;
     RunObject *made = PyObject_New(RunObject, (PyTypeObject *)run_type);
     if (made == NULL)
@@ -380,7 +607,7 @@ static PyObject *stamp_frames(RunObject *self, PyObject *const *args, Py_ssize_t
 {
     Run *run = &self->run;
     char *data;
-    Py_ssize_t size, done = 0;
+    Py_ssize_t size, done = 0, frame_bytes = run->format->frame_bytes;
     int64_t t_rx_ns, t_rx_before_ns = run->t_rx_ns;
     if (count != ARGUMENTS) {
         PyErr_Format(PyExc_TypeError, "stamp: expected %d arguments, got %zd", ARGUMENTS, count);
@@ -401,8 +628,8 @@ static PyObject *stamp_frames(RunObject *self, PyObject *const *args, Py_ssize_t
         return NULL;
     if (t_rx_ns > run->t_rx_ns)
         run->t_rx_ns = t_rx_ns;
-    Py_ssize_t most = size <= INT32_MAX && is_in_range(run) ? size / FRAME_BYTES : 0;
-    while (done < most && is_usual((const uint8_t *)data + done * FRAME_BYTES))
+    Py_ssize_t most = size <= INT32_MAX && is_in_range(run) ? size / frame_bytes : 0;
+    while (done < most && run->format->is_usual((const uint8_t *)data + done * frame_bytes))
         done++;
     PyObject *slots = PyBytes_FromStringAndSize(NULL, done * (Py_ssize_t)sizeof(Slot));
     if (slots == NULL) {
@@ -413,8 +640,8 @@ static PyObject *stamp_frames(RunObject *self, PyObject *const *args, Py_ssize_t
     most = done;
     for (done = 0; done < most; done++) {
         double error_ns;
-        if (!stamp(run, &error_ns, slot + done, (const uint8_t *)data + done * FRAME_BYTES,
-                   size - (done + 1) * FRAME_BYTES))
+        if (!stamp(run, &error_ns, slot + done, (const uint8_t *)data + done * frame_bytes,
+                   size - (done + 1) * frame_bytes))
             break;
         self->error_ns = error_ns;
     }
@@ -429,14 +656,21 @@ static PyObject *stamp_frames(RunObject *self, PyObject *const *args, Py_ssize_t
     return slots;
 }
 
-/* Run.state() -> frames, ticks, seq, t_ns, t_rx_ns, error_ns, bin, number of arrivals that were added to the bin */
+/* Run.state() -> frames, ticks, seq, t_ns, t_rx_ns, error_ns, bin, number of arrivals that were added to the bin, and
+ * the state of `StampTime`, None if the format does not use it */
 static PyObject *state_of(RunObject *self, PyObject *unused)
 {
     const Run *run = &self->run;
     const Bin *bin = &run->bin;
-    return Py_BuildValue("LLLLLd(LLddddLLd)L", self->frames, run->ticks, run->seq, run->t_ns, run->t_rx_ns,
+    const Stamps *stamps = &run->stamps;
+    PyObject *kept = run->format->has_stamp
+                         ? Py_BuildValue("iLLLLLLLd", stamps->in_use, stamps->stamp, stamps->before, stamps->ticks,
+                                         stamps->arrival_ns, stamps->origin_ns, stamps->live_ticks,
+                                         stamps->live_arrival_ns, stamps->lowest_ns)
+                         : Py_NewRef(Py_None);
+    return Py_BuildValue("LLLLLd(LLddddLLd)LN", self->frames, run->ticks, run->seq, run->t_ns, run->t_rx_ns,
                          self->error_ns, bin->device_ns, bin->arrival_ns, bin->lowest, bin->wait, bin->wait_least,
-                         bin->wait_most, bin->count, bin->late, bin->late_ns, bin->added);
+                         bin->wait_most, bin->count, bin->late, bin->late_ns, bin->added, kept);
 }
 
 static void free_run(PyObject *self)
@@ -706,7 +940,7 @@ static PyMethodDef methods[] = {
     {"add_slots", add_slots, METH_VARARGS, "Add slots to the minimum and maximum of a second."},
     {"frame_slots", frame_slots, METH_O, "Return slots as messages of the socket, back to back."},
     {"open_ring", open_ring, METH_VARARGS, "Return a Ring in the memory of a file."},
-    {"start_hi91", start_hi91, METH_VARARGS, "Return a Run for HI91 frames that starts with a state; or None."},
+    {"start", start, METH_VARARGS, "Return a Run for frames of a format that starts with a state; or None."},
     {NULL, NULL, 0, NULL},
 };
 

@@ -3,11 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import msgspec
 
 from imud.contracts.script import Message, ReplyFrame, TextLine, Transfer
+from imud.formats.kernel import KernelFormat
 from imud.model.errors import TransferError
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
@@ -72,7 +73,7 @@ def count_unknown(counts: dict[int, int], frame_type: int) -> None:
 class KernelCodec(Protocol):
     """Codec of frames that the kernel decodes. `imud.drivers` implements it, and the sample path may not import it."""
 
-    kernel_start: ClassVar[str]  # name of the function of the kernel that starts a run
+    kernel_format: KernelFormat  # format of the newest frame. The kernel decodes only frames of this format.
     word_is_status: bool  # whether a word of the frame contains status bits
 
     def usual_frames(self, data: bytes) -> bytes:

@@ -5,9 +5,6 @@ ranges in the manuals: the widest field of an acceleration and of an angular rat
 (manual B, section 5.1; most sensors have ±16 g and ±2000 °/s), the widest field of a magnetic field is HI92 with ±1000
 µT (section 3.3.2). No sensor measures a temperature outside -128 … 150 °C. An angle beyond a full turn is not an angle.
 A quaternion is a rotation only if its length is 1.
-
-The high byte of a float shows its magnitude up to a factor of 4. Thus one call shows whether all values of many frames
-are usual: accelerations below 32 g, other values below 2048. Only other frames need a check of each value.
 """
 
 from collections.abc import Sequence
@@ -23,28 +20,8 @@ MAG_LIMIT_UT: Final = 4000.0
 TEMPERATURE_LIMITS_C: Final = (-128.0, 150.0)  # a measured temperature is above the first value, up to the second, °C
 TURN_DEG: Final = 360.001  # no angle reaches this magnitude: a full turn with its rounding
 TURN_RAD: Final = TURN_DEG * RAD_PER_DEG
-# Squared length of three angles, degrees, below which no angle is beyond a full turn: one comparison in a fast path
-TURN_SQUARE: Final = 360.0**2
 # Limits of the squared length of a rotation: 0.98² and 1.02². Rounding to 16 bits changes the length by 1e-4.
 QUAT_SQUARE_MIN, QUAT_SQUARE_MAX = 0.9604, 1.0404
-
-# High bytes of little-endian 32-bit floats inside the limits. The high byte is the sign and the
-# upper seven bits of the exponent: 32 is 0x42000000, 2048 is 0x45000000, ±128 is 0x43000000 and 0xC3000000.
-ACCEL_HIGH_BYTES: Final = bytes(byte for byte in range(256) if byte & 0x7F < 0x42)
-VALUE_HIGH_BYTES: Final = bytes(byte for byte in range(256) if byte & 0x7F < 0x45)
-TEMPERATURE_HIGH_BYTES: Final = bytes([*range(0x43), *range(0x80, 0xC3)])
-
-
-def are_usual(accel: bytes | bytearray, others: bytes | bytearray) -> bool:
-    """Return whether all floats with these high bytes are usual. NaN and infinity are not usual."""
-    # for less than about 30 bytes, `not accel.strip(ACCEL_HIGH_BYTES)` is faster
-    return not (accel.translate(None, ACCEL_HIGH_BYTES) or others.translate(None, VALUE_HIGH_BYTES))
-
-
-def temperatures_possible(high_bytes: bytes | bytearray) -> bool:
-    """Return whether all temperatures with these high bytes are inside ±128 °C. `possible_temperature_c` decides the
-    other temperatures."""
-    return not high_bytes.translate(None, TEMPERATURE_HIGH_BYTES)
 
 
 def are_within(values: Sequence[float], limit: float) -> bool:

@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 from zlib import crc32
 
 from imud.model.errors import reason_of
+from imud.model.ledger import Ledger
 
 SOURCE: Final = Path(__file__).parent.parent / "_kernel.c"
 
@@ -34,6 +35,30 @@ def load(setting: str | None) -> Kernel:
     if getattr(module, "source_crc", None) != source_crc:  # a checkout with an older library
         return Kernel(None, "it was compiled from another version of imud/_kernel.c; compile it again")
     return Kernel(module)
+
+
+class KernelFormat(NamedTuple):
+    """Format of frames that the kernel decodes."""
+
+    name: str  # name in the table `formats` of the kernel
+    head: bytes  # first bytes of every frame
+    size_bytes: int  # size of a frame
+
+    def take(self, ledger: Ledger, frames: bytes, count: int, data: bytes) -> tuple[bytes, bytes]:
+        """Count the first `count` frames as samples. `frames` are the pending bytes of a codec and new bytes `data`.
+        Return the new pending bytes, which start a frame, and the end of `data` that the codec must decode."""
+        size = count * self.size_bytes
+        ledger.bytes_in_good_frames += size
+        ledger.frames_good += count
+        ledger.frames_in_samples += count
+        if frames is data and size == len(data):  # the usual case: complete frames only
+            ledger.bytes_in += size
+            return b"", b""
+        rest = frames[size:]
+        is_start = len(rest) < self.size_bytes and rest[: len(self.head)] == self.head[: len(rest)]
+        ledger.bytes_in += len(data) if is_start else len(data) - len(rest)
+        ledger.bytes_pending = len(rest) if is_start else 0
+        return (rest, b"") if is_start else (b"", rest)
 
 
 # Kernel of this process. Users read it at each call, so that a test can replace it.

@@ -283,12 +283,12 @@ class SampleClock:
         return self._t_rx_ns if self._run is None else int(self._run.t_rx_ns)
 
     def stamp_frames(
-        self, start: StartRun, frames: bytes, word_is_status: bool, t_rx_ns: int, utc_offset_ns: int
+        self, start: StartRun, kind: str, frames: bytes, word_is_status: bool, t_rx_ns: int, utc_offset_ns: int
     ) -> bytes:
-        """Return the slots of the usual frames at the start of the bytes, as `add_run`; empty if `sample` or `add_run`
-        must process the first frame. The kernel then keeps the state until `settle`."""
+        """Return the slots of the usual frames of a kind at the start of the bytes, as `add_run`; empty if `sample` or
+        `add_run` must process the first frame. The kernel then keeps the state until `settle`."""
         run, host = self._run, self._host
-        if run is None and (run := self._start_run(start)) is None:
+        if run is None and (run := self._start_run(start, kind)) is None:
             return b""
         try:
             slots: bytes = run.stamp(
@@ -300,7 +300,7 @@ class SampleClock:
             self._run, self.missed = run, 0
         return slots
 
-    def _start_run(self, start: StartRun) -> Any:
+    def _start_run(self, start: StartRun, kind: str) -> Any:
         """Return a run of the kernel with the present state; None if the next frames need Python."""
         time, fit = self._time, self._fit
         if (
@@ -310,6 +310,7 @@ class SampleClock:
             return None
         try:
             return start(
+                kind,
                 (
                     SYNC_CODES[self._fit_sync], -1 if self._own_status is None else self._own_status, self._seq,
                     self._t_ns, self._t_rx_ns, self._delay.byte_ns or 1, self._fit_bias_ns, self._fit_error_ns,
@@ -319,7 +320,7 @@ class SampleClock:
                     fit.ref_arrival_ns, fit.ref_device_ns, fit.fitted_ns, fit.until_ns, fit.slope, fit.slope_error,
                     fit.wait_most,
                 ),
-                fit.open_bin(),
+                fit.open_bin(), StampTime.NO_STATE if self._stamps is None else self._stamps.state(),
             )  # fmt: skip
         except OverflowError:  # a value with more than 64 bits, for example after many jumps of the counter
             return None
@@ -331,7 +332,9 @@ class SampleClock:
             return
         fit = self._fit
         assert fit is not None
-        frames, ticks, self._seq, self._t_ns, self._t_rx_ns, error_ns, open_bin, added = run.state()
+        frames, ticks, self._seq, self._t_ns, self._t_rx_ns, error_ns, open_bin, added, stamps = run.state()
+        if self._stamps is not None and stamps is not None:
+            self._stamps.set_state(stamps)
         self._time.advance_evenly(ticks, frames)
         fit.set_open_bin(open_bin, added)
         self._error_ns = error_ns

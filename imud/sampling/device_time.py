@@ -9,7 +9,7 @@
 """
 
 from collections.abc import Callable
-from typing import Final
+from typing import ClassVar, Final
 
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from imud.sampling.arrival_fit import SLOPE_HIGHEST, ArrivalFit
@@ -580,6 +580,7 @@ STUCK_MESSAGES: Final = 8
 # time without a frame with device time after which `pps_age_ms` makes the time stamps, ns
 FOREIGN_NS: Final = 1000 * NS_PER_MS
 WRAP: Final = 1 << 32
+StampState = tuple[bool, int, int, int, int, int, int, int, float]
 DAY_NS: Final = 86_400 * NS_PER_S
 DAY_EDGE_NS: Final = 2 * NS_PER_S  # maximum distance of a sample to the end of a day, ns: two periods of 1 s
 
@@ -591,6 +592,8 @@ class StampTime:
         "_arrival_ns", "_foreign_since_ns", "_foreign_ticks", "_live_arrival_ns", "_live_ticks", "_lowest_ns",
         "_modulus", "_origin_ns", "_pulsed", "_stamp", "_stuck", "_ticks", "before", "in_use",
     )  # fmt: skip
+
+    NO_STATE: ClassVar[StampState] = (False, 0, 0, 0, 0, 0, 0, 0, 0.0)
 
     def __init__(self, modulus: int) -> None:
         self._modulus = modulus
@@ -628,6 +631,21 @@ class StampTime:
         self._follow(arrival_ns, elapsed_ns)
         self.in_use = True
         return self._ticks % WRAP
+
+    def state(self) -> StampState:
+        """Return the state of the newest frame. The C kernel changes this state."""
+        return (
+            self.in_use, self._stamp, self.before, self._ticks, self._arrival_ns, self._origin_ns, self._live_ticks,
+            self._live_arrival_ns, self._lowest_ns,
+        )  # fmt: skip
+
+    def set_state(self, state: StampState) -> None:
+        """Set the state after frames of the kernel, at least one."""
+        (
+            _, self._stamp, self.before, self._ticks, self._arrival_ns, _, self._live_ticks, self._live_arrival_ns,
+            self._lowest_ns,
+        ) = state  # fmt: skip
+        self._stuck, self._foreign_ticks = 0, None
 
     def restart(self) -> None:
         """Start again: the device or its link was missing."""

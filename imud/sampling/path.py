@@ -309,7 +309,7 @@ class StreamPath(SamplePath):
         self._drain_edges = drain_edges
         self._start_run: StartRun | None = None  # None if Python decodes all frames
         if isinstance(codec, KernelCodec) and context.device_id <= DEVICE_ID_MOST and kernel.present.module is not None:
-            self._start_run = partial(getattr(kernel.present.module, codec.kernel_start), context.device_id)
+            self._start_run = partial(kernel.present.module.start, context.device_id)
         # samples that `publish_gathered` will publish, oldest first: packed slots of the kernel, then sample objects.
         # Not two lists: an object with more than 30 attributes is slower.
         self.gathered: list[Sample | bytes] = []
@@ -382,7 +382,8 @@ class StreamPath(SamplePath):
         packed, start, utc_offset = b"", self._start_run, self._utc_offset_ns
         utc_offset_ns = utc_offset()  # in all cases: the result must not depend on the use of the kernel
         if start is not None and use_kernel and (frames := codec.usual_frames(data)):
-            packed = self.clock.stamp_frames(start, frames, codec.word_is_status, t_rx_ns, utc_offset_ns)
+            kind = codec.kernel_format.name
+            packed = self.clock.stamp_frames(start, kind, frames, codec.word_is_status, t_rx_ns, utc_offset_ns)
             if packed:
                 self.loss.bad_frames = 0
                 data = codec.take(frames, len(packed) // SLOT_BYTES, data)

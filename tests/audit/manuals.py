@@ -163,14 +163,14 @@ B 3.1 sub-packets | several in one frame, each with its tag | drivers.hipnuc.uar
 B 3.2 factory output | HI91 at 100 Hz | sim.hipnuc.uart_settings:ModuleSettings
 B 3.3.1 size | 76 bytes, tag 0x91 | drivers.hipnuc.uart.codec:HI91
 B 3.3.1 pps_sync_stamp | ms since the last pulse, wraps at 8192 | drivers.hipnuc.uart.codec:PPS_STAMP_MODULUS_MS
-B 3.3.1 temperature | °C | drivers.hipnuc.uart.codec:decode_hi91
-B 3.3.1 air_pressure | Pa (ERRATA B35) | drivers.hipnuc.uart.codec:decode_hi91
-B 3.3.1 system_time | ms since power-on | drivers.hipnuc.uart.codec:decode_hi91
-B 3.3.1 acceleration | G | drivers.hipnuc.uart.codec:decode_hi91
-B 3.3.1 angular rate | °/s | drivers.hipnuc.uart.codec:decode_hi91
-B 3.3.1 magnetic field | µT | drivers.hipnuc.uart.codec:decode_hi91
-B 3.3.1 angles | roll, pitch, yaw in degrees | drivers.hipnuc.uart.codec:decode_hi91
-B 3.3.1 quaternion | W, X, Y, Z | drivers.hipnuc.uart.codec:decode_hi91
+B 3.3.1 temperature | °C | drivers.hipnuc.uart.codec:_decode_hi91
+B 3.3.1 air_pressure | Pa (ERRATA B35) | drivers.hipnuc.uart.codec:_decode_hi91
+B 3.3.1 system_time | ms since power-on | drivers.hipnuc.uart.codec:_decode_hi91
+B 3.3.1 acceleration | G | drivers.hipnuc.uart.codec:_decode_hi91
+B 3.3.1 angular rate | °/s | drivers.hipnuc.uart.codec:_decode_hi91
+B 3.3.1 magnetic field | µT | drivers.hipnuc.uart.codec:_decode_hi91
+B 3.3.1 angles | roll, pitch, yaw in degrees | drivers.hipnuc.uart.codec:_decode_hi91
+B 3.3.1 quaternion | W, X, Y, Z | drivers.hipnuc.uart.codec:_decode_hi91
 B 3.3.2 size | 48 bytes, tag 0x92 | drivers.hipnuc.uart.codec:HI92
 B 3.3.2 status | | drivers.hipnuc.uart.codec:HI92
 B 3.3.2 temperature | °C | drivers.hipnuc.uart.codec:HI92

@@ -1,4 +1,4 @@
-"""The rules on high bytes and on numbers agree. No driver lets an impossible value pass, and no output raises."""
+"""No driver lets an impossible value pass, and no output raises."""
 
 import struct
 from collections.abc import Iterable
@@ -40,19 +40,6 @@ from imud.publishers.nmea0183 import Formatter, HeadingReference, make
 from imud.publishers.socket.history import History, buckets
 from imud.publishers.socket.outbox import BinaryEncoding, JsonEncoding
 from imud.web.hub import bucket_of, raw_of
-
-
-def high_byte(value: float) -> bytes:
-    return struct.pack("<f", value)[3:]
-
-
-@given(st.floats(width=32))
-def test_a_usual_high_byte_has_no_impossible_value(value: float) -> None:
-    byte = high_byte(value)
-    assert value_limits.are_usual(byte, b"") == (-32 < value < 32)
-    assert value_limits.are_usual(b"", byte) == (-2048 < value < 2048)
-    assert value_limits.temperatures_possible(byte) == (-128 < value < 128)
-    assert (value_limits.possible_temperature_c(value) is not None) == (-128 < value <= 150)
 
 
 def test_limits_of_values_and_temperatures() -> None:

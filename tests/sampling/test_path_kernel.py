@@ -5,10 +5,10 @@ import math
 import os
 import struct
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from random import Random
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 from unittest.mock import Mock
 
 import pytest
@@ -20,6 +20,7 @@ from imud.attitude.published import published_frame
 from imud.contracts.publisher import AS_SENT, Batch
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucOptions, encode_frame, encode_hi92
+from imud.drivers.imu61x.uart import codec as imu61x
 from imud.formats import kernel
 from imud.formats.slot import SLOT_BYTES
 from imud.host.clock import HostClock
@@ -31,6 +32,7 @@ from imud.sampling.path import PathContext, StreamPath, make_clock
 from tests.support.event_loops import UTC_AHEAD_NS
 from tests.support.files import hi91
 
+Word = Literal["pps", "status"]
 BYTE_NS = 10_851
 SETTLE = 400  # frames of 1 ms until imud uses the fit and does not watch the counter
 BEGIN_NS = 1000 * 10**9
@@ -57,39 +59,88 @@ class Step(NamedTuple):
 STEPS = st.builds(
     Step, st.integers(0, 12), st.sampled_from([0, 0, 0, 1, 2, 5, 40, 81]),
     st.none() | st.none() | st.integers(0, 900),
-    st.sampled_from(["usual"] * 3 + ["nan", "text", "hi92", "zeros", "word", "hot", "pressure", "reset", "long"]),
+    st.sampled_from(["usual"] * 4 + ["extreme"] * 2 + ["nan", "text", "other", "zeros", "word", "hot", "pressure",
+                                                       "reset", "long"]),
     st.sampled_from([0, 0, 0, 1, 7, -3, 10**6, 2**31]), st.sampled_from([0, 0, 30, 900, 20_000, 700_000]),
     st.sampled_from([-1, -1, 0, 5, 30]), st.booleans(), st.sampled_from([0, 0, 0, 400, 20_000, -90_000]),
     st.sampled_from([None, None, 0, 1 << 31]),
 )  # fmt: skip
+EXTREME = [math.nan, math.inf, 3e38, 1e-45, 40, 31.9, -2047, 360, 360.0005, 361, -128, 150, 151, 0.98, 0, -0.0]
+COUNTS = ((0x7FFF, 0x7FFF), (-0x8000, -0x8000), (-1, -1), (0x7F7F, 0x7F7F), (9800, 1))
+WORDS = [*(struct.pack("<f", value) for value in EXTREME), *(struct.pack("<2h", *pair) for pair in COUNTS)]
 
 
-def changed(frame: bytes, at: int, data: bytes) -> bytes:
-    """Return the frame with other bytes in its payload and a correct check value."""
-    payload = bytearray(frame[6:])
-    payload[at : at + len(data)] = data
-    return encode_frame(bytes(payload))
+def values(ms: int) -> dict[str, Any]:
+    euler_rad = (0.01 * (ms % 300), -0.7, ms % 6)
+    return {"accel_m_s2": (1, -2, ms % 9), "gyro_rad_s": (0.1, -2, ms % 7), "euler_rad": euler_rad, "temperature_c": -3}
 
 
-KINDS: dict[str, Any] = {
-    "nan": lambda frame: changed(frame, 12, struct.pack("<f", float("nan"))),
-    "text": lambda frame: b"OK\r\n" + frame,
-    "hi92": lambda frame: frame + encode_hi92(
-        pps_stamp_ms=3, accel_m_s2=(1, 2, 3), gyro_rad_s=(0, 0, 0), mag_t=(0, 0, 0), euler_rad=(0, 0, 0),
-        quat_wxyz=(1, 0, 0, 0), temperature_c=3, pressure_pa=100_000,
-    ),
-    "zeros": lambda frame: changed(frame, 36, bytes(12) + frame[54:66] + bytes(16)),
-    "long": lambda frame: changed(frame, 60, struct.pack("<4f", 3.28, 0, 0, 0)),
-    "word": lambda frame: changed(frame, 1, b"\xff\xff\x80"),
-    "hot": lambda frame: changed(frame, 24, struct.pack("<f", 140_000.0)),
-    "pressure": lambda frame: changed(frame, 4, struct.pack("<f", 12.5)),
+def hi92(ms: int) -> bytes:
+    mag_t, quat, pressure_pa = (2e-5, 0, -4e-5), (1, 0, 0, 0), 101_000 + ms % 7
+    return encode_hi92(pps_stamp_ms=ms % 8192, mag_t=mag_t, quat_wxyz=quat, pressure_pa=pressure_pa, **values(ms))
+
+
+def ahrs(ms: int) -> bytes:
+    return imu61x.encode_ahrs(timer_us=1000 * ms, **values(ms))
+
+
+class Format(NamedTuple):
+    driver: str
+    frame: Callable[[int], bytes]  # returns the frame of a device time, ms
+    other: bytes  # a frame that the kernel does not decode
+    data_at: slice  # values in the payload that a frame of random words changes
+    changes: Mapping[str, Sequence[tuple[int, bytes]]]  # changed bytes of the payload by kind of a step
+
+    def changed(self, frame: bytes, changes: Sequence[tuple[int, bytes]]) -> bytes:
+        """Return the frame with other bytes in its payload and a correct check value."""
+        is_ahrs = self.frame is ahrs
+        payload = bytearray(frame[6:-4] if is_ahrs else frame[6:])
+        for at, data in changes:
+            payload[at : at + len(data)] = data
+        if is_ahrs:
+            return imu61x.encode_frame(imu61x.DEVICE_SYNC, imu61x.AHRS_FRAME, bytes(payload))
+        return encode_frame(bytes(payload))
+
+    def of_kind(self, kind: str, ms: int) -> bytes:
+        frame = self.frame(ms)
+        if kind == "text":
+            return b"OK\r\n" + frame
+        if kind == "other":
+            return frame + self.other
+        if kind == "extreme":  # at most three extreme values: the others show whether each value is at its place
+            random, words = Random(ms), range(self.data_at.start, self.data_at.stop, 4)
+            return self.changed(
+                frame, [(random.choice(words), random.choice(WORDS)) for _ in range(random.randint(1, 3))]
+            )
+        return self.changed(frame, self.changes.get(kind, ()))
+
+
+def floats(*values: float) -> bytes:
+    return struct.pack(f"<{len(values)}f", *values)
+
+
+FORMATS = {
+    "HI91": Format("hipnuc-uart", hi91, hi92(3), slice(12, 76), {
+        "nan": [(12, floats(math.nan))], "zeros": [(36, bytes(12)), (60, bytes(16))],
+        "long": [(60, floats(3.28, 0, 0, 0))], "word": [(1, b"\xff\xff\x80")], "hot": [(24, floats(140_000.0))],
+        "pressure": [(4, floats(12.5))],
+    }),
+    "HI92": Format("hipnuc-uart", hi92, hi91(3), slice(8, 48), {
+        "nan": [(28, b"\xff\xff\xff\x7f")], "zeros": [(22, bytes(6)), (40, bytes(8))], "long": [(40, b"\xff\x7f")],
+        "word": [(1, b"\xff\xff"), (4, b"\xff\xff")], "hot": [(3, b"\x80")], "pressure": [(6, b"\xff\x7f")],
+    }),
+    "AHRS": Format("imu61x-uart", ahrs, imu61x.encode_acknowledgement(3), slice(4, 44), {
+        "nan": [(16, floats(math.nan))], "zeros": [(4, bytes(40))], "long": [(4, floats(360.0, -360.0, 360.0005))],
+        "word": [(4, floats(-0.0, -0.0))], "hot": [(40, floats(151.0))], "pressure": [(28, floats(-4001.0))],
+    }),
 }  # fmt: skip
 
 
 class Run:
     """A path that processes steps, with or without the kernel."""
 
-    def __init__(self, options: HipnucOptions, turned: bool) -> None:
+    def __init__(self, of: Format, word: Word, turned: bool) -> None:
+        self.of = of
         self.slots = b""
         self.now_ns, self.slewed_ns, self.ms, self.number = BEGIN_NS, 0, 0, 0
         self.kernel_batches, self.held = 0, list[bool]()
@@ -103,10 +154,12 @@ class Run:
             "bow", 3, self.ledger, self.publish, self.seen.message, self.seen.bad_frame, lambda: 0, host, frame
         )
         clock: SampleClock = make_clock(
-            "bow", None, DRIVERS["hipnuc-uart"], None, host=host.steady, byte_ns=BYTE_NS,
+            "bow", None, DRIVERS[of.driver], None, host=host.steady, byte_ns=BYTE_NS,
             on_unknown_gap=self.ledger.add_unknown_gap,
         )  # fmt: skip
-        self.path = StreamPath(HipnucCodec(self.ledger, options), clock, context)
+        is_ahrs = of.driver == "imu61x-uart"
+        codec = imu61x.Imu61xCodec(self.ledger) if is_ahrs else HipnucCodec(self.ledger, HipnucOptions(hi91_word=word))
+        self.path = StreamPath(codec, clock, context)
         self.path.watch_status(0xFFFF_FFFF)
         self.path.observe(self.seen.observer)
 
@@ -125,8 +178,7 @@ class Run:
         for number in range(step.frames):
             self.ms += 1
             self.now_ns += NS_PER_MS + 40
-            frame = hi91(self.ms % 2**32)
-            stream += KINDS.get(step.kind, bytes)(frame) if number == step.frames // 2 else frame
+            stream += self.of.of_kind(step.kind if number == step.frames // 2 else "usual", self.ms % 2**32)
         self.number += 1
         self.now_ns += self.number * 7919 % 97 * 1000
         data = bytearray(stream[: len(stream) - step.cut])
@@ -156,10 +208,10 @@ class Run:
         )  # fmt: skip
 
 
-def play(steps: Sequence[Step], options: HipnucOptions, turned: bool, found: kernel.Kernel) -> Run:
+def play(steps: Sequence[Step], of: Format, found: kernel.Kernel, word: Word = "pps", turned: bool = False) -> Run:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernel, "present", found)
-        run = Run(options, turned)
+        run = Run(of, word, turned)
         for _ in range(SETTLE // 4):
             run.do(Step(4))
         for step in steps:
@@ -167,13 +219,13 @@ def play(steps: Sequence[Step], options: HipnucOptions, turned: bool, found: ker
     return run
 
 
-@given(
-    st.lists(STEPS, max_size=30), st.sampled_from([HipnucOptions(), HipnucOptions(hi91_word="status")]), st.booleans()
-)
-@example([Step(1), Step(2, waited_ms=0, publish=False), Step(1, waited_ms=5)], HipnucOptions(), False)
-def test_kernel_and_python_are_equal(steps: list[Step], options: HipnucOptions, turned: bool) -> None:
-    by_kernel, by_python = (play(steps, options, turned, one) for one in (kernel.present, kernel.Kernel(None)))
-    for one, other in zip(by_kernel.result(), by_python.result(), strict=True):
+@pytest.mark.parametrize("name", FORMATS)
+@given(steps=st.lists(STEPS, max_size=30), word=st.sampled_from(["pps", "status"]), turned=st.booleans())
+@example(steps=[Step(1), Step(2, waited_ms=0, publish=False), Step(1, waited_ms=5)], word="pps", turned=False)
+@example(steps=[Step(2, cut=5, damage=0), Step(10, slew_ns=20_000)], word="pps", turned=False)
+def test_kernel_and_python_are_equal(name: str, steps: list[Step], word: Word, turned: bool) -> None:
+    results = [play(steps, FORMATS[name], one, word, turned).result() for one in (kernel.present, kernel.Kernel(None))]
+    for one, other in zip(*results, strict=True):
         assert one == other
 
 
@@ -194,42 +246,48 @@ def test_none_keeps_its_references() -> None:
     assert abs(sys.getrefcount(None) - before) < 100
 
 
-def test_the_kernel_accepts_any_bytes_and_numbers(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_kernel_accepts_any_bytes_and_numbers(tmp_path: Path, name: str) -> None:
     module, file = kernel.present.module, os.open(tmp_path / "ring", os.O_RDWR | os.O_CREAT)
     assert module is not None
     os.ftruncate(file, 4096 + 8 * SLOT_BYTES)
     calls = Mock(wraps=module)
-    run = play([Step(10)] * 10, HipnucOptions(), False, kernel.Kernel(calls))
-    values, t_rx_ns = calls.start_hi91.call_args.args, run.path.clock.t_rx_ns
-    data = b"".join(hi91(values[2][0] + number) for number in range(1, 11))
+    of = FORMATS[name]
+    run = play([Step(10)] * 10, of, kernel.Kernel(calls))
+    values, t_rx_ns = calls.start.call_args.args, run.path.clock.t_rx_ns
+    tick = 1 if name != "AHRS" else 1000
+    data = b"".join(of.frame(values[3][0] // tick + number) for number in range(1, 11))
     random, made_slots = Random(25), 0
     for _ in range(3000):
         stream = bytearray(data[: random.choice([len(data), random.randrange(len(data) + 1)])])
         if stream and random.random() < 0.3:
             stream[random.randrange(len(stream))] ^= random.randrange(1, 256)
-        groups = [[values[0]], *map(list, values[1:]), [1, t_rx_ns + 10 * NS_PER_MS, UTC_AHEAD_NS, 0, 0, 0]]
+        groups = [[values[0]], *map(list, values[2:]), [1, t_rx_ns + 10 * NS_PER_MS, UTC_AHEAD_NS, 0, 0, 0]]
         for _ in range(random.randrange(4)):
             group = random.choice(groups)
             group[random.randrange(len(group))] = random.choice(EXTREMES)
         (device_id,), *state, arguments = groups
         with contextlib.suppress(OverflowError, TypeError):  # 2⁶⁴, and a float in place of an integer
-            made = module.start_hi91(device_id, *map(tuple, state))
+            made = module.start(device_id, name, *map(tuple, state))
             for _ in range(2):
                 slots = b"" if made is None else made.stamp(bytes(stream), *arguments)
-                assert len(slots) <= len(stream) // len(hi91(0)) * SLOT_BYTES
+                assert len(slots) <= len(stream) // len(of.frame(0)) * SLOT_BYTES
                 assert len(module.frame_slots(slots)) == len(slots) + 4 * (len(slots) // SLOT_BYTES)
                 with contextlib.suppress(ValueError):  # a memory that is too small for the ring
                     memory = bytearray(random.choice([4096 + SLOT_BYTES, 4096 + 8 * SLOT_BYTES]))
                     ring = module.open_ring(memory, random.choice([0, 7, *EXTREMES]), random.choice(EXTREMES), file)
                     assert ring.write(slots)
-                assert made is None or len(made.state()) == 8
+                assert made is None or len(made.state()) == 9
                 made_slots += bool(slots)
     os.close(file)
     assert made_slots > 300
+    with pytest.raises(ValueError, match=f"expected a format of the kernel, got x{name}"):
+        module.start(values[0], f"x{name}", *values[2:])
 
 
 @pytest.mark.parametrize("cut", [0, 40])
-def test_the_kernel_makes_the_samples_of_usual_reads(cut: int) -> None:
-    run = play([Step(10, cut)] * 50, HipnucOptions(), False, kernel.present)
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_kernel_makes_the_samples_of_usual_reads(name: str, cut: int) -> None:
+    run = play([Step(10, cut)] * 50, FORMATS[name], kernel.present)
     assert run.kernel_batches > 20  # a young fit changes often, and Python makes the samples of such a read
     assert run.ledger.closes()

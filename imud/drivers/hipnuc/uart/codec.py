@@ -13,9 +13,7 @@ If the check of a frame fails, the codec skips only its sync word, because a val
 frame. The bytes up to its end by the length field count as bad unless they are valid frames. The codec holds the bytes
 of an incomplete frame, at most FRAME_BYTES_MAX. `flush` ends the wait when the link is idle.
 
-Fast path: at 1 kHz, consecutive HI91 frames go through `_decode_run`. One match finds them, the CRC starts from the CRC
-of the header, one check of the high bytes of all floats finds NaN, and one `iter_unpack` reads all payloads. All other
-frames are decoded one by one. `make bench-instructions` measures the cost.
+The kernel (`imud/_kernel.c`) decodes usual frames in less CPU time. `make bench-instructions` measures the cost.
 """
 
 import re
@@ -23,11 +21,8 @@ import struct
 import sys
 from binascii import crc_hqx as crc16_xmodem
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from math import inf, isfinite
-from typing import Any, ClassVar, Final, Literal, ParamSpec
-
-import msgspec
+from math import isfinite
+from typing import Final, Literal, NamedTuple, ParamSpec
 
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
 from imud.contracts.lines import TimeBits
@@ -35,8 +30,6 @@ from imud.drivers.hipnuc.common import (
     EULER_RAD_PER_LSB,
     M_S2_PER_G,
     MAG_T_PER_LSB,
-    PRESSURE_MAX_PA,
-    PRESSURE_MIN_PA,
     QUAT_PER_LSB,
     byte_temperature_c,
     field_of,
@@ -45,20 +38,14 @@ from imud.drivers.hipnuc.common import (
 )
 from imud.drivers.hipnuc.uart.replies import LINE_CHARACTERS_MAX, LineFinder
 from imud.drivers.value_limits import (
-    ACCEL_HIGH_BYTES,
     ACCEL_LIMIT_G,
     GYRO_LIMIT_DEG_S,
     MAG_LIMIT_UT,
-    QUAT_SQUARE_MAX,
-    QUAT_SQUARE_MIN,
     TURN_DEG,
-    TURN_SQUARE,
-    VALUE_HIGH_BYTES,
-    are_usual,
-    are_within,
     possible_angles,
     possible_quaternion,
 )
+from imud.formats.kernel import KernelFormat
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Quaternion, Vector3
@@ -88,105 +75,41 @@ PRESSURE_OFFSET_PA: Final = 100_000.0
 
 # HI91 without its tag. The word is two bytes. In the native layout, `struct` reads a float in half the time.
 HI91_VALUES: Final = struct.Struct(("@" if sys.byteorder == "little" else "<") + "xBBbfI16f")
-# Slices of the high bytes in HI91 sub-packets: pressure, system_time, 16 floats and the next temperature of adjacent
-# sub-packets (76 is a multiple of 4); the pressures in these bytes; in the rest, the accelerations, the temperatures,
-# and system_time without the temperatures
-_RUN_HIGH_BYTES: Final = slice(7, None, 4)
-_RUN_PRESSURES: Final = slice(0, None, 19)
-_RUN_ACCEL: Final = tuple(slice(at, None, 18) for at in (1, 2, 3))
-_RUN_TEMPERATURES: Final = slice(17, None, 18)
-_RUN_TIMES: Final = slice(0, None, 17)
-# High bytes of the floats of one sub-packet: accelerations, other values
-_ACCEL_HIGH_BYTES: Final = slice(15, 24, 4)
-_OTHER_HIGH_BYTES: Final = slice(27, None, 4)
 
 
-def decode_hi91(values: Sequence[Any], word_is_status: bool, size: int, trailing: int) -> Measurement:
-    """Return the measurement of HI91_VALUES with all values. `size` and `trailing` describe the frame."""
-    low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz = values
-    # a global name costs twice as much as a local name, and a frame uses thirty of them
-    g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
-    temperature = byte_temperature_c(temperature)
-    if (
-        not PRESSURE_MIN_PA <= pressure <= PRESSURE_MAX_PA
-    ):  # `pressure_of` without a call, which costs a tenth of a frame
-        temperature, pressure = temperature_beside(temperature, pressure), None
-    word = low + 256 * high if low + 256 * high <= WORD_MOST else None
-    # a device without magnetometer sends zeros
-    return Measurement(
-        size, trailing, ms, (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad),
-        (mx * tesla, my * tesla, mz * tesla) if mx or my or mz else None,
-        possible_quaternion(qw, qx, qy, qz), (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
-        word if word_is_status else None, None if word_is_status else word,
-    )  # fmt: skip
-
-
-def decode_hi91_run(hi91s: bytes, word_is_status: bool, size: int, trailing: int) -> list[Measurement] | None:
-    """Return `decode_hi91` of adjacent sub-packets with usual values, one per frame.
-
-    None if an angle may be beyond a full turn, or a pressure is not finite. `trailing` bytes follow the first frame.
-    """
-    g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
-    low_pa, high_pa, word_most = PRESSURE_MIN_PA, PRESSURE_MAX_PA, WORD_MOST
-    least, most, turn = QUAT_SQUARE_MIN, QUAT_SQUARE_MAX, TURN_SQUARE
-    made: list[Measurement] = []
-    make, keep = Measurement, made.append
-    # decode_hi91 inline: the call costs a twentieth of the time
-    for (
-        low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
-    ) in HI91_VALUES.iter_unpack(hi91s):  # fmt: skip
-        if roll * roll + pitch * pitch + yaw * yaw > turn:
-            return None
-        # `byte_temperature_c` without a call
-        temperature = temperature + 0.0 if -128 < temperature < 127 else None  # noqa: PLW2901
-        if not low_pa <= pressure <= high_pa:
-            if not isfinite(pressure):
-                return None
-            temperature, pressure = temperature_beside(temperature, pressure), None  # noqa: PLW2901
-        word = low + 256 * high if low + 256 * high <= word_most else None
-        keep(
-            make(
-                size, trailing, ms, (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad),
-                (mx * tesla, my * tesla, mz * tesla) if mx or my or mz else None,
-                (qw, qx, qy, qz) if least < qw * qw + qx * qx + qy * qy + qz * qz < most else None,
-                (roll * rad, pitch * rad, yaw * rad), temperature, pressure, None,
-                word if word_is_status else None, None if word_is_status else word,
-            )
-        )  # fmt: skip
-        trailing -= size
-    return made
-
-
-def _run_usual(hi91s: bytes) -> bool:
-    """Return whether all floats of adjacent sub-packets are usual, except the pressures."""
-    high_bytes = bytearray(hi91s[_RUN_HIGH_BYTES])
-    del high_bytes[_RUN_PRESSURES]
-    x, y, z = _RUN_ACCEL
-    accel = high_bytes[x] + high_bytes[y] + high_bytes[z]
-    if are_usual(accel, high_bytes):
-        return True
-    # a large system_time and a negative temperature have other high bytes
-    del high_bytes[_RUN_TEMPERATURES], high_bytes[_RUN_TIMES]
-    return are_usual(accel, high_bytes)
+# Squares of limits: the square of a 32-bit float is exact
+_LIMIT_SQUARES: Final = (ACCEL_LIMIT_G**2, GYRO_LIMIT_DEG_S**2, MAG_LIMIT_UT**2, TURN_DEG**2)
 
 
 def _decode_hi91(data: bytes, at: int, word_is_status: bool, size: int, trailing: int) -> tuple[Measurement, bool]:
-    values = HI91_VALUES.unpack_from(data, at)
-    measurement = decode_hi91(values, word_is_status, size, trailing)
-    without = {name: None for name, (at, limit) in _GROUPS.items() if not are_within(values[at], limit)}
-    if without:
-        measurement = msgspec.structs.replace(measurement, **without)
-    return measurement, not without and are_within([values[3], *values[_QUAT]], inf)
-
-
-# groups in HI91_VALUES and their limits
-_GROUPS: Final = {
-    "accel_m_s2": (slice(5, 8), ACCEL_LIMIT_G),
-    "gyro_rad_s": (slice(8, 11), GYRO_LIMIT_DEG_S),
-    "mag_t": (slice(11, 14), MAG_LIMIT_UT),
-    "euler_rad": (slice(14, 17), TURN_DEG),
-}
-_QUAT: Final = slice(17, 21)
+    (
+        low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
+    ) = HI91_VALUES.unpack_from(data, at)  # fmt: skip
+    # `scaled` without calls, which cost a fifth of a frame; a global name costs twice as much as a local name
+    g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
+    g_square, deg_s_square, ut_square, turn_square = _LIMIT_SQUARES
+    accel = gyro = mag = euler = None
+    if ax * ax < g_square and ay * ay < g_square and az * az < g_square:
+        accel = (ax * g, ay * g, az * g)
+    if gx * gx < deg_s_square and gy * gy < deg_s_square and gz * gz < deg_s_square:
+        gyro = (gx * rad, gy * rad, gz * rad)
+    has_mag = mx or my or mz  # a device without magnetometer sends zeros
+    if has_mag and mx * mx < ut_square and my * my < ut_square and mz * mz < ut_square:
+        mag = (mx * tesla, my * tesla, mz * tesla)
+    if roll * roll < turn_square and pitch * pitch < turn_square and yaw * yaw < turn_square:
+        euler = (roll * rad, pitch * rad, yaw * rad)
+    temperature_c, pressure_pa = byte_temperature_c(temperature), pressure_of(pressure)
+    if pressure_pa is None:
+        temperature_c = temperature_beside(temperature_c, pressure)
+    word = low + 256 * high if low + 256 * high <= WORD_MOST else None
+    is_finite = (
+        accel is not None and gyro is not None and euler is not None and (mag is not None or not has_mag)
+        and isfinite(pressure + qw + qx + qy + qz)
+    )  # fmt: skip
+    return Measurement(
+        size, trailing, ms, accel, gyro, mag, possible_quaternion(qw, qx, qy, qz), euler, temperature_c, pressure_pa,
+        None, word if word_is_status else None, None if word_is_status else word,
+    ), is_finite  # fmt: skip
 
 
 def _decode_hi92(data: bytes, at: int, _word_is_status: bool, size: int, trailing: int) -> tuple[Measurement, bool]:
@@ -206,10 +129,10 @@ def _decode_hi92(data: bytes, at: int, _word_is_status: bool, size: int, trailin
     ), euler is not None  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class Packet:
+class Packet(NamedTuple):
     """Kind of sub-packet."""
 
+    kernel_format: KernelFormat
     size: int  # size with tag, bytes
     # `decode(data, at, word_is_status, size, trailing)` returns the measurement and whether all values are finite
     decode: Callable[[bytes, int, bool, int, int], tuple[Measurement, bool]]
@@ -225,7 +148,18 @@ def tag_name(tag: int) -> str:
     return f"{name} (tag {tag:#04x})" if name else f"tag {tag:#04x}"
 
 
-PACKETS: Final = {TAG_HI91: Packet(HI91.size, _decode_hi91), TAG_HI92: Packet(HI92.size, _decode_hi92)}
+SYNC: Final = b"\x5a\xa5"
+HEADER: Final = struct.Struct("<2sHH")  # sync word, payload length, CRC
+
+
+def _format(name: str, size: int) -> KernelFormat:
+    return KernelFormat(name, SYNC + size.to_bytes(2, "little"), HEADER.size + size)
+
+
+PACKETS: Final = {
+    TAG_HI91: Packet(_format("HI91", HI91.size), HI91.size, _decode_hi91),
+    TAG_HI92: Packet(_format("HI92", HI92.size), HI92.size, _decode_hi92),
+}
 
 
 def pack_hi91(
@@ -300,27 +234,16 @@ def _clip_float(value: float) -> float:
     return max(-_FLOAT32_MAX, min(_FLOAT32_MAX, value)) if isfinite(value) else value
 
 
-SYNC: Final = b"\x5a\xa5"
-HEADER: Final = struct.Struct("<2sHH")  # sync word, payload length, CRC
 PAYLOAD_BYTES_MAX: Final = 512  # section 3.1; devices make frames in a buffer of 512 bytes, with header
 FRAME_BYTES_MAX: Final = HEADER.size + PAYLOAD_BYTES_MAX
+# CRC of bytes 0 to 3 by the payload length
+_HEAD_CRC: Final = [crc16_xmodem(SYNC + length.to_bytes(2, "little"), 0) for length in range(PAYLOAD_BYTES_MAX + 1)]
 
 # First firmware version (1.6.9) with MAIN_STATUS in bytes 1-2 of HI91; older firmware sends pps_sync_stamp there
 STATUS_SINCE_APP_VER: Final = 169
 # Status bits of MAIN_STATUS about time: frame with a SOUT pulse; `system_time` not synchronized to UTC
 TIME_BITS: Final = TimeBits(sync_out=1 << 12, not_utc=1 << 11)
 
-_HI91_FRAME_BYTES: Final = HEADER.size + HI91.size
-_HI91_HEAD: Final = SYNC + HI91.size.to_bytes(2, "little")
-_RUN_SEED: Final = crc16_xmodem(_HI91_HEAD, 0)
-_RUN_FRAMES_MAX: Final = (
-    64  # imud copies a run out of the buffer; the limit bounds repeated copies after a damaged frame
-)
-# Pattern of adjacent HI91 frames by header and tag
-_RUN: Final = re.compile(
-    rb"(?s:%b..%b.{%d}){1,%d}" % (re.escape(_HI91_HEAD), re.escape(bytes([TAG_HI91])), HI91.size - 1, _RUN_FRAMES_MAX)
-)
-_RUN_PARTS: Final = struct.Struct(f"<4xH{HI91.size}s")  # CRC and payload
 # Pattern of a line directly before the idle time: at least two characters and both line end characters. Shorter text
 # can occur by chance inside an incomplete frame, which `flush` would drop.
 _IDLE_LINE: Final = re.compile(rb"[\t\x20-\x7e]{2,%d}\r\n\Z" % LINE_CHARACTERS_MAX)
@@ -347,6 +270,7 @@ class HipnucCodec:
         self.ledger = ledger
         self.unknown: dict[int, int] = {}  # number of sub-packets by unknown tag
         self.word_is_status = settings.hi91_word == "status"  # whether bytes 1-2 of HI91 are status bits
+        self.kernel_format = PACKETS[TAG_HI91].kernel_format  # of the newest frame
         self._word_is_fixed = settings.hi91_word != "auto"
         self._lines = LineFinder(ledger)
         self._tail = b""  # incomplete rest of the bytes: starts with a sync word, or is the first half of a sync word
@@ -361,25 +285,9 @@ class HipnucCodec:
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
         """Decode the next bytes of the stream. Return the completed events. Never raises an exception."""
         self.ledger.bytes_in += len(data)
-        if len(data) == _HI91_FRAME_BYTES and data.startswith(_HI91_HEAD) and not (self._tail or self._bad_ahead):
-            payload = data[HEADER.size :]  # fast path: the read is exactly one HI91 frame, as at 1 kHz
-            if (
-                crc16_xmodem(payload, _RUN_SEED) == data[4] | data[5] << 8
-                and payload[0] == TAG_HI91
-                and not payload[_ACCEL_HIGH_BYTES].strip(ACCEL_HIGH_BYTES)
-                and not payload[_OTHER_HIGH_BYTES].strip(VALUE_HIGH_BYTES)
-                and (made := decode_hi91_run(payload, self.word_is_status, _HI91_FRAME_BYTES, 0))
-            ):
-                ledger = self.ledger
-                ledger.bytes_in_good_frames += _HI91_FRAME_BYTES
-                ledger.frames_good += 1
-                ledger.frames_in_samples += 1
-                return made
         return self._scan(self._tail + data if self._tail else data, 0)
 
     # --- frames for the kernel --------------------------------------------------------------------------------------
-
-    kernel_start: ClassVar = "start_hi91"
 
     def usual_frames(self, data: bytes) -> bytes:
         tail = self._tail
@@ -388,19 +296,8 @@ class HipnucCodec:
         return tail + data if tail else data
 
     def take(self, frames: bytes, count: int, data: bytes) -> bytes:
-        ledger, size = self.ledger, count * _HI91_FRAME_BYTES
-        ledger.bytes_in_good_frames += size
-        ledger.frames_good += count
-        ledger.frames_in_samples += count
-        if frames is data and size == len(data):  # the usual case: complete frames only
-            ledger.bytes_in += size
-            return b""
-        rest = frames[size:]
-        is_start = len(rest) < _HI91_FRAME_BYTES and rest[: len(_HI91_HEAD)] == _HI91_HEAD[: len(rest)]
-        self._tail = rest if is_start else b""
-        ledger.bytes_in += len(data) if is_start else len(data) - len(rest)
-        ledger.bytes_pending = len(self._tail)
-        return b"" if is_start else rest
+        self._tail, rest = self.kernel_format.take(self.ledger, frames, count, data)
+        return rest
 
     # --- end of the stream ------------------------------------------------------------------------------------------
 
@@ -443,8 +340,6 @@ class HipnucCodec:
     def _decode_frame(self, data: bytes, at: int, give_up: int, events: list[CodecEvent]) -> int:
         """Decode the frame at `at`. Return its end, or `at` if it is incomplete."""
         total = len(data)
-        if (run := _RUN.match(data, at)) and (after := self._decode_run(data, at, run.end(), events)) > at:
-            return after
         if total - at < HEADER.size:
             return self._spend_sync(data, at, total, BadReason.CRC, events) if at < give_up else at
         length: int
@@ -454,56 +349,27 @@ class HipnucCodec:
         begin, end = at + HEADER.size, at + HEADER.size + length
         if end > total and at >= give_up:
             return at
-        if end > total or crc16_xmodem(data[begin:end], crc16_xmodem(data[at : at + 4], 0)) != crc:
+        if end > total or crc16_xmodem(data[begin:end], _HEAD_CRC[length]) != crc:
             return self._spend_sync(data, at, end, BadReason.CRC, events)
-        self._decode_payload(data, at, end, events)
-        return end
-
-    def _decode_run(self, data: bytes, at: int, end: int, events: list[CodecEvent]) -> int:
-        """Decode adjacent HI91 frames up to the first wrong CRC. Return their end."""
-        size, crc_of, seed = _HI91_FRAME_BYTES, crc16_xmodem, _RUN_SEED
-        payloads: list[bytes] = []
-        keep = payloads.append
-        for crc, payload in _RUN_PARTS.iter_unpack(data[at:end]):
-            if crc_of(payload, seed) != crc:
-                break
-            keep(payload)
-        count = len(payloads)
-        end = at + count * size
-        hi91s = b"".join(payloads)
-        made = decode_hi91_run(hi91s, self.word_is_status, size, len(data) - at - size) if _run_usual(hi91s) else None
-        if made is None:  # `_decode_payload` checks each value at three times the cost
-            for begin in range(at, end, size):
-                self._decode_payload(data, begin, begin + size, events)
-            return end
-        events += made
-        ledger = self.ledger
-        ledger.bytes_in_good_frames += end - at
-        ledger.frames_good += count
-        ledger.frames_in_samples += count
-        return end
-
-    def _decode_payload(self, data: bytes, at: int, end: int, events: list[CodecEvent]) -> None:
-        """Decode the sub-packets of a frame with a correct CRC, from `at` to `end` with its header."""
-        ledger = self.ledger
         found: list[Measurement] = []
-        finite = True
-        begin = at + HEADER.size
+        ledger, finite = self.ledger, True
         while begin < end:
             packet = PACKETS.get(data[begin])
             if packet is None:
                 ledger.unknown_tags += 1
                 count_unknown(self.unknown, data[begin])
                 break
-            if begin + packet.size > end:
+            kernel_format, size, decode = packet
+            if begin + size > end:
                 ledger.frames_bad_content += 1
                 ledger.bytes_in_bad_frames += end - at
                 events.append(BadFrame(BadReason.CONTENT, data[at:end]))
-                return
-            measurement, is_finite = packet.decode(data, begin, self.word_is_status, end - at, len(data) - end)
+                return end
+            measurement, is_finite = decode(data, begin, self.word_is_status, end - at, total - end)
             finite = finite and is_finite
             found.append(measurement)
-            begin += packet.size
+            self.kernel_format = kernel_format
+            begin += size
         ledger.bytes_in_good_frames += end - at
         ledger.frames_good += 1
         if found:
@@ -514,6 +380,7 @@ class HipnucCodec:
             ledger.frames_not_finite += 1
             events.append(BadFrame(BadReason.NOT_FINITE, data[at:end]))
         events += found
+        return end
 
     def _spend_sync(self, data: bytes, at: int, end: int, reason: BadReason, events: list[CodecEvent]) -> int:
         """Reject a frame, and skip only its sync word. `end` is its end according to its length field."""
@@ -551,7 +418,7 @@ def _is_whole(data: bytes, at: int) -> bool:
     begin, end = at + HEADER.size, at + HEADER.size + length
     if not 1 <= length <= PAYLOAD_BYTES_MAX or end > len(data):
         return False
-    return crc16_xmodem(data[begin:end], crc16_xmodem(data[at : at + 4], 0)) == crc
+    return crc16_xmodem(data[begin:end], _HEAD_CRC[length]) == crc
 
 
 # --- encoder for simulated devices ------------------------------------------------------------------------------

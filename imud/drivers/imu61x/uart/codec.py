@@ -5,20 +5,14 @@
 The device sends pitch before roll. imud computes the quaternion from the angles. The manual does not define their
 convention; imud assumes `common.EULER_CONVENTION`. The timer counts µs and wraps after 71.6 minutes.
 
-Fast path: a read usually contains only complete AHRS frames. `feed` and `_decode_run` decode these frames if all values
-are finite. They check the high bytes of all floats in one step. `FrameFinder` processes all other input. `make
-bench-instructions` measures the cost.
+The kernel (`imud/_kernel.c`) decodes usual AHRS frames in less CPU time. `make bench-instructions` measures the cost.
 """
 
-import re
 import struct
-import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from itertools import takewhile
-from math import cos, sin
-from typing import Any, Final
+from typing import ClassVar, Final
 from zlib import crc32 as inverted_crc32
 
 import msgspec
@@ -28,19 +22,13 @@ from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
 from imud.contracts.script import Message, ReplyFrame
 from imud.drivers.imu61x.common import CRC_INVERSION, CRC_START, M_S2_PER_G, RAD_S_PER_DEG_S, crc32
 from imud.drivers.value_limits import (
-    ACCEL_HIGH_BYTES,
     ACCEL_LIMIT_G,
     GYRO_LIMIT_DEG_S,
-    TEMPERATURE_HIGH_BYTES,
     TURN_DEG,
-    TURN_SQUARE,
-    VALUE_HIGH_BYTES,
-    are_usual,
-    are_within,
     possible_temperature_c,
     scaled,
-    temperatures_possible,
 )
+from imud.formats.kernel import KernelFormat
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
@@ -86,22 +74,26 @@ class FrameFinder:
         self._sync = sync
         self._tail = b""  # incomplete rest of the bytes: starts with a sync word, or is the first half of a sync word
         self._bad_ahead = 0  # rest of a damaged frame by its length field, in bytes from the start of the tail
-        self.idle = True  # Whether no earlier bytes are pending. Read-only for the codec.
 
     def feed(self, data: bytes) -> Sequence[Frame | BadFrame]:
         """Add the next bytes of the stream. Return the completed frames. Never raises an exception."""
         self._ledger.bytes_in += len(data)
         return self._scan(self._tail + data if self._tail else data, 0)
 
-    def feed_rest(self, data: bytes, take_run: Callable[[bytes], int]) -> Sequence[Frame | BadFrame]:
-        """Add bytes like `feed`. `take_run` first consumes complete frames and returns their total size.
+    # --- frames for the kernel ----------------------------------------------------------------------------------------
 
-        `take_run` receives the pending bytes with `data`, unless they may belong to a damaged frame.
-        """
-        self._ledger.bytes_in += len(data)
-        if self._tail:
-            data = self._tail + data
-        return self._scan(data, 0, 0 if self._bad_ahead else take_run(data))
+    def usual_frames(self, data: bytes) -> bytes:
+        """See `KernelCodec`."""
+        if self._bad_ahead:
+            return b""
+        return self._tail + data if self._tail else data
+
+    def take(self, kernel_format: KernelFormat, frames: bytes, count: int, data: bytes) -> bytes:
+        """See `KernelCodec`."""
+        self._tail, rest = kernel_format.take(self._ledger, frames, count, data)
+        return rest
+
+    # --- end of the stream --------------------------------------------------------------------------------------------
 
     def flush(self) -> Sequence[Frame | BadFrame]:
         """Drop an incomplete frame that contains a complete frame. imud calls this method when the link is idle."""
@@ -115,13 +107,12 @@ class FrameFinder:
         self._ledger.bytes_skipped += len(self._tail)
         self._tail = b""
         self._bad_ahead = 0
-        self.idle = True
         self._ledger.bytes_pending = 0
 
-    def _scan(self, data: bytes, drop_before: int, at: int = 0) -> list[Frame | BadFrame]:
-        """Return all complete frames in `data` from `at`. Incomplete frames that start before `drop_before` are bad."""
+    def _scan(self, data: bytes, drop_before: int) -> list[Frame | BadFrame]:
+        """Return all complete frames in `data`. Incomplete frames that start before `drop_before` are bad."""
         found: list[Frame | BadFrame] = []
-        sync, total = self._sync, len(data)
+        at, sync, total = 0, self._sync, len(data)
         while at < total:
             begin = data.find(sync, at)
             if begin < 0:
@@ -136,7 +127,6 @@ class FrameFinder:
             at = waiting
         self._tail = data[at:]
         self._bad_ahead = max(self._bad_ahead - at, 0)
-        self.idle = not (self._tail or self._bad_ahead)
         self._ledger.bytes_pending = total - at
         return found
 
@@ -192,7 +182,7 @@ class FrameFinder:
 
 
 def _crc_matches(raw: bytes) -> bool:
-    return crc32(raw[:-CRC_BYTES]) == int.from_bytes(raw[-CRC_BYTES:], "little")
+    return inverted_crc32(raw, CRC_START) == CRC_INVERSION
 
 
 STATUS_FRAME: Final = 0x00FF
@@ -336,27 +326,6 @@ AHRS: Final = struct.Struct("<I10f")
 AHRS_FRAME: Final = 0x0002
 TIMER_MODULUS: Final = 2**32
 
-_HEAD: Final = HEADER.pack(DEVICE_SYNC, AHRS_FRAME, AHRS.size)
-_ONLY: Final = struct.Struct(
-    f"<{HEADER.size}xI10f{CRC_BYTES}x"
-)  # timer and 10 floats of one frame; skips header and CRC
-# high bytes of the temperature and of the other floats in a frame
-_ONLY_TEMPERATURE: Final = AHRS_FRAME_BYTES - CRC_BYTES - 1
-_ONLY_HIGH_BYTES: Final = slice(HEADER.size + 7, AHRS_FRAME_BYTES - CRC_BYTES - 4, 4)
-_ONLY_ACCEL: Final = slice(HEADER.size + 19, HEADER.size + 28, 4)  # high bytes of the accelerations in a frame
-# pattern of adjacent AHRS frames by their headers
-_RUN: Final = re.compile(rb"(?s:%b.{%d})+" % (re.escape(_HEAD), AHRS_FRAME_BYTES - HEADER.size))
-_RUN_PARTS: Final = struct.Struct(f"<{HEADER.size}x{AHRS.size}sI")  # payload and CRC
-_RUN_SEED: Final = inverted_crc32(_HEAD, CRC_START)
-# AHRS in the native layout, in which `struct` reads a float in half the time
-_RUN_VALUES: Final = struct.Struct(("@" if sys.byteorder == "little" else "<") + "I10f")
-# Slices of the high bytes of adjacent payloads: timer, nine floats and temperature of each; the temperatures in these
-# bytes; the timers in the rest
-_RUN_HIGH_BYTES: Final = slice(3, None, 4)
-_RUN_TEMPERATURES: Final = slice(10, None, 11)
-_RUN_TIMERS: Final = slice(0, None, 10)
-_RUN_ACCEL: Final = tuple(slice(at, None, 9) for at in (3, 4, 5))  # the accelerations in the remaining bytes
-
 
 class Imu61xCodec:
     """Decoder of a byte stream into measurements and reply frames. Synchronization: one thread.
@@ -366,6 +335,9 @@ class Imu61xCodec:
     values; the frame counts as good.
     """
 
+    kernel_format: ClassVar = KernelFormat("AHRS", HEADER.pack(DEVICE_SYNC, AHRS_FRAME, AHRS.size), AHRS_FRAME_BYTES)
+    word_is_status: ClassVar = False
+
     def __init__(self, ledger: Ledger, _settings: Options | None = None) -> None:
         self.ledger = ledger
         self.unknown: dict[int, int] = {}  # number of frames by unknown identifier
@@ -373,75 +345,30 @@ class Imu61xCodec:
 
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
         """Decode the next bytes of the stream. Return the completed events. Never raises an exception."""
-        if (
-            len(data) == AHRS_FRAME_BYTES
-            and self._finder.idle
-            and inverted_crc32(data, CRC_START) == CRC_INVERSION
-            and data.startswith(_HEAD)
-            and not data[_ONLY_HIGH_BYTES].strip(VALUE_HIGH_BYTES)
-            and not data[_ONLY_ACCEL].strip(ACCEL_HIGH_BYTES)
-            and data[_ONLY_TEMPERATURE] in TEMPERATURE_HIGH_BYTES
-            and (made := _measurements((_ONLY.unpack(data),), AHRS_FRAME_BYTES, 0))
-        ):
-            ledger = self.ledger
-            ledger.bytes_in += AHRS_FRAME_BYTES
-            ledger.bytes_in_good_frames += AHRS_FRAME_BYTES
-            ledger.frames_good += 1
-            ledger.frames_in_samples += 1
-            return made
-        return self._decode(data)
+        return self._events(self._finder.feed(data))
+
+    def usual_frames(self, data: bytes) -> bytes:
+        return self._finder.usual_frames(data)
+
+    def take(self, frames: bytes, count: int, data: bytes) -> bytes:
+        return self._finder.take(self.kernel_format, frames, count, data)
 
     def flush(self) -> Sequence[CodecEvent]:
         """Return the complete frames inside an incomplete longer frame. imud calls it when the link is idle."""
-        events: list[CodecEvent] = []
-        self._add_found(self._finder.flush(), events)
-        return events
+        return self._events(self._finder.flush())
 
     def reset(self) -> None:
         """Count the pending bytes as skipped."""
         self._finder.reset()
 
-    def _decode(self, data: bytes) -> Sequence[CodecEvent]:
+    def _events(self, found: Sequence[Frame | BadFrame]) -> list[CodecEvent]:
         events: list[CodecEvent] = []
-        self._add_found(self._finder.feed_rest(data, lambda data: self._decode_run(data, events)), events)
-        return events
-
-    def _decode_run(self, data: bytes, events: list[CodecEvent]) -> int:
-        """Decode the adjacent AHRS frames at the start, up to a damaged or impossible frame. Return their size."""
-        run = _RUN.match(data)
-        if run is None:
-            return 0
-        size, seed, crc_of = AHRS_FRAME_BYTES, _RUN_SEED, inverted_crc32
-        payloads: list[bytes] = []
-        keep = payloads.append
-        for payload, crc in _RUN_PARTS.iter_unpack(run[0]):
-            if crc_of(payload, seed) ^ CRC_INVERSION != crc:
-                break
-            keep(payload)
-        joined = b"".join(payloads)
-        high_bytes = bytearray(joined[_RUN_HIGH_BYTES])
-        temperatures = high_bytes[_RUN_TEMPERATURES]
-        del high_bytes[_RUN_TEMPERATURES], high_bytes[_RUN_TIMERS]
-        x, y, z = _RUN_ACCEL
-        accel = high_bytes[x] + high_bytes[y] + high_bytes[z]
-        if not (are_usual(accel, high_bytes) and temperatures_possible(temperatures)):
-            possible: list[bytes] = list(takewhile(_is_possible, payloads))
-            joined = b"".join(possible)
-        made = _measurements(_RUN_VALUES.iter_unpack(joined), size, len(data) - size)
-        events += made
-        count = len(made)
-        ledger = self.ledger
-        ledger.bytes_in_good_frames += count * size
-        ledger.frames_good += count
-        ledger.frames_in_samples += count
-        return count * size
-
-    def _add_found(self, found: Sequence[Frame | BadFrame], events: list[CodecEvent]) -> None:
         for frame in found:
             if isinstance(frame, BadFrame):
                 events.append(frame)
             else:
                 self._add_frame(frame, events)
+        return events
 
     def _add_frame(self, frame: Frame, events: list[CodecEvent]) -> None:
         """Count a frame with a correct CRC and add its event."""
@@ -466,12 +393,18 @@ class Imu61xCodec:
             count_unknown(self.unknown, frame.frame_id)
 
     def _measure(self, frame: Frame, events: list[CodecEvent]) -> None:
-        values = AHRS.unpack_from(frame.payload)
-        size, trailing = len(frame.raw), frame.trailing_bytes
-        if not _is_possible(frame.payload):
+        us, pitch, roll, yaw, ax, ay, az, gx, gy, gz, temperature = AHRS.unpack_from(frame.payload)
+        accel = scaled((ax, ay, az), M_S2_PER_G, ACCEL_LIMIT_G)
+        gyro = scaled((gx, gy, gz), RAD_S_PER_DEG_S, GYRO_LIMIT_DEG_S)
+        euler = scaled((roll, pitch, yaw), RAD_PER_DEG, TURN_DEG)
+        temperature_c = possible_temperature_c(temperature)
+        if accel is None or gyro is None or euler is None or temperature_c is None:
             self.ledger.frames_not_finite += 1
             events.append(BadFrame(BadReason.NOT_FINITE, frame.raw))
-        events.append(_partial_measurement(values, size, trailing))
+        quat = None if euler is None else quat_from_euler_zyx(euler)
+        events.append(
+            Measurement(len(frame.raw), frame.trailing_bytes, us, accel, gyro, None, quat, euler, temperature_c)
+        )
 
 
 UNKNOWN_FRAMES: Final = {0x0166: "navigation", 0x0666: "raw data"}  # frames of other models
@@ -484,59 +417,6 @@ def frame_name(frame_id: int) -> str:
 
 
 _REPLY_FRAMES: Final = (STATUS_FRAME, PARAMETER_FRAME)
-
-
-def _is_possible(payload: bytes) -> bool:
-    values = AHRS.unpack_from(payload)
-    return (
-        are_within(values[1:4], TURN_DEG)
-        and are_within(values[4:7], ACCEL_LIMIT_G)
-        and are_within(values[7:10], GYRO_LIMIT_DEG_S)
-        and possible_temperature_c(values[10]) is not None
-    )
-
-
-def _measurements(frames: Iterable[Sequence[Any]], size: int, trailing: int) -> list[Measurement]:
-    """Return the measurements of adjacent AHRS frames with possible values; `trailing` bytes follow the first frame.
-
-    The list ends before a frame with an angle that may be beyond a full turn.
-    """
-    made: list[Measurement] = []
-    keep, make, g, rad, cosine, sine = made.append, Measurement, M_S2_PER_G, RAD_PER_DEG, cos, sin
-    turn = TURN_SQUARE
-    # quat_from_euler_zyx inline: a call costs a twentieth of a frame
-    for us, pitch_deg, roll_deg, yaw_deg, ax, ay, az, gx, gy, gz, temperature_c in frames:
-        if roll_deg * roll_deg + pitch_deg * pitch_deg + yaw_deg * yaw_deg > turn:
-            break
-        roll, pitch, yaw = roll_deg * rad, pitch_deg * rad, yaw_deg * rad
-        half_roll, half_pitch, half_yaw = roll * 0.5, pitch * 0.5, yaw * 0.5
-        cr, sr, cp, sp = cosine(half_roll), sine(half_roll), cosine(half_pitch), sine(half_pitch)
-        cy, sy = cosine(half_yaw), sine(half_yaw)
-        cc, ss, cs, sc = cy * cp, sy * sp, cy * sp, sy * cp
-        keep(
-            make(
-                size, trailing, us,
-                (ax * g, ay * g, az * g), (gx * rad, gy * rad, gz * rad), None,
-                (cc * cr + ss * sr, cc * sr - ss * cr, cs * cr + sc * sr, sc * cr - cs * sr),
-                (roll, pitch, yaw), temperature_c,
-            )
-        )  # fmt: skip
-        trailing -= size
-    return made
-
-
-def _partial_measurement(values: Sequence[Any], size: int, trailing: int) -> Measurement:
-    """Return the measurement without groups with a value that is not possible."""
-    us, pitch, roll, yaw = values[:4]
-    euler = scaled((roll, pitch, yaw), RAD_PER_DEG, TURN_DEG)
-    return Measurement(
-        size, trailing, us,
-        accel_m_s2=scaled(values[4:7], M_S2_PER_G, ACCEL_LIMIT_G),
-        gyro_rad_s=scaled(values[7:10], RAD_S_PER_DEG_S, GYRO_LIMIT_DEG_S),
-        quat_wxyz=None if euler is None else quat_from_euler_zyx(euler),
-        euler_rad=euler,
-        temperature_c=possible_temperature_c(values[10]),
-    )  # fmt: skip
 
 
 # --- encoder for simulated devices ------------------------------------------------------------------------------
