@@ -5,7 +5,7 @@
  * The names are the names of the Python code:
  *
  *   is_usual_…, decode_… ─▶ HipnucCodec, Imu61xCodec (imud/drivers/hipnuc/uart/codec.py, …/imu61x/uart/codec.py)
- *   add_stamp ─▶ StampTime (imud/sampling/device_time.py)
+ *   add_stamp ─▶ StampTime (imud/sampling/stamp_time.py)
  *   stamp ─▶ add_even_run (imud/sampling/clock.py), ArrivalFit.add_arrival (imud/sampling/arrival_fit.py),
  *                 encode_slots (imud/formats/slot.py)
  *   write_ring ─▶ ShmRing (imud/publishers/shm.py)

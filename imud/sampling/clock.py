@@ -40,8 +40,9 @@ from imud.model.sample import T_ERR_MOST, Measurement, Sample, Sync
 from imud.model.units import NS_PER_S
 from imud.sampling.arrival_fit import ENOUGH_SPAN_NS, SLOPE_HIGHEST, ArrivalFit
 from imud.sampling.arrival_time import FIRST_SPREAD_NS, ArrivalTime, LinkDelay
-from imud.sampling.device_time import FIRST_EARLY_NS, JUMP_EARLY_NS, JUMP_LATE_NS, DeviceTime, JumpDetector, StampTime
+from imud.sampling.device_time import FIRST_EARLY_NS, JUMP_EARLY_NS, JUMP_LATE_NS, DeviceTime, JumpDetector
 from imud.sampling.gaps import GAP_PERIODS, CounterLine
+from imud.sampling.stamp_time import StampTime
 from imud.sampling.steering import SETTLED_AFTER_NS, AidingSources, Holdover, Slew
 
 StartRun = Callable[..., Any]  # function of the kernel that starts a run, with its first argument
@@ -310,8 +311,7 @@ class SampleClock:
             return None
         try:
             return start(
-                kind,
-                (
+                kind, (
                     SYNC_CODES[self._fit_sync], -1 if self._own_status is None else self._own_status, self._seq,
                     self._t_ns, self._t_rx_ns, self._delay.byte_ns or 1, self._fit_bias_ns, self._fit_error_ns,
                 ),
