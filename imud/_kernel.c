@@ -8,6 +8,7 @@
  *   add_stamp ─▶ StampTime (imud/sampling/stamp_time.py)
  *   stamp ─▶ add_even_run (imud/sampling/clock.py), ArrivalFit.add_arrival (imud/sampling/arrival_fit.py),
  *                 encode_slots (imud/formats/slot.py)
+ *   can_frames ─▶ FrameReader (imud/links/socketcan.py)
  *   write_ring ─▶ ShmRing (imud/publishers/shm.py)
  *   frame_slots ─▶ BinaryEncoding (imud/publishers/socket/outbox.py)
  *   add_slots ─▶ add_slots (imud/publishers/socket/history.py)
@@ -16,6 +17,7 @@
  * sum to one operation (-ffp-contract=off), and each expression has the order of the Python expression.
  */
 #define Py_LIMITED_API 0x030B0000
+#define PY_SSIZE_T_CLEAN
 #include <Python.h>
 #include <structmember.h>
 #include <float.h>
@@ -936,7 +938,94 @@ static PyObject *add_slots(PyObject *self, PyObject *args)
     return PyErr_Occurred() ? NULL : PyLong_FromSsize_t(offset);
 }
 
+#define CAN_FRAME_BYTES 16   /* `struct can_frame`: identifier with flags, length, data from byte 8 */
+#define CAN_CONTROL_BYTES 64 /* control messages of a frame: arrival time, then number of dropped frames */
+#define CAN_STAMP_AT (sizeof(size_t) + 4)
+#define CAN_DROPS_AT (2 * sizeof(size_t) + 28)
+#define CAN_NO_DATA 0x60000000u /* an error frame or a remote frame */
+#define CAN_EXTENDED 0x80000000u
+#define CAN_ID_MOST 0x1FFFFFFFu
+#define CAN_BACKLOG_NS 5000000 /* `BACKLOG_NS` of imud/links/socketcan.py */
+#define SO_TIMESTAMPNS_NEW 64
+#define SO_RXQ_OVFL 40
+
+static int is_time(int64_t ns)
+{
+    return -TIME_MOST_NS <= ns && ns <= TIME_MOST_NS;
+}
+
+/* Return the frame of a row as the class `frame_type`; NULL without an exception if Python must decode the row. */
+static PyObject *can_frame(newfunc make, PyTypeObject *frame_type, const uint8_t *raw, const uint8_t *control,
+                           uint32_t drops, int64_t offset_ns, int64_t stepped_ns, int64_t now_ns, int64_t *newest_ns)
+{
+    uint32_t can_id, row_drops;
+    int32_t kind, drops_kind;
+    int64_t seconds, ns;
+    memcpy(&can_id, raw, 4);
+    memcpy(&kind, control + CAN_STAMP_AT, 4);
+    memcpy(&seconds, control + CAN_STAMP_AT + 4, 8);
+    memcpy(&ns, control + CAN_STAMP_AT + 12, 8);
+    memcpy(&drops_kind, control + CAN_DROPS_AT, 4);
+    memcpy(&row_drops, control + CAN_DROPS_AT + 4, 4);
+    if (can_id & CAN_NO_DATA || kind != SO_TIMESTAMPNS_NEW || (drops_kind == SO_RXQ_OVFL && row_drops != drops) ||
+        seconds < 0 || seconds > INT64_C(4000000000) || ns < 0 || ns >= 1000000000)
+        return NULL;
+    int64_t t_ns = seconds * 1000000000 + ns - offset_ns;
+    if (stepped_ns && !(*newest_ns < t_ns && t_ns <= now_ns) && *newest_ns < t_ns + stepped_ns &&
+        t_ns + stepped_ns <= now_ns)
+        t_ns += stepped_ns;
+    if (t_ns > *newest_ns)
+        *newest_ns = t_ns;
+    else if (t_ns < *newest_ns - CAN_BACKLOG_NS)
+        *newest_ns = now_ns;
+    if (*newest_ns > now_ns)
+        *newest_ns = now_ns;
+    PyObject *args = Py_BuildValue("((kOy#LO))", (unsigned long)(can_id & CAN_ID_MOST),
+                                   can_id & CAN_EXTENDED ? Py_True : Py_False, (const char *)raw + 8,
+                                   (Py_ssize_t)(raw[4] < 8 ? raw[4] : 8), (long long)*newest_ns, Py_False);
+    PyObject *made = args == NULL ? NULL : make(frame_type, args, NULL);
+    Py_XDECREF(args);
+    return made;
+}
+
+/* can_frames(frame_type, raw, control, count, drops, offset_ns, stepped_ns, now_ns, newest_ns) -> the frames; None if
+ * Python must decode them, because one is not a data frame, follows a loss, or has no arrival time */
+static PyObject *can_frames(PyObject *self, PyObject *args)
+{
+    PyObject *frame_type, *frames = NULL;
+    Py_buffer raw, control;
+    Py_ssize_t count;
+    unsigned int drops;
+    long long offset_ns, stepped_ns, now_ns, newest;
+    if (!PyArg_ParseTuple(args, "O!y*y*nILLLL:can_frames", &PyType_Type, &frame_type, &raw, &control, &count, &drops,
+                          &offset_ns, &stepped_ns, &now_ns, &newest))
+        return NULL;
+    int64_t newest_ns = newest;
+    if (count < 0 || count > raw.len / CAN_FRAME_BYTES || count > control.len / CAN_CONTROL_BYTES)
+        PyErr_SetString(PyExc_ValueError, "can_frames: expected buffers for count frames");
+    else if (!PyType_IsSubtype((PyTypeObject *)frame_type, &PyTuple_Type))
+        PyErr_SetString(PyExc_TypeError, "can_frames: expected a class of tuples");
+    else if (is_time(offset_ns / 2) && is_time(stepped_ns) && is_time(now_ns) && is_time(newest))
+        frames = PyList_New(count);
+    newfunc make = (newfunc)PyType_GetSlot(&PyTuple_Type, Py_tp_new);
+    for (Py_ssize_t i = 0; frames != NULL && i < count; i++) {
+        PyObject *frame = can_frame(make, (PyTypeObject *)frame_type, (const uint8_t *)raw.buf + i * CAN_FRAME_BYTES,
+                                    (const uint8_t *)control.buf + i * CAN_CONTROL_BYTES, drops, offset_ns, stepped_ns,
+                                    now_ns, &newest_ns);
+        if (frame == NULL)
+            Py_CLEAR(frames);
+        else
+            PyList_SetItem(frames, i, frame);
+    }
+    PyBuffer_Release(&raw);
+    PyBuffer_Release(&control);
+    if (frames == NULL && !PyErr_Occurred())
+        Py_RETURN_NONE;
+    return frames;
+}
+
 static PyMethodDef methods[] = {
+    {"can_frames", can_frames, METH_VARARGS, "Return CAN frames of the buffers of recvmmsg; or None."},
     {"add_slots", add_slots, METH_VARARGS, "Add slots to the minimum and maximum of a second."},
     {"frame_slots", frame_slots, METH_O, "Return slots as messages of the socket, back to back."},
     {"open_ring", open_ring, METH_VARARGS, "Return a Ring in the memory of a file."},

@@ -23,6 +23,7 @@ from msgspec import Meta
 
 from imud.contracts.link import CanLink, Claim, LinkType, OnBusNews, OnEnd, OnFrames
 from imud.contracts.status import KernelCounters
+from imud.formats import kernel
 from imud.formats.can import (
     DATA_BYTES_MAX,
     ERROR_FLAG,
@@ -129,8 +130,7 @@ BATCH_FRAMES: Final = 64
 SO_TIMESTAMPNS_NEW: Final = 64
 # Socket option and message type of the number of frames that a full receive buffer dropped: u32.
 SO_RXQ_OVFL: Final = 40
-# Maximum distance of two clock reads, ns. A longer distance means an interruption: imud reads again, at most
-# STEADY_TRIES times.
+# Maximum distance of two clock reads, ns. After a longer distance, imud reads again, at most STEADY_TRIES times.
 STEADY_NS: Final = 20 * NS_PER_US
 STEADY_TRIES: Final = 3
 _COUNT_MASK: Final = 0xFFFF_FFFF
@@ -178,16 +178,13 @@ class Vector(ctypes.Structure):
 
 
 _MESSAGE_BYTES: Final = ctypes.sizeof(MessageBuffers)
-# Place of `control_bytes` in a header. `recvmmsg` reads only this field of its own output again.
-_CONTROL_SIZE_WORD: Final = MessageHeader.control_bytes.offset // _WORD_BYTES
 # Constructor of `CanFrame` at a third of the usual cost.
 _new_frame: Final[Callable[[tuple[int, bool, bytes, int, bool]], CanFrame]] = partial(tuple.__new__, CanFrame)
 
 
 # Minimum change of the clock offset that counts as a step, ns. A smaller change can be an error of the two readings.
 STEP_NS: Final = 100 * NS_PER_US
-# Maximum time between the time stamp of a frame and its arrival in the queue of the socket, ns. The queue of the kernel
-# delays it.
+# Maximum time from the time stamp of a frame to its arrival in the queue of the socket, ns
 BACKLOG_NS: Final = 5 * NS_PER_MS
 
 
@@ -215,7 +212,6 @@ class FrameReader:
         self._messages = (MessageBuffers * BATCH_FRAMES).from_buffer(self._headers)
         self._assign_buffers()
         self._fresh_headers = bytes(self._headers)
-        self._header_words = memoryview(self._headers).cast("L")  # size_t on Linux
         self._receive = partial(
             _receive, receiver.fileno(), self._messages, BATCH_FRAMES, int(socket.MSG_DONTWAIT), None
         )
@@ -232,31 +228,39 @@ class FrameReader:
         if count < 0:
             return self._failed(ctypes.get_errno(), begun_ns)
         offset_ns, now_ns = self._clocks()
-        if count == 1:  # usual on a quiet bus: saves two iterators
-            only = RAW_FRAME.unpack_from(self._frames), _CONTROL.unpack_from(self._control)
-            frames = self._decoded((only,), offset_ns, now_ns)
-            self._header_words[_CONTROL_SIZE_WORD] = _CONTROL_BYTES
-        else:
-            frames = self._decoded(self._rows(count), offset_ns, now_ns)
-            header_bytes = count * _MESSAGE_BYTES
-            self._headers[:header_bytes] = self._fresh_headers[:header_bytes]
+        frames = self._usual(count, offset_ns, now_ns)
+        if frames is None:
+            raw = memoryview(self._frames)[: count * RAW_FRAME.size]
+            control = memoryview(self._control)[: count * _CONTROL_BYTES]
+            rows = zip(RAW_FRAME.iter_unpack(raw), _CONTROL.iter_unpack(control), strict=True)
+            frames = self._decoded(rows, offset_ns, now_ns)
+        self._headers[:] = self._fresh_headers
         if count < BATCH_FRAMES:
             self._empty_ns, self._empty_offset_ns = begun_ns, offset_ns
         return frames
 
-    def _rows(self, count: int) -> _Rows:
-        raw = memoryview(self._frames)[: count * RAW_FRAME.size]
-        control = memoryview(self._control)[: count * _CONTROL_BYTES]
-        return zip(RAW_FRAME.iter_unpack(raw), _CONTROL.iter_unpack(control), strict=True)
+    def _step_ns(self, offset_ns: int) -> int:
+        """Return the step of CLOCK_REALTIME since the queue was empty, ns; 0 without a step."""
+        step_ns = offset_ns - self._empty_offset_ns
+        return 0 if -STEP_NS < step_ns < STEP_NS else step_ns
+
+    def _usual(self, count: int, offset_ns: int, now_ns: int) -> list[CanFrame] | None:
+        """Return the result of `_decoded` from the kernel in C; None if Python must decode the frames."""
+        module, drops, newest_ns = kernel.present.module, self.dropped & _COUNT_MASK, self._newest_ns
+        if module is None or self._lost:
+            return None
+        step_ns, newest_ns = self._step_ns(offset_ns), max(newest_ns, self._empty_ns)
+        frames: list[CanFrame] | None = module.can_frames(
+            CanFrame, self._frames, self._control, count, drops, offset_ns, step_ns, now_ns, newest_ns
+        )
+        if frames is not None:
+            self._newest_ns = frames[-1].t_rx_ns
+        return frames
 
     def _decoded(self, rows: _Rows, offset_ns: int, now_ns: int) -> list[CanFrame]:
         frames: list[CanFrame] = []
         newest_ns, empty_ns, dropped, lost = self._newest_ns, self._empty_ns, self.dropped & _COUNT_MASK, self._lost
-        if newest_ns < empty_ns:  # noqa: PLR1730 - a call of max() costs 60 ns on the sample path
-            newest_ns = empty_ns
-        stepped_ns = offset_ns - self._empty_offset_ns
-        if -STEP_NS < stepped_ns < STEP_NS:
-            stepped_ns = 0
+        newest_ns, stepped_ns = max(newest_ns, empty_ns), self._step_ns(offset_ns)
         for (can_id, size, data), (kind, seconds, ns, drop_kind, drops) in rows:
             if drop_kind == SO_RXQ_OVFL and drops != dropped:
                 self.dropped += (drops - dropped) & _COUNT_MASK

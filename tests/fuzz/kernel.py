@@ -16,7 +16,11 @@ OPTIONS: Final = (
     "-g", "-O1", "-Wall", "-Wextra", "-Wno-unused-parameter", "-Werror", "-shared-libasan", "-fno-sanitize-recover=all",
     "-fsanitize=address,undefined,float-cast-overflow",
 )  # fmt: skip
-TESTS: Final = ("tests/sampling/test_path_kernel.py", "tests/publishers/socket/test_history.py")
+TESTS: Final = (
+    "tests/sampling/test_path_kernel.py",
+    "tests/publishers/socket/test_history.py",
+    "tests/links/test_socketcan.py",
+)
 # The tests import `imud._kernel`, and find the module that is already loaded.
 PROGRAM: Final = """
 import sys

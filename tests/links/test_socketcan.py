@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from imud.contracts.status import KernelCounters
+from imud.formats import kernel
 from imud.formats.can import RAW_FRAME, CanFrame, CyclicFrame, pack_frame
 from imud.links import netlink, socketcan
 from imud.links.cyclic_sender import LoopSender, setup
@@ -370,8 +371,9 @@ class Wire:
             is_stamped = any(frame.t_rx_ns < sent_ns for frame in self.read())
 
 
-@pytest.fixture
-def wire() -> Iterator[Wire]:
+@pytest.fixture(params=["kernel", "python"])
+def wire(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Wire]:
+    monkeypatch.setattr(kernel, "present", kernel.present if request.param == "kernel" else kernel.Kernel(None))
     with closing(Wire()) as made:
         yield made
 
@@ -489,7 +491,13 @@ def test_limits_of_a_step_and_of_a_backlog(wire: Wire) -> None:
             ((1, 0, bytes(8)), (socketcan.SO_TIMESTAMPNS_NEW, 0, t_ns, 0, 0))
             for t_ns in (20_000_000 + offset_ns, *times_ns)
         ]
-        return [frame.t_rx_ns for frame in reader._decoded(rows, offset_ns, now_ns)][1:]
+        for i, (frame, control) in enumerate(rows):
+            RAW_FRAME.pack_into(reader._frames, 16 * i, *frame)
+            socketcan._CONTROL.pack_into(reader._control, 64 * i, *control)
+        usual, reader._newest_ns = reader._usual(len(rows), offset_ns, now_ns), 0
+        frames = reader._decoded(rows, offset_ns, now_ns)
+        assert usual == (frames if kernel.present.module is not None else None)
+        return [frame.t_rx_ns for frame in frames][1:]
 
     assert stamps(99_999, 21_000_000, 20_050_000) == [20_000_000]
     assert stamps(100_000, 21_000_000, 20_050_000) == [20_050_000]

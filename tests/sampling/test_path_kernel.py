@@ -29,6 +29,7 @@ from imud.model.units import NS_PER_MS, NS_PER_US
 from imud.recording.state import StateWriter
 from imud.sampling.clock import SampleClock
 from imud.sampling.path import PathContext, StreamPath, make_clock
+from imud.sampling.stamp_time import StampTime
 from tests.support.event_loops import UTC_AHEAD_NS
 from tests.support.files import hi91
 
@@ -92,14 +93,12 @@ class Format(NamedTuple):
     changes: Mapping[str, Sequence[tuple[int, bytes]]]  # changed bytes of the payload by kind of a step
 
     def changed(self, frame: bytes, changes: Sequence[tuple[int, bytes]]) -> bytes:
-        """Return the frame with other bytes in its payload and a correct check value."""
         is_ahrs = self.frame is ahrs
         payload = bytearray(frame[6:-4] if is_ahrs else frame[6:])
         for at, data in changes:
             payload[at : at + len(data)] = data
-        if is_ahrs:
-            return imu61x.encode_frame(imu61x.DEVICE_SYNC, imu61x.AHRS_FRAME, bytes(payload))
-        return encode_frame(bytes(payload))
+        ahrs_frame = imu61x.DEVICE_SYNC, imu61x.AHRS_FRAME, bytes(payload)
+        return imu61x.encode_frame(*ahrs_frame) if is_ahrs else encode_frame(bytes(payload))
 
     def of_kind(self, kind: str, ms: int) -> bytes:
         frame = self.frame(ms)
@@ -239,10 +238,9 @@ def test_none_keeps_its_references() -> None:
     """Python 3.11 counts them, also if the headers of a later Python compiled the kernel."""
     module, before = kernel.present.module, sys.getrefcount(None)
     assert module is not None
-    for _ in range(1000):  # a device number out of range
-        assert (
-            module.start_hi91(-1, (1, -1, 1, 1, 1, 1, 0, 0), (0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0), (0,) * 9) is None
-        )
+    state = (1, -1, 1, 1, 1, 1, 0, 0), (0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0), (0,) * 9, StampTime.NO_STATE
+    for _ in range(1000):
+        assert module.start(-1, "HI91", *state) is None  # a device number out of range
     assert abs(sys.getrefcount(None) - before) < 100
 
 

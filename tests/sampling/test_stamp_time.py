@@ -15,7 +15,6 @@ MODULUS = 8192
 
 
 def ticks_of(stamps: list[int], times_ms: Iterable[int] = range(0, 1 << 20, 10)) -> list[int | None]:
-    """Return the ticks of values that arrive at these times."""
     time, known = StampTime(MODULUS), None
     found = []
     for stamp, ms in zip(stamps, times_ms, strict=False):
@@ -83,11 +82,8 @@ def test_messages_that_carry_time_are_preferred_and_may_alternate() -> None:
 
 
 def stamp_clock(unknown: list[int]) -> SampleClock:
-    """Return the clock of a device that sends HI91 or HI92 at 115200 baud."""
-    return SampleClock(
-        "bow", tick_ns=NS_PER_MS, tick_modulus=1 << 32, byte_ns=86_806, hold_ns=0, stamp_modulus=MODULUS,
-        on_unknown_gap=lambda: unknown.append(1),
-    )  # fmt: skip
+    times = {"tick_ns": NS_PER_MS, "tick_modulus": 1 << 32, "byte_ns": 86_806, "hold_ns": 0, "stamp_modulus": MODULUS}
+    return SampleClock("bow", **times, on_unknown_gap=lambda: unknown.append(1))  # type: ignore[arg-type]
 
 
 def test_samples_are_time_stamped_by_the_fit_of_their_values() -> None:
