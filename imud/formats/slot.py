@@ -119,7 +119,6 @@ _U64_MAX: Final = 0xFFFF_FFFF_FFFF_FFFF
 _I64_MIN: Final = -(1 << 63)
 _I64_MAX: Final = (1 << 63) - 1
 _ALL_PRESENT: Final = sum(PRESENT_BITS.values())
-_HI91_PRESENT: Final = _ALL_PRESENT - HAS_INCLI - HAS_EDGE
 _ZERO3: Vector3 = (0.0, 0.0, 0.0)
 _ZERO4: Quaternion = (0.0, 0.0, 0.0, 0.0)
 _ZERO2: Pair = (0.0, 0.0)
@@ -134,9 +133,7 @@ def slot_quality(slot: bytes) -> tuple[Sync, int]:
 def encode_slots(samples: Sequence[Sample], device_id: int) -> list[bytes]:
     """Return `samples` as SLOT_BYTES bytes each, with CRC. `device_id` is the device number of the daemon, 0…65535."""
     try:
-        if len(samples) == 1:  # usual case: no call for the list
-            return [_encode(samples[0], device_id)]
-        return _encode_alike(samples, device_id) or [_encode(sample, device_id) for sample in samples]
+        return [_encode(sample, device_id) for sample in samples]
     except struct.error:
         return [encode_slot(sample, device_id) for sample in samples]
 
@@ -190,36 +187,6 @@ def _encode(sample: Sample, device_id: int) -> bytes:
         pps,
     )  # fmt: skip
     return body + _CRC.pack(crc32(body))
-
-
-def _encode_alike(samples: Sequence[Sample], device_id: int) -> list[bytes]:
-    """Return `_encode` of samples with all values of an HI91 frame and no other values, in 0.85 of its time. The
-    function does not check each value for None. For other samples it returns an empty list or raises struct.error."""
-    head, values, crc, codes, slots = _HEAD.pack, _VALUES.pack, _CRC.pack, SYNC_CODES, list[bytes]()
-    for s in samples:
-        if s.incli_rad is not None or s.edge_seq is not None:
-            return []
-        present = _HI91_PRESENT
-        if (status := s.status) is None:
-            present, status = present - HAS_STATUS, 0
-        if (pps := s.pps_age_ms) is None:
-            present, pps = present - HAS_PPS_AGE, 0
-        try:
-            ax, ay, az = s.accel_m_s2  # type: ignore[misc]  # a rare None raises TypeError
-            gx, gy, gz = s.gyro_rad_s  # type: ignore[misc]
-            mx, my, mz = s.mag_t  # type: ignore[misc]
-            qw, qx, qy, qz = s.quat_wxyz  # type: ignore[misc]
-            roll, pitch, yaw = s.euler_rad  # type: ignore[misc]
-        except TypeError:
-            return []
-        body = head(
-            s.seq, s.t_ns, s.t_rx_ns, s.utc_ns, s.t_dev_ns, 0, s.t_err_ns, present, status, device_id, codes[s.sync], 0,
-        ) + values(
-            ax, ay, az, gx, gy, gz, mx, my, mz, qw, qx, qy, qz, roll, pitch, yaw, s.temperature_c, s.pressure_pa,
-            0.0, 0.0, pps,
-        )  # fmt: skip
-        slots.append(body + crc(crc32(body)))
-    return slots
 
 
 def _fitted(sample: Sample) -> Sample:
