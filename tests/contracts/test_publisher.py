@@ -21,12 +21,11 @@ def test_a_batch_makes_the_other_form_at_its_first_use(monkeypatch: pytest.Monke
     samples = [make_sample(seq) for seq in seqs]
     slots = b"".join(encode_slot(sample, 3) for sample in samples)
     made, packed = Batch(DEVICE, 3, samples), SlotBatch(DEVICE, 3, slots)
-    assert (made.is_packed, packed.is_packed) == (False, True)
     with monkeypatch.context() as patch:
         for name in ("decode_slots", "encode_slots"):  # these facts need no other form
             patch.setattr(publisher, name, None)
         for batch in (made, packed):
-            assert (len(batch), batch.seqs) == (len(seqs), (seqs[0], seqs[-1]))
+            assert (len(batch), batch.seqs, batch.is_packed) == (len(seqs), (seqs[0], seqs[-1]), batch is packed)
             assert list(batch.times_ns) == [seq * 1_000_000 for seq in seqs]
         assert (packed.packed, made.samples) == (slots, samples)
     assert (made.packed, packed.samples) == (slots, samples)

@@ -273,8 +273,8 @@ def test_the_kernel_accepts_any_bytes_and_numbers(tmp_path: Path, name: str) -> 
                 assert len(module.frame_slots(slots)) == len(slots) + 4 * (len(slots) // SLOT_BYTES)
                 with contextlib.suppress(ValueError):  # a memory that is too small for the ring
                     memory = bytearray(random.choice([4096 + SLOT_BYTES, 4096 + 8 * SLOT_BYTES]))
-                    ring = module.open_ring(memory, random.choice([0, 7, *EXTREMES]), random.choice(EXTREMES), file)
-                    assert ring.write(slots)
+                    mask, newest = random.choice([0, 7, *EXTREMES]), random.choice(EXTREMES)
+                    assert module.open_ring(memory, mask, newest, file).write(slots)
                 assert made is None or len(made.state()) == 9
                 made_slots += bool(slots)
     os.close(file)

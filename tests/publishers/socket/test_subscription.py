@@ -22,8 +22,7 @@ def test_subscription_matches() -> None:
 def test_many_clients_and_forms_have_a_limited_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """imud reads the clock if a form has 33 clients or more. It encodes at most 16 forms per batch immediately."""
     monkeypatch.setattr(Outbox, "put_samples", Mock())
-    now_ns = Mock(return_value=0)
-    plan = DeliveryPlan(Mock(side_effect=[1, 2, 3]), now_ns, TokenBucket(1, 1, 0, 1))
+    plan = DeliveryPlan(Mock(side_effect=[1, 2, 3]), now_ns := Mock(return_value=0), TokenBucket(1, 1, 0, 1))
     for clients in range(1, 34):
         plan.add(Subscription(None, None, 0, Form.JSON), Mock())
         plan.send(batch())
