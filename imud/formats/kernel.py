@@ -4,6 +4,7 @@ The value 0 of the environment variable IMUD_KERNEL switches the kernel off.
 """
 
 import os
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -37,7 +38,8 @@ def load(setting: str | None) -> Kernel:
     return Kernel(module)
 
 
-class KernelFormat(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class KernelFormat:
     """Format of frames that the kernel decodes."""
 
     name: str  # name in the table `formats` of the kernel

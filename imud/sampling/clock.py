@@ -34,6 +34,7 @@ from imud.contracts.lines import (
 )
 from imud.contracts.observer import InputObserver
 from imud.contracts.status import ClockStatus
+from imud.formats.kernel import KernelFormat
 from imud.formats.slot import SYNC_CODES
 from imud.host.clock import UNSTEERED, SteadyTime
 from imud.model.sample import T_ERR_MOST, Measurement, Sample, Sync
@@ -284,7 +285,7 @@ class SampleClock:
         return self._t_rx_ns if self._run is None else int(self._run.t_rx_ns)
 
     def stamp_frames(
-        self, start: StartRun, kind: str, frames: bytes, word_is_status: bool, t_rx_ns: int, utc_offset_ns: int
+        self, start: StartRun, kind: KernelFormat, frames: bytes, word_is_status: bool, t_rx_ns: int, utc_offset_ns: int
     ) -> bytes:
         """Return the slots of the usual frames of a kind at the start of the bytes, as `add_run`; empty if `sample` or
         `add_run` must process the first frame. The kernel then keeps the state until `settle`."""
@@ -301,7 +302,7 @@ class SampleClock:
             self._run, self.missed = run, 0
         return slots
 
-    def _start_run(self, start: StartRun, kind: str) -> Any:
+    def _start_run(self, start: StartRun, kind: KernelFormat) -> Any:
         """Return a run of the kernel with the present state; None if the next frames need Python."""
         time, fit = self._time, self._fit
         if (
@@ -311,7 +312,7 @@ class SampleClock:
             return None
         try:
             return start(
-                kind, (
+                kind.name, (
                     SYNC_CODES[self._fit_sync], -1 if self._own_status is None else self._own_status, self._seq,
                     self._t_ns, self._t_rx_ns, self._delay.byte_ns or 1, self._fit_bias_ns, self._fit_error_ns,
                 ),

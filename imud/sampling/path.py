@@ -382,8 +382,9 @@ class StreamPath(SamplePath):
         packed, start, utc_offset = b"", self._start_run, self._utc_offset_ns
         utc_offset_ns = utc_offset()  # in all cases: the result must not depend on the use of the kernel
         if start is not None and use_kernel and (frames := codec.usual_frames(data)):
-            kind = codec.kernel_format.name
-            packed = self.clock.stamp_frames(start, kind, frames, codec.word_is_status, t_rx_ns, utc_offset_ns)
+            packed = self.clock.stamp_frames(
+                start, codec.kernel_format, frames, codec.word_is_status, t_rx_ns, utc_offset_ns
+            )
             if packed:
                 self.loss.bad_frames = 0
                 data = codec.take(frames, len(packed) // SLOT_BYTES, data)
