@@ -9,12 +9,7 @@ from msgspec.structs import replace
 from imud.cli.status import block, page
 from imud.client.connection import Client
 from imud.contracts.condition import Condition, DeviceCondition, Reason, ReasonCode
-from imud.contracts.status import (
-    CKernelStatus,
-    DeviceState,
-    MqttStatus,
-    WorkStatus,
-)
+from imud.contracts.status import CKernelStatus, DeviceState, MqttStatus, WorkStatus
 from imud.formats import kernel
 from imud.model.units import NS_PER_S
 from tests.cli.conftest import Cli

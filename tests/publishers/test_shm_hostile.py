@@ -169,11 +169,8 @@ def test_directory_that_other_users_can_change_is_rejected(shared: Path, uid: in
 
 
 @pytest.mark.parametrize(
-    ("make", "why"),
-    [
-        (lambda path: path.symlink_to("real"), "a symbolic link"), (os.mkfifo, "Not a directory"),
-    ],
-)  # fmt: skip
+    ("make", "why"), [(lambda path: path.symlink_to("real"), "a symbolic link"), (os.mkfifo, "Not a directory")]
+)
 def test_paths_that_are_not_a_directory_are_rejected(tmp_path: Path, make: Callable[[Path], object], why: str) -> None:
     (tmp_path / "real").mkdir()
     make(tmp_path / "shm")

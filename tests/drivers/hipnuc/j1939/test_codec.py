@@ -158,9 +158,7 @@ def test_absent_is_not_zero_and_one_negative_count_is_a_value() -> None:
     assert [measured(0xFF43, f"{counts}000000000000").temperature_c for counts in ("983a", "993a")] == [150.0, None]
 
 
-SIGNALS = {
-    "Acc": ("accel_m_s2", 9.8), "Gyr": ("gyro_rad_s", math.pi / 180), "Mag": ("mag_t", 1e-6),
-}  # fmt: skip
+SIGNALS = {"Acc": ("accel_m_s2", 9.8), "Gyr": ("gyro_rad_s", math.pi / 180), "Mag": ("mag_t", 1e-6)}
 
 
 def test_the_vendors_signal_definitions_agree() -> None:
