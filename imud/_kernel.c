@@ -9,7 +9,8 @@
  *   stamp ─▶ add_even_run (imud/sampling/clock.py), ArrivalFit.add_arrival (imud/sampling/arrival_fit.py),
  *                 encode_slots (imud/formats/slot.py)
  *   can_frames ─▶ FrameReader (imud/links/socketcan.py)
- *   write_ring ─▶ ShmRing (imud/publishers/shm.py)
+ *   write_ring, beat_ring, show_ledger ─▶ ShmRing (imud/publishers/shm.py)
+ *   is_at ─▶ is_at (imud/formats/kernel.py)
  *   frame_slots ─▶ BinaryEncoding (imud/publishers/socket/outbox.py)
  *   add_slots ─▶ add_slots (imud/publishers/socket/history.py)
  *
@@ -26,6 +27,7 @@
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 /* The headers of Python 3.12 and later do not count this reference, but Python 3.11 does. */
@@ -707,6 +709,10 @@ static PyType_Spec run_spec = {
 #define RING_HEADER_BYTES 4096 /* `HEADER_BYTES` of imud/formats/ring.py */
 #define RING_NEWEST_OFFSET 192
 #define RING_FIRST_OFFSET 200
+#define RING_HEARTBEAT_OFFSET 208
+#define RING_LEDGER_OFFSET 256
+#define RING_DRIVER_BYTES 32
+#define RING_COUNTERS 59 /* `LEDGER_ROOM` of imud/formats/ring.py */
 
 static void put_word(uint8_t *memory, uint64_t value)
 {
@@ -719,8 +725,19 @@ typedef struct {
     Py_buffer memory;
     int64_t mask; /* number of slots - 1 */
     int64_t newest; /* sequence number of the newest slot */
+    uint64_t update; /* number of changes of the ledger */
     int fd;
 } RingObject;
+
+/* Block of the ledger (`HEADER_FIELDS` of imud/formats/ring.py). */
+typedef struct {
+    uint64_t update;
+    char driver[RING_DRIVER_BYTES];
+    uint64_t counters[RING_COUNTERS];
+    uint32_t crc32;
+} LedgerBlock;
+
+_Static_assert(offsetof(LedgerBlock, crc32) == 512, "a block of the ledger has no padding before its CRC-32");
 
 static PyObject *ring_type;
 
@@ -745,6 +762,7 @@ static PyObject *open_ring(PyObject *self, PyObject *args)
     made->memory = memory;
     made->mask = mask;
     made->newest = newest;
+    made->update = 0;
     made->fd = fd;
     return (PyObject *)made;
 }
@@ -775,6 +793,66 @@ static PyObject *write_ring(RingObject *self, PyObject *packed)
     return PyBool_FromLong(1);
 }
 
+/* Ring.beat(now_ns): write the heartbeat -> False without a change if the file is shorter than the memory */
+static PyObject *beat_ring(RingObject *self, PyObject *now)
+{
+    int64_t now_ns;
+    if (!integer(now, &now_ns))
+        return NULL;
+    if (lseek(self->fd, 0, SEEK_END) < self->memory.len)
+        return PyBool_FromLong(0);
+    put_word((uint8_t *)self->memory.buf + RING_HEARTBEAT_OFFSET, (uint64_t)now_ns);
+    return PyBool_FromLong(1);
+}
+
+/* Ring.show(driver, counters): write the ledger if it changed -> False without a change if the file is shorter than
+ * the memory */
+static PyObject *show_ledger(RingObject *self, PyObject *args)
+{
+    const char *driver;
+    Py_ssize_t size;
+    PyObject *counters;
+    uint8_t *to = (uint8_t *)self->memory.buf + RING_LEDGER_OFFSET;
+    LedgerBlock block = {.update = self->update + 1};
+    if (!PyArg_ParseTuple(args, "s#O!:show", &driver, &size, &PyTuple_Type, &counters))
+        return NULL;
+    memcpy(block.driver, driver, (size_t)(size < RING_DRIVER_BYTES ? size : RING_DRIVER_BYTES - 1));
+    Py_ssize_t count = PyTuple_Size(counters);
+    if (count > RING_COUNTERS) {
+        PyErr_Format(PyExc_ValueError, "expected at most %d counters, got %zd", RING_COUNTERS, count);
+        return NULL;
+    }
+    for (Py_ssize_t i = 0; i < count; i++) {
+        block.counters[i] = PyLong_AsUnsignedLongLong(PyTuple_GetItem(counters, i));
+        if (block.counters[i] == UINT64_MAX && PyErr_Occurred())
+            return NULL;
+    }
+    if (lseek(self->fd, 0, SEEK_END) < self->memory.len)
+        return PyBool_FromLong(0);
+    const uint8_t *payload = (const uint8_t *)&block + sizeof block.update;
+    size_t payload_bytes = offsetof(LedgerBlock, crc32) - sizeof block.update;
+    if (self->update && !memcmp(to + sizeof block.update, payload, payload_bytes))
+        return PyBool_FromLong(1);
+    block.crc32 = crc32_of((const uint8_t *)&block, offsetof(LedgerBlock, crc32));
+    put_word(to, UINT64_MAX); /* invalid while it changes */
+    __atomic_thread_fence(__ATOMIC_SEQ_CST);
+    memcpy(to + sizeof block.update, payload, payload_bytes + sizeof block.crc32);
+    put_word(to, block.update);
+    self->update = block.update;
+    return PyBool_FromLong(1);
+}
+
+/* is_at(path, st_dev, st_ino) -> whether the path, as bytes, is this file and not a link to it */
+static PyObject *is_at(PyObject *self, PyObject *args)
+{
+    const char *path;
+    unsigned long long device, inode;
+    struct stat found;
+    if (!PyArg_ParseTuple(args, "yKK:is_at", &path, &device, &inode))
+        return NULL;
+    return PyBool_FromLong(!lstat(path, &found) && found.st_dev == device && found.st_ino == inode);
+}
+
 static void free_ring(PyObject *self)
 {
     PyTypeObject *type = Py_TYPE(self);
@@ -785,6 +863,8 @@ static void free_ring(PyObject *self)
 
 static PyMethodDef ring_methods[] = {
     {"write", (PyCFunction)write_ring, METH_O, "Write slots; return False if the file was truncated."},
+    {"beat", (PyCFunction)beat_ring, METH_O, "Write the heartbeat; return False if the file was truncated."},
+    {"show", (PyCFunction)show_ledger, METH_VARARGS, "Write the ledger; return False if the file was truncated."},
     {NULL, NULL, 0, NULL},
 };
 
@@ -1028,6 +1108,7 @@ static PyMethodDef methods[] = {
     {"can_frames", can_frames, METH_VARARGS, "Return CAN frames of the buffers of recvmmsg; or None."},
     {"add_slots", add_slots, METH_VARARGS, "Add slots to the minimum and maximum of a second."},
     {"frame_slots", frame_slots, METH_O, "Return slots as messages of the socket, back to back."},
+    {"is_at", is_at, METH_VARARGS, "Return whether a path is a file."},
     {"open_ring", open_ring, METH_VARARGS, "Return a Ring in the memory of a file."},
     {"start", start, METH_VARARGS, "Return a Run for frames of a format that starts with a state; or None."},
     {NULL, NULL, 0, NULL},

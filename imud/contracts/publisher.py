@@ -54,7 +54,7 @@ class RecordingSource(Protocol):
 
 AS_SENT: Final = as_sent()  # axes and angles of HiPNUC devices: default of a batch
 # Name of a device, its driver as in `DeviceStatus.driver`, and its present ledger
-DeviceLedger = tuple[str, str, Sequence[int]]
+DeviceLedger = tuple[str, str, tuple[int, ...]]
 
 
 class Batch:

@@ -65,3 +65,15 @@ class KernelFormat:
 
 # Kernel of this process. Users read it at each call, so that a test can replace it.
 present = load(os.environ.get("IMUD_KERNEL"))
+
+
+def is_at(path: bytes, st_dev: int, st_ino: int) -> bool:
+    """Return whether `path` is the file with these numbers of `os.stat_result`, and not a link to it."""
+    module = present.module
+    if module is not None:
+        return bool(module.is_at(path, st_dev, st_ino))
+    try:
+        found = os.lstat(path)
+    except OSError:
+        return False
+    return found.st_ino == st_ino and found.st_dev == st_dev

@@ -14,7 +14,7 @@ import secrets
 import stat
 import struct
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
@@ -83,11 +83,15 @@ class RingDirectory:
     @property
     def current(self) -> bool:
         """Return whether `path` still names this directory. False after it was removed, renamed or mounted over."""
-        return _is_at(self.path, self._status)
+        return kernel.is_at(os.fsencode(self.path), self._status.st_dev, self._status.st_ino)
 
     def names(self, name: str, file: os.stat_result) -> bool:
         """Return whether the directory entry `name` is the file `file`."""
-        return _is_at(name, file, self._fd)
+        try:
+            found = os.lstat(name, dir_fd=self._fd)
+        except OSError:
+            return False
+        return os.path.samestat(found, file)
 
     def refuse_second_writer(self, name: str) -> None:
         """Raise ServerError if another daemon of this user or of root writes the ring `name`. `make` replaces any other
@@ -249,15 +253,6 @@ def _credible(status: os.stat_result) -> bool:
     return stat.S_ISREG(status.st_mode) and status.st_uid in (0, os.geteuid())
 
 
-def _is_at(path: str, known: os.stat_result, directory: int | None = None) -> bool:
-    """Return whether `path`, relative to a descriptor, is the file or directory `known`, and not a link to it."""
-    try:
-        found = os.lstat(path, dir_fd=directory)
-    except OSError:
-        return False
-    return found.st_ino == known.st_ino and found.st_dev == known.st_dev
-
-
 def _lock(descriptor: int) -> None:
     fcntl.fcntl(descriptor, fcntl.F_OFD_SETLK, _FLOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0))
 
@@ -290,7 +285,7 @@ class ShmRing:
         """Create the complete file in `directory`. Raises ServerError."""
         self._directory = directory
         path = ring_path(directory.path, header.device)
-        self._path, self._name = str(path), path.name
+        self._path, self._name = os.fsencode(path), path.name
         self._size_bytes = HEADER_BYTES + header.slot_count * SLOT_BYTES
         self._fd = directory.make(self._name, self._size_bytes, encode_header(header), mode, group_id)
         self._status = os.fstat(self._fd)
@@ -304,7 +299,7 @@ class ShmRing:
         open_ring = getattr(kernel.present.module, "open_ring", None)
         self._ring: Any = open_ring and open_ring(self._memory, self._mask, self._newest, self._fd)
         self.write: Callable[[bytes], bool] = self._ring.write if self._ring else self.write_in_python
-        self._known: tuple[str, Sequence[int]] | None = None
+        self._known: tuple[str, tuple[int, ...]] | None = None  # last ledger, without the kernel
         # minimum size of the file for a write; larger than any file after the file was truncated
         self._least_bytes = self._size_bytes
 
@@ -356,11 +351,13 @@ class ShmRing:
 
     def beat(self, now_ns: int) -> None:
         """Write the heartbeat."""
-        if self._is_whole():
+        if not (self._ring and self._ring.beat(now_ns)) and self._is_whole():
             self._words[HEARTBEAT_WORD] = now_ns
 
-    def set_ledger(self, driver: str, counters: Sequence[int]) -> None:
+    def set_ledger(self, driver: str, counters: tuple[int, ...]) -> None:
         """Write the driver, and the ledger as counters in the order of LEDGER_FIELDS, if they changed."""
+        if self._ring and self._ring.show(driver, counters):
+            return
         if self._known == (driver, counters) or not self._is_whole():
             return
         self._known = (driver, counters)
@@ -372,7 +369,7 @@ class ShmRing:
 
     def is_intact(self) -> bool:
         """Return whether the file has its size, and readers find it at its path."""
-        return self._is_whole() and _is_at(self._path, self._status)
+        return self._is_whole() and kernel.is_at(self._path, self._status.st_dev, self._status.st_ino)
 
     def is_named(self, directory: RingDirectory) -> bool:
         """Return whether the file has its name in `directory`."""

@@ -92,13 +92,10 @@ def test_torn_ledger_block_is_refused(at: int) -> None:
 
 
 @pytest.mark.parametrize("device", ["", "a/b", "../x", "a\0b", "x" * 64, "ü" * 32])
-def test_names_that_cannot_be_files(device: str) -> None:
+def test_default_directories_and_names_that_cannot_be_files(device: str) -> None:
     assert str(ring.ring_path("/run/imud/shm", "imu0")) == "/run/imud/shm/imud.imu0"
     with pytest.raises(ServerError, match="expected a name"):
         ring.ring_path("/dev/shm", device)
-
-
-def test_default_directories() -> None:
     assert ring.default_directories({"XDG_RUNTIME_DIR": "/run/user/9"}) == ["/run/imud/shm", "/run/user/9/imud/shm"]
     for environment in ({"XDG_RUNTIME_DIR": "relative"}, {}):
         assert ring.default_directories(environment) == ["/run/imud/shm"]

@@ -18,6 +18,7 @@ OPTIONS: Final = (
 )  # fmt: skip
 TESTS: Final = (
     "tests/sampling/test_path_kernel.py",
+    "tests/publishers/test_shm.py",
     "tests/publishers/socket/test_history.py",
     "tests/links/test_socketcan.py",
 )

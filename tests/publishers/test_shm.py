@@ -114,6 +114,10 @@ def test_batches_and_single_samples_write_the_same_bytes(
         many.publish(numbers)
         for number in numbers:
             one.publish([number])
+        driver, counts = random.choice(("", "x" * 31, "é" * 16)), random.choices((0, 7, (1 << 64) - 1), k=2)
+        for board in (one, many):
+            board.driver, (board.ledger.bytes_in, board.ledger.frames_lost) = driver, counts
+            board.tick(random.choice((0, NS_PER_S // 2, NS_PER_S)) if board is one else one.now_ns - many.now_ns)
         written = [board.path.read_bytes() for board in (one, many)]
         assert written[0][layout.OFFSETS["newest_seq"] :] == written[1][layout.OFFSETS["newest_seq"] :]
     one.publisher.close()

@@ -270,17 +270,14 @@ def test_removed_ring_is_created_again(board: Board, caplog: pytest.LogCaptureFi
         assert (ring.epoch, ring.missed) == (77, 0)
     assert f"the ring file of {DEVICE} was missing or truncated; created it again" in caplog.text
     assert board.word("first_seq") == 5
-
-
-def test_slow_reader_of_a_removed_ring(board: Board) -> None:
-    with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
-        board.publish([1, 2])
+    with Ring(board.path, now_ns=lambda: board.now_ns) as slow:
+        board.publish([7, 8])
         board.path.unlink()
         board.tick()
-        board.publish(range(3, 3 + 2 * SLOTS))
-        assert ring.read() == ([make_sample(1), make_sample(2)], 0)
-        samples, missed = ring.read()
-        assert [sample.seq for sample in samples] == list(range(3 + SLOTS, 3 + 2 * SLOTS))
+        board.publish(range(9, 9 + 2 * SLOTS))
+        assert slow.read() == ([make_sample(7), make_sample(8)], 0)
+        samples, missed = slow.read()
+        assert [sample.seq for sample in samples] == list(range(9 + SLOTS, 9 + 2 * SLOTS))
         assert missed == SLOTS
 
 
@@ -309,7 +306,7 @@ def test_truncated_ring_is_created_again(tmp_path: Path, size_bytes: int, first:
     board.publisher.close()
 
 
-def test_a_ring_truncated_completely_and_by_a_byte(board: Board) -> None:
+def test_a_ring_truncated_completely_and_by_a_byte_and_replaced(board: Board) -> None:
     with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
         board.publish([1, 2])
         os.truncate(board.path, 0)
@@ -324,28 +321,20 @@ def test_a_ring_truncated_completely_and_by_a_byte(board: Board) -> None:
         board.publish([6])
         assert ring.read() == ([make_sample(4)], 0)
         assert ring.read() == ([make_sample(6)], 1)
-
-
-def test_reader_of_a_truncated_ring_keeps_its_pages(board: Board) -> None:
-    """imud restores the size for a reader that does not check the file, and marks the file as closed."""
-    board.publish([1])
-    with board.path.open("rb") as file:
-        os.truncate(board.path, 0)
-        board.publish([2])
-        raw = file.read()
-    assert (len(raw), raw[44], any(raw[HEADER_BYTES:])) == (RING_BYTES, STATE_CLOSED, False)
-
-
-def test_ring_replaced_by_another_file(board: Board) -> None:
-    with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
         other = board.path.with_name("other")
         other.write_bytes(FORGED + bytes(SLOTS * SLOT_BYTES))
-        other.rename(board.path)
-        board.publish([1])
-        assert ring.read() == ([make_sample(1)], 0)
+        other.rename(board.path)  # another file replaces the ring
+        board.publish([7])
+        assert ring.read() == ([make_sample(7)], 0)
         board.tick()
-        board.publish([2])
-        assert ring.read() == ([make_sample(2)], 0)
+        board.publish([8])
+        assert ring.read() == ([make_sample(8)], 0)
+    # imud restores the size for a reader that does not check the file, and marks the file as closed
+    with board.path.open("rb") as file:
+        os.truncate(board.path, 0)
+        board.publish([9])
+        raw = file.read()
+    assert (len(raw), raw[44], any(raw[HEADER_BYTES:])) == (RING_BYTES, STATE_CLOSED, False)
 
 
 def test_directory_removed_and_created_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -370,7 +359,8 @@ def test_directory_removed_and_created_again(tmp_path: Path, caplog: pytest.LogC
     assert not list(folder.iterdir())
 
 
-def test_descriptors_are_closed(board: Board) -> None:  # a fixture of tests/conftest.py checks the descriptors
+# a fixture of tests/conftest.py checks the descriptors
+def test_descriptors_are_closed_and_none_is_left(board: Board, caplog: pytest.LogCaptureFixture) -> None:
     with Ring(board.path, now_ns=lambda: board.now_ns) as ring:
         for _ in range(20):
             os.truncate(board.path, 5)
@@ -378,9 +368,6 @@ def test_descriptors_are_closed(board: Board) -> None:  # a fixture of tests/con
             board.path.unlink()
             board.tick()
             ring.read()
-
-
-def test_no_descriptor_left(board: Board, caplog: pytest.LogCaptureFixture) -> None:
     board.path.unlink()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     try:
@@ -419,7 +406,7 @@ def test_full_tmpfs(tmp_path: Path) -> None:
         subprocess.run(["umount", "-l", tmp_path], check=True)
 
 
-def test_a_reader_of_a_fifo_and_of_a_forged_ring(tmp_path: Path) -> None:
+def test_a_reader_of_a_fifo_and_of_a_forged_ring_and_names_of_rings_in_a_message(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "imud.x")
     (tmp_path / "imud.y").symlink_to("imud.x")
     with pytest.raises(ServerError, match=r"expected a regular file \(-\), got another kind \(p\)"):
@@ -432,9 +419,6 @@ def test_a_reader_of_a_fifo_and_of_a_forged_ring(tmp_path: Path) -> None:
         assert not ring.alive(START_NS)
         assert ring.latest() is None
         assert ring.read() == ([], 0)
-
-
-def test_names_of_rings_in_a_message(tmp_path: Path) -> None:
     for name in ("bow", "\x1b[31m", "a\nb", "c" * 100, *(f"n{i}" for i in range(100))):
         (tmp_path / f"imud.{name}").touch()
     with pytest.raises(ServerError) as caught:

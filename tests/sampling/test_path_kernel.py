@@ -274,7 +274,10 @@ def test_the_kernel_accepts_any_bytes_and_numbers(tmp_path: Path, name: str) -> 
                 with contextlib.suppress(ValueError):  # a memory that is too small for the ring
                     memory = bytearray(random.choice([4096 + SLOT_BYTES, 4096 + 8 * SLOT_BYTES]))
                     mask, newest = random.choice([0, 7, *EXTREMES]), random.choice(EXTREMES)
-                    assert module.open_ring(memory, mask, newest, file).write(slots)
+                    ring = module.open_ring(memory, mask, newest, file)
+                    assert ring.write(slots)
+                    assert ring.beat(t_rx_ns)
+                    assert ring.show(name * 9, tuple(random.choices([0, 2**64 - 1], k=random.randrange(60))))
                 assert made is None or len(made.state()) == 9
                 made_slots += bool(slots)
     os.close(file)

@@ -93,7 +93,7 @@ def publisher_context(
 ) -> PublisherContext:  # fmt: skip
     devices = FakeDevices(
         status, control, recording or NothingRecorded(), each_status or (lambda: iter(status())),
-        ledgers or (lambda: [(d.name, d.driver, [d.ledger.get(key, 0) for key in LEDGER_FIELDS]) for d in status()]),
+        ledgers or (lambda: [(d.name, d.driver, tuple(d.ledger.get(f, 0) for f in LEDGER_FIELDS)) for d in status()]),
     )  # fmt: skip
     return PublisherContext(
         epoch, PublisherClock(now_ns, utc_offset_ns, utc_reference, cpu_ns), devices, outputs or OutputFacts(),

@@ -88,7 +88,7 @@ class Listener:
         _check_free(path)
         _remove_leftovers(path)
         self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._name = os.fspath(path)
+        self._name = os.fsencode(path)
         self._file = path.with_name(f"{path.name}.{os.getpid()}")
         self._inode = (0, 0)
         try:
@@ -121,10 +121,7 @@ class Listener:
 
     def has_file(self) -> bool:
         """Return whether `path` still names the socket file of this listener."""
-        try:
-            return _inode_of(self._name) == self._inode
-        except OSError:
-            return False
+        return kernel.is_at(self._name, *self._inode)
 
     def close(self) -> None:
         """Stop listening, and remove the file if it is still ours. A second call does nothing."""
@@ -140,7 +137,7 @@ class Listener:
         self.sock.close()
 
 
-def _inode_of(path: Path | str) -> tuple[int, int]:
+def _inode_of(path: Path) -> tuple[int, int]:
     found = os.lstat(path)
     return found.st_dev, found.st_ino
 
