@@ -30,7 +30,7 @@ from imud.contracts.status import DeviceState, FrameProblem, LinesStatus, Recent
 from imud.device.health import NO_SAMPLE, RUNNING, SEARCH_BEGUN, DeviceEvents
 from imud.links.serial_port import list_ports
 from imud.model.event import EventKind
-from imud.model.ledger import LOST_FIELDS, Ledger, counters_of
+from imud.model.ledger import LOST_FIELDS, Ledger
 from imud.model.units import NS_PER_MS, NS_PER_S
 
 MINUTE_NS: Final = 60 * NS_PER_S
@@ -355,7 +355,6 @@ RULES: Final = (
 
 # --- counts of the last minute ----------------------------------------------------------------------------------------
 
-_LOST: Final = counters_of(LOST_FIELDS)
 CAUSES: Final = tuple(name.removeprefix("lost_") for name in LOST_FIELDS)
 HOUR_NS: Final = 60 * MINUTE_NS
 STEADY: Final = 0.01  # maximum change of the expected rate within the window of a rate, as a share
@@ -377,7 +376,7 @@ class RecentCounts:
         self._ledger = ledger
         self._begun_ns = begun_ns
         self._timed = timed
-        self._seconds: deque[_Second] = deque([(begun_ns, ledger.samples, ledger.bytes_in, _LOST(ledger))], maxlen=64)
+        self._seconds: deque[_Second] = deque([(begun_ns, ledger.samples, ledger.bytes_in, ledger.losses())], maxlen=64)
         # CLOCK_MONOTONIC since which the expected rate is the same, without a gap of unknown size
         self._steady_ns = begun_ns
         self._steady_hz = 0.0  # expected rate at this time; 0.0 while the rate is not known
@@ -390,7 +389,7 @@ class RecentCounts:
         """Add the present counts. Return whether samples were lost in the last minute. `rate_hz`: expected rate, 0 if
         the device does not run; `resets`: own restarts."""
         ledger, seconds = self._ledger, self._seconds
-        lost, before = _LOST(ledger), seconds[-1][3]
+        lost, before = ledger.losses(), seconds[-1][3]
         if lost != before:
             self._add_loss(now_ns, _by_cause(before, lost))
         seconds.append((now_ns, ledger.samples, ledger.bytes_in, lost))

@@ -11,17 +11,13 @@ from imud.contracts.codec import BadFrame, wrong_length_words
 from imud.contracts.status import DeviceState
 from imud.host.log import MESSAGE_CHARACTERS_MAX, printable, same_as
 from imud.model.event import LEVELS, Event, EventKind
-from imud.model.ledger import LOST_FIELDS, Ledger, counters_of
+from imud.model.ledger import Ledger
 from imud.model.sample import Sync
 from imud.model.units import NS_PER_S
 
 log = logging.getLogger(__name__)
 
 INTERVAL_NS = NS_PER_S  # minimum interval of loss events and of bad-frame events, ns
-# Counters that cause events: `Ledger.lost`, `Ledger.frames_bad`, and `frames_not_finite`
-_TROUBLES = counters_of(
-    (*LOST_FIELDS, "frames_bad_crc", "frames_bad_length", "frames_bad_content", "frames_not_finite")
-)
 RAW_SHOWN_BYTES = 32  # maximum number of bytes of a bad frame in an event
 
 
@@ -72,7 +68,7 @@ class DeviceEvents:
         if sync is not None and sync is not self._sync:
             self._report_sync(now_ns, sync)
         ledger = self._ledger
-        if (counts := _TROUBLES(ledger)) == self._counts or now_ns < self._due_ns:
+        if (counts := ledger.troubles()) == self._counts or now_ns < self._due_ns:
             return
         self._counts = counts
         troubled = ledger.frames_bad() + ledger.frames_not_finite

@@ -5,7 +5,7 @@ ledger, between two callbacks. Another thread requests a snapshot from the loop,
 does not balance.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from operator import itemgetter
 from typing import Final
 
@@ -99,24 +99,34 @@ class Ledger:
         self.lost_unknown += 1
 
     def values(self) -> tuple[int, ...]:
-        """Return all counters in the order of LEDGER_FIELDS."""
-        return _ALL(self)
+        """Return all counters in the order of LEDGER_FIELDS. A written tuple is faster than `attrgetter`."""
+        return (
+            self.bytes_in, self.bytes_in_good_frames, self.bytes_in_bad_frames, self.bytes_skipped, self.bytes_pending,
+            self.frames_good, self.frames_in_samples, self.frames_in_replies, self.frames_ignored, self.frames_pending,
+            self.frames_bad_crc, self.frames_bad_length, self.frames_bad_content, self.unknown_tags, self.samples,
+            self.lost_gap_device, self.lost_crc, self.lost_overrun, self.lost_queue, self.replies_late,
+            self.replies_unsolicited, self.frames_not_finite, self.lost_unknown, self.frames_lost,
+        )  # fmt: skip
+
+    def losses(self) -> tuple[int, ...]:
+        """Return the counters of losses in the order of LOST_FIELDS."""
+        return self.lost_gap_device, self.lost_crc, self.lost_overrun, self.lost_queue, self.lost_unknown
+
+    def troubles(self) -> tuple[int, ...]:
+        """Return the counters of losses and of frames that imud could not use."""
+        return (
+            self.lost_gap_device, self.lost_crc, self.lost_overrun, self.lost_queue, self.lost_unknown,
+            self.frames_bad_crc, self.frames_bad_length, self.frames_bad_content, self.frames_not_finite,
+        )  # fmt: skip
 
     def snapshot(self) -> dict[str, int]:
         """Return all counters by name."""
         return dict(zip(LEDGER_FIELDS, self.values(), strict=True))
 
 
-def counters_of(names: Iterable[str]) -> Callable[[Ledger], tuple[int, ...]]:
-    """Return a function that reads the counters `names`. It is faster than `attrgetter`."""
-    read: Callable[[Ledger], tuple[int, ...]] = eval(f"lambda ledger: ({', '.join(f'ledger.{one}' for one in names)},)")
-    return read
-
-
 # The first counter of each balance is the sum of the others.
 BYTE_FIELDS: Final = ("bytes_in", "bytes_in_good_frames", "bytes_in_bad_frames", "bytes_skipped", "bytes_pending")
 FRAME_FIELDS: Final = ("frames_good", "frames_in_samples", "frames_in_replies", "frames_ignored", "frames_pending")
-_ALL: Final = counters_of(LEDGER_FIELDS)
 LOST_FIELDS: Final = tuple(name for name in LEDGER_FIELDS if name.startswith("lost_"))  # counters of losses by cause
 
 

@@ -1,16 +1,18 @@
 """The two sums of the ledger."""
 
-from imud.model.ledger import LEDGER_FIELDS, Ledger, bytes_open, frames_open, lost
+from imud.model.ledger import LEDGER_FIELDS, LOST_FIELDS, Ledger, bytes_open, frames_open, lost
 
 
 def test_every_byte_and_every_good_frame_must_be_somewhere() -> None:
     ledger = Ledger()
     assert ledger.closes()
     assert set(ledger.values()) == {0}
-    before = ledger.snapshot()
-    assert tuple(before) == LEDGER_FIELDS
-    ledger.samples += 1
-    assert (before["samples"], ledger.snapshot()["samples"]) == (0, 1)
+    for number, name in enumerate(LEDGER_FIELDS):
+        setattr(ledger, name, number)
+    assert (ledger.values(), ledger.troubles()) == (tuple(range(24)), (*ledger.losses(), 10, 11, 12, 21))
+    assert ledger.losses() == tuple(map(LEDGER_FIELDS.index, LOST_FIELDS))
+    before, ledger.samples = ledger.snapshot(), 15
+    assert (tuple(before), before["samples"], ledger.snapshot()["samples"]) == (LEDGER_FIELDS, 14, 15)
     ledger = Ledger()
     ledger.bytes_in = 100
     assert ledger.bytes_open() == bytes_open(ledger.snapshot()) == 100

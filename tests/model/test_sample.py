@@ -12,11 +12,15 @@ from imud.model.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA, T_ERR_MOST, Sample
 BY_NAME = {field.name: field for field in SAMPLE_SCHEMA}
 
 
-def test_units_by_their_definitions() -> None:
+def test_units_by_their_definitions_and_kinds_of_events_by_name() -> None:
     assert pytest.approx(57.295779513, rel=1e-9) == 1 / units.RAD_PER_DEG
     assert (units.STANDARD_GRAVITY_M_S2, units.T_PER_UT, units.PPM_PER_ONE) == (9.80665, 1e-6, 1e6)
     assert (units.NS_PER_S, units.NS_PER_MS, units.NS_PER_US) == (1e9, 1e6, 1e3)
     assert [units.uart_byte_ns(baud) for baud in (0, 9600, 1_000_000)] == [0, 1_041_666, 10_000], "10 bits per byte"
+    # a newer daemon can send an unknown kind of event
+    assert [kind_of(kind.value) for kind in EventKind] == list(EventKind)
+    assert type(kind_of("mark")) is EventKind
+    assert kind_of("eclipse") == "eclipse"
 
 
 def test_every_member_has_its_row_in_its_place_with_its_meaning() -> None:
@@ -33,10 +37,3 @@ def test_every_member_has_its_row_in_its_place_with_its_meaning() -> None:
     assert struct.pack("<I", T_ERR_MOST) == b"\xff" * 4
     with pytest.raises(struct.error):
         struct.pack("<I", T_ERR_MOST + 1)
-
-
-def test_kinds_of_events_by_name() -> None:
-    """A newer daemon can send an unknown kind."""
-    assert [kind_of(kind.value) for kind in EventKind] == list(EventKind)
-    assert type(kind_of("mark")) is EventKind
-    assert kind_of("eclipse") == "eclipse"
