@@ -244,13 +244,14 @@ RATE_WINDOW_NS: Final = 10 * NS_PER_S  # time over which imud measures the rate,
 RATE_SECONDS: Final = RATE_WINDOW_NS // NS_PER_S + 1  # number of counts in this time
 SHORT_NS: Final = 2 * NS_PER_S  # time of the rate in the status, ns: two samples of a device at 1 Hz
 RATE_SAMPLES: Final = 2  # deviation that the start and the end of the window can cause, samples
+DEVIATION_HZ: Final = RATE_SAMPLES * NS_PER_S / RATE_WINDOW_NS  # the same deviation of the rate
 
 
 def _is_other_rate(rate_hz: float | None, expected_hz: float, limits: ConditionLimits) -> bool:
     if rate_hz is None or not expected_hz:
         return False
-    tolerance_hz = max(limits.rate_percent / 100 * expected_hz, RATE_SAMPLES * NS_PER_S / RATE_WINDOW_NS)
-    return abs(rate_hz - expected_hz) > tolerance_hz
+    deviation_hz = abs(rate_hz - expected_hz)
+    return deviation_hz > DEVIATION_HZ and deviation_hz > limits.rate_percent / 100 * expected_hz
 
 
 def _is_inexact(t_err_ns: int, limits: ConditionLimits) -> bool:

@@ -281,15 +281,17 @@ class Device:
         transport, health, judge, path = self._transport, self._health, self._judge, self._transport.path
         has_news = path is None or now_ns - path.last_sample_ns > IDLE_FLUSH_NS or health.state is not RUNNING
         is_due = now_ns >= judge.due_ns
-        if self._is_quick and not (is_due or has_news or transport.busy or self.settings.lock.work is not None):
+        is_quick = self._is_quick and not (has_news or transport.busy or self.settings.lock.work is not None)
+        if is_quick and not is_due:
             return
-        needs_ticks = self._needs_ticks()
+        needs_ticks = not is_quick and self._needs_ticks()
         if needs_ticks:
             self._shared.owner.tick_soon()
             self._attachments.tick(now_ns, path.newest if path is not None else None)
         elif is_due:  # the other attachments wait for a command, or have a line and need ticks
             self.settings.tick(now_ns, None)
-        transport.tick(now_ns)
+        if not is_quick:  # the transport has no work while samples arrive
+            transport.tick(now_ns)
         if path is not None and (has_news or self._suspends != self._host.suspends):
             self._tick_flow(path, now_ns)
         if path is not None and (needs_ticks or is_due):
@@ -304,7 +306,10 @@ class Device:
         transport, settings, health, path = self._transport, self.settings, self._health, self._transport.path
         rate_hz, attachments, ledger = transport.expected_rate_hz, self._attachments, self.ledger
         self._is_slow = rate_hz * IDLE_FLUSH_NS < NS_PER_S
-        self._is_quick = not (self._is_slow or attachments.needs_ticks or transport.has_ticks)
+        has_lines, lines, utc_problem = attachments.needs_ticks, None, ""
+        if has_lines:
+            lines, utc_problem = transport.add_lines(attachments.lines_status()), attachments.utc_problem()
+        self._is_quick = not (self._is_slow or has_lines or transport.has_ticks)
         has_settings = bool(settings.declared or settings.is_unsaved or settings.comparison.problem)
         axes, axes_problem = self._attitude.problem(transport.driver, settings, transport.axes_problem)
         t_err_ns, last_ns = 0, path.last_sample_ns if path is not None else 0
@@ -312,9 +317,8 @@ class Device:
             t_err_ns = path.quality[1]
         self._judge.judge(now_ns, rate_hz, t_err_ns, last_ns, Known(
             health.state, health.problem, settings.resets - settings.resets_requested, transport.is_polled,
-            settings.status() if has_settings else None, axes, axes_problem,
-            transport.add_lines(attachments.lines_status()), path is not None and path.clock.has_scattered_time,
-            attachments.utc_problem(), ledger.bytes_open(), ledger.frames_open(),
+            settings.status() if has_settings else None, axes, axes_problem, lines,
+            path is not None and path.clock.has_scattered_time, utc_problem, ledger.bytes_open(), ledger.frames_open(),
         ))  # fmt: skip
 
     def _tick_flow(self, path: SamplePath, now_ns: int) -> None:

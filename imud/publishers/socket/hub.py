@@ -121,6 +121,8 @@ class ClientRecordings:
 
     def tick(self, now_ns: int) -> bool:
         """Check all recordings, and close the finished ones. Return whether one needs the next tick within 100 ms."""
+        if not (self.running or self._ending):
+            return False
         for number, made in list(self.running.items()):
             made.tick(now_ns)
             if made.ended:
