@@ -50,6 +50,9 @@ class RequestPort(ABC):
         """Receive further CAN frames; empty: only frames of the device. Raises CommandError if there is no CAN bus."""
         raise CommandError(f"{request.name}: expected a CAN bus, to receive other devices, got another link")
 
+    def on_change(self) -> None:  # noqa: B027 - `imud probe` makes no samples
+        """Note that imud sends a request that can change the sample rate."""
+
     def on_busy(self, busy: bool) -> None:
         """Note that a script starts (True) or has ended (False)."""
         self.busy = busy
@@ -133,6 +136,8 @@ class ScriptRunner:
                             break
                         timeout_ns = request.probe.timeout_ns << factor
                         await self._exchange(replace(request.probe, timeout_ns=timeout_ns))
+                    if request.payload and not request.repeatable:
+                        self._port.on_change()
                     outcome = await self._exchange(request)
                     undo = b""
                     request = script.send(outcome)

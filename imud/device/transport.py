@@ -310,6 +310,10 @@ class ReceivingTransport(Transport, RequestPort):
     async def work(self) -> None:
         await self._search.run()
 
+    def on_change(self) -> None:
+        if self.path is not None:
+            self.path.clock.expect_rate()
+
     async def ask_once(self) -> None:
         """Query identity and settings once."""
         await self._identify(1)

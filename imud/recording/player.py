@@ -448,7 +448,7 @@ def _repeat(device: PlayedDevice, path: Any, call: CallRecord) -> None:
             path.link_opened()
         case "edges", "restart":
             path.edges.restart()
-        case "clock", "restart" | "link_changed" | "set_own_status":
+        case "clock", "restart" | "link_changed" | "set_own_status" | "expect_rate":
             getattr(path.clock, call.method)(*arguments, **call.keywords)
         case "clock", "set_utc_reference":
             path.clock.set_utc_reference(None if arguments[0] is None else UtcReference(*arguments[0]))

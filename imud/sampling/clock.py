@@ -436,15 +436,11 @@ class SampleClock:
         self.settle()
         fit = self._fit if self._fit_sync is not Sync.ARRIVAL else None
         status = ClockStatus(
-            sync=self._sync if self._aiding else self._fit_sync,
-            offset_ns=self._t_ns - self._time.raw_ns if self._known else 0,
-            skew_ppm=(1 / fit.slope - 1) * 1e6 if fit else 0.0,
-            steering_ppm=self._host.rate * 1e6,
-            residual_ns=int(fit.residual_ns if fit else self._arrivals.spread.sigma_ns),
-            t_err_ns=self._t_err_ns,
-            resets=self.resets,
-            hold_ns=self._delay.hold_ns,
-        )
+            self._sync if self._aiding else self._fit_sync, self._t_ns - self._time.raw_ns if self._known else 0,
+            (1 / fit.slope - 1) * 1e6 if fit else 0.0,
+            int(fit.residual_ns if fit else self._arrivals.spread.sigma_ns), self._t_err_ns, self.resets,
+            self._delay.hold_ns, steering_ppm=self._host.rate * 1e6,
+        )  # fmt: skip
         return self._aiding.add_status(status) if self._aiding else status
 
     def link_changed(self, *, byte_ns: int, hold_ns: int) -> None:
@@ -470,13 +466,18 @@ class SampleClock:
         if self.observer is not None:
             self.observer.call("clock", "restart")
 
+    def expect_rate(self) -> None:
+        """Expect another sample rate: imud sends a request that can change it. Count no losses by the previous rate."""
+        self.settle()
+        self._time.change.expect(self._time.even_ns)
+        if self.observer is not None:
+            self.observer.call("clock", "expect_rate")
+
     def continue_from(self, other: "SampleClock") -> None:
         """Continue the sequence numbers and time stamps of another clock of the same device."""
         other.settle()
         self._seq, self._t_ns, self._t_rx_ns = other._seq, other._t_ns, other._t_rx_ns
         self.set_utc_reference(other.utc_reference)
-
-    # --- by arrival ----------------------------------------------------------------------------------------------
 
     def _stamped(self, stamps: StampTime, stamp: int, arrival_ns: int) -> int | None:
         """Return the ticks of a frame with `pps_age_ms` only; None if `pps_age_ms` is not usable for the time stamp."""
@@ -548,7 +549,6 @@ class SampleClock:
                 self._start_fit(arrival_ns)
             else:
                 fit_ns = self._refit(fit, device_ns, device_ns - before_ns, fit_ns, size_bytes)
-        # the fit is not in use yet
         if self._fit_sync is _ARRIVAL:
             if self._holdover is not None:
                 self._error_ns = self._holdover.error_ns(device_ns)

@@ -1,11 +1,9 @@
 """Device time from the device counter, without wraps and corrections, finer than a tick. Finds lost samples and jumps.
 
-    ticks ─▶ DeviceTime.advance ─▶ raw_ns, even_ns, missed        PeriodLearner: the step between samples
-                    │
-                    ├─ absorb_correction: the device corrected its counter, the samples continued
-                    └─ JumpDetector: the counter restarted, or has another time
-
-`gaps` handles counters that only number the samples.
+ticks ─▶ DeviceTime.advance ─▶ raw_ns, even_ns, missed        PeriodLearner: the step between samples
+                │
+                ├─ absorb_correction: the device corrected its counter, the samples continued
+                └─ JumpDetector: the counter restarted, or has another time
 """
 
 from collections.abc import Callable
@@ -13,7 +11,7 @@ from typing import Final
 
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from imud.sampling.arrival_fit import SLOPE_HIGHEST, ArrivalFit
-from imud.sampling.gaps import CounterLine
+from imud.sampling.gaps import CounterLine, ExpectedRate
 
 CONSISTENT: Final = 4  # number of consecutive equal steps that make a period
 # Number of consecutive equal steps that make a longer period than the present one. If one of ten frames is lost at 1
@@ -66,13 +64,9 @@ class PeriodLearner:
         self._on_unknown_gap = on_unknown_gap
         self._scatter = 0.0
         self.period_ticks = 0.0  # mean step, ticks; 0 if unknown
-        self._sum = 0.0
-        self._count = 0.0
-        self._even = 0
+        self._sum = self._count = 0.0
+        self._even = self._candidate = self._run = self._run_sum = 0
         self._before = -1
-        self._candidate = 0
-        self._run = 0
-        self._run_sum = 0
         self._uneven = self._uneven_sum = 0  # consecutive steps that are not exactly the period, and their sum
         self._unjudged: list[int] = []  # steps before the first period
         self._odd_at = 0.0  # number of the last step of another length
@@ -310,8 +304,8 @@ class DeviceTime:
     """
 
     __slots__ = (
-        "_even_for", "_gap", "_phase_ns", "_shift_ns", "_step_ns", "_unsettled", "_unsure_ns", "doubt_ns", "even_ns",
-        "missed", "modulus", "period", "raw_ns", "rephased", "tick_ns", "ticks", "uneven", "watched",
+        "_even_for", "_gap", "_phase_ns", "_shift_ns", "_step_ns", "_unsettled", "_unsure_ns", "change", "doubt_ns",
+        "even_ns", "missed", "modulus", "period", "raw_ns", "rephased", "tick_ns", "ticks", "uneven", "watched",
     )  # fmt: skip
 
     def __init__(self, tick_ns: int, tick_modulus: int, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
@@ -319,8 +313,7 @@ class DeviceTime:
         self.tick_ns = tick_ns
         self.modulus = tick_modulus
         self.ticks = 0  # newest counter value
-        self._phase_ns = 0.0
-        self._shift_ns = 0.0  # corrections of the counter in `even_ns`
+        self._phase_ns = self._shift_ns = 0.0  # parts of `even_ns`: phase in the tick, and corrections of the counter
         # part of `_shift_ns` without confirmation by an arrival: the first step of another rate looks like a correction
         self._unsure_ns = 0.0
         self._even_for = 0
@@ -331,6 +324,7 @@ class DeviceTime:
         self.doubt_ns = 0.0  # difference between even samples and counter values, ns, that no arrival has confirmed
         # number of samples in which the phase of a new rate can become accurate
         self._unsettled = 0
+        self.change = ExpectedRate()
         # Whether the device's rate changed. The position of the samples in their ticks is then unknown.
         self.rephased = False
         self.watched = 0  # number of further samples whose device time is compared with the arrivals
@@ -347,7 +341,9 @@ class DeviceTime:
         self._phase_ns = self._shift_ns = self._unsure_ns = self.doubt_ns = 0.0
         self.missed = self._gap = self.watched = self._even_for = 0
         self.uneven = self.rephased = False
-        self.raw_ns = self.even_ns = ticks % self.modulus * self.tick_ns
+        self.raw_ns = ticks % self.modulus * self.tick_ns
+        self.change.restart(self.even_ns, self.raw_ns)
+        self.even_ns = self.raw_ns
 
     def elapsed_ns(self, ticks: int) -> int:
         """Return the device time from the newest counter value to `ticks`, ns, with at most one wrap."""
@@ -379,7 +375,10 @@ class DeviceTime:
             self._even_for += 1
             self.even_ns += step * tick_ns
             return
+        before_ticks = period.period_ticks
         self.missed = missed = period.add_step(step)
+        if (missed or self.change.steps) and self.change.is_open(self.even_ns):
+            self.missed = self.change.lost(step, missed, before_ticks, period.period_ticks)
         if period.is_new:
             period.is_new, self._unsettled = False, UNSETTLED_MOST
             self._rephase()
@@ -498,6 +497,7 @@ class DeviceTime:
         self._unsure_ns += shift_ns - self._shift_ns
         self._shift_ns = shift_ns
         self.missed, self._gap = periods - 1, 0
+        self.change.take_back(self._step_ns // self.tick_ns % self.modulus)
         self.doubt_ns = min(abs(self._step_ns - periods * period_ns), period_ns)
         self.uneven = False
 
@@ -507,6 +507,7 @@ class DeviceTime:
         self._shift_ns -= back_ns
         self.even_ns -= back_ns
         self.missed = max(self.missed - periods, 0)
+        self.change.take_back(round(periods * self.period.period_ticks))
         self._gap -= periods
         self._even_for = 0
 

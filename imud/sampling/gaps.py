@@ -1,8 +1,9 @@
 """Gaps between samples, if the device counter alone does not show their size.
 
 `CounterLine` keeps the position of a device counter from before the present fit. Frames that waited for a busy host
-make a fit that is late. A frame in time then looks like a jump of the counter. `ArrivalPace` is for devices without
-device time: the pace of the frames with the shortest wait shows the lost samples.
+make a fit that is late. A frame in time then looks like a jump of the counter. `ExpectedRate` distinguishes lost samples
+from a lower rate that imud has requested. `ArrivalPace` is for devices without device time: the pace of the frames with
+the shortest wait shows the lost samples.
 """
 
 from collections.abc import Callable
@@ -24,6 +25,12 @@ STEADY: Final = 2e-5
 KEPT_NS: Final = 600 * NS_PER_S
 
 GAP_PERIODS: Final = 1.5  # minimum host time since the previous sample, in periods, that counts as a gap
+
+# --- another rate ---------------------------------------------------------------------------------------------------
+# Device time after a request in which the first step of another rate can arrive, ns: the reply and a restart
+RATE_WAIT_NS: Final = 3 * NS_PER_S
+LONGER: Final = 1.25  # minimum ratio of a period to the previous period that shows a lower rate
+LONGER_MOST: Final = 64  # maximum number of steps without a decision; a lower rate needs twelve
 
 # --- arrivals -------------------------------------------------------------------------------------------------------
 STEPS_ALWAYS: Final = 4  # number of counter steps accepted at any arrival time, because delayed frames arrive together
@@ -89,6 +96,56 @@ class CounterLine:
     def turns(self, device_ns: int, arrival_ns: float, turn_ns: int) -> int:
         """Return the number of lost turns of the counter before `device_ns`. A turn is `turn_ns` long."""
         return max(round(self.above(device_ns, arrival_ns) / (self.slope * turn_ns)), 0)
+
+
+class ExpectedRate:
+    """Steps that contain lost samples or show a lower rate, after a request of imud that can set the rate.
+
+    A step that is longer than the period counts as soon as a step of the previous period follows. If the steps make a
+    longer period, only the losses by the longer period count. The counter does not show all losses of a change. Not
+    counted: samples of the previous rate in the step with the change, less than one period of the new rate, and equal
+    gaps directly before the change that look like the new rate.
+    """
+
+    __slots__ = ("_until_ns", "steps")
+
+    def __init__(self) -> None:
+        self._until_ns = -1  # device time until which the rate can change, ns
+        self.steps: list[int] = []  # longer steps without a decision, ticks
+
+    def expect(self, device_ns: int) -> None:
+        """Expect another rate after the sample at `device_ns`."""
+        self._until_ns = device_ns + RATE_WAIT_NS
+
+    def restart(self, before_ns: int, device_ns: int) -> None:
+        """Continue at a new value of the counter, `device_ns`. Its caller reports the gap. `before_ns`: the value of
+        the previous sample."""
+        self._until_ns = device_ns + RATE_WAIT_NS if self.is_open(before_ns) else -1
+        self.steps.clear()
+
+    def is_open(self, device_ns: int) -> bool:
+        """Return whether the step after the sample at `device_ns` can show another rate."""
+        return device_ns <= self._until_ns or bool(self.steps)
+
+    def lost(self, ticks: int, missed: int, before_ticks: float, period_ticks: float) -> int:
+        """Add a step with `missed` lost samples by the previous period, `before_ticks`. Return the number of lost
+        samples that are now certain. `period_ticks` is the period with this step."""
+        longer = self.steps
+        if missed and len(longer) < LONGER_MOST:
+            longer.append(ticks)
+            return 0
+        if period_ticks > LONGER * before_ticks > 0:
+            first = [] if not longer else [int((longer[0] - before_ticks - 1) / period_ticks)]
+            found = [*first, *(round(one / period_ticks) - 1 for one in longer[1:])]
+        else:
+            found = [round(one / before_ticks) - 1 for one in longer]
+        longer.clear()
+        return missed + sum(max(one, 0) for one in found)
+
+    def take_back(self, ticks: int) -> None:
+        """Shorten the newest step without a decision: the counter was set forward by `ticks`."""
+        if self.steps:
+            self.steps[-1] -= ticks
 
 
 class ArrivalPace:

@@ -188,6 +188,8 @@ async def test_settings_are_read_again_after_each_action(device: LinkedDevice) -
     settings = device.device.status().settings
     assert (settings["pins.led"], settings["mounting"]) == ("IO7", "y_up")
     assert settings["output.hi91"] == "25 Hz"
+    await device.wait(1)
+    assert device.device.ledger.lost_gap_device == 0  # the rate was 100 Hz
     assert "a command changed settings of the device: pins.led is IO7, was IO5" in device.messages
     device.module.receive(b"CONFIG ATT MODE 1\r\n", device.clock.now_ns())  # by another program
     await device.wait(0.1)

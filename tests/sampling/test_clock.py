@@ -157,7 +157,7 @@ def test_repeated_stamps_rise_and_a_stuck_counter_falls_back_to_arrival() -> Non
     assert samples[-1].t_rx_ns - samples[-1].t_ns < NS_PER_S
 
 
-def test_without_device_time_or_with_it_in_every_second_message() -> None:
+def test_without_device_time_or_with_it_in_every_second_message_and_slewed_corrections() -> None:
     clock = make_clock()
     points: list[Point] = [(None, 10 * i) for i in range(100)]
     samples = feed(clock, points)
@@ -172,10 +172,7 @@ def test_without_device_time_or_with_it_in_every_second_message() -> None:
     samples = feed(clock, [(10 * (i // 2) if i % 2 else None, 10 * (i // 2) + 3 * (i % 2)) for i in range(600)])
     assert rises(samples)
     assert [s.sync for s in samples[-4:]] == [Sync.ARRIVAL, Sync.REGRESSION] * 2
-
-
-def test_corrections_are_slewed() -> None:
-    """Arrivals are suddenly 3 ms earlier. The step between samples changes by at most 0.05 %."""
+    # Arrivals are suddenly 3 ms earlier. The step between samples changes by at most 0.05 %.
     clock = make_clock(hold_ns=0)
     late = [clock.sample(message(10 * i), BEGIN_NS + (10 * i + 4) * NS_PER_MS, 0) for i in range(3000)]
     steps = [b.t_ns - a.t_ns for a, b in pairwise(late[2000:])]

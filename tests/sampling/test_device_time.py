@@ -147,7 +147,7 @@ def test_a_device_time_that_scatters_does_not_show_losses(period: int, scatter: 
     assert (learner.add_step(2 * period), lost, learner.is_scattered) == (1, 0, False)
 
 
-def test_steps_to_another_counter_and_steps_that_never_agree() -> None:
+def test_steps_that_never_agree_make_no_period_and_uneven_and_equal_ticks_cause_no_loss() -> None:
     noted: list[int] = []
     learner = PeriodLearner(lambda: noted.append(1))
     learner.add_step(1 << 31)
@@ -162,9 +162,6 @@ def test_steps_to_another_counter_and_steps_that_never_agree() -> None:
         learner.add_step(random.randrange(1, 1 << 30))
     assert not learner.period_ticks
     assert len(learner._unjudged) <= 64
-
-
-def test_uneven_and_equal_ticks_cause_no_loss() -> None:
     # 400 Hz in milliseconds.
     learner = PeriodLearner()
     assert [learner.add_step(2 + i % 2) for i in range(1000)] == [0] * 1000
@@ -386,13 +383,8 @@ def test_a_correction_needs_an_arrival_that_confirms_it() -> None:
     clock = make_clock()
     points = steady(0, 0, 1000) + steady(9_993 + 10, 10_003, 500)
     samples = feed(clock, points)
-    assert (
-        max(
-            abs(s.t_ns - BEGIN_NS - int(ms * NS_PER_MS) - NS_PER_MS)
-            for s, (_, ms) in zip(samples[500:], points[500:], strict=True)
-        )
-        < NS_PER_MS
-    )
+    off_ns = [s.t_ns - BEGIN_NS - int(ms + 1) * NS_PER_MS for s, (_, ms) in zip(samples, points, strict=True)]
+    assert max(map(abs, off_ns[500:])) < NS_PER_MS
 
 
 @pytest.mark.parametrize(("seconds", "seen"), [(4, False), (6, True)])
@@ -486,3 +478,30 @@ def test_a_change_of_rate_is_noticed_within_twelve_samples(steps: list[int], is_
     assert learner.is_new is is_new
     if is_new or steps[-1] == 1:
         assert learner.period_ticks == pytest.approx(sum(steps[-12:]) / 12, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("steps", "lost", "without"),
+    [
+        ([20] * 20, 0, 11), ([28] + [20] * 20, 0, 13), ([105] + [100] * 15, 0, 109), ([25] * 20, 0, 22),  # lower rates
+        ([5] * 20, 0, 0), ([20, 20, 5] + [5] * 20, 2, 2),  # a higher rate
+        # A higher rate, or a loss that the next step of the previous period shows.
+        ([20, 10, 30, 30, 10, 10], 5, 5), ([20] * 9 + [10], 9, 9), ([30, 7, 10], 2, 2), ([40, -50, 10], 0, 3),
+        # Losses at the lower rate. The first steps do not show which samples of the previous rate are missing.
+        ([40] + [20] * 20, 1, 14), ([20] * 3 + [60] + [20] * 20, 2, 19), ([31] + [20] * 20, 1, 13),
+        ([20] * 15 + [40, 40, 20], 2, 13), ([20, 30, 40, 50] * 20 + [10], 200, 200),  # the last one: no period
+    ],
+)  # fmt: skip
+def test_a_lower_rate_that_imud_requests_is_no_loss(steps: list[int], lost: int, without: int) -> None:
+    for expected, is_expected in ((without, False), (lost, True)):
+        time, found = DeviceTime(NS_PER_MS, 1 << 32), 0
+        time.begin(0)
+        for step in [10] * 100 + steps:
+            if step < 0:  # the device restarts its counter
+                time.begin(0)
+                continue
+            if time.ticks == 1000 and is_expected:
+                time.change.expect(time.even_ns)
+            time.advance(time.ticks + step)
+            found += time.missed
+        assert found == expected

@@ -197,7 +197,7 @@ def test_the_estimate_runs_at_the_slope_of_the_intervals_and_a_better_fit_within
     assert error > 200_000
 
 
-def test_the_width_grows_with_time_and_a_fit_beside_the_intervals_is_moved() -> None:
+def test_the_width_grows_with_time_and_contradictions_drop_old_intervals() -> None:
     intervals, x = filled(50.0, 5)
     assert intervals.width_ns(x + NS_PER_S) > intervals.width_ns(x) + 10_000
     intervals = IntervalFit()
@@ -221,9 +221,6 @@ def test_the_width_grows_with_time_and_a_fit_beside_the_intervals_is_moved() -> 
     beside = NS_PER_S + int(MS / 2 + intervals.width_ns(NS_PER_S) / 2 + 1.75 * NS_PER_S)
     errors = [intervals.combined(NS_PER_S, beside + more, 1e9, 0.0)[1] for more in (0, 1)]
     assert errors == pytest.approx([577_638_944, 1_531_179_641], abs=1)
-
-
-def test_contradictions_drop_old_intervals_or_are_covered() -> None:
     intervals, x = filled(0.0)
     for i in range(1, 200):
         at = x + i * NS_PER_S // 10

@@ -118,7 +118,7 @@ def test_it_begins_only_when_most_agree_and_the_fit_is_sure(
     assert pairing.running is begins
 
 
-def test_lines_without_events_or_off_by_a_period_are_dropped() -> None:
+def test_lines_without_events_are_dropped_and_a_line_follows_32_events() -> None:
     pairing = running()
     assert [(pair(pairing, 100 + i), pairing.running) for i in range(8)] == [(False, i < 7) for i in range(8)]
     assert pairing.learned
@@ -137,10 +137,7 @@ def test_lines_without_events_or_off_by_a_period_are_dropped() -> None:
         pairing, at = running(), 100 * PERIOD_NS
         pairing.add_events([(at, 1)])
         assert pairing.pair(at, at + NS_PER_MS, at + LEAD_NS, ERROR_NS, float(PERIOD_NS), slope) is is_paired
-
-
-def test_the_line_follows_32_events_and_its_window_their_spread() -> None:
-    """The window is 30 us and eight spreads. The spread starts at 10 us and has a memory of 32 events."""
+    # The window is 30 us and eight spreads. The spread starts at 10 us and has a memory of 32 events.
     assert [running(count).learned for count in (23, 24)] == [False, True], "16 pairs after the eighth event"
     assert running(8).spread_ns == 10_000
     for count in (40, 500):

@@ -158,7 +158,7 @@ def test_bytes_are_published_on_arrival_or_together() -> None:
     assert rig.ledger.closes()
 
 
-def test_samples_of_one_batch_come_in_order_between_messages_and_bad_frames() -> None:
+def test_samples_come_in_order_between_messages_and_edges_come_first() -> None:
     rig = PathRig("hipnuc-uart")
     path = StreamPath(rig.codec, rig.sample_clock, rig.context)
     reply = ReplyFrame(1, b"")
@@ -175,9 +175,6 @@ def test_samples_of_one_batch_come_in_order_between_messages_and_bad_frames() ->
     path.watch_status(0b010)
     path.on_data(b"3", rig.now)
     assert (path.take_status(), path.take_status()) == (0b010, 0)
-
-
-def test_a_listener_gets_measurements_while_it_waits_and_edges_come_first() -> None:
     rig, order = PathRig("hipnuc-uart"), list[str]()
     listener = SimpleNamespace(wants_samples=True, on_sample=lambda m: order.append(f"sample {m.dev_ticks}"))
     codec = HipnucCodec(rig.ledger, HipnucOptions())
@@ -188,7 +185,7 @@ def test_a_listener_gets_measurements_while_it_waits_and_edges_come_first() -> N
     assert order == ["edges", "sample 7", "edges"]
 
 
-def test_lost_samples_take_the_overruns_of_the_kernel() -> None:
+def test_an_observer_receives_overruns_and_each_input_of_path_and_clock() -> None:
     rig = PathRig("hipnuc-uart")
     path = rig.stream()
     path.observe(rig.noted)
@@ -197,9 +194,6 @@ def test_lost_samples_take_the_overruns_of_the_kernel() -> None:
         path.on_data(hi91(1000 + 10 * number), rig.now + 10 * number * MS)
     assert (rig.ledger.lost_overrun, rig.ledger.lost()) == (2, 2)
     assert ("overruns", 4) in rig.noted.reports
-
-
-def test_an_observer_receives_each_input_of_path_and_clock() -> None:
     rig = PathRig("hipnuc-uart")
     path, now = rig.stream(), rig.now
     path.observe(rig.noted)
@@ -218,6 +212,7 @@ def test_an_observer_receives_each_input_of_path_and_clock() -> None:
     clock.set_own_status(4)
     clock.link_changed(byte_ns=1, hold_ns=2)
     clock.restart()
+    clock.expect_rate()
     assert rig.noted.reports == [
         ("call", "ledger", "set", Ledger().snapshot()), ("call", "path", "begin", now), ("call", "loss", "link_opened"),
         ("data", hi91(1000), now, -1), ("data", b"x", now + 1, 7), ("call", "path", "publish_gathered"),
@@ -225,12 +220,12 @@ def test_an_observer_receives_each_input_of_path_and_clock() -> None:
         *(("edges", line, edges) for line in ("sout", "sout_div", "pps")),
         ("call", "aiding", "on_trigger_stamps", triggers), ("call", "clock", "set_utc_reference", None),
         ("call", "clock", "set_own_status", 4), ("call", "clock", "link_changed", ("byte_ns", 1), ("hold_ns", 2)),
-        ("call", "clock", "restart"),
+        ("call", "clock", "restart"), ("call", "clock", "expect_rate"),
     ]  # fmt: skip
     path.observe(None)
     path.on_data(hi91(1010), now + 10 * MS)
     clock.restart()
-    assert len(rig.noted.reports) == 16
+    assert len(rig.noted.reports) == 17
 
 
 # --- CAN frames -------------------------------------------------------------------------------------------------------
@@ -476,7 +471,7 @@ def test_a_read_is_of_the_newest_edge_before_it_and_others_are_missed_once() -> 
     assert made.missed == 0
 
 
-def test_a_read_without_an_edge_has_no_time_stamp() -> None:
+def test_a_read_without_an_edge_has_no_time_stamp_and_the_error_is_that_of_the_stamp() -> None:
     made = edges(2, 3)
     assert read(made, 1.9, 1.95) is None
     assert read(made, 4.5, 4.6) == (3, 3 * MS)
@@ -492,9 +487,6 @@ def test_a_read_without_an_edge_has_no_time_stamp() -> None:
     assert read(made, 2 * KEPT - 0.5, 2 * KEPT - 0.4) is None
     assert read(made, 2 * KEPT + 0.1, 2 * KEPT + 0.2) == (2 * KEPT, 2 * KEPT * MS)
     assert read(made, 3 * KEPT - 0.9, 3 * KEPT - 0.8) == (3 * KEPT - 1, (3 * KEPT - 1) * MS)
-
-
-def test_the_error_is_that_of_the_stamp_and_of_the_assumption() -> None:
     plain, assumed = edges(1).match(MS, MS + 1), edges(1, settings=ReadyOptions(line="Y")).match(MS, MS + 1)
     assert plain is not None
     assert assumed is not None

@@ -55,6 +55,8 @@ class Step(NamedTuple):
     publish: bool = True
     slew_ns: int = 0  # change of CLOCK_MONOTONIC against the steady time
     own_status: int | None = None
+    step_ms: int = 1
+    expect: bool = False  # whether imud expects another rate
 
 
 STEPS = st.builds(
@@ -64,7 +66,7 @@ STEPS = st.builds(
                                                        "reset", "long"]),
     st.sampled_from([0, 0, 0, 1, 7, -3, 10**6, 2**31]), st.sampled_from([0, 0, 30, 900, 20_000, 700_000]),
     st.sampled_from([-1, -1, 0, 5, 30]), st.booleans(), st.sampled_from([0, 0, 0, 400, 20_000, -90_000]),
-    st.sampled_from([None, None, 0, 1 << 31]),
+    st.sampled_from([None, None, 0, 1 << 31]), st.sampled_from([1, 1, 1, 3]), st.booleans(),
 )  # fmt: skip
 EXTREME = [math.nan, math.inf, 3e38, 1e-45, 40, 31.9, -2047, 360, 360.0005, 361, -128, 150, 151, 0.98, 0, -0.0]
 COUNTS = ((0x7FFF, 0x7FFF), (-0x8000, -0x8000), (-1, -1), (0x7F7F, 0x7F7F), (9800, 1))
@@ -171,12 +173,14 @@ class Run:
         if step.kind == "reset":
             path.clock.restart()
         self.slewed_ns += step.slew_ns
+        if step.expect:
+            path.clock.expect_rate()
         path.clock.set_own_status(step.own_status)
         self.ms += step.jump_ms
         stream = self.late_bytes
         for number in range(step.frames):
-            self.ms += 1
-            self.now_ns += NS_PER_MS + 40
+            self.ms += step.step_ms
+            self.now_ns += step.step_ms * (NS_PER_MS + 40)
             stream += self.of.of_kind(step.kind if number == step.frames // 2 else "usual", self.ms % 2**32)
         self.number += 1
         self.now_ns += self.number * 7919 % 97 * 1000
@@ -220,6 +224,7 @@ def play(steps: Sequence[Step], of: Format, found: kernel.Kernel, word: Word = "
 
 @pytest.mark.parametrize("name", FORMATS)
 @given(steps=st.lists(STEPS, max_size=30), word=st.sampled_from(["pps", "status"]), turned=st.booleans())
+@example(steps=[Step(4, expect=True), *[Step(4, step_ms=3)] * 9, *[Step(4)] * 9], word="pps", turned=False)
 @example(steps=[Step(1), Step(2, waited_ms=0, publish=False), Step(1, waited_ms=5)], word="pps", turned=False)
 @example(steps=[Step(2, cut=5, damage=0), Step(10, slew_ns=20_000)], word="pps", turned=False)
 def test_kernel_and_python_are_equal(name: str, steps: list[Step], word: Word, turned: bool) -> None:
