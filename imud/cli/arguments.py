@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 
-from imud.client.connection import Client, default_path
+from imud.client.connection import Client, decoded, default_path
 from imud.contracts.status import Deviations, DeviceStatus
 from imud.formats.jsonrpc import DEFAULT_PATH
 from imud.host.files import read_regular
@@ -107,7 +107,7 @@ def connect(args: argparse.Namespace) -> Client:
 
 def statuses(client: Client) -> list[DeviceStatus]:
     """Return the status of every device."""
-    return msgspec.convert(client.status()["devices"], list[DeviceStatus])
+    return decoded(client.status()["devices"], list[DeviceStatus])
 
 
 # --- questions ------------------------------------------------------------------------------------------------------

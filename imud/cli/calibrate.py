@@ -10,7 +10,7 @@ import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket
 from imud.cli.output import local_time, table
-from imud.client.connection import Client
+from imud.client.connection import Client, decoded
 from imud.contracts.command import CalibrationInfo, CalibrationResult, Handling, Kept, LastCalibration
 from imud.model.errors import BadArgument
 from imud.model.event import Event, EventKind
@@ -39,10 +39,11 @@ def calibrate(args: argparse.Namespace) -> int:
         raise BadArgument(f"expected --stop without a calibration, got {args.kind!r}")
     with Client(args.socket) as watching:
         if args.stop:
-            stopped = msgspec.convert(watching.call("stop_calibration", device=args.device), dict[str, bool])["stopped"]
+            reply = watching.call("stop_calibration", device=args.device)
+            stopped = decoded(reply, dict[str, bool], "stop_calibration")["stopped"]
             print("stopped; the device can still finish it" if stopped else f"{args.device} has no running calibration")
             return 0 if stopped else 1
-        found = msgspec.convert(watching.call("calibrations", device=args.device), list[CalibrationInfo])
+        found = decoded(watching.call("calibrations", device=args.device), list[CalibrationInfo], "calibrations")
         if args.kind is None:
             print(table(HEAD, [(one.kind, one.handling, one.kept, _last(one.last), one.help) for one in found]))
             return 0
@@ -98,7 +99,7 @@ def _follow(args: argparse.Namespace, watching: Client) -> CalibrationResult:
                 watching.call("stop_calibration", device=args.device)
             if not args.json and sys.stdout.isatty():
                 sys.stdout.write("\n")
-        return msgspec.convert(reply.result(), CalibrationResult)
+        return decoded(reply.result(), CalibrationResult, "calibrate")
 
 
 def _show(event: Event, out: TextIO, *, as_json: bool) -> None:

@@ -7,7 +7,7 @@ import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket, confirmed, connect, named_values, statuses
 from imud.cli.output import table
-from imud.client.connection import Client
+from imud.client.connection import Client, decoded
 from imud.contracts.command import VerbInfo
 from imud.contracts.condition import Condition
 
@@ -52,7 +52,7 @@ def command_arguments(parser: argparse.ArgumentParser) -> None:
 def command(args: argparse.Namespace) -> int:
     """Print the list of verbs, or run a verb and print its reply. A verb requires the right to control."""
     with Client(args.socket, timeout_s=LIMIT_S) as client:
-        known = msgspec.convert(client.call("actions", device=args.device), list[VerbInfo])
+        known = decoded(client.call("actions", device=args.device), list[VerbInfo], "actions")
         if args.name is None:
             for verb in known:
                 print("\n".join([f"{verb.name:24} {verb.help}", *(f"{'':24}   {p}" for p in verb.parameters)]))

@@ -17,7 +17,7 @@ import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket, duration_s
 from imud.cli.output import complain, local_time, raise_if_unread
-from imud.client.connection import Client
+from imud.client.connection import Client, decoded
 from imud.client.feed import clock_ahead_ns, utc_offset_ns
 from imud.contracts.condition import DeviceCondition, signature
 from imud.contracts.condition import duration as in_words
@@ -108,7 +108,8 @@ class DeviceNotes:
 def _condition(device: Mapping[str, Any]) -> tuple[str, str]:
     """Return a text that changes with the reasons of the condition, and the condition with its reasons. The first text
     is empty for a device that is OK, or whose daemon sends no condition."""
-    condition = msgspec.convert(device.get("condition"), DeviceCondition | None)
+    found = device.get("condition")
+    condition = None if found is None else decoded(found, DeviceCondition)
     causes = " ".join(sorted(code + setting for code, setting in signature(condition)))
     return causes, "ok" if not causes else str(condition)
 

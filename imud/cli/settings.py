@@ -12,7 +12,7 @@ import msgspec
 from imud.bridges.status import times
 from imud.cli.arguments import CliCommand, add_socket, confirmed, named_values
 from imud.cli.output import table
-from imud.client.connection import Client
+from imud.client.connection import Client, decoded
 from imud.config.yaml import FILE_BYTES_MAX, no_pause, read_yaml, yaml_block, yaml_comment
 from imud.contracts.setting import AppliedSettings, SettingInfo, SettingsPlan, SettingsReport, SettingsState
 from imud.device.flash import backup_text
@@ -106,7 +106,7 @@ def _report(client: Client, device: str, *, needed: bool) -> SettingsReport:
             raise
         print(f"{error}; imud prints the last reported settings:", file=sys.stderr)
         found = client.call("settings.get", device=device)
-    report = msgspec.convert(found, SettingsReport)
+    report = decoded(found, SettingsReport, "settings.get")
     if needed and report.status.read_ns is None:
         raise BadArgument(
             f"{device} has not reported its settings yet, and only members of the control group can request them"
@@ -230,7 +230,7 @@ def _other_device(backup: Mapping[str, Any], report: SettingsReport) -> list[str
 def _change(client: Client, args: argparse.Namespace, given: Mapping[str, Any] | None) -> int:
     """Print the plan, ask the user if the plan has a risk, then apply the plan. Return the exit status."""
     params = {"device": args.device, "settings": given, "save": args.save}
-    plan = msgspec.convert(client.call("settings.plan", **params), SettingsPlan)
+    plan = decoded(client.call("settings.plan", **params), SettingsPlan, "settings.plan")
     if not args.json:
         print(_planned(plan))
     if plan.empty:
@@ -239,7 +239,7 @@ def _change(client: Client, args: argparse.Namespace, given: Mapping[str, Any] |
         return 1 if plan.left_out else 0
     if plan.risk and not confirmed(f"change {args.device}", plan.risk, yes=args.yes):
         return 1
-    done = msgspec.convert(client.call("settings.apply", **params), AppliedSettings)
+    done = decoded(client.call("settings.apply", **params), AppliedSettings, "settings.apply")
     print(msgspec.json.encode(done).decode() if args.json else _account(done))
     # also 1 if the device did not keep a value
     return 1 if done.failure else 0

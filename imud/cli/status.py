@@ -9,9 +9,19 @@ import msgspec
 from imud.bridges.status import rows
 from imud.cli.arguments import CliCommand, add_socket, connect
 from imud.cli.output import paragraph
+from imud.client.connection import decoded
 from imud.contracts.status import CKernelStatus, DeviceStatus, MqttStatus
 from imud.model.errors import BadArgument
 from imud.model.options import unknown_name
+
+
+class _Reply(msgspec.Struct):
+    """Printed members of the status."""
+
+    devices: list[DeviceStatus]
+    mqtt: list[MqttStatus] = []
+    outputs: dict[str, str] = {}
+    c_kernel: CKernelStatus | None = None  # None from a daemon of an older version
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,15 +39,12 @@ def run(args: argparse.Namespace) -> int:
         if unknown := [name for name in args.device if name not in known]:
             raise BadArgument(unknown_name("a device", unknown[0], known))
         answer = {**answer, "devices": [one for one in answer["devices"] if one["name"] in args.device]}
-    devices = msgspec.convert(answer["devices"], list[DeviceStatus])
+    reply = decoded(answer, _Reply)
     if args.json:
         print(msgspec.json.encode(answer).decode())
     else:
-        mqtts = msgspec.convert(answer.get("mqtt", []), list[MqttStatus])
-        # a daemon of an older version does not send `c_kernel`
-        found = msgspec.convert(answer.get("c_kernel"), CKernelStatus | None)
-        print(page(devices, mqtts, msgspec.convert(answer.get("outputs", {}), dict[str, str]), found))
-    return 1 if any(device.has_problem for device in devices) else 0
+        print(page(reply.devices, reply.mqtt, reply.outputs, reply.c_kernel))
+    return 1 if any(device.has_problem for device in reply.devices) else 0
 
 
 def page(

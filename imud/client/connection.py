@@ -114,12 +114,12 @@ class Watch:
             return
         params = params_of(message)
         if message["method"] == "device":
-            known = _decoded(params, DeviceNumber, "device")
+            known = decoded(params, DeviceNumber, "device")
             self.device_ids[known.device] = known.device_id
             self._names[known.device_id] = known.device
             return
         if params.get("dropped"):
-            lost = _decoded(params, DroppedSamples, "dropped")
+            lost = decoded(params, DroppedSamples, "dropped")
             self._note_dropped(lost.device, lost.dropped)
         params.pop("dropped", None)
         if message["method"] == "sample":
@@ -171,7 +171,7 @@ def sample_of(params: Mapping[str, Any]) -> Sample:
 
 def event_of(params: Mapping[str, Any]) -> Event:
     """Return the event in a JSON notification. An unknown kind stays a string. Raises ServerError."""
-    received = _decoded(params, ReceivedEvent, "event")
+    received = decoded(params, ReceivedEvent, "event")
     return Event(received.t_ns, received.device, kind_of(received.kind), received.message, received.detail)
 
 
@@ -183,12 +183,14 @@ def params_of(message: Mapping[str, Any]) -> dict[str, Any]:
     return params
 
 
-def _decoded(params: Mapping[str, Any], kind: type[T], name: str) -> T:
-    """Return the parameters of the notification `name` as `kind`. Raises ServerError."""
+def decoded(value: object, kind: type[T], name: str = "status") -> T:
+    """Return the reply to the method `name`, or a part of it, as `kind`. Raises ServerError."""
     try:
-        return msgspec.convert(params, kind)
+        return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
-        raise ServerError(f"cannot decode the notification {name!r}: {reason_of(error)}") from error
+        raise ServerError(
+            f"cannot decode {name!r} of the daemon: {reason_of(error)}; if imud was updated, restart the daemon"
+        ) from error
 
 
 def _with_nan(value: object) -> object:
@@ -371,14 +373,14 @@ class Client:
         The method ends a subscription of `events` on this connection.
         """
         reply = self.call("events", devices=_listed(devices), enable=False, since_ns=since_ns, limit=limit)
-        return msgspec.convert(reply.get("events", []), list[StoredEvent])
+        return decoded(reply.get("events", []), list[StoredEvent], "events")
 
     def history(self, devices: Iterable[str], **params: int | str | None) -> dict[str, list[Bucket]]:
         """Return minimum and maximum of the samples of the last hour by device. `params` are the other parameters of
         the method: `from_ns`, `to_ns`, `points`, `convention`."""
         reply = self.call("history", devices=_listed(devices), **params)
         _check_convention(reply.get("convention"), params.get("convention"))
-        return msgspec.convert(reply["devices"], dict[str, list[Bucket]])
+        return decoded(reply["devices"], dict[str, list[Bucket]], "history")
 
     def notify(self, device: str, latency_ms: float | None = None) -> int:
         """Return a descriptor for `Ring.wait`, readable after each batch of samples of `device`. The caller closes it.
@@ -434,11 +436,7 @@ class Client:
 
     def _request(self, method: str, kind: type[T], **params: object) -> T:
         """Call a method and return its result as `kind`. Raises ServerError if the result has another form."""
-        result = self.call(method, **params)
-        try:
-            return msgspec.convert(result, kind)
-        except msgspec.ValidationError as error:
-            raise ServerError(f"{self.path}: cannot decode the reply to {method}: {reason_of(error)}") from error
+        return decoded(self.call(method, **params), kind, method)
 
     def _greet(self) -> Hello:
         message = self._receive(monotonic() + self.timeout_s, "hello")

@@ -11,9 +11,7 @@ from threading import Condition, Thread
 from time import monotonic, monotonic_ns, time_ns
 from typing import Final, NamedTuple
 
-import msgspec
-
-from imud.client.connection import Client, EventStream, Hello, Watch, event_of, params_of
+from imud.client.connection import Client, EventStream, Hello, Watch, decoded, event_of, params_of
 from imud.contracts.status import DeviceStatus
 from imud.model.errors import ImudError
 from imud.model.event import Event
@@ -167,7 +165,7 @@ class _Reading:
         if now_s >= self._status_due_s:
             reply = self._client.status()
             self._ahead_ns = clock_ahead_ns(reply["now_ns"])
-            statuses = msgspec.convert(reply["devices"], tuple[DeviceStatus, ...])
+            statuses = decoded(reply["devices"], tuple[DeviceStatus, ...])
             self._known = frozenset(status.name for status in statuses)
             self._status_due_s = now_s + _pause_s(STATUS_S, len(statuses))
             news = News(statuses=statuses, clients=len(reply["socket"]["clients"]))

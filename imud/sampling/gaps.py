@@ -1,9 +1,9 @@
 """Gaps between samples, if the device counter alone does not show their size.
 
 `CounterLine` keeps the position of a device counter from before the present fit. Frames that waited for a busy host
-make a fit that is late. A frame in time then looks like a jump of the counter. `ExpectedRate` distinguishes lost samples
-from a lower rate that imud has requested. `ArrivalPace` is for devices without device time: the pace of the frames with
-the shortest wait shows the lost samples.
+make a fit that is late. A frame in time then looks like a jump of the counter. `ExpectedRate` distinguishes lost
+samples from a lower rate that imud has requested. `ArrivalPace` is for devices without device time: the pace of the
+frames with the shortest wait shows the lost samples.
 """
 
 from collections.abc import Callable

@@ -17,13 +17,12 @@ from typing import Any, Final, Protocol
 from urllib.parse import urlsplit
 
 import foxglove
-import msgspec
 from foxglove.websocket import StatusLevel
 
 from imud.attitude.conventions import Convention
 from imud.bridges.channel import Diagnoses, Dialect, LiveDiagnosis, MessageChannel, MessageFrames, StampedEvent
 from imud.bridges.json import status_channel
-from imud.client.connection import Client, EventStream, Watch, event_of, params_of
+from imud.client.connection import Client, EventStream, Watch, decoded, event_of, params_of
 from imud.client.feed import clock_ahead_ns, utc_offset_ns
 from imud.contracts.status import Deviations, DeviceStatus
 from imud.model.errors import BadArgument, ImudError, ServerError, reason_of
@@ -156,7 +155,7 @@ class Relay:
 
     def _show_status(self, client: Client) -> None:
         reply = client.status()
-        statuses = msgspec.convert(reply["devices"], list[DeviceStatus])
+        statuses = decoded(reply["devices"], list[DeviceStatus])
         self._utc_offset_ns = utc_offset_ns(clock_ahead_ns(reply["now_ns"]))
         utc_ns = reply["now_ns"] + self._utc_offset_ns
         self._viewer.problem("")

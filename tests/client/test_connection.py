@@ -13,8 +13,9 @@ from unittest.mock import Mock
 import pytest
 from msgspec.structs import replace
 
-from imud.client.connection import Client, EventStream, default_path, event_of, rpc_error
+from imud.client.connection import Client, EventStream, decoded, default_path, event_of, rpc_error
 from imud.contracts.publisher import Batch
+from imud.contracts.status import DeviceState
 from imud.formats.jsonrpc import RpcError
 from imud.formats.recording import is_recording
 from imud.model.errors import LinkDenied, LinkError, LinkMissing, ServerError
@@ -180,8 +181,10 @@ def test_events(served: Daemon) -> None:
     assert [rpc_error({"code": 7, "message": "m", "data": data}).data for data in ({"a": 1}, [1])] == [{"a": 1}, None]
     event = event_of({"t_ns": 1, "device": "imu0", "kind": "earthquake", "message": "m", "later": 1})
     assert event.kind == "earthquake"
-    with pytest.raises(ServerError, match="cannot decode the notification 'event'"):
+    with pytest.raises(ServerError, match="cannot decode 'event' of the daemon: "):
         event_of({"t_ns": 1})
+    with pytest.raises(ServerError, match=r"'asleep' - .*; if imud was updated, restart the daemon"):
+        decoded(["asleep"], list[DeviceState])
 
 
 def test_notify_gives_a_descriptor_that_wakes(served: Daemon) -> None:
@@ -312,7 +315,10 @@ WATCHING = HELLO + b'{"id":1,"result":{"devices":{}}}\n'
     [
         (HELLO + b'{"method":5}\n', "expected a string as method"),
         (HELLO + b'{"id":1,"error":5}\n', "cannot decode the error 5"),
-        (HELLO + b'{"id":1,"result":{"devices":5}}\n', "cannot decode the reply to watch"),
+        (
+            HELLO + b'{"id":1,"result":{"devices":5}}\n',
+            "cannot decode 'watch' of the daemon: ",
+        ),
         (WATCHING + b'{"method":"sample","params":5}\n', "cannot decode the notification 'sample': expected an object"),
         (WATCHING + b'{"method":"sample","params":{"seq":"x"}}\n', "cannot decode a sample: .*seq"),
         (WATCHING + b'{"method":"dropped","params":{"device":"a","dropped":"x"}}\n', "dropped"),
