@@ -28,7 +28,7 @@ LIMIT_S: Final = 180.0  # Time limit of a request, s. A long plan with a restart
 
 def settings_arguments(parser: argparse.ArgumentParser) -> None:
     add_socket(parser)
-    parser.add_argument("device", metavar="DEVICE", help="name of the device")
+    parser.add_argument("device", nargs="?", metavar="DEVICE", help="name of the device")
     operation = parser.add_mutually_exclusive_group()
     operation.add_argument(
         "--apply", action="store_true", help="set the settings that differ from the declared settings"
@@ -57,6 +57,8 @@ def settings_arguments(parser: argparse.ArgumentParser) -> None:
 
 def settings(args: argparse.Namespace) -> int:
     """Print, set, save, back up or restore device settings. Return 1 if a setting differs or an operation failed."""
+    if args.device is None:
+        args.device = device_after(args.set or [])
     with Client(args.socket, timeout_s=LIMIT_S) as client:
         if args.restore is not None:
             return _restore(client, args)
@@ -70,6 +72,17 @@ def settings(args: argparse.Namespace) -> int:
         return _back_up(report, args)
     print(msgspec.json.encode(report).decode() if args.json else _shown(report, verbose=args.verbose))
     return 1 if report.status.state in (SettingsState.DIFFER, SettingsState.UNKNOWN) else 0
+
+
+def device_after(words: list[str]) -> str:
+    """Remove the device from the words after `--set`, and return it. Raises BadArgument if there is none."""
+    names = [word for word in words if "=" not in word]
+    if len(names) != 1 or len(words) == 1:
+        raise BadArgument(
+            f"expected one device, as in `imud settings bow`, got {' '.join(words) or 'none'}; see `imud devices`"
+        )
+    words.remove(names[0])
+    return names[0]
 
 
 def given_values(words: Sequence[str]) -> dict[str, object]:

@@ -293,7 +293,7 @@ def test_fields_choose_channels_and_ned_has_frames_of_its_own(recorded: Recorded
 # --- captures ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_raw_capture_has_the_times_of_the_device_and_says_so(tmp_path: Path, cli: Cli) -> None:
+def test_raw_and_stamped_captures_and_a_log_of_candump_have_their_times(tmp_path: Path, cli: Cli) -> None:
     (tmp_path / "c.raw").write_bytes(b"".join(hi91(10 * i) for i in range(300)))
     printed = cli("export", "--to", "csv", tmp_path / "c.raw")
     found = rows(printed.out)
@@ -314,9 +314,6 @@ def test_a_raw_capture_has_the_times_of_the_device_and_says_so(tmp_path: Path, c
     with out.open("rb") as stream:
         (metadata,) = [one.metadata for one in make_reader(stream).iter_metadata()]
     assert "without the times of the reads" in metadata["times"]
-
-
-def test_a_stamped_capture_and_a_log_of_candump_have_their_own_times(tmp_path: Path, cli: Cli) -> None:
     printed = cli("export", "--to", "csv", stamped_capture(tmp_path / "c.capture"))
     found = rows(printed.out)
     assert len(found) == FRAMES

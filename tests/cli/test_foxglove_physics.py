@@ -125,7 +125,7 @@ def with_truth(seen: Seen, topic: str) -> list[tuple[Any, Truth]]:
     return found
 
 
-def test_the_time_of_every_message_is_that_of_measurement_and_has_an_error(seen: Seen) -> None:
+def test_the_time_specific_force_and_turn_rate_of_every_message_are_those_of_the_measurement(seen: Seen) -> None:
     for topic, messages in seen.messages.items():
         for t_ns, message in messages:
             header = message.transforms[0].header if topic == "/tf" else message.header
@@ -136,9 +136,6 @@ def test_the_time_of_every_message_is_that_of_measurement_and_has_an_error(seen:
         assert stamp.t_err_ns > 0
         assert stamp.t_ns <= stamp.t_rx_ns
     assert {one.sync for _, one in seen.messages["/bow/stamp"]} <= {0, 1}, "no edge, no UTC"
-
-
-def test_specific_force_and_turn_rate_are_those_of_the_motion_in_the_axes_of_rep_103(seen: Seen) -> None:
     found = with_truth(seen, "/bow/imu/data")
     assert len(found) >= ENOUGH
     for imu, truth in found:
@@ -151,7 +148,7 @@ def test_specific_force_and_turn_rate_are_those_of_the_motion_in_the_axes_of_rep
     assert max(turning) > 0.1, "it moves, or the axes would not be seen"
 
 
-def test_the_attitude_turns_the_field_to_north_and_gravity_up(seen: Seen) -> None:
+def test_the_attitude_turns_the_field_to_north_and_diagnostics_have_state_and_losses(seen: Seen) -> None:
     for field, truth in with_truth(seen, "/bow/imu/mag"):
         assert xyz(field.magnetic_field) == pytest.approx(forward_left_up(truth.mag_t), abs=2e-7)
     found = paired(seen, "/bow/imu/mag", "/bow/imu/data")
@@ -164,9 +161,6 @@ def test_the_attitude_turns_the_field_to_north_and_gravity_up(seen: Seen) -> Non
         (one,) = message.transforms
         assert (one.header.frame_id, one.child_frame_id) == ("enu", "bow")
         assert (one.transform.rotation.w, *xyz(one.transform.rotation)) == (imu.orientation.w, *xyz(imu.orientation))
-
-
-def test_diagnostics_have_state_losses_and_the_error_of_the_clock(seen: Seen) -> None:
     for _, array in seen.messages["/diagnostics"]:
         (bow,) = array.status
         assert (bow.name, bow.message.partition(":")[0]) == ("imud: bow", "ok")

@@ -12,7 +12,7 @@ import pytest
 
 from imud import config
 from imud.cli import settings as cli_settings
-from imud.cli.settings import given_values
+from imud.cli.settings import device_after, given_values
 from imud.client.connection import Client
 from imud.contracts import setting
 from imud.contracts.setting import SettingsReport, declared_values
@@ -82,7 +82,7 @@ def test_values_in_place_of_the_declared_ones(daemon: RunningDaemon, words: Word
     cli(*words, "--set", "sout_divisor=5", "magnetic_calibration=false", "--set", "mode=6-axis")
     assert [actual(daemon)[name] for name in ("sout_divisor", "magnetic_calibration", "mode")] == [5, False, "6-axis"]
     cli(*words, "--set", "output.hi91=50", "alarm.x.min_deg=-10", "alarm.x.max_deg=10")
-    cli(*words, "--set", "alarm.x.min_deg=-5", "--set", "pins.led=7")
+    cli(*words[:-1], "--set", "alarm.x.min_deg=-5", "--set", "pins.led=7", words[-1])  # the device at the end
     found = actual(daemon)
     assert (found["output"]["hi91"], found["alarm"]["x"]["min_deg"], found["alarm"]["x"]["max_deg"]) == (50, -5, 10)
     assert (found["pins"]["led"], found["pins"]["sin"]) == (7, 1)
@@ -201,6 +201,9 @@ def test_values_in_the_notation_of_yaml() -> None:
         ("mode=9-axis", "9-axis"), ("mode=a{b", "a{b"),
     ]:  # fmt: skip
         assert list(given_values([word]).values()) == [value]
+    for given in ([], ["a=1"], ["bow"], ["a=1", "bow", "stern"]):
+        with pytest.raises(BadArgument, match="expected one device, as in `imud settings bow`"):
+            device_after(given)
     for word in ("output={hi91: ", "output={hi91: 50} {}", "output={a: 1, a: 2}"):
         with pytest.raises(BadArgument, match=r"output: expected YAML, for example \{hi91: 50\}, got "):
             given_values([word])

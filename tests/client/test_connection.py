@@ -40,7 +40,7 @@ def publish(served: Daemon, *batches: Batch) -> None:
     served.do(work)
 
 
-def test_requests_and_conventions(served: Daemon) -> None:
+def test_requests_conventions_and_refused_requests(served: Daemon) -> None:
     with Client(served.path) as client:
         assert (client.hello.protocol, client.hello.epoch) == (1, EPOCH)
         assert "read" in client.hello.rights
@@ -63,9 +63,6 @@ def test_requests_and_conventions(served: Daemon) -> None:
         assert next(watch).accel_m_s2 == (-0.5, 0.125, -9.75)
         with pytest.raises(RpcError):
             client.watch(convention="up")
-
-
-def test_a_refused_request_raises_and_the_connection_stays_open(served: Daemon) -> None:
     with Client(served.path) as client:
         with pytest.raises(RpcError, match="known: imu0, imu1") as caught:
             client.watch(["imu7"])
