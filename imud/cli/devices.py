@@ -6,7 +6,7 @@ from typing import Any, Final
 import msgspec
 
 from imud.cli.arguments import CliCommand, add_socket, confirmed, connect, named_values, statuses
-from imud.cli.output import table
+from imud.cli.output import table, terminal_width
 from imud.client.connection import Client, decoded
 from imud.contracts.command import VerbInfo
 from imud.contracts.condition import Condition
@@ -23,19 +23,11 @@ def devices(args: argparse.Namespace) -> int:
     """Print one line per device. Return 1 if all devices are missing, otherwise 0."""
     with connect(args) as client:
         found = statuses(client)
+    identity = ("product", "serial_number")
     rows = [
-        (
-            d.name,
-            d.word,
-            d.rate_hz,
-            d.driver,
-            d.identity.get("product", "-"),
-            d.identity.get("serial_number", "-"),
-            d.link,
-        )
-        for d in found
+        (d.name, d.word, d.rate_hz, d.driver, *(d.identity.get(name, "-") for name in identity), d.link) for d in found
     ]
-    print(table(HEAD, rows))
+    print(table(HEAD, rows, terminal_width()))
     return 0 if any(d.word != Condition.MISSING for d in found) else 1
 
 

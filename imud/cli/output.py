@@ -4,11 +4,13 @@ import errno
 import io
 import os
 import select
+import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
+from itertools import zip_longest
 from math import floor, log10
 from typing import Final, TextIO
 
@@ -16,6 +18,7 @@ from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
 from imud.model.units import NS_PER_US
 
 COLUMNS: Final = 80  # maximum width of texts, characters
+CELL_LEAST: Final = 6  # minimum width of a column of a table, characters
 WIDTH: Final = 40  # length of the longest bar of a histogram, characters
 BARS: Final = 12  # maximum number of bars of a histogram
 EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
@@ -24,12 +27,29 @@ STEPS: Final = (1, 2, 5, 10, 20)
 TAIL: Final = 0.005  # Share of outliers on each side of a histogram. The outermost bars count the outliers.
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Format a table. Columns of numbers are right-aligned. The text has no line end after the last row."""
+def table(head: Sequence[str], rows: Iterable[Sequence[object]], width: int | None = None) -> str:
+    """Format a table. Columns of numbers are right-aligned. The text has no line end after the last row.
+
+    `width`: maximum length of a line, characters. Cells of the widest columns then have several lines. None: no limit.
+    """
     cells = [[str(cell) for cell in head], *([_word(cell) for cell in row] for row in rows)]
     widths = [max(len(line[i]) for line in cells) for i in range(len(head))]
     numbers = [all(_is_number(line[i]) for line in cells[1:] if line[i] not in NO_VALUE) for i in range(len(head))]
-    return "\n".join(_line(line, widths, numbers) for line in cells)
+    while width is not None and sum(widths) + 2 * len(widths) - 2 > width and max(widths) > CELL_LEAST:
+        widths[widths.index(max(widths))] -= 1
+    lines = []
+    for row in cells:
+        parts = (
+            textwrap.wrap(cell, most, break_on_hyphens=False) if len(cell) > most else [cell]
+            for cell, most in zip(row, widths, strict=True)
+        )
+        lines += [_line(line, widths, numbers) for line in zip_longest(*parts, fillvalue="")]
+    return "\n".join(lines)
+
+
+def terminal_width() -> int | None:
+    """Return the number of columns of the terminal; None if standard output is not a terminal."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def shortened(text: str, width: int) -> str:

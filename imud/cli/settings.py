@@ -11,15 +11,14 @@ import msgspec
 
 from imud.bridges.status import times
 from imud.cli.arguments import CliCommand, add_socket, confirmed, named_values
-from imud.cli.output import table
+from imud.cli.output import table, terminal_width
 from imud.client.connection import Client, decoded
 from imud.config.yaml import FILE_BYTES_MAX, no_pause, read_yaml, yaml_block, yaml_comment
-from imud.contracts.setting import AppliedSettings, SettingInfo, SettingsPlan, SettingsReport, SettingsState
+from imud.contracts.setting import AppliedSettings, SettingInfo, SettingsPlan, SettingsReport, SettingsState, value_text
 from imud.device.flash import backup_text
 from imud.formats.jsonrpc import Code, RpcError
 from imud.host.files import read_regular, replace_file
 from imud.model.errors import BadArgument
-from imud.model.options import shown
 
 HEAD: Final = ("SETTING", "DECLARED", "ACTUAL", "")
 MORE: Final = ("UNIT", "MANUAL", "IN FORCE", "VALUES")
@@ -137,7 +136,7 @@ def _shown(report: SettingsReport, *, verbose: bool) -> str:
         SettingsState.AGREE: "all readable settings are as declared",
         SettingsState.DIFFER: f"{count} of {len(report.settings)} differ; set them with --apply, save them with --save",
     }[status.state]
-    lines = [table((*HEAD, *MORE) if verbose else HEAD, rows), "", words]
+    lines = [table((*HEAD, *MORE) if verbose else HEAD, rows, terminal_width()), "", words]
     if status.problem:
         lines.append(f"problem: {status.problem}")
     lines.append(f"imud wrote the flash {times(status.flash_writes)}, {status.flash_writes_day} within 24 hours")
@@ -152,10 +151,8 @@ def _row(one: SettingInfo, *, verbose: bool) -> Sequence[str]:
 
 
 def _value(value: Any) -> str:
-    """Format a value; strings without quotes."""
-    if value is None:
-        return "-"
-    return value if isinstance(value, str) else shown(value)
+    """Format a value for people."""
+    return "-" if value is None else value_text(value)
 
 
 def _settable(report: SettingsReport) -> dict[str, Any]:

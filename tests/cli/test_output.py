@@ -50,6 +50,11 @@ def test_a_table_aligns_numbers_and_cannot_write_to_the_terminal() -> None:
         "SETTING  ACTUAL          N", "mode     6-axis, slowly   7", "baud     115200          11",
         "node     -               -",
     ]  # fmt: skip
+    rows[0] = ("mode", "6-axis, slowly 0123456789", 7)
+    assert table(("SETTING", "ACTUAL", "N"), rows, 20).splitlines() == [
+        "SETTING  ACTUAL   N", "mode     6-axis,   7", "         slowly", "         0123456", "         789",
+        "baud     115200   11", "node     -        -",
+    ]  # fmt: skip
     for value, width, text in [
         (12.34, 5, "12.34"), (12345.6, 5, "12346"), (123456.0, 5, "1.2e5"), (1234567.0, 4, "1e6"), (-1e300, 3, "###"),
         (-12.34, 5, "-12.3"),
