@@ -137,6 +137,8 @@ class ExpectedRate:
         if period_ticks > LONGER * before_ticks > 0:
             first = [] if not longer else [int((longer[0] - before_ticks - 1) / period_ticks)]
             found = [*first, *(round(one / period_ticks) - 1 for one in longer[1:])]
+        elif not missed and ticks > LONGER * before_ticks:  # the device time scatters: no decision
+            return 0
         else:
             found = [round(one / before_ticks) - 1 for one in longer]
         longer.clear()

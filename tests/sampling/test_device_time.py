@@ -484,12 +484,12 @@ def test_a_change_of_rate_is_noticed_within_twelve_samples(steps: list[int], is_
     ("steps", "lost", "without"),
     [
         ([20] * 20, 0, 11), ([28] + [20] * 20, 0, 13), ([105] + [100] * 15, 0, 109), ([25] * 20, 0, 22),  # lower rates
-        ([5] * 20, 0, 0), ([20, 20, 5] + [5] * 20, 2, 2),  # a higher rate
-        # A higher rate, or a loss that the next step of the previous period shows.
+        ([5] * 20, 0, 0), ([20, 20, 5] + [5] * 20, 2, 2), ([20] * 15 + [40, 40, 20], 2, 13),
+        # A higher rate, or a loss that the next step of the previous period shows. The last case has no period.
         ([20, 10, 30, 30, 10, 10], 5, 5), ([20] * 9 + [10], 9, 9), ([30, 7, 10], 2, 2), ([40, -50, 10], 0, 3),
+        ([25] * 9 + [50] + [25] * 20, 1, 36), ([20, 30, 40, 50] * 20 + [10], 200, 200),
         # Losses at the lower rate. The first steps do not show which samples of the previous rate are missing.
         ([40] + [20] * 20, 1, 14), ([20] * 3 + [60] + [20] * 20, 2, 19), ([31] + [20] * 20, 1, 13),
-        ([20] * 15 + [40, 40, 20], 2, 13), ([20, 30, 40, 50] * 20 + [10], 200, 200),  # the last one: no period
     ],
 )  # fmt: skip
 def test_a_lower_rate_that_imud_requests_is_no_loss(steps: list[int], lost: int, without: int) -> None:
