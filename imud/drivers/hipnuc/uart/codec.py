@@ -21,8 +21,9 @@ import struct
 import sys
 from binascii import crc_hqx as crc16_xmodem
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from math import isfinite
-from typing import Final, Literal, NamedTuple, ParamSpec
+from typing import Final, Literal, ParamSpec
 
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
 from imud.contracts.lines import TimeBits
@@ -30,6 +31,8 @@ from imud.drivers.hipnuc.common import (
     EULER_RAD_PER_LSB,
     M_S2_PER_G,
     MAG_T_PER_LSB,
+    PRESSURE_MAX_PA,
+    PRESSURE_MIN_PA,
     QUAT_PER_LSB,
     byte_temperature_c,
     field_of,
@@ -41,9 +44,12 @@ from imud.drivers.value_limits import (
     ACCEL_LIMIT_G,
     GYRO_LIMIT_DEG_S,
     MAG_LIMIT_UT,
+    QUAT_SQUARE_MAX,
+    QUAT_SQUARE_MIN,
     TURN_DEG,
     possible_angles,
     possible_quaternion,
+    scaled,
 )
 from imud.formats.kernel import KernelFormat
 from imud.model.ledger import Ledger
@@ -77,6 +83,9 @@ PRESSURE_OFFSET_PA: Final = 100_000.0
 HI91_VALUES: Final = struct.Struct(("@" if sys.byteorder == "little" else "<") + "xBBbfI16f")
 
 
+# `byte_temperature_c` of each value. Negative values are indices from the end.
+_TEMPERATURES_C: Final = tuple(byte_temperature_c(value) for value in (*range(128), *range(-128, 0)))
+
 # Squares of limits: the square of a 32-bit float is exact
 _LIMIT_SQUARES: Final = (ACCEL_LIMIT_G**2, GYRO_LIMIT_DEG_S**2, MAG_LIMIT_UT**2, TURN_DEG**2)
 
@@ -85,29 +94,40 @@ def _decode_hi91(data: bytes, at: int, word_is_status: bool, size: int, trailing
     (
         low, high, temperature, pressure, ms, ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, qw, qx, qy, qz,
     ) = HI91_VALUES.unpack_from(data, at)  # fmt: skip
-    # `scaled` without calls, which cost a fifth of a frame; a global name costs twice as much as a local name
+    # Local names and no calls for usual values: a global name costs twice as much, a call a twentieth of a frame. If
+    # the sum of the squares is below the square of the limit, every value is below the limit.
     g, rad, tesla = M_S2_PER_G, RAD_PER_DEG, T_PER_UT
     g_square, deg_s_square, ut_square, turn_square = _LIMIT_SQUARES
-    accel = gyro = mag = euler = None
-    if ax * ax < g_square and ay * ay < g_square and az * az < g_square:
-        accel = (ax * g, ay * g, az * g)
-    if gx * gx < deg_s_square and gy * gy < deg_s_square and gz * gz < deg_s_square:
-        gyro = (gx * rad, gy * rad, gz * rad)
-    has_mag = mx or my or mz  # a device without magnetometer sends zeros
-    if has_mag and mx * mx < ut_square and my * my < ut_square and mz * mz < ut_square:
-        mag = (mx * tesla, my * tesla, mz * tesla)
-    if roll * roll < turn_square and pitch * pitch < turn_square and yaw * yaw < turn_square:
-        euler = (roll * rad, pitch * rad, yaw * rad)
-    temperature_c, pressure_pa = byte_temperature_c(temperature), pressure_of(pressure)
-    if pressure_pa is None:
-        temperature_c = temperature_beside(temperature_c, pressure)
-    word = low + 256 * high if low + 256 * high <= WORD_MOST else None
-    is_finite = (
-        accel is not None and gyro is not None and euler is not None and (mag is not None or not has_mag)
-        and isfinite(pressure + qw + qx + qy + qz)
-    )  # fmt: skip
+    is_finite, mag = True, None
+    if ax * ax + ay * ay + az * az < g_square:
+        accel: Vector3 | None = (ax * g, ay * g, az * g)
+    else:
+        is_finite = (accel := scaled((ax, ay, az), g, ACCEL_LIMIT_G)) is not None
+    if gx * gx + gy * gy + gz * gz < deg_s_square:
+        gyro: Vector3 | None = (gx * rad, gy * rad, gz * rad)
+    else:
+        is_finite &= (gyro := scaled((gx, gy, gz), rad, GYRO_LIMIT_DEG_S)) is not None
+    if mx or my or mz:  # a device without magnetometer sends zeros
+        if mx * mx + my * my + mz * mz < ut_square:
+            mag = (mx * tesla, my * tesla, mz * tesla)
+        else:
+            is_finite &= (mag := scaled((mx, my, mz), tesla, MAG_LIMIT_UT)) is not None
+    if roll * roll + pitch * pitch + yaw * yaw < turn_square:
+        euler: Vector3 | None = (roll * rad, pitch * rad, yaw * rad)
+    else:
+        is_finite &= (euler := scaled((roll, pitch, yaw), rad, TURN_DEG)) is not None
+    # `possible_quaternion` without a call
+    is_rotation = QUAT_SQUARE_MIN < qw * qw + qx * qx + qy * qy + qz * qz < QUAT_SQUARE_MAX
+    quat, temperature_c, pressure_pa = (qw, qx, qy, qz) if is_rotation else None, _TEMPERATURES_C[temperature], pressure
+    if not PRESSURE_MIN_PA <= pressure <= PRESSURE_MAX_PA:
+        temperature_c, pressure_pa = temperature_beside(temperature_c, pressure), None
+    if pressure_pa is None or quat is None:
+        is_finite &= isfinite(pressure + qw + qx + qy + qz)
+    word = low + 256 * high
+    if word > WORD_MOST:
+        word = None
     return Measurement(
-        size, trailing, ms, accel, gyro, mag, possible_quaternion(qw, qx, qy, qz), euler, temperature_c, pressure_pa,
+        size, trailing, ms, accel, gyro, mag, quat, euler, temperature_c, pressure_pa,
         None, word if word_is_status else None, None if word_is_status else word,
     ), is_finite  # fmt: skip
 
@@ -129,7 +149,8 @@ def _decode_hi92(data: bytes, at: int, _word_is_status: bool, size: int, trailin
     ), euler is not None  # fmt: skip
 
 
-class Packet(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Packet:
     """Kind of sub-packet."""
 
     kernel_format: KernelFormat
@@ -150,6 +171,7 @@ def tag_name(tag: int) -> str:
 
 SYNC: Final = b"\x5a\xa5"
 HEADER: Final = struct.Struct("<2sHH")  # sync word, payload length, CRC
+HEADER_BYTES: Final = HEADER.size  # the attribute is slower than a name
 
 
 def _format(name: str, size: int) -> KernelFormat:
@@ -321,13 +343,6 @@ class HipnucCodec:
         events: list[CodecEvent] = []
         at, total = 0, len(data)
         while at < total:
-            sync = data.find(SYNC, at)
-            if sync != at:
-                end = sync if sync >= 0 else total - data.endswith(SYNC[:1], at)
-                events += self._lines.add(data[at:end], self._bad_ahead - at, self._barred_ahead - at)
-                at = end
-                if sync < 0:
-                    break
             after = self._decode_frame(data, at, give_up, events)
             if after == at:
                 break
@@ -338,48 +353,62 @@ class HipnucCodec:
         return events
 
     def _decode_frame(self, data: bytes, at: int, give_up: int, events: list[CodecEvent]) -> int:
-        """Decode the frame at `at`. Return its end, or `at` if it is incomplete."""
+        """Decode the frame or the text at `at`. Return its end, or `at` if it is incomplete."""
         total = len(data)
-        if total - at < HEADER.size:
-            return self._spend_sync(data, at, total, BadReason.CRC, events) if at < give_up else at
+        if total - at < HEADER_BYTES:
+            return self._decode_rest(data, at, give_up, events)
+        sync: bytes
         length: int
-        _, length, crc = HEADER.unpack_from(data, at)
+        sync, length, crc = HEADER.unpack_from(data, at)
+        if sync != SYNC:
+            return self._add_text(data, at, events)
         if not 1 <= length <= PAYLOAD_BYTES_MAX:
             return self._spend_sync(data, at, at + 4, BadReason.LENGTH, events)
-        begin, end = at + HEADER.size, at + HEADER.size + length
-        if end > total and at >= give_up:
-            return at
+        begin = at + HEADER_BYTES
+        end = begin + length
         if end > total or crc16_xmodem(data[begin:end], _HEAD_CRC[length]) != crc:
-            return self._spend_sync(data, at, end, BadReason.CRC, events)
-        found: list[Measurement] = []
-        ledger, finite = self.ledger, True
+            is_incomplete = end > total and at >= give_up
+            return at if is_incomplete else self._spend_sync(data, at, end, BadReason.CRC, events)
+        ledger, finite, first = self.ledger, True, len(events)
         while begin < end:
             packet = PACKETS.get(data[begin])
             if packet is None:
                 ledger.unknown_tags += 1
                 count_unknown(self.unknown, data[begin])
                 break
-            kernel_format, size, decode = packet
-            if begin + size > end:
+            decode, after = packet.decode, begin + packet.size
+            if after > end:
                 ledger.frames_bad_content += 1
                 ledger.bytes_in_bad_frames += end - at
-                events.append(BadFrame(BadReason.CONTENT, data[at:end]))
+                events[first:] = [BadFrame(BadReason.CONTENT, data[at:end])]
                 return end
             measurement, is_finite = decode(data, begin, self.word_is_status, end - at, total - end)
             finite = finite and is_finite
-            found.append(measurement)
-            self.kernel_format = kernel_format
-            begin += size
+            events.append(measurement)
+            self.kernel_format = packet.kernel_format
+            begin = after
         ledger.bytes_in_good_frames += end - at
         ledger.frames_good += 1
-        if found:
+        if len(events) > first:
             ledger.frames_in_samples += 1
         else:
             ledger.frames_ignored += 1
         if not finite:
             ledger.frames_not_finite += 1
-            events.append(BadFrame(BadReason.NOT_FINITE, data[at:end]))
-        events += found
+            events.insert(first, BadFrame(BadReason.NOT_FINITE, data[at:end]))
+        return end
+
+    def _decode_rest(self, data: bytes, at: int, give_up: int, events: list[CodecEvent]) -> int:
+        """Do `_decode_frame` for fewer bytes than a header."""
+        if not data.startswith(SYNC, at):
+            return self._add_text(data, at, events)
+        return self._spend_sync(data, at, len(data), BadReason.CRC, events) if at < give_up else at
+
+    def _add_text(self, data: bytes, at: int, events: list[CodecEvent]) -> int:
+        """Add the bytes before the next sync word. Return their end."""
+        sync = data.find(SYNC, at)
+        end = sync if sync >= 0 else len(data) - data.endswith(SYNC[:1], at)
+        events += self._lines.add(data[at:end], self._bad_ahead - at, self._barred_ahead - at)
         return end
 
     def _spend_sync(self, data: bytes, at: int, end: int, reason: BadReason, events: list[CodecEvent]) -> int:
