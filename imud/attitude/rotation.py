@@ -14,6 +14,7 @@ Other devices rotate in the order Z → Y → X (aerospace order, 321), with rol
 """
 
 import math
+from math import cos, sin
 from typing import Final
 
 from imud.model.sample import Quaternion, Vector3
@@ -100,15 +101,10 @@ def matrix_from_euler312(euler_rad: Vector3) -> Matrix3:
 def quat_from_euler_zyx(euler_rad: Vector3) -> Quaternion:
     """Return the unit quaternion of (roll, pitch, yaw), rad, order ZYX: the product of rotations about Z, Y, X."""
     roll, pitch, yaw = euler_rad
-    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
-    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
-    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
-    return (
-        cy * cp * cr + sy * sp * sr,
-        cy * cp * sr - sy * sp * cr,
-        cy * sp * cr + sy * cp * sr,
-        sy * cp * cr - cy * sp * sr,
-    )
+    roll, pitch, yaw = roll / 2, pitch / 2, yaw / 2
+    cr, sr, cp, sp, cy, sy = cos(roll), sin(roll), cos(pitch), sin(pitch), cos(yaw), sin(yaw)
+    cy_cp, sy_sp, cy_sp, sy_cp = cy * cp, sy * sp, cy * sp, sy * cp
+    return (cy_cp * cr + sy_sp * sr, cy_cp * sr - sy_sp * cr, cy_sp * cr + sy_cp * sr, sy_cp * cr - cy_sp * sr)
 
 
 def euler_zyx_from_matrix(matrix: Matrix3) -> Vector3:

@@ -32,8 +32,9 @@ def are_within(values: Sequence[float], limit: float) -> bool:
 def scaled(values: Sequence[float], factor: float, limit: float) -> Vector3 | None:
     """Return three values times `factor`; None if the magnitude of one is not below `limit`."""
     x, y, z = values
-    # `are_within` without a call, which costs as much as the rest of a frame
-    if -limit < x < limit and -limit < y < limit and -limit < z < limit:
+    # `are_within` without a call, which costs as much as the rest of a frame. The first sum is the usual case: if it is
+    # below the square of the limit, every value is below the limit.
+    if x * x + y * y + z * z < limit * limit or (-limit < x < limit and -limit < y < limit and -limit < z < limit):
         return (x * factor, y * factor, z * factor)
     return None
 

@@ -37,8 +37,9 @@ from imud.model.units import RAD_PER_DEG
 DEVICE_SYNC: Final = b"\xaa\x55"  # start of a frame from the device
 HOST_SYNC: Final = b"\x55\xaa"  # start of a frame from the host
 HEADER: Final = struct.Struct("<2sHH")  # sync word, id, payload length
+HEADER_BYTES: Final = HEADER.size  # the attribute is slower than a name
 CRC_BYTES: Final = 4
-OVERHEAD_BYTES: Final = HEADER.size + CRC_BYTES
+OVERHEAD_BYTES: Final = HEADER_BYTES + CRC_BYTES
 # Maximum length of a payload, bytes. The longest known payload has 66 bytes (S1, depends on the model). A false length
 # then hides at most five samples, 23 ms at 115200 baud.
 PAYLOAD_BYTES_MAX: Final = 256
@@ -49,9 +50,12 @@ class Frame(msgspec.Struct, frozen=True, gc=False):
     """Frame with a correct CRC."""
 
     frame_id: int
-    payload: bytes
     raw: bytes
     trailing_bytes: int  # number of bytes of the same read after the frame
+
+    @property
+    def payload(self) -> bytes:
+        return self.raw[HEADER_BYTES:-CRC_BYTES]
 
 
 def encode_frame(sync: bytes, frame_id: int, payload: bytes) -> bytes:
@@ -112,49 +116,49 @@ class FrameFinder:
     def _scan(self, data: bytes, drop_before: int) -> list[Frame | BadFrame]:
         """Return all complete frames in `data`. Incomplete frames that start before `drop_before` are bad."""
         found: list[Frame | BadFrame] = []
-        at, sync, total = 0, self._sync, len(data)
+        at, total = 0, len(data)
         while at < total:
-            begin = data.find(sync, at)
-            if begin < 0:
-                end = total - data.endswith(sync[:1], at)
-                self._skip(at, end)
-                at = end
+            after = self._frame_at(data, at, drop_before, found)
+            if after == at:
                 break
-            self._skip(at, begin)
-            at, waiting = begin, self._frame_at(data, begin, drop_before, found)
-            if at == waiting:
-                break
-            at = waiting
+            at = after
         self._tail = data[at:]
         self._bad_ahead = max(self._bad_ahead - at, 0)
         self._ledger.bytes_pending = total - at
         return found
 
     def _frame_at(self, data: bytes, at: int, drop_before: int, found: list[Frame | BadFrame]) -> int:
-        """Find the frame with its sync word at `at`. Return its end, or `at` if it is incomplete."""
+        """Find the frame or the other bytes at `at`. Return their end, or `at` if the frame is incomplete."""
         total = len(data)
-        if total - at < HEADER.size:
+        if total - at < HEADER_BYTES:
+            if not data.startswith(self._sync, at):
+                return self._skip(data, at)
             return self._spend_sync(data, at, total, BadReason.CRC, found) if at < drop_before else at
+        sync: bytes
         frame_id: int
         length: int
-        _, frame_id, length = HEADER.unpack_from(data, at)
-        begin = at + HEADER.size
+        sync, frame_id, length = HEADER.unpack_from(data, at)
+        if sync != self._sync:
+            return self._skip(data, at)
         if not 1 <= length <= PAYLOAD_BYTES_MAX:
-            return self._spend_sync(data, at, begin, BadReason.LENGTH, found)
-        end = begin + length + CRC_BYTES
-        if end > total and at >= drop_before:
-            return at
+            return self._spend_sync(data, at, at + HEADER_BYTES, BadReason.LENGTH, found)
+        end = at + OVERHEAD_BYTES + length
         raw = data[at:end]
-        if end > total or not _crc_matches(raw):
-            return self._spend_sync(data, at, end, BadReason.CRC, found)
-        found.append(Frame(frame_id, raw[HEADER.size : -CRC_BYTES], raw, total - end))
+        if end > total or inverted_crc32(raw, CRC_START) != CRC_INVERSION:
+            is_incomplete = end > total and at >= drop_before
+            return at if is_incomplete else self._spend_sync(data, at, end, BadReason.CRC, found)
+        found.append(Frame(frame_id, raw, total - end))
         return end
 
-    def _skip(self, at: int, end: int) -> None:
-        """Count bytes outside frames. Bytes of a damaged frame by its length field are bad."""
+    def _skip(self, data: bytes, at: int) -> int:
+        """Count the bytes before the next sync word. Return their end. Bytes of a damaged frame by its length field are
+        bad."""
+        begin = data.find(self._sync, at)
+        end = begin if begin >= 0 else len(data) - data.endswith(self._sync[:1], at)
         bad = max(min(self._bad_ahead, end) - at, 0)
         self._ledger.bytes_in_bad_frames += bad
         self._ledger.bytes_skipped += end - at - bad
+        return end
 
     def _spend_sync(self, data: bytes, at: int, end: int, reason: BadReason, found: list[Frame | BadFrame]) -> int:
         """Reject the frame from `at` to its `end` by the length field: skip only the sync word."""
@@ -249,9 +253,8 @@ class Acknowledgement:
     result: int  # the raw value
 
 
-def is_reply(frame_id: int, payload: bytes) -> bool:
-    """Return whether a frame is S1, P1 or K1 by its id and length."""
-    size = len(payload)
+def is_reply(frame_id: int, size: int) -> bool:
+    """Return whether a frame is S1, P1 or K1 by its id and the size of its payload."""
     return (
         size == ACKNOWLEDGEMENT.size
         or (frame_id == STATUS_FRAME and size >= STATUS_BYTES_MIN)
@@ -323,6 +326,7 @@ AHRS_FRAME_BYTES: Final = OVERHEAD_BYTES + 44
 
 # timer µs, pitch roll yaw °, accel x y z g, gyro x y z °/s, temperature °C (table 4)
 AHRS: Final = struct.Struct("<I10f")
+AHRS_BYTES: Final = AHRS.size
 AHRS_FRAME: Final = 0x0002
 TIMER_MODULUS: Final = 2**32
 
@@ -372,39 +376,39 @@ class Imu61xCodec:
 
     def _add_frame(self, frame: Frame, events: list[CodecEvent]) -> None:
         """Count a frame with a correct CRC and add its event."""
-        ledger, size = self.ledger, len(frame.raw)
-        reply = is_reply(frame.frame_id, frame.payload)
-        measured = frame.frame_id == AHRS_FRAME and not reply
-        if (measured and len(frame.payload) < AHRS.size) or (not reply and frame.frame_id in _REPLY_FRAMES):
+        ledger, frame_id, size = self.ledger, frame.frame_id, len(frame.raw)
+        payload_size = size - OVERHEAD_BYTES
+        measured = frame_id == AHRS_FRAME and payload_size >= AHRS_BYTES
+        reply = not measured and is_reply(frame_id, payload_size)
+        if not (measured or reply) and frame_id in _KNOWN_FRAMES:  # too short
             ledger.frames_bad_content += 1
             ledger.bytes_in_bad_frames += size
             events.append(BadFrame(BadReason.CONTENT, frame.raw))
             return
         ledger.bytes_in_good_frames += size
         ledger.frames_good += 1
-        if reply:
-            ledger.frames_in_replies += 1
-            events.append(ReplyFrame(frame.frame_id, frame.payload))
-        elif measured:
+        if measured:
             ledger.frames_in_samples += 1
             self._measure(frame, events)
+        elif reply:
+            ledger.frames_in_replies += 1
+            events.append(ReplyFrame(frame_id, frame.payload))
         else:
             ledger.frames_ignored += 1
-            count_unknown(self.unknown, frame.frame_id)
+            count_unknown(self.unknown, frame_id)
 
     def _measure(self, frame: Frame, events: list[CodecEvent]) -> None:
-        us, pitch, roll, yaw, ax, ay, az, gx, gy, gz, temperature = AHRS.unpack_from(frame.payload)
+        raw = frame.raw
+        us, pitch, roll, yaw, ax, ay, az, gx, gy, gz, temperature = AHRS.unpack_from(raw, HEADER_BYTES)
         accel = scaled((ax, ay, az), M_S2_PER_G, ACCEL_LIMIT_G)
         gyro = scaled((gx, gy, gz), RAD_S_PER_DEG_S, GYRO_LIMIT_DEG_S)
         euler = scaled((roll, pitch, yaw), RAD_PER_DEG, TURN_DEG)
         temperature_c = possible_temperature_c(temperature)
         if accel is None or gyro is None or euler is None or temperature_c is None:
             self.ledger.frames_not_finite += 1
-            events.append(BadFrame(BadReason.NOT_FINITE, frame.raw))
+            events.append(BadFrame(BadReason.NOT_FINITE, raw))
         quat = None if euler is None else quat_from_euler_zyx(euler)
-        events.append(
-            Measurement(len(frame.raw), frame.trailing_bytes, us, accel, gyro, None, quat, euler, temperature_c)
-        )
+        events.append(Measurement(len(raw), frame.trailing_bytes, us, accel, gyro, None, quat, euler, temperature_c))
 
 
 UNKNOWN_FRAMES: Final = {0x0166: "navigation", 0x0666: "raw data"}  # frames of other models
@@ -416,7 +420,7 @@ def frame_name(frame_id: int) -> str:
     return f"{name} (identifier {frame_id:#06x})" if name else f"identifier {frame_id:#06x}"
 
 
-_REPLY_FRAMES: Final = (STATUS_FRAME, PARAMETER_FRAME)
+_KNOWN_FRAMES: Final = (AHRS_FRAME, STATUS_FRAME, PARAMETER_FRAME)
 
 
 # --- encoder for simulated devices ------------------------------------------------------------------------------

@@ -325,4 +325,4 @@ def test_p1_k1_and_replies_by_id_and_length() -> None:
         (0xFF, 22, True), (0xFF, 21, False), (6, 24, True), (6, 23, False), (9, 4, True), (2, 44, False),
         (9, 24, False),
     ):  # fmt: skip
-        assert uart_codec.is_reply(frame_id, bytes(size)) is wanted
+        assert uart_codec.is_reply(frame_id, size) is wanted
