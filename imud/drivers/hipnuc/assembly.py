@@ -26,6 +26,8 @@ from itertools import pairwise
 from statistics import median
 from typing import Final, NamedTuple
 
+import msgspec
+
 from imud.drivers.hipnuc.same_address import SameAddress
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
@@ -81,7 +83,9 @@ PHASE_SHARE, PERIOD_SHARE = 8, 128  # divisors of the lateness of one burst that
 class Cadence:
     """Period of the bursts of one device. The period proves lost bursts. Synchronization: one thread."""
 
-    __slots__ = ("_due_ns", "_is_silent", "_late_ns", "_newest_ns", "_odd_ns", "_room", "_usual_ns", "period_ns")
+    __slots__ = (
+        "_due_ns", "_is_silent", "_late_ns", "_least_ns", "_newest_ns", "_odd_ns", "_room", "_usual_ns", "period_ns",
+    )  # fmt: skip
 
     def __init__(self, period_ns: int, newest_ns: int) -> None:
         """`newest_ns`: arrival time of the newest burst."""
@@ -89,6 +93,7 @@ class Cadence:
         self._newest_ns = newest_ns
         self._due_ns = newest_ns  # expected arrival of the newest burst
         self._usual_ns: deque[int] = deque(maxlen=UNSTEADY_BURSTS)  # lateness of the newest punctual bursts
+        self._least_ns = 0  # minimum of `_usual_ns`; 0 if it is empty
         self._late_ns: list[int] = []  # lateness of the bursts since a gap, relative to the bursts before the gap
         self._room = 0  # number of bursts that fit into the long distances since the gap
         self._is_silent = False
@@ -110,11 +115,13 @@ class Cadence:
         if 2 * late_ns < -period_ns:  # another burst of the same period
             return 0, False
         self._due_ns += period_ns
-        least_ns = min(self._usual_ns, default=0)
+        usual_ns, least_ns = self._usual_ns, self._least_ns
         if 2 * (late_ns - least_ns) < period_ns:
             if self._room or self._late_ns:
                 self._close_gap()
-            self._usual_ns.append(late_ns)
+            oldest_ns = usual_ns[0] if usual_ns else least_ns
+            usual_ns.append(late_ns)
+            self._least_ns = late_ns if late_ns <= least_ns else min(usual_ns) if oldest_ns == least_ns else least_ns
             self._due_ns += late_ns // PHASE_SHARE
             self.period_ns = max(period_ns + late_ns // PERIOD_SHARE, PERIOD_LEAST_NS)
             return 0, False
@@ -165,6 +172,7 @@ class Cadence:
             return False
         self.period_ns = max(int(median(odd)), PERIOD_LEAST_NS)
         self._usual_ns.clear()
+        self._least_ns = 0
         odd.clear()
         return True
 
@@ -267,9 +275,8 @@ NEAR_FRAMES_MAX, FAR_WEIGHT = 8, 4
 AWAY_PERIODS: Final = 10  # number of its periods without a kind after which imud no longer waits for the kind
 SIDS_AGREE: Final = 4  # number of equal SIDs, less the different SIDs, after which the SID decides
 SIDS_AGREE_MAX: Final = 8
-STRAYS_MAX: Final = (
-    40  # Limit of samples without the anchor, see STRAY_WEIGHT. Above the limit, imud selects an anchor.
-)
+# Limit of samples without the anchor, see STRAY_WEIGHT. Above the limit, imud selects an anchor.
+STRAYS_MAX: Final = 40
 STRAY_WEIGHT: Final = 2  # weight of a sample without the anchor; each sample with the anchor subtracts 1
 # Number of equal consecutive distances for the first m; for another m; for a multiple of the known m (losses can cause
 # a multiple).
@@ -299,16 +306,12 @@ class _Kind:
         self.losses = KindLosses()
 
     @property
-    def is_near(self) -> bool:
-        return self.near >= NEAR_FRAMES
-
-    @property
     def has_shared_sid(self) -> bool:
         return self.agree >= SIDS_AGREE
 
     def is_due(self, t_ns: int, period_ns: int, *, is_even: bool) -> bool:
         """Return whether an anchor at `t_ns` waits for the kind. `is_even`: one period after the previous anchor."""
-        if not self.is_near or not self.every or self.seen_ns is None or self.missed >= AWAY_PERIODS:
+        if self.near < NEAR_FRAMES or not self.every or self.seen_ns is None or self.missed >= AWAY_PERIODS:
             return False
         if self.every == 1:
             return True
@@ -331,7 +334,8 @@ class _Kind:
             self.behind_ns = late_ns if self.every and late_ns > NEAR_SHARE * period_ns else 0
             if 4 * self.step_ns > period_ns:
                 self.leads = 2 * offset_ns > period_ns
-            self._learn(round(self.step_ns / period_ns))
+            is_usual = 4 * abs(self.step_ns - self.every * period_ns) < period_ns  # `round` is slow
+            self._learn(self.every if is_usual else round(self.step_ns / period_ns))
         self.seen_ns, self.missed, self.anchors = t_ns, 0, 0
 
     def _learn(self, step: int) -> None:
@@ -343,7 +347,7 @@ class _Kind:
             self.every = step
 
 
-class Part(NamedTuple):
+class Part(msgspec.Struct, frozen=True, gc=False):
     """Frame of the present sample."""
 
     data: bytes
@@ -405,8 +409,9 @@ class Assembly:
             done.append(self._take())
             if self._anchor is None:
                 return done + self._add_unknown(kind, Part(data, t_rx_ns, sid))
-        self._add(kind, Part(data, t_rx_ns, sid))
-        self._track(kind, t_rx_ns)
+        self._parts[kind] = Part(data, t_rx_ns, sid)
+        self._ledger.frames_pending += 1
+        self._track(kind, t_rx_ns, sid)
         if self._anchor in self._parts and not self._due:
             done.append(self._take())
         return done
@@ -463,18 +468,12 @@ class Assembly:
                     return True
         return 2 * age_ns > period_ns or (anchor is not None and 2 * (t_rx_ns - anchor.t_ns) > period_ns)
 
-    def _add(self, kind: int, part: Part) -> None:
-        self._parts[kind] = part
-        self._ledger.frames_pending += 1
-
-    def _track(self, kind: int, t_rx_ns: int) -> None:
+    def _track(self, kind: int, t_rx_ns: int, sid: int | None) -> None:
         """Update the state of a kind. An anchor then waits for the kinds that are due."""
         period_ns, kinds = self._cadence.period_ns, self._kinds
         known = kinds.get(kind)
         if known is None:
             known = kinds[kind] = _Kind()
-        part = self._parts.get(kind)
-        sid = part.sid if part is not None else None
         self._ledger.frames_lost += known.losses.add(t_rx_ns, sid)
         if kind != self._anchor:
             known.arrive(t_rx_ns, self._anchor_ns, period_ns)
@@ -508,7 +507,8 @@ class Assembly:
             )
             self._count_losses(first_ns, anchor.sid, is_instant=shares)
         elif self._anchor is not None:
-            burst_ns = [part.t_ns for kind, part in parts.items() if kinds[kind].is_near and kinds[kind].every]
+            known = [(kinds[kind], part.t_ns) for kind, part in parts.items()]
+            burst_ns = [t_ns for one, t_ns in known if one.near >= NEAR_FRAMES and one.every]
             if any(kinds[kind].has_shared_sid for kind in parts) or self._cadence.steps_to(first_ns) > 0:
                 self._incomplete += 1  # the anchor is lost, the sample is not
             if burst_ns and self._cadence.steps_to(burst_ns[0]) > 0:
@@ -570,7 +570,8 @@ class Assembly:
             self._parts = dict(parts[:cut])
             done.append(self._take())
             self._parts = dict(parts[cut:])
-        self._add(kind, part)
+        self._parts[kind] = part
+        self._ledger.frames_pending += 1
         self._learning.append((kind, part.t_ns))
         learned = learned_from(self._learning)
         if learned is not None:
@@ -589,7 +590,7 @@ class Assembly:
         self._kinds[learned.anchor].near = NEAR_FRAMES_MAX
         begin = next(place for place, (kind, _) in enumerate(frames) if kind == learned.anchor)
         for kind, t_ns in frames[begin:]:
-            self._track(kind, t_ns)
+            self._track(kind, t_ns, self._parts[kind].sid if kind in self._parts else None)
         if learned.anchor not in self._parts:
             self._due.clear()
 
