@@ -8,7 +8,7 @@
  *   add_stamp ─▶ StampTime (imud/sampling/stamp_time.py)
  *   stamp ─▶ add_even_run (imud/sampling/clock.py), ArrivalFit.add_arrival (imud/sampling/arrival_fit.py),
  *                 encode_slots (imud/formats/slot.py)
- *   can_frames ─▶ FrameReader (imud/links/socketcan.py)
+ *   receive, can_frames ─▶ FrameReader (imud/links/socketcan.py)
  *   write_ring, beat_ring, show_ledger ─▶ ShmRing (imud/publishers/shm.py)
  *   is_at ─▶ is_at (imud/formats/kernel.py)
  *   frame_slots ─▶ BinaryEncoding (imud/publishers/socket/outbox.py)
@@ -17,16 +17,21 @@
  * The result must be equal to the result of Python in every bit. Therefore the compiler must not join a product and a
  * sum to one operation (-ffp-contract=off), and each expression has the order of the Python expression.
  */
+#ifndef _GNU_SOURCE
+#define _GNU_SOURCE /* recvmmsg */
+#endif
 #define Py_LIMITED_API 0x030B0000
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 #include <structmember.h>
+#include <errno.h>
 #include <float.h>
 #include <math.h>
 #include <stddef.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/socket.h>
 #include <sys/stat.h>
 #include <unistd.h>
 
@@ -1020,6 +1025,7 @@ static PyObject *add_slots(PyObject *self, PyObject *args)
 
 #define CAN_FRAME_BYTES 16   /* `struct can_frame`: identifier with flags, length, data from byte 8 */
 #define CAN_CONTROL_BYTES 64 /* control messages of a frame: arrival time, then number of dropped frames */
+#define CAN_FRAMES_MOST 64   /* frames of a read: `BATCH_FRAMES` of imud/links/socketcan.py */
 #define CAN_STAMP_AT (sizeof(size_t) + 4)
 #define CAN_DROPS_AT (2 * sizeof(size_t) + 28)
 #define CAN_NO_DATA 0x60000000u /* an error frame or a remote frame */
@@ -1028,6 +1034,36 @@ static PyObject *add_slots(PyObject *self, PyObject *args)
 #define CAN_BACKLOG_NS 5000000 /* `BACKLOG_NS` of imud/links/socketcan.py */
 #define SO_TIMESTAMPNS_NEW 64
 #define SO_RXQ_OVFL 40
+
+/* receive(fd, raw, control) -> number of frames that recvmmsg(2) stored in the buffers; -errno if it failed. It never
+ * blocks, so that it keeps the interpreter lock. */
+static PyObject *receive(PyObject *self, PyObject *args)
+{
+    struct mmsghdr messages[CAN_FRAMES_MOST];
+    struct iovec vectors[CAN_FRAMES_MOST];
+    Py_buffer raw, control;
+    int fd, count = 0;
+    if (!PyArg_ParseTuple(args, "iw*w*:receive", &fd, &raw, &control))
+        return NULL;
+    Py_ssize_t most = raw.len / CAN_FRAME_BYTES;
+    if (most > CAN_FRAMES_MOST || control.len / CAN_CONTROL_BYTES < most) {
+        PyErr_SetString(PyExc_ValueError, "receive: expected buffers for at most 64 frames");
+    } else {
+        for (Py_ssize_t i = 0; i < most; i++) {
+            vectors[i] = (struct iovec){(char *)raw.buf + i * CAN_FRAME_BYTES, CAN_FRAME_BYTES};
+            messages[i].msg_hdr = (struct msghdr){
+                .msg_iov = &vectors[i], .msg_iovlen = 1,
+                .msg_control = (char *)control.buf + i * CAN_CONTROL_BYTES, .msg_controllen = CAN_CONTROL_BYTES,
+            };
+        }
+        count = recvmmsg(fd, messages, (unsigned int)most, MSG_DONTWAIT, NULL);
+        if (count < 0)
+            count = -errno;
+    }
+    PyBuffer_Release(&raw);
+    PyBuffer_Release(&control);
+    return PyErr_Occurred() ? NULL : PyLong_FromLong(count);
+}
 
 static int is_time(int64_t ns)
 {
@@ -1105,6 +1141,7 @@ static PyObject *can_frames(PyObject *self, PyObject *args)
 }
 
 static PyMethodDef methods[] = {
+    {"receive", receive, METH_VARARGS, "Receive CAN frames by recvmmsg."},
     {"can_frames", can_frames, METH_VARARGS, "Return CAN frames of the buffers of recvmmsg; or None."},
     {"add_slots", add_slots, METH_VARARGS, "Add slots to the minimum and maximum of a second."},
     {"frame_slots", frame_slots, METH_O, "Return slots as messages of the socket, back to back."},

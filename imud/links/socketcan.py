@@ -212,47 +212,47 @@ class FrameReader:
         self._messages = (MessageBuffers * BATCH_FRAMES).from_buffer(self._headers)
         self._assign_buffers()
         self._fresh_headers = bytes(self._headers)
-        self._receive = partial(
-            _receive, receiver.fileno(), self._messages, BATCH_FRAMES, int(socket.MSG_DONTWAIT), None
-        )
-        self._empty_ns = now_ns()
-        self._newest_ns = self._empty_ns
+        self._fd = receiver.fileno()
+        self._empty_ns = self._newest_ns = now_ns()
         # CLOCK_REALTIME minus CLOCK_MONOTONIC at the last read that emptied the queue, ns.
         self._empty_offset_ns = self._clocks()[0]
         self._lost = False
 
     def read(self) -> list[CanFrame]:
         """Return the waiting data frames, at most BATCH_FRAMES, oldest first. Raises OSError of the kernel."""
-        begun_ns = self._now_ns()
-        count: int = self._receive()
+        begun_ns, module = self._now_ns(), kernel.present.module
+        count: int = self._receive() if module is None else module.receive(self._fd, self._frames, self._control)
         if count < 0:
-            return self._failed(ctypes.get_errno(), begun_ns)
+            return self._failed(-count, begun_ns)
         offset_ns, now_ns = self._clocks()
-        frames = self._usual(count, offset_ns, now_ns)
+        frames = None if module is None or self._lost else self._usual(module, count, offset_ns, now_ns)
         if frames is None:
             raw = memoryview(self._frames)[: count * RAW_FRAME.size]
             control = memoryview(self._control)[: count * _CONTROL_BYTES]
             rows = zip(RAW_FRAME.iter_unpack(raw), _CONTROL.iter_unpack(control), strict=True)
             frames = self._decoded(rows, offset_ns, now_ns)
-        self._headers[:] = self._fresh_headers
         if count < BATCH_FRAMES:
             self._empty_ns, self._empty_offset_ns = begun_ns, offset_ns
         return frames
+
+    def _receive(self) -> int:
+        """Do `receive` of the kernel in C."""
+        self._headers[:] = self._fresh_headers
+        count: int = _receive(self._fd, self._messages, BATCH_FRAMES, int(socket.MSG_DONTWAIT), None)
+        return count if count >= 0 else -ctypes.get_errno()
 
     def _step_ns(self, offset_ns: int) -> int:
         """Return the step of CLOCK_REALTIME since the queue was empty, ns; 0 without a step."""
         step_ns = offset_ns - self._empty_offset_ns
         return 0 if -STEP_NS < step_ns < STEP_NS else step_ns
 
-    def _usual(self, count: int, offset_ns: int, now_ns: int) -> list[CanFrame] | None:
+    def _usual(self, module: Any, count: int, offset_ns: int, now_ns: int) -> list[CanFrame] | None:
         """Return the result of `_decoded` from the kernel in C; None if Python must decode the frames."""
-        module, drops, newest_ns = kernel.present.module, self.dropped & _COUNT_MASK, self._newest_ns
-        if module is None or self._lost:
-            return None
-        step_ns, newest_ns = self._step_ns(offset_ns), max(newest_ns, self._empty_ns)
+        newest_ns = self._newest_ns if self._newest_ns > self._empty_ns else self._empty_ns
         frames: list[CanFrame] | None = module.can_frames(
-            CanFrame, self._frames, self._control, count, drops, offset_ns, step_ns, now_ns, newest_ns
-        )
+            CanFrame, self._frames, self._control, count, self.dropped & _COUNT_MASK, offset_ns,
+            self._step_ns(offset_ns), now_ns, newest_ns,
+        )  # fmt: skip
         if frames is not None:
             self._newest_ns = frames[-1].t_rx_ns
         return frames

@@ -41,14 +41,10 @@ class Bus:
         self.batches: list[list[CanFrame]] = []
         self.ends: list[LinkError | None] = []
         self.news: list[tuple[str, str]] = []
-        self.delays_s: list[float] = []
-        """Delays of the started timers, s."""
-        self.looks = 0
-        """Number of ended timers of the link."""
-        self.by_timer: list[bool] = []
-        """True for each batch that a timer read."""
-        self.then: Callable[[], None] = lambda: None
-        """Function that runs once, directly after the next delivery."""
+        self.delays_s: list[float] = []  # delays of the started timers, s
+        self.looks = 0  # number of ended timers of the link
+        self.by_timer: list[bool] = []  # True for each batch that a timer read
+        self.then: Callable[[], None] = lambda: None  # runs once, directly after the next delivery
         self._sender = sender
         self._news = asyncio.Event()
         self._looking = False
@@ -494,9 +490,11 @@ def test_limits_of_a_step_and_of_a_backlog(wire: Wire) -> None:
         for i, (frame, control) in enumerate(rows):
             RAW_FRAME.pack_into(reader._frames, 16 * i, *frame)
             socketcan._CONTROL.pack_into(reader._control, 64 * i, *control)
-        usual, reader._newest_ns = reader._usual(len(rows), offset_ns, now_ns), 0
+        module = kernel.present.module
+        usual = None if module is None else reader._usual(module, len(rows), offset_ns, now_ns)
+        reader = FrameReader(wire.receiver, BusState("can0"), lambda: 0, lambda: 0)
         frames = reader._decoded(rows, offset_ns, now_ns)
-        assert usual == (frames if kernel.present.module is not None else None)
+        assert usual == (None if module is None else frames)
         return [frame.t_rx_ns for frame in frames][1:]
 
     assert stamps(99_999, 21_000_000, 20_050_000) == [20_000_000]

@@ -289,6 +289,9 @@ def test_the_kernel_accepts_any_bytes_and_numbers(tmp_path: Path, name: str) -> 
     assert made_slots > 300
     with pytest.raises(ValueError, match=f"expected a format of the kernel, got x{name}"):
         module.start(values[0], f"x{name}", *values[2:])
+    for frames, controls in ((65, 65), (2, 1)):
+        with pytest.raises(ValueError, match="expected buffers for at most 64 frames"):
+            module.receive(-1, bytearray(16 * frames), bytearray(64 * controls))
 
 
 @pytest.mark.parametrize("cut", [0, 40])
