@@ -171,8 +171,7 @@ class HostClocks:
         return sum(int(step_s * NS_PER_S) for at_s, step_s in steps if since_ns >= at_s * NS_PER_S)
 
 
-WAITING_BYTES: Final = 256
-"""Size of the receive buffer of an FT232, bytes."""
+WAITING_BYTES: Final = 256  # size of the receive buffer of an FT232, bytes
 
 
 # --- devices --------------------------------------------------------------------------------------------------------
@@ -186,14 +185,12 @@ class Device:
     `nothing`: no time."""
     rates_hz: Sequence[tuple[float, float]] = ((0.0, 100.0),)
     """Pairs of (start in s, rate in Hz). A change of the rate also shifts the sampling instant within the tick."""
-    swing_ppm: float = 0.0
-    """Amplitude of the rate error due to temperature, ppm, with the period `swing_s`."""
+    swing_ppm: float = 0.0  # amplitude of the rate error due to temperature, ppm, with the period `swing_s`
     swing_s: float = 200.0
     restarts_s: Sequence[float] = ()
     """Times of the device's restarts, s. After each, the device is silent for two seconds and its counter restarts."""
     ticks_before_wrap: int | None = None
-    loss: float = 0.0
-    """Share of frames that are lost individually."""
+    loss: float = 0.0  # share of frames that are lost individually
     loss_burst_s: tuple[float, float] | None = None
     """(period in s, duration in s) of bursts in which all frames are lost."""
     size_bytes: int = 82
@@ -215,8 +212,7 @@ class Cell:
     device: Device = field(default_factory=Device)
     wake: WakeLaw = QUIET
     stalls: Stalls | None = None
-    host: HostClocks | None = None
-    """Changes of the host clocks; None for unchanged clocks."""
+    host: HostClocks | None = None  # changes of the host clocks; None for unchanged clocks
 
     @property
     def name(self) -> str:

@@ -82,8 +82,7 @@ class CellFigures(msgspec.Struct, frozen=True):
     settling: float
     settled: float
     ratio: float
-    rms_ratio: float | None = None
-    """None in figures that an older version stored."""
+    rms_ratio: float | None = None  # None in figures that an older version stored
 
     def short_of(self, base: "CellFigures | None") -> list[str]:
         missed = []

@@ -44,8 +44,7 @@ SAMPLES: Final = 100  # per second and device
 INTERVALS: Final = 10  # per message: rate_hz 10
 NATS: Final = shutil.which("nats-server") or shutil.which("nats-server", path="/usr/sbin:/sbin")
 NATS_SERVERS: Final = 3
-OUTPUTS: Final = 3
-"""Number of gateways of `--cluster` that run the output `mqtt`."""
+OUTPUTS: Final = 3  # number of gateways of `--cluster` that run the output `mqtt`
 LIMIT_S: Final = 60.0  # end of a spool
 LOST: Final = "lost"
 OPEN: Final = "streams with an open ledger"

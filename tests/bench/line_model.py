@@ -30,8 +30,7 @@ class LineFaults:
     pulse_loss: float = 0.0
     edge_loss: float = 0.0
     frame_loss: float = 0.0
-    extra: float = 0.0
-    """Number of false pulses per true pulse, at random times."""
+    extra: float = 0.0  # number of false pulses per true pulse, at random times
     loaded: bool = False
 
 

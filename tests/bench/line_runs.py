@@ -20,8 +20,7 @@ class DatedSample(NamedTuple):
     sample: Sample
     truth_ns: int
     number: int
-    begun_ns: int = 0
-    """Latest possible start of the frame according to its arrival, ns."""
+    begun_ns: int = 0  # latest possible start of the frame according to its arrival, ns
 
     @property
     def off_ns(self) -> int:

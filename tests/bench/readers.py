@@ -26,8 +26,7 @@ LENGTH = struct.Struct("<I")  # length prefix of binary messages
 SEQ_DEVICE_AND_PRESSURE = struct.Struct("<Q52xH138xd")
 """Members of a slot: sequence number, device id and pressure."""
 CHUNK = 1 << 18  # 256 KiB per receive
-PARTS = 5
-"""Number of devices per watched device, with `--devices`."""
+PARTS = 5  # number of devices per watched device, with `--devices`
 
 
 class Seen:

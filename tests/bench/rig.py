@@ -34,16 +34,12 @@ class Load:
     encoding: str = "binary"
     rate_hz: float = 1000.0
     seconds: float = 5.0
-    warm_s: float = 3.0
-    """Time before the measurement, s: the clock computes its first fits, and the caches fill."""
+    warm_s: float = 3.0  # time before the measurement, s: the clock computes its first fits, and the caches fill
     bare: bool = False
-    latency_ms: float | None = None
-    """Latency that clients and shared memory request, ms; None for their defaults."""
-    client_hz: float | None = None
-    """Sample rate that a client requests, Hz; None for all samples."""
+    latency_ms: float | None = None  # latency that clients and shared memory request, ms; None for their defaults
+    client_hz: float | None = None  # sample rate that a client requests, Hz; None for all samples
     phases: int = 1
-    apart: int = 0
-    """Number of frames between the starts of two devices; 0 starts all devices at the same time."""
+    apart: int = 0  # number of frames between the starts of two devices; 0 starts all devices at the same time
     recorded: bool = False
 
     @property

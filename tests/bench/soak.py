@@ -67,8 +67,7 @@ BEHIND_AT_S: Final = 60.0  # start of the pause of the clients
 BEHIND_S: Final = 10.0
 """Time in which the clients do not read, s. The queues of some clients overflow in this time."""
 TAIL_S: Final = 1.0  # last samples on their way to the outputs
-END_LIMIT_S: Final = 20.0
-"""Maximum time until the daemon has written its data and ended, s."""
+END_LIMIT_S: Final = 20.0  # maximum time until the daemon has written its data and ended, s
 LOST_TOLERANCE: Final = 1  # frames, if the pty rejected any
 
 

@@ -20,8 +20,7 @@ DRIVERS = {driver.name: driver for driver in of_kind(devices.DRIVERS.values(), C
 every_driver = pytest.mark.parametrize("name", list(DRIVERS))
 PERIOD_NS = 10_000_000
 FRAME_NS = 250_000
-LEARNING_SETS = 10
-"""Some devices' samples depend on earlier frames."""
+LEARNING_SETS = 10  # some devices' samples depend on earlier frames
 
 
 def every_driver_and_seed(test: Callable[[str, int], None]) -> Callable[..., None]:

@@ -20,8 +20,7 @@ from imud.model.sample import Measurement
 from tests.support.codec_invariants import decode_polled
 
 NAMES = [driver.name for driver in of_kind(DRIVERS.values(), PolledDriver)]
-TRANSFERS_MAX = 20
-"""Maximum number of transfers of any script, for any replies."""
+TRANSFERS_MAX = 20  # maximum number of transfers of any script, for any replies
 
 every_driver = pytest.mark.parametrize("name", NAMES)
 

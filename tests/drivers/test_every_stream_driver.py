@@ -16,8 +16,7 @@ from imud.model.sample import Measurement
 from tests.support.codec_invariants import cut, untimed
 from tests.support.codec_invariants import feed_stream as feed_checked
 
-IDLE = 2000
-"""Number of zero bytes that complete any claimed frame."""
+IDLE = 2000  # number of zero bytes that complete any claimed frame
 
 DRIVERS = {driver.name: driver for driver in of_kind(devices.DRIVERS.values(), StreamDriver)}
 every_driver = pytest.mark.parametrize("name", list(DRIVERS))

@@ -324,17 +324,12 @@ class Trial:
     name: str
     period_ms: float = 1.0
     hold_ns: int = 0
-    most: int = 24
-    """Maximum number of frames in a read."""
-    waits: bool = False
-    """Whether frames wait and are read together."""
+    most: int = 24  # maximum number of frames in a read
+    waits: bool = False  # whether frames wait and are read together
     lost: float = 0.0
-    odd: float = 0.0
-    """Share of frames without device time, and of jumps of the counter."""
-    slewed: float = 0.0
-    """Rate of CLOCK_MONOTONIC relative to steady time."""
-    early_ns: int = 0
-    """Time by which some reads are too early, ns."""
+    odd: float = 0.0  # share of frames without device time, and of jumps of the counter
+    slewed: float = 0.0  # rate of CLOCK_MONOTONIC relative to steady time
+    early_ns: int = 0  # time by which some reads are too early, ns
 
 
 TRIALS: Final = (

@@ -14,8 +14,7 @@ from tests.support.clock_feed import BEGIN_NS, feed, message, rises, steady
 
 UNIX = 1 << 32
 DAY = 86_400_000
-SLEW = 550e-6
-"""500 ppm, and a margin for inexact crystals and lines."""
+SLEW = 550e-6  # 500 ppm, and a margin for inexact crystals and lines
 
 
 def model(profile: ArrivalProfile, rate_hz: int = 100, ppm: float = 0.0, seed: int = 1) -> ArrivalModel:

@@ -35,10 +35,8 @@ class Device:
     modulus: int
     ppm: float = 30.0
     first: int = 12345
-    stamp_modulus: int = 0
-    """Modulus of `pps_age_ms` in frames without a counter; 0 without this value."""
-    pulses: bool = False
-    """Whether a pulse per second resets `pps_age_ms`."""
+    stamp_modulus: int = 0  # modulus of `pps_age_ms` in frames without a counter; 0 without this value
+    pulses: bool = False  # whether a pulse per second resets `pps_age_ms`
 
     def stamp_ms(self, index: int) -> int | None:
         if not self.stamp_modulus:

@@ -25,8 +25,7 @@ from tests.support.event_loops import UTC_AHEAD_NS, VirtualClock
 from tests.support.files import hi91
 
 MS = NS_PER_MS
-WAKE_NS = 50_000
-"""Half of the maximum wake-up time of the host: the mean delay of an arrival without a latency timer."""
+WAKE_NS = 50_000  # half of the maximum wake-up time of the host: the mean delay of an arrival without a latency timer
 VALUES = Measurement(8, 0, None, accel_m_s2=(0.0, 0.0, 9.8), status=0b110)
 
 

@@ -47,8 +47,7 @@ def timers_left(loop: Any) -> list[str]:
     return found + [repr(alarm) for due_s, _, alarm in getattr(loop, "alarms", ()) if due_s == alarm.due_s]
 
 
-DESCRIPTOR_LIMIT_S = 60.0
-"""Maximum real time of a loop that waits only for descriptors, s."""
+DESCRIPTOR_LIMIT_S = 60.0  # maximum real time of a loop that waits only for descriptors, s
 
 
 UTC_AHEAD_NS = 1_795_000_000 * NS_PER_S  # CLOCK_REALTIME minus CLOCK_MONOTONIC

@@ -20,8 +20,7 @@ from tests.support.device_rig import DeviceRig, DeviceRigs, device_config, runni
 from tests.support.event_loops import LoopWorker, VirtualClock, run_virtually
 
 RATE_HZ = 250.0
-TRANSFER_NS = 160_000
-"""Duration of each transfer, ns: 32 bytes at 1.6 Mbit/s."""
+TRANSFER_NS = 160_000  # duration of each transfer, ns: 32 bytes at 1.6 Mbit/s
 
 
 class PolledBusBench:

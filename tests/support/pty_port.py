@@ -30,8 +30,7 @@ from imud.sim.sensor import StreamModule
 T = TypeVar("T")
 
 NOBODY_UID = 65534
-SETTLED_S = 0.05
-"""Time in which the kernel moves bytes from one buffer of a port to the next, s."""
+SETTLED_S = 0.05  # time in which the kernel moves bytes from one buffer of a port to the next, s
 
 
 class PtyPort:

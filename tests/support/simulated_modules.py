@@ -75,8 +75,7 @@ class SerialLine(Generic[M]):
         self.now_ns = BEGIN_NS
         self.module = module
         self.baud = module.baud
-        self.connected = True
-        """Whether the host's transmit line is connected to the device."""
+        self.connected = True  # whether the host's transmit line is connected to the device
         self.ledger = ledger
         self.codec = codec
         self.session = offline_runner(ledger)

@@ -91,8 +91,7 @@ EPOCH = 4886718345
 NOW_NS = 80_000_123_456_789
 LIMIT_S = 60.0
 DEVICES = {"imu0": 0, "imu1": 1}
-SAMPLES_CHECKED = 50
-"""Number of samples of a `Peer` that are checked against the schema, because a check takes 0.3 ms."""
+SAMPLES_CHECKED = 50  # number of samples of a `Peer` that are checked against the schema, because a check takes 0.3 ms
 
 
 def sample(device: str = "imu0", seq: int = 1, period_ns: int = 1_000_000) -> Sample:

@@ -70,8 +70,7 @@ class FakeDevice:
     make_frame: Callable[[Random], bytes] | None = None
     """Frames that the device sends; None for the example frames of the driver."""
     noise: bytes = b""
-    damage: float = 0.0
-    """Share of frames with one inverted bit."""
+    damage: float = 0.0  # share of frames with one inverted bit
     random: Random = field(default_factory=lambda: Random(1))
     sent_to: list[tuple[int, bytes]] = field(default_factory=list)
 

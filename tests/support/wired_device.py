@@ -37,10 +37,8 @@ BEGIN_NS = 1000 * NS_PER_S + 123_456_789
 BAUD = 115_200
 STEP_S = 0.002
 TICK_S = 0.1
-WAKE_NS = 30_000
-"""Time from the last byte to the program that reads it, ns."""
-EDGE_LATE_NS = 45_000
-"""Time from the measurement to the rising edge, ns: 125 µs to the frame minus 80 µs of the pulse."""
+WAKE_NS = 30_000  # time from the last byte to the program that reads it, ns
+EDGE_LATE_NS = 45_000  # time from the measurement to the rising edge, ns: 125 µs to the frame minus 80 µs of the pulse
 
 
 class WiredDevice:

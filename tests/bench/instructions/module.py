@@ -21,8 +21,7 @@ SETTLE_READS: Final = 300
 PPM: Final = 40  # rate error of the device's crystal
 DELAY_NS: Final = (20_000, 90_000, 35_000, 150_000, 60_000, 25_000, 110_000)  # delays of arrivals, repeated
 HEADER_BYTES: Final = 6
-TIME_AT: Final = 8
-"""Offset of the device time in an HI91 payload (u32, ms)."""
+TIME_AT: Final = 8  # offset of the device time in an HI91 payload (u32, ms)
 HI91: Final = encode_hi91(
     system_time_ms=0, accel_m_s2=(0.1226, -0.4903, 9.787), gyro_rad_s=(0.00175, -0.0035, 0.0052),
     mag_t=(2.13e-5, -3.4e-6, -4.27e-5), euler_rad=(0.0123, -0.0235, 0.7854),

@@ -9,7 +9,7 @@ import socket
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
+from itertools import islice, pairwise
 from random import Random
 from typing import Final
 
@@ -17,7 +17,7 @@ from imud.contracts.codec import StreamCodec
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.drivers.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenOptions, encode_tpdos
 from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucOptions
-from imud.drivers.imu61x.can import BASE_ID, Imu61xCanCodec, Imu61xCanOptions, encode_set
+from imud.drivers.imu61x.can import BASE_ID, INDEX_MODULUS, Imu61xCanCodec, Imu61xCanOptions, encode_set
 from imud.drivers.imu61x.uart.codec import Imu61xCodec, encode_ahrs
 from imud.fleet.writer import WriterQueue
 from imud.formats.can import pack_frame
@@ -31,7 +31,7 @@ from imud.model.units import NS_PER_MS, uart_byte_ns
 from imud.publishers.shm import ShmOptions, ShmPublisher
 from imud.publishers.socket.server import SocketOptions, SocketServer
 from imud.sampling.clock import SampleClock
-from imud.sampling.path import PathContext, StreamPath
+from imud.sampling.path import CanPath, PathContext, StreamPath
 from tests.bench.instructions import virtual_time
 from tests.bench.instructions.daemon import BUFFER, DRAIN_EVERY, QUIET_PERIOD_TICKS, VirtualDaemon, own_group
 from tests.bench.instructions.measured import INTERPRETER
@@ -40,7 +40,6 @@ from tests.support.publisher_context import publisher_context
 
 Run = Callable[[int], None]
 
-READ_BYTES: Final = 4096
 WARM: Final = 200  # operations before the count, for one frame per operation
 WARM_LEAST: Final = 20  # minimum for several frames per operation
 
@@ -86,31 +85,36 @@ def _interpreter(total: int, _directory: str) -> Run:
 # --- decoding -------------------------------------------------------------------------------------------------------
 
 
-def _feeding(codec: StreamCodec, reads: Sequence[bytes]) -> Run:
-    return _taking([partial(codec.feed, read) for read in reads])
+Encode = Callable[[int], list[bytes]]  # returns a number of frames
+
+
+def _single(codec: Callable[[], StreamCodec], encode: Encode, total: int, _directory: str) -> Run:
+    feed = codec().feed
+    return _taking([partial(feed, frame) for frame in encode(total)])
+
+
+def _bulk(codec: Callable[[], StreamCodec], encode: Encode, block: int, total: int, _directory: str) -> Run:
+    feed, stream = codec().feed, b"".join(encode(total * block + 1))
+    size = len(stream) // (total * block + 1) * block
+    # 30 bytes more in the first read: each following read starts inside a frame
+    cuts = [0, *range(size + 30, len(stream), size), len(stream)]
+    return _taking([partial(feed, stream[begin:end]) for begin, end in pairwise(cuts)])
+
+
+HI91_BLOCK: Final = 50  # HI91 frames in 4100 bytes. Such reads have an incomplete frame at each end.
+AHRS_BLOCK: Final = 75  # AHRS frames in about 4096 bytes
+
+
+def _hi91_codec() -> StreamCodec:
+    return HipnucCodec(Ledger(), HipnucOptions())
+
+
+def _ahrs_codec() -> StreamCodec:
+    return Imu61xCodec(Ledger())
 
 
 def _hi91_frames(count: int) -> list[bytes]:
     return [read.data for read in Module().reads(count)]
-
-
-def _hi91_single(total: int, _directory: str) -> Run:
-    return _feeding(HipnucCodec(Ledger(), HipnucOptions()), _hi91_frames(total))
-
-
-HI91_BLOCK: Final = 50
-"""Number of HI91 frames in 4100 bytes. Such reads have an incomplete frame at each end, like reads of 4096 bytes."""
-
-
-def _hi91_bulk(total: int, _directory: str) -> Run:
-    stream = b"".join(_hi91_frames(total * HI91_BLOCK + 1))
-    size = len(stream) // (total * HI91_BLOCK + 1) * HI91_BLOCK
-    return _feeding(HipnucCodec(Ledger(), HipnucOptions()), _cut(stream, size))
-
-
-def _cut(stream: bytes, size: int) -> list[bytes]:
-    # 30 bytes more in the first read: each following read starts inside a frame
-    return [stream[: size + 30], *(stream[at : at + size] for at in range(size + 30, len(stream), size))]
 
 
 def _ahrs_frames(count: int) -> list[bytes]:
@@ -126,33 +130,27 @@ def _ahrs_frames(count: int) -> list[bytes]:
     ]  # fmt: skip
 
 
-def _ahrs_single(total: int, _directory: str) -> Run:
-    return _feeding(Imu61xCodec(Ledger()), _ahrs_frames(total))
-
-
-AHRS_BLOCK: Final = 75  # AHRS frames in about 4096 bytes
-
-
-def _ahrs_bulk(total: int, _directory: str) -> Run:
-    stream = b"".join(_ahrs_frames(total * AHRS_BLOCK + 1))
-    size = len(stream) // (total * AHRS_BLOCK + 1) * AHRS_BLOCK
-    return _feeding(Imu61xCodec(Ledger()), _cut(stream, size))
-
-
 VECTOR: Final = (0.125, -0.25, 0.5)
 TPDO_IDS: Final = {1: 0x180, 2: 0x280, 3: 0x380, 4: 0x480, 6: 0x680, 7: 0x780}  # COB-IDs of node 0 by TPDO number
 
 
 def _imu61x_can(total: int, _directory: str) -> Run:
     codec = Imu61xCanCodec(Ledger(), Imu61xCanOptions())
-    frames = [
-        (can_id, data, number * 5 * NS_PER_MS + place * 200_000)
-        for number in range(total // 5 + 1)
-        for place, (can_id, data) in enumerate(
-            encode_set(index=number, accel_m_s2=VECTOR, gyro_rad_s=VECTOR, euler_rad=VECTOR, temperature_c=31.5)
-        )
+    sets = _imu61x_sets(total // 5 + 1)
+    return _taking([partial(codec.feed_frame, can_id, False, data, t_ns) for one in sets for can_id, data, t_ns in one])
+
+
+def _imu61x_sets(count: int) -> list[list[tuple[int, bytes, int]]]:
+    """Return the frames of samples at intervals of 5 ms: identifier, data and arrival in ns."""
+    return [
+        [
+            (can_id, data, virtual_time.BEGIN_NS + index * 5 * NS_PER_MS + place * 200_000)
+            for place, (can_id, data) in enumerate(
+                encode_set(index=index, accel_m_s2=VECTOR, gyro_rad_s=VECTOR, euler_rad=VECTOR, temperature_c=31.5)
+            )
+        ]
+        for index in range(count)
     ]
-    return _taking([partial(codec.feed_frame, can_id, False, data, t_ns) for can_id, data, t_ns in frames])
 
 
 def _canopen(total: int, _directory: str) -> Run:
@@ -169,21 +167,29 @@ def _canopen(total: int, _directory: str) -> Run:
     return _taking([partial(codec.feed_frame, can_id, False, data, t_ns) for can_id, data, t_ns in frames])
 
 
+KEPT_OPEN: Final[list[socket.socket]] = []
+
+
 def _can_read(frames: int, total: int, _directory: str) -> Run:
     """Return a function that reads `frames` CAN frames. Datagrams on the loopback interface replace the CAN bus."""
-    sender, receiver = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
-    receiver.bind(("127.0.0.1", 0))
-    receiver.setblocking(False)
-    sender.connect(receiver.getsockname())
-    reader, raw = FrameReader(receiver, BusState("can0")), pack_frame(BASE_ID, False, bytes(8))
+    sender, reader = _can_bus()
+    raw = pack_frame(BASE_ID, False, bytes(8))
 
-    # the default argument keeps the receiver open
-    def read(_kept_open: socket.socket = receiver) -> None:
+    def read() -> None:
         for _ in range(frames):
             sender.send(raw)
         assert len(reader.read()) == frames
 
     return _taking([read] * total)
+
+
+def _can_bus() -> tuple[socket.socket, FrameReader]:
+    sender, receiver = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+    receiver.bind(("127.0.0.1", 0))
+    receiver.setblocking(False)
+    sender.connect(receiver.getsockname())
+    KEPT_OPEN.append(receiver)
+    return sender, FrameReader(receiver, BusState("can0"))
 
 
 # --- clock, slot, ring ----------------------------------------------------------------------------------------------
@@ -302,16 +308,8 @@ def _mqtt_queue(total: int, _directory: str) -> Run:
 
 def _path(frames: int, total: int, directory: str) -> Run:
     """Process the bytes of a read up to shared memory and one binary client, without the event loop."""
-    server, (sock,) = asyncio.new_event_loop().run_until_complete(_serve(directory, 1, "binary"))
-    publishers = (_ring_publisher(directory), server)
-
-    def publish(batch: Batch) -> None:
-        for publisher in publishers:
-            publisher.publish(batch)
-
-    ledger, module = Ledger(), Module()
-    context = PathContext("d0", 0, ledger, publish, _ignore, _ignore, int, HostClock())
-    path = StreamPath(HipnucCodec(ledger, HipnucOptions()), _clock_of_module(), context)
+    context, sock = _path_context(directory)
+    path, module = StreamPath(HipnucCodec(context.ledger, HipnucOptions()), _clock_of_module(), context), Module()
 
     def process(reads: Sequence[Read]) -> None:
         for number, (data, t_rx_ns) in enumerate(reads):
@@ -325,6 +323,37 @@ def _path(frames: int, total: int, directory: str) -> Run:
     process([*first, *module.reads(-len(first) % DRAIN_EVERY)])
     reads = iter(module.reads(total, frames))
     return lambda count: process(list(islice(reads, count)))
+
+
+def _can_path(total: int, directory: str) -> Run:
+    """Process the frames of IMU61x samples, a frame per read, from the CAN link up to the outputs of `_path`."""
+    context, sock = _path_context(directory)
+    clock = SampleClock("d0", tick_ns=5 * NS_PER_MS, tick_modulus=INDEX_MODULUS, byte_ns=0, hold_ns=0)
+    path = CanPath(Imu61xCanCodec(context.ledger, Imu61xCanOptions()), clock, context)
+    (sender, reader), sets = _can_bus(), iter(_imu61x_sets(total))
+
+    def process(count: int) -> None:
+        for number, one in enumerate(islice(sets, count)):
+            for can_id, data, t_ns in one:
+                sender.send(pack_frame(can_id, False, data))
+                virtual_time.set_now(t_ns)
+                path.on_frames(reader.read())
+            if number % DRAIN_EVERY == DRAIN_EVERY - 1:
+                sock.recv_into(BUFFER)
+
+    return process
+
+
+def _path_context(directory: str) -> tuple[PathContext, socket.socket]:
+    """Return the context of a path with a ring and one binary client, and the socket of the client."""
+    server, (sock,) = asyncio.new_event_loop().run_until_complete(_serve(directory, 1, "binary"))
+    publishers = (_ring_publisher(directory), server)
+
+    def publish(batch: Batch) -> None:
+        for publisher in publishers:
+            publisher.publish(batch)
+
+    return PathContext("d0", 0, Ledger(), publish, _ignore, _ignore, int, HostClock()), sock
 
 
 def _ignore(*_arguments: object) -> None: ...
@@ -345,10 +374,14 @@ def _tick(total: int, directory: str) -> Run:
 
 STAGES: Final = (
     CountedStage(INTERPRETER, _interpreter, 10, 100),
-    CountedStage("decode HI91, reads of 4096 bytes", _hi91_bulk, 4, HI91_BLOCK),
-    CountedStage("decode HI91, a frame per read", _hi91_single, 200),
-    CountedStage("decode AHRS, reads of 4096 bytes", _ahrs_bulk, 3, AHRS_BLOCK),
-    CountedStage("decode AHRS, a frame per read", _ahrs_single, 200),
+    CountedStage(
+        "decode HI91, reads of 4096 bytes", partial(_bulk, _hi91_codec, _hi91_frames, HI91_BLOCK), 4, HI91_BLOCK
+    ),
+    CountedStage("decode HI91, a frame per read", partial(_single, _hi91_codec, _hi91_frames), 200),
+    CountedStage(
+        "decode AHRS, reads of 4096 bytes", partial(_bulk, _ahrs_codec, _ahrs_frames, AHRS_BLOCK), 3, AHRS_BLOCK
+    ),
+    CountedStage("decode AHRS, a frame per read", partial(_single, _ahrs_codec, _ahrs_frames), 200),
     CountedStage("CAN link, a frame per read", partial(_can_read, 1), 200),
     CountedStage("CAN link, 10 frames per read", partial(_can_read, 10), 20, 10),
     CountedStage("decode IMU61x CAN, a frame", _imu61x_can, 250),
@@ -365,6 +398,7 @@ STAGES: Final = (
     CountedStage("queue of the output mqtt, a sample", _mqtt_queue, 200),
     CountedStage("bytes to publishers, a sample per read", partial(_path, 1), 1000),
     CountedStage("bytes to publishers, 20 samples per read", partial(_path, 20), 50, 20),
+    CountedStage("CAN link to publishers, an IMU61x sample of 5 reads", _can_path, 100),
     CountedStage("daemon, 1 client, a sample per wake-up", partial(_daemon, 1, "binary", 1), 1000),
     CountedStage("daemon, 10 binary clients, a sample per wake-up", partial(_daemon, 10, "binary", 1), 200),
     CountedStage("daemon, 10 JSON clients, a sample per wake-up", partial(_daemon, 10, "json", 1), 200),

@@ -28,8 +28,7 @@ from imud.sim.imu61x.uart import Imu61xHardware, Imu61xModule, Imu61xSettings
 from imud.sim.physics import swing
 from tests.support.simulated_modules import over_i2c, over_spi
 
-EPOCH_NS = 5_000_000_000
-"""Start of the motion, equal for all devices."""
+EPOCH_NS = 5_000_000_000  # start of the motion, equal for all devices
 STEP_NS = 10_000_000
 INSTANTS = [EPOCH_NS + 500_000_000 + n * STEP_NS for n in range(1, 201)]
 """2 s of motion from 510 ms after power-on, when all devices have booted."""
@@ -54,8 +53,7 @@ HALF_STEPS = {
     "spi registers": {"accel_m_s2": 1.4965e-8, "gyro_rad_s": 2.1306e-9, "temperature_c": 2.8966e-8},
 }
 """Maximum error of each value in a format: half a step, SI."""
-ROUNDING = 1 + 1e-6
-"""Rounding of 64-bit floats, and of the last digit of the numbers above."""
+ROUNDING = 1 + 1e-6  # rounding of 64-bit floats, and of the last digit of the numbers above
 
 
 def by_uart() -> list[Measurement]:

@@ -180,8 +180,7 @@ class Host:
         self.codec = HipnucCanopenCodec(Ledger(), HipnucCanopenOptions(node=NODE))
         self.session = offline_runner(self.codec.ledger)
         self.periods = 0
-        self.limit_s = LIMIT_S
-        """Real time limit of a request: their node runs in a thread."""
+        self.limit_s = LIMIT_S  # real time limit of a request: their node runs in a thread
 
     def events(self, timeout_s: float) -> list[CodecEvent]:
         message = self.bus.recv(timeout_s)
