@@ -241,7 +241,7 @@ class Imu61xCanCodec:
             return ()
         if follows:
             pace.learn(span_ns, t_rx_ns - before_ns)
-        raw, first_ns = b"".join(held[slot] for slot in _IN_ORDER) + data, self._first_ns
+        raw, first_ns = b"".join([*map(held.__getitem__, _IN_ORDER), data]), self._first_ns
         held.clear()
         self._newest = -1
         ledger.frames_pending -= _CLOSING
@@ -271,15 +271,13 @@ class Imu61xCanCodec:
 
 def _measurement(values: Sequence[float], temperature: int, index: int, first_ns: int) -> Measurement:
     """Return the measurement of a complete set, without groups with a value that is not possible."""
-    euler = scaled(values[:3], RAD_PER_DEG, TURN_DEG)
+    roll, pitch, yaw, gx, gy, gz, ax, ay, az = values
+    euler = scaled((roll, pitch, yaw), RAD_PER_DEG, TURN_DEG)
     return Measurement(
-        SET.size, 0, index,
-        accel_m_s2=scaled(values[6:9], M_S2_PER_G, ACCEL_LIMIT_G),
-        gyro_rad_s=scaled(values[3:6], RAD_S_PER_DEG_S, GYRO_LIMIT_DEG_S),
-        quat_wxyz=None if euler is None else quat_from_euler_zyx(euler),
-        euler_rad=euler,
-        temperature_c=possible_temperature_c(temperature * C_PER_COUNT),
-        t_first_ns=first_ns,
+        SET.size, 0, index, scaled((ax, ay, az), M_S2_PER_G, ACCEL_LIMIT_G),
+        scaled((gx, gy, gz), RAD_S_PER_DEG_S, GYRO_LIMIT_DEG_S), None,
+        None if euler is None else quat_from_euler_zyx(euler), euler,
+        possible_temperature_c(temperature * C_PER_COUNT), t_first_ns=first_ns,
     )  # fmt: skip
 
 
