@@ -257,8 +257,7 @@ def test_a_deviation_and_an_interval_by_hand() -> None:
 
 
 def test_it_is_that_of_allantools() -> None:
-    random = np.random.default_rng(1)
-    rate_hz = 50.0
+    random, rate_hz = np.random.default_rng(1), 50.0
     one = white(random, 20_000, rate_hz, 0.1) + random_walk(random, 20_000, rate_hz, 0.02) + 9.81
     curve = analysis_noise.allan_curve([three(one)], rate_hz)
     tau_s, deviation, _, _ = allantools.oadev(one, rate=rate_hz, data_type="freq", taus=curve.tau_s)

@@ -140,8 +140,7 @@ def test_the_feed_ignores_unknown_devices_and_ends_its_watch(tmp_path: Path) -> 
 
 def test_it_connects_again_to_a_daemon_that_was_restarted(tmp_path: Path) -> None:
     with daemon(tmp_path) as served:
-        path = str(served.path)
-        heard = Listener()
+        path, heard = str(served.path), Listener()
         feed = Feed(path, OVERVIEW)
         feed.start(heard.on_news)
         heard.wait_for(lambda news: news.statuses)

@@ -119,8 +119,7 @@ def test_which_frames_count() -> None:
     assert codec.feed_frame(0x088, False, bytes(8), 0) == ()
     assert codec.ledger.frames_ignored == codec.ledger.frames_good == 1
     assert codec.ledger.closes()
-    codec = make()
-    data = bytes.fromhex("60 00 20 00 00 00 00 00")
+    codec, data = make(), bytes.fromhex("60 00 20 00 00 00 00 00")
     assert codec.feed_frame(0x588, False, data, 0) == (ReplyFrame(0x588, data),)
     assert codec.feed_frame(0x588, False, data[:7], 0) == (BadFrame(BadReason.LENGTH, data[:7], 0x588),)
     assert codec.feed_frame(0x608, False, data, 0) == ()  # from another master

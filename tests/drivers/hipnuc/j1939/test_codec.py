@@ -164,8 +164,7 @@ SIGNALS = {"Acc": ("accel_m_s2", 9.8), "Gyr": ("gyro_rad_s", math.pi / 180), "Ma
 def test_the_vendors_signal_definitions_agree() -> None:
     cantools = pytest.importorskip("cantools")
     database = cantools.database.load_file(shared("hipnuc-j1939.dbc"))
-    random = Random(6)
-    compared = 0
+    random, compared = Random(6), 0
     for pgn in messages.MEASURED:
         definition = database.get_message_by_frame_id(encode(pgn, b"")[0])
         for _ in range(50):
@@ -259,8 +258,7 @@ def test_samples_of_several_modules_slow_messages_and_loss() -> None:
     assert codec.ledger.lost() == 0
 
     for missing in range(4):
-        codec = learned()
-        frames = burst(50)
+        codec, frames = learned(), burst(50)
         del frames[missing]
         assert counts(feed(codec, frames, 100 * MS)) == []
         assert counts(feed(codec, burst(51), 110 * MS)) == [50, 51][missing == 2 :]  # the third frame has the roll
