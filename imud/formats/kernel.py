@@ -46,21 +46,33 @@ class KernelFormat:
     head: bytes  # first bytes of every frame
     size_bytes: int  # size of a frame
 
-    def take(self, ledger: Ledger, frames: bytes, count: int, data: bytes) -> tuple[bytes, bytes]:
-        """Count the first `count` frames as samples. `frames` are the pending bytes of a codec and new bytes `data`.
-        Return the new pending bytes, which start a frame, and the end of `data` that the codec must decode."""
-        size = count * self.size_bytes
+
+class KernelFrames:
+    """Part of a codec whose usual frames the kernel decodes: its undecoded bytes."""
+
+    kernel_format: KernelFormat  # format of the newest frame
+
+    def __init__(self, ledger: Ledger) -> None:
+        self.ledger = ledger
+        self._tail = b""  # incomplete rest of the bytes: starts with a sync word, or is the first half of a sync word
+
+    def take(self, frames: bytes, count: int, data: bytes) -> bytes:
+        """Count the first `count` frames as samples. `frames` are the pending bytes and new bytes `data`. Return the
+        end of `data` that the codec must decode."""
+        ledger, size_bytes = self.ledger, self.kernel_format.size_bytes
+        size = count * size_bytes
         ledger.bytes_in_good_frames += size
         ledger.frames_good += count
         ledger.frames_in_samples += count
         if frames is data and size == len(data):  # the usual case: complete frames only
             ledger.bytes_in += size
-            return b"", b""
-        rest = frames[size:]
-        is_start = len(rest) < self.size_bytes and rest[: len(self.head)] == self.head[: len(rest)]
+            return b""
+        rest, head = frames[size:], self.kernel_format.head
+        is_start = len(rest) < size_bytes and rest[: len(head)] == head[: len(rest)]
+        self._tail = rest if is_start else b""
         ledger.bytes_in += len(data) if is_start else len(data) - len(rest)
-        ledger.bytes_pending = len(rest) if is_start else 0
-        return (rest, b"") if is_start else (b"", rest)
+        ledger.bytes_pending = len(self._tail)
+        return b"" if is_start else rest
 
 
 # Kernel of this process. Users read it at each call, so that a test can replace it.

@@ -51,7 +51,7 @@ from imud.drivers.value_limits import (
     possible_quaternion,
     scaled,
 )
-from imud.formats.kernel import KernelFormat
+from imud.formats.kernel import KernelFormat, KernelFrames
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Quaternion, Vector3
@@ -279,7 +279,7 @@ class HipnucOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     firmware). `auto` selects `pps` until the device reports its firmware version."""
 
 
-class HipnucCodec:
+class HipnucCodec(KernelFrames):
     """Decoder of frames and lines of text from a byte stream. Synchronization: one thread.
 
     Every known sub-packet becomes one `Measurement` with the size of the complete frame, so that all sub-packets of a
@@ -289,13 +289,12 @@ class HipnucCodec:
     """
 
     def __init__(self, ledger: Ledger, settings: HipnucOptions) -> None:
-        self.ledger = ledger
+        super().__init__(ledger)
         self.unknown: dict[int, int] = {}  # number of sub-packets by unknown tag
         self.word_is_status = settings.hi91_word == "status"  # whether bytes 1-2 of HI91 are status bits
         self.kernel_format = PACKETS[TAG_HI91].kernel_format  # of the newest frame
         self._word_is_fixed = settings.hi91_word != "auto"
         self._lines = LineFinder(ledger)
-        self._tail = b""  # incomplete rest of the bytes: starts with a sync word, or is the first half of a sync word
         self._bad_ahead = 0  # rest of a damaged frame by its length field, in bytes from the start of the tail
         self._barred_ahead = 0  # rest of a complete damaged frame, in which the codec does not look for lines
 
@@ -316,10 +315,6 @@ class HipnucCodec:
         if self._bad_ahead or self._barred_ahead or self.ledger.bytes_pending != len(tail):  # a line is incomplete
             return b""
         return tail + data if tail else data
-
-    def take(self, frames: bytes, count: int, data: bytes) -> bytes:
-        self._tail, rest = self.kernel_format.take(self.ledger, frames, count, data)
-        return rest
 
     # --- end of the stream ------------------------------------------------------------------------------------------
 

@@ -28,7 +28,7 @@ from imud.drivers.value_limits import (
     possible_temperature_c,
     scaled,
 )
-from imud.formats.kernel import KernelFormat
+from imud.formats.kernel import KernelFormat, KernelFrames
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
@@ -44,6 +44,12 @@ OVERHEAD_BYTES: Final = HEADER_BYTES + CRC_BYTES
 # then hides at most five samples, 23 ms at 115200 baud.
 PAYLOAD_BYTES_MAX: Final = 256
 FRAME_BYTES_MAX: Final = OVERHEAD_BYTES + PAYLOAD_BYTES_MAX
+
+# timer µs, pitch roll yaw °, accel x y z g, gyro x y z °/s, temperature °C (table 4)
+AHRS: Final = struct.Struct("<I10f")
+AHRS_BYTES: Final = AHRS.size
+AHRS_FRAME: Final = 0x0002
+AHRS_FRAME_BYTES: Final = OVERHEAD_BYTES + AHRS_BYTES
 
 
 class Frame(msgspec.Struct, frozen=True, gc=False):
@@ -66,22 +72,23 @@ def encode_frame(sync: bytes, frame_id: int, payload: bytes) -> bytes:
     return body + crc32(body).to_bytes(CRC_BYTES, "little")
 
 
-class FrameFinder:
+class FrameFinder(KernelFrames):
     """Finder of the frames of one direction in a byte stream. Synchronization: one thread.
 
     It counts every byte and every damaged frame in the ledger. The caller counts the returned frames, because only the
     caller knows whether their content is valid.
     """
 
+    kernel_format = KernelFormat("AHRS", HEADER.pack(DEVICE_SYNC, AHRS_FRAME, AHRS_BYTES), AHRS_FRAME_BYTES)
+
     def __init__(self, ledger: Ledger, sync: bytes) -> None:
-        self._ledger = ledger
+        super().__init__(ledger)
         self._sync = sync
-        self._tail = b""  # incomplete rest of the bytes: starts with a sync word, or is the first half of a sync word
         self._bad_ahead = 0  # rest of a damaged frame by its length field, in bytes from the start of the tail
 
     def feed(self, data: bytes) -> Sequence[Frame | BadFrame]:
         """Add the next bytes of the stream. Return the completed frames. Never raises an exception."""
-        self._ledger.bytes_in += len(data)
+        self.ledger.bytes_in += len(data)
         return self._scan(self._tail + data if self._tail else data, 0)
 
     # --- frames for the kernel ----------------------------------------------------------------------------------------
@@ -91,11 +98,6 @@ class FrameFinder:
         if self._bad_ahead:
             return b""
         return self._tail + data if self._tail else data
-
-    def take(self, kernel_format: KernelFormat, frames: bytes, count: int, data: bytes) -> bytes:
-        """See `KernelCodec`."""
-        self._tail, rest = kernel_format.take(self._ledger, frames, count, data)
-        return rest
 
     # --- end of the stream --------------------------------------------------------------------------------------------
 
@@ -108,10 +110,10 @@ class FrameFinder:
 
     def reset(self) -> None:
         """Count the pending bytes as skipped."""
-        self._ledger.bytes_skipped += len(self._tail)
+        self.ledger.bytes_skipped += len(self._tail)
         self._tail = b""
         self._bad_ahead = 0
-        self._ledger.bytes_pending = 0
+        self.ledger.bytes_pending = 0
 
     def _scan(self, data: bytes, drop_before: int) -> list[Frame | BadFrame]:
         """Return all complete frames in `data`. Incomplete frames that start before `drop_before` are bad."""
@@ -124,7 +126,7 @@ class FrameFinder:
             at = after
         self._tail = data[at:]
         self._bad_ahead = max(self._bad_ahead - at, 0)
-        self._ledger.bytes_pending = total - at
+        self.ledger.bytes_pending = total - at
         return found
 
     def _frame_at(self, data: bytes, at: int, drop_before: int, found: list[Frame | BadFrame]) -> int:
@@ -156,13 +158,13 @@ class FrameFinder:
         begin = data.find(self._sync, at)
         end = begin if begin >= 0 else len(data) - data.endswith(self._sync[:1], at)
         bad = max(min(self._bad_ahead, end) - at, 0)
-        self._ledger.bytes_in_bad_frames += bad
-        self._ledger.bytes_skipped += end - at - bad
+        self.ledger.bytes_in_bad_frames += bad
+        self.ledger.bytes_skipped += end - at - bad
         return end
 
     def _spend_sync(self, data: bytes, at: int, end: int, reason: BadReason, found: list[Frame | BadFrame]) -> int:
         """Reject the frame from `at` to its `end` by the length field: skip only the sync word."""
-        ledger = self._ledger
+        ledger = self.ledger
         if reason is BadReason.CRC:
             ledger.frames_bad_crc += 1
         else:
@@ -322,12 +324,6 @@ def pack_acknowledgement(command: int, result: int) -> bytes:
     return ACKNOWLEDGEMENT.pack(command, result)
 
 
-AHRS_FRAME_BYTES: Final = OVERHEAD_BYTES + 44
-
-# timer µs, pitch roll yaw °, accel x y z g, gyro x y z °/s, temperature °C (table 4)
-AHRS: Final = struct.Struct("<I10f")
-AHRS_BYTES: Final = AHRS.size
-AHRS_FRAME: Final = 0x0002
 TIMER_MODULUS: Final = 2**32
 
 
@@ -339,7 +335,7 @@ class Imu61xCodec:
     values; the frame counts as good.
     """
 
-    kernel_format: ClassVar = KernelFormat("AHRS", HEADER.pack(DEVICE_SYNC, AHRS_FRAME, AHRS.size), AHRS_FRAME_BYTES)
+    kernel_format: ClassVar = FrameFinder.kernel_format
     word_is_status: ClassVar = False
 
     def __init__(self, ledger: Ledger, _settings: Options | None = None) -> None:
@@ -355,7 +351,7 @@ class Imu61xCodec:
         return self._finder.usual_frames(data)
 
     def take(self, frames: bytes, count: int, data: bytes) -> bytes:
-        return self._finder.take(self.kernel_format, frames, count, data)
+        return self._finder.take(frames, count, data)
 
     def flush(self) -> Sequence[CodecEvent]:
         """Return the complete frames inside an incomplete longer frame. imud calls it when the link is idle."""
