@@ -23,9 +23,9 @@ LATENCY_MS = 10.0
 VARIED = 10  # number of clients with all loads
 # loads with the goal CPU_AIM
 JUDGED = ("latency 10 ms", "at 100 Hz", "at 10 Hz, latency 20 ms")
-FLEETS = (0.0, (1, 4, 16, 32, 48, 64), 32), (LATENCY_MS, (48, 80, 128, 192, 250, 300), 250)
+FLEETS = (0.0, (1, 4, 16, 32, 48, 64), 32), (LATENCY_MS, (80, 112, 160, 200, 250), 250)
 """Latency, ms; numbers of devices; goal on one core."""
-APART_FRAMES = 50
+APART_FRAMES = 200
 """Number of frames between the starts of two devices. A clock needs more CPU time until its fit has settled. On a real
 gateway, imud also detects the devices one after another."""
 
@@ -86,9 +86,9 @@ def ratio_of(figure: str, some: Sequence[Outcome], others: Sequence[Outcome]) ->
 def growth(seconds: float, latency_ms: float, sizes: Sequence[int], aim: int) -> Iterator[Row]:
     """Yield the CPU time by number of devices, and the largest number of devices on one core without lost samples."""
     most, load = 0, Load(seconds=seconds, phases=4, latency_ms=latency_ms or None)
-    if latency_ms:
-        load = replace(load, apart=APART_FRAMES, warm_s=6.0)
     loads = [replace(load, devices=aim, bare=True), *(replace(load, devices=devices) for devices in sizes)]
+    if latency_ms:  # the measurement begins after the start of the last device
+        loads = [replace(one, apart=APART_FRAMES, warm_s=4.0 + one.devices * APART_FRAMES / 1e3) for one in loads]
     for one in loads:
         outcome = run(one)
         words = f"{one.devices} devices at 1 kHz, latency {latency_ms:g} ms{', bare loop' * one.bare}"
