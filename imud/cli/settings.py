@@ -74,7 +74,7 @@ def settings(args: argparse.Namespace) -> int:
 
 
 def device_after(words: list[str]) -> str:
-    """Remove the device from the words after `--set`, and return it. Raises BadArgument if there is none."""
+    """Remove the device from the words after `--set` and return it. Raises BadArgument without a device."""
     names = [word for word in words if "=" not in word]
     if len(names) != 1 or len(words) == 1:
         raise BadArgument(
