@@ -21,7 +21,6 @@
 #define _GNU_SOURCE /* recvmmsg */
 #endif
 #define Py_LIMITED_API 0x030B0000
-#define PY_SSIZE_T_CLEAN
 #include <Python.h>
 #include <structmember.h>
 #include <errno.h>
@@ -815,13 +814,13 @@ static PyObject *beat_ring(RingObject *self, PyObject *now)
 static PyObject *show_ledger(RingObject *self, PyObject *args)
 {
     const char *driver;
-    Py_ssize_t size;
     PyObject *counters;
     uint8_t *to = (uint8_t *)self->memory.buf + RING_LEDGER_OFFSET;
     LedgerBlock block = {.update = self->update + 1};
-    if (!PyArg_ParseTuple(args, "s#O!:show", &driver, &size, &PyTuple_Type, &counters))
+    if (!PyArg_ParseTuple(args, "sO!:show", &driver, &PyTuple_Type, &counters))
         return NULL;
-    memcpy(block.driver, driver, (size_t)(size < RING_DRIVER_BYTES ? size : RING_DRIVER_BYTES - 1));
+    size_t size = strlen(driver);
+    memcpy(block.driver, driver, size < RING_DRIVER_BYTES ? size : RING_DRIVER_BYTES - 1);
     Py_ssize_t count = PyTuple_Size(counters);
     if (count > RING_COUNTERS) {
         PyErr_Format(PyExc_ValueError, "expected at most %d counters, got %zd", RING_COUNTERS, count);
@@ -1096,9 +1095,10 @@ static PyObject *can_frame(newfunc make, PyTypeObject *frame_type, const uint8_t
         *newest_ns = now_ns;
     if (*newest_ns > now_ns)
         *newest_ns = now_ns;
-    PyObject *args = Py_BuildValue("((kOy#LO))", (unsigned long)(can_id & CAN_ID_MOST),
-                                   can_id & CAN_EXTENDED ? Py_True : Py_False, (const char *)raw + 8,
-                                   (Py_ssize_t)(raw[4] < 8 ? raw[4] : 8), (long long)*newest_ns, Py_False);
+    PyObject *args = Py_BuildValue("((kONLO))", (unsigned long)(can_id & CAN_ID_MOST),
+                                   can_id & CAN_EXTENDED ? Py_True : Py_False,
+                                   PyBytes_FromStringAndSize((const char *)raw + 8, raw[4] < 8 ? raw[4] : 8),
+                                   (long long)*newest_ns, Py_False);
     PyObject *made = args == NULL ? NULL : make(frame_type, args, NULL);
     Py_XDECREF(args);
     return made;

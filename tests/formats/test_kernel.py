@@ -1,5 +1,6 @@
 """The kernel is loaded if it belongs to its source. Otherwise imud knows why it does not use the kernel."""
 
+import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,6 +22,8 @@ def test_the_kernel_of_the_present_source_is_loaded(monkeypatch: pytest.MonkeyPa
         assert (kernel.load("1").module, kernel.load(None).module) == (module, module)
         assert kernel.load(None).problem.startswith(start)
         assert kernel.load("0") == Kernel(None, "IMUD_KERNEL=0 switches it off")
+    # Python 3.11 refuses the format unit `#` in a library that a later Python compiled
+    assert not re.search(r'(?:ParseTuple|BuildValue)[^;]*"[^"]*#', kernel.SOURCE.read_text())
 
 
 def test_a_file_is_at_its_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
