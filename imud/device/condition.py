@@ -470,9 +470,8 @@ class ConditionWatch:
         self._since_ns = now_ns
         self._counted: Sequence[Cause] = ()
         self.level = Condition.MISSING
-        self.is_ok = (
-            False  # whether no reason counts, no cause of a reason exists or ended recently, and samples arrive
-        )
+        # whether no reason counts, no cause of a reason exists or ended recently, and samples arrive
+        self.is_ok = False
 
     @property
     def condition(self) -> DeviceCondition:
