@@ -9,8 +9,11 @@ import grp
 import os
 import select
 import socket
-from collections.abc import Callable, Iterator
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
 from functools import partial
+from math import ceil
+from operator import attrgetter
 from typing import Final
 
 import msgspec
@@ -35,6 +38,8 @@ DRAIN_EVERY: Final = 16
 """Number of wake-ups between two reads of the clients. The socket buffers do not fill up in this time."""
 START_MS: Final = 1000  # until the daemon has opened the port
 CONNECT_MS: Final = 10  # until the clients are subscribed
+WAITING_MOST: Final = 20  # maximum number of reads that wait in the port
+ARRIVAL: Final = attrgetter("t_rx_ns")
 BUFFER: Final = bytearray(1 << 20)
 TICK_NS: Final = round(QUIET_TICK_S * NS_PER_S)
 TICK_SAMPLES: Final = TICK_NS // NS_PER_MS  # samples of the device between two ticks
@@ -47,33 +52,58 @@ SETTLE_TICKS: Final = 3 * MINUTE_NS // TICK_NS  # after the losses of the first 
 class _Feeder:
     def __init__(self, master: int, slave: int) -> None:
         self.loop: asyncio.AbstractEventLoop | None = None
-        self.reads: Iterator[Read] = iter(())
+        self._reads: Sequence[Read] = ()
+        self._at = 0  # index of the next read
+        self._is_paused = False
         self.clients: list[socket.socket] = []
         self._master = master
         self._readable = select.poll()
         self._readable.register(slave, select.POLLIN)
         self._epoll = select.epoll()
-        self.register, self.unregister, self.close = self._epoll.register, self._epoll.unregister, self._epoll.close
+        self.close = self._epoll.close
         self.wakes = 0
+
+    def register(self, fd: int, eventmask: int) -> None:
+        self._epoll.register(fd, eventmask)
+        self._is_paused = False
+
+    def unregister(self, fd: int) -> None:
+        self._epoll.unregister(fd)
+        self._is_paused = True  # of all descriptors, the daemon adds and removes only the port again and again
 
     def poll(self, timeout: float | None, maxevents: int) -> list[tuple[int, int]]:
         # the loop would sleep now: deliver the next read
         if timeout is None or timeout > 0:
-            read = next(self.reads, None)
-            if read is None:
+            if self._at == len(self._reads):
                 assert self.loop is not None
                 self.loop.stop()
+            elif self._is_paused and timeout is not None:
+                self._sleep(virtual_time.now_ns() + ceil(timeout * NS_PER_S))
             else:
-                self._feed(read)
+                data, t_rx_ns = self._reads[self._at]
+                self._at += 1
+                self._feed(data, t_rx_ns)
         return self._epoll.poll(0, maxevents)
 
-    def _feed(self, read: Read) -> None:
-        virtual_time.set_now(read.t_rx_ns)
-        os.write(self._master, read.data)
+    def _sleep(self, end_ns: int) -> None:
+        """Let the reads until a time wait in the port."""
+        begin, most = self._at, min(self._at + WAITING_MOST, len(self._reads))
+        self._at = end = bisect_right(self._reads, end_ns, begin, most, key=ARRIVAL)
+        if end > begin:
+            self._feed(b"".join([read.data for read in self._reads[begin:end]]), end_ns)
+        virtual_time.set_now(end_ns)
+
+    def _feed(self, data: bytes, t_rx_ns: int) -> None:
+        virtual_time.set_now(t_rx_ns)
+        os.write(self._master, data)
         self._readable.poll()  # wait until a kernel thread has moved the bytes to the slave
         self.wakes += 1
         if not self.wakes % DRAIN_EVERY:
             self.drain()
+
+    def deliver(self, reads: Sequence[Read]) -> None:
+        """Deliver these reads, then stop the loop."""
+        self._reads, self._at = reads, 0
 
     def drain(self) -> None:
         for client in self.clients:
@@ -83,20 +113,22 @@ class _Feeder:
 class VirtualDaemon:
     """A daemon with one device and its clients, in the caller's thread."""
 
-    def __init__(self, directory: str) -> None:
+    def __init__(self, directory: str, latency_ms: int = 0) -> None:
+        """The clients and shared memory request a latency."""
+        self._latency_ms = latency_ms
         self._master, slave = os.openpty()
         self._socket_path = f"{directory}/s"
         self._module = Module()
         self._feeder = _Feeder(self._master, slave)
         self._loop = SampleLoop(ReaderSelector(self._feeder))
         self._feeder.loop = self._loop
-        self._daemon = Daemon(_settings(directory, os.ttyname(slave)))
+        self._daemon = Daemon(_settings(directory, os.ttyname(slave), latency_ms))
         self._running = self._loop.create_task(self._daemon.run())
         self._pass_time(START_MS)
         self.process(self._module.first_minute())
 
     def connect(self, clients: int, encoding: str) -> None:
-        watch = line_of(encode_request("watch", {"encoding": encoding}, 1))
+        watch = line_of(encode_request("watch", {"encoding": encoding, "latency_ms": self._latency_ms}, 1))
         for _ in range(clients):
             client = socket.socket(socket.AF_UNIX)
             client.connect(self._socket_path)
@@ -110,9 +142,6 @@ class VirtualDaemon:
 
     def prepare(self, count: int, frames: int) -> list[Read]:
         return self._module.reads(count, frames)
-
-    def process(self, reads: list[Read]) -> None:
-        self._run(iter(reads))
 
     def quiet_ticks(self, count: int) -> list[Callable[[], None]]:
         """Return ticks of a quiet state: all samples arrive in time, and the device is at rest. The last minute had no
@@ -156,8 +185,8 @@ class VirtualDaemon:
         assert path is not None
         return path
 
-    def _run(self, reads: Iterator[Read]) -> None:
-        self._feeder.reads = reads
+    def process(self, reads: Sequence[Read]) -> None:
+        self._feeder.deliver(reads)
         self._loop.run_forever()
         # the daemon ended: raise its exception
         if self._running.done():
@@ -166,14 +195,14 @@ class VirtualDaemon:
     def _pass_time(self, duration_ms: int) -> None:
         for _ in range(duration_ms):
             virtual_time.set_now(virtual_time.now_ns() + NS_PER_MS)
-            self._run(iter(()))
+            self.process(())
         self._module.skip(duration_ms)
 
 
-def _settings(directory: str, port: str) -> config.Config:
+def _settings(directory: str, port: str, latency_ms: int) -> config.Config:
     tree = {
         "log_level": "error", "state_dir": directory, "socket": {"path": f"{directory}/s", "group": own_group()},
-        "shm": {"directory": directory, "group": own_group()}, "metrics": {"port": 0},
+        "shm": {"directory": directory, "group": own_group(), "latency_ms": latency_ms}, "metrics": {"port": 0},
         "devices": {"d0": {"driver": "hipnuc-uart", "identify": False, "uart": {"port": port, "baud": BAUD}}},
     }  # fmt: skip
     return config.parse(msgspec.json.encode(tree), "measurement")

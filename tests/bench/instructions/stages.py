@@ -359,8 +359,8 @@ def _path_context(directory: str) -> tuple[PathContext, socket.socket]:
 def _ignore(*_arguments: object) -> None: ...
 
 
-def _daemon(clients: int, encoding: str, frames: int, total: int, directory: str) -> Run:
-    daemon = VirtualDaemon(directory)
+def _daemon(clients: int, encoding: str, frames: int, latency_ms: int, total: int, directory: str) -> Run:
+    daemon = VirtualDaemon(directory, latency_ms)
     daemon.connect(clients, encoding)
     reads = iter(daemon.prepare(total, frames))
     return lambda count: daemon.process(list(islice(reads, count)))
@@ -399,9 +399,11 @@ STAGES: Final = (
     CountedStage("bytes to publishers, a sample per read", partial(_path, 1), 1000),
     CountedStage("bytes to publishers, 20 samples per read", partial(_path, 20), 50, 20),
     CountedStage("CAN link to publishers, an IMU61x sample of 5 reads", _can_path, 100),
-    CountedStage("daemon, 1 client, a sample per wake-up", partial(_daemon, 1, "binary", 1), 1000),
-    CountedStage("daemon, 10 binary clients, a sample per wake-up", partial(_daemon, 10, "binary", 1), 200),
-    CountedStage("daemon, 10 JSON clients, a sample per wake-up", partial(_daemon, 10, "json", 1), 200),
+    CountedStage("daemon, 1 client, a sample per wake-up", partial(_daemon, 1, "binary", 1, 0), 1000),
+    CountedStage("daemon, 10 binary clients, a sample per wake-up", partial(_daemon, 10, "binary", 1, 0), 200),
+    CountedStage("daemon, 10 JSON clients, a sample per wake-up", partial(_daemon, 10, "json", 1, 0), 200),
     CountedStage("tick, 1 device, 1 client", _tick, QUIET_PERIOD_TICKS, 1),
-    CountedStage("daemon, 1 client, 20 samples per wake-up", partial(_daemon, 1, "binary", 20), 50, 20),
+    CountedStage("daemon, 1 client, 20 samples per wake-up", partial(_daemon, 1, "binary", 20, 0), 50, 20),
+    CountedStage("daemon, 1 client, latency 10 ms", partial(_daemon, 1, "binary", 1, 10), 1000),
+    CountedStage("daemon, 10 binary clients, latency 10 ms", partial(_daemon, 10, "binary", 1, 10), 1000),
 )
