@@ -13,6 +13,7 @@
  *   is_at ─▶ is_at (imud/formats/kernel.py)
  *   frame_slots ─▶ BinaryEncoding (imud/publishers/socket/outbox.py)
  *   add_slots ─▶ add_slots (imud/publishers/socket/history.py)
+ *   add_latencies ─▶ LatencyMeter.add (imud/sampling/meters.py), slot_status_bits (imud/formats/slot.py)
  *
  * The result must be equal to the result of Python in every bit. Therefore the compiler must not join a product and a
  * sum to one operation (-ffp-contract=off), and each expression has the order of the Python expression.
@@ -581,6 +582,11 @@ static PyObject *start(PyObject *self, PyObject *args)
     return (PyObject *)made;
 }
 
+static int is_time(int64_t ns)
+{
+    return -TIME_MOST_NS <= ns && ns <= TIME_MOST_NS;
+}
+
 /* Read an integer of Python. Return 0 with an exception if it is not an integer of 64 bits. */
 static int integer(PyObject *object, int64_t *value)
 {
@@ -885,6 +891,57 @@ static PyType_Spec ring_spec = {
     "imud._kernel.Ring", sizeof(RingObject), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_DISALLOW_INSTANTIATION, ring_slots,
 };
 
+#define LATENCY_MOST_NS (INT64_C(1) << 50) /* 13 days; the sum of SLOTS_MOST latencies fits into 64 bits */
+#define SLOTS_MOST 4096
+
+/* add_latencies(buckets, bounds, slots, now_ns) -> status bits of the slots, sum of their latencies. Adds each latency
+ * to the bucket of the first bound that it does not exceed. None without a change if Python must count. */
+static PyObject *add_latencies(PyObject *self, PyObject *const *args, Py_ssize_t count)
+{
+    Py_buffer buckets;
+    char *bounds, *slots;
+    Py_ssize_t bounds_bytes, size;
+    int64_t now_ns, sum_ns = 0, latency_ns, bound_ns, t_ns;
+    uint32_t bits = 0, status;
+    if (count != 4) {
+        PyErr_Format(PyExc_TypeError, "add_latencies: expected 4 arguments, got %zd", count);
+        return NULL;
+    }
+    if (PyBytes_AsStringAndSize(args[1], &bounds, &bounds_bytes) < 0 ||
+        PyBytes_AsStringAndSize(args[2], &slots, &size) < 0 || !integer(args[3], &now_ns) ||
+        PyObject_GetBuffer(args[0], &buckets, PyBUF_WRITABLE) < 0)
+        return NULL;
+    Py_ssize_t bucket = bounds_bytes / (Py_ssize_t)sizeof bound_ns, slot_count = size / (Py_ssize_t)sizeof(Slot);
+    int is_usual = slot_count <= SLOTS_MOST && is_time(now_ns);
+    if (buckets.len < bounds_bytes + (Py_ssize_t)sizeof(int64_t)) {
+        PyErr_SetString(PyExc_ValueError, "add_latencies: expected a bucket more than bounds");
+        is_usual = 0;
+    }
+    for (Py_ssize_t i = 0; is_usual && i < slot_count; i++) {
+        memcpy(&t_ns, slots + i * (Py_ssize_t)sizeof(Slot) + offsetof(Slot, t_ns), sizeof t_ns);
+        is_usual = is_time(t_ns) && llabs(now_ns - t_ns) <= LATENCY_MOST_NS;
+    }
+    for (Py_ssize_t i = 0; is_usual && i < slot_count; i++, slots += sizeof(Slot)) {
+        memcpy(&t_ns, slots + offsetof(Slot, t_ns), sizeof t_ns);
+        memcpy(&status, slots + offsetof(Slot, status), sizeof status);
+        bits |= status;
+        sum_ns += latency_ns = now_ns - t_ns;
+        /* the time stamps rise, so that the latencies fall */
+        for (; bucket > 0; bucket--) {
+            memcpy(&bound_ns, bounds + (bucket - 1) * (Py_ssize_t)sizeof bound_ns, sizeof bound_ns);
+            if (bound_ns < latency_ns)
+                break;
+        }
+        ((int64_t *)buckets.buf)[bucket]++;
+    }
+    PyBuffer_Release(&buckets);
+    if (PyErr_Occurred())
+        return NULL;
+    if (!is_usual)
+        Py_RETURN_NONE;
+    return Py_BuildValue("kL", (unsigned long)bits, (long long)sum_ns);
+}
+
 #define FRAME_HEADER_BYTES 4 /* size of the message, little-endian (`FRAME_HEADER` of imud/formats/jsonrpc.py) */
 
 /* frame_slots(slots) -> the slots as messages of the socket, back to back */
@@ -1064,11 +1121,6 @@ static PyObject *receive(PyObject *self, PyObject *args)
     return PyErr_Occurred() ? NULL : PyLong_FromLong(count);
 }
 
-static int is_time(int64_t ns)
-{
-    return -TIME_MOST_NS <= ns && ns <= TIME_MOST_NS;
-}
-
 /* Return the frame of a row as the class `frame_type`; NULL without an exception if Python must decode the row. */
 static PyObject *can_frame(newfunc make, PyTypeObject *frame_type, const uint8_t *raw, const uint8_t *control,
                            uint32_t drops, int64_t offset_ns, int64_t stepped_ns, int64_t now_ns, int64_t *newest_ns)
@@ -1143,6 +1195,8 @@ static PyObject *can_frames(PyObject *self, PyObject *args)
 static PyMethodDef methods[] = {
     {"receive", receive, METH_VARARGS, "Receive CAN frames by recvmmsg."},
     {"can_frames", can_frames, METH_VARARGS, "Return CAN frames of the buffers of recvmmsg; or None."},
+    {"add_latencies", (PyCFunction)(void (*)(void))add_latencies, METH_FASTCALL,
+     "Add the latencies of slots to the buckets of a meter; return their status bits and the sum, or None."},
     {"add_slots", add_slots, METH_VARARGS, "Add slots to the minimum and maximum of a second."},
     {"frame_slots", frame_slots, METH_O, "Return slots as messages of the socket, back to back."},
     {"is_at", is_at, METH_VARARGS, "Return whether a path is a file."},

@@ -58,6 +58,7 @@ class StreamHold:
         self._host = host
         self._alarm = Alarm(self)
         self._paused_ns = 0  # CLOCK_MONOTONIC of the start of the hold
+        self._least_ns = 0  # minimum hold, ns, from the newest frame that was read on arrival
         self._watch_ns = 0  # CLOCK_MONOTONIC of the next frame that is read on arrival
         # maximum hold in which the bytes fit into the kernel buffer, from the number of bytes of the last hold, ns
         self._most_ns = FIRST_NS
@@ -65,6 +66,7 @@ class StreamHold:
     def on_data(self, data: bytes, t_rx_ns: int) -> None:
         """Process bytes that the link read on arrival."""
         path = self._path
+        self._least_ns = PERIODS_LEAST * path.period_ns
         self.hold_ns = hold_ns = self._allowed_ns()
         if not hold_ns:
             path.on_data(data, t_rx_ns)
@@ -86,10 +88,10 @@ class StreamHold:
             self.on_alarm()
 
     def _allowed_ns(self) -> int:
-        latency_ns, path = min(self.latency_ns, self._most_ns), self._path
-        if latency_ns < PERIODS_LEAST * path.period_ns or path.clock.utc_reference is not None or self._port.busy:
+        hold_ns = self.latency_ns if self.latency_ns < self._most_ns else self._most_ns
+        if hold_ns < self._least_ns or self._path.clock.utc_reference is not None or self._port.busy:
             return 0
-        return latency_ns
+        return hold_ns
 
     def _begin_hold(self, now_ns: int, hold_ns: int) -> None:
         self._paused_ns = now_ns

@@ -109,7 +109,6 @@ _CRC = struct.Struct("<I")
 _SLOT = struct.Struct(f"{SLOT_BYTES}s")
 _SEQ = struct.Struct("<Q")
 _T_NS = struct.Struct("<8xq240x")
-slot_time_and_status: Final = struct.Struct("<8xq40xI196x").unpack  # returns the fields `t_ns` and `status` of one slot
 _STATUS = struct.Struct("<56xI196x")
 _QUALITY = struct.Struct("<48xI10xB193x")
 _SYNC_OFFSET: Final = next(field.offset for field in SLOT_FIELDS if field.name == "sync")
@@ -215,10 +214,11 @@ class EqualPieces(Sequence[bytes]):
 
     def __init__(self, whole: bytes, size: int) -> None:
         self.whole = whole
+        self.number = len(whole) // size  # of pieces
         self._size = size
 
     def __len__(self) -> int:
-        return len(self.whole) // self._size
+        return self.number
 
     def __getitem__(self, index: Any) -> Any:
         """Return one piece, or a list of pieces for a slice."""

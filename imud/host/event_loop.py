@@ -64,12 +64,12 @@ class AlarmOwner(Protocol):
 class Alarm:
     """A timer that one owner sets again and again. Synchronization: the thread of the event loop."""
 
-    __slots__ = ("_alarms", "_handle", "_loop", "_owner", "due_s")
+    __slots__ = ("_alarms", "_handle", "_loop", "due_s", "on_alarm")
 
     def __init__(self, owner: AlarmOwner) -> None:
         """Call `owner.on_alarm` in the running loop each time that the alarm is due. The alarm is not set."""
         self.due_s: float | None = None  # time of the loop's clock; None if the alarm is not set
-        self._owner = owner
+        self.on_alarm = owner.on_alarm
         self._loop = loop = asyncio.get_running_loop()
         self._alarms = loop.alarms if isinstance(loop, SampleLoop) else None
         self._handle: asyncio.TimerHandle | None = None  # timer of a loop that has no alarms
@@ -83,7 +83,7 @@ class Alarm:
         if self._handle is not None:
             self._handle.cancel()
         self.due_s = due_s = self._loop.time() + delay_s
-        self._handle = self._loop.call_at(due_s, self.ring)
+        self._handle = self._loop.call_at(due_s, self._ring)
 
     def cancel(self) -> None:
         """Do not call the owner. Do nothing if the alarm is not set."""
@@ -91,10 +91,10 @@ class Alarm:
         if self._handle is not None:
             self._handle.cancel()
 
-    def ring(self) -> None:
-        """Call the owner. Only the event loop calls this method."""
+    def _ring(self) -> None:
+        """Call the owner: the timer of a loop without alarms is due."""
         self.due_s = None
-        self._owner.on_alarm()
+        self.on_alarm()
 
 
 class ReaderSelector(selectors.EpollSelector):
@@ -177,10 +177,11 @@ class ReaderSelector(selectors.EpollSelector):
             due.append(heappop(alarms))
         for due_s, _, alarm in due:
             if due_s == alarm.due_s:
+                alarm.due_s = None
                 try:
-                    alarm.ring()
+                    alarm.on_alarm()
                 except Exception as error:  # noqa: BLE001 - as for a reader
-                    self._failed(alarm.ring, error)
+                    self._failed(alarm.on_alarm, error)
 
     def _failed(self, callback: Callable[[], object], error: Exception) -> None:
         self.on_error({"message": f"Exception in reader {callback!r}", "exception": error})

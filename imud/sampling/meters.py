@@ -1,20 +1,27 @@
 """Counters of a sample path: latency, and the causes of lost samples."""
 
+from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
+from typing import Final
 
 from imud.contracts.status import LATENCY_BOUNDS_NS
+from imud.formats import kernel
+from imud.formats.slot import slot_status_bits, slot_times_ns
 from imud.model.ledger import Ledger
+
+_BOUNDS: Final = array("q", LATENCY_BOUNDS_NS).tobytes()
 
 
 class LatencyMeter:
     """Histogram of the time from a measurement to its publication."""
 
-    __slots__ = ("buckets", "sum_ns")
+    __slots__ = ("_add_latencies", "buckets", "sum_ns")
 
     def __init__(self) -> None:
-        self.buckets = [0] * (len(LATENCY_BOUNDS_NS) + 1)
+        self.buckets = array("q", bytes(len(_BOUNDS) + 8))
         self.sum_ns = 0
+        self._add_latencies = getattr(kernel.present.module, "add_latencies", None)
 
     def add_one(self, latency_ns: int) -> None:
         """Count a sample."""
@@ -34,6 +41,17 @@ class LatencyMeter:
                 return
             begin = end
         buckets[-1] += len(latencies) - begin
+
+    def add_slots(self, now_ns: int, packed: bytes) -> int:
+        """Count the samples of slots, as `add`. Return their status bits."""
+        counted = self._add_latencies(self.buckets, _BOUNDS, packed, now_ns) if self._add_latencies else None
+        if counted is None:
+            self.add(now_ns, slot_times_ns(packed))
+            return slot_status_bits(packed)
+        bits: int
+        bits, sum_ns = counted
+        self.sum_ns += sum_ns
+        return bits
 
 
 class LossMeter:

@@ -36,9 +36,6 @@ from imud.formats.slot import (
     SLOT_BYTES,
     decode_slots,
     slot_quality,
-    slot_status_bits,
-    slot_time_and_status,
-    slot_times_ns,
 )
 from imud.host.clock import UNSTEERED, HostClock, SteadyTime
 from imud.model.errors import Trouble
@@ -265,19 +262,13 @@ class SamplePath(ABC):
         if self._rotation is not None:
             self._finish(decode_slots(packed, self._device), t_rx_ns)
             return
-        count = len(packed) // SLOT_BYTES
-        self._ledger.samples += count
+        self._ledger.samples += len(packed) // SLOT_BYTES
         self._newest = packed
         self.last_sample_ns = t_rx_ns
         publish, now_ns = self._publish, self._now_ns  # a call of a function in an attribute of `self` is slower
         publish(SlotBatch(self._device, self._device_id, packed, self.frame))
-        if count == 1:  # the usual case
-            t_ns, status = slot_time_and_status(packed)
-            self.latency.add_one(now_ns() - t_ns)
-        else:
-            status = slot_status_bits(packed)
-            self.latency.add(now_ns(), slot_times_ns(packed))
-        self._status_seen |= status & self._status_mask
+        if status := self.latency.add_slots(now_ns(), packed):
+            self._status_seen |= status & self._status_mask
 
 
 class SampleListener(Protocol):
@@ -344,12 +335,14 @@ class StreamPath(SamplePath):
         """Process bytes, and hold their samples until `publish_gathered`. Return whether the bytes contained samples.
         `waited_ns` is the maximum time of the bytes in the kernel's buffer; 0 if imud read them on arrival."""
         self.last_data_ns = t_rx_ns
+        held, samples, clock = self.gathered, list[Sample](), self.clock
         try:
-            self.clock.waited_ns = waited_ns
-            samples: list[Sample] = []
-            packed, _ = self._stamp(data, t_rx_ns, samples, not self.gathered or isinstance(self.gathered[-1], bytes))
-            self.gathered += [packed, *samples] if packed else samples
-            self.clock.waited_ns = 0
+            clock.waited_ns = waited_ns
+            packed, _ = self._stamp(data, t_rx_ns, samples, not held or type(held[-1]) is bytes)
+            if packed:
+                held.append(packed)
+            held += samples
+            clock.waited_ns = 0
             return bool(packed or samples)
         finally:
             if self.observer is not None:
@@ -360,6 +353,9 @@ class StreamPath(SamplePath):
         held, self.gathered = self.gathered, []
         if self.observer is not None:
             self.observer.call("path", "publish_gathered")
+        if len(held) == 1 and type(held[0]) is bytes:  # the usual case
+            self._finish_slots(held[0], self.clock.t_rx_ns)
+            return
         packed = b"".join([one for one in held if isinstance(one, bytes)])
         samples = [one for one in held if not isinstance(one, bytes)]
         if packed and not samples:
@@ -370,8 +366,10 @@ class StreamPath(SamplePath):
     @property
     def held_by_fit(self) -> bool:
         """Whether the fit has time-stamped the newest held sample."""
-        newest = self.gathered[-1] if self.gathered else None
-        return isinstance(newest, bytes) or (newest is not None and newest.sync is Sync.REGRESSION)
+        if not self.gathered:
+            return False
+        newest = self.gathered[-1]
+        return isinstance(newest, bytes) or newest.sync is Sync.REGRESSION
 
     def _stamp(
         self, data: bytes, t_rx_ns: int, samples: list[Sample], use_kernel: bool

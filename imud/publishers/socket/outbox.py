@@ -370,13 +370,11 @@ class Outbox(ABC):
     ) -> None:  # fmt: skip
         """Send samples of one device to several clients: the same bytes, one `send` each."""
         # one loop here: a method call per client would cost as much as all other code around `send`
-        samples = len(messages)
-        if samples == 1:
-            whole = messages[0]
-        elif type(messages) is EqualPieces:
-            whole = messages.whole
+        if type(messages) is EqualPieces:
+            whole, samples = messages.whole, messages.number
         else:
-            whole = b"".join(messages)
+            samples = len(messages)
+            whole = messages[0] if samples == 1 else b"".join(messages)
         size = len(whole)
         delivery: Delivery | None = None
         for outbox in outboxes:
