@@ -67,7 +67,10 @@ class StreamHold:
         """Process bytes that the link read on arrival."""
         path = self._path
         self._least_ns = PERIODS_LEAST * path.period_ns
-        self.hold_ns = hold_ns = self._allowed_ns()
+        hold_ns = min(self.latency_ns, self._most_ns)
+        if hold_ns < self._least_ns or path.clock.utc_reference is not None or self._port.busy:
+            hold_ns = 0
+        self.hold_ns = hold_ns
         if not hold_ns:
             path.on_data(data, t_rx_ns)
         elif not path.gather(data, t_rx_ns):
@@ -87,12 +90,6 @@ class StreamHold:
             self._alarm.cancel()
             self.on_alarm()
 
-    def _allowed_ns(self) -> int:
-        hold_ns = self.latency_ns if self.latency_ns < self._most_ns else self._most_ns
-        if hold_ns < self._least_ns or self._path.clock.utc_reference is not None or self._port.busy:
-            return 0
-        return hold_ns
-
     def _begin_hold(self, now_ns: int, hold_ns: int) -> None:
         self._paused_ns = now_ns
         wait_ns = hold_ns - (now_ns + hold_ns) % GRID_NS
@@ -107,12 +104,13 @@ class StreamHold:
         most_ns = 2 * self._most_ns
         if data:
             path.gather(data, now_ns, waited_ns)
-            most_ns = min(most_ns, link.waiting_bytes * waited_ns // len(data))
-        self._most_ns = min(max(most_ns, 1), MOST_NS)
-        by_fit = path.held_by_fit
-        path.publish_gathered()
-        hold_ns = self._allowed_ns()
-        if data and by_fit and hold_ns and now_ns + hold_ns <= self._watch_ns:
+            full_ns = link.waiting_bytes * waited_ns // len(data)
+            if full_ns < most_ns:  # noqa: PLR1730 - a call of min() costs 700 instructions
+                most_ns = full_ns
+        self._most_ns = 1 if most_ns < 1 else MOST_NS if most_ns > MOST_NS else most_ns
+        by_fit = path.publish_gathered()
+        hold_ns = self.latency_ns if self.latency_ns < self._most_ns else self._most_ns
+        if data and by_fit and hold_ns >= self._least_ns and now_ns + hold_ns <= self._watch_ns:
             self.hold_ns = hold_ns
             self._begin_hold(now_ns, hold_ns)
         else:

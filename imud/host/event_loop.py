@@ -172,10 +172,9 @@ class ReaderSelector(selectors.EpollSelector):
 
     def _ring(self, now_s: float) -> None:
         """Ring the due alarms. An alarm that is set again rings in a later turn, so that readers are called between."""
-        alarms, due = self.alarms, list[tuple[float, int, Alarm]]()
-        while alarms and alarms[0][0] <= now_s:
-            due.append(heappop(alarms))
-        for due_s, _, alarm in due:
+        alarms, newest = self.alarms, next(_NUMBERS)
+        while alarms and alarms[0][0] <= now_s and alarms[0][1] < newest:
+            due_s, _, alarm = heappop(alarms)
             if due_s == alarm.due_s:
                 alarm.due_s = None
                 try:

@@ -279,10 +279,11 @@ class SampleClock:
         """Time stamp of the newest sample."""
         return self._t_ns if self._run is None else int(self._run.t_ns)
 
-    @property
-    def t_rx_ns(self) -> int:
-        """CLOCK_MONOTONIC at the read of the newest sample."""
-        return self._t_rx_ns if self._run is None else int(self._run.t_rx_ns)
+    def t_rx_ns(self) -> int:  # a property would cost 500 instructions
+        """Return CLOCK_MONOTONIC at the read of the newest sample."""
+        run = self._run
+        t_rx_ns: int = self._t_rx_ns if run is None else run.t_rx_ns
+        return t_rx_ns
 
     def stamp_frames(
         self, start: StartRun, kind: KernelFormat, frames: bytes, word_is_status: bool, t_rx_ns: int, utc_offset_ns: int

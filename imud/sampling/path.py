@@ -335,7 +335,8 @@ class StreamPath(SamplePath):
         """Process bytes, and hold their samples until `publish_gathered`. Return whether the bytes contained samples.
         `waited_ns` is the maximum time of the bytes in the kernel's buffer; 0 if imud read them on arrival."""
         self.last_data_ns = t_rx_ns
-        held, samples, clock = self.gathered, list[Sample](), self.clock
+        samples: list[Sample] = []
+        held, clock = self.gathered, self.clock
         try:
             clock.waited_ns = waited_ns
             packed, _ = self._stamp(data, t_rx_ns, samples, not held or type(held[-1]) is bytes)
@@ -348,20 +349,22 @@ class StreamPath(SamplePath):
             if self.observer is not None:
                 self.observer.data(data, t_rx_ns, waited_ns)
 
-    def publish_gathered(self) -> None:
-        """Publish the held samples as one batch."""
+    def publish_gathered(self) -> bool:
+        """Publish the held samples as one batch. Return `held_by_fit` of them."""
         held, self.gathered = self.gathered, []
         if self.observer is not None:
             self.observer.call("path", "publish_gathered")
         if len(held) == 1 and type(held[0]) is bytes:  # the usual case
-            self._finish_slots(held[0], self.clock.t_rx_ns)
-            return
+            self._finish_slots(held[0], self.clock.t_rx_ns())
+            return True
         packed = b"".join([one for one in held if isinstance(one, bytes)])
         samples = [one for one in held if not isinstance(one, bytes)]
-        if packed and not samples:
-            self._finish_slots(packed, self.clock.t_rx_ns)
-        elif samples:
-            self._finish([*decode_slots(packed, self._device), *samples], samples[-1].t_rx_ns)
+        if not samples:
+            if packed:
+                self._finish_slots(packed, self.clock.t_rx_ns())
+            return bool(packed)
+        self._finish([*decode_slots(packed, self._device), *samples], samples[-1].t_rx_ns)
+        return samples[-1].sync is Sync.REGRESSION
 
     @property
     def held_by_fit(self) -> bool:
