@@ -5,6 +5,7 @@
  * The names are the names of the Python code:
  *
  *   is_usual_…, decode_… ─▶ HipnucCodec, Imu61xCodec (imud/drivers/hipnuc/uart/codec.py, …/imu61x/uart/codec.py)
+ *   slewed ─▶ Slew.advance (imud/sampling/steering.py)
  *   add_stamp ─▶ StampTime (imud/sampling/stamp_time.py)
  *   stamp ─▶ add_even_run (imud/sampling/clock.py), ArrivalFit.add_arrival (imud/sampling/arrival_fit.py),
  *                 encode_slots (imud/formats/slot.py)
@@ -90,6 +91,9 @@
 #define NS_PER_MS 1000000
 #define EARLY_NS (-5e6)          /* an earlier frame can be a jump of the device counter */
 #define JUMP_LATE_NS 5e8         /* a later frame can be a jump of the device counter */
+#define SLEW 500e-6              /* limits of `Slew`, imud/sampling/steering.py */
+#define SLEW_SETTLING 0.2
+#define SETTLED_AFTER_NS INT64_C(10000000000)
 #define T_ERR_MOST 4294967295.0
 /* Maximum magnitude of times, ns: 36 years of CLOCK_MONOTONIC. Sums of some of them thus fit into 64 bits. Python has
  * no limit. The offset of UTC may be four times as large. */
@@ -140,6 +144,8 @@ typedef struct {
     double period_ticks, doubt_ns;
     int64_t ref_arrival_ns, ref_device_ns, fitted_ns, until_ns;
     double slope, slope_error, wait_most;
+    int64_t fit_begin_ns;
+    double left_ns; /* of `Slew` */
     Bin bin;
     Stamps stamps;
 } Run;
@@ -460,6 +466,13 @@ static void add_arrival(Bin *bin, int64_t device_ns, int64_t arrival_ns, int64_t
     }
 }
 
+/* Return the difference `left_ns` between published and estimated time after `elapsed_ns`. */
+static double slewed(double left_ns, int64_t elapsed_ns, int64_t age_ns)
+{
+    double most = elapsed_ns * (age_ns > SETTLED_AFTER_NS ? SLEW : SLEW_SETTLING);
+    return left_ns > most ? left_ns - most : left_ns < -most ? left_ns + most : 0.0;
+}
+
 /* Time-stamp and decode one frame. `trailing_bytes` follow it. Return 0 without a change if the frame is not usual. */
 static int stamp(Run *run, double *error_ns, Slot *slot, const uint8_t *frame, int64_t trailing_bytes)
 {
@@ -481,14 +494,16 @@ static int stamp(Run *run, double *error_ns, Slot *slot, const uint8_t *frame, i
         return 0;
     int64_t step_ns = step * run->tick_ns, next_ns = run->device_ns + step_ns;
     double fit_ns = run->ref_arrival_ns + run->slope * (double)(next_ns - run->ref_device_ns);
-    double above_ns = arrival_ns - fit_ns, wanted_ns = fit_ns - run->bias_ns;
+    double left_ns = slewed(run->left_ns, step_ns, next_ns - run->fit_begin_ns);
+    double above_ns = arrival_ns - fit_ns, wanted_ns = fit_ns - run->bias_ns + left_ns;
     int is_new = !run->waited_ns || above_ns <= 0.0; /* a held frame above the fit contains no new information */
     if (!is_new)
         above_ns = fmax(above_ns - run->waited_ns, 0.0);
     if (!(fabs(wanted_ns) < TIME_MOST_NS) || next_ns > TIME_MOST_NS || run->raw_ns > TIME_MOST_NS)
         return 0;
     int64_t steady_ns = (int64_t)wanted_ns, t_ns = steady_ns + run->offset_ns;
-    *error_ns = run->fit_error_ns + run->slope_error * (double)(next_ns - run->fitted_ns) + run->doubt_ns;
+    *error_ns = run->fit_error_ns + run->slope_error * (double)(next_ns - run->fitted_ns) + run->doubt_ns +
+                fabs(left_ns);
     /* an early or late frame, a fit that is due, or a time stamp that needs a correction */
     if (!(above_ns >= EARLY_NS && above_ns < JUMP_LATE_NS) || (is_new && next_ns >= run->until_ns) ||
         steady_ns < run->even_from_ns || steady_ns > arrival_ns || t_ns <= run->t_ns || t_ns > run->t_rx_ns ||
@@ -500,6 +515,7 @@ static int stamp(Run *run, double *error_ns, Slot *slot, const uint8_t *frame, i
     run->ticks = ticks;
     run->device_ns = next_ns;
     run->raw_ns += step_ns;
+    run->left_ns = left_ns;
     run->t_ns = t_ns;
     run->seq++;
     memset(slot, 0, sizeof *slot);
@@ -518,7 +534,7 @@ static int is_in_range(const Run *run)
 {
     const int64_t times_ns[] = {
         run->seq, run->t_ns, run->t_rx_ns, run->utc_offset_ns / 4, run->waited_ns, run->offset_ns, run->device_ns,
-        run->raw_ns, run->ref_arrival_ns, run->ref_device_ns, run->fitted_ns, run->bin.count, run->bin.late,
+        run->raw_ns, run->ref_arrival_ns, run->ref_device_ns, run->fitted_ns, run->fit_begin_ns, run->bin.count, run->bin.late,
         run->stamps.arrival_ns, run->stamps.origin_ns, run->stamps.stamp, run->stamps.live_ticks,
     };
     for (size_t i = 0; i < sizeof times_ns / sizeof *times_ns; i++)
@@ -552,12 +568,12 @@ static PyObject *start(PyObject *self, PyObject *args)
     const char *name;
     memset(&run, 0, sizeof run);
     if (!PyArg_ParseTuple(
-            args, "is(iLLLLLdd)(LLLLddLLLLddd)(LLddddLLd)(pLLLLLLLd):start", &run.device_id, &name, &run.sync,
+            args, "is(iLLLLLdd)(LLLLddLLLLdddLd)(LLddddLLd)(pLLLLLLLd):start", &run.device_id, &name, &run.sync,
             &run.own_status,
             &run.seq, &run.t_ns, &run.t_rx_ns, &run.byte_ns, &run.bias_ns, &run.fit_error_ns, &run.ticks,
             &run.device_ns, &run.raw_ns, &run.tick_ns, &run.period_ticks, &run.doubt_ns, &run.ref_arrival_ns,
             &run.ref_device_ns, &run.fitted_ns, &run.until_ns, &run.slope, &run.slope_error, &run.wait_most,
-            &bin->device_ns, &bin->arrival_ns, &bin->lowest, &bin->wait, &bin->wait_least, &bin->wait_most,
+            &run.fit_begin_ns, &run.left_ns, &bin->device_ns, &bin->arrival_ns, &bin->lowest, &bin->wait, &bin->wait_least, &bin->wait_most,
             &bin->count, &bin->late, &bin->late_ns, &stamps->in_use, &stamps->stamp, &stamps->before, &stamps->ticks,
             &stamps->arrival_ns, &stamps->origin_ns, &stamps->live_ticks, &stamps->live_arrival_ns, &stamps->lowest_ns))
         return NULL;
@@ -670,8 +686,8 @@ static PyObject *stamp_frames(RunObject *self, PyObject *const *args, Py_ssize_t
     return slots;
 }
 
-/* Run.state() -> frames, ticks, seq, t_ns, t_rx_ns, error_ns, bin, number of arrivals that were added to the bin, and
- * the state of `StampTime`, None if the format does not use it */
+/* Run.state() -> frames, ticks, seq, t_ns, t_rx_ns, error_ns, left_ns, bin, number of arrivals that were added to the
+ * bin, and the state of `StampTime`, None if the format does not use it */
 static PyObject *state_of(RunObject *self, PyObject *unused)
 {
     const Run *run = &self->run;
@@ -682,8 +698,8 @@ static PyObject *state_of(RunObject *self, PyObject *unused)
                                          stamps->arrival_ns, stamps->origin_ns, stamps->live_ticks,
                                          stamps->live_arrival_ns, stamps->lowest_ns)
                          : Py_NewRef(Py_None);
-    return Py_BuildValue("LLLLLd(LLddddLLd)LN", self->frames, run->ticks, run->seq, run->t_ns, run->t_rx_ns,
-                         self->error_ns, bin->device_ns, bin->arrival_ns, bin->lowest, bin->wait, bin->wait_least,
+    return Py_BuildValue("LLLLLdd(LLddddLLd)LN", self->frames, run->ticks, run->seq, run->t_ns, run->t_rx_ns,
+                         self->error_ns, run->left_ns, bin->device_ns, bin->arrival_ns, bin->lowest, bin->wait, bin->wait_least,
                          bin->wait_most, bin->count, bin->late, bin->late_ns, bin->added, kept);
 }
 

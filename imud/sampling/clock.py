@@ -281,9 +281,7 @@ class SampleClock:
 
     def t_rx_ns(self) -> int:  # a property would cost 500 instructions
         """Return CLOCK_MONOTONIC at the read of the newest sample."""
-        run = self._run
-        t_rx_ns: int = self._t_rx_ns if run is None else run.t_rx_ns
-        return t_rx_ns
+        return self._t_rx_ns if self._run is None else self._run.t_rx_ns  # type: ignore[no-any-return]
 
     def stamp_frames(
         self, start: StartRun, kind: KernelFormat, frames: bytes, word_is_status: bool, t_rx_ns: int, utc_offset_ns: int
@@ -308,7 +306,7 @@ class SampleClock:
         time, fit = self._time, self._fit
         if (
             self._fit_sync is _ARRIVAL or fit is None or self._aiding is not None or time.watched or time.rephased
-            or self._jump.late_reads or self._slew.left_ns or time.modulus != _KERNEL_MODULUS
+            or self._jump.late_reads or time.modulus != _KERNEL_MODULUS
         ):  # fmt: skip
             return None
         try:
@@ -320,7 +318,7 @@ class SampleClock:
                 (
                     time.ticks, time.even_ns, time.raw_ns, time.tick_ns, time.period.period_ticks, time.doubt_ns,
                     fit.ref_arrival_ns, fit.ref_device_ns, fit.fitted_ns, fit.until_ns, fit.slope, fit.slope_error,
-                    fit.wait_most,
+                    fit.wait_most, self._fit_begin_ns, self._slew.left_ns,
                 ),
                 fit.open_bin(), StampTime.NO_STATE if self._stamps is None else self._stamps.state(),
             )  # fmt: skip
@@ -334,7 +332,8 @@ class SampleClock:
             return
         fit = self._fit
         assert fit is not None
-        frames, ticks, self._seq, self._t_ns, self._t_rx_ns, error_ns, open_bin, added, stamps = run.state()
+        frames, ticks, self._seq, self._t_ns, self._t_rx_ns, error_ns, left_ns, open_bin, added, stamps = run.state()
+        self._slew.set(left_ns)
         if self._stamps is not None and stamps is not None:
             self._stamps.set_state(stamps)
         self._time.advance_evenly(ticks, frames)

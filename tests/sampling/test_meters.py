@@ -1,10 +1,12 @@
 """Latency, and causes of loss, computed by hand."""
 
+import struct
+
 from imud.contracts.status import LATENCY_BOUNDS_NS
 from imud.model.ledger import Ledger
 from imud.sampling.meters import LatencyMeter, LossMeter
 
-S = 1_000_000_000
+SLOT = struct.Struct("<8xq40xI196x")  # the fields `t_ns` and `status` of a slot
 
 
 def test_latencies_go_into_the_buckets_whose_bounds_they_do_not_exceed() -> None:
@@ -14,13 +16,20 @@ def test_latencies_go_into_the_buckets_whose_bounds_they_do_not_exceed() -> None
     assert (meter.buckets[0], meter.buckets[1]) == (1, 1)
     assert meter.buckets[len(LATENCY_BOUNDS_NS)] == 1
     assert meter.sum_ns == 100_001 + 10**12
-    latencies = [10**12, 50_000_001, 50_000_000, 20_000_000, 20_000_000, 5_000_001, 49_999, 7]
-    together, alone = LatencyMeter(), LatencyMeter()
-    together.add(2 * 10**12, published_after(*latencies))
-    for latency_ns in latencies:
-        alone.add(2 * 10**12, published_after(latency_ns))
-    assert (together.buckets, together.buckets[-1], together.buckets[0]) == (alone.buckets, 2, 2)
-    assert together.sum_ns == alone.sum_ns == sum(latencies)
+    usual, alone = [10**12, 50_000_001, 50_000_000, 20_000_000, 20_000_000, 5_000_001, 49_999, 7], LatencyMeter()
+    for latencies in (usual, [2**50 + 1, *usual], [2**62, *usual], [0, -5]):  # the kernel counts no longer latencies
+        together, packed = LatencyMeter(), LatencyMeter()
+        times_ns = published_after(*latencies)
+        together.add(2 * 10**12, times_ns)
+        slots = b"".join(SLOT.pack(t_ns, 1 << number) for number, t_ns in enumerate(times_ns))
+        assert packed.add_slots(2 * 10**12, slots) == 2 ** len(latencies) - 1
+        assert (packed.buckets, packed.sum_ns) == (together.buckets, together.sum_ns)
+        assert together.sum_ns == sum(latencies)
+        if latencies is usual:
+            for latency_ns in latencies:
+                alone.add(2 * 10**12, published_after(latency_ns))
+            assert (together.buckets, together.buckets[-1], together.buckets[0]) == (alone.buckets, 2, 2)
+            assert together.sum_ns == alone.sum_ns
 
 
 def published_after(*latencies_ns: int) -> list[int]:

@@ -144,7 +144,7 @@ def test_bytes_are_published_on_arrival_or_together() -> None:
     assert (rig.sizes, rig.ledger.samples) == ([1, 2], 3)
     newest = rig.batches[-1][-1]
     assert (path.newest, path.last_sample_ns, path.quality) == (newest, now + 22 * MS, (newest.sync, newest.t_err_ns))
-    assert (path.clock.t_ns, path.clock.t_rx_ns) == (newest.t_ns, now + 22 * MS)
+    assert (path.clock.t_ns, path.clock.t_rx_ns()) == (newest.t_ns, now + 22 * MS)
     assert make_clock("bow", None, DRIVERS["hipnuc-uart"], path.clock).t_ns == newest.t_ns
     assert sum(path.latency.buckets) == 3
     head = hi91(1030)[:3]

@@ -57,6 +57,7 @@ class Step(NamedTuple):
     own_status: int | None = None
     step_ms: int = 1
     expect: bool = False  # whether imud expects another rate
+    left_us: int = 0  # correction of the time stamps; an odd value also makes the fit 10 s older
 
 
 STEPS = st.builds(
@@ -67,6 +68,7 @@ STEPS = st.builds(
     st.sampled_from([0, 0, 0, 1, 7, -3, 10**6, 2**31]), st.sampled_from([0, 0, 30, 900, 20_000, 700_000]),
     st.sampled_from([-1, -1, 0, 5, 30]), st.booleans(), st.sampled_from([0, 0, 0, 400, 20_000, -90_000]),
     st.sampled_from([None, None, 0, 1 << 31]), st.sampled_from([1, 1, 1, 3]), st.booleans(),
+    st.sampled_from([0, 0, 0, 300, -900, 3, -5]),
 )  # fmt: skip
 EXTREME = [math.nan, math.inf, 3e38, 1e-45, 40, 31.9, -2047, 360, 360.0005, 361, -128, 150, 151, 0.98, 0, -0.0]
 COUNTS = ((0x7FFF, 0x7FFF), (-0x8000, -0x8000), (-1, -1), (0x7F7F, 0x7F7F), (9800, 1))
@@ -176,6 +178,8 @@ class Run:
         if step.expect:
             path.clock.expect_rate()
         path.clock.set_own_status(step.own_status)
+        path.clock._slew.add(step.left_us * NS_PER_US)
+        path.clock._fit_begin_ns -= step.left_us % 2 * 10**10
         self.ms += step.jump_ms
         stream = self.late_bytes
         for number in range(step.frames):
@@ -202,7 +206,7 @@ class Run:
         path = self.path
         path.publish_gathered()
         external = {"ledger": self.ledger, "steady": self.steady, "observer": self.seen.observer}
-        newest, taken = (path.quality, path.clock.t_ns, path.clock.t_rx_ns, path.newest), path.take_status()
+        newest, taken = (path.quality, path.clock.t_ns, path.clock.t_rx_ns(), path.newest), path.take_status()
         path.clock.settle()
         state = StateWriter(external, path.NOT_STATE).write({"path": path})
         return (
@@ -226,6 +230,7 @@ def play(steps: Sequence[Step], of: Format, found: kernel.Kernel, word: Word = "
 @given(steps=st.lists(STEPS, max_size=30), word=st.sampled_from(["pps", "status"]), turned=st.booleans())
 @example(steps=[Step(4, expect=True), *[Step(4, step_ms=3)] * 9, *[Step(4)] * 9], word="pps", turned=False)
 @example(steps=[Step(1), Step(2, waited_ms=0, publish=False), Step(1, waited_ms=5)], word="pps", turned=False)
+@example(steps=[Step(4, left_us=left_us) for left_us in (300, -900, 0, 3, 0, -5)], word="pps", turned=False)
 @example(steps=[Step(2, cut=5, damage=0), Step(10, slew_ns=20_000)], word="pps", turned=False)
 def test_kernel_and_python_are_equal(name: str, steps: list[Step], word: Word, turned: bool) -> None:
     results = [play(steps, FORMATS[name], one, word, turned).result() for one in (kernel.present, kernel.Kernel(None))]
@@ -243,7 +248,7 @@ def test_none_keeps_its_references() -> None:
     """Python 3.11 counts them, also if the headers of a later Python compiled the kernel."""
     module, before = kernel.present.module, sys.getrefcount(None)
     assert module is not None
-    state = (1, -1, 1, 1, 1, 1, 0, 0), (0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0), (0,) * 9, StampTime.NO_STATE
+    state = (1, -1, 1, 1, 1, 1, 0, 0), (0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0), (0,) * 9, StampTime.NO_STATE
     for _ in range(1000):
         assert module.start(-1, "HI91", *state) is None  # a device number out of range
     assert abs(sys.getrefcount(None) - before) < 100
@@ -257,7 +262,7 @@ def test_the_kernel_accepts_any_bytes_and_numbers(tmp_path: Path, name: str) -> 
     calls = Mock(wraps=module)
     of = FORMATS[name]
     run = play([Step(10)] * 10, of, kernel.Kernel(calls))
-    values, t_rx_ns = calls.start.call_args.args, run.path.clock.t_rx_ns
+    values, t_rx_ns = calls.start.call_args.args, run.path.clock.t_rx_ns()
     tick = 1 if name != "AHRS" else 1000
     data = b"".join(of.frame(values[3][0] // tick + number) for number in range(1, 11))
     random, made_slots = Random(25), 0
@@ -283,7 +288,7 @@ def test_the_kernel_accepts_any_bytes_and_numbers(tmp_path: Path, name: str) -> 
                     assert ring.write(slots)
                     assert ring.beat(t_rx_ns)
                     assert ring.show(name * 9, tuple(random.choices([0, 2**64 - 1], k=random.randrange(60))))
-                assert made is None or len(made.state()) == 9
+                assert made is None or len(made.state()) == 10
                 made_slots += bool(slots)
     os.close(file)
     assert made_slots > 300
