@@ -4,13 +4,17 @@ This is the code with the strictest limit on CPU time. For each read: one `feed`
 call of the clock and one record. Counters are plain integers. Synchronization: the event loop's thread only.
 """
 
+import struct
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from math import hypot, sqrt
 from typing import Any, ClassVar, Final, NamedTuple, Protocol
+
+from msgspec.structs import replace
 
 from imud.attitude.published import PublishedAxes
 from imud.contracts.codec import (
@@ -35,6 +39,7 @@ from imud.formats.slot import (
     DEVICE_ID_MOST,
     SLOT_BYTES,
     decode_slots,
+    encode_slot,
     slot_quality,
 )
 from imud.host.clock import UNSTEERED, HostClock, SteadyTime
@@ -377,24 +382,50 @@ class StreamPath(SamplePath):
     def _stamp(
         self, data: bytes, t_rx_ns: int, samples: list[Sample], use_kernel: bool
     ) -> tuple[bytes, Sequence[CodecEvent]]:
-        """Process usual frames at the start of `data` with the kernel, then the rest as `_sort`. Return the slots of
-        the frames and the events of the rest."""
+        """Process usual frames with the kernel, and a frame that changes the fit as `_sort`; then the rest as `_sort`.
+        Return the slots of the frames before the rest, and the events of the rest."""
         codec: Any = self.codec  # a KernelCodec if `_start_run` is not None
         packed, start, utc_offset = b"", self._start_run, self._utc_offset_ns
         utc_offset_ns = utc_offset()  # in all cases: the result must not depend on the use of the kernel
-        if start is not None and use_kernel and (frames := codec.usual_frames(data)):
-            packed = self.clock.stamp_frames(
+        while start is not None and use_kernel and (frames := codec.usual_frames(data)):
+            slots = self.clock.stamp_frames(
                 start, codec.kernel_format, frames, codec.word_is_status, t_rx_ns, utc_offset_ns
             )
-            if packed:
+            if slots:
                 self.loss.bad_frames = 0
-                data = codec.take(frames, len(packed) // SLOT_BYTES, data)
+                data, frames = codec.take(frames, len(slots) // SLOT_BYTES, data), b""
+                packed = packed + slots if packed else slots
                 if not data:
                     return packed, ()
+            end = codec.kernel_format.size_bytes - max(len(frames) - len(data), 0)  # of the first frame
+            if (packed and not slots) or not 0 < end <= len(data) or self.quality[0] is not Sync.REGRESSION:
+                break
+            slot = self._stamp_one(data[:end], len(data) - end, t_rx_ns, utc_offset_ns, samples)
+            packed, data = packed + slot, data[end:]
+            if not data:
+                return packed, ()
+            if not slot:
+                break
         events = codec.feed(data)
         if events:
             self._sort(events, t_rx_ns, utc_offset_ns, samples)
         return packed, events
+
+    def _stamp_one(
+        self, data: bytes, trailing_bytes: int, t_rx_ns: int, utc_offset_ns: int, samples: list[Sample]
+    ) -> bytes:
+        """Process a frame as `_sort`. Return its slot; if that is impossible, append its samples to `samples`."""
+        events = [
+            replace(event, trailing_bytes=event.trailing_bytes + trailing_bytes)
+            if type(event) is Measurement else event for event in self.codec.feed(data)
+        ]  # fmt: skip
+        self._sort(events, t_rx_ns, utc_offset_ns, samples)
+        if len(samples) == 1 and samples[0].sync is Sync.REGRESSION:
+            with suppress(struct.error):  # a value that does not fit into a slot
+                slot = encode_slot(samples[0], self._device_id)
+                samples.clear()
+                return slot
+        return b""
 
     def _flush(self, now_ns: int, samples: list[Sample]) -> None:
         """Process complete frames inside an incomplete longer frame."""
