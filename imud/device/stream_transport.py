@@ -55,7 +55,7 @@ class StreamHold:
         self._link = link
         self._path = path
         self._port = port
-        self._host = host
+        self._now_ns = host.now_ns
         self._alarm = Alarm(self)
         self._paused_ns = 0  # CLOCK_MONOTONIC of the start of the hold
         self._least_ns = 0  # minimum hold, ns, from the newest frame that was read on arrival
@@ -97,9 +97,9 @@ class StreamHold:
 
     def on_alarm(self) -> None:
         """End the hold: read and publish the held bytes. Start the next hold, or read on arrival."""
-        link, path = self._link, self._path
+        link, path, now = self._link, self._path, self._now_ns
         data = link.take()
-        now_ns = self._host.now_ns()
+        now_ns = now()
         waited_ns = now_ns - self._paused_ns
         most_ns = 2 * self._most_ns
         if data:

@@ -38,7 +38,8 @@ from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_S
 from imud.recording.observer import PathObserver
 from imud.sampling.clock import SampleClock
-from imud.sampling.path import PathContext, SamplePath, make_clock
+from imud.sampling.driver_clock import make_clock
+from imud.sampling.path import PathContext, SamplePath
 
 log = logging.getLogger(__name__)
 

@@ -22,7 +22,8 @@ from imud.model.sample import T_ERR_MOST, Sample, Sync
 from imud.model.units import uart_byte_ns
 from imud.recording.player import PlayedClock, PlayedDevice, ignore_message
 from imud.sampling.clock import SampleClock
-from imud.sampling.path import CanPath, PathContext, SamplePath, StreamPath, make_clock
+from imud.sampling.driver_clock import make_clock
+from imud.sampling.path import CanPath, PathContext, SamplePath, StreamPath
 
 NAME: Final = "replay"  # name of the device, as in `imud replay`
 DEVICE_ID: Final = 0

@@ -34,6 +34,7 @@ from imud.model.options import NoOptions
 from imud.model.units import NS_PER_MS
 from imud.recording.observer import TROUBLES
 from imud.recording.state import StateError, StateReader
+from imud.sampling.driver_clock import make_clock
 from imud.sampling.path import (
     CanPath,
     PathContext,
@@ -42,7 +43,6 @@ from imud.sampling.path import (
     ReadyEdges,
     SamplePath,
     StreamPath,
-    make_clock,
 )
 
 log = logging.getLogger(__name__)

@@ -281,7 +281,7 @@ class SampleClock:
 
     def t_rx_ns(self) -> int:  # a property would cost 500 instructions
         """Return CLOCK_MONOTONIC at the read of the newest sample."""
-        return self._t_rx_ns if self._run is None else self._run.t_rx_ns  # type: ignore[no-any-return]
+        return self._t_rx_ns if self._run is None else self._run.t_rx_ns
 
     def stamp_frames(
         self, start: StartRun, kind: KernelFormat, frames: bytes, word_is_status: bool, t_rx_ns: int, utc_offset_ns: int

@@ -28,8 +28,7 @@ from imud.contracts.codec import (
     StreamCodec,
     Vanished,
 )
-from imud.contracts.driver import Driver
-from imud.contracts.lines import DeviceLines, Edge, ReadyOptions
+from imud.contracts.lines import Edge, ReadyOptions
 from imud.contracts.observer import InputObserver
 from imud.contracts.publisher import AS_SENT, Batch, SlotBatch
 from imud.contracts.script import Message, ReplyFrame, TextLine
@@ -42,7 +41,7 @@ from imud.formats.slot import (
     encode_slot,
     slot_quality,
 )
-from imud.host.clock import UNSTEERED, HostClock, SteadyTime
+from imud.host.clock import HostClock
 from imud.model.errors import Trouble
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Sample, Sync
@@ -402,9 +401,7 @@ class StreamPath(SamplePath):
                 break
             slot = self._stamp_one(data[:end], len(data) - end, t_rx_ns, utc_offset_ns, samples)
             packed, data = packed + slot, data[end:]
-            if not data:
-                return packed, ()
-            if not slot:
+            if not (slot and data):
                 break
         events = codec.feed(data)
         if events:
@@ -496,36 +493,6 @@ class CanPath(SamplePath):
     def _take_incomplete(self, samples: list[Sample]) -> None:
         if events := self.codec.flush():
             self._sort(events, self.last_data_ns, self._utc_offset_ns(), samples)
-
-
-def make_clock(
-    name: str,
-    lines: DeviceLines | None,
-    driver: Driver,
-    before: SampleClock | None,
-    *,
-    host: SteadyTime = UNSTEERED,
-    byte_ns: int = 0,
-    hold_ns: int = 0,
-    on_unknown_gap: Callable[[], None] = lambda: None,
-) -> SampleClock:
-    """Return the clock for samples of `driver`. With `before`, continue its sequence numbers and time stamps."""
-    clock = SampleClock(
-        name,
-        tick_ns=driver.tick_ns,
-        tick_modulus=driver.tick_modulus,
-        byte_ns=byte_ns,
-        hold_ns=hold_ns,
-        stamp_modulus=driver.stamp_modulus,
-        bits=driver.time_bits,
-        sout=lines.sout.timing if lines is not None and lines.sout is not None else None,
-        sin=lines.sin.timing if lines is not None and lines.sin is not None else None,
-        host=host,
-        on_unknown_gap=on_unknown_gap,
-    )
-    if before is not None:
-        clock.continue_from(before)
-    return clock
 
 
 # Time without edges after which the line counts as stopped, ns. It is shorter than the time until a device is silent.

@@ -67,14 +67,12 @@ if TYPE_CHECKING:  # older base commits do not have this module
 FILE: Final = Path(__file__).with_suffix(".json")
 SETTLING_NS: Final = 30 * NS_PER_S  # first part of a run
 MACHINES: Final = 6  # seeds per cell
-QUICK: Final = (1, 4)
-"""Installations of the short form: their minimum wake-up times are 1/4 and 3/4 of the maximum."""
+QUICK: Final = (1, 4)  # installations of the short form: their minimum wake-up times are 1/4 and 3/4 of the maximum
 SETTLED_LEAST: Final = 0.97
 SETTLING_LEAST: Final = 0.95
 RATIO_LEAST: Final = 0.8  # below: t_err_ns is too small
 RATIO_MOST: Final = 3.0  # above: t_err_ns is too large
-WORSE_MOST: Final = 1.02
-"""Maximum ratio of σ to the base. 2 % allow for the random values of two runs."""
+WORSE_MOST: Final = 1.02  # Maximum ratio of σ to the base. 2 % allow for the random values of two runs.
 
 
 class CellFigures(msgspec.Struct, frozen=True):

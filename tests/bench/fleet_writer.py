@@ -29,8 +29,7 @@ from tests.bench.writer import open_ptys, template
 
 BEGIN_NS: Final = 10_000_000  # 10 ms until the first frame
 SEED: Final = 25  # noise of noisy_values
-VALUES: Final = 997
-"""Number of different values before they repeat. A recording cannot compress this many values well."""
+VALUES: Final = 997  # Number of different values before they repeat. A recording cannot compress this many values well.
 # bytes of acceleration and rotation rate in an HI91 frame
 ACCEL_AND_GYRO: Final = slice(18, 42)
 

@@ -18,8 +18,7 @@ from typing import Final
 CONNACK, PUBACK = 2, 4
 WINDOW: Final = 20  # messages without an acknowledgment per client
 KEEP_ALIVE_S: Final = 30  # CONNECT, section 3.1.2.10
-ANSWER_S: Final = 15.0
-"""Maximum time without a reply from the broker, s. Then the client closes the connection."""
+ANSWER_S: Final = 15.0  # Maximum time without a reply from the broker, s. Then the client closes the connection.
 RETRY_S: Final = 2.0  # maximum wait before a new connection, random
 READ_BYTES: Final = 262_144
 

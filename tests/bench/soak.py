@@ -46,8 +46,7 @@ from tests.support.surroundings import free_port
 
 RATES: Final = ((1.0, 34), (10.0, 22), (20.0, 14), (50.0, 8), (100.0, 3), (400.0, 1))
 """Pairs of (rate in Hz, number of ptys). Every second device is an IMU61x."""
-MODULES: Final = 8
-"""Number of Modbus devices on one bus behind a pty. imud polls each at MODULE_HZ."""
+MODULES: Final = 8  # Number of Modbus devices on one bus behind a pty. imud polls each at MODULE_HZ.
 MODULE_HZ: Final = 5.0
 MODULE_BAUD: Final = 115200
 LINE_SEED: Final = 25
@@ -59,13 +58,11 @@ CLIENTS: Final = 20  # clients on the socket
 SCRAPE_S: Final = 5.0  # interval of Prometheus in the test
 MINUTE_S: Final = 60.0
 SETTLE_S: Final = 600.0  # start-up is not part of the slope
-SLOPE_MIN_S: Final = 600.0
-"""Minimum duration for a slope, s. The slope of a shorter run is mainly noise."""
+SLOPE_MIN_S: Final = 600.0  # Minimum duration for a slope, s. The slope of a shorter run is mainly noise.
 SLOPE_LIMIT_MB_PER_H: Final = 1.0  # goal for a run with a slope
 GROWTH_LIMIT_MB: Final = 1.0  # goal for a shorter run
 BEHIND_AT_S: Final = 60.0  # start of the pause of the clients
-BEHIND_S: Final = 10.0
-"""Time in which the clients do not read, s. The queues of some clients overflow in this time."""
+BEHIND_S: Final = 10.0  # Time in which the clients do not read, s. The queues of some clients overflow in this time.
 TAIL_S: Final = 1.0  # last samples on their way to the outputs
 END_LIMIT_S: Final = 20.0  # maximum time until the daemon has written its data and ended, s
 LOST_TOLERANCE: Final = 1  # frames, if the pty rejected any

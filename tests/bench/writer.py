@@ -28,8 +28,7 @@ LATE_LIMIT_NS = 50_000_000
 
 MakeFrame = Callable[[int], bytes | bytearray]
 
-FIRST_PA = 2000
-"""Pressure of frame 0, Pa. imud ignores a pressure below 1000 Pa or above 120 kPa."""
+FIRST_PA = 2000  # Pressure of frame 0, Pa. imud ignores a pressure below 1000 Pa or above 120 kPa.
 
 
 def open_ptys(count: int) -> list[tuple[int, int]]:

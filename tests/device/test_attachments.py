@@ -22,7 +22,7 @@ from imud.model.errors import BadArgument, CommandError
 from imud.model.event import EventKind
 from imud.model.sample import Measurement, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S
-from imud.sampling.path import make_clock
+from imud.sampling.driver_clock import make_clock
 from imud.sim.ports.pins import MemoryLines, MemoryOutput
 from tests.support.device_rig import DeviceRig, DeviceRigs
 from tests.support.event_loops import VirtualClock, in_loop, run_virtually

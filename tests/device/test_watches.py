@@ -24,7 +24,8 @@ from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
 from imud.model.sample import Sample, Sync, Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S
-from imud.sampling.path import PathContext, StreamPath, make_clock
+from imud.sampling.driver_clock import make_clock
+from imud.sampling.path import PathContext, StreamPath
 from imud.sim.hipnuc.uart import HipnucModule
 from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings
 from imud.sim.imu61x.uart import Imu61xHardware, Imu61xModule

@@ -7,7 +7,8 @@ from imud.formats.records import CheckRecord, Kind, PathRecord, decode_object, r
 from imud.model.ledger import Ledger
 from imud.model.options import NoOptions
 from imud.recording.observer import ClockObserver, PathObserver
-from imud.sampling.path import PathContext, StreamPath, make_clock
+from imud.sampling.driver_clock import make_clock
+from imud.sampling.path import PathContext, StreamPath
 from tests.support.event_loops import VirtualClock
 from tests.support.files import hi91
 

@@ -86,7 +86,7 @@ def test_an_object_that_is_not_part_of_a_codec_cannot_be_written(value: object) 
         ["f", "imud.sampling.clock:SampleClock.__init__"], ["f", "imud.sampling.clock:Callable"],
         [0, "object", "subprocess:Popen", {}], [0, "object", "imud.sampling.none:None", {}],
         [0, "object", "imud.model.errors:ImudError", {}], [0, "object", "imud.model.ledger:Ledger", {"__class__": 1}],
-        [0, "object", "imud.formats.jsonrpc:RpcError", {}], [0, "object", "imud.sampling.path:make_clock", {}],
+        [0, "object", "imud.formats.jsonrpc:RpcError", {}], [0, "object", "imud.sampling.driver_clock:make_clock", {}],
         [0, "object", "imud.contracts.link:CanUse", {"__doc__": "x"}], [0, "nothing", []],
         ["b", ["x", "ledger"], "__class__"],
         ["r", 9], ["x", "nothing"], ["e", "imud.model.sample:Sync", "NONE"], ["what"], [],

@@ -312,8 +312,7 @@ def test_bursts_behind_a_slow_timer(rate_hz: int) -> None:
 
 BYTES: Final = 82
 BYTE_NS: Final = 10_850
-MODULUS: Final = 1 << 12
-"""Modulus of the counter, ticks. It wraps several times in a trial."""
+MODULUS: Final = 1 << 12  # Modulus of the counter, ticks. It wraps several times in a trial.
 ROUNDS: Final = 600
 
 

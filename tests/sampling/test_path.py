@@ -20,7 +20,8 @@ from imud.model.errors import TransferError, Trouble
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Sample, Sync
 from imud.model.units import NS_PER_MS
-from imud.sampling.path import CanPath, PathContext, PolledPath, PollTiming, ReadyEdges, StreamPath, make_clock
+from imud.sampling.driver_clock import make_clock
+from imud.sampling.path import CanPath, PathContext, PolledPath, PollTiming, ReadyEdges, StreamPath
 from tests.support.event_loops import UTC_AHEAD_NS, VirtualClock
 from tests.support.files import hi91
 

@@ -27,8 +27,7 @@ import msgspec
 from tests.bench.instructions.measured import INTERPRETER, MARK, MARKS
 
 FILE: Final = Path(__file__).with_name("figures.json")
-GROWTH_MOST: Final = 0.05
-"""Maximum growth of a stage, as a share. Two runs of the same code agree within 0.5 %."""
+GROWTH_MOST: Final = 0.05  # Maximum growth of a stage, as a share. Two runs of the same code agree within 0.5 %.
 LESS_NOTED: Final = 0.005  # report a decrease above this share
 BUILD_MOST: Final = 0.01
 """Maximum difference of the stage `interpreter`, as a share. A larger difference means another build of Python."""
