@@ -154,10 +154,8 @@ class Stalls:
 @dataclass(frozen=True, slots=True)
 class HostClocks:
     name: str
-    slews: tuple[tuple[float, float], ...] = ()
-    """Pairs of (start in s, rate error of CLOCK_MONOTONIC in ppm)."""
-    steps: tuple[tuple[float, float], ...] = ()
-    """Pairs of (time in s, forward step of CLOCK_REALTIME in s)."""
+    slews: tuple[tuple[float, float], ...] = ()  # pairs of (start in s, rate error of CLOCK_MONOTONIC in ppm)
+    steps: tuple[tuple[float, float], ...] = ()  # pairs of (time in s, forward step of CLOCK_REALTIME in s)
     suspend_s: tuple[float, float] | None = None
     """(start in s, duration in s) of a suspend. CLOCK_MONOTONIC and CLOCK_MONOTONIC_RAW stop. The device continues, and
     the host does not receive its frames."""

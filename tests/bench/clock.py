@@ -38,8 +38,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    rms_ns: float
-    """Root mean square of the errors relative to the true time, ns. A constant error is included."""
+    rms_ns: float  # Root mean square of the errors relative to the true time, ns. A constant error is included.
     sigma_ns: float
     """Standard deviation of the errors around their mean, ns: the error after a calibration of the constant part."""
     p999_ns: float

@@ -20,8 +20,7 @@ LINE_HEAD: Final = (
 )
 WHOLE_FROM_US: Final = 10.0  # larger values have no decimals
 
-Spread = tuple[float, float]
-"""Minimum and maximum over all crystals, µs."""
+Spread = tuple[float, float]  # minimum and maximum over all crystals, µs
 
 
 class ArrivalFigures(msgspec.Struct, frozen=True):
@@ -31,8 +30,7 @@ class ArrivalFigures(msgspec.Struct, frozen=True):
     rms_us: Spread
     p999_us: Spread
     mean_t_err_us: Spread
-    share: float
-    """Share of samples within 2 × t_err_ns after settling, for the worst crystal."""
+    share: float  # share of samples within 2 × t_err_ns after settling, for the worst crystal
     settling: float
 
     def row(self) -> str:

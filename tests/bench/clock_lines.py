@@ -36,8 +36,7 @@ FAULTS = {
     "1 % of edges lost": LineFaults(edge_loss=0.01), "5 % extra edges": LineFaults(extra=0.05),
     "10 % of pulses and of frames lost, loaded": LineFaults(pulse_loss=0.1, frame_loss=0.1, loaded=True),
 }  # fmt: skip
-Case = tuple[str, str, int, list[DatedSample]]
-"""Source of the time, condition, rate in Hz, and the samples of the run."""
+Case = tuple[str, str, int, list[DatedSample]]  # source of the time, condition, rate in Hz, and the samples of the run
 
 
 def model(profile: ArrivalProfile, rate_hz: int, crystal: Crystal) -> ArrivalModel:

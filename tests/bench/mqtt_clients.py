@@ -31,16 +31,14 @@ class MqttClient:
         self.at = first % len(ports)
         self.socket: socket.socket | None = None
         self.is_ready = False
-        self.waiting: deque[tuple[str, bytes]] = deque()
-        """Messages without an acknowledgment, in the order of sending."""
+        self.waiting: deque[tuple[str, bytes]] = deque()  # messages without an acknowledgment, in the order of sending
         self.sent = 0
         self.acknowledged = self.connects = 0
         self.retry_s = 0.0
         self.heard_s = self.wrote_s = 0.0
         self.out = bytearray()
         self.read = bytearray()
-        self.number = 0
-        """Packet identifier of the newest message. Identifiers of a connection are consecutive."""
+        self.number = 0  # Packet identifier of the newest message. Identifiers of a connection are consecutive.
 
     def give(self, topic: str, payload: bytes) -> None:
         self.waiting.append((topic, payload))

@@ -23,8 +23,7 @@ from imud.formats.slot import SLOT_BYTES
 from tests.bench.writer import FIRST_PA
 
 LENGTH = struct.Struct("<I")  # length prefix of binary messages
-SEQ_DEVICE_AND_PRESSURE = struct.Struct("<Q52xH138xd")
-"""Members of a slot: sequence number, device id and pressure."""
+SEQ_DEVICE_AND_PRESSURE = struct.Struct("<Q52xH138xd")  # members of a slot: sequence number, device id and pressure
 CHUNK = 1 << 18  # 256 KiB per receive
 PARTS = 5  # number of devices per watched device, with `--devices`
 
@@ -89,8 +88,7 @@ TAKES: dict[str, Take] = {"binary": take_binary, "json": take_json}
 
 class Client(NamedTuple):
     socket: socket.socket
-    buffer: bytearray
-    """Received bytes that were not processed yet."""
+    buffer: bytearray  # received bytes that were not processed yet
 
 
 def subscribe(path: str, encoding: str, bare: bool, wanted: dict[str, object]) -> Client:

@@ -206,8 +206,7 @@ class LineState:
     ledgers: Mapping[str, Mapping[str, int]]
     failed: Mapping[str, int]
     """Polls without a sample, by device. A status may not yet count the loss of a failed poll."""
-    replies: int
-    """Replies that the devices had sent. Read after the status of imud."""
+    replies: int  # Replies that the devices had sent. Read after the status of imud.
 
 
 def ask_line(path: Path, line: Process) -> LineState:

@@ -30,8 +30,7 @@ from tests.support.polled_bus_bench import PolledBusBench
 from tests.support.stories import in_bench, played
 
 LINES = DeviceLines(reset=ResetOptions(line="R"))
-BOOT_S = 2.9
-"""Start-up time of the device, a little shorter than in the manual."""
+BOOT_S = 2.9  # Start-up time of the device, a little shorter than in the manual
 
 
 @pytest.fixture
@@ -58,8 +57,7 @@ class Scene:
     def __init__(self, bench: PolledBusBench) -> None:
         self.line = reset_line(bench.lines, bench.clock.now_ns, self.boot)
         self.device = bench.registers()
-        self.dead = False
-        """Whether the device ignores the reset."""
+        self.dead = False  # whether the device ignores the reset
         bench.spi.device = self.device.spi
 
     def hang(self) -> None:

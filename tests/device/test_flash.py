@@ -94,8 +94,7 @@ def test_an_invalid_file_only_loses_the_counts(
 
 BACKUPS_MAX = 10
 
-T_NS = 1_795_000_000 * NS_PER_S
-"""2026-11-18T11:06:40Z."""
+T_NS = 1_795_000_000 * NS_PER_S  # 2026-11-18T11:06:40Z
 
 
 def test_a_backup_has_identity_time_and_settings_and_the_newest_are_kept(tmp_path: Path) -> None:

@@ -38,8 +38,7 @@ class Wire:
     def __init__(self) -> None:
         self.target: int | None = None
         self.selected: int | None = None
-        self.targets: list[int | None] = []
-        """The selected target of each transfer."""
+        self.targets: list[int | None] = []  # the selected target of each transfer
         self.count = 0
         self.fail: Exception | None = None
         self.closed = 0

@@ -418,8 +418,7 @@ async def test_the_kind_of_burst_is_detected_in_every_variant(
 
 
 MS = 1_000_000
-EVERY_NS = 2 * MS
-"""Period of the device, ns: 500 Hz; `rate_hz` is 100."""
+EVERY_NS = 2 * MS  # period of the device, ns: 500 Hz; `rate_hz` is 100
 DEADLINES_HZ = 100.0
 
 
@@ -427,8 +426,7 @@ class Signal:
     """The line of the device: an edge at each update of its registers."""
 
     def __init__(self, bench: PolledBusBench, device: Imu61xRegisters) -> None:
-        self.stamps: list[int] = []
-        """Number of edges since the line was opened."""
+        self.stamps: list[int] = []  # number of edges since the line was opened
         self.quiet = False
         self._stage, self._device = bench, device
 

@@ -441,8 +441,7 @@ def test_other_text_is_unsolicited_and_not_part_of_the_reply(session: ScriptRunn
     assert strays(ledger) == (0, 3)
 
 
-Step = Request | str | ReplyFrame
-"""A request to start, or a frame that the device sends."""
+Step = Request | str | ReplyFrame  # a request to start, or a frame that the device sends
 
 
 @pytest.mark.parametrize(

@@ -235,10 +235,8 @@ class DeafModule:
         self.clock = VirtualClock()
         self.rigs = DeviceRigs(self.clock.host)
         self.rig = self.rigs.add(configured(identify=True))
-        self.asked_ns: list[int] = []
-        """Times of the version requests."""
-        self.paused = False
-        """Whether the module sends no samples, but receives requests."""
+        self.asked_ns: list[int] = []  # times of the version requests
+        self.paused = False  # whether the module sends no samples, but receives requests
         self._deaf_to, self._deaf_to_settings = deaf_to, deaf_to_settings
         self._ms = self._seen = 0
 

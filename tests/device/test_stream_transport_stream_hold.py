@@ -23,10 +23,8 @@ from tests.support.stories import played
 
 MOST_NS = 50 * 10**6
 
-WIRE_NS = 890 * NS_PER_US
-"""Duration of a frame, ns: 82 bytes at 921600 baud."""
-FIT_MS = 400
-"""Time after which imud uses the fit and the maximum hold, ns."""
+WIRE_NS = 890 * NS_PER_US  # duration of a frame, ns: 82 bytes at 921600 baud
+FIT_MS = 400  # time after which imud uses the fit and the maximum hold, ns
 
 
 class Takes(MemoryLink):
@@ -35,8 +33,7 @@ class Takes(MemoryLink):
     def __init__(self, settings: MemoryOptions, clock: VirtualClock) -> None:
         super().__init__(settings)
         self.taken: list[tuple[int, int]] = []
-        self.resumed: list[int] = []
-        """Times of `resume`."""
+        self.resumed: list[int] = []  # times of `resume`
         self._clock = clock
 
     def take(self) -> bytes:

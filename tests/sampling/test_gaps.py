@@ -30,8 +30,7 @@ class Device:
     """A simulated device: its rate, its counter, and the error of its crystal."""
 
     rate_hz: int
-    tick_ns: int
-    """0: the counter numbers the samples. -1: no counter."""
+    tick_ns: int  # 0: the counter numbers the samples. -1: no counter.
     modulus: int
     ppm: float = 30.0
     first: int = 12345

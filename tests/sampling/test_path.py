@@ -81,8 +81,7 @@ class PathRig:
         self.noted: Any = Noted()
         self.codec: Any = Scripted(self.ledger)
         self.batches: list[list[Sample]] = []
-        self.reported: list[int] = []
-        """Number of reports to the observer before each batch."""
+        self.reported: list[int] = []  # number of reports to the observer before each batch
         self.messages: list[tuple[Message, int]] = []
         self.bad: list[BadReason] = []
         self.overruns = 0

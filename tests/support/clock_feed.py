@@ -7,8 +7,7 @@ from imud.model.sample import Measurement, Sample
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.clock import SampleClock
 
-Point = tuple[int | None, int]
-"""Device ticks, and host time since the start, ms."""
+Point = tuple[int | None, int]  # device ticks, and host time since the start, ms
 
 MODULUS = 1 << 32
 BEGIN_NS = 1_000 * NS_PER_S

@@ -15,8 +15,7 @@ from imud.model.sample import Measurement
 
 PENDING_BYTES_MAX: Final = 2048
 """Maximum number of pending bytes. Protocols have frames up to 1 KiB and lines up to 256 characters."""
-PENDING_FRAMES_MAX: Final = 16
-"""Maximum number of pending CAN frames. No sample needs more frames."""
+PENDING_FRAMES_MAX: Final = 16  # Maximum number of pending CAN frames. No sample needs more frames.
 
 
 def untimed(events: Iterable[CodecEvent]) -> list[CodecEvent]:

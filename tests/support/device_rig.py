@@ -34,22 +34,18 @@ from imud.recording.observer import ClockObserver
 from imud.recording.player import PlayedDevice, Player
 from tests.support.event_loops import VirtualClock, run_virtually
 
-LIMIT_S = 60.0
-"""Deadline of a wait, s. A loaded host delays a real device; virtual time does not wait."""
+LIMIT_S = 60.0  # Deadline of a wait, s. A loaded host delays a real device; virtual time does not wait.
 STEP_S = 0.002
-TURN_S = 0.0005
-"""Pause between two polls of a condition, s. Timers run during the pause, also in simulated time."""
+TURN_S = 0.0005  # Pause between two polls of a condition, s. Timers run during the pause, also in simulated time.
 
 
 class DeviceRig:
     def __init__(self, now_ns: Callable[[], int]) -> None:
         self.samples: list[Sample] = []
         self.batches = 0
-        self.published: list[tuple[int, list[Sample]]] = []
-        """Each batch with the time of its publication."""
+        self.published: list[tuple[int, list[Sample]]] = []  # each batch with the time of its publication
         self.events: list[Event] = []
-        self.recorded: list[bytes] = []
-        """Records of the device, if `DeviceRigs.recording` is True."""
+        self.recorded: list[bytes] = []  # records of the device, if `DeviceRigs.recording` is True
         self.now_ns = now_ns
         self.device: Device
 

@@ -257,10 +257,8 @@ class FakeModule(MemoryLink):
         self.set = dict(FACTORY)
         self.flash = dict(FACTORY)
         self.mounting = "level"
-        self.refuses: set[str] = set()
-        """Names of settings that the device answers with ERR."""
-        self.forgets: set[str] = set()
-        """Names of settings that the device confirms and does not store."""
+        self.refuses: set[str] = set()  # names of settings that the device answers with ERR
+        self.forgets: set[str] = set()  # names of settings that the device confirms and does not store
         self.silent: set[str] = set()
         self.commands: list[str] = []
         self.saves = 0

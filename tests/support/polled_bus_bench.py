@@ -31,8 +31,7 @@ class PolledBusBench:
         self.is_virtual = clock is not None
         self.node = folder / "spidev0.0"
         self.node.touch()
-        self.spi = InProcessSpi()
-        """SPI bus. `spi.device = …` connects a device."""
+        self.spi = InProcessSpi()  # SPI bus. `spi.device = …` connects a device.
         self.i2c = InProcessI2c({})
         self.lines = MemoryLines(self.clock.now_ns)
         self.before_next_time: Callable[[], None] | None = None

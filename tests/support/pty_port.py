@@ -41,8 +41,7 @@ class PtyPort:
         tty.setraw(slave)
         os.set_blocking(self.master, False)
         self.path = os.ttyname(slave)
-        self.slave = slave
-        """The near end. It stays open, so that the port exists between a close and the next open."""
+        self.slave = slave  # The near end. It stays open, so that the port exists between a close and the next open.
 
     def send(self, data: bytes) -> None:
         assert os.write(self.master, data) == len(data)

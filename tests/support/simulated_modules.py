@@ -208,8 +208,7 @@ class CanBench:
         self.now_ns = BEGIN_NS
         self.driver = driver
         self.bus: tuple[CanModule, ...] = (module, *others)
-        self.settings = settings
-        """Settings of the driver. Scripts change them when they follow the device."""
+        self.settings = settings  # Settings of the driver. Scripts change them when they follow the device.
         self.codec: CanCodec = driver.make_codec(Ledger(), settings)
         self.session = offline_runner(self.codec.ledger)
         self.sent: list[tuple[int, bytes]] = []

@@ -36,8 +36,7 @@ class MessageChecker:
     """Checks messages by the closed schema. Without the package jsonschema it checks nothing."""
 
     def __init__(self) -> None:
-        self.checked: dict[str, int] = {}
-        """Number of checked messages, by name."""
+        self.checked: dict[str, int] = {}  # number of checked messages, by name
         self._whole = socket_document()
         _close(self._whole)
         self._validators: dict[str, Any] = {}
@@ -84,8 +83,7 @@ def _close(schema: Any) -> None:
 NOT_SAVED = "not saved; run `imud command imu0 save`"
 
 T = TypeVar("T")
-CHECKER = MessageChecker()
-"""Checker of all messages that a `Peer` receives against docs/socket.schema.json."""
+CHECKER = MessageChecker()  # checker of all messages that a `Peer` receives against docs/socket.schema.json
 
 EPOCH = 4886718345
 NOW_NS = 80_000_123_456_789
@@ -144,8 +142,7 @@ CALIBRATIONS = {
         instructions=("Do not touch it.",), begin=lambda _target: None, kept=command.Kept.BY_SAVE,
     )
 }  # fmt: skip
-done_late = asyncio.Event()
-"""Event that ends the action `wait`."""
+done_late = asyncio.Event()  # event that ends the action `wait`
 
 
 class FakeControl:

@@ -83,8 +83,7 @@ def read_until(descriptor: int, end: bytes) -> bytes:
     return data
 
 
-LOWEST_PORT: Final = 15000
-"""Lowest port of a test. Usual ports of servers, for example 1883, 2947 and 9090, are lower."""
+LOWEST_PORT: Final = 15000  # Lowest port of a test. Usual ports of servers, for example 1883, 2947 and 9090, are lower.
 PORT_TRIES_MAX: Final = 100  # attempts to find an unused port
 
 
@@ -115,8 +114,7 @@ class Machine:
         self.pages: dict[tuple[str, int, str], str] = {}
         self.c_kernel: CKernelStatus | None = CKernelStatus(True)
         self.clock = KernelClock(True, 50, 1000)
-        self.sync_s: list[float] = []
-        """Times of the next writes."""
+        self.sync_s: list[float] = []  # times of the next writes
         self.uid = 1000
         self.gids: frozenset[int] = frozenset({1000})
         self.boot_utc_ns = 0

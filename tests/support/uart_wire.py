@@ -21,8 +21,7 @@ from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 SET_BAUD_NS: Final = 3 * NS_PER_MS
 """Duration of a change of the baud rate on a USB adapter, ns. Bytes that start in this time are lost."""
 REPLY_DELAY_NS: Final = 20 * NS_PER_MS  # time from a request to the reply
-TimedByte = tuple[int, int]
-"""End of the byte on the wire, ns; its value."""
+TimedByte = tuple[int, int]  # end of the byte on the wire, ns; its value
 
 
 def levels(data: bytes) -> list[int]:

@@ -51,8 +51,7 @@ class WiredDevice:
         self.source = FakeSource()
         self.memory = MemoryLines(self.clock.now_ns)
         self.cut: set[Pin] = set()
-        self.instants: dict[int, int] = {}
-        """Time of the measurement by device time (ms) of the received frames."""
+        self.instants: dict[int, int] = {}  # time of the measurement by device time (ms) of the received frames
         self.frames: list[int] = []
         self._config = DeviceConfig(
             "bow", "hipnuc-uart", None, identify, "memory", MemoryOptions(baud=BAUD), lines=lines, rmc=rmc
