@@ -85,7 +85,7 @@ def compare(kept: Figures, measured: Mapping[str, int]) -> list[Line]:
 
 LIMIT_S: Final = 900.0  # whole run under valgrind
 ROOT: Final = Path(__file__).parents[3]
-PASSED_ON: Final = ("PATH", "PYTHONPATH", "TMPDIR")
+PASSED_ON: Final = ("PATH", "PYTHONPATH", "TMPDIR", "IMUD_KERNEL")
 """Environment variables for the measured program. imud removes all others, because their size moves the stack."""
 
 
