@@ -458,14 +458,14 @@ class TopScreen(Screen[None]):
         return self.app
 
     def redraw(self) -> None:
-        """Draw the screen if its widgets exist."""
-        if self.is_ready:
+        """Draw the screen if its widgets exist. Textual removes the widgets of a closed screen."""
+        if self.is_ready and self.is_current:
             self.draw()
 
     def begin(self) -> None:
         """Draw the screen for the first time."""
         self.is_ready = True
-        self.draw()
+        self.redraw()
 
     def draw(self) -> None:
         """Draw the complete screen."""

@@ -155,6 +155,10 @@ async def test_the_page_of_a_device_has_curves_status_and_its_events(pilot: Pilo
     await press(pilot, app, "escape")
     assert isinstance(app.screen, top.Overview)
     assert SilentFeed.looked_at[-2:] == ["bow", None], "more samples of the device while its page is shown"
+    app.push_screen(page := top.DevicePage("bow"))
+    await pilot.pause()
+    await app.pop_screen()
+    page.begin()  # Textual calls it after a refresh, which can be after the user closed the page
     await press(pilot, app, "enter")
     lines_of_page = await give(pilot, app, News(statuses=(device("mast", 2),)))
     assert any("bow is no longer in the configuration" in line for line in lines_of_page)
