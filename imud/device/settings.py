@@ -222,10 +222,12 @@ class WorkLock:
         """Hold the lock for `work`, for example `the command save`. `stop`: how a user can stop it. `can_restart`:
         whether the work can restart the device counter.
 
-        Raises CommandError if other work, for example a calibration, does not end within WAIT_S. The error names it.
+        Raises CommandError if other work does not end within WAIT_S, and immediately during work that a user can stop
+        (a calibration). The error names the work.
         """
+        wait_s = 0.0 if self.work is not None and self.work.stop else WAIT_S
         try:
-            async with asyncio.timeout(WAIT_S):
+            async with asyncio.timeout(wait_s):
                 await self._lock.acquire()
         except TimeoutError:
             words = self.work.words(self._host.now_ns()) if self.work is not None else "other work has just ended"

@@ -671,6 +671,11 @@ async def test_a_command_waits_for_another_command_for_a_limited_time(bench: Mod
     await bench.pass_s(1)
     assert bench.device.status().work is None
     await bench.doing(bench.device.settings.report(fresh=True))
+    async with bench.device.settings.lock.hold("the calibration z", "stop it"):  # it can last for minutes
+        begin_ns = bench.clock.now_ns()
+        with pytest.raises(CommandError, match=r"the calibration z is running.*stop it; try again later"):
+            await bench.device.settings.report(fresh=True)
+        assert bench.clock.now_ns() == begin_ns
 
 
 # --- a backup before all is lost --------------------------------------------------------------------------------------
