@@ -463,14 +463,15 @@ class CanPath(SamplePath):
         samples: list[Sample] = []
         t_rx_ns = self.last_data_ns
         try:
-            feed = self.codec.feed_frame
-            utc_offset_ns = self._utc_offset_ns()
+            feed, utc_offset_ns = self.codec.feed_frame, None  # one read of the clocks for all samples
             for can_id, extended, data, t_rx_ns, after_loss in frames:
                 if after_loss:
+                    utc_offset_ns = utc_offset_ns or self._utc_offset_ns()
                     self._sort(self.codec.flush(), t_rx_ns, utc_offset_ns, samples)
                     self.codec.reset()
                 events = feed(can_id, extended, data, t_rx_ns)
-                if events:
+                if events:  # most frames only add values to a sample
+                    utc_offset_ns = utc_offset_ns or self._utc_offset_ns()
                     self._sort(events, t_rx_ns, utc_offset_ns, samples)
             self.last_data_ns = t_rx_ns
         finally:
