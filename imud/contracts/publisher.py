@@ -4,7 +4,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
 from socket import socket
-from typing import Any, ClassVar, Final, Protocol
+from typing import Any, ClassVar, Final, Protocol, cast
 
 from imud.attitude.conventions import Convention
 from imud.attitude.published import PublishedAxes, as_sent
@@ -12,6 +12,7 @@ from imud.contracts.command import CalibrationResult, Calibrations, LastCalibrat
 from imud.contracts.driver import Driver
 from imud.contracts.lines import UtcReference, WatchLine
 from imud.contracts.link import Claim
+from imud.contracts.registry import load
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import ClientStatus, DeviceStatus, FlightStatus, MqttStatus, OutputStatus, RecorderStatus
 from imud.formats.slot import SLOT_BYTES, decode_slots, encode_slots, slot_seqs, slot_times_ns
@@ -331,6 +332,11 @@ class PublisherContext:
 
 def _claims_nothing(_settings: Options) -> Sequence[Claim]:
     return ()
+
+
+def make_later(row: str) -> Callable[[Any, PublisherContext], Publisher]:
+    """Return a function that imports and creates the publisher `module:NAME`. An output that is off needs no memory."""
+    return lambda options, context: cast(Publisher, load(row)(options, context))
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,9 +2,15 @@
 
 from collections.abc import Iterator, Mapping
 from importlib import import_module
-from typing import Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
 
 T = TypeVar("T")
+
+
+def load(row: str) -> Any:
+    """Import and return the object `module:NAME`."""
+    module, _, attribute = row.partition(":")
+    return getattr(import_module(module), attribute)
 
 
 class Registry(Mapping[str, T], Generic[T]):
@@ -17,10 +23,10 @@ class Registry(Mapping[str, T], Generic[T]):
 
     def __getitem__(self, name: str) -> T:
         try:
-            module, _, attribute = self.rows[name].partition(":")
+            row = self.rows[name]
         except KeyError:
             raise KeyError(f"no {self.kind} named {name!r}; expected one of: {', '.join(sorted(self.rows))}") from None
-        return cast(T, getattr(import_module(module), attribute))
+        return cast(T, load(row))
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.rows)

@@ -23,6 +23,7 @@ from typing import Annotated, Any, Final, NamedTuple
 import msgspec
 import zstandard
 
+from imud.fleet.settings import NAME_PATTERN, is_name
 from imud.formats.slot import SLOT_BYTES, decode_slot
 from imud.model.errors import reason_of
 from imud.model.event import Event
@@ -30,9 +31,6 @@ from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_S
 
 ROOT: Final = "imud"
-# Pattern of a name, at most 64 characters. MQTT limits a topic to 65,535 bytes, and a client ID contains three names.
-NAME_PATTERN: Final = "[A-Za-z0-9_-]{1,64}"
-_NAME: Final = re.compile(NAME_PATTERN)
 
 
 class Stream(StrEnum):
@@ -58,11 +56,6 @@ class TopicParts(NamedTuple):
     gateway: str
     device: str  # device name; empty for a topic of the gateway
     leaf: str  # `state`, `status`, `settings`, `schema`, `command`, `answer`, or the name of a `Stream`
-
-
-def is_name(text: str) -> bool:
-    """Return whether `text` is a valid name of a site, a gateway or a device."""
-    return _NAME.fullmatch(text) is not None
 
 
 def topic_of(site: str, gateway: str, device: str, leaf: str) -> str:

@@ -18,7 +18,7 @@ import msgspec
 
 from imud import __version__
 from imud.contracts.condition import Condition, signature
-from imud.contracts.publisher import Batch, PublisherContext, PublisherType
+from imud.contracts.publisher import Batch, PublisherContext
 from imud.contracts.status import DeviceStatus, MqttStatus
 from imud.fleet.broker import BrokerTurn, Connect, PahoConnection, Will, check_extra
 from imud.fleet.commands import CommandChannel
@@ -30,11 +30,10 @@ from imud.fleet.messages import (
     VERSION,
     Stream,
     boot_text,
-    is_name,
     topic_of,
 )
 from imud.fleet.sender import MqttSender
-from imud.fleet.settings import LOCALHOST, DeviceSending, MqttOptions, broker_of, check_commands
+from imud.fleet.settings import LOCALHOST, DeviceSending, MqttOptions, broker_of, is_name
 from imud.fleet.spool import Spool
 from imud.fleet.streams import Gateway, gateway_clock
 from imud.fleet.writer import SentState, SpoolWriter, WriterQueue
@@ -454,6 +453,3 @@ def settings_of(status: DeviceStatus) -> dict[str, object] | None:
             "problem": declared.problem,
         }
     return found
-
-
-PUBLISHER = PublisherType("mqtt", MqttOptions, MqttPublisher, required=False, check=check_commands)

@@ -46,8 +46,8 @@ from imud.fleet.broker import (
     open_client,
     paho_client,
 )
-from imud.fleet.messages import ROOT, STATE, FleetMessage, Stream, TopicParts, decode_message, is_name, parse_topic
-from imud.fleet.settings import Broker, broker_of
+from imud.fleet.messages import ROOT, STATE, FleetMessage, Stream, TopicParts, decode_message, parse_topic
+from imud.fleet.settings import Broker, broker_of, is_name
 from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_S
 

@@ -10,7 +10,7 @@ import msgspec
 
 from imud.contracts.driver import Driver
 from imud.contracts.lines import LINE_VERBS
-from imud.fleet.messages import NAME_PATTERN, is_name
+from imud.contracts.publisher import PublisherType, make_later
 from imud.model.options import Options, is_host, shown, unknown_name
 from imud.model.units import NS_PER_S
 
@@ -19,6 +19,9 @@ BROKERS_MAX: Final = 16  # Maximum number of brokers. imud tries them in order, 
 EVERY: Final = "*"  # key for all devices without an entry of their own
 SET: Final = "set"  # command that changes settings; `set.NAME` allows it for one setting
 Measure = Literal["mean", "min", "max", "rms"]
+# Pattern of a name, at most 64 characters. MQTT limits a topic to 65,535 bytes, and a client ID contains three names.
+NAME_PATTERN: Final = "[A-Za-z0-9_-]{1,64}"
+_NAME: Final = re.compile(NAME_PATTERN)
 Name = Annotated[str, msgspec.Meta(pattern=f"^({NAME_PATTERN})?$", extra={"words": "letters, digits, _ and -"})]
 
 
@@ -110,6 +113,11 @@ class Broker(NamedTuple):
 
 
 PORTS: Final = {"mqtt": 1883, "mqtts": 8883, "ws": 80, "wss": 443}  # supported URL schemes and their default ports
+
+
+def is_name(text: str) -> bool:
+    """Return whether `text` is a valid name of a site, a gateway or a device."""
+    return _NAME.fullmatch(text) is not None
 
 
 def broker_of(url: str) -> Broker | None:
@@ -250,3 +258,8 @@ def _settings_in(words: str, known: Collection[str]) -> set[str]:
     names = [word.partition("=")[0].partition(".")[0] for word in words.split() if "=" in word]
     patterns = [re.compile(re.sub(r"\\{\w+\\}", r"\\w+", re.escape(name))) for name in names]
     return {name for name in known if any(pattern.fullmatch(name) for pattern in patterns)}
+
+
+PUBLISHER = PublisherType(
+    "mqtt", MqttOptions, make_later("imud.fleet.publisher:MqttPublisher"), required=False, check=check_commands
+)

@@ -41,9 +41,9 @@ from imud.fleet.messages import (
     check_payload,
     decode_message,
     encode_message,
-    is_name,
     parse_topic,
 )
+from imud.fleet.settings import is_name
 from imud.fleet.statistics import summed_up
 from imud.model.errors import reason_of
 from imud.model.units import NS_PER_S

@@ -13,7 +13,6 @@ import os
 import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from difflib import get_close_matches
 from pathlib import Path
 from struct import Struct
 from typing import Any, Final, NamedTuple
@@ -154,6 +153,8 @@ def _no_line(line: int | str, chips: Sequence[_Chip]) -> LinkMissing:
     if isinstance(line, int):
         return LinkMissing(f"{chips[0]} has no line {line}: its lines are 0 to {len(chips[0].names) - 1}")
     names = [name for chip in chips for name in chip.names if name]
+    from difflib import get_close_matches  # as in `unknown_name`
+
     near = get_close_matches(line, names, n=1, cutoff=0.5)
     hint = f"; did you mean {near[0]}?" if near else ""
     where = ", ".join(map(str, chips)) or "any chip: no chip exists"

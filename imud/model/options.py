@@ -8,7 +8,6 @@ path"})` replaces a pattern that a user cannot read.
 
 import re
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
 from ipaddress import ip_address
 from typing import Any, NamedTuple
 
@@ -152,6 +151,8 @@ def _inside(value: object, place: str) -> str:
 
 def unknown_name(what: str, name: str, known: Sequence[str]) -> str:
     """Return the error for a name that is not in `known`, with the most similar name. `what`: `a driver`, …."""
+    from difflib import get_close_matches  # only an error needs it: 0.2 MB
+
     near = get_close_matches(name, known, cutoff=0.5)
     hint = f"did you mean {near[0]}? " if near else ""
     return f"expected {what} that imud knows, got {got(name)}; {hint}known: {', '.join(sorted(known)) or 'none'}"

@@ -11,6 +11,6 @@ PUBLISHERS: Registry[PublisherType] = Registry(
         "metrics": "imud.publishers.metrics.publisher:PUBLISHER",
         "recorder": "imud.publishers.recorder.publisher:PUBLISHER",
         "nmea0183": "imud.publishers.nmea0183:PUBLISHER",
-        "mqtt": "imud.fleet.publisher:PUBLISHER",
+        "mqtt": "imud.fleet.settings:PUBLISHER",
     },
 )
