@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 
-from imud.client.connection import Client, decoded, default_path
 from imud.contracts.status import Deviations, DeviceStatus
-from imud.formats.jsonrpc import DEFAULT_PATH
+from imud.formats.jsonrpc import DEFAULT_PATH, default_path
 from imud.host.files import read_regular
 from imud.model.errors import BadArgument, ImudError, reason_of
 from imud.model.options import Options, json_or_text, shown, unknown_name, value_problem, wrong_values
@@ -74,6 +73,7 @@ def _sigma(sensor: _Sensor | None) -> float | None:
 
 
 if TYPE_CHECKING:  # importing contracts.driver would double the start time of `imud status`
+    from imud.client.connection import Client
     from imud.contracts.driver import Driver
 
 SECONDS_OF: Final = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
@@ -100,13 +100,17 @@ def add_socket(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def connect(args: argparse.Namespace) -> Client:
+def connect(args: argparse.Namespace) -> "Client":
     """Connect to the daemon. Raises LinkMissing, LinkDenied or ServerError. The error names the next step."""
+    from imud.client.connection import Client  # the daemon does not need it
+
     return Client(args.socket)
 
 
-def statuses(client: Client) -> list[DeviceStatus]:
+def statuses(client: "Client") -> list[DeviceStatus]:
     """Return the status of every device."""
+    from imud.client.connection import decoded
+
     return decoded(client.status()["devices"], list[DeviceStatus])
 
 

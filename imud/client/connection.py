@@ -22,11 +22,11 @@ from typing import Any, Final, Self, TypeVar
 import msgspec
 
 from imud.formats.jsonrpc import (
-    DEFAULT_PATH,
     FRAME_HEADER,
     FRAME_MAX_BYTES,
     PROTOCOL,
     RpcError,
+    default_path,
     encode_request,
     line_of,
     parse_object,
@@ -535,11 +535,6 @@ class Client:
         if not isinstance(message.get("method", ""), str):
             raise ServerError(f"{self.path}: expected a string as method, got {body[:80]!r}")
         return message
-
-
-def default_path() -> str:
-    """Return the environment variable IMUD_SOCKET; /run/imud/imud.sock if it is not set or empty."""
-    return os.environ.get("IMUD_SOCKET") or DEFAULT_PATH
 
 
 def rpc_error(error: object) -> RpcError:

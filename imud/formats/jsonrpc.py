@@ -10,6 +10,7 @@ The length decides the kind of a frame, because a slot can start with any byte, 
 length that is a multiple of 256 ends with a second newline.
 """
 
+import os
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -76,6 +77,11 @@ class RpcRequest:
 
 encode: Final = msgspec.json.Encoder().encode  # encodes JSON without spaces and raw newlines, NaN and infinity as null
 _decode: Final = msgspec.json.Decoder().decode
+
+
+def default_path() -> str:
+    """Return the environment variable IMUD_SOCKET; /run/imud/imud.sock if it is not set or empty."""
+    return os.environ.get("IMUD_SOCKET") or DEFAULT_PATH
 
 
 def parse_object(line: bytes | bytearray) -> dict[str, Any]:

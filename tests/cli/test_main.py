@@ -73,7 +73,7 @@ def test_no_daemon_a_daemon_that_hangs_and_an_interrupt(tmp_path: Path, cli: Cli
         assert error.startswith(f"imud {command}: no daemon at {tmp_path}/none: is imud running?")
     words, hang = ("status", "--socket", "/run/x.sock"), TimeoutError("/run/x.sock: waited in vain for hello")
     for failure, status, said in [(hang, 2, f"imud status: {hang}\n"), (KeyboardInterrupt, 130, "")]:
-        with mock.patch("imud.cli.arguments.Client", side_effect=failure):
+        with mock.patch("imud.client.connection.Client", side_effect=failure):
             assert cli(*words, status=status).err == said
 
 

@@ -13,10 +13,10 @@ from unittest.mock import Mock
 import pytest
 from msgspec.structs import replace
 
-from imud.client.connection import Client, EventStream, decoded, default_path, event_of, rpc_error
+from imud.client.connection import Client, EventStream, decoded, event_of, rpc_error
 from imud.contracts.publisher import Batch
 from imud.contracts.status import DeviceState
-from imud.formats.jsonrpc import RpcError
+from imud.formats.jsonrpc import RpcError, default_path
 from imud.formats.recording import is_recording
 from imud.model.errors import LinkDenied, LinkError, LinkMissing, ServerError
 from imud.model.event import Event, EventKind
