@@ -289,6 +289,7 @@ class ShmRing:
         self._size_bytes = HEADER_BYTES + header.slot_count * SLOT_BYTES
         self._fd = directory.make(self._name, self._size_bytes, encode_header(header), mode, group_id)
         self._status = os.fstat(self._fd)
+        self._inode = self._status.st_dev, self._status.st_ino
         self.group_given = self._status.st_gid == group_id  # True if the file has the requested group
         self._memory = self._mapped()
         with memoryview(self._memory) as view:
@@ -349,10 +350,13 @@ class ShmRing:
         self._newest = words[NEWEST_WORD] = last
         return True
 
-    def beat(self, now_ns: int) -> None:
-        """Write the heartbeat."""
-        if not (self._ring and self._ring.beat(now_ns)) and self._is_whole():
+    def beat(self, now_ns: int) -> bool:
+        """Write the heartbeat. Return False if the file was truncated."""
+        if self._ring and self._ring.beat(now_ns):
+            return True
+        if is_whole := self._is_whole():
             self._words[HEARTBEAT_WORD] = now_ns
+        return is_whole
 
     def set_ledger(self, driver: str, counters: tuple[int, ...]) -> None:
         """Write the driver, and the ledger as counters in the order of LEDGER_FIELDS, if they changed."""
@@ -367,9 +371,9 @@ class ShmRing:
         self._memory[_LEDGER_PAYLOAD] = block[8:]
         self._words[LEDGER_UPDATE_WORD] = self._update
 
-    def is_intact(self) -> bool:
-        """Return whether the file has its size, and readers find it at its path."""
-        return self._is_whole() and kernel.is_at(self._path, self._status.st_dev, self._status.st_ino)
+    def is_at_path(self) -> bool:
+        """Return whether readers find the file at its path."""
+        return kernel.is_at(self._path, *self._inode)
 
     def is_named(self, directory: RingDirectory) -> bool:
         """Return whether the file has its name in `directory`."""
@@ -513,15 +517,16 @@ class ShmPublisher:
 
     def tick(self, now_ns: int) -> None:
         """Write heartbeats. Once per second, create missing or truncated rings again, and write ledgers."""
-        if now_ns >= self._check_ns:
-            self._check_ns = now_ns + CHECK_NS
-            for name in self._places:
-                ring = self._rings.get(name)
-                if ring is None or not ring.is_intact():
-                    self._replace(name, self._current_directory(), now_ns)
-            self._show_ledgers()
-        for ring in self._rings.values():
-            ring.beat(now_ns)
+        if now_ns < self._check_ns:
+            for ring in self._rings.values():
+                ring.beat(now_ns)
+            return
+        self._check_ns = now_ns + CHECK_NS
+        for name in self._places:
+            found = self._rings.get(name)
+            if found is None or not (found.beat(now_ns) and found.is_at_path()):
+                self._replace(name, self._current_directory(), now_ns)
+        self._show_ledgers()
 
     def close(self) -> None:
         """Write the final ledgers and close all rings. A second call does nothing."""

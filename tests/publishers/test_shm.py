@@ -187,9 +187,9 @@ def test_order_of_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     notes.clear()
     board.tick()
     update = layout.OFFSETS["ledger_update"]
-    assert [note[:2] for note in notes[:3]] == [(update, 8), (update + 8, layout.LEDGER_BLOCK_BYTES - 8), (update, 8)]
-    assert [notes[0][2], notes[2][2]] == [SEQ_INVALID, 1]
-    assert notes[3:] == [(layout.OFFSETS["heartbeat_ns"], 8, board.now_ns)]
+    assert notes[0] == (layout.OFFSETS["heartbeat_ns"], 8, board.now_ns)
+    assert [note[:2] for note in notes[1:]] == [(update, 8), (update + 8, layout.LEDGER_BLOCK_BYTES - 8), (update, 8)]
+    assert [notes[1][2], notes[3][2]] == [SEQ_INVALID, 1]
     board.publisher.close()
 
 
