@@ -22,7 +22,7 @@ from imud.sampling.path import SamplePath
 
 # Minimum time between two checked samples, ns. A window of `GravityCheck` needs five samples in 5 s.
 CHECK_NS: Final = NS_PER_S - 50 * NS_PER_MS
-AGAIN_NS: Final = 30 * NS_PER_S  # time between two windows at rest without contradiction, ns
+AGAIN_NS: Final = 60 * NS_PER_S  # time between two windows at rest without contradiction, ns
 AS_DEVICE = "device"  # name of the convention if none is configured
 
 
