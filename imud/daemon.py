@@ -1,7 +1,7 @@
 """The daemon: one event loop with all configured devices and outputs.
 
 Device ──Batch──▶ Publisher ×n              (publish: a plain loop)
-tick, 10 Hz ──▶ devices, publishers         SIGHUP ──▶ reload        SIGTERM, SIGINT ──▶ stop
+tick, 2 Hz, 10 Hz ──▶ devices, outputs        SIGHUP ──▶ reload        SIGTERM, SIGINT ──▶ stop
 """
 
 import asyncio
@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from time import thread_time_ns
 from typing import Final
@@ -23,7 +24,7 @@ from typing import Final
 from imud import __version__
 from imud import config as configuration
 from imud.config.model import Config, DeviceConfig
-from imud.contracts.condition import Condition, summary
+from imud.contracts.condition import summary
 from imud.contracts.lines import LineFactory
 from imud.contracts.publisher import (
     DeviceControl,
@@ -45,6 +46,7 @@ from imud.lines.gpio import GPIO_LINES
 from imud.lines.watched_line import watching
 from imud.model.errors import CommandError, ConfigError, ImudError, ServerError
 from imud.model.event import Event, EventKind
+from imud.model.units import NS_PER_MS
 from imud.publishers.outputs import Outputs
 from imud.utc.system_clock import kernel_clock, system_reference
 
@@ -129,6 +131,8 @@ def _give(answer: "asyncio.Future[Config]", config: Config | None, error: Config
 
 TICK_S: Final = 0.1  # interval of ticks while a part needs them (`tick_soon`), s
 QUIET_TICK_S: Final = 0.5  # interval of ticks in a quiet state, s; half of the maximum age of a heartbeat
+CONDITION: Final = attrgetter("condition")
+DEVICES_NS: Final = 950 * NS_PER_MS  # minimum time between two ticks of quiet devices, ns: each second tick
 
 
 class Daemon:
@@ -158,7 +162,7 @@ class Daemon:
         self._latencies = LatencyBudget()
         self.recording = RecordableDevices(self._devices, host)
         host.utc_offset_ns()
-        # Threads of outputs use the offset of the last reading, which is at most one tick old. A reading by a thread
+        # Threads of outputs use the offset of the last reading, which is at most 1 s old. A reading by a thread
         # would change the steady time between two samples, and a recording would contain it at the wrong place.
         clock = PublisherClock(
             host.now_ns,
@@ -185,9 +189,10 @@ class Daemon:
         self._stop = asyncio.Event()
         self._alarm: Alarm | None = None
         self._is_soon = False  # whether the next tick follows after TICK_S
+        self._devices_due_ns = 0  # CLOCK_MONOTONIC of the next tick of quiet devices
         self._failure: BaseException | None = None
         self._manager = ServiceManager()
-        self._conditions: dict[str, Condition] | None = None  # conditions of the devices at the last status line
+        self._conditions: list[str] | None = None  # names and conditions of the devices at the last status line
         self._summary_line = ""
         self._signals: list[int] = []  # signals with a handler of this daemon
 
@@ -387,21 +392,24 @@ class Daemon:
                 self._alarm.set(TICK_S)
 
     def on_alarm(self) -> None:
-        """Call `tick` of all devices and outputs. An error stops the daemon (`_on_loop_error`)."""
+        """Call `tick` of all outputs. Call `tick` of all devices once per second, and after `tick_soon`. An error stops
+        the daemon (`_on_loop_error`)."""
         assert self._alarm is not None
-        self._is_soon = False
         now_ns = self._host.now_ns()
-        self._host.utc_offset_ns()  # without samples too: the rate of the clock is a mean between two reads
-        for device in self._devices.values():
-            device.tick(now_ns)
+        if self._is_soon or now_ns >= self._devices_due_ns:
+            self._is_soon, self._devices_due_ns = False, now_ns + DEVICES_NS
+            self._host.utc_offset_ns()  # without samples too: the rate of the clock is a mean between two reads
+            for device in self._devices.values():
+                device.tick(now_ns)
         self._outputs.tick(now_ns)
         self._manager.tick(now_ns, self._status_line)
         self._alarm.set(TICK_S if self._is_soon else QUIET_TICK_S)
 
     def _status_line(self) -> str:
-        conditions = {name: device.condition for name, device in self._devices.items()}
+        conditions = [*self._devices, *map(CONDITION, self._devices.values())]
         if conditions != self._conditions:
-            self._conditions, self._summary_line = conditions, summary(conditions)
+            self._conditions = conditions
+            self._summary_line = summary({name: device.condition for name, device in self._devices.items()})
         return self._summary_line
 
     async def _close(self) -> None:

@@ -394,7 +394,8 @@ class RecentCounts:
         if lost != before:
             self._add_loss(now_ns, _by_cause(before, lost))
         seconds.append((now_ns, ledger.samples, ledger.bytes_in, lost))
-        while seconds[1][0] <= now_ns - MINUTE_NS:  # one count remains before the minute
+        begin_ns = now_ns - MINUTE_NS
+        while seconds[1][0] <= begin_ns:  # one count remains before the minute
             seconds.popleft()
         if abs(rate_hz - self._steady_hz) > STEADY * self._steady_hz:
             self._steady_ns, self._steady_hz = now_ns, rate_hz

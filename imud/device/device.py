@@ -276,7 +276,7 @@ class Device:
             self._transport.close()
 
     def tick(self, now_ns: int) -> None:
-        """Update the state, detect an idle link, and send collected events. Called twice per second, and ten times per
+        """Update the state, detect an idle link, and send collected events. Called once per second, and ten times per
         second while `_needs_ticks`. While samples arrive, the work is due once per second."""
         transport, health, judge, path = self._transport, self._health, self._judge, self._transport.path
         has_news = path is None or now_ns - path.last_sample_ns > IDLE_FLUSH_NS or health.state is not RUNNING
@@ -284,7 +284,7 @@ class Device:
         is_quick = self._is_quick and not (has_news or transport.busy or self.settings.lock.work is not None)
         if is_quick and not is_due:
             return
-        needs_ticks = not is_quick and self._needs_ticks()
+        needs_ticks = not is_quick and self._needs_ticks(now_ns)
         if needs_ticks:
             self._shared.owner.tick_soon()
             self._attachments.tick(now_ns, path.newest if path is not None else None)
@@ -337,12 +337,14 @@ class Device:
     def condition(self) -> Condition:
         return self._judge.watch.level
 
-    def _needs_ticks(self) -> bool:
+    def _needs_ticks(self, now_ns: int) -> bool:
         """Return whether the device needs ten ticks per second."""
-        state = self._health.state
+        state, path = self._health.state, self._transport.path
         # `flush` must complete the samples of a slow device
         if self._is_slow if state is RUNNING else state in WATCHED:
             return True
+        if state is RUNNING and path is not None and now_ns - path.last_sample_ns > SILENCE_NS // 2:
+            return True  # it can become silent before the next tick of quiet devices
         return self._attachments.needs_ticks or self._transport.busy or self.settings.lock.work is not None
 
     def close(self) -> None:

@@ -57,7 +57,7 @@ class SampleWatch:
     def mark(self) -> None:
         """Start the watch, before the command."""
         self._pause_ns, self._before, self._resets = 0, self.newest, self.counter_resets
-        self._seen = self._before  # the last tick can be half a second old
+        self._seen = self._before  # the last tick can be one second old
 
     @property
     def newest(self) -> Sample | None:

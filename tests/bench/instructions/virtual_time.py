@@ -14,7 +14,9 @@ BEGIN_NS: Final = 1000 * NS_PER_S
 UTC_AHEAD_NS: Final = 1_795_000_000 * NS_PER_S  # CLOCK_REALTIME minus CLOCK_MONOTONIC
 
 _ns = [BEGIN_NS, BEGIN_NS + UTC_AHEAD_NS]
-_by_clock = {time.CLOCK_MONOTONIC_RAW: BEGIN_NS, time.CLOCK_BOOTTIME: BEGIN_NS}
+RAW: Final = time.CLOCK_MONOTONIC_RAW
+BOOTTIME: Final = time.CLOCK_BOOTTIME
+_by_clock = {RAW: BEGIN_NS, BOOTTIME: BEGIN_NS}
 _s = [BEGIN_NS / NS_PER_S]
 
 
@@ -31,6 +33,6 @@ def now_ns() -> int:
 
 
 def set_now(now_ns: int) -> None:
-    _ns[:] = now_ns, now_ns + UTC_AHEAD_NS
-    _by_clock[time.CLOCK_MONOTONIC_RAW] = _by_clock[time.CLOCK_BOOTTIME] = now_ns
+    _ns[0], _ns[1] = now_ns, now_ns + UTC_AHEAD_NS
+    _by_clock[RAW] = _by_clock[BOOTTIME] = now_ns
     _s[0] = now_ns / NS_PER_S
