@@ -154,12 +154,16 @@ async def test_an_unknown_device_and_ticks_at_two_rates(monkeypatch: pytest.Monk
     await asyncio.sleep(0)
     with pytest.raises(CommandError, match=r"^nobody: no such device$"):
         daemon.control("nobody")
+    daemon._devices["bow"] = device = Mock()
     daemon.tick_soon()
     daemon.tick_soon()  # the first request is enough
     monkeypatch.setattr("imud.publishers.outputs.Outputs.tick", lambda *_: daemon.tick_soon())
     alarm.due_s = None  # as during a tick
     daemon.on_alarm()
     assert [call.args for call in alarm.set.call_args_list] == [(0.5,), (0.1,), (0.1,)]
+    daemon._is_soon, daemon._devices_due_ns = False, 1 << 62
+    daemon.on_alarm()  # between two ticks of quiet devices
+    assert device.tick.call_count == 1
     daemon.stop()
     await running
 
@@ -557,8 +561,7 @@ async def test_a_reload_ends_with_an_error_of_its_own_and_with_the_daemon(tmp_pa
     await asyncio.sleep(0)
     await reloader.close()
     await asyncio.sleep(0)
-    assert [task.cancelled() for task in tasks] == [True]
-    assert target.applied == []
+    assert ([task.cancelled() for task in tasks], target.applied) == ([True], [])
 
 
 @pytest.mark.live

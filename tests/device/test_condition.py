@@ -227,8 +227,7 @@ def test_a_short_cause_a_repaired_setting_and_a_missing_device() -> None:
     assert watched.after(1, GONE) == "missing"  # before the first sample without a delay
     assert (watched.after(1), watched.after(6, LOST)) == ("ok", "degraded")
     assert (watched.after(5, GONE), watched.after(1, GONE)) == ("degraded", "missing")
-    assert watched.watch.condition.reasons == (GONE.reason(),)
-    assert watched.after(1) == "ok"
+    assert (watched.watch.condition.reasons, watched.after(1)) == ((GONE.reason(),), "ok")
 
 
 def test_history_contains_the_worst_condition_of_each_minute() -> None:
@@ -243,8 +242,7 @@ def test_history_contains_the_worst_condition_of_each_minute() -> None:
     assert watched.watch.history[-3:] == ("ok", None, "ok")
     watched.now_s += 100_000
     watched.after(1)
-    assert watched.watch.history[-2:] == (None, "ok")
-    assert len(watched.watch.history) == 60
+    assert (watched.watch.history[-2:], len(watched.watch.history)) == ((None, "ok"), 60)
 
 
 def test_text_of_a_condition_and_status_of_another_version() -> None:

@@ -201,8 +201,7 @@ async def test_a_module_with_a_new_address_is_followed(bench: LineBench, monkeyp
         for rig in rigs:
             await rig.until_samples(5)
         await rigs[0].device.act("move", {"address": 2})
-        assert module.settings.slave == 2
-        assert rigs[0].device.status().link == f"{bench.path}, address 2"
+        assert (module.settings.slave, rigs[0].device.status().link) == (2, f"{bench.path}, address 2")
         await rigs[0].until_samples(5)
         assert EventKind.DOWN not in rigs[0].kinds
         module.dead = True  # found at the new address, although the configuration contains the old address

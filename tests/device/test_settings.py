@@ -216,8 +216,7 @@ async def test_a_difference_raises_one_event_and_no_write(bench: ModuleBench) ->
     await bench.pass_s(100)
     found = 'mode is "6-axis", declared "9-axis", offset_deg is 0.0, declared 1.5'
     message = f"settings differ from the declared settings: {found}"
-    assert bench.messages == [message]
-    assert bench.told[0].detail == {"mode": '"6-axis"', "offset_deg": "0.0"}
+    assert (bench.messages, bench.told[0].detail) == ([message], {"mode": '"6-axis"', "offset_deg": "0.0"})
     assert (bench.status.differences["mode"].declared, bench.written()) == ("9-axis", [])
     assert [reason.code for reason in bench.device.status().reasons] == [ReasonCode.SETTING] * 2
     asked = bench.module.commands.count("GET")
@@ -476,8 +475,7 @@ async def test_plan_and_apply_of_given_values(bench: ModuleBench) -> None:
         with pytest.raises(BadArgument, match=message):
             await bench.doing(bench.device.settings.apply(given, save=True))
     plan = await bench.doing(bench.device.settings.plan({"mode": "9-axis", "baud": 921600}, save=True))
-    assert [step.name for step in plan.steps] == ["mode", "baud"]
-    assert bench.written() == []
+    assert ([step.name for step in plan.steps], bench.written()) == (["mode", "baud"], [])
     applied = await bench.doing(bench.device.settings.apply({"mode": "9-axis"}, save=False))
     assert [(one.name, one.before, one.outcome) for one in applied.steps] == [("mode", "6-axis", StepOutcome.VERIFIED)]
     assert (applied.problem, applied.saved, applied.differences) == ("", False, {})

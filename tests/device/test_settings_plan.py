@@ -42,8 +42,7 @@ def test_only_different_or_unreadable_settings_are_written() -> None:
     assert not planned({"mode": "9-axis"}, save=False).save
     assert planned({"mode": "6-axis"}, unsaved=True).save  # a previous write is not saved
     assert not planned({"mode": "6-axis"}, save=False, unsaved=True).save
-    assert names(planned({"secret": 5})) == ["secret"]
-    assert names(planned({"secret": 5}, secret=5)) == []
+    assert (names(planned({"secret": 5})), names(planned({"secret": 5}, secret=5))) == (["secret"], [])
     assert names(planned({"secret": 5}, secret=4)) == ["secret"]
     plan = settings_plan.make_plan(
         FAKE_SETTINGS, TARGET, {"secret": 5}, ACTUAL, {"secret": 5}, save=False, unsaved=False, by_name=True
@@ -372,8 +371,7 @@ def test_values_are_written_read_back_saved_and_compared() -> None:
     assert list(found.differences) == ["x"]
     device, flash = TableOfOne(setting.Written.VERIFIED, saves=True, connection=True), CountedFlash()
     found = applied(device, flash=flash)
-    assert device.done == ["x=2", "read"]
-    assert (found.saved, flash.counted) == (True, 1)
+    assert (device.done, (found.saved, flash.counted)) == (["x=2", "read"], (True, 1))
     device = TableOfOne(setting.Written.PENDING, effect=setting.Effect.AFTER_RESTART, connection=True, bus_rate=True)
     done = applied(device, by_name=True)
     assert (done.saved, done.restarted, done.problem) == (True, False, "")

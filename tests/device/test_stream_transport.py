@@ -92,8 +92,7 @@ async def test_after_a_replug_sequence_numbers_and_times_increase(rig: DeviceRig
     assert [s.seq for s in rig.samples] == list(range(1, 9))
     times = [s.t_ns for s in rig.samples]
     assert (times, rig.kinds) == (sorted(set(times)), [EventKind.UP, EventKind.DOWN, EventKind.UP])
-    assert rig.device.status().connects == 2
-    assert rig.ledger.lost() == 0
+    assert (rig.device.status().connects, rig.ledger.lost()) == (2, 0)
 
 
 @told(play)

@@ -454,6 +454,5 @@ def test_group_and_mode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     publisher = make(tmp_path, group=grp.getgrgid(os.getegid()).gr_name, mode=0o604)
     publisher.start()
     publisher.add_device("a", 0)
-    assert given == [(-1, os.getegid())]
-    assert stat.S_IMODE((tmp_path / "imud.a").stat().st_mode) == 0o604
+    assert (given, stat.S_IMODE((tmp_path / "imud.a").stat().st_mode)) == ([(-1, os.getegid())], 0o604)
     publisher.close()
