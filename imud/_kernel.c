@@ -988,9 +988,10 @@ typedef struct {
     uint8_t sync, reserved[3];
     float low[12], high[12]; /* accel, gyro, mag, euler */
     float quat_wxyz[4], temperature_c, pressure_pa;
+    uint32_t lost, gaps; /* Python counts them */
 } Second;
 
-_Static_assert(sizeof(Second) == 176, "a second has 176 bytes without padding");
+_Static_assert(sizeof(Second) == 184, "a second has 184 bytes without padding");
 
 /* Return whether each value is finite and fits into a float. */
 static int fit_float(const double *values, int count)
@@ -1072,7 +1073,7 @@ static PyObject *add_slots(PyObject *self, PyObject *args)
     if (!PyArg_ParseTuple(args, "w*y*n:add_slots", &open, &slots, &offset))
         return NULL;
     if (open.len != (Py_ssize_t)sizeof(Second) || offset < 0) {
-        PyErr_SetString(PyExc_ValueError, "expected 176 bytes of a second and an offset of 0 or more");
+        PyErr_SetString(PyExc_ValueError, "expected 184 bytes of a second and an offset of 0 or more");
     } else {
         Second second;
         Slot slot;

@@ -46,6 +46,7 @@ from imud.lines.gpio import GPIO_LINES
 from imud.lines.watched_line import watching
 from imud.model.errors import CommandError, ConfigError, ImudError, ServerError
 from imud.model.event import Event, EventKind
+from imud.model.ledger import NOTHING_LOST
 from imud.model.units import NS_PER_MS
 from imud.publishers.outputs import Outputs
 from imud.utc.system_clock import kernel_clock, system_reference
@@ -314,6 +315,11 @@ class Daemon:
     def ledgers(self) -> list[DeviceLedger]:
         """Return the ledgers of all devices."""
         return [(name, device.driver_name, device.ledger.values()) for name, device in self._devices.items()]
+
+    def losses(self, name: str) -> tuple[int, ...]:
+        """Return the counters of losses of a device (`Ledger.losses`); zeros if the device does not exist."""
+        device = self._devices.get(name)
+        return NOTHING_LOST if device is None else device.ledger.losses()
 
     def configured_devices(self) -> Sequence[DeviceConfig]:
         """Return all devices of the present configuration."""

@@ -260,6 +260,10 @@ class Devices(Protocol):
         """Return name, driver and counters (in the order of LEDGER_FIELDS) of every device."""
         ...
 
+    def losses(self, name: str) -> tuple[int, ...]:
+        """Return the counters of losses of a device (`Ledger.losses`); zeros if the device does not exist."""
+        ...
+
     def control(self, name: str) -> DeviceControl:
         """Return the device of this name. Raises CommandError if the device does not exist."""
         ...

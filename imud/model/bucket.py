@@ -34,3 +34,5 @@ class Bucket(msgspec.Struct, frozen=True, omit_defaults=True):
     quat_wxyz: tuple[float, ...] | None = None
     temperature_c: float | None = None
     pressure_pa: float | None = None
+    lost: int = 0  # number of lost samples by the ledger, without gaps of unknown size
+    gaps: int = 0  # number of gaps of unknown size

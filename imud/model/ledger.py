@@ -128,6 +128,7 @@ class Ledger:
 BYTE_FIELDS: Final = ("bytes_in", "bytes_in_good_frames", "bytes_in_bad_frames", "bytes_skipped", "bytes_pending")
 FRAME_FIELDS: Final = ("frames_good", "frames_in_samples", "frames_in_replies", "frames_ignored", "frames_pending")
 LOST_FIELDS: Final = tuple(name for name in LEDGER_FIELDS if name.startswith("lost_"))  # counters of losses by cause
+NOTHING_LOST: Final = (0,) * len(LOST_FIELDS)
 
 
 def lost(counts: Mapping[str, int]) -> int:

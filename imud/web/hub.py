@@ -7,7 +7,7 @@ event loop calls all other methods.
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import isfinite
 from threading import BoundedSemaphore
 from typing import Final
@@ -37,6 +37,7 @@ class Bucketing:
 
     def __init__(self, rate_hz: int) -> None:
         self._period_ns = NS_PER_S // rate_hz
+        self.lost = self.gaps = 0  # counted losses that no bucket contains yet
         self._open: list[Sample] = []
         self._number = -1  # number of the interval of the open bucket
 
@@ -55,10 +56,13 @@ class Bucketing:
 
     def _end(self) -> list[Bucket]:
         samples, self._open = self._open, []
-        return [bucket_of(samples)] if samples else []
+        if not samples:
+            return []
+        lost_now, gaps, self.lost, self.gaps = self.lost, self.gaps, 0, 0
+        return [bucket_of(samples, lost_now, gaps)]
 
 
-def bucket_of(samples: Sequence[Sample]) -> Bucket:
+def bucket_of(samples: Sequence[Sample], lost_samples: int = 0, gaps: int = 0) -> Bucket:
     """Return the bucket of samples of one device, at least one. Ignore values that are not finite."""
     first, last = samples[0], samples[-1]
     ranges = {name: _range([getattr(sample, name) for sample in samples]) for name in VECTORS}
@@ -74,6 +78,8 @@ def bucket_of(samples: Sequence[Sample]) -> Bucket:
         quat_wxyz=_last([sample.quat_wxyz for sample in samples]),
         temperature_c=next((one.temperature_c for one in reversed(samples) if one.temperature_c is not None), None),
         pressure_pa=next((one.pressure_pa for one in reversed(samples) if one.pressure_pa is not None), None),
+        lost=lost_samples,
+        gaps=gaps,
         **ranges,
     )
 
@@ -296,6 +302,8 @@ class BrowserHub:
         self._spread_state(news)
         if news.statuses is not None:
             before, self._statuses = self._statuses, {status.name: status for status in news.statuses}
+            if news.hello is None:  # the first status of a connection can follow the previous status after hours
+                self._count_losses(before)
             if before.keys() != self._statuses.keys():
                 self._want()  # a page can show a device that did not exist
             self._clients = news.clients
@@ -309,6 +317,14 @@ class BrowserHub:
         if news.dropped:
             self.dropped_samples += news.dropped
         self._spread_samples(news)
+
+    def _count_losses(self, before: Mapping[str, DeviceStatus]) -> None:
+        """Add the losses since the previous status to the next bucket of each device."""
+        for (_, name, _), bucketing in self._buckets.items():
+            if name in before and name in self._statuses:
+                then, now = _counts(before[name]), _counts(self._statuses[name])
+                bucketing.lost += max(lost(now) - lost(then), 0)
+                bucketing.gaps += max(now["lost_unknown"] - then["lost_unknown"], 0)
 
     def _spread_state(self, news: News) -> None:
         before = self._state

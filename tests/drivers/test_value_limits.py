@@ -40,6 +40,7 @@ from imud.publishers.nmea0183 import Formatter, HeadingReference, make
 from imud.publishers.socket.history import History, buckets
 from imud.publishers.socket.outbox import BinaryEncoding, JsonEncoding
 from imud.web.hub import bucket_of, raw_of
+from tests.support.publisher_context import publisher_context
 
 
 def test_limits_of_values_and_temperatures() -> None:
@@ -153,7 +154,7 @@ def test_no_output_raises_or_contains_an_impossible_value(name: str, seed: int) 
     assert motion is not None
     assert inf not in (motion.accel_norm_m_s2, *(motion.vibration_rms_m_s2 or ()), *(motion.vibration_peak_m_s2 or ()))
     assert len(BinaryEncoding(Convention.NED_FRD).encode(batch.converted(Convention.ENU_FLU))) == len(samples)
-    history = History()
+    history = History(publisher_context().devices)
     history.add(batch)
     text = msgspec.json.encode(list(buckets(history.seconds("bow"), 0, 10**15, 1, rotation)))
     text += b"".join(JsonEncoding(None, framed=True, texts=True, convention=Convention.NED_FRD).encode(batch))

@@ -17,7 +17,7 @@ from imud.contracts.publisher import (
 from imud.contracts.status import DeviceStatus
 from imud.model.errors import CommandError
 from imud.model.event import Event
-from imud.model.ledger import LEDGER_FIELDS
+from imud.model.ledger import LEDGER_FIELDS, NOTHING_LOST
 
 
 class NothingRecorded:
@@ -73,6 +73,7 @@ class FakeDevices:
     recording: RecordingSource
     each_status: Callable[[], Iterator[DeviceStatus]]
     ledgers: Callable[[], Sequence[DeviceLedger]]
+    losses: Callable[[str], tuple[int, ...]]
 
 
 @dataclass
@@ -90,10 +91,12 @@ def publisher_context(
     ledgers: Callable[[], Sequence[DeviceLedger]] | None = None, recording: RecordingSource | None = None,
     outputs: OutputFacts | None = None, latencies: Latencies | None = None, watch_line: WatchLine = _no_line,
     raise_event: Callable[[Event], None] = lambda _event: None,
+    losses: Callable[[str], tuple[int, ...]] = lambda _name: NOTHING_LOST,
 ) -> PublisherContext:  # fmt: skip
     devices = FakeDevices(
         status, control, recording or NothingRecorded(), each_status or (lambda: iter(status())),
         ledgers or (lambda: [(d.name, d.driver, tuple(d.ledger.get(f, 0) for f in LEDGER_FIELDS)) for d in status()]),
+        losses,
     )  # fmt: skip
     return PublisherContext(
         epoch, PublisherClock(now_ns, utc_offset_ns, utc_reference, cpu_ns), devices, outputs or OutputFacts(),

@@ -165,8 +165,14 @@ async def test_pages_get_new_events_and_the_samples_of_both_compared_devices() -
     single = opened(hub, look="device", device="bow")
     assert (wanted := feed.wanted[-1]) is not None
     assert wanted.devices == ("bow",)
-    hub.take_compared(news(1, 60))
-    assert await heard(late, "samples")
+    ledger = device("bow").ledger
+    for hello, times in ((HELLO, 1), (None, 2)):  # the first status of a connection is no loss
+        counts = (("lost_crc", 3 * times), ("lost_queue", 4 * times), ("lost_unknown", times))
+        more = {name: ledger[name] + count for name, count in counts}
+        hub.spread(News(statuses=(device("bow", ledger=ledger | more), device("stern", 1)), hello=hello))
+    hub.take_compared(news(1, 110))
+    (message,) = await heard(late, "samples")
+    assert [(one.get("lost"), one.get("gaps")) for one in message["buckets"]] == [(7, 1), (None, None)]
     assert not await heard(single, "samples"), "other axes"
 
 

@@ -89,6 +89,13 @@ PINCH = """const box = document.querySelector('#accel_m_s2 .plot');
     touch('touchmove', [0.3, 0.7]);
     touch('touchend', []);"""
 """Two fingers move to twice their distance."""
+COMPARED = """const { plots, difference } = window.imud?.view ?? {};
+    if (!difference?.stored) return false;
+    const end = difference.data[0][difference.stored - 1];"""
+"""Plots of a comparison, and end of the history in them."""
+OF_DEVICE = """const { plots: all, time } = window.imud?.view ?? {};
+    const [plots, difference] = [[all?.get?.('accel_m_s2')], time?.stamps];
+    if (!difference?.stored) return false;"""
 POINTS = "return window.imud.view.plots?.get('accel_m_s2').data[0].length >= arguments[0]"
 PLOTTED = """const plot = window.imud.view.plots.get('accel_m_s2');
     const lines = [plot.plot.data[0].map((x) => x - plot.offset_s), plot.plot.data[6], plot.plot.data[5]];
@@ -373,7 +380,8 @@ def test_keys_the_filter_and_stored_events(page: Page, site: Site) -> None:
 
 
 def test_two_devices_are_compared_with_their_delay(page: Page, tmp_path: Path) -> None:
-    """Both devices move in the same way, the second 100 ms later, with an offset of 0.5 m/s²."""
+    """Both devices move in the same way, the second 100 ms later, with an offset of 0.5 m/s². Some of its frames are
+    lost, before the page is open and after it."""
 
     def moved(offset: float, late_s: float) -> Callable[[int], bytes]:
         def value(number: int) -> float:
@@ -382,13 +390,16 @@ def test_two_devices_are_compared_with_their_delay(page: Page, tmp_path: Path) -
 
         return upright(value)
 
+    def lossy(frame_of: Callable[[int], bytes]) -> Callable[[int], bytes]:
+        return lambda number: b"" if number % 100 == 99 else frame_of(number)
+
     begun_s: dict[float, float] = {}
     (tmp_path / "other").mkdir()
     with cable(tmp_path) as one, cable(tmp_path / "other") as other:
         devices = {"bow": configured(one.name), "stern": configured(other.name)}
         with (
             running_daemon(tmp_path, devices, python=()) as daemon,
-            Sender(one, moved(0.5, 0.0)), Sender(other, moved(0.0, 0.1)), serving_web(daemon.socket) as url,
+            Sender(one, moved(0.5, 0.0)), Sender(other, lossy(moved(0.0, 0.1))), serving_web(daemon.socket) as url,
         ):  # fmt: skip
             daemon.wait_for("bow", "running")
             daemon.wait_for("stern", "running")
@@ -404,7 +415,13 @@ def test_two_devices_are_compared_with_their_delay(page: Page, tmp_path: Path) -
             name, mean, _rms, _most, same, delay = page.until(f"{row}; return !row.includes('–') && row")
             page.until_text(".notes", "Both devices use the same axes: body: x forward, y left, z up")
             assert "imud rotates the values of bow and stern." in page.text(".notes")
+            page.until(f"{COMPARED} return [...plots, difference].every((one) => one.losses.at(-1) > end)")
             assert (faults_of(page), page.problems()) == ([], [])
+            for address, all_plots in (("compare/bow/stern", COMPARED), ("device/stern", OF_DEVICE)):
+                page.driver.get("about:blank")
+                page.driver.get(f"{url}#/{address}")
+                begin = page.js("return Date.now() / 1000")
+                page.until(f"{all_plots} return [...plots, difference].every((one) => one.losses[0] < {begin} - 3)")
     assert name == "z"
     assert float(mean.split()[0]) == pytest.approx(0.5, abs=0.2)
     assert float(same) > 0.6
@@ -484,17 +501,22 @@ def test_a_plot_merges_old_points_without_loss_of_a_peak(scripts: Page) -> None:
         for (let t = 0; t < 8000; t += 1) {
           const range = t === 7003 ? [[-7], [9]] : [[1], [2]];
           const count = args[0].includes(t) ? 3 : 4;
-          const bucket = { first_s: t, last_s: t, utc_s: t, seq: t, count, t_err_s: t === 7980 ? 0.1 : 0 };
+          const lost = args[0].includes(t - 1) ? 1 : undefined; // imud web gets the counts of the ledger later
+          const bucket = { first_s: t, last_s: t, utc_s: t, seq: t, count, lost, t_err_s: t === 7980 ? 0.1 : 0 };
           if (t < 6000 || t > 6100) plot.add(bucket, range, 1);
         }
-        return [plot.stored, ...plot.data, plot.losses]""",
+        const past = new RollingPlot('p', 'p', 'm', ['x'], {}, group);
+        const second = (t) => [{ first_s: t, last_s: t, utc_s: t, seq: t, count: 1, gaps: t % 3 }, 1];
+        past.restore([0, 1, 2, 3].map(second), () => [[1], [2]]);
+        return [plot.stored, ...plot.data, [plot.losses, past.losses]]""",
         [7000, 7980, 7990],
     )
     assert 8000 - 3600 - 60 <= xs[0] < 8000 - 3500
     assert xs == sorted(xs)
     assert len(xs) - stored <= 663
     assert (most.index(9), most.count(9), most.count(None)) == (least.index(-7), 1, 2), "one peak, one gap, one loss"
-    assert (losses, xs[most.index(None, stored)]) == ([6101, 7000, 7990], 7989.5), "a time stamp error hides one"
+    assert xs[most.index(None, stored)] == 7989.5, "a time stamp error hides the place of one"
+    assert losses == [[6101, 7000, 7981, 7990], [1, 2]], "one mark for a loss"
 
 
 def test_a_hidden_page_reads_nothing(page: Page, site: Site) -> None:

@@ -1,7 +1,7 @@
 """History of the samples for plots: minimum and maximum of each second of the last hour, by device.
 
-A second is one record of 176 bytes with single precision. imud adds packed slots to the open second, so no sample
-object is made. The kernel in C does this work if it is installed.
+A second is one record of 184 bytes with single precision. imud adds packed slots to the open second, so no sample
+object is made. The kernel in C does this work if it is installed. The lost samples of a second come from the ledger.
 """
 
 from bisect import bisect_left
@@ -17,7 +17,7 @@ from typing import Any, Final
 import msgspec
 
 from imud.attitude.published import PublishedAxes, Rotation
-from imud.contracts.publisher import Batch
+from imud.contracts.publisher import Batch, Devices
 from imud.formats import kernel
 from imud.formats.slot import (
     HAS_ACCEL,
@@ -37,13 +37,14 @@ from imud.model.units import NS_PER_S
 KEPT_S: Final = 3600
 """Maximum age of the oldest second, s."""
 BYTES_MAX: Final = 64 << 20
-"""Maximum memory of all devices, bytes. With more than 105 devices, the history of each is shorter."""
+"""Maximum memory of all devices, bytes. With more than 101 devices, the history of each is shorter."""
 BATCHES_MAX: Final = 16
 """Number of batches that imud adds to a second together. The work for each wake-up is then small."""
 
 # first t_ns, last t_ns, last utc_ns, maximum latency, last seq, count, maximum t_err_ns, present bits, last sync,
-# minimum and maximum of 12 axes, last quaternion, last temperature, last pressure
-SECOND: Final = Struct("<qqqqQIIIB3x12f12f4fff")
+# minimum and maximum of 12 axes, last quaternion, last temperature, last pressure, lost samples, gaps of unknown size
+SECOND: Final = Struct("<qqqqQIIIB3x12f12f4fffII")
+_COUNT_MAX: Final = (1 << 32) - 1
 _NEW: Final = bytes(SECOND.size)
 # seq, t_ns, t_rx_ns, utc_ns, t_err_ns, present, sync, values
 _SLOT: Final = Struct("<Qqqq16xII6xBx9d4d3ddd48x")
@@ -108,9 +109,18 @@ class _DeviceHistory:
     """Seconds of one device. A second without samples has no record."""
 
     frame: PublishedAxes  # axes and angles of the samples
+    losses: tuple[int, ...]  # `Ledger.losses` at the newest slot in a second
     open: bytearray = field(default_factory=lambda: bytearray(_NEW))
     kept: bytearray = field(default_factory=bytearray)  # complete seconds, oldest first
     waiting: list[bytes] = field(default_factory=list)  # slots of the newest batches, not yet in a second
+
+    def add_losses(self, losses: tuple[int, ...]) -> None:
+        """Add the losses since the previous call to the open second."""
+        *lost, gaps = (max(now - then, 0) for then, now in zip(self.losses, losses, strict=True))
+        self.losses = losses
+        for place, count in ((SECOND.size - 8, sum(lost)), (SECOND.size - 4, gaps)):
+            known = int.from_bytes(self.open[place : place + 4], "little")
+            self.open[place : place + 4] = min(known + count, _COUNT_MAX).to_bytes(4, "little")
 
     def end_second(self, seconds_max: int) -> None:
         """Keep the open second, and remove the seconds that are too old."""
@@ -133,7 +143,8 @@ def _first_ns(records: bytearray, offset: int = 0) -> int:
 class History:
     """History of all devices. Synchronization: the event loop's thread only."""
 
-    def __init__(self) -> None:
+    def __init__(self, devices: Devices) -> None:
+        self._owner = devices
         self._devices: dict[str, _DeviceHistory] = {}
         self._add_slots = getattr(kernel.present.module, "add_slots", add_slots)
 
@@ -145,19 +156,27 @@ class History:
     def add(self, batch: Batch) -> None:
         device = self._devices.get(batch.device)
         if device is None or (device.frame is not batch.frame and device.frame != batch.frame):
-            device = self._devices[batch.device] = _DeviceHistory(batch.frame)
+            device = self._devices[batch.device] = _DeviceHistory(batch.frame, self._owner.losses(batch.device))
         waiting = device.waiting
         waiting.append(batch.packed)
         if len(waiting) >= BATCHES_MAX:
-            self._add_waiting(device)
+            self._add_waiting(batch.device, device)
 
-    def _add_waiting(self, device: _DeviceHistory) -> None:
+    def _add_waiting(self, name: str, device: _DeviceHistory) -> None:
         packed = b"".join(device.waiting)
         device.waiting.clear()
         offset = self._add_slots(device.open, packed, 0)
         while offset < len(packed):
             device.end_second(self.kept_s)
             offset = self._add_slots(device.open, packed, offset)
+        if (losses := self._owner.losses(name)) != device.losses:
+            device.add_losses(losses)
+
+    def tick(self) -> None:
+        """Add the waiting slots of the devices with a loss. Otherwise the loss of a slow device would be late."""
+        for name, device in self._devices.items():
+            if device.waiting and self._owner.losses(name) != device.losses:
+                self._add_waiting(name, device)
 
     def remove(self, device: str) -> None:
         """Forget a device. Do nothing if it is unknown."""
@@ -179,7 +198,7 @@ class History:
         if known is None:
             return b""
         if known.waiting:
-            self._add_waiting(known)
+            self._add_waiting(device, known)
         return bytes(known.kept) + (bytes(known.open) if known.open != _NEW else b"")
 
 
@@ -225,6 +244,8 @@ def _bucket(seconds: list[tuple[Any, ...]]) -> Bucket:
         quat_wxyz=newest(HAS_QUAT, 0, 4),
         temperature_c=None if temperature is None else temperature[0],
         pressure_pa=None if pressure is None else pressure[0],
+        lost=sum(one[39] for one in seconds),
+        gaps=sum(one[40] for one in seconds),
         **ranges,
     )
 

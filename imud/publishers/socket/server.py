@@ -306,7 +306,7 @@ class SocketServer:
         self.hub = Hub(settings.path, context, self._quota, self._time, pool, handle_line)
         has_history = kernel.present.module is not None if settings.history is None else settings.history
         if has_history:  # a reload of the section `socket` makes a new server, which continues the history
-            self.hub.history = context.kept.setdefault("history", History())
+            self.hub.history = context.kept.setdefault("history", History(context.devices))
         else:
             context.kept.pop("history", None)
         # direct references: a method of this class would cost one more call per batch
@@ -379,6 +379,8 @@ class SocketServer:
         self._quota.tick()
         if is_due:
             self._check_ns = now_ns + CHECK_NS
+            if hub.history is not None:
+                hub.history.tick()
             if not listener.has_file():
                 self._replace_file(listener)
         if self._paused:

@@ -101,7 +101,7 @@ export class Compare {
     this.makePlots();
     const [a, b] = this.names;
     this.grid.hidden = this.tools.hidden = !a || !b;
-    this.help.textContent = `rms and maximum are measured from the mean. A value of the history is the middle of the minimum and the maximum in its interval. Delay in the newest minute: ${b} shows the same motion this much later than ${a}; “–” if it is not clear.`;
+    this.help.textContent = `rms and maximum are measured from the mean. A value of the history is the middle of the minimum and the maximum in its interval. Delay in the newest minute: ${b} shows the same motion this much later than ${a}; “–” if it is not clear. A red mark shows lost samples of either device.`;
     if (a && b) this.stream.look({ look: "device", device: a, other: b, rate_hz: RATE_HZ });
     else this.stream.look({ look: "overview" });
   }
@@ -138,9 +138,15 @@ export class Compare {
       this.drawNotes();
     }
     const index = message.kind === "samples" && message.convention && !this.group.isPaused ? this.names.indexOf(message.device) : -1;
+    if (index >= 0) this.mark(message.buckets);
     for (const bucket of index < 0 ? [] : message.buckets) if (bucket[this.kind]) this.waiting[index].push([bucket, (bucket.first_s + bucket.last_s) / 2, this.values(index, bucket[this.kind])]);
     if (index >= 0) this.pair();
     if (index === 0) for (const bucket of message.buckets) if (this.arrivals.add(bucket)) this.restore(bucket.last_s);
+  }
+
+  /** Mark the lost samples of either device. */
+  mark(buckets) {
+    for (const plot of [...this.plots, this.difference]) for (const bucket of buckets) plot.mark(bucket);
   }
 
   /** Show the history of the daemon: the middle of minimum and maximum of each interval. */
@@ -163,6 +169,7 @@ export class Compare {
       const [one, other] = rows.get(bucket);
       return other[0] === null ? null : both(one.map((value, axis) => value - other[axis]));
     });
+    this.mark(b.map(([one]) => one));
   }
 
   /** Return the middle of each range. An angle is at most half a turn from the previous angle of a device. */

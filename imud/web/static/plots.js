@@ -11,6 +11,7 @@ const FINE_S = 600; // age at which a plot merges points
 const MERGED_S = 6; // time span of a merged point
 const LOCATED_PERIODS = 0.1; // largest time stamp error, in sample periods, with which a step of the time shows a lost sample
 const COUNTED_S = 2; // time of samples that the sample rate can count
+const MARK_S = 2; // least time between two marks: imud web gets the counts of lost samples once per second
 const GAP_LEAST_S = 1; // least time without values that breaks the line of merged points
 const MERGE_S = 60; // time span of the points that a plot merges together
 const LANE_MARGIN = 0.12; // free share of the height of a lane, above and below its curve
@@ -281,14 +282,21 @@ export class RollingPlot {
       this.step_s = undefined;
     } else if (before !== undefined) this.step_s = x - before;
     if (this.last && isLossBetween(this.last, bucket, this.group.rate_hz)) {
-      this.losses.push(x);
+      this.losses.push(x); // the place of the gap is exact
       if (xs.length && isNumber(this.data[1].at(-1))) this.push((xs.at(-1) + x) / 2, null);
     }
+    this.mark(bucket);
     this.last = bucket;
     this.push(x, range);
     this.newest = x;
     if (xs[this.stored] < x - FINE_S - MERGE_S) this.merge();
     this.draw();
+  }
+
+  /** Mark the lost samples that the ledger counted in a bucket, unless a mark is near. */
+  mark({ lost, gaps, first_s, last_s }, near_s = MARK_S) {
+    const x = (first_s + last_s) / 2 + this.offset_s;
+    if ((lost || gaps) && !this.losses.some((one) => Math.abs(one - x) < near_s)) this.losses.push(x);
   }
 
   merge() {
@@ -324,7 +332,6 @@ export class RollingPlot {
     const live = this.data;
     const { utc_s, last_s } = buckets.at(-1)[0];
     this.offset_s ??= utc_s - last_s;
-    const xOf = (bucket) => (bucket.first_s + bucket.last_s) / 2 + this.offset_s;
     const [first, last] = [buckets[0][0].first_s, last_s].map((one) => one + this.offset_s);
     const [begin, end] = [first, last].map((x, index) => live[0].filter((one) => (index ? one <= x : one < x)).length);
     this.data = live.map((one) => one.slice(0, begin));
@@ -332,10 +339,9 @@ export class RollingPlot {
     if (begin && first - live[0][begin - 1] > HOLE_BUCKETS * buckets[0][1]) this.push((live[0][begin - 1] + first) / 2, null);
     let before = null;
     for (const [bucket, period_s] of buckets) {
-      const x = xOf(bucket);
       if (before && bucket.first_s - before.last_s > period_s) this.push(before.last_s + this.offset_s, null);
-      if (before && isLossBetween(before, bucket, 0)) this.losses.push(x); // the sample rate of the past is not known
-      this.push(x, rangeOf(bucket));
+      this.mark(bucket, 0);
+      this.push((bucket.first_s + bucket.last_s) / 2 + this.offset_s, rangeOf(bucket));
       before = bucket;
     }
     this.stored = this.data[0].length;

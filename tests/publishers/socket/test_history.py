@@ -12,6 +12,7 @@ from imud.attitude.published import as_sent
 from imud.contracts.publisher import Batch
 from imud.formats import kernel
 from imud.model.bucket import VECTORS, Bucket
+from imud.model.ledger import Ledger
 from imud.model.sample import Sample
 from imud.publishers.socket import history
 from imud.publishers.socket.history import SECOND, History, buckets
@@ -39,8 +40,12 @@ def at(t_s: float, **values: Any) -> Sample:
     return msgspec.structs.replace(one, **(known | values))
 
 
+def kept(ledger: Ledger | None = None) -> History:
+    return History(publisher_context(losses=lambda _name: (ledger or Ledger()).losses()).devices)
+
+
 def made(*samples: Sample, device: str = "imu0", into: History | None = None) -> History:
-    into = History() if into is None else into
+    into = kept() if into is None else into
     for one in samples:
         into.add(Batch(device, 0, [one], FRAME))
     return into
@@ -81,7 +86,7 @@ def test_batches_of_any_size_have_the_same_history() -> None:
         at(100 + number / 40, **{name: tuple(random.gauss(0, 9) for _ in "xyz") for name in VECTORS})
         for number in range(500)
     ]
-    single, large = made(*samples), History()
+    single, large = made(*samples), kept()
     for begin in range(0, 500, 125):
         large.add(Batch("imu0", 0, samples[begin : begin + 125], FRAME))
     assert single.seconds("imu0") == large.seconds("imu0")
@@ -90,6 +95,33 @@ def test_batches_of_any_size_have_the_same_history() -> None:
         values = [one.gyro_rad_s[axis] for one in samples[:40] if one.gyro_rad_s]
         low, high = found(single)[0].gyro_rad_s or ((), ())
         assert (low[axis], high[axis]) == pytest.approx((min(values), max(values)), rel=1e-7)
+
+
+def test_a_second_has_the_losses_that_the_ledger_counted() -> None:
+    """The sum over all seconds is the count of the ledger since the first sample."""
+    ledger = Ledger()
+    ledger.lost_crc = 7  # before the first sample
+    of = made(*(at(1 + k / 100) for k in range(200)), into=kept(ledger))
+    ledger.lost_crc, ledger.lost_queue = 9, 3
+    made(*(at(3 + k / 100) for k in range(32)), into=of)
+    ledger.lost_gap_device, ledger.lost_unknown = 4, 2
+    made(*(at(4 + k) for k in range(3)), into=of)
+    of.tick()  # without it, the losses of a slow device are late
+    made(*(at(7 + k / 100) for k in range(100)), into=of)
+    assert [(one.first_s, one.lost, one.gaps) for one in found(of)] == [
+        (1, 0, 0), (2, 0, 0), (3, 5, 0), (4, 0, 0), (5, 0, 0), (6, 4, 2), (7, 0, 0),
+    ]  # fmt: skip
+    (all_of_them,) = found(of, 100)
+    assert (all_of_them.lost, all_of_them.gaps) == (ledger.lost() - 7, ledger.lost_unknown)
+    ledger.lost_crc, ledger.lost_queue = 0, 1 << 40  # another ledger; the record has 32 bits
+    of.tick()
+    made(*(at(7.99) for _ in range(16)), into=of)
+    assert found(of)[-1].lost == (1 << 32) - 1
+    packed = b"".join(Batch("imu0", 0, [at(7.995, mag_t=(1.0, 2.0, 3.0))], FRAME).packed for _ in range(3))
+    seconds = [bytearray(of.seconds("imu0")[-SECOND.size :]) for _ in range(2)]
+    by_kernel = getattr(kernel.load(None).module, "add_slots", history.add_slots)
+    assert by_kernel(seconds[0], packed, 0) == history.add_slots(seconds[1], packed, 0) == 768
+    assert (seconds[0], SECOND.unpack(seconds[0])[-2:]) == (seconds[1], ((1 << 32) - 1, 0))
 
 
 @pytest.mark.parametrize("convention", Convention)
@@ -116,7 +148,7 @@ def test_the_history_ends_after_an_hour_or_at_the_limit_of_memory(monkeypatch: p
     assert len(found(of)) == 3601, "3600 complete seconds and the open second"
     made(at(7301.0), into=of)
     assert [one.first_s for one in found(of)] == [7300.0, 7301.0]
-    many = History()
+    many = kept()
     for number in range(300):
         made(at(0.0), device=f"imu{number}", into=many)
     assert many.kept_s == (64 << 20) // (300 * SECOND.size)
