@@ -67,7 +67,7 @@ def parts(status: DeviceStatus) -> Iterator[tuple[str, str]]:
     if status.declared is not None and status.declared.state is not SettingsState.UNDECLARED:
         yield "settings", declared(status.declared)
     if status.declared is not None and status.declared.unsaved:
-        yield "unsaved", f"the flash of the device lacks a change: run `imud command {status.name} save`"
+        yield "unsaved", f"a change is not saved: run `imud command {status.name} save`"
     if status.unused:
         yield "unused", status.unused
     if status.status_bit_names and status.status_bits is not None:

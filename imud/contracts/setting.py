@@ -178,10 +178,11 @@ class SettingsStatus(msgspec.Struct, frozen=True):
     repairs: int = 0  # number of automatic attempts of imud to write the declared settings since start
     flash_writes: int = 0  # number of writes to the flash of this device by imud in all runs, automatic or by command
     flash_writes_day: int = 0  # number of these writes in the last 24 hours
-    # Whether the device would lose a change at power-off: imud changed a setting, and no save followed
-    unsaved: bool = False
-    # Present value of each setting that the device would lose at power-off, as far as imud knows the value in flash
+    unsaved: bool = False  # whether imud changed a setting, and no save followed
+    # Present value of each changed setting, except if flash contains the value
     lost_at_power_off: dict[str, Any] = {}  # msgspec copies a mutable default
+    # Names in `lost_at_power_off` whose value in flash is unknown: the device may lose the present value
+    flash_unknown: tuple[str, ...] = ()
 
 
 _UNIT = re.compile(r"_(hz|ms|deg_s|deg)$")

@@ -225,9 +225,11 @@ def _differs(_facts: Facts, name: str, one: SettingDifference) -> str:
     return f"{title_of(name)} is {actual} on the device, but “{value_text(one.declared)}” in the configuration."
 
 
-def _unsaved(_facts: Facts, name: str, value: Any) -> str:
+def _unsaved(facts: Facts, name: str, value: Any) -> str:
     what = f"{title_of(name)} “{value_text(value)}”" if name else "A change"
-    return f"{what} is lost at power-off because it is not saved."
+    if name and facts.declared is not None and name not in facts.declared.flash_unknown:
+        return f"{what} is lost at power-off because it is not saved."
+    return f"{what} is not saved, and the value in flash is unknown."
 
 
 def _ledger(facts: Facts, _name: str, _value: Any) -> str:

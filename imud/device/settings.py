@@ -425,8 +425,8 @@ class DeviceSettings:
         state = SettingsState.DIFFER if found else SettingsState.AGREE
         state = state if self.is_current else SettingsState.UNKNOWN
         not_reported = self.declared.keys() - self.values.keys()
-        is_known = self.is_unsaved and self.is_current and self._saved is not None
-        before, now = as_json(self._saved or {}), as_json(self.values if is_known else {})
+        is_known = self.is_unsaved and self.is_current
+        lost, unknown = self._in_flash.lost(self._saved, self.values) if is_known else ({}, ())
         return SettingsStatus(
             state if self.declared else SettingsState.UNDECLARED,
             self._config.on_difference,
@@ -436,7 +436,7 @@ class DeviceSettings:
             self._read_ns, self.comparison.repairs,
             self._files.flash.record(self.module).writes, self._files.flash.writes_day(self.module),
             self.is_unsaved and table.save is not None,
-            {name: one for name, one in now.items() if before.get(name) != one},
+            as_json(lost), unknown,
         )  # fmt: skip
 
     async def report(self, *, fresh: bool) -> SettingsReport:

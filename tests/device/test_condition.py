@@ -77,7 +77,9 @@ LATE = facts(t_err_ns=2_100_000)
          "Output “hi91 50, hi92 0” is lost at power-off because it is not saved.", SAVE),
         (declared(SettingsState.DIFFER, differences={"bias": SettingDifference([1.5, 0], {"x": True})}), "attention",
          "Bias is “x true” on the device, but “1.5, 0” in the configuration.", APPLY),
-        (declared(unsaved=True), "attention", "A change is lost at power-off because it is not saved.", SAVE),
+        (declared(unsaved=True, lost_at_power_off={"mode": "9 axes"}, flash_unknown=("mode",)), "attention",
+         "Mode “9 axes” is not saved, and the value in flash is unknown.", SAVE),
+        (declared(unsaved=True), "attention", "A change is not saved, and the value in flash is unknown.", SAVE),
         (declared(problem="cannot read the settings: no reply"), "attention", "Cannot read the settings: no reply.",
          "Run `imud settings` with the name of the device."),
         (axes(

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from imud.device.flash import FILE_NAME, BackupFolder, FlashWrites, ModuleFlash, backup_text
+from imud.device.flash import FILE_NAME, BackupFolder, FlashValues, FlashWrites, ModuleFlash, backup_text
 from imud.host.clock import HostClock
 from imud.model.units import NS_PER_S
 
@@ -114,3 +114,12 @@ def test_a_backup_has_identity_time_and_settings_and_the_newest_are_kept(tmp_pat
         "identity": {"product": "HI14", "serial_number": "04"}, "settings": {"mode": "6-axis"},
     }  # fmt: skip
     assert text.startswith("# Settings of bow as the device reported them. `imud settings bow --restore FILE`")
+
+
+def test_a_value_is_lost_unless_flash_contains_it_and_unknown_values_are_named() -> None:
+    flash = FlashValues()
+    now = {"same": 1, "differs": 3, "unknown": 4, "unchanged": 5}
+    flash.saved({"same": 1, "differs": 2})
+    before = {"same": 9, "differs": 3, "unknown": 9, "unchanged": 5}  # another program changed them without a save
+    assert flash.lost(before, now) == ({"differs": 3, "unknown": 4}, ("unknown",))
+    assert flash.lost(None, now) == ({"differs": 3}, ())
