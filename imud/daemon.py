@@ -45,7 +45,7 @@ from imud.host.service_manager import ServiceManager, notify
 from imud.lines.gpio import GPIO_LINES
 from imud.lines.watched_line import watching
 from imud.model.errors import CommandError, ConfigError, ImudError, ServerError
-from imud.model.event import Event, EventKind
+from imud.model.event import Event, EventKind, EventLog
 from imud.model.ledger import NOTHING_LOST
 from imud.model.units import NS_PER_MS
 from imud.publishers.outputs import Outputs
@@ -180,6 +180,7 @@ class Daemon:
             watch_line=watching(lines, host),
             owner=self,
             configuration="" if file is None else str(file.absolute()),
+            past_events=EventLog(host.now_ns()),
         )
         self._outputs = Outputs(self._context, extra or {})
         # a direct reference: a method of this class would cost one more call per batch

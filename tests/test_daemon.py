@@ -262,7 +262,7 @@ def config_of(folder: Path, **devices: dict[str, Any]) -> Config:
 @in_loop
 async def test_a_reload_starts_and_stops_devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def past() -> list[str]:
-        return [event.message for event in daemon._context.past_events.newest(0, 99)]
+        return [event.message for event in daemon._context.past_events.newest(0, 99).events]
 
     async def count_turns() -> None:
         while not running.done():

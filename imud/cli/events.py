@@ -185,7 +185,11 @@ class _Printer:
     def _print_past(self, client: Client, ahead_ns: int) -> None:
         """Print the stored events of the requested time."""
         since_ns = time.monotonic_ns() + ahead_ns - int(self._args.since * NS_PER_S)
-        for event in client.past_events(since_ns, self._args.device or None):
+        past = client.past_events(since_ns, self._args.device or None)
+        if past.since_ns > since_ns:
+            ago = in_words(time.monotonic_ns() + ahead_ns - past.since_ns)
+            complain(f"imud events: imud has all events of the last {ago}; for older events, run: journalctl -u imud")
+        for event in past.events:
             if self._left != 0:
                 self._print(event, ahead_ns)
 

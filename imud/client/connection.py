@@ -34,7 +34,7 @@ from imud.formats.jsonrpc import (
 from imud.formats.slot import SLOT_BYTES, SLOT_FIELDS, decode_slot
 from imud.model.bucket import Bucket
 from imud.model.errors import LinkDenied, LinkError, LinkMissing, ServerError, reason_of
-from imud.model.event import Event, StoredEvent, kind_of
+from imud.model.event import Event, PastEvents, kind_of
 from imud.model.options import wrong_values
 from imud.model.sample import Sample
 
@@ -367,13 +367,13 @@ class Client:
 
     def past_events(
         self, since_ns: int, devices: Iterable[str] | None = None, *, limit: int | None = None
-    ) -> list[StoredEvent]:
+    ) -> PastEvents:
         """Return the stored events since `since_ns` (CLOCK_MONOTONIC of the daemon), at most 1000, the oldest first.
 
         The method ends a subscription of `events` on this connection.
         """
         reply = self.call("events", devices=_listed(devices), enable=False, since_ns=since_ns, limit=limit)
-        return decoded(reply.get("events", []), list[StoredEvent], "events")
+        return decoded(reply, PastEvents, "events")
 
     def history(self, devices: Iterable[str], **params: int | str | None) -> dict[str, list[Bucket]]:
         """Return minimum and maximum of the samples of the last hour by device. `params` are the other parameters of

@@ -71,6 +71,15 @@ class StoredEvent(Event, frozen=True, omit_defaults=True):
     first_ns: int = 0  # CLOCK_MONOTONIC of the first event of the group
 
 
+class PastEvents(msgspec.Struct, frozen=True):
+    """Stored events, the oldest first."""
+
+    events: list[StoredEvent] = []  # msgspec copies a mutable default
+    # CLOCK_MONOTONIC since which `events` has all events. It is later than requested if imud started later, or if it
+    # removed older events.
+    since_ns: int = 0
+
+
 EVENTS_MAX: Final = 1000  # maximum number of stored groups of a device
 GROUP_NS: Final = 60 * NS_PER_S  # maximum time between two events of a group, ns
 # Kinds whose messages contain counts: all events of the kind are equal
@@ -82,7 +91,9 @@ _Key = tuple[str, ...]
 class EventLog:
     """Newest events of all devices and of the daemon, repeated events as groups. Synchronization: one thread."""
 
-    def __init__(self) -> None:
+    def __init__(self, begun_ns: int = 0) -> None:
+        self._begun_ns = begun_ns
+        self._removed_ns: dict[str, int] = {}  # time of the newest removed event by device
         # By device: groups by number in the order of their newest events, and number of the newest group of each key
         self._devices: dict[str, tuple[dict[int, StoredEvent], dict[_Key, int]]] = {}
         self._made = 0  # number of groups since start
@@ -104,21 +115,27 @@ class EventLog:
         if len(groups) > EVENTS_MAX:
             number, oldest = next(iter(groups.items()))
             del groups[number]
+            self._removed_ns[event.device] = oldest.t_ns
             if newest.get(_group_key(oldest)) == number:
                 del newest[_group_key(oldest)]
 
     def remove(self, device: str) -> None:
         """Remove the events of a device that left the configuration."""
         self._devices.pop(device, None)
+        self._removed_ns.pop(device, None)
 
-    def newest(self, since_ns: int, limit: int, devices: Collection[str] | None = None) -> list[StoredEvent]:
+    def newest(self, since_ns: int, limit: int, devices: Collection[str] | None = None) -> PastEvents:
         """Return the newest groups since `since_ns`, at most `limit`, the oldest first. None: of all devices."""
 
         def of(device: str) -> Iterator[StoredEvent]:
             return takewhile(lambda one: one.t_ns >= since_ns, reversed(self._devices[device][0].values()))
 
-        chosen = [of(device) for device in self._devices if devices is None or not device or device in devices]
-        return list(islice(merge(*chosen, key=lambda one: -one.t_ns), limit))[::-1]
+        names = [device for device in self._devices if devices is None or not device or device in devices]
+        found = list(islice(merge(*map(of, names), key=lambda one: -one.t_ns), limit + 1))
+        absent_ns = [self._removed_ns[name] for name in names if name in self._removed_ns]
+        if len(found) > limit:
+            absent_ns.append(found.pop().t_ns)
+        return PastEvents(found[::-1], max(since_ns, self._begun_ns, *(one + 1 for one in absent_ns)))
 
 
 def _group_key(event: Event) -> _Key:

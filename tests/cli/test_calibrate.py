@@ -36,7 +36,9 @@ def test_calibrations_are_listed_verified_and_saved(daemon: RunningDaemon, cli: 
     assert [words for words in ("\nverified\n  roll: ", "°, limit 0.5°: passed\n  saved\n") if words not in out] == []
     (level,) = [line for line in cli(*words).out.splitlines() if line.startswith("level ")]
     assert ", saved " in level
-    past = cli("events", "--since", "1h", "--socket", daemon.socket).out.splitlines()
+    shown = cli("events", "--since", "1h", "--socket", daemon.socket)
+    past = shown.out.splitlines()
+    assert shown.err.startswith("imud events: imud has all events of the last "), "it started less than 1 h ago"
     assert [line for line in past if " bow: up: " in line]
     assert "calibration: calibration level: verified" in past[-1]
     assert cli("events", "--since", "1h", "--count", "1", "--socket", daemon.socket).out.count("\n") == 1

@@ -19,7 +19,7 @@ from imud.contracts.status import DeviceState
 from imud.formats.jsonrpc import RpcError, default_path
 from imud.formats.recording import is_recording
 from imud.model.errors import LinkDenied, LinkError, LinkMissing, ServerError
-from imud.model.event import Event, EventKind
+from imud.model.event import Event, EventKind, PastEvents
 from imud.publishers.socket.server import SocketServer
 from tests.support.socket_rig import DEVICES, EPOCH, NOW_NS, Daemon, batch, daemon, sample
 
@@ -169,9 +169,9 @@ def test_events(served: Daemon) -> None:
         served.do(lambda server: server.event(down))
         assert (next(events), next(watch)) == (down, sample("imu0", 5))  # the sample arrived first
         served.do(lambda server: server.hub.context.past_events.add(down))
-        (stored,) = client.past_events(7, ["imu1"])
+        (stored,) = client.past_events(7, ["imu1"]).events
         assert (stored.t_ns, stored.message) == (7, down.message)
-        assert client.past_events(8) == []
+        assert client.past_events(8) == PastEvents([], 8)
         short = client.events(timeout_s=0.01)
         with pytest.raises(TimeoutError, match="no event within"):
             next(short)

@@ -204,7 +204,9 @@ class PollResult(msgspec.Struct, omit_defaults=True):
 
 class EventsResult(msgspec.Struct, omit_defaults=True):
     enable: bool
-    events: list[StoredEvent] = []  # stored events, the oldest first; absent without `since_ns`
+    # as in `PastEvents`; absent without `since_ns` in the request
+    events: list[StoredEvent] = []
+    since_ns: int | None = None
 
 
 class HistoryResult(msgspec.Struct, omit_defaults=True):

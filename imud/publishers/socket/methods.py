@@ -328,12 +328,15 @@ def _events(hub: Hub, connection: ClientConnection, params: EventsParams) -> Met
     limit = EVENTS_MAX if params.limit is None else params.limit
     if not 1 <= limit <= EVENTS_MAX:
         raise RpcError(Code.INVALID_PARAMS, f"limit: expected 1 to {EVENTS_MAX}, got {limit}")
-    past = [] if params.since_ns is None else hub.context.past_events.newest(params.since_ns, limit, devices)
+    result = EventsResult(enable)
+    if params.since_ns is not None:
+        past = hub.context.past_events.newest(params.since_ns, limit, devices)
+        result = EventsResult(enable, past.events, past.since_ns)
     if enable:
         hub.subscribe_events(connection, devices)
     else:
         hub.unsubscribe_events(connection)
-    return MethodReply(EventsResult(enable, past))
+    return MethodReply(result)
 
 
 def _history(hub: Hub, _connection: ClientConnection, params: HistoryParams) -> Pieces:

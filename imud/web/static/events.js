@@ -16,9 +16,9 @@ export const messageOf = ({ kind, message }) => (kind === "bad-frame" ? message.
 
 export const eventWords = (kind) => EVENT_WORDS[kind] ?? kind;
 
-/** Return the stored events, the oldest first. devices: names; undefined for all. */
+/** Return `events`, the stored events, the oldest first, and `since_ns`. devices: names; undefined for all. */
 export async function pastEvents(devices, limit = EVENTS_MAX) {
-  return (await call("events", { enable: false, since_ns: 0, limit, ...(devices ? { devices } : {}) })).events ?? [];
+  return { events: [], ...(await call("events", { enable: false, since_ns: 0, limit, ...(devices ? { devices } : {}) })) };
 }
 
 const levelOf = (one) => (CALM.includes(one.kind) ? "info" : "warning");
@@ -63,8 +63,10 @@ export class EventsSection {
   async load() {
     this.groups = null;
     this.early = [];
+    this.since_ns = Infinity;
     try {
-      const found = await pastEvents(this.whose === "this" ? [this.device] : undefined);
+      const { events: found, since_ns } = await pastEvents(this.whose === "this" ? [this.device] : undefined);
+      this.since_ns = since_ns; // later than the start of imud if it removed old events
       const newest_ns = found.at(-1)?.t_ns ?? 0;
       this.groups = found.filter((one) => !isProgress(one));
       for (const event of this.early) if (event.t_ns > newest_ns) addEvent(this.groups, event);
@@ -104,16 +106,16 @@ export class EventsSection {
     const open = new Set([...this.list.querySelectorAll("details[open]")].map((one) => one.dataset.first));
     const rows = this.shownGroups().map((one) => this.row(one, open));
     this.list.replaceChildren(...(rows.length ? rows : [el("li", {}, el("p", { class: "help", text: "No events." }))]));
-    const counts = perMinute(this.groups, this.now_s * 1e9, this.begun_ns);
+    const counts = perMinute(this.groups, this.now_s * 1e9, Math.max(this.begun_ns, this.since_ns));
     const most = Math.max(1, ...counts.map((one) => one?.count ?? 0));
     this.minutes.setAttribute("aria-label", `events per minute over the last hour, at most ${most}`);
     const bars = counts.map((one) => el("i", {
-      class: one === null ? "unknown" : one.isWarning ? "warning" : "", title: one === null ? "imud was not running" : `${one.count} events`,
+      class: one === null ? "unknown" : one.isWarning ? "warning" : "", title: one === null ? "unknown" : `${one.count} events`,
       css: { height: `${one?.count ? 6 + (44 * one.count) / most : 2}px` },
     }));
     const begun = counts.findIndex((one) => one !== null);
     this.minutes.replaceChildren(...bars, el("em", { text: "events per minute" }), el("span", { text: timeOf(this.now_s - 3600).slice(-8, -3) }),
-      ...(begun > 0 ? [el("span", { class: "begun", text: "imud started", css: { left: `${(100 * begun) / counts.length}%`, transform: begun > 15 ? "translateX(-100%)" : "none" } })] : []), el("span", { text: timeOf(this.now_s).slice(-8, -3) }));
+      ...(begun > 0 ? [el("span", { class: "begun", text: this.since_ns > this.begun_ns + 60e9 ? "older events removed" : "imud started", css: { left: `${(100 * begun) / counts.length}%`, transform: begun > 15 ? "translateX(-100%)" : "none" } })] : []), el("span", { text: timeOf(this.now_s).slice(-8, -3) }));
   }
 
   row(one, open) {

@@ -22,7 +22,7 @@ export function verdict(rows) {
 function strip(history) {
   const said = history.filter(Boolean);
   const ok = said.filter((one) => one === "ok").length;
-  return el("div", { class: "strip", role: "img", "aria-label": `last hour: OK in ${ok} of ${said.length} minutes` }, history.map((one) => el("i", { class: `h-${one ?? "none"}` })));
+  return el("div", { class: "strip", role: "img", "aria-label": `last hour: OK in ${ok} minutes, unknown in ${history.length - said.length}` }, history.map((one) => el("i", { class: `h-${one ?? "none"}` })));
 }
 
 function figures(row) {
@@ -74,7 +74,7 @@ export class Overview {
 
   async loadEvents() {
     try {
-      this.events = await pastEvents(undefined, EVENTS_SHOWN);
+      this.events = (await pastEvents(undefined, EVENTS_SHOWN)).events;
       this.drawEvents();
     } catch {
       this.happened.replaceChildren();
