@@ -385,6 +385,8 @@ def _values(status: DeviceStatus) -> dict[str, str]:
     values = words | {name: _number(value) for name, value in numbers.items()}
     if status.status_words:
         values["status"] = ", ".join(status.status_words)
+    if status.condition is not None and status.condition.steps:
+        values["next"] = status.condition.steps
     return values
 
 

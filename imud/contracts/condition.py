@@ -116,6 +116,11 @@ class DeviceCondition(msgspec.Struct, frozen=True):
     def is_ok(self) -> bool:
         return self.condition is Condition.OK
 
+    @property
+    def steps(self) -> str:
+        """Different next steps of the reasons as one text; empty without a step."""
+        return " ".join(dict.fromkeys(reason.next for reason in self.reasons if reason.next))
+
     def __str__(self) -> str:
         """Return the condition with its reasons as one text."""
         return f"{self.condition}: {' '.join(reason.message for reason in self.reasons)}".removesuffix(": ")

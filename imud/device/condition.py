@@ -503,7 +503,9 @@ class ConditionWatch:
         if before and _keys(before) != _keys(counted):
             condition = self.condition
             codes = ", ".join(dict.fromkeys(cause.rule.code for cause in counted))
-            self._events.raise_event(now_ns, EventKind.CONDITION, str(condition), condition=str(level), reasons=codes)
+            self._events.raise_event(
+                now_ns, EventKind.CONDITION, str(condition), condition=str(level), reasons=codes, next=condition.steps
+            )
 
     def _now_counted(self, now_ns: int, causes: Sequence[Cause]) -> Sequence[Cause]:
         """Return the causes that count now: they lasted long enough, or ended a short time ago."""

@@ -6,7 +6,6 @@ from typing import Any
 import msgspec
 
 from imud.bridges.channel import Diagnosis, DiagnosisLevel, LiveDiagnosis, LossCounts, RecordedDiagnosis, StampedEvent
-from imud.contracts.condition import Condition, DeviceCondition, Reason, ReasonCode
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample, Sync
@@ -27,10 +26,6 @@ def one(found: DeviceStatus) -> Diagnosis:
 
 
 def test_levels_and_messages_of_a_running_daemon() -> None:
-    for word, level in (("ok", OK), ("degraded", WARN), ("attention", WARN), ("missing", ERROR)):
-        reason = Reason(ReasonCode.LOST, "The adapter was pulled out.")
-        found = one(status(condition=DeviceCondition(Condition(word), 0, (reason,))))
-        assert (found.level, found.message) == (level, f"{word}: The adapter was pulled out.")
     assert one(status(state=DeviceState.SILENT, condition=None))[1:3] == (STALE, "silent")
     clock = ClockStatus(sync=Sync.REGRESSION, t_err_ns=12_000, skew_ppm=-40.5, residual_ns=900)
     found = one(status(clock=clock, identity={"product": "HI13", "serial_number": "17"}))

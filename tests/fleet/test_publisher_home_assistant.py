@@ -12,7 +12,6 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from imud.contracts.condition import Condition, DeviceCondition
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.fleet.messages import FleetMessage, MessageKind, encode_message
 from imud.fleet.publisher import discovery_of, discovery_topic
@@ -77,12 +76,8 @@ def test_values_are_rendered() -> None:
     running = msgspec.json.encode(status(state=DeviceState.RUNNING, temperature_c=41.26, rate_hz=99.96))
     assert rendered(found["temperature"]["value_template"], running) == "41.3"
     assert rendered(found["rate"]["value_template"], running) == "100.0"
-    assert rendered(found["condition"]["value_template"], running) == "ok"
-    assert rendered(found["problem"]["value_template"], running) == "OFF"
-    gone = DeviceCondition(Condition.MISSING, 0)
-    silent = msgspec.json.encode(status(condition=gone, temperature_c=None))
+    silent = msgspec.json.encode(status(temperature_c=None))
     assert rendered(found["temperature"]["value_template"], silent) == ""
-    assert rendered(found["problem"]["value_template"], silent) == "ON"
     payload = statistics([msgspec.structs.replace(sample("bow", 1), euler_rad=(0.1, -0.2, 3.0))])
     # 0.1 · 180/π = 5.7296, -0.2 · 180/π = -11.459, 3 · 180/π = 171.887
     assert rendered(found["roll"]["value_template"], payload) == "5.73"

@@ -13,7 +13,6 @@ import pytest
 from imud.cli.doctor import daemon as checks
 from imud.cli.doctor.command import examine, exit_status
 from imud.cli.doctor.surroundings import DoctorCheck, fetch_over_http
-from imud.contracts.condition import DOCTOR, Condition, DeviceCondition, Reason, ReasonCode
 from imud.contracts.status import CKernelStatus, DeviceState, DeviceStatus, KernelCounters, LinesStatus
 from imud.contracts.status import SerialLineCounters as Counters
 from imud.model.errors import LinkDenied, LinkMissing, ServerError
@@ -112,10 +111,6 @@ def test_states_come_with_the_reason_of_the_daemon(machine: Machine) -> None:
     found = machine.told(STATES)
     assert [severity for severity, _ in found] == ["ok", "error", "error"]
     assert "b: /dev/ttyUSB1 is not there" in found[1][1]
-    away, slow = Reason(ReasonCode.UTC, "No UTC.", DOCTOR), Reason(ReasonCode.NONE_LOST, "Slow.", "Set a rate.")
-    machine.status = [device("d", condition=DeviceCondition(Condition.DEGRADED, 0, (away, slow)))]
-    steps = [("warning", "d: No UTC. → see the findings about its port, bus and lines")]
-    assert machine.told(STATES) == [*steps, ("warning", "d: Slow. → Set a rate.")]
 
 
 AT = ("127.0.0.1", 9321, "/scrapes")
