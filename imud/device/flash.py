@@ -149,8 +149,10 @@ class FlashValues:
         return SavedState.SAME if saved == actual else SavedState.DIFFERS, saved
 
     def lost(self, before: Mapping[str, Any] | None, now: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
-        """Return the present values that the flash does not contain, and the names of those that it may contain.
-        `before`: the values before the unsaved change; None if they are unknown."""
+        """Return the present values that flash does not contain, and the names whose value in flash is unknown.
+
+        `before`: the values before the unsaved change; None if they are unknown.
+        """
         states = {name: self.state(name, one)[0] for name, one in now.items()}
         changed = {name for name, one in now.items() if before is not None and before.get(name) != one}
         unknown = tuple(name for name, one in states.items() if one is SavedState.UNKNOWN and name in changed)

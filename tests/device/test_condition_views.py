@@ -47,7 +47,7 @@ STATE_ONLY = {"imud devices", "imud top", "systemd", "metrics"}  # `imud status`
 
 
 def watched(known: Facts) -> tuple[DeviceStatus, Event]:
-    """Return the status with the condition from these facts, and the event of its begin."""
+    """Return the status with the condition from these facts, and the event of this condition."""
     events: list[Event] = []
     watch = ConditionWatch(LIMITS, DeviceEvents("bow", Ledger(), events.append), 0)
     for one in (facts() if known.state is not DeviceState.RUNNING else facts(DeviceState.FAILED, "busy"), known):

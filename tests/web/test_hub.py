@@ -166,7 +166,7 @@ async def test_pages_get_new_events_and_the_samples_of_both_compared_devices() -
     assert (wanted := feed.wanted[-1]) is not None
     assert wanted.devices == ("bow",)
     ledger = device("bow").ledger
-    for hello, times in ((HELLO, 1), (None, 2)):  # the first status of a connection is no loss
+    for hello, times in ((HELLO, 1), (None, 2)):  # imud web ignores the change to the first status
         counts = (("lost_crc", 3 * times), ("lost_queue", 4 * times), ("lost_unknown", times))
         more = {name: ledger[name] + count for name, count in counts}
         hub.spread(News(statuses=(device("bow", ledger=ledger | more), device("stern", 1)), hello=hello))
