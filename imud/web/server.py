@@ -116,6 +116,13 @@ STATIC_TYPES: Final = {
 }  # fmt: skip
 IMPORT: Final = re.compile(r'^import .* from "\./(.+)";\n', re.MULTILINE)
 """Import of a module of the page; group 1: its name."""
+SPARE: Final = re.compile(
+    r"""((["'])(?:(?!\2)[^\\\n]|\\.)*\2  # string
+        | `(?:[^`$\\]|\\(?s:.)|\$(?!\{)|\$\{(?:[^`}]|`[^`]*`)*\})*`)  # template with templates
+    | ^[ ]*(?:(?://.*|/\*\*(?s:.*?)\*/)?\n)? | [ ]+//[ ].*  # indentation, line without code, comment after code
+    """, re.MULTILINE | re.VERBOSE,
+)  # fmt: skip
+"""Texts that JavaScript does not need; group 1: a text that JavaScript needs unchanged."""
 BODY_BYTES_MAX: Final = 65536
 """Maximum body of a POST, bytes: the maximum line of the daemon's socket."""
 LOOK_BYTES_MAX: Final = 4096
@@ -165,7 +172,7 @@ class StaticFile(NamedTuple):
 
 
 def bundle(modules: Mapping[str, str]) -> str:
-    """Return JavaScript modules by their names as one module, each after the modules that it imports.
+    """Return JavaScript modules by their names as one module without comments, each after the modules that it imports.
 
     The names at the top level of all modules must differ.
     """
@@ -173,7 +180,8 @@ def bundle(modules: Mapping[str, str]) -> str:
     order: list[str] = []
     while len(order) < len(modules):
         order.append(next(name for name in modules if name not in order and imports[name] <= set(order)))
-    return re.sub(r"^export ", "", IMPORT.sub("", "".join(modules[name] for name in order)), flags=re.MULTILINE)
+    text = SPARE.sub(r"\1", IMPORT.sub("", "".join(modules[name] for name in order)))
+    return re.sub(r"^export ", "", text, flags=re.MULTILINE)
 
 
 def static_files() -> dict[str, StaticFile]:

@@ -171,8 +171,14 @@ def test_nothing_is_loaded_from_elsewhere_and_the_bundled_library_is_the_publish
             text = file.read_text()
             assert "innerHTML" not in text, file
             assert not re.search(r"(?:src|href|import|url|fetch)\W*https?://", text), file
-    modules = {"main.js": 'import { b } from "./b.js";\nb();\n', "b.js": "export const b = () => 1;\n"}
+    modules = {"main.js": 'import { b } from "./b.js";\nb();\n', "b.js": "export const b = () => 1; // it's `1`\n"}
     assert bundle(modules) == "const b = () => 1;\nb();\n"
+    texts = 'f(`x \\`\n  // y $ ${a ? `  b\n  c` : `${d}`}\n  z`, \'a  //  `\', "`  // \\" `");\n'
+    assert bundle({"a.js": f"/** `A\n *  b` */\nif (a)\n  // it's `c\n\n  {texts}"}) == f"if (a)\n{texts}"
+    page = bundle({file.name: file.read_text() for file in STATIC.glob("*.js")})
+    lines = "\n".join(file.read_text() for file in STATIC.glob("*.js")).split("\n")
+    code = [one.strip().removeprefix("export ").split("; // ")[0] for one in lines if not re.match(r" *(//|/?\*)", one)]
+    assert [one for one in code if "`" in one and one not in page] == []
     table = (STATIC / "uplot" / "README.md").read_text()
     rows = re.findall(r"^\| (\S+) \| ([0-9a-f]{64}) \|$", table, re.MULTILINE)
     assert {name for name, _ in rows} == {"uPlot.iife.min.js", "uPlot.min.css", "LICENSE"}
