@@ -106,6 +106,11 @@ def block(status: DeviceStatus, behind_ns: deque[int]) -> str:
         f"  host      CLOCK_MONOTONIC is steered by {clock.steering_ppm:+.1f} ppm",
         f"  residual  {clock.residual_ns / NS_PER_US:.1f} µs (one sigma)",
         *(f"  {name:<10}{words}" for name, words in aids(status)),
+        "  causes of the error (one sigma each):",
+    ]
+    for one in clock.parts:
+        lines += paragraph(f"  {one.name:<10}", f"{one.value_ns / NS_PER_US:.1f} µs. {one.message}")
+    lines += [
         f"  delay from measurement to arrival, {len(behind_ns)} samples:",
         *histogram([late_ns / NS_PER_US for late_ns in behind_ns], "µs"),
         *paragraph("  verdict   ", verdict(clock, behind_ns)),

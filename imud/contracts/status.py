@@ -62,6 +62,15 @@ class WorkStatus(msgspec.Struct, frozen=True):
         return f"{started}; {self.stop}" if self.stop else started
 
 
+class ErrorPart(msgspec.Struct, frozen=True):
+    """Cause of the time stamp error, with its size and the next step."""
+
+    name: str  # for example `adapter`
+    value_ns: int  # one-sigma error from this cause, at most the time stamp error
+    message: str  # the cause as a sentence
+    next: str  # step that reduces this part; empty if there is none
+
+
 class ClockStatus(msgspec.Struct, frozen=True):
     """State of the clock of one device."""
 
@@ -83,6 +92,7 @@ class ClockStatus(msgspec.Struct, frozen=True):
     reference_error_ns: int = 0  # one-sigma error of the host's estimate of UTC; 0 if there is no estimate
     # Rate of CLOCK_MONOTONIC relative to CLOCK_MONOTONIC_RAW minus 1, 1e-6: the correction by an NTP client
     steering_ppm: float = 0.0
+    parts: tuple[ErrorPart, ...] = ()  # causes of `t_err_ns`, the largest first; empty before the first sample
 
 
 class KernelCounters(msgspec.Struct, frozen=True):

@@ -9,6 +9,8 @@ from collections.abc import Callable
 from math import hypot, sqrt
 from typing import Final
 
+from imud.contracts.status import ErrorPart
+from imud.model.sample import Sync
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 from imud.sampling.arrival_fit import ENOUGH_SPAN_NS, ArrivalFit
 from imud.sampling.gaps import ArrivalLosses
@@ -134,8 +136,8 @@ class EvenArrivals:
     """
 
     __slots__ = (
-        "_above_mean", "_agreeing", "_arrival_ns", "_begin_ns", "_device_ns", "_fit", "_late_periods", "_learned",
-        "_period_ns", "_undecided", "error_ns", "t_ns",
+        "_above_mean", "_agreeing", "_arrival_ns", "_begin_ns", "_device_ns", "_late_periods", "_learned",
+        "_period_ns", "_undecided", "error_ns", "fit", "t_ns",
     )  # fmt: skip
 
     def __init__(self) -> None:
@@ -145,7 +147,7 @@ class EvenArrivals:
 
     def restart(self) -> None:
         """Discard the fit and the period: the device or its link was missing, or the rate changed."""
-        self._fit: ArrivalFit | None = None
+        self.fit: ArrivalFit | None = None
         self._period_ns = 0.0
         self._learned = 0
         self._begin_ns = self._arrival_ns = self._device_ns = 0
@@ -160,7 +162,7 @@ class EvenArrivals:
         """
         steps = number or 1
         before_ns, self._arrival_ns = self._arrival_ns, arrival_ns
-        fit, period_ns = self._fit, self._period_ns
+        fit, period_ns = self.fit, self._period_ns
         if fit is None:
             self._learn(delay, arrival_ns, steps)
             return False
@@ -208,7 +210,7 @@ class EvenArrivals:
             self.restart()
             return
         self._period_ns = period_ns
-        self._fit = ArrivalFit(0, arrival_ns, delay.hold_ns)
+        self.fit = ArrivalFit(0, arrival_ns, delay.hold_ns)
 
     def _are_missing(self, late: int, *, at_pace: bool) -> bool:
         """Return whether the last AGREEING frames are all late by `late` periods: then `late` samples are lost."""
@@ -248,6 +250,11 @@ class ArrivalTime:
     def resets(self) -> int:
         return self._losses.resets
 
+    @property
+    def fit(self) -> ArrivalFit | None:
+        """Return the fit that made the newest time; None if the arrival made it."""
+        return self._even.fit if self.error_ns and self.error_ns == self._even.error_ns else None
+
     def restart(self) -> None:
         """Start again after the device or the link was missing."""
         self._losses.restart()
@@ -283,3 +290,43 @@ class ArrivalTime:
             return self._even.t_ns
         t_ns, self.error_ns = self.delay.before(arrival_ns, size_bytes, spread.period_ns, spread.sigma_ns)
         return t_ns
+
+
+PARTS: Final = {
+    "arrivals": ("The link or this host delays the frames unequally.", "Reduce the load of this host or connect SOUT."),
+    "link": ("The arrival times do not show the constant delay of the link.", "Connect SOUT, which shows the delay."),
+    "adapter": ("The latency timer of the USB adapter delays the bytes.", "Reduce the latency timer or connect SOUT."),
+    "device": ("The device counts its time in steps.", "Connect SOUT."),
+    "poll": ("A read does not show the time of the measurement.", "Connect the data-ready line."),
+    "pulses": ("The interrupt latency of the kernel delays the time stamps of the pulses.", ""),
+    "utc": ("The UTC of this host has an error.", "Improve the UTC source of this host."),
+    "other": ("Frames wait, or the clock removes a correction slowly.", ""),
+}  # fmt: skip
+"""Causes of the time stamp error: sentence and next step."""
+
+
+def error_parts(
+    sync: Sync, t_err_ns: int, delay: LinkDelay, fit: ArrivalFit | None, spread_ns: float, tick_error_ns: float | None
+) -> tuple[ErrorPart, ...]:
+    """Return the causes of a time stamp error, the largest first.
+
+    `fit` is the fit that made the time stamp, None without a fit. `spread_ns` is the spread of the arrivals.
+    `tick_error_ns` is the error from the length of a tick; None for a polled device.
+    """
+    if sync in (Sync.EDGE, Sync.UTC) or tick_error_ns is None:
+        sizes = {"poll" if sync is Sync.ARRIVAL else "utc" if sync is Sync.UTC else "pulses": float(t_err_ns)}
+    elif fit is not None:
+        hidden_ns = SIGMA_OF_HIDDEN * fit.hidden_ns
+        sizes = {
+            "arrivals": fit.error_ns,
+            "adapter": hidden_ns,
+            "link": delay.bias_error_ns(0.0),
+            "device": tick_error_ns,
+        }
+        sizes["other"] = t_err_ns - hypot(fit.error_ns, delay.bias_error_ns(fit.hidden_ns)) - tick_error_ns
+    else:
+        link_ns = SIGMA_OF_RANGE * delay.floor_ns
+        rest_ns = max(t_err_ns - spread_ns - link_ns, 0.0)
+        sizes = {"arrivals": spread_ns, "link": link_ns, "adapter" if delay.hold_ns else "other": rest_ns}
+    parts = [ErrorPart(name, min(int(size_ns), t_err_ns), *PARTS[name]) for name, size_ns in sizes.items()]
+    return tuple(sorted((one for one in parts if one.value_ns > 0), key=lambda one: -one.value_ns))

@@ -40,7 +40,7 @@ from imud.host.clock import UNSTEERED, SteadyTime
 from imud.model.sample import T_ERR_MOST, Measurement, Sample, Sync
 from imud.model.units import NS_PER_S
 from imud.sampling.arrival_fit import ENOUGH_SPAN_NS, SLOPE_HIGHEST, ArrivalFit
-from imud.sampling.arrival_time import FIRST_SPREAD_NS, ArrivalTime, LinkDelay
+from imud.sampling.arrival_time import FIRST_SPREAD_NS, ArrivalTime, LinkDelay, error_parts
 from imud.sampling.device_time import FIRST_EARLY_NS, JUMP_EARLY_NS, JUMP_LATE_NS, DeviceTime, JumpDetector
 from imud.sampling.gaps import GAP_PERIODS, CounterLine
 from imud.sampling.stamp_time import StampTime
@@ -435,11 +435,13 @@ class SampleClock:
     def status(self) -> ClockStatus:
         self.settle()
         fit = self._fit if self._fit_sync is not Sync.ARRIVAL else None
+        sync, spread_ns = self._sync if self._aiding else self._fit_sync, self._arrivals.spread.sigma_ns
+        tick_error_ns = self._time.error_ns if self._error_ns else None  # a poll sets no `_error_ns`
         status = ClockStatus(
-            self._sync if self._aiding else self._fit_sync, self._t_ns - self._time.raw_ns if self._known else 0,
-            (1 / fit.slope - 1) * 1e6 if fit else 0.0,
-            int(fit.residual_ns if fit else self._arrivals.spread.sigma_ns), self._t_err_ns, self.resets,
-            self._delay.hold_ns, steering_ppm=self._host.rate * 1e6,
+            sync, self._t_ns - self._time.raw_ns if self._known else 0, (1 / fit.slope - 1) * 1e6 if fit else 0.0,
+            int(fit.residual_ns if fit else spread_ns), self._t_err_ns, self.resets, self._delay.hold_ns,
+            steering_ppm=self._host.rate * 1e6,
+            parts=error_parts(sync, self._t_err_ns, self._delay, fit or self._arrivals.fit, spread_ns, tick_error_ns),
         )  # fmt: skip
         return self._aiding.add_status(status) if self._aiding else status
 
@@ -456,12 +458,11 @@ class SampleClock:
         """Start again after the device or the link was missing. This does not count as a reset. If the device counter
         continued, the clock counts the lost samples. Otherwise the gap has an unknown size."""
         self.settle()
-        self._known = False
+        self._known, self.missed = False, 0
         self._time.period.restart()
         self._arrivals.restart()
         if self._stamps is not None:
             self._stamps.restart()
-        self.missed = 0
         self._drop_fit()
         if self.observer is not None:
             self.observer.call("clock", "restart")
@@ -656,8 +657,7 @@ class SampleClock:
         self._fit = ArrivalFit(self._fit_begin_ns, arrival_ns, self._delay.hold_ns, slope, slope_error)
 
     def _drop_fit(self) -> None:
-        self._fit = self._holdover = None
-        self._fit_sync = _ARRIVAL
+        self._fit, self._holdover, self._fit_sync = None, None, _ARRIVAL
         self._jump.reset()
         self._slew.set(0.0)
         if self._aiding is not None:

@@ -12,6 +12,7 @@ from imud.cli.clock import aids, block, page, verdict
 from imud.contracts.status import ClockStatus
 from imud.model.sample import Sync
 from imud.model.units import NS_PER_MS
+from imud.sampling.arrival_time import LinkDelay, error_parts
 from tests.cli.conftest import Cli
 from tests.support.daemon_process import running_daemon, sending_daemon, wait_until, write_config
 from tests.support.files import hi91
@@ -52,11 +53,14 @@ def test_aids_of_the_clock_have_rows() -> None:
         ("PPS", "59 pulses, 1 ignored because of their interval"),
         ("UTC", "error of the host clock 250.0 µs (one sigma)"),
     ]
-    text = block(equipped("bow"), deque([9_000_000] * 100))
+    parts = error_parts(Sync.EDGE, 4500, LinkDelay(0, 0), None, 0.0, 0.0)
+    bow = msgspec.structs.replace(equipped("bow"), clock=msgspec.structs.replace(equipped("bow").clock, parts=parts))
+    text = block(bow, deque([9_000_000] * 100))
+    assert "\n  pulses    4.5 µs. The interrupt latency of the kernel delays" in text
     assert max(map(len, text.splitlines())) <= 80
     verdict = "  verdict   the kernel's time stamps of the GPIO line"
     assert [words for words in ("\n  SOUT      4998 pulses", " 9000 µs 100.0 % ##", verdict) if words not in text] == []
-    both = page([equipped("bow"), device("stern")], {"bow": deque([9_000_000] * 100), "mast": deque()})
+    both = page([bow, device("stern")], {"bow": deque([9_000_000] * 100), "mast": deque()})
     assert both == f"{text}\n\nmast: no longer in the configuration"
     lines = msgspec.structs.replace(LINES, edges={})
     assert [name for name, _ in aids(equipped("bow", lines=lines, utc=None))] == ["SIN", "UTC"]

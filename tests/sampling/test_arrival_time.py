@@ -1,11 +1,14 @@
 """Frames without device time: by arrival time, by pace, by number."""
 
 from random import Random
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
+from imud.model.sample import Sync
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
-from imud.sampling.arrival_time import ArrivalSpread, ArrivalTime, EvenArrivals, LinkDelay
+from imud.sampling.arrival_time import ArrivalSpread, ArrivalTime, EvenArrivals, LinkDelay, error_parts
 
 FIRST_SPREAD_NS = 2 * NS_PER_MS
 
@@ -148,3 +151,26 @@ def test_the_period_outlasts_a_stopped_clock() -> None:
     for number in (*range(1, 50), *[49] * 500):
         spread.add_arrival(number * 10 * NS_PER_MS)
     assert 5 * NS_PER_MS < spread.period_ns < 10 * NS_PER_MS
+
+
+@pytest.mark.parametrize(
+    ("sync", "t_err_ns", "fit", "tick_error_ns", "expected"),
+    [
+        (Sync.EDGE, 4000, None, 0.0, {"pulses": 4000}),
+        (Sync.UTC, 9000, None, 0.0, {"utc": 9000}),
+        (Sync.ARRIVAL, 700, None, None, {"poll": 700}),
+        (Sync.ARRIVAL, 0, None, None, {}),
+        # 225 us / sqrt(12) of the link, 2 ms of the spread, the rest of the timer
+        (Sync.ARRIVAL, 7_000_000, None, 0.0, {"adapter": 4_935_048, "arrivals": 2_000_000, "link": 64_951}),
+        # 1 ms of the timer x sqrt((2 / 12 + 1 / 4) / 3); other: 500 - hypot(30, 64.95 + 372.68) - 5 us
+        (
+            Sync.REGRESSION, 500_000, SimpleNamespace(error_ns=30_000.0, hidden_ns=1e6), 5_000.0,
+            {"adapter": 372_677, "link": 64_951, "other": 56_343, "arrivals": 30_000, "device": 5_000},
+        ),
+    ],
+)  # fmt: skip
+def test_causes_of_the_time_stamp_error(
+    sync: Sync, t_err_ns: int, fit: Any, tick_error_ns: float | None, expected: dict[str, int]
+) -> None:
+    parts = error_parts(sync, t_err_ns, LinkDelay(10_850, NS_PER_MS), fit, float(FIRST_SPREAD_NS), tick_error_ns)
+    assert [(one.name, one.value_ns) for one in parts] == list(expected.items())

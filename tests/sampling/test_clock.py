@@ -59,6 +59,7 @@ def test_it_comes_from_arrival_to_regression_and_learns_fast_and_slow_counters()
     assert status.sync is Sync.REGRESSION
     assert abs(status.skew_ppm) < 1
     assert status.t_err_ns == samples[-1].t_err_ns
+    assert (status.parts[0].name, status.parts[0].value_ns) == ("link", 41_396), "143.4 us / sqrt(12)"
     assert abs(status.offset_ns - (BEGIN_NS - 5000 * NS_PER_MS)) < NEAR_NS
     clock = make_clock()
     points: list[Point] = [(int(10.5 * i), 10 * i) for i in range(6000)]
@@ -252,7 +253,7 @@ def test_the_time_of_polled_samples_is_that_of_the_poll_or_edge_and_rises() -> N
     assert [(sample.sync, sample.edge_seq, sample.t_ns) for sample in samples] == [
         (Sync.EDGE, 7, 100), (Sync.ARRIVAL, None, 200), (Sync.EDGE, 8, 300),
     ]  # fmt: skip
-    assert one.status().sync is Sync.EDGE
+    assert (one.status().sync, [part.name for part in one.status().parts]) == (Sync.EDGE, ["pulses"])
 
 
 @pytest.mark.parametrize(("hold_ns", "slower"), [(0, 0.0), (NS_PER_MS, 0.0), (0, 50e-6)])
