@@ -132,7 +132,7 @@ def desktop(folder: Path, url: str, bow: Module, daemon: RunningDaemon) -> None:
         daemon.wait_for("bow", "missing")
         daemon.wait_for("bow", "running")
         page.until_text("#event-list", "Device found")
-        page.until_text("#about", 'mode is "6-axis", declared "9-axis"')
+        page.until_text("#about", "mode: 6-axis, declared: 9-axis")
         page.until("return document.querySelector('[data-setting=mode].off')")
         choose(page, "#rate", "20")  # clears the plots, which otherwise show the pause
         page.until(FULL)

@@ -114,7 +114,7 @@ def test_a_setting_with_a_difference_is_marked_on_the_page_and_in_the_overview(p
     declared = {"mode": "9-axis", "magnetic_calibration": True}
     with daemon_with_module(tmp_path, "--rate", "100", settings=declared) as daemon, serving_web(daemon.socket) as url:
         open_page(page, url, "bow")
-        page.until_text("#about", 'mode is "6-axis", declared "9-axis"')
+        page.until_text("#about", "mode: 6-axis, declared: 9-axis")
         # actual values arrive after the names
         page.until("return document.querySelector('[data-setting=mode].off')")
         three = page.js("return [...document.querySelectorAll('[data-setting=mode] dd')].map((one) => one.innerText)")

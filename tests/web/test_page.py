@@ -10,6 +10,7 @@ from time import monotonic
 import numpy as np
 import pytest
 from msgspec.json import decode
+from selenium.webdriver.common.keys import Keys
 
 from imud.device.calibration import cell_of
 from imud.web.hub import row_of
@@ -96,6 +97,15 @@ COMPARED = """const { plots, difference } = window.imud?.view ?? {};
 OF_DEVICE = """const { plots: all, time } = window.imud?.view ?? {};
     const [plots, difference] = [[all?.get?.('accel_m_s2')], time?.stamps];
     if (!difference?.stored) return false;"""
+CONTROLS_IN_ORDER = """const selector = 'a[href], button, input, select, textarea, summary, [tabindex]';
+    window.controls = [...document.querySelectorAll(selector)].filter((one) =>
+        one.tabIndex >= 0 && !one.matches(':disabled') && one.checkVisibility({ visibilityProperty: true }));
+    return window.controls.length"""
+"""Number of controls that Tab reaches, in the order of the page."""
+FOCUSED = """const one = document.activeElement;
+    const outlined = [one, one.nextElementSibling].filter(Boolean).map((each) => getComputedStyle(each).outlineStyle);
+    return [window.controls.indexOf(one), one.id === 'skip' || outlined.includes('solid')]"""
+"""Place of the control with the focus, and whether the focus is visible."""
 POINTS = "return window.imud.view.plots?.get('accel_m_s2').data[0].length >= arguments[0]"
 PLOTTED = """const plot = window.imud.view.plots.get('accel_m_s2');
     const lines = [plot.plot.data[0].map((x) => x - plot.offset_s), plot.plot.data[6], plot.plot.data[5]];
@@ -216,20 +226,48 @@ def test_ledger_latency_status_and_settings_are_those_of_the_daemon(page: Page, 
     assert page.js("return document.querySelectorAll('#settings .control :enabled:not([inert] *)').length") == 0
     page.until("return window.imud.view.live.attitude.quaternion")
     assert page.js("return document.querySelector('#attitude3d canvas').toDataURL().length") > 3000
-    about = page.js("return [...document.querySelectorAll('#about :is(dt, dd)')].map((one) => one.textContent)")
-    names = page.js("return window.imud.view.status.rows.map(([name]) => name)")
-    assert (about[::2], len(about), "bytes" in names) == (names, 2 * len(names), True)
+    facts, more = page.js(
+        """return [...document.querySelectorAll('#about dl')].map((list) =>
+            Object.fromEntries([...list.children].map((one) => one.textContent).flatMap((text, at, all) =>
+                at % 2 ? [] : [[text, all[at + 1]]])))"""
+    )
+    names = set(page.js("return window.imud.view.status.rows.map(([name]) => name)"))
+    assert set(more) == names - {"link", "identity", "axes", "settings"} >= {"bytes"}
+    assert facts["Product"] == status["identity"]["product"]
+    assert facts["Link"] == f"{status['link']}, opened once"
+    assert (facts["Driver"], facts["Heading"]) == ("hipnuc-uart", "measured from the direction at power-on")
+    assert not re.search(r'[{}"]', "".join(facts.values())), "no JSON"
     page.js("window.imud.view.onMessage({ kind: 'events', events: [arguments[0]] })", TURNING)
     assert page.js("return document.querySelector('#calibration canvas').dataset.covered") == "8"
     assert page.text("#calibration-progress") == "half of the directions"
     assert page.text("#calibration-instruction").startswith("Turn the device")
     assert {"48.5 µT", "2.5 %"} <= set(re.findall(r"[\d.]+ (?:µT|%)", page.text("#calibration .measures")))
-    page.js(
+    lead, *parts = page.js(
+        "return [...document.querySelectorAll('#time :is(.lead, .chain li)')].map((one) => one.textContent)"
+    )
+    assert re.search(r"\(one sigma\)\. .+ Main cause: [A-Z][^.]+\. ", lead)
+    assert [one for one in parts if not re.fullmatch(r"\w+[A-Z][^.]+\.±[\d.,]+ [nµm]?s", one)] == []
+    assert len(parts) >= 2
+    news = page.js(
         """const { view } = window.imud, show = view.onMessage.bind(view), message = structuredClone(view.status);
         view.onMessage = () => {};
+        const news = document.querySelector('#condition [role=status]'), told = [];
+        for (const [condition, code, text] of arguments[0]) {
+            message.status.condition = { condition, since_ns: 0, reasons: [{ code, message: text, next: '' }] };
+            show(message);
+            if (told.at(-1) !== news.textContent) told.push(news.textContent);
+        }
         message.status.work = { name: 'the command save', begun_ns: (message.now_s - 60) * 1e9, by: 'uid 1000' };
-        show(message)"""
+        show(message);
+        return told""",
+        [
+            ("degraded", "lost", "1 %."),
+            ("degraded", "lost", "2 %."),
+            ("degraded", "rate", "3 %."),
+            ("ok", "ok", "No loss."),
+        ],
     )
+    assert news == ["bow: Degraded. 1 %.", "bow: Degraded. 3 %.", "bow: OK. No loss."], "each change once"
     assert page.text(".activity") == "the command save is running, started 60 s ago by uid 1000"
     assert page.problems() == []
 
@@ -306,6 +344,28 @@ def test_each_section_fits_any_width_with_names_and_contrast(page: Page, site: S
         assert sum(sizes.values()) <= 60_000, sizes
 
 
+def test_tab_reaches_each_control_in_order_with_a_visible_focus(page: Page, site: Site, token: str) -> None:
+    with serving_web(site[0].socket, "--token-file", token) as url:
+        open_page(page, url, "bow")
+        log_in(page, TOKEN)
+        page.until("return document.querySelectorAll('[data-setting]').length > 3")
+        page.until("return document.querySelectorAll('#about [data-action]').length >= 2")
+        page.until_text("#event-list", "Device found")
+        page.js("window.imud.view.onMessage = () => {}; window.imud.stream.look({ look: 'nothing' })")
+        page.js("document.querySelectorAll('main details').forEach((one) => (one.open = true))")
+        count = page.js(CONTROLS_IN_ORDER)
+        page.js("document.activeElement.blur(); getSelection().collapse(document.body, 0)")
+        walked = []
+        for _ in range(count):
+            page.driver.switch_to.active_element.send_keys(Keys.TAB)
+            walked.append(page.js(FOCUSED))
+        assert walked == [[number, True] for number in range(count)]
+        assert set(page.js("return window.controls.map((one) => one.closest('.section')?.id)")) >= {*SECTIONS} - {
+            "ledger"
+        }
+        assert page.problems() == []
+
+
 def faults_of(page: Page, address: str = "") -> list[object]:
     """Return cut elements, low contrasts, and controls without a name, at all widths in both color schemes."""
     found: list[object] = []
@@ -354,6 +414,11 @@ def test_keys_the_filter_and_stored_events(page: Page, site: Site) -> None:
     assert page.js("return window.imud.view.live.group.zoomed") is None
     page.js(PINCH)
     assert page.js("const [from, to] = window.imud.view.live.group.zoomed; return to - from") == pytest.approx(15)
+    press("g")
+    page.until("return document.querySelector('[data-device]')")
+    page.click("main .pair a")
+    page.until("return location.hash === '#/device/bow/events/all' && window.imud.view.events?.groups?.length")
+    assert page.text("#events [aria-label='events of'] [aria-checked=true]") == "All devices"
     press("g")
     page.until("return document.querySelector('[data-device]')")
     rows = [decode(encode(row_of(device(f"imu{number}"), None, 5))) for number in range(9)]
@@ -416,6 +481,13 @@ def test_two_devices_are_compared_with_their_delay(page: Page, tmp_path: Path) -
             page.until_text(".notes", "Both devices use the same axes: body: x forward, y left, z up")
             assert "imud rotates the values of bow and stern." in page.text(".notes")
             page.until(f"{COMPARED} return [...plots, difference].every((one) => one.losses.at(-1) > end)")
+            page.click("[aria-label=offset] :nth-child(2)")
+            centered = """const { data, offsets, plot } = window.imud.view.difference, at = plot.data[0].length - 9;
+                const isMoved = (offset, axis) =>
+                    Math.abs(plot.data[1 + 2 * axis][at] - data[1 + 2 * axis][at] - offset) < 1e-9;
+                return offsets[2] && offsets.every(isMoved) && offsets"""
+            moved = page.until(centered)
+            assert moved[2] == pytest.approx(-0.5, abs=0.2)
             assert (faults_of(page), page.problems()) == ([], [])
             for address, all_plots in (("compare/bow/stern", COMPARED), ("device/stern", OF_DEVICE)):
                 page.driver.get("about:blank")
@@ -451,6 +523,23 @@ def test_statistics_of_a_comparison_and_angles_over_a_half_turn(scripts: Page) -
     assert delay["delay"] == pytest.approx(3.5, abs=0.05)
     assert none["delay"] is None
     assert (least, most) == ([170, 178, 185, -10, 120, 210], [175, 181, 190, 20, 130, 220])
+
+
+def test_the_start_and_the_end_of_an_alarm_are_one_event(scripts: Page) -> None:
+    def row(t: int, count: int = 1, first: int = 0, device: str = "bow", **detail: object) -> dict[str, object]:
+        return {"t_ns": t, "first_ns": first or t, "count": count, "device": device, "kind": "alarm", "detail": detail}
+
+    groups = [
+        row(1, raised=1, active=True), row(2, active=True, device="mast"), row(3, raised=1, active=False),
+        row(4, tilt=True, shock=True), row(5, active=True, verdict="level"), row(6, tilt=False), row(7, shock=False),
+        row(8, active=False, device="keel"), row(20, 2, 10, active=False), row(21, 3, 9, active=True),
+    ]  # fmt: skip
+    join = "const { joinAlarms } = await import('/static/events.js'); return joinAlarms(args[0]).map((one) => "
+    join += "[one.first_ns, one.to_ns ?? 0, one.device, one.count, [...one.open ?? ['-']].join()])"
+    assert scripts.module(join, groups) == [
+        [2, 0, "mast", 1, "active"], [1, 3, "bow", 1, ""], [5, 0, "bow", 1, "-"], [4, 7, "bow", 1, ""],
+        [8, 0, "keel", 1, "-"], [9, 0, "bow", 3, "active"],
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])

@@ -77,6 +77,7 @@ export class Compare {
     this.kind = "euler_rad";
     this.statuses = new Map();
     this.span_s = 30;
+    this.isCentered = false;
     this.picks = el("div", { class: "picks" });
     this.tools = el("div");
     this.plotsBox = el("div", { class: "panel plots" });
@@ -128,7 +129,8 @@ export class Compare {
     this.plotsBox.replaceChildren(...[...this.plots, this.difference].map((one) => one.node));
     this.plotsBox.setAttribute("aria-label", `plots of ${title}`);
     const kinds = segmented("quantity", Object.entries(KINDS).map(([key, one]) => [key, one.title]), this.kind, (value) => { this.kind = value; this.restart(); });
-    this.tools.replaceChildren(timeBar(this.group, kinds));
+    const offset = segmented("offset", [["no", "As measured"], ["yes", "Mean removed"]], this.isCentered ? "yes" : "no", (value) => { this.isCentered = value === "yes"; this.drawTable(); });
+    this.tools.replaceChildren(timeBar(this.group, kinds, offset));
   }
 
   onMessage(message) {
@@ -216,6 +218,9 @@ export class Compare {
       const [a, b] = [1, 3].map((line) => inRange.map((index) => data[line][index] && (data[line][index] + data[line + 1][index]) / 2));
       const even = Math.max(inRange.filter((index) => index < stored).length, inRange.length - DELAY_S * RATE_HZ);
       const found = statistics(a, b, times.map((t, index) => Math.min(t - (times[index - 1] ?? t), WEIGHT_MAX_S)), even);
+      const moved = this.isCentered && found ? found.mean : 0;
+      this.plots[axis].move([0, moved]);
+      this.difference.move(Object.assign([...this.difference.offsets], { [axis]: -moved }));
       const texts = found ? [isAngle ? near(found.mean, 0) : found.mean, found.rms, found.most].map((one) => `${number(one, 2)} ${unit}`).concat(number(found.correlation, 3)) : ["–", "–", "–", "–"];
       const period_s = (times.at(-1) - times[even]) / (times.length - 1 - even);
       const delay = found && found.delay !== null ? `${number(found.delay * period_s * 1e3, 0)} ms` : "–";

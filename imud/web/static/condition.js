@@ -35,17 +35,27 @@ export function reasonList(reasons, most) {
 export class ConditionView {
   constructor(device) {
     this.device = device;
-    this.node = el("div", { id: "condition" });
-    this.drawn = "";
+    this.shown = el("div");
+    this.news = el("p", { class: "unseen", role: "status" }); // for screen readers
+    this.node = el("div", { id: "condition" }, this.shown, this.news);
+    this.drawn = this.told = "";
     this.isUnfolded = false;
   }
 
+  /** Announce the condition if it or the kinds of its reasons change. A number in a reason changes more often. */
+  tell({ condition, reasons }) {
+    const told = [condition, ...reasons.map((one) => one.code)].join();
+    if (this.told && told !== this.told) this.news.textContent = `${this.device}: ${CONDITION_WORDS[condition]}. ${reasons[0]?.message ?? ""}`;
+    this.told = told;
+  }
+
   draw(condition, now_s) {
+    if (condition) this.tell(condition);
     const drawn = JSON.stringify([condition?.condition, condition?.reasons]);
     if (drawn !== this.drawn) {
       this.drawn = drawn;
       this.since = el("span");
-      this.node.replaceChildren(condition ? this.box(condition) : "");
+      this.shown.replaceChildren(condition ? this.box(condition) : "");
     }
     if (condition) this.since.textContent = sinceWords(condition.since_ns / 1e9, now_s);
   }

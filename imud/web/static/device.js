@@ -133,7 +133,8 @@ export class DevicePage {
     if (PHONE.matches && !item) scrollTo(0, 0);
     else if (id) byId(here)?.scrollIntoView({ block: "start" });
     else scrollTo(0, 0);
-    this.settings.goTo(item);
+    this.settings.goTo(here === "settings" ? item : "");
+    if (here === "events" && item === "all") this.events.showFor("every");
     this.settings.drawBar();
     this.live.redraw();
     this.time.redraw();

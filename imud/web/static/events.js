@@ -1,5 +1,5 @@
 import { button, icon, section, segmented, toast } from "./ui.js";
-import { call, copy, el, number, shown, timeOf } from "./util.js";
+import { call, copy, duration, el, number, shown, timeOf } from "./util.js";
 
 const EVENT_WORDS = {
   up: "Device found", down: "Device lost", condition: "Condition", sync: "Time source", loss: "Lost samples", configuration: "Configuration", alarm: "Alarm",
@@ -31,6 +31,29 @@ export function addEvent(groups, event) {
   if (groups.length > EVENTS_MAX) groups.shift();
 }
 
+/** Return the groups with the start and the end of an alarm as one group. `open` contains the active alarms of a group;
+ *  `to_ns` is the end of its last alarm. */
+export function joinAlarms(groups) {
+  let found = [];
+  const beginOf = (one) => one.first_ns || one.t_ns;
+  for (const one of groups) {
+    const flags = one.kind === "alarm" && !one.detail?.verdict ? Object.entries(one.detail ?? {}).filter(([, value]) => typeof value === "boolean") : [];
+    const [begun, ended] = [true, false].map((is) => flags.filter(([, value]) => value === is).map(([name]) => name));
+    const known = ended.filter((name) => {
+      const at = found.findLastIndex((other) => other.device === one.device && other.open?.has(name));
+      if (at < 0) return false;
+      const [start] = found.splice(at, 1);
+      start.open.delete(name);
+      found.push({ ...start, to_ns: one.t_ns });
+      return true;
+    });
+    if (flags.length && !begun.length && known.length === ended.length) continue;
+    if (begun.length) found = found.filter((other) => !(other.device === one.device && other.ended?.some((name) => begun.includes(name)) && beginOf(other) > beginOf(one))); // an alarm that starts again
+    found.push({ ...one, ...(begun.length ? { open: new Set(begun) } : { ended }) });
+  }
+  return found.sort((a, b) => (a.to_ns ?? a.t_ns) - (b.to_ns ?? b.t_ns));
+}
+
 /** Return the number of events and warnings in each of the last 60 minutes; null before the start of imud. */
 export function perMinute(groups, now_ns, begun_ns) {
   return Array.from({ length: 60 }, (_, index) => {
@@ -54,9 +77,16 @@ export class EventsSection {
     this.minutes = el("div", { class: "minutes", role: "img" });
     this.last = el("p", { class: "help" });
     const level = segmented("event level", [["all", "All"], ["warning", "Warnings"]], "all", (value) => { this.level = value; this.draw(); });
-    const whose = segmented("events of", [["this", device], ["every", "All devices"]], "this", (value) => { this.whose = value; this.load(); });
+    this.choice = el("div", { class: "choice" });
+    this.showFor("this");
     const copyAll = button("Copy", async () => { await copy(this.text()); toast("Copied."); }, { kind: "quiet", glyph: "copy" });
-    this.node = section("events", "Events", el("div", { class: "timebar" }, whose, level, el("span", { class: "push" }), copyAll), this.minutes, el("div", { class: "panel flush" }, this.list), this.last);
+    this.node = section("events", "Events", el("div", { class: "timebar" }, this.choice, level, el("span", { class: "push" }), copyAll), this.minutes, el("div", { class: "panel flush" }, this.list), this.last);
+  }
+
+  /** Show the events of this device (`this`) or of all devices (`every`). */
+  showFor(whose) {
+    this.whose = whose;
+    this.choice.replaceChildren(segmented("events of", [["this", this.device], ["every", "All devices"]], whose, (value) => { this.whose = value; this.load(); }));
     this.load();
   }
 
@@ -64,8 +94,10 @@ export class EventsSection {
     this.groups = null;
     this.early = [];
     this.since_ns = Infinity;
+    const { whose } = this;
     try {
       const { events: found, since_ns } = await pastEvents(this.whose === "this" ? [this.device] : undefined);
+      if (whose !== this.whose) return;
       this.since_ns = since_ns; // later than the start of imud if it removed old events
       const newest_ns = found.at(-1)?.t_ns ?? 0;
       this.groups = found.filter((one) => !isProgress(one));
@@ -97,7 +129,7 @@ export class EventsSection {
   }
 
   shownGroups() {
-    return (this.groups ?? []).filter((one) => this.level === "all" || levelOf(one) === "warning").reverse();
+    return joinAlarms(this.groups ?? []).filter((one) => this.level === "all" || levelOf(one) === "warning").reverse();
   }
 
   draw() {
@@ -126,15 +158,23 @@ export class EventsSection {
     const summary = one.count > 1 ? `Details, since ${timeOf((one.first_ns || one.t_ns) / 1e9)}` : "Details";
     return el("li", { class: level, "data-kind": one.kind }, icon(level === "warning" ? "degraded" : "about", level),
       el("div", {}, el("p", {}, el("b", { text: eventWords(one.kind) }), one.count > 1 && el("em", { text: `×${number(one.count)}` }), this.whose === "every" && el("span", { class: "tag", text: one.device || "imud" })),
-        el("p", { text: message }),
+        el("p", { text: message + spanOf(one) }),
         (detail.length > 0 || one.count > 1) && el("details", { open: open.has(`${one.kind}${first}`), "data-first": `${one.kind}${first}` }, el("summary", { text: summary }),
           detail.map(([name, value]) => el("code", { text: `${name}: ${shown(value)}` })))),
-      el("time", { text: timeOf(one.t_ns / 1e9) }));
+      el("time", { text: timeOf((one.to_ns ?? one.t_ns) / 1e9) }));
   }
 
   text() {
-    return this.shownGroups().map((one) => `${timeOf(one.t_ns / 1e9, { date: true })} ${one.device || "imud"} ${one.kind}${one.count > 1 ? ` ×${one.count}` : ""}: ${one.message}`).join("\n");
+    return this.shownGroups().map((one) => `${timeOf(one.t_ns / 1e9, { date: true })} ${one.device || "imud"} ${one.kind}${one.count > 1 ? ` ×${one.count}` : ""}: ${one.message}${spanOf(one)}`).join("\n");
   }
+}
+
+/** Return the time span of an alarm; empty for other events. */
+function spanOf({ open, to_ns, first_ns, t_ns }) {
+  if (!open) return "";
+  const from_ns = first_ns || t_ns;
+  const from = timeOf(from_ns / 1e9);
+  return open.size ? `, since ${from}, no end reported` : `, from ${from} to ${timeOf(to_ns / 1e9)} (${duration((to_ns - from_ns) / 1e9)})`;
 }
 
 function isProgress(one) {

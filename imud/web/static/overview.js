@@ -67,7 +67,8 @@ export class Overview {
     this.group = el("h2", { class: "group", text: "OK" });
     this.rows = el("div", { class: "rows" });
     this.happened = el("ol", { class: "happened", id: "recent-events" });
-    main.append(this.verdict, this.filter, this.none, this.cards, this.group, this.rows, el("h2", { class: "group", text: "Recent events" }), this.happened);
+    this.all = el("a", { text: "All events", hidden: true });
+    main.append(this.verdict, this.filter, this.none, this.cards, this.group, this.rows, el("div", { class: "pair" }, el("h2", { class: "group", text: "Recent events" }), this.all), this.happened);
     stream.look({ look: "overview" });
     this.loadEvents();
   }
@@ -113,6 +114,8 @@ export class Overview {
     if (tally !== this.counted) this.tally.replaceChildren(...Object.entries(COUNTED).filter(([key]) => counts[key]).map(([key, say]) => el("span", {}, icon(key), say(counts[key]))));
     this.counted = tally;
     this.none.hidden = devices.length > 0;
+    this.all.hidden = !devices.length;
+    if (devices.length) this.all.href = deviceLink(sorted(devices)[0].name, "events", "all");
     this.filter.hidden = devices.length < FILTER_FROM;
     const wanted = this.filter.hidden ? "" : this.filter.value.trim().toLowerCase();
     const rows = sorted(devices).filter((one) => one.name.toLowerCase().includes(wanted));

@@ -136,6 +136,7 @@ export class RollingPlot {
       onkeydown: (event) => this.onKey(event), ontouchstart: onTouch, ontouchmove: onTouch, ontouchend: onTouch });
     this.node = el("figure", { id, class: "chart" }, el("figcaption", {}, el("b", { text: title }), el("span", { class: "unit", text: unit }), keys, el("div", { class: "chart-tools" }, scales)), this.box);
     this.data = [[], ...axes.flatMap(() => [[], []])];
+    this.offsets = axes.map(() => 0); // the plot shows each line with this offset
     this.drawn = 0;
     this.isDue = false;
     this.isVisible = true;
@@ -376,6 +377,11 @@ export class RollingPlot {
     this.last = null;
   }
 
+  move(offsets) {
+    this.offsets = offsets;
+    this.draw();
+  }
+
   draw() {
     if (this.isDue || !this.isVisible || !this.data[0].length || !this.box.clientWidth) return;
     this.isDue = true;
@@ -386,16 +392,18 @@ export class RollingPlot {
     this.isDue = false;
     if (!this.data[0].length) return;
     if (!this.plot) this.begin();
-    this.plot.setData(this.data);
+    const move = (one, line) => (line ? one.map((value) => (value === null ? null : value + this.offsets[(line - 1) >> 1])) : one);
+    this.plot.setData(this.offsets.some(Boolean) ? this.data.map(move) : this.data);
     this.drawn = performance.now();
     this.showValues();
   }
 
   /** Show the values at the cursor, or the newest values. */
   showValues() {
-    const at = this.plot?.cursor.idx ?? this.data[0].length - 1;
+    const shown = this.plot?.data ?? this.data;
+    const at = this.plot?.cursor.idx ?? shown[0].length - 1;
     this.values.forEach(({ value }, index) => {
-      const [most, least] = [1, 2].map((line) => this.data[line + 2 * index][at]).map((one) => (this.isAngle && isNumber(one) ? near(one, 0) : one));
+      const [most, least] = [1, 2].map((line) => shown[line + 2 * index][at]).map((one) => (this.isAngle && isNumber(one) ? near(one, 0) : one));
       const same = number(most, this.decimals) === number(least, this.decimals);
       setText(value, same ? number(most, this.decimals) : `${number(least, this.decimals)} … ${number(most, this.decimals)}`);
     });

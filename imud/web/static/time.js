@@ -6,6 +6,7 @@ const SYNC = {
   arrival: "the arrival times of the bytes", regression: "the device time, fitted to the arrival times", edge: "the device time, fitted to pulses",
   utc: "the device time, which the device synchronizes to UTC",
 };
+const PARTS = { arrivals: "Arrivals", link: "Link", adapter: "Adapter", device: "Device", poll: "Read", pulses: "Pulses", utc: "UTC", other: "Other" };
 const seconds = (ns) => duration(ns / 1e9);
 
 export class TimeSection {
@@ -14,10 +15,11 @@ export class TimeSection {
     this.stamps = new RollingPlot("stamps", "Time stamp error and latency", "ms", ["time stamp error", "latency"], { scale: 1e3, decimals: 3, isLog: true }, this.group);
     this.lead = el("p", { class: "lead" });
     this.chain = el("ol", { class: "chain" });
+    this.more = el("p", { class: "help" });
     this.list = el("ol", { class: "histogram" });
     this.note = el("p", { class: "help" });
     this.bars = [];
-    this.node = section("time", "Time", this.lead, this.chain, el("div", { class: "two" }, el("div", { class: "panel" }, this.stamps.node),
+    this.node = section("time", "Time", this.lead, this.chain, this.more, el("div", { class: "two" }, el("div", { class: "panel" }, this.stamps.node),
       el("div", { class: "panel", id: "latency" }, el("h3", { text: "Delay from measurement to publication" }), this.list, this.note)));
   }
 
@@ -33,17 +35,15 @@ export class TimeSection {
   draw({ status, latency_bounds_s }) {
     const { clock } = status;
     const source = SYNC[clock.sync] ?? clock.sync;
-    setText(this.lead, `The time stamp error is ±${seconds(clock.t_err_ns)} (one sigma). The time stamps come from ${source}.`);
-    const rate = status.expected_rate_hz ? `device clock, ${number(status.expected_rate_hz, 0)} Hz` : "device clock, rate not known";
-    const parts = [
-      ["Device", rate, `${number(clock.skew_ppm, 2)} ppm`],
-      ["Adapter", clock.hold_ns ? "latency timer of the USB adapter" : "no latency timer", clock.hold_ns ? seconds(clock.hold_ns) : "0 ms"],
-      ["Fit", "spread of the arrival times", `±${seconds(clock.residual_ns)}`],
-      ["Host", "batching in imud", seconds(status.hold_ns)],
-      ["UTC", clock.reference_error_ns ? "the host's estimate" : "no estimate of the host", clock.reference_error_ns ? `±${seconds(clock.reference_error_ns)}` : "–"],
-    ];
+    const parts = clock.parts ?? [];
+    const main = parts.length ? ` Main cause: ${parts[0].message} ${parts[0].next}` : "";
+    setText(this.lead, `The time stamp error is ±${seconds(clock.t_err_ns)} (one sigma). The time stamps come from ${source}.${main}`);
+    const rate = status.expected_rate_hz ? `${number(status.expected_rate_hz)} Hz` : "rate not known";
+    const timer = clock.hold_ns ? ` Latency timer of the USB adapter: ${seconds(clock.hold_ns)}.` : "";
+    const utc = clock.reference_error_ns ? `±${seconds(clock.reference_error_ns)}` : "not known";
+    setText(this.more, `Device clock: ${rate}, ${number(clock.skew_ppm, 2)} ppm. Spread of the arrival times: ±${seconds(clock.residual_ns)}.${timer} Batching in imud: ${seconds(status.hold_ns)}. UTC error of the host: ${utc}.`);
     const drawn = JSON.stringify(parts);
-    if (drawn !== this.drawn) this.chain.replaceChildren(...parts.map(([name, words, value]) => el("li", {}, el("b", { text: name }), el("span", { class: "help", text: words }), el("output", { text: value }))));
+    if (drawn !== this.drawn) this.chain.replaceChildren(...parts.map((one) => el("li", {}, el("b", { text: PARTS[one.name] ?? one.name }), el("span", { class: "help", text: one.message }), el("output", { text: `±${seconds(one.value_ns)}` }))));
     this.drawn = drawn;
     this.drawHistogram(status, latency_bounds_s);
   }
