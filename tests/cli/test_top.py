@@ -278,7 +278,8 @@ def test_curves_of_the_last_minute_of_one_start_and_devices_come_and_go_and_vect
     assert fleet.devices["bow"].newest is None
     fleet.add(sample("bow"))
     fleet.update([device("bow", 1, rate_hz=5.0)], 2)
-    assert (list(fleet.devices), fleet.devices["bow"].newest) == (["bow"], sample("bow"))
+    assert list(fleet.devices) == ["bow"]
+    assert fleet.devices["bow"].newest == sample("bow")
     assert (fleet.devices["bow"].status.rate_hz, fleet.clients) == (5.0, 2)
     for vector, length in [((3.0, 0.0, 4.0), 5.0), (None, None), ((math.nan, 1.0, 1.0), None)]:
         assert top.norm(vector) == length
