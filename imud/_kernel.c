@@ -63,6 +63,7 @@
 #define HI91_FLOATS 16           /* accel, gyro, mag, euler, quaternion */
 #define HI92_COUNTS 9            /* gyro, accel, mag */
 #define AHRS_FLOATS 10           /* pitch roll yaw, accel, gyro, temperature */
+#define MORE_OFFSET 256          /* place of the bytes of a slot that HAS_MORE announces */
 #define QUAT_SQUARE_MIN 0.9604   /* limits of the squared length of a rotation, see value_limits.py */
 #define QUAT_SQUARE_MAX 1.0404
 /* A float has this high byte or a larger one if it is not usual, also NaN: 32 g or more, other values 2048 or more */
@@ -100,7 +101,10 @@
 #define TIME_MOST_NS (INT64_C(1) << 60)
 
 enum { HAS_T_DEV = 1 << 0, HAS_ACCEL = 1 << 1, HAS_GYRO = 1 << 2, HAS_MAG = 1 << 3, HAS_QUAT = 1 << 4,
-       HAS_EULER = 1 << 5, HAS_TEMPERATURE = 1 << 6, HAS_PRESSURE = 1 << 7, HAS_STATUS = 1 << 9, HAS_PPS_AGE = 1 << 10 };
+       HAS_EULER = 1 << 5, HAS_TEMPERATURE = 1 << 6, HAS_PRESSURE = 1 << 7, HAS_STATUS = 1 << 9, HAS_PPS_AGE = 1 << 10,
+       HAS_MORE = 3 << 12 /* velocity, position */ };
+
+/* The kernel makes only slots without the fields since layout version 2: these bytes are 0 and not part of the CRC. */
 
 typedef struct {
     uint64_t seq;
@@ -111,11 +115,16 @@ typedef struct {
     uint8_t sync, reserved0;
     double accel_m_s2[3], gyro_rad_s[3], mag_t[3], quat_wxyz[4], euler_rad[3], temperature_c, pressure_pa, incli_rad[2];
     uint32_t pps_age_ms;
-    uint8_t reserved1[24];
+    uint8_t position_quality, position_satellites, reserved1[2];
+    int64_t gnss_utc_ns;
+    double heave_m;
+    uint8_t reserved2[4];
     uint32_t crc32;
+    double velocity_enu_m_s[3], latitude_rad, longitude_rad, height_m;
+    uint8_t reserved3[16];
 } Slot;
 
-_Static_assert(sizeof(Slot) == 256, "a slot has 256 bytes without padding");
+_Static_assert(sizeof(Slot) == 320 && offsetof(Slot, velocity_enu_m_s) == MORE_OFFSET, "a slot has 320 bytes without padding");
 
 /* Open bin of the fit (`_Bin`), and the number of arrivals that were added to it. */
 typedef struct {
@@ -526,7 +535,7 @@ static int stamp(Run *run, double *error_ns, Slot *slot, const uint8_t *frame, i
     slot->t_dev_ns = run->raw_ns;
     slot->t_err_ns = *error_ns < T_ERR_MOST ? (uint32_t)((int64_t)*error_ns + 1) : UINT32_MAX;
     decode(slot, payload, run);
-    slot->crc32 = crc32_of((const uint8_t *)slot, sizeof *slot - 4);
+    slot->crc32 = crc32_of((const uint8_t *)slot, offsetof(Slot, crc32));
     return 1;
 }
 
@@ -809,7 +818,12 @@ static PyObject *write_ring(RingObject *self, PyObject *packed)
         uint8_t *slot = memory + RING_HEADER_BYTES + (seq & (uint64_t)self->mask) * sizeof(Slot);
         put_word(slot, UINT64_MAX); /* invalid while it changes */
         __atomic_thread_fence(__ATOMIC_SEQ_CST);
-        memcpy(slot + sizeof seq, slots + sizeof seq, sizeof(Slot) - sizeof seq);
+        uint32_t present, before;
+        memcpy(&present, slots + offsetof(Slot, present), sizeof present);
+        memcpy(&before, slot + offsetof(Slot, present), sizeof before);
+        memcpy(slot + sizeof seq, slots + sizeof seq, MORE_OFFSET - sizeof seq);
+        if ((present | before) & HAS_MORE) /* these bytes of other slots are 0 */
+            memcpy(slot + MORE_OFFSET, slots + MORE_OFFSET, sizeof(Slot) - MORE_OFFSET);
         put_word(slot, seq);
         put_word(memory + RING_NEWEST_OFFSET, seq);
         if (seq != (uint64_t)self->newest + 1) /* the ring does not contain the samples between */

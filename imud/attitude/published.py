@@ -6,9 +6,9 @@ rotation of the navigation frame (declination and convention). imud rotates ever
     vectors    v' = M · v               accel_m_s2, gyro_rad_s, mag_t
     attitude   S' = N · S · Mᵀ          quat_wxyz; euler_rad is computed from it
 
-A sample with only Euler angles or only a quaternion gets both. `incli_rad` and values without a direction stay
-unchanged. A rotation by quarter turns only exchanges numbers and signs: no digit is lost, and a NaN stays in one
-element.
+A sample with only Euler angles or only a quaternion gets both. `incli_rad`, `velocity_enu_m_s`, `heave_m` and values
+without a direction stay unchanged. A rotation by quarter turns only exchanges numbers and signs: no digit is lost, and
+a NaN stays in one element.
 
 If a device sends some angles as NaN, imud publishes the values that do not depend on them: roll and pitch without yaw;
 each angle if the sensor is mounted as in its manual; yaw alone if the sensor is only rotated about the vertical, as if
@@ -99,7 +99,7 @@ class Rotation:
             None if gyro is None else turn(gyro),
             None if mag is None else turn(mag),
             quat, euler, sample.temperature_c, sample.pressure_pa, sample.incli_rad, sample.status, sample.pps_age_ms,
-            sample.edge_seq,
+            sample.edge_seq, sample.velocity_enu_m_s, sample.position, sample.heave_m, sample.gnss_utc_ns,
         )  # fmt: skip
 
     def samples(self, samples: Sequence[Sample]) -> list[Sample]:

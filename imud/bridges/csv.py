@@ -19,9 +19,9 @@ import msgspec
 
 from imud.bridges.channel import LossCounts, StampedEvent
 from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
-from imud.model.sample import Sample
+from imud.model.sample import Position, Sample, values_of
 
-# Columns of the array fields
+# Columns of fields with several values
 AXES: Final = {
     "accel_m_s2": ("accel_x_m_s2", "accel_y_m_s2", "accel_z_m_s2"),
     "gyro_rad_s": ("gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s"),
@@ -29,6 +29,8 @@ AXES: Final = {
     "quat_wxyz": ("quat_w", "quat_x", "quat_y", "quat_z"),
     "euler_rad": ("roll_rad", "pitch_rad", "yaw_rad"),
     "incli_rad": ("incli_x_rad", "incli_y_rad"),
+    "velocity_enu_m_s": ("velocity_east_m_s", "velocity_north_m_s", "velocity_up_m_s"),
+    "position": ("latitude_rad", "longitude_rad", "height_m", "position_quality", "satellites"),
 }
 # Fields that are empty for a file without times
 TIMES: Final = frozenset({"t_ns", "t_err_ns", "sync", "t_rx_ns", "utc_ns"})
@@ -71,7 +73,7 @@ def sample_row(fields: Sequence[str], without_times: bool = False) -> Callable[[
             elif value is None:
                 cells += width * (None,)
             else:
-                cells += value
+                cells += values_of(value) if isinstance(value, Position) else value
         return cells
 
     return row
@@ -144,6 +146,9 @@ def _column(name: str, is_unknown: bool) -> Column:
     def column(samples: Sequence[Sample]) -> tuple[Sequence[Any], int]:
         cells = list(map(get, samples))
         missing = cells.count(None)
+        if name == "position" and missing < len(cells):
+            cells = [nothing if cell is None else values_of(cell) for cell in cells]
+            return cells, sum(cell.count(None) for cell in cells)
         if name in REALS:
             cells = [None if cell is None else float(cell) for cell in cells]
         elif missing and width:

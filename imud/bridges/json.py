@@ -5,6 +5,7 @@
     /NAME/temperature    imud.Temperature          after a change, and once per second
     /NAME/pressure       imud.FluidPressure        after a change, and once per second
     /NAME/attitude       foxglove.FrameTransform   body in the navigation frame
+    /NAME/fix            foxglove.LocationFix      position, degrees
     /NAME/stamp          imud.SampleStamp          sequence number, times, time stamp error, other fields of each sample
     /NAME/losses         imud.Losses               after each loss
     /NAME/status         imud.DeviceStatus         for a live device, as in `imud status --json`
@@ -16,7 +17,7 @@ message contains only the members that the sample contains; NaN is null. It cont
 """
 
 from collections.abc import Callable, Sequence
-from math import isfinite
+from math import degrees, isfinite
 from operator import attrgetter
 from typing import Any, Final
 
@@ -36,7 +37,7 @@ from imud.bridges.channel import (
 )
 from imud.contracts.status import DeviceStatus
 from imud.host.log import printable
-from imud.model.sample import SAMPLE_SCHEMA, Pair, Quaternion, Sample, Sync, Vector3
+from imud.model.sample import SAMPLE_SCHEMA, Pair, Position, Quaternion, Sample, Sync, Vector3
 from imud.model.units import NS_PER_S
 
 Matrix = tuple[float, ...]  # matrix of 3 × 3 elements, row by row
@@ -114,6 +115,10 @@ class StampMessage(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
     status: int | None = None
     pps_age_ms: int | None = None
     edge_seq: int | None = None
+    velocity_enu_m_s: Vector3 | None = None
+    position: Position | None = None
+    heave_m: float | None = None
+    gnss_utc_ns: int | None = None
 
 
 STAMP_FIELDS = StampMessage.__struct_fields__[1:]  # fields of a sample in imud.SampleStamp
@@ -125,6 +130,7 @@ def timestamp(utc_ns: int) -> Timestamp:
 
 LEVEL_INFO: Final = 2
 LEVEL_WARNING: Final = 3
+NO_COVARIANCE: Final = (0.0,) * 9
 TEXT_MAX: Final = 4096  # maximum length of a log line, characters
 _encode: Final = msgspec.json.Encoder().encode
 _stamp_values: Final = attrgetter(*STAMP_FIELDS)
@@ -162,7 +168,7 @@ def _schema(name: str, properties: Properties) -> MessageSchema:
 _TEXT: Final = {"type": "string"}
 _NUMBER: Final = {"type": "number"}
 _INTEGER: Final = {"type": "integer"}
-_FIELD_TYPES: Final = {"string": _TEXT, "integer": _INTEGER, "number": _NUMBER}
+_FIELD_TYPES: Final = {"string": _TEXT, "integer": _INTEGER, "number": _NUMBER, "object": {"type": "object"}}
 
 
 def _field(name: str) -> Properties:
@@ -205,6 +211,13 @@ FRAME_TRANSFORM_SCHEMA: Final = _schema(
         "rotation": _numbers("xyzw"),
     },
 )
+LOCATION_SCHEMA: Final = _schema(
+    "foxglove.LocationFix",
+    {
+        "frame_id": _TEXT, "latitude": _NUMBER, "longitude": _NUMBER, "altitude": _NUMBER,
+        "position_covariance": _matrix("m²; unknown"), "position_covariance_type": _INTEGER,
+    },
+)  # fmt: skip
 LOG_SCHEMA: Final = _schema(
     "foxglove.Log", {"level": _INTEGER, "message": _TEXT, "name": _TEXT, "file": _TEXT, "line": _INTEGER}
 )
@@ -247,6 +260,7 @@ class JsonDialect:
             ("temperature", *_scalar(frames, "temperature_c", "imud.Temperature", noise.temperature_c)),
             ("pressure", *_scalar(frames, "pressure_pa", "imud.FluidPressure", noise.pressure_pa)),
             ("attitude", FRAME_TRANSFORM_SCHEMA, _transform(frames), ("quat_wxyz",)),
+            ("fix", LOCATION_SCHEMA, _fix(frames), ("position",)),
             ("stamp", STAMP_SCHEMA, _stamp, STAMP_FIELDS),
         )
         return [
@@ -341,6 +355,22 @@ def _transform(frames: MessageFrames) -> Encoder:
         if quat is None or not isfinite(sum(quat)):
             return None
         return _encode(TransformMessage(timestamp(sample.utc_ns), navigation, body, nowhere, _rotation(quat)))
+
+    return encode
+
+
+def _fix(frames: MessageFrames) -> Encoder:
+    def encode(sample: Sample) -> bytes | None:
+        place = sample.position
+        if place is None or place.quality == 0:  # an invalid position
+            return None
+        return _encode(
+            {
+                "timestamp": timestamp(sample.utc_ns), "frame_id": frames.body,
+                "latitude": degrees(place.latitude_rad), "longitude": degrees(place.longitude_rad),
+                "altitude": place.height_m or 0.0, "position_covariance": NO_COVARIANCE, "position_covariance_type": 0,
+            }
+        )  # fmt: skip
 
     return encode
 

@@ -5,6 +5,8 @@
     /NAME/temperature    sensor_msgs/Temperature    after a change, and once per second
     /NAME/pressure       sensor_msgs/FluidPressure  after a change, and once per second
     /tf                  tf2_msgs/TFMessage         attitude
+    /NAME/fix            sensor_msgs/NavSatFix      position
+    /NAME/velocity       geometry_msgs/TwistStamped velocity to the east, to the north and up
     /NAME/stamp          imud_msgs/SampleStamp      sequence number, times, error and other fields of each sample
     /NAME/losses         imud_msgs/Losses           after each loss
     /events              rcl_interfaces/Log
@@ -17,7 +19,7 @@ constant, so that an encoder needs one call of `struct` per message (measured: 1
 import re
 import struct
 from collections.abc import Callable, Sequence
-from math import isfinite, nan
+from math import degrees, isfinite, nan
 from struct import Struct
 from typing import Any, Final
 
@@ -126,6 +128,16 @@ FIELDS: Final = {
     "sensor_msgs/MagneticField": (
         "std_msgs/Header header\ngeometry_msgs/Vector3 magnetic_field\nfloat64[9] magnetic_field_covariance"
     ),
+    "sensor_msgs/NavSatStatus": (
+        "int8 STATUS_NO_FIX=-1\nint8 STATUS_FIX=0\nint8 status\nuint16 SERVICE_GPS=1\nuint16 service"
+    ),
+    "sensor_msgs/NavSatFix": (
+        "std_msgs/Header header\nsensor_msgs/NavSatStatus status\nfloat64 latitude\nfloat64 longitude\n"
+        "float64 altitude\nfloat64[9] position_covariance\nuint8 COVARIANCE_TYPE_UNKNOWN=0\n"
+        "uint8 position_covariance_type"
+    ),
+    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
+    "geometry_msgs/TwistStamped": "std_msgs/Header header\ngeometry_msgs/Twist twist",
     "sensor_msgs/Temperature": "std_msgs/Header header\nfloat64 temperature\nfloat64 variance",
     "sensor_msgs/FluidPressure": "std_msgs/Header header\nfloat64 fluid_pressure\nfloat64 variance",
     "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
@@ -150,8 +162,10 @@ FIELDS: Final = {
             "int64 edge_seq",
             "int64 status",
             "int64 pps_age_ms",
+            "int64 gnss_utc_ns",
             "float64[3] euler_rad",
             "float64[2] incli_rad",
+            "float64 heave_m",
             "uint32 t_err_ns",
             "uint8 sync",
         ]
@@ -163,6 +177,7 @@ FIELDS: Final = {
 }
 # Integer of imud_msgs/SampleStamp for a value that the sample does not contain. For real numbers it is NaN.
 NONE: Final = -1
+EAST_NORTH_UP: Final = "enu"  # `frame_id` of velocities, in every convention
 
 
 def schema(name: str) -> MessageSchema:
@@ -215,6 +230,8 @@ class Ros2Dialect:
                 _scalar(frames, "pressure_pa", frames.deviations.pressure_pa), {"pressure_pa"},
             ),
             ("/tf", "tf2_msgs/TFMessage", _transform(frames), {"quat_wxyz"}),
+            (topic(name, "fix"), "sensor_msgs/NavSatFix", _fix(frames), {"position"}),
+            (topic(name, "velocity"), "geometry_msgs/TwistStamped", _velocity(), {"velocity_enu_m_s"}),
             (topic(name, "stamp"), "imud_msgs/SampleStamp", _stamp(frames), _STAMP),
         )  # fmt: skip
         return [
@@ -241,7 +258,7 @@ class Ros2Dialect:
 _IMU: Final = {"accel_m_s2", "gyro_rad_s", "quat_wxyz"}
 _STAMP: Final = {
     "seq", "t_ns", "t_err_ns", "sync", "t_rx_ns", "utc_ns", "t_dev_ns", "euler_rad", "incli_rad", "status",
-    "pps_age_ms", "edge_seq",
+    "pps_age_ms", "edge_seq", "heave_m", "gnss_utc_ns",
 }  # fmt: skip
 
 
@@ -323,18 +340,55 @@ def _transform(frames: MessageFrames) -> Encoder:
     return encode
 
 
+def _fix(frames: MessageFrames) -> Encoder:
+    layout = Layout("iI", f'"{frames.body}', "b", "H", "3d", "72s", "B")
+    pack, (body,) = layout.pack, layout.texts
+    unknown = bytes(72)
+
+    def encode(sample: Sample) -> bytes | None:
+        place = sample.position
+        if place is None:
+            return None
+        # STATUS_NO_FIX, STATUS_FIX; SERVICE_GPS: the device does not send the systems of its satellites
+        status = -1 if place.quality == 0 else 0
+        altitude = nan if place.height_m is None else place.height_m
+        sec, nanosec = time_of(sample.utc_ns)
+        return pack(
+            ENCAPSULATION, sec, nanosec, body, status, 1, degrees(place.latitude_rad), degrees(place.longitude_rad),
+            altitude, unknown, 0,
+        )  # fmt: skip
+
+    return encode
+
+
+def _velocity() -> Encoder:
+    layout = Layout("iI", f'"{EAST_NORTH_UP}', "6d")
+    pack, (enu,) = layout.pack, layout.texts
+
+    def encode(sample: Sample) -> bytes | None:
+        velocity = sample.velocity_enu_m_s
+        if velocity is None:
+            return None
+        sec, nanosec = time_of(sample.utc_ns)
+        return pack(ENCAPSULATION, sec, nanosec, enu, *velocity, nan, nan, nan)
+
+    return encode
+
+
 def _stamp(frames: MessageFrames) -> Encoder:
-    layout = Layout("iI", f'"{frames.body}', "Q6q", "3d", "2d", "I", "B")
+    layout = Layout("iI", f'"{frames.body}', "Q7q", "6d", "I", "B")
     pack, (body,) = layout.pack, layout.texts
 
     def encode(sample: Sample) -> bytes | None:
         roll, pitch, yaw = sample.euler_rad or _NO_ANGLES
         incli_x, incli_y = sample.incli_rad or _NO_INCLINATION
+        heave = nan if sample.heave_m is None else sample.heave_m
         sec, nanosec = time_of(sample.utc_ns)
         return pack(
             ENCAPSULATION, sec, nanosec, body, sample.seq, sample.t_ns, sample.t_rx_ns, _or_none(sample.t_dev_ns),
-            _or_none(sample.edge_seq), _or_none(sample.status), _or_none(sample.pps_age_ms), roll, pitch, yaw,
-            incli_x, incli_y, sample.t_err_ns, SYNC_CODES[sample.sync],
+            _or_none(sample.edge_seq), _or_none(sample.status), _or_none(sample.pps_age_ms),
+            _or_none(sample.gnss_utc_ns), roll, pitch, yaw, incli_x, incli_y, heave, sample.t_err_ns,
+            SYNC_CODES[sample.sync],
         )  # fmt: skip
 
     return encode

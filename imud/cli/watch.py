@@ -18,7 +18,7 @@ from imud.cli.events import LOOK_S, DeviceNotes, keep_connected
 from imud.cli.output import COLUMNS, fitted, local_time, raise_if_unread, shortened
 from imud.client.connection import Client
 from imud.host.log import printable
-from imud.model.sample import SAMPLE_FIELDS, Sample
+from imud.model.sample import SAMPLE_FIELDS, Position, Sample, values_of
 from imud.model.units import NS_PER_MS, NS_PER_S, RAD_PER_DEG, T_PER_UT
 
 NONE: Final = "-"
@@ -93,6 +93,15 @@ _LAYOUT: Final = (
     _one("status", "STATUS", 10, lambda bits: f"0x{bits:08x}", is_number=False),
     _one("pps_age_ms", "PPS ms", 6, str),
     _one("edge_seq", "EDGE", 9, str),
+    _array("velocity_enu_m_s", "VELOCITY m/s", "ENU", (7, 6), _scaled(1, 2)),
+    FieldColumns(
+        "position", "POSITION °, m", (
+            TableColumn("LAT", 12, 12, _scaled(RAD_PER_DEG, 7)), TableColumn("LON", 12, 12, _scaled(RAD_PER_DEG, 7)),
+            TableColumn("HEIGHT", 9, 8, _scaled(1, 2)), TableColumn("Q", 3, 3, str), TableColumn("SAT", 3, 3, str),
+        ),
+    ),
+    _one("heave_m", "HEAVE m", 7, _scaled(1, 3)),
+    _one("gnss_utc_ns", "GNSS UTC s", 14, _scaled(NS_PER_S, 3)),
 )  # fmt: skip
 FIELDS: Final = {field.name: field for field in _LAYOUT}  # columns of each field of a sample
 
@@ -128,6 +137,8 @@ class TableLine(NamedTuple):
         cells: list[tuple[TableColumn, str]] = []
         for field in self.fields:
             value = getattr(sample, field.name)
+            if isinstance(value, Position):
+                value = values_of(value)
             values = value if isinstance(value, tuple) else (value,) * len(field.columns)
             cells += [(column, self._cell(column, one)) for column, one in zip(field.columns, values, strict=True)]
         return self._joined(cells)

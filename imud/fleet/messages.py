@@ -1,9 +1,10 @@
 """Topics and payloads of the fleet: messages of streams, requests and replies.
 
     JSON      {"v": 1, "gateway": …, "boot": …, "device": …, "kind": …, "first": 1, "last": 200, …}
-    slots     "IMUB" | version, u8 | 0 | header bytes, u16 | header, JSON | Zstandard frame of slots, 256 bytes each
+    slots     "IMUB" | version, u8 | 0 | header bytes, u16 | header, JSON | Zstandard frame of slots
 
-Integers are little-endian. Exactly one message covers each sequence number of a stream. The message contains complete
+`version` is the layout version of the slots: 1 with 256 bytes each, 2 with 320 bytes each. Integers are little-endian.
+Exactly one message covers each sequence number of a stream. The message contains complete
 samples, or statistics that replaced them in a full spool (`intervals` in the stream `samples`), or only the cause of
 the loss (`dropped`). If no message covers a number, the network lost it. If two messages cover it, the second is a
 duplicate.
@@ -24,10 +25,10 @@ import msgspec
 import zstandard
 
 from imud.fleet.settings import NAME_PATTERN, is_name
-from imud.formats.slot import SLOT_BYTES, decode_slot
+from imud.formats.slot import SLOT_BYTES, SLOT_BYTES_V1, SLOT_LAYOUT_VERSION, decode_slot
 from imud.model.errors import reason_of
 from imud.model.event import Event
-from imud.model.sample import Sample, Sync
+from imud.model.sample import Position, Sample, Sync, values_of
 from imud.model.units import NS_PER_S
 
 ROOT: Final = "imud"
@@ -82,8 +83,11 @@ def parse_topic(topic: str) -> TopicParts | None:
 
 VERSION: Final = 1
 MAGIC: Final = b"IMUB"
-# Maximum number of slots in one message: 128 kB before compression, the smallest limit of the large cloud brokers
+# Maximum number of slots in one message: 160 kB before compression. After it, messages of real data stay far below
+# 128 kB, the smallest limit of the large cloud brokers.
 SLOTS_MAX: Final = 500
+# Size of a slot by the version of the message. Slots of version 1 are slots without the fields of version 2.
+_SLOT_BYTES: Final = {1: SLOT_BYTES_V1, SLOT_LAYOUT_VERSION: SLOT_BYTES}
 SAMPLES_MAX: Final = 200  # maximum number of samples in one JSON message, about 100 kB
 HEADER_MAX: Final = 4096
 LEVEL: Final = 3  # compression level of Zstandard, its default
@@ -216,7 +220,7 @@ def encode_slots_message(message: FleetMessage, slots: Sequence[bytes]) -> bytes
     """Return the payload with 1 to SLOTS_MAX slots."""
     header = _ENCODER.encode(message)
     compressed = zstandard.ZstdCompressor(level=LEVEL).compress(b"".join(slots))
-    return _PREFIX.pack(MAGIC, VERSION, 0, len(header)) + header + compressed
+    return _PREFIX.pack(MAGIC, SLOT_LAYOUT_VERSION, 0, len(header)) + header + compressed
 
 
 def decode_message(payload: bytes) -> FleetMessage:
@@ -243,8 +247,8 @@ def check_payload(payload: bytes) -> MessageHead:
     try:
         if not payload.startswith(MAGIC):
             return _HEAD_DECODER.decode(payload)
-        header, slots = _parts_of_slots(payload)
-        _decompressed(slots)
+        header, slots, slot_bytes = _parts_of_slots(payload)
+        _decompressed(slots, slot_bytes)
         return _HEAD_DECODER.decode(header)
     except (msgspec.DecodeError, RecursionError, zstandard.ZstdError, struct.error) as error:
         raise ValueError(f"expected a message of a gateway, got {len(payload)} other bytes") from error
@@ -281,8 +285,10 @@ def _numbers(message: FleetMessage) -> Iterable[int | None]:
     for sample in message.samples:
         yield from (
             sample.seq, sample.t_ns, sample.t_err_ns, sample.t_rx_ns, sample.utc_ns, sample.t_dev_ns, sample.status,
-            sample.pps_age_ms, sample.edge_seq,
+            sample.pps_age_ms, sample.edge_seq, sample.gnss_utc_ns,
         )  # fmt: skip
+        if (position := sample.position) is not None:
+            yield from (position.quality, position.satellites)
     for one in message.intervals:
         yield from (
             one.first, one.last, one.count, one.begin_t_ns, one.end_t_ns, one.begin_utc_ns, one.end_utc_ns,
@@ -292,32 +298,36 @@ def _numbers(message: FleetMessage) -> Iterable[int | None]:
         yield event.t_ns
 
 
-def _parts_of_slots(payload: bytes) -> tuple[bytes, bytes]:
-    """Return the header and the compressed slots."""
+def _parts_of_slots(payload: bytes) -> tuple[bytes, bytes, int]:
+    """Return the header, the compressed slots, and the size of a slot."""
     _, version, _, size = _PREFIX.unpack_from(payload)
-    if version != VERSION or size > HEADER_MAX:
-        raise ValueError(f"expected slots of version {VERSION}, got {version} and a header of {size} bytes")
+    if version not in _SLOT_BYTES or size > HEADER_MAX:
+        raise ValueError(
+            f"expected slots of version 1 to {SLOT_LAYOUT_VERSION}, got {version} and a header of {size} bytes; is the "
+            "imud of the gateway newer?"
+        )
     begin = _PREFIX.size
-    return payload[begin : begin + size], payload[begin + size :]
+    return payload[begin : begin + size], payload[begin + size :], _SLOT_BYTES[version]
 
 
-def _decompressed(frame: bytes) -> bytes:
+def _decompressed(frame: bytes, slot_bytes: int) -> bytes:
     # the sender declares this size, and the decompressor allocates it
-    if not 0 < zstandard.frame_content_size(frame) <= SLOTS_MAX * SLOT_BYTES:
+    if not 0 < zstandard.frame_content_size(frame) <= SLOTS_MAX * slot_bytes:
         raise ValueError(f"expected 1 to {SLOTS_MAX} slots, got {zstandard.frame_content_size(frame)} bytes")
     slots = zstandard.ZstdDecompressor().decompress(frame)
-    if len(slots) % SLOT_BYTES:
-        raise ValueError(f"expected slots of {SLOT_BYTES} bytes, got {len(slots)}")
+    if len(slots) % slot_bytes:
+        raise ValueError(f"expected slots of {slot_bytes} bytes, got {len(slots)}")
     return slots
 
 
 def _decode_slots(payload: bytes) -> FleetMessage:
-    header, frame = _parts_of_slots(payload)
+    header, frame, slot_bytes = _parts_of_slots(payload)
     message = _DECODER.decode(checked_json(header))
-    slots = _decompressed(frame)
+    slots = _decompressed(frame, slot_bytes)
     samples = [
-        decode_slot(slots[at : at + SLOT_BYTES], message.device) for at in range(0, len(slots), SLOT_BYTES)
-    ]  # fmt: skip
+        decode_slot(slots[at : at + slot_bytes].ljust(SLOT_BYTES, b"\0"), message.device)
+        for at in range(0, len(slots), slot_bytes)
+    ]
     return msgspec.structs.replace(message, samples=samples)
 
 
@@ -326,7 +336,7 @@ def finite(sample: Sample) -> Sample:
     bad: dict[str, None] = {}
     for name in sample.__struct_fields__:
         value = getattr(sample, name)
-        parts = value if isinstance(value, tuple) else (value,)
+        parts = values_of(value) if isinstance(value, Position) else value if isinstance(value, tuple) else (value,)
         if any(isinstance(part, float) and not math.isfinite(part) for part in parts):
             bad[name] = None
     return msgspec.structs.replace(sample, **bad) if bad else sample

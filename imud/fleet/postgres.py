@@ -37,20 +37,28 @@ from imud.fleet.collector import Offsets
 from imud.fleet.messages import Interval
 from imud.fleet.reader import FleetBatch
 from imud.model.errors import ServerError
+from imud.model.sample import values_of
 from imud.model.units import NS_PER_S
 
 VECTORS: Final = ("accel_m_s2", "gyro_rad_s", "mag_t", "quat_wxyz", "euler_rad", "incli_rad")
 SCALARS: Final = ("temperature_c", "pressure_pa")
 NUMBERS: Final = ("status", "pps_age_ms", "edge_seq")
+# columns that older versions of imud did not create
+_LATER: Final = (
+    ("velocity_enu_m_s", "double precision[]"), ("heave_m", "double precision"), ("gnss_utc_ns", "bigint"),
+    ("latitude_rad", "double precision"), ("longitude_rad", "double precision"), ("height_m", "double precision"),
+    ("position_quality", "bigint"), ("satellites", "bigint"),
+)  # fmt: skip
+_NO_POSITION: Final = (None,) * 5
 KEY: Final = "site text NOT NULL, gateway text NOT NULL, boot text NOT NULL, device text NOT NULL"
 UTC_COLUMNS: Final = (("utc_ns", "bigint NOT NULL"), ("utc_set", "boolean NOT NULL"), ("utc_err_ns", "bigint"))
 _OF_SAMPLE: Final = (
     ("seq", "bigint NOT NULL"), ("t_ns", "bigint NOT NULL"), ("t_err_ns", "bigint NOT NULL"),
     ("sync", "text NOT NULL"), ("t_rx_ns", "bigint NOT NULL"), ("t_dev_ns", "bigint"),
     *((name, "double precision[]") for name in VECTORS), *((name, "double precision") for name in SCALARS),
-    *((name, "bigint") for name in NUMBERS),
+    *((name, "bigint") for name in NUMBERS), *_LATER,
 )  # fmt: skip
-_SAMPLE_NAMES: Final = tuple(name for name, _ in _OF_SAMPLE)
+_SAMPLE_NAMES: Final = tuple(name for name, _ in _OF_SAMPLE[:-5])
 # its ISO text has no offset; the offset follows the fraction of the second
 _EPOCH: Final = datetime(1970, 1, 1)  # noqa: DTZ001
 
@@ -89,7 +97,8 @@ LEDGER: Final = "imud_ledger"
 BOOTS: Final = "imud_boots"
 # Statements that create the tables, by table name
 SCHEMA: Final = {
-    SAMPLES.name: SAMPLES.statement(),
+    SAMPLES.name: SAMPLES.statement()
+    + "".join(f"ALTER TABLE {SAMPLES.name} ADD COLUMN IF NOT EXISTS {name} {kind};" for name, kind in _LATER),
     RECORDS.name: RECORDS.statement(),
     # half of each page stays free: PostgreSQL can then update a ledger within its page, without an index update
     LEDGER: f"CREATE TABLE IF NOT EXISTS {LEDGER} (gateway text, boot text, device text, stream text, "
@@ -107,6 +116,7 @@ def sample_rows(batch: FleetBatch) -> Iterable[Row]:
         yield (
             *_times(head, batch.time_of(one.utc_ns, one.t_ns)),
             *[list(value) if isinstance(value, tuple) else value for value in values],
+            *(_NO_POSITION if one.position is None else values_of(one.position)),
         )
 
 

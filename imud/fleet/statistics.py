@@ -15,8 +15,9 @@ from typing import Final
 from imud.fleet.messages import Interval, Measures
 from imud.model.sample import Sample, Sync
 
-VECTORS: Final = ("accel_m_s2", "gyro_rad_s", "mag_t", "quat_wxyz", "euler_rad", "incli_rad")
-SCALARS: Final = ("temperature_c", "pressure_pa")
+# a mean of positions would be wrong at a longitude of ±180°
+VECTORS: Final = ("accel_m_s2", "gyro_rad_s", "mag_t", "quat_wxyz", "euler_rad", "incli_rad", "velocity_enu_m_s")
+SCALARS: Final = ("temperature_c", "pressure_pa", "heave_m")
 ANGLES: Final = frozenset(("euler_rad", "incli_rad"))
 MEASURES: Final = ("mean", "min", "max", "rms")
 _ORDER: Final = {sync: place for place, sync in enumerate(Sync)}

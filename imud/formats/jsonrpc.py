@@ -2,12 +2,12 @@ r"""Wire format of the UNIX socket: JSON-RPC 2.0, one object per line, and binar
 
     line     {"jsonrpc":"2.0",…}\n
     frame    +-----------------+------------------------------------------------------------+
-             | length: u32, LE | length % 256 == 0: slots of this total length (slot.py)    |
+             | length: u32, LE | length % 320 == 0: slots of this total length (slot.py)    |
              |                 | otherwise: one JSON object and its newline                 |
              +-----------------+------------------------------------------------------------+
 
 The length decides the kind of a frame, because a slot can start with any byte, for example `{` for seq 123. JSON with a
-length that is a multiple of 256 ends with a second newline.
+length that is a multiple of 320 ends with a second newline.
 """
 
 import os

@@ -41,7 +41,7 @@ FILE_PREFIX: Final = "imud."
 OPEN_FLAGS: Final = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 MAGIC: Final = b"imudshm\0"
-RING_LAYOUT_VERSION: Final = 1
+RING_LAYOUT_VERSION: Final = 2
 HEADER_BYTES: Final = 4096  # size of the header: one page, so that slots start on a page
 # Maximum number of counters in the block. New counters use free places and need no new layout version.
 LEDGER_ROOM: Final = 59

@@ -62,10 +62,11 @@
 /* ---- layout -------------------------------------------------------------------------------------------------- */
 
 #define IMUD_MAGIC "imudshm" /* with the final zero, 8 bytes */
-#define IMUD_LAYOUT_VERSION 1u
-#define IMUD_SLOT_LAYOUT_VERSION 1u
+#define IMUD_LAYOUT_VERSION 2u
+#define IMUD_SLOT_LAYOUT_VERSION 2u
 #define IMUD_HEADER_BYTES 4096u
-#define IMUD_SLOT_BYTES 256u
+#define IMUD_SLOT_BYTES 320u
+#define IMUD_NO_COUNT 255 /* absent `position_quality` or `position_satellites` */
 #define IMUD_LEDGER_ROOM 59
 #define IMUD_SEQ_INVALID UINT64_MAX       /* stands in `seq` and `ledger_update` while their block is written */
 #define IMUD_HEARTBEAT_LIMIT_NS 1000000000 /* the heartbeat comes ten times a second */
@@ -88,7 +89,11 @@ enum {
     IMUD_HAS_INCLI = 1 << 8,
     IMUD_HAS_STATUS = 1 << 9,
     IMUD_HAS_PPS_AGE = 1 << 10,
-    IMUD_HAS_EDGE = 1 << 11
+    IMUD_HAS_EDGE = 1 << 11,
+    IMUD_HAS_VELOCITY = 1 << 12,
+    IMUD_HAS_POSITION = 1 << 13,
+    IMUD_HAS_HEAVE = 1 << 14,
+    IMUD_HAS_GNSS_UTC = 1 << 15
 };
 
 /* Places in `ledger`. */
@@ -142,8 +147,18 @@ typedef struct imud_slot {
     double pressure_pa;
     double incli_rad[2];
     uint32_t pps_age_ms;
-    uint8_t reserved1[24];
-    uint32_t crc32; /* of the bytes before it */
+    uint8_t position_quality;    /* as sent, 0 is invalid; IMUD_NO_COUNT if it is absent */
+    uint8_t position_satellites; /* IMUD_NO_COUNT if it is absent */
+    uint8_t reserved1[2];
+    int64_t gnss_utc_ns; /* UTC of the measurement from the GNSS receiver of the device, since 1970 */
+    double heave_m;      /* vertical displacement from the mean height, positive up */
+    uint8_t reserved2[4];
+    uint32_t crc32; /* of the bytes before it, and of the bytes after it with IMUD_HAS_VELOCITY or IMUD_HAS_POSITION */
+    double velocity_enu_m_s[3]; /* east, north, up */
+    double latitude_rad;        /* position, WGS 84: positive to the north */
+    double longitude_rad;       /* positive to the east */
+    double height_m;            /* above mean sea level; NaN if it is absent */
+    uint8_t reserved3[16];
 } imud_slot;
 
 /* First page of a ring. */
@@ -261,10 +276,11 @@ static inline void imud_crc_init_(uint32_t table[256])
     }
 }
 
-static inline uint32_t imud_crc_(const uint32_t table[256], const void *data, size_t size_bytes)
+/* CRC-32 of bytes after bytes with the value `crc`; 0 for the first bytes. */
+static inline uint32_t imud_crc_(const uint32_t table[256], uint32_t crc, const void *data, size_t size_bytes)
 {
     const unsigned char *byte = (const unsigned char *)data;
-    uint32_t crc = 0xFFFFFFFFu;
+    crc = ~crc;
     while (size_bytes--)
         crc = (crc >> 8) ^ table[(crc ^ *byte++) & 0xFFu];
     return ~crc;
@@ -276,10 +292,9 @@ static inline uint64_t imud_load_(const unsigned char *at)
 }
 
 /* Copies a block of u64 words that may change meanwhile. Returns whether its first word, its sequence number, was the
- * same before, in, and after the copy, and its CRC (in the 4 bytes at `crc_at`) is right. */
-static inline int imud_copy_(const imud_ring *ring, const unsigned char *from, void *to, size_t size_bytes, size_t crc_at)
+ * same before, in, and after the copy. */
+static inline int imud_copy_(const unsigned char *from, void *to, size_t size_bytes)
 {
-    uint32_t crc;
     uint64_t word, before = imud_load_(from);
     unsigned char *target = (unsigned char *)to;
     if (before == IMUD_SEQ_INVALID)
@@ -289,16 +304,20 @@ static inline int imud_copy_(const imud_ring *ring, const unsigned char *from, v
         memcpy(target + at, &word, 8);
     }
     __atomic_thread_fence(__ATOMIC_ACQUIRE);
-    if (imud_load_(from) != before || memcmp(target, &before, 8) != 0)
-        return 0;
-    memcpy(&crc, target + crc_at, 4);
-    return imud_crc_(ring->crc_table, target, crc_at) == crc;
+    return imud_load_(from) == before && memcmp(target, &before, 8) == 0;
 }
 
 static inline int imud_read_slot_(const imud_ring *ring, uint64_t seq, imud_slot *out)
 {
     const unsigned char *slot = ring->base + IMUD_HEADER_BYTES + (seq & ring->mask) * IMUD_SLOT_BYTES;
-    return imud_copy_(ring, slot, out, IMUD_SLOT_BYTES, offsetof(imud_slot, crc32)) && out->seq == seq;
+    uint32_t crc;
+    if (!imud_copy_(slot, out, IMUD_SLOT_BYTES) || out->seq != seq)
+        return 0;
+    crc = imud_crc_(ring->crc_table, 0, out, offsetof(imud_slot, crc32));
+    if (out->present & (IMUD_HAS_VELOCITY | IMUD_HAS_POSITION))
+        crc = imud_crc_(ring->crc_table, crc, out->velocity_enu_m_s,
+                        IMUD_SLOT_BYTES - offsetof(imud_slot, velocity_enu_m_s));
+    return out->crc32 == crc;
 }
 
 /* Oldest sample the ring can still hold when `newest` is its newest; newest + 1 when it holds none. */
@@ -573,7 +592,8 @@ static inline int imud_read_ledger(const imud_ring *ring, imud_ledger *out)
 {
     const unsigned char *block = ring->base + offsetof(imud_header, ledger_update);
     for (int attempt = 0; attempt < 3; attempt++)
-        if (imud_load_(block) != 0 && imud_copy_(ring, block, out, sizeof *out, offsetof(imud_ledger, crc32)))
+        if (imud_load_(block) != 0 && imud_copy_(block, out, sizeof *out) &&
+            imud_crc_(ring->crc_table, 0, out, offsetof(imud_ledger, crc32)) == out->crc32)
             return 1;
     return 0;
 }

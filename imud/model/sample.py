@@ -15,6 +15,21 @@ Quaternion = tuple[float, float, float, float]
 Pair = tuple[float, float]
 
 
+class Position(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
+    """Position on the WGS 84 ellipsoid."""
+
+    latitude_rad: float  # positive to the north
+    longitude_rad: float  # positive to the east
+    height_m: float | None = None  # height above mean sea level
+    quality: int | None = None  # quality of the position solution as sent, 0 … 254 (HiPNUC: as in NMEA GGA, 0 invalid)
+    satellites: int | None = None  # number of satellites in the solution, 0 … 254
+
+
+def values_of(position: Position) -> tuple[float, float, float | None, int | None, int | None]:
+    """Return the fields of a position in their order, for tables with one column per value."""
+    return position.latitude_rad, position.longitude_rad, position.height_m, position.quality, position.satellites
+
+
 # Regular expression of device names. They are file names of shared memory, label values and words on a command line.
 DEVICE_NAME_PATTERN: Final = r"[a-z0-9][a-z0-9_-]{0,31}"
 T_ERR_MOST: Final = 0xFFFF_FFFF  # maximum of `t_err_ns`, which has 32 bits in all outputs
@@ -51,6 +66,10 @@ class Measurement(msgspec.Struct, frozen=True, gc=False):
     pps_age_ms: int | None = None
     # Arrival of the first CAN frame of the measurement, CLOCK_MONOTONIC, ns; None on other links
     t_first_ns: int | None = None
+    velocity_enu_m_s: Vector3 | None = None  # velocity to the east, to the north and up
+    position: Position | None = None
+    heave_m: float | None = None  # vertical displacement from the mean height, positive up
+    gnss_utc_ns: int | None = None  # UTC of the measurement from the GNSS receiver of the device, ns since 1970
 
 
 class Sample(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
@@ -76,6 +95,10 @@ class Sample(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
     status: int | None = None
     pps_age_ms: int | None = None
     edge_seq: int | None = None  # number of the rising edge on SOUT, or of the trigger on SIN, for this sample
+    velocity_enu_m_s: Vector3 | None = None
+    position: Position | None = None
+    heave_m: float | None = None
+    gnss_utc_ns: int | None = None
 
 
 SAMPLE_FIELDS: tuple[str, ...] = Sample.__struct_fields__
@@ -85,7 +108,7 @@ class FieldInfo(msgspec.Struct, frozen=True):
     """Description of one member of a sample."""
 
     name: str
-    type: str  # JSON type; `number[3]` is an array of three numbers
+    type: str  # JSON type; `number[3]` is an array of three numbers, `object` has the members that `meaning` names
     unit: str  # SI unit of the value; empty if it has no unit
     frame: str  # axes or time scale of the value; empty without axes or time scale
     meaning: str
@@ -125,5 +148,16 @@ SAMPLE_SCHEMA: Final = (
         "edge_seq", "integer", "", "",
         "number of the rising edge on SOUT, or of the trigger on SIN, for the sample; absent if imud did not "
         "receive the edge", False,
+    ),
+    FieldInfo("velocity_enu_m_s", "number[3]", "m/s", "east, north, up", "velocity over ground", False),
+    FieldInfo(
+        "position", "object", "", "WGS 84",
+        "latitude_rad, longitude_rad; if the device sends them: height_m (above mean sea level), quality (as sent; "
+        "0 is invalid), satellites", False,
+    ),
+    FieldInfo("heave_m", "number", "m", "up", "vertical displacement from the mean height, positive up", False),
+    FieldInfo(
+        "gnss_utc_ns", "integer", "ns", "UTC",
+        "time of the measurement by the device's GNSS receiver, since 1970", False,
     ),
 )  # fmt: skip

@@ -418,7 +418,7 @@ ASKER: Final = "shared memory"  # name of this output in latency requests
 # Minimum time between two checks of the files, and between two ledgers, ns: each second tick in a quiet state
 CHECK_NS: Final = 950_000_000
 OTHERS_WRITE: Final = 0o022
-SLOTS_MIN, SLOTS_MAX = 64, 1 << 20  # limits of `slots`: a ring of 64 slots has 16 kB, a ring of 2²⁰ slots 256 MB
+SLOTS_MIN, SLOTS_MAX = 64, 1 << 20  # limits of `slots`: a ring of 64 slots has 20 kB, a ring of 2²⁰ slots 320 MB
 
 
 class ShmOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -429,7 +429,7 @@ class ShmOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True)
     directory: str = DIRECTORY
     """Directory of the ring files. If the default is not usable, imud uses $XDG_RUNTIME_DIR/imud/shm."""
     slots: Annotated[int, msgspec.Meta(ge=SLOTS_MIN, le=SLOTS_MAX)] = 4096
-    """Number of samples in a ring, a power of two: 4096 are four seconds at 1 kHz and 1 MB per device."""
+    """Number of samples in a ring, a power of two: 4096 are four seconds at 1 kHz and 1.3 MB per device."""
     latency_ms: Annotated[float, msgspec.Meta(ge=0, le=50)] = 5.0
     """Maximum hold of samples, ms; 0: imud writes each sample immediately (docs/latency.md)."""
     group: str = "imud"

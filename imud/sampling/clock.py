@@ -123,7 +123,7 @@ def add_even_run(
                 device, seq, t_ns, int(newest_error_ns) + 1 if newest_error_ns < _T_ERR_MOST else T_ERR_MOST, sync,
                 t_rx_ns, t_ns + utc_offset_ns, raw_ns, m.accel_m_s2, m.gyro_rad_s, m.mag_t, m.quat_wxyz, m.euler_rad,
                 m.temperature_c, m.pressure_pa, m.incli_rad, m.status if own is None else own | (m.status or 0),
-                m.pps_age_ms, None,
+                m.pps_age_ms, None, m.velocity_enu_m_s, m.position, m.heave_m, m.gnss_utc_ns,
             )
         )  # fmt: skip
     if len(samples) > before:
@@ -250,6 +250,7 @@ class SampleClock:
             self._device, seq, t_ns, t_err_ns, sync, t_rx_ns, t_ns + utc_offset_ns, t_dev_ns,
             m.accel_m_s2, m.gyro_rad_s, m.mag_t, m.quat_wxyz, m.euler_rad, m.temperature_c, m.pressure_pa,
             m.incli_rad, m.status if own is None else own | (m.status or 0), m.pps_age_ms, edge_seq,
+            m.velocity_enu_m_s, m.position, m.heave_m, m.gnss_utc_ns,
         )  # fmt: skip
 
     def add_run(
@@ -359,7 +360,7 @@ class SampleClock:
         return Sample(
             self._device, self._seq, t_ns, t_err_ns, self._fit_sync, t_rx_ns, t_ns + utc_offset_ns, None,
             m.accel_m_s2, m.gyro_rad_s, m.mag_t, m.quat_wxyz, m.euler_rad, m.temperature_c, m.pressure_pa,
-            m.incli_rad, m.status, m.pps_age_ms, edge_seq,
+            m.incli_rad, m.status, m.pps_age_ms, edge_seq, m.velocity_enu_m_s, m.position, m.heave_m, m.gnss_utc_ns,
         )  # fmt: skip
 
     # --- aiding sources ------------------------------------------------------------------------------------------

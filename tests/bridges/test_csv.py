@@ -20,6 +20,8 @@ def test_columns_and_rows() -> None:
         "accel_x_m_s2", "accel_y_m_s2", "accel_z_m_s2", "gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s",
         "mag_x_t", "mag_y_t", "mag_z_t", "quat_w", "quat_x", "quat_y", "quat_z", "roll_rad", "pitch_rad", "yaw_rad",
         "temperature_c", "pressure_pa", "incli_x_rad", "incli_y_rad", "status", "pps_age_ms", "edge_seq",
+        "velocity_east_m_s", "velocity_north_m_s", "velocity_up_m_s", "latitude_rad", "longitude_rad", "height_m",
+        "position_quality", "satellites", "heave_m", "gnss_utc_ns",
     ]  # fmt: skip
     names = SAMPLE_FIELDS
     row = table.sample_row(names)
@@ -45,7 +47,7 @@ def test_columns_and_rows() -> None:
         made = dict(zip(table.EVENT_COLUMNS, table.event_row(StampedEvent(forged, UTC_NS)), strict=True))
         assert (made["message"], made["kind"], made["detail"]) == (cell, cell, '{"\\u202e":"x"}')
     lengths = {field.name: int(field.type[7:-1]) for field in SAMPLE_SCHEMA if field.type.startswith("number[")}
-    assert {name: len(columns) for name, columns in table.AXES.items()} == lengths
+    assert {name: len(columns) for name, columns in table.AXES.items()} == {**lengths, "position": 5}
 
 
 def by_rows(samples: Sequence[Sample], fields: Sequence[str] = SAMPLE_FIELDS) -> bytes:

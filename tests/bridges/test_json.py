@@ -3,6 +3,8 @@
 import json
 from typing import Any
 
+import msgspec
+import pytest
 from jsonschema import Draft202012Validator
 
 from imud.bridges import channel as bridge
@@ -10,7 +12,7 @@ from imud.bridges.channel import MessageChannel, MessageFrames, StampedEvent
 from imud.bridges.json import JsonDialect, status_channel
 from imud.contracts.status import Deviations
 from imud.model.event import Event, EventKind
-from imud.model.sample import Sample
+from imud.model.sample import Position, Sample
 from tests.bridges.samples import BARE, EVENT, FULL, UTC_NS
 from tests.support.socket_rig import device_status
 
@@ -33,6 +35,21 @@ def read(channel: MessageChannel[Any], item: object) -> Any:
         Draft202012Validator(schema).validate(message)
     assert set(message) <= set(schema["properties"]) or channel.schema.name == "imud.DeviceStatus"
     return message
+
+
+def test_position_in_degrees() -> None:
+    channel = channels()["/bow/fix"]
+    fix = read(channel, FULL)
+    assert (fix["latitude"], fix["longitude"], fix["altitude"]) == pytest.approx(
+        (28.64788975654, -71.61972439135, 42.5)
+    )
+    assert (channel.schema.name, fix["timestamp"], fix["position_covariance_type"]) == (
+        "foxglove.LocationFix",
+        STAMP,
+        0,
+    )
+    invalid = msgspec.structs.replace(FULL, position=Position(0.5, -1.25, quality=0))
+    assert (channel.encode(BARE), channel.encode(invalid)) == (None, None)
 
 
 def test_messages_and_schemas() -> None:
@@ -71,7 +88,9 @@ def test_messages_and_schemas() -> None:
     assert message == {
         "seq": 7, "t_ns": FULL.t_ns, "t_err_ns": 12_000, "sync": "edge", "t_rx_ns": FULL.t_rx_ns, "utc_ns": UTC_NS,
         "t_dev_ns": 5_000_000, "euler_rad": [0.1, 0.2, 0.3], "incli_rad": [0.01, 0.02], "status": 3,
-        "pps_age_ms": 40, "edge_seq": 9,
+        "pps_age_ms": 40, "edge_seq": 9, "velocity_enu_m_s": [1.5, -2.5, 0.25], "heave_m": -0.125,
+        "position": {"latitude_rad": 0.5, "longitude_rad": -1.25, "height_m": 42.5, "quality": 4, "satellites": 17},
+        "gnss_utc_ns": UTC_NS + 9,
     }  # fmt: skip
     assert "t_dev_ns" not in read(channels()["/bow/stamp"], BARE)
     said = {field for channel in channels().values() for field in channel.fields}

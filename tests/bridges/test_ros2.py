@@ -4,6 +4,7 @@ import math
 import struct
 from typing import Any
 
+import msgspec
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -12,7 +13,7 @@ from imud.bridges.channel import MessageChannel, MessageFrames, StampedEvent
 from imud.bridges.ros2 import ENCAPSULATION, FIELDS, CdrWriter, Layout, Ros2Dialect, schema, time_of
 from imud.contracts.status import Deviations
 from imud.model.event import Event, EventKind
-from imud.model.sample import Sample
+from imud.model.sample import Position, Sample
 from tests.bridges.samples import BARE, EVENT, FULL, UTC_NS
 
 DIALECT = Ros2Dialect()
@@ -85,7 +86,18 @@ def test_transform_stamp_and_alignment() -> None:
     assert tuple(full.incli_rad) == FULL.incli_rad
     assert (bare.t_dev_ns, bare.edge_seq, bare.status, bare.pps_age_ms) == (-1, -1, -1, -1)
     assert bare.t_err_ns == 0xFFFF_FFFF
-    assert all(map(math.isnan, (*bare.euler_rad, *bare.incli_rad)))
+    assert all(map(math.isnan, (*bare.euler_rad, *bare.incli_rad, bare.heave_m)))
+    assert (full.heave_m, full.gnss_utc_ns, bare.gnss_utc_ns) == (-0.125, UTC_NS + 9, -1)
+    fix, velocity = channels()["/bow/fix"], channels()["/bow/velocity"]
+    place = read(fix, FULL)
+    assert (place.latitude, place.longitude, place.altitude) == (math.degrees(0.5), math.degrees(-1.25), 42.5)
+    assert (place.status.status, place.status.service, place.position_covariance_type) == (0, 1, 0)
+    invalid = read(fix, msgspec.structs.replace(FULL, position=Position(0.5, -1.25, quality=0)))
+    assert (invalid.status.status, math.isnan(invalid.altitude)) == (-1, True)
+    twist = read(velocity, FULL)
+    assert (twist.header.frame_id, xyz(twist.twist.linear)) == ("enu", (1.5, -2.5, 0.25))
+    assert all(map(math.isnan, xyz(twist.twist.angular)))
+    assert (fix.encode(BARE), velocity.encode(BARE)) == (None, None)
     for length in range(1, 9):
         name = "abcdefgh"[:length]
         for where, channel in channels(MessageFrames(name, has_north=False)).items():
@@ -93,7 +105,8 @@ def test_transform_stamp_and_alignment() -> None:
             if data is not None:
                 message = ROS.deserialize_cdr(data, channel.schema.name)
                 header = message.transforms[0].header if where == "/tf" else message.header  # type: ignore[attr-defined]
-                assert header.frame_id == (f"{name}_level" if where == "/tf" else name)
+                own = {"/tf": f"{name}_level", f"/{name}/velocity": "enu"}
+                assert header.frame_id == own.get(where, name)
                 again = ROS.serialize_cdr(message, channel.schema.name)
                 assert bytes(again) == data, where
 

@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 from imud.cli.watch import FIELDS, OUTPUTS, SampleTable, lines_of, usual_fields
-from imud.model.sample import SAMPLE_FIELDS, Sample, Sync
+from imud.model.sample import SAMPLE_FIELDS, Position, Sample, Sync
 from tests.cli.conftest import Terminal
 
 UTC_NS = 1_790_000_000_123_999_999  # 2026-09-21 14:13:20 UTC
@@ -25,6 +25,8 @@ LARGEST = Sample(
     t_dev_ns=9_999_999_000_000_000, accel_m_s2=(-156.9,) * 3, gyro_rad_s=(-40.0,) * 3, mag_t=(-0.0025,) * 3,
     quat_wxyz=(-0.5,) * 4, euler_rad=(-3.14,) * 3, temperature_c=-40.25, pressure_pa=101_325.5,
     incli_rad=(-1.5, -1.5), status=0xFFFF_FFFF, pps_age_ms=8191, edge_seq=10**9 - 1,
+    velocity_enu_m_s=(-300.25,) * 3, position=Position(-1.5, -3.14, -12345.67, 254, 254), heave_m=-12.5,
+    gnss_utc_ns=UTC_NS,
 )  # fmt: skip
 
 
@@ -62,11 +64,13 @@ def test_lines_have_80_columns_and_values_stay_in_their_columns() -> None:
     )
     assert SampleTable().text(ONE).splitlines()[-1].split() == ["19:43:20.123", "0.25", *["-"] * 9]
     assert FIELDS.keys() == set(SAMPLE_FIELDS)
-    assert SampleTable(SAMPLE_FIELDS).text(LARGEST).splitlines()[-4:] == [
+    assert SampleTable(SAMPLE_FIELDS).text(LARGEST).splitlines()[-6:] == [
         "nnnnn…nnnm 999999999 9999999.000000 4295 regression       0.000000 19:43:20.123",
         "    9999999.000000 -156.9 -156.9 -156.9  -2292  -2292  -2292",
         "     -2500  -2500  -2500 -0.5000 -0.5000 -0.5000 -0.5000 -179.9 -179.9 -179.9",
         "    -40.2 101326  -85.94  -85.94 0xffffffff   8191 999999999",
+        "    -300.25 -300.25 -300.25  -85.9436693 -179.9087477 -12345.67 254 254 -12.500",
+        "    1790000000.124",
     ]
     narrow = msgspec.structs.replace(
         WHOLE, mag_t=(2e-5, 0.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0), incli_rad=(0.1, 0.0)

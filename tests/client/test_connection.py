@@ -46,7 +46,7 @@ def test_requests_conventions_and_refused_requests(served: Daemon) -> None:
         assert "read" in client.hello.rights
         assert [device["name"] for device in client.devices()] == ["imu0", "imu1"]
         assert client.status()["now_ns"] == NOW_NS
-        assert client.schema()["slot"]["bytes"] == 256
+        assert client.schema()["slot"]["bytes"] == 320
         assert client.poll() == []
         publish(served, batch("imu0", 4), batch("imu1", 5))
         assert client.poll() == [sample("imu0", 4), sample("imu1", 5)]
@@ -284,8 +284,8 @@ def answering(path: Path, answer: bytes) -> Iterator[None]:
         (HELLO.replace(b'"epoch":7', b'"epoch":"x"'), ServerError, "cannot decode the greeting"),
         (b"", TimeoutError, "no hello within"),
         (HELLO + b'{"id":1,"result":{"devices":{}}}\n\xff\xff\xff\xff', ServerError, "expected a frame of at most"),
-        (HELLO + b'{"id":1,"result":{"devices":{"a":0}}}\n\x00\x01\x00\x00' + bytes(256), ServerError, "CRC"),
-        (HELLO + b'{"id":1,"result":{"devices":{}}}\n\0\1\0\0' + bytes(256), ServerError, "known device .*, got 0"),
+        (HELLO + b'{"id":1,"result":{"devices":{"a":0}}}\n\x40\x01\x00\x00' + bytes(320), ServerError, "CRC"),
+        (HELLO + b'{"id":1,"result":{"devices":{}}}\n\x40\1\0\0' + bytes(320), ServerError, "known device .*, got 0"),
     ],
 )  # fmt: skip
 def test_invalid_servers_raise_errors(tmp_path: Path, answer: bytes, error: type[Exception], words: str) -> None:

@@ -16,7 +16,7 @@ from imud.formats.ring import HEADER_BYTES, LEDGER_BLOCK_OFFSET, OFFSETS, encode
 from imud.formats.slot import SEQ_INVALID, SLOT_BYTES
 from imud.model.errors import LinkMissing, ServerError
 from imud.publishers.socket.client import Waker
-from tests.support.rings import DEVICE, SLOTS, START_NS, TORN, WHOLE, Board, make_sample, slot_at
+from tests.support.rings import DEVICE, SLOTS, START_NS, TORN, WHOLE, Board, make_sample, place_sample, slot_at
 from tests.support.surroundings import DAEMON_UID, HOSTILE_UID, needs_root
 
 
@@ -56,7 +56,7 @@ def test_no_such_ring_and_no_permission(board: Board, tmp_path: Path, monkeypatc
     with pytest.raises(ServerError, match=r"not a ring file: expected a regular file \(-\), got another kind \(d\)"):
         Ring(tmp_path)
     os.truncate(board.path, HEADER_BYTES + SLOTS * SLOT_BYTES - 1)
-    with pytest.raises(ServerError, match="expected 20480 bytes, got 20479"):
+    with pytest.raises(ServerError, match="expected 24576 bytes, got 24575"):
         Ring(board.path)
     refuse = Mock(side_effect=PermissionError(13, "Permission denied"))
     monkeypatch.setattr(os, "open", refuse)
@@ -130,6 +130,13 @@ def test_owner(board: Board) -> None:
 def test_reader_cannot_write(board: Board) -> None:
     maps = Path("/proc/self/maps").read_text().splitlines()
     assert sorted(line.split()[1] for line in maps if line.endswith(str(board.path))) == ["r--s", "rw-s"]
+
+
+def test_a_position_is_read_and_protected_by_the_crc(board: Board, ring: Ring) -> None:
+    board.publish_samples([place_sample(1), make_sample(2), place_sample(3)])
+    assert ring.read().samples == [place_sample(1), make_sample(2), place_sample(3)]
+    board.poke(slot_at(3) + 290, b"\x55")
+    assert ring.latest() is None
 
 
 def test_read_returns_the_samples_after_opening(board: Board, ring: Ring) -> None:

@@ -19,7 +19,7 @@ from imud.fleet import messages as fleet_messages
 from imud.fleet.messages import FleetMessage, MessageKind, Stream, decode_message, encode_message, encode_slots_message
 from imud.formats.slot import encode_slots
 from imud.model.event import Event, EventKind
-from imud.model.sample import Sample, Sync
+from imud.model.sample import Position, Sample, Sync
 
 NUMBER_MOST, SLOTS_MAX = 1 << 62, 500
 
@@ -44,7 +44,9 @@ def test_the_header_is_as_documented() -> None:
         "first": 1, "last": 1, "count": 1, "utc_ns": 9,
         "events": [{"t_ns": 3, "device": "bow", "kind": "up", "message": "up"}],
     }  # fmt: skip
-    bad = msgspec.structs.replace(made(5), gyro_rad_s=(0.0, math.nan, 0.0), temperature_c=math.inf)
+    bad = msgspec.structs.replace(
+        made(5), gyro_rad_s=(0.0, math.nan, 0.0), temperature_c=math.inf, position=Position(0.0, math.nan)
+    )
     payload = encode_message(message(MessageKind.SAMPLES, samples=[bad]))
     assert b"null" not in payload
     assert (decode_message(payload).samples, fleet_messages.finite(made(5))) == ([made(5)], made(5))
@@ -61,9 +63,13 @@ def test_samples_survive_encoding_and_decoding(as_slots: bool) -> None:
     else:
         payload = encode_message(message(MessageKind.SAMPLES, samples=samples))
     assert decode_message(payload).samples == samples
+    old = forged(
+        b"".join(slot[:256] for slot in encode_slots(samples, 0)), version=1
+    )  # from the spool of an older imud
+    assert (decode_message(old).samples, fleet_messages.check_payload(old).last) == (samples, 7)
 
 
-def forged(slots: bytes, version: int = 1, padding: int = 0) -> bytes:
+def forged(slots: bytes, version: int = 2, padding: int = 0) -> bytes:
     head = msgspec.json.encode(message(MessageKind.SLOTS)) + b" " * padding
     return struct.pack("<4sBBH", fleet_messages.MAGIC, version, 0, len(head)) + head + zstandard.compress(slots)
 
@@ -74,12 +80,12 @@ SLOT = encode_slots([made(5)], 0)[0]
 @pytest.mark.parametrize(
     "payload",
     [
-        b"", b"{}", b"IMUB", b"null", forged(bytes(256 * (SLOTS_MAX + 1))), forged(SLOT, version=2),
+        b"", b"{}", b"IMUB", b"null", forged(bytes(320 * (SLOTS_MAX + 1))), forged(SLOT, version=3),
         forged(SLOT, padding=4096), b'{"deep":' + b"[" * 100_000,
         encode_message(message(MessageKind.SAMPLES)).replace(b'"v":1', b'"v":2'),
         encode_message(message(MessageKind.SAMPLES, 8, 7)),
         encode_message(message(MessageKind.SAMPLES)).replace(b'"begin":1', b'"begin":0'),
-        encode_slots_message(message(MessageKind.SLOTS), [bytes(256)]),
+        encode_slots_message(message(MessageKind.SLOTS), [bytes(320)]),
         encode_slots_message(message(MessageKind.SLOTS), [bytes(100)]),
     ],
 )  # fmt: skip
@@ -96,10 +102,14 @@ def fields(kind: MessageKind, **more: Any) -> dict[str, Any]:
     return found
 
 
+PLACE = Position(0.5, 0.25, 6.0, 7, 8)
 INTERVAL = fleet_messages.Interval(5, 7, 3, 1, 2, 3, 4, 5, Sync.EDGE, {}, 6)
 CLOCK = fleet_messages.GatewayClock(1, 2, synchronised=True, error_ns=3)
 FULL = (
-    fields(MessageKind.SAMPLES, samples=[msgspec.structs.replace(made(5), t_dev_ns=1, pps_age_ms=2, edge_seq=3)]),
+    fields(
+        MessageKind.SAMPLES,
+        samples=[msgspec.structs.replace(made(5), t_dev_ns=1, pps_age_ms=2, edge_seq=3, gnss_utc_ns=4, position=PLACE)],
+    ),
     fields(MessageKind.INTERVALS, intervals=[INTERVAL]),
     fields(MessageKind.EVENTS, events=[Event(3, "bow", EventKind.UP, "up")], clock=CLOCK),
 )

@@ -88,7 +88,7 @@ def test_birth_states_and_farewell(tmp_path: Path) -> None:
     assert json.loads(sent[0][1])["boot"] == "000000000000004d"
     farewell = {"v": 1, "online": False, "boot": "000000000000004d", "reason": "imud stopped"}
     assert topics["imud/default/gw/state"] == farewell
-    assert topics["imud/default/gw/imu0/schema"]["slot"]["bytes"] == 256
+    assert topics["imud/default/gw/imu0/schema"]["slot"]["bytes"] == 320
     assert topics["imud/default/gw/imu0/status"]["state"] == "running"
     assert bench.broker.will is not None
     will = json.loads(bench.broker.will.payload)
@@ -355,4 +355,4 @@ def test_slots_can_be_decoded_with_the_published_schema(tmp_path: Path) -> None:
         }  # fmt: skip
         assert (found["accel_m_s2"], found["temperature_c"]) == (one.accel_m_s2, 20.5)
         assert not {"gyro_rad_s", "mag_t", "quat_wxyz", "euler_rad", "pressure_pa", "t_dev_ns"} & set(found)
-        assert found["crc32"] == zlib.crc32(slots[at * size : (at + 1) * size - 4])
+        assert found["crc32"] == zlib.crc32(slots[at * size : at * size + 252])

@@ -14,7 +14,7 @@ LEDGER = {name: 100 + i for i, name in enumerate(LEDGER_FIELDS)}
 
 GOLDEN = (
     b"imudshm\0"
-    + bytes.fromhex("01000000 01000000 00100000 00010000 00100000 18000000")  # 1, 1, 4096, 256, 4096, 24 counters
+    + bytes.fromhex("02000000 02000000 00100000 40010000 00100000 18000000")  # 2, 2, 4096, 320, 4096, 24 counters
     + bytes.fromhex("0807060504030201 67120000 01000000 03000000")
     + bytes(12)
     + b"front-imu".ljust(64, b"\0")
@@ -52,7 +52,7 @@ def test_no_ring_at_all(raw: bytes) -> None:
         ring.decode_header(raw, "/x")
 
 
-VERSIONS = [("layout_version", 3), ("slot_layout_version", 3), ("header_bytes", 4098), ("slot_bytes", 258)]
+VERSIONS = [("layout_version", 1), ("slot_layout_version", 3), ("header_bytes", 4098), ("slot_bytes", 258)]
 COUNTS = [("slot_count", 0), ("slot_count", 4095), ("ledger_count", 60)]
 
 

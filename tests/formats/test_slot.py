@@ -11,18 +11,19 @@ from hypothesis import strategies as st
 
 from imud.formats import slot as slot_format
 from imud.formats.slot import CRC_OFFSET, PRESENT_BITS, SLOT_BYTES, decode_slot, encode_slot, encode_slots
-from imud.model.sample import Sample, Sync
+from imud.model.sample import Position, Sample, Sync
 from tests.support.rings import check_layout
 
 FULL = Sample(
     "imu0", 258, 1_000_000_001, 250_000, Sync.EDGE, 1_000_400_000, 0x17A1_B2C3_D4E5_F607,
     t_dev_ns=-2, accel_m_s2=(1.0, -2.0, 0.5), gyro_rad_s=(4.0, 8.0, 16.0), mag_t=(-1.0, 0.25, 0.125),
     quat_wxyz=(1.0, 0.0, 0.0, -1.0), euler_rad=(2.0, 1.0, -0.5), temperature_c=32.0, pressure_pa=65536.0,
-    incli_rad=(-4.0, 0.0625), status=0x8001_0203, pps_age_ms=999, edge_seq=7,
+    incli_rad=(-4.0, 0.0625), status=0x8001_0203, pps_age_ms=999, edge_seq=7, velocity_enu_m_s=(8.0, -16.0, 0.25),
+    position=Position(0.5, -2.0, 64.0, 4, 17), heave_m=-0.125, gnss_utc_ns=0x1881_0203_0405_0607,
 )  # fmt: skip
 BARE = Sample("imu0", 1, 2, 3, Sync.ARRIVAL, 4, 5)
 
-INTEGERS = ("t_dev_ns", "status", "pps_age_ms", "edge_seq")
+INTEGERS = ("t_dev_ns", "status", "pps_age_ms", "edge_seq", "gnss_utc_ns")
 
 GOLDEN = (
     "0201000000000000"  # seq 258 = 0x102
@@ -32,7 +33,7 @@ GOLDEN = (
     "feffffffffffffff"  # t_dev_ns -2
     "0700000000000000"  # edge_seq
     "90d00300"  # t_err_ns 250 000 = 0x3d090
-    "ff0f0000"  # present: all twelve bits
+    "ffff0000"  # present: all sixteen bits
     "03020180"  # status
     "3412"  # device_id 0x1234
     "02"  # sync edge
@@ -46,7 +47,15 @@ GOLDEN = (
     "000000000000f040"  # 65536
     "00000000000010c0" "000000000000b03f"  # -4, 1/16
     "e7030000"  # 999
-    + "00" * 24
+    "04" "11" "0000"  # quality 4, 17 satellites
+    "0706050403028118"  # gnss_utc_ns
+    "000000000000c0bf"  # -1/8
+    "00000000"
+)  # fmt: skip
+MORE = (
+    "0000000000002040" "00000000000030c0" "000000000000d03f"  # 8, -16, 1/4
+    "000000000000e03f" "00000000000000c0" "0000000000005040"  # 1/2, -2, 64
+    + "00" * 16
 )  # fmt: skip
 """Written by hand: a power of two 2**n as f64 has only the exponent bits 1023 + n."""
 
@@ -63,10 +72,15 @@ def crc32_bit_by_bit(data: bytes) -> int:
 def test_golden_bytes() -> None:
     slot = encode_slot(FULL, 0x1234)
     assert slot[:CRC_OFFSET].hex(" ", 8) == bytes.fromhex(GOLDEN).hex(" ", 8)
-    assert slot[CRC_OFFSET:] == crc32_bit_by_bit(bytes.fromhex(GOLDEN)).to_bytes(4, "little")
+    assert slot[CRC_OFFSET + 4 :].hex(" ", 8) == bytes.fromhex(MORE).hex(" ", 8)
+    assert slot[CRC_OFFSET : CRC_OFFSET + 4] == crc32_bit_by_bit(bytes.fromhex(GOLDEN + MORE)).to_bytes(4, "little")
     assert crc32_bit_by_bit(b"123456789") == 0xCBF4_3926  # the published check value of CRC-32
-    raw = bytes.fromhex(GOLDEN)
-    assert decode_slot(raw + zlib.crc32(raw).to_bytes(4, "little"), "imu0") == FULL
+    raw, more = bytes.fromhex(GOLDEN), bytes.fromhex(MORE)
+    assert decode_slot(raw + zlib.crc32(raw + more).to_bytes(4, "little") + more, "imu0") == FULL
+    short = encode_slot(
+        msgspec.structs.replace(FULL, velocity_enu_m_s=None, position=None), 1
+    )  # the CRC ends before MORE
+    assert short[CRC_OFFSET:] == crc32_bit_by_bit(short[:CRC_OFFSET]).to_bytes(4, "little") + bytes(64)
     check_layout(slot_format.SLOT_FIELDS, SLOT_BYTES)
 
 
@@ -79,6 +93,13 @@ def test_presence_bit_of_each_field(name: str) -> None:
     assert getattr(decoded, name) == value
     assert all(getattr(decoded, other) is None for other in PRESENT_BITS if other != name)
     zero: Any = tuple(0.0 for _ in value) if isinstance(value, tuple) else 0  # zero differs from absent
+    if isinstance(value, Position):
+        zero = Position(0.0, 0.0, 0.0, 0, 0)
+        fullest = Position(0.0, 0.0, None, 300, -1)  # clipped
+        decoded = decode_slot(encode_slot(msgspec.structs.replace(BARE, position=fullest), 0), "imu0")
+        assert decoded.position == Position(0.0, 0.0, None, 254, 0)
+        place = Position(1.0, 2.0)
+        assert decode_slot(encode_slot(msgspec.structs.replace(BARE, position=place), 0), "imu0").position == place
     decoded = decode_slot(encode_slot(msgspec.structs.replace(BARE, **{name: zero}), 0), "imu0")
     assert getattr(decoded, name) == zero
 
@@ -96,10 +117,11 @@ def test_any_flipped_bit_and_the_sync_of_a_newer_layout_are_found() -> None:
         assert not slot_format.slot_is_whole(bytes(slot)), at
         with pytest.raises(ValueError, match="during the copy"):
             decode_slot(bytes(slot), "imu0")
-    raw = bytearray(encode_slot(FULL, 1)[:CRC_OFFSET])
+    raw = bytearray(encode_slot(BARE, 1))
     raw[62] = 4
+    raw[CRC_OFFSET : CRC_OFFSET + 4] = zlib.crc32(raw[:CRC_OFFSET]).to_bytes(4, "little")
     with pytest.raises(ValueError, match="sync 4"):
-        decode_slot(bytes(raw) + zlib.crc32(raw).to_bytes(4, "little"), "imu0")
+        decode_slot(bytes(raw), "imu0")
 
 
 @pytest.mark.parametrize("slot", [b"", bytes(SLOT_BYTES), encode_slot(FULL, 1)[:-1], b"\xff" * SLOT_BYTES])

@@ -63,8 +63,18 @@ static void put(size_t at, const void *data, size_t size_bytes)
 
 static void mend(size_t begin, size_t crc_at)
 {
-    uint32_t crc = imud_crc_(table, image + begin, crc_at - begin);
+    uint32_t crc = imud_crc_(table, 0, image + begin, crc_at - begin);
     put(crc_at, &crc, sizeof crc);
+}
+
+static void mend_slot(size_t begin)
+{
+    imud_slot slot;
+    memcpy(&slot, image + begin, sizeof slot);
+    slot.crc32 = imud_crc_(table, 0, &slot, offsetof(imud_slot, crc32));
+    if (slot.present & (IMUD_HAS_VELOCITY | IMUD_HAS_POSITION))
+        slot.crc32 = imud_crc_(table, slot.crc32, slot.velocity_enu_m_s, sizeof slot - offsetof(imud_slot, velocity_enu_m_s));
+    put(begin + offsetof(imud_slot, crc32), &slot.crc32, sizeof slot.crc32);
 }
 
 static void replace(void)
@@ -139,7 +149,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
             at += length;
         } else if (kind == MEND_SLOT) {
             offset = IMUD_HEADER_BYTES + (at < size ? data[at] % SLOTS : 0) * IMUD_SLOT_BYTES;
-            mend(offset, offset + offsetof(imud_slot, crc32));
+            mend_slot(offset);
             at++;
         } else if (kind == MEND_LEDGER) {
             mend(offsetof(imud_header, ledger_update), offsetof(imud_header, ledger_crc32));

@@ -25,7 +25,7 @@ from typing import Final
 
 from imud.client.ring import Ring
 from imud.formats import ring as formats_ring
-from imud.formats.slot import CRC_OFFSET, SLOT_BYTES, SYNC_CODES, decode_slot, encode_slot
+from imud.formats.slot import CRC_OFFSET, SLOT_BYTES, SYNC_CODES, decode_slot, encode_slot, slot_crc
 from imud.model.errors import ServerError
 from imud.model.ledger import LEDGER_FIELDS
 from imud.model.sample import Sample
@@ -70,14 +70,14 @@ def _comparable(sample: Sample) -> str:
 
 
 def mend_slot(data: bytes, _random: Random) -> bytes:
-    body = data[:CRC_OFFSET].ljust(CRC_OFFSET, b"\0")
-    return body + zlib.crc32(body).to_bytes(4, "little")
+    slot = data[:SLOT_BYTES].ljust(SLOT_BYTES, b"\0")
+    return slot[:CRC_OFFSET] + slot_crc(slot) + slot[CRC_OFFSET + 4 :]
 
 
 def slot_seeds() -> list[bytes]:
     slots = [encode_slot(make_sample(seq), 3) for seq in (1, 2, 1 << 40, (1 << 64) - 1)]
     random = Random(1)
-    bodies = [random.randbytes(62) + bytes([code]) + random.randbytes(189) for code in (*range(len(SYNC_CODES)), 9)]
+    bodies = [random.randbytes(62) + bytes([code]) + random.randbytes(257) for code in (*range(len(SYNC_CODES)), 9)]
     return [*slots, slots[0][:-1], slots[0] + b"\0", b"", *(mend_slot(body, random) for body in bodies)]
 
 
@@ -115,7 +115,8 @@ class RingFile:
 
     def mend_slot(self, number: int) -> None:
         at = _slot_at(number)
-        self.write(at + CRC_OFFSET, zlib.crc32(self.image[at : at + CRC_OFFSET]).to_bytes(4, "little"))
+        if len(slot := self.image[at : at + SLOT_BYTES]) == SLOT_BYTES:
+            self.write(at + CRC_OFFSET, slot_crc(bytes(slot)))
 
     def mend_ledger(self) -> None:
         block = self.image[formats_ring.LEDGER_BLOCK_OFFSET : formats_ring.LEDGER_CRC_OFFSET]

@@ -19,7 +19,7 @@ from imud.formats.slot import PRESENT_BITS, SEQ_INVALID, SLOT_BYTES, SLOT_FIELDS
 from imud.model.ledger import LEDGER_FIELDS
 from imud.model.sample import Sample
 from imud.publishers.socket.client import Waker
-from tests.support.rings import DEVICE, SLOTS, START_NS, TORN, WHOLE, Board, make_sample, slot_at
+from tests.support.rings import DEVICE, SLOTS, START_NS, TORN, WHOLE, Board, make_sample, place_sample, slot_at
 from tests.support.surroundings import DAEMON_UID, HOSTILE_UID, needs_root
 
 INCLUDE = Path(__file__).parents[2] / "imud" / "include"
@@ -110,7 +110,7 @@ def layout_program() -> tuple[str, list[str]]:
         add(name, f"IMUD_LEDGER_{name.upper()}", place)
     for sync, code in SYNC_CODES.items():
         add(sync, f"IMUD_SYNC_{sync.upper()}", code)
-    bits = {name: bit for name, bit in vars(slot).items() if name.startswith("HAS_")}
+    bits = {name: bit for name, bit in vars(slot).items() if name.startswith("HAS_") and name != "HAS_MORE"}
     assert sorted(bits.values()) == sorted(PRESENT_BITS.values())
     for name, bit in bits.items():
         add(name, f"IMUD_{name}", bit)
@@ -120,6 +120,7 @@ def layout_program() -> tuple[str, list[str]]:
     add("header bytes", "sizeof(imud_header)", shm_layout.HEADER_BYTES)
     add("layout", "IMUD_LAYOUT_VERSION", shm_layout.RING_LAYOUT_VERSION)
     add("slot layout", "IMUD_SLOT_LAYOUT_VERSION", slot.SLOT_LAYOUT_VERSION)
+    add("no count", "IMUD_NO_COUNT", slot.NO_COUNT)
     add("invalid", "IMUD_SEQ_INVALID", SEQ_INVALID)
     add("magic", "sizeof IMUD_MAGIC", len(shm_layout.MAGIC))
     for name, at in (("update", 0), ("driver", 8), ("values", 40), ("crc32", 512)):
@@ -175,6 +176,13 @@ def test_torn_slot_is_refused(board: Board, reader: Reader, name: str) -> None:
     assert reader.next() == (0, 0)
     board.publish([5])
     assert [reader.next(), reader.next(), reader.next()] == [(4, 1), (5, 0), (0, 0)]
+
+
+def test_a_position_is_read_and_protected_by_the_crc(board: Board, reader: Reader) -> None:
+    board.publish_samples([place_sample(1), make_sample(2), place_sample(3)])
+    assert [reader.next(), reader.next(), reader.next()] == [(1, 0), (2, 0), (3, 0)]
+    board.poke(slot_at(3) + 290, b"\x55")
+    assert reader.ask("latest") == ["latest", "0", "0"]
 
 
 def test_number_that_changes_during_the_copy_and_gaps(board: Board, reader: Reader) -> None:
@@ -373,8 +381,8 @@ def header_with(name: str, value: int) -> bytes:
 @pytest.mark.parametrize(
     ("content", "code"),
     [
-        (None, -1), (b"", -3), (bytes(shm_layout.HEADER_BYTES), -3), (header_with("layout_version", 2), -4),
-        (header_with("slot_layout_version", 2), -4), (header_with("slot_bytes", 512), -4),
+        (None, -1), (b"", -3), (bytes(shm_layout.HEADER_BYTES), -3), (header_with("layout_version", 1), -4),
+        (header_with("slot_layout_version", 3), -4), (header_with("slot_bytes", 512), -4),
         (header_with("header_bytes", 8192), -4), (header_with("slot_count", 63), -3),
         (header_with("slot_count", 2 * SLOTS), -3), (header_with("ledger_count", 60), -3),
     ],

@@ -31,7 +31,7 @@ from imud.publishers import shm as ring
 from imud.publishers.shm import ShmOptions, ShmPublisher
 from tests.support.files import ROOT
 from tests.support.publisher_context import FakeLatencies, publisher_context
-from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample, slot_at
+from tests.support.rings import DEVICE, SLOTS, START_NS, Board, make_sample, place_sample, slot_at
 
 
 def make(folder: Path, **settings: Any) -> ShmPublisher:
@@ -111,9 +111,10 @@ def test_batches_and_single_samples_write_the_same_bytes(
         for _ in range(random.choice((1, 2, 5, 20, SLOTS, SLOTS + 7))):
             seq += 1 if random.random() < 0.97 else random.randint(2, 2 * SLOTS)
             numbers.append(seq)
-        many.publish(numbers)
-        for number in numbers:
-            one.publish([number])
+        samples = [random.choice((make_sample, place_sample))(number) for number in numbers]
+        many.publish_samples(samples)
+        for sample in samples:
+            one.publish_samples([sample])
         driver, counts = random.choice(("", "x" * 31, "é" * 16)), random.choices((0, 7, (1 << 64) - 1), k=2)
         for board in (one, many):
             board.driver, (board.ledger.bytes_in, board.ledger.frames_lost) = driver, counts
@@ -391,7 +392,7 @@ def test_ring_in_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     assert len(os.listdir("/proc/self/fd")) == descriptors + 1  # the descriptor of the directory
     assert (board.context.outputs.rings, board.context.outputs.without_ring) == ({}, {DEVICE})
     [record] = (record for record in caplog.records if record.levelno == logging.ERROR)
-    assert re.search(r"imud.imu0 with 20480 bytes: No space left .* reduce shm.slots", record.getMessage())
+    assert re.search(r"imud.imu0 with 24576 bytes: No space left .* reduce shm.slots", record.getMessage())
     assert not list(tmp_path.iterdir())
     board.tick()
     with Ring(board.path, now_ns=lambda: board.now_ns) as reader:
@@ -402,7 +403,7 @@ def test_ring_in_full_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     descriptors = len(os.listdir("/proc/self/fd"))
     monkeypatch.setattr(mmap, "mmap", Mock(side_effect=OSError(errno.ENOMEM, "Cannot allocate memory")))
     board.tick()
-    assert f"cannot map 20480 bytes of imud.{DEVICE}: Cannot allocate memory" in caplog.text
+    assert f"cannot map 24576 bytes of imud.{DEVICE}: Cannot allocate memory" in caplog.text
     assert (board.path.exists(), len(os.listdir("/proc/self/fd"))) == (False, descriptors)
     assert board.context.outputs.without_ring == {DEVICE}
     board.publisher.close()

@@ -6,7 +6,7 @@ from imud.contracts.status import LATENCY_BOUNDS_NS
 from imud.model.ledger import Ledger
 from imud.sampling.meters import LatencyMeter, LossMeter
 
-SLOT = struct.Struct("<8xq40xI196x")  # the fields `t_ns` and `status` of a slot
+SLOT = struct.Struct("<8xq40xI260x")  # the fields `t_ns` and `status` of a slot
 
 
 def test_latencies_go_into_the_buckets_whose_bounds_they_do_not_exceed() -> None:

@@ -1,16 +1,17 @@
 """Shared memory in a folder of its own. The test controls clock and ledger of the publisher."""
 
 import struct
-import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+
+import msgspec
 
 from imud.contracts.publisher import Batch
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus, KernelCounters
 from imud.formats.ring import HEADER_BYTES, OFFSETS
-from imud.formats.slot import CRC_OFFSET, SEQ_INVALID, SLOT_BYTES, SlotField, encode_slot
+from imud.formats.slot import CRC_OFFSET, SEQ_INVALID, SLOT_BYTES, SlotField, encode_slot, slot_crc
 from imud.model.ledger import Ledger
-from imud.model.sample import Sample, Sync
+from imud.model.sample import Position, Sample, Sync
 from imud.publishers.shm import ShmOptions, ShmPublisher
 from tests.support.publisher_context import publisher_context
 
@@ -33,8 +34,8 @@ def make_sample(seq: int, device: str = DEVICE) -> Sample:
 
 
 def _reseal(slot: bytes, seq: int) -> bytes:
-    body = struct.pack("<Q", seq) + slot[8:CRC_OFFSET]
-    return body + zlib.crc32(body).to_bytes(4, "little")
+    slot = struct.pack("<Q", seq) + slot[8:]
+    return slot[:CRC_OFFSET] + slot_crc(slot) + slot[CRC_OFFSET + 4 :]
 
 
 WHOLE = encode_slot(make_sample(2), 3)
@@ -42,7 +43,8 @@ TORN = {
     "number invalid": struct.pack("<Q", SEQ_INVALID) + WHOLE[8:], "number not there yet": bytes(8) + WHOLE[8:],
     "payload of another sample": WHOLE[:8] + encode_slot(make_sample(66), 3)[8:],
     "payload half old": WHOLE[:128] + encode_slot(make_sample(66), 3)[128:],
-    "crc wrong": WHOLE[:-1] + bytes([WHOLE[-1] ^ 1]), "whole, but of another round": _reseal(WHOLE, 2 + SLOTS),
+    "crc wrong": WHOLE[:CRC_OFFSET] + bytes([WHOLE[CRC_OFFSET] ^ 1]) + WHOLE[CRC_OFFSET + 1 :],
+    "whole, but of another round": _reseal(WHOLE, 2 + SLOTS),
     "never written": bytes(SLOT_BYTES),
 }  # fmt: skip
 """Damaged slots of sample 2 that a reader must reject, by the kind of damage."""
@@ -107,3 +109,9 @@ def check_layout(fields: Iterable[SlotField], size_bytes: int) -> None:
         assert field.offset % size == 0, f"{field.name} is not aligned to its size"
         at += size * field.count
     assert at == size_bytes
+
+
+def place_sample(seq: int) -> Sample:
+    """Return the sample of `make_sample` with a position and a velocity, which are after the CRC-32 of a slot."""
+    place = Position(0.5, -0.25, seq + 0.125, 4, seq)
+    return msgspec.structs.replace(make_sample(seq), position=place, velocity_enu_m_s=(1.0, -float(seq), 0.5))

@@ -32,7 +32,7 @@ from imud.model.units import NS_PER_S
 
 # Minimum time between two readings of the rings, ns. Scrapes in between return the same values.
 LOOK_NS: Final = NS_PER_S
-# Maximum number of slots per device: a complete ring of the default size, 4 s at 1 kHz, 1 MB and about 2 ms of CPU time
+# Maximum number of slots per device: a complete ring of the default size, 4 s at 1 kHz, 1.3 MB and 2 ms of CPU time
 SAMPLES_MAX: Final = 4096
 SPAN_MIN_NS: Final = 10 * NS_PER_S  # Minimum span, ns. A second scraper must not shorten the span of the first.
 # Number of values between two pauses, 0.3 ms. A pause takes long if many programs need CPU time.

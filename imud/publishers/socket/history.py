@@ -47,7 +47,7 @@ SECOND: Final = Struct("<qqqqQIIIB3x12f12f4fffII")
 _COUNT_MAX: Final = (1 << 32) - 1
 _NEW: Final = bytes(SECOND.size)
 # seq, t_ns, t_rx_ns, utc_ns, t_err_ns, present, sync, values
-_SLOT: Final = Struct("<Qqqq16xII6xBx9d4d3ddd48x")
+_SLOT: Final = Struct("<Qqqq16xII6xBx9d4d3ddd112x")
 # bit of `present`, index of the first value in `_SLOT`, index of the first value in a second
 _VECTOR_PLACES: Final = ((HAS_ACCEL, 7, 0), (HAS_GYRO, 10, 3), (HAS_MAG, 13, 6), (HAS_EULER, 20, 9))
 # bit of `present`, range of the values in `_SLOT`, index of the first value in a second

@@ -525,7 +525,7 @@ def test_a_queue_is_sent_in_pieces() -> None:
     sock.room = True
     while outbox.flush():
         pass
-    assert sock.sent == [127 * 260, 127 * 260, 46 * 260]  # a piece ends with the message that reaches 32 KiB
+    assert sock.sent == [102 * 324, 102 * 324, 96 * 324]  # a piece ends with the message that reaches 32 KiB
 
 
 @pytest.mark.parametrize("sizes", [(30, 30, 30), (1, 99)])
