@@ -194,20 +194,24 @@ async def examine(port: str, may_ask: bool, title: str) -> list[ProbeReport]:
         found = await find(config, link)
         identity = await identity_of_device(found, link) if may_ask else Identity()
         words = identity_words(printable_identity(identity))
-        return [ProbeReport(port, title, found.driver.name, baud=link.baud, identity=words, problem=_unknown(found))]
+        return [ProbeReport(port, title, found.driver.name, baud=link.baud, identity=words, problem=unknown_of(found))]
     except ImudError as error:
         return [ProbeReport(port, title, problem=str(error))]
     finally:
         link.close()
 
 
-def _unknown(found: StreamFound) -> str:
-    """Describe received frames of unknown types; empty if the device sends samples."""
+def unknown_of(found: StreamFound) -> str:
+    """Describe received frames of unknown types with their numbers; empty if there are none."""
     ledger = Ledger()
     codec = found.driver.make_codec(ledger, found.driver.settings())
     for data, _ in found.chunks:
         codec.feed(data)
-    return "" if ledger.frames_in_samples or not codec.unknown else found.driver.unknown_words(codec.unknown)
+    if not codec.unknown:
+        return ""
+    if ledger.frames_in_samples:
+        return f"also {found.driver.unknown_types(codec.unknown)}"
+    return found.driver.unknown_words(codec.unknown, counted=True)
 
 
 async def find(config: DeviceConfig, link: StreamLink) -> StreamFound:

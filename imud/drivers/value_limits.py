@@ -17,6 +17,9 @@ from imud.model.units import RAD_PER_DEG
 ACCEL_LIMIT_G: Final = 40.0
 GYRO_LIMIT_DEG_S: Final = 4000.0
 MAG_LIMIT_UT: Final = 4000.0
+VELOCITY_LIMIT_M_S: Final = 1000.0
+HEIGHT_LIMIT_M: Final = 100_000.0
+HEAVE_LIMIT_M: Final = 100.0
 TEMPERATURE_LIMITS_C: Final = (-128.0, 150.0)  # a measured temperature is above the first value, up to the second, °C
 TURN_DEG: Final = 360.001  # no angle reaches this magnitude: a full turn with its rounding
 TURN_RAD: Final = TURN_DEG * RAD_PER_DEG

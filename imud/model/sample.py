@@ -21,7 +21,7 @@ class Position(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
     latitude_rad: float  # positive to the north
     longitude_rad: float  # positive to the east
     height_m: float | None = None  # height above mean sea level
-    quality: int | None = None  # quality of the position solution as sent, 0 … 254 (HiPNUC: as in NMEA GGA, 0 invalid)
+    quality: int | None = None  # quality of the position solution as sent, 0 … 254 (0: invalid)
     satellites: int | None = None  # number of satellites in the solution, 0 … 254
 
 

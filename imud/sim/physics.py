@@ -41,6 +41,8 @@ class Truth(NamedTuple):
     quat_wxyz: Quaternion  # rotation from body to ENU
     temperature_c: float
     pressure_pa: float
+    position_enu_m: Vector3 = (0.0, 0.0, 0.0)  # from the start of the motion
+    velocity_enu_m_s: Vector3 = (0.0, 0.0, 0.0)
 
 
 class Motion(Protocol):
@@ -91,12 +93,9 @@ class Swing:
         pitch, pitch_rate = _value_and_rate(self._pitch, t_s)
         yaw, yaw_rate = _value_and_rate(self._yaw, t_s)
         turn = sin_r, cos_r, sin_p, cos_p, _, _ = sin(roll), cos(roll), sin(pitch), cos(pitch), sin(yaw), cos(yaw)
-        up_m, up_m_s2 = _value_and_acceleration(self._up, t_s)
-        force = (
-            _value_and_acceleration(self._east, t_s)[1],
-            _value_and_acceleration(self._north, t_s)[1],
-            up_m_s2 + self.gravity_m_s2,
-        )
+        axes = [_value_and_derivatives(axis, t_s) for axis in (self._east, self._north, self._up)]
+        place, velocity, (east_m_s2, north_m_s2, up_m_s2) = zip(*axes, strict=True)
+        force = (east_m_s2, north_m_s2, up_m_s2 + self.gravity_m_s2)
         yaw_y, yaw_z = yaw_rate * sin_p, yaw_rate * cos_p  # yaw rate after the rotation about X
         return Truth(
             _into_body(force, turn),
@@ -105,7 +104,9 @@ class Swing:
             (roll, pitch, yaw),
             quat_from_euler312((roll, pitch, yaw)),
             TEMPERATURE_C + WARMING_C * sin(2 * pi / WARMING_PERIOD_S * t_s),
-            SEA_LEVEL_PA + PA_PER_M * up_m,
+            SEA_LEVEL_PA + PA_PER_M * place[2],
+            place,
+            velocity,
         )
 
 
@@ -122,13 +123,15 @@ def _value_and_rate(terms: _Terms, t_s: float) -> tuple[float, float]:
     return value, rate
 
 
-def _value_and_acceleration(terms: _Terms, t_s: float) -> tuple[float, float]:
-    value = acceleration = 0.0
+def _value_and_derivatives(terms: _Terms, t_s: float) -> Vector3:
+    value = rate = acceleration = 0.0
     for amplitude, omega, phase in terms:
-        term = amplitude * sin(omega * t_s + phase)
+        angle = omega * t_s + phase
+        term = amplitude * sin(angle)
         value += term
+        rate += amplitude * omega * cos(angle)
         acceleration -= term * omega * omega
-    return value, acceleration
+    return value, rate, acceleration
 
 
 def _into_body(v: Vector3, turn: _Turn) -> Vector3:
@@ -293,7 +296,7 @@ class Noise:
     def add(self, truth: Truth, t_s: float) -> Truth:
         levels = self._levels
         accel_bias, gyro_bias, mag_bias = self.bias(t_s)
-        accel, gyro, mag, euler, quat, temperature_c, pressure_pa = truth
+        accel, gyro, mag, euler, quat, temperature_c, pressure_pa, *_ = truth
         return Truth(
             self._blur(accel, accel_bias, levels.accel_m_s2),
             self._blur(gyro, gyro_bias, levels.gyro_rad_s),
@@ -302,6 +305,8 @@ class Noise:
             quat,
             temperature_c,
             pressure_pa + levels.pressure_pa * NORMAL[self._random.getrandbits(NORMAL_BITS)],
+            truth.position_enu_m,
+            truth.velocity_enu_m_s,
         )
 
     def _blur(self, vector: Vector3, bias: Vector3, sigma: float) -> Vector3:

@@ -52,8 +52,8 @@ def test_standard_input_and_files_without_a_message(tmp_path: Path, cli: Cli, mo
 
 def test_a_capture_without_samples_names_its_frames(tmp_path: Path, cli: Cli) -> None:
     """The number of named types has a limit."""
-    unknown, file = encode_frame(b"\x83" + bytes(55)), tmp_path / "capture"
-    found = "found valid frames of unknown types (HI83 (tag 0x83): 3), but no sample; "
+    unknown, file = encode_frame(b"\x77" + bytes(55)), tmp_path / "capture"
+    found = "found valid frames of unknown types (tag 0x77: 3), but no sample; "
     for capture, status, words in [
         (unknown * 3, 1, found), (unknown + b"OK\r\n", 1, "`imud settings NAME --set output.hi91=100`"),
         (unknown + MANUAL_FRAME, 0, ""), (b"OK\r\n", 0, ""),  # a capture of replies
@@ -63,7 +63,7 @@ def test_a_capture_without_samples_names_its_frames(tmp_path: Path, cli: Cli) ->
         assert words in err
         assert ("unknown types" in err) == bool(words)
         if status:
-            assert "types (HI83" in cli("replay", "--driver", DECODE[2], file, status=1).err
+            assert "types (tag 0x77" in cli("replay", "--driver", DECODE[2], file, status=1).err
     log = tmp_path / "drive.log"
     log.write_text("".join(f"({one}.0) can0 0CFF{0x60 + one % 12:02X}08#00\n" for one in range(24)))
     err = cli("decode", "--driver", "hipnuc-j1939", log, status=1).err

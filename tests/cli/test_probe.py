@@ -10,10 +10,12 @@ import pytest
 
 from imud.cli import probe
 from imud.cli.probe import ProbeReport, block
-from imud.contracts.driver import Driver
+from imud.contracts.driver import Driver, StreamDriver
 from imud.contracts.link import LinkType, OnBusNews, OnEnd, OnFrames
 from imud.device import can_search as detection
+from imud.device.stream_search import StreamFound
 from imud.drivers import DRIVERS
+from imud.drivers.hipnuc.uart.codec import encode_frame
 from imud.formats.can import CanFrame
 from imud.links.memory import MemoryCanLink, MemoryOptions
 from imud.links.netlink import CanDetails
@@ -30,6 +32,7 @@ from tests.support.simulated_modules import HIPNUC_STILL
 from tests.support.wired_device import LinkedModule
 
 PORT = "/dev/ttyUSB0"
+HI91, UNKNOWN = (encode_frame(bytes([tag]) + bytes(75)) for tag in (0x91, 0x77))
 
 
 class PortSettings(Options, frozen=True, kw_only=True):
@@ -106,6 +109,13 @@ def test_a_port_is_listened_to_and_only_asked_with_active(ports: Ports, cli: Cli
     assert lines[-1] == "  FT232R"
     assert max(map(len, lines)) <= 80
     assert port.opened == 3, "a port that is named twice is opened once"
+    driver = DRIVERS["hipnuc-uart"]
+    assert isinstance(driver, StreamDriver)
+    for frames, words in (
+        (HI91 + UNKNOWN, "also valid frames of unknown types (tag 0x77: 2)"), (UNKNOWN, "(tag 0x77: 2)"), (HI91, ""),
+    ):  # fmt: skip
+        named = probe.unknown_of(StreamFound(driver, 115200, ((frames, 0), (frames, 0))))
+        assert (words in named, bool(named)) == (True, bool(words))
     deaf = ports(Port())
     deaf.is_deaf = True
     found = printed(cli, "--active", PORT)

@@ -78,7 +78,7 @@ def test_a_stamped_capture_has_its_own_rate_and_no_figures_of_how_fast_it_was_re
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("a.raw", hi91(0) + encode_frame(b"\x83" + bytes(9)) + hi91(10), "valid frames of unknown types (HI83 (tag"),
+        ("a.raw", hi91(0) + encode_frame(b"\x85" + bytes(9)) + hi91(10), "valid frames of unknown types (tag 0x85"),
         ("a.log", b"(1.0) can0 388#0000\n(1.1) can0 188#00000000E803\n", "1 frame of a wrong length, the last of CAN"),
     ],
 )  # fmt: skip

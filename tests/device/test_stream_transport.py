@@ -412,9 +412,9 @@ def test_a_port_of_another_configured_device_reports_its_name() -> None:
     play_rigs(rigs, story, clock)
 
 
-HI83, HI81, OTHER = (encode_frame(bytes([tag]) + bytes(size)) for tag, size in ((0x83, 55), (0x81, 103), (0x77, 9)))
+TAG_85, TAG_84, OTHER = (encode_frame(bytes([tag]) + bytes(size)) for tag, size in ((0x85, 55), (0x84, 103), (0x77, 9)))
 RAW = imu61x_frame(DEVICE_SYNC, 0x0666, bytes(28))
-HI_NEXT = "imud decodes HI91 and HI92: select one with `imud settings bow --set output.hi91=100`"
+HI_NEXT = "imud decodes HI91, HI92, HI81 and HI83: select one with `imud settings bow --set output.hi91=100`"
 AHRS_NEXT = "imud decodes the AHRS frame (identifier 0x0002): select this output with the program of the vendor"
 
 
@@ -422,13 +422,13 @@ AHRS_NEXT = "imud decodes the AHRS frame (identifier 0x0002): select this output
 @pytest.mark.parametrize(
     ("driver", "frames", "types", "next_step"),
     [
-        ("hipnuc-uart", HI83, "HI83 (tag 0x83)", HI_NEXT),
-        ("hipnuc-uart", HI81 + b"$GPRMC,123519,A*6A\r\n" + HI83, "HI81 (tag 0x81), HI83 (tag 0x83)", HI_NEXT),
+        ("hipnuc-uart", TAG_85, "tag 0x85", HI_NEXT),
+        ("hipnuc-uart", TAG_84 + b"$GPRMC,123519,A*6A\r\n" + TAG_85, "tag 0x84, tag 0x85", HI_NEXT),
         ("hipnuc-uart", OTHER, "tag 0x77", HI_NEXT),
         ("imu61x-uart", RAW, "raw data (identifier 0x0666)", AHRS_NEXT),
         ("imu61x-uart", imu61x_frame(DEVICE_SYNC, 0x0777, bytes(9)), "identifier 0x0777", AHRS_NEXT),
     ],
-    ids=["HI83", "HI81, HI83 and NMEA", "other tag", "raw data", "other identifier"],
+    ids=["one tag", "two tags and NMEA", "other tag", "raw data", "other identifier"],
 )
 def test_valid_frames_of_unknown_types_are_named(
     driver: str, frames: bytes, types: str, next_step: str, baud: Any

@@ -214,7 +214,7 @@ class Slave:
         t_s = (now_ns - epoch_ns) / NS_PER_S
         has_time = new and self.variant.long_block == "answered"
         truth = self.motion.at(t_s)
-        accel, gyro, mag, euler, quat, celsius, pascal = self.noise.add(truth, t_s) if self.noise else truth
+        accel, gyro, mag, euler, quat, celsius, pascal, *_ = self.noise.add(truth, t_s) if self.noise else truth
         if self.settings.heading_mode:
             self.magnetometer.sample(now_ns, gyro)
         mag = self.magnetometer.measured(mag)

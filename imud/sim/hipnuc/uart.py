@@ -22,15 +22,17 @@ not.
 from bisect import bisect_right, insort
 from collections.abc import Callable
 from dataclasses import replace
-from math import degrees, pi, radians
+from math import cos, degrees, pi, radians
 from random import Random
-from typing import Final
+from typing import Any, Final
 
-from imud.drivers.hipnuc.uart.codec import encode_hi91, encode_hi92
-from imud.drivers.hipnuc.uart.commands import BAUD_RATES, MAX_RATE_HZ, OutputMessage
-from imud.model.sample import Vector3
+from imud.drivers.hipnuc.uart.codec import encode_frame, encode_hi91, encode_hi92
+from imud.drivers.hipnuc.uart.commands import BAUD_RATES, FRAME_BYTES, MAX_RATE_HZ, OutputMessage
+from imud.drivers.hipnuc.uart.ins import WEEK_MS, hi83_size, pack_hi81, pack_hi83
+from imud.model.sample import Measurement, Position, Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US, T_PER_UT
 from imud.sim.hipnuc.uart_settings import (
+    NO_UTC,
     NWU,
     VARIANTS,
     CommandRefused,
@@ -141,7 +143,13 @@ RATE_CHANGE_NS: Final = 5 * NS_PER_MS
 PPS_MODULUS_MS: Final = 8192  # Modulus of the PPS time without edges, ms. A recording shows 0 to 8191.
 NEAR_LEVEL_RAD: Final = radians(5)  # maximum tilt at which ATT RST 3 acts, rad
 _PRINTABLE = range(0x20, 0x7F)
-_FRAME_BYTES: Final = {OutputMessage.HI91: 82, OutputMessage.HI92: 54}
+INS_FIRMWARE: Final = 170  # default firmware of a device with HI81 or HI83
+NAVIGATING: Final = 3  # INS status
+RTK_FIXED, SATELLITES = 5, 21  # quality and satellites of the simulated position
+# Start of the motion: a spherical Earth is exact enough for a motion of some metres
+LATITUDE_RAD, LONGITUDE_RAD, HEIGHT_M, EARTH_RADIUS_M = radians(48.0), radians(11.0), 520.0, 6_371_000.0
+GNSS_UTC_NS: Final = 1_800_000_000 * NS_PER_S  # UTC at the device time 0
+GPS_WEEK: Final = 2453
 
 
 class HipnucModule:
@@ -216,7 +224,7 @@ class HipnucModule:
             return due_ns
         message, device_ms = min(self._next_ms.items(), key=lambda item: item[1])
         ready_ns = self._instant_ns(device_ms) + self.hardware.processing_ns
-        return self._wire.due_ns(ready_ns, _FRAME_BYTES[message])
+        return self._wire.due_ns(ready_ns, self._frame_bytes(message))
 
     def pins(self, now_ns: int) -> list[PinEdge]:
         """Return the edges on the output pins since the last call, in order."""
@@ -253,7 +261,7 @@ class HipnucModule:
     def _settings_changed(self, now_ns: int) -> None:
         """Schedule the messages after `now_ns` and apply the rotations of the attitude."""
         settings, device_ms = self.settings, self._device_ms(now_ns)
-        self._outputs = {OutputMessage.HI91: settings.hi91, OutputMessage.HI92: settings.hi92}
+        self._outputs: dict[OutputMessage, Output] = {one: getattr(settings, one.lower()) for one in OutputMessage}
         self._mounting = MountingRotation(self._frame, settings.level, settings.level_accel, self._yaw_rad)
         watching = settings.alarm_x.enabled or settings.alarm_y.enabled
         self._alarm_ms = (device_ms // ALARM_PERIOD_MS + 1) * ALARM_PERIOD_MS if watching else None
@@ -303,7 +311,7 @@ class HipnucModule:
     def _queue_frame(self, message: OutputMessage, sample_ns: int, device_ms: int, later_ns: int = 0) -> None:
         """Queue a frame. `later_ns` is an additional delay."""
         processing_ns = max(self.hardware.processing_ns + later_ns, 0)
-        ready_ns, size = sample_ns + processing_ns, _FRAME_BYTES[message]
+        ready_ns, size = sample_ns + processing_ns, self._frame_bytes(message)
         if ready_ns < self._quiet_until_ns or not self._wire.fits(ready_ns, size):
             self.frames_dropped += 1
             return
@@ -312,9 +320,12 @@ class HipnucModule:
         self._pins.frame(start_ns, min(SOUT_HIGH_NS, processing_ns), self.settings.sout_div, sample_ns)
         self._wire.send(ready_ns, self._encode(message, sample_ns, device_ms), sample_ns, device_ms)
 
+    def _frame_bytes(self, message: OutputMessage) -> int:
+        return FRAME_BYTES[message] if message is not OutputMessage.HI83 else 6 + hi83_size(self.hardware.hi83_bitmap)
+
     def _encode(self, message: OutputMessage, sample_ns: int, device_ms: int) -> bytes:
         reading = self._reading(sample_ns)
-        accel, gyro, mag, euler, quat, temperature_c, pressure_pa = reading
+        accel, gyro, mag, euler, quat, temperature_c, pressure_pa, *_ = reading
         device_ns = self._device_ns(sample_ns)
         if self.settings.att_mode == 1 and self.settings.mag_calibration:
             self._magnetometer.sample(device_ns, gyro)
@@ -325,6 +336,8 @@ class HipnucModule:
         if has_status:
             uptime_ms, utc = device_ms - self._on_ms, self._utc.synchronised(device_ns)
             status = main_status(reading, uptime_ms, nine_axis=self.settings.att_mode == 1, utc=utc)
+        if message in (OutputMessage.HI81, OutputMessage.HI83):
+            return self._encode_ins(message, reading._replace(mag_t=mag), device_ns, status)
         if message is OutputMessage.HI92:
             return encode_hi92(
                 pps_stamp_ms=pps_ms, accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, euler_rad=euler, quat_wxyz=quat,
@@ -335,6 +348,33 @@ class HipnucModule:
             quat_wxyz=quat, temperature_c=temperature_c, pressure_pa=pressure_pa,
             word_1_2=status if has_status else pps_ms,
         )  # fmt: skip
+
+    def _encode_ins(self, message: OutputMessage, reading: Truth, device_ns: int, status: int) -> bytes:
+        """Return an HI81 or HI83 frame. The device always has a position and UTC."""
+        east_m, north_m, up_m = reading.position_enu_m
+        radius_m = EARTH_RADIUS_M + HEIGHT_M
+        place = Position(
+            LATITUDE_RAD + north_m / radius_m, LONGITUDE_RAD + east_m / radius_m / cos(LATITUDE_RAD), HEIGHT_M + up_m,
+            RTK_FIXED, SATELLITES,
+        )  # fmt: skip
+        utc_ns = GNSS_UTC_NS + device_ns // NS_PER_MS * NS_PER_MS
+        values = Measurement(
+            0, 0, None, reading.accel_m_s2, reading.gyro_rad_s, reading.mag_t, reading.quat_wxyz, reading.euler_rad,
+            reading.temperature_c, reading.pressure_pa, velocity_enu_m_s=reading.velocity_enu_m_s, position=place,
+            heave_m=up_m, gnss_utc_ns=utc_ns,
+        )  # fmt: skip
+        status &= ~NO_UTC
+        if message is OutputMessage.HI81:
+            weeks, tow_ms = divmod(device_ns // NS_PER_MS, WEEK_MS)
+            payload = pack_hi81(
+                values, main_status=status, ins_status=NAVIGATING, week=GPS_WEEK + weeks, tow_ms=tow_ms
+            )  # fmt: skip
+        else:
+            payload = pack_hi83(
+                values, self.hardware.hi83_bitmap, main_status=status, ins_status=NAVIGATING,
+                system_time_us=device_ns // NS_PER_US,
+            )  # fmt: skip
+        return encode_frame(payload)
 
     def _reading(self, sample_ns: int) -> Truth:
         """Return the measurement at an instant with noise and mounting."""
@@ -427,8 +467,8 @@ class HipnucModule:
                 return self._level(kind, now_ns)
             case ["CONFIG", "YAW", mode, value]:
                 return self._set_yaw(mode, value, now_ns)
-            case ["LOG", "IMU91" | "HI91" | "HI92" as message, "ONMARK", "ONCE"]:
-                self._send_marked(OutputMessage.HI92 if message == OutputMessage.HI92 else OutputMessage.HI91, now_ns)
+            case ["LOG", "IMU91" | "HI91" | "HI92" | "HI81" | "HI83" as message, "ONMARK", "ONCE"]:
+                self._send_marked(OutputMessage("HI91" if message == "IMU91" else message), now_ns)
                 return []
         return None
 
@@ -493,15 +533,15 @@ def make(options: SimulatorOptions, now_ns: int) -> HipnucModule:
     baud = options.baud or next(fitting)
     if baud not in BAUD_RATES:
         raise ValueError(f"baud {baud}: expected one of {', '.join(map(str, BAUD_RATES))}")
-    output, silent = Output(period_ms), Output()
-    hi91, hi92 = (output, silent) if message is OutputMessage.HI91 else (silent, output)
+    newer = message in (OutputMessage.HI81, OutputMessage.HI83)
     hardware = HipnucHardware(
-        firmware=options.firmware or HipnucHardware().firmware,
+        firmware=options.firmware or (INS_FIRMWARE if newer else HipnucHardware().firmware),
         **sensor_of(options),
         mark_seed=options.seed,
         behaviour=options.chosen(VARIANTS),
     )
-    return HipnucModule(now_ns, ModuleSettings(baud=baud, hi91=hi91, hi92=hi92), hardware)
+    outputs: dict[str, Any] = {one.lower(): Output(period_ms if one is message else 0) for one in OutputMessage}
+    return HipnucModule(now_ns, replace(ModuleSettings(baud=baud), **outputs), hardware)
 
 
 SIMULATOR = Simulator("hipnuc-uart", "HiPNUC HI14R3 (CH0x0, CH10x, HI14) on a UART", make)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
 from math import tau
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from imud.attitude.rotation import Matrix3, euler_zyx_from_quat, is_rotation, quat_product
 from imud.drivers.hipnuc.uart.commands import BAUD_RATES
@@ -174,6 +174,8 @@ class ModuleSettings:
     mag_calibration: bool = True
     hi91: Output = Output(10)
     hi92: Output = Output()
+    hi81: Output = Output()
+    hi83: Output = Output()
     pins: tuple[int, ...] = (1, 2, 5, 6, 9)  # IO pin of PMUX1 … PMUX5
     sout_div: int = 8
     alarm_x: AlarmSetting = AlarmSetting()
@@ -195,7 +197,8 @@ class ModuleSettings:
 
     def port_lines(self) -> list[str]:
         """Return the lines of the reply to LOG COMCONFIG."""
-        return [f"BAUD: {self.baud}", f"LOG HI91 {self.hi91}", f"LOG HI92 {self.hi92}"]
+        newer = [f"LOG {name} {one}" for name, one in (("HI81", self.hi81), ("HI83", self.hi83)) if one != Output()]
+        return [f"BAUD: {self.baud}", f"LOG HI91 {self.hi91}", f"LOG HI92 {self.hi92}", *newer]
 
 
 NWU: Final = 4  # value of COORD
@@ -302,12 +305,15 @@ def _on_mark(settings: ModuleSettings, message: str, switch: str) -> ModuleSetti
 
 
 def _with_output(settings: ModuleSettings, message: str, output: Output) -> ModuleSettings:
-    return replace(settings, hi92=output) if message == "HI92" else replace(settings, hi91=output)
+    name = "hi91" if message == "IMU91" else message.lower()
+    chosen: dict[str, Any] = {name: output}
+    return replace(settings, **chosen)
 
 
 def _unlog_all(settings: ModuleSettings) -> ModuleSettings:
-    hi91, hi92 = (output if output.on_mark else Output() for output in (settings.hi91, settings.hi92))
-    return replace(settings, hi91=hi91, hi92=hi92)
+    names = ("hi91", "hi92", "hi81", "hi83")
+    off: dict[str, Any] = {name: Output() for name in names if not getattr(settings, name).on_mark}
+    return replace(settings, **off)
 
 
 # Commands that only change settings.
@@ -319,8 +325,8 @@ _CHANGES: Final[tuple[tuple[re.Pattern[str], Callable[..., ModuleSettings]], ...
     (re.compile(r"CONFIG PMUX([1-5]) IO(\S+)"), _pin),
     (re.compile(r"CONFIG PMUX4 DIV(\S+)"), _sout_div),
     (re.compile(r"CONFIG PMUX5 ([XY]),([^,]+,[^,]+,[^,]+,[^,]+)"), _alarm),
-    (re.compile(r"LOG (IMU91|HI91|HI92) ONTIME (\S+)"), _on_time),
-    (re.compile(r"LOG (IMU91|HI91|HI92) ONMARK (?!ONCE$)(\S+)"), _on_mark),
+    (re.compile(r"LOG (IMU91|HI91|HI92|HI81|HI83) ONTIME (\S+)"), _on_time),
+    (re.compile(r"LOG (IMU91|HI91|HI92|HI81|HI83) ONMARK (?!ONCE$)(\S+)"), _on_mark),
     (re.compile(r"UNLOGALL"), _unlog_all),
 )
 
@@ -341,6 +347,7 @@ class HipnucHardware(SensorHardware):
     mark_spread_ns: int = MARK_SPREAD_NS  # maximum deviation of the processing time after an edge on SIN, ns
     mark_seed: int = 1
     utc_epoch: Epoch = "unix"  # epoch of UTC in ms
+    hi83_bitmap: int = 0xD5FF  # fields of HI83: bits 0 to 8, heave, velocity, position and its quality
     uptime_ms: int = 0  # device time at the first power-on, ms, for a start near the end of the counter
     mag_bias_t: Vector3 = (0.0, 0.0, 0.0)  # result of an earlier magnetic calibration, T; zero: never calibrated
     # Magnetic field of parts that turn with the device, T. A calibration finds it.

@@ -231,6 +231,9 @@ def test_serial_data(machine: Machine) -> None:
     ]:  # fmt: skip
         machine.status = [status]
         machine.tells(HEARD, severity, words)
+    machine.status = [msgspec.structs.replace(counted(**GOOD), unused="valid frames of unknown types (tag 0x77: 3)")]
+    (severity, text), _ = machine.told(HEARD)
+    assert (severity, "does not use valid frames of unknown types (tag 0x77: 3)" in text) == ("warning", True)
 
 
 def one_way(**changes: object) -> DeviceStatus:

@@ -3,13 +3,14 @@ The simulated device replies, saves and resets settings, and rotates its axes as
 Pins of the simulated device follow the manual, sections 1.2 and 2.2.4, in step with its frames."""
 
 from itertools import pairwise
-from math import degrees, hypot, radians
+from math import cos, degrees, hypot, radians
 from typing import TypeVar
 
 import pytest
 
 from imud.attitude.rotation import matrix_from_quat
 from imud.drivers.hipnuc.uart import commands
+from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucOptions
 from imud.drivers.hipnuc.uart.commands import AlarmAxis, alarm, sout_divider
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.model.ledger import Ledger
@@ -513,3 +514,31 @@ def test_a_trigger_is_answered_125_us_later_on_average() -> None:
     bench.module.mark(bench.now_ns)
     (frame, *_) = bench.frames(405.0)
     assert frame.word_1_2 == frame.system_time_ms
+
+
+@pytest.mark.parametrize("message", ["HI81", "HI83"])
+def test_ins_messages_contain_the_true_position_and_velocity(message: str) -> None:
+    options = SimulatorOptions(rate_hz=10, message=message, noise="none", boot_ms=0)
+    module = make(options, 0)
+    bursts = [burst for burst in module.advance(3 * NS_PER_S) if burst.sample_ns is not None]
+    codec = HipnucCodec(Ledger(), HipnucOptions())
+    assert len(bursts) >= 28
+    for burst in bursts:
+        (m,) = codec.feed(burst.data)
+        assert isinstance(m, Measurement)
+        assert burst.sample_ns is not None
+        truth = module.hardware.motion.at(burst.sample_ns / NS_PER_S)
+        east_m, north_m, up_m = truth.position_enu_m
+        assert m.position is not None
+        assert m.gnss_utc_ns is not None
+        assert (m.position.quality, m.position.satellites, (m.status or 0) >> 16) == (5, 21, 3)
+        assert (m.position.latitude_rad - radians(48)) * 6_371_520 == pytest.approx(north_m, abs=0.012)
+        assert (m.position.longitude_rad - radians(11)) * 6_371_520 * cos(radians(48)) == pytest.approx(
+            east_m, abs=0.012
+        )
+        assert m.position.height_m == pytest.approx(520 + up_m, abs=0.001)
+        assert m.velocity_enu_m_s == pytest.approx(truth.velocity_enu_m_s, abs=0.0051)
+        assert m.euler_rad == pytest.approx(truth.euler_rad, abs=9e-5)
+        assert m.heave_m == (None if message == "HI81" else pytest.approx(up_m, abs=1e-6))
+        assert m.gnss_utc_ns == 1_800_000_000 * NS_PER_S + (burst.device_ms or 0) * NS_PER_MS
+        assert m.dev_ticks == (None if message == "HI81" else burst.device_ms)

@@ -53,7 +53,7 @@ def test_rates_mountings_pins_unlogall_and_reports() -> None:
         for rate_hz in (0, *RATES_HZ):
             settings = changed(FACTORY, commands.log_ontime(message, rate_hz).name, 156)
             assert settings
-            output = settings.hi92 if message is OutputMessage.HI92 else settings.hi91
+            output = getattr(settings, message.lower())
             assert output.period_ms == (1000 // rate_hz if rate_hz else 0)
     for baud in BAUD_RATES:
         settings = changed(FACTORY, commands.serial_config(baud).name, 156)

@@ -6,7 +6,8 @@
     +----+----+-------+-----+-----------------+
 
 `crc` is CRC-16/XMODEM over bytes 0…3 and the payload. The payload is a sequence of sub-packets; the tag byte defines
-the size: 0x91 (HI91, floats, 76 bytes), 0x92 (HI92, integers, 48 bytes). Lines of text, the replies to commands
+the size: 0x91 (HI91, floats, 76 bytes), 0x92 (HI92, integers, 48 bytes), and of newer firmware 0x81 (HI81, 104 bytes)
+and 0x83 (HI83, its bitmap defines the size; see `ins.py`). Lines of text, the replies to commands
 (`commands.py`), are between the frames and may be split by frames (`replies.py`).
 
 If the check of a frame fails, the codec skips only its sync word, because a valid frame may start inside the false
@@ -39,6 +40,7 @@ from imud.drivers.hipnuc.common import (
     pressure_of,
     temperature_beside,
 )
+from imud.drivers.hipnuc.uart.ins import HI81, TAG_HI81, TAG_HI83, decode_hi81, decode_hi83, hi83_bytes
 from imud.drivers.hipnuc.uart.replies import LINE_CHARACTERS_MAX, LineFinder
 from imud.drivers.value_limits import (
     ACCEL_LIMIT_G,
@@ -153,20 +155,15 @@ def _decode_hi92(data: bytes, at: int, _word_is_status: bool, size: int, trailin
 class Packet:
     """Kind of sub-packet."""
 
-    kernel_format: KernelFormat
-    size: int  # size with tag, bytes
+    kernel_format: KernelFormat | None  # None: the kernel does not decode it
+    size: int  # size with tag, bytes; 0 for HI83, see `hi83_bytes`
     # `decode(data, at, word_is_status, size, trailing)` returns the measurement and whether all values are finite
     decode: Callable[[bytes, int, bool, int, int], tuple[Measurement, bool]]
 
 
-# Tags of newer firmware that imud does not decode
-UNKNOWN_TAGS: Final = {0x81: "HI81", 0x83: "HI83"}
-
-
 def tag_name(tag: int) -> str:
-    """Return the name of an unknown tag, for example `HI83 (tag 0x83)`."""
-    name = UNKNOWN_TAGS.get(tag)
-    return f"{name} (tag {tag:#04x})" if name else f"tag {tag:#04x}"
+    """Return the name of an unknown tag, for example `tag 0x05`."""
+    return f"tag {tag:#04x}"
 
 
 SYNC: Final = b"\x5a\xa5"
@@ -178,9 +175,12 @@ def _format(name: str, size: int) -> KernelFormat:
     return KernelFormat(name, SYNC + size.to_bytes(2, "little"), HEADER.size + size)
 
 
+HI91_FORMAT: Final = _format("HI91", HI91.size)
 PACKETS: Final = {
-    TAG_HI91: Packet(_format("HI91", HI91.size), HI91.size, _decode_hi91),
+    TAG_HI91: Packet(HI91_FORMAT, HI91.size, _decode_hi91),
     TAG_HI92: Packet(_format("HI92", HI92.size), HI92.size, _decode_hi92),
+    TAG_HI81: Packet(None, HI81.size, decode_hi81),
+    TAG_HI83: Packet(None, 0, decode_hi83),
 }
 
 
@@ -292,7 +292,7 @@ class HipnucCodec(KernelFrames):
         super().__init__(ledger)
         self.unknown: dict[int, int] = {}  # number of sub-packets by unknown tag
         self.word_is_status = settings.hi91_word == "status"  # whether bytes 1-2 of HI91 are status bits
-        self.kernel_format = PACKETS[TAG_HI91].kernel_format  # of the newest frame
+        self.kernel_format = HI91_FORMAT  # of the newest frame that the kernel can decode
         self._word_is_fixed = settings.hi91_word != "auto"
         self._lines = LineFinder(ledger)
         self._bad_ahead = 0  # rest of a damaged frame by its length field, in bytes from the start of the tail
@@ -371,7 +371,7 @@ class HipnucCodec(KernelFrames):
                 ledger.unknown_tags += 1
                 count_unknown(self.unknown, data[begin])
                 break
-            decode, after = packet.decode, begin + packet.size
+            decode, after = packet.decode, begin + (packet.size or hi83_bytes(data, begin, end))
             if after > end:
                 ledger.frames_bad_content += 1
                 ledger.bytes_in_bad_frames += end - at
@@ -379,10 +379,11 @@ class HipnucCodec(KernelFrames):
                 return end
             measurement, is_finite = decode(data, begin, self.word_is_status, end - at, total - end)
             finite = finite and is_finite
+            self.kernel_format = packet.kernel_format or self.kernel_format
             events.append(measurement)
-            self.kernel_format = packet.kernel_format
             begin = after
-        ledger.bytes_in_good_frames += end - at
+        ledger.bytes_in_good_frames += begin - at
+        ledger.bytes_skipped += end - begin  # an unknown tag and the bytes after it
         ledger.frames_good += 1
         if len(events) > first:
             ledger.frames_in_samples += 1

@@ -64,15 +64,21 @@ ROTATION_TOLERANCE: Final = 1e-3  # tolerance of a rotation matrix of nine numbe
 class OutputMessage(StrEnum):
     HI91 = "HI91"  # floats, with device time; also called `IMU91`
     HI92 = "HI92"  # integers, without device time
+    HI81 = "HI81"  # INS devices with newer firmware: integers, with position
+    HI83 = "HI83"  # newer firmware: the fields of a bitmap, for which no source contains a command
 
 
-# Maximum output rate by baud rate (table 3.7)
+# Maximum output rate by baud rate (table 3.7; for HI81 and HI83 only the share of the baud rate limits the rate)
 MAX_RATE_HZ: Final = {
     OutputMessage.HI91: {9600: 10, 115200: 100, 230400: 250, 256000: 250, 460800: 500, 921600: 1000},
     OutputMessage.HI92: {9600: 10, 115200: 200, 230400: 250, 256000: 250, 460800: 500, 921600: 1000},
+    OutputMessage.HI81: dict.fromkeys((9600, 115200, 230400, 256000, 460800, 921600), 1000),
+    OutputMessage.HI83: dict.fromkeys((9600, 115200, 230400, 256000, 460800, 921600), 1000),
 }
-# Size of a frame with its header, bytes (sections 3.1, 3.3)
-FRAME_BYTES: Final = {OutputMessage.HI91: 6 + 76, OutputMessage.HI92: 6 + 48}
+# Size of a frame with its header, bytes (sections 3.1, 3.3); of HI83 the minimum
+FRAME_BYTES: Final = {
+    OutputMessage.HI91: 6 + 76, OutputMessage.HI92: 6 + 48, OutputMessage.HI81: 6 + 104, OutputMessage.HI83: 6 + 8,
+}  # fmt: skip
 
 
 class YawMode(Enum):

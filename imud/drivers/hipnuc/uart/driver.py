@@ -59,6 +59,7 @@ from imud.drivers.hipnuc.uart.commands import (
     send,
     wake,
 )
+from imud.drivers.hipnuc.uart.ins import FIELDS, WEEK_MS, pack_hi81, pack_hi83
 from imud.drivers.hipnuc.uart.replies import numbers_of, parse_report
 from imud.drivers.hipnuc.uart.settings import (
     RFU_312,
@@ -72,6 +73,7 @@ from imud.drivers.hipnuc.uart.settings import (
     why_silent,
 )
 from imud.model.errors import NoReply
+from imud.model.sample import Measurement, Position
 from imud.model.units import NS_PER_MS
 
 Message = Annotated[OutputMessage, Meta(extra={"section": "2.2.5"})]
@@ -232,7 +234,7 @@ CALIBRATIONS: Final[Calibrations] = {
 
 
 def _example_frame(random: Random) -> bytes:
-    """Return HI91 or HI92 with random values; one frame in four contains both."""
+    """Return HI91, HI92, both, HI81 or HI83 with random values."""
     quat = random_quaternion(random)
     common: Mapping[str, Any] = {
         "accel_m_s2": (random.gauss(0, 5), random.gauss(0, 5), random.gauss(9.8, 5)),
@@ -247,7 +249,19 @@ def _example_frame(random: Random) -> bytes:
     floats = encode_hi91(system_time_ms=random.randrange(2**32), word_1_2=word, **common)
     integers = encode_hi92(pps_stamp_ms=word, status=random.randrange(2**16), **common)
     both = encode_frame(floats[HEADER.size :] + integers[HEADER.size :])
-    return random.choice((floats, floats, integers, both))
+    place = Position(
+        random.uniform(-1.5, 1.5), random.uniform(-3, 3), random.uniform(-400, 9000), random.randrange(6),
+        random.randrange(60),
+    )  # fmt: skip
+    moving = Measurement(
+        0, 0, None, **common, velocity_enu_m_s=random_vector(random, 10), position=place, heave_m=random.gauss(0, 1),
+        gnss_utc_ns=random.randrange(1_600_000_000_000, 1_900_000_000_000) * NS_PER_MS,
+    )  # fmt: skip
+    week, tow_ms = random.randrange(1, 4000), random.randrange(WEEK_MS)
+    hi81 = encode_frame(pack_hi81(moving, ins_status=3, week=week, tow_ms=tow_ms))
+    bitmap = sum(1 << bit for bit in random.sample(sorted(FIELDS), 5))  # at most 134 bytes, as HI91 and HI92 together
+    hi83 = encode_frame(pack_hi83(moving, bitmap, ins_status=3, system_time_us=random.getrandbits(48)))
+    return random.choice((floats, floats, integers, both, hi81, hi83))
 
 
 def _apply_identity(codec: StreamCodec, identity: Identity) -> None:
@@ -288,5 +302,5 @@ DRIVER: Final = StreamDriver(
     why_silent=why_silent,
     example_frame=_example_frame,
     unknown_name=tag_name,
-    decoded="imud decodes HI91 and HI92: select one with `imud settings NAME --set output.hi91=100`",
+    decoded="imud decodes HI91, HI92, HI81 and HI83: select one with `imud settings NAME --set output.hi91=100`",
 )

@@ -23,8 +23,8 @@ from imud.model.ledger import Ledger
 _VERSION_LINE: Final = re.compile(r"\s*(?:PNAME|BUILD|UUID|APP_VER|BL_VER)\s*[=:].*")
 _VALUE_LINE: Final = re.compile(r"\s*([A-Za-z][A-Za-z0-9_.\-]*)\s*[=:]\s*(.*?)\s*")
 _COMMENT: Final = re.compile(r"\s*/\*.*?(\*/|$)")
-_OUTPUT: Final = re.compile(r"\b(?:IMU|HI)(91|92)\s+(?:COM\d+\s+)?ONTIME\s+(\d+(?:\.\d*)?|\.\d+)")
-_MARKED: Final = re.compile(r"\b(?:IMU|HI)(91|92)\s+(?:COM\d+\s+)?ONMARK\s+1\b")
+_OUTPUT: Final = re.compile(r"\b(?:IMU|HI)(91|92|81|83)\s+(?:COM\d+\s+)?ONTIME\s+(\d+(?:\.\d*)?|\.\d+)")
+_MARKED: Final = re.compile(r"\b(?:IMU|HI)(91|92|81|83)\s+(?:COM\d+\s+)?ONMARK\s+1\b")
 
 
 def is_end(message: Message) -> bool:
@@ -73,7 +73,7 @@ class Version:
 class PeriodicOutputs(NamedTuple):
     """Outputs in a reply to LOG COMCONFIG. Its form is not documented: imud looks for the form of the command."""
 
-    periods_s: Mapping[str, float]  # output periods by message (`HI91`, `HI92`); 0 is off
+    periods_s: Mapping[str, float]  # output periods by message (`OutputMessage`); 0 is off
     on_mark: frozenset[str]  # messages for each pulse on SIN
 
 

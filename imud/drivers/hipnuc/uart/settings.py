@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain
 from math import isclose
-from typing import Annotated, Any, Final, Literal, get_args
+from typing import Annotated, Any, Final, Literal
 
 import msgspec
 from msgspec import Meta
@@ -99,7 +99,8 @@ def alarm_ranges(settings: Mapping[str, Any]) -> AlarmRanges:
 
 
 ON_MARK: Final = "on_mark"
-MessageName = Literal["hi91", "hi92"]
+MessageName = Literal["hi91", "hi92", "hi81", "hi83"]
+MANUAL_MESSAGES: Final = frozenset({"hi91", "hi92"})  # messages of every device; the others need newer firmware
 Output = dict[MessageName, OutputRate | Literal["on_mark"]]
 Modes = Literal["6-axis", "9-axis"]
 MODES: Final[Mapping[int | None, Modes]] = {0: "6-axis", 1: "9-axis"}  # by the value of ATT_MODE
@@ -223,7 +224,7 @@ def _read(_target: Target, names: Collection[str] | None) -> RequestScript[Repor
 
 def _output(_target: Target, value: Output) -> RequestScript[None]:
     """Set each named message. `check` compares the load with the baud rate, which imud sets later."""
-    if value.keys() == set(get_args(MessageName)) and not any(value.values()):
+    if value.keys() >= MANUAL_MESSAGES and not any(value.values()):
         yield from send(commands.unlog_all())  # also messages that imud does not decode
     for name, rate in value.items():
         message = OutputMessage(name.upper())
@@ -289,6 +290,11 @@ def _has_all(declared: Mapping[str, Any], actual: Mapping[str, Any]) -> bool:
     """Return whether the actual values contain all declared values."""
     plain = msgspec.to_builtins(actual)
     return all(plain.get(name) == value for name, value in msgspec.to_builtins(declared).items())
+
+
+def _has_outputs(declared: Output, actual: Output) -> bool:
+    """Return whether all declared messages have their rate. HI81 or HI83 is off if the device does not report it."""
+    return all(actual.get(name, None if name in MANUAL_MESSAGES else 0) == rate for name, rate in declared.items())
 
 
 def _same_mounting(declared: MountingName | list[float], actual: MountingName | list[float]) -> bool:
@@ -384,7 +390,7 @@ SETTINGS: Final = SettingsTable(
             ),
             write=_output,
             report=Query.COMCONFIG,
-            agrees=_has_all,
+            agrees=_has_outputs,
         ),
         "output_enabled": Setting(
             type=_described(bool, "whether the device sends frames of any rate", "2.2.5"),
@@ -429,7 +435,7 @@ FUNCTIONS: Final = {"sin": "sin", "pps": "sin", "sout": "sout", "sout_div": "sou
 def declared_line_differences(values: Mapping[str, Any], lines: DeviceLines) -> dict[str, str]:
     """Return contradictions of GPIO lines and declared settings. A partial declaration is not compared."""
     known = dict(values)
-    if set(known.get("output") or ()) != set(get_args(MessageName)):
+    if not set(known.get("output") or ()) >= MANUAL_MESSAGES:
         known.pop("output", None)
     known.pop("alarm", None)
     return line_differences(known, lines)

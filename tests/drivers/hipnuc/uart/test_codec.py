@@ -307,10 +307,6 @@ def test_no_barometer_no_pressure(
         assert (event.temperature_c, event.pressure_pa) == expected
 
 
-def test_names_of_tags() -> None:
-    assert [uart_codec.tag_name(tag) for tag in (0x83, 0x05)] == ["HI83 (tag 0x83)", "tag 0x05"]
-
-
 def texts(data: bytes) -> list[str]:
     return [event.text for event in make().feed(data) if isinstance(event, TextLine)]
 

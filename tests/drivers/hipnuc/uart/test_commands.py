@@ -492,7 +492,7 @@ HALF_TURN = "a number from -180 to 180"
     [
         ("output", {"message": "HI91", "rate_hz": 500}, "expected at most 100 Hz"),  # too much for 115200 baud
         ("output", {"message": "HI91", "rate_hz": 300}, RATES),
-        ("output", {"message": "HI93", "rate_hz": 1}, "known: hi91, hi92"),
+        ("output", {"message": "HI93", "rate_hz": 1}, "known: hi81, hi83, hi91, hi92"),
         ("output_on_mark", {"message": None}, "imud settings bow --set output.MESSAGE=on_mark"),
         ("output_once", {"message": None}, 'one of "HI91", "HI92"'), ("mode", {"axes": 7}, 'one of "6-axis", "9-axis"'),
         ("level", {"level": None}, '"automatic", "cancel", "relative"'),
