@@ -28,6 +28,7 @@ from imud.drivers.imu61x.registers import BURST_CTRL
 from imud.drivers.imu61x.uart.codec import (
     AHRS_FRAME_BYTES,
     HOST_SYNC,
+    MAG_FRAME_BYTES,
     PARAMETERS,
     Frame,
     FrameFinder,
@@ -192,6 +193,7 @@ class Imu61xHardware(SensorHardware):
     """A device, and its behavior where the manual defines nothing."""
 
     status: Status = STATUS
+    has_magnetometer: bool = False  # whether AHRS frames have 56 bytes
     uptime_us: int = 0  # timer at the first power-on, µs, for a start near the end of its range
     behaviour: Imu61xBehaviour = field(default_factory=Imu61xBehaviour)
 
@@ -248,7 +250,7 @@ class Imu61xModule:
         if self._next_us is None:
             return self._restart_ns
         ready_ns = self._instant_ns(self._next_us) + self.hardware.processing_ns
-        return self._wire.due_ns(ready_ns, AHRS_FRAME_BYTES)
+        return self._wire.due_ns(ready_ns, self._frame_bytes)
 
     def counters(self) -> dict[str, int]:
         """Return the numbers of sent and dropped frames."""
@@ -307,7 +309,7 @@ class Imu61xModule:
         if self._new_baud_ns is not None or self._restart_ns is not None or sample_ns < self._busy_ns:
             self.frames_dropped += 1  # a new baud rate is pending, or the device is busy
             return
-        if not self._wire.fits(ready_ns, AHRS_FRAME_BYTES):
+        if not self._wire.fits(ready_ns, self._frame_bytes):
             self.frames_dropped += 1
             return
         self.frames_sent += 1
@@ -324,7 +326,12 @@ class Imu61xModule:
             gyro_rad_s=(x - off_x, y - off_y, z - off_z),
             euler_rad=(roll, pitch, remainder(yaw + self._heading_rad, 2 * pi)),
             temperature_c=reading.temperature_c,
+            mag_t=reading.mag_t if self.hardware.has_magnetometer else None,
         )
+
+    @property
+    def _frame_bytes(self) -> int:
+        return MAG_FRAME_BYTES if self.hardware.has_magnetometer else AHRS_FRAME_BYTES
 
     def _reading(self, sample_ns: int) -> Truth:
         """Return the measurement at an instant with noise."""
@@ -464,8 +471,8 @@ def make(options: SimulatorOptions, now_ns: int) -> Imu61xModule:
     """Return a device for the options. Raises ValueError for an unsupported option."""
     if options.rate_hz not in RATES_HZ:
         raise ValueError(f"rate {options.rate_hz:g} Hz: expected one of {', '.join(map(str, RATES_HZ))}")
-    if options.message.upper() not in ("", "AHRS"):
-        raise ValueError(f"message {options.message!r}: expected AHRS")
+    if options.message.upper() not in ("", "AHRS", "AHRS9"):
+        raise ValueError(f"message {options.message!r}: expected AHRS, or AHRS9 with the magnetic field")
     rate_hz = int(options.rate_hz)
     baud = options.baud or next(baud for baud in sorted(BAUD_RATES) if max_rate_hz(baud) >= rate_hz)
     if baud not in BAUD_RATES:
@@ -473,6 +480,7 @@ def make(options: SimulatorOptions, now_ns: int) -> Imu61xModule:
     hardware = Imu61xHardware(
         status=replace(STATUS, software_version=options.firmware or STATUS.software_version),
         **sensor_of(options),
+        has_magnetometer=options.message.upper() == "AHRS9",
         behaviour=options.chosen(VARIANTS),
     )
     return Imu61xModule(now_ns, Imu61xSettings(baud=baud, rate_hz=rate_hz), hardware)

@@ -12,6 +12,7 @@ from imud.contracts.script import Reply, ReplyFrame, Request
 from imud.drivers.imu61x.uart import codec
 from imud.drivers.imu61x.uart import commands as c
 from imud.drivers.imu61x.uart.codec import Acknowledgement, Parameter, parse_acknowledgement
+from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_S
 from imud.sim import SIMULATORS
@@ -263,3 +264,16 @@ def test_the_row_makes_it_from_common_options_and_refuses_others() -> None:
     ):  # fmt: skip
         with pytest.raises(ValueError, match=named):
             make(options, BEGIN_NS)
+
+
+def test_ahrs_frames_of_newer_models_contain_the_true_magnetic_field() -> None:
+    module = make(SimulatorOptions(message="ahrs9", rate_hz=100, noise="none", boot_ms=0), BEGIN_NS)
+    decoder = codec.Imu61xCodec(Ledger())
+    bursts = [burst for burst in module.advance(BEGIN_NS + NS_PER_S // 2) if burst.sample_ns is not None]
+    assert len(bursts) >= 45
+    for burst in bursts:
+        (m,) = decoder.feed(burst.data)
+        assert isinstance(m, Measurement)
+        assert burst.sample_ns is not None
+        truth = module.hardware.motion.at((burst.sample_ns - BEGIN_NS) / NS_PER_S)
+        assert (m.size_bytes, m.mag_t) == (66, pytest.approx(truth.mag_t, rel=1e-6))

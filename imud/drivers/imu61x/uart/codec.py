@@ -2,17 +2,21 @@
 
     AHRS, id 0x0002, 44 bytes   timer µs u32 | pitch | roll | yaw ° | accel 3 g | gyro 3 °/s | temperature °C, all f32
 
-The device sends pitch before roll. imud computes the quaternion from the angles. The manual does not define their
-convention; imud assumes `common.EULER_CONVENTION`. The timer counts µs and wraps after 71.6 minutes.
+    of newer models, 56 bytes   … | magnetic field 3, f32
+
+The manual does not contain the longer frame (source: the vendor's public ROS drivers). No source states the unit of the
+field; imud assumes µT (option `mag_unit`). The device sends pitch before roll. imud computes the quaternion from the
+angles. The manual does not define their convention; imud assumes `common.EULER_CONVENTION`. The timer counts µs and
+wraps after 71.6 minutes.
 
 The kernel (`imud/_kernel.c`) decodes usual AHRS frames in less CPU time. `make bench-instructions` measures the cost.
 """
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Literal
 from zlib import crc32 as inverted_crc32
 
 import msgspec
@@ -24,6 +28,7 @@ from imud.drivers.imu61x.common import CRC_INVERSION, CRC_START, M_S2_PER_G, RAD
 from imud.drivers.value_limits import (
     ACCEL_LIMIT_G,
     GYRO_LIMIT_DEG_S,
+    MAG_LIMIT_UT,
     TURN_DEG,
     possible_temperature_c,
     scaled,
@@ -32,7 +37,7 @@ from imud.formats.kernel import KernelFormat, KernelFrames
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
-from imud.model.units import RAD_PER_DEG
+from imud.model.units import RAD_PER_DEG, T_PER_UT
 
 DEVICE_SYNC: Final = b"\xaa\x55"  # start of a frame from the device
 HOST_SYNC: Final = b"\x55\xaa"  # start of a frame from the host
@@ -50,6 +55,10 @@ AHRS: Final = struct.Struct("<I10f")
 AHRS_BYTES: Final = AHRS.size
 AHRS_FRAME: Final = 0x0002
 AHRS_FRAME_BYTES: Final = OVERHEAD_BYTES + AHRS_BYTES
+MAG: Final = struct.Struct("<3f")  # after AHRS
+MAG_FRAME_BYTES: Final = AHRS_FRAME_BYTES + MAG.size
+MagUnit = Literal["ut", "mgauss"]
+T_PER_UNIT: Final[Mapping[MagUnit, float]] = {"ut": T_PER_UT, "mgauss": T_PER_UT / 10}
 
 
 class Frame(msgspec.Struct, frozen=True, gc=False):
@@ -338,8 +347,9 @@ class Imu61xCodec:
     kernel_format: ClassVar = FrameFinder.kernel_format
     word_is_status: ClassVar = False
 
-    def __init__(self, ledger: Ledger, _settings: Options | None = None) -> None:
+    def __init__(self, ledger: Ledger, settings: Options | None = None) -> None:
         self.ledger = ledger
+        self._mag_factor = T_PER_UNIT[getattr(settings, "mag_unit", "ut")]
         self.unknown: dict[int, int] = {}  # number of frames by unknown identifier
         self._finder = FrameFinder(ledger, DEVICE_SYNC)
 
@@ -400,14 +410,26 @@ class Imu61xCodec:
         gyro = scaled((gx, gy, gz), RAD_S_PER_DEG_S, GYRO_LIMIT_DEG_S)
         euler = scaled((roll, pitch, yaw), RAD_PER_DEG, TURN_DEG)
         temperature_c = possible_temperature_c(temperature)
-        if accel is None or gyro is None or euler is None or temperature_c is None:
+        mag, is_field = self._field(raw) if len(raw) == MAG_FRAME_BYTES else (None, True)
+        if accel is None or gyro is None or euler is None or temperature_c is None or not is_field:
             self.ledger.frames_not_finite += 1
             events.append(BadFrame(BadReason.NOT_FINITE, raw))
         quat = None if euler is None else quat_from_euler_zyx(euler)
-        events.append(Measurement(len(raw), frame.trailing_bytes, us, accel, gyro, None, quat, euler, temperature_c))
+        events.append(Measurement(len(raw), frame.trailing_bytes, us, accel, gyro, mag, quat, euler, temperature_c))
+
+    def _field(self, raw: bytes) -> tuple[Vector3 | None, bool]:
+        """Return the magnetic field, T, and whether it is possible. A device without magnetometer sends zeros."""
+        sent = MAG.unpack_from(raw, HEADER_BYTES + AHRS_BYTES)
+        if not any(sent):
+            return None, True
+        factor = self._mag_factor
+        mag = scaled(sent, factor, MAG_LIMIT_UT * T_PER_UT / factor)
+        return mag, mag is not None
 
 
-UNKNOWN_FRAMES: Final = {0x0166: "navigation", 0x0666: "raw data"}  # frames of other models
+# Frames of other models, without a layout in the manual. The vendor's public sources also use 0x0666 for the angle of a
+# front wheel, so that imud cannot decode it as accelerations and angular rates.
+UNKNOWN_FRAMES: Final = {0x0166: "navigation", 0x0666: "raw data"}
 
 
 def frame_name(frame_id: int) -> str:
@@ -425,9 +447,16 @@ K1_FRAME: Final = 0x000C  # id of K1 from the simulator; no document states it, 
 
 
 def encode_ahrs(
-    *, timer_us: int, accel_m_s2: Vector3, gyro_rad_s: Vector3, euler_rad: Vector3, temperature_c: float
+    *,
+    timer_us: int,
+    accel_m_s2: Vector3,
+    gyro_rad_s: Vector3,
+    euler_rad: Vector3,
+    temperature_c: float,
+    mag_t: Vector3 | None = None,
 ) -> bytes:
-    """Return a complete AHRS frame from SI values. `euler_rad` is roll, pitch, yaw. Raises OverflowError beyond f32."""
+    """Return a complete AHRS frame from SI values, of 56 bytes with `mag_t`. `euler_rad` is roll, pitch, yaw. Raises
+    OverflowError beyond f32."""
     roll, pitch, yaw = euler_rad
     payload = AHRS.pack(
         timer_us % TIMER_MODULUS,
@@ -436,7 +465,8 @@ def encode_ahrs(
         *(w / RAD_S_PER_DEG_S for w in gyro_rad_s),
         temperature_c,
     )
-    return encode_frame(DEVICE_SYNC, AHRS_FRAME, payload)
+    field = b"" if mag_t is None else MAG.pack(*(tesla / T_PER_UT for tesla in mag_t))
+    return encode_frame(DEVICE_SYNC, AHRS_FRAME, payload + field)
 
 
 def encode_status(status: Status) -> bytes:

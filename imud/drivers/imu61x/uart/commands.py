@@ -22,6 +22,7 @@ from imud.drivers.imu61x.uart.codec import (
     AHRS_FRAME_BYTES,
     HOST_SYNC,
     RESULT_DONE,
+    MagUnit,
     Parameter,
     Status,
     encode_frame,
@@ -277,8 +278,10 @@ STREAM: Final = output_mode(OutputMode.STREAM).payload
 
 
 class Imu61xUartOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of an IMU61x on a UART: a code that the manual does not state."""
+    """Options of an IMU61x on a UART: a unit and a code that the manual does not state."""
 
+    mag_unit: MagUnit = "ut"
+    """Unit of the magnetic field in AHRS frames of 56 bytes, µT or mG. No source states it."""
     result_done: Annotated[int, Meta(ge=0, le=0xFFFF)] = RESULT_DONE
     """Result in acknowledgements (K1) of an executed command; 0 is assumed."""
 

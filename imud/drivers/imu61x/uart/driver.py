@@ -328,6 +328,7 @@ def _example_frame(random: Random) -> bytes:
         gyro_rad_s=random_vector(random, 2),
         euler_rad=(random.uniform(-3, 3), random.uniform(-1.5, 1.5), random.uniform(-3, 3)),
         temperature_c=random.uniform(-40, 85),
+        mag_t=random.choice((None, random_vector(random, 5e-5))),
     )
 
 

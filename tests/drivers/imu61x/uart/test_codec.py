@@ -11,6 +11,7 @@ from imud.contracts.codec import BadFrame, BadReason, CodecEvent
 from imud.contracts.script import ReplyFrame
 from imud.drivers.imu61x.common import crc32
 from imud.drivers.imu61x.uart import codec as uart_codec
+from imud.drivers.imu61x.uart.commands import Imu61xUartOptions
 from imud.drivers.imu61x.uart.driver import DRIVER
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
@@ -174,7 +175,8 @@ def test_frames_of_other_kinds_and_lengths() -> None:
         assert (tested.ledger.frames_ignored, tested.ledger.frames_good, tested.unknown) == (1, 1, {0x0123: 1})
         assert tested.ledger.bytes_in_good_frames == 10 + size
         assert tested.ledger.closes()
-    assert [*map(uart_codec.frame_name, (0x0666, 0x0123))] == ["raw data (identifier 0x0666)", "identifier 0x0123"]
+    names = ["raw data (identifier 0x0666)", "navigation (identifier 0x0166)", "identifier 0x0123"]
+    assert [*map(uart_codec.frame_name, (0x0666, 0x0166, 0x0123))] == names
 
     longer = uart_codec.encode_frame(uart_codec.DEVICE_SYNC, uart_codec.AHRS_FRAME, GOLDEN[6:-4] + bytes(8))
     measurement = only(codec().feed(longer))
@@ -187,6 +189,36 @@ def test_frames_of_other_kinds_and_lengths() -> None:
     for size in (0, uart_codec.PAYLOAD_BYTES_MAX + 1):
         with pytest.raises(ValueError, match="payload"):
             uart_codec.encode_frame(uart_codec.DEVICE_SYNC, 1, bytes(size))
+
+
+@pytest.mark.parametrize("split", [1, 7, 1000])
+def test_frame_of_56_bytes_contains_the_magnetic_field(split: int) -> None:
+    whole = with_crc(AHRS_HEX.replace("0200 2C00", "0200 3800") + "00004842 0000A0C1 0000003F")  # 50, -20, 0.5 µT
+    tested, stream = codec(), whole + GOLDEN + whole
+    events = [event for at in range(0, len(stream), split) for event in tested.feed(stream[at : at + split])]
+    first, short, last = events
+    assert isinstance(first, Measurement)
+    assert isinstance(short, Measurement)
+    assert isinstance(last, Measurement)
+    assert first.mag_t == last.mag_t == pytest.approx((50e-6, -20e-6, 0.5e-6), rel=1e-12)
+    assert (first.size_bytes, first.temperature_c, short.mag_t) == (66, 36.5, None)
+    assert first.accel_m_s2 == short.accel_m_s2
+    assert (tested.ledger.frames_in_samples, tested.ledger.closes()) == (3, True)
+    assert uart_codec.encode_ahrs(
+        timer_us=0x12345678, accel_m_s2=first.accel_m_s2 or (0, 0, 0), gyro_rad_s=first.gyro_rad_s or (0, 0, 0),
+        euler_rad=first.euler_rad or (0, 0, 0), temperature_c=36.5, mag_t=(50e-6, -20e-6, 0.5e-6),
+    ) == whole  # fmt: skip
+    in_mgauss = uart_codec.Imu61xCodec(Ledger(), Imu61xUartOptions(mag_unit="mgauss"))
+    assert only(in_mgauss.feed(whole)).mag_t == pytest.approx((5e-6, -2e-6, 0.05e-6), rel=1e-12)
+    assert only(codec().feed(with_crc(AHRS_HEX.replace("2C00", "3800") + "00" * 12))).mag_t is None
+    for bad in ("0000C07F", "0000807F", "00008045"):  # NaN, infinity, 4096 µT
+        frame = with_crc(AHRS_HEX.replace("2C00", "3800") + "00004842" + bad + "0000003F")
+        tested = codec()
+        reason, measurement = tested.feed(frame)
+        assert reason == BadFrame(BadReason.NOT_FINITE, frame)
+        assert isinstance(measurement, Measurement)
+        assert (measurement.mag_t, measurement.temperature_c) == (None, 36.5)
+        assert (tested.ledger.frames_not_finite, tested.ledger.closes()) == (1, True)
 
 
 def test_frames_inside_damaged_ones_and_false_lengths() -> None:
