@@ -1,12 +1,14 @@
 """Status of a device as rows of name and text, for `imud status` and the page of `imud web`."""
 
 from collections.abc import Iterator
+from math import degrees
 
 from imud.attitude.conventions import Heading
 from imud.contracts.setting import SettingsState, SettingsStatus
 from imud.contracts.status import DeviceStatus, FrameStatus, LinesStatus, PollingStatus, SerialLineCounters, UtcStatus
 from imud.model.ledger import LEDGER_FIELDS, bytes_open, frames_open, lost
 from imud.model.options import shown
+from imud.model.sample import Position
 from imud.model.units import NS_PER_MS, NS_PER_US
 
 
@@ -68,8 +70,8 @@ def parts(status: DeviceStatus) -> Iterator[tuple[str, str]]:
         yield "settings", declared(status.declared)
     if status.declared is not None and status.declared.unsaved:
         yield "unsaved", f"a change is not saved: run `imud command {status.name} save`"
-    if status.unused:
-        yield "unused", status.unused
+    optional = (("unused", status.unused), ("position", position(status.position) if status.position else ""))
+    yield from ((name, words) for name, words in optional if words)
     if status.status_bit_names and status.status_bits is not None:
         yield "status", ", ".join(status.status_words) or "no known bit is set"
     if status.settings:
@@ -94,6 +96,16 @@ def parts(status: DeviceStatus) -> Iterator[tuple[str, str]]:
         yield from ((name, status.lines.problems[name]) for name in sorted(others))
     if status.utc is not None:
         yield "utc", utc(status.utc)
+
+
+def position(place: Position) -> str:
+    """Format a position."""
+    words = [f"{degrees(place.latitude_rad):.7f}°, {degrees(place.longitude_rad):.7f}°"]
+    if place.height_m is not None:
+        words.append(f"{place.height_m:.2f} m")
+    for name, value in (("quality", place.quality), ("satellites", place.satellites)):
+        words += [] if value is None else [f"{name} {value}"]
+    return ", ".join(words)
 
 
 def declared(settings: SettingsStatus) -> str:

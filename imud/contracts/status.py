@@ -12,7 +12,7 @@ from imud.contracts.command import CalibrationStatus
 from imud.contracts.condition import Condition, DeviceCondition, Reason, duration
 from imud.contracts.setting import SettingsStatus
 from imud.model.options import Options
-from imud.model.sample import Sync
+from imud.model.sample import Position, Sync
 
 Sigma = Annotated[float, Meta(gt=0)] | None
 
@@ -270,6 +270,7 @@ class DeviceStatus(msgspec.Struct, frozen=True):
     recent: RecentStatus | None = None  # counts of the last minute; null for a device of a recording
     calibration: CalibrationStatus | None = None  # running calibration; null if none is running
     work: WorkStatus | None = None  # running work that uses the device alone; null without work
+    position: Position | None = None  # of the newest sample; null without a position
     unused: str = ""  # received frames that imud cannot decode: wrong length or unknown type; empty without such frames
     # Worst condition in each of the last 60 minutes, the oldest first; null for a minute before the start of imud
     history: tuple[Condition | None, ...] = ()

@@ -539,6 +539,7 @@ class Device:
             hold_by=self._need.who,
             temperature_c=newest.temperature_c if newest else None,
             status_bits=newest.status if newest else None,
+            position=newest.position if newest else None,
             status_words=status_words(driver.status_bits, newest.status) if driver and newest else (),
             status_bit_names={str(number): bit.name for number, bit in driver.status_bits.items()} if driver else {},
             connects=self._connects,

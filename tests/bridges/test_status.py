@@ -1,11 +1,13 @@
 """Status of a device as rows of name and text."""
 
+import pytest
 from msgspec.structs import replace
 
 from imud.attitude.conventions import Heading
 from imud.bridges.status import axes, declared, driven, parts, rows, utc, watched
 from imud.contracts.setting import OnDifference, SettingDifference, SettingsState, SettingsStatus
 from imud.contracts.status import FrameStatus, LinesStatus, UtcStatus
+from imud.model.sample import Position
 from tests.support.metrics import LINES, UTC, device, equipped
 
 STATUS = replace(
@@ -67,3 +69,14 @@ def test_lines_utc_settings_and_status_bits() -> None:
     )  # fmt: skip
     assert dict(parts(shown)) == {"status": "accelerometer over range", "present": "mode 6-axis, output.hi91 100 Hz"}
     assert dict(parts(replace(shown, status_bits=0, status_words=())))["status"] == "no known bit is set"
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        (Position(0.5, -1.25), "28.6478898°, -71.6197244°"),
+        (Position(0.5, -1.25, 42.5, 0, 17), "28.6478898°, -71.6197244°, 42.50 m, quality 0, satellites 17"),
+    ],
+)
+def test_position(place: Position, words: str) -> None:
+    assert dict(parts(device("bow", position=place))) == {"position": words}

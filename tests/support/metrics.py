@@ -22,7 +22,7 @@ from imud.contracts.status import (
     UtcStatus,
 )
 from imud.model.ledger import LEDGER_FIELDS
-from imud.model.sample import Sync
+from imud.model.sample import Position, Sync
 from imud.publishers.metrics.metric import Snapshot
 from imud.publishers.metrics.publisher import Renderer
 from imud.publishers.metrics.rings import MotionValues, RingView
@@ -68,6 +68,7 @@ LINES = LinesStatus(
     edges_lost={"sout": 7, "alarm": 0, "pps": 0}, alarm=True, alarms=3, sin=True, triggers=400, triggers_missed=8,
     trigger_late_mean_ns=30_000, trigger_late_worst_ns=900_000, trigger_late_sum_ns=12_000_456,
 )  # fmt: skip
+PLACE = Position(0.5, 0.25, 10.0, 1, 9)
 UTC = UtcStatus(
     source="gpsd at 127.0.0.1:2947", problem="chronyd does not take samples", sentences=100, sent=90,
     refused={"stale": 7, "busy": 3}, pulses=59, pulses_ignored=1, chrony_sent=40, chrony_refused=19,
@@ -81,7 +82,10 @@ MOTION = MotionValues(12_500_000_000, (0.1, -0.2, 3.0), 9.81, (0.01, 0.02, 0.03)
 
 
 def equipped(name: str, number: int = 0, **changes: object) -> DeviceStatus:
-    parts = {"frame": FRAME, "clock": EDGED, "polling": POLLING, "serial_line": SERIAL_LINE, "lines": LINES, "utc": UTC}
+    parts = {
+        "frame": FRAME, "clock": EDGED, "polling": POLLING, "serial_line": SERIAL_LINE, "lines": LINES, "utc": UTC,
+        "position": PLACE,
+    }  # fmt: skip
     return device(name, number, **(parts | changes))
 
 

@@ -110,6 +110,7 @@ CLOCK: Final = status_part(lambda device: device.clock)
 FRAME: Final = status_part(lambda device: device.frame)
 LEDGER: Final = status_part(lambda device: device.ledger)
 KERNEL: Final = status_part(lambda device: device.kernel)
+POSITION: Final = status_part(lambda device: device.position)
 POLLING: Final = status_part(lambda device: device.polling)
 SERIAL_LINE: Final = status_part(lambda device: device.serial_line)
 EDGES: Final = status_part(_edged)
@@ -282,13 +283,13 @@ DEVICE_FAMILIES: Final = (
         CLOCK.one(lambda clock: clock.t_err_ns), SECONDS,
     ),
     _counter("imud_clock_resets_total", "Number of restarts of the device counter.", CLOCK.one(lambda c: c.resets)),
-    _gauge(
-        "imud_temperature_celsius", "Temperature from the device.", DEVICE.one(lambda d: d.temperature_c), CELSIUS
-    ),
+    _gauge("imud_temperature_celsius", "Temperature from the device.", DEVICE.one(lambda d: d.temperature_c), CELSIUS),
     _gauge(
         "imud_frame_problem", "1 if gravity or heading contradicts the attitude or the configuration, otherwise 0.",
         FRAME.one(lambda frame: bool(frame.problem)),
     ),
+    _gauge("imud_position_quality", "Quality of the position as sent; 0: invalid.", POSITION.one(lambda p: p.quality)),
+    _gauge("imud_position_satellites", "Satellites in the position.", POSITION.one(lambda p: p.satellites)),
     _gauge("imud_status_bits", "Status word of the newest sample.", DEVICE.one(lambda d: d.status_bits)),
     _counter(
         "imud_kernel_errors_total", "Port errors that the kernel counted since imud opened the link.",
@@ -374,9 +375,7 @@ TIME_FAMILIES: Final = (
     _counter(
         "imud_utc_sentences_total", "RMC sentences received from the source.", SENTENCES.one(lambda utc: utc.sentences)
     ),
-    _counter(
-        "imud_utc_sentences_sent_total", "RMC sentences sent to the device.", SENTENCES.one(lambda utc: utc.sent)
-    ),
+    _counter("imud_utc_sentences_sent_total", "RMC sentences sent to the device.", SENTENCES.one(lambda utc: utc.sent)),
     _counter(
         "imud_utc_sentences_refused_total", "RMC sentences that imud did not send, by cause.",
         SENTENCES.by("cause", lambda utc: utc.refused),

@@ -16,7 +16,7 @@ from imud.contracts.setting import OnDifference, SettingsState, SettingsStatus
 from imud.contracts.status import FlightStatus, MqttStatus, OutputStatus, RecorderStatus
 from imud.model.event import EventKind
 from imud.model.ledger import LEDGER_FIELDS
-from imud.model.sample import Sync
+from imud.model.sample import Position, Sync
 from imud.publishers.metrics import families
 from imud.publishers.metrics import metric as units
 from imud.publishers.metrics.metric import Family, MetricType, Snapshot
@@ -49,7 +49,7 @@ def key(name: str, **labels: str) -> Key:
 
 
 DEVICES = (
-    device("front", 0),
+    device("front", 0, position=Position(0.5, 0.25, quality=0, satellites=9)),
     device(
         "rear", 1, state=states.DeviceState.MISSING, clock=states.ClockStatus(), temperature_c=None, status_bits=None,
         expected_rate_hz=0.0, identity={},
@@ -94,6 +94,8 @@ def test_each_ledger_counter_has_a_metric() -> None:
 
 
 def test_values_states_and_identity() -> None:
+    bare = device("front", 0, position=Position(0.5, 0.25))  # neither quality nor satellites
+    assert not any(name.startswith("imud_position") for name, _ in rendered(Snapshot((bare,))))
     shown = rendered(Snapshot(DEVICES, heartbeat_age_ns=250_000_000, log_messages_dropped=3))
     front = {"device": "front"}
     expected = {
@@ -101,6 +103,7 @@ def test_values_states_and_identity() -> None:
         "imud_clock_residual_seconds": 3e-05, "imud_clock_error_seconds": 4.5e-05, "imud_clock_resets_total": 2,
         "imud_sample_rate_hertz": 999.5, "imud_sample_rate_expected_hertz": 1000.25, "imud_sample_hold_seconds": 0.005,
         "imud_sample_hold_wanted_seconds": 0.02, "imud_temperature_celsius": 36.5, "imud_status_bits": 4,
+        "imud_position_quality": 0, "imud_position_satellites": 9,
         "imud_device_connects_total": 3,
     }  # fmt: skip
     for name, value in expected.items():
@@ -109,7 +112,12 @@ def test_values_states_and_identity() -> None:
     for kind, count in kinds.items():
         assert shown[key("imud_kernel_errors_total", kind=kind, **front)] == count
     assert (shown[key("imud_heartbeat_age_seconds")], shown[key("imud_log_messages_dropped_total")]) == (0.25, 3)
-    for name in ("imud_temperature_celsius", "imud_status_bits", "imud_sample_rate_expected_hertz"):
+    for name in (
+        "imud_temperature_celsius",
+        "imud_status_bits",
+        "imud_position_quality",
+        "imud_sample_rate_expected_hertz",
+    ):
         assert key(name, device="front") in shown
         assert key(name, device="rear") not in shown
     for name, state, up in (("front", "running", 1), ("rear", "missing", 0)):
