@@ -1110,7 +1110,8 @@ static PyObject *add_slots(PyObject *self, PyObject *args)
     return PyErr_Occurred() ? NULL : PyLong_FromSsize_t(offset);
 }
 
-#define CAN_FRAME_BYTES 16   /* `struct can_frame`: identifier with flags, length, data from byte 8 */
+#define CAN_FRAME_BYTES 72   /* `struct canfd_frame`: identifier with flags, length, data from byte 8 as in can_frame */
+#define CAN_DATA_MOST 64
 #define CAN_CONTROL_BYTES 64 /* control messages of a frame: arrival time, then number of dropped frames */
 #define CAN_FRAMES_MOST 64   /* frames of a read: `BATCH_FRAMES` of imud/links/socketcan.py */
 #define CAN_STAMP_AT (sizeof(size_t) + 4)
@@ -1180,7 +1181,7 @@ static PyObject *can_frame(newfunc make, PyTypeObject *frame_type, const uint8_t
         *newest_ns = now_ns;
     PyObject *args = Py_BuildValue("((kONLO))", (unsigned long)(can_id & CAN_ID_MOST),
                                    can_id & CAN_EXTENDED ? Py_True : Py_False,
-                                   PyBytes_FromStringAndSize((const char *)raw + 8, raw[4] < 8 ? raw[4] : 8),
+                                   PyBytes_FromStringAndSize((const char *)raw + 8, Py_MIN(raw[4], CAN_DATA_MOST)),
                                    (long long)*newest_ns, Py_False);
     PyObject *made = args == NULL ? NULL : make(frame_type, args, NULL);
     Py_XDECREF(args);

@@ -1,7 +1,7 @@
-"""CAN frames (ISO 11898-1), filters, the kernel's 16-byte `struct can_frame`, and candump logs.
+"""CAN frames (ISO 11898-1), filters, `struct can_frame` and `struct canfd_frame` of the kernel, and candump logs.
 
 A link delivers frames to a codec as `CanFrame`. It sends frames as `struct can_frame`, so that a command consists of
-bytes on every kind of link.
+bytes on every kind of link. Only simulated devices send CAN FD frames.
 """
 
 import re
@@ -15,6 +15,9 @@ from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_MS, NS_PER_S
 
 DATA_BYTES_MAX: Final = 8  # maximum number of data bytes of a classical CAN frame (ISO 11898-1)
+# Possible numbers of data bytes of a CAN FD frame (ISO 11898-1)
+FD_LENGTHS: Final = (*range(DATA_BYTES_MAX + 1), 12, 16, 20, 24, 32, 48, 64)
+FD_DATA_BYTES_MAX: Final = FD_LENGTHS[-1]
 STANDARD_ID_MAX: Final = 0x7FF
 EXTENDED_ID_MAX: Final = 0x1FFF_FFFF
 # Flag in the identifier of `struct can_frame`: 29 bits (CAN_EFF_FLAG of linux/can.h)
@@ -25,6 +28,9 @@ ERROR_FLAG: Final = 0x2000_0000
 
 # `struct can_frame` in the byte order of the host: identifier with flags, length, data
 RAW_FRAME: Final = struct.Struct("=IB3x8s")
+# `struct canfd_frame`: the same with flags after the length. Length and data have the places of `struct can_frame`.
+RAW_FD_FRAME: Final = struct.Struct("=IBB2x64s")
+FD_FLAGS: Final = 0x05  # flags of sent CAN FD frames: fast data phase (CANFD_BRS), and CAN FD (CANFD_FDF)
 STANDARD_OVERHEAD_BITS, EXTENDED_OVERHEAD_BITS = 47, 67
 """Length of a frame without data and stuff bits, with three bits of interframe space (ISO 11898-1), for 11 and 29
 bits.
@@ -75,21 +81,25 @@ def frame_bits(extended: bool, data_bytes: int) -> int:
 
 
 def pack_frame(can_id: int, extended: bool, data: bytes) -> bytes:
-    """Return a frame as `struct can_frame`. Raises ValueError for an identifier or a length out of range."""
-    if not 0 <= can_id <= (EXTENDED_ID_MAX if extended else STANDARD_ID_MAX) or len(data) > DATA_BYTES_MAX:
-        raise ValueError(f"invalid CAN frame: identifier {can_id:#x}{' (29 bits)' * extended}, {len(data)} data bytes")
-    return RAW_FRAME.pack(can_id | EXTENDED_FLAG if extended else can_id, len(data), data)
+    """Return a frame as `struct can_frame`; with more than eight data bytes, as `struct canfd_frame`.
+
+    Raises ValueError for an identifier or a length out of range.
+    """
+    size = len(data)
+    if not 0 <= can_id <= (EXTENDED_ID_MAX if extended else STANDARD_ID_MAX) or size not in FD_LENGTHS:
+        raise ValueError(f"invalid CAN frame: identifier {can_id:#x}{' (29 bits)' * extended}, {size} data bytes")
+    flagged_id = can_id | EXTENDED_FLAG if extended else can_id
+    is_fd = size > DATA_BYTES_MAX
+    return RAW_FD_FRAME.pack(flagged_id, size, FD_FLAGS, data) if is_fd else RAW_FRAME.pack(flagged_id, size, data)
 
 
 # Maximum length of a line, bytes. CAN FD with 64 data bytes and a long bus name needs about 190.
 LINE_BYTES_MAX: Final = 512
 _FRAME: Final = re.compile(
-    rb"\((\d{1,18})\.(\d{1,9})\) +(\S+) +([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#((?:[0-9A-Fa-f]{2}){0,8})(?:_[0-9A-Fa-f])?"
-    rb"(?: [RT])?\s*"
+    rb"\((\d{1,18})\.(\d{1,9})\) +(\S+) +([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
+    rb"#(?:((?:[0-9A-Fa-f]{2}){0,8})(?:_[0-9A-Fa-f])?|#[0-9A-Fa-f]((?:[0-9A-Fa-f]{2}){0,64}))(?: [RT])?\s*"
 )
-_OTHER: Final = re.compile(
-    rb"\(\d{1,18}\.\d{1,9}\) +\S+ +[0-9A-Fa-f]{3,8}#(?:#[0-9A-Fa-f]+|R[\dA-Fa-f_]*)(?: [RT])?\s*"
-)
+_OTHER: Final = re.compile(rb"\(\d{1,18}\.\d{1,9}\) +\S+ +[0-9A-Fa-f]{3,8}#R[\dA-Fa-f_]*(?: [RT])?\s*")
 
 
 # Maximum fall of the time from line to line that is not a step of the clock, ns: lines of candump can change places
@@ -252,7 +262,7 @@ class CandumpReader:
                 f"(first: line {self.first_bad})"
             )
         elif not self.identifiers:
-            found.append(f"found no data frame, and {self.passed_over} error frames, remote frames or CAN FD frames")
+            found.append(f"found no data frame, and {self.passed_over} error frames or remote frames")
         return "; ".join(found)
 
     def __iter__(self) -> Iterator[CanFrame]:
@@ -266,8 +276,11 @@ class CandumpReader:
             if match is None:
                 self._note(line, number)
                 continue
-            seconds, fraction, name, digits, data = match.groups()
-            can_id = int(digits, 16)
+            seconds, fraction, name, digits, classical, fast = match.groups()
+            can_id, data = int(digits, 16), bytes.fromhex((fast or classical or b"").decode("ascii"))
+            if len(data) not in FD_LENGTHS:
+                self._note(line, number)
+                continue
             if can_id > EXTENDED_ID_MAX or (len(digits) == 3 and can_id > STANDARD_ID_MAX):
                 self._note(b"bad", number, passed=bool(can_id & ERROR_FLAG))
                 continue
@@ -275,7 +288,7 @@ class CandumpReader:
                 continue
             t_ns, is_jump = self._time(int(seconds) * NS_PER_S + int(fraction.ljust(9, b"0")), number)
             self._look_for_shift(can_id, t_ns, number)
-            frame = CanFrame(can_id, len(digits) == 8, bytes.fromhex(data.decode("ascii")), t_ns, is_jump)
+            frame = CanFrame(can_id, len(digits) == 8, data, t_ns, is_jump)
             if len(self.identifiers) < IDENTIFIERS_MAX:
                 first = self.identifiers.setdefault((can_id, frame.extended), [])
                 if len(first) < FIRST:

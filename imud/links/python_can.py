@@ -27,8 +27,10 @@ BATCH_FRAMES: Final = 64
 class PythonCanLink:
     """A bus of python-can as a `CanLink`. Synchronization: the loop's thread. The link has its own receiving thread."""
 
-    def __init__(self, backend: str, channel: str, bitrate: int = 0) -> None:
+    def __init__(self, backend: str, channel: str, bitrate: int = 0, data_bitrate: int = 0) -> None:
+        """`data_bitrate`: bit rate of the data phase of CAN FD, bit/s; 0: classical CAN."""
         self._backend = backend
+        self._data_bitrate = data_bitrate
         self._channel = channel
         self._bus: can.BusABC | None = None
         self._thread: threading.Thread | None = None
@@ -72,6 +74,8 @@ class PythonCanLink:
     def _opened(self) -> can.BusABC:
         filters = _as_python_can(self._filters)
         rate: dict[str, Any] = {"bitrate": self.bitrate} if self.bitrate else {}
+        if self._data_bitrate:
+            rate |= {"fd": True, "data_bitrate": self._data_bitrate}
         try:
             return can.Bus(self._channel, self._backend, can_filters=filters, ignore_config=True, **rate)
         except (can.CanError, OSError, ValueError, TypeError, ImportError, NotImplementedError) as error:
@@ -169,7 +173,7 @@ def _batch(bus: can.BusABC) -> list[CanFrame]:
     frames: list[CanFrame] = []
     message = bus.recv(LOOK_S)
     while message is not None:
-        if not (message.is_error_frame or message.is_remote_frame or message.is_fd):
+        if not (message.is_error_frame or message.is_remote_frame):
             now_ns = time.monotonic_ns()
             frames.append(CanFrame(message.arbitration_id, message.is_extended_id, bytes(message.data), now_ns))
         message = bus.recv(0) if len(frames) < BATCH_FRAMES else None

@@ -25,10 +25,11 @@ from imud.contracts.link import CanLink, Claim, LinkType, OnBusNews, OnEnd, OnFr
 from imud.contracts.status import KernelCounters
 from imud.formats import kernel
 from imud.formats.can import (
-    DATA_BYTES_MAX,
     ERROR_FLAG,
     EXTENDED_FLAG,
     EXTENDED_ID_MAX,
+    FD_DATA_BYTES_MAX,
+    RAW_FD_FRAME,
     RAW_FRAME,
     REMOTE_FLAG,
     CanFilter,
@@ -188,7 +189,7 @@ BACKLOG_NS: Final = 5 * NS_PER_MS
 
 
 class FrameReader:
-    """Receiving side of a socket with messages `struct can_frame`. The caller owns and closes the socket."""
+    """Receiving side of a socket with messages `struct canfd_frame` or `struct can_frame`. The caller closes it."""
 
     def __init__(
         self, receiver: socket.socket, state: BusState, now_ns: Callable[[], int] = time.monotonic_ns,
@@ -201,7 +202,7 @@ class FrameReader:
         self._state = state
         self._now_ns = now_ns
         self._wall_ns = wall_ns
-        self._frames = bytearray(RAW_FRAME.size * BATCH_FRAMES)
+        self._frames = bytearray(RAW_FD_FRAME.size * BATCH_FRAMES)
         self._control = bytearray(_CONTROL_BYTES * BATCH_FRAMES)
         self._vectors = (Vector * BATCH_FRAMES)()
         self._headers = bytearray(_MESSAGE_BYTES * BATCH_FRAMES)
@@ -223,11 +224,12 @@ class FrameReader:
         offset_ns, now_ns = self._clocks()
         frames = None if module is None or self._lost else self._usual(module, count, offset_ns, now_ns)
         if frames is None and count == 1:  # usual on a quiet bus: saves two iterators
-            only = RAW_FRAME.unpack_from(self._frames), _CONTROL.unpack_from(self._control)
+            only = RAW_FD_FRAME.unpack_from(self._frames), _CONTROL.unpack_from(self._control)
             frames = self._decoded((only,), offset_ns, now_ns)
         elif frames is None:
-            raw, control = self._frames[: count * RAW_FRAME.size], self._control[: count * _CONTROL_BYTES]
-            rows = zip(RAW_FRAME.iter_unpack(raw), _CONTROL.iter_unpack(control), strict=True)
+            raw = memoryview(self._frames)[: count * RAW_FD_FRAME.size]
+            control = memoryview(self._control)[: count * _CONTROL_BYTES]
+            rows = zip(RAW_FD_FRAME.iter_unpack(raw), _CONTROL.iter_unpack(control), strict=True)
             frames = self._decoded(rows, offset_ns, now_ns)
         if count < BATCH_FRAMES:
             self._empty_ns, self._empty_offset_ns = begun_ns, offset_ns
@@ -261,7 +263,7 @@ class FrameReader:
         frames: list[CanFrame] = []
         newest_ns, empty_ns, dropped, lost = self._newest_ns, self._empty_ns, self.dropped & _COUNT_MASK, self._lost
         newest_ns, stepped_ns = newest_ns if newest_ns > empty_ns else empty_ns, self._step_ns(offset_ns)
-        for (can_id, size, data), (kind, seconds, ns, drop_kind, drops) in rows:
+        for (can_id, size, _, data), (kind, seconds, ns, drop_kind, drops) in rows:
             if drop_kind == SO_RXQ_OVFL and drops != dropped:
                 self.dropped += (drops - dropped) & _COUNT_MASK
                 dropped, lost = drops, True
@@ -278,7 +280,7 @@ class FrameReader:
                 newest_ns = now_ns
             if newest_ns > now_ns:  # noqa: PLR1730
                 newest_ns = now_ns
-            whole = data if size == DATA_BYTES_MAX else data[:size]
+            whole = data if size == FD_DATA_BYTES_MAX else data[:size]  # the buffer can contain older bytes after it
             frames.append(_new_frame((can_id & EXTENDED_ID_MAX, can_id >= EXTENDED_FLAG, whole, newest_ns, lost)))
             lost = False
         self._newest_ns, self._lost = newest_ns, lost
@@ -307,8 +309,8 @@ class FrameReader:
         control = ctypes.addressof(ctypes.c_char.from_buffer(self._control))
         vector = ctypes.addressof(self._vectors)
         for i, message in enumerate(self._messages):
-            self._vectors[i].base = frames + i * RAW_FRAME.size
-            self._vectors[i].bytes = RAW_FRAME.size
+            self._vectors[i].base = frames + i * RAW_FD_FRAME.size
+            self._vectors[i].bytes = RAW_FD_FRAME.size
             header = message.header
             header.vector, header.vector_count = vector + i * ctypes.sizeof(Vector), 1
             header.control, header.control_bytes = control + i * _CONTROL_BYTES, _CONTROL_BYTES
@@ -340,22 +342,26 @@ class SocketCanOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields
     bitrate: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
     """Bit rate that imud sets for another backend, bit/s; 0: unchanged. The system sets the rate of a network
     interface."""
+    data_bitrate: Annotated[int, Meta(ge=0, le=8_000_000)] = 0
+    """Bit rate of the data phase of CAN FD that imud sets for another backend, bit/s; 0: classical CAN."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for keys that exclude each other."""
-        if self.bitrate and self.backend == NATIVE:
-            raise ValueError("bitrate: expected no value with backend socketcan; the system sets it (docs/can.md)")
+        for key in ("bitrate", "data_bitrate"):
+            if getattr(self, key) and self.backend == NATIVE:
+                raise ValueError(f"{key}: expected no value with backend socketcan; the system sets it (docs/can.md)")
 
 
 OpenSocket = Callable[[SocketCanOptions, Sequence[CanFilter]], socket.socket]
 
 
 def open_raw(settings: SocketCanOptions, filters: Sequence[CanFilter]) -> socket.socket:
-    """Open a raw CAN socket on the interface, with filters and the error frames WATCHED. Raises OSError."""
+    """Open a raw CAN socket on the interface, with filters, the error frames WATCHED and CAN FD. Raises OSError."""
     opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW | socket.SOCK_NONBLOCK, socket.CAN_RAW)
     try:
         opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, pack_filters(filters))
         opened.setsockopt(socket.SOL_CAN_RAW, CAN_RAW_ERR_FILTER, struct.pack("=I", WATCHED))
+        opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)  # no effect without CAN FD
         _enlarge(opened, settings)
         opened.bind((settings.interface,))
     except OSError:
@@ -401,9 +407,9 @@ class SocketCanLink:
         self._reader: FrameReader | None = None
         self._state = BusState(settings.interface)
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._on_frames: OnFrames = _ignore_frames
-        self._on_news: OnBusNews = _ignore_news
-        self._on_end: OnEnd = _ignore_end
+        self._on_frames: OnFrames = _ignore
+        self._on_news: OnBusNews = _ignore
+        self._on_end: OnEnd = _ignore
         self._filters: Sequence[CanFilter] = ()
         self._sender: Sender | None = None
         self.title = self.bus = settings.interface
@@ -572,13 +578,7 @@ class SocketCanLink:
         return LinkError(f"{name}: {os.strerror(error.errno or 0)}")
 
 
-def _ignore_frames(_frames: object) -> None: ...
-
-
-def _ignore_news(_news: str, _problem: str) -> None: ...
-
-
-def _ignore_end(_error: LinkError | None) -> None: ...
+def _ignore(*_news: object) -> None: ...
 
 
 def make(settings: SocketCanOptions) -> CanLink:
@@ -587,14 +587,15 @@ def make(settings: SocketCanOptions) -> CanLink:
         return SocketCanLink(settings)
     from imud.links.python_can import PythonCanLink
 
-    return PythonCanLink(settings.backend, settings.interface, settings.bitrate)
+    return PythonCanLink(settings.backend, settings.interface, settings.bitrate, settings.data_bitrate)
 
 
 def _claims(settings: SocketCanOptions) -> list[Claim]:
     """Return the claim of a device: a shared bus, or the port of a serial adapter (`slcan`) for one device."""
     name, port = settings.interface, settings.interface.startswith("/")
     place = name if port or settings.backend == NATIVE else f"{name} ({settings.backend})"
-    return [Claim(place=place, key="interface", shared=not port, terms={"bitrate": settings.bitrate})]
+    rates = {"bitrate": settings.bitrate, "data_bitrate": settings.data_bitrate}
+    return [Claim(place=place, key="interface", shared=not port, terms=rates)]
 
 
 LINK = LinkType("socketcan", SocketCanOptions, make_can=make, claims=_claims)

@@ -20,6 +20,7 @@ from imud.sim.sensor import SensorHardware, SimulatorOptions
 # Mean number of stuff bits in a frame. The model ignores that frames with fewer than eight bytes are shorter.
 STUFF_BITS: Final = 9
 BITRATE: Final = 500_000
+DATA_PHASE: Final = 4  # bit rate of the data after the eighth byte of a CAN FD frame, in bit rates (assumption)
 
 
 class SentFrame(NamedTuple):
@@ -83,12 +84,16 @@ class FrameWire:
             (frame_bits(extended, DATA_BYTES_MAX) + STUFF_BITS) * NS_PER_S // bitrate if bitrate else 0
             for extended in (False, True)
         )
+        self._byte_ns = 8 * NS_PER_S // (bitrate * DATA_PHASE) if bitrate else 0
         self._free_ns = free_ns
         self._waiting: deque[SentFrame] = deque()
 
     def send(self, ready_ns: int, can_id: int, extended: bool, data: bytes, sample_ns: int | None = None) -> None:
         """Queue a frame that is ready at `ready_ns`."""
-        self._free_ns = max(ready_ns, self._free_ns) + (self.extended_ns if extended else self.frame_ns)
+        on_wire_ns = (self.extended_ns if extended else self.frame_ns) + max(
+            len(data) - DATA_BYTES_MAX, 0
+        ) * self._byte_ns
+        self._free_ns = max(ready_ns, self._free_ns) + on_wire_ns
         self._waiting.append(SentFrame(self._free_ns, can_id, extended, data, sample_ns))
 
     def sent(self, now_ns: int) -> list[SentFrame]:

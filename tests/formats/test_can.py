@@ -1,6 +1,7 @@
 """Length of frames on the wire, and frames as bytes."""
 
 import io
+import struct
 from collections.abc import Sequence
 from random import Random
 
@@ -18,7 +19,9 @@ def test_length_of_a_frame_and_layout_of_the_kernel() -> None:
     assert can.RAW_FRAME.unpack(can.pack_frame(0x7FF, False, b"ab")) == (0x7FF, 2, b"ab" + bytes(6))
     assert can.RAW_FRAME.unpack(can.pack_frame(0, True, bytes(range(8)))) == (0x8000_0000, 8, bytes(range(8)))
     assert (can.EXTENDED_FLAG, can.REMOTE_FLAG, can.ERROR_FLAG) == (1 << 31, 1 << 30, 1 << 29)  # linux/can.h
-    wrong = [(0x800, False, b""), (-1, False, b""), (0x2000_0000, True, b""), (1, True, bytes(9))]
+    fast = can.pack_frame(0x18FF5B08, True, bytes(range(12)))  # identifier, length, BRS and FDF, padding, data
+    assert fast == struct.pack("=IBBH", 0x98FF5B08, 12, 5, 0) + bytes(range(12)).ljust(64, b"\0")
+    wrong = [(0x800, False, b""), (-1, False, b""), (0x2000_0000, True, b""), (1, True, bytes(9)), (1, True, bytes(65))]
     for can_id, extended, data in wrong:
         with pytest.raises(ValueError, match="invalid CAN frame"):
             can.pack_frame(can_id, extended, data)
@@ -45,7 +48,9 @@ LOG = b"""\
 (1436509053.650700) can1 7FF# T
 
 (1436509053.700000) can1 123#R8
-(1436509053.700001) can1 123##1001122
+(1436509053.700001) can1 123##5001122
+(1436509053.700001) can1 18FF5B08##1000102030405060708090A0B
+(1436509053.700001) can1 123##1000000000000000000
 (1436509053.700002) can1 20000040#0000000000000000
 (1436509053.700003) can1 1A2#1122334455667788_9
 """
@@ -62,9 +67,11 @@ def test_lines_of_candump() -> None:
         can.CanFrame(0x44, False, b"\x2a\x36\x6c\x2b", 1436509052_249713_000),
         can.CanFrame(0x18FEE9AA, True, bytes(range(1, 9)), 1436509053_650700_000),
         can.CanFrame(0x7FF, False, b"", 1436509053_650700_000),
+        can.CanFrame(0x123, False, b"\x00\x11\x22", 1436509053_700001_000),
+        can.CanFrame(0x18FF5B08, True, bytes(range(12)), 1436509053_700001_000),
         can.CanFrame(0x1A2, False, bytes.fromhex("1122334455667788"), 1436509053_700003_000),
     ]
-    assert (reader.passed_over, reader.problem) == (3, "")
+    assert (reader.passed_over, reader.bad_lines, reader.first_bad) == (2, 1, 8)  # no CAN FD frame has nine bytes
 
 
 @pytest.mark.parametrize(
@@ -148,5 +155,5 @@ def test_what_is_written_is_read() -> None:
     assert again == expected
     assert reader.problem == ""
     assert candump_line(can.CanFrame(0x65, False, b"\xab", 1_500_000_000)) == "(0000000001.500000) can0 065#AB\n"
-    with pytest.raises(ValueError, match="no classical CAN frame"):
+    with pytest.raises(ValueError, match="invalid CAN frame"):
         candump_line(can.CanFrame(0x800, False, b"", 0))

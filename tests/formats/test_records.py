@@ -68,10 +68,11 @@ def int64(*values: int) -> str:
     return b"".join(value.to_bytes(8, "little", signed=True) for value in values).hex()
 
 
+FD_FRAME = CanFrame(0x188, False, bytes(64), 9)
 GOLDEN = [
     (
-        records.encode_frames(258, [CanFrame(0x0CFF3408, True, b"\xab\xcd", 10, True), CanFrame(0x188, False, b"", 9)]),
-        "06 0201 1e000000" + int64(10) + "0834ff0c 03 02 abcd" + int64(9) + "88010000 00 00",
+        records.encode_frames(258, [CanFrame(0x0CFF3408, True, b"\xab\xcd", 10, True), FD_FRAME]),
+        "06 0201 5e000000" + int64(10) + "0834ff0c 03 02 abcd" + int64(9) + "88010000 00 40" + "00" * 64,
     ),
     (
         records.encode_readings(1, [records.ReadingRecord(3, 5, 9, 2, b"no")]),

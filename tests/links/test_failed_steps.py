@@ -21,6 +21,7 @@ from tests.support.event_loops import in_loop
 
 FRAMES = [CyclicFrame(number, False, b"", 1_000_000) for number in (1, 2)]
 BUFFER_BYTES = 1 << 20
+NO_RATES = {"bitrate": 0, "data_bitrate": 0}
 
 
 class FakeSocket:
@@ -48,7 +49,7 @@ class FakeSocket:
 
 @pytest.mark.parametrize(
     ("make", "steps"),
-    [(lambda: open_raw(SocketCanOptions(interface="can0"), []), 5), (lambda: KernelSender("can0", FRAMES), 3)],
+    [(lambda: open_raw(SocketCanOptions(interface="can0"), []), 6), (lambda: KernelSender("can0", FRAMES), 3)],
     ids=["raw", "broadcast manager"],
 )
 def test_a_socket_is_closed_when_a_step_fails(
@@ -63,12 +64,13 @@ def test_a_socket_is_closed_when_a_step_fails(
 
 
 def test_a_raw_socket_has_the_permitted_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without CAP_NET_ADMIN, the third call fails. The normal option then sets the buffer."""
-    made = FakeSocket(3, errno.EPERM)
+    """The fourth call fails without CAP_NET_ADMIN. The normal option then sets the buffer."""
+    made = FakeSocket(4, errno.EPERM)
     monkeypatch.setattr(socket, "socket", lambda *_: made)
     assert open_raw(SocketCanOptions(interface="can0"), []) is made  # type: ignore[comparison-overlap]  # the fake
-    assert made.calls[2] == (socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES // 2), "the kernel doubles the value"
-    assert made.calls[3] == (socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES // 2)
+    assert made.calls[2] == (socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
+    assert made.calls[3] == (socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES // 2), "the kernel doubles the value"
+    assert made.calls[4] == (socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES // 2)
     assert (made.calls[-1], made.closed) == ((("can0",),), False)
     KernelSender("can0", FRAMES).close()
     assert made.closed
@@ -194,9 +196,9 @@ CLAIMS: list[tuple[str, dict[str, object], tuple[object, ...]]] = [
     ("i2c", {"bus": 3, "address": 25}, ("/dev/i2c-3", "bus", True, 25, "address", {})),
     ("rs485", {"line": "/dev/b", "address": 7}, ("/dev/b", "line", True, 7, "address", TERMS)),
     ("rs485", {"line": "/dev/b"}, ("/dev/b", "line", True, None, "address", TERMS)),
-    ("socketcan", {"interface": "can0"}, ("can0", "interface", True, None, "", {"bitrate": 0})),
-    ("socketcan", {"interface": "1", "backend": "x"}, ("1 (x)", "interface", True, None, "", {"bitrate": 0})),
-    ("socketcan", {"interface": "/d", "backend": "x"}, ("/d", "interface", False, None, "", {"bitrate": 0})),
+    ("socketcan", {"interface": "can0"}, ("can0", "interface", True, None, "", NO_RATES)),
+    ("socketcan", {"interface": "1", "backend": "x"}, ("1 (x)", "interface", True, None, "", NO_RATES)),
+    ("socketcan", {"interface": "/d", "backend": "x"}, ("/d", "interface", False, None, "", NO_RATES)),
 ]
 
 

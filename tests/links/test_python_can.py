@@ -43,8 +43,13 @@ async def test_frames_pass_the_filters_in_the_loops_thread_and_commands_go_out()
 
     link.start(on_frames, lambda news, problem: None, lambda error: None)
     with can.Bus("pass", "virtual") as far:
-        for can_id, extended in ((0x65, False), (0x66, False), (0x65, True), (0x65, False)):
-            far.send(can.Message(arbitration_id=can_id, is_extended_id=extended, data=b"\1\2"))
+        for can_id, extended, data in (
+            (0x65, False, b"\1\2"),
+            (0x66, False, b""),
+            (0x65, True, b""),
+            (0x65, False, bytes(64)),
+        ):
+            far.send(can.Message(arbitration_id=can_id, is_extended_id=extended, data=data, is_fd=len(data) > 8))
         await asyncio.wait_for(done.wait(), LIMIT_S)
         link.write(pack_frame(0x123, False, b"\7") + pack_frame(0x1234, True, b""))
         sent = [m for m in (far.recv(LIMIT_S), far.recv(LIMIT_S)) if m]
@@ -53,7 +58,7 @@ async def test_frames_pass_the_filters_in_the_loops_thread_and_commands_go_out()
     assert threads == {threading.current_thread()}
     link.close()
     link.close()
-    assert [frame[:3] for frame in got] == [(0x65, False, b"\1\2")] * 2
+    assert [frame[:3] for frame in got] == [(0x65, False, b"\1\2"), (0x65, False, bytes(64))]
     assert 0 < got[0].t_rx_ns <= got[1].t_rx_ns
     assert "can pass" not in [thread.name for thread in threading.enumerate()]
     with pytest.raises(LinkError, match="not open"):
@@ -113,7 +118,7 @@ async def test_a_slow_bus_opens_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> 
 
 @in_loop
 async def test_only_data_frames_are_delivered_and_nothing_after_close(monkeypatch: pytest.MonkeyPatch) -> None:
-    kinds = [{}, {"is_error_frame": True}, {"is_remote_frame": True}, {"is_fd": True}, *[dict[str, bool]()] * 64]
+    kinds = [{}, {"is_error_frame": True}, {"is_remote_frame": True}, {"is_fd": True}, *[dict[str, bool]()] * 63]
     bus = FakeBus(*(can.Message(arbitration_id=n, is_extended_id=False, **kind) for n, kind in enumerate(kinds)))
     monkeypatch.setattr(can, "Bus", lambda *_, **__: bus)
     got: list[list[int]] = []
@@ -132,7 +137,7 @@ async def test_only_data_frames_are_delivered_and_nothing_after_close(monkeypatc
     wait_until(lambda: not bus.messages, "the thread has read the frame")
     link.close()
     await asyncio.sleep(0.01)  # the loop would deliver the frame now
-    assert (got, (bus.is_shut_down, bus.timeouts_s)) == ([[0, *range(4, 67)], [67]], (True, {0, 0.05}))
+    assert (got, (bus.is_shut_down, bus.timeouts_s)) == ([[0, *range(3, 66)], [66]], (True, {0, 0.05}))
 
 
 @in_loop
@@ -183,12 +188,12 @@ def test_settings_of_other_backends_and_filters_and_the_bit_rate(monkeypatch: py
     assert packed.hex() == "65000000ff0700c0" + "00e9fe9800ffffc3"
     opened, bus = list[dict[str, object]](), Mock()
     monkeypatch.setattr(can, "Bus", lambda *_where, **keys: opened.append(keys) or bus)  # type: ignore[func-returns-value]
-    for bitrate in (0, 250_000):
-        link = PythonCanLink("virtual", "x", bitrate)
+    for bitrate, data_bitrate in ((0, 0), (250_000, 0), (0, 2_000_000)):
+        link = PythonCanLink("virtual", "x", bitrate, data_bitrate)
         link.filters = wanted = [CanFilter(0x65, 0x7FF, False)]
         assert link.filters == wanted
         link.open()
     shared = {"can_filters": [{"can_id": 0x65, "can_mask": 0x7FF, "extended": False}], "ignore_config": True}
-    assert opened == [shared, shared | {"bitrate": 250_000}]
+    assert opened == [shared, shared | {"bitrate": 250_000}, shared | {"fd": True, "data_bitrate": 2_000_000}]
     link.filters = [CanFilter(0x66, 0x7FE, True)]
     bus.set_filters.assert_called_once_with([{"can_id": 0x66, "can_mask": 0x7FE, "extended": True}])

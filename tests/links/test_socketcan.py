@@ -16,7 +16,7 @@ import pytest
 
 from imud.contracts.status import KernelCounters
 from imud.formats import kernel
-from imud.formats.can import RAW_FRAME, CanFrame, CyclicFrame, pack_frame
+from imud.formats.can import FD_LENGTHS, RAW_FD_FRAME, RAW_FRAME, CanFrame, CyclicFrame, pack_frame
 from imud.links import netlink, socketcan
 from imud.links.cyclic_sender import LoopSender, setup
 from imud.links.netlink import CanDetails, absence, can_details, can_interfaces, parse_details, wait_until
@@ -389,6 +389,12 @@ def test_a_read_is_bounded_and_frames_come_with_the_time_of_their_arrival(wire: 
     wire.sender.send(pack_frame(0x1234, True, b""))
     wire.sender.send(pack_frame(0x1FFFFFFF, True, bytes(8)))
     assert [f[:3] for f in wire.read()] == [(0x1234, True, b""), (0x1FFFFFFF, True, bytes(8))]
+    # frames of every length in the same buffers: no frame contains bytes of an older frame
+    for lengths in (FD_LENGTHS, FD_LENGTHS[::-1]):
+        sent = [(0x18FF5B08, True, bytes(range(100 + size, 100 + 2 * size))) for size in lengths]
+        for frame in sent:
+            wire.sender.send(pack_frame(*frame))
+        assert [f[:3] for f in wire.read()] == sent
     wire.receiver.close()
     with pytest.raises(OSError, match="Bad file descriptor"):
         wire.reader.read()
@@ -484,11 +490,11 @@ def test_limits_of_a_step_and_of_a_backlog(wire: Wire) -> None:
     def stamps(offset_ns: int, now_ns: int, *times_ns: int) -> list[int]:
         reader = FrameReader(wire.receiver, BusState("can0"), lambda: 0, lambda: 0)
         rows = [
-            ((1, 0, bytes(8)), (socketcan.SO_TIMESTAMPNS_NEW, 0, t_ns, 0, 0))
+            ((1, 0, 0, bytes(64)), (socketcan.SO_TIMESTAMPNS_NEW, 0, t_ns, 0, 0))
             for t_ns in (20_000_000 + offset_ns, *times_ns)
         ]
         for i, (frame, control) in enumerate(rows):
-            RAW_FRAME.pack_into(reader._frames, 16 * i, *frame)
+            RAW_FD_FRAME.pack_into(reader._frames, 72 * i, *frame)
             socketcan._CONTROL.pack_into(reader._control, 64 * i, *control)
         module = kernel.present.module
         usual = None if module is None else reader._usual(module, len(rows), offset_ns, now_ns)

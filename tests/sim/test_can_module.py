@@ -103,9 +103,9 @@ def test_a_frame_takes_its_time_and_frames_leave_together_where_there_is_no_bit_
         assert len(wire.sent(1000)) == (5 if bitrate == 0 else 0)
         assert len(wire.sent(1000 + 5 * 240_000)) == (0 if bitrate == 0 else 5)
     # 47 or 67 bits around the data, 64 of data, some stuff bits
-    for extended, bits in ((False, 120), (True, 140)):
+    for extended, size, bits in ((False, 8, 120), (True, 8, 140), (True, 64, 140 + 56 * 8 // 4)):
         wire = FrameWire(500_000, 0)
-        wire.send(1000, 1, extended, bytes(8))
+        wire.send(1000, 1, extended, bytes(size))
         assert wire.next_ns() == 1000 + bits * 2000
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from imud.drivers.hipnuc.uart.codec import encode_hi91
 from imud.drivers.imu61x.can import encode_set
-from imud.formats.can import DATA_BYTES_MAX, EXTENDED_ID_MAX, STANDARD_ID_MAX, CanFrame
+from imud.formats.can import DATA_BYTES_MAX, EXTENDED_ID_MAX, FD_LENGTHS, STANDARD_ID_MAX, CanFrame
 from imud.formats.capture import MAGIC, RECORD, RECORD_BYTES_MAX, VERSION
 from imud.model.units import NS_PER_S, NS_PER_US
 
@@ -52,13 +52,15 @@ class CaptureWriter:
 
 
 def candump_line(frame: CanFrame, bus: str = "can0") -> str:
-    """Return a frame as a log line with the wall-clock time `t_rx_ns`. Raises ValueError for a non-classical frame."""
+    """Return a frame as a log line with the wall-clock time `t_rx_ns`. Raises ValueError for an invalid frame."""
     most = EXTENDED_ID_MAX if frame.extended else STANDARD_ID_MAX
-    if not 0 <= frame.can_id <= most or len(frame.data) > DATA_BYTES_MAX or frame.t_rx_ns < 0:
-        raise ValueError(f"no classical CAN frame: {frame}")
+    if not 0 <= frame.can_id <= most or len(frame.data) not in FD_LENGTHS or frame.t_rx_ns < 0:
+        raise ValueError(f"invalid CAN frame: {frame}")
     seconds, ns = divmod(frame.t_rx_ns, NS_PER_S)
     digits = 8 if frame.extended else 3
-    return f"({seconds:010d}.{ns // NS_PER_US:06d}) {bus} {frame.can_id:0{digits}X}#{frame.data.hex().upper()}\n"
+    flags = "#5" if len(frame.data) > DATA_BYTES_MAX else ""  # BRS and FDF
+    data = flags + frame.data.hex().upper()
+    return f"({seconds:010d}.{ns // NS_PER_US:06d}) {bus} {frame.can_id:0{digits}X}#{data}\n"
 
 
 BEGIN_NS = 1_763_717_507_000_000_000

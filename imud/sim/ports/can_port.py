@@ -12,7 +12,14 @@ import socket
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from imud.formats.can import ERROR_FLAG, EXTENDED_FLAG, EXTENDED_ID_MAX, RAW_FRAME, REMOTE_FLAG, pack_frame
+from imud.formats.can import (
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    EXTENDED_ID_MAX,
+    RAW_FD_FRAME,
+    REMOTE_FLAG,
+    pack_frame,
+)
 from imud.links.netlink import can_interfaces
 from imud.links.socketcan import MessageBuffers, Vector, libc
 from imud.model.errors import LinkError
@@ -74,12 +81,12 @@ class CanPort:
     def _receive(self, now_ns: int) -> None:
         while True:
             try:
-                raw = os.read(self._socket.fileno(), RAW_FRAME.size)
+                raw = os.read(self._socket.fileno(), RAW_FD_FRAME.size)
             except BlockingIOError:
                 return
             except OSError:  # the interface is down; it can return
                 return
-            can_id, size, data = RAW_FRAME.unpack(raw)
+            can_id, size, _, data = RAW_FD_FRAME.unpack(raw.ljust(RAW_FD_FRAME.size, b"\0"))
             if not can_id & (ERROR_FLAG | REMOTE_FLAG):
                 self.module.receive(can_id & EXTENDED_ID_MAX, can_id >= EXTENDED_FLAG, data[:size], now_ns)
 
@@ -91,6 +98,7 @@ def open_can_socket(interface: str) -> socket.socket:
     except OSError as error:
         raise LinkError(f"this kernel has no CAN sockets ({error.strerror}): load the kernel module can_raw") from error
     try:
+        opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)  # no effect without CAN FD
         opened.bind((interface,))
         opened.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
     except OSError as error:

@@ -74,16 +74,17 @@ def test_a_port_passes_frames_in_both_directions(pair: tuple[socket.socket, sock
     assert (port.fileno(), port.node, port.is_open) == (near.fileno(), port, True)
     far.send(pack_frame(0x7FF, False, b"abc"))
     far.send(pack_frame(0, True, b""))
+    far.send(pack_frame(1, True, bytes(range(64))))
     for flag in (ERROR_FLAG, REMOTE_FLAG):
         far.send(RAW_FRAME.pack(0x123 | flag, 8, bytes(8)))
     port.step(5, readable=False)
     assert received == []
     port.step(6, readable=True)
-    assert received == [(0x7FF, False, b"abc", 6), (0, True, b"", 6)]
+    assert received == [(0x7FF, False, b"abc", 6), (0, True, b"", 6), (1, True, bytes(range(64)), 6)]
     frame = SentFrame(10, 0x188, False, b"x")
-    due.append(frame)
+    due += [frame, SentFrame(10, 0x188, False, bytes(48))]
     port.step(10, readable=False)
-    assert far.recv(64) == pack_frame(0x188, False, b"x")
+    assert [far.recv(80) for _ in range(2)] == [pack_frame(0x188, False, data) for data in (bytes(48), b"x")]
     assert port.next_ns(10) == 10
     module.next_ns = lambda: 30
     assert port.next_ns(10) == 30
@@ -102,7 +103,7 @@ def test_a_port_passes_frames_in_both_directions(pair: tuple[socket.socket, sock
     port.step(101, readable=False)
     assert port.summary()["frames_refused"] == 2
     port.step(102, readable=True)  # a failed read is ignored: an interface can return
-    assert len(received) == 2
+    assert len(received) == 3
 
 
 def test_an_interface_that_is_not_there_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
