@@ -115,6 +115,8 @@ class SettingsTable:
     Its result has the type `Reports`. The script changes nothing."""
     # Returns the script that writes all settings to flash; None if the device has no flash for settings
     save: Callable[[Target], Any] | None = None
+    # Whether flash contains the settings after a confirmed save. False: some firmware confirms it without an effect
+    save_is_certain: bool = True
     # Returns the script that restarts the device and waits for it; None if imud cannot restart the device
     restart: Callable[[Target], Any] | None = None
     check: Callable[[Target, Mapping[str, Any]], None] = nothing_wrong

@@ -137,9 +137,9 @@ class FlashValues:
         """Note that the device started and now has the values of its flash, or that it saved unknown values."""
         self._values, self.follows = None, True
 
-    def saved(self, values: Mapping[str, Any]) -> None:
-        """Note that the device saved these values."""
-        self._values, self.follows = dict(values), False
+    def saved(self, values: Mapping[str, Any], *, is_certain: bool) -> None:
+        """Note that the device confirmed a save of these values. `is_certain`: whether the flash now contains them."""
+        self._values, self.follows = dict(values) if is_certain else None, False
 
     def state(self, name: str, actual: object) -> tuple[SavedState, object]:
         """Compare a present value with the flash. Return the state and the value in flash; None if it is unknown."""

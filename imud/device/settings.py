@@ -357,7 +357,7 @@ class DeviceSettings:
         self._reports, self.values, self.is_current = reports, report.values, True
         self._read_ns = now_ns = self._host.now_ns()
         if self._in_flash.follows:
-            self._in_flash.saved(self.values)
+            self._in_flash.saved(self.values, is_certain=True)
         if self.is_unsaved and not own and before != self._saved == self.values:
             self.is_unsaved = False  # a restart without a counter: the device has the values of its flash again
         text = printable_words(report.words)
@@ -489,11 +489,11 @@ class DeviceSettings:
 
         `changed`: the settings can differ from the last values.
         """
-        self.is_unsaved = False
-        if changed or not self.is_current:
+        self.is_unsaved, is_certain = False, self.table is None or self.table.save_is_certain
+        if changed or (is_certain and not self.is_current):
             self._in_flash.started()
         else:
-            self._in_flash.saved(self.values)
+            self._in_flash.saved(self.values, is_certain=is_certain)
 
     def changed(self, *, unsaved: bool) -> None:
         """Note that a command can have changed any setting, and whether the flash may not contain the change."""
@@ -559,7 +559,7 @@ class DeviceSettings:
             self.is_current = applying.heard
             if applying.saved:
                 self.is_unsaved = False
-                self._in_flash.saved(self.values)
+                self._in_flash.saved(self.values, is_certain=table.save_is_certain)
                 unreadable = {name: as_json(value) for name, value in self._all_written(table).items()}
                 self._files.flash.keep_unreadable(self.module, unreadable)
         if asked:  # a repair raises an event, which the log contains

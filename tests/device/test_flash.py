@@ -119,7 +119,7 @@ def test_a_backup_has_identity_time_and_settings_and_the_newest_are_kept(tmp_pat
 def test_a_value_is_lost_unless_flash_contains_it_and_unknown_values_are_named() -> None:
     flash = FlashValues()
     now = {"same": 1, "differs": 3, "unknown": 4, "unchanged": 5}
-    flash.saved({"same": 1, "differs": 2})
+    flash.saved({"same": 1, "differs": 2}, is_certain=True)
     before = {"same": 9, "differs": 3, "unknown": 9, "unchanged": 5}  # another program changed them without a save
     assert flash.lost(before, now) == ({"differs": 3, "unknown": 4}, ("unknown",))
     assert flash.lost(None, now) == ({"differs": 3}, ())

@@ -191,6 +191,37 @@ async def test_the_value_in_flash_is_inferred_from_starts_and_saves(bench: Modul
     assert await mode() == ("same", "9-axis", "9-axis")
 
 
+def test_a_save_that_may_have_no_effect_proves_nothing_about_the_flash(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = replace(FAKE_SETTINGS, save_is_certain=False)
+    driver = replace(FAKE_MODULE_DRIVER, device_settings=table)
+    monkeypatch.setattr(stream_transport, "DRIVERS", {**dict(DRIVERS), "fake-module": driver})
+    bench = ModuleBench()
+
+    async def mode() -> tuple[str, object, object]:
+        report = await bench.doing(bench.device.settings.report(fresh=False))
+        one = next(one for one in report.settings if one.name == "mode")
+        return str(one.saved_state), one.saved, one.actual
+
+    async def story() -> None:
+        await bench.until(lambda: bench.device.state is DeviceState.RUNNING)
+        await bench.pass_s(2)
+        await bench.doing(bench.device.act("save", {}))
+        assert await mode() == ("unknown", None, "6-axis")
+        applied = await bench.doing(bench.device.settings.apply({"mode": "9-axis"}, save=True))
+        assert applied.ends == ["save to flash: sent, not verified: imud cannot read the flash"]
+        assert await mode() == ("unknown", None, "9-axis")
+        bench.device.settings.forget()
+        await bench.doing(bench.device.act("save", {}))
+        await bench.doing(bench.device.settings.report(fresh=True))
+        assert await mode() == ("unknown", None, "9-axis")
+        await bench.pass_s(12)
+        bench.module.restart()
+        await bench.pass_s(2)
+        assert await mode() == ("same", "9-axis", "9-axis")  # the values after a start are the values of the flash
+
+    bench.play(story)
+
+
 @played(ModuleBench)
 async def test_without_declared_settings_imud_reads_the_settings_after_a_restart(bench: ModuleBench) -> None:
     await bench.pass_s(5)

@@ -133,7 +133,7 @@ def test_targets_and_link_of_the_row_and_an_address_outside_the_targets(name: st
     assert LINKS[driver.link].polled
     assert LINKS[driver.link].fits(driver)
     assert [link for link in LINKS if LINKS[link].fits(driver)] == [driver.link]
-    intervals_s = {"imu61x-i2c": [0, 10, 10], "imu61x-spi": [0, 10, 1], "hipnuc-modbus": [0, 10, 1]}[name]
+    intervals_s = {"imu61x-i2c": [0, 10, 10], "imu61x-spi": [0, 10, 1], "hipnuc-modbus": [0, 10, 1, 10]}[name]
     assert [poll.every_ns for poll in make(driver).polls] == [interval_s * 10**9 for interval_s in intervals_s]
     assert driver.update_ns(driver.settings()) == 0  # not known
     assert driver.update_ns(msgspec.convert({"update_hz": 200}, driver.settings)) == 5_000_000

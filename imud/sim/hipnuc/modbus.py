@@ -10,14 +10,15 @@ The simulator contains no I/O and reads no clock. It behaves as a real bus:
 - A new ID applies immediately, a new baud rate after save and restart. A restart loses unsaved settings.
 - `SlaveVariant` contains behavior that the manuals do not define.
 
-Assumptions: firmware 1.6.9 and newer has MAIN_STATUS, UPTIME and a quaternion of 0.0001 per count. The attitude is the
-truth. The device confirms mounting and levelling without an effect.
+Assumptions: firmware 1.6.9 and newer has MAIN_STATUS, UPTIME and a quaternion of 0.0001 per count. Firmware 1.7.0 and
+newer has HEAVE to SWAY_HZ and IDs up to 247. The attitude is the truth. The device confirms mounting and levelling
+without an effect.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
-from math import atan2, cos, degrees, sin
+from math import atan2, cos, degrees, sin, tau
 from random import Random
 from typing import Final, Literal
 
@@ -34,6 +35,7 @@ from imud.drivers.hipnuc.modbus.registers import (
     FACTORY_BAUD,
     FACTORY_ID,
     IDENTITY_FIRST,
+    MANUAL_ID_MAX,
     QUAT_OLD_PER_LSB,
     RANDOMISE_IDS,
     READ,
@@ -63,7 +65,9 @@ from imud.sim.ports.uart_wire import heard
 from imud.sim.sensor import Burst, Simulator, SimulatorOptions, motion_of, noise_of
 
 NEW_FIRMWARE: Final = 169
+NEWEST_FIRMWARE: Final = 170  # firmware with heave, and with IDs up to 247 (assumption)
 ILLEGAL_FUNCTION, ILLEGAL_VALUE, DEVICE_FAILURE = 1, 3, 4
+WAVE_HZ: Final = (0.1, 0.15, 0.2)  # frequencies of heave, surge and sway, Hz
 SETTINGS_FIRST: Final = BY_NAME["UART1_BAUD"].address
 STATUS_AT: Final = BY_NAME["MAIN_STATUS"].address
 SHORT_BLOCK_END: Final = BY_NAME["UPTIME"].address
@@ -88,6 +92,8 @@ class SlaveVariant:
     # Address of the confirmation of a new ID that applies immediately.
     address_reply: Literal["old", "new", "none"] = "old"
     rate_at_once: bool = False
+    saves: bool = True  # False: the device confirms a save without an effect, as newest firmware
+    saves_at_once: bool = False  # whether the device saves each written setting itself
     flash_ms: int = 0  # time of a save until its confirmation, ms
     refuses: frozenset[str] = frozenset()  # names of registers whose write the device refuses with exception 3
     ignores: frozenset[str] = frozenset()  # names of registers whose write the device confirms without an effect
@@ -124,6 +130,7 @@ class Slave:
     motion: Motion = field(default_factory=swing)
     noise: Noise | None = None
     skew_ppm: float = 20.0
+    wave_m: float = 0.0  # amplitude of heave, surge and sway, m; 0 if the product has no heave
     inclinometer: str = ""  # `single`, `dual`, or empty if the product has no inclinometer
     processing_ns: int = 300_000  # time from the end of a request to the start of its reply, ns (assumption)
     dead: bool = False
@@ -222,6 +229,7 @@ class Slave:
             accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, euler_rad=euler, quat_wxyz=quat, temperature_c=celsius,
             pressure_pa=pascal, incli_counts=incli_counts(truth, self.inclinometer),
             uptime_ms=self.uptime_ms(now_ns) if has_time else None,
+            **(self._heave(t_s) if has_time and self.firmware >= NEWEST_FIRMWARE else {}),
             quat_per_lsb=QUAT_PER_LSB if new else QUAT_OLD_PER_LSB,
         )  # fmt: skip
 
@@ -230,12 +238,13 @@ class Slave:
         known = [one for one in BY_NAME.values() if one.address == register and "W" in one.access]
         if not known:
             return ILLEGAL_ADDRESS
-        if value not in known[0].values or known[0].name in self.variant.refuses:
+        is_high = known[0].name == "MD_ID" and value > MANUAL_ID_MAX and self.firmware < NEWEST_FIRMWARE
+        if value not in known[0].values or known[0].name in self.variant.refuses or is_high:
             return ILLEGAL_VALUE
         if known[0].name in self.variant.ignores:
             return 0
         match known[0].name:
-            case "CTRL" if value == SAVE:
+            case "CTRL" if value == SAVE and self.variant.saves:
                 self.flash = self.settings
                 self.writes_to_flash += 1
             case "CTRL" if value == FACTORY_RESET:
@@ -250,7 +259,14 @@ class Slave:
                 self._number(value)
             case "HEADING_MODE":
                 self.settings = replace(self.settings, heading_mode=value)
+        if self.variant.saves_at_once and known[0].name != "CTRL":
+            self.flash = self.settings
         return 0
+
+    def _heave(self, t_s: float) -> dict[str, Vector3]:
+        """Return heave, surge and sway, and their frequencies; zeros if the product has no heave."""
+        x, y, z = (self.wave_m * sin(tau * hz * t_s) for hz in WAVE_HZ)
+        return {"heave_m": (x, y, z), "heave_hz": WAVE_HZ if self.wave_m else (0.0, 0.0, 0.0)}
 
     def _custom(self, request: bytes, random: Random) -> None:
         if len(request) == BY_SERIAL.size and request[1:3] == SET_ID_BY_SERIAL.to_bytes(2, "big"):

@@ -8,6 +8,9 @@ or does not reply, imud reads the 24 registers of the manual. The exception "ill
 another device is connected. Other exceptions and missing replies can have other causes. They count only before the
 first reply to the longer block, and imud tries the longer block again after the next identification.
 
+Newer firmware has HEAVE to SWAY_HZ at 0x4E to 0x53. Products without heave lack them or send zeros (assumption). imud
+reads them every ten seconds, and extends the block to 0x53 after the first value that is not zero.
+
 Two scales depend on the device. imud decides them by the values and keeps them:
 - Quaternion: the scale that gives unit length.
 - Inclinometer: two axes (±180°, ±90°, 180/32768 degrees per count) or one axis (0 … 360°, 360/32768). Y is reserved in
@@ -27,6 +30,7 @@ from typing import Annotated, Final, Literal
 from msgspec import Meta
 
 from imud.contracts.codec import BadFrame, BadReason, Poll, PolledEvent, Vanished
+from imud.contracts.script import Transfer
 from imud.drivers.hipnuc.common import (
     ACCEL_M_S2_PER_LSB,
     EULER_RAD_PER_LSB,
@@ -45,8 +49,12 @@ from imud.drivers.hipnuc.modbus.registers import (
     BLOCK_FIRST,
     BLOCK_REGISTERS,
     BY_NAME,
+    HEAVE_HZ_PER_LSB,
+    HEAVE_M_PER_LSB,
+    HEAVE_REGISTERS,
     INCLI_DUAL_RAD_PER_LSB,
     INCLI_SINGLE_RAD_PER_LSB,
+    LONG_BLOCK_REGISTERS,
     QUAT_OLD_PER_LSB,
     SHORT_BLOCK_REGISTERS,
     read_registers,
@@ -70,7 +78,9 @@ from imud.model.units import NS_PER_S
 # accel, gyro, mag, roll pitch yaw, temperature, pressure, quaternion wxyz, inclinometer: registers 0x34 … 0x4B
 BLOCK: Final = struct.Struct(">3h3h3h3ihi4h2h")
 UPTIME: Final = struct.Struct(">I")  # registers 0x4C … 0x4D, ms
+HEAVE: Final = struct.Struct(">3h3H")  # registers 0x4E … 0x53: heave, surge, sway, their frequencies
 DATA_AT: Final = 3
+HEAVE_AT: Final = DATA_AT + BLOCK.size + UPTIME.size
 # Time between two reads of the serial number, ns: another device can replace the device without a gap
 CHECK_NS: Final = 10 * NS_PER_S
 # Number of missing replies in a row before imud tries the shorter block. After three, the device counts as missing.
@@ -78,13 +88,16 @@ SILENT_MAX: Final = 2
 PITCHED_RAD: Final = radians(1.0)  # minimum pitch for a decision: a dual-axis inclinometer then shows 182 counts
 
 READ_BLOCK: Final = read_registers(BLOCK_FIRST, BLOCK_REGISTERS)
+READ_LONG_BLOCK: Final = read_registers(BLOCK_FIRST, LONG_BLOCK_REGISTERS)
 READ_SHORT_BLOCK: Final = read_registers(BLOCK_FIRST, SHORT_BLOCK_REGISTERS)
 READ_SERIAL: Final = read_registers(BY_NAME["SN"].address, BY_NAME["SN"].count)
+READ_HEAVE: Final = read_registers(BY_NAME["HEAVE"].address, HEAVE_REGISTERS)
 READ_STATUS: Final = read_registers(BY_NAME["MAIN_STATUS"].address, BY_NAME["MAIN_STATUS"].count)
 # Time between two reads of MAIN_STATUS, which is not in the block: maximum age of `status` of a sample, ns
 STATUS_NS: Final = NS_PER_S
 RESERVED_STATUS: Final = 1 << 13  # lowest reserved bit of MAIN_STATUS: with it, the register has filler bytes
-_SAMPLE, _SERIAL, _STATUS = 0, 1, 2
+_SAMPLE, _SERIAL, _STATUS, _HEAVE = 0, 1, 2, 3
+_SHORT, _USUAL, _LONG = READ_SHORT_BLOCK, READ_BLOCK, READ_LONG_BLOCK
 
 
 class HipnucModbusOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -114,7 +127,7 @@ class HipnucModbusCodec:
         self._stale_before = 0
         self._just_shortened = False
         self._book = PolledFrameDecoder(ledger, READ_BLOCK.read_bytes)
-        self._read_block(short=False)
+        self._read_block(_USUAL)
         self.reset()
 
     @property
@@ -128,6 +141,8 @@ class HipnucModbusCodec:
             return self._decode_serial(data)
         if poll == _STATUS:
             return self._decode_status(data)
+        if poll == _HEAVE:
+            return self._decode_heave(data)
         self._silent = 0
         if is_exception(data):
             return self._decode_exception(data)
@@ -135,17 +150,15 @@ class HipnucModbusCodec:
 
     def on_silence(self, poll: int) -> Sequence[PolledEvent]:
         """Use the shorter block after SILENT_MAX missing replies, if the longer block never had a reply."""
-        if poll != _SAMPLE or self._short or self._answered:
+        if poll != _SAMPLE or self._block is _SHORT or self._answered:
             return ()
         self._silent += 1
-        if self._silent < SILENT_MAX:
-            return ()
-        return self._shorten(sure=False, why="no reply to a read of the registers up to 0x4D")
+        return self._shorten(sure=False, why="no reply") if self._silent >= SILENT_MAX else ()
 
     def reset(self) -> None:
         """Forget scales and serial number, because another device may be connected."""
-        if self._short and not self._sure and not self._just_shortened:
-            self._read_block(short=False)
+        if self._block is _SHORT and not self._sure and not self._just_shortened:
+            self._read_block(_USUAL)
         self._just_shortened = False
         self._silent = 0
         self._book.reset()
@@ -156,27 +169,30 @@ class HipnucModbusCodec:
 
     def _decode_exception(self, data: bytes) -> Sequence[PolledEvent]:
         missing = data[2] == ILLEGAL_ADDRESS
-        if not self._short and (missing or not self._answered):
+        if self._block is not _SHORT and (missing or not self._answered):
             self._book.add_reply(data, good=True)
-            return self._shorten(sure=missing, why=f"{exception_text(data[2])} for a read of the registers up to 0x4D")
+            return self._shorten(sure=missing, why=exception_text(data[2]))
         self.ledger.bytes_in += len(data)
         self.ledger.bytes_in_bad_frames += len(data)
         self.ledger.frames_bad_content += 1
         return (BadFrame(BadReason.CONTENT, data),)
 
     def _shorten(self, *, sure: bool, why: str) -> Sequence[PolledEvent]:
-        self._read_block(short=True, sure=sure)
+        if self._block is _LONG:
+            self._read_block(_USUAL)
+            return (Vanished(f"{why} for a read of the registers up to 0x53; imud reads up to 0x4D, without heave"),)
+        self._read_block(_SHORT, sure=sure)
         self._just_shortened = True
-        return (Vanished(f"{why}; imud reads up to 0x4B, without device time"),)
+        return (Vanished(f"{why} for a read of the registers up to 0x4D; imud reads up to 0x4B, without device time"),)
 
-    def _read_block(self, *, short: bool, sure: bool = False) -> None:
+    def _read_block(self, block: Transfer, *, sure: bool = False) -> None:
         """Read this block in all following polls. `sure`: the device reported that it has no other block."""
-        self._short, self._sure = short, sure
+        self._block, self._sure = block, sure
         self._just_shortened = self._answered = False
         self._silent = 0
-        self.polls: Sequence[Poll] = _polls(short=short)
+        self.polls: Sequence[Poll] = _polls(block)
         self._stale_before = self.stale
-        self._book = PolledFrameDecoder(self.ledger, (READ_SHORT_BLOCK if short else READ_BLOCK).read_bytes)
+        self._book = PolledFrameDecoder(self.ledger, block.read_bytes)
 
     def _decode_serial(self, data: bytes) -> Sequence[PolledEvent]:
         whole = len(data) == READ_SERIAL.read_bytes and is_whole(data) and not absence(data)
@@ -187,7 +203,7 @@ class HipnucModbusCodec:
         self._serial = serial
         if not before or serial == before:
             return ()
-        self._read_block(short=False)
+        self._read_block(_USUAL)
         return (Vanished(f"another device: serial number {serial.hex().upper()}, was {before.hex().upper()}"),)
 
     def _decode_status(self, data: bytes) -> Sequence[PolledEvent]:
@@ -197,6 +213,15 @@ class HipnucModbusCodec:
             status = int.from_bytes(data[DATA_AT:-CRC_BYTES], "big")
             self._status = status if status < RESERVED_STATUS else None
         return ()
+
+    def _decode_heave(self, data: bytes) -> Sequence[PolledEvent]:
+        whole = len(data) == READ_HEAVE.read_bytes and is_whole(data) and data[1] == READ_HOLDING
+        self._book.add_reply(data, good=whole or is_exception(data))
+        values = data[DATA_AT:-CRC_BYTES]
+        if not whole or values in (bytes(len(values)), b"\xff" * len(values)):
+            return ()
+        self._read_block(_LONG)
+        return (Vanished("the device measures heave; imud reads up to 0x53"),)
 
     def _bad(self, data: bytes) -> BadReason | None:
         if not is_whole(data):
@@ -208,7 +233,7 @@ class HipnucModbusCodec:
         (
             ax, ay, az, gx, gy, gz, mx, my, mz, roll, pitch, yaw, celsius, pressure, qw, qx, qy, qz, ix, iy,
         ) = BLOCK.unpack_from(data, DATA_AT)  # fmt: skip
-        has_time = len(data) == READ_BLOCK.read_bytes
+        has_time, has_heave = self._block is not _SHORT, self._block is _LONG
         self._answered = True
         a, w, angle = ACCEL_M_S2_PER_LSB, GYRO_RAD_S_PER_LSB, EULER_RAD_PER_LSB
         euler = possible_angles((roll * angle, pitch * angle, yaw * angle))
@@ -218,6 +243,7 @@ class HipnucModbusCodec:
             vector_of(ax, ay, az, a), vector_of(gx, gy, gz, w), field_of(mx, my, mz),
             self._quaternion(qw, qx, qy, qz), euler, None if celsius == pressure in (0, -1) else temperature,
             pressure_of(pressure * PRESSURE_PA_PER_LSB), self._inclination(ix, iy, euler), self._status,
+            heave_m=HEAVE.unpack_from(data, HEAVE_AT)[0] * HEAVE_M_PER_LSB if has_heave else None,
         ), euler is not None and temperature is not None  # fmt: skip
 
     def _quaternion(self, w: int, x: int, y: int, z: int) -> Quaternion | None:
@@ -249,10 +275,10 @@ def _dual_y_rad(roll_rad: float, pitch_rad: float) -> float:
     return atan2(sin(pitch_rad), cos(pitch_rad) * cos(roll_rad))
 
 
-def _polls(*, short: bool) -> Sequence[Poll]:
-    # firmware without UPTIME has no MAIN_STATUS either
-    serial = Poll(READ_SERIAL, CHECK_NS)
-    return (Poll(READ_SHORT_BLOCK), serial) if short else (Poll(READ_BLOCK), serial, Poll(READ_STATUS, STATUS_NS))
+def _polls(block: Transfer) -> Sequence[Poll]:
+    # firmware without UPTIME has no MAIN_STATUS and no HEAVE either
+    polls = (Poll(block), Poll(READ_SERIAL, CHECK_NS), Poll(READ_STATUS, STATUS_NS), Poll(READ_HEAVE, CHECK_NS))
+    return polls[: {_SHORT: _STATUS, _USUAL: _HEAVE + 1, _LONG: _HEAVE}[block]]
 
 
 # --- encoder for simulated devices ------------------------------------------------------------------------------
@@ -270,8 +296,13 @@ def pack_block(
     uptime_ms: int | None,
     incli_counts: tuple[int, int] = (0, 0),
     quat_per_lsb: float = QUAT_PER_LSB,
+    heave_m: Vector3 | None = None,
+    heave_hz: Vector3 = (0.0, 0.0, 0.0),
 ) -> bytes:
-    """Return registers 0x34 … 0x4D from SI values, clipped to their range; up to 0x4B without `uptime_ms`."""
+    """Return registers 0x34 … 0x4D from SI values, clipped to their range; up to 0x4B without `uptime_ms`.
+
+    With `heave_m` (heave, surge, sway) and `heave_hz` (their frequencies), return the registers up to 0x53.
+    """
     data = BLOCK.pack(
         *(counts_of(a / ACCEL_M_S2_PER_LSB, 16) for a in accel_m_s2),
         *(counts_of(w / GYRO_RAD_S_PER_LSB, 16) for w in gyro_rad_s),
@@ -282,4 +313,9 @@ def pack_block(
         *(counts_of(q / quat_per_lsb, 16) for q in quat_wxyz),
         *incli_counts,
     )
-    return data if uptime_ms is None else data + UPTIME.pack(uptime_ms % 2**32)
+    if uptime_ms is not None:
+        data += UPTIME.pack(uptime_ms % 2**32)
+    if heave_m is None:
+        return data
+    frequencies = (min(max(round(hz / HEAVE_HZ_PER_LSB), 0), 0xFFFF) for hz in heave_hz)
+    return data + HEAVE.pack(*(counts_of(value / HEAVE_M_PER_LSB, 16) for value in heave_m), *frequencies)

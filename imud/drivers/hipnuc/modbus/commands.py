@@ -29,6 +29,7 @@ from imud.drivers.hipnuc.modbus.registers import (
     ID_MAX,
     IDENTITY_FIRST,
     IDENTITY_REGISTERS,
+    MANUAL_ID_MAX,
     NAME_BYTES,
     SERIAL_AT,
     SERIAL_BYTES,
@@ -159,13 +160,13 @@ def factory_reset(places: tuple[int, ...], line_baud: int) -> TransferScript[str
 
 
 def change_address(at: int, new: int) -> TransferScript[Written]:
-    """Set the address of the device at address `at`, 1 … 128, and follow it.
+    """Set the address of the device at address `at`, 1 … 247, and follow it.
 
     Raises BadArgument for an address in use on the bus, DeviceRefused, and NoReply for a device without reply at both
     addresses (imud then commands it back).
     """
     if new not in BY_NAME["MD_ID"].values:
-        raise BadArgument(f"address: expected 1 … {ID_MAX}, got {new!r}; a higher address requires the serial number")
+        raise BadArgument(f"address: expected 1 … {ID_MAX}, got {new!r}")
     serial = yield from _own_serial()
     yield from _refuse_taken(new, serial, at)
     yield from set_id(new)
@@ -176,7 +177,7 @@ def change_address(at: int, new: int) -> TransferScript[Written]:
         if (yield from _is_at(serial, at)):
             (now,) = yield from read(BY_NAME["MD_ID"])
             if now != new:
-                raise DeviceRefused(f"MD_ID: expected {new} after the write, got {now}")
+                raise DeviceRefused(f"MD_ID: expected {new} after the write, got {now}{_id_hint(new)}")
             return Written.VERIFIED if new == at else Written.PENDING
     with suppress(TransferError):
         yield replace(write_register(BY_NAME["MD_ID"].address, at), at=new)
@@ -199,13 +200,22 @@ def set_baud(baud: BaudRate) -> TransferScript[Written]:
 
 
 def set_id(new_id: int) -> TransferScript[None]:
-    """Set the address, 1 … 128. The confirmation may come from the old address, from the new address, or not at all.
+    """Set the address, 1 … 247. The confirmation may come from the old address, from the new address, or not at all.
 
-    Raises BadArgument for a higher address, which requires the serial number; DeviceRefused.
+    Raises BadArgument, DeviceRefused.
     """
     if new_id not in BY_NAME["MD_ID"].values:
-        raise BadArgument(f"MD_ID: expected 1 … {ID_MAX}, got {new_id!r}; a higher address requires the serial number")
-    return _write_unheard(BY_NAME["MD_ID"], new_id)
+        raise BadArgument(f"MD_ID: expected 1 … {ID_MAX}, got {new_id!r}")
+    try:
+        yield from _write_unheard(BY_NAME["MD_ID"], new_id)
+    except DeviceRefused as error:
+        raise DeviceRefused(f"{error}{_id_hint(new_id)}") from error
+
+
+def _id_hint(new_id: int) -> str:
+    """Return the next step if a device rejects an address above the range of the manual; empty for other addresses."""
+    hint = f"; older firmware accepts 1 … {MANUAL_ID_MAX}: try `imud modbus assign PORT --serial SN --id {new_id}`"
+    return hint if new_id > MANUAL_ID_MAX else ""
 
 
 def set_heading_mode(mode: AttitudeMode) -> TransferScript[Written]:

@@ -184,6 +184,7 @@ SETTINGS: Final = SettingsTable(
     },
     read=lambda _target, _names: commands.read_settings(),
     save=lambda _target: commands.save(),
+    save_is_certain=False,  # the newest firmware ignores the command
     restart=lambda target: commands.restart(commands.places_of(target), target.baud),
     check=_check,
 )

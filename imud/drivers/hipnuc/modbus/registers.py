@@ -3,7 +3,8 @@
 Values of two registers have the high word first. Differences from the table in the manual: the quaternion is signed;
 its scale is 2⁻¹⁵ in older firmware and 0.0001 in newer firmware (the codec decides by the values). 0.011 of the
 inclinometer is 360/32768 or 180/32768, by product. MAIN_STATUS, MAG_CALIBRATION, MAG_PROGRESS and UPTIME are registers
-of newer firmware, as in the vendor's programs.
+of newer firmware, as in the vendor's programs. The registers from HEAVE to SWAY_HZ and the IDs 129 … 247 are from the
+vendor's documents of newer firmware.
 """
 
 import struct
@@ -66,7 +67,10 @@ BaudRate = Literal[4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 9216
 # Baud rates by their code in UART1_BAUD (section 4.3.2). Code 9 is from the vendor's programs, not from the manual.
 BAUD_RATES: Final[tuple[BaudRate, ...]] = get_args(BaudRate)
 FACTORY_BAUD: Final[BaudRate] = 115200
-ID_MAX: Final = 128  # maximum ID of register MD_ID; higher IDs require the serial number
+ID_MAX: Final = SLAVES.stop - 1  # maximum ID of register MD_ID in newer firmware
+MANUAL_ID_MAX: Final = 128  # maximum ID of register MD_ID in the manual; higher IDs require the serial number
+HEAVE_M_PER_LSB: Final = 0.01
+HEAVE_HZ_PER_LSB: Final = 0.01
 
 _R, _W, _RW = Access.READ, Access.WRITE, Access.BOTH
 
@@ -101,6 +105,12 @@ REGISTERS: Final = (
     Register("INCLI_X", 0x4A, "i16", 1, _R, "inclinometer X, ±180° or 0 … 360°, scale by product", unit="rad"),
     Register("INCLI_Y", 0x4B, "i16", 1, _R, "inclinometer Y, ±90°; reserved in single-axis products", unit="rad"),
     Register("UPTIME", 0x4C, "u32", 2, _R, "time since power-on", 0.001, "s"),
+    Register("HEAVE", 0x4E, "i16", 1, _R, "heave", HEAVE_M_PER_LSB, "m"),
+    Register("SURGE", 0x4F, "i16", 1, _R, "surge", HEAVE_M_PER_LSB, "m"),
+    Register("SWAY", 0x50, "i16", 1, _R, "sway", HEAVE_M_PER_LSB, "m"),
+    Register("HEAVE_HZ", 0x51, "u16", 1, _R, "frequency of the heave", HEAVE_HZ_PER_LSB, "Hz"),
+    Register("SURGE_HZ", 0x52, "u16", 1, _R, "frequency of the surge", HEAVE_HZ_PER_LSB, "Hz"),
+    Register("SWAY_HZ", 0x53, "u16", 1, _R, "frequency of the sway", HEAVE_HZ_PER_LSB, "Hz"),
     Register("PNAME", 0x70, "text", 8, _R, "product, ASCII"),
     Register("SW_VERSION", 0x78, "u16", 1, _R, "firmware, 152 for 1.5.2"),
     Register("BL_VERSION", 0x79, "u16", 1, _R, "boot loader"),
@@ -112,7 +122,10 @@ REGISTERS: Final = (
 BY_NAME: Final = {register.name: register for register in REGISTERS}
 
 BLOCK_FIRST: Final = BY_NAME["ACCX"].address
-# 0x34 … 0x4D: all measured values and the device time
+HEAVE_REGISTERS: Final = 6  # HEAVE … SWAY_HZ
+# 0x34 … 0x53: the block of products with heave
+LONG_BLOCK_REGISTERS: Final = BY_NAME["HEAVE"].address + HEAVE_REGISTERS - BLOCK_FIRST
+# 0x34 … 0x4D: all other measured values and the device time
 BLOCK_REGISTERS: Final = BY_NAME["UPTIME"].address + 2 - BLOCK_FIRST
 # 0x34 … 0x4B: the block of firmware without UPTIME
 SHORT_BLOCK_REGISTERS: Final = BY_NAME["UPTIME"].address - BLOCK_FIRST

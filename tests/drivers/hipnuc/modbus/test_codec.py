@@ -223,7 +223,9 @@ def test_axes_of_the_inclinometer_are_found_kept_or_configured() -> None:
         assert measured(codec(), block(mag_t=mag_t)).mag_t == pytest.approx(mag_t, abs=2e-8)
 
     made = codec()
-    assert [poll.transfer.sends[0].hex() for poll in made.polls] == ["030034001a", "03007f0004", "0300090001"]
+    assert [poll.transfer.sends[0].hex() for poll in made.polls] == [
+        "030034001a", "03007f0004", "0300090001", "03004e0006",
+    ]  # fmt: skip
     assert made.polls[2].every_ns == 1_000_000_000
     assert measured(made, block()).status is None
     assert made.decode(2, framed(9, registers_reply(b"\x02\x08"))) == ()
@@ -234,6 +236,35 @@ def test_axes_of_the_inclinometer_are_found_kept_or_configured() -> None:
     assert measured(made, block(uptime_ms=8)).status is None
     made.decode(0, EXCEPTION)
     assert len(made.polls) == 2  # firmware without UPTIME has no MAIN_STATUS
+    assert made.ledger.closes()
+
+
+def test_heave_extends_the_block_by_hand() -> None:
+    """-1.23 m is FF85, 0.50 m 0032, 0 m 0000; 0.12 Hz is 000C, 655.35 Hz FFFF."""
+    made, words = codec(), "ff85 0032 0000 000c 0000 ffff"
+    for nothing in ("0000" * 6, "ffff" * 6):  # a product without heave
+        assert made.decode(3, framed(9, registers_reply(bytes.fromhex(nothing)))) == ()
+    heave = framed(9, registers_reply(bytes.fromhex(words)))
+    assert made.decode(3, EXCEPTION) == made.decode(3, heave[:-1]) == made.decode(3, heave[:-1] + b"\0") == ()
+    assert measured(made, block()).heave_m is None
+    assert made.decode(3, heave) == (Vanished("the device measures heave; imud reads up to 0x53"),)
+    assert [poll.transfer.sends[0].hex() for poll in made.polls] == ["0300340020", "03007f0004", "0300090001"]
+    made.reset()
+    long = framed(9, registers_reply(block(uptime_ms=9)[3:-2] + bytes.fromhex(words)))
+    found = measured(made, long)
+    assert found.heave_m == pytest.approx(-1.23)
+    assert (found.dev_ticks, found.size_bytes) == (9, 69)
+    (event,) = made.decode(0, block())  # another device without the registers can reply with a shorter block
+    assert isinstance(event, Vanished)
+    (event,) = made.decode(0, EXCEPTION)
+    assert "; imud reads up to 0x4D, without heave" in str(event)
+    assert made.polls[0].transfer == READ_BLOCK
+    assert measured(made, block(uptime_ms=10)).dev_ticks == 10
+    packed = modbus.pack_block(
+        accel_m_s2=(0, 0, 0), gyro_rad_s=(0, 0, 0), mag_t=(0, 0, 0), euler_rad=(0, 0, 0), quat_wxyz=(1, 0, 0, 0),
+        temperature_c=0, pressure_pa=0, uptime_ms=0, heave_m=(-1.23, 0.5, 0), heave_hz=(0.12, 0, 655.35),
+    )  # fmt: skip
+    assert packed[52:].hex(" ", 2) == words
     assert made.ledger.closes()
 
 

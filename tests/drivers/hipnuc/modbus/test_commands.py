@@ -2,6 +2,7 @@
 Every request in the manual, byte by byte, and rejected requests."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -51,6 +52,14 @@ def test_settings_are_read_back_and_saved_only_on_request(bench: ModbusBench) ->
     before_ns = bench.now_ns
     bench.run(commands.save())
     assert bench.now_ns - before_ns >= bench.slave.variant.flash_ms * 1_000_000
+    # the newest firmware confirms a save without an effect: it loses the value, or it has already saved it itself
+    for variant, kept in ((SlaveVariant(saves=False), 0), (SlaveVariant(saves=False, saves_at_once=True), 1)):
+        newest = ModbusBench(module(7, variant=variant))
+        newest.run(commands.set_heading_mode(NINE))
+        newest.run(commands.save())
+        restarted(newest)
+        assert newest.run(commands.read(BY_NAME["HEADING_MODE"])) == (kept,)
+    assert not SETTINGS.save_is_certain
     with pytest.raises(TransferError):
         ModbusBench(module(7, variant=SlaveVariant(flash_ms=2600))).run(commands.save())
     slow = ModbusBench(module(7, processing_ns=2_000_000_000))
@@ -90,8 +99,16 @@ def test_addresses_that_are_taken_not_accepted_or_lost() -> None:
     bench = ModbusBench(module(7), module(12, mute=2))
     with pytest.raises(BadArgument, match="in use"):
         bench.run(commands.change_address(7, 12))
-    with pytest.raises(BadArgument, match=r"1 … 128, got 129"):
-        ModbusBench().run(commands.change_address(7, 129))
+    with pytest.raises(BadArgument, match=r"1 … 247, got 248"):
+        ModbusBench().run(commands.change_address(7, 248))
+    for firmware, at in ((169, 7), (170, 247)):  # firmware of the manual rejects an address above 128
+        bench = ModbusBench(module(7, firmware=firmware))
+        with nullcontext() if at == 247 else pytest.raises(DeviceRefused, match="assign PORT --serial SN --id 247"):
+            assert bench.run(commands.change_address(7, 247)) is Written.VERIFIED
+        assert (bench.at, bench.slave.address) == (at, at)
+    bench = ModbusBench(module(7, firmware=170, variant=SlaveVariant(ignores=frozenset({"MD_ID"}))))
+    with pytest.raises(DeviceRefused, match="got 7; older firmware accepts 1 … 128: try"):
+        bench.run(commands.change_address(7, 129))
     bench = ModbusBench(module(7), module(80))
     with pytest.raises(BadArgument, match="address 80 is in use"):
         bench.run(commands.factory_reset((7,), BAUD))
@@ -257,7 +274,7 @@ def test_actions_without_an_address_reading_by_name_and_unsupported_values() -> 
     assert all(verb.help for verb in DRIVER.verbs.values())
     assert [str(one) for one in parameters_of(DRIVER.verbs["level"])] != []
     for name, given, names in (
-        ("address", {"address": 129}, "from 1 to 128"),
+        ("address", {"address": 248}, "from 1 to 247"),
         ("address", {}, "address is a setting: imud settings bow --set address=ADDRESS"),
         ("baud", {"baud": 12345}, "4800, 9600"), ("mounting", {"mounting": 1}, "level"),
         ("attitude_mode", {"axes": 1}, '"6-axis", "9-axis"'), ("level", {"level": 3}, "automatic"),
@@ -339,7 +356,7 @@ def test_the_table_has_effects_and_types() -> None:
     for name, values in VALUES.items():
         for value in values:
             assert msgspec.convert(value, SETTINGS.table[name].type) == value
-    for name, wrong in (("mode", 9), ("mounting", "z_up"), ("baud", 12345), ("address", 129), ("address", 0)):
+    for name, wrong in (("mode", 9), ("mounting", "z_up"), ("baud", 12345), ("address", 248), ("address", 0)):
         with pytest.raises(msgspec.ValidationError):
             msgspec.convert(wrong, SETTINGS.table[name].type)
 
@@ -445,7 +462,7 @@ def test_requests_to_all_and_invalid_requests() -> None:
         (lambda: registers.set_id_by_serial("047D955F8D2A1708", 248), "1 … 247"),
         (lambda: registers.randomise_ids(9, 9), "below the highest"),
         (lambda: registers.randomise_ids(0, 9), "1 … 247"), (lambda: registers.randomise_ids(True, 9), "1 … 247"),
-        (lambda: next(commands.set_id(129)), "1 … 128"), (lambda: next(commands.set_id(0)), "1 … 128"),
+        (lambda: next(commands.set_id(248)), "1 … 247"), (lambda: next(commands.set_id(0)), "1 … 247"),
         (lambda: registers.read_registers(0, 126), "1 … 125"), (lambda: registers.read_registers(0xFFFF, 2), "0xFFFF"),
         (lambda: registers.write_register(0, 0x10000), "0xFFFF"),
     ):  # fmt: skip
@@ -464,7 +481,7 @@ def test_table_of_registers() -> None:
         for address in range(register.address, register.address + register.count)
     ]
     assert sorted(taken) == taken == list(dict.fromkeys(taken))
-    assert set(range(0x34, 0x4E)) <= set(taken)
+    assert set(range(0x34, 0x54)) <= set(taken)
     assert {0x00, 0x04, 0x05, 0x06, 0x09, 0x0A, 0x0B, 0x70, 0x78, 0x79, 0x7F, 0x82, 0xA5, 0xA6} <= set(taken)
     assert all(register.values for register in registers.REGISTERS if register.access is not registers.Access.READ)
     assert all(register.meaning for register in registers.REGISTERS)
