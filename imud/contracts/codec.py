@@ -113,6 +113,7 @@ class CanCodec(Protocol):
 
     ledger: Ledger
     unknown: dict[int, int]  # number of frames of each unknown type that the device may have sent, by identifier or PGN
+    counts_losses: bool  # whether the codec counts the lost samples; False: the clock counts them by the device counter
 
     @property
     def problem(self) -> str:

@@ -10,6 +10,7 @@ DRIVERS: Registry[Driver] = Registry(
         "hipnuc-modbus": "imud.drivers.hipnuc.modbus.driver:DRIVER",
         "hipnuc-canopen": "imud.drivers.hipnuc.canopen.driver:DRIVER",
         "hipnuc-j1939": "imud.drivers.hipnuc.j1939.driver:DRIVER",
+        "hipnuc-canfd": "imud.drivers.hipnuc.canfd:DRIVER",
         "hipnuc-nmea2000": "imud.drivers.hipnuc.nmea2000:DRIVER",
         "imu61x-uart": "imud.drivers.imu61x.uart.driver:DRIVER",
         "imu61x-i2c": "imud.drivers.imu61x.i2c:DRIVER",

@@ -487,6 +487,10 @@ class CanPath(SamplePath):
         if was_idle and now_ns - self.last_data_ns >= FLUSH_PERIODS * self.period_ns:
             self._take_incomplete(samples)
 
+    def _add_loss(self, count: int) -> None:
+        if not self.codec.counts_losses:
+            super()._add_loss(count)
+
     def _reset(self, samples: list[Sample]) -> None:
         self._take_incomplete(samples)
         self.codec.reset()

@@ -19,6 +19,7 @@ CAN_SIMULATORS: Registry[CanSimulator] = Registry(
     "simulator on CAN",
     {
         "hipnuc-canopen": "imud.sim.hipnuc.canopen:SIMULATOR",
+        "hipnuc-canfd": "imud.sim.hipnuc.j1939:CANFD_SIMULATOR",
         "hipnuc-j1939": "imud.sim.hipnuc.j1939:SIMULATOR",
         "hipnuc-nmea2000": "imud.sim.hipnuc.nmea2000:SIMULATOR",
         "imu61x-can": "imud.sim.imu61x.can:SIMULATOR",

@@ -88,12 +88,14 @@ class FrameWire:
         self._free_ns = free_ns
         self._waiting: deque[SentFrame] = deque()
 
+    def frame_time_ns(self, extended: bool, data_bytes: int) -> int:
+        """Return the time of a frame on the wire, ns."""
+        more_bytes = max(data_bytes - DATA_BYTES_MAX, 0)
+        return (self.extended_ns if extended else self.frame_ns) + more_bytes * self._byte_ns
+
     def send(self, ready_ns: int, can_id: int, extended: bool, data: bytes, sample_ns: int | None = None) -> None:
         """Queue a frame that is ready at `ready_ns`."""
-        on_wire_ns = (self.extended_ns if extended else self.frame_ns) + max(
-            len(data) - DATA_BYTES_MAX, 0
-        ) * self._byte_ns
-        self._free_ns = max(ready_ns, self._free_ns) + on_wire_ns
+        self._free_ns = max(ready_ns, self._free_ns) + self.frame_time_ns(extended, len(data))
         self._waiting.append(SentFrame(self._free_ns, can_id, extended, data, sample_ns))
 
     def sent(self, now_ns: int) -> list[SentFrame]:

@@ -299,7 +299,7 @@ async def test_a_silent_device_reports_the_received_frames(bench: CanDeviceBench
 @pytest.mark.parametrize(
     ("driver", "can_id", "extended", "words"),
     [
-        ("hipnuc-j1939", 0x0CFF6008, True, "(PGN 65376 (0xFF60)), but no sample; imud decodes FF34, "),
+        ("hipnuc-j1939", 0x0CFF6008, True, "(PGN 65376 (0xFF60)), but no sample; imud decodes FF10, "),
         ("hipnuc-canopen", 0x508, False, "(COB-ID 0x508), but no sample; imud decodes TPDO 1 "),
         ("hipnuc-nmea2000", 0x0DF80123, True, "(PGN 129025 (0x1F801)), but no sample; imud decodes PGN 127250 "),
         ("imu61x-can", 201, False, "(identifier 201), but no sample; imud decodes the identifiers base_id "),

@@ -94,7 +94,7 @@ def test_calibrations_filters_steps_on_the_wire_and_figures_by_the_longest_begin
     for name, limit_deg in (("hipnuc-modbus", 15), ("hipnuc-uart", 5)):  # sections 4.3.5 and 2.2.4
         assert f"within {limit_deg}° of level" in DRIVERS[name].calibrations["accelerometer_level"].help
     assert {name for name, driver in DRIVERS.items() if driver.calibrations} == {
-        "hipnuc-uart", "hipnuc-modbus", "hipnuc-canopen", "hipnuc-j1939", "imu61x-uart",
+        "hipnuc-uart", "hipnuc-modbus", "hipnuc-canopen", "hipnuc-j1939", "hipnuc-canfd", "imu61x-uart",
     }  # fmt: skip
 
     for name in (name for name in DRIVERS if name.startswith("imu61x")):
@@ -160,6 +160,7 @@ def test_alarm_angles_are_within_half_a_turn() -> None:
 COUNTERS = {
     "hipnuc-uart": (NS_PER_MS, 1 << 32, 8192),  # 3.3.1: system_time is uint32 in ms, pps_sync_stamp rolls over at 8192
     "hipnuc-modbus": (NS_PER_MS, 1 << 32, 0),  # the registers of the system time, as the serial port
+    "hipnuc-canfd": (NS_PER_MS, 1 << 32, 0),  # FF5A has uint32 in ms; imud uses the ms of the uint64 of FF5B
     "imu61x-uart": (NS_PER_US, 1 << 32, 0),  # table 4: timer is uint32 in µs
     "imu61x-can": (contract.SAMPLE_COUNTER, 1 << 16, 0),  # table 33 and note 1: INDEX has 16 bits and counts frames
 }

@@ -141,6 +141,8 @@ class FakeCanCodec:
 
     problem = ""
 
+    counts_losses = False
+
     def __init__(self, ledger: Ledger, settings: FakeCanSettings) -> None:
         self.ledger = ledger
         self.unknown: dict[int, int] = {}

@@ -8,7 +8,7 @@ The calculation ignores stuff bits, up to 22 % (ISO 11898-1): rejected intervals
 includes the messages of all other configured devices, but no messages of devices that imud does not know.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -38,6 +38,13 @@ class CyclicMessage:
         if not self.interval_ms:
             return 0.0
         return frame_bits(self.extended, self.data_bytes) * MS_PER_S / self.interval_ms
+
+
+def refuse_short_intervals(values: Mapping[str, Any], names: Iterable[str], least_ms: int, most_ms: int) -> None:
+    """Raise BadArgument for an interval between 0, which means never, and `least_ms`."""
+    for name in names:
+        if 0 < (got := values.get(name, 0)) < least_ms:
+            raise BadArgument(f"{name}: expected 0 or {least_ms} … {most_ms}, got {got}")
 
 
 def refuse_overload(messages: Mapping[str, CyclicMessage], other_bits_per_s: float, bus_bits_per_s: int) -> None:

@@ -177,6 +177,8 @@ class HipnucNmea2000Options(Options, frozen=True, kw_only=True, forbid_unknown_f
 class HipnucNmea2000Codec:
     """Decoder of the frames of one sender. Synchronization: one thread."""
 
+    counts_losses = True
+
     def __init__(self, ledger: Ledger, settings: HipnucNmea2000Options) -> None:
         self.ledger = ledger
         self._fixed = None if settings.source == "auto" else settings.source

@@ -160,6 +160,8 @@ class _Series:
 class Imu61xCanCodec:
     """Decoder of the frames of one device. Synchronization: one thread."""
 
+    counts_losses = False
+
     def __init__(self, ledger: Ledger, settings: Imu61xCanOptions) -> None:
         self.ledger = ledger
         self.unknown: dict[int, int] = {}  # number of frames by standard identifier outside base_id … base_id + 4

@@ -12,13 +12,17 @@ the zero concerns the inclinometer only; the direction applies after the zero.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from math import atan2, cos, pi, sin
+from math import atan2, cos, pi, radians, sin
 from typing import Final, Literal
 
+from imud.drivers.hipnuc import canfd
 from imud.drivers.hipnuc.j1939 import codec, commands
 from imud.drivers.hipnuc.j1939.codec import FACTORY_ADDRESS, encode
 from imud.drivers.hipnuc.j1939.commands import LAYOUT, READ, WRITE
+from imud.drivers.hipnuc.uart import ins
+from imud.formats.can import FD_DATA_BYTES_MAX
 from imud.formats.j1939 import GLOBAL, J1939Id, join, split
+from imud.model.sample import Measurement, Position
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.can_module import BITRATE, CanSimulator, FrameWire, SentFrame
 from imud.sim.physics import Truth
@@ -29,12 +33,19 @@ REPLY_NS: Final = 200_000  # time from a request to its reply (assumed)
 # PGNs that are on, by the name of a message; empty name: the default of the factory.
 MESSAGES: Final = {
     "": (codec.ACCEL, codec.GYRO, codec.ROLL_PITCH, codec.HEADING),
-    "all": codec.PGNS,
+    "all": (codec.UTC, *codec.MEASURED),
+    "canfd": (codec.FAST,),
+    "canfd_old": (codec.FAST_OLD,),
     "inclinometer": (codec.INCLINOMETER,),
 }
-SLOW: Final = (codec.TEMPERATURE, codec.UTC)
+SLOW: Final = (codec.TEMPERATURE, codec.UTC, codec.PLACE, codec.HEIGHT, codec.GNSS, codec.VELOCITY)
+# Fields of FF5B: acceleration, angular rate, quaternion, time
+FAST_BITS: Final = 1 << ins.ACCEL | 1 << ins.GYRO | 1 << ins.QUAT | 1 << ins.TIME
+# Position and velocity of every device
+PLACE: Final = Position(radians(48.1), radians(11.5), 520.0, 4, 17)
+VELOCITY_M_S: Final = (1.5, -0.25, 0.0)
 SLOW_MS: Final = 1000  # interval of the slow messages of `all`, ms
-YEAR: Final = 2025
+UTC_NS: Final = 1_735_689_600 * NS_PER_S  # UTC at the zero of the motion: 2025-01-01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,6 +54,7 @@ class J1939Variant:
 
     # Reads with a reply: all reads, reads with the value 1, or none.
     reads: Literal["answered", "value_one", "ignored"] = "answered"
+    newer: bool = True  # whether the firmware has the PGNs of newer firmware, interval 0 and register 0x9D
     address_at_once: bool = False  # True: a new address applies immediately. False: after save and restart.
     # Source address of the confirmation if a new address applies immediately.
     confirms_from: Literal["old", "new"] = "old"
@@ -64,6 +76,7 @@ J1939_VARIANTS: Final[Mapping[str, J1939Variant]] = {
     "address at once": J1939Variant(address_at_once=True),
     "address at once, confirmed from there": J1939Variant(address_at_once=True, confirms_from="new"),
     "address at once, ignores reads": J1939Variant(address_at_once=True, confirms_from="new", reads="ignored"),
+    "older firmware": J1939Variant(newer=False),
     "claims no address": J1939Variant(claims_address=False),
     "slow flash": J1939Variant(flash_ms=1900),
     "factory reset restarts": J1939Variant(reset_restarts=True),
@@ -84,6 +97,7 @@ class J1939Settings:
     intervals_ms: Mapping[int, int] = field(default_factory=lambda: dict.fromkeys(MESSAGES[""], INTERVAL_MS))
     bitrate_code: int = commands.BITRATES.index(BITRATE)
     address: int = FACTORY_ADDRESS
+    output: int = 1  # whether messages are sent periodically
     x_reversed: int = 0
     y_reversed: int = 0
     zero_rad: tuple[float, float] = (0.0, 0.0)  # physical angles that read as zero, rad
@@ -94,6 +108,7 @@ class J1939Hardware(SensorHardware):
     """Hardware of a device."""
 
     bitrate: int | None = None  # bit rate of the bus, bit/s; 0: frames take no time; None: the rate of the settings
+    has_utc: bool = True  # False: FF2F contains the uptime without a date, as without GNSS
     sends_heading_twice: bool = True  # True: the heading message appears twice, as in newer firmware
     variant: J1939Variant = field(default_factory=J1939Variant)
 
@@ -144,7 +159,10 @@ class HipnucJ1939Module:
         waiting = self._leaving[0].due_ns if self._leaving else self._wire.next_ns()
         if waiting is not None or not self._next_ms:
             return waiting
-        return self._instant_ns(min(self._next_ms.values())) + self.hardware.processing_ns + self._wire.extended_ns
+        device_ms = min(self._next_ms.values())
+        first = min(pgn for pgn, next_ms in self._next_ms.items() if next_ms == device_ms)
+        size = FD_DATA_BYTES_MAX if first in canfd.PGNS else codec.MESSAGE_BYTES
+        return self._instant_ns(device_ms) + self.hardware.processing_ns + self._wire.frame_time_ns(True, size)
 
     def counters(self) -> dict[str, int]:
         return {"samples_sent": self.instants_sent, "frames_sent": self.frames_sent, "requests": self.requests}
@@ -159,6 +177,7 @@ class HipnucJ1939Module:
         self._wire = FrameWire(bitrate, self._begin_ns)
         self._next_ms = dict.fromkeys(settings.intervals_ms, 0)
         self._leaving = []
+        self._fast_sent = 0  # number of CAN FD samples
         self._claim(self._begin_ns)
 
     def _claim(self, now_ns: int) -> None:
@@ -182,7 +201,8 @@ class HipnucJ1939Module:
             self.instants_sent += 1
             for pgn in due:
                 self._next_ms[pgn] += self.settings.intervals_ms[pgn]
-                self._send(pgn, reading, sample_ns)
+                if self.settings.output:
+                    self._send(pgn, reading, sample_ns)
 
     def _reading(self, sample_ns: int) -> Truth:
         return self.hardware.reading((sample_ns - self.epoch_ns) / NS_PER_S)
@@ -203,9 +223,28 @@ class HipnucJ1939Module:
             codec.TEMPERATURE: lambda: codec.pack_temperature(reading.temperature_c),
             codec.QUATERNION: lambda: codec.pack_quaternion(reading.quat_wxyz),
             codec.INCLINOMETER: lambda: codec.pack_inclinometer(*self._inclination(reading)),
-            codec.UTC: lambda: codec.pack_utc(YEAR, 1, 1, (sample_ns - self.epoch_ns) / NS_PER_S % 86_400),
+            codec.UTC: lambda: (
+                codec.pack_utc(UTC_NS + sample_ns - self.epoch_ns)
+                if self.hardware.has_utc
+                else codec.pack_uptime(self._uptime_us(sample_ns) // 1000)
+            ),
+            codec.PLACE: lambda: codec.pack_place(PLACE),
+            codec.HEIGHT: lambda: codec.pack_height(PLACE),
+            codec.GNSS: lambda: codec.pack_gnss(PLACE),
+            codec.VELOCITY: lambda: codec.pack_velocity(VELOCITY_M_S),
+            codec.FAST_OLD: lambda: canfd.pack_old(_values(reading), self._uptime_us(sample_ns) // 1000),
+            codec.FAST: lambda: self._fast(reading, sample_ns),
         }
         return rows[pgn]()
+
+    def _uptime_us(self, t_ns: int) -> int:
+        """Return the time since power-on, µs of its own crystal."""
+        return round((t_ns - self._begin_ns) / self._ns_per_ms * 1000)
+
+    def _fast(self, reading: Truth, sample_ns: int) -> bytes:
+        self._fast_sent += 1
+        uptime_us = self._uptime_us(sample_ns)
+        return canfd.pack_fast(_values(reading), FAST_BITS, self._fast_sent - 1, time_us=uptime_us)
 
     def _inclination(self, reading: Truth) -> tuple[float, float]:
         """Return the angles of FF4A."""
@@ -249,6 +288,9 @@ class HipnucJ1939Module:
     def _present(self, register: int) -> int | None:
         """Return the value of a readable register; None for other registers."""
         settings = self.settings
+        newer = {commands.OUTPUT, *(commands.INTERVALS[pgn] for pgn in codec.NEWER_PGNS)}
+        if register in newer and not self.hardware.variant.newer:
+            return None
         for pgn, interval_register in commands.INTERVALS.items():
             if register == interval_register:
                 return settings.intervals_ms.get(pgn, 0)
@@ -260,6 +302,7 @@ class HipnucJ1939Module:
             commands.VERSION: FIRMWARE,
             commands.BITRATE: settings.bitrate_code,
             commands.ADDRESS: settings.address,
+            commands.OUTPUT: settings.output,
             commands.X_SIGN: settings.x_reversed,
             commands.Y_SIGN: settings.y_reversed,
         }.get(register)
@@ -268,7 +311,13 @@ class HipnucJ1939Module:
         """Set a register if the value is in range."""
         settings = self.settings
         pgn = next((pgn for pgn, address in commands.INTERVALS.items() if address == register), None)
-        if pgn is not None and commands.INTERVAL_MIN_MS <= value <= commands.INTERVAL_MAX_MS:
+        if pgn is not None and value == commands.NEVER_MS and self.hardware.variant.newer:
+            rest = {one: interval_ms for one, interval_ms in settings.intervals_ms.items() if one != pgn}
+            self.settings = replace(settings, intervals_ms=rest)
+            self._next_ms.pop(pgn, None)
+        elif register == commands.OUTPUT and value in (0, 1):
+            self.settings = replace(settings, output=value)
+        elif pgn is not None and commands.INTERVAL_MIN_MS <= value <= commands.INTERVAL_MAX_MS:
             self.settings = replace(settings, intervals_ms={**settings.intervals_ms, pgn: value})
             device_ms = (now_ns - self._begin_ns) / self._ns_per_ms
             self._next_ms[pgn] = (int(device_ms) // value + 1) * value
@@ -311,6 +360,14 @@ class HipnucJ1939Module:
         self.frames_sent += 1
 
 
+def _values(reading: Truth) -> Measurement:
+    """Return the truth as the values of a CAN FD message."""
+    return Measurement(
+        0, 0, None, reading.accel_m_s2, reading.gyro_rad_s, reading.mag_t, reading.quat_wxyz, reading.euler_rad,
+        reading.temperature_c,
+    )  # fmt: skip
+
+
 def physical_inclination(reading: Truth) -> tuple[float, float]:
     """Return the tilt about Y and X of the sensor, as a dual-axis inclinometer measures it."""
     roll, pitch, _ = reading.euler_rad
@@ -344,4 +401,10 @@ def make(options: SimulatorOptions, now_ns: int) -> HipnucJ1939Module:
     return HipnucJ1939Module(now_ns, settings, hardware)
 
 
+def make_canfd(options: SimulatorOptions, now_ns: int) -> HipnucJ1939Module:
+    """Return a device that sends CAN FD samples. Raises ValueError for an unsupported option."""
+    return make(replace(options, message=options.message or "canfd"), now_ns)
+
+
 SIMULATOR: Final = CanSimulator("hipnuc-j1939", "HiPNUC HI14 (CAN, SAE J1939)", make)
+CANFD_SIMULATOR: Final = CanSimulator("hipnuc-canfd", "HiPNUC device with newer firmware (CAN FD)", make_canfd)

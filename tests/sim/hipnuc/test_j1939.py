@@ -104,7 +104,8 @@ def test_four_modules_crystal_wire_and_the_next_frame() -> None:
             assert {frame.due_ns for frame in module.advance(next_ns)} == {next_ns}
     assert J1939Settings().intervals_ms == dict.fromkeys((0xFF34, 0xFF37, 0xFF3D, 0xFF41), 100)
     slow = {pgn: ms for pgn, ms in made(message="all", rate_hz=30.0).settings.intervals_ms.items() if ms != 33}
-    assert slow == {codec.TEMPERATURE: 990, codec.UTC: 990}  # ms, a multiple of 33
+    newer = (codec.PLACE, codec.HEIGHT, codec.GNSS, codec.VELOCITY)
+    assert slow == dict.fromkeys((codec.TEMPERATURE, codec.UTC, *newer), 990)  # ms, a multiple of 33
 
 
 @pytest.mark.manual("B 6.2.2 intervals", "B 6.2.2 bit rate", "B 6.2.2 address")

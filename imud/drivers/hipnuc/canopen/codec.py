@@ -85,6 +85,8 @@ class HipnucCanopenOptions(Options, frozen=True, kw_only=True, forbid_unknown_fi
 class HipnucCanopenCodec:
     """Decoder of the TPDOs of one node. Synchronization: one thread."""
 
+    counts_losses = True
+
     def __init__(self, ledger: Ledger, settings: HipnucCanopenOptions) -> None:
         self.ledger = ledger
         node, wanted = settings.node, settings.tpdos

@@ -10,7 +10,14 @@ from imud.contracts.command import Proof, Risk, Target, Verb, VerbResult, Verbs
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, DataSheet, random_vector
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import DeviceReport, Effect, Reports, Setting, SettingsTable
-from imud.drivers.hipnuc.bus_load import MS_PER_S, RATE_NOTE, CyclicMessage, refuse_other_rate, refuse_overload
+from imud.drivers.hipnuc.bus_load import (
+    MS_PER_S,
+    RATE_NOTE,
+    CyclicMessage,
+    refuse_other_rate,
+    refuse_overload,
+    refuse_short_intervals,
+)
 from imud.drivers.hipnuc.canopen import commands
 from imud.drivers.hipnuc.canopen.cia301 import (
     EMERGENCY,
@@ -49,7 +56,6 @@ from imud.drivers.hipnuc.canopen.commands import (
 )
 from imud.drivers.hipnuc.common import DOCUMENT, inclinometer_zero, refuse_all, save_verb, zeroed
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
-from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_S, NS_PER_US
 
 TPDOS: Final[tuple[TpdoNumber, ...]] = get_args(TpdoNumber)
@@ -105,17 +111,10 @@ def _refuse_overload(target: Target, values: Mapping[str, Any]) -> None:
 def _check(target: Target, values: Mapping[str, Any]) -> None:
     """Raise BadArgument for another bit rate than the bus, and for TPDOs that exceed it."""
     refuse_all(
-        lambda: _refuse_short_intervals(values),
+        lambda: refuse_short_intervals(values, map(interval_name, TPDOS), PERIOD_MIN_MS, PERIOD_MAX_MS),
         lambda: refuse_other_rate(target, values),
         lambda: _refuse_overload(target, values),
     )
-
-
-def _refuse_short_intervals(values: Mapping[str, Any]) -> None:
-    for tpdo in TPDOS:
-        if 0 < values.get(interval_name(tpdo), 0) < PERIOD_MIN_MS:
-            got = values[interval_name(tpdo)]
-            raise BadArgument(f"{interval_name(tpdo)}: expected 0 or {PERIOD_MIN_MS} … {PERIOD_MAX_MS}, got {got}")
 
 
 def report_name(place: Place) -> str:

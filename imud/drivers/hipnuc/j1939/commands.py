@@ -33,8 +33,8 @@ from imud.drivers.hipnuc.j1939.codec import (
     FACTORY_ADDRESS,
     PGNS,
     PRIORITY,
-    HipnucJ1939Options,
     J1939Node,
+    NodeOptions,
 )
 from imud.drivers.readdressing import Readdressing
 from imud.formats.can import CanFilter, pack_frame
@@ -52,6 +52,7 @@ CONTROL: Final = 0x0000
 ONCE: Final = 0x0096
 BITRATE: Final = 0x009A
 ADDRESS: Final = 0x009C
+OUTPUT: Final = 0x009D  # periodic output: 1 on, 0 off (source: a note of a third party; the values are assumed)
 X_SIGN: Final = 0x009E
 Y_SIGN: Final = 0x009F
 ZERO: Final = 0x00A5
@@ -68,6 +69,7 @@ BitRate = Literal[1_000_000, 800_000, 500_000, 250_000, 125_000]
 BITRATES: Final[tuple[BitRate, ...]] = get_args(BitRate)  # bit rates by their code in BITRATE, bit/s
 MODULE_ADDRESS_MIN, MODULE_ADDRESS_MAX = 1, 128
 INTERVAL_MIN_MS, INTERVAL_MAX_MS = 5, 1000
+NEVER_MS: Final = 0  # interval of a message that newer firmware does not send
 
 REPLY_TIMEOUT_NS: Final = 500 * NS_PER_MS  # the manual states none; J1939-21 gives a node 200 ms
 # Timeout of registers that may not exist, ns. Such registers do not reply, and imud reads many of them.
@@ -162,7 +164,7 @@ def read_values(peer: J1939Node, registers: Sequence[int]) -> RequestScript[dict
 
 
 def set_interval(peer: J1939Node, pgn: int, interval_ms: int) -> RequestScript[Written]:
-    """Set the interval of a message, 5 … 1000 ms. Like all functions below, raises NoReply, Rejected."""
+    """Set the interval of a message, 5 … 1000 ms, or 0: never. Like all functions below, raises NoReply, Rejected."""
     return _write_checked(peer, INTERVALS[pgn], interval_ms, f"interval of {pgn:04X}")
 
 
@@ -174,6 +176,11 @@ def set_bitrate(peer: J1939Node, bitrate: BitRate) -> RequestScript[Written]:
 def set_address(peer: J1939Node, address: int) -> RequestScript[Written]:
     """Set the address on the bus, 1 … 128; effective after `save` and `restart`."""
     return _write_checked(peer, ADDRESS, address, "address", pending=True)
+
+
+def set_output(peer: J1939Node, is_on: bool) -> RequestScript[Written]:
+    """Switch the periodic output of all messages on or off."""
+    return _write_checked(peer, OUTPUT, int(is_on), "periodic output")
 
 
 def set_direction(peer: J1939Node, axis: Literal["X", "Y"], is_reversed: bool) -> RequestScript[Written]:
@@ -280,17 +287,17 @@ def _value(outcome: Outcome) -> int:
     return value
 
 
-def change_address(settings: HipnucJ1939Options, new: int) -> RequestScript[Written]:
+def change_address(settings: NodeOptions, new: int) -> RequestScript[Written]:
     """Set the address of a device, 1 … 128, and follow the device (`Readdressing.change`)."""
     return set_address(settings.peer, new) if new == settings.address else _readdressing(settings).change(new)
 
 
-def restart(settings: HipnucJ1939Options, bus_bit_s: int) -> RequestScript[str | VerbResult]:
+def restart(settings: NodeOptions, bus_bit_s: int) -> RequestScript[str | VerbResult]:
     """Restart the device and follow it to its address (`Readdressing.restart`)."""
     return _readdressing(settings).restart(restart_request(settings.peer), bus_bit_s)
 
 
-def factory_reset_and_find(settings: HipnucJ1939Options) -> RequestScript[str]:
+def factory_reset_and_find(settings: NodeOptions) -> RequestScript[str]:
     """Restore the factory settings with address 8 and its bit rate, effective after a restart at the latest.
 
     Raises BadArgument if another device has address 8, Rejected.
@@ -304,7 +311,7 @@ def factory_reset_and_find(settings: HipnucJ1939Options) -> RequestScript[str]:
     return f"restored; the device has address {FACTORY_ADDRESS} after the next restart at the latest"
 
 
-def _readdressing(settings: HipnucJ1939Options) -> Readdressing:
+def _readdressing(settings: NodeOptions) -> Readdressing:
     peer, host = settings.peer, settings.host_address
     return Readdressing(
         options=settings,

@@ -11,7 +11,13 @@ from imud.contracts.command import Proof, Risk, Target, Verb, Verbs
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, random_vector
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import DeviceReport, Effect, Reports, Setting, SettingsTable
-from imud.drivers.hipnuc.bus_load import RATE_NOTE, CyclicMessage, refuse_other_rate, refuse_overload
+from imud.drivers.hipnuc.bus_load import (
+    RATE_NOTE,
+    CyclicMessage,
+    refuse_other_rate,
+    refuse_overload,
+    refuse_short_intervals,
+)
 from imud.drivers.hipnuc.common import REGISTERS, inclinometer_zero, random_quaternion, refuse_all, save_verb, zeroed
 from imud.drivers.hipnuc.j1939 import codec, commands
 from imud.drivers.hipnuc.j1939.codec import (
@@ -38,7 +44,9 @@ from imud.formats.j1939 import all_of, filter_of, pgn_name, sender_of
 CONTENT: Final = {
     codec.UTC: "UTC", codec.ACCEL: "acceleration", codec.GYRO: "angular rate", codec.MAG: "magnetic field",
     codec.ROLL_PITCH: "roll and pitch", codec.HEADING: "heading", codec.TEMPERATURE: "temperature",
-    codec.QUATERNION: "quaternion", codec.INCLINOMETER: "inclinometer",
+    codec.QUATERNION: "quaternion", codec.INCLINOMETER: "inclinometer", codec.PLACE: "latitude and longitude",
+    codec.HEIGHT: "height", codec.GNSS: "state of the position", codec.VELOCITY: "velocity",
+    codec.FAST_OLD: "sample on CAN FD, older", codec.FAST: "sample on CAN FD",
 }  # fmt: skip
 
 
@@ -50,6 +58,7 @@ def interval_name(pgn: int) -> str:
 # Registers of the settings, by name, in the order of the table
 SETTING_REGISTERS: Final = {
     **{interval_name(pgn): register for pgn, register in INTERVALS.items()},
+    "output_enabled": commands.OUTPUT,
     "x_reversed": commands.X_SIGN,
     "y_reversed": commands.Y_SIGN,
     "bit_rate": commands.BITRATE,
@@ -60,9 +69,7 @@ SETTING_REGISTERS: Final = {
 def values_of(values: Mapping[int, int]) -> dict[str, Any]:
     """Return settings by name from registers, without values outside the table."""
     reported: dict[str, Any] = {name: values.get(register) for name, register in SETTING_REGISTERS.items()}
-    for pgn in INTERVALS:  # 0 or missing: this firmware does not send the message
-        reported[interval_name(pgn)] = reported[interval_name(pgn)] or None
-    for name in ("x_reversed", "y_reversed"):
+    for name in ("output_enabled", "x_reversed", "y_reversed"):
         reported[name] = {0: False, 1: True}.get(-1 if reported[name] is None else reported[name])
     code = reported["bit_rate"]
     reported["bit_rate"] = BITRATES[code] if code is not None and code < len(BITRATES) else None
@@ -77,14 +84,22 @@ def _refuse_overload(target: Target, values: Mapping[str, Any]) -> None:
 
 
 def _check(target: Target, values: Mapping[str, Any]) -> None:
-    """Raise BadArgument for another bit rate than the bus, and for messages that exceed it."""
-    refuse_all(lambda: refuse_other_rate(target, values), lambda: _refuse_overload(target, values))
+    """Raise BadArgument for another bit rate than the bus, short intervals, and messages that exceed the bus."""
+    refuse_all(
+        lambda: refuse_other_rate(target, values),
+        lambda: refuse_short_intervals(values, map(interval_name, INTERVALS), INTERVAL_MIN_MS, INTERVAL_MAX_MS),
+        lambda: _refuse_overload(target, values),
+    )
 
 
 def _read(target: Target, names: Collection[str] | None) -> RequestScript[Reports]:
     """Read registers; each register is a report with the name of its setting."""
     wanted = [number for name, number in SETTING_REGISTERS.items() if names is None or name in names]
-    values = yield from commands.read_values(target.settings.peer, wanted)
+    known, newer = ([one for one in wanted if (one in _NEWER) is is_newer] for is_newer in (False, True))
+    values = yield from commands.read_values(target.settings.peer, known)
+    if values or not known:
+        # older firmware does not reply, and the script then stops after the first registers
+        values |= yield from commands.read_values(target.settings.peer, newer)
     return {
         name: DeviceReport({_WORDS[number]: _text(number, values[number])}, values_of({number: values[number]}))
         for name, number in SETTING_REGISTERS.items()
@@ -94,8 +109,14 @@ def _read(target: Target, names: Collection[str] | None) -> RequestScript[Report
 
 _WORDS: Final = {
     commands.ADDRESS: "address", commands.BITRATE: "bitrate", commands.X_SIGN: "x_reversed",
-    commands.Y_SIGN: "y_reversed", **{register: f"interval_ms_{pgn:04X}" for pgn, register in INTERVALS.items()},
+    commands.Y_SIGN: "y_reversed", commands.OUTPUT: "output_enabled",
+    **{register: f"interval_ms_{pgn:04X}" for pgn, register in INTERVALS.items()},
 }  # fmt: skip
+
+
+NEWER: Final = "not in V1.5.9"  # section of a setting that the manual does not contain
+# Registers of newer firmware
+_NEWER: Final = {commands.OUTPUT, *(INTERVALS[pgn] for pgn in codec.NEWER_PGNS)}
 
 
 def _text(register: int, value: int) -> str:
@@ -107,10 +128,11 @@ def _interval_setting(pgn: int) -> Setting:
         type=Annotated[
             int,
             Meta(
-                ge=INTERVAL_MIN_MS,
+                ge=commands.NEVER_MS,
                 le=INTERVAL_MAX_MS,
-                description=f"interval of the message with the {CONTENT[pgn]} (PGN {pgn:04X})",
-                extra={"unit": "ms", "section": "6.2.2"},
+                description=f"interval of the message with the {CONTENT[pgn]} (PGN {pgn:04X}), at least "
+                f"{INTERVAL_MIN_MS}; 0: never",
+                extra={"unit": "ms", "section": "6.2.2" if pgn in codec.MANUAL_PGNS else NEWER},
             ),
         ],
         write=lambda target, interval_ms: commands.set_interval(target.settings.peer, pgn, interval_ms),
@@ -130,6 +152,14 @@ def _sign(axis: Literal["X", "Y"]) -> Setting:
 SETTINGS: Final = SettingsTable(
     table={
         **{interval_name(pgn): _interval_setting(pgn) for pgn in INTERVALS},
+        "output_enabled": Setting(
+            type=Annotated[
+                bool,
+                Meta(description="whether the device sends messages periodically", extra={"section": NEWER}),
+            ],
+            write=lambda target, is_on: commands.set_output(target.settings.peer, is_on),
+            report="output_enabled",
+        ),
         "x_reversed": _sign("X"),
         "y_reversed": _sign("Y"),
         "bit_rate": Setting(

@@ -132,13 +132,13 @@ def decode_hi81(data: bytes, at: int, _word_is_status: bool, size: int, trailing
     if not (roll == pitch and roll in FILLERS):
         euler = possible_angles((roll * angle, pitch * angle, yaw * angle)) if heading <= TURN else None
     place = (longitude * POSITION_RAD_PER_LSB, latitude * POSITION_RAD_PER_LSB, height * HEIGHT_M_PER_LSB)
-    position, is_place = _position(place, *v[35:37])
+    position, is_place = position_of(*place, *v[35:37])
     return Measurement(
         size, trailing, None,  # the GPS time is another counter than `system_time` of a frame between two HI81
         _vector(v[8:11], ACCEL_M_S2_PER_LSB), _vector(v[5:8], GYRO_RAD_S_PER_LSB), field_of(*v[11:14]),
         possible_quaternion(qw * q, qx * q, qy * q, qz * q), euler, byte_temperature_c(temperature),
         pressure_of(pressure + PRESSURE_OFFSET_PA) if pressure else None, None, status, None, None,
-        _vector(v[42:45], VELOCITY_M_S_PER_LSB), position, None, _utc_ns(v[17:23], status),
+        _vector(v[42:45], VELOCITY_M_S_PER_LSB), position, None, utc_ns_of(v[17:23], status),
     ), heading <= TURN and is_place  # fmt: skip
 
 
@@ -172,7 +172,9 @@ def decode_hi83(data: bytes, at: int, _word_is_status: bool, size: int, trailing
 
     status = _status(main, ins)
     quality, satellites, _, _ = sent.get(QUALITY, (NO_COUNT,) * 4)
-    position, is_place = _position(sent[PLACE], quality, satellites, RAD_PER_DEG) if PLACE in sent else (None, True)
+    longitude, latitude, height_m = sent.get(PLACE, (0.0, 0.0, None))
+    place = (longitude * RAD_PER_DEG, latitude * RAD_PER_DEG, height_m)
+    position, is_place = position_of(*place, quality, satellites)
     quat = sent.get(QUAT)
     heave = None
     if MOTION in sent:
@@ -185,7 +187,7 @@ def decode_hi83(data: bytes, at: int, _word_is_status: bool, size: int, trailing
         vector(MAG, T_PER_UT, MAG_LIMIT_UT) if any(sent.get(MAG, ())) else None,
         None if quat is None else possible_quaternion(*quat), vector(EULER, RAD_PER_DEG, TURN_DEG),
         number(TEMPERATURE, possible_temperature_c), number(PRESSURE, pressure_of), None, status, None, None,
-        vector(VELOCITY, 1.0, VELOCITY_LIMIT_M_S), position, heave, _utc_ns(sent.get(UTC_TIME), status),
+        vector(VELOCITY, 1.0, VELOCITY_LIMIT_M_S), position, heave, utc_ns_of(sent.get(UTC_TIME), status),
     ), is_possible and is_place and (quat is None or isfinite(sum(quat)))  # fmt: skip
 
 
@@ -198,28 +200,26 @@ def _status(main: int, ins: int) -> int | None:
     return None if main & RESERVED_STATUS else main | ins << INS_SHIFT
 
 
-def _position(
-    place: Sequence[float], quality: int, satellites: int, factor: float = 1.0
+def position_of(
+    longitude_rad: float, latitude_rad: float, height_m: float | None, quality: int | None, satellites: int | None
 ) -> tuple[Position | None, bool]:
-    """Return the position of longitude, latitude and height, and whether it is possible. A device without a position
-    sends zeros."""
-    longitude, latitude, height_m = place[0] * factor, place[1] * factor, place[2]
-    if longitude == latitude == 0.0:
+    """Return the position, and whether it is possible. A device without a position sends zeros."""
+    if longitude_rad == latitude_rad == 0.0:
         return None, True
     if not (
-        abs(longitude) <= HALF_TURN * EULER_RAD_PER_LSB
-        and abs(latitude) <= HALF_TURN / 2 * EULER_RAD_PER_LSB
-        and abs(height_m) < HEIGHT_LIMIT_M
+        abs(longitude_rad) <= HALF_TURN * EULER_RAD_PER_LSB
+        and abs(latitude_rad) <= HALF_TURN / 2 * EULER_RAD_PER_LSB
+        and (height_m is None or abs(height_m) < HEIGHT_LIMIT_M)
     ):
         return None, False
-    return Position(latitude, longitude, height_m, _known(quality), _known(satellites)), True
+    return Position(latitude_rad, longitude_rad, height_m, _known(quality), _known(satellites)), True
 
 
-def _known(count: int) -> int | None:
+def _known(count: int | None) -> int | None:
     return None if count == NO_COUNT else count
 
 
-def _utc_ns(utc: Sequence[int] | None, status: int | None) -> int | None:
+def utc_ns_of(utc: Sequence[int] | None, status: int | None = 0) -> int | None:
     """Return UTC of year - 2000, month, day, hour, minute and ms of the minute, ns since 1970; None without UTC."""
     if utc is None or status is None or status & NOT_UTC:
         return None
@@ -236,8 +236,8 @@ def _utc_ns(utc: Sequence[int] | None, status: int | None) -> int | None:
 # --- encoder for simulated devices ------------------------------------------------------------------------------------
 
 
-def _utc_fields(utc_ns: int) -> tuple[int, ...]:
-    """Return the fields that `_utc_ns` reads."""
+def utc_fields(utc_ns: int) -> tuple[int, ...]:
+    """Return the fields that `utc_ns_of` reads."""
     minute = _EPOCH + timedelta(minutes=utc_ns // (60 * NS_PER_S))
     ms = utc_ns // NS_PER_MS % 60_000
     return minute.year - YEAR_ZERO, minute.month, minute.day, minute.hour, minute.minute, ms
@@ -262,7 +262,7 @@ def pack_hi81(
         *_counts(values.mag_t or zero, MAG_T_PER_LSB),
         0 if values.pressure_pa is None else counts_of(values.pressure_pa - PRESSURE_OFFSET_PA, 16), 0,
         counts_of(values.temperature_c or 0.0, 8),
-        *(_utc_fields(values.gnss_utc_ns) if values.gnss_utc_ns is not None else (0,) * 6),
+        *(utc_fields(values.gnss_utc_ns) if values.gnss_utc_ns is not None else (0,) * 6),
         counts_of(roll / EULER_RAD_PER_LSB, 16), counts_of(pitch / EULER_RAD_PER_LSB, 16),
         round(-yaw / EULER_RAD_PER_LSB) % TURN,
         *_counts(values.quat_wxyz or (0.0, 0.0, 0.0, 0.0), QUAT_PER_LSB),
@@ -284,7 +284,7 @@ def pack_hi83(
         MAG: [tesla / T_PER_UT for tesla in values.mag_t or zero],
         EULER: [angle / RAD_PER_DEG for angle in values.euler_rad or zero],
         QUAT: values.quat_wxyz or (0.0, 0.0, 0.0, 0.0), TIME: (system_time_us % 2**64,),
-        UTC_TIME: _utc_fields(values.gnss_utc_ns) if values.gnss_utc_ns is not None else (0,) * 6,
+        UTC_TIME: utc_fields(values.gnss_utc_ns) if values.gnss_utc_ns is not None else (0,) * 6,
         PRESSURE: (values.pressure_pa or 0.0,), TEMPERATURE: (values.temperature_c or 0.0,),
         MOTION: (values.heave_m or 0.0, 0.0, 0.0), VELOCITY: values.velocity_enu_m_s or zero,
         PLACE: (place.longitude_rad / RAD_PER_DEG, place.latitude_rad / RAD_PER_DEG, place.height_m or 0.0),

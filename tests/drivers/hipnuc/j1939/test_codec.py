@@ -14,11 +14,12 @@ from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Options
 from imud.drivers.hipnuc.j1939.driver import DRIVER
 from imud.formats.j1939 import J1939Id, join
 from imud.model.ledger import Ledger
-from imud.model.sample import Measurement
+from imud.model.sample import Measurement, Position, values_of
 from tests.support.files import shared
 
 MS = 1_000_000
 NONE = bytes([0xFF]) * 8
+UTC_NS = 1_741_964_966_535_000_000  # 2025-03-14 15:09:26.535, `date -u -d @1741964966`
 
 
 def measured(pgn: int, data: str) -> Measurement:
@@ -129,7 +130,7 @@ def test_packing_gives_the_golden_messages_and_clips_them() -> None:
         messages.pack_quaternion((9, -9, 0, 0)),
     )
     assert [data[:8].hex() for data in packed] == ["ffffff7f00000080", "ff7f0000e7030000", "ff7f008000000000"]
-    assert messages.pack_utc(2025, 3, 14, 15 * 3600 + 9 * 60 + 26.535).hex() == "19030e0f091a1702"
+    assert messages.pack_utc(UTC_NS).hex() == "19030e0f091a1702"
 
 
 def test_absent_is_not_zero_and_one_negative_count_is_a_value() -> None:
@@ -174,7 +175,7 @@ def test_the_vendors_signal_definitions_agree() -> None:
             compared += compare(ours, theirs)
     # all signals without the pressure, which newer definitions replace by reserved bytes
     assert compared == 50 * (3 + 3 + 3 + 2 + 1 + 1 + 4 + 2)
-    theirs = database.decode_message(encode(messages.UTC, b"")[0], messages.pack_utc(2025, 3, 14, 54566.535))
+    theirs = database.decode_message(encode(messages.UTC, b"")[0], messages.pack_utc(UTC_NS))
     expected = {"Year": 25, "Month": 3, "Day": 14, "Hour": 15, "Minute": 9, "Second": 26, "Millisecond": 535}
     assert theirs == {f"UTC_{name}": value for name, value in expected.items()}
 
@@ -228,10 +229,68 @@ def test_a_burst_of_any_priority_makes_a_sample() -> None:
     pgns = (0xFF34, 0xFF37, 0xFF3D, 0xFF41, 0xFF4A)
     assert [encode(pgn, b"")[0] for pgn in pgns] == [0x0CFF3408, 0x0CFF3708, 0x0CFF3D08, 0x0CFF4108, 0x0CFF4A08]
     codec = learned()
-    utc = encode(messages.UTC, messages.pack_utc(2025, 1, 1, 0))
-    before = codec.ledger.frames_ignored
-    assert counts(feed(codec, [utc, *burst(5)], 100 * MS)) == [5]
-    assert codec.ledger.frames_ignored == before + 1
+    utc = encode(messages.UTC, messages.pack_utc(UTC_NS))
+    (sample,) = feed(codec, [utc, *burst(5)], 100 * MS)
+    assert isinstance(sample, Measurement)
+    assert (counts([sample]), sample.gnss_utc_ns, codec.ledger.frames_ignored) == ([5], UTC_NS, 0)
+    # another FF2F replaces the first one; a sample 3 ms later is from another instant
+    for frames, start_ms in (([utc, utc], 107), ([utc], 117)):
+        feed(codec, frames, start_ms * MS)
+        (sample,) = feed(codec, burst(6), (start_ms + 3) * MS)
+        assert isinstance(sample, Measurement)
+        assert sample.gnss_utc_ns is None
+    codec.reset()
+    assert (codec.ledger.frames_ignored, codec.ledger.frames_pending) == (3, 0)
+
+
+def test_a_time_without_a_date_is_the_uptime_and_neither_utc_nor_a_loss() -> None:
+    """Newer firmware without GNSS sends the uptime modulo 24 h. The last day ends after 50 of 100 samples."""
+    codec, found = learned(), list[Measurement]()
+    for n in range(100):
+        uptime = encode(messages.UTC, messages.pack_uptime(86_400_000 - 500 + 10 * n))
+        found += [one for one in feed(codec, [uptime, *burst(n)], (100 + 10 * n) * MS) if isinstance(one, Measurement)]
+    assert messages.pack_uptime(86_400_000 - 1).hex() == "000000173b3be703"
+    assert messages.pack_uptime(86_400_000) == bytes(8)
+    assert counts(list(found)) == list(range(100))
+    assert all(one.gnss_utc_ns is None for one in found)
+    assert (codec.ledger.lost(), codec.ledger.frames_ignored) == (0, 100)
+    for data in ("000000173b3be703", "0000000000000000", "190d0e0f091a1702", "19030e18091a1702",
+                 "19030e0f091ae803", "19030e0f093d1702", "ffffffffffffffff"):  # fmt: skip
+        assert messages.utc_of(bytes.fromhex(data)) is None
+    assert messages.utc_of(bytes.fromhex("19030e0f091a1702")) == UTC_NS
+
+
+def parts(position: Position | None) -> tuple[object, ...]:
+    """Return the values of a position, its angles rounded to 0.6 m."""
+    assert position is not None
+    return round(position.latitude_rad, 7), round(position.longitude_rad, 7), *values_of(position)[2:]
+
+
+def test_position_and_velocity_by_hand() -> None:
+    """-33.5° and 151.25°, 520.25 m, quality 4 with 17 satellites; 1.50, -0.25 and 0.05 m/s."""
+    place, height = (0xFF10, bytes.fromhex("404e08ec20eb265a")), (0xFF14, bytes.fromhex("39cb0000d7119600"))
+    state, velocity = (0xFF18, bytes.fromhex("0405110f03ffffff")), (0xFF26, bytes.fromhex("9600e7ff05009800"))
+    found = messages.measurement_of([place, height, state, velocity])
+    assert parts(found.position) == (-0.5846853, 2.6398105, 520.25, 4, 17)
+    assert found.velocity_enu_m_s == pytest.approx((1.5, -0.25, 0.05))
+    assert parts(messages.measurement_of([place]).position) == (-0.5846853, 2.6398105, None, None, None)
+    for counts_of_place, is_valid in (
+        ((900_000_000, 1), True), ((900_000_001, 1), False), ((1, -1_800_000_000), True), ((1, -1_800_000_001), False),
+        ((0, 0), False), ((-1, -1), False),  # no position; not available
+    ):  # fmt: skip
+        data = messages.TWO_ANGLES.pack(*counts_of_place)
+        assert (messages.measurement_of([(0xFF10, data), state]).position is not None) == is_valid
+    assert messages.measurement_of([height, state]).position is None
+    for height_data in (NONE, bytes.fromhex("8096980000000000")):  # not available, 100 km
+        position = messages.measurement_of([place, (0xFF14, height_data), (0xFF18, NONE)]).position
+        assert parts(position) == (-0.5846853, 2.6398105, None, None, None)
+    for data in (NONE, bytes.fromhex("ff7fff7fff7f0000")):
+        assert messages.measurement_of([(0xFF26, data)]).velocity_enu_m_s is None
+    known = Position(math.radians(-33.5), math.radians(151.25), 520.25, 4, 17)
+    assert messages.pack_place(known) == place[1]
+    assert messages.pack_height(known)[:4] == height[1][:4]
+    assert messages.pack_gnss(known).hex() == "0400110003000000"
+    assert messages.pack_velocity((1.5, -0.25, 0.05)) == velocity[1]
 
 
 def test_samples_of_several_modules_slow_messages_and_loss() -> None:

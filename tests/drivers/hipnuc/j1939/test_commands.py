@@ -132,7 +132,7 @@ def test_missing_replies_unchanged_values_resets_and_rejected_arguments_are_repo
         bench = J1939Bench(J1939Settings(address=9), variant=J1939_VARIANTS[variant])
         assert bench.act("factory_reset") == result
     for name, arguments in (
-        ("interval", {"pgn": "FF34", "interval_ms": 4}), ("interval", {"pgn": "FF34", "interval_ms": 1001}),
+        ("interval", {"pgn": "FF34", "interval_ms": -1}), ("interval", {"pgn": "FF34", "interval_ms": 1001}),
         ("interval", {"pgn": "FF35", "interval_ms": 10}), ("bitrate", {"bitrate": 100_000}),
         ("address", {"address": 0}), ("address", {"address": 129}), ("direction", {"axis": "Z", "reversed": True}),
         ("zero", {"zero": "there"}), ("send_once", {"pgn": "FF35"}),
@@ -209,6 +209,7 @@ def test_all_that_can_be_read() -> None:
         None,  # FF2F is unknown
         "3401030064000000", "370103000A000000", None, "3D01030064000000", "4101030064000000", None, None, None,
         "9E00030001000000", "9F00030000000000", "9A00030002000000", "9C00030008000000",
+        None, "1401030000000000", None, None, None, None, "9D00030000000000",  # newer firmware: FF14 is off
     ]  # fmt: skip
     reports: Any
     frames, reports = played(
@@ -217,9 +218,18 @@ def test_all_that_can_be_read() -> None:
     )
     assert combined(reports).words == {
         "address": "8", "bitrate": "500000", "x_reversed": "1", "y_reversed": "0", "interval_ms_FF34": "100",
-        "interval_ms_FF37": "10", "interval_ms_FF3D": "100", "interval_ms_FF41": "100",
+        "interval_ms_FF37": "10", "interval_ms_FF3D": "100", "interval_ms_FF41": "100", "interval_ms_FF14": "0",
+        "output_enabled": "0",
     }  # fmt: skip
-    assert len(frames) == 13
+    assert len(frames) == 20
+    values = combined(reports).values
+    assert (values["ff14_interval_ms"], values["output_enabled"], values["ff34_interval_ms"]) == (0, False, 100)
+    older = [*replies[:13], None, None]  # older firmware: two requests without a reply end the read
+    frames, _ = played(
+        SETTINGS.read(Target(HipnucJ1939Options(), 0), None),
+        *(None if text is None else bytes.fromhex(text) for text in older),
+    )
+    assert len(frames) == 15
     bit_rate = SETTINGS.read(Target(HipnucJ1939Options(), 0), {SETTINGS.table["bit_rate"].report})
     found = combined(played(bit_rate, bytes.fromhex("9A00030005000000"))[1])  # type: ignore[arg-type]  # reports
     assert (found.words, found.values) == ({"bitrate": "5"}, {})

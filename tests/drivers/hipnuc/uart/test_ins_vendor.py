@@ -165,7 +165,7 @@ def check_values(m: Measurement, raw: Raw, counts: Counter[str]) -> None:
         assert latitude == longitude == 0 or not is_possible, raw.place
     assert m.status == (None if raw.status & 0xE000 else raw.status)
     if m.gnss_utc_ns is not None and raw.utc is not None:
-        assert ins._utc_fields(m.gnss_utc_ns // 10**6 * 10**6) == tuple(raw.utc) or raw.utc[5] >= 60_000
+        assert ins.utc_fields(m.gnss_utc_ns // 10**6 * 10**6) == tuple(raw.utc) or raw.utc[5] >= 60_000
         counts["values equal"] += 1
 
 
