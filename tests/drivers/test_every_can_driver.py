@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from imud import drivers as devices
 from imud.contracts.codec import CanCodec, CodecEvent
 from imud.contracts.driver import CanDriver, of_kind
-from imud.formats.can import EXTENDED_ID_MAX, STANDARD_ID_MAX, CanFrame, pack_frame
+from imud.formats.can import EXTENDED_ID_MAX, FD_LENGTHS, STANDARD_ID_MAX, CanFrame, pack_frame
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from tests.support.codec_invariants import feed_frames as feed_checked
@@ -133,6 +133,12 @@ def test_missing_frames_cost_their_samples_only(name: str, seed: int) -> None:
         assert one.gyro_rad_s in (None, expected.gyro_rad_s)
 
 
+def of_any_type(driver: CanDriver, random: Random) -> CanFrame:
+    """Return a frame with an identifier that the driver receives, and random data of any length, CAN FD included."""
+    wanted, size = random.choice(driver.filters(driver.settings())), random.choice((8, 8, 8, 64, *FD_LENGTHS))
+    return CanFrame(wanted.can_id, wanted.extended, random.randbytes(size), random.randrange(100 * PERIOD_NS))
+
+
 @every_driver_and_seed
 def test_any_frames_in_any_order_never_raise(name: str, seed: int) -> None:
     driver, random = DRIVERS[name], Random(seed)
@@ -140,7 +146,8 @@ def test_any_frames_in_any_order_never_raise(name: str, seed: int) -> None:
     for group in sets(driver, random, 12):
         for frame in group:
             kinds = (
-                frame, frame, foreign(driver, random), frame._replace(data=random.randbytes(len(frame.data))),
+                frame, frame, foreign(driver, random), of_any_type(driver, random),
+                frame._replace(data=random.randbytes(len(frame.data))),
                 frame._replace(data=random.randbytes(random.randint(0, 8))),
                 frame._replace(data=b"\x00\x00\x80\x7f\xff\xff\xff\xff"),  # infinity and NaN as floats
             )  # fmt: skip

@@ -23,7 +23,7 @@ LIMIT_S = 60.0
 class BusRig:
     """A device of the daemon on an interface, with the simulated modules of the bus; the first module is the device."""
 
-    def __init__(self, interface: str, driver: str, options: Options, *modules: CanModule, **link: Any) -> None:
+    def __init__(self, interface: str, driver: str, options: Options | None, *modules: CanModule, **link: Any) -> None:
         self.port = CanPort(CanModules(modules), interface) if modules else None
         self.output = DeviceOutput()
         self.samples, self.events = self.output.samples, self.output.events

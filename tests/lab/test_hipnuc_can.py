@@ -10,11 +10,13 @@ import socket
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
+from itertools import pairwise
 from time import monotonic, monotonic_ns
 
 import pytest
 
 from imud.contracts.command import CalibrationResult, VerbResult
+from imud.contracts.setting import StepOutcome
 from imud.contracts.status import DeviceState
 from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.drivers.hipnuc.j1939 import codec, commands
@@ -24,13 +26,22 @@ from imud.model.errors import NoReply
 from imud.model.event import EventKind
 from imud.model.sample import Sample
 from imud.sim.hipnuc.canopen import NODE_VARIANTS, HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
-from imud.sim.hipnuc.j1939 import J1939_VARIANTS, HipnucJ1939Module, J1939Hardware, J1939Settings
+from imud.sim.hipnuc.j1939 import (
+    CANFD_SIMULATOR,
+    J1939_VARIANTS,
+    PLACE,
+    HipnucJ1939Module,
+    J1939Hardware,
+    J1939Settings,
+)
 from imud.sim.hipnuc.nmea2000 import HipnucNmea2000Module, Nmea2000Hardware
 from imud.sim.physics import Still
 from imud.sim.ports.can_port import CanPort
+from imud.sim.sensor import SimulatorOptions
 from tests.lab.can_device import BusRig
 from tests.lab.can_interface import CanInterface
 from tests.lab.short_form import cases
+from tests.lab.tool import tool
 
 LIMIT_S = 30.0
 LEVEL = 100 + socket.CAN_J1939
@@ -150,7 +161,7 @@ def test_our_simulator_heard_and_set_by_a_node_of_the_kernel(vcan: CanInterface)
 
 async def test_driver_and_simulator_with_every_message_and_changes(vcan: CanInterface) -> None:
     """Two devices on the bus. The test changes settings of one device while both send, and restarts it."""
-    fast = dict.fromkeys(codec.PGNS, 100)
+    fast = dict.fromkeys((codec.UTC, *codec.MEASURED), 100)
     quiet = J1939Hardware(bitrate=0, boot_ms=0)
     module = HipnucJ1939Module(monotonic_ns(), J1939Settings(fast), quiet)
     other = HipnucJ1939Module(monotonic_ns(), J1939Settings(fast, address=9), quiet)
@@ -166,6 +177,10 @@ async def test_driver_and_simulator_with_every_message_and_changes(vcan: CanInte
         await rig.until(lambda: len(rig.samples) >= 20, "twenty samples")
         assert rig.samples[-1].temperature_c is not None
         assert rig.samples[-1].incli_rad is not None
+        position = rig.samples[-1].position
+        assert position is not None
+        assert (position.quality, position.satellites) == (PLACE.quality, PLACE.satellites)
+        assert rig.samples[-1].gnss_utc_ns is not None
         assert rig.device.ledger.lost() == 0
         await told("zero", zero="here")
         wanted = {"x_reversed": True, "bit_rate": 250_000, "ff34_interval_ms": 50, "ff37_interval_ms": 50}
@@ -183,6 +198,31 @@ async def test_driver_and_simulator_with_every_message_and_changes(vcan: CanInte
     last = rig.samples[-20:]
     assert {sample.accel_m_s2 is not None for sample in last} == {True}
     assert {sample.mag_t is not None for sample in last} == {True, False}
+
+
+@pytest.mark.parametrize(("message", "name"), [("canfd", "ff5b"), ("canfd_old", "ff5a")])
+async def test_can_fd_samples_of_a_found_device_and_a_change(vcan: CanInterface, message: str, name: str) -> None:
+    """The interface accepts CAN FD (MTU 72). imud finds the device, and the bus loses no frame of 64 bytes."""
+    vcan.down()
+    tool("ip", "link", "set", vcan.name, "mtu", "72")
+    vcan.up()
+    options = SimulatorOptions(message=message, boot_ms=0, noise="none", motion="still")
+    module = CANFD_SIMULATOR.make(options, monotonic_ns())
+    rig = BusRig(vcan.name, "auto", None, module)
+    async with rig.played():
+        await rig.until(lambda: len(rig.samples) >= 100, "a second of samples")
+        assert rig.device.status().driver == "hipnuc-canfd"
+        setting = f"{name}_interval_ms"
+        applied = await rig.done(rig.device.settings.apply({setting: 20}, save=False))
+        assert (applied.problem, [one.outcome for one in applied.steps]) == ("", [StepOutcome.VERIFIED])
+        await rig.until(lambda: len(rig.samples) >= 200, "two seconds of samples")
+        assert rig.device.ledger.lost() == rig.device.ledger.frames_bad() == 0
+    sample = rig.samples[-1]
+    assert sample.accel_m_s2 == pytest.approx((0, 0, 9.8), abs=0.01)
+    assert sample.quat_wxyz == pytest.approx((1, 0, 0, 0), abs=1e-3)
+    assert sample.t_dev_ns is not None
+    steps_ms = {(b.t_dev_ns or 0) - (a.t_dev_ns or 0) for a, b in pairwise(rig.samples[-50:])}
+    assert steps_ms == {20_000_000}
 
 
 async def test_nmea_2000_from_the_simulator(vcan: CanInterface) -> None:

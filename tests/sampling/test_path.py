@@ -14,6 +14,8 @@ from imud.contracts.lines import Edge, ReadyOptions, TriggerStamp
 from imud.contracts.publisher import Batch
 from imud.contracts.script import Message, ReplyFrame, TextLine
 from imud.drivers import DRIVERS
+from imud.drivers.hipnuc.canfd import HipnucCanfdCodec, HipnucCanfdOptions, pack_fast
+from imud.drivers.hipnuc.uart import ins
 from imud.drivers.hipnuc.uart.codec import HipnucCodec, HipnucOptions
 from imud.formats.can import CanFrame
 from imud.model.errors import TransferError, Trouble
@@ -57,6 +59,8 @@ class Scripted:
     def feed_frame(self, *_frame: object) -> Sequence[Any]:
         events, self.ledger.frames_pending = self.results.pop(0)
         return events
+
+    counts_losses = False
 
     def decode(self, *_poll: object) -> Sequence[Any]:
         return self.results.pop(0)[0]
@@ -237,6 +241,20 @@ def frame(t_rx_ns: int, after_loss: bool = False) -> CanFrame:
 def since(t_first_ns: int) -> Measurement:
     """Return values whose first frame arrived at `t_first_ns`."""
     return msgspec.structs.replace(VALUES, t_first_ns=t_first_ns)
+
+
+def test_a_loss_that_the_codec_counts_is_not_counted_by_the_clock() -> None:
+    """Three of 80 frames with system time and sequence number are lost."""
+    rig = PathRig("hipnuc-canfd")
+    rig.codec = HipnucCanfdCodec(rig.ledger, HipnucCanfdOptions())
+    path, now, bitmap = rig.can(), rig.now, 1 << ins.ACCEL | 1 << ins.TIME
+    path.begin(now)
+    for n in (n for n in range(80) if n not in (50, 51, 60)):
+        data = pack_fast(Measurement(0, 0, None, (0.0, 0.0, n / 8)), bitmap, n, time_us=10_000 * n)
+        path.on_frames([CanFrame(0x0CFF5B08, True, data, now + 10 * n * MS)])
+    assert (rig.ledger.samples, rig.ledger.lost()) == (77, 3)
+    newest = rig.batches[-1][-1]
+    assert (newest.seq, newest.t_dev_ns, newest.accel_m_s2) == (77, 790 * MS, (0.0, 0.0, 79 / 8))
 
 
 def test_samples_of_can_frames_start_before_the_first_frame_and_end_at_a_loss() -> None:

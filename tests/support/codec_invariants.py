@@ -1,7 +1,7 @@
 """Rules for every codec after each input: the ledger balances, the memory is limited, all events are counted."""
 
 from collections.abc import Iterable, Sequence
-from math import isnan
+from math import isnan, pi
 from random import Random
 from typing import Final
 
@@ -103,7 +103,10 @@ def check_counted(ledger: Ledger, events: Sequence[CodecEvent]) -> None:
 
 def finite(measurement: Measurement, partial: bool) -> bool:
     """Return whether all numbers are finite. `partial`: a vector can contain non-finite numbers."""
-    values = (measurement.accel_m_s2, measurement.gyro_rad_s, measurement.euler_rad, measurement.quat_wxyz)
+    m, place = measurement, measurement.position
+    values = (m.accel_m_s2, m.gyro_rad_s, m.euler_rad, m.quat_wxyz, m.velocity_enu_m_s)
+    if place is not None and not (abs(place.latitude_rad) <= pi / 2 + 1e-9 and abs(place.longitude_rad) <= pi + 1e-9):
+        return False
     for vector in values:
         if vector is None:
             continue

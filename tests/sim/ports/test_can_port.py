@@ -2,6 +2,7 @@
 
 import errno
 import socket
+import time
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -9,12 +10,17 @@ from unittest.mock import Mock, call
 
 import pytest
 
+from imud.drivers.hipnuc.canfd import HipnucCanfdCodec, HipnucCanfdOptions
 from imud.formats.can import ERROR_FLAG, RAW_FRAME, REMOTE_FLAG, pack_frame
-from imud.links.socketcan import libc
+from imud.links.socketcan import BusState, FrameReader, libc
 from imud.model.errors import LinkError
+from imud.model.ledger import Ledger
+from imud.model.sample import Measurement
 from imud.sim.can_module import SentFrame
+from imud.sim.hipnuc.j1939 import CANFD_SIMULATOR
 from imud.sim.ports import can_port
 from imud.sim.ports.can_port import CanPort, default_interface, open_can_socket
+from imud.sim.sensor import SimulatorOptions
 
 
 @pytest.fixture
@@ -104,6 +110,24 @@ def test_a_port_passes_frames_in_both_directions(pair: tuple[socket.socket, sock
     assert port.summary()["frames_refused"] == 2
     port.step(102, readable=True)  # a failed read is ignored: an interface can return
     assert len(received) == 3
+
+
+@pytest.mark.parametrize("message", ["canfd", "canfd_old"])
+def test_can_fd_samples_cross_a_socket(pair: tuple[socket.socket, socket.socket], message: str) -> None:
+    near, far = pair
+    begin_ns = time.monotonic_ns()
+    module = CANFD_SIMULATOR.make(SimulatorOptions(message=message, boot_ms=0, rate_hz=100.0, noise="none"), begin_ns)
+    port = CanPort(module, "vcan9", open_socket=lambda _name: near)
+    reader, codec = FrameReader(far, BusState("vcan9")), HipnucCanfdCodec(Ledger(), HipnucCanfdOptions())
+    events: list[Any] = []
+    for ms in range(0, 3000, 5):
+        port.step(begin_ns + ms * 1_000_000, readable=False)
+        for frame in reader.read():
+            if len(frame.data) == 64:  # not the claim of the address
+                events += codec.feed_frame(frame.can_id, frame.extended, frame.data, begin_ns + ms * 1_000_000)
+    assert all(isinstance(event, Measurement) for event in events)
+    assert [event.dev_ticks for event in events] == list(range(0, 2991, 10))
+    assert (len(events), codec.ledger.lost(), codec.ledger.frames_bad(), port.frames_refused) == (300, 0, 0, 0)
 
 
 def test_an_interface_that_is_not_there_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
