@@ -230,6 +230,7 @@ def test_all_that_can_be_read() -> None:
         *(None if text is None else bytes.fromhex(text) for text in older),
     )
     assert len(frames) == 15
+    assert len(played(SETTINGS.read(Target(HipnucJ1939Options(), 0), None), None, None)[0]) == 2  # a silent device
     bit_rate = SETTINGS.read(Target(HipnucJ1939Options(), 0), {SETTINGS.table["bit_rate"].report})
     found = combined(played(bit_rate, bytes.fromhex("9A00030005000000"))[1])  # type: ignore[arg-type]  # reports
     assert (found.words, found.values) == ({"bitrate": "5"}, {})
