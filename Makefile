@@ -18,7 +18,7 @@
 # make web-pictures   the pictures of `imud web`, in a real browser, into docs/pictures
 # make fuzz   every decoder of foreign bytes, 60 s each, with a table
 # make sanitize   tests of the C kernel with AddressSanitizer and UndefinedBehaviorSanitizer
-# make audit  items of both manuals: code and tests of each
+# make audit  items of both manuals and of newer firmware: code and tests of each
 # make deb    the Debian package of this release and architecture, into build/deb (RELEASE=trixie ARCH=arm64: of others)
 # make deb-try   installs, upgrades, removes and purges it in a Debian in a folder (as root)
 # make lab-debian   boots Debian 12 and 13 with systemd and checks the package there (as root; tests/lab_debian/README.md)

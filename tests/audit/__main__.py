@@ -1,16 +1,16 @@
-"""Prints, per section of both manuals, item → code → tests, and what the drivers describe: `make audit`.
+"""Prints, per section of the manuals and of newer firmware, item → code → tests, and what the drivers describe.
 
-Exits with 1 when an item has no code or no test.
+`make audit` runs it. It exits with 1 when an item has no code or no test.
 """
 
 import sys
 from collections.abc import Iterator
 
-from tests.audit import manuals
-from tests.audit.item import Item, described, faults, marks
+from tests.audit import manuals, newer
+from tests.audit.item import Item, described, evidence_of, faults
 
-TITLES = {"A": "Forsense IMU61x", "B": "HiPNUC CH0x0, CH10x, HI14"}
-ITEMS = {item.key: item for item in manuals.ITEMS}
+TITLES = {"A": "Forsense IMU61x", "B": "HiPNUC CH0x0, CH10x, HI14", "C": "Newer firmware and frames"}
+ITEMS = {item.key: item for item in (*manuals.ITEMS, *newer.ITEMS)}
 
 
 def report(marked: dict[str, list[str]]) -> Iterator[str]:
@@ -41,7 +41,7 @@ def _left(left: list[Item]) -> str:
 
 
 def main() -> int:
-    marked = marks()
+    marked = evidence_of(ITEMS.values())
     print("\n".join(report(marked)))
     print()
     for letter in TITLES:

@@ -1,13 +1,13 @@
 """Items of the manuals: the reaction of imud to each item, its place in the code, its tests, and its drivers.
 
-A test names its items with a mark, `@pytest.mark.manual("B 2.2.3 SERIALCONFIG", …)`. The audit reads the marks from the
-source of the tests, without imports.
+A test names its items with a mark, `@pytest.mark.manual("B 2.2.3 SERIALCONFIG", …)`, or the row of an item names its
+tests. The audit reads marks and names from the source of the tests, without imports.
 """
 
 import ast
 import importlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -29,6 +29,8 @@ class Item:
     words: str
     code: str
     """`module:name` below `imud` of the code for the item, or `left:` and the reason why imud does not implement it."""
+    tests: tuple[str, ...] = ()
+    """Tests of the item as `path::name`, in addition to the tests with its mark."""
 
     @property
     def left(self) -> str:
@@ -50,22 +52,41 @@ class Item:
             return False
 
 
+def item_of(row: str) -> Item:
+    """Return the item of a row: key | words | code | tests. The tests are optional."""
+    key, words, code, *tests = map(str.strip, row.split("|"))
+    return Item(key, words, code, tuple(test for names in tests for test in names.split()))
+
+
+def evidence_of(items: Iterable[Item]) -> dict[str, list[str]]:
+    """Return the existing tests by the key of each item: tests with its mark, and tests in its row."""
+    found = {key: list(tests) for key, tests in marks().items()}
+    for item in items:
+        if tests := [test for test in item.tests if test in _marks_by_test()]:
+            found.setdefault(item.key, []).extend(tests)
+    return found
+
+
 @cache
 def marks() -> dict[str, list[str]]:
     """Return the tests, as `path::name`, by the key of each item that they have a mark for."""
     found: dict[str, list[str]] = {}
-    for path in sorted(TESTS.rglob("test_*.py")):
-        for key, name in _marks_of(ast.parse(path.read_text())):
-            found.setdefault(key, []).append(f"{path.relative_to(TESTS)}::{name}")
+    for test, keys in _marks_by_test().items():
+        for key in keys:
+            found.setdefault(key, []).append(test)
     return found
 
 
-def _marks_of(tree: ast.Module) -> Iterator[tuple[str, str]]:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            for decorator in node.decorator_list:
-                for key in _keys(decorator):
-                    yield key, node.name
+@cache
+def _marks_by_test() -> dict[str, tuple[str, ...]]:
+    """Return the keys in the marks of each test."""
+    found: dict[str, tuple[str, ...]] = {}
+    for path in sorted(TESTS.rglob("test_*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.name.startswith("test_"):
+                keys = tuple(key for decorator in node.decorator_list for key in _keys(decorator))
+                found[f"{path.relative_to(TESTS)}::{node.name}"] = keys
+    return found
 
 
 def _keys(decorator: ast.expr) -> Iterator[str]:
@@ -86,7 +107,8 @@ def faults(items: Mapping[str, Item], marked: Mapping[str, list[str]]) -> Iterat
         if not item.code_exists:
             yield f"{key}: no {item.code} in imud"
         if key not in marked:
-            yield f"{key}: no test has a mark for it"
+            yield f"{key}: no test"
+        yield from (f"{key}: no test {test}" for test in item.tests if test not in _marks_by_test())
     for key, tests in marked.items():
         if key not in items:
             yield f"{key}: no such item, although {tests[0]} has a mark for it"

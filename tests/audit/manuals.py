@@ -7,7 +7,7 @@ Manual A is "IMU61X Interface Protocol and Instructions", manual B is "IMU配置
 
 from typing import Final
 
-from tests.audit.item import Item
+from tests.audit.item import item_of
 
 _ROWS: Final = """\
 A 1 stream mode | periodic AHRS frames | drivers.imu61x.uart.codec:Imu61xCodec
@@ -257,4 +257,4 @@ B 8.3 indoors | nine axes may be worse than six | left: said in the instructions
 B 9.1 angles of a quaternion | order 312, ENU | attitude.rotation:euler312_from_quat
 B 9.2 matrix of a quaternion | | attitude.rotation:matrix_from_quat
 """
-ITEMS: Final = [Item(*map(str.strip, row.split("|"))) for row in _ROWS.splitlines()]
+ITEMS: Final = [item_of(row) for row in _ROWS.splitlines()]

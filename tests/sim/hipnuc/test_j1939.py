@@ -21,7 +21,14 @@ from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.sim.can_module import CanModules, SentFrame
 from imud.sim.hipnuc import j1939
-from imud.sim.hipnuc.j1939 import SIMULATOR, HipnucJ1939Module, J1939Hardware, J1939Settings, J1939Variant
+from imud.sim.hipnuc.j1939 import (
+    J1939_VARIANTS,
+    SIMULATOR,
+    HipnucJ1939Module,
+    J1939Hardware,
+    J1939Settings,
+    J1939Variant,
+)
 from imud.sim.physics import Still
 from imud.sim.sensor import SimulatorOptions
 from tests.support.simulated_modules import run_script
@@ -212,6 +219,19 @@ def test_a_restart_is_answered_before_it_happens_or_not_at_all(confirms: bool) -
     sent = [f for now_us in (50_500, 60_000) for f in module.advance(BEGIN_NS + now_us * 1000)]
     expected = [bytes.fromhex("9C00030008000000"), bytes.fromhex("00000600FF000000")][: 1 + confirms]
     assert [f.data for f in sent if f.can_id == 0x0CEF5508] == expected
+
+
+def test_the_output_can_be_off_and_a_message_alone_too() -> None:
+    module = HipnucJ1939Module(BEGIN_NS, hardware=J1939Hardware(boot_ms=0, variant=J1939_VARIANTS["claims no address"]))
+    now_ns = BEGIN_NS
+    for request, pgns in (
+        ("370106000000 0000", {codec.ACCEL, codec.ROLL_PITCH, codec.HEADING}), ("9D00060000000000", set()),
+        ("9D00060001000000", {codec.ACCEL, codec.ROLL_PITCH, codec.HEADING}),
+    ):  # fmt: skip
+        module.receive(0x0CEF0855, True, bytes.fromhex(request), now_ns)
+        module.advance(now_ns + 5 * MS)
+        now_ns += 1000 * MS
+        assert {split(f.can_id).pgn for f in module.advance(now_ns)} == pgns
 
 
 def test_an_address_is_claimed_after_power_on_and_when_asked() -> None:

@@ -1,5 +1,6 @@
 """Simulated devices on one bus: time of a byte, replies, saved settings. No clock, no waiting."""
 
+import struct
 from math import dist, radians
 from typing import Any
 
@@ -54,6 +55,18 @@ READ_BLOCK, READ_SHORT = (read_registers(0x34, count).sends[0] for count in (26,
 
 def here(address: int, **more: Any) -> Slave:
     return slave(address, baud=BAUD, **more)
+
+
+@pytest.mark.parametrize(("firmware", "wave_m"), [(169, 2.0), (170, 0.0), (170, 2.0)])
+def test_heave_of_newer_firmware(firmware: int, wave_m: float) -> None:
+    """After 2.5 s, a wave of 2 m and 0.1 Hz is at its maximum."""
+    rig = ModbusMaster(here(1, firmware=firmware, wave_m=wave_m))
+    rig.now_ns += 2_500_000_000
+    reply = rig.ask(1, read_registers(0x4E, 6).sends[0])
+    assert is_exception(reply) == (firmware == 169)
+    if firmware > 169:
+        heave, _, _, hz, _, _ = struct.unpack(">3h3H", reply[3:-2])
+        assert (heave, hz) == (pytest.approx(100 * wave_m, abs=1), 10 * bool(wave_m))
 
 
 def test_time_of_bytes_pieces_echo_and_a_request_after_a_silence() -> None:
