@@ -25,6 +25,7 @@ from imud.model.errors import ImudError
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement
+from imud.sampling.device_time import ticks_over_day
 
 FIFO_WAIT_MS = 5000  # time limit for the first bytes of a FIFO, ms
 NOT_SHOWN = {"trailing_bytes", "dev_ticks", "t_first_ns"}
@@ -128,7 +129,8 @@ def as_object(event: CodecEvent, times: "UnwrappedTime") -> dict[str, object]:
 
 
 class UnwrappedTime:
-    """Unwrapped device time without a host clock. A step back by more than half of the range is a rollover."""
+    """Unwrapped device time without a host clock. A step back by more than half of the range is a rollover,
+    and a step back by nearly 24 h is the end of a day."""
 
     def __init__(self, driver: Driver) -> None:
         self._driver = driver
@@ -136,16 +138,19 @@ class UnwrappedTime:
         # Field name of the unwrapped counter: `t_dev_ns` for device time, `index` for a sample counter
         self.key = "index" if driver.tick_ns == SAMPLE_COUNTER else "t_dev_ns"
         self._last: int | None = None
-        self._turns = 0
+        self._rolled = 0  # ticks of all rollovers
 
     def unwrap(self, ticks: int) -> int:
         """Return the device time since the zero of the counter, ns, or the index of the sample."""
-        modulus = self._driver.tick_modulus
-        # a smaller step back is a duplicate or a restart, not a rollover
-        if self._last is not None and self._last - ticks > modulus // 2:
-            self._turns += 1
+        if self._last is not None:
+            modulus = self._driver.tick_modulus
+            # a smaller step back is a duplicate or a restart, not a rollover
+            if self._last - ticks > modulus // 2:
+                self._rolled += modulus
+            elif step := ticks_over_day(self._last, ticks, self._driver.tick_ns):
+                self._rolled += self._last + step - ticks
         self._last = ticks
-        return (self._turns * modulus + ticks) * self._tick
+        return (self._rolled + ticks) * self._tick
 
 
 DECODE = CliCommand(add_arguments, run)

@@ -609,7 +609,7 @@ class SampleClock:
             self._resets += above_ns > 0.0
             self.missed = time.missed
         else:
-            self._resets += not time.is_new_day
+            self._resets += 1
             self._begin_counter(ticks, arrival_ns, None)
         self._start_fit(arrival_ns)
         return self._less_bias(arrival_ns, size_bytes)

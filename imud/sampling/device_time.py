@@ -284,9 +284,21 @@ JUMP_EARLY_SIGMAS: Final = 10
 FIRST_EARLY_NS: Final = NS_PER_S
 JUMP_LATE_NS: Final = NS_PER_S / 2
 DAY_NS: Final = 86_400 * NS_PER_S
-DAY_EDGE_NS: Final = 2 * NS_PER_S  # maximum distance of a sample to the end of a day, ns: two periods of 1 s
+DAY_WRAP_NS: Final = 3_600 * NS_PER_S  # maximum time without a sample in which the counter can wrap at 24 h, ns
 # Number of late reads in one second that show a jump. Fewer can be the queue of a busy host.
 JUMP_LATE_READS: Final = 3
+
+
+def ticks_over_day(before: int, ticks: int, tick_ns: int) -> int:
+    """Return the number of ticks from counter value `before` to `ticks` over a wrap at 24 h; 0 without such a wrap.
+
+    Newer firmware of HiPNUC counts modulo 24 h, with and without UTC. `tick_ns` is 0 for a counter of samples.
+    """
+    if not tick_ns or ticks >= before:
+        return 0
+    day_ticks = DAY_NS // tick_ns
+    step = ticks + day_ticks - before
+    return step if before < day_ticks and step * tick_ns <= DAY_WRAP_NS else 0
 
 
 class DeviceTime:
@@ -347,12 +359,14 @@ class DeviceTime:
 
     def elapsed_ns(self, ticks: int) -> int:
         """Return the device time from the newest counter value to `ticks`, ns, with at most one wrap."""
-        return (ticks - self.ticks) % self.modulus * self.tick_ns
+        return self._step(ticks) * self.tick_ns
 
-    @property
-    def is_new_day(self) -> bool:
-        """Whether the newest uneven step is the end of a day: a device that knows UTC sends the time of the day."""
-        return 0 <= self._step_ns + DAY_NS <= DAY_EDGE_NS and self.ticks * self.tick_ns <= DAY_EDGE_NS
+    def _step(self, ticks: int) -> int:
+        """Return the number of ticks from the newest counter value to `ticks`, with at most one wrap."""
+        step = (ticks - self.ticks) % self.modulus
+        if step > self.modulus // 2:
+            return ticks_over_day(self.ticks, ticks, self.tick_ns) or step
+        return step
 
     def missed_since(self, line: CounterLine, ticks: int, arrival_ns: int) -> int | None:
         """Return the number of lost samples since the newest sample; None if the counter did not continue to `ticks`.
@@ -365,7 +379,7 @@ class DeviceTime:
 
     def advance(self, ticks: int) -> None:
         """Set the next counter value."""
-        step = (ticks - self.ticks) % self.modulus
+        step = self._step(ticks)
         self.ticks = ticks
         tick_ns, period = self.tick_ns, self.period
         self.raw_ns += step * tick_ns

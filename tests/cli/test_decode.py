@@ -40,6 +40,12 @@ def test_one_object_per_message(tmp_path: Path, cli: Cli) -> None:
     assert (ledger["bytes_in"], ledger["frames_in_samples"]) == (82 + 4 + 82 + 1, 1)
 
 
+def test_device_time_continues_after_24_hours_and_not_after_a_restart(tmp_path: Path, cli: Cli) -> None:
+    (tmp_path / "night").write_bytes(b"".join(hi91(ms) for ms in (86_399_990, 0, 10, 5)))
+    times = [one["t_dev_ns"] for one in lines(cli(*DECODE, tmp_path / "night").out)]
+    assert times == [86_399_990_000_000, 86_400_000_000_000, 86_400_010_000_000, 86_400_005_000_000]
+
+
 def test_standard_input_and_files_without_a_message(tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "noise").write_bytes(bytes(range(128, 256)) * 8)
     assert json.loads(cli(*DECODE, tmp_path / "noise", status=1).err)["bytes_in"] == 1024

@@ -118,10 +118,26 @@ def test_a_counter_that_stays_late_has_restarted(before: list[Point], after: lis
     assert (max(sample.t_err_ns for sample in samples) == 0xFFFF_FFFF) == (settled == 150)
 
 
-def test_the_end_of_a_day_is_no_reset() -> None:
-    for at_ms, resets in ((86_400_000, 0), (86_300_000, 1)):
-        feed(clock := make_clock(), steady(at_ms - 3000, 0, 300) + steady(0, 3000, 500))
-        assert clock.status().resets == resets
+@pytest.mark.parametrize(
+    ("before_ms", "after", "resets", "missed"),
+    [
+        (86_400_000, steady(0, 3000, 500), 0, 0),
+        (86_400_000, steady(30, 3030, 500), 0, 3),  # three samples lost at midnight
+        (86_398_000, steady(10_000, 15_000, 500), 0, 1200),  # 12 s without samples around midnight
+        (86_300_000, steady(0, 3000, 500), 1, 0),  # a restart 100 s before midnight
+        (86_399_000, steady(500, 3500, 500), 1, 0),  # a restart 1 s before midnight
+        (60_000, steady(0, 3000, 500), 1, 0),
+    ],
+)
+def test_the_end_of_a_day_is_no_reset(before_ms: int, after: list[Point], resets: int, missed: int) -> None:
+    feed(clock := make_clock(), steady(before_ms - 3000, 0, 300))
+    samples = feed(clock, after[:1])
+    assert (clock.status().resets, clock.missed) == (resets, missed)
+    samples += feed(clock, after[1:])
+    assert (clock.status().resets, clock.missed) == (resets, 0)
+    assert rises(samples)
+    assert resets or far(samples, after) < NEAR_NS
+    assert resets or samples[-1].t_dev_ns == (after[-1][0] or 0) * NS_PER_MS + 86_400_000 * NS_PER_MS
 
 
 @pytest.mark.parametrize("reads", [((200, 22_001),), ((150, 22_001), (150, 23_500))])

@@ -25,6 +25,7 @@ from imud.formats import kernel
 from imud.formats.slot import SLOT_BYTES
 from imud.host.clock import HostClock
 from imud.model.ledger import Ledger
+from imud.model.sample import Sync
 from imud.model.units import NS_PER_MS, NS_PER_US
 from imud.recording.state import StateWriter
 from imud.sampling.clock import SampleClock
@@ -143,10 +144,11 @@ FORMATS = {
 class Run:
     """A path that processes steps, with or without the kernel."""
 
-    def __init__(self, of: Format, word: Word, turned: bool) -> None:
+    def __init__(self, of: Format, word: Word, turned: bool, first_ms: int, modulus_ms: int) -> None:
         self.of = of
         self.slots = b""
-        self.now_ns, self.slewed_ns, self.ms, self.number = BEGIN_NS, 0, 0, 0
+        self.now_ns, self.slewed_ns, self.ms, self.number = BEGIN_NS, 0, first_ms, 0
+        self.modulus_ms = modulus_ms
         self.kernel_batches, self.held = 0, list[bool]()
         self.late_bytes = b""
         self.ledger = Ledger()
@@ -185,7 +187,7 @@ class Run:
         for number in range(step.frames):
             self.ms += step.step_ms
             self.now_ns += step.step_ms * (NS_PER_MS + 40)
-            stream += self.of.of_kind(step.kind if number == step.frames // 2 else "usual", self.ms % 2**32)
+            stream += self.of.of_kind(step.kind if number == step.frames // 2 else "usual", self.ms % self.modulus_ms)
         self.number += 1
         self.now_ns += self.number * 7919 % 97 * 1000
         data = bytearray(stream[: len(stream) - step.cut])
@@ -215,10 +217,13 @@ class Run:
         )  # fmt: skip
 
 
-def play(steps: Sequence[Step], of: Format, found: kernel.Kernel, word: Word = "pps", turned: bool = False) -> Run:
+def play(
+    steps: Sequence[Step], of: Format, found: kernel.Kernel, word: Word = "pps", turned: bool = False,
+    first_ms: int = 0, modulus_ms: int = 2**32,
+) -> Run:  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernel, "present", found)
-        run = Run(of, word, turned)
+        run = Run(of, word, turned, first_ms, modulus_ms)
         for _ in range(SETTLE // 4):
             run.do(Step(4))
         for step in steps:
@@ -236,6 +241,27 @@ def play(steps: Sequence[Step], of: Format, found: kernel.Kernel, word: Word = "
 def test_kernel_and_python_are_equal(name: str, steps: list[Step], word: Word, turned: bool) -> None:
     results = [play(steps, FORMATS[name], one, word, turned).result() for one in (kernel.present, kernel.Kernel(None))]
     for one, other in zip(*results, strict=True):
+        assert one == other
+
+
+DAY_MS = 86_400_000
+
+
+@pytest.mark.parametrize("lost", [0, 5])
+def test_samples_continue_over_the_end_of_a_day(lost: int) -> None:
+    """Newer firmware counts modulo 24 h. 25 reads of 4 frames begin 50 ms before the wrap, inside the 13th read."""
+    steps = [*[Step(4)] * 12, Step(4, jump_ms=lost), *[Step(4)] * 12]
+    runs = [
+        play(steps, FORMATS["HI91"], one, first_ms=DAY_MS - SETTLE - 50, modulus_ms=DAY_MS)
+        for one in (kernel.present, kernel.Kernel(None))
+    ]
+    for run in runs:
+        status, newest = run.path.clock.status(), run.path.newest
+        assert newest is not None
+        assert (newest.t_dev_ns, newest.sync) == ((DAY_MS + 50 + lost) * NS_PER_MS, Sync.REGRESSION)
+        assert (status.resets, run.ledger.losses(), run.ledger.samples) == (0, (lost, 0, 0, 0, 0), SETTLE + 100)
+    assert runs[0].kernel_batches > 10 > runs[1].kernel_batches == 0
+    for one, other in zip(*(run.result() for run in runs), strict=True):
         assert one == other
 
 
