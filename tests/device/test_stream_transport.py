@@ -20,6 +20,7 @@ from imud.drivers.hipnuc.uart import driver
 from imud.drivers.hipnuc.uart.codec import encode_frame
 from imud.drivers.imu61x.uart.codec import DEVICE_SYNC
 from imud.drivers.imu61x.uart.codec import encode_frame as imu61x_frame
+from imud.formats.nmea0183 import sentence
 from imud.links import LINKS
 from imud.links.memory import MemoryLink, MemoryOptions
 from imud.model.errors import LinkBusy, LinkError, Rejected
@@ -423,7 +424,12 @@ AHRS_NEXT = "imud decodes the AHRS frame (identifier 0x0002): select this output
     ("driver", "frames", "types", "next_step"),
     [
         ("hipnuc-uart", TAG_85, "tag 0x85", HI_NEXT),
-        ("hipnuc-uart", TAG_84 + b"$GPRMC,123519,A*6A\r\n" + TAG_85, "tag 0x84, tag 0x85", HI_NEXT),
+        (
+            "hipnuc-uart",
+            TAG_84 + sentence("GPRMC,123519,A") + TAG_85,
+            "tag 0x84, NMEA sentence RMC, tag 0x85",
+            HI_NEXT,
+        ),
         ("hipnuc-uart", OTHER, "tag 0x77", HI_NEXT),
         ("imu61x-uart", RAW, "raw data (identifier 0x0666)", AHRS_NEXT),
         ("imu61x-uart", imu61x_frame(DEVICE_SYNC, 0x0777, bytes(9)), "identifier 0x0777", AHRS_NEXT),

@@ -41,7 +41,7 @@ from imud.drivers.hipnuc.common import (
     temperature_beside,
 )
 from imud.drivers.hipnuc.uart.ins import HI81, TAG_HI81, TAG_HI83, decode_hi81, decode_hi83, hi83_bytes
-from imud.drivers.hipnuc.uart.replies import LINE_CHARACTERS_MAX, LineFinder
+from imud.drivers.hipnuc.uart.replies import LINE_CHARACTERS_MAX, SENTENCE_TYPE_MIN, LineFinder, sentence_name
 from imud.drivers.value_limits import (
     ACCEL_LIMIT_G,
     GYRO_LIMIT_DEG_S,
@@ -162,8 +162,8 @@ class Packet:
 
 
 def tag_name(tag: int) -> str:
-    """Return the name of an unknown tag, for example `tag 0x05`."""
-    return f"tag {tag:#04x}"
+    """Return the name of an unknown tag or sentence type, for example `tag 0x05`."""
+    return sentence_name(tag) if tag >= SENTENCE_TYPE_MIN else f"tag {tag:#04x}"
 
 
 SYNC: Final = b"\x5a\xa5"
@@ -290,11 +290,11 @@ class HipnucCodec(KernelFrames):
 
     def __init__(self, ledger: Ledger, settings: HipnucOptions) -> None:
         super().__init__(ledger)
-        self.unknown: dict[int, int] = {}  # number of sub-packets by unknown tag
+        self.unknown: dict[int, int] = {}  # number of sub-packets by unknown tag, and of NMEA sentences by type
         self.word_is_status = settings.hi91_word == "status"  # whether bytes 1-2 of HI91 are status bits
         self.kernel_format = HI91_FORMAT  # of the newest frame that the kernel can decode
         self._word_is_fixed = settings.hi91_word != "auto"
-        self._lines = LineFinder(ledger)
+        self._lines = LineFinder(ledger, self.unknown)
         self._bad_ahead = 0  # rest of a damaged frame by its length field, in bytes from the start of the tail
         self._barred_ahead = 0  # rest of a complete damaged frame, in which the codec does not look for lines
 

@@ -17,7 +17,9 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Final, NamedTuple
 
+from imud.contracts.codec import BadFrame, BadReason, count_unknown
 from imud.contracts.script import Message, TextLine
+from imud.formats.nmea0183 import checksum
 from imud.model.ledger import Ledger
 
 _VERSION_LINE: Final = re.compile(r"\s*(?:PNAME|BUILD|UUID|APP_VER|BL_VER)\s*[=:].*")
@@ -131,16 +133,28 @@ LINE_CHARACTERS_MAX: Final = 255
 
 _PRINTABLE: Final = bytes([0x09, *range(0x20, 0x7F)])
 
+# NMEA 0183 sentence of newer firmware, for example `$GNGGA,…*5C`, with the last three letters of its address
+_SENTENCE: Final = re.compile(rb"\$([A-Z][A-Z0-9]{0,4}([A-Z0-9]{3})(?:,[^*$]*)?)\*([0-9A-Fa-f]{2})")
+SENTENCE_TYPE_MIN: Final = 1 << 16  # minimum number of a sentence type; tags of sub-packets are smaller
+
+
+def sentence_name(sentence_type: int) -> str:
+    """Return the name of a sentence type, for example `NMEA sentence GGA`."""
+    return f"NMEA sentence {sentence_type.to_bytes(3, 'big').decode('ascii')}"
+
 
 class LineFinder:
     """Finder of text lines across reads and frames. It counts every byte in the ledger: good, bad, skipped, or pending.
 
-    Text inside a damaged frame is not a line, because its first characters may be the last bytes of the frame.
+    Text inside a damaged frame is not a line, because its first characters may be the last bytes of the frame. An NMEA
+    sentence is not part of a reply: it counts as an ignored frame in `unknown`, and as a damaged frame if its checksum
+    is wrong.
     Synchronization: one thread. Holds at most LINE_CHARACTERS_MAX + 1 bytes.
     """
 
-    def __init__(self, ledger: Ledger) -> None:
+    def __init__(self, ledger: Ledger, unknown: dict[int, int]) -> None:
         self._ledger = ledger
+        self._unknown = unknown  # number of sentences by type
         self._held = b""  # printable characters without a line end, with a possible CR
         self._held_bad = 0  # number of the first held bytes inside a damaged frame by its length field
         self._held_barred = 0  # number of these bytes inside a complete damaged frame
@@ -151,13 +165,13 @@ class LineFinder:
         """Number of bytes of the incomplete line."""
         return len(self._held)
 
-    def add(self, data: bytes, bad: int, barred: int) -> list[TextLine]:
-        """Add bytes outside frames. Return complete lines.
+    def add(self, data: bytes, bad: int, barred: int) -> list[TextLine | BadFrame]:
+        """Add bytes outside frames. Return complete lines, and NMEA sentences with a wrong checksum.
 
         The first `bad` bytes are inside a damaged frame, the first `barred` bytes inside a complete damaged frame. Both
         can be negative or more than all bytes.
         """
-        lines: list[TextLine] = []
+        lines: list[TextLine | BadFrame] = []
         ledger, start = self._ledger, 0
         while start < len(data):
             feed = data.find(b"\n", start)
@@ -167,10 +181,8 @@ class LineFinder:
             start = feed + 1
             text = self._held.removesuffix(b"\r")
             if text and not (barred > feed or self._held_barred):
-                lines.append(TextLine(text.decode("ascii")))
-                ledger.bytes_in_good_frames += len(self._held) + 1
-                ledger.frames_good += 1
-                ledger.frames_in_replies += 1
+                if (line := self._completed(text, self._held + b"\n")) is not None:
+                    lines.append(line)
                 self._held, self._held_bad = b"", 0
                 continue
             self.break_off()
@@ -179,6 +191,22 @@ class LineFinder:
             else:
                 ledger.bytes_skipped += 1
         return lines
+
+    def _completed(self, text: bytes, data: bytes) -> TextLine | BadFrame | None:
+        """Count a complete line of the bytes `data`, with its line end. Return None for an NMEA sentence."""
+        ledger, sentence = self._ledger, _SENTENCE.fullmatch(text)
+        if sentence and checksum(sentence[1]) != int(sentence[3], 16):
+            ledger.bytes_in_bad_frames += len(data)
+            ledger.frames_bad_crc += 1
+            return BadFrame(BadReason.CRC, data)
+        ledger.bytes_in_good_frames += len(data)
+        ledger.frames_good += 1
+        if sentence:
+            ledger.frames_ignored += 1
+            count_unknown(self._unknown, int.from_bytes(sentence[2], "big"))
+            return None
+        ledger.frames_in_replies += 1
+        return TextLine(text.decode("ascii"))
 
     def break_off(self) -> None:
         """Drop the incomplete line, because bytes other than text follow."""

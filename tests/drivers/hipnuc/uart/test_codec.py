@@ -19,6 +19,7 @@ from imud.drivers.hipnuc.uart import codec as uart_codec
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
+from tests.support.codec_invariants import feed_stream
 
 # Manual V1.5.9 section 3.5. Its text contains CRC 0x516C, its table 0xBB14; 0xBB14 is correct.
 MANUAL_HI91 = bytes.fromhex(
@@ -337,6 +338,24 @@ def test_lines_of_text() -> None:
         events = [event for byte in end for event in codec.feed(bytes([byte]))]
         assert events == [TextLine("y"), TextLine("z")]
         assert codec.ledger.closes()
+
+
+GGA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"  # checksum of the NMEA 0183 standard
+
+
+@pytest.mark.parametrize("size", [1, 7, 1000])
+def test_nmea_sentences_between_the_lines_of_a_reply_are_ignored_frames(size: int) -> None:
+    codec = make()
+    data = b"COORD=4\r\n" + GGA + GGA[:-4] + b"48\r\n" + b"$GNSXT,1*4B\r\n" + GGA + b"$odd\r\nOK\r\n"
+    events = feed_stream(codec, [data[at : at + size] for at in range(0, len(data), size)])
+    assert [event for event in events if isinstance(event, TextLine)] == [*map(TextLine, ("COORD=4", "$odd", "OK"))]
+    assert (reasons(events), codec.ledger.frames_bad_crc) == ([BadReason.CRC], 1)
+    assert {uart_codec.tag_name(one): count for one, count in codec.unknown.items()} == {
+        "NMEA sentence GGA": 2, "NMEA sentence SXT": 1,
+    }  # fmt: skip
+    ledger = codec.ledger
+    assert (ledger.frames_ignored, ledger.frames_in_replies, ledger.unknown_tags) == (3, 3, 0)
+    assert (ledger.bytes_in_bad_frames, ledger.bytes_skipped) == (len(GGA), 0)
 
 
 @pytest.mark.manual("B 3.4 CRC")
