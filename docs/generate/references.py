@@ -261,7 +261,7 @@ def calibrations_table() -> str:
     rows = ["| driver | kind | effect | device | result lasts |", "|---|---|---|---|---|"]
     for driver in DRIVERS.values():
         for kind, one in driver.calibrations.items():
-            hold = {Handling.REST: "at rest", Handling.TURN: "turned"}[one.handling]
+            hold = {Handling.REST: "at rest", Handling.SPIN: "turned level", Handling.TURN: "turned"}[one.handling]
             rows.append(f"| `{driver.name}` | `{kind}` | {cell(one.help)} | {hold} | {one.kept} |")
     return "\n".join(rows)
 

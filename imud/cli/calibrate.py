@@ -78,7 +78,9 @@ def _agreed(calibration: CalibrationInfo) -> bool:
     """Ask the user to start. Raises BadArgument if standard input is not a terminal."""
     if not sys.stdin.isatty():
         raise BadArgument("cannot ask for confirmation without a terminal; confirm with --yes")
-    request = "Start to turn the device, then press Enter" if calibration.handling is Handling.TURN else "Press Enter"
+    request = (
+        "Start to turn the device, then press Enter" if calibration.handling is not Handling.REST else "Press Enter"
+    )
     return input(f"{request} to start the calibration, or type n to cancel: ").strip().lower() in ("", "y", "yes")
 
 

@@ -156,7 +156,12 @@ def _value(value: Any) -> str:
 
 
 def _settable(report: SettingsReport) -> dict[str, Any]:
-    return {one.name: one.actual for one in report.settings if one.declarable and one.actual is not None}
+    """Return the values that can be set again, without values that imud does not know."""
+    return {
+        one.name: one.actual
+        for one in report.settings
+        if one.declarable and one.actual is not None and one.actual in one.schema.get("enum", [one.actual])
+    }
 
 
 def _yaml(report: SettingsReport) -> str:

@@ -166,6 +166,7 @@ class Handling(StrEnum):
     """Motion of the device during a calibration."""
 
     REST = "rest"  # the device must not move
+    SPIN = "spin"  # the user turns the device, which stays level, slowly about the vertical axis
     TURN = "turn"  # the user turns the device slowly, in one place, into as many directions as possible
 
 

@@ -209,9 +209,9 @@ def value_text(value: Any) -> str:
 
 def group_of(name: str, setting: Setting) -> str:
     """Return the group of a setting in a form: `connection`, `output`, `pins` or `measurement`."""
-    if setting.connection or name in ("heartbeat_ms", "second_bus", "i2c_address"):
+    if setting.connection or name in ("heartbeat_ms", "second_bus", "i2c_address", "port_baud"):
         return "connection"
-    if name.startswith(("output", "tpdo", "ff", "burst")):
+    if name.startswith(("output", "port_output", "tpdo", "ff", "burst")):
         return "output"
     return "pins" if name in ("pins", "sout_divisor", "alarm") else "measurement"
 

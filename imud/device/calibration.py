@@ -163,7 +163,9 @@ class Turning:
     POINT_DISTANCE_T. Thus memory and computing time have a limit.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, is_planar: bool = False) -> None:
+        """`is_planar`: the device stays level and turns about one axis only."""
+        self.is_planar = is_planar
         self._points: list[Vector3] = []
         self._fit = _SphereFit()
         self._turned = [0.0, 0.0, 0.0]
@@ -194,6 +196,13 @@ class Turning:
         """Angle about each axis of the sensor, rad, summed over both directions."""
         x, y, z = self._turned
         return (x, y, z)
+
+    @property
+    def share(self) -> float:
+        """Share of the wanted turns and, unless `is_planar`, of the wanted directions, 0 … 1."""
+        if self.is_planar:  # a circle in the field has few directions and no sphere
+            return min(1.0, max(self._turned) / TURNS_WANTED_RAD)
+        return min(1.0, coverage(self.cells(self.fit())) / COVERAGE_WANTED, min(self._turned) / TURNS_WANTED_RAD)
 
     @property
     def has_field(self) -> bool:
@@ -331,7 +340,7 @@ class CalibrationRun:
             raise CommandError("another calibration of this device is running")
         if save and calibration.kept is not Kept.BY_SAVE:
             raise CommandError(f"{kind}: cannot save: the result lasts {calibration.kept}")
-        limit_ns = TURN_LIMIT_NS if calibration.handling is Handling.TURN else None
+        limit_ns = None if calibration.handling is Handling.REST else TURN_LIMIT_NS
         self.status = CalibrationStatus(kind, "", self._now_ns, limit_ns, REQUESTED_BY.get())
         task = self._running = asyncio.ensure_future(self._run(kind, calibration, save))
         try:
@@ -404,7 +413,7 @@ class CalibrationRun:
         ask = calibration.verdict
         before = verdict = await self._transport.run_script(ask) if ask is not None else Verdict(done=False, words="")
         await self._transport.run_script(calibration.begin)
-        turning, begun_ns = Turning(), self._now_ns
+        turning, begun_ns = Turning(is_planar=calibration.handling is Handling.SPIN), self._now_ns
         report_ns = ask_ns = begun_ns
         problem = "the device did not finish the calibration"
         while self._now_ns - begun_ns < TURN_LIMIT_NS:
@@ -419,7 +428,7 @@ class CalibrationRun:
                 last, verdict = verdict, await self._transport.run_script(ask)
                 if verdict.words != last.words:
                     turning.restart_field()
-            if verdict.done and _turned_enough(turning) and (verdict.words != before.words or before.done):
+            if verdict.done and turning.share >= 1.0 and (verdict.words != before.words or before.done):
                 problem = ""
                 self._report_turning(kind, turning, verdict)
                 break
@@ -493,22 +502,14 @@ class CalibrationRun:
 
     def _report_turning(self, kind: str, turning: Turning, verdict: Verdict) -> None:
         sphere = turning.fit()
-        mask = turning.cells(sphere)
-        share = coverage(mask)
-        turned = min(turning.turned_rad) / TURNS_WANTED_RAD
-        progress = min(1.0, share / COVERAGE_WANTED, turned)
+        mask, progress = turning.cells(sphere), turning.share
         x, y, z = turning.turned_rad
         self._report(
-            kind, "turn", f"{progress:.0%} of the directions and turns", progress=progress, coverage=share,
+            kind, "turn", f"{progress:.0%} of the directions and turns", progress=progress, coverage=coverage(mask),
             cells=f"{mask:012x}", turned_x_rad=x, turned_y_rad=y, turned_z_rad=z,
             field_t=sphere.radius_t if sphere else None, residual=sphere.residual if sphere else None,
             device=verdict.words, device_progress=verdict.progress,
         )  # fmt: skip
-
-
-def _turned_enough(turning: Turning) -> bool:
-    share = coverage(turning.cells(turning.fit()))
-    return share >= COVERAGE_WANTED and min(turning.turned_rad) >= TURNS_WANTED_RAD
 
 
 def check(expectation: Expectation, means: RestMeans) -> Check:
@@ -522,6 +523,8 @@ def _bounded(name: str, value: float | None, limit: float, unit: str) -> Check:
 
 
 def _field_checks(turning: Turning) -> tuple[Check, ...]:
+    if turning.is_planar:
+        return ()
     sphere = turning.fit()
     if sphere is None:
         return (Check("residual of the field", None, RESIDUAL_MAX, "", False),)
@@ -550,6 +553,9 @@ def _advice(turning: Turning, checks: tuple[Check, ...]) -> str:
             "its samples contain no magnetic field; "
             "check that the device has a magnetometer, and that its output contains the field"
         )
+    if turning.is_planar:
+        words = "the field may be disturbed: go outdoors, and repeat the calibration more slowly"
+        return words if turning.share >= 1.0 else "it was turned by less than 360°: turn it about the vertical axis"
     share = coverage(turning.cells(turning.fit()))
     if share < COVERAGE_WANTED:
         return (

@@ -48,6 +48,7 @@ from imud.device.settings_plan import (
     described_settings,
     differences,
     make_plan,
+    settable_values,
     wanted_values,
     words,
 )
@@ -526,8 +527,7 @@ class DeviceSettings:
             return
         try:
             actual = await self.read()
-            settable = [name for name, setting in table.table.items() if setting.write is not None and name in actual]
-            values, utc_ns = {name: as_json(actual[name]) for name in settable}, self._host.utc_ns()
+            values, utc_ns = settable_values(table, actual), self._host.utc_ns()
             identity = identity_words(self.identity)
             text = backup_text(self._config.name, self._driver_name, identity, values, utc_ns)
             file = await self._files.backups.write_soon(self._config.name, text, utc_ns)

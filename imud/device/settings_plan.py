@@ -112,6 +112,12 @@ def wanted_values(table: SettingsTable, given: Mapping[str, Any]) -> dict[str, A
     return wanted
 
 
+def settable_values(table: SettingsTable, actual: Values) -> dict[str, Any]:
+    """Return the values that can be set again as JSON values, without values that imud does not know."""
+    values = {name: as_json(actual[name]) for name, one in table.table.items() if one.write and name in actual}
+    return {name: value for name, value in values.items() if not value_problem(value, table.table[name].type)}
+
+
 Path = tuple[str, ...]  # names of the parts that select a value in a setting, from the outside to the inside
 
 

@@ -27,7 +27,7 @@ def test_devices_and_verbs_are_listed_and_a_module_obeys(daemon: RunningDaemon, 
     assert f"{daemon.folder}/port at 115200 baud" in bow
     out = cli("command", "--socket", daemon.socket, "bow").out
     assert [line.split()[0] for line in out.splitlines() if not line.startswith(" ")] == [
-        "save", "restart", "factory_reset", "wake", "output_once", "level", "yaw",
+        "save", "restart", "factory_reset", "wake", "output_once", "level", "yaw", "reset_attitude", "ins_config",
     ]  # fmt: skip
     assert "angle_deg (a number from -180 to 180)" in out
     out = cli("command", "--socket", daemon.socket, "bow", "yaw", "angle_deg=16").out

@@ -16,6 +16,8 @@ from imud.cli.settings import device_after, given_values
 from imud.client.connection import Client
 from imud.contracts import setting
 from imud.contracts.setting import SettingsReport, declared_values
+from imud.device.settings_plan import described_settings
+from imud.drivers import DRIVERS
 from imud.formats.jsonrpc import Code, RpcError
 from imud.model.errors import BadArgument
 from tests.cli.conftest import Cli, Terminal
@@ -44,12 +46,20 @@ def actual(daemon: RunningDaemon) -> dict[str, Any]:
     return {one["name"]: one["actual"] for one in found["settings"]}
 
 
+def test_a_backup_leaves_out_values_that_imud_does_not_know() -> None:
+    table = DRIVERS["hipnuc-uart"].device_settings
+    assert table is not None
+    for values, kept in (({"mode": "3", "coordinates": 2}, {}), ({"mode": "humanoid", "coordinates": 4}, None)):
+        report = Mock(settings=described_settings(table, {}, values))
+        assert cli_settings._settable(report) == (values if kept is None else kept)
+
+
 def test_from_difference_to_agreement(daemon: RunningDaemon, words: Words, cli: Cli, tmp_path: Path) -> None:
     out = cli(*words, status=1).out  # report
     assert out.splitlines()[0].split() == ["SETTING", "DECLARED", "ACTUAL"]
     (mode,) = [line.split() for line in out.splitlines() if line.startswith("mode")]
     assert mode == ["mode", "9-axis", "6-axis", "differs"]
-    assert "2 of 11 differ; set them with --apply" in out
+    assert "2 of 20 differ; set them with --apply" in out
     assert "2.2.4" not in out
     assert "2.2.4" in cli(*words, "--verbose", status=1).out
     assert json.loads(cli(*words, "--json", status=1).out)["status"]["state"] == "differ"

@@ -163,7 +163,7 @@ def test_angles_are_compared_at_rest(
 
 
 def test_each_verb_with_an_effect_has_evidence_or_a_reason() -> None:
-    reads = {"read", "status", "sample_once", "installation_status"}
+    reads = {"read", "status", "sample_once", "installation_status", "ins_config"}
     for driver in DRIVERS.values():
         for name, verb in driver.verbs.items():
             assert (verb.proof == "value") == (name in reads), f"{driver.name} {name}"

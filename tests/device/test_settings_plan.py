@@ -34,6 +34,16 @@ def names(plan: setting.SettingsPlan) -> list[str]:
     return [step.name for step in plan.steps]
 
 
+def test_a_backup_contains_only_values_that_can_be_set_again() -> None:
+    table = DRIVERS["hipnuc-uart"].device_settings
+    assert table is not None
+    known = {"mode": "low_dynamics", "mounting": "024", "coordinates": 4}
+    assert settings_plan.settable_values(table, known | {"magnetometer_bias": [1.0, 2.0, 3.0]}) == known
+    assert settings_plan.settable_values(table, {"mode": "3", "coordinates": 2, "sout_divisor": 4}) == {
+        "sout_divisor": 4
+    }
+
+
 def test_only_different_or_unreadable_settings_are_written() -> None:
     assert planned({"mode": "6-axis", "output": {"a": 100}}) == setting.SettingsPlan()
     assert planned({"mode": "6-axis"}).empty

@@ -56,14 +56,14 @@ def test_verbs_that_restart_change_or_save(name: str) -> None:
     saving = {"save", "factory_reset"} if name == "imu61x-uart" else {"save"}
     assert {verb for verb, one in verbs.items() if one.saves} == saving & set(verbs)
     calibrating = {"calibrate_gyro", "calibrate_installation"}
-    changing = {"wake", "level", "zero", "start_streaming", "stop_streaming"} | calibrating
+    changing = {"wake", "level", "reset_attitude", "zero", "start_streaming", "stop_streaming"} | calibrating
     assert {verb for verb, one in verbs.items() if one.changes and not one.restarts} == changing & set(verbs)
     assert {verb for verb, one in verbs.items() if one.risk is Risk.RESET} == {"factory_reset"} & set(verbs)
 
 
 FLAGS = ("connection", "saves", "bus_rate", "unreadable", "after restart", "read only")
 FLAGGED = {
-    "hipnuc-uart": ("baud", "baud", "", "output_enabled", "mounting", "coordinates magnetometer_bias"),
+    "hipnuc-uart": ("baud", "baud", "", "output_enabled", "mounting coordinates", "magnetometer_bias"),
     "hipnuc-modbus": ("baud address", "", "baud", "mounting", "mounting baud", ""),
     "hipnuc-canopen": ("bit_rate node", "", "bit_rate", "", "bit_rate node", ""),
     "hipnuc-j1939": ("bit_rate address", "", "bit_rate", "", "bit_rate address", ""),

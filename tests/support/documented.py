@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,7 +15,7 @@ RANGE: Final = re.compile(r"(-?[\d.]+) to (-?[\d.]+)")
 ABOVE: Final = re.compile(r"above (-?[\d.]+)")
 SAME: Final = re.compile(r"as `(\w+)` above(.*)")
 WORD: Final = re.compile(r"`([^`]+)`")
-KEYS: Final = re.compile(r"keys ([\w, ]+), each with (?!the keys)")
+KEYS: Final = re.compile(r"keys ([\w, ]+?), each with (?!the keys)")
 WRONG: Final = "no such word"
 
 
@@ -70,12 +71,15 @@ def accepts(kind: Any, value: Any) -> bool:
 
 def check_values(row: Row, kind: Any) -> None:
     """Assert that `kind` accepts the values of a row, and no value next to them."""
-    found = KEYS.search(row.values)
-    keys = found[1].split(", ") if found else [""]
-    text = row.values[found.end() :] if found else row.values
-    for key in keys:
+    levels, text = list[list[str]](), row.values
+    while found := KEYS.search(text):
+        levels.append(found[1].split(", "))
+        text = text[found.end() :]
+    for path in product(*levels):
         for value, is_valid in examples(text):
-            whole = {key: value} if key else value
+            whole = value
+            for key in reversed(path):
+                whole = {key: whole}
             assert accepts(kind, whole) == is_valid, f"{row.name}: {whole!r} is {'' if is_valid else 'in'}valid"
 
 

@@ -165,10 +165,13 @@ MAIN_STATUS: Final[Mapping[int, StatusBit]] = {
 
 
 class AttitudeMode(Enum):
-    """Attitude modes: without or with the magnetometer."""
+    """Attitude modes: without or with the magnetometer, and three of newer firmware on a UART."""
 
     SIX_AXIS = 0  # heading is relative, 0 at power-on
     NINE_AXIS = 1  # heading is magnetic; it needs one calibration and an undisturbed field
+    HUMANOID = 4
+    SLOW_VEHICLE = 5  # slow vehicle on the ground
+    LOW_DYNAMICS = 7
 
 
 class LevelReset(Enum):

@@ -29,6 +29,7 @@ from typing import Any, Final
 from imud.drivers.hipnuc.uart.codec import encode_frame, encode_hi91, encode_hi92
 from imud.drivers.hipnuc.uart.commands import BAUD_RATES, FRAME_BYTES, MAX_RATE_HZ, OutputMessage
 from imud.drivers.hipnuc.uart.ins import WEEK_MS, hi83_size, pack_hi81, pack_hi83
+from imud.formats.nmea0183 import sentence
 from imud.model.sample import Measurement, Position, Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US, T_PER_UT
 from imud.sim.hipnuc.uart_settings import (
@@ -137,6 +138,8 @@ TX_BUFFER_BYTES: Final = 512
 # Maximum length of a command, bytes (assumption). The longest command of the manual, URFR, has 123 with nine decimals.
 COMMAND_BYTES_MAX: Final = 128
 REPLY_NS: Final = 200_000  # time from the end of a command to its reply, ns (assumption)
+# Commands of newer firmware without OK: a frame is the reply, or the device restarts
+WITHOUT_OK: Final = ("REBOOT", "LOG IMU91 ONMARK ONCE", "LOG HI91 ONMARK ONCE", "LOG HI92 ONMARK ONCE")
 WRITES_FLASH: Final = ("SAVECONFIG", "FRESET")
 # Time from a reply to the change of the baud rate, ns, if the change follows the reply (assumption).
 RATE_CHANGE_NS: Final = 5 * NS_PER_MS
@@ -170,6 +173,7 @@ class HipnucModule:
         self._random = Random(self.hardware.mark_seed)
         self._line = bytearray()
         self._magnetometer = SelfCalibration(self.hardware.hard_iron_t, self.hardware.mag_bias_t)
+        self._calibrates = False  # whether a command has started a calibration of the magnetometer
         self._actions = self._make_actions()
         self._power_on(now_ns, self.hardware.uptime_ms)
 
@@ -253,7 +257,7 @@ class HipnucModule:
         self._wire = Transmitter(settings.baud, TX_BUFFER_BYTES, self._ready_ns)
         self._rate_at_ns = self._quiet_until_ns = 0
         self._pps_ns = 0
-        self._utc = UtcTime(hardware.utc_epoch)
+        self._utc = UtcTime(hardware.utc_epoch, wraps_daily=hardware.behaviour.newer)
         self._enabled = True
         self._line.clear()
         self._settings_changed(self._ready_ns)
@@ -327,7 +331,7 @@ class HipnucModule:
         reading = self._reading(sample_ns)
         accel, gyro, mag, euler, quat, temperature_c, pressure_pa, *_ = reading
         device_ns = self._device_ns(sample_ns)
-        if self.settings.att_mode == 1 and self.settings.mag_calibration:
+        if (self.settings.att_mode == 1 and self.settings.mag_calibration) or self._calibrates:
             self._magnetometer.sample(device_ns, gyro)
         mag = self._magnetometer.measured(mag)
         pps_ms = (device_ns - self._pps_ns) // NS_PER_MS % PPS_MODULUS_MS
@@ -400,12 +404,14 @@ class HipnucModule:
         try:
             if line.startswith(behaviour.refuses):
                 raise CommandRefused(line)
-            settings = changed(self.settings, line, self.hardware.firmware)
+            settings = changed(self.settings, line, self.hardware.firmware, behaviour)
             if settings is not None:
                 reply: list[str] | None = []
                 self._change(settings, now_ns)
             else:
                 reply = self._act(line, now_ns)
+                if reply is None and behaviour.newer and line not in WITHOUT_OK:
+                    raise CommandRefused(line)
         except CommandRefused:
             self._say(["ERR"], now_ns)
             return
@@ -430,6 +436,8 @@ class HipnucModule:
         self._wire = Transmitter(self.settings.baud, TX_BUFFER_BYTES, now_ns)
 
     def _say(self, lines: list[str], now_ns: int) -> None:
+        if self.hardware.behaviour.newer:
+            lines = [*lines[:-1], sentence("GNGGA,,,,,,0,00,,,M,,M,,").decode("ascii").strip(), lines[-1]]
         data = "".join(f"{line}\r\n" for line in lines).encode("ascii")
         self._wire.send(now_ns + REPLY_NS, data)
         self._quiet_until_ns = now_ns + self.hardware.behaviour.quiet_ms * NS_PER_MS
@@ -451,8 +459,8 @@ class HipnucModule:
             "LOG ENABLE": lambda now_ns: self._enable(True, now_ns),
             "LOG DISABLE": lambda now_ns: self._enable(False, now_ns),
             "LOG VERSION": lambda _: version,
-            "LOG USRCONFIG": lambda _: self.settings.user_lines(),
-            "LOG COMCONFIG": lambda _: self.settings.port_lines(),
+            "LOG USRCONFIG": lambda _: self.settings.user_lines(hardware.behaviour),
+            "LOG COMCONFIG": lambda _: self.settings.port_lines(hardware.behaviour),
             "LOG MAGCONFIG": lambda _: [
                 "MB=" + ", ".join(f"{value / T_PER_UT:.2f}" for value in self._magnetometer.found_t)
             ],
@@ -462,6 +470,8 @@ class HipnucModule:
         action = self._actions.get(line)
         if action is not None:
             return action(now_ns)
+        if (reply := self._act_on_other(line)) is not None:
+            return reply
         match line.split(" "):
             case ["CONFIG", "ATT", "RST", kind]:
                 return self._level(kind, now_ns)
@@ -469,7 +479,24 @@ class HipnucModule:
                 return self._set_yaw(mode, value, now_ns)
             case ["LOG", "IMU91" | "HI91" | "HI92" | "HI81" | "HI83" as message, "ONMARK", "ONCE"]:
                 self._send_marked(OutputMessage("HI91" if message == "IMU91" else message), now_ns)
+                return None if self.hardware.behaviour.newer else []
+        return None
+
+    def _act_on_other(self, line: str) -> list[str] | None:
+        """Do `_act` for the commands of older and newer firmware. The replies are assumptions."""
+        behaviour = self.hardware.behaviour
+        match line.split(" "):
+            case ["CONFIG", "ATT", "RST", "1" | "4"] if behaviour.older:
+                return []  # no document describes the effect
+            case ["CONFIG", "MCAL", "START", *plane] if behaviour.newer and plane in ([], ["2D"]):
+                self._magnetometer.restart(planar=bool(plane))
+                self._calibrates = True
                 return []
+            case ["LOG", "MCAL", "STAT"] if behaviour.newer:
+                state = "RUNNING" if self._calibrates and not self._magnetometer.finished else "DONE"
+                return [f"STATE={state}", f"PROGRESS={100 * self._magnetometer.progress:.0f}%"]
+            case ["LOG", "INSCONFIG"] if behaviour.ins:
+                return [f"BASELINE={self.settings.baseline_m:g}"]
         return None
 
     def _save(self, _now_ns: int) -> list[str]:
@@ -535,7 +562,7 @@ def make(options: SimulatorOptions, now_ns: int) -> HipnucModule:
         raise ValueError(f"baud {baud}: expected one of {', '.join(map(str, BAUD_RATES))}")
     newer = message in (OutputMessage.HI81, OutputMessage.HI83)
     hardware = HipnucHardware(
-        firmware=options.firmware or (INS_FIRMWARE if newer else HipnucHardware().firmware),
+        firmware=options.firmware or (INS_FIRMWARE if newer else options.chosen(VARIANTS).firmware),
         **sensor_of(options),
         mark_seed=options.seed,
         behaviour=options.chosen(VARIANTS),

@@ -6,8 +6,9 @@ USRCONFIG and COMCONFIG. The other lines are assumptions.
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from itertools import product
 from math import tau
 from typing import Any, Final, Literal
 
@@ -46,6 +47,12 @@ class Behaviour:
     quiet_ms: int = 0  # time after a reply without frames, ms
     refuses: tuple[str, ...] = ()  # first words of commands that the device refuses with ERR
     ignores: tuple[str, ...] = ()  # First words of commands that the device does not know. It sends no reply.
+    firmware: int = 156  # firmware version without another option
+    # Firmware 1.6.9 and newer: COORD, URFR by digits, MCAL, two ports, NMEA sentences between the lines of a reply,
+    # `system_time` modulo 24 h, ERR for unknown commands. The lines of its reports are assumptions.
+    newer: bool = False
+    older: bool = False  # codes of older firmware: ZARU, ABW, ARG, GBW, GRG, INC_FMT, and ATT RST 1 and 4
+    ins: bool = False  # messages and commands of INS models; the device does not send these messages
 
 
 AS_IN_MANUAL: Final = Behaviour()
@@ -61,6 +68,9 @@ VARIANTS: Final[Mapping[str, Behaviour]] = {
     "no magnetometer": Behaviour(ignores=("LOG MAGCONFIG",)),
     "magnetometer refused": Behaviour(refuses=("LOG MAGCONFIG",)),
     "quiet after an answer": Behaviour(quiet_ms=700),
+    "firmware 1.7": Behaviour(newer=True, firmware=170),
+    "INS, firmware 1.7": Behaviour(newer=True, ins=True, firmware=170),
+    "older firmware": Behaviour(older=True, firmware=120),
     "all at once": Behaviour(
         rate_change=RateChange.BEFORE_ANSWER, factory_reset=ResetEffect.BEFORE_ANSWER, flash_ms=2000, quiet_ms=300
     ),
@@ -81,8 +91,10 @@ UPTIME_MODULUS_MS: Final = 2**32
 class UtcTime:
     """UTC in the frames of the device. Arguments are device time since power-on, ns. Synchronization: one thread."""
 
-    def __init__(self, epoch: Epoch) -> None:
-        self._modulus_ms = MODULUS_MS[epoch]
+    def __init__(self, epoch: Epoch, *, wraps_daily: bool = False) -> None:
+        """`wraps_daily`: the device counts modulo 24 h, also without UTC."""
+        self._modulus_ms = MODULUS_MS["day" if wraps_daily else epoch]
+        self._uptime_modulus_ms = MODULUS_MS["day"] if wraps_daily else UPTIME_MODULUS_MS
         self._anchor: tuple[int, int] | None = None  # device time of a pulse and the UTC second of this pulse
         self._pulse_ns: int | None = None
         self._intervals = 0  # number of correct intervals up to the last pulse
@@ -124,7 +136,7 @@ class UtcTime:
     def shown_ms(self, device_ns: int) -> int:
         """Return `system_time` of a frame sampled now."""
         if self._anchor is None:
-            return device_ns // NS_PER_MS % UPTIME_MODULUS_MS
+            return device_ns // NS_PER_MS % self._uptime_modulus_ms
         anchor_ns, second = self._anchor
         return (second * MS_PER_S + (device_ns - anchor_ns) // NS_PER_MS) % self._modulus_ms
 
@@ -181,10 +193,24 @@ class ModuleSettings:
     alarm_x: AlarmSetting = AlarmSetting()
     alarm_y: AlarmSetting = AlarmSetting()
     coord: int = 0  # axes of newer firmware: 0 as in the manual, 4 NWU
+    outputs: Mapping[str, Output] = field(default_factory=dict)  # other messages and ports, by name: `COM2 HI91`, `GGA`
+    port_baud: int = 115_200  # baud rate of COM2, newer firmware
+    codes: Mapping[str, str] = field(default_factory=dict)  # codes of older firmware
+    baseline_m: float = 1.0  # INS models
 
-    def user_lines(self) -> list[str]:
+    def user_lines(self, behaviour: Behaviour = AS_IN_MANUAL) -> list[str]:
         """Return the lines of the reply to LOG USRCONFIG."""
+        if behaviour.newer:
+            digits = [name for name, turned in DIGITS.items() if turned == self.urfr]
+            urfr = digits[0] if digits else ",".join(f"{value:g}" for value in self.urfr)
+            lines = replace(self, coord=0).user_lines()
+            return [
+                *(line.replace(": ", "=") for line in lines if not line.startswith("URFR")),
+                f"URFR={urfr}",
+                f"COORD={self.coord}",
+            ]
         return [
+            *(f"{name}: {value}" for name, value in self.codes.items()),
             f"ATT_MODE: {self.att_mode}",
             "URFR: " + ",".join(f"{value:g}" for value in self.urfr),
             f"EN_MCAL: {self.mag_calibration:d}",
@@ -195,12 +221,34 @@ class ModuleSettings:
             *([f"COORD {self.coord}"] if self.coord else []),
         ]
 
-    def port_lines(self) -> list[str]:
+    def port_lines(self, behaviour: Behaviour = AS_IN_MANUAL) -> list[str]:
         """Return the lines of the reply to LOG COMCONFIG."""
-        newer = [f"LOG {name} {one}" for name, one in (("HI81", self.hi81), ("HI83", self.hi83)) if one != Output()]
-        return [f"BAUD: {self.baud}", f"LOG HI91 {self.hi91}", f"LOG HI92 {self.hi92}", *newer]
+        lines = [f"BAUD: {self.baud}", f"LOG HI91 {self.hi91}", f"LOG HI92 {self.hi92}"]
+        shown = [("HI81", self.hi81)] if behaviour.ins or self.hi81 != Output() else []
+        shown += [("HI83", self.hi83)] if self.hi83 != Output() else []
+        silent = dict.fromkeys(INS_MESSAGES * behaviour.ins, Output())
+        if behaviour.newer:
+            lines.append(f"SERIALCONFIG COM2 {self.port_baud}")
+            silent |= {"COM2 HI91": Output(), "COM2 HI92": Output()}
+        others = [*shown, *(silent | dict(self.outputs)).items()]
+        return [*lines, *(f"LOG {name} {output}" for name, output in others)]
 
 
+INS_MESSAGES: Final = ("GGA", "RMC", "SXT")
+# Matrix of URFR by its digits, the direction of the physical axes: right, left, front, back, up, down
+_DIRECTIONS: Final = (
+    (1.0, 0.0, 0.0),
+    (-1.0, 0.0, 0.0),
+    (0.0, 1.0, 0.0),
+    (0.0, -1.0, 0.0),
+    (0.0, 0.0, 1.0),
+    (0.0, 0.0, -1.0),
+)
+DIGITS: Final = {
+    f"{x}{y}{z}": _DIRECTIONS[x] + _DIRECTIONS[y] + _DIRECTIONS[z]
+    for x, y, z in product(range(6), repeat=3)
+    if is_rotation((_DIRECTIONS[x], _DIRECTIONS[y], _DIRECTIONS[z]))
+}
 NWU: Final = 4  # value of COORD
 _QUARTER: Final = (0.5**0.5, 0.0, 0.0, 0.5**0.5)  # quarter turn about Z: from FLU to RFU axes, and from ENU to NWU
 
@@ -222,9 +270,12 @@ def _forward(vector: Vector3) -> Vector3:
     return forward, -right, up
 
 
-def changed(settings: ModuleSettings, line: str, firmware: int) -> ModuleSettings | None:
+def changed(
+    settings: ModuleSettings, line: str, firmware: int, behaviour: Behaviour = AS_IN_MANUAL
+) -> ModuleSettings | None:
     """Return the settings after the command in `line`; None if it changes no setting. Raises CommandRefused."""
-    for pattern, change in _CHANGES:
+    more = (*_NEWER * behaviour.newer, *_OLDER * behaviour.older, *_INS * behaviour.ins)
+    for pattern, change in (*more, *_CHANGES):
         if match := pattern.fullmatch(line):
             if "PMUX" in line and firmware < PMUX_FIRMWARE:
                 return None
@@ -331,6 +382,60 @@ _CHANGES: Final[tuple[tuple[re.Pattern[str], Callable[..., ModuleSettings]], ...
 )
 
 
+def _newer_mode(settings: ModuleSettings, text: str) -> ModuleSettings:
+    return replace(settings, att_mode=_whole(text, (0, 1, 4, 5, 7)))
+
+
+def _coord(settings: ModuleSettings, text: str) -> ModuleSettings:
+    return replace(settings, coord=_whole(text, (0, 2, 4)))
+
+
+def _digits(settings: ModuleSettings, text: str) -> ModuleSettings:
+    if text not in DIGITS:
+        raise CommandRefused(text)
+    return replace(settings, urfr=DIGITS[text])
+
+
+def _other_baud(settings: ModuleSettings, port: str, text: str) -> ModuleSettings:
+    """The host is connected to COM1."""
+    return _baud(settings, text) if port == "1" else replace(settings, port_baud=_whole(text, BAUD_RATES))
+
+
+def _other_output(settings: ModuleSettings, name: str, mode: str, value: str) -> ModuleSettings:
+    if name.startswith("COM1 "):
+        message = name.removeprefix("COM1 ")
+        return (_on_time if mode == "ONTIME" else _on_mark)(settings, message, value)
+    output = Output(round(number(value, 0.0, 1.0) * 1000)) if mode == "ONTIME" else Output(on_mark=value == "1")
+    return replace(settings, outputs={**settings.outputs, name.replace("IMU91", "HI91"): output})
+
+
+def _set_code(settings: ModuleSettings, name: str, value: str) -> ModuleSettings:
+    most = {"ABW": 6, "ARG": 3, "GBW": 6, "GRG": 3, "INC_FMT": 1, "ZARU": 100}[name]
+    number(value, 0, most)
+    return replace(settings, codes={**settings.codes, name: value})
+
+
+def _set_baseline(settings: ModuleSettings, text: str) -> ModuleSettings:
+    return replace(settings, baseline_m=number(text, -1000, 1000))
+
+
+# Commands of other firmware that only change settings. `changed` tries them first.
+_NEWER: Final[tuple[tuple[re.Pattern[str], Callable[..., ModuleSettings]], ...]] = (
+    (re.compile(r"CONFIG ATT MODE (\S+)"), _newer_mode),
+    (re.compile(r"CONFIG IMU COORD (\S+)"), _coord),
+    (re.compile(r"CONFIG IMU URFR ([0-9]+)"), _digits),
+    (re.compile(r"SERIALCONFIG COM([12]) (\S+)"), _other_baud),
+    (re.compile(r"LOG (COM[12] (?:IMU91|HI91|HI92)) (ONTIME|ONMARK) (?!ONCE$)(\S+)"), _other_output),
+)
+_OLDER: Final[tuple[tuple[re.Pattern[str], Callable[..., ModuleSettings]], ...]] = (
+    (re.compile(r"CONFIG IMU (ZARU|ABW|ARG|GBW|GRG|INC_FMT) (\S+)"), _set_code),
+)
+_INS: Final[tuple[tuple[re.Pattern[str], Callable[..., ModuleSettings]], ...]] = (
+    (re.compile(r"LOG (COM2 HI81|(?:COM2 )?(?:GGA|RMC|SXT)) (ONTIME|ONMARK) (?!ONCE$)(\S+)"), _other_output),
+    (re.compile(r"SETBASELINE (.+)"), _set_baseline),
+)
+
+
 # Spread of the processing time, ns (assumption). Section 1.2.1 of the manual gives only the mean.
 MARK_SPREAD_NS: Final = 15_000
 
@@ -392,6 +497,7 @@ class SelfCalibration:
         self.found_t = found_t
         self.finished = any(found_t)  # True after a calibration
         self._turned: Vector3 = _NO_TURN
+        self._planar = False
         self._before_ns: int | None = None
 
     @property
@@ -402,7 +508,11 @@ class SelfCalibration:
     @property
     def progress(self) -> float:
         """Return the completed share of the required rotation, 0 to 1; 1 after a calibration."""
-        return 1.0 if self.finished else min(self._turned) / TURN_RAD
+        return 1.0 if self.finished else (max if self._planar else min)(self._turned) / TURN_RAD
+
+    def restart(self, *, planar: bool) -> None:
+        """Start a calibration by a command. `planar`: a turn about one axis is enough."""
+        self.finished, self.found_t, self._turned, self._planar = False, _NO_TURN, _NO_TURN, planar
 
     def sample(self, device_ns: int, gyro_rad_s: Vector3) -> None:
         """Process one sample in 9-axis mode while the background calibration is on.
@@ -415,7 +525,7 @@ class SelfCalibration:
         step_s = (device_ns - before) / NS_PER_S
         x, y, z = (turned + abs(rate) * step_s for turned, rate in zip(self._turned, gyro_rad_s, strict=True))
         self._turned = (x, y, z)
-        if min(self._turned) >= TURN_RAD:
+        if self.progress >= 1.0:
             self.finished, self.found_t, self._turned = True, self._hard_iron_t, _NO_TURN
 
     def measured(self, field_t: Vector3) -> Vector3:

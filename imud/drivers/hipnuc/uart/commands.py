@@ -68,16 +68,34 @@ class OutputMessage(StrEnum):
     HI83 = "HI83"  # newer firmware: the fields of a bitmap, for which no source contains a command
 
 
+class InsMessage(StrEnum):
+    """NMEA sentences of INS models that imud only selects."""
+
+    GGA = "GGA"
+    RMC = "RMC"
+    SXT = "SXT"
+
+
+AnyMessage = OutputMessage | InsMessage
+
+
+def message_of(name: str) -> AnyMessage:
+    """Return the message with a name in lower or upper case. Raises ValueError."""
+    return OutputMessage(name.upper()) if name.upper() in OutputMessage.__members__ else InsMessage(name.upper())
+
+
 # Maximum output rate by baud rate (table 3.7; for HI81 and HI83 only the share of the baud rate limits the rate)
-MAX_RATE_HZ: Final = {
+MAX_RATE_HZ: Final[Mapping[AnyMessage, Mapping[int, int]]] = {
     OutputMessage.HI91: {9600: 10, 115200: 100, 230400: 250, 256000: 250, 460800: 500, 921600: 1000},
     OutputMessage.HI92: {9600: 10, 115200: 200, 230400: 250, 256000: 250, 460800: 500, 921600: 1000},
     OutputMessage.HI81: dict.fromkeys((9600, 115200, 230400, 256000, 460800, 921600), 1000),
     OutputMessage.HI83: dict.fromkeys((9600, 115200, 230400, 256000, 460800, 921600), 1000),
 }
-# Size of a frame with its header, bytes (sections 3.1, 3.3); of HI83 the minimum
-FRAME_BYTES: Final = {
+# Size of a frame with its header, bytes (sections 3.1, 3.3); of HI83 the minimum. NMEA 0183 permits 82 bytes; SXT has
+# 22 fields.
+FRAME_BYTES: Final[Mapping[AnyMessage, int]] = {
     OutputMessage.HI91: 6 + 76, OutputMessage.HI92: 6 + 48, OutputMessage.HI81: 6 + 104, OutputMessage.HI83: 6 + 8,
+    InsMessage.GGA: 82, InsMessage.RMC: 82, InsMessage.SXT: 255,
 }  # fmt: skip
 
 
@@ -139,6 +157,7 @@ class Query(StrEnum):
     USRCONFIG = "USRCONFIG"
     COMCONFIG = "COMCONFIG"
     MAGCONFIG = "MAGCONFIG"
+    INSCONFIG = "INSCONFIG"  # INS models
 
 
 # --- commands ---------------------------------------------------------------------------------------------------------
@@ -146,42 +165,42 @@ class Query(StrEnum):
 
 def reboot() -> Request:
     """Restart the device, as after power-on. It does not reply."""
-    return _command("REBOOT", silent=True)
+    return command("REBOOT", silent=True)
 
 
 def save_config() -> Request:
     """Write all settings to flash."""
-    return _command("SAVECONFIG", timeout_ns=FLASH_TIMEOUT_NS)
+    return command("SAVECONFIG", timeout_ns=FLASH_TIMEOUT_NS)
 
 
 def factory_reset() -> Request:
     """Restore the factory settings with the baud rate. `reset_to_factory` makes them effective."""
-    return _command("FRESET", timeout_ns=FLASH_TIMEOUT_NS)
+    return command("FRESET", timeout_ns=FLASH_TIMEOUT_NS)
 
 
 def unlog_all() -> Request:
     """Set the rate of every timed message to 0."""
-    return _command("UNLOGALL")
+    return command("UNLOGALL")
 
 
 def serial_config(baud: BaudRate) -> Request:
     """Set the baud rate: effective immediately, even before the reply, or after `save_config` and `reboot`."""
-    return _command(f"SERIALCONFIG {baud}")
+    return command(f"SERIALCONFIG {baud}")
 
 
 def attitude_mode(mode: AttitudeMode) -> Request:
     """Set 6-axis or 9-axis (AHRS) mode."""
-    return _command(f"CONFIG ATT MODE {mode.value}")
+    return command(f"CONFIG ATT MODE {mode.value}")
 
 
 def level_reset(kind: LevelReset) -> Request:
     """Set or cancel the level."""
-    return _command(f"CONFIG ATT RST {kind.value}")
+    return command(f"CONFIG ATT RST {kind.value}")
 
 
 def yaw(mode: YawMode, angle_deg: float) -> Request:
     """Set yaw, -180° … 180°; lost at power-off."""
-    return _command(f"CONFIG YAW {mode.value} {_text(angle_deg)}")
+    return command(f"CONFIG YAW {mode.value} {number_text(angle_deg)}")
 
 
 def mounting(matrix: Mounting | Matrix3) -> Request:
@@ -192,66 +211,71 @@ def mounting(matrix: Mounting | Matrix3) -> Request:
             f"CONFIG IMU URFR: expected a rotation matrix (3 x 3, orthonormal within {ROTATION_TOLERANCE:g}, "
             f"determinant +1), got {rows}"
         )
-    return _command("CONFIG IMU URFR " + ",".join(_text(value) for row in rows for value in row))
+    return command("CONFIG IMU URFR " + ",".join(number_text(value) for row in rows for value in row))
 
 
 def magnetic_calibration(enabled: bool) -> Request:
     """Enable (default) or disable the background calibration of the magnetometer (section 8.2)."""
-    return _command(f"CONFIG IMU EN_MCAL {int(enabled)}")
+    return command(f"CONFIG IMU EN_MCAL {int(enabled)}")
 
 
 def pin_function(function: PinFunction, pin: int) -> Request:
     """Set the function of pin IO1 … IO9. Some products lack some pins."""
-    return _command(f"CONFIG PMUX{function.value} IO{pin}")
+    return command(f"CONFIG PMUX{function.value} IO{pin}")
 
 
 def alarm(axis: AlarmAxis, min_deg: float, max_deg: float, enabled: bool) -> Request:
     """Watch the angle of an axis: the alarm pin is high outside `min_deg` … `max_deg`. Raises BadArgument."""
-    name, low, high = "CONFIG PMUX5", _text(min_deg), _text(max_deg)
+    name, low, high = "CONFIG PMUX5", number_text(min_deg), number_text(max_deg)
     if not min_deg < max_deg:
         raise BadArgument(f"{name}: expected the minimum below the maximum, got {low}° and {high}°")
-    return _command(f"{name} {axis},{low},{high},0,{int(enabled)}")
+    return command(f"{name} {axis},{low},{high},0,{int(enabled)}")
 
 
 def sout_divider(divider: int) -> Request:
     """Set the divisor of SOUT pulses for the SOUT_DIV pin, 1 … 64."""
-    return _command(f"CONFIG PMUX4 DIV{divider}")
+    return command(f"CONFIG PMUX4 DIV{divider}")
 
 
 def log_enable() -> Request:
     """Enable data frames (default)."""
-    return _command("LOG ENABLE")
+    return command("LOG ENABLE")
 
 
 def log_disable() -> Request:
     """Disable data frames of all rates."""
-    return _command("LOG DISABLE")
+    return command("LOG DISABLE")
 
 
-def log_ontime(message: OutputMessage, rate_hz: OutputRate) -> Request:
-    """Set the rate of a message; 0: off. `require_room` checks the baud rate."""
-    return _command(f"LOG {message} ONTIME {_text(1 / rate_hz if rate_hz else 0)}")
+def log_ontime(message: AnyMessage, rate_hz: OutputRate, port: str = "") -> Request:
+    """Set the rate of a message; 0: off. `require_room` checks the baud rate. `port`: `COM2 ` for another port."""
+    return command(f"LOG {port}{message} ONTIME {number_text(1 / rate_hz if rate_hz else 0)}")
 
 
-def log_onmark(message: OutputMessage) -> Request:
+def log_onmark(message: AnyMessage, port: str = "") -> Request:
     """Send `message` once for each pulse on SIN or `log_once`. First disable timed output (`unlog_all`)."""
-    return _command(f"LOG {message} ONMARK 1")
+    return command(f"LOG {port}{message} ONMARK 1")
 
 
 def log_once(message: OutputMessage) -> Request:
     """Send `message` once, as after a pulse on SIN. Requires `log_onmark`."""
-    return _command(f"LOG {message} ONMARK ONCE")
+    return command(f"LOG {message} ONMARK ONCE")
 
 
 @cache
 def ask(query: Query) -> Request:
-    """Request one of the four reports."""
-    is_part = is_version_line if query is Query.VERSION else is_setting_line
-    kind = "version" if query is Query.VERSION else "report"
-    return _command(f"LOG {query}", is_part=is_part, messages_min=2, kind=kind, repeatable=True)
+    """Request one of the reports."""
+    if query is not Query.VERSION:
+        return ask_lines(query)
+    return command(f"LOG {query}", is_part=is_version_line, messages_min=2, kind="version", repeatable=True)
 
 
-def require_room(rates_hz: Mapping[OutputMessage, float], baud: int) -> None:
+def ask_lines(report: str) -> Request:
+    """Request a report with lines of any form."""
+    return command(f"LOG {report}", is_part=is_setting_line, messages_min=2, kind="report", repeatable=True)
+
+
+def require_room(rates_hz: Mapping[AnyMessage, float], baud: int) -> None:
     """Raise BadArgument if the serial port cannot carry all messages, or if one message exceeds table 3.7.
 
     `baud` is one of BAUD_RATES.
@@ -259,8 +283,8 @@ def require_room(rates_hz: Mapping[OutputMessage, float], baud: int) -> None:
     frame_bytes_s = 0.0
     for message, rate_hz in rates_hz.items():
         frame_bytes_s += rate_hz * FRAME_BYTES[message]
-        most_hz = MAX_RATE_HZ[message][baud]
-        if rate_hz > most_hz:
+        most_hz = MAX_RATE_HZ.get(message, {}).get(baud)
+        if most_hz is not None and rate_hz > most_hz:
             raise BadArgument(
                 f"{message}: expected at most {most_hz} Hz at {baud} baud, got {rate_hz:g} Hz; "
                 f"set a lower rate or a higher baud rate first"
@@ -274,7 +298,7 @@ def require_room(rates_hz: Mapping[OutputMessage, float], baud: int) -> None:
         )
 
 
-def _command(
+def command(
     text: str,
     *,
     timeout_ns: int = REPLY_TIMEOUT_NS,
@@ -284,6 +308,7 @@ def _command(
     kind: str = "OK",
     repeatable: bool = False,
 ) -> Request:
+    """Return the request of a command line."""
     payload = (text + LINE_END).encode("ascii")
     return Request(
         payload, text, is_end, is_rejection, is_part, timeout_ns, silent, messages_min, kind, repeatable,
@@ -291,7 +316,7 @@ def _command(
     )  # fmt: skip
 
 
-def _text(value: float) -> str:
+def number_text(value: float) -> str:
     """Return a number as in the manual: no exponent, no trailing zeros, no minus before zero."""
     text = f"{value:.6f}".rstrip("0").rstrip(".")
     return "0" if text == "-0" else text
@@ -324,11 +349,11 @@ def read_report(query: Query) -> RequestScript[Mapping[str, str] | None]:
     """Read one report of settings, by the names of the device.
 
     A line without a name gets the name "COMCONFIG 1", "COMCONFIG 2" and so on. Raises NoReply, Rejected. Returns None
-    for MAGCONFIG in these cases, because a device without magnetometer may not know it (assumption).
+    for MAGCONFIG and INSCONFIG in these cases, because other models may not know them (assumption).
     """
     request = ask(query)
     outcome = yield request
-    if query is Query.MAGCONFIG and not isinstance(outcome, Reply):
+    if query in (Query.MAGCONFIG, Query.INSCONFIG) and not isinstance(outcome, Reply):
         return None
     report = parse_report(require_reply(request, outcome))
     words = dict(report.values)
@@ -355,6 +380,22 @@ def send(request: Request) -> RequestScript[None]:
     require_reply(request, (yield request))
 
 
+def send_if_known(request: Request) -> RequestScript[tuple[str, ...]]:
+    """Send a command that some firmware does not know, and return the lines of its reply. Raises NoReply, Rejected."""
+    outcome = yield request
+    if not isinstance(outcome, Reply):
+        raise Rejected((yield from not_supported(request, outcome)))
+    return outcome.lines
+
+
+def not_supported(request: Request, outcome: Outcome) -> RequestScript[str]:
+    """Return the error for a command without a positive reply, with the firmware version. Raises NoReply if the device
+    does not reply at all."""
+    got = " / ".join(outcome.lines) if isinstance(outcome, Rejection) else "no reply"
+    firmware = (yield from identify()).firmware or "of unknown version"
+    return f"{request.name}: not supported by firmware {firmware}: expected OK, got {got}"
+
+
 # --- output -----------------------------------------------------------------------------------------------------------
 
 
@@ -378,10 +419,10 @@ def ask_outputs() -> RequestScript[PeriodicOutputs | None]:
     return config if config.periods_s or config.on_mark else None
 
 
-def rates_hz(config: PeriodicOutputs | None) -> dict[OutputMessage, float]:
+def rates_hz(config: PeriodicOutputs | None) -> dict[AnyMessage, float]:
     """Return the output rates of all timed messages."""
     periods_s = config.periods_s if config is not None else {}
-    return {OutputMessage(name): 1 / period_s for name, period_s in periods_s.items() if period_s > 0}
+    return {message_of(name): 1 / period_s for name, period_s in periods_s.items() if period_s > 0}
 
 
 def wake() -> RequestScript[bool | None]:
@@ -406,7 +447,7 @@ def wake_by_force(baud: int) -> RequestScript[str]:
     config = yield from ask_outputs()
     if config is None:
         return "LOG ENABLE; the device does not report its output rates; if no sample arrives, set a rate with output"
-    if rates_hz(config):
+    if any(isinstance(message, OutputMessage) for message in rates_hz(config)):
         return "LOG ENABLE"
     rate_hz: OutputRate = 10 if baud == min(BAUD_RATES) else WAKE_HZ
     yield from send(log_ontime(OutputMessage.HI91, rate_hz))
@@ -432,7 +473,7 @@ def change_baud(baud: BaudRate, present_baud: int) -> RequestScript[int]:
     """
     require_room(rates_hz((yield from ask_outputs())), baud)
     answered = yield from _acknowledged(serial_config(baud))
-    heard = yield from _find((present_baud, baud) if answered else (baud, present_baud))
+    heard = yield from find((present_baud, baud) if answered else (baud, present_baud))
     if heard == present_baud != baud and not answered:
         raise NoReply(f"SERIALCONFIG {baud}: expected OK, got no reply; the device keeps {present_baud} baud")
     yield from send(save_config())
@@ -446,7 +487,7 @@ def change_baud(baud: BaudRate, present_baud: int) -> RequestScript[int]:
 def reset_to_factory(present_baud: int) -> RequestScript[int]:
     """Restore the factory settings, restart and follow the device. Return the baud rate. Raises NoReply, Rejected."""
     answered = yield from _acknowledged(factory_reset())
-    heard = yield from _find((present_baud, FACTORY_BAUD) if answered else (FACTORY_BAUD, present_baud))
+    heard = yield from find((present_baud, FACTORY_BAUD) if answered else (FACTORY_BAUD, present_baud))
     if not answered and heard == present_baud:
         raise NoReply("FRESET: expected OK, got no reply; read the settings to check the result")
     yield reboot()
@@ -469,7 +510,7 @@ def _acknowledged(request: Request) -> RequestScript[bool]:
     return isinstance(outcome, Reply)
 
 
-def _find(bauds: Sequence[int]) -> RequestScript[int]:
+def find(bauds: Sequence[int]) -> RequestScript[int]:
     """Return the first baud rate at which the device replies and keep it. Raises NoReply and restores the first one."""
     for baud in dict.fromkeys(bauds):
         yield pause(0, baud=baud)

@@ -1,6 +1,6 @@
 """Row `DRIVER` of HiPNUC devices on a UART: verbs and calibrations."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from random import Random
 from typing import Annotated, Any, Final, Literal
@@ -24,11 +24,12 @@ from imud.contracts.command import (
     yaw_at,
 )
 from imud.contracts.driver import Identity, StreamDriver, random_vector
-from imud.contracts.script import RequestScript, Silence
+from imud.contracts.script import Reply, RequestScript, Silence
 from imud.drivers.hipnuc.common import (
     FLOATS,
     MAIN_STATUS,
     NINE_AXES_NEEDED,
+    TURNING,
     LevelReset,
     heading_by_mode,
     levelled,
@@ -37,7 +38,7 @@ from imud.drivers.hipnuc.common import (
     random_quaternion,
     save_verb,
 )
-from imud.drivers.hipnuc.uart import commands
+from imud.drivers.hipnuc.uart import commands, firmware
 from imud.drivers.hipnuc.uart.codec import (
     HEADER,
     PPS_STAMP_MODULUS_MS,
@@ -158,6 +159,13 @@ VERBS: Final[Verbs] = {
         proof=Proof.SAMPLES,
         expected=lambda given: () if given.relative else (yaw_at(given.angle_deg),),
     ),
+    "reset_attitude": Verb(
+        "send ATT RST 1 or 4 of older firmware",
+        firmware.reset_attitude,
+        proof=Proof.NONE,
+        evidence="no document describes the effect",
+    ),
+    "ins_config": Verb("read the configuration of an INS model", firmware.ins_config, changes=False),
 }
 
 
@@ -209,6 +217,23 @@ def _save(_target: Target) -> RequestScript[None]:
     return send(commands.save_config())
 
 
+def _start(planar: bool) -> Callable[[Target], RequestScript[object]]:
+    return lambda _target: commands.send_if_known(firmware.start_calibration(planar))
+
+
+def _started_verdict(target: Target) -> RequestScript[Verdict]:
+    """Read the bias, and the state of a calibration that a command started. Raises NoReply, Rejected."""
+    bias = yield from _magnetometer_verdict(target)
+    return (yield from firmware.calibration_state(bias.words))
+
+
+def _calibration_unknown(_target: Target) -> RequestScript[str]:
+    """Return why the firmware cannot start a calibration by a command; empty if it can."""
+    request = firmware.ask_calibration()
+    outcome = yield request
+    return "" if isinstance(outcome, Reply) else (yield from commands.not_supported(request, outcome))
+
+
 _MAGNETOMETER: Final = magnetometer(_start_magnetometer, _magnetometer_verdict, _nine_axes_needed)
 
 CALIBRATIONS: Final[Calibrations] = {
@@ -219,6 +244,24 @@ CALIBRATIONS: Final[Calibrations] = {
         section="8.2",
         kept=Kept.BY_SAVE,
         save=_keep_magnetometer,
+    ),
+    "magnetometer_start": replace(
+        _MAGNETOMETER,
+        help="measure the magnetic field of the mount by a command of newer firmware, with its progress",
+        section=firmware.SOURCE,
+        begin=_start(planar=False),
+        verdict=_started_verdict,
+        unready=_calibration_unknown,
+    ),
+    "magnetometer_2d": replace(
+        _MAGNETOMETER,
+        help="measure the horizontal magnetic field of a vehicle by a command of newer firmware, with its progress",
+        section=firmware.SOURCE,
+        handling=Handling.SPIN,
+        instructions=(TURNING[0], "Turn the vehicle slowly, level and in one place: at least one full turn."),
+        begin=_start(planar=True),
+        verdict=_started_verdict,
+        unready=_calibration_unknown,
     ),
     **levels("2.2.4", 5, lambda kind: lambda _target: send(commands.level_reset(kind)), _save),
     "heading": Calibration(

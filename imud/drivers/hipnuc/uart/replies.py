@@ -25,8 +25,9 @@ from imud.model.ledger import Ledger
 _VERSION_LINE: Final = re.compile(r"\s*(?:PNAME|BUILD|UUID|APP_VER|BL_VER)\s*[=:].*")
 _VALUE_LINE: Final = re.compile(r"\s*([A-Za-z][A-Za-z0-9_.\-]*)\s*[=:]\s*(.*?)\s*")
 _COMMENT: Final = re.compile(r"\s*/\*.*?(\*/|$)")
-_OUTPUT: Final = re.compile(r"\b(?:IMU|HI)(91|92|81|83)\s+(?:COM\d+\s+)?ONTIME\s+(\d+(?:\.\d*)?|\.\d+)")
-_MARKED: Final = re.compile(r"\b(?:IMU|HI)(91|92|81|83)\s+(?:COM\d+\s+)?ONMARK\s+1\b")
+# `LOG HI91 ONTIME 0.01`, `LOG COM2 HI91 ONTIME 0.01` or `HI91 COM2 ONTIME 0.01`; INS models also have other messages
+_MESSAGE: Final = r"(?:\bCOM(\d+)\s+)?\b(?:(?:IMU|HI)(81|83|91|92)|(GGA|RMC|SXT))\s+(?:COM(\d+)\s+)?"
+_OUTPUT: Final = re.compile(_MESSAGE + r"(?:ONTIME\s+(\d+(?:\.\d*)?|\.\d+)|ONMARK\s+(1)\b)")
 
 
 def is_end(message: Message) -> bool:
@@ -77,6 +78,7 @@ class PeriodicOutputs(NamedTuple):
 
     periods_s: Mapping[str, float]  # output periods by message (`OutputMessage`); 0 is off
     on_mark: frozenset[str]  # messages for each pulse on SIN
+    ports: "Mapping[str, PeriodicOutputs]"  # outputs of other ports, by name (`COM2`)
 
 
 def parse_report(lines: Sequence[str]) -> Report:
@@ -104,14 +106,25 @@ def parse_version(lines: Sequence[str]) -> Version:
 
 
 def parse_comconfig(lines: Iterable[str]) -> PeriodicOutputs:
-    """Return the outputs in a reply to LOG COMCONFIG."""
-    periods_s, on_mark = {}, set()
+    """Return the outputs in a reply to LOG COMCONFIG.
+
+    Lines without a port are about the port of imud. If the reply names only one port, this is the port of imud.
+    """
+    periods_s: dict[str, dict[str, float]] = {}
+    on_mark: dict[str, set[str]] = {}
     for line in lines:
-        for message, period in _OUTPUT.findall(line):
-            periods_s[f"HI{message}"] = float(period)
-        for message in _MARKED.findall(line):
-            on_mark.add(f"HI{message}")
-    return PeriodicOutputs(periods_s, frozenset(on_mark))
+        for before, number, sentence, after, period, _ in _OUTPUT.findall(line):
+            port, message = before or after, sentence or f"HI{number}"
+            periods, marks = periods_s.setdefault(port, {}), on_mark.setdefault(port, set())
+            if period:
+                periods[message] = float(period)
+            else:
+                marks.add(message)
+    named = sorted(periods_s.keys() - {""})
+    if len(named) == 1 and "" not in periods_s:
+        periods_s[""], on_mark[""] = periods_s.pop(named[0]), on_mark.pop(named.pop())
+    ports = {f"COM{port}": PeriodicOutputs(periods_s[port], frozenset(on_mark[port]), {}) for port in named}
+    return PeriodicOutputs(periods_s.get("", {}), frozenset(on_mark.get("", ())), ports)
 
 
 def whole(text: str | None) -> int | None:

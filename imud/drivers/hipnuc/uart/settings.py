@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain
 from math import isclose
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, get_args
 
 import msgspec
 from msgspec import Meta
@@ -23,7 +23,7 @@ from imud.contracts.lines import AlarmRange, AlarmRanges, DeviceLines
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import DeviceReport, Effect, Reports, Setting, SettingsTable
 from imud.drivers.hipnuc.common import AttitudeMode
-from imud.drivers.hipnuc.uart import commands
+from imud.drivers.hipnuc.uart import commands, firmware
 from imud.drivers.hipnuc.uart.commands import (
     BAUD_RATES,
     MAX_RATE_HZ,
@@ -39,7 +39,20 @@ from imud.drivers.hipnuc.uart.commands import (
     PinFunction,
     PinName,
     Query,
+    command,
+    message_of,
     send,
+    send_if_known,
+)
+from imud.drivers.hipnuc.uart.firmware import (
+    ON_MARK,
+    Digits,
+    DigitsNumber,
+    Port,
+    described,
+    digits_of,
+    has_all,
+    matrix_of_digits,
 )
 from imud.drivers.hipnuc.uart.replies import numbers_of, parse_comconfig, whole
 from imud.model.errors import BadArgument
@@ -67,7 +80,7 @@ def axes_by_settings(settings: Mapping[str, str]) -> SentAxes:
     known = " or ".join(COORDINATES)
     problem = (
         f"coordinates: expected {known} from the device (COORD), got {value}: imud describes axes and angles as with "
-        "0, which can be wrong; set 0 or 4 with the program of the vendor (CONFIG IMU COORD), or configure `frame`"
+        "0, which can be wrong; run `imud settings NAME --set coordinates=0 --save`, or configure `frame`"
     )
     return replace(RFU_312, problem=problem)
 
@@ -90,7 +103,7 @@ _DIVISOR: Final = re.compile(r"(?:.*\bDIV)?\s*(\d{1,2})\b")
 
 def alarm_ranges(settings: Mapping[str, Any]) -> AlarmRanges:
     """Return the alarm ranges in the values of the device settings."""
-    index = EULER_INDEX[axes_by_settings({"coordinates": settings.get("coordinates") or "0"}).axes.order]
+    index = EULER_INDEX[axes_by_settings({"coordinates": str(settings.get("coordinates", 0))}).axes.order]
     by_axis = {
         axis.upper(): AlarmRange(index[axis.upper()], one.min_deg, one.max_deg, one.enabled)
         for axis, one in settings.get("alarm", {}).items()
@@ -98,12 +111,19 @@ def alarm_ranges(settings: Mapping[str, Any]) -> AlarmRanges:
     return AlarmRanges(by_axis, PIN_SETTING, MOUNTING_SETTING)
 
 
-ON_MARK: Final = "on_mark"
-MessageName = Literal["hi91", "hi92", "hi81", "hi83"]
+MessageName = Literal["hi91", "hi92", "hi81", "hi83", "gga", "rmc", "sxt"]
 MANUAL_MESSAGES: Final = frozenset({"hi91", "hi92"})  # messages of every device; the others need newer firmware
+SAMPLE_MESSAGES: Final = {one.value.lower() for one in OutputMessage}  # messages that imud decodes
 Output = dict[MessageName, OutputRate | Literal["on_mark"]]
-Modes = Literal["6-axis", "9-axis"]
-MODES: Final[Mapping[int | None, Modes]] = {0: "6-axis", 1: "9-axis"}  # by the value of ATT_MODE
+PortOutput = dict[Port, Output]
+Modes = Literal["6-axis", "9-axis", "humanoid", "slow_vehicle", "low_dynamics"]
+MODES: Final[Mapping[Modes, AttitudeMode]] = {
+    "6-axis": AttitudeMode.SIX_AXIS, "9-axis": AttitudeMode.NINE_AXIS, "humanoid": AttitudeMode.HUMANOID,
+    "slow_vehicle": AttitudeMode.SLOW_VEHICLE, "low_dynamics": AttitudeMode.LOW_DYNAMICS,
+}  # fmt: skip
+MODE_OF: Final = {mode.value: name for name, mode in MODES.items()}  # by the value of ATT_MODE
+Coordinates = Literal[0, 4]
+MountingValue = MountingName | Digits | DigitsNumber | list[float]
 Axis = Literal["x", "y"]
 Pin = Annotated[int, Meta(ge=1, le=PIN_MAX)]
 Angle = Annotated[float, Meta(ge=-180, le=180, extra={"unit": "°"})]
@@ -123,13 +143,8 @@ class AngleAlarm(Options, frozen=True, kw_only=True, forbid_unknown_fields=True)
 def report_values(raw: Mapping[str, str]) -> dict[str, Any]:
     """Return the settings in reports (`commands.read_report`) by name."""
     outputs = parse_comconfig(raw.values())
-    output: dict[str, Any] = {}
-    for message, period_s in outputs.periods_s.items():
-        rate_hz = round(1 / period_s, 3) if period_s else 0
-        output[message.lower()] = int(rate_hz) if rate_hz == int(rate_hz) else rate_hz
-    for message in outputs.on_mark:
-        output[message.lower()] = ON_MARK
-    alarms, coordinates = {}, None
+    alarms: dict[str, AngleAlarm] = {}
+    coordinates: int | str | None = None
     for name, text in raw.items():
         named, values = _NAME.fullmatch(name.strip()), _VALUES.fullmatch(text.strip())
         if named and values and (axis := (values[1] or named[1] or "").lower()):
@@ -137,22 +152,28 @@ def report_values(raw: Mapping[str, str]) -> dict[str, Any]:
             alarms[axis] = AngleAlarm(min_deg=low, max_deg=high, enabled=values[4] == "1")
         if coordinates is None and (found := _COORD.search(f"{name}: {text}")):
             number = numbers_of(found[1], 1)
-            coordinates = f"{number[0]:g}" if number is not None else found[1] or "no value"
+            coordinates = found[1] or "no value"
+            if number is not None:
+                coordinates = int(number[0]) if number[0] == int(number[0]) else f"{number[0]:g}"
     pins = {}
     for function in PinFunction:
         if found := _PIN.match(raw.get(f"PMUX{function.value}", "")):
             pins[function.name.lower()] = int(found[1])
     urfr = numbers_of(raw.get("URFR", ""), 9)
     mounting: str | list[float] | None = urfr
+    if (digits := digits_of(raw.get("URFR", ""))) in get_args(Digits):
+        mounting = digits
     for one in Mounting:
         if urfr is not None and _near(chain(*one.value), urfr):
             mounting = one.name.lower()
             break
-    calibrates, baud = whole(raw.get("EN_MCAL")), whole(raw.get("BAUD"))
+    calibrates, baud, mode = whole(raw.get("EN_MCAL")), whole(raw.get("BAUD")), whole(raw.get("ATT_MODE"))
     divisor = _DIVISOR.match(raw.get("SOUT_DIV", ""))
     reported: dict[str, Any] = {
-        "output": output or None,
-        "mode": MODES.get(whole(raw.get("ATT_MODE"))),
+        "output": firmware.rates_of(outputs) or None,
+        "port_output": {port.lower(): firmware.rates_of(one) for port, one in outputs.ports.items()} or None,
+        "port_baud": firmware.port_bauds(raw) or None,
+        "mode": None if mode is None else MODE_OF.get(mode, str(mode)),
         "mounting": mounting,
         "magnetic_calibration": None if calibrates is None else calibrates != 0,
         "pins": pins or None,
@@ -161,13 +182,15 @@ def report_values(raw: Mapping[str, str]) -> dict[str, Any]:
         "coordinates": coordinates,
         "magnetometer_bias": numbers_of(raw.get("MB", ""), 3),
         "baud": baud if baud in BAUD_RATES else None,
+        "baseline": firmware.baseline_of(raw),
+        **firmware.code_values(raw),
     }
     return {name: value for name, value in reported.items() if value is not None}
 
 
 def why_silent(settings: Mapping[str, Any]) -> str:
     """Return why a device with these values of its settings replies but sends no samples."""
-    output = settings.get("output", {})
+    output = {name: rate for name, rate in settings.get("output", {}).items() if name in SAMPLE_MESSAGES}
     rates = {name: rate for name, rate in output.items() if rate not in (0, ON_MARK)}
     if rates:
         name, rate_hz = max(rates.items(), key=lambda item: item[1])
@@ -179,12 +202,14 @@ def why_silent(settings: Mapping[str, Any]) -> str:
 
 def shown(raw: Mapping[str, str]) -> dict[str, str]:
     """Return the settings by name, as text with units. Unknown settings keep the name and text of the device."""
-    found, known = {}, report_values(raw)
+    found: dict[str, str] = {}
+    known = report_values(raw)
     for name, value in known.items():
         match name, value:
-            case "output", dict():
-                for message, rate in sorted(value.items()):
-                    found[f"output.{message}"] = "on mark" if rate == ON_MARK else f"{rate:g} Hz" if rate else "off"
+            case "output" | "port_output", dict():
+                found |= firmware.shown_rates(name, value)
+            case "port_baud", dict():
+                found |= {f"port_baud.{port}": f"{baud} bit/s" for port, baud in value.items()}
             case "pins", dict():
                 for function, pin in value.items():
                     found[f"pins.{function}"] = f"IO{pin}"
@@ -198,6 +223,8 @@ def shown(raw: Mapping[str, str]) -> dict[str, str]:
                 found[name] = f"{value} bit/s"
             case "mounting", list():
                 found[name] = ", ".join(f"{number:g}" for number in value)
+            case "baseline", float():
+                found[name] = f"{value:g} m"
             case _:
                 found[name] = {True: "on", False: "off"}[value] if isinstance(value, bool) else str(value)
     # a line contains no known setting if the known settings are the same without its text
@@ -210,9 +237,11 @@ def _near(one: Iterable[float], other: Iterable[float]) -> bool:
 
 
 def _read(_target: Target, names: Collection[str] | None) -> RequestScript[Reports]:
-    reports = {}
-    for query in (Query.USRCONFIG, Query.COMCONFIG, Query.MAGCONFIG):
-        if names is None or query in names:
+    reports: dict[str, DeviceReport] = {}
+    for query in (Query.USRCONFIG, Query.COMCONFIG, Query.MAGCONFIG, Query.INSCONFIG):
+        output = reports[Query.COMCONFIG].values.get("output", {}) if Query.COMCONFIG in reports else {}
+        is_due = query is not Query.INSCONFIG or not output.keys() <= {*MANUAL_MESSAGES, "hi83"}  # an INS model
+        if (names is None and is_due) or (names is not None and query in names):
             words = yield from commands.read_report(query)
             if words is not None:
                 reports[str(query)] = DeviceReport(words, report_values(words))
@@ -226,11 +255,26 @@ def _output(_target: Target, value: Output) -> RequestScript[None]:
     """Set each named message. `check` compares the load with the baud rate, which imud sets later."""
     if value.keys() >= MANUAL_MESSAGES and not any(value.values()):
         yield from send(commands.unlog_all())  # also messages that imud does not decode
+    yield from _send_output(value)
+
+
+def _send_output(value: Output, port: str = "") -> RequestScript[None]:
+    """Set each named message. `port`: empty for the port of imud, otherwise for example `COM2 `."""
     for name, rate in value.items():
-        message = OutputMessage(name.upper())
-        yield from send(commands.log_ontime(message, 0 if rate == ON_MARK else rate))
-        if rate == ON_MARK:
-            yield from send(commands.log_onmark(message))
+        message = message_of(name)
+        for request in (
+            commands.log_ontime(message, 0 if rate == ON_MARK else rate, port),
+            *([commands.log_onmark(message, port)] if rate == ON_MARK else []),
+        ):
+            if port or name not in MANUAL_MESSAGES:
+                yield from send_if_known(request)
+            else:
+                yield from send(request)
+
+
+def _port_output(_target: Target, value: PortOutput) -> RequestScript[None]:
+    for port, output in value.items():
+        yield from _send_output(output, f"{port.upper()} ")
 
 
 def _output_enabled(_target: Target, value: bool) -> RequestScript[None]:
@@ -238,15 +282,31 @@ def _output_enabled(_target: Target, value: bool) -> RequestScript[None]:
 
 
 def _mode(_target: Target, value: Modes) -> RequestScript[None]:
-    return send(commands.attitude_mode(AttitudeMode.NINE_AXIS if value == "9-axis" else AttitudeMode.SIX_AXIS))
+    request = commands.attitude_mode(MODES[value])
+    if value in ("6-axis", "9-axis"):
+        yield from send(request)
+    else:
+        yield from send_if_known(request)
 
 
-def _mounting(_target: Target, value: MountingName | list[float]) -> RequestScript[None]:
-    return send(commands.mounting(matrix_of(value)))
+def _coordinates(_target: Target, value: Coordinates) -> RequestScript[None]:
+    yield from send_if_known(command(f"CONFIG IMU COORD {value}"))
 
 
-def matrix_of(value: MountingName | list[float]) -> Matrix3:
-    """Return the URFR matrix of a mounting by name or by its nine numbers, rows first."""
+def _mounting(_target: Target, value: MountingValue) -> RequestScript[None]:
+    if not isinstance(value, list) and digits_of(value):
+        yield from send_if_known(firmware.mounting_by_digits(str(value)))
+    else:
+        yield from send(commands.mounting(matrix_of(value)))
+
+
+def matrix_of(value: MountingValue) -> Matrix3:
+    """Return the URFR matrix of a mounting by name, by its digits or by its nine numbers, rows first.
+
+    Raises BadArgument for impossible digits.
+    """
+    if isinstance(value, int) or (isinstance(value, str) and digits_of(value)):
+        return matrix_of_digits(str(value))
     if isinstance(value, str):
         return Mounting[value.upper()].value
     a, b, c, d, e, f, g, h, i = value
@@ -286,10 +346,9 @@ def _restart(target: Target) -> RequestScript[Any]:
 # --- comparison and checks --------------------------------------------------------------------------------------
 
 
-def _has_all(declared: Mapping[str, Any], actual: Mapping[str, Any]) -> bool:
-    """Return whether the actual values contain all declared values."""
-    plain = msgspec.to_builtins(actual)
-    return all(plain.get(name) == value for name, value in msgspec.to_builtins(declared).items())
+def _has_all_parts(declared: Mapping[str, Any], actual: Mapping[str, Any]) -> bool:
+    """Return whether the actual values of each port contain the declared values of this port."""
+    return all(has_all(one, actual.get(port, {})) for port, one in declared.items())
 
 
 def _has_outputs(declared: Output, actual: Output) -> bool:
@@ -297,7 +356,7 @@ def _has_outputs(declared: Output, actual: Output) -> bool:
     return all(actual.get(name, None if name in MANUAL_MESSAGES else 0) == rate for name, rate in declared.items())
 
 
-def _same_mounting(declared: MountingName | list[float], actual: MountingName | list[float]) -> bool:
+def _same_mounting(declared: MountingValue, actual: MountingValue) -> bool:
     return _near(chain(*matrix_of(declared)), chain(*matrix_of(actual)))
 
 
@@ -307,9 +366,14 @@ def _check(target: Target, values: Mapping[str, Any]) -> None:
     baud = values.get("baud", target.baud)
     output = values.get("output", {})
     if baud in BAUD_RATES:
-        rates = {OutputMessage(name.upper()): float(rate) for name, rate in output.items() if rate != ON_MARK}
+        rates = {message_of(name): float(rate) for name, rate in output.items() if rate != ON_MARK}
         try:
             commands.require_room(rates, baud)
+        except BadArgument as error:
+            problems.append(str(error))
+    if isinstance(mounting := values.get("mounting"), int):
+        try:
+            matrix_of(mounting)
         except BadArgument as error:
             problems.append(str(error))
     taken: dict[int, str] = {}
@@ -326,23 +390,24 @@ def _check(target: Target, values: Mapping[str, Any]) -> None:
         raise BadArgument("; ".join(problems))
 
 
-def _described(value_type: Any, description: str, section: str, unit: str = "") -> Any:
-    return Annotated[value_type, Meta(description=description, extra={"section": section, "unit": unit})]
-
-
 # Settings of a device, in writing order. Level (CONFIG ATT RST) and heading (CONFIG YAW) depend on the present
 # attitude, so they are verbs.
 SETTINGS: Final = SettingsTable(
     table={
         "mode": Setting(
-            type=_described(Modes, "attitude without or with the magnetometer for the heading", "2.2.4"),
+            type=described(
+                Modes,
+                "attitude without or with the magnetometer for the heading; three modes of newer firmware",
+                "2.2.4",
+            ),
             write=_mode,
             report=Query.USRCONFIG,
         ),
         "mounting": Setting(
-            type=_described(
-                MountingName | Annotated[list[float], Meta(min_length=9, max_length=9)],
-                "new sensor axis that points up or down in place of Z, or the nine numbers C00 … C22 of URFR",
+            type=described(
+                MountingName | Digits | DigitsNumber | Annotated[list[float], Meta(min_length=9, max_length=9)],
+                "new sensor axis that points up or down in place of Z, the nine numbers C00 … C22 of URFR, or "
+                "digits of newer firmware: direction of X, Y, Z, 0 right, 1 left, 2 front, 3 back, 4 up, 5 down",
                 "2.2.4",
             ),
             write=_mounting,
@@ -351,27 +416,27 @@ SETTINGS: Final = SettingsTable(
             agrees=_same_mounting,
         ),
         "magnetic_calibration": Setting(
-            type=_described(bool, "whether the background calibration of the magnetometer is enabled", "8.2"),
+            type=described(bool, "whether the background calibration of the magnetometer is enabled", "8.2"),
             write=_magnetic_calibration,
             report=Query.USRCONFIG,
         ),
         "pins": Setting(
-            type=_described(
+            type=described(
                 dict[PinName, Pin], "pin of each function, 1 for IO1; other functions are unchanged", "2.2.4"
             ),
             write=_pins,
             report=Query.USRCONFIG,
-            agrees=_has_all,
+            agrees=has_all,
         ),
         "sout_divisor": Setting(
-            type=_described(
+            type=described(
                 Annotated[int, Meta(ge=1, le=SOUT_DIVIDER_MAX)], "pulses on SOUT per pulse on SOUT_DIV", "2.2.4"
             ),
             write=_sout_divisor,
             report=Query.USRCONFIG,
         ),
         "alarm": Setting(
-            type=_described(
+            type=described(
                 dict[Axis, AngleAlarm],
                 "angles outside which the alarm pin is high, by axis; other axes are unchanged",
                 "2.2.4",
@@ -379,10 +444,10 @@ SETTINGS: Final = SettingsTable(
             ),
             write=_write_alarm,
             report=Query.USRCONFIG,
-            agrees=_has_all,
+            agrees=has_all,
         ),
         "output": Setting(
-            type=_described(
+            type=described(
                 Output,
                 "rate of each message, 0: off, on_mark: one frame for each pulse on SIN; other messages are unchanged",
                 "2.2.5",
@@ -393,20 +458,29 @@ SETTINGS: Final = SettingsTable(
             agrees=_has_outputs,
         ),
         "output_enabled": Setting(
-            type=_described(bool, "whether the device sends frames of any rate", "2.2.5"),
+            type=described(bool, "whether the device sends frames of any rate", "2.2.5"),
             write=_output_enabled,
             readable=False,
         ),
         "coordinates": Setting(
-            type=_described(
-                str,
+            type=described(
+                Coordinates,
                 "axes and angles of newer firmware (COORD): 0 as in the manual (ENU), 4 NWU with x forward",
-                "2.2.4",
+                firmware.SOURCE,
             ),
+            write=_coordinates,
             report=Query.USRCONFIG,
+            effect=Effect.AFTER_RESTART,  # no document states it: after a restart, the axes agree with the report
         ),
+        "port_output": Setting(
+            type=described(PortOutput, "rate of each message on other ports of the device", firmware.SOURCE, "Hz"),
+            write=_port_output,
+            report=Query.COMCONFIG,
+            agrees=_has_all_parts,
+        ),
+        **firmware.SETTINGS,
         "magnetometer_bias": Setting(
-            type=_described(
+            type=described(
                 list[float],
                 "offset from the calibration of the magnetometer; zero: not calibrated",
                 "8.1.1",
@@ -415,7 +489,7 @@ SETTINGS: Final = SettingsTable(
             report=Query.MAGCONFIG,
         ),
         "baud": Setting(
-            type=_described(BaudRate, "baud rate of the serial port; saves all other settings too", "2.2.3", "bit/s"),
+            type=described(BaudRate, "baud rate of the serial port; saves all other settings too", "2.2.3", "bit/s"),
             write=_baud,
             report=Query.COMCONFIG,
             connection=True,
@@ -493,7 +567,9 @@ def _marks(output: Mapping[str, Any] | None, baud: int | None, lines: DeviceLine
     """Yield contradictions of messages on mark: triggers need such a message, a pulse per second forbids it."""
     if output is None:
         return
-    marked = [OutputMessage(name.upper()) for name, rate in output.items() if rate == ON_MARK]
+    marked = [
+        OutputMessage(name.upper()) for name, rate in output.items() if rate == ON_MARK and name in SAMPLE_MESSAGES
+    ]
     if lines.sin is not None:
         if not marked:
             yield (

@@ -418,7 +418,12 @@ def test_reports_and_numbers_of_the_module() -> None:
     assert [r.is_setting_line(one) for one in (*VERSION[:-1], "ATT_MODE: 0")] == [False] * 5 + [True]
 
     lines = ("BAUD=115200", "LOG IMU91 ONTIME 0.01", "LOG HI92 COM1 ONTIME 0", "OK")
-    assert r.parse_comconfig(lines) == ({"HI91": 0.01, "HI92": 0.0}, frozenset())
+    com1: Any = ({"HI92": 0.0}, frozenset(), {})
+    assert r.parse_comconfig(lines) == ({"HI91": 0.01}, frozenset(), {"COM1": com1})
+    assert r.parse_comconfig(lines[2:]) == com1  # the only port is the port of imud
+    two = r.parse_comconfig(("LOG COM1 HI91 ONTIME .1", "LOG COM2 GGA ONMARK 1", "LOG COM2 RMC ONTIME 1"))
+    both: Any = {"COM1": ({"HI91": 0.1}, set(), {}), "COM2": ({"RMC": 1.0}, {"GGA"}, {})}
+    assert two == ({}, frozenset(), both)
     assert r.parse_report(lines) == r.Report({"BAUD": "115200"}, lines[1:3])
     for text, bias_ut in (("14.14, -2.08, -8.75", [14.14, -2.08, -8.75]), ("1,2", None), ("1,nan,2", None), ("", None)):
         assert r.numbers_of(text, 3) == bias_ut
@@ -492,7 +497,7 @@ HALF_TURN = "a number from -180 to 180"
     [
         ("output", {"message": "HI91", "rate_hz": 500}, "expected at most 100 Hz"),  # too much for 115200 baud
         ("output", {"message": "HI91", "rate_hz": 300}, RATES),
-        ("output", {"message": "HI93", "rate_hz": 1}, "known: hi81, hi83, hi91, hi92"),
+        ("output", {"message": "HI93", "rate_hz": 1}, "known: gga, hi81, hi83, hi91, hi92, rmc, sxt"),
         ("output_on_mark", {"message": None}, "imud settings bow --set output.MESSAGE=on_mark"),
         ("output_once", {"message": None}, 'one of "HI91", "HI92"'), ("mode", {"axes": 7}, 'one of "6-axis", "9-axis"'),
         ("level", {"level": None}, '"automatic", "cancel", "relative"'),

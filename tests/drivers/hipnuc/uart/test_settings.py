@@ -47,7 +47,10 @@ def test_factory_settings_and_the_table() -> None:
         assert isinstance(info, msgspec.inspect.Metadata), name
         assert (info.extra or {})["section"]
         assert (info.extra_json_schema or {})["description"]
-    assert [name for name, setting in TABLE.items() if setting.effect is Effect.AFTER_RESTART] == ["mounting"]
+    assert [name for name, setting in TABLE.items() if setting.effect is Effect.AFTER_RESTART] == [
+        "mounting",
+        "coordinates",
+    ]
     assert [name for name, setting in TABLE.items() if setting.connection] == ["baud"] == [*TABLE][-1:]
     line = HipnucLine()
     setting = TABLE["output_enabled"]
@@ -87,7 +90,7 @@ def test_the_same_in_words_with_units_and_lines_of_an_unknown_form_unchanged() -
 
     for raw in (
         {},
-        {"ATT_MODE": "7", "URFR": "1,2,3", "EN_MCAL": "x", "PMUX1": "IO0", "SOUT_DIV": "", "MB": "nan, 0, 0"},
+        {"ATT_MODE": "x", "URFR": "1,2,3", "EN_MCAL": "x", "PMUX1": "IO0", "SOUT_DIV": "", "MB": "nan, 0, 0"},
         {"URFR": "1,0,0,0,1,0,0,0,inf", "BAUD": "123", "ALARM_X": "-5,5", "COMCONFIG 1": "LOG HI93 ONTIME 1"},
     ):
         assert (report_values(raw), shown(raw)) == ({}, raw)
@@ -186,19 +189,19 @@ def test_the_alarm_is_read_from_the_modules_own_lines_and_from_other_forms() -> 
 
 @pytest.mark.parametrize(
     ("line", "value"),
-    [("COORD 4", "4"), ("coord,4.0", "4"), ("IMU_COORD: 04", "4"), ("CONFIG IMU COORD 2", "2"), ("Coord: 0", "0"),
-     ("COORD=", "no value"), ("COORD=-1", "-1"), ("COORDS=4", None), ("", None)],
+    [("COORD 4", 4), ("coord,4.0", 4), ("IMU_COORD: 04", 4), ("CONFIG IMU COORD 2", 2), ("Coord: 0", 0),
+     ("COORD=", "no value"), ("COORD=-1", -1), ("COORD=0.5", "0.5"), ("COORDS=4", None), ("", None)],
 )  # fmt: skip
-def test_coordinates_select_axes_and_the_angles_of_the_alarm(line: str, value: str | None) -> None:
+def test_coordinates_select_axes_and_the_angles_of_the_alarm(line: str, value: int | str | None) -> None:
     """COORD 4 makes roll the angle about the x axis, which the alarm of X watches."""
     settings = ModuleSettings(alarm_x=AlarmSetting(-5, 5.5, False), alarm_y=AlarmSetting(-30.25, 12, True))
     report = parse_report([*settings.user_lines(), line])
     raw = {**report.values, **{f"USRCONFIG {n}": other for n, other in enumerate(filter(None, report.other), 1)}}
     assert report_values(raw).get("coordinates") == value
     sent = DRIVER.sent_axes(shown(raw))
-    assert (sent.navigation_frame == "NWU", bool(sent.problem)) == (value == "4", value not in ("0", "4", None))
+    assert (sent.navigation_frame == "NWU", bool(sent.problem)) == (value == 4, value not in (0, 4, None))
     by_axis = alarm_ranges(report_values(raw)).by_axis
-    assert (by_axis["X"].euler_index, by_axis["Y"].euler_index) == ((0, 1) if value == "4" else (1, 0))
+    assert (by_axis["X"].euler_index, by_axis["Y"].euler_index) == ((0, 1) if value == 4 else (1, 0))
 
 
 SOUT = DeviceLines(sout=SoutOptions(line="A"))
