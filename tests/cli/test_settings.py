@@ -117,7 +117,7 @@ def test_mistakes_are_explained(words: Words, cli: Cli, tmp_path: Path) -> None:
     for value, problem in {
         "mode": "expected NAME=VALUE, got 'mode'",
         "mod=9": 'expected a setting that imud knows, got "mod"; did you mean mode?',
-        "mode=7": 'mode: expected one of "6-axis", "9-axis", got 7',
+        "mode=7": 'mode: expected one of "6-axis", "9-axis", "humanoid", "low_dynamics", "slow_vehicle", got 7',
         "magnetometer_bias=1": "magnetometer_bias: it is read-only",
     }.items():
         cli.refuses(problem, *words, "--set", value)

@@ -5,7 +5,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import replace
 from itertools import permutations, product
-from math import pi, radians
+from math import pi, radians, remainder
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -22,7 +22,7 @@ from imud.model.ledger import Ledger
 from imud.model.sample import Pair, Sample, Sync, Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.clock import SampleClock
-from imud.sim.hipnuc.uart_settings import HipnucHardware, ModuleSettings
+from imud.sim.hipnuc.uart_settings import VARIANTS, HipnucHardware, ModuleSettings
 from imud.sim.physics import Motion, Still, Truth, tumble
 from tests.support.event_loops import VirtualClock, run_virtually
 from tests.support.stories import played
@@ -352,8 +352,17 @@ class ByHand:
         return Still(0.05, -0.03, 0.4).at(t_s) if t_s < self._from_s else tumble().at(t_s)
 
 
-def module(motion: Motion, att_mode: int) -> WiredDevice:
-    hardware = HipnucHardware(motion=motion, hard_iron_t=HARD_IRON_T)
+class OnTheSpot:
+    """A level vehicle that turns about the vertical axis once in ten seconds."""
+
+    def at(self, t_s: float) -> Truth:
+        rate_rad_s = 2 * pi / 10
+        return Still(0.0, 0.0, remainder(rate_rad_s * t_s, 2 * pi)).at(t_s)._replace(gyro_rad_s=(0.0, 0.0, rate_rad_s))
+
+
+def module(motion: Motion, att_mode: int, variant: str = "as in the manual") -> WiredDevice:
+    behaviour = VARIANTS[variant]
+    hardware = HipnucHardware(motion=motion, hard_iron_t=HARD_IRON_T, behaviour=behaviour, firmware=behaviour.firmware)
     return WiredDevice(DeviceLines(), ModuleSettings(att_mode=att_mode), hardware)
 
 
@@ -365,6 +374,42 @@ async def test_magnetometer_of_a_module(it: WiredDevice) -> None:
     assert result.verified, result.problem
     assert result.device == "bias 14.14, -2.08, -8.75 µT"
     assert any(event.kind is EventKind.CALIBRATION for event in it.events)
+
+
+@pytest.mark.parametrize(
+    ("kind", "motion"), [("magnetometer_start", ByHand(5.0)), ("magnetometer_2d", OnTheSpot())], ids=["3D", "2D"]
+)
+@played(lambda motion: module(motion, 0, "firmware 1.7"))
+async def test_magnetometer_by_a_command_with_the_progress_of_the_device(
+    it: WiredDevice, kind: str, motion: Motion
+) -> None:
+    await it.wait(2)
+    result = await it.device.calibrate(kind, save=False)
+    assert result.verified, result.problem
+    assert result.device == "bias 14.14, -2.08, -8.75 µT, STATE DONE"
+    assert len(result.checks) == (0 if kind == "magnetometer_2d" else 2)
+    steps = [event.detail for event in it.events if event.detail.get("phase") == "turn"]
+    shown = [cast(float, step["device_progress"]) for step in steps]
+    assert shown == sorted(shown) or shown[0] == 1.0  # the first query can be before the start
+    assert (steps[-1]["progress"], shown[-1]) == (1.0, 1.0)
+    assert any(0.0 < one < 1.0 for one in shown)
+
+
+@played(lambda: module(Still(0.05, -0.03, 0.4), 1))
+async def test_a_calibration_that_the_firmware_does_not_know(it: WiredDevice) -> None:
+    await it.wait(2)
+    with pytest.raises(
+        CommandError, match=r"^magnetometer_2d: LOG MCAL STAT: not supported by firmware 1\.5\.6: expected OK, got no"
+    ):
+        await it.device.calibrate("magnetometer_2d", save=False)
+
+
+@played(lambda: module(Still(0.05, -0.03, 0.4), 0, "firmware 1.7"))
+async def test_a_vehicle_that_does_not_turn_is_not_calibrated(it: WiredDevice) -> None:
+    await it.wait(2)
+    result = await it.device.calibrate("magnetometer_2d", save=False)
+    assert not result.verified
+    assert result.problem.endswith("within 300 s; it was turned by less than 360°: turn it about the vertical axis")
 
 
 @pytest.mark.manual("B 2.2.4 YAW range")

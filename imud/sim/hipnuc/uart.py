@@ -173,7 +173,6 @@ class HipnucModule:
         self._random = Random(self.hardware.mark_seed)
         self._line = bytearray()
         self._magnetometer = SelfCalibration(self.hardware.hard_iron_t, self.hardware.mag_bias_t)
-        self._calibrates = False  # whether a command has started a calibration of the magnetometer
         self._actions = self._make_actions()
         self._power_on(now_ns, self.hardware.uptime_ms)
 
@@ -253,6 +252,7 @@ class HipnucModule:
         self._frame = frame_of(rows(settings.urfr))
         self._yaw_rad = 0.0
         self._on_ns, self._on_ms = now_ns, uptime_ms
+        self._calibrates = False  # whether a command has started a calibration of the magnetometer
         self._ready_ns = now_ns + hardware.boot_ms * NS_PER_MS
         self._wire = Transmitter(settings.baud, TX_BUFFER_BYTES, self._ready_ns)
         self._rate_at_ns = self._quiet_until_ns = 0

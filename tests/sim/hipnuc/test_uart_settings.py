@@ -89,6 +89,44 @@ def test_bad_values_are_refused_and_other_commands_are_not_for_it() -> None:
         assert changed(FACTORY, line, 156) is None
 
 
+@pytest.mark.parametrize(
+    ("variant", "line", "reply"),
+    [
+        ("firmware 1.7", "CONFIG IMU COORD 4", "OK"), ("firmware 1.7", "CONFIG IMU COORD 1", "ERR"),
+        ("firmware 1.7", "CONFIG IMU URFR 205", "OK"), ("firmware 1.7", "CONFIG IMU URFR 206", "ERR"),
+        ("firmware 1.7", "CONFIG IMU URFR 135", "ERR"), ("firmware 1.7", "CONFIG IMU URFR 1,0,0,0,1,0,0,0,1", "OK"),
+        ("firmware 1.7", "CONFIG ATT MODE 7", "OK"), ("firmware 1.7", "CONFIG ATT MODE 6", "ERR"),
+        ("firmware 1.7", "LOG COM2 HI91 ONTIME 0.01", "OK"), ("firmware 1.7", "LOG COM3 HI91 ONTIME 0.01", "ERR"),
+        ("firmware 1.7", "SERIALCONFIG COM2 9600", "OK"), ("firmware 1.7", "SERIALCONFIG COM2 1", "ERR"),
+        ("firmware 1.7", "CONFIG MCAL START 3D", "ERR"), ("firmware 1.7", "LOG GGA ONTIME 1", "ERR"),
+        ("firmware 1.7", "CONFIG IMU ABW 1", "ERR"), ("firmware 1.7", "LOG COM1 HI91 ONTIME 0", "OK"),
+        ("INS, firmware 1.7", "LOG GGA ONTIME 1", "OK"), ("INS, firmware 1.7", "SETBASELINE x", "ERR"),
+        ("older firmware", "CONFIG IMU GRG 3", "OK"), ("older firmware", "CONFIG IMU GRG 4", "ERR"),
+        ("older firmware", "CONFIG ATT RST 1", "OK"), ("older firmware", "CONFIG IMU COORD 0", ""),
+        ("as in the manual", "CONFIG IMU COORD 0", ""), ("as in the manual", "CONFIG ATT RST 1", "ERR"),
+        ("as in the manual", "LOG MCAL STAT", ""), ("as in the manual", "CONFIG IMU URFR 024", "ERR"),
+    ],
+)  # fmt: skip
+def test_commands_by_firmware(variant: str, line: str, reply: str) -> None:
+    """An NMEA sentence is between the lines of newer firmware."""
+    behaviour = uart_settings.VARIANTS[variant]
+    bench = HipnucUartBench(replace(FACTORY, hi91=Output()), hardware_of(behaviour, firmware=behaviour.firmware))
+    lines = bench.ask(line)
+    assert [one for one in lines if one[0] != "$"] == [reply] * bool(reply)
+    assert sum(one[0] == "$" for one in lines) == behaviour.newer
+
+
+def test_newer_firmware_counts_modulo_24_hours_and_sends_a_frame_without_ok() -> None:
+    newer = uart_settings.VARIANTS["firmware 1.7"]
+    bench = HipnucUartBench(None, hardware_of(newer, uptime_ms=86_399_000, boot_ms=500))
+    assert [one.system_time_ms for one in bench.frames(600)][-60:-8:10] == [
+        86_399_510, 86_399_610, 86_399_710, 86_399_810, 86_399_910, 10,
+    ]  # fmt: skip
+    bench = HipnucUartBench(replace(FACTORY, hi91=Output(on_mark=True)), hardware_of(newer))
+    bench.module.receive(b"LOG HI91 ONMARK ONCE\r\n", bench.now_ns)
+    assert [burst.sample_ns is not None for burst in bench.wait(50)] == [True]
+
+
 def bench_of(settings: ModuleSettings | None = None, **behaviour: object) -> HipnucUartBench:
     return HipnucUartBench(settings, hardware_of(Behaviour(**behaviour)))  # type: ignore[arg-type]  # names of fields
 
