@@ -164,7 +164,7 @@ def simulated_device(driver: str, port: Path) -> dict[str, Any]:
     [
         *((name, "", ()) for name in SIMULATORS if name in TABLES),
         ("hipnuc-uart", "INS, firmware 1.7", ("mode", "mounting", "output", "coordinates", "baseline")),
-        ("hipnuc-uart", "older firmware", tuple(code.name.lower() for code in firmware.Code)),
+        ("hipnuc-uart", "older firmware", tuple(code.name.lower() for code in firmware.OlderCode)),
     ],
 )
 def test_a_simulated_device_accepts_and_reports_every_setting(

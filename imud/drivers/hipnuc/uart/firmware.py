@@ -186,7 +186,7 @@ def port_bauds(raw: Mapping[str, str]) -> dict[str, int]:
 # --- settings ---------------------------------------------------------------------------------------------------------
 
 
-class Code(Enum):
+class OlderCode(Enum):
     """Codes of older firmware by setting: name of the device, maximum, meaning. No document gives their units."""
 
     ZERO_RATE_UPDATE = ("ZARU", None, "threshold of the zero angular rate update")
@@ -197,7 +197,7 @@ class Code(Enum):
     INCLINATION_FORMAT = ("INC_FMT", 1, "format of the inclinometer")
 
 
-def _code(code: Code) -> Setting:
+def _code(code: OlderCode) -> Setting:
     name, most, meaning = code.value
 
     def write(_target: Target, value: float) -> RequestScript[None]:
@@ -211,7 +211,7 @@ def _code(code: Code) -> Setting:
 def code_values(raw: Mapping[str, str]) -> dict[str, Any]:
     """Return the codes of older firmware in reports. Values outside their range are not included."""
     found: dict[str, Any] = {}
-    for code in Code:
+    for code in OlderCode:
         name, most, _ = code.value
         text = raw.get(name, "")
         number = (numbers_of(text, 1) or [-1])[0] if most is None else whole(text)
@@ -251,7 +251,7 @@ def reset_attitude(_target: Target, *, kind: Annotated[Literal[1, 4], Meta(extra
 
 
 SETTINGS: Final[Mapping[str, Setting]] = {
-    **{code.name.lower(): _code(code) for code in Code},
+    **{code.name.lower(): _code(code) for code in OlderCode},
     "baseline": Setting(
         type=described(float, "baseline of INS models (SETBASELINE; assumption: one number)", SOURCE, "m"),
         write=_write_baseline,
