@@ -336,7 +336,6 @@ def test_tab_reaches_each_control_and_each_section_fits_any_width_with_names_and
         page.until("return document.querySelectorAll('#about [data-action]').length >= 2")
         page.until_text("#event-list", "Device found")
         page.js("document.querySelectorAll('main details').forEach((one) => (one.open = true))")
-<<<<<<< HEAD
         page.js("window.imud.view.onMessage = () => {}")  # a message can replace the control with the focus
         count = page.js(CONTROLS_IN_ORDER)
         page.js("document.activeElement.blur(); getSelection().collapse(document.body, 0)")
@@ -347,10 +346,7 @@ def test_tab_reaches_each_control_and_each_section_fits_any_width_with_names_and
             "delete window.imud.view.onMessage; return window.controls.map((one) => one.closest('.section')?.id)"
         )
         assert set(found) - {None, "ledger"} == {*SECTIONS} - {"ledger"}
-        page.click("[data-setting=mode] [aria-checked=false]")
-=======
         page.js(CHOOSE_9_AXIS)
->>>>>>> 67af3524 (web: Choose the mode in a list in the tests)
         page.js("window.imud.view.onMessage({ kind: 'events', events: [arguments[0]] })", TURNING)
         faults = [fault for section in SECTIONS for fault in faults_of(page, f"#/device/bow/{section}")]
         page.click("#bar .primary")
