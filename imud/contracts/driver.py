@@ -11,6 +11,7 @@ from msgspec import Meta
 from imud.attitude.conventions import RFU_ENU, DeviceAxes, Heading
 from imud.contracts.codec import CanCodec, PolledCodec, StreamCodec
 from imud.contracts.command import Calibrations, Verbs
+from imud.contracts.firmware import Firmware
 from imud.contracts.lines import NO_TIME_BITS, AlarmRanges, DeviceLines, TimeBits
 from imud.contracts.script import RequestScript, TransferScript
 from imud.contracts.setting import Reports, SettingsTable
@@ -152,6 +153,7 @@ class Driver:
     renamed: Mapping[str, str] = field(default_factory=dict)
     calibrations: Calibrations = field(default_factory=dict)  # guided calibrations, by kind
     device_settings: SettingsTable | None = None  # table of the device settings; None if the driver does not know them
+    firmware: Firmware | None = None  # update of the firmware; None if the driver cannot update it
     # GPIO lines that the device can have: names of fields of `imud.contracts.lines.DeviceLines`
     lines: frozenset[str] = frozenset()
     # Returns the meaning of the ALARM line from the values of the device settings; None if no setting describes it

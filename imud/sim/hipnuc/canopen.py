@@ -47,9 +47,11 @@ from imud.drivers.hipnuc.canopen.commands import (
     TPDO_TYPE,
     Transmission,
 )
+from imud.drivers.hipnuc.canopen.firmware import ENTER_LOADER, PROGRAM
 from imud.model.sample import Pair
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.can_module import BITRATE, CanSimulator, FrameWire, SentFrame
+from imud.sim.hipnuc.boot_loader import Application, Flash, SdoLoader
 from imud.sim.physics import Truth
 from imud.sim.sensor import SensorHardware, SimulatorOptions, sensor_of
 
@@ -65,6 +67,7 @@ DEVICE_TYPE: Final = 0
 NAME: Final = b"HI14"
 # Identity values, invented: the manual contains none.
 IDENTITY_VALUES: Final = {1: 0x0000_03E8, 2: 0x0000_0E14, 3: 0x0000_009C, 4: 0x1708_0042}
+REVISION: Final = 3  # sub-index of the version of the firmware
 PERIODS_MS: Final = (0, *range(5, 1001))
 _BIT_RATE_OF: Final = {code: bit_s for bit_s, code in BIT_RATES.items()}
 _COMMANDS: Final = {size: command for command, size in reversed(READ_SIZES.items())}
@@ -138,6 +141,7 @@ class ObjectDictionary:
 
     def __init__(self, factory: NodeSettings, variant: NodeVariant | None = None) -> None:
         self.settings = self.saved = factory
+        self.revision = IDENTITY_VALUES[REVISION]  # version of the firmware
         self.writes_to_flash = 0
         self._factory = factory
         self._variant = variant or NodeVariant()
@@ -167,6 +171,8 @@ class ObjectDictionary:
         if entry.read is None or self._variant.reads == "aborted":
             return _abort(data, WRITE_ONLY)
         value = entry.read(self.settings).to_bytes(entry.size, "little")
+        if data[1:4] == objects.IDENTITY.to_bytes(2, "little") + bytes([REVISION]):
+            value = self.revision.to_bytes(entry.size, "little")
         return bytes([_COMMANDS[entry.size]]) + data[1:4] + value.ljust(4, b"\0")
 
     def _write(self, data: bytes, entry: _Entry) -> tuple[bytes, Control]:
@@ -272,6 +278,8 @@ class HipnucCanopenModule:
         self.samples_sent = self.frames_sent = 0
         self.objects = ObjectDictionary(self.hardware.factory, self.hardware.variant)
         self._leaving = FrameWire(0, now_ns)
+        self.memory = Flash(Application(NAME.decode(), self.objects.revision))
+        self.loader: SdoLoader | None = None  # active boot loader; None while the application runs
         self._power_on(now_ns)
 
     @property
@@ -282,7 +290,10 @@ class HipnucCanopenModule:
         if extended or now_ns < self._begin_ns:
             return
         self._run(now_ns)
-        if can_id == NMT and len(data) == 2 and data[1] in (0, self._node):
+        if self.loader is not None:
+            if can_id == SDO_REQUEST + self._node and len(data) == SDO_BYTES:
+                self._serve(data, now_ns)
+        elif can_id == NMT and len(data) == 2 and data[1] in (0, self._node):
             self._manage(data[0], now_ns)
         elif can_id == SYNC and self._state is NmtState.OPERATIONAL:
             self._measure(now_ns, [number for number in TPDO_FUNCTIONS if self._is_synchronous(number)])
@@ -313,14 +324,17 @@ class HipnucCanopenModule:
 
     def _power_on(self, now_ns: int) -> None:
         self.objects.restore()
-        settings = self.objects.settings
+        settings, application = self.objects.settings, self.memory.application(NAME.decode())
+        if application is not None:
+            self.objects.revision = application.version
         self._node = settings.node
         self._begin_ns = now_ns + self.hardware.boot_ms * NS_PER_MS
         self._tick = 1
-        self._state = NmtState.OPERATIONAL
+        self.loader = SdoLoader(self.memory) if application is None else None
+        self._state = NmtState.PRE_OPERATIONAL if self.loader else NmtState.OPERATIONAL
         self._incli_zero: Pair = (0.0, 0.0)
         self._wire = FrameWire(settings.bit_rate, self._begin_ns)
-        if self.hardware.variant.sends_boot_up:
+        if self.hardware.variant.sends_boot_up and self.loader is None:
             self._send(self._begin_ns, HEARTBEAT + self._node, bytes([NmtState.BOOT_UP.value]))
 
     def _tick_ns(self, tick: int) -> int:
@@ -387,6 +401,15 @@ class HipnucCanopenModule:
     # --- requests ------------------------------------------------------------------------------------------------
 
     def _serve(self, data: bytes, now_ns: int) -> None:
+        if data[1:4] == PROGRAM.to_bytes(2, "little") + bytes([ENTER_LOADER]) and self.loader is None:
+            self.loader, self._state = SdoLoader(self.memory), NmtState.PRE_OPERATIONAL
+        if self.loader is not None:
+            if reply := self.loader.serve(data):
+                self._send(now_ns + self.hardware.processing_ns, SDO_REPLY + self._node, reply)
+            if self.loader.wants_reset:
+                self._leaving = self._wire  # the device still sends the reply
+                self._power_on(now_ns)
+            return
         variant, before, saved = self.hardware.variant, self._node, self.objects.writes_to_flash
         reply, control = self.objects.serve(data)
         if variant.number_at_once:

@@ -13,6 +13,7 @@ of the device from `advance`. It behaves as a real device:
   manual does not define.
 - SOUT has a pulse before each frame. A rising edge on SIN sends the messages that are set to ONMARK. `pins` returns
   edges as `advance` returns bytes.
+- AT+RST restarts the device into its boot loader (`boot_loader.py`), which starts the application after a short time.
 - LOG DISABLE stops frames, not replies. It ends at a restart (assumption: the manual calls ENABLE the default).
 
 The attitude is the truth in both modes. In six-axis mode, the heading of a real device starts at zero; here it does
@@ -32,6 +33,7 @@ from imud.drivers.hipnuc.uart.ins import WEEK_MS, hi83_size, pack_hi81, pack_hi8
 from imud.formats.nmea0183 import sentence
 from imud.model.sample import Measurement, Position, Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US, T_PER_UT
+from imud.sim.hipnuc.boot_loader import Application, Flash, KbootLoader
 from imud.sim.hipnuc.uart_settings import (
     NO_UTC,
     NWU,
@@ -137,6 +139,7 @@ MAIN_STATUS_FIRMWARE: Final = 169  # firmware since which HI91 bytes 1-2 are MAI
 TX_BUFFER_BYTES: Final = 512
 # Maximum length of a command, bytes (assumption). The longest command of the manual, URFR, has 123 with nine decimals.
 COMMAND_BYTES_MAX: Final = 128
+LOADER_NS: Final = 5 * NS_PER_MS  # time from a restart until the boot loader receives bytes, ns (assumption)
 REPLY_NS: Final = 200_000  # time from the end of a command to its reply, ns (assumption)
 # Commands of newer firmware without OK: a frame is the reply, or the device restarts
 WITHOUT_OK: Final = ("REBOOT", "LOG IMU91 ONMARK ONCE", "LOG HI91 ONMARK ONCE", "LOG HI92 ONMARK ONCE")
@@ -173,6 +176,8 @@ class HipnucModule:
         self._random = Random(self.hardware.mark_seed)
         self._line = bytearray()
         self._magnetometer = SelfCalibration(self.hardware.hard_iron_t, self.hardware.mag_bias_t)
+        self.memory = Flash(Application(self.hardware.product, self.hardware.firmware))
+        self.loader: KbootLoader | None = None  # active boot loader; None while the application runs
         self._actions = self._make_actions()
         self._power_on(now_ns, self.hardware.uptime_ms)
 
@@ -182,15 +187,25 @@ class HipnucModule:
 
     def reboot(self, now_ns: int) -> None:
         """Restart after REBOOT or a power failure. The device loses unsaved settings."""
+        self._restart(now_ns, waits=False)
+
+    def _restart(self, now_ns: int, *, waits: bool) -> None:
+        """Restart the device. `waits`: the boot loader waits for a ping before it starts the application."""
         self._sample(now_ns)
         self._before_reboot += self._wire.stopped(now_ns)
         self._pins.power_lost(now_ns)
         self.settings = self.flash
-        self._power_on(now_ns, 0)
+        self._power_on(now_ns, 0, waits=waits)
 
     def receive(self, data: bytes, now_ns: int) -> None:
         self._sample(now_ns)
         if now_ns < self._ready_ns:  # the device still starts
+            return
+        if self.loader is not None:
+            for reply in self.loader.receive(data, now_ns):
+                self._wire.send(now_ns + REPLY_NS, reply)
+            if self.loader.wants_reset:
+                self._restart_after_reply(now_ns)
             return
         for byte in data:
             if byte == 0x0A:
@@ -205,6 +220,12 @@ class HipnucModule:
             elif byte != 0x0D:
                 self._line.clear()
 
+    def _restart_after_reply(self, now_ns: int) -> None:
+        """Restart when the pending replies of the boot loader have left the wire."""
+        sent = self._wire.sent(self._wire.due_ns(now_ns, 0))
+        self._restart(now_ns, waits=False)
+        self._before_reboot += sent
+
     def mark(self, now_ns: int) -> None:
         """Process a rising edge on SIN/PPS: restart the PPS time and send the messages that are set to ONMARK."""
         self._sample(now_ns)
@@ -217,12 +238,15 @@ class HipnucModule:
 
     def advance(self, now_ns: int) -> list[Burst]:
         self._sample(now_ns)
-        done, self._before_reboot = self._before_reboot, []
-        return done + self._wire.sent(now_ns)
+        before = [burst for burst in self._before_reboot if burst.due_ns <= now_ns]
+        self._before_reboot = self._before_reboot[len(before) :]
+        return before + self._wire.sent(now_ns)
 
     def next_ns(self) -> int | None:
         if self._before_reboot:
             return self._before_reboot[0].due_ns
+        if self.loader is not None and self._wire.next_ns() is None:
+            return self.loader.until_ns
         if (due_ns := self._wire.next_ns()) is not None or not self._next_ms:
             return due_ns
         message, device_ms = min(self._next_ms.items(), key=lambda item: item[1])
@@ -247,18 +271,27 @@ class HipnucModule:
         """Return the numbers of sent and dropped frames."""
         return {"frames_sent": self.frames_sent, "frames_dropped": self.frames_dropped}
 
-    def _power_on(self, now_ns: int, uptime_ms: int) -> None:
-        hardware, settings = self.hardware, self.settings
+    def _power_on(self, now_ns: int, uptime_ms: int, *, waits: bool = False) -> None:
+        settings, application = self.settings, self.memory.application(self.hardware.product)
+        if application is not None and application.version != self.hardware.firmware:
+            self.hardware = replace(self.hardware, firmware=application.version)
+            self._actions = self._make_actions()
+        hardware, self.loader = self.hardware, None
+        if application is None or waits:
+            version = 0 if application is None else application.version
+            self.loader = KbootLoader(self.memory, now_ns, hardware.bootloader, version)
+            if application is None:
+                self.loader.until_ns = None
         self._frame = frame_of(rows(settings.urfr))
         self._yaw_rad = 0.0
         self._on_ns, self._on_ms = now_ns, uptime_ms
         self._calibrates = False  # whether a command has started a calibration of the magnetometer
-        self._ready_ns = now_ns + hardware.boot_ms * NS_PER_MS
+        self._ready_ns = now_ns + (hardware.boot_ms * NS_PER_MS if self.loader is None else LOADER_NS)
         self._wire = Transmitter(settings.baud, TX_BUFFER_BYTES, self._ready_ns)
         self._rate_at_ns = self._quiet_until_ns = 0
         self._pps_ns = 0
         self._utc = UtcTime(hardware.utc_epoch, wraps_daily=hardware.behaviour.newer)
-        self._enabled = True
+        self._enabled = self.loader is None
         self._line.clear()
         self._settings_changed(self._ready_ns)
 
@@ -267,7 +300,7 @@ class HipnucModule:
         settings, device_ms = self.settings, self._device_ms(now_ns)
         self._outputs: dict[OutputMessage, Output] = {one: getattr(settings, one.lower()) for one in OutputMessage}
         self._mounting = MountingRotation(self._frame, settings.level, settings.level_accel, self._yaw_rad)
-        watching = settings.alarm_x.enabled or settings.alarm_y.enabled
+        watching = (settings.alarm_x.enabled or settings.alarm_y.enabled) and self.loader is None
         self._alarm_ms = (device_ms // ALARM_PERIOD_MS + 1) * ALARM_PERIOD_MS if watching else None
         if not watching:
             self._pins.alarm(now_ns, False)
@@ -289,6 +322,9 @@ class HipnucModule:
 
     def _sample(self, now_ns: int) -> None:
         """Sample up to now and queue the frames. Check the angles for ALARM at its interval."""
+        if self.loader is not None and self.loader.until_ns is not None and now_ns >= self.loader.until_ns:
+            at_ns, self.loader.until_ns = self.loader.until_ns, None
+            self._restart(at_ns, waits=False)
         if 0 < self._rate_at_ns <= now_ns:
             self._change_rate(self._rate_at_ns)
         self._watch_angles(now_ns)
@@ -454,6 +490,7 @@ class HipnucModule:
         ]
         return {
             "REBOOT": self.reboot,
+            "AT+RST": lambda now_ns: self._restart(now_ns, waits=True),
             "SAVECONFIG": self._save,
             "FRESET": self._factory_reset,
             "LOG ENABLE": lambda now_ns: self._enable(True, now_ns),

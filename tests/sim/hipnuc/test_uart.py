@@ -228,7 +228,7 @@ def test_line_ends_garbage_unknown_commands_and_bad_values() -> None:
         bench.module.receive(line.encode("latin-1"), bench.now_ns)
         assert bench.text(30.0) == VERSION
     for line in (
-        "", "HELLO", "log version", "LOG", "LOG VERSIONS", "LOG HI93 ONTIME 1", "CONFIG ATT", "AT+RST", "X" * 5000,
+        "", "HELLO", "log version", "LOG", "LOG VERSIONS", "LOG HI93 ONTIME 1", "CONFIG ATT", "AT+RSTX", "X" * 5000,
     ):  # fmt: skip
         bench = HipnucUartBench()
         assert bench.ask(line) == []

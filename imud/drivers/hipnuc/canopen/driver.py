@@ -54,6 +54,7 @@ from imud.drivers.hipnuc.canopen.commands import (
     Transmission,
     identify,
 )
+from imud.drivers.hipnuc.canopen.firmware import FIRMWARE
 from imud.drivers.hipnuc.common import DOCUMENT, inclinometer_zero, refuse_all, save_verb, zeroed
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame, CyclicFrame
 from imud.model.units import NS_PER_S, NS_PER_US
@@ -341,6 +342,7 @@ DRIVER: Final = CanDriver(
     renamed=RENAMED,
     calibrations=inclinometer_zero("5.4.1", VERBS),
     device_settings=SETTINGS,
+    firmware=FIRMWARE,
     sent_by=lambda settings: [CanFilter(settings.node, NODE_MASK, False)],
     node_of=_node_of,
     node_settings=lambda node: HipnucCanopenOptions(node=node),

@@ -61,6 +61,7 @@ from imud.drivers.hipnuc.uart.commands import (
     wake,
 )
 from imud.drivers.hipnuc.uart.ins import FIELDS, WEEK_MS, pack_hi81, pack_hi83
+from imud.drivers.hipnuc.uart.kboot import FIRMWARE
 from imud.drivers.hipnuc.uart.replies import numbers_of, parse_report
 from imud.drivers.hipnuc.uart.settings import (
     RFU_312,
@@ -338,6 +339,7 @@ DRIVER: Final = StreamDriver(
     verbs=VERBS,
     renamed=RENAMED,
     device_settings=SETTINGS,
+    firmware=FIRMWARE,
     calibrations=CALIBRATIONS,
     identify=identify,
     apply_identity=_apply_identity,
