@@ -71,6 +71,9 @@ COMMANDS = {
     "command": Subcommand("imud.cli.devices:COMMAND", "list the commands of a device, or run one command"),
     "settings": Subcommand("imud.cli.settings:SETTINGS", "print, change, save, back up or restore device settings"),
     "calibrate": Subcommand("imud.cli.calibrate:CALIBRATE", "guide a calibration of a device"),
+    "firmware": Subcommand(
+        "imud.cli.firmware:FIRMWARE", "update the firmware of a device from a file of the vendor", extra="firmware"
+    ),
     "schema": Subcommand("imud.cli.schema:SCHEMA", "list the fields of a sample with units and coordinate frames"),
 }
 

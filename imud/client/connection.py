@@ -389,7 +389,7 @@ class Client:
         descriptor ends with the connection, or when `notify` makes another one for this device.
         """
         self.call("notify", device=device, latency_ms=_finite(latency_ms))
-        return self._descriptor("notify")
+        return self.descriptor("notify")
 
     # --- recordings -------------------------------------------------------------------------------------------------
 
@@ -400,7 +400,7 @@ class Client:
         the recording.
         """
         self.call("record.start", devices=_listed(devices))
-        return self._descriptor("record.start")
+        return self.descriptor("record.start")
 
     def stop_recording(self) -> int:
         """Stop the recording. imud still sends its queue, then end of file. Return the number of dropped records."""
@@ -412,7 +412,7 @@ class Client:
         Raises RpcError if the configuration has no flight recorder.
         """
         seconds = self._request("record.snapshot", SnapshotReply).seconds
-        return self._descriptor("record.snapshot"), seconds
+        return self.descriptor("record.snapshot"), seconds
 
     # --- messages ---------------------------------------------------------------------------------------------------
 
@@ -453,7 +453,7 @@ class Client:
             raise ServerError(f"{self.path}: expected protocol {PROTOCOL}, got {hello.protocol}; update imud")
         return hello
 
-    def _descriptor(self, method: str) -> int:
+    def descriptor(self, method: str) -> int:
         """Return the descriptor of the last reply. Raises ServerError if the reply contained none."""
         if not self._fds:
             raise ServerError(f"expected a descriptor in the reply to {method}, got a reply without it")

@@ -47,10 +47,20 @@ class FirmwareResult(msgspec.Struct, frozen=True):
     product: str  # product that the device reports; empty if it does not report one
     before: str  # version before the update; empty if the device did not report it
     after: str  # version after the update; empty if the device did not report it
-    bytes: int  # length of the image
+    size_bytes: int  # length of the image
     verified: bool  # whether the device reports the expected version
     evidence: str  # evidence for the version, or the reason why imud could not verify it
-    seconds: float  # duration, s
+    duration_s: float
+
+
+class FirmwareControl(Protocol):
+    """Firmware update of one device, for clients with permission. `imud.device` implements it, and outputs may not
+    import that part."""
+
+    async def update(self, image: FirmwareImage, product: str, version: str) -> FirmwareResult:
+        """Write an image and verify the version. `product`: product of the image according to the user; `version`:
+        expected version; both can be empty. Raises ImudError."""
+        ...
 
 
 class LostContact(CommandError):
@@ -91,7 +101,7 @@ class Firmware:
 
 
 FLASH_STARTS: Final = (0x0000_0000, 0x0800_0000)
-"""Starts of the flash memory of the microcontrollers of NXP (Kinetis) and ST (STM32), for boot loaders without one."""
+"""First addresses of flash memory in microcontrollers: NXP Kinetis, ST STM32. Some boot loaders do not report it."""
 
 ENTER, ERASE, WRITE, START = "enter the boot loader", "erase", "write", "start the new firmware"
 

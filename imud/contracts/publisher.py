@@ -10,6 +10,7 @@ from imud.attitude.conventions import Convention
 from imud.attitude.published import PublishedAxes, as_sent
 from imud.contracts.command import CalibrationResult, Calibrations, LastCalibration, Verbs
 from imud.contracts.driver import Driver
+from imud.contracts.firmware import FirmwareControl
 from imud.contracts.lines import UtcReference, WatchLine
 from imud.contracts.link import Claim
 from imud.contracts.registry import load
@@ -215,6 +216,11 @@ class DeviceControl(Protocol):
     @property
     def last_calibrations(self) -> Mapping[str, LastCalibration]:
         """Result of the last calibration of each kind, of this run of imud or an earlier one."""
+        ...
+
+    @property
+    def firmware(self) -> FirmwareControl:
+        """Firmware update of the device."""
         ...
 
     async def calibrate(self, kind: str, *, save: bool) -> CalibrationResult:

@@ -7,10 +7,11 @@ from typing import Any
 from imud.contracts.codec import CanCodec
 from imud.contracts.command import Target
 from imud.contracts.driver import CanDriver, Identity, of_kind
+from imud.contracts.firmware import FirmwareImage, Report
 from imud.contracts.link import CanLink, CanUse, OnEnd
 from imud.contracts.script import ReplyFrame, Request, RequestScript
 from imud.contracts.status import DeviceState
-from imud.device.can_search import EVERYTHING, CanFound, CanRound, CanSearch
+from imud.device.can_search import EVERYTHING, CanDevice, CanFound, CanRound, CanSearch
 from imud.device.search import Remembered, RememberedDevice
 from imud.device.transport import (
     IDENTIFY_TRIES,
@@ -21,7 +22,7 @@ from imud.device.transport import (
 )
 from imud.drivers import DRIVERS
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame, frame_bits
-from imud.model.errors import LinkError
+from imud.model.errors import BadArgument, CommandError, LinkError
 from imud.model.event import EventKind
 from imud.model.options import Options, shown
 from imud.model.units import NS_PER_S
@@ -297,6 +298,20 @@ class CanTransport(ReceivingTransport):
         self.target = Target(self._options, self.bit_rate, other_bits_per_s=others)
         return await self.scripts.run(make(self.target, *arguments))
 
+    async def run_firmware(self, image: FirmwareImage, report: Report) -> None:
+        """Write an image. The codec of the driver returns the replies of the boot loader."""
+        last = self._remembered.get(self._config.name)
+        if not self.receiving and last is not None and last.node is not None:
+            found = DRIVERS.get(last.driver)
+            if isinstance(found, CanDriver):  # a device in its boot loader sends nothing: no search ends
+                self._search.end_with(CanFound(CanDevice(found, last.node)))
+        driver, name = self.driver, self._config.name
+        if driver is None or not self.receiving:
+            raise CommandError(f"{name}: expected a known driver, got a running search; set `driver` of {name}")
+        if driver.firmware is None:
+            raise BadArgument(f"{name}: {driver.name} has no firmware update")
+        await self.run_script(driver.firmware.update, image, report)
+
     # --- the samples -------------------------------------------------------------------------------------------------
 
     def set_latency(self, latency_ns: int) -> None:
@@ -353,7 +368,10 @@ class CanTransport(ReceivingTransport):
         """Report the received frames, and search again after a long silence."""
         health, driver = self._health, self.driver
         since_ns = health.silent_since_ns if health.state is DeviceState.SILENT else path.begun_ns
-        if self._searchable and now_ns - since_ns > SILENT_SEARCH_NS:
+        if words := self.loader_words(path):
+            health.report(words)
+            return
+        if self._searchable and not self.busy and now_ns - since_ns > SILENT_SEARCH_NS:
             self._search.search_again()
         if driver is None or self._round is not None or now_ns - since_ns <= UNHEARD_NS:
             return

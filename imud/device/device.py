@@ -37,6 +37,7 @@ from imud.device.attachments import Attachments
 from imud.device.calibration import CalibrationRun, RestWindow, check
 from imud.device.condition import ConditionJudge, Known
 from imud.device.evidence import STEP_S
+from imud.device.firmware import FirmwareUpdate
 from imud.device.flash import SettingsFiles
 from imud.device.health import NO_SAMPLE, RUNNING, DeviceEvents, Health
 from imud.device.latency import Need
@@ -236,6 +237,7 @@ class Device:
         self._attachments.add(self.settings)
         self._attachments.add(transport.samples)
         self._verb_run = VerbRun(self.settings, transport)
+        self.firmware = FirmwareUpdate(config.name, transport, self.settings, self._events, self._health, host)
         self._attitude = AttitudeWatch(config, self._events)
         self._status = StatusWatch(self._events)
         self._judge = ConditionJudge(config, transport.link.title, self.ledger, self._events, host.now_ns())
@@ -437,6 +439,7 @@ class Device:
                 raise instead
             raise BadArgument(f"{self.config.name}: unknown command {name[:64]!r}; expected: {self._known_verbs()}")
         if name in self._attachments.verbs:
+            self.firmware.refuse_other_work()
             return await self._verb_run.run_line(name, arguments, self._attachments)
         self._transport.require_replies()
         return await self._verb_run.run(name, verb, arguments)

@@ -114,6 +114,11 @@ class SearchRound(ABC, Generic[F]):
         elif not self._done.cancelled():
             self._done.exception()  # retrieved, so that asyncio does not log it
 
+    def end_with(self, found: F) -> None:
+        """End the search with a device that imud knows from another source. Do nothing if the search has ended."""
+        if not self._done.done():
+            self._follow(found)
+
     @abstractmethod
     def _first(self, now_ns: int) -> Listen | F | GaveUp:
         """Return the first step. `now_ns` is CLOCK_MONOTONIC."""

@@ -5,14 +5,16 @@ import logging
 from collections.abc import Callable
 from typing import Any, Final, Protocol
 
+from imud.contracts.codec import message_of
 from imud.contracts.command import Target
 from imud.contracts.driver import Identity, StreamDriver
+from imud.contracts.firmware import BootLoaderCodec, FirmwareImage, Report
 from imud.contracts.link import OnEnd, StreamLink
 from imud.contracts.script import Request, RequestScript
 from imud.contracts.setting import declared_values
 from imud.contracts.status import DeviceState
 from imud.device.latency import MOST_NS
-from imud.device.scripts import RequestPort
+from imud.device.scripts import RequestPort, ScriptRunner
 from imud.device.search import Remembered, RememberedDevice
 from imud.device.stream_search import StreamFound, StreamRound
 from imud.device.transport import (
@@ -25,7 +27,7 @@ from imud.device.transport import (
 from imud.drivers import DRIVERS
 from imud.host.clock import HostClock
 from imud.host.event_loop import Alarm
-from imud.model.errors import CommandError
+from imud.model.errors import BadArgument, CommandError
 from imud.model.event import EventKind
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
@@ -277,13 +279,15 @@ class StreamTransport(ReceivingTransport):
     def write(self, data: bytes) -> None:
         """Send a request at the baud rate of the device. Raises CommandError during a search, and LinkError."""
         self._require_device()
+        if isinstance(self._receiver, LoaderReceiver):
+            self._receiver.flush()
         self.link.write(data)
         driver = self.driver
         if driver is not None and data == driver.output_on and self._ledger.samples == self._samples_before:
             self._started = self._started or self.hears_replies
 
     def _require_device(self) -> None:
-        if not self.receiving:
+        if not (self.receiving or isinstance(self._receiver, LoaderReceiver)):
             raise CommandError(
                 f"{self._config.name}: cannot run a command during the search; try again in some seconds"
             )
@@ -309,6 +313,32 @@ class StreamTransport(ReceivingTransport):
         options = self._config.options or (self.driver.settings() if self.driver is not None else None)
         self.target = Target(options, self.link.baud, self._fixed_baud)
         return await self.scripts.run(make(self.target, *arguments))
+
+    async def run_firmware(self, image: FirmwareImage, report: Report) -> None:
+        """Write an image. The codec of the boot loader receives the bytes until the end."""
+        if not self.receiving and (last := self._remembered.get(self._config.name)) is not None:
+            driver, baud = DRIVERS.get(last.driver), last.baud
+            if isinstance(driver, StreamDriver) and baud:  # a device in its boot loader sends nothing: no search ends
+                self.link.set_baud(baud)
+                self._search.end_with(StreamFound(driver, baud))
+        driver = self.driver
+        if driver is None or not self.receiving:
+            name = self._config.name
+            raise CommandError(
+                f"{name}: expected a known driver and baud rate, got a search; set `driver` and `baud` of {name}"
+            )
+        if driver.firmware is None or driver.firmware.make_codec is None:
+            raise BadArgument(f"{self._config.name}: {driver.name} has no firmware update")
+        self._hold.release()
+        self._hold = self._discard
+        receiver = LoaderReceiver(driver.firmware.make_codec(self._ledger), self.scripts)
+        self._pass_to(receiver)
+        try:
+            await self.run_script(driver.firmware.update, image, report)
+        finally:
+            receiver.close()
+            if self._receiver is receiver:
+                self._begin(StreamFound(driver, self.link.baud))
 
     # --- the samples -------------------------------------------------------------------------------------------------
 
@@ -343,6 +373,9 @@ class StreamTransport(ReceivingTransport):
     def on_no_samples(self, path: SamplePath, now_ns: int) -> None:
         """Report the received bytes or replies, and search again if a search can find the device."""
         health = self._health
+        if words := self.loader_words(path):
+            health.report(words)
+            return
         if self._hears_unknown(now_ns):
             problem = f"on {self.where}: {self.unknown_words()}"
             self._report_silence(problem, now_ns, ended=health.state is not DeviceState.SILENT)
@@ -431,6 +464,26 @@ class StreamTransport(ReceivingTransport):
     @property
     def _searchable(self) -> bool:
         return self.link.auto_baud or self._config.driver == "auto"
+
+
+class LoaderReceiver:
+    """Receiver that passes the replies of a boot loader to the script runner."""
+
+    def __init__(self, codec: BootLoaderCodec, scripts: ScriptRunner) -> None:
+        self._codec = codec
+        self._scripts = scripts
+
+    def on_data(self, data: bytes, t_rx_ns: int) -> None:
+        for event in self._codec.feed(data):
+            if (message := message_of(event)) is not None:
+                self._scripts.on_message(message, t_rx_ns)
+
+    def flush(self) -> None:
+        """Discard an incomplete reply before the next request."""
+        self._codec.flush()
+
+    def close(self) -> None:
+        self._codec.reset()
 
 
 class _Discard:

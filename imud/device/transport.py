@@ -19,6 +19,7 @@ from imud.attitude.conventions import DeviceAxes
 from imud.attitude.published import PublishedAxes, published_frame
 from imud.config.model import DeviceConfig
 from imud.contracts.driver import Driver, Identity, StreamDriver
+from imud.contracts.firmware import FirmwareImage, Report
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link, OnEnd
 from imud.contracts.publisher import Batch
@@ -32,7 +33,7 @@ from imud.device.search import Remembered, SearchRound
 from imud.device.settings import DeviceSettings
 from imud.device.settings_plan import SettingsPort
 from imud.host.clock import HostClock
-from imud.model.errors import CommandError, NothingHeard
+from imud.model.errors import BadArgument, CommandError, NothingHeard
 from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_S
@@ -133,6 +134,7 @@ class Transport(SettingsPort):
         self._health = context.health
         self._host = context.host
         self._latency_ns = 0
+        self._loader = 0, ""  # CLOCK_MONOTONIC and text of the newest interrupted firmware update
         self.axes_problem = ""  # reason for which the axes of the device are uncertain
         self._compared: tuple[SamplePath, DeviceAxes] | None = None  # path, and the sent axes that it publishes
 
@@ -183,6 +185,19 @@ class Transport(SettingsPort):
         self.axes_problem = sent.problem
         if sent.problem and sent.problem != before:
             self._context.events.raise_event(self._host.now_ns(), EventKind.CONFIGURATION, sent.problem)
+
+    async def run_firmware(self, image: FirmwareImage, report: Report) -> None:
+        """Write an image to the device with its driver. Raises CommandError and LinkError."""
+        raise BadArgument(f"{self._config.name}: expected a device on a UART or on CANopen for a firmware update")
+
+    def in_boot_loader(self, words: str) -> None:
+        """Report `words` in place of a search until the next sample arrives: the device is in its boot loader."""
+        self._loader = self._host.now_ns(), words
+
+    def loader_words(self, path: SamplePath) -> str:
+        """Return the text of `in_boot_loader`; empty after a sample of the device."""
+        since_ns, words = self._loader
+        return words if path.last_sample_ns <= since_ns else ""
 
     # --- the samples -------------------------------------------------------------------------------------------------
 
@@ -374,6 +389,11 @@ class SearchLoop:
         self._again.clear()
         self._health.searching()
         self._round = self._transport.begin_search()
+
+    def end_with(self, found: Any) -> None:
+        """End a running search with a device that imud knows from another source."""
+        if self._round is not None:
+            self._round.end_with(found)
 
     def search_again(self) -> None:
         """Request another search."""

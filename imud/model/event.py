@@ -29,6 +29,8 @@ class EventKind(StrEnum):
     LINK = "link"
     # Progress of a guided calibration. `detail` contains kind, phase and measured values. At most twice per second.
     CALIBRATION = "calibration"
+    # Progress of a firmware update. `detail` contains phase and progress, 0 … 1. At most twice per second and phase.
+    FIRMWARE = "firmware"
     # Gravity at rest contradicts the attitude or the mounting. The message contains the likely cause.
     ATTITUDE = "attitude"
     RECORDER = "recorder"  # the recorder stopped (for example: full disk), continued, lost records, or saved a snapshot
@@ -51,6 +53,7 @@ LEVELS: Final = {
     EventKind.CONDITION: logging.INFO,  # the causes have events of their own
     EventKind.MARK: logging.DEBUG,  # as frequent as camera triggers
     EventKind.CALIBRATION: logging.DEBUG,  # twice per second during a calibration
+    EventKind.FIRMWARE: logging.DEBUG,  # twice per second during an update
 }
 
 
@@ -140,7 +143,7 @@ class EventLog:
 
 def _group_key(event: Event) -> _Key:
     """Return the key of the group of an event: equal events have equal keys."""
-    if event.kind is EventKind.CALIBRATION:
+    if event.kind in (EventKind.CALIBRATION, EventKind.FIRMWARE):
         return event.kind, str(event.detail.get("kind")), str(event.detail.get("phase"))
     return (event.kind,) if event.kind in COUNTED else (event.kind, event.message)
 

@@ -20,6 +20,7 @@ from docs.generate.socket_schema import socket_document
 from imud.attitude.conventions import Convention, Heading
 from imud.contracts import command, setting
 from imud.contracts.condition import Condition, DeviceCondition
+from imud.contracts.firmware import FirmwareImage, FirmwareResult
 from imud.contracts.publisher import AS_SENT, Batch, Latencies, PublisherContext, RecordingSource
 from imud.contracts.status import ClockStatus, Deviations, DeviceState, DeviceStatus, FrameStatus, KernelCounters
 from imud.host import event_loop
@@ -154,7 +155,14 @@ class FakeControl:
 
     def __init__(self, device: str) -> None:
         self._device = device
-        self.settings = self
+        self.settings = self.firmware = self
+
+    async def update(self, image: FirmwareImage, product: str, version: str) -> FirmwareResult:
+        if product == "wait":
+            await done_late.wait()
+        if product == "refused":
+            raise Rejected(f"{self._device} refuses {product}")
+        return FirmwareResult(product, "1.5.6", version, len(image.data), True, "", 1.5)
 
     async def act(self, name: str, arguments: Mapping[str, Any]) -> object:
         if name == "wait":

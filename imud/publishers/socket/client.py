@@ -6,7 +6,7 @@ import socket
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from typing import Final
+from typing import BinaryIO, Final
 
 from imud.contracts.status import ClientStatus
 from imud.formats.jsonrpc import LINE_MAX_BYTES, Code, RpcError, encode_error, frame_of, line_of
@@ -130,7 +130,7 @@ class ClientConnection(Outbox, ScheduledClient):
         self.rights = rights
         self.place = place
         self.wakers: dict[str, Waker] = {}  # by device
-        self._lent: socket.socket | None = None  # the socket of the other descriptor
+        self._lent: socket.socket | BinaryIO | None = None  # the socket of the other descriptor
         self.closed = False
         self.text_numbers = False  # whether imud sends integers that may exceed 2⁵³ as strings
         self.framed = False  # whether imud sends messages as frames; never reset
@@ -212,8 +212,8 @@ class ClientConnection(Outbox, ScheduledClient):
 
     # --- descriptors for the client -----------------------------------------------------------------------------------
 
-    def lend(self, sock: socket.socket) -> int:
-        """Take a socket, and close it when its descriptor is sent. Return the descriptor for the next reply.
+    def lend(self, sock: socket.socket | BinaryIO) -> int:
+        """Take a socket or a file, and close it when its descriptor is sent. Return the descriptor for the next reply.
 
         Raises RpcError if the previous one is not sent yet.
         """

@@ -2,15 +2,18 @@
 
 import asyncio
 import logging
+import os
 import socket
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Sequence
+from fcntl import F_ADD_SEALS, F_SEAL_GROW, F_SEAL_SEAL, F_SEAL_SHRINK, fcntl
 from functools import partial
-from typing import Final
+from typing import BinaryIO, Final, TypeVar
+from zlib import crc32
 
 from imud.contracts.publisher import Batch, PublisherContext
-from imud.contracts.status import ClientStatus, SocketStatus
+from imud.contracts.status import ClientStatus, SocketStatus, WorkStatus
 from imud.formats.jsonrpc import Code, RpcError, encode_notification
-from imud.model.errors import ImudError, reason_of
+from imud.model.errors import CommandError, ImudError, reason_of
 from imud.model.event import Event
 from imud.publishers.recorder.client_stream import ClientRecording, stream_pair
 from imud.publishers.socket.admission import Quota
@@ -22,6 +25,8 @@ from imud.publishers.socket.scheduler import TokenBucket
 from imud.publishers.socket.subscription import DeliveryPlan, Subscription
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 RECORDINGS_MAX: Final = 4
 """Maximum number of recordings of all clients. Each has a thread and a queue of up to 16 MiB."""
@@ -145,6 +150,84 @@ class ClientRecordings:
         self._ending.clear()
 
 
+class FirmwareUploads:
+    """Images of clients for firmware updates, and one update at a time. Synchronization: the event loop's thread.
+
+    A line of the protocol is too short for an image. `firmware.open` makes a file in memory with the size of the image
+    and sends its descriptor. The client writes the image into the file. `firmware.update` reads the file once and
+    checks its CRC-32, because the client can still change the content.
+    """
+
+    def __init__(self, context: PublisherContext, check_fds: Callable[[Sequence[int]], None]) -> None:
+        """`check_fds` raises RpcError if clients may not use descriptors."""
+        self._clock = context.clock
+        self._check_fds = check_fds
+        self._files: dict[int, BinaryIO] = {}  # by number of the connection
+        self._running: WorkStatus | None = None
+
+    def open(self, connection: ClientConnection, size_bytes: int) -> int:
+        """Make a file in place of the previous file of the client. Return the descriptor for the reply.
+
+        Raises RpcError.
+        """
+        self.remove(connection.number)
+        try:
+            file = os.fdopen(os.memfd_create("imud-firmware", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING), "r+b", 0)
+        except OSError as error:
+            message = f"firmware.open: the daemon cannot make a descriptor: {reason_of(error)}"
+            raise RpcError(Code.UNAVAILABLE, message) from None
+        try:
+            file.truncate(size_bytes)
+            fcntl(file, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL)  # the client cannot change the size
+            copy = os.fdopen(os.dup(file.fileno()), "r+b", 0)
+            try:
+                self._check_fds((file.fileno(), copy.fileno()))
+                fd = connection.lend(copy)
+            except RpcError:
+                copy.close()
+                raise
+        except (OSError, RpcError):
+            file.close()
+            raise
+        self._files[connection.number] = file
+        return fd
+
+    def take(self, number: int, crc: int) -> bytes:
+        """Remove the file of the client and return its content. Raises RpcError for another CRC-32."""
+        file = self._files.pop(number, None)
+        if file is None:
+            raise RpcError(Code.INVALID_PARAMS, "firmware.update: expected firmware.open on this connection before")
+        with file:
+            file.seek(0)
+            data = file.read()
+        if crc32(data) != crc:
+            message = f"firmware.update: expected an image with the CRC-32 {crc:#010x}, got {crc32(data):#010x}"
+            raise RpcError(Code.INVALID_PARAMS, message)
+        return data
+
+    async def alone(self, device: str, uid: int, update: Callable[[], Awaitable[T]]) -> T:
+        """Run an update. Raises CommandError if another update of the daemon is running."""
+        now_ns = self._clock.now_ns()
+        if self._running is not None:
+            raise CommandError(f"{device}: {self._running.words(now_ns)}; try again later")
+        self._running = WorkStatus(f"the firmware update of {device}", now_ns, f"uid {uid}", "")
+        try:
+            return await update()
+        finally:
+            self._running = None
+
+    def remove(self, number: int) -> None:
+        """Close the file of a client. Do nothing without a file."""
+        file = self._files.pop(number, None)
+        if file is not None:
+            file.close()
+
+    def close(self) -> None:
+        """Close all files. A second call does nothing."""
+        for number in list(self._files):
+            self.remove(number)
+
+
 WAKE_NS: Final = 300_000
 """Maximum time to wake clients in one turn of the event loop, ns. imud wakes the other clients in the next turn."""
 CLIENTS_PER_CHECK: Final = 16
@@ -174,6 +257,7 @@ class Hub(Clients):
         self.newest: dict[str, Batch] = {}  # the newest batch of each device
         self.history: History | None = None  # None if `socket.history` switches it off
         self.recordings = ClientRecordings(context, quota.check_fds)
+        self.firmware = FirmwareUploads(context, quota.check_fds)
         self._quota = quota
         self._time = time
         self._subscriptions: dict[int, Subscription] = {}
@@ -357,6 +441,7 @@ class Hub(Clients):
         self._events.pop(number, None)
         if number in self.recordings.running:
             self.recordings.remove(connection)
+        self.firmware.remove(number)
         for device in list(self._wanting_wake):
             self._forget_waker(connection, device)
 
@@ -391,6 +476,7 @@ class Hub(Clients):
     def close(self) -> None:
         """Close every client and cancel running requests. A second call does nothing."""
         self.recordings.close()
+        self.firmware.close()
         for connection in list(self.connections.values()):
             connection.close()
         for task in list(self.running.values()):

@@ -11,6 +11,7 @@ import msgspec
 from imud.attitude.conventions import Convention, Heading
 from imud.attitude.published import FrameWords
 from imud.contracts.condition import DeviceCondition
+from imud.contracts.firmware import IMAGE_BYTES_MAX, PRODUCT_MAX
 from imud.contracts.status import CKernelStatus, DeviceState, DeviceStatus, MqttStatus, SocketStatus
 from imud.model.bucket import Bucket
 from imud.model.event import Event, StoredEvent
@@ -89,6 +90,22 @@ class CalibrateParams(msgspec.Struct):
     device: str
     kind: str
     save: bool | None = None
+
+
+class FirmwareOpenParams(msgspec.Struct):
+    """Parameters of `firmware.open`."""
+
+    size_bytes: Annotated[int, msgspec.Meta(ge=1, le=IMAGE_BYTES_MAX)]
+
+
+class FirmwareUpdateParams(msgspec.Struct):
+    """Parameters of `firmware.update`. The client has written the image into the descriptor of `firmware.open`."""
+
+    device: str
+    address: Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]  # address of the first byte
+    crc32: Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]  # CRC-32 of the image, as in zlib
+    product: Annotated[str, msgspec.Meta(max_length=PRODUCT_MAX)] | None = None  # product according to the user
+    version: Annotated[str, msgspec.Meta(max_length=PRODUCT_MAX)] | None = None  # expected version
 
 
 class SettingsParams(msgspec.Struct):
@@ -220,6 +237,12 @@ class NotifyResult(msgspec.Struct):
 
     device: str
     latency_ms: float
+
+
+class FirmwareOpenResult(msgspec.Struct):
+    """Result of `firmware.open`. The descriptor is part of the same message."""
+
+    size_bytes: int
 
 
 class StopResult(msgspec.Struct):

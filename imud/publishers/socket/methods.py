@@ -11,6 +11,7 @@ import msgspec
 
 from imud.attitude.conventions import Convention
 from imud.contracts.command import REQUESTED_BY, CalibrationInfo, CalibrationResult, VerbInfo, described, infos
+from imud.contracts.firmware import FirmwareImage, FirmwareResult
 from imud.contracts.publisher import Batch, DeviceControl
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import LATENCY_BOUNDS_NS, CKernelStatus, DeviceState, DeviceStatus
@@ -45,6 +46,9 @@ from imud.publishers.socket.messages import (
     DeviceSummary,
     EventsParams,
     EventsResult,
+    FirmwareOpenParams,
+    FirmwareOpenResult,
+    FirmwareUpdateParams,
     HistoryParams,
     HistoryResult,
     NoParams,
@@ -416,6 +420,18 @@ def _calibrate(hub: Hub, connection: ClientConnection, params: CalibrateParams) 
     return control.calibrate(params.kind, save=bool(params.save))
 
 
+def _firmware_open(hub: Hub, connection: ClientConnection, params: FirmwareOpenParams) -> MethodReply:
+    fd = hub.firmware.open(connection, params.size_bytes)
+    return MethodReply(FirmwareOpenResult(params.size_bytes), fd)
+
+
+def _firmware_update(hub: Hub, connection: ClientConnection, params: FirmwareUpdateParams) -> Later:
+    control = _control(hub, params.device, connection, "firmware.update")
+    image = FirmwareImage(params.address, hub.firmware.take(connection.number, params.crc32))
+    product, version = params.product or "", params.version or ""
+    return hub.firmware.alone(params.device, connection.uid, lambda: control.firmware.update(image, product, version))
+
+
 def _stop_calibration(hub: Hub, _connection: ClientConnection, params: DeviceParams) -> MethodReply:
     """Stop the running calibration of a device, also if another client started it."""
     return MethodReply(StopResult(_control(hub, params.device).stop_calibration()))
@@ -475,6 +491,8 @@ METHODS: Final[Mapping[str, Method[Any]]] = {
     "command": Method(CommandParams, _command, Rights.CONTROL, acts=True),
     "calibrations": Method(DeviceParams, _calibrations, result=list[CalibrationInfo]),
     "calibrate": Method(CalibrateParams, _calibrate, Rights.CONTROL, acts=True, result=CalibrationResult),
+    "firmware.open": Method(FirmwareOpenParams, _firmware_open, Rights.CONTROL, result=FirmwareOpenResult),
+    "firmware.update": Method(FirmwareUpdateParams, _firmware_update, Rights.CONTROL, acts=True, result=FirmwareResult),
     "settings.get": Method(SettingsParams, _settings, result=SettingsReport),
     "settings.plan": Method(
         SettingsChangeParams, partial(_settings_change, "settings.plan"), Rights.CONTROL, result=SettingsPlan

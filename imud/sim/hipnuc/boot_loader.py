@@ -38,7 +38,7 @@ OUT_OF_RANGE, WRONG_COMMAND = 10200, 10000  # status of a command (assumption)
 TOGGLE_ERROR, NO_OBJECT, BAD_COMMAND, TOO_LONG = 0x0503_0000, 0x0602_0000, 0x0504_0001, 0x0607_0012
 # Mark, product, version, and length of an image of this simulator. Its CRC-32 follows the last byte.
 _HEAD: Final = struct.Struct("<8s16sII")
-_MARK: Final = b"SIMIMAGE"
+_MARK: Final = b"SIMIMG\0\0"
 
 
 class Application(NamedTuple):

@@ -63,7 +63,7 @@ class SimulatedBus:
     """A node in simulated time, with the callbacks of the vendor's library."""
 
     def __init__(self, lost: int = 0) -> None:
-        """`lost`: number of the reply that is lost; 0 for none."""
+        """`lost`: number of the reply that does not arrive; 0: every reply arrives."""
         self.now_ns = 1_000_000_000
         self.module = HipnucCanopenModule(0, HipnucCanopenHardware(boot_ms=0))
         self.said: list[str] = []

@@ -100,12 +100,20 @@ async def test_limits_are_allowed_unknown_members_ignored_and_nan_is_null(server
 
 
 def test_rights_and_effects_of_the_methods() -> None:
-    changing = {"command", "calibrate", "settings.plan", "settings.apply", "stop_calibration"}
+    changing = {
+        "command",
+        "calibrate",
+        "firmware.open",
+        "firmware.update",
+        "settings.plan",
+        "settings.apply",
+        "stop_calibration",
+    }
     recording = {"record.start", "record.stop", "record.snapshot"}
     assert {name for name, method in METHODS.items() if method.right is not Rights.READ} == changing | recording
     assert {name for name, method in METHODS.items() if method.acts} == {
-        "options", "watch", "unwatch", "events", "command", "calibrate", "settings.apply", "stop_calibration",
-        "record.stop",
+        "options", "watch", "unwatch", "events", "command", "calibrate", "firmware.update", "settings.apply",
+        "stop_calibration", "record.stop",
     }  # fmt: skip
 
 
