@@ -64,6 +64,11 @@ def read_image(path: Path) -> FirmwareImage:
             content = file.read(FILE_BYTES_MAX + 1)
     except OSError as error:
         raise BadArgument(f"cannot read {path}: {reason_of(error)}") from None
+    return parse_image(content, path)
+
+
+def parse_image(content: bytes, path: Path) -> FirmwareImage:
+    """Decode an Intel HEX file. `path` is for messages. Raises BadArgument as `read_image`."""
     if len(content) > FILE_BYTES_MAX:
         raise BadArgument(f"{path}: expected at most {FILE_BYTES_MAX} bytes, got a longer file")
     lines = content.decode("latin-1").split("\n")

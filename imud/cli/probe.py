@@ -6,18 +6,19 @@ The command only listens. It sends requests only to ports and buses of `--active
 import argparse
 import asyncio
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from typing import Final
 
 import msgspec
 
 from imud.cli.arguments import CliCommand
 from imud.cli.output import paragraph
 from imud.config.model import DeviceConfig
-from imud.contracts.codec import message_of
-from imud.contracts.driver import CanDriver, Identity, of_kind
-from imud.contracts.link import CanLink, StreamLink
-from imud.contracts.script import Request
+from imud.contracts.codec import CodecEvent, message_of
+from imud.contracts.driver import CanDriver, Identity, StreamDriver, of_kind
+from imud.contracts.link import CanLink, OnData, StreamLink
+from imud.contracts.script import Outcome, Reply, Request, RequestScript
 from imud.device.can_search import EVERYTHING, CanDevice, CanRound, CanSearch
 from imud.device.scripts import RequestPort, ScriptRunner
 from imud.device.settings import identity_words, printable_identity
@@ -31,6 +32,8 @@ from imud.links.serial_port import list_ports
 from imud.links.socketcan import ControllerState
 from imud.model.errors import CommandError, ImudError, NothingHeard
 from imud.model.ledger import Ledger
+
+PINGS: Final = 2  # number of requests to a boot loader at each baud rate
 
 
 class ProbeReport(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -195,10 +198,53 @@ async def examine(port: str, may_ask: bool, title: str) -> list[ProbeReport]:
         identity = await identity_of_device(found, link) if may_ask else Identity()
         words = identity_words(printable_identity(identity))
         return [ProbeReport(port, title, found.driver.name, baud=link.baud, identity=words, problem=unknown_of(found))]
+    except NothingHeard as error:
+        if may_ask and (driver := await boot_loader_at(link)) is not None:
+            problem = "the device is in its boot loader: it has no complete firmware; run `imud firmware`"
+            return [ProbeReport(port, title, driver.name, baud=link.baud, problem=problem)]
+        return [ProbeReport(port, title, problem=str(error))]
     except ImudError as error:
         return [ProbeReport(port, title, problem=str(error))]
     finally:
         link.close()
+
+
+async def boot_loader_at(link: StreamLink) -> StreamDriver | None:
+    """Ping boot loaders at each baud rate. Return the driver of the first reply; None without a reply.
+
+    Raises LinkError.
+    """
+    for driver in of_kind(DRIVERS.values(), StreamDriver):
+        if driver.firmware is None or driver.firmware.make_codec is None:
+            continue
+        for baud in driver.baud_rates:
+            link.set_baud(baud)
+            codec, ledger = driver.firmware.make_codec(Ledger()), Ledger()
+            runner = ScriptRunner(SerialRequestPort(link), ledger, HostClock())
+            link.deliver_to(receiver_of(codec.feed, runner))
+            if isinstance(await runner.run(repeated(driver.firmware.ping(None))), Reply):
+                return driver
+    return None
+
+
+def repeated(request: Request) -> RequestScript[Outcome]:
+    """Send a request until its reply arrives, at most PINGS times: bytes of another rate can damage it."""
+    for _ in range(PINGS):
+        outcome = yield request
+        if isinstance(outcome, Reply):
+            break
+    return outcome
+
+
+def receiver_of(feed: Callable[[bytes], Sequence[CodecEvent]], runner: ScriptRunner) -> OnData:
+    """Return a receiver that passes the messages of a codec to a script runner."""
+
+    def on_data(data: bytes, t_rx_ns: int) -> None:
+        for event in feed(data):
+            if (message := message_of(event)) is not None:
+                runner.on_message(message, t_rx_ns)
+
+    return on_data
 
 
 def unknown_of(found: StreamFound) -> str:
@@ -237,12 +283,7 @@ async def identity_of_device(found: StreamFound, link: StreamLink) -> Identity:
     codec = found.driver.make_codec(ledger, found.driver.settings())
     runner = ScriptRunner(SerialRequestPort(link), ledger, HostClock())
 
-    def on_data(data: bytes, t_rx_ns: int) -> None:
-        for event in codec.feed(data):
-            if (message := message_of(event)) is not None:
-                runner.on_message(message, t_rx_ns)
-
-    link.start(on_data, lambda error: None)
+    link.start(receiver_of(codec.feed, runner), lambda error: None)
     with contextlib.suppress(CommandError):
         return await runner.run(found.driver.identify())
     return Identity()

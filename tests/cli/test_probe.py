@@ -95,6 +95,17 @@ def printed(cli: Cli, *words: str, status: int = 0) -> ProbeReport:
     return ProbeReport(**report)
 
 
+def test_boot_loader_is_named_after_a_ping_at_its_baud_rate(ports: Ports, cli: Cli) -> None:
+    port = ports(Port())
+    port.module.memory.erase()
+    port.module.reboot(port.clock.now_ns())
+    found = printed(cli, "--active", PORT)
+    assert (found.driver, found.baud) == ("hipnuc-uart", 460_800)
+    assert found.problem == "the device is in its boot loader: it has no complete firmware; run `imud firmware`"
+    port.is_deaf = True
+    assert "got no byte at" in printed(cli, "--active", PORT, status=1).problem
+
+
 def test_a_port_is_listened_to_and_only_asked_with_active(ports: Ports, cli: Cli) -> None:
     port = ports(Port())
     assert printed(cli) == ProbeReport(PORT, "FT232R", "hipnuc-uart", "", 460_800)

@@ -29,6 +29,7 @@ from tests.fleet.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
 from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import VirtualClock, in_loop
 from tests.support.publisher_context import publisher_context
+from tests.support.wired_device import LinkedDevice
 
 ANSWERS_KEPT, WAITING_MAX = 32, 8
 
@@ -147,6 +148,21 @@ def test_commands_that_are_not_allowed_are_denied() -> None:
     assert problem.startswith('expected a setting after set. that imud knows, got "mod"; did you mean mode?')
     for entry in ("set.", "set.output.hi91", "get.mode"):
         assert wrong_values(CommandOptions, {"actions": [entry]})
+
+
+def test_no_request_of_the_broker_starts_a_firmware_update() -> None:
+    """The check of the configuration rejects the command, and a request for it does not reach the update."""
+    action, drivers = "firmware", {name: DRIVERS[name] for name in ("hipnuc-uart", "hipnuc-canopen")}
+    options = MqttOptions(commands=CommandOptions(actions=[action]))
+    (problem,) = check_commands(options, drivers).values()
+    assert problem.startswith(f'expected a command that imud knows, got "{action}"')
+    bench, linked = ChannelBench(actions=[action]), LinkedDevice()
+    bench.device = linked.device  # type: ignore[assignment]  # a device with its driver
+    assert bench.ask(1, action, file="new.hex", address=0, crc32=0) is None
+    bench.run()
+    (answer,) = bench.answers()
+    assert (answer.outcome, linked.link.written) == (Outcome.FAILED, [])
+    assert answer.error.startswith(f"bow: unknown command '{action}'")
 
 
 @pytest.mark.parametrize(

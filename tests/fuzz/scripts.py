@@ -38,13 +38,13 @@ def _asks(begin: Script) -> bool:
 
 def make(name: str) -> Target:
     driver = row(name, Driver)
-    messages = _stream_messages(driver) if isinstance(driver, StreamDriver) else _can_messages(row(name, CanDriver))
+    messages = _stream_messages(driver) if isinstance(driver, StreamDriver) else can_messages(row(name, CanDriver))
     scripts = _scripts(driver)
     mend = mender(name)
 
     def run(data: bytes) -> None:
         if data:
-            _answer(scripts[data[0] % len(scripts)], messages(data[1:]))
+            answer(scripts[data[0] % len(scripts)], messages(data[1:]))
 
     def seeds() -> list[bytes]:
         if isinstance(driver, StreamDriver):
@@ -78,27 +78,27 @@ def _scripts(driver: Driver) -> list[Script]:
 def _stream_messages(driver: StreamDriver) -> Callable[[bytes], Iterator[Message]]:
     def messages(data: bytes) -> Iterator[Message]:
         codec = driver.make_codec(Ledger(), driver.settings())
-        yield from _messages([*codec.feed(data), *codec.flush()])
+        yield from messages_of([*codec.feed(data), *codec.flush()])
 
     return messages
 
 
-def _can_messages(driver: CanDriver) -> Callable[[bytes], Iterator[Message]]:
+def can_messages(driver: CanDriver) -> Callable[[bytes], Iterator[Message]]:
     own = can.own_identifiers(driver)
 
     def messages(data: bytes) -> Iterator[Message]:
         codec = driver.make_codec(Ledger(), driver.settings())
         for frame in can.decoded(data, own):
-            yield from _messages(codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns))
+            yield from messages_of(codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns))
 
     return messages
 
 
-def _messages(events: Sequence[CodecEvent]) -> Iterator[Message]:
+def messages_of(events: Sequence[CodecEvent]) -> Iterator[Message]:
     return (message for message in map(message_of, events) if message is not None)
 
 
-def _answer(begin: Script, messages: Iterator[Message]) -> None:
+def answer(begin: Script, messages: Iterator[Message]) -> None:
     session = offline_runner(Ledger())
     now_ns = 0
     try:
