@@ -49,6 +49,7 @@ BEGIN_DOWNLOAD: Final = 0x21  # segmented download with its size
 SEGMENT_BYTES: Final = 7
 LAST_BYTES: Final = 8  # number of bytes of the last segment plus the number in its command, in the vendor's tool
 SEGMENT_REPLIES: Final = (0x20, 0x30)  # reply to a segment, by its toggle bit
+ABSENT: Final = (0x0602_0000, 0x0609_0011)  # abort codes of an application that lacks the object or the sub-index
 TIMED_OUT: Final = 0x0504_0000  # abort code after a segment without a reply
 ANSWER_NS: Final = 100 * NS_PER_MS  # wait for the reply to an expedited write, as the vendor's tool
 BOOT_NS: Final = 20 * NS_PER_MS  # time from the reply to ENTER_LOADER to the start of the boot loader
@@ -87,8 +88,9 @@ def update(target: Target, image: FirmwareImage, report: Report) -> RequestScrip
                 raise
             yield pause(QUIET_NS)
     report(START, total, total)
-    # the reply can be lost while the device restarts: the version shows the result
-    yield _write(node, START_APPLICATION, WRITTEN, "start the application")
+    for _ in range(TRIES):  # the reply can be lost while the device restarts: the version shows the result
+        if not isinstance((yield _write(node, START_APPLICATION, WRITTEN, "start the application")), Silence):
+            break
 
 
 def _enter(node: int) -> RequestScript[None]:
@@ -122,7 +124,10 @@ def _download(node: int, data: bytes, report: Report) -> RequestScript[None]:
     if isinstance(outcome, Silence):
         raise LostContact(f"{name}: expected a reply within {ERASE_NS // NS_PER_S} s, got none")
     if isinstance(outcome, Rejection):
-        raise Aborted(name, int.from_bytes(outcome.frames[-1].payload[4:], "little"))
+        code = int.from_bytes(outcome.frames[-1].payload[4:], "little")
+        if code in ABSENT:
+            raise LostContact(f"{name}: expected the boot loader, got the application: the device has restarted")
+        raise Aborted(name, code)
     for number, at in enumerate(range(0, total, SEGMENT_BYTES)):
         report(WRITE, at, total)
         part = data[at : at + SEGMENT_BYTES]

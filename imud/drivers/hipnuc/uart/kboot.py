@@ -242,8 +242,9 @@ def update(target: Target, image: FirmwareImage, report: Report) -> RequestScrip
                 raise
             yield pause(QUIET_NS)
     report(START, len(image.data), len(image.data))
-    # The reply can be lost while the device restarts: the version shows the result.
-    yield _command("reset", TAG_RESET, timeout_ns=NS_PER_S)
+    for _ in range(TRIES):  # the reply can be lost while the device restarts: the version shows the result
+        if isinstance((yield _command("reset", TAG_RESET, timeout_ns=NS_PER_S)), Reply):
+            break
 
 
 def _enter(report: Report) -> RequestScript[None]:
