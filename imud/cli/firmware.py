@@ -24,7 +24,6 @@ LIMIT_S: Final = TOTAL_S + 120.0  # Time limit of the request, s. The daemon end
 LOOK_S: Final = 0.5  # Maximum wait for the next event, s. After that, imud checks for the reply.
 BAR: Final = 30  # length of the progress bar, characters
 CLEAR_LINE: Final = "\r\x1b[2K"
-FILLER: Final = 0xFF  # byte of erased flash memory, for the gaps of an image
 KIND, DATA, END_OF_FILE = slice(7, 9), "00", "01"  # place of the kind in a record, and two kinds
 FRAME_DIGITS: Final = 11  # number of characters of a record without data
 
@@ -58,7 +57,7 @@ def firmware(args: argparse.Namespace) -> int:
 
 
 def read_image(path: Path) -> FirmwareImage:
-    """Read an Intel HEX file. Gaps contain FILLER. Raises BadArgument for another, damaged or truncated file."""
+    """Read an Intel HEX file. Gaps contain 0xFF, as erased flash memory. Raises BadArgument for another, damaged or truncated file."""
     try:
         with path.open("rb") as file:
             content = file.read(FILE_BYTES_MAX + 1)
@@ -95,7 +94,6 @@ def parse_image(content: bytes, path: Path) -> FirmwareImage:
         raise BadArgument(
             f"{path}: expected addresses within {IMAGE_BYTES_MAX} bytes, got {first:#010x} … {last:#010x}"
         )
-    hexadecimal.padding = FILLER
     return FirmwareImage(first, hexadecimal.tobinstr(start=first, end=last))
 
 

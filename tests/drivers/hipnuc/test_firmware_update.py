@@ -194,6 +194,17 @@ def test_second_update_succeeds_after_a_fault_at_any_step(make: Callable[[], Ben
         assert bytes(bench.module.memory.data) == make_image(bench.product, NEW, bench.size)
 
 
+def test_damaged_data_packet_is_sent_again_alone() -> None:
+    bench = UartBench()
+    update(bench)
+    steps = bench.faults.steps
+    bench = UartBench()
+    update(bench, plan={steps.index("boot loader, data at 256") + 1: "damaged request"})
+    at = steps.index("boot loader, data at 512")
+    assert bench.faults.steps == [*steps[:at], "boot loader, data at 256", *steps[at:]]
+    assert bench.version() == NEW
+
+
 @given(st.sampled_from(BENCHES), st.dictionaries(st.integers(1, 40), st.sampled_from(FAULTS), max_size=8))
 def test_second_update_succeeds_after_several_faults(make: Callable[[], Bench], plan: dict[int, str]) -> None:
     bench = make()
