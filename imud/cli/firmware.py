@@ -57,7 +57,10 @@ def firmware(args: argparse.Namespace) -> int:
 
 
 def read_image(path: Path) -> FirmwareImage:
-    """Read an Intel HEX file. Gaps contain 0xFF, as erased flash memory. Raises BadArgument for another, damaged or truncated file."""
+    """Read an Intel HEX file. Gaps contain 0xFF, as erased flash memory.
+
+    Raises BadArgument for another, damaged or truncated file.
+    """
     try:
         with path.open("rb") as file:
             content = file.read(FILE_BYTES_MAX + 1)
