@@ -106,6 +106,28 @@ async def test_update_after_power_loss_continues_from_the_boot_loader(
     assert device.problem == ""
 
 
+@pytest.mark.parametrize("link", LINKS, ids=str)
+@played(lambda link: LinkedDevice(**link))
+async def test_update_after_loss_of_the_cable_continues_from_the_boot_loader(
+    device: LinkedDevice, link: dict[str, Any]
+) -> None:
+    await running(device)
+    updating = start(device)
+    await device.until(lambda: "write" in phases(device))
+    device.link.disappear()
+    with pytest.raises(
+        CommandError, match=r"bow: .*\. The update is not complete: .* run `imud firmware bow FILE` again"
+    ):
+        await result_of(device, updating)
+    assert device.rig.is_in(DeviceState.MISSING)
+    with pytest.raises(CommandError, match="bow is missing: "):
+        await result_of(device, start(device))
+    device.link.appear()
+    await device.wait(3)
+    assert (await result_of(device, start(device))).after == "1.7.0"
+    await running(device)
+
+
 @played(lambda: LinkedDevice(baud="auto", driver="auto"))
 async def test_update_of_a_replugged_device_in_its_boot_loader(device: LinkedDevice) -> None:
     """The search for a silent device does not prevent the update. imud knows the driver and the rate."""
