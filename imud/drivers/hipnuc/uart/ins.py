@@ -90,7 +90,7 @@ MINUTE_MS_MOST: Final = 60_999  # in a leap second
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-# Layout of the field of each bit of HI83. `x` is a byte that imud does not use.
+# Layout of the fields of HI83 by bit. `x` is a byte that imud does not use.
 FIELDS: Final[Mapping[int, struct.Struct]] = {
     bit: struct.Struct("<" + code)
     for bit, code in {
