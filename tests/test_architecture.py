@@ -503,6 +503,7 @@ TESTED_IN = {
     "imud.links.cyclic_sender": "links/test_socketcan.py", "imud.links.netlink": "links/test_socketcan.py",
     "imud.model.bucket": "publishers/socket/test_history.py",
     "imud.publishers.metrics.metric": "publishers/metrics/test_families.py",
+    "imud.sim.hipnuc.ins": "sim/hipnuc/test_uart.py",
     "imud.sim.control": "sim/test_sensor.py", "imud.sim.hipnuc.nmea2000": "sim/test_can_module.py",
     "imud.sim.imu61x.can": "sim/test_can_module.py", "imud.sim.ports.arrival": "sim/ports/test_faults.py",
     "imud.sim.ports.in_process_bus": "links/test_spi.py", "imud.sim.ports.uart_wire": "sim/ports/test_pty.py",

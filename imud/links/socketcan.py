@@ -211,8 +211,7 @@ class FrameReader:
         self._fresh_headers = bytes(self._headers)
         self._fd = receiver.fileno()
         self._empty_ns = self._newest_ns = now_ns()
-        # CLOCK_REALTIME minus CLOCK_MONOTONIC at the last read that emptied the queue, ns.
-        self._empty_offset_ns = self._clocks()[0]
+        self._empty_offset_ns = self._clocks()[0]  # of the last read that emptied the queue, ns
         self._lost = False
 
     def read(self) -> list[CanFrame]:

@@ -22,9 +22,10 @@ from imud.drivers.hipnuc.j1939.commands import LAYOUT, READ, WRITE
 from imud.drivers.hipnuc.uart import ins
 from imud.formats.can import FD_DATA_BYTES_MAX
 from imud.formats.j1939 import GLOBAL, J1939Id, join, split
-from imud.model.sample import Measurement, Position
+from imud.model.sample import Position
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.can_module import BITRATE, CanSimulator, FrameWire, SentFrame
+from imud.sim.hipnuc.ins import ins_values
 from imud.sim.physics import Truth
 from imud.sim.sensor import SensorHardware, SimulatorOptions, sensor_of
 
@@ -232,7 +233,7 @@ class HipnucJ1939Module:
             codec.HEIGHT: lambda: codec.pack_height(PLACE),
             codec.GNSS: lambda: codec.pack_gnss(PLACE),
             codec.VELOCITY: lambda: codec.pack_velocity(VELOCITY_M_S),
-            codec.FAST_OLD: lambda: canfd.pack_old(_values(reading), self._uptime_us(sample_ns) // 1000),
+            codec.FAST_OLD: lambda: canfd.pack_old(ins_values(reading, 0), self._uptime_us(sample_ns) // 1000),
             codec.FAST: lambda: self._fast(reading, sample_ns),
         }
         return rows[pgn]()
@@ -244,7 +245,7 @@ class HipnucJ1939Module:
     def _fast(self, reading: Truth, sample_ns: int) -> bytes:
         self._fast_sent += 1
         uptime_us = self._uptime_us(sample_ns)
-        return canfd.pack_fast(_values(reading), FAST_BITS, self._fast_sent - 1, time_us=uptime_us)
+        return canfd.pack_fast(ins_values(reading, 0), FAST_BITS, self._fast_sent - 1, time_us=uptime_us)
 
     def _inclination(self, reading: Truth) -> tuple[float, float]:
         """Return the angles of FF4A."""
@@ -358,14 +359,6 @@ class HipnucJ1939Module:
         can_id = join(J1939Id(codec.PRIORITY, codec.CONFIGURE, sender, codec.HOST_ADDRESS))
         self._wire.send(now_ns + REPLY_NS, can_id, True, LAYOUT.pack(register, command, status, value))
         self.frames_sent += 1
-
-
-def _values(reading: Truth) -> Measurement:
-    """Return the truth as the values of a CAN FD message."""
-    return Measurement(
-        0, 0, None, reading.accel_m_s2, reading.gyro_rad_s, reading.mag_t, reading.quat_wxyz, reading.euler_rad,
-        reading.temperature_c,
-    )  # fmt: skip
 
 
 def physical_inclination(reading: Truth) -> tuple[float, float]:

@@ -23,7 +23,7 @@ not.
 from bisect import bisect_right, insort
 from collections.abc import Callable
 from dataclasses import replace
-from math import cos, degrees, pi, radians
+from math import degrees, pi, radians
 from random import Random
 from typing import Any, Final
 
@@ -31,9 +31,10 @@ from imud.drivers.hipnuc.uart.codec import encode_frame, encode_hi91, encode_hi9
 from imud.drivers.hipnuc.uart.commands import BAUD_RATES, FRAME_BYTES, MAX_RATE_HZ, OutputMessage
 from imud.drivers.hipnuc.uart.ins import WEEK_MS, hi83_size, pack_hi81, pack_hi83
 from imud.formats.nmea0183 import sentence
-from imud.model.sample import Measurement, Position, Vector3
+from imud.model.sample import Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US, T_PER_UT
 from imud.sim.hipnuc.boot_loader import Application, Flash, KbootLoader
+from imud.sim.hipnuc.ins import ins_values
 from imud.sim.hipnuc.uart_settings import (
     NO_UTC,
     NWU,
@@ -151,11 +152,21 @@ NEAR_LEVEL_RAD: Final = radians(5)  # maximum tilt at which ATT RST 3 acts, rad
 _PRINTABLE = range(0x20, 0x7F)
 INS_FIRMWARE: Final = 170  # default firmware of a device with HI81 or HI83
 NAVIGATING: Final = 3  # INS status
-RTK_FIXED, SATELLITES = 5, 21  # quality and satellites of the simulated position
-# Start of the motion: a spherical Earth is exact enough for a motion of some metres
-LATITUDE_RAD, LONGITUDE_RAD, HEIGHT_M, EARTH_RADIUS_M = radians(48.0), radians(11.0), 520.0, 6_371_000.0
-GNSS_UTC_NS: Final = 1_800_000_000 * NS_PER_S  # UTC at the device time 0
 GPS_WEEK: Final = 2453
+
+
+def encode_ins(message: OutputMessage, reading: Truth, hi83_bitmap: int, device_ns: int, status: int) -> bytes:
+    """Return an HI81 or HI83 frame. The device always has a position and UTC."""
+    values = ins_values(reading, device_ns)
+    status &= ~NO_UTC
+    if message is OutputMessage.HI81:
+        weeks, tow_ms = divmod(device_ns // NS_PER_MS, WEEK_MS)
+        payload = pack_hi81(values, main_status=status, ins_status=NAVIGATING, week=GPS_WEEK + weeks, tow_ms=tow_ms)
+    else:
+        payload = pack_hi83(
+            values, hi83_bitmap, main_status=status, ins_status=NAVIGATING, system_time_us=device_ns // NS_PER_US
+        )
+    return encode_frame(payload)
 
 
 class HipnucModule:
@@ -377,7 +388,7 @@ class HipnucModule:
             uptime_ms, utc = device_ms - self._on_ms, self._utc.synchronised(device_ns)
             status = main_status(reading, uptime_ms, nine_axis=self.settings.att_mode == 1, utc=utc)
         if message in (OutputMessage.HI81, OutputMessage.HI83):
-            return self._encode_ins(message, reading._replace(mag_t=mag), device_ns, status)
+            return encode_ins(message, reading._replace(mag_t=mag), self.hardware.hi83_bitmap, device_ns, status)
         if message is OutputMessage.HI92:
             return encode_hi92(
                 pps_stamp_ms=pps_ms, accel_m_s2=accel, gyro_rad_s=gyro, mag_t=mag, euler_rad=euler, quat_wxyz=quat,
@@ -388,33 +399,6 @@ class HipnucModule:
             quat_wxyz=quat, temperature_c=temperature_c, pressure_pa=pressure_pa,
             word_1_2=status if has_status else pps_ms,
         )  # fmt: skip
-
-    def _encode_ins(self, message: OutputMessage, reading: Truth, device_ns: int, status: int) -> bytes:
-        """Return an HI81 or HI83 frame. The device always has a position and UTC."""
-        east_m, north_m, up_m = reading.position_enu_m
-        radius_m = EARTH_RADIUS_M + HEIGHT_M
-        place = Position(
-            LATITUDE_RAD + north_m / radius_m, LONGITUDE_RAD + east_m / radius_m / cos(LATITUDE_RAD), HEIGHT_M + up_m,
-            RTK_FIXED, SATELLITES,
-        )  # fmt: skip
-        utc_ns = GNSS_UTC_NS + device_ns // NS_PER_MS * NS_PER_MS
-        values = Measurement(
-            0, 0, None, reading.accel_m_s2, reading.gyro_rad_s, reading.mag_t, reading.quat_wxyz, reading.euler_rad,
-            reading.temperature_c, reading.pressure_pa, velocity_enu_m_s=reading.velocity_enu_m_s, position=place,
-            heave_m=up_m, gnss_utc_ns=utc_ns,
-        )  # fmt: skip
-        status &= ~NO_UTC
-        if message is OutputMessage.HI81:
-            weeks, tow_ms = divmod(device_ns // NS_PER_MS, WEEK_MS)
-            payload = pack_hi81(
-                values, main_status=status, ins_status=NAVIGATING, week=GPS_WEEK + weeks, tow_ms=tow_ms
-            )  # fmt: skip
-        else:
-            payload = pack_hi83(
-                values, self.hardware.hi83_bitmap, main_status=status, ins_status=NAVIGATING,
-                system_time_us=device_ns // NS_PER_US,
-            )  # fmt: skip
-        return encode_frame(payload)
 
     def _reading(self, sample_ns: int) -> Truth:
         """Return the measurement at an instant with noise and mounting."""
