@@ -323,7 +323,7 @@ def test_the_kernel_accepts_any_bytes_and_numbers(tmp_path: Path, name: str) -> 
         module.start(values[0], f"x{name}", *values[2:])
     for frames, controls in ((65, 65), (2, 1)):
         with pytest.raises(ValueError, match="expected buffers for at most 64 frames"):
-            module.receive(-1, bytearray(16 * frames), bytearray(64 * controls))
+            module.receive(-1, bytearray(72 * frames), bytearray(64 * controls))
 
 
 @pytest.mark.parametrize("cut", [0, 40])

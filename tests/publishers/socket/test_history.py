@@ -120,7 +120,7 @@ def test_a_second_has_the_losses_that_the_ledger_counted() -> None:
     packed = b"".join(Batch("imu0", 0, [at(7.995, mag_t=(1.0, 2.0, 3.0))], FRAME).packed for _ in range(3))
     seconds = [bytearray(of.seconds("imu0")[-SECOND.size :]) for _ in range(2)]
     by_kernel = getattr(kernel.load(None).module, "add_slots", history.add_slots)
-    assert by_kernel(seconds[0], packed, 0) == history.add_slots(seconds[1], packed, 0) == 768
+    assert by_kernel(seconds[0], packed, 0) == history.add_slots(seconds[1], packed, 0) == 3 * 320
     assert (seconds[0], SECOND.unpack(seconds[0])[-2:]) == (seconds[1], ((1 << 32) - 1, 0))
 
 

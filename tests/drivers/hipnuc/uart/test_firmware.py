@@ -48,7 +48,7 @@ CHANGES: list[tuple[Behaviour, str, Any, list[str], dict[str, Any]]] = [
      {"outputs": {"COM2 HI92": Output(on_mark=True)}}),
     (NEWER, "port_baud", {"com2": 921600}, ["SERIALCONFIG COM2 921600", "LOG VERSION"], {"port_baud": 921600}),
     (INS, "output", {"gga": 1, "hi81": 20}, ["LOG GGA ONTIME 1", "LOG HI81 ONTIME 0.05"],
-     {"outputs": {"GGA": Output(1000), "HI81": Output(50)}}),
+     {"outputs": {"GGA": Output(1000)}, "hi81": Output(50)}),
     (INS, "output", {"rmc": 1, "sxt": 5}, ["LOG RMC ONTIME 1", "LOG SXT ONTIME 0.2"],
      {"outputs": {"RMC": Output(1000), "SXT": Output(200)}}),
     (INS, "baseline", 1.5, ["SETBASELINE 1.5"], {"baseline_m": 1.5}),
