@@ -248,7 +248,7 @@ def receiver_of(feed: Callable[[bytes], Sequence[CodecEvent]], runner: ScriptRun
 
 
 def unknown_of(found: StreamFound) -> str:
-    """Describe received frames of unknown types with their numbers; empty if there are none."""
+    """Describe received frames of unknown types with their numbers; return "" without one."""
     ledger = Ledger()
     codec = found.driver.make_codec(ledger, found.driver.settings())
     for data, _ in found.chunks:

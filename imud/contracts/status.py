@@ -68,7 +68,7 @@ class ErrorPart(msgspec.Struct, frozen=True):
     name: str  # for example `adapter`
     value_ns: int  # one-sigma error from this cause, at most the time stamp error
     message: str  # the cause as a sentence
-    next: str  # step that reduces this part; empty if there is none
+    next: str  # step that reduces this part; can be empty
 
 
 class ClockStatus(msgspec.Struct, frozen=True):

@@ -1,4 +1,4 @@
-"""Prints, per section of the manuals and of newer firmware, item → code → tests, and what the drivers describe.
+"""Prints, per section of the manuals and of newer firmware, item → code → tests, and the descriptions in the drivers.
 
 `make audit` runs it. It exits with 1 when an item has no code or no test.
 """
