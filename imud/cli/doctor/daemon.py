@@ -306,7 +306,7 @@ def heard(at: Surroundings) -> Findings:
         # frames with a correct check value: the baud rate and the driver are right
         elif counts["frames_ignored"]:
             yield error(
-                f"{one.name}: {one.problem or one.unused or 'valid frames of unknown types, but no sample'}",
+                f"{one.name}: {one.unused or one.problem or 'valid frames of unknown types, but no sample'}",
                 "select a frame type that imud decodes, in the settings of the device",
             )
         # framing errors are typical of a wrong baud rate

@@ -225,6 +225,8 @@ def test_serial_data(machine: Machine) -> None:
         (counted(bytes_in=5000, frames_good=7, frames_in_replies=7), "error", "but no sample in 7 frames"),
         (counted(bytes_in=5000, frames_good=7, frames_ignored=7), "error",
          "valid frames of unknown types, but no sample"),
+        (msgspec.structs.replace(counted(bytes_in=5000, frames_ignored=3), problem="x", unused="types (tag 0x77: 3)"),
+         "error", "bow: types (tag 0x77: 3)"),
         (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=5), "ok", "5 damaged"),
         (counted(DeviceState.RUNNING, **GOOD, frames_bad_crc=6), "warning", "6 damaged and"),
         (msgspec.structs.replace(counted(**GOOD), kernel=KernelCounters(overrun=2)), "warning", "overrun"),
