@@ -27,12 +27,12 @@ from imud.model.event import EventKind
 from imud.model.sample import Sample
 from imud.sim.hipnuc.canopen import NODE_VARIANTS, HipnucCanopenHardware, HipnucCanopenModule, NodeSettings
 from imud.sim.hipnuc.j1939 import (
-    CANFD_SIMULATOR,
     J1939_VARIANTS,
     PLACE,
     HipnucJ1939Module,
     J1939Hardware,
     J1939Settings,
+    make_canfd,
 )
 from imud.sim.hipnuc.nmea2000 import HipnucNmea2000Module, Nmea2000Hardware
 from imud.sim.physics import Still
@@ -207,7 +207,7 @@ async def test_can_fd_samples_of_a_found_device_and_a_change(vcan: CanInterface,
     tool("ip", "link", "set", vcan.name, "mtu", "72")
     vcan.up()
     options = SimulatorOptions(message=message, boot_ms=0, noise="none", motion="still")
-    module = CANFD_SIMULATOR.make(options, monotonic_ns())
+    module = make_canfd(options, monotonic_ns())
     rig = BusRig(vcan.name, "auto", None, module)
     async with rig.played():
         await rig.until(lambda: len(rig.samples) >= 100, "a second of samples")
@@ -217,9 +217,9 @@ async def test_can_fd_samples_of_a_found_device_and_a_change(vcan: CanInterface,
         assert (applied.problem, [one.outcome for one in applied.steps]) == ("", [StepOutcome.VERIFIED])
         await rig.until(lambda: len(rig.samples) >= 200, "two seconds of samples")
         assert rig.device.ledger.lost() == rig.device.ledger.frames_bad() == 0
-    sample = rig.samples[-1]
-    assert sample.accel_m_s2 == pytest.approx((0, 0, 9.8), abs=0.01)
-    assert sample.quat_wxyz == pytest.approx((1, 0, 0, 0), abs=1e-3)
+    sample, truth = rig.samples[-1], module.hardware.motion.at(0)
+    assert sample.accel_m_s2 == pytest.approx(truth.accel_m_s2, abs=0.01)
+    assert sample.quat_wxyz == pytest.approx(truth.quat_wxyz, abs=1e-3)
     assert sample.t_dev_ns is not None
     steps_ms = {(b.t_dev_ns or 0) - (a.t_dev_ns or 0) for a, b in pairwise(rig.samples[-50:])}
     assert steps_ms == {20_000_000}
