@@ -146,7 +146,6 @@ LONG_MODULES = {
     "imud.device.settings": "one state machine: identity and settings of a device, with its comparison",
     "imud.drivers.imu61x.uart.settings": "the table of settings with its scripts",
     "imud.publishers.metrics.families": "one table: the metric families",
-    "imud.publishers.nmea0183": "one output: sentences, ports and TCP",
     "imud.publishers.recorder.flight": "one state machine: the flight recorder",
     "imud.publishers.shm": "one output: rings and their directory",
     "imud.sampling.clock": "one state machine with a fast path",

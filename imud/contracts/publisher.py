@@ -296,8 +296,8 @@ class OutputFacts:
     clients: list[Callable[[], Sequence[ClientStatus]]] = field(default_factory=list)
     recorders: list[Callable[[], RecorderStatus]] = field(default_factory=list)
     flights: list[Callable[[], FlightStatus]] = field(default_factory=list)
-    # Functions that return the state of the ports of an output that sends sentences
-    sentences: list[Callable[[], Sequence[OutputStatus]]] = field(default_factory=list)
+    # Functions that return the state of the ports of an output, by the name of the output
+    ports: dict[str, Callable[[], Sequence[OutputStatus]]] = field(default_factory=dict)
     mqtts: list[Callable[[], MqttStatus]] = field(default_factory=list)
     snapshots: list[TakeSnapshot] = field(default_factory=list)  # functions of flight recorders that send a snapshot
     rings: dict[str, str] = field(default_factory=dict)  # path of the ring file of each device in shared memory
@@ -308,8 +308,12 @@ class OutputFacts:
 
     def problems(self) -> dict[str, str]:
         """Return the problem of each output, or port of an output, that does not work."""
-        ports = (port for status in self.sentences for port in status())
-        return self.failed | {f"nmea0183 {port.name}": port.problem for port in ports if port.problem}
+        return self.failed | {
+            f"{output} {port.name}": port.problem
+            for output, status in self.ports.items()
+            for port in status()
+            if port.problem
+        }
 
 
 class OutputOwner(Protocol):

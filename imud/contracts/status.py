@@ -322,11 +322,11 @@ class FlightStatus(msgspec.Struct, frozen=True):
 
 
 class OutputStatus(msgspec.Struct, frozen=True):
-    """One destination of an output that sends sentences."""
+    """One port of an output: a destination or a server."""
 
     name: str  # kind and address, for example `tcp 127.0.0.1:10110`
-    sent: int  # number of sentences sent since start, the sum over all clients
-    dropped: int  # number of sentences that imud did not send, because the destination was full or absent
+    sent: int  # number of messages (sentences, frames, lines) sent since start, the sum over all clients
+    dropped: int  # number of messages that imud did not send, because the destination was full or absent
     readers: int  # Number of connected clients. For a port or an address: 1 while it accepts data, otherwise 0.
     problem: str  # reason why imud sends nothing, one sentence; empty while imud sends
 

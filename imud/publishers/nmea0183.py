@@ -13,14 +13,12 @@ import math
 import os
 import socket
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Final, Literal, Protocol
 
 import msgspec
 import serial
 
-from imud.attitude.conventions import Convention, Heading
 from imud.contracts.link import Claim
 from imud.contracts.publisher import Batch, PublisherContext, PublisherType
 from imud.contracts.status import OutputStatus
@@ -29,9 +27,18 @@ from imud.formats.nmea0183 import Transducer
 from imud.host.network import listen, open_socket
 from imud.model.errors import ServerError, reason_of
 from imud.model.options import Options, is_ip_address, shown
-from imud.model.sample import Sample, Vector3
+from imud.model.sample import Sample
 from imud.model.units import NS_PER_S
 from imud.publishers.thinning import MeanRate, Pace
+from imud.publishers.vessel import (
+    HeadingReference,
+    VesselDevice,
+    magnetic_rad,
+    roll_pitch_rad,
+    true_rad,
+    turn_rate_rad_s,
+    turned,
+)
 
 log = logging.getLogger(__name__)
 
@@ -336,9 +343,6 @@ def _close_late(opening: "asyncio.Future[int]") -> None:
 
 
 PA_PER_BAR: Final = 100_000.0
-# Minimum cosine of pitch for a rate of turn (pitch 84°). Above this pitch, heading and roll are nearly the same
-# rotation.
-LEVEL_COS: Final = 0.1
 
 
 class Formatter(StrEnum):
@@ -364,15 +368,6 @@ TALKERS: Final[Mapping[Formatter, str]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class HeadingReference:
-    """Reference of the yaw of samples."""
-
-    heading: Heading = Heading.UNKNOWN
-    # Declination that imud added to a magnetic heading, degrees; None if imud did not correct yaw
-    declination_deg: float | None = None
-
-
 def make(kind: Formatter, sample: Sample, reference: HeadingReference, talker: str = "") -> bytes | None:
     """Return the sentence of a sample in `ned-frd`; None if the sample does not contain the values. A non-empty
     `talker` replaces the talker of TALKERS."""
@@ -380,19 +375,19 @@ def make(kind: Formatter, sample: Sample, reference: HeadingReference, talker: s
 
 
 def _hdt(talker: str, sample: Sample, reference: HeadingReference) -> bytes | None:
-    heading_rad = _true_rad(sample, reference)
+    heading_rad = true_rad(sample, reference)
     return None if heading_rad is None else nmea0183.hdt(talker, heading_rad)
 
 
 def _hdg(talker: str, sample: Sample, reference: HeadingReference) -> bytes | None:
-    heading_rad = _magnetic_rad(sample, reference)
+    heading_rad = magnetic_rad(sample, reference)
     declination_deg = reference.declination_deg
     variation_rad = None if declination_deg is None else math.radians(declination_deg)
     return None if heading_rad is None else nmea0183.hdg(talker, heading_rad, variation_rad)
 
 
 def _hdm(talker: str, sample: Sample, reference: HeadingReference) -> bytes | None:
-    heading_rad = _magnetic_rad(sample, reference)
+    heading_rad = magnetic_rad(sample, reference)
     return None if heading_rad is None else nmea0183.hdm(talker, heading_rad)
 
 
@@ -403,7 +398,7 @@ def _rot(talker: str, sample: Sample, _reference: HeadingReference) -> bytes | N
 
 def _xdr(talker: str, sample: Sample, _reference: HeadingReference) -> bytes | None:
     found = []
-    roll_pitch = _roll_pitch_rad(sample)
+    roll_pitch = roll_pitch_rad(sample)
     if roll_pitch is not None:
         roll_rad, pitch_rad = roll_pitch
         found.append(Transducer("A", math.degrees(pitch_rad), "D", "PTCH"))
@@ -416,10 +411,10 @@ def _xdr(talker: str, sample: Sample, _reference: HeadingReference) -> bytes | N
 
 
 def _pashr(_talker: str, sample: Sample, reference: HeadingReference) -> bytes | None:
-    roll_pitch = _roll_pitch_rad(sample)
+    roll_pitch = roll_pitch_rad(sample)
     if roll_pitch is None:
         return None
-    return nmea0183.pashr(sample.utc_ns, _true_rad(sample, reference), *roll_pitch)
+    return nmea0183.pashr(sample.utc_ns, true_rad(sample, reference), *roll_pitch)
 
 
 _MAKERS: Final[Mapping[Formatter, Callable[[str, Sample, HeadingReference], bytes | None]]] = {
@@ -432,50 +427,7 @@ _MAKERS: Final[Mapping[Formatter, Callable[[str, Sample, HeadingReference], byte
 }
 
 
-def turn_rate_rad_s(sample: Sample) -> float | None:
-    """Return the rate of change of the heading, positive to starboard; None without angular rate, or with the bow
-    straight up.
-
-    The rate is (q sin φ + r cos φ) / cos θ, with roll φ, pitch θ and the angular rates q about y and r about z. Thus
-    rolling and pitching have no effect. Without an attitude, imud assumes a level body.
-    """
-    gyro = sample.gyro_rad_s
-    if gyro is None or not all(map(math.isfinite, gyro)):
-        return None
-    roll_rad, pitch_rad = _roll_pitch_rad(sample) or (0.0, 0.0)
-    if math.cos(pitch_rad) < LEVEL_COS:
-        return None
-    return (gyro[1] * math.sin(roll_rad) + gyro[2] * math.cos(roll_rad)) / math.cos(pitch_rad)
-
-
-def _true_rad(sample: Sample, reference: HeadingReference) -> float | None:
-    return _yaw_rad(sample.euler_rad) if reference.heading is Heading.TRUE else None
-
-
-def _magnetic_rad(sample: Sample, reference: HeadingReference) -> float | None:
-    yaw_rad = _yaw_rad(sample.euler_rad)
-    if yaw_rad is None or reference.heading is Heading.MAGNETIC:
-        return yaw_rad
-    if reference.heading is Heading.TRUE and reference.declination_deg is not None:
-        return yaw_rad - math.radians(reference.declination_deg)
-    return None
-
-
-def _yaw_rad(euler_rad: Vector3 | None) -> float | None:
-    return euler_rad[2] if euler_rad is not None and math.isfinite(euler_rad[2]) else None
-
-
-def _roll_pitch_rad(sample: Sample) -> tuple[float, float] | None:
-    euler_rad = sample.euler_rad
-    if euler_rad is None or not (math.isfinite(euler_rad[0]) and math.isfinite(euler_rad[1])):
-        return None
-    return euler_rad[0], euler_rad[1]
-
-
-# Time between two reads of the heading reference from the device status, ns. The device reports the reference only on
-# request.
-REFERENCE_NS: Final = NS_PER_S
-WHO: Final = "nmea0183"  # name of this output in latency requests
+WHO: Final = "nmea0183"  # name of this output
 BITS_PER_BYTE: Final = 10  # bits per byte of a serial port with 8N1
 # Maximum usual length of each sentence, bytes, for the load of a serial port
 USUAL_BYTES: Final = {
@@ -551,13 +503,10 @@ class Nmea0183:
             Formatter(name): Pace(rate) for name, rate in settings.sentences.items()
         }
         self._outputs: list[SentenceOutput] = []
-        # 0: the next `tick` reads the heading reference
-        self._names: dict[str, None] = {}
-        self._device: str | None = None
-        self._reference = HeadingReference()
-        self._reference_ns = self._newest_ns = 0
+        latency_ns = round(NS_PER_S / max(settings.sentences.values()))
+        self._device = VesselDevice(WHO, settings.device, latency_ns, context)
+        self._newest_ns = 0
         self._rate = MeanRate()
-        self._warned = ""
         self._not_made = 0  # number of sentences that would exceed the length limit of the standard
 
     def start(self) -> None:
@@ -571,22 +520,20 @@ class Nmea0183:
         self._outputs += [UdpOutput(*found) for text in settings.udp if (found := address_of(text)) is not None]
         if settings.serial_port is not None:
             self._outputs.append(SerialOutput(settings.serial_port, settings.serial_baud, now_ns))
-        self._context.outputs.sentences.append(self.status)
+        self._context.outputs.ports[WHO] = self.status
 
     def add_device(self, name: str, device_id: int) -> None:
         """Add a device. The output uses the configured device, or the only device."""
-        self._names[name] = None
-        self._choose()
+        self._device.add(name)
 
     def remove_device(self, name: str) -> None:
-        self._names.pop(name, None)
-        self._choose()
+        self._device.remove(name)
 
     event: Final = None  # no sentence describes an event
 
     def publish(self, batch: Batch) -> None:
         """Send the due sentences with the values of the newest sample. Ignore the batches of other devices."""
-        if batch.device != self._device:
+        if batch.device != self._device.name:
             return
         if Formatter.ROT in self._paces:
             self._rate.add(batch.samples)
@@ -598,9 +545,8 @@ class Nmea0183:
             return
         if Formatter.ROT in due:
             newest = msgspec.structs.replace(newest, gyro_rad_s=self._rate.take())
-        rotation = batch.frame.rotation_to(Convention.NED_FRD)
-        turned = newest if rotation is None else rotation.sample(newest)
-        sentences = b"".join([self._made(kind, turned) for kind in due])
+        sample = turned(batch, newest)
+        sentences = b"".join([self._made(kind, sample) for kind in due])
         if sentences:
             for output in self._outputs:
                 output.put(sentences)
@@ -609,18 +555,15 @@ class Nmea0183:
         """Check the ports and read the heading reference."""
         for output in self._outputs:
             output.tick(now_ns)
-        if self._device is not None and now_ns - self._reference_ns >= REFERENCE_NS:
-            self._reference_ns = now_ns
-            self._read_reference(self._device)
+        self._device.tick(now_ns)
 
     def close(self) -> None:
         """Close all ports and withdraw the latency request. A second call does nothing."""
         for output in self._outputs:
             output.close()
         self._outputs.clear()
-        self._context.latencies.release(WHO)
-        if self.status in self._context.outputs.sentences:
-            self._context.outputs.sentences.remove(self.status)
+        self._device.close()
+        self._context.outputs.ports.pop(WHO, None)
 
     def status(self) -> list[OutputStatus]:
         """Return the state of each port."""
@@ -630,43 +573,11 @@ class Nmea0183:
     def _made(self, kind: Formatter, sample: Sample) -> bytes:
         """Return the sentence of a sample; empty without values, or with values that do not fit into a sentence."""
         try:
-            return make(kind, sample, self._reference, self._settings.talker) or b""
+            return make(kind, sample, self._device.reference, self._settings.talker) or b""
         except ValueError as error:
             self._not_made += 1
-            self._warn(f"NMEA 0183: cannot make a {kind} sentence: {error}")
+            self._device.warn(f"NMEA 0183: cannot make a {kind} sentence: {error}")
             return b""
-
-    def _choose(self) -> None:
-        """Choose the device and request the latency for the fastest sentence."""
-        wanted = self._settings.device
-        if wanted is None and len(self._names) == 1:
-            (wanted,) = self._names
-        device = wanted if wanted in self._names else None
-        if device is None and self._names:
-            self._warn(
-                f"nmea0183.device: expected the name of one device ({', '.join(self._names)}), got "
-                f"{wanted or 'none'}; imud sends no sentences"
-            )
-        if device == self._device:
-            return
-        self._device, self._reference_ns, self._reference = device, 0, HeadingReference()
-        latencies = self._context.latencies
-        if device is None:
-            latencies.release(WHO)
-        else:
-            latencies.ask(WHO, round(NS_PER_S / max(self._settings.sentences.values())), (device,))
-
-    def _read_reference(self, device: str) -> None:
-        """Read the heading reference of the device."""
-        found = next((status for status in self._context.devices.status() if status.name == device), None)
-        if found is None or found.frame is None:
-            return
-        self._reference = HeadingReference(found.frame.heading, found.frame.declination_deg)
-
-    def _warn(self, message: str) -> None:
-        if message != self._warned:
-            self._warned = message
-            log.warning("%s", message)
 
 
 def _claims(settings: Nmea0183Options) -> list[Claim]:

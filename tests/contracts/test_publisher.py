@@ -47,6 +47,6 @@ def test_a_batch_rotates_its_samples_once_for_each_convention() -> None:
 
 def test_problems_of_outputs_and_of_their_ports() -> None:
     ports = [OutputStatus("tcp a", 0, 0, 0, "busy"), OutputStatus("tcp b", 0, 0, 1, "")]
-    facts = OutputFacts(failed={"mqtt": "no broker"}, sentences=[lambda: ports])
+    facts = OutputFacts(failed={"mqtt": "no broker"}, ports={"nmea0183": lambda: ports})
     assert facts.problems() == {"mqtt": "no broker", "nmea0183 tcp a": "busy"}
     assert PUBLISHERS["socket"].claims(None) == ()

@@ -36,9 +36,10 @@ from imud.formats.slot import decode_slots
 from imud.model.ledger import Ledger
 from imud.model.sample import SAMPLE_FIELDS, Measurement, Sample, Sync
 from imud.publishers.metrics.rings import motion_of
-from imud.publishers.nmea0183 import Formatter, HeadingReference, make
+from imud.publishers.nmea0183 import Formatter, make
 from imud.publishers.socket.history import History, buckets
 from imud.publishers.socket.outbox import BinaryEncoding, JsonEncoding
+from imud.publishers.vessel import HeadingReference
 from imud.web.hub import bucket_of, raw_of
 from tests.support.publisher_context import publisher_context
 

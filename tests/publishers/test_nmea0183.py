@@ -3,7 +3,6 @@ Ports: accepted sentences arrive complete, other sentences are dropped and count
 
 import asyncio
 import json
-import math
 import os
 import shutil
 import socket
@@ -30,7 +29,7 @@ from imud.model.errors import ServerError
 from imud.model.options import wrong_values
 from imud.model.sample import Sample, Sync, Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S
-from imud.publishers import nmea0183
+from imud.publishers import nmea0183, vessel
 from imud.publishers.nmea0183 import open_serial as open_real_port
 from tests.support.event_loops import VirtualClock, in_loop
 from tests.support.publisher_context import FakeLatencies, publisher_context
@@ -205,12 +204,12 @@ async def test_the_only_device_or_the_configured_device_is_used(caplog: pytest.L
     bench = OutputBench(sentences={"HDT": 100.0})
     assert bench.asked.asked == {nmea0183.WHO: (10 * NS_PER_MS, ("bow",))}
     bench.output.add_device("mast", 1)
-    assert (bench.asked.asked, len(bench.context.outputs.sentences)) == ({}, 1)
+    assert (bench.asked.asked, [*bench.context.outputs.ports]) == ({}, ["nmea0183"])
     assert "nmea0183.device: expected the name of one device (bow, mast), got none" in caplog.text
     bench.output.remove_device("bow")
     assert bench.asked.asked == {nmea0183.WHO: (10 * NS_PER_MS, ("mast",))}
     bench.output.close()
-    assert (bench.asked.asked, bench.context.outputs.sentences) == ({}, [])
+    assert (bench.asked.asked, bench.context.outputs.ports) == ({}, {})
     named = OutputBench(device="mast", sentences={"HDT": 100.0})
     assert named.asked.asked == {}
     named.output.add_device("mast", 1)
@@ -257,7 +256,7 @@ def test_usual_bytes_covers_full_sentences_and_empty_samples_make_none(kind: nme
         "bow", 1, 0, 0, Sync.ARRIVAL, 0, NS_PER_S, euler_rad=(radians(-80), radians(-80), radians(211.5)),
         gyro_rad_s=(0.0, 0.0, radians(-0.3)), temperature_c=23.4, pressure_pa=101_325.0,
     )  # fmt: skip
-    made = nmea0183.make(kind, full, nmea0183.HeadingReference(Heading.TRUE, 12.6))
+    made = nmea0183.make(kind, full, vessel.HeadingReference(Heading.TRUE, 12.6))
     assert made is not None
     assert 0 <= nmea0183.USUAL_BYTES[kind] - len(made) <= 8
     assert nmea0183.make(kind, sample(euler_deg=None), CORRECTED) is None
@@ -326,9 +325,9 @@ async def test_gpsd_accepts_all_sentences_and_reports_their_values() -> None:
         assert {name for report in found for name in report} == {"class", "device", "heading"}
 
 
-MAGNETIC = nmea0183.HeadingReference(Heading.MAGNETIC)
-CORRECTED = nmea0183.HeadingReference(Heading.TRUE, 3.0)
-TRUE = nmea0183.HeadingReference(Heading.TRUE)
+MAGNETIC = vessel.HeadingReference(Heading.MAGNETIC)
+CORRECTED = vessel.HeadingReference(Heading.TRUE, 3.0)
+TRUE = vessel.HeadingReference(Heading.TRUE)
 
 
 def sample(
@@ -343,7 +342,7 @@ def sample(
     )  # fmt: skip
 
 
-def body(kind: nmea0183.Formatter, one: Sample, reference: nmea0183.HeadingReference, talker: str = "") -> str | None:
+def body(kind: nmea0183.Formatter, one: Sample, reference: vessel.HeadingReference, talker: str = "") -> str | None:
     """Return the text between `$` and `*`."""
     made = nmea0183.make(kind, one, reference, talker)
     return None if made is None else made.decode().removeprefix("$").partition("*")[0]
@@ -355,11 +354,11 @@ def body(kind: nmea0183.Formatter, one: Sample, reference: nmea0183.HeadingRefer
         (MAGNETIC, (None, "HCHDG,45.0,,,,", "HCHDM,45.0,M")),
         (CORRECTED, ("HCHDT,45.0,T", "HCHDG,42.0,,,3.0,E", "HCHDM,42.0,M")),
         (TRUE, ("HCHDT,45.0,T", None, None)),  # a true heading from the device has no magnetic heading
-        (nmea0183.HeadingReference(Heading.RELATIVE), (None, None, None)),  # relative to the direction at power-on
-        (nmea0183.HeadingReference(Heading.UNKNOWN), (None, None, None)),
+        (vessel.HeadingReference(Heading.RELATIVE), (None, None, None)),  # relative to the direction at power-on
+        (vessel.HeadingReference(Heading.UNKNOWN), (None, None, None)),
     ],
 )
-def test_a_heading_has_its_reference(reference: nmea0183.HeadingReference, sentences: tuple[str | None, ...]) -> None:
+def test_a_heading_has_its_reference(reference: vessel.HeadingReference, sentences: tuple[str | None, ...]) -> None:
     kinds = (nmea0183.Formatter.HDT, nmea0183.Formatter.HDG, nmea0183.Formatter.HDM)
     assert tuple(body(kind, sample(), reference) for kind in kinds) == sentences
     if sentences == (None, None, None):
@@ -378,16 +377,7 @@ def test_roll_pitch_temperature_pressure_and_the_talker() -> None:
     assert str(body(nmea0183.Formatter.PASHR, sample(), TRUE, "II")).startswith("PASHR,")
 
 
-def test_the_rate_of_turn_is_the_rate_of_the_heading() -> None:
-    assert nmea0183.turn_rate_rad_s(sample((0, 0, 0), (5, 5, 2))) == pytest.approx(radians(2))
-    # right side down by 90°: a rotation about y changes the heading
-    assert nmea0183.turn_rate_rad_s(sample((90, 0, 0), (0, 3, 0))) == pytest.approx(radians(3))
-    # bow up by 60°: the heading turns twice as fast as the body about its z axis
-    assert nmea0183.turn_rate_rad_s(sample((0, 60, 0), (0, 0, 1))) == pytest.approx(radians(2))
-    assert nmea0183.turn_rate_rad_s(sample(None, (0, 0, 1))) == pytest.approx(radians(1))
-    assert nmea0183.turn_rate_rad_s(sample((0, 85, 0), (0, 0, 1))) is None
-    assert nmea0183.turn_rate_rad_s(sample((0, 0, 0))) is None
-    assert nmea0183.turn_rate_rad_s(sample((0, 0, 0), (0, 0, math.inf))) is None
+def test_the_rate_of_turn_in_a_sentence() -> None:
     assert body(nmea0183.Formatter.ROT, sample((0, 0, 0), (0, 0, 1.5)), MAGNETIC) == "TIROT,90.0,A"
 
 

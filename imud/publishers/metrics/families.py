@@ -577,29 +577,29 @@ MQTT_FAMILIES: Final = (
 )  # fmt: skip
 
 
-def _output(read: Callable[[OutputStatus], float]) -> Reader:
+def _port(read: Callable[[OutputStatus], float]) -> Reader:
     """Return a reader of a value of each port."""
 
     def lines(snapshot: Snapshot) -> Lines:
-        return [((status.name,), read(status)) for status in snapshot.outputs]
+        return [((output, port.name), read(port)) for output, ports in snapshot.ports.items() for port in ports]
 
-    return Reader(("output",), lines)
+    return Reader(("output", "port"), lines)
 
 
-OUTPUT_FAMILIES: Final = (
+PORT_FAMILIES: Final = (
     Family(
-        "imud_nmea0183_sentences_total", MetricType.COUNTER, NO_UNIT, "Sentences sent.",
-        _output(lambda status: status.sent),
+        "imud_output_messages_total", MetricType.COUNTER, NO_UNIT, "Messages sent to a port of an output.",
+        _port(lambda status: status.sent),
     ),
     Family(
-        "imud_nmea0183_sentences_dropped_total", MetricType.COUNTER, NO_UNIT,
-        "Sentences that imud dropped because a port was missing or its queue was full.",
-        _output(lambda status: status.dropped),
+        "imud_output_messages_dropped_total", MetricType.COUNTER, NO_UNIT,
+        "Messages that imud dropped because a port was missing or its queue was full.",
+        _port(lambda status: status.dropped),
     ),
     Family(
-        "imud_nmea0183_readers", MetricType.GAUGE, NO_UNIT,
-        "Clients of the TCP server; for a serial port or an address 1 if it accepts data, otherwise 0.",
-        _output(lambda status: status.readers),
+        "imud_output_readers", MetricType.GAUGE, NO_UNIT,
+        "Clients of a server; for a port or an address 1 if it accepts data, otherwise 0.",
+        _port(lambda status: status.readers),
     ),
 )  # fmt: skip
 

@@ -43,7 +43,8 @@ class Snapshot:
     views: Mapping[str, RingView] = field(default_factory=dict)  # content of the rings
     recorders: Sequence[RecorderStatus] = ()  # state of the recorder, if it runs
     flights: Sequence[FlightStatus] = ()  # state of the flight recorder, if it runs
-    outputs: Sequence[OutputStatus] = ()  # states of the ports of outputs that send sentences
+    # States of the ports of outputs, by the name of the output
+    ports: Mapping[str, Sequence[OutputStatus]] = field(default_factory=dict)
     mqtts: Sequence[MqttStatus] = ()  # state of the output `mqtt`, if it runs
 
 

@@ -37,7 +37,7 @@ from imud.publishers.metrics.families import (
     FAMILIES,
     FLIGHT_FAMILIES,
     MQTT_FAMILIES,
-    OUTPUT_FAMILIES,
+    PORT_FAMILIES,
     RECORDER_FAMILIES,
     RECORDINGS_FAMILIES,
 )
@@ -130,7 +130,7 @@ class DaemonCollector(Collector):
         """Yield all metrics of the snapshot."""
         recorder = RECORDER_FAMILIES if self._snapshot.recorders else ()
         flight = FLIGHT_FAMILIES if self._snapshot.flights else ()
-        outputs = OUTPUT_FAMILIES if self._snapshot.outputs else ()
+        outputs = PORT_FAMILIES if self._snapshot.ports else ()
         mqtt = MQTT_FAMILIES if self._snapshot.mqtts else ()
         recordings = RECORDINGS_FAMILIES if recorder or flight else ()
         for family in (*FAMILIES, *recorder, *flight, *recordings, *outputs, *mqtt):
@@ -310,7 +310,7 @@ class MetricsPublisher:
                     recorders=tuple(status() for status in outputs.recorders),
                     flights=tuple(status() for status in outputs.flights),
                     mqtts=tuple(status() for status in outputs.mqtts),
-                    outputs=tuple(output for source in outputs.sentences for output in source()),
+                    ports={output: source() for output, source in outputs.ports.items()},
                 )
             )
 

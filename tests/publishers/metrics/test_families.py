@@ -329,8 +329,8 @@ def shown_names() -> set[str]:
     output = states.OutputStatus("tcp 127.0.0.1:10110", 1, 2, 3, "")
     mqtt = states.MqttStatus("mqtt://127.0.0.1:1883", "", "", 1, 2, 3, 4, 5, 6, 7, {"age": 8}, 9)
     snapshot = Snapshot(
-        DEVICES, (client(1),), ((("front", "up"), 1),), 1, recorders=(recorder,), flights=(flight,), outputs=(output,),
-        mqtts=(mqtt,),
+        DEVICES, (client(1),), ((("front", "up"), 1),), 1, recorders=(recorder,), flights=(flight,),
+        ports={"nmea0183": (output,)}, mqtts=(mqtt,),
     )  # fmt: skip
     body = Renderer(pause=lambda: None).render(snapshot, "").body.decode()
     return set(re.findall(r"^# HELP (\S+)", body, re.MULTILINE))
@@ -346,7 +346,7 @@ def test_every_metric_and_label_value_is_documented() -> None:
 
 
 def test_names_contain_type_and_unit() -> None:
-    more = (families.MQTT_FAMILIES, families.OUTPUT_FAMILIES, families.RECORDER_FAMILIES, families.FLIGHT_FAMILIES)
+    more = (families.MQTT_FAMILIES, families.PORT_FAMILIES, families.RECORDER_FAMILIES, families.FLIGHT_FAMILIES)
     for family in chain(families.FAMILIES, families.RECORDINGS_FAMILIES, *more):
         assert family.name.startswith("imud_")
         if isinstance(family, Family):
@@ -378,12 +378,13 @@ def test_alerts_use_metrics_that_exist() -> None:
 
 def test_each_metric_is_a_value_of_a_port() -> None:
     tcp, serial = "tcp 127.0.0.1:10110", "serial /dev/ttyUSB0"
-    outputs = (OutputStatus(tcp, 1, 2, 3, ""), OutputStatus(serial, 4, 5, 0, "No such file or directory"))
-    assert shown("imud_nmea0183_", Snapshot(outputs=outputs)) == {
-        f"sentences_total {tcp}": 1, f"sentences_dropped_total {tcp}": 2, f"readers {tcp}": 3,
-        f"sentences_total {serial}": 4, f"sentences_dropped_total {serial}": 5, f"readers {serial}": 0,
+    ports = (OutputStatus(tcp, 1, 2, 3, ""), OutputStatus(serial, 4, 5, 0, "No such file or directory"))
+    assert shown("imud_output_", Snapshot(ports={"nmea0183": ports})) == {
+        f"messages_total nmea0183 {tcp}": 1, f"messages_dropped_total nmea0183 {tcp}": 2, f"readers nmea0183 {tcp}": 3,
+        f"messages_total nmea0183 {serial}": 4, f"messages_dropped_total nmea0183 {serial}": 5,
+        f"readers nmea0183 {serial}": 0,
     }  # fmt: skip
-    assert shown("imud_nmea0183_", Snapshot()) == {}
+    assert shown("imud_output_", Snapshot()) == {}
 
 
 def test_each_metric_is_a_value_of_the_output() -> None:
