@@ -130,6 +130,11 @@ def _give(answer: "asyncio.Future[Config]", config: Config | None, error: Config
         answer.set_exception(error or ConfigError("not read"))
 
 
+def _log_ignored(config: Config) -> None:
+    for problem in config.ignored:
+        log.error("%s", problem)
+
+
 TICK_S: Final = 0.1  # interval of ticks while a part needs them (`tick_soon`), s
 QUIET_TICK_S: Final = 0.5  # interval of ticks in a quiet state, s; half of the maximum age of a heartbeat
 CONDITION: Final = attrgetter("condition")
@@ -211,6 +216,7 @@ class Daemon:
         if self._file is not None:
             self._reloader = Reloader(self._file, self, self._host)
         try:
+            _log_ignored(self.config)
             self._outputs.start(self.config.publishers)
             for device in self.config.devices:
                 self._start_device(device)
@@ -269,6 +275,7 @@ class Daemon:
         change = configuration.differences(self.config, new)
         self.config = new
         logging.getLogger().setLevel(new.log_level.upper())
+        _log_ignored(new)
         for name in (*change.devices_removed, *change.devices_changed):
             self._stop_device(name)
             await asyncio.sleep(0)

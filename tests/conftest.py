@@ -4,6 +4,7 @@ A test of logic receives the time as an argument. A `live` test runs a real daem
 condition with `wait_until`.
 """
 
+import os
 import signal
 import threading
 import time
@@ -28,6 +29,7 @@ _sleep = time.sleep
 
 def pytest_configure(config: pytest.Config) -> None:
     """Register the Hypothesis profiles and load `gate`, or the profile of `--hypothesis-profile`."""
+    os.environ["IMUD_PLUGINS"] = "off"  # other installed packages do not change the tests and their processes
     if not config.pluginmanager.has_plugin("hypothesispytest"):  # the lab runs without Hypothesis
         return
     from hypothesis import HealthCheck, settings

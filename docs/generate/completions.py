@@ -38,6 +38,7 @@ def completions() -> dict[str, str]:
 
 if __name__ == "__main__":
     os.environ.pop("IMUD_SOCKET", None)
+    os.environ["IMUD_PLUGINS"] = "off"  # the result must not depend on installed drivers and outputs
     for file, text in completions().items():
         path = Path(sys.argv[1]) / file
         path.parent.mkdir(parents=True, exist_ok=True)

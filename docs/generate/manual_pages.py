@@ -47,6 +47,7 @@ OWN_STATUS: Final = {
 ENVIRONMENT: Final = (
     ("IMUD_SOCKET", f"The daemon's socket, instead of {DEFAULT_PATH}."),
     ("IMUD_SHM", "The folder of the rings of shared memory."),
+    ("IMUD_PLUGINS", "off: imud ignores drivers and outputs of other packages."),
 )
 FILES: Final = (
     ("/etc/imud.yaml", "The configuration, imud.yaml(5)."),
@@ -238,6 +239,7 @@ def pages() -> dict[str, str]:
 
 
 if __name__ == "__main__":
+    os.environ["IMUD_PLUGINS"] = "off"  # the result must not depend on installed drivers and outputs
     os.environ.pop("IMUD_SOCKET", None)  # the default must not depend on the environment of the build
     folder = Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)

@@ -10,9 +10,8 @@ from typing import Any, Final
 
 import msgspec
 
-from imud.cli.arguments import CliCommand, add_duration, add_interface, add_option, add_socket, duration_s
+from imud.cli.arguments import CliCommand, add_driver, add_duration, add_interface, add_option, add_socket, duration_s
 from imud.cli.output import complain
-from imud.drivers import DRIVERS
 from imud.model.errors import BadArgument
 
 BAND: Final = re.compile(r"(\d+(?:\.\d*)?)-(\d+(?:\.\d*)?)")
@@ -37,7 +36,7 @@ def common_arguments(parser: argparse.ArgumentParser) -> None:
         help="ignore the samples of this time at the start, for example while the device warms up",
     )  # fmt: skip
     parser.add_argument("--device", metavar="NAME", help="device in a recording of several devices")
-    parser.add_argument("--driver", choices=sorted(DRIVERS), help="driver for a capture (default: hipnuc-uart)")
+    add_driver(parser, "driver for a capture (default: hipnuc-uart)")
     parser.add_argument("--baud", type=int, help="baud rate of a raw capture (default: 115200)")
     add_option(parser)
     add_interface(parser)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 
+from imud.contracts.registry import problems_of
 from imud.contracts.status import Deviations, DeviceStatus
 from imud.formats.jsonrpc import DEFAULT_PATH, default_path
 from imud.host.files import read_regular
@@ -195,6 +196,18 @@ def named_values(words: Iterable[str]) -> dict[str, object]:
             raise BadArgument(f"{name}: expected one value, got {shown(values[name])} and {shown(value)}")
         values[name] = value
     return values
+
+
+def add_driver(parser: argparse.ArgumentParser, purpose: str, *, required: bool = False) -> None:
+    """Add the option `--driver`. `purpose` is its help."""
+    from imud.drivers import DRIVERS  # most commands need no driver
+
+    def driver(text: str) -> str:
+        if text not in DRIVERS and text in problems_of(DRIVERS):
+            raise argparse.ArgumentTypeError(problems_of(DRIVERS)[text])
+        return text
+
+    parser.add_argument("--driver", required=required, choices=sorted(DRIVERS), type=driver, help=purpose)
 
 
 def add_option(parser: argparse.ArgumentParser) -> None:

@@ -13,7 +13,15 @@ from typing import BinaryIO
 
 import msgspec
 
-from imud.cli.arguments import CliCommand, add_interface, add_option, chosen_interface, driver_settings, given_options
+from imud.cli.arguments import (
+    CliCommand,
+    add_driver,
+    add_interface,
+    add_option,
+    chosen_interface,
+    driver_settings,
+    given_options,
+)
 from imud.contracts.codec import BadFrame, CodecEvent
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Driver, StreamDriver
 from imud.contracts.script import ReplyFrame, TextLine
@@ -32,7 +40,7 @@ NOT_SHOWN = {"trailing_bytes", "dev_ticks", "t_first_ns"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--driver", required=True, choices=sorted(DRIVERS), help="driver of the captured device")
+    add_driver(parser, "driver of the captured device", required=True)
     parser.add_argument("file", metavar="FILE", help="capture file, or - for standard input")
     add_option(parser)
     add_interface(parser)

@@ -15,6 +15,7 @@ from imud.bridges.json import JsonDialect
 from imud.bridges.ros2 import Ros2Dialect
 from imud.cli.arguments import (
     CliCommand,
+    add_driver,
     add_interface,
     add_noise,
     add_option,
@@ -173,7 +174,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="convention of axes and angles (default: CSV as published, MCAP enu-flu as in REP-103)",
     )  # fmt: skip
     add_noise(parser)
-    parser.add_argument("--driver", choices=sorted(DRIVERS), help=f"driver for a capture (default: {DRIVER})")
+    add_driver(parser, f"driver for a capture (default: {DRIVER})")
     parser.add_argument("--baud", type=int, help=f"baud rate of a raw capture (default: {BAUD})")
     add_option(parser)
     add_interface(parser)

@@ -11,7 +11,15 @@ import msgspec
 from msgspec.structs import replace
 
 from imud import config
-from imud.cli.arguments import CliCommand, add_interface, add_option, chosen_interface, driver_settings, given_options
+from imud.cli.arguments import (
+    CliCommand,
+    add_driver,
+    add_interface,
+    add_option,
+    chosen_interface,
+    driver_settings,
+    given_options,
+)
 from imud.cli.output import paragraph
 from imud.cli.status import block
 from imud.contracts.codec import wrong_length_words
@@ -196,7 +204,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="recording of imud (no options needed), raw or time-stamped capture, or for CAN a log of candump -L",
     )
-    parser.add_argument("--driver", choices=sorted(DRIVERS), help=f"driver for a capture (default: {DRIVER})")
+    add_driver(parser, f"driver for a capture (default: {DRIVER})")
     parser.add_argument("--speed", choices=SPEEDS, help=f"speed of a capture (default: {SPEED})")
     parser.add_argument(
         "--baud", type=int, help=f"baud rate of a capture if the capture does not contain it (default: {BAUD})"

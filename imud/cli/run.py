@@ -78,7 +78,8 @@ def check_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check(args: argparse.Namespace) -> int:
-    """Print one line if the file is valid, and notes. Raises ConfigError with line and column if it is invalid."""
+    """Print one line if the file is valid, and notes. Return 1 if a driver or output of another package has a problem,
+    otherwise 0. Raises ConfigError with line and column if the file is invalid."""
     settings = config.parse(standard_input(), "standard input") if args.file == "-" else config.load(args.file)
     names = ", ".join(device.name for device in settings.devices) or "none"
     print(f"{args.file}: valid; devices: {names}")
@@ -87,7 +88,9 @@ def check(args: argparse.Namespace) -> int:
             print(f"{args.file}:{device.line}: note: {device.name}: {note}")
     for note in (*unknown_devices(settings), *missing_directories(settings)):
         print(f"{args.file}: note: {note}")
-    return 0
+    for problem in settings.ignored:
+        complain(problem)
+    return 1 if settings.ignored else 0
 
 
 def unknown_devices(settings: Config) -> Iterator[str]:

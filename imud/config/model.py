@@ -45,6 +45,8 @@ class Config:
     publishers: Mapping[str, Options]  # options of each row of PUBLISHERS, with defaults for absent keys
     devices: tuple[DeviceConfig, ...]  # enabled devices in the order of the file
     disabled: tuple[str, ...] = ()  # names of devices with `enabled: false`
+    # Problems of other packages with drivers or outputs, each with the place of the device or output that imud ignores
+    ignored: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from re import compile as pattern
@@ -21,6 +22,7 @@ from imud.contracts.condition import ConditionLimits
 from imud.contracts.driver import CanDriver, Driver, PolledDriver
 from imud.contracts.lines import LINE_SCHEMAS, DeviceLines, LineOptions
 from imud.contracts.link import CanUse, Claim, LinkType, conflict_of
+from imud.contracts.registry import problems_of
 from imud.contracts.setting import SettingsTable, declared_values
 from imud.contracts.status import Deviations
 from imud.host.files import read_regular
@@ -60,7 +62,9 @@ def parse(text: str | bytes, filename: str, tables: Tables = TABLES, pause: Call
     problems = [*tree.problems, *keys.problems_besides(tree.problems)]
     if problems or config is None:
         raise ConfigError(_report(problems, filename))
-    return config
+    known = "\n".join(ignored := _lines(keys.ignored, filename))
+    broken = [*problems_of(tables.drivers).values(), *problems_of(tables.publishers).values()]
+    return replace(config, ignored=(*ignored, *(problem for problem in broken if problem not in known)))
 
 
 def _config(keys: Keys, tables: Tables, pause: Callable[[], None]) -> Config | None:
@@ -68,8 +72,8 @@ def _config(keys: Keys, tables: Tables, pause: Callable[[], None]) -> Config | N
     top = keys.mapping((), keys.tree.data)
     if top is None:
         return None
-    known = [*General.__struct_fields__, *tables.publishers, "devices"]
-    keys.unknown_keys((), top, known)
+    ignored = [name for name in top if keys.ignores(tables.publishers, name, (name,), "output")]
+    keys.unknown_keys((), top, [*General.__struct_fields__, *tables.publishers, *ignored, "devices"])
     general = keys.settings(General, (), {key: top[key] for key in General.__struct_fields__ if key in top})
     publishers = {name: keys.row(tables.publishers, name, top.get(name)) for name in tables.publishers}
     for name, options in publishers.items():
@@ -90,13 +94,17 @@ def _config(keys: Keys, tables: Tables, pause: Callable[[], None]) -> Config | N
 
 
 def _report(problems: Sequence[Problem], filename: str) -> str:
-    lines = []
-    for problem in sorted(problems)[:PROBLEMS_SHOWN]:
-        place = f"{filename}:{problem.mark.line}:{problem.mark.column}: "
-        lines.append(place + (f"{path_text(problem.path)}: " if problem.path else "") + problem.message)
+    lines = _lines(sorted(problems)[:PROBLEMS_SHOWN], filename)
     if len(problems) > PROBLEMS_SHOWN:
         lines.append(f"… and {len(problems) - PROBLEMS_SHOWN} more problems")
     return "\n".join(lines)
+
+
+def _lines(problems: Iterable[Problem], filename: str) -> list[str]:
+    return [
+        f"{filename}:{one.mark.line}:{one.mark.column}: {f'{path_text(one.path)}: ' * bool(one.path)}{one.message}"
+        for one in problems
+    ]
 
 
 # --- conflicts of ports, addresses and frames -------------------------------------------------------------------------
@@ -473,7 +481,7 @@ class DeviceReader:
             rule = "1 to 32 characters of a-z, 0-9, _ and -, starting with a letter or digit"
             self._keys.problem(path, f"expected a device name of {rule}, got {got(name)}", at_key=True)
         keys = self._keys.mapping(path, data)
-        if keys is None:
+        if keys is None or self._keys.ignores(self._tables.drivers, keys.get("driver"), (*path, "driver"), "device"):
             return None
         own = DeviceGeneral.__struct_fields__
         self._keys.unknown_keys(

@@ -17,6 +17,7 @@ from imud.config.yaml import Path as KeyPath
 from imud.contracts.driver import Driver
 from imud.contracts.link import LinkType
 from imud.contracts.publisher import PublisherType
+from imud.contracts.registry import problems_of
 from imud.contracts.setting import OnDifference
 from imud.drivers import DRIVERS
 from imud.links import LINKS
@@ -79,11 +80,19 @@ class Keys:
     def __init__(self, tree: YamlTree) -> None:
         self.tree = tree
         self.problems: list[Problem] = []
+        self.ignored: list[Problem] = []  # parts that imud ignores, because the driver or output has a problem
 
     def problems_besides(self, known: Sequence[Problem]) -> Iterator[Problem]:
         """Yield the problems, without the consequences of a `known` problem at the same place or inside it."""
         paths = [problem.path for problem in known]
         return (p for p in self.problems if not any(path[: len(p.path)] == p.path for path in paths))
+
+    def ignores(self, table: Mapping[str, Row], name: object, path: KeyPath, part: str) -> bool:
+        """Return whether the row is in a package with a problem. Note the problem at `path`."""
+        problem = problems_of(table).get(name) if isinstance(name, str) and name not in table else None
+        if problem is not None:
+            self.ignored.append(Problem(self.tree.mark(path), path, f"imud ignores this {part}: {problem}"))
+        return problem is not None
 
     def mapping(self, path: KeyPath, data: object) -> Mapping[str, Any] | None:
         """Return `data` if it is a mapping; otherwise add a problem and return None."""

@@ -133,6 +133,8 @@ class Driver:
 
     name: str  # family and link, for example `hipnuc-uart`
     title: str  # vendor and products, as readable text
+    # Interface version for which another package was written (`imud.contracts.registry`); 0 for drivers of imud
+    interface: int = 0
     settings: type[Options]  # type of the driver options (`options` of a device)
     tick_ns: int  # duration of one device tick, ns, or SAMPLE_COUNTER
     tick_modulus: int  # modulus of the device counter: it counts 0 … tick_modulus - 1

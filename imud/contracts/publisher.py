@@ -364,6 +364,7 @@ class PublisherType:
     # Returns the ports that these options use. No device can use them.
     claims: Callable[[Any], Sequence[Claim]] = _claims_nothing
     # Whether the daemon exits if the first start of the publisher fails. Otherwise the daemon tries again periodically.
-    required: bool = True
+    required: bool = False
     # Finds keys that contradict the drivers. Returns a reason, one sentence, by the path of the key.
     check: Callable[[Any, Mapping[str, Driver]], Mapping[tuple[str, ...], str]] = lambda _options, _drivers: {}
+    interface: int = 0  # interface version for which another package was written; 0 for outputs of imud

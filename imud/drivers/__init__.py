@@ -1,7 +1,7 @@
 """Wire protocols, one folder or module each: codec, commands, settings and the registry row in `driver.py`. No I/O."""
 
 from imud.contracts.driver import Driver
-from imud.contracts.registry import Registry
+from imud.contracts.registry import PluginGroup, Registry
 
 DRIVERS: Registry[Driver] = Registry(
     "driver",
@@ -17,4 +17,5 @@ DRIVERS: Registry[Driver] = Registry(
         "imu61x-spi": "imud.drivers.imu61x.spi:DRIVER",
         "imu61x-can": "imud.drivers.imu61x.can:DRIVER",
     },
+    PluginGroup("imud.drivers", Driver, reserved=("auto",)),
 )

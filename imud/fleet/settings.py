@@ -260,6 +260,4 @@ def _settings_in(words: str, known: Collection[str]) -> set[str]:
     return {name for name in known if any(pattern.fullmatch(name) for pattern in patterns)}
 
 
-PUBLISHER = PublisherType(
-    "mqtt", MqttOptions, make_later("imud.fleet.publisher:MqttPublisher"), required=False, check=check_commands
-)
+PUBLISHER = PublisherType("mqtt", MqttOptions, make_later("imud.fleet.publisher:MqttPublisher"), check=check_commands)

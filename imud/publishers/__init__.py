@@ -1,10 +1,10 @@
 """Registry of the outputs of samples and events."""
 
 from imud.contracts.publisher import PublisherType
-from imud.contracts.registry import Registry
+from imud.contracts.registry import PluginGroup, Registry
 
 PUBLISHERS: Registry[PublisherType] = Registry(
-    "publisher",
+    "output",
     {
         "socket": "imud.publishers.socket.server:PUBLISHER",
         "shm": "imud.publishers.shm:PUBLISHER",
@@ -13,4 +13,6 @@ PUBLISHERS: Registry[PublisherType] = Registry(
         "nmea0183": "imud.publishers.nmea0183:PUBLISHER",
         "mqtt": "imud.fleet.settings:PUBLISHER",
     },
+    # the configuration has these other keys at the top
+    PluginGroup("imud.outputs", PublisherType, reserved=("devices", "log_level", "state_dir")),
 )

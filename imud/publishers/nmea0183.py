@@ -585,4 +585,4 @@ def _claims(settings: Nmea0183Options) -> list[Claim]:
     return [] if used is None else [Claim(place=used, key="serial_port")]
 
 
-PUBLISHER = PublisherType("nmea0183", Nmea0183Options, Nmea0183, claims=_claims, required=False)
+PUBLISHER = PublisherType("nmea0183", Nmea0183Options, Nmea0183, claims=_claims)

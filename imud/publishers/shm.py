@@ -620,4 +620,4 @@ class ShmPublisher:
         log.warning("shm: group %s %s; its members cannot read shared memory", self._settings.group, why)
 
 
-PUBLISHER = PublisherType("shm", ShmOptions, ShmPublisher)
+PUBLISHER = PublisherType("shm", ShmOptions, ShmPublisher, required=True)

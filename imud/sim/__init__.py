@@ -1,6 +1,6 @@
 """Simulated devices with known truth, for `imud demo` and the tests."""
 
-from imud.contracts.registry import Registry
+from imud.contracts.registry import PluginGroup, Registry
 from imud.sim.can_module import CanSimulator
 from imud.sim.sensor import Simulator
 
@@ -12,6 +12,7 @@ SIMULATORS: Registry[Simulator] = Registry(
         "hipnuc-modbus": "imud.sim.hipnuc.modbus:SIMULATOR",
         "imu61x-uart": "imud.sim.imu61x.uart:SIMULATOR",
     },
+    PluginGroup("imud.simulators", Simulator),
 )
 
 # Simulated devices on a CAN interface.
@@ -24,4 +25,5 @@ CAN_SIMULATORS: Registry[CanSimulator] = Registry(
         "hipnuc-nmea2000": "imud.sim.hipnuc.nmea2000:SIMULATOR",
         "imu61x-can": "imud.sim.imu61x.can:SIMULATOR",
     },
+    PluginGroup("imud.can_simulators", CanSimulator),
 )

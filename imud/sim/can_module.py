@@ -72,6 +72,7 @@ class CanSimulator:
     # Function that makes the device, with power on at the given CLOCK_MONOTONIC. Raises ValueError for unsupported
     # options.
     make: Callable[[SimulatorOptions, int], CanModule]
+    interface: int = 0  # interface version for which another package was written; 0 for simulators of imud
 
 
 class FrameWire:

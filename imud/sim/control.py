@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from imud.contracts.registry import problems_of
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim import CAN_SIMULATORS, SIMULATORS
 from imud.sim.physics import GRAVITY_M_S2, MOTIONS
@@ -167,6 +168,9 @@ def simulated(text: str) -> tuple[str, int]:
     """Return name and node of NAME or NAME:NODE. The default node is 0. Raises ArgumentTypeError."""
     name, _, node = text.partition(":")
     known = sorted([*SIMULATORS, *CAN_SIMULATORS])
+    problems = [problem for table in (SIMULATORS, CAN_SIMULATORS) if (problem := problems_of(table).get(name))]
+    if problems and name not in known:
+        raise argparse.ArgumentTypeError("; ".join(problems))
     if name not in known or (node and not node.isdecimal()):
         raise argparse.ArgumentTypeError(f"expected one of {', '.join(known)}, with or without :NODE, got {text!r}")
     return name, int(node or 0)

@@ -122,6 +122,7 @@ class Simulator:
     # Function that makes the device, with power on at the given CLOCK_MONOTONIC. Raises ValueError for unsupported
     # options.
     make: Callable[[SimulatorOptions, int], StreamModule]
+    interface: int = 0  # interface version for which another package was written; 0 for simulators of imud
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -39,6 +39,8 @@ def configuration(at: Surroundings) -> Findings:
             )
         for name in at.config.disabled:
             yield note(f"device {name} is disabled in {at.config_file}")
+        for problem in at.config.ignored:
+            yield error(problem, "then restart imud: `sudo systemctl restart imud` (docs/drivers.md)")
         return
     try:
         at.at(at.config_file).open("rb").close()

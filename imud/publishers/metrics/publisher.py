@@ -315,4 +315,4 @@ class MetricsPublisher:
             )
 
 
-PUBLISHER = PublisherType("metrics", MetricsOptions, MetricsPublisher, required=False)
+PUBLISHER = PublisherType("metrics", MetricsOptions, MetricsPublisher)

@@ -236,4 +236,4 @@ def _wanted(settings: RecorderOptions) -> bool:
     return settings.enabled or settings.flight.enabled
 
 
-PUBLISHER = PublisherType("recorder", RecorderOptions, RecorderOutput, _wanted, required=False)
+PUBLISHER = PublisherType("recorder", RecorderOptions, RecorderOutput, _wanted)

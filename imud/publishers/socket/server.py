@@ -468,4 +468,4 @@ def _refuse(sock: socket.socket, error: RpcError) -> None:
     sock.close()
 
 
-PUBLISHER = PublisherType("socket", SocketOptions, SocketServer)
+PUBLISHER = PublisherType("socket", SocketOptions, SocketServer, required=True)
