@@ -18,7 +18,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
         "imud.analysis", "imud.bridges",
     ),
     ("imud.config", "imud.lines", "imud.sim", "imud.web"), ("imud.recording",), ("imud.device",), ("imud.daemon",),
-    ("imud.cli",), ("imud.__main__",),
+    ("imud.cli", "imud.testing"), ("imud.__main__",),
 )  # fmt: skip
 """Parts of imud. A part imports from lower layers and from itself; it never imports another part of its own layer."""
 PARTS = tuple(name for names in LAYERS for name in names)
@@ -506,6 +506,8 @@ TESTED_IN = {
     "imud.sim.control": "sim/test_sensor.py", "imud.sim.hipnuc.nmea2000": "sim/test_can_module.py",
     "imud.sim.imu61x.can": "sim/test_can_module.py", "imud.sim.ports.arrival": "sim/ports/test_faults.py",
     "imud.sim.ports.in_process_bus": "links/test_spi.py", "imud.sim.ports.uart_wire": "sim/ports/test_pty.py",
+    "imud.testing.can": "drivers/test_every_can_driver.py", "imud.testing.invariants": "testing/test_stream.py",
+    "imud.testing.polled": "drivers/test_every_polled_driver.py", "imud.testing.rows": "testing/test_stream.py",
     "imud.web.messages": "web/test_hub.py",
 }  # fmt: skip
 """Modules without a test module of their own, and the test module that covers them."""

@@ -113,7 +113,7 @@ class Registry(Mapping[str, T], Generic[T]):
 
     @property
     def plugin_problems(self) -> Mapping[str, str]:
-        """As `problems_of`."""
+        """Rows of `problems_of`."""
         return self._plugins[1]
 
     @cached_property

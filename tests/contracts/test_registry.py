@@ -77,7 +77,7 @@ def foreign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Foreign:
 
 
 def test_rows_of_other_packages_are_read_once_unless_imud_finds_the_name_in_its_own_rows(foreign: Foreign) -> None:
-    foreign.add("one", {"a": "A"}, "A = Row('a')")
+    foreign.add("one", {"a": "A", "old": "A"}, "A = Row('a')")
     foreign.add("one", {"a": "A"}, "A = Row('a')", "a-second-installation-of-the-same-package")
     table = foreign.read()
     assert table["own"] is OWN

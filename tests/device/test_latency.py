@@ -17,7 +17,7 @@ from imud.model.sample import Sample
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.clock import SampleClock
 from imud.sampling.path import CanPath, PathContext, StreamPath
-from tests.support.codec_invariants import cut
+from imud.testing.invariants import cut
 from tests.support.event_loops import VirtualClock
 
 MOST_NS = 50 * 10**6

@@ -1,15 +1,11 @@
 """Every driver, from its row in DRIVERS: the row, its examples, its calibrations and its data sheet are complete.
 Options and settings are as in the tables of the documents, counters and rates as in the manuals."""
 
-from collections.abc import Callable
-from random import Random
-
-import msgspec
 import pytest
 
 from imud.contracts import driver as contract
-from imud.contracts.command import Calibration, CalibrationInfo, Handling, Kept, Risk, infos
-from imud.contracts.driver import CanDriver, Driver, PolledDriver, StreamDriver
+from imud.contracts.command import Calibration, Handling, Kept, Risk
+from imud.contracts.driver import PolledDriver, StreamDriver
 from imud.contracts.setting import Effect
 from imud.drivers import DRIVERS
 from imud.model.units import NS_PER_MS, NS_PER_US, RAD_PER_DEG
@@ -18,29 +14,9 @@ from tests.support.documented import accepts, check_schema, check_values, rows
 every_driver = pytest.mark.parametrize("name", DRIVERS)
 
 
-def example_of(driver: Driver) -> Callable[[Random], object]:
-    """Return the maker of examples: a frame, the frames of a sample, or the bytes of a poll."""
-    if isinstance(driver, StreamDriver):
-        return driver.example_frame
-    if isinstance(driver, CanDriver):
-        return driver.example_frames
-    assert isinstance(driver, PolledDriver)
-    return driver.example_reading
-
-
 @every_driver
-def test_rows_are_complete(name: str) -> None:
-    driver = DRIVERS[name]
-    assert driver.name == name
-    assert driver.title
-    assert driver.navigation_frame
-    assert driver.euler_convention
-    example = example_of(DRIVERS[name])
-    assert example(Random(5)) == example(Random(5)) != example(Random(6))
-
-    described = infos(DRIVERS[name].calibrations)
-    assert msgspec.json.decode(msgspec.json.encode(described), type=list[CalibrationInfo]) == described
-
+def test_rows_have_their_name_and_a_data_sheet(name: str) -> None:
+    assert DRIVERS[name].name == name
     sheet = DRIVERS[name].data_sheet
     assert "manual" in sheet.document
     assert "no noise figures" in sheet.document

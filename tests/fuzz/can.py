@@ -12,9 +12,9 @@ from imud.contracts.driver import CanDriver
 from imud.formats.can import EXTENDED_ID_MAX, STANDARD_ID_MAX, CanFrame
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
+from imud.testing.invariants import check_closed, feed_frames, finite
 from tests.fuzz.drivers import names_of, row, variants
 from tests.fuzz.target import FRAMES_BYTES_MAX, Target
-from tests.support.codec_invariants import check_closed, feed_frames, finite
 
 OWN = 240  # lower values select an identifier of the device
 STEP_NS = 250_000  # 250 us

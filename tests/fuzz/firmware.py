@@ -22,11 +22,11 @@ from imud.formats.can import CanFrame
 from imud.model.errors import BadArgument
 from imud.model.ledger import Ledger
 from imud.sim.hipnuc.boot_loader import APPLICATION
+from imud.testing.invariants import check_closed, cut
 from tests.fuzz import can
 from tests.fuzz.drivers import row
 from tests.fuzz.scripts import BAUD, answer, can_messages, messages_of
 from tests.fuzz.target import Target
-from tests.support.codec_invariants import check_closed, cut
 
 IMAGE = FirmwareImage(APPLICATION, bytes(64))
 NODE = 8

@@ -12,9 +12,9 @@ from imud.contracts.driver import PolledDriver
 from imud.contracts.script import Transfer, run_transfer_script
 from imud.model.errors import DeviceRefused, TransferError, Trouble
 from imud.model.ledger import Ledger
+from imud.testing.invariants import check_closed, decode_polled
 from tests.fuzz.drivers import EXAMPLES, mend_reading, names_of, row, variants
 from tests.fuzz.target import FRAMES_BYTES_MAX, Target
-from tests.support.codec_invariants import check_closed, decode_polled
 
 CONVERSATION = 0x80  # bit of the first byte: replies to a script
 FAILS = 0x40  # bit of a reply: the transfer fails

@@ -7,9 +7,9 @@ from random import Random
 from imud.contracts.codec import CodecEvent, StreamCodec
 from imud.contracts.driver import StreamDriver
 from imud.model.ledger import Ledger
+from imud.testing.invariants import check_closed, check_counted, cut, feed_stream, untimed
 from tests.fuzz.drivers import EXAMPLES, mender, names_of, row, spliced, variants
 from tests.fuzz.target import FRAMES_BYTES_MAX, Target
-from tests.support.codec_invariants import check_closed, check_counted, cut, feed_stream, untimed
 
 SPLICE_SHARE = 0.1  # share of inputs with an inserted example frame
 

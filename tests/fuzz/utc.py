@@ -10,10 +10,10 @@ from typing import Final
 
 from imud.contracts.lines import UtcReference
 from imud.formats.nmea0183 import RMC_BYTES_MAX, Rmc, RmcFault, as_gprmc, build, checksum, parse
+from imud.testing.invariants import cut
 from imud.utc.receivers import LINE_BYTES_MAX, SentenceSplitter
 from imud.utc.rmc_feed import RmcFeed
 from tests.fuzz.target import Target
-from tests.support.codec_invariants import cut
 
 NOW_NS: Final = 80_000_000_000_000
 UTC_NS: Final = 1_763_717_507_000_000_000

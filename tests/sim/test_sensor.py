@@ -18,6 +18,7 @@ from imud.sim.hipnuc import canopen, j1939, modbus, uart_settings
 from imud.sim.imu61x import uart
 from imud.sim.physics import Noise, swing
 from imud.sim.sensor import SensorHardware, SimulatorOptions, sensor_of
+from imud.testing import simulator_tests
 
 OPTIONS = SimulatorOptions(gravity_m_s2=9.7, noise="none", skew_ppm=-35.0, boot_ms=7, processing_ns=11)
 
@@ -37,40 +38,10 @@ def test_every_option_of_the_sensor_arrives() -> None:
 
 BEGIN_NS = 5 * NS_PER_S
 
-
-@pytest.mark.parametrize("name", [*(name for name in SIMULATORS if name != "hipnuc-modbus"), *CAN_SIMULATORS])
-def test_a_device_sends_exactly_at_the_time_of_next_ns(name: str) -> None:
-    """Before this time nothing is sent. The same is valid after a restart, which cuts the frames on the wire."""
-    simulator = SIMULATORS[name] if name in SIMULATORS else CAN_SIMULATORS[name]
-    module = simulator.make(SimulatorOptions(noise="none", skew_ppm=50.0), BEGIN_NS)
-    now_ns, sent = BEGIN_NS, 0
-    for number in range(60):
-        next_ns = module.next_ns()
-        assert next_ns is not None
-        assert next_ns > now_ns or not number
-        assert not list(module.advance(next_ns - 1))
-        now_ns = next_ns
-        frames: list[Any] = [*module.advance(now_ns)]
-        assert frames
-        assert all(frame.due_ns == now_ns for frame in frames)
-        sent += len(frames)
-        if number == 30:
-            module.reboot(now_ns + 500_000)
-    counters = module.counters()
-    assert sent - 1 <= counters["frames_sent"] <= sent + 6  # a restart drops a frame, and a set is not complete
-
-
-@pytest.mark.parametrize("name", [*(name for name in SIMULATORS if name != "hipnuc-modbus"), *CAN_SIMULATORS])
-def test_the_crystal_and_the_boot_time_decide_the_times_of_frames(name: str) -> None:
-    """A crystal that is 1 % fast makes all periods 1 % shorter. A device is silent while it boots."""
-    simulator, spans_ns = SIMULATORS[name] if name in SIMULATORS else CAN_SIMULATORS[name], []
-    for skew_ppm in (0.0, 10_000.0):
-        module = simulator.make(SimulatorOptions(noise="none", skew_ppm=skew_ppm, boot_ms=300), BEGIN_NS)
-        frames: list[Any] = [*module.advance(BEGIN_NS + 20 * NS_PER_S)]
-        times_ns = [one.due_ns for one in frames if one.sample_ns is not None]
-        assert BEGIN_NS + 300_000_000 < times_ns[0] < BEGIN_NS + 500_000_000
-        spans_ns.append(times_ns[1000] - times_ns[0])
-    assert spans_ns[0] / spans_ns[1] == pytest.approx(1.01, rel=1e-3)
+# a Modbus device sends only replies
+test_simulators = simulator_tests(
+    *(SIMULATORS[name] for name in SIMULATORS if name != "hipnuc-modbus"), *CAN_SIMULATORS.values()
+)
 
 
 def register(number: int, value: int = 1, command: int = 6, size: int = 8) -> tuple[int, bool, bytes]:

@@ -19,7 +19,7 @@ from imud.drivers.hipnuc.uart import codec as uart_codec
 from imud.drivers.hipnuc.uart.driver import DRIVER
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
-from tests.support.codec_invariants import feed_stream
+from imud.testing.invariants import feed_stream
 
 # Manual V1.5.9 section 3.5. Its text contains CRC 0x516C, its table 0xBB14; 0xBB14 is correct.
 MANUAL_HI91 = bytes.fromhex(
