@@ -29,7 +29,7 @@ REQUIREMENTS: Final[Sequence[tuple[type[Driver], Sequence[Requirement]]]] = (
 def driver_tests(*drivers: Driver) -> Callable[..., None]:
     """Return a pytest function that checks all requirements for these drivers with random input."""
     import pytest
-    from hypothesis import given
+    from hypothesis import HealthCheck, given, settings
     from hypothesis import strategies as st
 
     @pytest.mark.parametrize(
@@ -42,6 +42,7 @@ def driver_tests(*drivers: Driver) -> Callable[..., None]:
             for requirement in found
         ],
     )
+    @settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])  # a loaded host is slow
     @given(seed=st.integers(0, 2**32), data=st.binary(max_size=DATA_BYTES_MAX))
     def test(driver: Driver, requirement: Requirement, seed: int, data: bytes) -> None:
         requirement(driver, Random(seed), data)

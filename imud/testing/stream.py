@@ -23,6 +23,11 @@ def measurements(events: Iterable[CodecEvent]) -> list[CodecEvent]:
     return [event for event in untimed(events) if isinstance(event, Measurement)]
 
 
+def truncated(frame: bytes, random: Random) -> bytes:
+    """Return the start of a frame. The first byte of the next frame does not complete it."""
+    return frame[: random.choice([size for size in range(1, len(frame)) if frame[size] != frame[0]])]
+
+
 def noise(driver: StreamDriver, random: Random) -> bytes:
     """Return damage of one kind, without a complete frame."""
     frame = driver.example_frame(random)
@@ -32,7 +37,7 @@ def noise(driver: StreamDriver, random: Random) -> bytes:
     text = random.choice((b"APP_VER=156\r\n", b"OK\n", b"\r", b"Z", b"no end", b"\r\n", b"x" * 400))
     kinds = (
         random.randbytes(random.randint(1, 60)),
-        frame[: random.randrange(1, len(frame))],  # truncated
+        truncated(frame, random),
         frame[random.randrange(1, len(frame)) :],  # start lost
         bytes(flipped),
         head + random.randbytes(random.randint(0, 6)),  # a wrong length
@@ -62,7 +67,7 @@ def any_split_gives_the_same_events(driver: StreamDriver, random: Random, _data:
 
 def a_cut_frame_costs_only_itself(driver: StreamDriver, random: Random, _data: bytes) -> None:
     before, after, lost = ([driver.example_frame(random) for _ in range(n)] for n in (3, 8, 1))
-    shortened = lost[0][: random.randrange(1, len(lost[0]))]
+    shortened = truncated(lost[0], random)
     events = feed_stream(make(driver), cut(b"".join([*before, shortened, *after]) + bytes(IDLE), random))
     expected = [event for frame in before + after for event in make(driver).feed(frame)]
     assert measurements(events) == measurements(expected)
