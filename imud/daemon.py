@@ -38,17 +38,19 @@ from imud.contracts.status import DeviceState, DeviceStatus
 from imud.device.device import Device, RecordableDevices
 from imud.device.factory import DeviceFactory
 from imud.device.latency import LatencyBudget
+from imud.drivers import DRIVERS
 from imud.host.clock import HostClock
 from imud.host.event_loop import Alarm
 from imud.host.log import printable
 from imud.host.service_manager import ServiceManager, notify
 from imud.lines.gpio import GPIO_LINES
 from imud.lines.watched_line import watching
+from imud.links import LINKS
 from imud.model.errors import CommandError, ConfigError, ImudError, ServerError
 from imud.model.event import Event, EventKind, EventLog
 from imud.model.ledger import NOTHING_LOST
 from imud.model.units import NS_PER_MS
-from imud.publishers.outputs import Outputs
+from imud.publishers.outputs import Outputs, modules_of
 from imud.utc.system_clock import kernel_clock, system_reference
 
 log = logging.getLogger(__name__)
@@ -360,9 +362,10 @@ class Daemon:
         self._outputs.remove_device(name)
 
     def _on_done(self, task: asyncio.Task[None]) -> None:
-        """Stop after an error in the task of a device. The service manager restarts imud."""
-        if not task.cancelled() and task.exception() is not None:
-            self._failure = task.exception()
+        """Stop after an internal error in the task of a device. The service manager restarts imud."""
+        error = None if task.cancelled() else task.exception()
+        if error is not None and not (isinstance(error, Exception) and self._take_driver_error(error)):
+            self._failure = error
             self._stop.set()
         if self._until_finished and self.finished:
             self._stop.set()
@@ -376,12 +379,37 @@ class Daemon:
     def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
         """Restart the output that raised an exception in a callback. Stop after any other internal error."""
         error = context.get("exception")
-        if isinstance(error, Exception) and self._outputs.take_error(error):
+        if isinstance(error, Exception) and (self._outputs.take_error(error) or self._take_driver_error(error)):
             return
         if not isinstance(error, ImudError):  # the caller prints the words of an ImudError
             log.error("%s", context.get("message"), exc_info=error if isinstance(error, BaseException) else None)
         self._failure = error if isinstance(error, BaseException) else RuntimeError(str(context.get("message")))
         self._stop.set()
+
+    def _take_driver_error(self, error: Exception) -> bool:
+        """Stop using the driver of another package that caused an error. Return False if none caused it.
+
+        Its devices end, and devices that search for their driver start again. A thread serves the devices of a polled
+        bus and has ended, so these devices need a restart of imud.
+        """
+        words = f"internal error {type(error).__name__}: {error}"
+        names = DRIVERS.disable(set(modules_of(error)), words)
+        users = {name for name, device in self._devices.items() if device.status().driver in names}
+        if not names or any(LINKS[one.link].polled for one in self.config.devices if one.name in users):
+            return False
+        log.error("%s: %s; imud stops its devices and continues", ", ".join(names), words, exc_info=error)
+        for one in self.config.devices:
+            ends = one.name in users
+            if ends or (one.name in self._devices and self._devices[one.name].state is not DeviceState.RUNNING):
+                if ends:
+                    text = f"imud does not use {one.name} and the driver {names[0]} until its next start: {words}"
+                    self.send_event(Event(self._host.now_ns(), "", EventKind.CONFIGURATION, text))
+                self._stop_device(one.name)
+                if not ends:
+                    self._start_device(one)
+        if self._alarm is not None:
+            self._alarm.set(TICK_S)  # the error may have ended a tick
+        return True
 
     def send_event(self, event: Event) -> None:
         """Store an event, and pass it to the outputs."""

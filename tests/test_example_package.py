@@ -14,6 +14,7 @@ import msgspec
 import pytest
 
 from imud.cli.demo import simulator
+from imud.client.connection import Client
 from tests.support.daemon_process import running_daemon, wait_until, write_config
 from tests.support.plugin_package import write_package
 
@@ -140,3 +141,44 @@ def test_a_package_with_a_problem_stops_nothing(tmp_path: Path, monkeypatch: pyt
     assert f"cannot use the driver old-uart {why}" in imud("decode", "--driver", "old-uart", capture, status=2)
     assert f"cannot use the simulator old-uart {why}" in imud("demo", "--device", "old-uart", status=2)
     assert "hipnuc-uart" in imud("schema")
+
+
+FAILING = """
+from dataclasses import replace
+from imud.drivers import DRIVERS
+from imud.drivers.imu61x.uart.codec import Imu61xCodec
+
+class Codec(Imu61xCodec):
+    def feed(self, data):
+        raise OverflowError("too large")
+
+ROW = replace(DRIVERS["imu61x-uart"], name="failing", interface=1, make_codec=Codec)
+"""
+
+
+def test_a_driver_that_raises_ends_only_its_devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = {"imud.drivers": {"failing": "failing_example:ROW"}}
+    write_package(tmp_path / "site", "failing-example", points, {"failing_example.py": FAILING})
+    use(tmp_path / "site", monkeypatch)
+    (tmp_path / "capture.bin").write_bytes(bytes(100))
+    devices = {
+        "bow": {"driver": "failing", "replay": {"path": str(tmp_path / "capture.bin"), "speed": "maximum"}},
+        "mast": {"uart": {"port": str(tmp_path / "port")}},
+    }
+    file = tmp_path / "imud.yaml"
+    with simulator(tmp_path, [("hipnuc-uart", 0)], 100.0, ""):
+        write_config(tmp_path, devices)
+        words = [sys.executable, "-m", "imud", "run", "--config", str(file)]
+        with (tmp_path / "log").open("w") as log, subprocess.Popen(words, stderr=log) as process:
+            try:
+                wait_until(lambda: "mast: hipnuc-uart on" in (tmp_path / "log").read_text(), "mast")
+                with Client(tmp_path / "imud.sock") as client:
+                    assert [one["name"] for one in client.status()["devices"]] == ["mast"]
+                events = imud("events", "--socket", tmp_path / "imud.sock", "--since", "10min")
+                assert "imud does not use bow and the driver failing until its next start" in " ".join(events.split())
+            finally:
+                process.terminate()
+            assert process.wait(60) == 0
+    text = (tmp_path / "log").read_text()
+    assert "failing: internal error OverflowError: too large; imud stops its devices and continues" in text
+    assert "Traceback" in text

@@ -7,7 +7,7 @@ first use of a name that is not a row of imud, and at the first iteration.
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cache, cached_property
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar, cast
@@ -94,6 +94,7 @@ class Registry(Mapping[str, T], Generic[T]):
         self.kind = kind
         self.rows = dict(rows)
         self._group = group
+        self._modules: dict[str, str] = {}  # module of each row of another package
 
     def __getitem__(self, name: str) -> T:
         if name in self.rows:
@@ -116,6 +117,16 @@ class Registry(Mapping[str, T], Generic[T]):
         """Rows of `problems_of`."""
         return self._plugins[1]
 
+    def disable(self, modules: Collection[str], reason: str) -> Sequence[str]:
+        """Remove the rows of other packages with one of these modules. Return their names."""
+        rows, problems = self._plugins
+        packages = {module.partition(".")[0] for module in modules}
+        found = [name for name in rows if self._modules[name].partition(".")[0] in packages]
+        for name in found:
+            del rows[name]
+            problems[name] = f"cannot use the {self.kind} {name}: {reason}"
+        return found
+
     @cached_property
     def _plugins(self) -> tuple[dict[str, T], dict[str, str]]:
         """Rows of other packages by name, and the reasons why imud cannot use a row."""
@@ -135,6 +146,7 @@ class Registry(Mapping[str, T], Generic[T]):
                 problems[point] = f"cannot use the {self.kind} {point} of {packages}: {problem}"
             else:
                 rows[point] = cast(T, row)
+                self._modules[point] = same[0].point.module
         return rows, problems
 
     def _clash(self, name: str, count: int, group: PluginGroup) -> str:

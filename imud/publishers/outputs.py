@@ -154,7 +154,7 @@ class Outputs:
 
     def take_error(self, error: BaseException) -> bool:
         """Restart the output that caused an error in a callback of the event loop. Return False if none caused it."""
-        modules = set(_modules_of(error))
+        modules = set(modules_of(error))
         for name, publisher in self._running.items():
             if name not in self._extra and any(_belongs(module, type(publisher).__module__) for module in modules):
                 self._fail(name, error)
@@ -252,7 +252,7 @@ def _unexpected(error: BaseException) -> BaseException | None:
     return None if isinstance(error, ServerError) else error
 
 
-def _modules_of(error: BaseException) -> Iterator[str]:
+def modules_of(error: BaseException) -> Iterator[str]:
     """Yield the names of the modules whose functions an exception passed."""
     trace = error.__traceback__
     while trace is not None:
