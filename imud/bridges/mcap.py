@@ -14,7 +14,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import accumulate, chain, count, repeat
 from typing import Any, Final
 
-import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -34,6 +33,7 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 from imud.bridges.channel import ByteWriter, MessageChannel, MessageSchema
+from imud.formats.zstandard import FrameEncoder
 
 # Size of a chunk, bytes, as in the writer of the library. Larger chunks save 2 %, but a reader of one second of a topic
 # must unpack a complete chunk.
@@ -95,7 +95,7 @@ class McapFile:
         self._parts: list[bytes] = []
         self._size = 0
         self._chunks: list[ChunkIndex] = []
-        self._compressor = zstandard.ZstdCompressor(level=LEVEL)
+        self._encoder = FrameEncoder(LEVEL)
         self._thread = ThreadPoolExecutor(1, "compress")
         # Chunk that the thread compresses: result, size, CRC, and the message indexes by channel
         self._waiting: tuple[Future[bytes], int, int, dict[int, list[int]]] | None = None
@@ -176,7 +176,7 @@ class McapFile:
                 indexes[channel.id] = channel.index
                 channel.index = []
         self._write_waiting()
-        compressed = self._thread.submit(self._compressor.compress, content)
+        compressed = self._thread.submit(self._encoder.encode, content)
         self._waiting = compressed, len(content), zlib.crc32(content), indexes
 
     def _write_waiting(self) -> None:

@@ -22,10 +22,10 @@ from enum import StrEnum
 from typing import Annotated, Any, Final, NamedTuple
 
 import msgspec
-import zstandard
 
 from imud.fleet.settings import NAME_PATTERN, is_name
 from imud.formats.slot import SLOT_BYTES, SLOT_BYTES_V1, SLOT_LAYOUT_VERSION, decode_slot
+from imud.formats.zstandard import FrameEncoder, content_size, decode_frame
 from imud.model.errors import reason_of
 from imud.model.event import Event
 from imud.model.sample import Position, Sample, Sync, values_of
@@ -222,7 +222,7 @@ def encode_slots_message(message: FleetMessage, slots: Sequence[bytes]) -> bytes
     header = _ENCODER.encode(message)
     version = SLOT_LAYOUT_VERSION if any(slot[SLOT_BYTES_V1:] != _NO_MORE for slot in slots) else 1
     packed = b"".join(slots if version > 1 else [slot[:SLOT_BYTES_V1] for slot in slots])
-    compressed = zstandard.ZstdCompressor(level=LEVEL).compress(packed)
+    compressed = FrameEncoder(LEVEL).encode(packed)
     return _PREFIX.pack(MAGIC, version, 0, len(header)) + header + compressed
 
 
@@ -230,7 +230,7 @@ def decode_message(payload: bytes) -> FleetMessage:
     """Return the message of a payload, with its slots as samples. Raises ValueError if the payload is invalid."""
     try:
         message = _decode_slots(payload) if payload.startswith(MAGIC) else _DECODER.decode(checked_json(payload))
-    except (msgspec.DecodeError, RecursionError, zstandard.ZstdError, struct.error) as error:
+    except (msgspec.DecodeError, RecursionError, struct.error) as error:
         raise ValueError(f"expected a message of a gateway, got {len(payload)} other bytes") from error
     if message.v != VERSION:
         raise ValueError(f"expected a message of version {VERSION}, got {message.v}: the gateway has a newer imud")
@@ -253,7 +253,7 @@ def check_payload(payload: bytes) -> MessageHead:
         header, slots, slot_bytes = _parts_of_slots(payload)
         _decompressed(slots, slot_bytes)
         return _HEAD_DECODER.decode(header)
-    except (msgspec.DecodeError, RecursionError, zstandard.ZstdError, struct.error) as error:
+    except (msgspec.DecodeError, RecursionError, struct.error) as error:
         raise ValueError(f"expected a message of a gateway, got {len(payload)} other bytes") from error
 
 
@@ -315,9 +315,9 @@ def _parts_of_slots(payload: bytes) -> tuple[bytes, bytes, int]:
 
 def _decompressed(frame: bytes, slot_bytes: int) -> bytes:
     # the sender declares this size, and the decompressor allocates it
-    if not 0 < zstandard.frame_content_size(frame) <= SLOTS_MAX * slot_bytes:
-        raise ValueError(f"expected 1 to {SLOTS_MAX} slots, got {zstandard.frame_content_size(frame)} bytes")
-    slots = zstandard.ZstdDecompressor().decompress(frame)
+    if not 0 < (size := content_size(frame)) <= SLOTS_MAX * slot_bytes:
+        raise ValueError(f"expected 1 to {SLOTS_MAX} slots, got {size} bytes")
+    slots = decode_frame(frame)
     if len(slots) % slot_bytes:
         raise ValueError(f"expected slots of {slot_bytes} bytes, got {len(slots)}")
     return slots

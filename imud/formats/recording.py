@@ -19,10 +19,9 @@ import zlib
 from collections.abc import Iterator
 from typing import Final, NamedTuple, Protocol
 
-import zstandard
-
 from imud.formats import records
 from imud.formats.records import Kind, Record, SessionRecord, decode_object, records_of
+from imud.formats.zstandard import FrameEncoder, content_size, decode_frame
 from imud.model.errors import ImudError
 
 # First bytes of a block. The first byte is not ASCII, so that no program mistakes the file for text.
@@ -57,13 +56,13 @@ class BlockEncoder:
 
     def __init__(self) -> None:
         self.number = 0  # number of the next block
-        self._compressor = zstandard.ZstdCompressor(level=LEVEL)
+        self._encoder = FrameEncoder(LEVEL)
 
     def encode(self, content: bytes) -> bytes:
         """Return the next block with this content. Raises ValueError for more than PLAIN_MAX bytes."""
         if len(content) > PLAIN_MAX:
             raise ValueError(f"expected a block of at most {PLAIN_MAX} bytes, got {len(content)}")
-        method, stored = ZSTANDARD, self._compressor.compress(content)
+        method, stored = ZSTANDARD, self._encoder.encode(content)
         if not len(content) / RATIO_MAX <= len(stored) < len(content):
             method, stored = STORED, content
         head = HEAD.pack(MAGIC, method, self.number, len(content), len(stored), 0)[:-_CRC_BYTES]
@@ -103,7 +102,6 @@ class BlockReader:
         self.bytes_cut = 0  # size of an incomplete block at the end of the file
         self.blocks_missing = 0  # number of blocks that are missing according to the block numbers
         self._vain_bytes = 0  # size of all possible blocks with a wrong CRC
-        self._decompressor = zstandard.ZstdDecompressor()
 
     def __iter__(self) -> Iterator[Block]:
         expected = 0
@@ -135,10 +133,10 @@ class BlockReader:
             return None
         if method == ZSTANDARD:
             try:
-                if zstandard.frame_content_size(stored) != plain:  # this size decides the allocation
+                if content_size(stored) != plain:  # this size decides the allocation
                     return None
-                stored = self._decompressor.decompress(stored)
-            except zstandard.ZstdError:
+                stored = decode_frame(stored)
+            except ValueError:
                 return None
         return Block(number, stored, size) if len(stored) == plain else None
 

@@ -142,7 +142,7 @@ def test_examples_of_the_page(daemon: RunningDaemon, words: tuple[object, ...], 
     """The second program finds the HI91 frames in the order of time without imud."""
     assert example("imud.client", env=os.environ | {"IMUD_SOCKET": str(daemon.socket)}) == "b'\\x89imudREC'\n"
     cli(*words, "--for", "1s", "--device", "bow", tmp_path / "file")
-    reads = [line.split() for line in example("zstandard", cwd=tmp_path).splitlines()]
+    reads = [line.split() for line in example("zstd", cwd=tmp_path).splitlines()]
     assert reads
     assert [int(t_ns) for _, t_ns, _ in reads] == sorted(int(t_ns) for _, t_ns, _ in reads)
     assert b"\x5a\xa5\x4c\x00" in bytes.fromhex("".join(data for *_, data in reads)), "HI91 has 76 bytes"
