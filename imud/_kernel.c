@@ -14,6 +14,7 @@
  *   is_at ─▶ is_at (imud/formats/kernel.py)
  *   frame_slots ─▶ BinaryEncoding (imud/publishers/socket/outbox.py)
  *   add_slots ─▶ add_slots (imud/publishers/socket/history.py)
+ *   evaluate ─▶ evaluate (imud/publishers/rules/limit.py)
  *   add_latencies ─▶ LatencyMeter.add (imud/sampling/meters.py), slot_status_bits (imud/formats/slot.py)
  *
  * The result must be equal to the result of Python in every bit. Therefore the compiler must not join a product and a
@@ -1224,7 +1225,261 @@ static PyObject *can_frames(PyObject *self, PyObject *args)
     return frames;
 }
 
+#define RULE_ORDER 4              /* `ORDER` of imud/publishers/rules/limit.py */
+#define RULE_AXES 3
+#define RULE_PERIOD_NS 1000000000 /* `PERIOD_NS`, `STEP_MAX_NS` */
+#define RULE_PERIOD_STEPS 16
+#define RULE_LATE_MAX 16
+#define RULE_GAP_PERIODS 1.5
+#define RULE_PERIOD_CHANGE 0.05
+
+enum { MAGNITUDE, SIGNED, TILT, INTEGER }; /* `Reduction` */
+enum { OF_SAMPLE, PEAK, RMS };             /* `Statistic` */
+enum { UNCHANGED, BEGIN, END, PERIOD };    /* `Change` */
+
+/* `LimitState` of imud/publishers/rules/limit.py */
+typedef struct {
+    double above, below, above_end, below_end, scale, value, period_ns, peak, peak_before;
+    int64_t hold_ns, end_hold_ns, window_ns, settle_ns, last_ns, held_ns, begin_ns, number, measured_ns, measured, late,
+        filter_ns, used, absent, not_finite, evaluated, restarts;
+    uint32_t bit;
+    uint16_t offset;
+    uint8_t count, reduction, statistic, has_band, designed, active, change, is_old, is_filtering, has_window;
+    double sums[RULE_AXES], squares[RULE_AXES], gains[RULE_ORDER], a1[RULE_ORDER], a2[RULE_ORDER];
+    double memory[RULE_AXES][RULE_ORDER][2];
+} Limit;
+
+_Static_assert(sizeof(Limit) == 560, "a limit has 560 bytes without padding");
+
+static int are_finite(const double *values, int count)
+{
+    for (int i = 0; i < count; i++)
+        if (!isfinite(values[i]))
+            return 0;
+    return 1;
+}
+
+static int follow_period(Limit *limit, int64_t t_ns, int64_t step_ns)
+{
+    if (limit->period_ns > 0 && (double)step_ns > RULE_GAP_PERIODS * limit->period_ns) {
+        limit->measured_ns = t_ns;
+        limit->measured = limit->is_filtering = 0;
+        limit->restarts++;
+        if (++limit->late >= RULE_LATE_MAX) {
+            limit->period_ns = 0;
+            limit->designed = 0;
+            limit->late = 0;
+        }
+        return 0;
+    }
+    limit->late = 0;
+    limit->measured += step_ns > 0;
+    if (limit->measured < RULE_PERIOD_STEPS || t_ns - limit->measured_ns < RULE_PERIOD_NS)
+        return 0;
+    double mean_ns = (double)(t_ns - limit->measured_ns) / (double)limit->measured;
+    limit->measured_ns = t_ns;
+    limit->measured = 0;
+    if (limit->period_ns > 0 && fabs(mean_ns - limit->period_ns) <= RULE_PERIOD_CHANGE * limit->period_ns)
+        return 0;
+    limit->period_ns = mean_ns;
+    limit->designed = 0;
+    return 1;
+}
+
+static void filter(Limit *limit, int64_t t_ns, double *x)
+{
+    if (!limit->is_filtering) {
+        limit->is_filtering = 1;
+        limit->filter_ns = t_ns;
+        limit->has_window = 0;
+        limit->held_ns = -1;
+        memset(limit->memory, 0, sizeof limit->memory);
+        for (int axis = 0; axis < limit->count; axis++)
+            limit->memory[axis][0][0] = limit->memory[axis][0][1] = -(limit->gains[0] * x[axis]);
+    }
+    for (int axis = 0; axis < limit->count; axis++) {
+        double value = x[axis];
+        for (int i = 0; i < RULE_ORDER; i++) {
+            double *memory = limit->memory[axis][i], fed = limit->gains[i] * value;
+            value = fed + memory[0];
+            memory[0] = memory[1] - limit->a1[i] * value;
+            memory[1] = -fed - limit->a2[i] * value;
+        }
+        x[axis] = value;
+    }
+}
+
+/* Return whether a window is complete; its RMS is then in `value`. */
+static int add_to_rms(Limit *limit, int64_t t_ns, int64_t step_ns, const double *x)
+{
+    if (limit->has_window && step_ns >= limit->window_ns)
+        limit->has_window = 0;
+    if (!limit->has_window)
+        limit->value = INFINITY;
+    if (!limit->has_window || t_ns - limit->begin_ns >= limit->window_ns) {
+        if (limit->has_window) {
+            double total = 0.0;
+            for (int axis = 0; axis < RULE_AXES; axis++) {
+                double mean = limit->has_band ? 0.0 : limit->sums[axis] / (double)limit->number;
+                double square = limit->squares[axis] / (double)limit->number - mean * mean;
+                total += 0.0 > square ? 0.0 : square;
+            }
+            limit->value = limit->scale * sqrt(total);
+        }
+        limit->begin_ns = t_ns;
+        limit->number = 0;
+        limit->has_window = 1;
+        memset(limit->sums, 0, sizeof limit->sums);
+        memset(limit->squares, 0, sizeof limit->squares);
+    }
+    limit->number++;
+    for (int axis = 0; axis < limit->count; axis++) {
+        limit->sums[axis] += x[axis];
+        limit->squares[axis] += x[axis] * x[axis];
+    }
+    return limit->value != INFINITY;
+}
+
+/* Return the value of a sample, or the peak of its windows. */
+static double value_of(Limit *limit, int64_t t_ns, const double *x)
+{
+    double value;
+    if (limit->reduction == TILT)
+        value = limit->scale * acos(cos(x[0]) * cos(x[1]));
+    else if (limit->reduction != MAGNITUDE)
+        value = limit->scale * x[0];
+    else if (limit->count == 1)
+        value = limit->scale * fabs(x[0]);
+    else
+        value = limit->scale * sqrt((x[0] * x[0] + x[1] * x[1]) + x[2] * x[2]);
+    if (limit->statistic == OF_SAMPLE || !isfinite(value))
+        return value;
+    if (!limit->has_window || t_ns - limit->begin_ns >= limit->window_ns) {
+        limit->peak_before = limit->has_window && t_ns - limit->begin_ns < 2 * limit->window_ns ? limit->peak : 0.0;
+        limit->peak = value;
+        limit->begin_ns = t_ns;
+        limit->has_window = 1;
+    } else if (value > limit->peak) {
+        limit->peak = value;
+    }
+    return limit->peak > limit->peak_before ? limit->peak : limit->peak_before;
+}
+
+static int compare(Limit *limit, double value, int64_t step_ns)
+{
+    limit->value = value;
+    limit->evaluated++;
+    int is_new_side = limit->active ? value <= limit->above_end && value >= limit->below_end
+                                    : value > limit->above || value < limit->below;
+    if (!is_new_side) {
+        limit->held_ns = -1;
+        return UNCHANGED;
+    }
+    if (limit->held_ns < 0)
+        limit->held_ns = 0;
+    else
+        limit->held_ns += step_ns < RULE_PERIOD_NS ? step_ns : RULE_PERIOD_NS;
+    if (limit->held_ns < (limit->active ? limit->end_hold_ns : limit->hold_ns))
+        return UNCHANGED;
+    limit->active = !limit->active;
+    limit->held_ns = -1;
+    return limit->active ? BEGIN : END;
+}
+
+static int add_to_limit(Limit *limit, const char *slot)
+{
+    int64_t t_ns, step_ns = 0;
+    uint32_t present, integer;
+    double x[RULE_AXES];
+    memcpy(&t_ns, slot + offsetof(Slot, t_ns), sizeof t_ns);
+    memcpy(&present, slot + offsetof(Slot, present), sizeof present);
+    if (limit->bit && !(present & limit->bit)) {
+        limit->absent++;
+        return UNCHANGED;
+    }
+    if (limit->reduction == INTEGER) {
+        memcpy(&integer, slot + limit->offset, sizeof integer);
+        x[0] = integer;
+    } else {
+        memcpy(x, slot + limit->offset, limit->count * sizeof x[0]);
+    }
+    if (!are_finite(x, limit->count) || !is_time(t_ns)) {
+        limit->not_finite++;
+        limit->is_filtering = 0;
+        return UNCHANGED;
+    }
+    if (limit->is_old)
+        step_ns = t_ns - limit->last_ns;
+    if (!limit->is_old || step_ns < 0) {
+        limit->is_old = 1;
+        limit->measured_ns = t_ns;
+        limit->measured = limit->late = limit->is_filtering = limit->has_window = 0;
+        limit->held_ns = -1;
+        step_ns = 0;
+    }
+    limit->last_ns = t_ns;
+    limit->used++;
+    if (limit->has_band) {
+        if (follow_period(limit, t_ns, step_ns))
+            return PERIOD;
+        if (!limit->designed)
+            return UNCHANGED;
+        filter(limit, t_ns, x);
+        if (!are_finite(x, limit->count)) {
+            limit->not_finite++;
+            limit->is_filtering = 0;
+            return UNCHANGED;
+        }
+        if (t_ns - limit->filter_ns < limit->settle_ns)
+            return UNCHANGED;
+    }
+    double value;
+    if (limit->statistic != RMS)
+        value = value_of(limit, t_ns, x);
+    else if (add_to_rms(limit, t_ns, step_ns, x))
+        value = limit->value;
+    else
+        return UNCHANGED;
+    if (!isfinite(value)) {
+        limit->not_finite++;
+        return UNCHANGED;
+    }
+    return compare(limit, value, step_ns);
+}
+
+/* evaluate(limit, slots, offset) -> offset after the first slot with a change; -1 if no slot has one */
+static PyObject *evaluate(PyObject *self, PyObject *const *args, Py_ssize_t count)
+{
+    Py_buffer state;
+    char *slots;
+    Py_ssize_t size, offset, end = -1;
+    Limit limit;
+    if (count != 3) {
+        PyErr_Format(PyExc_TypeError, "evaluate: expected 3 arguments, got %zd", count);
+        return NULL;
+    }
+    offset = PyLong_AsSsize_t(args[2]);
+    if ((offset == -1 && PyErr_Occurred()) || PyBytes_AsStringAndSize(args[1], &slots, &size) < 0 ||
+        PyObject_GetBuffer(args[0], &state, PyBUF_WRITABLE) < 0)
+        return NULL;
+    if (state.len == (Py_ssize_t)sizeof limit)
+        memcpy(&limit, state.buf, sizeof limit);
+    if (state.len != (Py_ssize_t)sizeof limit || offset < 0 || limit.count > RULE_AXES ||
+        limit.offset > sizeof(Slot) - sizeof(double) * RULE_AXES) {
+        PyErr_SetString(PyExc_ValueError, "expected 560 bytes of a limit and an offset of 0 or more");
+    } else {
+        for (; end < 0 && size - offset >= (Py_ssize_t)sizeof(Slot); offset += (Py_ssize_t)sizeof(Slot))
+            if ((limit.change = (uint8_t)add_to_limit(&limit, slots + offset)) != UNCHANGED)
+                end = offset + (Py_ssize_t)sizeof(Slot);
+        memcpy(state.buf, &limit, sizeof limit);
+    }
+    PyBuffer_Release(&state);
+    return PyErr_Occurred() ? NULL : PyLong_FromSsize_t(end);
+}
+
 static PyMethodDef methods[] = {
+    {"evaluate", (PyCFunction)(void (*)(void))evaluate, METH_FASTCALL,
+     "Evaluate slots up to the first change of a limit; return the offset after its slot, or -1."},
     {"receive", receive, METH_VARARGS, "Receive CAN frames by recvmmsg."},
     {"can_frames", can_frames, METH_VARARGS, "Return CAN frames of the buffers of recvmmsg; or None."},
     {"add_latencies", (PyCFunction)(void (*)(void))add_latencies, METH_FASTCALL,

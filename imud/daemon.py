@@ -43,6 +43,7 @@ from imud.host.clock import HostClock
 from imud.host.event_loop import Alarm
 from imud.host.log import printable
 from imud.host.service_manager import ServiceManager, notify
+from imud.lines.driven_line import driving
 from imud.lines.gpio import GPIO_LINES
 from imud.lines.watched_line import watching
 from imud.links import LINKS
@@ -185,6 +186,7 @@ class Daemon:
             outputs=OutputFacts(),
             latencies=self._latencies,
             watch_line=watching(lines, host),
+            drive_line=driving(lines, host),
             owner=self,
             configuration="" if file is None else str(file.absolute()),
             past_events=EventLog(host.now_ns()),

@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from re import compile as pattern
 from typing import Any, Final, NamedTuple
@@ -79,7 +79,7 @@ def _config(keys: Keys, tables: Tables, pause: Callable[[], None]) -> Config | N
     for name, options in publishers.items():
         for path, message in tables.publishers[name].check(options, tables.drivers).items() if options else ():
             keys.problem((name, *path), message)
-    outputs = {name: tables.publishers[name].claims(one) for name, one in publishers.items() if one is not None}
+    outputs = {name: options for name, options in publishers.items() if options is not None}
     devices = DeviceReader(keys, tables, pause, outputs).devices(top)
     if general is None or devices is None or keys.problems:
         return None
@@ -355,17 +355,16 @@ def read_lines(
     return DeviceLines(**made) if made else None  # type: ignore[arg-type]  # each was made by the schema of its key
 
 
-def lines_once(keys: Keys, devices: Sequence[DeviceConfig]) -> None:
-    """Report a GPIO line that is used twice, by one device or by two devices."""
+def lines_once(keys: Keys, used: Iterable[tuple[KeyPath, LineOptions]]) -> None:
+    """Report a GPIO line that is used twice, by devices or outputs. `used` contains the paths of their keys."""
     owners: list[tuple[LineOptions, str]] = []
-    for device in devices:
-        for name, settings in _lines_of_device(device):
-            path: KeyPath = ("devices", device.name, "lines", name)
-            first = next((place for other, place in owners if _same_line(other, settings)), None)
-            if first is not None:
-                wire = f"{settings.chip} line {settings.line}" if settings.chip else f"line {settings.line}"
-                keys.problem(path, f"expected an unused line, got {wire}, which {first} uses", at_key=True)
-            owners.append((settings, f"{device.name}.lines.{name} (line {keys.tree.key_mark(path).line})"))
+    for path, settings in used:
+        first = next((place for other, place in owners if _same_line(other, settings)), None)
+        if first is not None:
+            wire = f"{settings.chip} line {settings.line}" if settings.chip else f"line {settings.line}"
+            keys.problem(path, f"expected an unused line, got {wire}, which {first} uses", at_key=True)
+        place = ".".join(map(str, path[1:] if path[0] == "devices" else path))
+        owners.append((settings, f"{place} (line {keys.tree.key_mark(path).line})"))
 
 
 def read_rmc(keys: Keys, path: KeyPath, device: Mapping[str, Any], drivers: Mapping[str, Driver]) -> RmcOptions | None:
@@ -415,11 +414,11 @@ def _with_lines(drivers: Mapping[str, Driver]) -> Iterator[str]:
                 yield name
 
 
-def _lines_of_device(device: DeviceConfig) -> Iterator[tuple[str, LineOptions]]:
+def _lines_of_device(device: DeviceConfig) -> Iterator[tuple[KeyPath, LineOptions]]:
     for name in LINE_SCHEMAS if device.lines is not None else ():
         settings = getattr(device.lines, name)
         if settings is not None:
-            yield name, settings
+            yield ("devices", device.name, "lines", name), settings
 
 
 def _same_line(one: LineOptions, other: LineOptions) -> bool:
@@ -443,12 +442,14 @@ DEVICE_NAME: Final = pattern(DEVICE_NAME_PATTERN)
 
 
 class DeviceReader:
-    def __init__(
-        self, keys: Keys, tables: Tables, pause: Callable[[], None], outputs: Mapping[str, Sequence[Claim]]
-    ) -> None:
-        """imud calls `pause` after each device. `outputs` contains the ports that each output uses."""
+    def __init__(self, keys: Keys, tables: Tables, pause: Callable[[], None], outputs: Mapping[str, Options]) -> None:
+        """imud calls `pause` after each device. `outputs` contains the options of each output."""
         self._keys = keys
-        self._outputs = outputs
+        rows = tables.publishers
+        self._outputs = {name: rows[name].claims(one) for name, one in outputs.items()}
+        self._output_lines = [
+            ((name, *path), it) for name, one in outputs.items() for path, it in rows[name].lines(one)
+        ]
         self._tables = tables
         self._declared = DeclaredReader(keys, tables.drivers)
         self._pause = pause
@@ -471,7 +472,7 @@ class DeviceReader:
         for clash in clashes(used, self._tables.links, self._tables.drivers, self._pause, self._outputs):
             self._keys.problem(*clash)
         self._buses_carry(used)
-        lines_once(self._keys, used)
+        lines_once(self._keys, chain(*map(_lines_of_device, used), self._output_lines))
         return made
 
     def _device(self, name: str, data: object) -> tuple[DeviceConfig, bool] | None:

@@ -325,6 +325,28 @@ class LineOwner(Protocol):
 WatchLine = Callable[[InputOptions, str, LineOwner], WatchedInput]
 
 
+class DrivenOutput(Protocol):
+    """Output line that opens again after a failure. Synchronization: the thread of the loop only."""
+
+    problem: str  # reason why imud cannot drive the line, one sentence; empty if it can
+
+    def tick(self, now_ns: int) -> None:
+        """Open the line if an attempt is due. Call this method at least twice per second."""
+        ...
+
+    def set(self, active: bool) -> None:
+        """Set the level, now or after the line is open."""
+        ...
+
+    def close(self) -> None:
+        """Make the line inactive and release it. A second call does nothing."""
+        ...
+
+
+# Returns a driven line from its options and a readable purpose
+DriveLine = Callable[[OutputOptions, str], DrivenOutput]
+
+
 class OutputLine(Protocol):
     """Output line. Synchronization: one thread at a time."""
 

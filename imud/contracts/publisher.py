@@ -1,6 +1,6 @@
 """Contract of a publisher: it outputs samples and events and never delays the device."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
 from socket import socket
@@ -11,11 +11,19 @@ from imud.attitude.published import PublishedAxes, as_sent
 from imud.contracts.command import CalibrationResult, Calibrations, LastCalibration, Verbs
 from imud.contracts.driver import Driver
 from imud.contracts.firmware import FirmwareControl
-from imud.contracts.lines import UtcReference, WatchLine
+from imud.contracts.lines import DriveLine, LineOptions, UtcReference, WatchLine
 from imud.contracts.link import Claim
 from imud.contracts.registry import load
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
-from imud.contracts.status import ClientStatus, DeviceStatus, FlightStatus, MqttStatus, OutputStatus, RecorderStatus
+from imud.contracts.status import (
+    ClientStatus,
+    DeviceStatus,
+    FlightStatus,
+    MqttStatus,
+    OutputStatus,
+    RecorderStatus,
+    RulesStatus,
+)
 from imud.formats.slot import SLOT_BYTES, decode_slots, encode_slots, slot_seqs, slot_times_ns
 from imud.model.event import Event, EventLog
 from imud.model.options import Options
@@ -299,6 +307,7 @@ class OutputFacts:
     # Functions that return the state of the ports of an output, by the name of the output
     ports: dict[str, Callable[[], Sequence[OutputStatus]]] = field(default_factory=dict)
     mqtts: list[Callable[[], MqttStatus]] = field(default_factory=list)
+    rules: list[Callable[[], RulesStatus]] = field(default_factory=list)
     snapshots: list[TakeSnapshot] = field(default_factory=list)  # functions of flight recorders that send a snapshot
     rings: dict[str, str] = field(default_factory=dict)  # path of the ring file of each device in shared memory
     # Devices that have no ring file because imud cannot create it now
@@ -308,12 +317,17 @@ class OutputFacts:
 
     def problems(self) -> dict[str, str]:
         """Return the problem of each output, or port of an output, that does not work."""
-        return self.failed | {
-            f"{output} {port.name}": port.problem
-            for output, status in self.ports.items()
-            for port in status()
-            if port.problem
-        }
+        rules = {name: words for status in self.rules for name, words in status().problems().items()}
+        return (
+            self.failed
+            | rules
+            | {
+                f"{output} {port.name}": port.problem
+                for output, status in self.ports.items()
+                for port in status()
+                if port.problem
+            }
+        )
 
 
 class OutputOwner(Protocol):
@@ -338,6 +352,7 @@ class PublisherContext:
     outputs: OutputFacts
     latencies: Latencies  # register of the latencies that readers need
     watch_line: WatchLine  # watches a GPIO line that belongs to no device
+    drive_line: DriveLine  # drives a GPIO line that belongs to no device
     owner: OutputOwner
     configuration: str = ""  # absolute path of the configuration file; empty without a file
     past_events: EventLog = field(default_factory=EventLog)
@@ -363,6 +378,8 @@ class PublisherType:
     wanted: Callable[[Any], bool] = attrgetter("enabled")  # whether these options enable the publisher
     # Returns the ports that these options use. No device can use them.
     claims: Callable[[Any], Sequence[Claim]] = _claims_nothing
+    # Returns path of the key and options of each GPIO line that these options use. No device can use them.
+    lines: Callable[[Any], Iterable[tuple[tuple[str, ...], LineOptions]]] = lambda _options: ()
     # Whether the daemon exits if the first start of the publisher fails. Otherwise the daemon tries again periodically.
     required: bool = False
     # Finds keys that contradict the drivers. Returns a reason, one sentence, by the path of the key.

@@ -350,6 +350,29 @@ class MqttStatus(msgspec.Struct, frozen=True):
     replies_lost: int = 0  # number of discarded replies to requests: the broker refuses the topic, or too many wait
 
 
+class RuleStatus(msgspec.Struct, frozen=True):
+    """One rule for one device."""
+
+    rule: str
+    device: str
+    active: bool  # whether the value is beyond the limit
+    begins: int  # number of times that the rule became active since the start of the output
+    problem: str  # reason why imud does not evaluate the rule, one sentence; empty if imud evaluates it
+
+
+class RulesStatus(msgspec.Struct, frozen=True):
+    """The output `rules`."""
+
+    rules: tuple[RuleStatus, ...]
+    line_problems: dict[str, str]  # reason for each GPIO line that imud cannot drive, by rule
+    commands: dict[str, int]  # number of commands since the start of the output, by result
+
+    def problems(self) -> dict[str, str]:
+        """Return the problem of each rule and each GPIO line that does not work."""
+        lines = {f"rules {rule} line": words for rule, words in self.line_problems.items()}
+        return lines | {f"rules {one.rule} {one.device}": one.problem for one in self.rules if one.problem}
+
+
 class ClientStatus(msgspec.Struct, frozen=True):
     """One client of the UNIX socket."""
 

@@ -11,6 +11,7 @@ PUBLISHERS: Registry[PublisherType] = Registry(
         "metrics": "imud.publishers.metrics.publisher:PUBLISHER",
         "recorder": "imud.publishers.recorder.publisher:PUBLISHER",
         "nmea0183": "imud.publishers.nmea0183:PUBLISHER",
+        "rules": "imud.publishers.rules.settings:PUBLISHER",
         "mqtt": "imud.fleet.settings:PUBLISHER",
     },
     # the configuration has these other keys at the top

@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from imud.contracts.lines import UtcReference, WatchedInput, WatchLine
+from imud.contracts.lines import DriveLine, UtcReference, WatchLine
 from imud.contracts.publisher import (
     DeviceControl,
     DeviceLedger,
@@ -62,7 +63,7 @@ def _no_device(name: str) -> DeviceControl:
     raise CommandError(f"{name}: no such device")
 
 
-def _no_line(*_: object) -> WatchedInput:
+def _no_line(*_: object) -> Any:
     return NoLine()
 
 
@@ -90,6 +91,7 @@ def publisher_context(
     each_status: Callable[[], Iterator[DeviceStatus]] | None = None,
     ledgers: Callable[[], Sequence[DeviceLedger]] | None = None, recording: RecordingSource | None = None,
     outputs: OutputFacts | None = None, latencies: Latencies | None = None, watch_line: WatchLine = _no_line,
+    drive_line: DriveLine = _no_line,
     raise_event: Callable[[Event], None] = lambda _event: None,
     losses: Callable[[str], tuple[int, ...]] = lambda _name: NOTHING_LOST,
 ) -> PublisherContext:  # fmt: skip
@@ -100,5 +102,5 @@ def publisher_context(
     )  # fmt: skip
     return PublisherContext(
         epoch, PublisherClock(now_ns, utc_offset_ns, utc_reference, cpu_ns), devices, outputs or OutputFacts(),
-        latencies or FakeLatencies(), watch_line, FakeOwner(raise_event),
+        latencies or FakeLatencies(), watch_line, drive_line, FakeOwner(raise_event),
     )  # fmt: skip

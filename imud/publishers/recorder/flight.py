@@ -543,10 +543,12 @@ class FlightRecorder:
                 return
 
     def event(self, event: Event) -> None:
-        """Record an event. A missing device is an alert."""
+        """Record an event. A missing device or a rule with `snapshot` is an alert."""
         if self._writer is None:
             return
         self._feed.event(event)
+        if event.kind is EventKind.RULE and event.detail.get("snapshot"):
+            self._alert(event.device, event.message)
         if event.kind is EventKind.DOWN and self._settings.device_lost and self._feed.wants(event.device):
             self._alert(event.device, f"{event.device} is lost: {event.message}")
 

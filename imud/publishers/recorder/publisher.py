@@ -4,6 +4,7 @@ import logging
 import os
 from pathlib import Path
 
+from imud.contracts.lines import LineOptions
 from imud.contracts.publisher import Batch, PublisherContext, PublisherType
 from imud.contracts.status import RecorderStatus
 from imud.host.threads import BusThread, StartWorker
@@ -236,4 +237,9 @@ def _wanted(settings: RecorderOptions) -> bool:
     return settings.enabled or settings.flight.enabled
 
 
-PUBLISHER = PublisherType("recorder", RecorderOptions, RecorderOutput, _wanted)
+def _lines(settings: RecorderOptions) -> list[tuple[tuple[str, ...], LineOptions]]:
+    line = settings.flight.line if settings.flight.enabled else None
+    return [] if line is None else [(("flight", "line"), line)]
+
+
+PUBLISHER = PublisherType("recorder", RecorderOptions, RecorderOutput, _wanted, lines=_lines)

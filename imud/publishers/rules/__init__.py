@@ -1,0 +1,1 @@
+"""Output `rules`: events, snapshots, GPIO lines and commands after the values of devices passed a limit."""
