@@ -38,7 +38,7 @@ class EventKind(StrEnum):
     OUTPUT = (
         "output"  # an exception in an output. imud starts this output again; the devices and other outputs continue.
     )
-    # A rule of the output `rules` became active or ended (`detail.active`), or its command failed. `detail` has the rule.
+    # A rule of the output `rules` became active or ended (`detail.active`), or its command failed
     RULE = "rule"
     BAD_FRAME = "bad-frame"  # imud received a damaged or unknown frame. At most once per second and device.
 

@@ -20,6 +20,7 @@ TESTS: Final = (
     "tests/sampling/test_path_kernel.py",
     "tests/publishers/test_shm.py",
     "tests/publishers/socket/test_history.py",
+    "tests/publishers/rules/test_limit.py",
     "tests/links/test_socketcan.py",
 )
 # The tests import `imud._kernel`, and find the module that is already loaded.

@@ -2,17 +2,17 @@
 
     slot ─▶ field ─▶ band filter ─▶ magnitude ─▶ peak or RMS of a window ─▶ limit, hysteresis, hold ─▶ change
 
-A `LimitState` is also one record of `STATE` bytes for the kernel. `evaluate` processes slots up to the first change. The kernel in C does the
-same work with equal results in every bit (`Limit` in imud/_kernel.c).
+A `LimitState` is also a record of `STATE` bytes for the kernel. `evaluate` processes slots up to the first change. The
+kernel in C has equal results in every bit (`Limit` in imud/_kernel.c).
 
-**Hold.** A change needs samples on the new side of the limit for the hold time. The time between two samples counts with
-at most `STEP_MAX_NS`, so a gap does not complete a hold.
+**Hold.** A change needs samples on the new side of the limit for the hold time. The time between two samples counts
+with at most `STEP_MAX_NS`, so a gap does not complete a hold.
 
 **Band filter.** A Butterworth band-pass of order `ORDER` per edge from the bilinear transform with pre-warped edges, as
-`scipy.signal.butter(ORDER, edges, "bandpass", output="sos")`. It has `SECTIONS` biquads with the numerator g (1 - z⁻²).
-The sample period is the mean of `PERIOD_STEPS` or more steps in `PERIOD_NS` or more. The filter starts again after a gap
-(a step longer than 1.5 periods), after a non-finite value, and with a new design after the period changed by more than
-5 %. It starts in the steady state of its first value, and its values count after the settling time.
+`scipy.signal.butter(ORDER, edges, "bandpass", output="sos")`. Its `SECTIONS` biquads have the numerator g (1 - z⁻²).
+The sample period is the mean of `PERIOD_STEPS` or more steps in `PERIOD_NS` or more. The filter starts again after a
+gap (a step longer than 1.5 periods), after a non-finite value, and with a new design after the period changed by more
+than 5 %. It starts in the steady state of its first value, and its values count after the settling time.
 """
 
 import cmath
@@ -290,9 +290,7 @@ def _add(state: LimitState, packed: bytes, at: int) -> Change:
         x: list[float] = [float(_U32.unpack_from(packed, at + state.offset)[0])]
     else:
         x = list(_FIELDS[state.count].unpack_from(packed, at + state.offset))
-    if not all(map(isfinite, x)) or abs(t_ns) > _TIME_MOST_NS:
-        state.not_finite += 1
-        state.is_filtering = 0
+    if not _are_usable(state, [*x, inf if abs(t_ns) > _TIME_MOST_NS else 0.0]):
         return Change.NONE
     step_ns = t_ns - state.last_ns if state.is_old else 0
     if not state.is_old or step_ns < 0:  # the first sample, or the time stamps went back
@@ -306,19 +304,21 @@ def _add(state: LimitState, packed: bytes, at: int) -> Change:
         if not state.designed:
             return Change.NONE
         x = _filtered(state, t_ns, x)
-        if not all(map(isfinite, x)):
-            state.not_finite += 1
-            state.is_filtering = 0
-            return Change.NONE
-        if t_ns - state.filter_ns < state.settle_ns:
+        if not _are_usable(state, x) or t_ns - state.filter_ns < state.settle_ns:
             return Change.NONE
     value = _value(state, t_ns, step_ns, x)
-    if value is None:
-        return Change.NONE
-    if not isfinite(value):
-        state.not_finite += 1
-        return Change.NONE
-    return state.compare(value, step_ns)
+    is_value = value is not None and isfinite(value)
+    state.not_finite += value is not None and not is_value
+    return state.compare(value, step_ns) if value is not None and is_value else Change.NONE
+
+
+def _are_usable(state: LimitState, x: list[float]) -> bool:
+    """Return whether all components are finite; otherwise count them, and start the filter again."""
+    if all(map(isfinite, x)):
+        return True
+    state.not_finite += 1
+    state.is_filtering = 0
+    return False
 
 
 def _value(state: LimitState, t_ns: int, step_ns: int, x: list[float]) -> float | None:

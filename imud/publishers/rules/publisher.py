@@ -3,13 +3,14 @@
     batch ─▶ Limit of each rule ─▶ begin or end ─▶ event, line, command
     tick  ─▶ sample rate, lost samples, silence ─┘
 
-A rule has one state for each device. A rule that is active for a device that stops stays active: only values end it. When
-the output or the device ends (a changed configuration, the end of imud), imud ends its active rules with an event.
+A rule has one state for each device. An active rule of a device that stops stays active: only values end it. When the
+output or the device ends (a changed configuration, the end of imud), imud ends its active rules with an event.
 """
 
 import logging
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from math import degrees, inf
 from typing import Final
 
@@ -128,6 +129,16 @@ class DeviceRule:
         return f"the band filter starts again after each gap: {state.restarts} gaps"
 
 
+@dataclass(slots=True)
+class RateWindow:
+    """Open window of a sample rate."""
+
+    begun_ns: int  # CLOCK_MONOTONIC of the begin
+    stamp_ns: int  # time stamp of the newest sample before the window
+    count: int = 0
+    rate_hz: float | None = None  # rate of the previous window; None: no previous window
+
+
 class WatchedDevice:
     """One device with its rules."""
 
@@ -138,8 +149,7 @@ class WatchedDevice:
         self.samples = 0  # number of samples since the last tick
         self.newest = b""  # slots of the newest batch
         self.heard_ns = now_ns  # tick after the newest sample
-        # Time stamp of the newest sample of the previous window, by rule of the sample rate, and the number of samples
-        self.windows: dict[str, tuple[int, int, int]] = {}
+        self.windows: dict[str, RateWindow] = {}  # by rule of the sample rate
         self.losses: dict[str, deque[tuple[int, int]]] = {}  # time and lost samples of the window, by rule
 
 
@@ -279,19 +289,20 @@ class Rules:
         return float(total - kept[0][1])
 
     def _rate(self, device: WatchedDevice, one: DeviceRule, now_ns: int) -> float | None:
-        """Return the sample rate of a window that ends now, by time stamps; None within a window. 0 without samples."""
-        begun_ns, stamp_ns, count = device.windows.get(one.name, (0, 0, 0))
+        """Return the sample rate of the newest complete window, by time stamps: 0 without samples; None before the first
+        window."""
         newest_ns = slot_times_ns(device.newest[-SLOT_BYTES:])[0] if device.newest else 0
-        if not begun_ns:  # the first window begins with a sample
+        window = device.windows.get(one.name)
+        if window is None:  # the first window begins with a sample
             if device.newest:
-                device.windows[one.name] = (now_ns, newest_ns, 0)
+                device.windows[one.name] = RateWindow(now_ns, newest_ns)
             return None
-        count += device.samples
-        if now_ns - begun_ns < round(one.rule.window * NS_PER_S):
-            device.windows[one.name] = (begun_ns, stamp_ns, count)
-            return None
-        device.windows[one.name] = (now_ns, newest_ns, 0)
-        return count * NS_PER_S / (newest_ns - stamp_ns) if count and newest_ns > stamp_ns else 0.0
+        window.count += device.samples
+        if now_ns - window.begun_ns >= round(one.rule.window * NS_PER_S):
+            span_ns = newest_ns - window.stamp_ns
+            rate_hz = window.count * NS_PER_S / span_ns if window.count and span_ns > 0 else 0.0
+            device.windows[one.name] = window = RateWindow(now_ns, newest_ns, rate_hz=rate_hz)
+        return window.rate_hz
 
     # --- events and actions -------------------------------------------------------------------------------------------
 
@@ -318,7 +329,7 @@ class Rules:
             self._run(one, words, message, value)
 
     def _send(
-        self, one: DeviceRule, message: str, now_ns: int, value: float, t_ns: int, **detail: float | None
+        self, one: DeviceRule, message: str, now_ns: int, value: float, t_ns: int, **detail: str | float | bool | None
     ) -> None:  # fmt: skip
         log.log(logging.WARNING if one.active else logging.INFO, "%s: %s", one.device, message)
         facts: dict[str, str | int | float | bool | None] = {
@@ -343,7 +354,7 @@ class Rules:
             line.set(any(one.active for device in self._devices.values() for one in device.rules if one.name == name))
 
     def _run(self, one: DeviceRule, words: list[str], message: str, value: float) -> None:
-        """Run a command with the facts of the event in its environment. An argument `{value}` is replaced as a whole."""
+        """Run a command with the facts of the event in its environment. Replace arguments such as `{value}`."""
         facts = {
             "rule": one.name, "device": one.device, "active": str(int(one.active)), "measure": one.rule.measure,
             "value": f"{value:.9g}", "message": message,
