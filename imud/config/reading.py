@@ -448,7 +448,7 @@ class DeviceReader:
         rows = tables.publishers
         self._outputs = {name: rows[name].claims(one) for name, one in outputs.items()}
         self._output_lines = [
-            ((name, *path), it) for name, one in outputs.items() for path, it in rows[name].lines(one)
+            ((name, *path), it) for name, one in outputs.items() for path, it in rows[name].used_lines(one)
         ]
         self._tables = tables
         self._declared = DeclaredReader(keys, tables.drivers)

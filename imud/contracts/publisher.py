@@ -379,7 +379,7 @@ class PublisherType:
     # Returns the ports that these options use. No device can use them.
     claims: Callable[[Any], Sequence[Claim]] = _claims_nothing
     # Returns path of the key and options of each GPIO line that these options use. No device can use them.
-    lines: Callable[[Any], Iterable[tuple[tuple[str, ...], LineOptions]]] = lambda _options: ()
+    used_lines: Callable[[Any], Iterable[tuple[tuple[str, ...], LineOptions]]] = lambda _options: ()
     # Whether the daemon exits if the first start of the publisher fails. Otherwise the daemon tries again periodically.
     required: bool = False
     # Finds keys that contradict the drivers. Returns a reason, one sentence, by the path of the key.

@@ -364,12 +364,12 @@ class RulesStatus(msgspec.Struct, frozen=True):
     """The output `rules`."""
 
     rules: tuple[RuleStatus, ...]
-    line_problems: dict[str, str]  # reason for each GPIO line that imud cannot drive, by rule
+    lines: dict[str, str]  # reason for each GPIO line that imud cannot drive, by rule; empty if imud can drive it
     commands: dict[str, int]  # number of commands since the start of the output, by result
 
     def problems(self) -> dict[str, str]:
         """Return the problem of each rule and each GPIO line that does not work."""
-        lines = {f"rules {rule} line": words for rule, words in self.line_problems.items()}
+        lines = {f"rules {rule} line": words for rule, words in self.lines.items() if words}
         return lines | {f"rules {one.rule} {one.device}": one.problem for one in self.rules if one.problem}
 
 

@@ -85,6 +85,7 @@ class FakeRow:
         return self.faults
 
     claims: Callable[[Any], Sequence[Claim]] = lambda _settings: ()
+    used_lines: Callable[[Any], Sequence[Any]] = lambda _settings: ()
     problem: Callable[[Any, bool], str] = lambda _settings, _frames: ""
     check: Callable[[Any, Any], Mapping[tuple[str, ...], str]] = lambda _settings, _drivers: {}
 

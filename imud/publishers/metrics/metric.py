@@ -17,7 +17,15 @@ from prometheus_client.core import (
     Metric,
 )
 
-from imud.contracts.status import ClientStatus, DeviceStatus, FlightStatus, MqttStatus, OutputStatus, RecorderStatus
+from imud.contracts.status import (
+    ClientStatus,
+    DeviceStatus,
+    FlightStatus,
+    MqttStatus,
+    OutputStatus,
+    RecorderStatus,
+    RulesStatus,
+)
 from imud.model.units import NS_PER_S, PPM_PER_ONE
 from imud.publishers.metrics.rings import RingView
 
@@ -46,6 +54,7 @@ class Snapshot:
     # States of the ports of outputs, by the name of the output
     ports: Mapping[str, Sequence[OutputStatus]] = field(default_factory=dict)
     mqtts: Sequence[MqttStatus] = ()  # state of the output `mqtt`, if it runs
+    rules: Sequence[RulesStatus] = ()  # state of the output `rules`, if it runs
 
 
 @dataclass(frozen=True, slots=True)

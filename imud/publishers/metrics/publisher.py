@@ -43,6 +43,7 @@ from imud.publishers.metrics.families import (
 )
 from imud.publishers.metrics.metric import Snapshot
 from imud.publishers.metrics.rings import RingReader
+from imud.publishers.metrics.rule_families import RULE_FAMILIES
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 
 log = logging.getLogger(__name__)
@@ -132,8 +133,9 @@ class DaemonCollector(Collector):
         flight = FLIGHT_FAMILIES if self._snapshot.flights else ()
         outputs = PORT_FAMILIES if self._snapshot.ports else ()
         mqtt = MQTT_FAMILIES if self._snapshot.mqtts else ()
+        rules = RULE_FAMILIES if self._snapshot.rules else ()
         recordings = RECORDINGS_FAMILIES if recorder or flight else ()
-        for family in (*FAMILIES, *recorder, *flight, *recordings, *outputs, *mqtt):
+        for family in (*FAMILIES, *recorder, *flight, *recordings, *outputs, *mqtt, *rules):
             metric = family.metric(self._snapshot)
             metric.samples = _PausingList(metric.samples, self._pause)
             yield metric
@@ -310,6 +312,7 @@ class MetricsPublisher:
                     recorders=tuple(status() for status in outputs.recorders),
                     flights=tuple(status() for status in outputs.flights),
                     mqtts=tuple(status() for status in outputs.mqtts),
+                    rules=tuple(status() for status in outputs.rules),
                     ports={output: source() for output, source in outputs.ports.items()},
                 )
             )

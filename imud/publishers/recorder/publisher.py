@@ -242,4 +242,4 @@ def _lines(settings: RecorderOptions) -> list[tuple[tuple[str, ...], LineOptions
     return [] if line is None else [(("flight", "line"), line)]
 
 
-PUBLISHER = PublisherType("recorder", RecorderOptions, RecorderOutput, _wanted, lines=_lines)
+PUBLISHER = PublisherType("recorder", RecorderOptions, RecorderOutput, _wanted, used_lines=_lines)

@@ -246,7 +246,7 @@ class Rules:
             for device in self._devices.values()
             for one in device.rules
         )
-        problems = {name: line.problem for name, line in self._lines.items() if line.problem}
+        problems = {name: line.problem for name, line in self._lines.items()}
         counts = {result.value: self._runner.results[result] for result in Result}
         return RulesStatus(found, problems, counts)
 
@@ -289,7 +289,7 @@ class Rules:
         return float(total - kept[0][1])
 
     def _rate(self, device: WatchedDevice, one: DeviceRule, now_ns: int) -> float | None:
-        """Return the sample rate of the newest complete window, by time stamps: 0 without samples; None before the first
+        """Return the sample rate of the newest complete window, by time stamps: 0 without samples; None without a
         window."""
         newest_ns = slot_times_ns(device.newest[-SLOT_BYTES:])[0] if device.newest else 0
         window = device.windows.get(one.name)

@@ -172,5 +172,5 @@ def lines_of(options: RulesOptions) -> Iterator[tuple[tuple[str, ...], LineOptio
 
 
 PUBLISHER = PublisherType(
-    "rules", RulesOptions, make_later("imud.publishers.rules.publisher:Rules"), required=False, lines=lines_of
+    "rules", RulesOptions, make_later("imud.publishers.rules.publisher:Rules"), required=False, used_lines=lines_of
 )

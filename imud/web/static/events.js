@@ -4,7 +4,7 @@ import { call, copy, duration, el, number, shown, timeOf } from "./util.js";
 const EVENT_WORDS = {
   up: "Device found", down: "Device lost", condition: "Condition", sync: "Time source", loss: "Lost samples", configuration: "Configuration", alarm: "Alarm",
   attitude: "Gravity and attitude", "bad-frame": "Damaged frames", link: "Port or bus", mark: "Marks", calibration: "Calibration", recorder: "Recorder",
-  mqtt: "MQTT", output: "Output",
+  mqtt: "MQTT", output: "Output", rule: "Rule",
 };
 const CALM = ["up", "sync", "condition", "mark", "calibration"]; // kinds that are not warnings
 const GROUP_NS = 60e9; // maximum time between two events of a group
@@ -31,13 +31,14 @@ export function addEvent(groups, event) {
   if (groups.length > EVENTS_MAX) groups.shift();
 }
 
-/** Return the groups with the start and the end of an alarm as one group. `open` contains the active alarms of a group;
+/** Return the groups with the start and the end of an alarm or a rule as one group. `open` contains the active alarms of a group;
  *  `to_ns` is the end of its last alarm. */
 export function joinAlarms(groups) {
   let found = [];
   const beginOf = (one) => one.first_ns || one.t_ns;
   for (const one of groups) {
-    const flags = one.kind === "alarm" && !one.detail?.verdict ? Object.entries(one.detail ?? {}).filter(([, value]) => typeof value === "boolean") : [];
+    const flags = one.kind === "rule" && typeof one.detail?.active === "boolean" ? [[`rule ${one.detail.rule}`, one.detail.active]]
+      : one.kind === "alarm" && !one.detail?.verdict ? Object.entries(one.detail ?? {}).filter(([, value]) => typeof value === "boolean") : [];
     const [begun, ended] = [true, false].map((is) => flags.filter(([, value]) => value === is).map(([name]) => name));
     const known = ended.filter((name) => {
       const at = found.findLastIndex((other) => other.device === one.device && other.open?.has(name));

@@ -330,7 +330,7 @@ def shown_names() -> set[str]:
     mqtt = states.MqttStatus("mqtt://127.0.0.1:1883", "", "", 1, 2, 3, 4, 5, 6, 7, {"age": 8}, 9)
     snapshot = Snapshot(
         DEVICES, (client(1),), ((("front", "up"), 1),), 1, recorders=(recorder,), flights=(flight,),
-        ports={"nmea0183": (output,)}, mqtts=(mqtt,),
+        ports={"nmea0183": (output,)}, mqtts=(mqtt,), rules=(RULES,),
     )  # fmt: skip
     body = Renderer(pause=lambda: None).render(snapshot, "").body.decode()
     return set(re.findall(r"^# HELP (\S+)", body, re.MULTILINE))
@@ -404,6 +404,10 @@ def test_each_metric_is_a_value_of_the_output() -> None:
 
 
 RECORDER = RecorderStatus("a", "", 1, 2, 3, 4, 5, 6)
+RULES = states.RulesStatus(
+    (states.RuleStatus("lean", "bow", True, 3, ""), states.RuleStatus("lean", "mast", False, 0, "no euler_rad")),
+    {"lean": "busy", "hot": ""}, {"ok": 2, "failed": 1},
+)  # fmt: skip
 FULL = "No space left on device"
 
 
@@ -418,6 +422,15 @@ def test_each_metric_is_a_value_of_the_status() -> None:
     assert shown("imud_recorder_", full)["active"] == 0
     for prefix in ("imud_recorder_", "imud_recordings_", "imud_flight_"):
         assert shown(prefix, Snapshot()) == {}
+
+
+def test_each_metric_is_a_value_of_a_rule() -> None:
+    assert shown("imud_rule_", Snapshot(rules=(RULES,))) == {
+        "active bow lean": 1, "active mast lean": 0, "events_total bow lean": 3, "events_total mast lean": 0,
+        "problem bow lean": 0, "problem mast lean": 1, "line_problem lean": 1, "line_problem hot": 0,
+        "commands_total ok": 2, "commands_total failed": 1,
+    }  # fmt: skip
+    assert RULES.problems() == {"rules lean line": "busy", "rules lean mast": "no euler_rad"}
 
 
 def test_each_metric_is_a_value_of_the_flight_recorder() -> None:
