@@ -326,7 +326,8 @@ WatchLine = Callable[[InputOptions, str, LineOwner], WatchedInput]
 
 
 class DrivenOutput(Protocol):
-    """Output line that opens again after a failure. Synchronization: the thread of the loop only."""
+    """Output line that opens again after a failure. `imud.lines` implements it, and outputs may not import that part.
+    Synchronization: the thread of the loop only."""
 
     problem: str  # reason why imud cannot drive the line, one sentence; empty if it can
 

@@ -32,7 +32,7 @@ class FakeOutput:
 
 def test_it_opens_again_with_its_level() -> None:
     clock, line = VirtualClock(), FakeOutput()
-    lines = LineFactory(lambda *_: line, lambda *_: line)  # type: ignore[arg-type,return-value]
+    lines = LineFactory(lambda *_: line, lambda *_: line)  # type: ignore[arg-type]
     driven = driving(lines, clock.host)(OutputOptions(line="GPIO4"), "rule hot")
 
     def tick(seconds: float) -> None:

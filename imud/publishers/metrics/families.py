@@ -25,6 +25,7 @@ from imud.contracts.status import (
     MqttStatus,
     OutputStatus,
     RecorderStatus,
+    RuleStatus,
     UtcStatus,
 )
 from imud.model.ledger import bytes_open, frames_open
@@ -690,5 +691,46 @@ FLIGHT_FAMILIES: Final = (
     Family(
         "imud_flight_recorder_snapshots_sent_total", MetricType.COUNTER, NO_UNIT, "Snapshots sent to clients.",
         _flight(lambda status: status.sent),
+    ),
+)  # fmt: skip
+
+
+def _rule(read: Callable[[RuleStatus], float]) -> Reader:
+    """Return a reader of a value of each rule and device."""
+
+    def lines(snapshot: Snapshot) -> Lines:
+        return [((one.device, one.rule), read(one)) for status in snapshot.rules for one in status.rules]
+
+    return Reader(("device", "rule"), lines)
+
+
+def _rule_commands(snapshot: Snapshot) -> Lines:
+    return [((result,), count) for status in snapshot.rules for result, count in status.commands.items()]
+
+
+def _rule_lines(snapshot: Snapshot) -> Lines:
+    return [((rule,), bool(problem)) for status in snapshot.rules for rule, problem in status.lines.items()]
+
+
+RULE_FAMILIES: Final = (
+    Family(
+        "imud_rule_active", MetricType.GAUGE, NO_UNIT, "1 if the rule is active for the device, otherwise 0.",
+        _rule(lambda one: one.active),
+    ),
+    Family(
+        "imud_rule_events_total", MetricType.COUNTER, NO_UNIT, "Number of times that the rule became active.",
+        _rule(lambda one: one.begins),
+    ),
+    Family(
+        "imud_rule_problem", MetricType.GAUGE, NO_UNIT, "1 if imud cannot evaluate the rule, otherwise 0.",
+        _rule(lambda one: bool(one.problem)),
+    ),
+    Family(
+        "imud_rule_line_problem", MetricType.GAUGE, NO_UNIT, "1 if imud cannot drive the GPIO line, otherwise 0.",
+        Reader(("rule",), _rule_lines),
+    ),
+    Family(
+        "imud_rule_commands_total", MetricType.COUNTER, NO_UNIT, "Commands of rules by result.",
+        Reader(("result",), _rule_commands),
     ),
 )  # fmt: skip

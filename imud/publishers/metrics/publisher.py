@@ -40,10 +40,10 @@ from imud.publishers.metrics.families import (
     PORT_FAMILIES,
     RECORDER_FAMILIES,
     RECORDINGS_FAMILIES,
+    RULE_FAMILIES,
 )
 from imud.publishers.metrics.metric import Snapshot
 from imud.publishers.metrics.rings import RingReader
-from imud.publishers.metrics.rule_families import RULE_FAMILIES
 from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 
 log = logging.getLogger(__name__)

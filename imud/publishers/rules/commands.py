@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
-from time import monotonic
 from typing import IO, Final
 
 from imud.host.log import printable
@@ -27,7 +26,7 @@ from imud.publishers.rules.settings import CommandLimits
 log = logging.getLogger(__name__)
 
 HOUR_NS: Final = 3600 * NS_PER_S
-TERM_S: Final = 2.0  # time from SIGTERM to SIGKILL, s
+TERM_NS: Final = 2 * NS_PER_S  # time from SIGTERM to SIGKILL, ns
 POLL_S: Final = 0.05  # interval in which the thread looks for the end of the program, s
 LINE_BYTES: Final = 200  # maximum length of the last line of the output
 READ_BYTES: Final = 65536
@@ -82,7 +81,7 @@ class CommandRunner:
             return
         self._started.append(now_ns)
         kept = {name: os.environ[name] for name in KEPT_VARIABLES if name in os.environ}
-        command = RunningCommand(argv, {**kept, **facts}, limits.time_s)
+        command = RunningCommand(argv, {**kept, **facts}, limits.time_s, self._now_ns)
         self._running.add(command)
         loop = asyncio.get_running_loop()
 
@@ -105,7 +104,7 @@ class CommandRunner:
         return len(self._running)
 
     def close(self) -> None:
-        """End all commands. Their threads send SIGTERM, after TERM_S SIGKILL, and reap them. Do not wait."""
+        """End all commands. Their threads send SIGTERM, after TERM_NS SIGKILL, and reap them. Do not wait."""
         for command in self._running:
             command.stop()
 
@@ -117,10 +116,12 @@ class CommandRunner:
 class RunningCommand:
     """One command with its thread."""
 
-    def __init__(self, argv: Sequence[str], environment: Mapping[str, str], limit_s: float) -> None:
+    def __init__(
+        self, argv: Sequence[str], environment: Mapping[str, str], limit_s: float, now_ns: Callable[[], int]
+    ) -> None:
         self._argv = list(argv)
         self._environment = dict(environment)
-        self._limit_s = limit_s
+        self._limit_s, self._now_ns = limit_s, now_ns
         self._stop = threading.Event()
         self._tail = b""
 
@@ -139,9 +140,8 @@ class RunningCommand:
                 self._argv, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
                 env=self._environment, cwd="/", start_new_session=True,
             )  # fmt: skip
-        except (OSError, ValueError) as error:
-            reason = reason_of(error) if isinstance(error, OSError) else str(error)
-            return CommandEnd(Result.NOT_STARTED, f"cannot start {printable(self._argv[0])}: {reason}")
+        except OSError as error:
+            return CommandEnd(Result.NOT_STARTED, f"cannot start {printable(self._argv[0])}: {reason_of(error)}")
         assert process.stdout is not None
         with process.stdout as output:
             result = self._wait(process.pid, output)
@@ -161,18 +161,18 @@ class RunningCommand:
     def _wait(self, pid: int, output: IO[bytes]) -> Result:
         """Wait for the end of the program without reaping it. Send SIGTERM and SIGKILL to its group when due."""
         os.set_blocking(output.fileno(), False)
-        due_s, result, number = monotonic() + self._limit_s, Result.OK, signal.SIGTERM
+        due_ns, result, number = self._now_ns() + round(self._limit_s * NS_PER_S), Result.OK, signal.SIGTERM
         while True:
             ended = os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
             self._read(output)
             if ended:
                 return result
-            if result is Result.OK and (self._stop.is_set() or monotonic() >= due_s):
-                result, due_s = (Result.STOPPED if self._stop.is_set() else Result.TIMEOUT), 0.0
-            if result is not Result.OK and monotonic() >= due_s:
+            if result is Result.OK and (self._stop.is_set() or self._now_ns() >= due_ns):
+                result, due_ns = (Result.STOPPED if self._stop.is_set() else Result.TIMEOUT), 0
+            if result is not Result.OK and self._now_ns() >= due_ns:
                 with suppress(ProcessLookupError, PermissionError):
                     os.killpg(pid, number)
-                due_s, number = monotonic() + TERM_S, signal.SIGKILL
+                due_ns, number = self._now_ns() + TERM_NS, signal.SIGKILL
             (self._stop if result is Result.OK else threading.Event()).wait(POLL_S)
 
     def _read(self, output: IO[bytes]) -> None:

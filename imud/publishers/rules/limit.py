@@ -79,7 +79,7 @@ _INTEGERS: Final = (
     "last_ns",  # time stamp of the newest used sample
     "held_ns",  # time of the newest samples on the new side; -1: the newest sample is not on the new side
     "begin_ns", "number",  # first sample and number of samples of the window
-    "measured_ns", "measured",  # first sample and number of steps of the measurement of the sample period
+    "measured_ns", "measured",  # measurement of the sample period: first sample, number of steps
     "late",  # number of successive gaps
     "filter_ns",  # first sample of the filter
     "used", "absent", "not_finite",  # number of samples with the field, without it, and with a non-finite value
@@ -214,7 +214,7 @@ _ARRAYS: Final = (("sums", AXES), ("squares", AXES), ("gains", SECTIONS), ("a1",
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
+class Biquad:
     """Biquad gain (1 - z⁻²) / (1 + a1 z⁻¹ + a2 z⁻²)."""
 
     gain: float
@@ -227,7 +227,7 @@ def settle_s(low_hz: float, high_hz: float) -> float:
     return 2 / min(low_hz, high_hz - low_hz)
 
 
-def band_pass(low_hz: float, high_hz: float, rate_hz: float) -> list[Section]:
+def band_pass(low_hz: float, high_hz: float, rate_hz: float) -> list[Biquad]:
     """Return the biquads of the Butterworth band-pass with -3 dB at both edges. Each has the gain 1 at the center."""
     low, high = (2 * rate_hz * tan(pi * edge / rate_hz) for edge in (low_hz, high_hz))
     width, center = high - low, sqrt(low * high)
@@ -241,7 +241,7 @@ def band_pass(low_hz: float, high_hz: float, rate_hz: float) -> list[Section]:
             z = (2 * rate_hz + pole) / (2 * rate_hz - pole)
             a1, a2 = -2 * z.real, abs(z) ** 2
             there = (1 - z_center**-2) / (1 + a1 / z_center + a2 / z_center**2)
-            found.append(Section(1 / abs(there), a1, a2))
+            found.append(Biquad(1 / abs(there), a1, a2))
     return found
 
 

@@ -74,7 +74,7 @@ class DeviceRule:
         self.name, self.rule, self.device = name, rule, device
         self.limit = Limit(state_of(rule))
         self.active = False
-        self.begun_ns = 0  # time of the begin, CLOCK_MONOTONIC
+        self.begun_ns = 0  # time when the rule became active, CLOCK_MONOTONIC
         self.begins = 0
         self.problem = ""
         self._design_problem = ""
@@ -133,7 +133,7 @@ class DeviceRule:
 class RateWindow:
     """Open window of a sample rate."""
 
-    begun_ns: int  # CLOCK_MONOTONIC of the begin
+    begun_ns: int  # CLOCK_MONOTONIC at the start of the window
     stamp_ns: int  # time stamp of the newest sample before the window
     count: int = 0
     rate_hz: float | None = None  # rate of the previous window; None: no previous window
@@ -307,7 +307,7 @@ class Rules:
     # --- events and actions -------------------------------------------------------------------------------------------
 
     def _change(self, one: DeviceRule, value: float, t_ns: int) -> None:
-        """Send the event of a begin or an end, and start the actions."""
+        """Report that a rule became active or ended, and start the actions."""
         now_ns, rule = self._context.clock.now_ns(), one.rule
         one.active = not one.active
         unit = f" {rule.kind.unit}" if rule.kind.unit and rule.kind.unit != "°" else rule.kind.unit

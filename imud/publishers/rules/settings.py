@@ -82,7 +82,7 @@ class RuleOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
     command: Annotated[list[str], msgspec.Meta(max_length=64)] = msgspec.field(default_factory=list[str])
     """Program with an absolute path, and its arguments, that imud runs when the rule begins; empty: none."""
     end_command: Annotated[list[str], msgspec.Meta(max_length=64)] = msgspec.field(default_factory=list[str])
-    """The same when the rule ends."""
+    """Program and arguments that imud runs when the rule ends; empty: none."""
 
     def __post_init__(self) -> None:
         """Raise ValueError if a combination of keys is invalid."""

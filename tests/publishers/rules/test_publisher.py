@@ -48,7 +48,7 @@ class Rig:
         )  # fmt: skip
         given = {name: {"hold_s": 0, **rule} for name, rule in rules.items()}
         self.rules = Rules(msgspec.convert({"rules": given}, RulesOptions), self.context)
-        self.rules._runner.run = lambda argv, facts, on_end: self.commands.append((list(argv), dict(facts), on_end))  # type: ignore[method-assign,arg-type,misc]  # fmt: skip
+        self.rules._runner.run = lambda argv, facts, on_end: self.commands.append((list(argv), dict(facts), on_end))  # type: ignore[method-assign]  # fmt: skip
         for number, name in enumerate(devices):
             self.rules.add_device(name, number)
         self.rules.start()
