@@ -22,6 +22,7 @@ from imud.host import event_loop
 from imud.host.log import STDERR, is_journal, log_to
 from imud.model.errors import ConfigError, ImudError, ServerError
 from imud.model.options import unknown_name
+from imud.publishers.rules.settings import RulesOptions
 from imud.publishers.shm import ShmOptions, directory_problem
 
 log = logging.getLogger(__name__)
@@ -86,7 +87,7 @@ def check(args: argparse.Namespace) -> int:
     for device in settings.devices:
         for note in (*limits_of(device), *absent_capture(device)):
             print(f"{args.file}:{device.line}: note: {device.name}: {note}")
-    for note in (*unknown_devices(settings), *missing_directories(settings)):
+    for note in (*unknown_devices(settings), *rules_without_values(settings), *missing_directories(settings)):
         print(f"{args.file}: note: {note}")
     for problem in settings.ignored:
         complain(problem)
@@ -102,6 +103,17 @@ def unknown_devices(settings: Config) -> Iterator[str]:
             for name in [given] if isinstance(given, str) else given or ():
                 if name not in (*known, EVERY):
                     yield f"{output}.{key}: {unknown_name('a device', name, known)}"
+
+
+def rules_without_values(settings: Config) -> Iterator[str]:
+    """Yield a note for each rule that needs a field which the driver of a device never sends."""
+    rules = settings.publishers.get("rules")
+    for name, rule in rules.rules.items() if isinstance(rules, RulesOptions) else ():
+        for device in settings.devices:
+            driver = DRIVERS.get(device.driver)
+            is_named = rule.devices is None or device.name in rule.devices
+            if driver is not None and is_named and rule.field in driver.never_sends:
+                yield f"rules.rules.{name}: {device.name} never sends {rule.field}; the rule has no effect for it"
 
 
 def missing_directories(settings: Config) -> Iterator[str]:

@@ -156,6 +156,8 @@ class Driver:
     calibrations: Calibrations = field(default_factory=dict)  # guided calibrations, by kind
     device_settings: SettingsTable | None = None  # table of the device settings; None if the driver does not know them
     firmware: Firmware | None = None  # update of the firmware; None if the driver cannot update it
+    # Fields of `Sample` that no frame of the driver contains, among the fields that rules use
+    never_sends: frozenset[str] = frozenset()
     # GPIO lines that the device can have: names of fields of `imud.contracts.lines.DeviceLines`
     lines: frozenset[str] = frozenset()
     # Returns the meaning of the ALARM line from the values of the device settings; None if no setting describes it

@@ -1,5 +1,7 @@
 """An output that fails is closed and started again; devices and other outputs continue."""
 
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any, cast
 from unittest.mock import Mock, call
@@ -276,3 +278,15 @@ def test_an_exception_in_an_output_of_the_program_reaches_the_program(rig: Rig) 
     rig.failing[("mine", "publish")] = ValueError("mine")
     with pytest.raises(ValueError, match="mine"):
         outputs.publish(BATCH)
+
+
+def test_an_output_that_is_off_is_not_imported() -> None:
+    program = """
+import sys
+from imud.config import parse
+from imud.publishers import PUBLISHERS
+config = parse("devices: {}", "f")
+assert not PUBLISHERS["rules"].wanted(config.publishers["rules"])
+print([name for name in sys.modules if name in ("imud.publishers.rules.publisher", "imud.publishers.rules.commands")])
+"""
+    assert subprocess.check_output([sys.executable, "-c", program], text=True) == "[]\n"

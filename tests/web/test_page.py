@@ -529,6 +529,10 @@ def test_the_start_and_the_end_of_an_alarm_are_one_event(scripts: Page) -> None:
     ]  # fmt: skip
     join = "const { joinAlarms } = await import('/static/events.js'); return joinAlarms(args[0]).map((one) => "
     join += "[one.first_ns, one.to_ns ?? 0, one.device, one.count, [...one.open ?? ['-']].join()])"
+    rules = [{**row(t, rule=name, active=is_active), "kind": "rule"} for t, name, is_active in ((1, "a", True), (2, "b", True), (3, "a", False))]  # fmt: skip  # noqa: E501
+    assert scripts.module(join, [*rules, {**row(4, rule="a", result="failed"), "kind": "rule"}]) == [
+        [2, 0, "bow", 1, "rule b"], [1, 3, "bow", 1, ""], [4, 0, "bow", 1, "-"],
+    ]  # fmt: skip
     assert scripts.module(join, groups) == [
         [2, 0, "mast", 1, "active"], [1, 3, "bow", 1, ""], [5, 0, "bow", 1, "-"], [4, 7, "bow", 1, ""],
         [8, 0, "keel", 1, "-"], [9, 0, "bow", 3, "active"],

@@ -306,6 +306,7 @@ def _heading(settings: object, _read_back: Mapping[str, Any]) -> Heading:
 
 DRIVER: Final = CanDriver(
     name="hipnuc-nmea2000",
+    never_sends=frozenset({"accel_m_s2", "temperature_c", "incli_rad"}),
     title="HiPNUC CH0x0, CH10x, HI14, other heading and attitude sensors (CAN, NMEA 2000)",
     settings=HipnucNmea2000Options,
     make_codec=HipnucNmea2000Codec,

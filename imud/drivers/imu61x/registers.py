@@ -176,6 +176,7 @@ def register_driver(
 
     return PolledDriver(
         name=f"imu61x-{bus}",
+        never_sends=frozenset({"incli_rad", *(("euler_rad",) if bus == "i2c" else ())}),
         title=f"Forsense IMU612, IMU614, IMU618, IMU6132A, IMU6132B ({bus.upper()})",
         settings=settings,
         euler_convention=EULER_CONVENTION,

@@ -131,6 +131,9 @@ def test_a_missing_recorded_device_and_an_active_line_are_alerts(tmp_path: Path)
     bench.publish("bow", 1e6)  # without a limit of acceleration
     bench.tick(2)
     assert bench.files == []
+    bench.flight.event(Event(1, "bow", EventKind.RULE, "rule lean: tilt 11 °", {"active": True}))
+    bench.tick(12)
+    assert bench.files == []
     bench.flight.event(Event(1, "bow", EventKind.DOWN, "the adapter was pulled out"))
     bench.tick(2)
     (file,) = bench.files
@@ -708,3 +711,12 @@ def test_data_of_a_killed_process(bench: FlightWriterBench, tmp_path: Path, monk
     assert bench.writer.saved[1].problem == ""
     assert not any(file.exists() for file in files)
     assert (bench.folder / "b").stat().st_size > 100
+
+
+def test_a_rule_with_a_snapshot_is_an_alert(tmp_path: Path) -> None:
+    bench = FlightBench(tmp_path)
+    bench.flight.event(Event(1, "bow", EventKind.RULE, "rule lean: tilt 11 °", {"active": True, "snapshot": True}))
+    bench.tick(12)
+    (file,) = bench.files
+    assert decode_object(records_in(file)[-1], EndRecord).reason == "rule lean: tilt 11 °"
+    bench.flight.close()

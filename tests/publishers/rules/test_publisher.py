@@ -1,17 +1,21 @@
 """Output `rules`: events, lines, commands and snapshots of rules; rules of ticks; rules without values."""
 
 from collections.abc import Callable, Sequence
+from random import Random
 from typing import Any
 
 import msgspec
 import pytest
 
+from imud.cli.run import rules_without_values
 from imud.config import parse
+from imud.contracts.driver import CanDriver
 from imud.contracts.publisher import Batch
+from imud.drivers import DRIVERS
 from imud.model.errors import ConfigError
 from imud.model.event import Event, EventKind
-from imud.model.ledger import NOTHING_LOST
-from imud.model.sample import Sample, Sync
+from imud.model.ledger import NOTHING_LOST, Ledger
+from imud.model.sample import Measurement, Sample, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.publishers.rules.commands import CommandEnd, Result
 from imud.publishers.rules.publisher import Rules
@@ -219,6 +223,33 @@ def test_gaps_that_always_restart_the_filter_are_visible() -> None:
         rig.clock.advance((turn > 4) * 40 * NS_PER_MS)
         rig.tick(seconds=0)
     assert rig.context.outputs.problems()["rules one bow"].startswith("not evaluated: the band filter starts again")
+
+
+def test_imud_check_names_rules_without_values() -> None:
+    rules = "a: {measure: peak_accel_m_s2, above: 1}, b: {measure: temperature_c, above: 1, devices: [mast]}"
+    settings = parse(
+        f"rules: {{rules: {{{rules}}}}}\ndevices:\n"
+        "  bow: {driver: hipnuc-nmea2000, socketcan: {interface: can0}}\n"
+        "  mast: {driver: hipnuc-canopen, socketcan: {interface: can1}, options: {node: 8}}\n", "f",
+    )  # fmt: skip
+    assert list(rules_without_values(settings)) == [
+        "rules.rules.a: bow never sends accel_m_s2; the rule has no effect for it",
+        "rules.rules.b: mast never sends temperature_c; the rule has no effect for it",
+    ]
+
+
+def test_no_example_contains_a_field_that_the_driver_never_sends() -> None:
+    found = 0
+    for driver in (DRIVERS[name] for name in DRIVERS):
+        if isinstance(driver, CanDriver) and driver.never_sends:
+            codec, random = driver.make_codec(Ledger(), driver.settings()), Random(1)
+            frames = [frame for _ in range(50) for frame in driver.example_frames(random)]
+            events = [one for n, it in enumerate(frames) for one in codec.feed_frame(it.can_id, it.extended, it.data, n * 10**7) or ()]  # fmt: skip  # noqa: E501
+            measured = [one for one in events if isinstance(one, Measurement)]
+            assert measured
+            assert all(getattr(one, name) is None for one in measured for name in driver.never_sends)
+            found += 1
+    assert found == 2
 
 
 def test_names_lines_and_devices_of_the_configuration() -> None:

@@ -329,6 +329,7 @@ def _cyclic(settings: HipnucCanopenOptions) -> list[CyclicFrame]:
 
 DRIVER: Final = CanDriver(
     name="hipnuc-canopen",
+    never_sends=frozenset({"temperature_c"}),
     title="HiPNUC CH0x0, CH10x, HI14 (CANopen)",
     settings=HipnucCanopenOptions,
     make_codec=HipnucCanopenCodec,
