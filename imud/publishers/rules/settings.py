@@ -120,7 +120,7 @@ class RuleOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     @property
     def field(self) -> str:
-        """Field of the sample that the rule needs; empty if each sample has it."""
+        """Necessary field of a sample; empty if each sample contains the value."""
         if self.measure == "tilt_deg":
             return "incli_rad" if self.axis in XYZ else "euler_rad"
         return {
