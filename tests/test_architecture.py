@@ -13,9 +13,10 @@ PACKAGE = Path(__file__).parent.parent / "imud"
 
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("imud", "imud.model"), ("imud.host", "imud.formats", "imud.attitude"), ("imud.contracts",),
+    ("imud.bridges",),
     (
         "imud.drivers", "imud.sampling", "imud.links", "imud.publishers", "imud.fleet", "imud.utc", "imud.client",
-        "imud.analysis", "imud.bridges",
+        "imud.analysis",
     ),
     ("imud.config", "imud.lines", "imud.sim", "imud.web"), ("imud.recording",), ("imud.device",), ("imud.daemon",),
     ("imud.cli", "imud.testing"), ("imud.__main__",),

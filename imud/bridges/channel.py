@@ -126,6 +126,17 @@ class MessageFrames(NamedTuple):
         return f"{self.device}_level" if self.convention is Convention.ENU_FLU else f"{self.device}_level_ned"
 
 
+NORTH: Final = "ENU"  # navigation frame in the status of a device with a heading relative to north
+
+
+def has_north(status: DeviceStatus) -> bool:
+    """Return whether the navigation frame of samples in enu-flu is ENU; True while the driver is unknown."""
+    if status.frame is None:
+        return True
+    words = status.frame.conventions.get(str(Convention.ENU_FLU))
+    return words is None or words.navigation_frame == NORTH
+
+
 class ByteWriter(Protocol):
     """Destination of bytes."""
 

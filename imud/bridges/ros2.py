@@ -24,6 +24,7 @@ from struct import Struct
 from typing import Any, Final
 
 from imud.bridges.channel import (
+    STEADY_NS,
     Diagnoses,
     LossCounts,
     MessageChannel,
@@ -93,6 +94,11 @@ class CdrWriter:
         self._buffer += _text(value)
         return self
 
+    def octets(self, value: bytes) -> "CdrWriter":
+        """Append an array of octets."""
+        self._buffer += value
+        return self
+
     def done(self) -> bytes:
         """Return the encoded message."""
         return bytes(self._buffer)
@@ -140,6 +146,7 @@ FIELDS: Final = {
     "geometry_msgs/TwistStamped": "std_msgs/Header header\ngeometry_msgs/Twist twist",
     "sensor_msgs/Temperature": "std_msgs/Header header\nfloat64 temperature\nfloat64 variance",
     "sensor_msgs/FluidPressure": "std_msgs/Header header\nfloat64 fluid_pressure\nfloat64 variance",
+    "sensor_msgs/TimeReference": "std_msgs/Header header\nbuiltin_interfaces/Time time_ref\nstring source",
     "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
     "rcl_interfaces/Log": (
         "byte DEBUG=10\nbyte INFO=20\nbyte WARN=30\nbyte ERROR=40\nbyte FATAL=50\n"
@@ -323,6 +330,29 @@ def _scalar(frames: MessageFrames, name: str, sigma: float | None) -> Encoder:
         return pack(ENCAPSULATION, sec, nanosec, body, value, variance)
 
     return encode
+
+
+def time_reference(frames: MessageFrames) -> MessageChannel[Sample]:
+    """Return the channel for the time of a device, once per second: UTC of its GNSS receiver, otherwise its own time.
+    The stamp of the header is the same instant on CLOCK_REALTIME."""
+    sources = {source: Layout("iI", f'"{frames.body}', "iI", f'"{source}') for source in ("gnss", "device")}
+    due_ns = 0
+
+    def encode(sample: Sample) -> bytes | None:
+        nonlocal due_ns
+        source, time_ns = "gnss", sample.gnss_utc_ns
+        if time_ns is None:
+            source, time_ns = "device", sample.t_dev_ns
+        if time_ns is None or due_ns - STEADY_NS <= sample.utc_ns < due_ns:
+            return None
+        due_ns = sample.utc_ns + STEADY_NS
+        layout = sources[source]
+        body, name = layout.texts
+        return layout.pack(ENCAPSULATION, *time_of(sample.utc_ns), body, *time_of(time_ns), name)
+
+    where = topic(frames.device, "time_reference")
+    fields = frozenset({"gnss_utc_ns", "t_dev_ns"})
+    return MessageChannel(where, schema("sensor_msgs/TimeReference"), "cdr", encode, fields)
 
 
 def _transform(frames: MessageFrames) -> Encoder:

@@ -1,7 +1,9 @@
 """TCP and UDP sockets for an IP address, and addresses of a host name."""
 
 import asyncio
+import fcntl
 import socket
+import struct
 import threading
 from contextlib import suppress
 from typing import Final
@@ -63,3 +65,26 @@ def listen(address: str, port: int) -> socket.socket:
         listener.close()
         raise
     return listener
+
+
+SIOCGIFFLAGS: Final = 0x8913  # linux/sockios.h
+SIOCGIFADDR: Final = 0x8915
+IFF_UP, IFF_LOOPBACK, IFF_MULTICAST = 0x1, 0x8, 0x1000  # linux/if.h
+
+
+def multicast_addresses() -> list[str]:
+    """Return the IPv4 address of each interface that is up and supports multicast; 127.0.0.1 if there is none."""
+    found, loopback = [], []
+    with open_socket("127.0.0.1", socket.SOCK_DGRAM) as asked:
+        for _, name in socket.if_nameindex():
+            request = struct.pack("16s24x", name.encode()[:15])
+            try:
+                (flags,) = struct.unpack_from("H", fcntl.ioctl(asked, SIOCGIFFLAGS, request), 16)
+                address = socket.inet_ntoa(fcntl.ioctl(asked, SIOCGIFADDR, request)[20:24])
+            except OSError:  # the interface has no IPv4 address
+                continue
+            if flags & IFF_UP and flags & IFF_LOOPBACK:
+                loopback.append(address)
+            elif flags & IFF_UP and flags & IFF_MULTICAST:
+                found.append(address)
+    return found or loopback

@@ -12,6 +12,7 @@ PUBLISHERS: Registry[PublisherType] = Registry(
         "recorder": "imud.publishers.recorder.publisher:PUBLISHER",
         "nmea0183": "imud.publishers.nmea0183:PUBLISHER",
         "rules": "imud.publishers.rules.settings:PUBLISHER",
+        "ros2": "imud.publishers.ros2.options:PUBLISHER",
         "mqtt": "imud.fleet.settings:PUBLISHER",
     },
     # the configuration has these other keys at the top

@@ -20,7 +20,15 @@ import foxglove
 from foxglove.websocket import StatusLevel
 
 from imud.attitude.conventions import Convention
-from imud.bridges.channel import Diagnoses, Dialect, LiveDiagnosis, MessageChannel, MessageFrames, StampedEvent
+from imud.bridges.channel import (
+    Diagnoses,
+    Dialect,
+    LiveDiagnosis,
+    MessageChannel,
+    MessageFrames,
+    StampedEvent,
+    has_north,
+)
 from imud.bridges.json import status_channel
 from imud.client.connection import Client, EventStream, Watch, decoded, event_of, params_of
 from imud.client.feed import clock_ahead_ns, utc_offset_ns
@@ -35,8 +43,6 @@ ROUND_S: Final = 0.25
 STATUS_S: Final = 1.0
 RETRY_S: Final = 1.0
 """Time between two attempts to connect to the daemon, s."""
-NORTH: Final = "ENU"
-"""Navigation frame in the status of a device with a heading relative to north."""
 
 
 class Viewer(Protocol):
@@ -166,7 +172,7 @@ class Relay:
         for name, status in shown.items():
             known = self._devices.get(name)
             noise = (status.noise or Deviations()).updated(self._noise.get(name, Deviations()))
-            frames = MessageFrames(name, has_north=_has_north(status), deviations=noise)
+            frames = MessageFrames(name, has_north=has_north(status), deviations=noise)
             if known is None or known.frames != frames:
                 known = self._devices[name] = _ShownDevice(self._viewer, self._dialect, frames)
             known.show_status(status, utc_ns)
@@ -214,14 +220,6 @@ class _ShownDevice:
         """Stop offering the topics of the device, except topics of other devices (`kept`)."""
         for topic in self.topics.difference(kept):
             self._viewer.close_topic(topic)
-
-
-def _has_north(status: DeviceStatus) -> bool:
-    """Return whether the navigation frame of samples in enu-flu is ENU; True while the driver is unknown."""
-    if status.frame is None:
-        return True
-    words = status.frame.conventions.get(str(Convention.ENU_FLU))
-    return words is None or words.navigation_frame == NORTH
 
 
 VIEWERS: Final = ("file://", "https://app.foxglove.dev")

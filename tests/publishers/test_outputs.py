@@ -43,6 +43,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "tcp_address": "127.0.0.1", "tcp_port": 10110, "udp": [], "serial_port": None, "serial_baud": 38400,
     },
     "rules": {"enabled": False, "rules": {}, "commands": {"running": 4, "per_hour": 60, "time_s": 30}},
+    "ros2": {"enabled": False, "domain_id": 0, "node": "imud", "address": None, "devices": {"*": {"rate_hz": None}}},
     "mqtt": {
         "enabled": False, "brokers": ["mqtt://127.0.0.1:1883"], "version": "5", "site": "default", "gateway": "",
         "user": "", "password_file": None, "ca_file": None, "cert_file": None, "key_file": None, "keep_alive_s": 30,

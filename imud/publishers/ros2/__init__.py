@@ -1,0 +1,1 @@
+"""Output `ros2`: topics of ROS 2 without a ROS installation."""
