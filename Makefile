@@ -187,6 +187,11 @@ mqtt-deps:
 fleet-deps: mqtt-deps
 	apt-get install --yes --no-install-recommends postgresql
 
+# Fast DDS, the default of ROS 2, as a reader of the output `ros2`
+.PHONY: ros2-deps
+ros2-deps:
+	apt-get install --yes --no-install-recommends libfastrtps-dev g++
+
 lab-deps:
 	tests/lab/deps
 

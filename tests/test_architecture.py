@@ -503,6 +503,7 @@ TESTED_IN = {
     "imud.fleet.settings": "fleet/test_publisher.py",
     "imud.links.cyclic_sender": "links/test_socketcan.py", "imud.links.netlink": "links/test_socketcan.py",
     "imud.model.bucket": "publishers/socket/test_history.py",
+    "imud.publishers.ros2.options": "publishers/ros2/test_output.py",
     "imud.publishers.metrics.metric": "publishers/metrics/test_families.py",
     "imud.sim.hipnuc.ins": "sim/hipnuc/test_uart.py",
     "imud.sim.control": "sim/test_sensor.py", "imud.sim.hipnuc.nmea2000": "sim/test_can_module.py",

@@ -131,8 +131,8 @@ def parameters(values: Sequence[tuple[int, bytes]]) -> bytes:
     """Return a list of parameters, each padded to 4 bytes, with its end."""
     out = b""
     for number, value in values:
-        value += bytes(-len(value) % 4)
-        out += struct.pack("<HH", number, len(value)) + value
+        padding = bytes(-len(value) % 4)
+        out += struct.pack("<HH", number, len(value) + len(padding)) + value + padding
     return out + struct.pack("<HH", P_SENTINEL, 0)
 
 
@@ -156,7 +156,7 @@ def key_of(guid: bytes, *, is_participant: bool) -> bytes:
     return PL_CDR_LE + parameters([(P_PARTICIPANT_GUID if is_participant else P_ENDPOINT_GUID, guid)])
 
 
-# --- read --------------------------------------------------------------------------------------------------------------
+# --- read -------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)

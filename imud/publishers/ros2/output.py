@@ -7,14 +7,14 @@ reader costs no encoding. `ros_discovery_info` describes the node to other nodes
 """
 
 import logging
-from typing import Final
+from typing import Any, Final
 
 from imud.attitude.conventions import Convention
 from imud.bridges.channel import LiveDiagnosis, MessageChannel, MessageFrames, has_north
 from imud.bridges.ros2 import CdrWriter, Ros2Dialect, time_reference
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.contracts.status import Deviations, DeviceStatus, OutputStatus
-from imud.formats.rtps import GUID_BYTES, PREFIX_BYTES
+from imud.formats.rtps import PREFIX_BYTES
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_S
 from imud.publishers.ros2.options import Ros2Options
@@ -141,7 +141,7 @@ class Ros2Output:
         self._graph.write(made.done(), utc_ns)
 
 
-def added(participant: RtpsParticipant, channel: MessageChannel[object]) -> RtpsWriter:
+def added(participant: RtpsParticipant, channel: MessageChannel[Any]) -> RtpsWriter:
     """Add the writer of a channel."""
     name = channel.schema.name
     return participant.add(f"rt{channel.topic}", dds_type(name), TYPE_HASHES[name])

@@ -191,10 +191,10 @@ class RtpsNetwork:
     def open(self) -> tuple[socket.socket, socket.socket]:
         """Open both sockets and return them. Raises ServerError."""
         try:
-            self._multicast = shared = open_socket("0.0.0.0", socket.SOCK_DGRAM)  # noqa: S104 - multicast needs it
+            self._multicast = shared = open_socket("0.0.0.0", socket.SOCK_DGRAM)
             shared.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             shared.bind(("", self._group[1]))
-            self._unicast = own = open_socket("0.0.0.0", socket.SOCK_DGRAM)  # noqa: S104
+            self._unicast = own = open_socket("0.0.0.0", socket.SOCK_DGRAM)
             own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
             self.port = self._bind(own)
         except OSError as error:
