@@ -65,7 +65,8 @@ VALID = HEAD + rtps.data(
     rtps.SUBSCRIPTIONS_WRITER, 1,
     rtps.PL_CDR_LE + rtps.parameters([
         (rtps.P_ENDPOINT_GUID, OTHER + b"\0\0\1\4"), (rtps.P_TOPIC, rtps.text("rt/a")), (rtps.P_TYPE, rtps.text("b")),
-        (rtps.P_LIVELINESS, b"\0\0\0\0\xff\xff\xff\x7f\xff\xff\xff\xff"), (rtps.P_UNICAST, rtps.locator(Locator("192.0.2.9", 1))),
+        (rtps.P_LIVELINESS, b"\0\0\0\0\xff\xff\xff\x7f\xff\xff\xff\xff"),
+        (rtps.P_UNICAST, rtps.locator(Locator("192.0.2.9", 1))),
     ]), key=OTHER + b"\0\0\1\4",
 )  # fmt: skip
 

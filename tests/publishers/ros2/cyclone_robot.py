@@ -1,3 +1,5 @@
+# mypy: ignore-errors
+# the types of cyclonedds.idl are no types for mypy
 """A robot with Cyclone DDS: a process with IDL types that prints each received message as a line of JSON.
 
     python cyclone_robot.py DOMAIN SECONDS TOPIC...

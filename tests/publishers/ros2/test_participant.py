@@ -85,7 +85,8 @@ TOPIC = {"p05": rtps.text("rt/a")}
     [
         (TOPIC, True), ({"p05": rtps.text("rt/other")}, False), (TOPIC | {"p07": rtps.text("c")}, True),
         (TOPIC | {"p1d": b"\1\0\0\0"}, False), (TOPIC | {"p23": b"\1\0\0\0\0\0\0\0"}, False),
-        (TOPIC | {"p29": b"\1\0\0\0\2\0\0\0x\0"}, False), (TOPIC | {"p1b": b"\1\0\0\0"}, False), (TOPIC | {"p1f": b"\1\0\0\0"}, False),
+        (TOPIC | {"p29": b"\1\0\0\0\2\0\0\0x\0"}, False), (TOPIC | {"p1b": b"\1\0\0\0"}, False),
+        (TOPIC | {"p1f": b"\1\0\0\0"}, False),
     ],
 )  # fmt: skip
 def test_only_readers_with_the_same_topic_and_qos_match(changes: dict[str, bytes], fits: bool) -> None:
