@@ -33,6 +33,8 @@ def test_a_writer_repeats_kept_samples_and_counts_the_others() -> None:
     writer = RtpsWriter(wire, b"\0\0\1\3", "rt/a", "b", is_kept=False)
     writer.write(b"\0\1\0\0old.", 0)
     writer.match(MatchedReader(GUID, WHERE, is_reliable=True, start=1, acked=0))
+    writer.acknowledge(GUID, request(1, 1))
+    assert wire.made[-1].endswith(rtps.gap(writer.entity, GUID[12:], 1)), "kept, but before its start"
     for number in range(14):
         wire.is_full = number == 3
         writer.write(b"\0\1\0\0" + bytes([number] * 4), 0)
@@ -101,12 +103,15 @@ def test_only_readers_with_the_same_topic_and_qos_match(changes: dict[str, bytes
     assert not writer.readers
 
 
-def test_participants_above_the_limit_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "PEERS_MAX", 3)
-    monkeypatch.setattr(module, "READERS_MAX", 2)
+@pytest.mark.parametrize(("peers", "readers", "expected"), [(3, 10, (3, 2)), (10, 2, (2, 3))])
+def test_participants_and_readers_above_the_limit_are_refused(
+    monkeypatch: pytest.MonkeyPatch, peers: int, readers: int, expected: tuple[int, int]
+) -> None:
+    monkeypatch.setattr(module, "PEERS_MAX", peers)
+    monkeypatch.setattr(module, "READERS_MAX", readers)
     one = RtpsParticipant(0, "127.0.0.1", "imud", lambda: 0)
     writer = one.add("rt/a", "b", "RIHS01_0")
     for number in range(5):
         one.received(described(number), WHERE.address, 0)
         one.received(described(number, **TOPIC), WHERE.address, 0)
-    assert (len(writer.readers), one.refused) == (2, 3)
+    assert (len(writer.readers), one.refused) == expected
