@@ -46,6 +46,19 @@ class Heading(StrEnum):
     UNKNOWN = "unknown"  # the device did not report its reference
 
 
+class AttitudeSource(StrEnum):
+    """Sources of `quat_wxyz` and `euler_rad`."""
+
+    DEVICE = "device"
+    HOST = "host"  # imud computes them from the angular rate and the acceleration
+
+
+# Bit of `status` that imud sets while its attitude filter has not settled. Devices without an attitude do not use it.
+UNSETTLED_BIT: Final = 30
+UNSETTLED_WORDS: Final = "attitude filter of the host has not settled"
+HOST_NAVIGATION_WORDS: Final = "level, Z up; X where the yaw was 0 at the start of the filter on the host"
+
+
 @dataclass(frozen=True, slots=True)
 class DeviceAxes:
     """Axes and angles that a device sends."""

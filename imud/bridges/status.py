@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from math import degrees
 
-from imud.attitude.conventions import Heading
+from imud.attitude.conventions import AttitudeSource, Heading
 from imud.contracts.setting import SettingsState, SettingsStatus
 from imud.contracts.status import DeviceStatus, FrameStatus, LinesStatus, PollingStatus, SerialLineCounters, UtcStatus
 from imud.model.ledger import LEDGER_FIELDS, bytes_open, frames_open, lost
@@ -56,6 +56,8 @@ def axes(frame: FrameStatus) -> str:
     """Format axes and heading."""
     own = frame.convention == "device"
     words = f"{frame.frame if own else f'{frame.convention}, {frame.frame}'}; heading {frame.heading}"
+    if frame.attitude is AttitudeSource.HOST:
+        return f"{words} to the start of the attitude filter; imud computes the attitude on the host"
     if frame.heading is Heading.RELATIVE:
         words += " to power-on" + ("; declination_deg is ignored" if frame.declination_deg is not None else "")
     elif frame.declination_deg is not None:

@@ -5,13 +5,15 @@ from typing import Final, NamedTuple
 
 import msgspec
 
+from imud.attitude.conventions import AttitudeSource
 from imud.cli.arguments import CliCommand
 from imud.cli.output import table
+from imud.contracts.driver import Driver, status_bits_of
 from imud.drivers import DRIVERS
 from imud.model.sample import SAMPLE_SCHEMA
 
 FIELD_HEAD: Final = ("FIELD", "TYPE", "UNIT", "FRAME", "MEANING")
-DRIVER_HEAD: Final = ("DRIVER", "NAVIGATION FRAME", "EULER ANGLES")
+DRIVER_HEAD: Final = ("DRIVER", "ATTITUDE", "NAVIGATION FRAME", "EULER ANGLES")
 STATUS_HEAD: Final = ("DRIVER", "STATUS BIT", "MEANING IF SET")
 
 
@@ -21,6 +23,7 @@ class DriverSchema(NamedTuple):
     navigation_frame: str
     euler_convention: str
     status_bits: dict[str, str]  # names of the bits of `status`, by bit number
+    attitude: str  # source of the attitude: `device`, or `host` if only imud can compute it (key `attitude: host`)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,10 +46,15 @@ def driver_schemas() -> dict[str, DriverSchema]:
     return {
         name: DriverSchema(
             driver.navigation_frame, driver.euler_convention,
-            {str(number): bit.name for number, bit in driver.status_bits.items()},
+            {str(number): bit.name for number, bit in status_bits_of(driver, source).items()}, source,
         )
         for name, driver in DRIVERS.items()
+        for source in [_source(driver)]
     }  # fmt: skip
+
+
+def _source(driver: Driver) -> AttitudeSource:
+    return AttitudeSource.DEVICE if driver.sends_attitude(driver.settings()) else AttitudeSource.HOST
 
 
 def page(drivers: dict[str, DriverSchema]) -> str:
@@ -55,7 +63,10 @@ def page(drivers: dict[str, DriverSchema]) -> str:
     return "\n\n".join(
         [
             table(FIELD_HEAD, [(f.name, f.type, f.unit, f.frame, f.meaning) for f in SAMPLE_SCHEMA]),
-            table(DRIVER_HEAD, [(name, one.navigation_frame, one.euler_convention) for name, one in drivers.items()]),
+            table(
+                DRIVER_HEAD,
+                [(name, one.attitude, one.navigation_frame, one.euler_convention) for name, one in drivers.items()],
+            ),
             table(STATUS_HEAD, bits),
         ]
     )

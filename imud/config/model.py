@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 
-from imud.attitude.conventions import Convention
+from imud.attitude.conventions import AttitudeSource, Convention
 from imud.attitude.published import FrameOptions
 from imud.contracts.condition import ConditionLimits
 from imud.contracts.lines import DeviceLines
@@ -34,6 +34,7 @@ class DeviceConfig:
     declination_deg: float | None = None
     noise: Deviations | None = None  # standard deviations of the samples; None if they are unknown
     condition: ConditionLimits = field(default_factory=ConditionLimits)
+    attitude: AttitudeSource = AttitudeSource.DEVICE
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,17 +2,19 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
+from importlib import import_module
 from typing import Any, Final
 
 import msgspec
 
-from imud.attitude.conventions import RFU_ENU, Heading
+from imud.attitude.conventions import RFU_ENU, AttitudeSource, Heading
 from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes, mounting_of
 from imud.config.model import DeviceConfig
 from imud.config.schema import DeviceGeneral, Keys
 from imud.config.yaml import Path as KeyPath
 from imud.contracts.driver import Driver
 from imud.contracts.lines import LINE_SCHEMAS, DeviceLines, LineOptions
+from imud.model.errors import ImudError
 from imud.model.options import Options, shown
 from imud.utc.receivers import RmcOptions
 
@@ -69,6 +71,38 @@ def check_declination(
         why = "is relative to power-on" if heading is Heading.RELATIVE else "is already true"
         message = f"expected declination_deg only with a magnetic heading, got {general.driver}"
         keys.problem(place, f"{message}, whose heading {why}", at_key=True)
+
+
+def check_attitude(
+    keys: Keys, path: KeyPath, general: DeviceGeneral, options: Options | None, drivers: Mapping[str, Driver]
+) -> None:
+    """Report the attitude of the host for a device with its own attitude, or without the library."""
+    if general.attitude is not AttitudeSource.HOST:
+        return
+    place = (*path, "attitude")
+    if general.driver == "auto":
+        keys.problem(place, "expected the name of a driver next to attitude: host, got auto", at_key=True)
+        return
+    if options is None:
+        return  # another check reports the problem of the driver
+    if drivers[general.driver].sends_attitude(options):
+        message = (
+            f"expected a device without an attitude of its own ({', '.join(_without_attitude(drivers))}), got "
+            f"{general.driver} with these options; remove the key"
+        )
+        keys.problem(place, message, at_key=True)
+        return
+    try:
+        import_module("imud.sampling.attitude").check_extra()
+    except ImudError as error:
+        keys.problem(place, str(error), at_key=True)
+
+
+def _without_attitude(drivers: Mapping[str, Driver]) -> Iterator[str]:
+    for name in drivers:
+        with suppress(ImportError):
+            if not drivers[name].sends_attitude(drivers[name].settings()):
+                yield name
 
 
 LINK: Final = "uart"

@@ -10,7 +10,15 @@ from re import compile as pattern
 from typing import Any, Final, NamedTuple
 
 from imud.config.model import Config, DeviceConfig
-from imud.config.parts import check_declination, lines_of_device, lines_once, read_frame, read_lines, read_rmc
+from imud.config.parts import (
+    check_attitude,
+    check_declination,
+    lines_of_device,
+    lines_once,
+    read_frame,
+    read_lines,
+    read_rmc,
+)
 from imud.config.schema import TABLES, DeviceGeneral, General, Keys, Tables
 from imud.config.yaml import FILE_BYTES_MAX, Problem, no_pause, path_text, read_yaml
 from imud.config.yaml import Path as KeyPath
@@ -346,10 +354,13 @@ class DeviceReader:
             if lines is not None:
                 self._declared.check_lines(path, general.driver, declared, lines)
         check_declination(self._keys, path, general, options, self._tables.drivers)
+        check_attitude(self._keys, path, general, options, self._tables.drivers)
         line = self._keys.tree.key_mark(path).line
         own_keys = general.driver, options, general.identify, link_name, link_settings
         frames = frame, general.convention, general.declination_deg
-        made = DeviceConfig(name, *own_keys, line, lines, rmc, declared, general.on_difference, *frames, noise, limits)
+        made = DeviceConfig(
+            name, *own_keys, line, lines, rmc, declared, general.on_difference, *frames, noise, limits, general.attitude
+        )  # fmt: skip
         return made, general.enabled
 
     def _options(self, path: KeyPath, keys: Mapping[str, Any]) -> Options | None:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get
 
 import msgspec
 
-from imud.attitude.conventions import Convention
+from imud.attitude.conventions import AttitudeSource, Convention
 from imud.config.yaml import PROBLEMS_MAX, Problem, YamlTree
 from imud.config.yaml import Path as KeyPath
 from imud.contracts.driver import Driver
@@ -53,6 +53,9 @@ class DeviceGeneral(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     declination_deg: Annotated[float, msgspec.Meta(ge=-180, le=180)] | None = None
     """Direction of magnetic north from true north, east positive. imud adds it to a magnetic heading; null: no
     change."""
+    attitude: AttitudeSource = AttitudeSource.DEVICE
+    """`host`: imud computes the attitude of a device that sends only angular rate and acceleration
+    (docs/attitude.md). Needs the extra `imud[attitude]`."""
 
 
 Row = Driver | LinkType[Any] | PublisherType

@@ -8,7 +8,14 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, TypeVar
 import msgspec
 from msgspec import Meta
 
-from imud.attitude.conventions import RFU_ENU, DeviceAxes, Heading
+from imud.attitude.conventions import (
+    RFU_ENU,
+    UNSETTLED_BIT,
+    UNSETTLED_WORDS,
+    AttitudeSource,
+    DeviceAxes,
+    Heading,
+)
 from imud.contracts.codec import CanCodec, PolledCodec, StreamCodec
 from imud.contracts.command import Calibrations, Verbs
 from imud.contracts.firmware import Firmware
@@ -108,6 +115,13 @@ def status_words(bits: Mapping[int, StatusBit], status: int | None) -> tuple[str
     return tuple(bit.name for number, bit in bits.items() if status is not None and status >> number & 1)
 
 
+def status_bits_of(driver: "Driver", attitude: AttitudeSource) -> Mapping[int, StatusBit]:
+    """Return the known bits of the status of samples, with the bit of imud for its own attitude."""
+    if attitude is AttitudeSource.DEVICE:
+        return driver.status_bits
+    return {**driver.status_bits, UNSETTLED_BIT: StatusBit(UNSETTLED_WORDS, notable=True)}
+
+
 def no_problems(_options: Any, _link: Any) -> Sequence[KeyProblem]:
     """Return no problem. Default of drivers without additional rules."""
     return ()
@@ -148,6 +162,9 @@ class Driver:
     axes_by_settings: Callable[[Mapping[str, str]], SentAxes | None] = lambda _settings: None
     # Returns the reference of yaw from the driver options and the values of the device settings (empty: not read yet)
     heading: Callable[[Any, Mapping[str, Any]], Heading] = _unknown_heading
+    # Returns whether the samples contain an attitude of the device, from the driver options. False: they contain
+    # angular rate and acceleration, from which imud can compute it.
+    sends_attitude: Callable[[Any], bool] = lambda _options: True
     verbs: Verbs = field(default_factory=dict)  # verbs of the device, by name
     # Arguments of `imud settings NAME --set` in place of a removed command, by the name of the command. {NAME} is the
     # argument NAME of the command, {NAME|VALUE} has a default. Empty: `imud settings NAME` replaces the command. Remove

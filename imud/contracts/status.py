@@ -6,7 +6,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from imud.attitude.conventions import Heading
+from imud.attitude.conventions import AttitudeSource, Heading
 from imud.attitude.published import FrameWords
 from imud.contracts.command import CalibrationStatus
 from imud.contracts.condition import Condition, DeviceCondition, Reason, duration
@@ -203,6 +203,7 @@ class FrameStatus(msgspec.Struct, frozen=True):
     # there is no contradiction
     problem: str = ""
     problem_kind: FrameProblem | None = None  # kind of the contradiction; null if there is none
+    attitude: AttitudeSource = AttitudeSource.DEVICE  # source of `quat_wxyz` and `euler_rad`
 
 
 # Upper bounds of the latency histogram, ns. One more bucket without a bound follows.

@@ -28,7 +28,7 @@ from imud.contracts.command import (
     Verbs,
 )
 from imud.contracts.condition import Condition
-from imud.contracts.driver import status_words
+from imud.contracts.driver import status_bits_of, status_words
 from imud.contracts.lines import LineFactory
 from imud.contracts.link import Link
 from imud.contracts.publisher import PutRecord
@@ -239,7 +239,7 @@ class Device:
         self._verb_run = VerbRun(self.settings, transport)
         self.firmware = FirmwareUpdate(config.name, transport, self.settings, self._events, self._health, host)
         self._attitude = AttitudeWatch(config, self._events)
-        self._status = StatusWatch(self._events)
+        self._status = StatusWatch(self._events, config.attitude)
         self._judge = ConditionJudge(config, transport.link.title, self.ledger, self._events, host.now_ns())
         self._is_slow = True  # whether the sample period is longer than IDLE_FLUSH_NS, or not known
         self._is_quick = False  # whether a tick can end immediately while samples arrive and no command runs
@@ -517,6 +517,7 @@ class Device:
         driver, newest = transport.driver, path.newest if path is not None else None
         latency = path.latency if path is not None else LatencyMeter()
         frame = self._attitude.status(driver, path, self.settings)
+        bits = status_bits_of(driver, self.config.attitude) if driver else {}
         status = DeviceStatus(
             name=self.config.name,
             device_id=self.device_id,
@@ -543,8 +544,8 @@ class Device:
             temperature_c=newest.temperature_c if newest else None,
             status_bits=newest.status if newest else None,
             position=newest.position if newest else None,
-            status_words=status_words(driver.status_bits, newest.status) if driver and newest else (),
-            status_bit_names={str(number): bit.name for number, bit in driver.status_bits.items()} if driver else {},
+            status_words=status_words(bits, newest.status) if newest else (),
+            status_bit_names={str(number): bit.name for number, bit in bits.items()},
             connects=self._connects,
             lines=transport.add_lines(self._attachments.lines_status()),
             utc=self._attachments.utc_status(),

@@ -102,7 +102,7 @@ class DeviceContext:
 
         return PathContext(
             self.config.name, self.device_id, self.ledger, self.owner.publish, on_message, self.events.bad_frame,
-            overruns, self.host, self.published(driver.sent_axes(settings).axes),
+            overruns, self.host, self.published(driver.sent_axes(settings).axes), self.config.attitude,
         )  # fmt: skip
 
     def new_clock(self, driver: Driver, path: SamplePath | None) -> SampleClock:

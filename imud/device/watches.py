@@ -8,11 +8,11 @@ rest without contradiction.
 from collections.abc import Mapping
 from typing import Final
 
-from imud.attitude.conventions import Convention, Heading
+from imud.attitude.conventions import EULER_WORDS, HOST_NAVIGATION_WORDS, AttitudeSource, Convention, Heading
 from imud.attitude.gravity import Contradiction, GravityCheck
 from imud.attitude.published import PublishedAxes
 from imud.config.model import DeviceConfig
-from imud.contracts.driver import Driver, StatusBit
+from imud.contracts.driver import Driver, StatusBit, status_bits_of
 from imud.contracts.status import FrameProblem, FrameStatus
 from imud.device.health import DeviceEvents
 from imud.device.settings import DeviceSettings
@@ -70,13 +70,18 @@ class AttitudeWatch:
             return None
         frame, config, sent = path.frame, self._config, driver.sent_axes(settings.shown)
         kind, problem = self.problem(driver, settings, sent.problem)
-        words = frame.words(sent.euler_convention, sent.navigation_frame)
+        is_host = config.attitude is AttitudeSource.HOST
+        words = (
+            frame.words(EULER_WORDS[Convention.ENU_FLU], HOST_NAVIGATION_WORDS)
+            if is_host else frame.words(sent.euler_convention, sent.navigation_frame)
+        )  # fmt: skip
         return FrameStatus(
             frame=words.frame,
             convention=AS_DEVICE if frame.convention is None else str(frame.convention),
             euler_convention=words.euler_convention,
             navigation_frame=words.navigation_frame,
-            heading=frame.heading(driver.heading(config.options, settings.values)),
+            heading=Heading.RELATIVE if is_host else frame.heading(driver.heading(config.options, settings.values)),
+            attitude=config.attitude,
             declination_deg=frame.declination_deg,
             conventions={str(one): frame.words_of(one) for one in Convention},
             problem=problem,
@@ -116,8 +121,9 @@ INTERVAL_NS: Final = NS_PER_S  # minimum interval of events, ns
 class StatusWatch:
     """Check of the notable status bits of one device. Synchronization: the loop's thread only."""
 
-    def __init__(self, events: DeviceEvents) -> None:
+    def __init__(self, events: DeviceEvents, attitude: AttitudeSource = AttitudeSource.DEVICE) -> None:
         self._events = events
+        self._attitude = attitude
         self._path: SamplePath | None = None
         self._bits: Mapping[int, StatusBit] = {}
         self._set = 0  # bits that imud has reported as set, as a mask
@@ -144,7 +150,8 @@ class StatusWatch:
     def _begin(self, driver: Driver, path: SamplePath) -> None:
         """Watch the status bits of a new path."""
         self._path = path
-        self._bits = {number: bit for number, bit in driver.status_bits.items() if bit.notable}
+        known = status_bits_of(driver, self._attitude)
+        self._bits = {number: bit for number, bit in known.items() if bit.notable}
         path.watch_status(sum(1 << number for number in self._bits))
         self._set = 0
         self._seen_ns.clear()

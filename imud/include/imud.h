@@ -134,7 +134,8 @@ typedef struct imud_slot {
     uint64_t edge_seq; /* number of the SOUT edge, or SIN trigger, that belongs to the sample */
     uint32_t t_err_ns; /* one-sigma error of t_ns */
     uint32_t present;  /* IMUD_HAS_... */
-    uint32_t status;   /* status bits as sent; bit 31 is imud's own: the ALARM line was active */
+    uint32_t status;   /* status bits as sent; bits 31 and 30 are imud's own: the ALARM line was active, the attitude
+                          filter of the host has not settled */
     uint16_t device_id;
     uint8_t sync; /* IMUD_SYNC_... */
     uint8_t reserved0;

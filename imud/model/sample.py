@@ -138,7 +138,9 @@ SAMPLE_SCHEMA: Final = (
     FieldInfo("pressure_pa", "number", "Pa", "", "air pressure", False),
     FieldInfo("incli_rad", "number[2]", "rad", _SENSOR, "inclinometer X and Y", False),
     FieldInfo(
-        "status", "integer", "", "", "status bits as sent; bit 31 is imud's own: the ALARM line was active", False
+        "status", "integer", "", "",
+        "status bits as sent; bits of imud: bit 31: the ALARM line was active; bit 30: the attitude filter of the host "
+        "has not settled", False,
     ),
     FieldInfo(
         "pps_age_ms", "integer", "ms", "device clock",

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import msgspec
 
+from imud.attitude.conventions import AttitudeSource
 from imud.config.model import DeviceConfig
 from imud.contracts.codec import Reading
 from imud.contracts.lines import Edge
@@ -119,8 +120,10 @@ class PathObserver:
     def _state(self, path: SamplePath) -> bytes:
         external = {"ledger": self._ledger, "steady": self._host.steady, "observer": self}
         path.clock.settle()
+        if path.attitude is not None:
+            path.attitude.save()
         try:
-            return StateWriter(external, path.NOT_STATE).write({"path": path})
+            return StateWriter(external, path.NOT_STATE).write(path.roots)
         except StateError as error:
             log.warning("%s: recorded without its state: %s", self._config.name, error)
             return b""  # a replay then starts with a new clock
@@ -205,6 +208,7 @@ def _configuration(config: DeviceConfig) -> dict[str, Any]:
         "frame": config.frame,
         "convention": config.convention,
         "declination_deg": config.declination_deg,
+        "attitude": None if config.attitude is AttitudeSource.DEVICE else config.attitude,
         "noise": config.noise,
     }
     tree: dict[str, Any] = msgspec.to_builtins({key: one for key, one in made.items() if one is not None})

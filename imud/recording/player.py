@@ -14,7 +14,7 @@ import msgspec
 from msgspec.structs import replace
 
 from imud import __version__
-from imud.attitude.conventions import Convention
+from imud.attitude.conventions import AttitudeSource, Convention
 from imud.attitude.published import FrameOptions, PublishedAxes, published_frame
 from imud.config.model import DeviceConfig
 from imud.contracts.codec import BadFrame, Reading
@@ -322,7 +322,14 @@ class Player:
             raise StateError(self._no_state or "the recording does not contain the state of the clock")
         assert device.path is not None
         external = {"ledger": device.ledger, "steady": self._host.steady, "observer": None}
-        StateReader(state, external).restore("path", device.path)
+        reader = StateReader(state, external)
+        for name, root in device.path.roots.items():
+            reader.restore(name, root)
+        if device.path.attitude is not None:
+            try:
+                device.path.attitude.resume()
+            except ValueError as error:
+                raise StateError(f"cannot restore the state: {error}") from None
 
     def _path(
         self, device: PlayedDevice, driver: Driver, config: DeviceConfig, made: PathRecord, before: SamplePath | None
@@ -336,7 +343,7 @@ class Player:
         context = PathContext(
             config.name, device.device_id, ledger, self._publish, ignore_message, device.note_frame,
             lambda: device.overruns, self._host,
-            _frame_of(config, driver, device.described),
+            _frame_of(config, driver, device.described), config.attitude,
         )  # fmt: skip
         if isinstance(driver, StreamDriver):
             return StreamPath(driver.make_codec(ledger, options), clock, context)
@@ -376,6 +383,7 @@ def _config_of(described: DeviceRecord, driver: Driver, made: PathRecord) -> Dev
             frame=msgspec.convert(tree.get("frame"), FrameOptions | None),
             convention=msgspec.convert(tree.get("convention"), Convention | None),
             declination_deg=msgspec.convert(tree.get("declination_deg"), float | None),
+            attitude=msgspec.convert(tree.get("attitude", AttitudeSource.DEVICE), AttitudeSource),
         )  # fmt: skip
     except msgspec.ValidationError as error:
         raise ImudError(f"{described.name}: cannot read the recorded configuration: {reason_of(error)}") from None

@@ -11,11 +11,13 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from math import hypot, sqrt
 from typing import Any, ClassVar, Final, NamedTuple, Protocol
 
 from msgspec.structs import replace
 
+from imud.attitude.conventions import AttitudeSource
 from imud.attitude.published import PublishedAxes
 from imud.contracts.codec import (
     BadFrame,
@@ -66,6 +68,7 @@ class PathContext:
     overruns: Callable[[], int]  # returns the number of overruns that the kernel counted since the link was opened
     host: HostClock
     frame: PublishedAxes = AS_SENT  # axes and angles of the published samples
+    attitude: AttitudeSource = AttitudeSource.DEVICE
 
 
 class SamplePath(ABC):
@@ -73,10 +76,10 @@ class SamplePath(ABC):
 
     # Attributes that a recorded state does not contain: parts of the daemon, and statistics.
     NOT_STATE: ClassVar = frozenset({
-        "_device", "_device_id", "_drain_edges", "_ledger", "_listener", "_now_ns", "_on_bad_frame", "_on_message",
-        "_overruns", "_publish", "_rotation", "_start_run", "_status_mask", "_status_seen", "_utc_offset_ns",
-        "frame",
-        "latency",
+        "_changes", "_device", "_device_id", "_drain_edges", "_ledger", "_listener", "_now_ns", "_on_bad_frame",
+        "_on_message", "_overruns", "_publish", "_rotation", "_start_run", "_status_mask", "_status_seen",
+        "_utc_offset_ns", "attitude", "frame", "latency",
+        "_array", "_filter", "_from_up", "_to_euler",  # of `attitude`
     })  # fmt: skip
 
     def __init__(self, clock: SampleClock, context: PathContext) -> None:
@@ -96,6 +99,11 @@ class SamplePath(ABC):
         self._device_id = context.device_id
         self._ledger = context.ledger
         self._rotation = context.frame.rotation
+        # `HostAttitude`; None if imud does not compute the attitude. Only a device with the key loads vqf.
+        self.attitude: Any = None
+        if context.attitude is AttitudeSource.HOST:
+            self.attitude = import_module("imud.sampling.attitude").HostAttitude(context.frame.device)
+        self._changes = self._rotation is not None or self.attitude is not None
         self._publish = context.publish
         self._on_message = context.on_message
         self._on_bad_frame = context.on_bad_frame
@@ -111,8 +119,16 @@ class SamplePath(ABC):
 
     def set_frame(self, frame: PublishedAxes) -> None:
         """Publish the following samples in other axes."""
+        if self.attitude is not None and frame.device != self.frame.device:
+            self.attitude.set_axes(frame.device)
         self.frame = frame
         self._rotation = frame.rotation
+        self._changes = self._rotation is not None or self.attitude is not None
+
+    @property
+    def roots(self) -> Mapping[str, object]:
+        """Objects with the state of the path, by name, without the attributes in NOT_STATE."""
+        return {"path": self} if self.attitude is None else {"path": self, "attitude": self.attitude}
 
     def observe(self, observer: InputObserver | None) -> None:
         """Report each input of the path and of its clock to `observer`. None stops the reports."""
@@ -246,11 +262,11 @@ class SamplePath(ABC):
         """Publish samples as one batch. Their data arrived at `t_rx_ns`, and the path has reported it to its observer:
         an output may read the host clocks, and this reading must follow the data in a recording."""
         self._ledger.samples += len(samples)
-        self._newest = samples[-1]
         self.last_sample_ns = t_rx_ns
-        if self._rotation is not None:
-            samples = self._rotation.samples(samples)
-        # readers of the batch get the published axes, `newest` keeps the axes of the sensor
+        if self._changes:
+            samples = self._changed(samples)
+        else:
+            self._newest = samples[-1]
         self._publish(Batch(self._device, self._device_id, samples, self.frame))
         if mask := self._status_mask:
             for sample in samples:
@@ -261,9 +277,16 @@ class SamplePath(ABC):
         else:
             self.latency.add(self._now_ns(), [sample.t_ns for sample in samples])
 
+    def _changed(self, samples: list[Sample]) -> list[Sample]:
+        """Return the samples with the attitude of the host, in the published axes. `newest` keeps the sensor axes."""
+        if self.attitude is not None:
+            samples = self.attitude.samples(samples)
+        self._newest = samples[-1]
+        return samples if self._rotation is None else self._rotation.samples(samples)
+
     def _finish_slots(self, packed: bytes, t_rx_ns: int) -> None:
         """Publish slots of the kernel as one batch, as `_finish`."""
-        if self._rotation is not None:
+        if self._changes:
             self._finish(decode_slots(packed, self._device), t_rx_ns)
             return
         self._ledger.samples += len(packed) // SLOT_BYTES
@@ -607,11 +630,6 @@ class PolledPath(SamplePath):
     def period_ns(self) -> int:
         """Expected time between two reads, ns. It follows the reads of slow devices, up to READ_INTERVAL_MAX_NS."""
         return max(self._period_ns, min(self._interval_ns, READ_INTERVAL_MAX_NS))
-
-    def set_frame(self, frame: PublishedAxes) -> None:
-        """Publish the following samples in other axes."""
-        self.frame = frame
-        self._rotation = frame.rotation
 
     def observe(self, observer: InputObserver | None) -> None:
         """Report each input of the path, of its clock and of its data-ready line to `observer`."""

@@ -195,7 +195,7 @@ def test_a_good_file_and_defaults() -> None:
         ("devices:\n  a: {driver: acme-urat, port: {port: x}}", '2:15: devices.a.driver: expected a driver that imud knows, got "acme-urat"; did you mean acme-uart? known: acme-uart, auto, plain-uart'),
         ("devices:\n  a: {driver: 5, port: {port: x}}", "2:15: devices.a.driver: expected text, got 5"),
         ("devices:\n  a: {options: {range_g: 4}, port: {port: x}}", "2:7: devices.a.options: expected the name of a driver next to options, got auto; drivers: acme-uart, plain-uart"),
-        ("devices:\n  a: {driver: plain-uart, port: {port: x}, firmware: new.hex}", '2:44: devices.a.firmware: expected a key that imud knows, got "firmware"; did you mean frame? known: condition, convention, declination_deg, driver, enabled, file, frame, identify, lines, noise, on_difference, options, port, rmc, settings'),
+        ("devices:\n  a: {driver: plain-uart, port: {port: x}, firmware: new.hex}", '2:44: devices.a.firmware: expected a key that imud knows, got "firmware"; did you mean frame? known: attitude, condition, convention, declination_deg, driver, enabled, file, frame, identify, lines, noise, on_difference, options, port, rmc, settings'),
         ("devices:\n  a: {driver: plain-uart, options: {range_g: 4}, port: {port: x}}", '2:37: devices.a.options.range_g: expected a key that imud knows, got "range_g"; known: none'),
         ("devices:\n  a: {driver: acme-uart, options: {range_g: 17}, port: {port: x}}", "2:45: devices.a.options.range_g: expected a whole number from 2 to 16, got 17"),
         ("devices:\n  A: {port: {port: x}}", '2:3: devices.A: expected a device name of 1 to 32 characters of a-z, 0-9, _ and -, starting with a letter or digit, got "A"'),

@@ -2,6 +2,8 @@
 
 # ruff: noqa: E501 - a row of the table is a device and the whole message for it
 
+import sys
+
 import pytest
 
 from imud import config
@@ -233,6 +235,38 @@ def test_the_keys_of_frame_and_lines_are_part_of_the_device() -> None:
 )  # fmt: skip
 def test_what_is_refused(keys: str, message: str) -> None:
     assert message in problem(f"    {keys}\n")
+
+
+RAW = "devices:\n  bow:\n    driver: {}\n    {}\n    attitude: host\n"
+
+
+@pytest.mark.parametrize(
+    ("driver", "keys", "message"),
+    [
+        ("imu61x-spi", "spi: {port: /dev/spidev0.0}", ""), ("imu61x-i2c", "i2c: {bus: 1}", ""),
+        ("imu61x-spi", "spi: {port: /dev/spidev0.0}\n    options: {burst: registers}", ""),
+        ("imu61x-spi", "spi: {port: /dev/spidev0.0}\n    options: {burst: extended}",
+         "expected a device without an attitude of its own (imu61x-i2c, imu61x-spi), got imu61x-spi with these options"),
+        ("hipnuc-uart", "uart: {port: x}", "got hipnuc-uart with these options; remove the key"),
+        ("auto", "uart: {port: x}", "expected the name of a driver next to attitude: host, got auto"),
+    ],
+)  # fmt: skip
+def test_the_host_computes_an_attitude_only_for_raw_samples(driver: str, keys: str, message: str) -> None:
+    text = RAW.format(driver, keys)
+    if not message:
+        assert config.parse(text, "f.yaml").devices[0].attitude == "host"
+        return
+    with pytest.raises(ConfigError) as caught:
+        config.parse(text, "f.yaml")
+    assert str(caught.value).startswith(f"f.yaml:{text.count(chr(10))}:5: devices.bow.attitude: ")
+    assert message in str(caught.value)
+
+
+def test_a_missing_library_of_the_attitude_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "vqf", None)
+    with pytest.raises(ConfigError, match=r"devices.bow.attitude: expected the package vqf .*pip install"):
+        config.parse(RAW.format("imu61x-i2c", "i2c: {bus: 1}"), "f.yaml")
+    config.parse(RAW.format("imu61x-i2c", "i2c: {bus: 1}").replace("host", "device"), "f.yaml")
 
 
 def test_a_declination_needs_a_magnetic_heading() -> None:

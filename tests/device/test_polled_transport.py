@@ -7,13 +7,16 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from itertools import pairwise
-from math import dist, sqrt
+from math import asin, atan2, dist, hypot, pi, radians, sqrt
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from imud.attitude.conventions import AttitudeSource, Convention
+from imud.attitude.rotation import matrix_from_quat, quat_from_euler_zyx
+from imud.bridges.status import axes as device_axes
 from imud.config.model import DeviceConfig
 from imud.contracts.codec import Poll, Reading
 from imud.contracts.lines import DeviceLines, LineFactory, OnEdges, OnLineEnd, ReadyOptions
@@ -31,6 +34,7 @@ from imud.model.units import NS_PER_S
 from imud.sampling.path import PolledPath
 from imud.sim.imu61x.registers import Imu61xRegisters
 from imud.sim.imu61x.uart import REGISTER_VARIANTS
+from imud.sim.physics import Sine, Swing
 from imud.sim.ports.pins import MemoryInput, MemoryOutput
 from tests.support.device_rig import DeviceRig, device_config
 from tests.support.event_loops import VirtualClock, in_loop
@@ -89,6 +93,53 @@ async def test_spi_samples_have_the_values_of_their_time_stamp(
     assert max(errors) < sqrt(3) * 1.01
     assert device.window == 0
     assert not bench.spi.opened
+
+
+def with_attitude(config: DeviceConfig) -> DeviceConfig:
+    return replace(config, attitude=AttitudeSource.HOST, convention=Convention.NED_FRD)
+
+
+@pytest.mark.parametrize("bus", ["spi standard", "spi registers", "i2c"])
+@in_bench
+async def test_the_host_computes_the_attitude_of_raw_samples(bench: PolledBusBench, bus: str) -> None:
+    """The force gives roll and pitch. The published axes are level with z down, and FRD: pitch has the other sign."""
+    rest = Swing(roll=(Sine(0.3, 0.0, pi / 2), Sine(1e-4, 1.7)), pitch=(Sine(-0.2, 0.0, pi / 2),))  # never stale
+    device = bench.registers(motion=rest)
+    x, y, z = device.truth_at(bench.clock.now_ns()).accel_m_s2
+    expected = (atan2(y, z), asin(x / hypot(x, y, z)), 0)
+    if bus == "i2c":
+        bench.i2c.devices[0x18], config = device, on_i2c(address=0x18)
+    else:
+        bench.spi.device, config = device.spi, bench.on_spi(burst=bus.split()[1])
+    async with bench.running(with_attitude(config)) as (rig,):
+        await rig.until_samples(1600)
+        status = rig.device.status()
+        assert status.frame is not None
+        assert (status.frame.attitude, status.frame.heading, status.frame.problem) == ("host", "relative", "")
+        assert status.status_bit_names["30"] == "attitude filter of the host has not settled"
+        assert device_axes(status.frame).endswith("imud computes the attitude on the host")
+    first, last = rig.samples[0], rig.samples[-1]
+    assert (first.status, last.status) == (1 << 30, None)
+    assert last.euler_rad is not None
+    assert last.euler_rad == pytest.approx(expected, abs=2e-3)
+    assert last.quat_wxyz == pytest.approx(quat_from_euler_zyx(last.euler_rad), abs=1e-9)
+    assert [dict(event.detail) for event in rig.events if event.kind is EventKind.ALARM] == [
+        {"attitude filter of the host has not settled": True}, {"attitude filter of the host has not settled": False},
+    ]  # fmt: skip
+
+
+@in_bench
+async def test_the_attitude_of_the_host_follows_the_motion(bench: PolledBusBench) -> None:
+    device = bench.registers(update_ns=100_000)
+    bench.spi.device = device.spi
+    async with bench.running(replace(bench.on_spi(), attitude=AttitudeSource.HOST)) as (rig,):
+        await rig.until_samples(1500)
+    errors = []
+    for sample in rig.samples[500:]:
+        up = matrix_from_quat(sample.quat_wxyz or (0, 0, 0, 0))[2]
+        true_up = matrix_from_quat(device.truth_at(sample.t_ns).quat_wxyz)[2]
+        errors.append(dist(up, true_up))
+    assert max(errors) < radians(1.5)
 
 
 @pytest.mark.parametrize("options", [{}, {"update_hz": 100}], ids=["unknown", "slower than the reads"])

@@ -4,6 +4,7 @@ import struct
 
 import pytest
 
+from imud.attitude.conventions import UNSETTLED_BIT
 from imud.lines.sync import ALARM_STATUS
 from imud.model import units
 from imud.model.event import EventKind, kind_of
@@ -28,7 +29,7 @@ def test_every_member_has_its_row_in_its_place_with_its_meaning() -> None:
     optional = SAMPLE_FIELDS[-len(Sample.__struct_defaults__) :]
     assert [name for name, field in BY_NAME.items() if not field.always] == list(optional)
     assert ALARM_STATUS == 1 << 31
-    assert "bit 31" in BY_NAME["status"].meaning
+    assert all(f"bit {number}" in BY_NAME["status"].meaning for number in (31, UNSETTLED_BIT))
     meaning = BY_NAME["edge_seq"].meaning
     assert "rising edge on SOUT" in meaning
     assert "trigger on SIN" in meaning

@@ -44,7 +44,8 @@ class PolledBusBench:
 
     def running(self, *configs: DeviceConfig) -> AbstractAsyncContextManager[list[DeviceRig]]:
         host = HostClock(self._time, self.clock.realtime_ns, self._time)
-        return running(*configs, rigs=DeviceRigs(host, lines=self.lines.maker, start_worker=LoopWorker))
+        self.rigs = DeviceRigs(host, lines=self.lines.maker, start_worker=LoopWorker)
+        return running(*configs, rigs=self.rigs)
 
     def run(self, body: Coroutine[Any, Any, None]) -> None:
         run_virtually(self.clock, body)

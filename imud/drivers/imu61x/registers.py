@@ -184,6 +184,7 @@ def register_driver(
         data_sheet=SHEET,
         axes=FLU_LEVEL,
         heading=relative_heading,
+        sends_attitude=lambda options: getattr(options, "burst", "") == "extended",
         lines=frozenset({"reset", "data_ready"}),
         link=bus,
         targets=targets,

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final
 
 import msgspec
 
-from imud.attitude.conventions import Convention, Heading
+from imud.attitude.conventions import AttitudeSource, Convention, Heading
 from imud.attitude.published import FrameWords
 from imud.contracts.condition import DeviceCondition
 from imud.contracts.firmware import IMAGE_BYTES_MAX, PRODUCT_MAX
@@ -175,6 +175,7 @@ class DeviceFrame(msgspec.Struct, omit_defaults=True):
     frame: str | msgspec.UnsetType = msgspec.UNSET
     convention: str | msgspec.UnsetType = msgspec.UNSET
     heading: Heading | msgspec.UnsetType = msgspec.UNSET
+    attitude: AttitudeSource | msgspec.UnsetType = msgspec.UNSET  # `host`: imud computes the attitude
     declination_deg: float | msgspec.UnsetType | None = msgspec.UNSET
     conventions: dict[str, FrameWords] | msgspec.UnsetType = msgspec.UNSET
 

@@ -275,6 +275,7 @@ def _frame_of(device: DeviceStatus) -> DeviceFrame:
     if frame is not None:
         known.frame, known.convention, known.heading = frame.frame, frame.convention, frame.heading
         known.declination_deg, known.conventions = frame.declination_deg, frame.conventions
+        known.attitude = frame.attitude
     return known
 
 

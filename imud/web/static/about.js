@@ -21,7 +21,8 @@ export function factsOf({ identity, driver, link, connects, frame, declared }) {
     ...Object.entries(identity).map(([name, value]) => [words(name), value]),
     ["driver", driver], ["link", link && `${link}, opened ${times(connects)}`],
     ["axes", frame?.frame], ["convention", frame && frame.convention !== "device" && frame.convention], ["angles", frame?.euler_convention],
-    ["heading", frame && (HEADING_WORDS[frame.heading] ?? frame.heading) + (frame.declination_deg === null ? "" : frame.heading === "relative" ? "; declination_deg is ignored" : `, declination ${frame.declination_deg}°`)],
+    ["attitude", frame?.attitude === "host" && "computed by imud on the host"],
+    ["heading", frame && (frame.attitude === "host" ? "measured from the direction at the start of the attitude filter" : HEADING_WORDS[frame.heading] ?? frame.heading) + (frame.declination_deg === null ? "" : frame.heading === "relative" ? "; declination_deg is ignored" : `, declination ${frame.declination_deg}°`)],
     ["settings", declared && [words(declared.state), ...differences, ...unverified, declared.problem].filter(Boolean).join("; ")], ["flash", writes],
   ].filter(([, text]) => text).map(([name, text]) => [name[0].toUpperCase() + name.slice(1), String(text)]);
 }
