@@ -164,10 +164,10 @@ class HostAttitude:
     def resume(self) -> None:
         """Continue from the attributes of a recording. Raises ValueError if they do not fit this version of vqf."""
         period_ns = self._period_ns
-        if type(period_ns) is not int or not 0 < period_ns <= PERIOD_MAX_NS:
-            raise ValueError(
-                f"expected a period of the attitude filter from 1 to {PERIOD_MAX_NS} ns, got {period_ns!r}"
-            )
+        if wrong := [name for name, kinds in _KINDS.items() if _shape(getattr(self, name)) not in kinds]:
+            raise ValueError(f"expected the attributes of an attitude filter, got another type of {wrong[0]}")
+        if not 0 < period_ns <= PERIOD_MAX_NS:
+            raise ValueError(f"expected a period of the attitude filter from 1 to {PERIOD_MAX_NS} ns, got {period_ns}")
         restored = _vqf()(period_ns / NS_PER_S)
         if _shape(self.saved) != _shape(restored.state):
             raise ValueError("expected the state of an attitude filter of the installed vqf, got another state")
@@ -175,8 +175,16 @@ class HostAttitude:
         self._filter = restored
 
 
+# Shapes of the attributes in a recording, which is a foreign file
+_KINDS: Final[dict[str, tuple[Any, ...]]] = {
+    "_period_ns": (int,), "_started_ns": (int,), "_newest_ns": (int, type(None)), "_settled": (bool,),
+    "_yaw_rad": (float,), "_turn": ((tuple, *4 * [float]), type(None)),
+    "_intervals_ns": tuple((list, *n * [int]) for n in range(BLOCK)),
+}  # fmt: skip
+
+
 def _shape(state: Any) -> Any:
     """Return names, types and lengths of a state. The library does not check them."""
     if isinstance(state, dict):
         return {name: _shape(one) for name, one in state.items()}
-    return [type(one) for one in state] if isinstance(state, list) else type(state)
+    return (type(state), *map(type, state)) if isinstance(state, list | tuple) else type(state)

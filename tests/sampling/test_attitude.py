@@ -1,6 +1,7 @@
 """Attitude of the host: angles by hand, gaps, other rates, invalid values, its state, and a device's own attitude."""
 
 import csv
+import dataclasses
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -13,12 +14,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from imud.attitude.conventions import FLU_LEVEL, RFU_ENU, UNSETTLED_BIT, DeviceAxes, EulerOrder
+from imud.attitude.conventions import (
+    FLU_LEVEL,
+    RFU_ENU,
+    UNSETTLED_BIT,
+    AttitudeSource,
+    Convention,
+    DeviceAxes,
+    EulerOrder,
+)
+from imud.attitude.published import published_frame
+from imud.drivers import DRIVERS
+from imud.formats import kernel
+from imud.formats.can import CanFrame
 from imud.model.errors import ImudError
-from imud.model.sample import Sample, Sync, Vector3
+from imud.model.sample import Measurement, Sample, Sync, Vector3
 from imud.sampling import attitude
 from imud.sampling.attitude import HostAttitude
 from tests.bench.attitude import VENDOR_FILE, Figures, against_device, simulated
+from tests.sampling.test_path import PathRig
+from tests.support.files import hi91
 
 G = 9.80665
 STEP_NS = 10_000_000
@@ -199,14 +214,59 @@ def test_a_restored_filter_continues_bit_for_bit(at: int) -> None:
     "changes",
     [
         {"_period_ns": 0}, {"_period_ns": -1}, {"_period_ns": 1.5}, {"_period_ns": 10**12}, {"saved": {}},
+        {"_turn": (1.0, 0.0)}, {"_turn": "1"}, {"_intervals_ns": 32 * [1]}, {"_intervals_ns": ["1"]},
+        {"_yaw_rad": None}, {"_settled": 1}, {"_started_ns": None}, {"_newest_ns": 0.5},
         {"saved": {"gyrQuat": [1.0]}}, {"saved": None}, {"saved": [1]},
         {"saved": HostAttitude(FLU_LEVEL)._filter.state | {"gyrQuat": [1.0, 0.0]}},
         {"saved": HostAttitude(FLU_LEVEL)._filter.state | {"restT": "1"}},
+        {"saved": HostAttitude(FLU_LEVEL)._filter.state | {"gyrQuat": (1.0, 0.0, 0.0, 0.0)}},
     ],
 )  # fmt: skip
 def test_an_invalid_state_is_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="attitude filter"):
         restored(HostAttitude(FLU_LEVEL), **changes)
+
+
+def rig_with_host(driver: str, convention: Convention | None = None) -> PathRig:
+    rig = PathRig(driver)
+    axes = published_frame(None, convention, None, DRIVERS[driver].axes)
+    rig.context = dataclasses.replace(rig.context, attitude=AttitudeSource.HOST, frame=axes)
+    return rig
+
+
+def test_a_path_publishes_other_axes_than_its_newest_sample_has() -> None:
+    """x right, y forward, z up (ZXY), published as NED and FRD. The force to the right: the right side is up by 30°."""
+    rig = rig_with_host("hipnuc-canopen", Convention.NED_FRD)
+    path = rig.can()
+    measured = Measurement(8, 0, None, accel_m_s2=(G / 2, 0.0, G * cos(pi / 6)), gyro_rad_s=(0.0, 0.0, 0.0))
+    for number in range(400):
+        rig.codec.results.append(([measured], 0))
+        path.on_frames([CanFrame(0x188, False, bytes(8), rig.now + number * STEP_NS, False)])
+    (first,), (last,) = rig.batches[0], rig.batches[-1]
+    assert (first.status, last.status) == (UNSETTLED, None)
+    assert last.accel_m_s2 == pytest.approx((0, G / 2, -G * cos(pi / 6)))
+    assert degrees_of(last)[:2] == [-30, 0]
+    assert path.newest is not None
+    assert path.newest.accel_m_s2 == measured.accel_m_s2
+    assert degrees_of(path.newest) == [-30, 0, 0]
+
+
+@pytest.mark.parametrize("has_kernel", [True, False])
+def test_frames_with_an_attitude_are_the_same_with_and_without_the_key(
+    has_kernel: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not has_kernel:
+        monkeypatch.setattr(kernel, "present", kernel.present._replace(module=None))
+    found = []
+    for rig in (rig_with_host("hipnuc-uart"), PathRig("hipnuc-uart")):
+        path = rig.stream()
+        for number in range(300):
+            path.gather(hi91(1000 + number), rig.now + number * 1_000_000)
+            if number % 7 == 0:
+                path.publish_gathered()
+        found.append([one for batch in rig.batches for one in batch])
+    assert found[0] == found[1]
+    assert found[0][-1].quat_wxyz is not None
 
 
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
