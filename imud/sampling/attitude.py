@@ -70,6 +70,7 @@ class HostAttitude:
         self._newest_ns: int | None = None  # `t_ns` of the newest sample; None before the first sample
         self._intervals_ns: list[int] = []  # intervals of the present block
         self._settled = False
+        self._bias: Vector3 = (0.0, 0.0, 0.0)  # gyro bias at the end of the previous block, rad/s
         self._yaw_rad = 0.0  # yaw of the newest sample
         # Rotation from the navigation frame of the filter to the frame of the device; None: start with `_yaw_rad`
         self._turn: Quaternion | None = None
@@ -97,12 +98,14 @@ class HostAttitude:
         w, x, y, z = self._filter.getQuat6D().tolist()
         if not isfinite(w + x + y + z):  # values near the maximum of a float
             self._restart(keeps_bias=False)
-            self._newest_ns = None
+            self._newest_ns, self._intervals_ns, self._bias = None, [], (0.0, 0.0, 0.0)
             return sample
         quat = self._published((w, x, y, z))
         euler = self._to_euler(quat)
         self._yaw_rad = euler[2]
         status = sample.status if self._settled else (sample.status or 0) | 1 << UNSETTLED_BIT
+        if len(self._intervals_ns) == BLOCK:
+            self._end_block(accel, sample.t_ns)
         return replace(sample, quat_wxyz=quat, euler_rad=euler, status=status)
 
     def _add(self, gyro: Vector3, accel: Vector3, t_ns: int) -> None:
@@ -113,20 +116,21 @@ class HostAttitude:
             self._started_ns = t_ns
         else:
             self._intervals_ns.append(interval_ns)
-            is_gap = interval_ns > max(GAP_MAX_NS, GAP_PERIODS * self._period_ns)
-            if len(self._intervals_ns) == BLOCK:
-                self._end_block(t_ns)
-            if is_gap:
+            if interval_ns > max(GAP_MAX_NS, GAP_PERIODS * self._period_ns):
                 self._restart(keeps_bias=True)
                 self._started_ns, interval_ns = t_ns, 0
         steps = min(max(1, round(interval_ns / self._period_ns)), STEPS_MAX)
         scale = interval_ns / (steps * self._period_ns)
-        x, y, z = gyro
-        rate, force = self._array((x * scale, y * scale, z * scale)), self._array(accel, float)
+        # the filter subtracts its bias with its own period
+        (x, y, z), (bx, by, bz) = gyro, self._bias
+        rate, force = (
+            self._array((bx + (x - bx) * scale, by + (y - by) * scale, bz + (z - bz) * scale)),
+            self._array(accel, float),
+        )
         for _ in range(steps):
             self._filter.update(rate, force)
 
-    def _end_block(self, t_ns: int) -> None:
+    def _end_block(self, accel: Vector3, t_ns: int) -> None:
         """Follow the period of the samples, and decide whether the filter has settled."""
         median_ns = min(max(1, sorted(self._intervals_ns)[BLOCK // 2]), PERIOD_MAX_NS)
         self._intervals_ns = []
@@ -134,8 +138,13 @@ class HostAttitude:
             self._period_ns = median_ns
             self._restart(keeps_bias=True)
             self._started_ns = t_ns
+            self._filter.update(self._array((0.0, 0.0, 0.0)), self._array(accel, float))
+            w, x, y, z = self._filter.getQuat6D().tolist()
+            self._published((w, x, y, z))  # the next sample continues the yaw of this sample
             return
-        error_rad_s = self._filter.getBiasEstimate()[1]
+        bias, error_rad_s = self._filter.getBiasEstimate()
+        x, y, z = bias.tolist()
+        self._bias = (x, y, z)
         limit_rad_s = UNSETTLED_RAD_S if self._settled else SETTLED_RAD_S
         self._settled = error_rad_s <= limit_rad_s and t_ns - self._started_ns >= SETTLING_NS
 
@@ -178,6 +187,7 @@ class HostAttitude:
 # Shapes of the attributes in a recording, which is a foreign file
 _KINDS: Final[dict[str, tuple[Any, ...]]] = {
     "_period_ns": (int,), "_started_ns": (int,), "_newest_ns": (int, type(None)), "_settled": (bool,),
+    "_bias": ((tuple, float, float, float),),
     "_yaw_rad": (float,), "_turn": ((tuple, *4 * [float]), type(None)),
     "_intervals_ns": tuple((list, *n * [int]) for n in range(BLOCK)),
 }  # fmt: skip

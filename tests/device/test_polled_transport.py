@@ -134,6 +134,10 @@ async def test_the_attitude_of_the_host_follows_the_motion(bench: PolledBusBench
     bench.spi.device = device.spi
     async with bench.running(replace(bench.on_spi(), attitude=AttitudeSource.HOST)) as (rig,):
         await rig.until_samples(1500)
+        status = rig.device.status()
+    assert status.navigation_frame == "level, Z up; X where the yaw was 0 at the start of the filter on the host"
+    assert status.frame is not None
+    assert status.frame.heading == "relative"
     errors = []
     for sample in rig.samples[500:]:
         up = matrix_from_quat(sample.quat_wxyz or (0, 0, 0, 0))[2]

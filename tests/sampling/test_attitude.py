@@ -113,6 +113,26 @@ def test_samples_that_are_lost_for_a_short_time_do_not_change_the_angle() -> Non
     assert made[-1].euler_rad[2] == pytest.approx(1.0, abs=1e-3)
 
 
+def test_unequal_intervals_and_losses_change_neither_the_angle_nor_the_bias() -> None:
+    """Intervals of 12, 12, 12 and 4 ms, then a loss of 200 ms each second at rest, with a gyro bias."""
+    bias, host = (0.01, -0.008, 0.012), HostAttitude(FLU_LEVEL)
+    made = host.samples(run(2000, gyro=bias))
+    t_ns = made[-1].t_ns
+    for number in range(400):
+        t_ns += 4_000_000 if number % 4 == 3 else 12_000_000
+        made += host.samples([sample(t_ns, (0.01, -0.008, 1.012))])
+    start, turned = made[1999].euler_rad, made[-1].euler_rad
+    assert start is not None
+    assert turned is not None
+    assert (turned[2] - start[2]) % (2 * pi) == pytest.approx(4.0, abs=2e-3)  # 4 s at 1 rad/s
+    for number in range(1000):
+        t_ns += 200_000_000 if number % 100 == 0 else STEP_NS
+        made += host.samples([sample(t_ns, bias)])
+    rested = made[-1].euler_rad
+    assert rested is not None
+    assert rested[2] == pytest.approx(turned[2], abs=2e-3)
+
+
 @pytest.mark.parametrize("gap_ns", [251_000_000, 3_600_000_000_000])
 def test_a_long_gap_restarts_the_filter_with_the_last_yaw(gap_ns: int) -> None:
     host = HostAttitude(FLU_LEVEL)
