@@ -77,10 +77,13 @@ class SamplePath(ABC):
     # Attributes that a recorded state does not contain: parts of the daemon, and statistics.
     NOT_STATE: ClassVar = frozenset({
         "_changes", "_device", "_device_id", "_drain_edges", "_ledger", "_listener", "_now_ns", "_on_bad_frame",
-        "_on_message", "_overruns", "_publish", "_rotation", "_start_run", "_status_mask", "_status_seen",
+        "_on_message", "_overruns", "_publish", "_start_run", "_status_mask", "_status_seen",
         "_utc_offset_ns", "attitude", "frame", "latency",
         "_array", "_filter", "_from_up", "_to_euler",  # of `attitude`
     })  # fmt: skip
+
+    # `HostAttitude`; None if imud does not compute it. In the class, because more than 30 attributes are slower.
+    attitude: Any = None
 
     def __init__(self, clock: SampleClock, context: PathContext) -> None:
         self.clock = clock
@@ -98,12 +101,9 @@ class SamplePath(ABC):
         self._device = context.device
         self._device_id = context.device_id
         self._ledger = context.ledger
-        self._rotation = context.frame.rotation
-        # `HostAttitude`; None if imud does not compute the attitude. Only a device with the key loads vqf.
-        self.attitude: Any = None
         if context.attitude is AttitudeSource.HOST:
             self.attitude = import_module("imud.sampling.attitude").HostAttitude(context.frame.device)
-        self._changes = self._rotation is not None or self.attitude is not None
+        self._changes = self.frame.rotation is not None or self.attitude is not None
         self._publish = context.publish
         self._on_message = context.on_message
         self._on_bad_frame = context.on_bad_frame
@@ -122,8 +122,7 @@ class SamplePath(ABC):
         if self.attitude is not None and frame.device != self.frame.device:
             self.attitude.set_axes(frame.device)
         self.frame = frame
-        self._rotation = frame.rotation
-        self._changes = self._rotation is not None or self.attitude is not None
+        self._changes = self.frame.rotation is not None or self.attitude is not None
 
     @property
     def roots(self) -> Mapping[str, object]:
@@ -282,7 +281,8 @@ class SamplePath(ABC):
         if self.attitude is not None:
             samples = self.attitude.samples(samples)
         self._newest = samples[-1]
-        return samples if self._rotation is None else self._rotation.samples(samples)
+        rotation = self.frame.rotation
+        return samples if rotation is None else rotation.samples(samples)
 
     def _finish_slots(self, packed: bytes, t_rx_ns: int) -> None:
         """Publish slots of the kernel as one batch, as `_finish`."""
