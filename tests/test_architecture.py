@@ -502,7 +502,7 @@ TESTED_IN = {
     "imud.drivers.imu61x.uart.driver": "drivers/imu61x/uart/test_commands.py",
     "imud.drivers.polled_frames": "drivers/test_every_polled_driver.py",
     "imud.fleet.settings": "fleet/test_publisher.py",
-    "imud.links.cyclic_sender": "links/test_socketcan.py", "imud.links.netlink": "links/test_socketcan.py",
+    "imud.links.cyclic_sender": "links/test_socketcan.py", "imud.host.netlink": "links/test_socketcan.py",
     "imud.model.bucket": "publishers/socket/test_history.py",
     "imud.publishers.ros2.options": "publishers/ros2/test_output.py",
     "imud.publishers.metrics.metric": "publishers/metrics/test_families.py",

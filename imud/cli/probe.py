@@ -26,8 +26,8 @@ from imud.device.stream_search import StreamFound, StreamRound
 from imud.drivers import DRIVERS
 from imud.formats.can import CanFrame
 from imud.host.clock import HostClock
+from imud.host.netlink import can_details, can_interfaces
 from imud.links import LINKS
-from imud.links.netlink import can_details, can_interfaces
 from imud.links.serial_port import list_ports
 from imud.links.socketcan import ControllerState
 from imud.model.errors import CommandError, ImudError, NothingHeard

@@ -7,7 +7,7 @@ bytes on every kind of link. Only simulated devices send CAN FD frames.
 import re
 import struct
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import BinaryIO, Final, NamedTuple
 
@@ -91,6 +91,12 @@ def pack_frame(can_id: int, extended: bool, data: bytes) -> bytes:
     flagged_id = can_id | EXTENDED_FLAG if extended else can_id
     is_fd = size > DATA_BYTES_MAX
     return RAW_FD_FRAME.pack(flagged_id, size, FD_FLAGS, data) if is_fd else RAW_FRAME.pack(flagged_id, size, data)
+
+
+def pack_filters(filters: Sequence[CanFilter]) -> bytes:
+    """Return filters as `struct can_filter`: data frames only, with the given length of the identifier."""
+    flags = EXTENDED_FLAG | REMOTE_FLAG
+    return b"".join(struct.pack("=II", f.can_id | EXTENDED_FLAG * f.extended, f.mask | flags) for f in filters)
 
 
 # Maximum length of a line, bytes. CAN FD with 64 data bytes and a long bus name needs about 190.

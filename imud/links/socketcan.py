@@ -35,9 +35,10 @@ from imud.formats.can import (
     CanFilter,
     CanFrame,
     CyclicFrame,
+    pack_filters,
 )
+from imud.host import netlink
 from imud.host.files import user_name
-from imud.links import netlink
 from imud.links.cyclic_sender import NO_MANAGER, KernelSender, LoopSender, Sender
 from imud.model.errors import LinkDenied, LinkError, LinkMissing
 from imud.model.options import Options
@@ -382,12 +383,6 @@ def _enlarge(opened: socket.socket, settings: SocketCanOptions) -> None:
             "%s: receive buffer of %d bytes, requested %d (sysctl net.core.rmem_max): room for about %d frames",
             settings.interface, got, wanted, got // FRAME_BUFFER_BYTES,
         )  # fmt: skip
-
-
-def pack_filters(filters: Sequence[CanFilter]) -> bytes:
-    """Pack filters as `struct can_filter`: data frames only, with the given length of the identifier."""
-    flags = EXTENDED_FLAG | REMOTE_FLAG
-    return b"".join(struct.pack("=II", f.can_id | EXTENDED_FLAG * f.extended, f.mask | flags) for f in filters)
 
 
 class SocketCanLink:

@@ -17,8 +17,8 @@ from imud.device.stream_search import StreamFound
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.uart.codec import encode_frame
 from imud.formats.can import CanFrame
+from imud.host.netlink import CanDetails
 from imud.links.memory import MemoryCanLink, MemoryOptions
-from imud.links.netlink import CanDetails
 from imud.links.socketcan import ControllerState, SocketCanOptions
 from imud.model.errors import LinkError
 from imud.model.options import Options

@@ -11,10 +11,11 @@ from unittest.mock import Mock
 import msgspec
 import pytest
 
-from imud.formats.can import CanFilter, CyclicFrame, pack_frame
-from imud.links import LINKS, netlink
+from imud.formats.can import CanFilter, CyclicFrame, pack_filters, pack_frame
+from imud.host import netlink
+from imud.links import LINKS
 from imud.links.cyclic_sender import KernelSender, LoopSender
-from imud.links.socketcan import SO_RCVBUFFORCE, SocketCanLink, SocketCanOptions, open_raw, pack_filters
+from imud.links.socketcan import SO_RCVBUFFORCE, SocketCanLink, SocketCanOptions, open_raw
 from imud.model.errors import LinkDenied, LinkError, LinkMissing
 from tests.support.documented import check_schema
 from tests.support.event_loops import in_loop

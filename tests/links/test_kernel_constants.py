@@ -4,7 +4,8 @@ import socket
 
 import pytest
 
-from imud.links import cyclic_sender, device_node, i2c, netlink, rs485, serial_port, socketcan, spi
+from imud.host import netlink
+from imud.links import cyclic_sender, device_node, i2c, rs485, serial_port, socketcan, spi
 
 
 def write_ioctl(letter: str, number: int, size: int) -> int:

@@ -11,10 +11,10 @@ import pytest
 
 from imud.contracts.link import CanLink
 from imud.contracts.status import KernelCounters
-from imud.formats.can import CanFilter, CanFrame, CyclicFrame, pack_frame
+from imud.formats.can import CanFilter, CanFrame, CyclicFrame, pack_filters, pack_frame
 from imud.links import LINKS
 from imud.links.python_can import PythonCanLink
-from imud.links.socketcan import LINK, SocketCanOptions, pack_filters
+from imud.links.socketcan import LINK, SocketCanOptions
 from imud.model.errors import LinkError
 from tests.support.daemon_process import LIMIT_S, wait_until
 from tests.support.event_loops import in_loop

@@ -17,9 +17,10 @@ import pytest
 from imud.contracts.status import KernelCounters
 from imud.formats import kernel
 from imud.formats.can import FD_LENGTHS, RAW_FD_FRAME, RAW_FRAME, CanFrame, CyclicFrame, pack_frame
-from imud.links import netlink, socketcan
+from imud.host import netlink
+from imud.host.netlink import CanDetails, absence, can_details, can_interfaces, parse_details, wait_until
+from imud.links import socketcan
 from imud.links.cyclic_sender import LoopSender, setup
-from imud.links.netlink import CanDetails, absence, can_details, can_interfaces, parse_details, wait_until
 from imud.links.socketcan import BusState, ControllerState, FrameReader, SocketCanLink, SocketCanOptions
 from imud.model.errors import LinkError, LinkMissing
 from tests.support.daemon_process import LIMIT_S

@@ -9,7 +9,7 @@ from imud.cli.doctor.surroundings import DoctorFinding, Findings, Surroundings, 
 from imud.config.model import DeviceConfig
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.drivers.imu61x.common import PRODUCTS, product_id_of
-from imud.links.netlink import absence, can_interfaces
+from imud.host.netlink import absence, can_interfaces
 from imud.links.socketcan import NATIVE
 
 FAILED_SHARE: Final = 0.001

@@ -25,9 +25,9 @@ from imud.device.settings import printable_identity
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.modbus.registers import FACTORY_BAUD, FACTORY_ID
 from imud.formats.modbus import SLAVES
+from imud.host.netlink import absence, can_interfaces
 from imud.links import LINKS
 from imud.links.device_node import holders_of
-from imud.links.netlink import absence, can_interfaces
 from imud.links.serial_port import list_ports
 from imud.model.errors import DeviceRefused, LinkError, TransferError
 from imud.model.options import wrong_values

@@ -46,7 +46,7 @@ from imud.cli.setup.plan import (
 from imud.config.reading import DEVICE_NAME
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
-from imud.links.netlink import absence, can_interfaces
+from imud.host.netlink import absence, can_interfaces
 from imud.model.errors import BadArgument, ConfigError, ImudError
 from imud.model.units import NS_PER_MS
 

@@ -20,7 +20,7 @@ from imud.formats.can import (
     REMOTE_FLAG,
     pack_frame,
 )
-from imud.links.netlink import can_interfaces
+from imud.host.netlink import can_interfaces
 from imud.links.socketcan import MessageBuffers, Vector, libc
 from imud.model.errors import LinkError
 from imud.sim.can_module import CanModule
