@@ -28,6 +28,7 @@ class Claim:
     part_key: str = ""  # key of the option with the part
     # Options that must be equal for all devices of a shared place, by key
     terms: Mapping[str, object] = field(default_factory=dict)
+    advice: str = ""  # next step for the user if another device has the port or bus; empty: choose another one
 
 
 class Conflict(NamedTuple):
@@ -40,7 +41,8 @@ class Conflict(NamedTuple):
 def conflict_of(mine: Claim, other: Claim, owner: str) -> Conflict | None:
     """Return the conflict of a claim with the claim of `owner` for the same place; None if both are possible."""
     if not (mine.shared and other.shared):
-        return Conflict(mine.key, f"expected an unused {mine.key}, got {mine.place}; {owner} uses it")
+        advice = f"; {mine.advice}" if mine.advice else ""
+        return Conflict(mine.key, f"expected an unused {mine.key}, got {mine.place}; {owner} uses it{advice}")
     for key in differing_terms(mine.terms, other.terms):
         value, have = shown(mine.terms[key]), shown(other.terms[key])
         message = f"expected the same {key} for all devices of {mine.place}, got {value}; {owner} has {have}"

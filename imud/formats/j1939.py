@@ -16,12 +16,22 @@ from typing import Final, NamedTuple
 from imud.formats.can import DATA_BYTES_MAX, CanFilter
 
 GLOBAL: Final = 0xFF  # destination address of broadcasts
-ADDRESS_MAX: Final = 253  # maximum address of a node. 254 is the null address of nodes without an address.
+ADDRESS_MAX: Final = 253  # maximum address of a node
+NULL_ADDRESS: Final = 254  # source of "cannot claim"
 PDU2_MIN: Final = 240  # minimum PF of broadcasts
 PRIORITY_MAX: Final = 7
 PGN_MAX: Final = 0x3_FFFF
 WITHOUT_PRIORITY: Final = 0x03FF_FFFF  # mask of an identifier without its priority
 _WITHOUT_SOURCE: Final = WITHOUT_PRIORITY & ~0xFF
+
+# PGNs of every node (J1939-21, J1939-81)
+ACKNOWLEDGEMENT: Final = 59392  # 0xE800
+REQUEST: Final = 59904  # 0xEA00: requests another PGN
+TRANSPORT_DATA: Final = 60160  # 0xEB00: a part of a message of more than eight bytes
+TRANSPORT_CONTROL: Final = 60416  # 0xEC00: its announcement
+CLAIMED: Final = 60928  # 0xEE00, "address claimed" (J1939-81), a broadcast
+COMMANDED_ADDRESS: Final = 65240  # 0xFED8: NAME and its new address
+PGN_BYTES: Final = 3  # length of a PGN in the data of a frame
 
 
 class J1939Id(NamedTuple):
@@ -75,3 +85,50 @@ def filter_of(pgn: int, source: int | None, destination: int = GLOBAL) -> CanFil
     """Return the filter for one PGN with any priority from one node; None: from any node."""
     can_id = join(J1939Id(0, pgn, source or 0, destination))
     return CanFilter(can_id, _WITHOUT_SOURCE if source is None else WITHOUT_PRIORITY, True)
+
+
+# --- broadcasts of several frames (SAE J1939-21, section 5.10) ------------------------------------------------------
+
+BROADCAST: Final = 32  # control byte of the announcement (TP.CM_BAM)
+TRANSPORT_BYTES: Final = 7  # data bytes of a frame
+PART_TIMEOUT_NS: Final = 750_000_000  # maximum time between two frames (T1), ns
+
+
+class Announced(NamedTuple):
+    """Announced broadcast with its present content."""
+
+    source: int
+    data: bytes
+    t_ns: int  # arrival time of the newest frame
+
+
+class BroadcastReader:
+    """Assembly of the broadcasts with one PGN of a known length. It keeps the newest broadcast only, because hostile
+    frames must not use memory."""
+
+    def __init__(self, pgn: int, size: int) -> None:
+        self._announced = bytes((BROADCAST, size, 0, -(-size // TRANSPORT_BYTES), 0xFF)) + pgn.to_bytes(
+            PGN_BYTES, "little"
+        )
+        self._size = size
+        self._present: Announced | None = None
+
+    def announce(self, source: int, data: bytes, t_ns: int) -> None:
+        """Add an announcement. Ignore other PGNs and lengths."""
+        if data == self._announced:
+            self._present = Announced(source, b"", t_ns)
+
+    def add(self, source: int, data: bytes, t_ns: int) -> bytes | None:
+        """Add a data frame. Return the complete message; None before its end, and after a frame that does not fit."""
+        present = self._present
+        if present is None or source != present.source:
+            return None
+        self._present = None
+        number = len(present.data) // TRANSPORT_BYTES + 1
+        if len(data) != DATA_BYTES_MAX or data[0] != number or t_ns - present.t_ns > PART_TIMEOUT_NS:
+            return None
+        whole = present.data + data[1:]
+        if len(whole) >= self._size:
+            return whole[: self._size]
+        self._present = present._replace(data=whole, t_ns=t_ns)
+        return None

@@ -13,6 +13,7 @@ PUBLISHERS: Registry[PublisherType] = Registry(
         "nmea0183": "imud.publishers.nmea0183:PUBLISHER",
         "rules": "imud.publishers.rules.settings:PUBLISHER",
         "ros2": "imud.publishers.ros2.options:PUBLISHER",
+        "nmea2000": "imud.publishers.nmea2000:PUBLISHER",
         "mqtt": "imud.fleet.settings:PUBLISHER",
     },
     # the configuration has these other keys at the top

@@ -156,6 +156,19 @@ def test_an_output_cannot_use_the_port_of_a_device(
         config.parse(text, "f")
 
 
+@pytest.mark.parametrize("driver", ["hipnuc-j1939", "hipnuc-nmea2000"])
+def test_nmea2000_does_not_share_the_interface_of_a_device_by_default(driver: str) -> None:
+    text = "nmea2000: {{enabled: {}, interface: {}, share_interface: {}}}\ndevices:\n  a: {{driver: {}, socketcan: {{interface: can0}}}}\n"
+    for enabled, interface, shared in (("true", "can1", "false"), ("true", "can0", "true"), ("false", "can0", "false")):
+        config.parse(text.format(enabled, interface, shared, driver), "f")
+    with pytest.raises(ConfigError) as caught:
+        config.parse(text.format("true", "can0", "false", driver), "f")
+    assert str(caught.value) == (
+        "f:1:38: nmea2000.interface: expected an unused interface, got can0; a (line 3) uses it; use another interface, "
+        "or set nmea2000.share_interface if all devices of this bus are on NMEA 2000"
+    )
+
+
 def test_two_names_of_one_port_are_one_port(tmp_path: Path) -> None:
     port, late = tmp_path / "port", tmp_path / "late"
     late.touch()

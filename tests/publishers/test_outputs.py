@@ -44,6 +44,11 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     },
     "rules": {"enabled": False, "rules": {}, "commands": {"running": 4, "per_hour": 60, "time_s": 30}},
     "ros2": {"enabled": False, "domain_id": 0, "node": "imud", "address": None, "devices": {"*": {"rate_hz": None}}},
+    "nmea2000": {
+        "enabled": False, "interface": "can0", "device": None,
+        "messages": {"heading": 10, "rate_of_turn": 10, "attitude": 1}, "address": 128, "instance": 0,
+        "share_interface": False,
+    },
     "mqtt": {
         "enabled": False, "brokers": ["mqtt://127.0.0.1:1883"], "version": "5", "site": "default", "gateway": "",
         "user": "", "password_file": None, "ca_file": None, "cert_file": None, "key_file": None, "keep_alive_s": 30,

@@ -13,9 +13,7 @@ A sender may send its heading twice, from true and from magnetic north. `heading
 received reference and keeps it. imud ignores the other heading. It does not apply deviation and variation.
 """
 
-import struct
 from collections.abc import Mapping, Sequence
-from enum import IntEnum
 from math import isfinite, nan, pi, tau
 from random import Random
 from typing import Annotated, Any, Final, Literal, NamedTuple
@@ -29,6 +27,7 @@ from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Identity
 from imud.contracts.script import says_nothing
 from imud.drivers.hipnuc.assembly import Assembled, Assembly
 from imud.drivers.hipnuc.common import FLOATS, random_quaternion
+from imud.formats import nmea2000
 from imud.formats.can import CanFilter, CanFrame
 from imud.formats.j1939 import (
     ADDRESS_MAX,
@@ -41,34 +40,30 @@ from imud.formats.j1939 import (
     sender_of,
     split,
 )
+from imud.formats.nmea2000 import (
+    ATTITUDE,
+    ATTITUDE_LAYOUT,
+    HEADING,
+    HEADING_LAYOUT,
+    HEADING_MOST,
+    I16_MOST,
+    I32_MOST,
+    MESSAGE_BYTES,
+    PRIORITIES,
+    RAD_PER_LSB,
+    RATE_LAYOUT,
+    RATE_OF_TURN,
+    RATE_RAD_S_PER_LSB,
+    SID_MOST,
+    Reference,
+)
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
 from imud.model.units import NS_PER_S
 
-HEADING, RATE_OF_TURN, ATTITUDE = 127250, 127251, 127257
 PGNS: Final = (HEADING, RATE_OF_TURN, ATTITUDE)
-PRIORITIES: Final = {HEADING: 2, RATE_OF_TURN: 2, ATTITUDE: 3}  # default priorities of the standard
-MESSAGE_BYTES: Final = 8
-
-HEADING_LAYOUT: Final = struct.Struct("<BHhhB")
-RATE_LAYOUT: Final = struct.Struct("<Bi3x")
-ATTITUDE_LAYOUT: Final = struct.Struct("<BhhhB")
-RAD_PER_LSB: Final = 1e-4
-RATE_RAD_S_PER_LSB: Final = 1e-6 / 32
-
-I16_MOST, I32_MOST, SID_MOST = 0x7FFC, 0x7FFF_FFFC, 252  # maximum counts that are values
-HEADING_MOST: Final = 62_832  # maximum heading in counts: a full turn
 _NOTHING: Final = (b"\xff" * 7, b"\x7f" * 7)  # filler bytes after the SID of a message without values
-
-
-class Reference(IntEnum):
-    """Reference of a heading."""
-
-    TRUE = 0
-    MAGNETIC = 1
-    ERROR = 2
-    UNKNOWN = 3
 
 
 class Head(NamedTuple):
@@ -136,24 +131,18 @@ def _counter_clockwise(clockwise: int) -> float:
 
 def pack_heading(sid: int, yaw_rad: float | None, reference: Reference) -> bytes:
     """Return 127250 of a counter-clockwise yaw, without deviation and variation; None means "not available"."""
-    counts = 0xFFFF if yaw_rad is None else round(-yaw_rad % tau / RAD_PER_LSB)
-    return HEADING_LAYOUT.pack(sid, counts, 0x7FFF, 0x7FFF, 0xFC | reference)
+    return nmea2000.pack_heading(sid, None if yaw_rad is None else -yaw_rad, reference)
 
 
 def pack_rate_of_turn(sid: int, gyro_z_rad_s: float | None) -> bytes:
     """Return 127251 of a counter-clockwise rate."""
-    counts = 0x7FFF_FFFF if gyro_z_rad_s is None else _clip(-gyro_z_rad_s / RATE_RAD_S_PER_LSB, I32_MOST)
-    return RATE_LAYOUT.pack(sid, counts)[:5] + b"\xff\xff\xff"
+    return nmea2000.pack_rate_of_turn(sid, None if gyro_z_rad_s is None else -gyro_z_rad_s)
 
 
 def pack_attitude(sid: int, euler_rad: Vector3, *, has_yaw: bool = True) -> bytes:
     """Return the data of a frame with PGN 127257. The yaw of `euler_rad` is counter-clockwise."""
-    roll, pitch, yaw = (_clip(angle / RAD_PER_LSB, I16_MOST) for angle in euler_rad)
-    return ATTITUDE_LAYOUT.pack(sid, -yaw if has_yaw else 0x7FFF, pitch, roll, 0xFF)
-
-
-def _clip(value: float, most: int) -> int:
-    return max(-most, min(most, round(value)))
+    roll, pitch, yaw = euler_rad
+    return nmea2000.pack_attitude(sid, roll, pitch, -yaw if has_yaw else None)
 
 
 # Time without a message after which imud selects another sender, ns. The slowest message has a period of 1 s.

@@ -21,7 +21,7 @@ from imud.drivers.hipnuc.j1939.codec import FACTORY_ADDRESS, encode
 from imud.drivers.hipnuc.j1939.commands import LAYOUT, READ, WRITE
 from imud.drivers.hipnuc.uart import ins
 from imud.formats.can import FD_DATA_BYTES_MAX
-from imud.formats.j1939 import GLOBAL, J1939Id, join, split
+from imud.formats.j1939 import CLAIMED, GLOBAL, REQUEST, J1939Id, join, split
 from imud.model.sample import Position
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sim.can_module import BITRATE, CanSimulator, FrameWire, SentFrame
@@ -133,7 +133,7 @@ class HipnucJ1939Module:
 
     def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
         parts = split(can_id)
-        asks_claim = extended and parts.pgn == commands.REQUEST and data[:3] == commands.CLAIMED.to_bytes(3, "little")
+        asks_claim = extended and parts.pgn == REQUEST and data[:3] == CLAIMED.to_bytes(3, "little")
         if asks_claim and parts.destination in (self._address, GLOBAL) and now_ns >= self._begin_ns:
             self._claim(now_ns)
         is_request = extended and parts.pgn == codec.CONFIGURE and parts.destination == self._address
@@ -183,7 +183,7 @@ class HipnucJ1939Module:
 
     def _claim(self, now_ns: int) -> None:
         if self.hardware.variant.claims_address:
-            can_id = join(J1939Id(commands.REQUEST_PRIORITY, commands.CLAIMED, self._address))
+            can_id = join(J1939Id(commands.REQUEST_PRIORITY, CLAIMED, self._address))
             self._wire.send(now_ns + REPLY_NS, can_id, True, NAME)
             self.frames_sent += 1
 

@@ -15,7 +15,7 @@ from imud.drivers.hipnuc.j1939 import codec, commands
 from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Codec, HipnucJ1939Options, J1939Node
 from imud.drivers.hipnuc.j1939.driver import SETTINGS
 from imud.formats.can import EXTENDED_ID_MAX, RAW_FRAME
-from imud.formats.j1939 import split
+from imud.formats.j1939 import CLAIMED, split
 from imud.model.errors import NoReply, Rejected
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
@@ -98,7 +98,7 @@ def test_four_modules_crystal_wire_and_the_next_frame() -> None:
     for module in modules:
         assert samples_of(frames, module.settings.address) >= 94
     module = made(skew_ppm=1000.0)
-    frames = [f for f in module.advance(BEGIN_NS + SECOND_NS) if split(f.can_id).pgn != commands.CLAIMED]
+    frames = [f for f in module.advance(BEGIN_NS + SECOND_NS) if split(f.can_id).pgn != CLAIMED]
     assert [split(frame.can_id).pgn for frame in frames[:4]] == [0xFF34, 0xFF37, 0xFF3D, 0xFF41]
     assert module.counters() == {"samples_sent": 101, "frames_sent": 405, "requests": 0}
     for at_once in (False, True):

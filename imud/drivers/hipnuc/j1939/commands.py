@@ -38,7 +38,7 @@ from imud.drivers.hipnuc.j1939.codec import (
 )
 from imud.drivers.readdressing import Readdressing
 from imud.formats.can import CanFilter, pack_frame
-from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, filter_of, join, split
+from imud.formats.j1939 import ADDRESS_MAX, CLAIMED, REQUEST, WITHOUT_PRIORITY, J1939Id, filter_of, join, split
 from imud.model.errors import NoReply, Rejected
 from imud.model.units import NS_PER_MS, NS_PER_S
 
@@ -59,9 +59,7 @@ ZERO: Final = 0x00A5
 PRODUCT_NAME: Final = tuple(range(0x70, 0x78))
 VERSION: Final = 0x78
 READ_VALUE: Final = 1  # value of a read: reserved in the manual, 1 in the vendor's programs
-REQUEST: Final = 0xEA00  # PGN that requests another PGN (J1939-21)
 REQUEST_PRIORITY: Final = 6
-CLAIMED: Final = 0xEE00  # PGN Address Claimed (J1939-81), a broadcast
 INTERVALS: Final = {pgn: 0x0100 | pgn & 0xFF for pgn in PGNS}  # register of the interval of each message, ms
 
 SAVE, FACTORY, RESTART = 0x00, 0x01, 0xFF  # values of CONTROL
