@@ -11,8 +11,9 @@ from functools import partial
 from typing import Final
 
 from imud.drivers.hipnuc import nmea2000 as messages
-from imud.drivers.hipnuc.nmea2000 import EXAMPLE_SOURCE, Reference, encode
+from imud.drivers.hipnuc.nmea2000 import EXAMPLE_SOURCE, encode
 from imud.formats.j1939 import ADDRESS_MAX
+from imud.formats.nmea2000 import ATTITUDE, HEADING, RATE_OF_TURN, SID_MOST, Reference
 from imud.sim.can_module import CanSimulator, PeriodicCanModule
 from imud.sim.physics import Truth
 from imud.sim.sensor import SensorHardware, SimulatorOptions, sensor_of
@@ -20,7 +21,7 @@ from imud.sim.sensor import SensorHardware, SimulatorOptions, sensor_of
 BITRATE: Final = 250_000  # bit rate of NMEA 2000, bit/s
 RATE_MAX_HZ: Final = 100.0
 MESSAGES: Final = ("", "heading", "attitude")  # messages to send: empty for all three, or the name of one
-SIDS: Final = messages.SID_MOST + 1
+SIDS: Final = SID_MOST + 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,9 +45,9 @@ class HipnucNmea2000Module(PeriodicCanModule):
 def _frames(hardware: Nmea2000Hardware, number: int, reading: Truth) -> list[tuple[int, bytes]]:
     """Return the messages of one instant with the same SID. SIDs start again at power-on."""
     sid = number % SIDS
-    heading = messages.HEADING, messages.pack_heading(sid, reading.euler_rad[2], hardware.reference)
-    rate = messages.RATE_OF_TURN, messages.pack_rate_of_turn(sid, reading.gyro_rad_s[2])
-    attitude = messages.ATTITUDE, messages.pack_attitude(sid, reading.euler_rad)
+    heading = HEADING, messages.pack_heading(sid, reading.euler_rad[2], hardware.reference)
+    rate = RATE_OF_TURN, messages.pack_rate_of_turn(sid, reading.gyro_rad_s[2])
+    attitude = ATTITUDE, messages.pack_attitude(sid, reading.euler_rad)
     sent = {"heading": [heading], "attitude": [attitude]}.get(hardware.message, [heading, rate, attitude])
     return [encode(pgn, data, hardware.source) for pgn, data in sent]
 

@@ -12,7 +12,8 @@ import pytest
 
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
 from imud.drivers.hipnuc import nmea2000 as messages
-from imud.drivers.hipnuc.nmea2000 import ATTITUDE, HEADING, RATE_OF_TURN, Reference, encode
+from imud.drivers.hipnuc.nmea2000 import encode
+from imud.formats.nmea2000 import ATTITUDE, HEADING, RATE_OF_TURN, Reference
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 
