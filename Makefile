@@ -6,6 +6,7 @@
 # make check  ruff, mypy --strict, then the tests                   make bench  measurements, into build/bench.json
 #                                                                   (ARGS=--short: at most 5 minutes)
 # make alerts every alert provoked, by a real Prometheus that scrapes a daemon: fires and clears, with a table of times
+# make signalk-deps   installs the Signal K server with npm into build/signalk, for the tests of the output signalk
 # make monitoring-deps   installs Prometheus and Alertmanager, for the tests of rules, examples and dashboard
 # make fleet-deps  installs PostgreSQL, for the tests of the collector, and what make mqtt-deps installs
 # make mqtt-deps   installs mosquitto and nats-server, for the tests of the output mqtt and these:
@@ -176,6 +177,13 @@ web-deps:
 
 web-pictures: $(VENV)/made
 	$(BIN)/python -m docs.generate.web_pictures
+
+# Signal K server, 215 MB. Another package provides its data connections (streams), which the tests do not use.
+.PHONY: signalk-deps
+signalk-deps:
+	mkdir -p build/signalk
+	cp tests/publishers/signalk/package.json build/signalk/
+	npm install --prefix build/signalk --prefer-offline --no-audit --no-fund --ignore-scripts --omit=optional --loglevel=error
 
 monitoring-deps:
 	apt-get install --yes --no-install-recommends prometheus prometheus-alertmanager

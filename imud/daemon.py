@@ -189,6 +189,7 @@ class Daemon:
             drive_line=driving(lines, host),
             owner=self,
             configuration="" if file is None else str(file.absolute()),
+            state_dir=state_dir,
             past_events=EventLog(host.now_ns()),
         )
         self._outputs = Outputs(self._context, extra or {})

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
+from pathlib import Path
 from socket import socket
 from typing import Any, ClassVar, Final, Protocol, cast
 
@@ -355,6 +356,7 @@ class PublisherContext:
     drive_line: DriveLine  # drives a GPIO line that belongs to no device
     owner: OutputOwner
     configuration: str = ""  # absolute path of the configuration file; empty without a file
+    state_dir: Path | None = None  # directory of the state files; None: an output writes no state
     past_events: EventLog = field(default_factory=EventLog)
     kept: dict[str, Any] = field(default_factory=dict)  # data that a restarted output continues with, by name
 

@@ -166,10 +166,12 @@ T = TypeVar("T")
 class StateFile:
     """JSON file. Errors are logged and lose only the content. Synchronization: the thread of the event loop."""
 
-    def __init__(self, file: Path | None, thread: str, without: str) -> None:
-        """`file` None: no reads and writes. `without` describes the next start without the content, for messages."""
+    def __init__(self, file: Path | None, thread: str, without: str, *, mode: int = 0o640) -> None:
+        """`file` None: no reads and writes. `without` describes the next start without the content, for messages.
+        `mode`: permissions of the file, which the umask reduces."""
         self._file = file
         self._without = without
+        self._mode = mode
         self._contents: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
         self._problem = ""  # reported reason why imud cannot write the file; empty if it can
@@ -210,7 +212,7 @@ class StateFile:
             while not ended and not self._contents.empty():
                 newer = self._contents.get()
                 ended, content = newer is None, newer or content
-            self._try(file, partial(replace_file, file, content))
+            self._try(file, partial(replace_file, file, content, mode=self._mode))
             if ended:
                 return
 
