@@ -15,9 +15,11 @@ from imud.cli.output import complain, table
 from imud.fleet.accounts import GatewayState, StreamAccount, StreamKey
 from imud.fleet.broker import ReaderAccess
 from imud.fleet.collector import GC_ALLOCATIONS, FleetCollector, FleetStore, JsonLines, Selection
+from imud.fleet.influx import InfluxStore
 from imud.fleet.messages import GatewayClock, Stream
 from imud.fleet.postgres import PostgresStore
 from imud.fleet.reader import VERSIONS, Fleet, FleetBatch
+from imud.host.http_post import HttpPost, PostAccess, post_url
 from imud.host.threads import rare_garbage_collection
 from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
@@ -205,6 +207,7 @@ async def _draw(screen: _Screen, overview: FleetOverview, interval_s: float) -> 
 
 
 NAME: Final = "collector"
+OPEN: Final = PostAccess()  # no credentials
 HEAD: Final = (
     "GATEWAY",
     "BOOT",
@@ -225,8 +228,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _broker(collecting)
     collecting.add_argument(
         "--to", required=True, metavar="STORE",
-        help="postgresql://USER@HOST/DATABASE: write each row exactly once; -: print JSON lines",
+        help="postgresql://USER@HOST/DATABASE: write each row exactly once; http or https URL: line protocol to "
+        "InfluxDB, VictoriaMetrics, QuestDB or Telegraf; -: print JSON lines",
     )  # fmt: skip
+    collecting.add_argument(
+        "--to-token-file", metavar="FILE",
+        help="for an http or https URL: file with an InfluxDB token, or with a value of the header Authorization such "
+        "as 'Bearer TOKEN'",
+    )  # fmt: skip
+    collecting.add_argument(
+        "--to-ca-file", metavar="FILE", help="for an https URL: CA certificates (PEM) (default: the CAs of the system)"
+    )
     collecting.add_argument(
         "--name", default=NAME,
         help="name of this collector; the broker keeps messages for it while it does not run (default: %(default)s)",
@@ -282,7 +294,7 @@ def fleet_of(args: argparse.Namespace, name: str, *, from_begin: bool) -> Fleet:
 
 async def _collect(args: argparse.Namespace) -> int:
     fleet = fleet_of(args, args.name, from_begin=args.from_begin)
-    store = store_of(args.to)
+    store = store_of(args.to, PostAccess(args.to_token_file, args.to_ca_file))
     collector = FleetCollector(fleet, store, Selection(args.site, args.gateway, args.device))
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, collector.stop)
@@ -294,6 +306,8 @@ async def _collect(args: argparse.Namespace) -> int:
         store.close()
     if ledger := account_table(fleet.accounts):
         print(ledger, file=sys.stderr)
+    if isinstance(store, InfluxStore) and store.refused:
+        print(f"the server rejected {store.refused} messages; the log has the reasons", file=sys.stderr)
     if fleet.ignored:
         print(f"{fleet.ignored} messages were invalid and not stored; the log names them", file=sys.stderr)
     if fleet.problem:
@@ -301,13 +315,21 @@ async def _collect(args: argparse.Namespace) -> int:
     return 1 if fleet.problem else 0
 
 
-def store_of(text: str) -> FleetStore:
-    """Open the store of `--to`. Raises BadArgument, ServerError."""
+def store_of(text: str, access: PostAccess = OPEN) -> FleetStore:
+    """Open the store of `--to`. `access` is for a store with an HTTP URL. Raises BadArgument, ServerError."""
+    url = post_url(text)
+    if url is not None:
+        return InfluxStore(HttpPost(url, access))
+    if access != OPEN:
+        raise BadArgument("--to-token-file, --to-ca-file: expected --to with an http or https URL")
     if text == "-":
         return JsonLines(sys.stdout)
     if text.startswith(("postgresql://", "postgres://")):
         return PostgresStore(text)
-    raise BadArgument("--to: expected - for standard output, or a URL like postgresql://USER@HOST/DATABASE")
+    raise BadArgument(
+        "--to: expected - for standard output, a URL like postgresql://USER@HOST/DATABASE, or a write URL like "
+        "http://HOST:8086/write?db=imud without user, password and token"
+    )
 
 
 def account_table(accounts: Mapping[StreamKey, StreamAccount]) -> str:
