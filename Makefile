@@ -8,7 +8,8 @@
 # make alerts every alert provoked, by a real Prometheus that scrapes a daemon: fires and clears, with a table of times
 # make signalk-deps   installs the Signal K server with npm into build/signalk, for the tests of the output signalk
 # make monitoring-deps   installs Prometheus and Alertmanager, for the tests of rules, examples and dashboard
-# make fleet-deps  installs PostgreSQL, for the tests of the collector, and what make mqtt-deps installs
+# make fleet-deps  installs PostgreSQL, for the tests of the collector, and what make mqtt-deps and make influx-deps install
+# make influx-deps installs InfluxDB, for the tests of the output influx
 # make mqtt-deps   installs mosquitto and nats-server, for the tests of the output mqtt and these:
 # make fleet-demo    a broker, three gateways with a simulated sensor each, and `imud fleet top` on them
 # make fleet-faults  a gateway, a broker and what can happen between them (ARGS="--seconds 120"), as a table
@@ -192,7 +193,11 @@ monitoring-deps:
 mqtt-deps:
 	apt-get install --yes --no-install-recommends mosquitto openssl nats-server
 
-fleet-deps: mqtt-deps
+.PHONY: influx-deps
+influx-deps:
+	apt-get install --yes --no-install-recommends influxdb
+
+fleet-deps: mqtt-deps influx-deps
 	apt-get install --yes --no-install-recommends postgresql
 
 # Fast DDS, the default of ROS 2, as a reader of the output `ros2`

@@ -15,6 +15,7 @@ PUBLISHERS: Registry[PublisherType] = Registry(
         "ros2": "imud.publishers.ros2.options:PUBLISHER",
         "nmea2000": "imud.publishers.nmea2000:PUBLISHER",
         "signalk": "imud.publishers.signalk.settings:PUBLISHER",
+        "influx": "imud.publishers.influx.settings:PUBLISHER",
         "mqtt": "imud.fleet.settings:PUBLISHER",
     },
     # the configuration has these other keys at the top

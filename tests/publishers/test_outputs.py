@@ -50,6 +50,9 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "share_interface": False,
     "signalk": {
         "enabled": False, "device": None, "url": "http://127.0.0.1:3000", "ca_file": None, "rate_hz": 10,
+    "influx": {
+        "enabled": False, "to": {}, "devices": None, "rate_hz": 10, "site": "", "gateway": "", "batch_s": 1,
+        "ledger_s": 10, "queue_mb": 16,
     },
     "mqtt": {
         "enabled": False, "brokers": ["mqtt://127.0.0.1:1883"], "version": "5", "site": "default", "gateway": "",
@@ -73,6 +76,19 @@ def test_rows_and_defaults() -> None:
     assert {name: msgspec.to_builtins(row.settings()) for name, row in rows.items()} == DEFAULTS
     assert [name for name, row in rows.items() if row.required] == ["socket", "shm"]
     assert all(name == row.name for name, row in rows.items())
+
+
+def test_an_output_that_is_off_imports_nothing() -> None:
+    program = (
+        "import sys\nfrom imud.publishers import PUBLISHERS\nfor name in PUBLISHERS: PUBLISHERS[name]\n"
+        "print(*sys.modules)"
+    )
+    loaded = set(subprocess.check_output([sys.executable, "-c", program], text=True).split())
+    assert not loaded & {
+        "imud.publishers.influx.publisher",
+        "imud.publishers.influx.destinations",
+        "imud.formats.influx",
+    }
 
 
 class Switch(Options, frozen=True):

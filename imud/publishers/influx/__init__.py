@@ -1,0 +1,1 @@
+"""Output `influx`: samples, ledgers and events as line protocol of InfluxDB."""
