@@ -4,10 +4,11 @@ import json
 import os
 import re
 import shutil
+import socket
 import subprocess
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -57,12 +58,16 @@ class FakeDatabase:
     def __init__(self) -> None:
         self.replies: list[tuple[int, str]] = []
         self.bodies: list[bytes] = []
+        self.connections: list[socket.socket] = []
         self.requests: list[tuple[str, dict[str, str]]] = []
         fake = self
 
         class Handler(BaseHTTPRequestHandler):
             protocol_version = "HTTP/1.1"
-            timeout = 60
+
+            def setup(self) -> None:
+                super().setup()
+                fake.connections.append(self.connection)
 
             def do_POST(self) -> None:
                 body = self.rfile.read(int(self.headers["Content-Length"]))
@@ -93,6 +98,9 @@ class FakeDatabase:
 
     def close(self) -> None:
         self._server.shutdown()
+        for one in self.connections:
+            with suppress(OSError):  # the client closed it
+                one.shutdown(socket.SHUT_RDWR)
         self._server.server_close()
 
 
