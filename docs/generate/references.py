@@ -16,7 +16,7 @@ import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import chain, groupby
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, get_args
 
 import msgspec
 
@@ -145,6 +145,9 @@ def settings_parts() -> Iterator[tuple[str, str, type[Options]]]:
         yield f"Link `{name}`", f"devices.NAME.{name}.", link.settings
     for name, driver in TABLES.drivers.items():
         yield f"Options of driver `{name}`", "devices.NAME.options.", driver.settings
+        for field in msgspec.structs.fields(driver.settings):
+            for part in filter(lambda one: isinstance(one, type) and issubclass(one, Options), get_args(field.type)):
+                yield f"Option `{field.name}` of driver `{name}`", f"devices.NAME.options.{field.name}.", part
     for name, schema in LINE_SCHEMAS.items():
         yield f"Line `{name}`: {LINE_TITLES[name]}", f"devices.NAME.lines.{name}.", schema
     yield "Mounting of the sensor (`docs/frames.md`)", "devices.NAME.frame.", FrameOptions

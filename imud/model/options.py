@@ -127,6 +127,10 @@ def value_problem(value: object, field_type: Any) -> str:
             if isinstance(given, Mapping) and (found := wrong_values(info.value_type.cls, given)):
                 place = f"{key}.{found[0].name}" if found[0].name else str(key)
                 return f"{found[0].message}, at {shown(place)}"
+    if isinstance(info, inspect.UnionType) and isinstance(value, Mapping):
+        schemas = [one.cls for one in info.types if isinstance(one, inspect.StructType)]
+        if schemas and (found := wrong_values(schemas[0], value)):
+            return str(found[0])
     try:
         msgspec.convert(value, field_type)
     except msgspec.ValidationError as error:

@@ -73,7 +73,7 @@ C 6 kboot commands | get-property, erase-region, write-memory, reset | drivers.h
 C 6 Intel HEX | read by the library `intelhex` and checked | cli.firmware:parse_image | cli/test_firmware.py::test_gaps_contain_the_value_of_erased_flash cli/test_firmware.py::test_damaged_and_foreign_files_are_refused
 C 6 CAN | SDO object 0x1F51: sub-indices 5, 6, 1, 9 | drivers.hipnuc.canopen.firmware:PROGRAM | {_UPDATE}test_update_writes_and_starts_the_image {_UPDATE}test_second_update_succeeds_after_a_fault_at_any_step
 C 6 vendor's tool | updates the simulated boot loaders | sim.hipnuc.boot_loader:KbootLoader | drivers/hipnuc/test_firmware_vendor_tool.py::test_vendor_library_updates_the_simulated_node drivers/hipnuc/test_firmware_vendor_tool.py::test_vendor_tool_updates_the_simulated_device
-C 7 frame 0x0666 | raw data: named and counted, not decoded | drivers.imu61x.uart.codec:frame_name | drivers/imu61x/uart/test_codec.py::test_frames_of_other_kinds_and_lengths
+C 7 frame 0x0666 | raw data: decoded with a layout from the configuration; no source states the layout | drivers.imu61x.uart.raw:RawFrame | drivers/imu61x/uart/test_raw.py::test_golden_frames_of_each_type drivers/imu61x/uart/test_codec.py::test_frames_of_other_kinds_and_lengths
 C 7 frame 0x0166 | navigation: named and counted, not decoded | drivers.imu61x.uart.codec:frame_name | drivers/imu61x/uart/test_codec.py::test_frames_of_other_kinds_and_lengths
 C 7 AHRS of 56 bytes | magnetic field after the temperature | drivers.imu61x.uart.codec:MAG | drivers/imu61x/uart/test_codec.py::test_frame_of_56_bytes_contains_the_magnetic_field sim/imu61x/test_uart.py::test_ahrs_frames_of_newer_models_contain_the_true_magnetic_field
 """

@@ -5,11 +5,14 @@ import json
 import os
 import sys
 import threading
+from math import pi
 from pathlib import Path
 
 import pytest
 
 from imud.drivers.hipnuc.uart.codec import encode_frame
+from imud.drivers.imu61x.uart.codec import DEVICE_SYNC, RAW_FRAME
+from imud.drivers.imu61x.uart.codec import encode_frame as imu61x_frame
 from tests.cli.conftest import Cli
 from tests.support.files import hi91, imu61x_log
 
@@ -76,6 +79,22 @@ def test_a_capture_without_samples_names_its_frames(tmp_path: Path, cli: Cli) ->
     assert "found valid frames of unknown types (PGN 65376 (0xFF60): 2, " in err
     assert err.count("PGN 65") == 8
     assert "types (PGN 65376" in " ".join(cli("replay", "--driver", "hipnuc-j1939", log, status=1).err.split())
+
+
+def test_raw_frames_with_a_layout_from_an_option(tmp_path: Path, cli: Cli) -> None:
+    """2048 LSB/g and 16 LSB/(°/s): 1, -0.5, 2 g and 180, -90, 1 °/s."""
+    file = tmp_path / "capture"
+    file.write_bytes(imu61x_frame(DEVICE_SYNC, RAW_FRAME, bytes.fromhex("400B60FA1000 000800FC0010")))
+    decode = ("decode", "--driver", "imu61x-uart", file)
+    layout = '"type": "i16", "accel_at": 6, "gyro_at": 0, "accel_g_per_lsb": 4.8828125e-4, "gyro_deg_s_per_lsb": 0.0625'
+    (sample,) = lines(cli(*decode, "--option", f"raw_frame={{{layout}}}").out)
+    assert sample["accel_m_s2"] == pytest.approx([9.80665, -4.903325, 19.6133])
+    assert sample["gyro_rad_s"] == pytest.approx([pi, -pi / 2, pi / 180])
+    assert "t_dev_ns" not in sample
+    words = "(raw data (identifier 0x0666, set options.raw_frame to the layout in the documents of the device"
+    assert words in cli(*decode, status=1).err
+    err = cli(*decode, "--option", f"raw_frame={{{layout.replace('6,', '5,')}}}", status=2).err
+    assert "--option raw_frame: accel_at: expected 6 or more, the end of the field at gyro_at, got 5" in err
 
 
 def test_log_of_a_can_bus(tmp_path: Path, cli: Cli) -> None:

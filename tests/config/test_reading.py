@@ -28,6 +28,8 @@ from imud.contracts.lines import LINE_SCHEMAS, DeviceLines
 from imud.contracts.link import Claim
 from imud.contracts.setting import SettingsTable
 from imud.drivers import DRIVERS
+from imud.drivers.imu61x.uart.commands import Imu61xUartOptions
+from imud.drivers.imu61x.uart.raw import RawFrame
 from imud.links import LINKS
 from imud.model.errors import ConfigError
 from imud.model.options import NoOptions, Options
@@ -359,7 +361,10 @@ def test_shipped_file_shows_the_defaults() -> None:
     named = {device.name: device for device in full.devices}
     assert replace(named["imu"], line=0) == replace(plain.devices[0], line=0)
     for device in full.devices:
-        if device.options is not None:
+        if device.name == "tiller":
+            layout = RawFrame(type="f32", accel_at=4, gyro_at=16, accel_g_per_lsb=1, gyro_deg_s_per_lsb=1)
+            assert device.options == Imu61xUartOptions(raw_frame=layout)
+        elif device.options is not None:
             assert device.options == DRIVERS[device.driver].settings()
     assert named["recorded"].link_settings == msgspec.convert(
         {"path": "/var/lib/imud/drive.cap"}, LINKS["replay"].settings

@@ -18,7 +18,7 @@ from imud.contracts.status import DeviceState, KernelCounters
 from imud.device.search import RememberedDevice
 from imud.drivers.hipnuc.uart import driver
 from imud.drivers.hipnuc.uart.codec import encode_frame
-from imud.drivers.imu61x.uart.codec import DEVICE_SYNC
+from imud.drivers.imu61x.uart.codec import DEVICE_SYNC, frame_name
 from imud.drivers.imu61x.uart.codec import encode_frame as imu61x_frame
 from imud.formats.nmea0183 import sentence
 from imud.links import LINKS
@@ -431,7 +431,7 @@ AHRS_NEXT = "imud decodes the AHRS frame (identifier 0x0002): select this output
             HI_NEXT,
         ),
         ("hipnuc-uart", OTHER, "tag 0x77", HI_NEXT),
-        ("imu61x-uart", RAW, "raw data (identifier 0x0666)", AHRS_NEXT),
+        ("imu61x-uart", RAW, frame_name(0x0666), AHRS_NEXT),
         ("imu61x-uart", imu61x_frame(DEVICE_SYNC, 0x0777, bytes(9)), "identifier 0x0777", AHRS_NEXT),
     ],
     ids=["one tag", "two tags and NMEA", "other tag", "raw data", "other identifier"],

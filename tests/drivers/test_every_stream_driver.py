@@ -1,5 +1,6 @@
 """Every stream driver, from its row in DRIVERS: the requirements of `imud.testing`, lines of text, kinds of damage."""
 
+from dataclasses import replace
 from random import Random
 
 import pytest
@@ -8,11 +9,30 @@ from imud import drivers as devices
 from imud.contracts.codec import BadFrame, BadReason
 from imud.contracts.driver import StreamDriver, of_kind
 from imud.contracts.script import TextLine
+from imud.drivers.imu61x.uart.codec import DEVICE_SYNC, RAW_FRAME, encode_frame
+from imud.drivers.imu61x.uart.commands import Imu61xUartOptions
+from imud.drivers.imu61x.uart.raw import RawFrame
 from imud.testing import driver_tests
 from imud.testing.invariants import feed_stream as feed_checked
 from imud.testing.stream import IDLE, make
 
 DRIVERS = {driver.name: driver for driver in of_kind(devices.DRIVERS.values(), StreamDriver)}
+LAYOUT = RawFrame(type="i16", accel_at=6, gyro_at=0, accel_g_per_lsb=0.001, gyro_deg_s_per_lsb=0.1, timer_at=14)
+
+
+class RawOptions(Imu61xUartOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    raw_frame: RawFrame | None = LAYOUT
+
+
+def raw_frame(random: Random) -> bytes:
+    """Return a raw frame or an ignored AHRS frame."""
+    if random.random() < 0.2:
+        return DRIVERS["imu61x-uart"].example_frame(random)
+    payload = random.randbytes(LAYOUT.size_bytes + random.choice((0, 0, 3)))
+    return encode_frame(DEVICE_SYNC, RAW_FRAME, payload)
+
+
+DRIVERS["imu61x-uart, raw frames"] = replace(DRIVERS["imu61x-uart"], settings=RawOptions, example_frame=raw_frame)
 every_driver = pytest.mark.parametrize("name", list(DRIVERS))
 
 test_stream_drivers = driver_tests(*DRIVERS.values())
@@ -33,7 +53,7 @@ def test_damage_is_counted_by_its_kind(name: str) -> None:
     """A wrong bit in the payload is a CRC error, a length without a frame type is a length error."""
     driver = DRIVERS[name]
     frame = driver.example_frame(Random(1))
-    length_at = {"hipnuc-uart": 2, "imu61x-uart": 4}[name]
+    length_at = 2 if name == "hipnuc-uart" else 4
     wrong_length = frame[:length_at] + b"\xff\xff" + frame[length_at + 2 :]
     for data, reason in ((frame[:-1] + bytes([frame[-1] ^ 1]), BadReason.CRC), (wrong_length, BadReason.LENGTH)):
         codec = make(driver)

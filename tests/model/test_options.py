@@ -119,6 +119,7 @@ def test_the_place_of_a_wrong_part() -> None:
     assert value_problem([1, "x"], list[int]).endswith(' with "x" at [1]')
     assert value_problem(["", 1], list[int]).endswith(' with "" at [0]')
     assert value_problem({"rate_hz": 1, "names": ["a", 2]}, Trip).endswith(" with 2 at names[1]")
+    assert value_problem({"rate_hz": 0}, Trip | None) == "rate_hz: expected a number above 0, got 0"
     words = 'expected a number above 0, got "x", at "a.rate_hz"'
     assert value_problem({"b": {"rate_hz": 1}, "a": {"rate_hz": "x"}}, dict[str, Trip]) == words
     assert value_problem({"a": {}}, dict[str, Trip]).endswith(' (a number above 0), got none, at "a"')

@@ -15,6 +15,7 @@ of the device from `advance`. Behavior, with assumptions where the manual define
   measured angles can be read but have no effect. CMD 10 takes the same time, subtracts the bias of the gyroscope, and
   is refused while the device moves (all assumptions).
 - The heading starts at the truth and is not saved.
+- With a layout of raw frames, the stream contains raw frames in place of AHRS frames (layout invented).
 """
 
 from collections.abc import Callable, Mapping
@@ -27,19 +28,24 @@ from imud.drivers.imu61x.common import FILTER_DEFAULT, I2C_ADDRESSES
 from imud.drivers.imu61x.registers import BURST_CTRL
 from imud.drivers.imu61x.uart.codec import (
     AHRS_FRAME_BYTES,
+    DEVICE_SYNC,
     HOST_SYNC,
     MAG_FRAME_BYTES,
+    OVERHEAD_BYTES,
     PARAMETERS,
+    RAW_FRAME,
     Frame,
     FrameFinder,
     Parameter,
     Status,
     encode_acknowledgement,
     encode_ahrs,
+    encode_frame,
     encode_parameter,
     encode_status,
 )
 from imud.drivers.imu61x.uart.commands import BAUD_RATES, RATES_HZ, BusMode, Command, OutputMode, max_rate_hz
+from imud.drivers.imu61x.uart.raw import RawFrame, pack_raw
 from imud.model.ledger import Ledger
 from imud.model.sample import Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US, RAD_PER_DEG
@@ -188,12 +194,17 @@ STATUS: Final = Status(
 )  # fmt: skip
 
 
+# Layout of the raw frames of `--message RAW`, invented: timer, accelerations in g, angular rates in °/s
+RAW_LAYOUT: Final = RawFrame(type="f32", accel_at=4, gyro_at=16, accel_g_per_lsb=1, gyro_deg_s_per_lsb=1, timer_at=0)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Imu61xHardware(SensorHardware):
     """A device, and its behavior where the manual defines nothing."""
 
     status: Status = STATUS
     has_magnetometer: bool = False  # whether AHRS frames have 56 bytes
+    raw: RawFrame | None = None  # layout of raw frames; None: the stream contains AHRS frames
     uptime_us: int = 0  # timer at the first power-on, µs, for a start near the end of its range
     behaviour: Imu61xBehaviour = field(default_factory=Imu61xBehaviour)
 
@@ -313,17 +324,23 @@ class Imu61xModule:
             self.frames_dropped += 1
             return
         self.frames_sent += 1
-        self._wire.send(ready_ns, self._encode(sample_ns, device_us), sample_ns, device_us // 1000)
+        data = self._encode(sample_ns, device_us, self.hardware.raw)
+        self._wire.send(ready_ns, data, sample_ns, device_us // 1000)
 
-    def _encode(self, sample_ns: int, device_us: int) -> bytes:
+    def _encode(self, sample_ns: int, device_us: int, raw: RawFrame | None = None) -> bytes:
         reading = self._reading(sample_ns)
-        roll, pitch, yaw = euler_zyx_from_quat(reading.quat_wxyz)
+        accel_m_s2 = reading.accel_m_s2
         x, y, z = reading.gyro_rad_s
         off_x, off_y, off_z = (off * RAD_PER_DEG for off in self.settings.gyro_off_deg_s)
+        gyro_rad_s = (x - off_x, y - off_y, z - off_z)
+        if raw is not None:
+            payload = pack_raw(raw, timer_us=device_us, accel_m_s2=accel_m_s2, gyro_rad_s=gyro_rad_s)
+            return encode_frame(DEVICE_SYNC, RAW_FRAME, payload)
+        roll, pitch, yaw = euler_zyx_from_quat(reading.quat_wxyz)
         return encode_ahrs(
             timer_us=device_us,
-            accel_m_s2=reading.accel_m_s2,
-            gyro_rad_s=(x - off_x, y - off_y, z - off_z),
+            accel_m_s2=accel_m_s2,
+            gyro_rad_s=gyro_rad_s,
             euler_rad=(roll, pitch, remainder(yaw + self._heading_rad, 2 * pi)),
             temperature_c=reading.temperature_c,
             mag_t=reading.mag_t if self.hardware.has_magnetometer else None,
@@ -331,6 +348,8 @@ class Imu61xModule:
 
     @property
     def _frame_bytes(self) -> int:
+        if self.hardware.raw is not None:
+            return OVERHEAD_BYTES + self.hardware.raw.size_bytes
         return MAG_FRAME_BYTES if self.hardware.has_magnetometer else AHRS_FRAME_BYTES
 
     def _reading(self, sample_ns: int) -> Truth:
@@ -471,8 +490,8 @@ def make(options: SimulatorOptions, now_ns: int) -> Imu61xModule:
     """Return a device for the options. Raises ValueError for an unsupported option."""
     if options.rate_hz not in RATES_HZ:
         raise ValueError(f"rate {options.rate_hz:g} Hz: expected one of {', '.join(map(str, RATES_HZ))}")
-    if options.message.upper() not in ("", "AHRS", "AHRS9"):
-        raise ValueError(f"message {options.message!r}: expected AHRS, or AHRS9 with the magnetic field")
+    if options.message.upper() not in ("", "AHRS", "AHRS9", "RAW"):
+        raise ValueError(f"message {options.message!r}: expected AHRS, AHRS9 with the magnetic field, or RAW")
     rate_hz = int(options.rate_hz)
     baud = options.baud or next(baud for baud in sorted(BAUD_RATES) if max_rate_hz(baud) >= rate_hz)
     if baud not in BAUD_RATES:
@@ -481,6 +500,7 @@ def make(options: SimulatorOptions, now_ns: int) -> Imu61xModule:
         status=replace(STATUS, software_version=options.firmware or STATUS.software_version),
         **sensor_of(options),
         has_magnetometer=options.message.upper() == "AHRS9",
+        raw=RAW_LAYOUT if options.message.upper() == "RAW" else None,
         behaviour=options.chosen(VARIANTS),
     )
     return Imu61xModule(now_ns, Imu61xSettings(baud=baud, rate_hz=rate_hz), hardware)

@@ -12,11 +12,12 @@ from imud.contracts.script import Reply, ReplyFrame, Request
 from imud.drivers.imu61x.uart import codec
 from imud.drivers.imu61x.uart import commands as c
 from imud.drivers.imu61x.uart.codec import Acknowledgement, Parameter, parse_acknowledgement
+from imud.drivers.imu61x.uart.raw import RawCodec
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_S
 from imud.sim import SIMULATORS
-from imud.sim.imu61x.uart import Imu61xModule, Imu61xSettings, ParameterRefused, changed, make
+from imud.sim.imu61x.uart import RAW_LAYOUT, Imu61xModule, Imu61xSettings, ParameterRefused, changed, make
 from imud.sim.physics import Noise, swing
 from imud.sim.sensor import SimulatorOptions
 from tests.support.simulated_modules import BEGIN_NS, IMU61X_STILL, Imu61xBench, imu61x_bench
@@ -260,7 +261,7 @@ def test_the_row_makes_it_from_common_options_and_refuses_others() -> None:
     assert make(SimulatorOptions(rate_hz=200), BEGIN_NS).baud == 115200
     for options, named in (
         (SimulatorOptions(rate_hz=99), "rate 99 Hz: expected one of 1, 10"), (SimulatorOptions(baud=9600), "baud 9600"),
-        (SimulatorOptions(message="HI91"), "expected AHRS"), (SimulatorOptions(motion="fly"), "motion 'fly'"),
+        (SimulatorOptions(message="HI91"), "or RAW"), (SimulatorOptions(motion="fly"), "motion 'fly'"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=named):
             make(options, BEGIN_NS)
@@ -278,3 +279,19 @@ def test_ahrs_frames_of_newer_models_contain_the_true_magnetic_field() -> None:
         truth = module.hardware.motion.at((burst.sample_ns - BEGIN_NS) / NS_PER_S)
         assert m.size_bytes == 66
         assert m.mag_t == pytest.approx(truth.mag_t, rel=1e-6)
+
+
+def test_raw_frames_contain_the_truth_in_their_layout() -> None:
+    module = make(SimulatorOptions(message="raw", rate_hz=100, noise="none", boot_ms=0), BEGIN_NS)
+    decoder = RawCodec(Ledger(), RAW_LAYOUT)
+    bursts = [burst for burst in module.advance(BEGIN_NS + NS_PER_S // 2) if burst.sample_ns is not None]
+    assert len(bursts) >= 45
+    for burst in bursts:
+        (m,) = decoder.feed(burst.data)
+        assert isinstance(m, Measurement)
+        assert burst.sample_ns is not None
+        truth = module.hardware.motion.at((burst.sample_ns - BEGIN_NS) / NS_PER_S)
+        assert m.size_bytes == 38
+        assert m.dev_ticks == pytest.approx((burst.sample_ns - BEGIN_NS) / 1000, abs=20)
+        assert m.accel_m_s2 == pytest.approx(truth.accel_m_s2, abs=1e-5)
+        assert m.gyro_rad_s == pytest.approx(truth.gyro_rad_s, abs=1e-6)

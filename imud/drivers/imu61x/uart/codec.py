@@ -55,6 +55,7 @@ AHRS: Final = struct.Struct("<I10f")
 AHRS_BYTES: Final = AHRS.size
 AHRS_FRAME: Final = 0x0002
 AHRS_FRAME_BYTES: Final = OVERHEAD_BYTES + AHRS_BYTES
+RAW_FRAME: Final = 0x0666  # see `imud.drivers.imu61x.uart.raw`
 MAG: Final = struct.Struct("<3f")  # after AHRS
 MAG_FRAME_BYTES: Final = AHRS_FRAME_BYTES + MAG.size
 MagUnit = Literal["ut", "mgauss"]
@@ -346,12 +347,17 @@ class Imu61xCodec:
 
     kernel_format: ClassVar = FrameFinder.kernel_format
     word_is_status: ClassVar = False
+    sample_frame: ClassVar = AHRS_FRAME  # identifier of the frames with measurements
 
     def __init__(self, ledger: Ledger, settings: Options | None = None) -> None:
         self.ledger = ledger
         self._mag_factor = T_PER_UNIT[getattr(settings, "mag_unit", "ut")]
         self.unknown: dict[int, int] = {}  # number of frames by unknown identifier
         self._finder = FrameFinder(ledger, DEVICE_SYNC)
+        # by identifier of a known frame; a shorter frame is bad
+        self._payload_bytes_min = {
+            AHRS_FRAME: AHRS_BYTES, STATUS_FRAME: STATUS_BYTES_MIN, PARAMETER_FRAME: PARAMETERS.size,
+        }  # fmt: skip
 
     def feed(self, data: bytes) -> Sequence[CodecEvent]:
         """Decode the next bytes of the stream. Return the completed events. Never raises an exception."""
@@ -384,9 +390,10 @@ class Imu61xCodec:
         """Count a frame with a correct CRC and add its event."""
         ledger, frame_id, size = self.ledger, frame.frame_id, len(frame.raw)
         payload_size = size - OVERHEAD_BYTES
-        measured = frame_id == AHRS_FRAME and payload_size >= AHRS_BYTES
+        is_short = payload_size < self._payload_bytes_min.get(frame_id, 0)
+        measured = frame_id == self.sample_frame and not is_short
         reply = not measured and is_reply(frame_id, payload_size)
-        if not (measured or reply) and frame_id in _KNOWN_FRAMES:  # too short
+        if is_short and not reply:
             ledger.frames_bad_content += 1
             ledger.bytes_in_bad_frames += size
             events.append(BadFrame(BadReason.CONTENT, frame.raw))
@@ -427,18 +434,19 @@ class Imu61xCodec:
         return mag, mag is not None
 
 
-# Frames of other models, without a layout in the manual. The vendor's public sources also use 0x0666 for the angle of a
-# front wheel, so that imud cannot decode it as accelerations and angular rates.
-UNKNOWN_FRAMES: Final = {0x0166: "navigation", 0x0666: "raw data"}
+# Name and next step of frames that the codec does not decode: without a layout in the manual, or ignored by an option
+UNKNOWN_FRAMES: Final = {
+    AHRS_FRAME: ("AHRS", "ignored because options.raw_frame is set"),
+    0x0166: ("navigation", ""),
+    RAW_FRAME: ("raw data", "set options.raw_frame to the layout in the documents of the device, docs/buses.md"),
+}
 
 
 def frame_name(frame_id: int) -> str:
-    """Return the name of an unknown frame, for example `raw data (identifier 0x0666)`."""
-    name = UNKNOWN_FRAMES.get(frame_id)
-    return f"{name} (identifier {frame_id:#06x})" if name else f"identifier {frame_id:#06x}"
-
-
-_KNOWN_FRAMES: Final = (AHRS_FRAME, STATUS_FRAME, PARAMETER_FRAME)
+    """Return the name of an unknown frame, for example `navigation (identifier 0x0166)`."""
+    name, step = UNKNOWN_FRAMES.get(frame_id, ("", ""))
+    words = f"identifier {frame_id:#06x}" + f", {step}" * bool(step)
+    return f"{name} ({words})" if name else words
 
 
 # --- encoder for simulated devices ------------------------------------------------------------------------------

@@ -31,6 +31,7 @@ from imud.drivers.imu61x.uart.codec import (
     parse_parameter,
     parse_status,
 )
+from imud.drivers.imu61x.uart.raw import RawFrame
 from imud.model.errors import BadArgument, CommandError, NoReply, Rejected
 from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
@@ -278,12 +279,14 @@ STREAM: Final = output_mode(OutputMode.STREAM).payload
 
 
 class Imu61xUartOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of an IMU61x on a UART: a unit and a code that the manual does not state."""
+    """Options of an IMU61x on a UART: a unit, a code and a layout that the manual does not state."""
 
     mag_unit: MagUnit = "ut"
     """Unit of the magnetic field in AHRS frames of 56 bytes, µT or mG. No source states it."""
     result_done: Annotated[int, Meta(ge=0, le=0xFFFF)] = RESULT_DONE
     """Result in acknowledgements (K1) of an executed command; 0 is assumed."""
+    raw_frame: RawFrame | None = None
+    """Layout of frame 0x0666. imud then makes the samples from these frames and ignores AHRS frames."""
 
 
 # --- command mode -----------------------------------------------------------------------------------------------

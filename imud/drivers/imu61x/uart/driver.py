@@ -36,7 +36,6 @@ from imud.drivers.imu61x.uart import commands, settings
 from imud.drivers.imu61x.uart.codec import (
     RESULT_DONE,
     TIMER_MODULUS,
-    Imu61xCodec,
     encode_ahrs,
     frame_name,
 )
@@ -53,6 +52,7 @@ from imud.drivers.imu61x.uart.commands import (
     read3,
     settled,
 )
+from imud.drivers.imu61x.uart.raw import make_codec
 from imud.drivers.imu61x.uart.settings import (
     GYRO_OFFSETS,
     INSTALLATION_ANGLES,
@@ -337,7 +337,7 @@ DRIVER: Final = StreamDriver(
     title="Forsense IMU612, IMU614, IMU618, IMU6132A, IMU6132B (UART)",
     baud_rates=BAUD_RATES,
     settings=Imu61xUartOptions,
-    make_codec=Imu61xCodec,
+    make_codec=make_codec,
     tick_ns=NS_PER_US,
     tick_modulus=TIMER_MODULUS,
     euler_convention=EULER_CONVENTION,

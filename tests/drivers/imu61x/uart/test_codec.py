@@ -175,8 +175,8 @@ def test_frames_of_other_kinds_and_lengths() -> None:
         assert (tested.ledger.frames_ignored, tested.ledger.frames_good, tested.unknown) == (1, 1, {0x0123: 1})
         assert tested.ledger.bytes_in_good_frames == 10 + size
         assert tested.ledger.closes()
-    names = ["raw data (identifier 0x0666)", "navigation (identifier 0x0166)", "identifier 0x0123"]
-    assert [*map(uart_codec.frame_name, (0x0666, 0x0166, 0x0123))] == names
+    names = ["navigation (identifier 0x0166)", "identifier 0x0123"]
+    assert [*map(uart_codec.frame_name, (0x0166, 0x0123))] == names
 
     longer = uart_codec.encode_frame(uart_codec.DEVICE_SYNC, uart_codec.AHRS_FRAME, GOLDEN[6:-4] + bytes(8))
     measurement = only(codec().feed(longer))
