@@ -48,8 +48,10 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "enabled": False, "interface": "can0", "device": None,
         "messages": {"heading": 10, "rate_of_turn": 10, "attitude": 1}, "address": 128, "instance": 0,
         "share_interface": False,
+    },
     "signalk": {
         "enabled": False, "device": None, "url": "http://127.0.0.1:3000", "ca_file": None, "rate_hz": 10,
+    },
     "influx": {
         "enabled": False, "to": {}, "devices": None, "rate_hz": 10, "site": "", "gateway": "", "batch_s": 1,
         "ledger_s": 10, "queue_mb": 16,
