@@ -46,7 +46,6 @@ from imud.formats.slot import PRESENT_BITS, SLOT_BYTES, SLOT_FIELDS, SLOT_LAYOUT
 from imud.lines.sync import RESET, TRIGGER
 from imud.model.ledger import LEDGER_FIELDS
 from imud.model.options import Options, expected, shown
-from imud.publishers.influx.settings import DestinationOptions
 from imud.utc.receivers import RmcOptions
 from tests.support.files import ROOT
 
@@ -138,7 +137,6 @@ def settings_parts() -> Iterator[tuple[str, str, type[Options]]]:
         for field in msgspec.structs.fields(publisher.settings):
             if isinstance(field.default, Options):
                 yield f"Output `{name}`: `{field.name}`", f"{name}.{field.name}.", type(field.default)
-    yield "Output `influx`: entries of `to` (`docs/influx.md`)", "influx.to.URL.", DestinationOptions
     yield "Output `mqtt`: entries of `devices` (`docs/fleet.md`)", "mqtt.devices.NAME.", DeviceSending
     yield "Each device", "devices.NAME.", DeviceGeneral
     for name, link in TABLES.links.items():
