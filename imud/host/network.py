@@ -73,7 +73,7 @@ IFF_UP, IFF_LOOPBACK, IFF_MULTICAST = 0x1, 0x8, 0x1000  # linux/if.h
 
 
 def multicast_addresses() -> list[str]:
-    """Return the IPv4 address of each interface that is up and supports multicast; 127.0.0.1 if there is none."""
+    """Return the IPv4 addresses of the interfaces that are up and support multicast; otherwise 127.0.0.1."""
     found, loopback = [], []
     with open_socket("127.0.0.1", socket.SOCK_DGRAM) as asked:
         for _, name in socket.if_nameindex():

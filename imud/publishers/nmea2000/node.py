@@ -198,7 +198,7 @@ class Node:
         return self._claim_next(now_ns)
 
     def _claim_next(self, now_ns: int) -> list[Message]:
-        """Claim the next free address. Prepare "cannot claim" if there is none."""
+        """Claim the next free address. Prepare "cannot claim" if no address is free."""
         first = self._preferred
         for step in range(_ADDRESSES):
             address = (first + step) % _ADDRESSES
