@@ -11,7 +11,8 @@ import msgspec
 from imud.cli.arguments import CliCommand, add_socket
 from imud.cli.output import local_time, table
 from imud.client.connection import Client, decoded
-from imud.contracts.command import CalibrationInfo, CalibrationResult, Handling, Kept, LastCalibration
+from imud.contracts.command import CalibrationInfo, CalibrationResult, Handling, Kept
+from imud.contracts.setting import SAVE_SENT
 from imud.model.errors import BadArgument
 from imud.model.event import Event, EventKind
 from imud.model.units import RAD_PER_DEG, T_PER_UT
@@ -45,7 +46,7 @@ def calibrate(args: argparse.Namespace) -> int:
             return 0 if stopped else 1
         found = decoded(watching.call("calibrations", device=args.device), list[CalibrationInfo], "calibrations")
         if args.kind is None:
-            print(table(HEAD, [(one.kind, one.handling, one.kept, _last(one.last), one.help) for one in found]))
+            print(table(HEAD, [(one.kind, one.handling, one.kept, _last(one), one.help) for one in found]))
             return 0
         known = {one.kind: one for one in found}
         if args.kind not in known:
@@ -60,11 +61,13 @@ def calibrate(args: argparse.Namespace) -> int:
     return 0 if result.verified else 1
 
 
-def _last(last: LastCalibration | None) -> str:
+def _last(calibration: CalibrationInfo) -> str:
     """Format the result of the last calibration."""
+    last = calibration.last
     if last is None:
         return "not done yet"
-    result = "NOT verified" if not last.verified else "saved" if last.saved else "verified"
+    saved = "save not verified" if calibration.kept is Kept.BY_SAVE else "saved"
+    result = "NOT verified" if not last.verified else f"verified, {saved}" if last.saved else "verified"
     return f"{local_time(last.utc_ns):%Y-%m-%d}, {result}"
 
 
@@ -142,7 +145,7 @@ def _account(result: CalibrationResult, *, asked_to_save: bool) -> str:
             f"  {check.name}: {_value(check.value, check.unit)}, limit {_value(check.limit, check.unit)}: {mark}"
         )
     if result.saved:
-        lines.append("  saved")
+        lines.append(f"  {SAVE_SENT if result.kept is Kept.BY_SAVE else result.kept}")
     else:
         hint = "" if asked_to_save or not result.verified else "; save it with --save"
         lines.append(f"  not saved: lasts {result.kept}{hint if result.kept is Kept.BY_SAVE else ''}")

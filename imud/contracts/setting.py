@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cache
 from operator import attrgetter, eq
-from typing import Any, cast
+from typing import Any, Final, cast
 
 import msgspec
 
@@ -311,6 +311,9 @@ class AppliedStep(msgspec.Struct, frozen=True):
     message: str = ""  # reason if the setting is not applied or not verified; empty otherwise
 
 
+SAVE_SENT: Final = "save to flash: sent, not verified: imud cannot read the flash"
+
+
 class AppliedSettings(msgspec.Struct, frozen=True):
     """Applied steps, and remaining differences."""
 
@@ -335,7 +338,7 @@ class AppliedSettings(msgspec.Struct, frozen=True):
         is_verified = StepOutcome.VERIFIED in outcomes and StepOutcome.NOT_APPLIED not in outcomes
         save = "saved to flash"
         if not (self.restarted and is_verified):
-            save = "save to flash: sent, not verified: imud cannot read the flash"
+            save = SAVE_SENT
         doubt = [f"restart: sent, not verified: {self.restart_doubt}"] if self.restart_doubt else []
         return [save] * self.saved + ["restarted"] * self.restarted + doubt
 

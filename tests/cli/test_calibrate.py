@@ -33,9 +33,10 @@ def test_calibrations_are_listed_verified_and_saved(daemon: RunningDaemon, cli: 
     assert [words for words in found if words not in out] == []
     out = cli(*words, "level", "--yes", "--save").out
     assert "  1. Put the device down in the attitude that must be level, and do not touch it.\n" in out
-    assert [words for words in ("\nverified\n  roll: ", "°, limit 0.5°: passed\n  saved\n") if words not in out] == []
+    result = "\nverified\n  roll: ", "°, limit 0.5°: passed\n  save to flash: sent, not verified: "
+    assert [words for words in result if words not in out] == []
     (level,) = [line for line in cli(*words).out.splitlines() if line.startswith("level ")]
-    assert ", saved " in level
+    assert ", verified, save not verified " in level
     shown = cli("events", "--since", "1h", "--socket", daemon.socket)
     past = shown.out.splitlines()
     assert shown.err.startswith("imud events: imud has all events of the last "), "it started less than 1 h ago"
@@ -75,7 +76,7 @@ def test_a_module_on_rs485_is_levelled(tmp_path: Path, cli: Cli) -> None:
     with daemon_with_module(tmp_path, "--motion", "still", driver="hipnuc-modbus") as daemon:
         out = cli("calibrate", "--socket", daemon.socket, "bow", "level", "--yes", "--save").out
     assert "\nverified\n  roll: " in out
-    assert out.endswith("  saved\n")
+    assert out.endswith("  save to flash: sent, not verified: imud cannot read the flash\n")
 
 
 class Asked:
@@ -172,7 +173,10 @@ def test_a_result_has_its_checks_in_units_of_people_and_a_way_to_save_it() -> No
     ]  # fmt: skip
     assert account(Kept.BY_SAVE, asked_to_save=True)[-1].endswith("unless it is saved")
     assert account(Kept.NEVER)[-1] == "  not saved: lasts until power-off; it cannot be saved"
-    assert account(Kept.BY_DEVICE)[-1] == "  saved"
+    assert account(Kept.BY_DEVICE)[-1] == "  saved by the device itself"
+    sent = CalibrationResult("level", True, "", "", (), True, Kept.BY_SAVE)
+    words = ["verified", "  save to flash: sent, not verified: imud cannot read the flash"]
+    assert _account(sent, asked_to_save=True).splitlines() == words
     failed = account(Kept.BY_SAVE, problem="it moved")
     unsaved = "  not saved: lasts until power-off, unless it is saved"
     assert (failed[0], failed[-1]) == ("NOT verified: it moved", unsaved)

@@ -4,6 +4,9 @@ import { button, icon, section, toast } from "./ui.js";
 import { AXES, call, DEGREE, el, marked, number, quantity, setText, span, timeOf } from "./util.js";
 
 const SAVED_ON_REQUEST = "until power-off, unless it is saved";
+
+/** Words for a save: imud cannot read the flash, so that the reply of the device does not verify the save. */
+const afterSave = (kept) => kept === SAVED_ON_REQUEST ? ". The save to flash is not verified: imud cannot read the flash" : " and saved";
 const STEPS = ["Prepare", "Turn", "Check", "Save"];
 const TURN_RAD = 2 * Math.PI;
 const SIDES = [
@@ -93,7 +96,7 @@ export class CalibrationSection {
   entry(one) {
     const isBusy = !this.running.hidden;
     const { last } = one;
-    const words = isBusy && this.kind === one.kind ? "running" : last ? `${dayOf(last.utc_ns)}, ${last.verified ? "verified" : "not verified"}${last.saved ? ", saved" : ""}` : "not done yet";
+    const words = isBusy && this.kind === one.kind ? "running" : last ? `${dayOf(last.utc_ns)}, ${last.verified ? "verified" : "not verified"}${!last.saved ? "" : one.kept === SAVED_ON_REQUEST ? ", save not verified" : ", saved"}` : "not done yet";
     const save = one.kept === SAVED_ON_REQUEST ? el("input", { type: "checkbox" }) : null;
     const begin = button(`Start ${one.kind}`, () => this.begin(one.kind, save?.checked ?? false), { kind: "primary", disabled: isBusy });
     const control = el("div", { class: "buttons" }, begin, save && el("label", { class: "check" }, save, "save a verified result"), isBusy && el("span", { class: "help", text: "only one calibration at a time" }));
@@ -115,7 +118,7 @@ export class CalibrationSection {
       const done = await call("calibrate", { device: this.device, kind, save });
       const checks = done.checks.map((one) => el("li", {}, icon(one.passed ? "ok" : "missing"),
         el("span", {}, `${one.name} ${quantity(one.value, one.unit)}, at most ${quantity(one.limit, one.unit)}: `, el("b", { text: one.passed ? "passed" : "not passed" }))));
-      const words = done.verified ? `${kind} is verified${done.saved ? " and saved" : ""}` : `${kind}: ${done.problem}`;
+      const words = done.verified ? `${kind} is verified${done.saved ? afterSave(done.kept) : ""}` : `${kind}: ${done.problem}`;
       this.result.replaceChildren(el("div", { class: "panel" }, el("p", { class: done.verified ? "fine-result" : "wrong", text: words }), el("ul", { class: "outcome" }, checks),
         done.device && el("p", { class: "help", text: `The device reports: ${done.device}` }), !done.saved && el("p", { class: "help", text: `The result is kept: ${done.kept}.` })));
     } catch (error) {
@@ -144,7 +147,7 @@ export class CalibrationSection {
     setText(this.message, message);
     if (detail.phase === "end") {
       if (!this.isOwn) {
-        this.result.replaceChildren(el("p", { class: detail.verified ? "fine-result" : "wrong", text: message + (detail.saved ? " and saved" : "") }));
+        this.result.replaceChildren(el("p", { class: detail.verified ? "fine-result" : "wrong", text: message + (detail.saved ? afterSave(this.infos.find((one) => one.kind === detail.kind)?.kept) : "") }));
         this.load();
       }
       this.showRunning(false);
