@@ -59,6 +59,11 @@ UNSETTLED_WORDS: Final = "attitude filter of the host has not settled"
 HOST_NAVIGATION_WORDS: Final = "level, Z up; X where the yaw was 0 at the start of the filter on the host"
 
 
+def is_settled(status: int | None) -> bool:
+    """Return whether the attitude of a sample with this `status` is usable; always True for attitudes of devices."""
+    return status is None or not status >> UNSETTLED_BIT & 1
+
+
 @dataclass(frozen=True, slots=True)
 class DeviceAxes:
     """Axes and angles that a device sends."""

@@ -23,6 +23,7 @@ from typing import Any, Final
 
 import msgspec
 
+from imud.attitude.conventions import is_settled
 from imud.bridges.channel import (
     Diagnoses,
     LossCounts,
@@ -298,7 +299,7 @@ def _imu(frames: MessageFrames) -> Encoder:
             ImuMessage(
                 timestamp(sample.utc_ns),
                 body,
-                None if quat is None else _rotation(quat),
+                _rotation(quat) if quat is not None and is_settled(sample.status) else None,
                 None if gyro is None else VectorMember(*gyro),
                 None if accel is None else VectorMember(*accel),
                 *known,
@@ -352,7 +353,7 @@ def _transform(frames: MessageFrames) -> Encoder:
     def encode(sample: Sample) -> bytes | None:
         quat = sample.quat_wxyz
         # a viewer cannot draw NaN
-        if quat is None or not isfinite(sum(quat)):
+        if quat is None or not is_settled(sample.status) or not isfinite(sum(quat)):
             return None
         return _encode(TransformMessage(timestamp(sample.utc_ns), navigation, body, nowhere, _rotation(quat)))
 

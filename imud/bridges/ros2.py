@@ -23,6 +23,7 @@ from math import degrees, isfinite, nan
 from struct import Struct
 from typing import Any, Final
 
+from imud.attitude.conventions import is_settled
 from imud.bridges.channel import (
     STEADY_NS,
     Diagnoses,
@@ -279,7 +280,7 @@ def _imu(frames: MessageFrames, *, with_attitude: bool) -> Encoder:
     layout = Layout("iI", f'"{frames.body}', "4d", "72s", "3d", "72s", "3d", "72s")
     pack, (body,) = layout.pack, layout.texts
     noise = frames.deviations
-    attitude = _MATRIX.pack(*covariance(noise.attitude_rad, present=with_attitude))
+    attitude = _MATRIX.pack(*covariance(noise.attitude_rad))
     rate = _MATRIX.pack(*covariance(noise.gyro_rad_s))
     force = _MATRIX.pack(*covariance(noise.accel_m_s2))
     missing = _MATRIX.pack(*covariance(None, present=False))
@@ -288,12 +289,14 @@ def _imu(frames: MessageFrames, *, with_attitude: bool) -> Encoder:
         gyro, accel, quat = sample.gyro_rad_s, sample.accel_m_s2, sample.quat_wxyz
         if (quat is not None) is not with_attitude or (gyro is None and accel is None):
             return None
+        if not is_settled(sample.status):
+            quat = None
         w, x, y, z = quat or _NO_ROTATION
         gx, gy, gz = gyro or _NO_VECTOR
         ax, ay, az = accel or _NO_VECTOR
         sec, nanosec = time_of(sample.utc_ns)
         return pack(
-            ENCAPSULATION, sec, nanosec, body, x, y, z, w, attitude,
+            ENCAPSULATION, sec, nanosec, body, x, y, z, w, missing if quat is None else attitude,
             gx, gy, gz, missing if gyro is None else rate, ax, ay, az, missing if accel is None else force,
         )  # fmt: skip
 
@@ -361,7 +364,9 @@ def _transform(frames: MessageFrames) -> Encoder:
 
     def encode(sample: Sample) -> bytes | None:
         quat = sample.quat_wxyz
-        if quat is None or not isfinite(sum(quat)):  # tf refuses NaN and prints a warning for each message
+        if quat is None or not is_settled(sample.status):
+            return None
+        if not isfinite(sum(quat)):  # tf refuses NaN and prints a warning for each message
             return None
         w, x, y, z = quat
         sec, nanosec = time_of(sample.utc_ns)

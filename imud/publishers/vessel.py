@@ -8,7 +8,9 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from imud.attitude.conventions import Convention, Heading
+import msgspec
+
+from imud.attitude.conventions import Convention, Heading, is_settled
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.model.sample import Sample, Vector3
 from imud.model.units import NS_PER_S
@@ -141,6 +143,7 @@ class VesselDevice:
 
 
 def turned(batch: Batch, sample: Sample) -> Sample:
-    """Return a sample of a batch in `ned-frd`."""
+    """Return a sample of a batch in `ned-frd`, without attitude if the attitude filter of the host has not settled."""
     rotation = batch.frame.rotation_to(Convention.NED_FRD)
-    return sample if rotation is None else rotation.sample(sample)
+    made = sample if rotation is None else rotation.sample(sample)
+    return made if is_settled(made.status) else msgspec.structs.replace(made, quat_wxyz=None, euler_rad=None)

@@ -7,6 +7,7 @@ import msgspec
 import pytest
 from jsonschema import Draft202012Validator
 
+from imud.attitude.conventions import UNSETTLED_BIT
 from imud.bridges import channel as bridge
 from imud.bridges.channel import MessageChannel, MessageFrames, StampedEvent
 from imud.bridges.json import JsonDialect, status_channel
@@ -69,6 +70,10 @@ def test_messages_and_schemas() -> None:
     imu = read(made["/bow/imu/data"], FULL)
     assert imu["angular_velocity_covariance"] == [0.25, 0, 0, 0, 0.25, 0, 0, 0, 0.25]
     assert "linear_acceleration_covariance" not in imu
+    unsettled = msgspec.structs.replace(FULL, status=1 << UNSETTLED_BIT)
+    assert "orientation" in imu
+    assert "orientation" not in read(made["/bow/imu/data"], unsettled)
+    assert made["/bow/attitude"].encode(unsettled) is None
     assert read(made["/bow/imu/mag"], FULL)["magnetic_field_covariance"][4] == 4.0
     assert read(made["/bow/pressure"], FULL) == {
         "timestamp": STAMP, "frame_id": "bow", "fluid_pressure": 101325.0, "variance": 100.0

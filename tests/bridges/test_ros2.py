@@ -8,6 +8,7 @@ import msgspec
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from imud.attitude.conventions import UNSETTLED_BIT
 from imud.bridges import channel as bridge
 from imud.bridges.channel import MessageChannel, MessageFrames, StampedEvent
 from imud.bridges.ros2 import ENCAPSULATION, FIELDS, CdrWriter, Layout, Ros2Dialect, schema, time_of
@@ -61,6 +62,11 @@ def test_quantities() -> None:
     assert (imu.angular_velocity_covariance[4], imu.orientation_covariance[8]) == (0.0625, 0.015625)
     assert read(made["/bow/imu/mag"], FULL).magnetic_field_covariance[0] == 4.0
     assert read(made["/bow/temperature"], FULL).variance == 9.0
+    unsettled = msgspec.structs.replace(FULL, status=1 << UNSETTLED_BIT)
+    imu = read(made["/bow/imu/data"], unsettled)
+    assert (list(imu.orientation_covariance), imu.orientation.w) == ([-1, *8 * [0]], 1)
+    assert imu.angular_velocity_covariance[4] == 0.0625
+    assert made["/tf"].encode(unsettled) is None
     made = channels()
     assert xyz(read(made["/bow/imu/mag"], FULL).magnetic_field) == FULL.mag_t
     assert read(made["/bow/temperature"], FULL).temperature == 31.5

@@ -3,9 +3,12 @@ outputs (tests/publishers/test_nmea0183.py)."""
 
 from math import inf, nan, radians
 
+import msgspec
 import pytest
 
-from imud.attitude.conventions import Heading
+from imud.attitude.conventions import FLU_LEVEL, UNSETTLED_BIT, Heading
+from imud.attitude.published import as_sent
+from imud.contracts.publisher import Batch
 from imud.model.sample import Sample, Sync, Vector3
 from imud.publishers import vessel
 
@@ -40,3 +43,14 @@ def test_headings_need_a_reference() -> None:
         assert found == tuple(None if deg is None else pytest.approx(radians(deg)) for deg in (true_deg, magnetic_deg))
     assert vessel.roll_pitch_rad(one) == pytest.approx((radians(1), radians(2)))
     assert vessel.roll_pitch_rad(sample((1, nan, 45))) is None
+
+
+def test_an_unsettled_attitude_is_not_sent() -> None:
+    """Bit 30 of `status`: the attitude filter of the host has not settled. The rate of turn then expects a level
+    body."""
+    for status, has_attitude in ((None, True), (1 << 31, True), (1 << UNSETTLED_BIT, False)):
+        one = msgspec.structs.replace(sample((10, 5, 45), (0, 0, 1)), status=status)
+        found = vessel.turned(Batch("bow", 0, [one], as_sent(FLU_LEVEL)), one)
+        assert (vessel.roll_pitch_rad(found) is not None) is has_attitude
+        assert (vessel.true_rad(found, vessel.HeadingReference(Heading.TRUE)) is not None) is has_attitude
+        assert (vessel.turn_rate_rad_s(found) == pytest.approx(radians(-1))) is not has_attitude
