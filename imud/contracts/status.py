@@ -330,6 +330,7 @@ class OutputStatus(msgspec.Struct, frozen=True):
     dropped: int  # number of messages that imud did not send, because the destination was full or absent
     readers: int  # Number of connected clients. For a port or an address: 1 while it accepts data, otherwise 0.
     problem: str  # reason why imud sends nothing, one sentence; empty while imud sends
+    discarded: int = 0  # number of received messages that imud ignored, because they were invalid or above a limit
 
 
 class MqttStatus(msgspec.Struct, frozen=True):

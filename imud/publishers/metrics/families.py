@@ -598,6 +598,11 @@ PORT_FAMILIES: Final = (
         _port(lambda status: status.dropped),
     ),
     Family(
+        "imud_output_received_discarded_total", MetricType.COUNTER, NO_UNIT,
+        "Received messages that imud ignored because they were invalid or above a limit.",
+        _port(lambda status: status.discarded),
+    ),
+    Family(
         "imud_output_readers", MetricType.GAUGE, NO_UNIT,
         "Clients of a server; for a port or an address 1 if it accepts data, otherwise 0.",
         _port(lambda status: status.readers),

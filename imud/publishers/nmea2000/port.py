@@ -119,7 +119,8 @@ class NodePort:
     def status(self) -> OutputStatus:
         problem = self._problem or self._node.problem
         dropped = self._dropped + self._node.refused
-        return OutputStatus(f"can {self._interface}", self._sent, dropped, int(not problem), problem)
+        name, is_open = f"can {self._interface}", int(not problem)
+        return OutputStatus(name, self._sent, dropped, is_open, problem, self._node.malformed)
 
     def close(self) -> None:
         """Close the socket. A second call does nothing."""

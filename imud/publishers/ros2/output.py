@@ -119,7 +119,7 @@ class Ros2Output:
         readers = sum(len(one.readers) for one in self._participant.writers if one is not self._graph)
         sent, dropped = self._participant.totals
         name = f"domain {self._settings.domain_id}"
-        return [OutputStatus(name, sent, dropped, readers, self._participant.problem)]
+        return [OutputStatus(name, sent, dropped, readers, self._participant.problem, self._participant.discarded)]
 
     def close(self) -> None:
         """End the participant. A second call does nothing."""

@@ -293,6 +293,11 @@ class RtpsParticipant:
         return self._network.problem
 
     @property
+    def discarded(self) -> int:
+        """Number of invalid datagrams, and of descriptions of participants and readers above the limits."""
+        return self._reader.invalid + self.refused
+
+    @property
     def totals(self) -> tuple[int, int]:
         """Messages sent and dropped, the sum over all readers, without the description of the node."""
         made = [one for one in self._writers.values() if not one.is_kept]

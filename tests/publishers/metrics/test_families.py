@@ -378,11 +378,12 @@ def test_alerts_use_metrics_that_exist() -> None:
 
 def test_each_metric_is_a_value_of_a_port() -> None:
     tcp, serial = "tcp 127.0.0.1:10110", "serial /dev/ttyUSB0"
-    ports = (OutputStatus(tcp, 1, 2, 3, ""), OutputStatus(serial, 4, 5, 0, "No such file or directory"))
+    ports = (OutputStatus(tcp, 1, 2, 3, "", 6), OutputStatus(serial, 4, 5, 0, "No such file or directory"))
     assert shown("imud_output_", Snapshot(ports={"nmea0183": ports})) == {
         f"messages_total nmea0183 {tcp}": 1, f"messages_dropped_total nmea0183 {tcp}": 2, f"readers nmea0183 {tcp}": 3,
         f"messages_total nmea0183 {serial}": 4, f"messages_dropped_total nmea0183 {serial}": 5,
-        f"readers nmea0183 {serial}": 0,
+        f"readers nmea0183 {serial}": 0, f"received_discarded_total nmea0183 {tcp}": 6,
+        f"received_discarded_total nmea0183 {serial}": 0,
     }  # fmt: skip
     assert shown("imud_output_", Snapshot()) == {}
 

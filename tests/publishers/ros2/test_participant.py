@@ -114,4 +114,6 @@ def test_participants_and_readers_above_the_limit_are_refused(
     for number in range(5):
         one.received(described(number), WHERE.address, 0)
         one.received(described(number, **TOPIC), WHERE.address, 0)
-    assert (len(writer.readers), one.refused) == expected
+    assert (len(writer.readers), one.discarded) == expected
+    one.received(b"RTPX", WHERE.address, 0)
+    assert one.discarded == expected[1] + 1
