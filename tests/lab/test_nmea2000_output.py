@@ -1,5 +1,5 @@
 """The output `nmea2000` on a virtual interface: another output of imud, the address claim daemon of can-utils, a J1939
-socket of the kernel, the package `nmea2000` and the driver `hipnuc-nmea2000` are its peers."""
+socket of the kernel, the packages `nmea2000` and `cantools`, and the driver `hipnuc-nmea2000` are its peers."""
 
 import asyncio
 import math
@@ -9,6 +9,7 @@ from time import monotonic, monotonic_ns
 from typing import Any
 
 import can
+import cantools
 import msgspec
 from nmea2000 import NMEA2000Decoder
 
@@ -26,6 +27,22 @@ from tests.lab.tool import running
 from tests.support.publisher_context import publisher_context
 
 LIMIT_S = 60.0
+# 0.1 rad/s about the axis that points up is a turn to port
+TURN_RAD_S = -0.1 * math.cos(math.radians(10)) / math.cos(math.radians(5))
+NAMES = (("Attitude", 127257), ("Turn", 127251), ("Heading", 127250))
+# Fields as in the database of the project canboat: start bit, bits, sign, resolution. "Not available" has no scale.
+DBC = """VERSION ""
+BU_: imud
+BO_ 2381388286 Attitude: 8 imud
+ SG_ Yaw : 8|16@1- (1,0) [0|0] "" Vector__XXX
+ SG_ Pitch : 24|16@1- (0.0001,0) [0|0] "rad" Vector__XXX
+ SG_ Roll : 40|16@1- (0.0001,0) [0|0] "rad" Vector__XXX
+BO_ 2314277886 Turn: 8 imud
+ SG_ Rate : 8|32@1- (3.125e-08,0) [0|0] "rad/s" Vector__XXX
+BO_ 2314277630 Heading: 8 imud
+ SG_ Heading : 8|16@1+ (1,0) [0|0] "" Vector__XXX
+ SG_ Reference : 56|2@1+ (1,0) [0|0] "" Vector__XXX
+"""
 
 
 class Sender:
@@ -80,10 +97,25 @@ async def test_addresses_and_messages_on_a_real_bus(vcan: CanInterface) -> None:
         frames.clear()
         with node(vcan.name, 60) as peer:
             say(peer, vcan.name, 59904, (126996).to_bytes(3, "little"), 129)
-            await until([one, two], lambda: sum(split(frame.can_id).pgn == 126996 for frame in frames) == 20)
+            await until(
+                [one, two],
+                lambda: (
+                    sum(split(frame.can_id).pgn == 126996 for frame in frames) == 20
+                    and all(addresses(pgn) for pgn in (127250, 127251, 127257))
+                ),
+            )
         found = read(frames)
         assert found[126996]["modelId"] == "imud"
-        assert math.isclose(found[127257]["roll"], math.radians(10), abs_tol=1e-4)
+        dbc: Any = cantools.database.load_string(DBC)
+        other = {split(one.can_id).pgn: one.data for one in frames}
+        attitude, turn, heading = (dbc.decode_message(name, other[pgn]) for name, pgn in NAMES)
+        for got, expected in (
+            (found[127257]["roll"], math.radians(10)), (attitude["Roll"], math.radians(10)),
+            (found[127257]["pitch"], math.radians(5)), (attitude["Pitch"], math.radians(5)),
+            (found[127251]["rate"], TURN_RAD_S), (turn["Rate"], TURN_RAD_S),
+        ):  # fmt: skip
+            assert math.isclose(got, expected, abs_tol=1e-4)
+        assert (attitude["Yaw"], heading["Heading"], heading["Reference"]) == (32767, 65535, 3)
         rig = BusRig(vcan.name, "hipnuc-nmea2000", HipnucNmea2000Options(source=129))
         async with rig.played(waits=False):
             await until([one, two], lambda: len(rig.samples) > 3)
