@@ -10,7 +10,7 @@ import os
 import select
 import socket
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from math import ceil
 from operator import attrgetter
@@ -113,8 +113,8 @@ class _Feeder:
 class VirtualDaemon:
     """A daemon with one device and its clients, in the caller's thread."""
 
-    def __init__(self, directory: str, latency_ms: int = 0) -> None:
-        """The clients and shared memory request a latency."""
+    def __init__(self, directory: str, latency_ms: int = 0, outputs: Mapping[str, object] | None = None) -> None:
+        """The clients and shared memory request a latency. `outputs`: sections of more outputs."""
         self._latency_ms = latency_ms
         self._master, slave = os.openpty()
         self._socket_path = f"{directory}/s"
@@ -122,7 +122,7 @@ class VirtualDaemon:
         self._feeder = _Feeder(self._master, slave)
         self._loop = SampleLoop(ReaderSelector(self._feeder))
         self._feeder.loop = self._loop
-        self._daemon = Daemon(_settings(directory, os.ttyname(slave), latency_ms))
+        self._daemon = Daemon(_settings(directory, os.ttyname(slave), latency_ms, outputs or {}))
         self._running = self._loop.create_task(self._daemon.run())
         self._pass_time(START_MS)
         self.process(self._module.first_minute())
@@ -199,9 +199,10 @@ class VirtualDaemon:
         self._module.skip(duration_ms)
 
 
-def _settings(directory: str, port: str, latency_ms: int) -> config.Config:
+def _settings(directory: str, port: str, latency_ms: int, outputs: Mapping[str, object]) -> config.Config:
     tree = {
-        "log_level": "error", "state_dir": directory, "socket": {"path": f"{directory}/s", "group": own_group()},
+        **outputs, "log_level": "error", "state_dir": directory,
+        "socket": {"path": f"{directory}/s", "group": own_group()},
         "shm": {"directory": directory, "group": own_group(), "latency_ms": latency_ms}, "metrics": {"port": 0},
         "devices": {"d0": {"driver": "hipnuc-uart", "identify": False, "uart": {"port": port, "baud": BAUD}}},
     }  # fmt: skip

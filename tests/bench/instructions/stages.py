@@ -13,6 +13,8 @@ from itertools import islice, pairwise
 from random import Random
 from typing import Final
 
+import msgspec
+
 from imud.contracts.codec import StreamCodec
 from imud.contracts.publisher import Batch, PublisherContext
 from imud.drivers.hipnuc.canopen.codec import HipnucCanopenCodec, HipnucCanopenOptions, encode_tpdos
@@ -28,6 +30,9 @@ from imud.links.socketcan import BusState, FrameReader
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Sample
 from imud.model.units import NS_PER_MS, uart_byte_ns
+from imud.publishers import PUBLISHERS
+from imud.publishers.rules.publisher import Rules
+from imud.publishers.rules.settings import RulesOptions
 from imud.publishers.shm import ShmOptions, ShmPublisher
 from imud.publishers.socket.server import SocketOptions, SocketServer
 from imud.sampling.clock import SampleClock
@@ -303,6 +308,29 @@ def _mqtt_queue(total: int, _directory: str) -> Run:
     return _taking([partial(queue.put_batch, Batch("d0", 0, [sample])) for sample in _samples(total)])
 
 
+# --- output rules ---------------------------------------------------------------------------------------------------
+
+
+RULES: Final = {
+    "tilt": {"measure": "tilt_deg", "above": 80},
+    "shock": {"measure": "peak_accel_m_s2", "above": 500},
+    "vibration": {"measure": "rms_accel_m_s2", "above": 500},
+    "turn": {"measure": "angular_rate_deg_s", "above": 5000},
+}
+
+
+def _rules(count: int, total: int, _directory: str) -> Run:
+    """Evaluate the first `count` rules, none of which begins."""
+    chosen = dict(islice(RULES.items(), count))
+    rules = Rules(msgspec.convert({"enabled": True, "rules": chosen}, RulesOptions), _context())
+    rules.start()
+    rules.add_device("d0", 0)
+    batches = [Batch("d0", 0, [sample]) for sample in _samples(total)]
+    for batch in batches:
+        assert batch.packed
+    return _taking([partial(rules.publish, batch) for batch in batches])
+
+
 # --- all of it ------------------------------------------------------------------------------------------------------
 
 
@@ -366,6 +394,15 @@ def _daemon(clients: int, encoding: str, frames: int, latency_ms: int, total: in
     return lambda count: daemon.process(list(islice(reads, count)))
 
 
+def _disabled(total: int, directory: str) -> Run:
+    """Run a daemon with the sections of all disabled outputs. The count must be equal to the count without them."""
+    disabled = {name: {"enabled": False} for name, one in PUBLISHERS.items() if not one.wanted(one.settings())}
+    daemon = VirtualDaemon(directory, outputs={**disabled, "rules": {"enabled": False, "rules": RULES}})
+    daemon.connect(1, "binary")
+    reads = iter(daemon.prepare(total, 1))
+    return lambda count: daemon.process(list(islice(reads, count)))
+
+
 def _tick(total: int, directory: str) -> Run:
     daemon = VirtualDaemon(directory)
     daemon.connect(1, "binary")
@@ -396,10 +433,13 @@ STAGES: Final = (
     CountedStage("socket, 10 JSON clients", partial(_socket, 10, "json", 1), 96),
     CountedStage("socket, 10 binary clients, 20 samples in a batch", partial(_socket, 10, "binary", 20), 16, 20),
     CountedStage("queue of the output mqtt, a sample", _mqtt_queue, 200),
+    CountedStage("rules, 1 rule, a sample", partial(_rules, 1), 200),
+    CountedStage("rules, 4 rules, a sample", partial(_rules, 4), 200),
     CountedStage("bytes to publishers, a sample per read", partial(_path, 1), 1000),
     CountedStage("bytes to publishers, 20 samples per read", partial(_path, 20), 50, 20),
     CountedStage("CAN link to publishers, an IMU61x sample of 5 reads", _can_path, 100),
     CountedStage("daemon, 1 client, a sample per wake-up", partial(_daemon, 1, "binary", 1, 0), 1000),
+    CountedStage("daemon, 1 client, disabled outputs, a sample per wake-up", _disabled, 1000),
     CountedStage("daemon, 10 binary clients, a sample per wake-up", partial(_daemon, 10, "binary", 1, 0), 200),
     CountedStage("daemon, 10 JSON clients, a sample per wake-up", partial(_daemon, 10, "json", 1, 0), 200),
     CountedStage("tick, 1 device, 1 client", _tick, QUIET_PERIOD_TICKS, 1),
