@@ -448,6 +448,26 @@ def test_a_line_that_another_program_holds_is_taken_later(gpio_chip: GpioChip, t
     assert "imud" not in tool("gpioinfo", gpio_chip.path.name)
 
 
+def test_the_line_of_a_rule(gpio_chip: GpioChip, tmp_path: Path) -> None:
+    """The rule is active while the device is silent. It is active again at the stop of imud."""
+    rule = {"measure": "silence_s", "above": 5, "hold_s": 0, "line": {"line": "SIN"}}
+    rules = {"enabled": True, "rules": {"quiet": rule}}
+    device = {"driver": "hipnuc-uart", "uart": {"port": str(tty(tmp_path)), "baud": 115200}}
+
+    def wait_level(level: bool) -> None:
+        wait_until(lambda: gpio_chip.level("SIN") is level, f"the level {level}", LIMIT_S)
+
+    with running_daemon(tmp_path, {"bow": device}, limit_s=LIMIT_S, python=(), rules=rules):
+        wait_until(lambda: "imud rule quiet" in tool("gpioinfo", gpio_chip.path.name), "the line", LIMIT_S)
+        wait_level(True)
+        with running_imu(tmp_path, gpio_chip, {}, "--rate", "20"):
+            wait_level(False)
+            assert "imud rule quiet" in tool("gpioinfo", gpio_chip.path.name), "imud still drives the line"
+        wait_level(True)
+    assert not gpio_chip.level("SIN")
+    assert "imud" not in tool("gpioinfo", gpio_chip.path.name)
+
+
 class Mirror:
     def __init__(self, chip: GpioChip) -> None:
         self._chip = chip
