@@ -81,7 +81,7 @@ class InfluxOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def __post_init__(self) -> None:
         """Raise ValueError if a URL or a combination of keys is invalid."""
         if self.enabled and not self.to:
-            raise ValueError("to: expected at least one destination such as udp://127.0.0.1:8089, got none")
+            raise ValueError("expected at least one destination in the key to, such as udp://127.0.0.1:8089, got none")
         if len(self.to) > DESTINATIONS_MAX:
             raise ValueError(f"to: expected at most {DESTINATIONS_MAX} destinations, got {len(self.to)}")
         for url, one in self.to.items():

@@ -359,10 +359,10 @@ class SignalKServer:
     def _decoded(self, body: bytes, content_type: type[T]) -> T:
         try:
             return msgspec.json.decode(body, type=content_type)
-        except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
+        except (msgspec.DecodeError, UnicodeError, RecursionError):
             raise UnusableServer(
-                f"{self._url}: expected a reply of a Signal K server, got {shown(body[:80].decode(errors='replace'))} "
-                f"({error}); set signalk.url to a Signal K server"
+                f"{self._url}: expected a reply of a Signal K server, got {shown(body[:80].decode(errors='replace'))}; "
+                "set signalk.url to a Signal K server"
             ) from None
 
     def _report(self, problem: str) -> None:

@@ -320,7 +320,7 @@ RULES: Final = {
 
 
 def _rules(count: int, total: int, _directory: str) -> Run:
-    """Evaluate the first `count` rules, none of which begins."""
+    """Evaluate `count` rules. No rule begins."""
     chosen = dict(islice(RULES.items(), count))
     rules = Rules(msgspec.convert({"enabled": True, "rules": chosen}, RulesOptions), _context())
     rules.start()

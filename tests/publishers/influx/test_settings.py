@@ -11,7 +11,7 @@ from imud.publishers.influx.settings import InfluxOptions
 @pytest.mark.parametrize(
     ("given", "problem"),
     [
-        ({}, "to: expected at least one destination"),
+        ({}, "expected at least one destination in the key to"),
         ({"to": {f"udp://127.0.0.1:{port}": {} for port in range(1, 10)}}, "to: expected at most 8 .*, got 9"),
         *(({"to": {url: {}}}, "to: expected a URL such as") for url in (
             "udp://localhost:1", "udp://127.0.0.1", "udp://1.2.3.4:0", "tcp://1.2.3.4:5/x", "tcp://u@1.2.3.4:5", "file://a",

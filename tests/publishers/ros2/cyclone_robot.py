@@ -2,14 +2,14 @@
 # the types of cyclonedds.idl are no types for mypy
 """A robot with Cyclone DDS: a process with IDL types that prints each received message as a line of JSON.
 
-    python cyclone_robot.py DOMAIN SECONDS TOPIC...
+    python cyclone_robot.py DOMAIN TOPIC...     it ends with its standard input
 
 The types are the public definitions of ROS 2, decoded by the CDR reader of Cyclone DDS.
 """
 
 import json
+import select
 import sys
-import time
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -139,7 +139,7 @@ SENSOR = Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.H
 KEPT = Qos(EVENTUALLY, Policy.Durability.TransientLocal, Policy.History.KeepLast(1))
 
 
-def main(domain: int, seconds: float, topics: list[str]) -> None:
+def main(domain: int, topics: list[str]) -> None:
     participant = DomainParticipant(domain)
     readers = [
         ("graph", DataReader(participant, Topic(participant, "ros_discovery_info", ParticipantEntitiesInfo), qos=KEPT))
@@ -152,8 +152,9 @@ def main(domain: int, seconds: float, topics: list[str]) -> None:
     publications = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
     others = BuiltinDataReader(participant, BuiltinTopicDcpsParticipant)
     print(json.dumps({"topic": "ready"}), flush=True)
-    end_s = time.monotonic() + seconds
-    while time.monotonic() < end_s:
+    has_ended = False
+    while not has_ended:
+        has_ended = bool(select.select([sys.stdin], [], [], 0.02)[0])
         for one in publications.take(100):
             if one.topic_name.startswith("rt/"):
                 data = one.qos[Policy.Userdata].data.decode() if Policy.Userdata in one.qos else ""
@@ -168,8 +169,7 @@ def main(domain: int, seconds: float, topics: list[str]) -> None:
                 if type(sample).__name__ != "InvalidSample":
                     line = {"topic": where, "message": asdict(sample), "source_ns": sample.sample_info.source_timestamp}
                     print(json.dumps(line, default=list), flush=True)
-        time.sleep(0.02)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), float(sys.argv[2]), sys.argv[3:])
+    main(int(sys.argv[1]), sys.argv[2:])

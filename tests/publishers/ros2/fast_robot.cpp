@@ -1,17 +1,16 @@
 // A robot with Fast DDS: receives one topic of raw CDR messages and prints each message as hexadecimal digits.
-// fast_robot DOMAIN SECONDS TOPIC TYPE best_effort|reliable
+// fast_robot DOMAIN TOPIC TYPE best_effort|reliable: ends with its standard input
 #include <fastdds/dds/domain/DomainParticipant.hpp>
 #include <fastdds/dds/domain/DomainParticipantFactory.hpp>
 #include <fastdds/dds/subscriber/DataReader.hpp>
 #include <fastdds/dds/subscriber/SampleInfo.hpp>
 #include <fastdds/dds/subscriber/Subscriber.hpp>
 #include <fastdds/dds/topic/TopicDataType.hpp>
-#include <chrono>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
 #include <string>
-#include <thread>
+#include <poll.h>
 #include <vector>
 
 using namespace eprosima::fastdds::dds;
@@ -36,30 +35,31 @@ int main(int, char ** argv) {
   auto factory = DomainParticipantFactory::get_instance();
   auto participant = factory->create_participant(std::atoi(argv[1]), PARTICIPANT_QOS_DEFAULT);
   if (participant == nullptr) return 2;
-  TypeSupport type(new RawType(argv[4]));
+  TypeSupport type(new RawType(argv[3]));
   type.register_type(participant);
-  auto topic = participant->create_topic(argv[3], argv[4], TOPIC_QOS_DEFAULT);
+  auto topic = participant->create_topic(argv[2], argv[3], TOPIC_QOS_DEFAULT);
   DataReaderQos qos = DATAREADER_QOS_DEFAULT;
-  bool reliable = std::strcmp(argv[5], "best_effort") != 0;
+  bool reliable = std::strcmp(argv[4], "best_effort") != 0;
   qos.reliability().kind = reliable ? RELIABLE_RELIABILITY_QOS : BEST_EFFORT_RELIABILITY_QOS;
-  bool kept = std::strcmp(argv[5], "kept") == 0;
+  bool kept = std::strcmp(argv[4], "kept") == 0;
   qos.durability().kind = kept ? TRANSIENT_LOCAL_DURABILITY_QOS : VOLATILE_DURABILITY_QOS;
   qos.history().kind = KEEP_LAST_HISTORY_QOS;
   qos.history().depth = 4000;
   auto reader = participant->create_subscriber(SUBSCRIBER_QOS_DEFAULT)->create_datareader(topic, qos);
   std::printf("ready\n");
   std::fflush(stdout);
-  auto end = std::chrono::steady_clock::now() + std::chrono::milliseconds(int(1000 * std::atof(argv[2])));
   std::vector<unsigned char> sample;
   SampleInfo info;
-  while (std::chrono::steady_clock::now() < end) {
+  pollfd input{0, POLLIN, 0};
+  bool ended = false;
+  while (!ended) {
+    ended = poll(&input, 1, 10) > 0;
     while (reader->take_next_sample(&sample, &info) == ReturnCode_t::RETCODE_OK) {
       if (!info.valid_data) continue;
       for (unsigned char one : sample) std::printf("%02x", one);
       std::printf("\n");
       std::fflush(stdout);
     }
-    std::this_thread::sleep_for(std::chrono::milliseconds(10));
   }
   std::_Exit(0);
 }

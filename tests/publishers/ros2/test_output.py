@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import msgspec
@@ -26,6 +27,7 @@ from tests.support.socket_rig import device_status
 
 HERE = Path(__file__).parent
 LIMIT_S = 60
+PERIOD_NS = 10_000_000  # between two samples
 IMU = "sensor_msgs::msg::dds_::Imu_"
 DOMAIN = 100 + os.getpid() % 100
 
@@ -45,6 +47,7 @@ class Bench:
         self.context = publisher_context(
             lambda: [device_status("bow", 0)], now_ns=time.monotonic_ns, latencies=self.latencies
         )
+        self.domain = domain
         self.output = Ros2Output(Ros2Options(enabled=True, domain_id=domain, **settings), self.context)
         self.output.start()
         self.output.add_device("bow", 0)
@@ -52,19 +55,21 @@ class Bench:
 
     def publish(self) -> Sample:
         self.seq += 1
-        sample = msgspec.structs.replace(FULL, seq=self.seq, t_ns=self.seq * 10_000_000, utc_ns=self.seq * 10_000_000)
+        sample = msgspec.structs.replace(FULL, seq=self.seq, t_ns=self.seq * PERIOD_NS, utc_ns=self.seq * PERIOD_NS)
         self.output.publish(Batch("bow", 0, [sample]))
         return sample
 
-    async def run(self, is_done: Callable[[], bool], messages: int | None = None) -> None:
-        """Publish until `is_done`, or `messages` samples."""
+    async def run(self, is_done: Callable[[], bool], *, publishes: bool = True) -> None:
+        """Publish samples until `is_done`; without `publishes`, only wait."""
         end_s = time.monotonic() + LIMIT_S
-        while not is_done() and messages != 0:
+        turn = 0
+        while not is_done():
             assert time.monotonic() < end_s
-            if self.seq % 10 == 0:
+            turn += 1
+            if turn % 10 == 0:
                 self.output.tick(time.monotonic_ns())
-            self.publish()
-            messages = None if messages is None else messages - 1
+            if publishes:
+                self.publish()
             await asyncio.sleep(0.01)
 
     @property
@@ -73,22 +78,39 @@ class Bench:
 
 
 class Robot:
-    """A process that prints the messages that it receives."""
+    """A process that prints each message that it receives as a line, until its standard input ends."""
 
     def __init__(self, *command: str) -> None:
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self._lines: list[str] = []
+        self._thread = Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        self._lines.extend(self._process.stdout)
+
+    def messages(self, topic: str = "") -> list[str]:
+        """Return the lines with this text until now."""
+        return [line for line in self._lines if topic in line]
 
     def end(self) -> list[str]:
-        return self._process.communicate(timeout=LIMIT_S)[0].splitlines()
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.close()
+        self._process.wait(timeout=LIMIT_S)
+        self._thread.join(LIMIT_S)
+        self._process.stdout.close()
+        return self._lines
 
     def kill(self) -> None:
         self._process.kill()
         self.end()
 
 
-def cyclone(domain: int, seconds: float, *topics: str) -> Robot:
+def cyclone(domain: int, *topics: str) -> Robot:
     pytest.importorskip("cyclonedds", reason="needs the package cyclonedds")
-    return Robot(sys.executable, str(HERE / "cyclone_robot.py"), str(domain), str(seconds), *topics)
+    return Robot(sys.executable, str(HERE / "cyclone_robot.py"), str(domain), *topics)
 
 
 @pytest.mark.live
@@ -98,15 +120,21 @@ def test_cyclone_dds_receives_each_message() -> None:
     async def scenario() -> tuple[Bench, list[str]]:
         bench = Bench(DOMAIN)
         topics = ["bow/imu/data", "bow/imu/mag", "bow/temperature", "bow/pressure", "bow/time_reference", "diagnostics"]
-        robot = cyclone(DOMAIN, 8, *topics)
+        robot = cyclone(DOMAIN, *topics)
         await bench.run(lambda: bench.readers == len(topics))
         assert bench.latencies.asked.keys() <= {"ros2"}
-        await bench.run(lambda: False, 200)
-        await asyncio.sleep(1)
+        await bench.run(lambda: len(robot.messages('"bow/imu/data"')) >= 200)
+        # the robot requests lost messages again
+
+        def received() -> int:
+            return len(robot.messages('"source_ns"')) - len(robot.messages('"graph"'))
+
+        await bench.run(lambda: received() == bench.output.status()[0].sent, publishes=False)
         counted = bench.output.status()[0]
+        assert counted.dropped == 0
         lines = await asyncio.to_thread(robot.end)
         bench.output.close()
-        assert (counted.dropped, bench.context.outputs.ports) == (0, {})
+        assert bench.context.outputs.ports == {}
         return bench, [*lines, json.dumps({"topic": "sent", "message": counted.sent})]
 
     _, lines = asyncio.run(scenario())
@@ -141,18 +169,17 @@ def test_a_killed_robot_is_replaced() -> None:
     async def scenario() -> list[str]:
         domain = DOMAIN + 1
         bench = Bench(domain, devices={"bow": Ros2Sending(rate_hz=20)})
-        first = cyclone(domain, LIMIT_S, "bow/imu/data@sensor")
+        first = cyclone(domain, "bow/imu/data@sensor")
         await bench.run(lambda: bench.readers == 1)
         first.kill()
-        second = cyclone(domain, 6, "bow/imu/data")
-        await bench.run(lambda: bench.readers == 2)
-        await bench.run(lambda: False, 100)
+        second = cyclone(domain, "bow/imu/data")
+        await bench.run(lambda: len(second.messages('"bow/imu/data"')) >= 20)
         lines = await asyncio.to_thread(second.end)
         bench.output.close()
         return [line for line in lines if '"bow/imu/data"' in line]
 
     stamps = [json.loads(line)["message"]["header"]["stamp"]["nanosec"] for line in asyncio.run(scenario())]
-    assert len(stamps) >= 19
+    assert len(stamps) >= 20
     assert {(after - before) % 1_000_000_000 for before, after in pairwise(stamps)} == {50_000_000}
 
 
@@ -167,21 +194,23 @@ def test_fast_dds_receives_each_message(tmp_path: Path, kind: str) -> None:
     subprocess.run(built, check=True, timeout=120)
 
     async def scenario() -> tuple[list[str], int]:
-        domain = DOMAIN + 2 + (kind == "reliable")
-        bench = Bench(domain)
-        robot = Robot(program, str(domain), "6", "rt/bow/imu/data", IMU, kind)
-        await bench.run(lambda: bench.readers == 1)
-        await bench.run(lambda: False, 100)
+        bench = Bench(DOMAIN + 2 + (kind == "reliable"))
+        robot = Robot(program, str(bench.domain), "rt/bow/imu/data", IMU, kind)
+        await bench.run(lambda: len(robot.messages()) > 100)  # the first line is "ready"
         lines = await asyncio.to_thread(robot.end)
-        sent = bench.output.status()[0].sent
+        dropped = bench.output.status()[0].dropped
         bench.output.close()
-        return lines[1:], sent
+        return lines[1:], dropped
 
-    lines, sent = asyncio.run(scenario())
-    assert sent - len(lines) in (0, 1, 2), "Fast DDS may refuse the first messages, before it knows the writer"
+    lines, dropped = asyncio.run(scenario())
     store = get_typestore(Stores.ROS2_JAZZY)
-    decoded: Any = store.deserialize_cdr(bytes.fromhex(lines[-1]), "sensor_msgs/msg/Imu")
-    assert (decoded.header.frame_id, decoded.linear_acceleration.z) == ("bow", 9.75)
+    received: list[Any] = [store.deserialize_cdr(bytes.fromhex(line), "sensor_msgs/msg/Imu") for line in lines]
+    assert {(one.header.frame_id, one.linear_acceleration.z) for one in received} == {("bow", 9.75)}
+    stamps = [one.header.stamp.sec * 1_000_000_000 + one.header.stamp.nanosec for one in received]
+    steps = [(after - before) // PERIOD_NS for before, after in pairwise(stamps)]
+    assert all(step >= 1 for step in steps), "each message arrives once and in order"
+    if kind == "reliable":
+        assert sum(step - 1 for step in steps) <= dropped
 
 
 def test_a_daemon_without_the_output_imports_only_its_options() -> None:
