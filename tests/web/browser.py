@@ -55,7 +55,9 @@ class Page:
         self.until(script, selector, words, what=f"{selector} shows {words!r}")
 
     def click(self, selector: str) -> None:
-        self.js("document.querySelector(arguments[0]).click()", selector)
+        """Click an element. Wait until it exists, because a message can replace it."""
+        script = "const found = document.querySelector(arguments[0]); found?.click(); return Boolean(found)"
+        self.until(script, selector, what=f"click {selector}")
 
     def problems(self) -> list[str]:
         return [entry["message"] for entry in self.driver.get_log("browser") if entry["level"] == "SEVERE"]  # type: ignore[no-untyped-call]
