@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from urllib.parse import parse_qsl, urlsplit
 
 from imud.host.files import read_regular
+from imud.host.network import tls_context
 from imud.model.errors import reason_of
 
 if TYPE_CHECKING:
@@ -104,11 +105,7 @@ class HttpPost:
         host, port, tls, _ = self._url
         if not tls:
             return HTTPConnection(host, port, timeout=TIMEOUT_S)
-        import ssl
-
-        return HTTPSConnection(
-            host, port, timeout=TIMEOUT_S, context=ssl.create_default_context(cafile=self._access.ca_file)
-        )
+        return HTTPSConnection(host, port, timeout=TIMEOUT_S, context=tls_context(self._access.ca_file))
 
     def _authorization(self) -> dict[str, str]:
         """Return the header Authorization. Reads the file for each request, so that a new token needs no restart."""

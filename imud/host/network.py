@@ -6,9 +6,12 @@ import socket
 import struct
 import threading
 from contextlib import suppress
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from imud.model.errors import reason_of
+
+if TYPE_CHECKING:
+    import ssl
 
 BACKLOG: Final = 128  # number of connections that wait for `accept`
 
@@ -88,3 +91,17 @@ def multicast_addresses() -> list[str]:
             elif flags & IFF_UP and flags & IFF_MULTICAST:
                 found.append(address)
     return found or loopback
+
+
+def tls_context(ca_file: str | None) -> "ssl.SSLContext":
+    """Return a context for connections to servers with a valid certificate. Raises OSError if imud cannot read
+    `ca_file`; None: the certificates that the system trusts.
+
+    Python 3.13 rejects CA certificates without the extension "key usage". Certificates that a server made itself often
+    lack it. imud accepts them, as with older versions of Python.
+    """
+    import ssl
+
+    context = ssl.create_default_context(cafile=ca_file)
+    context.verify_flags &= ~ssl.VERIFY_X509_STRICT
+    return context

@@ -26,7 +26,7 @@ import msgspec
 
 from imud.contracts.status import OutputStatus
 from imud.host.files import StateFile
-from imud.host.network import resolve
+from imud.host.network import resolve, tls_context
 from imud.model.errors import ServerError, reason_of
 from imud.model.options import shown
 from imud.publishers.signalk.settings import WHO, SignalKOptions, address_of
@@ -196,8 +196,7 @@ class SignalKServer:
 
         context: ssl.SSLContext | bool = True
         if self._url.startswith("https:"):
-            load = ssl.create_default_context
-            context = await asyncio.get_running_loop().run_in_executor(None, lambda: load(cafile=self._ca_file))
+            context = await asyncio.get_running_loop().run_in_executor(None, tls_context, self._ca_file)
         connector = TCPConnector(ssl=context, resolver=_resolver(), limit=2)
         timeout = ClientTimeout(total=None)  # every request has the timeout REPLY_S
         return ClientSession(self._url, connector=connector, timeout=timeout, cookie_jar=DummyCookieJar())
