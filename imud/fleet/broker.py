@@ -20,6 +20,7 @@ import msgspec
 
 from imud.fleet.settings import Broker, MqttOptions
 from imud.host.files import read_regular
+from imud.host.network import tls_context
 from imud.model.errors import ServerError, reason_of
 from imud.model.units import NS_PER_S
 
@@ -228,16 +229,12 @@ def _tls_context(access: BrokerAccess) -> "ssl.SSLContext":
     """Return the TLS configuration of a client. Raises ValueError with the key and the path."""
     import ssl
 
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)  # requires a certificate of the broker and checks its name
     ca, cert, key = access.ca_file, access.cert_file, access.key_file
     for name, path in (("ca_file", ca), ("cert_file", cert), ("key_file", key)):
         if path is not None:
             _read(name, path, PEM_BYTES)
     try:
-        if ca is None:
-            context.load_default_certs()
-        else:
-            context.load_verify_locations(ca)
+        context = tls_context(ca)
     except ssl.SSLError as error:
         raise ValueError(f"ca_file {ca}: expected certificates (PEM), got no valid certificate") from error
     try:

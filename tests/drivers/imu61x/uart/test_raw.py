@@ -66,7 +66,7 @@ def test_golden_frames_of_each_type(layout: dict[str, Any], payload: str, ticks:
 
 
 def test_a_device_has_one_stream_of_samples() -> None:
-    """Without `raw_frame` of AHRS frames, with `raw_frame` of raw frames; the other frames are counted and named."""
+    """Samples are from AHRS frames, and with `raw_frame` from raw frames. imud counts and names other frames."""
     raw = raw_frame(bytes.fromhex(GOLDEN_PAYLOADS[0][1]))
     k1 = uart_codec.encode_acknowledgement(14, 0)
     for layout, size, ignored in ((None, len(GOLDEN), 0x0666), (LAYOUT, len(raw), 0x0002)):
