@@ -4,6 +4,7 @@ The collector is a client of paho-mqtt in a thread. Its session outlives a resta
 in the meantime. mosquitto reports on standard error that it listens, so the tests need no sleep.
 """
 
+import gc
 import os
 import shutil
 import signal
@@ -152,3 +153,5 @@ class Collector:
     def close(self) -> None:
         self._client.disconnect()
         self._client.loop_stop()
+        del self._client  # only its destructor closes the socket pair of its thread
+        gc.collect()

@@ -2,6 +2,7 @@
 Clients of paho-mqtt with a scripted broker: refusals, limits, hostile packets; errors of files; pauses."""
 
 import asyncio
+import gc
 import os
 import random
 import select
@@ -34,6 +35,13 @@ STABLE_NS, UNREAD_MAX, WEBSOCKET_BYTES = 30_000_000_000, 10_000, 1 << 24
 
 pytestmark = [pytest.mark.skipif(bool(NO_MOSQUITTO), reason=NO_MOSQUITTO), pytest.mark.live]
 WILL = Will("imud/s/g/state", b'{"online":false}')
+
+
+@pytest.fixture(autouse=True)
+def _no_garbage() -> Iterator[None]:
+    """Close the sockets that paho-mqtt leaves to the garbage collector, before another test counts descriptors."""
+    yield
+    gc.collect()
 
 
 def connect(url: str, **settings: object) -> PahoConnection:
