@@ -443,9 +443,10 @@ def test_tests_write_no_private_members() -> None:
 
 ELSEWHERE = (
     "audit", "bench", "lab", "lab_debian", "include", "fuzz", "attack", "support", "packaging", "monitoring",
+    "stability",
 )  # fmt: skip
 """Folders of tests that do not belong to one package: measurements, kernels, the C header, fuzzing, helpers, packages,
-and monitoring."""
+monitoring, and stored interfaces."""
 
 CROSS_CUTTING = {
     "cli/test_main.py": "`main` of imud/cli/__init__.py",

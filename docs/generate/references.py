@@ -6,6 +6,7 @@
 | docs/commands.md, docs/calibration.md, docs/settings.md | commands, calibrations and device settings of the drivers |
 | docs/shm.md | layout of shared memory |
 | docs/monitoring.md | rules for Prometheus |
+| docs/stability.md | versions of the interfaces (tests/stability/interfaces.py) |
 | docs/socket.schema.json | messages of the socket (docs/generate/socket_schema.py) |
 """
 
@@ -386,6 +387,16 @@ def layout_tables() -> dict[str, str]:
     }
 
 
+# --- docs/stability.md ------------------------------------------------------------------------------------------------
+
+
+def versions() -> str:
+    from tests.stability.interfaces import INTERFACES  # which imports this module
+
+    rows = [f"| [{name}](#{name}) | {one.version} | {one.read} |" for name, one in INTERFACES.items()]
+    return "\n".join(["| interface | version | a program reads it from |", "|---|---|---|", *rows])
+
+
 # --- all --------------------------------------------------------------------------------------------------------------
 
 PAGES: Final[Mapping[str, Callable[[], Mapping[str, str]]]] = {
@@ -395,6 +406,7 @@ PAGES: Final[Mapping[str, Callable[[], Mapping[str, str]]]] = {
     "docs/settings.md": lambda: {"settings": "\n" + device_settings_tables()},
     "docs/shm.md": layout_tables,
     "docs/monitoring.md": lambda: {"alerts": alert_table()},
+    "docs/stability.md": lambda: {"versions": versions()},
 }
 
 
