@@ -1,3 +1,3 @@
 """imud owns inertial sensors and gives every program clean, time-stamped, accounted-for samples."""
 
-__version__ = "0.1.0.dev1"
+__version__ = "0.1.0"

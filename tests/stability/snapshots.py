@@ -64,7 +64,7 @@ def problem(before: Mapping[str, str], after: Mapping[str, str], place: str) -> 
     if not broken or before.get(VERSION) != after[VERSION]:
         return ""
     return (
-        f"{len(broken)} incompatible changes with the same version {after[VERSION]}: undo the changes, or increment "
+        f"incompatible changes: {len(broken)}, version still {after[VERSION]}: undo the changes, or increment "
         f"{place}, and describe the changes in CHANGELOG.md under Changed or Removed"
     )
 

@@ -29,7 +29,7 @@ def test_only_an_incompatible_change_needs_another_version() -> None:
         ({VERSION: "1", "a": "optional, integer"}, ["removed  b: member"]),
     ):
         assert [str(one) for one in changes(before, after) if not one.is_compatible] == words
-        assert problem(before, after, "X").partition(" with")[0] == ("1 incompatible changes" if words else "")
+        assert problem(before, after, "X").partition(",")[0] == ("incompatible changes: 1" if words else "")
         assert problem(before, after | {VERSION: "2"}, "X") == ""
         text = advice("socket", INTERFACES["socket"], before, after)
         assert all(f"  incompatible: {one}" in text for one in words)
