@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeGuard
 
 import msgspec
 
@@ -91,6 +91,25 @@ def module_facts(name: str) -> Facts:
 def name_facts(module: str, name: str, prefix: str = "") -> Facts:
     """Return the facts of one name. `module` defines it, programs import it from `prefix`."""
     return _facts_of({name: _definitions(module)[name]}, prefix or module)
+
+
+def member_facts(module: str, place: str, path: str) -> Facts:
+    """Return the names in all dictionaries that a function writes. `place`: its name, or `Class.method`."""
+    node: ast.AST = _definitions(module)[place.partition(".")[0]]
+    if "." in place:
+        (node,) = (one for one in ast.walk(node) if getattr(one, "name", "") == place.partition(".")[2])
+    keys = [
+        str(key.value)
+        for one in ast.walk(node)
+        for key in (one.keys if isinstance(one, ast.Dict) else [one.slice] if _is_store(one) else [])
+        if isinstance(key, ast.Constant)
+    ]
+    assert keys, f"{module}.{place} writes no dictionary"
+    return {f"{path}: {key}": "member" for key in keys}
+
+
+def _is_store(node: ast.AST) -> TypeGuard[ast.Subscript]:
+    return isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Store)
 
 
 def _definitions(module: str) -> dict[str, ast.stmt]:

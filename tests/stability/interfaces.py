@@ -34,12 +34,14 @@ from imud.contracts.command import CalibrationResult
 from imud.contracts.firmware import FirmwareResult
 from imud.contracts.registry import INTERFACE_VERSION
 from imud.contracts.setting import AppliedSettings, SettingsReport
+from imud.contracts.status import FlightStatus
 from imud.drivers import DRIVERS
 from imud.fleet import messages, postgres
 from imud.fleet.accounts import GatewayState
 from imud.formats import jsonrpc, recording, records, ring, slot
 from imud.formats.influx import event_fields, measure_fields, sample_fields
 from imud.model.errors import ConfigError, ImudError
+from imud.model.event import EventKind
 from imud.model.ledger import LEDGER_FIELDS
 from imud.model.sample import SAMPLE_FIELDS, SAMPLE_SCHEMA
 from imud.publishers import PUBLISHERS
@@ -51,9 +53,21 @@ from imud.publishers.signalk.publisher import motion, surroundings
 from imud.publishers.socket.methods import METHODS
 from imud.publishers.vessel import HeadingReference
 from imud.sim import CAN_SIMULATORS, SIMULATORS
+from imud.utc.rmc_feed import Refusal
 from tests.bridges.samples import EVENT, FULL
-from tests.stability.facts import INPUT, OUTPUT, REQUIRED, Facts, module_facts, name_facts, schema_facts, type_facts
+from tests.stability.facts import (
+    INPUT,
+    OUTPUT,
+    REQUIRED,
+    Facts,
+    member_facts,
+    module_facts,
+    name_facts,
+    schema_facts,
+    type_facts,
+)
 from tests.support.files import ROOT
+from tests.support.metrics import UTC, client, equipped, views
 
 
 class Interface(NamedTuple):
@@ -80,8 +94,8 @@ def configuration() -> Facts:
         if title == "Link `memory`":  # only for tests of imud
             continue
         for name, text in type_facts(schema, path.rstrip("."), INPUT).items():
-            if name not in ("", path.rstrip(".")):
-                found[name.removeprefix(".")] = text
+            if name:
+                found.setdefault(name.removeprefix("."), text)
     for name, driver in DRIVERS.items():
         if driver.device_settings is not None:
             found |= type_facts(driver.device_settings.declarable, f"devices.NAME.settings ({name})", INPUT)
@@ -196,7 +210,19 @@ JSON_OF: Final[Mapping[str, type]] = {
     "imud settings --json": SettingsReport,
     "imud settings --set --json": AppliedSettings,
 }
-"""Printed objects. `status` and `watch` print objects of the socket."""
+"""Printed objects. `clock`, `status` and `watch` print objects of the socket."""
+MEMBERS_OF: Final = {
+    "imud decode": ("imud.cli.decode", ("as_object",)),
+    "imud doctor --json": ("imud.cli.doctor.command", ("as_json",)),
+    "imud info --json": ("imud.cli.record", ("summary",)),
+    "imud noise --json": (
+        "imud.cli.noise", ("as_object", "measurement_object", "grid_object", "_sensor_object", "_axis_object"),
+    ),
+    "imud schema --json": ("imud.cli.schema", ("run",)),
+    "imud setup --json": ("imud.cli.setup.steps", ("SetupSteps.as_json",)),
+    "imud spectrum --json": ("imud.cli.spectrum", ("as_object", "_sensor_object")),
+}  # fmt: skip
+"""Printed objects without a type: module and functions that make them."""
 
 
 def command_line() -> Facts:
@@ -206,7 +232,13 @@ def command_line() -> Facts:
         found = dict(_parser_facts(build_parser(), "imud"))
     for name, kind in JSON_OF.items():
         found |= type_facts(kind, name, OUTPUT)
-    found |= {f"imud doctor --json: {name}": "always" for name in msgspec.json.decode(doctor.as_json(()))}
+    for name, (module, functions) in MEMBERS_OF.items():
+        for function in functions:
+            found |= member_facts(module, function, name)
+    for driver in DRIVERS.values():
+        found |= {f"calibration ({driver.name}) {kind}": "calibration" for kind in driver.calibrations}
+        for verb, one in driver.verbs.items():
+            found |= type_facts(one.parameters, f"command ({driver.name}) {verb}", INPUT)
     sources = "".join(file.read_text() for file in (ROOT / "imud").rglob("*.py"))
     return found | {f"variable {name}": "read" for name in set(re.findall(r'"(IMUD_[A-Z]+)"', sources))}
 
@@ -290,10 +322,23 @@ def metrics() -> Facts:
             elif isinstance(one, Histogram):
                 bounds = " ".join(map(str, one.bounds_ns))
                 found[one.name] = f"histogram, labels device, bounds {bounds} ns"
-    page = Renderer(pause=lambda: None).render(Snapshot(), "").body.decode()
+    refused = msgspec.structs.replace(UTC, refused={one.value: 0 for one in Refusal})
+    snapshot = Snapshot(
+        (equipped("NAME", utc=refused),), (client(1),), tuple((("NAME", kind.value), 1) for kind in EventKind),
+        views=views("NAME"), flights=(FlightStatus("", *range(8)),),
+    )  # fmt: skip
+    page = Renderer(pause=lambda: None).render(snapshot, "").body.decode()
     types = re.findall(r"^# TYPE (process_\w+) (\w+)", page, re.MULTILINE)
+    for name, pairs in re.findall(r"^(imud_\w+)\{(.*)\}", page, re.MULTILINE):
+        labels = [pair for pair in re.findall(r'(\w+)="([^"]*)"', pairs) if pair[0] in CLOSED]
+        found |= {f"{name} {label}: {value}": "value" for label, value in labels}
     return found | {name: f"{kind}, labels none" for name, kind in types}
 
+
+CLOSED: Final = frozenset(
+    {"angle", "axis", "cause", "condition", "encoding", "fate", "kind", "reason", "result", "state", "sync"}
+)
+"""Labels with a set of values that imud defines."""
 
 RECORDS: Final = (
     records.SessionRecord, records.DeviceRecord, records.PathRecord, records.CallRecord, records.CheckRecord,
@@ -325,6 +370,8 @@ def mqtt() -> Facts:
     found |= type_facts(GatewayState, "state", OUTPUT)
     found |= type_facts(messages.CommandRequest, "request", INPUT)
     found |= type_facts(messages.CommandAnswer, "answer", OUTPUT)
+    for topic, function in (("state", "MqttPublisher._state"), ("schema", "schema_of"), ("settings", "settings_of")):
+        found |= member_facts("imud.fleet.publisher", function, f"written {topic}")
     found["slots"] = f"{messages.MAGIC!r}, layout {messages._PREFIX.format}, {messages.SLOTS_TYPE}"
     return found | {f"slots of version {version}": f"{size} bytes" for version, size in messages._SLOT_BYTES.items()}
 

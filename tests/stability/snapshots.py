@@ -22,11 +22,8 @@ class Change(NamedTuple):
     name: str
     before: str | None
     after: str | None
-
-    @property
-    def is_compatible(self) -> bool:
-        """Return whether existing programs continue to work: an addition that they do not have to supply."""
-        return self.before is None and not str(self.after).startswith(REQUIRED)
+    is_compatible: bool
+    """Whether existing programs continue to work: an addition that they do not have to supply."""
 
     def __str__(self) -> str:
         if self.before is None:
@@ -50,9 +47,20 @@ def present(interface: Interface) -> Facts:
 
 def changes(before: Mapping[str, str], after: Mapping[str, str]) -> list[Change]:
     """Return the differences of the facts, without the version."""
-    names = sorted((before.keys() | after.keys()) - {VERSION})
-    both = (Change(name, before.get(name), after.get(name)) for name in names)
-    return [one for one in both if one.before != one.after]
+    found = []
+    for name in sorted((before.keys() | after.keys()) - {VERSION}):
+        old, new = before.get(name), after.get(name)
+        if old != new:
+            # programs do not use a new command or function, so it can have required arguments
+            is_free = not str(new).startswith(REQUIRED) or _owner(name, after) not in (None, *before)
+            found.append(Change(name, old, new, old is None and is_free))
+    return found
+
+
+def _owner(name: str, facts: Mapping[str, str]) -> str | None:
+    """Return the fact of the command, function or object that the name is a part of; None without such a fact."""
+    places = (place for place in reversed(range(len(name))) if name[place] in ".([ :" and name[:place] in facts)
+    return next((name[:place] for place in places), None)
 
 
 def problem(before: Mapping[str, str], after: Mapping[str, str], place: str) -> str:

@@ -24,7 +24,9 @@ def test_only_an_incompatible_change_needs_another_version() -> None:
     before = {VERSION: "1", "a": "optional, integer", "b": "member"}
     for after, words in (
         (before | {"c": "optional, integer"}, []),
+        (before | {"a.c": "required, integer"}, ["added    a.c: required, integer"]),
         (before | {"c": "required, integer"}, ["added    c: required, integer"]),
+        (before | {"c": "function", "c(x)": "required, integer"}, []),
         (before | {"a": "optional, string"}, ["changed  a: optional, integer  ->  optional, string"]),
         ({VERSION: "1", "a": "optional, integer"}, ["removed  b: member"]),
     ):
