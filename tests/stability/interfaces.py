@@ -252,7 +252,8 @@ def _parser_facts(parser: argparse.ArgumentParser, path: str) -> Iterator[tuple[
             continue
         values = action.nargs if action.nargs is not None else 1
         default = "" if action.default in (None, False, argparse.SUPPRESS) else f", default {action.default}"
-        word = REQUIRED if action.required else "optional"
+        # Python before 3.14: `required` is set for arguments with any number of values
+        word = REQUIRED if action.required and values != "*" else "optional"
         for name in action.option_strings or [str(action.metavar or action.dest)]:
             yield f"{path} {name}", f"{word}, values {values}{default}"
             for choice in action.choices or ():
