@@ -23,6 +23,8 @@
 # make audit  items of both manuals and of newer firmware: code and tests of each
 # make deb    the Debian package of this release and architecture, into build/deb (RELEASE=trixie ARCH=arm64: of others)
 # make deb-try   installs, upgrades, removes and purges it in a Debian in a folder (as root)
+# make image  the OCI image of Debian 13, into build/image (as root; make image-deps)
+# make image-try   starts the image with compose.yaml and a simulated sensor (as root)
 # make lab-debian   boots Debian 12 and 13 with systemd and checks the package there (as root; tests/lab_debian/README.md)
 # make lab-debian-suite   the whole test suite on the own Python, compiler and broker of Debian 13
 # make lab-arm64    the same short on emulated arm64, and unit tests on its Python
@@ -167,6 +169,18 @@ deb: $(VENV)/made
 
 deb-try: deb
 	packaging/debian/try "$$(ls -t build/deb/*.deb | head -n 1)"
+
+# PACKAGE: a package of trixie that is already built
+.PHONY: image image-try image-deps
+image: $(VENV)/made
+	PYTHON=$(BIN)/python packaging/image/build $(PACKAGE)
+
+image-try: image
+	$(PIP) install --quiet podman-compose
+	PYTHON=$(BIN)/python packaging/image/try
+
+image-deps: deb-deps
+	apt-get install --yes --no-install-recommends umoci binutils podman runc
 
 deb-deps:
 	apt-get install --yes --no-install-recommends debhelper lintian mmdebstrap
