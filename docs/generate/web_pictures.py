@@ -19,7 +19,7 @@ from typing import Any, Final
 from PIL import Image
 
 from tests.support.daemon_process import RunningDaemon, running_daemon
-from tests.support.files import ROOT
+from tests.support.files import ROOT, UPLOT_MISSING
 from tests.web.browser import MISSING, Page, browser, choose, log_in, open_page, serving_web
 from tests.web.turned import turned_module
 
@@ -177,8 +177,8 @@ def calibration(folder: Path) -> None:
 
 
 def main() -> None:
-    if MISSING:
-        raise SystemExit(MISSING)
+    if MISSING or UPLOT_MISSING:
+        raise SystemExit(MISSING or UPLOT_MISSING)
     with ports(), ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="imud-web-")))
         modules = {name: stack.enter_context(module(name)) for name in MODULES}

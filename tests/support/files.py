@@ -16,6 +16,11 @@ from imud.model.units import NS_PER_S, NS_PER_US
 
 ROOT: Final = Path(__file__).parents[2]
 SHARED: Final = Path(os.environ.get("IMUD_SHARED") or ROOT.parent / "shared")
+UPLOT_MISSING: Final = (
+    "" if (ROOT / "imud/web/static/uplot").is_dir() else "no uPlot: install npm, then run python hatch_build.py"
+)
+needs_uplot: Final = pytest.mark.skipif(bool(UPLOT_MISSING), reason=UPLOT_MISSING)
+"""Mark of a test that needs plots in `imud web`."""
 
 
 FOLDER: Final = SHARED / "data"

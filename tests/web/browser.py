@@ -16,7 +16,7 @@ from selenium.webdriver import Chrome, ChromeOptions, ChromeService
 from selenium.webdriver.support.ui import WebDriverWait
 
 from tests.support.daemon_process import LIMIT_S, RunningDaemon, running_daemon
-from tests.support.files import hi91
+from tests.support.files import ROOT, hi91
 from tests.test_daemon import Cable, device
 
 CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
@@ -103,9 +103,10 @@ def enter(page: Page, token: str) -> None:
 
 
 @contextmanager
-def serving_web(socket: Path, *words: str, port: int = 0) -> Iterator[str]:
+def serving_web(socket: Path, *words: str, port: int = 0, folder: Path = ROOT) -> Iterator[str]:
+    """Run `imud web` from the package `imud` in `folder`. Yield the address of the page."""
     argv = [sys.executable, "-m", "imud", "web", "--socket", str(socket), "--port", str(port), *words]
-    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(argv, cwd=folder, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
             url = process.stdout.readline().strip()

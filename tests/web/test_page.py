@@ -2,6 +2,7 @@
 
 import math
 import re
+import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,7 @@ from imud.device.calibration import cell_of
 from imud.web.hub import row_of
 from imud.web.messages import encode
 from tests.support.daemon_process import RunningDaemon, running_daemon, wait_until
+from tests.support.files import ROOT, needs_uplot
 from tests.support.metrics import device
 from tests.test_daemon import cable
 from tests.test_daemon import device as configured
@@ -26,6 +28,7 @@ from tests.web.browser import (
     TOKEN,
     Page,
     Sender,
+    choose,
     enter,
     log_in,
     open_page,
@@ -124,6 +127,7 @@ def peaks(number: int) -> float:
     return 9.5 if number % PEAK_EVERY else 20.0 + number / PEAK_EVERY / 8
 
 
+@needs_uplot
 def test_the_plot_contains_every_sent_peak(page: Page, tmp_path: Path) -> None:
     with cable(tmp_path) as port, Sender(port, upright(peaks)) as sender, sent_by(tmp_path, port) as daemon:
         daemon.wait_for("bow", "running")
@@ -382,6 +386,7 @@ def faults_of(page: Page, address: str = "") -> list[object]:
     return found + [(address, describe({"backendNodeId": one, "depth": 2})["node"]) for one in nameless]
 
 
+@needs_uplot
 def test_keys_the_filter_and_stored_events(page: Page, site: Site) -> None:
     _, url = site
     page.driver.get(f"{url}#/device/bow")
@@ -440,6 +445,7 @@ def test_keys_the_filter_and_stored_events(page: Page, site: Site) -> None:
     assert (faults_of(page), page.problems()) == ([], [])
 
 
+@needs_uplot
 def test_two_devices_are_compared_with_their_delay(page: Page, tmp_path: Path) -> None:
     """Both devices move in the same way, the second 100 ms later, with an offset of 0.5 m/s². Some of its frames are
     lost, before the page is open and after it."""
@@ -581,6 +587,23 @@ def test_the_plots_continue_after_a_reload(page: Page, site: Site) -> None:
     assert times == sorted(times)
     assert greatest[0] >= least[0]
     assert page.problems() == []
+
+
+def test_without_uplot_the_page_shows_values_and_the_reason(page: Page, site: Site, tmp_path: Path) -> None:
+    shutil.copytree(ROOT / "imud", tmp_path / "imud", ignore=shutil.ignore_patterns("uplot", "__pycache__"))
+    with serving_web(site[0].socket, folder=tmp_path) as url:
+        open_page(page, url, "bow")
+        choose(page, "#spectrum-of", "accel_m_s2")
+        page.until(POINTS, 5)
+        page.until_text("#accel_m_s2 output", ".")
+        for chart in ("#accel_m_s2", "#stamps", "#spectrum"):
+            page.until_text(chart, "imud was built without uPlot. Install npm, then build imud again.")
+        page.until_text("#spectrum .help:last-child", "Highest peaks")
+        assert page.js("return document.querySelectorAll('.plot').length") == 0
+        assert (faults_of(page), page.problems()) == ([], [])
+        page.driver.get(f"{url}#/compare/bow/bow")
+        page.until_text("main", "A comparison needs two devices.")
+        assert page.problems() == []
 
 
 def test_a_plot_merges_old_points_without_loss_of_a_peak(scripts: Page) -> None:

@@ -65,7 +65,7 @@ def test_lost_samples_are_counted_and_a_vibration_keeps_its_frequency_and_size(p
                 """const one = window.imud.view.spectrum.spectrum;
                 return [one.rate_hz, one.missing, one.segments.length, one.gaps]"""
             )
-            note = page.text("#spectrum .help")
+            note = page.text("#spectrum .help:last-child")
         assert page.problems() == []
     assert rate_hz == pytest.approx(RATE_HZ, rel=0.005), "the rate of the device, not of the received samples"
     power = np.array(density, dtype=float) ** 2 * (frequencies[1] - frequencies[0])

@@ -26,6 +26,11 @@ export const ink = color("--mute");
 export const grid = color("--line");
 const lostColor = color("--missing");
 export const COLORS = [color("--x"), color("--y"), color("--z")];
+export const hasPlots = "uPlot" in globalThis;
+
+/** Return the node for a plot. Without uPlot, it contains the reason. */
+export const plotBox = (attributes) =>
+  hasPlots ? el("div", { class: "plot", role: "img", ...attributes }) : el("p", { class: "help", text: "Plots are not installed: imud was built without uPlot. Install npm, then build imud again." });
 
 /** Time range of several plots: the newest `span_s`, or a zoomed range; their pause, and the sample rate of the device. */
 export class PlotGroup {
@@ -130,9 +135,9 @@ export class RollingPlot {
     this.hidden = new Set(); // indexes of hidden lines
     this.values = axes.map((name, index) => this.key(name, index));
     const keys = el("div", { class: "keys" }, this.values.map((one) => one.node));
-    const scales = isLog ? null : segmented(`scale of ${title}`, [["together", "Combined"], ["lanes", "Separate"]], this.lanes ? "lanes" : "together", (value) => this.setLanes(value === "lanes"));
+    const scales = isLog || !hasPlots ? null : segmented(`scale of ${title}`, [["together", "Combined"], ["lanes", "Separate"]], this.lanes ? "lanes" : "together", (value) => this.setLanes(value === "lanes"));
     const onTouch = (event) => this.onTouch(event);
-    this.box = el("div", { class: "plot", tabindex: "0", role: "img", "aria-label": `plot of ${title}; arrow keys move the cursor, plus and minus zoom`,
+    this.box = plotBox({ tabindex: "0", "aria-label": `plot of ${title}; arrow keys move the cursor, plus and minus zoom`,
       onkeydown: (event) => this.onKey(event), ontouchstart: onTouch, ontouchmove: onTouch, ontouchend: onTouch });
     this.node = el("figure", { id, class: "chart" }, el("figcaption", {}, el("b", { text: title }), el("span", { class: "unit", text: unit }), keys, el("div", { class: "chart-tools" }, scales)), this.box);
     this.data = [[], ...axes.flatMap(() => [[], []])];
@@ -391,9 +396,9 @@ export class RollingPlot {
   drawNow() {
     this.isDue = false;
     if (!this.data[0].length) return;
-    if (!this.plot) this.begin();
+    if (!this.plot && hasPlots) this.begin();
     const move = (one, line) => (line ? one.map((value) => (value === null ? null : value + this.offsets[(line - 1) >> 1])) : one);
-    this.plot.setData(this.offsets.some(Boolean) ? this.data.map(move) : this.data);
+    this.plot?.setData(this.offsets.some(Boolean) ? this.data.map(move) : this.data);
     this.drawn = performance.now();
     this.showValues();
   }

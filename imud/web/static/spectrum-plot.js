@@ -1,6 +1,6 @@
 // Plot of the spectrum, with the frequency of the highest peak.
 
-import { COLORS, grid, ink, powers } from "./plots.js";
+import { COLORS, grid, hasPlots, ink, plotBox, powers } from "./plots.js";
 import { Spectrum } from "./spectrum.js";
 import { AXES, el, number, setText } from "./util.js";
 
@@ -29,7 +29,7 @@ export class SpectrumPlot {
       onChoice(this.member);
     });
     this.note = el("p", { class: "help", text: OFF });
-    this.box = el("div", { class: "plot", role: "img", "aria-label": "plot of the spectrum; its highest peaks are below" });
+    this.box = plotBox({ "aria-label": "plot of the spectrum; its highest peaks are below" });
     this.node = el("div", { class: "fill" }, el("div", { class: "buttons" }, this.choice), this.box, this.note);
     this.box.hidden = true;
     new ResizeObserver(() => this.plot && this.box.clientWidth && this.plot.setSize(this.size())).observe(this.box);
@@ -60,8 +60,8 @@ export class SpectrumPlot {
     const { frequencies, axes } = this.spectrum.result();
     // without frequency 0: the mean is subtracted
     this.data = [frequencies.slice(1), ...axes.map((axis) => axis.slice(1).map((value) => value || null))];
-    if (!this.plot) this.begin();
-    this.plot.setData(this.data);
+    if (!this.plot && hasPlots) this.begin();
+    this.plot?.setData(this.data);
     const peaks = axes.map((axis) => {
       const at = axis.reduce((best, value, k) => (k > 1 && value > axis[best] ? k : best), Math.min(2, axis.length - 1));
       return { frequency: frequencies[at], value: axis[at] };
