@@ -57,9 +57,10 @@ $(VENV)/made: $(VENV)/made-runtime
 	$(PIP) install --editable '.[dev]'
 	@touch $@
 
-# The optional kernel in C. Without a compiler, imud uses only its Python code.
+# The optional kernel in C, and the optional uPlot. Without a compiler, imud uses only its Python code. Without npm, `imud
+# web` shows no plots.
 KERNEL := imud/_kernel.abi3.so
-$(KERNEL): imud/_kernel.c hatch_build.py $(VENV)/made-runtime
+$(KERNEL): imud/_kernel.c hatch_build.py packaging/web/package-lock.json $(VENV)/made-runtime
 	-$(BIN)/python hatch_build.py
 
 demo: $(VENV)/made-runtime $(KERNEL)

@@ -102,7 +102,9 @@ def bundled(folder: Path, name: str) -> str:
     try:
         text = (folder / "LICENSE").read_text()
     except OSError as error:
-        raise SystemExit(f"copyright.py: cannot read the license of {name}: {error}") from error
+        raise SystemExit(
+            f"copyright.py: cannot read the license of {name}: {error}; install npm, then build again"
+        ) from error
     holders = [line.strip() for line in text.splitlines() if line.startswith("Copyright")]
     files = f"*/site-packages/{folder.relative_to(folder.parents[3])}/*"
     owners = "\n ".join(holders)

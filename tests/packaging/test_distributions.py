@@ -15,6 +15,7 @@ from typing import Final
 
 import pytest
 
+from hatch_build import UPLOT
 from imud import __version__
 from tests.support.daemon_process import LIMIT_S
 from tests.support.files import ROOT
@@ -23,13 +24,11 @@ BUILD: Final = "from hatchling import build; print(build.build_{1}({0!r}))"
 KERNEL: Final = "imud/_kernel.abi3.so"  # compiled by the build
 NOT_DISTRIBUTED: Final = {".git", ".venv", "PKG-INFO"}
 """Names in the top folder that are not distributed: the repository, an environment, and the metadata of an sdist."""
-pytestmark = [
-    pytest.mark.live,
-    pytest.mark.skipif(
-        importlib.util.find_spec("hatchling") is None and not os.environ.get("CI"),
-        reason="cannot find hatchling (extra dev)",
-    ),
-]
+needs_hatchling: Final = pytest.mark.skipif(
+    importlib.util.find_spec("hatchling") is None and not os.environ.get("CI"),
+    reason="cannot find hatchling (extra dev)",
+)
+pytestmark = [pytest.mark.live, needs_hatchling]
 
 
 @pytest.fixture(scope="module")
@@ -49,13 +48,13 @@ def build(tree: Path, folder: Path, what: str) -> Path:
 
 def repository() -> set[str]:
     """Return the paths of all files of the repository that are distributed: all files that .gitignore does not
-    exclude."""
+    exclude, and uPlot if it is installed."""
     patterns = [line for line in (ROOT / ".gitignore").read_text().splitlines() if line]
 
     def is_kept(name: str, *, folder: bool) -> bool:
         return not any(fnmatch(f"{name}/" if folder else name, pattern) for pattern in patterns)
 
-    found = set()
+    found = {str(path.relative_to(ROOT)) for path in (ROOT / UPLOT).rglob("*") if path.is_file()}
     for folder, folders, names in os.walk(ROOT):
         top = NOT_DISTRIBUTED if folder == str(ROOT) else set()
         folders[:] = [one for one in folders if one not in top and is_kept(one, folder=True)]
@@ -90,7 +89,6 @@ def test_the_wheel_has_every_file_of_the_package_as_it_is_and_no_other(distribut
         "imud/py.typed",
         "imud/include/imud.h",
         "imud/web/static/*.html",
-        "imud/web/static/uplot/*LICENSE*",
     ):
         assert any(fnmatch(path, pattern) for path in content), pattern
 
