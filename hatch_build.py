@@ -33,7 +33,9 @@ OPTIONS = ("-std=c11", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-c
 def compile_kernel(root: Path, compiler: str = "", options: tuple[str, ...] = ()) -> str:
     """Compile the kernel below `root`. Return the reason if that is not possible, otherwise an empty text."""
     command = shlex.split(compiler or os.environ.get("CC", "") or "cc")
-    include = sysconfig.get_paths()["include"]
+    # a cross compiler needs the headers of its target: folders separated by `:`
+    folders = (os.environ.get("IMUD_PYTHON_INCLUDE") or sysconfig.get_paths()["include"]).split(":")
+    includes = [f"-I{folder}" for folder in folders]
     target = root / LIBRARY
     made = target.with_suffix(f".{os.getpid()}")  # a running imud keeps the old file
     source = root / SOURCE
@@ -41,7 +43,7 @@ def compile_kernel(root: Path, compiler: str = "", options: tuple[str, ...] = ()
     version = f"-DSOURCE_CRC={crc32(source.read_bytes())}u"
     try:
         subprocess.run(
-            [*command, *OPTIONS, *options, version, f"-I{include}", str(source), "-o", str(made), "-lm"],
+            [*command, *OPTIONS, *options, version, *includes, str(source), "-o", str(made), "-lm"],
             check=True, capture_output=True, text=True,
         )  # fmt: skip
         made.replace(target)
