@@ -21,12 +21,13 @@
  * sum to one operation (-ffp-contract=off), and each expression has the order of the Python expression.
  */
 #ifndef _GNU_SOURCE
-#define _GNU_SOURCE /* recvmmsg */
+#define _GNU_SOURCE /* recvmmsg, statx */
 #endif
 #define Py_LIMITED_API 0x030B0000
 #include <Python.h>
 #include <structmember.h>
 #include <errno.h>
+#include <fcntl.h>
 #include <float.h>
 #include <math.h>
 #include <stddef.h>
@@ -35,6 +36,7 @@
 #include <string.h>
 #include <sys/socket.h>
 #include <sys/stat.h>
+#include <sys/sysmacros.h>
 #include <unistd.h>
 
 /* The headers of Python 3.12 and later do not count this reference, but Python 3.11 does. */
@@ -888,10 +890,12 @@ static PyObject *is_at(PyObject *self, PyObject *args)
 {
     const char *path;
     unsigned long long device, inode;
-    struct stat found;
+    /* lstat needs glibc 2.33, and its inode numbers have 32 bits on a 32-bit host */
+    struct statx found;
     if (!PyArg_ParseTuple(args, "yKK:is_at", &path, &device, &inode))
         return NULL;
-    return PyBool_FromLong(!lstat(path, &found) && found.st_dev == device && found.st_ino == inode);
+    return PyBool_FromLong(!statx(AT_FDCWD, path, AT_SYMLINK_NOFOLLOW, STATX_INO, &found) && found.stx_ino == inode &&
+                           makedev(found.stx_dev_major, found.stx_dev_minor) == device);
 }
 
 static void free_ring(PyObject *self)
