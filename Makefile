@@ -25,6 +25,8 @@
 # make deb-try   installs, upgrades, removes and purges it in a Debian in a folder (as root)
 # make image  the OCI image of Debian 13, into build/image (as root; make image-deps)
 # make image-try   starts the image with compose.yaml and a simulated sensor (as root)
+# make wheels   sdist and wheels, into build/dist (x86-64, aarch64, armv7, pure Python); make wheels-deps: what it needs
+# make test-wheels  installs and runs these wheels on every supported Python that is here
 # make lab-debian   boots Debian 12 and 13 with systemd and checks the package there (as root; tests/lab_debian/README.md)
 # make lab-debian-suite   the whole test suite on the own Python, compiler and broker of Debian 13
 # make lab-arm64    the same short on emulated arm64, and unit tests on its Python
@@ -185,6 +187,18 @@ image-deps: deb-deps
 
 deb-deps:
 	apt-get install --yes --no-install-recommends debhelper lintian mmdebstrap
+
+.PHONY: wheels wheels-deps test-wheels
+wheels: $(VENV)/made
+	PYTHON=$(BIN)/python packaging/wheels
+
+test-wheels:
+	.ci/test-wheels
+
+# compilers and emulators for the other architectures
+wheels-deps:
+	apt-get install --yes --no-install-recommends gcc libc6-dev gcc-aarch64-linux-gnu libc6-dev-arm64-cross \
+		gcc-arm-linux-gnueabihf libc6-dev-armhf-cross qemu-user-static
 
 # a browser for the tests of `imud web`
 .PHONY: web-deps web-pictures
