@@ -77,6 +77,8 @@ test: $(VENV)/made $(KERNEL)
 test-thorough: lint
 	IMUD_ALERTS=1 $(BIN)/pytest -n $(PROCESSES) --dist worksteal --hypothesis-profile thorough --timeout 1800
 	.ci/test-pythons
+	$(MAKE) wheels
+	.ci/test-wheels
 	$(MAKE) fuzz
 	$(MAKE) mutants
 	$(MAKE) bench-instructions

@@ -1,4 +1,4 @@
-"""packaging/release rejects wrong, incomplete and changed releases. Stubs replace the gate, the builds and the trials."""
+"""packaging/release rejects wrong, incomplete and changed releases. Stubs replace gate, builds and trials."""
 
 import os
 import shutil
