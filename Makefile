@@ -22,6 +22,8 @@
 # make sanitize   tests of the C kernel with AddressSanitizer and UndefinedBehaviorSanitizer
 # make audit  items of both manuals and of newer firmware: code and tests of each
 # make deb    the Debian package of this release and architecture, into build/deb (RELEASE=trixie ARCH=arm64: of others)
+# make apt-repository   a signed apt repository into build/apt (APT_KEY=FINGERPRINT APT_URL=ADDRESS, RELEASES, ARCHES)
+# make apt-try   installs the package with the one line of such a repository in a Debian in a folder (as root; RELEASE, ARCH)
 # make deb-try   installs, upgrades, removes and purges it in a Debian in a folder (as root)
 # make image  the OCI image of Debian 13, into build/image (as root; make image-deps)
 # make image-try   starts the image with compose.yaml and a simulated sensor (as root)
@@ -186,9 +188,17 @@ image-try: image
 
 image-deps: deb-deps
 	apt-get install --yes --no-install-recommends umoci binutils podman runc
+# variables of the environment: APT_KEY, APT_URL, RELEASES, ARCHES (packaging/apt/build)
+.PHONY: apt-repository apt-try
+apt-repository: $(VENV)/made
+	PYTHON=$(BIN)/python packaging/apt/build
+
+apt-try: deb
+	packaging/apt/try "$$(ls -t build/deb/*.deb | head -n 1)"
 
 deb-deps:
-	apt-get install --yes --no-install-recommends debhelper lintian mmdebstrap
+	apt-get install --yes --no-install-recommends debhelper lintian mmdebstrap apt-utils gnupg
+	apt-get install --yes --no-install-recommends gcc-aarch64-linux-gnu gcc-arm-linux-gnueabihf || echo "without cross compilers: packages for arm64 and armhf have no C kernel"
 
 .PHONY: wheels wheels-deps test-wheels
 wheels: $(VENV)/made

@@ -38,7 +38,7 @@ def test_scripts_are_shell() -> None:
         assert text.startswith("#!/bin/sh\nset -e\n")
         assert text.count("\n#DEBHELPER#\n") == 1
         subprocess.run(["sh", "-n", str(DEBIAN / name)], check=True, timeout=LIMIT_S)
-    for name in ["build", "try", "unit"]:
+    for name in ["build", "cross", "try", "unit"]:
         assert os.access(DEBIAN / name, os.X_OK)
         subprocess.run(["bash", "-n", str(DEBIAN / name)], check=True, timeout=LIMIT_S)
 
@@ -113,7 +113,7 @@ def test_control_overrides_and_version() -> None:
     assert all(len(line) <= 80 for line in rest)
     lines = (DEBIAN / "imud-daemon.lintian-overrides").read_text().splitlines()
     assert lines[0].startswith("# ")
-    assert all(re.match(r"# |imud-daemon( \[arm64\])?: ", line) for line in lines)
+    assert all(re.match(r"# |imud-daemon( \[arm64 armhf\])?: ", line) for line in lines)
     assert (DEBIAN / "imud.py").read_text().startswith("#!/usr/lib/imud/bin/python3 -I\n")
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["version"] == __version__
