@@ -198,7 +198,6 @@ apt-try: deb
 
 deb-deps:
 	apt-get install --yes --no-install-recommends debhelper lintian mmdebstrap apt-utils gnupg
-	apt-get install --yes --no-install-recommends gcc-aarch64-linux-gnu gcc-arm-linux-gnueabihf || echo "without cross compilers: packages for arm64 and armhf have no C kernel"
 
 .PHONY: wheels wheels-deps test-wheels
 wheels: $(VENV)/made
