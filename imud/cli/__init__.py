@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from imud import __version__
 from imud.cli.output import complain, discard_output, open_standard_streams
-from imud.model.errors import BadArgument, ConfigError, ImudError, reason_of
+from imud.host.installation import documents, needs_extra
+from imud.model.errors import ConfigError, ImudError, reason_of
 
 if TYPE_CHECKING:
     from imud.cli.arguments import CliCommand
@@ -28,14 +29,8 @@ class Subcommand(NamedTuple):
     def load(self) -> "CliCommand":
         """Import the module of the command and return the command. Raises BadArgument if the extra is missing."""
         path, _, name = self.target.partition(":")
-        try:
+        with needs_extra(self.extra):
             module = import_module(path)
-        except ModuleNotFoundError as error:
-            # a missing module of imud is a defect, not a missing extra
-            library = (error.name or "a library").partition(".")[0]
-            if not self.extra or library == "imud":
-                raise
-            raise BadArgument(f"cannot import {library}; install the extra: pip install 'imud[{self.extra}]'") from None
         return cast("CliCommand", getattr(module, name))
 
 
@@ -90,7 +85,9 @@ class CommandParser(argparse.ArgumentParser):
 
 def build_parser(commands: Collection[str] = COMMANDS) -> argparse.ArgumentParser:
     """Build the parser of the command line. Only `commands` get their arguments; other modules are not imported."""
-    parser = CommandParser(prog="imud", description="A daemon for inertial sensors.")
+    parser = CommandParser(
+        prog="imud", description="A daemon for inertial sensors.", epilog=f"Documents: {documents()}."
+    )
     parser.add_argument("--version", action="version", version=f"imud {__version__}")
     parsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, command in COMMANDS.items():

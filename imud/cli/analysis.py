@@ -12,6 +12,7 @@ import msgspec
 
 from imud.cli.arguments import CliCommand, add_driver, add_duration, add_interface, add_option, add_socket, duration_s
 from imud.cli.output import complain
+from imud.host.installation import needs_extra
 from imud.model.errors import BadArgument
 
 BAND: Final = re.compile(r"(\d+(?:\.\d*)?)-(\d+(?:\.\d*)?)")
@@ -69,13 +70,8 @@ def spectrum_arguments(parser: argparse.ArgumentParser) -> None:
 
 def loaded(name: str) -> Any:
     """Import a module of `imud.cli` that needs the extra. Raises BadArgument if a library of the extra is missing."""
-    try:
+    with needs_extra("analysis"):
         return import_module(f"imud.cli.{name}")
-    except ModuleNotFoundError as error:
-        library = (error.name or "a library").partition(".")[0]
-        if library == "imud":  # a defect of imud, not a missing library
-            raise
-        raise BadArgument(f"cannot import {library}; install the extra: pip install 'imud[analysis]'") from None
 
 
 def noise(args: argparse.Namespace) -> int:

@@ -47,6 +47,7 @@ from imud.drivers import DRIVERS
 from imud.formats.can import CandumpReader
 from imud.formats.capture import CaptureReader
 from imud.host.files import WRITE_FLAGS, open_regular
+from imud.host.installation import needs_extra
 from imud.host.log import STDERR, log_to
 from imud.model.errors import BadArgument, ImudError, reason_of
 from imud.recording.capture_player import NAME, KnownTimes
@@ -242,13 +243,8 @@ def _sink(
     if args.to == "csv":
         times = None if is_recording else times_of(file, DRIVERS[args.driver or DRIVER])
         return CsvSink(out, args.table or "samples", args.fields, without_times=times is KnownTimes.NONE)
-    try:
+    with needs_extra("export"):
         from imud.bridges.mcap import McapFile
-    except ModuleNotFoundError as error:
-        library = (error.name or "a library").partition(".")[0]
-        raise BadArgument(
-            f"--to mcap: cannot import {library}; install the extra: pip install 'imud[export]'"
-        ) from None
     dialect = Ros2Dialect() if args.schema == "ros2" else JsonDialect()
     convention = _convention(args)
     assert convention is not None

@@ -20,6 +20,7 @@ from imud.fleet.messages import GatewayClock, Stream
 from imud.fleet.postgres import PostgresStore
 from imud.fleet.reader import VERSIONS, Fleet, FleetBatch
 from imud.host.http_post import HttpPost, PostAccess, post_url
+from imud.host.installation import needs_extra
 from imud.host.threads import rare_garbage_collection
 from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
@@ -146,13 +147,11 @@ class _Redrawn:
 
     def __init__(self) -> None:
         try:
-            from rich.live import Live
-            from rich.text import Text
-        except ModuleNotFoundError as error:
-            library = (error.name or "rich").partition(".")[0]
-            raise BadArgument(
-                f"cannot import {library}; install the extra: pip install 'imud[top]', or use --plain"
-            ) from None
+            with needs_extra("top"):
+                from rich.live import Live
+                from rich.text import Text
+        except BadArgument as error:
+            raise BadArgument(f"{error}; or use --plain") from None
         self._text: Callable[[str], Text] = Text
         self._live = Live(screen=True, auto_refresh=False)
         self._live.start()

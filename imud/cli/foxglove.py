@@ -11,6 +11,7 @@ from imud.bridges.json import JsonDialect
 from imud.bridges.ros2 import Ros2Dialect
 from imud.cli.arguments import CliCommand, add_noise, add_socket, check_port, noise_by_device
 from imud.cli.output import complain
+from imud.host.installation import needs_extra
 from imud.model.errors import BadArgument
 from imud.web.guard import is_loopback
 
@@ -73,10 +74,8 @@ def run(args: argparse.Namespace) -> int:
             f"--address {args.address}: other hosts can reach this address without a password; add --open, or omit "
             f"--address and use a tunnel: ssh -L {PORT}:127.0.0.1:{PORT} GATEWAY"
         )
-    try:
+    with needs_extra("foxglove"):
         from imud.web.foxglove import FoxgloveServer, Relay, ViewerOrigins
-    except ModuleNotFoundError as error:
-        raise BadArgument(f"cannot import {error.name}; install the extra: pip install 'imud[foxglove]'") from None
     origins = ViewerOrigins(names=args.host, origins=args.allow_origin)
     server = FoxgloveServer(args.address, args.port, origins, note=lambda text: complain(f"imud foxglove: {text}"))
     with closing(server):

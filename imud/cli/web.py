@@ -9,6 +9,7 @@ from time import time
 from typing import TYPE_CHECKING, Final
 
 from imud.cli.arguments import CliCommand, add_socket, check_port
+from imud.host.installation import needs_extra
 from imud.model.errors import BadArgument, LinkError, reason_of
 from imud.web.guard import WebGuard, is_loopback, read_token
 
@@ -50,11 +51,8 @@ def run(args: argparse.Namespace) -> int:
     """Serve the page until SIGINT or SIGTERM. Raises BadArgument for unsafe arguments or without the extra `web`."""
     check_port(args.port)
     guard = guard_of(args)
-    try:
-        # needs aiohttp of the extra `web`
+    with needs_extra("web"):
         from imud.web.server import WebServer
-    except ModuleNotFoundError as error:
-        raise BadArgument(f"cannot import {error.name}; install the extra: pip install 'imud[web]'") from None
     asyncio.run(_serve(WebServer(args.socket, guard), args))
     return 0
 

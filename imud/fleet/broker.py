@@ -20,6 +20,7 @@ import msgspec
 
 from imud.fleet.settings import Broker, MqttOptions
 from imud.host.files import read_regular
+from imud.host.installation import needs_extra
 from imud.host.network import tls_context
 from imud.model.errors import ServerError, reason_of
 from imud.model.units import NS_PER_S
@@ -272,7 +273,6 @@ RECEIVED_MAX: Final = 100  # Maximum number of received messages in memory. imud
 # Bytes of a packet without topic and payload: type, lengths, packet identifier, content type, and correlation data of
 # 128 bytes
 OVERHEAD_BYTES: Final = 200
-EXTRA_MISSING: Final = "the output mqtt needs the extra mqtt: pip install 'imud[mqtt]'"
 
 
 class Will(NamedTuple):
@@ -333,10 +333,8 @@ Connect = Callable[[Broker, MqttOptions, str, Will, Callable[[], bool]], BrokerC
 
 def check_extra() -> None:
     """Raise ServerError if paho-mqtt is not installed."""
-    try:
+    with needs_extra("mqtt", ServerError):
         importlib.import_module("paho.mqtt.client")
-    except ImportError as error:
-        raise ServerError(EXTRA_MISSING) from error
 
 
 class PahoConnection:

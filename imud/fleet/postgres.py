@@ -36,6 +36,7 @@ from imud.fleet.accounts import (
 from imud.fleet.collector import Offsets
 from imud.fleet.messages import Interval
 from imud.fleet.reader import FleetBatch
+from imud.host.installation import needs_extra
 from imud.model.errors import ServerError
 from imud.model.sample import values_of
 from imud.model.units import NS_PER_S
@@ -174,7 +175,6 @@ CONNECT_S: Final = 10  # maximum time of an attempt to connect, s
 # Number of attempts to connect again, and the pause before each, s. The restart of a server takes some seconds.
 ATTEMPTS: Final = 20
 ATTEMPT_PAUSE_S: Final = 0.5
-EXTRA_MISSING: Final = "--to postgresql needs the extra fleet: pip install 'imud[fleet]'"
 _UTC_NS: Final = "t_ns + %(utc_offset_ns)s"
 # SQL expressions of the columns that change when the clock of a boot is known, equal to `accounts.placed`
 _PLACED: Final = {
@@ -193,10 +193,8 @@ class PostgresStore:
 
     def __init__(self, url: str) -> None:
         """Connect and create the tables. Raises ServerError."""
-        try:
+        with needs_extra("fleet", ServerError):
             import psycopg
-        except ImportError as error:
-            raise ServerError(EXTRA_MISSING) from error
         self._url = url
         self._error: type[Exception] = psycopg.Error
         self._conflict: type[Exception] = psycopg.errors.UniqueViolation

@@ -19,9 +19,11 @@ from typing import Any, Final, NamedTuple
 
 from imud.contracts.lines import Edge, InputOptions, LineFactory, LineOptions, OnEdges, OnLineEnd, OutputOptions
 from imud.host.files import group_of, user_name
+from imud.host.installation import install_command
 from imud.model.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
 
 DEVICES: Final = Path("/dev")
+GPIOD: Final = "gpiod>=2.3"  # requirement of the package
 GROUP: Final = "gpio"  # group of GPIO chips on Raspberry Pi OS, for messages about a chip that belongs to root
 GONE: Final = frozenset({errno.ENODEV, errno.ENOENT, errno.ENXIO, errno.EBADF})  # errors of a removed chip
 
@@ -43,11 +45,13 @@ def load_gpiod() -> Any:
     try:
         import gpiod
     except ImportError as error:
-        raise LinkError("GPIO lines need the Python package gpiod, got none; run `pip install 'gpiod>=2.3'`") from error
+        raise LinkError(
+            f"GPIO lines need the Python package gpiod, got none; run `{install_command(GPIOD)}`"
+        ) from error
     if not hasattr(gpiod, "request_lines"):
         raise LinkError(
             f"GPIO lines need gpiod 2.3 or later, got the module of libgpiod 1 ({gpiod.__file__}) of Debian 12; "
-            "run `pip install 'gpiod>=2.3'` in the environment of imud"
+            f"run `{install_command(GPIOD)}`"
         )
     return gpiod
 

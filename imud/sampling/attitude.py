@@ -23,13 +23,11 @@ from msgspec.structs import replace
 from imud.attitude.conventions import UNSETTLED_BIT, DeviceAxes
 from imud.attitude.published import TO_EULER
 from imud.attitude.rotation import IDENTITY, quat_from_matrix, quat_product, transposed
+from imud.host.installation import needs_extra
 from imud.model.errors import ImudError
 from imud.model.sample import Quaternion, Sample, Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S, RAD_PER_DEG
 
-EXTRA_MISSING: Final = (
-    "expected the package vqf for `attitude: host`, got none; install it with `pip install 'imud[attitude]'`"
-)
 GAP_MAX_NS: Final = 250 * NS_PER_MS  # at 200 °/s, an angular rate that changes in this time leaves an error of some 10°
 FIRST_PERIOD_NS: Final = 10 * NS_PER_MS  # period of the filter until the first block is complete, ns
 BLOCK: Final = 32  # number of intervals for the median
@@ -51,10 +49,8 @@ def check_extra() -> None:
 
 
 def _vqf() -> Any:
-    try:
+    with needs_extra("attitude", ImudError):
         return import_module("vqf").VQF
-    except ImportError as error:
-        raise ImudError(EXTRA_MISSING) from error
 
 
 class HostAttitude:

@@ -185,7 +185,7 @@ def test_the_extra_is_named_if_it_is_missing_and_the_daemon_does_not_load_it(res
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=LIMIT_S, check=True)
     assert done.stdout == "set()\n"
-    assert "imud noise: cannot import scipy; install the extra: pip install 'imud[analysis]'" in done.stderr
+    assert "imud noise: cannot import scipy; install the extra analysis: " in done.stderr
 
 
 def test_bands_and_a_missing_module_of_imud(capsys: pytest.CaptureFixture[str]) -> None:

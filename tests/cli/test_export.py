@@ -364,7 +364,7 @@ def test_a_full_disk_and_a_missing_library(
         cli.refuses("/dev/full: No space left on device", "export", "--to", to, "-o", "/dev/full", recorded.file)
     monkeypatch.setitem(sys.modules, "mcap.records", None)
     monkeypatch.delitem(sys.modules, "imud.bridges.mcap", raising=False)
-    cli.refuses("pip install 'imud[export]'", "export", "--to", "mcap", "-o", str(tmp_path / "a"), str(recorded.file))
+    cli.refuses(" install 'imud[export]'", "export", "--to", "mcap", "-o", str(tmp_path / "a"), str(recorded.file))
     assert list(tmp_path.iterdir()) == []
     for name in [name for name in sys.modules if name.partition(".")[0] == "mcap"]:
         monkeypatch.setitem(sys.modules, name, None)

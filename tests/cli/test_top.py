@@ -239,7 +239,7 @@ def test_without_a_terminal_or_the_library_it_says_what_to_do(monkeypatch: pytes
         monkeypatch.setattr(stream, "isatty", lambda: True)
     monkeypatch.setitem(sys.modules, "textual.app", None)
     monkeypatch.delitem(sys.modules, "imud.cli.top", raising=False)
-    cli.refuses("pip install 'imud[top]'", "top")
+    cli.refuses(" install 'imud[top]'", "top")
 
 
 def test_curves_of_the_last_minute_of_one_start_and_devices_come_and_go_and_vectors_have_a_length() -> None:

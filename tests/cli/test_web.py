@@ -54,7 +54,7 @@ def test_another_address_needs_a_token_and_who_may_look(token: str) -> None:
 def test_without_the_library_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, cli: Cli) -> None:
     monkeypatch.setitem(sys.modules, "aiohttp", None)
     monkeypatch.delitem(sys.modules, "imud.web.server", raising=False)
-    cli.refuses("pip install 'imud[web]'", "web")
+    cli.refuses(" install 'imud[web]'", "web")
 
 
 @pytest.mark.live

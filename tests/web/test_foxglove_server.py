@@ -142,7 +142,7 @@ def test_refused_arguments_and_the_warning(cli: Cli, monkeypatch: pytest.MonkeyP
         signal.signal(signal.SIGTERM, handler)
     monkeypatch.setitem(sys.modules, "foxglove", None)
     monkeypatch.delitem(sys.modules, "imud.web.foxglove", raising=False)
-    cli.refuses("pip install 'imud[foxglove]'", "foxglove")
+    cli.refuses(" install 'imud[foxglove]'", "foxglove")
 
 
 HOST = "127.0.0.1:8765"

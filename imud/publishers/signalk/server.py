@@ -26,6 +26,7 @@ import msgspec
 
 from imud.contracts.status import OutputStatus
 from imud.host.files import StateFile
+from imud.host.installation import needs_extra
 from imud.host.network import resolve, tls_context
 from imud.model.errors import ServerError, reason_of
 from imud.model.options import shown
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-EXTRA_MISSING: Final = "the output signalk needs the extra signalk: pip install 'imud[signalk]'"
 FILE_NAME: Final = "signalk.json"
 QUEUE_MAX: Final = 32  # Maximum number of deltas that wait. At 10 Hz, older values are of no use for an instrument.
 REPLY_S: Final = 10.0  # maximum time for one reply of the server, s
@@ -130,8 +130,9 @@ class SignalKServer:
 
     def start(self) -> None:
         """Read the token and start to connect. Raises ServerError if aiohttp is not installed."""
-        if importlib.util.find_spec("aiohttp") is None:
-            raise ServerError(EXTRA_MISSING)
+        with needs_extra("signalk", ServerError):
+            if importlib.util.find_spec("aiohttp") is None:
+                raise ModuleNotFoundError(name="aiohttp")
         file = None if self._state_dir is None else self._state_dir / FILE_NAME
         self._file = StateFile(file, WHO, "imud makes a new access request", mode=0o600)
         self._access = self._file.read(dict[str, str])
