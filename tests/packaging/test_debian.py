@@ -43,12 +43,14 @@ def test_scripts_are_shell() -> None:
         subprocess.run(["bash", "-n", str(DEBIAN / name)], check=True, timeout=LIMIT_S)
 
 
-def run_script(name: str, *arguments: str, root: Path) -> None:
+def run_script(name: str, *arguments: str, root: Path) -> str:
+    """Run a script of the package with its paths below `root`. Return its output."""
     text = (DEBIAN / name).read_text()
     places = "usr/lib/imud|usr/lib/systemd/system|var/lib/imud|etc/imud|run/udev|run/systemd/system"
     moved = re.sub(rf"(?<![\w/])/({places})", rf"{root}/\1", text)
     assert moved != text
-    subprocess.run(["sh", "-c", moved, name, *arguments], check=True, timeout=LIMIT_S)
+    argv = ["sh", "-c", moved, name, *arguments]
+    return subprocess.run(argv, check=True, timeout=LIMIT_S, stdout=subprocess.PIPE, text=True).stdout
 
 
 def test_only_a_purge_removes_the_state_and_never_that_of_another_package(tmp_path: Path) -> None:
@@ -77,7 +79,9 @@ def test_what_was_compiled_at_the_installation_goes_before_the_package(tmp_path:
     library.mkdir()
     (library / "one.py").touch()
     (tmp_path / "usr/lib/imud/bin/python3").symlink_to(sys.executable)
-    run_script("imud-daemon.postinst", "configure", "", root=tmp_path)
+    first, *_ = run_script("imud-daemon.postinst", "configure", "", root=tmp_path).splitlines()
+    assert first.startswith("imud-daemon: next step: run 'sudo imud setup'.")
+    assert run_script("imud-daemon.postinst", "configure", "0.1.0-1", root=tmp_path) == "", "an upgrade"
     assert list(library.rglob("*.pyc"))
     run_script("imud-daemon.prerm", "remove", root=tmp_path)
     assert list(library.iterdir()) == [library / "one.py"]
