@@ -54,6 +54,7 @@ FILES: Final = (
     (DEFAULT_PATH, "The socket: requests, samples and events."),
     ("/run/imud/shm", "The rings of shared memory."),
     ("/var/lib/imud", "The stored state of the daemon."),
+    ("/usr/share/doc/imud-daemon/docs", "The documents, with index.md as the first page."),
 )
 
 RAGGED: Final = ".ad l"

@@ -19,6 +19,7 @@ from imud.cli.doctor import buses, daemon, machine, ports
 from imud.cli.doctor.surroundings import DoctorCheck, DoctorFinding, Severity, Surroundings, ask_daemon, file_of_daemon
 from imud.cli.output import COLUMNS
 from imud.cli.run import DEFAULT_FILE
+from imud.host.installation import documents
 from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
 from imud.model.errors import ImudError
 
@@ -82,11 +83,13 @@ def verdict(examined: Sequence[Examined]) -> str:
 
 
 def page(examined: Sequence[Examined]) -> str:
-    """Format all findings, the worst severity last, and the verdict."""
+    """Format all findings, the worst severity last, the place of the documents that they name, and the verdict."""
     findings = [finding for one in examined for finding in one.findings]
     # the worst findings are last, next to the prompt of the shell
     findings.sort(key=lambda finding: _RANK[finding.severity])
-    return "\n".join([*(_block(finding) for finding in findings), "", *textwrap.wrap(verdict(examined), COLUMNS)])
+    place = [f"Folder docs: {documents()}", ""] if any("docs/" in finding.advice for finding in findings) else []
+    blocks = [_block(finding) for finding in findings]
+    return "\n".join([*blocks, "", *place, *textwrap.wrap(verdict(examined), COLUMNS)])
 
 
 _RANK: Final = {

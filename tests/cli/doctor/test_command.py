@@ -11,6 +11,7 @@ from imud.cli import main
 from imud.cli.doctor.command import CHECKS, Examined, as_json, examine, exit_status, page, verdict
 from imud.cli.doctor.surroundings import DoctorCheck, Findings, Surroundings, error, not_checked, note, ok, warning
 from imud.contracts.status import KernelCounters
+from imud.host.installation import documents
 from imud.model.errors import LinkError
 from tests.cli.conftest import Cli
 from tests.support.daemon_process import running_daemon
@@ -152,6 +153,9 @@ def test_verdict_exit_status_json_and_page() -> None:
     assert lines[2].startswith("error        word word")
     assert any(line.startswith("             → another") for line in lines)
     assert "\x1b" not in page([Examined("a", [error("\x1b[2J", "")])])
+    assert "Folder docs:" not in "\n".join(lines)
+    lines = page([Examined("a", [error("no edge", "is the wire connected (docs/lines.md)?")])]).splitlines()
+    assert lines[-4:] == ["", f"Folder docs: {documents()}", "", "1 error"]
 
 
 def test_a_check_that_cannot_look_ends_no_other_and_findings_are_bounded(machine: Machine) -> None:
