@@ -57,9 +57,14 @@ def test_only_a_purge_removes_the_state_and_never_that_of_another_package(tmp_pa
     state = tmp_path / "var/lib/imud/state.json"
     state.parent.mkdir(parents=True)
     state.touch()
-    for action in ("remove", "upgrade", "disappear", "abort-install"):
+    extra = tmp_path / "usr/lib/imud/lib/python3.13/site-packages/numpy.py"
+    extra.parent.mkdir(parents=True)
+    extra.touch()
+    for action in ("upgrade", "disappear", "abort-install", "remove"):
+        assert extra.exists(), "only a removal deletes the libraries that pip installed"
         run_script("imud-daemon.postrm", action, root=tmp_path)
         assert state.exists(), action
+    assert not (tmp_path / "usr/lib/imud").exists()
     run_script("imud-daemon.postrm", "purge", root=tmp_path)
     assert not state.parent.exists()
     unit, state = tmp_path / "usr/lib/systemd/system/imud.service", tmp_path / "var/lib/imud/theirs"
